@@ -84,6 +84,11 @@ def as_positions(positions: ArrayLike, *, name: str = "positions") -> Floats:
     return x
 
 
+def present(points: Floats) -> Bools:
+    """Return which points (..., d) are there: those without a NaN, shape (...)."""
+    return np.asarray(~np.isnan(points).any(axis=-1), dtype=np.bool_)
+
+
 def as_sigma(sigma: ArrayLike, dimensions: int) -> Floats:
     """Return a localisation error as one number per axis, shape (d,).
 
@@ -101,7 +106,7 @@ def as_sigma(sigma: ArrayLike, dimensions: int) -> Floats:
     return np.broadcast_to(s, (dimensions,)).copy()
 
 
-def require_positive(**values: Any) -> None:
+def require_positive(**values: float) -> None:
     """Raise one ValueError that lists every keyword whose value is not a positive number."""
     bad = [
         f"{name} = {value!r}"

@@ -1,0 +1,89 @@
+# The workshop. `make` alone lists what can be made; settings of the tools are in pyproject.toml.
+# PYTHON=/path/to/python chooses the interpreter; otherwise the first one that will do is taken.
+
+SHELL := /bin/sh
+.DEFAULT_GOAL := help
+PYTHON ?=
+BIN := .venv/bin
+RUN := $(BIN)/python -m
+PIP := $(RUN) pip --disable-pip-version-check
+
+# A venv cannot be moved: in a copied or renamed tree its stamps do not count.
+$(shell [ ! -d .venv ] || [ "$$(cat .venv/.tree 2>/dev/null)" = "$(CURDIR)" ] || rm -f .venv/.demo .venv/.test .venv/.docs)
+
+# Prints the first Python >= 3.11 that can make a venv with pip; else "none", or "venvless NAME".
+find_python = $(shell found=none; \
+  for p in $(or $(PYTHON),python3 python python3.14 python3.13 python3.12 python3.11); do \
+    "$$p" -c 'import sys; sys.exit(sys.version_info < (3, 11))' >/dev/null 2>&1 || continue; \
+    if "$$p" -c 'import venv, ensurepip' >/dev/null 2>&1; then found=$$p; break; fi; \
+    if [ "$$found" = none ]; then found="venvless $$p"; fi; \
+  done; echo "$$found")
+no_python = perrin needs Python 3.11 or newer: install it \
+  (Debian, Ubuntu: apt install python3 python3-venv; macOS: brew install python; or python.org) \
+  or name one that is not on the PATH: make PYTHON=/path/to/python
+no_venv = $(1) cannot make virtual environments: install its venv module \
+  (Debian, Ubuntu: apt install $(shell $(1) -c \
+  'import sys; print("python%d.%d-venv" % sys.version_info[:2])'))
+check_python = $(if $(filter none,$(1)),$(error $(no_python)),$(if $(filter venvless,$(1)),$(error $(call no_venv,$(lastword $(1))))))
+
+# $(call make_venv,FOLDER): keeps one that works, replaces one that does not.
+venv_works = $(shell $(1)/bin/python -c 'import sys, pip; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo yes)
+make_venv = $(if $(call venv_works,$(1)),:,$(call new_venv,$(1),$(find_python)))
+new_venv = $(call check_python,$(2))rm -rf $(1); $(2) -m venv $(1) || { echo '$(call no_venv,$(2))' >&2; exit 1; }
+
+.PHONY: help demo test test-lowest lint types doctests docs lock clean
+
+help:  ## list these targets
+	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1 - \2/p' Makefile | awk -F ' - ' '{printf "%-18s %s\n", $$1, $$2}'
+
+demo: .venv/.demo  ## the main job on an embedded table, into perrin-demo/
+	$(BIN)/perrin demo
+
+test: .venv/.test  ## the whole suite
+	$(RUN) pytest -q
+
+test-lowest:  ## the suite on the oldest dependencies allowed (Python 3.11)
+	@$(call make_venv,.venv-lowest)
+	.venv-lowest/bin/python -m pip install --quiet --disable-pip-version-check \
+	  -r requirements/lowest.txt $$(grep -E '^(pytest|hypothesis)==' requirements/test.lock)
+	.venv-lowest/bin/python -m pip install --quiet --disable-pip-version-check --no-deps -e .
+	.venv-lowest/bin/python -m pytest -q
+
+lint: .venv/.test  ## ruff: rules and format
+	$(RUN) ruff check .
+	$(RUN) ruff format --check .
+
+types: .venv/.test  ## mypy --strict on src
+	$(RUN) mypy
+
+doctests: .venv/.test  ## the examples in the docstrings
+	$(RUN) pytest --doctest-modules src/perrin -q
+
+docs: .venv/.docs  ## the documentation, into docs/_build/html
+	$(RUN) sphinx -q -b html docs docs/_build/html
+
+lock:  ## resolve the dependencies of pyproject.toml anew into requirements/
+	@$(call make_venv,.venv-lock)
+	.venv-lock/bin/python -m pip install --quiet --disable-pip-version-check uv
+	UV=.venv-lock/bin/uv sh requirements/lock.sh
+
+clean:  ## remove what was installed and built, demo output included
+	rm -rf .venv .venv-lowest .venv-lock dist docs/_build perrin-demo
+	rm -rf .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	find src tests -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# The locks are complete, so pip resolves nothing; `pip check` would show a gap.
+.venv/.demo: requirements/demo.lock pyproject.toml
+	@$(call make_venv,.venv)
+	@echo 'Installing locked versions into .venv (once; a minute or two)'
+	@$(PIP) install --quiet --no-deps -r requirements/demo.lock
+	@$(PIP) install --quiet --no-deps --no-build-isolation -e .
+	@$(PIP) --quiet check
+	@printf '%s' "$(CURDIR)" > .venv/.tree
+	@touch $@
+
+.venv/.test .venv/.docs: .venv/.%: requirements/%.lock .venv/.demo
+	@echo 'Installing $< into .venv'
+	@$(PIP) install --quiet --no-deps -r $<
+	@$(PIP) --quiet check
+	@touch $@

@@ -1,0 +1,556 @@
+"""How fast it diffuses: D_R and D_T from the steps by likelihood, or from a curve by a line."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from perrin._arrays import Floats, Ints, TooFewFramesError
+from perrin.motion import RigidMotion
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from perrin.lagged import LagCurve
+
+Quantity = Literal["rotation", "translation"]
+_UNITS = {"rotation": "rad^2/s", "translation": "um^2/s"}
+_CHI2 = {0.68: 0.9889, 0.95: 3.8415}  # quantiles of chi-squared with one degree of freedom
+_NORMAL = {0.68: 0.9945, 0.95: 1.9600}
+
+# Lowest logarithmic distance of an offset to its least value, in units of the mean square step.
+_EDGE = -30.0
+
+# Adding noisy body-frame steps turns noise into diffusion at second order: a motionless tetrahedron
+# reads D = 0.04 (sigma/R)^4/dt. Below ten times that a D_R is not resolved.
+_FLOOR = 0.04
+_RESOLVED = 10.0
+
+
+@dataclass(frozen=True)
+class DiffusionEstimate:
+    """A diffusion coefficient with what it rests on.
+
+    Attributes
+    ----------
+    value : float
+        D_R in rad^2/s or D_T in um^2/s.
+    ci68, ci95 : tuple of float
+        Confidence intervals; an end that the data do not bound is 0 or inf.
+    stderr : float
+        Half the width of the 68 % interval.
+    offset : float
+        Variance of one orientation (rad^2) or centre coordinate (um^2) from noise, mean over axes;
+        negative where motion blur outweighs the noise.
+    offset_stderr : float
+        Its standard error; NaN where it lies on the edge of what is possible.
+    resolution_floor : float or None
+        The D_R that a motionless cluster would read; None for D_T.
+    resolved : bool
+        Whether the value stands clear of that floor and of 0; if not, read it as an upper limit.
+    unit, method : str
+    n_frames : int
+        Frames with a pose, of all motions.
+    snr : float
+        D dt/s, s the noise variance predicted from the rigid-fit residuals; inf without noise.
+    """
+
+    value: float
+    ci68: tuple[float, float]
+    ci95: tuple[float, float]
+    stderr: float
+    offset: float
+    offset_stderr: float
+    resolution_floor: float | None
+    resolved: bool
+    unit: str
+    method: str
+    n_frames: int
+    snr: float
+
+    def __str__(self) -> str:
+        name = "D_R" if self.unit == _UNITS["rotation"] else "D_T"
+        tail = f"{self.unit} [{self.method}, {self.n_frames} frames]"
+        if not self.resolved:
+            return f"{name} < {self.ci95[1]:.2g} {tail}, 95 % limit"
+        return f"{name} = {with_error(self.value, self.stderr)} {tail}"
+
+    def __float__(self) -> float:
+        return self.value
+
+
+def with_error(value: float, stderr: float) -> str:
+    """Write a value with its standard error in the last digits: 0.0047(5).
+
+    Examples
+    --------
+    >>> with_error(0.00471, 0.00052), with_error(38.5, 12.0), with_error(0.0385, 0.0019)
+    ('0.0047(5)', '38(12)', '0.0385(19)')
+    """
+    if not (np.isfinite(stderr) and stderr > 0):
+        return f"{value:.3g}"
+    exponent = int(np.floor(np.log10(stderr)))
+    # Two digits of an error below 20, one above: the last digit then says 5 to 50 %.
+    digits = -exponent + (1 if round(stderr / 10**exponent, 1) < 2 else 0)
+    shown = round(stderr * 10.0**digits)
+    if digits <= 0:
+        return f"{round(value, digits):.0f}({shown * 10**-digits})"
+    return f"{value:.{digits}f}({shown})"
+
+
+def estimate_diffusion(
+    motion: RigidMotion | Sequence[RigidMotion],
+    *,
+    quantity: Quantity = "rotation",
+    method: Literal["mle"] = "mle",
+    noise: Literal["joint"] = "joint",
+) -> DiffusionEstimate:
+    """Estimate D_R or D_T from the steps of a motion by maximum likelihood, noise included.
+
+    Parameters
+    ----------
+    motion : RigidMotion or sequence of RigidMotion
+        Several are pooled: one D, each with its own noise.
+    quantity : {"rotation", "translation"}
+        D_R from body-frame rotation vectors, or D_T from the centre. For an anisotropic body the
+        value is the mean over the three axes (trace/3).
+    method : {"mle"}
+        Maximum likelihood.
+    noise : {"joint"}
+        The noise offset is estimated along with D. It may be negative, as under motion blur.
+
+    Returns
+    -------
+    DiffusionEstimate
+        With profile-likelihood intervals.
+
+    Raises
+    ------
+    TooFewFramesError
+        Fewer than 3 frames with a pose, or no step.
+    ValueError
+        For an unknown quantity, method or noise, or motions of 2 and 3 dimensions together.
+
+    Notes
+    -----
+    Steps over a time t between frames k and k + 1 have variance 2 D t + o (h_k + h_{k+1}) and
+    neighbours covariance -o h_{k+1}, with o the noise offset and h the noise of a frame over that
+    of a complete one (more with particles missing): a tridiagonal likelihood, linear in the number
+    of frames, in which a gap is one longer step. One offset serves the three body axes; the centre
+    has one for each lab axis.
+
+    Examples
+    --------
+    >>> from perrin import Cluster, simulate_motion
+    >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=300, rng=3)
+    >>> print(estimate_diffusion(truth))
+    D_R = 0.0050(4) rad^2/s [mle, 300 frames]
+    """
+    motions = [motion] if isinstance(motion, RigidMotion) else list(motion)
+    _check_choices(motions, quantity=quantity, method=method, noise=noise)
+    likelihood = _Likelihood.of(motions, quantity=quantity)
+    value = likelihood.best_value()
+    ci68, ci95 = (likelihood.interval(value, _CHI2[level]) for level in (0.68, 0.95))
+    offset, offset_stderr = likelihood.offset_at(value)
+    spread, floor = _predicted_spread(motions, quantity), None
+    if quantity == "rotation":
+        floor = float(np.mean([_FLOOR * (m.sigma / m.R) ** 4 / m.dt for m in motions]))
+    dt = float(np.mean([m.dt for m in motions]))
+    return DiffusionEstimate(
+        value=value,
+        ci68=ci68,
+        ci95=ci95,
+        stderr=(ci68[1] - ci68[0]) / 2,
+        offset=offset,
+        offset_stderr=offset_stderr,
+        resolution_floor=floor,
+        resolved=bool(ci95[0] > 0 and value > _RESOLVED * (floor or 0.0)),
+        unit=_UNITS[quantity],
+        method=method,
+        n_frames=sum(m.fitted.size for m in motions),
+        snr=value * dt / spread if spread > 0 else np.inf,
+    )
+
+
+def fit_line(curve: LagCurve, *, lag_range: tuple[float, float]) -> DiffusionEstimate:
+    """Fit a straight line with a free offset to a curve, as the paper does (Eqs. 20, 22 and 24).
+
+    Parameters
+    ----------
+    curve : LagCurve
+        From `msad` or `msd`.
+    lag_range : tuple of float
+        First and last lag time used, s, both included.
+
+    Returns
+    -------
+    DiffusionEstimate
+        The slope over 2 dof. Its error is that of the procedure on Brownian motion, correlations
+        between overlapping pairs included; the scatter about the line says nothing about it.
+
+    Raises
+    ------
+    ValueError
+        If the range holds fewer than 3 lags with data.
+
+    Examples
+    --------
+    >>> from perrin import Cluster, msad, simulate_motion
+    >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=300, rng=3)
+    >>> print(fit_line(msad(truth), lag_range=(3, 22)))
+    D_R = 0.0068(18) rad^2/s [line, 300 frames]
+    """
+    low, high = lag_range
+    dt = float(curve.lagtime[0])
+    inside = (curve.lagtime > low - 1e-6 * dt) & (curve.lagtime < high + 1e-6 * dt)
+    use = np.flatnonzero(inside & np.isfinite(curve.value))
+    if use.size < 3:
+        raise ValueError(
+            f"lag_range: {low:g} to {high:g} s holds {use.size} lags with data, at least 3 are "
+            f"needed; the curve runs from {dt:g} to {curve.lagtime[-1]:g} s"
+        )
+    t = curve.lagtime[use]
+    lever = (t - t.mean()) / np.sum((t - t.mean()) ** 2)
+    D = float(lever @ curve.value[use]) / (2 * curve.dof)
+    offset = float(np.mean(curve.value[use])) / (2 * curve.dof) - D * float(t.mean())
+    steps = len(curve.lagtime)
+    weights = np.zeros(use[-1] + 1)
+    weights[use] = lever / 2
+    variance = _quadratic_variance(weights, steps, D=max(D, 0.0) * dt, s=max(offset, 0.0))
+    walkers = curve.n_walks / curve.components.shape[1] if curve.quantity == "translation" else 1.0
+    # Gaps leave fewer pairs than a complete track; the variance grows in proportion.
+    thinned = float(np.mean((steps - use) * walkers / curve.n_pairs[use]))
+    stderr = float(np.sqrt(variance * thinned / curve.n_walks))
+    ci68, ci95 = ((D - z * stderr, D + z * stderr) for z in (_NORMAL[0.68], _NORMAL[0.95]))
+    return DiffusionEstimate(
+        value=D,
+        ci68=ci68,
+        ci95=ci95,
+        stderr=stderr,
+        offset=offset,
+        offset_stderr=np.nan,
+        resolution_floor=None,
+        resolved=ci95[0] > 0,
+        unit=_UNITS[curve.quantity],
+        method="line",
+        n_frames=steps + 1,
+        snr=D * dt / offset if offset > 0 else np.inf,
+    )
+
+
+def _quadratic_variance(weights: Floats, steps: int, *, D: float, s: float) -> float:
+    """Return the variance of sum_n weights[n-1] MSD(n) of a one-dimensional noisy Brownian walk.
+
+    The sum is a quadratic form y.Q.y in the steps y, whose covariance C is tridiagonal
+    (2D + 2s, -s); the variance is 2 tr (QC)^2. Q_jk, the weight over the pair count of all
+    displacements that contain both steps, comes from cumulative sums, one diagonal at a time.
+    """
+    L, N = len(weights), steps
+    lag = np.arange(1, L + 1)
+    per_pair = np.concatenate([[0.0], np.cumsum(weights / (N - lag + 1))])
+    held = per_pair[np.minimum(np.arange(N + L + 1), L)]
+    twice = np.concatenate([[0.0], np.cumsum(held)])
+
+    def diagonal(p: int) -> Floats:
+        k = np.arange(p, N)
+        top = np.maximum(np.minimum(k, L - 1) + 1, p)
+        contained: Floats = twice[N - k + top] - twice[N - k + p] - (twice[top] - twice[p])
+        return contained
+
+    a, b = 2 * D + 2 * s, -s
+    before, here = diagonal(1) if N > 1 else np.zeros(0), diagonal(0)
+    trace = 0.0
+    for p in range(min(L, N - 1) + 1):
+        after = diagonal(p + 1)
+        upper, lower = a * here, a * here
+        upper[: len(after)] += b * after
+        lower[1:] += b * after
+        if p:
+            upper += b * before[: len(here)]
+            lower += b * before[1 : len(here) + 1]
+            trace += 2 * float(upper @ lower)
+        else:
+            full = upper + lower - a * here
+            trace += float(full @ full)
+        before, here = here, after
+    return 2 * trace
+
+
+def _check_choices(
+    motions: Sequence[RigidMotion], *, quantity: str, method: str, noise: str
+) -> None:
+    """Refuse what is not offered, and motions that cannot be pooled or are too short."""
+    faults = [
+        f"{name}: expected {' or '.join(map(repr, offered))}, got {got!r}"
+        for name, got, offered in (
+            ("quantity", quantity, tuple(_UNITS)),
+            ("method", method, ("mle",)),
+            ("noise", noise, ("joint",)),
+        )
+        if got not in offered
+    ]
+    if len({m.template.shape[1] for m in motions}) != 1:
+        faults.append("motion: expected one or more motions, all in 2 or all in 3 dimensions")
+    if faults:
+        raise ValueError("; ".join(faults))
+    for i, m in enumerate(motions):
+        if len(m.steps()[0]) < 2:
+            raise TooFewFramesError(
+                f"motion {i} has {m.fitted.size} frames with a pose in too few steps: at least 3 "
+                "in a row (gaps allowed) are needed to tell diffusion from noise",
+                int(m.fitted.size),
+            )
+
+
+def _predicted_spread(motions: Sequence[RigidMotion], quantity: str) -> float:
+    """Return the noise variance of one orientation or centre coordinate, mean over axes."""
+
+    def spread(m: RigidMotion) -> float:
+        if quantity == "translation":
+            return float(np.nanmean(m.center_variance))
+        c = m.covariance[m.fitted]
+        return float(np.trace(c, axis1=1, axis2=2).mean() / c.shape[-1])
+
+    return float(np.mean([spread(m) for m in motions]))
+
+
+@dataclass(frozen=True, eq=False)
+class _Likelihood:
+    """The Gaussian likelihood of all steps, stacked to one tridiagonal system.
+
+    Step i has variance 2 D tau + o (h0 + h1) and covariance -o h1 with step i + 1 where the two
+    share a frame (`linked`); o is the noise offset of the step's `group`.
+    """
+
+    y: Floats
+    tau: Floats
+    h0: Floats
+    h1: Floats
+    linked: Floats
+    group: Ints
+
+    @classmethod
+    def of(cls, motions: Sequence[RigidMotion], *, quantity: str) -> _Likelihood:
+        """Stack the steps of every axis of every motion."""
+        parts: list[tuple[Floats, Floats, Floats, Floats, Floats]] = []
+        groups: list[int] = []
+        count = 0
+        for m in motions:
+            start, stop = m.steps()
+            y, h = _rotation_steps(m) if quantity == "rotation" else _translation_steps(m)
+            tau = m.time[stop] - m.time[start]
+            linked = np.append(start[1:] == stop[:-1], False).astype(np.float64)
+            for axis in range(y.shape[1]):
+                parts.append((y[:, axis], tau, h[start, axis], h[stop, axis], linked))
+                groups.append(count)
+                count += quantity == "translation"
+            count += quantity == "rotation"
+        group = np.repeat(np.array(groups), [len(p[0]) for p in parts])
+        y_all, tau_all, h0, h1, linked_all = (np.concatenate(c) for c in zip(*parts, strict=True))
+        return cls(y_all, tau_all, h0, h1, linked_all, group)
+
+    @cached_property
+    def _starts(self) -> Ints:
+        return np.flatnonzero(np.diff(self.group, prepend=-1))
+
+    @cached_property
+    def _power(self) -> Floats:
+        """Mean square step of each group: the scale of its noise offset."""
+        return self._per_group(self.y**2) / self._per_group(np.ones_like(self.y))
+
+    @cached_property
+    def _scale(self) -> float:
+        """Return the D that would explain all the motion without noise: the scale of D."""
+        return float(np.sum(self.y**2) / np.sum(2 * self.tau))
+
+    @cached_property
+    def _least(self) -> Floats:
+        """Return the least offset over D of each group: below it a variance would be negative."""
+        return -np.minimum.reduceat(self.tau / (self.h0 + self.h1), self._starts)
+
+    def _per_group(self, x: Floats) -> Floats:
+        total: Floats = np.add.reduceat(x, self._starts)
+        return total
+
+    def _evaluate(self, D: float, offset: Floats) -> tuple[float, float, Floats]:
+        """Return the log-likelihood, its slope in D, and its slopes in the offsets.
+
+        The inverse of a tridiagonal matrix has the diagonal 1/(d + d' - a), with d and d' the
+        pivots of the elimination from above and from below, and Z_{i,i+1} = -l_i Z_{i+1,i+1}.
+        """
+        from scipy.linalg.lapack import dpttrf, dpttrs
+
+        o, weight = offset[self.group], self.h0 + self.h1
+        a = 2 * D * self.tau + o * weight
+        cross = -self.h1[:-1] * self.linked[:-1]
+        b = o[:-1] * cross
+        d, lower, bad = dpttrf(a, b)
+        up, _, bad_up = dpttrf(a[::-1], b[::-1])
+        if bad or bad_up:
+            return -np.inf, np.nan, np.full(len(offset), np.nan)
+        z, _ = dpttrs(d, lower, self.y)
+        inverse = 1 / (d + up[::-1] - a)
+        on = inverse - z * z
+        off = -lower * inverse[1:] - z[:-1] * z[1:]
+        value = -0.5 * float(np.sum(np.log(d)) + self.y @ z)
+        slope = -float(self.tau @ on)
+        slopes = weight * on
+        slopes[:-1] += 2 * cross * off
+        return value, slope, -0.5 * self._per_group(slopes)
+
+    def ridge(
+        self, D: float, guess: Floats | None = None, tolerance: float = 1e-12
+    ) -> tuple[float, float, Floats]:
+        """Maximise over the offsets at one D: return value, slope along the ridge, offsets.
+
+        Each offset is the root of its own slope, all groups at once, by secant steps inside a
+        shrinking bracket; their coordinate t is the logarithm of the distance to the least value,
+        near which the likelihood falls off a cliff.
+        """
+        least, power = self._least * D, self._power
+        low, high = np.full(len(power), _EDGE), np.full(len(power), 6.0)
+        start = 0.5 * power if guess is None else guess
+        old = np.log(np.maximum((start - least) / power, 1e-6))
+        old_slope = self._evaluate(D, least + power * np.exp(old))[2] * np.exp(old)
+        t = np.clip(old + np.copysign(1e-3, old_slope), low, high)
+        for _ in range(100):
+            offset = least + power * np.exp(t)
+            value, slope_D, slopes = self._evaluate(D, offset)
+            slope = slopes * np.exp(t)
+            low, high = np.where(slope > 0, t, low), np.where(slope > 0, high, t)
+            target = _secant(t, slope, old, old_slope, low, high)
+            if np.all((np.abs(target - t) <= tolerance) | (high <= _EDGE)):
+                break
+            old, old_slope, t = t, slope, target
+        # Along the ridge an offset moves by `least` times the change of D, where it does not rest.
+        return value, slope_D + float(np.sum(self._least * slopes)), offset
+
+    def _follower(self, tolerance: float) -> Callable[[float], tuple[float, float, Floats]]:
+        """Return `ridge` as a function of D that starts from where its last two calls ended."""
+        trail: list[tuple[float, Floats]] = []
+
+        def follow(D: float) -> tuple[float, float, Floats]:
+            guess = trail[-1][1] if trail else None
+            if len(trail) > 1 and trail[-1][0] != trail[-2][0]:
+                (D0, o0), (D1, o1) = trail[-2:]
+                guess = o1 + (o1 - o0) * (D - D1) / (D1 - D0)
+            found = self.ridge(D, guess, tolerance)
+            trail.append((D, found[2]))
+            return found
+
+        return follow
+
+    def best_value(self) -> float:
+        """Return the D of greatest likelihood: the root of the slope along the ridge, or 0."""
+        from scipy.optimize import brentq
+
+        follow = self._follower(1e-12)
+        if follow(0.0)[1] <= 0:
+            return 0.0
+        high = self._scale
+        while follow(high)[1] > 0:
+            high *= 2
+        return float(brentq(lambda D: follow(D)[1], 0.0, high, xtol=1e-14 * high, rtol=1e-13))
+
+    def interval(self, value: float, drop: float) -> tuple[float, float]:
+        """Return where twice the profile log-likelihood has fallen by `drop`; 0 if it never has."""
+        # The height is flat in the offset on the ridge: half the digits of t give all of its own.
+        follow = self._follower(1e-6)
+        top = follow(value)[0]
+
+        def height(D: float) -> tuple[float, float]:
+            level, slope, _ = follow(D)
+            return level - top + drop / 2, slope
+
+        near = 0.02 * value if value else self._scale / len(self.y)
+        curvature = -height(value + near)[1] / near
+        reach = np.sqrt(drop / curvature) if curvature > 0 else near
+        high = _crossing(height, inside=value, start=value + reach, outside=np.inf)
+        if value == 0 or height(0.0)[0] > 0:
+            return 0.0, high
+        return _crossing(height, inside=value, start=value - reach, outside=0.0), high
+
+    def offset_at(self, value: float) -> tuple[float, float]:
+        """Return the mean noise offset and its standard error from the observed information.
+
+        The information is arrow-shaped (one D, an offset for each group); it comes from central
+        differences of the slopes.
+        """
+        offset = self.ridge(value)[2]
+        mean = float(offset.mean())
+        if np.any(offset - self._least * value <= 1e-9 * self._power) or value == 0:
+            return mean, np.nan
+        step_o, step_D = 1e-4 * self._power, 1e-4 * value
+        plus, minus = (self._evaluate(value, offset + sign * step_o) for sign in (1, -1))
+        h_oo = -(plus[2] - minus[2]) / (2 * step_o)
+        plus, minus = (self._evaluate(value + sign * step_D, offset) for sign in (1, -1))
+        h_DD, h_Do = -(plus[1] - minus[1]) / (2 * step_D), -(plus[2] - minus[2]) / (2 * step_D)
+        left = h_DD - float(np.sum(h_Do**2 / h_oo))
+        if left <= 0 or np.any(h_oo <= 0):
+            return mean, np.nan
+        variance = np.sum(1 / h_oo) / len(offset) ** 2 + np.mean(h_Do / h_oo) ** 2 / left
+        return mean, float(np.sqrt(variance))
+
+
+def _secant(
+    t: Floats, slope: Floats, old: Floats, old_slope: Floats, low: Floats, high: Floats
+) -> Floats:
+    """Return the next trial: the secant step, or the middle of the bracket where that leaves it."""
+    rise, run = slope - old_slope, t - old
+    step = np.divide(slope * run, rise, out=np.full_like(t, np.nan), where=rise != 0)
+    target = np.where(rise * run < 0, t - step, np.nan)
+    inside = (target > low) & (target < high)
+    # Falling slopes that never cross zero lead down to the edge, which is then the answer.
+    target = np.where((target <= low) & (low <= _EDGE), _EDGE, target)
+    return np.where(inside | (target == _EDGE), target, 0.5 * (low + high))
+
+
+def _crossing(
+    height: Callable[[float], tuple[float, float]], *, inside: float, start: float, outside: float
+) -> float:
+    """Return where a height falls through zero between `inside` (> 0) and `outside` (< 0).
+
+    Newton steps, halved into the bracket, or doubled away from `inside` while there is no bracket.
+    """
+    x = start if min(inside, outside) < start < max(inside, outside) else (inside + outside) / 2
+    for _ in range(200):
+        value, slope = height(x)
+        inside, outside = (x, outside) if value > 0 else (inside, x)
+        middle = 2 * x if outside == np.inf else (inside + outside) / 2
+        newton = x - value / slope if slope else np.nan
+        within = min(inside, outside) < newton < max(inside, outside)
+        old, x = x, newton if within else middle
+        if abs(x - old) <= 1e-11 * abs(x):
+            break
+    return float(x)
+
+
+def _rotation_steps(motion: RigidMotion) -> tuple[Floats, Floats]:
+    """Return body-frame rotation vectors along the principal axes, and each frame's noise there.
+
+    The noise is relative to the mean over axes of a complete frame. The axes are those in which the
+    covariance of the orientation is diagonal, so that one number an axis describes it.
+    """
+    _, stop = motion.steps()
+    c = motion.covariance
+    fullest = motion.n_present == motion.n_present[motion.fitted].max()
+    usual = np.nanmean(c[fullest], axis=0)
+    base = float(np.trace(usual)) / len(usual)
+    axes = np.linalg.eigh(usual)[1]
+    noise = np.einsum("ji,tjk,ki->ti", axes, c, axes)
+    relative = noise / base if base > 0 else np.where(np.isfinite(noise), 1.0, np.nan)
+    return motion.step_vectors()[stop - 1] @ axes, relative
+
+
+def _translation_steps(motion: RigidMotion) -> tuple[Floats, Floats]:
+    """Return displacements of the centre, and each frame's noise relative to a complete one's."""
+    start, stop = motion.steps()
+    v = motion.center_variance
+    base = float(np.nanmin(v))
+    relative = v / base if base > 0 else np.where(np.isfinite(v), 1.0, np.nan)
+    return motion.center[stop] - motion.center[start], np.repeat(
+        relative[:, None], motion.center.shape[1], axis=1
+    )

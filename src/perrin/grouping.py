@@ -1,0 +1,269 @@
+"""Which particles travel together, and their positions as an array: pandas ends here."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from perrin._arrays import Bools, Floats, Ints, TrackTableError, require_positive
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    import pandas as pd
+
+# The gap behind a touching neighbour: the next shell of a packing begins at 1.41 diameters.
+_REACH = 1.3
+_LONGEST_SPAN = 1_000_000
+_SPARSEST = 1000
+
+
+def cluster_positions(
+    table: pd.DataFrame, *, cluster: int | str | None = None
+) -> tuple[Floats, Ints]:
+    """Seat the tracks of one cluster in an array, one row per frame and one column per particle.
+
+    Every frame from the cluster's first to its last is a row. A row of the table with a NaN
+    coordinate counts as missing, as if it were not there. Particles keep the ids they came with.
+
+    Parameters
+    ----------
+    table : pandas.DataFrame
+        Tracks as `read_tracks` and `check_tracks` return them, coordinates in um.
+    cluster : int or str, optional
+        Which cluster, where the column ``cluster`` holds several. A table without that column is
+        one cluster.
+
+    Returns
+    -------
+    positions : ndarray, shape (T, n, d)
+        Coordinates in um, NaN where missing; d is 3 where the table has a column ``z``, else 2.
+        Particles are in the order of their ids.
+    frames : ndarray of int64, shape (T,)
+        The frame number of each row.
+
+    Raises
+    ------
+    ValueError
+        If the table holds several clusters and `cluster` does not say which, or not that one.
+    TrackTableError
+        If the table is not a clean track table, holds no coordinates, or has frame numbers so
+        sparse that they look like times or ids.
+
+    Examples
+    --------
+    >>> import pandas as pd
+    >>> from perrin.grouping import cluster_positions
+    >>> table = pd.DataFrame({"frame": [5, 7], "particle": [0, 0], "x": [1.0, 2.0], "y": 0.0})
+    >>> positions, frames = cluster_positions(table)
+    >>> frames
+    array([5, 6, 7])
+    >>> positions[:, 0, 0]
+    array([ 1., nan,  2.])
+    """
+    chosen = _one_cluster(table, cluster)
+    tracks = _tracks(chosen)
+    ids = np.unique(tracks.code[tracks.seen])
+    first, last = _span(tracks.frame[tracks.seen])
+    positions = np.full((last - first + 1, len(ids), tracks.x.shape[1]), np.nan)
+    row = tracks.frame[tracks.seen] - first
+    positions[row, np.searchsorted(ids, tracks.code[tracks.seen])] = tracks.x[tracks.seen]
+    return positions, np.arange(first, last + 1, dtype=np.int64)
+
+
+def find_clusters(table: pd.DataFrame, *, contact: float) -> pd.DataFrame:
+    """Find which particles travel together and number the clusters they form.
+
+    Two particles belong together when they are nearer than 1.3 times `contact` in more than half
+    of the frames that hold both, and at least 2 frames do. Clusters are the connected groups of at
+    least 3 particles (2 in two dimensions).
+
+    Parameters
+    ----------
+    table : pandas.DataFrame
+        Tracks as `read_tracks` and `check_tracks` return them, coordinates in um. A row with a NaN
+        coordinate counts as missing. An existing ``cluster`` column is replaced; ids must be
+        unique without it.
+    contact : float
+        Centre distance of touching particles, um.
+
+    Returns
+    -------
+    pandas.DataFrame
+        The same table with the column ``cluster`` (int64): clusters are numbered from 0 in the
+        order of their smallest particle id, particles of no cluster have -1.
+
+    Raises
+    ------
+    ValueError
+        If `contact` is not a positive number.
+    TrackTableError
+        If the table is not a clean track table.
+
+    Examples
+    --------
+    >>> import pandas as pd
+    >>> from perrin.grouping import find_clusters
+    >>> table = pd.DataFrame({"frame": [0, 0, 0, 1, 1, 1], "particle": [1, 2, 3, 1, 2, 3],
+    ...                       "x": [0.0, 1.0, 5.0, 0.1, 1.1, 5.0], "y": 0.0})
+    >>> find_clusters(table, contact=1.0)["cluster"].tolist()
+    [0, 0, -1, 0, 0, -1]
+    """
+    require_positive(contact=contact)
+    tracks = _tracks(table)
+    pairs = _lasting_pairs(tracks, _REACH * contact)
+    smallest = 3 if tracks.x.shape[1] == 3 else 2
+    labels = _components(pairs, tracks.n_particles, smallest)
+    return table.assign(cluster=labels[tracks.code])
+
+
+class _Tracks(NamedTuple):
+    """The columns of a table as arrays, one entry per row."""
+
+    frame: Ints
+    code: Ints
+    x: Floats
+    seen: Bools
+    n_particles: int
+
+
+def _tracks(table: pd.DataFrame) -> _Tracks:
+    """Return the columns as arrays; `code` numbers the particles in the order of their ids."""
+    import pandas as pd
+
+    _refuse_unclean(table)
+    axes = ["x", "y", "z"] if "z" in table else ["x", "y"]
+    x = table[axes].to_numpy(dtype=np.float64, na_value=np.nan)
+    code, ids = pd.factorize(table["particle"], sort=True)
+    frame = table["frame"].to_numpy(dtype=np.int64)
+    return _Tracks(frame, code.astype(np.int64), x, ~np.isnan(x).any(axis=1), len(ids))
+
+
+def _refuse_unclean(table: pd.DataFrame) -> None:
+    """Raise for what would become a wrong number here, listing all faults."""
+    missing = [name for name in ("frame", "particle", "x", "y") if name not in table]
+    faults = [f"missing columns {', '.join(missing)}"] if missing else []
+    faults += [
+        f"{table[name].isna().sum()} rows without {name}"
+        for name in ("frame", "particle")
+        if name in table and table[name].isna().any()
+    ]
+    faults += [] if len(table) else ["no rows"]
+    if not faults:
+        faults = _value_faults(table)
+    if faults:
+        raise TrackTableError(
+            f"not a clean track table: {'; '.join(faults)}. check_tracks names the rows",
+            tuple(faults),
+        )
+
+
+def _value_faults(table: pd.DataFrame) -> list[str]:
+    frame = table["frame"].to_numpy(dtype=np.float64)
+    axes = [axis for axis in ("x", "y", "z") if axis in table]
+    x = table[axes].to_numpy(dtype=np.float64, na_value=np.nan)
+    counts = {
+        "frame numbers that are not whole": (frame != np.round(frame)).sum(),
+        "rows with an infinite coordinate": np.isinf(x).any(axis=1).sum(),
+        "rows that repeat a particle in a frame": table.duplicated(["frame", "particle"]).sum(),
+    }
+    return [f"{count} {what}" for what, count in counts.items() if count]
+
+
+def _one_cluster(table: pd.DataFrame, cluster: int | str | None) -> pd.DataFrame:
+    """Return the rows of the cluster asked for, or of the only one there is."""
+    if "cluster" not in table:
+        if cluster is not None:
+            raise ValueError(f"cluster = {cluster!r}: the table has no column cluster")
+        return table
+    labels = table["cluster"]
+    present = sorted(labels[labels.notna() & (labels != -1)].unique().tolist())
+    if cluster is None and len(present) == 1:
+        cluster = present[0]
+    if cluster not in present:
+        asked = "expected cluster= one of these" if cluster is None else f"no cluster {cluster!r}"
+        raise ValueError(f"{asked}; the table holds {_listed(present)}")
+    return table[labels == cluster]
+
+
+def _listed(labels: list[Any], limit: int = 20) -> str:
+    if not labels:
+        return "no cluster: every row is loose (-1 or missing)"
+    more = f" and {len(labels) - limit} more" if len(labels) > limit else ""
+    return f"the {len(labels)} clusters {', '.join(map(repr, labels[:limit]))}{more}"
+
+
+def _span(frame: Ints) -> tuple[int, int]:
+    """Return the first and last frame, refusing numbers that cannot be frames."""
+    if not len(frame):
+        raise TrackTableError("no row has coordinates; nothing to follow", ("no coordinates",))
+    first, last = int(frame.min()), int(frame.max())
+    span, distinct = last - first + 1, len(np.unique(frame))
+    if span > max(_LONGEST_SPAN, _SPARSEST * distinct):
+        fault = (
+            f"frames run from {first} to {last}, a span of {span}, but only {distinct} of them "
+            "occur: these numbers look like times or ids; number the frames 0, 1, 2, ..."
+        )
+        raise TrackTableError(fault, (fault,))
+    return first, last
+
+
+def _lasting_pairs(tracks: _Tracks, reach: float) -> Ints:
+    """Return the pairs (P, 2) of codes that are near in over half of the frames they share."""
+    found = [near[:, 0] * tracks.n_particles + near[:, 1] for near in _near_pairs(tracks, reach)]
+    keys, n_near = np.unique(np.concatenate([np.empty(0, np.int64), *found]), return_counts=True)
+    # One near frame can never be over half of two or more.
+    keys, n_near = keys[n_near > 1], n_near[n_near > 1]
+    pairs = np.stack(np.divmod(keys, tracks.n_particles), axis=1)
+    lasting: Ints = pairs[2 * n_near > _shared_frames(tracks, pairs)]
+    return lasting
+
+
+def _near_pairs(tracks: _Tracks, reach: float) -> Iterator[Ints]:
+    """Yield, for each frame, the pairs of codes (P, 2), smaller first, within `reach`."""
+    from scipy.spatial import cKDTree
+
+    order = np.lexsort((tracks.code, tracks.frame))
+    order = order[tracks.seen[order]]
+    starts = np.flatnonzero(np.diff(tracks.frame[order])) + 1
+    for rows in np.split(order, starts):
+        if len(rows) > 1:
+            near = cKDTree(tracks.x[rows]).query_pairs(reach, output_type="ndarray")
+            yield tracks.code[rows][near]
+
+
+def _shared_frames(tracks: _Tracks, pairs: Ints) -> Ints:
+    """Return in how many frames both particles of each pair are seen."""
+    from scipy.sparse import csr_array
+
+    frames, column = np.unique(tracks.frame[tracks.seen], return_inverse=True)
+    code = tracks.code[tracks.seen]
+    present = csr_array(
+        (np.ones(len(code), dtype=np.int64), (code, column)),
+        shape=(tracks.n_particles, max(len(frames), 1)),
+    )
+    shared = np.zeros(len(pairs), dtype=np.int64)
+    # In parts, so that memory stays bounded however many pairs ever met.
+    step = max(1, 10_000_000 // max(len(frames), 1))
+    for i in range(0, len(pairs), step):
+        one, other = pairs[i : i + step].T
+        shared[i : i + step] = present[one].multiply(present[other]).sum(axis=1)
+    return shared
+
+
+def _components(pairs: Ints, n_particles: int, smallest: int) -> Ints:
+    """Return the cluster of each code, -1 for groups of fewer than `smallest`."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    links = coo_array((np.ones(len(pairs)), tuple(pairs.T)), shape=(n_particles, n_particles))
+    _, group = connected_components(links, directed=False)
+    _, first, inverse, size = np.unique(
+        group, return_index=True, return_inverse=True, return_counts=True
+    )
+    large = np.flatnonzero(size >= smallest)
+    number = np.full(len(size), -1, dtype=np.int64)
+    number[large[np.argsort(first[large])]] = np.arange(len(large))
+    labels: Ints = number[inverse]
+    return labels

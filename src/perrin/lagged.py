@@ -1,0 +1,279 @@
+"""Averages over all pairs of frames a lag time apart: MSD and MSAD, by one FFT kernel."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from perrin._arrays import (
+    Floats,
+    Ints,
+    TooFewFramesError,
+    as_positions,
+    frozen,
+    present,
+    require_positive,
+)
+from perrin.motion import RigidMotion
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+@dataclass(frozen=True, eq=False)
+class LagCurve:
+    """A mean square displacement, or angle, against lag time: value = 2 dof D t + offset.
+
+    Attributes
+    ----------
+    lagtime : ndarray, shape (L,)
+        s.
+    value : ndarray, shape (L,)
+        Sum of the components; NaN at a lag without a pair.
+    components : ndarray, shape (L, c)
+        The same by lab axis.
+    stderr : ndarray, shape (L,)
+        Standard error for Brownian motion with localisation noise, overlapping pairs counted as
+        what they are. Neighbouring lags are strongly correlated.
+    n_pairs : ndarray of int, shape (L,)
+        Pairs of frames (times particles, for free particles).
+    dof : int
+        Angles or coordinates that diffuse: 3 for an MSD in space, 2 for an MSAD (1 in the plane).
+    quantity : {"rotation", "translation"}
+    unit : str
+        Unit of value.
+    n_walks : float
+        Independent one-dimensional walks that were averaged: 3 for the MSD of one centre, 2 for the
+        MSAD of one direction, 3 for that of all directions of a cluster.
+    """
+
+    lagtime: Floats
+    value: Floats
+    components: Floats
+    stderr: Floats
+    n_pairs: Ints
+    dof: int
+    quantity: str
+    unit: str
+    n_walks: float
+
+    def __post_init__(self) -> None:
+        frozen(self.lagtime, self.value, self.components, self.stderr, self.n_pairs)
+
+    def __repr__(self) -> str:
+        name = "MSAD" if self.quantity == "rotation" else "MSD"
+        return f"LagCurve({name}, {len(self.lagtime)} lags, dof={self.dof}, {self.unit})"
+
+    def to_frame(self) -> pd.DataFrame:
+        """Return the curve as a table with a row per lag."""
+        import pandas as pd
+
+        axes = "xyz" if self.components.shape[1] == 3 else "xy"
+        names = axes if self.components.shape[1] > 1 else "z"
+        columns: dict[str, object] = {"lagtime": self.lagtime, "value": self.value}
+        columns |= {f"value_{a}": self.components[:, i] for i, a in enumerate(names)}
+        columns |= {"stderr": self.stderr, "n_pairs": self.n_pairs}
+        return pd.DataFrame(columns)
+
+
+def msd(motion_or_positions: RigidMotion | ArrayLike, *, dt: float | None = None) -> LagCurve:
+    """Return the mean square displacement over all lag times (Hunter 2011, Eq. 24: 6 D_T t).
+
+    Parameters
+    ----------
+    motion_or_positions : RigidMotion or array_like, shape (T, n, d)
+        A motion (its centre is used), or the positions of free particles, um, NaN where missing.
+    dt : float, optional
+        Time between frames, s; for positions only, where it is required.
+
+    Returns
+    -------
+    LagCurve
+        um^2; dof = d.
+
+    Raises
+    ------
+    ValueError
+        If dt is missing or superfluous, or the frames of a motion are not evenly spaced.
+    TooFewFramesError
+        If no two frames are there.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> steady = np.arange(5.0)[:, None, None] * [[1.0, 0.0, 0.0]]
+    >>> msd(steady, dt=0.5).value
+    array([ 1.,  4.,  9., 16.])
+    """
+    if isinstance(motion_or_positions, RigidMotion):
+        if dt is not None:
+            raise ValueError("dt: a RigidMotion knows its own; leave dt out")
+        motion = motion_or_positions
+        walks, piece = _on_grid(motion, motion.center[:, None])
+        return _curve(walks, piece, dt=motion.dt, quantity="translation", dof=walks.shape[2])
+    if dt is None:
+        raise ValueError("dt: the time between frames (s) is needed with positions")
+    require_positive(dt=dt)
+    walks = as_positions(motion_or_positions)
+    piece = np.zeros(len(walks), dtype=np.int64)
+    return _curve(walks, piece, dt=dt, quantity="translation", dof=walks.shape[2])
+
+
+def msad(motion: RigidMotion, *, directions: ArrayLike | None = None) -> LagCurve:
+    """Return the mean square angular displacement of directions (Hunter 2011, Eqs. 19 and 20).
+
+    Parameters
+    ----------
+    motion : RigidMotion
+    directions : array_like, shape (d,) or (K, d), optional
+        Body-fixed directions at the first fitted frame; several are averaged. Default: those of
+        the particles, as in the paper's Fig. 5.
+
+    Returns
+    -------
+    LagCurve
+        rad^2; dof = 2 (4 D_R t), in the plane 1 (2 D_R t).
+
+    Raises
+    ------
+    ValueError
+        If a direction is zero or the frames are not evenly spaced.
+
+    Examples
+    --------
+    >>> from perrin import Cluster, simulate_motion
+    >>> truth = simulate_motion(Cluster.tetrahedron(1.0), D_R=1e-3, dt=1.0, n_frames=20000, rng=0)
+    >>> round(float(msad(truth).value[9]) / (4 * 1e-3 * 10), 1)
+    1.0
+    """
+    if directions is None:
+        length = np.linalg.norm(motion.template, axis=1)
+        # A particle at the centre has no direction.
+        p = motion.template[length > 1e-6 * length.max()]
+    else:
+        p = np.atleast_2d(np.asarray(directions, dtype=np.float64))
+    phi, piece = _on_grid(motion, motion.rotational_displacement(p))
+    planar = phi.shape[2] == 1
+    # Averaging directions p weighs a rotation vector w by |w|^2 - <(w.p)^2>.
+    unit = p / np.linalg.norm(p, axis=1, keepdims=True)
+    weight = np.eye(p.shape[1]) - unit.T @ unit / len(unit)
+    walks = 1.0 if planar else float(np.trace(weight) ** 2 / np.sum(weight * weight))
+    dof = 1 if planar else 2
+    return _curve(phi, piece, dt=motion.dt, quantity="rotation", dof=dof, independent=walks)
+
+
+def _on_grid(motion: RigidMotion, walks: Floats) -> tuple[Floats, Ints]:
+    """Put walks (T, K, c) on the even grid of frames; frames without a row are missing."""
+    step = (motion.time - motion.time[0]) / motion.dt
+    row = np.rint(step).astype(np.int64)
+    if np.max(np.abs(step - row)) > 1e-3 or np.any(np.diff(row) < 1):
+        raise ValueError(
+            f"the frames are not evenly spaced (dt = {motion.dt:g} s): lag times mix; "
+            "estimate_diffusion takes the times as they are"
+        )
+    grid = np.full((int(row[-1]) + 1, *walks.shape[1:]), np.nan)
+    piece = np.zeros(len(grid), dtype=np.int64)
+    grid[row], piece[row] = walks, motion.piece
+    return grid, piece
+
+
+def _curve(
+    walks: Floats,
+    piece: Ints,
+    *,
+    dt: float,
+    quantity: str,
+    dof: int,
+    independent: float | None = None,
+) -> LagCurve:
+    """Average walks (T, K, c) over time, pieces and the K walkers."""
+    squares, pairs = np.zeros((len(walks) - 1, walks.shape[2])), np.zeros(len(walks) - 1, np.int64)
+    for label in np.unique(piece):
+        inside = np.where((piece == label)[:, None, None], walks, np.nan)
+        more, count = _square_sums(inside)
+        squares, pairs = squares + more, pairs + count
+    if not pairs.any():
+        raise TooFewFramesError("no two frames in one piece: a displacement needs two", 0)
+    average = np.full_like(squares, np.nan)
+    np.divide(squares, pairs[:, None], out=average, where=pairs[:, None] > 0)
+    value = average.sum(axis=1)
+    # Free particles are independent walkers; the directions of one body are not.
+    walkers = walks.shape[1] if independent is None else 1
+    n_walks = float(walks.shape[2] * walkers) if independent is None else independent
+    shared = pairs / walks.shape[1]
+    relative = _relative_error(value / (2 * dof), shared)
+    return LagCurve(
+        lagtime=np.arange(1, len(walks), dtype=np.float64) * dt,
+        value=value,
+        components=average,
+        stderr=value * relative / np.sqrt(n_walks),
+        n_pairs=pairs if independent is None else np.rint(shared).astype(np.int64),
+        dof=dof,
+        quantity=quantity,
+        unit="rad^2" if quantity == "rotation" else "um^2",
+        n_walks=n_walks,
+    )
+
+
+def _square_sums(walks: Floats) -> tuple[Floats, Ints]:
+    """Return sum |x(t + lag) - x(t)|^2 per component and the pairs, all lags from 1, walkers added.
+
+    With m the presence, the sum is corr(m x^2, m) + corr(m, m x^2) - 2 corr(m x, m x). The mean is
+    taken off first: squares of a far origin would swallow the displacements.
+    """
+    length = len(walks)
+    here = present(walks)
+    mask = here.astype(np.float64)
+    mean = np.where(here[..., None], walks, 0.0).sum(0) / np.maximum(mask.sum(0), 1)[:, None]
+    x = np.where(here[..., None], walks - mean, 0.0)
+    size = _fast_size(2 * length)
+    m = np.fft.rfft(mask, size, axis=0)[..., None]
+    f, g = np.fft.rfft(x, size, axis=0), np.fft.rfft(x * x, size, axis=0)
+    spectrum = 2 * np.real(np.conj(m) * g) - 2 * np.abs(f) ** 2
+    sums = np.fft.irfft(spectrum.sum(1), size, axis=0)[1:length]
+    counts = np.fft.irfft((np.abs(m) ** 2).sum((1, 2)), size)[1:length]
+    # A sum of squares that rounds below zero is zero.
+    return np.maximum(sums, 0.0), np.rint(counts).astype(np.int64)
+
+
+def _fast_size(least: int) -> int:
+    """Return the smallest 2^a 3^b 5^c that is at least `least`: such transforms are fast."""
+    best = 1 << (least - 1).bit_length()
+    five = 1
+    while five < best:
+        three = five
+        while three < best:
+            two = -(-least // three)
+            best = min(best, three << (two - 1).bit_length())
+            three *= 3
+        five *= 5
+    return best
+
+
+def _relative_error(half: Floats, pairs: Floats) -> Floats:
+    """Return the relative standard error of a one-dimensional MSD at every lag.
+
+    `half` is the MSD over 2, that is D t + s. Displacements over n frames that start j frames apart
+    have covariance 2 D dt (n - j) + 2 s [j = 0] - s [j = n] for j <= n; the variance of their mean
+    square is twice the mean of its square. D dt and s come from the first two lags.
+    """
+    good = np.flatnonzero(pairs > 0)
+    n = np.arange(1, len(half) + 1, dtype=np.float64)
+    first, second = (good[0], good[1]) if good.size > 1 else (good[0], good[0])
+    rise = (half[second] - half[first]) / max(n[second] - n[first], 1.0)
+    d = min(max(rise, 0.0), half[first] / n[first])
+    s = half[first] - d * n[first]
+    k = np.maximum(pairs, 1.0)
+    m = np.minimum(n - 1, np.floor(k - 1))
+    s1, s2, s3 = m * (m + 1) / 2, m * (m + 1) * (2 * m + 1) / 6, (m * (m + 1) / 2) ** 2
+    squares = n * n * m - 2 * n * s1 + s2  # sum over j = 1..m of (n - j)^2
+    tapered = squares - (n * n * s1 - 2 * n * s2 + s3) / k  # the same times 1 - j/k
+    total = (2 * (d * n + s)) ** 2 + 2 * (4 * d * d * tapered)
+    total = total + 2 * s * s * np.maximum(1 - n / k, 0.0)
+    mean = 2 * (d * n + s)
+    relative = np.full_like(half, np.nan)
+    np.divide(np.sqrt(2 * total / k), mean, out=relative, where=(pairs > 0) & (mean > 0))
+    return relative

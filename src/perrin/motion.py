@@ -1,0 +1,573 @@
+"""From positions to motion: where the cluster is and how it is turned in every frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from perrin._arrays import (
+    Bools,
+    DegenerateClusterError,
+    Floats,
+    Ints,
+    TooFewFramesError,
+    as_positions,
+    as_sigma,
+    frozen,
+    present,
+    require_positive,
+)
+from perrin.noise import center_variance, orientation_covariance
+from perrin.rotations import cumulative_product, fit_rotations, log_map
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    import pandas as pd
+    from scipy.spatial.transform import Rotation
+
+Reference = Literal["template", "previous"]
+
+# An axis whose orientation is this uncertain (rad) is not determined: the particles lie on a line
+# within the noise, and the small-angle theory of every error has lost its meaning.
+_LOST_AXIS = 0.3
+
+
+@dataclass(frozen=True, eq=False)
+class RigidMotion:
+    """Position and orientation of one rigid cluster in every frame; missing frames are NaN.
+
+    Attributes
+    ----------
+    time : ndarray, shape (T,)
+        Seconds.
+    center : ndarray, shape (T, d)
+        Centre of the whole template, um.
+    rotation : ndarray, shape (T, d, d)
+        Lab from body, ``x = R x0``; the identity at the first fitted frame.
+    residual : ndarray, shape (T,)
+        Root mean square distance of the particles present to the fitted body, um. For
+        ``reference="previous"`` the residual of the step that ends here, over sqrt(2).
+    n_present : ndarray of int, shape (T,)
+        Particles seen.
+    covariance : ndarray, shape (T, 3, 3) or (T, 1, 1)
+        Covariance of the fitted orientation, rad^2, body axes.
+    center_variance : ndarray, shape (T,)
+        Variance of the centre from localisation error, um^2, mean over axes.
+    piece : ndarray of int, shape (T,)
+        Stretches of doubtless identity; no pair of frames is formed across two pieces.
+    reason : tuple of str, length T
+        Why a frame has no pose; empty where it has one.
+    template : ndarray, shape (n, d)
+        The common shape, um, centred.
+    sigma : float
+        Localisation error of one coordinate from the rigid-fit residuals, um.
+    dt : float
+        Time between frames, s.
+    """
+
+    time: Floats
+    center: Floats
+    rotation: Floats
+    residual: Floats
+    n_present: Ints
+    covariance: Floats
+    center_variance: Floats
+    piece: Ints
+    reason: tuple[str, ...]
+    template: Floats
+    sigma: float
+    dt: float
+
+    def __post_init__(self) -> None:
+        frozen(self.time, self.center, self.rotation, self.residual, self.n_present)
+        frozen(self.covariance, self.center_variance, self.piece, self.template)
+
+    def __repr__(self) -> str:
+        n, d = self.template.shape
+        return (
+            f"RigidMotion(n={n}, d={d}, {self.fitted.size} of {len(self.time)} frames, "
+            f"dt={self.dt:g} s, sigma={self.sigma:.3g} um)"
+        )
+
+    @property
+    def fitted(self) -> Ints:
+        """Indices of the frames that have a pose."""
+        return np.flatnonzero(np.isfinite(self.center[:, 0]))
+
+    @property
+    def R(self) -> float:
+        """Mean distance of the particles to the centre, um."""
+        return float(np.linalg.norm(self.template, axis=1).mean())
+
+    def steps(self) -> tuple[Ints, Ints]:
+        """Return the first and last frame index of every step between neighbouring poses.
+
+        A gap is one longer step; no step joins two pieces.
+        """
+        rows = self.fitted
+        start, stop = rows[:-1], rows[1:]
+        same = self.piece[start] == self.piece[stop]
+        return start[same], stop[same]
+
+    def step_vectors(self) -> Floats:
+        """Return the body-frame rotation vector of every step, log(R_k^T R_{k+1}).
+
+        Returns
+        -------
+        ndarray, shape (T - 1, 3) or (T - 1, 1)
+            Row k is the rotation (rad) that ends at frame k + 1, from the last pose before it; NaN
+            where frame k + 1 has no pose or begins a piece.
+        """
+        start, stop = self.steps()
+        vector = np.full((len(self.time) - 1, self.covariance.shape[-1]), np.nan)
+        vector[stop - 1] = log_map(np.swapaxes(self.rotation[start], -1, -2) @ self.rotation[stop])
+        return vector
+
+    def orientation(self, p0: ArrayLike) -> Floats:
+        """Follow body-fixed directions through time (Hunter 2011, Eq. 17).
+
+        Parameters
+        ----------
+        p0 : array_like, shape (d,) or (K, d)
+            Directions at the first fitted frame; any length but zero.
+
+        Returns
+        -------
+        ndarray, shape (T, d) or (T, K, d)
+            Unit vectors in the lab frame.
+        """
+        p = np.asarray(p0, dtype=np.float64)
+        d = self.template.shape[1]
+        length = np.linalg.norm(p, axis=-1, keepdims=True)
+        if p.ndim not in (1, 2) or p.shape[-1] != d or not np.all((length > 0) & (length < np.inf)):
+            raise ValueError(f"p0: expected directions ({d},) or (K, {d}), none zero, got {p0!r}")
+        turned = np.einsum("tij,...j->t...i", self.rotation, p / length)
+        return np.asarray(turned)
+
+    def rotational_displacement(self, p0: ArrayLike) -> Floats:
+        """Integrate the unbounded vector angle phi of body-fixed directions (Hunter 2011, Eq. 18).
+
+        Each step adds a vector along p(t) x p(t + dt) as long as the angle between the two,
+        by arctan2 of cross and dot product. A gap is crossed by the one direct rotation between
+        its ends; phi starts at 0 in every piece.
+
+        Parameters
+        ----------
+        p0 : array_like, shape (d,) or (K, d)
+            Directions at the first fitted frame.
+
+        Returns
+        -------
+        ndarray, shape (T, 3) or (T, K, 3); in the plane (T, 1) or (T, K, 1)
+            rad, lab axes.
+        """
+        p = self.orientation(p0)
+        start, stop = self.steps()
+        phi = np.full((*p.shape[:-1], self.covariance.shape[-1]), np.nan)
+        phi[self.fitted] = 0.0
+        step = self.rotation[stop] @ np.swapaxes(self.rotation[start], -1, -2)
+        phi[stop] = _angle_vectors(p[start], p[stop], step)
+        total = np.cumsum(phi[self.fitted], axis=0)
+        first = np.isin(self.fitted, stop, invert=True)
+        origin = np.maximum.accumulate(np.where(first, np.arange(first.size), 0))
+        phi[self.fitted] = total - total[origin]
+        return phi
+
+    def positions(self) -> Floats:
+        """Return the particles of the rigid body in the lab frame, (T, n, d), um."""
+        turned = np.einsum("tij,nj->tni", self.rotation, self.template)
+        return np.asarray(turned + self.center[:, None])
+
+    def as_scipy(self) -> tuple[Rotation, Ints]:
+        """Return the fitted rotations as a scipy `Rotation`, and their frame indices."""
+        from scipy.spatial.transform import Rotation
+
+        if self.template.shape[1] != 3:
+            raise ValueError("scipy rotations are three-dimensional; this motion is in the plane")
+        return Rotation.from_matrix(self.rotation[self.fitted]), self.fitted
+
+    def to_frame(self) -> pd.DataFrame:
+        """Return a table with a row per frame; template, sigma and dt travel in ``attrs``."""
+        import pandas as pd
+
+        axes = "xyz"[: self.template.shape[1]]
+        columns: dict[str, object] = {"time": self.time}
+        columns |= {a: self.center[:, i] for i, a in enumerate(axes)}
+        columns |= {
+            f"r_{a}{b}": self.rotation[:, i, j]
+            for i, a in enumerate(axes)
+            for j, b in enumerate(axes)
+        }
+        columns |= {"residual": self.residual, "n_present": self.n_present}
+        angles = "xyz" if len(axes) == 3 else "z"
+        columns |= {
+            f"cov_{a}{b}": self.covariance[:, i, j]
+            for i, a in enumerate(angles)
+            for j, b in enumerate(angles)
+            if j >= i
+        }
+        columns |= {"center_variance": self.center_variance, "piece": self.piece}
+        columns |= {"reason": list(self.reason)}
+        table = pd.DataFrame(columns)
+        table.attrs = {"template": self.template.tolist(), "sigma": self.sigma, "dt": self.dt}
+        return table
+
+    @classmethod
+    def from_frame(cls, table: pd.DataFrame) -> RigidMotion:
+        """Read back what `to_frame` wrote.
+
+        Raises
+        ------
+        ValueError
+            If ``attrs`` lacks the template, sigma or dt, or a column is missing.
+        """
+        missing = {"template", "sigma", "dt"} - set(table.attrs)
+        if missing:
+            raise ValueError(f"this table was not made by to_frame: attrs lack {sorted(missing)}")
+        template = np.array(table.attrs["template"], dtype=np.float64)
+        axes = "xyz"[: template.shape[1]]
+        angles = "xyz" if len(axes) == 3 else "z"
+
+        def matrices(prefix: str, names: str, *, symmetric: bool) -> Floats:
+            def name(a: str, b: str) -> str:
+                return f"{prefix}_{min(a, b)}{max(a, b)}" if symmetric else f"{prefix}_{a}{b}"
+
+            rows = [[table[name(a, b)].to_numpy(np.float64) for b in names] for a in names]
+            return np.moveaxis(np.array(rows), -1, 0).copy()
+
+        def column(name: str) -> Floats:
+            return np.array(table[name], dtype=np.float64)
+
+        return cls(
+            time=column("time"),
+            center=np.stack([column(a) for a in axes], axis=1),
+            rotation=matrices("r", axes, symmetric=False),
+            residual=column("residual"),
+            n_present=np.array(table["n_present"], dtype=np.int64),
+            covariance=matrices("cov", angles, symmetric=True),
+            center_variance=column("center_variance"),
+            piece=np.array(table["piece"], dtype=np.int64),
+            reason=tuple(str(r) for r in table["reason"]),
+            template=template,
+            sigma=float(table.attrs["sigma"]),
+            dt=float(table.attrs["dt"]),
+        )
+
+
+def track_rotation(
+    positions: ArrayLike,
+    *,
+    dt: float,
+    frames: ArrayLike | None = None,
+    times: ArrayLike | None = None,
+    reference: Reference = "template",
+    sigma: ArrayLike | None = None,
+) -> RigidMotion:
+    """Fit a rigid body to a cluster's particles in every frame and return its motion.
+
+    Parameters
+    ----------
+    positions : array_like, shape (T, n, d)
+        Particle centres, um, d = 2 or 3; NaN where a particle is missing. Identities must be right.
+    dt : float
+        Time between frames, s.
+    frames : array_like of int, shape (T,), optional
+        Frame numbers of the rows, rising; missing numbers are gaps. Default 0, 1, 2, ...
+    times : array_like, shape (T,), optional
+        Times of the rows, s, where frames are not evenly spaced.
+    reference : {"template", "previous"}
+        "template" fits every frame to one common shape built from all frames (generalised
+        Procrustes). "previous" is the paper's product of successive rotations (Hunter 2011,
+        Eq. 13), whose orientation drifts under noise.
+    sigma : float or array_like, shape (d,), optional
+        Known localisation error, um, for `covariance`; default: from the residuals.
+
+    Returns
+    -------
+    RigidMotion
+        Frames that cannot be fitted are missing, with their reason.
+
+    Raises
+    ------
+    DegenerateClusterError
+        Fewer than 3 particles (2 in the plane), or particles on one line within the noise.
+    TooFewFramesError
+        Fewer than 2 frames with a pose.
+    ValueError
+        For bad shapes or values.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from perrin import Cluster, simulate_motion, track_rotation
+    >>> truth = simulate_motion(
+    ...     Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=50, rng=np.random.default_rng(1)
+    ... )
+    >>> motion = track_rotation(truth.positions(), dt=0.7)
+    >>> bool(np.allclose(motion.rotation, truth.rotation))
+    True
+    """
+    x = as_positions(positions)
+    require_positive(dt=dt)
+    if reference not in ("template", "previous"):
+        raise ValueError(f'reference: expected "template" or "previous", got {reference!r}')
+    time = _times(len(x), dt=dt, frames=frames, times=times)
+    given = None if sigma is None else as_sigma(sigma, x.shape[2])
+    seen = present(x)
+    _require_points(seen, x.shape[2])
+    fit = _fit_chain(x, seen) if reference == "previous" else _fit_template(x, seen)
+    return _measured(fit, x, seen, time=time, dt=dt, given=given)
+
+
+def _angle_vectors(p: Floats, q: Floats, step: Floats) -> Floats:
+    """Return the angle from p to q as a vector along p x q; in the plane as one signed number."""
+    dot = np.sum(p * q, axis=-1, keepdims=True)
+    if p.shape[-1] == 2:
+        cross = p[..., :1] * q[..., 1:] - p[..., 1:] * q[..., :1]
+        return np.asarray(np.arctan2(cross, dot))
+    normal = np.cross(p, q)
+    sine = np.linalg.norm(normal, axis=-1, keepdims=True)
+    axis = np.divide(normal, sine, out=np.zeros_like(normal), where=sine > 0)
+    opposite = (sine == 0) & (dot < 0)
+    if opposite.any():
+        # p and q = -p span no plane; only the rotation itself knows its axis, at angle pi.
+        own = (log_map(step) / np.pi).reshape(len(step), *[1] * (p.ndim - 2), 3)
+        axis = np.where(opposite, own, axis)
+    turn: Floats = np.arctan2(sine, dot) * axis
+    return turn
+
+
+class _Fit(NamedTuple):
+    """Poses before they are measured: rows without one are NaN; residual vectors in body axes."""
+
+    rotation: Floats
+    center: Floats
+    template: Floats
+    residual: Floats
+    sigma2: float
+
+
+def _times(count: int, *, dt: float, frames: ArrayLike | None, times: ArrayLike | None) -> Floats:
+    """Return the time of each row, from times, or from frame numbers, or from the count."""
+    if frames is not None and times is not None:
+        raise ValueError("frames and times say the same thing: give one of them")
+    source = times if times is not None else frames
+    t = np.arange(count, dtype=np.float64) if source is None else np.array(source, np.float64)
+    name = "frames" if times is None else "times"
+    if t.shape != (count,) or not np.all(np.isfinite(t)) or np.any(np.diff(t) <= 0):
+        raise ValueError(f"{name}: expected {count} finite rising numbers (one a row), got {t}")
+    return t if times is not None else t * dt
+
+
+def _require_points(seen: Bools, d: int) -> None:
+    """Refuse what no frame can mend: too few particles, or one that never appears."""
+    n = seen.shape[1]
+    if n < d:
+        raise DegenerateClusterError(
+            f"{n} particle{'s' if n > 1 else ''}: a rotation in {d} dimensions needs at least {d}",
+            (n,),
+        )
+    never = np.flatnonzero(~seen.any(axis=0))
+    if never.size:
+        raise ValueError(f"particles {never.tolist()} are missing in every frame: leave them out")
+
+
+def body_residuals(motion: RigidMotion, positions: ArrayLike) -> Floats:
+    """Return where the particles sit beside their places in the template, (T, n, d), um, body axes.
+
+    Parameters
+    ----------
+    motion : RigidMotion
+    positions : array_like, shape (T, n, d)
+        The positions that the motion was fitted to.
+    """
+    x = as_positions(positions)
+    out: Floats = np.einsum("tij,tni->tnj", motion.rotation, x - motion.center[:, None])
+    return out - motion.template
+
+
+def _fit_template(x: Floats, seen: Bools) -> _Fit:
+    """Fit all frames to their common shape: generalised Procrustes, missing points allowed."""
+
+    def refined(shape: Floats) -> Floats:
+        rotation, unique = fit_rotations(x, shape)
+        if not unique.any():
+            return shape
+        new = _mean_of(_in_body(x, seen, rotation, shape))
+        turn, known = fit_rotations(shape, new)
+        return new @ turn.T if known else new
+
+    shape = _settled(refined, x[np.argmax(seen.sum(axis=1))])
+    rotation, unique = fit_rotations(x, shape)
+    if not unique.any() or not np.isfinite(shape).all():
+        raise DegenerateClusterError(
+            f"no rotation can be found: the {x.shape[1]} particles lie on one line, or no frame "
+            f"shares {x.shape[2]} of them with the others",
+            (x.shape[1],),
+        )
+    return _finished(x, seen, rotation, shape)
+
+
+def _fit_chain(x: Floats, seen: Bools) -> _Fit:
+    """Multiply the rotations between successive frames (Eq. 13); a gap is one direct rotation."""
+    rows = np.flatnonzero(seen.sum(axis=1) >= x.shape[2])
+    step, unique = fit_rotations(x[rows[1:]], x[rows[:-1]])
+    while not unique.all():
+        rows = np.delete(rows, np.flatnonzero(~unique)[0] + 1)
+        step, unique = fit_rotations(x[rows[1:]], x[rows[:-1]])
+    rotation = np.full((len(x), x.shape[2], x.shape[2]), np.nan)
+    rotation[rows] = np.swapaxes(cumulative_product(np.swapaxes(step, -1, -2)), -1, -2)
+    first = x[rows[0]] if rows.size else x[0]
+    shape = _settled(lambda s: _mean_of(_in_body(x, seen, rotation, s)), first)
+    fit = _finished(x, seen, rotation, shape)
+    both = (seen[rows[1:]] & seen[rows[:-1]])[..., None]
+    end, begin = np.where(both, x[rows[1:]], np.nan), np.where(both, x[rows[:-1]], np.nan)
+    turned = np.einsum("tij,tnj->tni", step, begin - _mean_present(begin)[:, None])
+    e = np.full_like(x, np.nan)
+    e[rows[1:]] = (end - _mean_present(end)[:, None] - turned) / np.sqrt(2)
+    freedom = _freedom(both[..., 0].sum(axis=1), x.shape[2]).sum()
+    return fit._replace(residual=e, sigma2=float(np.nansum(e * e)) / freedom if freedom else np.nan)
+
+
+def _settled(refined: Callable[[Floats], Floats], shape: Floats) -> Floats:
+    """Refine a shape until it rests to rounding and no particle is added to it any more."""
+    for _ in range(500):
+        new = refined(shape)
+        change, size = np.nanmax(np.abs(new - shape)), np.nanmax(np.abs(new - _mean_present(new)))
+        grown = np.isfinite(new).sum() > np.isfinite(shape).sum()
+        shape = new
+        if not grown and change <= 1e-14 * size:
+            break
+    return shape
+
+
+def _in_body(x: Floats, seen: Bools, rotation: Floats, shape: Floats) -> Floats:
+    """Return the particles in the axes of the body, (T, n, d)."""
+    turned: Floats = np.einsum("tij,tni->tnj", rotation, x - _centers(x, rotation, shape)[:, None])
+    body: Floats = np.where(seen[..., None], turned, np.nan)
+    return body
+
+
+def _centers(x: Floats, rotation: Floats, shape: Floats) -> Floats:
+    """Return the lab position of the shape's origin, from the particles seen and known."""
+    known = np.isfinite(x) & np.isfinite(shape)
+    seat = _mean_present(np.where(known, shape, np.nan))
+    centroid = _mean_present(np.where(known, x, np.nan))
+    center: Floats = centroid - np.einsum("tij,tj->ti", rotation, seat)
+    return center
+
+
+def _mean_present(x: Floats) -> Floats:
+    """Average over the particles (second-last axis) that are not NaN; NaN where there are none."""
+    return _nan_mean(x, axis=-2)
+
+
+def _mean_of(body: Floats) -> Floats:
+    """Average the frames, and put the centre of the shape at the origin."""
+    shape = _nan_mean(body, axis=0)
+    centred: Floats = shape - _mean_present(shape)
+    return centred
+
+
+def _nan_mean(x: Floats, *, axis: int) -> Floats:
+    here = np.isfinite(x)
+    count = here.sum(axis=axis)
+    total = np.where(here, x, 0.0).sum(axis=axis)
+    mean: Floats = np.divide(total, count, out=np.full(total.shape, np.nan), where=count > 0)
+    return mean
+
+
+def _freedom(n_present: Ints, d: int) -> Ints:
+    """Return the degrees of freedom that a rigid fit leaves: 3n - 6 a frame (2n - 3 in 2-D)."""
+    return np.maximum(d * n_present - d * (d + 1) // 2, 0)
+
+
+def _finished(x: Floats, seen: Bools, rotation: Floats, shape: Floats) -> _Fit:
+    """Turn the template so that the first pose is the identity; collect residuals and sigma^2."""
+    fitted = np.flatnonzero(np.isfinite(rotation[:, 0, 0]))
+    if fitted.size < 2:
+        raise TooFewFramesError(
+            f"{fitted.size} frame{'s' if fitted.size != 1 else ''} with a pose: at least 2 are "
+            "needed to see a rotation",
+            int(fitted.size),
+        )
+    gauge = rotation[fitted[0]]
+    shape, rotation = shape @ gauge.T, rotation @ gauge.T
+    rotation[fitted[0]] = np.eye(len(gauge))
+    residual = _in_body(x, seen, rotation, shape) - shape
+    d = x.shape[2]
+    freedom = _freedom(seen[fitted].sum(axis=1), d).sum() - _freedom(np.array(len(shape)), d)
+    sigma2 = float(np.nansum(residual**2) / freedom) if freedom > 0 else np.nan
+    return _Fit(rotation, _centers(x, rotation, shape), shape, residual, sigma2)
+
+
+def _measured(
+    fit: _Fit, x: Floats, seen: Bools, *, time: Floats, dt: float, given: Floats | None
+) -> RigidMotion:
+    """Add what every pose is worth, refuse those worth nothing, and build the result."""
+    d = x.shape[2]
+    noise = np.full(d, fit.sigma2) if given is None else given**2
+    covariance, variance = _pose_errors(fit, seen, noise)
+    worst = np.sqrt(np.linalg.eigvalsh(np.nan_to_num(covariance))[:, -1])
+    lost = worst > _LOST_AXIS
+    fitted = np.isfinite(fit.rotation[:, 0, 0]) & ~lost
+    if fitted.sum() < 2:
+        width = np.linalg.svd(fit.template, compute_uv=False)[d - 2] / np.sqrt(len(fit.template))
+        raise DegenerateClusterError(
+            f"the {len(fit.template)} particles lie on one line within the noise: width "
+            f"{width:.3g} um, localisation error {np.sqrt(noise.mean()):.3g} um",
+            tuple(int(k) for k in np.flatnonzero(lost)),
+        )
+    square = np.where(seen[..., None], fit.residual, np.nan) ** 2
+    nan = np.where(fitted, 0.0, np.nan)
+    return RigidMotion(
+        time=time,
+        center=fit.center + nan[:, None],
+        rotation=fit.rotation + nan[:, None, None],
+        residual=np.sqrt(_nan_mean(square.sum(axis=2), axis=1)) + nan,
+        n_present=seen.sum(axis=1),
+        covariance=covariance + nan[:, None, None],
+        center_variance=variance + nan,
+        piece=np.zeros(len(x), dtype=np.int64),
+        reason=_reasons(seen, fitted, lost, d),
+        template=fit.template,
+        sigma=float(np.sqrt(fit.sigma2)),
+        dt=float(dt),
+    )
+
+
+def _pose_errors(fit: _Fit, seen: Bools, noise: Floats) -> tuple[Floats, Floats]:
+    """Return the covariance of the orientation and the variance of the centre of every pose."""
+    angles = 3 if len(noise) == 3 else 1
+    covariance = np.full((len(seen), angles, angles), np.nan)
+    variance = np.full(len(seen), np.nan)
+    fitted = np.flatnonzero(np.isfinite(fit.rotation[:, 0, 0]))
+    patterns, which = np.unique(seen[fitted], axis=0, return_inverse=True)
+    for i, pattern in enumerate(patterns):
+        rows = fitted[which.ravel() == i]
+        r = fit.rotation[rows]
+        body_noise = np.einsum("tij,i,tik->tjk", r, noise, r)
+        covariance[rows] = orientation_covariance(fit.template[pattern], body_noise)
+        variance[rows] = center_variance(fit.template, pattern, float(np.sqrt(noise.mean())))
+    return covariance, variance
+
+
+def _reasons(seen: Bools, fitted: Bools, lost: Bools, d: int) -> tuple[str, ...]:
+    """Say for every frame without a pose why it has none."""
+    n = seen.shape[1]
+
+    def reason(count: int, ok: bool, blurred: bool) -> str:
+        if ok:
+            return ""
+        if count < d:
+            return f"{count} of {n} particles, {d} needed" if count else "no particles"
+        if blurred:
+            return f"the {count} particles present lie on one line within the noise"
+        return f"the {count} particles present do not fix a rotation"
+
+    rows = zip(seen.sum(axis=1), fitted, lost, strict=True)
+    return tuple(reason(int(c), bool(ok), bool(bad)) for c, ok, bad in rows)

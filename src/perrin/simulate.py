@@ -1,0 +1,204 @@
+"""Brownian clusters with a known truth: motions whose D is planted, and localisation noise."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from perrin._arrays import Floats, as_positions, as_sigma, require_positive
+from perrin.motion import RigidMotion
+from perrin.rotations import cumulative_product, exp_map
+
+if TYPE_CHECKING:
+    from perrin.shapes import Cluster
+
+# The largest D dt of one substep of an anisotropic rotor: Gaussian rotation vectors are exact to
+# first order in D dt, and the error of E[R] left over at this step is about 1e-6.
+_SUBSTEP = 0.002
+
+
+def simulate_motion(
+    cluster: Cluster,
+    *,
+    D_R: ArrayLike,
+    D_T: float = 0.0,
+    dt: float,
+    n_frames: int,
+    scheme: Literal["brownian", "euler"] = "brownian",
+    rng: np.random.Generator | int,
+) -> RigidMotion:
+    """Simulate free Brownian rotation and translation of a rigid cluster.
+
+    Parameters
+    ----------
+    cluster : Cluster
+        The body.
+    D_R : float or array_like, shape (3,) or (3, 3)
+        Rotational diffusion coefficient, rad^2/s; three values or a tensor are in body axes.
+    D_T : float
+        Translational diffusion coefficient, um^2/s.
+    dt : float
+        Time between frames, s.
+    n_frames : int
+        Number of frames; frame 0, at the origin and unturned, counts.
+    scheme : {"brownian", "euler"}
+        "brownian" has the exact step law at any D_R dt for one D_R (angles from the heat kernel on
+        SO(3)), and substeps with D dt <= 0.002 for a tensor. "euler" is the paper's: R_x R_y R_z
+        with three Gaussian angles (Hunter 2011, Eq. 16), for one D_R only.
+    rng : numpy.random.Generator or int
+        Source of random numbers, or a seed.
+
+    Returns
+    -------
+    RigidMotion
+        The truth, with sigma = 0; ``.positions()`` gives the particles.
+
+    Raises
+    ------
+    ValueError
+        For bad values, a tensor that is not positive semidefinite, or a tensor with "euler".
+
+    Examples
+    --------
+    >>> from perrin import Cluster
+    >>> truth = simulate_motion(
+    ...     Cluster.tetrahedron(1.5), D_R=5e-3, D_T=0.04, dt=0.7, n_frames=100, rng=1
+    ... )
+    >>> truth.positions().shape
+    (100, 4, 3)
+    """
+    require_positive(dt=dt, n_frames=n_frames)
+    if not (np.isfinite(D_T) and D_T >= 0):
+        raise ValueError(f"D_T: expected a finite number >= 0 (um^2/s), got {D_T!r}")
+    if scheme not in ("brownian", "euler"):
+        raise ValueError(f'scheme: expected "brownian" or "euler", got {scheme!r}')
+    generator, n, d = np.random.default_rng(rng), int(n_frames), cluster.positions.shape[1]
+    tensor = _tensor(D_R, d)
+    rotation = _rotations(tensor * dt, n - 1, scheme=scheme, generator=generator)
+    jumps = generator.normal(scale=np.sqrt(2 * D_T * dt), size=(n - 1, d))
+    center = np.concatenate([np.zeros((1, d)), np.cumsum(jumps, axis=0)])
+    angles = 3 if d == 3 else 1
+    return RigidMotion(
+        time=np.arange(n, dtype=np.float64) * dt,
+        center=center,
+        rotation=rotation,
+        residual=np.zeros(n),
+        n_present=np.full(n, len(cluster.positions)),
+        covariance=np.zeros((n, angles, angles)),
+        center_variance=np.zeros(n),
+        piece=np.zeros(n, dtype=np.int64),
+        reason=("",) * n,
+        template=cluster.positions.copy(),
+        sigma=0.0,
+        dt=float(dt),
+    )
+
+
+def add_noise(positions: ArrayLike, *, sigma: ArrayLike, rng: np.random.Generator | int) -> Floats:
+    """Add Gaussian localisation errors to particle positions.
+
+    Parameters
+    ----------
+    positions : array_like, shape (T, n, d)
+        um.
+    sigma : float or array_like, shape (d,)
+        Standard deviation of one coordinate, um; one number or one per axis.
+    rng : numpy.random.Generator or int
+        Source of random numbers, or a seed.
+
+    Returns
+    -------
+    ndarray, shape (T, n, d)
+
+    Examples
+    --------
+    >>> noisy = add_noise([[[0.0, 0.0, 0.0]]] * 10000, sigma=(0.03, 0.03, 0.04), rng=1)
+    >>> noisy.std(axis=0).round(2)
+    array([[0.03, 0.03, 0.04]])
+    """
+    x = as_positions(positions)
+    s = as_sigma(sigma, x.shape[2])
+    return x + np.random.default_rng(rng).normal(size=x.shape) * s
+
+
+def _tensor(D_R: ArrayLike, d: int) -> Floats:
+    """Return D_R as a matrix, (3, 3) in space and (1, 1) in the plane."""
+    value = np.asarray(D_R, dtype=np.float64)
+    angles = 3 if d == 3 else 1
+    if value.ndim == 0:
+        value = value * np.eye(angles)
+    elif value.shape == (angles,):
+        value = np.diag(value)
+    if value.shape != (angles, angles) or not np.isfinite(value).all():
+        raise ValueError(
+            f"D_R: expected a finite number, {angles} values or a ({angles}, {angles}) tensor in "
+            f"body axes (rad^2/s), got {D_R!r}"
+        )
+    lowest = float(np.linalg.eigvalsh(value)[0])
+    if not np.allclose(value, value.T) or lowest < -1e-12 * float(np.abs(value).max()):
+        raise ValueError(f"D_R: expected a symmetric tensor without negative values, got {D_R!r}")
+    return value
+
+
+def _rotations(D: Floats, count: int, *, scheme: str, generator: np.random.Generator) -> Floats:
+    """Return count + 1 orientations, the first one the identity; D is per frame."""
+    isotropic = np.allclose(D, D[0, 0] * np.eye(len(D)), rtol=1e-12, atol=0.0)
+    if scheme == "euler":
+        if len(D) != 3 or not isotropic:
+            raise ValueError('scheme="euler" (Eq. 16) knows one D_R in three dimensions only')
+        left = _euler_steps(float(D[0, 0]), count, generator=generator)
+        return np.swapaxes(cumulative_product(np.swapaxes(left, -1, -2)), -1, -2)
+    if len(D) == 1 or float(np.trace(D)) == 0:
+        normal = generator.normal(size=(count, len(D)))
+        return cumulative_product(exp_map(normal * np.sqrt(2 * D[0, 0])))
+    if isotropic:
+        return cumulative_product(_heat_kernel_steps(float(D[0, 0]), count, generator=generator))
+    return _substepped(D, count, generator=generator)
+
+
+def _euler_steps(D: float, count: int, *, generator: np.random.Generator) -> Floats:
+    """Return R_x(alpha) R_y(beta) R_z(gamma) with Gaussian angles of variance 2 D (Eq. 16)."""
+    angles = generator.normal(scale=np.sqrt(2 * D), size=(count, 3))
+    x, y, z = (exp_map(angles[:, i, None] * np.eye(3)[i]) for i in range(3))
+    return np.asarray(x @ y @ z)
+
+
+def _substepped(D: Floats, count: int, *, generator: np.random.Generator) -> Floats:
+    """Compose Gaussian body-frame rotation vectors, each short enough to be exact."""
+    substeps = int(np.ceil(np.linalg.eigvalsh(D)[-1] / _SUBSTEP))
+    values, axes = np.linalg.eigh(2 * D / substeps)
+    root = axes * np.sqrt(np.maximum(values, 0.0))
+    fine = exp_map(generator.normal(size=(count * substeps, 3)) @ root.T)
+    return cumulative_product(fine)[::substeps]
+
+
+def _heat_kernel_steps(D: float, count: int, *, generator: np.random.Generator) -> Floats:
+    """Return rotations by angles from the heat kernel on SO(3) about uniform axes; D is D_R dt."""
+    angle, cdf = _angle_law(D)
+    drawn = np.interp(generator.random(count), cdf, angle)
+    axis = generator.normal(size=(count, 3))
+    axis /= np.linalg.norm(axis, axis=1, keepdims=True)
+    return exp_map(axis * drawn[:, None])
+
+
+def _angle_law(D: float) -> tuple[Floats, Floats]:
+    """Return angles and their cumulative probability under the heat kernel at D = D_R t.
+
+    The density is proportional to sin(a/2) sum_n (-1)^n (a + 2 pi n) exp(-(a + 2 pi n)^2 / 4D), the
+    character series sum (2l + 1) exp(-l(l+1)D) sin((l + 1/2)a) sin(a/2) summed over images
+    (Poisson). Images converge fast for small D, the series for large D; at D = 1 either is exact.
+    """
+    angle = np.linspace(0.0, min(np.pi, 14 * np.sqrt(2 * D)), 20001)
+    if D < 1:
+        n = np.arange(-3, 4)[:, None]
+        image = angle + 2 * np.pi * n
+        wave = np.sum((-1.0) ** n * image * np.exp(-(image**2) / (4 * D)), axis=0)
+    else:
+        degree = np.arange(8)[:, None]
+        weight = (2 * degree + 1) * np.exp(-degree * (degree + 1) * D)
+        wave = np.sum(weight * np.sin((degree + 0.5) * angle), axis=0)
+    density = np.maximum(wave * np.sin(angle / 2), 0.0)
+    cdf = np.concatenate([[0.0], np.cumsum(density[1:] + density[:-1])])
+    return angle, cdf / cdf[-1]
