@@ -3,49 +3,104 @@
 Positions (T, n, d) become a `RigidMotion`; a `RigidMotion` makes `LagCurve`s and
 `DiffusionEstimate`s; tables, files, pictures and the command line stand at the doors.
 Units: um, s, rad, K, Pa s.
+
+Each name is loaded from its room when it is first asked for, so that `import perrin` and the
+command line's help cost next to nothing.
 """
 
-from perrin._arrays import (
-    DegenerateClusterError,
-    IdentityWarning,
-    PrecisionWarning,
-    TooFewFramesError,
-    TrackTableError,
-)
-from perrin.diffusion import DiffusionEstimate, estimate_diffusion, fit_line
-from perrin.files import read_tracks, write_tracks
-from perrin.grouping import cluster_positions, find_clusters
-from perrin.lagged import LagCurve, msad, msd
-from perrin.motion import RigidMotion, track_rotation
-from perrin.noise import NoiseFloor, noise_floor
-from perrin.rotations import kabsch
-from perrin.shapes import Cluster
-from perrin.simulate import add_noise, simulate_motion
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from perrin._arrays import (
+        DegenerateClusterError,
+        IdentityWarning,
+        PrecisionWarning,
+        TooFewFramesError,
+        TrackTableError,
+    )
+    from perrin.analysis import analyze
+    from perrin.diffusion import DiffusionEstimate, estimate_diffusion, fit_line
+    from perrin.files import read_tracks, write_tracks
+    from perrin.grouping import cluster_positions, find_clusters, positions_table
+    from perrin.hydrodynamics import Size, size_from_rotation, size_from_translation
+    from perrin.lagged import LagCurve, msad, msd
+    from perrin.motion import RigidMotion, track_rotation
+    from perrin.noise import NoiseFloor, noise_floor
+    from perrin.report import write_run
+    from perrin.results import ClusterResult, Report, load_run
+    from perrin.rotations import kabsch
+    from perrin.shapes import Cluster
+    from perrin.simulate import add_noise, simulate_motion
 
 __version__ = "0.1.0"
 
 __all__ = [
     "Cluster",
+    "ClusterResult",
     "DegenerateClusterError",
     "DiffusionEstimate",
     "IdentityWarning",
     "LagCurve",
     "NoiseFloor",
     "PrecisionWarning",
+    "Report",
     "RigidMotion",
+    "Size",
     "TooFewFramesError",
     "TrackTableError",
     "add_noise",
+    "analyze",
     "cluster_positions",
     "estimate_diffusion",
     "find_clusters",
     "fit_line",
     "kabsch",
+    "load_run",
     "msad",
     "msd",
     "noise_floor",
+    "positions_table",
     "read_tracks",
     "simulate_motion",
+    "size_from_rotation",
+    "size_from_translation",
     "track_rotation",
+    "write_run",
     "write_tracks",
 ]
+
+# Which room a name is in, rooms in the order of the house.
+_ROOMS = {
+    "_arrays": ("DegenerateClusterError", "IdentityWarning", "PrecisionWarning")
+    + ("TooFewFramesError", "TrackTableError"),
+    "rotations": ("kabsch",),
+    "shapes": ("Cluster",),
+    "noise": ("NoiseFloor", "noise_floor"),
+    "motion": ("RigidMotion", "track_rotation"),
+    "grouping": ("cluster_positions", "find_clusters", "positions_table"),
+    "lagged": ("LagCurve", "msad", "msd"),
+    "diffusion": ("DiffusionEstimate", "estimate_diffusion", "fit_line"),
+    "hydrodynamics": ("Size", "size_from_rotation", "size_from_translation"),
+    "simulate": ("add_noise", "simulate_motion"),
+    "files": ("read_tracks", "write_tracks"),
+    "results": ("ClusterResult", "Report", "load_run"),
+    "analysis": ("analyze",),
+    "report": ("write_run",),
+}
+
+
+def __getattr__(name: str) -> Any:  # noqa: ANN401 (a module's attributes have any type)
+    """Load a public name from its room."""
+    from importlib import import_module
+
+    for room, names in _ROOMS.items():
+        if name in names:
+            value = getattr(import_module(f"perrin.{room}"), name)
+            globals()[name] = value
+            return value
+    raise AttributeError(f"module 'perrin' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    """List the public names, loaded or not."""
+    return sorted([*globals(), *__all__])

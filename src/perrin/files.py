@@ -94,12 +94,10 @@ def read_tracks(
     if suffix == ".gdf" and columns is None:
         columns = _gdf_columns(raw.shape[1], source)
     tracks = _checked(_named(raw, columns or {}, source), source, _Rows.of(raw, suffix))
-    axes = [axis for axis in _AXES if axis in tracks]
-    tracks[axes] *= _scale_per_axis(scale, len(axes))
-    return tracks
+    return _scaled(tracks, scale)
 
 
-def check_tracks(table: pd.DataFrame, *, source: str) -> pd.DataFrame:
+def check_tracks(table: pd.DataFrame, *, source: str, scale: ArrayLike = 1.0) -> pd.DataFrame:
     """Check a table of tracks and return a clean copy; every table passes through here.
 
     A NaN coordinate is not a fault: it is a missing point, and is kept.
@@ -112,6 +110,8 @@ def check_tracks(table: pd.DataFrame, *, source: str) -> pd.DataFrame:
     source : str
         What messages call the table: the name of its file, or "the table". For a source ending in
         ``.csv`` or ``.csv.gz`` they count lines (the header is line 1), else rows from 0.
+    scale : float or one float per axis
+        um per unit of the coordinates.
 
     Returns
     -------
@@ -143,7 +143,7 @@ def check_tracks(table: pd.DataFrame, *, source: str) -> pd.DataFrame:
         raise TypeError(f"{source}: expected a pandas DataFrame, got {type(table).__name__}")
     table = table.reset_index(drop=True)
     is_csv = source.lower().endswith((".csv", ".csv.gz"))
-    return _checked(table, source, _Rows.of(table, ".csv" if is_csv else ""))
+    return _scaled(_checked(table, source, _Rows.of(table, ".csv" if is_csv else "")), scale)
 
 
 def write_tracks(table: pd.DataFrame, path: _PathLike) -> None:
@@ -430,6 +430,13 @@ def _suffix(name: str) -> str:
         if name.lower().endswith(suffix):
             return suffix
     raise _error(name, f"unknown kind of file; expected a name ending in {', '.join(_SUFFIXES)}")
+
+
+def _scaled(tracks: pd.DataFrame, scale: ArrayLike) -> pd.DataFrame:
+    """Turn the file's units into um, in place."""
+    axes = [axis for axis in _AXES if axis in tracks]
+    tracks[axes] *= _scale_per_axis(scale, len(axes))
+    return tracks
 
 
 def _scale_per_axis(scale: ArrayLike, dimensions: int) -> Floats:

@@ -6,12 +6,21 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from perrin._arrays import Bools, Floats, Ints, TrackTableError, require_positive
+from perrin._arrays import (
+    Bools,
+    Floats,
+    Ints,
+    TrackTableError,
+    as_positions,
+    present,
+    require_positive,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     import pandas as pd
+    from numpy.typing import ArrayLike
 
 # The gap behind a touching neighbour: the next shell of a packing begins at 1.41 diameters.
 _REACH = 1.3
@@ -70,6 +79,38 @@ def cluster_positions(
     row = tracks.frame[tracks.seen] - first
     positions[row, np.searchsorted(ids, tracks.code[tracks.seen])] = tracks.x[tracks.seen]
     return positions, np.arange(first, last + 1, dtype=np.int64)
+
+
+def positions_table(positions: ArrayLike, *, frames: ArrayLike | None = None) -> pd.DataFrame:
+    """Turn an array of positions into a track table of one cluster: undo `cluster_positions`.
+
+    Parameters
+    ----------
+    positions : array_like, shape (T, n, d)
+        um; points that are NaN have no row.
+    frames : array_like of int, shape (T,), optional
+        Frame numbers; default 0, 1, 2, ...
+
+    Returns
+    -------
+    pandas.DataFrame
+        frame, particle, x, y[, z], cluster (0).
+
+    Examples
+    --------
+    >>> positions_table([[[0.0, 1.0], [2.0, 3.0]]])
+       frame  particle    x    y  cluster
+    0      0         0  0.0  1.0        0
+    1      0         1  2.0  3.0        0
+    """
+    import pandas as pd
+
+    x = as_positions(positions)
+    row, particle = np.nonzero(present(x))
+    number = np.arange(len(x)) if frames is None else np.asarray(frames, dtype=np.int64)
+    columns: dict[str, Any] = {"frame": number[row], "particle": particle}
+    columns |= {axis: x[row, particle, i] for i, axis in enumerate("xyz"[: x.shape[2]])}
+    return pd.DataFrame(columns).assign(cluster=0)
 
 
 def find_clusters(table: pd.DataFrame, *, contact: float) -> pd.DataFrame:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from perrin._arrays import Bools, DegenerateClusterError, Floats, Ints, present
+from perrin._arrays import Bools, DegenerateClusterError, Floats, present
 
 _CHUNK = 2048  # rows whose working arrays stay in the second-level cache
 _EPS = float(np.finfo(np.float64).eps)
@@ -38,7 +38,7 @@ def kabsch(points: ArrayLike, reference: ArrayLike, *, weights: ArrayLike | None
     Raises
     ------
     ValueError
-        If shapes do not fit, or a weight is negative or not finite.
+        If shapes do not fit, a coordinate is infinite, or a weight is negative or not finite.
     DegenerateClusterError
         If a row has no unique answer (too few particles, collinear ones, an exact mirror image);
         ``indices`` names the rows, counted along the flattened leading axes.
@@ -214,7 +214,7 @@ def _paired(
 ) -> tuple[Floats, Floats, Floats | None]:
     """Coerce and check the three inputs; absent particles get weight 0 and coordinate 0."""
     y, x = np.asarray(points, dtype=np.float64), np.asarray(reference, dtype=np.float64)
-    if y.ndim < 2 or x.ndim < 2 or y.shape[-2:] != x.shape[-2:] or y.shape[-1] not in (2, 3):
+    if y.ndim < 2 or y.shape[-2:] != x.shape[-2:] or y.shape[-1] not in (2, 3) or not y.shape[-2]:
         raise ValueError(
             "points and reference: expected two sets (..., n, d) with the same n and d = 2 or 3, "
             f"got {y.shape} and {x.shape}"
@@ -225,11 +225,13 @@ def _paired(
             f"weights: expected finite numbers >= 0 of shape (..., {y.shape[-2]}), got shape "
             f"{w.shape}" + ("" if w.size == 0 else f" with minimum {np.min(w)}")
         )
-    if np.isnan(y).any() or np.isnan(x).any():
-        here_y, here_x = present(y), present(x)
-        w = np.where(here_y & here_x, 1.0 if w is None else w, 0.0)
-        y, x = np.where(here_y[..., None], y, 0.0), np.where(here_x[..., None], x, 0.0)
-    return y, x, w
+    if np.isfinite(y).all() and np.isfinite(x).all():
+        return y, x, w
+    if np.isinf(y).any() or np.isinf(x).any():
+        raise ValueError("points and reference: infinite coordinate; use NaN for a missing point")
+    here_y, here_x = present(y), present(x)
+    w = np.where(here_y & here_x, 1.0 if w is None else w, 0.0)
+    return np.where(here_y[..., None], y, 0.0), np.where(here_x[..., None], x, 0.0), w
 
 
 def _rows(a: Floats, batch: tuple[int, ...]) -> Floats:
@@ -245,39 +247,37 @@ def _transposed(a: Floats, rows: slice) -> Floats:
     return np.ascontiguousarray(part.transpose(1, 2, 0))
 
 
-def _centred(y: Floats, x: Floats, w: Floats | None) -> tuple[Floats, Floats, Floats, Floats]:
-    """Return the centred points, the centred and weighted reference, and the two centres."""
+def _dispersion(y: Floats, x: Floats, w: Floats | None) -> tuple[Floats, Floats]:
+    """Return the cross-dispersion C = sum w y x^T (Eq. 8), (d, d, B), and its rounding error, (B,).
+
+    Centring a set at distance L leaves it uncertain by eps L.
+    """
     total = float(y.shape[0]) if w is None else np.maximum(w.sum(0), 1e-300)
     y0 = (y if w is None else y * w).sum(0) / total
     x0 = (x if w is None else x * w).sum(0) / total
-    return y - y0, x - x0 if w is None else (x - x0) * w, y0, x0
-
-
-def _dispersion(y: Floats, x: Floats, w: Floats | None) -> Floats:
-    """Return the cross-dispersion matrix C = sum w y x^T (Eq. 8), shape (d, d, B)."""
-    y_centred, x_weighted, _, _ = _centred(y, x, w)
-    c: Floats = y_centred[0][:, None] * x_weighted[0][None]
+    y, x = y - y0, x - x0
+    x_weighted = x if w is None else x * w
+    c: Floats = y[0][:, None] * x_weighted[0][None]
     for i in range(1, y.shape[0]):
-        c = c + y_centred[i][:, None] * x_weighted[i][None]
-    return c
+        c = c + y[i][:, None] * x_weighted[i][None]
+    y_size, x_size = _reach(y, w), _reach(x, w)
+    near = np.abs(y).max((0, 1)) * x_size * y.shape[0]
+    far = np.abs(y0).max(0) * x_size + np.abs(x0).max(0) * y_size
+    return c, 8 * _EPS * (near + far)
 
 
-def _rounding(y: Floats, x: Floats, w: Floats | None) -> Floats:
-    """Bound the rounding error of C: centring a set at distance L leaves it uncertain by eps L."""
-    y_centred, x_weighted, y0, x0 = _centred(y, x, w)
-    y_size = np.abs(y_centred if w is None else y_centred * w).sum((0, 1))
-    x_size = np.abs(x_weighted).sum((0, 1))
-    reach = np.abs(y0).max(0) * x_size + np.abs(x0).max(0) * y_size
-    size: Floats = reach + np.abs(y_centred).max((0, 1)) * x_size * y.shape[0]
-    return 8 * _EPS * size
+def _reach(centred: Floats, w: Floats | None) -> Floats:
+    """Return the weighted sum of the absolute coordinates, (B,)."""
+    size: Floats = np.abs(centred if w is None else centred * w).sum((0, 1))
+    return size
 
 
 def _solve_planar(y: Floats, x: Floats, w: Floats | None) -> tuple[Floats, Bools]:
     """Maximise Tr(R^T C) over rotations of the plane: one angle."""
-    c = _dispersion(y, x, w)
+    c, error = _dispersion(y, x, w)
     cosine, sine = c[0, 0] + c[1, 1], c[1, 0] - c[0, 1]
     length = np.hypot(cosine, sine)
-    unique = length > _rounding(y, x, w)
+    unique = length > error
     length = np.where(unique, length, 1.0)
     cosine, sine = cosine / length, sine / length
     return np.stack([cosine, -sine, sine, cosine], -1).reshape(-1, 2, 2), unique
@@ -285,19 +285,13 @@ def _solve_planar(y: Floats, x: Floats, w: Floats | None) -> tuple[Floats, Bools
 
 def _solve_spatial(y: Floats, x: Floats, w: Floats | None) -> tuple[Floats, Bools]:
     """Maximise Tr(R^T C) over SO(3): fast path with a certificate, SVD for the rows without one."""
-    c = _dispersion(y, x, w)
-    rotation, certain = _newton(c)
+    c, error = _dispersion(y, x, w)
+    rotation, certain = _newton(c, error)
     out = np.ascontiguousarray(rotation.transpose(2, 0, 1))
     rest = np.flatnonzero(~certain)
     if rest.size:
-        error = _rounding(_few(y, rest), _few(x, rest), None if w is None else _few(w, rest))
-        out[rest], certain[rest] = _svd(c[:, :, rest].transpose(2, 0, 1), error)
+        out[rest], certain[rest] = _svd(c[:, :, rest].transpose(2, 0, 1), error[rest])
     return out, certain
-
-
-def _few(a: Floats, rows: Ints) -> Floats:
-    """Pick rows of a set with the batch last; a single set, which broadcasts, stays whole."""
-    return a if a.shape[-1] == 1 else a[..., rows]
 
 
 def _svd(c: Floats, error: Floats) -> tuple[Floats, Bools]:
@@ -308,10 +302,12 @@ def _svd(c: Floats, error: Floats) -> tuple[Floats, Bools]:
     return u @ vt, s[:, 1] + sign * s[:, 2] > error
 
 
-def _newton(c: Floats) -> tuple[Floats, Bools]:
-    """Return rotations (3, 3, B) and whether each is proven to be the maximum."""
-    norm = np.sqrt((c * c).sum((0, 1)))
-    b = c / np.where(norm > 0, norm, 1.0)
+def _newton(c: Floats, error: Floats) -> tuple[Floats, Bools]:
+    """Return rotations (3, 3, B) and whether each is proven to be the one maximum."""
+    largest = np.abs(c).max((0, 1))
+    b = c / np.where(largest > 0, largest, 1.0)
+    norm = np.sqrt((b * b).sum((0, 1)))
+    b = b / np.where(norm > 0, norm, 1.0)
     cofactor = _cofactor(b)
     det = (b[0] * cofactor[0]).sum(0)
     root, gap = _largest_root(det, (cofactor * cofactor).sum((0, 1)))
@@ -320,10 +316,14 @@ def _newton(c: Floats) -> tuple[Floats, Bools]:
     r = 0.5 * (root * root + 1.0) * b + root * cofactor - _product(b, gram)
     r = r / np.maximum(gap, 1e-12)
     # One Newton-Schulz step squares away the rounding that a small gap lets in.
-    r = 1.5 * r - 0.5 * _product(r, _product(r.transpose(1, 0, 2), r))
+    schulz = 0.5 * (r - _product(r, _product(r.transpose(1, 0, 2), r)))
+    r = r + schulz
     step, definite = _newton_step(_product(r.transpose(1, 0, 2), b))
-    # The step is quadratic: from an error under 1e-7 it lands within rounding.
-    certain = definite & (gap > 1e-7) & ((step * step).sum(0) < 1e-14)
+    # Both steps are quadratic: short ones land within rounding, and a long one betrays a root
+    # that has not settled. The error left by the second grows as the gap closes.
+    settled = ((schulz * schulz).sum((0, 1)) < 1e-16) & ((step * step).sum(0) < 1e-14 * gap)
+    # |B| = 1 bounds two factors of the gap by sqrt(2), so the third, s2 + s3, is over gap / 2.
+    certain = definite & settled & (gap > 1e-7) & (0.5 * gap * norm * largest > error)
     turned = r + np.stack([_cross(r[i], step) for i in range(3)])
     return turned, certain
 

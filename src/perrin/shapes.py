@@ -167,3 +167,12 @@ def _touching_unit(n: int) -> tuple[Floats, str]:
     radius = 0.5 / np.sin(np.pi / (n - 2))
     symmetry = {5: "D_3h", 6: "O_h", 7: "D_5h"}[n]
     return _bipyramid(n - 2, radius, np.sqrt(1 - radius**2)), symmetry
+
+
+def is_tetrahedron(positions: Floats, *, tolerance: float = 0.1) -> bool:
+    """Return whether four particles in space have six pair distances alike, within `tolerance`."""
+    if positions.shape != (4, 3):
+        return False
+    first, second = np.triu_indices(4, 1)
+    distance = np.linalg.norm(positions[first] - positions[second], axis=1)
+    return bool(distance.max() - distance.min() < tolerance * distance.mean())

@@ -1,0 +1,370 @@
+"""What a run found: the report, its clusters, and the folder that holds them."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from perrin.diffusion import DiffusionEstimate
+from perrin.hydrodynamics import Size
+from perrin.lagged import LagCurve, msad, msd
+from perrin.motion import RigidMotion
+from perrin.noise import NoiseFloor, floor_of
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    import pandas as pd
+
+
+@dataclass(frozen=True, eq=False)
+class ClusterResult:
+    """What was measured on one cluster.
+
+    Attributes
+    ----------
+    cluster : int
+    motion : RigidMotion
+    D_R, D_T : DiffusionEstimate
+    tensor : None
+        Room for the diffusion tensor.
+    noise : NoiseFloor
+        Predicted from sigma and the shape.
+    sizes : dict of Size or None
+        "translation" and "rotation", by the paper's factor; None where it does not apply.
+    warnings : tuple of str
+    label : str or None
+        The cluster's name in the table, where it is text.
+    """
+
+    cluster: int
+    motion: RigidMotion
+    D_R: DiffusionEstimate
+    D_T: DiffusionEstimate
+    tensor: None
+    noise: NoiseFloor
+    sizes: dict[str, Size] | None
+    warnings: tuple[str, ...]
+    label: str | None = None
+
+    @cached_property
+    def msad(self) -> LagCurve:
+        """The MSAD averaged over the particles' directions."""
+        return msad(self.motion)
+
+    @cached_property
+    def msd(self) -> LagCurve:
+        """The MSD of the centre."""
+        return msd(self.motion)
+
+    @property
+    def phi2_measured(self) -> float:
+        """The noise floor Phi^2 (rad^2) that the steps themselves show."""
+        return self.D_R.offset * floor_factor(self.motion)
+
+    @property
+    def phi2_stderr(self) -> float:
+        """The standard error of `phi2_measured`, rad^2; NaN at the edge of what is possible."""
+        return self.D_R.offset_stderr * floor_factor(self.motion)
+
+    @property
+    def name(self) -> str:
+        """The cluster's number, or its label."""
+        return self.label or str(self.cluster)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the cluster's entry of ``summary.json``."""
+        sizes = None
+        if self.sizes is not None:
+            t, r = self.sizes["translation"], self.sizes["rotation"]
+            sizes = {
+                "sphere_T": {"value": t.sphere, "stderr": t.sphere_stderr},
+                "sphere_R": {"value": r.sphere, "stderr": r.sphere_stderr},
+                "cluster_T": {"value": t.cluster, "stderr": t.cluster_stderr},
+                "cluster_R": {"value": r.cluster, "stderr": r.cluster_stderr},
+            }
+        return {
+            "cluster": self.cluster,
+            "label": self.label,
+            "n_particles": len(self.motion.template),
+            "n_frames": int(self.motion.fitted.size),
+            "D_R": _estimate_dict(self.D_R),
+            "D_T": _estimate_dict(self.D_T),
+            "sigma": _number(self.motion.sigma),
+            "sigma_xyz": None,
+            "phi2": {"measured": _number(self.phi2_measured), "predicted": self.noise.phi2},
+            "snr": _number(self.D_R.snr),
+            "tensor": None,
+            "sizes": sizes,
+            "size_factor": None if self.sizes is None else self.sizes["rotation"].factor,
+            "warnings": list(self.warnings),
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class Pooled:
+    """One D_R and D_T for all rigid clusters together, each with its own noise.
+
+    Attributes
+    ----------
+    D_R, D_T : DiffusionEstimate
+    clusters : tuple of int
+        Which clusters went in.
+    """
+
+    D_R: DiffusionEstimate
+    D_T: DiffusionEstimate
+    clusters: tuple[int, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Report:
+    """The result of a run: a result per cluster, pooled values, warnings, and where they come from.
+
+    Attributes
+    ----------
+    clusters : tuple of ClusterResult
+    pooled : Pooled
+    warnings : tuple of str
+        What concerns the whole table; each cluster has its own besides.
+    tracks : pandas.DataFrame
+        The positions used: frame from 0, particle, cluster, x, y[, z], um.
+    settings : dict
+        Arguments, versions, and the input with its SHA-256.
+    """
+
+    clusters: tuple[ClusterResult, ...]
+    pooled: Pooled
+    warnings: tuple[str, ...]
+    tracks: pd.DataFrame
+    settings: dict[str, Any] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        count = len(self.warnings) + sum(len(c.warnings) for c in self.clusters)
+        lines = [f"Report({len(self.clusters)} clusters, {count} warnings)"]
+        lines += [f"  cluster {c.name}: {c.D_R}; {c.D_T}" for c in self.clusters[:10]]
+        if len(self.clusters) > 1:
+            lines.append(f"  pooled: {self.pooled.D_R}; {self.pooled.D_T}")
+        return "\n".join(lines)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return ``summary.json`` as a dictionary: plain numbers, null for what is unknown."""
+        return {
+            "clusters": [c.to_dict() for c in self.clusters],
+            "pooled": {
+                "D_R": _estimate_dict(self.pooled.D_R),
+                "D_T": _estimate_dict(self.pooled.D_T),
+                "p_same": None,
+                "clusters": list(self.pooled.clusters),
+            },
+            "warnings": list(self.warnings),
+        }
+
+    def save(self, folder: str | os.PathLike[str], *, overwrite: bool = False) -> None:
+        """Write the run's data (no pictures) to a new folder, which appears whole or not at all.
+
+        Raises
+        ------
+        FileExistsError
+            If the folder exists and `overwrite` is not set, or is not a run folder.
+        """
+        with staged_folder(folder, overwrite=overwrite) as stage:
+            write_data(self, stage)
+
+
+def load_run(folder: str | os.PathLike[str]) -> Report:
+    """Read a run folder back.
+
+    Raises
+    ------
+    FileNotFoundError
+        If the folder or one of its files is missing.
+    """
+    import pandas as pd
+
+    path = Path(folder)
+    summary = json.loads((path / "summary.json").read_text(encoding="utf-8"))
+    settings = json.loads((path / "run.json").read_text(encoding="utf-8"))
+    motions = pd.read_parquet(path / "motion.parquet")
+    attributes = motions.attrs["clusters"]
+    results = []
+    for entry in summary["clusters"]:
+        rows = motions[motions["cluster"] == entry["cluster"]].reset_index(drop=True)
+        rows.attrs = attributes[str(entry["cluster"])]
+        results.append(_result_from(entry, RigidMotion.from_frame(rows)))
+    pooled = summary["pooled"]
+    return Report(
+        clusters=tuple(results),
+        pooled=Pooled(
+            _estimate_from(pooled["D_R"]), _estimate_from(pooled["D_T"]), tuple(pooled["clusters"])
+        ),
+        warnings=tuple(summary["warnings"]),
+        tracks=pd.read_parquet(path / "tracks.parquet"),
+        settings=settings,
+    )
+
+
+@contextmanager
+def staged_folder(folder: str | os.PathLike[str], *, overwrite: bool = False) -> Iterator[Path]:
+    """Give a folder to write into that takes its place, whole, when all has been written.
+
+    Raises
+    ------
+    FileExistsError
+        If the place is taken and `overwrite` is not set, or what stands there is no run folder.
+    OSError
+        If the place cannot be written.
+    """
+    place = Path(folder)
+    check_place(place, overwrite=overwrite)
+    place.parent.mkdir(parents=True, exist_ok=True)
+    stage = place.with_name(f".{place.name}.{os.getpid()}.part")
+    stage.mkdir()
+    try:
+        yield stage
+        if place.exists():
+            old = stage.with_name(stage.name + ".old")
+            place.rename(old)
+            stage.rename(place)
+            shutil.rmtree(old)
+        else:
+            stage.rename(place)
+    finally:
+        shutil.rmtree(stage, ignore_errors=True)
+
+
+def check_place(folder: str | os.PathLike[str], *, overwrite: bool = False) -> None:
+    """Refuse, before any work is done, an output folder that stands already.
+
+    Raises
+    ------
+    FileExistsError, PermissionError
+        As in `staged_folder`.
+    """
+    place = Path(folder)
+    if not place.exists():
+        parent = next(p for p in place.absolute().parents if p.exists())
+        if not parent.is_dir() or not os.access(parent, os.W_OK):
+            raise PermissionError(f"{place} cannot be made: {parent} is not a writable folder")
+        return
+    if not overwrite:
+        raise FileExistsError(f"{place} exists: choose another folder or say overwrite")
+    if not place.is_dir() or (any(place.iterdir()) and not (place / "run.json").is_file()):
+        raise FileExistsError(f"{place} is no run folder of perrin (no run.json): not overwritten")
+
+
+def write_data(report: Report, folder: Path) -> None:
+    """Write summary.json, tracks.parquet, motion.parquet, curves.csv and run.json to a folder."""
+    _write_json(folder / "summary.json", report.to_dict())
+    _write_json(folder / "run.json", report.settings)
+    report.tracks.to_parquet(folder / "tracks.parquet", index=False)
+    motion_table(report).to_parquet(folder / "motion.parquet", index=False)
+    curve_table(report).to_csv(folder / "curves.csv", index=False)
+
+
+def motion_table(report: Report) -> pd.DataFrame:
+    """Return the motion of all clusters, a row per cluster and frame; templates in ``attrs``."""
+    import pandas as pd
+
+    parts, attributes = [], {}
+    for result in report.clusters:
+        part = result.motion.to_frame()
+        attributes[str(result.cluster)] = part.attrs
+        part.attrs = {}
+        part.insert(0, "cluster", result.cluster)
+        part.insert(1, "frame", np.rint(result.motion.time / result.motion.dt).astype(np.int64))
+        parts.append(part)
+    table = pd.concat(parts, ignore_index=True)
+    table.attrs = {"clusters": attributes}
+    return table
+
+
+def curve_table(report: Report) -> pd.DataFrame:
+    """Return the MSD and MSAD of all clusters, a row per cluster, quantity and lag."""
+    import pandas as pd
+
+    parts = []
+    for result in report.clusters:
+        for name, curve in (("msad", result.msad), ("msd", result.msd)):
+            part = curve.to_frame()
+            part.insert(0, "cluster", result.cluster)
+            part.insert(1, "quantity", name)
+            parts.append(part)
+    return pd.concat(parts, ignore_index=True)
+
+
+def predicted_noise(motion: RigidMotion) -> NoiseFloor:
+    """Return the noise floor that sigma and the shape predict, averaged over the poses."""
+    covariance = np.mean(motion.covariance[motion.fitted], axis=0)
+    return NoiseFloor(float(floor_of(covariance)), covariance)
+
+
+def floor_factor(motion: RigidMotion) -> float:
+    """Return Phi^2 over the variance of one orientation angle: 4, or 2 in the plane."""
+    return 2.0 if motion.covariance.shape[-1] == 1 else 4.0
+
+
+def _number(value: float) -> float | None:
+    """Return a number that JSON can hold; None where it is unbounded or unknown."""
+    return float(value) if np.isfinite(value) else None
+
+
+def _estimate_dict(estimate: DiffusionEstimate) -> dict[str, Any]:
+    """Return an estimate for JSON, ends of intervals without bound as None."""
+    entry = asdict(estimate)
+    for name in ("value", "stderr", "offset", "offset_stderr", "snr"):
+        entry[name] = _number(entry[name])
+    for name in ("ci68", "ci95"):
+        entry[name] = [_number(end) for end in entry[name]]
+    return entry
+
+
+def _estimate_from(entry: dict[str, Any]) -> DiffusionEstimate:
+    """Read back what `_estimate_dict` wrote."""
+    fields = dict(entry)
+    for name in ("ci68", "ci95"):
+        low, high = fields[name]
+        fields[name] = (low, np.inf if high is None else high)
+    fields["offset_stderr"] = np.nan if entry["offset_stderr"] is None else entry["offset_stderr"]
+    fields["snr"] = np.inf if entry["snr"] is None else entry["snr"]
+    return DiffusionEstimate(**fields)
+
+
+def _result_from(entry: dict[str, Any], motion: RigidMotion) -> ClusterResult:
+    """Rebuild one cluster's result from its summary and its motion."""
+    sizes = None
+    if entry["sizes"] is not None:
+        sizes = {
+            mode: Size(
+                entry["sizes"][f"cluster_{letter}"]["value"],
+                entry["sizes"][f"cluster_{letter}"]["stderr"],
+                entry["sizes"][f"sphere_{letter}"]["value"],
+                entry["sizes"][f"sphere_{letter}"]["stderr"],
+                entry["size_factor"],
+            )
+            for mode, letter in (("translation", "T"), ("rotation", "R"))
+        }
+    return ClusterResult(
+        cluster=entry["cluster"],
+        motion=motion,
+        D_R=_estimate_from(entry["D_R"]),
+        D_T=_estimate_from(entry["D_T"]),
+        tensor=None,
+        noise=predicted_noise(motion),
+        sizes=sizes,
+        warnings=tuple(entry["warnings"]),
+        label=entry["label"],
+    )
+
+
+def _write_json(path: Path, content: dict[str, Any]) -> None:
+    text = json.dumps(content, indent=2, allow_nan=False, ensure_ascii=False)
+    path.write_text(text + "\n", encoding="utf-8")

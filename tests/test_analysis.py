@@ -1,0 +1,294 @@
+"""The main job: tables in, the right clusters out, and bad tables told apart."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import perrin
+from perrin.analysis import _autocorrelation
+
+SHARED = Path(__file__).resolve().parents[2] / "shared" / "data" / "optitrack"
+
+
+def tracks(*, seed: int = 0, n_frames: int = 150, cluster: int = 0, sigma: float = 0.03):
+    rng = np.random.default_rng(seed)
+    truth = perrin.simulate_motion(
+        perrin.Cluster.touching(4, 2.45), D_R=5e-3, D_T=0.04, dt=0.73, n_frames=n_frames, rng=rng
+    )
+    table = perrin.positions_table(perrin.add_noise(truth.positions(), sigma=sigma, rng=rng))
+    shift = [20.0 * cluster, -5.0, 3.0]
+    table[["x", "y", "z"]] += shift
+    return table.assign(cluster=cluster, particle=table["particle"] + 4 * cluster)
+
+
+def values(report: perrin.Report) -> np.ndarray:
+    return np.array([[c.D_R.value, *c.D_R.ci95, c.D_T.value, *c.D_T.ci95] for c in report.clusters])
+
+
+@pytest.fixture(scope="module")
+def base() -> pd.DataFrame:
+    return tracks(seed=4)
+
+
+@pytest.fixture(scope="module")
+def answer(base: pd.DataFrame) -> np.ndarray:
+    return values(perrin.analyze(base, dt=0.73))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda t: t.sample(frac=1.0, random_state=1),
+        lambda t: t.assign(particle=t["particle"].map({0: 91, 1: 7, 2: 55, 3: 8})),
+        lambda t: t.assign(particle=t["particle"].map({0: "a", 1: "c", 2: "d", 3: "b"})),
+        lambda t: t.assign(frame=t["frame"] + 1000),
+        lambda t: t.assign(x=t["x"] + 1e4, y=t["y"] - 3e3),
+        lambda t: t.assign(x=t["y"], y=-t["x"]),
+    ],
+    ids=["rows shuffled", "ids permuted", "text ids", "frames renumbered", "moved", "turned"],
+)
+def test_the_same_table_in_another_dress_gives_the_same_answer(base, answer, change):
+    """Row order, ids, frame numbers, origin and axes of the lab do not matter (1e-7)."""
+    np.testing.assert_allclose(values(perrin.analyze(change(base), dt=0.73)), answer, rtol=1e-7)
+
+
+def test_a_rotated_lab_gives_the_same_d_r(base, answer):
+    """A rotation by any angle mixes the lab axes; D_R and its interval stay (1e-7)."""
+    turn = perrin.simulate_motion(
+        perrin.Cluster.trimer(1.0), D_R=1.0, dt=1.0, n_frames=2, rng=3
+    ).rotation[1]
+    turned = base.copy()
+    turned[["x", "y", "z"]] = base[["x", "y", "z"]].to_numpy() @ turn.T
+    np.testing.assert_allclose(
+        values(perrin.analyze(turned, dt=0.73))[:, :3], answer[:, :3], rtol=1e-7
+    )
+
+
+def test_units_scale_the_answer(base, answer):
+    """Millimetres read with scale 1000 give the same; another dt divides every coefficient."""
+    mm = base.assign(**{a: base[a] / 1000 for a in "xyz"})
+    np.testing.assert_allclose(values(perrin.analyze(mm, dt=0.73, scale=1000)), answer, rtol=1e-7)
+    np.testing.assert_allclose(values(perrin.analyze(base, dt=7.3)), answer / 10, rtol=1e-7)
+
+
+def test_anisotropic_scale_undoes_anisotropic_pixels(base, answer):
+    """One scale per axis turns voxels into um."""
+    voxels = base.assign(x=base["x"] / 0.2, y=base["y"] / 0.2, z=base["z"] / 0.25)
+    report = perrin.analyze(voxels, dt=0.73, scale=(0.2, 0.2, 0.25))
+    np.testing.assert_allclose(values(report), answer, rtol=1e-7)
+
+
+def test_frames_and_particles_may_be_missing(base):
+    """Dropping frames and single points leaves D_R within its error, told in words and counts."""
+    thinned = base[(base["frame"] % 10 != 3) & ~((base["frame"] == 7) & (base["particle"] == 2))]
+    thinned = thinned[~((thinned["frame"] == 9) & (thinned["particle"] < 2))]
+    (result,) = perrin.analyze(thinned, dt=0.73).clusters
+    full = perrin.analyze(base, dt=0.73).clusters[0]
+    assert result.motion.fitted.size == 150 - 15 - 1
+    assert result.motion.n_present[7] == 3
+    assert "2 of 4 particles" in result.motion.reason[9]
+    assert abs(result.D_R.value - full.D_R.value) < full.D_R.stderr
+    assert any("16 of 150 frames have no pose" in w for w in result.warnings)
+
+
+def test_nan_coordinates_are_missing_points_counted_in_a_warning(base):
+    """A NaN row is the same as no row, but for the warning that counts it."""
+    holes = base.copy()
+    holes.loc[holes["frame"] == 20, "z"] = np.nan
+    with_nan = perrin.analyze(holes, dt=0.73)
+    without = perrin.analyze(base[base["frame"] != 20], dt=0.73)
+    np.testing.assert_array_equal(values(with_nan), values(without))
+    assert any("4 rows" in w and "NaN" in w for w in with_nan.warnings)
+    assert not any("NaN" in w for w in without.warnings)
+
+
+def test_without_clusters_up_to_twenty_particles_are_one(base):
+    """No cluster column: one cluster with a warning, and more than 20 particles an error."""
+    plain = base.drop(columns="cluster")
+    report = perrin.analyze(plain, dt=0.73)
+    assert len(report.clusters) == 1
+    assert any("one cluster" in w for w in report.warnings)
+    crowd = pd.concat([tracks(seed=k, cluster=k, n_frames=20) for k in range(6)])
+    with pytest.raises(perrin.TrackTableError, match=r"24 particles.*--contact"):
+        perrin.analyze(crowd.drop(columns="cluster"), dt=0.73)
+    found = perrin.analyze(crowd.drop(columns="cluster"), dt=0.73, contact=2.45)
+    np.testing.assert_allclose(values(found), values(perrin.analyze(crowd, dt=0.73)), rtol=1e-9)
+
+
+def test_several_clusters_are_pooled():
+    """Pooling four clusters halves the error, and equals pooling their motions."""
+    table = pd.concat([tracks(seed=10 + k, cluster=k) for k in range(4)])
+    report = perrin.analyze(table, dt=0.73)
+    pooled = perrin.estimate_diffusion([c.motion for c in report.clusters])
+    assert report.pooled.D_R.value == pooled.value
+    assert report.pooled.clusters == (0, 1, 2, 3)
+    single = np.mean([c.D_R.stderr for c in report.clusters])
+    assert 0.4 < report.pooled.D_R.stderr / single < 0.6
+    assert abs(report.pooled.D_R.value - 5e-3) < 3 * report.pooled.D_R.stderr
+    assert abs(report.pooled.D_T.value - 0.04) < 3 * report.pooled.D_T.stderr
+
+
+def test_a_bad_cluster_among_good_ones_is_a_warning():
+    """Two collinear points and a lone frame are left out by name; the good cluster stands."""
+    good = tracks(seed=1, cluster=0)
+    pair = tracks(seed=2, cluster=1)
+    pair = pair[pair["particle"] < 6]
+    flash = tracks(seed=3, cluster=2)
+    flash = flash[flash["frame"] == 0]
+    report = perrin.analyze(pd.concat([good, pair, flash]), dt=0.73)
+    assert [c.cluster for c in report.clusters] == [0]
+    assert any("cluster 1 was left out: 2 particles" in w for w in report.warnings)
+    assert any("cluster 2 was left out: 1 frame" in w for w in report.warnings)
+    with pytest.raises(perrin.DegenerateClusterError, match="2 particles"):
+        perrin.analyze(pair, dt=0.73)
+    with pytest.raises(perrin.TooFewFramesError, match="1 frame"):
+        perrin.analyze(flash, dt=0.73)
+
+
+def test_loose_particles_are_counted_and_left_out(base):
+    """Rows with cluster -1 take no part but stay in the table."""
+    loose = base.assign(cluster=-1, particle=base["particle"] + 50)
+    report = perrin.analyze(pd.concat([base, loose]), dt=0.73)
+    assert len(report.clusters) == 1
+    assert any("4 particles belong to no cluster" in w for w in report.warnings)
+    assert len(report.tracks) == 2 * len(base)
+
+
+def test_frames_are_sliced(base):
+    """frames=(A, B) uses A <= frame < B; an empty slice says what there is."""
+    report = perrin.analyze(base, dt=0.73, frames=(20, 80))
+    assert len(report.clusters[0].motion.time) == 60
+    expected = values(perrin.analyze(base[base["frame"].between(20, 79)], dt=0.73))
+    np.testing.assert_array_equal(values(report), expected)
+    with pytest.raises(ValueError, match=r"500.*0 to 149"):
+        perrin.analyze(base, dt=0.73, frames=(500, None))
+
+
+def test_sizes_are_the_papers_for_tetrahedra_only(base):
+    """Sizes follow Eqs. 25-27 with propagated errors; a trimer has none, with a word."""
+    report = perrin.analyze(base, dt=0.73, viscosity=2.18e-3, temperature=295)
+    result = report.clusters[0]
+    kT = 1.380649e-23 * 295
+    d_t = kT / (3 * np.pi * 2.18e-3 * result.D_T.value * 1e-12) * 1e6
+    d_r = (kT / (np.pi * 2.18e-3 * result.D_R.value)) ** (1 / 3) * 1e6
+    assert result.sizes["translation"].cluster == pytest.approx(d_t)
+    assert result.sizes["rotation"].sphere == pytest.approx(d_r / 1.844)
+    relative = result.D_R.stderr / result.D_R.value / 3
+    assert result.sizes["rotation"].cluster_stderr == pytest.approx(d_r * relative)
+    trimer = base[base["particle"] < 3]
+    other = perrin.analyze(trimer, dt=0.73, viscosity=2.18e-3, temperature=295).clusters[0]
+    assert other.sizes is None
+    assert any("tetrahedra only" in w for w in other.warnings)
+    with pytest.raises(ValueError, match="both viscosity"):
+        perrin.analyze(base, dt=0.73, viscosity=2.18e-3)
+
+
+def test_a_soft_body_is_flagged_and_a_noisy_one_is_not():
+    """Breathing particles warn; white noise as large does not; a stated sigma decides."""
+    rng = np.random.default_rng(5)
+    noisy = tracks(seed=5, sigma=0.12, n_frames=300)
+    soft = tracks(seed=5, sigma=0.01, n_frames=300)
+    walk = np.cumsum(rng.normal(size=(300, 4, 3)), axis=0)
+    walk = 0.12 * (walk - walk.mean(0)) / walk.std()
+    soft[["x", "y", "z"]] += walk.reshape(-1, 3)
+
+    def flagged(table: pd.DataFrame, **known: float) -> bool:
+        (result,) = perrin.analyze(table, dt=0.73, **known).clusters
+        return any("not rigid" in w for w in result.warnings)
+
+    assert flagged(soft)
+    assert not flagged(noisy)
+    assert not flagged(soft, sigma=0.1)
+    assert flagged(noisy, sigma=0.03)
+
+
+def test_a_soft_body_is_left_out_of_the_pool():
+    """Pooling takes the rigid clusters and says which it leaves out."""
+    rng = np.random.default_rng(6)
+    walk = np.cumsum(rng.normal(size=(150, 4, 3)), axis=0)
+    soft = tracks(seed=7, cluster=1)
+    soft[["x", "y", "z"]] += (0.2 * walk / walk.std()).reshape(-1, 3)
+    report = perrin.analyze(pd.concat([tracks(seed=8), soft]), dt=0.73)
+    assert report.pooled.clusters == (0,)
+    assert any("leave out what is not rigid: cluster 1" in w for w in report.warnings)
+
+
+def test_a_wrong_sigma_shows_in_the_noise_floor():
+    """Residuals that say 30 nm against steps with ten times that offset raise a warning."""
+    rng = np.random.default_rng(9)
+    truth = perrin.simulate_motion(
+        perrin.Cluster.touching(4, 2.45), D_R=1e-3, dt=0.73, n_frames=600, rng=rng
+    )
+    shaken = np.empty((600, 4, 3))
+    for k in range(600):
+        jitter = perrin.simulate_motion(
+            perrin.Cluster.touching(4, 2.45), D_R=3e-3, dt=1.0, n_frames=2, rng=rng
+        )
+        shaken[k] = truth.positions()[k] @ jitter.rotation[1].T
+    x = perrin.add_noise(shaken, sigma=0.03, rng=rng)
+    (result,) = perrin.analyze(perrin.positions_table(x), dt=0.73).clusters
+    assert any("noise floor" in w for w in result.warnings)
+    quiet = perrin.analyze(tracks(seed=9, n_frames=300), dt=0.73).clusters[0]
+    assert not any("noise floor" in w for w in quiet.warnings)
+
+
+def test_a_motionless_cluster_is_an_upper_limit():
+    """Without diffusion nothing is resolved, and the report says so."""
+    x = np.repeat(perrin.Cluster.touching(4, 2.45).positions[None], 100, axis=0)
+    table = perrin.positions_table(perrin.add_noise(x, sigma=0.03, rng=2))
+    (result,) = perrin.analyze(table, dt=0.73, viscosity=1e-3, temperature=300).clusters
+    assert not result.D_R.resolved
+    assert result.sizes is None
+    assert any("not resolved: D_R <" in w for w in result.warnings)
+
+
+def test_text_clusters_are_numbered_and_named(base):
+    """Names become numbers in the order of the names and stay as labels; no name is no cluster."""
+    other = tracks(seed=2, cluster=1).assign(cluster="knee")
+    loose = base.assign(cluster=None, particle=base["particle"] + 70)
+    table = pd.concat([base.assign(cluster="leg"), other, loose])
+    report = perrin.analyze(table, dt=0.73)
+    assert [(c.cluster, c.label) for c in report.clusters] == [(0, "knee"), (1, "leg")]
+    assert any("belong to no cluster" in w for w in report.warnings)
+
+
+def test_autocorrelation_of_a_known_series():
+    """An AR(1) series gives its coefficient back; gaps are not bridged."""
+    rng = np.random.default_rng(0)
+    x = np.zeros((20000, 1, 1))
+    for k in range(1, len(x)):
+        x[k] = 0.8 * x[k - 1] + rng.normal()
+    assert _autocorrelation(x) == pytest.approx(0.8, abs=0.02)
+    x[::2] = np.nan
+    assert np.isnan(_autocorrelation(x))
+
+
+@pytest.mark.parametrize("bad", [{"dt": 0.0}, {"dt": -1.0}, {"dt": np.nan}, {"scale": 0.0}])
+def test_arguments_out_of_range_are_refused(base, bad):
+    """Arguments dt and scale must be positive."""
+    with pytest.raises(ValueError, match=next(iter(bad))):
+        perrin.analyze(base, **({"dt": 0.73} | bad))
+
+
+@pytest.mark.skipif(not SHARED.exists(), reason="the real data is not here")
+def test_real_marker_bodies():
+    """Leg and knee are rigid at 0.39 and 0.70 mm, the foot in its soft shoe (1.94 mm) is not."""
+    table = pd.read_csv(SHARED / "walking.csv.gz")
+    bodies = pd.read_csv(SHARED / "walking_labels.csv").rename(columns={"body": "cluster"})
+    table = table.merge(bodies[["particle", "cluster"]], on="particle")
+    report = perrin.analyze(table, dt=1 / 160, scale=1000)
+    found = {c.label: c for c in report.clusters}
+    assert {k: len(c.motion.template) for k, c in found.items()} == {"Foot": 5, "Knee": 4, "Leg": 3}
+    for name, sigma in (("Leg", 0.39), ("Knee", 0.70), ("Foot", 1.94)):
+        result = found[name]
+        counts = table[table["cluster"] == name].groupby("frame").size()
+        assert result.motion.fitted.size == (counts >= 3).sum()
+        complete = counts.index[counts == len(result.motion.template)]
+        rows = table[(table["cluster"] == name) & table["frame"].isin(complete)]
+        alone = perrin.analyze(rows, dt=1 / 160, scale=1000).clusters[0]
+        assert alone.motion.sigma / 1000 == pytest.approx(sigma, rel=0.05)
+        assert any("not rigid" in w for w in result.warnings) == (name == "Foot")
