@@ -71,8 +71,13 @@ __all__ = [
 
 # Which room a name is in, rooms in the order of the house.
 _ROOMS = {
-    "_arrays": ("DegenerateClusterError", "IdentityWarning", "PrecisionWarning")
-    + ("TooFewFramesError", "TrackTableError"),
+    "_arrays": (
+        "DegenerateClusterError",
+        "IdentityWarning",
+        "PrecisionWarning",
+        "TooFewFramesError",
+        "TrackTableError",
+    ),
     "rotations": ("kabsch",),
     "shapes": ("Cluster",),
     "noise": ("NoiseFloor", "noise_floor"),

@@ -157,7 +157,10 @@ def simulate(
             rng=rng,
         )
         positions = perrin.add_noise(truth.positions(), sigma=_numbers("--sigma", sigma), rng=rng)
-        perrin.write_tracks(perrin.positions_table(positions), output)
+        table = perrin.positions_table(positions)
+        if output.suffix == ".gdf":  # a format without room for a cluster column
+            table = table.drop(columns="cluster")
+        perrin.write_tracks(table, output)
         print(f"{frames} frames of one {shape} written to {output}")
 
 
@@ -187,9 +190,16 @@ def _told() -> Iterator[None]:
     try:
         yield
     except (ValueError, OSError) as error:
-        print("perrin: " + "; ".join(str(error).splitlines()), file=sys.stderr)
+        print(f"perrin: {_one_line(error)}", file=sys.stderr)
         unanswerable = isinstance(error, DegenerateClusterError | TooFewFramesError)
         raise typer.Exit(1 if unanswerable else 2) from None
+
+
+def _one_line(error: Exception) -> str:
+    """Return an error's message on one line, the system's with the file first."""
+    if isinstance(error, OSError) and error.strerror and error.filename:
+        return f"{error.filename}: {error.strerror}"
+    return "; ".join(line.strip() for line in str(error).splitlines())
 
 
 def _numbers(option: str, text: str) -> float | list[float]:
@@ -250,20 +260,21 @@ def _show(report: Report, output: Path) -> None:
 
 def _cluster_table(result: ClusterResult) -> Table:
     """Return the short table of one cluster: coefficients, noise, sizes."""
+    from rich.box import SIMPLE_HEAD
     from rich.table import Table
 
     from perrin.diffusion import with_error
 
     title = f"cluster {result.name}: {result.motion.fitted.size} frames"
-    table = Table("", "value", "68 %", "95 %", title=title, title_justify="left")
+    table = Table("", "value", "68 %", "95 %", title=title, title_justify="left", box=SIMPLE_HEAD)
     for name, estimate in (("D_R", result.D_R), ("D_T", result.D_T)):
         table.add_row(f"{name} ({estimate.unit})", *_estimate_cells(estimate))
     table.add_row("sigma (nm)", f"{1e3 * result.motion.sigma:.3g}")
-    table.add_row("Phi^2 predicted (rad^2)", f"{result.noise.phi2:.3g}")
-    table.add_row("Phi^2 measured (rad^2)", with_error(result.phi2_measured, result.phi2_stderr))
+    table.add_row("Phi^2, predicted (rad^2)", f"{result.noise.phi2:.3g}")
+    table.add_row("Phi^2, measured (rad^2)", with_error(result.phi2_measured, result.phi2_stderr))
     for mode, size in (result.sizes or {}).items():
         shown = with_error(size.sphere, size.sphere_stderr)
-        table.add_row(f"sphere diameter from {mode} (um)*", shown)
+        table.add_row(f"sphere by {mode} (um)*", shown)
     if result.sizes:
         table.caption = "* with the paper's factor 1.844 (Hoffmann 2009)"
     return table
@@ -271,10 +282,12 @@ def _cluster_table(result: ClusterResult) -> Table:
 
 def _pooled_table(report: Report) -> Table:
     """Return the table of the values pooled over clusters."""
+    from rich.box import SIMPLE_HEAD
     from rich.table import Table
 
     count = len(report.pooled.clusters)
-    table = Table("", "value", "68 %", "95 %", title=f"{count} clusters pooled")
+    title = f"{count} clusters pooled"
+    table = Table("", "value", "68 %", "95 %", title=title, title_justify="left", box=SIMPLE_HEAD)
     for name, estimate in (("D_R", report.pooled.D_R), ("D_T", report.pooled.D_T)):
         table.add_row(f"{name} ({estimate.unit})", *_estimate_cells(estimate))
     return table
@@ -288,7 +301,7 @@ def _estimate_cells(estimate: DiffusionEstimate) -> tuple[str, str, str]:
     if not estimate.resolved:
         value = f"< {estimate.ci95[1]:.2g} (95 %)"
     (low68, high68), (low95, high95) = estimate.ci68, estimate.ci95
-    return value, f"{low68:.4g} to {high68:.4g}", f"{low95:.4g} to {high95:.4g}"
+    return value, f"{low68:.3g} to {high68:.3g}", f"{low95:.3g} to {high95:.3g}"
 
 
 if __name__ == "__main__":

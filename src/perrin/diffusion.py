@@ -21,8 +21,12 @@ _UNITS = {"rotation": "rad^2/s", "translation": "um^2/s"}
 _CHI2 = {0.68: 0.9889, 0.95: 3.8415}  # quantiles of chi-squared with one degree of freedom
 _NORMAL = {0.68: 0.9945, 0.95: 1.9600}
 
-# Lowest logarithmic distance of an offset to its least value, in units of the mean square step.
-_EDGE = -30.0
+# Lowest and highest logarithmic distance of an offset to its least value, in units of the mean
+# square step. Without diffusion a long track needs an offset far above that.
+_EDGE, _TOP = -30.0, 60.0
+
+# A group of steps this much smaller (mean square) than another one's does not move at all.
+_REST = 1e-24
 
 # Adding noisy body-frame steps turns noise into diffusion at second order: a motionless tetrahedron
 # reads D = 0.04 (sigma/R)^4/dt. Below ten times that a D_R is not resolved.
@@ -136,11 +140,13 @@ def estimate_diffusion(
 
     Notes
     -----
-    Steps over a time t between frames k and k + 1 have variance 2 D t + o (h_k + h_{k+1}) and
-    neighbours covariance -o h_{k+1}, with o the noise offset and h the noise of a frame over that
-    of a complete one (more with particles missing): a tridiagonal likelihood, linear in the number
-    of frames, in which a gap is one longer step. One offset serves the three body axes; the centre
-    has one for each lab axis.
+    Steps over a time t between frames k and k + 1 have variance 2 D t + o_k + o_{k+1} and
+    neighbours covariance -o_{k+1}, with o_k = o + s (h_k - 1): a tridiagonal likelihood, linear in
+    the number of frames, in which a gap is one longer step. The offset o = s - b is noise less
+    motion blur, h_k the noise of a frame and axis over that of a complete one. Only o is free: s is
+    as predicted from the rigid-fit residuals, as far as o allows with 0 <= b <= D t/2. One offset
+    serves the three body axes; the centre has one for each lab axis, and an axis along which it
+    never moves (a planar track in space) is left out.
 
     Examples
     --------
@@ -321,8 +327,10 @@ def _predicted_spread(motions: Sequence[RigidMotion], quantity: str) -> float:
 class _Likelihood:
     """The Gaussian likelihood of all steps, stacked to one tridiagonal system.
 
-    Step i has variance 2 D tau + o (h0 + h1) and covariance -o h1 with step i + 1 where the two
-    share a frame (`linked`); o is the noise offset of the step's `group`.
+    Step i has variance 2 D tau + o0 + o1 and covariance -o1 with step i + 1 where the two share a
+    frame (`linked`). The frame's offset is o + s (h - 1) with o the offset and s the noise of the
+    step's `group`: blur, which o may hold too, does not grow with the noise. `predicted` is the s
+    that the residuals tell, one a group.
     """
 
     y: Floats
@@ -331,30 +339,47 @@ class _Likelihood:
     h1: Floats
     linked: Floats
     group: Ints
+    predicted: Floats
 
     @classmethod
     def of(cls, motions: Sequence[RigidMotion], *, quantity: str) -> _Likelihood:
         """Stack the steps of every axis of every motion."""
         parts: list[tuple[Floats, Floats, Floats, Floats, Floats]] = []
         groups: list[int] = []
-        count = 0
+        predicted: list[float] = []
         for m in motions:
             start, stop = m.steps()
-            y, h = _rotation_steps(m) if quantity == "rotation" else _translation_steps(m)
+            y, h, s = _rotation_steps(m) if quantity == "rotation" else _translation_steps(m)
             tau = m.time[stop] - m.time[start]
             linked = np.append(start[1:] == stop[:-1], False).astype(np.float64)
             for axis in range(y.shape[1]):
+                if axis == 0 or quantity == "translation":
+                    predicted.append(s)
                 parts.append((y[:, axis], tau, h[start, axis], h[stop, axis], linked))
-                groups.append(count)
-                count += quantity == "translation"
-            count += quantity == "rotation"
+                groups.append(len(predicted) - 1)
         group = np.repeat(np.array(groups), [len(p[0]) for p in parts])
         y_all, tau_all, h0, h1, linked_all = (np.concatenate(c) for c in zip(*parts, strict=True))
-        return cls(y_all, tau_all, h0, h1, linked_all, group)
+        return cls(y_all, tau_all, h0, h1, linked_all, group, np.array(predicted))._moving()
+
+    def _moving(self) -> _Likelihood:
+        """Leave out the groups that never move, unless none does."""
+        keep = self._power > _REST * self._power.max()
+        if keep.all() or not keep.any():
+            return self
+        rows, label = keep[self.group], np.cumsum(keep) - 1
+        y, tau, h0, h1, linked = (
+            c[rows] for c in (self.y, self.tau, self.h0, self.h1, self.linked)
+        )
+        return _Likelihood(y, tau, h0, h1, linked, label[self.group[rows]], self.predicted[keep])
 
     @cached_property
     def _starts(self) -> Ints:
         return np.flatnonzero(np.diff(self.group, prepend=-1))
+
+    @cached_property
+    def _excess(self) -> Floats:
+        """Noise of a step's two frames beyond that of two complete ones, relative."""
+        return self.h0 + self.h1 - 2
 
     @cached_property
     def _power(self) -> Floats:
@@ -368,95 +393,134 @@ class _Likelihood:
 
     @cached_property
     def _least(self) -> Floats:
-        """Return the least offset over D of each group: below it a variance would be negative."""
-        return -np.minimum.reduceat(self.tau / (self.h0 + self.h1), self._starts)
+        """Return the least offset over D of each group, the blur of a shutter that never closes."""
+        return -0.5 * np.minimum.reduceat(self.tau, self._starts)
 
     def _per_group(self, x: Floats) -> Floats:
         total: Floats = np.add.reduceat(x, self._starts)
         return total
 
-    def _evaluate(self, D: float, offset: Floats) -> tuple[float, float, Floats]:
-        """Return the log-likelihood, its slope in D, and its slopes in the offsets.
+    def _evaluate(self, D: float, offset: Floats) -> tuple[float, float, Floats, Floats]:
+        """Return the log-likelihood, its slope in D, its slopes in the offsets, and their tilts.
 
-        The inverse of a tridiagonal matrix has the diagonal 1/(d + d' - a), with d and d' the
-        pivots of the elimination from above and from below, and Z_{i,i+1} = -l_i Z_{i+1,i+1}.
+        A slope is half of z.A.z - tr(C^-1 A), with C the covariance, A its slope and z = C^-1 y;
+        the tilt is the logarithm of the ratio of the two. The inverse of a tridiagonal matrix has
+        the diagonal 1/(d + d' - a), with d and d' the pivots of the elimination from above and from
+        below, and Z_{i,i+1} = -l_i Z_{i+1,i+1}.
         """
         from scipy.linalg.lapack import dpttrf, dpttrs
 
-        o, weight = offset[self.group], self.h0 + self.h1
-        a = 2 * D * self.tau + o * weight
-        cross = -self.h1[:-1] * self.linked[:-1]
-        b = o[:-1] * cross
+        noise, by_offset, by_D = self._noise(D, offset)
+        o, s = offset[self.group], noise[self.group]
+        a = 2 * D * self.tau + 2 * o + s * self._excess
+        b = -((o + s * (self.h1 - 1)) * self.linked)[:-1]
         d, lower, bad = dpttrf(a, b)
         up, _, bad_up = dpttrf(a[::-1], b[::-1])
         if bad or bad_up:
-            return -np.inf, np.nan, np.full(len(offset), np.nan)
+            return -np.inf, np.nan, np.full(len(offset), np.nan), np.full(len(offset), _TOP)
         z, _ = dpttrs(d, lower, self.y)
-        inverse = 1 / (d + up[::-1] - a)
-        on = inverse - z * z
-        off = -lower * inverse[1:] - z[:-1] * z[1:]
+        inverse, square = 1 / (d + up[::-1] - a), z * z
+        raised, raised_s = self._moments(square, -z[:-1] * z[1:])
+        lowered, lowered_s = self._moments(inverse, lower * inverse[1:])
+        up_hill, down_hill = raised + by_offset * raised_s, lowered + by_offset * lowered_s
         value = -0.5 * float(np.sum(np.log(d)) + self.y @ z)
-        slope = -float(self.tau @ on)
-        slopes = weight * on
-        slopes[:-1] += 2 * cross * off
-        return value, slope, -0.5 * self._per_group(slopes)
+        slope = float(self.tau @ (square - inverse) + by_D @ (raised_s - lowered_s))
+        return value, slope, up_hill - down_hill, np.log(up_hill / down_hill)
+
+    def _moments(self, on: Floats, off: Floats) -> tuple[Floats, Floats]:
+        """Return half the trace of a matrix with the slopes of C in the offsets, and in the noises.
+
+        `on` is its diagonal, `off` the negative of the diagonal beside it.
+        """
+        beside = self.linked * np.append(off, 0.0)
+        of_noise = self._per_group(0.5 * self._excess * on + (self.h1 - 1) * beside)
+        return self._per_group(on + beside), of_noise
+
+    def _noise(self, D: float, offset: Floats) -> tuple[Floats, Floats, Floats]:
+        """Return the noise s in each offset o = s - b, and its slopes in the offset and in D.
+
+        s is as near to the predicted one as o allows, with a blur b from 0 to that of a shutter
+        that never closes.
+        """
+        least, most = np.maximum(offset, 0.0), offset - self._least * D
+        held = self.predicted > most
+        tied = held | (self.predicted < least)
+        s = np.clip(self.predicted, least, most)
+        return s, tied.astype(np.float64), np.where(held, -self._least, 0.0)
 
     def ridge(
         self, D: float, guess: Floats | None = None, tolerance: float = 1e-12
     ) -> tuple[float, float, Floats]:
         """Maximise over the offsets at one D: return value, slope along the ridge, offsets.
 
-        Each offset is the root of its own slope, all groups at once, by secant steps inside a
+        Each offset is the root of its own tilt, all groups at once, by secant steps inside a
         shrinking bracket; their coordinate t is the logarithm of the distance to the least value,
-        near which the likelihood falls off a cliff.
+        near which the likelihood falls off a cliff. Logarithms make the secant nearly straight.
         """
         least, power = self._least * D, self._power
-        low, high = np.full(len(power), _EDGE), np.full(len(power), 6.0)
+        low, high = np.full(len(power), _EDGE), np.full(len(power), _TOP)
         start = 0.5 * power if guess is None else guess
         old = np.log(np.maximum((start - least) / power, 1e-6))
-        old_slope = self._evaluate(D, least + power * np.exp(old))[2] * np.exp(old)
-        t = np.clip(old + np.copysign(1e-3, old_slope), low, high)
+        old_tilt = self._evaluate(D, least + power * np.exp(old))[3]
+        t = np.clip(old + np.copysign(1e-3, old_tilt), low, high)
         for _ in range(100):
             offset = least + power * np.exp(t)
-            value, slope_D, slopes = self._evaluate(D, offset)
-            slope = slopes * np.exp(t)
-            low, high = np.where(slope > 0, t, low), np.where(slope > 0, high, t)
-            target = _secant(t, slope, old, old_slope, low, high)
-            if np.all((np.abs(target - t) <= tolerance) | (high <= _EDGE)):
+            value, slope_D, slopes, tilt = self._evaluate(D, offset)
+            low, high = np.where(tilt > 0, t, low), np.where(tilt > 0, high, t)
+            target = _secant(t, tilt, old, old_tilt, low, high)
+            moves = np.minimum(np.abs(target - t), np.abs(t - old))
+            done = (moves <= tolerance) | (high <= _EDGE)
+            if done.all():
                 break
-            old, old_slope, t = t, slope, target
-        # Along the ridge an offset moves by `least` times the change of D, where it does not rest.
-        return value, slope_D + float(np.sum(self._least * slopes)), offset
+            old, old_tilt, t = t, tilt, np.where(done, t, target)
+        # At its edge an offset moves by `least` times the change of D; at a root that is no matter.
+        edge = np.where(t < _EDGE + 1, self._least * slopes, 0.0)
+        return value, slope_D + float(edge.sum()), offset
 
     def _follower(self, tolerance: float) -> Callable[[float], tuple[float, float, Floats]]:
         """Return `ridge` as a function of D that starts from where its last two calls ended."""
         trail: list[tuple[float, Floats]] = []
+        known: dict[float, tuple[float, float, Floats]] = {}
 
         def follow(D: float) -> tuple[float, float, Floats]:
+            if D in known:
+                return known[D]
             guess = trail[-1][1] if trail else None
             if len(trail) > 1 and trail[-1][0] != trail[-2][0]:
                 (D0, o0), (D1, o1) = trail[-2:]
                 guess = o1 + (o1 - o0) * (D - D1) / (D1 - D0)
             found = self.ridge(D, guess, tolerance)
             trail.append((D, found[2]))
+            known[D] = found
             return found
 
         return follow
 
     def best_value(self) -> float:
-        """Return the D of greatest likelihood: the root of the slope along the ridge, or 0."""
+        """Return the D of greatest likelihood: the highest root of the slope along the ridge, or 0.
+
+        Short tracks can have several roots, so the whole range is searched.
+        """
         from scipy.optimize import brentq
 
-        follow = self._follower(1e-12)
-        if follow(0.0)[1] <= 0:
+        if self._scale == 0:
             return 0.0
-        high = self._scale
-        while follow(high)[1] > 0:
-            high *= 2
-        return float(brentq(lambda D: follow(D)[1], 0.0, high, xtol=1e-14 * high, rtol=1e-13))
+        follow = self._follower(1e-11)
+        D = [0.0, *(self._scale * 4.0 ** np.arange(-7, 1)).tolist()]
+        while follow(D[-1])[1] > 0:
+            D.append(2 * D[-1])
+        slopes = [follow(x)[1] for x in D]
+        peaks = [0.0] if slopes[0] <= 0 else []
+        for low, high, before, after in zip(D, D[1:], slopes, slopes[1:], strict=False):
+            if before > 0 >= after:
+                root = brentq(lambda x: follow(x)[1], low, high, xtol=1e-14 * high, rtol=1e-13)
+                peaks.append(float(root))
+        return max(peaks, key=lambda x: follow(x)[0])
 
     def interval(self, value: float, drop: float) -> tuple[float, float]:
         """Return where twice the profile log-likelihood has fallen by `drop`; 0 if it never has."""
+        if self._scale == 0:
+            return 0.0, 0.0
         # The height is flat in the offset on the ridge: half the digits of t give all of its own.
         follow = self._follower(1e-6)
         top = follow(value)[0]
@@ -477,17 +541,22 @@ class _Likelihood:
         """Return the mean noise offset and its standard error from the observed information.
 
         The information is arrow-shaped (one D, an offset for each group); it comes from central
-        differences of the slopes.
+        one-sided differences of the slopes.
         """
+        if self._scale == 0:
+            return 0.0, np.nan
         offset = self.ridge(value)[2]
         mean = float(offset.mean())
         if np.any(offset - self._least * value <= 1e-9 * self._power) or value == 0:
             return mean, np.nan
-        step_o, step_D = 1e-4 * self._power, 1e-4 * value
-        plus, minus = (self._evaluate(value, offset + sign * step_o) for sign in (1, -1))
-        h_oo = -(plus[2] - minus[2]) / (2 * step_o)
-        plus, minus = (self._evaluate(value + sign * step_D, offset) for sign in (1, -1))
-        h_DD, h_Do = -(plus[1] - minus[1]) / (2 * step_D), -(plus[2] - minus[2]) / (2 * step_D)
+        # Steps away from where the noise parts from the predicted one, and the slopes have a kink.
+        step_o = np.where(offset < self.predicted, -1e-4, 1e-4) * self._power
+        held = np.any(self.predicted > offset - self._least * value)
+        step_D = -1e-4 * value if held else 1e-4 * value
+        near, far = (self._evaluate(value, offset + k * step_o) for k in (1, 2))
+        h_oo = (near[2] - far[2]) / step_o
+        near, far = (self._evaluate(value + k * step_D, offset) for k in (1, 2))
+        h_DD, h_Do = (near[1] - far[1]) / step_D, (near[2] - far[2]) / step_D
         left = h_DD - float(np.sum(h_Do**2 / h_oo))
         if left <= 0 or np.any(h_oo <= 0):
             return mean, np.nan
@@ -528,29 +597,30 @@ def _crossing(
     return float(x)
 
 
-def _rotation_steps(motion: RigidMotion) -> tuple[Floats, Floats]:
-    """Return body-frame rotation vectors along the principal axes, and each frame's noise there.
+def _rotation_steps(motion: RigidMotion) -> tuple[Floats, Floats, float]:
+    """Return body-frame rotation vectors along principal axes, each frame's noise, and its unit.
 
-    The noise is relative to the mean over axes of a complete frame. The axes are those in which the
-    covariance of the orientation is diagonal, so that one number an axis describes it.
+    The noise is relative to the mean over axes of a complete frame, the unit. The axes are those in
+    which the covariance of the orientation is diagonal, so that one number an axis describes it.
     """
     _, stop = motion.steps()
     c = motion.covariance
     fullest = motion.n_present == motion.n_present[motion.fitted].max()
     usual = np.nanmean(c[fullest], axis=0)
-    base = float(np.trace(usual)) / len(usual)
     axes = np.linalg.eigh(usual)[1]
     noise = np.einsum("ji,tjk,ki->ti", axes, c, axes)
-    relative = noise / base if base > 0 else np.where(np.isfinite(noise), 1.0, np.nan)
-    return motion.step_vectors()[stop - 1] @ axes, relative
+    base = float(np.trace(usual)) / len(usual)
+    return motion.step_vectors()[stop - 1] @ axes, _relative(noise, base), base
 
 
-def _translation_steps(motion: RigidMotion) -> tuple[Floats, Floats]:
-    """Return displacements of the centre, and each frame's noise relative to a complete one's."""
+def _translation_steps(motion: RigidMotion) -> tuple[Floats, Floats, float]:
+    """Return displacements of the centre, each frame's noise over a complete one's, and that."""
     start, stop = motion.steps()
-    v = motion.center_variance
-    base = float(np.nanmin(v))
-    relative = v / base if base > 0 else np.where(np.isfinite(v), 1.0, np.nan)
-    return motion.center[stop] - motion.center[start], np.repeat(
-        relative[:, None], motion.center.shape[1], axis=1
-    )
+    base = float(np.nanmin(motion.center_variance))
+    noise = np.repeat(motion.center_variance[:, None], motion.center.shape[1], axis=1)
+    return motion.center[stop] - motion.center[start], _relative(noise, base), base
+
+
+def _relative(noise: Floats, base: float) -> Floats:
+    """Return noise over its unit; without noise every frame is worth the same."""
+    return noise / base if base > 0 else np.where(np.isfinite(noise), 1.0, np.nan)

@@ -332,9 +332,9 @@ def _angle_vectors(p: Floats, q: Floats, step: Floats) -> Floats:
     normal = np.cross(p, q)
     sine = np.linalg.norm(normal, axis=-1, keepdims=True)
     axis = np.divide(normal, sine, out=np.zeros_like(normal), where=sine > 0)
-    opposite = (sine == 0) & (dot < 0)
+    opposite = (sine < 1e-12 * -dot) & (dot < 0)
     if opposite.any():
-        # p and q = -p span no plane; only the rotation itself knows its axis, at angle pi.
+        # p and q = -p span no plane, or one of rounding; only the rotation itself knows its axis.
         own = (log_map(step) / np.pi).reshape(len(step), *[1] * (p.ndim - 2), 3)
         axis = np.where(opposite, own, axis)
     turn: Floats = np.arctan2(sine, dot) * axis
@@ -358,8 +358,12 @@ def _times(count: int, *, dt: float, frames: ArrayLike | None, times: ArrayLike 
     source = times if times is not None else frames
     t = np.arange(count, dtype=np.float64) if source is None else np.array(source, np.float64)
     name = "frames" if times is None else "times"
-    if t.shape != (count,) or not np.all(np.isfinite(t)) or np.any(np.diff(t) <= 0):
-        raise ValueError(f"{name}: expected {count} finite rising numbers (one a row), got {t}")
+    if t.shape != (count,):
+        raise ValueError(f"{name}: expected {count} numbers (one a row), got shape {t.shape}")
+    bad = ~np.isfinite(t) | np.append(False, ~(np.diff(t) > 0))
+    if bad.any():
+        k = int(np.argmax(bad))
+        raise ValueError(f"{name}: expected finite, rising numbers, got {t[k]} at row {k}")
     return t if times is not None else t * dt
 
 
@@ -368,7 +372,7 @@ def _require_points(seen: Bools, d: int) -> None:
     n = seen.shape[1]
     if n < d:
         raise DegenerateClusterError(
-            f"{n} particle{'s' if n > 1 else ''}: a rotation in {d} dimensions needs at least {d}",
+            f"{n} particle{'s' if n != 1 else ''}: a rotation in {d} dimensions needs at least {d}",
             (n,),
         )
     never = np.flatnonzero(~seen.any(axis=0))
@@ -404,25 +408,16 @@ def _fit_template(x: Floats, seen: Bools) -> _Fit:
     shape = _settled(refined, x[np.argmax(seen.sum(axis=1))])
     rotation, unique = fit_rotations(x, shape)
     if not unique.any() or not np.isfinite(shape).all():
-        raise DegenerateClusterError(
-            f"no rotation can be found: the {x.shape[1]} particles lie on one line, or no frame "
-            f"shares {x.shape[2]} of them with the others",
-            (x.shape[1],),
-        )
+        raise _no_rotation(x)
     return _finished(x, seen, rotation, shape)
 
 
 def _fit_chain(x: Floats, seen: Bools) -> _Fit:
     """Multiply the rotations between successive frames (Eq. 13); a gap is one direct rotation."""
-    rows = np.flatnonzero(seen.sum(axis=1) >= x.shape[2])
-    step, unique = fit_rotations(x[rows[1:]], x[rows[:-1]])
-    while not unique.all():
-        rows = np.delete(rows, np.flatnonzero(~unique)[0] + 1)
-        step, unique = fit_rotations(x[rows[1:]], x[rows[:-1]])
+    rows, step = _chain_steps(x, seen)
     rotation = np.full((len(x), x.shape[2], x.shape[2]), np.nan)
     rotation[rows] = np.swapaxes(cumulative_product(np.swapaxes(step, -1, -2)), -1, -2)
-    first = x[rows[0]] if rows.size else x[0]
-    shape = _settled(lambda s: _mean_of(_in_body(x, seen, rotation, s)), first)
+    shape = _settled(lambda s: _mean_of(_in_body(x, seen, rotation, s)), x[rows[0]])
     fit = _finished(x, seen, rotation, shape)
     both = (seen[rows[1:]] & seen[rows[:-1]])[..., None]
     end, begin = np.where(both, x[rows[1:]], np.nan), np.where(both, x[rows[:-1]], np.nan)
@@ -431,6 +426,39 @@ def _fit_chain(x: Floats, seen: Bools) -> _Fit:
     e[rows[1:]] = (end - _mean_present(end)[:, None] - turned) / np.sqrt(2)
     freedom = _freedom(both[..., 0].sum(axis=1), x.shape[2]).sum()
     return fit._replace(residual=e, sigma2=float(np.nansum(e * e)) / freedom if freedom else np.nan)
+
+
+def _chain_steps(x: Floats, seen: Bools) -> tuple[Ints, Floats]:
+    """Return the frames that can be chained, and the rotation from each to the next."""
+    rows = np.flatnonzero(seen.sum(axis=1) >= x.shape[2])
+    while rows.size > 1:
+        step, unique = fit_rotations(x[rows[1:]], x[rows[:-1]])
+        if unique.all():
+            return rows, step
+        # A frame that cannot follow the one before it goes; of a run of them only the first, for
+        # the next may well follow the frame that is then before it.
+        first = ~unique & np.append(True, unique[:-1])
+        rows = rows[np.append(True, ~first)]
+    if (seen.sum(axis=1) >= x.shape[2]).sum() > 1:
+        raise _no_rotation(x)
+    raise _too_few(rows.size)
+
+
+def _no_rotation(x: Floats) -> DegenerateClusterError:
+    _, n, d = x.shape
+    return DegenerateClusterError(
+        f"no rotation can be found: the {n} particles lie on one line, or no frame "
+        f"shares {d} of them with the others",
+        (n,),
+    )
+
+
+def _too_few(count: int) -> TooFewFramesError:
+    return TooFewFramesError(
+        f"{count} frame{'s' if count != 1 else ''} with a pose: at least 2 are needed to see a "
+        "rotation",
+        count,
+    )
 
 
 def _settled(refined: Callable[[Floats], Floats], shape: Floats) -> Floats:
@@ -490,11 +518,7 @@ def _finished(x: Floats, seen: Bools, rotation: Floats, shape: Floats) -> _Fit:
     """Turn the template so that the first pose is the identity; collect residuals and sigma^2."""
     fitted = np.flatnonzero(np.isfinite(rotation[:, 0, 0]))
     if fitted.size < 2:
-        raise TooFewFramesError(
-            f"{fitted.size} frame{'s' if fitted.size != 1 else ''} with a pose: at least 2 are "
-            "needed to see a rotation",
-            int(fitted.size),
-        )
+        raise _too_few(int(fitted.size))
     gauge = rotation[fitted[0]]
     shape, rotation = shape @ gauge.T, rotation @ gauge.T
     rotation[fitted[0]] = np.eye(len(gauge))

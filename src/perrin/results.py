@@ -256,7 +256,9 @@ def check_place(folder: str | os.PathLike[str], *, overwrite: bool = False) -> N
             raise PermissionError(f"{place} cannot be made: {parent} is not a writable folder")
         return
     if not overwrite:
-        raise FileExistsError(f"{place} exists: choose another folder or say overwrite")
+        raise FileExistsError(
+            f"{place} exists: choose another folder, or overwrite=True (--overwrite)"
+        )
     if not place.is_dir() or (any(place.iterdir()) and not (place / "run.json").is_file()):
         raise FileExistsError(f"{place} is no run folder of perrin (no run.json): not overwritten")
 

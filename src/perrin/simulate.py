@@ -70,7 +70,9 @@ def simulate_motion(
     (100, 4, 3)
     """
     require_positive(dt=dt, n_frames=n_frames)
-    if not (np.isfinite(D_T) and D_T >= 0):
+    if n_frames != int(n_frames):
+        raise ValueError(f"n_frames: expected a whole number, got {n_frames!r}")
+    if not (np.ndim(D_T) == 0 and np.isfinite(D_T) and D_T >= 0):
         raise ValueError(f"D_T: expected a finite number >= 0 (um^2/s), got {D_T!r}")
     if scheme not in ("brownian", "euler"):
         raise ValueError(f'scheme: expected "brownian" or "euler", got {scheme!r}')
@@ -128,7 +130,7 @@ def _tensor(D_R: ArrayLike, d: int) -> Floats:
     value = np.asarray(D_R, dtype=np.float64)
     angles = 3 if d == 3 else 1
     if value.ndim == 0:
-        value = value * np.eye(angles)
+        value = np.diag(np.full(angles, value))
     elif value.shape == (angles,):
         value = np.diag(value)
     if value.shape != (angles, angles) or not np.isfinite(value).all():
@@ -144,7 +146,7 @@ def _tensor(D_R: ArrayLike, d: int) -> Floats:
 
 def _rotations(D: Floats, count: int, *, scheme: str, generator: np.random.Generator) -> Floats:
     """Return count + 1 orientations, the first one the identity; D is per frame."""
-    isotropic = np.allclose(D, D[0, 0] * np.eye(len(D)), rtol=1e-12, atol=0.0)
+    isotropic = np.allclose(D, D[0, 0] * np.eye(len(D)), rtol=0.0, atol=1e-12 * np.trace(D))
     if scheme == "euler":
         if len(D) != 3 or not isotropic:
             raise ValueError('scheme="euler" (Eq. 16) knows one D_R in three dimensions only')
@@ -170,8 +172,10 @@ def _substepped(D: Floats, count: int, *, generator: np.random.Generator) -> Flo
     substeps = int(np.ceil(np.linalg.eigvalsh(D)[-1] / _SUBSTEP))
     values, axes = np.linalg.eigh(2 * D / substeps)
     root = axes * np.sqrt(np.maximum(values, 0.0))
-    fine = exp_map(generator.normal(size=(count * substeps, 3)) @ root.T)
-    return cumulative_product(fine)[::substeps]
+    step = np.broadcast_to(np.eye(3), (count, 3, 3))
+    for _ in range(substeps):
+        step = step @ exp_map(generator.normal(size=(count, 3)) @ root.T)
+    return cumulative_product(step)
 
 
 def _heat_kernel_steps(D: float, count: int, *, generator: np.random.Generator) -> Floats:

@@ -1,0 +1,338 @@
+"""A report to read: a run folder's pictures and its one self-contained HTML file."""
+
+from __future__ import annotations
+
+import base64
+from datetime import datetime
+from importlib.resources import files
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jinja2 import Environment, StrictUndefined
+
+from perrin.plot import (
+    MAX_CLUSTERS,
+    bare_text,
+    number_text,
+    power_of,
+    save_figures,
+    significant,
+    ten_to,
+    unit_text,
+    value_text,
+)
+from perrin.results import floor_factor, staged_folder, write_data
+
+if TYPE_CHECKING:
+    import os
+    from collections.abc import Iterable, Mapping
+
+    from perrin.diffusion import DiffusionEstimate
+    from perrin.results import ClusterResult, Report
+
+_CAPTIONS = {
+    "curves": (
+        "Mean square angular displacement (left) and mean square displacement (right) against lag "
+        "time. Points: the data, faint beyond a quarter of the track, where few independent "
+        "displacements remain. Band: one standard error of Brownian motion. Line: the "
+        "maximum-likelihood fit, which was made to the steps, not to these points. Open circles: "
+        "the same diffusion without noise. Dashed: the noise floor that the localisation error "
+        "predicts.",
+        "The points should follow the line within the band over the first quarter (neighbouring "
+        "lags wander together). Points that flatten towards the dashed line at short lags are "
+        "noise; a bend upwards at long lags is drift or driven motion, a plateau is confinement.",
+    ),
+    "residuals": (
+        "Root mean square distance of the particles to the rigid body fitted to the frame (top), "
+        "and how many particles were seen (bottom). Crosses mark frames without a pose.",
+        "Even scatter about the line is localisation error. Slow waves mean that the body is not "
+        "rigid, single spikes are bad localisations, and a step that stays is a swap of "
+        "identities.",
+    ),
+    "sphere": (
+        "Paths of the particles' directions on the unit sphere, lab axes; strong in front, faint "
+        "behind; an open circle ends each path.",
+        "A free body wanders without a preferred place. Long straight chords are jumps or gaps; "
+        "rings about one axis are driven or hindered rotation.",
+    ),
+    "angle": (
+        "Angle of the body in the plane since the first frame, full turns counted; breaks are "
+        "frames without a pose, an open circle ends the path.",
+        "A free body wanders without a trend. A steady slope is driven rotation; jumps are swaps "
+        "of identities.",
+    ),
+    "clusters": (
+        "Diffusion coefficients of all clusters with 68 % (thick) and 95 % (thin) intervals; the "
+        "vertical band is the pooled value with its own. Triangles are upper limits.",
+        "If all clusters diffuse alike, about one thin line in twenty misses the pooled line. Many "
+        "misses mean that the clusters differ, and the pooled value describes none of them.",
+    ),
+}
+
+# Up to so many warnings about single clusters are spelled out at the top as well.
+_SPELLED = 12
+
+_ARGUMENT_UNITS = {
+    "dt": "s",
+    "sigma": "µm",
+    "contact": "µm",
+    "viscosity": "Pa s",
+    "temperature": "K",
+    "scale": "µm per unit",
+}
+
+
+def write_run(report: Report, folder: str | os.PathLike[str], *, overwrite: bool = False) -> None:
+    """Write a run folder: the data, the figures and the HTML report; whole or not at all.
+
+    Parameters
+    ----------
+    report : Report
+    folder : path
+        Made new. Figures go to ``figures/``, the report to ``report.html``.
+    overwrite : bool
+        Replace an existing run folder.
+
+    Raises
+    ------
+    FileExistsError
+        If the folder exists and `overwrite` is not set, or is not a run folder.
+    """
+    with staged_folder(folder, overwrite=overwrite) as stage:
+        write_data(report, stage)
+        place = stage / "figures"
+        place.mkdir()
+        html = render_html(report, save_figures(report, place))
+        (stage / "report.html").write_text(html, encoding="utf-8")
+
+
+def render_html(report: Report, figures: Iterable[Path]) -> str:
+    """Return a report as one HTML page that needs no other file.
+
+    Parameters
+    ----------
+    report : Report
+    figures : iterable of Path
+        From `perrin.plot.save_figures`; the PNGs among them are put into the page.
+
+    Returns
+    -------
+    str
+    """
+    pictures = {f.stem: _inline(f) for f in figures if f.suffix == ".png"}
+    # Text of users (labels, paths) goes through the template alone, which escapes it.
+    environment = Environment(
+        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    template = files("perrin").joinpath("report.html.jinja").read_text(encoding="utf-8")
+    several = len(report.clusters) > 1
+    return environment.from_string(template).render(
+        **_provenance(report.settings),
+        several=several,
+        label=None if several else report.clusters[0].label,
+        headline=_headline(report),
+        overview=[_overview_row(c) for c in report.clusters] if several else [],
+        pooled=_pooled_row(report) if several else None,
+        warnings=report.warnings,
+        warned=[(c.cluster, c.name, c.warnings) for c in report.clusters if c.warnings],
+        spelled=sum(len(c.warnings) for c in report.clusters) <= _SPELLED,
+        overview_figure=_figure(pictures, "clusters", "clusters"),
+        clusters=[_section(c, pictures, report.settings) for c in report.clusters],
+        hidden=max(len(report.clusters) - MAX_CLUSTERS, 0),
+        planar=report.clusters[0].motion.template.shape[1] == 2,
+    )
+
+
+def _inline(file: Path) -> str:
+    return "data:image/png;base64," + base64.b64encode(file.read_bytes()).decode("ascii")
+
+
+def _figure(pictures: Mapping[str, str], stem: str, kind: str) -> dict[str, str] | None:
+    """Return a picture with its caption, or None where it was not drawn."""
+    if stem not in pictures:
+        return None
+    shows, look_for = _CAPTIONS[kind]
+    return {"source": pictures[stem], "kind": kind, "shows": shows, "look_for": look_for}
+
+
+def _headline(report: Report) -> list[dict[str, Any]]:
+    """Return D_R and D_T as the first thing to read: pooled where there are several clusters."""
+    estimates = (report.pooled.D_R, report.pooled.D_T)
+    return [{"letter": k} | _estimate(e) for k, e in zip("RT", estimates, strict=True)]
+
+
+def _overview_row(result: ClusterResult) -> dict[str, Any]:
+    """Return one cluster's line in the list of all."""
+    return {
+        "anchor": result.cluster,
+        "name": result.name,
+        "D_R": _estimate(result.D_R),
+        "D_T": _estimate(result.D_T),
+        "sigma": _length(result.motion.sigma),
+        "frames": result.motion.fitted.size,
+        "warnings": len(result.warnings),
+    }
+
+
+def _pooled_row(report: Report) -> dict[str, Any]:
+    """Return the pooled line, and which clusters it leaves out."""
+    used = set(report.pooled.clusters)
+    return {
+        "D_R": _estimate(report.pooled.D_R),
+        "D_T": _estimate(report.pooled.D_T),
+        "frames": report.pooled.D_R.n_frames,
+        "count": len(used),
+        "left_out": [c.name for c in report.clusters if c.cluster not in used],
+    }
+
+
+def _section(
+    result: ClusterResult, pictures: Mapping[str, str], settings: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Return everything the page says about one cluster."""
+    path = "angle" if result.motion.template.shape[1] == 2 else "sphere"
+    kinds = (("curves", "curves"), ("residuals", "residuals"), ("orientations", path))
+    stem = f"cluster-{result.cluster}"
+    drawn = [_figure(pictures, f"{stem}-{name}", kind) for name, kind in kinds]
+    return {
+        "anchor": result.cluster,
+        "name": result.name,
+        "estimates": [
+            {"letter": k} | _estimate(e)
+            for k, e in zip("RT", (result.D_R, result.D_T), strict=True)
+        ],
+        "facts": [*_noise_facts(result), *_body_facts(result)],
+        "sizes": _sizes(result),
+        "no_sizes": _why_no_sizes(result, settings),
+        "warnings": result.warnings,
+        "figures": [f for f in drawn if f],
+    }
+
+
+def _estimate(estimate: DiffusionEstimate) -> dict[str, Any]:
+    """Return an estimate in words: value, standard error and both intervals, one power of ten."""
+    high = estimate.ci95[1]
+    power = power_of(estimate.value if estimate.resolved or not np.isfinite(high) else high)
+    stderr = "–"
+    if estimate.resolved and np.isfinite(estimate.stderr):
+        stderr = _scaled(significant(estimate.stderr / 10.0**power, 2), power)
+    return {
+        "value": value_text(estimate),
+        "resolved": estimate.resolved,
+        "bare": bare_text(estimate),
+        "stderr": stderr,
+        "ci68": _interval(estimate.ci68, power),
+        "ci95": _interval(estimate.ci95, power),
+        "unit": unit_text(estimate.unit),
+    }
+
+
+def _interval(ends: tuple[float, float], power: int) -> str:
+    """Write an interval with two digits of its half width, or what is left without a bound."""
+    low, high = (end / 10.0**power for end in ends)
+    if not np.isfinite(high):
+        return f"above {_scaled(significant(low, 2), power)}" if low > 0 else "not bounded"
+    half = (high - low) / 2
+    decimals = max(1 - int(np.floor(np.log10(half))), 0) if half > 0 else 2
+    # An end without a bound is exactly 0, not 0 to some digits.
+    first = f"{low:.{decimals}f}" if low else "0"
+    return _scaled(f"{first} to {high:.{decimals}f}", power)
+
+
+def _scaled(text: str, power: int) -> str:
+    """Put a power of ten behind a number, or behind an interval in brackets."""
+    if not power:
+        return text
+    return f"({text}) × {ten_to(power)}" if " " in text else f"{text} × {ten_to(power)}"
+
+
+def _length(um: float) -> str:
+    """Write a length in nm, or in um where it is large."""
+    if not np.isfinite(um):
+        return "unknown"
+    return f"{number_text(1e3 * um)} nm" if um < 10 else f"{number_text(um)} µm"
+
+
+def _floor(phi2: float, stderr: float = 0.0) -> str:
+    """Write a noise floor as mean square angle and as angle."""
+    text = f"{number_text(phi2, stderr)} rad²"
+    if phi2 <= 0:
+        return f"{text} (negative: no angle)"
+    return f"{text} (Φ = {number_text(float(np.rad2deg(np.sqrt(phi2))))}°)"
+
+
+def _noise_facts(result: ClusterResult) -> list[tuple[str, str, str]]:
+    """Return name, value and remark of everything about the noise."""
+    motion, estimate = result.motion, result.D_R
+    error = floor_factor(motion) * estimate.offset_stderr
+    known = bool(np.isfinite(error))
+    measured = _floor(result.phi2_measured, error if known else 0.0)
+    remark = "offset of the steps, free in the fit"
+    remark += "" if known else "; its error is unknown: it lies on the edge of the possible"
+    snr = number_text(estimate.snr) if np.isfinite(estimate.snr) else "without bound"
+    facts = [
+        ("σ", _length(motion.sigma), "localisation error of one coordinate, from the residuals"),
+        ("Φ² measured", measured, remark),
+        ("Φ² predicted", _floor(result.noise.phi2), "from the localisation error and the shape"),
+        ("signal to noise", snr, "diffusion within Δt over the noise, variances of one angle"),
+    ]
+    if estimate.resolution_floor is not None:
+        text = f"{number_text(estimate.resolution_floor)} rad²/s"
+        facts.append(("resolution", text, "what a motionless cluster with this noise would read"))
+    return facts
+
+
+def _body_facts(result: ClusterResult) -> list[tuple[str, str, str]]:
+    """Return name, value and remark of what was tracked."""
+    motion = result.motion
+    n, d = motion.template.shape
+    frames = f"{motion.fitted.size} of {len(motion.time)}"
+    body = f"in {d} dimensions, mean distance to the centre {number_text(motion.R)} µm"
+    return [
+        ("frames used", frames, f"one every {motion.dt:g} s"),
+        ("particles", str(n), body),
+    ]
+
+
+def _sizes(result: ClusterResult) -> list[tuple[str, str, str]]:
+    """Return the diameters of cluster and sphere, um, from each of the two coefficients."""
+    if result.sizes is None:
+        return []
+    sizes = ((k, result.sizes[name]) for k, name in (("T", "translation"), ("R", "rotation")))
+    return [
+        (
+            letter,
+            f"{number_text(size.cluster, size.cluster_stderr)} µm",
+            f"{number_text(size.sphere, size.sphere_stderr)} µm",
+        )
+        for letter, size in sizes
+    ]
+
+
+def _why_no_sizes(result: ClusterResult, settings: Mapping[str, Any]) -> str:
+    """Say why there are no sizes."""
+    said = [w for w in result.warnings if w.startswith("no sizes: ")]
+    if said:
+        return said[0].removeprefix("no sizes: ")
+    if settings.get("arguments", {}).get("viscosity") is None:
+        return "viscosity and temperature were not given"
+    return "not computed"
+
+
+def _provenance(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return where the numbers come from: input, date, arguments, versions."""
+    source = settings.get("input", {})
+    path, created = source.get("path"), settings.get("created")
+    arguments = [
+        (name, "not given" if value is None else f"{value} {_ARGUMENT_UNITS.get(name, '')}".strip())
+        for name, value in settings.get("arguments", {}).items()
+    ]
+    return {
+        "input_name": Path(path).name if path else "table in memory",
+        "input_path": path or "a table in memory",
+        "sha256": source.get("sha256") or "none (no file)",
+        "date": f"{datetime.fromisoformat(created):%Y-%m-%d %H:%M} UTC" if created else "no date",
+        "arguments": arguments,
+        "versions": list(settings.get("versions", {}).items()),
+    }

@@ -1,0 +1,295 @@
+"""The command line as a user meets it: what it prints, writes, and with which status it ends."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+import pytest
+from typer.testing import CliRunner
+
+import perrin
+from perrin.cli import app
+
+
+class Outcome(NamedTuple):
+    returncode: int
+    stdout: str
+    stderr: str
+
+
+def run(*arguments: object, cwd: Path) -> Outcome:
+    """Call the command line in this process: the same code as a command, without its start."""
+    with contextlib.chdir(cwd):
+        result = CliRunner(env={"COLUMNS": "100", "NO_COLOR": "1"}).invoke(
+            app, [str(a) for a in arguments]
+        )
+    if result.exception is not None and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    return Outcome(result.exit_code, result.stdout, result.stderr)
+
+
+def command(*arguments: object, cwd: Path) -> Outcome:
+    """Run the command as a process of its own, every Python warning an error."""
+    words = [sys.executable, "-W", "error", "-m", "perrin.cli", *map(str, arguments)]
+    environment = os.environ | {"COLUMNS": "100", "NO_COLOR": "1"}
+    result = subprocess.run(words, cwd=cwd, env=environment, capture_output=True, text=True)
+    return Outcome(result.returncode, result.stdout, result.stderr)
+
+
+def refused(result: Outcome, status: int, *words: str) -> None:
+    """One clear line on stderr, the right status, no traceback."""
+    assert result.returncode == status, result.stderr
+    assert result.stderr.count("\n") == 1, result.stderr
+    assert result.stderr.startswith("perrin: ")
+    for word in words:
+        assert word in result.stderr
+
+
+@pytest.fixture(scope="module")
+def table() -> pd.DataFrame:
+    rng = np.random.default_rng(8)
+    truth = perrin.simulate_motion(
+        perrin.Cluster.touching(4, 2.45), D_R=5e-3, D_T=0.04, dt=0.73, n_frames=60, rng=rng
+    )
+    return perrin.positions_table(perrin.add_noise(truth.positions(), sigma=0.03, rng=rng))
+
+
+@pytest.fixture
+def csv(table: pd.DataFrame, tmp_path: Path) -> Path:
+    path = tmp_path / "tracks.csv"
+    perrin.write_tracks(table, path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    folder = tmp_path_factory.mktemp("demo")
+    result = command("demo", cwd=folder)
+    assert result.returncode == 0, result.stderr
+    return folder / "perrin-demo", result.stdout
+
+
+def test_demo_gives_the_planted_values_back(demo):
+    """The demo's 95 % intervals hold D_R = 4.93e-3 and D_T = 3.85e-2; sigma is 34 nm within 5 %."""
+    (cluster,) = json.loads((demo[0] / "summary.json").read_text())["clusters"]
+    assert cluster["D_R"]["ci95"][0] < 4.93e-3 < cluster["D_R"]["ci95"][1]
+    assert cluster["D_T"]["ci95"][0] < 3.85e-2 < cluster["D_T"]["ci95"][1]
+    assert cluster["sigma"] == pytest.approx(math.sqrt((2 * 0.03**2 + 0.04**2) / 3), rel=0.05)
+    assert cluster["phi2"]["predicted"] == pytest.approx(7.55e-4, rel=0.1)
+    assert cluster["n_frames"] == 300
+    assert cluster["warnings"] == []
+
+
+def test_demo_prints_a_short_table(demo):
+    """Coefficients with both intervals, sigma, noise floor and sizes are on the screen."""
+    for words in ("D_R (rad^2/s)", "D_T (um^2/s)", "68 %", "95 %", "sigma (nm)", "Phi^2", "1.844"):
+        assert words in demo[1]
+    assert len(demo[1].splitlines()) < 25
+
+
+def test_demo_writes_a_whole_run_folder(demo):
+    """Every file that a run folder promises is there, and nothing half-made beside it."""
+    names = {p.name for p in demo[0].iterdir()}
+    assert names == {
+        "summary.json", "tracks.parquet", "motion.parquet", "curves.csv", "figures",
+        "report.html", "run.json",
+    }  # fmt: skip
+    assert list((demo[0] / "figures").glob("*.png"))
+    assert [p.name for p in demo[0].parent.iterdir()] == ["perrin-demo"]
+
+
+def test_summary_has_the_promised_form(demo):
+    """summary.json has the keys of the contract, plain numbers, and null for the unknown."""
+    text = (demo[0] / "summary.json").read_text()
+    assert "NaN" not in text
+    assert "Infinity" not in text
+    summary = json.loads(text)
+    assert set(summary) == {"clusters", "pooled", "warnings"}
+    assert {"D_R", "D_T", "p_same"} <= set(summary["pooled"])
+    (cluster,) = summary["clusters"]
+    assert {
+        "cluster", "n_particles", "n_frames", "D_R", "D_T", "sigma", "sigma_xyz", "phi2", "snr",
+        "tensor", "sizes", "warnings",
+    } <= set(cluster)  # fmt: skip
+    estimate = {"value", "ci68", "ci95", "stderr", "unit", "method", "resolved"}
+    assert estimate <= set(cluster["D_R"])
+    assert (cluster["D_R"]["unit"], cluster["D_T"]["unit"]) == ("rad^2/s", "um^2/s")
+    for key in ("sphere_T", "sphere_R", "cluster_T", "cluster_R"):
+        assert set(cluster["sizes"][key]) == {"value", "stderr"}
+    run_record = json.loads((demo[0] / "run.json").read_text())
+    assert len(run_record["input"]["sha256"]) == 64
+    assert run_record["arguments"]["dt"] == 0.73
+
+
+def test_tables_of_the_run_agree_with_the_package(demo):
+    """Motion, curves and tracks read back to what the summary says."""
+    report = perrin.load_run(demo[0])
+    assert report.to_dict() == json.loads((demo[0] / "summary.json").read_text())
+    curves = pd.read_csv(demo[0] / "curves.csv")
+    msad = curves[curves["quantity"] == "msad"]
+    np.testing.assert_allclose(msad["value"], perrin.msad(report.clusters[0].motion).value)
+    again = perrin.estimate_diffusion(report.clusters[0].motion)
+    assert again.value == pytest.approx(report.clusters[0].D_R.value, rel=1e-9)
+    assert list(report.tracks) == ["frame", "particle", "x", "y", "z", "cluster"]
+
+
+def test_demo_replaces_only_its_own(tmp_path):
+    """A folder called perrin-demo that perrin did not make is not touched."""
+    (tmp_path / "perrin-demo").mkdir()
+    (tmp_path / "perrin-demo" / "thesis.txt").write_text("precious")
+    refused(run("demo", cwd=tmp_path), 2, "perrin-demo", "not overwritten")
+    assert (tmp_path / "perrin-demo" / "thesis.txt").read_text() == "precious"
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".csv.gz", ".parquet", ".gdf"])
+def test_every_format_gives_the_same_answer(table, tmp_path, suffix):
+    """The same tracks in four formats give the same summary."""
+    path = tmp_path / f"tracks{suffix}"
+    whole = table.drop(columns="cluster") if suffix == ".gdf" else table
+    perrin.write_tracks(whole, path)
+    result = run("analyze", path, "--dt", 0.73, "-o", tmp_path / "run", cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    (cluster,) = json.loads((tmp_path / "run" / "summary.json").read_text())["clusters"]
+    expected = perrin.analyze(table, dt=0.73).clusters[0].D_R.value
+    assert cluster["D_R"]["value"] == pytest.approx(expected, rel=1e-12)
+
+
+def test_options_reach_the_analysis(csv, tmp_path):
+    """Options do on the command line what the arguments do in Python."""
+    options = ("--scale", "2,2,2", "--frames", "5:50", "--sigma", "0.06,0.06,0.06")
+    options += ("--viscosity", "1e-3", "--temperature", "300", "--columns", "x=2,y=3,z=4")
+    result = run("analyze", csv, "--dt", "0.5", *options, "-o", "run", cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    expected = perrin.analyze(
+        csv, dt=0.5, scale=2, frames=(5, 50), sigma=0.06, viscosity=1e-3, temperature=300
+    )
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert summary == json.loads(json.dumps(expected.to_dict()))
+
+
+def test_an_existing_folder_is_refused_without_overwrite(csv, tmp_path):
+    """The same command twice ends with status 2, and with --overwrite it replaces the run."""
+    words = ("analyze", csv, "--dt", 0.73, "-o", tmp_path / "run")
+    assert run(*words, cwd=tmp_path).returncode == 0
+    refused(run(*words, cwd=tmp_path), 2, "run", "exists", "--overwrite")
+    assert run(*words, "--overwrite", cwd=tmp_path).returncode == 0
+    assert {p.name for p in tmp_path.iterdir()} == {"tracks.csv", "run"}
+
+
+def _spoiled(table: pd.DataFrame, column: str, value: object) -> pd.DataFrame:
+    bad = table.astype({column: object}).copy()
+    bad.loc[7, column] = value
+    return bad
+
+
+BAD_TABLES = {
+    "missing column": (lambda t: t.drop(columns="frame"), 2, ("frame",)),
+    "text in a number": (lambda t: _spoiled(t, "x", "lost"), 2, ("line 9", "lost", "x")),
+    "duplicate": (lambda t: pd.concat([t, t.iloc[[3]]]), 2, ("line 242", "frame", "particle")),
+    "inf": (lambda t: _spoiled(t, "y", "inf"), 2, ("line 9", "y", "inf")),
+    "NaN frame": (lambda t: _spoiled(t, "frame", None), 2, ("line 9", "frame")),
+    "NaN particle": (lambda t: _spoiled(t, "particle", None), 2, ("line 9", "particle")),
+    "one frame": (lambda t: t[t["frame"] == 3], 1, ("1 frame",)),
+    "two particles": (lambda t: t[t["particle"] < 2], 1, ("2 particles",)),
+    "collinear": (lambda t: t.assign(x=t["particle"], y=0.0, z=0.0), 1, ("one line",)),
+    "no rows": (lambda t: t.iloc[:0], 2, ()),
+}
+
+
+@pytest.mark.parametrize("name", BAD_TABLES)
+def test_bad_tables_get_one_line_and_no_folder(table, tmp_path, name):
+    """Each bad table is refused with file, row and remedy, and leaves nothing behind."""
+    spoil, status, words = BAD_TABLES[name]
+    spoil(table).to_csv(tmp_path / "bad.csv", index=False)
+    result = run("analyze", "bad.csv", "--dt", 0.73, "-o", "run", cwd=tmp_path)
+    refused(result, status, *words)
+    if status == 2:
+        assert "bad.csv" in result.stderr
+    assert [p.name for p in tmp_path.iterdir()] == ["bad.csv"]
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("empty.csv", b""),
+        ("picture.csv", b"\x89PNG\r\n\x1a\n" + bytes(range(256)) * 9),
+        ("prose.csv", b"Dear diary,\ntoday the cluster\nturned, twice, and then, once more\n"),
+        ("wrong.parquet", b"not a parquet file at all"),
+        ("wrong.gdf", b"GIF89a" + bytes(200)),
+        ("tracks.xyz", b"1 2 3"),
+    ],
+)
+def test_files_that_are_no_tables_are_refused(tmp_path, name, content):
+    """An empty file, binary rubbish, prose and unknown kinds end with status 2 and the name."""
+    (tmp_path / name).write_bytes(content)
+    refused(run("analyze", name, "--dt", 1, "-o", "run", cwd=tmp_path), 2, name)
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_gdf_cut_short_is_refused(table, tmp_path):
+    """A .gdf that ends before its header says so is no table."""
+    path = tmp_path / "tracks.gdf"
+    perrin.write_tracks(table.drop(columns="cluster"), path)
+    path.write_bytes(path.read_bytes()[:-100])
+    refused(run("analyze", path, "--dt", 1, "-o", "run", cwd=tmp_path), 2, "tracks.gdf", "short")
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (("--dt", "0"), ("dt", "> 0")),
+        (("--dt", "-1"), ("dt", "> 0")),
+        (("--dt", "1", "--scale", "0"), ("scale",)),
+        (("--dt", "1", "--scale", "big"), ("--scale", "big")),
+        (("--dt", "1", "--frames", "9"), ("--frames", "A:B")),
+        (("--dt", "1", "--columns", "x"), ("--columns",)),
+        (("--dt", "1", "--contact", "-2"), ("contact",)),
+        (("--dt", "1", "--viscosity", "1e-3"), ("temperature",)),
+    ],
+)
+def test_wrong_arguments_end_with_status_2(csv, tmp_path, options, words):
+    """Each argument out of range is named, and no folder is made."""
+    refused(run("analyze", csv, *options, "-o", "run", cwd=tmp_path), 2, *words)
+    assert not (tmp_path / "run").exists()
+
+
+def test_missing_input_and_unwritable_output(csv, tmp_path):
+    """A missing file and an output below a file are named, status 2."""
+    missing = command("analyze", "nowhere.csv", "--dt", 1, "-o", "run", cwd=tmp_path)
+    refused(missing, 2, "nowhere.csv")
+    below = tmp_path / "tracks.csv" / "run"
+    refused(run("analyze", csv, "--dt", 1, "-o", below, cwd=tmp_path), 2, "tracks.csv")
+    result = run("analyze", csv, cwd=tmp_path)
+    assert result.returncode == 2
+    assert "--dt" in result.stderr
+
+
+def test_simulate_and_convert_close_the_circle(tmp_path):
+    """A simulated table, converted to every format and back, is the same table."""
+    options = ("--radius", 1.5, "--d-r", 5e-3, "--d-t", 0.04, "--sigma", "0.03,0.03,0.04")
+    options += ("--frames", 20, "--dt", 0.7, "--seed", 5)
+    first = tmp_path / "a.parquet"
+    assert run("simulate", "tetrahedron", *options, "-o", first, cwd=tmp_path).returncode == 0
+    again = tmp_path / "b.csv.gz"
+    assert run("convert", first, again, cwd=tmp_path).returncode == 0
+    pd.testing.assert_frame_equal(perrin.read_tracks(first), perrin.read_tracks(again))
+    assert len(perrin.read_tracks(first)) == 80
+    assert run("simulate", "trimer", *options, "-o", "c.gdf", cwd=tmp_path).returncode == 0
+    refused(run("simulate", "cube", *options, "-o", "d.csv", cwd=tmp_path), 2, "cube", "trimer")
+
+
+def test_help_and_version():
+    """The help names every command; the version is the package's."""
+    result = command("--help", cwd=Path.cwd())
+    for name in ("demo", "analyze", "simulate", "convert"):
+        assert name in result.stdout
+    assert run("--version", cwd=Path.cwd()).stdout.strip() == perrin.__version__

@@ -1,0 +1,107 @@
+"""The doors of the house: what an import costs, who imports whom, that the README is true."""
+
+from __future__ import annotations
+
+import ast
+import re
+import runpy
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+import perrin
+
+ROOT = Path(__file__).resolve().parents[1]
+SOURCE = ROOT / "src" / "perrin"
+
+# The house, top to bottom: a room imports only rooms above it.
+ROOMS = [
+    "_arrays", "rotations", "shapes", "noise", "motion", "grouping", "lagged", "diffusion",
+    "hydrodynamics", "simulate", "files", "results", "analysis", "plot", "report", "cli",
+]  # fmt: skip
+LAZY = ("pandas", "scipy", "matplotlib", "pyarrow", "jinja2", "typer", "rich", "trackpy", "numba")
+
+
+def loaded_after(statement: str) -> set[str]:
+    code = f"{statement}\nimport sys\nprint(*sys.modules)"
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+    return set(result.stdout.split())
+
+
+def test_import_is_light():
+    """`import perrin` and all numerical names load numpy alone, under 250 modules."""
+    assert len(loaded_after("import perrin")) < 250
+    names = [n for n in perrin.__all__ if n != "write_run"]
+    modules = loaded_after(f"from perrin import {', '.join(names)}")
+    assert len(modules) < 250
+    assert modules.isdisjoint(LAZY)
+
+
+def test_public_names_are_the_ones_listed():
+    """Every name in __all__ loads, its room is the one listed, and no other name is invented."""
+    assert sorted(n for names in perrin._ROOMS.values() for n in names) == sorted(perrin.__all__)
+    for room, names in perrin._ROOMS.items():
+        for name in names:
+            assert getattr(perrin, name).__module__ == f"perrin.{room}"
+    with pytest.raises(AttributeError, match="no attribute 'nonsense'"):
+        _ = perrin.nonsense
+
+
+def imports_of(path: Path) -> set[str]:
+    """Return every module that a file imports, anywhere in it."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            found.add(node.module)
+    return found
+
+
+def test_rooms_import_only_rooms_above_them():
+    """The import rule of ARCHITECTURE.md, and that every room is on the list."""
+    assert {p.stem for p in SOURCE.glob("*.py")} == {*ROOMS, "__init__"}
+    for place, room in enumerate(ROOMS):
+        used = {m.split(".")[1] for m in imports_of(SOURCE / f"{room}.py") if "perrin." in m}
+        assert used <= set(ROOMS[:place]), room
+
+
+def test_only_plot_imports_matplotlib():
+    """Pictures stand at the door: no other room knows matplotlib."""
+    users = {p.stem for p in SOURCE.glob("*.py") if any("matplotlib" in m for m in imports_of(p))}
+    assert users == {"plot"}
+
+
+def test_help_answers_at_once():
+    """`perrin --help` takes under 0.4 s (the best of five: the machine may be busy)."""
+    durations = []
+    for _ in range(5):
+        start = time.perf_counter()
+        subprocess.run([sys.executable, "-m", "perrin.cli", "--help"], capture_output=True)
+        durations.append(time.perf_counter() - start)
+    assert min(durations) < 0.4
+
+
+def test_the_readme_code_runs(tmp_path, monkeypatch, capsys):
+    """The README's Python example runs as it stands and prints what it says."""
+    monkeypatch.chdir(tmp_path)
+    (code,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+    exec(compile(code, "README.md", "exec"), {})
+    printed = capsys.readouterr().out
+    promised = re.findall(r"^# (D_[RT] = .*)$", code, re.MULTILINE)
+    assert promised
+    for line in promised:
+        assert line in printed
+
+
+def test_the_demo_table_is_remade_by_its_recipe():
+    """The embedded table is what examples/make_demo_table.py makes, to the last digit."""
+    remade = runpy.run_path(str(ROOT / "examples" / "make_demo_table.py"))["demo_table"]()
+    embedded = perrin.read_tracks(SOURCE / "data" / "demo_tracks.csv.gz")
+    pd.testing.assert_frame_equal(embedded, remade[list(embedded)], check_exact=True)

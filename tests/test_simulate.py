@@ -1,0 +1,293 @@
+"""Simulated motions obey the law they were planted with."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from perrin import Cluster, add_noise, simulate_motion
+from perrin.rotations import log_map
+
+BODY = Cluster.tetrahedron(1.5)
+PLANE = Cluster.from_positions([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+TENSOR = np.array([[3.0, 0.5, 0.2], [0.5, 2.0, -0.3], [0.2, -0.3, 1.0]]) * 1e-3
+
+
+def simulate(cluster=BODY, **options):
+    """Return a motion with defaults that may be overridden."""
+    options = {"D_R": 1e-2, "dt": 1.0, "n_frames": 10, "rng": 1} | options
+    return simulate_motion(cluster, **options)
+
+
+def steps(motion):
+    """Return the body-frame rotation of every step, R_k^T R_{k+1}."""
+    return np.swapaxes(motion.rotation[:-1], -1, -2) @ motion.rotation[1:]
+
+
+def mean_and_error(sample):
+    """Return the mean over the first axis and its standard error."""
+    return sample.mean(0), sample.std(0) / np.sqrt(len(sample))
+
+
+# ---- the law of the steps -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1e-4, 1e-2, 0.1, 0.5, 0.99, 1.01, 2.0])
+def test_the_step_law_at_any_step(scale):
+    """<cos> = (3 exp(-2 D dt) - 1)/2 and degree 2 decays by exp(-6 D dt), within 4 errors."""
+    motion = simulate(D_R=scale / 0.7, dt=0.7, n_frames=100_001, rng=31)
+    angle = np.linalg.norm(log_map(steps(motion)), axis=1)
+    # 1 - <cos> by the half angle, so that nothing cancels at D dt = 1e-6.
+    loss, error = mean_and_error(2 * np.sin(angle / 2) ** 2)
+    assert abs(loss + 1.5 * np.expm1(-2 * scale)) < 4 * error
+    cos = np.cos(angle)
+    character = 4 * cos**2 + 2 * cos - 1  # 1 + 2 cos a + 2 cos 2a
+    mean, error = mean_and_error(character)
+    assert abs(mean - 5 * np.exp(-6 * scale)) < 4 * error + 1e-12
+
+
+@pytest.mark.parametrize("scale", [1e-6, 0.3, 1.5])
+def test_the_axes_of_the_steps_are_uniform(scale):
+    """Isotropic steps point nowhere in particular: <u> = 0, <u u^T> = 1/3, within 4.5 errors."""
+    v = log_map(steps(simulate(D_R=scale, n_frames=50_001, rng=32)))
+    u = v / np.linalg.norm(v, axis=1, keepdims=True)
+    mean, error = mean_and_error(u)
+    assert np.all(np.abs(mean) < 4.5 * error)
+    mean, error = mean_and_error(u[:, :, None] * u[:, None])
+    assert np.all(np.abs(mean - np.eye(3) / 3) < 4.5 * error)
+
+
+@pytest.mark.parametrize("tensor", [TENSOR, np.diag(TENSOR), 1e-3, [1e-3, 0.0, 0.0]])
+def test_the_planted_tensor_is_in_the_steps(tensor):
+    """<theta theta^T> = 2 D dt in body axes, within 4.5 errors and the second order in D dt."""
+    dt = 0.5
+    planted = np.asarray(tensor)
+    if planted.ndim < 2:
+        planted = np.diag(np.broadcast_to(planted, 3))
+    v = log_map(steps(simulate(D_R=tensor, dt=dt, n_frames=40_001, rng=33)))
+    mean, error = mean_and_error(v[:, :, None] * v[:, None])
+    assert np.all(
+        np.abs(mean - 2 * planted * dt) <= 4.5 * error + 4 * (np.trace(planted) * dt) ** 2
+    )
+
+
+def test_a_large_anisotropic_step_decays_by_its_tensor():
+    """E[R] = exp(-(tr D - D) dt) for any tensor, also when 2 D dt is of order one (4.5 errors)."""
+    dt = 200.0
+    r = steps(simulate(D_R=TENSOR, dt=dt, n_frames=20_001, rng=34))
+    values, axes = np.linalg.eigh(np.trace(TENSOR) * np.eye(3) - TENSOR)
+    expected = axes @ np.diag(np.exp(-values * dt)) @ axes.T
+    mean, error = mean_and_error(r)
+    assert np.all(np.abs(mean - expected) < 4.5 * error)
+    assert expected.max() < 0.6
+
+
+def test_body_axes_are_meant():
+    """The tensor is fixed in the body: lab-frame steps of a body that turned are isotropic."""
+    motion = simulate(D_R=[0.0, 0.0, 0.01], n_frames=1000, rng=35)
+    z = motion.rotation[:, :, 2]
+    np.testing.assert_allclose(z, np.broadcast_to([0.0, 0.0, 1.0], z.shape), atol=1e-12)
+    mixed = simulate(D_R=[0.02, 0.02, 0.0], n_frames=5000, rng=36)
+    body = log_map(steps(mixed))
+    lab = np.einsum("tij,tj->ti", mixed.rotation[:-1], body)
+    assert np.var(body[:, 2]) < 0.01 * np.var(body[:, 0])
+    assert np.var(lab[:, 2]) > 0.5 * np.var(lab[:, 0])
+
+
+def test_a_tensor_of_equal_values_is_the_number():
+    """One D_R, three equal values and a multiple of the unit matrix give the same bits."""
+    one = simulate(D_R=2e-3, n_frames=50)
+    for same in ([2e-3] * 3, 2e-3 * np.eye(3)):
+        np.testing.assert_array_equal(simulate(D_R=same, n_frames=50).rotation, one.rotation)
+    turn = Rotation.random(random_state=2).as_matrix()
+    rounded = simulate(D_R=turn @ (2e-3 * np.eye(3)) @ turn.T, n_frames=50)
+    np.testing.assert_allclose(rounded.rotation, one.rotation, atol=1e-12)
+
+
+def test_steps_compose():
+    """Two steps of dt have the law of one step of 2 dt: E over pairs = exp(-4 D dt), 4 errors."""
+    r = simulate(D_R=0.1, n_frames=100_001, rng=37).rotation
+    two = np.einsum("tii->t", np.swapaxes(r[:-2:2], 1, 2) @ r[2::2]) / 3
+    mean, error = mean_and_error(two)
+    assert abs(mean - np.exp(-0.4)) < 4 * error
+
+
+# ---- the paper's scheme -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("scale", [1e-3, 0.05, 0.25])
+def test_eulers_scheme_has_the_right_mean(scale):
+    """Eq. 16: E[R] = exp(-2 D dt) 1 exactly, within 4.5 errors."""
+    r = simulate(D_R=scale, n_frames=50_001, scheme="euler", rng=38).rotation
+    # The paper multiplies in the lab, so its steps are R_{k+1} R_k^T.
+    left = r[1:] @ np.swapaxes(r[:-1], -1, -2)
+    mean, error = mean_and_error(left)
+    assert np.all(np.abs(mean - np.exp(-2 * scale) * np.eye(3)) < 4.5 * error)
+
+
+def test_finite_steps_of_both_schemes():
+    """At D dt = 0.25 <alpha^2>/4 D dt of a lab axis is 0.913 for Brownian steps, about any axis.
+
+    (facts/estimation.md, 1c.) Euler's scheme is not isotropic there: its y axis differs from z.
+    """
+    z, y = np.eye(3)[2], np.eye(3)[1]
+    r = simulate(D_R=0.25, n_frames=200_001, rng=40).rotation
+    s = simulate(D_R=0.25, n_frames=200_001, scheme="euler", rng=39).rotation
+    brownian, euler = (q[1:] @ np.swapaxes(q[:-1], 1, 2) for q in (r, s))
+    ratio, error = mean_and_error(np.sum(log_map(brownian) ** 2, axis=1) / 1.5)
+    assert abs(ratio - 0.9582) < 4 * error + 5e-5
+    for axis in (z, y):
+        ratio, error = mean_and_error(np.arccos(np.clip(brownian @ axis @ axis, -1, 1)) ** 2)
+        assert abs(ratio - 0.9131) < 4 * error + 5e-5
+    square = [np.arccos(np.clip(euler @ axis @ axis, -1, 1)) ** 2 for axis in (z, y)]
+    difference, error = mean_and_error(square[1] - square[0])
+    assert difference > 4 * error
+
+
+def test_eulers_scheme_is_equation_16():
+    """A step is R_x R_y R_z with angles of standard deviation sqrt(2 D dt): the same draws."""
+    angles = np.random.default_rng(41).normal(scale=np.sqrt(2 * 0.01 * 0.5), size=(20, 3))
+    expected = [np.eye(3)]
+    for triple in angles:
+        expected.append(Rotation.from_euler("XYZ", triple).as_matrix() @ expected[-1])
+    got = simulate(D_R=0.01, dt=0.5, n_frames=21, scheme="euler", rng=41).rotation
+    np.testing.assert_allclose(got, expected, atol=1e-13)
+
+
+# ---- translation, the plane, the frame ----------------------------------------------------------
+
+
+@pytest.mark.parametrize("cluster", [BODY, PLANE])
+def test_translation_variance(cluster):
+    """Each coordinate of the centre moves by 2 D_T dt a step, within 4.5 errors, uncorrelated."""
+    d = cluster.positions.shape[1]
+    motion = simulate(cluster, D_T=0.04, dt=0.7, n_frames=50_001, rng=42)
+    jump = np.diff(motion.center, axis=0)
+    mean, error = mean_and_error(jump[:, :, None] * jump[:, None])
+    assert np.all(np.abs(mean - 2 * 0.04 * 0.7 * np.eye(d)) < 4.5 * error)
+    mean, error = mean_and_error(jump)
+    assert np.all(np.abs(mean) < 4.5 * error)
+    mean, error = mean_and_error(jump[1:] * jump[:-1])
+    assert np.all(np.abs(mean) < 4.5 * error)
+
+
+@pytest.mark.parametrize("scale", [1e-5, 0.1, 2.0])
+def test_the_plane_has_one_angle(scale):
+    """In 2-D the turn of a step is Gaussian of variance 2 D dt: <cos> = exp(-D dt), 4 errors."""
+    motion = simulate(PLANE, D_R=scale, n_frames=50_001, rng=43)
+    assert motion.rotation.shape == (50_001, 2, 2)
+    angle = log_map(steps(motion))[:, 0]
+    mean, error = mean_and_error(2 * np.sin(angle / 2) ** 2)
+    assert abs(mean + np.expm1(-scale)) < 4 * error
+    mean, error = mean_and_error(np.sin(angle))
+    assert abs(mean) < 4 * error
+
+
+def test_the_truth_is_a_rigid_body():
+    """Frame 0 counts, unturned at the origin; the particles keep their places in the body."""
+    motion = simulate(D_T=0.1, dt=0.5, n_frames=200)
+    np.testing.assert_array_equal(motion.rotation[0], np.eye(3))
+    np.testing.assert_array_equal(motion.center[0], np.zeros(3))
+    np.testing.assert_array_equal(motion.time, 0.5 * np.arange(200))
+    x = motion.positions()
+    assert x.shape == (200, 4, 3)
+    np.testing.assert_allclose(x.mean(1), motion.center, atol=1e-13)
+    sides = np.linalg.norm(x[:, 1:] - x[:, :1], axis=-1)
+    np.testing.assert_allclose(sides, np.broadcast_to(sides[0], sides.shape), rtol=1e-12)
+    assert motion.sigma == 0.0
+    assert not motion.covariance.any()
+    assert simulate(n_frames=1).positions().shape == (1, 4, 3)
+
+
+def test_long_products_stay_rotations():
+    """After 300 000 steps the matrices are orthogonal to 1e-12."""
+    r = simulate(D_R=0.1, n_frames=300_001).rotation[-10:]
+    np.testing.assert_allclose(
+        r @ np.swapaxes(r, 1, 2), np.broadcast_to(np.eye(3), r.shape), atol=1e-12
+    )
+
+
+def test_no_motion_without_diffusion():
+    """D_R = 0 and D_T = 0 leave every particle exactly where it was."""
+    for scheme in ("brownian", "euler"):
+        for zero in (0, 0.0, [0.0, 0.0, 0.0]):
+            motion = simulate(D_R=zero, scheme=scheme)
+            np.testing.assert_array_equal(motion.rotation, np.broadcast_to(np.eye(3), (10, 3, 3)))
+            assert not motion.center.any()
+
+
+@pytest.mark.parametrize("options", [{}, {"scheme": "euler"}, {"D_R": [1e-3, 2e-3, 3e-3]}])
+def test_one_seed_one_motion(options):
+    """The same seed gives the same bits, as a number or a generator; another seed other ones."""
+    one = simulate(D_T=0.1, rng=5, **options)
+    two = simulate(D_T=0.1, rng=np.random.default_rng(5), **options)
+    np.testing.assert_array_equal(one.positions(), two.positions())
+    assert not np.array_equal(simulate(D_T=0.1, rng=6, **options).positions(), one.positions())
+    state = np.random.default_rng(5)
+    first, second = simulate(rng=state, **options), simulate(rng=state, **options)
+    assert not np.array_equal(first.rotation, second.rotation)
+
+
+@pytest.mark.parametrize(
+    ("options", "word"),
+    [
+        ({"dt": 0}, "dt"),
+        ({"dt": -1}, "dt"),
+        ({"dt": np.nan}, "dt"),
+        ({"n_frames": 0}, "n_frames"),
+        ({"n_frames": 2.5}, "n_frames"),
+        ({"D_T": -1}, "D_T"),
+        ({"D_T": np.nan}, "D_T"),
+        ({"D_T": [1, 2, 3]}, "D_T"),
+        ({"D_R": -1e-3}, "D_R"),
+        ({"D_R": np.inf}, "D_R"),
+        ({"D_R": [1, 2]}, "D_R"),
+        ({"D_R": [1, 2, -1e-3]}, "D_R"),
+        ({"D_R": np.ones((2, 2))}, "D_R"),
+        ({"D_R": [[1, 2, 0], [0, 1, 0], [0, 0, 1]]}, "D_R"),
+        ({"D_R": [[1, 2, 0], [2, 1, 0], [0, 0, 1]]}, "D_R"),
+        ({"D_R": [1, 2, 3], "scheme": "euler"}, "euler"),
+        ({"cluster": PLANE, "scheme": "euler"}, "euler"),
+        ({"cluster": PLANE, "D_R": [1, 2, 3]}, "D_R"),
+        ({"scheme": "verlet"}, "scheme"),
+    ],
+)
+def test_what_has_no_meaning_is_refused(options, word):
+    """Bad numbers, bad tensors and unknown schemes raise a ValueError that names them."""
+    with pytest.raises(ValueError, match=word):
+        simulate(**options)
+
+
+# ---- noise --------------------------------------------------------------------------------------
+
+
+def test_noise_has_its_sigma_on_every_axis():
+    """The added errors have the planted variances (4.5 errors), no mean and no correlation."""
+    x = np.random.default_rng(50).normal(size=(20_000, 4, 3)) + 100
+    sigma = np.array([0.03, 0.02, 0.05])
+    noise = (add_noise(x, sigma=sigma, rng=51) - x).reshape(-1, 3)
+    mean, error = mean_and_error(noise[:, :, None] * noise[:, None])
+    assert np.all(np.abs(mean - np.diag(sigma**2)) < 4.5 * error)
+    mean, error = mean_and_error(noise)
+    assert np.all(np.abs(mean) < 4.5 * error)
+
+
+def test_noise_leaves_its_input_and_its_holes():
+    """The input stays, missing points stay missing, sigma 0 adds nothing, one seed one answer."""
+    x = np.zeros((5, 2, 3))
+    x[2, 1] = np.nan
+    before = x.copy()
+    noisy = add_noise(x, sigma=0.1, rng=1)
+    np.testing.assert_array_equal(x, before)
+    np.testing.assert_array_equal(np.isnan(noisy), np.isnan(x))
+    np.testing.assert_array_equal(noisy, add_noise(x, sigma=0.1, rng=np.random.default_rng(1)))
+    np.testing.assert_array_equal(add_noise(x, sigma=0, rng=1), x)
+    assert add_noise(x[..., :2], sigma=[0.1, 0.2], rng=1).shape == (5, 2, 2)
+
+
+@pytest.mark.parametrize("sigma", [-1, np.nan, [1, 2], np.ones((5, 2, 3))])
+def test_noise_refuses_what_is_no_sigma(sigma):
+    """A negative, missing or misshapen sigma, and positions of the wrong shape, are refused."""
+    with pytest.raises(ValueError, match="sigma"):
+        add_noise(np.zeros((5, 2, 3)), sigma=sigma, rng=1)
+    with pytest.raises(ValueError, match="positions"):
+        add_noise(np.zeros((5, 3)), sigma=0.1, rng=1)
