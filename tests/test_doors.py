@@ -21,7 +21,7 @@ SOURCE = ROOT / "src" / "perrin"
 # The house, top to bottom: a room imports only rooms above it.
 ROOMS = [
     "_arrays", "rotations", "shapes", "noise", "motion", "grouping", "lagged", "diffusion",
-    "hydrodynamics", "simulate", "files", "results", "analysis", "plot", "report", "cli",
+    "hydrodynamics", "simulate", "gdf", "files", "results", "analysis", "plot", "report", "cli",
 ]  # fmt: skip
 LAZY = ("pandas", "scipy", "matplotlib", "pyarrow", "jinja2", "typer", "rich", "trackpy", "numba")
 

@@ -54,6 +54,14 @@ class TrackTableError(ValueError):
         self.faults = faults
 
 
+def table_error(source: str, *faults: str) -> TrackTableError:
+    """Return the error that lists all faults of one table."""
+    if len(faults) == 1:
+        return TrackTableError(f"{source}: {faults[0]}", faults)
+    lines = "".join(f"\n  - {fault}" for fault in faults)
+    return TrackTableError(f"{source}: {len(faults)} faults in this track table{lines}", faults)
+
+
 class PrecisionWarning(UserWarning):
     """The number is right but says less than it seems to."""
 

@@ -199,7 +199,7 @@ def _one_line(error: Exception) -> str:
     """Return an error's message on one line, the system's with the file first."""
     if isinstance(error, OSError) and error.strerror and error.filename:
         return f"{error.filename}: {error.strerror}"
-    return "; ".join(line.strip() for line in str(error).splitlines())
+    return "; ".join(line.strip().removeprefix("- ") for line in str(error).splitlines())
 
 
 def _numbers(option: str, text: str) -> float | list[float]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gzip
 import io
-import math
 import os
 import zlib
 from dataclasses import dataclass
@@ -13,7 +12,8 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
-from perrin._arrays import Bools, Floats, Ints, TrackTableError
+from perrin._arrays import Bools, Floats, Ints, table_error
+from perrin.gdf import gdf_bytes, parse_gdf
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -27,8 +27,6 @@ _COLUMNS = (*_REQUIRED, "z", "cluster", "time")
 _SUFFIXES = (".csv", ".csv.gz", ".parquet", ".gdf")
 _LARGEST_EXACT = 2**53
 
-_GDF_MAGIC = 82991
-_GDF_TYPES = {1: "u1", 2: "i2", 3: "i4", 4: "f4", 5: "f8"}
 _GDF_COLUMNS = {
     4: ("x", "y", "frame", "particle"),
     5: ("x", "y", "z", "frame", "particle"),
@@ -194,14 +192,6 @@ def write_tracks(table: pd.DataFrame, path: _PathLike) -> None:
 # ---- messages -----------------------------------------------------------------------------------
 
 
-def _error(source: str, *faults: str) -> TrackTableError:
-    """Return the error that lists all faults of one table."""
-    if len(faults) == 1:
-        return TrackTableError(f"{source}: {faults[0]}", faults)
-    lines = "".join(f"\n  - {fault}" for fault in faults)
-    return TrackTableError(f"{source}: {len(faults)} faults in this track table{lines}", faults)
-
-
 @dataclass(frozen=True)
 class _Rows:
     """How messages name rows: lines of a csv file, or rows of a table."""
@@ -244,7 +234,7 @@ def _checked(table: pd.DataFrame, source: str, rows: _Rows) -> pd.DataFrame:
             faults += found
     faults += _repeat_faults(clean, rows)
     if faults:
-        raise _error(source, *faults)
+        raise table_error(source, *faults)
     return pd.DataFrame(clean)
 
 
@@ -429,7 +419,9 @@ def _suffix(name: str) -> str:
     for suffix in _SUFFIXES:
         if name.lower().endswith(suffix):
             return suffix
-    raise _error(name, f"unknown kind of file; expected a name ending in {', '.join(_SUFFIXES)}")
+    raise table_error(
+        name, f"unknown kind of file; expected a name ending in {', '.join(_SUFFIXES)}"
+    )
 
 
 def _scaled(tracks: pd.DataFrame, scale: ArrayLike) -> pd.DataFrame:
@@ -454,7 +446,7 @@ def _named(table: pd.DataFrame, columns: Mapping[str, str | int], source: str) -
     names = list(table.columns)
     places, faults = _places(names, columns)
     if faults:
-        raise _error(source, *faults)
+        raise table_error(source, *faults)
     rest = [i for i, n in enumerate(names) if i not in places.values() and n not in places]
     named = table.iloc[:, [*places.values(), *rest]]
     named.columns = [*places, *(names[i] for i in rest)]
@@ -482,7 +474,7 @@ def _places(names: list[Any], columns: Mapping[str, str | int]) -> tuple[dict[st
 
 def _gdf_columns(n_columns: int, source: str) -> dict[str, int]:
     if n_columns not in _GDF_COLUMNS:
-        raise _error(
+        raise table_error(
             source,
             f"a .gdf of {n_columns} columns does not say which is which (4 are x, y, frame, "
             f"particle; 5 are x, y, z, frame, particle); name them, for example {_GDF_EXAMPLE}",
@@ -509,11 +501,11 @@ def _parse_csv(data: bytes, source: str) -> pd.DataFrame:
         )
     except (pd.errors.ParserError, pd.errors.EmptyDataError) as error:
         reason = str(error).strip().removeprefix("Error tokenizing data. C error: ")
-        raise _error(
+        raise table_error(
             source, f"not a table with one header line and commas between the columns: {reason}"
         ) from None
     if not isinstance(table.index, pd.RangeIndex):
-        raise _error(source, "rows have more fields than the header (line 1) has names")
+        raise table_error(source, "rows have more fields than the header (line 1) has names")
     table.columns = table.columns.astype(str).str.strip()
     return _without_blank_lines(table, data)
 
@@ -528,30 +520,30 @@ def _exact_floats(pandas_version: str) -> dict[str, Any]:
 def _refuse_unreadable_text(data: bytes, source: str) -> None:
     """Raise for an empty file, one that is no UTF-8 text, or one without a header."""
     if not data.strip():
-        raise _error(source, "the file is empty")
+        raise table_error(source, "the file is empty")
     try:
         data.decode("utf-8")
     except UnicodeDecodeError as error:
         line = data.count(b"\n", 0, error.start) + 1
-        raise _error(
+        raise table_error(
             source, f"not a text file in UTF-8 (line {line}); save it as csv in UTF-8"
         ) from None
     if b"\0" in data:
-        raise _error(source, "a binary file, not a csv; give it the suffix of its kind")
+        raise table_error(source, "a binary file, not a csv; give it the suffix of its kind")
     _refuse_header(data[:65536].decode("utf-8-sig", errors="replace").splitlines()[0], source)
 
 
 def _refuse_header(header: str, source: str) -> None:
     """Raise for a first line that cannot be the names of columns between commas."""
     if header.strip() and all(_is_number(name) for name in header.split(",")):
-        raise _error(
+        raise table_error(
             source,
             f"line 1 holds numbers ({header[:60]}) where the names of the columns are expected; "
             "add a header line such as frame,particle,x,y,z",
         )
     other = next((mark for mark in (";", "\t") if mark in header and "," not in header), None)
     if other:
-        raise _error(source, f"columns are separated by {other!r}; save it with commas")
+        raise table_error(source, f"columns are separated by {other!r}; save it with commas")
 
 
 def _is_number(text: str) -> bool:
@@ -575,7 +567,9 @@ def _parse_csv_gz(data: bytes, source: str) -> pd.DataFrame:
     try:
         text = gzip.decompress(data)
     except (gzip.BadGzipFile, EOFError, zlib.error) as error:
-        raise _error(source, f"not a whole gzip file ({error}); fetch or write it again") from None
+        raise table_error(
+            source, f"not a whole gzip file ({error}); fetch or write it again"
+        ) from None
     return _parse_csv(text, source)
 
 
@@ -588,71 +582,14 @@ def _parse_parquet(data: bytes, source: str) -> pd.DataFrame:
         return pq.read_table(io.BytesIO(data)).to_pandas(ignore_metadata=True)
     except (pa.ArrowException, OSError) as error:
         reason = str(error).strip().splitlines()[0]
-        raise _error(source, f"not a parquet file that can be read ({reason})") from None
+        raise table_error(source, f"not a parquet file that can be read ({reason})") from None
 
 
 def _parse_gdf(data: bytes, source: str) -> pd.DataFrame:
     """Parse an IDL .gdf file; its columns are numbered."""
     import pandas as pd
 
-    if data.startswith(b"GDF v. 1.0"):
-        raise _error(source, "the ASCII variant of GDF; write it again in binary, without /ascii")
-    shape, dtype, offset = _gdf_header(data, source)
-    expected, found = math.prod(shape) * dtype.itemsize, len(data) - offset
-    if found != expected:
-        what = "cut short" if found < expected else "too long"
-        raise _error(
-            source,
-            f"{what}: {shape[0]} rows of {shape[1]} columns ({dtype.name}) take {expected} bytes "
-            f"after the header, the file has {found}; copy or write it again",
-        )
-    values = np.frombuffer(data, dtype=dtype, offset=offset).reshape(shape)
-    return pd.DataFrame(values.astype(np.float64))
-
-
-def _gdf_header(data: bytes, source: str) -> tuple[tuple[int, int], np.dtype[Any], int]:
-    """Return (rows, columns), the type of the numbers, and where they begin."""
-    words = _gdf_words(data, source)
-    n_dims = words[1] if len(words) > 1 else 0
-    if len(words) > 1 and n_dims not in (1, 2):
-        raise _error(source, f"expected a .gdf with 2 dimensions (columns, rows), got {n_dims}")
-    if len(words) < n_dims + 4:
-        raise _error(source, f"cut short within its header: it has {len(data)} bytes")
-    # IDL drops a last dimension of 1: a table of one row has one dimension.
-    n_columns, n_rows = (*words[2 : 2 + n_dims], 1)[:2]
-    code, count = words[2 + n_dims : 4 + n_dims]
-    faults = []
-    if code not in _GDF_TYPES:
-        kinds = ", ".join(f"{c} {np.dtype(t).name}" for c, t in _GDF_TYPES.items())
-        faults.append(f"unknown type code {code} in the header; expected one of {kinds}")
-    if min(n_columns, n_rows) < 0 or count != n_columns * n_rows:
-        faults.append(
-            f"the header contradicts itself: {n_columns} columns x {n_rows} rows, but "
-            f"{count} elements"
-        )
-    if faults:
-        raise _error(source, *faults)
-    order = _gdf_byte_order(data)
-    return (n_rows, n_columns), np.dtype(f"{order}{_GDF_TYPES[code]}"), 4 * (n_dims + 4)
-
-
-def _gdf_byte_order(data: bytes) -> str:
-    """Return "<" or ">" by the magic number, "" without it."""
-    orders = {_GDF_MAGIC.to_bytes(4, "little"): "<", _GDF_MAGIC.to_bytes(4, "big"): ">"}
-    return orders.get(data[:4], "")
-
-
-def _gdf_words(data: bytes, source: str) -> list[int]:
-    """Return the first words of the file, as many as a header of two dimensions has."""
-    order = _gdf_byte_order(data)
-    if not order:
-        raise _error(
-            source,
-            f"not a .gdf file: it does not begin with the magic number {_GDF_MAGIC} in either "
-            f"byte order, but with the bytes {data[:4].hex(' ') or '(none)'}",
-        )
-    head = data[: min(24, len(data) // 4 * 4)]
-    return [int(word) for word in np.frombuffer(head, dtype=f"{order}i4")]
+    return pd.DataFrame(parse_gdf(data, source))
 
 
 # ---- writers: a clean table to bytes ------------------------------------------------------------
@@ -685,11 +622,9 @@ def _gdf_bytes(table: pd.DataFrame, target: str) -> bytes:
     elif max(table["particle"].abs().max(), table["frame"].abs().max()) > _LARGEST_EXACT:
         faults.append("a .gdf of float64 cannot hold frames or ids beyond 2**53; renumber them")
     if faults:
-        raise _error(target, *(f"{fault}, or write .csv or .parquet" for fault in faults))
+        raise table_error(target, *(f"{fault}, or write .csv or .parquet" for fault in faults))
     names = [*(axis for axis in _AXES if axis in table), "frame", "particle"]
-    values: NDArray[Any] = table[names].to_numpy(dtype="<f8")
-    header = [_GDF_MAGIC, 2, values.shape[1], values.shape[0], 5, values.size]
-    return np.array(header, dtype="<i4").tobytes() + values.tobytes()
+    return gdf_bytes(table[names].to_numpy(dtype=np.float64))
 
 
 _PARSERS: dict[str, Callable[[bytes, str], Any]] = {

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from perrin._arrays import (
     Bools,
@@ -140,10 +140,10 @@ class RigidMotion:
         ndarray, shape (T, d) or (T, K, d)
             Unit vectors in the lab frame.
         """
-        p = np.asarray(p0, dtype=np.float64)
+        p = np.atleast_1d(np.asarray(p0, dtype=np.float64))
         d = self.template.shape[1]
         length = np.linalg.norm(p, axis=-1, keepdims=True)
-        if p.ndim not in (1, 2) or p.shape[-1] != d or not np.all((length > 0) & (length < np.inf)):
+        if p.ndim > 2 or p.shape[-1] != d or not np.all((length > 0) & (length < np.inf)):
             raise ValueError(f"p0: expected directions ({d},) or (K, {d}), none zero, got {p0!r}")
         turned = np.einsum("tij,...j->t...i", self.rotation, p / length)
         return np.asarray(turned)
@@ -232,26 +232,28 @@ class RigidMotion:
         axes = "xyz"[: template.shape[1]]
         angles = "xyz" if len(axes) == 3 else "z"
 
+        def column(name: str, dtype: type = np.float64) -> NDArray[Any]:
+            if name not in table:
+                raise ValueError(f"this table was not made by to_frame: it lacks column {name!r}")
+            return np.array(table[name], dtype=dtype)
+
         def matrices(prefix: str, names: str, *, symmetric: bool) -> Floats:
             def name(a: str, b: str) -> str:
                 return f"{prefix}_{min(a, b)}{max(a, b)}" if symmetric else f"{prefix}_{a}{b}"
 
-            rows = [[table[name(a, b)].to_numpy(np.float64) for b in names] for a in names]
+            rows = [[column(name(a, b)) for b in names] for a in names]
             return np.moveaxis(np.array(rows), -1, 0).copy()
-
-        def column(name: str) -> Floats:
-            return np.array(table[name], dtype=np.float64)
 
         return cls(
             time=column("time"),
             center=np.stack([column(a) for a in axes], axis=1),
             rotation=matrices("r", axes, symmetric=False),
             residual=column("residual"),
-            n_present=np.array(table["n_present"], dtype=np.int64),
+            n_present=column("n_present", np.int64),
             covariance=matrices("cov", angles, symmetric=True),
             center_variance=column("center_variance"),
-            piece=np.array(table["piece"], dtype=np.int64),
-            reason=tuple(str(r) for r in table["reason"]),
+            piece=column("piece", np.int64),
+            reason=tuple(column("reason", str).tolist()),
             template=template,
             sigma=float(table.attrs["sigma"]),
             dt=float(table.attrs["dt"]),

@@ -118,7 +118,8 @@ def orientation_covariance(positions: Floats, noise: Floats) -> Floats:
     inverse = np.linalg.inv(_inertia(r))
     arms = inverse @ skew(r)
     covariance: Floats = np.einsum("iab,...bc,idc->...ad", arms, noise, arms)
-    return covariance
+    # Symmetric to the last bit, as tables store one triangle of it.
+    return 0.5 * (covariance + np.swapaxes(covariance, -1, -2))
 
 
 def center_variance(positions: Floats, present: Bools, sigma: float) -> float:

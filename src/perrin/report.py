@@ -31,8 +31,10 @@ if TYPE_CHECKING:
     from perrin.diffusion import DiffusionEstimate
     from perrin.results import ClusterResult, Report
 
+# What each figure is, what it shows, and what to look for.
 _CAPTIONS = {
     "curves": (
+        "Mean square displacements against lag time.",
         "Mean square angular displacement (left) and mean square displacement (right) against lag "
         "time. Points: the data, faint beyond a quarter of the track, where few independent "
         "displacements remain. Band: one standard error of Brownian motion. Line: the "
@@ -44,6 +46,7 @@ _CAPTIONS = {
         "noise; a bend upwards at long lags is drift or driven motion, a plateau is confinement.",
     ),
     "residuals": (
+        "Residuals and particles seen.",
         "Root mean square distance of the particles to the rigid body fitted to the frame (top), "
         "and how many particles were seen (bottom). Crosses mark frames without a pose.",
         "Even scatter about the line is localisation error. Slow waves mean that the body is not "
@@ -51,18 +54,21 @@ _CAPTIONS = {
         "identities.",
     ),
     "sphere": (
+        "Paths of the particles' directions.",
         "Paths of the particles' directions on the unit sphere, lab axes; strong in front, faint "
         "behind; an open circle ends each path.",
         "A free body wanders without a preferred place. Long straight chords are jumps or gaps; "
         "rings about one axis are driven or hindered rotation.",
     ),
     "angle": (
+        "Angle in the plane.",
         "Angle of the body in the plane since the first frame, full turns counted; breaks are "
         "frames without a pose, an open circle ends the path.",
         "A free body wanders without a trend. A steady slope is driven rotation; jumps are swaps "
         "of identities.",
     ),
     "clusters": (
+        "All clusters.",
         "Diffusion coefficients of all clusters with 68 % (thick) and 95 % (thin) intervals; the "
         "vertical band is the pooled value with its own. Triangles are upper limits.",
         "If all clusters diffuse alike, about one thin line in twenty misses the pooled line. Many "
@@ -152,8 +158,9 @@ def _figure(pictures: Mapping[str, str], stem: str, kind: str) -> dict[str, str]
     """Return a picture with its caption, or None where it was not drawn."""
     if stem not in pictures:
         return None
-    shows, look_for = _CAPTIONS[kind]
-    return {"source": pictures[stem], "kind": kind, "shows": shows, "look_for": look_for}
+    title, shows, look_for = _CAPTIONS[kind]
+    said = {"title": title, "shows": shows, "look_for": look_for}
+    return {"source": pictures[stem], "kind": kind} | said
 
 
 def _headline(report: Report) -> list[dict[str, Any]]:

@@ -1,0 +1,287 @@
+"""Pictures show the numbers they claim to show."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+from matplotlib import rcParams
+from matplotlib.colors import to_rgba
+from matplotlib.figure import Figure
+
+import perrin
+from perrin import plot
+from perrin.diffusion import DiffusionEstimate
+
+
+def measured(*, clusters=1, frames=80, planar=False, labels=None, D_R=0.02, gaps=False):
+    rng = np.random.default_rng(3)
+    square = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.2, 1.1]])
+    body = perrin.Cluster.from_positions(square) if planar else perrin.Cluster.tetrahedron(1.5)
+    parts = []
+    for k in range(clusters):
+        truth = perrin.simulate_motion(body, D_R=D_R, D_T=0.04, dt=0.5, n_frames=frames, rng=rng)
+        x = perrin.add_noise(truth.positions(), sigma=0.03, rng=rng)
+        frame, particle = np.indices(x.shape[:2]).reshape(2, -1)
+        part = pd.DataFrame({"frame": frame, "particle": particle + 4 * k})
+        part["cluster"] = labels[k] if labels else k
+        part[list("xyz")[: x.shape[2]]] = x.reshape(-1, x.shape[2])
+        parts.append(part)
+    table = pd.concat(parts, ignore_index=True)
+    if gaps:
+        lost = table["frame"].isin((20, 21, 40)) & (table["particle"] % 4 > 0)
+        table = table[~lost & ~((table["frame"] == 50) & (table["particle"] == 2))]
+    return perrin.analyze(table, dt=0.5)
+
+
+@pytest.fixture(scope="module")
+def space():
+    return measured(gaps=True).clusters[0]
+
+
+@pytest.fixture(scope="module")
+def plane():
+    return measured(planar=True).clusters[0]
+
+
+def axes(**kwargs):
+    return Figure().add_subplot(**kwargs)
+
+
+def line(ax, start):
+    (found,) = [x for x in ax.lines if str(x.get_label()).startswith(start)]
+    return found
+
+
+def drawn(ax):
+    ax.figure.canvas.draw()
+    return ax
+
+
+def estimate(**changes):
+    usual = DiffusionEstimate(
+        value=0.01, ci68=(0.009, 0.011), ci95=(0.008, 0.012), stderr=0.001, offset=1e-4,
+        offset_stderr=1e-5, resolution_floor=1e-9, resolved=True, unit="rad^2/s", method="mle",
+        n_frames=100, snr=50.0,
+    )  # fmt: skip
+    return replace(usual, **changes)
+
+
+def test_lag_curve_shows_curve_fit_pure_diffusion_and_floor(space):
+    curve, fit = space.msad, space.D_R
+    ax = axes()
+    assert plot.plot_lag_curve(curve, ax=ax, estimate=fit, floor=space.noise.phi2) is ax
+    sure, faint = line(ax, "MSAD"), line(ax, "beyond")
+    x, y = (np.concatenate([a.get_data()[i] for a in (sure, faint)]) for i in (0, 1))
+    assert np.array_equal(x, curve.lagtime)
+    assert np.array_equal(y, curve.value)
+    assert sure.get_xdata().max() <= curve.lagtime[-1] / 4 < faint.get_xdata().min()
+    assert faint.get_alpha() < 0.5
+    t, fitted = line(ax, "ML fit").get_data()
+    assert np.allclose(fitted, 4 * (fit.value * t + fit.offset), rtol=1e-12)
+    t, pure = line(ax, "pure diffusion").get_data()
+    assert np.allclose(pure, 4 * fit.value * t, rtol=1e-12)
+    assert line(ax, "pure diffusion").get_markerfacecolor() == "none"
+    assert list(line(ax, "noise floor").get_ydata()) == [space.noise.phi2] * 2
+    assert (ax.get_xscale(), ax.get_yscale()) == ("log", "log")
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("lag time (s)", "MSAD (rad²)")
+    low, high = ax.get_ylim()
+    assert low < space.noise.phi2 < np.nanmax(curve.value) < high
+
+
+def test_lag_curve_band_is_one_standard_error(space):
+    ax = axes()
+    plot.plot_lag_curve(space.msd, ax=ax)
+    corners = ax.collections[0].get_paths()[0].vertices
+    t, value, error = (a[:5] for a in (space.msd.lagtime, space.msd.value, space.msd.stderr))
+    for x, middle, half in zip(t, value, error, strict=True):
+        at = corners[np.isclose(corners[:, 0], x), 1]
+        assert at.min() == pytest.approx(middle - half)
+        assert at.max() == pytest.approx(middle + half)
+    assert ax.get_ylabel() == "MSD (µm²)"
+
+
+def test_lag_curve_in_the_plane_has_its_own_factors(plane):
+    ax, fit = axes(), plane.D_R
+    plot.plot_lag_curve(plane.msad, ax=ax, estimate=fit, label="my data")
+    t, fitted = line(ax, "ML fit").get_data()
+    assert np.allclose(fitted, 2 * (fit.value * t + fit.offset))
+    assert "2 $D_R$ t" in line(ax, "pure").get_label()
+    assert line(ax, "my data").get_marker() == "."
+
+
+def test_lag_curve_with_a_negative_offset_leaves_out_what_has_no_logarithm(space):
+    ax = axes()
+    plot.plot_lag_curve(space.msad, ax=ax, estimate=estimate(offset=-0.02), floor=0.0)
+    t, fitted = line(ax, "ML fit").get_data()
+    assert np.array_equal(np.isnan(fitted), 0.01 * t <= 0.02)
+    assert not [x for x in ax.lines if str(x.get_label()).startswith("noise")]
+    drawn(ax)
+
+
+def test_an_unresolved_estimate_is_a_limit_without_pure_diffusion(space):
+    ax = axes()
+    limit = estimate(value=0.0, ci68=(0, 1e-3), ci95=(0, 2.04e-3), resolved=False)
+    plot.plot_lag_curve(space.msad, ax=ax, estimate=limit)
+    assert "< 0.0020 rad²/s (95 %)" in line(ax, "ML fit").get_label()
+    assert not [x for x in ax.lines if str(x.get_label()).startswith("pure")]
+
+
+def test_long_curves_are_thinned_evenly_on_the_logarithm():
+    walk = np.random.default_rng(1).normal(size=(100_000, 1, 3)).cumsum(axis=0)
+    curve = perrin.msd(walk, dt=0.1)
+    ax = axes()
+    plot.plot_lag_curve(curve, ax=ax)
+    t = np.concatenate([line(ax, name).get_xdata() for name in ("MSD", "beyond")])
+    assert 100 < len(t) <= 200
+    assert (t[0], t[-1]) == (curve.lagtime[0], curve.lagtime[-1])
+    value = line(ax, "MSD").get_ydata()
+    assert value[-1] == curve.value[np.searchsorted(curve.lagtime, line(ax, "MSD").get_xdata()[-1])]
+
+
+def test_a_curve_of_zeros_is_no_crash():
+    curve = perrin.msd(np.zeros((10, 1, 3)), dt=1.0)
+    drawn(plot.plot_lag_curve(curve, ax=axes()))
+
+
+def test_residuals_presence_and_refused_frames(space):
+    motion = space.motion
+    ax = axes()
+    assert plot.plot_residual(motion, ax=ax) is ax
+    t, shown = line(ax, "rms residual").get_data()
+    assert np.array_equal(t, motion.time)
+    assert np.allclose(shown, 1e3 * motion.residual, equal_nan=True)
+    assert ax.get_ylabel() == "residual (nm)"
+    assert list(line(ax, "no pose (3 of 80").get_xdata()) == [10.0, 10.5, 20.0]
+    expected = line(ax, "expected").get_ydata()
+    assert expected[0] == pytest.approx(1e3 * motion.sigma * np.sqrt(6 / 4))
+    assert expected[50] == pytest.approx(1e3 * motion.sigma * np.sqrt(3 / 3))
+    # It is what the residuals are on average.
+    ratio = np.nanmean(motion.residual**2) / np.nanmean((expected / 1e3) ** 2)
+    assert ratio == pytest.approx(1, abs=0.1)
+    ax = axes()
+    assert plot.plot_presence(motion, ax=ax) is ax
+    assert np.array_equal(ax.lines[0].get_ydata(), motion.n_present)
+    assert list(ax.lines[1].get_ydata()) == [1, 1, 1]
+    assert ax.get_xlabel() == "time (s)"
+
+
+def test_large_residuals_are_in_um(space):
+    big = replace(space.motion, residual=1e3 * space.motion.residual)
+    ax = axes()
+    plot.plot_residual(big, ax=ax)
+    assert ax.get_ylabel() == "residual (µm)"
+    assert np.allclose(ax.lines[0].get_ydata(), big.residual, equal_nan=True)
+
+
+def test_orientations_lie_on_the_sphere_and_end_where_the_motion_ends(space):
+    ax = axes(projection="3d")
+    assert plot.plot_orientations(space.motion, ax=ax) is ax
+    paths = space.motion.orientation(space.motion.template)
+    faint = [x for x in ax.lines if x.get_alpha() == 0.35]
+    assert len(faint) == 4
+    for i, path in enumerate(faint):
+        assert np.allclose(np.transpose(path.get_data_3d()), paths[:, i], equal_nan=True)
+    ends = [x for x in ax.lines if x.get_marker() == "o" and len(x.get_data_3d()[0])]
+    assert np.allclose([np.ravel(x.get_data_3d()) for x in ends], paths[-1])
+    assert len({to_rgba(x.get_color()) for x in faint}) == 4
+    assert list(ax.get_box_aspect() / ax.get_box_aspect()[0]) == [1, 1, 1]
+    drawn(ax)
+
+
+def test_orientation_in_the_plane_is_the_unbounded_angle(plane):
+    ax = axes()
+    assert plot.plot_orientations(plane.motion, ax=ax) is ax
+    angle = plane.motion.rotational_displacement([1.0, 0.0])[:, 0]
+    assert np.array_equal(ax.lines[0].get_ydata(), angle)
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("time (s)", "angle φ (rad)")
+
+
+def segments(ax):
+    return [np.array(c.get_segments()) for c in ax.collections if hasattr(c, "get_segments")]
+
+
+def test_forest_shows_values_intervals_and_the_pooled_band():
+    report = measured(clusters=3, labels=["a$_b$", "<b>", "c"])
+    ax = axes()
+    assert plot.plot_forest(report.clusters, ax=ax, pooled=report.pooled.D_R) is ax
+    wide, narrow = segments(ax)
+    for k, result in enumerate(report.clusters):
+        assert tuple(wide[k][:, 0]) == result.D_R.ci95
+        assert tuple(narrow[k][:, 0]) == result.D_R.ci68
+        assert (wide[k][:, 1] == k).all()
+    assert list(ax.lines[0].get_xdata()) == [c.D_R.value for c in report.clusters]
+    pooled = line(ax, "pooled")
+    assert list(pooled.get_xdata()) == [report.pooled.D_R.value] * 2
+    bands = [(p.get_x(), p.get_x() + p.get_width()) for p in ax.patches]
+    assert np.allclose(bands, [report.pooled.D_R.ci95, report.pooled.D_R.ci68])
+    assert [t.get_text() for t in ax.get_yticklabels()] == ["a$_b$", "<b>", "c"]
+    assert ax.get_xlabel() == "$D_R$ (rad²/s)"
+    drawn(ax)
+    plot.plot_forest(report.clusters, ax=ax, quantity="translation")
+    assert ax.get_xlabel() == "$D_T$ (µm²/s)"
+
+
+def test_forest_with_limits_open_ends_and_wide_ranges(space):
+    odd = [
+        estimate(),
+        estimate(value=0.0, ci68=(0, 1e-4), ci95=(0, 2e-4), resolved=False),
+        estimate(value=0.0, ci68=(0, np.inf), ci95=(0, np.inf), resolved=False),
+        estimate(value=0.02, ci95=(0.001, np.inf)),
+        estimate(value=3.0, ci68=(2, 4), ci95=(1, 5)),
+    ]
+    clusters = [replace(space, D_R=e) for e in odd]
+    for some in (clusters, clusters[1:3], clusters[:2], clusters[2:3]):
+        ax = axes()
+        plot.plot_forest(some, ax=ax, pooled=some[0].D_R)
+        assert np.isfinite(ax.get_xlim()).all()
+        drawn(ax)
+    ax = axes()
+    plot.plot_forest(clusters, ax=ax)
+    assert ax.get_xscale() == "log"
+    limits, beyond = ax.lines[1], ax.lines[2]
+    assert limits.get_xdata()[0] == 2e-4
+    assert list(limits.get_ydata()) == [1, 2]
+    assert list(beyond.get_ydata()) == [3]
+
+
+def test_forest_of_many_clusters_is_ordered_by_value(space):
+    values = np.random.default_rng(2).uniform(0.01, 0.02, size=61)
+    clusters = [replace(space, D_R=estimate(value=v, ci68=(v, v), ci95=(v, v))) for v in values]
+    ax = axes()
+    plot.plot_forest(clusters, ax=ax)
+    assert list(ax.lines[0].get_xdata()) == sorted(values)
+    assert "ordered" in ax.get_ylabel()
+
+
+@pytest.mark.parametrize("planar", [False, True])
+def test_save_figures_names_its_files_and_changes_no_setting(tmp_path, planar):
+    before = dict(rcParams)
+    files = plot.save_figures(measured(planar=planar, frames=20), tmp_path)
+    kinds = ("curves", "residuals", "orientations")
+    names = [f"cluster-0-{kind}.{end}" for kind in kinds for end in ("png", "pdf")]
+    assert [f.name for f in files] == names
+    assert sorted(f.name for f in tmp_path.iterdir()) == sorted(names)
+    assert all(f.stat().st_size > 2000 for f in files)
+    assert dict(rcParams) == before
+
+
+def test_save_figures_draws_the_first_clusters_and_all_in_one(tmp_path, monkeypatch):
+    monkeypatch.setattr(plot, "MAX_CLUSTERS", 1)
+    files = plot.save_figures(measured(clusters=3, frames=20), tmp_path)
+    stems = {f.stem for f in files}
+    assert "clusters" in stems
+    assert {s.split("-")[1] for s in stems if "-" in s} == {"0"}
+
+
+def test_numbers_in_words():
+    assert plot.value_text(estimate()) == "0.0100(10) rad²/s"
+    small = estimate(value=4.7e-7, stderr=5e-8, unit="um^2/s")
+    assert plot.value_text(small) == "4.7(5) × 10⁻⁷ µm²/s"
+    unbounded = estimate(value=0.0, ci95=(0.0, np.inf), resolved=False)
+    assert plot.bare_text(unbounded) == "< ∞"
+    assert plot.number_text(5e-5, 9e-4) == "0.5(9) × 10⁻³" or plot.number_text(5e-5, 9e-4) == (
+        "0.5(90) × 10⁻⁴"
+    )
