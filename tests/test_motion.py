@@ -161,6 +161,7 @@ def test_a_frame_that_cannot_be_chained_is_left_out():
     truth, x = simulated(BIPYRAMID, seed=7)
     x[50, :2] = np.nan
     x[51, 3:] = np.nan
+    x[52, :2] = np.nan
     x[80, 2:4] = np.nan
     x[81:84, :2] = np.nan
     motion = track_rotation(x, dt=0.5, reference="previous")
@@ -300,6 +301,16 @@ def test_sigma_is_as_good_as_its_degrees_of_freedom(cluster, fraction):
         score.append((motion.sigma / 0.03 - 1) / (np.sqrt(2 / dof) / 2))
     assert abs(np.mean(score)) < 4 / np.sqrt(40)
     assert abs(np.std(score) - 1) < 4 / np.sqrt(80)
+
+
+def test_sigma_of_the_shortest_tracks():
+    """The template costs its own degrees of freedom: sigma^2 of 1000 two-frame tracks, 4 errors."""
+    truth = simulate_motion(TETRA, D_R=0.1, dt=1.0, n_frames=2, rng=1).positions()
+    sigma2 = [
+        track_rotation(add_noise(truth, sigma=0.03, rng=seed), dt=1.0).sigma ** 2
+        for seed in range(1000)
+    ]
+    assert np.mean(sigma2) / 0.03**2 == pytest.approx(1, abs=4 * np.sqrt(2 / 6 / 1000) + 0.003)
 
 
 def test_the_product_measures_the_same_sigma():

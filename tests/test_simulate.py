@@ -31,7 +31,7 @@ def mean_and_error(sample):
 # ---- the law of the steps -----------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("scale", [1e-6, 1e-4, 1e-2, 0.1, 0.5, 0.99, 1.01, 2.0])
+@pytest.mark.parametrize("scale", [1e-6, 1e-4, 1e-2, 0.1, 0.5, 0.99, 1.01, 2.0, 20.0])
 def test_the_step_law_at_any_step(scale):
     """<cos> = (3 exp(-2 D dt) - 1)/2 and degree 2 decays by exp(-6 D dt), within 4 errors."""
     motion = simulate(D_R=scale / 0.7, dt=0.7, n_frames=100_001, rng=31)

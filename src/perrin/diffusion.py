@@ -145,8 +145,8 @@ def estimate_diffusion(
     the number of frames, in which a gap is one longer step. The offset o = s - b is noise less
     motion blur, h_k the noise of a frame and axis over that of a complete one. Only o is free: s is
     as predicted from the rigid-fit residuals, as far as o allows with 0 <= b <= D t/2. One offset
-    serves the three body axes; the centre has one for each lab axis, and an axis along which it
-    never moves (a planar track in space) is left out.
+    serves the three body axes; the centre has one for each axis of its noise, and an axis along
+    which it never moves (a planar track in space) is left out.
 
     Examples
     --------
@@ -614,11 +614,18 @@ def _rotation_steps(motion: RigidMotion) -> tuple[Floats, Floats, float]:
 
 
 def _translation_steps(motion: RigidMotion) -> tuple[Floats, Floats, float]:
-    """Return displacements of the centre, each frame's noise over a complete one's, and that."""
+    """Return displacements of the centre, each frame's noise over a complete one's, and that.
+
+    The axes are those of the noise, which leaves its mark in the product of successive steps: a
+    laboratory turned does not change the answer.
+    """
     start, stop = motion.steps()
+    y = motion.center[stop] - motion.center[start]
+    beside = (y[:-1] * (start[1:] == stop[:-1])[:, None]).T @ y[1:]
+    axes = np.linalg.eigh(beside + beside.T)[1]
     base = float(np.nanmin(motion.center_variance))
-    noise = np.repeat(motion.center_variance[:, None], motion.center.shape[1], axis=1)
-    return motion.center[stop] - motion.center[start], _relative(noise, base), base
+    noise = np.repeat(motion.center_variance[:, None], y.shape[1], axis=1)
+    return y @ axes, _relative(noise, base), base
 
 
 def _relative(noise: Floats, base: float) -> Floats:

@@ -349,12 +349,12 @@ def _shortened(name: str, *, most: int = 24) -> str:
 
 
 def _thinned(curve: LagCurve) -> Ints:
-    """Return the indices of the lags shown: those with data, evenly on a logarithmic scale."""
+    """Return the indices of the lags shown: those with a logarithm, evenly on its scale."""
     count = len(curve.lagtime)
     kept = np.arange(count)
     if count > _POINTS:
         kept = np.unique(np.rint(np.geomspace(1, count, _POINTS)).astype(np.int64)) - 1
-    return kept[np.isfinite(curve.value[kept])]
+    return kept[curve.value[kept] > 0]
 
 
 def _draw_points(curve: LagCurve, *, ax: Axes, label: str | None) -> None:

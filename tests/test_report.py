@@ -1,0 +1,236 @@
+"""The HTML report says what was measured, safely and in one file; the run folder is all or none."""
+
+from __future__ import annotations
+
+import base64
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+
+import perrin
+from perrin import plot, report
+from perrin.results import write_data
+from test_plot import estimate, measured
+
+PNG = base64.b64decode(
+    "iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAQAAAC1HAwCAAAAC0lEQVR42mNk+M8AAAMBAQDJ/pLvAAAAAElFTkSuQmCC"
+)
+
+
+class Page(HTMLParser):
+    """Collects text, tags, and everything that could fetch."""
+
+    def __init__(self, html):
+        super().__init__()
+        self.words, self.tags, self.sources, self.open = [], [], [], []
+        self.feed(html)
+        self.close()
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+        self.sources += [v for k, v in attrs if k in ("src", "href", "srcset", "data", "action")]
+        self.handlers = [k for k, _ in attrs if k.startswith("on")]
+        assert not self.handlers
+        if tag not in ("meta", "img", "br"):
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        if "style" not in self.open:
+            self.words.append(data)
+
+    @property
+    def text(self):
+        return " ".join(" ".join(self.words).replace("\xa0", " ").split())
+
+
+@pytest.fixture(scope="module")
+def single():
+    found = measured(frames=60)
+    settings = {
+        "input": {"path": '/data/<my> & "tracks".csv', "sha256": "ab" * 32},
+        "arguments": {"dt": 0.5, "sigma": None, "viscosity": 2.18e-3, "temperature": 295.0},
+        "versions": {"python": "3.11.7", "perrin": "0.1.0"},
+        "created": "2026-01-02T03:04:05+00:00",
+    }
+    return replace(found, settings=settings)
+
+
+def pictures(folder, *stems):
+    for stem in stems:
+        (folder / f"{stem}.png").write_bytes(PNG)
+    return [folder / f"{stem}.png" for stem in stems]
+
+
+def test_the_page_holds_the_numbers(single):
+    page = Page(report.render_html(single, []))
+    (found,) = single.clusters
+    assert page.open == []
+    for one in (found.D_R, found.D_T):
+        assert plot.bare_text(one) in page.text
+        for end in (*one.ci68, *one.ci95):
+            # The ends as print rounds them.
+            shown = [float(n) for n in re.findall(r"\d+\.\d+", page.text)]
+            assert min(abs(n - end) for n in shown) < 0.02 * one.stderr + 5e-3 * end
+    assert plot.number_text(1e3 * found.motion.sigma) + " nm" in page.text
+    assert plot.number_text(found.noise.phi2) in page.text
+    degrees = np.rad2deg(np.sqrt(found.noise.phi2))
+    assert f"Φ = {plot.number_text(degrees)}°" in page.text
+    assert "60 of 60" in page.text
+    assert "ab" * 32 in page.text
+    assert "2026-01-02 03:04 UTC" in page.text
+    assert "0.00218 Pa s" in page.text
+    assert "sigma not given" in page.text
+    assert "Optics Express 19, 17189 (2011)" in page.text
+    assert "MSAD = 4" in page.text
+    assert "pooled" not in page.text
+
+
+def test_sizes_are_marked_as_the_papers(single):
+    size = perrin.size_from_rotation(
+        4.93e-3, cluster=perrin.Cluster.tetrahedron(1.5), viscosity=2.18e-3, temperature=295,
+        factor="hoffmann2009",
+    )  # fmt: skip
+    sizes = {"rotation": replace(size, cluster_stderr=0.2), "translation": size}
+    with_sizes = replace(single, clusters=(replace(single.clusters[0], sizes=sizes),))
+    text = Page(report.render_html(with_sizes, [])).text
+    assert "paper's factor 1.844 (Hoffmann 2009)" in text
+    assert "4.9(2) µm" in text
+    assert "2.68 µm" in text
+    bare = replace(single.clusters[0], sizes=None)
+    text = Page(report.render_html(replace(single, clusters=(bare,), settings={}), [])).text
+    assert "No hydrodynamic sizes: viscosity and temperature were not given" in text
+
+
+def test_the_page_fetches_nothing_and_runs_nothing(single, tmp_path):
+    files = pictures(tmp_path, "cluster-0-curves", "cluster-0-residuals", "cluster-0-orientations")
+    html = report.render_html(single, [*files, tmp_path / "cluster-0-curves.pdf"])
+    page = Page(html)
+    assert page.tags.count("img") == 3
+    assert all(s.startswith(("data:image/png;base64,", "#")) for s in page.sources)
+    assert base64.b64decode(page.sources[0].partition(",")[2]) == PNG
+    assert not {"script", "link", "iframe", "object", "base"} & set(page.tags)
+    assert not re.search(r"https?:|url\(|@import|javascript:", html)
+    assert page.text.count("What to look for:") == 3
+
+
+def test_what_users_wrote_is_escaped(single):
+    html = report.render_html(single, [])
+    assert "<my>" not in html
+    assert "&lt;my&gt; &amp; &#34;tracks&#34;.csv" in html
+    label = '<script>alert("x")</script> & co'
+    named = [replace(single.clusters[0], cluster=k, label=label, warnings=(label,)) for k in (0, 1)]
+    for clusters in (named, named[:1]):
+        page = Page(
+            report.render_html(replace(single, clusters=tuple(clusters), warnings=(label,)), [])
+        )
+        assert "script" not in page.tags
+        assert label in page.text
+        assert page.open == []
+
+
+def test_warnings_stand_in_a_box(single):
+    said = "not rigid: it bends"
+    one = replace(single.clusters[0], warnings=(said,))
+    html = report.render_html(replace(single, clusters=(one,), warnings=("rows are missing",)), [])
+    box = html[html.index('<div class="warning"') :]
+    assert said in box[: box.index("</div>")]
+    assert "rows are missing" in box[: box.index("</div>")]
+    assert '<div class="warning"' not in report.render_html(single, [])
+
+
+def test_limits_open_ends_and_unknown_errors_are_words(single):
+    unbounded = estimate(
+        value=0.0, ci68=(0, np.inf), ci95=(0, np.inf), stderr=np.inf, resolved=False,
+        offset_stderr=np.nan, snr=0.0,
+    )  # fmt: skip
+    limit = estimate(value=0.0, ci68=(0, 1e-5), ci95=(0, 2e-5), resolved=False, unit="um^2/s")
+    odd = replace(single.clusters[0], D_R=unbounded, D_T=limit)
+    pooled = replace(single.pooled, D_R=unbounded, D_T=limit)
+    for clusters in ((odd,), (odd, single.clusters[0])):
+        text = Page(report.render_html(replace(single, clusters=clusters, pooled=pooled), [])).text
+        assert "< ∞" in text
+        assert "not bounded" in text
+        assert "< 2.0 × 10⁻⁵" in text
+        assert "(0 to 2.0) × 10⁻⁵" in text
+        assert "not resolved, an upper limit" in text
+        assert "its error is unknown" in text
+        assert not re.search(r"\bnan\b|\binf\b|None", text)
+    half = estimate(ci95=(0.004, np.inf), offset=-1e-4, snr=np.inf)
+    text = Page(report.render_html(replace(single, clusters=(replace(odd, D_R=half),)), [])).text
+    assert "above 0.0040" in text
+    assert "(negative: no angle)" in text
+    assert "without bound" in text
+
+
+def test_two_dimensions_have_their_own_words():
+    found = measured(planar=True, frames=40)
+    text = Page(report.render_html(found, [])).text
+    assert "MSAD = 2" in text
+    assert "in 2 dimensions" in text
+    assert "table in memory" in text
+
+
+def test_many_clusters_are_listed_pooled_and_the_figures_counted(single, tmp_path):
+    one = single.clusters[0]
+    many = tuple(replace(one, cluster=k, warnings=("a", "b") if k < 10 else ()) for k in range(60))
+    files = pictures(tmp_path, "clusters", *[f"cluster-{k}-curves" for k in range(12)])
+    pooled = replace(single.pooled, clusters=tuple(range(59)))
+    page = Page(report.render_html(replace(single, clusters=many, pooled=pooled), files))
+    assert page.tags.count("img") == 13
+    assert "first 12 of 60 clusters" in page.text
+    assert "pooled over 59 clusters" in page.text
+    assert "leaves out 59" in page.text
+    assert "Cluster 3 : 2 warnings" in page.text
+    assert [f"#cluster-{k}" in page.sources for k in range(60)] == [True] * 60
+    assert page.text.count("What to look for:") == 2
+
+
+def test_the_run_folder_is_complete(single, tmp_path):
+    place = tmp_path / "run"
+    report.write_run(single, place)
+    names = {f.name for f in place.iterdir()}
+    assert names == {
+        "summary.json", "tracks.parquet", "motion.parquet", "curves.csv", "run.json", "figures",
+        "report.html",
+    }  # fmt: skip
+    assert len(list((place / "figures").iterdir())) == 6
+    assert Page((place / "report.html").read_text(encoding="utf-8")).tags.count("img") == 3
+    assert [p.name for p in tmp_path.iterdir()] == ["run"]
+    # The page made from what was read back is the same page.
+    again = report.render_html(perrin.load_run(place), [])
+    assert again == report.render_html(single, [])
+
+
+def test_an_existing_folder_is_refused_or_replaced(single, tmp_path, monkeypatch):
+    monkeypatch.setattr(report, "save_figures", lambda *_: [])
+    place = tmp_path / "run"
+    report.write_run(single, place)
+    (place / "old").touch()
+    with pytest.raises(FileExistsError, match="overwrite"):
+        report.write_run(single, place)
+    report.write_run(single, place, overwrite=True)
+    assert not (place / "old").exists()
+
+
+@pytest.mark.parametrize("step", ["save_figures", "render_html"])
+def test_a_failure_leaves_nothing_behind_and_keeps_what_stood(single, tmp_path, monkeypatch, step):
+    place = tmp_path / "run"
+    place.mkdir()
+    write_data(single, place)
+
+    def fail(*_):
+        raise RuntimeError("disk full")
+
+    monkeypatch.setattr(report, "save_figures", lambda *_: [])
+    monkeypatch.setattr(report, step, fail)
+    for target in (place, tmp_path / "new"):
+        with pytest.raises(RuntimeError, match="disk full"):
+            report.write_run(single, target, overwrite=True)
+    assert [p.name for p in tmp_path.iterdir()] == ["run"]
+    assert (place / "summary.json").is_file()
