@@ -23,12 +23,12 @@ if TYPE_CHECKING:
     from perrin.files import read_tracks, write_tracks
     from perrin.grouping import cluster_positions, find_clusters, positions_table
     from perrin.hydrodynamics import Size, size_from_rotation, size_from_translation
-    from perrin.lagged import LagCurve, msad, msd
-    from perrin.motion import RigidMotion, track_rotation
+    from perrin.lagged import LagCurve, msad, msad_vector, msd, orientation_correlation
+    from perrin.motion import RigidMotion, remove_rotation, track_rotation
     from perrin.noise import NoiseFloor, noise_floor
     from perrin.report import write_run
     from perrin.results import ClusterResult, Report, load_run
-    from perrin.rotations import kabsch
+    from perrin.rotations import Similarity, axis_angle, kabsch, similarity
     from perrin.shapes import Cluster
     from perrin.simulate import add_noise, simulate_motion
 
@@ -45,11 +45,13 @@ __all__ = [
     "PrecisionWarning",
     "Report",
     "RigidMotion",
+    "Similarity",
     "Size",
     "TooFewFramesError",
     "TrackTableError",
     "add_noise",
     "analyze",
+    "axis_angle",
     "cluster_positions",
     "estimate_diffusion",
     "find_clusters",
@@ -57,10 +59,14 @@ __all__ = [
     "kabsch",
     "load_run",
     "msad",
+    "msad_vector",
     "msd",
     "noise_floor",
+    "orientation_correlation",
     "positions_table",
     "read_tracks",
+    "remove_rotation",
+    "similarity",
     "simulate_motion",
     "size_from_rotation",
     "size_from_translation",
@@ -78,12 +84,12 @@ _ROOMS = {
         "TooFewFramesError",
         "TrackTableError",
     ),
-    "rotations": ("kabsch",),
+    "rotations": ("Similarity", "axis_angle", "kabsch", "similarity"),
     "shapes": ("Cluster",),
     "noise": ("NoiseFloor", "noise_floor"),
-    "motion": ("RigidMotion", "track_rotation"),
+    "motion": ("RigidMotion", "remove_rotation", "track_rotation"),
     "grouping": ("cluster_positions", "find_clusters", "positions_table"),
-    "lagged": ("LagCurve", "msad", "msd"),
+    "lagged": ("LagCurve", "msad", "msad_vector", "msd", "orientation_correlation"),
     "diffusion": ("DiffusionEstimate", "estimate_diffusion", "fit_line"),
     "hydrodynamics": ("Size", "size_from_rotation", "size_from_translation"),
     "simulate": ("add_noise", "simulate_motion"),

@@ -108,7 +108,7 @@ def analyze(
     >>> from importlib.resources import files
     >>> report = perrin.analyze(str(files("perrin") / "data" / "demo_tracks.csv.gz"), dt=0.73)
     >>> print(report.clusters[0].D_R)
-    D_R = 0.0050(4) rad^2/s [mle, 300 frames]
+    D_R = 0.0051(4) rad^2/s [mle, 300 frames]
     """
     _check_arguments(dt=dt, contact=contact, viscosity=viscosity, temperature=temperature)
     table, source = _table(tracks, scale=scale, columns=columns)
@@ -176,6 +176,8 @@ def _clustered(
     empty = int(table[axes].isna().any(axis=1).sum())
     if empty:
         warnings.append(f"{empty} rows without coordinates (NaN) count as missing points")
+    if "z" in table and np.ptp(table["z"].dropna()) == 0:
+        warnings.append("z never changes: leave the column out to analyse motion in the plane")
     if "cluster" in table:
         table, labels = _numbered(table)
     elif contact is not None:

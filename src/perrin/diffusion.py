@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from perrin._arrays import Floats, Ints, TooFewFramesError
+from perrin._arrays import Bools, Floats, Ints, TooFewFramesError
 from perrin.motion import RigidMotion
 
 if TYPE_CHECKING:
@@ -141,12 +141,10 @@ def estimate_diffusion(
     Notes
     -----
     Steps over a time t between frames k and k + 1 have variance 2 D t + o_k + o_{k+1} and
-    neighbours covariance -o_{k+1}, with o_k = o + s (h_k - 1): a tridiagonal likelihood, linear in
-    the number of frames, in which a gap is one longer step. The offset o = s - b is noise less
-    motion blur, h_k the noise of a frame and axis over that of a complete one. Only o is free: s is
-    as predicted from the rigid-fit residuals, as far as o allows with 0 <= b <= D t/2. One offset
-    serves the three body axes; the centre has one for each axis of its noise, and an axis along
-    which it never moves (a planar track in space) is left out.
+    neighbours covariance -o_{k+1}: a tridiagonal likelihood, linear in the number of frames, in
+    which a gap is one longer step. o_k = o + e_k; the offset o, one for each motion, is free, and
+    e_k is by how much the noise predicted from the rigid-fit residuals exceeds that of the best
+    known frame and axis (particles missing, a body with unequal axes).
 
     Examples
     --------
@@ -327,64 +325,48 @@ def _predicted_spread(motions: Sequence[RigidMotion], quantity: str) -> float:
 class _Likelihood:
     """The Gaussian likelihood of all steps, stacked to one tridiagonal system.
 
-    Step i has variance 2 D tau + o0 + o1 and covariance -o1 with step i + 1 where the two share a
-    frame (`linked`). The frame's offset is o + s (h - 1) with o the offset and s the noise of the
-    step's `group`: blur, which o may hold too, does not grow with the noise. `predicted` is the s
-    that the residuals tell, one a group.
+    Step i has variance 2 D tau + 2 o + e0 + e1 and covariance -(o + e1) with step i + 1 where the
+    two share a frame (`linked`); o is the noise offset of the step's `group`, e0 and e1 the known
+    excess of its two frames, `level` the mean excess of a group's complete frames.
     """
 
     y: Floats
     tau: Floats
-    h0: Floats
-    h1: Floats
+    e0: Floats
+    e1: Floats
     linked: Floats
     group: Ints
-    predicted: Floats
+    level: Floats
 
     @classmethod
     def of(cls, motions: Sequence[RigidMotion], *, quantity: str) -> _Likelihood:
-        """Stack the steps of every axis of every motion."""
+        """Stack the steps of every axis of every motion; the axes of a motion share its offset."""
         parts: list[tuple[Floats, Floats, Floats, Floats, Floats]] = []
         groups: list[int] = []
-        predicted: list[float] = []
-        for m in motions:
+        levels: list[float] = []
+        for number, m in enumerate(motions):
             start, stop = m.steps()
-            y, h, s = _rotation_steps(m) if quantity == "rotation" else _translation_steps(m)
+            y, excess = _rotation_steps(m) if quantity == "rotation" else _translation_steps(m)
             tau = m.time[stop] - m.time[start]
             linked = np.append(start[1:] == stop[:-1], False).astype(np.float64)
             for axis in range(y.shape[1]):
-                if axis == 0 or quantity == "translation":
-                    predicted.append(s)
-                parts.append((y[:, axis], tau, h[start, axis], h[stop, axis], linked))
-                groups.append(len(predicted) - 1)
-        group = np.repeat(np.array(groups), [len(p[0]) for p in parts])
-        y_all, tau_all, h0, h1, linked_all = (np.concatenate(c) for c in zip(*parts, strict=True))
-        return cls(y_all, tau_all, h0, h1, linked_all, group, np.array(predicted))._moving()
-
-    def _moving(self) -> _Likelihood:
-        """Leave out the groups that never move, unless none does."""
-        keep = self._power > _REST * self._power.max()
-        if keep.all() or not keep.any():
-            return self
-        rows, label = keep[self.group], np.cumsum(keep) - 1
-        y, tau, h0, h1, linked = (
-            c[rows] for c in (self.y, self.tau, self.h0, self.h1, self.linked)
-        )
-        return _Likelihood(y, tau, h0, h1, linked, label[self.group[rows]], self.predicted[keep])
+                parts.append((y[:, axis], tau, excess[start, axis], excess[stop, axis], linked))
+                groups.append(number)
+            levels.append(float(np.nanmean(excess[_complete(m)])))
+        group = np.repeat(np.array(groups), [len(part[0]) for part in parts])
+        y_all, tau_all, e0, e1, linked_all = (np.concatenate(c) for c in zip(*parts, strict=True))
+        return cls(y_all, tau_all, e0, e1, linked_all, group, np.array(levels))
 
     @cached_property
     def _starts(self) -> Ints:
         return np.flatnonzero(np.diff(self.group, prepend=-1))
 
     @cached_property
-    def _excess(self) -> Floats:
-        """Noise of a step's two frames beyond that of two complete ones, relative."""
-        return self.h0 + self.h1 - 2
-
-    @cached_property
     def _power(self) -> Floats:
         """Mean square step of each group: the scale of its noise offset."""
-        return self._per_group(self.y**2) / self._per_group(np.ones_like(self.y))
+        power = self._per_group(self.y**2) / self._per_group(np.ones_like(self.y))
+        floor: Floats = np.maximum(power, _REST * power.max())
+        return floor
 
     @cached_property
     def _scale(self) -> float:
@@ -410,43 +392,20 @@ class _Likelihood:
         """
         from scipy.linalg.lapack import dpttrf, dpttrs
 
-        noise, by_offset, by_D = self._noise(D, offset)
-        o, s = offset[self.group], noise[self.group]
-        a = 2 * D * self.tau + 2 * o + s * self._excess
-        b = -((o + s * (self.h1 - 1)) * self.linked)[:-1]
+        o = offset[self.group]
+        a = 2 * (D * self.tau + o) + (self.e0 + self.e1)
+        b = -((o + self.e1) * self.linked)[:-1]
         d, lower, bad = dpttrf(a, b)
         up, _, bad_up = dpttrf(a[::-1], b[::-1])
         if bad or bad_up:
             return -np.inf, np.nan, np.full(len(offset), np.nan), np.full(len(offset), _TOP)
         z, _ = dpttrs(d, lower, self.y)
         inverse, square = 1 / (d + up[::-1] - a), z * z
-        raised, raised_s = self._moments(square, -z[:-1] * z[1:])
-        lowered, lowered_s = self._moments(inverse, lower * inverse[1:])
-        up_hill, down_hill = raised + by_offset * raised_s, lowered + by_offset * lowered_s
+        up_hill = self._per_group(square - self.linked * np.append(z[:-1] * z[1:], 0.0))
+        down_hill = self._per_group(inverse + self.linked * np.append(lower * inverse[1:], 0.0))
         value = -0.5 * float(np.sum(np.log(d)) + self.y @ z)
-        slope = float(self.tau @ (square - inverse) + by_D @ (raised_s - lowered_s))
+        slope = float(self.tau @ (square - inverse))
         return value, slope, up_hill - down_hill, np.log(up_hill / down_hill)
-
-    def _moments(self, on: Floats, off: Floats) -> tuple[Floats, Floats]:
-        """Return half the trace of a matrix with the slopes of C in the offsets, and in the noises.
-
-        `on` is its diagonal, `off` the negative of the diagonal beside it.
-        """
-        beside = self.linked * np.append(off, 0.0)
-        of_noise = self._per_group(0.5 * self._excess * on + (self.h1 - 1) * beside)
-        return self._per_group(on + beside), of_noise
-
-    def _noise(self, D: float, offset: Floats) -> tuple[Floats, Floats, Floats]:
-        """Return the noise s in each offset o = s - b, and its slopes in the offset and in D.
-
-        s is as near to the predicted one as o allows, with a blur b from 0 to that of a shutter
-        that never closes.
-        """
-        least, most = np.maximum(offset, 0.0), offset - self._least * D
-        held = self.predicted > most
-        tied = held | (self.predicted < least)
-        s = np.clip(self.predicted, least, most)
-        return s, tied.astype(np.float64), np.where(held, -self._least, 0.0)
 
     def ridge(
         self, D: float, guess: Floats | None = None, tolerance: float = 1e-12
@@ -541,22 +500,19 @@ class _Likelihood:
         """Return the mean noise offset and its standard error from the observed information.
 
         The information is arrow-shaped (one D, an offset for each group); it comes from central
-        one-sided differences of the slopes.
+        differences of the slopes.
         """
         if self._scale == 0:
             return 0.0, np.nan
         offset = self.ridge(value)[2]
-        mean = float(offset.mean())
-        if np.any(offset - self._least * value <= 1e-9 * self._power) or value == 0:
+        mean = float(np.mean(offset + self.level))
+        if value == 0 or np.any(offset - self._least * value <= 1e-3 * self._power):
             return mean, np.nan
-        # Steps away from where the noise parts from the predicted one, and the slopes have a kink.
-        step_o = np.where(offset < self.predicted, -1e-4, 1e-4) * self._power
-        held = np.any(self.predicted > offset - self._least * value)
-        step_D = -1e-4 * value if held else 1e-4 * value
-        near, far = (self._evaluate(value, offset + k * step_o) for k in (1, 2))
-        h_oo = (near[2] - far[2]) / step_o
-        near, far = (self._evaluate(value + k * step_D, offset) for k in (1, 2))
-        h_DD, h_Do = (near[1] - far[1]) / step_D, (near[2] - far[2]) / step_D
+        step_o, step_D = 1e-4 * self._power, 1e-4 * value
+        more, less = (self._evaluate(value, offset + k * step_o) for k in (1, -1))
+        h_oo = (less[2] - more[2]) / (2 * step_o)
+        more, less = (self._evaluate(value + k * step_D, offset) for k in (1, -1))
+        h_DD, h_Do = (less[1] - more[1]) / (2 * step_D), (less[2] - more[2]) / (2 * step_D)
         left = h_DD - float(np.sum(h_Do**2 / h_oo))
         if left <= 0 or np.any(h_oo <= 0):
             return mean, np.nan
@@ -597,37 +553,29 @@ def _crossing(
     return float(x)
 
 
-def _rotation_steps(motion: RigidMotion) -> tuple[Floats, Floats, float]:
-    """Return body-frame rotation vectors along principal axes, each frame's noise, and its unit.
+def _rotation_steps(motion: RigidMotion) -> tuple[Floats, Floats]:
+    """Return body-frame rotation vectors along principal axes, and the excess noise of each frame.
 
-    The noise is relative to the mean over axes of a complete frame, the unit. The axes are those in
-    which the covariance of the orientation is diagonal, so that one number an axis describes it.
+    The excess (T, axes) is over the least noisy frame and axis. The axes are those in which the
+    covariance of the orientation is diagonal, so that one number an axis describes it.
     """
     _, stop = motion.steps()
     c = motion.covariance
-    fullest = motion.n_present == motion.n_present[motion.fitted].max()
-    usual = np.nanmean(c[fullest], axis=0)
-    axes = np.linalg.eigh(usual)[1]
+    axes = np.linalg.eigh(np.nanmean(c[_complete(motion)], axis=0))[1]
     noise = np.einsum("ji,tjk,ki->ti", axes, c, axes)
-    base = float(np.trace(usual)) / len(usual)
-    return motion.step_vectors()[stop - 1] @ axes, _relative(noise, base), base
+    return motion.step_vectors()[stop - 1] @ axes, noise - np.nanmin(noise)
 
 
-def _translation_steps(motion: RigidMotion) -> tuple[Floats, Floats, float]:
-    """Return displacements of the centre, each frame's noise over a complete one's, and that.
-
-    The axes are those of the noise, which leaves its mark in the product of successive steps: a
-    laboratory turned does not change the answer.
-    """
+def _translation_steps(motion: RigidMotion) -> tuple[Floats, Floats]:
+    """Return displacements of the centre, and the excess noise of each frame over the least one."""
     start, stop = motion.steps()
     y = motion.center[stop] - motion.center[start]
-    beside = (y[:-1] * (start[1:] == stop[:-1])[:, None]).T @ y[1:]
-    axes = np.linalg.eigh(beside + beside.T)[1]
-    base = float(np.nanmin(motion.center_variance))
-    noise = np.repeat(motion.center_variance[:, None], y.shape[1], axis=1)
-    return y @ axes, _relative(noise, base), base
+    noise = motion.center_variance - np.nanmin(motion.center_variance)
+    return y, np.repeat(noise[:, None], y.shape[1], axis=1)
 
 
-def _relative(noise: Floats, base: float) -> Floats:
-    """Return noise over its unit; without noise every frame is worth the same."""
-    return noise / base if base > 0 else np.where(np.isfinite(noise), 1.0, np.nan)
+def _complete(motion: RigidMotion) -> Bools:
+    """Return the fitted frames that show the most particles."""
+    fitted = np.isfinite(motion.center[:, 0])
+    complete: Bools = fitted & (motion.n_present == motion.n_present[fitted].max())
+    return complete

@@ -167,15 +167,32 @@ class RigidMotion:
         """
         p = self.orientation(p0)
         start, stop = self.steps()
-        phi = np.full((*p.shape[:-1], self.covariance.shape[-1]), np.nan)
-        phi[self.fitted] = 0.0
         step = self.rotation[stop] @ np.swapaxes(self.rotation[start], -1, -2)
-        phi[stop] = _angle_vectors(p[start], p[stop], step)
-        total = np.cumsum(phi[self.fitted], axis=0)
+        return self._summed(_angle_vectors(p[start], p[stop], step))
+
+    def accumulated_rotation(self) -> Floats:
+        """Add up the rotation vectors of all steps in lab axes (Hunter 2011, appendix).
+
+        Returns
+        -------
+        ndarray, shape (T, 3); in the plane (T, 1)
+            rad; 0 at the beginning of every piece, NaN in frames without a pose.
+        """
+        start, stop = self.steps()
+        step = self.rotation[stop] @ np.swapaxes(self.rotation[start], -1, -2)
+        return self._summed(log_map(step))
+
+    def _summed(self, steps: Floats) -> Floats:
+        """Sum the vectors of all steps (S, ..., c) to a walk that starts at 0 in every piece."""
+        _, stop = self.steps()
+        walk = np.full((len(self.time), *steps.shape[1:]), np.nan)
+        walk[self.fitted] = 0.0
+        walk[stop] = steps
+        total = np.cumsum(walk[self.fitted], axis=0)
         first = np.isin(self.fitted, stop, invert=True)
         origin = np.maximum.accumulate(np.where(first, np.arange(first.size), 0))
-        phi[self.fitted] = total - total[origin]
-        return phi
+        walk[self.fitted] = total - total[origin]
+        return walk
 
     def positions(self) -> Floats:
         """Return the particles of the rigid body in the lab frame, (T, n, d), um."""
@@ -325,6 +342,63 @@ def track_rotation(
     return _measured(fit, x, seen, time=time, dt=dt, given=given)
 
 
+def remove_rotation(
+    positions: ArrayLike, *, dt: float = 1.0, frames: ArrayLike | None = None
+) -> tuple[Floats, RigidMotion]:
+    """Take the bulk rotation and drift off a many-body system (Hunter 2011, conclusion).
+
+    The rotation between successive frames is fitted to the particles seen in both, whose own
+    diffusion is noise to it; the steps are multiplied (Eq. 13) and undone.
+
+    Parameters
+    ----------
+    positions : array_like, shape (T, n, d)
+        Particles that move on their own in a frame that turns and drifts, um; NaN where missing.
+    dt : float
+        Time between frames, s.
+    frames : array_like of int, shape (T,), optional
+        Frame numbers of the rows.
+
+    Returns
+    -------
+    positions : ndarray, shape (T, n, d)
+        In the axes of the first fitted frame, about the centre of the particles' mean places, um;
+        NaN in frames without a pose.
+    motion : RigidMotion
+        The motion taken off.
+
+    Raises
+    ------
+    DegenerateClusterError, TooFewFramesError
+        As in `track_rotation`.
+    ValueError
+        For bad shapes or values, and for particles seen only in frames without a pose.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from perrin import Cluster, remove_rotation, simulate_motion
+    >>> truth = simulate_motion(Cluster.touching(7, 2.0), D_R=1e-3, dt=1.0, n_frames=50, rng=0)
+    >>> still, motion = remove_rotation(truth.positions())
+    >>> bool(np.allclose(still, still[0]))
+    True
+    """
+    x = as_positions(positions)
+    require_positive(dt=dt)
+    time = _times(len(x), dt=dt, frames=frames, times=None)
+    seen = present(x)
+    _require_points(seen, x.shape[2])
+    usable = seen
+    while True:
+        body, fit = _unturned(x, usable)
+        motion = _measured(fit, x, seen, time=time, dt=dt, given=None)
+        refused = np.isfinite(fit.center[:, 0]) & np.isnan(motion.center[:, 0])
+        if not refused.any():
+            return body, motion
+        # The error of a frame that hardly fixes a rotation would stay in all later frames.
+        usable = usable & ~refused[:, None]
+
+
 def _angle_vectors(p: Floats, q: Floats, step: Floats) -> Floats:
     """Return the angle from p to q as a vector along p x q; in the plane as one signed number."""
     dot = np.sum(p * q, axis=-1, keepdims=True)
@@ -379,7 +453,7 @@ def _require_points(seen: Bools, d: int) -> None:
         )
     never = np.flatnonzero(~seen.any(axis=0))
     if never.size:
-        raise ValueError(f"particles {never.tolist()} are missing in every frame: leave them out")
+        raise ValueError(f"particles {never.tolist()} are missing in every frame with a pose: leave them out")
 
 
 def body_residuals(motion: RigidMotion, positions: ArrayLike) -> Floats:
@@ -420,14 +494,38 @@ def _fit_chain(x: Floats, seen: Bools) -> _Fit:
     rotation = np.full((len(x), x.shape[2], x.shape[2]), np.nan)
     rotation[rows] = np.swapaxes(cumulative_product(np.swapaxes(step, -1, -2)), -1, -2)
     shape = _settled(lambda s: _mean_of(_in_body(x, seen, rotation, s)), x[rows[0]])
-    fit = _finished(x, seen, rotation, shape)
+    _, residual, sigma2 = _step_misfit(x, seen, rows, step)
+    return _finished(x, seen, rotation, shape)._replace(residual=residual, sigma2=sigma2)
+
+
+def _unturned(x: Floats, seen: Bools) -> tuple[Floats, _Fit]:
+    """Undo the product of the steps (Eq. 13): particles in the moving axes, and the motion."""
+    rows, step = _chain_steps(x, seen)
+    shift, residual, sigma2 = _step_misfit(x, seen, rows, step)
+    rotation = np.full((len(x), x.shape[2], x.shape[2]), np.nan)
+    rotation[rows] = np.swapaxes(cumulative_product(np.swapaxes(step, -1, -2)), -1, -2)
+    # c_{k+1} = R^k c_k + v^k becomes a sum in the axes of the body.
+    jumps = np.einsum("tji,tj->ti", rotation[rows[1:]], shift)
+    origin = np.concatenate([_mean_present(x[rows[:1]]), jumps]).cumsum(axis=0)
+    center = np.full((len(x), x.shape[2]), np.nan)
+    center[rows] = np.einsum("tij,tj->ti", rotation[rows], origin)
+    body = np.einsum("tji,tnj->tni", rotation, x - center[:, None])
+    mean = _nan_mean(body, axis=0)
+    middle = _mean_present(mean)
+    fit = _Fit(rotation, center + rotation @ middle, mean - middle, residual, sigma2)
+    return body - middle, fit
+
+
+def _step_misfit(x: Floats, seen: Bools, rows: Ints, step: Floats) -> tuple[Floats, Floats, float]:
+    """Return the shift of each step about the origin, its residuals over sqrt(2), and sigma^2."""
     both = (seen[rows[1:]] & seen[rows[:-1]])[..., None]
     end, begin = np.where(both, x[rows[1:]], np.nan), np.where(both, x[rows[:-1]], np.nan)
-    turned = np.einsum("tij,tnj->tni", step, begin - _mean_present(begin)[:, None])
+    shift = _mean_present(end) - np.einsum("tij,tj->ti", step, _mean_present(begin))
+    turned = np.einsum("tij,tnj->tni", step, begin) + shift[:, None]
     e = np.full_like(x, np.nan)
-    e[rows[1:]] = (end - _mean_present(end)[:, None] - turned) / np.sqrt(2)
+    e[rows[1:]] = (end - turned) / np.sqrt(2)
     freedom = _freedom(both[..., 0].sum(axis=1), x.shape[2]).sum()
-    return fit._replace(residual=e, sigma2=float(np.nansum(e * e)) / freedom if freedom else np.nan)
+    return shift, e, float(np.nansum(e * e)) / freedom if freedom else np.nan
 
 
 def _chain_steps(x: Floats, seen: Bools) -> tuple[Ints, Floats]:
@@ -436,6 +534,7 @@ def _chain_steps(x: Floats, seen: Bools) -> tuple[Ints, Floats]:
     while rows.size > 1:
         step, unique = fit_rotations(x[rows[1:]], x[rows[:-1]])
         if unique.all():
+            _require_points(seen[rows], x.shape[2])
             return rows, step
         # A frame that cannot follow the one before it goes; of a run of them only the first, for
         # the next may well follow the frame that is then before it.
@@ -465,7 +564,7 @@ def _too_few(count: int) -> TooFewFramesError:
 
 def _settled(refined: Callable[[Floats], Floats], shape: Floats) -> Floats:
     """Refine a shape until it rests to rounding and no particle is added to it any more."""
-    for _ in range(500):
+    for _ in range(100):
         new = refined(shape)
         change, size = np.nanmax(np.abs(new - shape)), np.nanmax(np.abs(new - _mean_present(new)))
         grown = np.isfinite(new).sum() > np.isfinite(shape).sum()

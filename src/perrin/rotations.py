@@ -5,6 +5,8 @@ Rotations are active matrices, lab from body: ``x = R x0``. All functions take l
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -69,6 +71,57 @@ def kabsch(points: ArrayLike, reference: ArrayLike, *, weights: ArrayLike | None
             rows,
         )
     return rotation
+
+
+class Similarity(NamedTuple):
+    """Scale, rotation and shift of ``y = s R x + v`` (Hunter 2011, Eq. 1)."""
+
+    s: Floats
+    R: Floats
+    v: Floats
+
+
+def similarity(points: ArrayLike, reference: ArrayLike) -> Similarity:
+    """Find the scale, rotation and shift that carry each reference set onto its points.
+
+    Parameters
+    ----------
+    points : array_like, shape (..., n, d)
+        y of ``y = s R x + v``; a row with a NaN is an absent particle.
+    reference : array_like, shape (..., n, d)
+        x; leading axes broadcast.
+
+    Returns
+    -------
+    Similarity
+        ``s`` of shape (...), positive, ``R`` (..., d, d) proper, ``v`` (..., d): the least-squares
+        solution.
+
+    Raises
+    ------
+    DegenerateClusterError
+        As in `kabsch`.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from perrin import Cluster, similarity
+    >>> x = Cluster.tetrahedron(1.0).positions
+    >>> s, R, v = similarity(2.0 * x + [1.0, 0.0, -1.0], x)
+    >>> float(s.round(12)), v.round(12).tolist()
+    (2.0, [1.0, 0.0, -1.0])
+    """
+    R = kabsch(points, reference)
+    y, x, w = _paired(points, reference, None)
+    weight = np.ones(y.shape[-2]) if w is None else w
+    total = weight.sum(-1)[..., None]
+    y0 = (weight[..., None] * y).sum(-2) / total
+    x0 = (weight[..., None] * x).sum(-2) / total
+    turned = np.einsum("...ij,...nj->...ni", R, x - x0[..., None, :])
+    along = np.sum(weight[..., None] * (y - y0[..., None, :]) * turned, axis=(-2, -1))
+    s = along / np.sum(weight[..., None] * turned**2, axis=(-2, -1))
+    v = y0 - s[..., None] * np.einsum("...ij,...j->...i", R, x0)
+    return Similarity(np.asarray(s), R, np.asarray(v))
 
 
 def fit_rotations(
@@ -167,6 +220,43 @@ def log_map(rotation: ArrayLike) -> Floats:
     ratio = np.divide(angle, sine, out=np.full_like(sine, 2.0), where=sine > 1e-9)
     out: Floats = v * ratio[..., None]
     return out
+
+
+def axis_angle(rotation: ArrayLike) -> tuple[Floats, Floats]:
+    """Return axis and angle of a rotation (Hunter 2011, Eqs. 28-31), safe at every angle and axis.
+
+    Parameters
+    ----------
+    rotation : array_like, shape (..., 3, 3)
+        Proper rotation matrices.
+
+    Returns
+    -------
+    axis : ndarray, shape (..., 3)
+        Unit vectors; NaN where the angle is 0 and there is no axis.
+    angle : ndarray, shape (...)
+        rad, in [0, pi]. At pi either sign of the axis is right.
+
+    Raises
+    ------
+    ValueError
+        For another shape; a rotation of the plane has no axis.
+
+    Examples
+    --------
+    >>> axis, angle = axis_angle(exp_map([0.5, 0.0, 0.0]))  # along x, where Eq. 29 is 0/0
+    >>> axis.round(12).tolist(), float(angle.round(12))
+    ([1.0, 0.0, 0.0], 0.5)
+    """
+    r = np.asarray(rotation, dtype=np.float64)
+    if r.shape[-2:] != (3, 3):
+        raise ValueError(f"rotation: expected matrices (..., 3, 3), got shape {r.shape}")
+    vector = log_map(r)
+    # hypot does not square: an angle of 1e-200 is one too.
+    angle = np.asarray(np.hypot.reduce(vector, axis=-1))
+    axis = np.full_like(vector, np.nan)
+    np.divide(vector, angle[..., None], out=axis, where=angle[..., None] > 0)
+    return axis, angle
 
 
 def skew(vector: Floats) -> Floats:
