@@ -720,6 +720,68 @@ def test_step_vectors_are_in_body_axes():
     assert np.isfinite(motion.step_vectors()).all(axis=1).sum() == len(start)
 
 
+# ---- the summed rotation vectors ----------------------------------------------------------------
+
+
+@pytest.mark.parametrize("omega", [[0, 0, 4.0], [2.0, -1.0, 0.5], [-25.0, 0, 0]])
+def test_rotation_vectors_of_a_steady_turn_add_up(omega):
+    """At constant omega the sum is omega t, many turns on, along x too."""
+    motion = track_rotation(spinning(omega, 300), dt=0.1)
+    expected = np.outer(np.arange(300) * 0.1, omega)
+    np.testing.assert_allclose(motion.accumulated_rotation(), expected, rtol=0, atol=1e-9)
+
+
+def test_summed_rotation_vectors_are_scipys():
+    """Row by row the sum of the lab-frame rotvecs R_{k+1} R_k^T, the body's turned into the lab."""
+    motion = track_rotation(simulated(TETRA, sigma=0.03, seed=31)[1], dt=0.5)
+    rotation, _ = motion.as_scipy()
+    expected = np.cumsum((rotation[1:] * rotation[:-1].inv()).as_rotvec(), axis=0)
+    walk = motion.accumulated_rotation()
+    assert walk.shape == (120, 3)
+    np.testing.assert_array_equal(walk[0], 0)
+    np.testing.assert_allclose(walk[1:], expected, rtol=0, atol=1e-12)
+    lab = np.einsum("tij,tj->ti", motion.rotation[:-1], motion.step_vectors())
+    np.testing.assert_allclose(np.diff(walk, axis=0), lab, rtol=0, atol=1e-12)
+
+
+def test_summed_rotation_vectors_cross_gaps_and_restart_in_pieces():
+    """A gap is the one direct turn between its ends; missing frames are NaN; pieces begin at 0."""
+    x = spinning([0, 0, 4.0], 50)
+    x[10:12] = np.nan
+    x[20:33] = np.nan
+    x[39:41] = np.nan
+    cut = replace(track_rotation(x, dt=0.1), piece=np.repeat([0, 1], [40, 10]))
+    expected = 0.4 * np.arange(50.0)
+    expected[33:] -= 2 * np.pi
+    expected[41:] -= expected[41]
+    expected[[10, 11, *range(20, 33), 39, 40]] = np.nan
+    walk = cut.accumulated_rotation()
+    np.testing.assert_allclose(walk[:, 2], expected, rtol=0, atol=1e-11)
+    np.testing.assert_allclose(walk[cut.fitted, :2], 0, atol=1e-12)
+
+
+def test_summed_rotation_in_the_plane_is_the_angle():
+    """In 2-D the sum is the unbounded angle of any direction, one signed number."""
+    angle = np.cumsum(np.random.default_rng(32).normal(0.5, 0.8, 300))
+    x = np.einsum("tij,nj->tni", exp_map(angle[:, None]), FLAT.positions)
+    x[100:103] = np.nan
+    motion = track_rotation(x, dt=0.1)
+    walk = motion.accumulated_rotation()
+    assert walk.shape == (300, 1)
+    np.testing.assert_allclose(walk, motion.rotational_displacement([1.0, 0.0]), atol=1e-12)
+
+
+def test_summed_rotation_follows_the_lab():
+    """Turn, shift and rescale the lab: the vectors turn with it; body labels do not matter."""
+    _, x = simulated(TETRA, sigma=0.03, seed=33)
+    q = Rotation.random(random_state=4).as_matrix()
+    walk = track_rotation(x, dt=0.5).accumulated_rotation()
+    other = track_rotation(40.0 * x @ q.T + [5.0, 6.0, 7.0], dt=0.5).accumulated_rotation()
+    np.testing.assert_allclose(other, walk @ q.T, rtol=0, atol=1e-9)
+    shuffled = track_rotation(x[:, [2, 0, 3, 1]], dt=0.5).accumulated_rotation()
+    np.testing.assert_allclose(shuffled, walk, rtol=0, atol=1e-9)
+
+
 # ---- in and out ---------------------------------------------------------------------------------
 
 

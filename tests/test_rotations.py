@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.spatial.transform import Rotation
 
-from perrin import Cluster, DegenerateClusterError, kabsch
+from perrin import Cluster, DegenerateClusterError, axis_angle, kabsch, similarity
 from perrin.rotations import cumulative_product, exp_map, fit_rotations, log_map, skew
 
 TETRA = Cluster.tetrahedron(1.0).positions
@@ -511,3 +511,253 @@ def test_running_products_are_those_of_a_plain_loop(count, d):
     got = cumulative_product(steps)
     assert got.shape == (count + 1, d, d)
     np.testing.assert_allclose(got, expected, rtol=0, atol=1e-13)
+
+
+# ---- similarity ---------------------------------------------------------------------------------
+
+
+def planted(d, batch=(), seed=31, noise=0.0):
+    """Return reference sets, points s R x + v (+ noise), and the planted s, R, v."""
+    rng = np.random.default_rng(seed)
+    x = rng.normal(size=(*batch, 6, d))
+    s = np.exp(rng.normal(size=batch))
+    R = exp_map(2.0 * rng.normal(size=(*batch, 3 if d == 3 else 1)))
+    v = 10.0 * rng.normal(size=(*batch, d))
+    y = s[..., None, None] * np.einsum("...ij,...nj->...ni", R, x) + v[..., None, :]
+    return x, y + noise * rng.normal(size=y.shape), (s, R, v)
+
+
+def misfit(y, x, s, R, v):
+    """Return the sum that Eq. 5 makes least, with the s and v of Eq. 1; absent rows left out."""
+    model = np.asarray(s)[..., None, None] * np.einsum("...ij,...nj->...ni", R, x)
+    return np.nansum((y - model - np.asarray(v)[..., None, :]) ** 2, axis=(-2, -1))
+
+
+@pytest.mark.parametrize("batch", [(), (1,), (50,), (4, 3)])
+@pytest.mark.parametrize("d", [2, 3])
+def test_similarity_recovers_what_was_planted(d, batch):
+    """Scale, rotation and shift of Eq. 1 come back to 1e-12, one set or many."""
+    x, y, truth = planted(d, batch)
+    found = similarity(y, x)
+    for got, expected, shape in zip(found, truth, [(), (d, d), (d,)], strict=True):
+        assert got.shape == (*batch, *shape)
+        np.testing.assert_allclose(got, expected, rtol=1e-12, atol=1e-12)
+    assert found.s is found[0]
+    assert found.R is found[1]
+    assert found.v is found[2]
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_similarity_leaves_out_nan_rows(d):
+    """A NaN in either set takes the particle out, whatever stands in the other set."""
+    x, y, truth = planted(d, (40,))
+    y[:, 1] = np.nan
+    y[::2, 4, 0] = np.nan
+    x = np.where(np.arange(6)[:, None] == 2, np.nan, x)
+    y[:, 2] = 1e6
+    for got, expected in zip(similarity(y, x), truth, strict=True):
+        np.testing.assert_allclose(got, expected, rtol=1e-11, atol=1e-11)
+    noisy_x, noisy_y, _ = planted(d, (40,), noise=0.1)
+    kept = similarity(np.delete(noisy_y, 3, 1), np.delete(noisy_x, 3, 1))
+    noisy_y[:, 3] = np.nan
+    for got, expected in zip(similarity(noisy_y, noisy_x), kept, strict=True):
+        np.testing.assert_allclose(got, expected, rtol=1e-11, atol=1e-11)
+
+
+@pytest.mark.parametrize("holes", [False, True])
+@pytest.mark.parametrize("d", [2, 3])
+def test_no_similarity_fits_better(d, holes):
+    """On noisy data every step away in s, R, v or all three costs more, large steps and small."""
+    rng = np.random.default_rng(32)
+    x, y, _ = planted(d, (30,), noise=0.3)
+    if holes:
+        y[np.arange(30)[:, None], rng.integers(0, 6, (30, 2))] = np.nan
+    s, R, v = similarity(y, x)
+    best = misfit(y, x, s, R, v)
+    for size in (1e-3, 1e-2, 0.3):
+        ds = size * rng.normal(size=s.shape)
+        dR = exp_map(size * rng.normal(size=(len(s), 3 if d == 3 else 1)))
+        dv = size * rng.normal(size=v.shape)
+        for near in ((s + ds, R, v), (s, R @ dR, v), (s, R, v + dv), (s + ds, R @ dR, v + dv)):
+            assert np.all(misfit(y, x, *near) > best)
+    # At the optimum the cost has no slope.
+    h = 1e-5
+    slope = [misfit(y, x, s + h, R, v) - misfit(y, x, s - h, R, v)]
+    slope += [misfit(y, x, s, R, v + h * e) - misfit(y, x, s, R, v - h * e) for e in np.eye(d)]
+    for e in np.eye(3 if d == 3 else 1):
+        slope += [misfit(y, x, s, R @ exp_map(h * e), v) - misfit(y, x, s, R @ exp_map(-h * e), v)]
+    np.testing.assert_allclose(np.array(slope) / (2 * h), 0, atol=1e-6)
+
+
+def test_similarity_follows_the_axes_and_units_of_both_sets():
+    """Turn, shift and stretch either set: s, R, v follow; without noise the inverse is inverse."""
+    x, y, _ = planted(3, (20,), noise=0.2)
+    s, R, v = similarity(y, x)
+    q, shift = random_rotations(1)[0], np.array([3.0, -4.0, 5.0])
+    s2, R2, v2 = similarity(7.0 * y @ q.T + shift, x)
+    np.testing.assert_allclose(s2, 7.0 * s, rtol=1e-12)
+    np.testing.assert_allclose(R2, q @ R, atol=1e-12)
+    np.testing.assert_allclose(v2, 7.0 * v @ q.T + shift, atol=1e-11)
+    s3, R3, v3 = similarity(y, 0.1 * x @ q.T + shift)
+    np.testing.assert_allclose(s3, 10.0 * s, rtol=1e-12)
+    np.testing.assert_allclose(R3, R @ q.T, atol=1e-12)
+    np.testing.assert_allclose(v3, v - np.einsum("t,tij,j->ti", s3, R3, shift), atol=1e-10)
+    clean_x, clean_y, (s0, R0, v0) = planted(3)
+    back = similarity(clean_x, clean_y)
+    np.testing.assert_allclose(back.s, 1 / s0, rtol=1e-12)
+    np.testing.assert_allclose(back.R, R0.T, atol=1e-12)
+    np.testing.assert_allclose(back.v, -R0.T @ v0 / s0, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("left", "right"), [((), (4,)), ((4,), ()), ((4, 1), (3,)), ((1, 3), (4, 1)), ((0,), ())]
+)
+@pytest.mark.parametrize("d", [2, 3])
+def test_leading_axes_of_similarity_broadcast(d, left, right):
+    """Any leading shapes give what single calls give, also more of them on the reference."""
+    rng = np.random.default_rng(33)
+    y, x = rng.normal(size=(*left, 6, d)), rng.normal(size=(*right, 6, d))
+    s, R, v = similarity(y, x)
+    batch = np.broadcast_shapes(left, right)
+    assert (s.shape, R.shape, v.shape) == (batch, (*batch, d, d), (*batch, d))
+    y, x = np.broadcast_to(y, (*batch, 6, d)), np.broadcast_to(x, (*batch, 6, d))
+    for k in np.ndindex(batch):
+        one = similarity(y[k], x[k])
+        np.testing.assert_allclose(s[k], one.s, rtol=1e-12)
+        np.testing.assert_allclose(R[k], one.R, atol=1e-12)
+        np.testing.assert_allclose(v[k], one.v, atol=1e-12)
+
+
+def test_similarity_never_mirrors():
+    """Mirrored data get a proper rotation and a positive scale, the best that such can do."""
+    rng = np.random.default_rng(34)
+    for d in (2, 3):
+        x = rng.normal(size=(30, 6, d))
+        s, R, v = similarity(x * np.r_[np.ones(d - 1), -1.0], x)
+        assert np.all(s > 0)
+        np.testing.assert_allclose(np.linalg.det(R), 1.0, atol=1e-13)
+        best = misfit(x * np.r_[np.ones(d - 1), -1.0], x, s, R, v)
+        for turn in exp_map(3.0 * rng.normal(size=(50, 3 if d == 3 else 1))):
+            assert np.all(misfit(x * np.r_[np.ones(d - 1), -1.0], x, s, R @ turn, v) >= best)
+
+
+@pytest.mark.parametrize("name", HOPELESS)
+def test_similarity_refuses_what_has_no_answer(name):
+    """Collinear, coincident and exactly mirrored sets are refused with their rows."""
+    points, reference = HOPELESS[name]
+    good = TETRA if len(points) == 4 else TRIMER
+    with pytest.raises(DegenerateClusterError, match="collinear") as caught:
+        similarity(np.stack([good, points]), np.stack([good, reference]))
+    assert caught.value.indices == (1,)
+    y = np.where(np.arange(4)[:, None] < 2, np.nan, TETRA)
+    with pytest.raises(DegenerateClusterError):
+        similarity(y, TETRA)
+    with pytest.raises(ValueError, match="infinite"):
+        similarity(np.where(np.eye(4, 3) > 0, np.inf, TETRA), TETRA)
+
+
+# ---- axis and angle -----------------------------------------------------------------------------
+
+AXES = {
+    "x": [1.0, 0, 0],
+    "-x": [-1.0, 0, 0],
+    "y": [0, 1.0, 0],
+    "-z": [0, 0, -1.0],
+    "nearly x": [1.0, 1e-9, 0],
+    "any": [0.36, -0.48, 0.8],
+}
+
+
+@pytest.mark.parametrize("angle", [1e-300, 1e-200, 1e-160, 1e-12, 1e-8, 1e-3, 1.0, np.pi / 2, 3.0])
+@pytest.mark.parametrize("name", AXES)
+def test_axis_and_angle_of_a_planted_rotation(name, angle):
+    """Both come back at every angle from 1e-300 up, also along x, where eq. 29 is 0/0."""
+    u = np.array(AXES[name]) / np.linalg.norm(AXES[name])
+    axis, got = axis_angle(exp_map(angle * u))
+    assert float(got) == pytest.approx(angle, rel=1e-14)
+    np.testing.assert_allclose(axis, u, rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("gap", [1e-3, 1e-6, 1e-8, 1e-10, 1e-12])
+@pytest.mark.parametrize("name", AXES)
+def test_axis_and_angle_near_half_a_turn(name, gap):
+    """Just under pi the sign of the axis is still known; just over it the other one is right."""
+    u = np.array(AXES[name]) / np.linalg.norm(AXES[name])
+    for side in (1, -1):
+        axis, angle = axis_angle(exp_map((np.pi - side * gap) * u))
+        assert float(angle) == pytest.approx(np.pi - gap, abs=1e-14)
+        np.testing.assert_allclose(axis, side * u, rtol=0, atol=1e-14)
+
+
+def test_at_exactly_half_a_turn_either_sign_is_right():
+    """At pi the angle is pi to rounding and the axis one of two, never NaN, also along x, y, z."""
+    u = np.random.default_rng(41).normal(size=(300, 3))
+    u = np.concatenate([u / np.linalg.norm(u, axis=1, keepdims=True), np.eye(3), -np.eye(3)])
+    axis, angle = axis_angle(2 * u[:, :, None] * u[:, None] - np.eye(3))
+    np.testing.assert_allclose(angle, np.pi, rtol=0, atol=1e-14)
+    assert np.all(angle <= np.pi)
+    np.testing.assert_allclose(np.abs(np.sum(axis * u, axis=1)), 1, atol=1e-14)
+
+
+def test_no_turn_has_no_axis():
+    """The identity has angle 0 and axis NaN; a missing rotation has neither; neighbours stay."""
+    q = random_rotations(4)
+    q[1], q[2] = np.eye(3), np.nan
+    axis, angle = axis_angle(q)
+    assert angle[1] == 0
+    assert np.isnan(axis[1:3]).all()
+    assert np.isnan(angle[2])
+    assert np.isfinite(axis[[0, 3]]).all()
+    single = axis_angle(np.eye(3))
+    assert single[0].shape == (3,)
+    assert single[1].shape == ()
+
+
+def test_axis_times_angle_is_scipys_rotation_vector():
+    """Over the whole group and leading axes, against Rotation.as_rotvec and magnitude (1e-13)."""
+    q = random_rotations(3000)
+    axis, angle = axis_angle(q.reshape(30, 100, 3, 3))
+    assert axis.shape == (30, 100, 3)
+    assert angle.shape == (30, 100)
+    peer = Rotation.from_matrix(q)
+    product = (axis * angle[..., None]).reshape(-1, 3)
+    np.testing.assert_allclose(product, peer.as_rotvec(), rtol=0, atol=1e-13)
+    np.testing.assert_allclose(angle.ravel(), peer.magnitude(), rtol=0, atol=1e-13)
+    np.testing.assert_allclose(np.linalg.norm(axis, axis=-1), 1, rtol=0, atol=1e-14)
+    assert axis_angle(np.empty((0, 3, 3)))[0].shape == (0, 3)
+
+
+def test_equations_28_to_31_hold_as_printed():
+    """R u = u; w = u x i/|u x i|; R w = w'; sin(dphi) u = w x w', for any axis off x (1e-12)."""
+    q = np.concatenate([random_rotations(2000), exp_map([[0, 0, 1e-5], [0.3, 3.1, 0.2]])])
+    u, angle = axis_angle(q)
+    np.testing.assert_allclose(np.einsum("tij,tj->ti", q, u), u, rtol=0, atol=1e-12)
+    w = np.cross(u, [1.0, 0.0, 0.0])
+    w /= np.linalg.norm(w, axis=1, keepdims=True)
+    turned_w = np.einsum("tij,tj->ti", q, w)
+    cross = np.cross(w, turned_w)
+    np.testing.assert_allclose(cross, np.sin(angle)[:, None] * u, rtol=0, atol=1e-12)
+    # Eq. 31 alone has dphi or pi - dphi; with the cosine it is the angle between w and w'.
+    between = np.arctan2(np.linalg.norm(cross, axis=1), np.sum(w * turned_w, axis=1))
+    np.testing.assert_allclose(between, angle, rtol=0, atol=1e-12)
+
+
+@laws
+@given(seed=seeds)
+def test_axis_and_angle_follow_the_lab(seed):
+    """Another lab turns the axis and leaves the angle; the inverse has the opposite axis."""
+    q, lab = random_rotations(2, seed=seed % 2**31)
+    axis, angle = axis_angle(q)
+    other, same = axis_angle(lab @ q @ lab.T)
+    # The axis is known to eps over the sine of the angle.
+    slack = 1e-13 / np.sin(angle)
+    assert abs(angle - same) < 1e-13
+    assert np.abs(other - lab @ axis).max() < slack
+    assert np.abs(axis_angle(q.T)[0] + axis).max() < slack
+
+
+@pytest.mark.parametrize("shape", [(), (3,), (2, 2), (5, 2, 2), (4, 4), (3, 4), (4, 3), (9,)])
+def test_other_shapes_have_no_axis(shape):
+    """What is not (..., 3, 3) is refused with its shape, the plane too."""
+    with pytest.raises(ValueError, match=r"rotation: expected matrices \(\.\.\., 3, 3\)"):
+        axis_angle(np.zeros(shape))

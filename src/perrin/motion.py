@@ -453,7 +453,9 @@ def _require_points(seen: Bools, d: int) -> None:
         )
     never = np.flatnonzero(~seen.any(axis=0))
     if never.size:
-        raise ValueError(f"particles {never.tolist()} are missing in every frame with a pose: leave them out")
+        raise ValueError(
+            f"particles {never.tolist()} are missing in every frame with a pose: leave them out"
+        )
 
 
 def body_residuals(motion: RigidMotion, positions: ArrayLike) -> Floats:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure as Figure  # rooms below annotate with it
 
 from perrin.diffusion import with_error
 
@@ -16,16 +16,18 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from matplotlib.axes import Axes
+    from numpy.typing import ArrayLike
 
     from perrin._arrays import Floats, Ints
     from perrin.diffusion import DiffusionEstimate
     from perrin.lagged import LagCurve
     from perrin.motion import RigidMotion
     from perrin.results import ClusterResult, Pooled, Report
+    from perrin.shapes import Cluster
 
 # Okabe and Ito's colours, told apart by colour-blind readers and in grey print.
 _INK, _BLUE, _RED, _GREY = "#222222", "#0072B2", "#D55E00", "#8a8a8a"
-_PARTICLES = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 
 _CROSS: dict[str, Any] = {
     "marker": "x",
@@ -46,6 +48,7 @@ _POINTS = 200  # lag times shown
 _PATH = 5000  # frames of an orientation path shown
 _RASTER = 5000  # points beyond which a line is an image inside a PDF
 _DPI = 150
+_PIXELS = 400  # of a drawn cluster, each way
 
 
 def plot_lag_curve(
@@ -172,11 +175,11 @@ def plot_orientations(motion: RigidMotion, *, ax: Axes) -> Axes:
     space: Any = ax  # matplotlib's 3-D axes carry no types
     _draw_sphere(space)
     length = np.linalg.norm(motion.template, axis=1)
-    which = np.flatnonzero(length > 1e-6 * length.max())[: len(_PARTICLES)]
+    which = np.flatnonzero(length > 1e-6 * length.max())[: len(PALETTE)]
     shown = np.arange(0, len(motion.time), -(-len(motion.time) // _PATH))
     shown = np.union1d(shown, motion.fitted[-1:])
     paths = motion.orientation(motion.template[which])
-    for color, i, path in zip(_PARTICLES, which, np.swapaxes(paths, 0, 1), strict=False):
+    for color, i, path in zip(PALETTE, which, np.swapaxes(paths, 0, 1), strict=False):
         _draw_path(space, path[shown], color=color, label=f"particle {i}")
     space.plot([], [], "o", ms=6, mfc="white", mec=_INK, label="last frame")
     space.legend(loc="upper left", frameon=False, fontsize="small", handlelength=1.2)
@@ -255,7 +258,7 @@ def save_figures(report: Report, folder: str | os.PathLike[str]) -> list[Path]:
     place = Path(folder)
     files: list[Path] = []
     if len(report.clusters) > 1:
-        files += _saved(_forest_figure(report.clusters, report.pooled), place / "clusters")
+        files += save_figure(_forest_figure(report.clusters, report.pooled), place / "clusters")
     kinds: dict[str, Callable[[ClusterResult], Figure]] = {
         "curves": _curve_figure,
         "residuals": _residual_figure,
@@ -263,8 +266,82 @@ def save_figures(report: Report, folder: str | os.PathLike[str]) -> list[Path]:
     }
     for result in report.clusters[:MAX_CLUSTERS]:
         for kind, draw in kinds.items():
-            files += _saved(draw(result), place / f"cluster-{result.cluster}-{kind}")
+            files += save_figure(draw(result), place / f"cluster-{result.cluster}-{kind}")
     return files
+
+
+def new_figure(width: float, height: float) -> Figure:
+    """Return an empty figure of a size in inches, laid out so that labels never collide.
+
+    Parameters
+    ----------
+    width, height : float
+        Inches.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+    """
+    return Figure(figsize=(width, height), layout="constrained")
+
+
+def save_figure(figure: Figure, stem: Path) -> list[Path]:
+    """Write a figure as PNG and PDF.
+
+    Parameters
+    ----------
+    figure : matplotlib.figure.Figure
+    stem : Path
+        The files' path without its suffix.
+
+    Returns
+    -------
+    list of Path
+    """
+    FigureCanvasAgg(figure)
+    files = [stem.with_name(stem.name + suffix) for suffix in (".png", ".pdf")]
+    for file in files:
+        figure.savefig(file, dpi=_DPI)
+        # The layout found for the first file serves the second.
+        figure.set_layout_engine("none")
+    return files
+
+
+def plot_cluster(cluster: Cluster, *, ax: Axes, diameter: float, view: ArrayLike) -> Axes:
+    """Draw a cluster as solid shaded spheres, seen without perspective.
+
+    Parameters
+    ----------
+    cluster : Cluster
+        In space.
+    ax : matplotlib.axes.Axes
+    diameter : float
+        Sphere diameter, um.
+    view : array_like, shape (3, 3)
+        Rotation that turns the body before it is seen along z, x to the right and y up.
+
+    Returns
+    -------
+    matplotlib.axes.Axes
+        um.
+    """
+    centers = cluster.positions @ np.asarray(view, dtype=np.float64).T
+    half = float(np.abs(centers).max()) + 0.6 * diameter
+    x = np.linspace(-half, half, _PIXELS)
+    height, color = np.full((_PIXELS, _PIXELS), -np.inf), np.ones((_PIXELS, _PIXELS, 3))
+    for i, center in enumerate(centers):
+        across = np.stack(np.meshgrid(x - center[0], x - center[1]), axis=-1) / (diameter / 2)
+        inside = np.sum(across**2, axis=-1)
+        up = np.sqrt(np.maximum(1 - inside, 0.0))
+        front = (inside < 1) & (center[2] + up * diameter / 2 > height)
+        height[front] = (center[2] + up * diameter / 2)[front]
+        # Light from over the left shoulder, and some from everywhere.
+        light = 0.35 + 0.65 * np.maximum((across @ [-0.4, 0.5] + up) / np.hypot(0.64, 1), 0)
+        own = np.array([int(PALETTE[i % len(PALETTE)][k : k + 2], 16) / 255 for k in (1, 3, 5)])
+        color[front] = (light[..., None] * own)[front]
+    ax.imshow(color, origin="lower", extent=(-half, half, -half, half), interpolation="bilinear")
+    ax.set(xlabel="x (µm)", ylabel="y (µm)")
+    return ax
 
 
 def value_text(estimate: DiffusionEstimate) -> str:
@@ -535,7 +612,7 @@ def _draw_intervals(
 
 def _curve_figure(result: ClusterResult) -> Figure:
     """Draw MSAD and MSD side by side."""
-    figure = Figure(figsize=(10, 4.6), layout="constrained")
+    figure = new_figure(10, 4.6)
     left, right = figure.subplots(1, 2)
     plot_lag_curve(result.msad, ax=left, estimate=result.D_R, floor=result.noise.phi2)
     motion = result.motion
@@ -547,7 +624,7 @@ def _curve_figure(result: ClusterResult) -> Figure:
 
 def _residual_figure(result: ClusterResult) -> Figure:
     """Draw residual over presence, one time axis."""
-    figure = Figure(figsize=(10, 4.2), layout="constrained")
+    figure = new_figure(10, 4.2)
     top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=[2.4, 1])
     plot_residual(result.motion, ax=top)
     plot_presence(result.motion, ax=bottom)
@@ -558,7 +635,7 @@ def _residual_figure(result: ClusterResult) -> Figure:
 def _orientation_figure(result: ClusterResult) -> Figure:
     """Draw the paths on the sphere, or the angle in the plane."""
     planar = result.motion.template.shape[1] == 2
-    figure = Figure(figsize=(10, 3.6) if planar else (6, 6), layout="constrained")
+    figure = new_figure(10, 3.6) if planar else new_figure(6, 6)
     ax = figure.add_subplot() if planar else figure.add_subplot(projection="3d")
     plot_orientations(result.motion, ax=ax)
     return figure
@@ -567,7 +644,7 @@ def _orientation_figure(result: ClusterResult) -> Figure:
 def _forest_figure(clusters: Sequence[ClusterResult], pooled: Pooled) -> Figure:
     """Draw D_R and D_T of all clusters side by side, as high as the list is long."""
     rows = len(clusters) if len(clusters) <= _MANY else 40
-    figure = Figure(figsize=(10, 1.6 + 0.2 * rows), layout="constrained")
+    figure = new_figure(10, 1.6 + 0.2 * rows)
     left, right = figure.subplots(1, 2)
     plot_forest(clusters, ax=left, quantity="rotation", pooled=pooled.D_R)
     plot_forest(clusters, ax=right, quantity="translation", pooled=pooled.D_T)
@@ -575,14 +652,3 @@ def _forest_figure(clusters: Sequence[ClusterResult], pooled: Pooled) -> Figure:
         right.tick_params(labelleft=False)
         right.set_ylabel("")
     return figure
-
-
-def _saved(figure: Figure, stem: Path) -> list[Path]:
-    """Write a figure as PNG and PDF."""
-    FigureCanvasAgg(figure)
-    files = [stem.with_name(stem.name + suffix) for suffix in (".png", ".pdf")]
-    for file in files:
-        figure.savefig(file, dpi=_DPI)
-        # The layout found for the first file serves the second.
-        figure.set_layout_engine("none")
-    return files

@@ -253,7 +253,7 @@ def axis_angle(rotation: ArrayLike) -> tuple[Floats, Floats]:
         raise ValueError(f"rotation: expected matrices (..., 3, 3), got shape {r.shape}")
     vector = log_map(r)
     # hypot does not square: an angle of 1e-200 is one too.
-    angle = np.asarray(np.hypot.reduce(vector, axis=-1))
+    angle = np.asarray(np.minimum(np.hypot.reduce(vector, axis=-1), np.pi))
     axis = np.full_like(vector, np.nan)
     np.divide(vector, angle[..., None], out=axis, where=angle[..., None] > 0)
     return axis, angle
