@@ -756,8 +756,8 @@ def test_lags_without_data_are_left_out():
 def test_the_line_knows_its_true_error():
     """Over 300 tracks in the paper's window stderr is the scatter, a quarter of D, within 12 %.
 
-    12 % is 3 Monte-Carlo errors. For D_R it is 6(2) % conservative (measured, 1200 tracks): the four
-    directions of a body that has turned are worth more than three walks.
+    12 % is 3 Monte-Carlo errors. For D_R it is 6(2) % conservative (measured, 1200 tracks): the
+    four directions of a body that has turned are worth more than three walks.
     """
     cluster, lines = Cluster.touching(4, 2.45), {"R": [], "T": []}
     for seed in range(300):

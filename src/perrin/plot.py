@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     import os
     from collections.abc import Callable, Sequence
 
-    from matplotlib.axes import Axes
+    from matplotlib.axes import Axes as Axes
     from numpy.typing import ArrayLike
 
     from perrin._arrays import Floats, Ints
