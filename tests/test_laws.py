@@ -1,5 +1,7 @@
 """Physics: what is planted under the paper's conditions comes back, and the paper's numbers too."""
 
+import functools
+
 import numpy as np
 import pytest
 
@@ -20,6 +22,7 @@ DT, FRAMES, SIGMA = 0.73, 300, (0.03, 0.03, 0.04)
 CLUSTER = Cluster.touching(4, 2.45)
 
 
+@functools.cache
 def paper_track(seed):
     """Return the tracked motion of one simulated cluster under the paper's conditions."""
     rng = np.random.default_rng([2011, seed])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from contextlib import contextmanager
 from pathlib import Path
@@ -189,6 +190,10 @@ def _told() -> Iterator[None]:
 
     try:
         yield
+    except BrokenPipeError:
+        # The reader has gone (a pipe into head); the run itself is written. Python's own flush at
+        # the end would complain again.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except (ValueError, OSError) as error:
         print(f"perrin: {_one_line(error)}", file=sys.stderr)
         unanswerable = isinstance(error, DegenerateClusterError | TooFewFramesError)
@@ -267,14 +272,18 @@ def _cluster_table(result: ClusterResult) -> Table:
 
     title = f"cluster {result.name}: {result.motion.fitted.size} frames"
     table = Table("", "value", "68 %", "95 %", title=title, title_justify="left", box=SIMPLE_HEAD)
+    table.columns[0].no_wrap = True
     for name, estimate in (("D_R", result.D_R), ("D_T", result.D_T)):
         table.add_row(f"{name} ({estimate.unit})", *_estimate_cells(estimate))
     table.add_row("sigma (nm)", f"{1e3 * result.motion.sigma:.3g}")
-    table.add_row("Phi^2, predicted (rad^2)", f"{result.noise.phi2:.3g}")
-    table.add_row("Phi^2, measured (rad^2)", with_error(result.phi2_measured, result.phi2_stderr))
-    for mode, size in (result.sizes or {}).items():
-        shown = with_error(size.sphere, size.sphere_stderr)
-        table.add_row(f"sphere by {mode} (um)*", shown)
+    table.add_row("Phi^2 (rad^2)", f"{result.noise.phi2:.3g}", "predicted noise floor")
+    measured = with_error(result.phi2_measured, result.phi2_stderr)
+    table.add_row("", measured, "measured noise floor")
+    for mode, name in (("translation", "D_T"), ("rotation", "D_R")):
+        if result.sizes:
+            size = result.sizes[mode]
+            shown = with_error(size.sphere, size.sphere_stderr)
+            table.add_row(f"sphere, {name} (um)*", shown)
     if result.sizes:
         table.caption = "* with the paper's factor 1.844 (Hoffmann 2009)"
     return table
@@ -288,6 +297,7 @@ def _pooled_table(report: Report) -> Table:
     count = len(report.pooled.clusters)
     title = f"{count} clusters pooled"
     table = Table("", "value", "68 %", "95 %", title=title, title_justify="left", box=SIMPLE_HEAD)
+    table.columns[0].no_wrap = True
     for name, estimate in (("D_R", report.pooled.D_R), ("D_T", report.pooled.D_T)):
         table.add_row(f"{name} ({estimate.unit})", *_estimate_cells(estimate))
     return table

@@ -406,7 +406,8 @@ class _Likelihood:
         down_hill = self._per_group(inverse + self.linked * np.append(lower * inverse[1:], 0.0))
         value = -0.5 * float(np.sum(np.log(d)) + self.y @ z)
         slope = float(self.tau @ (square - inverse))
-        return value, slope, up_hill - down_hill, np.log(up_hill / down_hill)
+        tilt = np.log(np.maximum(up_hill / down_hill, np.exp(-_TOP)))  # nothing moves: downhill
+        return value, slope, up_hill - down_hill, tilt
 
     def ridge(
         self, D: float, guess: Floats | None = None, tolerance: float = 1e-12

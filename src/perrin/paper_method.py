@@ -137,7 +137,7 @@ def _by_svd(dispersion: Floats) -> Floats:
 
 
 def _cost_around(rng: np.random.Generator) -> tuple[Floats, Floats]:
-    """Return how far 25 000 rotations are turned from the fitted one, and how much worse they fit."""
+    """Return angles from the fitted rotation of 25 000 others, and how much worse they fit."""
     x = rng.normal(size=(500, 4, 3))
     y = x + 0.1 * rng.normal(size=x.shape)
     y, x = y - y.mean(1, keepdims=True), x - x.mean(1, keepdims=True)
@@ -448,6 +448,7 @@ def _distance_ratio(body: Cluster) -> float:
 
 
 def unit(vector: Floats) -> Floats:
+    """Return vectors (..., 3) at length 1."""
     return np.asarray(vector / np.linalg.norm(vector, axis=-1, keepdims=True))
 
 

@@ -72,8 +72,8 @@ def figure_2(study: Study) -> Item:
         ax.set_aspect("equal", adjustable="datalim")
 
     text = (
-        "One tetrahedron, D_R = 1e-4 rad^2/ts, 10^4 steps. (a) The directions of its four particles "
-        "on the unit sphere. (b) (phi_x, phi_y) of two of them, from (0, 0) to the open circles."
+        "One tetrahedron, D_R = 1e-4 rad^2/ts, 10^4 steps. (a) The directions of its four "
+        "particles on the unit sphere. (b) (phi_x, phi_y) of two of them, from (0, 0) to the open circles."
     )
     return Item("fig2", _ORIENTATIONS, "Fig. 2: trajectories on the sphere and in rotation space",
                 text, table, draw, claims, size=(11, 5.2))  # fmt: skip
@@ -154,7 +154,7 @@ def axes(study: Study) -> Item:
 
     text = (
         "Five touching spheres with D_R = (1, 1, 2) x 1e-3 rad^2/ts, the last about the long axis, "
-        "no noise. MSAD(p) = 2 (tr D - p.D.p) dt: a direction does not see the rotation about itself."
+        "no noise. MSAD(p) = 2 (tr D - p.D.p) dt: a direction does not see turns about itself."
     )
     return Item("axes", _ORIENTATIONS, "Two chosen directions of an anisotropic body", text, table,
                 draw, claims, size=(6.5, 4.6))  # fmt: skip
