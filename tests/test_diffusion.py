@@ -401,14 +401,14 @@ def test_offsets_scatter_about_the_planted_noise(standard, quantity):
 def test_noisy_offsets_equal_the_floor(quantity):
     """At SNR 0.3 noise rules: the offset is the planted floor within 3 standard errors, sd 1.
 
-    The z-score's sd of 60 tracks is 1 within 3 errors (27 %).
+    The z-score's sd of 40 tracks is 1 within 3 errors (34 %).
     """
-    found = [estimate_diffusion(tracked(cloud(s, snr=0.3)), quantity=quantity) for s in range(60)]
+    found = [estimate_diffusion(tracked(cloud(s, snr=0.3)), quantity=quantity) for s in range(40)]
     s = S_R if quantity == "rotation" else S_T
     offsets = np.array([e.offset for e in found])
     z = (offsets - s) / [e.offset_stderr for e in found]
     assert abs(offsets.mean() - s) < 3 * standard_error(offsets)
-    assert abs(z.std(ddof=1) - 1) < 3 / np.sqrt(2 * 59)
+    assert abs(z.std(ddof=1) - 1) < 3 / np.sqrt(2 * 39)
 
 
 @pytest.mark.parametrize("quantity", QUANTITIES)
@@ -454,13 +454,13 @@ def test_missing_frames_do_not_bias():
 
 @pytest.mark.parametrize("blur", [1, 8])
 def test_missing_particles_do_not_bias(blur):
-    """15 % of the particles of a bipyramid missing, with and without blur: 40 tracks, unbiased.
+    """15 % of the particles of a bipyramid missing, with and without blur: 30 tracks, unbiased.
 
     Its noise differs by axis and frame, blur does not: taken for one another they cost 20 %.
     """
     cluster = Cluster.touching(5, 2.45)
     check_unbiased(
-        [tracked(lossy(s, particles=0.15, cluster=cluster, substeps=blur)) for s in range(40)]
+        [tracked(lossy(s, particles=0.15, cluster=cluster, substeps=blur)) for s in range(30)]
     )
 
 
@@ -468,8 +468,8 @@ def test_missing_particles_do_not_bias(blur):
     "cluster", [TETRAHEDRON, Cluster.trimer(1.5)], ids=["tetrahedron", "trimer"]
 )
 def test_blur_makes_negative_offsets_and_no_bias(cluster):
-    """A shutter that never closes: the offset is s - D dt/3 < 0 and D is unbiased (40 tracks)."""
-    motions = [tracked(cloud(s, cluster=cluster, substeps=8, snr=50.0)) for s in range(40)]
+    """A shutter that never closes: the offset is s - D dt/3 < 0 and D is unbiased (30 tracks)."""
+    motions = [tracked(cloud(s, cluster=cluster, substeps=8, snr=50.0)) for s in range(30)]
     every = check_unbiased(motions, {q: planted(q, 50.0) for q in QUANTITIES})
     for quantity, found in every.items():
         offsets = [e.offset / planted(quantity, 50.0) for e in found]
@@ -483,7 +483,7 @@ def test_noise_that_differs_by_axis_is_told_from_blur():
     body = Cluster.from_positions(
         [[-1.5, 0.3, 0], [-0.5, -0.3, 0.3], [0.5, 0.3, -0.3], [1.5, -0.3, 0]]
     )
-    check_unbiased([tracked(cloud(s, cluster=body, substeps=8)) for s in range(40)])
+    check_unbiased([tracked(cloud(s, cluster=body, substeps=8)) for s in range(30)])
 
 
 def test_poor_z_does_not_spoil_D_T():
@@ -497,20 +497,20 @@ def test_poor_z_does_not_spoil_D_T():
 
 
 def test_in_the_plane_one_angle_and_two_coordinates():
-    """2-D: D_R with 2 D t and D_T with 4 D t come back, 60 tracks; rms error sqrt(6/N), sqrt(6/2N).
+    """2-D: D_R with 2 D t and D_T with 4 D t come back, 40 tracks; rms error sqrt(6/N), sqrt(6/2N).
 
-    The known limits of joint estimates (facts, section 2) within 3 Monte-Carlo errors (27 %).
+    The known limits of joint estimates (facts, section 2) within 3 Monte-Carlo errors (34 %).
     """
     flat, motions = Cluster.from_positions([[0, 0], [2, 0], [1, 1.6]]), []
     truth = {"rotation": 4e-3, "translation": 0.03}
-    for seed in range(60):
+    for seed in range(40):
         m = simulate_motion(flat, D_R=4e-3, D_T=0.03, dt=1.0, n_frames=300, rng=seed)
         motions.append(tracked(add_noise(m.positions(), sigma=0.02, rng=900 + seed)))
     every = check_unbiased(motions, truth)
     for quantity, angles in (("rotation", 1), ("translation", 2)):
         values = np.array([e.value for e in every[quantity]])
         rms = np.sqrt(np.mean((values / truth[quantity] - 1) ** 2))
-        assert rms == pytest.approx(np.sqrt(6 / (300 * angles)), rel=0.27)
+        assert rms == pytest.approx(np.sqrt(6 / (300 * angles)), rel=0.34)
 
 
 def test_an_anisotropic_body_has_a_third_of_the_trace():
@@ -622,10 +622,10 @@ def test_strange_motions_get_finite_answers(kind, quantity):
 
 @pytest.mark.parametrize("quantity", QUANTITIES)
 def test_random_strange_motions(quantity):
-    """60 random mixtures of few frames, odd units, SNR 1e-3 to 1e6 and body: finite and nested."""
+    """40 random mixtures of few frames, odd units, SNR 1e-3 to 1e6 and body: finite and nested."""
     rng = np.random.default_rng(99)
     bodies = [TETRAHEDRON, Cluster.trimer(1.0), Cluster.touching(5, 2.45), Cluster.touching(7, 2.0)]
-    for seed in range(60):
+    for seed in range(40):
         snr, unit = 10 ** rng.uniform(-3, 6), 10.0 ** rng.integers(-9, 9)
         sigma = min(SIGMA, SIGMA * np.sqrt(2e3 / snr))
         x = cloud(seed, n_frames=int(rng.choice([3, 4, 6, 12, 60])), cluster=bodies[seed % 4],
@@ -663,17 +663,22 @@ def test_an_axis_at_rest_counts_in_the_mean():
     assert space.value == pytest.approx(2 / 3 * plane.value, rel=1e-9)
 
 
-def test_a_long_track_is_solved_as_well():
-    """1e5 frames: D_T is within 4 standard errors (0.45 %, the bound) of the truth.
+def test_a_long_track_is_solved_from_any_guess():
+    """1e5 frames: the best offset at the true D is found from the one at D = 0, and is the noise.
 
-    Without diffusion a long diffusive track needs an offset far above the step: the search for it
-    must not end in a wrong root of the slope.
+    Without diffusion a long diffusive track needs an offset far above the step; a search begun
+    there once crept, and ended in a wrong D. The noise comes back within 4 standard errors (D
+    known: that is 0.2 % of D, measured).
     """
     truth = simulate_motion(TETRAHEDRON, D_R=0.0, D_T=4.5e-3, dt=1.0, n_frames=100_000, rng=1)
     noise = np.random.default_rng(2).normal(scale=0.015, size=truth.center.shape)
     motion = dataclasses.replace(truth, center=truth.center + noise)
-    value = _Likelihood.of([motion], quantity="translation").best_value()
-    assert value == pytest.approx(4.5e-3, rel=4 * 0.0045)
+    likelihood = _Likelihood.of([motion], quantity="translation")
+    start = likelihood.ridge(0.0)[2]
+    assert start > 100 * likelihood._power
+    found, fresh = likelihood.ridge(4.5e-3, start)[2], likelihood.ridge(4.5e-3)[2]
+    assert found == pytest.approx(fresh, rel=1e-8)
+    assert found == pytest.approx(0.015**2, abs=4 * 0.002 * 4.5e-3)
 
 
 # ---- refusals -----------------------------------------------------------------------------------

@@ -179,7 +179,7 @@ def test_brownian_curves_lie_above_those_of_any_direction():
 
 
 def test_the_order_of_whole_curves_is_no_theorem():
-    """Coning: omega that goes round sums to nothing, a tilted direction's angle grows with time.
+    """Coning: omega that goes round sums to nothing, a tilted direction's angle grows past it.
 
     The appendix's "always" holds for steps, and for diffusion on average; not for every motion.
     """
@@ -191,7 +191,7 @@ def test_the_order_of_whole_curves_is_no_theorem():
     tilted = msad(motion, directions=[1.0, 0.0, 2.0]).value
     assert tilted[0] < whole[0]
     assert whole.max() < 2
-    assert tilted[350] > 10 * whole.max()
+    assert tilted[200] > 5 * whole.max()
 
 
 @pytest.mark.parametrize("curve_of", [msad_vector, orientation_correlation])

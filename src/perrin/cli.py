@@ -166,6 +166,43 @@ def simulate(
 
 
 @app.command()
+def paper(
+    output: Annotated[Path, typer.Option("-o", "--output", help="Folder for figures and claims.")],
+    seed: Annotated[int, typer.Option(help="Seed of the random numbers.")] = 2011,
+    overwrite: Overwrite = False,
+) -> None:
+    """Remake every figure, table and claim of Hunter et al. 2011."""
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    from perrin.paper import reproduce
+    from perrin.results import check_place
+
+    console = Console(highlight=False)
+    columns = BarColumn(), TextColumn("{task.completed}/{task.total}"), TimeElapsedColumn()
+    bar = Progress(*columns, TextColumn("{task.description}"), console=console)
+    with _told():
+        check_place(output, overwrite=overwrite)
+        with bar:
+            task = bar.add_task("starting", total=None)
+            claims = reproduce(
+                output,
+                seed=seed,
+                overwrite=overwrite,
+                progress=lambda done, total, title: bar.update(
+                    task, completed=done, total=total, description=escape(title)
+                ),
+            )
+        failing = [claim for claim in claims if not claim.holds]
+        console.print(f"{len(claims)} claims, {len(failing)} of them do not hold:")
+        for claim in failing:
+            told = escape(claim.remark or claim.claim)
+            console.print(f"- {escape(claim.source)}: {told}", soft_wrap=True)
+        console.print(f"Written to {escape(str(output))}: claims.md, figures, tables.")
+
+
+@app.command()
 def convert(
     source: Annotated[Path, typer.Argument(help="Track table to read.")],
     target: Annotated[Path, typer.Argument(help="Track table to write, kind by its suffix.")],

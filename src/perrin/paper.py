@@ -6,7 +6,7 @@ import json
 from typing import TYPE_CHECKING
 
 from perrin import __version__
-from perrin.claims import Study, claims_page, write_claims, write_item
+from perrin.claims import Study, write_claims, write_item
 from perrin.paper_experiment import conclusion, figure_5, table_1
 from perrin.paper_method import challis, figure_1, localisation, product, simulation
 from perrin.paper_noise import bodies, constancy, figure_3, figure_4, sampling
@@ -15,7 +15,7 @@ from perrin.results import staged_folder
 
 if TYPE_CHECKING:
     import os
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable
 
     from perrin.claims import Claim, Item
 
@@ -31,8 +31,8 @@ _HEADING = """# The paper, claim by claim
 G. L. Hunter, K. V. Edmond, M. T. Elsesser and E. R. Weeks, "Tracking rotational diffusion of
 colloidal clusters", Optics Express 19, 17189 (2011), remade by `perrin paper`. Every number under
 "measured" comes from that run; a claim holds where it differs from the expected one by no more
-than the tolerance. Statistical tolerances are three standard errors: of hundreds of claims one or
-two may fail by chance with another seed."""
+than the tolerance. Statistical tolerances are three standard errors: of more than a
+hundred claims one may fail by chance with another seed."""
 
 
 def reproduce(
@@ -82,8 +82,3 @@ def reproduce(
                     "planted_error": planted_error}  # fmt: skip
         (stage / "run.json").write_text(json.dumps(settings, indent=2) + "\n", encoding="utf-8")
     return tuple(claim for item in items for claim in item.claims)
-
-
-def page(items: Sequence[Item]) -> str:
-    """Return the documentation's page "the paper, claim by claim" for items already made."""
-    return claims_page(items, heading=_HEADING)

@@ -152,22 +152,22 @@ def _spread_claims(slopes: Floats) -> tuple[Claim, ...]:
         statistical("relative error of D_R (printed 0.49/4.93)", "Table 1, section 5",
                     expected=_D_R_ERROR / _D_R, measured=float(relative[0]),
                     stderr=float(relative[0] * error),
-                    remark=f"D_R of the paper's procedure scatters by {relative[0]:.0%} "
+                    remark=f"D_R of the paper's procedure scatters by {100 * relative[0]:.0f} % "
                            f"({1e3 * spread[0]:.2f}e-3 rad^2/s) over {count} repeats, not by the "
                            "printed 10 %."),
         statistical("relative error of D_T (printed 0.49/3.85)", "Table 1, section 5",
                     expected=_D_T_ERROR / _D_T, measured=float(relative[1]),
                     stderr=float(relative[1] * error),
-                    remark=f"D_T of the paper's procedure scatters by {relative[1]:.0%} over "
-                           f"{count} repeats, not by the printed 13 %."),
-        statistical("least squares over all particles makes D_R more accurate than D_T, which "
-                    "explains the better size: relative spread of D_R over that of D_T, below 1 by "
-                    "the size's factor 1/3", "section 5", expected=1 / 3,
+                    remark=f"D_T of the paper's procedure scatters by {100 * relative[1]:.0f} % "
+                           f"over {count} repeats, not by the printed 13 %."),
+        statistical("least squares over all particles explains why the rotational size is the more "
+                    "precise one, by a factor 3: relative spread of D_R over that of D_T",
+                    "section 5", expected=1 / 3,
                     measured=float(relative[0] / relative[1]),
                     stderr=float(relative[0] / relative[1] * np.sqrt(2) * error),
-                    remark=f"D_R and D_T scatter alike (ratio {relative[0] / relative[1]:.2f}); the "
-                           "rotational size is the more precise one because d goes as D_R^(-1/3) "
-                           "and as D_T^(-1)."),
+                    remark=f"D_R and D_T scatter alike (ratio {relative[0] / relative[1]:.2f}): "
+                           "the rotational size is the more precise one because d goes as "
+                           "D_R^(-1/3) and as D_T^(-1)."),
         statistical("relative error of the rotational size over that of the translational one, "
                     "from Eqs. 26-27", "Eqs. 26-27, section 5", expected=1 / 3,
                     measured=float(size_errors[0] / size_errors[1]),
@@ -326,8 +326,8 @@ def conclusion(study: Study) -> Item:
         found = fit_line(clean, lag_range=(1, 10)).value
         angle = np.linalg.norm(motion.step_vectors(), axis=1).mean()
         claims += [
-            Claim(f"diffusion of the particles after the bulk rotation is removed, over the planted "
-                  f"one, {name}", "section 6", 1.0, found / D, 0.02, "2 %"),
+            Claim("diffusion of the particles after the bulk rotation is removed, over the "
+                  f"planted one, {name}", "section 6", 1.0, found / D, 0.02, "2 %"),
             Claim(f"rotation per frame that was removed (rad), {name}", "section 6", turns,
                   float(angle), 0.02 * turns, "2 %"),
         ]  # fmt: skip
