@@ -19,7 +19,7 @@ if TYPE_CHECKING:
         TrackTableError,
     )
     from perrin.analysis import analyze
-    from perrin.diffusion import DiffusionEstimate, estimate_diffusion, fit_line
+    from perrin.diffusion import DiffusionEstimate, cramer_rao, estimate_diffusion, fit_line
     from perrin.files import read_tracks, write_tracks
     from perrin.grouping import cluster_positions, find_clusters, positions_table
     from perrin.hydrodynamics import Size, size_from_rotation, size_from_translation
@@ -53,6 +53,7 @@ __all__ = [
     "analyze",
     "axis_angle",
     "cluster_positions",
+    "cramer_rao",
     "estimate_diffusion",
     "find_clusters",
     "fit_line",
@@ -90,7 +91,7 @@ _ROOMS = {
     "motion": ("RigidMotion", "remove_rotation", "track_rotation"),
     "grouping": ("cluster_positions", "find_clusters", "positions_table"),
     "lagged": ("LagCurve", "msad", "msad_vector", "msd", "orientation_correlation"),
-    "diffusion": ("DiffusionEstimate", "estimate_diffusion", "fit_line"),
+    "diffusion": ("DiffusionEstimate", "cramer_rao", "estimate_diffusion", "fit_line"),
     "hydrodynamics": ("Size", "size_from_rotation", "size_from_translation"),
     "simulate": ("add_noise", "simulate_motion"),
     "files": ("read_tracks", "write_tracks"),

@@ -64,7 +64,8 @@ class LagCurve:
         frozen(self.lagtime, self.value, self.components, self.stderr, self.n_pairs)
 
     def __repr__(self) -> str:
-        name = "MSAD" if self.quantity == "rotation" else "MSD"
+        names = {"rotation": "MSAD", "translation": "MSD", "orientation": "correlation"}
+        name = names[self.quantity]
         return f"LagCurve({name}, {len(self.lagtime)} lags, dof={self.dof}, {self.unit})"
 
     def to_frame(self) -> pd.DataFrame:
@@ -74,7 +75,8 @@ class LagCurve:
         axes = "xyz" if self.components.shape[1] == 3 else "xy"
         names = axes if self.components.shape[1] > 1 else "z"
         columns: dict[str, object] = {"lagtime": self.lagtime, "value": self.value}
-        columns |= {f"value_{a}": self.components[:, i] for i, a in enumerate(names)}
+        if self.quantity != "orientation":  # a correlation has no components
+            columns |= {f"value_{a}": self.components[:, i] for i, a in enumerate(names)}
         columns |= {"stderr": self.stderr, "n_pairs": self.n_pairs}
         return pd.DataFrame(columns)
 
