@@ -156,6 +156,22 @@ def test_loose_particles_are_counted_and_left_out(base):
     assert len(report.tracks) == 2 * len(base)
 
 
+def test_a_constant_z_is_told(base):
+    """A table whose z never changes is analysed with a word of advice."""
+    flat = perrin.Cluster.from_positions([[0, 0], [2, 0], [1, 1.7]])
+    truth = perrin.simulate_motion(flat, D_R=5e-3, D_T=0.03, dt=1.0, n_frames=60, rng=1)
+    noisy = perrin.add_noise(truth.positions(), sigma=0.02, rng=2)
+    told = perrin.analyze(perrin.positions_table(noisy).assign(z=1.5), dt=1.0).warnings
+    assert any("z never changes" in w for w in told)
+    assert not any("z never changes" in w for w in perrin.analyze(base, dt=0.73).warnings)
+
+
+def test_a_contact_distance_that_finds_nothing_is_refused(base):
+    """Too small a contact distance leaves every particle loose: an error that names it."""
+    with pytest.raises(perrin.TrackTableError, match=r"loose at contact = 0\.3 um"):
+        perrin.analyze(base.drop(columns="cluster"), dt=0.73, contact=0.3)
+
+
 def test_frames_are_sliced(base):
     """frames=(A, B) uses A <= frame < B; an empty slice says what there is."""
     report = perrin.analyze(base, dt=0.73, frames=(20, 80))

@@ -170,36 +170,47 @@ def _clustered(
     table: pd.DataFrame, *, contact: float | None
 ) -> tuple[pd.DataFrame, dict[int, str], list[str]]:
     """Make sure that every row has a cluster number; return it, names of clusters, and warnings."""
-    warnings: list[str] = []
+    warnings = _oddities(table)
     labels: dict[int, str] = {}
-    axes = [a for a in ("x", "y", "z") if a in table]
-    empty = int(table[axes].isna().any(axis=1).sum())
-    if empty:
-        warnings.append(f"{empty} rows without coordinates (NaN) count as missing points")
-    if "z" in table and np.ptp(table["z"].dropna()) == 0:
-        warnings.append("z never changes: leave the column out to analyse motion in the plane")
     if "cluster" in table:
         table, labels = _numbered(table)
     elif contact is not None:
         table = find_clusters(table, contact=contact)
     else:
-        count = table["particle"].nunique()
-        if count > _ONE_CLUSTER:
-            raise TrackTableError(
-                f"{count} particles and no cluster column: say the centre distance of touching "
-                "particles (contact, --contact) so that the clusters can be found"
-            )
-        table = table.assign(cluster=0)
+        table = _as_one(table)
         warnings.append(
-            f"no cluster column and no contact distance: all {count} particles are taken as one "
-            "cluster"
+            "no cluster column and no contact distance: all "
+            f"{table['particle'].nunique()} particles are taken as one cluster"
         )
-    loose = table.loc[table["cluster"] == -1, "particle"].nunique()
-    if loose:
-        warnings.append(f"{loose} particles belong to no cluster and are left out")
-    if (table["cluster"] == -1).all():
-        raise TrackTableError("no cluster: every particle is marked as loose (-1) or found so")
+    loose = table["cluster"] == -1
+    if loose.all():
+        how = "marked as loose (-1)" if contact is None else f"loose at contact = {contact} um"
+        raise TrackTableError(f"no cluster: every particle is {how}; correct that, or the scale")
+    if loose.any():
+        count = table.loc[loose, "particle"].nunique()
+        warnings.append(f"{count} particles belong to no cluster and are left out")
     return table, labels, warnings
+
+
+def _oddities(table: pd.DataFrame) -> list[str]:
+    """Say what is no fault in a table but should be known."""
+    axes = [a for a in ("x", "y", "z") if a in table]
+    empty = int(table[axes].isna().any(axis=1).sum())
+    told = [f"{empty} rows without coordinates (NaN) count as missing points"] if empty else []
+    if "z" in table and table["z"].nunique() == 1:
+        told.append("z never changes: leave the column out to analyse motion in the plane")
+    return told
+
+
+def _as_one(table: pd.DataFrame) -> pd.DataFrame:
+    """Take all particles as one cluster, if they are few enough to be one."""
+    count = table["particle"].nunique()
+    if count > _ONE_CLUSTER:
+        raise TrackTableError(
+            f"{count} particles and no cluster column: say the centre distance of touching "
+            "particles (contact, --contact) so that the clusters can be found"
+        )
+    return table.assign(cluster=0)
 
 
 def _numbered(table: pd.DataFrame) -> tuple[pd.DataFrame, dict[int, str]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -64,19 +65,9 @@ def figure_5(study: Study) -> Item:
         [pd.DataFrame({"quantity": name, "lag_s": c.lagtime, "value": c.value, "stderr": c.stderr})
          for name, c in curves.items()], ignore_index=True,
     )  # fmt: skip
-    claims = (*_line_claims(curves, fits), *_spread_claims(slopes))
+    claims = (*_line_claims(curves, fits), *_spread_claims(slopes), *_precision_claims(slopes))
 
-    def draw(figure: Figure) -> None:
-        left, right = figure.subplots(1, 2)
-        _draw_experiment(left, curves, fits)
-        bins = np.linspace(0, 2.2, 34)
-        for i, name in ((1, "MSD, $D_T$"), (0, "MSAD, $D_R$")):
-            right.hist(slopes[:, i] / (_D_R, _D_T)[i], bins, histtype="step", lw=1.6,
-                       color=_COLORS[i], label=name)  # fmt: skip
-        right.axvspan(0.9, 1.1, color="#dddddd", lw=0, label="printed error of $D_R$")
-        right.set(xlabel="fitted / planted coefficient", ylabel=f"of {repeats} repeats")
-        right.legend(frameon=False)
-
+    draw = partial(_draw_figure_5, curves=curves, fits=fits, slopes=slopes)
     text = (
         f"A tetrahedron of {_DIAMETER} um spheres under the experiment's conditions ({_FRAMES} "
         f"frames every {_DT} s, noise 30, 30 and 40 nm, Table 1's coefficients planted), by the "
@@ -85,6 +76,21 @@ def figure_5(study: Study) -> Item:
     )
     return Item("fig5", _SECTION, "Fig. 5: MSD and MSAD of a tetrahedral cluster", text, table,
                 draw, claims, size=(10.5, 4.8))  # fmt: skip
+
+
+def _draw_figure_5(
+    figure: Figure, curves: dict[str, LagCurve], fits: dict[str, DiffusionEstimate], slopes: Floats
+) -> None:
+    """Draw the one track beside the coefficients of all repeats."""
+    left, right = figure.subplots(1, 2)
+    _draw_experiment(left, curves, fits)
+    bins = np.linspace(0, 2.2, 34)
+    for i, name in ((1, "MSD, $D_T$"), (0, "MSAD, $D_R$")):
+        right.hist(slopes[:, i] / (_D_R, _D_T)[i], bins, histtype="step", lw=1.6,
+                   color=_COLORS[i], label=name)  # fmt: skip
+    right.axvspan(0.9, 1.1, color="#dddddd", lw=0, label="printed error of $D_R$")
+    right.set(xlabel="fitted / planted coefficient", ylabel=f"of {len(slopes)} repeats")
+    right.legend(frameon=False)
 
 
 _COLORS = (PALETTE[1], PALETTE[0])
@@ -139,8 +145,6 @@ def _spread_claims(slopes: Floats) -> tuple[Claim, ...]:
     count = len(slopes)
     mean, spread = slopes.mean(axis=0), slopes.std(axis=0, ddof=1)
     relative = spread / (_D_R, _D_T)
-    # Sizes go as D_T^-1 and D_R^(-1/3) (Eqs. 26 and 27).
-    size_errors = relative / (3, 1)
     error = 1 / np.sqrt(2 * count)
     return (
         statistical("mean D_R of the repeats over the planted one", "Table 1, section 5",
@@ -160,6 +164,16 @@ def _spread_claims(slopes: Floats) -> tuple[Claim, ...]:
                     stderr=float(relative[1] * error),
                     remark=f"D_T of the paper's procedure scatters by {100 * relative[1]:.0f} % "
                            f"over {count} repeats, not by the printed 13 %."),
+    )  # fmt: skip
+
+
+def _precision_claims(slopes: Floats) -> tuple[Claim, ...]:
+    """Check why the rotational size is the more precise one."""
+    relative = slopes.std(axis=0, ddof=1) / (_D_R, _D_T)
+    # Sizes go as D_T^-1 and D_R^(-1/3) (Eqs. 26 and 27).
+    size_errors = relative / (3, 1)
+    error = 1 / np.sqrt(2 * len(slopes))
+    return (
         statistical("least squares over all particles explains why the rotational size is the more "
                     "precise one, by a factor 3: relative spread of D_R over that of D_T",
                     "section 5", expected=1 / 3,
@@ -205,56 +219,35 @@ def table_1(study: Study) -> Item:
     Item
     """
     sizes = _printed_sizes(study)
-    rows = []
-    for mode, size in sizes.items():
-        for what in ("cluster", "sphere"):
-            value, error = _PRINTED[mode][what]
-            rows.append({
-                "mode": mode, "diameter_of": what, "printed_um": value, "printed_error_um": error,
-                "from_D_um": getattr(size, what), "propagated_error_um":
-                getattr(size, f"{what}_stderr"),
-            })  # fmt: skip
-    table = pd.DataFrame(rows)
+    table = _size_table(sizes)
     claims = [claim for _, row in table.iterrows() for claim in _size_claims(row)]
     claims += _stokes_claims(sizes["translation"].cluster, sizes["rotation"].cluster)
-    trans, rot = sizes["translation"].sphere, sizes["rotation"].sphere
-    phi = float(np.sqrt(noise_floor(Cluster.touching(4, _DIAMETER), sigma=_SIGMA).phi2))
-    claims += [
-        Claim("d_tetra over d_sphere", "Eq. 25, section 5", 1.844,
-              sizes["rotation"].cluster / rot, 1e-9, "rounding"),
-        Claim("the two sizes agree within 4 %: their difference (%)", "Table 1, section 5", 4.0,
-              100 * (trans / rot - 1), 0.5, "rounding"),
-        Claim("excess of the rotational d_sphere over 2.45 um (%)", "Table 1, section 5", 9.0,
-              100 * (rot / _DIAMETER - 1), 0.5, "rounding"),
-        Claim("excess in the earlier analysis, as the translational d_sphere (%)",
-              "Table 1, section 5", 14.0, 100 * (trans / _DIAMETER - 1), 0.5, "rounding"),
-        Claim("angular resolution Phi of touching 2.45 um spheres, sigma = 30, 30, 40 nm (rad; "
-              "printed 0.028)", "Eq. 23, section 5", 0.0275, phi, 6e-4, "0.0006 rad"),
-        Claim("the same in degrees", "Eq. 23, section 5", 1.6, float(np.rad2deg(phi)), 0.05,
-              "rounding"),
-    ]  # fmt: skip
+    claims += _sphere_claims(sizes)
 
-    def draw(figure: Figure) -> None:
-        ax = figure.subplots()
-        place = np.arange(len(table))
-        look: dict[str, Any] = {"fmt": "o", "capsize": 4}
-        ax.errorbar(place - 0.1, table["printed_um"], table["printed_error_um"], **look,
-                    color=PALETTE[1], label="printed")  # fmt: skip
-        ax.errorbar(place + 0.1, table["from_D_um"], table["propagated_error_um"], **look,
-                    color=PALETTE[0], label="from the printed D, errors propagated")  # fmt: skip
-        ax.axhline(_DIAMETER, color="#222222", ls="--", lw=1, label="2.45 µm (light scattering)")
-        names = [f"{m}\n$d_{{\\rm {'tetra' if w == 'cluster' else 'sphere'}}}$"
-                 for m, w in zip(table["mode"], table["diameter_of"], strict=True)]  # fmt: skip
-        ax.set_xticks(place, names)
-        ax.set(ylabel="diameter (µm)", ylim=(2, 6.2))
-        ax.legend(frameon=False)
-
+    draw = partial(_draw_table_1, table=table)
     text = (
         "T = 295 K, viscosity 2.18 mPa s, d_tetra = 1.844 d_sphere. The sizes follow from the "
         "printed D_T = 0.0385(49) um^2/s and D_R = 0.00493(49) rad^2/s."
     )
     return Item("table1", _SECTION, "Table 1: sizes of the tetrahedral cluster", text, table, draw,
                 tuple(claims), size=(7, 4.6))  # fmt: skip
+
+
+def _draw_table_1(figure: Figure, table: pd.DataFrame) -> None:
+    """Draw the printed sizes beside those that follow from the printed coefficients."""
+    ax = figure.subplots()
+    place = np.arange(len(table))
+    look: dict[str, Any] = {"fmt": "o", "capsize": 4}
+    ax.errorbar(place - 0.1, table["printed_um"], table["printed_error_um"], **look,
+                color=PALETTE[1], label="printed")  # fmt: skip
+    ax.errorbar(place + 0.1, table["from_D_um"], table["propagated_error_um"], **look,
+                color=PALETTE[0], label="from the printed D, errors propagated")  # fmt: skip
+    ax.axhline(_DIAMETER, color="#222222", ls="--", lw=1, label="2.45 µm (light scattering)")
+    names = [f"{m}\n$d_{{\\rm {'tetra' if w == 'cluster' else 'sphere'}}}$"
+             for m, w in zip(table["mode"], table["diameter_of"], strict=True)]  # fmt: skip
+    ax.set_xticks(place, names)
+    ax.set(ylabel="diameter (µm)", ylim=(2, 6.2))
+    ax.legend(frameon=False)
 
 
 def _printed_sizes(study: Study) -> dict[str, Size]:
@@ -272,6 +265,20 @@ def _printed_sizes(study: Study) -> dict[str, Size]:
             replace(rotation, value=_D_R, stderr=_D_R_ERROR),
             cluster=body, factor="hoffmann2009", **known),
     }  # fmt: skip
+
+
+def _size_table(sizes: dict[str, Size]) -> pd.DataFrame:
+    """Return the printed sizes beside those that follow from the printed coefficients."""
+    rows = []
+    for mode, size in sizes.items():
+        for what in ("cluster", "sphere"):
+            value, error = _PRINTED[mode][what]
+            rows.append({
+                "mode": mode, "diameter_of": what, "printed_um": value, "printed_error_um": error,
+                "from_D_um": getattr(size, what), "propagated_error_um":
+                getattr(size, f"{what}_stderr"),
+            })  # fmt: skip
+    return pd.DataFrame(rows)
 
 
 def _size_claims(row: pd.Series) -> list[Claim]:
@@ -296,6 +303,26 @@ def _stokes_claims(translation: float, rotation: float) -> list[Claim]:
               thermal / (3 * translation), 1e-9, "rounding"),
         Claim("D_R of the rotational d_tetra (rad^2/s)", "Eq. 27, section 5", _D_R,
               thermal / rotation**3, 1e-9, "rounding"),
+    ]  # fmt: skip
+
+
+def _sphere_claims(sizes: dict[str, Size]) -> list[Claim]:
+    """Compare the sizes with each other and with 2.45 um, and check the angular resolution."""
+    trans, rot = sizes["translation"].sphere, sizes["rotation"].sphere
+    phi = float(np.sqrt(noise_floor(Cluster.touching(4, _DIAMETER), sigma=_SIGMA).phi2))
+    return [
+        Claim("d_tetra over d_sphere", "Eq. 25, section 5", 1.844,
+              sizes["rotation"].cluster / rot, 1e-9, "rounding"),
+        Claim("the two sizes agree within 4 %: their difference (%)", "Table 1, section 5", 4.0,
+              100 * (trans / rot - 1), 0.5, "rounding"),
+        Claim("excess of the rotational d_sphere over 2.45 um (%)", "Table 1, section 5", 9.0,
+              100 * (rot / _DIAMETER - 1), 0.5, "rounding"),
+        Claim("excess in the earlier analysis, as the translational d_sphere (%)",
+              "Table 1, section 5", 14.0, 100 * (trans / _DIAMETER - 1), 0.5, "rounding"),
+        Claim("angular resolution Phi of touching 2.45 um spheres, sigma = 30, 30, 40 nm (rad; "
+              "printed 0.028)", "Eq. 23, section 5", 0.0275, phi, 6e-4, "0.0006 rad"),
+        Claim("the same in degrees", "Eq. 23, section 5", 1.6, float(np.rad2deg(phi)), 0.05,
+              "rounding"),
     ]  # fmt: skip
 
 
@@ -325,28 +352,36 @@ def conclusion(study: Study) -> Item:
         table[f"seen {name}"], table[f"removed {name}"] = raw.value, clean.value
         found = fit_line(clean, lag_range=(1, 10)).value
         angle = np.linalg.norm(motion.step_vectors(), axis=1).mean()
-        claims += [
-            Claim("diffusion of the particles after the bulk rotation is removed, over the "
-                  f"planted one, {name}", "section 6", 1.0, found / D, 0.02, "2 %"),
-            Claim(f"rotation per frame that was removed (rad), {name}", "section 6", turns,
-                  float(angle), 0.02 * turns, "2 %"),
-        ]  # fmt: skip
+        claims += _removal_claims(name, diffusion=found / D, angle=float(angle), turns=turns)
 
-    def draw(figure: Figure) -> None:
-        ax = figure.subplots()
-        shown = np.unique(np.rint(np.geomspace(1, frames / 2, 30)).astype(int)) - 1
-        t = table["lag_s"][shown]
-        for color, name in zip(PALETTE, ("without drift", "with drift"), strict=False):
-            ax.loglog(t, table[f"seen {name}"][shown], "--", color=color, label=f"seen, {name}")
-            ax.loglog(t, table[f"removed {name}"][shown], "-", color=color,
-                      label=f"rotation removed, {name}")  # fmt: skip
-        ax.loglog(t[::2], 6 * D * t[::2], "o", mfc="none", mec="#222222", label="6 D Δt")
-        ax.set(xlabel="Δt (s)", ylabel="MSD (µm²)")
-        ax.legend(frameon=False)
-
+    draw = partial(_draw_conclusion, table=table, D=D)
     text = (
         "500 independent particles (D = 0.01 um^2/s) in a box of 20 um that turns by 0.01 rad a "
         "frame, without and with a drift: MSD as seen, and after `remove_rotation`."
     )
     return Item("conclusion", _CONCLUSION, "Bulk rotation of a many-body system", text, table, draw,
                 tuple(claims), size=(6.5, 4.8))  # fmt: skip
+
+
+def _removal_claims(name: str, *, diffusion: float, angle: float, turns: float) -> list[Claim]:
+    """Check the relative diffusion that is left and the angle per frame that was removed."""
+    return [
+        Claim("diffusion of the particles after the bulk rotation is removed, over the "
+              f"planted one, {name}", "section 6", 1.0, diffusion, 0.02, "2 %"),
+        Claim(f"rotation per frame that was removed (rad), {name}", "section 6", turns,
+              angle, 0.02 * turns, "2 %"),
+    ]  # fmt: skip
+
+
+def _draw_conclusion(figure: Figure, table: pd.DataFrame, *, D: float) -> None:
+    """Draw the MSDs as seen and with the rotation removed."""
+    ax = figure.subplots()
+    shown = np.unique(np.rint(np.geomspace(1, (len(table) + 1) / 2, 30)).astype(int)) - 1
+    t = table["lag_s"][shown]
+    for color, name in zip(PALETTE, ("without drift", "with drift"), strict=False):
+        ax.loglog(t, table[f"seen {name}"][shown], "--", color=color, label=f"seen, {name}")
+        ax.loglog(t, table[f"removed {name}"][shown], "-", color=color,
+                  label=f"rotation removed, {name}")  # fmt: skip
+    ax.loglog(t[::2], 6 * D * t[::2], "o", mfc="none", mec="#222222", label="6 D Δt")
+    ax.set(xlabel="Δt (s)", ylabel="MSD (µm²)")
+    ax.legend(frameon=False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -43,14 +44,27 @@ def challis(study: Study) -> Item:
     rng = study.rng("challis")
     rows = [_fitted_sets(n, rng=rng) for n in range(3, 8)]
     table = pd.DataFrame(rows)
-    worst = table.max()
     angle, rise = _cost_around(rng)
     line = rng.normal(size=(200, 1, 3)) * rng.normal(size=(200, 5, 1))
     pair = rng.normal(size=(200, 2, 3))
     refused = _refused(line) + _refused(pair)
+    claims = _challis_claims(table, rise, refused)
+
+    draw = partial(_draw_challis, table=table, angle=angle, rise=rise)
+    text = (
+        "Random sets of points are scaled, turned and shifted by known amounts; `similarity` and "
+        "`kabsch` find the transformation again. Noisy sets have noise of a tenth of their size; "
+        "Eqs. 9-10 are evaluated with numpy's SVD beside `kabsch`, which has none."
+    )
+    return Item("challis", _CHALLIS, "Rigid transformations", text, table, draw, claims)
+
+
+def _challis_claims(table: pd.DataFrame, rise: Floats, refused: int) -> tuple[Claim, ...]:
+    """Check the largest errors of the fits, that they are minima, and which sets are solved."""
+    worst = table.max()
     section = "section 2.1"
     rounding = "rounding"
-    claims = (
+    return (
         Claim("y = s R x + v: largest error of s, R and v, 1000 noise-free sets of 3 to 7 points",
               f"Eq. 1, {section}", 0.0, worst["similarity"], 1e-12, rounding),
         Claim("y = R x (s = 1, v = 0): largest error of R", f"Eq. 2, {section}", 0.0,
@@ -71,23 +85,18 @@ def challis(study: Study) -> Item:
               refused / 400, 0.0, "exact"),
     )  # fmt: skip
 
-    def draw(figure: Figure) -> None:
-        left, right = figure.subplots(1, 2)
-        for color, name in zip(PALETTE, ("similarity", "rotation", "svd"), strict=False):
-            left.semilogy(table["n"], table[name], "o-", color=color, label=_ERRORS[name])
-        left.set(xlabel="points n", ylabel="largest error in 200 sets", ylim=(1e-16, 1e-11))
-        left.set_xticks(table["n"])
-        left.legend(frameon=False)
-        right.loglog(np.rad2deg(angle), rise, ".", ms=2, color=PALETTE[0], rasterized=True)
-        right.set(xlabel="turned away from R (degrees)")
-        right.set_ylabel("rise of the squared distance (relative)")
 
-    text = (
-        "Random sets of points are scaled, turned and shifted by known amounts; `similarity` and "
-        "`kabsch` find the transformation again. Noisy sets have noise of a tenth of their size; "
-        "Eqs. 9-10 are evaluated with numpy's SVD beside `kabsch`, which has none."
-    )
-    return Item("challis", _CHALLIS, "Rigid transformations", text, table, draw, claims)
+def _draw_challis(figure: Figure, table: pd.DataFrame, angle: Floats, rise: Floats) -> None:
+    """Draw the errors of the fits, and how the squared distance rises around them."""
+    left, right = figure.subplots(1, 2)
+    for color, name in zip(PALETTE, ("similarity", "rotation", "svd"), strict=False):
+        left.semilogy(table["n"], table[name], "o-", color=color, label=_ERRORS[name])
+    left.set(xlabel="points n", ylabel="largest error in 200 sets", ylim=(1e-16, 1e-11))
+    left.set_xticks(table["n"])
+    left.legend(frameon=False)
+    right.loglog(np.rad2deg(angle), rise, ".", ms=2, color=PALETTE[0], rasterized=True)
+    right.set(xlabel="turned away from R (degrees)")
+    right.set_ylabel("rise of the squared distance (relative)")
 
 
 _ERRORS = {
@@ -176,32 +185,12 @@ def product(study: Study) -> Item:
     steps = np.unique(np.rint(np.geomspace(1, 5000, 30)).astype(int))
     drift = [_drift(r, steps, repeats=study.repeats(200), rng=rng) for r in (0.02, 0.05)]
     table = pd.concat(drift, ignore_index=True)
-    closed = "1e4 noise-free steps (um)"
-    claims = [
-        Claim(f"the centre of mass is the mean of the particles, {closed}", "Eq. 11, section 2.2",
-              0.0, closing["center"], 1e-10, "1e-10 um"),
-        Claim(f"x_i = R x_i^0, {closed}", "Eq. 12, section 2.2", 0.0, closing["template"], 1e-10,
-              "1e-10 um"),
-        Claim(f"x_i(t) is the product of successive rotations on x_i^0, {closed}",
-              "Eq. 13, section 2.2", 0.0, closing["previous"], 1e-10, "1e-10 um"),
-    ]  # fmt: skip
+    claims = _closing_claims(closing)
     expected = ((0.02, 1.72, 2.3, 1.2), (0.05, 4.30, 11.7, 3.0))
     for part, (ratio, one, late, common) in zip(drift, expected, strict=True):
         claims += _drift_claims(part, ratio=ratio, one=one, late=late, common=common)
 
-    def draw(figure: Figure) -> None:
-        ax = figure.subplots()
-        for color, part in zip(PALETTE, drift, strict=False):
-            ratio = part["sigma_over_R"].iloc[0]
-            ax.loglog(part["steps"], part["product_deg"], "-", color=color, lw=1.5,
-                      label=f"product of rotations, σ/R = {ratio}")  # fmt: skip
-            ax.loglog(part["steps"], part["common_deg"], "--", color=color, lw=1.5,
-                      label=f"common shape, σ/R = {ratio}")  # fmt: skip
-        ax.set(xlabel="steps", ylabel="rms angle to the planted orientation (degrees)")
-        ax.set_yticks([1, 2, 5, 10], ["1", "2", "5", "10"])
-        ax.set_yticks([], minor=True)
-        ax.legend(frameon=False)
-
+    draw = partial(_draw_product, drift=drift)
     text = (
         "A tetrahedron that diffuses and turns for 10^4 steps (Eq. 16) without noise, by "
         '`track_rotation(reference="previous")`; then a stationary one with noise: rms angle '
@@ -210,6 +199,21 @@ def product(study: Study) -> Item:
     )
     return Item("product", _CLUSTERS, "The product of successive rotations", text, table, draw,
                 tuple(claims), size=(6.5, 4.6))  # fmt: skip
+
+
+def _draw_product(figure: Figure, drift: list[pd.DataFrame]) -> None:
+    """Draw the orientation errors of both noise levels."""
+    ax = figure.subplots()
+    for color, part in zip(PALETTE, drift, strict=False):
+        ratio = part["sigma_over_R"].iloc[0]
+        ax.loglog(part["steps"], part["product_deg"], "-", color=color, lw=1.5,
+                  label=f"product of rotations, σ/R = {ratio}")  # fmt: skip
+        ax.loglog(part["steps"], part["common_deg"], "--", color=color, lw=1.5,
+                  label=f"common shape, σ/R = {ratio}")  # fmt: skip
+    ax.set(xlabel="steps", ylabel="rms angle to the planted orientation (degrees)")
+    ax.set_yticks([1, 2, 5, 10], ["1", "2", "5", "10"])
+    ax.set_yticks([], minor=True)
+    ax.legend(frameon=False)
 
 
 def _closing(rng: np.random.Generator) -> dict[str, float]:
@@ -224,6 +228,19 @@ def _closing(rng: np.random.Generator) -> dict[str, float]:
         "template": float(np.abs(common.positions() - x).max()),
         "previous": float(np.abs(chain.positions() - x).max()),
     }
+
+
+def _closing_claims(closing: dict[str, float]) -> list[Claim]:
+    """Check that noise-free trajectories close."""
+    closed = "1e4 noise-free steps (um)"
+    return [
+        Claim(f"the centre of mass is the mean of the particles, {closed}", "Eq. 11, section 2.2",
+              0.0, closing["center"], 1e-10, "1e-10 um"),
+        Claim(f"x_i = R x_i^0, {closed}", "Eq. 12, section 2.2", 0.0, closing["template"], 1e-10,
+              "1e-10 um"),
+        Claim(f"x_i(t) is the product of successive rotations on x_i^0, {closed}",
+              "Eq. 13, section 2.2", 0.0, closing["previous"], 1e-10, "1e-10 um"),
+    ]  # fmt: skip
 
 
 def _drift(ratio: float, steps: Ints, *, repeats: int, rng: np.random.Generator) -> pd.DataFrame:
@@ -303,21 +320,24 @@ def localisation(study: Study) -> Item:
               "section 3", 1.0, covered, 0.0, "exact"),
     )  # fmt: skip
 
-    def draw(figure: Figure) -> None:
-        ax = figure.subplots()
-        ax.axhspan(20, 60, color="#dddddd", lw=0, label="typical in experiments")
-        ax.plot(width, table["limit_nm"], color=PALETTE[0], label="(0.2 µm per pixel)/N")
-        ax.plot(10, limit, "o", mfc="white", mec=PALETTE[0], ms=8, label="the paper's example")
-        for sigma in NOISES:
-            ax.axhline(1e3 * sigma, color=PALETTE[1], lw=0.8, ls=":")
-        ax.plot([], [], ":", color=PALETTE[1], lw=0.8, label="levels simulated")
-        ax.set(xlabel="width of the object N (pixels)", ylabel="localisation error (nm)")
-        ax.set(ylim=(0, 110), xlim=(5, 30))
-        ax.legend(frameon=False, loc="upper right", bbox_to_anchor=(1, 0.9))
-
+    draw = partial(_draw_localisation, table=table, limit=limit)
     text = "(um per pixel)/N: the paper's rule of thumb, taken as it states it."
     return Item("localisation", _TESTS, "Localisation error", text, table, draw, claims,
                 size=(6.5, 4.2))  # fmt: skip
+
+
+def _draw_localisation(figure: Figure, table: pd.DataFrame, limit: float) -> None:
+    """Draw the rule of thumb beside the noise levels simulated."""
+    ax = figure.subplots()
+    ax.axhspan(20, 60, color="#dddddd", lw=0, label="typical in experiments")
+    ax.plot(table["width_px"], table["limit_nm"], color=PALETTE[0], label="(0.2 µm per pixel)/N")
+    ax.plot(10, limit, "o", mfc="white", mec=PALETTE[0], ms=8, label="the paper's example")
+    for sigma in NOISES:
+        ax.axhline(1e3 * sigma, color=PALETTE[1], lw=0.8, ls=":")
+    ax.plot([], [], ":", color=PALETTE[1], lw=0.8, label="levels simulated")
+    ax.set(xlabel="width of the object N (pixels)", ylabel="localisation error (nm)")
+    ax.set(ylim=(0, 110), xlim=(5, 30))
+    ax.legend(frameon=False, loc="upper right", bbox_to_anchor=(1, 0.9))
 
 
 def simulation(study: Study) -> Item:
@@ -344,38 +364,29 @@ def simulation(study: Study) -> Item:
         [pd.DataFrame(a, columns=["alpha", "beta", "gamma"]).assign(body=n)
          for n, a in angles.items()], ignore_index=True,
     )  # fmt: skip
-    claims = [
-        Claim("coordinates of the tetrahedron: largest deviation (um)", "Eq. 14, section 3", 0.0,
-              _misplaced(bodies["tetrahedron"], _PRINTED_TETRAHEDRON), 1e-12, "rounding"),
-        Claim("coordinates of the pentahedron: largest deviation (um)", "Eq. 15, section 3", 0.0,
-              _misplaced(bodies["pentahedron"], _PRINTED_PENTAHEDRON), 1e-12, "rounding"),
-    ]  # fmt: skip
-    for name, a in angles.items():
-        claims.append(
-            statistical(f"standard deviation of the angles of R_x R_y R_z over sqrt(2 D_R), {name}",
-                        "Eq. 16, section 3", expected=1.0, measured=float(a.std()),
-                        stderr=float(1 / np.sqrt(2 * a.size)))
-        )  # fmt: skip
-    claims.append(_noise_claim(rng))
+    claims = (*_simulation_claims(bodies, angles), _noise_claim(rng))
 
-    def draw(figure: Figure) -> None:
-        ax = figure.subplots()
-        x = np.linspace(-4, 4, 200)
-        values = table[["alpha", "beta", "gamma"]].to_numpy()
-        ax.hist(values, 60, range=(-4, 4), density=True, histtype="step", color=PALETTE[:3],
-                label=["α about x", "β about y", "γ about z"])  # fmt: skip
-        ax.plot(x[::8], np.exp(-x[::8] ** 2 / 2) / np.sqrt(2 * np.pi), "o", mfc="none",
-                mec="#222222", label="Gaussian")  # fmt: skip
-        ax.set(xlabel="angle of a step / $(2 D_R)^{1/2}$", ylabel="probability density")
-        ax.legend(frameon=False)
-
+    draw = partial(_draw_simulation, table=table)
     text = (
         f"Tetrahedra and pentahedra exactly as printed, R = {R:.3f} um (touching spheres of 2 um: "
         "the paper does not print R), 10^4 steps of three Gaussian angles, multiplied as "
         "R_x R_y R_z, and Gaussian noise of 10, 30, 50, 70 and 100 nm."
     )
-    return Item("simulation", _TESTS, "The simulation", text, table, draw, tuple(claims),
+    return Item("simulation", _TESTS, "The simulation", text, table, draw, claims,
                 size=(6.5, 4.2))  # fmt: skip
+
+
+def _draw_simulation(figure: Figure, table: pd.DataFrame) -> None:
+    """Draw the distribution of the angles of a step."""
+    ax = figure.subplots()
+    x = np.linspace(-4, 4, 200)
+    values = table[["alpha", "beta", "gamma"]].to_numpy()
+    ax.hist(values, 60, range=(-4, 4), density=True, histtype="step", color=PALETTE[:3],
+            label=["α about x", "β about y", "γ about z"])  # fmt: skip
+    ax.plot(x[::8], np.exp(-x[::8] ** 2 / 2) / np.sqrt(2 * np.pi), "o", mfc="none",
+            mec="#222222", label="Gaussian")  # fmt: skip
+    ax.set(xlabel="angle of a step / $(2 D_R)^{1/2}$", ylabel="probability density")
+    ax.legend(frameon=False)
 
 
 _PRINTED_TETRAHEDRON = np.array([(1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)]) / np.sqrt(3)
@@ -388,6 +399,23 @@ def _misplaced(body: Cluster, printed: Floats) -> float:
     """Return how far the particles are from the printed places, in whatever order (um)."""
     distance = np.linalg.norm(body.positions[:, None] - R * printed, axis=2)
     return float(max(distance.min(axis=0).max(), distance.min(axis=1).max()))
+
+
+def _simulation_claims(bodies: dict[str, Cluster], angles: dict[str, Floats]) -> list[Claim]:
+    """Check the bodies against the printed ones, and the width of the angles (Eqs. 14-16)."""
+    claims = [
+        Claim("coordinates of the tetrahedron: largest deviation (um)", "Eq. 14, section 3", 0.0,
+              _misplaced(bodies["tetrahedron"], _PRINTED_TETRAHEDRON), 1e-12, "rounding"),
+        Claim("coordinates of the pentahedron: largest deviation (um)", "Eq. 15, section 3", 0.0,
+              _misplaced(bodies["pentahedron"], _PRINTED_PENTAHEDRON), 1e-12, "rounding"),
+    ]  # fmt: skip
+    for name, a in angles.items():
+        claims.append(
+            statistical(f"standard deviation of the angles of R_x R_y R_z over sqrt(2 D_R), {name}",
+                        "Eq. 16, section 3", expected=1.0, measured=float(a.std()),
+                        stderr=float(1 / np.sqrt(2 * a.size)))
+        )  # fmt: skip
+    return claims
 
 
 def _noise_claim(rng: np.random.Generator) -> Claim:
@@ -430,15 +458,18 @@ def figure_1(study: Study) -> Item:
               "between particles", "Fig. 1, section 1", spread[0], spread[1], 0.02, "2 %", remark),
     )  # fmt: skip
 
-    def draw(figure: Figure) -> None:
-        view = Rotation.from_euler("xyz", [-65, 20, 10], degrees=True).as_matrix()
-        for ax, body in zip(figure.subplots(1, 3), bodies, strict=True):
-            plot_cluster(body, ax=ax, diameter=2.0, view=view)
-            ax.set(title=f"n = {len(body.positions)}", xlim=(-3, 3), ylim=(-3, 3))
-
+    draw = partial(_draw_figure_1, bodies=bodies)
     text = "Solid spheres of 2 um in place of the paper's confocal micrographs."
     return Item("fig1", "1 Introduction", "Fig. 1: clusters with n = 4, 5 and 6", text,
                 pd.concat(parts, ignore_index=True), draw, claims, size=(10, 3.6))  # fmt: skip
+
+
+def _draw_figure_1(figure: Figure, bodies: list[Cluster]) -> None:
+    """Draw the clusters side by side."""
+    view = Rotation.from_euler("xyz", [-65, 20, 10], degrees=True).as_matrix()
+    for ax, body in zip(figure.subplots(1, 3), bodies, strict=True):
+        plot_cluster(body, ax=ax, diameter=2.0, view=view)
+        ax.set(title=f"n = {len(body.positions)}", xlim=(-3, 3), ylim=(-3, 3))
 
 
 def _distance_ratio(body: Cluster) -> float:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -72,18 +72,21 @@ def figure_3(study: Study) -> Item:
     )
     claims = [claim for D in _SPEEDS for claim in _diffusion_claims(curves[D], D)]
 
-    def draw(figure: Figure) -> None:
-        for ax, D, panel in zip(figure.subplots(1, 2), _SPEEDS, "ab", strict=True):
-            _draw_noisy(ax, curves[D], D)
-            ax.set_title(f"({panel}) $D_R$ = {D:g} rad²/ts", loc="left")
-            ax.legend(frameon=False)
-
+    draw = partial(_draw_figure_3, curves=curves)
     text = (
         f"Tetrahedra with R = {R:.3f} um, 10^4 steps, five noise levels, by the product of "
         "successive rotations."
     )
     return Item("fig3", _SECTION, "Fig. 3: MSAD for different noise levels", text, table, draw,
                 tuple(claims), size=(10, 4.8))  # fmt: skip
+
+
+def _draw_figure_3(figure: Figure, curves: dict[float, dict[float, LagCurve]]) -> None:
+    """Draw the MSADs of each D_R on a panel of its own."""
+    for ax, D, panel in zip(figure.subplots(1, 2), _SPEEDS, "ab", strict=True):
+        _draw_noisy(ax, curves[D], D)
+        ax.set_title(f"({panel}) $D_R$ = {D:g} rad²/ts", loc="left")
+        ax.legend(frameon=False)
 
 
 def _curve_rows(curve: LagCurve, D: float, sigma: float) -> pd.DataFrame:
@@ -155,18 +158,7 @@ def figure_4(study: Study) -> Item:
     for (shape, D), each in curves.items():
         claims += _collapse_claims(*each, shape=shape, D=D)
 
-    def draw(figure: Figure) -> None:
-        left, right = figure.subplots(1, 2)
-        _draw_floors(left, table)
-        floors = {s: noise_floor(Cluster.tetrahedron(R), sigma=s).phi2 for s in NOISES}
-        for D in _SPEEDS:
-            _draw_noisy(right, curves["tetrahedron", D][0], D, floors=floors)
-        right.set(ylabel="MSAD − $Φ^2$ (rad²)", ylim=(1e-4, None))
-        handles, labels = right.get_legend_handles_labels()
-        right.legend(handles[:6], labels[:6], frameon=False)
-        left.set_title("(a)", loc="left")
-        right.set_title("(b)", loc="left")
-
+    draw = partial(_draw_figure_4, table=table, curves=curves)
     text = (
         f"(a) Phi^2 at lag 1 of {_STILL} frames of stationary clusters, R = 1.0, 1.5 and 2.5 um, "
         "noise 10 to 100 nm (sigma/R at most 0.1), by the product of successive rotations; filled "
@@ -175,6 +167,24 @@ def figure_4(study: Study) -> Item:
     )
     return Item("fig4", _SECTION, "Fig. 4: the noise floor and its subtraction", text, table, draw,
                 tuple(claims), size=(11, 4.8))  # fmt: skip
+
+
+def _draw_figure_4(
+    figure: Figure,
+    table: pd.DataFrame,
+    curves: dict[tuple[str, float], tuple[dict[float, LagCurve], ...]],
+) -> None:
+    """Draw the floors, and the MSADs of the tetrahedra less their floors."""
+    left, right = figure.subplots(1, 2)
+    _draw_floors(left, table)
+    floors = {s: noise_floor(Cluster.tetrahedron(R), sigma=s).phi2 for s in NOISES}
+    for D in _SPEEDS:
+        _draw_noisy(right, curves["tetrahedron", D][0], D, floors=floors)
+    right.set(ylabel="MSAD − $Φ^2$ (rad²)", ylim=(1e-4, None))
+    handles, labels = right.get_legend_handles_labels()
+    right.legend(handles[:6], labels[:6], frameon=False)
+    left.set_title("(a)", loc="left")
+    right.set_title("(b)", loc="left")
 
 
 def _chained(positions: Floats, body: Cluster) -> RigidMotion:
@@ -238,15 +248,17 @@ def _floor_claims(table: pd.DataFrame) -> list[Claim]:
             statistical(f"Phi^2 over the exact expression, {shape}, all directions, {where}",
                         source, expected=1.0, measured=mean / exact, stderr=error),
         ]  # fmt: skip
+    return [*claims, _radius_claim(table)]
+
+
+def _radius_claim(table: pd.DataFrame) -> Claim:
+    """Check how Phi^2 of tetrahedra goes with their size."""
     tetra = table[(table["body"] == "tetrahedron") & (table["sigma_um"] == NOISES[0])]
     size = np.log(tetra["R_um"])
     slope = np.polyfit(size, np.log(tetra["phi2"]), 1)[0]
     error = float(tetra["stderr"].iloc[0] / np.sqrt(np.sum((size - size.mean()) ** 2)))
-    claims.append(
-        statistical("exponent of Phi^2 in R, tetrahedra, sigma = 10 nm", "Eq. 23, section 4.1",
-                    expected=-2.0, measured=float(slope), stderr=error)
-    )  # fmt: skip
-    return claims
+    return statistical("exponent of Phi^2 in R, tetrahedra, sigma = 10 nm", "Eq. 23, section 4.1",
+                       expected=-2.0, measured=float(slope), stderr=error)  # fmt: skip
 
 
 def _collapse_claims(
@@ -332,19 +344,7 @@ def bodies(study: Study) -> Item:
     # Unequal axes are fewer independent ones: at worst a trimer's, 4 % more error.
     claims = _body_claims(table, 1.05 / np.sqrt(frames))
 
-    def draw(figure: Figure) -> None:
-        ax = figure.subplots()
-        x = table["n"] * table["R_um"] ** 2
-        ax.loglog(x, 6 * sigma**2 / x, "-", color="#222222", label="6 σ²/(n R²)")
-        ax.loglog(x, table["exact"], "x", color=PALETTE[1], ms=9, label="exact expression")
-        ax.loglog(x, table["phi2"], "o", mfc="none", mec=PALETTE[0], ms=9, label="measured")
-        for n, place, value in zip(table["n"][:5], x, table["phi2"], strict=False):
-            ax.annotate(f"n = {n}", (place, value), (8, 6), textcoords="offset points")
-        ax.annotate("Eq. 15", (x.iloc[5], table["phi2"].iloc[5]), (8, 6),
-                    textcoords="offset points")  # fmt: skip
-        ax.set(xlabel="n R² (µm²)", ylabel="$Φ^2$ (rad²)")
-        ax.legend(frameon=False)
-
+    draw = partial(_draw_bodies, table=table, sigma=sigma)
     text = (
         "Stationary clusters of 3 to 7 touching spheres of 2 um, and the pentahedron of Eq. 15; "
         "sigma = 20 nm, lag 1. Averaged over the directions of its own particles, the floor of a "
@@ -353,6 +353,21 @@ def bodies(study: Study) -> Item:
     )
     return Item("bodies", _SECTION, "The noise floor of other bodies", text, table, draw,
                 tuple(claims), size=(6.5, 4.6))  # fmt: skip
+
+
+def _draw_bodies(figure: Figure, table: pd.DataFrame, *, sigma: float) -> None:
+    """Draw measured, exact and approximate Phi^2 of each body."""
+    ax = figure.subplots()
+    x = table["n"] * table["R_um"] ** 2
+    ax.loglog(x, 6 * sigma**2 / x, "-", color="#222222", label="6 σ²/(n R²)")
+    ax.loglog(x, table["exact"], "x", color=PALETTE[1], ms=9, label="exact expression")
+    ax.loglog(x, table["phi2"], "o", mfc="none", mec=PALETTE[0], ms=9, label="measured")
+    for n, place, value in zip(table["n"][:5], x, table["phi2"], strict=False):
+        ax.annotate(f"n = {n}", (place, value), (8, 6), textcoords="offset points")
+    ax.annotate("Eq. 15", (x.iloc[5], table["phi2"].iloc[5]), (8, 6),
+                textcoords="offset points")  # fmt: skip
+    ax.set(xlabel="n R² (µm²)", ylabel="$Φ^2$ (rad²)")
+    ax.legend(frameon=False)
 
 
 def _body_claims(table: pd.DataFrame, error: float) -> list[Claim]:
@@ -411,26 +426,10 @@ def constancy(study: Study) -> Item:
     claims = []
     for route, v in values.items():
         table[route.replace(" ", "_")] = v.mean(axis=0)
-        rise = v[:, 99] / v[:, 0].mean()
-        claims.append(
-            statistical(f"MSADs of stationary clusters are constant over time: lag 100 over lag 1, "
-                        f"{route}, sigma/R = {ratio}", "Eq. 21, section 4.1", expected=1.0,
-                        measured=float(rise.mean()),
-                        stderr=float(rise.std(ddof=1) / np.sqrt(len(rise))),
-                        remark=f"By the {route} the MSAD rises by {100 * (rise.mean() - 1):.0f} % "
-                               f"from lag 1 to lag 100: {_RISES[route]}.")
-        )  # fmt: skip
+        claims.append(_constancy_claim(route, v[:, 99] / v[:, 0].mean(), ratio=ratio))
     floor = noise_floor(body, sigma=ratio).phi2
 
-    def draw(figure: Figure) -> None:
-        ax = figure.subplots()
-        for color, route in zip(PALETTE, values, strict=False):
-            ax.plot(table["lag_ts"], table[route.replace(" ", "_")] / floor, color=color,
-                    label=route)  # fmt: skip
-        ax.axhline(1, color="#222222", lw=1, ls="--", label="$Φ^2$ (Eq. 23)")
-        ax.set(xlabel="Δt (ts)", ylabel="MSAD / $Φ^2$", ylim=(0.95, None))
-        ax.legend(frameon=False)
-
+    draw = partial(_draw_constancy, table=table, floor=floor)
     text = (
         f"Stationary tetrahedra, sigma/R = {ratio}, 5000 steps, 40 repeats of the product and 24 "
         "of the fit to one common shape."
@@ -439,11 +438,36 @@ def constancy(study: Study) -> Item:
                 tuple(claims), size=(6.5, 4.2))  # fmt: skip
 
 
+def _draw_constancy(figure: Figure, table: pd.DataFrame, *, floor: float) -> None:
+    """Draw the MSADs of both routes over the floor of Eq. 23."""
+    ax = figure.subplots()
+    for color, route in zip(PALETTE, _RISES, strict=False):
+        ax.plot(table["lag_ts"], table[route.replace(" ", "_")] / floor, color=color,
+                label=route)  # fmt: skip
+    ax.axhline(1, color="#222222", lw=1, ls="--", label="$Φ^2$ (Eq. 23)")
+    ax.set(xlabel="Δt (ts)", ylabel="MSAD / $Φ^2$", ylim=(0.95, None))
+    ax.legend(frameon=False)
+
+
 _RISES = {
     "product": "errors of successive rotations do not cancel at second order",
     "common shape": "the orientation does not drift, but phi adds up steps, whose noise does not "
     "cancel at second order",
 }
+
+
+def _constancy_claim(route: str, rise: Floats, *, ratio: float) -> Claim:
+    """Check the rise of the MSAD from lag 1 to lag 100, one value for each repeat."""
+    return statistical(
+        f"MSADs of stationary clusters are constant over time: lag 100 over lag 1, {route}, "
+        f"sigma/R = {ratio}",
+        "Eq. 21, section 4.1",
+        expected=1.0,
+        measured=float(rise.mean()),
+        stderr=float(rise.std(ddof=1) / np.sqrt(len(rise))),
+        remark=f"By the {route} the MSAD rises by {100 * (rise.mean() - 1):.0f} % from lag 1 to "
+        f"lag 100: {_RISES[route]}.",
+    )
 
 
 def sampling(study: Study) -> Item:
@@ -461,6 +485,20 @@ def sampling(study: Study) -> Item:
     parts = [_undersampled(x, scheme, steps if x < 1 else 10 * steps, study, rng)
              for scheme in ("brownian", "euler") for x in (0.04, 0.1, 0.2, 0.4, 1.0)]  # fmt: skip
     table = pd.DataFrame(parts)
+    claims = _sampling_claims(table)
+
+    draw = partial(_draw_sampling, table=table)
+    text = (
+        "Noise-free clusters with one step every dt: how slow the motion appears, and how often "
+        "the particle nearest to where one was is another one. Expected at 4 D_R dt = 1: 0.9131 "
+        "from the heat kernel on SO(3), 0.9126 from the law of Eq. 16 by quadrature."
+    )
+    return Item("sampling", _SECTION, "Sampling rules", text, table, draw, tuple(claims),
+                size=(10, 4.4))  # fmt: skip
+
+
+def _sampling_claims(table: pd.DataFrame) -> list[Claim]:
+    """Check the lower limit of the time between frames, and what happens at 4 D_R dt = 1."""
     last = table[table["msad_dt"] == 1.0].set_index("scheme")
     source = "section 4.1"
     shortest = noise_floor(Cluster.tetrahedron(R), sigma=0.1).phi2 / (4 * 1e-4)
@@ -482,29 +520,24 @@ def sampling(study: Study) -> Item:
                   f"Nearest-neighbour linking loses a particle in "
                   f"{100 * lost:.0f} % of the steps; 4 D_R dt <= 0.07 is safe.")
         )  # fmt: skip
+    return claims
 
-    def draw(figure: Figure) -> None:
-        left, right = figure.subplots(1, 2)
-        for color, (scheme, part) in zip(PALETTE, table.groupby("scheme"), strict=False):
-            label = {"brownian": "Brownian steps", "euler": "Eq. 16"}[scheme]
-            left.errorbar(part["msad_dt"], part["factor"], part["stderr"], fmt="o-", color=color,
-                          label=label)  # fmt: skip
-        left.set(xlabel="$4 D_R Δt$ (rad²)", ylabel="MSAD / $4 D_R Δt$")
-        left.legend(frameon=False)
-        brownian = table[table["scheme"] == "brownian"]
-        for color, shape in zip(PALETTE[2:], _BODIES, strict=False):
-            right.plot(brownian["msad_dt"], 100 * brownian[f"lost_{shape}"], "o-", color=color,
-                       label=shape)  # fmt: skip
-        right.set(xlabel="$4 D_R Δt$ (rad²)", ylabel="steps with a particle lost (%)")
-        right.legend(frameon=False)
 
-    text = (
-        "Noise-free clusters with one step every dt: how slow the motion appears, and how often "
-        "the particle nearest to where one was is another one. Expected at 4 D_R dt = 1: 0.9131 "
-        "from the heat kernel on SO(3), 0.9126 from the law of Eq. 16 by quadrature."
-    )
-    return Item("sampling", _SECTION, "Sampling rules", text, table, draw, tuple(claims),
-                size=(10, 4.4))  # fmt: skip
+def _draw_sampling(figure: Figure, table: pd.DataFrame) -> None:
+    """Draw the apparent slowness and the share of steps lost."""
+    left, right = figure.subplots(1, 2)
+    for color, (scheme, part) in zip(PALETTE, table.groupby("scheme"), strict=False):
+        label = {"brownian": "Brownian steps", "euler": "Eq. 16"}[scheme]
+        left.errorbar(part["msad_dt"], part["factor"], part["stderr"], fmt="o-", color=color,
+                      label=label)  # fmt: skip
+    left.set(xlabel="$4 D_R Δt$ (rad²)", ylabel="MSAD / $4 D_R Δt$")
+    left.legend(frameon=False)
+    brownian = table[table["scheme"] == "brownian"]
+    for color, shape in zip(PALETTE[2:], _BODIES, strict=False):
+        right.plot(brownian["msad_dt"], 100 * brownian[f"lost_{shape}"], "o-", color=color,
+                   label=shape)  # fmt: skip
+    right.set(xlabel="$4 D_R Δt$ (rad²)", ylabel="steps with a particle lost (%)")
+    right.legend(frameon=False)
 
 
 def _undersampled(
