@@ -1,7 +1,7 @@
 """perrin: measure how rigid clusters of colloidal particles diffuse and turn.
 
-Positions (T, n, d) become a `RigidMotion`; a `RigidMotion` makes `LagCurve`s and
-`DiffusionEstimate`s; tables, files, pictures and the command line stand at the doors.
+Positions (T, n, d) become a `RigidMotion`, which makes every `LagCurve` and
+`DiffusionEstimate`; tables, files, pictures and the command line stand at the doors.
 Units: um, s, rad, K, Pa s.
 
 Each name is loaded from its room when it is first asked for, so that `import perrin` and the
