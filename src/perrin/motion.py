@@ -21,7 +21,7 @@ from perrin._arrays import (
     require_positive,
 )
 from perrin.noise import center_variance, orientation_covariance
-from perrin.rotations import cumulative_product, fit_rotations, log_map
+from perrin.rotations import fit_rotations, log_map, successive_product
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -494,7 +494,7 @@ def _fit_chain(x: Floats, seen: Bools) -> _Fit:
     """Multiply the rotations between successive frames (Eq. 13); a gap is one direct rotation."""
     rows, step = _chain_steps(x, seen)
     rotation = np.full((len(x), x.shape[2], x.shape[2]), np.nan)
-    rotation[rows] = np.swapaxes(cumulative_product(np.swapaxes(step, -1, -2)), -1, -2)
+    rotation[rows] = successive_product(step)
     shape = _settled(lambda s: _mean_of(_in_body(x, seen, rotation, s)), x[rows[0]])
     _, residual, sigma2 = _step_misfit(x, seen, rows, step)
     return _finished(x, seen, rotation, shape)._replace(residual=residual, sigma2=sigma2)
@@ -505,7 +505,7 @@ def _unturned(x: Floats, seen: Bools) -> tuple[Floats, _Fit]:
     rows, step = _chain_steps(x, seen)
     shift, residual, sigma2 = _step_misfit(x, seen, rows, step)
     rotation = np.full((len(x), x.shape[2], x.shape[2]), np.nan)
-    rotation[rows] = np.swapaxes(cumulative_product(np.swapaxes(step, -1, -2)), -1, -2)
+    rotation[rows] = successive_product(step)
     # c_{k+1} = R^k c_k + v^k becomes a sum in the axes of the body.
     jumps = np.einsum("tji,tj->ti", rotation[rows[1:]], shift)
     origin = np.concatenate([_mean_present(x[rows[:1]]), jumps]).cumsum(axis=0)
@@ -526,7 +526,7 @@ def _step_misfit(x: Floats, seen: Bools, rows: Ints, step: Floats) -> tuple[Floa
     turned = np.einsum("tij,tnj->tni", step, begin) + shift[:, None]
     e = np.full_like(x, np.nan)
     e[rows[1:]] = (end - turned) / np.sqrt(2)
-    freedom = _freedom(both[..., 0].sum(axis=1), x.shape[2]).sum()
+    freedom = degrees_of_freedom(both[..., 0].sum(axis=1), x.shape[2]).sum()
     return shift, e, float(np.nansum(e * e)) / freedom if freedom else np.nan
 
 
@@ -612,7 +612,7 @@ def _nan_mean(x: Floats, *, axis: int) -> Floats:
     return mean
 
 
-def _freedom(n_present: Ints, d: int) -> Ints:
+def degrees_of_freedom(n_present: Ints, d: int) -> Ints:
     """Return the degrees of freedom that a rigid fit leaves: 3n - 6 a frame (2n - 3 in 2-D)."""
     return np.maximum(d * n_present - d * (d + 1) // 2, 0)
 
@@ -627,7 +627,9 @@ def _finished(x: Floats, seen: Bools, rotation: Floats, shape: Floats) -> _Fit:
     rotation[fitted[0]] = np.eye(len(gauge))
     residual = _in_body(x, seen, rotation, shape) - shape
     d = x.shape[2]
-    freedom = _freedom(seen[fitted].sum(axis=1), d).sum() - _freedom(np.array(len(shape)), d)
+    # The template was fitted too: it costs what one frame has.
+    freedom = degrees_of_freedom(seen[fitted].sum(axis=1), d).sum()
+    freedom -= degrees_of_freedom(np.array(len(shape)), d)
     sigma2 = float(np.nansum(residual**2) / freedom) if freedom > 0 else np.nan
     return _Fit(rotation, _centers(x, rotation, shape), shape, residual, sigma2)
 

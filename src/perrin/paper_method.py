@@ -13,7 +13,7 @@ from perrin._arrays import DegenerateClusterError, Floats, Ints
 from perrin.claims import Claim, Item, Study, statistical
 from perrin.motion import track_rotation
 from perrin.plot import PALETTE, plot_cluster
-from perrin.rotations import axis_angle, cumulative_product, kabsch, similarity
+from perrin.rotations import axis_angle, kabsch, similarity, successive_product
 from perrin.shapes import Cluster
 from perrin.simulate import add_noise, simulate_motion
 
@@ -251,8 +251,7 @@ def _drift(ratio: float, steps: Ints, *, repeats: int, rng: np.random.Generator)
     for repeat in range(repeats):
         x = add_noise(still, sigma=ratio, rng=rng)
         step = kabsch(x[1:], x[:-1])
-        # Eq. 13 grows on the left, `cumulative_product` on the right.
-        orientation = np.swapaxes(cumulative_product(np.swapaxes(step, 1, 2)), 1, 2)
+        orientation = successive_product(step)
         square += axis_angle(orientation[steps])[1] ** 2 / repeats
         one += float(np.mean(axis_angle(step)[1] ** 2)) / repeats
         if repeat < 8:

@@ -16,7 +16,7 @@ from perrin.motion import track_rotation
 from perrin.noise import noise_floor
 from perrin.paper_method import NOISES, STEPS, R
 from perrin.plot import PALETTE
-from perrin.rotations import cumulative_product, kabsch
+from perrin.rotations import kabsch, successive_product
 from perrin.shapes import Cluster
 from perrin.simulate import add_noise, simulate_motion
 
@@ -194,9 +194,9 @@ def _chained(positions: Floats, body: Cluster) -> RigidMotion:
     What `track_rotation` does besides (template, residuals, errors) is not needed here and would
     take ten times as long.
     """
-    step = np.swapaxes(kabsch(positions[1:], positions[:-1]), 1, 2)
+    step = kabsch(positions[1:], positions[:-1])
     motion = simulate_motion(body, D_R=0.0, dt=1.0, n_frames=len(positions), rng=0)
-    return replace(motion, rotation=np.swapaxes(cumulative_product(step), 1, 2).copy())
+    return replace(motion, rotation=successive_product(step).copy())
 
 
 def _measured_floor(

@@ -10,6 +10,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure as Figure  # rooms below annotate with it
 
 from perrin.diffusion import with_error
+from perrin.motion import degrees_of_freedom
 
 if TYPE_CHECKING:
     import os
@@ -515,7 +516,7 @@ def _expected_residual(motion: RigidMotion) -> Floats:
     d, n = motion.template.shape[1], motion.n_present
     expected = np.full(len(n), np.nan)
     rows = motion.fitted
-    free = np.maximum(d * n[rows] - d * (d + 1) // 2, 0)
+    free = degrees_of_freedom(n[rows], d)
     expected[rows] = motion.sigma * np.sqrt(free / n[rows])
     return expected
 

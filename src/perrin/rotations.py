@@ -280,8 +280,7 @@ def cumulative_product(steps: Floats) -> Floats:
 
     Notes
     -----
-    Two levels of blocks, so that the Python loops have about sqrt(K) turns. For products that
-    grow on the left (Hunter 2011, Eq. 13) transpose the steps and the result.
+    Two levels of blocks, so that the Python loops have about sqrt(K) turns.
     """
     count, d = steps.shape[0], steps.shape[-1]
     length = max(1, int(np.ceil(np.sqrt(count))))
@@ -297,6 +296,21 @@ def cumulative_product(steps: Floats) -> Floats:
     product[0] = np.eye(d)
     product[1:] = inside.reshape(-1, d, d)[:count]
     return product
+
+
+def successive_product(steps: Floats) -> Floats:
+    """Return the products of successive rotations Q_0 = 1, Q_{k+1} = R^k Q_k (Hunter 2011, Eq. 13).
+
+    Parameters
+    ----------
+    steps : ndarray, shape (K, d, d)
+        In lab axes.
+
+    Returns
+    -------
+    ndarray, shape (K + 1, d, d)
+    """
+    return np.swapaxes(cumulative_product(np.swapaxes(steps, -1, -2)), -1, -2)
 
 
 def _paired(

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from perrin._arrays import Floats, as_positions, as_sigma, require_positive
 from perrin.motion import RigidMotion
-from perrin.rotations import cumulative_product, exp_map
+from perrin.rotations import cumulative_product, exp_map, successive_product
 
 if TYPE_CHECKING:
     from perrin.shapes import Cluster
@@ -151,7 +151,7 @@ def _rotations(D: Floats, count: int, *, scheme: str, generator: np.random.Gener
         if len(D) != 3 or not isotropic:
             raise ValueError('scheme="euler" (Eq. 16) knows one D_R in three dimensions only')
         left = _euler_steps(float(D[0, 0]), count, generator=generator)
-        return np.swapaxes(cumulative_product(np.swapaxes(left, -1, -2)), -1, -2)
+        return successive_product(left)
     if len(D) == 1 or float(np.trace(D)) == 0:
         normal = generator.normal(size=(count, len(D)))
         return cumulative_product(exp_map(normal * np.sqrt(2 * D[0, 0])))
