@@ -9,22 +9,16 @@ from scipy.stats import multivariate_normal
 
 from perrin import (
     Cluster,
-    LagCurve,
     RigidMotion,
     TooFewFramesError,
     add_noise,
-    cramer_rao,
     estimate_diffusion,
-    fit_line,
     kabsch,
-    msad,
-    msd,
     noise_floor,
-    orientation_correlation,
     simulate_motion,
     track_rotation,
 )
-from perrin.diffusion import _Likelihood, _quadratic_variance, with_error
+from perrin.diffusion import _Likelihood, with_error
 
 TETRAHEDRON = Cluster.tetrahedron(1.5)
 SIGMA = 0.03  # sigma/R = 0.02
@@ -718,108 +712,6 @@ def test_two_and_three_dimensions_do_not_pool():
         estimate_diffusion([])
 
 
-# ---- the line -----------------------------------------------------------------------------------
-
-
-def straight(D, offset, n=200, dt=0.5, dof=2):
-    """Return a curve that is a straight line to the last digit."""
-    t = dt * np.arange(1, n + 1)
-    value = 2 * dof * (D * t + offset)
-    return LagCurve(
-        lagtime=t,
-        value=value,
-        components=np.tile(value[:, None] / 3, 3),
-        stderr=0.1 * value,
-        n_pairs=n + 1 - np.arange(1, n + 1),
-        dof=dof,
-        quantity="rotation",
-        unit="rad^2",
-        n_walks=2.0,
-    )
-
-
-@pytest.mark.parametrize(("D", "offset"), [(5e-3, 2e-4), (1e-9, 0.0), (3.0, -0.1)])
-@pytest.mark.parametrize("dof", [1, 2, 3])
-def test_a_straight_line_is_returned_exactly(D, offset, dof):
-    """Value = 2 dof (D t + offset) gives D and offset to 1e-12."""
-    found = fit_line(straight(D, offset, dof=dof), lag_range=(3, 22))
-    assert found.value == pytest.approx(D, rel=1e-12)
-    assert found.offset == pytest.approx(offset, rel=1e-9, abs=1e-12 * D)
-    assert (found.method, found.unit) == ("line", "rad^2/s")
-
-
-def test_lag_range_ends_are_included():
-    """Both ends belong to the window, also where dt does not divide them in binary."""
-    curve = straight(5e-3, 2e-4, n=30, dt=0.1)
-    bent = np.array(curve.value)
-    bent[[1, 6]] += 1.0  # 0.2 s and 0.7 s lie just outside 0.3 to 0.6 s
-    outside = dataclasses.replace(curve, value=bent)
-    assert fit_line(outside, lag_range=(0.3, 0.6)).value == pytest.approx(5e-3, rel=1e-10)
-    for index in (2, 5):
-        bent = np.array(curve.value)
-        bent[index] += 1.0
-        inside = dataclasses.replace(curve, value=bent)
-        assert abs(fit_line(inside, lag_range=(0.3, 0.6)).value / 5e-3 - 1) > 1
-
-
-def test_too_few_lags_are_refused_with_the_numbers():
-    """A window of two lags, beyond the curve or upside down: refused, and the curve's span said."""
-    curve = straight(5e-3, 2e-4)
-    for window in ((3.0, 3.6), (200.0, 300.0), (22.0, 3.0)):
-        with pytest.raises(ValueError, match=r"at least 3.*from 0.5 to 100 s"):
-            fit_line(curve, lag_range=window)
-    with pytest.raises(ValueError, match="holds 2 lags"):
-        fit_line(curve, lag_range=(3.0, 3.6))
-
-
-def test_lags_without_data_are_left_out():
-    """NaN lags inside the window change nothing on a straight line."""
-    curve = straight(5e-3, 2e-4)
-    holes = np.array(curve.value)
-    holes[[7, 8, 20]] = np.nan
-    found = fit_line(dataclasses.replace(curve, value=holes), lag_range=(3, 22))
-    assert found.value == pytest.approx(5e-3, rel=1e-12)
-    assert np.isfinite(found.stderr)
-
-
-def test_the_line_knows_its_true_error():
-    """Over 300 tracks in the paper's window stderr is the scatter, a quarter of D, within 12 %.
-
-    12 % is 3 Monte-Carlo errors. For D_R it is 6(2) % conservative (measured, 1200 tracks): the
-    four directions of a body that has turned are worth more than three walks.
-    """
-    cluster, lines = Cluster.touching(4, 2.45), {"R": [], "T": []}
-    for seed in range(300):
-        rng = np.random.default_rng([seed, 11])
-        truth = simulate_motion(cluster, D_R=4.93e-3, D_T=3.85e-2, dt=0.73, n_frames=300, rng=rng)
-        x = add_noise(truth.positions(), sigma=(0.03, 0.03, 0.04), rng=rng)
-        motion = tracked(x, dt=0.73)
-        lines["R"].append(fit_line(msad(motion), lag_range=(3, 22)))
-        lines["T"].append(fit_line(msd(motion), lag_range=(3, 22)))
-    for name, truth, percent, excess in (("R", 4.93e-3, 0.25, 1.06), ("T", 3.85e-2, 0.27, 1.0)):
-        values = np.array([e.value for e in lines[name]])
-        stated = np.mean([e.stderr for e in lines[name]])
-        assert stated / excess == pytest.approx(values.std(), rel=0.12)
-        assert values.std() / truth == pytest.approx(percent, rel=0.12)
-        assert abs(values.mean() - truth) < 3 * standard_error(values)
-
-
-@pytest.mark.parametrize("N", [1, 2, 3, 7, 20])
-@pytest.mark.parametrize("s", [0.0, 0.8])
-def test_quadratic_variance_is_a_dense_trace(N, s):
-    """The variance of a weighted sum of MSDs is 2 tr (QC)^2, built densely, to 1e-12."""
-    rng = np.random.default_rng(N)
-    C = (2 * 0.7 + 2 * s) * np.eye(N) - s * (np.eye(N, k=1) + np.eye(N, k=-1))
-    for length in {1, (N + 1) // 2, N}:
-        weights = rng.normal(size=length)
-        Q = np.zeros((N, N))
-        for lag, w in enumerate(weights, start=1):
-            for start in range(N - lag + 1):
-                Q[start : start + lag, start : start + lag] += w / (N - lag + 1)
-        expected = 2 * np.trace(Q @ C @ Q @ C)
-        assert _quadratic_variance(weights, N, D=0.7, s=s) == pytest.approx(expected, rel=1e-12)
-
-
 # ---- print and speed ----------------------------------------------------------------------------
 
 
@@ -886,50 +778,3 @@ def test_an_estimate_takes_few_passes(standard, quantity, monkeypatch):
         passes.append(0)
         estimate_diffusion(motion, quantity=quantity)
     assert max(passes) < 300, passes
-
-
-# ---- the bound ----------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("n_frames", "snr", "axes", "known", "joint"),
-    [
-        (100, 0.05, 3, 29.82, 31.45),
-        (100, 50, 1, 14.49, 24.87),
-        (300, 1, 3, 7.62, 10.00),
-        (300, 20, 3, None, 8.3),
-        (1000, 5, 2, 3.72, 5.81),
-        (10000, 0.2, 1, 3.49, 3.91),
-    ],
-)
-def test_the_bound_is_the_published_table(n_frames, snr, axes, known, joint):
-    """The Cramer-Rao bound in percent equals an independent table to its last digit."""
-    for noise, percent in (("known", known), ("joint", joint)):
-        if percent is not None:
-            bound = 100 * cramer_rao(n_frames=n_frames, snr=snr, axes=axes, noise=noise)
-            assert bound == pytest.approx(percent, abs=0.006 if percent != 8.3 else 0.06)
-
-
-def test_the_bound_is_the_inverse_of_a_dense_fisher_matrix():
-    """For 20 frames the sine eigenvalues give what tr(C^-1 dC C^-1 dC)/2 gives densely."""
-    steps = np.eye(19)
-    shape = 2 * steps - np.eye(19, k=1) - np.eye(19, k=-1)
-    inverse = np.linalg.inv(2 * steps + shape / 0.7)
-    slopes = [inverse @ (2 * steps), inverse @ shape / 0.7]
-    fisher = np.array([[np.trace(a @ b) / 2 for a in slopes] for b in slopes])
-    assert cramer_rao(n_frames=20, snr=0.7, axes=1) == pytest.approx(
-        np.sqrt(np.linalg.inv(fisher)[0, 0])
-    )
-
-
-def test_the_bound_refuses_what_has_none():
-    """SNR, axes and the number of frames must be positive, the noise one of two words."""
-    for bad in ({"snr": 0.0}, {"axes": 0}, {"n_frames": 2}, {"noise": "guessed"}):
-        with pytest.raises(ValueError, match="expected"):
-            cramer_rao(**({"n_frames": 100, "snr": 1.0} | bad))
-
-
-def test_a_correlation_is_no_line(positions):
-    """fit_line refuses an orientation correlation, which is no straight line."""
-    with pytest.raises(ValueError, match="correlation"):
-        fit_line(orientation_correlation(tracked(positions)), lag_range=(1, 10))

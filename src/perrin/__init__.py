@@ -19,7 +19,9 @@ if TYPE_CHECKING:
         TrackTableError,
     )
     from perrin.analysis import analyze
-    from perrin.diffusion import DiffusionEstimate, cramer_rao, estimate_diffusion, fit_line
+    from perrin.bounds import cramer_rao
+    from perrin.curve_fits import fit_line
+    from perrin.diffusion import DiffusionEstimate, estimate_diffusion
     from perrin.files import read_tracks, write_tracks
     from perrin.grouping import cluster_positions, find_clusters, positions_table
     from perrin.hydrodynamics import Size, size_from_rotation, size_from_translation
@@ -91,7 +93,9 @@ _ROOMS = {
     "motion": ("RigidMotion", "remove_rotation", "track_rotation"),
     "grouping": ("cluster_positions", "find_clusters", "positions_table"),
     "lagged": ("LagCurve", "msad", "msad_vector", "msd", "orientation_correlation"),
-    "diffusion": ("DiffusionEstimate", "cramer_rao", "estimate_diffusion", "fit_line"),
+    "diffusion": ("DiffusionEstimate", "estimate_diffusion"),
+    "curve_fits": ("fit_line",),
+    "bounds": ("cramer_rao",),
     "hydrodynamics": ("Size", "size_from_rotation", "size_from_translation"),
     "simulate": ("add_noise", "simulate_motion"),
     "files": ("read_tracks", "write_tracks"),

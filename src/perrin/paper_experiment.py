@@ -12,7 +12,7 @@ from scipy.constants import Boltzmann
 from scipy.spatial.transform import Rotation
 
 from perrin.claims import Claim, Item, Study, statistical
-from perrin.diffusion import fit_line
+from perrin.curve_fits import fit_line
 from perrin.hydrodynamics import size_from_rotation, size_from_translation
 from perrin.lagged import msad, msd
 from perrin.motion import remove_rotation, track_rotation

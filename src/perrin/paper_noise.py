@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 import pandas as pd
 
+from perrin.bounds import cramer_rao
 from perrin.claims import Claim, Item, Study, statistical
-from perrin.diffusion import cramer_rao
 from perrin.lagged import msad
 from perrin.motion import track_rotation
 from perrin.noise import noise_floor
