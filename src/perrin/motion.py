@@ -65,6 +65,9 @@ class RigidMotion:
         The common shape, um, centred.
     sigma : float
         Localisation error of one coordinate from the rigid-fit residuals, um.
+    noise : ndarray, shape (d,)
+        Localisation error of each lab axis behind `covariance` and `center_variance`, um: the one
+        stated, or sigma.
     dt : float
         Time between frames, s.
     """
@@ -80,11 +83,12 @@ class RigidMotion:
     reason: tuple[str, ...]
     template: Floats
     sigma: float
+    noise: Floats
     dt: float
 
     def __post_init__(self) -> None:
         frozen(self.time, self.center, self.rotation, self.residual, self.n_present)
-        frozen(self.covariance, self.center_variance, self.piece, self.template)
+        frozen(self.covariance, self.center_variance, self.piece, self.template, self.noise)
 
     def __repr__(self) -> str:
         n, d = self.template.shape
@@ -208,7 +212,7 @@ class RigidMotion:
         return Rotation.from_matrix(self.rotation[self.fitted]), self.fitted
 
     def to_frame(self) -> pd.DataFrame:
-        """Return a table with a row per frame; template, sigma and dt travel in ``attrs``."""
+        """Return a table with a row per frame; what belongs to all of them is in ``attrs``."""
         import pandas as pd
 
         axes = "xyz"[: self.template.shape[1]]
@@ -231,6 +235,7 @@ class RigidMotion:
         columns |= {"reason": list(self.reason)}
         table = pd.DataFrame(columns)
         table.attrs = {"template": self.template.tolist(), "sigma": self.sigma, "dt": self.dt}
+        table.attrs["noise"] = self.noise.tolist()
         return table
 
     @classmethod
@@ -240,9 +245,9 @@ class RigidMotion:
         Raises
         ------
         ValueError
-            If ``attrs`` lacks the template, sigma or dt, or a column is missing.
+            If ``attrs`` lacks the template, sigma, noise or dt, or a column is missing.
         """
-        missing = {"template", "sigma", "dt"} - set(table.attrs)
+        missing = {"template", "sigma", "noise", "dt"} - set(table.attrs)
         if missing:
             raise ValueError(f"this table was not made by to_frame: attrs lack {sorted(missing)}")
         template = np.array(table.attrs["template"], dtype=np.float64)
@@ -273,6 +278,7 @@ class RigidMotion:
             reason=tuple(column("reason", str).tolist()),
             template=template,
             sigma=float(table.attrs["sigma"]),
+            noise=np.array(table.attrs["noise"], dtype=np.float64),
             dt=float(table.attrs["dt"]),
         )
 
@@ -665,6 +671,7 @@ def _measured(
         reason=_reasons(seen, fitted, lost, d),
         template=fit.template,
         sigma=float(np.sqrt(fit.sigma2)),
+        noise=np.sqrt(noise),
         dt=float(dt),
     )
 

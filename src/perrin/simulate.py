@@ -94,6 +94,7 @@ def simulate_motion(
         reason=("",) * n,
         template=cluster.positions.copy(),
         sigma=0.0,
+        noise=np.zeros(d),
         dt=float(dt),
     )
 

@@ -1,0 +1,131 @@
+"""What a motion's steps look like to an estimator: how large, how long, how noisy at each end."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from perrin._arrays import Bools, Floats, TooFewFramesError
+from perrin.motion import RigidMotion, degrees_of_freedom
+from perrin.noise import center_variance, orientation_covariance
+
+Quantity = Literal["rotation", "translation"]
+
+# Axes whose noise differs by less than this are equally noisy: the errors of the common shape make
+# such differences, and their effect on D is of the order of their square.
+_ALIKE = 0.02
+
+
+@dataclass(frozen=True, eq=False)
+class Steps:
+    """The S steps of one motion along A axes.
+
+    Attributes
+    ----------
+    size : ndarray, shape (S, A)
+        Rotation angles (rad) about body axes, or displacements of the centre (um) along lab axes.
+    duration : ndarray, shape (S,)
+        s; a gap is one longer step.
+    linked : ndarray of bool, shape (S,)
+        Whether the next step begins with the frame that this one ends with.
+    before, after : ndarray, shape (S, A)
+        Noise variance of the frame at the beginning and at the end, per um^2 of sigma^2.
+    complete : float
+        Mean noise variance of the frames that show the most particles, per um^2 of sigma^2.
+    sigma : float
+        Localisation error from the rigid-fit residuals, um.
+    freedom : int
+        Degrees of freedom of those residuals.
+    dt : float
+        Time between frames, s.
+    """
+
+    size: Floats
+    duration: Floats
+    linked: Bools
+    before: Floats
+    after: Floats
+    complete: float
+    sigma: float
+    freedom: int
+    dt: float
+
+    @property
+    def even(self) -> bool:
+        """Whether all steps take equally long, hang together, and are equally noisy."""
+        same_time = np.ptp(self.duration) <= 1e-9 * self.duration[0]
+        noise = np.concatenate([self.before, self.after])
+        same_noise = np.all(np.ptp(noise, axis=0) <= 1e-9 * noise.max())
+        return bool(same_time and same_noise and self.linked[:-1].all())
+
+
+def steps_of(motion: RigidMotion, quantity: Quantity) -> Steps:
+    """Return the steps of a motion and the noise of their frames.
+
+    Rotation: body-frame rotation vectors along the axes in which the covariance of the orientation
+    is diagonal, so that one number an axis describes the noise. Translation: the centre.
+    """
+    start, stop = motion.steps()
+    if len(start) < 2:
+        raise TooFewFramesError(
+            f"{motion.fitted.size} frames with a pose in too few steps: at least 3 in a row (gaps "
+            "allowed) are needed to tell diffusion from noise",
+            int(motion.fitted.size),
+        )
+    size, noise = _turns(motion, stop) if quantity == "rotation" else _jumps(motion, start, stop)
+    n, d = motion.template.shape
+    freedom = degrees_of_freedom(motion.n_present[motion.fitted], d).sum()
+    return Steps(
+        size=size,
+        duration=motion.time[stop] - motion.time[start],
+        linked=np.append(start[1:] == stop[:-1], False),
+        before=noise[start],
+        after=noise[stop],
+        complete=float(np.mean(noise[_complete(motion)])),
+        sigma=motion.sigma,
+        freedom=int(freedom - degrees_of_freedom(np.array(n), d)),
+        dt=motion.dt,
+    )
+
+
+def _turns(motion: RigidMotion, stop: np.ndarray) -> tuple[Floats, Floats]:
+    """Return rotation vectors (S, A) and noise (T, A) along the axes of the mean covariance."""
+    square = float(np.mean(motion.noise**2))
+    if square > 0:
+        c = motion.covariance / square
+    else:
+        unit = orientation_covariance(motion.template, np.eye(motion.template.shape[1]))
+        c = np.broadcast_to(unit, motion.covariance.shape)
+    complete = _complete(motion)
+    values, axes = np.linalg.eigh(np.mean(c[complete], axis=0))
+    noise = np.einsum("ji,tjk,ki->ti", axes, c, axes)
+    for group in np.split(np.arange(len(values)), 1 + np.flatnonzero(_apart(values))):
+        noise[np.ix_(complete, group)] = noise[np.ix_(complete, group)].mean(axis=1)[:, None]
+    return motion.step_vectors()[stop - 1] @ axes, noise
+
+
+def _apart(values: Floats) -> Bools:
+    """Return whether each of the rising values stands clear of the one before."""
+    clear: Bools = np.diff(values) > _ALIKE * values[1:]
+    return clear
+
+
+def _jumps(motion: RigidMotion, start: np.ndarray, stop: np.ndarray) -> tuple[Floats, Floats]:
+    """Return displacements of the centre (S, A) and its noise (T, A)."""
+    size = motion.center[stop] - motion.center[start]
+    square = float(np.mean(motion.noise**2))
+    if square > 0:
+        noise = motion.center_variance / square
+    else:
+        everyone = np.ones(len(motion.template), dtype=np.bool_)
+        noise = np.full(len(motion.time), center_variance(motion.template, everyone, 1.0))
+    return size, np.repeat(noise[:, None], size.shape[1], axis=1)
+
+
+def _complete(motion: RigidMotion) -> Bools:
+    """Return the fitted frames that show the most particles."""
+    fitted = np.isfinite(motion.center[:, 0])
+    complete: Bools = fitted & (motion.n_present == motion.n_present[fitted].max())
+    return complete
