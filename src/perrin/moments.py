@@ -184,11 +184,12 @@ def _cosines(motion: RigidMotion, lag: int) -> Floats:
 def _exponent(cosine: Floats) -> tuple[float, Floats]:
     """Return -log of the mean, and what every pair adds to its error."""
     here = np.isfinite(cosine)
-    mean = float(cosine[here].mean())
-    if mean <= 0:
+    mean, spread = float(cosine[here].mean()), float(cosine[here].std())
+    if mean <= 3 * spread / np.sqrt(here.sum()):
         raise ValueError(
             "the steps are so long that the orientation is lost between frames (mean cosine "
-            f"{mean:.3g}): D_R cannot be read from them; sample more often"
+            f"{mean:.2g} of {here.sum()} steps, not clear of 0): D_R cannot be read from them; "
+            "sample more often"
         )
     return -np.log(mean), np.where(here, (mean - cosine) / (mean * here.sum()), 0.0)
 

@@ -1,0 +1,251 @@
+"""The likelihood of steps is the normal density it claims to be, and its top is found."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy.stats import multivariate_normal
+
+from perrin import Cluster, add_noise, simulate_motion, track_rotation
+from perrin.likelihood import Likelihood, Track, _Sines, _Tridiagonal
+from perrin.steps import steps_of
+
+QUANTITIES = ("rotation", "translation")
+SIGMA = 0.03
+TETRAHEDRON = Cluster.tetrahedron(1.5)
+
+
+def cloud(seed, n_frames=14, cluster=TETRAHEDRON, frames=0.0, particles=0.0, times=None):
+    """Return the tracked motion of a noisy Brownian cluster, ends complete."""
+    rng = np.random.default_rng([seed, 7])
+    truth = simulate_motion(cluster, D_R=3e-3, D_T=4e-3, dt=1.0, n_frames=n_frames, rng=rng)
+    x = add_noise(truth.positions(), sigma=SIGMA, rng=rng)
+    lost = rng.random(x.shape[:2]) < particles
+    lost[rng.random(len(x)) < frames] = True
+    lost[[0, -1]] = False
+    x[lost] = np.nan
+    return track_rotation(x, dt=1.0, times=times)
+
+
+def cases():
+    """Return lists of motions: even, gapped, with partial frames, uneven, pooled, planar."""
+    even = cloud(1)
+    partial = cloud(3, n_frames=20, particles=0.12, cluster=Cluster.touching(5, 2.45))
+    uneven = cloud(4, times=np.cumsum(np.random.default_rng(4).uniform(0.5, 2, 14)))
+    flat = Cluster.from_positions([[0, 0], [2, 0], [1, 1.6]])
+    return {
+        "even": [even],
+        "trimer": [cloud(8, cluster=Cluster.trimer(1.5))],
+        "gapped": [cloud(2, n_frames=24, frames=0.4)],
+        "partial": [partial],
+        "uneven": [uneven],
+        "pieces": [dataclasses.replace(even, piece=np.repeat([0, 1], 7))],
+        "pooled": [partial, even, uneven],
+        "plane": [cloud(5, cluster=flat)],
+    }
+
+
+CASES = cases()
+MODES = {
+    "joint": lambda s: Track.free(s, blur=s.duration.min() / 2, drift=False),
+    "exposed": lambda s: Track.free(s, blur=0.8 * s.dt / 3, drift=False),
+    "residual": lambda s: Track.informed(s, blur=0.1, drift=False),
+    "known": lambda s: Track.fixed(s, sigma=0.04, blur=0.2, drift=False),
+}
+
+
+def built(case, quantity, mode):
+    tracks = [MODES[mode](steps_of(m, quantity)) for m in CASES[case]]
+    return Likelihood.of(tracks)
+
+
+def frame_noise(motion, quantity):
+    """Return the noise variance of every frame along every axis, per um^2, from the definition."""
+    square = SIGMA**2 if motion.noise[0] == 0 else motion.noise[0] ** 2
+    if quantity == "translation":
+        return np.repeat(motion.center_variance[:, None], motion.center.shape[1], axis=1) / square
+    c = motion.covariance / square
+    full = motion.n_present == motion.n_present[motion.fitted].max()
+    values, axes = np.linalg.eigh(np.nanmean(c[full], axis=0))
+    noise = np.einsum("ji,tjk,ki->ti", axes, c, axes)
+    alike = [[0]]
+    for i in range(1, len(values)):  # axes within 2 % of the one before are taken as equal
+        near = values[i] - values[i - 1] <= 0.02 * values[i]
+        alike = [*alike[:-1], [*alike[-1], i]] if near else [*alike, [i]]
+    for group in alike:
+        for t in np.flatnonzero(full):
+            noise[t, group] = np.mean(noise[t, group])
+    return noise
+
+
+def dense_covariance(motion, quantity, D, theta, mode):
+    """Return the covariance of all steps: S (noise - b D) S^T + 2 D tau, axis after axis."""
+    start, stop = motion.steps()
+    tau = motion.time[stop] - motion.time[start]
+    noise = frame_noise(motion, quantity)
+    if mode in ("joint", "exposed"):
+        excess = motion.sigma**2 * noise
+        noise = theta + excess - np.nanmin(excess)
+        blur = tau.min() / 2 if mode == "joint" else 0.8 * motion.dt / 3
+    elif mode == "residual":
+        full = motion.n_present == motion.n_present[motion.fitted].max()
+        noise, blur = theta * noise / np.nanmean(noise[full]), 0.1
+    else:
+        noise, blur = 0.04**2 * noise, 0.2
+    blocks = []
+    for axis in noise.T:
+        take = np.zeros((len(start), len(motion.time)))
+        take[np.arange(len(start)), start] = -1
+        take[np.arange(len(start)), stop] = 1
+        blocks.append((take * np.nan_to_num(axis - blur * D)) @ take.T + np.diag(2 * D * tau))
+    return blocks
+
+
+def dense_value(case, quantity, mode, likelihood, D, theta):
+    """Return the log-density of all steps, and of the residuals, without the constants."""
+    total = 0.0
+    for motion, track, t in zip(CASES[case], likelihood.tracks, theta, strict=True):
+        y = track.steps.size
+        for column, block in zip(y.T, dense_covariance(motion, quantity, D, t, mode), strict=True):
+            total += multivariate_normal(cov=block).logpdf(column)
+            total += 0.5 * len(column) * np.log(2 * np.pi)
+        if mode == "residual":
+            ratio = track.theta / t
+            total -= 0.5 * track.freedom * (np.log(t) + ratio)
+    return total
+
+
+def points(likelihood):
+    """Return D and theta of every group, small and large against the signal."""
+    count = len(likelihood.tracks)
+    for size in (0.1, 3.0):
+        D = 0.5 * likelihood.scale
+        yield D, size * D[0] * (1 + 0.1 * np.arange(count))
+
+
+@pytest.mark.parametrize("quantity", QUANTITIES)
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("case", CASES)
+def test_the_value_is_the_dense_normal_density(case, mode, quantity):
+    """It equals a dense multivariate normal log-density to 1e-9, whatever the noise mode."""
+    likelihood = built(case, quantity, mode)
+    for D, theta in points(likelihood):
+        expected = dense_value(case, quantity, mode, likelihood, float(D[0]), theta)
+        value = float(likelihood.sums(D, theta).value.sum())
+        assert value == pytest.approx(expected, rel=1e-9)
+
+
+@pytest.mark.parametrize("quantity", QUANTITIES)
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("case", CASES)
+def test_the_slopes_are_finite_differences(case, mode, quantity):
+    """Rise less fall in D and in every theta equals central differences of the value, to 1e-5."""
+    likelihood = built(case, quantity, mode)
+    for D, theta in points(likelihood):
+        sums, step = likelihood.sums(D, theta), 1e-5
+        more, less = (likelihood.sums(D * (1 + k * step), theta).value.sum() for k in (1, -1))
+        slope = float((sums.rise_D - sums.fall_D).sum() * D[0])
+        assert slope == pytest.approx((more - less) / (2 * step), rel=1e-5, abs=1e-4)
+        more, less = (likelihood.sums(D, theta * (1 + k * step)).value for k in (1, -1))
+        slopes = (sums.rise - sums.fall) * theta
+        assert slopes == pytest.approx((more - less) / (2 * step), rel=1e-5, abs=1e-4)
+
+
+@pytest.mark.parametrize("quantity", QUANTITIES)
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("case", ["even", "trimer", "plane"])
+def test_both_kernels_agree(case, mode, quantity):
+    """Sine transform and tridiagonal elimination give the same value and slopes to 1e-10."""
+    tracks = built(case, quantity, mode).tracks
+    D, theta = np.array([2e-3]), np.array([3e-4])
+    one, two = (kernel.of(tracks, [0]).sums(D, theta) for kernel in (_Sines, _Tridiagonal))
+    for a, b in zip(one, two, strict=True):
+        assert a == pytest.approx(b, rel=1e-10)
+
+
+@pytest.mark.parametrize("case", ["even", "gapped", "partial", "uneven", "pooled"])
+def test_a_free_mean_velocity_is_the_restricted_likelihood(case):
+    """With drift the value is the density of all contrasts that no mean velocity can change.
+
+    The constant between a density of contrasts and the restricted likelihood, ln(tau.tau)/2 for
+    each axis, is added; dense QR finds the contrasts.
+    """
+    steps = [steps_of(m, "translation") for m in CASES[case]]
+    likelihood = Likelihood.of([Track.free(s, blur=0.2, drift=True) for s in steps])
+    plain = Likelihood.of([Track.free(s, blur=0.2, drift=False) for s in steps])
+    for D, theta in points(likelihood):
+        expected = 0.0
+        for motion, track, t in zip(CASES[case], likelihood.tracks, theta, strict=True):
+            tau = track.steps.duration
+            contrasts = np.linalg.qr(tau[:, None], mode="complete")[0][:, 1:]
+            noise = motion.sigma**2 * frame_noise(motion, "translation")
+            noise = t + noise - np.nanmin(noise) - 0.2 * D[0]
+            start, stop = motion.steps()
+            take = np.zeros((len(start), len(motion.time)))
+            take[np.arange(len(start)), start], take[np.arange(len(start)), stop] = -1, 1
+            for y, axis in zip(track.steps.size.T, noise.T, strict=True):
+                C = (take * np.nan_to_num(axis)) @ take.T + np.diag(2 * D[0] * tau)
+                small = contrasts.T @ C @ contrasts
+                expected += multivariate_normal(cov=small).logpdf(contrasts.T @ y)
+                expected += 0.5 * (len(y) - 1) * np.log(2 * np.pi) - 0.5 * np.log(tau @ tau)
+        value = float(likelihood.sums(D, theta).value.sum())
+        assert value == pytest.approx(expected, rel=1e-9)
+        assert value != pytest.approx(float(plain.sums(D, theta).value.sum()), rel=1e-6)
+        step, sums = 1e-5, likelihood.sums(D, theta)
+        more, less = (likelihood.sums(D * (1 + k * step), theta).value.sum() for k in (1, -1))
+        slope = float((sums.rise_D - sums.fall_D).sum() * D[0])
+        assert slope == pytest.approx((more - less) / (2 * step), rel=1e-5, abs=1e-4)
+        more, less = (likelihood.sums(D, theta * (1 + k * step)).value for k in (1, -1))
+        slopes = (sums.rise - sums.fall) * theta
+        assert slopes == pytest.approx((more - less) / (2 * step), rel=1e-5, abs=1e-4)
+
+
+def brute(likelihood, D):
+    """Return the profile log-likelihood by brute force: every theta by itself, grid on grid."""
+    total, count = 0.0, len(likelihood.tracks)
+    for g in range(count):
+        scale = float(np.mean(likelihood.tracks[g].steps.size ** 2))
+        grid = np.geomspace(1e-9, 1e3, 60)
+        for _ in range(5):
+            alone = Likelihood.of([likelihood.tracks[g]])
+            values = [alone.sums(np.array([D]), np.array([scale * t])).value[0] for t in grid]
+            k = int(np.argmax(values))
+            grid = np.geomspace(grid[max(k - 1, 0)], grid[min(k + 1, len(grid) - 1)], 25)
+        total += max(values)
+    return total
+
+
+@pytest.mark.parametrize("mode", ["joint", "exposed", "residual"])
+@pytest.mark.parametrize(("seed", "n_frames"), [(1, 60), (2, 25), (3, 5), (0, 8)])
+def test_top_and_intervals_are_those_of_a_brute_force_profile(mode, seed, n_frames):
+    """The value is the top of a profile on a grid; interval ends lie 0.99/2 and 3.84/2 below.
+
+    With 5 and 8 frames the profile can have several tops: the highest counts.
+    """
+    motion = cloud(seed, n_frames=n_frames)
+    likelihood = Likelihood.of([MODES[mode](steps_of(motion, "rotation"))])
+    best = likelihood.best()
+    top = brute(likelihood, best.D[0])
+    assert best.value[0] == pytest.approx(top, abs=1e-4)
+    grid = likelihood.scale[0] * np.geomspace(1e-4, 10, 40)
+    assert max(brute(likelihood, D) for D in grid) <= top + 1e-6
+    for drop in (0.98894, 3.84146):
+        low, high = likelihood.interval(best, drop)
+        assert brute(likelihood, high) == pytest.approx(top - drop / 2, abs=1e-4)
+        if low > 0:
+            assert brute(likelihood, low) == pytest.approx(top - drop / 2, abs=1e-4)
+        else:
+            assert brute(likelihood, 1e-9 * likelihood.scale[0]) >= top - drop / 2 - 1e-3
+
+
+def test_apart_finds_the_top_of_every_motion():
+    """A D for every group gives what each motion gives alone, to 1e-9."""
+    steps = [steps_of(m, "rotation") for m in (cloud(i, n_frames=60) for i in range(4))]
+    tracks = [MODES["joint"](s) for s in steps] + [
+        MODES["joint"](steps_of(CASES["gapped"][0], "rotation"))
+    ]
+    together = Likelihood.of(tracks).apart().best()
+    for i, track in enumerate(tracks):
+        alone = Likelihood.of([track]).best()
+        assert together.D[i] == pytest.approx(alone.D[0], rel=1e-9)
+        assert together.value[i] == pytest.approx(alone.value[0], rel=1e-9)
