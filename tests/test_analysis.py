@@ -306,3 +306,43 @@ def test_real_marker_bodies():
         alone = perrin.analyze(rows, dt=1 / 160, scale=1000).clusters[0]
         assert alone.motion.sigma / 1000 == pytest.approx(sigma, rel=0.05)
         assert any("not rigid" in w for w in result.warnings) == (name == "Foot")
+
+
+def test_noise_exposure_and_drift_reach_the_estimates(base):
+    """Held noise narrows the interval and is told; a flow is taken off D_T and told."""
+    free = perrin.analyze(base, dt=0.73).clusters[0]
+    held = perrin.analyze(base, dt=0.73, noise="residual")
+    assert held.clusters[0].D_R.stderr < 0.8 * free.D_R.stderr
+    assert any("exposure is not stated" in w for w in held.warnings)
+    stated = perrin.analyze(base, dt=0.73, noise=0.03, exposure=0.0)
+    assert stated.warnings == ()
+    assert stated.clusters[0].D_R.noise == "0.03 um"
+    moving = base.assign(x=base["x"] + 0.5 * base["frame"])
+    flow = perrin.analyze(moving, dt=0.73, drift=True).clusters[0]
+    assert flow.D_T.value == pytest.approx(free.D_T.value, rel=0.05)
+    assert any("mean velocity of x 0.6" in w for w in flow.warnings)
+
+
+def test_clusters_that_differ_are_not_pooled_without_a_word():
+    """A cluster that turns three times as fast makes p_same small, and a warning says so."""
+    tables = [tracks(seed=k, cluster=k) for k in range(3)]
+    alike = perrin.analyze(pd.concat(tables), dt=0.73)
+    assert alike.to_dict()["pooled"]["p_same"] > 0.01
+    assert not any("do not agree" in w for w in alike.warnings)
+    rng = np.random.default_rng(9)
+    fast = perrin.simulate_motion(
+        perrin.Cluster.touching(4, 2.45), D_R=1.5e-2, D_T=0.04, dt=0.73, n_frames=150, rng=rng
+    )
+    noisy = perrin.add_noise(fast.positions() + np.array([0.0, 50.0, 0.0]), sigma=0.03, rng=rng)
+    table = perrin.positions_table(noisy)
+    table = table.assign(cluster=9, particle=table["particle"] + 100)
+    mixed = perrin.analyze(pd.concat([*tables, table]), dt=0.73)
+    assert mixed.pooled.D_R.p_same < 1e-3
+    assert any("do not agree on one D_R" in w for w in mixed.warnings)
+    assert not any("do not agree on one D_T" in w for w in mixed.warnings)
+
+
+def test_coarse_sampling_and_few_frames_are_warned_of():
+    """What estimate_diffusion warns of stands in the cluster's warnings; nothing is raised."""
+    short = perrin.analyze(tracks(n_frames=20), dt=0.73).clusters[0]
+    assert any("19 steps, fewer than 30" in w for w in short.warnings)

@@ -178,6 +178,21 @@ def test_options_reach_the_analysis(csv, tmp_path):
     assert summary == json.loads(json.dumps(expected.to_dict()))
 
 
+def test_noise_and_exposure_are_options(csv, tmp_path):
+    """--noise, --exposure and --drift arrive; nonsense is refused by name."""
+    more = ("--noise", "residual", "--exposure", "0.2", "--drift")
+    result = run("analyze", csv, "--dt", "0.73", *more, "-o", "run", cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    report = perrin.load_run(tmp_path / "run")
+    D_R, D_T = report.clusters[0].D_R, report.clusters[0].D_T
+    assert (D_R.noise, D_R.exposure, D_R.drift) == ("residual", 0.2, None)
+    assert len(D_T.drift[0]) == 3
+    for wrong in (("--noise", "loud"), ("--noise", "-1"), ("--exposure", "2")):
+        refused(
+            run("analyze", csv, "--dt", "0.73", *wrong, "-o", "b", cwd=tmp_path), 2, wrong[0][2:]
+        )
+
+
 def test_an_existing_folder_is_refused_without_overwrite(csv, tmp_path):
     """The same command twice ends with status 2, and with --overwrite it replaces the run."""
     words = ("analyze", csv, "--dt", 0.73, "-o", tmp_path / "run")

@@ -5,22 +5,24 @@ from __future__ import annotations
 import hashlib
 import os
 import platform
+import warnings as python_warnings
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from perrin._arrays import (
     DegenerateClusterError,
     Floats,
+    PrecisionWarning,
     TooFewFramesError,
     TrackTableError,
     as_sigma,
     require_positive,
 )
-from perrin.diffusion import DiffusionEstimate, estimate_diffusion
+from perrin.diffusion import DiffusionEstimate, estimate_diffusion, with_error
 from perrin.files import check_tracks, read_tracks
 from perrin.grouping import cluster_positions, find_clusters
 from perrin.hydrodynamics import Size, size_from_rotation, size_from_translation
@@ -35,12 +37,15 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from perrin.noise import NoiseFloor
+    from perrin.steps import Quantity
 
 # Without a cluster column up to this many particles may pass as one body.
 _ONE_CLUSTER = 20
 # A body is called soft when its residuals are large against its size and smooth in time; a sigma
 # stated by the user replaces both rules by a factor on it.
 _SOFT_SIZE, _SOFT_SMOOTH, _SOFT_FACTOR = 0.03, 0.3, 2.0
+# Clusters that agree less well than this by chance have no common D.
+_DIFFER = 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +56,23 @@ class _Conditions:
     sigma: ArrayLike | None
     viscosity: float | None
     temperature: float | None
+    noise: Literal["joint", "residual"] | float
+    exposure: float | None
+    drift: bool
+
+    def estimate(
+        self, motion: RigidMotion | list[RigidMotion], quantity: Quantity
+    ) -> DiffusionEstimate:
+        """Estimate D_R or D_T; what has to be known of it goes into the report's own warnings."""
+        with python_warnings.catch_warnings():
+            python_warnings.simplefilter("ignore", PrecisionWarning)
+            return estimate_diffusion(
+                motion,
+                quantity=quantity,
+                noise=self.noise,
+                exposure=self.exposure,
+                drift=self.drift and quantity == "translation",
+            )
 
 
 def analyze(
@@ -61,6 +83,9 @@ def analyze(
     columns: Mapping[str, str | int] | None = None,
     contact: float | None = None,
     sigma: ArrayLike | None = None,
+    noise: Literal["joint", "residual"] | float = "joint",
+    exposure: float | None = None,
+    drift: bool = False,
     viscosity: float | None = None,
     temperature: float | None = None,
     frames: tuple[int | None, int | None] | None = None,
@@ -84,6 +109,13 @@ def analyze(
     sigma : float or array_like, optional
         Known localisation error, um, one number or one per axis: sets the predicted noise floor and
         the test of rigidity, not the estimates.
+    noise : {"joint", "residual"} or float
+        How the noise under the estimates is known: free, from the rigid-fit residuals, or a
+        localisation error in um; see `estimate_diffusion`.
+    exposure : float, optional
+        Open fraction of dt, 0 to 1; unknown by default.
+    drift : bool
+        Give D_T a free mean velocity along each axis (flow, sedimentation).
     viscosity, temperature : float, optional
         Pa s and K: with both, sizes of tetrahedra follow.
     frames : tuple of int or None, optional
@@ -112,13 +144,14 @@ def analyze(
     """
     _check_arguments(dt=dt, contact=contact, viscosity=viscosity, temperature=temperature)
     table, source = _table(tracks, scale=scale, columns=columns)
-    conditions = _Conditions(dt, sigma, viscosity, temperature)
+    conditions = _Conditions(dt, sigma, viscosity, temperature, noise, exposure, drift)
     table = _sliced(table, frames)
     table, labels, warnings = _clustered(table, contact=contact)
     first = int(table["frame"].min())
     table["frame"] -= first
     results, failures = _each(table, labels, conditions)
-    pooled, more = _pooled(results)
+    pooled, more = _pooled(results, conditions)
+    more += _exposure_taken(conditions)
     arguments = asdict(conditions) | {"contact": contact, "frames": frames, "columns": columns}
     arguments |= {name: _plain(given) for name, given in (("scale", scale), ("sigma", sigma))}
     settings = _settings(source, arguments=arguments, first_frame=first)
@@ -248,8 +281,7 @@ def _measure(
     positions, frames = cluster_positions(rows)
     sigma = conditions.sigma
     motion = track_rotation(positions, dt=conditions.dt, frames=frames, sigma=sigma)
-    D_R = estimate_diffusion(motion, quantity="rotation")
-    D_T = estimate_diffusion(motion, quantity="translation")
+    D_R, D_T = (conditions.estimate(motion, q) for q in ("rotation", "translation"))
     noise = predicted_noise(motion)
     sizes, said = _sizes(motion, D_R, D_T, conditions)
     warnings = (
@@ -257,6 +289,9 @@ def _measure(
         *_softness(motion, positions, sigma),
         *_floor_mismatch(motion, D_R, noise),
         *_unresolved(D_R, D_T),
+        *(f"D_R: {text}" for text in D_R.warnings),
+        *(f"D_T: {text}" for text in D_T.warnings),
+        *_drift_told(D_T),
         *said,
     )
     return ClusterResult(cluster, motion, D_R, D_T, None, noise, sizes, warnings, label)
@@ -321,6 +356,25 @@ def _unresolved(D_R: DiffusionEstimate, D_T: DiffusionEstimate) -> list[str]:
     return [f"not resolved: {estimate}" for estimate in (D_R, D_T) if not estimate.resolved]
 
 
+def _drift_told(D_T: DiffusionEstimate) -> list[str]:
+    """Say which mean velocity was taken off D_T."""
+    if D_T.drift is None or D_T.drift_stderr is None:
+        return []
+    axes = zip("xyz", D_T.drift[0], D_T.drift_stderr[0], strict=False)
+    told = ", ".join(f"{axis} {with_error(v, e)}" for axis, v, e in axes)
+    return [f"D_T is about a mean velocity of {told} um/s"]
+
+
+def _exposure_taken(conditions: _Conditions) -> list[str]:
+    """Say what an unknown exposure was taken for where the noise is held."""
+    if conditions.noise == "joint" or conditions.exposure is not None:
+        return []
+    return [
+        f"noise {conditions.noise}: the exposure is not stated and taken as 0; a shutter that is "
+        "open all the time would make D up to 26 % low"
+    ]
+
+
 def _sizes(
     motion: RigidMotion, D_R: DiffusionEstimate, D_T: DiffusionEstimate, conditions: _Conditions
 ) -> tuple[dict[str, Size] | None, list[str]]:
@@ -340,7 +394,7 @@ def _sizes(
     }, []
 
 
-def _pooled(results: list[ClusterResult]) -> tuple[Pooled, list[str]]:
+def _pooled(results: list[ClusterResult], conditions: _Conditions) -> tuple[Pooled, list[str]]:
     """Pool all clusters that passed as rigid; say which are left out."""
     soft = [r for r in results if any(w.startswith("not rigid") for w in r.warnings)]
     used = [r for r in results if r not in soft] or results
@@ -352,8 +406,13 @@ def _pooled(results: list[ClusterResult]) -> tuple[Pooled, list[str]]:
     if len(used) == 1:
         return Pooled(used[0].D_R, used[0].D_T, clusters), warnings
     motions = [r.motion for r in used]
-    D_R = estimate_diffusion(motions, quantity="rotation")
-    D_T = estimate_diffusion(motions, quantity="translation")
+    D_R, D_T = (conditions.estimate(motions, q) for q in ("rotation", "translation"))
+    warnings += [
+        f"the clusters do not agree on one {name}: equal values would scatter as much with "
+        f"probability {estimate.p_same:.1g}"
+        for name, estimate in (("D_R", D_R), ("D_T", D_T))
+        if estimate.p_same is not None and estimate.p_same < _DIFFER
+    ]
     return Pooled(D_R, D_T, clusters), warnings
 
 

@@ -6,7 +6,7 @@ import os
 import sys
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal, cast
 
 import typer
 
@@ -98,6 +98,19 @@ def analyze(
             "and the test of rigidity."
         ),
     ] = None,
+    noise: Annotated[
+        str,
+        typer.Option(
+            help="How the noise under D is known: joint (free), residual (from the rigid fit; "
+            "right only if all particles of a frame are seen at once), or sigma in um."
+        ),
+    ] = "joint",
+    exposure: Annotated[
+        float | None, typer.Option(help="Open fraction of dt, 0 to 1; unknown if left out.")
+    ] = None,
+    drift: Annotated[
+        bool, typer.Option("--drift", help="Take a mean velocity (flow, sedimentation) off D_T.")
+    ] = False,
     viscosity: Annotated[float | None, typer.Option(help="Pa s, for sizes.")] = None,
     temperature: Annotated[float | None, typer.Option(help="K, for sizes.")] = None,
     frames: Annotated[
@@ -118,6 +131,9 @@ def analyze(
             columns=_columns(columns),
             contact=contact,
             sigma=None if sigma is None else _numbers("--sigma", sigma),
+            noise=_noise(noise),
+            exposure=exposure,
+            drift=drift,
             viscosity=viscosity,
             temperature=temperature,
             frames=_slice(frames),
@@ -253,6 +269,18 @@ def _numbers(option: str, text: str) -> float | list[float]:
     return values[0] if len(values) == 1 else values
 
 
+def _noise(text: str) -> Literal["joint", "residual"] | float:
+    """Read joint, residual, or a number."""
+    if text in ("joint", "residual"):
+        return cast('Literal["joint", "residual"]', text)
+    try:
+        return float(text)
+    except ValueError:
+        raise ValueError(
+            f"--noise: expected joint, residual or sigma in um, got {text!r}"
+        ) from None
+
+
 def _columns(text: str | None) -> dict[str, str | int] | None:
     """Read name=column pairs; a column that is a whole number is a position."""
     if text is None:
@@ -335,8 +363,13 @@ def _pooled_table(report: Report) -> Table:
     title = f"{count} clusters pooled"
     table = Table("", "value", "68 %", "95 %", title=title, title_justify="left", box=SIMPLE_HEAD)
     table.columns[0].no_wrap = True
+    same = []
     for name, estimate in (("D_R", report.pooled.D_R), ("D_T", report.pooled.D_T)):
         table.add_row(f"{name} ({estimate.unit})", *_estimate_cells(estimate))
+        same += [] if estimate.p_same is None else [f"{name} {estimate.p_same:.2g}"]
+    if same:
+        table.caption = f"chance of such a scatter about one value: {', '.join(same)}"
+        table.caption_justify = "left"
     return table
 
 

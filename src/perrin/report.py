@@ -83,6 +83,7 @@ _ARGUMENT_UNITS = {
     "dt": "s",
     "sigma": "µm",
     "contact": "µm",
+    "exposure": "of dt",
     "viscosity": "Pa s",
     "temperature": "K",
     "scale": "µm per unit",
@@ -147,6 +148,9 @@ def render_html(report: Report, figures: Iterable[Path]) -> str:
         clusters=[_section(c, pictures, report.settings) for c in report.clusters],
         hidden=max(len(report.clusters) - MAX_CLUSTERS, 0),
         planar=report.clusters[0].motion.template.shape[1] == 2,
+        noise=report.pooled.D_R.noise,
+        exposure=report.pooled.D_R.exposure,
+        drift=report.pooled.D_T.drift is not None,
     )
 
 
@@ -190,8 +194,21 @@ def _pooled_row(report: Report) -> dict[str, Any]:
         "D_T": _estimate(report.pooled.D_T),
         "frames": report.pooled.D_R.n_frames,
         "count": len(used),
+        "agree": _agreement(report),
         "left_out": [c.name for c in report.clusters if c.cluster not in used],
     }
+
+
+def _agreement(report: Report) -> str:
+    """Say how well the clusters agree on one value."""
+    said = [
+        f"{name} {number_text(estimate.p_same)}"
+        for name, estimate in (("D_R", report.pooled.D_R), ("D_T", report.pooled.D_T))
+        if estimate.p_same is not None
+    ]
+    if not said:
+        return ""
+    return f"; equal values would scatter as much as these with probability {', '.join(said)}"
 
 
 def _section(
@@ -275,7 +292,8 @@ def _noise_facts(result: ClusterResult) -> list[tuple[str, str, str]]:
     error = floor_factor(motion) * estimate.offset_stderr
     known = bool(np.isfinite(error))
     measured = _floor(result.phi2_measured, error if known else 0.0)
-    remark = "offset of the steps, free in the fit"
+    held = {"joint": "free in the fit", "residual": "the residuals weighed in"}
+    remark = f"offset of the steps, {held.get(estimate.noise, 'held')}"
     remark += "" if known else "; its error is unknown: it lies on the edge of the possible"
     snr = number_text(estimate.snr) if np.isfinite(estimate.snr) else "without bound"
     facts = [

@@ -162,7 +162,7 @@ class Report:
             "pooled": {
                 "D_R": _estimate_dict(self.pooled.D_R),
                 "D_T": _estimate_dict(self.pooled.D_T),
-                "p_same": None,
+                "p_same": self.pooled.D_R.p_same,
                 "clusters": list(self.pooled.clusters),
             },
             "warnings": list(self.warnings),
@@ -322,10 +322,14 @@ def _number(value: float) -> float | None:
 def _estimate_dict(estimate: DiffusionEstimate) -> dict[str, Any]:
     """Return an estimate for JSON, ends of intervals without bound as None."""
     entry = asdict(estimate)
-    for name in ("value", "stderr", "offset", "offset_stderr", "snr"):
+    for name in ("value", "stderr", "offset", "offset_stderr", "snr", "dt"):
         entry[name] = _number(entry[name])
     for name in ("ci68", "ci95"):
         entry[name] = [_number(end) for end in entry[name]]
+    entry["warnings"] = list(estimate.warnings)
+    for name in ("drift", "drift_stderr"):
+        if entry[name] is not None:
+            entry[name] = [list(row) for row in entry[name]]
     return entry
 
 
@@ -337,6 +341,10 @@ def _estimate_from(entry: dict[str, Any]) -> DiffusionEstimate:
         fields[name] = (low, np.inf if high is None else high)
     fields["offset_stderr"] = np.nan if entry["offset_stderr"] is None else entry["offset_stderr"]
     fields["snr"] = np.inf if entry["snr"] is None else entry["snr"]
+    fields["warnings"] = tuple(entry["warnings"])
+    for name in ("drift", "drift_stderr"):
+        if entry[name] is not None:
+            fields[name] = tuple(map(tuple, entry[name]))
     return DiffusionEstimate(**fields)
 
 
