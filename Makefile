@@ -31,7 +31,7 @@ venv_works = $(shell $(1)/bin/python -c 'import sys, pip; sys.exit(sys.version_i
 make_venv = $(if $(call venv_works,$(1)),:,$(call new_venv,$(1),$(find_python)))
 new_venv = $(call check_python,$(2))rm -rf $(1); $(2) -m venv $(1) || { echo '$(call no_venv,$(2))' >&2; exit 1; }
 
-.PHONY: help demo test test-lowest lint types doctests docs lock clean
+.PHONY: help demo test test-lowest coverage lint types doctests docs lock clean
 
 help:  ## list these targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1 - \2/p' Makefile | awk -F ' - ' '{printf "%-18s %s\n", $$1, $$2}'
@@ -48,6 +48,9 @@ test-lowest:  ## the suite on the oldest dependencies allowed (Python 3.11)
 	  -r requirements/lowest.txt $$(grep -E '^(pytest|hypothesis)==' requirements/test.lock)
 	.venv-lowest/bin/python -m pip install --quiet --disable-pip-version-check --no-deps -e .
 	.venv-lowest/bin/python -m pytest -q
+
+coverage: .venv/.test  ## do intervals cover? a quick look (docs/validation.md has the long one)
+	$(BIN)/python benchmarks/coverage.py --quick
 
 lint: .venv/.test  ## ruff: rules and format
 	$(RUN) ruff check .
