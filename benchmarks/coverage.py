@@ -33,6 +33,7 @@ SHORT = LINES | {"cover68": (0.62, 0.74)}
 TRIMER = LINES | {"efficiency": 0.85}
 GAPS = {"cover95": (0.92, 1.0), "percent": 2.0}
 BLUR = {"percent": 1.0}
+COVER = {"cover68": LINES["cover68"], "cover95": LINES["cover95"]}
 
 
 @dataclass(frozen=True)
@@ -45,11 +46,28 @@ class Cell:
     lines: dict
     missing: float = 0.0
     substeps: int = 1
+    axes: tuple = (1.0, 1.0, 1.0)
+    sigma_z: float = 1.0
+    quantity: str = "rotation"
 
     def __str__(self):
         told = f"{self.body}, {self.frames} frames, SNR {self.snr:g}"
+        told += ", D_T" if self.quantity == "translation" else ""
+        told += f", axes {self.axes[0]:g}:{self.axes[1]:g}:{self.axes[2]:g}" if self.uneven else ""
+        told += f", sigma_z {self.sigma_z:g} times sigma_xy" if self.sigma_z != 1 else ""
         told += f", {self.missing:.0%} missing" if self.missing else ""
         return told + (", full blur" if self.substeps > 1 else "")
+
+    @property
+    def uneven(self):
+        """Whether the axes of the body diffuse unequally."""
+        return len(set(self.axes)) > 1
+
+    @property
+    def sigma(self):
+        """Localisation error of each axis, um; its mean square is the same in all cells."""
+        sigma = np.array([1.0, 1.0, self.sigma_z])
+        return SIGMA_OVER_R * R * sigma / np.sqrt(np.mean(sigma**2))
 
 
 CELLS = (
@@ -61,44 +79,52 @@ CELLS = (
     Cell("trimer", 300, 5, TRIMER),
     Cell("tetrahedron", 300, 5, GAPS, missing=0.3),
     Cell("tetrahedron", 300, 5, BLUR, substeps=20),
+    Cell("tetrahedron", 300, 5, COVER, axes=(1, 1, 4)),
+    Cell("tetrahedron", 300, 2, COVER, sigma_z=3, quantity="translation"),
+    Cell("tetrahedron", 300, 2, COVER, sigma_z=5, quantity="translation"),
 )
 METHODS = {
-    "joint": lambda track: perrin.estimate_diffusion(track.motion),
+    "joint": lambda track: perrin.estimate_diffusion(track.motion, quantity=track.quantity),
     "residual": lambda track: perrin.estimate_diffusion(
-        track.motion, noise="residual", exposure=track.exposure
+        track.motion, quantity=track.quantity, noise="residual", exposure=track.exposure
     ),
 }
 
 
 @dataclass(frozen=True)
 class Track:
-    """Noisy positions, the motion fitted to them, and how long the shutter was open."""
+    """Noisy positions, the motion fitted to them, the open shutter, and what is asked for."""
 
     positions: np.ndarray
     motion: perrin.RigidMotion
     exposure: float
+    quantity: str
 
 
 def planted(cell):
-    """Return the D_R (per frame) of a cell: the noise variance of an angle times the ratio."""
+    """Return the D (per frame) of a cell: the noise variance of a coordinate times the ratio."""
+    if cell.quantity == "translation":
+        return cell.snr * (SIGMA_OVER_R * R) ** 2 / len(BODIES[cell.body].positions)
     covariance = perrin.noise_floor(BODIES[cell.body], sigma=SIGMA_OVER_R * R).covariance
     return cell.snr * np.trace(covariance) / 3
 
 
 def simulate(cell, rng):
     """Return one track of a cell; substeps within a frame are averaged, as an open shutter does."""
+    D = planted(cell) if cell.quantity == "rotation" else 1e-3
     truth = perrin.simulate_motion(
         BODIES[cell.body],
-        D_R=planted(cell),
+        D_R=D * np.array(cell.axes) / np.mean(cell.axes) if cell.uneven else D,
+        D_T=planted(cell) if cell.quantity == "translation" else 0.0,
         dt=1 / cell.substeps,
         n_frames=cell.frames * cell.substeps,
         rng=rng,
     )
     x = truth.positions()
     x = x.reshape(cell.frames, cell.substeps, *x.shape[1:]).mean(axis=1)
-    x = perrin.add_noise(x, sigma=SIGMA_OVER_R * R, rng=rng)
+    x = perrin.add_noise(x, sigma=cell.sigma, rng=rng)
     x[1:-1][rng.random(cell.frames - 2) < cell.missing] = np.nan
-    return Track(x, perrin.track_rotation(x, dt=1.0), float(cell.substeps > 1))
+    return Track(x, perrin.track_rotation(x, dt=1.0), float(cell.substeps > 1), cell.quantity)
 
 
 @dataclass(frozen=True)
@@ -145,11 +171,10 @@ def judge(cell, method, estimates):
     if "bias" in cell.lines:
         line = 100 * cell.lines["bias"] * spread
         figures["bias %"] = (*figures["bias %"][:2], (-line, line))
-    if not cell.missing and cell.substeps == 1:
+    if "efficiency" in cell.lines:
         efficiency = (bound(cell, method) / spread) ** 2
         error = efficiency * np.sqrt((kurtosis - 1) / count)
-        line = (cell.lines["efficiency"], np.inf) if "efficiency" in cell.lines else None
-        figures["efficiency"] = (efficiency, error, line)
+        figures["efficiency"] = (efficiency, error, (cell.lines["efficiency"], np.inf))
     for name in ("cover68", "cover95"):
         intervals = [getattr(e, name.replace("cover", "ci")) for e in estimates]
         cover = np.mean([low <= truth <= high for low, high in intervals])
