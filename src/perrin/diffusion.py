@@ -57,6 +57,8 @@ class DiffusionEstimate:
         Frames with a pose, of all motions.
     snr : float
         D dt/s, s the noise variance predicted from the rigid-fit residuals; inf without noise.
+    dt : float
+        Time between frames, s, mean over the motions; NaN where there was none to tell.
     """
 
     value: float
@@ -71,6 +73,7 @@ class DiffusionEstimate:
     method: str
     n_frames: int
     snr: float
+    dt: float = np.nan
 
     def __str__(self) -> str:
         name = "D_R" if self.unit == UNITS["rotation"] else "D_T"
@@ -173,6 +176,7 @@ def estimate_diffusion(
         method=method,
         n_frames=sum(m.fitted.size for m in motions),
         snr=value * dt / spread if spread > 0 else np.inf,
+        dt=dt,
     )
 
 

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from perrin.lagged import LagCurve
     from perrin.motion import RigidMotion
     from perrin.results import ClusterResult, Pooled, Report
+    from perrin.sampling import SamplingPlan
     from perrin.shapes import Cluster
 
 # Okabe and Ito's colours, told apart by colour-blind readers and in grey print.
@@ -238,6 +239,38 @@ def plot_forest(
     # A name is the user's text: dollars in it are no formula.
     ax.set_yticks(np.arange(len(rows)), names, parse_math=False)
     ax.set(ylabel="cluster")
+    return ax
+
+
+def plot_plan(plan: SamplingPlan, *, ax: Axes) -> Axes:
+    """Draw the expected error of D_R against the time between frames, log-log.
+
+    Parameters
+    ----------
+    plan : SamplingPlan
+    ax : matplotlib.axes.Axes
+
+    Returns
+    -------
+    matplotlib.axes.Axes
+        s, and standard error over D_R in percent. The band is the window; the lines are broken
+        where particles cannot be told apart any more; dotted lines are the paper's two rules.
+    """
+    if plan.dt_min < plan.dt_max:
+        said = f"window {number_text(plan.dt_min)} to {number_text(plan.dt_max)} s"
+        ax.axvspan(plan.dt_min, plan.dt_max, color=_GREY, alpha=0.18, lw=0, label=said)
+    sure = plan.dt <= plan.dt_rigid
+    for error, best, color, said in (
+        (plan.error, plan.expected_error, _BLUE, "noise estimated along (default)"),
+        (plan.error_residual, plan.expected_error_residual, _RED, "noise from the residuals"),
+    ):
+        percent = 100 * error
+        ax.plot(plan.dt[sure], percent[sure], color=color, lw=1.8, label=said)
+        lost = np.append(~sure[1:], True) & ~(~sure).all()
+        ax.plot(plan.dt[lost], percent[lost], color=color, lw=1.2, ls=(0, (4, 3)))
+        ax.plot(plan.dt_best, 100 * best, "o", ms=7, mfc="white", mec=color, mew=1.6, zorder=4)
+    for dt, said in ((plan.paper_dt_min, "SNR = 1"), (plan.paper_dt_max, "MSAD = 1 rad²")):
+        ax.axvline(dt, color=_INK, lw=1, ls=":")
     return ax
 
 
