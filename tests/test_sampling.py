@@ -54,6 +54,11 @@ def test_an_empty_window_says_so():
     assert "buy frames or particles" in empty.reasons[0]
     for plan in (full, empty):  # SNR 20 is out of reach in both
         assert plan.dt_best == pytest.approx(0.1 / (4 * D_R))
+    # However large the noise and short the time, the plan stands (SNR 0.06).
+    for photons in (False, True):
+        plan = plan_sampling(BODY, D_R=D_R, sigma=2.7, n_frames=4, total_time=15.3, photons=photons)
+        assert plan.dt_best == pytest.approx(min(0.1 / (4 * D_R), 15.3 / 3))
+    assert plan_sampling(BODY, D_R=D_R, sigma=2.7, total_time=15.3).n_frames == 4
 
 
 def test_published_frame_counts():
