@@ -304,9 +304,77 @@ def test_simulate_and_convert_close_the_circle(tmp_path):
     refused(run("simulate", "cube", *options, "-o", "d.csv", cwd=tmp_path), 2, "cube", "trimer")
 
 
+PLAN = ("plan", "tetrahedron", "--diameter", 2.45, "--d-r", "4.93e-3", "--sigma", "0.03,0.03,0.04")
+
+
+def test_plan_prints_what_the_package_says(tmp_path):
+    """Window, best dt, errors, frames for 10, 3 and 1 %, the paper's rules; no file unasked."""
+    result = run(*PLAN, "--frames", 300, "--d-t", 0.0385, cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    plan = perrin.plan_sampling(
+        perrin.Cluster.touching(4, 2.45),
+        D_R=4.93e-3, sigma=(0.03, 0.03, 0.04), n_frames=300, D_T=0.0385,
+    )  # fmt: skip
+    counts = [str(plan.frames_for(r)) for r in (0.1, 0.03, 0.01)]
+    for words in (
+        "300 frames every 0.766 s", "8.3 %", "5.0 %", "0.191 to 5.07 s", "0.0383 to 50.7 s",
+        "needed for 10 %", "needed for 1 %", *counts, *plan.reasons,
+    ):  # fmt: skip
+        assert words in result.stdout
+    assert not list(tmp_path.iterdir())
+
+
+def test_plan_takes_either_size_and_every_budget(tmp_path):
+    """A radius makes the same body; time and light reach the plan."""
+    by_radius = [x if x != "--diameter" else "--radius" for x in PLAN]
+    by_radius[by_radius.index(2.45)] = 2.45 * math.sqrt(3 / 8)
+    assert run(*by_radius, cwd=tmp_path).stdout == run(*PLAN, cwd=tmp_path).stdout
+    assert "no optimum" in run(*PLAN, "--time", 220, cwd=tmp_path).stdout
+    light = run(*PLAN, "--time", 220, "--frames", 300, "--photons", cwd=tmp_path)
+    assert "Given light" in light.stdout
+
+
+def test_plan_draws_and_never_overwrites_silently(tmp_path):
+    """The picture is a picture of its kind; one that is there stays, unless --overwrite."""
+    for name, start in (("a.png", b"\x89PNG"), ("a.pdf", b"%PDF")):
+        assert run(*PLAN, "-o", name, cwd=tmp_path).returncode == 0
+        assert (tmp_path / name).read_bytes().startswith(start)
+    (tmp_path / "a.png").write_text("precious")
+    refused(run(*PLAN, "-o", "a.png", cwd=tmp_path), 2, "a.png", "exists", "--overwrite")
+    assert (tmp_path / "a.png").read_text() == "precious"
+    assert run(*PLAN, "-o", "a.png", "--overwrite", cwd=tmp_path).returncode == 0
+    assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (("--radius", "1"), ("--radius", "--diameter")),
+        (("--frames", "2"), ("n_frames",)),
+        (("--time", "-3", "--photons"), ("total_time", "photons")),
+        (("--d-t", "-1"), ("D_T",)),
+        (("--sigma", "a"), ("--sigma",)),
+        (("--sigma", "0"), ("sigma", "more than 0")),
+        (("--d-r", "0"), ("D_R",)),
+        (("-o", "plan.doc"), ("plan.doc", ".png")),
+        (("-o", "nowhere/plan.png"), ("nowhere",)),
+    ],
+)
+def test_plan_refuses_in_one_line(tmp_path, options, words):
+    """Each wrong option is named, status 2."""
+    refused(run(*PLAN, *options, cwd=tmp_path), 2, *words)
+    assert not list(tmp_path.iterdir())
+
+
+def test_plan_knows_its_shapes(tmp_path):
+    """An unknown shape and a missing size are told together."""
+    result = run("plan", "cube", "--d-r", 1, "--sigma", 1, cwd=tmp_path)
+    refused(result, 2, "cube", "trimer", "--diameter")
+
+
 def test_help_and_version():
     """The help names every command; the version is the package's."""
     result = command("--help", cwd=Path.cwd())
-    for name in ("demo", "analyze", "simulate", "convert"):
+    for name in ("demo", "analyze", "simulate", "plan", "convert"):
         assert name in result.stdout
     assert run("--version", cwd=Path.cwd()).stdout.strip() == perrin.__version__

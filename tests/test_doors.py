@@ -20,11 +20,37 @@ SOURCE = ROOT / "src" / "perrin"
 
 # The house, top to bottom: a room imports only rooms above it.
 ROOMS = [
-    "_arrays", "rotations", "shapes", "noise", "motion", "grouping", "lagged", "steps",
-    "likelihood", "scatter", "moments", "diffusion", "curve_fits", "bounds", "hydrodynamics",
-    "simulate", "gdf", "files", "results", "analysis", "plot", "report", "claims", "paper_method",
-    "paper_noise", "paper_orientations", "paper_experiment", "paper", "cli",
-]  # fmt: skip
+    "_arrays",
+    "rotations",
+    "shapes",
+    "noise",
+    "motion",
+    "grouping",
+    "lagged",
+    "steps",
+    "likelihood",
+    "scatter",
+    "moments",
+    "diffusion",
+    "curve_fits",
+    "bounds",
+    "sampling",
+    "hydrodynamics",
+    "simulate",
+    "gdf",
+    "files",
+    "results",
+    "analysis",
+    "plot",
+    "report",
+    "claims",
+    "paper_method",
+    "paper_noise",
+    "paper_orientations",
+    "paper_experiment",
+    "paper",
+    "cli",
+]
 LAZY = ("pandas", "scipy", "matplotlib", "pyarrow", "jinja2", "typer", "rich", "trackpy", "numba")
 
 

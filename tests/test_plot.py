@@ -276,6 +276,61 @@ def test_save_figures_draws_the_first_clusters_and_all_in_one(tmp_path, monkeypa
     assert {s.split("-")[1] for s in stems if "-" in s} == {"0"}
 
 
+PAPER = {"D_R": 4.93e-3, "sigma": (0.03, 0.03, 0.04)}
+
+
+def test_a_plan_shows_its_errors_window_and_the_paper_s_rules():
+    plan = perrin.plan_sampling(perrin.Cluster.touching(4, 2.45), **PAPER, n_frames=300)
+    ax = axes()
+    assert plot.plot_plan(plan, ax=ax) is ax
+    for name, error in (
+        ("noise estimated", plan.error),
+        ("noise from the residuals", plan.error_residual),
+    ):
+        sure = line(ax, name)
+        (lost,) = [
+            x for x in ax.lines
+            if x.get_color() == sure.get_color() and x is not sure and x.get_linestyle() == "--"
+        ]  # fmt: skip
+        joined = [
+            np.append(a[:-1], b) for a, b in zip(sure.get_data(), lost.get_data(), strict=True)
+        ]
+        assert np.array_equal(joined, [plan.dt, 100 * error])
+        assert sure.get_xdata()[-1] <= plan.dt_rigid
+    (best,) = [x for x in ax.lines if str(x.get_label()).startswith("best, 0.766 s")]
+    assert list(best.get_xydata()[0]) == [plan.dt_best, 100 * plan.expected_error]
+    (window,) = ax.patches
+    assert (window.get_x(), window.get_x() + window.get_width()) == pytest.approx(
+        (plan.dt_min, plan.dt_max)
+    )
+    (rules,) = segments(ax)
+    assert [r[0, 0] for r in rules] == [plan.paper_dt_min, plan.paper_dt_max]
+    low, high = ax.get_xlim()
+    assert low < plan.paper_dt_min < plan.paper_dt_max < high
+    assert (ax.get_xscale(), ax.get_yscale()) == ("log", "log")
+    assert ax.get_xlabel() == "time between frames (s)"
+    assert ax.get_ylabel() == "expected error of $D_R$ (%)"
+    drawn(ax)
+
+
+@pytest.mark.parametrize(
+    "budget",
+    [
+        {"total_time": 220},
+        {"n_frames": 300, "total_time": 220, "photons": True},
+        {"n_frames": 300, "sigma": 0.3},
+        {"total_time": 2.0},
+    ],
+)
+def test_every_plan_can_be_drawn(budget):
+    plan = perrin.plan_sampling(perrin.Cluster.touching(4, 2.45), **(PAPER | budget))
+    ax = axes()
+    plot.plot_plan(plan, ax=ax)
+    assert len(ax.patches) == (plan.dt_min < plan.dt_max)
+    assert np.isfinite(ax.get_xlim()).all()
+    drawn(ax)
+
+
 def test_numbers_in_words():
     assert plot.value_text(estimate()) == "0.0100(10) rad²/s"
     small = estimate(value=4.7e-7, stderr=5e-8, unit="um^2/s")

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from perrin.report import write_run
     from perrin.results import ClusterResult, Report, load_run
     from perrin.rotations import Similarity, axis_angle, kabsch, similarity
+    from perrin.sampling import SamplingPlan, SamplingVerdict, judge_sampling, plan_sampling
     from perrin.shapes import Cluster
     from perrin.simulate import add_noise, simulate_motion
 
@@ -47,6 +48,8 @@ __all__ = [
     "PrecisionWarning",
     "Report",
     "RigidMotion",
+    "SamplingPlan",
+    "SamplingVerdict",
     "Similarity",
     "Size",
     "TooFewFramesError",
@@ -59,6 +62,7 @@ __all__ = [
     "estimate_diffusion",
     "find_clusters",
     "fit_line",
+    "judge_sampling",
     "kabsch",
     "load_run",
     "msad",
@@ -66,6 +70,7 @@ __all__ = [
     "msd",
     "noise_floor",
     "orientation_correlation",
+    "plan_sampling",
     "positions_table",
     "read_tracks",
     "remove_rotation",
@@ -96,6 +101,7 @@ _ROOMS = {
     "diffusion": ("DiffusionEstimate", "estimate_diffusion"),
     "curve_fits": ("fit_line",),
     "bounds": ("cramer_rao",),
+    "sampling": ("SamplingPlan", "SamplingVerdict", "judge_sampling", "plan_sampling"),
     "hydrodynamics": ("Size", "size_from_rotation", "size_from_translation"),
     "simulate": ("add_noise", "simulate_motion"),
     "files": ("read_tracks", "write_tracks"),

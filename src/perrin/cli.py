@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 
     from perrin.diffusion import DiffusionEstimate
     from perrin.results import ClusterResult, Report
+    from perrin.sampling import SamplingPlan
+    from perrin.shapes import Cluster
 
 app = typer.Typer(
     name="perrin",
@@ -28,6 +30,7 @@ app = typer.Typer(
 
 _SHOWN, _SHOWN_WARNINGS = 5, 20
 _SHAPES = ("tetrahedron", "pentahedron", "trimer")
+_PICTURES = (".png", ".pdf", ".svg")
 
 Tracks = Annotated[Path, typer.Argument(help="Track table: .csv, .csv.gz, .parquet or .gdf.")]
 Interval = Annotated[float, typer.Option("--dt", help="Time between frames, s.")]
@@ -182,6 +185,61 @@ def simulate(
 
 
 @app.command()
+def plan(
+    shape: Annotated[str, typer.Argument(help=f"{', '.join(_SHAPES)}.")],
+    d_r: Annotated[float, typer.Option("--d-r", help="D_R as far as it is known, rad^2/s.")],
+    sigma: Annotated[str, typer.Option(help="Localisation error, um, one number or x,y,z.")],
+    radius: Annotated[
+        float | None, typer.Option(help="Mean distance of particles to the centre, um.")
+    ] = None,
+    diameter: Annotated[
+        float | None, typer.Option(help="Instead of the radius: diameter of touching spheres, um.")
+    ] = None,
+    d_t: Annotated[
+        float | None, typer.Option("--d-t", help="D_T, um^2/s: travel then counts for linking.")
+    ] = None,
+    frames: Annotated[int | None, typer.Option(help="The most frames that can be taken.")] = None,
+    time: Annotated[float | None, typer.Option(help="The longest movie, s.")] = None,
+    photons: Annotated[
+        bool,
+        typer.Option(
+            "--photons",
+            help="The light is limited: that of --frames frames in --time s, each with --sigma, "
+            "can be divided among any number of frames.",
+        ),
+    ] = False,
+    output: Annotated[
+        Path | None,
+        typer.Option("-o", "--output", help="Picture of error against dt: .png, .pdf or .svg."),
+    ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace that picture.")] = False,
+) -> None:
+    """Say how often and how many times to look, and how well D_R will be known."""
+    import perrin
+
+    with _told():
+        if output is not None:
+            _check_picture(output, overwrite=overwrite)
+        found = perrin.plan_sampling(
+            _body(shape, radius=radius, diameter=diameter),
+            D_R=d_r,
+            sigma=_numbers("--sigma", sigma),
+            D_T=d_t,
+            n_frames=frames,
+            total_time=time,
+            photons=photons,
+        )
+        _show_plan(found)
+        if output is not None:
+            from perrin.plot import new_figure, plot_plan
+
+            figure = new_figure(7, 4.6)
+            plot_plan(found, ax=figure.add_subplot())
+            figure.savefig(output, dpi=150)
+            print(f"Written to {output}")
+
+
+@app.command()
 def paper(
     output: Annotated[Path, typer.Option("-o", "--output", help="Folder for figures and claims.")],
     seed: Annotated[int, typer.Option(help="Seed of the random numbers.")] = 2011,
@@ -293,6 +351,63 @@ def _columns(text: str | None) -> dict[str, str | int] | None:
         return int(column) if column.lstrip("-").isdecimal() else column
 
     return {name.strip(): place(column.strip()) for name, _, column in pairs}
+
+
+def _body(shape: str, *, radius: float | None, diameter: float | None) -> Cluster:
+    """Return the named body of that radius, or of touching spheres of that diameter."""
+    from perrin import Cluster
+
+    faults = []
+    if shape not in _SHAPES:
+        faults.append(f"shape: expected {', '.join(_SHAPES)}, got {shape!r}")
+    if (radius is None) == (diameter is None):
+        faults.append("expected either --radius or --diameter (touching spheres)")
+    if faults:
+        raise ValueError("; ".join(faults))
+    if diameter is not None:
+        return Cluster.touching({"trimer": 3, "tetrahedron": 4, "pentahedron": 5}[shape], diameter)
+    body: Cluster = getattr(Cluster, shape)(radius)
+    return body
+
+
+def _check_picture(path: Path, *, overwrite: bool) -> None:
+    """Refuse, before any work is done, a picture that cannot or must not be written."""
+    if path.suffix.lower() not in _PICTURES:
+        raise ValueError(f"{path}: expected a picture that ends in {', '.join(_PICTURES)}")
+    if path.exists() and not overwrite:
+        raise FileExistsError(f"{path} exists: choose another name, or --overwrite")
+    if not path.parent.is_dir():
+        raise FileNotFoundError(f"{path}: there is no folder {path.parent}")
+
+
+def _show_plan(plan: SamplingPlan) -> None:
+    """Print the plan as a short table, and its reasons."""
+    from rich.box import SIMPLE_HEAD
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    from perrin.sampling import percent
+
+    title = f"best: {plan.n_frames} frames every {plan.dt_best:.3g} s"
+    names = ("noise:", "estimated (default)", "from residuals")
+    table = Table(*names, title=title, title_justify="left", box=SIMPLE_HEAD)
+    table.columns[0].no_wrap = True
+    errors = percent(plan.expected_error), percent(plan.expected_error_residual)
+    table.add_row("expected error of D_R", *errors)
+    for share in (0.1, 0.03, 0.01):
+        counts = (str(plan.frames_for(share, noise=noise)) for noise in ("joint", "residual"))
+        table.add_row(f"frames needed for {100 * share:g} %", *counts)
+    table.add_section()
+    window = f"{plan.dt_min:.3g} to {plan.dt_max:.3g} s"
+    table.add_row("window of dt", "empty" if plan.dt_min > plan.dt_max else window)
+    table.add_row("the paper's rules", f"{plan.paper_dt_min:.3g} to {plan.paper_dt_max:.3g} s")
+    table.add_row("SNR at the best dt", f"{plan.snr:.3g}")
+    table.add_row("noise floor Phi^2", f"{plan.phi2:.3g} rad^2")
+    console = Console(highlight=False)
+    console.print(table)
+    for reason in plan.reasons:
+        console.print(f"- {escape(reason)}", soft_wrap=True)
 
 
 def _slice(text: str | None) -> tuple[int | None, int | None] | None:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure as Figure  # rooms below annotate with it
+from matplotlib.ticker import LogLocator, NullFormatter
 
 from perrin.diffusion import with_error
 from perrin.motion import degrees_of_freedom
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     from perrin.lagged import LagCurve
     from perrin.motion import RigidMotion
     from perrin.results import ClusterResult, Pooled, Report
+    from perrin.sampling import SamplingPlan
     from perrin.shapes import Cluster
 
 # Okabe and Ito's colours, told apart by colour-blind readers and in grey print.
@@ -238,6 +240,46 @@ def plot_forest(
     # A name is the user's text: dollars in it are no formula.
     ax.set_yticks(np.arange(len(rows)), names, parse_math=False)
     ax.set(ylabel="cluster")
+    return ax
+
+
+def plot_plan(plan: SamplingPlan, *, ax: Axes) -> Axes:
+    """Draw the expected error of D_R against the time between frames, log-log.
+
+    Parameters
+    ----------
+    plan : SamplingPlan
+    ax : matplotlib.axes.Axes
+
+    Returns
+    -------
+    matplotlib.axes.Axes
+        s, and standard error over D_R in percent. The band is the window; the lines are broken
+        where particles cannot be told apart any more; dotted lines are the paper's two rules.
+    """
+    if plan.dt_min < plan.dt_max:
+        said = f"window, {number_text(plan.dt_min)} to {number_text(plan.dt_max)} s"
+        ax.axvspan(plan.dt_min, plan.dt_max, color=_GREY, alpha=0.18, lw=0, label=said)
+    _draw_errors(plan.error, plan, ax=ax, color=_BLUE, label="noise estimated along (default)")
+    _draw_errors(plan.error_residual, plan, ax=ax, color=_RED, label="noise from the residuals")
+    best: dict[str, Any] = {
+        "mfc": "white",
+        "mew": 1.6,
+        "ms": 7,
+        "ls": "none",
+        "marker": "o",
+        "zorder": 4,
+    }
+    said = f"best, {number_text(plan.dt_best)} s"
+    ax.plot(plan.dt_best, 100 * plan.expected_error, mec=_BLUE, label=said, **best)
+    ax.plot(plan.dt_best, 100 * plan.expected_error_residual, mec=_RED, **best)
+    lost: dict[str, Any] = {"color": _GREY, "lw": 1.4, "ls": (0, (3, 2))}
+    ax.plot([], [], label="particles cannot be told apart", **lost)
+    rules = [plan.paper_dt_min, plan.paper_dt_max]
+    said = "rules of Hunter 2011, {} and {} s".format(*map(number_text, rules))
+    ax.vlines(rules, 0, 1, _INK, lw=1.2, ls=":", label=said, transform=ax.get_xaxis_transform())
+    _scale_plan(plan, ax=ax)
+    _legend_above(ax, ncols=2)
     return ax
 
 
@@ -467,6 +509,28 @@ def _draw_estimate(curve: LagCurve, estimate: DiffusionEstimate, *, ax: Axes) ->
         sparse = np.geomspace(first, last, 12)
         pure, said = slope * estimate.value * sparse, f"pure diffusion {slope} {symbol} t"
         ax.plot(sparse, pure, "o", mfc="none", mec=_BLUE, ms=5, mew=0.9, label=said)
+
+
+def _draw_errors(error: Floats, plan: SamplingPlan, *, ax: Axes, color: str, label: str) -> None:
+    """Draw an error in percent, broken where particles cannot be told apart any more."""
+    sure = plan.dt <= plan.dt_rigid
+    ax.plot(plan.dt[sure], 100 * error[sure], color=color, lw=1.8, label=label)
+    rest = plan.dt >= plan.dt[sure][-1]
+    ax.plot(plan.dt[rest], 100 * error[rest], color=color, lw=1.4, ls=(0, (3, 2)))
+
+
+def _scale_plan(plan: SamplingPlan, *, ax: Axes) -> None:
+    """Set axes on which both errors and the paper's rules are seen, with plain numbers."""
+    ax.set(xscale="log", yscale="log", xlabel="time between frames (s)")
+    ax.set_xlim(plan.dt[0], max(plan.dt[-1], 1.5 * plan.paper_dt_max))
+    ax.set_ylabel("expected error of $D_R$ (%)")
+    low, high = 100 * plan.error_residual.min() / 1.3, 100 * plan.error.max() * 1.15
+    ax.set_ylim(low, high)
+    few = high < 12 * low
+    ax.yaxis.set_major_locator(LogLocator(subs=range(1, 10) if few else (1, 2, 5), numticks=20))
+    ax.yaxis.set_minor_formatter(NullFormatter())
+    ax.yaxis.set_major_formatter("{x:g}")
+    ax.xaxis.set_major_formatter(lambda value, _: number_text(value, digits=1))
 
 
 def _legend_above(ax: Axes, *, ncols: int) -> None:

@@ -23,6 +23,7 @@ from perrin.plot import (
     value_text,
 )
 from perrin.results import floor_factor, staged_folder, write_data
+from perrin.sampling import judge_sampling
 
 if TYPE_CHECKING:
     import os
@@ -227,6 +228,7 @@ def _section(
             for k, e in zip("RT", (result.D_R, result.D_T), strict=True)
         ],
         "facts": [*_noise_facts(result), *_body_facts(result)],
+        "sampling": _sampling(result),
         "sizes": _sizes(result),
         "no_sizes": _why_no_sizes(result, settings),
         "warnings": result.warnings,
@@ -317,6 +319,17 @@ def _body_facts(result: ClusterResult) -> list[tuple[str, str, str]]:
     return [
         ("frames used", frames, f"one every {motion.dt:g} s"),
         ("particles", str(n), body),
+    ]
+
+
+def _sampling(result: ClusterResult) -> list[tuple[str, str]]:
+    """Return the verdict on the time between frames, from each of the two coefficients."""
+    d = result.motion.template.shape[1]
+    pairs = (("R", result.D_R, 2 * d - 3), ("T", result.D_T, d))
+    return [
+        (letter, str(judge_sampling(estimate, axes=axes)))
+        for letter, estimate, axes in pairs
+        if estimate.dt > 0 and 0 < estimate.ci95[1] < np.inf
     ]
 
 

@@ -1,0 +1,380 @@
+"""When to take frames: published numbers, budgets, identity, units, and what simulations reach."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from perrin import (
+    Cluster,
+    DegenerateClusterError,
+    DiffusionEstimate,
+    add_noise,
+    cramer_rao,
+    estimate_diffusion,
+    judge_sampling,
+    noise_floor,
+    plan_sampling,
+    simulate_motion,
+    track_rotation,
+)
+
+# Hunter 2011, section 5 and Table 1.
+BODY = Cluster.touching(4, 2.45)
+PAPER = {"D_R": 4.93e-3, "sigma": (0.03, 0.03, 0.04)}
+D_R = PAPER["D_R"]
+PHI2 = noise_floor(BODY, sigma=PAPER["sigma"]).phi2
+
+
+def test_the_window_is_the_rule():
+    """The window is [5 Phi^2/4D_R, 0.1/4D_R], and SNR 20 the best for a number of frames."""
+    plan = plan_sampling(BODY, **PAPER, n_frames=300)
+    assert plan.phi2 == PHI2
+    assert plan.dt_min == pytest.approx(5 * PHI2 / (4 * D_R))
+    assert plan.dt_max == pytest.approx(0.1 / (4 * D_R))
+    assert plan.dt_best == pytest.approx(20 * PHI2 / (4 * D_R))
+    assert plan.snr == pytest.approx(20)
+    assert plan.expected_error == cramer_rao(n_frames=300, snr=plan.snr)
+    assert plan.expected_error_residual == cramer_rao(n_frames=300, snr=plan.snr, noise="residual")
+    assert plan.paper_dt_min == pytest.approx(PHI2 / (4 * D_R))
+    assert plan.paper_dt_max == pytest.approx(1 / (4 * D_R))
+
+
+def test_an_empty_window_says_so():
+    """With Phi^2 above 0.02 the best dt is 0.1/4D_R, with the words to buy frames or particles."""
+    full, empty = (
+        plan_sampling(BODY, D_R=D_R, sigma=sigma, n_frames=300)
+        for sigma in np.sqrt(np.array([0.0199, 0.0201]) * 4 / 6) * BODY.R
+    )
+    assert full.dt_min < full.dt_max
+    assert "empty" not in full.reasons[0]
+    assert empty.dt_min > empty.dt_max
+    assert "buy frames or particles" in empty.reasons[0]
+    for plan in (full, empty):  # SNR 20 is out of reach in both
+        assert plan.dt_best == pytest.approx(0.1 / (4 * D_R))
+    # However large the noise and short the time, the plan stands (SNR 0.06).
+    for photons in (False, True):
+        plan = plan_sampling(BODY, D_R=D_R, sigma=2.7, n_frames=4, total_time=15.3, photons=photons)
+        assert plan.dt_best == pytest.approx(min(0.1 / (4 * D_R), 15.3 / 3))
+    assert plan_sampling(BODY, D_R=D_R, sigma=2.7, total_time=15.3).n_frames == 4
+
+
+def test_published_frame_counts():
+    """At SNR 5 an error r takes 2.25/r^2 frames, 0.93/r^2 with the noise from residuals.
+
+    10, 3 and 1 %: 225, 2500, 22 500 and 93, 1030, 9300; the factors have three digits, and the
+    ends of a track cost three frames more.
+    """
+    plan = plan_sampling(BODY, **PAPER, total_time=220)
+    assert plan.snr == pytest.approx(5)
+    for error, joint, residual in ((0.1, 225, 93), (0.03, 2500, 1033), (0.01, 22500, 9300)):
+        assert plan.frames_for(error) == pytest.approx(joint, rel=0.003, abs=3.5)
+        assert plan.frames_for(error, noise="residual") == pytest.approx(residual, rel=5e-3, abs=2)
+
+
+def test_frames_for_is_the_least_number():
+    """One frame less misses the wanted error; nothing is below three frames."""
+    plan = plan_sampling(BODY, **PAPER, n_frames=300)
+    n = plan.frames_for(plan.expected_error)
+    assert n == 300
+    for noise in ("joint", "residual", "known"):
+        n = plan.frames_for(0.04, noise=noise)
+        enough, short = (cramer_rao(n_frames=k, snr=plan.snr, noise=noise) for k in (n, n - 1))
+        assert enough <= 0.04 < short
+    assert plan.frames_for(5.0) == 3
+    with pytest.raises(ValueError, match="relative_error"):
+        plan.frames_for(0)
+    with pytest.raises(ValueError, match="noise"):
+        plan.frames_for(0.1, noise="guessed")
+
+
+def test_the_table_of_budgets():
+    """Variances at fixed time, and for fixed light, against SNR are the published ones."""
+    # SNR, fixed time unknown and residual, light residual and unknown; any one scale each.
+    table = np.array([
+        [0.5, 1.83, 1.31, 1.85, 2.59], [1, 2.98, 1.81, 1.81, 2.98], [5, 11.24, 4.65, 2.08, 5.03],
+        [20, 41.37, 14.68, 3.28, 9.25],
+    ])  # fmt: skip
+    time = plan_sampling(BODY, **PAPER, total_time=1e5)
+    light = plan_sampling(BODY, **PAPER, n_frames=10**5, total_time=1e5, photons=True)
+    stated = 1e5 / (10**5 - 1)
+    at_snr = {
+        "time": table[:, 0] * PHI2 / (4 * D_R),
+        "light": np.sqrt(table[:, 0] * PHI2 / (4 * D_R) * stated),
+    }
+    for plan, dt, error, column in (
+        (time, "time", "error", 1), (time, "time", "error_residual", 2),
+        (light, "light", "error_residual", 3), (light, "light", "error", 4),
+    ):  # fmt: skip
+        curve = np.log(getattr(plan, error))
+        variance = np.exp(2 * np.interp(np.log(at_snr[dt]), np.log(plan.dt), curve))
+        ratio = variance / table[:, column]
+        # Three digits of the table, and the interpolation between the curve's points.
+        assert ratio == pytest.approx(ratio[1], rel=0.01)
+
+
+def test_given_time_more_frames_help_and_no_optimum_is_claimed():
+    """The error rises with dt throughout; the advice is the short end of the window."""
+    plan = plan_sampling(BODY, **PAPER, total_time=2200)
+    assert plan.dt_best == plan.dt_min
+    assert plan.n_frames == int(2200 / plan.dt_min) + 1
+    assert (np.diff(plan.error) > 0).all()
+    assert any("no optimum" in said for said in plan.reasons)
+
+
+@pytest.mark.parametrize(("n_frames", "spread_out"), [(100, False), (600, True), (3000, True)])
+def test_given_frames_and_time_both_are_limits(n_frames, spread_out):
+    """All frames over all the time, unless that is longer than frames alone would ask for.
+
+    No dt of the curve has a smaller error than the best one, but for the last 2 % beyond SNR 20.
+    """
+    plan = plan_sampling(BODY, **PAPER, n_frames=n_frames, total_time=220)
+    assert plan.n_frames == n_frames
+    if spread_out:
+        assert plan.dt_best == pytest.approx(220 / (n_frames - 1))
+    else:
+        assert plan.snr == pytest.approx(20)
+    assert plan.dt_best * (n_frames - 1) <= 220 * (1 + 1e-12)
+    assert plan.error.min() > plan.expected_error * (1 - 1e-9 if spread_out else 0.98)
+    assert any("below the window" in said for said in plan.reasons) == (n_frames == 3000)
+
+
+def test_given_light_the_stated_movie_is_a_point_of_the_curve():
+    """At the stated dt the error is that of the stated movie; sigma^2 goes as 1/dt elsewhere."""
+    plan = plan_sampling(BODY, **PAPER, n_frames=300, total_time=220, photons=True)
+    stated = 220 / 299
+    there = np.exp(np.interp(np.log(stated), np.log(plan.dt), np.log(plan.error)))
+    usual = cramer_rao(n_frames=300, snr=4 * D_R * stated / PHI2)
+    assert there == pytest.approx(usual, rel=0.01)  # interpolated
+    assert plan.snr == pytest.approx(0.5)
+    assert plan.snr == pytest.approx(4 * D_R * plan.dt_best / (PHI2 * stated / plan.dt_best))
+    assert plan.expected_error < usual
+    assert plan.n_frames > 300
+
+
+def test_without_a_budget_300_frames_are_stated():
+    """Neither frames nor time: the plan is that of 300 frames and says so."""
+    plan, stated = plan_sampling(BODY, **PAPER), plan_sampling(BODY, **PAPER, n_frames=300)
+    assert str(plan) == str(stated)
+    assert "(300)" in plan.reasons[1]
+
+
+# 4 D_R dt, and the percentage of steps that nearest neighbours and the best rigid fit get wrong,
+# published. The limits must lie where the table says hardly any and 0.1 to 0.4 %.
+@pytest.mark.parametrize(
+    ("body", "hardly", "some"),
+    [
+        (Cluster.trimer(1.5), 0.12, 0.2),
+        (Cluster.tetrahedron(1.5), 0.072, 0.12),
+        (Cluster.pentahedron(1.5), 0.04, 0.072),
+    ],
+)
+def test_identity_limits_are_those_of_the_table(body, hardly, some):
+    """Linking holds from 0.00 % to 0.07 % wrong, the rigid fit to 4 D_R dt = 0.2."""
+    plan = plan_sampling(body, D_R=D_R, sigma=0.03)
+    assert hardly <= 4 * D_R * plan.dt_link <= some
+    assert 4 * D_R * plan.dt_rigid == pytest.approx(0.2, rel=0.01)
+
+
+@pytest.mark.parametrize("n", [3, 4, 5, 6, 7])
+@pytest.mark.parametrize("D_T", [0.0, 0.05])
+def test_linking_is_wrong_in_004_percent_of_the_steps_at_its_limit(n, D_T):
+    """Simulated steps of touching spheres, turned and shifted, at the stated limit."""
+    body = Cluster.touching(n, 1.0)
+    dt = plan_sampling(body, D_R=1.0, D_T=D_T, sigma=0.01).dt_link
+    steps, rng = 40_000, np.random.default_rng(n)
+    truth = simulate_motion(body, D_R=1.0, dt=dt, n_frames=steps + 1, rng=rng)
+    turn = np.swapaxes(truth.rotation[:-1], 1, 2) @ truth.rotation[1:]
+    shift = rng.normal(scale=np.sqrt(2 * D_T * dt), size=(steps, 1, 3))
+    after = np.swapaxes(turn @ body.positions.T, 1, 2) + shift
+    apart = np.sum((after[:, :, None] - body.positions) ** 2, axis=-1)
+    wrong = np.mean((apart.argmin(axis=2) != np.arange(n)).any(axis=1))
+    assert wrong < 4e-4 + 3 * np.sqrt(4e-4 / steps)
+
+
+def test_high_symmetry_shortens_the_window():
+    """A bipyramid of seven is confused by a turn of 36 degrees, before 4 D_R dt = 0.1."""
+    plan = plan_sampling(Cluster.touching(7, 2.0), D_R=D_R, sigma=0.03)
+    assert plan.dt_max == plan.dt_rigid
+    assert 4 * D_R * plan.dt_max == pytest.approx(2 * np.deg2rad(36) ** 2 / 3.3**2)
+    # A measured shape has no symmetry by name; neighbours' angles are then the careful limit.
+    measured = plan_sampling(Cluster.touching(7, 2.0).positions, D_R=D_R, sigma=0.03)
+    assert measured.dt_max <= plan.dt_max * (1 + 1e-12)
+
+
+def test_translation_shortens_linking_only():
+    """A moving centre confuses nearest neighbours earlier and leaves the rest of the plan alone."""
+    rest, moves = (plan_sampling(BODY, **PAPER, D_T=D_T) for D_T in (None, 0.0385))
+    assert moves.dt_link < rest.dt_link
+    assert (moves.dt_best, moves.dt_rigid) == (rest.dt_best, rest.dt_rigid)
+    # Without rotation: half the spacing is 4.2 standard deviations of one axis of a step.
+    shift = plan_sampling(BODY, D_R=1e-12, sigma=0.03, D_T=0.04).dt_link
+    assert shift == pytest.approx((2.45 / 2 / 4.2) ** 2 / (2 * 0.04))
+    assert any("the centre moves" in said for said in moves.reasons)
+
+
+@pytest.mark.parametrize("budget", [
+    {"n_frames": 200}, {"total_time": 100.0}, {"n_frames": 400, "total_time": 100.0},
+    {"n_frames": 400, "total_time": 100.0, "photons": True},
+])  # fmt: skip
+def test_units_rescale_the_plan(budget):
+    """With times 60 and lengths 1000 times larger in number, the plan is the same experiment."""
+    usual = plan_sampling(BODY, **PAPER, D_T=0.04, **budget)
+    scaled = dict(budget)
+    if "total_time" in scaled:
+        scaled["total_time"] *= 60
+    other = plan_sampling(
+        1e3 * BODY.positions, D_R=D_R / 60, D_T=0.04 * 1e6 / 60, sigma=(30, 30, 40), **scaled
+    )
+    for name in ("dt_min", "dt_max", "dt_best", "dt_link", "paper_dt_min", "paper_dt_max", "dt"):
+        assert getattr(other, name) == pytest.approx(60 * getattr(usual, name), rel=1e-9)
+    assert other.n_frames == usual.n_frames
+    assert other.snr == pytest.approx(usual.snr)
+    assert other.error == pytest.approx(usual.error)
+
+
+def test_in_the_plane_one_angle_shares_D():
+    """In 2-D Phi^2 is 2 s, the MSAD 2 D_R t, and one axis has the error."""
+    square = Cluster.from_positions([[1.0, 0], [0, 1], [-1, 0], [0, -1]])
+    plan = plan_sampling(square, D_R=0.01, sigma=0.02, n_frames=500)
+    s = 0.02**2 / 4
+    assert plan.phi2 == pytest.approx(2 * s)
+    assert plan.dt_best == pytest.approx(20 * s / 0.01)
+    assert plan.paper_dt_min == pytest.approx(plan.phi2 / (2 * 0.01))
+    assert plan.expected_error == cramer_rao(n_frames=500, snr=plan.snr, axes=1)
+    assert plan.residual_dof == 2 * 4 - 3
+
+
+def test_bias_of_long_steps_is_told_where_it_counts():
+    """At 4 D_R dt = 0.1 D_R reads 0.4 % low: told for 2e5 frames, not for 300."""
+    short, long = (plan_sampling(BODY, D_R=D_R, sigma=0.3, n_frames=n) for n in (300, 200_000))
+    assert not any("too small" in said for said in short.reasons)
+    assert any("0.42 % too small" in said for said in long.reasons)
+
+
+def test_every_fault_is_in_one_message():
+    """All that is wrong is named at once, and bodies without an orientation as such."""
+    bad = {"D_R": -1, "sigma": (1, 2), "D_T": -1, "n_frames": 2.5, "total_time": 0, "photons": True}
+    with pytest.raises(ValueError, match=r"D_R = -1, total_time = 0.*sigma.*D_T.*n_frames"):
+        plan_sampling(BODY, **bad)
+    with pytest.raises(ValueError, match="sigma: expected more than 0"):
+        plan_sampling(BODY, D_R=1.0, sigma=0)
+    for budget in ({}, {"n_frames": 9}, {"total_time": 9.0}):
+        with pytest.raises(ValueError, match="photons: expected n_frames and total_time"):
+            plan_sampling(BODY, D_R=1.0, sigma=0.1, photons=True, **budget)
+    with pytest.raises(ValueError, match="fewer than 3 frames"):
+        plan_sampling(BODY, D_R=1e-6, sigma=0.1, total_time=3.0)
+    with pytest.raises(ValueError, match="same place"):
+        plan_sampling([[0, 0, 0], [0, 0, 0], [1, 0, 0], [0, 1, 0]], D_R=1.0, sigma=0.1)
+    with pytest.raises(DegenerateClusterError):
+        plan_sampling(Cluster.touching(2, 1.0), D_R=1.0, sigma=0.1)
+
+
+@pytest.fixture(scope="module")
+def at_the_best_dt():
+    """Return a plan of 100 frames, and the estimates of 120 clusters measured as it says."""
+    plan = plan_sampling(BODY, **PAPER, n_frames=100)
+    rng, found = np.random.default_rng(4), []
+    for _ in range(120):
+        truth = simulate_motion(BODY, D_R=D_R, dt=plan.dt_best, n_frames=100, rng=rng)
+        noisy = add_noise(truth.positions(), sigma=PAPER["sigma"], rng=rng)
+        found.append(estimate_diffusion(track_rotation(noisy, dt=plan.dt_best)))
+    return plan, found
+
+
+def test_the_expected_error_is_what_the_estimator_reaches(at_the_best_dt):
+    """The scatter of 120 estimates is the expected error, within 3 standard errors of a scatter."""
+    plan, found = at_the_best_dt
+    scatter = np.std([e.value for e in found], ddof=1) / D_R
+    assert scatter / plan.expected_error == pytest.approx(1, abs=3 / np.sqrt(2 * 119))
+
+
+def test_what_was_planned_is_judged_well_sampled(at_the_best_dt):
+    """The verdict on data taken as planned: well sampled, factors 1 within their scatter."""
+    plan, found = at_the_best_dt
+    verdicts = [judge_sampling(e) for e in found]
+    assert all("Well sampled" in str(v) for v in verdicts)
+    factors = np.array([v.factor for v in verdicts])
+    # The factor goes as s/D, whose relative error is that of D to a few percent.
+    assert np.median(factors) == pytest.approx(1, abs=4 * plan.expected_error / np.sqrt(120))
+    assert np.mean([v.error for v in verdicts]) == pytest.approx(plan.expected_error, rel=0.1)
+
+
+def estimate(**changes):
+    """Return an estimate of D_R at SNR 1.7, 4 D_R dt = 4e-4, made with the bound's error."""
+    usual = DiffusionEstimate(
+        value=0.01, ci68=(0.009, 0.011), ci95=(0.008, 0.012), stderr=0.001, offset=6e-5,
+        offset_stderr=1e-6, resolution_floor=1e-9, resolved=True, unit="rad^2/s", method="mle",
+        n_frames=300, snr=1.7, dt=0.01,
+    )  # fmt: skip
+    return replace(usual, **changes)
+
+
+def test_the_factor_is_the_ratio_to_the_planned_dt():
+    """plan_sampling with the D, noise and frames of the data asks for factor times their dt."""
+    for snr, dt in ((1.7, 0.01), (0.2, 0.01), (60.0, 0.3), (8.0, 4.0), (1.0, 4.0)):
+        data = estimate(snr=snr, dt=dt)
+        sigma = np.sqrt(data.value * dt / snr / (noise_floor(BODY, sigma=1.0).phi2 / 4))
+        plan = plan_sampling(BODY, D_R=data.value, sigma=sigma, n_frames=300)
+        verdict = judge_sampling(data)
+        assert verdict.factor == pytest.approx(plan.dt_best / dt)
+        assert verdict.dt_best == pytest.approx(plan.dt_best)
+        assert verdict.bound_best == pytest.approx(plan.expected_error)
+
+
+def test_oversampled_12_times():
+    """SNR 20/12: every 12th frame would have done; the error against the bound is told."""
+    verdict = judge_sampling(estimate(snr=20 / 12))
+    assert verdict.factor == pytest.approx(12)
+    assert "Oversampled 12 times" in str(verdict)
+    assert "every 12th frame would have done" in str(verdict)
+    assert verdict.bound == cramer_rao(n_frames=300, snr=20 / 12)
+    assert verdict.bound_best == pytest.approx(cramer_rao(n_frames=300, snr=20))
+    assert verdict.error == pytest.approx(0.1)
+    assert "Standard error 10 %" in str(verdict)
+    assert "worth" not in str(verdict)
+    assert "worth 17 %" in str(judge_sampling(estimate(snr=1e3, dt=0.5, stderr=0.002)))
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"snr": 4.99}, "Oversampled 4 times"),
+        ({"snr": 5.01}, "Well sampled"),
+        ({"snr": 50.0, "dt": 2.49}, "Well sampled"),
+        ({"snr": 50.0, "dt": 2.51}, "Undersampled"),
+        ({"snr": 50.0, "dt": 6.0}, "reads 1.0 % low"),
+        ({"snr": 6.0, "dt": 6.0}, "buy frames or particles"),
+        ({"snr": np.inf}, "Well sampled (SNR inf"),
+        ({"snr": 50.0, "dt": 6.0, "unit": "um^2/s"}, "Well sampled"),
+        ({"snr": 1.0, "dt": 6.0, "unit": "um^2/s"}, "Oversampled 20 times"),
+    ],
+)  # fmt: skip
+def test_verdicts(changes, words):
+    """Each verdict on its side of its threshold; D_T has no limit from rotation."""
+    assert words in str(judge_sampling(estimate(**changes)))
+
+
+def test_unresolved_data_are_judged_at_their_limit():
+    """Without a resolved D the factor is the least one: that of the 95 % limit."""
+    limit = estimate(value=0.0, ci68=(0, 1e-4), ci95=(0, 2e-4), resolved=False, snr=0.0)
+    verdict = judge_sampling(limit)
+    assert verdict.factor == pytest.approx(20 * 6e-5 / (2e-4 * 0.01))
+    assert "Oversampled at least 600 times" in str(verdict)
+    assert "Not resolved" in str(verdict)
+    near = estimate(resolved=False, snr=1.0)
+    assert judge_sampling(near).snr == pytest.approx(1.2)
+
+
+def test_what_cannot_be_judged():
+    """No time between frames, or no D and no limit to it."""
+    for changes in ({"dt": np.nan}, {"resolved": False, "ci95": (0.0, np.inf)}):
+        with pytest.raises(ValueError, match="estimate: expected a time between frames"):
+            judge_sampling(estimate(**changes))
+
+
+def test_the_estimate_carries_its_dt():
+    """estimate_diffusion states the time between frames, the mean one of several motions."""
+    motions = [simulate_motion(BODY, D_R=D_R, dt=dt, n_frames=20, rng=1) for dt in (0.5, 0.7)]
+    assert estimate_diffusion(motions[0]).dt == 0.5
+    assert estimate_diffusion(motions, quantity="translation").dt == pytest.approx(0.6)
