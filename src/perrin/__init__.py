@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     )
     from perrin.analysis import analyze
     from perrin.bounds import cramer_rao
-    from perrin.curve_fits import fit_line
+    from perrin.curve_fits import fit_gls, fit_line
     from perrin.diffusion import DiffusionEstimate, estimate_diffusion
     from perrin.files import read_tracks, write_tracks
     from perrin.grouping import cluster_positions, find_clusters, positions_table
@@ -58,6 +58,7 @@ __all__ = [
     "cramer_rao",
     "estimate_diffusion",
     "find_clusters",
+    "fit_gls",
     "fit_line",
     "kabsch",
     "load_run",
@@ -94,7 +95,7 @@ _ROOMS = {
     "grouping": ("cluster_positions", "find_clusters", "positions_table"),
     "lagged": ("LagCurve", "msad", "msad_vector", "msd", "orientation_correlation"),
     "diffusion": ("DiffusionEstimate", "estimate_diffusion"),
-    "curve_fits": ("fit_line",),
+    "curve_fits": ("fit_gls", "fit_line"),
     "bounds": ("cramer_rao",),
     "hydrodynamics": ("Size", "size_from_rotation", "size_from_translation"),
     "simulate": ("add_noise", "simulate_motion"),

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.polynomial.polynomial import polyval
 from numpy.typing import ArrayLike
 
 from perrin._arrays import (
@@ -348,27 +349,58 @@ def _fast_size(least: int) -> int:
     return best
 
 
+def overlap_sums(lag: Floats, pairs: Floats, *, D: float, s: float) -> tuple[Floats, Floats]:
+    """Return what the covariance of an MSD at two lags is made of, as polynomials of the shorter.
+
+    One-dimensional displacements over a and b >= a frames of which j are shared have covariance
+    2 D j, + s for a common first or last frame, - s where one ends at the other's beginning. The
+    covariance of their mean squares is 2 S(a, b) over both numbers of pairs; S, half of whose
+    terms double for a = b, sums the squared covariances over all pairs of displacements.
+
+    Parameters
+    ----------
+    lag, pairs : ndarray, shape (L,)
+        The longer lags b, frames, and the displacements of that length.
+    D, s : float
+        Diffusion coefficient times dt, and variance of one coordinate from noise.
+
+    Returns
+    -------
+    near, far : ndarray, shape (5, L)
+        Coefficients of a^0 .. a^4 in S(a, b), for a <= pairs and for a >= pairs; where a = b,
+        2 s^2 pairs come on top.
+    """
+    b, p, zero = lag, pairs, np.zeros_like(pairs)
+    squares, noise = 4 * D * D, 2 * s * s
+    cross = 8 * D * s * p
+    near = squares * np.stack([zero, p / 3, p * b + 1 / 6, -p / 3, zero - 1 / 6])
+    near[:2] += 2 * noise * p, cross - noise
+    once, twice = p * (p - 1) / 2, p * (p * p - 1) / 3
+    far = squares * np.stack([p * twice / 2, -2 * twice, p * (b + 1) + 2 * once, -p, zero])
+    far[:2] += noise * p, cross
+    return near, far
+
+
 def _relative_error(half: Floats, pairs: Floats) -> Floats:
     """Return the relative standard error of a one-dimensional MSD at every lag.
 
-    `half` is the MSD over 2, that is D t + s. Displacements over n frames that start j frames apart
-    have covariance 2 D dt (n - j) + 2 s [j = 0] - s [j = n] for j <= n; the variance of their mean
-    square is twice the mean of its square. D dt and s come from the first two lags.
+    `half` is the MSD over 2, that is D t + s; D dt and s come from the first two lags.
     """
-    good = np.flatnonzero(pairs > 0)
     n = np.arange(1, len(half) + 1, dtype=np.float64)
-    first, second = (good[0], good[1]) if good.size > 1 else (good[0], good[0])
-    rise = (half[second] - half[first]) / max(n[second] - n[first], 1.0)
-    d = min(max(rise, 0.0), half[first] / n[first])
-    s = half[first] - d * n[first]
+    d, s = _first_look(half, pairs)
     k = np.maximum(pairs, 1.0)
-    m = np.minimum(n - 1, np.floor(k - 1))
-    s1, s2, s3 = m * (m + 1) / 2, m * (m + 1) * (2 * m + 1) / 6, (m * (m + 1) / 2) ** 2
-    squares = n * n * m - 2 * n * s1 + s2  # sum over j = 1..m of (n - j)^2
-    tapered = squares - (n * n * s1 - 2 * n * s2 + s3) / k  # the same times 1 - j/k
-    total = (2 * (d * n + s)) ** 2 + 2 * (4 * d * d * tapered)
-    total = total + 2 * s * s * np.maximum(1 - n / k, 0.0)
+    near, far = overlap_sums(n, k, D=d, s=s)
+    total = np.where(n <= k, *(polyval(n, c, tensor=False) for c in (near, far))) + 2 * s * s * k
     mean = 2 * (d * n + s)
     relative = np.full_like(half, np.nan)
-    np.divide(np.sqrt(2 * total / k), mean, out=relative, where=(pairs > 0) & (mean > 0))
+    np.divide(np.sqrt(2 * total) / k, mean, out=relative, where=(pairs > 0) & (mean > 0))
     return relative
+
+
+def _first_look(half: Floats, pairs: Floats) -> tuple[float, float]:
+    """Return D dt and s of half an MSD, D t + s, from its first two lags; neither is negative."""
+    good = np.flatnonzero(pairs > 0)
+    first, second = (good[0], good[1]) if good.size > 1 else (good[0], good[0])
+    rise = (half[second] - half[first]) / max(second - first, 1)
+    d = min(max(rise, 0.0), half[first] / (first + 1))
+    return float(d), float(half[first] - d * (first + 1))
