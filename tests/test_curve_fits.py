@@ -16,7 +16,7 @@ from perrin import (
     simulate_motion,
     track_rotation,
 )
-from perrin.curve_fits import _quadratic_variance
+from perrin.curve_fits import _covariance, _quadratic_variance
 
 
 def straight(D, offset, n=200, dt=0.5, dof=2):
@@ -102,20 +102,59 @@ def test_the_line_knows_its_true_error():
         assert abs(values.mean() - truth) < 3 * values.std() / np.sqrt(len(values))
 
 
+def dense_forms(N):
+    """Return the matrices Q_n of MSD(n) = y.Q_n.y, y the N steps of a walk."""
+    forms = np.zeros((N, N, N))
+    for lag in range(1, N + 1):
+        for start in range(N - lag + 1):
+            forms[lag - 1, start : start + lag, start : start + lag] += 1 / (N - lag + 1)
+    return forms
+
+
 @pytest.mark.parametrize("N", [1, 2, 3, 7, 20])
-@pytest.mark.parametrize("s", [0.0, 0.8])
-def test_quadratic_variance_is_a_dense_trace(N, s):
-    """The variance of a weighted sum of MSDs is 2 tr (QC)^2, built densely, to 1e-12."""
-    rng = np.random.default_rng(N)
+@pytest.mark.parametrize("s", [0.0, 0.8, -0.2])
+def test_the_covariance_of_lags_is_a_dense_trace(N, s):
+    """cov(MSD(n), MSD(m)) is 2 tr (Q_n C Q_m C), built densely, to 1e-12; negative offsets too."""
     C = (2 * 0.7 + 2 * s) * np.eye(N) - s * (np.eye(N, k=1) + np.eye(N, k=-1))
-    for length in {1, (N + 1) // 2, N}:
-        weights = rng.normal(size=length)
-        Q = np.zeros((N, N))
-        for lag, w in enumerate(weights, start=1):
-            for start in range(N - lag + 1):
-                Q[start : start + lag, start : start + lag] += w / (N - lag + 1)
-        expected = 2 * np.trace(Q @ C @ Q @ C)
-        assert _quadratic_variance(weights, N, D=0.7, s=s) == pytest.approx(expected, rel=1e-12)
+    QC = dense_forms(N) @ C
+    expected = 2 * np.einsum("nij,mji->nm", QC, QC)
+    use, complete = np.arange(N), np.ones(N)
+    found = _covariance(use, N, seen=complete, D=0.7, s=s)
+    np.testing.assert_allclose(found, expected, rtol=1e-12)
+
+
+@pytest.mark.parametrize("seen", [1.0, 0.6])
+def test_both_ways_to_a_variance_agree(seen):
+    """Cumulative sums give what the covariance matrix gives, to 1e-10, on any choice of lags."""
+    rng = np.random.default_rng(4)
+    for use in (np.arange(30), np.array([0, 3, 4, 17, 29]), np.array([25, 28])):
+        weights, part = rng.normal(size=use.size), np.full(use.size, seen)
+        covariance = _covariance(use, 30, seen=part, D=0.7, s=0.3)
+        short = _quadratic_variance(weights, use, 30, seen=part, D=0.7, s=0.3)
+        assert short == pytest.approx(weights @ covariance @ weights, rel=1e-10)
+
+
+def test_missing_frames_add_the_covariance_they_should():
+    """Frames missing at random: the mean dense covariance over 400 masks, within 4 of its errors.
+
+    The mean squares are taken over the pairs there are; 24 steps, 30 % missing, lags 1 to 5.
+    """
+    N, f, D, s = 24, 0.7, 0.7, 0.3
+    rng, pairs = np.random.default_rng(2), []
+    position = 2 * D * np.minimum.outer(np.arange(N + 1.0), np.arange(N + 1.0))
+    position += s * np.eye(N + 1)
+    for _ in range(400):
+        here = rng.random(N + 1) < f
+        step = np.zeros((5, N + 1, N + 1))
+        for lag in range(1, 6):
+            start = np.flatnonzero(here[:-lag] & here[lag:])
+            step[lag - 1, start, start + lag], step[lag - 1, start, start] = 1.0, -1.0
+            step[lag - 1] /= np.sqrt(f * f * (N + 1 - lag))
+        cross = np.einsum("nia,ab,mjb->nmij", step, position, step, optimize=True)
+        pairs.append(2 * np.sum(cross**2, axis=(2, 3)))
+    mean, error = np.mean(pairs, axis=0), np.std(pairs, axis=0) / np.sqrt(len(pairs))
+    found = _covariance(np.arange(5), N, seen=np.full(5, f), D=D, s=s)
+    assert np.all(np.abs(found - mean) < 4 * error)
 
 
 def test_a_correlation_is_no_line():

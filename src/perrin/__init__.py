@@ -25,8 +25,17 @@ if TYPE_CHECKING:
     from perrin.files import read_tracks, write_tracks
     from perrin.grouping import cluster_positions, find_clusters, positions_table
     from perrin.hydrodynamics import Size, size_from_rotation, size_from_translation
-    from perrin.lagged import LagCurve, msad, msad_vector, msd, orientation_correlation
-    from perrin.motion import RigidMotion, remove_rotation, track_rotation
+    from perrin.lagged import (
+        LagCurve,
+        VanHove,
+        msad,
+        msad_axes,
+        msad_vector,
+        msd,
+        orientation_correlation,
+        van_hove,
+    )
+    from perrin.motion import RigidMotion, remove_rotation, threshold_displacement, track_rotation
     from perrin.noise import NoiseFloor, noise_floor
     from perrin.report import write_run
     from perrin.results import ClusterResult, Report, load_run
@@ -51,6 +60,7 @@ __all__ = [
     "Size",
     "TooFewFramesError",
     "TrackTableError",
+    "VanHove",
     "add_noise",
     "analyze",
     "axis_angle",
@@ -63,6 +73,7 @@ __all__ = [
     "kabsch",
     "load_run",
     "msad",
+    "msad_axes",
     "msad_vector",
     "msd",
     "noise_floor",
@@ -74,7 +85,9 @@ __all__ = [
     "simulate_motion",
     "size_from_rotation",
     "size_from_translation",
+    "threshold_displacement",
     "track_rotation",
+    "van_hove",
     "write_run",
     "write_tracks",
 ]
@@ -91,9 +104,18 @@ _ROOMS = {
     "rotations": ("Similarity", "axis_angle", "kabsch", "similarity"),
     "shapes": ("Cluster",),
     "noise": ("NoiseFloor", "noise_floor"),
-    "motion": ("RigidMotion", "remove_rotation", "track_rotation"),
+    "motion": ("RigidMotion", "remove_rotation", "threshold_displacement", "track_rotation"),
     "grouping": ("cluster_positions", "find_clusters", "positions_table"),
-    "lagged": ("LagCurve", "msad", "msad_vector", "msd", "orientation_correlation"),
+    "lagged": (
+        "LagCurve",
+        "VanHove",
+        "msad",
+        "msad_axes",
+        "msad_vector",
+        "msd",
+        "orientation_correlation",
+        "van_hove",
+    ),
     "diffusion": ("DiffusionEstimate", "estimate_diffusion"),
     "curve_fits": ("fit_gls", "fit_line"),
     "bounds": ("cramer_rao",),

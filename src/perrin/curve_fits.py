@@ -153,7 +153,7 @@ def _window(curve: LagCurve, lag_range: str | tuple[float, float]) -> Ints:
             raise ValueError(
                 f'lag_range: expected "best", "paper" or two lag times (s), got {lag_range!r}'
             )
-        lag_range = (_PAPER[0] * duration, _PAPER[1] * duration)
+        lag_range = (_PAPER[0] * (duration + dt), _PAPER[1] * (duration + dt))
     low, high = lag_range
     inside = (curve.lagtime > low - 1e-6 * dt) & (curve.lagtime < high + 1e-6 * dt)
     use = np.flatnonzero(inside & np.isfinite(curve.value))
@@ -221,9 +221,10 @@ def _line_weights(use: Ints) -> Floats:
 
 def _gls_weights(curve: LagCurve, use: Ints, *, D: float, s: float) -> Floats:
     """Return the weights (2, lags) that make slope and level of generalised least squares."""
-    n, thin = use + np.float64(1), np.sqrt(_thinning(curve, use))
-    design = np.stack([n, np.ones_like(n)], axis=1)
-    covariance = _covariance(n, len(curve.lagtime), D=D, s=s) * thin[:, None] * thin
+    if D == s == 0:  # nothing moves: all weights are as good
+        return _line_weights(use)
+    design = np.stack([use + np.float64(1), np.ones(use.size)], axis=1)
+    covariance = _covariance(use, len(curve.lagtime), seen=_seen(curve, use), D=D, s=s)
     solved = np.linalg.solve(covariance, design)
     return np.asarray(np.linalg.solve(design.T @ solved, solved.T))
 
@@ -241,17 +242,17 @@ def _model(curve: LagCurve, use: Ints, weights: Floats) -> tuple[float, float]:
     return D, max(s, _FULL_BLUR * D)
 
 
-def _thinning(curve: LagCurve, use: Ints) -> Floats:
-    """Return the pairs of a complete track over those that are there: gaps raise the variance."""
+def _seen(curve: LagCurve, use: Ints) -> Floats:
+    """Return the part of the frames that is there, at each lag the root of that of the pairs."""
     walkers = curve.n_walks / curve.components.shape[1] if curve.quantity == "translation" else 1.0
-    return np.asarray((len(curve.lagtime) - use) * walkers / curve.n_pairs[use])
+    return np.asarray(np.sqrt(curve.n_pairs[use] / ((len(curve.lagtime) - use) * walkers)))
 
 
 def _variance(curve: LagCurve, use: Ints, slope: Floats, *, D: float, s: float) -> float:
     """Return the variance of D dt as the weights make it of the curve."""
-    weights = np.zeros(use[-1] + 1)
-    weights[use] = slope / 2 * np.sqrt(_thinning(curve, use))
-    return _quadratic_variance(weights, len(curve.lagtime), D=D, s=s) / curve.n_walks
+    weights, steps = slope / 2, len(curve.lagtime)
+    variance = _quadratic_variance(weights, use, steps, seen=_seen(curve, use), D=D, s=s)
+    return variance / curve.n_walks
 
 
 def _line_variance(curve: LagCurve, use: Ints, *, D: float, s: float) -> float:
@@ -306,32 +307,34 @@ def _interval(
     return float(low) / dt, float(high) / dt
 
 
-def _covariance(lags: Floats, steps: int, *, D: float, s: float) -> Floats:
-    """Return the covariance (L, L) of the MSD over 2 of a one-dimensional noisy Brownian walk."""
+def _covariance(use: Ints, steps: int, *, seen: Floats, D: float, s: float) -> Floats:
+    """Return the covariance (L, L) of the MSD of a one-dimensional noisy Brownian walk at lags."""
+    lags = use + np.float64(1)
     pairs = steps + 1 - lags
-    near, far = overlap_sums(lags, pairs, D=D, s=s)
-    short, long = np.meshgrid(lags, pairs)
-    total = np.where(short <= long, _at(near[..., None], short), _at(far[..., None], short))
-    total += np.diag(2 * s * s * pairs)
-    lower = np.tril(total / pairs[:, None] / pairs) / 2
+    near, far, itself = overlap_sums(lags, steps, seen=seen, D=D, s=s)
+    short, whole = np.meshgrid(lags, pairs)
+    sums = np.where(short <= whole, _at(near[..., None], short), _at(far[..., None], short))
+    lower = 2 * np.tril(sums + np.diag(itself)) / pairs[:, None] / pairs
     return np.asarray(lower + np.tril(lower, -1).T)
 
 
-def _quadratic_variance(weights: Floats, steps: int, *, D: float, s: float) -> float:
-    """Return the variance of sum_n weights[n-1] MSD(n) of a one-dimensional noisy Brownian walk.
+def _quadratic_variance(
+    weights: Floats, use: Ints, steps: int, *, seen: Floats, D: float, s: float
+) -> float:
+    """Return weights . covariance . weights without the matrix.
 
-    The double sum over lags a <= b of the polynomials in a becomes one over b of cumulative sums.
+    The double sum over lags a <= b of polynomials in a becomes one over b of cumulative sums.
     """
-    b = np.arange(1.0, len(weights) + 1)
+    b = use + np.float64(1)
     pairs = steps + 1 - b
-    near, far = overlap_sums(b, pairs, D=D, s=s)
+    near, far, itself = overlap_sums(b, steps, seen=seen, D=D, s=s)
     w = weights / pairs
-    powers = b ** np.arange(5)[:, None]
-    sums = np.concatenate([np.zeros((5, 1)), np.cumsum(w * powers, axis=1)], axis=1)
-    split = np.minimum(b, pairs).astype(np.int64)
+    sums = np.cumsum(w * b ** np.arange(5)[:, None], axis=1)
+    sums = np.concatenate([np.zeros((5, 1)), sums], axis=1)
+    split = np.minimum(np.arange(b.size) + 1, np.searchsorted(b, pairs, side="right"))
     shorter = np.sum(near * sums[:, split] + far * (sums[:, 1:] - sums[:, split]), axis=0)
-    itself = np.where(b <= pairs, _at(near, b), _at(far, b))
-    return float(2 * w @ (2 * shorter - w * itself + w * 2 * s * s * pairs))
+    own = np.where(b <= pairs, _at(near, b), _at(far, b))
+    return float(2 * w @ (2 * shorter + w * (itself - own)))
 
 
 def _at(coefficients: Floats, x: Floats) -> Floats:
