@@ -17,7 +17,7 @@ CELLS = ["100:0.05", "100:5", "300:0.2", "300:1", "300:20", "1000:0.05", "1000:5
 def scatter_error(curve):
     """Fit the paper's window and believe the scatter about the line, as fitting programs do."""
     n = len(curve.lagtime) + 1
-    use = slice(round(3 / 220 * n) - 1, round(n / 10))
+    use = slice(-(-3 * n // 220) - 1, n // 10)
     (slope, _), covariance = np.polyfit(curve.lagtime[use], curve.value[use], 1, cov=True)
     D, stderr = slope / (2 * curve.dof), np.sqrt(covariance[0, 0]) / (2 * curve.dof)
     return D, stderr, (D - stderr, D + stderr), (D - 1.96 * stderr, D + 1.96 * stderr)

@@ -39,7 +39,8 @@ class LagCurve:
         The same by lab axis.
     stderr : ndarray, shape (L,)
         Standard error for Brownian motion with localisation noise, overlapping pairs counted as
-        what they are. Neighbouring lags are strongly correlated.
+        what they are, missing frames as missing at random. Neighbouring lags are strongly
+        correlated.
     n_pairs : ndarray of int, shape (L,)
         Pairs of frames (times particles, for free particles).
     dof : int
@@ -100,7 +101,9 @@ def msd(
     drift : bool
         Whether to take off a mean velocity, the same in all pieces and for all particles: flow,
         stage drift, sedimentation. It is told in ``LagCurve.drift``. What the velocity takes of the
-        Brownian motion along with it, t/T of the MSD in a run of length T, is given back.
+        Brownian motion along with it, t/T of the MSD in a run of length T, is given back; of the
+        longest lag of a single track nothing is left, and it is NaN. ``stderr`` is within 10 % up
+        to half of the run, too small near its end.
 
     Returns
     -------
