@@ -92,8 +92,8 @@ def fit_gls(curve: LagCurve) -> DiffusionEstimate:
     The covariance of the curve at different lags is the exact one of Brownian motion with
     localisation noise, at the D and offset found, iterated. Of the lags 1, 2, ... as many are
     used as tell about D: 2 + 6/k, where cosh k = 1 + SNR (4 at SNR 50, 22 at 0.05), which loses
-    less than 0.3 % of the variance. Below an SNR of 0.01 the curve itself holds less than the steps:
-    `estimate_diffusion` then does better.
+    less than 0.3 % of the variance. Below an SNR of 0.01 the curve itself holds less than the
+    steps: `estimate_diffusion` then does better.
 
     Parameters
     ----------

@@ -24,6 +24,8 @@ from perrin.motion import RigidMotion, threshold_displacement
 if TYPE_CHECKING:
     import pandas as pd
 
+_ORDERS = 100  # of Hermite polynomials, beyond which the error of a bin is bounded from above
+
 
 @dataclass(frozen=True, eq=False)
 class LagCurve:
@@ -75,14 +77,13 @@ class LagCurve:
         return f"LagCurve({name}, {len(self.lagtime)} lags, dof={self.dof}, {self.unit})"
 
     def to_frame(self) -> pd.DataFrame:
-        """Return the curve as a table with a row per lag."""
+        """Return the curve as a table with a row per lag, lab components where there are several."""
         import pandas as pd
 
         axes = "xyz" if self.components.shape[1] == 3 else "xy"
-        names = axes if self.components.shape[1] > 1 else "z"
         columns: dict[str, object] = {"lagtime": self.lagtime, "value": self.value}
-        if self.quantity != "orientation":  # a correlation has no components
-            columns |= {f"value_{a}": self.components[:, i] for i, a in enumerate(names)}
+        if self.components.shape[1] > 1:
+            columns |= {f"value_{a}": self.components[:, i] for i, a in enumerate(axes)}
         columns |= {"stderr": self.stderr, "n_pairs": self.n_pairs}
         return pd.DataFrame(columns)
 
@@ -102,7 +103,7 @@ def msd(
         Whether to take off a mean velocity, the same in all pieces and for all particles: flow,
         stage drift, sedimentation. It is told in ``LagCurve.drift``. What the velocity takes of the
         Brownian motion along with it, t/T of the MSD in a run of length T, is given back; of the
-        longest lag of a single track nothing is left, and it is NaN. ``stderr`` is within 10 % up
+        longest lag of a single track nothing is left, and it is NaN. ``stderr`` is within 20 % up
         to half of the run, too small near its end.
 
     Returns
@@ -462,9 +463,6 @@ def _bin_edges(bins: int | ArrayLike, *, reach: float) -> Floats:
     if edges.ndim != 1 or edges.size < 2 or not np.all(np.diff(edges) > 0):
         raise ValueError("bins: expected a number, or rising edges, at least two of them")
     return edges
-
-
-_ORDERS = 100  # of Hermite polynomials, beyond which correlations between bins are bounded
 
 
 def _shared(walk: Floats, piece: Ints, steps: int, *, pairs: int) -> Floats:
