@@ -77,7 +77,7 @@ class LagCurve:
         return f"LagCurve({name}, {len(self.lagtime)} lags, dof={self.dof}, {self.unit})"
 
     def to_frame(self) -> pd.DataFrame:
-        """Return the curve as a table with a row per lag, lab components where there are several."""
+        """Return a table with a row per lag; lab components where there are several."""
         import pandas as pd
 
         axes = "xyz" if self.components.shape[1] == 3 else "xy"
