@@ -11,14 +11,19 @@ from perrin import (
     Cluster,
     TooFewFramesError,
     add_noise,
+    fit_line,
     kabsch,
     msad,
+    msad_axes,
+    msad_vector,
     msd,
     noise_floor,
     simulate_motion,
     track_rotation,
+    van_hove,
 )
-from perrin.rotations import exp_map
+from perrin.lagged import _restored
+from perrin.rotations import cumulative_product, exp_map
 
 TETRAHEDRON = Cluster.tetrahedron(1.5)
 SMALL = settings(max_examples=25, deadline=None, derandomize=True)
@@ -361,7 +366,7 @@ def test_stderr_of_free_particles_counts_each_as_a_walker():
 
 
 def test_to_frame_has_a_row_per_lag():
-    """The table holds lag time, value, components by axis, error and pairs."""
+    """The table holds lag time, value, components by lab axis if several, error and pairs."""
     table = msd(noisy(9, n_frames=30)).to_frame()
     names = ["lagtime", "value", "value_x", "value_y", "value_z", "stderr", "n_pairs"]
     assert list(table.columns) == names
@@ -369,13 +374,9 @@ def test_to_frame_has_a_row_per_lag():
     assert np.allclose(table[["value_x", "value_y", "value_z"]].sum(axis=1), table["value"])
     flat = Cluster.from_positions([[0, 0], [2, 0], [1, 1.6]])
     motion = simulate_motion(flat, D_R=4e-3, D_T=0.05, dt=0.5, n_frames=20, rng=0)
-    assert list(msad(motion).to_frame().columns) == [
-        "lagtime",
-        "value",
-        "value_z",
-        "stderr",
-        "n_pairs",
-    ]
+    single = ["lagtime", "value", "stderr", "n_pairs"]
+    assert list(msad(motion).to_frame()) == single
+    assert list(msad_axes(noisy(9, n_frames=30))[0].to_frame()) == single
     assert list(msd(motion).to_frame().columns)[2:4] == ["value_x", "value_y"]
 
 
@@ -386,3 +387,241 @@ def test_a_curve_cannot_be_changed():
         curve.value[0] = 1.0
     with pytest.raises(dataclasses.FrozenInstanceError):
         curve.dof = 2
+
+
+# ---- single axes of the body --------------------------------------------------------------------
+
+ROD = Cluster.from_positions([[-3.0, 0, 0], [0, 0.5, 0.3], [0.2, -0.6, 0.4], [3.0, 0, 0]])
+
+
+def gappy(seed, cluster=ROD, D_R=5e-3, n_frames=150):
+    """Return a noisy motion with missing frames and two pieces."""
+    motion = noisy(seed, n_frames=n_frames, D_R=D_R, cluster=cluster, gaps=0.15)
+    return dataclasses.replace(motion, piece=np.repeat([0, 1], [90, n_frames - 90]))
+
+
+def test_msad_axes_is_the_direct_sum_of_body_steps():
+    """Gaps, pieces, every lag: body-frame step vectors added up along each axis, to 1e-9."""
+    motion = gappy(1)
+    axes = np.array([[1.0, 0, 0], [1.0, 2.0, -1.0]])
+    curves = msad_axes(motion, axes=axes)
+    steps = motion.step_vectors() @ (axes / np.linalg.norm(axes, axis=1)[:, None]).T
+    walk = np.vstack([np.zeros(2), np.nancumsum(steps, axis=0)])
+    walk[np.isnan(motion.center[:, 0])] = np.nan
+    for curve, column in zip(curves, walk.T, strict=True):
+        assert (curve.dof, curve.n_walks, curve.unit) == (1, 1.0, "rad^2")
+        for lag in (1, 2, 10, 50, 89):
+            expected, pairs = direct(column[:, None], lag, motion.piece)
+            assert curve.n_pairs[lag - 1] == pairs
+            assert curve.value[lag - 1] == pytest.approx(expected[0], rel=1e-9)
+
+
+def test_each_axis_has_its_own_diffusion():
+    """A rod-like body: D about the long axis first, then across, each within 3.5 of its errors."""
+    D = np.array([2e-2, 5e-3, 5e-3])
+    truth = simulate_motion(ROD, D_R=D, dt=1.0, n_frames=4000, rng=2)
+    curves = msad_axes(truth)
+    for planted, curve in zip(D, curves, strict=True):
+        found = fit_line(curve)
+        assert abs(found.value - planted) < 3.5 * found.stderr
+        assert found.stderr < 0.06 * planted
+    single = msad_axes(truth, axes=[0.0, 0.0, 2.0])
+    assert len(single) == 1
+
+
+def test_the_axes_belong_to_the_body():
+    """Lab rotated, particles renumbered, another unit, time reversed: the curves stay the same."""
+    rng = np.random.default_rng(3)
+    truth = simulate_motion(ROD, D_R=1e-2, dt=1.0, n_frames=120, rng=rng)
+    x = add_noise(truth.positions(), sigma=0.02, rng=rng)
+    q = kabsch(rng.normal(size=(4, 3)), rng.normal(size=(4, 3)))
+    base = msad_axes(track_rotation(x, dt=1.0))
+    for other in (x @ q.T, x[:, [2, 0, 3, 1]], 1e-3 * x + 7.0, x[::-1]):
+        for a, b in zip(base, msad_axes(track_rotation(other, dt=1.0)), strict=True):
+            np.testing.assert_allclose(b.value, a.value, rtol=1e-6)
+
+
+def test_a_body_that_turns_steadily_turns_about_its_axes_by_the_components():
+    """At constant omega the curve of axis a is (omega . a t)^2, beyond any number of turns."""
+    omega = np.array([0.5, -0.9, 1.7])
+    curves = msad_axes(turning(omega, n_frames=100), axes=np.eye(3))
+    t = 0.5 * np.arange(1, 100)
+    for curve, w in zip(curves, omega, strict=True):
+        np.testing.assert_allclose(curve.value, (w * t) ** 2, rtol=1e-8)
+
+
+def test_the_plane_has_one_axis():
+    """2-D: one curve, that of msad_vector; axes are refused there, and zero axes everywhere."""
+    flat = Cluster.from_positions([[0.0, 0.0], [2.0, 0.1], [0.5, 1.2]])
+    motion = simulate_motion(flat, D_R=1e-2, dt=1.0, n_frames=50, rng=1)
+    (curve,) = msad_axes(motion)
+    np.testing.assert_allclose(curve.value, msad_vector(motion).value, rtol=1e-12)
+    with pytest.raises(ValueError, match="one axis only"):
+        msad_axes(motion, axes=[0, 0, 1])
+    for bad in ([0.0, 0.0, 0.0], [1.0, 2.0], [[1.0, np.nan, 0.0]]):
+        with pytest.raises(ValueError, match=r"axes: expected \(3,\)"):
+            msad_axes(noisy(1, n_frames=20), axes=bad)
+
+
+# ---- drift --------------------------------------------------------------------------------------
+
+
+def test_a_steady_velocity_makes_no_difference():
+    """Adding any velocity leaves the MSD without drift as it was, and is told; gaps and pieces."""
+    motion = gappy(4)
+    velocity = np.array([0.3, -2.0, 0.05])
+    moved = dataclasses.replace(motion, center=motion.center + motion.time[:, None] * velocity)
+    still, carried = (msd(m, drift=True) for m in (motion, moved))
+    np.testing.assert_allclose(carried.value, still.value, rtol=1e-8)
+    np.testing.assert_allclose(np.subtract(carried.drift, still.drift), velocity, rtol=1e-9)
+    assert msd(motion).drift is None
+    assert msd(moved).value[60] > 10 * still.value[60]
+
+
+@pytest.mark.parametrize("pieces", [1, 2])
+def test_what_a_mean_velocity_takes_is_given_back_exactly(pieces):
+    """The expected MSD of noisy Brownian walks, less their mean step, becomes 2 D n + 2 s, 1e-9.
+
+    The expectation is summed over all displacements from the covariance of the positions.
+    """
+    T, D, s = 30, 0.7, 0.4
+    piece = np.repeat(np.arange(pieces), T // pieces)
+    same = piece[:, None] == piece
+    start = (T // pieces) * piece
+    time = np.arange(T) - start
+    cov = same * 2 * D * np.minimum.outer(time, time) + s * np.eye(T)
+    ends = np.zeros(T)
+    for p in range(pieces):
+        rows = np.flatnonzero(piece == p)
+        ends[rows[[0, -1]]] = [-1.0, 1.0]
+    total = T - pieces
+    left = np.eye(T) - np.outer(time, ends) / total
+    cov = left @ cov @ left.T
+    expected, pairs = np.full((T - 1, 1), np.nan), np.zeros(T - 1, dtype=np.int64)
+    for lag in range(1, T // pieces):
+        i = np.flatnonzero(piece[lag:] == piece[:-lag])
+        square = cov[i + lag, i + lag] + cov[i, i] - 2 * cov[i + lag, i]
+        expected[lag - 1], pairs[lag - 1] = square.mean(), len(i)
+    lengths = np.full(pieces, T // pieces - 1)
+    found = _restored(expected, pairs, lengths)[:, 0]
+    n = np.arange(1, T // pieces)
+    last = n.size if pieces > 1 else n.size - 1  # all of one piece is its own drift
+    np.testing.assert_allclose(found[:last], 2 * D * n[:last] + 2 * s, rtol=1e-9)
+    assert np.isnan(found[last:]).all()
+
+
+def test_free_particles_share_their_drift():
+    """30 particles in a flow: velocity within 4 errors, the MSD's D within 3.5 of its own."""
+    rng = np.random.default_rng(5)
+    x = np.cumsum(rng.normal(scale=np.sqrt(2 * 0.1), size=(200, 30, 3)), axis=0)
+    x += 0.5 * np.arange(200)[:, None, None] * [0.3, 0.0, -0.1]
+    curve = msd(x, dt=0.5, drift=True)
+    error = np.sqrt(2 * 0.1 / (30 * 199)) / 0.5
+    assert np.abs(np.subtract(curve.drift, [0.3, 0.0, -0.1])).max() < 4 * error
+    found = fit_line(curve)
+    assert abs(found.value - 0.2) < 3.5 * found.stderr
+
+
+# ---- van Hove -----------------------------------------------------------------------------------
+
+
+def brownian_center(seed, n_frames=400):
+    """Return a motion whose centre makes Gaussian steps, seen with noise."""
+    return noisy(seed, n_frames=n_frames, D_T=0.5, sigma=0.2)
+
+
+def test_a_gaussian_is_told_as_one():
+    """100 tracks, overlapping pairs and noise: alpha2 about 0, scatter as stated within 22 %.
+
+    The mean alpha2 is 0 within 3 errors; each bin's density is the Gaussian within 4, and its
+    scatter the stated one within 15 % on average over the bins.
+    """
+    edges = np.linspace(-6, 6, 13)
+    runs = [
+        van_hove(brownian_center(seed, n_frames=150), lag=4.0, quantity="translation", bins=edges)
+        for seed in range(100)
+    ]
+    alpha = np.array([r.alpha2 for r in runs])
+    stated = np.mean([r.alpha2_stderr for r in runs])
+    assert abs(alpha.mean()) < 3 * alpha.std() / np.sqrt(100)
+    assert stated == pytest.approx(alpha.std(), rel=0.22)
+    density = np.array([r.density for r in runs])
+    gaussian = np.mean([r.gaussian for r in runs], axis=0)
+    scatter = density.std(axis=0)
+    assert np.all(np.abs(density.mean(axis=0) - gaussian) < 4 * scatter / np.sqrt(100))
+    ratio = np.mean([r.stderr for r in runs], axis=0) / scatter
+    assert ratio.mean() == pytest.approx(1, abs=0.15)
+
+
+def test_a_mixture_is_not_gaussian():
+    """Rotations of two sizes, mixed half and half, 20000 steps: the alpha2 of the mixture in 10 %.
+
+    For variances v and w = 9 v it is 2 (v^2 + w^2)/(v + w)^2 - 1 = 0.64.
+    """
+    rng = np.random.default_rng(6)
+    size = np.where(rng.random(20_000) < 0.5, 0.02, 0.06)[:, None]
+    steps = exp_map(size * rng.normal(size=(20_000, 3)))
+    rotation = cumulative_product(steps)
+    motion = track_rotation(np.einsum("tij,nj->tni", rotation, TETRAHEDRON.positions), dt=1.0)
+    found = van_hove(motion, lag=1.0)
+    v, w = 0.02**2, 0.06**2
+    expected = 2 * (v * v + w * w) / (v + w) ** 2 - 1
+    assert found.alpha2 == pytest.approx(expected, rel=0.1)
+    assert found.alpha2 > 10 * found.alpha2_stderr
+    assert (found.quantity, found.unit, found.lagtime) == ("rotation", "rad", 1.0)
+
+
+def test_the_density_is_a_density():
+    """It integrates to 1, the Gaussian nearly so; beyond given edges it does not."""
+    found = van_hove(brownian_center(1), lag=3.0, quantity="translation", bins=20)
+    width = np.diff(found.edges)
+    assert found.density @ width == pytest.approx(1, rel=1e-12)
+    assert found.gaussian @ width == pytest.approx(1, rel=0.01)
+    assert list(found.to_frame()) == ["low", "high", "density", "stderr", "gaussian"]
+    cut = van_hove(brownian_center(1), lag=3.0, quantity="translation", bins=[0.0, 1.0])
+    inside = found.n_pairs * 3 * cut.density[0]
+    assert inside == pytest.approx(round(inside), abs=1e-6)
+    assert 0 < cut.density[0] < 0.5
+
+
+def test_van_hove_follows_units_and_time_reversal():
+    """Scaled lengths scale the edges; backwards, every displacement changes its sign."""
+    motion = brownian_center(2)
+    a = van_hove(motion, lag=5.0, quantity="translation")
+    scaled = dataclasses.replace(motion, center=1e-6 * motion.center)
+    b = van_hove(scaled, lag=5.0, quantity="translation")
+    np.testing.assert_allclose(b.edges, 1e-6 * a.edges, rtol=1e-9)
+    np.testing.assert_allclose(b.stderr, 1e6 * a.stderr, rtol=1e-6)
+    assert b.alpha2 == pytest.approx(a.alpha2, rel=1e-9)
+    backwards = dataclasses.replace(motion, center=motion.center[::-1])
+    c = van_hove(backwards, lag=5.0, quantity="translation")
+    assert c.alpha2 == pytest.approx(a.alpha2, rel=1e-9)
+    np.testing.assert_allclose(c.density, a.density[::-1], rtol=1e-9)
+
+
+def test_van_hove_counts_the_pairs_there_are():
+    """Gaps and pieces: as many pairs as the MSD has at that lag, and the same mean square."""
+    motion = gappy(7)
+    found = van_hove(motion, lag=6.0)
+    curve = msad_vector(motion)
+    assert found.n_pairs == curve.n_pairs[5]
+    assert found.lagtime == curve.lagtime[5]
+
+
+def test_van_hove_refuses_what_it_cannot_answer():
+    """Lags off the grid or too long, bad bins, another quantity, a body at rest: one line each."""
+    motion = noisy(8, n_frames=30)
+    for lag in (0.0, 0.5, 30.0, -1.0):
+        with pytest.raises(ValueError, match=r"multiple of dt = 1 s up to 29 s"):
+            van_hove(motion, lag=lag)
+    for bins in (0, [1.0], [1.0, 1.0], [[0.0, 1.0]]):
+        with pytest.raises(ValueError, match="bins: expected"):
+            van_hove(motion, lag=1.0, bins=bins)
+    with pytest.raises(ValueError, match="quantity: expected"):
+        van_hove(motion, lag=1.0, quantity="spin")
+    cut = dataclasses.replace(motion, piece=np.arange(30))
+    with pytest.raises(TooFewFramesError, match="no two frames of one piece are 2 s apart"):
+        van_hove(cut, lag=2.0)
+    still = dataclasses.replace(motion, center=np.zeros((30, 3)))
+    with pytest.raises(ValueError, match="nothing moves"):
+        van_hove(still, lag=1.0, quantity="translation")

@@ -341,3 +341,17 @@ def test_numbers_in_words():
     assert [plot.number_text(v) for v in (0.0, 30, -1843, 2.5e9)] == [
         "0", "30.0", "−1840", "2.50 × 10⁹"
     ]  # fmt: skip
+
+
+def test_van_hove_shows_the_bins_and_the_gaussian(space):
+    """Points at the bins' middles with their density, the Gaussian beside them, and alpha_2."""
+    result = perrin.van_hove(space.motion, lag=1.0, bins=9)
+    ax = drawn(plot.plot_van_hove(result, ax=axes()))
+    (points,) = ax.containers
+    full = result.density > 0
+    middle = (result.edges[1:] + result.edges[:-1]) / 2
+    np.testing.assert_allclose(points.lines[0].get_xdata(), middle[full])
+    np.testing.assert_allclose(points.lines[0].get_ydata(), result.density[full])
+    np.testing.assert_allclose(line(ax, "Gaussian").get_ydata(), result.gaussian)
+    assert "α₂" in points.get_label()
+    assert ax.get_xlabel() == "rotation in 1 s (rad)"

@@ -20,13 +20,22 @@ if TYPE_CHECKING:
     )
     from perrin.analysis import analyze
     from perrin.bounds import cramer_rao
-    from perrin.curve_fits import fit_line
+    from perrin.curve_fits import fit_gls, fit_line
     from perrin.diffusion import DiffusionEstimate, estimate_diffusion
     from perrin.files import read_tracks, write_tracks
     from perrin.grouping import cluster_positions, find_clusters, positions_table
     from perrin.hydrodynamics import Size, size_from_rotation, size_from_translation
-    from perrin.lagged import LagCurve, msad, msad_vector, msd, orientation_correlation
-    from perrin.motion import RigidMotion, remove_rotation, track_rotation
+    from perrin.lagged import (
+        LagCurve,
+        VanHove,
+        msad,
+        msad_axes,
+        msad_vector,
+        msd,
+        orientation_correlation,
+        van_hove,
+    )
+    from perrin.motion import RigidMotion, remove_rotation, threshold_displacement, track_rotation
     from perrin.noise import NoiseFloor, noise_floor
     from perrin.report import write_run
     from perrin.results import ClusterResult, Report, load_run
@@ -54,6 +63,7 @@ __all__ = [
     "Size",
     "TooFewFramesError",
     "TrackTableError",
+    "VanHove",
     "add_noise",
     "analyze",
     "axis_angle",
@@ -61,11 +71,13 @@ __all__ = [
     "cramer_rao",
     "estimate_diffusion",
     "find_clusters",
+    "fit_gls",
     "fit_line",
     "judge_sampling",
     "kabsch",
     "load_run",
     "msad",
+    "msad_axes",
     "msad_vector",
     "msd",
     "noise_floor",
@@ -78,7 +90,9 @@ __all__ = [
     "simulate_motion",
     "size_from_rotation",
     "size_from_translation",
+    "threshold_displacement",
     "track_rotation",
+    "van_hove",
     "write_run",
     "write_tracks",
 ]
@@ -95,11 +109,20 @@ _ROOMS = {
     "rotations": ("Similarity", "axis_angle", "kabsch", "similarity"),
     "shapes": ("Cluster",),
     "noise": ("NoiseFloor", "noise_floor"),
-    "motion": ("RigidMotion", "remove_rotation", "track_rotation"),
+    "motion": ("RigidMotion", "remove_rotation", "threshold_displacement", "track_rotation"),
     "grouping": ("cluster_positions", "find_clusters", "positions_table"),
-    "lagged": ("LagCurve", "msad", "msad_vector", "msd", "orientation_correlation"),
+    "lagged": (
+        "LagCurve",
+        "VanHove",
+        "msad",
+        "msad_axes",
+        "msad_vector",
+        "msd",
+        "orientation_correlation",
+        "van_hove",
+    ),
     "diffusion": ("DiffusionEstimate", "estimate_diffusion"),
-    "curve_fits": ("fit_line",),
+    "curve_fits": ("fit_gls", "fit_line"),
     "bounds": ("cramer_rao",),
     "sampling": ("SamplingPlan", "SamplingVerdict", "judge_sampling", "plan_sampling"),
     "hydrodynamics": ("Size", "size_from_rotation", "size_from_translation"),

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from perrin._arrays import Floats, Ints
     from perrin.diffusion import DiffusionEstimate
-    from perrin.lagged import LagCurve
+    from perrin.lagged import LagCurve, VanHove
     from perrin.motion import RigidMotion
     from perrin.results import ClusterResult, Pooled, Report
     from perrin.sampling import SamplingPlan
@@ -91,6 +91,45 @@ def plot_lag_curve(
     ax.set(xscale="log", yscale="log", xlabel="lag time (s)")
     ax.set_ylabel(f"{_NAMES[curve.quantity][0]} ({unit})")
     _set_range(ax, curve, estimate, floor)
+    _legend_above(ax, ncols=2)
+    return ax
+
+
+def plot_van_hove(result: VanHove, *, ax: Axes) -> Axes:
+    """Draw a distribution of rotations or displacements beside the Gaussian of the same width.
+
+    Parameters
+    ----------
+    result : VanHove
+    ax : matplotlib.axes.Axes
+
+    Returns
+    -------
+    matplotlib.axes.Axes
+        Logarithmic; empty bins are left out. The legend says alpha_2 and its error for a Gaussian.
+    """
+    middle = (result.edges[1:] + result.edges[:-1]) / 2
+    full = result.density > 0
+    said = f"{result.n_pairs} pairs, α₂ = {number_text(result.alpha2, result.alpha2_stderr)}"
+    ax.errorbar(
+        middle[full],
+        result.density[full],
+        result.stderr[full],
+        fmt="o",
+        color=_BLUE,
+        ms=3.5,
+        elinewidth=0.8,
+        label=said,
+    )
+    ax.plot(middle, result.gaussian, "-", color=_RED, lw=1.2, label="Gaussian of the same width")
+    name = "rotation" if result.quantity == "rotation" else "displacement"
+    unit = unit_text(result.unit)
+    ax.set_yscale("log", nonpositive="clip")
+    ax.set_ylim(0.3 * float(result.density[full].min()), 2 * float(result.density.max()))
+    ax.set(
+        xlabel=f"{name} in {result.lagtime:.3g} s ({unit})",
+        ylabel=f"probability density (1/{unit})",
+    )
     _legend_above(ax, ncols=2)
     return ax
 
