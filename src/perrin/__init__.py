@@ -31,16 +31,19 @@ if TYPE_CHECKING:
     from perrin.report import write_run
     from perrin.results import ClusterResult, Report, load_run
     from perrin.rotations import Similarity, axis_angle, kabsch, similarity
-    from perrin.shapes import Cluster
+    from perrin.shapes import Cluster, point_group, rotation_group
     from perrin.simulate import add_noise, simulate_motion
+    from perrin.tensors import CoupledTensor, DiffusionTensor, coupled_tensor, diffusion_tensor
 
 __version__ = "0.1.0"
 
 __all__ = [
     "Cluster",
     "ClusterResult",
+    "CoupledTensor",
     "DegenerateClusterError",
     "DiffusionEstimate",
+    "DiffusionTensor",
     "IdentityWarning",
     "LagCurve",
     "NoiseFloor",
@@ -55,7 +58,9 @@ __all__ = [
     "analyze",
     "axis_angle",
     "cluster_positions",
+    "coupled_tensor",
     "cramer_rao",
+    "diffusion_tensor",
     "estimate_diffusion",
     "find_clusters",
     "fit_line",
@@ -66,9 +71,11 @@ __all__ = [
     "msd",
     "noise_floor",
     "orientation_correlation",
+    "point_group",
     "positions_table",
     "read_tracks",
     "remove_rotation",
+    "rotation_group",
     "similarity",
     "simulate_motion",
     "size_from_rotation",
@@ -88,13 +95,14 @@ _ROOMS = {
         "TrackTableError",
     ),
     "rotations": ("Similarity", "axis_angle", "kabsch", "similarity"),
-    "shapes": ("Cluster",),
+    "shapes": ("Cluster", "point_group", "rotation_group"),
     "noise": ("NoiseFloor", "noise_floor"),
     "motion": ("RigidMotion", "remove_rotation", "track_rotation"),
     "grouping": ("cluster_positions", "find_clusters", "positions_table"),
     "lagged": ("LagCurve", "msad", "msad_vector", "msd", "orientation_correlation"),
     "diffusion": ("DiffusionEstimate", "estimate_diffusion"),
     "curve_fits": ("fit_line",),
+    "tensors": ("CoupledTensor", "DiffusionTensor", "coupled_tensor", "diffusion_tensor"),
     "bounds": ("cramer_rao",),
     "hydrodynamics": ("Size", "size_from_rotation", "size_from_translation"),
     "simulate": ("add_noise", "simulate_motion"),

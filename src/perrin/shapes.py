@@ -223,7 +223,7 @@ def rotation_group(positions: ArrayLike, *, tolerance: float) -> Floats:
     if line is not None:
         return _line_group(line, d, tolerance)
     spatial = np.pad(x, ((0, 0), (0, 3 - d)))
-    elements = _symmetry_elements(spatial, tolerance)
+    elements = symmetry_elements(spatial, tolerance)
     proper = elements[np.linalg.det(elements) > 0]
     if d == 3:
         return proper
@@ -266,7 +266,7 @@ def point_group(positions: ArrayLike, *, tolerance: float | None = None) -> str:
         if np.abs(line).max() <= allowed:
             return "K_h"
         return "D_inf_h" if len(_line_group(line, 3, allowed)) == 2 else "C_inf_v"
-    return _schoenflies(_symmetry_elements(np.pad(x, ((0, 0), (0, 3 - x.shape[1]))), allowed))
+    return _schoenflies(symmetry_elements(np.pad(x, ((0, 0), (0, 3 - x.shape[1]))), allowed))
 
 
 def _checked(positions: ArrayLike, tolerance: float) -> Floats:
@@ -295,7 +295,7 @@ def _line_group(line: Floats, d: int, tolerance: float) -> Floats:
     return np.stack([np.eye(d), half])
 
 
-def _symmetry_elements(x: Floats, tolerance: float) -> Floats:
+def symmetry_elements(x: Floats, tolerance: float) -> Floats:
     """Return the point group as orthogonal matrices (g, 3, 3), the identity first.
 
     An element is known by its sign (-1 for a rotation times the inversion) and by the particles'
