@@ -25,7 +25,15 @@ if TYPE_CHECKING:
     from perrin.files import read_tracks, write_tracks
     from perrin.grouping import cluster_positions, find_clusters, positions_table
     from perrin.hydrodynamics import Size, size_from_rotation, size_from_translation
-    from perrin.lagged import LagCurve, msad, msad_vector, msd, orientation_correlation
+    from perrin.lagged import (
+        LagCurve,
+        QuaternionCovariance,
+        msad,
+        msad_vector,
+        msd,
+        orientation_correlation,
+        quaternion_covariance,
+    )
     from perrin.motion import RigidMotion, remove_rotation, track_rotation
     from perrin.noise import NoiseFloor, noise_floor
     from perrin.report import write_run
@@ -48,6 +56,7 @@ __all__ = [
     "LagCurve",
     "NoiseFloor",
     "PrecisionWarning",
+    "QuaternionCovariance",
     "Report",
     "RigidMotion",
     "Similarity",
@@ -73,6 +82,7 @@ __all__ = [
     "orientation_correlation",
     "point_group",
     "positions_table",
+    "quaternion_covariance",
     "read_tracks",
     "remove_rotation",
     "rotation_group",
@@ -99,7 +109,15 @@ _ROOMS = {
     "noise": ("NoiseFloor", "noise_floor"),
     "motion": ("RigidMotion", "remove_rotation", "track_rotation"),
     "grouping": ("cluster_positions", "find_clusters", "positions_table"),
-    "lagged": ("LagCurve", "msad", "msad_vector", "msd", "orientation_correlation"),
+    "lagged": (
+        "LagCurve",
+        "QuaternionCovariance",
+        "msad",
+        "msad_vector",
+        "msd",
+        "orientation_correlation",
+        "quaternion_covariance",
+    ),
     "diffusion": ("DiffusionEstimate", "estimate_diffusion"),
     "curve_fits": ("fit_line",),
     "tensors": ("CoupledTensor", "DiffusionTensor", "coupled_tensor", "diffusion_tensor"),

@@ -224,7 +224,7 @@ def rotation_group(positions: ArrayLike, *, tolerance: float) -> Floats:
         return _line_group(line, d, tolerance)
     spatial = np.pad(x, ((0, 0), (0, 3 - d)))
     elements = symmetry_elements(spatial, tolerance)
-    proper = elements[np.linalg.det(elements) > 0]
+    proper: Floats = elements[np.linalg.det(elements) > 0]
     if d == 3:
         return proper
     return np.ascontiguousarray(proper[proper[:, 2, 2] > 0, :2, :2])
@@ -346,7 +346,7 @@ def _mappings(x: Floats, sign: int, tolerance: float) -> tuple[Ints, Floats]:
 def _nearest(rotation: Floats, x: Floats, sign: int) -> Ints:
     """Return which particle's (mirrored) place each turned particle is nearest to, (K, n)."""
     turned = x @ np.swapaxes(rotation, 1, 2)
-    return np.argmin(np.linalg.norm(turned[:, :, None] - sign * x, axis=3), axis=2)
+    return np.asarray(np.argmin(np.linalg.norm(turned[:, :, None] - sign * x, axis=3), axis=2))
 
 
 def _widest_pair(x: Floats) -> tuple[int, int]:

@@ -146,17 +146,15 @@ class Steps:
             return _nowhere(D, theta)
         solved, _ = dpbtrs(down, self.y.reshape(-1), lower=1)
         z = solved.reshape(self.y.shape)
-        inverse = np.linalg.inv(pivots + up_pivots[::-1] - diagonal)
-        across = -np.linalg.solve(pivots[:-1], beside @ inverse[1:])
+        inverse = _inverses(pivots + up_pivots[::-1] - diagonal)
+        across = -_inverses(pivots[:-1]) @ (beside @ inverse[1:])
         same = z[:, :, None] * z[:, None, :] - inverse
         next_one = (z[:-1, :, None] * z[1:, None, :] - across) * self.linked[:-1, None, None]
         value = -0.5 * (log_det + np.sum(self.y * z))
         weighted = 2 * same.sum(0) - next_one.sum(0) - next_one.sum(0).T
         by_theta = 0.5 * np.einsum("jsab,sab->j", self.begin + self.end, same)
         by_theta -= np.einsum("jsab,sab->j", self.end[:, :-1], next_one)
-        return self._assembled(
-            value, np.tensordot(self.tau, same, 1), weighted, by_theta, D, B
-        )
+        return self._assembled(value, np.tensordot(self.tau, same, 1), weighted, by_theta, D, B)
 
     def _assembled(
         self, value: float, timed: Floats, weighted: Floats, by_theta: Floats, D: Floats, B: float
@@ -176,21 +174,29 @@ def _factor(diagonal: Floats, beside: Floats) -> tuple[Floats, Floats, float]:
     from scipy.linalg.lapack import dpbtrf
 
     count, b, _ = diagonal.shape
-    band = np.zeros((2 * b, count, b))
-    for i in range(b):
-        for j in range(b):
-            if i >= j:
-                band[i - j, :, j] = diagonal[:, i, j]
-            band[b + i - j, :-1, j] = beside[:, i, j]
-    factor, bad = dpbtrf(band.reshape(2 * b, -1), lower=1)
+    band = np.zeros((count, b, 2 * b))
+    for j in range(b):
+        band[:, j, : b - j] = diagonal[:, j:, j]
+        band[:-1, j, b - j : 2 * b - j] = beside[:, :, j]
+    factor, bad = dpbtrf(band.reshape(-1, 2 * b).T, lower=1, overwrite_ab=1)
     if bad:
         return factor, diagonal, np.inf
+    columns = factor.T.reshape(count, b, 2 * b)
     lower = np.zeros_like(diagonal)
-    blocks = factor.reshape(2 * b, count, b)
-    for i in range(b):
-        for j in range(i + 1):
-            lower[:, i, j] = blocks[i - j, :, j]
+    for j in range(b):
+        lower[:, j:, j] = columns[:, j, : b - j]
     return factor, lower @ np.swapaxes(lower, 1, 2), 2 * float(np.log(factor[0]).sum())
+
+
+def _inverses(a: Floats) -> Floats:
+    """Return the inverses of symmetric matrices (S, b, b), by cofactors where b = 3: quicker."""
+    if a.shape[1] != 3:
+        return np.asarray(np.linalg.inv(a))
+    i, j = np.array([1, 2, 0]), np.array([2, 0, 1])
+    cofactor = a[:, i][:, :, i] * a[:, j][:, :, j] - a[:, i][:, :, j] * a[:, j][:, :, i]
+    determinant = np.einsum("sb,sb->s", a[:, 0], cofactor[:, 0])
+    inverse: Floats = cofactor / determinant[:, None, None]
+    return inverse
 
 
 @dataclass(frozen=True, eq=False)
@@ -286,11 +292,6 @@ def axial(axis: Floats) -> Family:
     return family
 
 
-def linear(basis: Floats) -> Family:
-    """Return the family D = sum q_j E_j, whose members may turn negative: for derivatives."""
-    return lambda q: (np.tensordot(q, basis, 1), basis)
-
-
 class Maximum(NamedTuple):
     """The greatest likelihood of a family: value, D (b, b), free noise parameters (G, c)."""
 
@@ -299,21 +300,29 @@ class Maximum(NamedTuple):
     own: Floats
 
 
-def maximise(sources: Sequence[Source], family: Family, q: Floats, own: Floats) -> Maximum:
+def maximise(
+    sources: Sequence[Source],
+    family: Family,
+    q: Floats,
+    own: Floats,
+    *,
+    settled: float = _SETTLED,
+) -> Maximum:
     """Return the maximum over a family of D, common to all, and over the noise of each source.
 
-    A quasi-Newton search (BFGS) from a true Hessian, which is taken anew where the search has not
-    settled after a dozen steps or stands still. It ends at a root of the slopes.
+    A quasi-Newton search (BFGS) from a true Hessian, which is taken anew where the search stands
+    still or has not settled after many steps. It ends at a root of the slopes: where one more step
+    would gain less than `settled`.
     """
     problem = _Problem(sources, family, len(q), own.shape)
     p = np.concatenate([q, own.ravel()])
     value, slope = problem.slopes(p)
     for _ in range(20):
         inverse = problem.arrow(p).inverse()
-        for _ in range(12):
+        for _ in range(30):
             step = inverse @ slope
             gain = 0.5 * float(slope @ step)
-            if gain <= _SETTLED:
+            if gain <= settled:
                 return Maximum(value, *problem.parts(p))
             trial = problem.climbed(p, value, step, gain)
             if trial is None:
@@ -329,11 +338,25 @@ def maximise(sources: Sequence[Source], family: Family, q: Floats, own: Floats) 
     )
 
 
-def information(sources: Sequence[Source], best: Maximum, basis: Floats) -> Floats:
-    """Return the observed information (m, m) on D = sum d_j E_j, the noise left free."""
-    q = np.einsum("kab,ab->k", basis, best.D) / np.einsum("kab,kab->k", basis, basis)
-    problem = _Problem(sources, linear(basis), len(q), best.own.shape)
-    return problem.arrow(np.concatenate([q, best.own.ravel()])).information()
+def spread(sources: Sequence[Source], best: Maximum, basis: Floats) -> tuple[Floats, Floats]:
+    """Return directions of D (m, b, b) and the covariance (m, m) of the error along them.
+
+    From the observed information, the noise left free. The directions F E_j F, with F the root of
+    D, are of the size of D itself: its small values may be thousands of times below the others. The
+    covariance is NaN where the information is not positive.
+    """
+    values, axes = np.linalg.eigh(best.D)
+    root = (axes * np.sqrt(np.maximum(values, 1e-4 * values[-1]))) @ axes.T
+    directions = root @ basis @ root
+
+    def family(q: Floats) -> tuple[Floats, Floats]:
+        return best.D + np.tensordot(q, directions, 1), directions
+
+    problem = _Problem(sources, family, len(basis), best.own.shape)
+    known = problem.arrow(np.append(np.zeros(len(basis)), best.own)).information()
+    if not (np.isfinite(known).all() and np.linalg.eigvalsh(known)[0] > 0):
+        return directions, np.full_like(known, np.nan)
+    return directions, np.asarray(np.linalg.inv(known))
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 
-from perrin._arrays import Bools, Floats, TooFewFramesError, frozen
+from perrin._arrays import Bools, Floats, PrecisionWarning, TooFewFramesError, frozen
 from perrin.diffusion import UNITS, Quantity, with_error
 from perrin.motion import RigidMotion, degrees_of_freedom
 from perrin.noise import orientation_covariance
@@ -18,8 +19,8 @@ from perrin.step_likelihood import (
     Source,
     Steps,
     axial,
-    information,
     maximise,
+    spread,
     squares,
 )
 
@@ -33,6 +34,17 @@ _ELEMENTS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 # An axis that an error of one standard deviation turns by more than this (degrees) is not known.
 _KNOWN_AXIS = 20.0
+
+# The error in degrees of the axes of equal values: any direction of their plane will do.
+_EQUAL = 45.0
+
+# Noise this far below a step (variance) is none: simulated truth, whose residuals are rounding.
+_NOISELESS = 1e-12
+
+_NO_ERRORS = "no errors are known: a value lies on its edge, 0; take longer tracks or longer steps"
+
+# Values are told apart at this level.
+_LEVEL = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +71,7 @@ class DiffusionTensor:
         Of the elements xx, yy, zz, xy, xz, yz.
     axis_errors : ndarray, shape (3, 3)
         How far, in degrees, one standard error turns axes a and b in their common plane; 45 where
-        their values are equal.
+        symmetry makes their values equal, 0 where it fixes the axes.
     symmetry : str
         The point group whose symmetry the tensor was given; "C_1" for none.
     offset : ndarray, shape (3, 3)
@@ -100,9 +112,17 @@ class DiffusionTensor:
 
     @property
     def resolved_axes(self) -> Bools:
-        """Which axes (3,) are known to within 20 degrees in both planes that they lie in."""
-        others = self.axis_errors[~np.eye(3, dtype=bool)].reshape(3, 2)
-        return np.asarray((others < _KNOWN_AXIS).all(axis=1))
+        """Which axes (3,) are known.
+
+        Those that symmetry fixes, and those whose values the tests tell apart (p < 0.05) and whose
+        errors are below 20 degrees in both planes that they lie in. Errors alone would not do:
+        sorted values keep a distance that makes the axes of an isotropic body look known.
+        """
+        known = self.axis_errors < _KNOWN_AXIS if self.p_isotropic < _LEVEL else np.eye(3) > 0
+        near = 0 if np.diff(self.principal_values).argmin() == 0 else 1
+        if self.p_axial >= _LEVEL:
+            known[near, near + 1] = known[near + 1, near] = False
+        return np.asarray((known | (self.axis_errors == 0)).all(axis=1))
 
     def along(self, direction: ArrayLike) -> tuple[float, float]:
         """Return the coefficient along, or about, a body direction, and its standard error.
@@ -134,16 +154,22 @@ class DiffusionTensor:
 
     def _statement(self) -> str:
         """Say which axes are known."""
+        if np.isnan(self.stderr).any():
+            return _NO_ERRORS
         known = np.flatnonzero(self.resolved_axes)
-        worst = np.where(np.eye(3, dtype=bool), 0.0, self.axis_errors).max(axis=1)
+        worst = self.axis_errors.max(axis=1)
+        equal = (self.axis_errors == _EQUAL).any() and self.symmetry != "C_1"
         if known.size == 3:
             return "axes known to " + ", ".join(f"{w:.0f}" for w in worst) + " degrees"
         if known.size == 1:
             a, b = (k + 1 for k in range(3) if k != known[0])
+            why = f"are equal by symmetry {self.symmetry}" if equal else "cannot be told apart"
             return (
-                f"values {a} and {b} cannot be told apart: the plane of their axes is known, not "
-                f"the axes; its normal, axis {known[0] + 1}, to {worst[known[0]]:.0f} degrees"
+                f"values {a} and {b} {why}: the plane of their axes is known, not the axes; its "
+                f"normal, axis {known[0] + 1}, to {worst[known[0]]:.0f} degrees"
             )
+        if equal:
+            return f"the values are equal by symmetry {self.symmetry}: read the mean"
         return "the axes cannot be told apart: read the mean, not the three sorted values"
 
 
@@ -232,6 +258,11 @@ def diffusion_tensor(
     TooFewFramesError
         Fewer than 12 steps in all.
 
+    Warns
+    -----
+    PrecisionWarning
+        If a value lies on its edge, 0; errors are then NaN.
+
     Notes
     -----
     Steps of length t have covariance 2 D t + O + O' and -O' with the next one, O = s C - 2 B dt D
@@ -257,7 +288,10 @@ def diffusion_tensor(
     best = free if len(basis) == 6 else data.fit(basis, near=free)
     tensor = data.in_units(best.D)
     covariance = data.covariance(best, basis, _ELEMENTS)
+    if np.isnan(covariance).any():
+        warnings.warn(f"diffusion_tensor: {_NO_ERRORS}", PrecisionWarning, stacklevel=2)
     values, axes = np.linalg.eigh(tensor)
+    values = np.maximum(values, 0.0)  # the tensor is a square: below 0 is rounding
     axes = axes * np.sign(np.linalg.det(axes))
     return DiffusionTensor(
         tensor=tensor,
@@ -324,7 +358,7 @@ def coupled_tensor(
     data = _collected([motion], [_screws(motion)], noise="joint", exposure=None)
     basis = _symmetric_basis(6)
     best = data.fit(basis)
-    elements = tuple(zip(*np.tril_indices(6), strict=True))
+    elements = [(i, j) for i in range(6) for j in range(i + 1)]
     tensor, covariance = data.in_units(best.D), data.covariance(best, basis, elements)
     where = diffusion_center(tensor) if place is None else place
     return CoupledTensor(
@@ -491,7 +525,8 @@ def _invariant_basis(elements: Floats) -> Floats:
     basis = _symmetric_basis(3)
     mapped = np.einsum("gij,mjk,glk->mil", elements, basis, elements) / len(elements)
     share, mix = np.linalg.eigh(np.einsum("mij,nij->mn", basis, mapped))
-    return np.einsum("mn,mij->nij", mix[:, share > 0.5], basis)
+    invariant: Floats = np.einsum("mn,mij->nij", mix[:, share > 0.5], basis)
+    return invariant
 
 
 class _Vectors(NamedTuple):
@@ -533,7 +568,9 @@ def _orientation_shape(motion: RigidMotion) -> Floats:
 def _center_shape(motion: RigidMotion) -> Floats:
     """Return the covariance of every centre for a localisation error of 1 um, (T, 3, 3)."""
     sigma, count = _localisation(motion), len(motion.template)
-    variance = motion.center_variance / sigma**2 if sigma > 0 else np.full(len(motion.time), 1 / count)
+    variance = (
+        motion.center_variance / sigma**2 if sigma > 0 else np.full(len(motion.time), 1 / count)
+    )
     return np.asarray(variance[:, None, None] * np.eye(3))
 
 
@@ -616,11 +653,9 @@ class _Data:
         self, best: Maximum, basis: Floats, elements: Sequence[tuple[int, int]]
     ) -> Floats:
         """Return the covariance of elements of D in um, rad and s; NaN where it is not known."""
-        known = information(self.sources, best, basis)
-        if not (np.isfinite(known).all() and np.linalg.eigvalsh(known)[0] > 0):
-            return np.full((len(elements),) * 2, np.nan)
-        slopes = np.array([[self.in_units(e)[i, j] for e in basis] for i, j in elements])
-        covariance: Floats = slopes @ np.linalg.inv(known) @ slopes.T
+        directions, errors = spread(self.sources, best, basis)
+        slopes = np.array([[self.in_units(e)[i, j] for e in directions] for i, j in elements])
+        covariance: Floats = slopes @ errors @ slopes.T
         return covariance
 
     def mean_noise(self, best: Maximum) -> Floats:
@@ -652,10 +687,8 @@ def _collected(
     sources = []
     for m, v in zip(motions, vectors, strict=True):
         shapes = v.shapes / np.outer(scale, scale)
-        # An amplitude of 1 is then noise as large as a step.
-        size = np.nanmean(np.trace(shapes, axis1=2, axis2=3), axis=1) / np.count_nonzero(
-            np.nanmax(shapes, axis=(1, 2)) > 0, axis=-1
-        )
+        # An amplitude of 1 is then noise as large as a step, in the three components it has.
+        size = np.nanmean(np.trace(shapes, axis1=2, axis2=3), axis=1) / 3
         start, stop = m.steps()
         shapes = shapes / size[:, None, None, None]
         steps = Steps(
@@ -690,7 +723,8 @@ def _known_noise(
     if noise == "residual":
         freedom = degrees_of_freedom(motion.n_present[motion.fitted], 3).sum()
         freedom -= degrees_of_freedom(np.array(len(motion.template)), 3)
-        return motion.sigma**2 * size, float(freedom)
+        theta = motion.sigma**2 * size
+        return theta, float(freedom) if theta.min() > _NOISELESS else np.inf
     return float(noise) ** 2 * size, np.inf
 
 
@@ -698,12 +732,11 @@ def _tests(data: _Data, free: Maximum) -> tuple[float, float]:
     """Return the p-values of isotropy and of axial symmetry from likelihood ratios."""
     from scipy.special import chdtrc
 
-    round_body = data.fit(np.eye(3)[None] / 3**0.5, near=free)
-    axial_body = data.fit_axial(free)
-    return tuple(
-        float(chdtrc(freedom, max(2 * (free.value - other.value), 0.0)))
-        for freedom, other in ((5, round_body), (2, axial_body))
-    )
+    def p_value(restricted: Maximum, freedom: int) -> float:
+        return float(chdtrc(freedom, max(2 * (free.value - restricted.value), 0.0)))
+
+    isotropic = data.fit(np.eye(3)[None] / 3**0.5, near=free)
+    return p_value(isotropic, 5), p_value(data.fit_axial(free), 2)
 
 
 def _variance(covariance: Floats, a: Floats, b: Floats) -> float:
@@ -713,15 +746,17 @@ def _variance(covariance: Floats, a: Floats, b: Floats) -> float:
 
 
 def _axis_errors(values: Floats, axes: Floats, covariance: Floats) -> Floats:
-    """Return by how many degrees an error of D_ab turns axes a and b: half the angle whose tangent
-    is 2 D_ab/(D_a - D_b).
+    """Return by how many degrees one standard error of D_ab turns axes a and b.
+
+    The angle is half the one whose tangent is 2 D_ab/(D_a - D_b).
     """
     errors = np.zeros((3, 3))
+    rounding = 1e-9 * values[2]
     for a, b in ((0, 1), (0, 2), (1, 2)):
-        off = np.sqrt(max(_variance(covariance, axes[:, a], axes[:, b]), 0.0))
+        variance = _variance(covariance, axes[:, a], axes[:, b])
         apart = values[b] - values[a]
-        same = apart <= 1e-9 * values[2]
-        angle = 45.0 if same else np.degrees(0.5 * np.arctan2(2 * off, apart))
+        off = np.sqrt(variance) if not variance < rounding**2 else 0.0
+        angle = _EQUAL if apart <= rounding else np.degrees(0.5 * np.arctan2(2 * off, apart))
         errors[a, b] = errors[b, a] = angle
     return errors
 
@@ -740,4 +775,5 @@ def _shifted_errors(tensor: Floats, covariance: Floats, place: Floats | None) ->
 
     slopes = np.array([(moved(k, h) - moved(k, -h)) / (2 * h) for k, h in enumerate(1e-3 * sd)])
     variance = np.einsum("kab,kl,lab->ab", slopes, covariance, slopes)
-    return np.sqrt(np.maximum(variance, 0.0))
+    errors: Floats = np.sqrt(np.maximum(variance, 0.0))
+    return errors
