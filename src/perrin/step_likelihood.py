@@ -300,19 +300,11 @@ class Maximum(NamedTuple):
     own: Floats
 
 
-def maximise(
-    sources: Sequence[Source],
-    family: Family,
-    q: Floats,
-    own: Floats,
-    *,
-    settled: float = _SETTLED,
-) -> Maximum:
+def maximise(sources: Sequence[Source], family: Family, q: Floats, own: Floats) -> Maximum:
     """Return the maximum over a family of D, common to all, and over the noise of each source.
 
     A quasi-Newton search (BFGS) from a true Hessian, which is taken anew where the search stands
-    still or has not settled after many steps. It ends at a root of the slopes: where one more step
-    would gain less than `settled`.
+    still or has not settled after many steps. It ends at a root of the slopes.
     """
     problem = _Problem(sources, family, len(q), own.shape)
     p = np.concatenate([q, own.ravel()])
@@ -322,7 +314,7 @@ def maximise(
         for _ in range(30):
             step = inverse @ slope
             gain = 0.5 * float(slope @ step)
-            if gain <= settled:
+            if gain <= _SETTLED:
                 return Maximum(value, *problem.parts(p))
             trial = problem.climbed(p, value, step, gain)
             if trial is None:

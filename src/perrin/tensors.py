@@ -148,7 +148,8 @@ class DiffusionTensor:
         return (
             f"{name} = {values} {self.unit} [{self.n_frames} frames, symmetry {self.symmetry}]\n"
             f"mean {with_error(self.mean, self.mean_stderr)}, "
-            f"isotropic: p = {self.p_isotropic:.2g}, axial: p = {self.p_axial:.2g}\n"
+            f"isotropic: {_probability(self.p_isotropic)}, "
+            f"axial: {_probability(self.p_axial)}\n"
             f"{self._statement()}"
         )
 
@@ -171,6 +172,10 @@ class DiffusionTensor:
         if equal:
             return f"the values are equal by symmetry {self.symmetry}: read the mean"
         return "the axes cannot be told apart: read the mean, not the three sorted values"
+
+
+def _probability(p: float) -> str:
+    return f"p = {p:.2g}" if p >= 1e-6 else "p < 1e-6"
 
 
 @dataclass(frozen=True, eq=False)
@@ -276,6 +281,9 @@ def diffusion_tensor(
     >>> truth = simulate_motion(body, D_R=[1e-3, 2e-3, 6e-3], dt=1.0, n_frames=1000, rng=1)
     >>> x = add_noise(truth.positions(), sigma=0.02, rng=2)
     >>> print(diffusion_tensor(track_rotation(x, dt=1.0)))
+    D_R = 0.00100(8), 0.00208(13), 0.0058(4) rad^2/s [1000 frames, symmetry C_1]
+    mean 0.00297(15), isotropic: p < 1e-6, axial: p < 1e-6
+    axes known to 3, 3, 2 degrees
     """
     motions = [motion] if isinstance(motion, RigidMotion) else list(motion)
     _check_choices(motions, quantity=quantity, noise=noise, exposure=exposure)
