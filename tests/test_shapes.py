@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from perrin import Cluster
-from perrin.shapes import is_tetrahedron
+from perrin import Cluster, point_group, rotation_group
+from perrin.rotations import exp_map
+from perrin.shapes import is_tetrahedron, symmetry_elements
 
 
 def distances(cluster):
@@ -131,3 +132,152 @@ def test_which_bodies_are_tetrahedra():
     assert not is_tetrahedron(Cluster.touching(5, 2.45).positions)
     assert not is_tetrahedron(Cluster.touching(6, 2.45).positions[:4])
     assert not is_tetrahedron(np.ones((4, 2)))
+
+
+# ---- symmetry -----------------------------------------------------------------------------------
+
+GOLDEN = (1 + 5**0.5) / 2
+
+
+def ring(n, height=0.0, turn=0.0, radius=1.0):
+    angle = turn + 2 * np.pi * np.arange(n) / n
+    return radius * np.stack([np.cos(angle), np.sin(angle), np.full(n, height / radius)], axis=1)
+
+
+def two_rings(n, turn, height):
+    return np.concatenate([ring(n, height), ring(n, -height, turn)])
+
+
+def cyclic(x, *sides):
+    """Return a set with its coordinates in all cyclic orders."""
+    return np.concatenate([x, x[:, [1, 2, 0]], x[:, [2, 0, 1]], *sides])
+
+
+def orbit(x, turn):
+    """Return x and its images under the powers of a matrix."""
+    images = [np.array(x, dtype=float)]
+    while not np.allclose(images[-1] @ turn.T, images[0]):
+        images.append(images[-1] @ turn.T)
+    return np.concatenate(images)
+
+
+SIGNS = np.array([(a, b) for a in (1.0, -1) for b in (1, -1)])
+CUBE = np.array([(a, b, c) for a in (1.0, -1) for b in (1, -1) for c in (1, -1)])
+THIRD = exp_map([0, 0, 2 * np.pi / 3])
+RANDOM = np.array([[1, 0.2, 0.6], [0.5, 1.4, 0.9]])
+BODIES = {
+    "I_h": cyclic(np.insert(SIGNS * [1, GOLDEN], 0, 0, axis=1), [[0, 0, 0]]),
+    "O_h": CUBE,
+    "T_h": cyclic(np.insert(SIGNS * [1, 2.3], 2, 0, axis=1)),
+    "T_d": CUBE[CUBE.prod(axis=1) > 0],
+    "D_2": two_rings(2, 0.4, 0.7),
+    "D_3": two_rings(3, 0.3, 0.7),
+    "D_2d": two_rings(2, np.pi / 2, 0.4),
+    "D_3d": two_rings(3, np.pi / 3, 0.5),
+    "D_6d": two_rings(6, np.pi / 6, 0.6),
+    "D_2h": np.insert(SIGNS * [1, 2], 2, 0, axis=1),
+    "D_6h": two_rings(6, 0, 0.6),
+    "C_2": orbit([[1, 0, 0.3], [0.4, 1.2, -0.5]], np.diag([-1.0, -1, 1])),
+    "C_3": orbit([[1, 0, 0], [0.3, 1.1, 0.5], [1.5, 0.9, -0.4]], THIRD),
+    "C_2v": np.array([[0, 0, 0], [2.0, 0, 0], [1, 1.5, 0]]),
+    "C_4v": np.concatenate([ring(4), [[0, 0, 1.2]]]),
+    "C_2h": np.array([[1.0, 0, 0], [-1, 0, 0], [1, 1, 0], [-1, -1, 0]]),
+    "C_3h": orbit([[1, 0, 0], [0.3, 1.3, 0]], THIRD),
+    "S_4": orbit(RANDOM, np.diag([1, 1, -1.0]) @ exp_map([0, 0, np.pi / 2])),
+    "C_i": np.concatenate([RANDOM, [[0.4, -0.5, 1.5]], -RANDOM, [[-0.4, 0.5, -1.5]]]),
+    "C_s": np.array([[0, 0, 0], [1.0, 0, 0], [0, 1.3, 0]]),
+    "C_1": np.random.default_rng(5).normal(size=(6, 3)),
+}
+ORDERS = {"I_h": 60, "O_h": 24, "T_h": 12, "T_d": 12, "D_6h": 12, "D_3": 6, "C_4v": 4, "S_4": 2}
+
+
+@pytest.mark.parametrize("symbol", BODIES)
+def test_point_groups(symbol):
+    """Every family is named, in any pose, order and size, exact or with 1 % errors."""
+    rng = np.random.default_rng(2)
+    x = rng.permutation(BODIES[symbol]) @ exp_map(rng.normal(size=3)).T
+    assert point_group(x) == symbol
+    assert point_group(1e-9 * x) == symbol
+    assert point_group(x @ np.diag([1, 1, -1.0])) == symbol
+    assert point_group(x + rng.normal(size=x.shape) * 0.01, tolerance=0.06) == symbol
+    if symbol in ORDERS:
+        assert len(rotation_group(x, tolerance=1e-6)) == ORDERS[symbol]
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.01])
+@pytest.mark.parametrize("symbol", BODIES)
+def test_rotation_groups_are_exact_groups(symbol, noise):
+    """Products and inverses are members to rounding, also where the body is not exact."""
+    rng = np.random.default_rng(3)
+    x = BODIES[symbol] + noise * rng.normal(size=BODIES[symbol].shape)
+    group = rotation_group(x, tolerance=6 * noise + 1e-9)
+    unity = np.broadcast_to(np.eye(3), group.shape)
+    np.testing.assert_allclose(group @ np.swapaxes(group, 1, 2), unity, atol=1e-13)
+    np.testing.assert_allclose(np.linalg.det(group), 1, atol=1e-13)
+    np.testing.assert_array_equal(group[0].round(13), np.eye(3))
+    products = (group[:, None] @ group).reshape(-1, 9)
+    apart = np.abs(products[:, None] - group.reshape(-1, 9)).max(axis=2)
+    assert apart.min(axis=1).max() < 1e-12
+    # Every member carries the body on itself, each particle to the place of one other.
+    centred = x - x.mean(0)
+    miss = np.linalg.norm((centred @ np.swapaxes(group, 1, 2))[:, :, None] - centred, axis=3)
+    assert miss.min(axis=2).max() <= 12 * noise + 1e-9
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        *(Cluster.touching(n, 2.45) for n in range(2, 8)),
+        Cluster.pentahedron(1.5),
+        Cluster.tetrahedron(1.5),
+        Cluster.trimer(1.0),
+    ],
+)
+def test_the_bodies_have_the_symmetry_they_state(body):
+    """`Cluster.symmetry` is what `point_group` finds; a distorted body has less."""
+    assert point_group(body.positions) == body.symmetry
+    if len(body.positions) > 3:
+        off = np.random.default_rng(1).normal(size=body.positions.shape) * 0.05
+        assert point_group(body.positions + off) == "C_1"
+
+
+def test_lines_points_and_the_plane():
+    """Particles on a line, one particle, and bodies of the plane."""
+    turn = exp_map([1.0, 0.4, 0.2])
+    rod = np.array([[0, 0, -1.0], [0, 0, 0], [0, 0, 1]]) @ turn.T
+    assert point_group(rod) == "D_inf_h"
+    bent = np.array([[0, 0, -1.0], [0.3, 0, 0], [0, 0, 1]]) @ turn.T
+    assert point_group(bent, tolerance=1e-3) == "C_2v"
+    assert point_group([[0, 0, 0], [0, 0, 1], [0, 0, 3]]) == "C_inf_v"
+    assert point_group([[1, 2, 3]]) == "K_h"
+    swap = rotation_group(rod, tolerance=0.01)
+    assert swap.shape == (2, 3, 3)
+    np.testing.assert_allclose(rod @ swap[1].T, rod[::-1], atol=1e-12)
+    assert len(rotation_group([[0, 0, 0], [0, 0, 1], [0, 0, 3]], tolerance=0.01)) == 1
+    assert len(rotation_group([[1, 2, 3]], tolerance=0)) == 1
+    square = SIGNS @ [[0.8, 0.6], [-0.6, 0.8]]
+    turns = rotation_group(square, tolerance=0.01)
+    assert turns.shape == (4, 2, 2)
+    np.testing.assert_allclose(np.linalg.det(turns), 1, atol=1e-13)
+    assert point_group(square) == "D_4h"
+    np.testing.assert_allclose(rotation_group([[0, 1], [0, -1]], tolerance=0)[1], -np.eye(2))
+
+
+def test_a_nearly_symmetric_body_is_judged_by_the_tolerance():
+    """A tetrahedron stretched by 5 % along a twofold axis is D_2d; within 10 % it is T_d."""
+    x = Cluster.tetrahedron(1.0).positions * [1, 1, 1.05]
+    assert point_group(x, tolerance=1e-3) == "D_2d"
+    assert point_group(x, tolerance=0.1) == "T_d"
+    # The symmetrised body is a true tetrahedron: the elements are those of a cube's corners.
+    elements = symmetry_elements(x, 0.1)
+    assert len(elements) == 24
+    np.testing.assert_allclose(np.abs(elements).round(12) % 1, 0, atol=1e-12)
+
+
+@pytest.mark.parametrize("tolerance", [-1, np.nan, np.inf])
+def test_tolerances_must_be_lengths(tolerance):
+    """A tolerance that is no finite number >= 0 is refused."""
+    with pytest.raises(ValueError, match="tolerance"):
+        rotation_group(np.eye(3), tolerance=tolerance)
+    with pytest.raises(ValueError, match="tolerance"):
+        point_group(np.eye(3), tolerance=tolerance)

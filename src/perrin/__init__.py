@@ -37,24 +37,29 @@ if TYPE_CHECKING:
     )
     from perrin.motion import RigidMotion, remove_rotation, threshold_displacement, track_rotation
     from perrin.noise import NoiseFloor, noise_floor
+    from perrin.quaternions import QuaternionCovariance, quaternion_covariance
     from perrin.report import write_run
     from perrin.results import ClusterResult, Report, load_run
     from perrin.rotations import Similarity, axis_angle, kabsch, similarity
     from perrin.sampling import SamplingPlan, SamplingVerdict, judge_sampling, plan_sampling
-    from perrin.shapes import Cluster
+    from perrin.shapes import Cluster, point_group, rotation_group
     from perrin.simulate import add_noise, simulate_motion
+    from perrin.tensors import CoupledTensor, DiffusionTensor, coupled_tensor, diffusion_tensor
 
 __version__ = "0.1.0"
 
 __all__ = [
     "Cluster",
     "ClusterResult",
+    "CoupledTensor",
     "DegenerateClusterError",
     "DiffusionEstimate",
+    "DiffusionTensor",
     "IdentityWarning",
     "LagCurve",
     "NoiseFloor",
     "PrecisionWarning",
+    "QuaternionCovariance",
     "Report",
     "RigidMotion",
     "SamplingPlan",
@@ -68,7 +73,9 @@ __all__ = [
     "analyze",
     "axis_angle",
     "cluster_positions",
+    "coupled_tensor",
     "cramer_rao",
+    "diffusion_tensor",
     "estimate_diffusion",
     "find_clusters",
     "fit_gls",
@@ -83,9 +90,12 @@ __all__ = [
     "noise_floor",
     "orientation_correlation",
     "plan_sampling",
+    "point_group",
     "positions_table",
+    "quaternion_covariance",
     "read_tracks",
     "remove_rotation",
+    "rotation_group",
     "similarity",
     "simulate_motion",
     "size_from_rotation",
@@ -107,7 +117,7 @@ _ROOMS = {
         "TrackTableError",
     ),
     "rotations": ("Similarity", "axis_angle", "kabsch", "similarity"),
-    "shapes": ("Cluster",),
+    "shapes": ("Cluster", "point_group", "rotation_group"),
     "noise": ("NoiseFloor", "noise_floor"),
     "motion": ("RigidMotion", "remove_rotation", "threshold_displacement", "track_rotation"),
     "grouping": ("cluster_positions", "find_clusters", "positions_table"),
@@ -121,8 +131,10 @@ _ROOMS = {
         "orientation_correlation",
         "van_hove",
     ),
+    "quaternions": ("QuaternionCovariance", "quaternion_covariance"),
     "diffusion": ("DiffusionEstimate", "estimate_diffusion"),
     "curve_fits": ("fit_gls", "fit_line"),
+    "tensors": ("CoupledTensor", "DiffusionTensor", "coupled_tensor", "diffusion_tensor"),
     "bounds": ("cramer_rao",),
     "sampling": ("SamplingPlan", "SamplingVerdict", "judge_sampling", "plan_sampling"),
     "hydrodynamics": ("Size", "size_from_rotation", "size_from_translation"),

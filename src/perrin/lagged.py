@@ -131,7 +131,7 @@ def msd(
         if dt is not None:
             raise ValueError("dt: a RigidMotion knows its own; leave dt out")
         motion, dt = motion_or_positions, motion_or_positions.dt
-        walks, piece = _on_grid(motion, motion.center[:, None])
+        walks, piece = on_grid(motion, motion.center[:, None])
     elif dt is None:
         raise ValueError("dt: the time between frames (s) is needed with positions")
     else:
@@ -170,7 +170,7 @@ def msad(motion: RigidMotion, *, directions: ArrayLike | None = None) -> LagCurv
     1.0
     """
     p = _directions(motion, directions)
-    phi, piece = _on_grid(motion, motion.rotational_displacement(p))
+    phi, piece = on_grid(motion, motion.rotational_displacement(p))
     planar = phi.shape[2] == 1
     # Averaging directions p weighs a rotation vector w by |w|^2 - <(w.p)^2>.
     unit = p / np.linalg.norm(p, axis=1, keepdims=True)
@@ -211,7 +211,7 @@ def msad_vector(motion: RigidMotion, *, threshold: float = 0.0) -> LagCurve:
     1.0
     """
     angles = threshold_displacement(motion, threshold=threshold)
-    walk, piece = _on_grid(motion, angles[:, None])
+    walk, piece = on_grid(motion, angles[:, None])
     dof = walk.shape[2]
     return _curve(walk, piece, dt=motion.dt, quantity="rotation", dof=dof, independent=float(dof))
 
@@ -248,7 +248,7 @@ def msad_axes(motion: RigidMotion, *, axes: ArrayLike | None = None) -> tuple[La
     >>> print(fit_line(along))
     D_R = 0.00501(9) rad^2/s [line, 20000 frames]
     """
-    walk, piece = _on_grid(motion, motion.accumulated_rotation(axes="body")[:, None])
+    walk, piece = on_grid(motion, motion.accumulated_rotation(axes="body")[:, None])
     if walk.shape[2] == 1:
         if axes is not None:
             raise ValueError("axes: a motion in the plane turns about one axis only")
@@ -298,7 +298,7 @@ def orientation_correlation(
         raise ValueError(f"degree: expected 1 or 2, got {degree!r}")
     if motion.template.shape[1] != 3:
         raise ValueError("orientation_correlation is for motions in three dimensions")
-    p, piece = _on_grid(motion, motion.orientation(_directions(motion, directions)))
+    p, piece = on_grid(motion, motion.orientation(_directions(motion, directions)))
     value, pairs = _mean_products(p if degree == 1 else _quadrupole(p), piece)
     return LagCurve(
         lagtime=np.arange(1, len(p), dtype=np.float64) * motion.dt,
@@ -442,7 +442,7 @@ def _displaced(motion: RigidMotion, *, lag: float, quantity: str) -> tuple[Float
     if quantity not in ("rotation", "translation"):
         raise ValueError(f'quantity: expected "rotation" or "translation", got {quantity!r}')
     walk = motion.accumulated_rotation() if quantity == "rotation" else motion.center
-    grid, piece = _on_grid(motion, walk)
+    grid, piece = on_grid(motion, walk)
     steps = round(lag / motion.dt)
     if abs(steps * motion.dt - lag) > 1e-3 * motion.dt or not 1 <= steps < len(grid):
         raise ValueError(
@@ -522,7 +522,7 @@ def _directions(motion: RigidMotion, directions: ArrayLike | None) -> Floats:
     return np.asarray(motion.template[length > 1e-6 * length.max()])
 
 
-def _on_grid(motion: RigidMotion, walks: Floats) -> tuple[Floats, Ints]:
+def on_grid(motion: RigidMotion, walks: Floats) -> tuple[Floats, Ints]:
     """Put walks (T, K, c) on the even grid of frames; frames without a row are missing."""
     step = (motion.time - motion.time[0]) / motion.dt
     row = np.rint(step).astype(np.int64)
@@ -645,7 +645,7 @@ def _quadrupole(p: Floats) -> Floats:
 def _mean_products(walks: Floats, piece: Ints) -> tuple[Floats, Ints]:
     """Return the mean dot product of walks (T, K, c) with themselves a lag apart, and the pairs."""
     length, K = walks.shape[:2]
-    size = _fast_size(2 * length)
+    size = fast_size(2 * length)
     sums, pairs = np.zeros(size // 2 + 1), np.zeros(size // 2 + 1)
     here = present(walks)
     for label in np.unique(piece):
@@ -674,7 +674,7 @@ def _square_sums(walks: Floats) -> tuple[Floats, Ints]:
     mask = here.astype(np.float64)
     mean = np.where(here[..., None], walks, 0.0).sum(0) / np.maximum(mask.sum(0), 1)[:, None]
     x = np.where(here[..., None], walks - mean, 0.0)
-    size = _fast_size(2 * length)
+    size = fast_size(2 * length)
     m = np.fft.rfft(mask, size, axis=0)[..., None]
     f, g = np.fft.rfft(x, size, axis=0), np.fft.rfft(x * x, size, axis=0)
     spectrum = 2 * np.real(np.conj(m) * g) - 2 * np.abs(f) ** 2
@@ -684,7 +684,7 @@ def _square_sums(walks: Floats) -> tuple[Floats, Ints]:
     return np.maximum(sums, 0.0), np.rint(counts).astype(np.int64)
 
 
-def _fast_size(least: int) -> int:
+def fast_size(least: int) -> int:
     """Return the smallest 2^a 3^b 5^c that is at least `least`: such transforms are fast."""
     best = 1 << (least - 1).bit_length()
     five = 1

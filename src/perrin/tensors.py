@@ -1,0 +1,789 @@
+"""How it diffuses in each direction: tensors of rotation, translation and both, in body axes."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal, NamedTuple
+
+import numpy as np
+
+from perrin._arrays import Bools, Floats, PrecisionWarning, TooFewFramesError, frozen
+from perrin.diffusion import UNITS, with_error
+from perrin.motion import RigidMotion, degrees_of_freedom
+from perrin.noise import orientation_covariance
+from perrin.rotations import exp_map, kabsch, skew
+from perrin.shapes import point_group, symmetry_elements
+from perrin.tensor_likelihood import (
+    Maximum,
+    Source,
+    VectorSteps,
+    axial,
+    maximise,
+    spread,
+    squares,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import ArrayLike
+
+    from perrin.steps import Quantity
+
+# Elements of a symmetric matrix in the order of `DiffusionTensor.covariance`.
+_ELEMENTS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+
+# An axis that an error of one standard deviation turns by more than this (degrees) is not known.
+_KNOWN_AXIS = 20.0
+
+# The error in degrees of the axes of equal values: any direction of their plane will do.
+_EQUAL = 45.0
+
+# Noise this far below a step (variance) is none: simulated truth, whose residuals are rounding.
+_NOISELESS = 1e-12
+
+_NO_ERRORS = "no errors are known: a value lies on its edge, 0; take longer tracks or longer steps"
+
+# Values are told apart at this level.
+_LEVEL = 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class DiffusionTensor:
+    """A diffusion tensor in body axes: those of the (first) motion's template.
+
+    Attributes
+    ----------
+    tensor : ndarray, shape (3, 3)
+        rad^2/s or um^2/s.
+    principal_values : ndarray, shape (3,)
+        Rising. Sorted values of an isotropic body differ by their errors alone: read them with
+        `p_isotropic`, `p_axial` and `resolved_axes`.
+    axes : ndarray, shape (3, 3)
+        Column a is the body axis of principal value a; right-handed.
+    stderr : ndarray, shape (3,)
+        Standard errors of the principal values.
+    p_isotropic : float
+        Probability of data this anisotropic if all three values were equal (likelihood ratio,
+        chi-squared with 5 degrees of freedom).
+    p_axial : float
+        The same if two values were equal, about any axis (2 degrees of freedom).
+    covariance : ndarray, shape (6, 6)
+        Of the elements xx, yy, zz, xy, xz, yz.
+    axis_errors : ndarray, shape (3, 3)
+        How far, in degrees, one standard error turns axes a and b in their common plane; 45 where
+        symmetry makes their values equal, 0 where it fixes the axes.
+    symmetry : str
+        The point group whose symmetry the tensor was given; "C_1" for none.
+    offset : ndarray, shape (3, 3)
+        Noise of one frame less blur, rad^2 or um^2, body axes, mean over frames and motions.
+    quantity : {"rotation", "translation"}
+    unit : str
+    n_frames : int
+        Frames with a pose, of all motions.
+    """
+
+    tensor: Floats
+    principal_values: Floats
+    axes: Floats
+    stderr: Floats
+    p_isotropic: float
+    p_axial: float
+    covariance: Floats
+    axis_errors: Floats
+    symmetry: str
+    offset: Floats
+    quantity: Quantity
+    unit: str
+    n_frames: int
+
+    def __post_init__(self) -> None:
+        frozen(self.tensor, self.principal_values, self.axes, self.stderr, self.covariance)
+        frozen(self.axis_errors, self.offset)
+
+    @property
+    def mean(self) -> float:
+        """A third of the trace."""
+        return float(np.trace(self.tensor)) / 3
+
+    @property
+    def mean_stderr(self) -> float:
+        """Standard error of the mean."""
+        return float(np.sqrt(self.covariance[:3, :3].sum())) / 3
+
+    @property
+    def resolved_axes(self) -> Bools:
+        """Which axes (3,) are known.
+
+        Those that symmetry fixes, and those whose values the tests tell apart (p < 0.05) and whose
+        errors are below 20 degrees in both planes that they lie in. Errors alone would not do:
+        sorted values keep a distance that makes the axes of an isotropic body look known.
+        """
+        known = self.axis_errors < _KNOWN_AXIS if self.p_isotropic < _LEVEL else np.eye(3) > 0
+        near = 0 if np.diff(self.principal_values).argmin() == 0 else 1
+        if self.p_axial >= _LEVEL:
+            known[near, near + 1] = known[near + 1, near] = False
+        return np.asarray((known | (self.axis_errors == 0)).all(axis=1))
+
+    def along(self, direction: ArrayLike) -> tuple[float, float]:
+        """Return the coefficient along, or about, a body direction, and its standard error.
+
+        Free of the bias of sorted values: the direction is chosen beforehand.
+
+        Parameters
+        ----------
+        direction : array_like, shape (3,)
+            Body axes, any length but zero.
+        """
+        p = np.asarray(direction, dtype=np.float64)
+        if p.shape != (3,) or not 0 < np.linalg.norm(p) < np.inf:
+            raise ValueError(f"direction: expected 3 numbers, not all zero, got {direction!r}")
+        p = p / np.linalg.norm(p)
+        weight = np.array([p[i] * p[j] * (1 + (i != j)) for i, j in _ELEMENTS])
+        return float(p @ self.tensor @ p), float(np.sqrt(weight @ self.covariance @ weight))
+
+    def __str__(self) -> str:
+        name = "D_R" if self.quantity == "rotation" else "D_T"
+        pairs = zip(self.principal_values, self.stderr, strict=True)
+        values = ", ".join(with_error(value, stderr) for value, stderr in pairs)
+        return (
+            f"{name} = {values} {self.unit} [{self.n_frames} frames, symmetry {self.symmetry}]\n"
+            f"mean {with_error(self.mean, self.mean_stderr)}, "
+            f"isotropic: {_probability(self.p_isotropic)}, "
+            f"axial: {_probability(self.p_axial)}\n"
+            f"{self._statement()}"
+        )
+
+    def _statement(self) -> str:
+        """Say which axes are known."""
+        if np.isnan(self.stderr).any():
+            return _NO_ERRORS
+        known = np.flatnonzero(self.resolved_axes)
+        worst = self.axis_errors.max(axis=1)
+        equal = (self.axis_errors == _EQUAL).any() and self.symmetry != "C_1"
+        if known.size == 3:
+            return "axes known to " + ", ".join(f"{w:.0f}" for w in worst) + " degrees"
+        if known.size == 1:
+            a, b = (k + 1 for k in range(3) if k != known[0])
+            why = f"are equal by symmetry {self.symmetry}" if equal else "cannot be told apart"
+            return (
+                f"values {a} and {b} {why}: the plane of their axes is known, not the axes; its "
+                f"normal, axis {known[0] + 1}, to {worst[known[0]]:.0f} degrees"
+            )
+        if equal:
+            return f"the values are equal by symmetry {self.symmetry}: read the mean"
+        return "the axes cannot be told apart: read the mean, not the three sorted values"
+
+
+def _probability(p: float) -> str:
+    return f"p = {p:.2g}" if p >= 1e-6 else "p < 1e-6"
+
+
+@dataclass(frozen=True, eq=False)
+class CoupledTensor:
+    """The 6 x 6 tensor of translation, rotation and their coupling, in body axes.
+
+    Attributes
+    ----------
+    tensor : ndarray, shape (6, 6)
+        Translation first: um^2/s, um rad/s, rad^2/s.
+    stderr : ndarray, shape (6, 6)
+        Standard errors of the elements; where the point was estimated, its error included.
+    point : ndarray, shape (3,)
+        The point of the body whose translation this is, from the centre of the template, um.
+    n_frames : int
+        Frames with a pose.
+    """
+
+    tensor: Floats
+    stderr: Floats
+    point: Floats
+    n_frames: int
+
+    def __post_init__(self) -> None:
+        frozen(self.tensor, self.stderr, self.point)
+
+    @property
+    def D_T(self) -> Floats:
+        """Translation, (3, 3), um^2/s."""
+        return self.tensor[:3, :3]
+
+    @property
+    def D_R(self) -> Floats:
+        """Rotation, (3, 3), rad^2/s; the same for every point."""
+        return self.tensor[3:, 3:]
+
+    @property
+    def D_C(self) -> Floats:
+        """Coupling, (3, 3), um rad/s: row the translation, column the rotation."""
+        return self.tensor[:3, 3:]
+
+
+def diffusion_tensor(
+    motion: RigidMotion | Sequence[RigidMotion],
+    *,
+    quantity: Quantity = "rotation",
+    noise: Literal["joint", "residual"] | float = "joint",
+    exposure: float | None = None,
+    symmetry: str | None = None,
+) -> DiffusionTensor:
+    """Estimate the 3 x 3 tensor of rotation or translation in body axes by maximum likelihood.
+
+    Parameters
+    ----------
+    motion : RigidMotion or sequence of RigidMotion
+        In three dimensions. Several of like bodies, particles in the same order, are pooled: one
+        tensor, each with its own noise; their templates are turned onto the first.
+    quantity : {"rotation", "translation"}
+        From body-frame rotation vectors, or from the centre's displacements in the axes that the
+        body has half way through each step.
+    noise : {"joint", "residual"} or float
+        "joint": the noise is predicted from the template but for one amplitude, which is estimated
+        along with D. "residual": that amplitude is measured by the residuals of the rigid fit
+        (right only if all particles of a frame are seen at the same instant). A number: the
+        localisation error of one coordinate, um.
+    exposure : float, optional
+        Open fraction of dt, 0 to 1: motion blur is exposure/6. Default: unknown, estimated between
+        none and the largest possible. A stated exposure makes known noise worth having.
+    symmetry : str, optional
+        Schoenflies symbol of the point group that the tensor shares. Default: that of the template
+        within its error. "C_1" gives the tensor no symmetry. Another symbol is looked for with
+        growing tolerance, as real clusters of unequal spheres need.
+
+    Returns
+    -------
+    DiffusionTensor
+        The p-values are those of the fit without symmetry: they also say whether the data agree
+        with a symmetry that makes values equal.
+
+    Raises
+    ------
+    ValueError
+        For planar motions, unknown choices, bodies that differ, a symmetry that the template has
+        not, or steps that hold too little.
+    TooFewFramesError
+        Fewer than 12 steps in all.
+
+    Warns
+    -----
+    PrecisionWarning
+        If a value lies on its edge, 0; errors are then NaN.
+
+    Notes
+    -----
+    Steps of length t have covariance 2 D t + O + O' and -O' with the next one, O = s C - 2 B dt D
+    with C the covariance of a pose and B the blur (a block tridiagonal likelihood; a gap is one
+    longer step). Errors are from the observed information with noise and blur left free.
+
+    Examples
+    --------
+    >>> from perrin import Cluster, add_noise, simulate_motion, track_rotation
+    >>> body = Cluster.from_positions([[0, 0, 0], [3, 0, 0], [0, 2, 0], [0, 0, 1]])
+    >>> truth = simulate_motion(body, D_R=[1e-3, 2e-3, 6e-3], dt=1.0, n_frames=1000, rng=1)
+    >>> x = add_noise(truth.positions(), sigma=0.02, rng=2)
+    >>> print(diffusion_tensor(track_rotation(x, dt=1.0)))
+    D_R = 0.00100(8), 0.00208(13), 0.0058(4) rad^2/s [1000 frames, symmetry C_1]
+    mean 0.00297(15), isotropic: p < 1e-6, axial: p < 1e-6
+    axes known to 3, 3, 2 degrees
+    """
+    motions = [motion] if isinstance(motion, RigidMotion) else list(motion)
+    _check_choices(motions, quantity=quantity, noise=noise, exposure=exposure)
+    turns = _alignments(motions)
+    symbol, basis = _symmetry(motions[0], symmetry)
+    vectors = [_vectors(m, quantity, turn) for m, turn in zip(motions, turns, strict=True)]
+    data = _collected(motions, vectors, noise=noise, exposure=exposure)
+    free = data.fit(_symmetric_basis(3))
+    p_isotropic, p_axial = _tests(data, free)
+    best = free if len(basis) == 6 else data.fit(basis, near=free)
+    tensor = data.in_units(best.D)
+    covariance = data.covariance(best, basis, _ELEMENTS)
+    if np.isnan(covariance).any():
+        warnings.warn(f"diffusion_tensor: {_NO_ERRORS}", PrecisionWarning, stacklevel=2)
+    values, axes = np.linalg.eigh(tensor)
+    values = np.maximum(values, 0.0)  # the tensor is a square: below 0 is rounding
+    axes = axes * np.sign(np.linalg.det(axes))
+    return DiffusionTensor(
+        tensor=tensor,
+        principal_values=values,
+        axes=axes,
+        stderr=np.sqrt([_variance(covariance, a, a) for a in axes.T]),
+        p_isotropic=p_isotropic,
+        p_axial=p_axial,
+        covariance=covariance,
+        axis_errors=_axis_errors(values, axes, covariance),
+        symmetry=symbol,
+        offset=data.mean_noise(best),
+        quantity=quantity,
+        unit=UNITS[quantity],
+        n_frames=sum(m.fitted.size for m in motions),
+    )
+
+
+def coupled_tensor(
+    motion: RigidMotion, *, point: Literal["diffusion", "centroid"] | ArrayLike = "diffusion"
+) -> CoupledTensor:
+    """Estimate the 6 x 6 tensor of translation, rotation and their coupling in body axes.
+
+    Parameters
+    ----------
+    motion : RigidMotion
+        In three dimensions.
+    point : {"diffusion", "centroid"} or array_like, shape (3,)
+        Whose translation: the centre of diffusion (where the coupling is symmetric), the centre
+        of the template, or a point of the body in template axes, um.
+
+    Returns
+    -------
+    CoupledTensor
+
+    Raises
+    ------
+    ValueError
+        For planar motions, an unknown point, or steps that hold too little.
+    TooFewFramesError
+        Fewer than 50 steps.
+
+    Notes
+    -----
+    The steps are the SE(3) logarithms of g_k^-1 g_{k+1}, in the likelihood of `diffusion_tensor`
+    with noise of its own for centre and orientation, uncorrelated as they are at the centroid for
+    localisation errors alike in all axes, and blur unknown. From the centroid to a point r of the
+    body, with the coupling C of row translation and column rotation and [r] u = r x u:
+    D_R' = D_R, C' = C - [r] D_R, D_T' = D_T - [r] C^T + C [r] - [r] D_R [r]. The coupling is
+    symmetric at the r that solves (tr(D_R) - D_R) r = v, where C - C^T = [v].
+
+    Examples
+    --------
+    >>> from perrin import Cluster, simulate_motion
+    >>> truth = simulate_motion(
+    ...     Cluster.tetrahedron(1.5), D_R=5e-3, D_T=0.04, dt=0.7, n_frames=2000, rng=1
+    ... )
+    >>> coupled = coupled_tensor(truth, point="centroid")
+    >>> bool(abs(coupled.D_C / coupled.stderr[:3, 3:]).max() < 4)
+    True
+    """
+    _check_choices([motion], quantity="rotation", noise="joint", exposure=None, needed=50)
+    place = _place(point)
+    data = _collected([motion], [_screws(motion)], noise="joint", exposure=None)
+    basis = _symmetric_basis(6)
+    best = data.fit(basis)
+    elements = [(i, j) for i in range(6) for j in range(i + 1)]
+    tensor, covariance = data.in_units(best.D), data.covariance(best, basis, elements)
+    where = diffusion_center(tensor) if place is None else place
+    return CoupledTensor(
+        tensor=shifted(tensor, where),
+        stderr=_shifted_errors(tensor, covariance, place),
+        point=where,
+        n_frames=int(motion.fitted.size),
+    )
+
+
+def shifted(tensor: Floats, point: ArrayLike) -> Floats:
+    """Move a coupled tensor (6, 6) to a point r of the body: u' = u + omega x r for every motion.
+
+    Parameters
+    ----------
+    tensor : ndarray, shape (6, 6)
+        Translation first.
+    point : array_like, shape (3,)
+        From the present point, um, body axes.
+
+    Examples
+    --------
+    >>> shifted(np.diag([1.0, 1, 1, 1, 1, 1]), [0, 0, 2.0]).diagonal()
+    array([5., 5., 1., 1., 1., 1.])
+    """
+    move = np.eye(6)
+    move[:3, 3:] = -skew(np.asarray(point, dtype=np.float64))
+    moved: Floats = move @ tensor @ move.T
+    return moved
+
+
+def diffusion_center(tensor: Floats) -> Floats:
+    """Return the centre of diffusion (3,) of a coupled tensor from its present point, um.
+
+    There the coupling is symmetric.
+
+    Examples
+    --------
+    >>> away = shifted(np.diag([1.0, 1, 1, 1, 2, 3]), [0.5, 0, 1])
+    >>> diffusion_center(away).round(12) + 0.0
+    array([-0.5,  0. , -1. ])
+    """
+    rotation, coupling = tensor[3:, 3:], tensor[:3, 3:]
+    odd = coupling - coupling.T
+    v = np.array([odd[2, 1], odd[0, 2], odd[1, 0]])
+    center: Floats = np.linalg.solve(np.trace(rotation) * np.eye(3) - rotation, v)
+    return center
+
+
+def _check_choices(
+    motions: Sequence[RigidMotion],
+    *,
+    quantity: str,
+    noise: str | float,
+    exposure: float | None,
+    needed: int = 12,
+) -> None:
+    """Refuse what is not offered, all faults at once, and motions that are too short."""
+    faults = []
+    if quantity not in UNITS:
+        faults.append(f"quantity: expected {' or '.join(map(repr, UNITS))}, got {quantity!r}")
+    if not _is_noise(noise):
+        faults.append(
+            f"noise: expected 'joint', 'residual' or a number > 0 (sigma in um), got {noise!r}"
+        )
+    if exposure is not None and not (np.ndim(exposure) == 0 and 0 <= exposure <= 1):
+        faults.append(f"exposure: expected a fraction of dt from 0 to 1, or None, got {exposure!r}")
+    if not motions or any(m.template.shape[1] != 3 for m in motions):
+        faults.append(
+            "motion: expected one or more motions in three dimensions; in the plane there is one "
+            "angle and no tensor, see estimate_diffusion"
+        )
+    if faults:
+        raise ValueError("; ".join(faults))
+    count = sum(len(m.steps()[0]) for m in motions)
+    if count < needed:
+        raise TooFewFramesError(
+            f"{count} steps between poses: a tensor needs at least {needed}",
+            sum(m.fitted.size for m in motions),
+        )
+
+
+def _is_noise(noise: str | float) -> bool:
+    """Return whether this is one of the choices for the noise."""
+    if isinstance(noise, str):
+        return noise in ("joint", "residual")
+    return bool(np.ndim(noise) == 0 and np.isfinite(noise) and noise > 0)
+
+
+def _place(point: Literal["diffusion", "centroid"] | ArrayLike) -> Floats | None:
+    """Return the point asked for in body axes; None for the centre of diffusion."""
+    if isinstance(point, str) and point in ("diffusion", "centroid"):
+        return None if point == "diffusion" else np.zeros(3)
+    place = np.array(point, dtype=np.float64) if not isinstance(point, str) else np.empty(0)
+    if place.shape != (3,) or not np.isfinite(place).all():
+        raise ValueError(
+            f"point: expected 'diffusion', 'centroid' or 3 numbers (body axes, um), got {point!r}"
+        )
+    return place
+
+
+def _alignments(motions: Sequence[RigidMotion]) -> list[Floats]:
+    """Return the rotations that turn the templates onto the first; refuse bodies that differ."""
+    first = motions[0]
+    turns = []
+    for number, m in enumerate(motions):
+        if m.template.shape != first.template.shape:
+            raise ValueError(
+                f"motion {number} has {len(m.template)} particles and the first "
+                f"{len(first.template)}: a common tensor needs like bodies"
+            )
+        turn = kabsch(first.template, m.template) if number else np.eye(3)
+        apart = first.template - m.template @ turn.T
+        rms = float(np.sqrt((apart * apart).sum(axis=1).mean()))
+        allowed = 3 * max(first.sigma, m.sigma) + 1e-6 * first.R
+        if not rms <= allowed:
+            raise ValueError(
+                f"motion {number}: its particles lie {rms:.3g} um (rms) from those of the first "
+                f"body, more than {allowed:.3g} um (3 sigma): another body, or other labels"
+            )
+        turns.append(turn)
+    return turns
+
+
+def _symmetry(motion: RigidMotion, wanted: str | None) -> tuple[str, Floats]:
+    """Return the point group to impose and a basis (m, 3, 3) of the tensors that have it."""
+    if wanted == "C_1":
+        return "C_1", _symmetric_basis(3)
+    error = motion.sigma / np.sqrt(motion.fitted.size)
+    # Six errors of a template's coordinate, and what the noise inflates it by at second order.
+    tolerance = 6 * error + 2 * motion.sigma**2 / motion.R + 1e-6 * motion.R
+    if wanted is None:
+        symbol = point_group(motion.template, tolerance=tolerance)
+        return symbol, _invariant_basis(symmetry_elements(motion.template, tolerance))
+    seen = []
+    first, second = np.triu_indices(len(motion.template), 1)
+    gap = np.linalg.norm(motion.template[first] - motion.template[second], axis=1).min()
+    while tolerance <= 0.3 * gap:
+        symbol = point_group(motion.template, tolerance=tolerance)
+        if symbol == wanted:
+            return symbol, _invariant_basis(symmetry_elements(motion.template, tolerance))
+        seen.append(symbol)
+        tolerance *= 1.3
+    raise ValueError(
+        f"symmetry: the template is not {wanted!r} within 0.3 of its closest distance; it is "
+        f"{' or '.join(dict.fromkeys(seen)) or 'too noisy to tell'} (C_1 asks for no symmetry)"
+    )
+
+
+def _symmetric_basis(b: int) -> Floats:
+    """Return a basis of the symmetric matrices, orthonormal, (b (b + 1) / 2, b, b)."""
+    unit = np.eye(b)
+    pairs = zip(*np.tril_indices(b), strict=True)
+    return np.array(
+        [
+            (np.outer(unit[i], unit[j]) + np.outer(unit[j], unit[i])) / (2 if i == j else 2**0.5)
+            for i, j in pairs
+        ]
+    )
+
+
+def _invariant_basis(elements: Floats) -> Floats:
+    """Return an orthonormal basis of the symmetric matrices that a point group leaves alone."""
+    basis = _symmetric_basis(3)
+    mapped = np.einsum("gij,mjk,glk->mil", elements, basis, elements) / len(elements)
+    share, mix = np.linalg.eigh(np.einsum("mij,nij->mn", basis, mapped))
+    invariant: Floats = np.einsum("mn,mij->nij", mix[:, share > 0.5], basis)
+    return invariant
+
+
+class _Vectors(NamedTuple):
+    """VectorSteps (S, b) in body axes and the shapes (r, T, b, b) of the noise of every frame.
+
+    The shapes are for a localisation error of 1 um.
+    """
+
+    y: Floats
+    shapes: Floats
+
+
+def _localisation(motion: RigidMotion) -> float:
+    """Return the localisation error (um) that the motion's pose errors were computed with."""
+    return float(np.sqrt(np.mean(motion.noise**2)))
+
+
+def _vectors(motion: RigidMotion, quantity: Quantity, turn: Floats) -> _Vectors:
+    """Return the steps of a motion and their noise in the axes of the first template."""
+    start, stop = motion.steps()
+    theta = motion.step_vectors()[stop - 1]
+    if quantity == "rotation":
+        shape = turn @ _orientation_shape(motion) @ turn.T
+        return _Vectors(theta @ turn.T, shape[None])
+    middle = motion.rotation[start] @ exp_map(0.5 * theta)
+    jump = np.einsum("sji,sj->si", middle, motion.center[stop] - motion.center[start])
+    return _Vectors(jump @ turn.T, _center_shape(motion)[None])
+
+
+def _orientation_shape(motion: RigidMotion) -> Floats:
+    """Return the covariance of every orientation for a localisation error of 1 um, (T, 3, 3)."""
+    sigma = _localisation(motion)
+    if sigma > 0:
+        return motion.covariance / sigma**2
+    one = orientation_covariance(motion.template, np.eye(3))
+    return np.broadcast_to(one, motion.covariance.shape)
+
+
+def _center_shape(motion: RigidMotion) -> Floats:
+    """Return the covariance of every centre for a localisation error of 1 um, (T, 3, 3)."""
+    sigma, count = _localisation(motion), len(motion.template)
+    variance = (
+        motion.center_variance / sigma**2 if sigma > 0 else np.full(len(motion.time), 1 / count)
+    )
+    return np.asarray(variance[:, None, None] * np.eye(3))
+
+
+def _screws(motion: RigidMotion) -> _Vectors:
+    """Return SE(3) logarithms, translation first, and the noise of centre and orientation.
+
+    The translation is V^-1 R_k^T (x_{k+1} - x_k) with
+    V^-1 = 1 - [w]/2 + (1 - (a/2) cot(a/2)) [w]^2/a^2 for the rotation vector w of angle a.
+    """
+    start, stop = motion.steps()
+    w = motion.step_vectors()[stop - 1]
+    jump = np.einsum(
+        "sji,sj->si", motion.rotation[start], motion.center[stop] - motion.center[start]
+    )
+    half = 0.5 * np.linalg.norm(w, axis=1)
+    # (1 - h cot h) / (2h)^2 -> 1/12 (1 + h^2/15) at small h, where the quotient loses its digits.
+    small = half < 1e-3
+    h = np.where(small, 1.0, half)
+    factor = np.where(small, (1 + half**2 / 15) / 12, (1 - h / np.tan(h)) / (4 * h * h))
+    once = np.cross(w, jump)
+    u = jump - 0.5 * once + factor[:, None] * np.cross(w, once)
+    shapes = np.zeros((2, len(motion.time), 6, 6))
+    shapes[0, :, :3, :3] = _center_shape(motion)
+    shapes[1, :, 3:, 3:] = _orientation_shape(motion)
+    return _Vectors(np.concatenate([u, w], axis=1), shapes)
+
+
+@dataclass(frozen=True, eq=False)
+class _Data:
+    """VectorSteps of all motions in units of their own size, so that all numbers are of order 1.
+
+    Attributes
+    ----------
+    sources : list of Source
+    scale : ndarray, shape (b,)
+        Unit of each component of a step.
+    time : float
+        Unit of time, s.
+    """
+
+    sources: list[Source]
+    scale: Floats
+    time: float
+
+    def fit(self, basis: Floats, near: Maximum | None = None) -> Maximum:
+        """Return the best tensor >= 0 in the span of a basis."""
+        D = self._first_guess() if near is None else near.D
+        own = np.array([s.start() for s in self.sources]) if near is None else near.own
+        values, axes = np.linalg.eigh(D)
+        root = (axes * np.sqrt(np.maximum(values, 1e-3 * values[-1]))) @ axes.T
+        q = np.einsum("mij,ij->m", basis, root)
+        return maximise(self.sources, squares(basis), q, own)
+
+    def fit_axial(self, near: Maximum) -> Maximum:
+        """Return the best tensor with two values equal, about any axis."""
+        values, axes = np.linalg.eigh(near.D)
+        values = np.maximum(values, 1e-3 * values[-1])
+        found = []
+        for k, others in ((0, [1, 2]), (2, [0, 1])):
+            q = np.array([values[others].mean(), values[k], 0.0, 0.0]) ** [0.5, 0.5, 1, 1]
+            found.append(maximise(self.sources, axial(axes[:, k]), q, near.own))
+        return max(found, key=lambda m: m.value)
+
+    def _first_guess(self) -> Floats:
+        """Return D from the covariance of steps and of neighbours, kept positive."""
+        duration = sum(float(s.steps.tau.sum()) for s in self.sources)
+        now = np.sum([s.steps.y.T @ s.steps.y for s in self.sources], axis=0) / duration
+        beside = np.sum([_neighbours(s.steps) for s in self.sources], axis=0) / duration
+        values, axes = np.linalg.eigh(0.5 * now + beside)
+        floor = 0.05 * np.trace(now) / len(now)
+        guess: Floats = (axes * np.maximum(values, floor)) @ axes.T
+        return guess
+
+    def in_units(self, D: Floats) -> Floats:
+        """Return a tensor in um, rad and s."""
+        out: Floats = D * np.outer(self.scale, self.scale) / self.time
+        return out
+
+    def covariance(
+        self, best: Maximum, basis: Floats, elements: Sequence[tuple[int, int]]
+    ) -> Floats:
+        """Return the covariance of elements of D in um, rad and s; NaN where it is not known."""
+        directions, errors = spread(self.sources, best, basis)
+        slopes = np.array([[self.in_units(e)[i, j] for e in directions] for i, j in elements])
+        covariance: Floats = slopes @ errors @ slopes.T
+        return covariance
+
+    def mean_noise(self, best: Maximum) -> Floats:
+        """Return the noise of one frame less blur in um and rad, mean over motions."""
+        pairs = zip(self.sources, best.own, strict=True)
+        noise = np.mean([s.noise(best.D, own) for s, own in pairs], axis=0)
+        out: Floats = noise * np.outer(self.scale, self.scale)
+        return out
+
+
+def _neighbours(steps: VectorSteps) -> Floats:
+    """Return the summed products of neighbouring steps, symmetric."""
+    product = (steps.y[:-1] * steps.linked[:-1, None]).T @ steps.y[1:]
+    return 0.5 * (product + product.T)
+
+
+def _collected(
+    motions: Sequence[RigidMotion],
+    vectors: Sequence[_Vectors],
+    *,
+    noise: str | float,
+    exposure: float | None,
+) -> _Data:
+    """Bring the steps of all motions to their own units, and say what is known of their noise."""
+    y = np.concatenate([v.y for v in vectors])
+    scale = _scale(y)
+    time = float(np.mean([m.dt for m in motions]))
+    B = None if exposure is None else exposure / 6
+    sources = []
+    for m, v in zip(motions, vectors, strict=True):
+        shapes = v.shapes / np.outer(scale, scale)
+        # An amplitude of 1 is then noise as large as a step, in the three components it has.
+        size = np.nanmean(np.trace(shapes, axis1=2, axis2=3), axis=1) / 3
+        start, stop = m.steps()
+        shapes = shapes / size[:, None, None, None]
+        steps = VectorSteps(
+            y=v.y / scale,
+            tau=(m.time[stop] - m.time[start]) / time,
+            begin=shapes[:, start],
+            end=shapes[:, stop],
+            linked=np.append(start[1:] == stop[:-1], False),
+            dt=m.dt / time,
+        )
+        theta, weight = _known_noise(m, steps, noise=noise, size=size)
+        sources.append(Source(steps, theta, weight, B))
+    return _Data(sources, scale, time)
+
+
+def _scale(y: Floats) -> Floats:
+    """Return the root mean square component of each triple of a step."""
+    triple = np.sqrt((y.reshape(len(y), -1, 3) ** 2).mean(axis=(0, 2)))
+    if not triple.all():
+        raise ValueError("the body does not move at all: there is no tensor to estimate")
+    return np.repeat(triple, 3)
+
+
+def _known_noise(
+    motion: RigidMotion, steps: VectorSteps, *, noise: str | float, size: Floats
+) -> tuple[Floats, float]:
+    """Return the noise amplitudes and the degrees of freedom that they are known with."""
+    if noise == "joint":
+        # The neighbours' covariance is minus the noise; a little more keeps the start inside.
+        square = -np.trace(_neighbours(steps)) / steps.linked.sum() / steps.y.shape[1]
+        return np.full(len(size), max(float(square), 0.0) + 0.05), 0.0
+    if noise == "residual":
+        freedom = degrees_of_freedom(motion.n_present[motion.fitted], 3).sum()
+        freedom -= degrees_of_freedom(np.array(len(motion.template)), 3)
+        theta = motion.sigma**2 * size
+        return theta, float(freedom) if theta.min() > _NOISELESS else np.inf
+    return float(noise) ** 2 * size, np.inf
+
+
+def _tests(data: _Data, free: Maximum) -> tuple[float, float]:
+    """Return the p-values of isotropy and of axial symmetry from likelihood ratios."""
+    from scipy.special import chdtrc
+
+    def p_value(restricted: Maximum, freedom: int) -> float:
+        return float(chdtrc(freedom, max(2 * (free.value - restricted.value), 0.0)))
+
+    isotropic = data.fit(np.eye(3)[None] / 3**0.5, near=free)
+    return p_value(isotropic, 5), p_value(data.fit_axial(free), 2)
+
+
+def _variance(covariance: Floats, a: Floats, b: Floats) -> float:
+    """Return the variance of a.D.b from the covariance of the elements of D."""
+    weight = np.array([a[i] * b[j] + (a[j] * b[i] if i != j else 0.0) for i, j in _ELEMENTS])
+    return float(weight @ covariance @ weight)
+
+
+def _axis_errors(values: Floats, axes: Floats, covariance: Floats) -> Floats:
+    """Return by how many degrees one standard error of D_ab turns axes a and b.
+
+    The angle is half the one whose tangent is 2 D_ab/(D_a - D_b).
+    """
+    errors = np.zeros((3, 3))
+    rounding = 1e-9 * values[2]
+    for a, b in ((0, 1), (0, 2), (1, 2)):
+        variance = _variance(covariance, axes[:, a], axes[:, b])
+        apart = values[b] - values[a]
+        off = np.sqrt(variance) if not variance < rounding**2 else 0.0
+        angle = _EQUAL if apart <= rounding else np.degrees(0.5 * np.arctan2(2 * off, apart))
+        errors[a, b] = errors[b, a] = angle
+    return errors
+
+
+def _shifted_errors(tensor: Floats, covariance: Floats, place: Floats | None) -> Floats:
+    """Return the standard errors (6, 6) after the move, by central differences in the elements."""
+    lower = np.tril_indices(6)
+    sd = np.sqrt(np.diag(covariance))
+
+    def moved(element: int, change: float) -> Floats:
+        other = tensor.copy()
+        i, j = lower[0][element], lower[1][element]
+        other[i, j] += change
+        other[j, i] = other[i, j]
+        return shifted(other, diffusion_center(other) if place is None else place)
+
+    slopes = np.array([(moved(k, h) - moved(k, -h)) / (2 * h) for k, h in enumerate(1e-3 * sd)])
+    variance = np.einsum("kab,kl,lab->ab", slopes, covariance, slopes)
+    errors: Floats = np.sqrt(np.maximum(variance, 0.0))
+    return errors

@@ -1,0 +1,572 @@
+"""Diffusion tensors: the likelihood is what it claims, laws hold, planted tensors come back."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy.stats import multivariate_normal
+
+from perrin import (
+    Cluster,
+    PrecisionWarning,
+    TooFewFramesError,
+    add_noise,
+    coupled_tensor,
+    cramer_rao,
+    diffusion_tensor,
+    kabsch,
+    noise_floor,
+    simulate_motion,
+    track_rotation,
+)
+from perrin.rotations import exp_map, skew
+from perrin.tensor_likelihood import Source, VectorSteps, axial, maximise, spread, squares
+from perrin.tensors import diffusion_center, shifted
+
+SLANT = exp_map(np.array([0.4, -0.7, 0.3]))
+BODY = Cluster.from_positions(np.random.default_rng(5).normal(size=(6, 3)))
+SIGMA = 0.03 * BODY.R
+NOISE = float(np.trace(noise_floor(BODY, sigma=SIGMA).covariance)) / 3
+QUANTITIES = ("rotation", "translation")
+
+
+def planted(ratio=(1, 1.5, 3), snr=9.0):
+    """Return the tensor with this ratio of values along slanted axes, and this mean SNR."""
+    values = np.array(ratio) / np.mean(ratio) * snr * NOISE
+    return SLANT @ np.diag(values) @ SLANT.T
+
+
+def cloud(seed, n_frames=300, tensor=None, missing=0.0, **how):
+    """Return noisy positions (T, 6, 3) of the body."""
+    rng = np.random.default_rng([seed, 11])
+    tensor = planted(**how) if tensor is None else tensor
+    truth = simulate_motion(BODY, D_R=tensor, D_T=0.02, dt=1.0, n_frames=n_frames, rng=rng)
+    x = add_noise(truth.positions(), sigma=SIGMA, rng=rng)
+    x[1:-1][rng.random(n_frames - 2) < missing] = np.nan
+    return x
+
+
+def tracked(seed, **what):
+    return track_rotation(cloud(seed, **what), dt=1.0)
+
+
+def in_body(motion, tensor):
+    """Return a tensor given in the axes of BODY in those of the motion's template."""
+    turn = kabsch(motion.template, BODY.positions)
+    return turn @ tensor @ turn.T
+
+
+def spd(rng, b):
+    a = rng.normal(size=(b, b))
+    return a @ a.T / b + 0.3 * np.eye(b)
+
+
+def steps_of(seed, b=3, r=1, count=9, *, even=False, pieces=False):
+    """Return random steps: even ones, or with gaps, frames of different noise and two pieces."""
+    rng = np.random.default_rng(seed)
+    noise = np.array([[spd(rng, b) for _ in range(count + 1)] for _ in range(r)])
+    tau, linked = rng.integers(1, 4, count) * 0.7, np.arange(count) < count - 1
+    if even:
+        noise[:] = noise[:, :1]
+        tau[:] = 0.7
+    if pieces:
+        linked[count // 2] = False
+    begin, end = noise[:, :-1].copy(), noise[:, 1:].copy()
+    return VectorSteps(rng.normal(size=(count, b)), tau, begin, end, linked, 0.7)
+
+
+def dense_value(steps, D, theta, B):
+    """Return the log-density of the steps from their covariance written out."""
+    count, b = steps.y.shape
+    first = np.tensordot(theta, steps.begin, 1) - 2 * B * steps.dt * D
+    last = np.tensordot(theta, steps.end, 1) - 2 * B * steps.dt * D
+    cov = np.zeros((count, b, count, b))
+    for i in range(count):
+        cov[i, :, i] = 2 * D * steps.tau[i] + first[i] + last[i]
+        if steps.linked[i]:
+            cov[i, :, i + 1] = cov[i + 1, :, i] = -last[i]
+    normal = multivariate_normal(np.zeros(count * b), cov.reshape(count * b, -1))
+    return normal.logpdf(steps.y.ravel()) + 0.5 * count * b * np.log(2 * np.pi)
+
+
+# ---- the likelihood -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("b", "r"), [(3, 1), (6, 2)])
+@pytest.mark.parametrize("how", [{"even": True}, {}, {"pieces": True}])
+def test_the_likelihood_is_the_normal_density(b, r, how):
+    """Either kernel equals the dense normal density; on even steps they equal one another."""
+    steps = steps_of(1, b, r, **how)
+    rng = np.random.default_rng(2)
+    D, theta, B = spd(rng, b), rng.uniform(0.2, 0.5, r), 0.1
+    found = steps.by_bands(D, theta, B)
+    assert found.value == pytest.approx(dense_value(steps, D, theta, B), abs=1e-10)
+    assert steps.even == bool(how.get("even"))
+    if steps.even:
+        quick = steps.by_sines(D, theta, B)
+        for one, other in zip(quick, found, strict=True):
+            np.testing.assert_allclose(one, other, rtol=1e-11, atol=1e-11)
+
+
+@pytest.mark.parametrize("how", [{"even": True}, {"pieces": True}])
+def test_the_slopes_are_those_of_the_likelihood(how):
+    """Derivatives by D, by the noise and by the blur equal central differences."""
+    steps = steps_of(3, r=2, **how)
+    rng = np.random.default_rng(4)
+    D, theta, B, h = spd(rng, 3), np.array([0.3, 0.4]), 0.1, 1e-6
+    found = steps.slopes(D, theta, B)
+    to = spd(rng, 3)
+
+    def rise(dD=0.0, dtheta=0.0, dB=0.0):
+        ends = [steps.slopes(D + s * dD, theta + s * dtheta, B + s * dB).value for s in (h, -h)]
+        return (ends[0] - ends[1]) / (2 * h)
+
+    assert np.sum(found.D * to) == pytest.approx(rise(dD=to), rel=1e-6, abs=1e-6)
+    for k in range(2):
+        assert found.theta[k] == pytest.approx(rise(dtheta=np.eye(2)[k]), rel=1e-6, abs=1e-6)
+    assert pytest.approx(rise(dB=1.0), rel=1e-6, abs=1e-6) == found.B
+
+
+def test_a_covariance_that_is_none_has_no_likelihood():
+    """Outside the positive definite both kernels say minus infinity."""
+    steps = steps_of(1, even=True)
+    for slopes in (steps.by_sines, steps.by_bands):
+        assert slopes(-np.eye(3), np.array([0.1]), 0.0).value == -np.inf
+        assert slopes(np.diag([1.0, 1, -0.1]), np.array([0.1]), 0.0).value == -np.inf
+
+
+@pytest.mark.parametrize("weight", [0.0, 50.0, np.inf])
+@pytest.mark.parametrize("B", [None, 0.1])
+def test_the_slopes_of_a_source_and_of_a_family(weight, B):
+    """With squares, angles and a measured amplitude the chain of derivatives holds."""
+    source = Source(steps_of(5, r=2, even=True), np.array([0.3, 0.2]), weight, B)
+    own, q, h = source.start() + 0.1, np.array([0.6, 0.9, 0.2, -0.1]), 1e-6
+    family = axial(SLANT[:, 0])
+
+    def value(p):
+        return source.slopes(family(p[:4])[0], p[4:])[0]
+
+    _, by_D, by_own = source.slopes(family(q)[0], own)
+    slopes = np.append(np.einsum("ab,kab->k", by_D, family(q)[1]), by_own)
+    p = np.append(q, own)
+    for k, step in enumerate(h * np.eye(len(p))):
+        rise = (value(p + step) - value(p - step)) / (2 * h)
+        assert slopes[k] == pytest.approx(rise, rel=1e-5, abs=1e-6)
+
+
+def test_the_maximum_and_its_spread_without_noise():
+    """Known absent noise: the best D is the mean square over 2 tau, its errors those of Wishart."""
+    rng = np.random.default_rng(6)
+    y = rng.normal(size=(400, 3)) @ np.diag([1.0, 1.5, 2.0])
+    zero = np.zeros((1, 400, 3, 3))
+    steps = VectorSteps(y, np.full(400, 0.5), zero, zero, np.arange(400) < 399, 0.5)
+    source = Source(steps, np.zeros(1), np.inf, 0.0)
+    basis = np.array([np.diag(e) for e in np.eye(3)])
+    best = maximise([source], squares(basis), np.ones(3), np.zeros((1, 0)))
+    expected = (y * y).mean(axis=0)
+    np.testing.assert_allclose(np.diag(best.D), expected, rtol=1e-8)
+    directions, covariance = spread([source], best, basis)
+    slopes = np.array([np.diag(e) for e in directions]).T
+    sd = np.sqrt(np.diag(slopes @ covariance @ slopes.T))
+    np.testing.assert_allclose(sd / expected, np.sqrt(2 / 400), rtol=1e-5)
+
+
+# ---- laws ---------------------------------------------------------------------------------------
+
+
+def same(found, expected, tensor):
+    """Say that a result has this tensor and otherwise the same numbers, to 1e-6 of its size."""
+    size = np.trace(expected.tensor)
+    np.testing.assert_allclose(found.tensor, tensor, atol=1e-6 * size)
+    np.testing.assert_allclose(found.stderr, expected.stderr, rtol=1e-4)
+    assert found.p_axial == pytest.approx(expected.p_axial, rel=1e-4)
+    assert found.p_isotropic == pytest.approx(expected.p_isotropic, rel=1e-4)
+
+
+@pytest.mark.parametrize("quantity", QUANTITIES)
+@pytest.mark.parametrize("missing", [0.0, 0.1])
+def test_laws(quantity, missing):
+    """Turn and shift the lab, permute, reverse time, change units: the answer follows."""
+    x = cloud(1, missing=missing)
+    motion = track_rotation(x, dt=1.0)
+    found = diffusion_tensor(motion, quantity=quantity)
+    turn = exp_map(np.array([1.0, -0.5, 2.0]))
+    other = diffusion_tensor(track_rotation(x @ turn.T + 7, dt=1.0), quantity=quantity)
+    same(other, found, turn @ found.tensor @ turn.T)
+    other = diffusion_tensor(track_rotation(x[:, ::-1], dt=1.0), quantity=quantity)
+    same(other, found, found.tensor)
+    back = track_rotation(x[::-1], dt=1.0)
+    first = kabsch(back.template, motion.template)
+    same(diffusion_tensor(back, quantity=quantity), found, first @ found.tensor @ first.T)
+    power = 1e-6 if quantity == "translation" else 1.0
+    units = diffusion_tensor(track_rotation(1e-3 * x, dt=60.0), quantity=quantity)
+    scaled = dataclasses.replace(found, tensor=found.tensor * power / 60)
+    scaled = dataclasses.replace(scaled, stderr=found.stderr * power / 60)
+    same(units, scaled, scaled.tensor)
+
+
+def test_answers_repeat_from_anywhere():
+    """The maximum does not depend on where the search starts: 1e-7 of the value."""
+    steps = steps_of(8, count=300, even=True)
+    y = np.random.default_rng(1).normal(size=(301, 3)) * 0.3
+    y = np.diff(y, axis=0) + np.random.default_rng(2).normal(size=(300, 3)) * [1, 1.2, 2]
+    steps = dataclasses.replace(steps, y=y)
+    source = Source(steps, np.array([0.1]), 0.0, None)
+    basis = np.array([np.diag(e) for e in np.eye(3)])
+    found = [
+        maximise([source], squares(basis), np.array(q), np.array([[t, 0.6]])).D
+        for q, t in (((1, 1, 1), 0.3), ((0.5, 2, 0.7), 0.05), ((3, 3, 3), 1.0))
+    ]
+    for other in found[1:]:
+        np.testing.assert_allclose(other, found[0], atol=1e-7 * np.trace(found[0]))
+
+
+def test_symmetry_is_taken_from_the_template_or_as_told():
+    """A trimer's tensor is axial, a tetrahedron's isotropic, an irregular body's anything."""
+    for cluster, symbol, rank in (
+        (Cluster.trimer(1.4), "D_3h", 2),
+        (Cluster.tetrahedron(1.5), "T_d", 1),
+        (BODY, "C_1", 3),
+    ):
+        truth = simulate_motion(cluster, D_R=5e-3, dt=1.0, n_frames=200, rng=1)
+        motion = track_rotation(add_noise(truth.positions(), sigma=0.03, rng=2), dt=1.0)
+        found = diffusion_tensor(motion)
+        assert found.symmetry == symbol
+        distinct = 1 + (np.diff(found.principal_values) > 1e-9 * found.mean).sum()
+        assert distinct == rank
+        loose = diffusion_tensor(motion, symmetry="C_1")
+        assert (np.diff(loose.principal_values) > 1e-6 * loose.mean).all()
+        assert found.p_isotropic == pytest.approx(loose.p_isotropic)
+        if rank == 2:
+            normal = np.linalg.svd(motion.template)[2][2]
+            assert abs(normal @ found.axes[:, found.resolved_axes]) == pytest.approx(1, abs=1e-4)
+            assert "equal by symmetry D_3h" in str(found)
+    with pytest.raises(ValueError, match=r"not 'T_d'.*it is C_1"):
+        diffusion_tensor(motion, symmetry="T_d")
+
+
+def test_unequal_spheres_take_the_symmetry_they_are_told():
+    """A tetrahedron that is 3 % off is C_1 by itself and T_d by order."""
+    off = np.random.default_rng(3).normal(size=(4, 3)) * 0.07
+    cluster = Cluster.from_positions(Cluster.touching(4, 2.45).positions + off)
+    truth = simulate_motion(cluster, D_R=5e-3, dt=1.0, n_frames=300, rng=1)
+    motion = track_rotation(add_noise(truth.positions(), sigma=0.03, rng=2), dt=1.0)
+    assert diffusion_tensor(motion).symmetry == "C_1"
+    told = diffusion_tensor(motion, symmetry="T_d")
+    np.testing.assert_allclose(told.tensor, told.mean * np.eye(3), atol=1e-12)
+
+
+def test_pools_share_the_tensor_and_keep_their_own_axes():
+    """Two halves pooled give nearly the whole; bodies turned in the lab are turned back."""
+    x = cloud(3, n_frames=600)
+    whole = diffusion_tensor(track_rotation(x, dt=1.0))
+    turn = exp_map(np.array([2.0, 1.0, -1.0]))
+    parts = [track_rotation(x[:300], dt=1.0), track_rotation(x[300:] @ turn.T, dt=1.0)]
+    pooled = diffusion_tensor(parts)
+    assert np.abs(pooled.tensor - whole.tensor).max() < 0.5 * whole.stderr.max()
+    np.testing.assert_allclose(pooled.stderr, whole.stderr, rtol=0.3)
+    assert pooled.n_frames == 600
+    twice = diffusion_tensor([parts[0], parts[0]])
+    once = diffusion_tensor(parts[0])
+    np.testing.assert_allclose(twice.tensor, once.tensor, atol=1e-6 * once.mean)
+    np.testing.assert_allclose(twice.stderr, once.stderr / 2**0.5, rtol=1e-4)
+
+
+def test_pools_refuse_other_bodies():
+    """Another number of particles, or other places, is refused with the numbers."""
+    one = tracked(1, n_frames=50)
+    relabelled = track_rotation(cloud(1, n_frames=50)[:, [1, 0, 2, 3, 4, 5]], dt=1.0)
+    with pytest.raises(ValueError, match=r"motion 1: its particles lie .* um .*other labels"):
+        diffusion_tensor([one, relabelled])
+    four = track_rotation(cloud(1, n_frames=50)[:, :4], dt=1.0)
+    with pytest.raises(ValueError, match="motion 1 has 4 particles and the first 6"):
+        diffusion_tensor([one, four])
+
+
+# ---- planted truth ------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def runs():
+    """Return z-scores of 40 tracks along the true axes: default and residual noise."""
+    out = {"joint": [], "residual": []}
+    truth = planted()
+    for seed in range(40):
+        motion = tracked(seed)
+        tensor = in_body(motion, truth)
+        values, axes = np.linalg.eigh(tensor)
+        for name, how in (("joint", {}), ("residual", {"noise": "residual", "exposure": 0.0})):
+            found = diffusion_tensor(motion, symmetry="C_1", **how)
+            along = np.array([found.along(axis) for axis in axes.T])
+            p = (found.p_isotropic, found.p_axial)
+            out[name].append([*(along[:, 0] / values), *(along[:, 1] / values), *p])
+    return {name: np.array(rows) for name, rows in out.items()}
+
+
+def test_planted_values_come_back_within_their_errors(runs):
+    """Along the true axes z-scores have mean 0 and spread 1, 120 values a route.
+
+    The default may be off by 0.35 of its error: where blur is unknown it cannot be less than none.
+    """
+    for name, bias in (("joint", 0.45), ("residual", 0.0)):
+        z = (runs[name][:, :3] - 1) / runs[name][:, 3:6]
+        assert np.all(np.abs(z.mean(axis=0)) < bias + 3 / 40**0.5)
+        assert 0.8 < z.std() < 1.25  # 1 +- 3/sqrt(2 120), and the bias
+
+
+def test_known_noise_reaches_the_bound_of_one_axis(runs):
+    """The spread is that of the Cramer-Rao bound of each axis, 9.0 % at N = 300, SNR 9 (+-11 %)."""
+    covariance = SLANT.T @ noise_floor(BODY, sigma=SIGMA).covariance @ SLANT
+    values = np.diag(SLANT.T @ planted() @ SLANT)
+    bound = [
+        cramer_rao(n_frames=300, snr=snr, axes=1, noise="known")
+        for snr in values / np.diag(covariance)
+    ]
+    spread_found = runs["residual"][:, :3].std(axis=0)
+    assert np.all(spread_found < 1.35 * np.array(bound))
+    np.testing.assert_allclose(runs["residual"][:, 3:6].mean(axis=0), bound, rtol=0.08)
+
+
+def test_anisotropy_is_seen(runs):
+    """1:1.5:3 is never taken for isotropic at N = 300, and seldom for axial."""
+    p = runs["joint"][:, 6:]
+    assert p[:, 0].max() < 1e-3
+    assert (p[:, 1] < 0.05).mean() > 0.55
+
+
+def test_isotropy_is_rejected_no_more_often_than_stated():
+    """At the 5 % level at most 8 % of tracks of an isotropic body (benchmarks/tensors.py: 7 %).
+
+    60 tracks: more than 10 rejections would have probability 1e-3 at 7 %.
+    """
+    p = [
+        diffusion_tensor(tracked(seed, ratio=(1, 1, 1), n_frames=200), symmetry="C_1").p_isotropic
+        for seed in range(60)
+    ]
+    assert np.sum(np.array(p) < 0.05) <= 10
+    assert 0.25 < np.median(p) < 0.75
+
+
+def test_missing_frames_and_blur_leave_the_mean_alone():
+    """10 % of frames missing, or a shutter open all the time: the mean D is right to 4 errors.
+
+    Ignored, blur would lower the mean by 20 % and gaps would raise it by 10 %.
+    """
+    ratio = []
+    for seed in range(12):
+        motion = tracked(seed, missing=0.1, n_frames=600)
+        ratio.append(diffusion_tensor(motion).mean / (np.trace(planted()) / 3))
+    assert np.mean(ratio) == pytest.approx(1, abs=4 * 0.06 / 12**0.5)
+    ratio = []
+    for seed in range(8):
+        truth = simulate_motion(BODY, D_R=planted(), dt=0.1, n_frames=6000, rng=seed)
+        x = truth.positions().reshape(600, 10, 6, 3).mean(axis=1)
+        motion = track_rotation(add_noise(x, sigma=SIGMA, rng=seed), dt=1.0)
+        ratio.append(diffusion_tensor(motion).mean / (np.trace(planted()) / 3))
+        stated = diffusion_tensor(motion, exposure=1.0)
+        assert stated.mean == pytest.approx(np.trace(planted()) / 3, rel=0.25)
+    assert np.mean(ratio) == pytest.approx(1, abs=4 * 0.06 / 8**0.5)
+
+
+def test_translation_of_an_anisotropic_body():
+    """Centres planted to move along and across a turning body give its tensor back."""
+    rng = np.random.default_rng(4)
+    truth = simulate_motion(BODY, D_R=planted(), dt=0.1, n_frames=30001, rng=rng)
+    planted_t = SLANT @ np.diag([0.01, 0.015, 0.03]) @ SLANT.T
+    jumps = rng.normal(size=(30000, 3)) @ np.linalg.cholesky(2 * planted_t * 0.1).T
+    lab = np.einsum("tij,tj->ti", truth.rotation[:-1], jumps)
+    x = truth.positions()
+    x[1:] += np.cumsum(lab, axis=0)[:, None]
+    motion = track_rotation(add_noise(x[::10], sigma=SIGMA, rng=rng), dt=1.0)
+    found = diffusion_tensor(motion, quantity="translation")
+    tensor = in_body(motion, planted_t)
+    values, axes = np.linalg.eigh(tensor)
+    for value, axis in zip(values, axes.T, strict=True):
+        measured, error = found.along(axis)
+        assert abs(measured - value) < 4 * error
+        assert error / value < 0.08
+    assert found.unit == "um^2/s"
+
+
+def test_what_is_said_of_the_axes():
+    """Near-degenerate values: the plane. Isotropic: the mean. Well apart: three axes."""
+    near = diffusion_tensor(tracked(1, ratio=(1, 1.05, 3)))
+    assert "values 1 and 2 cannot be told apart: the plane" in str(near)
+    assert near.resolved_axes.tolist() == [False, False, True]
+    even = diffusion_tensor(tracked(3, ratio=(1, 1, 1)), symmetry="C_1")
+    assert even.p_isotropic > 0.05
+    assert "read the mean, not the three sorted values" in str(even)
+    assert not even.resolved_axes.any()
+    wide = diffusion_tensor(tracked(1, ratio=(1, 3, 9), n_frames=1000))
+    assert wide.resolved_axes.all()
+    assert "axes known to" in str(wide)
+    truth = np.linalg.eigh(in_body(tracked(1, ratio=(1, 3, 9), n_frames=1000), planted((1, 3, 9))))
+    off = np.degrees(np.arccos(np.abs(np.sum(wide.axes * truth[1], axis=0))))
+    assert np.all(off < 4 * wide.axis_errors.max(axis=1))
+    assert np.linalg.det(wide.axes) == pytest.approx(1)
+
+
+# ---- coupling -----------------------------------------------------------------------------------
+
+
+def coupled_walk(tensor, *, n_frames, substeps, rng):
+    """Return rotations and positions of a body whose body-frame velocities have this tensor."""
+    root = np.linalg.cholesky(2 * tensor / substeps)
+    R, x = np.eye(3), np.zeros(3)
+    rotations, places = [R], [x]
+    noise = rng.normal(size=(n_frames - 1, substeps, 6)) @ root.T
+    turns = exp_map(noise[..., 3:])
+    middle = exp_map(0.5 * noise[..., 3:])
+    jumps = np.einsum("fsij,fsj->fsi", middle, noise[..., :3])
+    for turn, jump in zip(turns, jumps, strict=True):
+        for one, move in zip(turn, jump, strict=True):
+            x = x + R @ move
+            R = R @ one
+        rotations.append(R)
+        places.append(x)
+    return np.array(rotations), np.array(places)
+
+
+@pytest.fixture(scope="module")
+def coupled():
+    """Return a motion from a planted coupled walk of BODY, the tensor, a short part with gaps."""
+    rng = np.random.default_rng(8)
+    tensor = np.zeros((6, 6))
+    tensor[:3, :3] = SLANT @ np.diag([0.01, 0.012, 0.02]) @ SLANT.T
+    tensor[3:, 3:] = planted(snr=9)
+    tensor[3:, 3:] *= 4e-3 / np.trace(tensor[3:, 3:]) * 3
+    tensor[:3, 3:] = np.array([[1.0, 2, -1], [0.5, -1, 1], [2, 0, 1.5]]) * 8e-4
+    tensor[3:, :3] = tensor[:3, 3:].T
+    R, x = coupled_walk(tensor, n_frames=4000, substeps=4, rng=rng)
+    points = np.einsum("tij,nj->tni", R, BODY.positions) + x[:, None]
+    points = add_noise(points, sigma=SIGMA, rng=rng)
+    motion = track_rotation(points, dt=1.0)
+    both = np.kron(np.eye(2), kabsch(motion.template, BODY.positions))
+    points[1::10] = np.nan
+    return motion, both @ tensor @ both.T, track_rotation(points[:400], dt=1.0)
+
+
+def test_a_planted_coupled_tensor_comes_back(coupled):
+    """All 21 elements at the centroid: rms z between 0.6 and 1.5 (1 +- 3/sqrt(2 21))."""
+    motion, tensor, gapped = coupled
+    found = coupled_tensor(motion, point="centroid")
+    z = ((found.tensor - tensor) / found.stderr)[np.tril_indices(6)]
+    assert 0.6 < np.sqrt(np.mean(z**2)) < 1.5
+    assert np.abs(z).max() < 4
+    # The coupling is seen, and no noise is left in the diagonals (2 to 14 % if it were).
+    assert np.abs(found.D_C / found.stderr[:3, 3:]).max() > 5
+    short = coupled_tensor(gapped, point="centroid")
+    assert np.abs((short.tensor - tensor) / short.stderr).max() < 4
+    assert short.n_frames == 360
+    np.testing.assert_array_equal(found.point, 0)
+    np.testing.assert_array_equal(found.D_T, found.tensor[:3, :3])
+    np.testing.assert_array_equal(found.D_R, found.tensor[3:, 3:])
+
+
+def test_the_centre_of_diffusion(coupled):
+    """There the coupling is symmetric; the planted centre comes back, and points agree."""
+    motion, tensor, _ = coupled
+    found = coupled_tensor(motion)
+    np.testing.assert_allclose(found.D_C, found.D_C.T, atol=1e-12 * np.abs(found.tensor).max())
+    expected = diffusion_center(tensor)
+    assert np.linalg.norm(expected) > 0.05
+    assert np.linalg.norm(found.point - expected) < 0.35 * np.linalg.norm(expected)
+    z = (found.tensor - shifted(tensor, expected)) / found.stderr
+    assert np.abs(z).max() < 4
+    centroid = coupled_tensor(motion, point="centroid")
+    there = coupled_tensor(motion, point=found.point)
+    np.testing.assert_allclose(there.tensor, shifted(centroid.tensor, found.point), rtol=1e-10)
+    np.testing.assert_allclose(there.tensor, found.tensor, rtol=1e-10, atol=1e-15)
+
+
+def test_moving_the_point():
+    """Formulas of the shift, block by block; there and back; the centre found from anywhere."""
+    rng = np.random.default_rng(3)
+    tensor, r = spd(rng, 6), np.array([0.3, -1.0, 0.5])
+    moved, k = shifted(tensor, r), skew(r)
+    D_T, D_C, D_R = tensor[:3, :3], tensor[:3, 3:], tensor[3:, 3:]
+    np.testing.assert_allclose(moved[3:, 3:], D_R)
+    np.testing.assert_allclose(moved[:3, 3:], D_C - k @ D_R)
+    np.testing.assert_allclose(moved[:3, :3], D_T - k @ D_C.T + D_C @ k - k @ D_R @ k)
+    np.testing.assert_allclose(shifted(moved, -r), tensor, atol=1e-14)
+    center = diffusion_center(tensor)
+    np.testing.assert_allclose(diffusion_center(moved), center - r, atol=1e-13)
+    symmetric = shifted(tensor, center)[:3, 3:]
+    np.testing.assert_allclose(symmetric, symmetric.T, atol=1e-14)
+
+
+def test_the_search_takes_few_passes(monkeypatch):
+    """A tensor with errors and p-values: under 200 passes over the steps (35 ms for 300 frames)."""
+    passes = []
+    slopes = VectorSteps.slopes
+
+    def counted(self, D, theta, B):
+        passes.append(1)
+        return slopes(self, D, theta, B)
+
+    monkeypatch.setattr(VectorSteps, "slopes", counted)
+    for seed in range(5):
+        motion = tracked(seed)
+        passes.clear()
+        diffusion_tensor(motion)
+        assert len(passes) < 200
+
+
+# ---- at the door --------------------------------------------------------------------------------
+
+
+def test_what_cannot_be_answered_is_refused():
+    """All faults at once; planar motions; too few steps; a body at rest."""
+    motion = tracked(1, n_frames=60)
+    with pytest.raises(ValueError, match=r"quantity: .*; noise: .*; exposure: "):
+        diffusion_tensor(motion, quantity="heat", noise="none", exposure=1.5)
+    with pytest.raises(ValueError, match=r"noise: .*got -0\.1"):
+        diffusion_tensor(motion, noise=-0.1)
+    flat = simulate_motion(
+        Cluster.from_positions([[0, 0], [2, 0]]), D_R=0.1, dt=1, n_frames=30, rng=1
+    )
+    for estimate in (diffusion_tensor, coupled_tensor):
+        with pytest.raises(ValueError, match="in the plane there is one angle and no tensor"):
+            estimate(flat)
+    with pytest.raises(ValueError, match="expected one or more motions"):
+        diffusion_tensor([])
+    with pytest.raises(TooFewFramesError, match="9 steps between poses"):
+        diffusion_tensor(tracked(1, n_frames=10))
+    with pytest.raises(TooFewFramesError, match="at least 50"):
+        coupled_tensor(tracked(1, n_frames=40))
+    with pytest.raises(ValueError, match="point: expected"):
+        coupled_tensor(motion, point="middle")
+    still = simulate_motion(BODY, D_R=0.0, dt=1.0, n_frames=30, rng=1)
+    with pytest.raises(ValueError, match="does not move at all"):
+        diffusion_tensor(still)
+    with pytest.raises(ValueError, match="direction: expected 3 numbers"):
+        diffusion_tensor(motion).along([0, 0, 0])
+
+
+def test_a_value_on_its_edge_is_told():
+    """Noise that drowns the motion: a value of 0, errors NaN, and a warning that says so."""
+    motion = tracked(2, n_frames=40, snr=1e-4)
+    with pytest.warns(PrecisionWarning, match="a value lies on its edge"):
+        found = diffusion_tensor(motion)
+    assert found.principal_values[0] < 1e-6 * found.principal_values[2]
+    assert "no errors are known" in str(found)
+
+
+def test_truth_without_noise_is_served_by_every_option():
+    """Simulated truth (sigma 0, covariance 0) and its rounding give the planted tensor."""
+    truth = simulate_motion(BODY, D_R=planted(), D_T=0.02, dt=1.0, n_frames=2000, rng=1)
+    values, axes = np.linalg.eigh(planted())
+    for motion in (truth, track_rotation(truth.positions(), dt=1.0)):
+        for how in ({}, {"noise": "residual"}, {"noise": "residual", "exposure": 0.0}):
+            found = diffusion_tensor(motion, **how)
+            for value, axis in zip(values, axes.T, strict=True):
+                measured, error = found.along(axis)
+                assert abs(measured - value) < 4 * error
+
+
+def test_results_cannot_be_changed():
+    """Arrays of results are read-only."""
+    found = diffusion_tensor(tracked(1, n_frames=60))
+    for array in (found.tensor, found.axes, found.stderr, found.covariance, found.offset):
+        with pytest.raises(ValueError, match="read-only"):
+            array[0] = 1.0
