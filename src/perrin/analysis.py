@@ -29,6 +29,7 @@ from perrin.hydrodynamics import Size, size_from_rotation, size_from_translation
 from perrin.motion import RigidMotion, body_residuals, track_rotation
 from perrin.results import ClusterResult, Pooled, Report, floor_factor, predicted_noise
 from perrin.shapes import is_tetrahedron
+from perrin.tensors import DiffusionTensor, diffusion_tensor
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -284,6 +285,7 @@ def _measure(
     D_R, D_T = (conditions.estimate(motion, q) for q in ("rotation", "translation"))
     noise = predicted_noise(motion)
     sizes, said = _sizes(motion, D_R, D_T, conditions)
+    tensor, unfound = _tensor(motion, conditions)
     warnings = (
         *_missing(motion),
         *_softness(motion, positions, sigma),
@@ -292,9 +294,25 @@ def _measure(
         *(f"D_R: {text}" for text in D_R.warnings),
         *(f"D_T: {text}" for text in D_T.warnings),
         *_drift_told(D_T),
+        *unfound,
         *said,
     )
-    return ClusterResult(cluster, motion, D_R, D_T, None, noise, sizes, warnings, label)
+    return ClusterResult(cluster, motion, D_R, D_T, tensor, noise, sizes, warnings, label)
+
+
+def _tensor(
+    motion: RigidMotion, conditions: _Conditions
+) -> tuple[DiffusionTensor | None, list[str]]:
+    """Return the rotational tensor, or None and the reason; in the plane there is none."""
+    if motion.template.shape[1] != 3:
+        return None, []
+    try:
+        with python_warnings.catch_warnings():
+            python_warnings.simplefilter("ignore", PrecisionWarning)
+            tensor = diffusion_tensor(motion, noise=conditions.noise, exposure=conditions.exposure)
+    except ValueError as error:
+        return None, [f"no diffusion tensor: {error}"]
+    return tensor, []
 
 
 def _missing(motion: RigidMotion) -> list[str]:

@@ -228,6 +228,7 @@ def _section(
             for k, e in zip("RT", (result.D_R, result.D_T), strict=True)
         ],
         "facts": [*_noise_facts(result), *_body_facts(result)],
+        "tensor": _tensor(result),
         "sampling": _sampling(result),
         "sizes": _sizes(result),
         "no_sizes": _why_no_sizes(result, settings),
@@ -320,6 +321,28 @@ def _body_facts(result: ClusterResult) -> list[tuple[str, str, str]]:
         ("frames used", frames, f"one every {motion.dt:g} s"),
         ("particles", str(n), body),
     ]
+
+
+def _tensor(result: ClusterResult) -> dict[str, Any] | None:
+    """Return the rotational tensor in words: a line a principal axis, and how sure they are."""
+    tensor = result.tensor
+    if tensor is None:
+        return None
+    rows = [
+        (
+            k + 1,
+            f"{number_text(float(tensor.principal_values[k]), float(tensor.stderr[k]))} rad²/s",
+            ", ".join(f"{x:+.2f}" for x in tensor.axes[:, k]),
+        )
+        for k in range(3)
+    ]
+    chance = f"isotropic {number_text(tensor.p_isotropic)}, axial {number_text(tensor.p_axial)}"
+    return {
+        "rows": rows,
+        "symmetry": tensor.symmetry,
+        "chance": chance,
+        "statement": tensor.statement,
+    }
 
 
 def _sampling(result: ClusterResult) -> list[tuple[str, str]]:

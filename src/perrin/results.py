@@ -6,7 +6,7 @@ import json
 import os
 import shutil
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,6 +18,7 @@ from perrin.hydrodynamics import Size
 from perrin.lagged import LagCurve, msad, msd
 from perrin.motion import RigidMotion
 from perrin.noise import NoiseFloor, floor_of
+from perrin.tensors import DiffusionTensor
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -34,8 +35,8 @@ class ClusterResult:
     cluster : int
     motion : RigidMotion
     D_R, D_T : DiffusionEstimate
-    tensor : None
-        Room for the diffusion tensor.
+    tensor : DiffusionTensor or None
+        Of rotation, in body axes; None in the plane and where there are too few steps.
     noise : NoiseFloor
         Predicted from sigma and the shape.
     sizes : dict of Size or None
@@ -49,7 +50,7 @@ class ClusterResult:
     motion: RigidMotion
     D_R: DiffusionEstimate
     D_T: DiffusionEstimate
-    tensor: None
+    tensor: DiffusionTensor | None
     noise: NoiseFloor
     sizes: dict[str, Size] | None
     warnings: tuple[str, ...]
@@ -102,7 +103,7 @@ class ClusterResult:
             "sigma_xyz": None,
             "phi2": {"measured": _number(self.phi2_measured), "predicted": self.noise.phi2},
             "snr": _number(self.D_R.snr),
-            "tensor": None,
+            "tensor": None if self.tensor is None else _tensor_dict(self.tensor),
             "sizes": sizes,
             "size_factor": None if self.sizes is None else self.sizes["rotation"].factor,
             "warnings": list(self.warnings),
@@ -335,17 +336,45 @@ def _estimate_dict(estimate: DiffusionEstimate) -> dict[str, Any]:
 
 def _estimate_from(entry: dict[str, Any]) -> DiffusionEstimate:
     """Read back what `_estimate_dict` wrote."""
-    fields = dict(entry)
+    read = dict(entry)
     for name in ("ci68", "ci95"):
-        low, high = fields[name]
-        fields[name] = (low, np.inf if high is None else high)
-    fields["offset_stderr"] = np.nan if entry["offset_stderr"] is None else entry["offset_stderr"]
-    fields["snr"] = np.inf if entry["snr"] is None else entry["snr"]
-    fields["warnings"] = tuple(entry["warnings"])
+        low, high = read[name]
+        read[name] = (low, np.inf if high is None else high)
+    read["offset_stderr"] = np.nan if entry["offset_stderr"] is None else entry["offset_stderr"]
+    read["dt"] = np.nan if entry["dt"] is None else entry["dt"]
+    read["snr"] = np.inf if entry["snr"] is None else entry["snr"]
+    read["warnings"] = tuple(entry["warnings"])
     for name in ("drift", "drift_stderr"):
         if entry[name] is not None:
-            fields[name] = tuple(map(tuple, entry[name]))
-    return DiffusionEstimate(**fields)
+            read[name] = tuple(map(tuple, entry[name]))
+    return DiffusionEstimate(**read)
+
+
+_TENSOR_ARRAYS = (
+    "tensor", "principal_values", "axes", "stderr", "covariance", "axis_errors", "offset",
+)  # fmt: skip
+
+
+def _tensor_dict(tensor: DiffusionTensor) -> dict[str, Any]:
+    """Return a tensor for JSON; unknown errors as None. Column a of axes is axis a."""
+    entry = {f.name: getattr(tensor, f.name) for f in fields(tensor)}
+    for name in _TENSOR_ARRAYS:
+        array = entry[name].astype(object)
+        array[~np.isfinite(entry[name])] = None
+        entry[name] = array.tolist()
+    for name in ("p_isotropic", "p_axial"):
+        entry[name] = _number(entry[name])
+    return entry
+
+
+def _tensor_from(entry: dict[str, Any]) -> DiffusionTensor:
+    """Read back what `_tensor_dict` wrote."""
+    read = dict(entry)
+    for name in _TENSOR_ARRAYS:
+        read[name] = np.array(entry[name], dtype=np.float64)
+    for name in ("p_isotropic", "p_axial"):
+        read[name] = np.nan if entry[name] is None else entry[name]
+    return DiffusionTensor(**read)
 
 
 def _result_from(entry: dict[str, Any], motion: RigidMotion) -> ClusterResult:
@@ -367,7 +396,7 @@ def _result_from(entry: dict[str, Any], motion: RigidMotion) -> ClusterResult:
         motion=motion,
         D_R=_estimate_from(entry["D_R"]),
         D_T=_estimate_from(entry["D_T"]),
-        tensor=None,
+        tensor=None if entry["tensor"] is None else _tensor_from(entry["tensor"]),
         noise=predicted_noise(motion),
         sizes=sizes,
         warnings=tuple(entry["warnings"]),

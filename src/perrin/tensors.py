@@ -152,11 +152,12 @@ class DiffusionTensor:
             f"mean {with_error(self.mean, self.mean_stderr)}, "
             f"isotropic: {_probability(self.p_isotropic)}, "
             f"axial: {_probability(self.p_axial)}\n"
-            f"{self._statement()}"
+            f"{self.statement}"
         )
 
-    def _statement(self) -> str:
-        """Say which axes are known."""
+    @property
+    def statement(self) -> str:
+        """Which axes are known, in words: "the plane, not the axes" where two cannot be told apart."""
         if np.isnan(self.stderr).any():
             return _NO_ERRORS
         known = np.flatnonzero(self.resolved_axes)
@@ -432,7 +433,7 @@ def _check_choices(
         faults.append(f"quantity: expected {' or '.join(map(repr, UNITS))}, got {quantity!r}")
     if not _is_noise(noise):
         faults.append(
-            f"noise: expected 'joint', 'residual' or a number > 0 (sigma in um), got {noise!r}"
+            f"noise: expected 'joint', 'residual' or a number >= 0 (sigma in um), got {noise!r}"
         )
     if exposure is not None and not (np.ndim(exposure) == 0 and 0 <= exposure <= 1):
         faults.append(f"exposure: expected a fraction of dt from 0 to 1, or None, got {exposure!r}")
@@ -455,7 +456,7 @@ def _is_noise(noise: str | float) -> bool:
     """Return whether this is one of the choices for the noise."""
     if isinstance(noise, str):
         return noise in ("joint", "residual")
-    return bool(np.ndim(noise) == 0 and np.isfinite(noise) and noise > 0)
+    return bool(np.ndim(noise) == 0 and np.isfinite(noise) and noise >= 0)
 
 
 def _place(point: Literal["diffusion", "centroid"] | ArrayLike) -> Floats | None:
@@ -540,7 +541,7 @@ def _invariant_basis(elements: Floats) -> Floats:
 
 
 class _Vectors(NamedTuple):
-    """VectorSteps (S, b) in body axes and the shapes (r, T, b, b) of the noise of every frame.
+    """Steps (S, b) in body axes and the shapes (r, T, b, b) of the noise of every frame.
 
     The shapes are for a localisation error of 1 um.
     """
@@ -610,7 +611,7 @@ def _screws(motion: RigidMotion) -> _Vectors:
 
 @dataclass(frozen=True, eq=False)
 class _Data:
-    """VectorSteps of all motions in units of their own size, so that all numbers are of order 1.
+    """Steps of all motions in units of their own size, so that all numbers are of order 1.
 
     Attributes
     ----------
