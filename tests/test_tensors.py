@@ -1,6 +1,10 @@
 """Diffusion tensors: the likelihood is what it claims, laws hold, planted tensors come back."""
 
+import contextlib
 import dataclasses
+import io
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -510,6 +514,19 @@ def test_the_search_takes_few_passes(monkeypatch):
         passes.clear()
         diffusion_tensor(motion)
         assert len(passes) < 200
+
+
+def test_the_theory_page_prints_what_it_shows():
+    """Every piece of code in docs/theory/tensors.md prints the block below it."""
+    page = (Path(__file__).parents[1] / "docs" / "theory" / "tensors.md").read_text()
+    pieces = re.findall(r"```python\n(.*?)```\n```\n(.*?)```", page, re.DOTALL)
+    names = {}
+    for code, shown in pieces:
+        printed = io.StringIO()
+        with contextlib.redirect_stdout(printed):
+            exec(code, names)
+        assert printed.getvalue() == shown
+    assert len(pieces) == 6
 
 
 # ---- at the door --------------------------------------------------------------------------------
