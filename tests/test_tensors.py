@@ -530,10 +530,15 @@ def test_what_cannot_be_answered_is_refused():
             estimate(flat)
     with pytest.raises(ValueError, match="expected one or more motions"):
         diffusion_tensor([])
-    with pytest.raises(TooFewFramesError, match="9 steps between poses"):
+    with pytest.raises(TooFewFramesError, match=r"9 steps between poses.*12 in all"):
         diffusion_tensor(tracked(1, n_frames=10))
-    with pytest.raises(TooFewFramesError, match="at least 50"):
+    with pytest.raises(TooFewFramesError, match="needs 50 in all"):
         coupled_tensor(tracked(1, n_frames=40))
+    with pytest.raises(TooFewFramesError, match=r"at least 1 a motion.*2 of every motion"):
+        diffusion_tensor([motion, tracked(1, n_frames=2)])
+    truth = simulate_motion(BODY, D_R=planted(), dt=1.0, n_frames=60, rng=1)
+    with pytest.raises(ValueError, match="pool them apart"):
+        diffusion_tensor([motion, truth], noise="residual")
     with pytest.raises(ValueError, match="point: expected"):
         coupled_tensor(motion, point="middle")
     still = simulate_motion(BODY, D_R=0.0, dt=1.0, n_frames=30, rng=1)
@@ -550,6 +555,19 @@ def test_a_value_on_its_edge_is_told():
         found = diffusion_tensor(motion)
     assert found.principal_values[0] < 1e-6 * found.principal_values[2]
     assert "no errors are known" in str(found)
+    with pytest.warns(PrecisionWarning, match="coupled_tensor: no errors"):
+        found = coupled_tensor(tracked(2, n_frames=60, snr=1e-4), point="centroid")
+    assert np.isnan(found.stderr).all()
+
+
+def test_steps_that_share_no_frame():
+    """Pieces of one step each have no neighbours to show the noise; stated, it is taken off."""
+    motion = tracked(4, n_frames=1200)
+    apart = dataclasses.replace(motion, piece=np.arange(1200) // 2)
+    found = diffusion_tensor(apart, noise=SIGMA, exposure=0.0)
+    assert abs(found.mean - np.trace(planted()) / 3) < 4 * found.mean_stderr
+    joint = diffusion_tensor(apart)
+    assert joint.mean_stderr > found.mean_stderr
 
 
 def test_truth_without_noise_is_served_by_every_option():

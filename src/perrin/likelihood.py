@@ -167,7 +167,7 @@ def _modes(track: Track) -> Floats:
     power = dst(s.size, type=1, norm="ortho", axis=0) ** 2
     weight, known = track.weight[0][0], track.known[0][0]
     columns = []
-    for axes in _alike(weight, known):
+    for axes in _alike(np.stack([weight, known])):
         columns.append(
             np.stack(
                 [
@@ -182,11 +182,10 @@ def _modes(track: Track) -> Floats:
     return np.concatenate(columns, axis=1)
 
 
-def _alike(weight: Floats, known: Floats) -> list[Ints]:
-    """Group the axes that have the same noise, to rounding."""
-    noise = np.stack([weight, known])
+def _alike(noise: Floats) -> list[Ints]:
+    """Group the columns of (M, A) that are the same to rounding."""
     scale = 1e-9 * np.abs(noise).max(axis=1, keepdims=True)
-    free, found = np.arange(len(weight)), []
+    free, found = np.arange(noise.shape[1]), []
     while free.size:
         same = np.all(np.abs(noise[:, free] - noise[:, free[:1]]) <= scale, axis=0)
         found.append(free[same])
@@ -196,17 +195,21 @@ def _alike(weight: Floats, known: Floats) -> list[Ints]:
 
 @dataclass(frozen=True, eq=False)
 class _Tridiagonal:
-    """Any tracks: all axes stacked to one tridiagonal system, solved by LAPACK.
+    """Any tracks: their axes stacked to one tridiagonal system, solved by LAPACK.
 
-    The inverse of a tridiagonal matrix has the diagonal 1/(d + d' - a), with d and d' the pivots
-    of the elimination from above and from below, and Z_{i,i+1} = -l_i Z_{i+1,i+1}. With a free
-    mean velocity on each axis the likelihood is the restricted one.
+    Axes with the same noise are one block with several columns y (missing ones are 0; `count` says
+    how many there are). The inverse of a tridiagonal matrix has the diagonal 1/(d + d' - a), d and
+    d' being the pivots of the elimination from above and from below, and
+    Z_{i,i+1} = -l_i Z_{i+1,i+1}.
+    With a free mean velocity on each axis the likelihood is the restricted one.
     """
 
     groups: Ints
     starts: Ints
     which: Ints
     blocks: Ints
+    columns: tuple[tuple[int, Ints], ...]
+    count: Floats
     y: Floats
     tau: Floats
     linked: Floats
@@ -217,23 +220,34 @@ class _Tridiagonal:
 
     @classmethod
     def of(cls, tracks: Sequence[Track], groups: Sequence[int]) -> _Tridiagonal:
-        def stacked(part: Callable[[Track], Floats | Bools]) -> Floats:
-            columns = [np.broadcast_to(part(t).T, t.steps.size.T.shape).ravel() for t in tracks]
-            return np.asarray(np.concatenate(columns), dtype=np.float64)
+        blocks = [(i, axes) for i, t in enumerate(tracks) for axes in _same_noise(t)]
+        lengths = [len(tracks[i].steps.size) for i, _ in blocks]
+        starts = np.cumsum([0, *lengths[:-1]])
+        group = np.array([i for i, _ in blocks])
+        y = np.zeros((sum(lengths), max(len(axes) for _, axes in blocks)), order="F")
+        for start, length, (i, axes) in zip(starts, lengths, blocks, strict=True):
+            y[start : start + length, : len(axes)] = tracks[i].steps.size[:, axes]
 
-        sizes = [t.steps.size.size for t in tracks]
-        lengths = [len(t.steps.size) for t in tracks for _ in range(t.steps.size.shape[1])]
+        def noise(part: Callable[[Track], Floats]) -> Floats:
+            return np.concatenate([part(tracks[i])[:, axes[0]] for i, axes in blocks])
+
+        def stacked(part: Callable[[Track], Floats | Bools]) -> Floats:
+            rows = [part(tracks[i]) for i, _ in blocks]
+            return np.asarray(np.concatenate(rows), dtype=np.float64)
+
         return cls(
             groups=np.array(groups),
-            starts=np.cumsum([0, *sizes[:-1]]),
-            which=np.repeat(np.arange(len(groups)), sizes),
-            blocks=np.cumsum([0, *lengths[:-1]]),
-            y=stacked(lambda t: t.steps.size),
+            starts=starts[np.flatnonzero(np.diff(group, prepend=-1))],
+            which=np.repeat(group, lengths),
+            blocks=starts,
+            columns=tuple(blocks),
+            count=np.repeat([float(len(axes)) for _, axes in blocks], lengths),
+            y=y,
             tau=stacked(lambda t: t.steps.duration),
             linked=stacked(lambda t: t.steps.linked),
             blur=np.array([t.blur for t in tracks]),
-            weight=(stacked(lambda t: t.weight[0]), stacked(lambda t: t.weight[1])),
-            known=(stacked(lambda t: t.known[0]), stacked(lambda t: t.known[1])),
+            weight=(noise(lambda t: t.weight[0]), noise(lambda t: t.weight[1])),
+            known=(noise(lambda t: t.known[0]), noise(lambda t: t.known[1])),
             drift=any(t.drift for t in tracks),
         )
 
@@ -243,7 +257,7 @@ class _Tridiagonal:
             nothing = np.zeros(len(self.groups))
             return Sums(nothing - np.inf, nothing + 1.0, nothing, nothing + 1.0, nothing)
         value, square, cross, inverse, corner = solved
-        blur = self.blur[self.which]
+        blur = self._spread_groups(self.blur)
         through, half = self.tau - blur, 0.5 * (self.weight[0] + self.weight[1])
         shared = self.linked * self.weight[1]
         rows = (
@@ -258,7 +272,10 @@ class _Tridiagonal:
     def _solved(
         self, D: Floats, theta: Floats
     ) -> tuple[Floats, Floats, Floats, Floats, Floats] | None:
-        """Return the value by step, z^2 and C^-1 on and beside the diagonal, z = C^-1 y."""
+        """Return the value by step, z z and C^-1 on and beside the diagonal, z = C^-1 y.
+
+        All are summed over the columns of a block.
+        """
         from scipy.linalg.lapack import dpttrf, dpttrs
 
         a, b = self._bands(D, theta)
@@ -269,41 +286,58 @@ class _Tridiagonal:
         z, _ = dpttrs(d, lower, self.y)
         inverse = 1 / (d + up[::-1] - a)
         corner = self._beside(-lower * inverse[1:])
-        value = -0.5 * (np.log(d) + self.y * z)
+        value = -0.5 * self.count * np.log(d)
         if self.drift:
             unit, _ = dpttrs(d, lower, self.tau)
             worth = self._spread(self.tau * unit)
-            z = z - unit * self._spread(self.tau * z) / worth
-            value = -0.5 * (np.log(d) + self.y * z)
-            value[self.blocks] -= 0.5 * np.log(worth[self.blocks])
+            z = z - (unit / worth)[:, None] * self._spread(self.tau[:, None] * z)
+            value[self.blocks] -= 0.5 * (self.count * np.log(worth))[self.blocks]
             inverse = inverse - unit * unit / worth
             corner = corner - self._beside(unit[:-1] * unit[1:]) / worth
-        return value, z * z, self._beside(z[:-1] * z[1:]), inverse, corner
+        value -= 0.5 * np.einsum("rc,rc->r", self.y, z)
+        square, cross = np.einsum("rc,rc->r", z, z), np.einsum("rc,rc->r", z[:-1], z[1:])
+        return value, square, self._beside(cross), self.count * inverse, self.count * corner
 
-    def velocities(self, D: Floats, theta: Floats) -> tuple[Floats, Floats]:
-        """Return the mean velocity of every axis of every track and its standard error."""
+    def velocities(self, D: Floats, theta: Floats) -> tuple[list[Floats], list[Floats]]:
+        """Return the mean velocity of every track along every axis, and its standard error."""
         from scipy.linalg.lapack import dpttrf, dpttrs
 
         d, lower, _ = dpttrf(*self._bands(D, theta))
         unit, _ = dpttrs(d, lower, self.tau)
         worth = np.add.reduceat(self.tau * unit, self.blocks)
-        return np.add.reduceat(self.y * unit, self.blocks) / worth, 1 / np.sqrt(worth)
+        mean = np.add.reduceat(self.y * unit[:, None], self.blocks, axis=0) / worth[:, None]
+        found = [np.empty(sum(len(a) for i, a in self.columns if i == g)) for g in self.groups]
+        errors = [np.empty_like(f) for f in found]
+        for k, (i, axes) in enumerate(self.columns):
+            found[i][axes] = mean[k, : len(axes)]
+            errors[i][axes] = 1 / np.sqrt(worth[k])
+        return found, errors
 
     def _bands(self, D: Floats, theta: Floats) -> tuple[Floats, Floats]:
         """Return the diagonal of the covariance of all steps and the one beside it."""
-        D_i, theta_i, blur = D[self.which], theta[self.which], (self.blur * D)[self.which]
+        D_i, theta_i, blur = (self._spread_groups(x) for x in (D, theta, self.blur * D))
         first, last = (w * theta_i + k - blur for w, k in zip(self.weight, self.known, strict=True))
         return 2 * D_i * self.tau + first + last, -(last * self.linked)[:-1]
+
+    def _spread_groups(self, x: Floats) -> Floats:
+        """Return a number of each group at every step; one number where there is one group."""
+        return x if len(x) == 1 else x[self.which]
 
     def _beside(self, product: Floats) -> Floats:
         padded: Floats = self.linked * np.append(product, 0.0)
         return padded
 
     def _spread(self, x: Floats) -> Floats:
-        """Return the sum over each axis of each track, at every step."""
+        """Return the sum over each block, at every step."""
         lengths = np.diff(np.append(self.blocks, len(x)))
-        total: Floats = np.repeat(np.add.reduceat(x, self.blocks), lengths)
+        total: Floats = np.repeat(np.add.reduceat(x, self.blocks, axis=0), lengths, axis=0)
         return total
+
+
+def _same_noise(track: Track) -> list[Ints]:
+    """Group the axes of a track whose noise is the same in every frame."""
+    parts = np.concatenate([*track.weight, *track.known])
+    return _alike(parts)
 
 
 class Peak(NamedTuple):
@@ -512,10 +546,9 @@ class Likelihood:
     ) -> tuple[tuple[tuple[float, ...], ...], tuple[tuple[float, ...], ...]]:
         """Return the mean velocity along each axis of every group and its standard error."""
         (kernel,) = (k for k in self.kernels if isinstance(k, _Tridiagonal))
-        D = np.broadcast_to(best.D, best.theta.shape)
-        axes = self.tracks[0].steps.size.shape[1]
-        value, error = (x.reshape(-1, axes).tolist() for x in kernel.velocities(D, best.theta))
-        return tuple(map(tuple, value)), tuple(map(tuple, error))
+        D = np.full(len(best.theta), best.D[0])
+        value, error = kernel.velocities(D, best.theta)
+        return tuple(tuple(v.tolist()) for v in value), tuple(tuple(e.tolist()) for e in error)
 
     def offsets(self, best: Peak) -> tuple[Floats, float]:
         """Return the noise offset of each group, and the standard error of their mean.

@@ -328,15 +328,17 @@ def _tensor(result: ClusterResult) -> dict[str, Any] | None:
     tensor = result.tensor
     if tensor is None:
         return None
+    equal = np.ptp(tensor.principal_values) <= 1e-6 * tensor.principal_values[-1]
     rows = [
         (
             k + 1,
             f"{number_text(float(tensor.principal_values[k]), float(tensor.stderr[k]))} rad²/s",
             ", ".join(f"{x:+.2f}" for x in tensor.axes[:, k]),
         )
-        for k in range(3)
+        for k in range(0 if equal else 3)
     ]
-    chance = f"isotropic {number_text(tensor.p_isotropic)}, axial {number_text(tensor.p_axial)}"
+    chances = (("isotropic", tensor.p_isotropic), ("axial", tensor.p_axial))
+    chance = ", ".join(f"{w} {number_text(p) if p > 1e-6 else '< 10⁻⁶'}" for w, p in chances)
     return {
         "rows": rows,
         "symmetry": tensor.symmetry,

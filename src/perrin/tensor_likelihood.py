@@ -77,12 +77,12 @@ class VectorSteps:
     @cached_property
     def even(self) -> bool:
         """Whether all steps are alike and linked, so that a sine transform separates them."""
-        spread = np.ptp(self.begin, axis=1).max(initial=0.0)
-        size = max(float(np.abs(self.begin).max(initial=0.0)), np.finfo(np.float64).tiny)
+        uneven = max(np.ptp(self.begin, axis=1).max(), np.abs(self.end - self.begin).max())
+        size = max(float(np.abs(self.begin).max()), np.finfo(np.float64).tiny)
         return bool(
             self.linked[:-1].all()
             and np.ptp(self.tau) <= _ALIKE * self.tau[0]
-            and max(spread, np.abs(self.end - self.begin).max(initial=0.0)) <= _ALIKE * size
+            and uneven <= _ALIKE * size
         )
 
     @cached_property

@@ -41,7 +41,7 @@ _KNOWN_AXIS = 20.0
 _EQUAL = 45.0
 
 # Noise this far below a step (variance) is none: simulated truth, whose residuals are rounding.
-_NOISELESS = 1e-12
+_NOISELESS = 1e-8
 
 _NO_ERRORS = "no errors are known: a value lies on its edge, 0; take longer tracks or longer steps"
 
@@ -157,7 +157,7 @@ class DiffusionTensor:
 
     @property
     def statement(self) -> str:
-        """Which axes are known, in words: "the plane, not the axes" where two cannot be told apart."""
+        """Which axes are known, in words; where two cannot be told apart, the plane."""
         if np.isnan(self.stderr).any():
             return _NO_ERRORS
         known = np.flatnonzero(self.resolved_axes)
@@ -238,15 +238,16 @@ def diffusion_tensor(
         tensor, each with its own noise; their templates are turned onto the first.
     quantity : {"rotation", "translation"}
         From body-frame rotation vectors, or from the centre's displacements in the axes that the
-        body has half way through each step.
+        body has half way through each step; a drift of the sample is not taken off.
     noise : {"joint", "residual"} or float
         "joint": the noise is predicted from the template but for one amplitude, which is estimated
         along with D. "residual": that amplitude is measured by the residuals of the rigid fit
         (right only if all particles of a frame are seen at the same instant). A number: the
         localisation error of one coordinate, um.
     exposure : float, optional
-        Open fraction of dt, 0 to 1: motion blur is exposure/6. Default: unknown, estimated between
-        none and the largest possible. A stated exposure makes known noise worth having.
+        Open fraction of dt, 0 to 1: motion blur is exposure/6. Unknown (None) leaves the blur of
+        the joint fit free, between none and the largest possible; with the noise given it is taken
+        as 0.
     symmetry : str, optional
         Schoenflies symbol of the point group that the tensor shares. Default: that of the template
         within its error. "C_1" gives the tensor no symmetry. Another symbol is looked for with
@@ -264,7 +265,7 @@ def diffusion_tensor(
         For planar motions, unknown choices, bodies that differ, a symmetry that the template has
         not, or steps that hold too little.
     TooFewFramesError
-        Fewer than 12 steps in all.
+        Fewer than 12 steps in all, or fewer than 2 of a motion.
 
     Warns
     -----
@@ -345,12 +346,18 @@ def coupled_tensor(
     TooFewFramesError
         Fewer than 50 steps.
 
+    Warns
+    -----
+    PrecisionWarning
+        If a value lies on its edge, 0; errors are then NaN.
+
     Notes
     -----
     The steps are the SE(3) logarithms of g_k^-1 g_{k+1}, in the likelihood of `diffusion_tensor`
-    with noise of its own for centre and orientation, uncorrelated as they are at the centroid for
-    localisation errors alike in all axes, and blur unknown. From the centroid to a point r of the
-    body, with the coupling C of row translation and column rotation and [r] u = r x u:
+    with noise of its own for centre and orientation (uncorrelated, as they are at the centroid for
+    localisation errors alike in all axes and all particles seen) and blur unknown. From the
+    centroid to a point r of the body, with the coupling C of row translation and column rotation
+    and [r] u = r x u:
     D_R' = D_R, C' = C - [r] D_R, D_T' = D_T - [r] C^T + C [r] - [r] D_R [r]. The coupling is
     symmetric at the r that solves (tr(D_R) - D_R) r = v, where C - C^T = [v].
 
@@ -371,6 +378,8 @@ def coupled_tensor(
     best = data.fit(basis)
     elements = [(i, j) for i in range(6) for j in range(i + 1)]
     tensor, covariance = data.in_units(best.D), data.covariance(best, basis, elements)
+    if np.isnan(covariance).any():
+        warnings.warn(f"coupled_tensor: {_NO_ERRORS}", PrecisionWarning, stacklevel=2)
     where = diffusion_center(tensor) if place is None else place
     return CoupledTensor(
         tensor=shifted(tensor, where),
@@ -444,10 +453,11 @@ def _check_choices(
         )
     if faults:
         raise ValueError("; ".join(faults))
-    count = sum(len(m.steps()[0]) for m in motions)
-    if count < needed:
+    counts = [len(m.steps()[0]) for m in motions]
+    if sum(counts) < needed or min(counts) < 2:
         raise TooFewFramesError(
-            f"{count} steps between poses: a tensor needs at least {needed}",
+            f"{sum(counts)} steps between poses, at least {min(counts)} a motion: a tensor needs "
+            f"{needed} in all and 2 of every motion",
             sum(m.fitted.size for m in motions),
         )
 
@@ -694,7 +704,8 @@ def _collected(
     y = np.concatenate([v.y for v in vectors])
     scale = _scale(y)
     time = float(np.mean([m.dt for m in motions]))
-    B = None if exposure is None else exposure / 6
+    unknown = exposure is None and noise == "joint"
+    B = None if unknown else (exposure or 0.0) / 6
     sources = []
     for m, v in zip(motions, vectors, strict=True):
         shapes = v.shapes / np.outer(scale, scale)
@@ -712,6 +723,11 @@ def _collected(
         )
         theta, weight = _known_noise(m, steps, noise=noise, size=size)
         sources.append(Source(steps, theta, weight, B))
+    if len({np.isinf(source.weight) for source in sources}) > 1:
+        raise ValueError(
+            "noise='residual': some motions show no noise at all (simulated truth) and others do; "
+            "pool them apart"
+        )
     return _Data(sources, scale, time)
 
 
@@ -729,7 +745,8 @@ def _known_noise(
     """Return the noise amplitudes and the degrees of freedom that they are known with."""
     if noise == "joint":
         # The neighbours' covariance is minus the noise; a little more keeps the start inside.
-        square = -np.trace(_neighbours(steps)) / steps.linked.sum() / steps.y.shape[1]
+        square = -np.trace(_neighbours(steps)) / max(steps.linked.sum(), 1)
+        square = square / steps.y.shape[1]
         return np.full(len(size), max(float(square), 0.0) + 0.05), 0.0
     if noise == "residual":
         freedom = degrees_of_freedom(motion.n_present[motion.fitted], 3).sum()
