@@ -10,6 +10,7 @@ import pytest
 
 import perrin
 from perrin.analysis import _autocorrelation
+from perrin.report import render_html
 
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data" / "optitrack"
 
@@ -346,3 +347,23 @@ def test_coarse_sampling_and_few_frames_are_warned_of():
     """What estimate_diffusion warns of stands in the cluster's warnings; nothing is raised."""
     short = perrin.analyze(tracks(n_frames=20), dt=0.73).clusters[0]
     assert any("19 steps, fewer than 30" in w for w in short.warnings)
+
+
+def test_the_tensor_of_unequal_axes_reaches_the_summary(base, tmp_path):
+    """Planted axes come back in the summary and from the run folder; a plane has no tensor."""
+    body = perrin.Cluster.from_positions([[0, 0, 0], [3, 0, 0], [0, 2, 0], [0, 0, 1]])
+    planted = np.array([2e-3, 4e-3, 12e-3])
+    truth = perrin.simulate_motion(body, D_R=planted, D_T=0.04, dt=0.7, n_frames=400, rng=1)
+    table = perrin.positions_table(perrin.add_noise(truth.positions(), sigma=0.03, rng=2))
+    report = perrin.analyze(table, dt=0.7)
+    entry = report.to_dict()["clusters"][0]["tensor"]
+    pull = (np.array(entry["principal_values"]) - planted) / entry["stderr"]
+    assert np.all(np.abs(pull) < 3.5)
+    assert max(entry["p_isotropic"], entry["p_axial"]) < 1e-3
+    report.save(tmp_path / "run")
+    assert perrin.load_run(tmp_path / "run").to_dict() == report.to_dict()
+    assert "principal axis 3" in render_html(report, [])
+    assert perrin.analyze(base.drop(columns="z"), dt=0.73).clusters[0].tensor is None
+    even = perrin.analyze(base, dt=0.73)
+    assert even.clusters[0].tensor.symmetry == "T_d"
+    assert "principal axis 3" not in render_html(even, [])

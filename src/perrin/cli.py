@@ -30,6 +30,7 @@ app = typer.Typer(
 
 _SHOWN, _SHOWN_WARNINGS = 5, 20
 _SHAPES = ("tetrahedron", "pentahedron", "trimer")
+_UNEQUAL = 0.05  # below this probability of equal axes the tensor is worth a look
 _PICTURES = (".png", ".pdf", ".svg")
 
 Tracks = Annotated[Path, typer.Argument(help="Track table: .csv, .csv.gz, .parquet or .gdf.")]
@@ -432,6 +433,9 @@ def _show(report: Report, output: Path) -> None:
     console = Console(highlight=False)
     for result in report.clusters[:_SHOWN]:
         console.print(_cluster_table(result))
+        if result.tensor is not None and result.tensor.p_isotropic < _UNEQUAL:
+            told = f"rotation about the body's axes: {result.tensor}\n"
+            console.print(escape(told), soft_wrap=True)
     if len(report.clusters) > 1:
         console.print(_pooled_table(report))
     told = [("", text) for text in report.warnings]

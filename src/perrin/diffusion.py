@@ -257,8 +257,11 @@ def _probability_same(likelihood: Likelihood, best: Peak) -> float:
 def _by_moments(moments: Moments) -> _Found:
     """Give a closed-form estimate its normal intervals."""
     value, stderr = moments.value, moments.stderr
-    ci68, ci95 = ((value - z * stderr, value + z * stderr) for z in (_NORMAL[0.68], _NORMAL[0.95]))
-    return _Found(value, ci68, ci95, moments.offset, moments.offset_stderr)
+    ci68, ci95 = (
+        (float(value - z * stderr), float(value + z * stderr))
+        for z in (_NORMAL[0.68], _NORMAL[0.95])
+    )
+    return _Found(float(value), ci68, ci95, moments.offset, moments.offset_stderr)
 
 
 def _track(
