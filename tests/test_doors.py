@@ -21,9 +21,9 @@ SOURCE = ROOT / "src" / "perrin"
 # The house, top to bottom: a room imports only rooms above it.
 ROOMS = [
     "_arrays", "rotations", "shapes", "noise", "motion", "grouping", "lagged", "diffusion",
-    "curve_fits", "bounds", "hydrodynamics", "simulate", "gdf", "files", "results", "analysis",
-    "plot", "report", "claims", "paper_method", "paper_noise", "paper_orientations",
-    "paper_experiment", "paper", "cli",
+    "curve_fits", "bounds", "resistance", "mobility", "hydrodynamics", "surroundings",
+    "simulate", "gdf", "files", "results", "analysis", "plot", "report", "claims",
+    "paper_method", "paper_noise", "paper_orientations", "paper_experiment", "paper", "cli",
 ]  # fmt: skip
 LAZY = ("pandas", "scipy", "matplotlib", "pyarrow", "jinja2", "typer", "rich", "trackpy", "numba")
 

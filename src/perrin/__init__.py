@@ -24,8 +24,14 @@ if TYPE_CHECKING:
     from perrin.diffusion import DiffusionEstimate, estimate_diffusion
     from perrin.files import read_tracks, write_tracks
     from perrin.grouping import cluster_positions, find_clusters, positions_table
-    from perrin.hydrodynamics import Size, size_from_rotation, size_from_translation
+    from perrin.hydrodynamics import (
+        Size,
+        size_and_viscosity,
+        size_from_rotation,
+        size_from_translation,
+    )
     from perrin.lagged import LagCurve, msad, msad_vector, msd, orientation_correlation
+    from perrin.mobility import Mobility, apparent_translation, cluster_mobility
     from perrin.motion import RigidMotion, remove_rotation, track_rotation
     from perrin.noise import NoiseFloor, noise_floor
     from perrin.report import write_run
@@ -33,6 +39,14 @@ if TYPE_CHECKING:
     from perrin.rotations import Similarity, axis_angle, kabsch, similarity
     from perrin.shapes import Cluster
     from perrin.simulate import add_noise, simulate_motion
+    from perrin.surroundings import (
+        WallFactor,
+        gravitational_height,
+        settling_velocity,
+        wall_diffusion,
+        wall_factor,
+        water_viscosity,
+    )
 
 __version__ = "0.1.0"
 
@@ -43,6 +57,7 @@ __all__ = [
     "DiffusionEstimate",
     "IdentityWarning",
     "LagCurve",
+    "Mobility",
     "NoiseFloor",
     "PrecisionWarning",
     "Report",
@@ -51,14 +66,18 @@ __all__ = [
     "Size",
     "TooFewFramesError",
     "TrackTableError",
+    "WallFactor",
     "add_noise",
     "analyze",
+    "apparent_translation",
     "axis_angle",
+    "cluster_mobility",
     "cluster_positions",
     "cramer_rao",
     "estimate_diffusion",
     "find_clusters",
     "fit_line",
+    "gravitational_height",
     "kabsch",
     "load_run",
     "msad",
@@ -69,11 +88,16 @@ __all__ = [
     "positions_table",
     "read_tracks",
     "remove_rotation",
+    "settling_velocity",
     "similarity",
     "simulate_motion",
+    "size_and_viscosity",
     "size_from_rotation",
     "size_from_translation",
     "track_rotation",
+    "wall_diffusion",
+    "wall_factor",
+    "water_viscosity",
     "write_run",
     "write_tracks",
 ]
@@ -96,7 +120,21 @@ _ROOMS = {
     "diffusion": ("DiffusionEstimate", "estimate_diffusion"),
     "curve_fits": ("fit_line",),
     "bounds": ("cramer_rao",),
-    "hydrodynamics": ("Size", "size_from_rotation", "size_from_translation"),
+    "mobility": ("Mobility", "apparent_translation", "cluster_mobility"),
+    "hydrodynamics": (
+        "Size",
+        "size_and_viscosity",
+        "size_from_rotation",
+        "size_from_translation",
+    ),
+    "surroundings": (
+        "WallFactor",
+        "gravitational_height",
+        "settling_velocity",
+        "wall_diffusion",
+        "wall_factor",
+        "water_viscosity",
+    ),
     "simulate": ("add_noise", "simulate_motion"),
     "files": ("read_tracks", "write_tracks"),
     "results": ("ClusterResult", "Report", "load_run"),
