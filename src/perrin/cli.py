@@ -307,12 +307,14 @@ def _spheres(
             + ("" if positions is None else f" and {positions}")
         )
     centers, radius = read_spheres(positions)
-    if (radius is None) == (diameter is None):
-        there = "has none" if radius is None else "has one"
-        raise ValueError(
-            f"the size: expected --diameter or a column radius, one of them; {positions} {there}"
-        )
-    return centers, radius if diameter is None else diameter / 2
+    if radius is not None and diameter is None:
+        return centers, radius
+    if radius is None and diameter is not None:
+        return centers, diameter / 2
+    there = "has none" if radius is None else "has one"
+    raise ValueError(
+        f"the size: expected --diameter or a column radius, one of them; {positions} {there}"
+    )
 
 
 def _numbers(option: str, text: str) -> float | list[float]:
@@ -421,7 +423,7 @@ def _show_prediction(body: Mobility, *, name: str) -> None:
     ):
         table.add_row(f"cluster diameter, {mode} (um)", f"{diameter:.4f}")
         table.add_row(f"over the sphere's, {mode}", f"{factor:.4f}")
-    place = ", ".join(f"{x:.4f}" for x in body.center - body.centroid)
+    place = ", ".join(f"{round(x, 4) + 0.0:.4f}" for x in body.center - body.centroid)
     table.add_row("centre of diffusion* (um)", "", place)
     table.caption = (
         f"* from the centroid of the spheres. Relative error about {body.error:.1g} (degree "
