@@ -347,6 +347,16 @@ def test_predict_refuses_in_one_line(tmp_path, options, words):
     refused(run("predict", *CONDITIONS, *options, cwd=tmp_path), 2, *words)
 
 
+def test_predict_says_when_the_accuracy_is_not_reached(tmp_path, monkeypatch):
+    """A warning is one line beside the result."""
+    monkeypatch.setattr("perrin.resistance._MOST_UNKNOWNS", 300)
+    result = run("predict", "dimer", "--diameter", 2, *CONDITIONS, cwd=tmp_path)
+    assert result.returncode == 0
+    assert result.stderr.startswith("warning: degree 6 leaves a relative error of")
+    assert result.stderr.count("\n") == 1
+    assert "D_R" in result.stdout
+
+
 def test_help_and_version():
     """The help names every command; the version is the package's."""
     result = command("--help", cwd=Path.cwd())

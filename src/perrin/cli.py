@@ -186,6 +186,7 @@ def predict(
 ) -> None:
     """Predict how a rigid cluster of spheres diffuses: D_T, D_R, hydrodynamic diameters."""
     import json
+    import warnings
 
     import perrin
 
@@ -193,13 +194,17 @@ def predict(
         if output is not None and output.exists() and not overwrite:
             raise FileExistsError(f"{output} exists: choose another file, or --overwrite")
         centers, radius = _spheres(shape, diameter=diameter, positions=positions)
-        body = perrin.cluster_mobility(
-            centers,
-            radius=radius,
-            viscosity=viscosity,
-            temperature=temperature,
-            accuracy=accuracy,
-        )
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always", perrin.PrecisionWarning)
+            body = perrin.cluster_mobility(
+                centers,
+                radius=radius,
+                viscosity=viscosity,
+                temperature=temperature,
+                accuracy=accuracy,
+            )
+        for warning in told:
+            print(f"warning: {warning.message}", file=sys.stderr)
         if output is not None:
             text = json.dumps(body.to_dict(), indent=2, allow_nan=False)
             output.write_text(text + "\n", encoding="utf-8")

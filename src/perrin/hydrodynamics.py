@@ -26,8 +26,8 @@ Factor: TypeAlias = Literal["exact", "hoffmann2009"]
 _HOFFMANN = 1.844
 
 # Pairs up to this much farther apart than the closest one count as touching. Spheres of one kind
-# vary by a few per cent; the next neighbours of any cluster are 1.41 diameters away, those of the
-# paper's pentahedron 1.22.
+# vary by a few per cent; the next neighbours in compact clusters are 1.41 diameters away, those of
+# the paper's pentahedron 1.22.
 _TOUCHING = 1.2
 
 # Half the interval (K) over which the slope of a viscosity is taken.

@@ -306,21 +306,18 @@ def apparent_translation(mobility: Mobility, *, point: ArrayLike) -> float:
 
 
 def condition_faults(**values: float) -> list[str]:
-    """Return what is wrong with positive numbers, one of which may be the temperature in K."""
+    """Return what is wrong with numbers that must be positive; a temperature must be in kelvin."""
     faults = [
         f"{name}: expected a finite number > 0, got {value!r}"
         for name, value in values.items()
         if not (np.ndim(value) == 0 and np.isfinite(value) and value > 0)
     ]
-    temperature = values.get("temperature", 300.0)
-    if np.ndim(temperature) == 0 and 0 < temperature < _COLDEST:
+    kelvin = values.get("temperature", _COLDEST)
+    if np.ndim(kelvin) == 0 and (0 < kelvin < _COLDEST or _HOTTEST < kelvin < np.inf):
+        hint = f"; if it is in degrees Celsius, say {kelvin + 273.15:g}"
         faults.append(
-            f"temperature: expected kelvin ({_COLDEST:g} to {_HOTTEST:g}), got {temperature!r}; "
-            f"if these are degrees Celsius, say {temperature + 273.15:g}"
-        )
-    elif np.ndim(temperature) == 0 and _HOTTEST < temperature < np.inf:
-        faults.append(
-            f"temperature: expected kelvin ({_COLDEST:g} to {_HOTTEST:g}), got {temperature!r}"
+            f"temperature: expected kelvin, {_COLDEST:g} to {_HOTTEST:g}, got {kelvin!r}"
+            + (hint if kelvin < _COLDEST else "")
         )
     return faults
 
@@ -372,13 +369,13 @@ def _body(
             "centers: expected finite coordinates of shape (n, 3), one row a sphere (z = 0 in a "
             f"plane), got shape {x.shape}{'' if np.isfinite(x).all() else ' with NaN or inf'}"
         )
-    elif a.shape in ((), (len(x),)):
-        a = np.broadcast_to(a, len(x)).copy()
-        faults += [_pair_fault(i, j, x, a) for i, j in _pairs(x, a, overlapping=False)]
-    if a.shape != x.shape[:1] or not (np.isfinite(a) & (a > 0)).all():
+    if a.shape not in ((), x.shape[:1]) or not (np.isfinite(a) & (a > 0)).all():
         faults.append(
             f"radius: expected one number > 0 or one for each centre (um), got {radius!r}"
         )
+    if not faults:
+        a = np.broadcast_to(a, len(x)).copy()
+        faults += [_pair_fault(i, j, x, a) for i, j in _pairs(x, a, overlapping=False)]
     faults += condition_faults(**conditions)
     if faults:
         raise ValueError("; ".join(faults))

@@ -40,14 +40,14 @@ class Resistance:
     Attributes
     ----------
     matrix : ndarray, shape (6, 6)
-        (force, torque) = matrix (velocity, angular velocity) about the centroid, symmetrised.
+        (force, torque) = matrix (velocity, angular velocity) about the origin, symmetrised.
     degree : int
         Highest degree of the harmonics.
     asymmetry : float
         Antisymmetric part before symmetrisation, relative: reciprocity makes it 0.
     change : float
         Largest relative change of the resistance, over all directions of motion, from the solution
-        two degrees lower.
+        two degrees lower (from degree 1 for degree 2, from degree 2 for degree 1).
     residual : float
         Root mean square velocity left over on the surface, relative, the worst of six motions.
     """
@@ -181,37 +181,44 @@ def _compared(solution: _Solution, other: _Solution, degree: int) -> Resistance:
 
 
 def _solve(centers: Floats, radii: Floats, degree: int) -> _Solution:
-    """Fit the flows of all spheres to rigid motion on the surface and add up their forces.
-
-    Columns nearly orthogonal make normal equations as good as a QR factorisation and several times
-    faster.
-    """
+    """Fit the flows of all spheres to rigid motion on the surface and add up their forces."""
     from scipy.linalg import cho_factor, cho_solve
 
-    centroid = centers.mean(0)
     points, weight, shows = _surface(centers, radii, degree)
     spheres = list(zip(centers[shows], radii[shows], strict=True))
+    normal, right, power = _normal_equations(spheres, points, weight, degree)
+    scale = 1 / np.sqrt(np.diag(normal))
+    normal *= scale[:, None]
+    normal *= scale
+    normal[np.diag_indices(len(normal))] += _RIDGE
+    right *= scale[:, None]
+    factor = cho_factor(normal, lower=True, overwrite_a=True, check_finite=False)
+    strength = cho_solve(factor, right, check_finite=False)
+    # Rounding may leave a residual of -1e-16 where the fit is exact, as for one sphere.
+    left = np.maximum(1 - np.sum(right * strength, axis=0) / power, 0.0)
+    raw = _forces(spheres, degree) @ (scale[:, None] * strength)
+    return _Solution(raw, float(np.sqrt(left.max())))
+
+
+def _normal_equations(
+    spheres: list[tuple[Floats, float]], points: Floats, weight: Floats, degree: int
+) -> tuple[Floats, Floats, Floats]:
+    """Return products of all flows with each other and with the six motions, and the motions' own.
+
+    The flows are nearly orthogonal, so that normal equations are as good as a QR factorisation, and
+    several times faster.
+    """
     size = _unknowns(degree) * len(spheres)
     normal, right, power = np.zeros((size, size)), np.zeros((size, 6)), np.zeros(6)
     for rows in _blocks(len(points), size):
         at, root = points[rows], np.sqrt(weight[rows])
         flow = np.concatenate([_flows((at - c) / a, degree) for c, a in spheres])
         flow = (flow * root).reshape(size, -1)
-        wanted = (_rigid_motions(at - centroid) * root).reshape(6, -1).T
+        wanted = (_rigid_motions(at) * root).reshape(6, -1).T
         normal += flow @ flow.T
         right += flow @ wanted
         power += np.sum(wanted**2, axis=0)
-    scale = 1 / np.sqrt(np.diag(normal))
-    normal *= scale[:, None]
-    normal *= scale
-    normal[np.diag_indices(size)] += _RIDGE
-    right *= scale[:, None]
-    factor = cho_factor(normal, lower=True, overwrite_a=True, check_finite=False)
-    strength = cho_solve(factor, right, check_finite=False)
-    # Rounding may leave a residual of -1e-16 where the fit is exact, as for one sphere.
-    left = np.maximum(1 - np.sum(right * strength, axis=0) / power, 0.0)
-    raw = _forces(spheres, centroid, degree) @ (scale[:, None] * strength)
-    return _Solution(raw, float(np.sqrt(left.max())))
+    return normal, right, power
 
 
 def _blocks(count: int, width: int) -> Iterator[slice]:
@@ -283,11 +290,11 @@ def even_directions(count: int) -> Floats:
     return np.stack([ring * np.cos(angle), ring * np.sin(angle), z], axis=1)
 
 
-def _rigid_motions(arm: Floats) -> Floats:
-    """Return the velocities (6, 3, P) of three unit translations and three unit rotations."""
-    shift = np.broadcast_to(np.eye(3)[:, :, None], (3, 3, len(arm)))
+def _rigid_motions(points: Floats) -> Floats:
+    """Return the velocities (6, 3, P) of unit translations, and of unit rotations about 0."""
+    shift = np.broadcast_to(np.eye(3)[:, :, None], (3, 3, len(points)))
     # The columns of -[r]x are e_k x r.
-    turn = np.moveaxis(-skew(arm), 0, -1).swapaxes(0, 1)
+    turn = np.moveaxis(-skew(points), 0, -1).swapaxes(0, 1)
     return np.concatenate([shift, turn])
 
 
@@ -339,8 +346,8 @@ def _solid_harmonics(x: Floats, degree: int) -> NDArray[np.complex128]:
     return value
 
 
-def _forces(spheres: list[tuple[Floats, float]], centroid: Floats, degree: int) -> Floats:
-    """Return force and torque about the centroid that each flow takes, shape (6, unknowns).
+def _forces(spheres: list[tuple[Floats, float]], degree: int) -> Floats:
+    """Return force and torque about the origin that each flow takes, shape (6, unknowns).
 
     Of a flow with pressure x/r^3 about a sphere of radius a the force is 4 pi a, of the toroidal
     flow of x/r^3 the torque 8 pi a^2; all others take none.
@@ -354,6 +361,6 @@ def _forces(spheres: list[tuple[Floats, float]], centroid: Floats, degree: int) 
     force = np.zeros((6, width * len(spheres)))
     for j, (center, radius) in enumerate(spheres):
         force[:3, j * width + pressure] = 4 * np.pi * radius * np.eye(3)
-        force[3:, j * width + pressure] = 4 * np.pi * radius * skew(center - centroid)
+        force[3:, j * width + pressure] = 4 * np.pi * radius * skew(center)
         force[3:, j * width + toroidal] = 8 * np.pi * radius**2 * np.eye(3)
     return force
