@@ -176,6 +176,8 @@ def test_the_difference_of_two_routes_counts_conditions_once():
     assert value == t.sphere - r.sphere
     assert stderr == pytest.approx(difference.std(), rel=0.02)
     assert stderr < 0.9 * np.hypot(t.sphere_stderr, r.sphere_stderr)
+    sure = size_from_translation(D_T[0], **shape, **HOT)
+    assert sure.difference(sure) == (0.0, 0.0)
     assert t.difference(t)[1] == pytest.approx(0.02 * 2**0.5 * t.sphere, rel=1e-9)
 
 

@@ -78,8 +78,9 @@ class Size:
         >>> [round(x, 2) for x in translation.difference(rotation)]
         [0.17, 0.39]
         """
-        shared = 2 * self.shared_stderr * other.shared_stderr
-        variance = self.sphere_stderr**2 + other.sphere_stderr**2 - shared
+        variance = (self.shared_stderr - other.shared_stderr) ** 2
+        for size in (self, other):
+            variance += size.sphere_stderr**2 - size.shared_stderr**2
         return self.sphere - other.sphere, float(np.sqrt(variance))
 
 
@@ -262,7 +263,7 @@ def _size(diameter: float, known: _Known, *, ratio: float, order: int, factor: s
         sphere=sphere,
         sphere_stderr=sphere * relative,
         factor=factor,
-        shared_stderr=sphere * known.by_conditions / order,
+        shared_stderr=sphere * (known.by_conditions / order),
     )
 
 
