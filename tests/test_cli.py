@@ -352,7 +352,7 @@ def test_predict_says_when_the_accuracy_is_not_reached(tmp_path, monkeypatch):
     monkeypatch.setattr("perrin.resistance._MOST_UNKNOWNS", 300)
     result = run("predict", "dimer", "--diameter", 2, *CONDITIONS, cwd=tmp_path)
     assert result.returncode == 0
-    assert result.stderr.startswith("warning: degree 6 leaves a relative error of")
+    assert result.stderr.startswith("warning: degree 5 leaves a relative error of")
     assert result.stderr.count("\n") == 1
     assert "D_R" in result.stdout
 

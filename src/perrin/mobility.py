@@ -54,8 +54,8 @@ class Mobility:
     degree : int
         Highest degree of the harmonics used.
     error : float
-        Estimated relative error of D in its worst direction: the larger of what the last two
-        degrees changed and three times the violation of reciprocity.
+        Estimated relative error of D in its worst direction: the larger of three quarters of what
+        the last two degrees changed and three times the violation of reciprocity.
     residual : float
         Root mean square velocity on the surface that the solution leaves over, relative.
     """

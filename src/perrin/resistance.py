@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -25,9 +26,14 @@ _PROBES = 2000
 # On normal equations with a unit diagonal. Flows about spheres deep inside each other nearly
 # coincide; this shifts the forces by less than 1e-7 and keeps the factorisation positive.
 _RIDGE = 1e-13
+# Two degrees change at least 1.8 times the error that they leave where spheres are alike, 0.6 times
+# it at radii 1:10 (benchmarks/mobility.py); this keeps the estimate above a third of the error.
+_CHANGE = 0.75
 # The antisymmetric part shows a third or less of the error that the surface points make where
 # spheres overlap.
 _ASYMMETRY = 3.0
+# Degrees tried. Equal touching spheres end at 7, unequal ones higher.
+_DEGREES = (5, 7, *range(8, 42, 2))
 # Unknowns that a solution of rising degree may reach: a minute and half a gigabyte.
 _MOST_UNKNOWNS = 7000
 _BLOCK = 4_000_000
@@ -64,7 +70,8 @@ class Resistance:
     @property
     def error(self) -> float:
         """Estimated relative error of the resistance in its worst direction of motion."""
-        return max(self.change, _ASYMMETRY * self.asymmetry, float(np.finfo(np.float64).eps))
+        noise = float(np.finfo(np.float64).eps)
+        return max(_CHANGE * self.change, _ASYMMETRY * self.asymmetry, noise)
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +115,7 @@ def solve_resistance(centers: Floats, radii: Floats, *, degree: int) -> Resistan
 
 
 def converge_resistance(centers: Floats, radii: Floats, *, accuracy: float) -> Resistance:
-    """Raise the degree by twos from 4 until the error estimate is under `accuracy`.
+    """Raise the degree from 5 until the error estimate is under `accuracy`.
 
     Parameters
     ----------
@@ -124,34 +131,37 @@ def converge_resistance(centers: Floats, radii: Floats, *, accuracy: float) -> R
     Raises
     ------
     ValueError
-        If there are more spheres than degree 4 can serve.
+        If there are more spheres than degree 5 can serve.
 
     Warns
     -----
     PrecisionWarning
         If the largest system that is tried does not reach `accuracy`.
     """
-    most = _MOST_UNKNOWNS // _unknowns(4)
+    lowest = _DEGREES[0]
+    most = _MOST_UNKNOWNS // _unknowns(lowest)
     if len(centers) > most:
         raise ValueError(
             f"centers: {len(centers)} spheres; up to {most} are served with an error estimate; "
-            "state a degree (1 to 3) for more"
+            f"state a degree (1 to {lowest - 1}) for more"
         )
-    lower, degree = _solve(centers, radii, 2), 4
-    while True:
-        solution = _solve(centers, radii, degree)
-        result = _compared(solution, lower, degree)
+    solved = {lowest - 2: _solve(centers, radii, lowest - 2)}
+    for degree, further in pairwise(_DEGREES):
+        for needed in (degree - 2, degree):
+            if needed not in solved:
+                solved[needed] = _solve(centers, radii, needed)
+        result = _compared(solved[degree], solved[degree - 2], degree)
         if result.error <= accuracy:
             return result
-        if _unknowns(degree + 2) * len(centers) > _MOST_UNKNOWNS:
-            warnings.warn(
-                f"degree {degree} leaves a relative error of {result.error:.1e}, above "
-                f"{accuracy:.1e}; state a higher degree if that matters",
-                PrecisionWarning,
-                stacklevel=3,
-            )
-            return result
-        lower, degree = solution, degree + 2
+        if _unknowns(further) * len(centers) > _MOST_UNKNOWNS:
+            break
+    warnings.warn(
+        f"degree {degree} leaves a relative error of {result.error:.1e}, above {accuracy:.1e}; "
+        "state a higher degree if that matters",
+        PrecisionWarning,
+        stacklevel=3,
+    )
+    return result
 
 
 def _unknowns(degree: int) -> int:
