@@ -304,6 +304,74 @@ def test_simulate_and_convert_close_the_circle(tmp_path):
     refused(run("simulate", "cube", *options, "-o", "d.csv", cwd=tmp_path), 2, "cube", "trimer")
 
 
+CONDITIONS = ("--viscosity", 2.18e-3, "--temperature", 295)
+
+
+def test_predict_prints_and_saves_a_named_body(tmp_path):
+    """The prediction of the paper's cluster: D_T 0.0453, D_R 6.73e-3, the same in the JSON file."""
+    options = ("predict", "tetrahedron", "--diameter", 2.45, *CONDITIONS, "-o", "p.json")
+    result = run(*options, cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    for shown in ("tetrahedron", "0.0453", "0.00672", "1.784", "1.818"):
+        assert shown in result.stdout
+    entry = json.loads((tmp_path / "p.json").read_text())
+    body = perrin.cluster_mobility(
+        perrin.Cluster.touching(4, 2.45), radius=1.225, viscosity=2.18e-3, temperature=295.0
+    )
+    assert entry == body.to_dict()
+    assert entry["D_T_mean_um2_per_s"] == pytest.approx(0.0453, abs=5e-5)
+    assert entry["D_R_mean_rad2_per_s"] == pytest.approx(6.73e-3, abs=5e-6)
+    refused(run(*options, cwd=tmp_path), 2, "p.json exists", "--overwrite")
+    assert run(*options, "--overwrite", cwd=tmp_path).returncode == 0
+
+
+def test_predict_reads_positions(tmp_path):
+    """A file with radii, or without them and --diameter; without -o nothing is written."""
+    (tmp_path / "a.csv").write_text("x,y,z,radius\n0,0,0,1\n0,0,2.5,1.5\n")
+    result = run("predict", "--positions", "a.csv", *CONDITIONS, cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    assert "0.4603" in result.stdout  # the centre of diffusion of a 1:1.5 dimer
+    (tmp_path / "b.csv").write_text("x,y,z\n0,0,0\n0,0,2.45\n")
+    file = run("predict", "--positions", "b.csv", "--diameter", 2.45, *CONDITIONS, cwd=tmp_path)
+    named = run("predict", "dimer", "--diameter", 2.45, *CONDITIONS, cwd=tmp_path)
+    assert file.stdout.splitlines()[1:] == named.stdout.splitlines()[1:]
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.csv", "b.csv"]
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (("tetrahedron",), ("--diameter",)),
+        (("cube", "--diameter", 1), ("cube", "tetrahedron")),
+        ((), ("tetrahedron", "--positions")),
+        (("dimer", "--positions", "a.csv"), ("dimer", "a.csv")),
+        (("--positions", "a.csv", "--diameter", 2), ("a.csv has one",)),
+        (("--positions", "none.csv"), ("none.csv",)),
+        (("--positions", "bad.csv"), ("column 'x'", "line 3", "column 'z' is missing", "colour")),
+        (("--positions", "empty.csv"), ("no rows",)),
+        (("tetrahedron", "--diameter", -1), ("diameter",)),
+        (("tetrahedron", "--diameter", 1, "--temperature", 22), ("kelvin",)),
+        (("tetrahedron", "--diameter", 1, "-o", "nowhere/p.json"), ("nowhere",)),
+    ],
+)
+def test_predict_refuses_in_one_line(tmp_path, options, words):
+    """Status 2 and one line that names every fault."""
+    (tmp_path / "a.csv").write_text("x,y,z,radius\n0,0,0,1\n0,0,2.5,1.5\n")
+    (tmp_path / "bad.csv").write_text("x,y,colour\n0,0,red\nabc,0,blue\n")
+    (tmp_path / "empty.csv").write_text("x,y,z,radius\n")
+    refused(run("predict", *CONDITIONS, *options, cwd=tmp_path), 2, *words)
+
+
+def test_predict_says_when_the_accuracy_is_not_reached(tmp_path, monkeypatch):
+    """A warning is one line beside the result."""
+    monkeypatch.setattr("perrin.resistance._MOST_UNKNOWNS", 300)
+    result = run("predict", "dimer", "--diameter", 2, *CONDITIONS, cwd=tmp_path)
+    assert result.returncode == 0
+    assert result.stderr.startswith("warning: degree 5 leaves a relative error of")
+    assert result.stderr.count("\n") == 1
+    assert "D_R" in result.stdout
+
+
 PLAN = ("plan", "tetrahedron", "--diameter", 2.45, "--d-r", "4.93e-3", "--sigma", "0.03,0.03,0.04")
 
 
@@ -375,6 +443,6 @@ def test_plan_knows_its_shapes(tmp_path):
 def test_help_and_version():
     """The help names every command; the version is the package's."""
     result = command("--help", cwd=Path.cwd())
-    for name in ("demo", "analyze", "simulate", "plan", "convert"):
+    for name in ("demo", "analyze", "simulate", "plan", "predict", "convert"):
         assert name in result.stdout
     assert run("--version", cwd=Path.cwd()).stdout.strip() == perrin.__version__

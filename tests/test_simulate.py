@@ -1,10 +1,12 @@
 """Simulated motions obey the law they were planted with."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from perrin import Cluster, add_noise, simulate_motion
+from perrin import Cluster, add_noise, apparent_translation, cluster_mobility, simulate_motion
 from perrin.rotations import log_map
 
 BODY = Cluster.tetrahedron(1.5)
@@ -255,6 +257,104 @@ def test_what_has_no_meaning_is_refused(options, word):
     """Bad numbers, bad tensors and unknown schemes raise a ValueError that names them."""
     with pytest.raises(ValueError, match=word):
         simulate(**options)
+
+
+# ---- a body that moves by its mobility ----------------------------------------------------------
+
+CHAIN = np.array([[0.0, 0, 0], [2, 0, 0], [2, 2, 0], [2, 2, 2]])  # a screw of touching spheres
+KNOWN = {"viscosity": 1e-3, "temperature": 300.0}
+
+
+@pytest.fixture(scope="module")
+def chain():
+    """Return a body whose coupling is as large as touching spheres make it."""
+    return cluster_mobility(CHAIN, radius=1.0, **KNOWN)
+
+
+@pytest.fixture(scope="module")
+def propeller(chain):
+    """Return the same spheres with a tensor of strong coupling, to see every term of the law."""
+    axes = Rotation.random(3, random_state=3).as_matrix()
+    values = np.array([[0.05, 0.03, 0.02], [0.012, 0.006, 0.003], [0.006, -0.003, 0.002]])
+    D_T, D_R, coupling = np.einsum("kij,kj,klj->kil", axes, values, axes)
+    return replace(chain, D=np.block([[D_T, coupling], [coupling, D_R]]))
+
+
+def screws(motion, body):
+    """Return every step of the centre of diffusion and its turn in body axes, (T - 1, 6)."""
+    point = motion.center + motion.rotation @ (body.center - body.centroid)
+    before = np.swapaxes(motion.rotation[:-1], 1, 2)
+    shift = (before @ np.diff(point, axis=0)[..., None])[..., 0]
+    return np.concatenate([shift, log_map(before @ motion.rotation[1:])], axis=1)
+
+
+@pytest.mark.parametrize(("name", "frames"), [("chain", 300_001), ("propeller", 40_001)])
+def test_the_planted_6x6_tensor_is_in_the_steps(name, frames, request):
+    """Covariances of body-frame screws are 2 D dt in all 36 places, within 4.5 errors."""
+    body = request.getfixturevalue(name)
+    dt = 1e-3 / np.trace(body.D_R)  # the second order in D dt is then below the errors
+    step = screws(simulate_motion(body, dt=dt, n_frames=frames, rng=60), body)
+    mean, error = mean_and_error(step[:, :, None] * step[:, None])
+    assert np.all(np.abs(mean - 2 * body.D * dt) < 4.5 * error)
+    # The coupling is seen, so that its sign is tested.
+    place = np.unravel_index(np.abs(body.coupling).argmax(), (3, 3))
+    seen, unsure = mean[:3, 3:][place], error[:3, 3:][place]
+    assert abs(seen) > 6 * unsure
+    drift, error = mean_and_error(step)
+    assert np.all(np.abs(drift) < 4.5 * error)
+
+
+def test_long_steps_of_a_coupled_body(propeller):
+    """At any dt the centre of diffusion has <x^2> = 2 tr(D_T) dt, <R> = exp(-(tr D_R - D_R) dt)."""
+    dt = 0.4 / np.trace(propeller.D_R)
+    motion = simulate_motion(propeller, dt=dt, n_frames=8001, rng=61)
+    step = screws(motion, propeller)
+    mean, error = mean_and_error(np.sum(step[:, :3] ** 2, axis=1))
+    assert abs(mean - 2 * np.trace(propeller.D_T) * dt) < 4.5 * error
+    values, axes = np.linalg.eigh(np.trace(propeller.D_R) * np.eye(3) - propeller.D_R)
+    expected = axes @ np.diag(np.exp(-values * dt)) @ axes.T
+    mean, error = mean_and_error(steps(motion))
+    assert np.all(np.abs(mean - expected) < 4.5 * error)
+
+
+def test_a_tracked_point_off_the_centre_of_diffusion():
+    """The centroid of a 1:3 dimer moves by 6 D_T t + 2 r^2 (1 - exp(-2 D_R t)), D_R across it.
+
+    At short times that is the apparent D_T, at long ones a constant more than the true one.
+    """
+    body = cluster_mobility([[0, 0, 0], [0, 0, 4]], radius=[1.0, 3.0], **KNOWN)
+    across, r = body.D_R[0, 0], np.linalg.norm(body.center - body.centroid)
+    for scale, frames in ((1e-3, 15_001), (0.2, 4001), (1.0, 1001)):
+        t = scale / across
+        motion = simulate_motion(body, dt=t, n_frames=frames, rng=62)
+        mean, error = mean_and_error(np.sum(np.diff(motion.center, axis=0) ** 2, axis=1))
+        expected = 2 * np.trace(body.D_T) * t + 2 * r**2 * (1 - np.exp(-2 * across * t))
+        assert abs(mean - expected) < 4 * error
+        if scale == 1e-3:
+            apparent = apparent_translation(body, point=body.centroid)
+            assert expected == pytest.approx(6 * apparent * t, rel=1e-3)
+            assert mean > 2 * np.trace(body.D_T) * t + 4 * error
+
+
+def test_the_motion_of_a_mobility_is_a_rigid_body(chain):
+    """The template is the centres, frame 0 is at the origin, one seed makes one walk."""
+    motion = simulate_motion(chain, dt=0.5, n_frames=50, rng=7)
+    np.testing.assert_allclose(motion.template, CHAIN - CHAIN.mean(0), atol=1e-15)
+    np.testing.assert_array_equal(motion.center[0], np.zeros(3))
+    np.testing.assert_array_equal(motion.rotation[0], np.eye(3))
+    np.testing.assert_allclose(motion.positions().mean(1), motion.center, atol=1e-12)
+    again = simulate_motion(chain, dt=0.5, n_frames=50, rng=np.random.default_rng(7))
+    np.testing.assert_array_equal(again.positions(), motion.positions())
+    assert simulate_motion(chain, dt=0.5, n_frames=1, rng=7).positions().shape == (1, 4, 3)
+
+
+def test_a_mobility_has_its_own_coefficients(chain):
+    """D_R, D_T or another scheme beside a Mobility are refused, and a Cluster needs D_R."""
+    for options in ({"D_R": 1e-3}, {"D_T": 0.1}, {"scheme": "euler"}):
+        with pytest.raises(ValueError, match="Mobility"):
+            simulate_motion(chain, dt=1.0, n_frames=5, rng=1, **options)
+    with pytest.raises(ValueError, match="D_R: needed"):
+        simulate_motion(BODY, dt=1.0, n_frames=5, rng=1)
 
 
 # ---- noise --------------------------------------------------------------------------------------

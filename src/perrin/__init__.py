@@ -24,7 +24,12 @@ if TYPE_CHECKING:
     from perrin.diffusion import DiffusionEstimate, estimate_diffusion
     from perrin.files import read_tracks, write_tracks
     from perrin.grouping import cluster_positions, find_clusters, positions_table
-    from perrin.hydrodynamics import Size, size_from_rotation, size_from_translation
+    from perrin.hydrodynamics import (
+        Size,
+        size_and_viscosity,
+        size_from_rotation,
+        size_from_translation,
+    )
     from perrin.lagged import (
         LagCurve,
         VanHove,
@@ -35,6 +40,7 @@ if TYPE_CHECKING:
         orientation_correlation,
         van_hove,
     )
+    from perrin.mobility import Mobility, apparent_translation, cluster_mobility
     from perrin.motion import RigidMotion, remove_rotation, threshold_displacement, track_rotation
     from perrin.noise import NoiseFloor, noise_floor
     from perrin.quaternions import QuaternionCovariance, quaternion_covariance
@@ -44,6 +50,14 @@ if TYPE_CHECKING:
     from perrin.sampling import SamplingPlan, SamplingVerdict, judge_sampling, plan_sampling
     from perrin.shapes import Cluster, point_group, rotation_group
     from perrin.simulate import add_noise, simulate_motion
+    from perrin.surroundings import (
+        WallFactor,
+        gravitational_height,
+        settling_velocity,
+        wall_diffusion,
+        wall_factor,
+        water_viscosity,
+    )
     from perrin.tensors import CoupledTensor, DiffusionTensor, coupled_tensor, diffusion_tensor
 
 __version__ = "0.1.0"
@@ -57,6 +71,7 @@ __all__ = [
     "DiffusionTensor",
     "IdentityWarning",
     "LagCurve",
+    "Mobility",
     "NoiseFloor",
     "PrecisionWarning",
     "QuaternionCovariance",
@@ -69,9 +84,12 @@ __all__ = [
     "TooFewFramesError",
     "TrackTableError",
     "VanHove",
+    "WallFactor",
     "add_noise",
     "analyze",
+    "apparent_translation",
     "axis_angle",
+    "cluster_mobility",
     "cluster_positions",
     "coupled_tensor",
     "cramer_rao",
@@ -80,6 +98,7 @@ __all__ = [
     "find_clusters",
     "fit_gls",
     "fit_line",
+    "gravitational_height",
     "judge_sampling",
     "kabsch",
     "load_run",
@@ -96,13 +115,18 @@ __all__ = [
     "read_tracks",
     "remove_rotation",
     "rotation_group",
+    "settling_velocity",
     "similarity",
     "simulate_motion",
+    "size_and_viscosity",
     "size_from_rotation",
     "size_from_translation",
     "threshold_displacement",
     "track_rotation",
     "van_hove",
+    "wall_diffusion",
+    "wall_factor",
+    "water_viscosity",
     "write_run",
     "write_tracks",
 ]
@@ -137,7 +161,21 @@ _ROOMS = {
     "tensors": ("CoupledTensor", "DiffusionTensor", "coupled_tensor", "diffusion_tensor"),
     "bounds": ("cramer_rao",),
     "sampling": ("SamplingPlan", "SamplingVerdict", "judge_sampling", "plan_sampling"),
-    "hydrodynamics": ("Size", "size_from_rotation", "size_from_translation"),
+    "mobility": ("Mobility", "apparent_translation", "cluster_mobility"),
+    "hydrodynamics": (
+        "Size",
+        "size_and_viscosity",
+        "size_from_rotation",
+        "size_from_translation",
+    ),
+    "surroundings": (
+        "WallFactor",
+        "gravitational_height",
+        "settling_velocity",
+        "wall_diffusion",
+        "wall_factor",
+        "water_viscosity",
+    ),
     "simulate": ("add_noise", "simulate_motion"),
     "files": ("read_tracks", "write_tracks"),
     "results": ("ClusterResult", "Report", "load_run"),

@@ -13,9 +13,11 @@ import typer
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from numpy.typing import ArrayLike
     from rich.table import Table
 
     from perrin.diffusion import DiffusionEstimate
+    from perrin.mobility import Mobility
     from perrin.results import ClusterResult, Report
     from perrin.sampling import SamplingPlan
     from perrin.shapes import Cluster
@@ -30,6 +32,7 @@ app = typer.Typer(
 
 _SHOWN, _SHOWN_WARNINGS = 5, 20
 _SHAPES = ("tetrahedron", "pentahedron", "trimer")
+_TOUCHING = ("dimer", "trimer", "tetrahedron", "bipyramid", "octahedron", "pentagonal-bipyramid")
 _UNEQUAL = 0.05  # below this probability of equal axes the tensor is worth a look
 _PICTURES = (".png", ".pdf", ".svg")
 
@@ -186,6 +189,51 @@ def simulate(
 
 
 @app.command()
+def predict(
+    viscosity: Annotated[float, typer.Option(help="Pa s.")],
+    temperature: Annotated[float, typer.Option(help="K.")],
+    shape: Annotated[
+        str | None, typer.Argument(help=f"Touching spheres: {', '.join(_TOUCHING)}.")
+    ] = None,
+    diameter: Annotated[float | None, typer.Option(help="Sphere diameter, um.")] = None,
+    positions: Annotated[
+        Path | None,
+        typer.Option(help="Any other body: csv with columns x,y,z (um), perhaps radius."),
+    ] = None,
+    accuracy: Annotated[float, typer.Option(help="Relative error aimed at.")] = 1e-4,
+    output: Annotated[Path | None, typer.Option("-o", "--output", help="JSON file.")] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the file.")] = False,
+) -> None:
+    """Predict how a rigid cluster of spheres diffuses: D_T, D_R, hydrodynamic diameters."""
+    import json
+    import warnings
+
+    import perrin
+
+    with _told():
+        if output is not None and output.exists() and not overwrite:
+            raise FileExistsError(f"{output} exists: choose another file, or --overwrite")
+        centers, radius = _spheres(shape, diameter=diameter, positions=positions)
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always", perrin.PrecisionWarning)
+            body = perrin.cluster_mobility(
+                centers,
+                radius=radius,
+                viscosity=viscosity,
+                temperature=temperature,
+                accuracy=accuracy,
+            )
+        for warning in told:
+            print(f"warning: {warning.message}", file=sys.stderr)
+        if output is not None:
+            text = json.dumps(body.to_dict(), indent=2, allow_nan=False)
+            output.write_text(text + "\n", encoding="utf-8")
+        _show_prediction(body, name=shape or str(positions))
+        if output is not None:
+            print(f"Written to {output}")
+
+
+@app.command()
 def plan(
     shape: Annotated[str, typer.Argument(help=f"{', '.join(_SHAPES)}.")],
     d_r: Annotated[float, typer.Option("--d-r", help="D_R as far as it is known, rad^2/s.")],
@@ -319,6 +367,36 @@ def _one_line(error: Exception) -> str:
     return "; ".join(line.strip().removeprefix("- ") for line in str(error).splitlines())
 
 
+def _spheres(
+    shape: str | None, *, diameter: float | None, positions: Path | None
+) -> tuple[ArrayLike, ArrayLike]:
+    """Return centres and radius of a named body of touching spheres, or those of a file."""
+    import perrin
+    from perrin._arrays import require_positive
+    from perrin.files import read_spheres
+
+    if diameter is not None:
+        require_positive(diameter=diameter)
+    if positions is None and shape in _TOUCHING:
+        if diameter is None:
+            raise ValueError("--diameter: the sphere diameter (um) is needed")
+        return perrin.Cluster.touching(_TOUCHING.index(shape) + 2, diameter).positions, diameter / 2
+    if positions is None or shape is not None:
+        raise ValueError(
+            f"expected one of {', '.join(_TOUCHING)}, or --positions FILE, got {shape!r}"
+            + ("" if positions is None else f" and {positions}")
+        )
+    centers, radius = read_spheres(positions)
+    if radius is not None and diameter is None:
+        return centers, radius
+    if radius is None and diameter is not None:
+        return centers, diameter / 2
+    there = "has none" if radius is None else "has one"
+    raise ValueError(
+        f"the size: expected --diameter or a column radius, one of them; {positions} {there}"
+    )
+
+
 def _numbers(option: str, text: str) -> float | list[float]:
     """Read one number, or several separated by commas."""
     try:
@@ -434,8 +512,8 @@ def _show(report: Report, output: Path) -> None:
     for result in report.clusters[:_SHOWN]:
         console.print(_cluster_table(result))
         if result.tensor is not None and result.tensor.p_isotropic < _UNEQUAL:
-            told = f"rotation about the body's axes: {result.tensor}\n"
-            console.print(escape(told), soft_wrap=True)
+            axes = f"rotation about the body's axes: {result.tensor}\n"
+            console.print(escape(axes), soft_wrap=True)
     if len(report.clusters) > 1:
         console.print(_pooled_table(report))
     told = [("", text) for text in report.warnings]
@@ -471,6 +549,39 @@ def _cluster_table(result: ClusterResult) -> Table:
     if result.sizes:
         table.caption = "* with the paper's factor 1.844 (Hoffmann 2009)"
     return table
+
+
+def _show_prediction(body: Mobility, *, name: str) -> None:
+    """Print the short table of a prediction."""
+    from rich.box import SIMPLE_HEAD
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    title = f"{escape(name)}, {len(body.radius)} spheres of {body.sphere_diameter:.4g} um"
+    table = Table(
+        "", "mean", "principal values", title=title, title_justify="left", box=SIMPLE_HEAD
+    )
+    table.columns[0].no_wrap = True
+    for label, values in (
+        ("D_T (um^2/s)", body.principal_D_T.values),
+        ("D_R (rad^2/s)", body.principal_D_R.values),
+    ):
+        shown = ", ".join(f"{value:.5g}" for value in values)
+        table.add_row(label, f"{values.mean():.5g}", shown)
+    for mode, diameter, factor in (
+        ("D_T", body.diameter_T, body.diameter_factor_T),
+        ("D_R", body.diameter_R, body.diameter_factor_R),
+    ):
+        table.add_row(f"cluster diameter, {mode} (um)", f"{diameter:.4f}")
+        table.add_row(f"over the sphere's, {mode}", f"{factor:.4f}")
+    place = ", ".join(f"{round(x, 4) + 0.0:.4f}" for x in body.center - body.centroid)
+    table.add_row("centre of diffusion* (um)", "", place)
+    table.caption = (
+        f"* from the centroid of the spheres. Relative error about {body.error:.1g} (degree "
+        f"{body.degree})"
+    )
+    Console(highlight=False).print(table)
 
 
 def _pooled_table(report: Report) -> Table:

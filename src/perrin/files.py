@@ -189,6 +189,56 @@ def write_tracks(table: pd.DataFrame, path: _PathLike) -> None:
         beside.unlink(missing_ok=True)
 
 
+def read_spheres(path: _PathLike) -> tuple[Floats, Floats | None]:
+    r"""Read the spheres of one body from a csv file with columns x, y, z and perhaps radius.
+
+    Parameters
+    ----------
+    path : str or path
+        One header line, one row a sphere, um.
+
+    Returns
+    -------
+    centers : ndarray, shape (n, 3)
+    radius : ndarray, shape (n,), or None
+        None where the file has no such column.
+
+    Raises
+    ------
+    TrackTableError
+        If it is no such table; all faults are listed.
+    OSError
+        If it cannot be read.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     file = Path(folder) / "dimer.csv"
+    ...     _ = file.write_text("x,y,z,radius\n0,0,0,1\n0,0,2.5,1.5\n")
+    ...     centers, radius = read_spheres(file)
+    >>> radius
+    array([1. , 1.5])
+    """
+    source = os.fspath(path)
+    table = _parse_csv(Path(path).read_bytes(), source)
+    faults = [f"column {name!r} is missing" for name in _AXES if name not in table]
+    unknown = [name for name in table if name not in (*_AXES, "radius")]
+    if unknown:
+        faults.append(f"columns other than x, y, z and radius: {', '.join(unknown)}")
+    if not len(table):
+        faults.append("no rows; expected one row per sphere")
+    for name in [name for name in (*_AXES, "radius") if name in table]:
+        bad = ~np.isfinite(_as_numbers(table[name])[0])
+        if bad.any():
+            line = int(table.index[bad][0]) + 2
+            faults.append(f"column {name!r} holds no finite number in line {line}")
+    if faults:
+        raise table_error(source, *faults)
+    radius = table["radius"].to_numpy(np.float64) if "radius" in table else None
+    return table[list(_AXES)].to_numpy(np.float64), radius
+
+
 # ---- messages -----------------------------------------------------------------------------------
 
 

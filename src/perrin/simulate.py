@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from perrin._arrays import Floats, as_positions, as_sigma, require_positive
+from perrin.mobility import Mobility
 from perrin.motion import RigidMotion
 from perrin.rotations import cumulative_product, exp_map, successive_product
 
@@ -20,9 +21,9 @@ _SUBSTEP = 0.002
 
 
 def simulate_motion(
-    cluster: Cluster,
+    cluster: Cluster | Mobility,
     *,
-    D_R: ArrayLike,
+    D_R: ArrayLike | None = None,
     D_T: float = 0.0,
     dt: float,
     n_frames: int,
@@ -33,10 +34,12 @@ def simulate_motion(
 
     Parameters
     ----------
-    cluster : Cluster
-        The body.
+    cluster : Cluster or Mobility
+        The body. A `Mobility` moves by its own 6x6 tensor, anisotropic and coupled, about its
+        centre of diffusion.
     D_R : float or array_like, shape (3,) or (3, 3)
-        Rotational diffusion coefficient, rad^2/s; three values or a tensor are in body axes.
+        Rotational diffusion coefficient, rad^2/s; three values or a tensor are in body axes. Needed
+        with a `Cluster`; like D_T not to be given with a `Mobility`.
     D_T : float
         Translational diffusion coefficient, um^2/s.
     dt : float
@@ -58,7 +61,8 @@ def simulate_motion(
     Raises
     ------
     ValueError
-        For bad values, a tensor that is not positive semidefinite, or a tensor with "euler".
+        For bad values, a tensor that is not positive semidefinite, a tensor with "euler", or
+        coefficients beside a `Mobility`.
 
     Examples
     --------
@@ -72,30 +76,41 @@ def simulate_motion(
     require_positive(dt=dt, n_frames=n_frames)
     if n_frames != int(n_frames):
         raise ValueError(f"n_frames: expected a whole number, got {n_frames!r}")
-    if not (np.ndim(D_T) == 0 and np.isfinite(D_T) and D_T >= 0):
-        raise ValueError(f"D_T: expected a finite number >= 0 (um^2/s), got {D_T!r}")
     if scheme not in ("brownian", "euler"):
         raise ValueError(f'scheme: expected "brownian" or "euler", got {scheme!r}')
-    generator, n, d = np.random.default_rng(rng), int(n_frames), cluster.positions.shape[1]
-    tensor = _tensor(D_R, d)
-    rotation = _rotations(tensor * dt, n - 1, scheme=scheme, generator=generator)
-    jumps = generator.normal(scale=np.sqrt(2 * D_T * dt), size=(n - 1, d))
-    center = np.concatenate([np.zeros((1, d)), np.cumsum(jumps, axis=0)])
-    angles = 3 if d == 3 else 1
+    generator, n = np.random.default_rng(rng), int(n_frames)
+    if isinstance(cluster, Mobility):
+        if D_R is not None or D_T != 0 or scheme != "brownian":
+            raise ValueError(
+                'a Mobility has its own D_R, D_T and scheme ("brownian"); leave them out'
+            )
+        template = cluster.centers - cluster.centroid
+        center, rotation = _coupled(cluster, n - 1, dt=dt, generator=generator)
+    else:
+        template = cluster.positions.copy()
+        center, rotation = _uncoupled(
+            template.shape[1], n - 1, D_R=D_R, D_T=D_T, dt=dt, scheme=scheme, generator=generator
+        )
+    return _truth(center, rotation, template, dt=float(dt))
+
+
+def _truth(center: Floats, rotation: Floats, template: Floats, *, dt: float) -> RigidMotion:
+    """Return a motion without noise or gaps."""
+    n, angles = len(center), 3 if template.shape[1] == 3 else 1
     return RigidMotion(
         time=np.arange(n, dtype=np.float64) * dt,
         center=center,
         rotation=rotation,
         residual=np.zeros(n),
-        n_present=np.full(n, len(cluster.positions)),
+        n_present=np.full(n, len(template)),
         covariance=np.zeros((n, angles, angles)),
         center_variance=np.zeros(n),
         piece=np.zeros(n, dtype=np.int64),
         reason=("",) * n,
-        template=cluster.positions.copy(),
+        template=template,
         sigma=0.0,
-        noise=np.zeros(d),
-        dt=float(dt),
+        noise=np.zeros(template.shape[1]),
+        dt=dt,
     )
 
 
@@ -124,6 +139,49 @@ def add_noise(positions: ArrayLike, *, sigma: ArrayLike, rng: np.random.Generato
     x = as_positions(positions)
     s = as_sigma(sigma, x.shape[2])
     return x + np.random.default_rng(rng).normal(size=x.shape) * s
+
+
+def _uncoupled(
+    d: int,
+    count: int,
+    *,
+    D_R: ArrayLike | None,
+    D_T: float,
+    dt: float,
+    scheme: str,
+    generator: np.random.Generator,
+) -> tuple[Floats, Floats]:
+    """Return centres and orientations that diffuse independently, count + 1 of them."""
+    if D_R is None:
+        raise ValueError("D_R: needed with a Cluster (rad^2/s); only a Mobility has its own")
+    if not (np.ndim(D_T) == 0 and np.isfinite(D_T) and D_T >= 0):
+        raise ValueError(f"D_T: expected a finite number >= 0 (um^2/s), got {D_T!r}")
+    rotation = _rotations(_tensor(D_R, d) * dt, count, scheme=scheme, generator=generator)
+    jumps = generator.normal(scale=np.sqrt(2 * D_T * dt), size=(count, d))
+    return np.concatenate([np.zeros((1, d)), np.cumsum(jumps, axis=0)]), rotation
+
+
+def _coupled(
+    body: Mobility, count: int, *, dt: float, generator: np.random.Generator
+) -> tuple[Floats, Floats]:
+    """Return centroids and orientations that diffuse by a 6x6 tensor, count + 1 of them.
+
+    A substep is a screw in body axes with Gaussian displacement and turn about the centre of
+    diffusion, where the coupling is symmetric and no drift arises; half of its turn comes before
+    its displacement.
+    """
+    substeps = int(np.ceil(np.linalg.eigvalsh(body.D_R)[-1] * dt / _SUBSTEP))
+    root = np.linalg.cholesky(2 * body.D * dt / substeps)
+    turn, shift = np.broadcast_to(np.eye(3), (count, 3, 3)), np.zeros((count, 3, 1))
+    for _ in range(substeps):
+        screw = generator.normal(size=(count, 6)) @ root.T
+        halfway = turn @ exp_map(0.5 * screw[:, 3:])
+        shift = shift + halfway @ screw[:, :3, None]
+        turn = turn @ exp_map(screw[:, 3:])
+    rotation = cumulative_product(turn)
+    path = np.concatenate([np.zeros((1, 3)), np.cumsum((rotation[:-1] @ shift)[..., 0], axis=0)])
+    arm = body.centroid - body.center
+    return path + rotation @ arm - arm, rotation
 
 
 def _tensor(D_R: ArrayLike, d: int) -> Floats:
