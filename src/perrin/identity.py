@@ -29,8 +29,6 @@ _DOUBT, _TRUST = float(np.log(100.0)), 10.0
 # A step of under 0.4 of the least angle between two assignments cannot be mistaken.
 _SHORT = 0.4
 _BATCH = 100_000
-# Medians of chi squared with 1 and 3 degrees of freedom.
-_MEDIAN = {2: 0.455, 3: 2.366}
 _COMPLETE = 0.05
 _TINY = 1e-6  # rad: what rounding leaves of a rotation
 # Of large bodies a fit this near (of the least particle distance) is right; searched from one in
@@ -134,13 +132,13 @@ def settle_identity(
     seen = present(x)
     time = np.arange(len(x), dtype=np.float64) if times is None else np.asarray(times, np.float64)
     n = _size(seen) if size is None else size
+    frames = _Frames.of(x, seen, n)
+    if labelled and _undoubted(frames, _body_as_given(frames)):
+        return _as_given(seen, n)
     seed = _seed(x, seen, n)
     if seed is None:
         return _as_given(seen, n)
-    frames = _Frames.of(x, seen, n)
     body = _body(frames, seed, labelled=labelled)
-    if labelled and _undoubted(frames, body):
-        return _as_given(seen, n)
     lists = _assignments(frames, body, labelled=labelled)
     answer = _chained(frames, body, lists, time, labelled=labelled)
     if labelled and not answer.cuts.size:
@@ -344,6 +342,24 @@ def _orientations(d: int) -> Floats:
     return turns
 
 
+def _body_as_given(frames: _Frames) -> _Body | None:
+    """Build the shape as if all labels were right; None if they are not."""
+    n, d = frames.n, frames.x.shape[2]
+    rows = np.flatnonzero(frames.count == n)
+    if n < d or rows.size < 2 or frames.x.shape[1] != n:
+        return None
+    rows = rows[np.linspace(0, rows.size - 1, min(rows.size, _MODELS)).astype(int)]
+    label = frames.column[rows[0]]
+    if not (frames.column[rows] == label).all():
+        return None
+    points = frames.x[rows]
+    template = points[0] - points[0].mean(axis=0)
+    misfit = _fits(points[1:], template)[1]
+    if not misfit.max() <= _NOISE * max(np.median(misfit), _TINY**2 * (template**2).sum()):
+        return None
+    return _averaged(points, template, label)
+
+
 def _body(frames: _Frames, seed: int, *, labelled: bool) -> _Body:
     """Build the shape from frames assigned to the seed, and find its symmetries within noise."""
     n, d = frames.n, frames.x.shape[2]
@@ -353,7 +369,7 @@ def _body(frames: _Frames, seed: int, *, labelled: bool) -> _Body:
     some = frames.x[rows[:: max(1, rows.size // 15)], :n]
     template = frames.x[seed, :n] - frames.x[seed, :n].mean(axis=0)
     freedom = _freedom(n, d)
-    sigma2 = float(np.median(_best(some, template)[1])) / freedom
+    sigma2 = float(np.median(_best(some, template)[1])) / _median_chi2(freedom)
     rough = _Body(template, sigma2, _group(template, sigma2), label)
     order = np.broadcast_to(np.arange(n), (rows.size, n)).copy()
     same = (frames.column[rows, :n] == label).all(axis=1) & labelled
@@ -361,7 +377,7 @@ def _body(frames: _Frames, seed: int, *, labelled: bool) -> _Body:
     misfit[same] = _fits(frames.x[rows[same], :n], template)[1]
     odd = np.flatnonzero(misfit > _NOISE * sigma2 * freedom)
     order[odd], misfit[odd] = _base(frames.x[rows[odd], :n], rough)
-    good = np.argsort(misfit, kind="stable")[: (rows.size + 1) // 2]
+    good = misfit <= 2 * _NOISE * sigma2 * freedom
     points = _seated(frames.x[rows[good]], order[good][:, None])[:, 0]
     return _averaged(points, template, label)
 
@@ -369,13 +385,13 @@ def _body(frames: _Frames, seed: int, *, labelled: bool) -> _Body:
 def _averaged(points: Floats, shape: Floats, label: Ints) -> _Body:
     """Average complete frames (K, n, d), in order, to a shape; find its noise and symmetries."""
     n, d = shape.shape
-    for _ in range(2):
-        rotation, misfit = _fits(points, shape)
-        fits = np.isfinite(misfit)
+    rotation, misfit = _fits(points, shape)
+    fits = np.isfinite(misfit)
+    if fits.any():
         centred = points[fits] - points[fits].mean(axis=1, keepdims=True)
         shape = np.einsum("tij,tni->tnj", rotation[fits], centred).mean(axis=0)
     # Rounding takes the place of noise where there is none.
-    sigma2 = float(np.median(_fits(points, shape)[1])) / _freedom(n, d)
+    sigma2 = float(np.median(_fits(points, shape)[1])) / _median_chi2(_freedom(n, d))
     sigma2 = max(sigma2, (1e-7 * float(np.abs(shape).max())) ** 2)
     return _Body(shape, sigma2, _group(shape, sigma2), label)
 
@@ -394,6 +410,11 @@ def _remade(body: _Body, answer: Identity, x: Floats) -> _Body:
 
 def _freedom(n: int, d: int) -> float:
     return max(float(degrees_of_freedom(np.array(n), d)), 1.0)
+
+
+def _median_chi2(freedom: float) -> float:
+    """Return the median of chi squared (Wilson and Hilferty, 1931; within 3 % from 1 on)."""
+    return freedom * (1 - 2 / (9 * freedom)) ** 3
 
 
 def _group(template: Floats, sigma2: float) -> Ints:
@@ -429,8 +450,10 @@ def _limit(count: Ints, body: _Body) -> Floats:
     return np.asarray(_NOISE * body.sigma2 * freedom, dtype=np.float64)
 
 
-def _undoubted(frames: _Frames, body: _Body) -> bool:
+def _undoubted(frames: _Frames, body: _Body | None) -> bool:
     """Return whether the labels fit everywhere and no step is long enough to be mistaken."""
+    if body is None:
+        return False
     place = _places(frames, body.label)
     rows = np.flatnonzero(frames.count >= body.template.shape[1])
     if not _known(frames, place).all() or len(body.template) > _ALL:
@@ -636,7 +659,8 @@ def _spread(lists: _Lists, time: Floats, rows: Ints, *, labelled: bool) -> Float
     gap = np.diff(time)
     usual = float(np.median(gap)) if gap.size else 1.0
     median = float(np.median(steps)) if steps.size else 0.0
-    spread: Floats = max(median / _MEDIAN[d], _TINY**2) * np.maximum(gap / usual, 1.0)
+    typical = median / _median_chi2(3.0 if d == 3 else 1.0)
+    spread: Floats = max(typical, _TINY**2) * np.maximum(gap / usual, 1.0)
     return spread
 
 
