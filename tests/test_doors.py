@@ -20,10 +20,10 @@ SOURCE = ROOT / "src" / "perrin"
 
 # The house, top to bottom: a room imports only rooms above it.
 ROOMS = [
-    "_arrays", "rotations", "shapes", "noise", "motion", "grouping", "lagged", "diffusion",
-    "curve_fits", "bounds", "hydrodynamics", "simulate", "gdf", "files", "results", "analysis",
-    "plot", "report", "claims", "paper_method", "paper_noise", "paper_orientations",
-    "paper_experiment", "paper", "cli",
+    "_arrays", "rotations", "shapes", "noise", "motion", "identity", "rods", "bonds", "linking",
+    "grouping", "quality", "lagged", "diffusion", "rod_diffusion", "curve_fits", "bounds",
+    "hydrodynamics", "simulate", "gdf", "files", "results", "analysis", "plot", "report", "claims",
+    "paper_method", "paper_noise", "paper_orientations", "paper_experiment", "paper", "cli",
 ]  # fmt: skip
 LAZY = ("pandas", "scipy", "matplotlib", "pyarrow", "jinja2", "typer", "rich", "trackpy", "numba")
 

@@ -23,13 +23,16 @@ if TYPE_CHECKING:
     from perrin.curve_fits import fit_line
     from perrin.diffusion import DiffusionEstimate, estimate_diffusion
     from perrin.files import read_tracks, write_tracks
-    from perrin.grouping import cluster_positions, find_clusters, positions_table
+    from perrin.grouping import cluster_positions, find_clusters, identify, positions_table
     from perrin.hydrodynamics import Size, size_from_rotation, size_from_translation
+    from perrin.identity import Identity, settle_identity
     from perrin.lagged import LagCurve, msad, msad_vector, msd, orientation_correlation
     from perrin.motion import RigidMotion, remove_rotation, track_rotation
     from perrin.noise import NoiseFloor, noise_floor
     from perrin.report import write_run
     from perrin.results import ClusterResult, Report, load_run
+    from perrin.rod_diffusion import estimate_rod
+    from perrin.rods import RodMotion, track_direction
     from perrin.rotations import Similarity, axis_angle, kabsch, similarity
     from perrin.shapes import Cluster
     from perrin.simulate import add_noise, simulate_motion
@@ -41,12 +44,14 @@ __all__ = [
     "ClusterResult",
     "DegenerateClusterError",
     "DiffusionEstimate",
+    "Identity",
     "IdentityWarning",
     "LagCurve",
     "NoiseFloor",
     "PrecisionWarning",
     "Report",
     "RigidMotion",
+    "RodMotion",
     "Similarity",
     "Size",
     "TooFewFramesError",
@@ -57,8 +62,10 @@ __all__ = [
     "cluster_positions",
     "cramer_rao",
     "estimate_diffusion",
+    "estimate_rod",
     "find_clusters",
     "fit_line",
+    "identify",
     "kabsch",
     "load_run",
     "msad",
@@ -69,10 +76,12 @@ __all__ = [
     "positions_table",
     "read_tracks",
     "remove_rotation",
+    "settle_identity",
     "similarity",
     "simulate_motion",
     "size_from_rotation",
     "size_from_translation",
+    "track_direction",
     "track_rotation",
     "write_run",
     "write_tracks",
@@ -91,9 +100,12 @@ _ROOMS = {
     "shapes": ("Cluster",),
     "noise": ("NoiseFloor", "noise_floor"),
     "motion": ("RigidMotion", "remove_rotation", "track_rotation"),
-    "grouping": ("cluster_positions", "find_clusters", "positions_table"),
+    "identity": ("Identity", "settle_identity"),
+    "rods": ("RodMotion", "track_direction"),
+    "grouping": ("cluster_positions", "find_clusters", "identify", "positions_table"),
     "lagged": ("LagCurve", "msad", "msad_vector", "msd", "orientation_correlation"),
     "diffusion": ("DiffusionEstimate", "estimate_diffusion"),
+    "rod_diffusion": ("estimate_rod",),
     "curve_fits": ("fit_line",),
     "bounds": ("cramer_rao",),
     "hydrodynamics": ("Size", "size_from_rotation", "size_from_translation"),

@@ -137,7 +137,7 @@ def settle_identity(
         return _as_given(seen, n)
     seed = _seed(x, seen, n)
     if seed is None:
-        return _as_given(seen, n)
+        return _as_given(seen, n) if labelled else _unknown(seen, n)
     body = _body(frames, seed, labelled=labelled)
     lists = _assignments(frames, body, labelled=labelled)
     answer = _chained(frames, body, lists, time, labelled=labelled)
@@ -217,6 +217,14 @@ def _as_given(seen: Bools, n: int) -> Identity:
     piece = np.zeros(len(seen), dtype=np.int64)
     unsettled = none if n == seen.shape[1] else np.arange(len(seen))
     return Identity(order, piece, none, none.copy(), none.copy(), unsettled)
+
+
+def _unknown(seen: Bools, n: int) -> Identity:
+    """Settle nothing: no frame shows the whole body."""
+    none = np.empty(0, dtype=np.int64)
+    order = np.full((len(seen), n), -1, dtype=np.int64)
+    piece = np.zeros(len(seen), dtype=np.int64)
+    return Identity(order, piece, none, none.copy(), none.copy(), np.flatnonzero(seen.any(axis=1)))
 
 
 def _fits(points: Floats, template: Floats) -> tuple[Floats, Floats]:
