@@ -8,8 +8,10 @@ import numpy as np
 
 from perrin._arrays import (
     Bools,
+    DegenerateClusterError,
     Floats,
     Ints,
+    TooFewFramesError,
     TrackTableError,
     as_positions,
     present,
@@ -274,7 +276,10 @@ def _settled(frame: Ints, x: Floats, size: int) -> tuple[Ints, Ints]:
 
 def _ends_of(positions: Floats, times: Ints) -> tuple[Ints, Ints]:
     """Return the order of the two ends of a rod in every frame, and the pieces."""
-    rod = track_direction(positions, dt=1.0, times=times.astype(np.float64), labelled=False)
+    try:
+        rod = track_direction(positions, dt=1.0, times=times.astype(np.float64), labelled=False)
+    except (DegenerateClusterError, TooFewFramesError):
+        return np.full(positions.shape[:2], -1), np.zeros(len(positions), dtype=np.int64)
     along = np.einsum("td,td->t", positions[:, 1] - positions[:, 0], rod.direction)
     order = np.where((along < 0)[:, None], [1, 0], [0, 1])
     return np.where(np.isfinite(along)[:, None], order, -1), rod.piece

@@ -21,6 +21,7 @@ _DOUBT = float(np.log(100.0))
 # missing over each one found.
 _LOPSIDED = 0.6
 _FEWEST = 3
+_NEVER = 1e6  # the cost of a link that is none
 
 
 def link_clusters(frame: Ints, x: Floats, *, reach: float, contact: float, size: int) -> Ints:
@@ -149,13 +150,15 @@ def _linked(centers: _Centers) -> Ints:
     for groups in frames_of(centers.frame):
         now = int(centers.frame[groups[0]])
         active = active[centers.frame[active] >= now - _MEMORY]
-        for old, new in _links(centers, active, groups, variance):
-            track[new] = track[old]
+        ended = []
+        for old, new, sure in _links(centers, active, groups, variance):
+            ended.append(old)
+            if sure:
+                track[new] = track[old]
         fresh = groups[track[groups] < 0]
         track[fresh] = count + np.arange(fresh.size)
         count += fresh.size
-        followed = np.isin(track[active], track[groups])
-        active = np.concatenate([active[~followed], groups])
+        active = np.concatenate([np.setdiff1d(active, ended), groups])
     return track
 
 
@@ -181,28 +184,29 @@ def _step_variance(centers: _Centers) -> float:
     return float(np.median(np.concatenate(squares))) / median_chi2
 
 
-def _links(centers: _Centers, old: Ints, new: Ints, variance: float) -> Iterator[tuple[int, int]]:
-    """Yield the sure links between tracks' last groups and the groups of this frame."""
+def _links(
+    centers: _Centers, old: Ints, new: Ints, variance: float
+) -> Iterator[tuple[int, int, bool]]:
+    """Yield the likeliest links of tracks' last groups to groups of this frame, and if sure."""
     from scipy.optimize import linear_sum_assignment
 
     for rows, columns, cost in _contests(centers, old, new, variance):
-        # Nobody has to be linked: leaving one out costs what lies at the gate.
         n, m = cost.shape
+        if n == m == 1:
+            yield int(old[rows[0]]), int(new[columns[0]]), True
+            continue
+        # Nobody has to be linked: leaving one out costs what lies at the gate.
         full = np.full((n + m, n + m), _GATE / 2)
         full[:n, :m] = cost
         full[n:, m:] = 0.0
         i, j = linear_sum_assignment(full)
         best = full[i, j].sum()
-        for a, b in zip(i, j, strict=True):
-            if a >= n or b >= m:
-                continue
-            other = full.copy()
-            other[a, b] = np.inf if n * m == 1 else 1e6
-            if n * m > 1:
+        for a, b in zip(i.tolist(), j.tolist(), strict=True):
+            if a < n and b < m:
+                other = full.copy()
+                other[a, b] = _NEVER
                 rival = other[linear_sum_assignment(other)].sum()
-                if rival - best <= _DOUBT:
-                    continue
-            yield int(old[rows[a]]), int(new[columns[b]])
+                yield int(old[rows[a]]), int(new[columns[b]]), bool(rival - best > _DOUBT)
 
 
 def _contests(
@@ -237,6 +241,6 @@ def _contests(
         if edges.size:
             rows, a = np.unique(i[edges], return_inverse=True)
             columns, b = np.unique(j[edges], return_inverse=True)
-            cost = np.full((rows.size, columns.size), 1e6)
+            cost = np.full((rows.size, columns.size), _NEVER)
             cost[a, b] = half[edges]
             yield rows, columns, cost

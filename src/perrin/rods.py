@@ -170,7 +170,7 @@ def track_direction(
     >>> from perrin import Cluster, add_noise, simulate_motion, track_direction
     >>> truth = simulate_motion(Cluster.touching(2, 2.0), D_R=0.01, dt=0.5, n_frames=500, rng=1)
     >>> track_direction(add_noise(truth.positions(), sigma=0.03, rng=2), dt=0.5)
-    RodMotion(n=2, length=2 um, 500 of 500 frames, dt=0.5 s, sigma=0.0306 um)
+    RodMotion(n=2, length=2 um, 500 of 500 frames, dt=0.5 s, sigma=0.0318 um)
     """
     x = as_positions(positions)
     if x.shape[2] != 3 or x.shape[1] < 2:
