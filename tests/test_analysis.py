@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 
 import perrin
-from perrin.analysis import _autocorrelation
+from perrin.quality import _autocorrelation
 
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data" / "optitrack"
 
@@ -104,17 +104,21 @@ def test_nan_coordinates_are_missing_points_counted_in_a_warning(base):
     assert not any("NaN" in w for w in without.warnings)
 
 
-def test_without_clusters_up_to_twenty_particles_are_one(base):
-    """No cluster column: one cluster with a warning, and more than 20 particles an error."""
+def test_without_a_cluster_column_bodies_are_found(base):
+    """One body is told to be one; six are found with and without contact; a gas is refused."""
     plain = base.drop(columns="cluster")
     report = perrin.analyze(plain, dt=0.73)
     assert len(report.clusters) == 1
     assert any("one cluster" in w for w in report.warnings)
     crowd = pd.concat([tracks(seed=k, cluster=k, n_frames=20) for k in range(6)])
-    with pytest.raises(perrin.TrackTableError, match=r"24 particles.*--contact"):
-        perrin.analyze(crowd.drop(columns="cluster"), dt=0.73)
-    found = perrin.analyze(crowd.drop(columns="cluster"), dt=0.73, contact=2.45)
-    np.testing.assert_allclose(values(found), values(perrin.analyze(crowd, dt=0.73)), rtol=1e-9)
+    told = values(perrin.analyze(crowd, dt=0.73))
+    for contact in (2.45, None):
+        found = perrin.analyze(crowd.drop(columns="cluster"), dt=0.73, contact=contact)
+        np.testing.assert_allclose(values(found), told, rtol=1e-9)
+    assert any("6 bodies found" in w for w in found.warnings)
+    gas = np.random.default_rng(3).normal(size=(60, 25, 3)).cumsum(axis=0)
+    with pytest.raises(perrin.TrackTableError, match=r"keep their distance.*--contact"):
+        perrin.analyze(perrin.positions_table(gas).drop(columns="cluster"), dt=0.73)
 
 
 def test_several_clusters_are_pooled():
@@ -131,18 +135,18 @@ def test_several_clusters_are_pooled():
 
 
 def test_a_bad_cluster_among_good_ones_is_a_warning():
-    """Two collinear points and a lone frame are left out by name; the good cluster stands."""
+    """A lone particle and a lone frame are left out by name; the good cluster stands."""
     good = tracks(seed=1, cluster=0)
-    pair = tracks(seed=2, cluster=1)
-    pair = pair[pair["particle"] < 6]
+    single = tracks(seed=2, cluster=1)
+    single = single[single["particle"] < 5]
     flash = tracks(seed=3, cluster=2)
     flash = flash[flash["frame"] == 0]
-    report = perrin.analyze(pd.concat([good, pair, flash]), dt=0.73)
+    report = perrin.analyze(pd.concat([good, single, flash]), dt=0.73)
     assert [c.cluster for c in report.clusters] == [0]
-    assert any("cluster 1 was left out: 2 particles" in w for w in report.warnings)
+    assert any("cluster 1 was left out: 1 particle" in w for w in report.warnings)
     assert any("cluster 2 was left out: 1 frame" in w for w in report.warnings)
-    with pytest.raises(perrin.DegenerateClusterError, match="2 particles"):
-        perrin.analyze(pair, dt=0.73)
+    with pytest.raises(perrin.DegenerateClusterError, match="1 particle"):
+        perrin.analyze(single, dt=0.73)
     with pytest.raises(perrin.TooFewFramesError, match="1 frame"):
         perrin.analyze(flash, dt=0.73)
 

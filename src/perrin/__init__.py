@@ -29,8 +29,9 @@ if TYPE_CHECKING:
     from perrin.lagged import LagCurve, msad, msad_vector, msd, orientation_correlation
     from perrin.motion import RigidMotion, remove_rotation, track_rotation
     from perrin.noise import NoiseFloor, noise_floor
+    from perrin.quality import Quality, judge_quality
     from perrin.report import write_run
-    from perrin.results import ClusterResult, Report, load_run
+    from perrin.results import ClusterResult, Report, RodResult, load_run
     from perrin.rod_diffusion import estimate_rod
     from perrin.rods import RodMotion, track_direction
     from perrin.rotations import Similarity, axis_angle, kabsch, similarity
@@ -49,9 +50,11 @@ __all__ = [
     "LagCurve",
     "NoiseFloor",
     "PrecisionWarning",
+    "Quality",
     "Report",
     "RigidMotion",
     "RodMotion",
+    "RodResult",
     "Similarity",
     "Size",
     "TooFewFramesError",
@@ -66,6 +69,7 @@ __all__ = [
     "find_clusters",
     "fit_line",
     "identify",
+    "judge_quality",
     "kabsch",
     "load_run",
     "msad",
@@ -103,6 +107,7 @@ _ROOMS = {
     "identity": ("Identity", "settle_identity"),
     "rods": ("RodMotion", "track_direction"),
     "grouping": ("cluster_positions", "find_clusters", "identify", "positions_table"),
+    "quality": ("Quality", "judge_quality"),
     "lagged": ("LagCurve", "msad", "msad_vector", "msd", "orientation_correlation"),
     "diffusion": ("DiffusionEstimate", "estimate_diffusion"),
     "rod_diffusion": ("estimate_rod",),
@@ -111,7 +116,7 @@ _ROOMS = {
     "hydrodynamics": ("Size", "size_from_rotation", "size_from_translation"),
     "simulate": ("add_noise", "simulate_motion"),
     "files": ("read_tracks", "write_tracks"),
-    "results": ("ClusterResult", "Report", "load_run"),
+    "results": ("ClusterResult", "Report", "RodResult", "load_run"),
     "analysis": ("analyze",),
     "report": ("write_run",),
 }

@@ -119,7 +119,8 @@ def _wander(code: Ints, x: Floats, count: int) -> Floats:
     for axis in centred.T:
         mean = np.bincount(code, weights=axis, minlength=count) / n
         variance += np.bincount(code, weights=(axis - mean[code]) ** 2, minlength=count) / n
-    return variance / x.shape[1]
+    mean_variance: Floats = variance / x.shape[1]
+    return mean_variance
 
 
 def _summed(

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from perrin.diffusion import DiffusionEstimate
-    from perrin.results import ClusterResult, Report
+    from perrin.results import ClusterResult, Pooled, Report
 
 app = typer.Typer(
     name="perrin",
@@ -286,13 +286,17 @@ def _show(report: Report, output: Path) -> None:
     from rich.console import Console
     from rich.markup import escape
 
+    from perrin.results import perp_text
+
     console = Console(highlight=False)
     for result in report.clusters[:_SHOWN]:
         console.print(_cluster_table(result))
-    if len(report.clusters) > 1:
-        console.print(_pooled_table(report))
+    if report.pooled is not None and len(report.clusters) > 1:
+        console.print(_pooled_table(report.pooled))
+    for rod in report.rods[:_SHOWN]:
+        console.print(escape(perp_text(rod)))
     told = [("", text) for text in report.warnings]
-    told += [(f", cluster {r.name}", text) for r in report.clusters for text in r.warnings]
+    told += [(f", cluster {r.name}", text) for r in report.results for text in r.warnings]
     for where, text in told[:_SHOWN_WARNINGS]:
         console.print(f"[yellow]warning{escape(where)}:[/] {escape(text)}", soft_wrap=True)
     if len(told) > _SHOWN_WARNINGS:
@@ -326,16 +330,16 @@ def _cluster_table(result: ClusterResult) -> Table:
     return table
 
 
-def _pooled_table(report: Report) -> Table:
+def _pooled_table(pooled: Pooled) -> Table:
     """Return the table of the values pooled over clusters."""
     from rich.box import SIMPLE_HEAD
     from rich.table import Table
 
-    count = len(report.pooled.clusters)
+    count = len(pooled.clusters)
     title = f"{count} clusters pooled"
     table = Table("", "value", "68 %", "95 %", title=title, title_justify="left", box=SIMPLE_HEAD)
     table.columns[0].no_wrap = True
-    for name, estimate in (("D_R", report.pooled.D_R), ("D_T", report.pooled.D_T)):
+    for name, estimate in (("D_R", pooled.D_R), ("D_T", pooled.D_T)):
         table.add_row(f"{name} ({estimate.unit})", *_estimate_cells(estimate))
     return table
 

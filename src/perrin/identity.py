@@ -154,7 +154,7 @@ class _Frames(NamedTuple):
 
     x: Floats
     column: Ints
-    count: Ints
+    shown: Ints
     n: int
 
     @classmethod
@@ -353,7 +353,7 @@ def _orientations(d: int) -> Floats:
 def _body_as_given(frames: _Frames) -> _Body | None:
     """Build the shape as if all labels were right; None if they are not."""
     n, d = frames.n, frames.x.shape[2]
-    rows = np.flatnonzero(frames.count == n)
+    rows = np.flatnonzero(frames.shown == n)
     if n < d or rows.size < 2 or frames.x.shape[1] != n:
         return None
     rows = rows[np.linspace(0, rows.size - 1, min(rows.size, _MODELS)).astype(int)]
@@ -372,7 +372,7 @@ def _body(frames: _Frames, seed: int, *, labelled: bool) -> _Body:
     """Build the shape from frames assigned to the seed, and find its symmetries within noise."""
     n, d = frames.n, frames.x.shape[2]
     label = frames.column[seed, :n]
-    rows = np.flatnonzero(frames.count == n)
+    rows = np.flatnonzero(frames.shown == n)
     rows = rows[np.linspace(0, rows.size - 1, min(rows.size, _MODELS)).astype(int)]
     some = frames.x[rows[:: max(1, rows.size // 15)], :n]
     template = frames.x[seed, :n] - frames.x[seed, :n].mean(axis=0)
@@ -431,8 +431,9 @@ def _group(template: Floats, sigma2: float) -> Ints:
     limit = 2 * _NOISE * sigma2 * float(degrees_of_freedom(np.array(n), d))
     if n <= _ALL:
         table = _table(n, n, n)
-        misfit = _fits(template[table], template)[1]
-        return table[(misfit <= limit) | (np.arange(len(table)) == 0)]
+        alike = _fits(template[table], template)[1] <= limit
+        alike[0] = True
+        return np.asarray(table[alike])
     found = [tuple(range(n))]
     for start in _orientations(d):
         order, _, misfit = _refined(template, template, start)
@@ -449,7 +450,7 @@ def _places(frames: _Frames, label: Ints) -> Ints:
 
 def _known(frames: _Frames, place: Ints) -> Bools:
     """Return the frames whose every detection has a label of the seed's."""
-    return np.asarray((place >= 0).sum(axis=1) == frames.count)
+    return np.asarray((place >= 0).sum(axis=1) == frames.shown)
 
 
 def _limit(count: Ints, body: _Body) -> Floats:
@@ -463,11 +464,11 @@ def _undoubted(frames: _Frames, body: _Body | None) -> bool:
     if body is None:
         return False
     place = _places(frames, body.label)
-    rows = np.flatnonzero(frames.count >= body.template.shape[1])
-    if not _known(frames, place).all() or len(body.template) > _ALL:
+    rows = np.flatnonzero(frames.shown >= body.template.shape[1])
+    if not _known(frames, place).all():
         return False
     rotation, misfit = _fits(_seated(frames.x[rows], place[rows, None])[:, 0], body.template)
-    if not (misfit <= _limit(frames.count[rows], body)).all():
+    if not (misfit <= _limit(frames.shown[rows], body)).all():
         return False
     seats, which = np.unique(place[rows] >= 0, axis=0, return_inverse=True)
     least = np.array([_least_angle(body, tuple(s.tolist())) for s in seats])[which.ravel()]
@@ -479,6 +480,8 @@ def _least_angle(body: _Body, here: tuple[bool, ...]) -> float:
     """Return the least angle between two noise-like assignments of the particles that are here."""
     seats = np.flatnonzero(here)
     n = len(body.template)
+    if n > _ALL:
+        seats = np.arange(n)
     table = body.group if seats.size == n else _table(seats.size, n, seats.size)
     points = body.template if seats.size == n else body.template[seats]
     rotation, misfit = _fits(_seated(points[None], table)[0], body.template)
@@ -502,23 +505,22 @@ def _assignments(frames: _Frames, body: _Body, *, labelled: bool) -> _Lists:
     found: dict[int, Ints] = {}
     place = _places(frames, body.label)
     misfit = np.full(len(frames.x), np.inf)
-    trusted = np.flatnonzero(_known(frames, place) & (frames.count > 0)) if labelled else []
-    misfit[trusted] = _fits(_seated(frames.x[trusted], place[trusted, None])[:, 0], body.template)[
-        1
-    ]
-    fits = misfit <= _limit(frames.count, body)
-    whole = np.flatnonzero(frames.count == n)
+    trusted = np.flatnonzero(_known(frames, place) & (frames.shown > 0) & labelled)
+    seated = _seated(frames.x[trusted], place[trusted, None])[:, 0]
+    misfit[trusted] = _fits(seated, body.template)[1]
+    fits = misfit <= _limit(frames.shown, body)
+    whole = np.flatnonzero(frames.shown == n)
     base = place.copy()
     odd = whole[~fits[whole]]
     base[odd], misfit[odd] = _base(frames.x[odd, :n], body)
-    for k in whole[misfit[whole] <= _limit(frames.count[whole], body)]:
+    for k in whole[misfit[whole] <= _limit(frames.shown[whole], body)]:
         found[int(k)] = base[k][body.group]
-    for k in np.flatnonzero(fits & (frames.count < n)) if n > _ALL else []:
+    for k in np.flatnonzero(fits & (frames.shown < n)) if n > _ALL else []:
         found[int(k)] = place[k][None]
     if n <= _ALL:
         _search(frames, body, found, drop=0)
         _search(frames, body, found, drop=1)
-    return _padded(frames, body, found, np.flatnonzero(fits & (frames.count == n)))
+    return _padded(frames, body, found, np.flatnonzero(fits & (frames.shown == n)))
 
 
 def _base(points: Floats, body: _Body) -> tuple[Ints, Floats]:
@@ -539,9 +541,9 @@ def _base(points: Floats, body: _Body) -> tuple[Ints, Floats]:
 def _search(frames: _Frames, body: _Body, found: dict[int, Ints], *, drop: int) -> None:
     """Try every assignment of the frames that have none yet, leaving `drop` detections out."""
     n, d = body.template.shape
-    for count in np.unique(frames.count).tolist():
+    for count in np.unique(frames.shown).tolist():
         used = min(count, n) - drop
-        rows = np.array([k for k in np.flatnonzero(frames.count == count) if k not in found], int)
+        rows = np.array([k for k in np.flatnonzero(frames.shown == count) if k not in found], int)
         if used < d or count > _ALL + 1 or not rows.size:
             continue
         table = _table(count, n, used)
@@ -587,9 +589,9 @@ def _padded(frames: _Frames, body: _Body, found: dict[int, Ints], labelled: Ints
     rotation, misfit = np.zeros((count, width, d, d)), np.full((count, width), np.inf)
     rows, listed = np.nonzero((place >= 0).any(axis=2))
     for part in _batches(rows.size, 1):
-        k, c = rows[part], listed[part]
-        seated = _seated(frames.x[k], place[k, c][:, None])[:, 0]
-        rotation[k, c], misfit[k, c] = _fits(seated, body.template)
+        at = rows[part], listed[part]
+        seated = _seated(frames.x[at[0]], place[at][:, None])[:, 0]
+        rotation[at], misfit[at] = _fits(seated, body.template)
     return _Lists(place, rotation, misfit, labelled)
 
 
@@ -612,8 +614,8 @@ def _chained(
         piece=np.cumsum(piece),
         swaps=np.setdiff1d(_exchanges(site), rows[~sure]) if labelled else rows[:0],
         cuts=rows[~sure],
-        extra=rows[frames.count[rows] > used[rows]],
-        unsettled=np.setdiff1d(np.flatnonzero(frames.count > 0), rows),
+        extra=rows[frames.shown[rows] > used[rows]],
+        unsettled=np.setdiff1d(np.flatnonzero(frames.shown > 0), rows),
     )
 
 
@@ -712,12 +714,12 @@ def _exchanges(site: Ints) -> Ints:
 def _kept(frames: _Frames, order: Ints, site: Ints) -> Ints:
     """Give frames without assignment the labels that held before them (at the start, after)."""
     out = order.copy()
-    rows = np.flatnonzero((order < 0).all(axis=1) & (frames.count > 0))
+    rows = np.flatnonzero((order < 0).all(axis=1) & (frames.shown > 0))
     first = np.argmax(site >= 0, axis=0)
     opening = site[first, np.arange(site.shape[1])]
     for k in rows.tolist():
         held = np.where(site[k] >= 0, site[k], opening)
-        for column in frames.column[k, : frames.count[k]].tolist():
+        for column in frames.column[k, : frames.shown[k]].tolist():
             if column < len(held) and held[column] >= 0 and out[k, held[column]] < 0:
                 out[k, held[column]] = column
     return out

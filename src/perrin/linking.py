@@ -178,7 +178,7 @@ def _step_variance(centers: _Centers) -> float:
             squares.append(there[mutual] ** 2 / gap)
         before = whole
     d = centers.place.shape[1]
-    median_chi2 = d * (1 - 2 / (9 * d)) ** 3
+    median_chi2 = float(d * (1 - 2 / (9 * d)) ** 3)
     if not squares:
         return np.inf
     return float(np.median(np.concatenate(squares))) / median_chi2

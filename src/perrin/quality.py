@@ -1,4 +1,4 @@
-"""How far a fitted body deserves trust: is it rigid, how large are its errors, what was repaired."""
+"""How far a fitted body deserves trust: is it rigid, how large its errors are, what was done."""
 
 from __future__ import annotations
 
@@ -91,7 +91,10 @@ class Quality:
     @classmethod
     def from_dict(cls, entry: dict[str, Any]) -> Quality:
         """Read back what `to_dict` wrote."""
-        return cls(**{k: tuple(v) if isinstance(v, list) else v for k, v in entry.items()})
+        fields: dict[str, Any] = {
+            k: tuple(v) if isinstance(v, list) else v for k, v in entry.items()
+        }
+        return cls(**fields)
 
 
 def judge_quality(

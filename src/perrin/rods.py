@@ -22,6 +22,7 @@ from perrin._arrays import (
 from perrin.rotations import exp_map, successive_product
 
 if TYPE_CHECKING:
+    import pandas as pd
     from numpy.typing import ArrayLike
 
 # Log-odds as in identity: a hundred to one settles, and labels weigh e^10.
@@ -31,6 +32,9 @@ _BENT = 0.1
 # A chain looks alike from both ends if its places do within so much of its length.
 _ALIKE = 0.05
 _MEDIAN_2 = 2 * float(np.log(2.0))  # median of chi squared with 2 degrees of freedom
+
+
+_COLUMNS = ("residual", "n_present", "variance", "center_variance", "piece")
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,6 +112,50 @@ class RodMotion:
         same = self.piece[rows[:-1]] == self.piece[rows[1:]]
         return rows[:-1][same], rows[1:][same]
 
+    def to_frame(self) -> pd.DataFrame:
+        """Return a table with a row per frame; places, swaps, sigma and dt travel in ``attrs``."""
+        import pandas as pd
+
+        columns: dict[str, object] = {"time": self.time}
+        columns |= {a: self.center[:, i] for i, a in enumerate("xyz")}
+        columns |= {f"u_{a}": self.direction[:, i] for i, a in enumerate("xyz")}
+        columns |= {name: getattr(self, name) for name in _COLUMNS}
+        table = pd.DataFrame(columns | {"reason": list(self.reason)})
+        table.attrs = {
+            "places": self.places.tolist(),
+            "swaps": self.swaps.tolist(),
+            "sigma": self.sigma,
+            "dt": self.dt,
+        }
+        return table
+
+    @classmethod
+    def from_frame(cls, table: pd.DataFrame) -> RodMotion:
+        """Read back what `to_frame` wrote.
+
+        Raises
+        ------
+        ValueError
+            If ``attrs`` lacks the places, swaps, sigma or dt, or a column is missing.
+        """
+        missing = {"places", "swaps", "sigma", "dt"} - set(table.attrs)
+        missing |= {"time", "x", "u_x", "reason", *_COLUMNS} - set(table)
+        if missing:
+            raise ValueError(f"this table was not made by to_frame: it lacks {sorted(missing)}")
+        whole = {"n_present", "piece"}
+        numbers = {c: table[c].to_numpy(np.int64 if c in whole else np.float64) for c in _COLUMNS}
+        return cls(
+            time=table["time"].to_numpy(np.float64),
+            center=table[["x", "y", "z"]].to_numpy(np.float64),
+            direction=table[["u_x", "u_y", "u_z"]].to_numpy(np.float64),
+            reason=tuple(table["reason"].astype(str).tolist()),
+            places=np.array(table.attrs["places"], dtype=np.float64),
+            swaps=np.array(table.attrs["swaps"], dtype=np.int64),
+            sigma=float(table.attrs["sigma"]),
+            dt=float(table.attrs["dt"]),
+            **{name: np.array(values) for name, values in numbers.items()},
+        )
+
 
 class Steps(NamedTuple):
     """Steps of one walk whose noise is known: what a likelihood needs.
@@ -176,7 +224,8 @@ def track_direction(
     if x.shape[2] != 3 or x.shape[1] < 2:
         raise ValueError(f"positions: expected (T, n, 3) with n >= 2, got {x.shape}")
     require_positive(dt=dt)
-    time = np.arange(len(x)) * float(dt) if times is None else np.array(times, dtype=np.float64)
+    given_times = np.arange(len(x)) * float(dt) if times is None else times
+    time = np.array(given_times, dtype=np.float64)
     seen = present(x)
     rows = np.flatnonzero(seen.sum(axis=1) >= 2)
     if rows.size < 2:
