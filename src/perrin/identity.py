@@ -53,7 +53,7 @@ class Identity:
     extra : ndarray of int
         Rows in which a detection is no particle of the body.
     unsettled : ndarray of int
-        Rows that fit the body in no assignment.
+        Rows with enough detections for a pose that fit the body in no assignment.
     """
 
     order: Ints
@@ -615,7 +615,7 @@ def _chained(
         swaps=np.setdiff1d(_exchanges(site), rows[~sure]) if labelled else rows[:0],
         cuts=rows[~sure],
         extra=rows[frames.shown[rows] > used[rows]],
-        unsettled=np.setdiff1d(np.flatnonzero(frames.shown > 0), rows),
+        unsettled=np.setdiff1d(np.flatnonzero(frames.shown >= frames.x.shape[2]), rows),
     )
 
 

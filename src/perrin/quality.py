@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 # stated by the user replaces both rules by a factor on it.
 _SOFT_SIZE, _SOFT_SMOOTH, _SOFT_FACTOR = 0.03, 0.3, 2.0
 # A bond breaks when the mean distance of a pair in one eighth of the time leaves that in another
-# by a tenth of itself and by more than the noise.
-_BLOCKS, _BROKEN, _BEYOND = 8, 0.1, 4.0
+# by a fifth of itself and by more than the noise.
+_BLOCKS, _BROKEN, _BEYOND = 8, 0.2, 4.0
 # sigma per axis is told where each variance is known to 30 %.
 _TOLD = 0.3
 # A scale error of z counts from 1 % and 5 standard errors on.
