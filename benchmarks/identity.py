@@ -13,6 +13,7 @@ import numpy as np
 import pandas as pd
 
 import perrin
+from perrin.grouping import each_cluster
 
 D_R, D_T, DT, SIGMA = 4.9e-3, 3.85e-2, 0.73, (0.03, 0.03, 0.04)
 DIAMETER, FRAMES = 2.45, 300
@@ -161,8 +162,7 @@ def scale(rng, clusters):
         found = perrin.find_clusters(table, contact=contact)
         times.append(time.perf_counter())
         spent = np.zeros(2)
-        for _, rows in found.groupby("cluster"):
-            x, frames = perrin.cluster_positions(rows)
+        for _, x, frames, _ in each_cluster(found):
             start = time.perf_counter()
             identity = perrin.settle_identity(x, times=frames)
             middle = time.perf_counter()

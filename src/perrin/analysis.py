@@ -8,7 +8,7 @@ import platform
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -22,9 +22,9 @@ from perrin._arrays import (
 )
 from perrin.diffusion import DiffusionEstimate, estimate_diffusion
 from perrin.files import check_tracks, read_tracks
-from perrin.grouping import cluster_positions, find_clusters
+from perrin.grouping import each_cluster, find_clusters
 from perrin.hydrodynamics import Size, size_from_rotation, size_from_translation
-from perrin.identity import Identity, settle_identity
+from perrin.identity import settle_identity
 from perrin.motion import RigidMotion, track_rotation
 from perrin.quality import Quality, judge_quality
 from perrin.results import (
@@ -264,10 +264,10 @@ def _each(
     results: list[ClusterResult] = []
     rods: list[RodResult] = []
     failures: list[str] = []
-    for cluster, rows in table[table["cluster"] != -1].groupby("cluster", sort=True):
-        label = labels.get(int(cluster))
+    for cluster, positions, frames, piece in each_cluster(table):
+        label = labels.get(cluster)
         try:
-            result = _measure(rows, int(cluster), label, conditions)
+            result = _measure(_Tracks(positions, frames, piece), cluster, label, conditions)
             if isinstance(result, RodResult):
                 rods.append(result)
             else:
@@ -280,53 +280,47 @@ def _each(
     return results, rods, failures
 
 
+class _Tracks(NamedTuple):
+    """One cluster's particles: positions (T, n, d), frame numbers, pieces the table brought."""
+
+    positions: Floats
+    frames: Ints
+    piece: Ints
+
+
 def _measure(
-    rows: pd.DataFrame, cluster: int, label: str | None, conditions: _Conditions
+    tracks: _Tracks, cluster: int, label: str | None, conditions: _Conditions
 ) -> ClusterResult | RodResult:
     """Measure a body, or the direction of a rod that has no full orientation."""
-    positions, frames = cluster_positions(rows)
-    if positions.shape[1:] == (2, 3):
-        return _measure_rod(positions, frames, cluster, label, conditions)
-    identity = settle_identity(positions, times=frames)
-    piece = _pieces(identity, rows, frames)
-    arranged = identity.arranged(positions)
+    if tracks.positions.shape[1:] == (2, 3):
+        return _measure_rod(tracks, cluster, label, conditions)
     try:
-        motion = track_rotation(
-            arranged, dt=conditions.dt, frames=frames, sigma=conditions.sigma, piece=piece
-        )
+        return _measure_body(tracks, cluster, label, conditions)
     except DegenerateClusterError as error:
         try:
-            return _measure_rod(positions, frames, cluster, label, conditions)
+            return _measure_rod(tracks, cluster, label, conditions)
         except (DegenerateClusterError, ValueError):
             raise error from None
-    return _measure_body(motion, arranged, identity, frames, cluster, label, conditions)
-
-
-def _pieces(identity: Identity, rows: pd.DataFrame, frames: Ints) -> Ints:
-    """Join the cuts found here with those that the table brought (column ``piece``)."""
-    if "piece" not in rows:
-        return identity.piece
-    given = rows.groupby("frame")["piece"].min().reindex(frames).ffill().to_numpy(np.int64)
-    changed = np.append(False, (np.diff(given) != 0) | (np.diff(identity.piece) != 0))
-    return np.cumsum(changed).astype(np.int64)
 
 
 def _measure_body(
-    motion: RigidMotion,
-    positions: Floats,
-    identity: Identity,
-    frames: Ints,
-    cluster: int,
-    label: str | None,
-    conditions: _Conditions,
+    tracks: _Tracks, cluster: int, label: str | None, conditions: _Conditions
 ) -> ClusterResult:
-    """Estimate one cluster's coefficients and collect what must be said about them."""
+    """Settle who is who, estimate the coefficients, and collect what must be said about them."""
+    frames = tracks.frames
+    identity = settle_identity(tracks.positions, times=frames)
+    positions = identity.arranged(tracks.positions)
+    changed = (np.diff(tracks.piece) != 0) | (np.diff(identity.piece) != 0)
+    piece = np.append(0, np.cumsum(changed)).astype(np.int64)
+    motion = track_rotation(
+        positions, dt=conditions.dt, frames=frames, sigma=conditions.sigma, piece=piece
+    )
     quality = judge_quality(
         motion,
         positions,
         sigma=conditions.sigma,
         swaps=tuple(frames[identity.swaps].tolist()),
-        cuts=tuple(frames[1:][np.diff(motion.piece) != 0].tolist()),
+        cuts=tuple(frames[1:][changed].tolist()),
         extra=tuple(frames[identity.extra].tolist()),
     )
     D_R = estimate_diffusion(motion, quantity="rotation")
@@ -345,51 +339,48 @@ def _measure_body(
 
 
 def _measure_rod(
-    positions: Floats, frames: Ints, cluster: int, label: str | None, conditions: _Conditions
+    tracks: _Tracks, cluster: int, label: str | None, conditions: _Conditions
 ) -> RodResult:
     """Estimate how fast the direction and the centre of a straight chain diffuse."""
-    times = frames * conditions.dt
-    motion = track_direction(positions, dt=conditions.dt, times=times, sigma=conditions.sigma)
+    frames, dt = tracks.frames, conditions.dt
+    motion = track_direction(tracks.positions, dt=dt, times=frames * dt, sigma=conditions.sigma)
     D_perp, D_T = estimate_rod(motion), estimate_rod(motion, quantity="translation")
-    n = len(motion.places)
     warnings = [
-        f"no D_R: {n} particles on one line have a direction but no full orientation; D_perp is "
-        "how fast that direction diffuses"
+        f"no D_R: {len(motion.places)} particles on one line have a direction but no full "
+        "orientation; D_perp is how fast that direction diffuses"
     ]
     if motion.swaps.size:
-        listed = ", ".join(map(str, frames[motion.swaps].tolist()))
-        warnings.append(f"identity: the ends swap labels at frame {listed}; put right")
+        warnings.append(f"identity: the ends swap labels at {_at(frames[motion.swaps])}; put right")
     cuts = frames[1:][np.diff(motion.piece) != 0]
     if cuts.size:
-        listed = ", ".join(map(str, cuts.tolist()))
-        warnings.append(f"identity: the ends may be mistaken at frame {listed}; the track is cut")
-    told = (*_missing(motion), *warnings)
-    return RodResult(cluster, motion, D_perp, D_T, told, label)
+        warnings.append(f"identity: the ends may be mistaken at {_at(cuts)}; the track is cut")
+    return RodResult(cluster, motion, D_perp, D_T, (*_missing(motion), *warnings), label)
+
+
+def _at(frames: Iterable[int]) -> str:
+    """List frames in words."""
+    listed = [str(int(k)) for k in frames]
+    return f"frame{'s' if len(listed) > 1 else ''} {', '.join(listed)}"
 
 
 def _identity_told(quality: Quality, unsettled: Ints, count: int) -> list[str]:
     """Name every frame at which labels were repaired, a track cut, or a detection left out."""
-
-    def at(frames: Iterable[int]) -> str:
-        listed = list(frames)
-        return f"frame{'s' if len(listed) > 1 else ''} {', '.join(map(str, listed))}"
-
     told = []
     if quality.swaps:
-        told.append(f"identity: labels swap at {at(quality.swaps)}; put right")
+        told.append(f"identity: labels swap at {_at(quality.swaps)}; put right")
     if quality.cuts:
         told.append(
-            f"identity: which particle is which is in doubt at {at(quality.cuts)}; the track is cut"
+            f"identity: who is who is in doubt at {_at(quality.cuts)}; the track is cut there"
         )
     if quality.extra:
         told.append(
             f"identity: a detection that is no particle of the body is left out at "
-            f"{at(quality.extra)}"
+            f"{_at(quality.extra)}"
         )
     if unsettled.size:
         told.append(
             f"identity: {unsettled.size} of {count} frames fit the common shape in no assignment "
-            f"(first: {at(unsettled[:10].tolist())}); they keep their labels"
+            f"(first: {_at(unsettled[:10].tolist())}); they keep their labels"
         )
     if len(quality.cuts) > _MANY_CUTS * count:
         told.append(

@@ -362,10 +362,11 @@ def _body_as_given(frames: _Frames) -> _Body | None:
         return None
     points = frames.x[rows]
     template = points[0] - points[0].mean(axis=0)
-    misfit = _fits(points[1:], template)[1]
-    if not misfit.max() <= _NOISE * max(np.median(misfit), _TINY**2 * (template**2).sum()):
+    rotation, misfit = _fits(points, template)
+    usual = max(float(np.median(misfit[1:])), _TINY**2 * float((template**2).sum()))
+    if not misfit.max() <= _NOISE * usual:
         return None
-    return _averaged(points, template, label)
+    return _body_of(_mean_shape(points, rotation), points, label)
 
 
 def _body(frames: _Frames, seed: int, *, labelled: bool) -> _Body:
@@ -392,12 +393,23 @@ def _body(frames: _Frames, seed: int, *, labelled: bool) -> _Body:
 
 def _averaged(points: Floats, shape: Floats, label: Ints) -> _Body:
     """Average complete frames (K, n, d), in order, to a shape; find its noise and symmetries."""
-    n, d = shape.shape
     rotation, misfit = _fits(points, shape)
     fits = np.isfinite(misfit)
     if fits.any():
-        centred = points[fits] - points[fits].mean(axis=1, keepdims=True)
-        shape = np.einsum("tij,tni->tnj", rotation[fits], centred).mean(axis=0)
+        shape = _mean_shape(points[fits], rotation[fits])
+    return _body_of(shape, points, label)
+
+
+def _mean_shape(points: Floats, rotation: Floats) -> Floats:
+    """Average complete frames in the axes of the body."""
+    centred = points - points.mean(axis=1, keepdims=True)
+    mean: Floats = np.einsum("tij,tni->tnj", rotation, centred).mean(axis=0)
+    return mean
+
+
+def _body_of(shape: Floats, points: Floats, label: Ints) -> _Body:
+    """Find the noise of frames about a shape, and its symmetries within that noise."""
+    n, d = shape.shape
     # Rounding takes the place of noise where there is none.
     sigma2 = float(np.median(_fits(points, shape)[1])) / _median_chi2(_freedom(n, d))
     sigma2 = max(sigma2, (1e-7 * float(np.abs(shape).max())) ** 2)
