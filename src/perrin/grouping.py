@@ -114,10 +114,11 @@ def each_cluster(table: pd.DataFrame) -> Iterator[tuple[int, Floats, Ints, Ints]
         positions, frames = _seats(tracks.frame[rows], tracks.code[rows], tracks.x[rows])
         piece = np.zeros(len(frames), dtype=np.int64)
         if stretch is not None:
-            # From the last row of a frame to the next frame that has one.
-            known = np.full(len(frames), -1, dtype=np.int64)
-            known[tracks.frame[rows] - frames[0]] = np.arange(rows.size)
-            piece = stretch[rows[np.maximum.accumulate(known)]]
+            at = tracks.frame[rows] - frames[0]
+            piece[at] = stretch[rows]
+            last = np.zeros(len(frames), dtype=np.int64)
+            last[at] = at
+            piece = piece[np.maximum.accumulate(last)]
         yield int(label[inside[0]]), positions, frames, piece
 
 
@@ -455,7 +456,7 @@ def _shared_frames(tracks: _Tracks, pairs: Ints) -> Ints:
     )
     shared = np.zeros(len(pairs), dtype=np.int64)
     # In parts, so that memory stays bounded however many pairs ever met.
-    step = max(1, 10_000_000 // max(len(frames), 1))
+    step = max(1, 500_000 // max(len(frames), 1))
     for i in range(0, len(pairs), step):
         one, other = pairs[i : i + step].T
         shared[i : i + step] = present[one].multiply(present[other]).sum(axis=1)

@@ -94,8 +94,8 @@ def settle_identity(
     times : array_like, shape (T,), optional
         Time of each row, any unit; default 0, 1, 2, ...
     size : int, optional
-        Number of particles n of the body; default: the most seen together in 5 % of the frames, or
-        m where every two columns are seen together.
+        Number of particles n of the body; default: the columns with points in over 5 % of the rows
+        if every two of them are seen together, else the most seen together in 5 % of the rows.
     labelled : bool
         Whether a column is meant to be one particle throughout. It then stays one unless an
         exchange is e^10 times more likely.
@@ -188,10 +188,13 @@ class _Lists(NamedTuple):
 
 
 def _size(seen: Bools) -> int:
-    """Return how many particles the body has; columns never seen together may be one particle."""
-    met = (seen.T.astype(np.float64) @ seen.astype(np.float64)) > 0
-    if met.all():
-        return int(seen.shape[1])
+    """Return how many particles the body has.
+
+    Columns never seen together may be one particle, and one seen in few frames may be none.
+    """
+    lasting = seen[:, seen.sum(axis=0) > _COMPLETE * len(seen)].astype(np.float64)
+    if lasting.size and (lasting.T @ lasting > 0).all():
+        return int(lasting.shape[1])
     counts = np.sort(seen.sum(axis=1))
     counts = counts[counts > 0]
     return int(counts[-max(1, int(np.ceil(_COMPLETE * len(counts))))]) if counts.size else 0
