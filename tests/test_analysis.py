@@ -324,3 +324,64 @@ def test_real_marker_bodies_are_found_without_labels():
     found = perrin.find_clusters(table).groupby("particle")["cluster"].first()
     assert (found >= 0).all()
     assert len(set(zip(found, key[found.index], strict=True))) == 3
+
+
+def test_exchanged_labels_are_put_right_and_told(base, answer):
+    """Pairs and cycles exchanged for good: the answer stands, each frame is in a warning."""
+    x, _ = perrin.cluster_positions(base)
+    mixed = x.copy()
+    mixed[40:, [0, 2]] = mixed[40:, [2, 0]]
+    mixed[77:, [1, 2, 3]] = mixed[77:, [2, 3, 1]]
+    report = perrin.analyze(perrin.positions_table(mixed), dt=0.73)
+    np.testing.assert_allclose(values(report), answer, rtol=1e-6)
+    (told,) = (w for w in report.clusters[0].warnings if "swap" in w)
+    assert "40" in told
+    assert "77" in told
+    assert report.to_dict()["clusters"][0]["quality"]["swaps"] == [40, 77]
+
+
+def test_ids_that_break_off_do_not_split_a_cluster(base):
+    """A tracker that loses a particle and finds it again gives it a new id: one cluster of four."""
+    broken = base.drop(columns="cluster")
+    later = (broken["particle"] == 2) & (broken["frame"] >= 80)
+    broken = broken.assign(particle=broken["particle"].mask(later, 9))
+    broken = broken[~((broken["particle"] == 2) & (broken["frame"] >= 76))]
+    (result,) = perrin.analyze(broken, dt=0.73, contact=2.45).clusters
+    assert len(result.motion.template) == 4
+    assert result.motion.fitted.size == 150
+    full = perrin.analyze(base, dt=0.73).clusters[0]
+    assert abs(result.D_R.value - full.D_R.value) < full.D_R.stderr
+
+
+def test_rods_are_measured_and_full_rotation_refused(tmp_path):
+    """A dumbbell beside a tetrahedron: D_perp in the summary, D_R null with the reason."""
+    truth = perrin.simulate_motion(
+        perrin.Cluster.touching(2, 2.45), D_R=0.01, D_T=0.05, dt=0.73, n_frames=150, rng=1
+    )
+    pair = perrin.positions_table(perrin.add_noise(truth.positions(), sigma=0.03, rng=2))
+    pair = pair.assign(cluster=5, particle=pair["particle"] + 50)
+    both = perrin.analyze(pd.concat([tracks(seed=1), pair]), dt=0.73)
+    assert [c.cluster for c in both.clusters] == [0]
+    alone = perrin.analyze(pair, dt=0.73)
+    assert alone.pooled is None
+    for name, report in (("both", both), ("alone", alone)):
+        (rod,) = report.rods
+        assert rod.D_perp.ci95[0] < 0.01 < rod.D_perp.ci95[1]
+        perrin.write_run(report, tmp_path / name)
+        again = perrin.load_run(tmp_path / name)
+        assert again.to_dict() == report.to_dict()
+        entry = report.to_dict()["clusters"][-1]
+        assert entry["D_R"] is None
+        assert any("no D_R" in w for w in entry["warnings"])
+        assert entry["D_perp"]["value"] == rod.D_perp.value
+
+
+def test_a_pair_in_the_plane_has_one_angle():
+    """In two dimensions n = 2 is a body: 2 D_R dt per step, the planted D_R comes back."""
+    pair = perrin.Cluster.from_positions([[0.0, 0.0], [2.0, 0.0]])
+    truth = perrin.simulate_motion(pair, D_R=0.02, D_T=0.03, dt=0.5, n_frames=400, rng=3)
+    table = perrin.positions_table(perrin.add_noise(truth.positions(), sigma=0.02, rng=4))
+    (result,) = perrin.analyze(table.drop(columns="cluster"), dt=0.5).clusters
+    assert result.msad.dof == 1
+    assert result.D_R.ci95[0] < 0.02 < result.D_R.ci95[1]
+    assert result.noise.phi2 == pytest.approx(2 * 0.02**2 / 2.0, rel=0.2)
