@@ -89,6 +89,31 @@ def test_labels_exchanged_for_good_are_put_right(body, kind):
     np.testing.assert_array_equal(arranged[:, first], x)
 
 
+@pytest.mark.parametrize("row", [3, 12, 30, 60, 90, 117])
+@pytest.mark.parametrize("body", [4, 7])
+def test_one_exchange_is_found_wherever_it_is(body, row):
+    """Neither of two labellings needs to be rare."""
+    x, _ = track(30, body)
+    x[row:, [0, 2]] = x[row:, [2, 0]]
+    assert settle_identity(x).swaps.tolist() == [row]
+
+
+def test_large_bodies_with_holes():
+    """Thirty particles, 2 % missing, one exchange: found, and every frame settled."""
+    rng = np.random.default_rng(1)
+    body = perrin.Cluster.from_positions(rng.normal(scale=3.0, size=(30, 3)))
+    truth = perrin.simulate_motion(body, D_R=1e-3, dt=1.0, n_frames=60, rng=rng)
+    x = perrin.add_noise(truth.positions(), sigma=0.03, rng=rng)
+    x[30:, [0, 3]] = x[30:, [3, 0]]
+    lost = rng.random(x.shape[:2]) < 0.02
+    lost[:, [0, 3]] = False
+    x[lost] = np.nan
+    found = settle_identity(x)
+    assert not found.unsettled.size
+    assert (found.order[40] >= 0).sum() == np.isfinite(x[40, :, 0]).sum()
+    assert found.swaps.tolist() == [30]
+
+
 @pytest.mark.parametrize("body", [3, 4, 6])
 @pytest.mark.parametrize("D_R", [SLOW, 0.1, 1.0])
 def test_right_labels_are_left_alone_however_far_the_body_turns(body, D_R):

@@ -366,8 +366,9 @@ def _body_as_given(frames: _Frames) -> _Body | None:
     points = frames.x[rows]
     template = points[0] - points[0].mean(axis=0)
     rotation, misfit = _fits(points, template)
-    usual = max(float(np.median(misfit[1:])), _TINY**2 * float((template**2).sum()))
-    if not misfit.max() <= _NOISE * usual:
+    # Of two labellings that share the time, neither is right for all: the lower tenth shows one.
+    usual = max(float(np.quantile(misfit[1:], 0.1)), _TINY**2 * float((template**2).sum()))
+    if not misfit.max() <= 2 * _NOISE * usual:
         return None
     return _body_of(_mean_shape(points, rotation), points, label)
 
@@ -530,11 +531,11 @@ def _assignments(frames: _Frames, body: _Body, *, labelled: bool) -> _Lists:
     base[odd], misfit[odd] = _base(frames.x[odd, :n], body)
     for k in whole[misfit[whole] <= _limit(frames.shown[whole], body)]:
         found[int(k)] = base[k][body.group]
-    for k in np.flatnonzero(fits & (frames.shown < n)) if n > _ALL else []:
-        found[int(k)] = place[k][None]
     if n <= _ALL:
         _search(frames, body, found, drop=0)
         _search(frames, body, found, drop=1)
+    else:
+        _patch(frames, body, found, place, fits)
     return _padded(frames, body, found, np.flatnonzero(fits & (frames.shown == n)))
 
 
@@ -572,6 +573,30 @@ def _search(frames: _Frames, body: _Body, found: dict[int, Ints], *, drop: int) 
             for k, fit in zip(rows[part].tolist(), fits, strict=True):
                 if fit.any():
                     found[k] = table[fit]
+
+
+def _patch(frames: _Frames, body: _Body, found: dict[int, Ints], place: Ints, fits: Bools) -> None:
+    """Seat the detections of incomplete frames of large bodies, near where their labels say."""
+    from scipy.optimize import linear_sum_assignment
+
+    d = body.template.shape[1]
+    for k in np.flatnonzero((frames.shown >= d) & (frames.shown <= frames.n)).tolist():
+        if k in found:
+            continue
+        x, order = frames.x[k, : frames.shown[k]], place[k]
+        for _ in range(0 if fits[k] else 10):
+            seated = _seated(frames.x[k][None], order[None])[0, 0]
+            rotation, misfit = _fits(seated, body.template)
+            if not np.isfinite(misfit):
+                break
+            lab = body.template @ rotation.T
+            away = lab + np.nanmean(seated - lab, axis=0) - x[:, None]
+            detection, seat = linear_sum_assignment((away**2).sum(axis=2))
+            order = np.full(frames.n, -1, dtype=np.int64)
+            order[seat] = detection
+        misfit = _fits(_seated(frames.x[k][None], order[None])[0, 0], body.template)[1]
+        if misfit <= float(_limit(frames.shown[k], body)):
+            found[k] = order[None]
 
 
 def _strays(points: Floats, table: Ints, rotation: Floats, template: Floats) -> Bools:
