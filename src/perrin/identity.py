@@ -367,7 +367,8 @@ def _body_as_given(frames: _Frames) -> _Body | None:
     template = points[0] - points[0].mean(axis=0)
     rotation, misfit = _fits(points, template)
     # Of two labellings that share the time, neither is right for all: the lower tenth shows one.
-    usual = max(float(np.quantile(misfit[1:], 0.1)), _TINY**2 * float((template**2).sum()))
+    lowest = float(np.sort(misfit[1:])[(rows.size - 1) // 10])
+    usual = max(lowest, _TINY**2 * float((template**2).sum()))
     if not misfit.max() <= 2 * _NOISE * usual:
         return None
     return _body_of(_mean_shape(points, rotation), points, label)
