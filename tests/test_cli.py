@@ -216,8 +216,8 @@ BAD_TABLES = {
     "NaN frame": (lambda t: _spoiled(t, "frame", None), 2, ("line 9", "frame")),
     "NaN particle": (lambda t: _spoiled(t, "particle", None), 2, ("line 9", "particle")),
     "one frame": (lambda t: t[t["frame"] == 3], 1, ("1 frame",)),
-    "two particles": (lambda t: t[t["particle"] < 2], 1, ("2 particles",)),
-    "collinear": (lambda t: t.assign(x=t["particle"], y=0.0, z=0.0), 1, ("one line",)),
+    "one particle": (lambda t: t[t["particle"] < 1], 1, ("1 particle",)),
+    "one place": (lambda t: t.assign(x=0.0, y=0.0, z=0.0), 1, ("one line",)),
     "no rows": (lambda t: t.iloc[:0], 2, ()),
 }
 

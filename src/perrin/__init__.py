@@ -23,13 +23,14 @@ if TYPE_CHECKING:
     from perrin.curve_fits import fit_gls, fit_line
     from perrin.diffusion import DiffusionEstimate, estimate_diffusion
     from perrin.files import read_tracks, write_tracks
-    from perrin.grouping import cluster_positions, find_clusters, positions_table
+    from perrin.grouping import cluster_positions, find_clusters, identify, positions_table
     from perrin.hydrodynamics import (
         Size,
         size_and_viscosity,
         size_from_rotation,
         size_from_translation,
     )
+    from perrin.identity import Identity, settle_identity
     from perrin.lagged import (
         LagCurve,
         VanHove,
@@ -43,9 +44,12 @@ if TYPE_CHECKING:
     from perrin.mobility import Mobility, apparent_translation, cluster_mobility
     from perrin.motion import RigidMotion, remove_rotation, threshold_displacement, track_rotation
     from perrin.noise import NoiseFloor, noise_floor
+    from perrin.quality import Quality, judge_quality
     from perrin.quaternions import QuaternionCovariance, quaternion_covariance
     from perrin.report import write_run
-    from perrin.results import ClusterResult, Report, load_run
+    from perrin.results import ClusterResult, Report, RodResult, load_run
+    from perrin.rod_diffusion import estimate_rod
+    from perrin.rods import RodMotion, track_direction
     from perrin.rotations import Similarity, axis_angle, kabsch, similarity
     from perrin.sampling import SamplingPlan, SamplingVerdict, judge_sampling, plan_sampling
     from perrin.shapes import Cluster, point_group, rotation_group
@@ -69,14 +73,18 @@ __all__ = [
     "DegenerateClusterError",
     "DiffusionEstimate",
     "DiffusionTensor",
+    "Identity",
     "IdentityWarning",
     "LagCurve",
     "Mobility",
     "NoiseFloor",
     "PrecisionWarning",
+    "Quality",
     "QuaternionCovariance",
     "Report",
     "RigidMotion",
+    "RodMotion",
+    "RodResult",
     "SamplingPlan",
     "SamplingVerdict",
     "Similarity",
@@ -95,10 +103,13 @@ __all__ = [
     "cramer_rao",
     "diffusion_tensor",
     "estimate_diffusion",
+    "estimate_rod",
     "find_clusters",
     "fit_gls",
     "fit_line",
     "gravitational_height",
+    "identify",
+    "judge_quality",
     "judge_sampling",
     "kabsch",
     "load_run",
@@ -115,6 +126,7 @@ __all__ = [
     "read_tracks",
     "remove_rotation",
     "rotation_group",
+    "settle_identity",
     "settling_velocity",
     "similarity",
     "simulate_motion",
@@ -122,6 +134,7 @@ __all__ = [
     "size_from_rotation",
     "size_from_translation",
     "threshold_displacement",
+    "track_direction",
     "track_rotation",
     "van_hove",
     "wall_diffusion",
@@ -144,7 +157,10 @@ _ROOMS = {
     "shapes": ("Cluster", "point_group", "rotation_group"),
     "noise": ("NoiseFloor", "noise_floor"),
     "motion": ("RigidMotion", "remove_rotation", "threshold_displacement", "track_rotation"),
-    "grouping": ("cluster_positions", "find_clusters", "positions_table"),
+    "identity": ("Identity", "settle_identity"),
+    "rods": ("RodMotion", "track_direction"),
+    "grouping": ("cluster_positions", "find_clusters", "identify", "positions_table"),
+    "quality": ("Quality", "judge_quality"),
     "lagged": (
         "LagCurve",
         "VanHove",
@@ -157,6 +173,7 @@ _ROOMS = {
     ),
     "quaternions": ("QuaternionCovariance", "quaternion_covariance"),
     "diffusion": ("DiffusionEstimate", "estimate_diffusion"),
+    "rod_diffusion": ("estimate_rod",),
     "curve_fits": ("fit_gls", "fit_line"),
     "tensors": ("CoupledTensor", "DiffusionTensor", "coupled_tensor", "diffusion_tensor"),
     "bounds": ("cramer_rao",),
@@ -178,7 +195,7 @@ _ROOMS = {
     ),
     "simulate": ("add_noise", "simulate_motion"),
     "files": ("read_tracks", "write_tracks"),
-    "results": ("ClusterResult", "Report", "load_run"),
+    "results": ("ClusterResult", "Report", "RodResult", "load_run"),
     "analysis": ("analyze",),
     "report": ("write_run",),
 }

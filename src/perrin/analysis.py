@@ -9,30 +9,41 @@ import warnings as python_warnings
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
 from perrin._arrays import (
     DegenerateClusterError,
     Floats,
+    Ints,
     PrecisionWarning,
     TooFewFramesError,
     TrackTableError,
-    as_sigma,
     require_positive,
 )
 from perrin.diffusion import DiffusionEstimate, estimate_diffusion, with_error
 from perrin.files import check_tracks, read_tracks
-from perrin.grouping import cluster_positions, find_clusters
+from perrin.grouping import each_cluster, find_clusters
 from perrin.hydrodynamics import Size, size_from_rotation, size_from_translation
-from perrin.motion import RigidMotion, body_residuals, track_rotation
-from perrin.results import ClusterResult, Pooled, Report, floor_factor, predicted_noise
+from perrin.identity import settle_identity
+from perrin.motion import RigidMotion, track_rotation
+from perrin.quality import Quality, judge_quality
+from perrin.results import (
+    ClusterResult,
+    Pooled,
+    Report,
+    RodResult,
+    floor_factor,
+    predicted_noise,
+)
+from perrin.rod_diffusion import estimate_rod
+from perrin.rods import RodMotion, track_direction
 from perrin.shapes import is_tetrahedron
 from perrin.tensors import DiffusionTensor, diffusion_tensor
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterable, Mapping
 
     import pandas as pd
     from numpy.typing import ArrayLike
@@ -40,11 +51,10 @@ if TYPE_CHECKING:
     from perrin.noise import NoiseFloor
     from perrin.steps import Quantity
 
-# Without a cluster column up to this many particles may pass as one body.
-_ONE_CLUSTER = 20
-# A body is called soft when its residuals are large against its size and smooth in time; a sigma
-# stated by the user replaces both rules by a factor on it.
-_SOFT_SIZE, _SOFT_SMOOTH, _SOFT_FACTOR = 0.03, 0.3, 2.0
+# So few particles in so few frames may pass as one body without a cluster column.
+_FEW, _FEWEST = 20, 8
+# Cuts in more than this share of the frames are no accident.
+_MANY_CUTS = 0.02
 # Clusters that agree less well than this by chance have no common D.
 _DIFFER = 0.01
 
@@ -106,7 +116,7 @@ def analyze(
         Our column names to the file's names or column numbers (files only).
     contact : float, optional
         Centre distance of touching particles, um: finds the clusters in a table without a
-        cluster column.
+        cluster column. Without it they are found by the distances that stay the same.
     sigma : float or array_like, optional
         Known localisation error, um, one number or one per axis: sets the predicted noise floor and
         the test of rigidity, not the estimates.
@@ -150,13 +160,14 @@ def analyze(
     table, labels, warnings = _clustered(table, contact=contact)
     first = int(table["frame"].min())
     table["frame"] -= first
-    results, failures = _each(table, labels, conditions)
-    pooled, more = _pooled(results, conditions)
+    results, rods, failures = _each(table, labels, conditions)
+    pooled, more = _pooled(results, conditions) if results else (None, [])
     more += _exposure_taken(conditions)
     arguments = asdict(conditions) | {"contact": contact, "frames": frames, "columns": columns}
     arguments |= {name: _plain(given) for name, given in (("scale", scale), ("sigma", sigma))}
     settings = _settings(source, arguments=arguments, first_frame=first)
-    return Report(tuple(results), pooled, (*warnings, *failures, *more), table, settings)
+    told = (*warnings, *failures, *more)
+    return Report(tuple(results), pooled, told, table, settings, tuple(rods))
 
 
 def _check_arguments(
@@ -183,6 +194,8 @@ def _table(
     if columns is not None:
         raise ValueError("columns: only for files; rename the columns of a table")
     table = check_tracks(tracks, source="the table", scale=scale)
+    if "piece" in tracks:  # where `identify` was in doubt
+        table["piece"] = tracks["piece"].to_numpy()
     return table, {"path": None, "sha256": None}
 
 
@@ -204,22 +217,16 @@ def _clustered(
     table: pd.DataFrame, *, contact: float | None
 ) -> tuple[pd.DataFrame, dict[int, str], list[str]]:
     """Make sure that every row has a cluster number; return it, names of clusters, and warnings."""
-    warnings = _oddities(table)
+    given, warnings = table, _oddities(table)
     labels: dict[int, str] = {}
     if "cluster" in table:
         table, labels = _numbered(table)
-    elif contact is not None:
-        table = find_clusters(table, contact=contact)
     else:
-        table = _as_one(table)
-        warnings.append(
-            "no cluster column and no contact distance: all "
-            f"{table['particle'].nunique()} particles are taken as one cluster"
-        )
+        table, said = _grouped(table, contact=contact)
+        warnings += said
     loose = table["cluster"] == -1
     if loose.all():
-        how = "marked as loose (-1)" if contact is None else f"loose at contact = {contact} um"
-        raise TrackTableError(f"no cluster: every particle is {how}; correct that, or the scale")
+        raise TrackTableError(_nothing_found(contact, marked="cluster" in given))
     if loose.any():
         count = table.loc[loose, "particle"].nunique()
         warnings.append(f"{count} particles belong to no cluster and are left out")
@@ -236,15 +243,41 @@ def _oddities(table: pd.DataFrame) -> list[str]:
     return told
 
 
-def _as_one(table: pd.DataFrame) -> pd.DataFrame:
-    """Take all particles as one cluster, if they are few enough to be one."""
-    count = table["particle"].nunique()
-    if count > _ONE_CLUSTER:
-        raise TrackTableError(
-            f"{count} particles and no cluster column: say the centre distance of touching "
-            "particles (contact, --contact) so that the clusters can be found"
-        )
-    return table.assign(cluster=0)
+def _grouped(table: pd.DataFrame, *, contact: float | None) -> tuple[pd.DataFrame, list[str]]:
+    """Find the clusters of a table without that column, pairs where there is nothing larger."""
+    count, frames = table["particle"].nunique(), table["frame"].nunique()
+    if contact is None and frames < _FEWEST and count <= _FEW:
+        # Distances seen so rarely tell nothing; few particles may still be one body.
+        found = table.assign(cluster=0)
+    else:
+        found = find_clusters(table, contact=contact)
+        if (found["cluster"] == -1).all():
+            found = find_clusters(table, contact=contact, size=2)
+    if contact is not None:
+        return found, []
+    if (found["cluster"] == 0).all():
+        return found, [
+            "no cluster column and no contact distance: all "
+            f"{count} particles are taken as one cluster"
+        ]
+    bodies = int(found["cluster"].max()) + 1
+    return found, [
+        f"no cluster column and no contact distance: {bodies} bodies found by the distances that "
+        f"stay the same, among {count} particles"
+    ]
+
+
+def _nothing_found(contact: float | None, *, marked: bool) -> str:
+    """Say why there is no cluster, and what to do."""
+    if marked:
+        return "no cluster: every particle is marked as loose (-1); correct that, or the scale"
+    if contact is not None:
+        how = f"loose at contact = {contact} um"
+        return f"no cluster: every particle is {how}; correct that, or the scale"
+    return (
+        "no cluster: no two particles keep their distance (to a tenth, over 8 frames or more): say "
+        "the centre distance of touching particles (contact, --contact), or give a column cluster"
+    )
 
 
 def _numbered(table: pd.DataFrame) -> tuple[pd.DataFrame, dict[int, str]]:
@@ -260,35 +293,78 @@ def _numbered(table: pd.DataFrame) -> tuple[pd.DataFrame, dict[int, str]]:
 
 def _each(
     table: pd.DataFrame, labels: dict[int, str], conditions: _Conditions
-) -> tuple[list[ClusterResult], list[str]]:
+) -> tuple[list[ClusterResult], list[RodResult], list[str]]:
     """Measure cluster by cluster; one that cannot answer is a warning, unless none can."""
     results: list[ClusterResult] = []
+    rods: list[RodResult] = []
     failures: list[str] = []
-    for cluster, rows in table[table["cluster"] != -1].groupby("cluster", sort=True):
-        label = labels.get(int(cluster))
+    for cluster, positions, frames, piece in each_cluster(table):
+        label = labels.get(cluster)
         try:
-            results.append(_measure(rows, int(cluster), label, conditions))
+            result = _measure(_Tracks(positions, frames, piece), cluster, label, conditions)
+            if isinstance(result, RodResult):
+                rods.append(result)
+            else:
+                results.append(result)
         except (DegenerateClusterError, TooFewFramesError) as error:
             failures.append(f"cluster {label or cluster} was left out: {error}")
-            if not results and len(failures) == table["cluster"].loc[lambda c: c != -1].nunique():
+            count = table["cluster"].loc[lambda c: c != -1].nunique()
+            if not (results or rods) and len(failures) == count:
                 raise
-    return results, failures
+    return results, rods, failures
+
+
+class _Tracks(NamedTuple):
+    """One cluster's particles: positions (T, n, d), frame numbers, pieces the table brought."""
+
+    positions: Floats
+    frames: Ints
+    piece: Ints
 
 
 def _measure(
-    rows: pd.DataFrame, cluster: int, label: str | None, conditions: _Conditions
+    tracks: _Tracks, cluster: int, label: str | None, conditions: _Conditions
+) -> ClusterResult | RodResult:
+    """Measure a body, or the direction of a rod that has no full orientation."""
+    if tracks.positions.shape[1:] == (2, 3):
+        return _measure_rod(tracks, cluster, label, conditions)
+    try:
+        return _measure_body(tracks, cluster, label, conditions)
+    except DegenerateClusterError as error:
+        try:
+            return _measure_rod(tracks, cluster, label, conditions)
+        except (DegenerateClusterError, ValueError):
+            raise error from None
+
+
+def _measure_body(
+    tracks: _Tracks, cluster: int, label: str | None, conditions: _Conditions
 ) -> ClusterResult:
-    """Estimate one cluster's coefficients and collect what must be said about them."""
-    positions, frames = cluster_positions(rows)
-    sigma = conditions.sigma
-    motion = track_rotation(positions, dt=conditions.dt, frames=frames, sigma=sigma)
+    """Settle who is who, estimate the coefficients, and collect what must be said about them."""
+    frames = tracks.frames
+    identity = settle_identity(tracks.positions, times=frames)
+    positions = identity.arranged(tracks.positions)
+    changed = (np.diff(tracks.piece) != 0) | (np.diff(identity.piece) != 0)
+    piece = np.append(0, np.cumsum(changed)).astype(np.int64)
+    motion = track_rotation(
+        positions, dt=conditions.dt, frames=frames, sigma=conditions.sigma, piece=piece
+    )
+    quality = judge_quality(
+        motion,
+        positions,
+        sigma=conditions.sigma,
+        swaps=tuple(frames[identity.swaps].tolist()),
+        cuts=tuple(frames[1:][changed].tolist()),
+        extra=tuple(frames[identity.extra].tolist()),
+    )
     D_R, D_T = (conditions.estimate(motion, q) for q in ("rotation", "translation"))
     noise = predicted_noise(motion)
     sizes, said = _sizes(motion, D_R, D_T, conditions)
     tensor, unfound = _tensor(motion, conditions)
     warnings = (
         *_missing(motion),
-        *_softness(motion, positions, sigma),
+        *_identity_told(quality, frames[identity.unsettled], len(frames)),
+        *quality.warnings,
         *_floor_mismatch(motion, D_R, noise),
         *_unresolved(D_R, D_T),
         *(f"D_R: {text}" for text in D_R.warnings),
@@ -297,7 +373,7 @@ def _measure(
         *unfound,
         *said,
     )
-    return ClusterResult(cluster, motion, D_R, D_T, tensor, noise, sizes, warnings, label)
+    return ClusterResult(cluster, motion, D_R, D_T, tensor, noise, sizes, warnings, label, quality)
 
 
 def _tensor(
@@ -315,7 +391,59 @@ def _tensor(
     return tensor, []
 
 
-def _missing(motion: RigidMotion) -> list[str]:
+def _measure_rod(
+    tracks: _Tracks, cluster: int, label: str | None, conditions: _Conditions
+) -> RodResult:
+    """Estimate how fast the direction and the centre of a straight chain diffuse."""
+    frames, dt = tracks.frames, conditions.dt
+    motion = track_direction(tracks.positions, dt=dt, times=frames * dt, sigma=conditions.sigma)
+    D_perp, D_T = estimate_rod(motion), estimate_rod(motion, quantity="translation")
+    warnings = [
+        f"no D_R: {len(motion.places)} particles on one line have a direction but no full "
+        "orientation; D_perp is how fast that direction diffuses"
+    ]
+    if motion.swaps.size:
+        warnings.append(f"identity: the ends swap labels at {_at(frames[motion.swaps])}; put right")
+    cuts = frames[1:][np.diff(motion.piece) != 0]
+    if cuts.size:
+        warnings.append(f"identity: the ends may be mistaken at {_at(cuts)}; the track is cut")
+    return RodResult(cluster, motion, D_perp, D_T, (*_missing(motion), *warnings), label)
+
+
+def _at(frames: Iterable[int]) -> str:
+    """List frames in words."""
+    listed = [str(int(k)) for k in frames]
+    return f"frame{'s' if len(listed) > 1 else ''} {', '.join(listed)}"
+
+
+def _identity_told(quality: Quality, unsettled: Ints, count: int) -> list[str]:
+    """Name every frame at which labels were repaired, a track cut, or a detection left out."""
+    told = []
+    if quality.swaps:
+        told.append(f"identity: labels swap at {_at(quality.swaps)}; put right")
+    if quality.cuts:
+        told.append(
+            f"identity: who is who is in doubt at {_at(quality.cuts)}; the track is cut there"
+        )
+    if quality.extra:
+        told.append(
+            f"identity: a detection that is no particle of the body is left out at "
+            f"{_at(quality.extra)}"
+        )
+    if unsettled.size:
+        told.append(
+            f"identity: {unsettled.size} of {count} frames fit the common shape in no assignment "
+            f"(first: {_at(unsettled[:10].tolist())}); they keep their labels"
+        )
+    if len(quality.cuts) > _MANY_CUTS * count:
+        told.append(
+            "identity: the body turns too far between frames for its symmetry; cutting the longest "
+            "steps makes D_R too low: sample faster"
+        )
+    return told
+
+
+def _missing(motion: RigidMotion | RodMotion) -> list[str]:
     """Say how many frames have no pose, and why."""
     reasons = [r for r in motion.reason if r]
     if not reasons:
@@ -323,37 +451,6 @@ def _missing(motion: RigidMotion) -> list[str]:
     kinds = {r: reasons.count(r) for r in sorted(set(reasons))}
     listed = "; ".join(f"{count} x {reason}" for reason, count in kinds.items())
     return [f"{len(reasons)} of {len(motion.time)} frames have no pose ({listed})"]
-
-
-def _softness(motion: RigidMotion, positions: Floats, sigma: ArrayLike | None) -> list[str]:
-    """Warn of a body that is not rigid: residuals large and smooth, or far above a stated sigma."""
-    if sigma is not None:
-        stated = float(np.sqrt(np.mean(as_sigma(sigma, positions.shape[2]) ** 2)))
-        if motion.sigma <= _SOFT_FACTOR * stated:
-            return []
-        return [
-            f"not rigid: the particles leave the common shape by {motion.sigma:.3g} um a "
-            f"coordinate, {motion.sigma / stated:.1f} times the stated sigma; or identities swap, "
-            "or the particles of a frame are not simultaneous"
-        ]
-    smooth = _autocorrelation(body_residuals(motion, positions))
-    if motion.sigma <= _SOFT_SIZE * motion.R or not smooth > _SOFT_SMOOTH:
-        return []
-    return [
-        f"not rigid: residuals of {motion.sigma:.3g} um a coordinate are "
-        f"{motion.sigma / motion.R:.3f} of R (over {_SOFT_SIZE}) and smooth in time (lag-1 "
-        f"autocorrelation {smooth:.2f}, over {_SOFT_SMOOTH}); if this is the localisation error "
-        "itself, state it as sigma"
-    ]
-
-
-def _autocorrelation(residuals: Floats) -> float:
-    """Return the lag-1 autocorrelation of residual vectors (T, n, d); NaN without pairs."""
-    before, after = residuals[:-1], residuals[1:]
-    both = np.isfinite(before) & np.isfinite(after)
-    a, b = before[both], after[both]
-    power = 0.5 * float(a @ a + b @ b)
-    return float(a @ b) / power if power > 0 else np.nan
 
 
 def _floor_mismatch(motion: RigidMotion, D_R: DiffusionEstimate, noise: NoiseFloor) -> list[str]:
@@ -414,7 +511,7 @@ def _sizes(
 
 def _pooled(results: list[ClusterResult], conditions: _Conditions) -> tuple[Pooled, list[str]]:
     """Pool all clusters that passed as rigid; say which are left out."""
-    soft = [r for r in results if any(w.startswith("not rigid") for w in r.warnings)]
+    soft = [r for r in results if r.quality is not None and not r.quality.rigid]
     used = [r for r in results if r not in soft] or results
     warnings = []
     if soft and len(used) < len(results):

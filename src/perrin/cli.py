@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from perrin.diffusion import DiffusionEstimate
     from perrin.mobility import Mobility
-    from perrin.results import ClusterResult, Report
+    from perrin.results import ClusterResult, Pooled, Report
     from perrin.sampling import SamplingPlan
     from perrin.shapes import Cluster
 
@@ -508,16 +508,20 @@ def _show(report: Report, output: Path) -> None:
     from rich.console import Console
     from rich.markup import escape
 
+    from perrin.results import perp_text
+
     console = Console(highlight=False)
     for result in report.clusters[:_SHOWN]:
         console.print(_cluster_table(result))
         if result.tensor is not None and result.tensor.p_isotropic < _UNEQUAL:
             axes = f"rotation about the body's axes: {result.tensor}\n"
             console.print(escape(axes), soft_wrap=True)
-    if len(report.clusters) > 1:
-        console.print(_pooled_table(report))
+    if report.pooled is not None and len(report.clusters) > 1:
+        console.print(_pooled_table(report.pooled))
+    for rod in report.rods[:_SHOWN]:
+        console.print(escape(perp_text(rod)))
     told = [("", text) for text in report.warnings]
-    told += [(f", cluster {r.name}", text) for r in report.clusters for text in r.warnings]
+    told += [(f", cluster {r.name}", text) for r in report.results for text in r.warnings]
     for where, text in told[:_SHOWN_WARNINGS]:
         console.print(f"[yellow]warning{escape(where)}:[/] {escape(text)}", soft_wrap=True)
     if len(told) > _SHOWN_WARNINGS:
@@ -584,17 +588,17 @@ def _show_prediction(body: Mobility, *, name: str) -> None:
     Console(highlight=False).print(table)
 
 
-def _pooled_table(report: Report) -> Table:
+def _pooled_table(pooled: Pooled) -> Table:
     """Return the table of the values pooled over clusters."""
     from rich.box import SIMPLE_HEAD
     from rich.table import Table
 
-    count = len(report.pooled.clusters)
+    count = len(pooled.clusters)
     title = f"{count} clusters pooled"
     table = Table("", "value", "68 %", "95 %", title=title, title_justify="left", box=SIMPLE_HEAD)
     table.columns[0].no_wrap = True
     same = []
-    for name, estimate in (("D_R", report.pooled.D_R), ("D_T", report.pooled.D_T)):
+    for name, estimate in (("D_R", pooled.D_R), ("D_T", pooled.D_T)):
         table.add_row(f"{name} ({estimate.unit})", *_estimate_cells(estimate))
         same += [] if estimate.p_same is None else [f"{name} {estimate.p_same:.2g}"]
     if same:

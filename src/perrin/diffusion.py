@@ -201,7 +201,7 @@ def estimate_diffusion(
     steps = [_steps(i, m, quantity) for i, m in enumerate(motions)]
     if method == "mle":
         tracks = [_track(s, noise=noise, exposure=exposure, drift=drift) for s in steps]
-        found = _by_likelihood(tracks)
+        found = by_likelihood(tracks)
     elif method == "cve":
         found = _by_moments(
             covariance_estimate([_track(s, noise=noise, exposure=exposure) for s in steps])
@@ -216,7 +216,7 @@ def estimate_diffusion(
 
 
 @dataclass(frozen=True)
-class _Found:
+class Found:
     """What an estimator found, before it is judged."""
 
     value: float
@@ -229,11 +229,11 @@ class _Found:
     p_same: float | None = None
 
 
-def _by_likelihood(tracks: Sequence[Track]) -> _Found:
+def by_likelihood(tracks: Sequence[Track]) -> Found:
     """Maximise the likelihood; intervals from its profile, widened by unequal axes."""
     likelihood = Likelihood.of(tracks)
     if not likelihood.scale[0] > 0:
-        return _Found(0.0, (0.0, 0.0), (0.0, 0.0), 0.0, np.nan)
+        return Found(0.0, (0.0, 0.0), (0.0, 0.0), 0.0, np.nan)
     best = likelihood.best()
     value = float(best.D[0])
     wider = excess_scatter(tracks, value, best.theta)
@@ -241,7 +241,7 @@ def _by_likelihood(tracks: Sequence[Track]) -> _Found:
     offsets, offset_stderr = likelihood.offsets(best)
     drift, drift_stderr = likelihood.velocities(best) if tracks[0].drift else (None, None)
     p_same = _probability_same(likelihood, best) if len(tracks) > 1 else None
-    return _Found(
+    return Found(
         value, ci68, ci95, float(offsets.mean()), offset_stderr, drift, drift_stderr, p_same
     )
 
@@ -254,14 +254,14 @@ def _probability_same(likelihood: Likelihood, best: Peak) -> float:
     return float(chdtrc(len(likelihood.tracks) - 1, max(2 * gain, 0.0)))
 
 
-def _by_moments(moments: Moments) -> _Found:
+def _by_moments(moments: Moments) -> Found:
     """Give a closed-form estimate its normal intervals."""
     value, stderr = moments.value, moments.stderr
     ci68, ci95 = (
         (float(value - z * stderr), float(value + z * stderr))
         for z in (_NORMAL[0.68], _NORMAL[0.95])
     )
-    return _Found(float(value), ci68, ci95, moments.offset, moments.offset_stderr)
+    return Found(float(value), ci68, ci95, moments.offset, moments.offset_stderr)
 
 
 def _track(
@@ -284,7 +284,7 @@ def _orientation_noise(steps: Steps, noise: str | float) -> float:
 
 
 def _told(
-    found: _Found,
+    found: Found,
     motions: Sequence[RigidMotion],
     steps: Sequence[Steps],
     *,

@@ -8,16 +8,22 @@ import numpy as np
 
 from perrin._arrays import (
     Bools,
+    DegenerateClusterError,
     Floats,
     Ints,
+    TooFewFramesError,
     TrackTableError,
     as_positions,
     present,
     require_positive,
 )
+from perrin.bonds import rigid_groups
+from perrin.identity import settle_identity
+from perrin.linking import link_clusters
+from perrin.rods import track_direction
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
 
     import pandas as pd
     from numpy.typing import ArrayLike
@@ -71,13 +77,57 @@ def cluster_positions(
     >>> positions[:, 0, 0]
     array([ 1., nan,  2.])
     """
-    chosen = _one_cluster(table, cluster)
-    tracks = _tracks(chosen)
-    ids = np.unique(tracks.code[tracks.seen])
-    first, last = _span(tracks.frame[tracks.seen])
-    positions = np.full((last - first + 1, len(ids), tracks.x.shape[1]), np.nan)
-    row = tracks.frame[tracks.seen] - first
-    positions[row, np.searchsorted(ids, tracks.code[tracks.seen])] = tracks.x[tracks.seen]
+    tracks = _tracks(_one_cluster(table, cluster))
+    rows = np.flatnonzero(tracks.seen)
+    return _seats(tracks.frame[rows], tracks.code[rows], tracks.x[rows])
+
+
+def each_cluster(table: pd.DataFrame) -> Iterator[tuple[int, Floats, Ints, Ints]]:
+    """Yield cluster by cluster what `cluster_positions` returns, checking the table only once.
+
+    Parameters
+    ----------
+    table : pandas.DataFrame
+        Tracks with the column ``cluster`` (whole numbers, -1 for none) and perhaps ``piece``.
+
+    Yields
+    ------
+    cluster : int
+        Rising.
+    positions : ndarray, shape (T, n, d)
+    frames : ndarray of int64, shape (T,)
+    piece : ndarray of int64, shape (T,)
+        The column ``piece`` of each frame; where it is missing, that of the frame before.
+
+    Raises
+    ------
+    TrackTableError
+        As in `cluster_positions`.
+    """
+    # Ids need to be unique within a cluster only.
+    unique = ["frame", "particle", "cluster"]
+    tracks = _tracks(table, unique=unique)
+    label = table["cluster"].to_numpy(dtype=np.int64)
+    stretch = table["piece"].to_numpy(dtype=np.int64) if "piece" in table else None
+    for inside in _rows_by_label(label):
+        rows = inside[tracks.seen[inside]]
+        positions, frames = _seats(tracks.frame[rows], tracks.code[rows], tracks.x[rows])
+        piece = np.zeros(len(frames), dtype=np.int64)
+        if stretch is not None:
+            at = tracks.frame[rows] - frames[0]
+            piece[at] = stretch[rows]
+            last = np.zeros(len(frames), dtype=np.int64)
+            last[at] = at
+            piece = piece[np.maximum.accumulate(last)]
+        yield int(label[inside[0]]), positions, frames, piece
+
+
+def _seats(frame: Ints, code: Ints, x: Floats) -> tuple[Floats, Ints]:
+    """Seat the detections of one cluster in an array, a row per frame from first to last."""
+    ids = np.unique(code)
+    first, last = _span(frame)
+    positions = np.full((last - first + 1, len(ids), x.shape[1]), np.nan)
+    positions[frame - first, np.searchsorted(ids, code)] = x
     return positions, np.arange(first, last + 1, dtype=np.int64)
 
 
@@ -113,12 +163,15 @@ def positions_table(positions: ArrayLike, *, frames: ArrayLike | None = None) ->
     return pd.DataFrame(columns).assign(cluster=0)
 
 
-def find_clusters(table: pd.DataFrame, *, contact: float) -> pd.DataFrame:
+def find_clusters(
+    table: pd.DataFrame, *, contact: float | None = None, size: int | None = None
+) -> pd.DataFrame:
     """Find which particles travel together and number the clusters they form.
 
-    Two particles belong together when they are nearer than 1.3 times `contact` in more than half
-    of the frames that hold both, and at least 2 frames do. Clusters are the connected groups of at
-    least 3 particles (2 in two dimensions).
+    With `contact` two particles belong together when they are nearer than 1.3 times that in more
+    than half of the frames that hold both, and at least 2 frames do; clusters are the connected
+    groups. Without it they belong together when their distance stays constant within noise
+    (`rigid_groups`): bodies may pass each other, and frames may be missing.
 
     Parameters
     ----------
@@ -126,8 +179,10 @@ def find_clusters(table: pd.DataFrame, *, contact: float) -> pd.DataFrame:
         Tracks as `read_tracks` and `check_tracks` return them, coordinates in um. A row with a NaN
         coordinate counts as missing. An existing ``cluster`` column is replaced; ids must be
         unique without it.
-    contact : float
+    contact : float, optional
         Centre distance of touching particles, um.
+    size : int, optional
+        Fewest particles of a cluster; default 3 (2 in two dimensions).
 
     Returns
     -------
@@ -138,7 +193,7 @@ def find_clusters(table: pd.DataFrame, *, contact: float) -> pd.DataFrame:
     Raises
     ------
     ValueError
-        If `contact` is not a positive number.
+        If `contact` is not a positive number, or `size` no whole number of at least 2.
     TrackTableError
         If the table is not a clean track table.
 
@@ -151,12 +206,127 @@ def find_clusters(table: pd.DataFrame, *, contact: float) -> pd.DataFrame:
     >>> find_clusters(table, contact=1.0)["cluster"].tolist()
     [0, 0, -1, 0, 0, -1]
     """
-    require_positive(contact=contact)
+    if contact is not None:
+        require_positive(contact=contact)
     tracks = _tracks(table)
-    pairs = _lasting_pairs(tracks, _REACH * contact)
-    smallest = 3 if tracks.x.shape[1] == 3 else 2
-    labels = _components(pairs, tracks.n_particles, smallest)
+    smallest = min(3, tracks.x.shape[1]) if size is None else _whole(size)
+    if contact is None:
+        rows = np.flatnonzero(tracks.seen)
+        columns = tracks.frame[rows], tracks.code[rows], tracks.x[rows]
+        group = rigid_groups(*columns, count=tracks.n_particles, smallest=smallest)
+        labels = np.searchsorted(np.unique(group[group >= 0]), group)
+        labels = np.where(group >= 0, labels, -1)
+    else:
+        pairs = _lasting_pairs(tracks, _REACH * contact)
+        labels = _components(pairs, tracks.n_particles, smallest)
     return table.assign(cluster=labels[tracks.code])
+
+
+def identify(table: pd.DataFrame, *, contact: float, size: int) -> pd.DataFrame:
+    """Give detections without lasting ids a particle and a cluster that last.
+
+    In every frame detections are grouped by touching (1.3 times `contact`), the centres of the
+    groups are linked through time, and in each cluster particles are told apart by the rigid fit
+    and least rotation (`settle_identity`). Missing and extra detections are allowed.
+
+    Parameters
+    ----------
+    table : pandas.DataFrame
+        Columns frame, x, y[, z], um, a row per detection; a column ``particle`` or ``cluster`` is
+        not used and replaced. A row with a NaN coordinate counts as missing.
+    contact : float
+        Centre distance of touching particles, um.
+    size : int
+        Particles of a cluster.
+
+    Returns
+    -------
+    pandas.DataFrame
+        The same rows with ``particle``, ``cluster`` and ``piece`` (int64). Detections of no
+        cluster, or whose place in it cannot be told, have ``cluster`` -1 and an id of their own.
+        A new ``piece`` of a cluster begins where its particles (not the cluster) may have been
+        mistaken; no step should join two pieces.
+
+    Raises
+    ------
+    ValueError
+        If `contact` is not a positive number, or `size` no whole number of at least 2.
+    TrackTableError
+        If the table is not clean.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from perrin import Cluster, add_noise, identify, positions_table, simulate_motion
+    >>> truth = simulate_motion(Cluster.touching(4, 2.0), D_R=5e-3, dt=0.7, n_frames=50, rng=1)
+    >>> x = add_noise(truth.positions(), sigma=0.02, rng=2)
+    >>> raw = positions_table(x).sample(frac=1, random_state=0)[["frame", "x", "y", "z"]]
+    >>> found = identify(raw, contact=2.0, size=4)
+    >>> found.groupby(["cluster", "particle"]).size().tolist()
+    [50, 50, 50, 50]
+    """
+    require_positive(contact=contact)
+    size = _whole(size)
+    tracks = _tracks(table.assign(particle=np.arange(len(table))))
+    rows = np.flatnonzero(tracks.seen)
+    frame, x = tracks.frame[rows], tracks.x[rows]
+    cluster = link_clusters(frame, x, reach=_REACH * contact, contact=contact, size=size)
+    seat, piece = np.full(len(rows), -1, dtype=np.int64), np.zeros(len(rows), dtype=np.int64)
+    for inside in _rows_by_label(cluster):
+        seat[inside], piece[inside] = _settled(frame[inside], x[inside], size)
+    out = np.full((3, len(table)), -1, dtype=np.int64)
+    sure = seat >= 0
+    out[0, rows[sure]] = cluster[sure] * size + seat[sure]
+    out[1, rows[sure]] = cluster[sure]
+    out[2, rows] = piece
+    loose = np.flatnonzero(out[0] < 0)
+    out[0, loose] = int(cluster.max(initial=-1) + 1) * size + np.arange(loose.size)
+    return table.assign(particle=out[0], cluster=out[1], piece=np.maximum(out[2], 0))
+
+
+def _whole(size: int) -> int:
+    if not (np.ndim(size) == 0 and size == int(size) and size >= 2):
+        raise ValueError(f"size: expected a whole number of particles, at least 2, got {size!r}")
+    return int(size)
+
+
+def _rows_by_label(label: Ints) -> Iterator[Ints]:
+    """Yield the rows of each label but -1."""
+    order = np.argsort(label, kind="stable")
+    order = order[label[order] >= 0]
+    if order.size:
+        yield from np.split(order, np.flatnonzero(np.diff(label[order])) + 1)
+
+
+def _settled(frame: Ints, x: Floats, size: int) -> tuple[Ints, Ints]:
+    """Return the particle (0 to size - 1, or -1) and the piece of each detection of one cluster."""
+    order = np.argsort(frame, kind="stable")
+    times, row, counts = np.unique(frame[order], return_inverse=True, return_counts=True)
+    column = np.arange(len(frame)) - np.repeat(np.cumsum(counts) - counts, counts)
+    positions = np.full((len(times), size, x.shape[1]), np.nan)
+    positions[row, column] = x[order]
+    if size == 2 and x.shape[1] == 3:
+        taken, piece = _ends_of(positions, times)
+    else:
+        found = settle_identity(positions, times=times, size=size, labelled=False)
+        taken, piece = found.order, found.piece
+    which = np.full((len(times), size), -1, dtype=np.int64)
+    at, seat = np.nonzero(taken >= 0)
+    which[at, taken[at, seat]] = seat
+    out = np.empty((2, len(frame)), dtype=np.int64)
+    out[:, order] = which[row, column], piece[row]
+    return out[0], out[1]
+
+
+def _ends_of(positions: Floats, times: Ints) -> tuple[Ints, Ints]:
+    """Return the order of the two ends of a rod in every frame, and the pieces."""
+    try:
+        rod = track_direction(positions, dt=1.0, times=times.astype(np.float64), labelled=False)
+    except (DegenerateClusterError, TooFewFramesError):
+        return np.full(positions.shape[:2], -1), np.zeros(len(positions), dtype=np.int64)
+    along = np.einsum("td,td->t", positions[:, 1] - positions[:, 0], rod.direction)
+    order = np.where((along < 0)[:, None], [1, 0], [0, 1])
+    return np.where(np.isfinite(along)[:, None], order, -1), rod.piece
 
 
 class _Tracks(NamedTuple):
@@ -169,11 +339,11 @@ class _Tracks(NamedTuple):
     n_particles: int
 
 
-def _tracks(table: pd.DataFrame) -> _Tracks:
+def _tracks(table: pd.DataFrame, *, unique: Sequence[str] = ("frame", "particle")) -> _Tracks:
     """Return the columns as arrays; `code` numbers the particles in the order of their ids."""
     import pandas as pd
 
-    _refuse_unclean(table)
+    _refuse_unclean(table, unique)
     axes = ["x", "y", "z"] if "z" in table else ["x", "y"]
     x = table[axes].to_numpy(dtype=np.float64, na_value=np.nan)
     code, ids = pd.factorize(table["particle"], sort=True)
@@ -181,7 +351,7 @@ def _tracks(table: pd.DataFrame) -> _Tracks:
     return _Tracks(frame, code.astype(np.int64), x, ~np.isnan(x).any(axis=1), len(ids))
 
 
-def _refuse_unclean(table: pd.DataFrame) -> None:
+def _refuse_unclean(table: pd.DataFrame, unique: Sequence[str]) -> None:
     """Raise for what would become a wrong number here, listing all faults."""
     missing = [name for name in ("frame", "particle", "x", "y") if name not in table]
     faults = [f"missing columns {', '.join(missing)}"] if missing else []
@@ -192,7 +362,7 @@ def _refuse_unclean(table: pd.DataFrame) -> None:
     ]
     faults += [] if len(table) else ["no rows"]
     if not faults:
-        faults = _value_faults(table)
+        faults = _value_faults(table, unique)
     if faults:
         raise TrackTableError(
             f"not a clean track table: {'; '.join(faults)}. check_tracks names the rows",
@@ -200,14 +370,14 @@ def _refuse_unclean(table: pd.DataFrame) -> None:
         )
 
 
-def _value_faults(table: pd.DataFrame) -> list[str]:
+def _value_faults(table: pd.DataFrame, unique: Sequence[str]) -> list[str]:
     frame = table["frame"].to_numpy(dtype=np.float64)
     axes = [axis for axis in ("x", "y", "z") if axis in table]
     x = table[axes].to_numpy(dtype=np.float64, na_value=np.nan)
     counts = {
         "frame numbers that are not whole": (frame != np.round(frame)).sum(),
         "rows with an infinite coordinate": np.isinf(x).any(axis=1).sum(),
-        "rows that repeat a particle in a frame": table.duplicated(["frame", "particle"]).sum(),
+        "rows that repeat a particle in a frame": table.duplicated(list(unique)).sum(),
     }
     return [f"{count} {what}" for what, count in counts.items() if count]
 
@@ -286,7 +456,7 @@ def _shared_frames(tracks: _Tracks, pairs: Ints) -> Ints:
     )
     shared = np.zeros(len(pairs), dtype=np.int64)
     # In parts, so that memory stays bounded however many pairs ever met.
-    step = max(1, 10_000_000 // max(len(frames), 1))
+    step = max(1, 500_000 // max(len(frames), 1))
     for i in range(0, len(pairs), step):
         one, other = pairs[i : i + step].T
         shared[i : i + step] = present[one].multiply(present[other]).sum(axis=1)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
@@ -21,7 +21,7 @@ from perrin._arrays import (
     require_positive,
 )
 from perrin.noise import center_variance, orientation_covariance
-from perrin.rotations import fit_rotations, log_map, successive_product
+from perrin.rotations import exp_map, fit_rotations, log_map, skew, successive_product
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -30,6 +30,9 @@ if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
 Reference = Literal["template", "previous"]
+Weights = Literal["equal", "sigma"]
+
+_CONVERGED = 1e-13  # rad: a Gauss-Newton step this short has arrived
 
 # An axis whose orientation is this uncertain (rad) is not determined: the particles lie on a line
 # within the noise, and the small-angle theory of every error has lost its meaning.
@@ -299,6 +302,8 @@ def track_rotation(
     times: ArrayLike | None = None,
     reference: Reference = "template",
     sigma: ArrayLike | None = None,
+    weights: Weights = "equal",
+    piece: ArrayLike | None = None,
 ) -> RigidMotion:
     """Fit a rigid body to a cluster's particles in every frame and return its motion.
 
@@ -317,7 +322,15 @@ def track_rotation(
         Procrustes). "previous" is the paper's product of successive rotations (Hunter 2011,
         Eq. 13), whose orientation drifts under noise.
     sigma : float or array_like, shape (d,), optional
-        Known localisation error, um, for `covariance`; default: from the residuals.
+        Known localisation error, um, for `covariance`; default: from the residuals. With
+        ``weights="sigma"`` also (n, 1) or (n, d), one for each particle.
+    weights : {"equal", "sigma"}
+        "sigma" weighs every coordinate of every particle with 1/sigma^2 (poses, not the template):
+        for a tetrahedron the variance of the orientation falls to 0.94, 0.70 and 0.42 where sigma_z
+        is 1.33, 2 and 3 times sigma_xy.
+    piece : array_like of int, shape (T,), optional
+        Stretches of doubtless identity, as `settle_identity` finds them; no pair of frames is
+        formed across two of them. Default: one.
 
     Returns
     -------
@@ -349,11 +362,17 @@ def track_rotation(
     if reference not in ("template", "previous"):
         raise ValueError(f'reference: expected "template" or "previous", got {reference!r}')
     time = _times(len(x), dt=dt, frames=frames, times=times)
-    given = None if sigma is None else as_sigma(sigma, x.shape[2])
+    stretch = _pieces(len(x), piece)
+    given = _given_noise(sigma, x.shape[1:], weights=weights, reference=reference)
     seen = present(x)
     _require_points(seen, x.shape[2])
     fit = _fit_chain(x, seen) if reference == "previous" else _fit_template(x, seen)
-    return _measured(fit, x, seen, time=time, dt=dt, given=given)
+    if weights == "equal" or given is None:
+        motion = _measured(fit, x, seen, time=time, dt=dt, given=given)
+    else:
+        fit, errors = _weighted(fit, x, seen, given**2)
+        motion = _measured(fit, x, seen, time=time, dt=dt, given=given.mean(axis=0), errors=errors)
+    return replace(motion, piece=stretch)
 
 
 def remove_rotation(
@@ -531,6 +550,39 @@ def _times(count: int, *, dt: float, frames: ArrayLike | None, times: ArrayLike 
         k = int(np.argmax(bad))
         raise ValueError(f"{name}: expected finite, rising numbers, got {t[k]} at row {k}")
     return t if times is not None else t * dt
+
+
+def _pieces(count: int, piece: ArrayLike | None) -> Ints:
+    """Return the piece of each row, a copy."""
+    if piece is None:
+        return np.zeros(count, dtype=np.int64)
+    stretch = np.asarray(piece)
+    if stretch.shape != (count,) or not np.issubdtype(stretch.dtype, np.integer):
+        raise ValueError(
+            f"piece: expected {count} whole numbers (one a row), got {stretch.dtype} of shape "
+            f"{stretch.shape}"
+        )
+    return np.array(stretch, dtype=np.int64)
+
+
+def _given_noise(
+    sigma: ArrayLike | None, shape: tuple[int, ...], *, weights: str, reference: str
+) -> Floats | None:
+    """Return the stated sigma, (d,), or (n, d) where it is to weigh the particles."""
+    if weights not in ("equal", "sigma"):
+        raise ValueError(f'weights: expected "equal" or "sigma", got {weights!r}')
+    if weights == "equal":
+        return None if sigma is None else as_sigma(sigma, shape[1])
+    if sigma is None or reference != "template":
+        raise ValueError('weights="sigma" needs sigma, and reference="template"')
+    s = np.asarray(sigma, dtype=np.float64)
+    if s.shape in ((shape[0], 1), shape):
+        s = np.broadcast_to(s, shape).copy()
+    else:
+        s = np.broadcast_to(as_sigma(sigma, shape[1]), shape).copy()
+    if not (np.isfinite(s) & (s > 0)).all():
+        raise ValueError(f"sigma: expected finite numbers > 0 to weigh with, got {sigma!r}")
+    return s
 
 
 def _require_points(seen: Bools, d: int) -> None:
@@ -724,13 +776,82 @@ def _finished(x: Floats, seen: Bools, rotation: Floats, shape: Floats) -> _Fit:
     return _Fit(rotation, _centers(x, rotation, shape), shape, residual, sigma2)
 
 
+def _weighted(
+    fit: _Fit, x: Floats, seen: Bools, variance: Floats
+) -> tuple[_Fit, tuple[Floats, Floats]]:
+    """Fit the poses again with weights 1/variance (n, d); return them and their errors.
+
+    Gauss-Newton steps in the rotation vector (lab axes) and the centre.
+    """
+    rows = np.flatnonzero(np.isfinite(fit.rotation[:, 0, 0]))
+    d, angles = x.shape[2], fit.rotation.shape[1] * (fit.rotation.shape[1] - 1) // 2
+    rotation, center = fit.rotation[rows], fit.center[rows]
+    weight = np.where(seen[rows][..., None], 1 / variance, 0.0)
+    points = np.where(seen[rows][..., None], x[rows], 0.0)
+    for _ in range(20):
+        arm = np.einsum("tij,nj->tni", rotation, fit.template)
+        slope = _pose_slopes(arm)
+        e = points - center[:, None] - arm
+        information = np.einsum("tnda,tnd,tndb->tab", slope, weight, slope)
+        step = np.linalg.solve(
+            information, np.einsum("tnda,tnd,tnd->ta", slope, weight, e)[..., None]
+        )[..., 0]
+        rotation = exp_map(step[:, :angles]) @ rotation
+        center = center + step[:, angles:]
+        if np.abs(step[:, :angles]).max() < _CONVERGED:
+            break
+    inverse = np.linalg.inv(information)
+    covariance = np.full((len(x), angles, angles), np.nan)
+    turn = rotation @ rotation[0].T if d == 3 else np.ones((rows.size, 1, 1))
+    covariance[rows] = np.swapaxes(turn, -1, -2) @ inverse[:, :angles, :angles] @ turn
+    covariance = 0.5 * (covariance + np.swapaxes(covariance, -1, -2))
+    center_error = np.full(len(x), np.nan)
+    center_error[rows] = np.trace(inverse[:, angles:, angles:], axis1=1, axis2=2) / d
+    return _turned(fit, rows, rotation, center, x, seen), (covariance, center_error)
+
+
+def _pose_slopes(arm: Floats) -> Floats:
+    """Return the change of each coordinate (T, n, d) with rotation vector and centre."""
+    t, n, d = arm.shape
+    unit = np.broadcast_to(np.eye(d), (t, n, d, d))
+    if d == 2:
+        across = np.stack([-arm[..., 1], arm[..., 0]], axis=-1)[..., None]
+        return np.concatenate([across, unit], axis=-1)
+    return np.concatenate([-skew(arm), unit], axis=-1)
+
+
+def _turned(
+    fit: _Fit, rows: Ints, rotation: Floats, center: Floats, x: Floats, seen: Bools
+) -> _Fit:
+    """Return a fit with other poses, its first one the identity again."""
+    gauge = rotation[0]
+    turns, places = fit.rotation.copy(), fit.center.copy()
+    turns[rows], places[rows] = rotation @ gauge.T, center
+    turns[rows[0]] = np.eye(len(gauge))
+    template = fit.template @ gauge.T
+    body = np.einsum("tij,tni->tnj", turns, x - places[:, None]) - template
+    return fit._replace(
+        rotation=turns,
+        center=places,
+        template=template,
+        residual=np.where(seen[..., None], body, np.nan),
+    )
+
+
 def _measured(
-    fit: _Fit, x: Floats, seen: Bools, *, time: Floats, dt: float, given: Floats | None
+    fit: _Fit,
+    x: Floats,
+    seen: Bools,
+    *,
+    time: Floats,
+    dt: float,
+    given: Floats | None,
+    errors: tuple[Floats, Floats] | None = None,
 ) -> RigidMotion:
     """Add what every pose is worth, refuse those worth nothing, and build the result."""
     d = x.shape[2]
     noise = np.full(d, fit.sigma2) if given is None else given**2
-    covariance, variance = _pose_errors(fit, seen, noise)
+    covariance, variance = _pose_errors(fit, seen, noise) if errors is None else errors
     worst = np.sqrt(np.linalg.eigvalsh(np.nan_to_num(covariance))[:, -1])
     lost = worst > _LOST_AXIS
     fitted = np.isfinite(fit.rotation[:, 0, 0]) & ~lost

@@ -339,7 +339,7 @@ def save_figures(report: Report, folder: str | os.PathLike[str]) -> list[Path]:
     """
     place = Path(folder)
     files: list[Path] = []
-    if len(report.clusters) > 1:
+    if report.pooled is not None and len(report.clusters) > 1:
         files += save_figure(_forest_figure(report.clusters, report.pooled), place / "clusters")
     kinds: dict[str, Callable[[ClusterResult], Figure]] = {
         "curves": _curve_figure,

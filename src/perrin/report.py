@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
     from perrin.diffusion import DiffusionEstimate
-    from perrin.results import ClusterResult, Report
+    from perrin.results import ClusterResult, Pooled, Report, RodResult
 
 # What each figure is, what it shows, and what to look for.
 _CAPTIONS = {
@@ -138,20 +138,21 @@ def render_html(report: Report, figures: Iterable[Path]) -> str:
     return environment.from_string(template).render(
         **_provenance(report.settings),
         several=several,
-        label=None if several else report.clusters[0].label,
+        label=None if several else report.results[0].label,
         headline=_headline(report),
         overview=[_overview_row(c) for c in report.clusters] if several else [],
-        pooled=_pooled_row(report) if several else None,
+        pooled=_pooled_row(report, report.pooled) if several and report.pooled else None,
+        rods=[_rod_row(rod) for rod in report.rods],
         warnings=report.warnings,
-        warned=[(c.cluster, c.name, c.warnings) for c in report.clusters if c.warnings],
-        spelled=sum(len(c.warnings) for c in report.clusters) <= _SPELLED,
+        warned=[(c.cluster, c.name, c.warnings) for c in report.results if c.warnings],
+        spelled=sum(len(c.warnings) for c in report.results) <= _SPELLED,
         overview_figure=_figure(pictures, "clusters", "clusters"),
         clusters=[_section(c, pictures, report.settings) for c in report.clusters],
         hidden=max(len(report.clusters) - MAX_CLUSTERS, 0),
-        planar=report.clusters[0].motion.template.shape[1] == 2,
-        noise=report.pooled.D_R.noise,
-        exposure=report.pooled.D_R.exposure,
-        drift=report.pooled.D_T.drift is not None,
+        planar=any(c.motion.template.shape[1] == 2 for c in report.clusters),
+        noise="joint" if report.pooled is None else report.pooled.D_R.noise,
+        exposure=None if report.pooled is None else report.pooled.D_R.exposure,
+        drift=report.pooled is not None and report.pooled.D_T.drift is not None,
     )
 
 
@@ -170,6 +171,8 @@ def _figure(pictures: Mapping[str, str], stem: str, kind: str) -> dict[str, str]
 
 def _headline(report: Report) -> list[dict[str, Any]]:
     """Return D_R and D_T as the first thing to read: pooled where there are several clusters."""
+    if report.pooled is None:
+        return []
     estimates = (report.pooled.D_R, report.pooled.D_T)
     return [{"letter": k} | _estimate(e) for k, e in zip("RT", estimates, strict=True)]
 
@@ -187,24 +190,37 @@ def _overview_row(result: ClusterResult) -> dict[str, Any]:
     }
 
 
-def _pooled_row(report: Report) -> dict[str, Any]:
-    """Return the pooled line, and which clusters it leaves out."""
-    used = set(report.pooled.clusters)
+def _rod_row(rod: RodResult) -> dict[str, Any]:
+    """Return one rod's line: a direction, no full orientation."""
     return {
-        "D_R": _estimate(report.pooled.D_R),
-        "D_T": _estimate(report.pooled.D_T),
-        "frames": report.pooled.D_R.n_frames,
+        "anchor": rod.cluster,
+        "name": rod.name,
+        "D_perp": _estimate(rod.D_perp),
+        "D_T": _estimate(rod.D_T),
+        "length": _length(rod.motion.length),
+        "frames": rod.motion.fitted.size,
+        "warnings": rod.warnings,
+    }
+
+
+def _pooled_row(report: Report, pooled: Pooled) -> dict[str, Any]:
+    """Return the pooled line, and which clusters it leaves out."""
+    used = set(pooled.clusters)
+    return {
+        "D_R": _estimate(pooled.D_R),
+        "D_T": _estimate(pooled.D_T),
+        "frames": pooled.D_R.n_frames,
         "count": len(used),
-        "agree": _agreement(report),
+        "agree": _agreement(pooled),
         "left_out": [c.name for c in report.clusters if c.cluster not in used],
     }
 
 
-def _agreement(report: Report) -> str:
+def _agreement(pooled: Pooled) -> str:
     """Say how well the clusters agree on one value."""
     said = [
         f"{name} {number_text(estimate.p_same)}"
-        for name, estimate in (("D_R", report.pooled.D_R), ("D_T", report.pooled.D_T))
+        for name, estimate in (("D_R", pooled.D_R), ("D_T", pooled.D_T))
         if estimate.p_same is not None
     ]
     if not said:

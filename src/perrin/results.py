@@ -13,11 +13,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from perrin.diffusion import DiffusionEstimate
+from perrin.diffusion import DiffusionEstimate, with_error
 from perrin.hydrodynamics import Size
 from perrin.lagged import LagCurve, msad, msd
 from perrin.motion import RigidMotion
 from perrin.noise import NoiseFloor, floor_of
+from perrin.quality import Quality
+from perrin.rods import RodMotion
 from perrin.tensors import DiffusionTensor
 
 if TYPE_CHECKING:
@@ -44,6 +46,8 @@ class ClusterResult:
     warnings : tuple of str
     label : str or None
         The cluster's name in the table, where it is text.
+    quality : Quality or None
+        Rigidity, errors per axis, and what was repaired.
     """
 
     cluster: int
@@ -55,6 +59,7 @@ class ClusterResult:
     sizes: dict[str, Size] | None
     warnings: tuple[str, ...]
     label: str | None = None
+    quality: Quality | None = None
 
     @cached_property
     def msad(self) -> LagCurve:
@@ -92,6 +97,7 @@ class ClusterResult:
                 "cluster_T": {"value": t.cluster, "stderr": t.cluster_stderr},
                 "cluster_R": {"value": r.cluster, "stderr": r.cluster_stderr},
             }
+        xyz = None if self.quality is None else self.quality.sigma_xyz
         return {
             "cluster": self.cluster,
             "label": self.label,
@@ -100,12 +106,59 @@ class ClusterResult:
             "D_R": _estimate_dict(self.D_R),
             "D_T": _estimate_dict(self.D_T),
             "sigma": _number(self.motion.sigma),
-            "sigma_xyz": None,
+            "sigma_xyz": None if xyz is None else list(xyz),
             "phi2": {"measured": _number(self.phi2_measured), "predicted": self.noise.phi2},
             "snr": _number(self.D_R.snr),
             "tensor": None if self.tensor is None else _tensor_dict(self.tensor),
             "sizes": sizes,
             "size_factor": None if self.sizes is None else self.sizes["rotation"].factor,
+            "quality": None if self.quality is None else self.quality.to_dict(),
+            "warnings": list(self.warnings),
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class RodResult:
+    """What was measured on one rod or straight chain: it has a direction, no full orientation.
+
+    Attributes
+    ----------
+    cluster : int
+    motion : RodMotion
+    D_perp, D_T : DiffusionEstimate
+        Of the direction (<|du|^2> = 4 D_perp dt) and of the centre.
+    warnings : tuple of str
+    label : str or None
+    """
+
+    cluster: int
+    motion: RodMotion
+    D_perp: DiffusionEstimate
+    D_T: DiffusionEstimate
+    warnings: tuple[str, ...]
+    label: str | None = None
+
+    @property
+    def name(self) -> str:
+        """The rod's number, or its label."""
+        return self.label or str(self.cluster)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the rod's entry of ``summary.json``."""
+        return {
+            "cluster": self.cluster,
+            "label": self.label,
+            "n_particles": len(self.motion.places),
+            "n_frames": int(self.motion.fitted.size),
+            "D_R": None,
+            "D_perp": _estimate_dict(self.D_perp),
+            "D_T": _estimate_dict(self.D_T),
+            "length": self.motion.length,
+            "sigma": _number(self.motion.sigma),
+            "sigma_xyz": None,
+            "snr": _number(self.D_perp.snr),
+            "tensor": None,
+            "sizes": None,
             "warnings": list(self.warnings),
         }
 
@@ -133,38 +186,51 @@ class Report:
     Attributes
     ----------
     clusters : tuple of ClusterResult
-    pooled : Pooled
+    pooled : Pooled or None
+        None where there are only rods.
     warnings : tuple of str
         What concerns the whole table; each cluster has its own besides.
     tracks : pandas.DataFrame
         The positions used: frame from 0, particle, cluster, x, y[, z], um.
     settings : dict
         Arguments, versions, and the input with its SHA-256.
+    rods : tuple of RodResult
+        Pairs and straight chains in three dimensions, which have no full rotation.
     """
 
     clusters: tuple[ClusterResult, ...]
-    pooled: Pooled
+    pooled: Pooled | None
     warnings: tuple[str, ...]
     tracks: pd.DataFrame
     settings: dict[str, Any] = field(default_factory=dict)
+    rods: tuple[RodResult, ...] = ()
+
+    @property
+    def results(self) -> tuple[ClusterResult | RodResult, ...]:
+        """Bodies and rods together."""
+        both: list[ClusterResult | RodResult] = [*self.clusters, *self.rods]
+        return tuple(both)
 
     def __repr__(self) -> str:
-        count = len(self.warnings) + sum(len(c.warnings) for c in self.clusters)
-        lines = [f"Report({len(self.clusters)} clusters, {count} warnings)"]
+        count = len(self.warnings) + sum(len(c.warnings) for c in self.results)
+        lines = [f"Report({len(self.results)} clusters, {count} warnings)"]
         lines += [f"  cluster {c.name}: {c.D_R}; {c.D_T}" for c in self.clusters[:10]]
-        if len(self.clusters) > 1:
+        lines += [f"  {perp_text(rod)}" for rod in self.rods[:10]]
+        if self.pooled is not None and len(self.clusters) > 1:
             lines.append(f"  pooled: {self.pooled.D_R}; {self.pooled.D_T}")
         return "\n".join(lines)
 
     def to_dict(self) -> dict[str, Any]:
         """Return ``summary.json`` as a dictionary: plain numbers, null for what is unknown."""
+        entries = [result.to_dict() for result in self.results]
+        pooled = self.pooled
         return {
-            "clusters": [c.to_dict() for c in self.clusters],
+            "clusters": sorted(entries, key=lambda entry: int(entry["cluster"])),
             "pooled": {
-                "D_R": _estimate_dict(self.pooled.D_R),
-                "D_T": _estimate_dict(self.pooled.D_T),
-                "p_same": self.pooled.D_R.p_same,
-                "clusters": list(self.pooled.clusters),
+                "D_R": None if pooled is None else _estimate_dict(pooled.D_R),
+                "D_T": None if pooled is None else _estimate_dict(pooled.D_T),
+                "p_same": None if pooled is None else pooled.D_R.p_same,
+                "clusters": [] if pooled is None else list(pooled.clusters),
             },
             "warnings": list(self.warnings),
         }
@@ -196,17 +262,19 @@ def load_run(folder: str | os.PathLike[str]) -> Report:
     settings = json.loads((path / "run.json").read_text(encoding="utf-8"))
     motions = pd.read_parquet(path / "motion.parquet")
     attributes = motions.attrs["clusters"]
-    results = []
+    results: list[ClusterResult] = []
+    rods: list[RodResult] = []
     for entry in summary["clusters"]:
         rows = motions[motions["cluster"] == entry["cluster"]].reset_index(drop=True)
         rows.attrs = attributes[str(entry["cluster"])]
-        results.append(_result_from(entry, RigidMotion.from_frame(rows)))
-    pooled = summary["pooled"]
+        if "D_perp" in entry:
+            rods.append(_rod_from(entry, RodMotion.from_frame(rows)))
+        else:
+            results.append(_result_from(entry, RigidMotion.from_frame(rows)))
     return Report(
         clusters=tuple(results),
-        pooled=Pooled(
-            _estimate_from(pooled["D_R"]), _estimate_from(pooled["D_T"]), tuple(pooled["clusters"])
-        ),
+        rods=tuple(rods),
+        pooled=_pooled_from(summary["pooled"]),
         warnings=tuple(summary["warnings"]),
         tracks=pd.read_parquet(path / "tracks.parquet"),
         settings=settings,
@@ -278,7 +346,7 @@ def motion_table(report: Report) -> pd.DataFrame:
     import pandas as pd
 
     parts, attributes = [], {}
-    for result in report.clusters:
+    for result in report.results:
         part = result.motion.to_frame()
         attributes[str(result.cluster)] = part.attrs
         part.attrs = {}
@@ -301,7 +369,15 @@ def curve_table(report: Report) -> pd.DataFrame:
             part.insert(0, "cluster", result.cluster)
             part.insert(1, "quantity", name)
             parts.append(part)
+    if not parts:
+        return pd.DataFrame(columns=["cluster", "quantity"])
     return pd.concat(parts, ignore_index=True)
+
+
+def perp_text(rod: RodResult) -> str:
+    """Return a rod's coefficients as one line."""
+    shown = with_error(rod.D_perp.value, rod.D_perp.stderr)
+    return f"rod {rod.name}: D_perp = {shown} {rod.D_perp.unit}; {rod.D_T}"
 
 
 def predicted_noise(motion: RigidMotion) -> NoiseFloor:
@@ -401,7 +477,28 @@ def _result_from(entry: dict[str, Any], motion: RigidMotion) -> ClusterResult:
         sizes=sizes,
         warnings=tuple(entry["warnings"]),
         label=entry["label"],
+        quality=None if entry["quality"] is None else Quality.from_dict(entry["quality"]),
     )
+
+
+def _rod_from(entry: dict[str, Any], motion: RodMotion) -> RodResult:
+    """Rebuild one rod's result from its summary and its motion."""
+    return RodResult(
+        cluster=entry["cluster"],
+        motion=motion,
+        D_perp=_estimate_from(entry["D_perp"]),
+        D_T=_estimate_from(entry["D_T"]),
+        warnings=tuple(entry["warnings"]),
+        label=entry["label"],
+    )
+
+
+def _pooled_from(entry: dict[str, Any]) -> Pooled | None:
+    """Rebuild the pooled values; None where there were only rods."""
+    if entry["D_R"] is None:
+        return None
+    estimates = _estimate_from(entry["D_R"]), _estimate_from(entry["D_T"])
+    return Pooled(*estimates, tuple(entry["clusters"]))
 
 
 def _write_json(path: Path, content: dict[str, Any]) -> None:

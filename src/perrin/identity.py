@@ -1,0 +1,766 @@
+"""Which detection is which particle of a body, in every frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import combinations, permutations
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from perrin._arrays import Bools, Floats, Ints, as_positions, frozen, present
+from perrin.motion import degrees_of_freedom
+from perrin.rotations import fit_rotations
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from numpy.typing import ArrayLike
+
+# A fit is noise-like up to so many times the usual mean square residual: chance does not reach it,
+# and a swapped pair (1000 times and more) is far above.
+_NOISE = 16.0
+# Up to so many particles every assignment is tried, and so many frames at most build the template.
+_ALL, _MODELS = 6, 300
+# Log-odds: an assignment is settled when the next best is a hundred times less likely, and lasting
+# labels are trusted e^10 times more than an exchange of them.
+_DOUBT, _TRUST = float(np.log(100.0)), 10.0
+# A step of under 0.4 of the least angle between two assignments cannot be mistaken.
+_SHORT = 0.4
+_BATCH = 100_000
+_COMPLETE = 0.05
+_TINY = 1e-6  # rad: what rounding leaves of a rotation
+# Of large bodies a fit this near (of the least particle distance) is right; searched from one in
+# five of the orientations.
+_CLOSE, _COARSE = 0.1, 5
+
+
+@dataclass(frozen=True, eq=False)
+class Identity:
+    """Which column of an array of detections holds which particle, row by row.
+
+    Attributes
+    ----------
+    order : ndarray of int, shape (T, n)
+        The column of each particle; -1 where it is missing.
+    piece : ndarray of int, shape (T,)
+        Stretches of doubtless identity.
+    swaps : ndarray of int
+        Rows at which the labels changed hands and were put right.
+    cuts : ndarray of int
+        Rows that begin a new piece: two assignments were about as likely.
+    extra : ndarray of int
+        Rows in which a detection is no particle of the body.
+    unsettled : ndarray of int
+        Rows with enough detections for a pose that fit the body in no assignment.
+    """
+
+    order: Ints
+    piece: Ints
+    swaps: Ints
+    cuts: Ints
+    extra: Ints
+    unsettled: Ints
+
+    def __post_init__(self) -> None:
+        frozen(self.order, self.piece, self.swaps, self.cuts, self.extra, self.unsettled)
+
+    def arranged(self, positions: ArrayLike) -> Floats:
+        """Return the detections (T, m, d) as particles (T, n, d), NaN where missing."""
+        x = as_positions(positions)
+        taken = np.take_along_axis(x, np.maximum(self.order, 0)[..., None], axis=1)
+        return np.where(self.order[..., None] >= 0, taken, np.nan)
+
+
+def settle_identity(
+    positions: ArrayLike,
+    *,
+    times: ArrayLike | None = None,
+    size: int | None = None,
+    labelled: bool = True,
+) -> Identity:
+    """Decide in every frame which detection is which particle of one rigid body.
+
+    Of the assignments that fit the common shape as well as noise allows, by a proper rotation, the
+    one of least rotation since the last frame is taken. Mirror images never fit (in the plane of a
+    flat body they do, as half turns). Where the second best is nearly as likely the track is cut.
+
+    Parameters
+    ----------
+    positions : array_like, shape (T, m, d)
+        Detections of one body, um; NaN where there is none. Columns mean nothing where `labelled`
+        is False. Columns that are never seen together may be the same particle.
+    times : array_like, shape (T,), optional
+        Time of each row, any unit; default 0, 1, 2, ...
+    size : int, optional
+        Number of particles n of the body; default: the columns with points in over 5 % of the rows
+        if every two of them are seen together, else the most seen together in 5 % of the rows.
+    labelled : bool
+        Whether a column is meant to be one particle throughout. It then stays one unless an
+        exchange is e^10 times more likely.
+
+    Returns
+    -------
+    Identity
+
+    Raises
+    ------
+    ValueError
+        For bad shapes.
+
+    Notes
+    -----
+    The likelihood of an assignment is exp(-S/(2 sigma^2) - theta^2/(2 s^2)) with S the squared
+    residual of the fit, sigma^2 from its median, theta the angle of the step and s^2 from the
+    median step, growing with the time across gaps. All assignments are tried for up to 6
+    particles; beyond, linear assignment and rigid fit in turn, from many orientations.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from perrin import Cluster, simulate_motion
+    >>> from perrin.identity import settle_identity
+    >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=40, rng=1)
+    >>> x = truth.positions() + 0.01 * np.random.default_rng(1).normal(size=(40, 4, 3))
+    >>> x[25:] = x[25:, [1, 0, 2, 3]]
+    >>> found = settle_identity(x)
+    >>> found.swaps.tolist(), found.order[24].tolist(), found.order[25].tolist()
+    ([25], [0, 1, 2, 3], [1, 0, 2, 3])
+    """
+    x = as_positions(positions)
+    seen = present(x)
+    time = np.arange(len(x), dtype=np.float64) if times is None else np.asarray(times, np.float64)
+    n = _size(seen) if size is None else size
+    frames = _Frames.of(x, seen, n)
+    if labelled and _undoubted(frames, _body_as_given(frames)):
+        return _as_given(seen, n)
+    seed = _seed(x, seen, n)
+    if seed is None:
+        return _as_given(seen, n) if labelled else _unknown(seen, n)
+    body = _body(frames, seed, labelled=labelled)
+    lists = _assignments(frames, body, labelled=labelled)
+    answer = _chained(frames, body, lists, time, labelled=labelled)
+    if labelled and not answer.cuts.size:
+        return answer
+    # The first shape mixes equivalent views of the body; the second keeps its small irregularities.
+    body = _remade(body, answer, x)
+    lists = _assignments(frames, body, labelled=labelled)
+    return _chained(frames, body, lists, time, labelled=labelled)
+
+
+class _Frames(NamedTuple):
+    """Detections moved to the left: x (T, w, d), the columns they came from, and how many."""
+
+    x: Floats
+    column: Ints
+    shown: Ints
+    n: int
+
+    @classmethod
+    def of(cls, x: Floats, seen: Bools, n: int) -> _Frames:
+        width = max(int(seen.sum(axis=1).max()), n)
+        column = np.argsort(~seen, axis=1, kind="stable")[:, :width]
+        here = np.take_along_axis(seen, column, axis=1)
+        points = np.take_along_axis(x, column[..., None], axis=1)
+        pad = width - column.shape[1]
+        column = np.pad(np.where(here, column, -1), ((0, 0), (0, pad)), constant_values=-1)
+        points = np.pad(points, ((0, 0), (0, pad), (0, 0)), constant_values=np.nan)
+        return cls(np.where((column >= 0)[..., None], points, np.nan), column, here.sum(axis=1), n)
+
+
+class _Body(NamedTuple):
+    """The shape, its noise, its near-symmetries as permutations, and the label of each particle."""
+
+    template: Floats
+    sigma2: float
+    group: Ints
+    label: Ints
+
+
+class _Lists(NamedTuple):
+    """The noise-like assignments of every frame, padded to (T, C): places in `_Frames`, fits."""
+
+    place: Ints
+    rotation: Floats
+    misfit: Floats
+    own: Ints  # rows whose first assignment is their labels
+
+
+def _size(seen: Bools) -> int:
+    """Return how many particles the body has.
+
+    Columns never seen together may be one particle, and one seen in few frames may be none.
+    """
+    lasting = seen[:, seen.sum(axis=0) > _COMPLETE * len(seen)].astype(np.float64)
+    if lasting.size and (lasting.T @ lasting > 0).all():
+        return int(lasting.shape[1])
+    counts = np.sort(seen.sum(axis=1))
+    counts = counts[counts > 0]
+    return int(counts[-max(1, int(np.ceil(_COMPLETE * len(counts))))]) if counts.size else 0
+
+
+def _seed(x: Floats, seen: Bools, n: int) -> int | None:
+    """Return a complete frame to begin with: of a few, the one that most frames look like."""
+    d = x.shape[2]
+    rows = np.flatnonzero(seen.sum(axis=1) == n)
+    if n < d or n > seen.shape[1] or rows.size < 2:
+        return None
+    rows = rows[np.linspace(0, rows.size - 1, min(rows.size, 15)).astype(int)]
+    points = np.stack([x[k][seen[k]] for k in rows])
+    misfit = [np.median(_best(points, points[k])[1]) for k in range(min(5, rows.size))]
+    best = int(np.argmin(misfit))
+    return int(rows[best]) if np.isfinite(misfit[best]) else None
+
+
+def _as_given(seen: Bools, n: int) -> Identity:
+    """Leave the columns as they are: one particle each."""
+    none = np.empty(0, dtype=np.int64)
+    order = np.where(seen, np.arange(seen.shape[1]), -1)
+    piece = np.zeros(len(seen), dtype=np.int64)
+    unsettled = none if n == seen.shape[1] else np.arange(len(seen))
+    return Identity(order, piece, none, none.copy(), none.copy(), unsettled)
+
+
+def _unknown(seen: Bools, n: int) -> Identity:
+    """Settle nothing: no frame shows the whole body."""
+    none = np.empty(0, dtype=np.int64)
+    order = np.full((len(seen), n), -1, dtype=np.int64)
+    piece = np.zeros(len(seen), dtype=np.int64)
+    return Identity(order, piece, none, none.copy(), none.copy(), np.flatnonzero(seen.any(axis=1)))
+
+
+def _fits(points: Floats, template: Floats) -> tuple[Floats, Floats]:
+    """Return the rotation and the squared residual of each rigid fit; inf where not unique."""
+    rotation, unique = fit_rotations(points, template)
+    here = present(points) & present(template)
+    weight = here[..., None] / np.maximum(here.sum(axis=-1), 1)[..., None, None]
+    y, t = np.where(here[..., None], points, 0.0), np.where(here[..., None], template, 0.0)
+    y = y - (y * weight).sum(axis=-2, keepdims=True)
+    t = t - (t * weight).sum(axis=-2, keepdims=True)
+    e = np.where(here[..., None], y - t @ np.swapaxes(rotation, -1, -2), 0.0)
+    return rotation, np.where(unique, (e * e).sum(axis=(-2, -1)), np.inf)
+
+
+@lru_cache(maxsize=64)
+def _table(m: int, n: int, used: int) -> Ints:
+    """Return all ways (C, n) to seat `used` of m detections on n particles; -1 is an empty seat."""
+    rows = []
+    for seats in combinations(range(n), used):
+        for taken in permutations(range(m), used):
+            row = [-1] * n
+            for seat, detection in zip(seats, taken, strict=True):
+                row[seat] = detection
+            rows.append(row)
+    table = np.array(rows, dtype=np.int64)
+    frozen(table)
+    return table
+
+
+def _seated(points: Floats, order: Ints) -> Floats:
+    """Return points (K, w, d) in the places that order (K, C, n) or (C, n) says, (K, C, n, d)."""
+    index = np.broadcast_to(order, (len(points), *order.shape[-2:]))
+    rows = np.arange(len(points))[:, None, None]
+    return np.where((index >= 0)[..., None], points[rows, np.maximum(index, 0)], np.nan)
+
+
+def _batches(count: int, width: int) -> Iterator[slice]:
+    step = max(1, _BATCH // max(width, 1))
+    return (slice(low, low + step) for low in range(0, count, step))
+
+
+def _best(points: Floats, template: Floats) -> tuple[Ints, Floats]:
+    """Return the best assignment (K, n) of complete frames (K, n, d), and its misfit (K,)."""
+    n = len(template)
+    return _matched(points, template) if n > _ALL else _best_of(points, template, _table(n, n, n))
+
+
+def _best_of(points: Floats, template: Floats, table: Ints) -> tuple[Ints, Floats]:
+    """Return the best of the assignments in a table (C, n) for every frame, and its misfit."""
+    best, least = np.empty((len(points), len(template)), np.int64), np.empty(len(points))
+    for rows in _batches(len(points), len(table)):
+        misfit = _fits(_seated(points[rows], table), template)[1]
+        choice = np.argmin(misfit, axis=1)
+        best[rows], least[rows] = (
+            table[choice],
+            np.take_along_axis(misfit, choice[:, None], 1)[:, 0],
+        )
+    return best, least
+
+
+def _matched(points: Floats, template: Floats) -> tuple[Ints, Floats]:
+    """Assign large bodies by linear assignment and rigid fit in turn, from many orientations.
+
+    The last frame's rotation comes first; a fit much closer than any wrong one ends the search.
+    """
+    n, d = template.shape
+    best, least = np.zeros((len(points), n), np.int64), np.full(len(points), np.inf)
+    apart = np.linalg.norm(template[:, None] - template, axis=2) + np.diag(np.full(n, np.inf))
+    enough = (_CLOSE * float(apart.min())) ** 2 * _freedom(n, d)
+    last = np.eye(d)
+    for k, x in enumerate(points):
+        for rotation in (last, *_orientations(d)[::_COARSE]):
+            order, turned, misfit = _refined(x, template, rotation)
+            if misfit < least[k]:
+                best[k], least[k], last = order, misfit, turned
+            if least[k] <= enough:
+                break
+    return best, least
+
+
+def _refined(x: Floats, template: Floats, rotation: Floats) -> tuple[Ints, Floats, float]:
+    """Assign and fit in turn until the assignment rests."""
+    from scipy.optimize import linear_sum_assignment
+
+    order, misfit = np.arange(len(template)), np.inf
+    y, t = x - x.mean(axis=0), template - template.mean(axis=0)
+    for _ in range(20):
+        # The squared distances differ from this by what does not depend on the assignment.
+        new = linear_sum_assignment(-(t @ rotation.T) @ y.T)[1]
+        if np.isfinite(misfit) and (new == order).all():
+            break
+        order = new
+        rotation, value = _fits(y[order], t)
+        misfit = float(value)
+        if not np.isfinite(misfit):
+            break
+    return order, rotation, misfit
+
+
+@lru_cache(maxsize=2)
+def _orientations(d: int) -> Floats:
+    """Return orientations that cover all rotations: every one has a start within about 30 degrees.
+
+    Super-Fibonacci spirals in three dimensions (Alexa, CVPR 2022).
+    """
+    count = 300
+    s = np.arange(count) + 0.5
+    if d == 2:
+        angle = 2 * np.pi * s[::10] / count
+        c, v = np.cos(angle), np.sin(angle)
+        turns = np.stack([np.stack([c, -v], -1), np.stack([v, c], -1)], -2)
+        frozen(turns)
+        return turns
+    inner, outer = np.sqrt(s / count), np.sqrt(1 - s / count)
+    alpha, beta = 2 * np.pi * s / np.sqrt(2.0), 2 * np.pi * s / 1.533751168755204288118041
+    a, b = inner * np.sin(alpha), inner * np.cos(alpha)
+    c, w = outer * np.sin(beta), outer * np.cos(beta)
+    turns = np.empty((count, 3, 3))
+    turns[:, 0] = np.stack([1 - 2 * (b * b + c * c), 2 * (a * b - c * w), 2 * (a * c + b * w)], -1)
+    turns[:, 1] = np.stack([2 * (a * b + c * w), 1 - 2 * (a * a + c * c), 2 * (b * c - a * w)], -1)
+    turns[:, 2] = np.stack([2 * (a * c - b * w), 2 * (b * c + a * w), 1 - 2 * (a * a + b * b)], -1)
+    frozen(turns)
+    return turns
+
+
+def _body_as_given(frames: _Frames) -> _Body | None:
+    """Build the shape as if all labels were right; None if they are not."""
+    n, d = frames.n, frames.x.shape[2]
+    rows = np.flatnonzero(frames.shown == n)
+    if n < d or rows.size < 2 or frames.x.shape[1] != n:
+        return None
+    rows = rows[np.linspace(0, rows.size - 1, min(rows.size, _MODELS)).astype(int)]
+    label = frames.column[rows[0]]
+    if not (frames.column[rows] == label).all():
+        return None
+    points = frames.x[rows]
+    template = points[0] - points[0].mean(axis=0)
+    rotation, misfit = _fits(points, template)
+    # Of two labellings that share the time, neither is right for all: the lower tenth shows one.
+    lowest = float(np.sort(misfit[1:])[(rows.size - 1) // 10])
+    usual = max(lowest, _TINY**2 * float((template**2).sum()))
+    if not misfit.max() <= 2 * _NOISE * usual:
+        return None
+    return _body_of(_mean_shape(points, rotation), points, label)
+
+
+def _body(frames: _Frames, seed: int, *, labelled: bool) -> _Body:
+    """Build the shape from frames assigned to the seed, and find its symmetries within noise."""
+    n, d = frames.n, frames.x.shape[2]
+    label = frames.column[seed, :n]
+    rows = np.flatnonzero(frames.shown == n)
+    rows = rows[np.linspace(0, rows.size - 1, min(rows.size, _MODELS)).astype(int)]
+    some = frames.x[rows[:: max(1, rows.size // 15)], :n]
+    template = frames.x[seed, :n] - frames.x[seed, :n].mean(axis=0)
+    freedom = _freedom(n, d)
+    sigma2 = float(np.median(_best(some, template)[1])) / _median_chi2(freedom)
+    rough = _Body(template, sigma2, _group(template, sigma2), label)
+    order = np.broadcast_to(np.arange(n), (rows.size, n)).copy()
+    same = (frames.column[rows, :n] == label).all(axis=1) & labelled
+    misfit = np.full(rows.size, np.inf)
+    misfit[same] = _fits(frames.x[rows[same], :n], template)[1]
+    odd = np.flatnonzero(misfit > _NOISE * sigma2 * freedom)
+    order[odd], misfit[odd] = _base(frames.x[rows[odd], :n], rough)
+    good = misfit <= 2 * _NOISE * sigma2 * freedom
+    points = _seated(frames.x[rows[good]], order[good][:, None])[:, 0]
+    return _averaged(points, template, label)
+
+
+def _averaged(points: Floats, shape: Floats, label: Ints) -> _Body:
+    """Average complete frames (K, n, d), in order, to a shape; find its noise and symmetries."""
+    rotation, misfit = _fits(points, shape)
+    fits = np.isfinite(misfit)
+    if fits.any():
+        shape = _mean_shape(points[fits], rotation[fits])
+    return _body_of(shape, points, label)
+
+
+def _mean_shape(points: Floats, rotation: Floats) -> Floats:
+    """Average complete frames in the axes of the body."""
+    centred = points - points.mean(axis=1, keepdims=True)
+    mean: Floats = np.einsum("tij,tni->tnj", rotation, centred).mean(axis=0)
+    return mean
+
+
+def _body_of(shape: Floats, points: Floats, label: Ints) -> _Body:
+    """Find the noise of frames about a shape, and its symmetries within that noise."""
+    n, d = shape.shape
+    # Rounding takes the place of noise where there is none.
+    sigma2 = float(np.median(_fits(points, shape)[1])) / _median_chi2(_freedom(n, d))
+    sigma2 = max(sigma2, (1e-7 * float(np.abs(shape).max())) ** 2)
+    return _Body(shape, sigma2, _group(shape, sigma2), label)
+
+
+def _remade(body: _Body, answer: Identity, x: Floats) -> _Body:
+    """Build the shape again, from the longest stretch without a cut."""
+    whole = (answer.order >= 0).all(axis=1)
+    longest = np.bincount(answer.piece[whole], minlength=1).argmax()
+    rows = np.flatnonzero(whole & (answer.piece == longest))
+    if rows.size < 2:
+        return body
+    rows = rows[np.linspace(0, rows.size - 1, min(rows.size, _MODELS)).astype(int)]
+    points = np.take_along_axis(x[rows], answer.order[rows][..., None], axis=1)
+    return _averaged(points, body.template, body.label)
+
+
+def _freedom(n: int, d: int) -> float:
+    return max(float(degrees_of_freedom(np.array(n), d)), 1.0)
+
+
+def _median_chi2(freedom: float) -> float:
+    """Return the median of chi squared (Wilson and Hilferty, 1931; within 3 % from 1 on)."""
+    return freedom * (1 - 2 / (9 * freedom)) ** 3
+
+
+def _group(template: Floats, sigma2: float) -> Ints:
+    """Return the permutations (G, n) that leave the shape as it is within noise, identity first."""
+    n, d = template.shape
+    limit = 2 * _NOISE * sigma2 * float(degrees_of_freedom(np.array(n), d))
+    if n <= _ALL:
+        table = _table(n, n, n)
+        alike = _fits(template[table], template)[1] <= limit
+        alike[0] = True
+        return np.asarray(table[alike])
+    found = [tuple(range(n))]
+    for start in _orientations(d):
+        order, _, misfit = _refined(template, template, start)
+        if misfit <= limit and tuple(order.tolist()) not in found:
+            found.append(tuple(order.tolist()))
+    return np.array(found, dtype=np.int64)
+
+
+def _places(frames: _Frames, label: Ints) -> Ints:
+    """Return where (T, n) each labelled column stands among the detections; -1 where it is not."""
+    match = frames.column[:, None, :] == label[None, :, None]
+    return np.where(match.any(axis=2), match.argmax(axis=2), -1)
+
+
+def _known(frames: _Frames, place: Ints) -> Bools:
+    """Return the frames whose every detection has a label of the seed's."""
+    return np.asarray((place >= 0).sum(axis=1) == frames.shown)
+
+
+def _limit(count: Ints, body: _Body) -> Floats:
+    """Return the misfit up to which a frame with so many particles is noise-like."""
+    freedom = degrees_of_freedom(count, body.template.shape[1])
+    return np.asarray(_NOISE * body.sigma2 * freedom, dtype=np.float64)
+
+
+def _undoubted(frames: _Frames, body: _Body | None) -> bool:
+    """Return whether the labels fit everywhere and no step is long enough to be mistaken."""
+    if body is None:
+        return False
+    place = _places(frames, body.label)
+    rows = np.flatnonzero(frames.shown >= body.template.shape[1])
+    if not _known(frames, place).all():
+        return False
+    rotation, misfit = _fits(_seated(frames.x[rows], place[rows, None])[:, 0], body.template)
+    if not (misfit <= _limit(frames.shown[rows], body)).all():
+        return False
+    seats, which = np.unique(place[rows] >= 0, axis=0, return_inverse=True)
+    least = np.array([_least_angle(body, tuple(s.tolist())) for s in seats])[which.ravel()]
+    angle = np.sqrt(_square_angle(rotation[:-1], rotation[1:]))
+    return bool((angle < _SHORT * np.minimum(least[:-1], least[1:])).all())
+
+
+def _least_angle(body: _Body, here: tuple[bool, ...]) -> float:
+    """Return the least angle between two noise-like assignments of the particles that are here."""
+    seats = np.flatnonzero(here)
+    n = len(body.template)
+    if n > _ALL:
+        seats = np.arange(n)
+    table = body.group if seats.size == n else _table(seats.size, n, seats.size)
+    points = body.template if seats.size == n else body.template[seats]
+    rotation, misfit = _fits(_seated(points[None], table)[0], body.template)
+    angle = np.sqrt(_square_angle(rotation, np.eye(len(rotation[0]))))
+    own = np.full(n, -1)
+    own[seats] = np.arange(seats.size)
+    other = (table != own).any(axis=1) & (misfit <= 2 * _limit(np.array(seats.size), body))
+    return float(angle[other].min(initial=np.pi))
+
+
+def _square_angle(one: Floats, other: Floats) -> Floats:
+    """Return the squared angle between rotations; sin^2(angle / 2) = (d - tr(A^T B)) / 4."""
+    trace = np.einsum("...ij,...ij->...", one, other)
+    half = np.sqrt(np.clip((one.shape[-1] - trace) / 4, 0.0, 1.0))
+    return np.asarray((2 * np.arcsin(half)) ** 2)
+
+
+def _assignments(frames: _Frames, body: _Body, *, labelled: bool) -> _Lists:
+    """List the noise-like assignments of every frame."""
+    n = frames.n
+    found: dict[int, Ints] = {}
+    place = _places(frames, body.label)
+    misfit = np.full(len(frames.x), np.inf)
+    trusted = np.flatnonzero(_known(frames, place) & (frames.shown > 0) & labelled)
+    seated = _seated(frames.x[trusted], place[trusted, None])[:, 0]
+    misfit[trusted] = _fits(seated, body.template)[1]
+    fits = misfit <= _limit(frames.shown, body)
+    whole = np.flatnonzero(frames.shown == n)
+    base = place.copy()
+    odd = whole[~fits[whole]]
+    base[odd], misfit[odd] = _base(frames.x[odd, :n], body)
+    for k in whole[misfit[whole] <= _limit(frames.shown[whole], body)]:
+        found[int(k)] = base[k][body.group]
+    if n <= _ALL:
+        _search(frames, body, found, drop=0)
+        _search(frames, body, found, drop=1)
+    else:
+        _patch(frames, body, found, place, fits)
+    return _padded(frames, body, found, np.flatnonzero(fits & (frames.shown == n)))
+
+
+def _base(points: Floats, body: _Body) -> tuple[Ints, Floats]:
+    """Return one assignment that fits; up to symmetry only one in |G| has to be tried."""
+    n = len(body.template)
+    if n > _ALL:
+        return _matched(points, body.template)
+    rest = dict.fromkeys(map(tuple, _table(n, n, n).tolist()))
+    chosen = []
+    while rest:
+        row = np.array(next(iter(rest)))
+        chosen.append(row)
+        for other in row[body.group].tolist():
+            rest.pop(tuple(other), None)
+    return _best_of(points, body.template, np.array(chosen))
+
+
+def _search(frames: _Frames, body: _Body, found: dict[int, Ints], *, drop: int) -> None:
+    """Try every assignment of the frames that have none yet, leaving `drop` detections out."""
+    n, d = body.template.shape
+    for count in np.unique(frames.shown).tolist():
+        used = min(count, n) - drop
+        rows = np.array([k for k in np.flatnonzero(frames.shown == count) if k not in found], int)
+        if used < d or count > _ALL + 1 or not rows.size:
+            continue
+        table = _table(count, n, used)
+        limit = float(_limit(np.array(used), body))
+        for part in _batches(rows.size, len(table)):
+            points = frames.x[rows[part]]
+            rotation, misfit = _fits(_seated(points, table), body.template)
+            fits = misfit <= limit
+            if drop and count <= n:
+                fits &= _strays(points[:, :count], table, rotation, body.template)
+            for k, fit in zip(rows[part].tolist(), fits, strict=True):
+                if fit.any():
+                    found[k] = table[fit]
+
+
+def _patch(frames: _Frames, body: _Body, found: dict[int, Ints], place: Ints, fits: Bools) -> None:
+    """Seat the detections of incomplete frames of large bodies, near where their labels say."""
+    from scipy.optimize import linear_sum_assignment
+
+    d = body.template.shape[1]
+    for k in np.flatnonzero((frames.shown >= d) & (frames.shown <= frames.n)).tolist():
+        if k in found:
+            continue
+        x, order = frames.x[k, : frames.shown[k]], place[k]
+        for _ in range(0 if fits[k] else 10):
+            seated = _seated(frames.x[k][None], order[None])[0, 0]
+            rotation, misfit = _fits(seated, body.template)
+            if not np.isfinite(misfit):
+                break
+            lab = body.template @ rotation.T
+            away = lab + np.nanmean(seated - lab, axis=0) - x[:, None]
+            detection, seat = linear_sum_assignment((away**2).sum(axis=2))
+            order = np.full(frames.n, -1, dtype=np.int64)
+            order[seat] = detection
+        misfit = _fits(_seated(frames.x[k][None], order[None])[0, 0], body.template)[1]
+        if misfit <= float(_limit(frames.shown[k], body)):
+            found[k] = order[None]
+
+
+def _strays(points: Floats, table: Ints, rotation: Floats, template: Floats) -> Bools:
+    """Return where the detection left out is over half a particle distance from all empty seats.
+
+    Nearer it is one of the body's particles, measured badly.
+    """
+    n, count = len(template), points.shape[1]
+    taken = (table[:, :, None] == np.arange(count)).any(axis=1)
+    left = points[:, np.argmin(taken, axis=1)]
+    seated = _seated(points, table)
+    here = (table >= 0)[..., None]
+    share = here / here.sum(axis=1, keepdims=True)
+    center = (np.nan_to_num(seated) * share).sum(axis=2)
+    arms = template[None] - (template[None] * share).sum(axis=1, keepdims=True)
+    seats = center[:, :, None] + np.einsum("kcij,cnj->kcni", rotation, arms)
+    distance = np.linalg.norm(seats - left[:, :, None], axis=3)
+    apart = np.linalg.norm(template[:, None] - template, axis=2) + np.diag(np.full(n, np.inf))
+    far = np.where(table < 0, distance, np.inf).min(axis=2) > 0.5 * apart.min()
+    return np.asarray(far)
+
+
+def _padded(frames: _Frames, body: _Body, found: dict[int, Ints], labelled: Ints) -> _Lists:
+    """Lay the lists of all frames side by side, with their fits."""
+    width = max((len(table) for table in found.values()), default=1) + 1
+    count, d = len(frames.x), frames.x.shape[2]
+    place = np.full((count, width, frames.n), -1, dtype=np.int64)
+    for k, table in found.items():
+        place[k, : len(table)] = table
+    rotation, misfit = np.zeros((count, width, d, d)), np.full((count, width), np.inf)
+    rows, listed = np.nonzero((place >= 0).any(axis=2))
+    for part in _batches(rows.size, 1):
+        at = rows[part], listed[part]
+        seated = _seated(frames.x[at[0]], place[at][:, None])[:, 0]
+        rotation[at], misfit[at] = _fits(seated, body.template)
+    return _Lists(place, rotation, misfit, labelled)
+
+
+def _chained(
+    frames: _Frames, body: _Body, lists: _Lists, time: Floats, *, labelled: bool
+) -> Identity:
+    """Follow the most likely assignment from frame to frame; cut where it is in doubt."""
+    rows = np.flatnonzero(np.isfinite(lists.misfit).any(axis=1))
+    choice, sure = _followed(frames, body, lists, time, rows, labelled=labelled)
+    order = np.full((len(frames.x), frames.n), -1, dtype=np.int64)
+    order[rows] = _columns(frames, lists, rows)[np.arange(rows.size), choice]
+    used = (order >= 0).sum(axis=1)
+    site = _sites(order)
+    if labelled:
+        order = _kept(frames, order, site)
+    piece = np.zeros(len(frames.x), dtype=np.int64)
+    piece[rows[~sure]] = 1
+    return Identity(
+        order=order,
+        piece=np.cumsum(piece),
+        swaps=np.setdiff1d(_exchanges(site), rows[~sure]) if labelled else rows[:0],
+        cuts=rows[~sure],
+        extra=rows[frames.shown[rows] > used[rows]],
+        unsettled=np.setdiff1d(np.flatnonzero(frames.shown >= frames.x.shape[2]), rows),
+    )
+
+
+def _followed(
+    frames: _Frames, body: _Body, lists: _Lists, time: Floats, rows: Ints, *, labelled: bool
+) -> tuple[list[int], Bools]:
+    """Return the choice in each settled frame, and whether the step to it is beyond doubt."""
+    if not rows.size:
+        return [], np.empty(0, dtype=np.bool_)
+    spread = _spread(lists, time[rows], rows, labelled=labelled)
+    choice, sure = [_first_choice(frames, body, lists, rows[0], labelled=labelled)], [True]
+    for part in _batches(rows.size - 1, lists.misfit.shape[1] ** 2):
+        chain = rows[part.start : part.stop + 1]
+        cost = _costs(lists, chain, spread[part], body.sigma2)
+        if labelled:
+            cost += _TRUST * _differ(_columns(frames, lists, chain))
+        ranked = np.argsort(cost, axis=2)[:, :, :2]
+        two = np.take_along_axis(cost, ranked, axis=2)
+        clear = two[:, :, 1] - two[:, :, 0] > _DOUBT
+        for following, beyond in zip(ranked[:, :, 0].tolist(), clear.tolist(), strict=True):
+            sure.append(beyond[choice[-1]])
+            choice.append(following[choice[-1]])
+    return choice, np.array(sure)
+
+
+def _first_choice(frames: _Frames, body: _Body, lists: _Lists, row: int, *, labelled: bool) -> int:
+    """Return the assignment to begin with: nearest to the labels, then the best fit."""
+    column = _columns(frames, lists, np.array([row]))[0]
+    wrong = ((column != body.label) & (column >= 0)).sum(axis=1) * labelled
+    wrong = np.where(np.isfinite(lists.misfit[row]), wrong, len(body.label) + 1)
+    return int(np.lexsort((lists.misfit[row], wrong))[0])
+
+
+def _columns(frames: _Frames, lists: _Lists, rows: Ints) -> Ints:
+    """Return the columns that the listed assignments of some frames take, (K, C, n)."""
+    place = lists.place[rows]
+    column = frames.column[rows[:, None, None], np.maximum(place, 0)]
+    return np.where(place >= 0, column, -1)
+
+
+def _spread(lists: _Lists, time: Floats, rows: Ints, *, labelled: bool) -> Floats:
+    """Return the variance of one component of each step's rotation vector, from the median."""
+    d = lists.rotation.shape[-1]
+    first, second = lists.rotation[rows[:-1]], lists.rotation[rows[1:]]
+    square = _square_angle(first[:, :1], second)
+    square = np.where(np.isfinite(lists.misfit[rows[1:]]), square, np.inf)
+    own = np.isin(rows, lists.own)
+    steps = square[own[:-1] & own[1:], 0]
+    if not (labelled and 2 * steps.size > rows.size):
+        steps = square.min(axis=1)
+    gap = np.diff(time)
+    usual = float(np.median(gap)) if gap.size else 1.0
+    median = float(np.median(steps)) if steps.size else 0.0
+    typical = median / _median_chi2(3.0 if d == 3 else 1.0)
+    spread: Floats = max(typical, _TINY**2) * np.maximum(gap / usual, 1.0)
+    return spread
+
+
+def _costs(lists: _Lists, chain: Ints, spread: Floats, sigma2: float) -> Floats:
+    """Return minus the log-likelihood (K, C, C) of every choice after every choice before."""
+    d = lists.rotation.shape[-1]
+    flat = lists.rotation[chain].reshape(len(chain), -1, d * d)
+    trace = flat[:-1] @ np.swapaxes(flat[1:], -1, -2)
+    half = np.sqrt(np.clip((d - trace) / 4, 0.0, 1.0))
+    angle = 2 * np.arcsin(half)
+    cost: Floats = angle**2 / (2 * spread[:, None, None])
+    return cost + lists.misfit[chain[1:]][:, None, :] / (2 * sigma2)
+
+
+def _differ(column: Ints) -> Bools:
+    """Return which choices (K - 1, C, C) move a column to another particle."""
+    n = column.shape[2]
+    before, after = column[:-1, :, None], column[1:, None]
+    moved = np.zeros((len(before), column.shape[1], column.shape[1]), dtype=np.bool_)
+    for i, j in permutations(range(n), 2):
+        moved |= (before[..., i] == after[..., j]) & (before[..., i] >= 0)
+    return moved
+
+
+def _sites(order: Ints) -> Ints:
+    """Return the particle that each column was last (T, m); -1 before its first."""
+    site = np.full((len(order), int(order.max(initial=0)) + 1), -1, dtype=np.int64)
+    row, particle = np.nonzero(order >= 0)
+    site[row, order[row, particle]] = particle
+    last = np.maximum.accumulate(np.where(site >= 0, np.arange(len(site))[:, None], -1), axis=0)
+    held = np.take_along_axis(site, np.maximum(last, 0), axis=0)
+    return np.where(last >= 0, held, -1)
+
+
+def _exchanges(site: Ints) -> Ints:
+    """Return the rows at which a column becomes another particle than it last was."""
+    changed = (site[1:] != site[:-1]) & (site[:-1] >= 0)
+    return np.flatnonzero(changed.any(axis=1)) + 1
+
+
+def _kept(frames: _Frames, order: Ints, site: Ints) -> Ints:
+    """Give frames without assignment the labels that held before them (at the start, after)."""
+    out = order.copy()
+    rows = np.flatnonzero((order < 0).all(axis=1) & (frames.shown > 0))
+    first = np.argmax(site >= 0, axis=0)
+    opening = site[first, np.arange(site.shape[1])]
+    for k in rows.tolist():
+        held = np.where(site[k] >= 0, site[k], opening)
+        for column in frames.column[k, : frames.shown[k]].tolist():
+            if column < len(held) and held[column] >= 0 and out[k, held[column]] < 0:
+                out[k, held[column]] = column
+    return out

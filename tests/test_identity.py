@@ -1,0 +1,250 @@
+"""Which detection is which particle: planted exchanges come back, nothing is guessed."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import perrin
+from perrin.identity import _table, settle_identity
+
+BODIES = {n: perrin.Cluster.touching(n, 2.45) for n in (3, 4, 5, 6, 7)}
+SLOW = 4.9e-3 * 0.73  # D_R dt of the paper's experiment
+
+
+def track(seed, body=4, *, D_R=SLOW, n_frames=120, sigma=(0.03, 0.03, 0.04)):
+    """Return noisy positions (T, n, 3) with right labels, dt = 1, and the generator."""
+    rng = np.random.default_rng(seed)
+    truth = perrin.simulate_motion(
+        BODIES[body], D_R=D_R, D_T=0.03, dt=1.0, n_frames=n_frames, rng=rng
+    )
+    return perrin.add_noise(truth.positions(), sigma=sigma, rng=rng), rng
+
+
+def shuffled(x, rng):
+    """Order the columns of every row at random; return them and which particle each one is."""
+    who = np.argsort(rng.random(x.shape[:2]), axis=1)
+    return np.take_along_axis(x, who[..., None], axis=1), who
+
+
+def wrong_steps(found, who):
+    """Count the steps inside a piece at which a seat passes to another particle."""
+    seated = np.take_along_axis(who, np.maximum(found.order, 0), axis=1)
+    both = (found.order[1:] >= 0) & (found.order[:-1] >= 0)
+    moved = ((seated[1:] != seated[:-1]) & both).any(axis=1)
+    return int((moved & (found.piece[1:] == found.piece[:-1])).sum())
+
+
+@pytest.mark.parametrize("body", [3, 4, 5, 6])
+def test_labels_shuffled_in_every_frame_are_sorted_out(body):
+    """At the paper's sampling and 4 times slower no assignment is wrong; all frames are settled."""
+    for factor in (1, 4):
+        x, rng = track(body, body, D_R=factor * SLOW)
+        mixed, who = shuffled(x, rng)
+        found = settle_identity(mixed, labelled=False)
+        assert wrong_steps(found, who) == 0
+        assert not found.unsettled.size
+        assert np.isfinite(found.arranged(mixed)).all()
+
+
+def test_seven_particles_are_assigned_without_trying_all_orders():
+    """Beyond six, linear assignment and rigid fit in turn do the same."""
+    x, rng = track(1, 7, n_frames=40)
+    mixed, who = shuffled(x, rng)
+    found = settle_identity(mixed, labelled=False)
+    assert wrong_steps(found, who) == 0
+    assert not found.unsettled.size
+
+
+def test_where_the_second_best_is_nearly_as_likely_the_track_is_cut():
+    """At 16 times the paper's interval there are cuts, and every wrong step is behind one."""
+    wrong = cuts = 0
+    for seed in range(6):
+        x, rng = track(seed, D_R=16 * SLOW)
+        mixed, who = shuffled(x, rng)
+        found = settle_identity(mixed, labelled=False)
+        wrong, cuts = wrong + wrong_steps(found, who), cuts + found.cuts.size
+    assert cuts >= 5
+    # At odds of 100 to 1 a step, 714 steps leave fewer than one error on average.
+    assert wrong <= 3
+
+
+@pytest.mark.parametrize("kind", [2, 3], ids=["pair", "three-cycle"])
+@pytest.mark.parametrize("body", [3, 4, 5])
+def test_labels_exchanged_for_good_are_put_right(body, kind):
+    """A swapped pair shows in the residual, a cycle in the angle of the step: all are told."""
+    x, rng = track(10 + body, body)
+    rows, mixed = [17, 18, 60, 99], x.copy()
+    for k in rows:
+        some = rng.permutation(body)[:kind]
+        mixed[k:, some] = mixed[k:, np.roll(some, 1)]
+    found = settle_identity(mixed)
+    assert found.swaps.tolist() == rows
+    assert not found.cuts.size
+    arranged = found.arranged(mixed)
+    first = [int(np.flatnonzero((arranged[0] == p).all(axis=1))[0]) for p in x[0]]
+    np.testing.assert_array_equal(arranged[:, first], x)
+
+
+@pytest.mark.parametrize("row", [3, 12, 30, 60, 90, 117])
+@pytest.mark.parametrize("body", [4, 7])
+def test_one_exchange_is_found_wherever_it_is(body, row):
+    """Neither of two labellings needs to be rare."""
+    x, _ = track(30, body)
+    x[row:, [0, 2]] = x[row:, [2, 0]]
+    assert settle_identity(x).swaps.tolist() == [row]
+
+
+def test_large_bodies_with_holes():
+    """Thirty particles, 2 % missing, one exchange: found, and every frame settled."""
+    rng = np.random.default_rng(1)
+    body = perrin.Cluster.from_positions(rng.normal(scale=3.0, size=(30, 3)))
+    truth = perrin.simulate_motion(body, D_R=1e-3, dt=1.0, n_frames=60, rng=rng)
+    x = perrin.add_noise(truth.positions(), sigma=0.03, rng=rng)
+    x[30:, [0, 3]] = x[30:, [3, 0]]
+    lost = rng.random(x.shape[:2]) < 0.02
+    lost[:, [0, 3]] = False
+    x[lost] = np.nan
+    found = settle_identity(x)
+    assert not found.unsettled.size
+    assert (found.order[40] >= 0).sum() == np.isfinite(x[40, :, 0]).sum()
+    assert found.swaps.tolist() == [30]
+
+
+@pytest.mark.parametrize("body", [3, 4, 6])
+@pytest.mark.parametrize("D_R", [SLOW, 0.1, 1.0])
+def test_right_labels_are_left_alone_however_far_the_body_turns(body, D_R):
+    """Lasting labels outweigh a shorter rotation: no step of a long stride is changed."""
+    x, rng = track(20, body, D_R=D_R)
+    x[rng.random(x.shape[:2]) < 0.02] = np.nan
+    found = settle_identity(x)
+    seated = found.order >= 0
+    np.testing.assert_array_equal(np.where(seated, np.arange(body), -1), found.order)
+    assert not found.swaps.size
+
+
+def test_missing_particles_do_not_matter():
+    """Labels shuffled and 3 % lost: three of four are enough, two are not."""
+    x, rng = track(3, n_frames=200)
+    mixed, who = shuffled(x, rng)
+    mixed[rng.random(mixed.shape[:2]) < 0.03] = np.nan
+    found = settle_identity(mixed, labelled=False)
+    seen = np.isfinite(mixed[..., 0]).sum(axis=1)
+    np.testing.assert_array_equal((found.order >= 0).sum(axis=1)[seen > 2], seen[seen > 2])
+    assert wrong_steps(found, who) == 0
+
+
+def test_a_stray_detection_is_left_out():
+    """Something else in a particle's place, or besides all of them, is no particle."""
+    x, _ = track(4)
+    x[30, 2] += [2.0, 2.0, -2.0]
+    found = settle_identity(x)
+    assert found.extra.tolist() == [30]
+    assert found.order[30].tolist() == [0, 1, -1, 3]
+    more = np.concatenate([x, np.full((len(x), 1, 3), np.nan)], axis=1)
+    more[50, 4] = x[50, 0] + [1.5, 0.0, 0.0]
+    found = settle_identity(more)
+    assert found.extra.tolist() == [30, 50]
+    assert found.order[50].tolist() == [0, 1, 2, 3]
+
+
+def test_a_particle_measured_badly_stays():
+    """Eight standard deviations off it is still nearer to its place than to any other thing."""
+    x, _ = track(5)
+    x[40, 1] += [0.3, 0.0, 0.0]
+    found = settle_identity(x)
+    assert found.order[40].tolist() == [0, 1, 2, 3]
+    assert found.swaps.size + found.extra.size + found.cuts.size == 0
+
+
+def test_ids_that_break_off_are_one_particle():
+    """A lost particle comes back under a new id: two columns, never seen together, one seat."""
+    x, _ = track(6)
+    broken = np.concatenate([x, np.full((len(x), 1, 3), np.nan)], axis=1)
+    broken[70:, 4], broken[66:, 1] = x[70:, 1], np.nan
+    found = settle_identity(broken)
+    assert found.order.shape == (120, 4)
+    assert found.order[60].tolist() == [0, 1, 2, 3]
+    assert found.order[80].tolist() == [0, 4, 2, 3]
+    assert not found.swaps.size
+
+
+def test_mirror_images_are_no_fit():
+    """A mirrored body is another one: its frames keep their labels and are told as unsettled.
+
+    (Of a tetrahedron some exchange of labels undoes the mirror; an irregular body has none.)
+    """
+    rng = np.random.default_rng(8)
+    body = perrin.Cluster.from_positions(rng.normal(size=(6, 3)))
+    truth = perrin.simulate_motion(body, D_R=SLOW, dt=1.0, n_frames=50, rng=rng)
+    x = perrin.add_noise(truth.positions(), sigma=0.01, rng=rng)
+    x[20:23, :, 2] *= -1
+    found = settle_identity(x)
+    assert found.unsettled.tolist() == [20, 21, 22]
+    np.testing.assert_array_equal(found.order, np.tile(np.arange(6), (50, 1)))
+
+
+@pytest.mark.parametrize("n", [2, 3, 5])
+def test_bodies_in_the_plane(n):
+    """In two dimensions the same holds, from two particles on."""
+    rng = np.random.default_rng(n)
+    angle = 2 * np.pi * np.arange(n) / n
+    body = perrin.Cluster.from_positions(1.4 * np.stack([np.cos(angle), np.sin(angle)], axis=1))
+    truth = perrin.simulate_motion(body, D_R=SLOW, D_T=0.03, dt=1.0, n_frames=80, rng=rng)
+    x = perrin.add_noise(truth.positions(), sigma=0.03, rng=rng)
+    mixed, who = shuffled(x, rng)
+    found = settle_identity(mixed, labelled=False)
+    assert wrong_steps(found, who) == 0
+    assert not found.unsettled.size
+
+
+def test_turning_moving_and_scaling_space_changes_nothing():
+    """The answer is about the body: same order in other axes, another place, another unit."""
+    x, rng = track(8)
+    mixed, _ = shuffled(x, rng)
+    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    turn *= np.linalg.det(turn)
+    base = settle_identity(mixed, labelled=False)
+    for other in (mixed @ turn.T, mixed + 1e3, mixed * 1e-3):
+        again = settle_identity(other, labelled=False)
+        np.testing.assert_array_equal(again.order, base.order)
+
+
+def test_a_long_gap_is_a_longer_step():
+    """After a gap of 300 frames the body may have turned anywhere: cut, as nobody can know."""
+    x, rng = track(9, D_R=4 * SLOW, n_frames=400)
+    mixed, _ = shuffled(np.delete(x, np.arange(50, 350), axis=0), rng)
+    times = np.delete(np.arange(400.0), np.arange(50, 350))
+    assert settle_identity(mixed, times=times, labelled=False).cuts.tolist() == [50]
+    assert settle_identity(mixed[:50], labelled=False).cuts.size == 0
+
+
+def test_without_a_complete_frame_labels_stay_and_detections_stay_unknown():
+    """Nothing to build a shape from: labels are trusted, plain detections are given no seat."""
+    x, _ = track(2, n_frames=40)
+    for k in range(40):
+        x[k, k % 4] = np.nan
+    np.testing.assert_array_equal(
+        settle_identity(x).order, np.where(np.isnan(x[..., 0]), -1, np.arange(4))
+    )
+    found = settle_identity(x, labelled=False)
+    assert (found.order == -1).all()
+    assert found.unsettled.size == 40
+
+
+def test_the_table_of_seatings_is_complete():
+    """All ways to seat 2 of 3 detections on 3 particles: 3 pairs of seats times 6 orders."""
+    table = _table(3, 3, 2)
+    assert len({tuple(row) for row in table.tolist()}) == 18
+    assert ((table >= 0).sum(axis=1) == 2).all()
+
+
+def test_the_page_on_identity_says_what_the_code_prints(capsys):
+    """The snippets of docs/theory/identity.md run and print the lines given beneath them."""
+    page = Path(__file__).resolve().parents[1] / "docs" / "theory" / "identity.md"
+    code = "".join(re.findall(r"```python\n(.*?)```", page.read_text("utf-8"), re.DOTALL))
+    exec(compile(code, str(page), "exec"), {})
+    assert capsys.readouterr().out.splitlines() == re.findall(r"^# (.*)$", code, re.MULTILINE)

@@ -1,0 +1,134 @@
+"""Raw detections: groups of touching particles, followed through time."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import perrin
+from perrin.linking import touching_groups
+
+DIAMETER = 2.45
+
+
+def raw(positions, rng, *, extra=0):
+    """Return the shuffled rows of bodies (T, n, 3) without ids, with the truth besides."""
+    parts = []
+    for body, x in enumerate(positions):
+        frame, site = np.indices(x.shape[:2])
+        columns = {"frame": frame.ravel(), "body": body, "site": site.ravel()}
+        parts.append(pd.DataFrame(columns | dict(zip("xyz", x.reshape(-1, 3).T, strict=True))))
+    for k in range(extra):
+        at = rng.uniform(-20, 60, 3)
+        parts.append(
+            pd.DataFrame({"frame": [k], "body": -1, "site": -1, "x": at[0], "y": at[1], "z": at[2]})
+        )
+    table = pd.concat(parts, ignore_index=True)
+    return table.sample(frac=1, random_state=int(rng.integers(99))).reset_index(drop=True)
+
+
+def track(rng, n_frames=100, body=4, factor=1.0):
+    truth = perrin.simulate_motion(
+        perrin.Cluster.touching(body, DIAMETER),
+        D_R=4.9e-3,
+        D_T=0.0385,
+        dt=0.73 * factor,
+        n_frames=n_frames,
+        rng=rng,
+    )
+    return perrin.add_noise(truth.positions(), sigma=(0.03, 0.03, 0.04), rng=rng)
+
+
+def wrong(found):
+    """Count the particles that are two within one piece."""
+    seated = found[found["cluster"] >= 0]
+    truth = seated["body"] * 100 + seated["site"]
+    return int((truth.groupby([seated["particle"], seated["piece"]]).nunique() > 1).sum())
+
+
+def test_shuffled_rows_become_lasting_particles():
+    """Three clusters, 1 % lost, stray detections about: every particle keeps to itself."""
+    rng = np.random.default_rng(0)
+    table = raw([track(rng) + np.array([25.0 * k, 0, 0]) for k in range(3)], rng, extra=60)
+    table = table[rng.random(len(table)) > 0.01]
+    found = perrin.identify(table, contact=DIAMETER, size=4)
+    assert wrong(found) == 0
+    real = found[found["body"] >= 0]
+    # Of frames that lost two particles of one cluster (1 in 1700) the others are loose.
+    assert (real["cluster"] >= 0).mean() > 0.99
+    assert (found.loc[found["body"] < 0, "cluster"] == -1).all()
+    assert not found.duplicated(["frame", "particle"]).any()
+
+
+def test_two_clusters_that_pass_are_never_mistaken():
+    """Nearest sphere centres come to 1.2 diameters, within reach of the grouping."""
+    rng = np.random.default_rng(1)
+    one, other = (track(rng) for _ in range(2))
+    one, other = (x - x.mean(axis=1, keepdims=True) for x in (one, other))
+    by, gap = np.linspace(-4, 4, 100)[:, None, None] * [0.0, 1.0, 0.0], 0.0
+    while True:
+        moved = other + by + [gap, 0.0, 0.0]
+        nearest = np.linalg.norm(one[:, :, None] - moved[:, None], axis=-1).min(axis=(1, 2))
+        if nearest.min() >= 1.2 * DIAMETER:
+            break
+        gap += 0.01
+    assert (nearest < 1.3 * DIAMETER).any()
+    found = perrin.identify(raw([one, moved], rng), contact=DIAMETER, size=4)
+    assert wrong(found) == 0
+    assert (found["cluster"] >= 0).all()
+    assert found["piece"].max() == 0
+    assert found["cluster"].nunique() == 2
+
+
+def test_analysis_of_raw_detections_is_that_of_the_labelled_tracks():
+    """Raw detections give the same D_R as the true labels do."""
+    rng = np.random.default_rng(2)
+    x = track(rng)
+    found = perrin.identify(raw([x], rng), contact=DIAMETER, size=4)
+    labelled = perrin.analyze(perrin.positions_table(x), dt=0.73).clusters[0]
+    result = perrin.analyze(found, dt=0.73).clusters[0]
+    np.testing.assert_allclose(result.D_R.value, labelled.D_R.value, rtol=1e-6)
+
+
+def test_cuts_of_identify_reach_the_analysis():
+    """Sampled too slowly for its symmetry a cluster is cut; no step joins two pieces."""
+    rng = np.random.default_rng(3)
+    found = perrin.identify(raw([track(rng, factor=16)], rng), contact=DIAMETER, size=4)
+    assert found["piece"].max() > 0
+    (result,) = perrin.analyze(found, dt=16 * 0.73).clusters
+    assert result.motion.piece.max() >= found["piece"].max()
+    assert len(result.quality.cuts) == result.motion.piece.max()
+    told = [w for w in result.warnings if "identity" in w and "cut" in w]
+    assert all(str(frame) in told[0] for frame in result.quality.cuts)
+
+
+def test_rods_have_two_ends():
+    """size=2 tells the ends of dumbbells apart by least rotation."""
+    rng = np.random.default_rng(4)
+    found = perrin.identify(raw([track(rng, body=2)], rng), contact=DIAMETER, size=2)
+    assert wrong(found) == 0
+    assert (found["cluster"] == 0).all()
+
+
+def test_other_columns_stay_and_the_input_is_untouched():
+    """The columns particle and cluster are replaced, the rest is the caller's."""
+    rng = np.random.default_rng(5)
+    table = raw([track(rng, n_frames=20)], rng).assign(mass=2.0, particle=7)
+    before = table.copy()
+    found = perrin.identify(table, contact=DIAMETER, size=4)
+    pd.testing.assert_frame_equal(table, before)
+    pd.testing.assert_frame_equal(
+        found.drop(columns=["particle", "cluster", "piece"]), before.drop(columns="particle")
+    )
+    with pytest.raises(ValueError, match="contact = "):
+        perrin.identify(table, contact=0.0, size=4)
+    with pytest.raises(ValueError, match="size: expected"):
+        perrin.identify(table, contact=1.0, size=2.5)
+
+
+def test_groups_stop_growing_at_their_size():
+    """Two pairs nearer than the reach stay two, and a lone point is loose."""
+    x = np.array([[0.0, 0], [1.0, 0], [2.2, 0], [3.2, 0], [9.0, 0]])
+    assert touching_groups(x, reach=1.3, size=2, smallest=2).tolist() == [0, 0, 1, 1, -1]
+    assert touching_groups(x, reach=1.3, size=4, smallest=2).tolist() == [0, 0, 0, 0, -1]

@@ -1,0 +1,134 @@
+"""What is said of a fit is so: noise per axis, stretched z, blurred scans, broken bonds."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import perrin
+
+
+def judged(x, **options):
+    return perrin.judge_quality(perrin.track_rotation(x, dt=0.73), x, **options)
+
+
+def noisy(seed, *, body=4, D_R=4.9e-3, n_frames=300, sigma=(0.03, 0.03, 0.04)):
+    truth = perrin.simulate_motion(
+        perrin.Cluster.touching(body, 2.45), D_R=D_R, D_T=0.04, dt=0.73, n_frames=n_frames, rng=seed
+    )
+    return perrin.add_noise(truth.positions(), sigma=sigma, rng=seed + 1000)
+
+
+@pytest.mark.parametrize("body", [3, 4, 6])
+def test_a_good_cluster_raises_no_word(body):
+    """Rigid, equal scales, simultaneous particles: no warning on five clusters of each kind."""
+    for seed in range(5):
+        assert judged(noisy(seed, body=body)).warnings == ()
+
+
+@pytest.mark.parametrize("sigma", [(0.03, 0.03, 0.03), (0.02, 0.04, 0.06)])
+def test_sigma_per_axis_comes_back(sigma):
+    """The planted errors, to 4 times the spread that the projector predicts (9 % at most)."""
+    found = np.mean([judged(noisy(s, sigma=sigma)).sigma_xyz for s in range(6)], axis=0)
+    np.testing.assert_allclose(found, sigma, rtol=4 * 0.09 / np.sqrt(6))
+
+
+def test_a_trimer_that_hardly_turns_cannot_tell_sigma_per_axis():
+    """Its residuals lie in its plane, which stays where it is."""
+    assert judged(noisy(1, body=3, D_R=1e-5)).sigma_xyz is None
+    assert judged(noisy(1, body=3, D_R=0.02)).sigma_xyz is not None
+
+
+def test_a_stretched_z_is_measured():
+    """3 % come back within 3 standard errors and are told; without a stretch 1 does."""
+    x = noisy(2)
+    stretched, plain = judged(x * [1.0, 1.0, 1.03]), judged(x)
+    assert abs(stretched.z_scale - 1.03) < 3 * stretched.z_scale_stderr
+    assert abs(plain.z_scale - 1.0) < 3 * plain.z_scale_stderr
+    assert any("z scale" in w for w in stretched.warnings)
+
+
+def test_a_sequential_scan_is_suspected():
+    """Particles recorded as a plane sweeps 12 um a frame: z looks noisier than it is."""
+    sub, n = 60, 300
+    truth = perrin.simulate_motion(
+        perrin.Cluster.touching(4, 2.45),
+        D_R=4.9e-3,
+        D_T=0.0385,
+        dt=0.73 / sub,
+        n_frames=n * sub,
+        rng=3,
+    )
+    p = truth.positions().reshape(n, sub, 4, 3)
+    plane = p[:, :1, :, 2].mean(axis=2) - 6 + 12 * np.arange(sub) / sub
+    met = np.abs(p[..., 2] - plane[..., None]).argmin(axis=1)
+    x = np.take_along_axis(p, met[:, None, :, None], axis=1)[:, 0]
+    x = perrin.add_noise(x, sigma=(0.03, 0.03, 0.04), rng=4)
+    for known in (None, (0.05, 0.05, 0.067)):
+        quality = judged(x, sigma=known)
+        assert any(w.startswith("scan:") for w in quality.warnings) == (known is None)
+    assert judged(x).scan_blur > 1.6
+    told = judged(noisy(9, sigma=(0.03, 0.03, 0.09)), sigma=(0.03, 0.03, 0.09))
+    assert told.scan_blur == pytest.approx(1.0, abs=0.15)
+
+
+def test_a_breaking_bond_is_named():
+    """One particle creeps away: the pair, the two distances, and no longer rigid."""
+    x = noisy(5)
+    x[:, 3] += np.linspace(0, 2, 300)[:, None] * [0.4, 0.4, 0.4]
+    quality = judged(x)
+    assert not quality.rigid
+    assert 3 in quality.drifting_pair
+    assert any("a bond breaks" in r for r in quality.reasons)
+
+
+def test_smooth_errors_alone_are_not_softness():
+    """Residuals of 1.5 % of R that are smooth in time, as real cameras make, pass as rigid."""
+    x = noisy(6, sigma=0.0)
+    rng = np.random.default_rng(6)
+    error = np.zeros(x.shape)
+    for k in range(1, len(x)):
+        error[k] = 0.95 * error[k - 1] + rng.normal(size=x.shape[1:])
+    quality = judged(x + 0.015 * 1.5 * error / error.std())
+    assert quality.autocorrelation > 0.8
+    assert quality.rigid
+
+
+def test_a_stated_sigma_decides():
+    """Twice the stated sigma is the limit."""
+    x = noisy(7)
+    assert judged(x, sigma=0.03).rigid
+    assert not judged(x, sigma=0.01).rigid
+    assert judged(x, sigma=0.03).residual_over_sigma == pytest.approx(1.12, abs=0.1)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_labels_and_axes_of_the_lab_do_not_matter(seed):
+    """Particles renamed, the lab turned about z: the same verdict."""
+    x = noisy(seed + 20)
+    base = judged(x)
+    c, s = np.cos(0.7), np.sin(0.7)
+    turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]])
+    for other in (x[:, [2, 0, 3, 1]], x @ turn.T + 100.0):
+        again = judged(other)
+        for name in ("residual_over_R", "z_scale", "scan_blur", "autocorrelation"):
+            # Noise that by chance differs between x and y is not diagonal in turned axes.
+            rel = 1e-3 if name == "scan_blur" else 1e-6
+            assert getattr(again, name) == pytest.approx(getattr(base, name), rel=rel)
+
+
+def test_bodies_in_the_plane_are_judged_too():
+    """Two dimensions know no z; the rest holds."""
+    flat = perrin.Cluster.from_positions([[0, 0], [2, 0], [1, 1.7]])
+    truth = perrin.simulate_motion(flat, D_R=0.02, D_T=0.03, dt=1.0, n_frames=300, rng=1)
+    quality = judged(perrin.add_noise(truth.positions(), sigma=(0.02, 0.04), rng=2))
+    assert quality.z_scale is None
+    np.testing.assert_allclose(quality.sigma_xyz, (0.02, 0.04), rtol=0.25)
+
+
+def test_quality_survives_json():
+    """to_dict and from_dict are inverse."""
+    import json
+
+    quality = judged(noisy(8), swaps=(4, 9))
+    assert perrin.Quality.from_dict(json.loads(json.dumps(quality.to_dict()))) == quality
