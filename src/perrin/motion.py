@@ -110,6 +110,15 @@ class RigidMotion:
         """Mean distance of the particles to the centre, um."""
         return float(np.linalg.norm(self.template, axis=1).mean())
 
+    @property
+    def template_error(self) -> float:
+        """How far the template's places may be off, um.
+
+        Six standard errors, what noise inflates the shape by at second order, and rounding.
+        """
+        first_order = 6 * self.sigma / np.sqrt(self.fitted.size)
+        return float(first_order + 2 * self.sigma**2 / self.R + 1e-6 * self.R)
+
     def steps(self) -> tuple[Ints, Ints]:
         """Return the first and last frame index of every step between neighbouring poses.
 

@@ -10,6 +10,7 @@ import numpy as np
 from perrin._arrays import Floats, as_positions, as_sigma
 from perrin.motion import body_residuals
 from perrin.rotations import skew
+from perrin.shapes import point_group
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -61,6 +62,8 @@ class Quality:
         above what the optics explain it betrays a sequential scan.
     swaps, cuts, extra : tuple of int
         Rows of repaired exchanges of labels, of cuts, and of detections left out.
+    symmetry : str
+        Point group of the shape within its own error (Schoenflies symbol).
     fraction : float
         Share of the rows from the first frame to the last that have a pose.
     warnings : tuple of str
@@ -81,6 +84,7 @@ class Quality:
     swaps: tuple[int, ...]
     cuts: tuple[int, ...]
     extra: tuple[int, ...]
+    symmetry: str
     fraction: float
     warnings: tuple[str, ...]
 
@@ -162,6 +166,7 @@ def judge_quality(
         swaps=swaps,
         cuts=cuts,
         extra=extra,
+        symmetry=point_group(motion.template, tolerance=motion.template_error),
         fraction=motion.fitted.size / len(motion.time),
         warnings=(*soft, *broken, *odd),
     )

@@ -266,7 +266,7 @@ def point_group(positions: ArrayLike, *, tolerance: float | None = None) -> str:
         if np.abs(line).max() <= allowed:
             return "K_h"
         return "D_inf_h" if len(_line_group(line, 3, allowed)) == 2 else "C_inf_v"
-    return _schoenflies(symmetry_elements(np.pad(x, ((0, 0), (0, 3 - x.shape[1]))), allowed))
+    return schoenflies(symmetry_elements(np.pad(x, ((0, 0), (0, 3 - x.shape[1]))), allowed))
 
 
 def _checked(positions: ArrayLike, tolerance: float) -> Floats:
@@ -385,7 +385,7 @@ def _exact_matrices(x: Floats, elements: Ints) -> Floats:
     return matrix
 
 
-def _schoenflies(elements: Floats) -> str:
+def schoenflies(elements: Floats) -> str:
     """Name a finite point group from its matrices."""
     proper = elements[np.linalg.det(elements) > 0]
     mirrors = _axes(-elements[_is_trace(elements, 1.0) & (np.linalg.det(elements) < 0)])

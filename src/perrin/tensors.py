@@ -13,7 +13,7 @@ from perrin.diffusion import UNITS, with_error
 from perrin.motion import RigidMotion, degrees_of_freedom
 from perrin.noise import orientation_covariance
 from perrin.rotations import exp_map, kabsch, skew
-from perrin.shapes import point_group, symmetry_elements
+from perrin.shapes import point_group, schoenflies, symmetry_elements
 from perrin.tensor_likelihood import (
     Maximum,
     Source,
@@ -508,12 +508,10 @@ def _symmetry(motion: RigidMotion, wanted: str | None) -> tuple[str, Floats]:
     """Return the point group to impose and a basis (m, 3, 3) of the tensors that have it."""
     if wanted == "C_1":
         return "C_1", _symmetric_basis(3)
-    error = motion.sigma / np.sqrt(motion.fitted.size)
-    # Six errors of a template's coordinate, and what the noise inflates it by at second order.
-    tolerance = 6 * error + 2 * motion.sigma**2 / motion.R + 1e-6 * motion.R
+    tolerance = motion.template_error
     if wanted is None:
-        symbol = point_group(motion.template, tolerance=tolerance)
-        return symbol, _invariant_basis(symmetry_elements(motion.template, tolerance))
+        elements = symmetry_elements(motion.template, tolerance)
+        return schoenflies(elements), _invariant_basis(elements)
     seen = []
     first, second = np.triu_indices(len(motion.template), 1)
     gap = np.linalg.norm(motion.template[first] - motion.template[second], axis=1).min()
