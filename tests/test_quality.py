@@ -137,18 +137,18 @@ def test_quality_survives_json():
 @pytest.mark.parametrize(
     ("cluster", "symbol"),
     [
-        (Cluster.tetrahedron(1.5), "T_d"),
-        (Cluster.touching(5, 2.45), "D_3h"),
-        (Cluster.touching(6, 2.45), "O_h"),
-        (Cluster.from_positions([[0, 0, 0], [3, 0, 0], [0, 2, 0], [0, 0, 1]]), "C_1"),
-        (Cluster.from_positions([[0, 0], [2, 0], [1, 3**0.5]]), "D_3h"),
+        (perrin.Cluster.tetrahedron(1.5), "T_d"),
+        (perrin.Cluster.touching(5, 2.45), "D_3h"),
+        (perrin.Cluster.touching(6, 2.45), "O_h"),
+        (perrin.Cluster.from_positions([[0, 0, 0], [3, 0, 0], [0, 2, 0], [0, 0, 1]]), "C_1"),
+        (perrin.Cluster.from_positions([[0, 0], [2, 0], [1, 3**0.5]]), "D_3h"),
     ],
 )
 def test_the_symmetry_of_a_noisy_shape_is_found(cluster, symbol):
     """The point group from the measured shape, in space and in the plane, whatever the labels."""
     rng = np.random.default_rng(3)
-    truth = simulate_motion(cluster, D_R=5e-3, dt=1.0, n_frames=200, rng=rng)
-    x = add_noise(truth.positions(), sigma=0.03, rng=rng)
+    truth = perrin.simulate_motion(cluster, D_R=5e-3, dt=1.0, n_frames=200, rng=rng)
+    x = perrin.add_noise(truth.positions(), sigma=0.03, rng=rng)
     for order in (slice(None), rng.permutation(len(cluster.positions))):
-        motion = track_rotation(x[:, order], dt=1.0)
-        assert judge_quality(motion, x[:, order]).symmetry == symbol
+        motion = perrin.track_rotation(x[:, order], dt=1.0)
+        assert perrin.judge_quality(motion, x[:, order]).symmetry == symbol
