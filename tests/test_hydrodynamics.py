@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -250,12 +248,3 @@ def test_bad_input_to_the_joint_size():
     """The same for size_and_viscosity."""
     with pytest.raises(ValueError, match=r"D_T.*kelvin.*D_R"):
         size_and_viscosity(-1.0, (0.1, -1), cluster=TETRAHEDRON, temperature=22.0)
-
-
-def test_the_theory_page_is_true(capsys):
-    """The code of docs/theory/hydrodynamics.md runs and prints what stands there."""
-    page = Path(__file__).resolve().parents[1] / "docs" / "theory" / "hydrodynamics.md"
-    code = "\n".join(re.findall(r"```python\n(.*?)```", page.read_text("utf-8"), re.DOTALL))
-    exec(compile(code, str(page), "exec"), {})
-    promised = re.findall(r"^# (.*)$", code, re.MULTILINE)
-    assert promised == capsys.readouterr().out.splitlines()

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import re
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -240,11 +237,3 @@ def test_the_table_of_seatings_is_complete():
     table = _table(3, 3, 2)
     assert len({tuple(row) for row in table.tolist()}) == 18
     assert ((table >= 0).sum(axis=1) == 2).all()
-
-
-def test_the_page_on_identity_says_what_the_code_prints(capsys):
-    """The snippets of docs/theory/identity.md run and print the lines given beneath them."""
-    page = Path(__file__).resolve().parents[1] / "docs" / "theory" / "identity.md"
-    code = "".join(re.findall(r"```python\n(.*?)```", page.read_text("utf-8"), re.DOTALL))
-    exec(compile(code, str(page), "exec"), {})
-    assert capsys.readouterr().out.splitlines() == re.findall(r"^# (.*)$", code, re.MULTILINE)

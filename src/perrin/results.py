@@ -126,7 +126,7 @@ class RodResult:
     cluster : int
     motion : RodMotion
     D_perp, D_T : DiffusionEstimate
-        Of the direction (<|du|^2> = 4 D_perp dt) and of the centre.
+        Of the direction (``<|du|^2>`` = 4 D_perp dt) and of the centre.
     warnings : tuple of str
     label : str or None
     """

@@ -25,7 +25,7 @@ def estimate_rod(
     ----------
     motion : RodMotion
     quantity : {"direction", "translation"}
-        D_perp (rad^2/s), with <|du|^2> = 4 D_perp dt for short times, or the mean D_T (um^2/s).
+        D_perp (rad^2/s), with ``<|du|^2>`` = 4 D_perp dt for short times, or the mean D_T (um^2/s).
 
     Returns
     -------
