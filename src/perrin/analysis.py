@@ -160,7 +160,7 @@ def analyze(
         and D_R imply together.
     diameter : float, optional
         Of one sphere, um: with viscosity and temperature, every cluster's predicted D_T and D_R
-        stand beside the measured ones. Sizes are then of a body of this diameter over distance.
+        stand beside the measured ones. Without it, sizes are those of spheres that touch.
     frames : tuple of int or None, optional
         First frame and first frame not used any more, as in a slice.
 

@@ -47,6 +47,11 @@ class Compared:
         um^2/s or rad^2/s.
     stderr : float
         Standard error of the measured value; NaN where that is an upper limit only.
+
+    Examples
+    --------
+    >>> round(Compared(predicted=6.73e-3, measured=4.93e-3, stderr=0.49e-3).pull, 1)
+    -3.7
     """
 
     predicted: float
