@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -17,16 +17,18 @@ from perrin.hydrodynamics import (
     size_from_translation,
 )
 from perrin.mobility import Mobility, cluster_mobility
+from perrin.shapes import matching_rotation
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from perrin.diffusion import DiffusionEstimate
+    from perrin.mobility import Principal
     from perrin.tensors import DiffusionTensor
 
-# Shapes are alike if their distances differ by less than this many standard errors; of 1000 true
-# tetrahedra a few then stand alone, which costs a solution each and nothing else.
-_ALIKE = 4.0
+# Shapes are alike if particles differ by less than this many standard errors; one in 10^5 is missed
+# and costs a solution, nothing else.
+_ALIKE = 5.0
 # Distances (relative) that no diffusion coefficient can tell apart, for tables without noise.
 _SAME = 1e-4
 # Principal values closer than this (relative) cannot be told apart in a track of 10^4 frames.
@@ -95,9 +97,8 @@ class Prediction:
     D_perp : Compared or None
         Of a rod's direction; None for a body.
     principal_D_T, principal_D_R : tuple of Compared
-        Principal values, rising; empty where the body is nearly isotropic or they were not
-        measured. Measured values lie apart by their errors alone where the predicted ones are
-        nearly equal and the shape has no symmetry.
+        Predicted principal values, rising, and what was measured along their axes; empty where the
+        body is nearly isotropic or no tensor was measured.
     """
 
     diameter: float
@@ -159,6 +160,32 @@ class Body:
     told: tuple[str, ...] = ()
 
 
+class _Solved(NamedTuple):
+    """A shape with its sorted pair distances, and the body it makes."""
+
+    shape: Shape
+    distances: Floats
+    body: Body
+
+    def turned_onto(self, shape: Shape, distances: Floats) -> Body | None:
+        """Return the body in the axes of a shape that is alike within errors; None if it is not."""
+        if len(distances) != len(self.distances):
+            return None
+        error = float(np.hypot(shape.error, self.shape.error))
+        tolerance = max(_ALIKE * error, _SAME * float(distances.mean()))
+        # A quick look: two particles move a distance by twice the tolerance at most.
+        if np.abs(distances - self.distances).max() > 2 * tolerance:
+            return None
+        if np.linalg.norm(shape.positions - self.shape.positions, axis=1).max() <= tolerance:
+            return self.body
+        if self.body.mobility is None or shape.positions.shape[1] != 3:
+            return self.body
+        turn = matching_rotation(self.shape.positions, shape.positions, tolerance=tolerance)
+        if turn is None:
+            return None
+        return replace(self.body, mobility=_turned(self.body.mobility, turn))
+
+
 def solve_bodies(
     shapes: Sequence[Shape], *, diameter: float | None, viscosity: float, temperature: float
 ) -> list[Body]:
@@ -178,8 +205,7 @@ def solve_bodies(
 
     Notes
     -----
-    Shapes are compared by their sorted pair distances, so that neither labels nor orientations
-    matter; a shared tensor is right in its principal values, not in its axes.
+    Neither labels nor orientations matter: a shared solution is turned into the axes of each shape.
 
     Examples
     --------
@@ -188,22 +214,18 @@ def solve_bodies(
     >>> one, other = solve_bodies(
     ...     [Shape(x, 1e-3), Shape(x[::-1], 1e-3)], diameter=None, viscosity=1e-3, temperature=300
     ... )
-    >>> one is other, round(one.mobility.diameter_factor_R, 3)
+    >>> one.mobility.error == other.mobility.error, round(one.mobility.diameter_factor_R, 3)
     (True, 1.818)
     """
-    solved: list[tuple[Floats, float, Body]] = []
+    solved: list[_Solved] = []
     bodies = []
     for shape in shapes:
         distances = _sorted_distances(shape.positions)
-        shared = (
-            body
-            for known, error, body in solved
-            if _alike(distances, known, errors=(shape.error, error))
-        )
-        body = next(shared, None)
+        shared = (known.turned_onto(shape, distances) for known in solved)
+        body = next((one for one in shared if one is not None), None)
         if body is None:
             body = _solve(shape.positions, diameter, viscosity, temperature)
-            solved.append((distances, shape.error, body))
+            solved.append(_Solved(shape, distances, body))
         bodies.append(body)
     return bodies
 
@@ -267,6 +289,7 @@ def compare_body(
     Parameters
     ----------
     mobility : Mobility
+        In the axes of the motion's template.
     D_T, D_R : DiffusionEstimate
     tensor_T, tensor_R : DiffusionTensor, optional
 
@@ -274,14 +297,14 @@ def compare_body(
     -------
     Prediction
     """
-    values_T, values_R = mobility.principal_D_T.values, mobility.principal_D_R.values
+    T, R = mobility.principal_D_T, mobility.principal_D_R
     return Prediction(
         diameter=mobility.sphere_diameter,
         error=mobility.error,
-        D_T=_beside(float(values_T.mean()), D_T),
-        D_R=_beside(float(values_R.mean()), D_R),
-        principal_D_T=_principal(values_T, tensor_T),
-        principal_D_R=_principal(values_R, tensor_R),
+        D_T=_beside(float(T.values.mean()), D_T),
+        D_R=_beside(float(R.values.mean()), D_R),
+        principal_D_T=_principal(T, tensor_T),
+        principal_D_R=_principal(R, tensor_R),
     )
 
 
@@ -318,26 +341,36 @@ def _beside(predicted: float, estimate: DiffusionEstimate) -> Compared:
     return Compared(predicted, estimate.value, error)
 
 
-def _principal(values: Floats, tensor: DiffusionTensor | None) -> tuple[Compared, ...]:
-    """Compare principal values where the body has unequal ones and a tensor was measured."""
-    if tensor is None or not are_unequal(values):
+def _principal(values: Principal, tensor: DiffusionTensor | None) -> tuple[Compared, ...]:
+    """Compare along the predicted axes where the body has unequal ones and a tensor was measured.
+
+    Sorted measured values would be of other axes wherever errors exchange two of them.
+    """
+    if tensor is None or not are_unequal(values.values):
         return ()
-    rows = zip(values, tensor.principal_values, tensor.stderr, strict=True)
+    x, y, z = values.axes
+    # What the elements xx, yy, zz, xy, xz, yz weigh in a value along an axis.
+    weight = np.stack([x * x, y * y, z * z, 2 * x * y, 2 * x * z, 2 * y * z], axis=1)
+    measured = np.einsum("ik,ij,jk->k", values.axes, tensor.tensor, values.axes)
+    variance = np.einsum("ke,ef,kf->k", weight, tensor.covariance, weight)
+    rows = zip(values.values, measured, np.sqrt(variance), strict=True)
     return tuple(Compared(*map(float, row)) for row in rows)
+
+
+def _turned(mobility: Mobility, rotation: Floats) -> Mobility:
+    """Return the same body turned about the origin."""
+    both = np.kron(np.eye(2), rotation)
+    return replace(
+        mobility,
+        D=both @ mobility.D @ both.T,
+        center=rotation @ mobility.center,
+        centers=mobility.centers @ rotation.T,
+    )
 
 
 def _sorted_distances(positions: Floats) -> Floats:
     first, second = np.triu_indices(len(positions), 1)
     return np.sort(np.linalg.norm(positions[first] - positions[second], axis=1))
-
-
-def _alike(one: Floats, other: Floats, *, errors: tuple[float, float]) -> bool:
-    """Return whether two bodies' sorted distances agree within their errors."""
-    if len(one) != len(other):
-        return False
-    # A distance has the error of two coordinates along it.
-    error = float(np.sqrt(2) * np.hypot(*errors))
-    return bool(np.abs(one - other).max() <= max(_ALIKE * error, _SAME * one.mean()))
 
 
 def _solve(positions: Floats, diameter: float | None, viscosity: float, temperature: float) -> Body:
