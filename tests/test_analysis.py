@@ -187,23 +187,168 @@ def test_frames_are_sliced(base):
         perrin.analyze(base, dt=0.73, frames=(500, None))
 
 
-def test_sizes_are_the_papers_for_tetrahedra_only(base):
-    """Sizes follow Eqs. 25-27 with propagated errors; a trimer has none, with a word."""
-    report = perrin.analyze(base, dt=0.73, viscosity=2.18e-3, temperature=295)
-    result = report.clusters[0]
+KNOWN = {"viscosity": 2.18e-3, "temperature": 295.0}
+
+
+def spheres(
+    body: perrin.Mobility, *, seed: int, cluster: int = 0, n_frames: int = 400
+) -> pd.DataFrame:
+    """Tracks of a body that diffuses as its hydrodynamics says."""
+    truth = perrin.simulate_motion(body, dt=0.5, n_frames=n_frames, rng=seed)
+    table = perrin.positions_table(perrin.add_noise(truth.positions(), sigma=0.02, rng=seed + 1))
+    first = 100 * cluster
+    return table.assign(cluster=cluster, particle=table["particle"] + first, x=table["x"] + first)
+
+
+def test_sizes_are_those_of_the_measured_shape(base):
+    """Tetrahedron and trimer: the sizes of `size_from_*` at the template, by factors of its own."""
     kT = 1.380649e-23 * 295
-    d_t = kT / (3 * np.pi * 2.18e-3 * result.D_T.value * 1e-12) * 1e6
-    d_r = (kT / (np.pi * 2.18e-3 * result.D_R.value)) ** (1 / 3) * 1e6
-    assert result.sizes["translation"].cluster == pytest.approx(d_t)
-    assert result.sizes["rotation"].sphere == pytest.approx(d_r / 1.844)
-    relative = result.D_R.stderr / result.D_R.value / 3
-    assert result.sizes["rotation"].cluster_stderr == pytest.approx(d_r * relative)
-    trimer = base[base["particle"] < 3]
-    other = perrin.analyze(trimer, dt=0.73, viscosity=2.18e-3, temperature=295).clusters[0]
-    assert other.sizes is None
-    assert any("tetrahedra only" in w for w in other.warnings)
+    factors = {4: (1.784, 1.818), 3: (1.623, 1.665)}
+    for table in (base, base[base["particle"] < 3]):
+        result = perrin.analyze(table, dt=0.73, **KNOWN).clusters[0]
+        c_t, c_r = factors[len(result.motion.template)]
+        d_t = kT / (3 * np.pi * 2.18e-3 * result.D_T.value * 1e-12) * 1e6
+        d_r = (kT / (np.pi * 2.18e-3 * result.D_R.value)) ** (1 / 3) * 1e6
+        assert result.sizes["translation"].cluster == pytest.approx(d_t)
+        # The measured shape differs from touching spheres by 30 nm/sqrt(150) in 2.45 um.
+        assert result.sizes["translation"].sphere == pytest.approx(d_t / c_t, rel=2e-3)
+        assert result.sizes["rotation"].sphere == pytest.approx(d_r / c_r, rel=2e-3)
+        relative = result.D_R.stderr / result.D_R.value / 3
+        assert result.sizes["rotation"].cluster_stderr == pytest.approx(d_r * relative)
+        shape = result.motion.template
+        both = perrin.size_and_viscosity(result.D_T, result.D_R, cluster=shape, temperature=295.0)
+        assert result.sizes["both"].sphere == pytest.approx(both.sphere, rel=1e-9)
+        assert result.sizes["both"].viscosity == pytest.approx(both.viscosity, rel=1e-9)
+        assert result.prediction is None
+
+
+def test_conditions_are_asked_for_together(base):
+    """The temperature alone gives what needs no viscosity; other gaps and Celsius are refused."""
+    (result,) = perrin.analyze(base, dt=0.73, temperature=295.0).clusters
+    assert list(result.sizes) == ["both"]
+    full = perrin.analyze(base, dt=0.73, **KNOWN).clusters[0].sizes["both"]
+    assert result.sizes["both"].viscosity == pytest.approx(full.viscosity, rel=1e-12)
     with pytest.raises(ValueError, match="both viscosity"):
         perrin.analyze(base, dt=0.73, viscosity=2.18e-3)
+    for lacking in ({}, {"temperature": 295.0}, {"viscosity": 1e-3}):
+        with pytest.raises(ValueError, match="a prediction needs the viscosity"):
+            perrin.analyze(base, dt=0.73, diameter=2.45, **lacking)
+    with pytest.raises(ValueError, match=r"diameter.*> 0.*kelvin.*295\.15"):
+        perrin.analyze(base, dt=0.73, viscosity=1e-3, temperature=22.0, diameter=-1.0)
+
+
+@pytest.mark.parametrize("n", [3, 4])
+def test_what_is_predicted_is_measured(n, tmp_path):
+    """Bodies moved by their own hydrodynamics: pulls within 3.5, sizes within 3 errors of 2 um.
+
+    The trimer is compared axis by axis as well: D_R differs by 28 %, D_T by 9 %.
+    """
+    body = perrin.cluster_mobility(perrin.Cluster.touching(n, 2.0), radius=1.0, **KNOWN)
+    report = perrin.analyze(spheres(body, seed=20 + n), dt=0.5, diameter=2.0, **KNOWN)
+    (result,) = report.clusters
+    found = result.prediction
+    axes = (*found.principal_D_T, *found.principal_D_R)
+    assert len(axes) == (6 if n == 3 else 0)
+    for one in (found.D_T, found.D_R, *axes):
+        assert abs(one.pull) < 3.5
+    assert found.D_R.pull == (result.D_R.value - found.D_R.predicted) / result.D_R.stderr
+    # The shape is known to 1 nm in 2 um; D_R goes with the third power of it.
+    assert found.D_T.predicted == pytest.approx(np.trace(body.D_T) / 3, rel=2e-3)
+    assert found.D_R.predicted == pytest.approx(np.trace(body.D_R) / 3, rel=6e-3)
+    if n == 3:
+        # In the plane of a trimer all directions are alike, and it moves and turns fastest there.
+        assert axes[1].measured == pytest.approx(axes[2].measured, rel=1e-6)
+        assert axes[4].measured == pytest.approx(axes[5].measured, rel=1e-6)
+    planted = [*body.principal_D_T.values, *body.principal_D_R.values]
+    np.testing.assert_allclose([c.predicted for c in axes], planted[: len(axes)], rtol=1e-2)
+    for size in result.sizes.values():
+        assert abs(size.sphere - 2.0) < 3 * size.sphere_stderr
+    both = result.sizes["both"]
+    assert abs(both.viscosity - KNOWN["viscosity"]) < 3 * both.viscosity_stderr
+    perrin.write_run(report, tmp_path / "run")
+    again = perrin.load_run(tmp_path / "run")
+    assert again.clusters[0].prediction == found
+    assert again.clusters[0].sizes == result.sizes
+
+
+def test_like_clusters_share_one_solution(monkeypatch):
+    """Relabelled and turned tetrahedra are solved once, another shape once more."""
+    tables = [tracks(seed=k, cluster=k, n_frames=60) for k in range(3)]
+    swap = {4: 6, 5: 4, 6: 7, 7: 5}
+    tables[1] = tables[1].assign(particle=tables[1]["particle"].map(swap))
+    trimer = tracks(seed=5, cluster=3, n_frames=60)
+    tables.append(trimer[trimer["particle"] < 15])
+    solved = []
+
+    def counted(positions, **known):
+        solved.append(len(positions))
+        return perrin.cluster_mobility(positions, **known)
+
+    monkeypatch.setattr("perrin.predictions.cluster_mobility", counted)
+    report = perrin.analyze(pd.concat(tables), dt=0.73, diameter=2.45, **KNOWN)
+    assert solved == [4, 3]
+    values = [c.prediction.D_R.predicted for c in report.clusters]
+    np.testing.assert_allclose(values[:3], values[0], rtol=1e-12)
+    assert values[3] > 1.1 * values[0]
+
+
+def test_a_shared_solution_is_turned_into_the_axes_of_each_body(monkeypatch):
+    """A bent chain of four, relabelled and turned: along its axes the same as solved for itself."""
+    bent = 2.0 * np.array([[0.0, 0, 0], [1, 0, 0], [1.5, 0.9, 0], [1.5, 0.9, 1.1]])
+    body = perrin.cluster_mobility(bent, radius=1.0, **KNOWN)
+    one = spheres(body, seed=31, n_frames=150)
+    other = spheres(body, seed=35, n_frames=150, cluster=1)
+    other = other.assign(particle=other["particle"].map({100: 102, 101: 100, 102: 103, 103: 101}))
+    both = perrin.analyze(pd.concat([one, other]), dt=0.5, diameter=2.0, **KNOWN).clusters
+    monkeypatch.setattr("perrin.predictions.matching_rotation", lambda *_, **__: None)
+    alone = perrin.analyze(pd.concat([one, other]), dt=0.5, diameter=2.0, **KNOWN).clusters
+    # The templates differ by 20 nm/sqrt(150) a coordinate, a thousandth of the diameter.
+    for shared, own in zip(both, alone, strict=True):
+        for quantity in ("principal_D_T", "principal_D_R"):
+            for a, b in zip(
+                getattr(shared.prediction, quantity), getattr(own.prediction, quantity), strict=True
+            ):
+                assert a.predicted == pytest.approx(b.predicted, rel=5e-3)
+                assert a.measured == pytest.approx(b.measured, rel=2e-2)
+                assert a.stderr == pytest.approx(b.stderr, rel=2e-2)
+
+
+def test_rods_are_predicted():
+    """A dimer of the planted diameter: D_T and D_perp within 3.5 standard errors."""
+    body = perrin.cluster_mobility(perrin.Cluster.touching(2, 2.0), radius=1.0, **KNOWN)
+    report = perrin.analyze(spheres(body, seed=7), dt=0.5, diameter=2.0, **KNOWN)
+    (rod,) = report.rods
+    across = body.principal_D_R.values[0]
+    assert rod.prediction.D_perp.predicted == pytest.approx(across, rel=6e-3)
+    assert abs(rod.prediction.D_perp.pull) < 3.5
+    assert abs(rod.prediction.D_T.pull) < 3.5
+    assert "pull" in str(rod.prediction)
+
+
+def test_shapes_that_cannot_be_solved_are_told(base, monkeypatch):
+    """A plane, a diameter in nm, overlaps, too many spheres, poor accuracy: a warning each."""
+
+    def told(table: pd.DataFrame = base, **known: float) -> tuple[perrin.ClusterResult, str]:
+        (result,) = perrin.analyze(table, dt=0.73, **KNOWN, **known).clusters
+        return result, "; ".join(result.warnings)
+
+    flat, words = told(base.drop(columns="z"), diameter=2.45)
+    assert flat.sizes is flat.prediction is None
+    assert "no sizes and no prediction: they follow from motion in three dimensions" in words
+    wrong, words = told(diameter=2450.0)
+    assert wrong.sizes is wrong.prediction is None
+    assert "2.45 um apart, which spheres of 2450 um cannot be" in words
+    assert "would overlap" in told(diameter=3.0)[1]
+    assert "do not touch" in told(diameter=1.2)[1]
+    assert told(diameter=2.45)[1] == ""
+    monkeypatch.setattr("perrin.resistance._MOST_UNKNOWNS", 430)
+    rough, words = told(diameter=2.45)
+    assert rough.prediction.error > 1e-4
+    assert "predicted flow: degree 5 leaves a relative error" in words
+    monkeypatch.setattr("perrin.resistance._MOST_UNKNOWNS", 300)
+    refused, words = told()
+    assert refused.sizes is None
+    assert "no sizes: cluster_mobility refuses this shape: centers: 4 spheres" in words
 
 
 def test_a_soft_body_is_flagged_and_a_noisy_one_is_not():
@@ -259,9 +404,14 @@ def test_a_motionless_cluster_is_an_upper_limit():
     """Without diffusion nothing is resolved, and the report says so."""
     x = np.repeat(perrin.Cluster.touching(4, 2.45).positions[None], 100, axis=0)
     table = perrin.positions_table(perrin.add_noise(x, sigma=0.03, rng=2))
-    (result,) = perrin.analyze(table, dt=0.73, viscosity=1e-3, temperature=300).clusters
+    report = perrin.analyze(table, dt=0.73, viscosity=1e-3, temperature=300, diameter=2.45)
+    (result,) = report.clusters
     assert not result.D_R.resolved
     assert result.sizes is None
+    assert any("no sizes: D_R and D_T: an upper limit only" in w for w in result.warnings)
+    entry = report.to_dict()["clusters"][0]["prediction"]["D_R"]
+    assert entry["pull"] is entry["stderr"] is None
+    assert entry["predicted"] > 0
     assert any("not resolved: D_R <" in w for w in result.warnings)
 
 

@@ -92,8 +92,11 @@ def test_demo_gives_the_planted_values_back(demo):
 
 
 def test_demo_prints_a_short_table(demo):
-    """Coefficients with both intervals, sigma, noise floor and sizes are on the screen."""
-    for words in ("D_R (rad^2/s)", "D_T (um^2/s)", "68 %", "95 %", "sigma (nm)", "Phi^2", "1.844"):
+    """Coefficients, sigma, noise floor, sizes and predictions with pulls are on the screen."""
+    for words in (
+        "D_R (rad^2/s)", "D_T (um^2/s)", "68 %", "95 %", "sigma (nm)", "Phi^2", "sphere*, both",
+        "viscosity (mPa s)", "0.00672", "0.0453", "pull -", "Planted in the simulation",
+    ):  # fmt: skip
         assert words in demo[1]
     assert len(demo[1].splitlines()) < 25
 
@@ -127,6 +130,12 @@ def test_summary_has_the_promised_form(demo):
     assert (cluster["D_R"]["unit"], cluster["D_T"]["unit"]) == ("rad^2/s", "um^2/s")
     for key in ("sphere_T", "sphere_R", "cluster_T", "cluster_R"):
         assert set(cluster["sizes"][key]) == {"value", "stderr"}
+    assert cluster["size_factor"] == "exact"
+    for key in ("D_R", "D_T"):
+        compared = cluster["prediction"][key]
+        assert compared["measured"] == cluster[key]["value"]
+        pull = (compared["measured"] - compared["predicted"]) / cluster[key]["stderr"]
+        assert compared["pull"] == pytest.approx(pull)
     run_record = json.loads((demo[0] / "run.json").read_text())
     assert len(run_record["input"]["sha256"]) == 64
     assert run_record["arguments"]["dt"] == 0.73
@@ -169,11 +178,13 @@ def test_options_reach_the_analysis(csv, tmp_path):
     """Options do on the command line what the arguments do in Python."""
     options = ("--scale", "2,2,2", "--frames", "5:50", "--sigma", "0.06,0.06,0.06")
     options += ("--viscosity", "1e-3", "--temperature", "300", "--columns", "x=2,y=3,z=4")
+    options += ("--diameter", "4.9")
     result = run("analyze", csv, "--dt", "0.5", *options, "-o", "run", cwd=tmp_path)
     assert result.returncode == 0, result.stderr
     expected = perrin.analyze(
-        csv, dt=0.5, scale=2, frames=(5, 50), sigma=0.06, viscosity=1e-3, temperature=300
-    )
+        csv, dt=0.5, scale=2, frames=(5, 50), sigma=0.06, viscosity=1e-3, temperature=300,
+        diameter=4.9,
+    )  # fmt: skip
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
     assert summary == json.loads(json.dumps(expected.to_dict()))
 
@@ -271,6 +282,7 @@ def test_a_gdf_cut_short_is_refused(table, tmp_path):
         (("--dt", "1", "--columns", "x"), ("--columns",)),
         (("--dt", "1", "--contact", "-2"), ("contact",)),
         (("--dt", "1", "--viscosity", "1e-3"), ("temperature",)),
+        (("--dt", "1", "--diameter", "2"), ("diameter", "viscosity", "temperature")),
     ],
 )
 def test_wrong_arguments_end_with_status_2(csv, tmp_path, options, words):

@@ -47,6 +47,7 @@ ROOMS = [
     "resistance",
     "mobility",
     "hydrodynamics",
+    "predictions",
     "surroundings",
     "simulate",
     "gdf",

@@ -91,20 +91,46 @@ def test_the_page_holds_the_numbers(single):
     assert "pooled" not in page.text
 
 
-def test_sizes_are_marked_as_the_papers(single):
-    size = perrin.size_from_rotation(
-        4.93e-3, cluster=perrin.Cluster.tetrahedron(1.5), viscosity=2.18e-3, temperature=295,
-        factor="hoffmann2009",
-    )  # fmt: skip
-    sizes = {"rotation": replace(size, cluster_stderr=0.2), "translation": size}
+def test_sizes_and_the_viscosity_they_imply_are_shown(single):
+    body = perrin.cluster_mobility(
+        perrin.Cluster.touching(4, 2.45), radius=1.225, viscosity=2.18e-3, temperature=295
+    )
+    D_T, D_R = (3.85e-2, 0.49e-2), (4.93e-3, 0.49e-3)
+    known = {"cluster": body, "viscosity": 2.18e-3, "temperature": 295}
+    sizes = {
+        "translation": perrin.size_from_translation(D_T, **known),
+        "rotation": perrin.size_from_rotation(D_R, **known),
+        "both": perrin.size_and_viscosity(D_T, D_R, cluster=body, temperature=295),
+    }
     with_sizes = replace(single, clusters=(replace(single.clusters[0], sizes=sizes),))
     text = Page(report.render_html(with_sizes, [])).text
-    assert "paper's factor 1.844 (Hoffmann 2009)" in text
-    assert "4.9(2) µm" in text
-    assert "2.68 µm" in text
+    assert "1.844" not in text
+    # The values of docs/theory/hydrodynamics.md.
+    for shown in ("2.9(4) µm", "2.72(9) µm", "2.6(2) µm", "they imply 2.4(5) mPa s"):
+        assert shown in text
+    one = replace(single.clusters[0], sizes={"rotation": sizes["rotation"]})
+    text = Page(report.render_html(replace(single, clusters=(one,)), [])).text
+    assert "2.72(9) µm" in text
+    assert "they imply" not in text
     bare = replace(single.clusters[0], sizes=None)
     text = Page(report.render_html(replace(single, clusters=(bare,), settings={}), [])).text
     assert "No hydrodynamic sizes: viscosity and temperature were not given" in text
+
+
+def test_predictions_stand_beside_the_measured_values(single):
+    """A line a coefficient and principal axis; what is not resolved has no pull."""
+    D_R = perrin.Compared(0.00673, 0.0051, 0.0004)
+    prediction = perrin.Prediction(
+        2.45, 1e-5, D_T=perrin.Compared(0.0453, 0.0, np.nan), D_R=D_R, principal_D_R=(D_R,) * 3
+    )
+    one = replace(single.clusters[0], prediction=prediction)
+    text = Page(report.render_html(replace(single, clusters=(one,)), [])).text
+    assert "measured predicted pull" in text
+    assert "0.0051(4) rad²/s 0.00673 rad²/s −4.1" in text
+    assert "R , axis 3" in text
+    assert "not resolved 0.0453 µm²/s –" in text
+    assert "spheres of 2.45 µm" in text
+    assert "pull" not in Page(report.render_html(single, [])).text
 
 
 def test_the_page_fetches_nothing_and_runs_nothing(single, tmp_path):

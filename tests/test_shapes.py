@@ -5,7 +5,7 @@ import pytest
 
 from perrin import Cluster, point_group, rotation_group
 from perrin.rotations import exp_map
-from perrin.shapes import is_tetrahedron, symmetry_elements
+from perrin.shapes import is_tetrahedron, matching_rotation, symmetry_elements
 
 
 def distances(cluster):
@@ -281,3 +281,15 @@ def test_tolerances_must_be_lengths(tolerance):
         rotation_group(np.eye(3), tolerance=tolerance)
     with pytest.raises(ValueError, match="tolerance"):
         point_group(np.eye(3), tolerance=tolerance)
+
+
+def test_a_body_is_carried_onto_its_relabelled_copy_and_not_onto_its_mirror_image():
+    """The planted rotation of a body without symmetry comes back; its mirror image has none."""
+    rng = np.random.default_rng(2)
+    x = rng.normal(size=(6, 3))
+    x -= x.mean(0)
+    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    turn *= np.linalg.det(turn)
+    moved = (x @ turn.T)[rng.permutation(6)]
+    np.testing.assert_allclose(matching_rotation(x, moved, tolerance=1e-6), turn, atol=1e-12)
+    assert matching_rotation(x, -moved, tolerance=1e-2) is None

@@ -44,6 +44,7 @@ if TYPE_CHECKING:
     from perrin.mobility import Mobility, apparent_translation, cluster_mobility
     from perrin.motion import RigidMotion, remove_rotation, threshold_displacement, track_rotation
     from perrin.noise import NoiseFloor, noise_floor
+    from perrin.predictions import Compared, Prediction
     from perrin.quality import Quality, judge_quality
     from perrin.quaternions import QuaternionCovariance, quaternion_covariance
     from perrin.report import write_run
@@ -69,6 +70,7 @@ __version__ = "0.1.0"
 __all__ = [
     "Cluster",
     "ClusterResult",
+    "Compared",
     "CoupledTensor",
     "DegenerateClusterError",
     "DiffusionEstimate",
@@ -79,6 +81,7 @@ __all__ = [
     "Mobility",
     "NoiseFloor",
     "PrecisionWarning",
+    "Prediction",
     "Quality",
     "QuaternionCovariance",
     "Report",
@@ -185,6 +188,7 @@ _ROOMS = {
         "size_from_rotation",
         "size_from_translation",
     ),
+    "predictions": ("Compared", "Prediction"),
     "surroundings": (
         "WallFactor",
         "gravitational_height",

@@ -6,7 +6,7 @@ import hashlib
 import os
 import platform
 import warnings as python_warnings
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
@@ -20,14 +20,23 @@ from perrin._arrays import (
     PrecisionWarning,
     TooFewFramesError,
     TrackTableError,
-    require_positive,
 )
 from perrin.diffusion import DiffusionEstimate, estimate_diffusion, with_error
 from perrin.files import check_tracks, read_tracks
 from perrin.grouping import each_cluster, find_clusters
-from perrin.hydrodynamics import Size, size_from_rotation, size_from_translation
 from perrin.identity import settle_identity
+from perrin.mobility import Mobility, condition_faults
 from perrin.motion import RigidMotion, track_rotation
+from perrin.predictions import (
+    Body,
+    Shape,
+    are_unequal,
+    compare_body,
+    compare_rod,
+    find_sizes,
+    is_known,
+    solve_bodies,
+)
 from perrin.quality import Quality, judge_quality
 from perrin.results import (
     ClusterResult,
@@ -39,7 +48,6 @@ from perrin.results import (
 )
 from perrin.rod_diffusion import estimate_rod
 from perrin.rods import RodMotion, track_direction
-from perrin.shapes import is_tetrahedron
 from perrin.tensors import DiffusionTensor, diffusion_tensor
 
 if TYPE_CHECKING:
@@ -48,6 +56,7 @@ if TYPE_CHECKING:
     import pandas as pd
     from numpy.typing import ArrayLike
 
+    from perrin.hydrodynamics import Size
     from perrin.noise import NoiseFloor
     from perrin.steps import Quantity
 
@@ -67,6 +76,7 @@ class _Conditions:
     sigma: ArrayLike | None
     viscosity: float | None
     temperature: float | None
+    diameter: float | None
     noise: Literal["joint", "residual"] | float
     exposure: float | None
     drift: bool
@@ -85,6 +95,22 @@ class _Conditions:
                 drift=self.drift and quantity == "translation",
             )
 
+    def bodies(self, shapes: list[Shape]) -> list[Body]:
+        """Solve for the flow around every shape; only for a stated temperature."""
+        # Without a viscosity the bodies give ratios of sizes only, in which it cancels.
+        assumed = {"viscosity": self.viscosity or 1e-3, "temperature": self.temperature or 300.0}
+        return solve_bodies(shapes, diameter=self.diameter, **assumed)
+
+    def sizes(
+        self, mobility: Mobility, *, D_T: DiffusionEstimate, D_R: DiffusionEstimate
+    ) -> dict[str, Size]:
+        """Return the sizes that the coefficients imply under these conditions."""
+        if self.temperature is None:
+            return {}
+        return find_sizes(
+            mobility, D_T=D_T, D_R=D_R, viscosity=self.viscosity, temperature=self.temperature
+        )
+
 
 def analyze(
     tracks: str | os.PathLike[str] | pd.DataFrame,
@@ -99,6 +125,7 @@ def analyze(
     drift: bool = False,
     viscosity: float | None = None,
     temperature: float | None = None,
+    diameter: float | None = None,
     frames: tuple[int | None, int | None] | None = None,
 ) -> Report:
     """Measure D_R and D_T of every cluster in a track table.
@@ -128,7 +155,12 @@ def analyze(
     drift : bool
         Give D_T a free mean velocity along each axis (flow, sedimentation).
     viscosity, temperature : float, optional
-        Pa s and K: with both, sizes of tetrahedra follow.
+        Pa s and K: with both, sizes follow from D_T and from D_R for equal spheres of the measured
+        shape, in three dimensions. The temperature alone gives the size and the viscosity that D_T
+        and D_R imply together.
+    diameter : float, optional
+        Of one sphere, um: with viscosity and temperature, every cluster's predicted D_T and D_R
+        stand beside the measured ones. Without it, sizes are those of spheres that touch.
     frames : tuple of int or None, optional
         First frame and first frame not used any more, as in a slice.
 
@@ -153,14 +185,17 @@ def analyze(
     >>> print(report.clusters[0].D_R)
     D_R = 0.0051(4) rad^2/s [mle, 300 frames]
     """
-    _check_arguments(dt=dt, contact=contact, viscosity=viscosity, temperature=temperature)
+    _check_arguments(
+        dt=dt, contact=contact, viscosity=viscosity, temperature=temperature, diameter=diameter
+    )
     table, source = _table(tracks, scale=scale, columns=columns)
-    conditions = _Conditions(dt, sigma, viscosity, temperature, noise, exposure, drift)
+    conditions = _Conditions(dt, sigma, viscosity, temperature, diameter, noise, exposure, drift)
     table = _sliced(table, frames)
     table, labels, warnings = _clustered(table, contact=contact)
     first = int(table["frame"].min())
     table["frame"] -= first
     results, rods, failures = _each(table, labels, conditions)
+    results, rods = _interpreted(results, rods, conditions)
     pooled, more = _pooled(results, conditions) if results else (None, [])
     more += _exposure_taken(conditions)
     arguments = asdict(conditions) | {"contact": contact, "frames": frames, "columns": columns}
@@ -170,14 +205,20 @@ def analyze(
     return Report(tuple(results), pooled, told, table, settings, tuple(rods))
 
 
-def _check_arguments(
-    *, dt: float, contact: float | None, viscosity: float | None, temperature: float | None
-) -> None:
+def _check_arguments(*, dt: float, **given: float | None) -> None:
     """Refuse arguments out of range, all in one message."""
-    given = {"contact": contact, "viscosity": viscosity, "temperature": temperature}
-    require_positive(dt=dt, **{name: v for name, v in given.items() if v is not None})
-    if (viscosity is None) != (temperature is None):
-        raise ValueError("sizes need both viscosity (Pa s) and temperature (K): one is missing")
+    known = {name: value for name, value in given.items() if value is not None}
+    faults = condition_faults(dt=dt, **known)
+    if "viscosity" in known and "temperature" not in known:
+        faults.append(
+            "sizes need both viscosity (Pa s) and temperature (K): the temperature is missing"
+        )
+    if "diameter" in known and not {"viscosity", "temperature"} <= set(known):
+        faults.append(
+            "diameter: a prediction needs the viscosity (Pa s) and the temperature (K) as well"
+        )
+    if faults:
+        raise ValueError("; ".join(faults))
 
 
 def _table(
@@ -359,7 +400,6 @@ def _measure_body(
     )
     D_R, D_T = (conditions.estimate(motion, q) for q in ("rotation", "translation"))
     noise = predicted_noise(motion)
-    sizes, said = _sizes(motion, D_R, D_T, conditions)
     tensor, unfound = _tensor(motion, conditions)
     warnings = (
         *_missing(motion),
@@ -371,21 +411,25 @@ def _measure_body(
         *(f"D_T: {text}" for text in D_T.warnings),
         *_drift_told(D_T),
         *unfound,
-        *said,
     )
-    return ClusterResult(cluster, motion, D_R, D_T, tensor, noise, sizes, warnings, label, quality)
+    return ClusterResult(cluster, motion, D_R, D_T, tensor, noise, None, warnings, label, quality)
 
 
 def _tensor(
-    motion: RigidMotion, conditions: _Conditions
+    motion: RigidMotion, conditions: _Conditions, quantity: Quantity = "rotation"
 ) -> tuple[DiffusionTensor | None, list[str]]:
-    """Return the rotational tensor, or None and the reason; in the plane there is none."""
+    """Return the tensor in body axes, or None and the reason; in the plane there is none."""
     if motion.template.shape[1] != 3:
         return None, []
     try:
         with python_warnings.catch_warnings():
             python_warnings.simplefilter("ignore", PrecisionWarning)
-            tensor = diffusion_tensor(motion, noise=conditions.noise, exposure=conditions.exposure)
+            tensor = diffusion_tensor(
+                motion,
+                quantity=quantity,
+                noise=conditions.noise,
+                exposure=conditions.exposure,
+            )
     except ValueError as error:
         return None, [f"no diffusion tensor: {error}"]
     return tensor, []
@@ -490,23 +534,63 @@ def _exposure_taken(conditions: _Conditions) -> list[str]:
     ]
 
 
-def _sizes(
-    motion: RigidMotion, D_R: DiffusionEstimate, D_T: DiffusionEstimate, conditions: _Conditions
-) -> tuple[dict[str, Size] | None, list[str]]:
-    """Return sizes by the paper's factor, or None and the reason."""
-    viscosity, temperature = conditions.viscosity, conditions.temperature
-    if viscosity is None or temperature is None:
+def _interpreted(
+    results: list[ClusterResult], rods: list[RodResult], conditions: _Conditions
+) -> tuple[list[ClusterResult], list[RodResult]]:
+    """Add what the shapes imply: sizes, and predictions where a diameter was stated."""
+    if conditions.temperature is None:
+        return results, rods
+    shapes = [_shape(r.motion.template, r.motion) for r in results]
+    pairs = zip(results, conditions.bodies(shapes), strict=True)
+    results = [_with_sizes(result, body, conditions) for result, body in pairs]
+    if conditions.diameter is None:
+        return results, rods
+    places = [np.outer(rod.motion.places, [0.0, 0.0, 1.0]) for rod in rods]
+    lines = [_shape(x, rod.motion) for x, rod in zip(places, rods, strict=True)]
+    foreseen = zip(rods, conditions.bodies(lines), strict=True)
+    return results, [_with_prediction(rod, body) for rod, body in foreseen]
+
+
+def _shape(positions: Floats, motion: RigidMotion | RodMotion) -> Shape:
+    """Return a measured shape with the error of its coordinates, which are means over frames."""
+    return Shape(positions, float(np.nan_to_num(motion.sigma) / np.sqrt(motion.fitted.size)))
+
+
+def _with_sizes(result: ClusterResult, body: Body, conditions: _Conditions) -> ClusterResult:
+    """Add the sizes and, for a stated diameter, the prediction, or why there are none."""
+    if body.mobility is None:
+        lacking = "no sizes" if conditions.diameter is None else "no sizes and no prediction"
+        return replace(result, warnings=(*result.warnings, f"{lacking}: {body.reason}"))
+    D_T, D_R = result.D_T, result.D_R
+    sizes = conditions.sizes(body.mobility, D_T=D_T, D_R=D_R)
+    limits = " and ".join(k for k, D in (("D_R", D_R), ("D_T", D_T)) if not is_known(D))
+    told = [f"no size{' from' if sizes else 's:'} {limits}: an upper limit only"] if limits else []
+    prediction = None
+    if conditions.diameter is not None:
+        tensor_T, more = _translation_tensor(result.motion, body.mobility, conditions)
+        prediction = compare_body(
+            body.mobility, D_T=D_T, D_R=D_R, tensor_T=tensor_T, tensor_R=result.tensor
+        )
+        told += more
+    warnings = (*result.warnings, *body.told, *told)
+    return replace(result, sizes=sizes or None, prediction=prediction, warnings=warnings)
+
+
+def _translation_tensor(
+    motion: RigidMotion, mobility: Mobility, conditions: _Conditions
+) -> tuple[DiffusionTensor | None, list[str]]:
+    """Measure D_T in body axes where it should differ between them; a drift would mix with it."""
+    if conditions.drift or not are_unequal(mobility.principal_D_T.values):
         return None, []
-    if not is_tetrahedron(motion.template):
-        return None, ["no sizes: the paper's factor 1.844 holds for tetrahedra only"]
-    if not (D_R.resolved and D_T.resolved):
-        return None, ["no sizes: a diffusion coefficient is not resolved"]
-    shared = {"viscosity": viscosity, "temperature": temperature}
-    shape = motion.template
-    return {
-        "translation": size_from_translation(D_T, cluster=shape, factor="hoffmann2009", **shared),
-        "rotation": size_from_rotation(D_R, cluster=shape, factor="hoffmann2009", **shared),
-    }, []
+    return _tensor(motion, conditions, "translation")
+
+
+def _with_prediction(rod: RodResult, body: Body) -> RodResult:
+    """Add the prediction for a rod, or why there is none."""
+    if body.mobility is None:
+        return replace(rod, warnings=(*rod.warnings, f"no prediction: {body.reason}"))
+    prediction = compare_rod(body.mobility, D_T=rod.D_T, D_perp=rod.D_perp)
+    return replace(rod, prediction=prediction, warnings=(*rod.warnings, *body.told))
 
 
 def _pooled(results: list[ClusterResult], conditions: _Conditions) -> tuple[Pooled, list[str]]:

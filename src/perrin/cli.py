@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from contextlib import contextmanager
+from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, cast
 
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
 
     from perrin.diffusion import DiffusionEstimate
     from perrin.mobility import Mobility
+    from perrin.predictions import Compared
     from perrin.results import ClusterResult, Pooled, Report
     from perrin.sampling import SamplingPlan
     from perrin.shapes import Cluster
@@ -81,7 +83,7 @@ def demo(output: Output = Path("perrin-demo")) -> None:
 
     with _told(), as_file(files("perrin") / "data" / "demo_tracks.csv.gz") as path:
         check_place(output, overwrite=True)
-        report = perrin.analyze(path, dt=0.73, viscosity=2.18e-3, temperature=295.0)
+        report = perrin.analyze(path, dt=0.73, viscosity=2.18e-3, temperature=295.0, diameter=2.45)
         perrin.write_run(report, output, overwrite=True)
         _show(report, output)
         print("Planted in the simulation: D_R = 0.00493 rad^2/s, D_T = 0.0385 um^2/s.")
@@ -119,7 +121,14 @@ def analyze(
         bool, typer.Option("--drift", help="Take a mean velocity (flow, sedimentation) off D_T.")
     ] = False,
     viscosity: Annotated[float | None, typer.Option(help="Pa s, for sizes.")] = None,
-    temperature: Annotated[float | None, typer.Option(help="K, for sizes.")] = None,
+    temperature: Annotated[
+        float | None,
+        typer.Option(help="K, for sizes; alone it gives size and viscosity from D_T and D_R."),
+    ] = None,
+    diameter: Annotated[
+        float | None,
+        typer.Option(help="Of one sphere, um: predicted D_T and D_R beside the measured ones."),
+    ] = None,
     frames: Annotated[
         str | None, typer.Option(help="A:B uses the frames A <= frame < B; A or B may be left out.")
     ] = None,
@@ -143,6 +152,7 @@ def analyze(
             drift=drift,
             viscosity=viscosity,
             temperature=temperature,
+            diameter=diameter,
             frames=_slice(frames),
         )
         perrin.write_run(report, output, overwrite=overwrite)
@@ -520,6 +530,8 @@ def _show(report: Report, output: Path) -> None:
         console.print(_pooled_table(report.pooled))
     for rod in report.rods[:_SHOWN]:
         console.print(escape(perp_text(rod)))
+        if rod.prediction is not None:
+            console.print(escape(f"  {rod.prediction}"), soft_wrap=True)
     told = [("", text) for text in report.warnings]
     told += [(f", cluster {r.name}", text) for r in report.results for text in r.warnings]
     for where, text in told[:_SHOWN_WARNINGS]:
@@ -545,14 +557,46 @@ def _cluster_table(result: ClusterResult) -> Table:
     table.add_row("Phi^2 (rad^2)", f"{result.noise.phi2:.3g}", "predicted noise floor")
     measured = with_error(result.phi2_measured, result.phi2_stderr)
     table.add_row("", measured, "measured noise floor")
-    for mode, name in (("translation", "D_T"), ("rotation", "D_R")):
-        if result.sizes:
-            size = result.sizes[mode]
-            shown = with_error(size.sphere, size.sphere_stderr)
-            table.add_row(f"sphere, {name} (um)*", shown)
+    for row in (*_size_rows(result), *_prediction_rows(result)):
+        table.add_row(*row)
     if result.sizes:
-        table.caption = "* with the paper's factor 1.844 (Hoffmann 2009)"
+        table.caption = "* diameter, for equal spheres at the measured places"
+        table.caption_justify = "left"
     return table
+
+
+def _size_rows(result: ClusterResult) -> Iterator[tuple[str, ...]]:
+    """Yield a line for each size, and the viscosity that both coefficients imply."""
+    from perrin.diffusion import with_error
+
+    sizes = result.sizes or {}
+    for mode, name in (("translation", "D_T"), ("rotation", "D_R"), ("both", "both")):
+        if mode in sizes:
+            size = sizes[mode]
+            yield f"sphere*, {name} (um)", with_error(size.sphere, size.sphere_stderr)
+            if size.viscosity is not None and size.viscosity_stderr is not None:
+                shown = with_error(1e3 * size.viscosity, 1e3 * size.viscosity_stderr)
+                yield "viscosity (mPa s)", shown, "from both"
+
+
+def _prediction_rows(result: ClusterResult) -> Iterator[tuple[str, ...]]:
+    """Yield a line for each predicted coefficient: value, and the measured one's pull."""
+    prediction = result.prediction
+    if prediction is None:
+        return
+    for name, compared, axes in (
+        ("D_R", prediction.D_R, prediction.principal_D_R),
+        ("D_T", prediction.D_T, prediction.principal_D_T),
+    ):
+        if compared is not None:
+            yield f"{name}, predicted", f"{compared.predicted:.4g}", _pull_text(compared)
+        for k, one in enumerate(axes, start=1):
+            measured = f"measured {one.measured:.3g}"
+            yield f"  principal {k}", f"{one.predicted:.4g}", _pull_text(one), measured
+
+
+def _pull_text(compared: Compared) -> str:
+    return f"pull {compared.pull:+.1f}" if isfinite(compared.pull) else "not resolved"
 
 
 def _show_prediction(body: Mobility, *, name: str) -> None:

@@ -329,11 +329,11 @@ def _body(cluster: Cluster | Mobility | ArrayLike) -> Mobility:
         return cluster
     known = cluster.diameter if isinstance(cluster, Cluster) else None
     positions = _centers(cluster)
-    diameter = _neighbour_distance(positions) if known is None else known
+    diameter = neighbour_distance(positions) if known is None else known
     return cluster_mobility(positions, radius=diameter / 2, viscosity=1e-3, temperature=300.0)
 
 
-def _neighbour_distance(positions: Floats) -> float:
+def neighbour_distance(positions: Floats) -> float:
     """Return the mean distance of spheres that touch; 1 for a single sphere."""
     first, second = np.triu_indices(len(positions), 1)
     distance = np.linalg.norm(positions[first] - positions[second], axis=1)

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
     from perrin.diffusion import DiffusionEstimate
+    from perrin.predictions import Compared, Prediction
     from perrin.results import ClusterResult, Pooled, Report, RodResult
 
 # What each figure is, what it shows, and what to look for.
@@ -87,6 +88,7 @@ _ARGUMENT_UNITS = {
     "exposure": "of dt",
     "viscosity": "Pa s",
     "temperature": "K",
+    "diameter": "µm",
     "scale": "µm per unit",
 }
 
@@ -200,6 +202,7 @@ def _rod_row(rod: RodResult) -> dict[str, Any]:
         "length": _length(rod.motion.length),
         "frames": rod.motion.fitted.size,
         "warnings": rod.warnings,
+        "prediction": _prediction(rod.prediction),
     }
 
 
@@ -246,7 +249,9 @@ def _section(
         "facts": [*_noise_facts(result), *_body_facts(result)],
         "tensor": _tensor(result),
         "sampling": _sampling(result),
+        "prediction": _prediction(result.prediction),
         "sizes": _sizes(result),
+        "viscosity": _viscosity(result),
         "no_sizes": _why_no_sizes(result, settings),
         "warnings": result.warnings,
         "figures": [f for f in drawn if f],
@@ -375,26 +380,58 @@ def _sampling(result: ClusterResult) -> list[tuple[str, str]]:
 
 
 def _sizes(result: ClusterResult) -> list[tuple[str, str, str]]:
-    """Return the diameters of cluster and sphere, um, from each of the two coefficients."""
-    if result.sizes is None:
-        return []
-    sizes = ((k, result.sizes[name]) for k, name in (("T", "translation"), ("R", "rotation")))
+    """Return the diameters of cluster and sphere, um, and from which coefficients they are."""
+    found = result.sizes or {}
     return [
         (
-            letter,
+            letters,
             f"{number_text(size.cluster, size.cluster_stderr)} µm",
             f"{number_text(size.sphere, size.sphere_stderr)} µm",
         )
-        for letter, size in sizes
+        for letters, name in (("T", "translation"), ("R", "rotation"), ("TR", "both"))
+        if (size := found.get(name)) is not None
     ]
+
+
+def _viscosity(result: ClusterResult) -> str:
+    """Return the viscosity that both coefficients imply, or nothing."""
+    both = (result.sizes or {}).get("both")
+    if both is None or both.viscosity is None or both.viscosity_stderr is None:
+        return ""
+    return f"{number_text(1e3 * both.viscosity, 1e3 * both.viscosity_stderr)} mPa s"
+
+
+def _prediction(prediction: Prediction | None) -> dict[str, Any] | None:
+    """Return predicted beside measured values, a line each, in the order of the first table."""
+    if prediction is None:
+        return None
+    groups = (
+        ("R", "rad²/s", prediction.D_R, prediction.principal_D_R),
+        ("⊥", "rad²/s", prediction.D_perp, ()),
+        ("T", "µm²/s", prediction.D_T, prediction.principal_D_T),
+    )
+    rows = []
+    for letter, unit, mean, principal in groups:
+        lines = [("", mean), *((f"axis {k}", one) for k, one in enumerate(principal, start=1))]
+        rows += [(letter, *_compared(one, unit), part) for part, one in lines if one is not None]
+    return {"diameter": f"{number_text(prediction.diameter)} µm", "rows": rows}
+
+
+def _compared(one: Compared, unit: str) -> tuple[str, str, str]:
+    """Write a measured value, a predicted one, and how many standard errors lie between."""
+    if not np.isfinite(one.pull):
+        return "not resolved", f"{number_text(one.predicted)} {unit}", "–"
+    measured = number_text(one.measured, one.stderr)
+    pull = f"{one.pull:+.1f}".replace("-", "−")
+    return f"{measured} {unit}", f"{number_text(one.predicted)} {unit}", pull
 
 
 def _why_no_sizes(result: ClusterResult, settings: Mapping[str, Any]) -> str:
     """Say why there are no sizes."""
-    said = [w for w in result.warnings if w.startswith("no sizes: ")]
+    said = [w for w in result.warnings if w.startswith("no sizes")]
     if said:
-        return said[0].removeprefix("no sizes: ")
-    if settings.get("arguments", {}).get("viscosity") is None:
+        return said[0].partition(": ")[2]
+    if settings.get("arguments", {}).get("temperature") is None:
         return "viscosity and temperature were not given"
     return "not computed"
 

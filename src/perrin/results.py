@@ -18,6 +18,7 @@ from perrin.hydrodynamics import Size
 from perrin.lagged import LagCurve, msad, msd
 from perrin.motion import RigidMotion
 from perrin.noise import NoiseFloor, floor_of
+from perrin.predictions import Prediction
 from perrin.quality import Quality
 from perrin.rods import RodMotion
 from perrin.tensors import DiffusionTensor
@@ -42,12 +43,15 @@ class ClusterResult:
     noise : NoiseFloor
         Predicted from sigma and the shape.
     sizes : dict of Size or None
-        "translation" and "rotation", by the paper's factor; None where it does not apply.
+        "translation" and "rotation", where the viscosity is known, and "both", with the viscosity
+        that both coefficients imply; of equal spheres of the measured shape. None without any.
     warnings : tuple of str
     label : str or None
         The cluster's name in the table, where it is text.
     quality : Quality or None
         Rigidity, errors per axis, and what was repaired.
+    prediction : Prediction or None
+        What spheres of the stated diameter would do; None if none was stated.
     """
 
     cluster: int
@@ -60,6 +64,7 @@ class ClusterResult:
     warnings: tuple[str, ...]
     label: str | None = None
     quality: Quality | None = None
+    prediction: Prediction | None = None
 
     @cached_property
     def msad(self) -> LagCurve:
@@ -88,15 +93,6 @@ class ClusterResult:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the cluster's entry of ``summary.json``."""
-        sizes = None
-        if self.sizes is not None:
-            t, r = self.sizes["translation"], self.sizes["rotation"]
-            sizes = {
-                "sphere_T": {"value": t.sphere, "stderr": t.sphere_stderr},
-                "sphere_R": {"value": r.sphere, "stderr": r.sphere_stderr},
-                "cluster_T": {"value": t.cluster, "stderr": t.cluster_stderr},
-                "cluster_R": {"value": r.cluster, "stderr": r.cluster_stderr},
-            }
         xyz = None if self.quality is None else self.quality.sigma_xyz
         return {
             "cluster": self.cluster,
@@ -110,8 +106,9 @@ class ClusterResult:
             "phi2": {"measured": _number(self.phi2_measured), "predicted": self.noise.phi2},
             "snr": _number(self.D_R.snr),
             "tensor": None if self.tensor is None else _tensor_dict(self.tensor),
-            "sizes": sizes,
-            "size_factor": None if self.sizes is None else self.sizes["rotation"].factor,
+            "sizes": None if self.sizes is None else _sizes_dict(self.sizes),
+            "size_factor": next((s.factor for s in (self.sizes or {}).values()), None),
+            "prediction": None if self.prediction is None else self.prediction.to_dict(),
             "quality": None if self.quality is None else self.quality.to_dict(),
             "warnings": list(self.warnings),
         }
@@ -129,6 +126,8 @@ class RodResult:
         Of the direction (``<|du|^2>`` = 4 D_perp dt) and of the centre.
     warnings : tuple of str
     label : str or None
+    prediction : Prediction or None
+        What spheres of the stated diameter would do; None if none was stated.
     """
 
     cluster: int
@@ -137,6 +136,7 @@ class RodResult:
     D_T: DiffusionEstimate
     warnings: tuple[str, ...]
     label: str | None = None
+    prediction: Prediction | None = None
 
     @property
     def name(self) -> str:
@@ -159,6 +159,7 @@ class RodResult:
             "snr": _number(self.D_perp.snr),
             "tensor": None,
             "sizes": None,
+            "prediction": None if self.prediction is None else self.prediction.to_dict(),
             "warnings": list(self.warnings),
         }
 
@@ -453,20 +454,46 @@ def _tensor_from(entry: dict[str, Any]) -> DiffusionTensor:
     return DiffusionTensor(**read)
 
 
+# From which coefficients a size follows, and what its keys in the summary end in.
+_SIZE_KEYS = {"translation": "T", "rotation": "R", "both": "TR"}
+
+
+def _sizes_dict(sizes: dict[str, Size]) -> dict[str, Any]:
+    """Return sizes for JSON; None for those that were not found."""
+    entry: dict[str, Any] = {}
+    for mode, letters in _SIZE_KEYS.items():
+        size = sizes.get(mode)
+        for what in ("sphere", "cluster"):
+            entry[f"{what}_{letters}"] = size and {
+                "value": getattr(size, what),
+                "stderr": getattr(size, f"{what}_stderr"),
+            }
+    both = sizes.get("both")
+    entry["viscosity_TR"] = both and {"value": both.viscosity, "stderr": both.viscosity_stderr}
+    return entry
+
+
+def _sizes_from(entry: dict[str, Any]) -> dict[str, Size]:
+    """Read back what `_sizes_dict` wrote."""
+    found = {}
+    for mode, letters in _SIZE_KEYS.items():
+        sphere, cluster = (entry["sizes"][f"{what}_{letters}"] for what in ("sphere", "cluster"))
+        thickness = entry["sizes"]["viscosity_TR"] if mode == "both" else None
+        if sphere is not None:
+            found[mode] = Size(
+                cluster=cluster["value"],
+                cluster_stderr=cluster["stderr"],
+                sphere=sphere["value"],
+                sphere_stderr=sphere["stderr"],
+                factor=entry["size_factor"],
+                viscosity=thickness and thickness["value"],
+                viscosity_stderr=thickness and thickness["stderr"],
+            )
+    return found
+
+
 def _result_from(entry: dict[str, Any], motion: RigidMotion) -> ClusterResult:
     """Rebuild one cluster's result from its summary and its motion."""
-    sizes = None
-    if entry["sizes"] is not None:
-        sizes = {
-            mode: Size(
-                entry["sizes"][f"cluster_{letter}"]["value"],
-                entry["sizes"][f"cluster_{letter}"]["stderr"],
-                entry["sizes"][f"sphere_{letter}"]["value"],
-                entry["sizes"][f"sphere_{letter}"]["stderr"],
-                entry["size_factor"],
-            )
-            for mode, letter in (("translation", "T"), ("rotation", "R"))
-        }
     return ClusterResult(
         cluster=entry["cluster"],
         motion=motion,
@@ -474,10 +501,11 @@ def _result_from(entry: dict[str, Any], motion: RigidMotion) -> ClusterResult:
         D_T=_estimate_from(entry["D_T"]),
         tensor=None if entry["tensor"] is None else _tensor_from(entry["tensor"]),
         noise=predicted_noise(motion),
-        sizes=sizes,
+        sizes=None if entry["sizes"] is None else _sizes_from(entry),
         warnings=tuple(entry["warnings"]),
         label=entry["label"],
         quality=None if entry["quality"] is None else Quality.from_dict(entry["quality"]),
+        prediction=_prediction_from(entry),
     )
 
 
@@ -490,7 +518,14 @@ def _rod_from(entry: dict[str, Any], motion: RodMotion) -> RodResult:
         D_T=_estimate_from(entry["D_T"]),
         warnings=tuple(entry["warnings"]),
         label=entry["label"],
+        prediction=_prediction_from(entry),
     )
+
+
+def _prediction_from(entry: dict[str, Any]) -> Prediction | None:
+    """Read back a prediction; runs without one may lack the key."""
+    given = entry.get("prediction")
+    return None if given is None else Prediction.from_dict(given)
 
 
 def _pooled_from(entry: dict[str, Any]) -> Pooled | None:

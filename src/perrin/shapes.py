@@ -269,6 +269,35 @@ def point_group(positions: ArrayLike, *, tolerance: float | None = None) -> str:
     return schoenflies(symmetry_elements(np.pad(x, ((0, 0), (0, 3 - x.shape[1]))), allowed))
 
 
+def matching_rotation(x: Floats, onto: Floats, *, tolerance: float) -> Floats | None:
+    """Return the rotation that carries a body onto another one, whatever their labels.
+
+    Parameters
+    ----------
+    x, onto : ndarray, shape (n, 3)
+        Centred, of indistinguishable particles, not on one line.
+    tolerance : float
+        How far (um) a turned particle may be from its place.
+
+    Returns
+    -------
+    ndarray, shape (3, 3), or None
+        onto = R x but for the order, the best one of several; None where there is none.
+
+    Examples
+    --------
+    >>> x = Cluster.touching(4, 2.45).positions
+    >>> R = matching_rotation(x, x[::-1, [1, 2, 0]], tolerance=0.01)
+    >>> np.allclose(np.sort((x @ R.T)[:, 0]), np.sort(x[:, 1]))
+    True
+    """
+    order, miss = _mappings(x, onto, tolerance)
+    if not miss.size:
+        return None
+    rotation: Floats = fit_rotations(onto[order[np.argmin(miss)]][None], x)[0][0]
+    return rotation
+
+
 def _checked(positions: ArrayLike, tolerance: float) -> Floats:
     """Return centred positions after checking them and the tolerance."""
     if not (np.ndim(tolerance) == 0 and np.isfinite(tolerance) and tolerance >= 0):
@@ -305,7 +334,7 @@ def symmetry_elements(x: Floats, tolerance: float) -> Floats:
     found = {
         (sign, *map(int, order)): worst
         for sign in (1, -1)
-        for order, worst in zip(*_mappings(x, sign, 2 * tolerance), strict=True)
+        for order, worst in zip(*_mappings(x, sign * x, 2 * tolerance), strict=True)
     }
     identity = (1, *range(len(x)))
     group = {identity}
@@ -318,35 +347,35 @@ def symmetry_elements(x: Floats, tolerance: float) -> Floats:
     return _exact_matrices(x, np.array(ordered))
 
 
-def _mappings(x: Floats, sign: int, tolerance: float) -> tuple[Ints, Floats]:
-    """Return the permutations with R x_i = sign x_p(i) within the tolerance, and the worst miss."""
+def _mappings(x: Floats, onto: Floats, tolerance: float) -> tuple[Ints, Floats]:
+    """Return the permutations with R x_i = onto_p(i) within the tolerance, and the worst miss."""
     i, j = _widest_pair(x)
-    gap = np.linalg.norm(x[:, None] - x, axis=2)
-    reach = np.linalg.norm(x, axis=1)
+    gap, reach = np.linalg.norm(x[i] - x[j]), np.linalg.norm(x[[i, j]], axis=1)
+    there = np.linalg.norm(onto, axis=1)
     like = (
-        (np.abs(reach[:, None] - reach[i]) <= 2 * tolerance)
-        & (np.abs(reach - reach[j]) <= 2 * tolerance)
-        & (np.abs(gap - gap[i, j]) <= 4 * tolerance)
+        (np.abs(there[:, None] - reach[0]) <= 2 * tolerance)
+        & (np.abs(there - reach[1]) <= 2 * tolerance)
+        & (np.abs(np.linalg.norm(onto[:, None] - onto, axis=2) - gap) <= 4 * tolerance)
     )
     k, m = np.nonzero(like)
     origin = np.zeros((len(k), 3))
     rotation, unique = fit_rotations(
-        sign * np.stack([origin, x[k], x[m]], axis=1), np.stack([origin[0], x[i], x[j]])
+        np.stack([origin, onto[k], onto[m]], axis=1), np.stack([np.zeros(3), x[i], x[j]])
     )
     rotation = rotation[unique]
     for _ in range(3):
-        order = _nearest(rotation, x, sign)
+        order = _nearest(rotation, x, onto)
         order = order[(np.sort(order, axis=1) == np.arange(len(x))).all(axis=1)]
-        rotation, unique = fit_rotations(sign * x[order], x)
+        rotation, unique = fit_rotations(onto[order], x)
         order, rotation = order[unique], rotation[unique]
-    miss = np.linalg.norm(x @ np.swapaxes(rotation, 1, 2) - sign * x[order], axis=2).max(axis=1)
+    miss = np.linalg.norm(x @ np.swapaxes(rotation, 1, 2) - onto[order], axis=2).max(axis=1)
     return order[miss <= tolerance], miss[miss <= tolerance]
 
 
-def _nearest(rotation: Floats, x: Floats, sign: int) -> Ints:
-    """Return which particle's (mirrored) place each turned particle is nearest to, (K, n)."""
+def _nearest(rotation: Floats, x: Floats, onto: Floats) -> Ints:
+    """Return which place each turned particle is nearest to, (K, n)."""
     turned = x @ np.swapaxes(rotation, 1, 2)
-    return np.asarray(np.argmin(np.linalg.norm(turned[:, :, None] - sign * x, axis=3), axis=2))
+    return np.asarray(np.argmin(np.linalg.norm(turned[:, :, None] - onto, axis=3), axis=2))
 
 
 def _widest_pair(x: Floats) -> tuple[int, int]:
