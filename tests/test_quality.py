@@ -142,6 +142,7 @@ def test_quality_survives_json():
         (perrin.Cluster.touching(6, 2.45), "O_h"),
         (perrin.Cluster.from_positions([[0, 0, 0], [3, 0, 0], [0, 2, 0], [0, 0, 1]]), "C_1"),
         (perrin.Cluster.from_positions([[0, 0], [2, 0], [1, 3**0.5]]), "D_3h"),
+        (perrin.Cluster.from_positions([[0, 0], [2, 0]]), "D_inf_h"),
     ],
 )
 def test_the_symmetry_of_a_noisy_shape_is_found(cluster, symbol):

@@ -260,13 +260,14 @@ def point_group(positions: ArrayLike, *, tolerance: float | None = None) -> str:
     'C_2v'
     """
     x = _checked(positions, 0.0 if tolerance is None else tolerance)
+    x = np.pad(x, ((0, 0), (0, 3 - x.shape[1])))
     allowed = 1e-6 * float(np.linalg.norm(x, axis=1).mean()) if tolerance is None else tolerance
     line = _along_line(x, allowed)
     if line is not None:
         if np.abs(line).max() <= allowed:
             return "K_h"
         return "D_inf_h" if len(_line_group(line, 3, allowed)) == 2 else "C_inf_v"
-    return schoenflies(symmetry_elements(np.pad(x, ((0, 0), (0, 3 - x.shape[1]))), allowed))
+    return schoenflies(symmetry_elements(x, allowed))
 
 
 def matching_rotation(x: Floats, onto: Floats, *, tolerance: float) -> Floats | None:
