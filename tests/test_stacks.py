@@ -5,8 +5,10 @@ from __future__ import annotations
 import doctest
 import json
 import pickle
+import sys
 import tracemalloc
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -52,6 +54,24 @@ def test_written_stack_reads_back_exactly(tmp_path, movie, dtype):
         for a, b in zip(again, stack, strict=True):
             np.testing.assert_array_equal(a, b)
             assert a.dtype == b.dtype
+
+
+@pytest.mark.parametrize("shape", [(1, 4, 12, 16), (5, 1, 12, 16), (1, 1, 12, 16), (2, 3, 1, 16)])
+def test_thin_stacks_read_back(tmp_path, shape):
+    """A single stack, a 2-D movie, a single image, a line: the shape is kept."""
+    movie = np.arange(np.prod(shape), dtype=np.uint16).reshape(shape)
+    voxel = (np.nan if shape[1] == 1 else VOXEL[0], *VOXEL[1:])
+    stack = open_stack(movie, voxel=VOXEL[1:] if shape[1] == 1 else VOXEL, dt=DT)
+    write_stack(stack, tmp_path / "a.ome.tif")
+    with open_stack(tmp_path / "a.ome.tif") as again:
+        assert_same(again, movie, voxel=voxel)
+
+
+def test_values_that_ome_has_no_type_for_are_refused(tmp_path, movie):
+    with pytest.raises(ValueError, match="OME-TIFF has no bool"):
+        write_stack(open_stack(movie > 5, **GIVEN), tmp_path / "a.ome.tif")
+    with pytest.raises(ValueError, match=r"written as \.ome\.tif"):
+        write_stack(open_stack(movie, **GIVEN), tmp_path / "a.tif")
 
 
 def test_a_bad_frame_leaves_no_file(tmp_path, movie):
@@ -136,6 +156,8 @@ def test_sequence_of_files(tmp_path, movie, as_glob):
     movie = np.concatenate([movie, movie + 1, movie + 2])  # 15 files
     for i, frame in enumerate(movie):
         tifffile.imwrite(tmp_path / f"t{i}.tif", frame, photometric="minisblack")
+    (tmp_path / "._t0.tif").write_bytes(b"an operating system's own")
+    (tmp_path / "notes.txt").write_text("no image")
     path = f"{tmp_path}/t*.tif" if as_glob else tmp_path
     with open_stack(path, **GIVEN) as stack:
         assert_same(stack, movie)
@@ -303,7 +325,7 @@ def test_another_process_opens_the_file_again(tmp_path, movie):
 def test_missing_reader_is_named(tmp_path, monkeypatch):
     """Without the library of a format the error says what to install."""
     for suffix, module in ((".lif", "liffile"), (".nd2", "nd2"), (".ims", "h5py")):
-        monkeypatch.setitem(__import__("sys").modules, module, None)
+        monkeypatch.setitem(sys.modules, module, None)
         with pytest.raises(ImportError, match=rf"{module}.*pip install 'perrin\[{suffix[1:]}\]'"):
             open_stack(tmp_path / f"a{suffix}")
 
@@ -375,6 +397,42 @@ def test_zeiss(tmp_path, movie):
         open_stack(tmp_path / "a.czi", channel=0)
     with open_stack(tmp_path / "a.czi", channel=1, dt=DT) as stack:
         assert_same(stack, movie // 2)
+
+
+class NikonFile:
+    """A stand-in for nd2.ND2File, with its axes, times and calibration as documented."""
+
+    def __init__(self, path):
+        self.movie = np.load(path)
+        t, z, y, x = self.movie.shape
+        self.sizes = {"T": t, "Z": z, "C": 2, "Y": y, "X": x}
+        self.dtype = self.movie.dtype
+        volume = SimpleNamespace(axesCalibration=VOXEL[::-1], axesCalibrated=(True, True, False))
+        self.metadata = SimpleNamespace(channels=[SimpleNamespace(volume=volume)] * 2)
+
+    def frame_metadata(self, number):
+        time = SimpleNamespace(relativeTimeMs=500.0 + 1e3 * (number // 4 * DT + number % 4 * 0.01))
+        return SimpleNamespace(channels=[SimpleNamespace(time=time)] * 2)
+
+    def read_frame(self, number):
+        plane = self.movie[number // 4, number % 4]
+        return np.stack([plane, plane // 2])
+
+    def close(self):
+        pass
+
+
+def test_nikon(tmp_path, movie, monkeypatch):
+    """Planes, channel and times as nd2 gives them; an axis not calibrated is asked for."""
+    monkeypatch.setitem(sys.modules, "nd2", SimpleNamespace(ND2File=NikonFile))
+    with open(tmp_path / "a.nd2", "wb") as file:
+        np.save(file, movie)
+    with pytest.raises(ValueError, match="no voxel size along z: "):
+        open_stack(tmp_path / "a.nd2", channel=1)
+    with open_stack(tmp_path / "a.nd2", channel=1, voxel=VOXEL) as stack:
+        np.testing.assert_array_equal(stack.frame(3), movie[3] // 2)
+        np.testing.assert_allclose(stack.times, 0.5 + np.arange(5) * DT)
+        assert stack.plane_time == pytest.approx(0.01)
 
 
 def lif_bytes(movie, voxel, dt):

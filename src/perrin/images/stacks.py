@@ -26,6 +26,8 @@ _PathLike: TypeAlias = str | os.PathLike[str]
 # A value of the user's further than this from the file's is told.
 _TELL = 1e-3
 
+_OME_TYPES = ("uint8", "int8", "uint16", "int16", "uint32", "int32", "float32", "float64")
+
 
 @dataclass(frozen=True, eq=False)
 class Stack:
@@ -100,6 +102,8 @@ class Stack:
             raise IndexError(f"{self.source}: no frame {i}: it has {len(self)}, counted from 0")
         try:
             data = self.read(int(i))
+        except MemoryError:
+            raise
         # The readers of damaged files raise whatever their decoders do.
         except Exception as fault:
             raise FrameError(
@@ -225,7 +229,7 @@ def open_stack(
     if isinstance(path, (str, os.PathLike)):
         source = os.fspath(path)
         contents = _opened(source, pick)
-        read: Callable[[int], NDArray[Any]] = _FileFrames(source, pick, contents)
+        read: Callable[[int], NDArray[Any]] = _FileFrames(os.path.abspath(source), pick, contents)
     else:
         source = "array"
         contents, read = _array_contents(path, pick)
@@ -313,7 +317,7 @@ def _settled(
         warnings.warn(
             f"{source}: the values given are used: " + "; ".join(told),
             PrecisionWarning,
-            stacklevel=4,
+            stacklevel=3,
         )
     return size, times, per_plane
 
@@ -386,7 +390,7 @@ def write_stack(stack: Stack, path: _PathLike) -> None:
     Parameters
     ----------
     stack : Stack
-        The movie; values of 8, 16 or 32 bits.
+        The movie; integers of 8 to 32 bits, or floats of 32 or 64.
     path : str or path
         Where to, ending in ``.ome.tif`` or ``.ome.tiff``.
 
@@ -413,11 +417,11 @@ def write_stack(stack: Stack, path: _PathLike) -> None:
     target = Path(path)
     if not target.name.lower().endswith((".ome.tif", ".ome.tiff")):
         raise ValueError(f"{target}: a stack is written as .ome.tif")
-    if np.dtype(stack.dtype).kind not in "uif" or np.dtype(stack.dtype).itemsize > 4:
-        raise ValueError(f"{target}: OME-TIFF has no {stack.dtype}: convert to 8, 16 or 32 bits")
+    if stack.dtype.name not in _OME_TYPES:
+        raise ValueError(f"{target}: OME-TIFF has no {stack.dtype}: expected one of {_OME_TYPES}")
     tifffile = needed("tifffile", "images")
     beside = target.with_name(f".{target.name}.{os.getpid()}.part")
-    n_bytes = int(np.prod(stack.shape)) * np.dtype(stack.dtype).itemsize
+    n_bytes = int(np.prod(stack.shape)) * stack.dtype.itemsize
     try:
         tifffile.imwrite(
             beside,

@@ -211,7 +211,12 @@ def sequence_files(path: str) -> list[str]:
     from glob import glob
 
     inside = Path(path).iterdir() if Path(path).is_dir() else map(Path, glob(path))
-    files = [str(f) for f in inside if f.suffix.lower() in (".tif", ".tiff") and f.is_file()]
+    # Names that begin with a dot are an operating system's own, and halves of files being written.
+    files = [
+        str(f)
+        for f in inside
+        if f.suffix.lower() in (".tif", ".tiff") and f.is_file() and not f.name.startswith(".")
+    ]
     return sorted(files, key=_counted)
 
 

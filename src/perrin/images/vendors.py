@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -215,10 +216,24 @@ def ome_zarr(path: str, pick: Pick) -> Contents:
     sizes = dict(zip(axes, array.shape, strict=True))
     where = layout(sizes, pick)
 
+    depth = array.chunks[list(axes).index("Z")] if "Z" in axes else 1
+
+    # Blocks may be many planes deep: the last one read is kept.
+    @lru_cache(maxsize=1)
+    def block(others: tuple[int, ...], number: int) -> NDArray[Any]:
+        rest = iter(others)
+        span = {
+            "Z": slice(number * depth, (number + 1) * depth),
+            "Y": slice(None),
+            "X": slice(None),
+        }
+        return np.asarray(array[tuple(span.get(a) or next(rest) for a in axes)])
+
     def plane(t: int, z: int) -> NDArray[Any]:
         at = where.at(t, z)
-        index = tuple(slice(None) if a in "YX" else at.get(a, 0) for a in axes)
-        return np.asarray(array[index])
+        others = tuple(at.get(a, 0) for a in axes if a not in "ZYX")
+        planes = block(others, at.get("Z", 0) // depth)
+        return planes[at.get("Z", 0) % depth] if "Z" in axes else planes
 
     return Contents(
         shape=(where.t, where.z, sizes["Y"], sizes["X"]),
