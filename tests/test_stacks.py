@@ -382,6 +382,11 @@ def test_imaris(tmp_path, movie):
             clock[f"TimePoint{t + 1}"] = text(f"2024-03-01 23:59:59.{t * 150:03d}")
     with open_stack(tmp_path / "a.ims") as stack:
         assert_same(stack, movie, dt=0.15)
+    with h5py.File(tmp_path / "a.ims", "a") as file:
+        for t in range(1, 5):
+            del file[f"DataSet/ResolutionLevel 0/TimePoint {t}"]
+    with open_stack(tmp_path / "a.ims", planes=1, dt=0.15) as stack:  # slices are times
+        assert_same(stack, movie[0][:, None], dt=0.15)
 
 
 def test_zeiss(tmp_path, movie):

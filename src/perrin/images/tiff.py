@@ -79,7 +79,10 @@ def tiff(path: str, pick: Pick, *, one_frame: bool = False) -> Contents:
 
 def _cut_short(file: Any) -> bool:  # noqa: ANN401 (tifffile is untyped here)
     """Return whether the chain of images ends otherwise than with the zero that ends it."""
-    file.filehandle.seek(file.pages.next_page_offset)
+    end = file.pages.next_page_offset
+    if end is None:
+        return False
+    file.filehandle.seek(end)
     return any(file.filehandle.read(file.tiff.offsetsize))
 
 

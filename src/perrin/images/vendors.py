@@ -170,8 +170,8 @@ def ims(path: str, pick: Pick) -> Contents:
 
     def plane(t: int, z: int) -> NDArray[Any]:
         at = where.at(t, z)
-        data = finest[f"TimePoint {at['T']}"][f"Channel {at['C']}"]["Data"]
-        return np.asarray(data[at["Z"], : size["Y"], : size["X"]])
+        data = finest[f"TimePoint {at.get('T', 0)}"][f"Channel {at['C']}"]["Data"]
+        return np.asarray(data[at.get("Z", 0), : size["Y"], : size["X"]])
 
     return Contents(
         shape=(where.t, where.z, size["Y"], size["X"]),
