@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from perrin._arrays import (
         DegenerateClusterError,
+        FrameError,
         IdentityWarning,
         PrecisionWarning,
         TooFewFramesError,
@@ -31,6 +32,8 @@ if TYPE_CHECKING:
         size_from_translation,
     )
     from perrin.identity import Identity, settle_identity
+    from perrin.images.render import render_stack
+    from perrin.images.stacks import Stack, open_stack, write_stack
     from perrin.lagged import (
         LagCurve,
         VanHove,
@@ -75,6 +78,7 @@ __all__ = [
     "DegenerateClusterError",
     "DiffusionEstimate",
     "DiffusionTensor",
+    "FrameError",
     "Identity",
     "IdentityWarning",
     "LagCurve",
@@ -92,6 +96,7 @@ __all__ = [
     "SamplingVerdict",
     "Similarity",
     "Size",
+    "Stack",
     "TooFewFramesError",
     "TrackTableError",
     "VanHove",
@@ -121,6 +126,7 @@ __all__ = [
     "msad_vector",
     "msd",
     "noise_floor",
+    "open_stack",
     "orientation_correlation",
     "plan_sampling",
     "point_group",
@@ -128,6 +134,7 @@ __all__ = [
     "quaternion_covariance",
     "read_tracks",
     "remove_rotation",
+    "render_stack",
     "rotation_group",
     "settle_identity",
     "settling_velocity",
@@ -144,6 +151,7 @@ __all__ = [
     "wall_factor",
     "water_viscosity",
     "write_run",
+    "write_stack",
     "write_tracks",
 ]
 
@@ -151,6 +159,7 @@ __all__ = [
 _ROOMS = {
     "_arrays": (
         "DegenerateClusterError",
+        "FrameError",
         "IdentityWarning",
         "PrecisionWarning",
         "TooFewFramesError",
@@ -199,6 +208,8 @@ _ROOMS = {
     ),
     "simulate": ("add_noise", "simulate_motion"),
     "files": ("read_tracks", "write_tracks"),
+    "images.stacks": ("Stack", "open_stack", "write_stack"),
+    "images.render": ("render_stack",),
     "results": ("ClusterResult", "Report", "RodResult", "load_run"),
     "analysis": ("analyze",),
     "report": ("write_run",),

@@ -54,6 +54,23 @@ class TrackTableError(ValueError):
         self.faults = faults
 
 
+class FrameError(ValueError):
+    """One frame of a stack cannot be read; the others may be.
+
+    Attributes
+    ----------
+    frame : int
+        Which frame, from 0.
+    source : str
+        The file.
+    """
+
+    def __init__(self, message: str, frame: int = 0, source: str = "") -> None:
+        super().__init__(message)
+        self.frame = frame
+        self.source = source
+
+
 def table_error(source: str, *faults: str) -> TrackTableError:
     """Return the error that lists all faults of one table."""
     if len(faults) == 1:

@@ -1,0 +1,266 @@
+"""TIFF in its dialects: plain, OME, ImageJ, and sequences of files."""
+
+from __future__ import annotations
+
+import re
+from contextlib import closing
+from math import prod
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from perrin.images.contents import (
+    Contents,
+    Layout,
+    Pick,
+    chosen,
+    even_times,
+    in_seconds,
+    in_um,
+    layout,
+    needed,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from perrin._arrays import Floats
+
+
+class _Scale(NamedTuple):
+    """What a header says of lengths and times."""
+
+    voxel: Floats
+    times: Floats | None = None
+    plane_time: float | None = None
+
+
+class _Declared(NamedTuple):
+    """Images one after the other in a file, as its header declares them."""
+
+    axes: str
+    shape: tuple[int, ...]
+    dtype: np.dtype[Any]
+    dataoffset: int
+
+
+_SILENT = _Scale(np.full(3, np.nan))
+
+
+def tiff(path: str, pick: Pick, *, one_frame: bool = False) -> Contents:
+    """Describe one TIFF file; with `one_frame` all its images are the planes of a single frame."""
+    file = needed("tifffile", "images").TiffFile(path)
+    try:
+        number = chosen([str(series.name) for series in file.series], pick.image)
+        series = _imagej_series(file) or file.series[number]
+        sizes = dict(zip(series.axes, series.shape, strict=True))
+        choice = _whole(sizes, pick) if one_frame else pick
+        where = layout(sizes, choice, cut=_cut_short(file))
+        scale = _scale(file, number, where, pick.channel or 0)
+    except Exception:
+        file.close()
+        raise
+
+    def plane(t: int, z: int) -> NDArray[Any]:
+        return _plane(file, series, where.at(t, z))
+
+    return Contents(
+        shape=(where.t, where.z, sizes["Y"], sizes["X"]),
+        dtype=np.dtype(series.dtype),
+        plane=plane,
+        close=file.close,
+        voxel=scale.voxel,
+        times=scale.times if scale.times is not None else even_times(where.t, np.nan),
+        plane_time=scale.plane_time,
+    )
+
+
+def _cut_short(file: Any) -> bool:  # noqa: ANN401 (tifffile is untyped here)
+    """Return whether the chain of images ends otherwise than with the zero that ends it."""
+    end = file.pages.next_page_offset
+    if end is None:
+        return False
+    file.filehandle.seek(end)
+    return any(file.filehandle.read(file.tiff.offsetsize))
+
+
+def _imagej_series(file: Any) -> _Declared | None:  # noqa: ANN401
+    """Return the images that an ImageJ header declares where the file ends before their last."""
+    header = file.imagej_metadata if file.is_imagej else None
+    page = file.pages.first
+    if not header or len(file.pages) > 1 or not page.is_contiguous:
+        return None
+    axes = {"T": "frames", "Z": "slices", "C": "channels"}
+    shape = (*(int(header.get(name, 1)) for name in axes.values()), *page.shape)
+    start = page.dataoffsets[0]
+    whole = prod(shape) * np.dtype(page.dtype).itemsize
+    if page.axes != "YX" or start + whole <= file.filehandle.size:
+        return None
+    return _Declared("TZCYX", shape, page.dtype, start)
+
+
+def _whole(sizes: Mapping[str, int], pick: Pick) -> Pick:
+    """Return the choice that takes a file for one frame."""
+    if sizes.get("T", 1) > 1:
+        raise ValueError(f"is a movie of {sizes['T']} frames, where one frame was expected")
+    return pick._replace(planes=prod(n for axis, n in sizes.items() if axis not in "CSYX"))
+
+
+def _plane(file: Any, series: Any, at: dict[str, int]) -> NDArray[Any]:  # noqa: ANN401
+    """Read one image (y, x) of a series."""
+    index = [at.get(axis, 0) for axis in series.axes]
+    if any(i >= n for i, n in zip(index, series.shape, strict=True)):
+        raise ValueError("the file ends before it")
+    lead = _leading(series)
+    number = int(np.ravel_multi_index(index[:lead], series.shape[:lead])) if lead else 0
+    block = _stretch(file, series, number, lead)
+    inside = (
+        slice(None) if axis in "YX" else i
+        for axis, i in zip(series.axes[lead:], index[lead:], strict=True)
+    )
+    return np.asarray(block[tuple(inside)])
+
+
+def _leading(series: Any) -> int:  # noqa: ANN401
+    """Return how many axes count images; the others lie within one (Y, X, colours)."""
+    return min(str(series.axes).index(axis) for axis in "YX" + ("S" if "S" in series.axes else ""))
+
+
+def _stretch(file: Any, series: Any, number: int, lead: int) -> NDArray[Any]:  # noqa: ANN401
+    """Read the images that belong to one index, (Y, X) or with colours.
+
+    Of a contiguous file the header may list the first page only, so the bytes are counted.
+    """
+    block = series.shape[lead:]
+    if series.dataoffset is None:
+        page = series.pages[number] if number < len(series.pages) else None
+        if page is None:
+            raise ValueError(f"image {number} is not in the file")
+        return np.asarray(page.asarray().reshape(block))
+    dtype = np.dtype(series.dtype).newbyteorder(file.byteorder)
+    n_bytes = prod(block) * dtype.itemsize
+    file.filehandle.seek(series.dataoffset + number * n_bytes)
+    data = file.filehandle.read(n_bytes)
+    if len(data) < n_bytes:
+        raise ValueError(f"the file ends before or within image {number}")
+    return np.frombuffer(data, dtype=dtype).reshape(block)
+
+
+def _scale(file: Any, number: int, where: Layout, channel: int) -> _Scale:  # noqa: ANN401
+    """Read voxel size and times from the dialect of the file."""
+    if file.is_ome:
+        return _ome(file.ome_metadata, number, where, channel)
+    if file.is_imagej:
+        return _imagej(file, where)
+    return _SILENT
+
+
+def _ome(xml: str, number: int, where: Layout, channel: int) -> _Scale:
+    """Read the OME header: pixel sizes, and times measured plane by plane or an interval."""
+    from xml.etree import ElementTree
+
+    pixels = [e for e in ElementTree.fromstring(xml).iter() if e.tag.endswith("}Pixels")][number]
+    voxel = np.array(
+        [
+            in_um(
+                pixels.get(f"PhysicalSize{axis}"), pixels.get(f"PhysicalSize{axis}Unit", "\u00b5m")
+            )
+            for axis in "ZYX"
+        ]
+    )
+    step = in_seconds(pixels.get("TimeIncrement"), pixels.get("TimeIncrementUnit", "s"))
+    clock = np.full((where.t, where.z), np.nan)
+    for e in pixels:
+        if e.tag.endswith("}Plane") and e.get("DeltaT") and int(e.get("TheC", 0)) == channel:
+            t, z = int(e.get("TheT", 0)), int(e.get("TheZ", 0))
+            if t < where.t and z < where.z:
+                unit = in_seconds(1.0, e.get("DeltaTUnit", "s"))
+                clock[t, z] = float(e.get("DeltaT", "nan")) * unit
+    return _clocked(voxel, clock, even_times(where.t, step))
+
+
+def _clocked(voxel: Floats, clock: Floats, even: Floats | None) -> _Scale:
+    """Take the times of planes (t, z) where all frames have them, else the even ones."""
+    start = clock[:, 0]
+    steps = np.diff(clock, axis=1)
+    steps = steps[np.isfinite(steps)]
+    per_plane = float(np.median(steps)) if steps.size else 0.0
+    measured = bool(np.all(np.isfinite(start)) and np.all(np.diff(start) > 0))
+    return _Scale(voxel, start if measured else even, per_plane if per_plane > 0 else None)
+
+
+def _imagej(file: Any, where: Layout) -> _Scale:  # noqa: ANN401
+    """Read the ImageJ header: unit, spacing, interval, and the resolution tags in that unit."""
+    header = file.imagej_metadata or {}
+    unit = header.get("unit")
+    tags = file.pages[0].tags
+
+    def size(tag: str) -> float:
+        if tag not in tags or not all(tags[tag].value):
+            return float("nan")
+        count, length = tags[tag].value
+        return in_um(length / count, unit)
+
+    voxel = np.array([in_um(header.get("spacing"), unit), size("YResolution"), size("XResolution")])
+    rate = float(header.get("fps") or 0)
+    step = in_seconds(header.get("finterval") or (1 / rate if rate > 0 else None), "s")
+    return _Scale(voxel, even_times(where.t, step))
+
+
+def sequence_files(path: str) -> list[str]:
+    """Return the TIFF files of a folder or a glob, in the order of the numbers in their names."""
+    from glob import glob
+
+    inside = Path(path).iterdir() if Path(path).is_dir() else map(Path, glob(path))
+    # Names that begin with a dot are an operating system's own, and halves of files being written.
+    files = [
+        str(f)
+        for f in inside
+        if f.suffix.lower() in (".tif", ".tiff") and f.is_file() and not f.name.startswith(".")
+    ]
+    return sorted(files, key=_counted)
+
+
+def _counted(path: str) -> list[int | str]:
+    """Sort key that puts t9 before t10."""
+    return [int(part) if part.isdigit() else part for part in re.split(r"([0-9]+)", path)]
+
+
+def sequence(path: str, pick: Pick) -> Contents:
+    """Describe a folder or glob of TIFF files.
+
+    A file of several images is one frame; files of one image each are counted in `pick.planes`.
+    """
+    files = sequence_files(path)
+    if not files:
+        raise ValueError("has no .tif or .tiff file")
+    if len(files) == 1:
+        return tiff(files[0], pick)
+    first = tiff(files[0], pick, one_frame=True)
+    first.close()
+    _, inner, y, x = first.shape
+    outer = Pick(planes=pick.planes if inner == 1 else 1)
+    if inner > 1 and pick.planes not in (None, inner):
+        raise ValueError(f"has files of {inner} images each, not planes={pick.planes}")
+    where = layout({"I": len(files)}, outer)
+
+    def plane(t: int, z: int) -> NDArray[Any]:
+        number, k = (t, z) if inner > 1 else (t * where.z + z, 0)
+        with closing(tiff(files[number], pick, one_frame=True)) as file:
+            if file.shape != first.shape or file.dtype != first.dtype:
+                raise ValueError(
+                    f"{files[number]} is {file.shape[1:]} {file.dtype}, the first file "
+                    f"{first.shape[1:]} {first.dtype}"
+                )
+            return file.plane(0, k)
+
+    return Contents(
+        shape=(where.t, inner if inner > 1 else where.z, y, x),
+        dtype=first.dtype,
+        plane=plane,
+        close=lambda: None,
+        voxel=first.voxel,
+        times=even_times(where.t, np.nan),
+    )

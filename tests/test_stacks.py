@@ -1,0 +1,513 @@
+"""Stacks of every format come back as they were written, and say what is wrong with them."""
+
+from __future__ import annotations
+
+import doctest
+import json
+import pickle
+import sys
+import tracemalloc
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import perrin
+from perrin import FrameError, PrecisionWarning, open_stack, write_stack
+
+tifffile = pytest.importorskip("tifffile")
+
+VOXEL, DT = (0.25, 0.2, 0.1), 0.73
+GIVEN = {"voxel": VOXEL, "dt": DT}
+
+
+@pytest.fixture
+def movie():
+    return np.random.default_rng(1).integers(0, 60000, (5, 4, 12, 16), dtype=np.uint16)
+
+
+def assert_same(stack, movie, voxel=VOXEL, dt=DT):
+    """Compare voxels bit by bit, sizes and times."""
+    assert stack.shape == movie.shape
+    assert stack.dtype == movie.dtype
+    for i in range(len(movie)):
+        np.testing.assert_array_equal(stack.frame(i), movie[i])
+    np.testing.assert_allclose(stack.voxel, voxel, rtol=1e-6)  # rational tags, float32 headers
+    np.testing.assert_allclose(stack.times, np.arange(len(movie)) * dt, rtol=1e-6)
+
+
+@pytest.mark.parametrize("dtype", ["uint8", "uint16", "int16", "float32"])
+def test_written_stack_reads_back_exactly(tmp_path, movie, dtype):
+    """Voxels, voxel size and uneven times come back to the last bit."""
+    source = open_stack(
+        movie.astype(dtype), voxel=(0.1 + 0.2, 1 / 3, 0.1), dt=1 / 7, plane_time=0.01
+    )
+    uneven = source.times + np.array([0, 1, 0, 2, 0]) * 0.0123456789
+    stack = perrin.Stack(source.shape, source.dtype, source.voxel, uneven, 0.01, "x", source.read)
+    write_stack(stack, tmp_path / "movie.ome.tif")
+    assert [f.name for f in tmp_path.iterdir()] == ["movie.ome.tif"]
+    with open_stack(tmp_path / "movie.ome.tif") as again:
+        np.testing.assert_array_equal(again.voxel, stack.voxel)
+        np.testing.assert_array_equal(again.times, stack.times)
+        assert again.plane_time == pytest.approx(0.01, rel=1e-12)  # a difference of two times
+        for a, b in zip(again, stack, strict=True):
+            np.testing.assert_array_equal(a, b)
+            assert a.dtype == b.dtype
+
+
+@pytest.mark.parametrize("shape", [(1, 4, 12, 16), (5, 1, 12, 16), (1, 1, 12, 16), (2, 3, 1, 16)])
+def test_thin_stacks_read_back(tmp_path, shape):
+    """A single stack, a 2-D movie, a single image, a line: the shape is kept."""
+    movie = np.arange(np.prod(shape), dtype=np.uint16).reshape(shape)
+    voxel = (np.nan if shape[1] == 1 else VOXEL[0], *VOXEL[1:])
+    stack = open_stack(movie, voxel=VOXEL[1:] if shape[1] == 1 else VOXEL, dt=DT)
+    write_stack(stack, tmp_path / "a.ome.tif")
+    with open_stack(tmp_path / "a.ome.tif") as again:
+        assert_same(again, movie, voxel=voxel)
+
+
+def test_values_that_ome_has_no_type_for_are_refused(tmp_path, movie):
+    with pytest.raises(ValueError, match="OME-TIFF has no bool"):
+        write_stack(open_stack(movie > 5, **GIVEN), tmp_path / "a.ome.tif")
+    with pytest.raises(ValueError, match=r"written as \.ome\.tif"):
+        write_stack(open_stack(movie, **GIVEN), tmp_path / "a.tif")
+
+
+def test_a_bad_frame_leaves_no_file(tmp_path, movie):
+    """A stack that cannot be read to its end is not written, and nothing is left."""
+
+    def read(i):
+        if i == 3:
+            raise OSError("bad sector")
+        return movie[i]
+
+    stack = perrin.Stack(movie.shape, movie.dtype, np.array(VOXEL), np.arange(5.0), None, "x", read)
+    with pytest.raises(FrameError, match="frame 3 of 5 cannot be read: bad sector"):
+        write_stack(stack, tmp_path / "movie.ome.tif")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("axes", ["TZYX", "ZTYX"])
+def test_ome_axes_units_and_interval(tmp_path, movie, axes):
+    """An OME file says which axis is time; units are converted."""
+    header = {"axes": axes, "TimeIncrement": DT * 1e3, "TimeIncrementUnit": "ms"}
+    for axis, length in zip("ZYX", VOXEL, strict=True):
+        header |= {f"PhysicalSize{axis}": length * 1e3, f"PhysicalSize{axis}Unit": "nm"}
+    data = movie if axes == "TZYX" else movie.swapaxes(0, 1)
+    tifffile.imwrite(tmp_path / "a.ome.tif", data, ome=True, metadata=header, compression="zlib")
+    with open_stack(tmp_path / "a.ome.tif") as stack:
+        assert_same(stack, movie)
+        assert stack.plane_time is None
+
+
+@pytest.mark.parametrize("byteorder", ["<", ">"])
+def test_imagej_hyperstack(tmp_path, movie, byteorder):
+    """An ImageJ file has its spacing in a header and its pixel size in the resolution tags."""
+    tifffile.imwrite(
+        tmp_path / "a.tif",
+        movie,
+        imagej=True,
+        byteorder=byteorder,
+        resolution=(1 / VOXEL[2], 1 / VOXEL[1]),
+        metadata={"axes": "TZYX", "spacing": VOXEL[0], "unit": "micron", "finterval": DT},
+    )
+    with open_stack(tmp_path / "a.tif") as stack:
+        assert_same(stack, movie)
+
+
+def test_channels_are_chosen_not_guessed(tmp_path, movie):
+    """Several channels are refused unless one is named."""
+    both = np.stack([movie, movie[::-1]], axis=2)
+    path = tmp_path / "a.tif"
+    tifffile.imwrite(path, both, imagej=True, metadata={"axes": "TZCYX"})
+    with pytest.raises(ValueError, match="2 channels: pass channel=0 to 1"):
+        open_stack(path, **GIVEN)
+    with pytest.raises(ValueError, match="no channel 2"):
+        open_stack(path, channel=2, **GIVEN)
+    for channel, wanted in ((0, movie), (1, movie[::-1])):
+        with open_stack(path, channel=channel, **GIVEN) as stack:
+            assert_same(stack, wanted)
+
+
+def test_a_plain_tiff_says_nothing_and_nothing_is_guessed(tmp_path, movie):
+    """Pages may be times or planes; sizes and times are asked for, all at once."""
+    path = tmp_path / "a.tif"
+    with tifffile.TiffWriter(path) as file:
+        for page in movie.reshape(-1, 12, 16):
+            file.write(page, contiguous=False, metadata=None)
+    with pytest.raises(ValueError, match="20 images are times or planes: pass planes=1"):
+        open_stack(path, **GIVEN)
+    with pytest.raises(ValueError, match="do not make whole frames of planes=3"):
+        open_stack(path, planes=3, **GIVEN)
+    with pytest.raises(ValueError, match=r"along z, y, x: pass voxel=.*; no times.*pass dt="):
+        open_stack(path, planes=4)
+    with open_stack(path, planes=4, **GIVEN) as stack:
+        assert_same(stack, movie)
+    with open_stack(path, voxel=(0.2, 0.1), dt=DT) as stack:  # (y, x): a 2-D movie
+        assert_same(stack, movie.reshape(20, 1, 12, 16), voxel=(np.nan, 0.2, 0.1))
+    with open_stack(path, planes=20, voxel=VOXEL) as stack:  # one stack needs no dt
+        assert_same(stack, movie.reshape(1, 20, 12, 16))
+
+
+@pytest.mark.parametrize("as_glob", [False, True])
+def test_sequence_of_files(tmp_path, movie, as_glob):
+    """A file per frame, or a file per plane, in the order of the numbers: 9 before 10."""
+    movie = np.concatenate([movie, movie + 1, movie + 2])  # 15 files
+    for i, frame in enumerate(movie):
+        tifffile.imwrite(tmp_path / f"t{i}.tif", frame, photometric="minisblack")
+    (tmp_path / "._t0.tif").write_bytes(b"an operating system's own")
+    (tmp_path / "notes.txt").write_text("no image")
+    path = f"{tmp_path}/t*.tif" if as_glob else tmp_path
+    with open_stack(path, **GIVEN) as stack:
+        assert_same(stack, movie)
+    with pytest.raises(ValueError, match="files of 4 images each, not planes=5"):
+        open_stack(path, planes=5, **GIVEN)
+    (tmp_path / "planes").mkdir()
+    for i, plane in enumerate(movie.reshape(-1, 12, 16)):
+        tifffile.imwrite(tmp_path / "planes" / f"p{i}.tif", plane)
+    with open_stack(tmp_path / "planes", planes=4, **GIVEN) as stack:
+        assert_same(stack, movie)
+    tifffile.imwrite(tmp_path / "t3.tif", movie[0, :2], photometric="minisblack")
+    with open_stack(path, **GIVEN) as stack:
+        np.testing.assert_array_equal(stack.frame(4), movie[4])
+        with pytest.raises(FrameError, match=r"frame 3 .*t3.tif is \(2, 12, 16\)"):
+            stack.frame(3)
+
+
+def test_values_given_win_and_are_told(tmp_path, movie):
+    """The user's voxel size and interval are used beside the file's; the difference is told."""
+    write_stack(open_stack(movie, **GIVEN), tmp_path / "a.ome.tif")
+    with pytest.warns(PrecisionWarning, match=r"voxel z 0.3 \(in the file 0.25\); dt 0.7 \(in"):
+        stack = open_stack(tmp_path / "a.ome.tif", voxel=(0.3, 0.2, 0.1), dt=0.7)
+    with stack:
+        assert_same(stack, movie, voxel=(0.3, 0.2, 0.1), dt=0.7)
+    with open_stack(tmp_path / "a.ome.tif", **GIVEN) as stack:  # the same values: no word
+        assert_same(stack, movie)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"voxel": (0, 0.2, 0.2), "dt": 1}, "expected lengths > 0"),
+        ({"voxel": (0.2, 0.2), "dt": 1}, "has no frames of planes=1"),
+        ({"voxel": 0.2, "dt": 1}, r"voxel: expected \(z, y, x\)"),
+        ({"voxel": VOXEL, "dt": -1}, "dt: expected seconds > 0"),
+        ({"voxel": VOXEL, "dt": 1, "plane_time": -1}, "plane_time: expected"),
+        ({}, "pass voxel=.*pass dt="),
+    ],
+)
+def test_bad_values_are_refused(movie, given, message):
+    with pytest.raises(ValueError, match=message):
+        open_stack(movie, **given)
+
+
+def test_arrays(movie):
+    """Arrays (t, z, y, x), (z, y, x) and, with a voxel (y, x), (t, y, x)."""
+    assert_same(open_stack(movie, **GIVEN), movie)
+    assert_same(open_stack(movie[0], voxel=VOXEL), movie[:1])
+    flat = open_stack(movie[:, 0], voxel=VOXEL[1:], dt=DT)
+    assert_same(flat, movie[:, :1], voxel=(np.nan, *VOXEL[1:]))
+    assert "shape=(5, 4, 12, 16)" in repr(open_stack(movie, **GIVEN))
+    with pytest.raises(IndexError, match="no frame 5: it has 5"):
+        flat.frame(5)
+
+
+def test_an_imagej_file_cut_short_keeps_its_good_frames(tmp_path, movie):
+    """The header says how many frames there were; the lost ones are FrameErrors."""
+    path = tmp_path / "a.tif"
+    tifffile.imwrite(path, movie, imagej=True, metadata={"axes": "TZYX"})
+    path.write_bytes(path.read_bytes()[: 1000 + 3 * movie[0].nbytes])
+    with open_stack(path, **GIVEN) as stack:
+        assert stack.shape == movie.shape
+        for i in range(3):
+            np.testing.assert_array_equal(stack.frame(i), movie[i])
+        for i in (3, 4):
+            with pytest.raises(FrameError, match=f"frame {i} of 5 cannot be read: the file ends"):
+                stack.frame(i)
+
+
+def test_pages_cut_short_keep_their_good_frames(tmp_path, movie):
+    """A file that does not say how many frames it had: the one in which it ends is the last."""
+    path = tmp_path / "a.tif"
+    with tifffile.TiffWriter(path) as file:
+        for page in movie.reshape(-1, 12, 16):
+            file.write(page, contiguous=False, metadata=None)
+    path.write_bytes(path.read_bytes()[: path.stat().st_size * 11 // 20])
+    with open_stack(path, planes=4, **GIVEN) as stack:
+        assert len(stack) == 3
+        np.testing.assert_array_equal(stack.frame(1), movie[1])
+        with pytest.raises(FrameError, match="frame 2 of 3 cannot be read: ") as caught:
+            stack.frame(2)
+    assert caught.value.frame == 2
+
+
+def test_an_ome_chain_cut_short_keeps_its_good_frames(tmp_path, movie):
+    """The OME header counts: images missing from the chain are FrameErrors."""
+    path = tmp_path / "a.ome.tif"
+    tifffile.imwrite(path, movie, ome=True, metadata={"axes": "TZYX"}, compression="zlib")
+    with tifffile.TiffFile(path) as file:
+        page = file.pages[10]
+        link = page.offset + 2 + 12 * len(page.tags)
+    data = bytearray(path.read_bytes())
+    data[link : link + 4] = bytes(4)
+    path.write_bytes(data)
+    with open_stack(path, **GIVEN) as stack:
+        assert stack.shape == movie.shape
+        np.testing.assert_array_equal(stack.frame(1), movie[1])
+        with pytest.raises(FrameError, match="frame 2 of 5 cannot be read: image 11 is not in"):
+            stack.frame(2)
+
+
+def test_an_ome_file_without_its_header_is_refused(tmp_path, movie):
+    """The header of a written stack is at its end: half the file is no stack."""
+    path = tmp_path / "a.ome.tif"
+    write_stack(open_stack(movie, **GIVEN), path)
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    for planes in (None, 4):
+        with pytest.raises(ValueError, match="cut short"):
+            open_stack(path, planes=planes, **GIVEN)
+
+
+def test_corrupt_frame_is_named(tmp_path, movie):
+    """Damaged bytes within a frame spoil that frame alone."""
+    path = tmp_path / "a.ome.tif"
+    tifffile.imwrite(path, movie, ome=True, metadata={"axes": "TZYX"}, compression="zlib")
+    with tifffile.TiffFile(path) as file:
+        offset = file.pages[9].dataoffsets[0]
+    data = bytearray(path.read_bytes())
+    data[offset : offset + 40] = b"\xff" * 40
+    path.write_bytes(data)
+    with open_stack(path, **GIVEN) as stack:
+        for i in (0, 1, 3, 4):
+            np.testing.assert_array_equal(stack.frame(i), movie[i])
+        with pytest.raises(FrameError, match="frame 2 of 5 cannot be read") as caught:
+            stack.frame(2)
+    assert (caught.value.frame, caught.value.source) == (2, str(path))
+
+
+@pytest.mark.parametrize("content", [b"", b"not a tiff at all", b"II*\x00\x08\x00\x00\x00\xff"])
+def test_no_tiff_at_all(tmp_path, content):
+    """Files that are none are refused under their name; a missing one is missing."""
+    (tmp_path / "a.tif").write_bytes(content)
+    with pytest.raises(ValueError, match=r"a\.tif: "):
+        open_stack(tmp_path / "a.tif", **GIVEN)
+    with pytest.raises(FileNotFoundError):
+        open_stack(tmp_path / "b.tif", **GIVEN)
+
+
+def test_memory_stays_under_three_frames(tmp_path):
+    """A pass through a movie of 30 frames holds less than three at any moment."""
+    frame = np.zeros((16, 128, 128), dtype=np.uint16)
+    movie = open_stack(np.broadcast_to(frame, (30, *frame.shape)), **GIVEN)
+    path = tmp_path / "a.ome.tif"
+    write_stack(movie, path)
+    with open_stack(path) as stack:
+        stack.frame(0)
+        tracemalloc.start()
+        for i in range(len(stack)):
+            stack.frame(i)
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+    assert peak < 3 * frame.nbytes
+
+
+def test_another_process_opens_the_file_again(tmp_path, movie):
+    """A stack is sent as a path, whatever it has open."""
+    write_stack(open_stack(movie, **GIVEN), tmp_path / "a.ome.tif")
+    with open_stack(tmp_path / "a.ome.tif") as stack:
+        sent = pickle.dumps(stack)
+        assert len(sent) < 2000
+        with pickle.loads(sent) as other:
+            assert_same(other, movie)
+
+
+def test_missing_reader_is_named(tmp_path, monkeypatch):
+    """Without the library of a format the error says what to install."""
+    for suffix, module in ((".lif", "liffile"), (".nd2", "nd2"), (".ims", "h5py")):
+        monkeypatch.setitem(sys.modules, module, None)
+        with pytest.raises(ImportError, match=rf"{module}.*pip install 'perrin\[{suffix[1:]}\]'"):
+            open_stack(tmp_path / f"a{suffix}")
+
+
+@pytest.mark.parametrize("version", ["0.4", "0.5"])
+def test_ome_zarr(tmp_path, movie, version):
+    """OME-Zarr as its two specifications write it: finest level, scales multiplied, units."""
+    zarr = pytest.importorskip("zarr", minversion="3")
+    group = zarr.open_group(tmp_path / "a.zarr", mode="w", zarr_format=2 if version == "0.4" else 3)
+    group.create_array("0", data=movie, chunks=(1, 2, 8, 8))
+    scales = {
+        "axes": [{"name": "t", "type": "time", "unit": "millisecond"}]
+        + [{"name": a, "type": "space", "unit": "nanometer"} for a in "zyx"],
+        "datasets": [
+            {
+                "path": "0",
+                "coordinateTransformations": [
+                    {"type": "scale", "scale": [1.0, *(1e3 * v for v in VOXEL)]}
+                ],
+            }
+        ],
+        "coordinateTransformations": [{"type": "scale", "scale": [DT * 1e3, 1.0, 1.0, 1.0]}],
+    }
+    if version == "0.4":
+        group.attrs["multiscales"] = [scales]
+    else:
+        group.attrs["ome"] = {"version": "0.5", "multiscales": [scales]}
+    with open_stack(tmp_path / "a.zarr") as stack:
+        assert_same(stack, movie)
+    array = zarr.open_group(tmp_path / "a.zarr", mode="r")["0"]
+    assert_same(open_stack(array, **GIVEN), movie)
+
+
+def test_imaris(tmp_path, movie):
+    """An Imaris file: blocks padded beyond the image, sizes from its extent, times of day."""
+    h5py = pytest.importorskip("h5py")
+
+    def text(value):
+        return np.array(list(str(value)), dtype="S1")
+
+    with h5py.File(tmp_path / "a.ims", "w") as file:
+        for t, frame in enumerate(movie):
+            padded = np.pad(frame, ((0, 2), (0, 4), (0, 0)))
+            where = f"DataSet/ResolutionLevel 0/TimePoint {t}/Channel 0/Data"
+            file.create_dataset(where, data=padded, chunks=(2, 8, 8))
+        about = file.create_group("DataSetInfo/Image").attrs
+        for i, axis in enumerate("XYZ"):
+            n = movie.shape[3 - i]
+            about[axis] = text(n)
+            about[f"ExtMin{i}"], about[f"ExtMax{i}"] = text(-1.5), text(-1.5 + n * VOXEL[2 - i])
+        about["Unit"] = text("um")
+        clock = file.create_group("DataSetInfo/TimeInfo").attrs
+        for t in range(5):
+            clock[f"TimePoint{t + 1}"] = text(f"2024-03-01 23:59:59.{t * 150:03d}")
+    with open_stack(tmp_path / "a.ims") as stack:
+        assert_same(stack, movie, dt=0.15)
+    with h5py.File(tmp_path / "a.ims", "a") as file:
+        for t in range(1, 5):
+            del file[f"DataSet/ResolutionLevel 0/TimePoint {t}"]
+    with open_stack(tmp_path / "a.ims", planes=1, dt=0.15) as stack:  # slices are times
+        assert_same(stack, movie[0][:, None], dt=0.15)
+
+
+def test_zeiss(tmp_path, movie):
+    """A .czi file written by Zeiss's own library, two channels."""
+    czi = pytest.importorskip("pylibCZIrw.czi")
+    with czi.create_czi(str(tmp_path / "a.czi")) as file:
+        for t, z, c in np.ndindex(5, 4, 2):
+            plane = {"T": t, "Z": z, "C": c}
+            file.write(movie[t, z, :, :, None] // (c + 1), plane=plane)
+        x, y, z = (1e-6 * length for length in VOXEL[::-1])
+        file.write_metadata("a", scale_x=x, scale_y=y, scale_z=z)
+    with pytest.raises(ValueError, match="no times of its 5 frames: pass dt="):
+        open_stack(tmp_path / "a.czi", channel=0)
+    with open_stack(tmp_path / "a.czi", channel=1, dt=DT) as stack:
+        assert_same(stack, movie // 2)
+
+
+class NikonFile:
+    """A stand-in for nd2.ND2File, with its axes, times and calibration as documented."""
+
+    def __init__(self, path):
+        self.movie = np.load(path)
+        t, z, y, x = self.movie.shape
+        self.sizes = {"T": t, "Z": z, "C": 2, "Y": y, "X": x}
+        self.dtype = self.movie.dtype
+        volume = SimpleNamespace(axesCalibration=VOXEL[::-1], axesCalibrated=(True, True, False))
+        self.metadata = SimpleNamespace(channels=[SimpleNamespace(volume=volume)] * 2)
+
+    def frame_metadata(self, number):
+        time = SimpleNamespace(relativeTimeMs=500.0 + 1e3 * (number // 4 * DT + number % 4 * 0.01))
+        return SimpleNamespace(channels=[SimpleNamespace(time=time)] * 2)
+
+    def read_frame(self, number):
+        plane = self.movie[number // 4, number % 4]
+        return np.stack([plane, plane // 2])
+
+    def close(self):
+        pass
+
+
+def test_nikon(tmp_path, movie, monkeypatch):
+    """Planes, channel and times as nd2 gives them; an axis not calibrated is asked for."""
+    monkeypatch.setitem(sys.modules, "nd2", SimpleNamespace(ND2File=NikonFile))
+    with open(tmp_path / "a.nd2", "wb") as file:
+        np.save(file, movie)
+    with pytest.raises(ValueError, match="no voxel size along z: "):
+        open_stack(tmp_path / "a.nd2", channel=1)
+    with open_stack(tmp_path / "a.nd2", channel=1, voxel=VOXEL) as stack:
+        np.testing.assert_array_equal(stack.frame(3), movie[3] // 2)
+        np.testing.assert_allclose(stack.times, 0.5 + np.arange(5) * DT)
+        assert stack.plane_time == pytest.approx(0.01)
+
+
+def lif_bytes(movie, voxel, dt):
+    """Return a small Leica file: an XML header in UTF-16, then one block of memory."""
+    t, z, y, x = movie.shape
+    step = movie.itemsize
+    dimensions = ""
+    for number, n, length, unit in (
+        (1, x, voxel[2] * 1e-6, "m"),
+        (2, y, voxel[1] * 1e-6, "m"),
+        (3, z, voxel[0] * 1e-6, "m"),
+        (4, t, dt, "s"),
+    ):
+        dimensions += (
+            f'<DimensionDescription DimID="{number}" NumberOfElements="{n}" Origin="0" '
+            f'Length="{(n - 1) * length!r}" Unit="{unit}" BitInc="0" BytesInc="{step}"/>'
+        )
+        step *= n
+    image = (
+        '<Data><Image><ImageDescription><Channels><ChannelDescription DataType="0" ChannelTag="0" '
+        'Resolution="16" NameOfMeasuredQuantity="" Min="0" Max="65535" Unit="" LUTName="Gray" '
+        'IsLUTInverted="0" BytesInc="0" BitInc="0"/></Channels>'
+        f"<Dimensions>{dimensions}</Dimensions></ImageDescription></Image></Data>"
+        f'<Memory Size="{movie.nbytes}" MemoryBlockID="MemBlock_1"/>'
+    )
+    xml = (
+        '<LMSDataContainerHeader Version="2"><Element Name="a.lif"><Memory Size="0" '
+        'MemoryBlockID="MemBlock_0"/><Children><Element Name="Series001" UniqueID="1">'
+        f"{image}</Element></Children></Element></LMSDataContainerHeader>"
+    ).encode("utf-16-le")
+
+    def number(value, n=4):
+        return int(value).to_bytes(n, "little")
+
+    def block(name, data):
+        text = name.encode("utf-16-le")
+        head = b"\x2a" + number(len(data), 8) + b"\x2a" + number(len(name)) + text
+        return number(0x70) + number(len(head)) + head + data
+
+    start = number(0x70) + number(len(xml) + 5) + b"\x2a" + number(len(xml) // 2) + xml
+    return start + block("MemBlock_0", b"") + block("MemBlock_1", movie.tobytes())
+
+
+def test_leica(tmp_path, movie):
+    """A .lif file laid out as Leica does; cut short, it keeps its good frames."""
+    pytest.importorskip("liffile")
+    data = lif_bytes(movie, VOXEL, DT)
+    (tmp_path / "a.lif").write_bytes(data)
+    with open_stack(tmp_path / "a.lif") as stack:
+        assert_same(stack, movie)
+    (tmp_path / "b.lif").write_bytes(data[: -movie[0].nbytes])
+    with open_stack(tmp_path / "b.lif") as stack:
+        np.testing.assert_array_equal(stack.frame(3), movie[3])
+        with pytest.raises(FrameError, match="frame 4 of 5"):
+            stack.frame(4)
+
+
+def test_zarr_folder_without_scales(tmp_path):
+    """A zarr folder that is no OME-Zarr is refused with the way out."""
+    pytest.importorskip("zarr")
+    (tmp_path / "a.zarr").mkdir()
+    header = {"zarr_format": 3, "node_type": "group", "attributes": {}}
+    (tmp_path / "a.zarr" / "zarr.json").write_text(json.dumps(header))
+    with pytest.raises(ValueError, match="without OME-Zarr"):
+        open_stack(tmp_path / "a.zarr", **GIVEN)
+
+
+def test_the_page_about_stacks_runs():
+    """The example of docs/stacks.md prints what the page says."""
+    page = Path(__file__).resolve().parents[1] / "docs" / "stacks.md"
+    result = doctest.testfile(str(page), module_relative=False)
+    assert result.attempted > 0
+    assert result.failed == 0
