@@ -31,6 +31,8 @@ if TYPE_CHECKING:
         size_from_translation,
     )
     from perrin.identity import Identity, settle_identity
+    from perrin.images.locate import fit_pose, locate
+    from perrin.images.optics import Optics
     from perrin.lagged import (
         LagCurve,
         VanHove,
@@ -78,6 +80,7 @@ __all__ = [
     "LagCurve",
     "Mobility",
     "NoiseFloor",
+    "Optics",
     "PrecisionWarning",
     "Quality",
     "QuaternionCovariance",
@@ -107,12 +110,14 @@ __all__ = [
     "find_clusters",
     "fit_gls",
     "fit_line",
+    "fit_pose",
     "gravitational_height",
     "identify",
     "judge_quality",
     "judge_sampling",
     "kabsch",
     "load_run",
+    "locate",
     "msad",
     "msad_axes",
     "msad_vector",
@@ -195,6 +200,8 @@ _ROOMS = {
     ),
     "simulate": ("add_noise", "simulate_motion"),
     "files": ("read_tracks", "write_tracks"),
+    "images.optics": ("Optics",),
+    "images.locate": ("fit_pose", "locate"),
     "results": ("ClusterResult", "Report", "RodResult", "load_run"),
     "analysis": ("analyze",),
     "report": ("write_run",),

@@ -1,0 +1,1 @@
+"""From a microscope stack to particles: what spheres look like, where they are."""
