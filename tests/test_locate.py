@@ -233,6 +233,22 @@ def test_a_frame_without_spheres_has_no_rows(tetrahedra, learned):
     assert table["frame"].tolist() == [0, 0, 0, 0]
 
 
+def test_a_sphere_cut_by_the_border_is_found_when_asked_for(tetrahedra, learned):
+    """Cut near a sphere's middle: all four are found within their errors; else chi2 tells."""
+    movie, _, places = tetrahedra
+    cut = int(places[0][:, 0].min() / VOXEL[2]) - 2
+    stack = Movie(movie.frames[:1, :, :, cut:])
+    asked = {"diameter": DIAMETER, "contact": DIAMETER, "optics": learned}
+    truth = places[:1] - [cut * VOXEL[2], 0, 0]
+    partial = perrin.locate(stack, border=False, **asked)
+    assert len(partial) < 4
+    assert partial["chi2"].min() > 2
+    table = perrin.locate(stack, **asked)
+    found, rows = in_true_order(table, truth)
+    sigma = table[["sigma_x", "sigma_y", "sigma_z"]].to_numpy()[rows]
+    assert np.all(np.abs(found - truth) < 4.5 * sigma)
+
+
 def test_masses_without_a_gap_are_said_to_have_none():
     """A clear gap is found wherever noise lies; a smooth spread of masses is a warning."""
     real = np.linspace(20000, 30500, 40)
@@ -240,6 +256,32 @@ def test_masses_without_a_gap_are_said_to_have_none():
     assert mass_cut(real) == 0
     with pytest.warns(perrin.PrecisionWarning, match="no clear gap"):
         assert mass_cut(np.geomspace(100, 10000, 50)) == 0
+
+
+@pytest.mark.skipif(not REAL.exists(), reason="the real confocal stack is not here")
+def test_a_real_stack_of_dark_spheres():
+    """Of 37 listed spheres (whole voxels, by eye) at least 20 are within one voxel, 30 within two.
+
+    They are one crowd, which the image model leaves where it is, and says so.
+    """
+    from PIL import Image, ImageSequence
+
+    with warnings.catch_warnings():
+        # The file was written by Python 2.
+        warnings.simplefilter("ignore", UserWarning)
+        listed = np.load(REAL / "particle-positions.npy")[:, ::-1]
+    with Image.open(REAL / "small_confocal_image.tif") as pages:
+        frame = np.array([np.array(page) for page in ImageSequence.Iterator(pages)])
+    stack, asked = Movie([frame], voxel=(1.0, 1.0, 1.0)), {"diameter": 11, "contact": 11}
+    asked |= {"dark": True, "percentile": 40, "minmass": 0}
+    table = perrin.locate(stack, refine=None, **asked)
+    distance = cdist(listed, table[["x", "y", "z"]]).min(axis=1)
+    assert np.sum(distance < 1) >= 20
+    assert np.sum(distance < 2) >= 30
+    optics = perrin.Optics(10.5, (1.6, 0.8), CameraNoise(0.0, 25.0))
+    with pytest.warns(perrin.PrecisionWarning, match="chains of over 16"):
+        crowd = perrin.locate(stack, optics=optics, **asked)
+    assert not crowd["refined"].all()
 
 
 def test_bad_arguments_are_listed_together(tetrahedra):

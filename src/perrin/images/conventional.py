@@ -32,6 +32,7 @@ def find_features(
     voxel: tuple[float, float, float],
     dark: bool,
     percentile: float,
+    border: bool,
 ) -> Features:
     """Find the local maxima of one frame, spheres and noise alike, with trackpy.
 
@@ -46,6 +47,8 @@ def find_features(
         Spheres are darker than what surrounds them.
     percentile : float
         Of the voxels that are no candidates.
+    border : bool
+        Also spheres that the frame's border cuts, but for their centre.
 
     Raises
     ------
@@ -61,21 +64,23 @@ def find_features(
     trackpy = _trackpy()
     step = np.array(voxel)
     # A core smaller than its sphere looks larger than it is by the blur; touching balls may not.
-    margin = 2 if diameter < 0.8 * contact else 0
-    size = np.ceil(diameter / step).astype(int) + margin
+    size = np.ceil(diameter / step).astype(int) + (2 if diameter < 0.8 * contact else 0)
     size += 1 - size % 2
+    padding = size // 2 + 3 if border else np.zeros(3, dtype=int)
+    # trackpy's own inversion is announced to go.
+    bright = frame.max() - frame if dark else frame
     with _quiet():
         found = trackpy.locate(
-            frame,
+            np.pad(bright, [(p, p) for p in padding], mode="edge"),
             tuple(int(s) for s in size),
             separation=tuple(0.7 * contact / step),
             percentile=percentile,
             minmass=0,
-            invert=dark,
             characterize=False,
         )
-    centers = found[["z", "y", "x"]].to_numpy(dtype=np.float64) * step
-    return Features(centers, found["mass"].to_numpy(dtype=np.float64))
+    centers = found[["z", "y", "x"]].to_numpy(dtype=np.float64) - padding
+    inside = np.all((centers >= 0) & (centers <= np.array(frame.shape) - 1), axis=1)
+    return Features(centers[inside] * step, found["mass"].to_numpy(dtype=np.float64)[inside])
 
 
 def refine_by_trackpy(

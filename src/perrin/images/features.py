@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,17 +13,9 @@ if TYPE_CHECKING:
     from perrin._arrays import Floats, Ints
 
 _REACH = 1.3  # centres closer than this many contact distances belong together
-_CROWD = 8  # larger groups are fitted sphere by sphere, each with its neighbours
 _CLEAR_GAP = 2.0  # ratio of neighbouring masses that parts spheres from noise
 _ALIKE = 4.0  # masses all within this ratio are spheres all of them
 _FAINT = 20.0  # a gap that much below the largest mass parts noise from noise
-
-
-class Neighbourhood(NamedTuple):
-    """Spheres to be fitted together, and those among them whose answer counts."""
-
-    members: Ints
-    wanted: Ints
 
 
 def mass_cut(mass: Floats) -> float:
@@ -51,44 +43,29 @@ def mass_cut(mass: Floats) -> float:
             f"the masses of the {mass.size} spots found have no clear gap between spheres and "
             "noise: all are kept; look at their histogram and set minmass",
             PrecisionWarning,
-            stacklevel=3,
+            stacklevel=4,
         )
         return 0.0
     k = int(ratio.argmax())
     return float(np.sqrt(ordered[k] * ordered[k + 1]))
 
 
-def neighbourhoods(centers: Floats, *, contact: float) -> list[Neighbourhood]:
-    """Part the spheres of one frame into groups to be fitted together.
-
-    Chains of touching spheres are one group; where it has more than 8, each sphere is fitted
-    with those that touch it and keeps its own answer alone.
+def touching_together(centers: Floats, *, contact: float) -> list[Ints]:
+    """Return the spheres of one frame as groups to be fitted together: chains of touching ones.
 
     Examples
     --------
     >>> import numpy as np
     >>> x = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.1], [0.0, 0.0, 9.0]])
-    >>> [group.members.tolist() for group in neighbourhoods(x, contact=1.0)]
+    >>> [group.tolist() for group in touching_together(x, contact=1.0)]
     [[0, 1], [2]]
     """
-    from scipy.spatial import cKDTree
-
     from perrin.linking import touching_groups
 
     if not len(centers):
         return []
-    reach = _REACH * contact
-    label = touching_groups(centers, reach=reach, size=len(centers), smallest=1)
-    tree = cKDTree(centers)
-    groups = []
-    for members in (np.flatnonzero(label == k) for k in range(label.max() + 1)):
-        if len(members) <= _CROWD:
-            groups.append(Neighbourhood(members, members))
-            continue
-        for i in members:
-            near = np.array(sorted(tree.query_ball_point(centers[i], reach)), dtype=np.int64)
-            groups.append(Neighbourhood(near, np.array([i])))
-    return groups
+    label = touching_groups(centers, reach=_REACH * contact, size=len(centers), smallest=1)
+    return [np.flatnonzero(label == k) for k in range(label.max() + 1)]
 
 
 def at_contact(centers: Floats, *, contact: float) -> Floats:

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 _WINDOW = 3.5  # voxels within so many blurs of a sphere's surface are fitted
 _CONVERGED = 1e-4  # last step of a sphere over the blur: far below what any photons tell
 _ROUNDS = 40
+_ENOUGH = 5  # voxels for each number that is fitted
 _BACKGROUND = 4  # a level and its slope along z, y and x
 
 
@@ -45,6 +46,10 @@ class Window(NamedTuple):
     mask: Bools
     data: Floats  # (m,)
     background: Floats  # (4, m)
+
+    def shows(self, count: int) -> bool:
+        """Return whether enough voxels are left to fit `count` spheres."""
+        return len(self.data) >= _ENOUGH * (4 * count + _BACKGROUND)
 
     def spots(self, image: SphereImage, centers: Floats) -> tuple[Floats, Floats]:
         """Return unit images (n, m) of spheres on these voxels and their gradients (n, 3, m)."""
@@ -180,7 +185,10 @@ def fit_window(
     damping, settled = 1e-3, False
     for _ in range(_ROUNDS):
         information, score = _normal_equations(window, state)
-        damped = information + damping * np.diag(np.diag(information))
+        scale = np.diag(information)
+        if not scale.min() > 0:  # a sphere without light in the window: nothing to be found
+            break
+        damped = information + np.diag((damping + 1e-12) * scale)
         step = np.asarray(np.linalg.solve(damped, score), dtype=np.float64)
         trial = _stepped(window, image, noise, state, step)
         if _misfit(window, trial.expected, state.weight) > _misfit(

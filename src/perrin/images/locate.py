@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal, Protocol
 
 import numpy as np
 
-from perrin._arrays import Floats, require_positive
+from perrin._arrays import Floats, PrecisionWarning, require_positive
 from perrin.images.conventional import Features, find_features, refine_by_trackpy
-from perrin.images.features import Neighbourhood, at_contact, mass_cut, neighbourhoods
+from perrin.images.features import at_contact, mass_cut, touching_together
 from perrin.images.image_fit import (
     FreeCenters,
     ImageFit,
@@ -32,6 +33,7 @@ Refine = Literal["model", "trackpy"] | None
 
 _LEARN_FRAMES = 5  # frames looked at to set the mass cut and to learn the optics
 _LEARN_GROUPS = 15  # groups of spheres the optics are learned from
+_CROWD = 16  # spheres in a larger group stay where they were found: see `locate`
 
 
 class Stack(Protocol):
@@ -63,6 +65,8 @@ class Search:
         Of voxels too dim to be a sphere's middle.
     minmass : float or None
         Least integrated brightness of a sphere; None is the widest gap.
+    border : bool
+        Also spheres cut by the stack's border.
     """
 
     diameter: float
@@ -70,6 +74,7 @@ class Search:
     dark: bool = False
     percentile: float = 95.0
     minmass: float | None = None
+    border: bool = True
 
     def spots(self, stack: Stack, i: int) -> tuple[Floats, Features]:
         """Return a frame and its spots, those of enough mass."""
@@ -81,6 +86,7 @@ class Search:
             voxel=_voxel(stack),
             dark=self.dark,
             percentile=self.percentile,
+            border=self.border,
         )
         keep = found.mass >= (self.minmass or 0.0)
         return frame, Features(found.centers[keep], found.mass[keep])
@@ -103,6 +109,7 @@ def locate(
     dark: bool = False,
     minmass: float | None = None,
     percentile: float = 95.0,
+    border: bool = True,
     frames: Iterable[int] | None = None,
 ) -> pd.DataFrame:
     """Find every sphere of a stack, and refine its place by the model of its image.
@@ -127,6 +134,9 @@ def locate(
         Least integrated brightness; by default the widest gap between spheres and noise.
     percentile : float
         Of voxels too dim to be a sphere's middle; lower it where spheres fill the field.
+    border : bool
+        Also spheres whose centre is inside the stack but which its border cuts; without them their
+        neighbours' light is misread, which `chi2` shows.
     frames : iterable of int, optional
         Frames to do; default all.
 
@@ -136,8 +146,8 @@ def locate(
         ``frame, x, y, z`` in um, the origin at the centre of voxel (0, 0, 0), ``mass``; and for
         "model" ``sigma_x, sigma_y, sigma_z`` in um (from the Fisher information), ``chi2`` of the
         group's image per degree of freedom, and ``refined``: False where the fit did not settle,
-        left by over half a radius, or found no sphere, and the place found first was kept, without
-        errors.
+        left by over half a radius, found no sphere, or was not tried, and the place found first was
+        kept, without errors.
 
     Raises
     ------
@@ -149,7 +159,9 @@ def locate(
     Warns
     -----
     PrecisionWarning
-        Where the masses show no gap between spheres and noise.
+        Where the masses show no gap between spheres and noise; where more than 16 spheres touch
+        in a chain: the model of their image asks for every neighbour, and for light more even than
+        a dense sample has, so that they stay where they were found.
 
     Examples
     --------
@@ -168,11 +180,14 @@ def locate(
     [[3.2, 3.1, 3.0]]
     """
     _checked(stack, diameter, contact, refine, percentile)
-    search = Search(diameter, contact, dark, percentile, minmass).with_minmass(stack)
+    search = Search(diameter, contact, dark, percentile, minmass, border).with_minmass(stack)
     if refine == "model" and optics is None:
         optics = fit_optics(stack, search)
     listed = _listed(stack, frames)
-    return _table([_frame_columns(stack, i, search, refine, optics) for i in listed])
+    table = _table([_frame_columns(stack, i, search, refine, optics) for i in listed])
+    if refine == "model":
+        _warn_of_untried(table)
+    return table
 
 
 def fit_optics(stack: Stack, search: Search) -> Optics:
@@ -187,8 +202,8 @@ def fit_optics(stack: Stack, search: Search) -> Optics:
     samples = []
     for i in _spread(stack.shape[0]):
         frame, found = search.spots(stack, i)
-        for group in neighbourhoods(found.centers, contact=search.contact):
-            samples.append(_sample(frame, found, group, search.contact))
+        groups = touching_together(found.centers, contact=search.contact)
+        samples += [_sample(frame, found, g, search.contact) for g in groups if len(g) <= _CROWD]
     keep = _spread(len(samples), _LEARN_GROUPS)
     return fit_samples([samples[k] for k in keep], diameter=search.diameter, voxel=_voxel(stack))
 
@@ -308,16 +323,18 @@ def _by_model(
     image = optics.image(voxel)
     centers, sigma = found.centers.copy(), np.full_like(found.centers, np.nan)
     chi2, refined = np.full(len(centers), np.nan), np.zeros(len(centers), dtype=np.bool_)
-    for group in neighbourhoods(found.centers, contact=contact):
+    groups = touching_together(found.centers, contact=contact)
+    for group in (g for g in groups if len(g) <= _CROWD):
         sample = _sample(frame, found, group, contact)
         window = cut_window(frame, image, sample.centers, others=sample.others)
+        if not window.shows(len(group)):
+            continue
         fit = fit_window(window, image, optics.noise, FreeCenters(sample.centers))
-        own = np.isin(group.members, group.wanted)
-        good = own & _believable(fit, sample.centers, optics.diameter / 4)
-        spheres = group.members[good]
+        good = _believable(fit, sample.centers, optics.diameter / 4)
+        spheres = group[good]
         centers[spheres] = fit.centers[good]
         sigma[spheres] = np.sqrt(np.diag(fit.covariance)).reshape(-1, 3)[good]
-        chi2[group.members[own]] = fit.chi2
+        chi2[group] = fit.chi2
         refined[spheres] = True
     errors = _places(sigma, "sigma_")
     return _places(centers) | {"mass": found.mass} | errors | {"chi2": chi2, "refined": refined}
@@ -330,9 +347,21 @@ def _believable(fit: ImageFit, start: Floats, furthest: float) -> Bools:
     return np.asarray(fit.converged & (moved < furthest) & bright)
 
 
-def _sample(frame: Floats, found: Features, group: Neighbourhood, contact: float) -> Sample:
-    others = np.delete(found.centers, group.members, axis=0)
-    return Sample(frame, at_contact(found.centers[group.members], contact=contact), others)
+def _warn_of_untried(table: pd.DataFrame) -> None:
+    untried = int(table["chi2"].isna().sum())
+    if untried:
+        warnings.warn(
+            f"{untried} of {len(table)} spheres touch in chains of over {_CROWD}, or have no "
+            "voxels to themselves: they stay where found, perhaps a tenth of a sphere off; "
+            "the column `refined` says which",
+            PrecisionWarning,
+            stacklevel=3,
+        )
+
+
+def _sample(frame: Floats, found: Features, group: Ints, contact: float) -> Sample:
+    others = np.delete(found.centers, group, axis=0)
+    return Sample(frame, at_contact(found.centers[group], contact=contact), others)
 
 
 def _places(centers: Floats, prefix: str = "") -> dict[str, Floats | Bools]:
@@ -343,7 +372,7 @@ def _table(columns: list[dict[str, Floats | Bools]]) -> pd.DataFrame:
     import pandas as pd
 
     if not columns:
-        return pd.DataFrame(columns=["frame", "x", "y", "z", "mass"])
+        return pd.DataFrame(columns=["frame", "x", "y", "z", "mass", "chi2"])
     return pd.concat([pd.DataFrame(c) for c in columns], ignore_index=True)
 
 

@@ -80,9 +80,15 @@ def fit_samples(
     Gauss-Newton steps in the logarithms of the three lengths, with every sphere's place and
     brightness and every background eliminated exactly (the Schur complement of the information).
     """
-    if not samples:
-        raise ValueError("no spheres to learn the optics from; check diameter, contact and minmass")
     log = np.log([diameter, max(voxel[0], 0.15 * diameter), max(voxel[1] / 2, 0.06 * diameter)])
+    samples = [
+        s for s in samples if _window(s, s.centers, _image(log, voxel)).shows(len(s.centers))
+    ]
+    if not samples:
+        raise ValueError(
+            "no spheres to learn the optics from: none was found, or all stand in a crowd; check "
+            "diameter, contact and minmass, state optics, or take the places as found (refine=None)"
+        )
     mean = float(np.mean([s.frame.mean() for s in samples]))
     noise = CameraNoise(1.0, 0.05 * abs(mean))
     centers = [s.centers for s in samples]
@@ -120,8 +126,12 @@ def _image(log: Floats, voxel: tuple[float, float, float]) -> SphereImage:
 def _fitted(
     sample: Sample, centers: Floats, image: SphereImage, noise: CameraNoise
 ) -> tuple[Window, ImageFit]:
-    window = cut_window(sample.frame, image, centers, others=sample.others)
+    window = _window(sample, centers, image)
     return window, fit_window(window, image, noise, FreeCenters(centers))
+
+
+def _window(sample: Sample, centers: Floats, image: SphereImage) -> Window:
+    return cut_window(sample.frame, image, centers, others=sample.others)
 
 
 def _told(
