@@ -134,7 +134,7 @@ def pose_errors(motion, rotation, places):
     gauge = perrin.kabsch(motion.template, BODY.positions)
     turn = log_map(motion.rotation @ gauge @ np.swapaxes(rotation, 1, 2))
     off = motion.center - places.mean(axis=1)
-    return 1e3 * (off - off.mean(axis=0)), 1e3 * turn
+    return 1e3 * (off - np.nanmean(off, axis=0)), 1e3 * turn
 
 
 def speed(movie, table, optics):
@@ -188,7 +188,7 @@ def main():
     posed = perrin.fit_pose(movie, free, optics=optics)
     for name, motion in (("free centres", free), ("pose in the image", posed)):
         center, turn = pose_errors(motion, rotation, places)
-        spread = center.std(axis=0).round(2), turn.std(axis=0).round(2)
+        spread = [np.nanstd(e, axis=0).round(2) for e in (center, turn)]
         print(f"{name}: centre {spread[0]} nm, turn {spread[1]} mrad")
     print("floor of the pose", (1e3 * rigid[:6]).round(2))
     speed(movie, tables[None], optics)

@@ -21,7 +21,8 @@ _FAINT = 20.0  # a gap that much below the largest mass parts noise from noise
 def mass_cut(mass: Floats) -> float:
     """Return the mass that parts spheres from noise: the middle of the widest gap in log mass.
 
-    Masses all within a factor 4 are spheres, and nothing is cut.
+    Masses all within a factor 4 are spheres; what other frames hold below a quarter of the least of
+    them is noise.
 
     Warns
     -----
@@ -35,8 +36,10 @@ def mass_cut(mass: Floats) -> float:
     2449
     """
     ordered = np.sort(mass[mass > 0])
-    if not ordered.size or ordered[-1] < _ALIKE * ordered[0]:
+    if not ordered.size:
         return 0.0
+    if ordered[-1] < _ALIKE * ordered[0]:
+        return float(ordered[0] / _ALIKE)
     ratio = np.where(ordered[1:] > ordered[-1] / _FAINT, ordered[1:] / ordered[:-1], 1.0)
     if ratio.max() < _CLEAR_GAP:
         warnings.warn(
