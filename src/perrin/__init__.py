@@ -32,6 +32,8 @@ if TYPE_CHECKING:
         size_from_translation,
     )
     from perrin.identity import Identity, settle_identity
+    from perrin.images.locate import fit_pose, locate
+    from perrin.images.optics import Optics
     from perrin.images.render import render_stack
     from perrin.images.stacks import Stack, open_stack, write_stack
     from perrin.lagged import (
@@ -84,6 +86,7 @@ __all__ = [
     "LagCurve",
     "Mobility",
     "NoiseFloor",
+    "Optics",
     "PrecisionWarning",
     "Prediction",
     "Quality",
@@ -115,12 +118,14 @@ __all__ = [
     "find_clusters",
     "fit_gls",
     "fit_line",
+    "fit_pose",
     "gravitational_height",
     "identify",
     "judge_quality",
     "judge_sampling",
     "kabsch",
     "load_run",
+    "locate",
     "msad",
     "msad_axes",
     "msad_vector",
@@ -210,6 +215,8 @@ _ROOMS = {
     "files": ("read_tracks", "write_tracks"),
     "images.stacks": ("Stack", "open_stack", "write_stack"),
     "images.render": ("render_stack",),
+    "images.optics": ("Optics",),
+    "images.locate": ("fit_pose", "locate"),
     "results": ("ClusterResult", "Report", "RodResult", "load_run"),
     "analysis": ("analyze",),
     "report": ("write_run",),

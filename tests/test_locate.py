@@ -1,0 +1,295 @@
+"""Where spheres are in images: the model of the image, its fit, and the table of a movie."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+from scipy.spatial.distance import cdist
+
+import perrin
+from perrin.images.features import mass_cut
+from perrin.images.image_fit import (
+    CameraNoise,
+    FreeCenters,
+    RigidCenters,
+    cut_window,
+    fit_window,
+)
+from perrin.images.locate import Search, fit_optics
+from perrin.images.sphere_image import sphere_image
+from perrin.rotations import exp_map, log_map
+
+VOXEL = (0.25, 0.2, 0.2)
+PSF = (0.4, 0.15)
+DIAMETER = 2.45
+GAIN, READ = 3.0, 2.0
+NOISE = CameraNoise(GAIN, READ**2)
+BODY = perrin.Cluster.touching(4, DIAMETER)
+NOBODY = np.empty((0, 3))
+REAL = Path(__file__).resolve().parents[2] / "shared" / "data" / "peri_confocal"
+
+
+def brute_force(centers, shape, fine=4):
+    """Render unit balls on a grid `fine` times finer, blur it, and average over each voxel."""
+    grid = [
+        ((np.arange(n * fine) + 0.5) / fine - 0.5) * h for n, h in zip(shape, VOXEL, strict=True)
+    ]
+    light = np.zeros([n * fine for n in shape], dtype=np.float32)
+    for z, y, x in centers:
+        r2 = ((grid[0] - z) ** 2)[:, None, None] + ((grid[1] - y) ** 2)[:, None]
+        r = np.sqrt(r2 + (grid[2] - x) ** 2)
+        light += np.clip((DIAMETER / 2 - r) / 0.05 + 0.5, 0, 1)
+    width = np.array([PSF[0], PSF[1], PSF[1]]) / np.array(VOXEL) * fine
+    blurred = gaussian_filter(light, width, truncate=5)
+    return blurred.reshape([k for n in shape for k in (n, fine)]).mean(axis=(1, 3, 5))
+
+
+def photographed(light, rng, photons=40.0, background=4.0):
+    """Return grey levels of an image of unit brightness."""
+    grey = GAIN * rng.poisson(photons * light + background) + rng.normal(0, READ, light.shape)
+    return np.clip(np.round(grey), 0, 255)
+
+
+class Movie:
+    """Frames in memory."""
+
+    def __init__(self, frames, voxel=VOXEL):
+        self.frames = np.asarray(frames)
+        self.shape, self.voxel = self.frames.shape, voxel
+
+    def frame(self, i):
+        return self.frames[i]
+
+
+@pytest.fixture(scope="module")
+def tetrahedra():
+    """Ten frames of a tetrahedron at random poses: the movie, rotations, true places (T, 4, 3)."""
+    rng = np.random.default_rng(11)
+    rotation = exp_map(rng.normal(size=(10, 3)))
+    middle = np.array([4.0, 4.0, 4.8]) + rng.uniform(-0.1, 0.1, (10, 3))
+    places = middle[:, None] + np.einsum("tij,nj->tni", rotation, BODY.positions)
+    frames = [photographed(brute_force(p[:, ::-1], (40, 41, 41)), rng) for p in places]
+    return Movie(frames), rotation, places
+
+
+@pytest.fixture(scope="module")
+def learned(tetrahedra):
+    """Learn the optics from the movie, the diameter given 4 % wrong."""
+    return fit_optics(tetrahedra[0], Search(2.55, DIAMETER))
+
+
+def in_true_order(table, places):
+    """Return located places, shape and order of the true ones, and the rows they came from."""
+    found = np.empty_like(places)
+    rows = np.empty(places.shape[:2], dtype=int)
+    for i, truth in enumerate(places):
+        part = table[table["frame"] == i]
+        nearest = cdist(truth, part[["x", "y", "z"]]).argmin(axis=1)
+        assert len(part) == len(set(nearest)) == len(truth)
+        found[i], rows[i] = part[["x", "y", "z"]].to_numpy()[nearest], part.index[nearest]
+    return found, rows
+
+
+def test_the_image_is_that_of_brute_force():
+    """A supersampled ball at a sub-voxel shift agrees to 0.2 % of its brightness.
+
+    The limit is the voxel taken as a Gaussian: its fourth moment is off, at the edge alone. The
+    noise of 40 photons is eighty times that.
+    """
+    shape, center = (34, 30, 30), np.array([4.1, 2.93, 3.07])
+    spot = sphere_image(diameter=DIAMETER, psf=PSF, voxel=VOXEL).spot(center, shape)
+    truth = brute_force([center], shape, fine=5)
+    drawn = np.zeros(shape)
+    drawn[spot.box] = spot.value
+    assert np.abs(drawn - truth).max() < 2e-3
+    assert np.sqrt(np.mean((drawn - truth)[spot.box] ** 2)) < 3e-4
+
+
+def test_the_image_holds_the_balls_light_and_its_slope():
+    """Light sums to the ball's volume; the gradient is that of finite differences."""
+    image = sphere_image(diameter=DIAMETER, psf=PSF, voxel=VOXEL)
+    z, y, x = (h * np.arange(-20, 21) + 0.03 for h in VOXEL)
+    value, gradient = image.at(z, y, x)
+    assert value.sum() * np.prod(VOXEL) == pytest.approx(np.pi * DIAMETER**3 / 6, rel=1e-4)
+    step = 1e-5
+    offsets = np.eye(3) * step
+    for axis in range(3):
+        up, down = (
+            image.at(*(g - sign * o for g, o in zip((z, y, x), offsets[axis], strict=True)))[0]
+            for sign in (1, -1)
+        )
+        assert np.allclose(gradient[axis], (up - down) / (2 * step), atol=1e-6)
+
+
+def test_a_blur_flatter_than_round_is_refused():
+    """Exchanged point spreads and lengths that are none are named."""
+    with pytest.raises(ValueError, match="exchanged"):
+        sphere_image(diameter=2.0, psf=(0.15, 0.4), voxel=VOXEL)
+    with pytest.raises(ValueError, match=r"psf\[plane\] = 0"):
+        sphere_image(diameter=2.0, psf=(0.15, 0), voxel=VOXEL)
+
+
+def test_pose_derivatives_are_those_of_finite_differences():
+    """Centres follow the six numbers as the slope says."""
+    pose = RigidCenters(np.array([1.0, 2.0, 3.0]), exp_map([0.3, -0.2, 0.9]), BODY.positions)
+    step = 1e-6
+    for k, slope in enumerate(pose.slope):
+        up, down = (pose.moved(sign * step * np.eye(6)[k]).centers for sign in (1, -1))
+        assert np.allclose((up - down).ravel() / (2 * step), slope, atol=1e-8)
+
+
+def fitted(frame, start, voxel=VOXEL, scale=1.0, noise=NOISE):
+    image = sphere_image(
+        diameter=scale * DIAMETER, psf=(scale * PSF[0], scale * PSF[1]), voxel=voxel
+    )
+    window = cut_window(frame, image, start, others=NOBODY)
+    return fit_window(window, image, noise, FreeCenters(start))
+
+
+def test_the_fit_follows_shifts_mirrors_units_and_negatives(tetrahedra):
+    """Shift by voxels, exchange x and y, change the unit, or negate: the places follow.
+
+    The tolerance is the fit's own: it stops at steps below 1e-4 of the blur, 16 pm.
+    """
+    movie, _, places = tetrahedra
+    frame, start = movie.frame(0), places[0][:, ::-1] + 0.03
+    found = fitted(frame, start).centers
+    rolled = np.pad(frame[:-2, :-2], ((2, 0), (2, 0), (0, 0)), mode="edge")
+    shift = np.array([0.5, 0.4, 0.0])
+    assert np.allclose(fitted(rolled, start + shift).centers, found + shift, atol=2e-5)
+    swapped = [0, 2, 1]
+    mirrored = fitted(frame.transpose(swapped), start[:, swapped]).centers
+    assert np.allclose(mirrored, found[:, swapped], atol=2e-5)
+    unit = fitted(frame, 7 * start, tuple(7 * h for h in VOXEL), scale=7.0).centers
+    assert np.allclose(unit, 7 * found, atol=1e-4)
+    even = CameraNoise(0.0, 50.0)
+    negative = fitted(255 - frame, start, noise=even)
+    assert np.allclose(negative.centers, fitted(frame, start, noise=even).centers, atol=2e-5)
+    assert (negative.brightness < 0).all()
+
+
+def test_optics_are_learned_from_the_movie(learned):
+    """Diameter, point spread and gain come back, within four stated errors or 3 %."""
+    got = np.array([learned.diameter, *learned.psf])
+    assert np.all(np.abs(got - [DIAMETER, *PSF]) < 4 * np.array(learned.stderr))
+    assert np.all(np.array(learned.stderr) < 0.005)
+    assert learned.noise.gain == pytest.approx(GAIN, rel=0.05)
+
+
+def test_touching_spheres_are_located_within_the_stated_errors(tetrahedra, learned):
+    """No sphere missed or false; errors of 40 places have the stated size (chi-squared of 120)."""
+    movie, _, places = tetrahedra
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        table = perrin.locate(movie, diameter=DIAMETER, contact=DIAMETER, optics=learned)
+    found, rows = in_true_order(table, places)
+    sigma = table[["sigma_x", "sigma_y", "sigma_z"]].to_numpy()[rows]
+    assert table["refined"].all()
+    # The mean square has standard error sqrt(2/120) = 0.13: four of them.
+    assert np.mean(((found - places) / sigma) ** 2) == pytest.approx(1.0, abs=0.52)
+    assert table["chi2"].mean() == pytest.approx(1.0, abs=0.05)
+    assert np.all(sigma.mean(axis=(0, 1)) < [0.005, 0.005, 0.007])
+
+
+def test_the_pose_is_found_within_its_covariance(tetrahedra, learned):
+    """Poses started 20 nm off end where the images say: errors of 60 numbers have stated size."""
+    movie, rotation, places = tetrahedra
+    near = places + np.random.default_rng(0).normal(0, 0.02, places.shape)
+    start = perrin.track_rotation(near, dt=1.0)
+    shape = BODY.positions @ perrin.kabsch(start.template, BODY.positions).T
+    posed = perrin.fit_pose(movie, replace(start, template=shape), optics=learned)
+    assert np.allclose(posed.rotation[0], np.eye(3), atol=1e-12)
+    gauge = perrin.kabsch(posed.template, BODY.positions)
+    turn = log_map(np.swapaxes(rotation, 1, 2) @ posed.rotation @ gauge)
+    errors = gauge.T @ posed.covariance @ gauge
+    normal = np.einsum("ti,tij,tj->t", turn, np.linalg.inv(errors), turn) / 3
+    assert normal.mean() == pytest.approx(1.0, abs=4 * np.sqrt(2 / 30))
+    off = np.sum((posed.center - places.mean(axis=1)) ** 2, axis=1) / (3 * posed.center_variance)
+    assert off.mean() == pytest.approx(1.0, abs=4 * np.sqrt(2 / 30))
+
+
+def test_refinement_by_trackpy_and_none(tetrahedra):
+    """The plain routes stay: centroids off by over 50 nm, discs by less than half of that."""
+    movie, _, places = tetrahedra
+    movie, rms = Movie(movie.frames[:2]), {}
+    for refine in (None, "trackpy"):
+        table = perrin.locate(movie, diameter=DIAMETER, contact=DIAMETER, refine=refine)
+        assert list(table) == ["frame", "x", "y", "z", "mass"]
+        found, _ = in_true_order(table, places[:2])
+        rms[refine] = np.sqrt(np.mean((found - places[:2]) ** 2))
+    assert rms[None] > 0.05
+    assert rms["trackpy"] < 0.5 * rms[None]
+
+
+def test_a_frame_without_spheres_has_no_rows(tetrahedra, learned):
+    """An empty frame among others is no error."""
+    frames = np.stack([tetrahedra[0].frame(0), np.zeros((40, 41, 41))])
+    table = perrin.locate(Movie(frames), diameter=DIAMETER, contact=DIAMETER, optics=learned)
+    assert table["frame"].tolist() == [0, 0, 0, 0]
+
+
+def test_a_sphere_cut_by_the_border_is_found_when_asked_for(tetrahedra, learned):
+    """Cut near a sphere's middle: all four are found within their errors; else chi2 tells."""
+    movie, _, places = tetrahedra
+    cut = int(places[0][:, 0].min() / VOXEL[2]) - 2
+    stack = Movie(movie.frames[:1, :, :, cut:])
+    asked = {"diameter": DIAMETER, "contact": DIAMETER, "optics": learned}
+    truth = places[:1] - [cut * VOXEL[2], 0, 0]
+    partial = perrin.locate(stack, border=False, **asked)
+    assert len(partial) < 4
+    assert partial["chi2"].min() > 2
+    table = perrin.locate(stack, **asked)
+    found, rows = in_true_order(table, truth)
+    sigma = table[["sigma_x", "sigma_y", "sigma_z"]].to_numpy()[rows]
+    assert np.all(np.abs(found - truth) < 4.5 * sigma)
+
+
+def test_masses_without_a_gap_are_said_to_have_none():
+    """A clear gap is found wherever noise lies; a smooth spread of masses is a warning."""
+    real = np.linspace(20000, 30500, 40)
+    assert 1400 < mass_cut(np.concatenate([np.geomspace(3, 1400, 300), real])) < 20000
+    assert 1400 < mass_cut(real) < 20000
+    assert mass_cut(np.empty(0)) == 0
+    with pytest.warns(perrin.PrecisionWarning, match="no clear gap"):
+        assert mass_cut(np.geomspace(100, 10000, 50)) == 0
+
+
+@pytest.mark.skipif(not REAL.exists(), reason="the real confocal stack is not here")
+def test_a_real_stack_of_dark_spheres():
+    """Of 37 listed spheres (whole voxels, by eye) at least 20 are within one voxel, 30 within two.
+
+    They are one crowd, which the image model leaves where it is, and says so.
+    """
+    from PIL import Image, ImageSequence
+
+    with warnings.catch_warnings():
+        # The file was written by Python 2.
+        warnings.simplefilter("ignore", UserWarning)
+        listed = np.load(REAL / "particle-positions.npy")[:, ::-1]
+    with Image.open(REAL / "small_confocal_image.tif") as pages:
+        frame = np.array([np.array(page) for page in ImageSequence.Iterator(pages)])
+    stack, asked = Movie([frame], voxel=(1.0, 1.0, 1.0)), {"diameter": 11, "contact": 11}
+    asked |= {"dark": True, "percentile": 40, "minmass": 0}
+    table = perrin.locate(stack, refine=None, **asked)
+    distance = cdist(listed, table[["x", "y", "z"]]).min(axis=1)
+    assert np.sum(distance < 1) >= 20
+    assert np.sum(distance < 2) >= 30
+    optics = perrin.Optics(10.5, (1.6, 0.8), CameraNoise(0.0, 25.0))
+    with pytest.warns(perrin.PrecisionWarning, match="chains of over 16"):
+        crowd = perrin.locate(stack, optics=optics, **asked)
+    assert not crowd["refined"].all()
+
+
+def test_bad_arguments_are_listed_together(tetrahedra):
+    """One message names every fault."""
+    with pytest.raises(ValueError, match=r"refine: .*'disc'; diameter 9.*exchanged.*; percentile"):
+        perrin.locate(tetrahedra[0], diameter=9, contact=2, refine="disc", percentile=100)
+    with pytest.raises(ValueError, match="expected 0 to 9"):
+        perrin.locate(tetrahedra[0], diameter=2.45, contact=2.45, refine=None, frames=[10])
+    with pytest.raises(ValueError, match="no spheres"):
+        perrin.locate(Movie(np.zeros((2, 20, 20, 20))), diameter=2.45, contact=2.45)
