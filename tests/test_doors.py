@@ -90,12 +90,14 @@ def loaded_after(statement: str) -> set[str]:
 def test_import_is_light():
     """`import perrin` and all numerical names load numpy alone.
 
-    `import perrin` is under 250 modules; all names together under 215 besides our own rooms.
+    `import perrin` is under 250 modules; all names together add under 45 to numpy's own (which are
+    173 to 217) and our rooms.
     """
     assert len(loaded_after("import perrin")) < 250
     names = [n for n in perrin.__all__ if n != "write_run"]
     modules = loaded_after(f"from perrin import {', '.join(names)}")
-    assert sum(not m.startswith("perrin") for m in modules) < 215
+    more = modules - loaded_after("import numpy")
+    assert sum(not m.startswith("perrin") for m in more) < 45
     assert modules.isdisjoint(LAZY)
 
 

@@ -24,6 +24,8 @@ from perrin.images.locate import Search, fit_optics
 from perrin.images.sphere_image import sphere_image
 from perrin.rotations import exp_map, log_map
 
+pytest.importorskip("trackpy")
+
 VOXEL = (0.25, 0.2, 0.2)
 PSF = (0.4, 0.15)
 DIAMETER = 2.45

@@ -45,7 +45,7 @@ def test_it_is_the_rule_said_frame_by_frame(threshold):
     assert np.array_equal(np.isnan(walk[:, 0]), np.isnan(motion.center[:, 0]))
     piece = None
     for row in motion.fitted:
-        here = Rotation.from_matrix(motion.rotation[row])
+        here = Rotation.from_matrix(motion.rotation[row].copy())
         if motion.piece[row] != piece:
             piece, reference, base = motion.piece[row], here, np.zeros(3)
         turn = (here * reference.inv()).as_rotvec()
