@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.polynomial.polynomial import polyval
 
-from perrin.diffusion import UNITS, DiffusionEstimate
+from perrin.diffusion import NORMAL, UNITS, DiffusionEstimate
 from perrin.lagged import overlap_sums
 
 if TYPE_CHECKING:
@@ -15,8 +15,6 @@ if TYPE_CHECKING:
 
     from perrin._arrays import Floats, Ints
     from perrin.lagged import LagCurve
-
-_NORMAL = {0.68: 0.9945, 0.95: 1.9600}
 
 # The paper's window, 3 s to 22 s of a run of 220 s, as fractions of the duration.
 _PAPER = (3 / 220, 22 / 220)
@@ -268,7 +266,7 @@ def _estimate(curve: LagCurve, use: Ints, weights: Floats, *, method: str) -> Di
     D, s = _model(curve, use, weights)
     slope, level = (_variance(curve, use, w, D=D, s=s) for w in weights)
     parts = tuple(_variance(curve, use, weights[0], D=d, s=e) for d, e in ((1, 0), (1, 1), (0, 1)))
-    ci68, ci95 = (_interval(value, parts, D=D, s=s, z=_NORMAL[p], dt=dt) for p in (0.68, 0.95))
+    ci68, ci95 = (_interval(value, parts, D=D, s=s, z=NORMAL[p], dt=dt) for p in (0.68, 0.95))
     return DiffusionEstimate(
         value=value / dt,
         ci68=ci68,

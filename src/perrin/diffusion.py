@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings as python_warnings
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from perrin.likelihood import Likelihood, Peak, Track
 from perrin.moments import Moments, covariance_estimate, trace_estimate
 from perrin.motion import RigidMotion
 from perrin.scatter import excess_scatter
-from perrin.steps import Quantity, Steps, steps_of
+from perrin.steps import Quantity, Steps, choice_faults, steps_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 Method = Literal["mle", "cve", "trace"]
 UNITS = {"rotation": "rad^2/s", "translation": "um^2/s"}
 _CHI2 = {0.68: 0.9889, 0.95: 3.8415}  # quantiles of chi-squared with one degree of freedom
-_NORMAL = {0.68: 0.9945, 0.95: 1.9600}
+NORMAL = {0.68: 0.9945, 0.95: 1.9600}
 
 # Adding noisy body-frame steps turns noise into diffusion at second order: a motionless tetrahedron
 # reads D = 0.04 (sigma/R)^4/dt. Below ten times that a D_R is not resolved.
@@ -258,8 +258,7 @@ def _by_moments(moments: Moments) -> Found:
     """Give a closed-form estimate its normal intervals."""
     value, stderr = moments.value, moments.stderr
     ci68, ci95 = (
-        (float(value - z * stderr), float(value + z * stderr))
-        for z in (_NORMAL[0.68], _NORMAL[0.95])
+        (float(value - z * stderr), float(value + z * stderr)) for z in (NORMAL[0.68], NORMAL[0.95])
     )
     return Found(float(value), ci68, ci95, moments.offset, moments.offset_stderr)
 
@@ -384,18 +383,10 @@ def _check(
     drift: bool,
 ) -> None:
     """Refuse what is not offered or does not go together, all in one message."""
-    faults = [
-        f"{name}: expected {' or '.join(map(repr, offered))}, got {got!r}"
-        for name, got, offered in (
-            ("quantity", quantity, tuple(UNITS)),
-            ("method", method, ("mle", "cve", "trace")),
-        )
-        if got not in offered
-    ]
-    if not (noise in ("joint", "residual") if isinstance(noise, str) else _at_least_zero(noise)):
-        faults.append(f"noise: expected 'joint', 'residual' or sigma in um, got {noise!r}")
-    if exposure is not None and not (_at_least_zero(exposure) and exposure <= 1):  # type: ignore[operator]
-        faults.append(f"exposure: expected a fraction of dt, 0 to 1, got {exposure!r}")
+    faults = choice_faults(quantity=quantity, noise=noise, exposure=exposure)
+    if method not in get_args(Method):
+        offered = " or ".join(map(repr, get_args(Method)))
+        faults.append(f"method: expected {offered}, got {method!r}")
     if method == "trace" and quantity == "translation":
         faults.append('method="trace" is for quantity="rotation"')
     if drift and (quantity == "rotation" or method != "mle"):
@@ -404,11 +395,3 @@ def _check(
         faults.append("motion: expected one or more motions, all in 2 or all in 3 dimensions")
     if faults:
         raise ValueError("; ".join(faults))
-
-
-def _at_least_zero(value: object) -> bool:
-    try:
-        number = float(value)  # type: ignore[arg-type]
-    except (TypeError, ValueError):
-        return False
-    return bool(0 <= number < np.inf)

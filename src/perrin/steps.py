@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 
 from perrin._arrays import Bools, Floats, TooFewFramesError
 from perrin.motion import RigidMotion, degrees_of_freedom
-from perrin.noise import center_variance, orientation_covariance
+from perrin.noise import orientation_covariance
 
 Quantity = Literal["rotation", "translation"]
 
@@ -75,8 +75,6 @@ def steps_of(motion: RigidMotion, quantity: Quantity) -> Steps:
             int(motion.fitted.size),
         )
     size, noise = _turns(motion, stop) if quantity == "rotation" else _jumps(motion, start, stop)
-    n, d = motion.template.shape
-    freedom = degrees_of_freedom(motion.n_present[motion.fitted], d).sum()
     return Steps(
         size=size,
         duration=motion.time[stop] - motion.time[start],
@@ -85,19 +83,60 @@ def steps_of(motion: RigidMotion, quantity: Quantity) -> Steps:
         after=noise[stop],
         complete=float(np.mean(noise[_complete(motion)])),
         sigma=motion.sigma,
-        freedom=int(freedom - degrees_of_freedom(np.array(n), d)),
+        freedom=residual_freedom(motion),
         dt=motion.dt,
     )
 
 
-def _turns(motion: RigidMotion, stop: np.ndarray) -> tuple[Floats, Floats]:
-    """Return rotation vectors (S, A) and noise (T, A) along the axes of the mean covariance."""
+def residual_freedom(motion: RigidMotion) -> int:
+    """Return the degrees of freedom of all rigid-fit residuals; the template costs those of one."""
+    n, d = motion.template.shape
+    freedom = degrees_of_freedom(motion.n_present[motion.fitted], d).sum()
+    return int(freedom - degrees_of_freedom(np.array(n), d))
+
+
+def unit_covariance(motion: RigidMotion) -> Floats:
+    """Return the covariance of every orientation for a localisation error of 1 um, (T, a, a)."""
     square = float(np.mean(motion.noise**2))
     if square > 0:
-        c = motion.covariance / square
-    else:
-        unit = orientation_covariance(motion.template, np.eye(motion.template.shape[1]))
-        c = np.broadcast_to(unit, motion.covariance.shape)
+        return np.asarray(motion.covariance / square)
+    unit = orientation_covariance(motion.template, np.eye(motion.template.shape[1]))
+    return np.broadcast_to(unit, motion.covariance.shape)
+
+
+def unit_center_variance(motion: RigidMotion) -> Floats:
+    """Return the variance of every centre for a localisation error of 1 um, (T,)."""
+    square = float(np.mean(motion.noise**2))
+    if square > 0:
+        return np.asarray(motion.center_variance / square)
+    return np.full(len(motion.time), 1 / len(motion.template))
+
+
+def choice_faults(*, quantity: object, noise: object, exposure: object) -> list[str]:
+    """Say which choices of an estimate from steps are not on offer."""
+    faults = []
+    if quantity not in get_args(Quantity):
+        offered = " or ".join(map(repr, get_args(Quantity)))
+        faults.append(f"quantity: expected {offered}, got {quantity!r}")
+    if not (noise in ("joint", "residual") if isinstance(noise, str) else _within(noise, np.inf)):
+        faults.append(f"noise: expected 'joint', 'residual' or sigma in um, got {noise!r}")
+    if exposure is not None and not _within(exposure, 1.0):
+        faults.append(f"exposure: expected a fraction of dt, 0 to 1, got {exposure!r}")
+    return faults
+
+
+def _within(value: Any, most: float) -> bool:  # noqa: ANN401 (a user's argument)
+    """Return whether a value is one finite number from 0 to `most`."""
+    try:
+        number = np.nan if isinstance(value, str) else float(value)
+    except (TypeError, ValueError):
+        return False
+    return bool(np.isfinite(number) and 0 <= number <= most)
+
+
+def _turns(motion: RigidMotion, stop: np.ndarray) -> tuple[Floats, Floats]:
+    """Return rotation vectors (S, A) and noise (T, A) along the axes of the mean covariance."""
+    c = unit_covariance(motion)
     complete = _complete(motion)
     values, axes = np.linalg.eigh(np.mean(c[complete], axis=0))
     noise = np.einsum("ji,tjk,ki->ti", axes, c, axes)
@@ -115,13 +154,7 @@ def _apart(values: Floats) -> Bools:
 def _jumps(motion: RigidMotion, start: np.ndarray, stop: np.ndarray) -> tuple[Floats, Floats]:
     """Return displacements of the centre (S, A) and its noise (T, A)."""
     size = motion.center[stop] - motion.center[start]
-    square = float(np.mean(motion.noise**2))
-    if square > 0:
-        noise = motion.center_variance / square
-    else:
-        everyone = np.ones(len(motion.template), dtype=np.bool_)
-        noise = np.full(len(motion.time), center_variance(motion.template, everyone, 1.0))
-    return size, np.repeat(noise[:, None], size.shape[1], axis=1)
+    return size, np.repeat(unit_center_variance(motion)[:, None], size.shape[1], axis=1)
 
 
 def _complete(motion: RigidMotion) -> Bools:

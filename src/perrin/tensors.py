@@ -10,10 +10,10 @@ import numpy as np
 
 from perrin._arrays import Bools, Floats, PrecisionWarning, TooFewFramesError, frozen
 from perrin.diffusion import UNITS, with_error
-from perrin.motion import RigidMotion, degrees_of_freedom
-from perrin.noise import orientation_covariance
+from perrin.motion import RigidMotion
 from perrin.rotations import exp_map, kabsch, skew
 from perrin.shapes import point_group, schoenflies, symmetry_elements
+from perrin.steps import choice_faults, residual_freedom, unit_center_variance, unit_covariance
 from perrin.tensor_likelihood import (
     Maximum,
     Source,
@@ -437,15 +437,7 @@ def _check_choices(
     needed: int = 12,
 ) -> None:
     """Refuse what is not offered, all faults at once, and motions that are too short."""
-    faults = []
-    if quantity not in UNITS:
-        faults.append(f"quantity: expected {' or '.join(map(repr, UNITS))}, got {quantity!r}")
-    if not _is_noise(noise):
-        faults.append(
-            f"noise: expected 'joint', 'residual' or a number >= 0 (sigma in um), got {noise!r}"
-        )
-    if exposure is not None and not (np.ndim(exposure) == 0 and 0 <= exposure <= 1):
-        faults.append(f"exposure: expected a fraction of dt from 0 to 1, or None, got {exposure!r}")
+    faults = choice_faults(quantity=quantity, noise=noise, exposure=exposure)
     if not motions or any(m.template.shape[1] != 3 for m in motions):
         faults.append(
             "motion: expected one or more motions in three dimensions; in the plane there is one "
@@ -460,13 +452,6 @@ def _check_choices(
             f"{needed} in all and 2 of every motion",
             sum(m.fitted.size for m in motions),
         )
-
-
-def _is_noise(noise: str | float) -> bool:
-    """Return whether this is one of the choices for the noise."""
-    if isinstance(noise, str):
-        return noise in ("joint", "residual")
-    return bool(np.ndim(noise) == 0 and np.isfinite(noise) and noise >= 0)
 
 
 def _place(point: Literal["diffusion", "centroid"] | ArrayLike) -> Floats | None:
@@ -558,39 +543,21 @@ class _Vectors(NamedTuple):
     shapes: Floats
 
 
-def _localisation(motion: RigidMotion) -> float:
-    """Return the localisation error (um) that the motion's pose errors were computed with."""
-    return float(np.sqrt(np.mean(motion.noise**2)))
-
-
 def _vectors(motion: RigidMotion, quantity: Quantity, turn: Floats) -> _Vectors:
     """Return the steps of a motion and their noise in the axes of the first template."""
     start, stop = motion.steps()
     theta = motion.step_vectors()[stop - 1]
     if quantity == "rotation":
-        shape = turn @ _orientation_shape(motion) @ turn.T
+        shape = turn @ unit_covariance(motion) @ turn.T
         return _Vectors(theta @ turn.T, shape[None])
     middle = motion.rotation[start] @ exp_map(0.5 * theta)
     jump = np.einsum("sji,sj->si", middle, motion.center[stop] - motion.center[start])
     return _Vectors(jump @ turn.T, _center_shape(motion)[None])
 
 
-def _orientation_shape(motion: RigidMotion) -> Floats:
-    """Return the covariance of every orientation for a localisation error of 1 um, (T, 3, 3)."""
-    sigma = _localisation(motion)
-    if sigma > 0:
-        return motion.covariance / sigma**2
-    one = orientation_covariance(motion.template, np.eye(3))
-    return np.broadcast_to(one, motion.covariance.shape)
-
-
 def _center_shape(motion: RigidMotion) -> Floats:
     """Return the covariance of every centre for a localisation error of 1 um, (T, 3, 3)."""
-    sigma, count = _localisation(motion), len(motion.template)
-    variance = (
-        motion.center_variance / sigma**2 if sigma > 0 else np.full(len(motion.time), 1 / count)
-    )
-    return np.asarray(variance[:, None, None] * np.eye(3))
+    return np.asarray(unit_center_variance(motion)[:, None, None] * np.eye(3))
 
 
 def _screws(motion: RigidMotion) -> _Vectors:
@@ -613,7 +580,7 @@ def _screws(motion: RigidMotion) -> _Vectors:
     u = jump - 0.5 * once + factor[:, None] * np.cross(w, once)
     shapes = np.zeros((2, len(motion.time), 6, 6))
     shapes[0, :, :3, :3] = _center_shape(motion)
-    shapes[1, :, 3:, 3:] = _orientation_shape(motion)
+    shapes[1, :, 3:, 3:] = unit_covariance(motion)
     return _Vectors(np.concatenate([u, w], axis=1), shapes)
 
 
@@ -747,10 +714,8 @@ def _known_noise(
         square = square / steps.y.shape[1]
         return np.full(len(size), max(float(square), 0.0) + 0.05), 0.0
     if noise == "residual":
-        freedom = degrees_of_freedom(motion.n_present[motion.fitted], 3).sum()
-        freedom -= degrees_of_freedom(np.array(len(motion.template)), 3)
         theta = motion.sigma**2 * size
-        return theta, float(freedom) if theta.min() > _NOISELESS else np.inf
+        return theta, float(residual_freedom(motion)) if theta.min() > _NOISELESS else np.inf
     return float(noise) ** 2 * size, np.inf
 
 
