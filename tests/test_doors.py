@@ -63,6 +63,7 @@ ROOMS = [
     "images.features",
     "images.optics",
     "images.locate",
+    "images.imaging",
     "results",
     "analysis",
     "plot",

@@ -15,6 +15,7 @@ import numpy as np
 
 from perrin.diffusion import DiffusionEstimate, with_error
 from perrin.hydrodynamics import Size
+from perrin.images.imaging import Imaging, read_imaging, write_imaging
 from perrin.lagged import LagCurve, msad, msd
 from perrin.motion import RigidMotion
 from perrin.noise import NoiseFloor, floor_of
@@ -197,6 +198,8 @@ class Report:
         Arguments, versions, and the input with its SHA-256.
     rods : tuple of RodResult
         Pairs and straight chains in three dimensions, which have no full rotation.
+    imaging : Imaging or None
+        How the spheres were seen, where the run began with images.
     """
 
     clusters: tuple[ClusterResult, ...]
@@ -205,6 +208,7 @@ class Report:
     tracks: pd.DataFrame
     settings: dict[str, Any] = field(default_factory=dict)
     rods: tuple[RodResult, ...] = ()
+    imaging: Imaging | None = None
 
     @property
     def results(self) -> tuple[ClusterResult | RodResult, ...]:
@@ -279,6 +283,7 @@ def load_run(folder: str | os.PathLike[str]) -> Report:
         warnings=tuple(summary["warnings"]),
         tracks=pd.read_parquet(path / "tracks.parquet"),
         settings=settings,
+        imaging=read_imaging(path) if (path / "imaging.json").is_file() else None,
     )
 
 
@@ -340,6 +345,8 @@ def write_data(report: Report, folder: Path) -> None:
     report.tracks.to_parquet(folder / "tracks.parquet", index=False)
     motion_table(report).to_parquet(folder / "motion.parquet", index=False)
     curve_table(report).to_csv(folder / "curves.csv", index=False)
+    if report.imaging is not None:
+        write_imaging(report.imaging, folder)
 
 
 def motion_table(report: Report) -> pd.DataFrame:
