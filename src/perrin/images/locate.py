@@ -14,7 +14,6 @@ from perrin.images.features import at_contact, mass_cut, touching_together
 from perrin.images.image_fit import (
     FreeCenters,
     ImageFit,
-    RigidCenters,
     cut_window,
     fit_window,
 )
@@ -27,8 +26,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from perrin._arrays import Ints
-    from perrin.images.sphere_image import SphereImage
-    from perrin.motion import RigidMotion
 
 Refine = Literal["model", "trackpy"] | None
 _Voxel = tuple[float, float, float]
@@ -50,7 +47,7 @@ class Stack(Protocol):
         """(t, z, y, x)."""
 
     @property
-    def voxel(self) -> tuple[float, float, float]:
+    def voxel(self) -> Floats | tuple[float, float, float]:
         """(z, y, x), um."""
 
     def frame(self, i: int, /) -> Floats:
@@ -304,9 +301,9 @@ def locate(
     >>> found[["x", "y", "z"]].round(1).values.tolist()
     [[3.2, 3.1, 3.0]]
     """
-    _checked(stack, diameter, contact, refine, percentile)
-    listed = _listed(stack, frames)
     search = Search(diameter, contact, dark, percentile, minmass, border)
+    check_search(stack, search, refine)
+    listed = _listed(stack, frames)
     sample = sample_frames(stack, search, listed)
     method = choose_method(stack, search, sample, refine=refine, optics=optics)
     table = found_table(_looked(stack, listed, method))
@@ -351,95 +348,6 @@ def fit_optics(sample: Sequence[Sampled], search: Search, *, voxel: _Voxel) -> O
         ]
     keep = _spread(len(samples), _LEARN_GROUPS)
     return fit_samples([samples[k] for k in keep], diameter=search.diameter, voxel=voxel)
-
-
-def fit_pose(
-    stack: Stack,
-    motion: RigidMotion,
-    *,
-    optics: Optics,
-    frames: Ints | None = None,
-    others: pd.DataFrame | None = None,
-) -> RigidMotion:
-    """Fit the six numbers of a rigid cluster's pose to the images themselves.
-
-    Parameters
-    ----------
-    stack : Stack
-    motion : RigidMotion
-        Of the free centres: the common shape, and every frame's start.
-    optics : Optics
-        How a sphere is seen.
-    frames : ndarray of int, shape (T,), optional
-        The stack's frame of each row of `motion`; default 0, 1, ...
-    others : DataFrame, optional
-        Spheres (``frame, x, y, z``) of other clusters, whose light is left out.
-
-    Returns
-    -------
-    RigidMotion
-        The same with `center`, `rotation`, `covariance` and `center_variance` from the images; a
-        frame whose fit does not settle has no pose and says so in `reason`.
-
-    Notes
-    -----
-    The shape is taken as known: an error in it goes into the pose unseen. `residual` stays that of
-    the free centres, which shows whether the cluster is rigid at all.
-    """
-    rows = motion.fitted
-    frames = np.arange(len(motion.time)) if frames is None else np.asarray(frames)
-    image = optics.image(_voxel(stack))
-    poses = {
-        int(k): _pose(stack, int(frames[k]), motion, int(k), optics, image, others) for k in rows
-    }
-    return _replaced(motion, {k: fit for k, fit in poses.items() if fit.converged})
-
-
-def _pose(
-    stack: Stack,
-    i: int,
-    motion: RigidMotion,
-    row: int,
-    optics: Optics,
-    image: SphereImage,
-    others: pd.DataFrame | None,
-) -> ImageFit:
-    start = RigidCenters(motion.center[row], motion.rotation[row], motion.template)
-    away = np.empty((0, 3))
-    if others is not None:
-        away = others.loc[others["frame"] == i, ["z", "y", "x"]].to_numpy(dtype=np.float64)
-    frame = np.asarray(stack.frame(i), dtype=np.float64)
-    return fit_window(
-        cut_window(frame, image, start.centers, others=away), image, optics.noise, start
-    )
-
-
-def _replaced(motion: RigidMotion, fits: dict[int, ImageFit]) -> RigidMotion:
-    """Return the motion with the fitted poses, its first one the identity again."""
-    rotation, center = np.full_like(motion.rotation, np.nan), np.full_like(motion.center, np.nan)
-    covariance = np.full_like(motion.covariance, np.nan)
-    variance = np.full_like(motion.center_variance, np.nan)
-    for k, fit in fits.items():
-        pose = fit.arrangement
-        if isinstance(pose, RigidCenters):
-            rotation[k], center[k] = pose.rotation, pose.center
-            covariance[k] = fit.covariance[3:, 3:]
-            variance[k] = np.trace(fit.covariance[:3, :3]) / 3
-    gauge = rotation[min(fits)] if fits else np.eye(3)
-    rotation = rotation @ gauge.T
-    reason = tuple(
-        "the pose fit to the image did not settle" if k in set(motion.fitted) - set(fits) else why
-        for k, why in enumerate(motion.reason)
-    )
-    return replace(
-        motion,
-        rotation=rotation,
-        center=center,
-        covariance=np.swapaxes(rotation, -1, -2) @ covariance @ rotation,
-        center_variance=variance,
-        template=motion.template @ gauge.T,
-        reason=reason,
-    )
 
 
 def _by_model(
@@ -530,22 +438,20 @@ def _listed(stack: Stack, frames: Iterable[int] | None) -> list[int]:
     return listed
 
 
-def _checked(
-    stack: Stack, diameter: float, contact: float, refine: Refine, percentile: float
-) -> None:
-    """Raise one error with every fault of the arguments."""
-    require_positive(diameter=diameter, contact=contact)
+def check_search(stack: Stack, search: Search, refine: Refine) -> None:
+    """Raise one error with every fault of the arguments of a search."""
+    require_positive(diameter=search.diameter, contact=search.contact)
     faults = []
     if len(stack.shape) != 4:
         faults.append(f"stack: expected shape (t, z, y, x), got {stack.shape}")
     if refine not in ("model", "trackpy", None):
         faults.append(f"refine: expected 'model', 'trackpy' or None, got {refine!r}")
-    if diameter > 1.2 * contact:
+    if search.diameter > 1.2 * search.contact:
         faults.append(
-            f"diameter {diameter} um is more than contact {contact} um: balls do not overlap; "
-            "are the two exchanged?"
+            f"diameter {search.diameter} um is more than contact {search.contact} um: balls do not "
+            "overlap; are the two exchanged?"
         )
-    if not 0 <= percentile < 100:
-        faults.append(f"percentile: expected 0 <= percentile < 100, got {percentile}")
+    if not 0 <= search.percentile < 100:
+        faults.append(f"percentile: expected 0 <= percentile < 100, got {search.percentile}")
     if faults:
         raise ValueError("; ".join(faults))
