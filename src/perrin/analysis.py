@@ -24,7 +24,7 @@ from perrin._arrays import (
 from perrin.diffusion import DiffusionEstimate, estimate_diffusion, with_error
 from perrin.files import check_tracks, read_tracks
 from perrin.grouping import each_cluster, find_clusters
-from perrin.identity import settle_identity
+from perrin.identity import Identity, settle_identity
 from perrin.mobility import Mobility, condition_faults
 from perrin.motion import RigidMotion, track_rotation
 from perrin.predictions import (
@@ -48,6 +48,7 @@ from perrin.results import (
 )
 from perrin.rod_diffusion import estimate_rod
 from perrin.rods import RodMotion, track_direction
+from perrin.rotations import fit_rotations, log_map
 from perrin.tensors import DiffusionTensor, diffusion_tensor
 
 if TYPE_CHECKING:
@@ -69,6 +70,7 @@ if TYPE_CHECKING:
 _FEW, _FEWEST = 20, 8
 # Cuts in more than this share of the frames are no accident.
 _MANY_CUTS = 0.02
+_ANGLES = 5  # of cuts, told one by one
 # Clusters that agree less well than this by chance have no common D.
 _DIFFER = 0.01
 
@@ -474,7 +476,7 @@ def _fit_body(tracks: _Tracks, cluster: int, label: str | None, conditions: Cond
         cuts=tuple(frames[1:][changed].tolist()),
         extra=tuple(frames[identity.extra].tolist()),
     )
-    told = _identity_told(quality, frames[identity.unsettled], len(frames))
+    told = _identity_told(quality, identity, tracks, motion)
     return _Body(cluster, label, frames, motion, quality, (*told, *quality.warnings))
 
 
@@ -560,20 +562,27 @@ def _at(frames: Iterable[int]) -> str:
     return f"frame{'s' if len(listed) > 1 else ''} {', '.join(listed)}"
 
 
-def _identity_told(quality: Quality, unsettled: Ints, count: int) -> list[str]:
+def _identity_told(
+    quality: Quality, identity: Identity, tracks: _Tracks, motion: RigidMotion
+) -> list[str]:
     """Name every frame at which labels were repaired, a track cut, or a detection left out."""
     told = []
     if quality.swaps:
-        told.append(f"identity: labels swap at {_at(quality.swaps)}; put right")
+        told.append(
+            f"identity: labels swap at {_at(quality.swaps)}; put right"
+            f"{_misfit_told(identity, tracks, motion)}"
+        )
     if quality.cuts:
         told.append(
             f"identity: who is who is in doubt at {_at(quality.cuts)}; the track is cut there"
+            f"{_jumps_told(quality, tracks, motion)}"
         )
     if quality.extra:
         told.append(
             f"identity: a detection that is no particle of the body is left out at "
             f"{_at(quality.extra)}"
         )
+    unsettled, count = tracks.frames[identity.unsettled], len(tracks.frames)
     if unsettled.size:
         told.append(
             f"identity: {unsettled.size} of {count} frames fit the common shape in no assignment "
@@ -585,6 +594,42 @@ def _identity_told(quality: Quality, unsettled: Ints, count: int) -> list[str]:
             "steps makes D_R too low: sample faster"
         )
     return told
+
+
+def _misfit_told(identity: Identity, tracks: _Tracks, motion: RigidMotion) -> str:
+    """Say which residual the swaps would have left with the labels as they came."""
+    rows = identity.swaps[identity.swaps > 0]
+    before = identity.order[rows - 1]
+    x = np.take_along_axis(tracks.positions[rows], np.maximum(before, 0)[..., None], axis=1)
+    whole = (before >= 0).all(axis=1) & np.isfinite(x).all(axis=(1, 2))
+    if not whole.any():
+        return ""
+    points = x[whole]
+    # An exact mirror image has no best rotation; it is left out.
+    rotation, unique = fit_rotations(points, motion.template)
+    if not unique.any():
+        return ""
+    turned = motion.template @ np.swapaxes(rotation[unique], -1, -2)
+    off = (points - points.mean(axis=1, keepdims=True))[unique] - turned
+    worst = float(np.sqrt((off**2).sum(axis=2).mean(axis=1)).max())
+    usual = float(np.nanmedian(motion.residual))
+    return f" (residual as labelled up to {worst:.3g} um against {usual:.3g} median)"
+
+
+def _jumps_told(quality: Quality, tracks: _Tracks, motion: RigidMotion) -> str:
+    """Say how far the body turns where the track is cut, as far as the fits tell."""
+    rows = np.searchsorted(tracks.frames, quality.cuts)
+    turn = motion.rotation[rows] @ np.swapaxes(motion.rotation[rows - 1], -1, -2)
+    known = np.isfinite(turn).all(axis=(-2, -1))
+    if not known.any():
+        return ""
+    angle = np.rad2deg(np.linalg.norm(log_map(turn[known]), axis=-1))
+    listed = ", ".join(f"{a:.0f}" for a in angle[:_ANGLES])
+    return (
+        f" (step angle{'s' if angle.size > 1 else ''} {listed}"
+        f"{', ...' if angle.size > _ANGLES else ''} deg: a jump of the body's symmetry, "
+        f"{quality.symmetry}, cannot be told from a real turn)"
+    )
 
 
 def _missing(motion: RigidMotion | RodMotion) -> list[str]:
