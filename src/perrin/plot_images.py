@@ -28,11 +28,13 @@ if TYPE_CHECKING:
 
     import pandas as pd
 
-    from perrin._arrays import Bools, Floats
+    from perrin._arrays import Bools, Floats, Ints
     from perrin.diffusion import DiffusionEstimate
     from perrin.images.imaging import Imaging, View
+    from perrin.motion import RigidMotion
     from perrin.plot import Axes, Figure
     from perrin.results import ClusterResult, Report, RodResult
+    from perrin.rods import RodMotion
 
 Side = Literal["xy", "xz", "yz"]
 Series = Literal["spheres", "spots", "brightness", "level", "saturated"]
@@ -43,6 +45,7 @@ _ACROSS: dict[str, tuple[str, str]] = {"xy": ("x", "y"), "xz": ("x", "z"), "yz":
 # Spheres are drawn no darker than this part of black, so that circles and numbers are seen on them.
 _DARKEST = 0.6
 
+_TRAIL = 100  # frames of a path: longer ones hide the spheres
 _PANELS = 8  # views in a montage
 _ACROSS_PAGE = 4  # of them in a row
 _NUMBERED = 12  # clusters whose numbers can be read on every side
@@ -104,7 +107,7 @@ def plot_tracks(report: Report, view: View, *, ax: Axes) -> Axes:
     Returns
     -------
     matplotlib.axes.Axes
-        um, the xy projection. Frames without a pose break a path.
+        um, the xy projection. A path reaches 100 frames back; frames without a pose break it.
     """
     imaging = imaging_of(report)
     _draw_image(imaging, view, ax=ax, side="xy")
@@ -112,11 +115,10 @@ def plot_tracks(report: Report, view: View, *, ax: Axes) -> Axes:
     _draw_circles(here, imaging.diameter, ax=ax, across="x", down="y", lw=0.9)
     for result in report.results:
         motion = result.motion
-        frame = np.rint(motion.time / motion.dt) + _first_frame(report)
-        path = motion.center[frame <= view.frame]
-        color, raster = _color(result.cluster), len(path) > _RASTER
-        ax.plot(path[:, 0], path[:, 1], color="white", lw=2.6, alpha=0.7, rasterized=raster)
-        ax.plot(path[:, 0], path[:, 1], color=color, lw=1.3, rasterized=raster)
+        frame = _frame_numbers(report, motion)
+        path = motion.center[(frame <= view.frame) & (frame > view.frame - _TRAIL)]
+        ax.plot(path[:, 0], path[:, 1], color="white", lw=2.4, alpha=0.7)
+        ax.plot(path[:, 0], path[:, 1], color=_color(result.cluster), lw=1.2)
     ax.set_title(_frame_text(imaging, view.frame), size="medium")
     return ax
 
@@ -208,11 +210,7 @@ def plot_rigidity(report: Report, *, ax: Axes) -> Axes:
         motion = result.motion
         look: dict[str, Any] = {"color": GREY, "alpha": 0.5, "lw": 0.6}
         if few:
-            look = {
-                "color": _color(result.cluster),
-                "lw": 0.9,
-                "label": f"cluster {_plain(result.name)}",
-            }
+            look = {"color": _color(result.cluster), "lw": 0.9, "label": _named(result)}
         raster = len(motion.time) * len(results) > _RASTER
         ax.plot(start + motion.time, 1e3 * motion.residual, rasterized=raster, **look)
     if not few:
@@ -244,7 +242,7 @@ def plot_step_angles(report: Report, *, ax: Axes) -> Axes:
         rotation vector has the variance 2 (D_R t + offset). Ticks are the largest steps; a dotted
         line, where it is within range, is the least turn that brings a body onto itself.
     """
-    angle, duration, owner, time = _steps(report)
+    angle, duration, end = _steps(report)
     if not angle.size:
         return _say(ax, "no step between two poses")
     top = 1.08 * max(float(angle.max()), 1e-3)
@@ -259,9 +257,7 @@ def plot_step_angles(report: Report, *, ax: Axes) -> Axes:
         ax.plot(fine, angle.size * width * density, color=RED, lw=1.4, label=said)
     k = int(angle.argmax())
     largest = np.sort(angle)[-_TICKS:]
-    said = (
-        f"largest: {number_text(angle[k])}° (cluster {_plain(owner[k])}, {number_text(time[k])} s)"
-    )
+    said = f"largest: {number_text(angle[k])}° ({end[k]})"
     look: dict[str, Any] = {"color": INK, "ls": "none", "ms": 9, "clip_on": False, "zorder": 4}
     ax.plot(largest, np.zeros(len(largest)), "|", label=said, transform=_foot(ax), **look)
     _mark_symmetry(report, top, ax=ax)
@@ -353,14 +349,19 @@ def _color(cluster: int) -> str:
     return PALETTE[cluster % len(PALETTE)]
 
 
-def _plain(name: str) -> str:
+def _named(result: ClusterResult | RodResult) -> str:
     """Return a cluster's name, which is the user's text: dollars in it are no formula."""
-    return shortened(name).replace("$", r"\$")
+    return "cluster " + shortened(result.name).replace("$", r"\$")
 
 
 def _first_frame(report: Report) -> int:
     """Return the stack's frame that the tracks call 0."""
     return int(report.settings.get("first_frame") or 0)
+
+
+def _frame_numbers(report: Report, motion: RigidMotion | RodMotion) -> Ints:
+    """Return the stack's frame of every row of a motion."""
+    return np.rint(motion.time / motion.dt).astype(np.int64) + _first_frame(report)
 
 
 def _start(report: Report) -> float:
@@ -457,10 +458,9 @@ def _draw_circles(
 def _write_number(cluster: int, place: Floats, *, ax: Axes, small: bool) -> None:
     """Write a cluster's number at its middle, to be read on light and dark."""
     outline = [withStroke(linewidth=2, foreground="white")]
-    text = ax.text(
-        place[0], place[1], str(cluster), color=INK, ha="center", va="center", clip_on=True
-    )
+    text = ax.text(place[0], place[1], str(cluster), color=INK, ha="center", va="center")
     text.set(size="x-small" if small else "medium", weight="bold", path_effects=outline)
+    text.set_clip_on(True)
 
 
 def _mass_edges(mass: Floats, minmass: float) -> Floats:
@@ -499,22 +499,22 @@ def _mark_largest(report: Report, *, ax: Axes) -> None:
     worst: ClusterResult | RodResult = report.results[int(np.argmax(tops))]
     k = int(np.nanargmax(worst.motion.residual))
     x, y = _start(report) + worst.motion.time[k], 1e3 * worst.motion.residual[k]
-    said = f"largest: {number_text(y)} nm (cluster {_plain(worst.name)}, {number_text(x)} s)"
+    frame = _frame_numbers(report, worst.motion)[k]
+    said = f"largest: {number_text(y)} nm ({_named(worst)}, frame {frame})"
     ax.plot(x, y, "o", ms=8, mfc="none", mec=INK, mew=1.0, label=said)
 
 
-def _steps(report: Report) -> tuple[Floats, Floats, list[str], Floats]:
-    """Return angle (degrees), duration, name of the cluster and time of its end, of every step."""
-    angle, duration, time = [np.empty(0)], [np.empty(0)], [np.empty(0)]
-    owner: list[str] = []
+def _steps(report: Report) -> tuple[Floats, Floats, list[str]]:
+    """Return angle (degrees), duration (s) and end (in words) of every step."""
+    angle, duration = [np.empty(0)], [np.empty(0)]
+    end: list[str] = []
     for result in report.clusters:
         motion = result.motion
         start, stop = motion.steps()
         angle.append(np.rad2deg(np.linalg.norm(motion.step_vectors()[stop - 1], axis=-1)))
         duration.append(motion.time[stop] - motion.time[start])
-        time.append(_start(report) + motion.time[stop])
-        owner += [result.name] * len(stop)
-    return np.concatenate(angle), np.concatenate(duration), owner, np.concatenate(time)
+        end += [f"{_named(result)}, frame {k}" for k in _frame_numbers(report, motion)[stop]]
+    return np.concatenate(angle), np.concatenate(duration), end
 
 
 def _angle_density(
@@ -553,11 +553,20 @@ def least_turn(symmetry: str) -> float:
     return 360 / order if order > 1 else np.inf
 
 
+def least_turns(report: Report) -> list[float]:
+    """Return the least turns, degrees, that bring the bodies of a report onto themselves."""
+    turns = set()
+    for result in report.clusters:
+        group = "" if result.quality is None else result.quality.symmetry
+        # In the plane only the axis across it counts, and then its mirror gives the group an h.
+        if result.motion.template.shape[1] == 3 or group.endswith("h"):
+            turns.add(least_turn(group))
+    return sorted(t for t in turns if np.isfinite(t))
+
+
 def _mark_symmetry(report: Report, top: float, *, ax: Axes) -> None:
     """Draw the least turns of the bodies' symmetries that lie below `top`, degrees."""
-    groups = {c.quality.symmetry for c in report.clusters if c.quality is not None}
-    turns = sorted({least_turn(g) for g in groups})
-    for turn in turns:
+    for turn in least_turns(report):
         if turn < top:
             said = f"turn onto itself, {number_text(turn)}°"
             ax.axvline(turn, color=INK, lw=1.2, ls=":", label=said)

@@ -8,7 +8,7 @@ import numpy as np
 
 from perrin.pages import byline, captioned, inline_pictures, render_page
 from perrin.plot import number_text
-from perrin.plot_images import imaging_of, least_turn
+from perrin.plot_images import imaging_of, least_turns
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -37,7 +37,7 @@ _CAPTIONS = {
     "tracks": (
         "Tracks on the images.",
         "Some frames all over the movie, seen from above: the spheres of the frame, and the path "
-        "of each cluster's centre up to it. A cluster keeps its colour.",
+        "of each cluster's centre in the 100 frames before it. A cluster keeps its colour.",
         "A cluster should keep its colour from frame to frame. A path that jumps from one cluster "
         "to another is a mistake; paths that all lean one way are drift; a path that ends is a "
         "cluster that was lost.",
@@ -285,11 +285,9 @@ def _body_facts(report: Report) -> list[Fact]:
         off = f"{100 * (mean / contact - 1):+.2g} %".replace("-", "−")
         remark = f"mean of {distance.size} pairs; contact is {number_text(contact)} µm ({off})"
         facts.append(("touching spheres apart", f"{number_text(mean, digits=4)} µm", remark))
-    turns = [least_turn(c.quality.symmetry) for c in report.clusters if c.quality is not None]
-    least = min(turns, default=np.inf)
-    if np.isfinite(least):
+    for turn in least_turns(report)[:1]:
         remark = "a step of half of it or more cannot be told from an exchange of spheres"
-        facts.append(("least turn onto itself", f"{number_text(least)}°", remark))
+        facts.append(("least turn onto itself", f"{number_text(turn)}°", remark))
     return facts
 
 
