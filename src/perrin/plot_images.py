@@ -249,12 +249,7 @@ def plot_step_angles(report: Report, *, ax: Axes) -> Axes:
     width = max(float(np.median(angle)) / 5, top / _MOST_BINS)
     edges = np.arange(0, top + width, width)
     ax.hist(angle, edges.tolist(), color=BLUE, alpha=0.75, label=f"{angle.size} steps")
-    if report.pooled is not None:
-        planar = any(c.motion.template.shape[1] == 2 for c in report.clusters)
-        fine = np.linspace(0, edges[-1], 20 * len(edges))
-        density = _angle_density(fine, duration, report.pooled.D_R, planar=planar)
-        said = "Brownian rotation with the pooled $D_R$ and noise"
-        ax.plot(fine, angle.size * width * density, color=RED, lw=1.4, label=said)
+    _draw_expected(report, edges, duration, ax=ax)
     k = int(angle.argmax())
     largest = np.sort(angle)[-_TICKS:]
     said = f"largest: {number_text(angle[k])}° ({end[k]})"
@@ -395,7 +390,8 @@ def _foot(ax: Axes) -> Any:  # noqa: ANN401 (matplotlib's transforms carry no co
 def _count_axis(ax: Axes) -> None:
     """Make the axis of numbers logarithmic: a single one among thousands is seen."""
     ax.set_yscale("log")
-    ax.set_ylim(bottom=0.5)
+    # Set both ends: the far tail of a law would stretch margins without bound.
+    ax.set_ylim(0.5, 2 * ax.dataLim.ymax)
     ax.yaxis.set_major_formatter("{x:g}")
 
 
@@ -517,6 +513,17 @@ def _steps(report: Report) -> tuple[Floats, Floats, list[str]]:
     return np.concatenate(angle), np.concatenate(duration), end
 
 
+def _draw_expected(report: Report, edges: Floats, duration: Floats, *, ax: Axes) -> None:
+    """Draw the numbers of steps that the pooled D_R and its noise give for columns of a width."""
+    if report.pooled is None:
+        return
+    planar = any(c.motion.template.shape[1] == 2 for c in report.clusters)
+    angle = np.linspace(0, edges[-1], 20 * len(edges))
+    density = _angle_density(angle, duration, report.pooled.D_R, planar=planar)
+    said = "Brownian rotation with the pooled $D_R$ and noise"
+    ax.plot(angle, duration.size * edges[1] * density, color=RED, lw=1.4, label=said)
+
+
 def _angle_density(
     angle: Floats, duration: Floats, D_R: DiffusionEstimate, *, planar: bool
 ) -> Floats:
@@ -627,8 +634,9 @@ def _found_figure(imaging: Imaging) -> Figure:
     main.set_xlabel("")
     main.tick_params(labelbottom=False)
     right.tick_params(labelleft=False)
-    right.xaxis.set_major_locator(MaxNLocator(3))
-    below.yaxis.set_major_locator(MaxNLocator(3))
+    room = 3 if depth > 0.2 * wide else 1
+    right.xaxis.set_major_locator(MaxNLocator(room))
+    below.yaxis.set_major_locator(MaxNLocator(room))
     return figure
 
 
