@@ -340,6 +340,14 @@ def test_paths_end_at_the_views_frame(report):
     assert ax.get_title() == "frame 20, 14.0 s"
 
 
+def test_paths_are_no_longer_than_their_tail(report, monkeypatch):
+    monkeypatch.setattr(plot_images, "_TRAIL", 10)
+    view = next(v for v in report.imaging.views if v.frame == 20)
+    ax = axes()
+    plot_images.plot_tracks(report, view, ax=ax)
+    assert np.array_equal(ax.lines[1].get_xydata(), report.clusters[0].motion.center[11:21, :2])
+
+
 def test_health_is_the_tables(report):
     frames = report.imaging.frames.assign(
         spheres=np.arange(40), saturated=np.linspace(0, 0.02, 40), level=10 - 0.1 * np.arange(40)

@@ -74,7 +74,8 @@ def plot_found(imaging: Imaging, view: View, *, ax: Axes, side: Side = "xy") -> 
     view : View
     ax : matplotlib.axes.Axes
     side : {"xy", "xz", "yz"}
-        y and z point down, as rows of an image do; in "yz" z points to the right.
+        y and z point down, as rows of an image do; in "yz" z points to the right. In the plane
+        there is only "xy".
 
     Returns
     -------

@@ -242,7 +242,7 @@ def _reasons(refused: Any) -> str:  # noqa: ANN401 (pandas carries no types)
     said = "the places first found were kept"
     if "reason" not in refused:
         return said
-    counts = refused["reason"].replace("", "no reason told").value_counts()
+    counts = refused["reason"].fillna("").replace("", "no reason told").value_counts()
     return f"{said}: {', '.join(f'{reason} ({n})' for reason, n in counts.items())}"
 
 
