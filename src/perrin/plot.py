@@ -29,13 +29,13 @@ if TYPE_CHECKING:
     from perrin.shapes import Cluster
 
 # Okabe and Ito's colours, told apart by colour-blind readers and in grey print.
-_INK, _BLUE, _RED, _GREY = "#222222", "#0072B2", "#D55E00", "#8a8a8a"
+INK, BLUE, RED, GREY = "#222222", "#0072B2", "#D55E00", "#8a8a8a"
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 
 _CROSS: dict[str, Any] = {
     "marker": "x",
     "ls": "none",
-    "color": _INK,
+    "color": INK,
     "ms": 4,
     "mew": 0.8,
     "clip_on": False,
@@ -87,11 +87,11 @@ def plot_lag_curve(
     unit = unit_text(curve.unit)
     if floor is not None and floor > 0:
         said = f"noise floor {number_text(floor)} {unit}"
-        ax.axhline(floor, color=_RED, lw=1.1, ls="--", label=said)
+        ax.axhline(floor, color=RED, lw=1.1, ls="--", label=said)
     ax.set(xscale="log", yscale="log", xlabel="lag time (s)")
     ax.set_ylabel(f"{_NAMES[curve.quantity][0]} ({unit})")
     _set_range(ax, curve, estimate, floor)
-    _legend_above(ax, ncols=2)
+    legend_above(ax, ncols=2)
     return ax
 
 
@@ -116,12 +116,12 @@ def plot_van_hove(result: VanHove, *, ax: Axes) -> Axes:
         result.density[full],
         result.stderr[full],
         fmt="o",
-        color=_BLUE,
+        color=BLUE,
         ms=3.5,
         elinewidth=0.8,
         label=said,
     )
-    ax.plot(middle, result.gaussian, "-", color=_RED, lw=1.2, label="Gaussian of the same width")
+    ax.plot(middle, result.gaussian, "-", color=RED, lw=1.2, label="Gaussian of the same width")
     name = "rotation" if result.quantity == "rotation" else "displacement"
     unit = unit_text(result.unit)
     ax.set_yscale("log", nonpositive="clip")
@@ -130,7 +130,7 @@ def plot_van_hove(result: VanHove, *, ax: Axes) -> Axes:
         xlabel=f"{name} in {result.lagtime:.3g} s ({unit})",
         ylabel=f"probability density (1/{unit})",
     )
-    _legend_above(ax, ncols=2)
+    legend_above(ax, ncols=2)
     return ax
 
 
@@ -153,11 +153,11 @@ def plot_residual(motion: RigidMotion, *, ax: Axes) -> Axes:
     middle = float(np.median(motion.residual[rows]))
     scale, unit = (1e3, "nm") if middle < 1 else (1.0, "µm")
     raster = len(motion.time) > _RASTER
-    drawn = ax.plot(motion.time, scale * motion.residual, "-", color=_BLUE, lw=0.7, marker=".")
+    drawn = ax.plot(motion.time, scale * motion.residual, "-", color=BLUE, lw=0.7, marker=".")
     drawn[0].set(ms=2, rasterized=raster, label="rms residual of the frame")
     expected = scale * _expected_residual(motion)
     said = f"expected from σ = {number_text(scale * motion.sigma)} {unit}"
-    drawn = ax.plot(motion.time, expected, color=_RED, lw=1.2, drawstyle="steps-mid", label=said)
+    drawn = ax.plot(motion.time, expected, color=RED, lw=1.2, drawstyle="steps-mid", label=said)
     drawn[0].set_rasterized(raster)
     refused = _refused(motion)
     if refused.size:
@@ -169,7 +169,7 @@ def plot_residual(motion: RigidMotion, *, ax: Axes) -> Axes:
     ax.set(xlabel="time (s)", ylabel=f"residual ({unit})")
     top = scale * float(np.max(motion.residual[rows]))
     ax.set_ylim(0, 1.08 * top if top > 0 else 1.0)
-    _legend_above(ax, ncols=3)
+    legend_above(ax, ncols=3)
     return ax
 
 
@@ -187,7 +187,7 @@ def plot_presence(motion: RigidMotion, *, ax: Axes) -> Axes:
         Time in s.
     """
     n = len(motion.template)
-    drawn = ax.plot(motion.time, motion.n_present, drawstyle="steps-mid", color=_BLUE, lw=1)
+    drawn = ax.plot(motion.time, motion.n_present, drawstyle="steps-mid", color=BLUE, lw=1)
     drawn[0].set_rasterized(len(motion.time) > _RASTER)
     refused = _refused(motion)
     if refused.size:
@@ -223,7 +223,7 @@ def plot_orientations(motion: RigidMotion, *, ax: Axes) -> Axes:
     paths = motion.orientation(motion.template[which])
     for color, i, path in zip(PALETTE, which, np.swapaxes(paths, 0, 1), strict=False):
         _draw_path(space, path[shown], color=color, label=f"particle {i}")
-    space.plot([], [], "o", ms=6, mfc="white", mec=_INK, label="last frame")
+    space.plot([], [], "o", ms=6, mfc="white", mec=INK, label="last frame")
     space.legend(loc="upper left", frameon=False, fontsize="small", handlelength=1.2)
     said = [f"particles 0 to {which[-1]} of {len(length)}"] if len(which) < len(length) else []
     said += [f"{len(shown)} of {len(motion.time)} frames"] if len(shown) < len(motion.time) else []
@@ -267,15 +267,15 @@ def plot_forest(
     if pooled is not None:
         for ends, alpha in ((pooled.ci95, 0.15), (pooled.ci68, 0.3)):
             low, high = np.clip(ends, left, right)
-            ax.axvspan(low, high, color=_RED, alpha=alpha, lw=0, zorder=0)
-        ax.axvline(pooled.value, color=_RED, lw=1, zorder=1, label=f"pooled, {value_text(pooled)}")
+            ax.axvspan(low, high, color=RED, alpha=alpha, lw=0, zorder=0)
+        ax.axvline(pooled.value, color=RED, lw=1, zorder=1, label=f"pooled, {value_text(pooled)}")
         ax.legend(loc="lower center", bbox_to_anchor=(0.5, 1), frameon=False, fontsize="small")
     ax.set(xlabel=f"{_NAMES[quantity][1]} ({unit_text(estimates[0].unit)})")
     ax.set_ylim(len(rows) - 0.4, -0.6)
     if many:
         ax.set(ylabel="clusters, ordered by value")
         return ax
-    names = [_shortened(clusters[i].name) for i in rows]
+    names = [shortened(clusters[i].name) for i in rows]
     # A name is the user's text: dollars in it are no formula.
     ax.set_yticks(np.arange(len(rows)), names, parse_math=False)
     ax.set(ylabel="cluster")
@@ -298,9 +298,9 @@ def plot_plan(plan: SamplingPlan, *, ax: Axes) -> Axes:
     """
     if plan.dt_min < plan.dt_max:
         said = f"window, {number_text(plan.dt_min)} to {number_text(plan.dt_max)} s"
-        ax.axvspan(plan.dt_min, plan.dt_max, color=_GREY, alpha=0.18, lw=0, label=said)
-    _draw_errors(plan.error, plan, ax=ax, color=_BLUE, label="noise estimated along (default)")
-    _draw_errors(plan.error_residual, plan, ax=ax, color=_RED, label="noise from the residuals")
+        ax.axvspan(plan.dt_min, plan.dt_max, color=GREY, alpha=0.18, lw=0, label=said)
+    _draw_errors(plan.error, plan, ax=ax, color=BLUE, label="noise estimated along (default)")
+    _draw_errors(plan.error_residual, plan, ax=ax, color=RED, label="noise from the residuals")
     best: dict[str, Any] = {
         "mfc": "white",
         "mew": 1.6,
@@ -310,15 +310,15 @@ def plot_plan(plan: SamplingPlan, *, ax: Axes) -> Axes:
         "zorder": 4,
     }
     said = f"best, {number_text(plan.dt_best)} s"
-    ax.plot(plan.dt_best, 100 * plan.expected_error, mec=_BLUE, label=said, **best)
-    ax.plot(plan.dt_best, 100 * plan.expected_error_residual, mec=_RED, **best)
-    lost: dict[str, Any] = {"color": _GREY, "lw": 1.4, "ls": (0, (3, 2))}
+    ax.plot(plan.dt_best, 100 * plan.expected_error, mec=BLUE, label=said, **best)
+    ax.plot(plan.dt_best, 100 * plan.expected_error_residual, mec=RED, **best)
+    lost: dict[str, Any] = {"color": GREY, "lw": 1.4, "ls": (0, (3, 2))}
     ax.plot([], [], label="particles cannot be told apart", **lost)
     rules = [plan.paper_dt_min, plan.paper_dt_max]
     said = "rules of Hunter 2011, {} and {} s".format(*map(number_text, rules))
-    ax.vlines(rules, 0, 1, _INK, lw=1.2, ls=":", label=said, transform=ax.get_xaxis_transform())
+    ax.vlines(rules, 0, 1, INK, lw=1.2, ls=":", label=said, transform=ax.get_xaxis_transform())
     _scale_plan(plan, ax=ax)
-    _legend_above(ax, ncols=2)
+    legend_above(ax, ncols=2)
     return ax
 
 
@@ -503,7 +503,8 @@ def unit_text(ascii_unit: str) -> str:
     return ascii_unit.replace("um", "µm").replace("^2", "²")
 
 
-def _shortened(name: str, *, most: int = 24) -> str:
+def shortened(name: str, *, most: int = 24) -> str:
+    """Return a user's name for a cluster, cut where it is too long for a picture."""
     return name if len(name) <= most else name[: most - 1] + "…"
 
 
@@ -524,12 +525,12 @@ def _draw_points(curve: LagCurve, *, ax: Axes, label: str | None) -> None:
     low, high = np.maximum(value - error, 1e-2 * value), value + error
     sure = t <= 0.25 * curve.lagtime[-1]
     rest = t >= t[sure].max(initial=0.0)
-    points: dict[str, Any] = {"color": _INK, "ms": 4, "mew": 0}
+    points: dict[str, Any] = {"color": INK, "ms": 4, "mew": 0}
     ax.plot(t[sure], value[sure], ".", label=label or _NAMES[curve.quantity][0], **points)
     if not sure.all():
         said = "beyond ¼ of the track"
         ax.plot(t[~sure], value[~sure], ".", alpha=0.3, label=said, **points)
-    band: dict[str, Any] = {"color": _GREY, "lw": 0}
+    band: dict[str, Any] = {"color": GREY, "lw": 0}
     ax.fill_between(t[sure], low[sure], high[sure], alpha=0.35, label="± 1 standard error", **band)
     ax.fill_between(t[rest], low[rest], high[rest], alpha=0.15, **band)
 
@@ -543,11 +544,11 @@ def _draw_estimate(curve: LagCurve, estimate: DiffusionEstimate, *, ax: Axes) ->
     method = _METHODS.get(estimate.method, estimate.method)
     said = f"{method} {symbol} {'= ' if estimate.resolved else ''}{value_text(estimate)}"
     # Blur can make the offset so negative that the line has no logarithm at short lags.
-    ax.plot(t, np.where(line > 0, line, np.nan), color=_BLUE, lw=1.4, label=said)
+    ax.plot(t, np.where(line > 0, line, np.nan), color=BLUE, lw=1.4, label=said)
     if estimate.resolved:
         sparse = np.geomspace(first, last, 12)
         pure, said = slope * estimate.value * sparse, f"pure diffusion {slope} {symbol} t"
-        ax.plot(sparse, pure, "o", mfc="none", mec=_BLUE, ms=5, mew=0.9, label=said)
+        ax.plot(sparse, pure, "o", mfc="none", mec=BLUE, ms=5, mew=0.9, label=said)
 
 
 def _draw_errors(error: Floats, plan: SamplingPlan, *, ax: Axes, color: str, label: str) -> None:
@@ -572,7 +573,7 @@ def _scale_plan(plan: SamplingPlan, *, ax: Axes) -> None:
     ax.xaxis.set_major_formatter(lambda value, _: number_text(value, digits=1))
 
 
-def _legend_above(ax: Axes, *, ncols: int) -> None:
+def legend_above(ax: Axes, *, ncols: int) -> None:
     """Put the legend over the axes, where it hides nothing."""
     ax.legend(
         loc="lower left",
@@ -635,8 +636,8 @@ def _draw_sphere(ax: Any) -> None:  # noqa: ANN401
         r = np.sin(polar)
         ax.plot(r * np.cos(azimuth), r * np.sin(azimuth), np.cos(polar), **grid)
     for axis, name in zip(np.eye(3), "xyz", strict=True):
-        ax.plot(*np.outer(axis, [1.0, 1.2]), color=_GREY, lw=0.9)
-        ax.text(*(1.3 * axis), name, color=_INK, ha="center", va="center")
+        ax.plot(*np.outer(axis, [1.0, 1.2]), color=GREY, lw=0.9)
+        ax.text(*(1.3 * axis), name, color=INK, ha="center", va="center")
     ax.set(xlim=(-1, 1), ylim=(-1, 1), zlim=(-1, 1), xlabel="x", ylabel="y", zlabel="z")
     ax.set_proj_type("ortho")
     ax.set_box_aspect((1, 1, 1), zoom=1.4)
@@ -659,10 +660,10 @@ def _draw_path(ax: Any, path: Floats, *, color: str, label: str) -> None:  # noq
 def _plot_angle(motion: RigidMotion, *, ax: Axes) -> Axes:
     """Draw the unbounded angle of a motion in the plane."""
     angle = motion.rotational_displacement([1.0, 0.0])[:, 0]
-    ax.plot(motion.time, angle, color=_BLUE, lw=0.9, rasterized=len(angle) > _RASTER)
+    ax.plot(motion.time, angle, color=BLUE, lw=0.9, rasterized=len(angle) > _RASTER)
     last = motion.fitted[-1]
-    ax.plot(motion.time[last], angle[last], "o", ms=7, mfc="white", mec=_BLUE, mew=1.4)
-    ax.axhline(0, color=_GREY, lw=0.6)
+    ax.plot(motion.time[last], angle[last], "o", ms=7, mfc="white", mec=BLUE, mew=1.4)
+    ax.axhline(0, color=GREY, lw=0.6)
     ax.set(xlabel="time (s)", ylabel="angle φ (rad)")
     return ax
 
@@ -694,16 +695,16 @@ def _draw_intervals(
     value = np.array([e.value for e in estimates])
     resolved = np.array([e.resolved for e in estimates], dtype=np.bool_)
     ci68, ci95 = (np.array([getattr(e, c) for e in estimates]) for c in ("ci68", "ci95"))
-    for ends, width, color in ((ci95, 0.8, _GREY if thin else _BLUE), (ci68, 3.5, _BLUE)):
+    for ends, width, color in ((ci95, 0.8, GREY if thin else BLUE), (ci68, 3.5, BLUE)):
         low, high = np.clip(ends, left, right).T
         seen = (low < right) & (high > left)
         ax.hlines(rows[seen], low[seen], high[seen], color=color, lw=width / (1 + thin))
-    look: dict[str, Any] = {"ms": 2, "color": "white"} if thin else {"ms": 5, "color": _INK}
+    look: dict[str, Any] = {"ms": 2, "color": "white"} if thin else {"ms": 5, "color": INK}
     ax.plot(value[resolved], rows[resolved], "o", mew=0, **look)
     limits = np.minimum(ci95[:, 1], right)
     beyond, below = (ci95[:, 1] > right) & resolved, (ci95[:, 0] < left) & resolved
-    edge: dict[str, Any] = {"ls": "none", "clip_on": False, "mec": _BLUE, "mfc": _BLUE, "ms": 4}
-    limit = edge | {"mec": _INK, "mfc": "white", "ms": 3 if thin else 7}
+    edge: dict[str, Any] = {"ls": "none", "clip_on": False, "mec": BLUE, "mfc": BLUE, "ms": 4}
+    limit = edge | {"mec": INK, "mfc": "white", "ms": 3 if thin else 7}
     for which, x, marker, look in (
         (~resolved, limits, "<", limit),
         (beyond, np.full(len(rows), right), ">", edge),

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import base64
-from datetime import datetime
-from importlib.resources import files
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jinja2 import Environment, StrictUndefined
 
+from perrin.pages import byline, captioned, inline_pictures, render_page
 from perrin.plot import (
     MAX_CLUSTERS,
     bare_text,
@@ -22,12 +18,15 @@ from perrin.plot import (
     unit_text,
     value_text,
 )
+from perrin.plot_images import save_image_figures
+from perrin.quality_page import render_quality
 from perrin.results import filled_folder, floor_factor, staged_folder, write_data
 from perrin.sampling import judge_sampling
 
 if TYPE_CHECKING:
     import os
     from collections.abc import Iterable, Mapping
+    from pathlib import Path
 
     from perrin.diffusion import DiffusionEstimate
     from perrin.predictions import Compared, Prediction
@@ -100,7 +99,8 @@ def write_run(report: Report, folder: str | os.PathLike[str], *, overwrite: bool
     ----------
     report : Report
     folder : path
-        Made new. Figures go to ``figures/``, the report to ``report.html``.
+        Made new. Figures go to ``figures/``, the report to ``report.html``; how the spheres were
+        seen, where the run began with images, to ``quality.html``.
     overwrite : bool
         Replace an existing run folder.
 
@@ -137,6 +137,9 @@ def _write(report: Report, stage: Path) -> None:
     place.mkdir()
     html = render_html(report, save_figures(report, place))
     (stage / "report.html").write_text(html, encoding="utf-8")
+    if report.imaging is not None:
+        html = render_quality(report, save_image_figures(report, place))
+        (stage / "quality.html").write_text(html, encoding="utf-8")
 
 
 def render_html(report: Report, figures: Iterable[Path]) -> str:
@@ -152,14 +155,10 @@ def render_html(report: Report, figures: Iterable[Path]) -> str:
     -------
     str
     """
-    pictures = {f.stem: _inline(f) for f in figures if f.suffix == ".png"}
-    # Text of users (labels, paths) goes through the template alone, which escapes it.
-    environment = Environment(
-        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    template = files("perrin").joinpath("report.html.jinja").read_text(encoding="utf-8")
+    pictures = inline_pictures(figures)
     several = len(report.clusters) > 1
-    return environment.from_string(template).render(
+    return render_page(
+        "report",
         **_provenance(report.settings),
         several=several,
         label=None if several else report.results[0].label,
@@ -167,6 +166,7 @@ def render_html(report: Report, figures: Iterable[Path]) -> str:
         overview=[_overview_row(c) for c in report.clusters] if several else [],
         pooled=_pooled_row(report, report.pooled) if several and report.pooled else None,
         rods=[_rod_row(rod) for rod in report.rods],
+        seen=report.imaging is not None,
         warnings=report.warnings,
         warned=[(c.cluster, c.name, c.warnings) for c in report.results if c.warnings],
         spelled=sum(len(c.warnings) for c in report.results) <= _SPELLED,
@@ -180,17 +180,9 @@ def render_html(report: Report, figures: Iterable[Path]) -> str:
     )
 
 
-def _inline(file: Path) -> str:
-    return "data:image/png;base64," + base64.b64encode(file.read_bytes()).decode("ascii")
-
-
 def _figure(pictures: Mapping[str, str], stem: str, kind: str) -> dict[str, str] | None:
     """Return a picture with its caption, or None where it was not drawn."""
-    if stem not in pictures:
-        return None
-    title, shows, look_for = _CAPTIONS[kind]
-    said = {"title": title, "shows": shows, "look_for": look_for}
-    return {"source": pictures[stem], "kind": kind} | said
+    return captioned(pictures, stem, kind, _CAPTIONS[kind])
 
 
 def _headline(report: Report) -> list[dict[str, Any]]:
@@ -461,16 +453,13 @@ def _why_no_sizes(result: ClusterResult, settings: Mapping[str, Any]) -> str:
 def _provenance(settings: Mapping[str, Any]) -> dict[str, Any]:
     """Return where the numbers come from: input, date, arguments, versions."""
     source = settings.get("input", {})
-    path, created = source.get("path"), settings.get("created")
     arguments = [
         (name, "not given" if value is None else f"{value} {_ARGUMENT_UNITS.get(name, '')}".strip())
         for name, value in settings.get("arguments", {}).items()
     ]
-    return {
-        "input_name": Path(path).name if path else "table in memory",
-        "input_path": path or "a table in memory",
+    return byline(settings) | {
+        "input_path": source.get("path") or "a table in memory",
         "sha256": source.get("sha256") or "none (no file)",
-        "date": f"{datetime.fromisoformat(created):%Y-%m-%d %H:%M} UTC" if created else "no date",
         "arguments": arguments,
         "versions": list(settings.get("versions", {}).items()),
     }
