@@ -23,7 +23,7 @@ import perrin
 from perrin.images.conventional import refine_by_trackpy
 from perrin.images.features import at_contact
 from perrin.images.image_fit import FreeCenters, cut_window, fit_window
-from perrin.images.locate import Search, fit_optics
+from perrin.images.locate import Search, choose_method, sample_frames
 from perrin.rotations import exp_map, log_map
 
 VOXEL = np.array([0.25, 0.2, 0.2])
@@ -172,7 +172,9 @@ def main():
     rng = np.random.default_rng(args.seed)
     movie, rotation, places = simulated(args.frames, args.photons, rng)
     search = {"diameter": 1.03 * DIAMETER, "contact": DIAMETER}
-    optics = fit_optics(movie, Search(**search))
+    looked_for = Search(**search)
+    sample = sample_frames(movie, looked_for, range(args.frames))
+    optics = choose_method(movie, looked_for, sample).optics
     print(optics)
     # Bleaching takes 15 % on average, depth 9 %.
     floor, rigid = numerical_floor(places[0], 0.85 * args.photons)

@@ -20,7 +20,7 @@ from perrin.images.image_fit import (
     cut_window,
     fit_window,
 )
-from perrin.images.locate import Search, fit_optics
+from perrin.images.locate import Search, choose_method, sample_frames
 from perrin.images.sphere_image import sphere_image
 from perrin.rotations import exp_map, log_map
 
@@ -82,7 +82,9 @@ def tetrahedra():
 @pytest.fixture(scope="module")
 def learned(tetrahedra):
     """Learn the optics from the movie, the diameter given 4 % wrong."""
-    return fit_optics(tetrahedra[0], Search(2.55, DIAMETER))
+    movie, search = tetrahedra[0], Search(2.55, DIAMETER)
+    sample = sample_frames(movie, search, range(movie.shape[0]))
+    return choose_method(movie, search, sample).optics
 
 
 def in_true_order(table, places):

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from perrin._arrays import (
         DegenerateClusterError,
         FrameError,
+        IdentityError,
         IdentityWarning,
         PrecisionWarning,
         TooFewFramesError,
@@ -32,9 +33,11 @@ if TYPE_CHECKING:
         size_from_translation,
     )
     from perrin.identity import Identity, settle_identity
-    from perrin.images.locate import fit_pose, locate
+    from perrin.images.locate import locate
     from perrin.images.optics import Optics
+    from perrin.images.poses import fit_pose
     from perrin.images.render import render_stack
+    from perrin.images.run import analyze_stack
     from perrin.images.stacks import Stack, open_stack, write_stack
     from perrin.lagged import (
         LagCurve,
@@ -82,6 +85,7 @@ __all__ = [
     "DiffusionTensor",
     "FrameError",
     "Identity",
+    "IdentityError",
     "IdentityWarning",
     "LagCurve",
     "Mobility",
@@ -106,6 +110,7 @@ __all__ = [
     "WallFactor",
     "add_noise",
     "analyze",
+    "analyze_stack",
     "apparent_translation",
     "axis_angle",
     "cluster_mobility",
@@ -165,6 +170,7 @@ _ROOMS = {
     "_arrays": (
         "DegenerateClusterError",
         "FrameError",
+        "IdentityError",
         "IdentityWarning",
         "PrecisionWarning",
         "TooFewFramesError",
@@ -216,7 +222,9 @@ _ROOMS = {
     "images.stacks": ("Stack", "open_stack", "write_stack"),
     "images.render": ("render_stack",),
     "images.optics": ("Optics",),
-    "images.locate": ("fit_pose", "locate"),
+    "images.locate": ("locate",),
+    "images.poses": ("fit_pose",),
+    "images.run": ("analyze_stack",),
     "results": ("ClusterResult", "Report", "RodResult", "load_run"),
     "analysis": ("analyze",),
     "report": ("write_run",),

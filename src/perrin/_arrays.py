@@ -54,6 +54,10 @@ class TrackTableError(ValueError):
         self.faults = faults
 
 
+class IdentityError(ValueError):
+    """Which particle is which cannot be told: frames are too far apart."""
+
+
 class FrameError(ValueError):
     """One frame of a stack cannot be read; the others may be.
 

@@ -9,7 +9,7 @@ import warnings as python_warnings
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -51,7 +51,7 @@ from perrin.rods import RodMotion, track_direction
 from perrin.tensors import DiffusionTensor, diffusion_tensor
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Callable, Iterable, Mapping
 
     import pandas as pd
     from numpy.typing import ArrayLike
@@ -59,6 +59,11 @@ if TYPE_CHECKING:
     from perrin.hydrodynamics import Size
     from perrin.noise import NoiseFloor
     from perrin.steps import Quantity
+
+    # A better motion for every cluster, from its motion and the frame numbers of its rows.
+    Improve: TypeAlias = Callable[
+        [Mapping[int, tuple[RigidMotion, Ints]]], Mapping[int, RigidMotion]
+    ]
 
 # So few particles in so few frames may pass as one body without a cluster column.
 _FEW, _FEWEST = 20, 8
@@ -69,8 +74,8 @@ _DIFFER = 0.01
 
 
 @dataclass(frozen=True, eq=False)
-class _Conditions:
-    """What the user knows of the experiment."""
+class Conditions:
+    """What the user knows of the experiment: see `analyze`."""
 
     dt: float
     sigma: ArrayLike | None
@@ -80,6 +85,11 @@ class _Conditions:
     noise: Literal["joint", "residual"] | float
     exposure: float | None
     drift: bool
+    times: Floats | None = None  # of every frame, s, where they are not dt apart
+
+    def clock(self, frames: Ints) -> Floats:
+        """Return the times of frames, s."""
+        return np.asarray(frames * self.dt if self.times is None else self.times[frames])
 
     def estimate(
         self, motion: RigidMotion | list[RigidMotion], quantity: Quantity
@@ -185,27 +195,70 @@ def analyze(
     >>> print(report.clusters[0].D_R)
     D_R = 0.0051(4) rad^2/s [mle, 300 frames]
     """
-    _check_arguments(
+    check_arguments(
         dt=dt, contact=contact, viscosity=viscosity, temperature=temperature, diameter=diameter
     )
     table, source = _table(tracks, scale=scale, columns=columns)
-    conditions = _Conditions(dt, sigma, viscosity, temperature, diameter, noise, exposure, drift)
+    conditions = Conditions(dt, sigma, viscosity, temperature, diameter, noise, exposure, drift)
     table = _sliced(table, frames)
+    arguments = told_conditions(conditions) | {"contact": contact, "frames": frames}
+    arguments |= {"columns": columns, "scale": _plain(scale)}
+    return measure_table(table, conditions, contact=contact, source=source, arguments=arguments)
+
+
+def measure_table(
+    table: pd.DataFrame,
+    conditions: Conditions,
+    *,
+    source: Mapping[str, str | None],
+    arguments: Mapping[str, Any],
+    contact: float | None = None,
+    improved: Improve | None = None,
+) -> Report:
+    """Measure every cluster of a clean table; `analyze` without its door.
+
+    Parameters
+    ----------
+    table : pandas.DataFrame
+        As `check_tracks` returns it, perhaps with cluster and piece.
+    conditions : Conditions
+    source, arguments : mapping
+        For run.json.
+    contact : float, optional
+        As in `analyze`.
+    improved : callable, optional
+        Given the fitted bodies by cluster number, returns their motions from better data, without
+        those that have to be left out.
+    """
     table, labels, warnings = _clustered(table, contact=contact)
     first = int(table["frame"].min())
     table["frame"] -= first
-    results, rods, failures = _each(table, labels, conditions)
+    if conditions.times is not None:
+        conditions = replace(conditions, times=conditions.times[first:])
+    bodies, rods, failures = _fitted(table, labels, conditions)
+    if improved is not None:
+        motions = improved({b.cluster: (b.motion, b.frames + first) for b in bodies})
+        bodies = [b._replace(motion=motions[b.cluster]) for b in bodies if b.cluster in motions]
+    results, unanswered = _estimated(bodies, conditions)
+    failures += unanswered
+    if failures and not (results or rods):
+        raise failures[-1].error
     results, rods = _interpreted(results, rods, conditions)
     pooled, more = _pooled(results, conditions) if results else (None, [])
     more += _exposure_taken(conditions)
-    arguments = asdict(conditions) | {"contact": contact, "frames": frames, "columns": columns}
-    arguments |= {name: _plain(given) for name, given in (("scale", scale), ("sigma", sigma))}
     settings = _settings(source, arguments=arguments, first_frame=first)
-    told = (*warnings, *failures, *more)
+    told = (*warnings, *(failure.told for failure in failures), *more)
     return Report(tuple(results), pooled, told, table, settings, tuple(rods))
 
 
-def _check_arguments(*, dt: float, **given: float | None) -> None:
+def told_conditions(conditions: Conditions) -> dict[str, Any]:
+    """Return the conditions as run.json keeps them."""
+    entry = asdict(replace(conditions, times=None))
+    del entry["times"]
+    return entry | {"sigma": _plain(conditions.sigma)}
+
+
+def check_arguments(*, dt: float, **given: float | None) -> None:
     """Refuse arguments out of range, all in one message."""
     known = {name: value for name, value in given.items() if value is not None}
     faults = condition_faults(dt=dt, **known)
@@ -332,27 +385,35 @@ def _numbered(table: pd.DataFrame) -> tuple[pd.DataFrame, dict[int, str]]:
     return table.assign(cluster=codes.astype(np.int64)), labels
 
 
-def _each(
-    table: pd.DataFrame, labels: dict[int, str], conditions: _Conditions
-) -> tuple[list[ClusterResult], list[RodResult], list[str]]:
-    """Measure cluster by cluster; one that cannot answer is a warning, unless none can."""
-    results: list[ClusterResult] = []
+def _fitted(
+    table: pd.DataFrame, labels: dict[int, str], conditions: Conditions
+) -> tuple[list[_Body], list[RodResult], list[_Failure]]:
+    """Fit cluster by cluster; return bodies, rods, and what cannot answer."""
+    bodies: list[_Body] = []
     rods: list[RodResult] = []
-    failures: list[str] = []
+    failures: list[_Failure] = []
     for cluster, positions, frames, piece in each_cluster(table):
         label = labels.get(cluster)
         try:
-            result = _measure(_Tracks(positions, frames, piece), cluster, label, conditions)
-            if isinstance(result, RodResult):
-                rods.append(result)
+            found = _fit(_Tracks(positions, frames, piece), cluster, label, conditions)
+            if isinstance(found, RodResult):
+                rods.append(found)
             else:
-                results.append(result)
+                bodies.append(found)
         except (DegenerateClusterError, TooFewFramesError) as error:
-            failures.append(f"cluster {label or cluster} was left out: {error}")
-            count = table["cluster"].loc[lambda c: c != -1].nunique()
-            if not (results or rods) and len(failures) == count:
-                raise
-    return results, rods, failures
+            failures.append(_Failure(label or str(cluster), error))
+    return bodies, rods, failures
+
+
+class _Failure(NamedTuple):
+    """A cluster that cannot answer, and why."""
+
+    name: str
+    error: DegenerateClusterError | TooFewFramesError
+
+    @property
+    def told(self) -> str:
+        return f"cluster {self.name} was left out: {self.error}"
 
 
 class _Tracks(NamedTuple):
@@ -363,14 +424,25 @@ class _Tracks(NamedTuple):
     piece: Ints
 
 
-def _measure(
-    tracks: _Tracks, cluster: int, label: str | None, conditions: _Conditions
-) -> ClusterResult | RodResult:
-    """Measure a body, or the direction of a rod that has no full orientation."""
+class _Body(NamedTuple):
+    """One cluster's fitted motion, what it went through, and what has to be told of it."""
+
+    cluster: int
+    label: str | None
+    frames: Ints
+    motion: RigidMotion
+    quality: Quality
+    told: tuple[str, ...]
+
+
+def _fit(
+    tracks: _Tracks, cluster: int, label: str | None, conditions: Conditions
+) -> _Body | RodResult:
+    """Fit a body, or measure the direction of a rod that has no full orientation."""
     if tracks.positions.shape[1:] == (2, 3):
         return _measure_rod(tracks, cluster, label, conditions)
     try:
-        return _measure_body(tracks, cluster, label, conditions)
+        return _fit_body(tracks, cluster, label, conditions)
     except DegenerateClusterError as error:
         try:
             return _measure_rod(tracks, cluster, label, conditions)
@@ -378,17 +450,19 @@ def _measure(
             raise error from None
 
 
-def _measure_body(
-    tracks: _Tracks, cluster: int, label: str | None, conditions: _Conditions
-) -> ClusterResult:
-    """Settle who is who, estimate the coefficients, and collect what must be said about them."""
+def _fit_body(tracks: _Tracks, cluster: int, label: str | None, conditions: Conditions) -> _Body:
+    """Settle who is who, fit the common shape to every frame, and judge the fits."""
     frames = tracks.frames
     identity = settle_identity(tracks.positions, times=frames)
     positions = identity.arranged(tracks.positions)
     changed = (np.diff(tracks.piece) != 0) | (np.diff(identity.piece) != 0)
     piece = np.append(0, np.cumsum(changed)).astype(np.int64)
     motion = track_rotation(
-        positions, dt=conditions.dt, frames=frames, sigma=conditions.sigma, piece=piece
+        positions,
+        dt=conditions.dt,
+        times=conditions.clock(frames),
+        sigma=conditions.sigma,
+        piece=piece,
     )
     quality = judge_quality(
         motion,
@@ -398,13 +472,33 @@ def _measure_body(
         cuts=tuple(frames[1:][changed].tolist()),
         extra=tuple(frames[identity.extra].tolist()),
     )
+    told = _identity_told(quality, frames[identity.unsettled], len(frames))
+    return _Body(cluster, label, frames, motion, quality, (*told, *quality.warnings))
+
+
+def _estimated(
+    bodies: Iterable[_Body], conditions: Conditions
+) -> tuple[list[ClusterResult], list[_Failure]]:
+    """Estimate the coefficients of every body; return what cannot answer as well."""
+    results: list[ClusterResult] = []
+    failures: list[_Failure] = []
+    for body in bodies:
+        try:
+            results.append(_estimate_body(body, conditions))
+        except (DegenerateClusterError, TooFewFramesError) as error:
+            failures.append(_Failure(body.label or str(body.cluster), error))
+    return results, failures
+
+
+def _estimate_body(body: _Body, conditions: Conditions) -> ClusterResult:
+    """Estimate the coefficients, and collect what must be said about them."""
+    motion = body.motion
     D_R, D_T = (conditions.estimate(motion, q) for q in ("rotation", "translation"))
     noise = predicted_noise(motion)
     tensor, unfound = _tensor(motion, conditions)
     warnings = (
         *_missing(motion),
-        *_identity_told(quality, frames[identity.unsettled], len(frames)),
-        *quality.warnings,
+        *body.told,
         *_floor_mismatch(motion, D_R, noise),
         *_unresolved(D_R, D_T),
         *(f"D_R: {text}" for text in D_R.warnings),
@@ -412,11 +506,13 @@ def _measure_body(
         *_drift_told(D_T),
         *unfound,
     )
-    return ClusterResult(cluster, motion, D_R, D_T, tensor, noise, None, warnings, label, quality)
+    return ClusterResult(
+        body.cluster, motion, D_R, D_T, tensor, noise, None, warnings, body.label, body.quality
+    )
 
 
 def _tensor(
-    motion: RigidMotion, conditions: _Conditions, quantity: Quantity = "rotation"
+    motion: RigidMotion, conditions: Conditions, quantity: Quantity = "rotation"
 ) -> tuple[DiffusionTensor | None, list[str]]:
     """Return the tensor in body axes, or None and the reason; in the plane there is none."""
     if motion.template.shape[1] != 3:
@@ -436,11 +532,13 @@ def _tensor(
 
 
 def _measure_rod(
-    tracks: _Tracks, cluster: int, label: str | None, conditions: _Conditions
+    tracks: _Tracks, cluster: int, label: str | None, conditions: Conditions
 ) -> RodResult:
     """Estimate how fast the direction and the centre of a straight chain diffuse."""
     frames, dt = tracks.frames, conditions.dt
-    motion = track_direction(tracks.positions, dt=dt, times=frames * dt, sigma=conditions.sigma)
+    motion = track_direction(
+        tracks.positions, dt=dt, times=conditions.clock(frames), sigma=conditions.sigma
+    )
     D_perp, D_T = estimate_rod(motion), estimate_rod(motion, quantity="translation")
     warnings = [
         f"no D_R: {len(motion.places)} particles on one line have a direction but no full "
@@ -524,7 +622,7 @@ def _drift_told(D_T: DiffusionEstimate) -> list[str]:
     return [f"D_T is about a mean velocity of {told} um/s"]
 
 
-def _exposure_taken(conditions: _Conditions) -> list[str]:
+def _exposure_taken(conditions: Conditions) -> list[str]:
     """Say what an unknown exposure was taken for where the noise is held."""
     if conditions.noise == "joint" or conditions.exposure is not None:
         return []
@@ -535,7 +633,7 @@ def _exposure_taken(conditions: _Conditions) -> list[str]:
 
 
 def _interpreted(
-    results: list[ClusterResult], rods: list[RodResult], conditions: _Conditions
+    results: list[ClusterResult], rods: list[RodResult], conditions: Conditions
 ) -> tuple[list[ClusterResult], list[RodResult]]:
     """Add what the shapes imply: sizes, and predictions where a diameter was stated."""
     if conditions.temperature is None:
@@ -556,7 +654,7 @@ def _shape(positions: Floats, motion: RigidMotion | RodMotion) -> Shape:
     return Shape(positions, float(np.nan_to_num(motion.sigma) / np.sqrt(motion.fitted.size)))
 
 
-def _with_sizes(result: ClusterResult, body: Body, conditions: _Conditions) -> ClusterResult:
+def _with_sizes(result: ClusterResult, body: Body, conditions: Conditions) -> ClusterResult:
     """Add the sizes and, for a stated diameter, the prediction, or why there are none."""
     if body.mobility is None:
         lacking = "no sizes" if conditions.diameter is None else "no sizes and no prediction"
@@ -577,7 +675,7 @@ def _with_sizes(result: ClusterResult, body: Body, conditions: _Conditions) -> C
 
 
 def _translation_tensor(
-    motion: RigidMotion, mobility: Mobility, conditions: _Conditions
+    motion: RigidMotion, mobility: Mobility, conditions: Conditions
 ) -> tuple[DiffusionTensor | None, list[str]]:
     """Measure D_T in body axes where it should differ between them; a drift would mix with it."""
     if conditions.drift or not are_unequal(mobility.principal_D_T.values):
@@ -593,7 +691,7 @@ def _with_prediction(rod: RodResult, body: Body) -> RodResult:
     return replace(rod, prediction=prediction, warnings=(*rod.warnings, *body.told))
 
 
-def _pooled(results: list[ClusterResult], conditions: _Conditions) -> tuple[Pooled, list[str]]:
+def _pooled(results: list[ClusterResult], conditions: Conditions) -> tuple[Pooled, list[str]]:
     """Pool all clusters that passed as rigid; say which are left out."""
     soft = [r for r in results if r.quality is not None and not r.quality.rigid]
     used = [r for r in results if r not in soft] or results
@@ -616,15 +714,15 @@ def _pooled(results: list[ClusterResult], conditions: _Conditions) -> tuple[Pool
 
 
 def _settings(
-    source: dict[str, str | None], *, arguments: dict[str, Any], first_frame: int
+    source: Mapping[str, str | None], *, arguments: Mapping[str, Any], first_frame: int
 ) -> dict[str, Any]:
     """Return what run.json keeps: enough to repeat the run and to know that it is the same."""
     from importlib.metadata import version
 
     names = ("perrin", "numpy", "scipy", "pandas")
     return {
-        "input": source,
-        "arguments": arguments,
+        "input": dict(source),
+        "arguments": dict(arguments),
         "first_frame": first_frame,
         "versions": {"python": platform.python_version()} | {n: version(n) for n in names},
         "created": datetime.now(UTC).isoformat(timespec="seconds"),

@@ -354,12 +354,15 @@ def motion_table(report: Report) -> pd.DataFrame:
     import pandas as pd
 
     parts, attributes = [], {}
+    # A motion has every frame from its cluster's first to its last.
+    whole = report.tracks.dropna(subset=["x", "y"])
+    first = whole.groupby("cluster")["frame"].min()
     for result in report.results:
         part = result.motion.to_frame()
         attributes[str(result.cluster)] = part.attrs
         part.attrs = {}
         part.insert(0, "cluster", result.cluster)
-        part.insert(1, "frame", np.rint(result.motion.time / result.motion.dt).astype(np.int64))
+        part.insert(1, "frame", first[result.cluster] + np.arange(len(part), dtype=np.int64))
         parts.append(part)
     table = pd.concat(parts, ignore_index=True)
     table.attrs = {"clusters": attributes}

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from perrin.images.image_fit import CameraNoise
 from perrin.images.optics import Optics
 
 if TYPE_CHECKING:
@@ -127,13 +126,7 @@ def read_imaging(folder: Path) -> Imaging:
     return Imaging(
         **tables,
         views=views,
-        optics=None if optics is None else _optics(optics),
+        optics=None if optics is None else Optics.from_dict(optics),
         voxel=(z, y, x),
         **entry,
     )
-
-
-def _optics(entry: dict[str, Any]) -> Optics:
-    psf_z, psf = entry["psf"]
-    a, b, c = entry["stderr"]
-    return Optics(entry["diameter"], (psf_z, psf), CameraNoise(*entry["noise"]), (a, b, c))

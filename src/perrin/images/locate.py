@@ -4,36 +4,39 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol
 
 import numpy as np
 
-from perrin._arrays import Floats, PrecisionWarning, require_positive
+from perrin._arrays import Floats, FrameError, PrecisionWarning, require_positive
 from perrin.images.conventional import Features, find_features, refine_by_trackpy
 from perrin.images.features import at_contact, mass_cut, touching_together
 from perrin.images.image_fit import (
     FreeCenters,
     ImageFit,
-    RigidCenters,
     cut_window,
     fit_window,
 )
 from perrin.images.optics import Optics, Sample, fit_samples
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Sequence
 
     import pandas as pd
+    from numpy.typing import NDArray
 
-    from perrin._arrays import Bools, Ints
-    from perrin.images.sphere_image import SphereImage
-    from perrin.motion import RigidMotion
+    from perrin._arrays import Ints
 
 Refine = Literal["model", "trackpy"] | None
+_Voxel = tuple[float, float, float]
 
 _LEARN_FRAMES = 5  # frames looked at to set the mass cut and to learn the optics
 _LEARN_GROUPS = 15  # groups of spheres the optics are learned from
 _CROWD = 16  # spheres in a larger group stay where they were found: see `locate`
+
+# Why a sphere stays where it was found.
+_UNTRIED, _HIDDEN = "in a crowd", "no voxels of its own"
+_UNSETTLED, _MOVED, _DARK = "fit did not settle", "moved over half a radius", "no light of its own"
 
 
 class Stack(Protocol):
@@ -44,7 +47,7 @@ class Stack(Protocol):
         """(t, z, y, x)."""
 
     @property
-    def voxel(self) -> tuple[float, float, float]:
+    def voxel(self) -> Floats | tuple[float, float, float]:
         """(z, y, x), um."""
 
     def frame(self, i: int, /) -> Floats:
@@ -76,27 +79,145 @@ class Search:
     minmass: float | None = None
     border: bool = True
 
-    def spots(self, stack: Stack, i: int) -> tuple[Floats, Features]:
-        """Return a frame and its spots, those of enough mass."""
-        frame = np.asarray(stack.frame(i), dtype=np.float64)
-        found = find_features(
+    def spots(self, frame: Floats, voxel: _Voxel) -> Features:
+        """Return the spots of a frame, noise among them."""
+        return find_features(
             frame,
             diameter=self.diameter,
             contact=self.contact,
-            voxel=_voxel(stack),
+            voxel=voxel,
             dark=self.dark,
             percentile=self.percentile,
             border=self.border,
         )
-        keep = found.mass >= (self.minmass or 0.0)
-        return frame, Features(found.centers[keep], found.mass[keep])
 
-    def with_minmass(self, stack: Stack) -> Search:
-        """Return the search with its mass cut set, from a few frames all over the movie."""
-        if self.minmass is not None:
-            return self
-        masses = [self.spots(stack, i)[1].mass for i in _spread(stack.shape[0])]
-        return replace(self, minmass=mass_cut(np.concatenate(masses)))
+    def spheres(self, spots: Features) -> Features:
+        """Return the spots of enough mass."""
+        keep = spots.mass >= (self.minmass or 0.0)
+        return Features(spots.centers[keep], spots.mass[keep])
+
+
+class Sampled(NamedTuple):
+    """A frame looked at to learn from, and its spots."""
+
+    number: int
+    frame: Floats
+    spots: Features
+
+
+class Found(NamedTuple):
+    """What one frame holds.
+
+    Attributes
+    ----------
+    columns : dict of ndarray
+        The frame's part of the table of `locate`.
+    spots : int
+        Before the mass cut.
+    level : float
+        Median grey level.
+    saturated : float
+        Share of the voxels that have the highest value of the frame.
+    """
+
+    columns: dict[str, NDArray[Any]]
+    spots: int
+    level: float
+    saturated: float
+
+
+@dataclass(frozen=True)
+class Method:
+    """How every frame is treated: the same for all, and each for itself.
+
+    Attributes
+    ----------
+    search : Search
+        With its mass cut.
+    refine : {"model", "trackpy", None}
+    optics : Optics or None
+        For "model".
+    """
+
+    search: Search
+    refine: Refine = "model"
+    optics: Optics | None = None
+
+    def look(self, stack: Stack, i: int) -> Found:
+        """Find and refine the spheres of frame i.
+
+        Raises
+        ------
+        FrameError
+            If the frame cannot be read.
+        """
+        frame, voxel = _read(stack, i), _voxel(stack)
+        spots = self.search.spots(frame, voxel)
+        columns = self._columns(frame, self.search.spheres(spots), voxel)
+        columns = {"frame": np.full(len(columns["mass"]), i, dtype=np.int64)} | columns
+        share = float(np.mean(frame == frame.max()))
+        return Found(columns, len(spots.mass), float(np.median(frame)), share)
+
+    def _columns(self, frame: Floats, found: Features, voxel: _Voxel) -> dict[str, NDArray[Any]]:
+        contact = self.search.contact
+        if self.refine == "model" and self.optics is not None:
+            return _by_model(frame, found, contact, self.optics, voxel)
+        centers = found.centers
+        if self.refine == "trackpy":
+            centers = refine_by_trackpy(
+                frame, centers, diameter=self.search.diameter, contact=contact, voxel=voxel
+            )
+        return _places(centers) | {"mass": found.mass}
+
+
+def sample_frames(stack: Stack, search: Search, frames: Sequence[int]) -> list[Sampled]:
+    """Look at a few frames all over the movie, as far as they can be read.
+
+    Raises
+    ------
+    FrameError
+        If none of them can.
+    """
+    seen = []
+    fault: FrameError | None = None
+    for k in _spread(len(frames)):
+        try:
+            frame = _read(stack, frames[k])
+        except FrameError as error:
+            fault = fault or error
+            continue
+        seen.append(Sampled(frames[k], frame, search.spots(frame, _voxel(stack))))
+    if fault is not None and not seen:
+        raise fault
+    return seen
+
+
+def choose_method(
+    stack: Stack,
+    search: Search,
+    sample: Sequence[Sampled],
+    *,
+    refine: Refine = "model",
+    optics: Optics | None = None,
+) -> Method:
+    """Set what was left open, mass cut and optics, from a few frames.
+
+    Raises
+    ------
+    ValueError
+        Where no sphere is found, or the optics do not settle.
+
+    Warns
+    -----
+    PrecisionWarning
+        As in `mass_cut`.
+    """
+    if search.minmass is None:
+        masses = [seen.spots.mass for seen in sample]
+        search = replace(search, minmass=mass_cut(np.concatenate([np.empty(0), *masses])))
+    if refine == "model" and optics is None:
+        optics = fit_optics(sample, search, voxel=_voxel(stack))
+    return Method(search, refine, optics if refine == "model" else None)
 
 
 def locate(
@@ -147,7 +268,7 @@ def locate(
         "model" ``sigma_x, sigma_y, sigma_z`` in um (from the Fisher information), ``chi2`` of the
         group's image per degree of freedom, and ``refined``: False where the fit did not settle,
         left by over half a radius, found no sphere, or was not tried, and the place found first was
-        kept, without errors.
+        kept, without errors; `reason` says which of these.
 
     Raises
     ------
@@ -159,9 +280,10 @@ def locate(
     Warns
     -----
     PrecisionWarning
-        Where the masses show no gap between spheres and noise; where more than 16 spheres touch
-        in a chain: the model of their image asks for every neighbour, and for light more even than
-        a dense sample has, so that they stay where they were found.
+        Where a frame cannot be read: it is left out. Where the masses show no gap between spheres
+        and noise. Where more than 16 spheres touch in a chain: the model of their image asks for
+        every neighbour, and for light more even than a dense sample has, so that they stay where
+        they were found.
 
     Examples
     --------
@@ -179,18 +301,35 @@ def locate(
     >>> found[["x", "y", "z"]].round(1).values.tolist()
     [[3.2, 3.1, 3.0]]
     """
-    _checked(stack, diameter, contact, refine, percentile)
-    search = Search(diameter, contact, dark, percentile, minmass, border).with_minmass(stack)
-    if refine == "model" and optics is None:
-        optics = fit_optics(stack, search)
+    search = Search(diameter, contact, dark, percentile, minmass, border)
+    check_search(stack, search, refine)
     listed = _listed(stack, frames)
-    table = _table([_frame_columns(stack, i, search, refine, optics) for i in listed])
-    if refine == "model":
+    sample = sample_frames(stack, search, listed)
+    method = choose_method(stack, search, sample, refine=refine, optics=optics)
+    table = found_table(_looked(stack, listed, method))
+    if refine == "model" and len(table):
         _warn_of_untried(table)
     return table
 
 
-def fit_optics(stack: Stack, search: Search) -> Optics:
+def _looked(stack: Stack, frames: Sequence[int], method: Method) -> list[Found]:
+    """Return what every frame holds; one that cannot be read is a warning."""
+    found, faults = [], []
+    for i in frames:
+        try:
+            found.append(method.look(stack, i))
+        except FrameError as fault:
+            faults.append(str(fault))
+    if faults:
+        warnings.warn(
+            f"{len(faults)} of {len(frames)} frames are left out: {'; '.join(faults[:3])}",
+            PrecisionWarning,
+            stacklevel=3,
+        )
+    return found
+
+
+def fit_optics(sample: Sequence[Sampled], search: Search, *, voxel: _Voxel) -> Optics:
     """Learn the sphere's size in the light, the point spread and the noise from a few frames.
 
     Raises
@@ -198,153 +337,49 @@ def fit_optics(stack: Stack, search: Search) -> Optics:
     ValueError
         Where no sphere is found, or the search does not settle.
     """
-    search = search.with_minmass(stack)
     samples = []
-    for i in _spread(stack.shape[0]):
-        frame, found = search.spots(stack, i)
+    for seen in sample:
+        found = search.spheres(seen.spots)
         groups = touching_together(found.centers, contact=search.contact)
-        samples += [_sample(frame, found, g, search.contact) for g in groups if len(g) <= _CROWD]
+        samples += [
+            _sample(seen.frame, found, group, search.contact)
+            for group in groups
+            if len(group) <= _CROWD
+        ]
     keep = _spread(len(samples), _LEARN_GROUPS)
-    return fit_samples([samples[k] for k in keep], diameter=search.diameter, voxel=_voxel(stack))
-
-
-def fit_pose(
-    stack: Stack,
-    motion: RigidMotion,
-    *,
-    optics: Optics,
-    frames: Ints | None = None,
-    others: pd.DataFrame | None = None,
-) -> RigidMotion:
-    """Fit the six numbers of a rigid cluster's pose to the images themselves.
-
-    Parameters
-    ----------
-    stack : Stack
-    motion : RigidMotion
-        Of the free centres: the common shape, and every frame's start.
-    optics : Optics
-        How a sphere is seen.
-    frames : ndarray of int, shape (T,), optional
-        The stack's frame of each row of `motion`; default 0, 1, ...
-    others : DataFrame, optional
-        Spheres (``frame, x, y, z``) of other clusters, whose light is left out.
-
-    Returns
-    -------
-    RigidMotion
-        The same with `center`, `rotation`, `covariance` and `center_variance` from the images; a
-        frame whose fit does not settle has no pose and says so in `reason`.
-
-    Notes
-    -----
-    The shape is taken as known: an error in it goes into the pose unseen. `residual` stays that of
-    the free centres, which shows whether the cluster is rigid at all.
-    """
-    rows = motion.fitted
-    frames = np.arange(len(motion.time)) if frames is None else np.asarray(frames)
-    image = optics.image(_voxel(stack))
-    poses = {
-        int(k): _pose(stack, int(frames[k]), motion, int(k), optics, image, others) for k in rows
-    }
-    return _replaced(motion, {k: fit for k, fit in poses.items() if fit.converged})
-
-
-def _pose(
-    stack: Stack,
-    i: int,
-    motion: RigidMotion,
-    row: int,
-    optics: Optics,
-    image: SphereImage,
-    others: pd.DataFrame | None,
-) -> ImageFit:
-    start = RigidCenters(motion.center[row], motion.rotation[row], motion.template)
-    away = np.empty((0, 3))
-    if others is not None:
-        away = others.loc[others["frame"] == i, ["z", "y", "x"]].to_numpy(dtype=np.float64)
-    frame = np.asarray(stack.frame(i), dtype=np.float64)
-    return fit_window(
-        cut_window(frame, image, start.centers, others=away), image, optics.noise, start
-    )
-
-
-def _replaced(motion: RigidMotion, fits: dict[int, ImageFit]) -> RigidMotion:
-    """Return the motion with the fitted poses, its first one the identity again."""
-    rotation, center = np.full_like(motion.rotation, np.nan), np.full_like(motion.center, np.nan)
-    covariance = np.full_like(motion.covariance, np.nan)
-    variance = np.full_like(motion.center_variance, np.nan)
-    for k, fit in fits.items():
-        pose = fit.arrangement
-        if isinstance(pose, RigidCenters):
-            rotation[k], center[k] = pose.rotation, pose.center
-            covariance[k] = fit.covariance[3:, 3:]
-            variance[k] = np.trace(fit.covariance[:3, :3]) / 3
-    gauge = rotation[min(fits)] if fits else np.eye(3)
-    rotation = rotation @ gauge.T
-    reason = tuple(
-        "the pose fit to the image did not settle" if k in set(motion.fitted) - set(fits) else why
-        for k, why in enumerate(motion.reason)
-    )
-    return replace(
-        motion,
-        rotation=rotation,
-        center=center,
-        covariance=np.swapaxes(rotation, -1, -2) @ covariance @ rotation,
-        center_variance=variance,
-        template=motion.template @ gauge.T,
-        reason=reason,
-    )
-
-
-def _frame_columns(
-    stack: Stack, i: int, search: Search, refine: Refine, optics: Optics | None
-) -> dict[str, Floats | Bools]:
-    """Return the columns of one frame's part of the table."""
-    frame, found = search.spots(stack, i)
-    columns: dict[str, Floats | Bools] = {"frame": np.full(len(found.mass), i)}
-    if refine == "model" and optics is not None:
-        return columns | _by_model(frame, found, search.contact, optics, _voxel(stack))
-    centers = found.centers
-    if refine == "trackpy":
-        centers = refine_by_trackpy(
-            frame, centers, diameter=search.diameter, contact=search.contact, voxel=_voxel(stack)
-        )
-    return columns | _places(centers) | {"mass": found.mass}
+    return fit_samples([samples[k] for k in keep], diameter=search.diameter, voxel=voxel)
 
 
 def _by_model(
-    frame: Floats,
-    found: Features,
-    contact: float,
-    optics: Optics,
-    voxel: tuple[float, float, float],
-) -> dict[str, Floats | Bools]:
+    frame: Floats, found: Features, contact: float, optics: Optics, voxel: _Voxel
+) -> dict[str, NDArray[Any]]:
+    """Fit every group of touching spheres; return the columns of the table."""
     image = optics.image(voxel)
     centers, sigma = found.centers.copy(), np.full_like(found.centers, np.nan)
-    chi2, refined = np.full(len(centers), np.nan), np.zeros(len(centers), dtype=np.bool_)
+    chi2, reason = np.full(len(centers), np.nan), np.full(len(centers), _UNTRIED, dtype=object)
     groups = touching_together(found.centers, contact=contact)
     for group in (g for g in groups if len(g) <= _CROWD):
         sample = _sample(frame, found, group, contact)
         window = cut_window(frame, image, sample.centers, others=sample.others)
         if not window.shows(len(group)):
+            reason[group] = _HIDDEN
             continue
         fit = fit_window(window, image, optics.noise, FreeCenters(sample.centers))
-        good = _believable(fit, sample.centers, optics.diameter / 4)
-        spheres = group[good]
-        centers[spheres] = fit.centers[good]
-        sigma[spheres] = np.sqrt(np.diag(fit.covariance)).reshape(-1, 3)[good]
         chi2[group] = fit.chi2
-        refined[spheres] = True
-    errors = _places(sigma, "sigma_")
-    return _places(centers) | {"mass": found.mass} | errors | {"chi2": chi2, "refined": refined}
+        reason[group] = _doubts(fit, sample.centers, optics.diameter / 4)
+        good = reason[group] == ""
+        centers[group[good]] = fit.centers[good]
+        sigma[group[good]] = np.sqrt(np.diag(fit.covariance)).reshape(-1, 3)[good]
+    columns = _places(centers) | {"mass": found.mass} | _places(sigma, "sigma_")
+    return columns | {"chi2": chi2, "refined": reason == "", "reason": reason}
 
 
-def _believable(fit: ImageFit, start: Floats, furthest: float) -> Bools:
-    """Return which spheres of a fit are where they were looked for, and as bright as the rest."""
-    moved = np.linalg.norm(fit.centers - start, axis=1)
-    bright = fit.brightness / np.median(fit.brightness) > 0.1
-    return np.asarray(fit.converged & (moved < furthest) & bright)
+def _doubts(fit: ImageFit, start: Floats, furthest: float) -> NDArray[np.object_]:
+    """Return why each sphere of a fit is not to be believed; "" where it is."""
+    moved = np.linalg.norm(fit.centers - start, axis=1) >= furthest
+    dark = ~(fit.brightness / np.median(fit.brightness) > 0.1)
+    why = np.where(dark, _DARK, np.where(moved, _MOVED, "")).astype(object)
+    return why if fit.converged else np.full(len(start), _UNSETTLED, dtype=object)
 
 
 def _warn_of_untried(table: pd.DataFrame) -> None:
@@ -364,19 +399,25 @@ def _sample(frame: Floats, found: Features, group: Ints, contact: float) -> Samp
     return Sample(frame, at_contact(found.centers[group], contact=contact), others)
 
 
-def _places(centers: Floats, prefix: str = "") -> dict[str, Floats | Bools]:
+def _places(centers: Floats, prefix: str = "") -> dict[str, NDArray[Any]]:
     return {f"{prefix}{axis}": centers[:, k] for axis, k in zip("xyz", (2, 1, 0), strict=True)}
 
 
-def _table(columns: list[dict[str, Floats | Bools]]) -> pd.DataFrame:
+def found_table(found: Iterable[Found]) -> pd.DataFrame:
+    """Return what frames hold as the table of `locate`."""
     import pandas as pd
 
-    if not columns:
-        return pd.DataFrame(columns=["frame", "x", "y", "z", "mass", "chi2"])
-    return pd.concat([pd.DataFrame(c) for c in columns], ignore_index=True)
+    parts = [pd.DataFrame(f.columns) for f in found]
+    if not parts:
+        return pd.DataFrame(columns=["frame", "x", "y", "z", "mass"])
+    return pd.concat(parts, ignore_index=True)
 
 
-def _voxel(stack: Stack) -> tuple[float, float, float]:
+def _read(stack: Stack, i: int) -> Floats:
+    return np.asarray(stack.frame(i), dtype=np.float64)
+
+
+def _voxel(stack: Stack) -> _Voxel:
     z, y, x = (float(h) for h in stack.voxel)
     return z, y, x
 
@@ -397,22 +438,20 @@ def _listed(stack: Stack, frames: Iterable[int] | None) -> list[int]:
     return listed
 
 
-def _checked(
-    stack: Stack, diameter: float, contact: float, refine: Refine, percentile: float
-) -> None:
-    """Raise one error with every fault of the arguments."""
-    require_positive(diameter=diameter, contact=contact)
+def check_search(stack: Stack, search: Search, refine: Refine) -> None:
+    """Raise one error with every fault of the arguments of a search."""
+    require_positive(diameter=search.diameter, contact=search.contact)
     faults = []
     if len(stack.shape) != 4:
         faults.append(f"stack: expected shape (t, z, y, x), got {stack.shape}")
     if refine not in ("model", "trackpy", None):
         faults.append(f"refine: expected 'model', 'trackpy' or None, got {refine!r}")
-    if diameter > 1.2 * contact:
+    if search.diameter > 1.2 * search.contact:
         faults.append(
-            f"diameter {diameter} um is more than contact {contact} um: balls do not overlap; "
-            "are the two exchanged?"
+            f"diameter {search.diameter} um is more than contact {search.contact} um: balls do not "
+            "overlap; are the two exchanged?"
         )
-    if not 0 <= percentile < 100:
-        faults.append(f"percentile: expected 0 <= percentile < 100, got {percentile}")
+    if not 0 <= search.percentile < 100:
+        faults.append(f"percentile: expected 0 <= percentile < 100, got {search.percentile}")
     if faults:
         raise ValueError("; ".join(faults))

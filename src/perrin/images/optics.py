@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from perrin.images.image_fit import CameraNoise, FreeCenters, cut_window, fit_wi
 from perrin.images.sphere_image import SphereImage, sphere_image
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from perrin._arrays import Floats
     from perrin.images.image_fit import ImageFit, Window
@@ -43,6 +43,12 @@ class Optics:
     psf: tuple[float, float]
     noise: CameraNoise
     stderr: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    @classmethod
+    def from_dict(cls, entry: Mapping[str, Any]) -> Optics:
+        """Read back what `dataclasses.asdict` made."""
+        (psf_z, psf), (a, b, c) = entry["psf"], entry["stderr"]
+        return cls(entry["diameter"], (psf_z, psf), CameraNoise(*entry["noise"]), (a, b, c))
 
     def image(self, voxel: tuple[float, float, float]) -> SphereImage:
         """Return the table of the sphere's image for voxels (z, y, x), um."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import threading
 import warnings
@@ -84,6 +85,11 @@ class Stack:
         self.close()
 
     @property
+    def path(self) -> Path | None:
+        """The file, folder or glob that is read; None for what is in memory."""
+        return Path(self.read.path) if isinstance(self.read, _FileFrames) else None
+
+    @property
     def dt(self) -> float:
         """Median time between frames, s; NaN for a single frame."""
         return float(np.median(np.diff(self.times))) if len(self) > 1 else float("nan")
@@ -95,6 +101,8 @@ class Stack:
         ------
         FrameError
             If this frame cannot be read: catch it to go on with the next one.
+        OSError
+            If the whole file is out of reach where the stack was sent.
         IndexError
             If there is no such frame.
         """
@@ -102,7 +110,7 @@ class Stack:
             raise IndexError(f"{self.source}: no frame {i}: it has {len(self)}, counted from 0")
         try:
             data = self.read(int(i))
-        except MemoryError:
+        except (MemoryError, _UnopenedError):
             raise
         # The readers of damaged files raise whatever their decoders do.
         except Exception as fault:
@@ -123,21 +131,32 @@ class Stack:
             self.read.close()
 
 
+class _UnopenedError(OSError):
+    """A whole file is out of reach, as on another machine: no fault of one frame."""
+
+
 class _FileFrames:
     """Frames of an open file: one reader at a time, and opened anew where it is unpickled."""
 
     def __init__(self, path: str, pick: Pick, contents: Contents | None = None) -> None:
-        self._path, self._pick, self._contents = path, pick, contents
+        self.path, self._pick, self._contents = path, pick, contents
         self._lock = threading.Lock()
 
     def __call__(self, i: int) -> NDArray[Any]:
         with self._lock:
             if self._contents is None:
-                self._contents = _contents(self._path, self._pick)
+                self._contents = self._opened()
             return self._contents.frame(i)
 
+    def _opened(self) -> Contents:
+        try:
+            return _contents(self.path, self._pick)
+        # The readers of damaged files raise whatever their decoders do.
+        except Exception as fault:
+            raise _UnopenedError(f"{self.path} cannot be opened here: {fault}") from fault
+
     def __reduce__(self) -> tuple[type[_FileFrames], tuple[str, Pick]]:
-        return _FileFrames, (self._path, self._pick)
+        return _FileFrames, (self.path, self._pick)
 
     def close(self) -> None:
         with self._lock:
@@ -380,6 +399,33 @@ def _differences(
         for name, (used, there) in pairs.items()
         if abs(used - there) > _TELL * abs(there)
     ]
+
+
+def digest(stack: Stack) -> str:
+    """Return the SHA-256 of what a stack is read from: its files with their names, or its frames.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> still = np.zeros((1, 2, 8, 8), dtype=np.uint8)
+    >>> digest(open_stack(still, voxel=(1, 1, 1)))[:12]
+    '38723a2e5e8a'
+    """
+    total = hashlib.sha256()
+    if stack.path is None:
+        for frame in stack:
+            total.update(np.ascontiguousarray(frame).tobytes())
+        return total.hexdigest()
+    if stack.path.is_file():
+        with open(stack.path, "rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    folder = stack.path.is_dir()
+    inside = sorted(stack.path.rglob("*")) if folder else sequence_files(str(stack.path))
+    for part in filter(Path.is_file, map(Path, inside)):
+        total.update(part.relative_to(stack.path).as_posix().encode() if folder else b"")
+        with open(part, "rb") as file:
+            total.update(hashlib.file_digest(file, "sha256").digest())
+    return total.hexdigest()
 
 
 def write_stack(stack: Stack, path: _PathLike) -> None:
