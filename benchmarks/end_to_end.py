@@ -7,10 +7,9 @@ and 0.15 um, 40 photons, background 2 to 6 photons along x, gain 3, read noise 2
 are not told. The movie is kept as OME-TIFF, its true positions beside it, and rendered only once.
 
 The same estimator takes the true positions of the same paths: differences between the two are in
-units of the standard errors that it states for the true positions. With --pose the rigid pose is
-fitted to the images as well, and both poses are compared with the true ones.
+units of the standard errors that it states for the true positions.
 
-Usage: python benchmarks/end_to_end.py [--movie FILE.ome.tif] [--seed 0] [--photons 40] [--pose]
+Usage: python benchmarks/end_to_end.py [--movie FILE.ome.tif] [--seed 0] [--photons 40]
 """
 
 import argparse
@@ -18,13 +17,11 @@ import resource
 import tempfile
 import time
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.distance import cdist
 
 import perrin
-from perrin.images.locate import Search, fit_optics
 from perrin.rotations import exp_map, log_map
 
 DIAMETER, DT = 2.45, 0.73
@@ -90,37 +87,25 @@ def kept(movie, **recipe):
         perrin.write_stack(stack, movie)
         np.savez(beside, positions=truth, **recipe)
     with np.load(beside) as known:
-        other = {k: known[k].item() for k in recipe if known[k].item() != recipe[k]}
+        other = {k: known[k].tolist() for k, v in recipe.items() if np.any(known[k] != v)}
         if other:
             raise SystemExit(f"{movie} is of another recipe: {other}")
         return perrin.open_stack(movie), known["positions"]
 
 
-class Run(NamedTuple):
-    """What the pipeline found, the spheres it rests on, and the seconds of every stage."""
-
-    report: perrin.Report
-    spheres: object
-    optics: perrin.Optics
-    seconds: dict
-
-
 def pipeline(stack):
-    """Return the run: everything from the stack to the report."""
-    clock = [time.perf_counter()]
-    search = Search(diameter=DIAMETER, contact=DIAMETER).with_minmass(stack)
-    optics = fit_optics(stack, search)
-    clock.append(time.perf_counter())
-    spheres = perrin.locate(
-        stack, diameter=DIAMETER, contact=DIAMETER, optics=optics, minmass=search.minmass
-    )
-    clock.append(time.perf_counter())
-    table = perrin.identify(spheres, contact=DIAMETER, size=4)
-    clock.append(time.perf_counter())
-    report = perrin.analyze(table[table["cluster"] >= 0], dt=DT)
-    clock.append(time.perf_counter())
-    stages = ("learn mass cut, optics", "locate", "identify", "analyze")
-    return Run(report, table, optics, dict(zip(stages, np.diff(clock), strict=True)))
+    """Return the report, and the seconds of every stage."""
+    begun, last = {"opening": time.perf_counter()}, 0.0
+
+    def tick(_done, _total, title):
+        nonlocal last
+        last = time.perf_counter()
+        begun.setdefault(title, last)
+
+    report = perrin.analyze_stack(stack, diameter=DIAMETER, contact=DIAMETER, progress=tick)
+    begun["the rest"] = last
+    ends = [*begun.values(), time.perf_counter()]
+    return report, dict(zip(begun, np.diff(ends), strict=True))
 
 
 def true_report(truth):
@@ -185,7 +170,9 @@ def tell_coefficients(report, true, truth):
     """Print D_R and D_T, found and true, pooled and of every cluster."""
     pairs, false = matched(report, truth)
     print(f"clusters: {len(pairs)} of {len(truth)} found, {len(false)} false")
-    print(" " * 8 + f"{'D_R found':>12s}{'true':>12s}{'differ':>8s}{'D_T found':>12s}{'true':>12s}")
+    columns = ("D_R found", "true", "differ", "D_T found", "true", "differ")
+    widths = (12, 12, 8) * 2
+    print(" " * 8 + "".join(f"{c:>{w}s}" for c, w in zip(columns, widths, strict=True)))
     rows = [("pooled", report.pooled, true.pooled)]
     rows += [(str(c), pairs[c], true.clusters[c]) for c in sorted(pairs)]
     for name, one, other in rows:
@@ -210,21 +197,15 @@ def pose_errors(motion, true):
     return 1e3 * (motion.center - true.center), 1e3 * turn
 
 
-def tell_poses(stack, run, true, truth):
-    """Print the errors of both poses, from the free centres and from the images."""
-    pairs, _ = matched(run.report, truth)
-    motions = {"free centres": {c: r.motion for c, r in pairs.items()}, "pose in the image": {}}
-    start = time.perf_counter()
-    for c, r in pairs.items():
-        others = run.spheres[run.spheres["cluster"] != r.cluster]
-        posed = perrin.fit_pose(stack, r.motion, optics=run.optics, others=others)
-        motions["pose in the image"][c] = posed
-    spent = 1e3 * (time.perf_counter() - start) / (len(pairs) * truth.shape[1])
-    for name, bodies in motions.items():
-        errors = [pose_errors(m, true.clusters[c].motion) for c, m in bodies.items()]
+def tell_poses(report, true, truth):
+    """Print the errors of the poses from the free centres, and of those fitted to the images."""
+    spheres = report.imaging.features
+    free = perrin.analyze(spheres[spheres["cluster"] >= 0], dt=DT)
+    for name, results in (("free centres", free), ("image", report)):
+        pairs, _ = matched(results, truth)
+        errors = [pose_errors(r.motion, true.clusters[c].motion) for c, r in pairs.items()]
         center, turn = (np.nanstd(e, axis=(0, 1)).round(2) for e in zip(*errors, strict=True))
-        print(f"{name}: centre {center} nm, turn {turn} mrad")
-    print(f"fit_pose {spent:.0f} ms per cluster-frame")
+        print(f"pose from the {name}: centre {center} nm, turn {turn} mrad")
 
 
 def main():
@@ -232,21 +213,20 @@ def main():
     parser.add_argument("--movie", type=Path, help="an .ome.tif to keep, or kept before")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--photons", type=float, default=40.0)
-    parser.add_argument("--pose", action="store_true", help="fit poses to the images as well")
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         movie = args.movie or Path(folder) / "movie.ome.tif"
         stack, truth = kept(movie, seed=args.seed, photons=args.photons)
         with stack:
-            run, true = pipeline(stack), true_report(truth)
-            # Linux counts in kB.
-            peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-            tell_spheres(run.spheres, truth)
-            tell_coefficients(run.report, true, truth)
-            if args.pose:
-                tell_poses(stack, run, true, truth)
-    for stage, spent in run.seconds.items():
-        print(f"{stage:24s}{spent:8.2f} s{1e3 * spent / truth.shape[1]:8.0f} ms/frame")
+            report, seconds = pipeline(stack)
+    # Linux counts in kB.
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    true = true_report(truth)
+    tell_spheres(report.imaging.features, truth)
+    tell_coefficients(report, true, truth)
+    tell_poses(report, true, truth)
+    for stage, spent in seconds.items():
+        print(f"{stage:32s}{spent:8.2f} s{1e3 * spent / truth.shape[1]:8.0f} ms/frame")
     print(f"peak memory {peak:.0f} MB")
 
 
