@@ -118,13 +118,18 @@ def true_report(truth):
     return perrin.analyze(pd.concat(tables, ignore_index=True), dt=DT)
 
 
+def frames_of(motion):
+    """Return the frame of each row of a motion."""
+    return np.rint(motion.time / DT).astype(int)
+
+
 def matched(report, truth):
     """Return {true cluster: result} and the results that are no true cluster's."""
     middles = truth.mean(axis=2)
     pairs, false = {}, []
     for result in report.clusters:
-        frames = np.rint(result.motion.time / DT).astype(int)
-        away = np.linalg.norm(middles[:, frames] - result.motion.center, axis=2)
+        away = middles[:, frames_of(result.motion)] - result.motion.center
+        away = np.linalg.norm(away, axis=2)
         typical = np.nanmedian(away, axis=1)
         best = int(typical.argmin())
         if typical[best] < SAME and best not in pairs:
@@ -189,12 +194,13 @@ def tell_coefficients(report, true, truth):
 
 def pose_errors(motion, true):
     """Return errors of the centre, nm, and of the turn, mrad, both (T, 3)."""
-    apart = np.swapaxes(true.rotation, -1, -2) @ motion.rotation
+    rows = frames_of(motion)
+    apart = np.swapaxes(true.rotation[rows], -1, -2) @ motion.rotation
     # The body's own axes are a matter of choice: one turn for all frames, the mean one.
     first = apart[motion.fitted[0]]
     axes = first @ exp_map(np.nanmean(log_map(first.T @ apart), axis=0))
     turn = log_map(axes.T @ apart)
-    return 1e3 * (motion.center - true.center), 1e3 * turn
+    return 1e3 * (motion.center - true.center[rows]), 1e3 * turn
 
 
 def tell_poses(report, true, truth):
