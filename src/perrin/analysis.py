@@ -86,6 +86,7 @@ class Conditions:
     exposure: float | None
     drift: bool
     times: Floats | None = None  # of every frame, s, where they are not dt apart
+    sigma_ratio: ArrayLike | None = None  # of the axes, where that alone is known
 
     def clock(self, frames: Ints) -> Floats:
         """Return the times of frames, s."""
@@ -253,8 +254,8 @@ def measure_table(
 
 def told_conditions(conditions: Conditions) -> dict[str, Any]:
     """Return the conditions as run.json keeps them."""
-    entry = asdict(replace(conditions, times=None))
-    del entry["times"]
+    entry = asdict(replace(conditions, times=None, sigma_ratio=None))
+    del entry["times"], entry["sigma_ratio"]
     return entry | {"sigma": _plain(conditions.sigma)}
 
 
@@ -468,6 +469,7 @@ def _fit_body(tracks: _Tracks, cluster: int, label: str | None, conditions: Cond
         motion,
         positions,
         sigma=conditions.sigma,
+        sigma_ratio=conditions.sigma_ratio,
         swaps=tuple(frames[identity.swaps].tolist()),
         cuts=tuple(frames[1:][changed].tolist()),
         extra=tuple(frames[identity.extra].tolist()),

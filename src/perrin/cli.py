@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING, Annotated, Literal, cast
 import typer
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
     from numpy.typing import ArrayLike
+    from rich.progress import TaskID
     from rich.table import Table
 
     from perrin.diffusion import DiffusionEstimate
@@ -49,6 +50,19 @@ Columns = Annotated[
     typer.Option(help="Names or numbers of the file's columns: x=0,y=1,z=2,frame=-2,particle=-1."),
 ]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an existing run folder.")]
+Noise = Annotated[
+    str,
+    typer.Option(
+        help="How the noise under D is known: joint (free), residual (from the rigid fit; "
+        "right only if all particles of a frame are seen at once), or sigma in um."
+    ),
+]
+Exposure = Annotated[
+    float | None, typer.Option(help="Open fraction of dt, 0 to 1; unknown if left out.")
+]
+Drift = Annotated[
+    bool, typer.Option("--drift", help="Take a mean velocity (flow, sedimentation) off D_T.")
+]
 
 
 def main() -> None:
@@ -107,19 +121,9 @@ def analyze(
             "and the test of rigidity."
         ),
     ] = None,
-    noise: Annotated[
-        str,
-        typer.Option(
-            help="How the noise under D is known: joint (free), residual (from the rigid fit; "
-            "right only if all particles of a frame are seen at once), or sigma in um."
-        ),
-    ] = "joint",
-    exposure: Annotated[
-        float | None, typer.Option(help="Open fraction of dt, 0 to 1; unknown if left out.")
-    ] = None,
-    drift: Annotated[
-        bool, typer.Option("--drift", help="Take a mean velocity (flow, sedimentation) off D_T.")
-    ] = False,
+    noise: Noise = "joint",
+    exposure: Exposure = None,
+    drift: Drift = False,
     viscosity: Annotated[float | None, typer.Option(help="Pa s, for sizes.")] = None,
     temperature: Annotated[
         float | None,
@@ -157,6 +161,171 @@ def analyze(
         )
         perrin.write_run(report, output, overwrite=overwrite)
         _show(report, output)
+
+
+@app.command()
+def run(
+    stack: Annotated[
+        Path, typer.Argument(help="Movie of stacks: TIFF, OME-TIFF, .lif, .nd2, .czi, .ims, .zarr.")
+    ],
+    diameter: Annotated[float, typer.Option(help="Of the ball that is seen, um.")],
+    contact: Annotated[float, typer.Option(help="Centre distance of touching spheres, um.")],
+    output: Annotated[
+        Path,
+        typer.Option("-o", "--output", help="Folder for the run; one that was stopped goes on."),
+    ],
+    voxel: Annotated[
+        str | None,
+        typer.Option(help="Voxel size z,y,x (y,x in the plane), um, if not in the file."),
+    ] = None,
+    dt: Annotated[
+        float | None, typer.Option("--dt", help="Time between frames, s, if not in the file.")
+    ] = None,
+    plane_time: Annotated[
+        float | None, typer.Option(help="Time from one plane to the next, s.")
+    ] = None,
+    planes: Annotated[
+        int | None, typer.Option(help="Planes of a frame, if not in the file.")
+    ] = None,
+    channel: Annotated[int | None, typer.Option(help="Channel, from 0.")] = None,
+    image: Annotated[
+        str | None, typer.Option(help="Image of a file with several, by number or name.")
+    ] = None,
+    size: Annotated[
+        int | None, typer.Option(help="Spheres of a cluster; the most common number if left out.")
+    ] = None,
+    frames: Annotated[
+        str | None, typer.Option(help="A:B uses the frames A <= frame < B; A or B may be left out.")
+    ] = None,
+    exclude: Annotated[
+        str | None, typer.Option(help="Clusters to leave out, by number: 3,7.")
+    ] = None,
+    refine: Annotated[
+        str,
+        typer.Option(help="model: fit the image; trackpy: its disc model; none: places as found."),
+    ] = "model",
+    dark: Annotated[
+        bool, typer.Option("--dark", help="Spheres are darker than what surrounds them.")
+    ] = False,
+    minmass: Annotated[
+        float | None, typer.Option(help="Least mass of a sphere; the widest gap if left out.")
+    ] = None,
+    percentile: Annotated[
+        float, typer.Option(help="Of voxels too dim for a sphere's middle; lower in full fields.")
+    ] = 95.0,
+    noise: Noise = "joint",
+    exposure: Exposure = None,
+    drift: Drift = False,
+    viscosity: Annotated[
+        float | None, typer.Option(help="Pa s: with the temperature, sizes and predictions.")
+    ] = None,
+    temperature: Annotated[float | None, typer.Option(help="K.")] = None,
+    workers: Annotated[
+        int, typer.Option(min=0, help="Processes of this machine that share the work.")
+    ] = 0,
+    scheduler: Annotated[
+        str | None, typer.Option(help="Dask scheduler that does the work: tcp://host:8786.")
+    ] = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Measure D_R and D_T of every cluster in a movie of image stacks.
+
+    Finished frames are kept in the output folder: after an interruption the same command goes on.
+    """
+    import warnings
+
+    import perrin
+    from perrin.report import complete_run
+    from perrin.results import check_resumable
+
+    with _told(), _kept_told(output):
+        check_resumable(output, parts="located", overwrite=overwrite)
+        with warnings.catch_warnings(record=True) as said:
+            warnings.simplefilter("always", perrin.PrecisionWarning)
+            movie = perrin.open_stack(
+                stack,
+                voxel=None if voxel is None else _numbers("--voxel", voxel),
+                dt=dt,
+                plane_time=plane_time,
+                planes=planes,
+                channel=channel,
+                image=int(image) if image is not None and image.isdecimal() else image,
+            )
+        for warning in said:
+            print(f"warning: {warning.message}", file=sys.stderr)
+        with movie, _progress() as progress:
+            report = perrin.analyze_stack(
+                movie,
+                diameter=diameter,
+                contact=contact,
+                size=size,
+                frames=_slice(frames),
+                exclude=_whole_numbers("--exclude", exclude),
+                refine=_refine(refine),
+                dark=dark,
+                minmass=minmass,
+                percentile=percentile,
+                noise=_noise(noise),
+                exposure=exposure,
+                drift=drift,
+                viscosity=viscosity,
+                temperature=temperature,
+                keep=output,
+                anew=overwrite,
+                workers=workers,
+                scheduler=scheduler,
+                progress=progress,
+            )
+        complete_run(report, output)
+        _show(report, output)
+
+
+@contextmanager
+def _kept_told(output: Path) -> Iterator[None]:
+    """Say, when a run stops early, that finished frames are kept."""
+    try:
+        yield
+    except BaseException as stop:
+        if (output / "located").is_dir() and not (output / "run.json").exists():
+            print(
+                f"Finished frames are kept in {output}: the same command goes on from there.",
+                file=sys.stderr,
+            )
+        if isinstance(stop, KeyboardInterrupt):
+            raise typer.Exit(130) from None
+        raise
+
+
+@contextmanager
+def _progress() -> Iterator[Callable[[int, int, str], None]]:
+    """Give a function that shows how far the work is, how fast, and how long it will take."""
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeRemainingColumn,
+    )
+
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[rate]}"),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=Console(stderr=True, highlight=False)) as bar:
+        tasks: dict[str, TaskID] = {}
+
+        def tell(done: int, total: int, title: str) -> None:
+            if title not in tasks:
+                tasks[title] = bar.add_task(title, total=total or None, completed=done, rate="")
+            task = bar.tasks[tasks[title]]
+            rate = f"{task.speed:.2g} frames/s" if task.speed else ""
+            bar.update(tasks[title], completed=done, total=total or None, rate=rate)
+
+        yield tell
 
 
 @app.command()
@@ -356,7 +525,7 @@ def convert(
 @contextmanager
 def _told() -> Iterator[None]:
     """Say an error in one line; exit status 1: the data cannot answer, 2: the input is wrong."""
-    from perrin import DegenerateClusterError, TooFewFramesError
+    from perrin import DegenerateClusterError, IdentityError, TooFewFramesError
 
     try:
         yield
@@ -364,9 +533,9 @@ def _told() -> Iterator[None]:
         # The reader has gone (a pipe into head); the run itself is written. Python's own flush at
         # the end would complain again.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    except (ValueError, OSError) as error:
+    except (ValueError, OSError, ImportError) as error:
         print(f"perrin: {_one_line(error)}", file=sys.stderr)
-        unanswerable = isinstance(error, DegenerateClusterError | TooFewFramesError)
+        unanswerable = isinstance(error, DegenerateClusterError | IdentityError | TooFewFramesError)
         raise typer.Exit(1 if unanswerable else 2) from None
 
 
@@ -426,6 +595,21 @@ def _noise(text: str) -> Literal["joint", "residual"] | float:
         raise ValueError(
             f"--noise: expected joint, residual or sigma in um, got {text!r}"
         ) from None
+
+
+def _whole_numbers(option: str, text: str | None) -> list[int]:
+    """Read whole numbers separated by commas."""
+    try:
+        return [int(part) for part in (text or "").split(",") if part.strip()]
+    except ValueError:
+        raise ValueError(f"{option}: expected numbers like 3,7, got {text!r}") from None
+
+
+def _refine(text: str) -> Literal["model", "trackpy"] | None:
+    """Read model, trackpy or none."""
+    if text not in ("model", "trackpy", "none"):
+        raise ValueError(f"--refine: expected model, trackpy or none, got {text!r}")
+    return None if text == "none" else cast('Literal["model", "trackpy"]', text)
 
 
 def _columns(text: str | None) -> dict[str, str | int] | None:

@@ -58,7 +58,7 @@ class Quality:
         By how much z is stretched against x and y (1: not), from how the shape changes with
         orientation.
     scan_blur : float or None
-        sigma_z over sigma_xy, over the stated ratio where `sigma` has one number per axis. Far
+        sigma_z over sigma_xy, over the ratio stated by `sigma` or `sigma_ratio`. Far
         above what the optics explain it betrays a sequential scan.
     swaps, cuts, extra : tuple of int
         Rows of repaired exchanges of labels, of cuts, and of detections left out.
@@ -106,6 +106,7 @@ def judge_quality(
     positions: ArrayLike,
     *,
     sigma: ArrayLike | None = None,
+    sigma_ratio: ArrayLike | None = None,
     swaps: tuple[int, ...] = (),
     cuts: tuple[int, ...] = (),
     extra: tuple[int, ...] = (),
@@ -119,6 +120,8 @@ def judge_quality(
         The positions that the motion was fitted to, um.
     sigma : float or array_like, shape (d,), optional
         Localisation error known to the user, um.
+    sigma_ratio : array_like, shape (d,), optional
+        Localisation errors of the axes over each other, where only that is known: for `scan_blur`.
     swaps, cuts, extra : tuple of int
         What the identity of the particles went through (`Identity`).
 
@@ -147,7 +150,7 @@ def judge_quality(
     sample = _sample(motion, residuals)
     sigma_xyz = _sigma_per_axis(sample)
     scale, scale_error = _z_scale(sample, smooth)
-    blur = _scan_blur(sigma_xyz, sigma)
+    blur = _scan_blur(sigma_xyz, sigma if sigma_ratio is None else sigma_ratio)
     over, soft = _softness(motion, smooth, sigma)
     broken = _broken(pair, drift, ends)
     odd = _odd_scale(scale, scale_error) + _blurred(blur)

@@ -22,7 +22,7 @@ from perrin.plot import (
     unit_text,
     value_text,
 )
-from perrin.results import floor_factor, staged_folder, write_data
+from perrin.results import filled_folder, floor_factor, staged_folder, write_data
 from perrin.sampling import judge_sampling
 
 if TYPE_CHECKING:
@@ -110,11 +110,33 @@ def write_run(report: Report, folder: str | os.PathLike[str], *, overwrite: bool
         If the folder exists and `overwrite` is not set, or is not a run folder.
     """
     with staged_folder(folder, overwrite=overwrite) as stage:
-        write_data(report, stage)
-        place = stage / "figures"
-        place.mkdir()
-        html = render_html(report, save_figures(report, place))
-        (stage / "report.html").write_text(html, encoding="utf-8")
+        _write(report, stage)
+
+
+def complete_run(report: Report, folder: str | os.PathLike[str]) -> None:
+    """Write a run into the folder that holds its finished frames: as `write_run`, in their place.
+
+    Parameters
+    ----------
+    report : Report
+    folder : path
+        As given to `analyze_stack` as `keep`.
+
+    Raises
+    ------
+    OSError
+        If it cannot be written; the finished frames stay.
+    """
+    with filled_folder(folder) as stage:
+        _write(report, stage)
+
+
+def _write(report: Report, stage: Path) -> None:
+    write_data(report, stage)
+    place = stage / "figures"
+    place.mkdir()
+    html = render_html(report, save_figures(report, place))
+    (stage / "report.html").write_text(html, encoding="utf-8")
 
 
 def render_html(report: Report, figures: Iterable[Path]) -> str:

@@ -316,6 +316,56 @@ def staged_folder(folder: str | os.PathLike[str], *, overwrite: bool = False) ->
         shutil.rmtree(stage, ignore_errors=True)
 
 
+@contextmanager
+def filled_folder(folder: str | os.PathLike[str]) -> Iterator[Path]:
+    """Give a folder to write into, whose files then go into an unfinished run folder.
+
+    ``run.json`` goes last and makes the folder a finished one; what else stands there stays.
+
+    Raises
+    ------
+    OSError
+        If the place cannot be written.
+    """
+    place = Path(folder)
+    place.mkdir(parents=True, exist_ok=True)
+    stage = place / f".{os.getpid()}.part"
+    stage.mkdir()
+    try:
+        yield stage
+        (place / "run.json").unlink(missing_ok=True)
+        for new in sorted(stage.iterdir(), key=lambda path: path.name == "run.json"):
+            old = place / new.name
+            if old.is_dir():
+                shutil.rmtree(old)
+            new.replace(old)
+    finally:
+        shutil.rmtree(stage, ignore_errors=True)
+
+
+def check_resumable(folder: str | os.PathLike[str], *, parts: str, overwrite: bool = False) -> None:
+    """Refuse an output folder that is neither new, nor empty, nor an unfinished run with parts.
+
+    Parameters
+    ----------
+    folder : path
+    parts : str
+        The folder inside that an unfinished run has.
+    overwrite : bool
+        A finished one will do as well.
+
+    Raises
+    ------
+    FileExistsError, PermissionError
+        As in `staged_folder`.
+    """
+    place = Path(folder)
+    unfinished = (place / parts).is_dir() and not (place / "run.json").exists()
+    empty = place.is_dir() and not any(place.iterdir())
+    if not (unfinished or empty):
+        check_place(place, overwrite=overwrite)
+
+
 def check_place(folder: str | os.PathLike[str], *, overwrite: bool = False) -> None:
     """Refuse, before any work is done, an output folder that stands already.
 

@@ -208,7 +208,11 @@ def at_border(features: pd.DataFrame, *, margin: float, dropped: Mapping[int, In
             f"cluster {cluster}: centre within d/2 + 2 sigma ({margin:.2g} um) of the border in "
             f"{at(frames)}"
         )
-        text += f"; frames dropped, as spheres are out of view: {at(gone)[6:]}" if len(gone) else ""
+        text += (
+            f"; frames dropped, as spheres are out of view: {at(gone).partition(' ')[2]}"
+            if len(gone)
+            else ""
+        )
         told.append(text)
     return told
 

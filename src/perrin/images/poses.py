@@ -146,11 +146,12 @@ def with_poses(
         reason[k] = why
     fitted = np.flatnonzero(np.isfinite(rotation[:, 0, 0]))
     gauge = rotation[fitted[0]] if fitted.size else np.eye(3)
+    covariance = gauge @ covariance @ gauge.T
     return replace(
         motion,
         rotation=rotation @ gauge.T,
         center=center,
-        covariance=gauge @ covariance @ gauge.T,
+        covariance=(covariance + np.swapaxes(covariance, -1, -2)) / 2,
         center_variance=variance,
         template=motion.template @ gauge.T,
         reason=tuple(reason),

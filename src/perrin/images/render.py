@@ -173,7 +173,7 @@ class _Movie:
         light = self._light(i, rng)
         counts = self.offset + self.gain * (rng.poisson(light) if self.noise else light)
         if self.noise and self.read_noise > 0:
-            counts += rng.normal(0.0, self.read_noise, light.shape)
+            counts = counts + rng.normal(0.0, self.read_noise, light.shape)
         if self.dtype.kind != "f":
             # A camera saturates: the ends of its range are its own.
             counts = np.clip(np.rint(counts), 0, np.iinfo(self.dtype).max)

@@ -151,7 +151,7 @@ def analyze_stack(
         poses = _Poses(stack, located.method.optics, seen, contact, folder / _POSED, place)
         report = measure_table(
             _tracks(seen, exclude),
-            conditions,
+            replace(conditions, sigma_ratio=_stated(seen)),
             source={"path": depends["path"], "sha256": depends["sha256"]},
             arguments=_arguments(conditions, depends, seen.size, exclude),
             improved=poses.improved,
@@ -347,6 +347,15 @@ def _without_cut_bodies(
     features = features.copy()
     features.loc[gone, ["cluster", "particle", "piece"]] = (-1, -1, 0)
     return features, {int(c): part.to_numpy() for c, part in cut.groupby("cluster")["frame"]}
+
+
+def _stated(seen: _Seen) -> Floats | None:
+    """Return the median stated errors of the axes, um, where places were refined."""
+    names = [f"sigma_{axis}" for axis in seen.axes]
+    if not set(names) <= set(seen.features):
+        return None
+    median = seen.features[names].median().to_numpy(dtype=np.float64)
+    return median if np.isfinite(median).all() else None
 
 
 def _tracks(seen: _Seen, exclude: Iterable[int]) -> pd.DataFrame:

@@ -1,0 +1,335 @@
+"""A movie of stacks gives the D of its true positions, in one piece or in many, here or elsewhere.
+
+The movie is small: two touching tetrahedra, eight frames, written as an OME-TIFF.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import perrin
+from perrin.images import stages
+from perrin.images.locate import Method
+from perrin.images.parts import PartWriter, open_parts, read_parts
+
+pytest.importorskip("tifffile")
+pytest.importorskip("trackpy")
+pytest.importorskip("threadpoolctl")
+
+DIAMETER, DT, FRAMES = 2.45, 0.73, 8
+SEARCH = {"diameter": DIAMETER, "contact": DIAMETER}
+OPTIONS = ["--diameter", "2.45", "--contact", "2.45"]
+CENTERS = [(4.4, 4.4, 4.8), (9.6, 9.6, 4.8)]
+
+
+def rendered(n_frames=FRAMES, seed=0, **changed):
+    """Return a movie of two tetrahedra and the true positions (T, 8, 3)."""
+    body = perrin.Cluster.touching(4, DIAMETER)
+    motions = [
+        perrin.simulate_motion(body, D_R=5e-3, D_T=0.01, dt=DT, n_frames=n_frames, rng=seed + k)
+        for k in range(2)
+    ]
+    settings = {"photons": 40, "background": 3, "gain": 3, "read_noise": 2, "offset": 5}
+    movie = perrin.render_stack(
+        motions,
+        centers=CENTERS,
+        voxel=(0.25, 0.2, 0.2),
+        shape=(38, 68, 70),
+        diameter=DIAMETER,
+        psf=(0.4, 0.15, 0.15),
+        rng=seed + 7,
+        **settings | changed,
+    )
+    places = [m.positions() + c for m, c in zip(motions, CENTERS, strict=True)]
+    return movie, np.concatenate(places, axis=1)
+
+
+@pytest.fixture(scope="module")
+def movie_file(tmp_path_factory):
+    """Write the movie; return its path and the true positions."""
+    movie, places = rendered()
+    path = tmp_path_factory.mktemp("movie") / "movie.ome.tif"
+    perrin.write_stack(movie, path)
+    return path, places
+
+
+@pytest.fixture(scope="module")
+def whole(movie_file):
+    """Run in one piece."""
+    with perrin.open_stack(movie_file[0]) as stack:
+        return perrin.analyze_stack(stack, **SEARCH)
+
+
+@pytest.fixture(scope="module")
+def learned(whole):
+    """Return what a run learns from a few frames, to be given to others."""
+    return SEARCH | {"optics": whole.imaging.optics, "minmass": whole.imaging.minmass}
+
+
+def assert_identical(report, other):
+    """Compare every number of two reports, bit by bit."""
+    assert report.to_dict() == other.to_dict()
+    pd.testing.assert_frame_equal(report.tracks, other.tracks, check_exact=True)
+    for a, b in zip(report.clusters, other.clusters, strict=True):
+        for name in ("rotation", "center", "covariance", "residual"):
+            np.testing.assert_array_equal(getattr(a.motion, name), getattr(b.motion, name))
+    for name in ("features", "frames", "spots"):
+        one, two = getattr(report.imaging, name), getattr(other.imaging, name)
+        pd.testing.assert_frame_equal(one, two, check_exact=True)
+
+
+def run(*arguments, **settings):
+    """Call the command line in a process of its own."""
+    command = [sys.executable, "-m", "perrin.cli", "run", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, check=False, **settings)
+
+
+def test_the_movie_gives_what_its_true_positions_give(movie_file, whole):
+    """Every cluster is found, none is false; D differs from that of the truth by 0.2 errors."""
+    places = movie_file[1]
+    assert len(whole.clusters) == 2
+    for result in whole.clusters:
+        start = result.motion.center[0]
+        mine = np.linalg.norm(places[0].reshape(2, 4, 3).mean(axis=1) - start, axis=1).argmin()
+        true = perrin.track_rotation(places[:, 4 * mine : 4 * mine + 4], dt=DT)
+        for found, quantity in ((result.D_R, "rotation"), (result.D_T, "translation")):
+            with pytest.warns(perrin.PrecisionWarning, match="7 steps"):
+                expected = perrin.estimate_diffusion(true, quantity=quantity)
+            assert abs(found.value - expected.value) < 0.2 * expected.stderr
+        # 40 photons: 4.5 nm in x and y, 6 nm along z, and the table's constant offset apart.
+        off = 1e3 * (result.motion.center - true.center)
+        assert (off - off.mean(axis=0)).std(axis=0).max() < 6
+        assert np.abs(off.mean(axis=0)).max() < 12
+
+
+def test_the_run_says_how_spheres_were_seen(whole):
+    """Counts, places and optics are those of the movie."""
+    imaging = whole.imaging
+    assert imaging.frames["spheres"].tolist() == [8] * FRAMES
+    assert imaging.frames["frame"].tolist() == list(range(FRAMES))
+    np.testing.assert_allclose(imaging.frames["time"], DT * np.arange(FRAMES))
+    assert (imaging.features["cluster"] >= 0).all()
+    assert imaging.optics.diameter == pytest.approx(DIAMETER, abs=0.02)
+    assert len(imaging.spots) > 8  # noise among them
+    assert {v.frame for v in imaging.views} <= set(range(FRAMES))
+    assert imaging.views[0].xy.shape == (68, 70)
+    assert imaging.views[0].xz.shape == (38, 70)
+    assert imaging.views[0].yz.shape == (38, 68)
+
+
+def test_frames_and_clusters_can_be_left_out(movie_file, learned):
+    """A slice of frames counts from its own first one; other clusters keep their number."""
+    with perrin.open_stack(movie_file[0]) as stack:
+        part = perrin.analyze_stack(stack, **learned, frames=(2, 7), exclude=[0])
+    assert [c.cluster for c in part.clusters] == [1]
+    assert part.settings["first_frame"] == 2
+    assert part.imaging.frames["frame"].tolist() == list(range(2, 7))
+    assert part.clusters[0].motion.fitted.size == 5
+    assert set(part.imaging.features["cluster"]) == {0, 1}
+    with perrin.open_stack(movie_file[0]) as stack:
+        with pytest.raises(ValueError, match=r"exclude: there is no cluster 7; found \[0, 1\]"):
+            perrin.analyze_stack(stack, **learned, frames=(0, 3), exclude=[7])
+        with pytest.raises(ValueError, match="frames 40:50 hold none of the stack's, 0 to 7"):
+            perrin.analyze_stack(stack, **SEARCH, frames=(40, 50))
+        with pytest.raises(perrin.TooFewFramesError, match="one frame shows no motion"):
+            perrin.analyze_stack(stack, **SEARCH, frames=(3, 4))
+
+
+def test_a_run_folder_is_whole_and_reads_back(tmp_path, movie_file, whole):
+    """The command line writes what the function returns; a finished run is not overwritten."""
+    done = run(movie_file[0], *OPTIONS, "-o", tmp_path / "run")
+    assert done.returncode == 0, done.stderr
+    assert "Traceback" not in done.stderr
+    again = perrin.load_run(tmp_path / "run")
+    assert_identical(again, whole)
+    names = {p.name for p in (tmp_path / "run").iterdir()}
+    wanted = {"summary.json", "tracks.parquet", "motion.parquet", "curves.csv", "figures"}
+    assert wanted | {"report.html", "run.json", "features.parquet"} <= names
+    assert not [n for n in names if n.startswith(".")]
+    motion = pd.read_parquet(tmp_path / "run" / "motion.parquet")
+    assert motion["frame"].tolist() == 2 * list(range(FRAMES))
+    settings = json.loads((tmp_path / "run" / "run.json").read_text())
+    assert settings["arguments"]["diameter"] == DIAMETER
+    assert len(settings["input"]["sha256"]) == 64
+
+    refused = run(movie_file[0], *OPTIONS, "-o", tmp_path / "run")
+    assert refused.returncode == 2
+    assert "exists" in refused.stderr
+    assert refused.stderr.count("\n") == 1
+
+
+@pytest.fixture
+def counted(monkeypatch):
+    """Count the frames that are looked at."""
+    looked = []
+    look = Method.look
+    monkeypatch.setattr(Method, "look", lambda m, s, i: (looked.append(i), look(m, s, i))[1])
+    return looked
+
+
+def test_a_killed_run_goes_on_and_gives_the_same(tmp_path, movie_file, whole, counted):
+    """After kill -9 only what was not finished is done again; every bit is the same."""
+    script = tmp_path / "script.py"
+    script.write_text(
+        "from perrin.cli import main\n"
+        "from perrin.images import stages\n"
+        "from perrin.images.parts import PartWriter\n"
+        "stages.PartWriter = lambda folder: PartWriter(folder, seconds=0.0)\n"
+        "main()\n"
+    )
+    command = [sys.executable, script, "run", movie_file[0], *OPTIONS, "-o", tmp_path / "run"]
+    located = tmp_path / "run" / "located"
+    with subprocess.Popen(command, stderr=subprocess.DEVNULL) as process:
+        while process.poll() is None and len(list(located.glob("part-*"))) < 2:
+            time.sleep(0.01)
+        process.send_signal(signal.SIGKILL)
+    finished = {int(e["frame"]) for e in read_parts(located)[1]}
+    assert 0 < len(finished) < FRAMES, "killed too late to test anything"
+    with perrin.open_stack(movie_file[0]) as stack:
+        report = perrin.analyze_stack(stack, **SEARCH, keep=tmp_path / "run")
+    assert sorted(counted) == sorted(set(range(FRAMES)) - finished)
+    assert_identical(report, whole)
+
+
+def test_a_full_disk_is_told_and_the_run_goes_on(tmp_path, movie_file, whole, monkeypatch, capsys):
+    """What was written before stays; one line says what to do; the second call ends the work."""
+    from perrin.cli import app
+
+    monkeypatch.setattr(stages, "PartWriter", lambda folder: PartWriter(folder, seconds=0.0))
+    sync, written = os.fsync, []
+
+    def full(handle):
+        written.append(handle)
+        if len(written) > 11:
+            raise OSError(28, "No space left on device", "somewhere")
+        sync(handle)
+
+    folder = tmp_path / "run"
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "fsync", full)
+        with pytest.raises(SystemExit) as stopped:
+            app(["run", str(movie_file[0]), *OPTIONS, "-o", str(folder)])
+    assert stopped.value.code == 2
+    told = capsys.readouterr().err
+    assert "No space left on device" in told
+    assert "the same command goes on" in told
+    kept = len(list((folder / "located").glob("part-*")))
+    assert 0 < kept < FRAMES
+    assert not list((folder / "located").glob(".*"))
+    with perrin.open_stack(movie_file[0]) as stack:
+        report = perrin.analyze_stack(stack, **SEARCH, keep=folder)
+    assert_identical(report, whole)
+
+
+def test_parts_of_other_settings_or_input_are_refused(tmp_path, movie_file):
+    """They are named; nothing is mixed; overwriting starts anew."""
+    with perrin.open_stack(movie_file[0]) as stack:
+        short = {"frames": (0, 3), "refine": None, "keep": tmp_path / "run"}
+        perrin.analyze_stack(stack, **SEARCH, **short)
+        with pytest.raises(ValueError, match=r"percentile 95.0 there, 90.0 now; choose another"):
+            perrin.analyze_stack(stack, **SEARCH, **short, percentile=90.0)
+        anew = perrin.analyze_stack(stack, **SEARCH, **short, percentile=90.0, anew=True)
+        assert anew.settings["arguments"]["percentile"] == 90.0
+    with perrin.open_stack(movie_file[0]) as stack:
+        mirrored = np.stack([frame[:, ::-1] for frame in stack])
+    other = perrin.open_stack(mirrored, voxel=(0.25, 0.2, 0.2), dt=DT)
+    with pytest.raises(ValueError, match=r"path .*there, None now; .*sha256 "):
+        perrin.analyze_stack(other, **SEARCH, **short, percentile=90.0)
+
+
+def test_a_damaged_part_is_made_anew(tmp_path):
+    """A part that a failing disk cut short counts as not there."""
+    open_parts(tmp_path, {"a": 1})
+    with PartWriter(tmp_path, seconds=0.0) as writer:
+        for k in range(3):
+            writer.add(pd.DataFrame({"frame": [k], "x": [k / 3]}), {"frame": k})
+    victim = sorted(tmp_path.glob("part-*"))[1]
+    victim.write_bytes(victim.read_bytes()[:100])
+    table, entries, damaged = read_parts(tmp_path)
+    assert table["frame"].tolist() == [0, 2]
+    assert [e["frame"] for e in entries] == [0, 2]
+    assert damaged == [victim.name]
+    assert not victim.exists()
+
+
+def test_a_frame_that_cannot_be_read_is_told_and_skipped(tmp_path, movie_file):
+    """A file of a sequence that was cut short loses its frame only, which is a gap."""
+    import tifffile
+
+    with perrin.open_stack(movie_file[0]) as stack:
+        for i, frame in enumerate(stack):
+            tifffile.imwrite(tmp_path / f"t{i}.tif", frame)
+    victim = tmp_path / "t4.tif"
+    victim.write_bytes(victim.read_bytes()[:50_000])
+    with perrin.open_stack(tmp_path, voxel=(0.25, 0.2, 0.2), dt=DT) as stack:
+        report = perrin.analyze_stack(stack, **SEARCH, refine=None)
+        table = report.imaging.frames
+        assert table.loc[table["fault"] != "", "frame"].tolist() == [4]
+        for result in report.clusters:
+            assert result.motion.fitted.tolist() == [0, 1, 2, 3, 5, 6, 7]
+        told = [text for text in report.warnings if "1 of 8 frames cannot be read" in text]
+        assert "frame 4" in told[0]
+        assert "t4.tif" in told[0]
+        with pytest.warns(perrin.PrecisionWarning, match="1 of 8 frames are left out: .*t4"):
+            found = perrin.locate(stack, **SEARCH, refine=None)
+    assert sorted(found["frame"].unique()) == [0, 1, 2, 3, 5, 6, 7]
+
+
+def test_many_workers_give_what_one_gives(movie_file):
+    """Two processes of this machine: every bit is the same."""
+    pytest.importorskip("distributed")
+    conventional = SEARCH | {"refine": None, "frames": (0, 5)}
+    with perrin.open_stack(movie_file[0]) as stack:
+        alone = perrin.analyze_stack(stack, **conventional)
+        assert_identical(perrin.analyze_stack(stack, **conventional, workers=2), alone)
+
+
+@pytest.fixture
+def cluster(tmp_path):
+    """Start a Dask scheduler and two workers on the loopback address; yield address and workers."""
+    pytest.importorskip("distributed")
+    file = tmp_path / "scheduler.json"
+    logs = open(tmp_path / "log", "w")  # noqa: SIM115 (closed below)
+    flags = {"stdout": logs, "stderr": logs}
+    local = ["--host", "127.0.0.1"]
+    start = [sys.executable, "-m", "distributed.cli.dask_scheduler", *local, "--port", "0"]
+    processes = [subprocess.Popen([*start, "--scheduler-file", file, "--no-dashboard"], **flags)]
+    while not file.exists():
+        assert processes[0].poll() is None, (tmp_path / "log").read_text()
+        time.sleep(0.05)
+    address = json.loads(file.read_text())["address"]
+    worker = [sys.executable, "-m", "distributed.cli.dask_worker", address, "--no-nanny"]
+    worker += ["--nthreads", "1", "--no-dashboard", "--local-directory", str(tmp_path), *local]
+    processes += [subprocess.Popen(worker, **flags) for _ in range(2)]
+    yield address, processes[1:]
+    for process in processes[::-1]:
+        process.kill()
+        process.wait()
+    logs.close()
+
+
+def test_a_dask_cluster_that_loses_a_worker_gives_the_same(movie_file, whole, learned, cluster):
+    """One of two workers is killed half-way; every bit is that of the serial run."""
+    address, workers = cluster
+    killed = []
+
+    def kill_half_way(done, total, title):
+        if title == "locating spheres" and 0 < done < total and not killed:
+            workers[0].send_signal(signal.SIGKILL)
+            killed.append(done)
+
+    with perrin.open_stack(movie_file[0]) as stack:
+        report = perrin.analyze_stack(stack, **learned, scheduler=address, progress=kill_half_way)
+    assert killed
+    assert killed[0] < FRAMES
+    assert workers[0].wait() == -signal.SIGKILL
+    assert_identical(report, whole)
