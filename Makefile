@@ -50,7 +50,7 @@ test-lowest:  ## the suite on the oldest dependencies allowed (Python 3.11)
 	.venv-lowest/bin/python -m pytest -q
 
 coverage: .venv/.test  ## do intervals cover? a quick look (docs/validation.md has the long one)
-	$(BIN)/python benchmarks/coverage.py --quick
+	$(BIN)/python benchmarks/intervals.py --quick
 
 lint: .venv/.test  ## ruff: rules and format
 	$(RUN) ruff check .

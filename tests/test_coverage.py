@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-BENCHMARK = Path(__file__).resolve().parents[1] / "benchmarks" / "coverage.py"
+BENCHMARK = Path(__file__).resolve().parents[1] / "benchmarks" / "intervals.py"
 
 
 @pytest.fixture(scope="module")

@@ -130,6 +130,15 @@ def test_the_image_holds_the_balls_light_and_its_slope():
         assert np.allclose(gradient[axis], (up - down) / (2 * step), atol=1e-6)
 
 
+def test_a_sphere_out_of_view_shows_nothing():
+    """Its box is empty, and so are the image and its gradient."""
+    spot = sphere_image(diameter=DIAMETER, psf=PSF, voxel=VOXEL).spot(
+        np.array([-9.0, 2.0, 2.0]), (20, 20, 20)
+    )
+    assert spot.value.size == 0
+    assert spot.gradient.shape == (3, *spot.value.shape)
+
+
 def test_a_blur_flatter_than_round_is_refused():
     """Exchanged point spreads and lengths that are none are named."""
     with pytest.raises(ValueError, match="exchanged"):

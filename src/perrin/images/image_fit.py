@@ -60,7 +60,7 @@ class Window(NamedTuple):
             spot = image.spot(center, shape)
             layer[(0, *spot.box)] = spot.value
             layer[(slice(1, None), *spot.box)] = spot.gradient
-        kept = whole.reshape(4 * len(centers), -1)[:, self.mask.ravel()]
+        kept = whole.reshape(4 * len(centers), -1).take(np.flatnonzero(self.mask), axis=1)
         kept = kept.reshape(len(centers), 4, -1)
         return kept[:, 0], kept[:, 1:]
 
@@ -259,19 +259,17 @@ def _state(
     window: Window,
     noise: CameraNoise,
 ) -> _State:
-    n = len(value)
-    design = np.concatenate([value, window.background])
-    by_place = (linear[:n, None, None] * gradient).reshape(3 * n, -1)
-    slope = arrangement.slope
-    by_number = by_place if slope is None else slope @ by_place
-    expected = linear @ design
-    return _State(
-        arrangement,
-        linear,
-        expected,
-        noise.weight(expected),
-        np.concatenate([by_number, design]),
-    )
+    slope, n = arrangement.slope, len(value)
+    k = 3 * n if slope is None else len(slope)
+    jacobian = np.empty((k + len(linear), len(window.data)))
+    brightness = linear[:n, None, None]
+    if slope is None:
+        np.multiply(brightness, gradient, out=jacobian[:k].reshape(gradient.shape))
+    else:
+        np.matmul(slope, (brightness * gradient).reshape(3 * n, -1), out=jacobian[:k])
+    jacobian[k : k + n], jacobian[k + n :] = value, window.background
+    expected = linear @ jacobian[k:]
+    return _State(arrangement, linear, expected, noise.weight(expected), jacobian)
 
 
 def _finished(window: Window, state: _State, settled: bool) -> ImageFit:

@@ -102,9 +102,10 @@ def fit_samples(
         image = _image(log, voxel)
         fits = [_fitted(s, c, image, noise) for s, c in zip(samples, centers, strict=True)]
         centers = [fit.centers for _, fit in fits]
+        probes = _probes(log, voxel)
         information, score = (
             np.sum(part, axis=0)
-            for part in zip(*(_told(window, fit, log, voxel) for window, fit in fits), strict=True)
+            for part in zip(*(_told(window, fit, probes) for window, fit in fits), strict=True)
         )
         step = np.linalg.solve(information, score)
         noise = _noise(fits)
@@ -140,11 +141,18 @@ def _window(sample: Sample, centers: Floats, image: SphereImage) -> Window:
     return cut_window(sample.frame, image, centers, others=sample.others)
 
 
+def _probes(log: Floats, voxel: tuple[float, float, float]) -> list[tuple[SphereImage, ...]]:
+    """Return the images of spheres with each logarithm a little larger, and a little smaller."""
+    shifts = _PROBE * np.eye(3)
+    return [(_image(log + shift, voxel), _image(log - shift, voxel)) for shift in shifts]
+
+
 def _told(
-    window: Window, fit: ImageFit, log: Floats, voxel: tuple[float, float, float]
+    window: Window, fit: ImageFit, probes: list[tuple[SphereImage, ...]]
 ) -> tuple[Floats, Floats]:
     """Return one fit's information (3, 3) on the logarithms, and its score."""
-    slope = np.stack([_difference(window, fit, log, voxel, axis) for axis in range(3)])
+    seen = [[fit.brightness @ window.spots(p, fit.centers)[0] for p in pair] for pair in probes]
+    slope = np.stack([(up - down) / (2 * _PROBE) for up, down in seen])
     weighted = slope * fit.weight
     nuisance = fit.jacobian * fit.weight
     shared = nuisance @ slope.T
@@ -153,17 +161,6 @@ def _told(
     return weighted @ slope.T - shared.T @ taken, weighted @ residual - taken.T @ (
         nuisance @ residual
     )
-
-
-def _difference(
-    window: Window, fit: ImageFit, log: Floats, voxel: tuple[float, float, float], axis: int
-) -> Floats:
-    """Return the central difference of the expected light by one logarithm."""
-    seen = []
-    for sign in (1.0, -1.0):
-        value, _ = window.spots(_image(log + sign * _PROBE * np.eye(3)[axis], voxel), fit.centers)
-        seen.append(fit.brightness @ value)
-    return np.asarray((seen[0] - seen[1]) / (2 * _PROBE))
 
 
 def _noise(fits: Sequence[tuple[Window, ImageFit]]) -> CameraNoise:

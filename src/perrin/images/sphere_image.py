@@ -87,18 +87,18 @@ class SphereImage:
             Derivatives by the centre's (z, y, x), per um.
         """
         rho = np.hypot(y[:, None], x)
+        shape = (len(z), *rho.shape)
         along, along_slope = _splines(np.abs(z) / self._spacing[0], self._knots.shape[0])
         across, across_slope = _splines(rho.ravel() / self._spacing[1], self._knots.shape[1])
         profile = along @ self._knots
-        shape = (len(z), *rho.shape)
+        by_z = along_slope @ self._knots * (-np.sign(z) / self._spacing[0])[:, None]
+        outward = across_slope / (self._spacing[1] * np.where(rho > 0, rho, 1.0)).reshape(-1, 1)
         value = (profile @ across.T).reshape(shape)
-        by_z = ((along_slope @ self._knots) @ across.T).reshape(shape) / self._spacing[0]
-        by_rho = (profile @ across_slope.T).reshape(shape) / self._spacing[1]
-        outward = by_rho / np.where(rho > 0, rho, 1.0)
+        by_rho = (profile @ outward.T).reshape(shape)
         gradient = np.empty((3, *shape))
-        np.multiply(by_z, -np.sign(z)[:, None, None], out=gradient[0])
-        np.multiply(outward, -y[:, None], out=gradient[1])
-        np.multiply(outward, -x, out=gradient[2])
+        np.matmul(by_z, across.T, out=gradient[0].reshape(len(z), rho.size))
+        np.multiply(by_rho, -y[:, None], out=gradient[1])
+        np.multiply(by_rho, -x, out=gradient[2])
         return value, gradient
 
 

@@ -1,6 +1,6 @@
 """Are the estimates at the statistical limit, and do their intervals cover? Simulated truth.
 
-Usage: python benchmarks/coverage.py [--tracks N] [--seed N] [--quick] [--paper]
+Usage: python benchmarks/intervals.py [--tracks N] [--seed N] [--quick] [--paper]
 
 Prints a table for docs/validation.md: for each cell (body, frames, signal-to-noise ratio, what is
 done to the track) and each estimator the bias, the spread, the efficiency (Cramer-Rao bound over
