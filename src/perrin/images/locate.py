@@ -98,10 +98,10 @@ class Search:
 
 
 class Sampled(NamedTuple):
-    """A frame looked at to learn from, and its spots."""
+    """A frame looked at to learn from, in the stack's own type, and its spots."""
 
     number: int
-    frame: Floats
+    frame: NDArray[Any]
     spots: Features
 
 
@@ -151,12 +151,13 @@ class Method:
         FrameError
             If the frame cannot be read.
         """
-        frame, voxel = _read(stack, i), _voxel(stack)
+        data, voxel = np.asarray(stack.frame(i)), _voxel(stack)
+        frame = np.asarray(data, dtype=np.float64)
         spots = self.search.spots(frame, voxel)
         columns = self._columns(frame, self.search.spheres(spots), voxel)
         columns = {"frame": np.full(len(columns["mass"]), i, dtype=np.int64)} | columns
-        share = float(np.mean(frame == frame.max()))
-        return Found(columns, len(spots.mass), float(np.median(frame)), share)
+        share = float(np.mean(data == data.max()))
+        return Found(columns, len(spots.mass), float(np.median(data)), share)
 
     def _columns(self, frame: Floats, found: Features, voxel: _Voxel) -> dict[str, NDArray[Any]]:
         contact = self.search.contact
@@ -182,11 +183,12 @@ def sample_frames(stack: Stack, search: Search, frames: Sequence[int]) -> list[S
     fault: FrameError | None = None
     for k in _spread(len(frames)):
         try:
-            frame = _read(stack, frames[k])
+            data = np.asarray(stack.frame(frames[k]))
         except FrameError as error:
             fault = fault or error
             continue
-        seen.append(Sampled(frames[k], frame, search.spots(frame, _voxel(stack))))
+        spots = search.spots(np.asarray(data, dtype=np.float64), _voxel(stack))
+        seen.append(Sampled(frames[k], data, spots))
     if fault is not None and not seen:
         raise fault
     return seen
@@ -411,10 +413,6 @@ def found_table(found: Iterable[Found]) -> pd.DataFrame:
     if not parts:
         return pd.DataFrame(columns=["frame", "x", "y", "z", "mass"])
     return pd.concat(parts, ignore_index=True)
-
-
-def _read(stack: Stack, i: int) -> Floats:
-    return np.asarray(stack.frame(i), dtype=np.float64)
 
 
 def _voxel(stack: Stack) -> _Voxel:

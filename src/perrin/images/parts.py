@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import time
-import uuid
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -129,6 +128,8 @@ class PartWriter:
         OSError
             Where it cannot be written, as on a full disk; parts written before stay good.
         """
+        import uuid
+
         import pandas as pd
 
         if not self._entries:

@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-import shutil
-import tempfile
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
-from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+import perrin.images.checks as checks
 from perrin._arrays import DegenerateClusterError, Floats, IdentityError, TooFewFramesError
 from perrin.analysis import Conditions, check_arguments, measure_table, told_conditions
 from perrin.files import check_tracks
 from perrin.grouping import identify
-from perrin.images import checks
 from perrin.images.imaging import Imaging, View
 from perrin.images.locate import Search, check_search
 from perrin.images.parts import PartsError
@@ -210,6 +207,8 @@ def _depends(
     frames: Sequence[int],
 ) -> dict[str, Any]:
     """Return all that the located spheres depend on."""
+    from importlib.metadata import version
+
     return {
         "path": None if stack.path is None else str(stack.path),
         "sha256": digest(stack),
@@ -227,6 +226,8 @@ def _depends(
 @contextmanager
 def _kept_in(keep: str | os.PathLike[str] | None) -> Iterator[Path]:
     """Give the folder of the parts, one that goes away if none is wanted."""
+    import tempfile
+
     if keep is not None:
         yield Path(keep)
         return
@@ -246,6 +247,8 @@ def _located(
     anew: bool,
 ) -> Located:
     """Locate all frames, and refuse or throw away the parts of another run."""
+    import shutil
+
     try:
         return locate_frames(
             stack, search, refine=refine, optics=optics, frames=frames, settings=settings,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import shutil
 import warnings
 from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
@@ -254,6 +253,8 @@ def fit_poses(
     items = _standing(motions, features)
     settings = {"starts": _digest(templates, items.values()), "optics": asdict(optics)}
     if place.folder.exists() and not _same(place.folder, settings):
+        import shutil
+
         # Poses follow from what was located: those of other bodies are of no use to anybody.
         shutil.rmtree(place.folder)
     open_parts(place.folder, settings)
