@@ -5,19 +5,23 @@ The movie is small: two touching tetrahedra, eight frames, written as an OME-TIF
 
 from __future__ import annotations
 
+import doctest
 import json
 import os
+import pickle
+import re
 import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 
 import perrin
-from perrin.images import stages
+from perrin.images import stages, workers
 from perrin.images.locate import Method
 from perrin.images.parts import PartWriter, open_parts, read_parts
 
@@ -333,3 +337,96 @@ def test_a_dask_cluster_that_loses_a_worker_gives_the_same(movie_file, whole, le
     assert killed[0] < FRAMES
     assert workers[0].wait() == -signal.SIGKILL
     assert_identical(report, whole)
+
+
+def test_the_page_tells_the_truth():
+    """The example of docs/run.md prints what the page says, and every option of it is one."""
+    page = Path(__file__).resolve().parents[1] / "docs" / "run.md"
+    result = doctest.testfile(str(page), module_relative=False)
+    assert result.attempted > 0
+    assert result.failed == 0
+    offered = subprocess.run(
+        [sys.executable, "-m", "perrin.cli", "run", "--help"],
+        capture_output=True,
+        text=True,
+        check=True,
+        env=os.environ | {"COLUMNS": "200", "TERMINAL_WIDTH": "200"},
+    ).stdout
+    named = set(re.findall(r"(?<![\w-])--[a-z][a-z-]+", page.read_text())) - {"--help"}
+    assert len(named) > 12
+    assert [option for option in sorted(named) if option not in offered] == []
+
+
+@pytest.mark.parametrize(
+    ("options", "status", "told"),
+    [
+        ([], 2, "no voxel size along z, y, x: pass voxel=(z, y, x) in um; no times of its"),
+        (["--voxel", "0.25,0.2,0.2", "--dt", "0.7", "--refine", "best"], 2, "--refine: expected"),
+        (
+            ["--voxel", "0.25,0.2,0.2", "--dt", "0.7", "--exclude", "a"],
+            2,
+            "--exclude: expected num",
+        ),
+        (["--voxel", "0.25,0.2,0.2", "--dt", "0.7", "--refine", "none"], 1, "no particles"),
+    ],
+)
+def test_what_cannot_be_is_said_in_one_line(tmp_path, capsys, options, status, told):
+    """A bare TIFF without a sphere: what is missing, what is wrong; no folder is left by that."""
+    import tifffile
+
+    from perrin.cli import app
+
+    path = tmp_path / "bare.tif"
+    tifffile.imwrite(path, np.full((3, 16, 32, 32), 7, dtype=np.uint8), metadata={"axes": "TZYX"})
+    with pytest.raises(SystemExit) as stopped:
+        app(["run", str(path), *OPTIONS, "-o", str(tmp_path / "run"), *options])
+    error = capsys.readouterr().err
+    assert stopped.value.code == status
+    assert f"perrin: {path}: {told}" in error or f"perrin: {told}" in error
+    assert "Traceback" not in error
+    assert (tmp_path / "run").exists() == (status == 1)
+
+
+def test_workers_that_are_not_there_are_told(monkeypatch, movie_file):
+    """Without dask the command to install it; without a scheduler, its address."""
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with perrin.open_stack(movie_file[0]) as stack:
+        with pytest.raises(ModuleNotFoundError, match=r"pip install 'perrin\[cluster\]'"):
+            perrin.analyze_stack(stack, **SEARCH, refine=None, workers=2)
+        monkeypatch.undo()
+        pytest.importorskip("distributed")
+        monkeypatch.setattr(workers, "_TIMEOUT", 0.3)
+        with pytest.raises(OSError, match=r"tcp://127.0.0.1:9"):
+            perrin.analyze_stack(stack, **SEARCH, refine=None, scheduler="tcp://127.0.0.1:9")
+
+
+def test_a_file_out_of_a_workers_reach_is_no_bad_frame(tmp_path, movie_file):
+    """Where the whole file is missing every frame would count as damaged."""
+    path = tmp_path / "movie.ome.tif"
+    path.write_bytes(movie_file[0].read_bytes())
+    with perrin.open_stack(path) as stack:
+        sent = pickle.dumps(stack)
+    path.unlink()
+    with pytest.raises(OSError, match=r"movie.ome.tif cannot be opened here") as failed:
+        pickle.loads(sent).frame(0)
+    assert not isinstance(failed.value, perrin.FrameError)
+
+
+def test_steps_over_half_a_contact_are_refused(learned):
+    """A cluster that leaps to and fro by 0.6 contact distances: nobody can tell who is who."""
+    body = perrin.Cluster.touching(4, DIAMETER).positions
+    leap = np.where(np.arange(FRAMES) % 2, 0.3, -0.3)[:, None] * [DIAMETER, 0.0, 0.0]
+    wild = perrin.render_stack(
+        body + leap[:, None] + [7.0, 7.0, 4.8],
+        voxel=(0.25, 0.2, 0.2),
+        shape=(38, 68, 70),
+        diameter=DIAMETER,
+        psf=(0.4, 0.15, 0.15),
+        photons=40,
+        background=3,
+        gain=3,
+        dt=DT,
+        rng=1,
+    )
+    with pytest.raises(perrin.IdentityError, match=r"1.47 um is over half of the contact distance"):
+        perrin.analyze_stack(wild, **learned)

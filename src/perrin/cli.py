@@ -722,7 +722,8 @@ def _show(report: Report, output: Path) -> None:
         console.print(f"[yellow]warning{escape(where)}:[/] {escape(text)}", soft_wrap=True)
     if len(told) > _SHOWN_WARNINGS:
         console.print(f"and {len(told) - _SHOWN_WARNINGS} more warnings in summary.json")
-    console.print(f"Written to {escape(str(output))}: report.html, figures, summary.json, tables.")
+    pages = "report.html" if report.imaging is None else "report.html, quality.html"
+    console.print(f"Written to {escape(str(output))}: {pages}, figures, summary.json, tables.")
 
 
 def _cluster_table(result: ClusterResult) -> Table:

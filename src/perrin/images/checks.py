@@ -248,7 +248,7 @@ def long_steps(motion: RigidMotion, *, contact: float) -> list[str]:
         return []
     safe = motion.dt * (_QUARTER / over) ** 2
     return [
-        f"rms step {over * contact:.2g} um is over a quarter of the contact distance "
+        f"rms step {over * contact:.3g} um is over a quarter of the contact distance "
         f"{contact:.3g} um: identities are unsafe at dt = {motion.dt:.3g} s; they are safe below "
         f"dt = {safe:.2g} s"
     ]
@@ -261,7 +261,7 @@ def refused(motion: RigidMotion, *, contact: float) -> str:
         return ""
     fast = motion.dt * (_QUARTER / over) ** 2
     return (
-        f"rms step {over * contact:.2g} um is over half of the contact distance {contact:.3g} um: "
+        f"rms step {over * contact:.3g} um is over half of the contact distance {contact:.3g} um: "
         f"who is who cannot be told; take frames every {fast:.2g} s"
     )
 

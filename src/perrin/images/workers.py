@@ -13,7 +13,6 @@ T = TypeVar("T")
 
 _CHUNK = 4  # items a worker takes at once: a file is opened once for all of them
 _TIMEOUT = 30  # s, to find the scheduler
-_DEATHS = 3  # workers that one task may take with it before it is given up
 
 
 def work_through(
@@ -93,7 +92,8 @@ def _spread_out(
             future.release()
     except KilledWorker as fault:
         raise OSError(
-            f"{_DEATHS + 1} workers died over the same piece of work (out of memory?): {fault}"
+            "workers die again and again over the same piece of work (out of memory, or out of "
+            f"time?): {fault}"
         ) from fault
     except CancelledError as fault:
         raise ConnectionError("the Dask scheduler is gone; what was done is kept") from fault
@@ -103,20 +103,18 @@ def _spread_out(
 def _client(workers: int, scheduler: str | None) -> Iterator[Any]:
     """Give a client of the cluster at that address, or of processes started here."""
     try:
-        import dask
         from distributed import Client, LocalCluster
     except ModuleNotFoundError as missing:
         raise ModuleNotFoundError(
             "other workers need dask.distributed, which is not installed: "
             "pip install 'perrin[cluster]'"
         ) from missing
-    with dask.config.set({"distributed.scheduler.allowed-failures": _DEATHS}):
-        if scheduler is not None:
-            with Client(scheduler, timeout=_TIMEOUT, set_as_default=False) as client:
-                yield client
-            return
-        cluster = LocalCluster(
-            n_workers=workers, threads_per_worker=1, dashboard_address=None, silence_logs=50
-        )
-        with cluster, Client(cluster, set_as_default=False) as client:
+    if scheduler is not None:
+        with Client(scheduler, timeout=_TIMEOUT, set_as_default=False) as client:
             yield client
+        return
+    cluster = LocalCluster(
+        n_workers=workers, threads_per_worker=1, dashboard_address=None, silence_logs=50
+    )
+    with cluster, Client(cluster, set_as_default=False) as client:
+        yield client
