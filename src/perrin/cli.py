@@ -238,7 +238,7 @@ def run(
     from perrin.report import complete_run
     from perrin.results import check_resumable
 
-    with _told(), _kept_told(output):
+    with _kept_told(output), _told():
         check_resumable(output, parts="located", overwrite=overwrite)
         with warnings.catch_warnings(record=True) as said:
             warnings.simplefilter("always", perrin.PrecisionWarning)

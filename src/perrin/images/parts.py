@@ -162,6 +162,9 @@ def write_whole(place: Path, content: bytes) -> None:
             os.fsync(file.fileno())
         beside.replace(place)
         _sync_folder(place.parent)
+    except OSError as fault:
+        # A write says what is wrong, but not where.
+        raise OSError(fault.errno, fault.strerror, str(place)) from fault
     finally:
         beside.unlink(missing_ok=True)
 
