@@ -10,7 +10,8 @@ import numpy as np
 
 from perrin._arrays import Floats, PrecisionWarning, require_positive
 from perrin.images.conventional import Features, find_features, refine_by_trackpy
-from perrin.images.features import at_contact, mass_cut, touching_together
+from perrin.images.crowd import CrowdFit, fit_crowd, piece_of
+from perrin.images.features import at_contact, groups_and_crowds, mass_cut
 from perrin.images.image_fit import (
     FreeCenters,
     ImageFit,
@@ -18,10 +19,11 @@ from perrin.images.image_fit import (
     cut_window,
     fit_window,
 )
-from perrin.images.optics import Optics, Sample, fit_samples
+from perrin.images.optics import CrowdSample, Optics, Sample, fit_samples
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
+    from typing import TypeAlias
 
     import pandas as pd
 
@@ -29,11 +31,14 @@ if TYPE_CHECKING:
     from perrin.images.sphere_image import SphereImage
     from perrin.motion import RigidMotion
 
+    Columns: TypeAlias = dict[str, Floats | Bools]
+
 Refine = Literal["model", "trackpy"] | None
 
 _LEARN_FRAMES = 5  # frames looked at to set the mass cut and to learn the optics
 _LEARN_GROUPS = 15  # groups of spheres the optics are learned from
-_CROWD = 16  # spheres in a larger group stay where they were found: see `locate`
+_LEARN_CROWDS = 2  # pieces of crowds the optics are learned from where there are no small groups
+_PIECE = 30  # spheres in such a piece
 
 
 class Stack(Protocol):
@@ -147,7 +152,7 @@ def locate(
         "model" ``sigma_x, sigma_y, sigma_z`` in um (from the Fisher information), ``chi2`` of the
         group's image per degree of freedom, and ``refined``: False where the fit did not settle,
         left by over half a radius, found no sphere, or was not tried, and the place found first was
-        kept, without errors.
+        kept, without errors. Of crowds see the notes.
 
     Raises
     ------
@@ -159,9 +164,16 @@ def locate(
     Warns
     -----
     PrecisionWarning
-        Where the masses show no gap between spheres and noise; where more than 16 spheres touch
-        in a chain: the model of their image asks for every neighbour, and for light more even than
-        a dense sample has, so that they stay where they were found.
+        Where the masses show no gap between spheres and noise; where a sphere has no voxels to
+        itself and stays where it was found.
+
+    Notes
+    -----
+    More than 16 spheres in a chain, neighbours within 1.6 times `contact`, are a crowd, which is
+    fitted until its image has nothing left over: spots that turn out to be no spheres are left out,
+    and spheres that were missed are added, with a `mass` of NaN. Its `chi2` is that of each
+    sphere's own voxels. Its background has a level of its own in every plane; what shines there
+    without being a sphere is misread as one if it is bright enough.
 
     Examples
     --------
@@ -199,13 +211,18 @@ def fit_optics(stack: Stack, search: Search) -> Optics:
         Where no sphere is found, or the search does not settle.
     """
     search = search.with_minmass(stack)
-    samples = []
+    samples: list[Sample | CrowdSample] = []
+    crowds: list[Sample | CrowdSample] = []
     for i in _spread(stack.shape[0]):
         frame, found = search.spots(stack, i)
-        groups = touching_together(found.centers, contact=search.contact)
-        samples += [_sample(frame, found, g, search.contact) for g in groups if len(g) <= _CROWD]
-    keep = _spread(len(samples), _LEARN_GROUPS)
-    return fit_samples([samples[k] for k in keep], diameter=search.diameter, voxel=_voxel(stack))
+        groups, crowded = groups_and_crowds(found.centers, contact=search.contact)
+        samples += [_sample(frame, found, group, search.contact) for group in groups]
+        crowds += [_piece(frame, found, group, search, stack) for group in crowded]
+    most = _LEARN_GROUPS
+    if sum(len(s.centers) for s in samples) < sum(len(s.centers) for s in crowds):
+        samples, most = crowds, _LEARN_CROWDS
+    learned = [samples[k] for k in _spread(len(samples), most)]
+    return fit_samples(learned, diameter=search.diameter, voxel=_voxel(stack))
 
 
 def fit_pose(
@@ -299,12 +316,14 @@ def _replaced(motion: RigidMotion, fits: dict[int, ImageFit]) -> RigidMotion:
 
 def _frame_columns(
     stack: Stack, i: int, search: Search, refine: Refine, optics: Optics | None
-) -> dict[str, Floats | Bools]:
+) -> Columns:
     """Return the columns of one frame's part of the table."""
     frame, found = search.spots(stack, i)
-    columns: dict[str, Floats | Bools] = {"frame": np.full(len(found.mass), i)}
+    columns: Columns = {"frame": np.full(len(found.mass), i)}
     if refine == "model" and optics is not None:
-        return columns | _by_model(frame, found, search.contact, optics, _voxel(stack))
+        columns = _by_model(frame, found, search.contact, optics, _voxel(stack))
+        columns = _with_crowds(columns, frame, found, search, optics, _voxel(stack))
+        return {"frame": np.full(len(columns["mass"]), i)} | columns
     centers = found.centers
     if refine == "trackpy":
         centers = refine_by_trackpy(
@@ -319,12 +338,12 @@ def _by_model(
     contact: float,
     optics: Optics,
     voxel: tuple[float, float, float],
-) -> dict[str, Floats | Bools]:
+) -> Columns:
     image = optics.image(voxel)
     centers, sigma = found.centers.copy(), np.full_like(found.centers, np.nan)
     chi2, refined = np.full(len(centers), np.nan), np.zeros(len(centers), dtype=np.bool_)
-    groups = touching_together(found.centers, contact=contact)
-    for group in (g for g in groups if len(g) <= _CROWD):
+    groups, _ = groups_and_crowds(found.centers, contact=contact)
+    for group in groups:
         sample = _sample(frame, found, group, contact)
         window = cut_window(frame, image, sample.centers, others=sample.others)
         if not window.shows(len(group)):
@@ -340,6 +359,52 @@ def _by_model(
     return _places(centers) | {"mass": found.mass} | errors | {"chi2": chi2, "refined": refined}
 
 
+def _with_crowds(
+    columns: Columns,
+    frame: Floats,
+    found: Features,
+    search: Search,
+    optics: Optics,
+    voxel: tuple[float, float, float],
+) -> Columns:
+    """Return the columns with the rows of every crowd replaced by those of its fit."""
+    _, crowds = groups_and_crowds(found.centers, contact=search.contact)
+    for group in crowds:
+        crowd = fit_crowd(
+            frame,
+            found.centers[group],
+            others=np.delete(found.centers, group, axis=0),
+            contact=search.contact,
+            image=optics.image(voxel),
+            noise=optics.noise,
+        )
+        last = (np.array(frame.shape) - 1) * np.array(voxel)
+        theirs = _crowd_columns(crowd, found.centers[group], found.mass[group], search, last)
+        columns = {k: np.concatenate([columns[k], theirs[k]]) for k in columns}
+    stays = np.ones(len(columns["mass"]), dtype=np.bool_)
+    stays[np.concatenate([np.empty(0, dtype=np.int64), *crowds])] = False
+    return {k: column[stays] for k, column in columns.items()}
+
+
+def _crowd_columns(
+    crowd: CrowdFit, start: Floats, mass: Floats, search: Search, last: Floats
+) -> Columns:
+    """Return the columns of a crowd that was found at `start`, in a stack that ends at `last`.
+
+    A sphere whose fit did not settle stays where it was found first, or is left out where it was
+    not; without `border` so is one that the border cuts.
+    """
+    first = crowd.origin >= 0
+    good = crowd.settled & np.isfinite(crowd.sigma).all(axis=1)
+    centers = np.where(good[:, None], crowd.centers, start[crowd.origin])
+    sigma = np.where(good[:, None], crowd.sigma, np.nan)
+    margin = 0.0 if search.border else search.diameter / 2
+    kept = np.all((centers >= margin) & (centers <= last - margin), axis=1) & (good | first)
+    columns: Columns = _places(centers) | {"mass": np.where(first, mass[crowd.origin], np.nan)}
+    columns |= _places(sigma, "sigma_") | {"chi2": crowd.chi2, "refined": good}
+    return {k: column[kept] for k, column in columns.items()}
+
+
 def _believable(fit: ImageFit, start: Floats, furthest: float) -> Bools:
     """Return which spheres of a fit are where they were looked for, and as bright as the rest."""
     moved = np.linalg.norm(fit.centers - start, axis=1)
@@ -351,9 +416,8 @@ def _warn_of_untried(table: pd.DataFrame) -> None:
     untried = int(table["chi2"].isna().sum())
     if untried:
         warnings.warn(
-            f"{untried} of {len(table)} spheres touch in chains of over {_CROWD}, or have no "
-            "voxels to themselves: they stay where found, perhaps a tenth of a sphere off; "
-            "the column `refined` says which",
+            f"{untried} of {len(table)} spheres have no voxels to themselves: they stay where "
+            "found, perhaps a tenth of a sphere off; the column `refined` says which",
             PrecisionWarning,
             stacklevel=3,
         )
@@ -364,11 +428,18 @@ def _sample(frame: Floats, found: Features, group: Ints, contact: float) -> Samp
     return Sample(frame, at_contact(found.centers[group], contact=contact), others)
 
 
-def _places(centers: Floats, prefix: str = "") -> dict[str, Floats | Bools]:
+def _piece(
+    frame: Floats, found: Features, group: Ints, search: Search, stack: Stack
+) -> CrowdSample:
+    piece, centers = piece_of(frame, found.centers[group], _voxel(stack), count=_PIECE)
+    return CrowdSample(piece, centers, np.empty((0, 3)), search.contact)
+
+
+def _places(centers: Floats, prefix: str = "") -> Columns:
     return {f"{prefix}{axis}": centers[:, k] for axis, k in zip("xyz", (2, 1, 0), strict=True)}
 
 
-def _table(columns: list[dict[str, Floats | Bools]]) -> pd.DataFrame:
+def _table(columns: list[Columns]) -> pd.DataFrame:
     import pandas as pd
 
     if not columns:
