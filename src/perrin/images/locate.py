@@ -50,7 +50,7 @@ class Stack(Protocol):
 
     @property
     def voxel(self) -> tuple[float, float, float]:
-        """(z, y, x), um."""
+        """(z, y, x), um; z is NaN of a 2-D movie."""
 
     def frame(self, i: int, /) -> Floats:
         """Return frame i, (z, y, x)."""
@@ -122,7 +122,8 @@ def locate(
     Parameters
     ----------
     stack : Stack
-        Anything with ``shape (t, z, y, x)``, ``voxel (z, y, x)`` in um and ``frame(i)``.
+        Anything with ``shape (t, z, y, x)``, ``voxel (z, y, x)`` in um and ``frame(i)``; of a 2-D
+        movie z = 1 and the voxel's z is NaN.
     diameter : float
         Of the ball that is seen, um: the whole sphere, or the fluorescent core of it.
     contact : float
@@ -130,7 +131,7 @@ def locate(
     refine : {"model", "trackpy", None}
         "model" fits the ball blurred by the optics; "trackpy" its least-squares fit of discs;
         None leaves the filtered centroid, which is off by a tenth of the contact distance where
-        balls touch.
+        balls touch. The model is that of a volume: in a 2-D movie it gives way to None.
     optics : Optics, optional
         How a sphere is seen; by default learned from a few frames (`fit_optics`).
     dark : bool
@@ -148,11 +149,11 @@ def locate(
     Returns
     -------
     DataFrame
-        ``frame, x, y, z`` in um, the origin at the centre of voxel (0, 0, 0), ``mass``; and for
-        "model" ``sigma_x, sigma_y, sigma_z`` in um (from the Fisher information), ``chi2`` of the
-        group's image per degree of freedom, and ``refined``: False where the fit did not settle,
-        left by over half a radius, found no sphere, or was not tried, and the place found first was
-        kept, without errors. Of crowds see the notes.
+        ``frame, x, y, z`` (no z of a 2-D movie) in um, the origin at the centre of voxel (0, 0, 0),
+        ``mass``; and for "model" ``sigma_x, sigma_y, sigma_z`` in um (from the Fisher information),
+        ``chi2`` of the group's image per degree of freedom, and ``refined``: False where the fit
+        did not settle, left by over half a radius, found no sphere, or was not tried, and the place
+        found first was kept, without errors. Of crowds see the notes.
 
     Raises
     ------
@@ -165,7 +166,7 @@ def locate(
     -----
     PrecisionWarning
         Where the masses show no gap between spheres and noise; where a sphere has no voxels to
-        itself and stays where it was found.
+        itself and stays where it was found; where the model is asked for in a 2-D movie.
 
     Notes
     -----
@@ -192,6 +193,14 @@ def locate(
     [[3.2, 3.1, 3.0]]
     """
     _checked(stack, diameter, contact, refine, percentile)
+    if refine == "model" and _flat(stack):
+        refine = None
+        warnings.warn(
+            "the model of the image is that of a volume; in this 2-D movie places are filtered "
+            "centroids: pass refine=None, or refine='trackpy' where spheres touch",
+            PrecisionWarning,
+            stacklevel=2,
+        )
     search = Search(diameter, contact, dark, percentile, minmass, border).with_minmass(stack)
     if refine == "model" and optics is None:
         optics = fit_optics(stack, search)
@@ -329,7 +338,10 @@ def _frame_columns(
         centers = refine_by_trackpy(
             frame, centers, diameter=search.diameter, contact=search.contact, voxel=_voxel(stack)
         )
-    return columns | _places(centers) | {"mass": found.mass}
+    places = _places(centers)
+    if _flat(stack):
+        del places["z"]
+    return columns | places | {"mass": found.mass}
 
 
 def _by_model(
@@ -445,6 +457,11 @@ def _table(columns: list[Columns]) -> pd.DataFrame:
     if not columns:
         return pd.DataFrame(columns=["frame", "x", "y", "z", "mass", "chi2"])
     return pd.concat([pd.DataFrame(c) for c in columns], ignore_index=True)
+
+
+def _flat(stack: Stack) -> bool:
+    """Return whether the movie is two-dimensional: one plane, of no height."""
+    return bool(np.isnan(stack.voxel[0]))
 
 
 def _voxel(stack: Stack) -> tuple[float, float, float]:
