@@ -100,10 +100,6 @@ class CrowdSample(NamedTuple):
     others: Floats
     contact: float
 
-    def shows(self, image: SphereImage) -> bool:
-        """Return whether there are voxels enough: a crowd has its neighbours' too."""
-        return self.frame.size > 0 and image.diameter > 0
-
     def look(self, lens: _Lens, noise: CameraNoise) -> Told:
         """Fit places and background, and tell what the rest says of the optics."""
         found = fit_crowd(
@@ -168,7 +164,8 @@ def fit_samples(
     brightness and every background eliminated exactly (the Schur complement of the information).
     """
     log = np.log([diameter, max(voxel[0], 0.15 * diameter), max(voxel[1] / 2, 0.06 * diameter)])
-    samples = [s for s in samples if s.shows(_Lens(log, voxel).image())]
+    image = _Lens(log, voxel).image()
+    samples = [s for s in samples if isinstance(s, CrowdSample) or s.shows(image)]
     if not samples:
         raise ValueError(
             "no spheres to learn the optics from: none was found, or none has voxels to itself; "
