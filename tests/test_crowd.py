@@ -123,6 +123,14 @@ def test_missed_spheres_are_found_and_false_ones_left_out(pack):
     assert np.all(again.settled)
 
 
+def test_noise_is_no_crowd():
+    """Of spots in noise alone, and in no light at all, nothing is left."""
+    rng = np.random.default_rng(0)
+    start = rng.uniform(1, 8, (20, 3))
+    for frame in (3.0 * rng.poisson(5, (40, 50, 50)), np.zeros((40, 50, 50))):
+        assert len(fitted(frame, start).centers) == 0
+
+
 def test_dark_spheres_are_found_as_bright_ones_are(pack):
     """The negative of an image has the same spheres."""
     places, frame = pack

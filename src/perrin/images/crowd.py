@@ -21,6 +21,7 @@ from perrin.images.crowd_light import (
     own_misfit,
     shine,
     standard_errors,
+    told_by,
 )
 from perrin.images.image_fit import within
 
@@ -108,6 +109,8 @@ def fit_crowd(
         light, _ = _settle(scene, light, _GLANCE, _NEARLY)
         keep = _present(scene, light, contact)
         given_up = np.concatenate([given_up, start[~keep]])
+        if not keep.any():
+            break
         new = _missed(scene, light, keep, contact, given_up)
         if keep.all() and not len(new):
             break
@@ -169,13 +172,15 @@ def _cost(scene: Scene, now: Light, then: Light, usual: float) -> float:
 
 def _usual(light: Light) -> float:
     """Return the usual brightness, which is negative for dark spheres."""
-    return float(np.median(light.brightness))
+    # Of an image without any light any will do: nothing is found there.
+    return float(np.median(light.brightness)) or 1.0
 
 
 def _present(scene: Scene, light: Light, contact: float) -> Bools:
     """Return which spheres are there: as bright as usual, in sight, each by itself."""
     relative = light.brightness / _usual(light)
     keep = (relative > 1 / _FACTOR) & (relative < _FACTOR) & (in_sight(scene, light) > _OLD_SIGHT)
+    keep &= told_by(light) > _SEEN
     for i, j in _overlapping(light.centers, _APART * contact):
         if keep[i] and keep[j]:
             keep[i if relative[i] < relative[j] else j] = False

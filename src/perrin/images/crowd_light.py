@@ -296,6 +296,13 @@ def in_sight(scene: Scene, light: Light) -> Floats:
     return np.array(seen) / volume
 
 
+def told_by(light: Light) -> Floats:
+    """Return the chi-squared (n,) that every sphere's light is worth, all else being known."""
+    pairs = zip(light.spots, light.brightness, strict=True)
+    worth = [b**2 * np.sum(light.weight[spot.box] * spot.value**2) for spot, b in pairs]
+    return np.array(worth, dtype=np.float64)
+
+
 def left_over(scene: Scene, light: Light, least: float) -> tuple[Floats, Floats, Floats, float]:
     """Return what one more sphere would do, everywhere, also beyond the scene's border.
 
