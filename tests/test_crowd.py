@@ -181,8 +181,9 @@ def test_a_real_stack_of_dark_spheres():
     """Starting places listed for another program: 35 of 37 are met, by spheres that do not overlap.
 
     The list was made by centroids, by its authors' account, and has pairs at 0.64 and 0.9
-    diameters: it says which spheres there are, not to a voxel where. The image does: with what is
-    expected from the fit, residuals are those of the camera alone.
+    diameters: it says which spheres there are, not to a voxel where. Hard spheres do not overlap;
+    5 % are left to their spread of size. The noise stated was learned from this stack, so that chi2
+    is 1 wherever the fit is as good as it was then.
     """
     from PIL import Image, ImageSequence
 
@@ -204,5 +205,5 @@ def test_a_real_stack_of_dark_spheres():
     assert np.sum(off < 2) >= 25
     assert np.sum(off < 5.5) >= 35
     apart = cdist(found, found) + np.diag(np.full(len(found), np.inf))
-    assert apart.min() > 0.94 * optics.diameter
+    assert apart.min() > 0.95 * optics.diameter
     assert table["chi2"].median() == pytest.approx(1.0, abs=0.1)
