@@ -9,7 +9,9 @@ fit, and the diameter is told 3 % wrong. Places are compared after subtraction o
 offset, which is printed. The floor is the Fisher information of the brute-force image, by finite
 differences, brightness and a flat background free.
 
-Usage: python benchmarks/locate.py [--frames 60] [--photons 40] [--seed 0]
+With --core the spheres are core-shell: only a core of that diameter, um, is seen.
+
+Usage: python benchmarks/locate.py [--frames 60] [--photons 40] [--core 1.2] [--seed 0]
 """
 
 import argparse
@@ -45,8 +47,8 @@ class Movie:
         return self.frames[i]
 
 
-def rendered(places, brightness, depth_loss=0.15):
-    """Return the light of balls at places (n, 3), x, y, z in um."""
+def rendered(places, brightness, seen, depth_loss=0.15):
+    """Return the light of balls seen `seen` um wide at places (n, 3), x, y, z in um."""
     grid = [
         ((np.arange(n * FINE) + 0.5) / FINE - 0.5) * h for n, h in zip(SHAPE, VOXEL, strict=True)
     ]
@@ -54,14 +56,14 @@ def rendered(places, brightness, depth_loss=0.15):
     for (x, y, z), bright in zip(places, brightness, strict=True):
         r2 = ((grid[0] - z) ** 2)[:, None, None] + ((grid[1] - y) ** 2)[:, None]
         r = np.sqrt(r2 + (grid[2] - x) ** 2)
-        light += bright * np.clip((DIAMETER / 2 - r) / 0.05 + 0.5, 0, 1)
+        light += bright * np.clip((seen / 2 - r) / 0.05 + 0.5, 0, 1)
     # Across the whole of a stack of 64 planes.
     light *= (1 - depth_loss * grid[0] / 16)[:, None, None]
     blurred = gaussian_filter(light, PSF / VOXEL * FINE, truncate=5)
     return blurred.reshape([k for n in SHAPE for k in (n, FINE)]).mean(axis=(1, 3, 5))
 
 
-def simulated(n_frames, photons, rng):
+def simulated(n_frames, photons, seen, rng):
     """Return a movie, its rotations and its true places."""
     rotation = exp_map(rng.normal(size=(n_frames, 3)) * 2)
     middle = VOXEL[::-1] * (np.array(SHAPE[::-1]) / 2) + rng.uniform(-0.1, 0.1, (n_frames, 3))
@@ -70,24 +72,24 @@ def simulated(n_frames, photons, rng):
     background = 2 + 4 * np.arange(SHAPE[2]) / 256
     frames = []
     for i, where in enumerate(places):
-        light = rendered(where, own * (1 - 0.3 * i / n_frames)) + background
+        light = rendered(where, own * (1 - 0.3 * i / n_frames), seen) + background
         grey = GAIN * rng.poisson(light) + rng.normal(0, READ, SHAPE)
         frames.append(np.clip(np.round(grey), 0, 255).astype(np.uint8))
     return Movie(frames), rotation, places
 
 
-def numerical_floor(places, photons):
+def numerical_floor(places, photons, seen):
     """Return standard errors: of free centres (rms of the spheres), and of the pose first six."""
     step = 0.02
-    base = rendered(places, np.full(4, photons))
+    base = rendered(places, np.full(4, photons), seen)
     slopes = []
     for i in range(4):
         for axis in range(3):
             shift = np.zeros((4, 3))
             shift[i, axis] = step
-            up, down = (rendered(places + s * shift, np.full(4, photons)) for s in (1, -1))
+            up, down = (rendered(places + s * shift, np.full(4, photons), seen) for s in (1, -1))
             slopes.append((up - down) / (2 * step))
-    columns = [rendered(places[[i]], np.ones(1)) for i in range(4)] + [np.ones(SHAPE)]
+    columns = [rendered(places[[i]], np.ones(1), seen) for i in range(4)] + [np.ones(SHAPE)]
     jacobian = np.array([c.ravel() for c in slopes + columns]) * GAIN
     weight = 1 / (GAIN**2 * (base + 4) + READ**2).ravel()
     arm = places - places.mean(axis=0)
@@ -137,7 +139,7 @@ def pose_errors(motion, rotation, places):
     return 1e3 * (off - np.nanmean(off, axis=0)), 1e3 * turn
 
 
-def speed(movie, table, optics):
+def speed(movie, table, optics, seen):
     """Print the time of one cluster's refinement in one frame, by the model and by trackpy."""
     image = optics.image(movie.voxel)
     contact = {"contact": DIAMETER}
@@ -152,7 +154,7 @@ def speed(movie, table, optics):
 
     def discs(i):
         frame, near = movie.frame(i).astype(float), at_contact(start(i), **contact)
-        refine_by_trackpy(frame, near, diameter=DIAMETER, voxel=movie.voxel, **contact)
+        refine_by_trackpy(frame, near, diameter=seen, voxel=movie.voxel, **contact)
 
     count = range(min(10, len(movie.frames)))
     own, theirs = timed(model, count), timed(discs, count)
@@ -167,17 +169,18 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--frames", type=int, default=60)
     parser.add_argument("--photons", type=float, default=40.0)
+    parser.add_argument("--core", type=float, default=DIAMETER)
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
     rng = np.random.default_rng(args.seed)
-    movie, rotation, places = simulated(args.frames, args.photons, rng)
-    search = {"diameter": 1.03 * DIAMETER, "contact": DIAMETER}
+    movie, rotation, places = simulated(args.frames, args.photons, args.core, rng)
+    search = {"diameter": 1.03 * args.core, "contact": DIAMETER}
     looked_for = Search(**search)
     sample = sample_frames(movie, looked_for, range(args.frames))
     optics = choose_method(movie, looked_for, sample).optics
     print(optics)
     # Bleaching takes 15 % on average, depth 9 %.
-    floor, rigid = numerical_floor(places[0], 0.85 * args.photons)
+    floor, rigid = numerical_floor(places[0], 0.85 * args.photons, args.core)
     print(f"{'nm':24s}{'offset x, y, z':>24s}{'sd x, y, z':>24s}{'lost':>8s}")
     tables = {r: perrin.locate(movie, refine=r, **search) for r in (None, "trackpy")}
     tables["model"] = perrin.locate(movie, optics=optics, **search)
@@ -193,7 +196,7 @@ def main():
         spread = [np.nanstd(e, axis=0).round(2) for e in (center, turn)]
         print(f"{name}: centre {spread[0]} nm, turn {spread[1]} mrad")
     print("floor of the pose", (1e3 * rigid[:6]).round(2))
-    speed(movie, tables[None], optics)
+    speed(movie, tables[None], optics, args.core)
 
 
 if __name__ == "__main__":

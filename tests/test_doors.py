@@ -59,6 +59,8 @@ ROOMS = [
     "images.render",
     "images.sphere_image",
     "images.image_fit",
+    "images.crowd_light",
+    "images.crowd",
     "images.conventional",
     "images.features",
     "images.optics",

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -33,7 +32,6 @@ GAIN, READ = 3.0, 2.0
 NOISE = CameraNoise(GAIN, READ**2)
 BODY = perrin.Cluster.touching(4, DIAMETER)
 NOBODY = np.empty((0, 3))
-REAL = Path(__file__).resolve().parents[2] / "shared" / "data" / "peri_confocal"
 
 
 def brute_force(centers, shape, fine=4):
@@ -270,32 +268,6 @@ def test_masses_without_a_gap_are_said_to_have_none():
     assert mass_cut(np.empty(0)) == 0
     with pytest.warns(perrin.PrecisionWarning, match="no clear gap"):
         assert mass_cut(np.geomspace(100, 10000, 50)) == 0
-
-
-@pytest.mark.skipif(not REAL.exists(), reason="the real confocal stack is not here")
-def test_a_real_stack_of_dark_spheres():
-    """Of 37 listed spheres (whole voxels, by eye) at least 20 are within one voxel, 30 within two.
-
-    They are one crowd, which the image model leaves where it is, and says so.
-    """
-    from PIL import Image, ImageSequence
-
-    with warnings.catch_warnings():
-        # The file was written by Python 2.
-        warnings.simplefilter("ignore", UserWarning)
-        listed = np.load(REAL / "particle-positions.npy")[:, ::-1]
-    with Image.open(REAL / "small_confocal_image.tif") as pages:
-        frame = np.array([np.array(page) for page in ImageSequence.Iterator(pages)])
-    stack, asked = Movie([frame], voxel=(1.0, 1.0, 1.0)), {"diameter": 11, "contact": 11}
-    asked |= {"dark": True, "percentile": 40, "minmass": 0}
-    table = perrin.locate(stack, refine=None, **asked)
-    distance = cdist(listed, table[["x", "y", "z"]]).min(axis=1)
-    assert np.sum(distance < 1) >= 20
-    assert np.sum(distance < 2) >= 30
-    optics = perrin.Optics(10.5, (1.6, 0.8), CameraNoise(0.0, 25.0))
-    with pytest.warns(perrin.PrecisionWarning, match="chains of over 16"):
-        crowd = perrin.locate(stack, optics=optics, **asked)
-    assert not crowd["refined"].all()
 
 
 def test_bad_arguments_are_listed_together(tetrahedra):

@@ -42,7 +42,7 @@ def find_features(
     diameter, contact : float
         Of the visible ball, and centre to centre of touching spheres, um.
     voxel : tuple of float
-        (z, y, x), um.
+        (z, y, x), um; a z of NaN says that the frame is one plane, whose spots have z = 0.
     dark : bool
         Spheres are darker than what surrounds them.
     percentile : float
@@ -62,11 +62,11 @@ def find_features(
     of other rows wherever voxels are not cubes.
     """
     trackpy = _trackpy()
-    step = np.array(voxel)
+    frame, step = _of_plane(frame, voxel)
     # A core smaller than its sphere looks larger than it is by the blur; touching balls may not.
     size = np.ceil(diameter / step).astype(int) + (2 if diameter < 0.8 * contact else 0)
     size += 1 - size % 2
-    padding = size // 2 + 3 if border else np.zeros(3, dtype=int)
+    padding = size // 2 + 3 if border else np.zeros_like(size)
     # trackpy's own inversion is announced to go.
     bright = frame.max() - frame if dark else frame
     with _quiet():
@@ -78,9 +78,10 @@ def find_features(
             minmass=0,
             characterize=False,
         )
-    centers = found[["z", "y", "x"]].to_numpy(dtype=np.float64) - padding
+    centers = found[_axes(step)].to_numpy(dtype=np.float64) - padding
     inside = np.all((centers >= 0) & (centers <= np.array(frame.shape) - 1), axis=1)
-    return Features(centers[inside] * step, found["mass"].to_numpy(dtype=np.float64)[inside])
+    mass = found["mass"].to_numpy(dtype=np.float64)[inside]
+    return Features(_in_space(centers[inside] * step), mass)
 
 
 def refine_by_trackpy(
@@ -101,7 +102,7 @@ def refine_by_trackpy(
     diameter, contact : float
         um.
     voxel : tuple of float
-        (z, y, x), um.
+        (z, y, x), um; a z of NaN says that the frame is one plane.
 
     Returns
     -------
@@ -118,16 +119,19 @@ def refine_by_trackpy(
     trackpy = _trackpy()
     if not len(centers):
         return centers
-    step = np.array(voxel)
+    frame, step = _of_plane(frame, voxel)
+    axes, places = _axes(step), centers[:, -len(step) :] / step
     mask = np.ceil(diameter / step).astype(int) + 2
     mask += 1 - mask % 2
     # A disc of size s is at half its height where r = s (edge + (1 - edge) sqrt(2 log 2 / 3)).
     half = _EDGE + (1 - _EDGE) * np.sqrt(2 * np.log(2) / 3)
     size = diameter / 2 / half / step
-    table = pd.DataFrame(centers / step, columns=["z", "y", "x"])
+    table = pd.DataFrame(places, columns=axes)
     table["frame"] = 0
-    known = {f"size_{axis}": s for axis, s in zip("zyx", size, strict=True)}
-    middle = np.rint(centers / step).astype(int)
+    # trackpy knows one size where the mask is as wide along all axes.
+    sizes = ["size"] if len(set(mask)) == 1 else [f"size_{axis}" for axis in axes]
+    known = dict(zip(sizes, size, strict=False))
+    middle = np.rint(places).astype(int)
     table["signal"] = frame[tuple(middle.T)] - np.percentile(frame, 50)
     with _quiet():
         refined = trackpy.refine_leastsq(
@@ -138,7 +142,22 @@ def refine_by_trackpy(
             fit_function="disc",
             param_val={"disc_size": _EDGE, "background": float(np.percentile(frame, 50)), **known},
         )
-    return np.asarray(refined[["z", "y", "x"]].to_numpy(dtype=np.float64) * step)
+    return _in_space(refined[axes].to_numpy(dtype=np.float64) * step)
+
+
+def _of_plane(frame: Floats, voxel: tuple[float, float, float]) -> tuple[Floats, Floats]:
+    """Return frame and voxel without the z axis where they are those of a plane."""
+    step = np.array(voxel)
+    return (frame[0], step[1:]) if np.isnan(step[0]) else (frame, step)
+
+
+def _axes(step: Floats) -> list[str]:
+    return list("zyx"[-len(step) :])
+
+
+def _in_space(centers: Floats) -> Floats:
+    """Return centres (n, 3): those of a plane have z = 0."""
+    return np.pad(centers, [(0, 0), (3 - centers.shape[1], 0)])
 
 
 @dataclass(frozen=True)

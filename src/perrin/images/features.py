@@ -13,6 +13,8 @@ if TYPE_CHECKING:
     from perrin._arrays import Floats, Ints
 
 _REACH = 1.3  # centres closer than this many contact distances belong together
+_IN_SIGHT = 1.6  # closer than this their images overlap, blur and all
+_CROWD = 16  # spheres in a longer chain of overlapping images are a crowd
 _CLEAR_GAP = 2.0  # ratio of neighbouring masses that parts spheres from noise
 _ALIKE = 4.0  # masses all within this ratio are spheres all of them
 _FAINT = 20.0  # a gap that much below the largest mass parts noise from noise
@@ -63,11 +65,37 @@ def touching_together(centers: Floats, *, contact: float) -> list[Ints]:
     >>> [group.tolist() for group in touching_together(x, contact=1.0)]
     [[0, 1], [2]]
     """
+    return _chains(centers, _REACH * contact)
+
+
+def groups_and_crowds(centers: Floats, *, contact: float) -> tuple[list[Ints], list[Ints]]:
+    """Return the spheres of one frame as groups to be fitted together, and as crowds.
+
+    A crowd is a chain of over 16 spheres whose images overlap (closer than 1.6 contacts): each
+    stands in the light of some others, which stand in that of yet others.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> pair, row = [[0.0, 0.0, 0.0], [0.0, 0.0, 1.0]], [[9.0, 9.0, 1.5 * k] for k in range(20)]
+    >>> groups, crowds = groups_and_crowds(np.array(pair + row), contact=1.0)
+    >>> groups[0].tolist(), len(crowds[0])
+    ([0, 1], 20)
+    """
+    chains = _chains(centers, _IN_SIGHT * contact)
+    crowds = [chain for chain in chains if len(chain) > _CROWD]
+    crowded = np.zeros(len(centers), dtype=np.bool_)
+    crowded[np.concatenate([np.empty(0, dtype=np.int64), *crowds])] = True
+    together = touching_together(centers, contact=contact)
+    return [group for group in together if not crowded[group[0]]], crowds
+
+
+def _chains(centers: Floats, reach: float) -> list[Ints]:
     from perrin.linking import touching_groups
 
     if not len(centers):
         return []
-    label = touching_groups(centers, reach=_REACH * contact, size=len(centers), smallest=1)
+    label = touching_groups(centers, reach=reach, size=len(centers), smallest=1)
     return [np.flatnonzero(label == k) for k in range(label.max() + 1)]
 
 

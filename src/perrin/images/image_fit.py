@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from perrin._arrays import Bools, Floats
     from perrin.images.sphere_image import SphereImage
 
-_WINDOW = 3.5  # voxels within so many blurs of a sphere's surface are fitted
 _CONVERGED = 1e-4  # last step of a sphere over the blur: far below what any photons tell
 _ROUNDS = 40
 _ENOUGH = 5  # voxels for each number that is fitted
@@ -147,21 +146,28 @@ def cut_window(frame: Floats, image: SphereImage, centers: Floats, *, others: Fl
     centers, others : ndarray, shape (n, 3), (m, 3)
         (z, y, x), um.
     """
-    extent = image.diameter / 2 + _WINDOW * np.array([image.blur[0], image.blur[1], image.blur[1]])
-    voxel = np.array(image.voxel)
-    low = np.clip(np.floor((centers.min(0) - extent) / voxel), 0, None).astype(int)
-    high = np.minimum(np.ceil((centers.max(0) + extent) / voxel) + 1, frame.shape).astype(int)
-    box = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
-    grid = [h * np.arange(a, b) for h, a, b in zip(voxel, low, high, strict=True)]
-    mask = _within(grid, centers, extent)
-    near = np.all(np.abs(others - np.clip(others, low * voxel, high * voxel)) < extent, axis=1)
-    mask &= ~_within(grid, others[near], extent)
+    extent, voxel = image.extent, np.array(image.voxel)
+    box = box_around(centers, extent, image.voxel, frame.shape)
+    grid = [h * np.arange(s.start, s.stop) for s, h in zip(box, voxel, strict=True)]
+    mask = within(grid, centers, extent)
+    low, high = (np.array([getattr(s, end) for s in box]) * voxel for end in ("start", "stop"))
+    near = np.all(np.abs(others - np.clip(others, low, high)) < extent, axis=1)
+    mask &= ~within(grid, others[near], extent)
     z, y, x = np.meshgrid(*(g - g.mean() for g in grid), indexing="ij", sparse=True)
     background = np.stack([np.broadcast_to(b, mask.shape)[mask] for b in (np.ones(()), z, y, x)])
     return Window(box, mask, frame[box][mask].astype(np.float64), background)
 
 
-def _within(grid: list[Floats], centers: Floats, extent: Floats) -> Bools:
+def box_around(
+    centers: Floats, extent: Floats, voxel: tuple[float, float, float], shape: tuple[int, ...]
+) -> tuple[slice, ...]:
+    """Return the box of voxels that reaches `extent` (3,) beyond the centres, inside `shape`."""
+    low = np.clip(np.floor((centers.min(0) - extent) / voxel), 0, None).astype(int)
+    high = np.minimum(np.ceil((centers.max(0) + extent) / voxel) + 1, shape).astype(int)
+    return tuple(slice(a, b) for a, b in zip(low, high, strict=True))
+
+
+def within(grid: list[Floats], centers: Floats, extent: Floats) -> Bools:
     """Return which voxels of a grid lie in the ellipsoid `extent` around any of the centres."""
     mask = np.zeros(tuple(len(g) for g in grid), dtype=np.bool_)
     for center in centers:

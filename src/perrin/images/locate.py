@@ -10,32 +10,41 @@ import numpy as np
 
 from perrin._arrays import Floats, FrameError, PrecisionWarning, require_positive
 from perrin.images.conventional import Features, find_features, refine_by_trackpy
-from perrin.images.features import at_contact, mass_cut, touching_together
+from perrin.images.crowd import CrowdFit, fit_crowd, piece_of
+from perrin.images.features import at_contact, groups_and_crowds, mass_cut
 from perrin.images.image_fit import (
     FreeCenters,
     ImageFit,
     cut_window,
     fit_window,
 )
-from perrin.images.optics import Optics, Sample, fit_samples
+from perrin.images.optics import CrowdSample, Optics, Sample, fit_samples
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
+    from typing import TypeAlias
 
     import pandas as pd
     from numpy.typing import NDArray
 
     from perrin._arrays import Ints
 
+    Columns: TypeAlias = dict[str, NDArray[Any]]
+
 Refine = Literal["model", "trackpy"] | None
 _Voxel = tuple[float, float, float]
 
 _LEARN_FRAMES = 5  # frames looked at to set the mass cut and to learn the optics
 _LEARN_GROUPS = 15  # groups of spheres the optics are learned from
-_CROWD = 16  # spheres in a larger group stay where they were found: see `locate`
+_LEARN_CROWDS = 2  # pieces of crowds the optics are learned from where there are no small groups
+_PIECE = 30  # spheres in such a piece
 
 # Why a sphere stays where it was found.
-_UNTRIED, _HIDDEN = "in a crowd", "no voxels of its own"
+_HIDDEN = "no voxels of its own"
+NO_FLAT_MODEL = (
+    "the model of the image is that of a volume; in this 2-D movie places are filtered centroids: "
+    "pass refine=None, or refine='trackpy' where spheres touch"
+)
 _UNSETTLED, _MOVED, _DARK = "fit did not settle", "moved over half a radius", "no light of its own"
 
 
@@ -48,7 +57,7 @@ class Stack(Protocol):
 
     @property
     def voxel(self) -> Floats | tuple[float, float, float]:
-        """(z, y, x), um."""
+        """(z, y, x), um; z is NaN of a 2-D movie."""
 
     def frame(self, i: int, /) -> Floats:
         """Return frame i, (z, y, x)."""
@@ -162,13 +171,17 @@ class Method:
     def _columns(self, frame: Floats, found: Features, voxel: _Voxel) -> dict[str, NDArray[Any]]:
         contact = self.search.contact
         if self.refine == "model" and self.optics is not None:
-            return _by_model(frame, found, contact, self.optics, voxel)
+            columns = _by_model(frame, found, contact, self.optics, voxel)
+            return _with_crowds(columns, frame, found, self.search, self.optics, voxel)
         centers = found.centers
         if self.refine == "trackpy":
             centers = refine_by_trackpy(
                 frame, centers, diameter=self.search.diameter, contact=contact, voxel=voxel
             )
-        return _places(centers) | {"mass": found.mass}
+        places = _places(centers)
+        if np.isnan(voxel[0]):
+            del places["z"]
+        return places | {"mass": found.mass}
 
 
 def sample_frames(stack: Stack, search: Search, frames: Sequence[int]) -> list[Sampled]:
@@ -266,11 +279,11 @@ def locate(
     Returns
     -------
     DataFrame
-        ``frame, x, y, z`` in um, the origin at the centre of voxel (0, 0, 0), ``mass``; and for
-        "model" ``sigma_x, sigma_y, sigma_z`` in um (from the Fisher information), ``chi2`` of the
-        group's image per degree of freedom, and ``refined``: False where the fit did not settle,
-        left by over half a radius, found no sphere, or was not tried, and the place found first was
-        kept, without errors; `reason` says which of these.
+        ``frame, x, y, z`` (no z of a 2-D movie) in um, the origin at the centre of voxel (0, 0, 0),
+        ``mass``; and for "model" ``sigma_x, sigma_y, sigma_z`` in um (from the Fisher information),
+        ``chi2`` of the group's image per degree of freedom, and ``refined``: False where the fit
+        did not settle, left by over half a radius, found no sphere, or was not tried, and the place
+        found first was kept, without errors; `reason` says which of these. Of crowds see the notes.
 
     Raises
     ------
@@ -283,9 +296,16 @@ def locate(
     -----
     PrecisionWarning
         Where a frame cannot be read: it is left out. Where the masses show no gap between spheres
-        and noise. Where more than 16 spheres touch in a chain: the model of their image asks for
-        every neighbour, and for light more even than a dense sample has, so that they stay where
-        they were found.
+        and noise. Where a sphere has no voxels to itself and stays where it was found. Where the
+        model is asked for in a 2-D movie.
+
+    Notes
+    -----
+    More than 16 spheres in a chain, neighbours within 1.6 times `contact`, are a crowd, which is
+    fitted until its image has nothing left over: spots that turn out to be no spheres are left out,
+    and spheres that were missed are added, with a `mass` of NaN. Its `chi2` is that of each
+    sphere's own voxels. Its background has a level of its own in every plane; what shines there
+    without being a sphere is misread as one if it is bright enough.
 
     Examples
     --------
@@ -305,6 +325,9 @@ def locate(
     """
     search = Search(diameter, contact, dark, percentile, minmass, border)
     check_search(stack, search, refine)
+    if refine == "model" and is_flat(stack):
+        refine = None
+        warnings.warn(NO_FLAT_MODEL, PrecisionWarning, stacklevel=2)
     listed = _listed(stack, frames)
     sample = sample_frames(stack, search, listed)
     method = choose_method(stack, search, sample, refine=refine, optics=optics)
@@ -339,17 +362,18 @@ def fit_optics(sample: Sequence[Sampled], search: Search, *, voxel: _Voxel) -> O
     ValueError
         Where no sphere is found, or the search does not settle.
     """
-    samples = []
+    samples: list[Sample | CrowdSample] = []
+    crowds: list[Sample | CrowdSample] = []
     for seen in sample:
         found = search.spheres(seen.spots)
-        groups = touching_together(found.centers, contact=search.contact)
-        samples += [
-            _sample(seen.frame, found, group, search.contact)
-            for group in groups
-            if len(group) <= _CROWD
-        ]
-    keep = _spread(len(samples), _LEARN_GROUPS)
-    return fit_samples([samples[k] for k in keep], diameter=search.diameter, voxel=voxel)
+        groups, crowded = groups_and_crowds(found.centers, contact=search.contact)
+        samples += [_sample(seen.frame, found, group, search.contact) for group in groups]
+        crowds += [_piece(seen.frame, found, group, search, voxel) for group in crowded]
+    most = _LEARN_GROUPS
+    if sum(len(s.centers) for s in samples) < sum(len(s.centers) for s in crowds):
+        samples, most = crowds, _LEARN_CROWDS
+    learned = [samples[k] for k in _spread(len(samples), most)]
+    return fit_samples(learned, diameter=search.diameter, voxel=voxel)
 
 
 def _by_model(
@@ -358,9 +382,9 @@ def _by_model(
     """Fit every group of touching spheres; return the columns of the table."""
     image = optics.image(voxel)
     centers, sigma = found.centers.copy(), np.full_like(found.centers, np.nan)
-    chi2, reason = np.full(len(centers), np.nan), np.full(len(centers), _UNTRIED, dtype=object)
-    groups = touching_together(found.centers, contact=contact)
-    for group in (g for g in groups if len(g) <= _CROWD):
+    chi2, reason = np.full(len(centers), np.nan), np.full(len(centers), "", dtype=object)
+    groups, _ = groups_and_crowds(found.centers, contact=contact)
+    for group in groups:
         sample = _sample(frame, found, group, contact)
         window = cut_window(frame, image, sample.centers, others=sample.others)
         if not window.shows(len(group)):
@@ -384,13 +408,59 @@ def _doubts(fit: ImageFit, start: Floats, furthest: float) -> NDArray[np.object_
     return why if fit.converged else np.full(len(start), _UNSETTLED, dtype=object)
 
 
+def _with_crowds(
+    columns: Columns,
+    frame: Floats,
+    found: Features,
+    search: Search,
+    optics: Optics,
+    voxel: _Voxel,
+) -> Columns:
+    """Return the columns with the rows of every crowd replaced by those of its fit."""
+    _, crowds = groups_and_crowds(found.centers, contact=search.contact)
+    for group in crowds:
+        crowd = fit_crowd(
+            frame,
+            found.centers[group],
+            others=np.delete(found.centers, group, axis=0),
+            contact=search.contact,
+            image=optics.image(voxel),
+            noise=optics.noise,
+        )
+        last = (np.array(frame.shape) - 1) * np.array(voxel)
+        theirs = _crowd_columns(crowd, found.centers[group], found.mass[group], search, last)
+        columns = {k: np.concatenate([columns[k], theirs[k]]) for k in columns}
+    stays = np.ones(len(columns["mass"]), dtype=np.bool_)
+    stays[np.concatenate([np.empty(0, dtype=np.int64), *crowds])] = False
+    return {k: column[stays] for k, column in columns.items()}
+
+
+def _crowd_columns(
+    crowd: CrowdFit, start: Floats, mass: Floats, search: Search, last: Floats
+) -> Columns:
+    """Return the columns of a crowd that was found at `start`, in a stack that ends at `last`.
+
+    A sphere whose fit did not settle stays where it was found first, or is left out where it was
+    not; without `border` so is one that the border cuts.
+    """
+    first = crowd.origin >= 0
+    good = crowd.settled & np.isfinite(crowd.sigma).all(axis=1)
+    centers = np.where(good[:, None], crowd.centers, start[crowd.origin])
+    sigma = np.where(good[:, None], crowd.sigma, np.nan)
+    margin = 0.0 if search.border else search.diameter / 2
+    kept = np.all((centers >= margin) & (centers <= last - margin), axis=1) & (good | first)
+    columns = _places(centers) | {"mass": np.where(first, mass[crowd.origin], np.nan)}
+    columns |= _places(sigma, "sigma_") | {"chi2": crowd.chi2, "refined": good}
+    columns["reason"] = np.where(good, "", _UNSETTLED).astype(object)
+    return {k: column[kept] for k, column in columns.items()}
+
+
 def _warn_of_untried(table: pd.DataFrame) -> None:
     untried = int(table["chi2"].isna().sum())
     if untried:
         warnings.warn(
-            f"{untried} of {len(table)} spheres touch in chains of over {_CROWD}, or have no "
-            "voxels to themselves: they stay where found, perhaps a tenth of a sphere off; "
-            "the column `refined` says which",
+            f"{untried} of {len(table)} spheres have no voxels to themselves: they stay where "
+            "found, perhaps a tenth of a sphere off; the column `refined` says which",
             PrecisionWarning,
             stacklevel=3,
         )
@@ -399,6 +469,18 @@ def _warn_of_untried(table: pd.DataFrame) -> None:
 def _sample(frame: Floats, found: Features, group: Ints, contact: float) -> Sample:
     others = np.delete(found.centers, group, axis=0)
     return Sample(frame, at_contact(found.centers[group], contact=contact), others)
+
+
+def _piece(
+    frame: NDArray[Any], found: Features, group: Ints, search: Search, voxel: _Voxel
+) -> CrowdSample:
+    piece, centers = piece_of(frame, found.centers[group], voxel, count=_PIECE)
+    return CrowdSample(piece, centers, np.empty((0, 3)), search.contact)
+
+
+def is_flat(stack: Stack) -> bool:
+    """Return whether a movie is two-dimensional: one plane, of no height."""
+    return bool(np.isnan(stack.voxel[0]))
 
 
 def _places(centers: Floats, prefix: str = "") -> dict[str, NDArray[Any]]:

@@ -7,19 +7,22 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from perrin.images.crowd import fit_crowd
+from perrin.images.crowd_light import told_apart, total
 from perrin.images.image_fit import CameraNoise, FreeCenters, cut_window, fit_window
 from perrin.images.sphere_image import SphereImage, sphere_image
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     from perrin._arrays import Floats
-    from perrin.images.image_fit import ImageFit, Window
+    from perrin.images.image_fit import Window
 
 _PROBE = 0.01  # change of a logarithm for a central difference
 _LONGEST = 0.25  # longest step of a logarithm
 _CONVERGED = 1e-3
 _ROUNDS = 15
+_LOOKS = 2  # at the light left over by a crowd, in every round
 
 
 @dataclass(frozen=True)
@@ -55,6 +58,16 @@ class Optics:
         return sphere_image(diameter=self.diameter, psf=self.psf, voxel=voxel)
 
 
+class Told(NamedTuple):
+    """What one look at a sample tells."""
+
+    centers: Floats
+    information: Floats  # (3, 3), on the logarithms of diameter, psf z and psf plane
+    score: Floats  # (3,)
+    light: Floats  # expected, of every voxel that counts
+    square: Floats  # and the squared residual there
+
+
 class Sample(NamedTuple):
     """One group of spheres in one frame, to learn from."""
 
@@ -62,15 +75,89 @@ class Sample(NamedTuple):
     centers: Floats
     others: Floats
 
+    def shows(self, image: SphereImage) -> bool:
+        """Return whether there are voxels enough."""
+        return self._window(image).shows(len(self.centers))
+
+    def look(self, lens: _Lens, noise: CameraNoise) -> Told:
+        """Fit places and background, and tell what the rest says of the optics."""
+        image = lens.image
+        window = self._window(image)
+        fit = fit_window(window, image, noise, FreeCenters(self.centers))
+        slope = lens.slope(lambda shifted: fit.brightness @ window.spots(shifted, fit.centers)[0])
+        weighted = slope * fit.weight
+        nuisance = fit.jacobian * fit.weight
+        shared = nuisance @ slope.T
+        taken = np.linalg.lstsq(nuisance @ fit.jacobian.T, shared, rcond=None)[0]
+        residual = window.data - fit.expected
+        information = weighted @ slope.T - shared.T @ taken
+        score = weighted @ residual - taken.T @ (nuisance @ residual)
+        return Told(fit.centers, information, score, fit.expected, residual**2)
+
+    def _window(self, image: SphereImage) -> Window:
+        return cut_window(self.frame, image, self.centers, others=self.others)
+
+
+class CrowdSample(NamedTuple):
+    """A piece of a frame full of touching spheres, to learn from."""
+
+    frame: Floats
+    centers: Floats
+    others: Floats
+    contact: float
+
+    def look(self, lens: _Lens, noise: CameraNoise) -> Told:
+        """Fit places and background, and tell what the rest says of the optics."""
+        found = fit_crowd(
+            self.frame,
+            self.centers,
+            others=self.others,
+            contact=self.contact,
+            image=lens.image,
+            noise=noise,
+            looks=_LOOKS,
+        )
+        scene, light = found.scene, found.light
+        slope = lens.slope(
+            lambda shifted: total(scene, scene.spots(shifted, light.centers), light.brightness)
+        )
+        information, score = told_apart(scene, light, slope)
+        count = scene.mask
+        residual = (scene.data - light.expected)[count]
+        return Told(light.centers, information, score, light.expected[count], residual**2)
+
+
+class _Lens(NamedTuple):
+    """The sphere's image where the search stands, and with each logarithm a little up and down."""
+
+    image: SphereImage
+    pairs: list[tuple[SphereImage, ...]]
+
+    @classmethod
+    def at(cls, log: Floats, voxel: tuple[float, float, float]) -> _Lens:
+        """Return it for the logarithms of diameter, psf z and psf plane."""
+        steps = _PROBE * np.eye(3)
+        pairs = [tuple(_image(log + s * d, voxel) for s in (1, -1)) for d in steps]
+        return cls(_image(log, voxel), pairs)
+
+    def slope(self, light: Callable[[SphereImage], Floats]) -> Floats:
+        """Return the central differences (3, ...) of some light by the logarithms."""
+        return np.stack([(light(up) - light(down)) / (2 * _PROBE) for up, down in self.pairs])
+
+
+def _image(log: Floats, voxel: tuple[float, float, float]) -> SphereImage:
+    size, psf_z, psf = np.exp(log)
+    return sphere_image(diameter=float(size), psf=(float(psf_z), float(psf)), voxel=voxel)
+
 
 def fit_samples(
-    samples: Sequence[Sample], *, diameter: float, voxel: tuple[float, float, float]
+    samples: Sequence[Sample | CrowdSample], *, diameter: float, voxel: tuple[float, float, float]
 ) -> Optics:
     """Find sphere diameter, point spread and noise of greatest likelihood for all samples.
 
     Parameters
     ----------
-    samples : sequence of Sample
+    samples : sequence of Sample or CrowdSample
     diameter : float
         Where the search starts, um; the answer is the diameter seen.
     voxel : tuple of float
@@ -87,28 +174,23 @@ def fit_samples(
     brightness and every background eliminated exactly (the Schur complement of the information).
     """
     log = np.log([diameter, max(voxel[0], 0.15 * diameter), max(voxel[1] / 2, 0.06 * diameter)])
-    samples = [
-        s for s in samples if _window(s, s.centers, _image(log, voxel)).shows(len(s.centers))
-    ]
+    image = _image(log, voxel)
+    samples = [s for s in samples if isinstance(s, CrowdSample) or s.shows(image)]
     if not samples:
         raise ValueError(
-            "no spheres to learn the optics from: none was found, or all stand in a crowd; check "
-            "diameter, contact and minmass, state optics, or take the places as found (refine=None)"
+            "no spheres to learn the optics from: none was found, or none has voxels to itself; "
+            "check diameter, contact and minmass, state optics, or take the places as found "
+            "(refine=None)"
         )
     mean = float(np.mean([s.frame.mean() for s in samples]))
     noise = CameraNoise(1.0, 0.05 * abs(mean))
-    centers = [s.centers for s in samples]
     for _ in range(_ROUNDS):
-        image = _image(log, voxel)
-        fits = [_fitted(s, c, image, noise) for s, c in zip(samples, centers, strict=True)]
-        centers = [fit.centers for _, fit in fits]
-        probes = _probes(log, voxel)
-        information, score = (
-            np.sum(part, axis=0)
-            for part in zip(*(_told(window, fit, probes) for window, fit in fits), strict=True)
-        )
-        step = np.linalg.solve(information, score)
-        noise = _noise(fits)
+        lens = _Lens.at(log, voxel)
+        looks = [s.look(lens, noise) for s in samples]
+        samples = [s._replace(centers=k.centers) for s, k in zip(samples, looks, strict=True)]
+        information = np.sum([k.information for k in looks], axis=0)
+        step = np.linalg.solve(information, np.sum([k.score for k in looks], axis=0))
+        noise = _noise(looks)
         log = log + step * min(1.0, _LONGEST / np.abs(step).max())
         # A point spread flatter than round is no microscope's: such a step ends at round.
         log[1] = max(log[1], log[2] + 1e-3)
@@ -125,52 +207,14 @@ def fit_samples(
     return Optics(size, (psf_z, psf), noise, (float(error[0]), float(error[1]), float(error[2])))
 
 
-def _image(log: Floats, voxel: tuple[float, float, float]) -> SphereImage:
-    size, psf_z, psf = np.exp(log)
-    return sphere_image(diameter=float(size), psf=(float(psf_z), float(psf)), voxel=voxel)
-
-
-def _fitted(
-    sample: Sample, centers: Floats, image: SphereImage, noise: CameraNoise
-) -> tuple[Window, ImageFit]:
-    window = _window(sample, centers, image)
-    return window, fit_window(window, image, noise, FreeCenters(centers))
-
-
-def _window(sample: Sample, centers: Floats, image: SphereImage) -> Window:
-    return cut_window(sample.frame, image, centers, others=sample.others)
-
-
-def _probes(log: Floats, voxel: tuple[float, float, float]) -> list[tuple[SphereImage, ...]]:
-    """Return the images of spheres with each logarithm a little larger, and a little smaller."""
-    shifts = _PROBE * np.eye(3)
-    return [(_image(log + shift, voxel), _image(log - shift, voxel)) for shift in shifts]
-
-
-def _told(
-    window: Window, fit: ImageFit, probes: list[tuple[SphereImage, ...]]
-) -> tuple[Floats, Floats]:
-    """Return one fit's information (3, 3) on the logarithms, and its score."""
-    seen = [[fit.brightness @ window.spots(p, fit.centers)[0] for p in pair] for pair in probes]
-    slope = np.stack([(up - down) / (2 * _PROBE) for up, down in seen])
-    weighted = slope * fit.weight
-    nuisance = fit.jacobian * fit.weight
-    shared = nuisance @ slope.T
-    taken = np.linalg.lstsq(nuisance @ fit.jacobian.T, shared, rcond=None)[0]
-    residual = window.data - fit.expected
-    return weighted @ slope.T - shared.T @ taken, weighted @ residual - taken.T @ (
-        nuisance @ residual
-    )
-
-
-def _noise(fits: Sequence[tuple[Window, ImageFit]]) -> CameraNoise:
+def _noise(looks: Sequence[Told]) -> CameraNoise:
     """Return gain and floor from how squared residuals grow with the expected light.
 
     A gain below nothing (a processed image) is nothing, and so is a floor that would make the
     variance of the darkest voxels negative.
     """
-    light = np.concatenate([fit.expected for _, fit in fits])
-    square = np.concatenate([(window.data - fit.expected) ** 2 for window, fit in fits])
+    light = np.concatenate([look.light for look in looks])
+    square = np.concatenate([look.square for look in looks])
     design = np.stack([light, np.ones_like(light)])
     noise = CameraNoise(0.0, float(square.mean()))
     for _ in range(4):

@@ -15,7 +15,7 @@ from perrin.analysis import Conditions, check_arguments, measure_table, told_con
 from perrin.files import check_tracks
 from perrin.grouping import identify
 from perrin.images.imaging import Imaging, View
-from perrin.images.locate import Search, check_search
+from perrin.images.locate import NO_FLAT_MODEL, Search, check_search, is_flat
 from perrin.images.parts import PartsError
 from perrin.images.stacks import digest
 from perrin.images.stages import Located, Workplace, fit_poses, locate_frames
@@ -135,6 +135,8 @@ def analyze_stack(
     """
     search = Search(diameter, contact, dark, percentile, minmass, border)
     check_search(stack, search, refine)
+    flat = refine == "model" and is_flat(stack)
+    refine = None if flat else refine
     listed = _listed(len(stack), frames)
     conditions = _conditions(stack, contact, noise, exposure, drift, viscosity, temperature)
     depends = _depends(stack, search, refine, optics, listed)
@@ -154,7 +156,8 @@ def analyze_stack(
             improved=poses.improved,
         )
     imaging = _imaging(stack, located, seen, search)
-    return _with_checks(report, imaging, located, seen, poses.told, stack)
+    told = [NO_FLAT_MODEL, *poses.told] if flat else poses.told
+    return _with_checks(report, imaging, located, seen, told, stack)
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,6 +13,7 @@ import numpy as np
 from perrin._arrays import Floats, frozen, require_positive
 
 _STEP = 0.25  # spacing of the table's knots in units of the narrower blur; cubic error under 1e-4
+_WINDOW = 3.5  # voxels within so many blurs of a sphere's surface are its own
 _REACH = 4.5  # the table ends this many blurs outside the sphere, where under 1e-5 is left
 
 
@@ -52,6 +53,11 @@ class SphereImage:
         """Distance from the centre beyond which nothing is left, along z, y and x, um."""
         z, plane = (self.diameter / 2 + _REACH * blur for blur in self.blur)
         return z, plane, plane
+
+    @property
+    def extent(self) -> Floats:
+        """Half axes (z, y, x) of the ellipsoid of voxels that a fit asks for, um."""
+        return self.diameter / 2 + _WINDOW * np.array([self.blur[0], self.blur[1], self.blur[1]])
 
     def spot(self, center: Floats, shape: tuple[int, ...]) -> SphereSpot:
         """Return the image of a sphere at `center` (z, y, x), um, inside an array of `shape`.

@@ -1,0 +1,154 @@
+"""Close-packed dark spheres in a real confocal stack: which are found, and how well.
+
+The folder holds `small_confocal_image.tif` (48 x 64 x 64) and `particle-positions.npy`, 37 starting
+places (z, y, x), voxels, of the walkthrough of PERI (peri-source/peri, docs/_static); by its
+authors' account they are centroids by trackpy of most of the spheres. Distances to them say which
+spheres are met. How well places are known is said by the image itself, and by a twin: the fitted
+spheres drawn anew with noise, whose places are known.
+
+Usage: python benchmarks/peri.py FOLDER [--out peri.png] [--seed 0]
+"""
+
+import argparse
+import time
+import warnings
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+from PIL import Image, ImageSequence
+from scipy.spatial.distance import cdist
+
+import perrin
+from perrin.images.conventional import find_features
+from perrin.images.crowd import fit_crowd
+from perrin.images.crowd_light import first_light
+from perrin.images.locate import Search, choose_method, sample_frames
+
+D = 11.0  # voxels, as said of the spheres in the walkthrough
+VOXEL = (1.0, 1.0, 1.0)
+
+
+class Movie:
+    """One frame in memory, voxels as the unit of length."""
+
+    def __init__(self, frame):
+        self.shape, self.voxel, self.image = (1, *frame.shape), VOXEL, frame
+
+    def frame(self, _):
+        """Return the frame."""
+        return self.image
+
+
+def read(folder):
+    """Return the frame and the listed places (z, y, x)."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # the file was written by Python 2
+        listed = np.load(folder / "particle-positions.npy")
+    with Image.open(folder / "small_confocal_image.tif") as pages:
+        return np.array([np.array(page) for page in ImageSequence.Iterator(pages)], float), listed
+
+
+def plain(frame):
+    """Return the places of trackpy's locate, its own defaults, on the inverted image."""
+    import trackpy
+
+    found = trackpy.locate((frame.max() - frame).astype(np.uint8), 11)
+    return found[["z", "y", "x"]].to_numpy()
+
+
+def zyx(table):
+    return table[["z", "y", "x"]].to_numpy()
+
+
+def report(name, places, listed):
+    """Print how many of the listed are met, and how near to each other spheres are."""
+    off = cdist(listed, places).min(axis=1)
+    apart = cdist(places, places) + np.diag(np.full(len(places), np.inf))
+    met = "".join(f"{np.sum(off < r):5d}" for r in (1, 2, D / 2))
+    print(f"{name:26s}{len(places):8d}{met}{apart.min():12.2f}")
+
+
+def misfit_at(fit, places):
+    """Return chi-squared per voxel with the spheres at other places, their brightness refitted."""
+    centers = fit.light.centers.copy()
+    distance = cdist(places, centers)
+    for place, k, near in zip(places, distance.argmin(1), distance.min(1), strict=True):
+        if near < D / 3:
+            centers[k] = place
+    light = first_light(fit.scene, centers)
+    return fit.light.misfit(fit.scene, light.expected) / fit.light.counted
+
+
+def draw(frame, places, listed, path):
+    """Draw slices along the three axes: circles where spheres are cut, crosses where listed."""
+    mpl.use("Agg")
+    import matplotlib.pyplot as plt
+
+    slices = [(0, 13), (0, 17), (0, 24), (1, 8), (1, 25), (2, 31)]
+    figure, panels = plt.subplots(
+        2, 3, figsize=(13, 8.4), height_ratios=[4, 3], layout="constrained"
+    )
+    for panel, (axis, k) in zip(panels.flat, slices, strict=True):
+        across, along = (i for i in range(3) if i != axis)
+        panel.imshow(frame.take(k, axis=axis), cmap="gray", origin="lower")
+        for place in places:
+            cut = (D / 2) ** 2 - (place[axis] - k) ** 2
+            if cut > 0:
+                at = (place[along], place[across])
+                panel.add_patch(plt.Circle(at, np.sqrt(cut), fill=False, color="tab:cyan", lw=1.5))
+        near = listed[np.abs(listed[:, axis] - k) < D / 2]
+        panel.plot(near[:, along], near[:, across], "x", color="tab:orange", ms=7, mew=1.8)
+        names = "zyx"
+        panel.set(title=f"{names[axis]} = {k}", xlabel=names[along], ylabel=names[across])
+        panel.set_xlim(-0.5, frame.shape[along] - 0.5)
+        panel.set_ylim(-0.5, frame.shape[across] - 0.5)
+    figure.suptitle("circles: found, where the slice cuts them; crosses: listed, within a radius")
+    figure.savefig(path, dpi=110)
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--out", type=Path, default=Path("peri.png"))
+    parser.add_argument("--seed", type=int, default=0)
+    args = parser.parse_args()
+    frame, listed = read(args.folder)
+    movie, asked = Movie(frame), {"diameter": D, "contact": D, "dark": True}
+    print(f"{'':26s}{'spheres':>8s}{'<1':>5s}{'<2':>5s}{'<D/2':>5s}{'least apart':>12s}")
+    report("listed", listed, listed)
+    report("trackpy, its defaults", plain(frame), listed)
+    first = zyx(perrin.locate(movie, refine=None, **asked))
+    report("found first", first, listed)
+    start = time.perf_counter()
+    search = Search(**asked)
+    sample = sample_frames(movie, search, range(movie.shape[0]))
+    optics = choose_method(movie, search, sample).optics
+    learned = time.perf_counter()
+    table = perrin.locate(movie, optics=optics, **asked)
+    seconds = time.perf_counter() - learned
+    report("refined", zyx(table), listed)
+    print(optics)
+    print(f"optics {learned - start:.1f} s, refined {seconds:.1f} s")
+    print("stated errors, x, y, z:", table.filter(like="sigma").mean().round(3).tolist(), "voxels")
+    nobody = np.empty((0, 3))
+    image = optics.image(VOXEL)
+    fit = fit_crowd(frame, first, others=nobody, contact=D, image=image, noise=optics.noise)
+    for name, places in (("refined", fit.centers), ("found first", first), ("listed", listed)):
+        print(f"chi2 with the spheres at the places {name}: {misfit_at(fit, places):.3f}")
+    rng = np.random.default_rng(args.seed)
+    noise = rng.normal(size=frame.shape) / np.sqrt(optics.noise.weight(fit.light.expected))
+    twin = np.clip(np.round(fit.light.expected + noise), 0, 255)
+    search = {"diameter": D, "contact": D, "voxel": VOXEL, "dark": True}
+    again = find_features(twin, percentile=95, border=True, **search)
+    bright = again.centers[again.mass > 0.5 * np.median(again.mass)]
+    refit = fit_crowd(twin, bright, others=nobody, contact=D, image=image, noise=optics.noise)
+    for name, places in (("found first", bright), ("refined", refit.centers)):
+        off = fit.centers - places[cdist(fit.centers, places).argmin(axis=1)]
+        rms = np.sqrt(np.median(off**2, axis=0) / 0.455)
+        print(f"errors on the twin, z, y, x, {name}: {rms.round(3)} voxels")
+    draw(frame, zyx(table), listed, args.out)
+
+
+if __name__ == "__main__":
+    main()
