@@ -136,6 +136,10 @@ def main():
     fit = fit_crowd(frame, first, others=nobody, contact=D, image=image, noise=optics.noise)
     for name, places in (("refined", fit.centers), ("found first", first), ("listed", listed)):
         print(f"chi2 with the spheres at the places {name}: {misfit_at(fit, places):.3f}")
+    left = (fit.scene.data - fit.light.expected)[fit.scene.mask].std()
+    white = [np.diff(frame, 2, axis=axis).std() / np.sqrt(6) for axis in range(3)]
+    print(f"left over by the model {left:.2f} grey levels; second differences of the image along")
+    print("z, y, x, which know no model, say that its noise is", np.round(white, 2).tolist())
     rng = np.random.default_rng(args.seed)
     noise = rng.normal(size=frame.shape) / np.sqrt(optics.noise.weight(fit.light.expected))
     twin = np.clip(np.round(fit.light.expected + noise), 0, 255)
