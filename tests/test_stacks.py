@@ -260,13 +260,45 @@ def test_an_ome_chain_cut_short_keeps_its_good_frames(tmp_path, movie):
 
 
 def test_an_ome_file_without_its_header_is_refused(tmp_path, movie):
-    """The header of a written stack is at its end: half the file is no stack."""
+    """Where the header is at the end, as tifffile leaves it, half the file is no stack."""
     path = tmp_path / "a.ome.tif"
-    write_stack(open_stack(movie, **GIVEN), path)
+    tifffile.imwrite(path, movie, ome=True, metadata={"axes": "TZYX"})
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     for planes in (None, 4):
         with pytest.raises(ValueError, match="cut short"):
             open_stack(path, planes=planes, **GIVEN)
+
+
+@pytest.mark.parametrize("share", [0.35, 0.48, 0.65, 0.8, 0.95])
+def test_a_written_stack_that_is_cut_short_keeps_its_good_frames(tmp_path, movie, share):
+    """All it says of itself stands first, and each image behind its own header."""
+    path = tmp_path / "a.ome.tif"
+    write_stack(open_stack(movie, **GIVEN), path)
+    content = path.read_bytes()
+    path.write_bytes(content[: int(share * len(content))])
+    with open_stack(path) as stack:
+        assert stack.shape == movie.shape
+        np.testing.assert_array_equal(stack.voxel, VOXEL)
+        good = []
+        for i in range(len(stack)):
+            try:
+                np.testing.assert_array_equal(stack.frame(i), movie[i])
+                good.append(i)
+            except FrameError as fault:
+                assert fault.frame == i  # noqa: PT017 (some frames do come back)
+    # The header takes some of the file; the rest is frames of equal size.
+    assert good == list(range(len(good)))
+    assert share * len(movie) - 2 < len(good) < len(movie)
+
+
+def test_a_file_cut_within_an_images_header_is_refused(tmp_path, movie):
+    path = tmp_path / "a.ome.tif"
+    write_stack(open_stack(movie, **GIVEN), path)
+    with tifffile.TiffFile(path) as file:
+        end = file.pages[10].offset + 5
+    path.write_bytes(path.read_bytes()[:end])
+    with pytest.raises(ValueError, match="is cut short, within the header of an image"):
+        open_stack(path)
 
 
 def test_corrupt_frame_is_named(tmp_path, movie):

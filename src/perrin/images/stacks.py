@@ -468,23 +468,25 @@ def write_stack(stack: Stack, path: _PathLike) -> None:
     tifffile = needed("tifffile", "images")
     beside = target.with_name(f".{target.name}.{os.getpid()}.part")
     n_bytes = int(np.prod(stack.shape)) * stack.dtype.itemsize
+    described: bytes | None = _ome_header(stack, tifffile)
     try:
-        tifffile.imwrite(
-            beside,
-            (plane for frame in stack for plane in frame),
-            shape=stack.shape,
-            dtype=stack.dtype,
-            ome=True,
-            bigtiff=n_bytes > 2**31,
-            photometric="minisblack",
-            metadata=_ome_header(stack),
-        )
+        with tifffile.TiffWriter(beside, bigtiff=n_bytes > 2**31) as file:
+            # Every plane with its own header before it: a file that is cut short keeps the rest.
+            for plane in (plane for frame in stack for plane in frame):
+                file.write(
+                    plane,
+                    description=described,
+                    photometric="minisblack",
+                    metadata=None,
+                    contiguous=False,
+                )
+                described = None
         beside.replace(target)
     finally:
         beside.unlink(missing_ok=True)
 
 
-def _ome_header(stack: Stack) -> dict[str, Any]:
+def _ome_header(stack: Stack, tifffile: Any) -> bytes:  # noqa: ANN401 (an untyped library)
     """Return axes, sizes and times in the words of OME."""
     header: dict[str, Any] = {"axes": "TZYX"}
     for axis, length in zip("ZYX", stack.voxel, strict=True):
@@ -495,4 +497,7 @@ def _ome_header(stack: Stack) -> dict[str, Any]:
     delay = np.arange(stack.shape[1]) * (stack.plane_time or 0.0)
     clock = (stack.times[:, None] + delay).ravel()
     header["Plane"] = {"DeltaT": clock.tolist(), "DeltaTUnit": ["s"] * clock.size}
-    return header
+    xml = tifffile.OmeXml()
+    t, z, y, x = stack.shape
+    xml.addimage(stack.dtype, stack.shape, (t * z, 1, 1, y, x, 1), **header)
+    return bytes(xml.tostring(declaration=True).encode())

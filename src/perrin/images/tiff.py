@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import struct
 from contextlib import closing
 from math import prod
 from pathlib import Path
@@ -59,6 +60,9 @@ def tiff(path: str, pick: Pick, *, one_frame: bool = False) -> Contents:
         choice = _whole(sizes, pick) if one_frame else pick
         where = layout(sizes, choice, cut=_cut_short(file))
         scale = _scale(file, number, where, pick.channel or 0)
+    except struct.error as fault:
+        file.close()
+        raise ValueError("is cut short, within the header of an image: copy it again") from fault
     except Exception:
         file.close()
         raise
