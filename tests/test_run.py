@@ -246,8 +246,88 @@ def test_parts_of_other_settings_or_input_are_refused(tmp_path, movie_file):
     with perrin.open_stack(movie_file[0]) as stack:
         mirrored = np.stack([frame[:, ::-1] for frame in stack])
     other = perrin.open_stack(mirrored, voxel=(0.25, 0.2, 0.2), dt=DT)
-    with pytest.raises(ValueError, match=r"path .*there, None now; .*sha256 "):
+    with pytest.raises(ValueError, match=r"another run: sha256 '.*' there, '.*' now"):
         perrin.analyze_stack(other, **SEARCH, **short, percentile=90.0)
+
+
+def test_parts_of_another_channel_are_refused_those_of_a_moved_file_taken(tmp_path, counted):
+    """The file is the same to the last bit, what is seen of it is not; its name does not matter."""
+    import tifffile
+
+    movie, _ = rendered(n_frames=3)
+    both = np.stack([np.stack([f, f[:, ::-1]], axis=1) for f in movie])
+    path = tmp_path / "two.ome.tif"
+    tifffile.imwrite(path, both, ome=True, metadata={"axes": "TZCYX"})
+    opened = {"voxel": (0.25, 0.2, 0.2), "dt": DT}
+    asked = SEARCH | {"refine": None, "keep": tmp_path / "run"}
+    with perrin.open_stack(path, channel=0, **opened) as stack:
+        first = perrin.analyze_stack(stack, **asked)
+    with (
+        perrin.open_stack(path, channel=1, **opened) as stack,
+        pytest.raises(ValueError, match="channel 0 there, 1 now"),
+    ):
+        perrin.analyze_stack(stack, **asked)
+    moved = path.rename(tmp_path / "elsewhere.ome.tif")
+    counted.clear()
+    with perrin.open_stack(moved, channel=0, **opened) as stack:
+        assert_identical(perrin.analyze_stack(stack, **asked), first)
+    assert counted == []
+
+
+def test_all_faults_are_told_at_the_door(movie_file, counted):
+    """Not after hours of work, and not one by one."""
+    wrong = {"size": 1, "noise": "loud", "exposure": 2.0, "viscosity": -1.0, "percentile": 100.0}
+    with perrin.open_stack(movie_file[0]) as stack, pytest.raises(ValueError, match=r".") as told:
+        perrin.analyze_stack(stack, **SEARCH, **wrong, workers=2, scheduler="tcp://127.0.0.1:9")
+    for name in (*wrong, "workers"):
+        assert f"{name}: expected" in str(told.value)
+    assert counted == []
+
+
+def test_a_movie_of_pairs_gives_rods():
+    """Pairs have a direction and no pose to fit; the run still answers."""
+    body = perrin.Cluster.touching(2, DIAMETER)
+    truth = perrin.simulate_motion(body, D_R=0.02, D_T=0.02, dt=DT, n_frames=FRAMES, rng=3)
+    movie = perrin.render_stack(
+        truth,
+        centers=[(4.4, 4.4, 4.8)],
+        voxel=(0.25, 0.2, 0.2),
+        shape=(38, 44, 44),
+        diameter=DIAMETER,
+        psf=(0.4, 0.15, 0.15),
+        photons=40,
+        background=3,
+        gain=3,
+        rng=1,
+    )
+    report = perrin.analyze_stack(movie, **SEARCH)
+    assert report.clusters == ()
+    (rod,) = report.rods
+    off = rod.motion.center - truth.center - [4.4, 4.4, 4.8]
+    assert np.abs(off - off.mean(axis=0)).max() < 0.02  # 4 nm a sphere
+
+
+def test_a_movie_in_the_plane_goes_the_whole_way(tmp_path):
+    """Triangles of bright discs: places are centroids, the angle follows, and it is told."""
+    body = perrin.Cluster([[0.0, 0.0], [1.2, 0.0], [0.3, 1.1]])
+    truth = perrin.simulate_motion(body, D_R=0.01, D_T=0.005, dt=1.0, n_frames=12, rng=4)
+    places = truth.positions() + 5.0
+    grid = 0.1 * np.arange(100)
+    near = [np.exp(-0.5 * ((grid - places[..., k, None]) / 0.15) ** 2) for k in (1, 0)]
+    light = np.einsum("tny,tnx->tyx", *near) * 150 + 10
+    movie = np.random.default_rng(1).poisson(light).astype(np.uint16)
+    stack = perrin.open_stack(movie, voxel=(0.1, 0.1), dt=1.0)
+    report = perrin.analyze_stack(stack, diameter=0.6, contact=1.15)
+    (result,) = report.clusters
+    assert result.motion.template.shape == (3, 2)
+    turned = result.motion.rotation @ np.swapaxes(result.motion.rotation[:1], 1, 2)
+    true = truth.rotation @ np.swapaxes(truth.rotation[:1], 1, 2)
+    angle = [np.arctan2(r[:, 1, 0], r[:, 0, 0]) for r in (turned, true)]
+    assert np.abs(angle[0] - angle[1]).max() < 0.03  # 10 nm on 0.7 um
+    assert any("the model of the image is that of a volume" in text for text in report.warnings)
+    perrin.write_run(report, tmp_path / "run")
+    assert_identical(perrin.load_run(tmp_path / "run"), report)
+    assert (tmp_path / "run" / "quality.html").is_file()
 
 
 def test_a_damaged_part_is_made_anew(tmp_path):

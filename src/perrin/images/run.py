@@ -19,10 +19,11 @@ from perrin.images.locate import NO_FLAT_MODEL, Search, check_search, is_flat
 from perrin.images.parts import PartsError
 from perrin.images.stacks import digest
 from perrin.images.stages import Located, Workplace, fit_poses, locate_frames
+from perrin.steps import choice_faults
 
 if TYPE_CHECKING:
     import os
-    from collections.abc import Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
     import pandas as pd
 
@@ -134,11 +135,15 @@ def analyze_stack(
     (1, 3)
     """
     search = Search(diameter, contact, dark, percentile, minmass, border)
-    check_search(stack, search, refine)
+    sphere = contact if viscosity is not None and temperature is not None else None
+    known = (None, viscosity, temperature, sphere, noise, exposure, drift)
+    conditions = Conditions(stack.dt, *known, times=_uneven(stack))
+    _check(stack, search, refine, conditions, size=size, workers=workers, scheduler=scheduler)
     flat = refine == "model" and is_flat(stack)
     refine = None if flat else refine
-    listed = _listed(len(stack), frames)
-    conditions = _conditions(stack, contact, noise, exposure, drift, viscosity, temperature)
+    listed, out = _listed(len(stack), frames), sorted({int(c) for c in exclude})
+    if progress is not None:
+        progress(0, 0, "taking the file's SHA-256")
     depends = _depends(stack, search, refine, optics, listed)
     with _kept_in(keep) as folder:
         place = Workplace(folder / _LOCATED, workers, scheduler, progress)
@@ -149,10 +154,10 @@ def analyze_stack(
         seen = _grouped(located, stack, search, size)
         poses = _Poses(stack, located.method.optics, seen, contact, folder / _POSED, place)
         report = measure_table(
-            _tracks(seen, exclude),
+            _tracks(seen, out),
             replace(conditions, sigma_ratio=_stated(seen)),
-            source={"path": depends["path"], "sha256": depends["sha256"]},
-            arguments=_arguments(conditions, depends, seen.size, exclude),
+            source={"path": stack.source if stack.path else None, "sha256": depends["sha256"]},
+            arguments=_arguments(conditions, depends, seen.size, out),
             improved=poses.improved,
         )
     imaging = _imaging(stack, located, seen, search)
@@ -184,22 +189,48 @@ def _listed(count: int, frames: tuple[int | None, int | None] | None) -> list[in
     return listed
 
 
-def _conditions(
+def _uneven(stack: Stack) -> Floats | None:
+    """Return the times of the frames where they are not evenly spaced."""
+    even = np.abs(np.diff(stack.times) - stack.dt) <= _EVEN * stack.dt
+    return None if even.all() else stack.times
+
+
+def _check(
     stack: Stack,
-    contact: float,
-    noise: Literal["joint", "residual"] | float,
-    exposure: float | None,
-    drift: bool,
-    viscosity: float | None,
-    temperature: float | None,
-) -> Conditions:
-    """Return what is known of the experiment; times only where frames are not evenly spaced."""
-    dt = stack.dt
-    check_arguments(dt=dt, viscosity=viscosity, temperature=temperature)
-    even = bool(np.all(np.abs(np.diff(stack.times) - dt) <= _EVEN * dt))
-    sphere = contact if viscosity is not None and temperature is not None else None
-    known = (None, viscosity, temperature, sphere, noise, exposure, drift)
-    return Conditions(dt, *known, times=None if even else stack.times)
+    search: Search,
+    refine: Refine,
+    conditions: Conditions,
+    *,
+    size: int | None,
+    workers: int,
+    scheduler: str | None,
+) -> None:
+    """Raise one error with every fault of the arguments, before hours of work."""
+    if len(stack) < 2:
+        raise TooFewFramesError("one frame shows no motion: two or more are needed", len(stack))
+    faults = choice_faults(
+        quantity="rotation", noise=conditions.noise, exposure=conditions.exposure
+    )
+    given = {"viscosity": conditions.viscosity, "temperature": conditions.temperature}
+    faults += _faults_of(check_search, stack, search, refine)
+    faults += _faults_of(check_arguments, dt=conditions.dt, **given)
+    if size is not None and not (size == int(size) and size >= 2):
+        faults.append(f"size: expected a whole number of spheres, at least 2, got {size!r}")
+    if workers < 0 or (workers and scheduler is not None):
+        faults.append(
+            f"workers: expected processes of this machine, 0 or more, or a scheduler instead, got "
+            f"{workers} and {scheduler!r}"
+        )
+    if faults:
+        raise ValueError("; ".join(faults))
+
+
+def _faults_of(check: Callable[..., None], *arguments: object, **named: object) -> list[str]:
+    try:
+        check(*arguments, **named)
+    except ValueError as fault:
+        return [str(fault)]
+    return []
 
 
 def _depends(
@@ -210,11 +241,9 @@ def _depends(
     frames: Sequence[int],
 ) -> dict[str, Any]:
     """Return all that the located spheres depend on."""
-    from importlib.metadata import version
-
     return {
-        "path": None if stack.path is None else str(stack.path),
         "sha256": digest(stack),
+        **stack.choice,
         "shape": list(stack.shape),
         "voxel": [float(v) if np.isfinite(v) else None for v in stack.voxel],
         "first_frame": frames[0],
@@ -222,8 +251,17 @@ def _depends(
         **asdict(search),
         "refine": refine,
         "optics": None if optics is None else asdict(optics),
-        "versions": {name: version(name) for name in _LIBRARIES},
+        "versions": {name: _version(name) for name in _LIBRARIES},
     }
+
+
+def _version(name: str) -> str | None:
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return None
 
 
 @contextmanager
@@ -364,15 +402,15 @@ def _stated(seen: _Seen) -> Floats | None:
     return median if np.isfinite(median).all() else None
 
 
-def _tracks(seen: _Seen, exclude: Iterable[int]) -> pd.DataFrame:
+def _tracks(seen: _Seen, out: Sequence[int]) -> pd.DataFrame:
     """Return the table of tracks, clusters that are not wanted left out."""
-    features, out = seen.features, {int(c) for c in exclude}
+    features = seen.features
     found = set(features.loc[features["cluster"] >= 0, "cluster"].unique().tolist())
     if not found:
         raise DegenerateClusterError(
             f"no cluster of {seen.size} touching spheres is seen in three frames or more"
         )
-    unknown = sorted(out - found)
+    unknown = sorted(set(out) - found)
     if unknown:
         raise ValueError(f"exclude: there is no cluster {unknown[0]}; found {sorted(found)}")
     rows = features[(features["cluster"] >= 0) & ~features["cluster"].isin(out)]
@@ -405,7 +443,7 @@ class _Poses:
         self.told += [f"cluster {c} was refused: {why}" for c, why in reasons.items() if why]
         if motions and not kept:
             raise IdentityError(next(iter(reasons.values())))
-        if self.optics is None or len(self.seen.axes) < 3:
+        if self.optics is None or not kept:
             return {c: motion for c, (motion, _) in kept.items()}
         better, told = fit_poses(
             self.stack,
@@ -419,11 +457,11 @@ class _Poses:
 
 
 def _arguments(
-    conditions: Conditions, depends: Mapping[str, Any], size: int, exclude: Iterable[int]
+    conditions: Conditions, depends: Mapping[str, Any], size: int, out: Sequence[int]
 ) -> dict[str, Any]:
     """Return what run.json keeps of the arguments."""
-    mine = {k: v for k, v in depends.items() if k not in ("path", "sha256", "versions")}
-    return told_conditions(conditions) | mine | {"size": size, "exclude": sorted(set(exclude))}
+    mine = {k: v for k, v in depends.items() if k not in ("sha256", "versions")}
+    return told_conditions(conditions) | mine | {"size": size, "exclude": list(out)}
 
 
 def _imaging(stack: Stack, located: Located, seen: _Seen, search: Search) -> Imaging:

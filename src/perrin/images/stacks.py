@@ -90,6 +90,11 @@ class Stack:
         return Path(self.read.path) if isinstance(self.read, _FileFrames) else None
 
     @property
+    def choice(self) -> dict[str, int | str | None]:
+        """What was chosen of the file: channel, planes, image; empty for what is in memory."""
+        return self.read.pick._asdict() if isinstance(self.read, _FileFrames) else {}
+
+    @property
     def dt(self) -> float:
         """Median time between frames, s; NaN for a single frame."""
         return float(np.median(np.diff(self.times))) if len(self) > 1 else float("nan")
@@ -139,7 +144,7 @@ class _FileFrames:
     """Frames of an open file: one reader at a time, and opened anew where it is unpickled."""
 
     def __init__(self, path: str, pick: Pick, contents: Contents | None = None) -> None:
-        self.path, self._pick, self._contents = path, pick, contents
+        self.path, self.pick, self._contents = path, pick, contents
         self._lock = threading.Lock()
 
     def __call__(self, i: int) -> NDArray[Any]:
@@ -150,13 +155,13 @@ class _FileFrames:
 
     def _opened(self) -> Contents:
         try:
-            return _contents(self.path, self._pick)
+            return _contents(self.path, self.pick)
         # The readers of damaged files raise whatever their decoders do.
         except Exception as fault:
             raise _UnopenedError(f"{self.path} cannot be opened here: {fault}") from fault
 
     def __reduce__(self) -> tuple[type[_FileFrames], tuple[str, Pick]]:
-        return _FileFrames, (self.path, self._pick)
+        return _FileFrames, (self.path, self.pick)
 
     def close(self) -> None:
         with self._lock:
