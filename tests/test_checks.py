@@ -8,6 +8,7 @@ import pytest
 
 import perrin
 from perrin.images import checks
+from perrin.images.bodies import group_sizes
 from perrin.images.features import mass_cut
 from perrin.rotations import exp_map
 
@@ -147,7 +148,7 @@ def test_groups_of_touching_spheres_are_counted():
     apart = np.array([[0.0, 0.0, 0.0], 2 * (x[0] - x[1]), [30.0, 0.0, 0.0]])
     near = (x + apart[:, None]).reshape(-1, 3) @ turn.T
     spheres = pd.DataFrame(near, columns=["x", "y", "z"]).assign(frame=3)
-    found = checks.group_sizes(spheres, contact=CONTACT, axes=["x", "y", "z"])
+    found = group_sizes(spheres, contact=CONTACT, axes=["x", "y", "z"])
     np.testing.assert_array_equal(found, [8] * 8 + [4] * 4)
 
 

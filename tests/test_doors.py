@@ -69,6 +69,7 @@ ROOMS = [
     "images.parts",
     "images.workers",
     "images.stages",
+    "images.bodies",
     "images.checks",
     "images.imaging",
     "results",

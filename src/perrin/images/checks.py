@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from perrin.linking import touching_groups
+from perrin.images.bodies import REACH
 from perrin.rotations import log_map
 
 if TYPE_CHECKING:
@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from perrin._arrays import Floats, Ints
     from perrin.motion import RigidMotion
 
-REACH = 1.3  # spheres nearer than this many contact distances count as touching
 _LISTED = 10  # frames named one by one
 _PAIR = 0.03  # relative error of the mean pair distance that is told
 _SATURATED, _SATURATED_LEAST = 1e-5, 10  # share and number of voxels at the end of the range
@@ -95,6 +94,8 @@ def faded(features: pd.DataFrame) -> list[str]:
 
 def dimmed_with_depth(features: pd.DataFrame) -> list[str]:
     """Say by how much brightness changes from the lowest sphere to the highest."""
+    # What was found in the light left over by a crowd has no mass.
+    features = features[features["mass"].notna()]
     if "z" not in features or len(features) < 10:
         return []
     relative = features["mass"] / features.groupby("frame")["mass"].transform("median")
@@ -159,20 +160,10 @@ def mean_pair_distance(features: pd.DataFrame, *, contact: float, axes: list[str
     return float(every.mean()) if every.size else np.nan
 
 
-def group_sizes(features: pd.DataFrame, *, contact: float, axes: list[str]) -> Ints:
-    """Return for every row how many spheres touch in its chain, itself counted."""
-    out = np.zeros(len(features), dtype=np.int64)
-    x = features[axes].to_numpy(dtype=np.float64)
-    for rows in features.reset_index(drop=True).groupby("frame").indices.values():
-        label = touching_groups(x[rows], reach=REACH * contact, size=len(rows), smallest=1)
-        out[rows] = np.bincount(label)[label]
-    return out
-
-
 def counts(features: pd.DataFrame, *, size: int, contact: float) -> list[str]:
     """Say in which frames a cluster has not as many spheres as it should.
 
-    `features` has the column ``together``, from `group_sizes`.
+    `features` is that of `Bodies`.
     """
     told = []
     for cluster, rows in features[features["cluster"] >= 0].groupby("cluster"):
@@ -195,7 +186,7 @@ def counts(features: pd.DataFrame, *, size: int, contact: float) -> list[str]:
 def at_border(features: pd.DataFrame, *, margin: float, dropped: Mapping[int, Ints]) -> list[str]:
     """Say which clusters come near the border, and which of their frames were dropped.
 
-    `features` has the column ``border``: distance of a centre to the nearest border, um.
+    `features` is that of `Bodies`.
     """
     told = []
     tracked = features[features["cluster"] >= 0]

@@ -10,10 +10,9 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 import perrin.images.checks as checks
-from perrin._arrays import DegenerateClusterError, Floats, IdentityError, TooFewFramesError
+from perrin._arrays import Floats, IdentityError, TooFewFramesError
 from perrin.analysis import Conditions, check_arguments, measure_table, told_conditions
-from perrin.files import check_tracks
-from perrin.grouping import identify
+from perrin.images.bodies import Bodies, find_bodies, stated_errors, tracks_of
 from perrin.images.imaging import Imaging, View
 from perrin.images.locate import NO_FLAT_MODEL, Search, check_search, is_flat
 from perrin.images.parts import PartsError
@@ -25,9 +24,7 @@ if TYPE_CHECKING:
     import os
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
-    import pandas as pd
-
-    from perrin._arrays import Bools, Ints
+    from perrin._arrays import Ints
     from perrin.images.locate import Refine
     from perrin.images.optics import Optics
     from perrin.images.stacks import Stack
@@ -39,7 +36,6 @@ _VIEWS = 8  # frames that are kept as pictures
 _EVEN = 1e-3  # intervals that differ by less than this share of dt are equal
 _LIBRARIES = ("perrin", "numpy", "scipy", "trackpy")
 _LOCATED, _POSED = "located", "posed"
-_SURE = 0.95  # groups of other sizes are told where less than this share has the size taken
 
 
 def analyze_stack(
@@ -151,30 +147,19 @@ def analyze_stack(
             stack, search, refine=refine, optics=optics, frames=listed, settings=depends,
             place=place, anew=anew,
         )  # fmt: skip
-        seen = _grouped(located, stack, search, size)
-        poses = _Poses(stack, located.method.optics, seen, contact, folder / _POSED, place)
+        method = located.method
+        bodies = find_bodies(located.features, stack, search, optics=method.optics, size=size)
+        poses = _Poses(stack, method.optics, bodies, contact, folder / _POSED, place)
         report = measure_table(
-            _tracks(seen, out),
-            replace(conditions, sigma_ratio=_stated(seen)),
+            tracks_of(bodies, exclude=out),
+            replace(conditions, sigma_ratio=stated_errors(bodies)),
             source={"path": stack.source if stack.path else None, "sha256": depends["sha256"]},
-            arguments=_arguments(conditions, depends, seen.size, out),
+            arguments=_arguments(conditions, depends, bodies.size, out),
             improved=poses.improved,
         )
-    imaging = _imaging(stack, located, seen, search)
+    imaging = _imaging(stack, located, bodies, search)
     told = [NO_FLAT_MODEL, *poses.told] if flat else poses.told
-    return _with_checks(report, imaging, located, seen, told, stack)
-
-
-@dataclass(frozen=True, eq=False)
-class _Seen:
-    """Spheres that were found, which cluster each is of, and what was noticed on the way."""
-
-    features: pd.DataFrame  # of `Imaging`, and ``together``, ``border`` of `checks`
-    axes: list[str]
-    size: int
-    margin: float  # of the border, um
-    dropped: dict[int, Ints]  # frames of each cluster that lack spheres at the border
-    told: list[str]
+    return _with_checks(report, imaging, located, bodies, told, stack)
 
 
 def _listed(count: int, frames: tuple[int | None, int | None] | None) -> list[int]:
@@ -306,129 +291,13 @@ def _located(
     )
 
 
-def _grouped(located: Located, stack: Stack, search: Search, size: int | None) -> _Seen:
-    """Say which spheres are of which cluster."""
-    features = located.features
-    if not len(features):
-        raise DegenerateClusterError(
-            "no particles were found in any frame: look at minmass, diameter, and whether the "
-            "spheres are dark"
-        )
-    axes = [axis for axis in "xyz" if axis in features]
-    usable = _usable(features)
-    together = np.ones(len(features), dtype=np.int64)
-    together[usable] = checks.group_sizes(features[usable], contact=search.contact, axes=axes)
-    told: list[str] = []
-    if size is None:
-        size, told = _common_size(together[usable], dimension=len(axes))
-    found = identify(features.loc[usable, ["frame", *axes]], contact=search.contact, size=size)
-    columns = {"cluster": -1, "particle": -1, "piece": 0}
-    features = features.assign(together=together, **columns)
-    features.loc[usable, list(columns)] = found[list(columns)]
-    features.loc[features["cluster"] < 0, ["particle", "piece"]] = (-1, 0)
-    features["border"] = _to_border(features, stack, axes)
-    blur = located.method.optics.psf[0] if located.method.optics is not None else 0.0
-    margin = search.diameter / 2 + 2 * blur
-    features, dropped = _without_cut_bodies(features, size=size, margin=margin)
-    return _Seen(features, axes, size, margin, dropped, told)
-
-
-def _usable(features: pd.DataFrame) -> Bools:
-    """Return the rows whose places are good: where a fit was tried and failed they are not."""
-    if "refined" not in features:
-        return np.ones(len(features), dtype=np.bool_)
-    tried = features["chi2"].notna().to_numpy()
-    return np.asarray(features["refined"].to_numpy(dtype=np.bool_) | ~tried)
-
-
-def _common_size(together: Ints, *, dimension: int) -> tuple[int, list[str]]:
-    """Return the most common number of touching spheres, and what was seen besides."""
-    counted = np.bincount(together)
-    groups = np.round(counted / np.maximum(np.arange(len(counted)), 1)).astype(int)
-    groups[:2] = 0
-    if not groups.any():
-        raise DegenerateClusterError(
-            f"no spheres touch: all {len(together)} found are over 1.3 contact distances apart; "
-            "correct contact or the voxel size"
-        )
-    bodies = groups.copy()
-    bodies[:dimension] = 0
-    size = int(np.argmax(bodies if bodies.any() else groups))
-    share = groups[size] / groups.sum()
-    if share >= _SURE:
-        return size, []
-    listed = ", ".join(f"{count} of {n}" for n, count in enumerate(groups) if count)
-    return size, [
-        f"clusters are taken to be of {size} spheres, the most common number; groups of touching "
-        f"spheres in all frames: {listed}; state the size to measure others"
-    ]
-
-
-def _to_border(features: pd.DataFrame, stack: Stack, axes: list[str]) -> Floats:
-    """Return how far each centre is from the nearest border of the stack, um."""
-    length = dict(zip("zyx", np.array(stack.shape[1:]) * stack.voxel, strict=True))
-    half = dict(zip("zyx", stack.voxel / 2, strict=True))
-    sides = [
-        np.minimum(features[a] + half[a], length[a] - half[a] - features[a]).to_numpy()
-        for a in axes
-    ]
-    return np.asarray(np.min(sides, axis=0), dtype=np.float64)
-
-
-def _without_cut_bodies(
-    features: pd.DataFrame, *, size: int, margin: float
-) -> tuple[pd.DataFrame, dict[int, Ints]]:
-    """Loosen bodies at the border some of whose spheres are out of view.
-
-    Their unseen light misleads the fits of the spheres that are left.
-    """
-    tracked = features[features["cluster"] >= 0]
-    bodies = tracked.groupby(["cluster", "frame"]).agg(n=("x", "size"), border=("border", "min"))
-    cut = bodies[(bodies["n"] < size) & (bodies["border"] < margin)].reset_index()
-    gone = features.set_index(["cluster", "frame"]).index.isin(
-        cut.set_index(["cluster", "frame"]).index
-    )
-    features = features.copy()
-    features.loc[gone, ["cluster", "particle", "piece"]] = (-1, -1, 0)
-    return features, {int(c): part.to_numpy() for c, part in cut.groupby("cluster")["frame"]}
-
-
-def _stated(seen: _Seen) -> Floats | None:
-    """Return the median stated errors of the axes, um, where places were refined."""
-    names = [f"sigma_{axis}" for axis in seen.axes]
-    if not set(names) <= set(seen.features):
-        return None
-    median = seen.features[names].median().to_numpy(dtype=np.float64)
-    return median if np.isfinite(median).all() else None
-
-
-def _tracks(seen: _Seen, out: Sequence[int]) -> pd.DataFrame:
-    """Return the table of tracks, clusters that are not wanted left out."""
-    features = seen.features
-    found = set(features.loc[features["cluster"] >= 0, "cluster"].unique().tolist())
-    if not found:
-        raise DegenerateClusterError(
-            f"no cluster of {seen.size} touching spheres is seen in three frames or more"
-        )
-    unknown = sorted(set(out) - found)
-    if unknown:
-        raise ValueError(f"exclude: there is no cluster {unknown[0]}; found {sorted(found)}")
-    rows = features[(features["cluster"] >= 0) & ~features["cluster"].isin(out)]
-    if not len(rows):
-        raise ValueError(f"exclude: no cluster is left of {sorted(found)}")
-    table = check_tracks(
-        rows[["frame", "particle", "cluster", *seen.axes]], source="the spheres found"
-    )
-    return table.assign(piece=rows["piece"].to_numpy())
-
-
 @dataclass(eq=False)
 class _Poses:
     """Takes the motions of free centres to those fitted to the images."""
 
     stack: Stack
     optics: Optics | None
-    seen: _Seen
+    bodies: Bodies
     contact: float
     folder: Path
     place: Workplace
@@ -449,7 +318,7 @@ class _Poses:
             self.stack,
             kept,
             optics=self.optics,
-            features=self.seen.features,
+            features=self.bodies.features,
             place=replace(self.place, folder=self.folder),
         )
         self.told += told
@@ -464,12 +333,12 @@ def _arguments(
     return told_conditions(conditions) | mine | {"size": size, "exclude": list(out)}
 
 
-def _imaging(stack: Stack, located: Located, seen: _Seen, search: Search) -> Imaging:
+def _imaging(stack: Stack, located: Located, bodies: Bodies, search: Search) -> Imaging:
     z, y, x = (float(v) for v in stack.voxel)
     read = located.frames.loc[located.frames["fault"] == "", "frame"].to_numpy()
     shown = read[np.unique(np.linspace(0, len(read) - 1, min(_VIEWS, len(read))).astype(int))]
     return Imaging(
-        features=seen.features.drop(columns=["together", "border"]),
+        features=bodies.features.drop(columns=["together", "border"]),
         frames=located.frames,
         spots=located.spots,
         views=tuple(_view(stack, int(i), search.dark) for i in shown),
@@ -493,12 +362,12 @@ def _with_checks(
     report: Report,
     imaging: Imaging,
     located: Located,
-    seen: _Seen,
+    bodies: Bodies,
     told: list[str],
     stack: Stack,
 ) -> Report:
     """Return the report with the images, and with all that speaks against it."""
-    features, contact, method = seen.features, imaging.contact, located.method
+    features, contact, method = bodies.features, imaging.contact, located.method
     warnings = (
         *located.told,
         *checks.unreadable(located.frames),
@@ -507,10 +376,10 @@ def _with_checks(
         *checks.faded(features),
         *checks.dimmed_with_depth(features),
         *checks.unrefined(features),
-        *checks.pair_distance(features, contact=contact, refine=method.refine, axes=seen.axes),
-        *seen.told,
-        *checks.counts(features, size=seen.size, contact=contact),
-        *checks.at_border(features, margin=seen.margin, dropped=seen.dropped),
+        *checks.pair_distance(features, contact=contact, refine=method.refine, axes=bodies.axes),
+        *bodies.told,
+        *checks.counts(features, size=bodies.size, contact=contact),
+        *checks.at_border(features, margin=bodies.margin, dropped=bodies.dropped),
         *told,
         *report.warnings,
     )

@@ -62,7 +62,6 @@ class Workplace:
         task: Callable[[S], tuple[pd.DataFrame, dict[str, Any]]],
         items: Mapping[int, S],
         *,
-        folder: Path,
         title: str,
     ) -> tuple[pd.DataFrame, pd.DataFrame, list[str]]:
         """Do what is not done yet, item by item, each known by its frame.
@@ -76,23 +75,23 @@ class Workplace:
         """
         import pandas as pd
 
-        _, entries, damaged = read_parts(folder)
+        _, entries, damaged = read_parts(self.folder)
         done = {int(e["frame"]) for e in entries}
         todo = [item for frame, item in items.items() if frame not in done]
         count = len(items) - len(todo)
         self.tell(count, len(items), title)
-        with PartWriter(folder) as writer:
+        with PartWriter(self.folder) as writer:
             for rows, entry in work_through(
                 task, todo, workers=self.workers, scheduler=self.scheduler
             ):
                 writer.add(rows, entry)
                 count += 1
                 self.tell(count, len(items), title)
-        table, entries, _ = read_parts(folder)
+        table, entries, _ = read_parts(self.folder)
         listed = pd.DataFrame(entries).sort_values("frame", ignore_index=True)
         rows = table.sort_values("frame", kind="stable", ignore_index=True)
-        told = [f"{len(damaged)} damaged parts in {folder} were made anew"] if damaged else []
-        return rows, listed, told
+        told = f"{len(damaged)} damaged parts in {self.folder} were made anew"
+        return rows, listed, [told] if damaged else []
 
     def tell(self, done: int, total: int, title: str) -> None:
         """Say how far the work is."""
@@ -159,9 +158,7 @@ def locate_frames(
         None if found is None else Optics.from_dict(found),
     )
     task = _Locate(_light(stack), method)
-    rows, entries, told = place.kept(
-        task, {i: i for i in frames}, folder=place.folder, title="locating spheres"
-    )
+    rows, entries, told = place.kept(task, {i: i for i in frames}, title="locating spheres")
     entries.insert(1, "time", stack.times[entries["frame"].to_numpy()])
     spots = pd.DataFrame(learned["spots"], columns=["frame", "mass"])
     return Located(method, rows, entries, spots, learned["told"] + told)
@@ -259,7 +256,7 @@ def fit_poses(
         shutil.rmtree(place.folder)
     open_parts(place.folder, settings)
     task = _Stand(_light(stack), optics, templates)
-    rows, _, told = place.kept(task, items, folder=place.folder, title="fitting poses")
+    rows, _, told = place.kept(task, items, title="fitting poses")
     return _reposed(motions, rows, told)
 
 

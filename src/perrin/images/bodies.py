@@ -1,0 +1,209 @@
+"""Which of the spheres found in a movie make up its clusters."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from perrin._arrays import DegenerateClusterError
+from perrin.files import check_tracks
+from perrin.grouping import identify
+from perrin.linking import touching_groups
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    import pandas as pd
+
+    from perrin._arrays import Bools, Floats, Ints
+    from perrin.images.locate import Search
+    from perrin.images.optics import Optics
+    from perrin.images.stacks import Stack
+
+REACH = 1.3  # spheres nearer than this many contact distances count as touching
+_SURE = 0.95  # groups of other sizes are told where less than this share has the size taken
+
+
+@dataclass(frozen=True, eq=False)
+class Bodies:
+    """Spheres that were found, which cluster each is of, and what was noticed on the way.
+
+    Attributes
+    ----------
+    features : DataFrame
+        As in `Imaging`, and ``together`` (spheres in a chain of touching ones), ``border``
+        (distance of the centre to it, um).
+    axes : list of str
+    size : int
+        Spheres of a cluster.
+    margin : float
+        Centres nearer to the border than this belong to spheres that it cuts, um.
+    dropped : dict of ndarray
+        Frames of each cluster that lack spheres at the border.
+    told : list of str
+    """
+
+    features: pd.DataFrame
+    axes: list[str]
+    size: int
+    margin: float
+    dropped: dict[int, Ints]
+    told: list[str]
+
+
+def find_bodies(
+    features: pd.DataFrame,
+    stack: Stack,
+    search: Search,
+    *,
+    optics: Optics | None,
+    size: int | None = None,
+) -> Bodies:
+    """Say which spheres of a movie are of which cluster.
+
+    Parameters
+    ----------
+    features : DataFrame
+        As `locate` returns it.
+    stack : Stack
+    search : Search
+    optics : Optics or None
+    size : int, optional
+        Spheres of a cluster; default: the most common number of touching ones.
+
+    Raises
+    ------
+    DegenerateClusterError
+        If nothing was found, or no spheres touch.
+    """
+    if not len(features):
+        raise DegenerateClusterError(
+            "no particles were found in any frame: look at minmass, diameter, and whether the "
+            "spheres are dark"
+        )
+    axes = [axis for axis in "xyz" if axis in features]
+    usable = _usable(features)
+    together = np.ones(len(features), dtype=np.int64)
+    together[usable] = group_sizes(features[usable], contact=search.contact, axes=axes)
+    told: list[str] = []
+    if size is None:
+        size, told = _common_size(together[usable], dimension=len(axes))
+    found = identify(features.loc[usable, ["frame", *axes]], contact=search.contact, size=size)
+    columns = {"cluster": -1, "particle": -1, "piece": 0}
+    features = features.assign(together=together, **columns)
+    features.loc[usable, list(columns)] = found[list(columns)]
+    features.loc[features["cluster"] < 0, ["particle", "piece"]] = (-1, 0)
+    features["border"] = _to_border(features, stack, axes)
+    blur = 0.0 if optics is None else optics.psf[0]
+    margin = search.diameter / 2 + 2 * blur
+    features, dropped = _without_cut_bodies(features, size=size, margin=margin)
+    return Bodies(features, axes, size, margin, dropped, told)
+
+
+def _usable(features: pd.DataFrame) -> Bools:
+    """Return the rows whose places are good: where a fit was tried and failed they are not."""
+    if "refined" not in features:
+        return np.ones(len(features), dtype=np.bool_)
+    tried = features["chi2"].notna().to_numpy()
+    return np.asarray(features["refined"].to_numpy(dtype=np.bool_) | ~tried)
+
+
+def _common_size(together: Ints, *, dimension: int) -> tuple[int, list[str]]:
+    """Return the most common number of touching spheres, and what was seen besides."""
+    counted = np.bincount(together)
+    groups = np.round(counted / np.maximum(np.arange(len(counted)), 1)).astype(int)
+    groups[:2] = 0
+    if not groups.any():
+        raise DegenerateClusterError(
+            f"no spheres touch: all {len(together)} found are over 1.3 contact distances apart; "
+            "correct contact or the voxel size"
+        )
+    bodies = groups.copy()
+    bodies[:dimension] = 0
+    size = int(np.argmax(bodies if bodies.any() else groups))
+    share = groups[size] / groups.sum()
+    if share >= _SURE:
+        return size, []
+    listed = ", ".join(f"{count} of {n}" for n, count in enumerate(groups) if count)
+    return size, [
+        f"clusters are taken to be of {size} spheres, the most common number; groups of touching "
+        f"spheres in all frames: {listed}; state the size to measure others"
+    ]
+
+
+def _to_border(features: pd.DataFrame, stack: Stack, axes: list[str]) -> Floats:
+    """Return how far each centre is from the nearest border of the stack, um."""
+    length = dict(zip("zyx", np.array(stack.shape[1:]) * stack.voxel, strict=True))
+    half = dict(zip("zyx", stack.voxel / 2, strict=True))
+    sides = [
+        np.minimum(features[a] + half[a], length[a] - half[a] - features[a]).to_numpy()
+        for a in axes
+    ]
+    return np.asarray(np.min(sides, axis=0), dtype=np.float64)
+
+
+def _without_cut_bodies(
+    features: pd.DataFrame, *, size: int, margin: float
+) -> tuple[pd.DataFrame, dict[int, Ints]]:
+    """Loosen bodies at the border some of whose spheres are out of view.
+
+    Their unseen light misleads the fits of the spheres that are left.
+    """
+    tracked = features[features["cluster"] >= 0]
+    bodies = tracked.groupby(["cluster", "frame"]).agg(n=("x", "size"), border=("border", "min"))
+    cut = bodies[(bodies["n"] < size) & (bodies["border"] < margin)].reset_index()
+    gone = features.set_index(["cluster", "frame"]).index.isin(
+        cut.set_index(["cluster", "frame"]).index
+    )
+    features = features.copy()
+    features.loc[gone, ["cluster", "particle", "piece"]] = (-1, -1, 0)
+    return features, {int(c): part.to_numpy() for c, part in cut.groupby("cluster")["frame"]}
+
+
+def group_sizes(features: pd.DataFrame, *, contact: float, axes: list[str]) -> Ints:
+    """Return for every row how many spheres touch in its chain, itself counted."""
+    out = np.zeros(len(features), dtype=np.int64)
+    x = features[axes].to_numpy(dtype=np.float64)
+    for rows in features.reset_index(drop=True).groupby("frame").indices.values():
+        label = touching_groups(x[rows], reach=REACH * contact, size=len(rows), smallest=1)
+        out[rows] = np.bincount(label)[label]
+    return out
+
+
+def stated_errors(bodies: Bodies) -> Floats | None:
+    """Return the median stated errors of the axes, um, where places were refined."""
+    names = [f"sigma_{axis}" for axis in bodies.axes]
+    if not set(names) <= set(bodies.features):
+        return None
+    median = bodies.features[names].median().to_numpy(dtype=np.float64)
+    return median if np.isfinite(median).all() else None
+
+
+def tracks_of(bodies: Bodies, *, exclude: Sequence[int]) -> pd.DataFrame:
+    """Return the table of tracks, clusters that are not wanted left out.
+
+    Raises
+    ------
+    DegenerateClusterError
+        If there is no cluster.
+    ValueError
+        If one to be left out does not exist, or none is left.
+    """
+    features = bodies.features
+    found = set(features.loc[features["cluster"] >= 0, "cluster"].unique().tolist())
+    if not found:
+        raise DegenerateClusterError(
+            f"no cluster of {bodies.size} touching spheres is seen in three frames or more"
+        )
+    unknown = sorted(set(exclude) - found)
+    if unknown:
+        raise ValueError(f"exclude: there is no cluster {unknown[0]}; found {sorted(found)}")
+    rows = features[(features["cluster"] >= 0) & ~features["cluster"].isin(exclude)]
+    if not len(rows):
+        raise ValueError(f"exclude: no cluster is left of {sorted(found)}")
+    table = check_tracks(
+        rows[["frame", "particle", "cluster", *bodies.axes]], source="the spheres found"
+    )
+    return table.assign(piece=rows["piece"].to_numpy())
