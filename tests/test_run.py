@@ -14,6 +14,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +25,8 @@ import perrin
 from perrin.images import stages, workers
 from perrin.images.locate import Method
 from perrin.images.parts import PartWriter, open_parts, read_parts
+from perrin.plot_images import _frame_numbers
+from perrin.results import motion_table
 
 pytest.importorskip("tifffile")
 pytest.importorskip("trackpy")
@@ -282,6 +285,19 @@ def test_all_faults_are_told_at_the_door(movie_file, counted):
     for name in (*wrong, "workers"):
         assert f"{name}: expected" in str(told.value)
     assert counted == []
+
+
+def test_uneven_times_are_those_of_the_stack(movie_file, learned):
+    """A microscope that waits now and then: every step has its own duration."""
+    with perrin.open_stack(movie_file[0]) as stack:
+        times = stack.times + np.array([0, 0, 0, 5, 5, 9, 9, 9]) * DT + 100.0
+        uneven = replace(stack, times=times)
+        report = perrin.analyze_stack(uneven, **learned, frames=(1, None))
+    for result in report.clusters:
+        np.testing.assert_allclose(result.motion.time, times[1:] - times[1], rtol=1e-12)
+    table = motion_table(report)
+    assert table["frame"].tolist() == 2 * list(range(FRAMES - 1))
+    np.testing.assert_array_equal(_frame_numbers(report, report.clusters[0].motion), range(1, 8))
 
 
 def test_a_movie_of_pairs_gives_rods():

@@ -237,7 +237,8 @@ def measure_table(
     first = int(table["frame"].min())
     table["frame"] -= first
     if conditions.times is not None:
-        conditions = replace(conditions, times=conditions.times[first:])
+        since = conditions.times[first:] - conditions.times[first]
+        conditions = replace(conditions, times=since)
     bodies, rods, failures = _fitted(table, labels, conditions)
     if improved is not None:
         motions = improved({b.cluster: (b.motion, b.frames + first) for b in bodies})

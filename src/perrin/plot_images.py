@@ -357,7 +357,10 @@ def _first_frame(report: Report) -> int:
 
 def _frame_numbers(report: Report, motion: RigidMotion | RodMotion) -> Ints:
     """Return the stack's frame of every row of a motion."""
-    return np.rint(motion.time / motion.dt).astype(np.int64) + _first_frame(report)
+    frames = imaging_of(report).frames
+    times = frames["time"].to_numpy(dtype=np.float64)
+    nearest = np.searchsorted((times[1:] + times[:-1]) / 2, motion.time + _start(report))
+    return np.asarray(frames["frame"].to_numpy(dtype=np.int64)[nearest])
 
 
 def _start(report: Report) -> float:
