@@ -70,12 +70,12 @@ def main():
     for _ in range(args.crowds):
         places = packed(args.spheres, rng)
         movie, places = rendered(places, -1.2 if args.cut else 1.8, int(rng.integers(2**31)))
-        search = Search(**asked)
+        search = Search(**asked, crowds=True)
         sample = sample_frames(movie, search, range(movie.shape[0]))
         optics = choose_method(movie, search, sample).optics
         for refine in (None, "model"):
             start = time.perf_counter()
-            table = perrin.locate(movie, refine=refine, optics=optics, **asked)
+            table = perrin.locate(movie, refine=refine, optics=optics, crowds=True, **asked)
             seconds += [time.perf_counter() - start] if refine else []
             missed, false, off_here = errors(table, places)
             lost[refine].append([missed, false, len(places)])

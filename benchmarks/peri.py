@@ -121,11 +121,11 @@ def main():
     first = zyx(perrin.locate(movie, refine=None, **asked))
     report("found first", first, listed)
     start = time.perf_counter()
-    search = Search(**asked)
+    search = Search(**asked, crowds=True)
     sample = sample_frames(movie, search, range(movie.shape[0]))
     optics = choose_method(movie, search, sample).optics
     learned = time.perf_counter()
-    table = perrin.locate(movie, optics=optics, **asked)
+    table = perrin.locate(movie, optics=optics, crowds=True, **asked)
     seconds = time.perf_counter() - learned
     report("refined", zyx(table), listed)
     print(optics)

@@ -90,7 +90,7 @@ def test_a_crowd_is_located_within_the_stated_errors(pack):
     """
     places, frame = pack
     stack, asked = Movie(frame), {"diameter": 1.03 * DIAMETER, "contact": DIAMETER}
-    search = Search(**asked)
+    search = Search(**asked, crowds=True)
     sample = sample_frames(stack, search, range(stack.shape[0]))
     optics = choose_method(stack, search, sample).optics
     got = np.array([optics.diameter, *optics.psf])
@@ -99,7 +99,7 @@ def test_a_crowd_is_located_within_the_stated_errors(pack):
     assert np.all(np.abs(got - [DIAMETER, *width]) < 4 * np.array(optics.stderr))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        table = perrin.locate(stack, optics=optics, **asked)
+        table = perrin.locate(stack, optics=optics, crowds=True, **asked)
     assert len(table) == len(places)
     assert table["refined"].all()
     off = normal(table, places)
@@ -150,11 +150,28 @@ def test_spheres_that_the_border_cuts_do_not_mislead(pack):
     end = (np.array(frame.shape) - low - 1) * VOXEL
     inside = np.all((part >= 0) & (part <= end[::-1]), axis=1)
     table = perrin.locate(
-        Movie(frame[8:, 10:, 10:]), diameter=DIAMETER, contact=DIAMETER, optics=OPTICS
+        Movie(frame[8:, 10:, 10:]),
+        diameter=DIAMETER,
+        contact=DIAMETER,
+        optics=OPTICS,
+        crowds=True,
     )
     off = normal(table, part[inside])
     assert len(table) == inside.sum()
     assert np.mean(off**2) == pytest.approx(1.0, abs=4 * np.sqrt(2 / off.size))
+
+
+def test_crowds_stay_where_they_are_found_unless_asked_for(pack):
+    """No seconds of work that nobody asked for; what is not refined says so, and why."""
+    places, frame = pack
+    asked = {"diameter": DIAMETER, "contact": DIAMETER}
+    with pytest.warns(perrin.PrecisionWarning, match=r"crowds=True refines"):
+        table = perrin.locate(Movie(frame), **asked)
+    first = perrin.locate(Movie(frame), refine=None, **asked)
+    np.testing.assert_array_equal(table[["x", "y", "z"]], first[["x", "y", "z"]])
+    assert not table["refined"].any()
+    assert set(table["reason"]) == {"in a crowd"}
+    assert table[["sigma_x", "sigma_y", "sigma_z", "chi2"]].isna().all(axis=None)
 
 
 def test_the_normal_equations_are_those_of_finite_differences(pack):
@@ -200,7 +217,7 @@ def test_a_real_stack_of_dark_spheres():
     first = perrin.locate(stack, refine=None, **asked)[["x", "y", "z"]]
     assert np.sum(cdist(listed, first).min(axis=1) < 1) >= 20
     optics = perrin.Optics(11.17, (3.66, 1.2), CameraNoise(0.09, 12.7))
-    table = perrin.locate(stack, optics=optics, **asked)
+    table = perrin.locate(stack, optics=optics, crowds=True, **asked)
     found = table[["x", "y", "z"]].to_numpy()
     off = cdist(listed, found).min(axis=1)
     assert table["refined"].all()

@@ -21,7 +21,7 @@ from perrin.images.image_fit import (
 from perrin.images.optics import CrowdSample, Optics, Sample, fit_samples
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Iterable, Iterator, Sequence
     from typing import TypeAlias
 
     import pandas as pd
@@ -40,7 +40,7 @@ _LEARN_CROWDS = 2  # pieces of crowds the optics are learned from where there ar
 _PIECE = 30  # spheres in such a piece
 
 # Why a sphere stays where it was found.
-_HIDDEN = "no voxels of its own"
+_CROWDED, _HIDDEN = "in a crowd", "no voxels of its own"
 NO_FLAT_MODEL = (
     "the model of the image is that of a volume; in this 2-D movie places are filtered centroids: "
     "pass refine=None, or refine='trackpy' where spheres touch"
@@ -79,6 +79,8 @@ class Search:
         Least integrated brightness of a sphere; None is the widest gap.
     border : bool
         Also spheres cut by the stack's border.
+    crowds : bool
+        Also refine spheres in chains of over 16.
     """
 
     diameter: float
@@ -87,6 +89,7 @@ class Search:
     percentile: float = 95.0
     minmass: float | None = None
     border: bool = True
+    crowds: bool = False
 
     def spots(self, frame: Floats, voxel: _Voxel) -> Features:
         """Return the spots of a frame, noise among them."""
@@ -170,8 +173,10 @@ class Method:
 
     def _columns(self, frame: Floats, found: Features, voxel: _Voxel) -> dict[str, NDArray[Any]]:
         contact = self.search.contact
-        if self.refine == "model" and self.optics is not None:
+        if self.refine == "model":
             columns = _by_model(frame, found, contact, self.optics, voxel)
+            if self.optics is None or not self.search.crowds:
+                return columns
             return _with_crowds(columns, frame, found, self.search, self.optics, voxel)
         centers = found.centers
         if self.refine == "trackpy":
@@ -230,7 +235,7 @@ def choose_method(
     if search.minmass is None:
         masses = [seen.spots.mass for seen in sample]
         search = replace(search, minmass=mass_cut(np.concatenate([np.empty(0), *masses])))
-    if refine == "model" and optics is None:
+    if refine == "model" and optics is None and not _crowded(sample, search):
         optics = fit_optics(sample, search, voxel=_voxel(stack))
     return Method(search, refine, optics if refine == "model" else None)
 
@@ -246,6 +251,7 @@ def locate(
     minmass: float | None = None,
     percentile: float = 95.0,
     border: bool = True,
+    crowds: bool = False,
     frames: Iterable[int] | None = None,
 ) -> pd.DataFrame:
     """Find every sphere of a stack, and refine its place by the model of its image.
@@ -273,6 +279,9 @@ def locate(
     border : bool
         Also spheres whose centre is inside the stack but which its border cuts; without them their
         neighbours' light is misread, which `chi2` shows.
+    crowds : bool
+        Also refine crowds, see the notes: some seconds for each of them in a frame. Otherwise they
+        stay where they were found.
     frames : iterable of int, optional
         Frames to do; default all.
 
@@ -296,16 +305,16 @@ def locate(
     -----
     PrecisionWarning
         Where a frame cannot be read: it is left out. Where the masses show no gap between spheres
-        and noise. Where a sphere has no voxels to itself and stays where it was found. Where the
-        model is asked for in a 2-D movie.
+        and noise. Where spheres stay where they were found: those of crowds, and what has no
+        voxels to itself. Where the model is asked for in a 2-D movie.
 
     Notes
     -----
-    More than 16 spheres in a chain, neighbours within 1.6 times `contact`, are a crowd, which is
-    fitted until its image has nothing left over: spots that turn out to be no spheres are left out,
-    and spheres that were missed are added, with a `mass` of NaN. Its `chi2` is that of each
-    sphere's own voxels. Its background has a level of its own in every plane; what shines there
-    without being a sphere is misread as one if it is bright enough.
+    More than 16 spheres in a chain, neighbours within 1.6 times `contact`, are a crowd. With
+    `crowds` it is fitted until its image has nothing left over: spots that turn out to be no
+    spheres are left out, and spheres that were missed are added, with a `mass` of NaN. Its `chi2`
+    is that of each sphere's own voxels. Its background has a level of its own in every plane; what
+    shines there without being a sphere is misread as one if it is bright enough.
 
     Examples
     --------
@@ -323,7 +332,7 @@ def locate(
     >>> found[["x", "y", "z"]].round(1).values.tolist()
     [[3.2, 3.1, 3.0]]
     """
-    search = Search(diameter, contact, dark, percentile, minmass, border)
+    search = Search(diameter, contact, dark, percentile, minmass, border, crowds)
     check_search(stack, search, refine)
     if refine == "model" and is_flat(stack):
         refine = None
@@ -368,7 +377,8 @@ def fit_optics(sample: Sequence[Sampled], search: Search, *, voxel: _Voxel) -> O
         found = search.spheres(seen.spots)
         groups, crowded = groups_and_crowds(found.centers, contact=search.contact)
         samples += [_sample(seen.frame, found, group, search.contact) for group in groups]
-        crowds += [_piece(seen.frame, found, group, search, voxel) for group in crowded]
+        if search.crowds:
+            crowds += [_piece(seen.frame, found, group, search, voxel) for group in crowded]
     most = _LEARN_GROUPS
     if sum(len(s.centers) for s in samples) < sum(len(s.centers) for s in crowds):
         samples, most = crowds, _LEARN_CROWDS
@@ -376,28 +386,59 @@ def fit_optics(sample: Sequence[Sampled], search: Search, *, voxel: _Voxel) -> O
     return fit_samples(learned, diameter=search.diameter, voxel=voxel)
 
 
+def _crowded(sample: Sequence[Sampled], search: Search) -> bool:
+    """Return whether most spheres are in crowds that are not to be refined."""
+    inside = outside = 0
+    for seen in sample:
+        found = search.spheres(seen.spots).centers
+        groups, crowds = groups_and_crowds(found, contact=search.contact)
+        inside, outside = inside + sum(map(len, crowds)), outside + sum(map(len, groups))
+    return not search.crowds and inside > outside
+
+
 def _by_model(
-    frame: Floats, found: Features, contact: float, optics: Optics, voxel: _Voxel
+    frame: Floats, found: Features, contact: float, optics: Optics | None, voxel: _Voxel
 ) -> dict[str, NDArray[Any]]:
     """Fit every group of touching spheres; return the columns of the table."""
-    image = optics.image(voxel)
     centers, sigma = found.centers.copy(), np.full_like(found.centers, np.nan)
-    chi2, reason = np.full(len(centers), np.nan), np.full(len(centers), "", dtype=object)
-    groups, _ = groups_and_crowds(found.centers, contact=contact)
-    for group in groups:
+    chi2, reason = np.full(len(centers), np.nan), np.full(len(centers), _CROWDED, dtype=object)
+    for group, fit in _fits(frame, found, contact, optics, voxel) if optics is not None else ():
+        if fit is None:
+            reason[group] = _HIDDEN
+            continue
+        chi2[group] = fit.chi2
+        reason[group] = fit.doubts
+        good = fit.doubts == ""
+        centers[group[good]] = fit.centers[good]
+        sigma[group[good]] = fit.sigma[good]
+    columns = _places(centers) | {"mass": found.mass} | _places(sigma, "sigma_")
+    return columns | {"chi2": chi2, "refined": reason == "", "reason": reason}
+
+
+class _GroupFit(NamedTuple):
+    """Refined spheres of one group: places and errors (n, 3), and why one is not to be believed."""
+
+    centers: Floats
+    sigma: Floats
+    chi2: float
+    doubts: NDArray[np.object_]
+
+
+def _fits(
+    frame: Floats, found: Features, contact: float, optics: Optics, voxel: _Voxel
+) -> Iterator[tuple[Ints, _GroupFit | None]]:
+    """Yield every group of touching spheres with its fit; None without enough voxels."""
+    image = optics.image(voxel)
+    for group in groups_and_crowds(found.centers, contact=contact)[0]:
         sample = _sample(frame, found, group, contact)
         window = cut_window(frame, image, sample.centers, others=sample.others)
         if not window.shows(len(group)):
-            reason[group] = _HIDDEN
+            yield group, None
             continue
         fit = fit_window(window, image, optics.noise, FreeCenters(sample.centers))
-        chi2[group] = fit.chi2
-        reason[group] = _doubts(fit, sample.centers, optics.diameter / 4)
-        good = reason[group] == ""
-        centers[group[good]] = fit.centers[good]
-        sigma[group[good]] = np.sqrt(np.diag(fit.covariance)).reshape(-1, 3)[good]
-    columns = _places(centers) | {"mass": found.mass} | _places(sigma, "sigma_")
-    return columns | {"chi2": chi2, "refined": reason == "", "reason": reason}
+        sigma = np.sqrt(np.diag(fit.covariance)).reshape(-1, 3)
+        doubts = _doubts(fit, sample.centers, optics.diameter / 4)
+        yield group, _GroupFit(fit.centers, sigma, fit.chi2, doubts)
 
 
 def _doubts(fit: ImageFit, start: Floats, furthest: float) -> NDArray[np.object_]:
@@ -459,8 +500,9 @@ def _warn_of_untried(table: pd.DataFrame) -> None:
     untried = int(table["chi2"].isna().sum())
     if untried:
         warnings.warn(
-            f"{untried} of {len(table)} spheres have no voxels to themselves: they stay where "
-            "found, perhaps a tenth of a sphere off; the column `refined` says which",
+            f"{untried} of {len(table)} spheres touch in chains of over 16 (crowds=True refines "
+            "them) or have no voxels to themselves: they stay where found, some hundredths of a "
+            "sphere off, up to a tenth; the column `reason` says which",
             PrecisionWarning,
             stacklevel=3,
         )

@@ -130,7 +130,8 @@ def analyze_stack(
     >>> len(report.clusters), len(report.clusters[0].motion.template)
     (1, 3)
     """
-    search = Search(diameter, contact, dark, percentile, minmass, border)
+    # Clusters that meet may be a crowd for some frames.
+    search = Search(diameter, contact, dark, percentile, minmass, border, crowds=True)
     sphere = contact if viscosity is not None and temperature is not None else None
     known = (None, viscosity, temperature, sphere, noise, exposure, drift)
     conditions = Conditions(stack.dt, *known, times=_uneven(stack))
