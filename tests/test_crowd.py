@@ -163,7 +163,7 @@ def test_spheres_that_the_border_cuts_do_not_mislead(pack):
 
 def test_crowds_stay_where_they_are_found_unless_asked_for(pack):
     """No seconds of work that nobody asked for; what is not refined says so, and why."""
-    places, frame = pack
+    frame = pack[1]
     asked = {"diameter": DIAMETER, "contact": DIAMETER}
     with pytest.warns(perrin.PrecisionWarning, match=r"crowds=True refines"):
         table = perrin.locate(Movie(frame), **asked)
