@@ -7,6 +7,7 @@ import pytest
 
 import perrin
 from perrin.identity import _table, settle_identity
+from perrin.rotations import exp_map
 
 BODIES = {n: perrin.Cluster.touching(n, 2.45) for n in (3, 4, 5, 6, 7)}
 SLOW = 4.9e-3 * 0.73  # D_R dt of the paper's experiment
@@ -237,3 +238,21 @@ def test_the_table_of_seatings_is_complete():
     table = _table(3, 3, 2)
     assert len({tuple(row) for row in table.tolist()}) == 18
     assert ((table >= 0).sum(axis=1) == 2).all()
+
+
+@pytest.mark.parametrize(
+    ("degrees", "doubted"), [(30, False), (45, False), (60, True), (75, False)]
+)
+def test_a_leap_of_a_quiet_body_is_judged_by_its_own_size(degrees, doubted):
+    """However small the usual steps: 60 degrees one way or 60 the other, nobody can tell.
+
+    75 degrees are taken for the 45 that are left of 120. At 60 labels that last decide.
+    """
+    body = BODIES[4].positions
+    turn = exp_map(np.deg2rad(degrees) * body[0] / np.linalg.norm(body[0]))
+    rng = np.random.default_rng(degrees)
+    x = np.concatenate([np.stack([body] * 20), np.stack([body @ turn.T] * 20)])
+    x = x + 0.01 * rng.normal(size=x.shape)
+    found = settle_identity(shuffled(x, rng)[0], labelled=False)
+    assert found.cuts.tolist() == ([20] if doubted else [])
+    assert settle_identity(x).cuts.size == 0 or degrees > 60

@@ -26,6 +26,8 @@ _ALL, _MODELS = 6, 300
 # Log-odds: an assignment is settled when the next best is a hundred times less likely, and lasting
 # labels are trusted e^10 times more than an exchange of them.
 _DOUBT, _TRUST = float(np.log(100.0)), 10.0
+# A step of over four standard deviations of an axis (squared) counts as one of four.
+_LEAP = 16.0
 # A step of under 0.4 of the least angle between two assignments cannot be mistaken.
 _SHORT = 0.4
 _BATCH = 100_000
@@ -113,7 +115,8 @@ def settle_identity(
     -----
     The likelihood of an assignment is exp(-S/(2 sigma^2) - theta^2/(2 s^2)) with S the squared
     residual of the fit, sigma^2 from its median, theta the angle of the step and s^2 from the
-    median step, growing with the time across gaps. All assignments are tried for up to 6
+    median step, growing with the time across gaps, and at least theta^2/16 of the least turn: a
+    leap is not judged by the law of small steps. All assignments are tried for up to 6
     particles; beyond, linear assignment and rigid fit in turn, from many orientations.
 
     Examples
@@ -721,9 +724,13 @@ def _costs(lists: _Lists, chain: Ints, spread: Floats, sigma2: float) -> Floats:
     flat = lists.rotation[chain].reshape(len(chain), -1, d * d)
     trace = flat[:-1] @ np.swapaxes(flat[1:], -1, -2)
     half = np.sqrt(np.clip((d - trace) / 4, 0.0, 1.0))
-    angle = 2 * np.arcsin(half)
-    cost: Floats = angle**2 / (2 * spread[:, None, None])
-    return cost + lists.misfit[chain[1:]][:, None, :] / (2 * sigma2)
+    square = (2 * np.arcsin(half)) ** 2
+    misfit = lists.misfit[chain[1:]][:, None, :]
+    # A body that leaps follows no law of its small steps: those of the leap's own size decide.
+    least = np.where(np.isfinite(misfit), square, np.inf).min(axis=2, keepdims=True)
+    wide = np.maximum(spread[:, None, None], least / _LEAP)
+    cost: Floats = square / (2 * wide)
+    return cost + misfit / (2 * sigma2)
 
 
 def _differ(column: Ints) -> Bools:
