@@ -276,7 +276,8 @@ def run(
                 scheduler=scheduler,
                 progress=progress,
             )
-        complete_run(report, output)
+            progress(0, 0, "writing the report")
+            complete_run(report, output)
         _show(report, output)
 
 
@@ -300,18 +301,12 @@ def _kept_told(output: Path) -> Iterator[None]:
 def _progress() -> Iterator[Callable[[int, int, str], None]]:
     """Give a function that shows how far the work is, how fast, and how long it will take."""
     from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeRemainingColumn,
-    )
+    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
-        MofNCompleteColumn(),
+        TextColumn("{task.fields[count]}"),
         TextColumn("{task.fields[rate]}"),
         TimeRemainingColumn(),
     )
@@ -320,10 +315,15 @@ def _progress() -> Iterator[Callable[[int, int, str], None]]:
 
         def tell(done: int, total: int, title: str) -> None:
             if title not in tasks:
-                tasks[title] = bar.add_task(title, total=total or None, completed=done, rate="")
+                for task in bar.tasks:  # what came before is over
+                    bar.update(task.id, total=task.total or 1, completed=task.total or 1)
+                tasks[title] = bar.add_task(
+                    title, total=total or None, completed=done, count="", rate=""
+                )
             task = bar.tasks[tasks[title]]
             rate = f"{task.speed:.2g} frames/s" if task.speed else ""
-            bar.update(tasks[title], completed=done, total=total or None, rate=rate)
+            count = f"{done}/{total}" if total else ""
+            bar.update(task.id, completed=done, total=total or None, count=count, rate=rate)
 
         yield tell
 
