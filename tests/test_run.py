@@ -287,7 +287,7 @@ def test_all_faults_are_told_at_the_door(movie_file, counted):
     assert counted == []
 
 
-def test_uneven_times_are_those_of_the_stack(movie_file, learned):
+def test_uneven_times_are_those_of_the_stack(tmp_path, movie_file, learned):
     """A microscope that waits now and then: every step has its own duration."""
     with perrin.open_stack(movie_file[0]) as stack:
         times = stack.times + np.array([0, 0, 0, 5, 5, 9, 9, 9]) * DT + 100.0
@@ -297,7 +297,53 @@ def test_uneven_times_are_those_of_the_stack(movie_file, learned):
         np.testing.assert_allclose(result.motion.time, times[1:] - times[1], rtol=1e-12)
     table = motion_table(report)
     assert table["frame"].tolist() == 2 * list(range(FRAMES - 1))
+    assert any("run from 0.73 to 4.38 s: the estimates take" in text for text in report.warnings)
+    np.testing.assert_allclose(report.clusters[0].msd.lagtime, DT * np.arange(1, FRAMES - 1))
+    perrin.write_run(report, tmp_path / "run")
+    assert perrin.load_run(tmp_path / "run").to_dict() == report.to_dict()
     np.testing.assert_array_equal(_frame_numbers(report, report.clusters[0].motion), range(1, 8))
+
+
+def test_a_larger_body_is_no_cluster_of_the_size_looked_for():
+    """Beside a trimer a bipyramid: neither threes of it nor a doubt about its speed are told."""
+    bodies = [perrin.Cluster.touching(3, DIAMETER), perrin.Cluster.touching(5, DIAMETER)]
+    truth = [
+        perrin.simulate_motion(b, D_R=5e-3, D_T=0.01, dt=DT, n_frames=FRAMES, rng=k)
+        for k, b in enumerate(bodies)
+    ]
+    movie = perrin.render_stack(
+        truth,
+        centers=CENTERS,
+        voxel=(0.25, 0.2, 0.2),
+        shape=(40, 70, 70),
+        diameter=DIAMETER,
+        psf=(0.4, 0.15, 0.15),
+        photons=40,
+        background=3,
+        gain=3,
+        rng=1,
+    )
+    by_default = perrin.analyze_stack(movie, **SEARCH)
+    assert [len(c.motion.template) for c in by_default.clusters] == [5]  # the larger of equals
+    report = perrin.analyze_stack(movie, **SEARCH, size=3)
+    (only,) = report.clusters
+    assert len(only.motion.template) == 3
+    assert np.linalg.norm(only.motion.center[0] - CENTERS[0]) < 0.5
+    told = " ".join(report.warnings)
+    assert "larger bodies are left out (touching spheres: 5 in 8 frames)" in told
+    assert "two clusters within" not in told
+    assert "refused" not in told
+
+
+def test_voxels_without_a_number_make_a_frame_unreadable(movie_file, learned):
+    """A NaN is neither bright nor dark; the frame is a gap and its reason is told."""
+    with perrin.open_stack(movie_file[0]) as stack:
+        frames = np.stack(list(stack)).astype(np.float32)
+    frames[3, 2, 5, 7] = np.nan
+    movie = perrin.open_stack(frames, voxel=(0.25, 0.2, 0.2), dt=DT)
+    report = perrin.analyze_stack(movie, **learned)
+    assert report.clusters[0].motion.fitted.tolist() == [0, 1, 2, 4, 5, 6, 7]
+    assert any("frame 3 has 1 voxels without a number" in text for text in report.warnings)
 
 
 def test_a_movie_of_pairs_gives_rods():
@@ -457,6 +503,9 @@ def test_the_page_tells_the_truth():
     ("options", "status", "told"),
     [
         ([], 2, "no voxel size along z, y, x: pass voxel=(z, y, x) in um; no times of its"),
+        (["--voxel", "0.25,0.2,0.2"], 2, "no times of its 3 frames: pass dt= in s (here: --dt)"),
+        (["--voxel", "0.25,0.2,0.2", "--dt", "0.7", "--optics", "2.45"], 2, "--optics: expected"),
+        (["--voxel", "0.25,0.2,0.2", "--dt", "0.7"], 1, "no spheres to learn the optics from"),
         (["--voxel", "0.25,0.2,0.2", "--dt", "0.7", "--refine", "best"], 2, "--refine: expected"),
         (
             ["--voxel", "0.25,0.2,0.2", "--dt", "0.7", "--exclude", "a"],
@@ -480,10 +529,10 @@ def test_what_cannot_be_is_said_in_one_line(tmp_path, capsys, options, status, t
     assert stopped.value.code == status
     assert f"perrin: {path}: {told}" in error or f"perrin: {told}" in error
     assert "Traceback" not in error
-    assert (tmp_path / "run").exists() == (status == 1)
+    assert "the same command goes on" not in error
 
 
-def test_workers_that_are_not_there_are_told(monkeypatch, movie_file):
+def test_workers_that_are_not_there_are_told(tmp_path, monkeypatch, movie_file):
     """Without dask the command to install it; without a scheduler, its address."""
     monkeypatch.setitem(sys.modules, "distributed", None)
     with perrin.open_stack(movie_file[0]) as stack:
@@ -492,8 +541,12 @@ def test_workers_that_are_not_there_are_told(monkeypatch, movie_file):
         monkeypatch.undo()
         pytest.importorskip("distributed")
         monkeypatch.setattr(workers, "_TIMEOUT", 0.3)
+        elsewhere = SEARCH | {"refine": None, "keep": tmp_path / "run"}
         with pytest.raises(OSError, match=r"tcp://127.0.0.1:9"):
-            perrin.analyze_stack(stack, **SEARCH, refine=None, scheduler="tcp://127.0.0.1:9")
+            perrin.analyze_stack(stack, **elsewhere, scheduler="tcp://127.0.0.1:9")
+        with pytest.raises(ValueError, match="expected an address like tcp://node7:8786, got 'no'"):
+            perrin.analyze_stack(stack, **elsewhere, scheduler="no")
+        assert not (tmp_path / "run").exists()
 
 
 def test_a_file_out_of_a_workers_reach_is_no_bad_frame(tmp_path, movie_file):

@@ -534,7 +534,7 @@ def test_what_cannot_be_answered_is_refused():
         diffusion_tensor(tracked(1, n_frames=10))
     with pytest.raises(TooFewFramesError, match="needs 50 in all"):
         coupled_tensor(tracked(1, n_frames=40))
-    with pytest.raises(TooFewFramesError, match=r"at least 1 a motion.*2 of every motion"):
+    with pytest.raises(TooFewFramesError, match=r"1 in the shortest motion.*2 of every motion"):
         diffusion_tensor([motion, tracked(1, n_frames=2)])
     truth = simulate_motion(BODY, D_R=planted(), dt=1.0, n_frames=60, rng=1)
     with pytest.raises(ValueError, match="pool them apart"):

@@ -54,6 +54,10 @@ class TrackTableError(ValueError):
         self.faults = faults
 
 
+class NoSpheresError(ValueError):
+    """The images show no spheres that could be measured in the way that was asked for."""
+
+
 class IdentityError(ValueError):
     """Which particle is which cannot be told: frames are too far apart."""
 

@@ -417,7 +417,7 @@ class _Failure(NamedTuple):
 
     @property
     def told(self) -> str:
-        return f"cluster {self.name} was left out: {self.error}"
+        return f"cluster {self.name} was left out: {str(self.error).removeprefix('motion 0: ')}"
 
 
 class _Tracks(NamedTuple):

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from perrin.diffusion import DiffusionEstimate
+    from perrin.images.optics import Optics
+    from perrin.images.stacks import Stack
     from perrin.mobility import Mobility
     from perrin.predictions import Compared
     from perrin.results import ClusterResult, Pooled, Report
@@ -213,6 +215,13 @@ def run(
     percentile: Annotated[
         float, typer.Option(help="Of voxels too dim for a sphere's middle; lower in full fields.")
     ] = 95.0,
+    optics: Annotated[
+        str | None,
+        typer.Option(
+            help="How a sphere is seen, learned if left out: diameter,psf_z,psf (um), and the "
+            "noise's gain,floor (a voxel's variance is gain times its light plus floor)."
+        ),
+    ] = None,
     noise: Noise = "joint",
     exposure: Exposure = None,
     drift: Drift = False,
@@ -238,11 +247,11 @@ def run(
     from perrin.report import complete_run
     from perrin.results import check_resumable
 
-    with _kept_told(output), _told():
+    with _told(), _kept_told(output):
         check_resumable(output, parts="located", overwrite=overwrite)
         with warnings.catch_warnings(record=True) as said:
             warnings.simplefilter("always", perrin.PrecisionWarning)
-            movie = perrin.open_stack(
+            movie = _opened(
                 stack,
                 voxel=None if voxel is None else _numbers("--voxel", voxel),
                 dt=dt,
@@ -262,6 +271,7 @@ def run(
                 frames=_slice(frames),
                 exclude=_whole_numbers("--exclude", exclude),
                 refine=_refine(refine),
+                optics=_optics(optics),
                 dark=dark,
                 minmass=minmass,
                 percentile=percentile,
@@ -281,20 +291,47 @@ def run(
         _show(report, output)
 
 
+def _opened(path: Path, **given: object) -> Stack:
+    """Open a stack; name the options where something is missing."""
+    import perrin
+
+    try:
+        return perrin.open_stack(path, **given)  # type: ignore[arg-type]
+    except ValueError as fault:
+        options = [f"--{n.replace('_', '-')}" for n in given if f"{n}=" in str(fault)]
+        hint = f" (here: {', '.join(options)})" if options else ""
+        raise ValueError(f"{fault}{hint}") from None
+
+
+def _optics(text: str | None) -> Optics | None:
+    """Read diameter, point spread along z and in the plane, gain and floor of the noise."""
+    from perrin.images.image_fit import CameraNoise
+    from perrin.images.optics import Optics
+
+    if text is None:
+        return None
+    values = _numbers("--optics", text)
+    if not isinstance(values, list) or len(values) != 5:
+        raise ValueError(f"--optics: expected diameter,psf_z,psf,gain,floor, got {text!r}")
+    diameter, psf_z, psf, gain, floor = values
+    return Optics(diameter, (psf_z, psf), CameraNoise(gain, floor))
+
+
 @contextmanager
 def _kept_told(output: Path) -> Iterator[None]:
-    """Say, when a run stops early, that finished frames are kept."""
+    """Say, when a run is stopped from outside, that finished frames are kept."""
     try:
         yield
-    except BaseException as stop:
-        if (output / "located").is_dir() and not (output / "run.json").exists():
+    except (OSError, KeyboardInterrupt) as stop:
+        if isinstance(stop, OSError):
+            print(f"perrin: {_one_line(stop)}", file=sys.stderr)
+        kept = any((output / "located").glob("part-*"))
+        if kept and not (output / "run.json").exists():
             print(
                 f"Finished frames are kept in {output}: the same command goes on from there.",
                 file=sys.stderr,
             )
-        if isinstance(stop, KeyboardInterrupt):
-            raise typer.Exit(130) from None
-        raise
+        raise typer.Exit(2 if isinstance(stop, OSError) else 130) from None
 
 
 @contextmanager
@@ -525,7 +562,14 @@ def convert(
 @contextmanager
 def _told() -> Iterator[None]:
     """Say an error in one line; exit status 1: the data cannot answer, 2: the input is wrong."""
-    from perrin import DegenerateClusterError, IdentityError, TooFewFramesError
+    import perrin
+
+    no_answer = (
+        perrin.DegenerateClusterError,
+        perrin.IdentityError,
+        perrin.NoSpheresError,
+        perrin.TooFewFramesError,
+    )
 
     try:
         yield
@@ -535,8 +579,7 @@ def _told() -> Iterator[None]:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except (ValueError, OSError, ImportError) as error:
         print(f"perrin: {_one_line(error)}", file=sys.stderr)
-        unanswerable = isinstance(error, DegenerateClusterError | IdentityError | TooFewFramesError)
-        raise typer.Exit(1 if unanswerable else 2) from None
+        raise typer.Exit(1 if isinstance(error, no_answer) else 2) from None
 
 
 def _one_line(error: Exception) -> str:

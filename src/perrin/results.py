@@ -6,7 +6,7 @@ import json
 import os
 import shutil
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -28,6 +28,9 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     import pandas as pd
+
+
+EVEN = 5e-4  # frames that are off an even grid by less than this share of dt are on it
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,12 +73,12 @@ class ClusterResult:
     @cached_property
     def msad(self) -> LagCurve:
         """The MSAD averaged over the particles' directions."""
-        return msad(self.motion)
+        return msad(counted(self.motion))
 
     @cached_property
     def msd(self) -> LagCurve:
         """The MSD of the centre."""
-        return msd(self.motion)
+        return msd(counted(self.motion))
 
     @property
     def phi2_measured(self) -> float:
@@ -439,6 +442,14 @@ def perp_text(rod: RodResult) -> str:
     """Return a rod's coefficients as one line."""
     shown = with_error(rod.D_perp.value, rod.D_perp.stderr)
     return f"rod {rod.name}: D_perp = {shown} {rod.D_perp.unit}; {rod.D_T}"
+
+
+def counted(motion: RigidMotion) -> RigidMotion:
+    """Return a motion of every frame with uneven times as one of even times, for lags in frames."""
+    even = np.asarray(motion.dt * np.arange(len(motion.time)), dtype=np.float64)
+    if np.all(np.abs(motion.time - motion.time[0] - even) <= EVEN * motion.dt):
+        return motion
+    return replace(motion, time=even)
 
 
 def predicted_noise(motion: RigidMotion) -> NoiseFloor:

@@ -448,8 +448,8 @@ def _check_choices(
     counts = [len(m.steps()[0]) for m in motions]
     if sum(counts) < needed or min(counts) < 2:
         raise TooFewFramesError(
-            f"{sum(counts)} steps between poses, at least {min(counts)} a motion: a tensor needs "
-            f"{needed} in all and 2 of every motion",
+            f"{sum(counts)} steps between poses, {min(counts)} in the shortest motion: a tensor "
+            f"needs {needed} in all and 2 of every motion",
             sum(m.fitted.size for m in motions),
         )
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from perrin._arrays import DegenerateClusterError
+from perrin._arrays import DegenerateClusterError, NoSpheresError
 from perrin.files import check_tracks
 from perrin.grouping import identify
 from perrin.linking import touching_groups
@@ -75,16 +75,16 @@ def find_bodies(
 
     Raises
     ------
-    DegenerateClusterError
+    NoSpheresError, DegenerateClusterError
         If nothing was found, or no spheres touch.
     """
-    if not len(features):
-        raise DegenerateClusterError(
-            "no particles were found in any frame: look at minmass, diameter, and whether the "
-            "spheres are dark"
+    usable = _usable(features)
+    if not usable.any():
+        raise NoSpheresError(
+            f"no particles: {len(features)} places were found and none of them shows a sphere; "
+            "look at diameter and minmass, and whether the spheres are dark (--dark)"
         )
     axes = [axis for axis in "xyz" if axis in features]
-    usable = _usable(features)
     together = np.ones(len(features), dtype=np.int64)
     together[usable] = group_sizes(features[usable], contact=search.contact, axes=axes)
     told: list[str] = []
@@ -94,12 +94,31 @@ def find_bodies(
     columns = {"cluster": -1, "particle": -1, "piece": 0}
     features = features.assign(together=together, **columns)
     features.loc[usable, list(columns)] = found[list(columns)]
+    features, more = _without_larger(features, size=size)
     features.loc[features["cluster"] < 0, ["particle", "piece"]] = (-1, 0)
     features["border"] = _to_border(features, stack, axes)
     blur = 0.0 if optics is None else optics.psf[0]
     margin = search.diameter / 2 + 2 * blur
     features, dropped = _without_cut_bodies(features, size=size, margin=margin)
-    return Bodies(features, axes, size, margin, dropped, told)
+    return Bodies(features, axes, size, margin, dropped, told + more)
+
+
+def _without_larger(features: pd.DataFrame, *, size: int) -> tuple[pd.DataFrame, list[str]]:
+    """Loosen what stands in a larger group in most of its frames: a part of another body."""
+    tracked = features[features["cluster"] >= 0]
+    usual = tracked.groupby(["cluster", "frame"])["together"].max().groupby("cluster").median()
+    larger = usual[usual > size]
+    if not len(larger):
+        return features, []
+    parts = features["cluster"].isin(larger.index)
+    kinds = features[features["together"].isin(larger)].groupby("together")["frame"].nunique()
+    listed = ", ".join(f"{n} in {count} frames" for n, count in kinds.items())
+    features = features.copy()
+    features.loc[parts, "cluster"] = -1
+    return features, [
+        f"larger bodies are left out (touching spheres: {listed}): they are no clusters of {size}; "
+        "--size measures them"
+    ]
 
 
 def _usable(features: pd.DataFrame) -> Bools:
@@ -122,14 +141,15 @@ def _common_size(together: Ints, *, dimension: int) -> tuple[int, list[str]]:
         )
     bodies = groups.copy()
     bodies[:dimension] = 0
-    size = int(np.argmax(bodies if bodies.any() else groups))
+    counts = bodies if bodies.any() else groups
+    size = int(np.flatnonzero(counts == counts.max())[-1])
     share = groups[size] / groups.sum()
     if share >= _SURE:
         return size, []
     listed = ", ".join(f"{count} of {n}" for n, count in enumerate(groups) if count)
     return size, [
-        f"clusters are taken to be of {size} spheres, the most common number; groups of touching "
-        f"spheres in all frames: {listed}; state the size to measure others"
+        f"clusters are taken to be of {size} spheres, the most common number (the largest of "
+        f"equals); groups of touching spheres in all frames: {listed}; --size measures others"
     ]
 
 

@@ -99,7 +99,7 @@ def dimmed_with_depth(features: pd.DataFrame) -> list[str]:
     if "z" not in features or len(features) < 10:
         return []
     relative = features["mass"] / features.groupby("frame")["mass"].transform("median")
-    z, y = features["z"].to_numpy(dtype=np.float64), relative.to_numpy(dtype=np.float64)
+    z, y = features["z"].to_numpy(dtype=np.float64), np.log(relative.to_numpy(dtype=np.float64))
     off = z - z.mean()
     power = float(off @ off)
     if not power > 0:
@@ -113,8 +113,8 @@ def dimmed_with_depth(features: pd.DataFrame) -> list[str]:
     if not (abs(change) > _DEPTH and abs(change) > _DEPTH_ERRORS * doubt):
         return []
     return [
-        f"amplitude changes with depth, by {100 * change:+.0f} % over {np.ptp(z):.3g} um: z is "
-        "biased by some nm, the same for all frames unless clusters wander in z"
+        f"amplitude changes with depth, by about {100 * np.expm1(change):+.0f} % over "
+        f"{np.ptp(z):.3g} um: z is biased, nearly the same in all frames of a cluster"
     ]
 
 
@@ -160,10 +160,12 @@ def mean_pair_distance(features: pd.DataFrame, *, contact: float, axes: list[str
     return float(every.mean()) if every.size else np.nan
 
 
-def counts(features: pd.DataFrame, *, size: int, contact: float) -> list[str]:
-    """Say in which frames a cluster has not as many spheres as it should.
+def counts(
+    features: pd.DataFrame, *, size: int, contact: float, frames: tuple[int, int]
+) -> list[str]:
+    """Say in which frames a cluster has not as many spheres as it should, or is not there.
 
-    `features` is that of `Bodies`.
+    `features` is that of `Bodies`, `frames` the first and the last.
     """
     told = []
     for cluster, rows in features[features["cluster"] >= 0].groupby("cluster"):
@@ -172,15 +174,21 @@ def counts(features: pd.DataFrame, *, size: int, contact: float) -> list[str]:
         absent = last - first + 1 - len(present)
         few = present[present < size].value_counts().sort_index()
         crowd = rows.groupby("frame")["together"].max().loc[lambda n: n > size]
-        said = [f"{n} found in {k} frames" for n, k in few.items()]
-        said += [f"none placed in {absent}"] if absent else []
+        said = [f"{n} found in {_frames(k)}" for n, k in few.items()]
+        said += [f"none placed in {_frames(absent)}"] if absent else []
         said += [
-            f"{n} found in {k} (two clusters within {REACH * contact:.2g} um)"
+            f"{n} found in {_frames(k)} (two clusters within {REACH * contact:.2g} um)"
             for n, k in crowd.value_counts().sort_index().items()
         ]
+        said += [f"first seen in frame {first}"] if first > frames[0] else []
+        said += [f"lost after frame {last}"] if last < frames[1] else []
         if said:
             told.append(f"cluster {cluster}: {size} expected, {', '.join(said)}")
     return told
+
+
+def _frames(count: int) -> str:
+    return f"{count} frame{'' if count == 1 else 's'}"
 
 
 def at_border(features: pd.DataFrame, *, margin: float, dropped: Mapping[int, Ints]) -> list[str]:

@@ -164,7 +164,7 @@ class Method:
             If the frame cannot be read.
         """
         data, voxel = np.asarray(stack.frame(i)), _voxel(stack)
-        frame = np.asarray(data, dtype=np.float64)
+        frame = _numbers(data, i)
         spots = self.search.spots(frame, voxel)
         columns = self._columns(frame, self.search.spheres(spots), voxel)
         columns = {"frame": np.full(len(columns["mass"]), i, dtype=np.int64)} | columns
@@ -202,10 +202,10 @@ def sample_frames(stack: Stack, search: Search, frames: Sequence[int]) -> list[S
     for k in _spread(len(frames)):
         try:
             data = np.asarray(stack.frame(frames[k]))
+            spots = search.spots(_numbers(data, frames[k]), _voxel(stack))
         except FrameError as error:
             fault = fault or error
             continue
-        spots = search.spots(np.asarray(data, dtype=np.float64), _voxel(stack))
         seen.append(Sampled(frames[k], data, spots))
     if fault is not None and not seen:
         raise fault
@@ -518,6 +518,15 @@ def _piece(
 ) -> CrowdSample:
     piece, centers = piece_of(frame, found.centers[group], voxel, count=_PIECE)
     return CrowdSample(piece, centers, np.empty((0, 3)), search.contact)
+
+
+def _numbers(data: NDArray[Any], i: int) -> Floats:
+    """Return a frame as floats; voxels without a number would be bright or dark by chance."""
+    frame = np.asarray(data, dtype=np.float64)
+    lost = int(np.count_nonzero(~np.isfinite(frame)))
+    if lost:
+        raise FrameError(f"frame {i} has {lost} voxels without a number (NaN or infinite)", i)
+    return frame
 
 
 def is_flat(stack: Stack) -> bool:

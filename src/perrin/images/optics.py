@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from perrin._arrays import NoSpheresError
 from perrin.images.crowd import fit_crowd
 from perrin.images.crowd_light import told_apart, total
 from perrin.images.image_fit import CameraNoise, FreeCenters, cut_window, fit_window
@@ -165,7 +166,7 @@ def fit_samples(
 
     Raises
     ------
-    ValueError
+    NoSpheresError
         Without samples, or where the search does not settle.
 
     Notes
@@ -174,13 +175,14 @@ def fit_samples(
     brightness and every background eliminated exactly (the Schur complement of the information).
     """
     log = np.log([diameter, max(voxel[0], 0.15 * diameter), max(voxel[1] / 2, 0.06 * diameter)])
+    log[1] = max(log[1], _roundest(log[2], voxel))
     image = _image(log, voxel)
     samples = [s for s in samples if isinstance(s, CrowdSample) or s.shows(image)]
     if not samples:
-        raise ValueError(
+        raise NoSpheresError(
             "no spheres to learn the optics from: none was found, or none has voxels to itself; "
-            "check diameter, contact and minmass, state optics, or take the places as found "
-            "(refine=None)"
+            "check diameter, contact and minmass, and whether spheres are dark (--dark), state the "
+            "optics (--optics), or take the places as found (--refine none)"
         )
     mean = float(np.mean([s.frame.mean() for s in samples]))
     noise = CameraNoise(1.0, 0.05 * abs(mean))
@@ -192,19 +194,30 @@ def fit_samples(
         step = np.linalg.solve(information, np.sum([k.score for k in looks], axis=0))
         noise = _noise(looks)
         log = log + step * min(1.0, _LONGEST / np.abs(step).max())
-        # A point spread flatter than round is no microscope's: such a step ends at round.
-        log[1] = max(log[1], log[2] + 1e-3)
+        log[1] = max(log[1], _roundest(log[2], voxel))
         if np.abs(step).max() < _CONVERGED:
             break
     else:
-        raise ValueError(
+        raise NoSpheresError(
             f"sphere size and point spread do not settle: diameter {np.exp(log[0]):.3g}, psf "
             f"({np.exp(log[1]):.3g}, {np.exp(log[2]):.3g}) um after {_ROUNDS} rounds on "
-            f"{len(samples)} groups; state optics=Optics(diameter, psf, noise)"
+            f"{len(samples)} groups: are these spheres, bright enough, or dark (--dark), and is "
+            "the voxel size right? State the optics (--optics), or take the places as found "
+            "(--refine none)"
         )
     size, psf_z, psf = (float(v) for v in np.exp(log))
     error = np.exp(log) * np.sqrt(np.diag(np.linalg.inv(information)))
     return Optics(size, (psf_z, psf), noise, (float(error[0]), float(error[1]), float(error[2])))
+
+
+def _roundest(log_psf: float, voxel: tuple[float, float, float]) -> float:
+    """Return the logarithm of the least point spread along z: flatter is no microscope's.
+
+    With the widths of the voxels the blur along z stays the larger one, probes included.
+    """
+    plane = np.exp(2 * (log_psf + _PROBE)) + (voxel[1] * voxel[2] - voxel[0] ** 2) / 12
+    narrowest = np.exp(2 * log_psf)
+    return 0.5 * float(np.log(max(plane, narrowest))) + _PROBE + 1e-3
 
 
 def _noise(looks: Sequence[Told]) -> CameraNoise:

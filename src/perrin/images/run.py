@@ -18,6 +18,8 @@ from perrin.images.locate import NO_FLAT_MODEL, Search, check_search, is_flat
 from perrin.images.parts import PartsError
 from perrin.images.stacks import digest
 from perrin.images.stages import Located, Workplace, fit_poses, locate_frames
+from perrin.images.workers import check_scheduler
+from perrin.results import EVEN
 from perrin.steps import choice_faults
 
 if TYPE_CHECKING:
@@ -33,7 +35,6 @@ if TYPE_CHECKING:
     from perrin.results import ClusterResult, Report
 
 _VIEWS = 8  # frames that are kept as pictures
-_EVEN = 1e-3  # intervals that differ by less than this share of dt are equal
 _LIBRARIES = ("perrin", "numpy", "scipy", "trackpy")
 _LOCATED, _POSED = "located", "posed"
 
@@ -107,10 +108,9 @@ def analyze_stack(
     Raises
     ------
     ValueError
-        For arguments out of range; where no sphere is found or the optics cannot be learned; if
-        `keep` holds parts of another input or of other settings.
-    DegenerateClusterError, TooFewFramesError
-        If no spheres touch or no cluster can be measured.
+        For arguments out of range; if `keep` holds parts of another input or of other settings.
+    NoSpheresError, DegenerateClusterError, TooFewFramesError
+        If there are no spheres, none touch, or no cluster can be measured.
     IdentityError
         If particles move over half a contact distance between frames.
     OSError
@@ -177,8 +177,8 @@ def _listed(count: int, frames: tuple[int | None, int | None] | None) -> list[in
 
 def _uneven(stack: Stack) -> Floats | None:
     """Return the times of the frames where they are not evenly spaced."""
-    even = np.abs(np.diff(stack.times) - stack.dt) <= _EVEN * stack.dt
-    return None if even.all() else stack.times
+    grid = stack.times[0] + stack.dt * np.arange(len(stack))
+    return None if np.all(np.abs(stack.times - grid) <= EVEN * stack.dt) else stack.times
 
 
 def _check(
@@ -209,6 +209,25 @@ def _check(
         )
     if faults:
         raise ValueError("; ".join(faults))
+    if scheduler is not None:
+        check_scheduler(scheduler)
+
+
+def _ends(located: Located) -> tuple[int, int]:
+    """Return the first and the last frame that could be read."""
+    read = located.frames.loc[located.frames["fault"] == "", "frame"]
+    return int(read.min()), int(read.max())
+
+
+def _unevenness(stack: Stack) -> list[str]:
+    """Say how uneven the times of the frames are, and what becomes of it."""
+    if _uneven(stack) is None:
+        return []
+    gaps = np.diff(stack.times)
+    return [
+        f"times between frames run from {gaps.min():.4g} to {gaps.max():.4g} s: the estimates take "
+        f"them as they are; MSD and MSAD count frames, of {stack.dt:.4g} s each"
+    ]
 
 
 def _faults_of(check: Callable[..., None], *arguments: object, **named: object) -> list[str]:
@@ -379,7 +398,8 @@ def _with_checks(
         *checks.unrefined(features),
         *checks.pair_distance(features, contact=contact, refine=method.refine, axes=bodies.axes),
         *bodies.told,
-        *checks.counts(features, size=bodies.size, contact=contact),
+        *checks.counts(features, size=bodies.size, contact=contact, frames=_ends(located)),
+        *_unevenness(stack),
         *checks.at_border(features, margin=bodies.margin, dropped=bodies.dropped),
         *told,
         *report.warnings,

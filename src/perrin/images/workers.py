@@ -12,7 +12,7 @@ S = TypeVar("S")
 T = TypeVar("T")
 
 _CHUNK = 4  # items a worker takes at once: a file is opened once for all of them
-_TIMEOUT = 30  # s, to find the scheduler
+_TIMEOUT = 15  # s, to find the scheduler
 _KEPT = 2**28  # bytes that a worker's memory allocator does not give back
 
 
@@ -59,6 +59,24 @@ def work_through(
         return
     with _client(workers, scheduler) as client:
         yield from _spread_out(client, task, items)
+
+
+def check_scheduler(address: str) -> None:
+    """Find out, before any work is done, whether a scheduler answers.
+
+    Raises
+    ------
+    ValueError
+        For an address that is none.
+    ModuleNotFoundError, OSError
+        As in `work_through`.
+    """
+    import re
+
+    if not re.fullmatch(r"\w+://\S+:\d+", address):
+        raise ValueError(f"scheduler: expected an address like tcp://node7:8786, got {address!r}")
+    with _client(0, address):
+        pass
 
 
 def _one_thread(task: Callable[[S], T], item: S) -> T:
