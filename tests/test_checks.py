@@ -130,13 +130,13 @@ def test_a_wrong_pair_distance_is_told(refine, advice):
 def test_clusters_with_other_numbers_of_spheres_are_told():
     """Fewer, none, and more, as where two clusters meet."""
     x = table(20)
-    assert checks.counts(x, size=4, contact=CONTACT, frames=(0, 19)) == []
+    assert checks.counts(x, size=4, contact=CONTACT, frames=np.arange(20)) == []
     lost = x.drop(index=[4 * k for k in range(3, 15)])  # one sphere in 12 frames
-    lost = lost[lost["frame"] != 1]
+    lost = lost[~lost["frame"].isin([1, 5])]  # frame 5 could not be read
     meeting = lost.assign(together=np.where(lost["frame"] >= 18, 8, lost["together"]))
-    told = checks.counts(meeting, size=4, contact=CONTACT, frames=(0, 25))
+    told = checks.counts(meeting, size=4, contact=CONTACT, frames=np.delete(np.arange(26), 5))
     assert told == [
-        "cluster 0: 4 expected, 3 found in 12 frames, none placed in 1 frame, 8 found in 2 frames "
+        "cluster 0: 4 expected, 3 found in 11 frames, none placed in 1 frame, 8 found in 2 frames "
         "(two clusters within 3.2 um), lost after frame 19"
     ]
 

@@ -160,18 +160,16 @@ def mean_pair_distance(features: pd.DataFrame, *, contact: float, axes: list[str
     return float(every.mean()) if every.size else np.nan
 
 
-def counts(
-    features: pd.DataFrame, *, size: int, contact: float, frames: tuple[int, int]
-) -> list[str]:
+def counts(features: pd.DataFrame, *, size: int, contact: float, frames: Ints) -> list[str]:
     """Say in which frames a cluster has not as many spheres as it should, or is not there.
 
-    `features` is that of `Bodies`, `frames` the first and the last.
+    `features` is that of `Bodies`, `frames` all that could be read.
     """
     told = []
     for cluster, rows in features[features["cluster"] >= 0].groupby("cluster"):
         present = rows.groupby("frame").size()
         first, last = int(present.index.min()), int(present.index.max())
-        absent = last - first + 1 - len(present)
+        absent = int(((frames >= first) & (frames <= last)).sum()) - len(present)
         few = present[present < size].value_counts().sort_index()
         crowd = rows.groupby("frame")["together"].max().loc[lambda n: n > size]
         said = [f"{n} found in {_frames(k)}" for n, k in few.items()]
@@ -180,8 +178,8 @@ def counts(
             f"{n} found in {_frames(k)} (two clusters within {REACH * contact:.2g} um)"
             for n, k in crowd.value_counts().sort_index().items()
         ]
-        said += [f"first seen in frame {first}"] if first > frames[0] else []
-        said += [f"lost after frame {last}"] if last < frames[1] else []
+        said += [f"first seen in frame {first}"] if first > frames.min() else []
+        said += [f"lost after frame {last}"] if last < frames.max() else []
         if said:
             told.append(f"cluster {cluster}: {size} expected, {', '.join(said)}")
     return told

@@ -213,12 +213,6 @@ def _check(
         check_scheduler(scheduler)
 
 
-def _ends(located: Located) -> tuple[int, int]:
-    """Return the first and the last frame that could be read."""
-    read = located.frames.loc[located.frames["fault"] == "", "frame"]
-    return int(read.min()), int(read.max())
-
-
 def _unevenness(stack: Stack) -> list[str]:
     """Say how uneven the times of the frames are, and what becomes of it."""
     if _uneven(stack) is None:
@@ -388,6 +382,7 @@ def _with_checks(
 ) -> Report:
     """Return the report with the images, and with all that speaks against it."""
     features, contact, method = bodies.features, imaging.contact, located.method
+    read = located.frames.loc[located.frames["fault"] == "", "frame"].to_numpy(dtype=np.int64)
     warnings = (
         *located.told,
         *checks.unreadable(located.frames),
@@ -398,7 +393,7 @@ def _with_checks(
         *checks.unrefined(features),
         *checks.pair_distance(features, contact=contact, refine=method.refine, axes=bodies.axes),
         *bodies.told,
-        *checks.counts(features, size=bodies.size, contact=contact, frames=_ends(located)),
+        *checks.counts(features, size=bodies.size, contact=contact, frames=read),
         *_unevenness(stack),
         *checks.at_border(features, margin=bodies.margin, dropped=bodies.dropped),
         *told,
