@@ -26,7 +26,7 @@ from perrin.images import stages, workers
 from perrin.images.locate import Method
 from perrin.images.parts import PartWriter, open_parts, read_parts
 from perrin.plot_images import _frame_numbers
-from perrin.results import motion_table
+from perrin.results import check_resumable, filled_folder, motion_table
 
 pytest.importorskip("tifffile")
 pytest.importorskip("trackpy")
@@ -579,3 +579,31 @@ def test_steps_over_half_a_contact_are_refused(learned):
     )
     with pytest.raises(perrin.IdentityError, match=r"1.47 um is over half of the contact distance"):
         perrin.analyze_stack(wild, **learned)
+
+
+def test_a_folder_is_finished_when_run_json_is_there(tmp_path):
+    """Writing that fails leaves parts and no run.json; what a killed one left goes away."""
+    (tmp_path / "located").mkdir()
+    (tmp_path / ".99999.part").mkdir()
+    (tmp_path / "figures").mkdir()
+    (tmp_path / "figures" / "old.png").write_text("old")
+
+    def write(text, fault=None):
+        with filled_folder(tmp_path) as stage:
+            (stage / "figures").mkdir()
+            for name in ("run.json", "summary.json", "figures/new.png"):
+                (stage / name).write_text(text)
+            if fault is not None:
+                raise fault
+
+    with pytest.raises(OSError, match="full"):
+        write("first", OSError("full"))
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["figures", "located"]
+    check_resumable(tmp_path, parts="located")
+    write("second")
+    names = sorted(p.name for p in tmp_path.iterdir())
+    assert names == ["figures", "located", "run.json", "summary.json"]
+    assert [p.name for p in (tmp_path / "figures").iterdir()] == ["new.png"]
+    with pytest.raises(FileExistsError):
+        check_resumable(tmp_path, parts="located")
+    check_resumable(tmp_path, parts="located", overwrite=True)

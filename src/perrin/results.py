@@ -332,6 +332,8 @@ def filled_folder(folder: str | os.PathLike[str]) -> Iterator[Path]:
     """
     place = Path(folder)
     place.mkdir(parents=True, exist_ok=True)
+    for left in place.glob(".*.part"):  # by one that was killed
+        shutil.rmtree(left)
     stage = place / f".{os.getpid()}.part"
     stage.mkdir()
     try:
