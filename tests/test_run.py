@@ -36,6 +36,14 @@ DIAMETER, DT, FRAMES = 2.45, 0.73, 8
 SEARCH = {"diameter": DIAMETER, "contact": DIAMETER}
 OPTIONS = ["--diameter", "2.45", "--contact", "2.45"]
 CENTERS = [(4.4, 4.4, 4.8), (9.6, 9.6, 4.8)]
+SCENE = {
+    "voxel": (0.25, 0.2, 0.2),
+    "diameter": DIAMETER,
+    "psf": (0.4, 0.15, 0.15),
+    "photons": 40,
+    "background": 3,
+    "gain": 3,
+}
 
 
 def rendered(n_frames=FRAMES, seed=0, **changed):
@@ -45,14 +53,11 @@ def rendered(n_frames=FRAMES, seed=0, **changed):
         perrin.simulate_motion(body, D_R=5e-3, D_T=0.01, dt=DT, n_frames=n_frames, rng=seed + k)
         for k in range(2)
     ]
-    settings = {"photons": 40, "background": 3, "gain": 3, "read_noise": 2, "offset": 5}
+    settings = SCENE | {"read_noise": 2, "offset": 5}
     movie = perrin.render_stack(
         motions,
         centers=CENTERS,
-        voxel=(0.25, 0.2, 0.2),
         shape=(38, 68, 70),
-        diameter=DIAMETER,
-        psf=(0.4, 0.15, 0.15),
         rng=seed + 7,
         **settings | changed,
     )
@@ -314,14 +319,9 @@ def test_a_larger_body_is_no_cluster_of_the_size_looked_for():
     movie = perrin.render_stack(
         truth,
         centers=CENTERS,
-        voxel=(0.25, 0.2, 0.2),
         shape=(40, 70, 70),
-        diameter=DIAMETER,
-        psf=(0.4, 0.15, 0.15),
-        photons=40,
-        background=3,
-        gain=3,
         rng=1,
+        **SCENE,
     )
     by_default = perrin.analyze_stack(movie, **SEARCH)
     assert [len(c.motion.template) for c in by_default.clusters] == [5]  # the larger of equals
@@ -353,14 +353,9 @@ def test_a_movie_of_pairs_gives_rods():
     movie = perrin.render_stack(
         truth,
         centers=[(4.4, 4.4, 4.8)],
-        voxel=(0.25, 0.2, 0.2),
         shape=(38, 44, 44),
-        diameter=DIAMETER,
-        psf=(0.4, 0.15, 0.15),
-        photons=40,
-        background=3,
-        gain=3,
         rng=1,
+        **SCENE,
     )
     report = perrin.analyze_stack(movie, **SEARCH)
     assert report.clusters == ()
@@ -567,15 +562,10 @@ def test_steps_over_half_a_contact_are_refused(learned):
     leap = np.where(np.arange(FRAMES) % 2, 0.3, -0.3)[:, None] * [DIAMETER, 0.0, 0.0]
     wild = perrin.render_stack(
         body + leap[:, None] + [7.0, 7.0, 4.8],
-        voxel=(0.25, 0.2, 0.2),
         shape=(38, 68, 70),
-        diameter=DIAMETER,
-        psf=(0.4, 0.15, 0.15),
-        photons=40,
-        background=3,
-        gain=3,
         dt=DT,
         rng=1,
+        **SCENE,
     )
     with pytest.raises(perrin.IdentityError, match=r"1.47 um is over half of the contact distance"):
         perrin.analyze_stack(wild, **learned)

@@ -7,7 +7,7 @@ import sys
 from contextlib import contextmanager
 from math import isfinite
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, cast
+from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 
 import typer
 
@@ -291,12 +291,12 @@ def run(
         _show(report, output)
 
 
-def _opened(path: Path, **given: object) -> Stack:
+def _opened(path: Path, **given: Any) -> Stack:  # noqa: ANN401 (as open_stack takes them)
     """Open a stack; name the options where something is missing."""
     import perrin
 
     try:
-        return perrin.open_stack(path, **given)  # type: ignore[arg-type]
+        return perrin.open_stack(path, **given)
     except ValueError as fault:
         options = [f"--{n.replace('_', '-')}" for n in given if f"{n}=" in str(fault)]
         hint = f" (here: {', '.join(options)})" if options else ""

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
 # The gap behind a touching neighbour: the next shell of a packing begins at 1.41 diameters.
-_REACH = 1.3
+REACH = 1.3
 _LONGEST_SPAN = 1_000_000
 _SPARSEST = 1000
 
@@ -217,7 +217,7 @@ def find_clusters(
         labels = np.searchsorted(np.unique(group[group >= 0]), group)
         labels = np.where(group >= 0, labels, -1)
     else:
-        pairs = _lasting_pairs(tracks, _REACH * contact)
+        pairs = _lasting_pairs(tracks, REACH * contact)
         labels = _components(pairs, tracks.n_particles, smallest)
     return table.assign(cluster=labels[tracks.code])
 
@@ -270,7 +270,7 @@ def identify(table: pd.DataFrame, *, contact: float, size: int) -> pd.DataFrame:
     tracks = _tracks(table.assign(particle=np.arange(len(table))))
     rows = np.flatnonzero(tracks.seen)
     frame, x = tracks.frame[rows], tracks.x[rows]
-    cluster = link_clusters(frame, x, reach=_REACH * contact, contact=contact, size=size)
+    cluster = link_clusters(frame, x, reach=REACH * contact, contact=contact, size=size)
     seat, piece = np.full(len(rows), -1, dtype=np.int64), np.zeros(len(rows), dtype=np.int64)
     for inside in _rows_by_label(cluster):
         seat[inside], piece[inside] = _settled(frame[inside], x[inside], size)

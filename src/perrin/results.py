@@ -29,8 +29,10 @@ if TYPE_CHECKING:
 
     import pandas as pd
 
+    from perrin._arrays import Floats
 
-EVEN = 5e-4  # frames that are off an even grid by less than this share of dt are on it
+
+_EVEN = 5e-4  # times that are off an even grid by less than this share of dt are on it
 
 
 @dataclass(frozen=True, eq=False)
@@ -448,10 +450,15 @@ def perp_text(rod: RodResult) -> str:
 
 def counted(motion: RigidMotion) -> RigidMotion:
     """Return a motion of every frame with uneven times as one of even times, for lags in frames."""
-    even = np.asarray(motion.dt * np.arange(len(motion.time)), dtype=np.float64)
-    if np.all(np.abs(motion.time - motion.time[0] - even) <= EVEN * motion.dt):
+    if evenly_spaced(motion.time, dt=motion.dt):
         return motion
-    return replace(motion, time=even)
+    return replace(motion, time=motion.dt * np.arange(len(motion.time), dtype=np.float64))
+
+
+def evenly_spaced(times: Floats, *, dt: float) -> bool:
+    """Return whether times are those of neighbouring frames dt apart, from the first on."""
+    grid = times[0] + dt * np.arange(len(times))
+    return bool(np.all(np.abs(times - grid) <= _EVEN * dt))
 
 
 def predicted_noise(motion: RigidMotion) -> NoiseFloor:

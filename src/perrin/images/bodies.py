@@ -10,7 +10,7 @@ import numpy as np
 from perrin._arrays import DegenerateClusterError, NoSpheresError
 from perrin.files import check_tracks
 from perrin.grouping import identify
-from perrin.linking import touching_groups
+from perrin.images.features import touching_together
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from perrin.images.optics import Optics
     from perrin.images.stacks import Stack
 
-REACH = 1.3  # spheres nearer than this many contact distances count as touching
 _SURE = 0.95  # groups of other sizes are told where less than this share has the size taken
 
 
@@ -187,8 +186,8 @@ def group_sizes(features: pd.DataFrame, *, contact: float, axes: list[str]) -> I
     out = np.zeros(len(features), dtype=np.int64)
     x = features[axes].to_numpy(dtype=np.float64)
     for rows in features.reset_index(drop=True).groupby("frame").indices.values():
-        label = touching_groups(x[rows], reach=REACH * contact, size=len(rows), smallest=1)
-        out[rows] = np.bincount(label)[label]
+        for group in touching_together(x[rows], contact=contact):
+            out[rows[group]] = len(group)
     return out
 
 

@@ -6,8 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from perrin.images.bodies import REACH
-from perrin.rotations import log_map
+from perrin.grouping import REACH
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -265,10 +264,17 @@ def refused(motion: RigidMotion, *, contact: float) -> str:
 
 def _squares(motion: RigidMotion) -> float:
     """Return the mean square displacement of the particles over one frame, um^2."""
-    near = np.diff(motion.time) < 1.5 * motion.dt
-    x = motion.center[:, None] + motion.template @ np.swapaxes(motion.rotation, -1, -2)
-    square = ((x[1:] - x[:-1]) ** 2).sum(axis=-1)[near & (np.diff(motion.piece) == 0)]
-    return float(np.nanmean(square)) if np.isfinite(square).any() else np.nan
+    start, stop = _neighbours(motion)
+    x = motion.positions()
+    square = ((x[stop] - x[start]) ** 2).sum(axis=-1)
+    return float(square.mean()) if square.size else np.nan
+
+
+def _neighbours(motion: RigidMotion) -> tuple[Ints, Ints]:
+    """Return the rows of the steps that join neighbouring frames."""
+    start, stop = motion.steps()
+    near = motion.time[stop] - motion.time[start] < 1.5 * motion.dt
+    return start[near], stop[near]
 
 
 def sampling(motion: RigidMotion, *, phi2: float) -> list[str]:
@@ -295,8 +301,5 @@ def sampling(motion: RigidMotion, *, phi2: float) -> list[str]:
 
 def _step_angles(motion: RigidMotion) -> Floats:
     """Return the rotation angles between neighbouring frames, rad."""
-    near = (np.diff(motion.time) < 1.5 * motion.dt) & (np.diff(motion.piece) == 0)
-    turn = motion.rotation[1:][near] @ np.swapaxes(motion.rotation[:-1][near], -1, -2)
-    turn = turn[np.isfinite(turn).all(axis=(-2, -1))]
-    vector = log_map(turn) if len(turn) else np.empty((0, 3))
-    return np.asarray(np.linalg.norm(np.atleast_2d(vector), axis=-1))
+    _, stop = _neighbours(motion)
+    return np.asarray(np.linalg.norm(motion.step_vectors()[stop - 1], axis=-1))

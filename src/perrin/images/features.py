@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from perrin._arrays import PrecisionWarning
+from perrin.grouping import REACH
 
 if TYPE_CHECKING:
     from perrin._arrays import Floats, Ints
 
-_REACH = 1.3  # centres closer than this many contact distances belong together
 _IN_SIGHT = 1.6  # closer than this their images overlap, blur and all
 _CROWD = 16  # spheres in a longer chain of overlapping images are a crowd
 _CLEAR_GAP = 2.0  # ratio of neighbouring masses that parts spheres from noise
@@ -65,7 +65,7 @@ def touching_together(centers: Floats, *, contact: float) -> list[Ints]:
     >>> [group.tolist() for group in touching_together(x, contact=1.0)]
     [[0, 1], [2]]
     """
-    return _chains(centers, _REACH * contact)
+    return _chains(centers, REACH * contact)
 
 
 def groups_and_crowds(centers: Floats, *, contact: float) -> tuple[list[Ints], list[Ints]]:
@@ -112,7 +112,7 @@ def at_contact(centers: Floats, *, contact: float) -> Floats:
     array([0.05, 1.05])
     """
     distance = np.linalg.norm(centers[:, None] - centers, axis=-1)
-    near = distance[np.triu(distance < _REACH * contact, 1)]
+    near = distance[np.triu(distance < REACH * contact, 1)]
     scale = min(contact / near.mean(), 1.0) if near.size else 1.0
     middle = centers.mean(axis=0)
     return np.asarray(middle + scale * (centers - middle))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -19,7 +20,7 @@ from perrin.images.parts import PartsError
 from perrin.images.stacks import digest
 from perrin.images.stages import Located, Workplace, fit_poses, locate_frames
 from perrin.images.workers import check_scheduler
-from perrin.results import EVEN
+from perrin.results import evenly_spaced
 from perrin.steps import choice_faults
 
 if TYPE_CHECKING:
@@ -144,10 +145,11 @@ def analyze_stack(
     depends = _depends(stack, search, refine, optics, listed)
     with _kept_in(keep) as folder:
         place = Workplace(folder / _LOCATED, workers, scheduler, progress)
-        located = _located(
-            stack, search, refine=refine, optics=optics, frames=listed, settings=depends,
-            place=place, anew=anew,
+        find = partial(
+            locate_frames, stack, search, refine=refine, optics=optics, frames=listed,
+            settings=depends, place=place,
         )  # fmt: skip
+        located = _located(find, place.folder, anew=anew)
         method = located.method
         bodies = find_bodies(located.features, stack, search, optics=method.optics, size=size)
         poses = _Poses(stack, method.optics, bodies, contact, folder / _POSED, place)
@@ -177,8 +179,7 @@ def _listed(count: int, frames: tuple[int | None, int | None] | None) -> list[in
 
 def _uneven(stack: Stack) -> Floats | None:
     """Return the times of the frames where they are not evenly spaced."""
-    grid = stack.times[0] + stack.dt * np.arange(len(stack))
-    return None if np.all(np.abs(stack.times - grid) <= EVEN * stack.dt) else stack.times
+    return None if evenly_spaced(stack.times, dt=stack.dt) else stack.times
 
 
 def _check(
@@ -275,34 +276,19 @@ def _kept_in(keep: str | os.PathLike[str] | None) -> Iterator[Path]:
         yield Path(folder)
 
 
-def _located(
-    stack: Stack,
-    search: Search,
-    *,
-    refine: Refine,
-    optics: Optics | None,
-    frames: Sequence[int],
-    settings: Mapping[str, Any],
-    place: Workplace,
-    anew: bool,
-) -> Located:
+def _located(find: Callable[[], Located], folder: Path, *, anew: bool) -> Located:
     """Locate all frames, and refuse or throw away the parts of another run."""
     import shutil
 
     try:
-        return locate_frames(
-            stack, search, refine=refine, optics=optics, frames=frames, settings=settings,
-            place=place,
-        )  # fmt: skip
+        return find()
     except PartsError as error:
         if not anew:
             raise PartsError(
                 f"{error}; choose another folder, or anew=True (--overwrite)"
             ) from None
-    shutil.rmtree(place.folder)
-    return locate_frames(
-        stack, search, refine=refine, optics=optics, frames=frames, settings=settings, place=place
-    )
+    shutil.rmtree(folder)
+    return find()
 
 
 @dataclass(eq=False)

@@ -75,19 +75,20 @@ class Workplace:
         """
         import pandas as pd
 
-        _, entries, damaged = read_parts(self.folder)
+        table, entries, damaged = read_parts(self.folder)
         done = {int(e["frame"]) for e in entries}
         todo = [item for frame, item in items.items() if frame not in done]
         count = len(items) - len(todo)
         self.tell(count, len(items), title)
-        with PartWriter(self.folder) as writer:
-            for rows, entry in work_through(
-                task, todo, workers=self.workers, scheduler=self.scheduler
-            ):
-                writer.add(rows, entry)
-                count += 1
-                self.tell(count, len(items), title)
-        table, entries, _ = read_parts(self.folder)
+        if todo:
+            with PartWriter(self.folder) as writer:
+                for rows, entry in work_through(
+                    task, todo, workers=self.workers, scheduler=self.scheduler
+                ):
+                    writer.add(rows, entry)
+                    count += 1
+                    self.tell(count, len(items), title)
+            table, entries, _ = read_parts(self.folder)
         listed = pd.DataFrame(entries).sort_values("frame", ignore_index=True)
         rows = table.sort_values("frame", kind="stable", ignore_index=True)
         told = f"{len(damaged)} damaged parts in {self.folder} were made anew"
