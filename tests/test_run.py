@@ -532,7 +532,8 @@ def test_workers_that_are_not_there_are_told(tmp_path, monkeypatch, movie_file):
     monkeypatch.setitem(sys.modules, "distributed", None)
     with perrin.open_stack(movie_file[0]) as stack:
         with pytest.raises(ModuleNotFoundError, match=r"pip install 'perrin\[cluster\]'"):
-            perrin.analyze_stack(stack, **SEARCH, refine=None, workers=2)
+            perrin.analyze_stack(stack, **SEARCH, workers=2, keep=tmp_path / "run")
+        assert not (tmp_path / "run").exists()
         monkeypatch.undo()
         pytest.importorskip("distributed")
         monkeypatch.setattr(workers, "_TIMEOUT", 0.3)

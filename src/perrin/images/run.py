@@ -19,7 +19,7 @@ from perrin.images.locate import NO_FLAT_MODEL, Search, check_search, is_flat
 from perrin.images.parts import PartsError
 from perrin.images.stacks import digest
 from perrin.images.stages import Located, Workplace, fit_poses, locate_frames
-from perrin.images.workers import check_scheduler
+from perrin.images.workers import check_workers
 from perrin.results import evenly_spaced
 from perrin.steps import choice_faults
 
@@ -210,8 +210,7 @@ def _check(
         )
     if faults:
         raise ValueError("; ".join(faults))
-    if scheduler is not None:
-        check_scheduler(scheduler)
+    check_workers(workers, scheduler)
 
 
 def _unevenness(stack: Stack) -> list[str]:

@@ -61,8 +61,8 @@ def work_through(
         yield from _spread_out(client, task, items)
 
 
-def check_scheduler(address: str) -> None:
-    """Find out, before any work is done, whether a scheduler answers.
+def check_workers(workers: int, scheduler: str | None) -> None:
+    """Find out, before any work is done, whether dask is there and the scheduler answers.
 
     Raises
     ------
@@ -73,10 +73,28 @@ def check_scheduler(address: str) -> None:
     """
     import re
 
-    if not re.fullmatch(r"\w+://\S+:\d+", address):
-        raise ValueError(f"scheduler: expected an address like tcp://node7:8786, got {address!r}")
-    with _client(0, address):
-        pass
+    if scheduler is not None:
+        if not re.fullmatch(r"\w+://\S+:\d+", scheduler):
+            raise ValueError(
+                f"scheduler: expected an address like tcp://node7:8786, got {scheduler!r}"
+            )
+        with _client(0, scheduler):
+            pass
+    elif workers:
+        _dask()
+
+
+def _dask() -> tuple[Any, Any, Any]:
+    """Return dask, and distributed's Client and LocalCluster."""
+    try:
+        import dask
+        from distributed import Client, LocalCluster
+    except ModuleNotFoundError as missing:
+        raise ModuleNotFoundError(
+            "other workers need dask.distributed, which is not installed: "
+            "pip install 'perrin[cluster]'"
+        ) from missing
+    return dask, Client, LocalCluster
 
 
 def _one_thread(task: Callable[[S], T], item: S) -> T:
@@ -121,14 +139,7 @@ def _spread_out(
 @contextmanager
 def _client(workers: int, scheduler: str | None) -> Iterator[Any]:
     """Give a client of the cluster at that address, or of processes started here."""
-    try:
-        import dask
-        from distributed import Client, LocalCluster
-    except ModuleNotFoundError as missing:
-        raise ModuleNotFoundError(
-            "other workers need dask.distributed, which is not installed: "
-            "pip install 'perrin[cluster]'"
-        ) from missing
+    dask, Client, LocalCluster = _dask()
     if scheduler is not None:
         with Client(scheduler, timeout=_TIMEOUT, set_as_default=False) as client:
             yield client
