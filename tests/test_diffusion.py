@@ -782,7 +782,7 @@ def test_all_faults_come_in_one_message():
         ({"exposure": 1.2}, "exposure"),
         ({"exposure": "half"}, "exposure"),
         ({"exposure": "0.5"}, "exposure"),
-        ({"drift": True}, "drift"),
+        ({"drift": True, "method": "trace"}, "drift"),
         ({"drift": True, "quantity": "translation", "method": "cve"}, "drift"),
         ({"method": "trace", "quantity": "translation"}, "trace"),
     ],

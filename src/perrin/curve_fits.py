@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.polynomial.polynomial import polyval
 
-from perrin.diffusion import NORMAL, UNITS, DiffusionEstimate
+from perrin.diffusion import NORMAL, UNITS, DiffusionEstimate, Found
 from perrin.lagged import overlap_sums
 
 if TYPE_CHECKING:
@@ -267,20 +267,22 @@ def _estimate(curve: LagCurve, use: Ints, weights: Floats, *, method: str) -> Di
     slope, level = (_variance(curve, use, w, D=D, s=s) for w in weights)
     parts = tuple(_variance(curve, use, weights[0], D=d, s=e) for d, e in ((1, 0), (1, 1), (0, 1)))
     ci68, ci95 = (_interval(value, parts, D=D, s=s, z=NORMAL[p], dt=dt) for p in (0.68, 0.95))
-    return DiffusionEstimate(
+    found = Found(
         value=value / dt,
         ci68=ci68,
         ci95=ci95,
-        stderr=float(np.sqrt(slope)) / dt,
         offset=offset,
         offset_stderr=float(np.sqrt(level)),
-        resolution_floor=None,
-        resolved=ci95[0] > 0,
-        unit=UNITS[curve.quantity],
+        stderr=float(np.sqrt(slope)) / dt,
+    )
+    return DiffusionEstimate.judged(
+        found,
+        quantity="translation" if curve.quantity == "translation" else "rotation",
         method=method,
         n_frames=len(curve.lagtime) + 1,
-        snr=value / offset if offset > 0 else np.inf,
         dt=dt,
+        noise_variance=curve.noise,
+        resolution_floor=curve.resolution_floor,
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings as python_warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
@@ -35,6 +35,21 @@ _COARSE_IN_PLANE = 2.0
 
 
 @dataclass(frozen=True)
+class Found:
+    """What an estimator found, before it is judged."""
+
+    value: float
+    ci68: tuple[float, float]
+    ci95: tuple[float, float]
+    offset: float
+    offset_stderr: float
+    drift: tuple[tuple[float, ...], ...] | None = None
+    drift_stderr: tuple[tuple[float, ...], ...] | None = None
+    p_same: float | None = None
+    stderr: float | None = None  # half the width of ci68 unless given
+
+
+@dataclass(frozen=True)
 class DiffusionEstimate:
     """A diffusion coefficient with what it rests on.
 
@@ -59,15 +74,17 @@ class DiffusionEstimate:
     n_frames : int
         Frames with a pose, of all motions.
     snr : float
-        D dt/s, s the noise variance predicted from the rigid-fit residuals; inf without noise.
+        D dt/s, s the noise variance of one orientation or centre coordinate that the rigid-fit
+        residuals predict (or the stated sigma); inf without noise, NaN where it is not known.
     dt : float
-        Time between frames, s, mean over motions.
+        Time between the frames that exist, s: the median step, mean over motions.
     noise : str
         How the noise was known: "joint", "residual", or the sigma in um.
     exposure : float or None
         The open fraction of dt as stated; None for unknown.
     drift, drift_stderr : tuple of tuple of float, or None
-        Mean velocity of every motion along x, y, z, um/s, where it was left free.
+        Where it was left free, the mean velocity of every motion along x, y, z, um/s; for D_R the
+        mean spin about the lab's x, y, z, rad/s (in the plane one number).
     p_same : float or None
         Pooled motions: how probable it is that equal coefficients scatter as much as these do
         (likelihood ratio); None for one motion and for other methods than "mle".
@@ -95,10 +112,64 @@ class DiffusionEstimate:
     p_same: float | None = None
     warnings: tuple[str, ...] = ()
 
+    @classmethod
+    def judged(
+        cls,
+        found: Found,
+        *,
+        quantity: Literal["rotation", "translation"],
+        method: str,
+        n_frames: int,
+        dt: float,
+        noise_variance: float,
+        resolution_floor: float | None = None,
+        noise: str = "joint",
+        exposure: float | None = None,
+        warnings: tuple[str, ...] = (),
+    ) -> DiffusionEstimate:
+        """Make an estimate of what an estimator found; the one place where snr and resolved arise.
+
+        Parameters
+        ----------
+        found : Found
+        quantity, method, n_frames, dt, resolution_floor, noise, exposure, warnings
+            As in the attributes.
+        noise_variance : float
+            Of one orientation (rad^2) or centre coordinate (um^2); NaN where it is not known.
+        """
+        if np.isnan(noise_variance):
+            snr = np.nan
+        else:
+            snr = found.value * dt / noise_variance if noise_variance > 0 else np.inf
+        half_width = (found.ci68[1] - found.ci68[0]) / 2
+        floor = _RESOLVED * (resolution_floor or 0.0)
+        return cls(
+            value=found.value,
+            ci68=found.ci68,
+            ci95=found.ci95,
+            stderr=half_width if found.stderr is None else found.stderr,
+            offset=found.offset,
+            offset_stderr=found.offset_stderr,
+            resolution_floor=resolution_floor,
+            resolved=bool(found.ci95[0] > 0 and found.value > floor),
+            unit=UNITS[quantity],
+            method=method,
+            n_frames=n_frames,
+            snr=float(snr),
+            dt=dt,
+            noise=noise,
+            exposure=exposure,
+            drift=found.drift,
+            drift_stderr=found.drift_stderr,
+            p_same=found.p_same,
+            warnings=warnings,
+        )
+
     def __str__(self) -> str:
         name = "D_R" if self.unit == UNITS["rotation"] else "D_T"
         how = self.method if self.noise == "joint" else f"{self.method}, {self.noise} noise"
-        how += ", drift removed" if self.drift else ""
+        taken = "mean spin" if name == "D_R" else "drift"
+        how += f", {taken} removed" if self.drift else ""
         tail = f"{self.unit} [{how}, {self.n_frames} frames]"
         if not self.resolved and self.ci95[1] > 0:
             return f"{name} < {self.ci95[1]:.2g} {tail}, 95 % limit"
@@ -158,7 +229,8 @@ def estimate_diffusion(
         Open fraction of dt, 0 to 1. Unknown (None) leaves the joint offset free, negative too, as
         motion blur makes it; with the noise given it is taken as 0.
     drift : bool
-        Give D_T a free mean velocity along each axis (flow, sedimentation), told in the result.
+        Leave a mean velocity along each axis free (flow, sedimentation), for D_R a mean spin about
+        each lab axis; the result states it. The likelihood is then the restricted one.
 
     Returns
     -------
@@ -210,23 +282,9 @@ def estimate_diffusion(
         given = None if noise == "joint" else [_orientation_noise(s, noise) for s in steps]
         blur = (exposure or 0.0) * motions[0].dt / 3
         found = _by_moments(trace_estimate(motions, noise=given, blur=blur))
-    return _told(
+    return _judged(
         found, motions, steps, quantity=quantity, method=method, noise=noise, exposure=exposure
     )
-
-
-@dataclass(frozen=True)
-class Found:
-    """What an estimator found, before it is judged."""
-
-    value: float
-    ci68: tuple[float, float]
-    ci95: tuple[float, float]
-    offset: float
-    offset_stderr: float
-    drift: tuple[tuple[float, ...], ...] | None = None
-    drift_stderr: tuple[tuple[float, ...], ...] | None = None
-    p_same: float | None = None
 
 
 def by_likelihood(tracks: Sequence[Track]) -> Found:
@@ -239,11 +297,18 @@ def by_likelihood(tracks: Sequence[Track]) -> Found:
     wider = excess_scatter(tracks, value, best.theta)
     ci68, ci95 = (likelihood.interval(best, wider * _CHI2[level]) for level in (0.68, 0.95))
     offsets, offset_stderr = likelihood.offsets(best)
-    drift, drift_stderr = likelihood.velocities(best) if tracks[0].drift else (None, None)
+    drift, drift_stderr = _steady(likelihood, best) if tracks[0].drift else (None, None)
     p_same = _probability_same(likelihood, best) if len(tracks) > 1 else None
     return Found(
         value, ci68, ci95, float(offsets.mean()), offset_stderr, drift, drift_stderr, p_same
     )
+
+
+def _steady(likelihood: Likelihood, best: Peak) -> tuple[tuple[tuple[float, ...], ...], ...]:
+    """Return the steady motion of every track and its standard errors."""
+    mean, information = likelihood.steady_motion(best)
+    errors = np.sqrt(np.diagonal(np.linalg.inv(information), axis1=1, axis2=2))
+    return tuple(map(tuple, mean.tolist())), tuple(map(tuple, errors.tolist()))
 
 
 def _probability_same(likelihood: Likelihood, best: Peak) -> float:
@@ -282,7 +347,7 @@ def _orientation_noise(steps: Steps, noise: str | float) -> float:
     return sigma**2 * steps.complete
 
 
-def _told(
+def _judged(
     found: Found,
     motions: Sequence[RigidMotion],
     steps: Sequence[Steps],
@@ -293,36 +358,26 @@ def _told(
     exposure: float | None,
 ) -> DiffusionEstimate:
     """Judge what was found: floor, resolution, signal-to-noise ratio, warnings."""
+    intervals = [s.usual_duration for s in steps]
     floor = None
     if quantity == "rotation":
-        floor = float(np.mean([_FLOOR * (m.sigma / m.R) ** 4 / m.dt for m in motions]))
-    spread = _spread(motions, steps, noise)
-    dt = float(np.mean([m.dt for m in motions]))
-    snr = found.value * dt / spread if spread > 0 else np.inf
-    said = _said(found.value, steps, quantity=quantity, method=method, snr=snr)
-    for text in said:
-        python_warnings.warn(text, PrecisionWarning, stacklevel=3)
-    return DiffusionEstimate(
-        value=found.value,
-        ci68=found.ci68,
-        ci95=found.ci95,
-        stderr=(found.ci68[1] - found.ci68[0]) / 2,
-        offset=found.offset,
-        offset_stderr=found.offset_stderr,
-        resolution_floor=floor,
-        resolved=bool(found.ci95[0] > 0 and found.value > _RESOLVED * (floor or 0.0)),
-        unit=UNITS[quantity],
+        squares = [_FLOOR * (m.sigma / m.R) ** 4 for m in motions]
+        floor = float(np.mean(np.divide(squares, intervals)))
+    estimate = DiffusionEstimate.judged(
+        found,
+        quantity=quantity,
         method=method,
         n_frames=sum(m.fitted.size for m in motions),
-        snr=snr,
-        dt=dt,
+        dt=float(np.mean(intervals)),
+        noise_variance=_spread(motions, steps, noise),
+        resolution_floor=floor,
         noise=noise if isinstance(noise, str) else f"{noise:g} um",
         exposure=exposure,
-        drift=found.drift,
-        drift_stderr=found.drift_stderr,
-        p_same=found.p_same,
-        warnings=said,
     )
+    limits = _limits(estimate, steps, quantity=quantity)
+    for text in limits:
+        python_warnings.warn(text, PrecisionWarning, stacklevel=3)
+    return replace(estimate, warnings=limits)
 
 
 def _spread(motions: Sequence[RigidMotion], steps: Sequence[Steps], noise: str | float) -> float:
@@ -332,24 +387,24 @@ def _spread(motions: Sequence[RigidMotion], steps: Sequence[Steps], noise: str |
     return float(np.mean(np.multiply(squares, means)))
 
 
-def _said(
-    value: float, steps: Sequence[Steps], *, quantity: str, method: str, snr: float
+def _limits(
+    estimate: DiffusionEstimate, steps: Sequence[Steps], *, quantity: str
 ) -> tuple[str, ...]:
-    """Say where the estimate leaves the conditions under which it is exact."""
-    said = []
+    """State where the estimate leaves the conditions under which it is exact."""
+    limits = []
     count = sum(len(s.duration) for s in steps)
     if count < _FEW:
-        said.append(f"{count} steps, fewer than {_FEW}: the interval is approximate")
-    if snr < _NOISY:
-        said.append(
-            f"signal-to-noise ratio {snr:.2g} under {_NOISY}: the noise is far larger than a "
-            "step; sample less often"
+        limits.append(f"{count} steps, fewer than {_FEW}: the interval is approximate")
+    if estimate.snr < _NOISY:
+        limits.append(
+            f"signal-to-noise ratio {estimate.snr:.2g} under {_NOISY}: the noise is far larger "
+            "than a step; sample less often"
         )
-    if quantity == "rotation" and method != "trace":
+    if quantity == "rotation" and estimate.method != "trace":
         time = float(sum(np.sum(s.duration**2) for s in steps))
         mean = time / float(sum(np.sum(s.duration) for s in steps))
-        said += _coarse(value * mean, planar=steps[0].size.shape[1] == 1)
-    return tuple(said)
+        limits += _coarse(estimate.value * mean, planar=steps[0].size.shape[1] == 1)
+    return tuple(limits)
 
 
 def _coarse(step: float, *, planar: bool) -> list[str]:
@@ -389,8 +444,8 @@ def _check(
         faults.append(f"method: expected {offered}, got {method!r}")
     if method == "trace" and quantity == "translation":
         faults.append('method="trace" is for quantity="rotation"')
-    if drift and (quantity == "rotation" or method != "mle"):
-        faults.append('drift=True needs quantity="translation" and method="mle"')
+    if drift and method != "mle":
+        faults.append('drift=True needs method="mle"')
     if len({m.template.shape[1] for m in motions}) != 1:
         faults.append("motion: expected one or more motions, all in 2 or all in 3 dimensions")
     if faults:

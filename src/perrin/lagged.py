@@ -55,6 +55,11 @@ class LagCurve:
         MSAD of one direction, 3 for that of all directions of a cluster.
     drift : tuple of float or None
         Mean velocity that was taken off, um/s by axis.
+    noise : float
+        Noise variance of one orientation (rad^2) or centre coordinate (um^2) that the rigid-fit
+        residuals predict; NaN where there are none (free particles).
+    resolution_floor : float or None
+        The D_R that a motionless cluster would read (rad^2/s); None for translation.
     """
 
     lagtime: Floats
@@ -67,6 +72,8 @@ class LagCurve:
     unit: str
     n_walks: float
     drift: tuple[float, ...] | None = None
+    noise: float = np.nan
+    resolution_floor: float | None = None
 
     def __post_init__(self) -> None:
         frozen(self.lagtime, self.value, self.components, self.stderr, self.n_pairs)

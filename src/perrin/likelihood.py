@@ -8,7 +8,7 @@ needs are found by a sine transform where the steps are even, else by tridiagona
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple, Protocol
 
@@ -53,7 +53,9 @@ class Track:
     level : float
         Mean of `known` over the frames that show the most particles.
     drift : bool
-        Whether every axis has a free mean velocity.
+        Whether a steady velocity or spin is free; `steps` are then without their least-squares one.
+    steady : ndarray, shape (p,)
+        That one; zeros without drift.
     """
 
     steps: Steps
@@ -64,16 +66,18 @@ class Track:
     freedom: float
     level: float
     drift: bool = False
+    steady: Floats = field(default_factory=lambda: np.zeros(0))
 
     @classmethod
     def free(cls, steps: Steps, *, blur: float, drift: bool) -> Track:
         """Leave the offset free; known is by how much a frame exceeds the least noisy one."""
+        steps, steady = _centred(steps, drift=drift)
         noise = [steps.sigma**2 * n for n in (steps.before, steps.after)]
         least = min(float(n.min()) for n in noise)
         one = np.ones_like(noise[0])
         known = noise[0] - least, noise[1] - least
         level = steps.sigma**2 * steps.complete - least
-        return cls(steps, (one, one), known, blur, 0.0, 0.0, level, drift)
+        return cls(steps, (one, one), known, blur, 0.0, 0.0, level, drift, steady)
 
     @classmethod
     def informed(cls, steps: Steps, *, blur: float, drift: bool) -> Track:
@@ -81,17 +85,25 @@ class Track:
         theta = steps.sigma**2 * steps.complete
         if theta == 0:
             return cls.fixed(steps, sigma=0.0, blur=blur, drift=drift)
+        steps, steady = _centred(steps, drift=drift)
         weight = steps.before / steps.complete, steps.after / steps.complete
         none = np.zeros_like(weight[0])
-        return cls(steps, weight, (none, none), blur, theta, float(steps.freedom), 0.0, drift)
+        freedom = float(steps.freedom)
+        return cls(steps, weight, (none, none), blur, theta, freedom, 0.0, drift, steady)
 
     @classmethod
     def fixed(cls, steps: Steps, *, sigma: float, blur: float, drift: bool) -> Track:
         """Take the localisation error sigma (um) as known."""
+        steps, steady = _centred(steps, drift=drift)
         known = sigma**2 * steps.before, sigma**2 * steps.after
         none = np.zeros_like(known[0])
         level = sigma**2 * steps.complete
-        return cls(steps, (none, none), known, blur, 0.0, np.inf, level, drift)
+        return cls(steps, (none, none), known, blur, 0.0, np.inf, level, drift, steady)
+
+
+def _centred(steps: Steps, *, drift: bool) -> tuple[Steps, Floats]:
+    """Return the steps and their steady motion; without drift all of it stays in the steps."""
+    return steps.without_steady_motion() if drift else (steps, np.zeros(steps.steady.shape[2]))
 
 
 class Sums(NamedTuple):
@@ -201,14 +213,13 @@ class _Tridiagonal:
     how many there are). The inverse of a tridiagonal matrix has the diagonal 1/(d + d' - a), d and
     d' being the pivots of the elimination from above and from below, and
     Z_{i,i+1} = -l_i Z_{i+1,i+1}.
-    With a free mean velocity on each axis the likelihood is the restricted one.
+    With a free steady motion the likelihood is the restricted one (REML): with U = C^-1 X for the
+    effect X of the steady motion on the steps, and G = X^T U, C^-1 becomes C^-1 - U G^-1 U^T.
     """
 
     groups: Ints
     starts: Ints
     which: Ints
-    blocks: Ints
-    columns: tuple[tuple[int, Ints], ...]
     count: Floats
     y: Floats
     tau: Floats
@@ -216,7 +227,7 @@ class _Tridiagonal:
     blur: Floats
     weight: tuple[Floats, Floats]
     known: tuple[Floats, Floats]
-    drift: bool
+    steady: Floats | None
 
     @classmethod
     def of(cls, tracks: Sequence[Track], groups: Sequence[int]) -> _Tridiagonal:
@@ -227,6 +238,11 @@ class _Tridiagonal:
         y = np.zeros((sum(lengths), max(len(axes) for _, axes in blocks)), order="F")
         for start, length, (i, axes) in zip(starts, lengths, blocks, strict=True):
             y[start : start + length, : len(axes)] = tracks[i].steps.size[:, axes]
+        steady = None
+        if any(t.drift for t in tracks):
+            steady = np.zeros((*y.shape, tracks[0].steps.steady.shape[2]))
+            for start, length, (i, axes) in zip(starts, lengths, blocks, strict=True):
+                steady[start : start + length, : len(axes)] = tracks[i].steps.steady[:, axes]
 
         def noise(part: Callable[[Track], Floats]) -> Floats:
             return np.concatenate([part(tracks[i])[:, axes[0]] for i, axes in blocks])
@@ -239,8 +255,6 @@ class _Tridiagonal:
             groups=np.array(groups),
             starts=starts[np.flatnonzero(np.diff(group, prepend=-1))],
             which=np.repeat(group, lengths),
-            blocks=starts,
-            columns=tuple(blocks),
             count=np.repeat([float(len(axes)) for _, axes in blocks], lengths),
             y=y,
             tau=stacked(lambda t: t.steps.duration),
@@ -248,7 +262,7 @@ class _Tridiagonal:
             blur=np.array([t.blur for t in tracks]),
             weight=(noise(lambda t: t.weight[0]), noise(lambda t: t.weight[1])),
             known=(noise(lambda t: t.known[0]), noise(lambda t: t.known[1])),
-            drift=any(t.drift for t in tracks),
+            steady=steady,
         )
 
     def sums(self, D: Floats, theta: Floats) -> Sums:
@@ -287,31 +301,37 @@ class _Tridiagonal:
         inverse = 1 / (d + up[::-1] - a)
         corner = self._beside(-lower * inverse[1:])
         value = -0.5 * self.count * np.log(d)
-        if self.drift:
-            unit, _ = dpttrs(d, lower, self.tau)
-            worth = self._spread(self.tau * unit)
-            z = z - (unit / worth)[:, None] * self._spread(self.tau[:, None] * z)
-            value[self.blocks] -= 0.5 * (self.count * np.log(worth))[self.blocks]
-            inverse = inverse - unit * unit / worth
-            corner = corner - self._beside(unit[:-1] * unit[1:]) / worth
+        inverse, corner = self.count * inverse, self.count * corner
+        if self.steady is not None:
+            unit, gram, mean = self._steady_motion(d, lower)
+            z = z - np.einsum("rcp,rp->rc", unit, mean[self.which])
+            value[self.starts] -= 0.5 * np.linalg.slogdet(gram)[1]
+            shared = unit @ np.linalg.inv(gram)[self.which]
+            inverse = inverse - np.einsum("rcp,rcp->r", shared, unit)
+            corner = corner - self._beside(np.einsum("rcp,rcp->r", shared[:-1], unit[1:]))
         value -= 0.5 * np.einsum("rc,rc->r", self.y, z)
         square, cross = np.einsum("rc,rc->r", z, z), np.einsum("rc,rc->r", z[:-1], z[1:])
-        return value, square, self._beside(cross), self.count * inverse, self.count * corner
+        return value, square, self._beside(cross), inverse, corner
 
-    def velocities(self, D: Floats, theta: Floats) -> tuple[list[Floats], list[Floats]]:
-        """Return the mean velocity of every track along every axis, and its standard error."""
-        from scipy.linalg.lapack import dpttrf, dpttrs
+    def _steady_motion(self, d: Floats, lower: Floats) -> tuple[Floats, Floats, Floats]:
+        """Return U = C^-1 X (rows, c, p), G = X^T U (G, p, p) and G^-1 U^T y (G, p)."""
+        from scipy.linalg.lapack import dpttrs
+
+        x = self.steady
+        if x is None:
+            raise ValueError("these tracks have no free steady motion")
+        unit = dpttrs(d, lower, x.reshape(len(x), -1))[0].reshape(x.shape)
+        gram = np.add.reduceat(np.swapaxes(x, -1, -2) @ unit, self.starts)
+        right = np.add.reduceat(np.einsum("rcp,rc->rp", unit, self.y), self.starts)
+        return unit, gram, np.linalg.solve(gram, right[..., None])[..., 0]
+
+    def steady_motion(self, D: Floats, theta: Floats) -> tuple[Floats, Floats]:
+        """Return the steady motion (G, p) of every track and its inverse covariance (G, p, p)."""
+        from scipy.linalg.lapack import dpttrf
 
         d, lower, _ = dpttrf(*self._bands(D, theta))
-        unit, _ = dpttrs(d, lower, self.tau)
-        worth = np.add.reduceat(self.tau * unit, self.blocks)
-        mean = np.add.reduceat(self.y * unit[:, None], self.blocks, axis=0) / worth[:, None]
-        found = [np.empty(sum(len(a) for i, a in self.columns if i == g)) for g in self.groups]
-        errors = [np.empty_like(f) for f in found]
-        for k, (i, axes) in enumerate(self.columns):
-            found[i][axes] = mean[k, : len(axes)]
-            errors[i][axes] = 1 / np.sqrt(worth[k])
-        return found, errors
+        _, gram, mean = self._steady_motion(d, lower)
+        return mean, gram
 
     def _bands(self, D: Floats, theta: Floats) -> tuple[Floats, Floats]:
         """Return the diagonal of the covariance of all steps and the one beside it."""
@@ -326,12 +346,6 @@ class _Tridiagonal:
     def _beside(self, product: Floats) -> Floats:
         padded: Floats = self.linked * np.append(product, 0.0)
         return padded
-
-    def _spread(self, x: Floats) -> Floats:
-        """Return the sum over each block, at every step."""
-        lengths = np.diff(np.append(self.blocks, len(x)))
-        total: Floats = np.repeat(np.add.reduceat(x, self.blocks, axis=0), lengths, axis=0)
-        return total
 
 
 def _same_noise(track: Track) -> list[Ints]:
@@ -541,14 +555,14 @@ class Likelihood:
             return 0.0, high
         return _crossing(height, inside=value, start=value - reach, outside=0.0), high
 
-    def velocities(
-        self, best: Peak
-    ) -> tuple[tuple[tuple[float, ...], ...], tuple[tuple[float, ...], ...]]:
-        """Return the mean velocity along each axis of every group and its standard error."""
-        (kernel,) = (k for k in self.kernels if isinstance(k, _Tridiagonal))
-        D = np.full(len(best.theta), best.D[0])
-        value, error = kernel.velocities(D, best.theta)
-        return tuple(tuple(v.tolist()) for v in value), tuple(tuple(e.tolist()) for e in error)
+    def steady_motion(self, best: Peak) -> tuple[Floats, Floats]:
+        """Return the steady velocity or spin of every group (G, p), lab axes, and its information.
+
+        The information (G, p, p) is the inverse of the covariance at the D and noise of `best`.
+        """
+        kernel = next(k for k in self.kernels if isinstance(k, _Tridiagonal))
+        mean, gram = kernel.steady_motion(np.full(len(best.theta), best.D[0]), best.theta)
+        return mean + np.array([t.steady for t in self.tracks]), gram
 
     def offsets(self, best: Peak) -> tuple[Floats, float]:
         """Return the noise offset of each group, and the standard error of their mean.

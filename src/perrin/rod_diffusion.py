@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from perrin._arrays import TooFewFramesError
-from perrin.diffusion import UNITS, DiffusionEstimate, by_likelihood
+from perrin.diffusion import DiffusionEstimate, by_likelihood
 from perrin.likelihood import Track
 from perrin.rods import center_steps, direction_steps
 from perrin.steps import Steps
@@ -54,21 +54,13 @@ def estimate_rod(
         )
     blur = float(walk.tau.min()) / 2  # the exposure is unknown: see estimate_diffusion
     found = by_likelihood([Track.free(_steps(walk, motion), blur=blur, drift=False)])
-    noise = float(np.nanmean(walk.variance))
-    return DiffusionEstimate(
-        value=found.value,
-        ci68=found.ci68,
-        ci95=found.ci95,
-        stderr=(found.ci68[1] - found.ci68[0]) / 2,
-        offset=found.offset,
-        offset_stderr=found.offset_stderr,
-        resolution_floor=None,
-        resolved=bool(found.ci95[0] > 0),
-        unit=UNITS["rotation" if quantity == "direction" else "translation"],
+    return DiffusionEstimate.judged(
+        found,
+        quantity="rotation" if quantity == "direction" else "translation",
         method="mle",
         n_frames=int(motion.fitted.size),
-        snr=found.value * motion.dt / noise if noise > 0 else np.inf,
-        dt=motion.dt,
+        dt=float(np.median(walk.tau)),
+        noise_variance=float(np.nanmean(walk.variance)),
     )
 
 
@@ -92,4 +84,5 @@ def _steps(walk: Walk, motion: RodMotion) -> Steps:
         sigma=1.0,
         freedom=0,
         dt=motion.dt,
+        steady=np.zeros((*walk.y.shape, 0)),
     )

@@ -1,8 +1,8 @@
-"""What a motion's steps look like to an estimator: how large, how long, how noisy at each end."""
+"""The steps of a motion as estimators take them: size, duration, noise of both ends."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -40,6 +40,9 @@ class Steps:
         Degrees of freedom of those residuals.
     dt : float
         Time between frames, s.
+    steady : ndarray, shape (S, A, p)
+        What each component of a steady velocity (um/s) or spin (rad/s) along the p lab axes adds to
+        each step: the time it takes, and for a rotation the turn from lab to body axes.
     """
 
     size: Floats
@@ -51,6 +54,22 @@ class Steps:
     sigma: float
     freedom: int
     dt: float
+    steady: Floats
+
+    @property
+    def usual_duration(self) -> float:
+        """The median duration of a step, s: the time between the frames that exist."""
+        return float(np.median(self.duration))
+
+    def without_steady_motion(self) -> tuple[Steps, Floats]:
+        """Return the steps less their least-squares steady motion, and that motion (p,).
+
+        The restricted likelihood is the same for both; its searches begin from the steps' own size,
+        and every other statistic of the steps would contain the steady motion.
+        """
+        rows = self.steady.reshape(self.size.size, -1)
+        mean = np.linalg.lstsq(rows, self.size.ravel(), rcond=None)[0]
+        return replace(self, size=self.size - self.steady @ mean), mean
 
     @property
     def even(self) -> bool:
@@ -74,10 +93,19 @@ def steps_of(motion: RigidMotion, quantity: Quantity) -> Steps:
             "allowed) are needed to tell diffusion from noise",
             int(motion.fitted.size),
         )
-    size, noise = _turns(motion, stop) if quantity == "rotation" else _jumps(motion, start, stop)
+    duration = motion.time[stop] - motion.time[start]
+    if quantity == "rotation":
+        axes, noise = _noise_axes(motion)
+        size = motion.step_vectors()[stop - 1] @ axes
+        # A spin of the lab moves the body by R^T of it; in the plane both are one number.
+        turned = motion.rotation[start] @ axes if len(axes) == 3 else np.ones((len(start), 1, 1))
+        steady = np.swapaxes(turned, -1, -2) * duration[:, None, None]
+    else:
+        size, noise = _displacements(motion, start, stop)
+        steady = np.eye(size.shape[1]) * duration[:, None, None]
     return Steps(
         size=size,
-        duration=motion.time[stop] - motion.time[start],
+        duration=duration,
         linked=np.append(start[1:] == stop[:-1], False),
         before=noise[start],
         after=noise[stop],
@@ -85,6 +113,7 @@ def steps_of(motion: RigidMotion, quantity: Quantity) -> Steps:
         sigma=motion.sigma,
         freedom=residual_freedom(motion),
         dt=motion.dt,
+        steady=steady,
     )
 
 
@@ -134,15 +163,15 @@ def _within(value: Any, most: float) -> bool:  # noqa: ANN401 (a user's argument
     return bool(np.isfinite(number) and 0 <= number <= most)
 
 
-def _turns(motion: RigidMotion, stop: np.ndarray) -> tuple[Floats, Floats]:
-    """Return rotation vectors (S, A) and noise (T, A) along the axes of the mean covariance."""
+def _noise_axes(motion: RigidMotion) -> tuple[Floats, Floats]:
+    """Return the axes (A, A) of the mean covariance, and the noise (T, A) along them."""
     c = unit_covariance(motion)
     complete = _complete(motion)
     values, axes = np.linalg.eigh(np.mean(c[complete], axis=0))
     noise = np.einsum("ji,tjk,ki->ti", axes, c, axes)
     for group in np.split(np.arange(len(values)), 1 + np.flatnonzero(_apart(values))):
         noise[np.ix_(complete, group)] = noise[np.ix_(complete, group)].mean(axis=1)[:, None]
-    return motion.step_vectors()[stop - 1] @ axes, noise
+    return axes, noise
 
 
 def _apart(values: Floats) -> Bools:
@@ -151,7 +180,7 @@ def _apart(values: Floats) -> Bools:
     return clear
 
 
-def _jumps(motion: RigidMotion, start: np.ndarray, stop: np.ndarray) -> tuple[Floats, Floats]:
+def _displacements(motion: RigidMotion, start: np.ndarray, stop: np.ndarray) -> tuple[Floats, Floats]:
     """Return displacements of the centre (S, A) and its noise (T, A)."""
     size = motion.center[stop] - motion.center[start]
     return size, np.repeat(unit_center_variance(motion)[:, None], size.shape[1], axis=1)
