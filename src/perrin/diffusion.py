@@ -272,11 +272,11 @@ def estimate_diffusion(
     _check(motions, quantity=quantity, method=method, noise=noise, exposure=exposure, drift=drift)
     steps = [_steps(i, m, quantity) for i, m in enumerate(motions)]
     if method == "mle":
-        tracks = [_track(s, noise=noise, exposure=exposure, drift=drift) for s in steps]
+        tracks = [track_of(s, noise=noise, exposure=exposure, drift=drift) for s in steps]
         found = by_likelihood(tracks)
     elif method == "cve":
         found = _by_moments(
-            covariance_estimate([_track(s, noise=noise, exposure=exposure) for s in steps])
+            covariance_estimate([track_of(s, noise=noise, exposure=exposure) for s in steps])
         )
     else:
         given = None if noise == "joint" else [_orientation_noise(s, noise) for s in steps]
@@ -328,10 +328,10 @@ def _by_moments(moments: Moments) -> Found:
     return Found(float(value), ci68, ci95, moments.offset, moments.offset_stderr)
 
 
-def _track(
+def track_of(
     steps: Steps, *, noise: str | float, exposure: float | None, drift: bool = False
 ) -> Track:
-    """Say what is known of the noise of the steps; blur takes b D from every frame's variance."""
+    """Return the steps with what is known of their noise; blur takes b D from its variance."""
     if noise == "joint":
         # An unknown exposure may blur up to the limit at which steps stop being possible at all.
         blur = steps.duration.min() / 2 if exposure is None else exposure * steps.dt / 3

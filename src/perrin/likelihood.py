@@ -335,9 +335,10 @@ class _Tridiagonal:
 
     def _bands(self, D: Floats, theta: Floats) -> tuple[Floats, Floats]:
         """Return the diagonal of the covariance of all steps and the one beside it."""
-        D_i, theta_i, blur = (self._spread_groups(x) for x in (D, theta, self.blur * D))
-        first, last = (w * theta_i + k - blur for w, k in zip(self.weight, self.known, strict=True))
-        return 2 * D_i * self.tau + first + last, -(last * self.linked)[:-1]
+        D, theta, blur = (self._spread_groups(x) for x in (D, theta, self.blur))
+        return covariance_bands(
+            D, theta, self.tau, self.linked, blur=blur, weight=self.weight, known=self.known
+        )
 
     def _spread_groups(self, x: Floats) -> Floats:
         """Return a number of each group at every step; one number where there is one group."""
@@ -346,6 +347,25 @@ class _Tridiagonal:
     def _beside(self, product: Floats) -> Floats:
         padded: Floats = self.linked * np.append(product, 0.0)
         return padded
+
+
+def covariance_bands(
+    D: Floats | float,
+    theta: Floats | float,
+    tau: Floats,
+    linked: Floats | Bools,
+    *,
+    blur: Floats | float,
+    weight: tuple[Floats, Floats],
+    known: tuple[Floats, Floats],
+) -> tuple[Floats, Floats]:
+    """Return the diagonal of the covariance of steps and the one beside it, along the first axis.
+
+    The variance is 2 D tau + o_before + o_after and the covariance with the next step -o_after,
+    o = weight theta + known - blur D.
+    """
+    before, after = (w * theta + k - blur * D for w, k in zip(weight, known, strict=True))
+    return 2 * D * tau + before + after, -(after * linked)[:-1]
 
 
 def _same_noise(track: Track) -> list[Ints]:
@@ -563,6 +583,12 @@ class Likelihood:
         kernel = next(k for k in self.kernels if isinstance(k, _Tridiagonal))
         mean, gram = kernel.steady_motion(np.full(len(best.theta), best.D[0]), best.theta)
         return mean + np.array([t.steady for t in self.tracks]), gram
+
+    def steady_motion_at(self, D: float, theta: float) -> tuple[Floats, Floats]:
+        """Return the steady motion (p,) of a single track at given D and theta, with information."""
+        kernel = next(k for k in self.kernels if isinstance(k, _Tridiagonal))
+        mean, gram = kernel.steady_motion(np.array([D]), np.array([theta]))
+        return mean[0] + self.tracks[0].steady, gram[0]
 
     def offsets(self, best: Peak) -> tuple[Floats, float]:
         """Return the noise offset of each group, and the standard error of their mean.
