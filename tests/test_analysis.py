@@ -92,7 +92,7 @@ def test_frames_and_particles_may_be_missing(base):
     assert result.motion.n_present[7] == 3
     assert "2 of 4 particles" in result.motion.reason[9]
     assert abs(result.D_R.value - full.D_R.value) < full.D_R.stderr
-    assert any("16 of 150 frames have no pose" in w for w in result.warnings)
+    assert any("16 of 150 frames have no pose" in w for w in result.notes)
 
 
 def test_nan_coordinates_are_missing_points_counted_in_a_warning(base):
@@ -102,8 +102,8 @@ def test_nan_coordinates_are_missing_points_counted_in_a_warning(base):
     with_nan = perrin.analyze(holes, dt=0.73)
     without = perrin.analyze(base[base["frame"] != 20], dt=0.73)
     np.testing.assert_array_equal(values(with_nan), values(without))
-    assert any("4 rows" in w and "NaN" in w for w in with_nan.warnings)
-    assert not any("NaN" in w for w in without.warnings)
+    assert any("4 rows" in w and "NaN" in w for w in with_nan.notes)
+    assert not any("NaN" in w for w in without.notes)
 
 
 def test_without_a_cluster_column_bodies_are_found(base):
@@ -111,13 +111,13 @@ def test_without_a_cluster_column_bodies_are_found(base):
     plain = base.drop(columns="cluster")
     report = perrin.analyze(plain, dt=0.73)
     assert len(report.clusters) == 1
-    assert any("one cluster" in w for w in report.warnings)
+    assert any("one cluster" in w for w in report.notes)
     crowd = pd.concat([tracks(seed=k, cluster=k, n_frames=20) for k in range(6)])
     told = values(perrin.analyze(crowd, dt=0.73))
     for contact in (2.45, None):
         found = perrin.analyze(crowd.drop(columns="cluster"), dt=0.73, contact=contact)
         np.testing.assert_allclose(values(found), told, rtol=1e-9)
-    assert any("6 bodies found" in w for w in found.warnings)
+    assert any("6 bodies found" in w for w in found.notes)
     gas = np.random.default_rng(3).normal(size=(60, 25, 3)).cumsum(axis=0)
     with pytest.raises(perrin.TrackTableError, match=r"keep their distance.*--contact"):
         perrin.analyze(perrin.positions_table(gas).drop(columns="cluster"), dt=0.73)
@@ -158,7 +158,7 @@ def test_loose_particles_are_counted_and_left_out(base):
     loose = base.assign(cluster=-1, particle=base["particle"] + 50)
     report = perrin.analyze(pd.concat([base, loose]), dt=0.73)
     assert len(report.clusters) == 1
-    assert any("4 particles belong to no cluster" in w for w in report.warnings)
+    assert any("4 particles belong to no cluster" in w for w in report.notes)
     assert len(report.tracks) == 2 * len(base)
 
 
@@ -423,7 +423,7 @@ def test_text_clusters_are_numbered_and_named(base):
     table = pd.concat([base.assign(cluster="leg"), other, loose])
     report = perrin.analyze(table, dt=0.73)
     assert [(c.cluster, c.label) for c in report.clusters] == [(0, "knee"), (1, "leg")]
-    assert any("belong to no cluster" in w for w in report.warnings)
+    assert any("belong to no cluster" in w for w in report.notes)
 
 
 def test_autocorrelation_of_a_known_series():
@@ -486,7 +486,7 @@ def test_exchanged_labels_are_put_right_and_told(base, answer):
     mixed[77:, [1, 2, 3]] = mixed[77:, [2, 3, 1]]
     report = perrin.analyze(perrin.positions_table(mixed), dt=0.73)
     np.testing.assert_allclose(values(report), answer, rtol=1e-6)
-    (told,) = (w for w in report.clusters[0].warnings if "swap" in w)
+    (told,) = (w for w in report.clusters[0].notes if "labels change" in w)
     assert "40" in told
     assert "77" in told
     assert report.to_dict()["clusters"][0]["quality"]["swaps"] == [40, 77]
@@ -524,7 +524,7 @@ def test_rods_are_measured_and_full_rotation_refused(tmp_path):
         assert again.to_dict() == report.to_dict()
         entry = report.to_dict()["clusters"][-1]
         assert entry["D_R"] is None
-        assert any("no D_R" in w for w in entry["warnings"])
+        assert any("no D_R" in w for w in entry["notes"])
         assert entry["D_perp"]["value"] == rod.D_perp.value
 
 
@@ -544,14 +544,14 @@ def test_noise_exposure_and_drift_reach_the_estimates(base):
     free = perrin.analyze(base, dt=0.73).clusters[0]
     held = perrin.analyze(base, dt=0.73, noise="residual")
     assert held.clusters[0].D_R.stderr < 0.8 * free.D_R.stderr
-    assert any("exposure is not stated" in w for w in held.warnings)
+    assert any("exposure is not stated" in w for w in held.notes)
     stated = perrin.analyze(base, dt=0.73, noise=0.03, exposure=0.0)
     assert stated.warnings == ()
     assert stated.clusters[0].D_R.noise == "0.03 um"
     moving = base.assign(x=base["x"] + 0.5 * base["frame"])
     flow = perrin.analyze(moving, dt=0.73, drift=True).clusters[0]
     assert flow.D_T.value == pytest.approx(free.D_T.value, rel=0.05)
-    assert any("mean velocity of x 0.6" in w for w in flow.warnings)
+    assert any("mean velocity of x 0.6" in w for w in flow.notes)
 
 
 def test_clusters_that_differ_are_not_pooled_without_a_word():
@@ -606,7 +606,7 @@ def test_a_swap_says_the_residual_it_would_have_left():
     x = perrin.add_noise(truth.positions(), sigma=0.03, rng=2)
     x[30:] = x[30:, [1, 0, 2, 3]]
     report = perrin.analyze(perrin.positions_table(x), dt=0.73)
-    (told,) = (w for w in report.clusters[0].warnings if "labels swap" in w)
+    (told,) = (w for w in report.clusters[0].notes if "labels change" in w)
     assert told.startswith("identity: labels swap at frame 30; put right (residual as labelled up")
     swapped, usual = (float(word) for word in re.findall(r"([0-9.]+) (?:um|median)", told))
     mirrored = body.positions[[1, 0, 2, 3]]

@@ -21,6 +21,8 @@ SOURCE = ROOT / "src" / "perrin"
 # The house, top to bottom: a room imports only rooms above it.
 ROOMS = [
     "_arrays",
+    "_text",
+    "clock",
     "rotations",
     "shapes",
     "noise",
@@ -38,6 +40,7 @@ ROOMS = [
     "scatter",
     "moments",
     "diffusion",
+    "step_tests",
     "rod_diffusion",
     "curve_fits",
     "tensor_likelihood",

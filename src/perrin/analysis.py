@@ -6,7 +6,7 @@ import hashlib
 import os
 import platform
 import warnings as python_warnings
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias
@@ -21,6 +21,8 @@ from perrin._arrays import (
     TooFewFramesError,
     TrackTableError,
 )
+from perrin._text import frames_text, listed
+from perrin.clock import frame_stride, read_clock
 from perrin.diffusion import DiffusionEstimate, estimate_diffusion, with_error
 from perrin.files import check_tracks, read_tracks
 from perrin.grouping import each_cluster, find_clusters
@@ -49,6 +51,14 @@ from perrin.results import (
 from perrin.rod_diffusion import estimate_rod
 from perrin.rods import RodMotion, track_direction
 from perrin.rotations import fit_rotations, log_map
+from perrin.step_tests import (
+    JUMP_LEVEL,
+    Jumps,
+    SteadyMotion,
+    cut_at,
+    find_jumps,
+    steady_motion,
+)
 from perrin.tensors import DiffusionTensor, diffusion_tensor
 
 if TYPE_CHECKING:
@@ -73,6 +83,13 @@ _MANY_CUTS = 0.02
 _ANGLES = 5  # of cuts, told one by one
 # Clusters that agree less well than this by chance have no common D.
 _DIFFER = 0.01
+# A steady velocity or spin is reported below this p-value, shared by all clusters of a table.
+_STEADY = 1e-3
+# Identity corrected in this share of the frames, at most, is information.
+_FEW_FRAMES = 0.01
+# Jumps of a length that differs by less than this share are all of one length.
+_ONE_LENGTH = 0.3
+_SHOWN_JUMPS = 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,8 +104,10 @@ class Conditions:
     noise: Literal["joint", "residual"] | float
     exposure: float | None
     drift: bool
+    keep_jumps: bool = False
     times: Floats | None = None  # of every frame, s, where they are not dt apart
     sigma_ratio: ArrayLike | None = None  # of the axes, where that alone is known
+    first_frame: int = 0  # what the table calls its first frame
 
     def clock(self, frames: Ints) -> Floats:
         """Return the times of frames, s."""
@@ -105,7 +124,7 @@ class Conditions:
                 quantity=quantity,
                 noise=self.noise,
                 exposure=self.exposure,
-                drift=self.drift and quantity == "translation",
+                drift=self.drift,
             )
 
     def bodies(self, shapes: list[Shape]) -> list[Body]:
@@ -136,6 +155,7 @@ def analyze(
     noise: Literal["joint", "residual"] | float = "joint",
     exposure: float | None = None,
     drift: bool = False,
+    keep_jumps: bool = False,
     viscosity: float | None = None,
     temperature: float | None = None,
     diameter: float | None = None,
@@ -147,9 +167,9 @@ def analyze(
     ----------
     tracks : path or pandas.DataFrame
         A .csv, .csv.gz, .parquet or .gdf file, or a table with the columns frame, particle, x,
-        y[, z] and perhaps cluster.
+        y[, z] and perhaps cluster and time (s), which may be uneven.
     dt : float
-        Time between frames, s.
+        Time between successive frame numbers, s; the column time must agree with it.
     scale : float or array_like
         um per unit of the coordinates, one number or one per axis.
     columns : mapping, optional
@@ -166,7 +186,11 @@ def analyze(
     exposure : float, optional
         Open fraction of dt, 0 to 1; unknown by default.
     drift : bool
-        Give D_T a free mean velocity along each axis (flow, sedimentation).
+        Take a mean velocity off D_T (flow, sedimentation) and a mean spin off D_R; both are
+        reported.
+    keep_jumps : bool
+        Leave steps in the estimates that Brownian motion cannot make (a jump of the stage, an
+        exchange of labels). By default they are reported and the estimates of D leave them out.
     viscosity, temperature : float, optional
         Pa s and K: with both, sizes follow from D_T and from D_R for equal spheres of the measured
         shape, in three dimensions. The temperature alone gives the size and the viscosity that D_T
@@ -202,7 +226,9 @@ def analyze(
         dt=dt, contact=contact, viscosity=viscosity, temperature=temperature, diameter=diameter
     )
     table, source = _table(tracks, scale=scale, columns=columns)
-    conditions = Conditions(dt, sigma, viscosity, temperature, diameter, noise, exposure, drift)
+    conditions = Conditions(
+        dt, sigma, viscosity, temperature, diameter, noise, exposure, drift, keep_jumps
+    )
     table = _sliced(table, frames)
     arguments = told_conditions(conditions) | {"contact": contact, "frames": frames}
     arguments |= {"columns": columns, "scale": _plain(scale)}
@@ -233,32 +259,44 @@ def measure_table(
         Given the fitted bodies by cluster number, returns their motions from better data, without
         those that have to be left out.
     """
-    table, labels, warnings = _clustered(table, contact=contact)
+    table, labels, remarks = _clustered(table, contact=contact)
     first = int(table["frame"].min())
     table["frame"] -= first
     if conditions.times is not None:
         since = conditions.times[first:] - conditions.times[first]
         conditions = replace(conditions, times=since)
+    else:
+        clock = read_clock(table, dt=conditions.dt)
+        conditions = replace(conditions, times=clock.times)
+        remarks.notes += clock.notes
+    remarks.notes += frame_stride(table)
+    conditions = replace(conditions, first_frame=first)
     bodies, rods, failures = _fitted(table, labels, conditions)
     if improved is not None:
         motions = improved({b.cluster: (b.motion, b.frames + first) for b in bodies})
         bodies = [b._replace(motion=motions[b.cluster]) for b in bodies if b.cluster in motions]
-    results, unanswered = _estimated(bodies, conditions)
-    failures += unanswered
-    if failures and not (results or rods):
+    done = _estimated(bodies, conditions)
+    failures += done.failures
+    if failures and not (done.results or rods):
         raise failures[-1].error
-    results, rods = _interpreted(results, rods, conditions)
-    pooled, more = _pooled(results, conditions) if results else (None, [])
-    more += _exposure_taken(conditions)
+    results, rods = _interpreted(done.results, rods, conditions)
+    pooled, more = _pooled(results, done.motions, conditions)
+    warnings = (
+        *more,
+        *remarks.warnings,
+        *_failures_text(failures),
+        *_common_jumps(done.jumps),
+    )
+    notes = (*remarks.notes, *_assumed_exposure(conditions))
     settings = _settings(source, arguments=arguments, first_frame=first)
-    told = (*warnings, *(failure.told for failure in failures), *more)
-    return Report(tuple(results), pooled, told, table, settings, tuple(rods))
+    return Report(tuple(results), pooled, warnings, table, settings, tuple(rods), notes=notes)
 
 
 def told_conditions(conditions: Conditions) -> dict[str, Any]:
     """Return the conditions as run.json keeps them."""
     entry = asdict(replace(conditions, times=None, sigma_ratio=None))
-    del entry["times"], entry["sigma_ratio"]
+    for name in ("times", "sigma_ratio", "first_frame"):
+        del entry[name]
     return entry | {"sigma": _plain(conditions.sigma)}
 
 
@@ -311,34 +349,46 @@ def _sliced(table: pd.DataFrame, frames: tuple[int | None, int | None] | None) -
     return table[keep].reset_index(drop=True)
 
 
+@dataclass
+class _Remarks:
+    """What there is to say of a table as a whole."""
+
+    warnings: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+
 def _clustered(
     table: pd.DataFrame, *, contact: float | None
-) -> tuple[pd.DataFrame, dict[int, str], list[str]]:
-    """Make sure that every row has a cluster number; return it, names of clusters, and warnings."""
-    given, warnings = table, _oddities(table)
+) -> tuple[pd.DataFrame, dict[int, str], _Remarks]:
+    """Make sure that every row has a cluster number; return it, names of clusters, and remarks."""
+    given, remarks = table, _table_remarks(table)
     labels: dict[int, str] = {}
     if "cluster" in table:
         table, labels = _numbered(table)
     else:
-        table, said = _grouped(table, contact=contact)
-        warnings += said
+        table, grouping = _grouped(table, contact=contact)
+        remarks.notes += grouping
     loose = table["cluster"] == -1
     if loose.all():
         raise TrackTableError(_nothing_found(contact, marked="cluster" in given))
     if loose.any():
         count = table.loc[loose, "particle"].nunique()
-        warnings.append(f"{count} particles belong to no cluster and are left out")
-    return table, labels, warnings
+        remarks.notes.append(f"{count} particles belong to no cluster and are left out")
+    return table, labels, remarks
 
 
-def _oddities(table: pd.DataFrame) -> list[str]:
-    """Say what is no fault in a table but should be known."""
+def _table_remarks(table: pd.DataFrame) -> _Remarks:
+    """Report what is no fault in a table but should be known."""
     axes = [a for a in ("x", "y", "z") if a in table]
     empty = int(table[axes].isna().any(axis=1).sum())
-    told = [f"{empty} rows without coordinates (NaN) count as missing points"] if empty else []
+    remarks = _Remarks()
+    if empty:
+        remarks.notes.append(f"{empty} rows without coordinates (NaN) count as missing points")
     if "z" in table and table["z"].nunique() == 1:
-        told.append("z never changes: leave the column out to analyse motion in the plane")
-    return told
+        remarks.warnings.append(
+            "z never changes: leave the column out to analyse motion in the plane"
+        )
+    return remarks
 
 
 def _grouped(table: pd.DataFrame, *, contact: float | None) -> tuple[pd.DataFrame, list[str]]:
@@ -416,8 +466,20 @@ class _Failure(NamedTuple):
     error: DegenerateClusterError | TooFewFramesError
 
     @property
-    def told(self) -> str:
-        return f"cluster {self.name} was left out: {str(self.error).removeprefix('motion 0: ')}"
+    def reason(self) -> str:
+        return str(self.error).removeprefix("motion 0: ")
+
+
+def _failures_text(failures: list[_Failure]) -> list[str]:
+    """Name the clusters that were left out, each reason once."""
+    by_reason: dict[str, list[str]] = {}
+    for failure in failures:
+        by_reason.setdefault(failure.reason, []).append(failure.name)
+    return [
+        f"cluster{'s' if len(names) > 1 else ''} {listed(names)} "
+        f"{'were' if len(names) > 1 else 'was'} left out: {reason}"
+        for reason, names in by_reason.items()
+    ]
 
 
 class _Tracks(NamedTuple):
@@ -429,14 +491,15 @@ class _Tracks(NamedTuple):
 
 
 class _Body(NamedTuple):
-    """One cluster's fitted motion, what it went through, and what has to be told of it."""
+    """One cluster's fitted motion, its quality, and the remarks on both."""
 
     cluster: int
     label: str | None
     frames: Ints
     motion: RigidMotion
     quality: Quality
-    told: tuple[str, ...]
+    warnings: tuple[str, ...]
+    notes: tuple[str, ...]
 
 
 def _fit(
@@ -455,7 +518,7 @@ def _fit(
 
 
 def _fit_body(tracks: _Tracks, cluster: int, label: str | None, conditions: Conditions) -> _Body:
-    """Settle who is who, fit the common shape to every frame, and judge the fits."""
+    """Settle which label belongs to which particle, fit the common shape, and judge the fits."""
     frames = tracks.frames
     identity = settle_identity(tracks.positions, times=frames)
     positions = identity.arranged(tracks.positions)
@@ -477,43 +540,220 @@ def _fit_body(tracks: _Tracks, cluster: int, label: str | None, conditions: Cond
         cuts=tuple(frames[1:][changed].tolist()),
         extra=tuple(frames[identity.extra].tolist()),
     )
-    told = _identity_told(quality, identity, tracks, motion)
-    return _Body(cluster, label, frames, motion, quality, (*told, *quality.warnings))
+    warnings, notes = _identity_remarks(
+        quality, identity, tracks, motion, first=conditions.first_frame
+    )
+    return _Body(
+        cluster,
+        label,
+        frames,
+        motion,
+        quality,
+        (*warnings, *quality.warnings),
+        (*notes, *getattr(quality, "notes", ())),
+    )
 
 
-def _estimated(
-    bodies: Iterable[_Body], conditions: Conditions
-) -> tuple[list[ClusterResult], list[_Failure]]:
-    """Estimate the coefficients of every body; return what cannot answer as well."""
-    results: list[ClusterResult] = []
-    failures: list[_Failure] = []
+@dataclass
+class _Estimated:
+    """The results of all bodies, and what later steps need of how they were made.
+
+    `motions` are those that D was estimated from, by cluster and quantity; `jumps` are the frames
+    at which a cluster jumps with the displacements of its centre.
+    """
+
+    results: list[ClusterResult] = field(default_factory=list)
+    failures: list[_Failure] = field(default_factory=list)
+    motions: dict[tuple[int, Quantity], RigidMotion] = field(default_factory=dict)
+    jumps: dict[int, list[tuple[str, Floats]]] = field(default_factory=dict)
+
+
+def _estimated(bodies: list[_Body], conditions: Conditions) -> _Estimated:
+    """Estimate the coefficients of every body; keep what cannot answer with its reason."""
+    done = _Estimated()
     for body in bodies:
         try:
-            results.append(_estimate_body(body, conditions))
+            _estimate_body(body, conditions, done, bodies=len(bodies))
         except (DegenerateClusterError, TooFewFramesError) as error:
-            failures.append(_Failure(body.label or str(body.cluster), error))
-    return results, failures
+            done.failures.append(_Failure(body.label or str(body.cluster), error))
+    return done
 
 
-def _estimate_body(body: _Body, conditions: Conditions) -> ClusterResult:
-    """Estimate the coefficients, and collect what must be said about them."""
+@dataclass(frozen=True)
+class _Diffusion:
+    """One coefficient, the motion it was estimated from, and what its steps show beside it."""
+
+    estimate: DiffusionEstimate
+    motion: RigidMotion
+    jumps: Jumps
+    left_out: Ints
+    steady: bool
+    warnings: tuple[str, ...]
+    notes: tuple[str, ...]
+
+
+def _estimate_body(body: _Body, conditions: Conditions, done: _Estimated, *, bodies: int) -> None:
+    """Estimate the coefficients of a body, and collect the remarks on them."""
     motion = body.motion
-    D_R, D_T = (conditions.estimate(motion, q) for q in ("rotation", "translation"))
+    turn = _diffusion(body, "rotation", conditions, bodies=bodies)
+    path = _diffusion(body, "translation", conditions, bodies=bodies)
+    D_R, D_T = turn.estimate, path.estimate
     noise = predicted_noise(motion)
-    tensor, unfound = _tensor(motion, conditions)
+    tensor, unfound = _tensor(turn.motion, conditions)
+    other_motion = turn.steady or turn.jumps.rows.size
     warnings = (
-        *_missing(motion),
-        *body.told,
-        *_floor_mismatch(motion, D_R, noise),
-        *_unresolved(D_R, D_T),
-        *(f"D_R: {text}" for text in D_R.warnings),
-        *(f"D_T: {text}" for text in D_T.warnings),
-        *_drift_told(D_T),
-        *unfound,
+        *body.warnings,
+        *([] if other_motion else _floor_mismatch(motion, D_R, noise)),
+        *turn.warnings,
+        *path.warnings,
     )
-    return ClusterResult(
-        body.cluster, motion, D_R, D_T, tensor, noise, None, warnings, body.label, body.quality
+    result = ClusterResult(
+        body.cluster,
+        motion,
+        D_R,
+        D_T,
+        tensor,
+        noise,
+        None,
+        warnings,
+        body.label,
+        body.quality,
+        notes=(*_missing(motion), *body.notes, *turn.notes, *path.notes, *unfound),
+        jumps={
+            name: tuple(body.frames[found.left_out].tolist())
+            for name, found in (("rotation", turn), ("translation", path))
+            if found.left_out.size
+        },
     )
+    done.results.append(result)
+    done.motions[body.cluster, "rotation"] = turn.motion
+    done.motions[body.cluster, "translation"] = path.motion
+    for row, move in zip(path.jumps.rows, path.jumps.size, strict=True):
+        frame = int(body.frames[row]) + conditions.first_frame
+        done.jumps.setdefault(frame, []).append((result.name, move))
+
+
+def _diffusion(
+    body: _Body, quantity: Quantity, conditions: Conditions, *, bodies: int
+) -> _Diffusion:
+    """Estimate one coefficient from the steps that Brownian motion can make.
+
+    `bodies` is the number of clusters tested: the level of the steady motion is one for all.
+    """
+    motion, name = body.motion, "D_R" if quantity == "rotation" else "D_T"
+    estimate = conditions.estimate(motion, quantity)
+    jumps = find_jumps(motion, estimate)
+    left_out = jumps.rows[:0]
+    warnings: list[str] = []
+    if jumps.rows.size:
+        frames = body.frames[jumps.rows] + conditions.first_frame
+        warnings.append(_jumps_text(jumps, frames, quantity, kept=conditions.keep_jumps))
+        if not (jumps.many or conditions.keep_jumps):
+            left_out = jumps.rows
+            motion = cut_at(motion, left_out)
+            estimate = conditions.estimate(motion, quantity)
+    steady = False
+    if not (conditions.drift or jumps.many):
+        found = steady_motion(motion, estimate)
+        steady = found.p < _STEADY / bodies
+        warnings += [_steady_text(found, quantity)] if steady else []
+    if not estimate.resolved and not steady:
+        warnings.append(f"not resolved: {estimate}")
+    warnings += [f"{name}: {text}" for text in estimate.warnings]
+    notes = tuple(_drift_text(estimate, quantity))
+    return _Diffusion(estimate, motion, jumps, left_out, steady, tuple(warnings), notes)
+
+
+def _jumps_text(jumps: Jumps, frames: Ints, quantity: Quantity, *, kept: bool) -> str:
+    """Name the steps that Brownian motion cannot make, with frame and size."""
+    turn = quantity == "rotation"
+    name, unit = ("D_R", "deg") if turn else ("D_T", "um")
+    what = "the body turns" if turn else "the centre moves"
+    length = np.rad2deg(jumps.length) if turn else jumps.length
+    shown = _amounts(length, unit)
+    if jumps.many:
+        return (
+            f"steps: {what} in {len(frames)} of {jumps.n_steps} steps farther than Brownian "
+            f"motion can (the longest {length.max():.3g} {unit}, at frame "
+            f"{frames[np.argmax(length)]}){_wrapping(jumps, quantity)}: no jumps but another kind "
+            f"of motion (hops, a changing D, heavy tails), which one {name} does not describe"
+        )
+    done = f"{name} contains them" if kept else f"{name} leaves them out (keep_jumps keeps them)"
+    if len(frames) == 1:
+        done = done.replace("them", "it")
+    return (
+        f"jump: {what} by {shown} in one step, at {frames_text(frames)}"
+        f"{_wrapping(jumps, quantity)}; Brownian motion does so with a probability below "
+        f"{JUMP_LEVEL:g} in the whole track; {done}"
+    )
+
+
+def _amounts(values: Floats, unit: str) -> str:
+    return f"{listed([f'{v:.3g}' for v in values])} {unit}"
+
+
+def _wrapping(jumps: Jumps, quantity: Quantity) -> str:
+    """Report jumps that all have one length along one axis each: coordinates in a periodic box."""
+    if quantity == "rotation" or len(jumps.rows) < 2:
+        return ""
+    size = np.abs(jumps.size)
+    largest = size.max(axis=1)
+    usual = float(np.median(largest))
+    alike = np.mean(np.abs(largest - usual) < _ONE_LENGTH * usual)
+    if alike < 0.8 or np.mean(np.sort(size, axis=1)[:, -2] < 0.5 * largest) < 0.8:
+        return ""
+    return f", most of them by about {usual:.3g} um along one axis, as coordinates wrapped in a box"
+
+
+def _steady_text(found: SteadyMotion, quantity: Quantity) -> str:
+    """Name a steady velocity or spin with its error and the remedy."""
+    turn = quantity == "rotation"
+    value, error = np.array(found.value), np.array(found.stderr)
+    size = float(np.linalg.norm(value))
+    stderr = float(np.linalg.norm(value * error) / size)
+    unit, name = ("rad/s", "D_R") if turn else ("um/s", "D_T")
+    what = "the body turns" if turn else "the centre moves"
+    way = ""
+    if len(value) > 1:
+        along = ", ".join(f"{v:.2f}" for v in value / size)
+        way = f" {'about' if turn else 'along'} ({along})"
+    return (
+        f"steady motion: {what} steadily at {with_error(size, stderr)} {unit}{way} (F test, p = "
+        f"{found.p:.1g}), and {name} contains that; drift=True takes it off"
+    )
+
+
+def _drift_text(estimate: DiffusionEstimate, quantity: Quantity) -> list[str]:
+    """State which mean velocity or spin was taken off."""
+    if estimate.drift is None or estimate.drift_stderr is None:
+        return []
+    axes = "xyz" if len(estimate.drift[0]) > 1 else "z"
+    parts = zip(axes, estimate.drift[0], estimate.drift_stderr[0], strict=False)
+    shown = ", ".join(f"{axis} {with_error(v, e)}" for axis, v, e in parts)
+    if quantity == "rotation":
+        return [f"D_R is about a mean spin of {shown} rad/s, which was taken off"]
+    return [f"D_T is about a mean velocity of {shown} um/s, which was taken off"]
+
+
+def _common_jumps(jumps: dict[int, list[tuple[str, Floats]]]) -> list[str]:
+    """Name frames at which several clusters jump: exchanged clusters, or a jump of the stage."""
+    shared = sorted((frame, found) for frame, found in jumps.items() if len(found) > 1)
+    return [
+        f"jump: clusters {listed(name for name, _ in found)} jump at the same frame {frame}: "
+        f"{_common_cause(np.array([move for _, move in found]))}"
+        for frame, found in shared[:_SHOWN_JUMPS]
+    ]
+
+
+def _common_cause(moves: Floats) -> str:
+    """Tell a jump of all clusters by one vector from clusters that take each other's place."""
+    typical = float(np.mean(np.linalg.norm(moves, axis=1)))
+    together = float(np.linalg.norm(moves.mean(axis=0)))
+    if together > 0.8 * typical:
+        return "the stage or the camera moved"
+    if together < 0.2 * typical:
+        return "their labels were exchanged"
+    return "labels were exchanged, or the stage turned"
 
 
 def _tensor(
@@ -545,60 +785,77 @@ def _measure_rod(
         tracks.positions, dt=dt, times=conditions.clock(frames), sigma=conditions.sigma
     )
     D_perp, D_T = estimate_rod(motion), estimate_rod(motion, quantity="translation")
-    warnings = [
+    first = conditions.first_frame
+    notes = [
+        *_missing(motion),
         f"no D_R: {len(motion.places)} particles on one line have a direction but no full "
-        "orientation; D_perp is how fast that direction diffuses"
+        "orientation; D_perp is how fast that direction diffuses",
     ]
+    warnings: list[str] = []
     if motion.swaps.size:
-        warnings.append(f"identity: the ends swap labels at {_at(frames[motion.swaps])}; put right")
+        swaps = frames[motion.swaps] + first
+        text = f"identity: the ends exchange labels at {frames_text(swaps)}; corrected"
+        (warnings if motion.swaps.size > _FEW_FRAMES * len(frames) else notes).append(text)
     cuts = frames[1:][np.diff(motion.piece) != 0]
     if cuts.size:
-        warnings.append(f"identity: the ends may be mistaken at {_at(cuts)}; the track is cut")
-    return RodResult(cluster, motion, D_perp, D_T, (*_missing(motion), *warnings), label)
+        warnings.append(
+            f"identity: the ends may be mistaken at {frames_text(cuts + first)}; the track is cut"
+        )
+    return RodResult(cluster, motion, D_perp, D_T, tuple(warnings), label, notes=tuple(notes))
 
 
-def _at(frames: Iterable[int]) -> str:
-    """List frames in words."""
-    listed = [str(int(k)) for k in frames]
-    return f"frame{'s' if len(listed) > 1 else ''} {', '.join(listed)}"
+def _identity_remarks(
+    quality: Quality, identity: Identity, tracks: _Tracks, motion: RigidMotion, *, first: int
+) -> tuple[list[str], list[str]]:
+    """Name the frames at which labels were corrected, a track cut, or a detection left out.
 
+    What concerns less than 1 % of the frames is a note, the rest a warning.
+    """
+    warnings: list[str] = []
+    notes: list[str] = []
+    count = len(tracks.frames)
 
-def _identity_told(
-    quality: Quality, identity: Identity, tracks: _Tracks, motion: RigidMotion
-) -> list[str]:
-    """Name every frame at which labels were repaired, a track cut, or a detection left out."""
-    told = []
+    def remark(frames: Iterable[int], text: str) -> None:
+        (warnings if len(list(frames)) > _FEW_FRAMES * count else notes).append(text)
+
+    def at(frames: Iterable[int]) -> str:
+        return frames_text(k + first for k in frames)
+
     if quality.swaps:
-        told.append(
-            f"identity: labels swap at {_at(quality.swaps)}; put right"
-            f"{_misfit_told(identity, tracks, motion)}"
+        remark(
+            quality.swaps,
+            f"identity: labels change particles at {at(quality.swaps)}; corrected"
+            f"{_misfit_text(identity, tracks, motion)}",
         )
     if quality.cuts:
-        told.append(
-            f"identity: who is who is in doubt at {_at(quality.cuts)}; the track is cut there"
-            f"{_jumps_told(quality, tracks, motion)}"
+        remark(
+            quality.cuts,
+            f"identity: which label belongs to which particle is in doubt at {at(quality.cuts)}; "
+            f"the track is cut there{_angles_text(quality, tracks, motion)}",
         )
     if quality.extra:
-        told.append(
+        remark(
+            quality.extra,
             f"identity: a detection that is no particle of the body is left out at "
-            f"{_at(quality.extra)}"
+            f"{at(quality.extra)}",
         )
-    unsettled, count = tracks.frames[identity.unsettled], len(tracks.frames)
+    unsettled = tracks.frames[identity.unsettled]
     if unsettled.size:
-        told.append(
+        remark(
+            unsettled,
             f"identity: {unsettled.size} of {count} frames fit the common shape in no assignment "
-            f"(first: {_at(unsettled[:10].tolist())}); they keep their labels"
+            f"({at(unsettled.tolist())}); they keep their labels",
         )
     if len(quality.cuts) > _MANY_CUTS * count:
-        told.append(
+        warnings.append(
             "identity: the body turns too far between frames for its symmetry; cutting the longest "
             "steps makes D_R too low: sample faster"
         )
-    return told
+    return warnings, notes
 
 
-def _misfit_told(identity: Identity, tracks: _Tracks, motion: RigidMotion) -> str:
-    """Say which residual the swaps would have left with the labels as they came."""
+def _misfit_text(identity: Identity, tracks: _Tracks, motion: RigidMotion) -> str:
+    """Return which residual the corrected frames would have left with the labels as they came."""
     rows = identity.swaps[identity.swaps > 0]
     before = identity.order[rows - 1]
     x = np.take_along_axis(tracks.positions[rows], np.maximum(before, 0)[..., None], axis=1)
@@ -617,8 +874,8 @@ def _misfit_told(identity: Identity, tracks: _Tracks, motion: RigidMotion) -> st
     return f" (residual as labelled up to {worst:.3g} um against {usual:.3g} median)"
 
 
-def _jumps_told(quality: Quality, tracks: _Tracks, motion: RigidMotion) -> str:
-    """Say how far the body turns where the track is cut, as far as the fits tell."""
+def _angles_text(quality: Quality, tracks: _Tracks, motion: RigidMotion) -> str:
+    """Return how far the body turns where the track is cut, as far as the fits show."""
     rows = np.searchsorted(tracks.frames, quality.cuts)
     turn = motion.rotation[rows] @ np.swapaxes(motion.rotation[rows - 1], -1, -2)
     known = np.isfinite(turn).all(axis=(-2, -1))
@@ -656,22 +913,8 @@ def _floor_mismatch(motion: RigidMotion, D_R: DiffusionEstimate, noise: NoiseFlo
     ]
 
 
-def _unresolved(D_R: DiffusionEstimate, D_T: DiffusionEstimate) -> list[str]:
-    """Name the coefficients that are upper limits only."""
-    return [f"not resolved: {estimate}" for estimate in (D_R, D_T) if not estimate.resolved]
-
-
-def _drift_told(D_T: DiffusionEstimate) -> list[str]:
-    """Say which mean velocity was taken off D_T."""
-    if D_T.drift is None or D_T.drift_stderr is None:
-        return []
-    axes = zip("xyz", D_T.drift[0], D_T.drift_stderr[0], strict=False)
-    told = ", ".join(f"{axis} {with_error(v, e)}" for axis, v, e in axes)
-    return [f"D_T is about a mean velocity of {told} um/s"]
-
-
-def _exposure_taken(conditions: Conditions) -> list[str]:
-    """Say what an unknown exposure was taken for where the noise is held."""
+def _assumed_exposure(conditions: Conditions) -> list[str]:
+    """State what an unknown exposure was taken for where the noise is held."""
     if conditions.noise == "joint" or conditions.exposure is not None:
         return []
     return [
@@ -739,19 +982,29 @@ def _with_prediction(rod: RodResult, body: Body) -> RodResult:
     return replace(rod, prediction=prediction, warnings=(*rod.warnings, *body.told))
 
 
-def _pooled(results: list[ClusterResult], conditions: Conditions) -> tuple[Pooled, list[str]]:
-    """Pool all clusters that passed as rigid; say which are left out."""
+def _pooled(
+    results: list[ClusterResult],
+    motions: Mapping[tuple[int, Quantity], RigidMotion],
+    conditions: Conditions,
+) -> tuple[Pooled | None, list[str]]:
+    """Pool all clusters that passed as rigid; without any nothing is pooled."""
     soft = [r for r in results if r.quality is not None and not r.quality.rigid]
-    used = [r for r in results if r not in soft] or results
+    used = [r for r in results if r not in soft]
+    if not used:
+        return None, _nothing_rigid(soft)
     warnings = []
-    if soft and len(used) < len(results):
-        names = ", ".join(r.name for r in soft)
-        warnings.append(f"the pooled values leave out what is not rigid: cluster {names}")
+    if soft:
+        names = listed(r.name for r in soft)
+        many = "s" if len(soft) > 1 else ""
+        warnings.append(f"the pooled values leave out what is not rigid: cluster{many} {names}")
     clusters = tuple(r.cluster for r in used)
     if len(used) == 1:
         return Pooled(used[0].D_R, used[0].D_T, clusters), warnings
-    motions = [r.motion for r in used]
-    D_R, D_T = (conditions.estimate(motions, q) for q in ("rotation", "translation"))
+    quantities: tuple[Quantity, Quantity] = ("rotation", "translation")
+    D_R, D_T = (
+        conditions.estimate([motions[r.cluster, quantity] for r in used], quantity)
+        for quantity in quantities
+    )
     warnings += [
         f"the clusters do not agree on one {name}: equal values would scatter as much with "
         f"probability {estimate.p_same:.1g}"
@@ -759,6 +1012,17 @@ def _pooled(results: list[ClusterResult], conditions: Conditions) -> tuple[Poole
         if estimate.p_same is not None and estimate.p_same < _DIFFER
     ]
     return Pooled(D_R, D_T, clusters), warnings
+
+
+def _nothing_rigid(soft: list[ClusterResult]) -> list[str]:
+    """State that nothing is pooled because no cluster moves as one rigid body."""
+    if not soft:
+        return []
+    which = "the cluster is" if len(soft) == 1 else f"none of the {len(soft)} clusters is"
+    return [
+        f"not rigid: {which}{' not' if len(soft) == 1 else ''} a rigid body, and nothing is "
+        "pooled; D_R and D_T of what is not rigid describe no body"
+    ]
 
 
 def _settings(

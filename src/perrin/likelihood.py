@@ -585,7 +585,7 @@ class Likelihood:
         return mean + np.array([t.steady for t in self.tracks]), gram
 
     def steady_motion_at(self, D: float, theta: float) -> tuple[Floats, Floats]:
-        """Return the steady motion (p,) of a single track at given D and theta, with information."""
+        """Return the steady motion (p,) of a single track at D and theta, and its information."""
         kernel = next(k for k in self.kernels if isinstance(k, _Tridiagonal))
         mean, gram = kernel.steady_motion(np.array([D]), np.array([theta]))
         return mean[0] + self.tracks[0].steady, gram[0]

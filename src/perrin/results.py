@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from perrin.clock import EVEN
 from perrin.diffusion import DiffusionEstimate, with_error
 from perrin.hydrodynamics import Size
 from perrin.images.imaging import Imaging, read_imaging, write_imaging
@@ -32,9 +33,6 @@ if TYPE_CHECKING:
     from perrin._arrays import Floats
 
 
-_EVEN = 5e-4  # times that are off an even grid by less than this share of dt are on it
-
-
 @dataclass(frozen=True, eq=False)
 class ClusterResult:
     """What was measured on one cluster.
@@ -52,12 +50,18 @@ class ClusterResult:
         "translation" and "rotation", where the viscosity is known, and "both", with the viscosity
         that both coefficients imply; of equal spheres of the measured shape. None without any.
     warnings : tuple of str
+        What speaks against the numbers.
     label : str or None
         The cluster's name in the table, where it is text.
     quality : Quality or None
         Rigidity, errors per axis, and what was repaired.
     prediction : Prediction or None
         What spheres of the stated diameter would do; None if none was stated.
+    notes : tuple of str
+        What informs: how the table was read, what was left out or corrected.
+    jumps : dict of tuple of int
+        "rotation" and "translation": the frames (from 0) at which a step was left out of the
+        estimates because Brownian motion cannot make it.
     """
 
     cluster: int
@@ -71,6 +75,8 @@ class ClusterResult:
     label: str | None = None
     quality: Quality | None = None
     prediction: Prediction | None = None
+    notes: tuple[str, ...] = ()
+    jumps: dict[str, tuple[int, ...]] = field(default_factory=dict)
 
     @cached_property
     def msad(self) -> LagCurve:
@@ -116,7 +122,9 @@ class ClusterResult:
             "size_factor": next((s.factor for s in (self.sizes or {}).values()), None),
             "prediction": None if self.prediction is None else self.prediction.to_dict(),
             "quality": None if self.quality is None else self.quality.to_dict(),
+            "jumps": {name: list(frames) for name, frames in self.jumps.items()},
             "warnings": list(self.warnings),
+            "notes": list(self.notes),
         }
 
 
@@ -134,6 +142,7 @@ class RodResult:
     label : str or None
     prediction : Prediction or None
         What spheres of the stated diameter would do; None if none was stated.
+    notes : tuple of str
     """
 
     cluster: int
@@ -143,6 +152,7 @@ class RodResult:
     warnings: tuple[str, ...]
     label: str | None = None
     prediction: Prediction | None = None
+    notes: tuple[str, ...] = ()
 
     @property
     def name(self) -> str:
@@ -167,6 +177,7 @@ class RodResult:
             "sizes": None,
             "prediction": None if self.prediction is None else self.prediction.to_dict(),
             "warnings": list(self.warnings),
+            "notes": list(self.notes),
         }
 
 
@@ -205,6 +216,8 @@ class Report:
         Pairs and straight chains in three dimensions, which have no full rotation.
     imaging : Imaging or None
         How the spheres were seen, where the run began with images.
+    notes : tuple of str
+        What informs of the whole table: how it was read, what was left out.
     """
 
     clusters: tuple[ClusterResult, ...]
@@ -214,6 +227,7 @@ class Report:
     settings: dict[str, Any] = field(default_factory=dict)
     rods: tuple[RodResult, ...] = ()
     imaging: Imaging | None = None
+    notes: tuple[str, ...] = ()
 
     @property
     def results(self) -> tuple[ClusterResult | RodResult, ...]:
@@ -243,6 +257,7 @@ class Report:
                 "clusters": [] if pooled is None else list(pooled.clusters),
             },
             "warnings": list(self.warnings),
+            "notes": list(self.notes),
         }
 
     def save(self, folder: str | os.PathLike[str], *, overwrite: bool = False) -> None:
@@ -289,6 +304,7 @@ def load_run(folder: str | os.PathLike[str]) -> Report:
         tracks=pd.read_parquet(path / "tracks.parquet"),
         settings=settings,
         imaging=read_imaging(path) if (path / "imaging.json").is_file() else None,
+        notes=tuple(summary.get("notes", ())),
     )
 
 
@@ -458,7 +474,7 @@ def counted(motion: RigidMotion) -> RigidMotion:
 def evenly_spaced(times: Floats, *, dt: float) -> bool:
     """Return whether times are those of neighbouring frames dt apart, from the first on."""
     grid = times[0] + dt * np.arange(len(times))
-    return bool(np.all(np.abs(times - grid) <= _EVEN * dt))
+    return bool(np.all(np.abs(times - grid) <= EVEN * dt))
 
 
 def predicted_noise(motion: RigidMotion) -> NoiseFloor:
@@ -497,9 +513,12 @@ def _estimate_from(entry: dict[str, Any]) -> DiffusionEstimate:
     for name in ("ci68", "ci95"):
         low, high = read[name]
         read[name] = (low, np.inf if high is None else high)
-    read["offset_stderr"] = np.nan if entry["offset_stderr"] is None else entry["offset_stderr"]
-    read["dt"] = np.nan if entry["dt"] is None else entry["dt"]
-    read["snr"] = np.inf if entry["snr"] is None else entry["snr"]
+    for name in ("value", "offset", "offset_stderr", "dt"):
+        read[name] = np.nan if entry[name] is None else entry[name]
+    # Without a value nothing is known; beside one, what JSON cannot hold is unbounded.
+    unbounded = np.nan if entry["value"] is None else np.inf
+    for name in ("stderr", "snr"):
+        read[name] = unbounded if entry[name] is None else entry[name]
     read["warnings"] = tuple(entry["warnings"])
     for name in ("drift", "drift_stderr"):
         if entry[name] is not None:
@@ -586,6 +605,8 @@ def _result_from(entry: dict[str, Any], motion: RigidMotion) -> ClusterResult:
         label=entry["label"],
         quality=None if entry["quality"] is None else Quality.from_dict(entry["quality"]),
         prediction=_prediction_from(entry),
+        notes=tuple(entry.get("notes", ())),
+        jumps={name: tuple(frames) for name, frames in entry.get("jumps", {}).items()},
     )
 
 
@@ -599,6 +620,7 @@ def _rod_from(entry: dict[str, Any], motion: RodMotion) -> RodResult:
         warnings=tuple(entry["warnings"]),
         label=entry["label"],
         prediction=_prediction_from(entry),
+        notes=tuple(entry.get("notes", ())),
     )
 
 

@@ -26,8 +26,8 @@ MOST_JUMPS = 0.01
 _CANDIDATE = 1e-3
 _FEWEST = 8  # steps, below which no scale is known
 _ROUNDS = 10  # of finding candidates beside the diffusion of the steps that are none
-# Above this p-value at the D that contains the steady motion no fit without it is made: the refitted
-# p-value is smaller by the share of the motion in D, which is then a few parts in N.
+# Above this p-value, at the D that contains the steady motion, no fit without it is made: it would
+# change D, and with it p, by a few parts in N.
 _SCREEN = 0.05
 # A displaced frame is a matter of localisation up to so many times the variance that its own
 # residual explains; beyond it the body itself was elsewhere for one frame.
@@ -223,9 +223,7 @@ class _Residuals(NamedTuple):
     measured_badly: Bools  # (S - 1,), whether localisation explains how far that frame lies off
 
 
-def _residuals(
-    motion: RigidMotion, estimate: DiffusionEstimate, *, without: Bools
-) -> _Residuals:
+def _residuals(motion: RigidMotion, estimate: DiffusionEstimate, *, without: Bools) -> _Residuals:
     """Return the residual of each step given all others, over its standard deviation.
 
     `without` marks steps that the mean motion of an estimate with drift was fitted without.

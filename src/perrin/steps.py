@@ -68,7 +68,7 @@ class Steps:
         and every other statistic of the steps would contain the steady motion.
         """
         rows = self.steady.reshape(self.size.size, -1)
-        mean = np.linalg.lstsq(rows, self.size.ravel(), rcond=None)[0]
+        mean: Floats = np.linalg.lstsq(rows, self.size.ravel(), rcond=None)[0].astype(np.float64)
         return replace(self, size=self.size - self.steady @ mean), mean
 
     @property
@@ -180,7 +180,9 @@ def _apart(values: Floats) -> Bools:
     return clear
 
 
-def _displacements(motion: RigidMotion, start: np.ndarray, stop: np.ndarray) -> tuple[Floats, Floats]:
+def _displacements(
+    motion: RigidMotion, start: np.ndarray, stop: np.ndarray
+) -> tuple[Floats, Floats]:
     """Return displacements of the centre (S, A) and its noise (T, A)."""
     size = motion.center[stop] - motion.center[start]
     return size, np.repeat(unit_center_variance(motion)[:, None], size.shape[1], axis=1)

@@ -1,0 +1,133 @@
+"""When the frames of a track table were recorded: the column time."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from perrin._arrays import Floats, TrackTableError
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from perrin._arrays import Ints
+
+# Times that are off an even grid by less than this share of dt are on it.
+EVEN = 5e-4
+# The usual interval of the column may differ from dt by this share: what clocks and rounding do.
+_AGREES = 0.01
+_LISTED = 5
+
+
+class Clock(NamedTuple):
+    """Times of all frames, s, from frame 0 on; None where they are dt apart. What informs of it."""
+
+    times: Floats | None
+    notes: tuple[str, ...]
+
+
+def read_clock(table: pd.DataFrame, *, dt: float) -> Clock:
+    """Return the times of all frames from the column ``time`` of a table.
+
+    Parameters
+    ----------
+    table : pandas.DataFrame
+        A clean track table; frames from 0 on. Without a column ``time`` frames are dt apart.
+    dt : float
+        Time between successive frame numbers, s, which the column must agree with.
+
+    Returns
+    -------
+    Clock
+        The time of a frame is the mean over its rows; frames without a time are interpolated.
+
+    Raises
+    ------
+    TrackTableError
+        If times do not rise with the frame numbers, are missing in more than half of the frames,
+        or if the median interval of neighbouring frames differs from dt by more than 1 %.
+
+    Examples
+    --------
+    >>> import pandas as pd
+    >>> from perrin.clock import read_clock
+    >>> table = pd.DataFrame({"frame": [0, 1, 2, 3], "time": [0.0, 0.5, 1.0, 9.0]})
+    >>> read_clock(table, dt=0.5).times.tolist()
+    [0.0, 0.5, 1.0, 9.0]
+    """
+    if "time" not in table or not table["time"].notna().any():
+        return Clock(None, ())
+    by_frame = table.groupby("frame")["time"]
+    mean, known = by_frame.mean(), by_frame.mean().notna().to_numpy()
+    frame = mean.index.to_numpy(dtype=np.int64)[known]
+    time = mean.to_numpy(dtype=np.float64)[known]
+    spread = float((by_frame.max() - by_frame.min()).max())
+    faults = _faults(frame, time, missing=int((~known).sum()), spread=spread, dt=dt)
+    if faults:
+        raise TrackTableError(
+            f"the column time: {'; '.join(faults)}. Correct it or dt, or leave the column out",
+            tuple(faults),
+        )
+    since = time - time[0]
+    grid = dt * (frame - frame[0])
+    if np.all(np.abs(since - grid) <= EVEN * dt):
+        return Clock(None, ())
+    last = int(table["frame"].max())
+    numbers = np.arange(last + 1)
+    times = np.interp(numbers, frame, since)
+    # Before the first and after the last known time frames are dt apart.
+    times += dt * (np.minimum(numbers - frame[0], 0) + np.maximum(numbers - frame[-1], 0))
+    gaps = np.diff(time) / np.diff(frame)
+    notes = [
+        f"the column time is used: intervals between frames run from {gaps.min():.4g} to "
+        f"{gaps.max():.4g} s (median {np.median(gaps):.4g} s)"
+    ]
+    if not known.all():
+        notes.append(f"{(~known).sum()} frames have no time; theirs is interpolated")
+    if spread > EVEN * dt:
+        notes.append(f"the times of one frame differ by up to {spread:.3g} s; their mean is used")
+    return Clock(times, tuple(notes))
+
+
+def _faults(frame: Ints, time: Floats, *, missing: int, spread: float, dt: float) -> list[str]:
+    """Return what keeps the times from being those of the frames."""
+    if missing > len(time):
+        return [f"{missing} of {missing + len(time)} frames have none"]
+    step, number = np.diff(time), np.diff(frame)
+    if not len(step):
+        return []
+    back = np.flatnonzero(step <= 0)
+    if back.size:
+        listed = ", ".join(str(k) for k in frame[back[:_LISTED] + 1])
+        more = f" and {back.size - _LISTED} more" if back.size > _LISTED else ""
+        return [f"it does not rise from one frame to the next at frames {listed}{more}"]
+    usual = float(np.median(step / number))
+    faults = []
+    if abs(usual - dt) > _AGREES * dt:
+        faults.append(
+            f"its median interval is {usual:.6g} s a frame, which contradicts dt = {dt:g} s"
+        )
+    if spread > usual:
+        faults.append(f"rows of one frame differ by up to {spread:.3g} s, more than an interval")
+    return faults
+
+
+def frame_stride(table: pd.DataFrame) -> tuple[str, ...]:
+    """State in words where all frame numbers are multiples of a number, counted from the first.
+
+    Examples
+    --------
+    >>> import pandas as pd
+    >>> from perrin.clock import frame_stride
+    >>> frame_stride(pd.DataFrame({"frame": [0, 5, 10, 20]}))[0][:36]
+    'frame numbers are multiples of 5: a '
+    """
+    frame = np.unique(table["frame"].to_numpy(dtype=np.int64))
+    stride = int(np.gcd.reduce(np.diff(frame))) if len(frame) > 2 else 1
+    if stride == 1:
+        return ()
+    return (
+        f"frame numbers are multiples of {stride}: a step between neighbouring rows takes "
+        f"{stride} dt; if dt is the time between these rows, number the frames 0, 1, 2, ...",
+    )
