@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias
 import numpy as np
 
 from perrin._arrays import (
+    Bools,
     DegenerateClusterError,
     Floats,
     Ints,
@@ -108,6 +109,7 @@ class Conditions:
     times: Floats | None = None  # of every frame, s, where they are not dt apart
     sigma_ratio: ArrayLike | None = None  # of the axes, where that alone is known
     first_frame: int = 0  # what the table calls its first frame
+    recorded: Bools | None = None  # (frames,), the frames that any row of the table has
 
     def clock(self, frames: Ints) -> Floats:
         """Return the times of frames, s."""
@@ -269,8 +271,9 @@ def measure_table(
         clock = read_clock(table, dt=conditions.dt)
         conditions = replace(conditions, times=clock.times)
         remarks.notes += clock.notes
-    remarks.notes += frame_stride(table)
-    conditions = replace(conditions, first_frame=first)
+    recorded = np.bincount(table["frame"]) > 0
+    remarks.notes += _absent_frames(recorded, frame_stride(table), first)
+    conditions = replace(conditions, first_frame=first, recorded=recorded)
     bodies, rods, failures = _fitted(table, labels, conditions)
     if improved is not None:
         motions = improved({b.cluster: (b.motion, b.frames + first) for b in bodies})
@@ -294,8 +297,8 @@ def measure_table(
 
 def told_conditions(conditions: Conditions) -> dict[str, Any]:
     """Return the conditions as run.json keeps them."""
-    entry = asdict(replace(conditions, times=None, sigma_ratio=None))
-    for name in ("times", "sigma_ratio", "first_frame"):
+    entry = asdict(replace(conditions, times=None, sigma_ratio=None, recorded=None))
+    for name in ("times", "sigma_ratio", "first_frame", "recorded"):
         del entry[name]
     return entry | {"sigma": _plain(conditions.sigma)}
 
@@ -347,6 +350,15 @@ def _sliced(table: pd.DataFrame, frames: tuple[int | None, int | None] | None) -
         low, high = int(table["frame"].min()), int(table["frame"].max())
         raise ValueError(f"frames {first}:{stop} hold no rows; the table runs from {low} to {high}")
     return table[keep].reset_index(drop=True)
+
+
+def _absent_frames(recorded: Bools, stride: tuple[str, ...], first: int) -> list[str]:
+    """Report frame numbers that no row has; where they have a stride, that explains them."""
+    absent = np.flatnonzero(~recorded) + first
+    if stride or not absent.size:
+        return list(stride)
+    count = "1 frame number has" if absent.size == 1 else f"{absent.size} frame numbers have"
+    return [f"{count} no row ({frames_text(absent)}): a step across them is one longer step"]
 
 
 @dataclass
@@ -606,6 +618,7 @@ def _estimate_body(body: _Body, conditions: Conditions, done: _Estimated, *, bod
         *([] if other_motion else _floor_mismatch(motion, D_R, noise)),
         *turn.warnings,
         *path.warnings,
+        *_limits_text(D_R, D_T),
     )
     result = ClusterResult(
         body.cluster,
@@ -618,7 +631,13 @@ def _estimate_body(body: _Body, conditions: Conditions, done: _Estimated, *, bod
         warnings,
         body.label,
         body.quality,
-        notes=(*_missing(motion), *body.notes, *turn.notes, *path.notes, *unfound),
+        notes=(
+            *_missing(motion, body.frames, conditions),
+            *body.notes,
+            *turn.notes,
+            *path.notes,
+            *unfound,
+        ),
         jumps={
             name: tuple(body.frames[found.left_out].tolist())
             for name, found in (("rotation", turn), ("translation", path))
@@ -640,7 +659,7 @@ def _diffusion(
 
     `bodies` is the number of clusters tested: the level of the steady motion is one for all.
     """
-    motion, name = body.motion, "D_R" if quantity == "rotation" else "D_T"
+    motion = body.motion
     estimate = conditions.estimate(motion, quantity)
     jumps = find_jumps(motion, estimate)
     left_out = jumps.rows[:0]
@@ -652,16 +671,28 @@ def _diffusion(
             left_out = jumps.rows
             motion = cut_at(motion, left_out)
             estimate = conditions.estimate(motion, quantity)
+    notes = _drift_text(estimate, quantity)
+    if not estimate.resolved:
+        notes.append(f"not resolved: {estimate}")
     steady = False
     if not (conditions.drift or jumps.many):
         found = steady_motion(motion, estimate)
         steady = found.p < _STEADY / bodies
         warnings += [_steady_text(found, quantity)] if steady else []
-    if not estimate.resolved and not steady:
-        warnings.append(f"not resolved: {estimate}")
-    warnings += [f"{name}: {text}" for text in estimate.warnings]
-    notes = tuple(_drift_text(estimate, quantity))
-    return _Diffusion(estimate, motion, jumps, left_out, steady, tuple(warnings), notes)
+    return _Diffusion(estimate, motion, jumps, left_out, steady, tuple(warnings), tuple(notes))
+
+
+def _limits_text(D_R: DiffusionEstimate, D_T: DiffusionEstimate) -> list[str]:
+    """State where an estimate leaves the conditions under which it is exact, each limit once.
+
+    An upper limit is stated as one and needs no word on its signal-to-noise ratio.
+    """
+    named: dict[str, list[str]] = {}
+    for name, estimate in (("D_R", D_R), ("D_T", D_T)):
+        for text in estimate.warnings:
+            if estimate.resolved or not text.startswith("signal-to-noise"):
+                named.setdefault(text, []).append(name)
+    return [f"{' and '.join(names)}: {text}" for text, names in named.items()]
 
 
 def _jumps_text(jumps: Jumps, frames: Ints, quantity: Quantity, *, kept: bool) -> str:
@@ -787,7 +818,7 @@ def _measure_rod(
     D_perp, D_T = estimate_rod(motion), estimate_rod(motion, quantity="translation")
     first = conditions.first_frame
     notes = [
-        *_missing(motion),
+        *_missing(motion, frames, conditions),
         f"no D_R: {len(motion.places)} particles on one line have a direction but no full "
         "orientation; D_perp is how fast that direction diffuses",
     ]
@@ -890,14 +921,17 @@ def _angles_text(quality: Quality, tracks: _Tracks, motion: RigidMotion) -> str:
     )
 
 
-def _missing(motion: RigidMotion | RodMotion) -> list[str]:
-    """Say how many frames have no pose, and why."""
-    reasons = [r for r in motion.reason if r]
+def _missing(motion: RigidMotion | RodMotion, frames: Ints, conditions: Conditions) -> list[str]:
+    """State how many of the frames that were recorded have no pose, and why."""
+    recorded = np.ones(len(frames), dtype=np.bool_)
+    if conditions.recorded is not None:
+        recorded = conditions.recorded[frames]
+    reasons = [r for r, seen in zip(motion.reason, recorded, strict=True) if r and seen]
     if not reasons:
         return []
     kinds = {r: reasons.count(r) for r in sorted(set(reasons))}
-    listed = "; ".join(f"{count} x {reason}" for reason, count in kinds.items())
-    return [f"{len(reasons)} of {len(motion.time)} frames have no pose ({listed})"]
+    by_kind = "; ".join(f"{count} x {reason}" for reason, count in kinds.items())
+    return [f"{len(reasons)} of {np.count_nonzero(recorded)} frames have no pose ({by_kind})"]
 
 
 def _floor_mismatch(motion: RigidMotion, D_R: DiffusionEstimate, noise: NoiseFloor) -> list[str]:

@@ -165,8 +165,27 @@ class DiffusionEstimate:
             warnings=warnings,
         )
 
+    @classmethod
+    def absent(
+        cls, *, quantity: Literal["rotation", "translation"], n_frames: int, reason: str
+    ) -> DiffusionEstimate:
+        """Return the estimate of a coefficient that the data cannot show, all numbers NaN."""
+        nothing = (np.nan, np.nan)
+        found = Found(np.nan, nothing, nothing, np.nan, np.nan)
+        return cls.judged(
+            found,
+            quantity=quantity,
+            method="none",
+            n_frames=n_frames,
+            dt=np.nan,
+            noise_variance=np.nan,
+            warnings=(reason,),
+        )
+
     def __str__(self) -> str:
         name = "D_R" if self.unit == UNITS["rotation"] else "D_T"
+        if np.isnan(self.value):
+            return f"{name}: none ({'; '.join(self.warnings)})"
         how = self.method if self.noise == "joint" else f"{self.method}, {self.noise} noise"
         taken = "mean spin" if name == "D_R" else "drift"
         how += f", {taken} removed" if self.drift else ""

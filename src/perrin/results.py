@@ -512,7 +512,7 @@ def _estimate_from(entry: dict[str, Any]) -> DiffusionEstimate:
     read = dict(entry)
     for name in ("ci68", "ci95"):
         low, high = read[name]
-        read[name] = (low, np.inf if high is None else high)
+        read[name] = (low, np.inf if high is None else high) if low is not None else (np.nan,) * 2
     for name in ("value", "offset", "offset_stderr", "dt"):
         read[name] = np.nan if entry[name] is None else entry[name]
     # Without a value nothing is known; beside one, what JSON cannot hold is unbounded.

@@ -32,6 +32,8 @@ _SCREEN = 0.05
 # A displaced frame is a matter of localisation up to so many times the variance that its own
 # residual explains; beyond it the body itself was elsewhere for one frame.
 _BADLY_MEASURED = 100.0
+# A variance so many times its own takes a step out of the prediction of the others.
+_LEFT_OUT = 1e6
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +64,7 @@ class Jumps:
     @property
     def many(self) -> bool:
         """Whether there are more than 1 % of such steps: then they are another kind of motion."""
-        return len(self.rows) > max(1.0, MOST_JUMPS * self.n_steps)
+        return len(self.rows) > max(1, round(MOST_JUMPS * self.n_steps))
 
     @property
     def length(self) -> Floats:
@@ -105,13 +107,14 @@ def find_jumps(motion: RigidMotion, estimate: DiffusionEstimate) -> Jumps:
 
     Notes
     -----
-    The residual of each step given all others, z = C^-1 y over the root of its variance, is
-    chi-squared with d degrees of freedom in z M^-1 z, M the mean of z z^T, which also takes up
-    unequal axes. A first M comes from the half of the steps with the smallest z, so that jumps do
-    not hide each other; the final one from all steps that are no candidates, with D and noise
-    fitted to them, and the p-value is that of Hotelling's T^2. A displaced frame has the residual
-    of a step and its successor with opposite signs; where that one is larger, the frame is at
-    fault.
+    The residual of each step given all others, z = (C^-1 y) / (C^-1)_jj over the root of its
+    variance 1/(C^-1)_jj, is chi-squared with d degrees of freedom in z M^-1 z, M the mean of
+    z z^T, which also takes up unequal axes. A first M comes from the half of the steps with the
+    smallest z, so that jumps do not hide each other; the final one from all steps that are no
+    candidates, with D and noise fitted to them, and the p-value is that of Hotelling's T^2.
+    Candidates are left out of the prediction of their neighbours. A displaced frame has the
+    residual of a step and its successor with opposite signs; where that one is larger, and the
+    residual of the rigid fit can explain it, the frame was measured badly.
 
     Examples
     --------
@@ -224,9 +227,9 @@ class _Residuals(NamedTuple):
 
 
 def _residuals(motion: RigidMotion, estimate: DiffusionEstimate, *, without: Bools) -> _Residuals:
-    """Return the residual of each step given all others, over its standard deviation.
+    """Return the residual of each step given all others but those `without`, standardised.
 
-    `without` marks steps that the mean motion of an estimate with drift was fitted without.
+    An estimate with drift was fitted without them as well.
     """
     from scipy.linalg.lapack import dpttrf, dpttrs
 
@@ -248,7 +251,8 @@ def _residuals(motion: RigidMotion, estimate: DiffusionEstimate, *, without: Boo
     )
     step, frame = np.empty_like(size), np.zeros((len(size) - 1, size.shape[1]))
     for axis in range(size.shape[1]):
-        a, b = diagonal[:, axis], beside[:, axis]
+        extra = _LEFT_OUT * diagonal[:, axis] * without
+        a, b = diagonal[:, axis] + extra, beside[:, axis]
         d, lower, bad = dpttrf(a, b)
         up, _, bad_up = dpttrf(a[::-1], b[::-1])
         if bad or bad_up:
@@ -257,7 +261,7 @@ def _residuals(motion: RigidMotion, estimate: DiffusionEstimate, *, without: Boo
         z, _ = dpttrs(d, lower, size[:, axis])
         inverse = 1 / (d + up[::-1] - a)
         corner = -lower * inverse[1:]
-        step[:, axis] = z / np.sqrt(inverse)
+        step[:, axis] = z / inverse / np.sqrt(1 / inverse - extra)
         variance = inverse[:-1] + inverse[1:] - 2 * corner
         frame[:, axis] = (z[:-1] - z[1:]) / np.sqrt(variance)
     length = size / np.sqrt(diagonal)
@@ -296,8 +300,10 @@ def _candidates(residuals: _Residuals, known: Bools) -> Bools:
     given_others = _bulk_square(residuals.step, residuals.step)
     # Jumps back and forth resemble noise once the noise is fitted to them: the length alone.
     alone = np.where(around == 0, _bulk_square(residuals.length, residuals.length), 0.0)
-    likely = ((given_others > limit) & (given_others > around)) | (alone > limit)
-    return np.asarray(likely & inside & ~known)
+    # A jump spoils the prediction of its neighbours: the largest of them is taken first.
+    largest = np.maximum(np.append(given_others[1:], 0.0), np.append(0.0, given_others[:-1]))
+    likely = (given_others > limit) & (given_others > around) & (given_others > largest)
+    return np.asarray((likely | (alone > limit)) & inside & ~known)
 
 
 def _bulk_square(z: Floats, bulk: Floats) -> Floats:

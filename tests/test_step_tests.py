@@ -1,0 +1,222 @@
+"""Laws of the tests for jumps and for a steady velocity or spin."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import perrin
+from perrin.motion import track_rotation
+from perrin.step_tests import cut_at, find_jumps, steady_motion
+
+DT = 0.73
+TETRA = 1.5 * np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / np.sqrt(3)
+FLAT = np.array([[0.0, 0.0], [2.0, 0.0], [1.0, 1.6]]) - [1.0, 1.6 / 3]
+
+
+def brownian(seed, *, frames=300, D_R=5e-3, D_T=0.02, spin=(0, 0, 0), sigma=0.03, bad=0.0):
+    """Return noisy places (T, 4, 3) of a tetrahedron; a share `bad` of the frames is 6 times worse.
+
+    An independent simulator: steps in body axes, the spin in lab axes, four substeps a frame.
+    """
+    rng = np.random.default_rng([seed, 11])
+    turn, places = Rotation.identity(), [TETRA]
+    for _ in range(frames - 1):
+        for _ in range(4):
+            turn = turn * Rotation.from_rotvec(rng.normal(size=3) * np.sqrt(2 * D_R * DT / 4))
+            turn = Rotation.from_rotvec(np.array(spin) * DT / 4) * turn
+        places.append(turn.apply(TETRA))
+    path = np.cumsum(rng.normal(size=(frames, 1, 3)) * np.sqrt(2 * D_T * DT), axis=0)
+    noise = rng.normal(size=(frames, 4, 3)) * sigma
+    noise[rng.random(frames) < bad] *= 6
+    return np.array(places) + path + noise
+
+
+def jumps_of(x, quantity, **given):
+    motion = track_rotation(x, dt=DT)
+    estimate = perrin.estimate_diffusion(motion, quantity=quantity, **given)
+    return find_jumps(motion, estimate), motion, estimate
+
+
+def turned(x, rotvec):
+    """Turn places (T, n, 3) about their own centres."""
+    center = x.mean(axis=1, keepdims=True)
+    return Rotation.from_rotvec(rotvec).apply((x - center).reshape(-1, 3)).reshape(x.shape) + center
+
+
+@pytest.mark.parametrize("size", [3.0, 50.0])
+@pytest.mark.parametrize("drift", [False, True])
+def test_a_stage_jump_is_found_and_cut(size, drift):
+    """One jump, however long, is found at its frame with its size; D_T without it is the true one.
+
+    D_T differs from that of the track without the jump by the one step that is left out, at most a
+    hundredth of it (1/299, and what drift=True takes off).
+    """
+    x = brownian(1)
+    x[150:] += [size, 0, 0]
+    found, motion, estimate = jumps_of(x, "translation", drift=drift)
+    assert found.rows.tolist() == [150]
+    assert not found.many
+    assert found.length[0] == pytest.approx(size, abs=4 * np.sqrt(2 * 0.02 * DT))
+    clean = perrin.estimate_diffusion(
+        track_rotation(brownian(1), dt=DT), quantity="translation", drift=drift
+    )
+    cut = perrin.estimate_diffusion(cut_at(motion, found.rows), quantity="translation", drift=drift)
+    assert cut.value == pytest.approx(clean.value, rel=0.01)
+    assert estimate.value > 1.2 * clean.value
+    assert not jumps_of(x, "rotation", drift=drift)[0].rows.size
+
+
+def test_one_large_turn_is_found():
+    """A turn of 57 degrees beside steps of 5 is a jump of the orientation, not of the centre."""
+    x = brownian(2)
+    x[120:] = turned(x[120:], [1.0, 0, 0])
+    found, motion, _ = jumps_of(x, "rotation")
+    assert found.rows.tolist() == [120]
+    assert np.rad2deg(found.length[0]) == pytest.approx(57.3, abs=15)
+    assert not jumps_of(x, "translation")[0].rows.size
+    cut = perrin.estimate_diffusion(cut_at(motion, found.rows))
+    clean = perrin.estimate_diffusion(track_rotation(brownian(2), dt=DT))
+    assert cut.value == pytest.approx(clean.value, rel=0.015)
+
+
+def test_several_jumps_do_not_hide_each_other():
+    """Three jumps, 1 % of the steps, are all found; a tenth of the steps are no jumps any more."""
+    x = brownian(3)
+    for frame, axis in ((60, 0), (61, 1), (250, 0)):
+        x[frame:, :, axis] += 5.0
+    found, _, _ = jumps_of(x, "translation")
+    assert found.rows.tolist() == [60, 61, 250]
+    assert not found.many
+    rng = np.random.default_rng(4)
+    hops = (rng.random(300) < 0.1)[:, None] * rng.normal(size=(300, 3)) * 3
+    found, _, _ = jumps_of(brownian(3) + np.cumsum(hops, axis=0)[:, None], "translation")
+    assert found.many
+
+
+def test_coordinates_wrapped_in_a_box_are_found():
+    """Wraps to and fro resemble localisation noise to a fit; their length alone gives them away."""
+    x = brownian(4, D_T=0.04)
+    center = x.mean(axis=1, keepdims=True)
+    wraps = np.floor(center / 3.0)
+    found, _, _ = jumps_of(x - 3.0 * wraps, "translation")
+    crossings = np.flatnonzero((np.diff(wraps[:, 0], axis=0) != 0).any(axis=1)) + 1
+    inside = crossings[(crossings > 1) & (crossings < 299)]
+    assert len(np.intersect1d(found.rows, inside)) >= 0.95 * len(inside)
+    assert found.many
+
+
+@pytest.mark.parametrize("quantity", ["rotation", "translation"])
+def test_brownian_motion_and_badly_measured_frames_have_no_jumps(quantity):
+    """No jump in 40 tracks, of which half have 3 % of frames with six times the noise.
+
+    At the level of 1e-6 a track none is expected in any; slow bodies show the bad frames most.
+    """
+    for seed in range(40):
+        slow = {"D_R": 1e-5, "D_T": 1e-4} if seed % 3 == 0 else {}
+        x = brownian(seed, frames=(60, 150)[seed % 2], bad=0.03 * (seed % 4 > 1), **slow)
+        assert not jumps_of(x, quantity)[0].rows.size, seed
+
+
+def test_jumps_follow_rotation_and_time_reversal():
+    """Turning the lab or reversing time gives the same jumps."""
+    x = brownian(5, frames=120)
+    x[70:] += [2.0, 1.0, 0]
+    turn = Rotation.from_rotvec([0.3, -1.2, 0.7]).as_matrix()
+    assert jumps_of(x @ turn.T, "translation")[0].rows.tolist() == [70]
+    back = jumps_of(x[::-1], "translation")[0]
+    assert back.rows.tolist() == [120 - 70]
+
+
+def test_a_steady_velocity_is_named_with_its_error():
+    """A flow of a tenth of a step a frame is found within its error; without one p is uniform.
+
+    The velocity's error is sqrt(2 D/T) per axis; 4 of them bound one draw of three to 2e-4.
+    """
+    motion = track_rotation(brownian(6), dt=DT)
+    flow = np.array([0.9, -0.3, 0.2])
+    moved = replace(motion, center=motion.center + motion.time[:, None] * flow)
+    still, found = (
+        steady_motion(m, perrin.estimate_diffusion(m, quantity="translation"))
+        for m in (motion, moved)
+    )
+    assert found.p < 1e-12
+    assert found.stderr == pytest.approx([np.sqrt(2 * 0.02 / (299 * DT))] * 3, rel=0.25)
+    assert np.all(np.abs(np.array(found.value) - flow) < 4 * np.array(found.stderr))
+    assert still.p > 1e-4
+    # Both velocities contain the same Brownian part; the covariance of the estimate differs a bit.
+    assert np.subtract(found.value, still.value) == pytest.approx(flow, abs=0.01)
+
+
+def test_a_steady_spin_is_named_and_taken_off():
+    """0.2 rad/s about the lab's z: found, its size within 4 errors, and D_R right without it."""
+    motion = track_rotation(brownian(7, spin=(0, 0, 0.2)), dt=DT)
+    plain = perrin.estimate_diffusion(motion)
+    found = steady_motion(motion, plain)
+    assert found.p < 1e-30
+    assert abs(found.value[2] - 0.2) < 4 * found.stderr[2]
+    rest = perrin.estimate_diffusion(motion, drift=True)
+    assert plain.value > 2 * 5e-3
+    assert abs(rest.value - 5e-3) < 4 * rest.stderr
+    assert rest.drift[0] == pytest.approx(found.value, abs=1e-9)
+
+
+def test_a_spin_leaves_the_same_diffusion_behind():
+    """D_R with the mean spin off has no trace of the spin: mean over 20 tracks within 3 errors."""
+    values = []
+    for seed in range(20):
+        motion = track_rotation(brownian(seed, frames=150, spin=(0.1, 0, 0.25)), dt=DT)
+        values.append(perrin.estimate_diffusion(motion, drift=True).value / 5e-3)
+    assert abs(np.mean(values) - 1) < 3 * np.std(values) / np.sqrt(len(values))
+
+
+def test_a_spin_in_the_plane():
+    """In the plane the spin is one number about z."""
+    flat = perrin.Cluster.from_positions(FLAT)
+    truth = perrin.simulate_motion(flat, D_R=5e-3, D_T=0.02, dt=DT, n_frames=300, rng=8)
+    angle = 0.2 * truth.time
+    turn = np.stack(
+        [
+            np.stack([np.cos(angle), -np.sin(angle)], -1),
+            np.stack([np.sin(angle), np.cos(angle)], -1),
+        ],
+        -2,
+    )
+    moved = replace(truth, rotation=turn @ truth.rotation)
+    found = steady_motion(moved, perrin.estimate_diffusion(moved))
+    assert len(found.value) == 1
+    assert abs(found.value[0] - 0.2) < 4 * found.stderr[0]
+    estimate = perrin.estimate_diffusion(moved, drift=True)
+    plain = perrin.estimate_diffusion(truth, drift=True)
+    assert estimate.value == pytest.approx(plain.value, rel=1e-9)
+
+
+@pytest.mark.parametrize("quantity", ["rotation", "translation"])
+def test_the_test_for_a_steady_motion_keeps_its_level(quantity):
+    """Of 150 Brownian tracks of 100 frames 5 % have p < 0.05; 15 or more are chance of 0.6 %."""
+    p = [
+        steady_motion(m, perrin.estimate_diffusion(m, quantity=quantity)).p
+        for m in (track_rotation(brownian(s, frames=100), dt=DT) for s in range(150))
+    ]
+    assert np.count_nonzero(np.array(p) < 0.05) < 15
+    assert np.count_nonzero(np.array(p) < 0.05) > 1
+
+
+def test_a_velocity_changes_nothing_but_the_drift():
+    """D_T, errors, intervals and p_same are the same to 1e-6 up to 10 um/s, gaps included."""
+    rng = np.random.default_rng(9)
+    places = [brownian(s, frames=150) for s in (20, 21)]
+    for x in places:
+        x[rng.random(150) < 0.3] = np.nan
+
+    def answer(velocity):
+        time = DT * np.arange(150)[:, None, None]
+        motions = [track_rotation(x + time * velocity, dt=DT) for x in places]
+        return perrin.estimate_diffusion(motions, quantity="translation", drift=True)
+
+    still = answer(np.zeros(3))
+    for speed in (0.3, 1.0, 3.0, 10.0):
+        found = answer(speed * np.array([0.6, -0.64, 0.48]))
+        for name in ("value", "stderr", "ci68", "ci95", "offset", "p_same"):
+            assert getattr(found, name) == pytest.approx(getattr(still, name), rel=1e-6), name
