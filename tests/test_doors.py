@@ -20,6 +20,8 @@ SOURCE = ROOT / "src" / "perrin"
 
 # The house, top to bottom: a room imports only rooms above it.
 ROOMS = [
+    "_text",
+    "_units",
     "_arrays",
     "rotations",
     "shapes",
@@ -51,7 +53,9 @@ ROOMS = [
     "surroundings",
     "simulate",
     "gdf",
+    "column_names",
     "files",
+    "remarks",
     "images.contents",
     "images.tiff",
     "images.vendors",

@@ -591,7 +591,7 @@ def test_many_rows_are_counted_and_a_few_shown():
 def test_missing_columns_are_listed_with_those_found():
     """All at once, with what to do."""
     (fault,) = faults_of(tracks()[["frame", "z"]].rename(columns={"frame": "Frame"}))
-    assert "missing columns frame, particle, x, y; found: Frame, z;" in fault
+    assert "missing columns particle, x, y; found: Frame, z;" in fault
     assert "columns=" in fault
 
 

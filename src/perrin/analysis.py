@@ -21,6 +21,7 @@ from perrin._arrays import (
     TooFewFramesError,
     TrackTableError,
 )
+from perrin._units import viscosity_remarks
 from perrin.diffusion import DiffusionEstimate, estimate_diffusion, with_error
 from perrin.files import check_tracks, read_tracks
 from perrin.grouping import each_cluster, find_clusters
@@ -249,7 +250,7 @@ def measure_table(
         raise failures[-1].error
     results, rods = _interpreted(results, rods, conditions)
     pooled, more = _pooled(results, conditions) if results else (None, [])
-    more += _exposure_taken(conditions)
+    more += [*_exposure_taken(conditions), *viscosity_remarks(conditions.viscosity)]
     settings = _settings(source, arguments=arguments, first_frame=first)
     told = (*warnings, *(failure.told for failure in failures), *more)
     return Report(tuple(results), pooled, told, table, settings, tuple(rods))

@@ -58,6 +58,8 @@ class ClusterResult:
         Rigidity, errors per axis, and what was repaired.
     prediction : Prediction or None
         What spheres of the stated diameter would do; None if none was stated.
+    notes : tuple of str
+        What only informs, beside the warnings.
     """
 
     cluster: int
@@ -71,6 +73,7 @@ class ClusterResult:
     label: str | None = None
     quality: Quality | None = None
     prediction: Prediction | None = None
+    notes: tuple[str, ...] = ()
 
     @cached_property
     def msad(self) -> LagCurve:
@@ -117,6 +120,7 @@ class ClusterResult:
             "prediction": None if self.prediction is None else self.prediction.to_dict(),
             "quality": None if self.quality is None else self.quality.to_dict(),
             "warnings": list(self.warnings),
+            "notes": list(self.notes),
         }
 
 
@@ -134,6 +138,8 @@ class RodResult:
     label : str or None
     prediction : Prediction or None
         What spheres of the stated diameter would do; None if none was stated.
+    notes : tuple of str
+        What only informs, beside the warnings.
     """
 
     cluster: int
@@ -143,6 +149,7 @@ class RodResult:
     warnings: tuple[str, ...]
     label: str | None = None
     prediction: Prediction | None = None
+    notes: tuple[str, ...] = ()
 
     @property
     def name(self) -> str:
@@ -167,6 +174,7 @@ class RodResult:
             "sizes": None,
             "prediction": None if self.prediction is None else self.prediction.to_dict(),
             "warnings": list(self.warnings),
+            "notes": list(self.notes),
         }
 
 
@@ -205,6 +213,8 @@ class Report:
         Pairs and straight chains in three dimensions, which have no full rotation.
     imaging : Imaging or None
         How the spheres were seen, where the run began with images.
+    notes : tuple of str
+        What only informs about the whole table, beside the warnings.
     """
 
     clusters: tuple[ClusterResult, ...]
@@ -214,6 +224,7 @@ class Report:
     settings: dict[str, Any] = field(default_factory=dict)
     rods: tuple[RodResult, ...] = ()
     imaging: Imaging | None = None
+    notes: tuple[str, ...] = ()
 
     @property
     def results(self) -> tuple[ClusterResult | RodResult, ...]:
@@ -243,6 +254,7 @@ class Report:
                 "clusters": [] if pooled is None else list(pooled.clusters),
             },
             "warnings": list(self.warnings),
+            "notes": list(self.notes),
         }
 
     def save(self, folder: str | os.PathLike[str], *, overwrite: bool = False) -> None:
@@ -289,6 +301,7 @@ def load_run(folder: str | os.PathLike[str]) -> Report:
         tracks=pd.read_parquet(path / "tracks.parquet"),
         settings=settings,
         imaging=read_imaging(path) if (path / "imaging.json").is_file() else None,
+        notes=_notes_from(summary),
     )
 
 
@@ -388,9 +401,7 @@ def check_place(folder: str | os.PathLike[str], *, overwrite: bool = False) -> N
             raise PermissionError(f"{place} cannot be made: {parent} is not a writable folder")
         return
     if not overwrite:
-        raise FileExistsError(
-            f"{place} exists: choose another folder, or overwrite=True (--overwrite)"
-        )
+        raise FileExistsError(f"{place} exists: choose another folder, or overwrite=True")
     if not place.is_dir() or (any(place.iterdir()) and not (place / "run.json").is_file()):
         raise FileExistsError(f"{place} is no run folder of perrin (no run.json): not overwritten")
 
@@ -586,6 +597,7 @@ def _result_from(entry: dict[str, Any], motion: RigidMotion) -> ClusterResult:
         label=entry["label"],
         quality=None if entry["quality"] is None else Quality.from_dict(entry["quality"]),
         prediction=_prediction_from(entry),
+        notes=_notes_from(entry),
     )
 
 
@@ -599,6 +611,7 @@ def _rod_from(entry: dict[str, Any], motion: RodMotion) -> RodResult:
         warnings=tuple(entry["warnings"]),
         label=entry["label"],
         prediction=_prediction_from(entry),
+        notes=_notes_from(entry),
     )
 
 
@@ -606,6 +619,11 @@ def _prediction_from(entry: dict[str, Any]) -> Prediction | None:
     """Read back a prediction; runs without one may lack the key."""
     given = entry.get("prediction")
     return None if given is None else Prediction.from_dict(given)
+
+
+def _notes_from(entry: dict[str, Any]) -> tuple[str, ...]:
+    """Read back notes; runs of earlier versions have none."""
+    return tuple(entry.get("notes", ()))
 
 
 def _pooled_from(entry: dict[str, Any]) -> Pooled | None:
