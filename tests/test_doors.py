@@ -90,6 +90,7 @@ ROOMS = [
     "paper_orientations",
     "paper_experiment",
     "paper",
+    "options",
     "cli",
 ]
 LAZY = ("pandas", "scipy", "matplotlib", "pyarrow", "jinja2", "typer", "rich", "trackpy", "numba")

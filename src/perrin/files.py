@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 _REQUIRED = ("frame", "particle", "x", "y")
 _AXES = ("x", "y", "z")
-_SUFFIXES = (".csv", ".csv.gz", ".parquet", ".gdf")
+SUFFIXES = (".csv", ".csv.gz", ".parquet", ".gdf")
 _LARGEST_EXACT = 2**53
 
 _GDF_COLUMNS = {
@@ -476,11 +476,11 @@ _CHECKS: dict[str, _Check] = {
 
 
 def _suffix(name: str) -> str:
-    for suffix in _SUFFIXES:
+    for suffix in SUFFIXES:
         if name.lower().endswith(suffix):
             return suffix
     raise table_error(
-        name, f"unknown kind of file; expected a name ending in {', '.join(_SUFFIXES)}"
+        name, f"unknown kind of file; expected a name ending in {', '.join(SUFFIXES)}"
     )
 
 
