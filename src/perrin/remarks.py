@@ -20,6 +20,7 @@ _AROUND = (
     (re.compile(r"(?<=# )(\w+)s\b"), r"\1"),
     (re.compile(r"\b(?:has|have)\b"), "have"),
     (re.compile(r"\b(?:is|are)\b"), "are"),
+    (re.compile(r"(#[^;()]*)(?:; \1)+"), r"\1"),
 )
 
 
