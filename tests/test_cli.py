@@ -7,8 +7,10 @@ import io
 import json
 import math
 import os
+import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,7 +19,7 @@ import pandas as pd
 import pytest
 
 import perrin
-from perrin.cli import app
+from perrin.cli import _show, analyze, app
 
 
 class Outcome(NamedTuple):
@@ -118,12 +120,12 @@ def test_summary_has_the_promised_form(demo):
     assert "NaN" not in text
     assert "Infinity" not in text
     summary = json.loads(text)
-    assert set(summary) == {"clusters", "pooled", "warnings"}
+    assert set(summary) == {"clusters", "pooled", "warnings", "notes"}
     assert {"D_R", "D_T", "p_same"} <= set(summary["pooled"])
     (cluster,) = summary["clusters"]
     assert {
         "cluster", "n_particles", "n_frames", "D_R", "D_T", "sigma", "sigma_xyz", "phi2", "snr",
-        "tensor", "sizes", "warnings",
+        "tensor", "sizes", "warnings", "notes",
     } <= set(cluster)  # fmt: skip
     estimate = {"value", "ci68", "ci95", "stderr", "unit", "method", "resolved"}
     assert estimate <= set(cluster["D_R"])
@@ -153,12 +155,197 @@ def test_tables_of_the_run_agree_with_the_package(demo):
     assert list(report.tracks) == ["frame", "particle", "x", "y", "z", "cluster"]
 
 
-def test_demo_replaces_only_its_own(tmp_path):
-    """A folder called perrin-demo that perrin did not make is not touched."""
-    (tmp_path / "perrin-demo").mkdir()
-    (tmp_path / "perrin-demo" / "thesis.txt").write_text("precious")
+def contents(folder: Path) -> dict[str, bytes]:
+    """Return every file below a folder."""
+    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+def test_demo_replaces_only_its_own(demo, csv, tmp_path):
+    """The demo can be repeated; a folder that holds anything else stays as it is.
+
+    Anything else: another file, a run of another command, or the demo's run with a file added.
+    """
+    place = tmp_path / "perrin-demo"
+    place.mkdir()
+    (place / "thesis.txt").write_text("precious")
+    refused(run("demo", cwd=tmp_path), 2, "perrin-demo", "not overwritten", "run.json")
+    assert contents(place) == {"thesis.txt": b"precious"}
+
+    (place / "thesis.txt").unlink()
+    place.rmdir()
+    assert run("analyze", csv, "--dt", 0.73, "-o", place, cwd=tmp_path).returncode == 0
+    before = contents(place)
     refused(run("demo", cwd=tmp_path), 2, "perrin-demo", "not overwritten")
-    assert (tmp_path / "perrin-demo" / "thesis.txt").read_text() == "precious"
+    assert contents(place) == before
+
+    shutil.rmtree(place)
+    shutil.copytree(demo[0], place)
+    for added in ("thesis.txt", "figures/mine.png"):
+        (place / added).write_text("precious")
+        refused(run("demo", cwd=tmp_path), 2, "perrin-demo", added, "not overwritten")
+        assert (place / added).read_text() == "precious"
+        (place / added).unlink()
+    (place / "report.html").write_text("of an earlier version")
+    result = run("demo", cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    assert set(contents(place)) == set(contents(demo[0]))
+    assert b"earlier version" not in (place / "report.html").read_bytes()
+
+
+def test_demo_with_a_folder_overwrites_nothing(demo, tmp_path):
+    """With -o even the demo's own folder is refused, unless --overwrite; status 2, no work."""
+    place = tmp_path / "perrin-demo"
+    shutil.copytree(demo[0], place)
+    before = contents(place)
+    refused(run("demo", "-o", place, cwd=tmp_path), 2, "exists", "--overwrite")
+    assert contents(place) == before
+    assert run("demo", "-o", place, "--overwrite", cwd=tmp_path).returncode == 0
+
+
+WRITERS = {
+    "simulate": (
+        "simulate", "trimer", "--radius", 1, "--d-r", 0.01, "--dt", 1, "--frames", 3, "-o", "t.csv",
+    ),
+    "convert": ("convert", "source.csv", "t.csv"),
+    "predict": (
+        "predict", "dimer", "--diameter", 2, "--viscosity", 1e-3, "--temperature", 300, "-o",
+        "t.csv",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_no_command_overwrites_a_file(table, tmp_path, monkeypatch, name):
+    """Without --overwrite a file that is there stays, and nothing is computed; with it, it goes."""
+    perrin.write_tracks(table, tmp_path / "source.csv")
+    target = tmp_path / "t.csv"
+    target.write_text("precious")
+    for function in ("simulate_motion", "read_tracks", "cluster_mobility"):
+        with monkeypatch.context() as patched:
+            patched.setattr(perrin, function, None, raising=False)
+            refused(run(*WRITERS[name], cwd=tmp_path), 2, "t.csv exists", "--overwrite")
+    assert target.read_text() == "precious"
+    result = run(*WRITERS[name], "--overwrite", cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    assert target.read_text() != "precious"
+    target.unlink()
+    target.mkdir()
+    refused(run(*WRITERS[name], "--overwrite", cwd=tmp_path), 2, "t.csv", "folder")
+
+
+@pytest.mark.parametrize("name", ["simulate", "convert"])
+def test_a_table_of_unknown_kind_is_refused_first(tmp_path, name):
+    """The suffix of a table to write is checked before the table is made."""
+    words = ["t.doc" if word == "t.csv" else word for word in WRITERS[name]]
+    refused(run(*words, cwd=tmp_path), 2, "t.doc", ".parquet")
+    assert not list(tmp_path.iterdir())
+
+
+def test_every_command_that_writes_can_be_refused(csv, tmp_path):
+    """The place of the output is the first thing that analyze, paper and run look at."""
+    place = tmp_path / "taken"
+    place.mkdir()
+    (place / "thesis.txt").write_text("precious")
+    for words in (
+        ("analyze", "nowhere.csv", "--dt", 1),
+        ("paper",),
+        ("run", "nowhere.tif", "--diameter", 1, "--contact", 1),
+    ):
+        refused(run(*words, "-o", place, cwd=tmp_path), 2, "taken exists", "--overwrite")
+        again = run(*words, "-o", place, "--overwrite", cwd=tmp_path)
+        refused(again, 2, "taken", "not overwritten")
+    assert contents(place) == {"thesis.txt": b"precious"}
+
+
+def test_columns_of_other_spellings_are_noted(table, tmp_path):
+    """Convert reads Frame and x (um), writes our names, and states what it recognised."""
+    spelt = table.rename(columns={"frame": "Frame", "x": "x (um)", "particle": "Particle ID"})
+    spelt.to_csv(tmp_path / "spelt.csv", index=False)
+    result = run("convert", "spelt.csv", "plain.csv", cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    assert "note: columns recognised: 'Frame' as frame, 'Particle ID' as particle" in result.stdout
+    pd.testing.assert_frame_equal(perrin.read_tracks(tmp_path / "plain.csv"), table)
+
+
+@pytest.mark.parametrize(
+    ("header", "words"),
+    [
+        ("t,particle,x,y,z", ("missing column frame", "--columns frame=...")),
+        ("frame,particle,x (nm),y (nm),z (nm)", ("are in nm", "--scale 0.001")),
+        ("frame,particle,X,x (um),y,z", ("x: 2 columns", "--columns x=X")),
+    ],
+)
+def test_faults_of_a_table_name_options(tmp_path, header, words):
+    """Messages of the library come in the words of the command line."""
+    row = ",".join("1" for _ in header.split(","))
+    (tmp_path / "t.csv").write_text(f"{header}\n{row}\n")
+    result = run("analyze", "t.csv", "--dt", 1, "-o", "run", cwd=tmp_path)
+    refused(result, 2, *words)
+    assert "columns={" not in result.stderr
+
+
+def report_of(table: pd.DataFrame, count: int, **changes: object) -> perrin.Report:
+    """Return a report of a number of like clusters, with remarks."""
+    whole = perrin.analyze(table, dt=0.73)
+    clusters = tuple(
+        replace(
+            whole.clusters[0],
+            cluster=k,
+            warnings=(f"{k + 2} of 60 frames have no pose",),
+            notes=(f"{k + 3} rows without coordinates count as missing points",),
+        )
+        for k in range(count)
+    )
+    return replace(whole, clusters=clusters, **changes)
+
+
+@pytest.mark.parametrize("count", [1, 10, 40])
+def test_the_screen_merges_warnings_and_sets_notes_apart(table, capsys, count):
+    """One line for what all clusters share; warnings first, then the notes."""
+    recognised = "columns recognised: 'Frame' as frame"
+    lost = tuple(f"cluster {50 + k} was left out: {k} frames" for k in range(30))
+    report = report_of(table, count, warnings=lost, notes=(recognised,))
+    _show(report, Path("folder"), analyze)
+    lines = [
+        line for line in capsys.readouterr().out.splitlines() if line.startswith(("! ", "note"))
+    ]
+    where = "" if count == 1 else f"in all {count} clusters, for example cluster 0: "
+    assert lines == [
+        "! warning: cluster 50 was left out: 0 frames (and 29 more of this kind)",
+        f"! warning: {where}2 of 60 frames have no pose",
+        f"note: {recognised}",
+        f"note: {where}3 rows without coordinates count as missing points",
+    ]
+
+
+def test_units_that_look_wrong_are_one_line_each(csv, tmp_path):
+    """A viscosity in mPa s, a sigma and a diameter in nm: a warning, in options, and a result."""
+    thick = ("--viscosity", 2.18, "--temperature", 295)
+    result = run("analyze", csv, "--dt", 0.73, *thick, "-o", "run", cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    assert result.stdout.count("--viscosity: 2.18 Pa s") == 1
+    assert result.stderr == ""
+    (warning,) = json.loads((tmp_path / "run" / "summary.json").read_text())["warnings"]
+    assert warning.startswith("viscosity: 2.18 Pa s is 2180 times that of water")
+    result = run("predict", "dimer", "--diameter", 2450, *thick, cwd=tmp_path)
+    assert result.returncode == 0
+    assert result.stderr.splitlines() == [
+        "warning: the diameter of a sphere, 2450 um, is outside 0.05 to 50 um; if it is in nm, it "
+        "is 2.45 um",
+        "warning: --viscosity: 2.18 Pa s is 2180 times that of water; if the value is in mPa s "
+        "(cP), state 0.00218",
+    ]
+    plan = ("plan", "tetrahedron", "--d-r", "5e-3", "--diameter")
+    for options, words in (
+        ((2.45, "--sigma", 30), ("--sigma: 30 um", "R = 1.5 um", "state 0.03")),
+        ((2450, "--sigma", 0.03), ("2450 um", "0.05 to 50 um", "2.45 um")),
+    ):
+        result = run(*plan, *options, cwd=tmp_path)
+        assert result.returncode == 0
+        assert result.stderr.count("\n") == 1
+        assert result.stderr.startswith("warning: ")
+        assert all(word in result.stderr for word in words)
+    assert run(*plan, 2.45, "--sigma", 0.03, cwd=tmp_path).stderr == ""
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".csv.gz", ".parquet", ".gdf"])
@@ -274,13 +461,13 @@ def test_a_gdf_cut_short_is_refused(table, tmp_path):
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (("--dt", "0"), ("dt", "> 0")),
-        (("--dt", "-1"), ("dt", "> 0")),
-        (("--dt", "1", "--scale", "0"), ("scale",)),
+        (("--dt", "0"), ("--dt:", "> 0")),
+        (("--dt", "-1"), ("--dt:", "> 0")),
+        (("--dt", "1", "--scale", "0"), ("--scale:",)),
         (("--dt", "1", "--scale", "big"), ("--scale", "big")),
         (("--dt", "1", "--frames", "9"), ("--frames", "A:B")),
         (("--dt", "1", "--columns", "x"), ("--columns",)),
-        (("--dt", "1", "--contact", "-2"), ("contact",)),
+        (("--dt", "1", "--contact", "-2"), ("--contact:",)),
         (("--dt", "1", "--viscosity", "1e-3"), ("temperature",)),
         (("--dt", "1", "--diameter", "2"), ("diameter", "viscosity", "temperature")),
     ],
@@ -361,8 +548,8 @@ def test_predict_reads_positions(tmp_path):
         (("--positions", "none.csv"), ("none.csv",)),
         (("--positions", "bad.csv"), ("column 'x'", "line 3", "column 'z' is missing", "colour")),
         (("--positions", "empty.csv"), ("no rows",)),
-        (("tetrahedron", "--diameter", -1), ("diameter",)),
-        (("tetrahedron", "--diameter", 1, "--temperature", 22), ("kelvin",)),
+        (("tetrahedron", "--diameter", -1), ("--diameter -1.0",)),
+        (("tetrahedron", "--diameter", 1, "--temperature", 22), ("--temperature:", "kelvin")),
         (("tetrahedron", "--diameter", 1, "-o", "nowhere/p.json"), ("nowhere",)),
     ],
 )
@@ -430,12 +617,12 @@ def test_plan_draws_and_never_overwrites_silently(tmp_path):
     ("options", "words"),
     [
         (("--radius", "1"), ("--radius", "--diameter")),
-        (("--frames", "2"), ("n_frames",)),
-        (("--time", "-3", "--photons"), ("total_time", "photons")),
-        (("--d-t", "-1"), ("D_T",)),
+        (("--frames", "2"), ("--frames:",)),
+        (("--time", "-3", "--photons"), ("--time -3.0", "--photons: expected --frames and --time")),
+        (("--d-t", "-1"), ("--d-t:",)),
         (("--sigma", "a"), ("--sigma",)),
         (("--sigma", "0"), ("sigma", "more than 0")),
-        (("--d-r", "0"), ("D_R",)),
+        (("--d-r", "0"), ("--d-r 0.0",)),
         (("-o", "plan.doc"), ("plan.doc", ".png")),
         (("-o", "nowhere/plan.png"), ("nowhere",)),
     ],

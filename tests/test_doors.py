@@ -20,6 +20,8 @@ SOURCE = ROOT / "src" / "perrin"
 
 # The house, top to bottom: a room imports only rooms above it.
 ROOMS = [
+    "_text",
+    "_units",
     "_arrays",
     "_text",
     "clock",
@@ -54,7 +56,9 @@ ROOMS = [
     "surroundings",
     "simulate",
     "gdf",
+    "column_names",
     "files",
+    "remarks",
     "images.contents",
     "images.tiff",
     "images.vendors",
@@ -89,6 +93,7 @@ ROOMS = [
     "paper_orientations",
     "paper_experiment",
     "paper",
+    "options",
     "cli",
 ]
 LAZY = ("pandas", "scipy", "matplotlib", "pyarrow", "jinja2", "typer", "rich", "trackpy", "numba")

@@ -591,7 +591,7 @@ def test_many_rows_are_counted_and_a_few_shown():
 def test_missing_columns_are_listed_with_those_found():
     """All at once, with what to do."""
     (fault,) = faults_of(tracks()[["frame", "z"]].rename(columns={"frame": "Frame"}))
-    assert "missing columns frame, particle, x, y; found: Frame, z;" in fault
+    assert "missing columns particle, x, y; found: Frame, z;" in fault
     assert "columns=" in fault
 
 
@@ -633,3 +633,123 @@ def test_what_is_no_table_is_a_type_error():
     """An array has no columns."""
     with pytest.raises(TypeError, match="expected a pandas DataFrame, got ndarray"):
         check_tracks(np.zeros((3, 4)), source="the table")
+
+
+# ---- spellings and units ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("Frame", "Particle", "X", "Y", "Z"),
+        (" frame ", "particle ", " x", "y ", "z"),
+        ("frame", "particle", "x (um)", "y [\u00b5m]", "z (\u03bcm)"),
+        ("FRAME", "Particle ID", "x_um", "Y_um", "z [ micron ]"),
+        ("Frame Number", "particle_id", "x", "y", "Z (um)"),
+    ],
+)
+def test_spellings_that_differ_in_case_blanks_or_unit_are_read(tmp_path, names):
+    """The same table under other names gives the same numbers, and a note of every other name."""
+    table = tracks()
+    spelt = table.set_axis(list(names), axis=1)
+    spelt.to_parquet(tmp_path / "t.parquet")
+    for back in (read_tracks(tmp_path / "t.parquet"), check_tracks(spelt, source="the table")):
+        pd.testing.assert_frame_equal(back, table)
+        (note,) = back.attrs["notes"]
+        for theirs, ours in zip(names, table.columns, strict=True):
+            assert (f"{theirs!r} as {ours}" in note) == (theirs != ours)
+    assert "notes" not in check_tracks(table, source="the table").attrs
+
+
+def test_exact_names_win_and_the_others_are_noted():
+    """Beside a column with our name none of another spelling is read, and that is stated."""
+    table = tracks().assign(X=7.0, **{"y (um)": 8.0})
+    back = check_tracks(table, source="the table")
+    pd.testing.assert_frame_equal(back, tracks())
+    assert back.attrs["notes"] == [
+        "columns left out beside others with exactly our names: 'X', 'y (um)'"
+    ]
+
+
+def test_of_two_candidates_none_is_chosen(tmp_path):
+    """X and x (um) could both be x: a fault with both names and the remedy, which works."""
+    table = tracks().rename(columns={"x": "X"}).assign(**{"x (um)": 8.0})
+    table.to_csv(tmp_path / "t.csv", index=False)
+    with pytest.raises(TrackTableError) as caught:
+        read_tracks(tmp_path / "t.csv")
+    (fault,) = caught.value.faults
+    assert fault == (
+        "x: 2 columns could be it, 'X', 'x (um)'; choose one, for example columns={'x': 'X'}"
+    )
+    back = read_tracks(tmp_path / "t.csv", columns={"x": "X"})
+    np.testing.assert_array_equal(back["x"], tracks()["x"])
+
+
+@pytest.mark.parametrize("name", ["xx", "x (a.u.)", "x (s)", "x1", "mean x", "x_std", "pos_x"])
+def test_other_names_are_not_guessed(name):
+    """A name with another word or an unknown unit is none of ours."""
+    table = tracks().rename(columns={"x": name})
+    assert "missing column x" in faults_of(table)[0]
+
+
+@pytest.mark.parametrize(
+    ("unit", "right", "wrong"),
+    [
+        ("um", 1, (0.1, 1e-3)),
+        ("nm", 1e-3, (1, 0.1, 1e3)),
+        ("mm", 1e3, (1, 1e-3)),
+        ("px", 0.16, (1, (1, 1, 1))),
+        ("pixels", (0.1, 0.1, 0.3), (1,)),
+    ],
+)
+@pytest.mark.parametrize("form", ["{} ({})", "{} [{}]", "{}({})"])
+def test_a_unit_in_a_name_must_agree_with_the_scale(unit, right, wrong, form):
+    """The right scale is read as without the unit; a contradiction is refused with both numbers."""
+    table = tracks()
+    named = table.rename(columns={axis: form.format(axis, unit) for axis in "xyz"})
+    expected = check_tracks(table, source="the table", scale=right)
+    pd.testing.assert_frame_equal(
+        check_tracks(named, source="the table", scale=right), expected, check_exact=True
+    )
+    for scale in wrong:
+        with pytest.raises(TrackTableError, match=f"in {unit}, but the scale is .*state scale"):
+            check_tracks(named, source="the table", scale=scale)
+
+
+def test_units_of_single_axes_are_judged_by_their_own_scale(tmp_path):
+    """X and y in nm, z in um: one number per axis; the message states all three."""
+    table = tracks().rename(columns={"x": "x (nm)", "y": "y (nm)", "z": "z (um)"})
+    table.to_csv(tmp_path / "t.csv", index=False)
+    read_tracks(tmp_path / "t.csv", scale=(1e-3, 1e-3, 1))
+    fault = fault_of((tmp_path / "t.csv").read_text(), tmp_path)
+    assert "'x (nm)', 'y (nm)' are in nm, but the scale is 1 um per unit" in fault
+    assert "state scale=(0.001, 0.001, 1)" in fault
+
+
+def test_columns_by_name_keep_their_unit_and_by_number_do_not(tmp_path):
+    """A mapping by name is no way around the unit; one by number is."""
+    table = tracks().rename(columns={axis: f"POS_{axis} (nm)" for axis in "xyz"})
+    table.to_csv(tmp_path / "t.csv", index=False)
+    by_name = {axis: f"POS_{axis} (nm)" for axis in "xyz"}
+    assert "in nm" in fault_of((tmp_path / "t.csv").read_text(), tmp_path, columns=by_name)
+    nm = read_tracks(tmp_path / "t.csv", columns=by_name, scale=1e-3)
+    plain = read_tracks(tmp_path / "t.csv", columns={"x": 2, "y": 3, "z": 4})
+    np.testing.assert_allclose(nm[["x", "y", "z"]], 1e-3 * plain[["x", "y", "z"]], rtol=1e-15)
+
+
+@pytest.mark.parametrize(("unit", "seconds"), [("s", 1), ("ms", 1e-3), ("min", 60)])
+def test_a_time_in_another_unit_is_converted_and_noted(unit, seconds):
+    """No argument can contradict the unit of time, so it holds."""
+    table = tracks().assign(time=0.25)
+    back = check_tracks(table.rename(columns={"time": f"Time ({unit})"}), source="the table")
+    np.testing.assert_allclose(back["time"], 0.25 * seconds, rtol=1e-15)
+    converted = any("converted" in note for note in back.attrs["notes"])
+    assert converted == (seconds != 1)
+
+
+def test_lists_of_columns_are_short():
+    """A table of 300 strange columns does not fill the screen."""
+    table = pd.DataFrame({f"column {k}": [1.0] for k in range(300)})
+    fault = faults_of(table)[0]
+    assert "column 9 and 290 more;" in fault
+    assert len(fault) < 400

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 
 from perrin import (
     Cluster,
+    UnitWarning,
     cluster_mobility,
     estimate_diffusion,
     simulate_motion,
@@ -248,3 +250,16 @@ def test_bad_input_to_the_joint_size():
     """The same for size_and_viscosity."""
     with pytest.raises(ValueError, match=r"D_T.*kelvin.*D_R"):
         size_and_viscosity(-1.0, (0.1, -1), cluster=TETRAHEDRON, temperature=22.0)
+
+
+@pytest.mark.parametrize("size", [size_from_translation, size_from_rotation])
+def test_a_viscosity_in_another_unit_is_named(size):
+    """Above 0.5 Pa s each function warns with the value and what it is in mPa s; 0.2 is quiet."""
+    for viscosity in (2.18, (2.18, 0.1), lambda kelvin: 2.18):
+        with pytest.warns(UnitWarning, match=r"viscosity: 2\.18 Pa s .* state 0\.00218") as said:
+            size(0.01, cluster=TETRAHEDRON, viscosity=viscosity, temperature=295.0)
+        assert len(said) == 1
+        assert said[0].filename == __file__
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        size(0.01, cluster=TETRAHEDRON, viscosity=0.2, temperature=295.0)

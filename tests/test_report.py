@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import json
 import re
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -212,7 +213,7 @@ def test_many_clusters_are_listed_pooled_and_the_figures_counted(single, tmp_pat
     assert "first 12 of 60 clusters" in page.text
     assert "pooled over 59 clusters" in page.text
     assert "leaves out 59" in page.text
-    assert "Cluster 3 : 2 warnings" in page.text
+    assert "In 10 of 60 clusters ( 0 , 1 , 2 , 3 , 4 , 5 , 6 , 7 , 8 , 9 ): a" in page.text
     assert [f"#cluster-{k}" in page.sources for k in range(60)] == [True] * 60
     assert page.text.count("What to look for:") == 2
 
@@ -260,3 +261,55 @@ def test_a_failure_leaves_nothing_behind_and_keeps_what_stood(single, tmp_path, 
             report.write_run(single, target, overwrite=True)
     assert [p.name for p in tmp_path.iterdir()] == ["run"]
     assert (place / "summary.json").is_file()
+
+
+@pytest.mark.parametrize("count", [1, 40])
+def test_notes_stand_apart_and_are_not_counted(single, count):
+    """Notes have a box of their own after the warnings; the table counts warnings only."""
+    one = single.clusters[0]
+    many = tuple(
+        replace(one, cluster=k, notes=(f"{k + 3} rows are missing",), warnings=("bends",) * (k > 1))
+        for k in range(count)
+    )
+    found = replace(single, clusters=many, notes=("columns recognised: 'Frame' as frame",))
+    html = report.render_html(found, [])
+    page = Page(html)
+    assert page.open == []
+    notes = html[html.index('<div class="notes"') :]
+    assert "columns recognised" in notes[: notes.index("</div>")]
+    assert "columns recognised" not in html[: html.index('<div class="notes"')]
+    if count == 1:
+        assert '<div class="warning"' not in html
+        assert "3 rows are missing" in notes[: notes.index("</div>")]
+        return
+    assert html.index('<div class="warning"') < html.index('<div class="notes"')
+    assert "In 38 of 40 clusters ( 2 , 3 , 4 , 5 , 6 , 7 , 8 , 9 , 10 , 11 and 28 more): bends" in (
+        page.text
+    )
+    assert "In all 40 clusters, for example cluster 0 : 3 rows are missing" in page.text
+    counts = re.findall(r"<td>(\d+|–)</td></tr>", html)
+    assert counts[:40] == ["–", "–"] + 38 * ["1"]
+
+
+def test_several_clusters_without_a_pooled_value(single):
+    """Where nothing is pooled the page says so in the first place, and shows every cluster."""
+    many = tuple(replace(single.clusters[0], cluster=k) for k in range(3))
+    page = Page(report.render_html(replace(single, clusters=many, pooled=None), []))
+    assert "No values are pooled; those of the single clusters follow" in page.text
+    assert "There is no pooled value" in page.text
+    assert [f"#cluster-{k}" in page.sources for k in range(3)] == [True] * 3
+
+
+def test_notes_are_kept_and_older_runs_have_none(single, tmp_path):
+    """Notes read back; a run folder without the key is read as one without notes."""
+    one = replace(single.clusters[0], notes=("5 rows",))
+    found = replace(single, clusters=(one,), notes=("columns recognised",))
+    found.save(tmp_path / "run")
+    again = perrin.load_run(tmp_path / "run")
+    assert (again.notes, again.clusters[0].notes) == (("columns recognised",), ("5 rows",))
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    for entry in (summary, *summary["clusters"]):
+        del entry["notes"]
+    (tmp_path / "run" / "summary.json").write_text(json.dumps(summary))
+    again = perrin.load_run(tmp_path / "run")
+    assert (again.notes, again.clusters[0].notes) == ((), ())

@@ -497,8 +497,8 @@ def test_the_page_tells_the_truth():
 @pytest.mark.parametrize(
     ("options", "status", "told"),
     [
-        ([], 2, "no voxel size along z, y, x: pass voxel=(z, y, x) in um; no times of its"),
-        (["--voxel", "0.25,0.2,0.2"], 2, "no times of its 3 frames: pass dt= in s (here: --dt)"),
+        ([], 2, "no voxel size along z, y, x: pass --voxel z,y,x in um; no times of its"),
+        (["--voxel", "0.25,0.2,0.2"], 2, "no times of its 3 frames: pass --dt in s"),
         (["--voxel", "0.25,0.2,0.2", "--dt", "0.7", "--optics", "2.45"], 2, "--optics: expected"),
         (["--voxel", "0.25,0.2,0.2", "--dt", "0.7"], 1, "no spheres to learn the optics from"),
         (["--voxel", "0.25,0.2,0.2", "--dt", "0.7", "--refine", "best"], 2, "--refine: expected"),

@@ -1,5 +1,6 @@
 """When to take frames: published numbers, budgets, identity, units, and what simulations reach."""
 
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -9,6 +10,7 @@ from perrin import (
     Cluster,
     DegenerateClusterError,
     DiffusionEstimate,
+    UnitWarning,
     add_noise,
     cramer_rao,
     estimate_diffusion,
@@ -378,3 +380,15 @@ def test_the_estimate_carries_its_dt():
     motions = [simulate_motion(BODY, D_R=D_R, dt=dt, n_frames=20, rng=1) for dt in (0.5, 0.7)]
     assert estimate_diffusion(motions[0]).dt == 0.5
     assert estimate_diffusion(motions, quantity="translation").dt == pytest.approx(0.6)
+
+
+def test_lengths_that_look_like_nanometres_are_named():
+    """A sigma larger than the body and spheres of 2450 um warn with both numbers; the usual not."""
+    with pytest.warns(UnitWarning, match=r"sigma: 30 um .* R = 1\.5 um.* state 0\.03"):
+        plan_sampling(BODY, D_R=D_R, sigma=30.0)
+    with pytest.warns(UnitWarning, match=r"nearest particles, 2450 um, .* it is 2\.45 um"):
+        plan_sampling(Cluster.touching(4, 2450.0), D_R=D_R, sigma=0.03)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for diameter in (0.06, 2.45, 49.0):
+            plan_sampling(Cluster.touching(4, diameter), D_R=D_R, sigma=0.01 * diameter)

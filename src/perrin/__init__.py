@@ -20,6 +20,7 @@ if TYPE_CHECKING:
         PrecisionWarning,
         TooFewFramesError,
         TrackTableError,
+        UnitWarning,
     )
     from perrin.analysis import analyze
     from perrin.bounds import cramer_rao
@@ -108,6 +109,7 @@ __all__ = [
     "Stack",
     "TooFewFramesError",
     "TrackTableError",
+    "UnitWarning",
     "VanHove",
     "WallFactor",
     "add_noise",
@@ -178,6 +180,7 @@ _ROOMS = {
         "PrecisionWarning",
         "TooFewFramesError",
         "TrackTableError",
+        "UnitWarning",
     ),
     "rotations": ("Similarity", "axis_angle", "kabsch", "similarity"),
     "shapes": ("Cluster", "point_group", "rotation_group"),

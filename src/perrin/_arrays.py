@@ -91,6 +91,10 @@ class PrecisionWarning(UserWarning):
     """The number is right but says less than it seems to."""
 
 
+class UnitWarning(PrecisionWarning):
+    """A number is possible, but usual only in another unit."""
+
+
 class IdentityWarning(UserWarning):
     """Which particle is which, or what belongs together, was assumed and not measured."""
 

@@ -23,6 +23,7 @@ from perrin._arrays import (
     TrackTableError,
 )
 from perrin._text import frames_text, listed
+from perrin._units import viscosity_remarks
 from perrin.clock import frame_stride, read_clock
 from perrin.diffusion import DiffusionEstimate, estimate_diffusion, with_error
 from perrin.files import check_tracks, read_tracks
@@ -289,6 +290,7 @@ def measure_table(
         *remarks.warnings,
         *_failures_text(failures),
         *_common_jumps(done.jumps),
+        *viscosity_remarks(conditions.viscosity),
     )
     notes = (*remarks.notes, *_assumed_exposure(conditions))
     settings = _settings(source, arguments=arguments, first_frame=first)
@@ -436,7 +438,7 @@ def _nothing_found(contact: float | None, *, marked: bool) -> str:
         return f"no cluster: every particle is {how}; correct that, or the scale"
     return (
         "no cluster: no two particles keep their distance (to a tenth, over 8 frames or more): say "
-        "the centre distance of touching particles (contact, --contact), or give a column cluster"
+        "the centre distance of touching particles (contact=), or give a column cluster"
     )
 
 

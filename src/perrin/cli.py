@@ -3,24 +3,26 @@
 from __future__ import annotations
 
 import os
+import re
 import sys
 from contextlib import contextmanager
 from math import isfinite
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
+from typing import TYPE_CHECKING, Annotated, Literal, cast
 
 import typer
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
+    from typing import TextIO
 
     from numpy.typing import ArrayLike
+    from rich.console import Console
     from rich.progress import TaskID
     from rich.table import Table
 
     from perrin.diffusion import DiffusionEstimate
     from perrin.images.optics import Optics
-    from perrin.images.stacks import Stack
     from perrin.mobility import Mobility
     from perrin.predictions import Compared
     from perrin.results import ClusterResult, Pooled, Report
@@ -35,11 +37,17 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
-_SHOWN, _SHOWN_WARNINGS = 5, 20
+_SHOWN, _SHOWN_WARNINGS, _SHOWN_NOTES = 5, 20, 10
 _SHAPES = ("tetrahedron", "pentahedron", "trimer")
 _TOUCHING = ("dimer", "trimer", "tetrahedron", "bipyramid", "octahedron", "pentagonal-bipyramid")
 _UNEQUAL = 0.05  # below this probability of equal axes the tensor is worth a look
 _PICTURES = (".png", ".pdf", ".svg")
+# What a run of the demo writes, by which the folder of an earlier one is recognised.
+_DEMO = "perrin-demo"
+_DEMO_FILES = re.compile(
+    r"summary\.json|run\.json|report\.html|curves\.csv|(?:tracks|motion)\.parquet"
+    r"|figures|figures/cluster-0-\w+\.(?:png|pdf)"
+)
 
 Tracks = Annotated[Path, typer.Argument(help="Track table: .csv, .csv.gz, .parquet or .gdf.")]
 Interval = Annotated[float, typer.Option("--dt", help="Time between frames, s.")]
@@ -52,6 +60,7 @@ Columns = Annotated[
     typer.Option(help="Names or numbers of the file's columns: x=0,y=1,z=2,frame=-2,particle=-1."),
 ]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an existing run folder.")]
+OverwriteFile = Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")]
 Noise = Annotated[
     str,
     typer.Option(
@@ -90,18 +99,32 @@ def _root(
 
 
 @app.command()
-def demo(output: Output = Path("perrin-demo")) -> None:
+def demo(
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "-o", "--output", help=f"Folder for the run; {_DEMO} if left out, replaced if a demo's."
+        ),
+    ] = None,
+    overwrite: Overwrite = False,
+) -> None:
     """Analyse an embedded table: one simulated tetrahedron under the paper's conditions."""
+    from dataclasses import replace
     from importlib.resources import as_file, files
 
     import perrin
     from perrin.results import check_place
 
-    with _told(), as_file(files("perrin") / "data" / "demo_tracks.csv.gz") as path:
-        check_place(output, overwrite=True)
+    with _messages(demo), as_file(files("perrin") / "data" / "demo_tracks.csv.gz") as path:
+        place = output or Path(_DEMO)
+        if output is None and place.exists() and not overwrite:
+            _check_demo(place)
+            overwrite = True
+        check_place(place, overwrite=overwrite)
         report = perrin.analyze(path, dt=0.73, viscosity=2.18e-3, temperature=295.0, diameter=2.45)
-        perrin.write_run(report, output, overwrite=True)
-        _show(report, output)
+        report = replace(report, settings=report.settings | {"made": "demo"})
+        perrin.write_run(report, place, overwrite=overwrite)
+        _show(report, place, demo)
         print("Planted in the simulation: D_R = 0.00493 rad^2/s, D_T = 0.0385 um^2/s.")
 
 
@@ -144,7 +167,7 @@ def analyze(
     import perrin
     from perrin.results import check_place
 
-    with _told():
+    with _messages(analyze):
         check_place(output, overwrite=overwrite)
         report = perrin.analyze(
             tracks,
@@ -162,7 +185,7 @@ def analyze(
             frames=_slice(frames),
         )
         perrin.write_run(report, output, overwrite=overwrite)
-        _show(report, output)
+        _show(report, output, analyze)
 
 
 @app.command()
@@ -241,27 +264,21 @@ def run(
 
     Finished frames are kept in the output folder: after an interruption the same command goes on.
     """
-    import warnings
-
     import perrin
     from perrin.report import complete_run
     from perrin.results import check_resumable
 
-    with _told(), _kept_told(output):
+    with _messages(run), _frames_kept(output):
         check_resumable(output, parts="located", overwrite=overwrite)
-        with warnings.catch_warnings(record=True) as said:
-            warnings.simplefilter("always", perrin.PrecisionWarning)
-            movie = _opened(
-                stack,
-                voxel=None if voxel is None else _numbers("--voxel", voxel),
-                dt=dt,
-                plane_time=plane_time,
-                planes=planes,
-                channel=channel,
-                image=int(image) if image is not None and image.isdecimal() else image,
-            )
-        for warning in said:
-            print(f"warning: {warning.message}", file=sys.stderr)
+        movie = perrin.open_stack(
+            stack,
+            voxel=None if voxel is None else _numbers("--voxel", voxel),
+            dt=dt,
+            plane_time=plane_time,
+            planes=planes,
+            channel=channel,
+            image=int(image) if image is not None and image.isdecimal() else image,
+        )
         with movie, _progress() as progress:
             report = perrin.analyze_stack(
                 movie,
@@ -288,19 +305,7 @@ def run(
             )
             progress(0, 0, "writing the report")
             complete_run(report, output)
-        _show(report, output)
-
-
-def _opened(path: Path, **given: Any) -> Stack:  # noqa: ANN401 (as open_stack takes them)
-    """Open a stack; name the options where something is missing."""
-    import perrin
-
-    try:
-        return perrin.open_stack(path, **given)
-    except ValueError as fault:
-        options = [f"--{n.replace('_', '-')}" for n in given if f"{n}=" in str(fault)]
-        hint = f" (here: {', '.join(options)})" if options else ""
-        raise ValueError(f"{fault}{hint}") from None
+        _show(report, output, run)
 
 
 def _optics(text: str | None) -> Optics | None:
@@ -318,20 +323,20 @@ def _optics(text: str | None) -> Optics | None:
 
 
 @contextmanager
-def _kept_told(output: Path) -> Iterator[None]:
-    """Say, when a run is stopped from outside, that finished frames are kept."""
+def _frames_kept(output: Path) -> Iterator[None]:
+    """State, when a run is stopped from outside, that finished frames are kept."""
     try:
         yield
     except (OSError, KeyboardInterrupt) as stop:
-        if isinstance(stop, OSError):
-            print(f"perrin: {_one_line(stop)}", file=sys.stderr)
         kept = any((output / "located").glob("part-*"))
         if kept and not (output / "run.json").exists():
             print(
                 f"Finished frames are kept in {output}: the same command goes on from there.",
                 file=sys.stderr,
             )
-        raise typer.Exit(2 if isinstance(stop, OSError) else 130) from None
+        if isinstance(stop, OSError):
+            raise
+        raise typer.Exit(130) from None
 
 
 @contextmanager
@@ -378,13 +383,16 @@ def simulate(
     sigma: Annotated[str, typer.Option(help="Localisation error, um, one number or x,y,z.")] = "0",
     frames: Annotated[int, typer.Option(help="Number of frames.")] = 300,
     seed: Annotated[int, typer.Option(help="Seed of the random numbers.")] = 0,
+    overwrite: OverwriteFile = False,
 ) -> None:
     """Write the track table of one simulated Brownian cluster with localisation noise."""
     import numpy as np
 
     import perrin
+    from perrin.files import SUFFIXES
 
-    with _told():
+    with _messages(simulate):
+        _check_file(output, SUFFIXES, overwrite=overwrite)
         if shape not in _SHAPES:
             raise ValueError(f"shape: expected {', '.join(_SHAPES)}, got {shape!r}")
         rng = np.random.default_rng(seed)
@@ -398,7 +406,7 @@ def simulate(
         )
         positions = perrin.add_noise(truth.positions(), sigma=_numbers("--sigma", sigma), rng=rng)
         table = perrin.positions_table(positions)
-        if output.suffix == ".gdf":  # a format without room for a cluster column
+        if output.suffix.lower() == ".gdf":  # a format without room for a cluster column
             table = table.drop(columns="cluster")
         perrin.write_tracks(table, output)
         print(f"{frames} frames of one {shape} written to {output}")
@@ -418,29 +426,30 @@ def predict(
     ] = None,
     accuracy: Annotated[float, typer.Option(help="Relative error aimed at.")] = 1e-4,
     output: Annotated[Path | None, typer.Option("-o", "--output", help="JSON file.")] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the file.")] = False,
+    overwrite: OverwriteFile = False,
 ) -> None:
     """Predict how a rigid cluster of spheres diffuses: D_T, D_R, hydrodynamic diameters."""
     import json
     import warnings
 
-    import perrin
+    import numpy as np
 
-    with _told():
-        if output is not None and output.exists() and not overwrite:
-            raise FileExistsError(f"{output} exists: choose another file, or --overwrite")
+    import perrin
+    from perrin._units import length_remarks
+
+    with _messages(predict):
+        if output is not None:
+            _check_file(output, overwrite=overwrite)
         centers, radius = _spheres(shape, diameter=diameter, positions=positions)
-        with warnings.catch_warnings(record=True) as told:
-            warnings.simplefilter("always", perrin.PrecisionWarning)
-            body = perrin.cluster_mobility(
-                centers,
-                radius=radius,
-                viscosity=viscosity,
-                temperature=temperature,
-                accuracy=accuracy,
-            )
-        for warning in told:
-            print(f"warning: {warning.message}", file=sys.stderr)
+        for remark in length_remarks("the diameter of a sphere", 2 * np.asarray(radius).mean()):
+            warnings.warn(remark, perrin.UnitWarning, stacklevel=2)
+        body = perrin.cluster_mobility(
+            centers,
+            radius=radius,
+            viscosity=viscosity,
+            temperature=temperature,
+            accuracy=accuracy,
+        )
         if output is not None:
             text = json.dumps(body.to_dict(), indent=2, allow_nan=False)
             output.write_text(text + "\n", encoding="utf-8")
@@ -477,14 +486,14 @@ def plan(
         Path | None,
         typer.Option("-o", "--output", help="Picture of error against dt: .png, .pdf or .svg."),
     ] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace that picture.")] = False,
+    overwrite: OverwriteFile = False,
 ) -> None:
     """Say how often and how many times to look, and how well D_R will be known."""
     import perrin
 
-    with _told():
+    with _messages(plan):
         if output is not None:
-            _check_picture(output, overwrite=overwrite)
+            _check_file(output, _PICTURES, overwrite=overwrite)
         found = perrin.plan_sampling(
             _body(shape, radius=radius, diameter=diameter),
             D_R=d_r,
@@ -521,7 +530,7 @@ def paper(
     console = Console(highlight=False)
     columns = BarColumn(), TextColumn("{task.completed}/{task.total}"), TimeElapsedColumn()
     bar = Progress(*columns, TextColumn("{task.description}"), console=console)
-    with _told():
+    with _messages(paper):
         check_place(output, overwrite=overwrite)
         with bar:
             task = bar.add_task("starting", total=None)
@@ -536,8 +545,8 @@ def paper(
         failing = [claim for claim in claims if not claim.holds]
         console.print(f"{len(claims)} claims, {len(failing)} of them do not hold:")
         for claim in failing:
-            told = escape(claim.remark or claim.claim)
-            console.print(f"- {escape(claim.source)}: {told}", soft_wrap=True)
+            remark = escape(claim.remark or claim.claim)
+            console.print(f"- {escape(claim.source)}: {remark}", soft_wrap=True)
         console.print(f"Written to {escape(str(output))}: claims.md, figures, tables.")
 
 
@@ -547,22 +556,31 @@ def convert(
     target: Annotated[Path, typer.Argument(help="Track table to write, kind by its suffix.")],
     scale: Scale = "1",
     columns: Columns = None,
+    overwrite: OverwriteFile = False,
 ) -> None:
     """Convert a track table between .csv, .csv.gz, .parquet and .gdf."""
     import perrin
+    from perrin.files import SUFFIXES
 
-    with _told():
+    with _messages(convert):
+        _check_file(target, SUFFIXES, overwrite=overwrite)
         table = perrin.read_tracks(
             source, scale=_numbers("--scale", scale), columns=_columns(columns)
         )
         perrin.write_tracks(table, target)
+        for note in table.attrs.get("notes", ()):
+            print(f"note: {note}")
         print(f"{len(table)} rows written to {target}")
 
 
 @contextmanager
-def _told() -> Iterator[None]:
-    """Say an error in one line; exit status 1: the data cannot answer, 2: the input is wrong."""
+def _messages(command: Callable[..., None]) -> Iterator[None]:
+    """Print warnings and an error in one line each, in the words of the command line.
+
+    Exit status 1: the data cannot answer; 2: the input or the place of the output is wrong.
+    """
     import perrin
+    from perrin.options import in_options, options_of
 
     no_answer = (
         perrin.DegenerateClusterError,
@@ -571,15 +589,52 @@ def _told() -> Iterator[None]:
         perrin.TooFewFramesError,
     )
 
+    options = options_of(command)
     try:
-        yield
+        with _warnings_in_one_line(options):
+            yield
     except BrokenPipeError:
         # The reader has gone (a pipe into head); the run itself is written. Python's own flush at
         # the end would complain again.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except (ValueError, OSError, ImportError) as error:
-        print(f"perrin: {_one_line(error)}", file=sys.stderr)
+        print(f"perrin: {in_options(_one_line(error), options)}", file=sys.stderr)
         raise typer.Exit(1 if isinstance(error, no_answer) else 2) from None
+
+
+@contextmanager
+def _warnings_in_one_line(options: dict[str, str]) -> Iterator[None]:
+    """Print the library's warnings when they are given, each text once."""
+    import warnings
+
+    import perrin
+    from perrin.options import in_options
+
+    ours = (perrin.PrecisionWarning, perrin.IdentityWarning)
+    printed: set[str] = set()
+    with warnings.catch_warnings():
+        usual = warnings.showwarning
+
+        def show(
+            message: Warning | str,
+            category: type[Warning],
+            filename: str,
+            lineno: int,
+            file: TextIO | None = None,
+            line: str | None = None,
+        ) -> None:
+            if not issubclass(category, ours):
+                usual(message, category, filename, lineno, file, line)
+                return
+            text = in_options(" ".join(str(message).split()), options)
+            if text not in printed:
+                print(f"warning: {text}", file=sys.stderr)
+                printed.add(text)
+
+        for category in ours:
+            warnings.simplefilter("always", category)
+        warnings.showwarning = show
+        yield
 
 
 def _one_line(error: Exception) -> str:
@@ -686,14 +741,39 @@ def _body(shape: str, *, radius: float | None, diameter: float | None) -> Cluste
     return body
 
 
-def _check_picture(path: Path, *, overwrite: bool) -> None:
-    """Refuse, before any work is done, a picture that cannot or must not be written."""
-    if path.suffix.lower() not in _PICTURES:
-        raise ValueError(f"{path}: expected a picture that ends in {', '.join(_PICTURES)}")
+def _check_file(path: Path, endings: tuple[str, ...] = (), *, overwrite: bool) -> None:
+    """Refuse, before any work is done, a file that cannot or must not be written."""
+    if endings and not path.name.lower().endswith(endings):
+        raise ValueError(f"{path}: expected a name that ends in {', '.join(endings)}")
+    if path.is_dir():
+        raise IsADirectoryError(f"{path} is a folder: state the name of a file")
     if path.exists() and not overwrite:
         raise FileExistsError(f"{path} exists: choose another name, or --overwrite")
     if not path.parent.is_dir():
         raise FileNotFoundError(f"{path}: there is no folder {path.parent}")
+    if not os.access(path.parent, os.W_OK):
+        raise PermissionError(f"{path}: the folder {path.parent} is not writable")
+
+
+def _check_demo(folder: Path) -> None:
+    """Refuse to replace a folder unless it is empty or all in it was written by the demo."""
+    import json
+
+    found = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*"))
+    foreign = [name for name in found if not _DEMO_FILES.fullmatch(name)]
+    try:
+        made = json.loads((folder / "run.json").read_text(encoding="utf-8"))["made"] == "demo"
+    except (OSError, ValueError, KeyError, TypeError):
+        made = False
+    if (made and not foreign) or (not found and folder.is_dir()):
+        return
+    from perrin._text import listed
+
+    reason = f"it holds {listed(foreign)}" if made else "no run.json in it names the demo"
+    raise FileExistsError(
+        f"{folder} is not what a demo wrote ({reason}): not overwritten; move it away, or choose "
+        "another folder with -o"
+    )
 
 
 def _show_plan(plan: SamplingPlan) -> None:
@@ -740,8 +820,8 @@ def _slice(text: str | None) -> tuple[int | None, int | None] | None:
     return ends[0], ends[1]
 
 
-def _show(report: Report, output: Path) -> None:
-    """Print the short tables, the warnings, and where the rest is."""
+def _show(report: Report, output: Path, command: Callable[..., None]) -> None:
+    """Print the short tables, the warnings, the notes, and where the rest is."""
     from rich.console import Console
     from rich.markup import escape
 
@@ -759,14 +839,36 @@ def _show(report: Report, output: Path) -> None:
         console.print(escape(perp_text(rod)))
         if rod.prediction is not None:
             console.print(escape(f"  {rod.prediction}"), soft_wrap=True)
-    told = [("", text) for text in report.warnings]
-    told += [(f", cluster {r.name}", text) for r in report.results for text in r.warnings]
-    for where, text in told[:_SHOWN_WARNINGS]:
-        console.print(f"[yellow]warning{escape(where)}:[/] {escape(text)}", soft_wrap=True)
-    if len(told) > _SHOWN_WARNINGS:
-        console.print(f"and {len(told) - _SHOWN_WARNINGS} more warnings in summary.json")
+    _show_remarks(report, command, console)
     pages = "report.html" if report.imaging is None else "report.html, quality.html"
     console.print(f"Written to {escape(str(output))}: {pages}, figures, summary.json, tables.")
+
+
+def _show_remarks(report: Report, command: Callable[..., None], console: Console) -> None:
+    """Print the warnings, then the notes, with those of several clusters in one line."""
+    from rich.markup import escape
+
+    from perrin.options import in_options, options_of
+    from perrin.remarks import condensed, merged
+
+    options = options_of(command)
+    warnings = [
+        *condensed(report.warnings),
+        *merged({result.name: result.warnings for result in report.results}),
+    ]
+    notes = [
+        *condensed(report.notes),
+        *merged({result.name: result.notes for result in report.results}),
+    ]
+    for text in warnings[:_SHOWN_WARNINGS]:
+        shown = escape(in_options(text, options))
+        console.print(f"[bold yellow]! warning:[/] {shown}", soft_wrap=True)
+    if len(warnings) > _SHOWN_WARNINGS:
+        console.print(f"and {len(warnings) - _SHOWN_WARNINGS} more warnings in summary.json")
+    for text in notes[:_SHOWN_NOTES]:
+        console.print(f"[dim]note: {escape(in_options(text, options))}[/]", soft_wrap=True)
+    if len(notes) > _SHOWN_NOTES:
+        console.print(f"[dim]and {len(notes) - _SHOWN_NOTES} more notes in summary.json[/]")
 
 
 def _cluster_table(result: ClusterResult) -> Table:

@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 
 from perrin._arrays import Bools, Floats, Ints, table_error
+from perrin._text import listed
+from perrin.column_names import COLUMNS, Spelling, recognise_columns, seconds, unit_faults
 from perrin.gdf import gdf_bytes, parse_gdf
 
 if TYPE_CHECKING:
@@ -23,8 +25,7 @@ if TYPE_CHECKING:
 
 _REQUIRED = ("frame", "particle", "x", "y")
 _AXES = ("x", "y", "z")
-_COLUMNS = (*_REQUIRED, "z", "cluster", "time")
-_SUFFIXES = (".csv", ".csv.gz", ".parquet", ".gdf")
+SUFFIXES = (".csv", ".csv.gz", ".parquet", ".gdf")
 _LARGEST_EXACT = 2**53
 
 _GDF_COLUMNS = {
@@ -56,14 +57,16 @@ def read_tracks(
         Which column of the file is which of ours (``frame``, ``particle``, ``x``, ``y``, ``z``,
         ``cluster``, ``time``), by its name in the file or by its number from 0 (from the end where
         negative): ``{"x": "POS_X"}`` or ``{"x": 0, "y": 1, "frame": -2, "particle": -1}``.
-        Columns that already bear our names need no entry.
+        Columns that already bear our names need no entry, nor do those that differ in case, blanks
+        or a unit only (``Frame``, ``Particle ID``, ``x (um)``, ``Y_um``); see the notes.
 
     Returns
     -------
     pandas.DataFrame
         ``frame`` (int64), ``particle`` (int64 or text), ``x``, ``y`` and, where given, ``z``
         (float64, um), ``cluster`` and ``time`` (s) as in `check_tracks`. Other columns of the
-        file are left out.
+        file are left out. ``attrs["notes"]``, where there are any, is a list of texts that state
+        which columns were recognised under another spelling.
 
     Raises
     ------
@@ -73,6 +76,16 @@ def read_tracks(
         If `scale` is not one positive number, or one per axis.
     OSError
         If the file is missing or may not be read.
+
+    Notes
+    -----
+    A column with exactly our name is always taken. Otherwise a column is taken that has our name
+    but for case, blanks, underscores and a unit at its end; where two columns could be the same one
+    of ours, the table is refused. A unit of length in the name of a column must agree with `scale`:
+    nm needs 0.001, px needs the size of a pixel, and um needs 1; the table is refused where they
+    contradict each other, since one of the two is wrong. Columns that `columns` gives by number are
+    taken without regard to their names. A unit of time in the name of the column ``time`` converts
+    it to s, as no argument can contradict it.
 
     Examples
     --------
@@ -91,8 +104,8 @@ def read_tracks(
     raw = _PARSERS[suffix](Path(path).read_bytes(), source)
     if suffix == ".gdf" and columns is None:
         columns = _gdf_columns(raw.shape[1], source)
-    tracks = _checked(_named(raw, columns or {}, source), source, _Rows.of(raw, suffix))
-    return _scaled(tracks, scale)
+    named = _named(raw, columns or {}, source)
+    return _finished(named, source, _Rows.of(raw, suffix), scale)
 
 
 def check_tracks(table: pd.DataFrame, *, source: str, scale: ArrayLike = 1.0) -> pd.DataFrame:
@@ -116,7 +129,8 @@ def check_tracks(table: pd.DataFrame, *, source: str, scale: ArrayLike = 1.0) ->
     pandas.DataFrame
         Those columns in that order, rows in the order given, with a fresh index. ``frame`` is
         int64, coordinates and ``time`` are float64. ``particle`` and ``cluster`` are int64, or text
-        throughout. A row of no cluster has ``cluster`` -1, or NaN where clusters are text.
+        throughout. A row of no cluster has ``cluster`` -1, or NaN where clusters are text. Columns
+        of other spellings and units in their names are treated as in `read_tracks`.
 
     Raises
     ------
@@ -141,11 +155,12 @@ def check_tracks(table: pd.DataFrame, *, source: str, scale: ArrayLike = 1.0) ->
         raise TypeError(f"{source}: expected a pandas DataFrame, got {type(table).__name__}")
     table = table.reset_index(drop=True)
     is_csv = source.lower().endswith((".csv", ".csv.gz"))
-    return _scaled(_checked(table, source, _Rows.of(table, ".csv" if is_csv else "")), scale)
+    named = _Named(table, recognise_columns(table.columns))
+    return _finished(named, source, _Rows.of(table, ".csv" if is_csv else ""), scale)
 
 
 def write_tracks(table: pd.DataFrame, path: _PathLike) -> None:
-    """Write tracks to a file of the kind that its suffix names.
+    """Write tracks to a file of the kind that its suffix names; an existing file is replaced.
 
     The file is written beside its place and renamed, so that a half-written one never stands.
     Numbers read back bit-identical. The columns written are those of `check_tracks`.
@@ -225,7 +240,7 @@ def read_spheres(path: _PathLike) -> tuple[Floats, Floats | None]:
     faults = [f"column {name!r} is missing" for name in _AXES if name not in table]
     unknown = [name for name in table if name not in (*_AXES, "radius")]
     if unknown:
-        faults.append(f"columns other than x, y, z and radius: {', '.join(unknown)}")
+        faults.append(f"columns other than x, y, z and radius: {listed(unknown)}")
     if not len(table):
         faults.append("no rows; expected one row per sphere")
     for name in [name for name in (*_AXES, "radius") if name in table]:
@@ -259,26 +274,20 @@ class _Rows:
     def where(self, bad: Bools) -> str:
         """Return "line 3" or "lines 3, 7, 9, 12, 20 and 4 more"."""
         numbers = self.numbers[bad]
-        shown = ", ".join(str(number) for number in numbers[:5])
-        more = f" and {len(numbers) - 5} more" if len(numbers) > 5 else ""
-        return f"{self.word}{'s' if len(numbers) > 1 else ''} {shown}{more}"
-
-
-def _listed(names: list[Any], limit: int = 20) -> str:
-    shown = ", ".join(str(name) for name in names[:limit])
-    return shown + (f" and {len(names) - limit} more" if len(names) > limit else "")
+        plural = "s" if len(numbers) > 1 else ""
+        return f"{self.word}{plural} {listed(numbers.tolist(), most=5)}"
 
 
 # ---- the check ----------------------------------------------------------------------------------
 
 
-def _checked(table: pd.DataFrame, source: str, rows: _Rows) -> pd.DataFrame:
-    """Return the clean table, or raise all faults at once."""
+def _checked(table: pd.DataFrame, source: str, rows: _Rows, faults: list[str]) -> pd.DataFrame:
+    """Return the clean table, or raise all faults at once, those found before among them."""
     import pandas as pd
 
-    faults = _column_faults(table)
+    faults = list(faults)
     clean: dict[str, NDArray[Any]] = {}
-    for name in _COLUMNS:
+    for name in COLUMNS:
         if list(table.columns).count(name) == 1:
             clean[name], found = _CHECKS[name](table[name], name, rows)
             faults += found
@@ -288,18 +297,19 @@ def _checked(table: pd.DataFrame, source: str, rows: _Rows) -> pd.DataFrame:
     return pd.DataFrame(clean)
 
 
-def _column_faults(table: pd.DataFrame) -> list[str]:
+def _column_faults(table: pd.DataFrame, named: _Named) -> list[str]:
     """Return the faults of the table as a whole: its columns and its length."""
     found = list(table.columns)
     faults = []
-    missing = [name for name in _REQUIRED if name not in found]
+    ambiguous = {fault.partition(":")[0] for fault in named.spelling.faults}
+    missing = [name for name in _REQUIRED if name not in found and name not in ambiguous]
     if missing:
         faults.append(
             f"missing column{'s' if len(missing) > 1 else ''} {', '.join(missing)}; found: "
-            f"{_listed(found) or 'none'}; rename them, or say columns={{'{missing[0]}': ...}} with "
-            "the file's name or number of the column"
+            f"{listed(named.table.columns) or 'none'}; rename them, or state "
+            f"columns={{'{missing[0]}': ...}} with the file's name or number of the column"
         )
-    twice = [name for name in _COLUMNS if found.count(name) > 1]
+    twice = [name for name in COLUMNS if found.count(name) > 1]
     if twice:
         faults.append(f"more than one column is called {', '.join(twice)}; keep one of each")
     if not len(table):
@@ -466,18 +476,30 @@ _CHECKS: dict[str, _Check] = {
 
 
 def _suffix(name: str) -> str:
-    for suffix in _SUFFIXES:
+    for suffix in SUFFIXES:
         if name.lower().endswith(suffix):
             return suffix
     raise table_error(
-        name, f"unknown kind of file; expected a name ending in {', '.join(_SUFFIXES)}"
+        name, f"unknown kind of file; expected a name ending in {', '.join(SUFFIXES)}"
     )
 
 
-def _scaled(tracks: pd.DataFrame, scale: ArrayLike) -> pd.DataFrame:
-    """Turn the file's units into um, in place."""
-    axes = [axis for axis in _AXES if axis in tracks]
-    tracks[axes] *= _scale_per_axis(scale, len(axes))
+def _finished(named: _Named, source: str, rows: _Rows, scale: ArrayLike) -> pd.DataFrame:
+    """Check a table, turn its units into um and s, and attach its notes."""
+    spelling = named.spelling
+    table = named.table.rename(columns=dict(spelling.renamed))
+    axes = [axis for axis in _AXES if axis in table]
+    faults = [*spelling.faults, *_column_faults(table, named)]
+    if {"x", "y"} <= set(axes):
+        factors = dict(zip(axes, _scale_per_axis(scale, len(axes)).tolist(), strict=True))
+        faults += unit_faults(spelling.units, factors)
+    tracks = _checked(table, source, rows, faults)
+    for axis in axes:
+        tracks[axis] *= factors[axis]
+    if "time" in tracks:
+        tracks["time"] *= seconds(spelling.units)
+    if spelling.notes:
+        tracks.attrs["notes"] = list(spelling.notes)
     return tracks
 
 
@@ -491,7 +513,15 @@ def _scale_per_axis(scale: ArrayLike, dimensions: int) -> Floats:
     return np.broadcast_to(values, (dimensions,))
 
 
-def _named(table: pd.DataFrame, columns: Mapping[str, str | int], source: str) -> pd.DataFrame:
+@dataclass(frozen=True, eq=False)
+class _Named:
+    """A raw table with the columns of the mapping under our names, and how the others are spelt."""
+
+    table: pd.DataFrame
+    spelling: Spelling
+
+
+def _named(table: pd.DataFrame, columns: Mapping[str, str | int], source: str) -> _Named:
     """Return the table with the columns of the mapping under our names."""
     names = list(table.columns)
     places, faults = _places(names, columns)
@@ -500,7 +530,8 @@ def _named(table: pd.DataFrame, columns: Mapping[str, str | int], source: str) -
     rest = [i for i, n in enumerate(names) if i not in places.values() and n not in places]
     named = table.iloc[:, [*places.values(), *rest]]
     named.columns = [*places, *(names[i] for i in rest)]
-    return named
+    taken = {ours: theirs if isinstance(theirs, str) else None for ours, theirs in columns.items()}
+    return _Named(named, recognise_columns([names[i] for i in rest], taken=taken))
 
 
 def _places(names: list[Any], columns: Mapping[str, str | int]) -> tuple[dict[str, int], list[str]]:
@@ -508,8 +539,8 @@ def _places(names: list[Any], columns: Mapping[str, str | int]) -> tuple[dict[st
     places: dict[str, int] = {}
     faults = []
     for ours, theirs in columns.items():
-        if ours not in _COLUMNS:
-            faults.append(f"columns: unknown name {ours!r}; expected {', '.join(_COLUMNS)}")
+        if ours not in COLUMNS:
+            faults.append(f"columns: unknown name {ours!r}; expected {', '.join(COLUMNS)}")
         elif isinstance(theirs, str) and theirs in names:
             places[ours] = names.index(theirs)
         elif isinstance(theirs, int | np.integer) and -len(names) <= theirs < len(names):
@@ -517,7 +548,7 @@ def _places(names: list[Any], columns: Mapping[str, str | int]) -> tuple[dict[st
         else:
             faults.append(
                 f"columns: {ours} should be column {theirs!r}, which the file does not have; "
-                f"its {len(names)} columns are: {_listed(names)}"
+                f"its {len(names)} columns are: {listed(names)}"
             )
     return places, faults
 

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
+from perrin._arrays import UnitWarning
+from perrin._units import viscosity_remarks
 from perrin.diffusion import DiffusionEstimate
 from perrin.mobility import BOLTZMANN, Mobility, cluster_mobility, condition_faults
 from perrin.shapes import Cluster, is_tetrahedron
@@ -131,6 +134,11 @@ def size_from_translation(
         If a number is not positive, the temperature is not in kelvin, the shape cannot be used, or
         the paper's factor is asked for another body than a tetrahedron.
 
+    Warns
+    -----
+    UnitWarning
+        If the viscosity is above 0.5 Pa s.
+
     Examples
     --------
     >>> known = {"cluster": Cluster.tetrahedron(1.5), "viscosity": 2.18e-3, "temperature": 295}
@@ -172,6 +180,11 @@ def size_from_rotation(
     Raises
     ------
     ValueError
+        As in `size_from_translation`.
+
+    Warns
+    -----
+    UnitWarning
         As in `size_from_translation`.
 
     Examples
@@ -283,6 +296,8 @@ def _known(
         _require([], viscosity=(eta, 0.0))
         rise = viscosity(kelvin + _SLOPE) - viscosity(kelvin - _SLOPE)
         by_conditions = abs(1 / kelvin - rise / (2 * _SLOPE * eta)) * kelvin_error
+    for remark in viscosity_remarks(eta):
+        warnings.warn(remark, UnitWarning, stacklevel=3)
     return _Known(value, eta, kelvin, error / value, by_conditions)
 
 

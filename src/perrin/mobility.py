@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from perrin._arrays import Floats, frozen
+from perrin._arrays import Floats, UnitWarning, frozen
+from perrin._units import viscosity_remarks
 from perrin.resistance import converge_resistance, exposed_surface, solve_resistance
 from perrin.rotations import skew
 from perrin.shapes import Cluster
@@ -228,6 +230,8 @@ def cluster_mobility(
     -----
     PrecisionWarning
         If `accuracy` is not reached.
+    UnitWarning
+        If the viscosity is above 0.5 Pa s.
 
     Notes
     -----
@@ -244,6 +248,8 @@ def cluster_mobility(
     (1.784, 1.818)
     """
     x, a = _body(centers, radius, viscosity=viscosity, temperature=temperature)
+    for remark in viscosity_remarks(viscosity):
+        warnings.warn(remark, UnitWarning, stacklevel=2)
     # Lengths in mean radii, so that no power of a unit can overflow or look small.
     unit = float(a.mean())
     scaled, relative = (x - x.mean(0)) / unit, a / unit

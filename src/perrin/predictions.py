@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from perrin._arrays import Floats, PrecisionWarning
+from perrin._arrays import Floats, PrecisionWarning, UnitWarning
 from perrin.hydrodynamics import (
     Size,
     neighbour_distance,
@@ -258,14 +258,18 @@ def find_sizes(
     sizes: dict[str, Size] = {}
     has_T, has_R = is_known(D_T), is_known(D_R)
     if viscosity is not None:
-        if has_T:
-            sizes["translation"] = size_from_translation(
-                D_T, cluster=mobility, viscosity=viscosity, temperature=temperature
-            )
-        if has_R:
-            sizes["rotation"] = size_from_rotation(
-                D_R, cluster=mobility, viscosity=viscosity, temperature=temperature
-            )
+        known: dict[str, Any] = {
+            "cluster": mobility,
+            "viscosity": viscosity,
+            "temperature": temperature,
+        }
+        with warnings.catch_warnings():
+            # A viscosity in another unit concerns the whole table, not each of its clusters.
+            warnings.simplefilter("ignore", UnitWarning)
+            if has_T:
+                sizes["translation"] = size_from_translation(D_T, **known)
+            if has_R:
+                sizes["rotation"] = size_from_rotation(D_R, **known)
     if has_T and has_R:
         sizes["both"] = size_and_viscosity(D_T, D_R, cluster=mobility, temperature=temperature)
     return sizes
@@ -388,6 +392,8 @@ def _solve(positions: Floats, diameter: float | None, viscosity: float, temperat
     try:
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", PrecisionWarning)
+            # A viscosity in another unit concerns the whole table, not each of its shapes.
+            warnings.simplefilter("ignore", UnitWarning)
             mobility = cluster_mobility(
                 positions,
                 radius=ratio * distance / 2,

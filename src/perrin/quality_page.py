@@ -9,6 +9,7 @@ import numpy as np
 from perrin.pages import byline, captioned, inline_pictures, render_page
 from perrin.plot import number_text
 from perrin.plot_images import imaging_of, least_turns
+from perrin.remarks import condensed
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -103,7 +104,8 @@ def render_quality(report: Report, figures: Iterable[Path]) -> str:
         "quality",
         **byline(report.settings),
         headline=_headline(report),
-        warnings=report.warnings,
+        warnings=condensed(report.warnings),
+        notes=condensed(report.notes),
         facts=[
             *_light_facts(imaging),
             _mass_cut(imaging),

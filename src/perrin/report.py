@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from perrin._text import listed
 from perrin.pages import byline, captioned, inline_pictures, render_page
 from perrin.plot import (
     MAX_CLUSTERS,
@@ -20,12 +21,13 @@ from perrin.plot import (
 )
 from perrin.plot_images import save_image_figures
 from perrin.quality_page import render_quality
+from perrin.remarks import condensed, grouped
 from perrin.results import filled_folder, floor_factor, staged_folder, write_data
 from perrin.sampling import judge_sampling
 
 if TYPE_CHECKING:
     import os
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Iterable, Mapping, Sequence
     from pathlib import Path
 
     from perrin.diffusion import DiffusionEstimate
@@ -77,8 +79,7 @@ _CAPTIONS = {
     ),
 }
 
-# Up to so many warnings about single clusters are spelled out at the top as well.
-_SPELLED = 12
+_LINKS = 10  # clusters that are linked to from one line
 
 _ARGUMENT_UNITS = {
     "dt": "s",
@@ -167,17 +168,44 @@ def render_html(report: Report, figures: Iterable[Path]) -> str:
         pooled=_pooled_row(report, report.pooled) if several and report.pooled else None,
         rods=[_rod_row(rod) for rod in report.rods],
         seen=report.imaging is not None,
-        warnings=report.warnings,
-        warned=[(c.cluster, c.name, c.warnings) for c in report.results if c.warnings],
-        spelled=sum(len(c.warnings) for c in report.results) <= _SPELLED,
+        warnings=condensed(report.warnings),
+        warned=_remarks(report, {c.name: c.warnings for c in report.results}),
+        notes=condensed(report.notes),
+        noted=_remarks(report, {c.name: c.notes for c in report.results}),
         overview_figure=_figure(pictures, "clusters", "clusters"),
         clusters=[_section(c, pictures, report.settings) for c in report.clusters],
         hidden=max(len(report.clusters) - MAX_CLUSTERS, 0),
         planar=any(c.motion.template.shape[1] == 2 for c in report.clusters),
-        noise="joint" if report.pooled is None else report.pooled.D_R.noise,
-        exposure=None if report.pooled is None else report.pooled.D_R.exposure,
-        drift=report.pooled is not None and report.pooled.D_T.drift is not None,
+        **_method(report),
     )
+
+
+def _method(report: Report) -> dict[str, Any]:
+    """Return how noise, exposure and drift entered the estimates, the same for all clusters."""
+    one = report.pooled or next(iter(report.clusters), None)
+    if one is None:
+        return {"noise": "joint", "exposure": None, "drift": False}
+    return {
+        "noise": one.D_R.noise,
+        "exposure": one.D_R.exposure,
+        "drift": one.D_T.drift is not None,
+    }
+
+
+def _remarks(report: Report, texts: Mapping[str, Sequence[str]]) -> list[dict[str, Any]]:
+    """Return the texts about single clusters, with links, those of one kind in one line."""
+    anchors = {result.name: result.cluster for result in report.results}
+    return [
+        {
+            "text": remark.text,
+            "count": len(remark.names),
+            "total": remark.total,
+            "same": remark.same,
+            "links": [(anchors[name], name) for name in remark.names[:_LINKS]],
+            "more": max(len(remark.names) - _LINKS, 0),
+        }
+        for remark in grouped(texts)
+    ]
 
 
 def _figure(pictures: Mapping[str, str], stem: str, kind: str) -> dict[str, str] | None:
@@ -216,6 +244,7 @@ def _rod_row(rod: RodResult) -> dict[str, Any]:
         "length": _length(rod.motion.length),
         "frames": rod.motion.fitted.size,
         "warnings": rod.warnings,
+        "notes": rod.notes,
         "prediction": _prediction(rod.prediction),
     }
 
@@ -229,7 +258,7 @@ def _pooled_row(report: Report, pooled: Pooled) -> dict[str, Any]:
         "frames": pooled.D_R.n_frames,
         "count": len(used),
         "agree": _agreement(pooled),
-        "left_out": [c.name for c in report.clusters if c.cluster not in used],
+        "left_out": listed(c.name for c in report.clusters if c.cluster not in used),
     }
 
 
@@ -268,6 +297,7 @@ def _section(
         "viscosity": _viscosity(result),
         "no_sizes": _why_no_sizes(result, settings),
         "warnings": result.warnings,
+        "notes": result.notes,
         "figures": [f for f in drawn if f],
     }
 
@@ -442,9 +472,9 @@ def _compared(one: Compared, unit: str) -> tuple[str, str, str]:
 
 def _why_no_sizes(result: ClusterResult, settings: Mapping[str, Any]) -> str:
     """Say why there are no sizes."""
-    said = [w for w in result.warnings if w.startswith("no sizes")]
-    if said:
-        return said[0].partition(": ")[2]
+    stated = [t for t in (*result.warnings, *result.notes) if t.startswith("no sizes")]
+    if stated:
+        return stated[0].partition(": ")[2]
     if settings.get("arguments", {}).get("temperature") is None:
         return "viscosity and temperature were not given"
     return "not computed"

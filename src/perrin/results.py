@@ -143,6 +143,7 @@ class RodResult:
     prediction : Prediction or None
         What spheres of the stated diameter would do; None if none was stated.
     notes : tuple of str
+        What only informs, beside the warnings.
     """
 
     cluster: int
@@ -304,7 +305,7 @@ def load_run(folder: str | os.PathLike[str]) -> Report:
         tracks=pd.read_parquet(path / "tracks.parquet"),
         settings=settings,
         imaging=read_imaging(path) if (path / "imaging.json").is_file() else None,
-        notes=tuple(summary.get("notes", ())),
+        notes=_notes_from(summary),
     )
 
 
@@ -404,9 +405,7 @@ def check_place(folder: str | os.PathLike[str], *, overwrite: bool = False) -> N
             raise PermissionError(f"{place} cannot be made: {parent} is not a writable folder")
         return
     if not overwrite:
-        raise FileExistsError(
-            f"{place} exists: choose another folder, or overwrite=True (--overwrite)"
-        )
+        raise FileExistsError(f"{place} exists: choose another folder, or overwrite=True")
     if not place.is_dir() or (any(place.iterdir()) and not (place / "run.json").is_file()):
         raise FileExistsError(f"{place} is no run folder of perrin (no run.json): not overwritten")
 
@@ -605,7 +604,7 @@ def _result_from(entry: dict[str, Any], motion: RigidMotion) -> ClusterResult:
         label=entry["label"],
         quality=None if entry["quality"] is None else Quality.from_dict(entry["quality"]),
         prediction=_prediction_from(entry),
-        notes=tuple(entry.get("notes", ())),
+        notes=_notes_from(entry),
         jumps={name: tuple(frames) for name, frames in entry.get("jumps", {}).items()},
     )
 
@@ -620,7 +619,7 @@ def _rod_from(entry: dict[str, Any], motion: RodMotion) -> RodResult:
         warnings=tuple(entry["warnings"]),
         label=entry["label"],
         prediction=_prediction_from(entry),
-        notes=tuple(entry.get("notes", ())),
+        notes=_notes_from(entry),
     )
 
 
@@ -628,6 +627,11 @@ def _prediction_from(entry: dict[str, Any]) -> Prediction | None:
     """Read back a prediction; runs without one may lack the key."""
     given = entry.get("prediction")
     return None if given is None else Prediction.from_dict(given)
+
+
+def _notes_from(entry: dict[str, Any]) -> tuple[str, ...]:
+    """Read back notes; runs of earlier versions have none."""
+    return tuple(entry.get("notes", ()))
 
 
 def _pooled_from(entry: dict[str, Any]) -> Pooled | None:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from perrin._arrays import Floats, as_sigma, frozen, require_positive
+from perrin._arrays import Floats, UnitWarning, as_sigma, frozen, require_positive
+from perrin._units import length_remarks
 from perrin.bounds import NoiseKnowledge, cramer_rao, whole
 from perrin.diffusion import UNITS
 from perrin.motion import degrees_of_freedom
@@ -285,6 +287,12 @@ def plan_sampling(
     ValueError
         For values out of range or a budget that contradicts itself, all in one message.
 
+    Warns
+    -----
+    UnitWarning
+        If sigma is larger than the cluster, or the nearest particles are less than 0.05 or more
+        than 50 um apart.
+
     Notes
     -----
     Errors are the Cramér-Rao bound of `cramer_rao` without motion blur. Two particles are confused
@@ -304,6 +312,8 @@ def plan_sampling(
     """
     body = cluster if isinstance(cluster, Cluster) else Cluster.from_positions(cluster)
     _check(body, D_R, sigma, D_T, n_frames, total_time, photons=photons)
+    for remark in _unit_remarks(body, sigma):
+        warnings.warn(remark, UnitWarning, stacklevel=2)
     floor = noise_floor(body, sigma=sigma)
     experiment = _Experiment.of(
         body,
@@ -382,6 +392,19 @@ def _faults(check: Callable[[], None]) -> list[str]:
 def _require_noise(sigma: ArrayLike, dimensions: int) -> None:
     if not as_sigma(sigma, dimensions).any():
         raise ValueError("sigma: expected more than 0 um; without noise there is nothing to plan")
+
+
+def _unit_remarks(body: Cluster, sigma: ArrayLike) -> list[str]:
+    """Return a line for each length that is possible, but usual only in another unit."""
+    remarks = length_remarks("the distance of the nearest particles", float(_distances(body).min()))
+    largest = as_sigma(sigma, body.positions.shape[1]).max()
+    if largest > body.R:
+        remarks.append(
+            f"sigma: {largest:.4g} um is more than the mean distance of the particles to the "
+            f"centre, R = {body.R:.4g} um: no orientation can be measured so; if sigma is in nm, "
+            f"state {1e-3 * largest:.4g}"
+        )
+    return remarks
 
 
 def _distances(body: Cluster) -> Floats:

@@ -81,7 +81,7 @@ def find_bodies(
     if not usable.any():
         raise NoSpheresError(
             f"no particles: {len(features)} places were found and none of them shows a sphere; "
-            "look at diameter and minmass, and whether the spheres are dark (--dark)"
+            "look at diameter and minmass, and whether the spheres are dark (dark=True)"
         )
     axes = [axis for axis in "xyz" if axis in features]
     together = np.ones(len(features), dtype=np.int64)
@@ -116,7 +116,7 @@ def _without_larger(features: pd.DataFrame, *, size: int) -> tuple[pd.DataFrame,
     features.loc[parts, "cluster"] = -1
     return features, [
         f"larger bodies are left out (touching spheres: {listed}): they are no clusters of {size}; "
-        "--size measures them"
+        "size= measures them"
     ]
 
 
@@ -148,7 +148,7 @@ def _common_size(together: Ints, *, dimension: int) -> tuple[int, list[str]]:
     listed = ", ".join(f"{count} of {n}" for n, count in enumerate(groups) if count)
     return size, [
         f"clusters are taken to be of {size} spheres, the most common number (the largest of "
-        f"equals); groups of touching spheres in all frames: {listed}; --size measures others"
+        f"equals); groups of touching spheres in all frames: {listed}; size= measures others"
     ]
 
 

@@ -284,7 +284,7 @@ def _located(find: Callable[[], Located], folder: Path, *, anew: bool) -> Locate
     except PartsError as error:
         if not anew:
             raise PartsError(
-                f"{error}; choose another folder, or anew=True (--overwrite)"
+                f"{error}; choose another folder, or anew=True"
             ) from None
     shutil.rmtree(folder)
     return find()
