@@ -376,6 +376,7 @@ def _clustered(
 ) -> tuple[pd.DataFrame, dict[int, str], _Remarks]:
     """Make sure that every row has a cluster number; return it, names of clusters, and remarks."""
     given, remarks = table, _table_remarks(table)
+    remarks.notes[:0] = table.attrs.get("notes", ())
     labels: dict[int, str] = {}
     if "cluster" in table:
         table, labels = _numbered(table)

@@ -72,7 +72,17 @@ Exposure = Annotated[
     float | None, typer.Option(help="Open fraction of dt, 0 to 1; unknown if left out.")
 ]
 Drift = Annotated[
-    bool, typer.Option("--drift", help="Take a mean velocity (flow, sedimentation) off D_T.")
+    bool,
+    typer.Option(
+        "--drift",
+        help="Take a mean velocity (flow) off D_T and a mean spin off D_R; both are stated.",
+    ),
+]
+KeepJumps = Annotated[
+    bool,
+    typer.Option(
+        "--keep-jumps", help="Keep steps in D that Brownian motion cannot make (stage jumps)."
+    ),
 ]
 
 
@@ -149,6 +159,7 @@ def analyze(
     noise: Noise = "joint",
     exposure: Exposure = None,
     drift: Drift = False,
+    keep_jumps: KeepJumps = False,
     viscosity: Annotated[float | None, typer.Option(help="Pa s, for sizes.")] = None,
     temperature: Annotated[
         float | None,
@@ -179,6 +190,7 @@ def analyze(
             noise=_noise(noise),
             exposure=exposure,
             drift=drift,
+            keep_jumps=keep_jumps,
             viscosity=viscosity,
             temperature=temperature,
             diameter=diameter,
@@ -248,6 +260,7 @@ def run(
     noise: Noise = "joint",
     exposure: Exposure = None,
     drift: Drift = False,
+    keep_jumps: KeepJumps = False,
     viscosity: Annotated[
         float | None, typer.Option(help="Pa s: with the temperature, sizes and predictions.")
     ] = None,
@@ -295,6 +308,7 @@ def run(
                 noise=_noise(noise),
                 exposure=exposure,
                 drift=drift,
+                keep_jumps=keep_jumps,
                 viscosity=viscosity,
                 temperature=temperature,
                 keep=output,

@@ -181,8 +181,8 @@ def fit_samples(
     if not samples:
         raise NoSpheresError(
             "no spheres to learn the optics from: none was found, or none has voxels to itself; "
-            "check diameter, contact and minmass, and whether spheres are dark (dark=True), state the "
-            "optics (optics=), or take the places as found (refine=None)"
+            "check diameter, contact and minmass, and whether spheres are dark (dark=True), state "
+            "the optics (optics=), or take the places as found (refine=None)"
         )
     mean = float(np.mean([s.frame.mean() for s in samples]))
     noise = CameraNoise(1.0, 0.05 * abs(mean))

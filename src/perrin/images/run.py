@@ -57,6 +57,7 @@ def analyze_stack(
     noise: Literal["joint", "residual"] | float = "joint",
     exposure: float | None = None,
     drift: bool = False,
+    keep_jumps: bool = False,
     viscosity: float | None = None,
     temperature: float | None = None,
     keep: str | os.PathLike[str] | None = None,
@@ -85,7 +86,7 @@ def analyze_stack(
         Numbers of clusters to leave out; the others keep theirs.
     refine, optics, dark, minmass, percentile, border
         As in `locate`. For "model" poses are fitted to the images as well.
-    noise, exposure, drift, viscosity, temperature
+    noise, exposure, drift, keep_jumps, viscosity, temperature
         As in `analyze`. With viscosity and temperature, what spheres of diameter `contact` should
         do stands beside what was measured.
     keep : path, optional
@@ -134,8 +135,10 @@ def analyze_stack(
     # Clusters that meet may be a crowd for some frames.
     search = Search(diameter, contact, dark, percentile, minmass, border, crowds=True)
     sphere = contact if viscosity is not None and temperature is not None else None
-    known = (None, viscosity, temperature, sphere, noise, exposure, drift)
-    conditions = Conditions(stack.dt, *known, times=_uneven(stack))
+    conditions = Conditions(
+        stack.dt, None, viscosity, temperature, sphere, noise, exposure, drift, keep_jumps,
+        times=_uneven(stack),
+    )  # fmt: skip
     _check(stack, search, refine, conditions, size=size, workers=workers, scheduler=scheduler)
     flat = refine == "model" and is_flat(stack)
     refine = None if flat else refine
@@ -283,9 +286,7 @@ def _located(find: Callable[[], Located], folder: Path, *, anew: bool) -> Locate
         return find()
     except PartsError as error:
         if not anew:
-            raise PartsError(
-                f"{error}; choose another folder, or anew=True"
-            ) from None
+            raise PartsError(f"{error}; choose another folder, or anew=True") from None
     shutil.rmtree(folder)
     return find()
 
