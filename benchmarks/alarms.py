@@ -68,7 +68,7 @@ KINDS = {
     "extra": r"no particle of the body|left out at",
     "unsettled": r"no assignment",
     "symmetry": r"too far between frames|sample faster",
-    "units": r"\bunits?\b|trackpy|outside 0\.05|per (pixel|unit)|in nm\b|nearest distance",
+    "units": r"\bunits?\b|trackpy|outside [\d.]+ (to|-)|per (pixel|unit)|in nm\b|lengths in um",
     "viscosity": r"viscosity.*(water|Pa s)|viscosity .* (is|over|above)",
     "disagreement": r"do not agree|not agree on one",
     "coarse": r"4 D_R dt",
@@ -81,13 +81,16 @@ KINDS = {
     "rod": r"no D_R: .* one line|on one line",
     "tensor": r"no diffusion tensor",
     "missing": r"\bmissing\b|\bNaN\b|without coordinates|no pose",
+    "misfit": r"common shape badly",
+    "anisotropic": r"anisotrop|unequally|isotropic body",
     "planar": r"z never changes",
     "saturation": r"saturat",
     "fading": r"brightness fell|bleach",
-    "frozen": r"identical|same (image|frame)",
+    "frozen": r"identical|same (image|frame)|repeats? an earlier frame",
     "too large": r"(larger|greater|wider|longer|exceeds) .*(stack|frame|image)|does not fit",
 }
 NAMED, ONE_KIND, ANY_KIND = 0.95, 0.01, 0.03
+LONGEST = 500  # characters of a warning that can be read in a terminal
 EXCLUDED, QUICKLY_EXCLUDED = 1e-4, 0.005
 
 DT, EDGE, SIGMA = 0.73, 2.45, 0.02
@@ -494,6 +497,12 @@ def planned(data, **_):
     return Said(tuple(printed.split(". ")))
 
 
+def fitted_line(data, **_):
+    """Return what a straight line through the MSAD warns of."""
+    curve = perrin.msad(perrin.track_rotation(data, dt=DT))
+    return Said(perrin.fit_line(curve).warnings)
+
+
 def filmed(data, **arguments):
     return report_texts(perrin.analyze_stack(data, **arguments))
 
@@ -605,6 +614,9 @@ CLEAN = [
           arguments={"drift": True}, sizes=(4,)),
     clean("flow, drift=True, 30 % of the frames lost", changes=(partial(flowing, velocity=1.0),),
           edits=(partial(without_frames, share=0.3),), arguments={"drift": True}, sizes=(4,)),
+    clean("steady turn, drift=True", changes=(partial(turning, rate=0.2),),
+          arguments={"drift": True}, sizes=(4,)),
+    clean("line through an MSAD", make=lambda rng: recorded(rng)[0], measure=fitted_line),
     clean("no flow, drift=True", arguments={"drift": True}, sizes=(4,)),
     clean("sizes and predictions", sizes=(4,),
           arguments={"viscosity": 2.18e-3, "temperature": 295.0, "diameter": EDGE}),
@@ -679,6 +691,8 @@ FAULTS = [
     fault("two bodies under one number", (*NOT_RIGID, "none rigid"), count=2, changes=(together,),
           allowed=("unsettled", "extra", "floor")),
     fault("unequal D_R", "disagreement", count=3, D_R=[2e-3, 5e-3, 2e-2]),
+    fault("line through an anisotropic MSAD", "anisotropic", measure=fitted_line,
+          make=lambda rng: recorded(rng, body=SQUARE, D_R=[[1e-3, 1e-3, 1e-2]])[0]),
     fault("undersampled", "coarse", body=SCALENE, D_R=0.14, D_T=0.3, allowed=IDENTITY),
     fault("noise dominates", REST, D_R=1e-5, D_T=0.04, sigma=0.05, allowed=REST),
     fault("20 frames", "few", frames=20, allowed=REST),
@@ -688,7 +702,7 @@ FAULTS = [
     fault("viscosity 2.18 Pa s", "viscosity",
           arguments={"viscosity": 2.18, "temperature": 295.0}),
     fault("plan with sigma in nm", "units", make=lambda _: PLAN, measure=planned,
-          allowed=("other",)),
+          allowed=("other", "floor", "too long")),
 ]  # fmt: skip
 
 
@@ -723,7 +737,8 @@ FILMS = [
     film("saturation", "saturation", photons=400.0, dtype="uint8", allowed=("fading",)),
     film("bleaching", "fading", bleaching=0.6),
     film("identical frames", "frozen", still=True, noise=False, allowed=REST),
-    film("diameter larger than the stack", "too large", diameter=40.0),
+    film("diameter larger than the stack", "too large", diameter=12.0),
+    film("diameter in nm", ("too large", "units"), diameter=2000.0),
 ]
 
 
@@ -732,9 +747,9 @@ FILMS = [
 
 @dataclass
 class Tally:
-    """What was found in the tables of one case."""
+    """What was found in the tables of one case (None: a part of a tally)."""
 
-    case: Case
+    case: Case | None
     tables: int = 0
     named: int = 0
     elsewhere: int = 0  # named among the notes where a warning is asked for, or the reverse
@@ -755,13 +770,12 @@ class Tally:
 def measured(case, rng):
     """Return what is said of one table; an error counts as a warning."""
     with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("ignore")
-        warnings.simplefilter("always", perrin.PrecisionWarning)
+        warnings.simplefilter("always")
         try:
             said = case.measure(case.make(rng), **case.arguments)
         except Exception as error:
             said = Said((f"refused: {type(error).__name__}: {error}",))
-    more = tuple(str(w.message) for w in caught)
+    more = tuple(str(w.message) for w in caught if w.category.__module__.startswith("perrin"))
     return Said((*said.warnings, *more), said.notes, said.sizes)
 
 
@@ -784,6 +798,9 @@ def tried(case, seed, repeat):
     here, there = said.warnings, said.notes
     right = matches(here, case.expected)
     texts = {kind_of(t): t for t in here if t not in right}
+    longest = max(here, key=len, default="")
+    if len(longest) > LONGEST:
+        texts["too long"] = longest
     texts = {k: t for k, t in texts.items() if k not in case.allowed}
     if case.sizes is not None and said.sizes not in (None, case.sizes):
         texts["wrong bodies"] = f"bodies of {said.sizes} spheres, planted {case.sizes}"
@@ -801,9 +818,9 @@ def tried(case, seed, repeat):
 
 
 def tally(number, films, seed, repeats):
-    """Try some repeats of one case, given by its number: a worker can be sent nothing else."""
+    """Try some repeats of the case of a number; cases themselves cannot be sent to a worker."""
     case = (FILMS if films else FAULTS + CLEAN)[number]
-    total = Tally(case)
+    total = Tally(None)
     for repeat in repeats:
         total.add(tried(case, seed, repeat))
     return number, total
@@ -812,19 +829,16 @@ def tally(number, films, seed, repeats):
 def trial(*, films, only, seed, repeats, jobs):
     """Return the tallies of all cases whose names contain `only`."""
     cases = FILMS if films else FAULTS + CLEAN
-    chosen = [i for i, case in enumerate(cases) if only in case.name]
+    found = {i: Tally(case) for i, case in enumerate(cases) if only in case.name}
     pieces = [range(k, min(k + 10, repeats)) for k in range(0, repeats, 10)]
-    tasks = [(i, films, seed, piece) for piece in pieces for i in chosen]
-    found = {i: Tally(cases[i]) for i in chosen}
+    tasks = [(i, films, seed, piece) for piece in pieces for i in found]
     if jobs == 1:
         for task in tasks:
             number, part = tally(*task)
             found[number].add(part)
         return list(found.values())
     with ProcessPoolExecutor(jobs) as pool:
-        for done in [pool.submit(tally, *task) for task in tasks]:
-            number, part = done.result()
-            part.case = cases[number]
+        for number, part in pool.map(tally, *zip(*tasks, strict=True)):
             found[number].add(part)
     return list(found.values())
 

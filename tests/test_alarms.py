@@ -125,7 +125,7 @@ def test_cases_name_kinds_that_exist_and_have_names_of_their_own():
     assert len({c.name for c in EVERY}) == len(EVERY)
     for case in EVERY:
         assert set(case.expected) <= set(NAMES.KINDS)
-        assert set(case.allowed) <= {*NAMES.KINDS, "other"}
+        assert set(case.allowed) <= {*NAMES.KINDS, "other", "too long"}
         assert case.where in ("warnings", "notes")
 
 
@@ -163,6 +163,8 @@ def test_what_is_allowed_or_wrong_in_a_clean_table():
     rest = case_of("clean: unnamed, at rest, smooth error")
     found = planted(rest, NAMES.Said(("not resolved: D_R < 1",), ("labels swap",), (3,)))
     assert found.alarmed == 0
+    found = planted(rest, NAMES.Said(("not resolved" + 600 * ".",), (), (3,)))
+    assert dict(found.kinds) == {"too long": 1}
     found = planted(rest, NAMES.Said((), (), (2,)))
     assert dict(found.kinds) == {"wrong bodies": 1}
 
