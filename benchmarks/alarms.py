@@ -940,6 +940,8 @@ def main(given=None):
     tallies = trial(
         films=chosen.images, only=chosen.only, seed=chosen.seed, repeats=repeats, jobs=chosen.jobs
     )
+    if not tallies:
+        parser.error(f"no case has {chosen.only!r} in its name")
     show(tallies, texts=chosen.texts)
     broken = verdicts(tallies, level=QUICKLY_EXCLUDED if chosen.quick else None)
     count, spent = sum(t.tables for t in tallies), time.perf_counter() - start
