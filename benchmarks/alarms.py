@@ -18,9 +18,10 @@ Notes are not counted. A fault that informs (labels corrected in one frame) must
 notes. A refusal counts as a warning with the text of the error; bodies of other sizes than planted
 and warnings of more than 500 characters count as kinds of their own. The exit status is 1 when a
 line does not hold. --quick takes 2 tables of every case and calls a line broken where the count
-excludes it (p < 0.005). --only runs the cases whose name contains NAME. --images takes movies instead of
-tables (5 of each case unless --repeats says otherwise). --texts prints one text of every kind that
-should not be there.
+excludes it (p < 0.005).
+--only runs the cases whose name contains NAME. --images takes movies instead of tables (5 of each
+case unless --repeats says otherwise). --texts prints one text of every kind that should not be
+there.
 """
 
 import argparse
