@@ -23,11 +23,11 @@ _FEWEST, _BLOCKS, _BLOCK = 8, 8, 5
 # are bad coordinates and do not count.
 _TAIL, _GROSS = 0.1, 5.0
 _NORMAL_RANGE = 2.563  # between these quantiles of a normal distribution, in standard deviations
-# A distance is constant where it varies by under a tenth of itself.
+# A distance is constant where it varies by under a tenth of the distance to the nearest particle.
 _CONSTANT = 0.1
 # Variations are slow where more than half of the variance lies between blocks of time. The
 # distance of two free particles then varies as their separation does along every axis; that of a
-# body by under 3 % of it (variance), or under 30 % of its slow part.
+# body by under a tenth of it (variance), or under 30 % of its slow part.
 _SLOW, _TIED, _PARTAKES = 0.5, 0.1, 0.3
 # Wandering by under 0.2 % of the distance to the nearest particle is less than any localisation
 # error hides: at rest.
@@ -35,9 +35,9 @@ _AT_REST = 2e-3
 # Two groups are one body unless their distances vary by over 2.5 times (rms) what each varies
 # in itself; slow variations, which few blocks show, are compared at this level of an F test.
 _APART, _LEVEL = 2.5, 1e-3
-# A group that varies by over 6 times what the tightest does is a body only if the distances vary
-# by under a tenth of what the separations do along the axes (variance).
-_LOOSE, _TURNS = 6.0, 0.1
+# A group varying by over 6 times what the tightest does is a body only if its distances vary less
+# (variance) than the separations along the axes: trapped particles vary alike in both.
+_LOOSE, _LESS = 6.0, 0.7
 # The localisation error along one axis of the microscope is at most this factor from the others'.
 _WORST_AXIS, _STEPS, _PRICE = 5.0, 12, 0.02
 
@@ -102,11 +102,11 @@ def rigid_groups(frame: Ints, code: Ints, x: Floats, *, count: int, smallest: in
 
     Notes
     -----
-    A distance is steady if it varies by under a tenth of itself and its variation is noise: white
-    in time, or much smaller than that of the separation along the axes, or under 0.2 % of the
-    distance to the nearest particle (bodies at rest, whatever the noise). Coordinates farther off
-    than 5 standard deviations do not count. Where the separation of two particles wanders, the
-    distance must not wander with it.
+    A distance is steady if it varies by under a tenth of the distance to the nearest particle and
+    its variation is noise: white in time, or much smaller than that of the separation along the
+    axes, or under 0.2 % of the distance to the nearest particle (bodies at rest, whatever the
+    noise). Distances off by more than 5 standard deviations do not count. Where the separation of
+    two particles wanders, the distance must not wander with it.
 
     Pairs are joined from the nearest and steadiest on (smallest product of distance and its
     fluctuation: particles of one body are near). Two groups become one if the distances between
@@ -130,8 +130,10 @@ def rigid_groups(frame: Ints, code: Ints, x: Floats, *, count: int, smallest: in
     label = np.full(count, -1, dtype=np.int64)
     level = pairs.variance / noise_along(pairs, count=count)
     groups = [g for g in _joined(pairs, level, count) if len(g[0]) >= max(smallest, 2)]
-    for members, inside in groups:
-        if _keeps_shape(pairs, inside):
+    groups = [g for g in groups if _keeps_shape(pairs, level, g[1])]
+    rms = [float(np.sqrt(np.mean(level[inside]))) for _, inside in groups]
+    for (members, inside), fluctuation in zip(groups, rms, strict=True):
+        if fluctuation <= _LOOSE * min(rms) or _turns(pairs, level, inside):
             label[members] = min(members)
     return label
 
@@ -211,10 +213,10 @@ def _followed(frame: Ints, code: Ints, x: Floats, *, count: int) -> Pairs:
     for chunk in np.split(np.arange(len(brief)), _cuts(ends)):
         pair, one, two = _shared_rows(number, code, brief[chunk], other[chunk])
         sides = first[chunk], second[chunk]
-        parts.append(_varied(*sides, pair, x[one] - x[two], dimensions=x.shape[1]))
-    pairs = Pairs(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+        parts.append(_varied(*sides, pair, x[one] - x[two]))
+    pairs = Pairs._make(np.concatenate(column) for column in zip(*parts, strict=True))
     seen = pairs.shared > 0
-    pairs = Pairs(*(column[seen] for column in pairs))
+    pairs = Pairs._make(column[seen] for column in pairs)
     nearest = np.full(count, np.inf)
     for side in (pairs.first, pairs.second):
         np.minimum.at(nearest, side, pairs.distance)
@@ -243,9 +245,7 @@ def _shared_rows(number: Ints, code: Ints, brief: Ints, other: Ints) -> tuple[In
     return pair[both], one[both], two[both]
 
 
-def _varied(
-    first: Ints, second: Ints, pair: Ints, separation: Floats, *, dimensions: int
-) -> Pairs:
+def _varied(first: Ints, second: Ints, pair: Ints, separation: Floats) -> Pairs:
     """Turn separations, sorted by pair and time, into their statistics."""
     count = len(first)
     distance = np.linalg.norm(separation, axis=1)
@@ -263,7 +263,16 @@ def _varied(
     n = np.maximum(shared, 1)
     direction = np.stack([np.bincount(pair, weights=u, minlength=count) / n for u in unit.T], 1)
     return Pairs(
-        first, second, shared, blocks, median, variance, slow, free, free_slow, direction,
+        first,
+        second,
+        shared,
+        blocks,
+        median,
+        variance,
+        slow,
+        free,
+        free_slow,
+        direction,
         np.full(count, np.inf),
     )
 
@@ -393,10 +402,16 @@ def _one_body(
     return slow[0] <= limit * slow[1] + 1e-300
 
 
-def _keeps_shape(pairs: Pairs, inside: list[int]) -> bool:
-    """Return whether the distances inside a group vary less than the separations, if these do."""
-    part = Pairs(*(column[inside] for column in pairs))
+def _keeps_shape(pairs: Pairs, level: Floats, inside: list[int]) -> bool:
+    """Return whether the distances in a group wander less than the separations, if these do."""
+    part = Pairs._make(column[inside] for column in pairs)
     total, between = (part.shared - 1) * part.free, (part.blocks - 1) * part.free_slow
-    at_rest = between.sum() <= _SLOW * total.sum() or bool(part.resting.all())
-    tied = part.variance.sum() <= 0.6 * part.free.sum()
-    return bool(at_rest or (tied and part.slow.sum() <= _PARTAKES * part.free_slow.sum()))
+    if between.sum() <= _SLOW * total.sum() or part.resting.all():
+        return True
+    wander = part.slow.sum() <= _PARTAKES * part.free_slow.sum()
+    return bool(wander and _turns(pairs, level, inside))
+
+
+def _turns(pairs: Pairs, level: Floats, inside: list[int]) -> bool:
+    """Return whether the separations in a group vary more along the axes than the distances."""
+    return bool(np.mean(level[inside]) <= _LESS * np.mean(pairs.free[inside]))
