@@ -29,6 +29,7 @@ ROOMS = [
     "rods",
     "bonds",
     "linking",
+    "screening",
     "grouping",
     "quality",
     "lagged",

@@ -218,8 +218,9 @@ def _followed(frame: Ints, code: Ints, x: Floats, *, count: int) -> Pairs:
     seen = pairs.shared > 0
     pairs = Pairs._make(column[seen] for column in pairs)
     nearest = np.full(count, np.inf)
+    unlike = pairs.distance > 0
     for side in (pairs.first, pairs.second):
-        np.minimum.at(nearest, side, pairs.distance)
+        np.minimum.at(nearest, side[unlike], pairs.distance[unlike])
     return pairs._replace(nearest=np.minimum(nearest[pairs.first], nearest[pairs.second]))
 
 
@@ -259,7 +260,9 @@ def _varied(first: Ints, second: Ints, pair: Ints, separation: Floats) -> Pairs:
     off = (distance - median[pair])[:, None]
     variance, slow = _variances(pair, block, off, shared, blocks)
     free, free_slow = _variances(pair, block, separation, shared, blocks)
-    unit = (separation / np.maximum(distance, 1e-300)[:, None]) ** 2
+    # Two particles at one place have no direction: all axes count alike.
+    alike = np.where(distance == 0, 1 / np.sqrt(separation.shape[1]), 0.0)[:, None]
+    unit = (separation / np.where(distance == 0, 1.0, distance)[:, None] + alike) ** 2
     n = np.maximum(shared, 1)
     direction = np.stack([np.bincount(pair, weights=u, minlength=count) / n for u in unit.T], 1)
     return Pairs(
@@ -386,12 +389,15 @@ def _joined(pairs: Pairs, level: Floats, count: int) -> list[tuple[list[int], li
 def _one_body(
     pairs: Pairs, level: Floats, steady: Bools, across: list[int], inside: list[int]
 ) -> bool:
-    """Return whether the pairs between two groups are as steady as those inside them."""
+    """Return whether the pairs between two groups are as steady as those inside them.
+
+    Pairs at rest are: their variations, perhaps smooth in time, are too small to be compared.
+    """
     from scipy.special import fdtri
 
     if 2 * np.count_nonzero(steady[across]) <= len(across):
         return False
-    if not inside:
+    if not inside or pairs.resting[across + inside].all():
         return True
     if np.mean(level[across]) > _APART**2 * np.mean(level[inside]) + 1e-300:
         return False
