@@ -37,10 +37,11 @@ _FEWEST, _AROUND = 8, 5
 _EXCESS = 3.0
 # A coordinate farther from every other particle than this number of body sizes is no measurement.
 _TOO_FAR = 20.0
-# Particles move if they spread over this number of rounding errors.
-_MOVES = 10.0
+# Particles move if they spread over this number of rounding errors; a centre that varies by less
+# than this share of the spread was removed, whatever the rounding.
+_MOVES, _STILL = 10.0, 1e-6
 # Values lie on a lattice if their differences are multiples of one step to this share of it.
-_LATTICE, _DIVISORS = 0.01, 10
+_LATTICE, _NEARLY = 1e-3, 0.02
 _FRAMES = 60  # in which the nearest particles are searched for
 
 
@@ -79,9 +80,9 @@ def screen_rows(table: pd.DataFrame) -> Screened:
     -----
     Two kinds are found. A *placeholder* is a point that stands for a lost particle, such as
     (0, 0, 0): rows at exactly the same place that is entered and left by steps of more than 5 times
-    the particle's median step, in 3 rows or more (the origin: in one), or that is visited
-    repeatedly though the resolution of the table makes that impossible. A *repeat* has all
-    coordinates of the particle's previous row.
+    the particle's median step, in 3 rows or more (the origin: in one), or to which a particle
+    returns more often than the resolution of the table allows. A *repeat* has all coordinates of
+    the particle's previous row.
 
     A particle at rest in a table of few digits repeats its place as well. The number of repeats by
     rounding is n product_a p_a for n steps, with p_a the probability that coordinate a stays:
@@ -248,10 +249,9 @@ def _is_still(x: Floats) -> bool:
     """Return whether the centre of frames (T, n, d) is constant to rounding, their points not."""
     seen = present(x)
     rounding = np.array([_resolution(axis[seen]) for axis in np.moveaxis(x, 2, 0)]) / 2
-    rounding += 1e-14 * np.nanmax(np.abs(x))
     centre = np.nanmean(x, axis=1)
     spread = np.sqrt(np.nanmedian(np.nanvar(x, axis=0), axis=0))
-    still = np.ptp(centre, axis=0) <= 2 * rounding
+    still = np.ptp(centre, axis=0) <= np.maximum(2 * rounding, _STILL * spread)
     return bool(still.all() and (spread > _MOVES * rounding).any())
 
 
@@ -348,17 +348,33 @@ def _placeholders(code: Ints, x: Floats) -> Bools:
     leaps = np.bincount(at, weights=visits.leap > _LEAP, minlength=count)
     origin = np.zeros(count, dtype=np.bool_)
     origin[place] = (x == 0).all(axis=1)
+    brisk = 2 * np.bincount(at, weights=visits.leap >= 1, minlength=count) > known
     reached = ((rows >= _ROWS) | origin) & (2 * leaps > known)
-    both = at * (int(code.max()) + 1) + visits.code
-    _, first, times = np.unique(both, return_index=True, return_counts=True)
-    returned = first[times > 1]
-    for particle in np.unique(visits.code[returned]):
-        inside = np.flatnonzero(code == particle)
-        chance = 0.5 * len(inside) ** 2 * float(np.prod(_chances(x[inside])))
-        if chance * (int(code.max()) + 1) < _CHANCE:
-            reached[at[returned[visits.code[returned] == particle]]] = True
+    often = _revisited(code, x, visits, origin)
+    reached[often] |= brisk[often]
     marked: Bools = reached[place]
     return marked
+
+
+def _revisited(code: Ints, x: Floats, visits: _Visits, origin: Bools) -> Ints:
+    """Return the places to which a particle came back more often than rounding explains."""
+    from scipy.special import pdtrc
+
+    particles = int(code.max()) + 1
+    both, times = np.unique(visits.place * particles + visits.code, return_counts=True)
+    place, who = np.divmod(both[times > 1], particles)
+    times = times[times > 1]
+    found = [np.empty(0, dtype=np.int64)]
+    for particle in np.unique(who):
+        own = who == particle
+        start, stop = np.searchsorted(code, [particle, particle + 1])
+        rows = int(stop - start)
+        returns = rows * float(np.prod(_chances(x[start:stop])))
+        # The origin is known beforehand; any other row may be the first visit.
+        known = origin[place[own]]
+        level = pdtrc(times[own] - np.where(known, 1, 2), returns) * np.where(known, 1, rows)
+        found.append(place[own][level * particles < _CHANCE])
+    return np.unique(np.concatenate(found))
 
 
 def _places(x: Floats) -> Ints:
@@ -391,7 +407,8 @@ def _visits(code: Ints, place: Ints, x: Floats) -> _Visits:
     usual[few] = np.inf
     step[~same] = np.inf
     leap = np.minimum(np.append(np.inf, step), np.append(step, np.inf))
-    leap = np.where(np.isfinite(leap), leap / usual[who], np.nan)
+    leap[np.isinf(leap)] = np.nan
+    leap /= usual[who]
     return _Visits(who, place[first], leap)
 
 
@@ -428,7 +445,10 @@ def _chances(x: Floats) -> Floats:
     median = np.median(step[step.any(axis=1)], axis=0) if step.any() else np.zeros(x.shape[1])
     # Where digits count from the first that is not zero, the largest values are the coarsest.
     large = np.abs(x) >= np.median(np.abs(x), axis=0)
-    lattice = [_resolution(values[upper]) for values, upper in zip(x.T, large.T, strict=True)]
+    lattice = [
+        max(_resolution(values), _resolution(values[upper]))
+        for values, upper in zip(x.T, large.T, strict=True)
+    ]
     chance = np.divide(lattice, median, out=np.ones(len(median)), where=median > 0)
     return np.asarray(np.minimum(chance, 1.0))
 
@@ -453,11 +473,19 @@ def _resolution(values: Floats) -> float:
     gaps = gaps[gaps > rounding]
     if not gaps.size:
         return rounding
-    for divisor in range(1, _DIVISORS + 1):
-        step = float(gaps.min()) / divisor
-        off = np.abs(gaps / step - np.round(gaps / step))
-        if rounding <= _LATTICE * step and off.max() <= _LATTICE:
+    step = float(gaps.min())
+    # Euclid's algorithm for all differences; a step that divides the smallest and the largest is
+    # refined by them, so that rounding errors do not grow.
+    while rounding < _LATTICE * step:
+        off = np.abs(gaps - np.round(gaps / step) * step)
+        off = off[off > _LATTICE * step]
+        if not off.size:
             return step
+        finer = float(off.min())
+        for gap in (float(gaps.min()), float(gaps.max())):
+            times = round(gap / finer)
+            finer = gap / times if abs(gap - times * finer) <= _NEARLY * finer else finer
+        step = min(finer, 0.75 * step)
     return rounding
 
 
