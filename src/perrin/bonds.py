@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 # Up to this number of particles every pair is followed; of more only the neighbours, which are
 # searched for in some of the frames.
-_ALL_PAIRS, _NEIGHBOURS, _LOOKS = 64, 12, 60
+_ALL_PAIRS, _NEIGHBOURS, _SAMPLED = 64, 12, 60
 # Followed positions per chunk of pairs: bounds the memory.
 _CHUNK = 1_000_000
 # A pair needs this number of shared frames. They are divided into blocks of time: white noise has
@@ -39,7 +39,9 @@ _APART, _LEVEL = 2.5, 1e-3
 # (variance) than the separations along the axes: trapped particles vary alike in both.
 _LOOSE, _LESS = 6.0, 0.7
 # The localisation error along one axis of the microscope is at most this factor from the others'.
-_WORST_AXIS, _STEPS, _PRICE = 5.0, 12, 0.02
+# The logarithm of its square costs this share of a fluctuation's sampling error, so that equal
+# errors stay equal.
+_WORST_AXIS, _STEPS, _PRICE = 5.0, 12, 0.25
 
 
 class Pairs(NamedTuple):
@@ -77,7 +79,7 @@ class Pairs(NamedTuple):
         tied = self.variance <= _TIED * self.free
         still = self.share(self.free_slow, self.free) <= _SLOW
         apart = still | (self.slow <= _PARTAKES * self.free_slow)
-        kept = self.resting | ((white | tied) & apart)
+        kept = self.resting | tied | (white & apart)
         return np.asarray((self.shared >= _FEWEST) & constant & kept)
 
 
@@ -103,10 +105,10 @@ def rigid_groups(frame: Ints, code: Ints, x: Floats, *, count: int, smallest: in
     Notes
     -----
     A distance is steady if it varies by under a tenth of the distance to the nearest particle and
-    its variation is noise: white in time, or much smaller than that of the separation along the
-    axes, or under 0.2 % of the distance to the nearest particle (bodies at rest, whatever the
-    noise). Distances off by more than 5 standard deviations do not count. Where the separation of
-    two particles wanders, the distance must not wander with it.
+    its variation is noise: white in time, or under a tenth (variance) of that of the separation
+    along the axes, or under 0.2 % of the distance to the nearest particle (bodies at rest, whatever
+    the noise). Where the separation of two particles wanders, the distance must not wander with
+    it. Distances off by more than 5 standard deviations do not count.
 
     Pairs are joined from the nearest and steadiest on (smallest product of distance and its
     fluctuation: particles of one body are near). Two groups become one if the distances between
@@ -128,7 +130,7 @@ def rigid_groups(frame: Ints, code: Ints, x: Floats, *, count: int, smallest: in
     """
     pairs = _followed(frame, code, x, count=count)
     label = np.full(count, -1, dtype=np.int64)
-    level = pairs.variance / noise_along(pairs, count=count)
+    level = pairs.variance / _noise_along(pairs, count=count)
     groups = [g for g in _joined(pairs, level, count) if len(g[0]) >= max(smallest, 2)]
     groups = [g for g in groups if _keeps_shape(pairs, level, g[1])]
     rms = [float(np.sqrt(np.mean(level[inside]))) for _, inside in groups]
@@ -144,33 +146,24 @@ def frames_of(frame: Ints) -> Iterator[Ints]:
     yield from np.split(order, np.flatnonzero(np.diff(frame[order])) + 1)
 
 
-def noise_along(pairs: Pairs, *, count: int) -> Floats:
-    """Return the relative variance of the localisation error along the directions of pairs.
+def _noise_along(pairs: Pairs, *, count: int) -> Floats:
+    """Return the variance of the localisation error along each pair, over its mean over the axes.
 
     One axis may have a larger or smaller error than the others: axis and ratio are those for which
     the fluctuations of the steady pairs within connected groups agree best (least absolute
     differences of logarithms).
-
-    Parameters
-    ----------
-    pairs : Pairs
-    count : int
-        Number of particles.
-
-    Returns
-    -------
-    ndarray, shape (P,)
-        Relative to the mean over the axes; 1 where all axes are alike.
     """
     used = np.flatnonzero(pairs.steady & (pairs.variance > 0))
     dimensions = pairs.direction.shape[1]
     best, weights = np.inf, np.ones(dimensions)
     group = _component(pairs.first[used], pairs.second[used], count)
+    sampling = np.sqrt(2 / (pairs.shared[used] - 1))
+    price = _PRICE * float(np.mean(sampling)) if used.size else 0.0
     for factor in np.geomspace(_WORST_AXIS**-2, _WORST_AXIS**2, 2 * _STEPS + 1):
         for axis in range(dimensions):
             trial = np.where(np.arange(dimensions) == axis, factor, 1.0)
             excess = np.log(pairs.variance[used] / (pairs.direction[used] @ trial))
-            misfit = _spread_within(group, excess) + _PRICE * abs(np.log(factor))
+            misfit = _spread_within(group, excess) + price * abs(np.log(factor))
             if misfit < best:
                 best, weights = misfit, trial
     along: Floats = pairs.direction @ (weights / weights.mean())
@@ -321,7 +314,7 @@ def _candidates(frame: Ints, code: Ints, x: Floats, *, count: int) -> tuple[Ints
         first, second = np.triu_indices(count, 1)
         return first.astype(np.int64), second.astype(np.int64)
     keys = [np.empty(0, dtype=np.int64)]
-    for rows in _looks(frame, code, count):
+    for rows in _sampled_frames(frame, code, count):
         near = _neighbours(x[rows])
         one, other = code[rows[near[:, 0]]], code[rows[near[:, 1]]]
         keys.append(np.unique(np.minimum(one, other) * count + np.maximum(one, other)))
@@ -329,10 +322,10 @@ def _candidates(frame: Ints, code: Ints, x: Floats, *, count: int) -> tuple[Ints
     return first, second
 
 
-def _looks(frame: Ints, code: Ints, count: int) -> Iterator[Ints]:
+def _sampled_frames(frame: Ints, code: Ints, count: int) -> Iterator[Ints]:
     """Yield the rows of some frames, evenly spaced, and of as many as show every other particle."""
     frames = np.unique(frame)
-    chosen = set(frames[np.linspace(0, len(frames) - 1, _LOOKS).astype(int)].tolist())
+    chosen = set(frames[np.linspace(0, len(frames) - 1, _SAMPLED).astype(int)].tolist())
     seen = np.zeros(count, dtype=np.bool_)
     seen[code[np.isin(frame, list(chosen))]] = True
     rest = np.flatnonzero(~seen[code])
