@@ -33,6 +33,7 @@ ROOMS = [
     "rods",
     "bonds",
     "linking",
+    "screening",
     "grouping",
     "quality",
     "lagged",
