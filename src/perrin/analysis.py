@@ -53,6 +53,15 @@ from perrin.results import (
 from perrin.rod_diffusion import estimate_rod
 from perrin.rods import RodMotion, track_direction
 from perrin.rotations import fit_rotations, log_map
+from perrin.screening import (
+    CENTRE_REMOVED,
+    centre_removed,
+    distance_notes,
+    far_points,
+    far_sentence,
+    has_trackpy_columns,
+    screen_rows,
+)
 from perrin.step_tests import (
     JUMP_LEVEL,
     Jumps,
@@ -84,7 +93,7 @@ _FEW, _FEWEST = 20, 8
 _MANY_CUTS = 0.02
 _ANGLES = 5  # of cuts, told one by one
 # Clusters that agree less well than this by chance have no common D.
-_DIFFER = 0.01
+_DIFFER = 0.003
 # A steady velocity or spin is reported below this p-value, shared by all clusters of a table.
 _STEADY = 1e-3
 # Identity corrected in this share of the frames, at most, is information.
@@ -145,6 +154,14 @@ class Conditions:
         return find_sizes(
             mobility, D_T=D_T, D_R=D_R, viscosity=self.viscosity, temperature=self.temperature
         )
+
+
+@dataclass(frozen=True)
+class Remarks:
+    """What there is to report of a table as a whole."""
+
+    warnings: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
 
 
 def analyze(
@@ -228,14 +245,23 @@ def analyze(
     check_arguments(
         dt=dt, contact=contact, viscosity=viscosity, temperature=temperature, diameter=diameter
     )
-    table, source = _table(tracks, scale=scale, columns=columns)
+    table, source, remarks = _table(tracks, scale=scale, columns=columns)
     conditions = Conditions(
         dt, sigma, viscosity, temperature, diameter, noise, exposure, drift, keep_jumps
     )
     table = _sliced(table, frames)
+    screened = screen_rows(table)
+    remarks = Remarks([*screened.warnings, *remarks.warnings], [*remarks.notes, *screened.notes])
     arguments = told_conditions(conditions) | {"contact": contact, "frames": frames}
     arguments |= {"columns": columns, "scale": _plain(scale)}
-    return measure_table(table, conditions, contact=contact, source=source, arguments=arguments)
+    return measure_table(
+        screened.table,
+        conditions,
+        contact=contact,
+        source=source,
+        arguments=arguments,
+        remarks=remarks,
+    )
 
 
 def measure_table(
@@ -246,6 +272,7 @@ def measure_table(
     arguments: Mapping[str, Any],
     contact: float | None = None,
     improved: Improve | None = None,
+    remarks: Remarks | None = None,
 ) -> Report:
     """Measure every cluster of a clean table; `analyze` without its door.
 
@@ -261,8 +288,12 @@ def measure_table(
     improved : callable, optional
         Given the fitted bodies by cluster number, returns their motions from better data, without
         those that have to be left out.
+    remarks : Remarks, optional
+        What reading and screening the table brought up.
     """
-    table, labels, remarks = _clustered(table, contact=contact)
+    remarks = Remarks() if remarks is None else remarks
+    table, labels, more = _clustered(table, contact=contact)
+    remarks = Remarks([*remarks.warnings, *more.warnings], [*remarks.notes, *more.notes])
     first = int(table["frame"].min())
     table["frame"] -= first
     if conditions.times is not None:
@@ -271,9 +302,9 @@ def measure_table(
     else:
         clock = read_clock(table, dt=conditions.dt)
         conditions = replace(conditions, times=clock.times)
-        remarks.notes += clock.notes
+        remarks.notes.extend(clock.notes)
     recorded = np.bincount(table["frame"]) > 0
-    remarks.notes += _absent_frames(recorded, frame_stride(table), first)
+    remarks.notes.extend(_absent_frames(recorded, frame_stride(table), first))
     conditions = replace(conditions, first_frame=first, recorded=recorded)
     bodies, rods, failures = _fitted(table, labels, conditions)
     if improved is not None:
@@ -284,9 +315,9 @@ def measure_table(
     if failures and not (done.results or rods):
         raise failures[-1].error
     results, rods = _interpreted(done.results, rods, conditions)
-    pooled, more = _pooled(results, done.motions, conditions)
+    pooled, unpooled = _pooled(results, done.motions, conditions)
     warnings = (
-        *more,
+        *unpooled,
         *remarks.warnings,
         *_failures_text(failures),
         *_common_jumps(done.jumps),
@@ -326,18 +357,26 @@ def _table(
     *,
     scale: ArrayLike,
     columns: Mapping[str, str | int] | None,
-) -> tuple[pd.DataFrame, dict[str, str | None]]:
-    """Read or check the table; say where it came from."""
+) -> tuple[pd.DataFrame, dict[str, str | None], Remarks]:
+    """Read or check the table; return where it came from, and what reading it brought up."""
     if isinstance(tracks, str | os.PathLike):
         table = read_tracks(tracks, scale=scale, columns=columns)
         digest = hashlib.sha256(Path(tracks).read_bytes()).hexdigest()
-        return table, {"path": os.fspath(tracks), "sha256": digest}
-    if columns is not None:
-        raise ValueError("columns: only for files; rename the columns of a table")
-    table = check_tracks(tracks, source="the table", scale=scale)
-    if "piece" in tracks:  # where `identify` was in doubt
-        table["piece"] = tracks["piece"].to_numpy()
-    return table, {"path": None, "sha256": None}
+        source: dict[str, str | None] = {"path": os.fspath(tracks), "sha256": digest}
+        names: Iterable[str] = table.attrs.get("columns", table.columns)
+    else:
+        if columns is not None:
+            raise ValueError("columns: only for files; rename the columns of a table")
+        table = check_tracks(tracks, source="the table", scale=scale)
+        source, names = {"path": None, "sha256": None}, map(str, tracks.columns)
+        if "piece" in tracks:  # where `identify` was in doubt
+            table["piece"] = tracks["piece"].to_numpy()
+    notes, warnings = distance_notes(
+        table,
+        scale_given=bool(np.any(np.asarray(scale) != 1)),
+        trackpy_columns=has_trackpy_columns(names),
+    )
+    return table, source, Remarks(list(warnings), [*table.attrs.get("notes", ()), *notes])
 
 
 def _sliced(table: pd.DataFrame, frames: tuple[int | None, int | None] | None) -> pd.DataFrame:
@@ -363,26 +402,21 @@ def _absent_frames(recorded: Bools, stride: tuple[str, ...], first: int) -> list
     return [f"{count} no row ({frames_text(absent)}): a step across them is one longer step"]
 
 
-@dataclass
-class _Remarks:
-    """What there is to say of a table as a whole."""
-
-    warnings: list[str] = field(default_factory=list)
-    notes: list[str] = field(default_factory=list)
-
-
 def _clustered(
     table: pd.DataFrame, *, contact: float | None
-) -> tuple[pd.DataFrame, dict[int, str], _Remarks]:
+) -> tuple[pd.DataFrame, dict[int, str], Remarks]:
     """Make sure that every row has a cluster number; return it, names of clusters, and remarks."""
-    given, remarks = table, _table_remarks(table)
-    remarks.notes[:0] = table.attrs.get("notes", ())
+    given, remarks = table, Remarks()
+    if "z" in table and table["z"].nunique() == 1:
+        remarks.warnings.append(
+            "z never changes: leave the column out to analyse motion in the plane"
+        )
     labels: dict[int, str] = {}
     if "cluster" in table:
         table, labels = _numbered(table)
     else:
         table, grouping = _grouped(table, contact=contact)
-        remarks.notes += grouping
+        remarks.notes.extend(grouping)
     loose = table["cluster"] == -1
     if loose.all():
         raise TrackTableError(_nothing_found(contact, marked="cluster" in given))
@@ -390,20 +424,6 @@ def _clustered(
         count = table.loc[loose, "particle"].nunique()
         remarks.notes.append(f"{count} particles belong to no cluster and are left out")
     return table, labels, remarks
-
-
-def _table_remarks(table: pd.DataFrame) -> _Remarks:
-    """Report what is no fault in a table but should be known."""
-    axes = [a for a in ("x", "y", "z") if a in table]
-    empty = int(table[axes].isna().any(axis=1).sum())
-    remarks = _Remarks()
-    if empty:
-        remarks.notes.append(f"{empty} rows without coordinates (NaN) count as missing points")
-    if "z" in table and table["z"].nunique() == 1:
-        remarks.warnings.append(
-            "z never changes: leave the column out to analyse motion in the plane"
-        )
-    return remarks
 
 
 def _grouped(table: pd.DataFrame, *, contact: float | None) -> tuple[pd.DataFrame, list[str]]:
@@ -464,7 +484,9 @@ def _fitted(
     for cluster, positions, frames, piece in each_cluster(table):
         label = labels.get(cluster)
         try:
-            found = _fit(_Tracks(positions, frames, piece), cluster, label, conditions)
+            far = far_points(positions)
+            tracks = _Tracks(np.where(far[..., None], np.nan, positions), frames, piece, far)
+            found = _fit(tracks, cluster, label, conditions)
             if isinstance(found, RodResult):
                 rods.append(found)
             else:
@@ -498,11 +520,19 @@ def _failures_text(failures: list[_Failure]) -> list[str]:
 
 
 class _Tracks(NamedTuple):
-    """One cluster's particles: positions (T, n, d), frame numbers, pieces the table brought."""
+    """One cluster's particles: positions (T, n, d), frame numbers, pieces the table brought.
+
+    `far` (T, n) marks points that were left out because they lie far from the body.
+    """
 
     positions: Floats
     frames: Ints
     piece: Ints
+    far: Bools
+
+    def far_text(self, first: int) -> list[str]:
+        """State which points were left out."""
+        return [far_sentence(self.far, self.frames + first)] if self.far.any() else []
 
 
 class _Body(NamedTuple):
@@ -515,6 +545,7 @@ class _Body(NamedTuple):
     quality: Quality
     warnings: tuple[str, ...]
     notes: tuple[str, ...]
+    centred: bool
 
 
 def _fit(
@@ -565,7 +596,8 @@ def _fit_body(tracks: _Tracks, cluster: int, label: str | None, conditions: Cond
         motion,
         quality,
         (*warnings, *quality.warnings),
-        (*notes, *getattr(quality, "notes", ())),
+        (*tracks.far_text(conditions.first_frame), *notes, *getattr(quality, "notes", ())),
+        centred=centre_removed(tracks.positions),
     )
 
 
@@ -663,6 +695,13 @@ def _diffusion(
     `bodies` is the number of clusters tested: the level of the steady motion is one for all.
     """
     motion = body.motion
+    if body.centred and quantity == "translation":
+        nothing = np.empty(0, dtype=np.int64)
+        estimate = DiffusionEstimate.absent(
+            quantity=quantity, n_frames=int(motion.fitted.size), reason=CENTRE_REMOVED
+        )
+        none = Jumps(nothing, np.empty((0, 3)), np.empty(0), 0)
+        return _Diffusion(estimate, motion, none, nothing, False, (), ())
     estimate = conditions.estimate(motion, quantity)
     jumps = find_jumps(motion, estimate)
     left_out = jumps.rows[:0]
@@ -822,6 +861,7 @@ def _measure_rod(
     first = conditions.first_frame
     notes = [
         *_missing(motion, frames, conditions),
+        *tracks.far_text(first),
         f"no D_R: {len(motion.places)} particles on one line have a direction but no full "
         "orientation; D_perp is how fast that direction diffuses",
     ]
@@ -1037,11 +1077,12 @@ def _pooled(
     clusters = tuple(r.cluster for r in used)
     if len(used) == 1:
         return Pooled(used[0].D_R, used[0].D_T, clusters), warnings
-    quantities: tuple[Quantity, Quantity] = ("rotation", "translation")
-    D_R, D_T = (
-        conditions.estimate([motions[r.cluster, quantity] for r in used], quantity)
-        for quantity in quantities
-    )
+    D_R = conditions.estimate([motions[r.cluster, "rotation"] for r in used], "rotation")
+    moving = [r for r in used if np.isfinite(r.D_T.value)]
+    D_T = used[0].D_T
+    if moving:
+        paths = [motions[r.cluster, "translation"] for r in moving]
+        D_T = conditions.estimate(paths, "translation")
     warnings += [
         f"the clusters do not agree on one {name}: equal values would scatter as much with "
         f"probability {estimate.p_same:.1g}"

@@ -185,7 +185,7 @@ class DiffusionEstimate:
     def __str__(self) -> str:
         name = "D_R" if self.unit == UNITS["rotation"] else "D_T"
         if np.isnan(self.value):
-            return f"{name}: none ({'; '.join(self.warnings)})"
+            return f"{name}: none ({self.warnings[0].partition(':')[0]})"
         how = self.method if self.noise == "joint" else f"{self.method}, {self.noise} noise"
         taken = "mean spin" if name == "D_R" else "drift"
         how += f", {taken} removed" if self.drift else ""

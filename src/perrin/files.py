@@ -65,7 +65,8 @@ def read_tracks(
     pandas.DataFrame
         ``frame`` (int64), ``particle`` (int64 or text), ``x``, ``y`` and, where given, ``z``
         (float64, um), ``cluster`` and ``time`` (s) as in `check_tracks`. Other columns of the
-        file are left out. ``attrs["notes"]``, where there are any, is a list of texts that state
+        file are left out. ``attrs["columns"]`` holds all of the file's column
+        names; ``attrs["notes"]``, where there are any, is a list of texts that state
         which columns were recognised under another spelling.
 
     Raises
@@ -500,6 +501,7 @@ def _finished(named: _Named, source: str, rows: _Rows, scale: ArrayLike) -> pd.D
         tracks["time"] *= seconds(spelling.units)
     if spelling.notes:
         tracks.attrs["notes"] = list(spelling.notes)
+    tracks.attrs["columns"] = [str(name) for name in named.table.columns]
     return tracks
 
 
