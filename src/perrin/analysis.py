@@ -31,6 +31,7 @@ from perrin.grouping import each_cluster, find_clusters
 from perrin.identity import Identity, settle_identity
 from perrin.mobility import Mobility, condition_faults
 from perrin.motion import RigidMotion, track_rotation
+from perrin.noise import floor_range
 from perrin.predictions import (
     Body,
     Shape,
@@ -70,6 +71,7 @@ from perrin.step_tests import (
     find_jumps,
     steady_motion,
 )
+from perrin.steps import residual_freedom
 from perrin.tensors import DiffusionTensor, diffusion_tensor
 
 if TYPE_CHECKING:
@@ -101,6 +103,9 @@ _FEW_FRAMES = 0.01
 # Jumps of a length that differs by less than this share are all of one length.
 _ONE_LENGTH = 0.3
 _SHOWN_JUMPS = 5
+# The noise floor is tested at this many standard errors (0.05 % of clean tracks), and for any
+# sigma_z/sigma_xy up to this one.
+_FLOOR_ERRORS, _NOISE_RATIO = 3.5, 5.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -650,7 +655,11 @@ def _estimate_body(body: _Body, conditions: Conditions, done: _Estimated, *, bod
     other_motion = turn.steady or turn.jumps.rows.size
     warnings = (
         *body.warnings,
-        *([] if other_motion else _floor_mismatch(motion, D_R, noise)),
+        *(
+            []
+            if other_motion
+            else _floor_mismatch(motion, D_R, noise, stated=conditions.sigma is not None)
+        ),
         *turn.warnings,
         *path.warnings,
         *_limits_text(D_R, D_T),
@@ -977,15 +986,28 @@ def _missing(motion: RigidMotion | RodMotion, frames: Ints, conditions: Conditio
     return [f"{len(reasons)} of {np.count_nonzero(recorded)} frames have no pose ({by_kind})"]
 
 
-def _floor_mismatch(motion: RigidMotion, D_R: DiffusionEstimate, noise: NoiseFloor) -> list[str]:
-    """Warn where the offset of the steps is not the noise that the residuals (or sigma) predict."""
+def _floor_mismatch(
+    motion: RigidMotion, D_R: DiffusionEstimate, noise: NoiseFloor, *, stated: bool
+) -> list[str]:
+    """Warn where the offset of the steps is not the noise that the residuals (or sigma) predict.
+
+    Where sigma is not stated, any sigma_z/sigma_xy up to 5 may be behind the residuals: a body that
+    does not turn tells them apart by nothing else.
+    """
     factor = floor_factor(motion)
     measured, error = factor * D_R.offset, factor * D_R.offset_stderr
-    if not abs(measured - noise.phi2) > 3 * error:
+    low = high = noise.phi2
+    if not stated:
+        if motion.template.shape[1] == 3:
+            ends = floor_range(motion.template, motion.rotation[motion.fitted], ratio=_NOISE_RATIO)
+            low, high = (end * noise.phi2 for end in ends)
+        error = float(np.hypot(error, high * np.sqrt(2 / max(residual_freedom(motion), 1))))
+    if not (measured - high > _FLOOR_ERRORS * error or low - measured > _FLOOR_ERRORS * error):
         return []
+    predicted = f"{low:.3g}" if high < 1.01 * low else f"{low:.3g} to {high:.3g}"
     return [
         f"noise floor: the steps show Phi^2 = {measured:.3g} +- {error:.2g} rad^2, the "
-        f"localisation error predicts {noise.phi2:.3g}; motion blur lowers it, particles recorded "
+        f"localisation error predicts {predicted}; motion blur lowers it, particles recorded "
         "one after another or noise that is smooth in time change it"
     ]
 

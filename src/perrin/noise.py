@@ -122,6 +122,42 @@ def orientation_covariance(positions: Floats, noise: Floats) -> Floats:
     return 0.5 * (covariance + np.swapaxes(covariance, -1, -2))
 
 
+def floor_range(template: Floats, rotation: Floats, *, ratio: float) -> tuple[float, float]:
+    """Return by how much an unknown sigma_z/sigma_xy changes the floor that residuals predict.
+
+    Parameters
+    ----------
+    template : ndarray, shape (n, 3)
+        Centred.
+    rotation : ndarray, shape (T, 3, 3)
+        Lab from body, without NaN.
+    ratio : float
+        sigma_z over sigma_xy lies between 1/ratio and ratio.
+
+    Returns
+    -------
+    tuple of float
+        Least and greatest Phi^2 over the one of equal errors, for the same mean square residual.
+
+    Notes
+    -----
+    Orientation covariance C and expected square residual, (n - 1) tr S - tr M C, are both linear in
+    the noise S in body axes, so their ratio is monotonic in (sigma_z/sigma_xy)^2.
+    """
+    along_z = np.einsum("ti,tj->ij", rotation[:, 2], rotation[:, 2]) / len(rotation)
+    inertia = _inertia(template)
+
+    def floor_per_residual(square: float) -> float:
+        noise = np.eye(3) + (square - 1) * along_z
+        covariance = orientation_covariance(template, noise)
+        left = (len(template) - 1) * np.trace(noise) - np.trace(inertia @ covariance)
+        return float(np.trace(covariance) / left)
+
+    equal = floor_per_residual(1.0)
+    ends = [floor_per_residual(square) / equal for square in (ratio**-2, ratio**2)]
+    return min(1.0, *ends), max(1.0, *ends)
+
+
 def center_variance(positions: Floats, present: Bools, sigma: float) -> float:
     """Return the variance (um^2, mean over axes) of a cluster's centre fitted from some particles.
 
