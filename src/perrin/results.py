@@ -205,6 +205,8 @@ class Report:
         Pairs and straight chains in three dimensions, which have no full rotation.
     imaging : Imaging or None
         How the spheres were seen, where the run began with images.
+    notes : tuple of str
+        What informs, of all clusters together.
     """
 
     clusters: tuple[ClusterResult, ...]
@@ -214,6 +216,7 @@ class Report:
     settings: dict[str, Any] = field(default_factory=dict)
     rods: tuple[RodResult, ...] = ()
     imaging: Imaging | None = None
+    notes: tuple[str, ...] = ()
 
     @property
     def results(self) -> tuple[ClusterResult | RodResult, ...]:
@@ -243,6 +246,7 @@ class Report:
                 "clusters": [] if pooled is None else list(pooled.clusters),
             },
             "warnings": list(self.warnings),
+            "notes": list(self.notes),
         }
 
     def save(self, folder: str | os.PathLike[str], *, overwrite: bool = False) -> None:
@@ -286,6 +290,7 @@ def load_run(folder: str | os.PathLike[str]) -> Report:
         rods=tuple(rods),
         pooled=_pooled_from(summary["pooled"]),
         warnings=tuple(summary["warnings"]),
+        notes=tuple(summary.get("notes", ())),
         tracks=pd.read_parquet(path / "tracks.parquet"),
         settings=settings,
         imaging=read_imaging(path) if (path / "imaging.json").is_file() else None,

@@ -145,7 +145,7 @@ def _settled_roles(
         If it does not; a single unnamed axis is left to `layout`.
     """
     if not unknown or (len(unknown) == 1 and not known):
-        return {k: "Q" for k in unknown}
+        return dict.fromkeys(unknown, "Q")
     sizes = [shape[k] for k in unknown]
     roles = {
         (1, ("T",)): "Z" if pick.planes == sizes[0] else "",
