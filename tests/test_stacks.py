@@ -171,7 +171,7 @@ def as_colours(wanted):
 @pytest.mark.parametrize("written", [{}, {"compression": "zlib"}, {"byteorder": ">"}])
 @pytest.mark.parametrize("name", UNNAMED)
 def test_axes_without_names_keep_every_image_in_its_place(tmp_path, name, written):
-    """imwrite of an array calls its axes QQYX, or takes the last four images for colours."""
+    """An array in imwrite gets axes QQYX, or imwrite takes the last four images for colours."""
     sizes, chosen, read = UNNAMED[name]
     data = np.random.default_rng(1).integers(0, 4000, (*sizes, 12, 16), dtype=np.uint16)
     path = tmp_path / "a.tif"

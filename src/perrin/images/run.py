@@ -37,6 +37,7 @@ if TYPE_CHECKING:
 
 _VIEWS = 8  # frames that are kept as pictures
 _LIBRARIES = ("perrin", "numpy", "scipy", "trackpy")
+_FEWEST = 3  # different images of a movie
 _LISTED = 10  # clusters named one by one
 _LOCATED, _POSED = "located", "posed"
 
@@ -153,6 +154,7 @@ def analyze_stack(
             settings=depends, place=place,
         )  # fmt: skip
         located = _located(find, place.folder, anew=anew)
+        _check_copies(located)
         method = located.method
         bodies = find_bodies(located.features, stack, search, optics=method.optics, size=size)
         poses = _Poses(stack, method.optics, bodies, contact, folder / _POSED, place)
@@ -292,6 +294,18 @@ def _located(find: Callable[[], Located], folder: Path, *, anew: bool) -> Locate
             ) from None
     shutil.rmtree(folder)
     return find()
+
+
+def _check_copies(located: Located) -> None:
+    """Refuse a movie that holds fewer than three different images because the others are copies."""
+    frames = located.frames
+    different = int(((frames["copy_of"] < 0) & (frames["fault"] == "")).sum())
+    copies = checks.repeated(frames).warnings
+    if copies and different < _FEWEST:
+        raise TooFewFramesError(
+            f"{copies[0]}; {different} different images are left, and {_FEWEST} are needed",
+            different,
+        )
 
 
 @dataclass(eq=False)
