@@ -176,9 +176,12 @@ def locate_frames(
 
 
 def _first_alike(entries: pd.DataFrame) -> Ints:
-    """Return the earlier frame that each frame repeats exactly; -1 where it repeats none."""
+    """Return the earlier frame that each frame repeats exactly; -1 where it repeats none.
+
+    Frames without a sphere are empty, whether they are alike or not.
+    """
     first = entries.groupby("digest")["frame"].transform("min")
-    alike = (entries["digest"] != "") & (first < entries["frame"])
+    alike = (entries["digest"] != "") & (entries["spheres"] > 0) & (first < entries["frame"])
     return np.where(alike, first, -1).astype(np.int64)
 
 
