@@ -53,6 +53,19 @@ def sampled_ball(points, radius, psf, step):
         (1.225, (0.2, 0.2, 0.2)),
     ],
 )
+@pytest.mark.parametrize(
+    ("changed", "told"),
+    [
+        ({"diameter": 2450.0}, "a sphere of 2450 um is larger than the stack, which is"),
+        ({"psf": (1e-4, 1e-4, 1e-4)}, "a point spread of 0.0001 um is too narrow for a sphere of"),
+    ],
+)
+def test_spheres_in_another_unit_are_refused(changed, told):
+    """Before their image is tabulated, which would take terabytes."""
+    with pytest.raises(ValueError, match=told):
+        render_stack([[MIDDLE]], **{**BARE, **changed})
+
+
 def test_a_sphere_is_exact(radius, psf):
     """Against columns 5 nm wide (whose own error is 3e-4 of the peak at worst)."""
     rng = np.random.default_rng(2)

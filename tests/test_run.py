@@ -23,6 +23,7 @@ import pytest
 
 import perrin
 from perrin.images import stages, workers
+from perrin.images.image_fit import CameraNoise
 from perrin.images.locate import Method
 from perrin.images.parts import PartWriter, open_parts, read_parts
 from perrin.plot_images import _frame_numbers
@@ -302,11 +303,78 @@ def test_uneven_times_are_those_of_the_stack(tmp_path, movie_file, learned):
         np.testing.assert_allclose(result.motion.time, times[1:] - times[1], rtol=1e-12)
     table = motion_table(report)
     assert table["frame"].tolist() == 2 * list(range(FRAMES - 1))
-    assert any("run from 0.73 to 4.38 s: the estimates take" in text for text in report.warnings)
+    assert any("run from 0.73 to 4.38 s: they are taken" in text for text in report.notes)
     np.testing.assert_allclose(report.clusters[0].msd.lagtime, DT * np.arange(1, FRAMES - 1))
     perrin.write_run(report, tmp_path / "run")
     assert perrin.load_run(tmp_path / "run").to_dict() == report.to_dict()
     np.testing.assert_array_equal(_frame_numbers(report, report.clusters[0].motion), range(1, 8))
+
+
+def copied(stack, frames):
+    """Return a movie of some frames of another, in memory."""
+    movie = np.stack([stack.frame(i) for i in frames])
+    return perrin.open_stack(movie, voxel=stack.voxel, dt=DT)
+
+
+def test_one_image_written_many_times_shows_no_motion(movie_file, learned, counted):
+    """Before any sphere is looked for; where one voxel of one frame differs it is a movie."""
+    with perrin.open_stack(movie_file[0]) as stack:
+        still = copied(stack, [2] * 7)
+        with pytest.raises(perrin.TooFewFramesError, match="all 7 frames are exactly the same ima"):
+            perrin.analyze_stack(still, **learned)
+        assert counted == []
+        moving = copied(stack, [2] * 6 + [3])
+        with pytest.raises(perrin.TooFewFramesError, match=r"5 of 7 frames repeat .* 2 different"):
+            perrin.analyze_stack(moving, **learned)
+
+
+def test_frames_that_repeat_another_are_missing_frames(movie_file, learned):
+    """D is that of the movie without them: a copy is no measurement of a body at rest."""
+    order = [0, 1, 1, 2, 3, 3, 0, 4]
+    with perrin.open_stack(movie_file[0]) as stack:
+        copies = perrin.analyze_stack(copied(stack, order), **learned, refine=None)
+        whole = copied(stack, [0, 1, 5, 2, 3, 6, 7, 4])
+        apart = perrin.analyze_stack(whole, **learned, refine=None)
+    (told,) = [text for text in copies.warnings if "repeat" in text]
+    assert told == (
+        "3 of 8 frames repeat an earlier frame exactly, voxel by voxel (first: frame 2, as frame "
+        "1): they are no measurements and are treated as missing: frames 2, 5 to 6"
+    )
+    assert not [text for text in apart.warnings if "repeat" in text]
+    assert copies.imaging.frames["copy_of"].tolist() == [-1, -1, 1, -1, -1, 4, 0, -1]
+    assert sorted(set(copies.imaging.features["frame"])) == [0, 1, 3, 4, 7]
+    for result in copies.clusters:
+        assert result.motion.fitted.tolist() == [0, 1, 3, 4, 7]
+
+
+@pytest.mark.parametrize(
+    ("changed", "told"),
+    [
+        ({"diameter": 2450.0, "contact": 2450.0}, "diameter 2450 um does not fit into the stack"),
+        ({"diameter": 10.0, "contact": 10.0}, "diameter 10 um does not fit into the stack: the st"),
+        ({"contact": 2450.0}, "contact 2450 um is longer than the stack's diagonal"),
+        ({"diameter": 1e-3}, "diameter 0.001 um is less than half a voxel"),
+        (
+            {"optics": perrin.Optics(2450.0, (0.4, 0.15), CameraNoise(3.0, 4.0))},
+            "optics: diameter 2450 um does not fit into the stack",
+        ),
+    ],
+)
+@pytest.mark.parametrize("find", [perrin.analyze_stack, perrin.locate])
+def test_lengths_in_another_unit_are_refused_at_the_door(movie_file, counted, find, changed, told):
+    """In one message with the stack's extent, before anything is read or allocated."""
+    with perrin.open_stack(movie_file[0]) as stack, pytest.raises(ValueError, match=told) as failed:
+        find(stack, **SEARCH | changed)
+    sizes = "the stack is 9.5 x 13.6 x 14 um (z, y, x), its voxels are 0.25 x 0.2 x 0.2 um"
+    assert sizes in str(failed.value)
+    assert counted == []
+
+
+def test_a_movie_by_steps_without_a_fault_has_no_warning_of_its_images(whole):
+    """What a run of images adds to that of its tracks: nothing, or notes."""
+    spoken = ("mass", "saturated", "bright", "depth", "refined", "pair", "missing", "scan", "step ")
+    told = [text for text in whole.warnings if any(word in text for word in spoken)]
+    assert told == []
 
 
 def test_a_larger_body_is_no_cluster_of_the_size_looked_for():
@@ -381,7 +449,7 @@ def test_a_movie_in_the_plane_goes_the_whole_way(tmp_path):
     true = truth.rotation @ np.swapaxes(truth.rotation[:1], 1, 2)
     angle = [np.arctan2(r[:, 1, 0], r[:, 0, 0]) for r in (turned, true)]
     assert np.abs(angle[0] - angle[1]).max() < 0.03  # 10 nm on 0.7 um
-    assert any("the model of the image is that of a volume" in text for text in report.warnings)
+    assert any("the model of the image is that of a volume" in text for text in report.notes)
     perrin.write_run(report, tmp_path / "run")
     assert_identical(perrin.load_run(tmp_path / "run"), report)
     assert (tmp_path / "run" / "quality.html").is_file()

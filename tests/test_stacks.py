@@ -150,6 +150,73 @@ def test_a_plain_tiff_says_nothing_and_nothing_is_guessed(tmp_path, movie):
         assert_same(stack, movie.reshape(1, 20, 12, 16))
 
 
+UNNAMED = {
+    "(t, z)": ((5, 6), {}, "(t, z, y, x)"),
+    "(t, 1)": ((5, 1), {}, "(t, z, y, x)"),
+    "(1, z)": ((1, 5), {}, "(t, z, y, x)"),
+    "(t, c, z)": ((2, 3, 5), {"planes": 5, "channel": 1}, "(t, c, z, y, x)"),
+    "(t, z, c)": ((2, 5, 3), {"planes": 5, "channel": 1}, "(t, z, c, y, x)"),
+    "(t, 1, z)": ((2, 1, 5), {"planes": 5}, "(t, 1, z, y, x)"),
+    "colours": ((5, 4), {"planes": 4}, "(t, z, y, x)"),
+}
+
+
+def as_colours(wanted):
+    """Return how `imwrite` stores three or four images by default today, and how it is to be."""
+    if not wanted:
+        return {"photometric": "minisblack"}
+    return {"photometric": "rgb", "planarconfig": "separate"}
+
+
+@pytest.mark.parametrize("written", [{}, {"compression": "zlib"}, {"byteorder": ">"}])
+@pytest.mark.parametrize("name", UNNAMED)
+def test_axes_without_names_keep_every_image_in_its_place(tmp_path, name, written):
+    """An array in imwrite gets axes QQYX, or imwrite takes the last four images for colours."""
+    sizes, chosen, read = UNNAMED[name]
+    data = np.random.default_rng(1).integers(0, 4000, (*sizes, 12, 16), dtype=np.uint16)
+    path = tmp_path / "a.tif"
+    tifffile.imwrite(path, data, **written, **as_colours(name == "colours"))
+    wanted = data if "channel" not in chosen else data.take(1, axis=read.split(", ").index("c"))
+    if name == "(t, 1, z)":
+        wanted = data[:, 0]
+    with open_stack(path, voxel=VOXEL, dt=DT, **chosen) as stack:
+        assert_same(stack, wanted)
+        assert stack.notes == (
+            f"the file does not name the axes of its shape {data.shape}: read as {read}",
+        )
+
+
+@pytest.mark.parametrize(
+    ("shape", "axes", "asked", "told"),
+    [
+        ((5, 12, 16), None, {}, "does not say whether its 5 images are times or planes: pass plan"),
+        ((5, 4, 12, 16), None, {}, "4 images along axis 1 tifffile took for colours: pass planes"),
+        ((2, 3, 5, 12, 16), None, {}, "does not say what its axes of 2, 3, 5 images are: pass"),
+        ((2, 3, 5, 12, 16), None, {"planes": 5}, "does not say what its axes of 2, 3, 5 images"),
+        ((2, 5, 5, 12, 16), None, {"planes": 5, "channel": 1}, "does not say what its axes of 2"),
+        ((2, 1, 5, 12, 16), None, {}, "does not say what its axes of 2, 5 images are"),
+        ((2, 5, 12, 16), None, {"planes": 1}, "has 5 planes a frame, not planes=1"),
+        ((2, 5, 12, 16), "TQYX", {}, "does not say what its axes of 5 images are"),
+        ((2, 5, 12, 16), "TTYX", {}, "has axes TTYX, several of one name"),
+    ],
+)
+def test_axes_that_cannot_be_known_are_asked_for(tmp_path, shape, axes, asked, told):
+    path = tmp_path / "a.tif"
+    named = {} if axes is None else {"metadata": {"axes": axes}}
+    colours = as_colours("colours" in told)
+    tifffile.imwrite(path, np.zeros(shape, dtype=np.uint16), **named, **colours)
+    with pytest.raises(ValueError, match=told):
+        open_stack(path, voxel=VOXEL, dt=DT, **asked)
+
+
+@pytest.mark.parametrize(("axes", "order"), [("TZYX", (0, 1)), ("ZTYX", (1, 0)), ("TQYX", (0, 1))])
+def test_axes_with_names_are_taken_at_their_word(tmp_path, movie, axes, order):
+    data, named = movie.transpose(*order, 2, 3), {"metadata": {"axes": axes}}
+    tifffile.imwrite(tmp_path / "a.tif", data, **named, **as_colours(axes == "TZYX"))
+    with open_stack(tmp_path / "a.tif", planes=4, **GIVEN) as stack:
+        assert_same(stack, movie)
+
+
 @pytest.mark.parametrize("as_glob", [False, True])
 def test_sequence_of_files(tmp_path, movie, as_glob):
     """A file per frame, or a file per plane, in the order of the numbers: 9 before 10."""

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from perrin.images.checks import bleaching
 from perrin.pages import byline, captioned, inline_pictures, render_page
 from perrin.plot import number_text
 from perrin.plot_images import imaging_of, least_turns
@@ -71,8 +72,8 @@ _CAPTIONS = {
     "health": (
         "Frame by frame.",
         "Spheres found and all spots, the brightness of the spheres, the grey level of the frame, "
-        "and the share of voxels at the end of the camera's range. Crosses mark frames that could "
-        "not be read.",
+        "and the share of voxels clipped at the end of the camera's range. Crosses mark frames "
+        "that could not be read.",
         "Level lines. Brightness that falls is bleaching: errors grow with it. Spheres that come "
         "and go cross the border or the mass cut. Saturated voxels flatten the spheres' image and "
         "shift its fit.",
@@ -200,13 +201,12 @@ def _light_facts(imaging: Imaging) -> list[Fact]:
 
 def _bleaching(imaging: Imaging) -> list[Fact]:
     """Return the brightness of the last tenth of the movie against that of the first."""
-    mass = imaging.features.groupby("frame")["mass"].median().to_numpy(dtype=np.float64)
-    tenth = max(len(mass) // 10, 1)
-    if len(mass) < 2 or not mass[:tenth].mean() > 0:
+    change = bleaching(imaging.features)
+    if change is None:
         return []
-    ratio = 100 * mass[-tenth:].mean() / mass[:tenth].mean()
-    remark = "of the spheres, last tenth of the movie against the first"
-    return [("brightness", f"{number_text(ratio)} %", remark)]
+    error = f" ± {number_text(100 * change.stderr, digits=1)}" if change.stderr > 0 else ""
+    remark = "of the tracked spheres, last tenth of the movie against the first"
+    return [("brightness", f"{number_text(100 * (1 + change.value))}{error} %", remark)]
 
 
 def _mass_cut(imaging: Imaging) -> Fact:

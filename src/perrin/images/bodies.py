@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from perrin.images.optics import Optics
     from perrin.images.stacks import Stack
 
-_SURE = 0.95  # groups of other sizes are told where less than this share has the size taken
+_SURE = 0.95  # groups of other sizes are reported where less than this share has the size taken
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +41,10 @@ class Bodies:
         Centres nearer to the border than this belong to spheres that it cuts, um.
     dropped : dict of ndarray
         Frames of each cluster that lack spheres at the border.
-    told : list of str
+    warnings : list of str
+        What is left out.
+    notes : list of str
+        How the size was found.
     """
 
     features: pd.DataFrame
@@ -49,7 +52,8 @@ class Bodies:
     size: int
     margin: float
     dropped: dict[int, Ints]
-    told: list[str]
+    warnings: list[str]
+    notes: list[str]
 
 
 def find_bodies(
@@ -86,20 +90,20 @@ def find_bodies(
     axes = [axis for axis in "xyz" if axis in features]
     together = np.ones(len(features), dtype=np.int64)
     together[usable] = group_sizes(features[usable], contact=search.contact, axes=axes)
-    told: list[str] = []
+    notes: list[str] = []
     if size is None:
-        size, told = _common_size(together[usable], dimension=len(axes))
+        size, notes = _common_size(together[usable], dimension=len(axes))
     found = identify(features.loc[usable, ["frame", *axes]], contact=search.contact, size=size)
     columns = {"cluster": -1, "particle": -1, "piece": 0}
     features = features.assign(together=together, **columns)
     features.loc[usable, list(columns)] = found[list(columns)]
-    features, more = _without_larger(features, size=size)
+    features, warnings = _without_larger(features, size=size)
     features.loc[features["cluster"] < 0, ["particle", "piece"]] = (-1, 0)
     features["border"] = _to_border(features, stack, axes)
     blur = 0.0 if optics is None else optics.psf[0]
     margin = search.diameter / 2 + 2 * blur
     features, dropped = _without_cut_bodies(features, size=size, margin=margin)
-    return Bodies(features, axes, size, margin, dropped, told + more)
+    return Bodies(features, axes, size, margin, dropped, warnings, notes)
 
 
 def _without_larger(features: pd.DataFrame, *, size: int) -> tuple[pd.DataFrame, list[str]]:

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 Plane: TypeAlias = Callable[[int, int], NDArray[Any]]
 
 # Axes that may be times or planes: the letters by which tifffile says that it does not know.
-_UNNAMED = "IQ"
+UNNAMED = "IQ"
 
 _UM = {
     **dict.fromkeys(("m", "meter", "metre"), 1e6),
@@ -66,6 +66,8 @@ class Contents:
         Seconds.
     plane_time : float or None
         Seconds from one plane to the next.
+    notes : tuple of str
+        How it was read where the file does not say.
     """
 
     shape: tuple[int, int, int, int]
@@ -75,6 +77,7 @@ class Contents:
     voxel: Floats
     times: Floats | None = None
     plane_time: float | None = None
+    notes: tuple[str, ...] = ()
 
     def frame(self, t: int) -> NDArray[Any]:
         """Return one frame (z, y, x), read plane by plane so that no second copy is made."""
@@ -106,7 +109,7 @@ def layout(sizes: Mapping[str, int], pick: Pick, *, cut: bool = False) -> Layout
     """
     size = {axis: n for axis, n in sizes.items() if n > 1 and axis not in "YX"}
     fixed = _channel({a: size.pop(a) for a in "CS" if a in size}, pick.channel)
-    strange = {a: n for a, n in size.items() if a not in "TZ" + _UNNAMED}
+    strange = {a: n for a, n in size.items() if a not in "TZ" + UNNAMED}
     if strange:
         raise ValueError(
             f"has axes that are neither time, plane nor channel: {strange}; save the part wanted "

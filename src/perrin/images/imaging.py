@@ -49,8 +49,9 @@ class Imaging:
         says besides, and ``cluster, particle, piece`` (cluster -1: of none).
     frames : pandas.DataFrame
         A row per frame used: ``frame``, ``time`` (s), ``spots`` (before the mass cut), ``spheres``,
-        ``level`` (median grey level), ``saturated`` (share of voxels at the end of the range),
-        ``fault`` (why it could not be read, or "").
+        ``level`` (median grey level), ``saturated`` (share of voxels clipped at the highest value),
+        ``fault`` (why it could not be read, or ""), ``copy_of`` (the earlier frame that it repeats
+        exactly, or -1; such a frame has no features).
     spots : pandas.DataFrame
         ``frame, mass`` of all spots, noise included, of a few frames all over the movie.
     views : tuple of View

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import warnings
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol
@@ -18,7 +19,7 @@ from perrin.images.image_fit import (
     cut_window,
     fit_window,
 )
-from perrin.images.optics import CrowdSample, Optics, Sample, fit_samples
+from perrin.images.optics import CrowdSample, Optics, Sample, fit_samples, saturated_share
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
@@ -129,13 +130,16 @@ class Found(NamedTuple):
     level : float
         Median grey level.
     saturated : float
-        Share of the voxels that have the highest value of the frame.
+        Share of the voxels that were clipped at the highest value.
+    digest : str
+        Of the voxels: equal for equal frames only.
     """
 
     columns: dict[str, NDArray[Any]]
     spots: int
     level: float
     saturated: float
+    digest: str
 
 
 @dataclass(frozen=True)
@@ -168,8 +172,8 @@ class Method:
         spots = self.search.spots(frame, voxel)
         columns = self._columns(frame, self.search.spheres(spots), voxel)
         columns = {"frame": np.full(len(columns["mass"]), i, dtype=np.int64)} | columns
-        share = float(np.mean(data == data.max()))
-        return Found(columns, len(spots.mass), float(np.median(data)), share)
+        level = float(np.median(data))
+        return Found(columns, len(spots.mass), level, saturated_share(data), frame_digest(data))
 
     def _columns(self, frame: Floats, found: Features, voxel: _Voxel) -> dict[str, NDArray[Any]]:
         contact = self.search.contact
@@ -333,7 +337,7 @@ def locate(
     [[3.2, 3.1, 3.0]]
     """
     search = Search(diameter, contact, dark, percentile, minmass, border, crowds)
-    check_search(stack, search, refine)
+    check_search(stack, search, refine, optics=optics)
     if refine == "model" and is_flat(stack):
         refine = None
         warnings.warn(NO_FLAT_MODEL, PrecisionWarning, stacklevel=2)
@@ -356,7 +360,8 @@ def _looked(stack: Stack, frames: Sequence[int], method: Method) -> list[Found]:
             faults.append(str(fault))
     if faults:
         warnings.warn(
-            f"{len(faults)} of {len(frames)} frames are left out: {'; '.join(faults[:3])}",
+            f"{len(faults)} of {len(frames)} frames are left out: {'; '.join(faults[:3])}"
+            f"{f' and {len(faults) - 3} more' if len(faults) > 3 else ''}",
             PrecisionWarning,
             stacklevel=3,
         )
@@ -529,6 +534,11 @@ def _numbers(data: NDArray[Any], i: int) -> Floats:
     return frame
 
 
+def frame_digest(data: NDArray[Any]) -> str:
+    """Return a digest of the voxels of a frame."""
+    return hashlib.blake2b(np.ascontiguousarray(data).tobytes(), digest_size=16).hexdigest()
+
+
 def is_flat(stack: Stack) -> bool:
     """Return whether a movie is two-dimensional: one plane, of no height."""
     return bool(np.isnan(stack.voxel[0]))
@@ -569,12 +579,14 @@ def _listed(stack: Stack, frames: Iterable[int] | None) -> list[int]:
     return listed
 
 
-def check_search(stack: Stack, search: Search, refine: Refine) -> None:
+def check_search(
+    stack: Stack, search: Search, refine: Refine, *, optics: Optics | None = None
+) -> None:
     """Raise one error with every fault of the arguments of a search."""
-    require_positive(diameter=search.diameter, contact=search.contact)
-    faults = []
     if len(stack.shape) != 4:
-        faults.append(f"stack: expected shape (t, z, y, x), got {stack.shape}")
+        raise ValueError(f"stack: expected shape (t, z, y, x), got {stack.shape}")
+    require_positive(diameter=search.diameter, contact=search.contact)
+    faults = _size_faults(stack, search, optics)
     if refine not in ("model", "trackpy", None):
         faults.append(f"refine: expected 'model', 'trackpy' or None, got {refine!r}")
     if search.diameter > 1.2 * search.contact:
@@ -586,3 +598,39 @@ def check_search(stack: Stack, search: Search, refine: Refine) -> None:
         faults.append(f"percentile: expected 0 <= percentile < 100, got {search.percentile}")
     if faults:
         raise ValueError("; ".join(faults))
+
+
+def _size_faults(stack: Stack, search: Search, optics: Optics | None) -> list[str]:
+    """Return what does not fit into the stack or between its voxels: lengths in another unit.
+
+    Windows, masks and tables grow with the cube of the diameter in voxels: this comes before any
+    of them. Two touching spheres are seen together where the stack's diagonal is longer than
+    `contact`; half a voxel is far below what any microscope shows as a sphere.
+    """
+    voxel = np.asarray(stack.voxel, dtype=np.float64)
+    there = np.isfinite(voxel)
+    voxel, extent = voxel[there], (np.array(stack.shape[1:]) * voxel)[there]
+    spheres = {"diameter": search.diameter}
+    if optics is not None:
+        spheres["optics: diameter"] = optics.diameter
+        spheres["optics: point spread"] = max(optics.psf)
+    faults = [
+        f"{name} {length:g} um does not fit into the stack"
+        for name, length in spheres.items()
+        if length > extent.min()
+    ]
+    if search.diameter < voxel.max() / 2:
+        faults.append(f"diameter {search.diameter:g} um is less than half a voxel")
+    if search.contact > np.linalg.norm(extent):
+        faults.append(f"contact {search.contact:g} um is longer than the stack's diagonal")
+    if not faults:
+        return []
+    axes = "z, y, x" if there.all() else "y, x"
+    return [
+        f"{', '.join(faults)}: the stack is {_lengths(extent)} um ({axes}), its voxels are "
+        f"{_lengths(voxel)} um; are the lengths in um?"
+    ]
+
+
+def _lengths(values: Floats) -> str:
+    return " x ".join(f"{value:.4g}" for value in values)

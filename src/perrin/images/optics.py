@@ -16,6 +16,8 @@ from perrin.images.sphere_image import SphereImage, sphere_image
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
+    from numpy.typing import NDArray
+
     from perrin._arrays import Floats
     from perrin.images.image_fit import Window
 
@@ -24,6 +26,49 @@ _LONGEST = 0.25  # longest step of a logarithm
 _CONVERGED = 1e-3
 _ROUNDS = 15
 _LOOKS = 2  # at the light left over by a crowd, in every round
+# Saturation: fewer voxels, or a smaller share, spoil no place.
+_FEWEST_CLIPPED, _LEAST_CLIPPED = 10, 1e-5
+_LEVELS = 3  # occupied grey levels below the highest, with which it is compared
+_PILED_UP = 1e-6  # level of the test in one frame: movies have thousands
+
+
+def saturated_share(data: NDArray[Any]) -> float:
+    """Return the share of voxels whose light was clipped at the highest value; 0 where none was.
+
+    Parameters
+    ----------
+    data : ndarray
+        One frame, in the type in which it was recorded.
+
+    Notes
+    -----
+    The largest value of a frame is always somebody's. It is the end of the range where it is the
+    largest of an integer type, or where significantly more voxels have it than have any of the
+    three occupied grey levels below it: without clipping, fewer voxels are brighter, level by
+    level. The numbers of voxels at two levels are compared by the binomial test.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> light = np.random.default_rng(1).poisson(200.0, size=100_000).astype(np.uint16)
+    >>> saturated_share(light), round(saturated_share(np.minimum(light, 230)), 3)
+    (0.0, 0.02)
+    """
+    from scipy.special import bdtrc
+
+    top = data.max()
+    count = int(np.count_nonzero(data == top))
+    share = count / data.size
+    if count < _FEWEST_CLIPPED or share <= _LEAST_CLIPPED:
+        return 0.0
+    if data.dtype.kind in "iu" and top == np.iinfo(data.dtype).max:
+        return share
+    numbers = np.unique(data, return_counts=True)[1]
+    if len(numbers) == 1:
+        return 0.0
+    most = int(numbers[-1 - _LEVELS : -1].max())
+    # One of the voxels is there by the choice of the level.
+    return share if bdtrc(count - 2, count - 1 + most, 0.5) < _PILED_UP else 0.0
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 # Where a Gaussian ends: 5 sigma, 3e-7 of its peak.
 _REACH = 5.0
+# Diameters over point spreads up to which a ball is drawn: a table of 200 MB.
+_FINEST = 280.0
 
 
 def ball_image(offsets: tuple[Floats, Floats, Floats], *, radius: float, psf: Floats) -> Floats:
@@ -348,6 +350,7 @@ def render_stack(
     )
     if labelled > diameter:
         raise ValueError(f"core: {core!r} um is more than diameter={diameter!r}")
+    _check_sphere(labelled, blur, extent=np.array(shape) * size)
     dark = _background(shape, size, background, slope)
     paths, time, n = _paths(motions, centers, dt)
     scan = plane_time * (shape[0] - 1) + exposure
@@ -418,6 +421,27 @@ def _check_numbers(
         faults.append("gradient, offset: expected finite numbers, three of them for the gradient")
     if faults:
         raise ValueError("render_stack: " + "; ".join(faults))
+
+
+def _check_sphere(diameter: float, psf: Floats, *, extent: Floats) -> None:
+    """Refuse a sphere whose image would not fit into memory: its lengths are not in um.
+
+    The ball is tabulated on cubes of half the narrowest point spread, so that its table grows with
+    the cube of their ratio. A sphere may be cut by the stack, but one longer than its longest side
+    shows no surface.
+    """
+    sides = " x ".join(f"{side:.4g}" for side in extent)
+    if diameter > extent.max():
+        raise ValueError(
+            f"render_stack: a sphere of {diameter:g} um is larger than the stack, which is {sides} "
+            "um (z, y, x); are the lengths in um?"
+        )
+    if psf.min() < diameter / _FINEST:
+        raise ValueError(
+            f"render_stack: a point spread of {psf.min():g} um is too narrow for a sphere of "
+            f"{diameter:g} um in a stack of {sides} um (z, y, x): expected at least "
+            f"{diameter / _FINEST:.2g} um; are the lengths in um?"
+        )
 
 
 def _background(shape: tuple[int, int, int], voxel: Floats, level: float, slope: Floats) -> Floats:

@@ -37,6 +37,8 @@ if TYPE_CHECKING:
 
 _VIEWS = 8  # frames that are kept as pictures
 _LIBRARIES = ("perrin", "numpy", "scipy", "trackpy")
+_FEWEST = 3  # different images of a movie
+_LISTED = 10  # clusters named one by one
 _LOCATED, _POSED = "located", "posed"
 
 
@@ -139,7 +141,9 @@ def analyze_stack(
         stack.dt, None, viscosity, temperature, sphere, noise, exposure, drift, keep_jumps,
         times=_uneven(stack),
     )  # fmt: skip
-    _check(stack, search, refine, conditions, size=size, workers=workers, scheduler=scheduler)
+    _check(
+        stack, search, refine, optics, conditions, size=size, workers=workers, scheduler=scheduler
+    )
     flat = refine == "model" and is_flat(stack)
     refine = None if flat else refine
     listed, out = _listed(len(stack), frames), sorted({int(c) for c in exclude})
@@ -153,6 +157,7 @@ def analyze_stack(
             settings=depends, place=place,
         )  # fmt: skip
         located = _located(find, place.folder, anew=anew)
+        _check_copies(located)
         method = located.method
         bodies = find_bodies(located.features, stack, search, optics=method.optics, size=size)
         poses = _Poses(stack, method.optics, bodies, contact, folder / _POSED, place)
@@ -164,8 +169,8 @@ def analyze_stack(
             improved=poses.improved,
         )
     imaging = _imaging(stack, located, bodies, search)
-    told = [NO_FLAT_MODEL, *poses.told] if flat else poses.told
-    return _with_checks(report, imaging, located, bodies, told, stack)
+    findings = poses.findings + checks.Findings(notes=(NO_FLAT_MODEL,) if flat else ())
+    return _with_checks(report, imaging, located, bodies, findings, stack)
 
 
 def _listed(count: int, frames: tuple[int | None, int | None] | None) -> list[int]:
@@ -189,6 +194,7 @@ def _check(
     stack: Stack,
     search: Search,
     refine: Refine,
+    optics: Optics | None,
     conditions: Conditions,
     *,
     size: int | None,
@@ -202,7 +208,7 @@ def _check(
         quantity="rotation", noise=conditions.noise, exposure=conditions.exposure
     )
     given = {"viscosity": conditions.viscosity, "temperature": conditions.temperature}
-    faults += _faults_of(check_search, stack, search, refine)
+    faults += _faults_of(check_search, stack, search, refine, optics=optics)
     faults += _faults_of(check_arguments, dt=conditions.dt, **given)
     if size is not None and not (size == int(size) and size >= 2):
         faults.append(f"size: expected a whole number of spheres, at least 2, got {size!r}")
@@ -217,13 +223,13 @@ def _check(
 
 
 def _unevenness(stack: Stack) -> list[str]:
-    """Say how uneven the times of the frames are, and what becomes of it."""
+    """Say how uneven the times of the frames are."""
     if _uneven(stack) is None:
         return []
     gaps = np.diff(stack.times)
     return [
-        f"times between frames run from {gaps.min():.4g} to {gaps.max():.4g} s: the estimates take "
-        f"them as they are; MSD and MSAD count frames, of {stack.dt:.4g} s each"
+        f"times between frames run from {gaps.min():.4g} to {gaps.max():.4g} s: they are taken as "
+        "they are"
     ]
 
 
@@ -291,6 +297,18 @@ def _located(find: Callable[[], Located], folder: Path, *, anew: bool) -> Locate
     return find()
 
 
+def _check_copies(located: Located) -> None:
+    """Refuse a movie that holds fewer than three different images because the others are copies."""
+    frames = located.frames
+    different = int(((frames["copy_of"] < 0) & (frames["fault"] == "")).sum())
+    copies = checks.repeated(frames).warnings
+    if copies and different < _FEWEST:
+        raise TooFewFramesError(
+            f"{copies[0]}; {different} different images are left, and {_FEWEST} are needed",
+            different,
+        )
+
+
 @dataclass(eq=False)
 class _Poses:
     """Takes the motions of free centres to those fitted to the images."""
@@ -301,7 +319,7 @@ class _Poses:
     contact: float
     folder: Path
     place: Workplace
-    told: list[str] = field(default_factory=list)
+    findings: checks.Findings = field(default_factory=checks.Findings)
 
     def improved(
         self, motions: Mapping[int, tuple[RigidMotion, Ints]]
@@ -309,19 +327,22 @@ class _Poses:
         """Refuse what moves too far, and fit the poses of the rest."""
         reasons = {c: checks.refused(m, contact=self.contact) for c, (m, _) in motions.items()}
         kept = {c: pair for c, pair in motions.items() if not reasons[c]}
-        self.told += [f"cluster {c} was refused: {why}" for c, why in reasons.items() if why]
+        out = [f"cluster {c} was refused: {why}" for c, why in reasons.items() if why]
+        more = (f"{len(out) - _LISTED} more clusters were refused",) if len(out) > _LISTED else ()
+        self.findings += checks.Findings((*out[:_LISTED], *more))
         if motions and not kept:
             raise IdentityError(next(iter(reasons.values())))
         if self.optics is None or not kept:
             return {c: motion for c, (motion, _) in kept.items()}
-        better, told = fit_poses(
+        better, unsettled, count, remade = fit_poses(
             self.stack,
             kept,
             optics=self.optics,
             features=self.bodies.features,
             place=replace(self.place, folder=self.folder),
         )
-        self.told += told
+        self.findings += checks.unsettled(unsettled, count)
+        self.findings += checks.Findings(notes=tuple(remade))
         return better
 
 
@@ -363,42 +384,63 @@ def _with_checks(
     imaging: Imaging,
     located: Located,
     bodies: Bodies,
-    told: list[str],
+    findings: checks.Findings,
     stack: Stack,
 ) -> Report:
-    """Return the report with the images, and with all that speaks against it."""
+    """Return the report with the images, with all that speaks against it and all that informs."""
     features, contact, method = bodies.features, imaging.contact, located.method
-    read = located.frames.loc[located.frames["fault"] == "", "frame"].to_numpy(dtype=np.int64)
-    warnings = (
-        *located.told,
-        *checks.unreadable(located.frames),
-        *checks.empty(located.frames, minmass=imaging.minmass),
-        *checks.saturated(located.frames, voxels=int(np.prod(stack.shape[1:]))),
-        *checks.faded(features),
-        *checks.dimmed_with_depth(features),
-        *checks.unrefined(features),
-        *checks.pair_distance(features, contact=contact, refine=method.refine, axes=bodies.axes),
-        *bodies.told,
-        *checks.counts(features, size=bodies.size, contact=contact, frames=read),
-        *_unevenness(stack),
-        *checks.at_border(features, margin=bodies.margin, dropped=bodies.dropped),
-        *told,
-        *report.warnings,
+    good = (located.frames["fault"] == "") & (located.frames["copy_of"] < 0)
+    read = located.frames.loc[good, "frame"].to_numpy(dtype=np.int64)
+    found = (
+        checks.Findings(tuple(located.told), (*stack.notes, *located.remade))
+        + checks.unreadable(located.frames)
+        + checks.repeated(located.frames)
+        + checks.empty(located.frames, minmass=imaging.minmass)
+        + checks.saturated(located.frames)
+        + checks.faded(features)
+        + checks.dimmed_with_depth(features)
+        + checks.unrefined(features)
+        + checks.pair_distance(features, contact=contact, refine=method.refine, axes=bodies.axes)
+        + checks.Findings(tuple(bodies.warnings), tuple(bodies.notes))
+        + checks.counts(features, size=bodies.size, contact=contact, frames=read)
+        + checks.Findings(notes=tuple(_unevenness(stack)))
+        + checks.at_border(features, margin=bodies.margin, dropped=bodies.dropped)
+        + findings
     )
-    clusters = tuple(_checked(result, imaging, stack) for result in report.clusters)
-    return replace(report, clusters=clusters, warnings=warnings, imaging=imaging)
+    clusters, of_clusters = _checked(report.clusters, imaging, stack)
+    found += of_clusters
+    return replace(
+        report,
+        clusters=clusters,
+        warnings=(*found.warnings, *report.warnings),
+        notes=(*found.notes, *report.notes),
+        imaging=imaging,
+    )
 
 
-def _checked(result: ClusterResult, imaging: Imaging, stack: Stack) -> ClusterResult:
-    more = (
-        *checks.long_steps(result.motion, contact=imaging.contact),
-        *checks.sampling(result.motion, phi2=result.noise.phi2),
-        *checks.scan_blur(
-            result.motion,
-            D_T=result.D_T.value,
+def _checked(
+    results: Sequence[ClusterResult], imaging: Imaging, stack: Stack
+) -> tuple[tuple[ClusterResult, ...], checks.Findings]:
+    """Return the clusters with what speaks against one of them, and what speaks of several."""
+    contact, own, found = imaging.contact, {r.name: r.warnings for r in results}, checks.Findings()
+    alarms: tuple[Callable[[ClusterResult], checks.Verdict | None], ...] = (
+        lambda r: checks.long_steps(r.motion, contact=contact),
+        lambda r: checks.slow_sampling(r.motion),
+        lambda r: checks.scan_blur(
+            r.motion,
+            D_T=r.D_T,
             plane_time=stack.plane_time,
             height=imaging.voxel[0],
             diameter=imaging.diameter,
         ),
     )
-    return replace(result, warnings=(*result.warnings, *more))
+    for check in alarms:
+        for name, text in checks.of_clusters({r.name: check(r) for r in results}).items():
+            if name:
+                own[name] = (*own[name], text)
+            else:
+                found += checks.Findings((text,))
+    fast = {r.name: checks.fast_sampling(r.motion, phi2=r.noise.phi2) for r in results}
+    for name, text in checks.of_clusters(fast).items():
+        found += checks.Findings(notes=(f"cluster {name}: {text}" if name else text,))
+    return tuple(replace(r, warnings=own[r.name]) for r in results), found

@@ -52,6 +52,8 @@ class Stack:
         Where the frames come from.
     read : callable
         ``read(i)`` returns frame i; `frame` is the safe way to it.
+    notes : tuple of str
+        How the file was read where it does not say, for instance which of its axes are times.
     """
 
     shape: tuple[int, int, int, int]
@@ -61,6 +63,7 @@ class Stack:
     plane_time: float | None
     source: str
     read: Callable[[int], NDArray[Any]]
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         frozen(self.voxel, self.times)
@@ -262,7 +265,9 @@ def open_stack(
     except Exception:
         contents.close()
         raise
-    return Stack(contents.shape, contents.dtype, *settled, source=source, read=read)
+    return Stack(
+        contents.shape, contents.dtype, *settled, source=source, read=read, notes=contents.notes
+    )
 
 
 def _opened(source: str, pick: Pick) -> Contents:

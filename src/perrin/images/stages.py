@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from perrin._arrays import Floats, FrameError, PrecisionWarning
+from perrin._arrays import Floats, FrameError, PrecisionWarning, TooFewFramesError
 from perrin.images.image_fit import RigidCenters
 from perrin.images.locate import Method, choose_method, found_table, sample_frames
 from perrin.images.optics import Optics
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from perrin._arrays import Ints
-    from perrin.images.locate import Refine, Search
+    from perrin.images.locate import Refine, Sampled, Search
     from perrin.images.stacks import Stack
     from perrin.motion import RigidMotion
 
@@ -70,8 +70,8 @@ class Workplace:
         -------
         rows, entries : DataFrame
             What the task made of all items, in the order of the frames.
-        told : list of str
-            What has to be known of the parts.
+        remade : list of str
+            Which parts had to be made again.
         """
         import pandas as pd
 
@@ -91,8 +91,8 @@ class Workplace:
             table, entries, _ = read_parts(self.folder)
         listed = pd.DataFrame(entries).sort_values("frame", ignore_index=True)
         rows = table.sort_values("frame", kind="stable", ignore_index=True)
-        told = f"{len(damaged)} damaged parts in {self.folder} were made anew"
-        return rows, listed, [told] if damaged else []
+        remade = f"{len(damaged)} damaged parts in {self.folder} were made again"
+        return rows, listed, [remade] if damaged else []
 
     def tell(self, done: int, total: int, title: str) -> None:
         """Say how far the work is."""
@@ -104,7 +104,7 @@ class Located(NamedTuple):
     """What `locate_frames` found.
 
     `features` is the table of `locate`, `frames` and `spots` are those of `Imaging`, `told` what
-    has to be known of the parts.
+    was doubtful in choosing the method, `remade` which parts had to be made again.
     """
 
     method: Method
@@ -112,6 +112,7 @@ class Located(NamedTuple):
     frames: pd.DataFrame
     spots: pd.DataFrame
     told: list[str]
+    remade: list[str]
 
 
 def locate_frames(
@@ -159,10 +160,29 @@ def locate_frames(
         None if found is None else Optics.from_dict(found),
     )
     task = _Locate(_light(stack), method)
-    rows, entries, told = place.kept(task, {i: i for i in frames}, title="locating spheres")
+    rows, entries, remade = place.kept(task, {i: i for i in frames}, title="locating spheres")
     entries.insert(1, "time", stack.times[entries["frame"].to_numpy()])
+    entries["copy_of"] = _first_alike(entries)
+    rows = rows[~rows["frame"].isin(entries.loc[entries["copy_of"] >= 0, "frame"])]
     spots = pd.DataFrame(learned["spots"], columns=["frame", "mass"])
-    return Located(method, rows, entries, spots, learned["told"] + told)
+    return Located(
+        method,
+        rows.reset_index(drop=True),
+        entries.drop(columns="digest"),
+        spots,
+        learned["told"],
+        remade,
+    )
+
+
+def _first_alike(entries: pd.DataFrame) -> Ints:
+    """Return the earlier frame that each frame repeats exactly; -1 where it repeats none.
+
+    Frames without a sphere are empty, whether they are alike or not.
+    """
+    first = entries.groupby("digest")["frame"].transform("min")
+    alike = (entries["digest"] != "") & (entries["spheres"] > 0) & (first < entries["frame"])
+    return np.where(alike, first, -1).astype(np.int64)
 
 
 def _learned(
@@ -175,6 +195,7 @@ def _learned(
 ) -> dict[str, Any]:
     """Learn from a few frames how all are to be treated; plain values as JSON holds them."""
     sample = sample_frames(stack, search, frames)
+    _refuse_still(stack, sample, frames)
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always", PrecisionWarning)
         method = choose_method(stack, search, sample, refine=refine, optics=optics)
@@ -184,6 +205,30 @@ def _learned(
         "spots": [[seen.number, mass] for seen in sample for mass in seen.spots.mass.tolist()],
         "told": [str(one.message) for one in said],
     }
+
+
+def _refuse_still(stack: Stack, sample: Sequence[Sampled], frames: Sequence[int]) -> None:
+    """Refuse a movie all of whose frames are the same image; one without any contrast is not one.
+
+    Raises
+    ------
+    TooFewFramesError
+    """
+    first = sample[0].frame
+    if first.min() == first.max() or len(frames) < 2:
+        return
+    if not all(np.array_equal(seen.frame, first) for seen in sample):
+        return
+    try:
+        same = all(np.array_equal(stack.frame(i), first) for i in frames)
+    except FrameError:
+        return
+    if same:
+        raise TooFewFramesError(
+            f"all {len(frames)} frames are exactly the same image, voxel by voxel: the movie shows "
+            f"no motion, one image was written {len(frames)} times",
+            1,
+        )
 
 
 @dataclass(frozen=True)
@@ -198,10 +243,11 @@ class _Locate:
         try:
             found = self.method.look(self.stack, i)
         except FrameError as fault:
-            nothing = {"level": np.nan, "saturated": np.nan, "fault": str(fault)}
+            nothing = {"level": np.nan, "saturated": np.nan, "digest": "", "fault": str(fault)}
             return found_table([]), entry | nothing
         entry |= {"spots": found.spots, "spheres": len(found.columns["mass"])}
-        entry |= {"level": found.level, "saturated": found.saturated, "fault": ""}
+        entry |= {"level": found.level, "saturated": found.saturated, "digest": found.digest}
+        entry["fault"] = ""
         return found_table([found]), entry
 
 
@@ -228,7 +274,7 @@ def fit_poses(
     optics: Optics,
     features: pd.DataFrame,
     place: Workplace,
-) -> tuple[dict[int, RigidMotion], list[str]]:
+) -> tuple[dict[int, RigidMotion], int, int, list[str]]:
     """Fit the pose of every body in every frame to the images.
 
     Parameters
@@ -245,7 +291,10 @@ def fit_poses(
     -------
     motions : dict of RigidMotion
         Where a fit does not settle the pose of the free centres stays.
-    told : list of str
+    unsettled, count : int
+        How many fits did not settle, of how many.
+    remade : list of str
+        Which parts had to be made again.
     """
     templates = {c: motion.template for c, (motion, _) in motions.items()}
     items = _standing(motions, features)
@@ -257,8 +306,8 @@ def fit_poses(
         shutil.rmtree(place.folder)
     open_parts(place.folder, settings)
     task = _Stand(_light(stack), optics, templates)
-    rows, _, told = place.kept(task, items, title="fitting poses")
-    return _reposed(motions, rows, told)
+    rows, _, remade = place.kept(task, items, title="fitting poses")
+    return _reposed(motions, rows), int(rows["x"].isna().sum()), len(rows), remade
 
 
 def _same(folder: Path, settings: Mapping[str, Any]) -> bool:
@@ -339,10 +388,9 @@ class _Stand:
 
 
 def _reposed(
-    motions: Mapping[int, tuple[RigidMotion, Ints]], rows: pd.DataFrame, told: list[str]
-) -> tuple[dict[int, RigidMotion], list[str]]:
+    motions: Mapping[int, tuple[RigidMotion, Ints]], rows: pd.DataFrame
+) -> dict[int, RigidMotion]:
     answer = {}
-    lost = int(rows["x"].isna().sum())
     for cluster, (motion, frames) in motions.items():
         mine = rows[(rows["cluster"] == cluster) & rows["x"].notna()]
         row_of = {int(frame): k for k, frame in enumerate(frames)}
@@ -354,10 +402,4 @@ def _reposed(
             for i, p, s in zip(number, pose, spread, strict=True)
         }
         answer[cluster] = with_poses(motion, poses)
-    if lost:
-        told = [
-            *told,
-            f"{lost} of {len(rows)} poses did not settle in the image and are those of the free "
-            "centres",
-        ]
-    return answer, told
+    return answer

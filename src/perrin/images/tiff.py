@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perrin.images.contents import (
+    UNNAMED,
     Contents,
     Layout,
     Pick,
@@ -56,7 +57,8 @@ def tiff(path: str, pick: Pick, *, one_frame: bool = False) -> Contents:
     try:
         number = chosen([str(series.name) for series in file.series], pick.image)
         series = _imagej_series(file) or file.series[number]
-        sizes = dict(zip(series.axes, series.shape, strict=True))
+        names, notes = _named_axes(series, pick)
+        sizes = dict(zip(names, series.shape, strict=True))
         choice = _whole(sizes, pick) if one_frame else pick
         where = layout(sizes, choice, cut=_cut_short(file))
         scale = _scale(file, number, where, pick.channel or 0)
@@ -68,7 +70,7 @@ def tiff(path: str, pick: Pick, *, one_frame: bool = False) -> Contents:
         raise
 
     def plane(t: int, z: int) -> NDArray[Any]:
-        return _plane(file, series, where.at(t, z))
+        return _plane(file, series, names, where.at(t, z))
 
     return Contents(
         shape=(where.t, where.z, sizes["Y"], sizes["X"]),
@@ -78,7 +80,94 @@ def tiff(path: str, pick: Pick, *, one_frame: bool = False) -> Contents:
         voxel=scale.voxel,
         times=scale.times if scale.times is not None else even_times(where.t, np.nan),
         plane_time=scale.plane_time,
+        notes=notes,
     )
+
+
+def _named_axes(series: Any, pick: Pick) -> tuple[list[str], tuple[str, ...]]:  # noqa: ANN401
+    """Return a name of its own for every axis of a series, and how unnamed ones were read.
+
+    tifffile names axes of an unknown meaning Q or I, several of them alike: what `imwrite` makes of
+    an array (t, z, y, x) has the axes QQYX. Two of them are times and planes in the order of the
+    array; three, or one beside a named one, only where `pick` settles which is which.
+    """
+    axes = _without_colours(series, pick)
+    named = [axis for axis in axes if axis not in UNNAMED]
+    if len(set(named)) < len(named):
+        raise ValueError(f"has axes {series.axes}, several of one name")
+    unknown = [k for k, axis in enumerate(axes) if axis in UNNAMED]
+    shape = tuple(series.shape)
+    known = [axis for axis in "TZ" if axis in axes]
+    if len(unknown) == 2 and not known:
+        roles = dict(zip(unknown, "TZ", strict=True))
+    else:
+        roles = _settled_roles([k for k in unknown if shape[k] > 1], known, shape, pick)
+    # Axes of one element that are left are no choice: any name of their own will do.
+    answer = [roles.get(k, f"{axis}{k}" if k in unknown else axis) for k, axis in enumerate(axes)]
+    if not {"T", "Z"} & set(roles.values()):
+        return answer, ()
+    read = ", ".join(
+        roles.get(k, "1" if k in unknown else axis).lower() for k, axis in enumerate(axes)
+    )
+    return answer, (f"the file does not name the axes of its shape {shape}: read as ({read})",)
+
+
+def _without_colours(series: Any, pick: Pick) -> list[str]:  # noqa: ANN401
+    """Return the letters of the axes, Q for what only `imwrite` took for the colours of an image.
+
+    Of three or four images in a row, not named by their writer, tifffile makes colours.
+    """
+    axes = list(series.axes)
+    if getattr(series, "kind", "") != "shaped" or set(axes) & set("TZC") or "S" not in axes:
+        return axes
+    place = axes.index("S")
+    if place > axes.index("Y") or pick.channel is not None:
+        return axes
+    if pick.planes is None:
+        n, shape = series.shape[place], tuple(series.shape)
+        raise ValueError(
+            f"has shape {shape}, whose {n} images along axis {place} tifffile took for colours: "
+            f"pass planes={n} if they are the planes of a frame"
+            f"{', planes=1 if they are times' if len(shape) == 3 else ''}, or channel=0 to {n - 1}"
+        )
+    axes[place] = "Q"
+    return axes
+
+
+def _settled_roles(
+    unknown: list[int], known: list[str], shape: tuple[int, ...], pick: Pick
+) -> dict[int, str]:
+    """Return which of the unnamed axes are times, planes and channels, as far as `pick` says so.
+
+    Raises
+    ------
+    ValueError
+        If it does not; a single unnamed axis is left to `layout`.
+    """
+    if not unknown or (len(unknown) == 1 and not known):
+        return dict.fromkeys(unknown, "Q")
+    sizes = [shape[k] for k in unknown]
+    roles = {
+        (1, ("T",)): "Z" if pick.planes == sizes[0] else "",
+        (1, ("Z",)): "T" if pick.planes is not None else "",
+        (2, ()): "TZ" if pick.planes == sizes[-1] else "",
+        (3, ()): _order_of_three(sizes[1:], pick),
+    }.get((len(unknown), tuple(known)), "")
+    if not roles:
+        raise ValueError(
+            f"has shape {shape} and does not say what its axes of "
+            f"{', '.join(map(str, sizes))} images are: pass planes=, the number of planes of one "
+            "frame, and channel= if one of them is channels (times come first then), or write the "
+            "file with its axes, as in imwrite(..., metadata={'axes': 'TZYX'})"
+        )
+    return dict(zip(unknown, roles, strict=True))
+
+
+def _order_of_three(inner: list[int], pick: Pick) -> str:
+    """Return which of the two inner axes are planes and channels; "" where it is open."""
+    if pick.channel is None or inner.count(pick.planes or 0) != 1:
+        return ""
+    return "TZC" if inner[0] == pick.planes else "TCZ"
 
 
 def _cut_short(file: Any) -> bool:  # noqa: ANN401 (tifffile is untyped here)
@@ -112,9 +201,14 @@ def _whole(sizes: Mapping[str, int], pick: Pick) -> Pick:
     return pick._replace(planes=prod(n for axis, n in sizes.items() if axis not in "CSYX"))
 
 
-def _plane(file: Any, series: Any, at: dict[str, int]) -> NDArray[Any]:  # noqa: ANN401
-    """Read one image (y, x) of a series."""
-    index = [at.get(axis, 0) for axis in series.axes]
+def _plane(
+    file: Any,  # noqa: ANN401
+    series: Any,  # noqa: ANN401
+    names: list[str],
+    at: dict[str, int],
+) -> NDArray[Any]:
+    """Read one image (y, x) of a series, whose axes have these names."""
+    index = [at.get(name, 0) for name in names]
     if any(i >= n for i, n in zip(index, series.shape, strict=True)):
         raise ValueError("the file ends before it")
     lead = _leading(series)
