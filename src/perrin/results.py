@@ -302,7 +302,6 @@ def load_run(folder: str | os.PathLike[str]) -> Report:
         rods=tuple(rods),
         pooled=_pooled_from(summary["pooled"]),
         warnings=tuple(summary["warnings"]),
-        notes=tuple(summary.get("notes", ())),
         tracks=pd.read_parquet(path / "tracks.parquet"),
         settings=settings,
         imaging=read_imaging(path) if (path / "imaging.json").is_file() else None,
