@@ -31,6 +31,7 @@ ROOMS = [
     "linking",
     "grouping",
     "quality",
+    "pairs",
     "lagged",
     "quaternions",
     "steps",
