@@ -221,18 +221,21 @@ def _grid_lags(curve: LagCurve) -> _Lags:
     data = np.isfinite(curve.value)
     inside = data & (np.abs(n - whole) <= NEAR) & (whole <= _blocks(curve).max())
     use = np.flatnonzero(inside)
-    if use.size < 2:
+    blocks = _blocks(curve)
+    # Where most frames stand alone, the pairs on a grid hold little of what the track does.
+    alone = blocks.sum() < blocks.size
+    if use.size < 2 or alone:
         if data.sum() >= 2:
             raise ValueError(
                 f"curve: the frames lie on no compact grid of times (uneven times or long holes): "
-                f"{use.size} of {data.sum()} lags are within stretches of even frames, a slope with "
-                "a known error needs 2; estimate_diffusion takes the times as they are"
+                f"{use.size} of {data.sum()} lags are within stretches of even frames, {blocks.size} "
+                "in number; a slope with a known error needs 2 lags, and stretches of 2 frames or "
+                "more on average. estimate_diffusion takes the times as they are"
             )
         raise ValueError(
             f"curve: a slope needs at least 2 lags with data, this one has {data.sum()}"
         )
     exact = np.abs(n - whole) < 1e-6
-    blocks = _blocks(curve)
     fitting = places(blocks, whole[use])
     walkers = curve.n_walks / curve.components.shape[1] if curve.quantity == "translation" else 1.0
     kinds = zip(*np.unique(blocks, return_counts=True), strict=True)

@@ -262,14 +262,27 @@ def direction_weights(directions: Floats) -> Floats:
     return np.asarray(np.eye(3) - unit.T @ unit / len(unit))
 
 
+def weighs_alike(weights: Floats) -> bool:
+    """Return whether weights (3, 3) of the rotational tensor are those of all axes, to a hundredth.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> weighs_alike(2 / 3 * np.eye(3)), weighs_alike(np.diag([1.0, 0.5, 0.5]))
+    (True, False)
+    """
+    uneven = 3 / np.trace(weights) * weights - np.eye(3)
+    return bool(np.abs(np.linalg.eigvalsh(uneven)).max() < _EVEN_WEIGHTS)
+
+
 def _axis_ratio(motion: RigidMotion, weights: Floats) -> tuple[float, float] | None:
     """Return tr(D W)/tr W over tr(D)/3 and its standard error; None where W weighs axes evenly.
 
     Mean products of steps and of neighbouring steps, which take the noise off, stand for D.
     """
-    uneven = 3 / np.trace(weights) * weights - np.eye(3)
-    if np.abs(np.linalg.eigvalsh(uneven)).max() < _EVEN_WEIGHTS:
+    if weighs_alike(weights):
         return None
+    uneven = 3 / np.trace(weights) * weights - np.eye(3)
     start, stop = motion.steps()
     w = motion.step_vectors()[stop - 1]
     linked = start[1:] == stop[:-1]

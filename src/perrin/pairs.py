@@ -230,7 +230,7 @@ def pair_sums(kernel: Kernel, frames: Frames, *, most: int | None = None) -> Pai
     if not whole:
         for elements in frames.blocks:
             grid.add_block(kernel, frames, elements)
-    if singles is None:
+    if singles is None or not singles[0].size:
         return grid.done()
     return grid.joined(kernel, frames, singles, most)
 
@@ -240,34 +240,35 @@ def _listed(frames: Frames) -> tuple[tuple[Ints, Ints], bool]:
     _, number = np.unique(frames.piece, return_inverse=True)
     apart = 2 * (np.ptp(frames.time) + frames.step)
     t = frames.time - frames.time.min() + apart * number
-    element = np.arange(len(t))
-    end = np.searchsorted(t, t + 0.5 * apart) - 1
-    whole = int((end - element).sum()) <= _MOST_PAIRS
+    begin = np.arange(len(t)) + 1
+    end = np.searchsorted(t, t + 0.5 * apart)
+    whole = int((end - begin).sum()) <= _MOST_PAIRS
     if not whole:
-        reach = _reach(t, apart, frames.step)
-        end = np.minimum(end, np.searchsorted(t, t + reach, side="right") - 1)
-        warnings.warn(
-            f"the frames lie in {frames.block[-1] + 1} groups that share no compact grid of times "
-            f"and make more than {_MOST_PAIRS} pairs: pairs across groups are formed up to a lag "
-            f"of {reach:.4g} s",
-            PrecisionWarning,
-            stacklevel=5,
-        )
-    first = np.repeat(element, end - element)
-    last = np.arange(len(first)) - np.repeat(np.cumsum(end - element) - end - 1, end - element)
-    if not whole:
-        across = frames.block[first] != frames.block[last]
-        first, last = first[across], last[across]
+        begin = np.searchsorted(frames.block, frames.block, side="right")
+        reach = _reach(t, begin, end, frames.step)
+        if reach < frames.time[-1] - frames.time[0]:
+            warnings.warn(
+                f"the frames lie in {frames.block[-1] + 1} groups that share no compact grid of "
+                f"times and make more than {_MOST_PAIRS} pairs: pairs across groups are formed up "
+                f"to a lag of {reach:.4g} s",
+                PrecisionWarning,
+                stacklevel=5,
+            )
+        end = np.minimum(end, np.searchsorted(t, t + reach, side="right"))
+    size = np.maximum(end - begin, 0)
+    first = np.repeat(np.arange(len(t)), size)
+    last = np.arange(len(first)) - np.repeat(np.cumsum(size) - size - begin, size)
     return (first, last), whole
 
 
-def _reach(t: Floats, longest: float, step: float) -> float:
+def _reach(t: Floats, begin: Ints, end: Ints, step: float) -> float:
     """Return the longest lag up to which no more pairs are formed than allowed: a bin's end."""
-    low, high = 0.0, longest
+    low, high = 0.0, float(t[-1] - t[0])
     for _ in range(60):
         middle = 0.5 * (low + high)
-        count = (np.searchsorted(t, t + middle, side="right") - 1 - np.arange(len(t))).sum()
-        low, high = (middle, high) if count <= _MOST_PAIRS else (low, middle)
+        last = np.minimum(end, np.searchsorted(t, t + middle, side="right"))
+        within = np.maximum(last - begin, 0).sum() <= _MOST_PAIRS
+        low, high = (middle, high) if within else (low, middle)
     return float((np.floor(low / step - NEAR) + NEAR) * step)
 
 
