@@ -227,10 +227,10 @@ def _grid_lags(curve: LagCurve) -> _Lags:
     if use.size < 2 or alone:
         if data.sum() >= 2:
             raise ValueError(
-                f"curve: the frames lie on no compact grid of times (uneven times or long holes): "
-                f"{use.size} of {data.sum()} lags are within stretches of even frames, {blocks.size} "
-                "in number; a slope with a known error needs 2 lags, and stretches of 2 frames or "
-                "more on average. estimate_diffusion takes the times as they are"
+                "curve: the frames lie on no compact grid of times (uneven times or long holes): "
+                f"{use.size} of {data.sum()} lags are within the {blocks.size} stretches of even "
+                "frames; a slope with a known error needs 2 lags, and stretches of 2 frames or more "
+                "on average. estimate_diffusion takes the times as they are"
             )
         raise ValueError(
             f"curve: a slope needs at least 2 lags with data, this one has {data.sum()}"

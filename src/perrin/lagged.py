@@ -69,7 +69,8 @@ class LagCurve:
         Unit of value.
     n_walks : float
         Independent one-dimensional walks that were averaged: 3 for the MSD of one centre, 2 for the
-        MSAD of one direction, 3 for that of all directions of a cluster.
+        MSAD of one direction, 3 for that of all directions of a cluster; fewer where the body turns
+        faster about one axis than about the others.
     drift : tuple of float or None
         Mean velocity that was taken off, um/s by axis.
     step : float or None
@@ -243,8 +244,7 @@ def msad(motion: RigidMotion, *, directions: ArrayLike | None = None) -> LagCurv
     if phi.shape[2] == 1:
         return _turned(motion, phi, dof=1, independent=1.0)
     weights = direction_weights(p)
-    # A rotation vector w counts w.W w, whose mean and variance are those of so many axes.
-    walks = float(np.trace(weights) ** 2 / np.sum(weights * weights))
+    walks = _independent_walks(motion, weights)
     ratio = _axis_ratio(motion, weights)
     return _turned(motion, phi, dof=2, independent=walks, weights=weights, ratio=ratio)
 
@@ -273,6 +273,22 @@ def weighs_alike(weights: Floats) -> bool:
     """
     uneven = 3 / np.trace(weights) * weights - np.eye(3)
     return bool(np.abs(np.linalg.eigvalsh(uneven)).max() < _EVEN_WEIGHTS)
+
+
+def _independent_walks(motion: RigidMotion, weights: Floats) -> float:
+    """Return n = (tr WS)^2 / tr WSWS, of how many equal walks a mean square w.W w has the error.
+
+    S is the covariance of a step's rotation vector w, free of what its own error adds to the
+    square; where the particles lie alike about all axes, the body is taken as isotropic.
+    """
+    start, stop = motion.steps()
+    if weighs_alike(direction_weights(_directions(motion, None))) or len(stop) < 2:
+        return float(np.trace(weights) ** 2 / np.sum(weights * weights))
+    w = motion.step_vectors()[stop - 1]
+    count, product = len(w), weights @ (w.T @ w)
+    total = np.trace(product) ** 2
+    square = (count * np.sum(product * product.T) - total) / (count + 1)
+    return float(np.clip(total / square, 1.0, 3.0)) if square > 0 else 3.0
 
 
 def _axis_ratio(motion: RigidMotion, weights: Floats) -> tuple[float, float] | None:
@@ -339,8 +355,10 @@ def msad_vector(motion: RigidMotion, *, threshold: float = 0.0) -> LagCurve:
     """
     walk = threshold_displacement(motion, threshold=threshold)[:, None]
     dof = walk.shape[2]
-    weights = None if dof == 1 else np.eye(3)
-    return _turned(motion, walk, dof=dof, independent=float(dof), weights=weights)
+    if dof == 1:
+        return _turned(motion, walk, dof=1, independent=1.0)
+    walks = _independent_walks(motion, np.eye(3))
+    return _turned(motion, walk, dof=3, independent=walks, weights=np.eye(3))
 
 
 def msad_axes(motion: RigidMotion, *, axes: ArrayLike | None = None) -> tuple[LagCurve, ...]:

@@ -82,7 +82,8 @@ def plot_lag_curve(
     tensor : DiffusionTensor, optional
         Of rotation, for a curve whose directions weigh the body's axes unequally: the line and the
         circles are then what it predicts for those directions, with a band of one standard error,
-        and not those of `estimate`, which counts all axes alike.
+        and not those of `estimate`, which counts all axes alike. Their <D> is the mean of the
+        tensor over the axes across the directions.
 
     Returns
     -------
@@ -562,13 +563,14 @@ def _model_line(
 
     D of the line is tr(D W)/dof with the weights W of the curve.
     """
-    if tensor is not None and curve.weights is not None and not weighs_alike(curve.weights):
+    resolved = estimate is None or estimate.resolved
+    uneven = curve.weights is not None and not weighs_alike(curve.weights)
+    if tensor is not None and curve.weights is not None and uneven and resolved:
         D, stderr = tensor.weighted(curve.weights)
         offset = float(np.einsum("ij,ij->", curve.weights, tensor.offset)) / curve.dof
-        said = f"{number_text(D, stderr)} {unit_text(tensor.unit)}"
-        return _Line(
-            D, offset, stderr, True, "$D$", f"ML tensor, mean of these directions $D$ = {said}"
-        )
+        symbol = r"$\langle D\rangle$"
+        said = f"tensor {symbol} = {number_text(D, stderr)} {unit_text(tensor.unit)}"
+        return _Line(D, offset, stderr, True, symbol, said)
     if estimate is None:
         return None
     symbol = _NAMES[curve.quantity][1]
@@ -588,8 +590,7 @@ def _draw_line(curve: LagCurve, line: _Line, *, ax: Axes) -> None:
     if line.stderr > 0:
         half = slope * line.stderr * t
         low = np.maximum(value - half, 1e-2 * np.abs(value))
-        said = "± 1 standard error of $D$"
-        ax.fill_between(t, low, value + half, color=BLUE, lw=0, alpha=0.2, label=said)
+        ax.fill_between(t, low, value + half, color=BLUE, lw=0, alpha=0.25)
     if line.resolved:
         sparse = np.geomspace(first, last, 12)
         pure, said = slope * line.D * sparse, f"pure diffusion {slope} {line.symbol} t"
