@@ -36,10 +36,11 @@ _LONGEST = 0.4
 
 _ROUNDS = 100
 
-# A slope is said not to be D_R where the steps show it with this many standard errors (a chance of
-# 0.3 % for an isotropic body), and where the difference is above this part of the slope's own error
-# (below, a 95 % interval still covers 94 %).
-_SURE, _MATTERS = 3.0, 0.25
+# A slope is stated not to be D_R where the steps show it with this many standard errors (a chance
+# well below 1 % for an isotropic body of 60 frames, whose ratio has longer tails than a Gaussian),
+# and where the difference is above this part of the slope's own error (below, a 95 % interval still
+# covers 94 %).
+_SURE, _MATTERS = 4.0, 0.25
 
 
 def fit_line(
@@ -229,8 +230,8 @@ def _grid_lags(curve: LagCurve) -> _Lags:
             raise ValueError(
                 "curve: the frames lie on no compact grid of times (uneven times or long holes): "
                 f"{use.size} of {data.sum()} lags are within the {blocks.size} stretches of even "
-                "frames; a slope with a known error needs 2 lags, and stretches of 2 frames or more "
-                "on average. estimate_diffusion takes the times as they are"
+                "frames; a slope with a known error needs 2 lags, and stretches of 2 frames or "
+                "more on average. estimate_diffusion takes the times as they are"
             )
         raise ValueError(
             f"curve: a slope needs at least 2 lags with data, this one has {data.sum()}"

@@ -269,7 +269,7 @@ def _reach(t: Floats, begin: Ints, end: Ints, step: float) -> float:
         last = np.minimum(end, np.searchsorted(t, t + middle, side="right"))
         within = np.maximum(last - begin, 0).sum() <= _MOST_PAIRS
         low, high = (middle, high) if within else (low, middle)
-    return float((np.floor(low / step - NEAR) + NEAR) * step)
+    return float((np.floor(low / step - NEAR) + NEAR) * step)  # the end of a bin
 
 
 @dataclass(frozen=True, eq=False)
