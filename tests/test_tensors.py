@@ -396,7 +396,7 @@ def test_what_is_said_of_the_axes():
     assert near.resolved_axes.tolist() == [False, False, True]
     even = diffusion_tensor(tracked(3, ratio=(1, 1, 1)), symmetry="C_1")
     assert even.p_isotropic > 0.05
-    assert "read the mean, not the three sorted values" in str(even)
+    assert "read D_R, the mean, not the three sorted values" in str(even)
     assert not even.resolved_axes.any()
     wide = diffusion_tensor(tracked(1, ratio=(1, 3, 9), n_frames=1000))
     assert wide.resolved_axes.all()
