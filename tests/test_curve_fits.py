@@ -279,6 +279,7 @@ def test_fits_follow_the_units(fit):
     other = dataclasses.replace(
         curve,
         lagtime=curve.lagtime * time,
+        step=curve.step * time,
         value=curve.value * length2,
         components=curve.components * length2,
         stderr=curve.stderr * length2,
