@@ -36,6 +36,7 @@ ROOMS = [
     "screening",
     "grouping",
     "quality",
+    "pairs",
     "lagged",
     "quaternions",
     "steps",

@@ -214,8 +214,8 @@ def test_the_lab_the_unit_and_the_labels_do_not_matter(curve_of):
 
 
 @pytest.mark.parametrize("curve_of", [msad_vector, orientation_correlation])
-def test_left_out_frames_are_gaps_and_uneven_times_are_refused(curve_of):
-    """Frame numbers with holes equal rows of NaN; times off the grid have no lag."""
+def test_left_out_frames_are_gaps_and_uneven_times_have_their_lags(curve_of):
+    """Frame numbers with holes equal rows of NaN; times off the grid are taken as they are."""
     x = brownian(6, 100, 1e-2).positions()
     holes = x.copy()
     holes[30:40] = np.nan
@@ -225,8 +225,11 @@ def test_left_out_frames_are_gaps_and_uneven_times_are_refused(curve_of):
     np.testing.assert_allclose(a.value, b.value, rtol=1e-9, atol=1e-12)
     np.testing.assert_array_equal(a.n_pairs, b.n_pairs)
     uneven = track_rotation(x, dt=1.0, times=np.arange(100) ** 1.1)
-    with pytest.raises(ValueError, match="evenly spaced"):
-        curve_of(uneven)
+    curve = curve_of(uneven)
+    assert curve.n_pairs.sum() == 100 * 99 // 2
+    total = np.sum(curve.n_pairs * curve.lagtime)
+    i, j = np.triu_indices(100, 1)
+    assert total == pytest.approx(np.sum(uneven.time[j] - uneven.time[i]), rel=1e-12)
     every = replace(track_rotation(x, dt=1.0), piece=np.arange(100))
     with pytest.raises(TooFewFramesError):
         curve_of(every)

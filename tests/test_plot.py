@@ -129,6 +129,67 @@ def test_an_unresolved_estimate_is_a_limit_without_pure_diffusion(space):
     assert not [x for x in ax.lines if str(x.get_label()).startswith("pure")]
 
 
+@pytest.fixture(scope="module")
+def rod():
+    """Return the result of a body that turns ten times faster about its long axis."""
+    body = perrin.Cluster.from_positions([[-3, 0, 0], [0, 0.5, 0.3], [0.2, -0.6, 0.4], [3, 0, 0]])
+    rng = np.random.default_rng(5)
+    truth = perrin.simulate_motion(
+        body, D_R=[2e-2, 2e-3, 2e-3], D_T=0.04, dt=0.5, n_frames=600, rng=rng
+    )
+    x = perrin.add_noise(truth.positions(), sigma=0.06, rng=rng)
+    frame, particle = np.indices(x.shape[:2]).reshape(2, -1)
+    table = pd.DataFrame({"frame": frame, "particle": particle, "cluster": 0})
+    table[["x", "y", "z"]] = x.reshape(-1, 3)
+    return perrin.analyze(table, dt=0.5).clusters[0]
+
+
+def test_the_msad_of_an_anisotropic_body_is_compared_with_its_tensor(rod):
+    """Line, circles and floor are those of the directions averaged: W = 1 - <p p^T>."""
+    left = plot._curve_figure(rod).axes[0]
+    unit = rod.motion.template / np.linalg.norm(rod.motion.template, axis=1, keepdims=True)
+    W = np.eye(3) - unit.T @ unit / len(unit)
+    D, noise = np.trace(rod.tensor.tensor @ W), np.trace(rod.tensor.offset @ W)
+    t, fitted = line(left, "tensor").get_data()
+    np.testing.assert_allclose(fitted, 2 * (D * t + noise), rtol=1e-9)
+    t, pure = line(left, "pure diffusion 4").get_data()
+    np.testing.assert_allclose(pure, 2 * D * t, rtol=1e-9)
+    (floor,) = set(line(left, "noise floor").get_ydata())
+    assert floor == pytest.approx(2 * np.trace(rod.noise.covariance @ W), rel=1e-9)
+    shown = plot.number_text(*rod.tensor.weighted(W))
+    assert shown in line(left, "tensor").get_label()
+    assert not [x for x in left.lines if str(x.get_label()).startswith("ML fit")]
+    value, stderr = rod.tensor.weighted(W)
+    corners = left.collections[-1].get_paths()[0].vertices
+    at = corners[np.isclose(corners[:, 0], t[0]), 1]
+    assert at.max() == pytest.approx(4 * (value * t[0] + noise / 2 + stderr * t[0]), rel=1e-9)
+
+
+def test_the_first_points_of_an_anisotropic_body_lie_on_the_tensors_line(rod):
+    """At lags 1 and 2 the points are within 2 of their errors; D_R's line is off by more than 3."""
+    curve = rod.msad
+    D = rod.tensor.weighted(curve.weights)[0]
+    noise = np.trace(rod.tensor.offset @ curve.weights)
+    pull = (curve.value - 4 * D * curve.lagtime - 2 * noise) / curve.stderr
+    assert np.abs(pull[:2]).max() < 2
+    mean = 4 * (rod.D_R.value * curve.lagtime + rod.D_R.offset)
+    assert np.abs((curve.value - mean) / curve.stderr)[0] > 3
+
+
+def test_curves_of_uneven_times_are_drawn_at_their_lags():
+    """Every lag of a short curve with pauses is a point at its mean time."""
+    rng = np.random.default_rng(8)
+    interval = np.where(np.arange(59) % 15 == 14, 20.0, 0.7)
+    x = perrin.simulate_motion(
+        perrin.Cluster.tetrahedron(1.5), D_R=1e-3, D_T=0.02, dt=0.7, n_frames=60, rng=rng
+    ).positions()
+    motion = perrin.track_rotation(x, dt=0.7, times=np.append(0, interval.cumsum()))
+    curve = perrin.msd(motion)
+    ax = drawn(plot.plot_lag_curve(curve, ax=axes(), estimate=estimate(unit="um^2/s")))
+    t = np.concatenate([line(ax, name).get_xdata() for name in ("MSD", "beyond")])
+    np.testing.assert_array_equal(t, curve.lagtime)
+
+
 def test_long_curves_are_thinned_evenly_on_the_logarithm():
     walk = np.random.default_rng(1).normal(size=(100_000, 1, 3)).cumsum(axis=0)
     curve = perrin.msd(walk, dt=0.1)

@@ -1,6 +1,7 @@
 """Diffusion tensors: the likelihood is what it claims, laws hold, planted tensors come back."""
 
 import dataclasses
+from itertools import permutations
 
 import numpy as np
 import pytest
@@ -21,7 +22,7 @@ from perrin import (
 )
 from perrin.rotations import exp_map, skew
 from perrin.tensor_likelihood import Source, VectorSteps, axial, maximise, spread, squares
-from perrin.tensors import diffusion_center, shifted
+from perrin.tensors import axes_like, diffusion_center, shifted
 
 SLANT = exp_map(np.array([0.4, -0.7, 0.3]))
 BODY = Cluster.from_positions(np.random.default_rng(5).normal(size=(6, 3)))
@@ -395,7 +396,7 @@ def test_what_is_said_of_the_axes():
     assert near.resolved_axes.tolist() == [False, False, True]
     even = diffusion_tensor(tracked(3, ratio=(1, 1, 1)), symmetry="C_1")
     assert even.p_isotropic > 0.05
-    assert "read the mean, not the three sorted values" in str(even)
+    assert "read D_R, the mean, not the three sorted values" in str(even)
     assert not even.resolved_axes.any()
     wide = diffusion_tensor(tracked(1, ratio=(1, 3, 9), n_frames=1000))
     assert wide.resolved_axes.all()
@@ -588,3 +589,44 @@ def test_results_cannot_be_changed():
     for array in (found.tensor, found.axes, found.stderr, found.covariance, found.offset):
         with pytest.raises(ValueError, match="read-only"):
             array[0] = 1.0
+
+
+# ---- names of axes, means over axes -------------------------------------------------------------
+
+
+def test_a_weighted_mean_is_that_of_the_directions():
+    """One direction, all axes and a mixture: tr(D W)/tr W, errors as for `along` and the mean."""
+    body = Cluster.from_positions([[0, 0, 0], [3, 0, 0], [0, 2, 0], [0, 0, 1]])
+    truth = simulate_motion(body, D_R=[1e-3, 2e-3, 6e-3], dt=1.0, n_frames=400, rng=1)
+    found = diffusion_tensor(truth)
+    p = np.array([1.0, -2.0, 0.5])
+    assert found.weighted(np.outer(p, p)) == pytest.approx(found.along(p), rel=1e-12)
+    assert found.weighted(3 * np.eye(3)) == pytest.approx(
+        (found.mean, found.mean_stderr), rel=1e-12
+    )
+    W = np.diag([1.0, 0.5, 0.5])
+    assert found.weighted(W)[0] == pytest.approx(np.trace(found.tensor @ W) / 2, rel=1e-12)
+    for bad in (np.zeros((3, 3)), np.eye(2), np.full((3, 3), np.nan)):
+        with pytest.raises(ValueError, match="weights: expected"):
+            found.weighted(bad)
+
+
+def test_the_summary_has_no_second_mean():
+    """`summary` is the text without the mean, so that one mean is shown beside D_R."""
+    truth = simulate_motion(Cluster.tetrahedron(1.0), D_R=1e-3, dt=1.0, n_frames=100, rng=1)
+    found = diffusion_tensor(truth)
+    assert str(found).count("\nmean ") == 1
+    assert "\nmean " not in found.summary
+    head, tail = str(found).split("\nmean ")
+    assert found.summary == head + "\n" + tail.partition(", ")[2]
+    assert found.statement == "the values are equal by symmetry T_d: read D_R, the mean"
+
+
+def test_axes_are_named_as_those_of_a_reference():
+    """Any order and signs of the columns are undone; small turns do not matter."""
+    rng = np.random.default_rng(2)
+    for order in permutations(range(3)):
+        reference = exp_map(rng.normal(size=3))
+        turned = reference @ exp_map(0.2 * rng.normal(size=3))
+        shuffled = (turned * [1, -1, -1])[:, order]
+        np.testing.assert_array_equal(np.array(order)[axes_like(shuffled, reference)], range(3))

@@ -1,4 +1,4 @@
-"""What a lag time apart differs: MSD, MSAD, correlations and distributions over all pairs."""
+"""Mean square displacements, angles, correlations and distributions against lag time."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from math import erf
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-from numpy.polynomial.polynomial import polyval
 from numpy.typing import ArrayLike
 
 from perrin._arrays import (
+    Bools,
     Floats,
     Ints,
     TooFewFramesError,
@@ -20,21 +20,38 @@ from perrin._arrays import (
     require_positive,
 )
 from perrin.motion import RigidMotion, threshold_displacement
+from perrin.pairs import (
+    NEAR,
+    Frames,
+    PairSums,
+    Products,
+    Squares,
+    first_look,
+    pair_sums,
+    place_frames,
+    relative_error,
+)
 
 if TYPE_CHECKING:
     import pandas as pd
 
 _ORDERS = 100  # of Hermite polynomials, beyond which the error of a bin is bounded from above
 
+# Directions that weigh the axes this evenly cannot move a slope by more than this part.
+_EVEN_WEIGHTS = 0.01
+
 
 @dataclass(frozen=True, eq=False)
 class LagCurve:
     """A mean square displacement, or angle, against lag time: value = 2 dof D t + offset.
 
+    The lags are multiples of the step between frames. Where frames lie on no compact grid of times
+    (uneven times, long holes) they are the lags that have pairs.
+
     Attributes
     ----------
     lagtime : ndarray, shape (L,)
-        s.
+        Mean time between the frames of the pairs, s.
     value : ndarray, shape (L,)
         Sum of the components; NaN at a lag without a pair.
     components : ndarray, shape (L, c)
@@ -52,7 +69,8 @@ class LagCurve:
         Unit of value.
     n_walks : float
         Independent one-dimensional walks that were averaged: 3 for the MSD of one centre, 2 for the
-        MSAD of one direction, 3 for that of all directions of a cluster.
+        MSAD of one direction, 3 for that of all directions of a cluster; fewer where the body turns
+        faster about one axis than about the others.
     drift : tuple of float or None
         Mean velocity that was taken off, um/s by axis.
     noise : float
@@ -60,6 +78,17 @@ class LagCurve:
         residuals predict; NaN where there are none (free particles).
     resolution_floor : float or None
         The D_R that a motionless cluster would read (rad^2/s); None for translation.
+    step : float or None
+        Step of the grid of times, s; None for the first lag time.
+    blocks : tuple of int
+        Steps from first to last frame of each stretch of frames on a grid; empty for one stretch
+        with a step per lag.
+    weights : ndarray, shape (3, 3), or None
+        What each element of the rotational tensor counts, body axes: the slope is 2 tr(D W). The
+        trace is dof. None for translation, and in the plane.
+    ratio : tuple of float or None
+        tr(D W)/dof over the mean of D about all axes, as the motion's steps show it, and its
+        standard error; None where all axes count alike.
     """
 
     lagtime: Floats
@@ -74,9 +103,15 @@ class LagCurve:
     drift: tuple[float, ...] | None = None
     noise: float = np.nan
     resolution_floor: float | None = None
+    step: float | None = None
+    blocks: tuple[int, ...] = ()
+    weights: Floats | None = None
+    ratio: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         frozen(self.lagtime, self.value, self.components, self.stderr, self.n_pairs)
+        if self.weights is not None:
+            frozen(self.weights)
 
     def __repr__(self) -> str:
         names = {"rotation": "MSAD", "translation": "MSD", "orientation": "correlation"}
@@ -96,7 +131,10 @@ class LagCurve:
 
 
 def msd(
-    motion_or_positions: RigidMotion | ArrayLike, *, dt: float | None = None, drift: bool = False
+    motion_or_positions: RigidMotion | ArrayLike,
+    *,
+    dt: float | None = None,
+    drift: bool | ArrayLike | None = None,
 ) -> LagCurve:
     """Return the mean square displacement over all lag times (Hunter 2011, Eq. 24: 6 D_T t).
 
@@ -106,12 +144,14 @@ def msd(
         A motion (its centre is used), or the positions of free particles, um, NaN where missing.
     dt : float, optional
         Time between frames, s; for positions only, where it is required.
-    drift : bool
-        Whether to take off a mean velocity, the same in all pieces and for all particles: flow,
-        stage drift, sedimentation. It is told in ``LagCurve.drift``. What the velocity takes of the
-        Brownian motion along with it, t/T of the MSD in a run of length T, is given back; of the
-        longest lag of a single track nothing is left, and it is NaN. ``stderr`` is within 20 % up
-        to half of the run, too small near its end.
+    drift : array_like, shape (d,), or bool, optional
+        A known velocity, um/s, that is taken off: the curve and its errors are those of the walk
+        without it. True: the mean velocity, the same in all pieces and for all particles (flow,
+        stage drift, sedimentation), is estimated and taken off. What an estimated velocity takes of
+        the Brownian motion along with it, t/T of the MSD in a run of length T, is given back; of
+        the longest lag of a single track nothing is left, and it is NaN. ``stderr`` is then within
+        20 % up to half of the run, too small near its end. Either is reported in
+        ``LagCurve.drift``.
 
     Returns
     -------
@@ -121,9 +161,14 @@ def msd(
     Raises
     ------
     ValueError
-        If dt is missing or superfluous, or the frames of a motion are not evenly spaced.
+        If dt is missing or superfluous, or a velocity is not d finite numbers.
     TooFewFramesError
         If no two frames are there.
+
+    Warns
+    -----
+    PrecisionWarning
+        If frames lie on no compact grid of times and are so many that not all pairs are formed.
 
     Examples
     --------
@@ -133,20 +178,33 @@ def msd(
     array([ 1.,  4.,  9., 16.])
     >>> msd(steady, dt=0.5, drift=True).drift
     (2.0, 0.0, 0.0)
+    >>> msd(steady, dt=0.5, drift=[2.0, 0.0, 0.0]).value
+    array([0., 0., 0., 0.])
     """
     if isinstance(motion_or_positions, RigidMotion):
         if dt is not None:
             raise ValueError("dt: a RigidMotion knows its own; leave dt out")
         motion, dt = motion_or_positions, motion_or_positions.dt
-        walks, piece = on_grid(motion, motion.center[:, None])
+        walks, time, piece = motion.center[:, None], motion.time, motion.piece
     elif dt is None:
         raise ValueError("dt: the time between frames (s) is needed with positions")
     else:
         require_positive(dt=dt)
         walks = as_positions(motion_or_positions)
+        time = dt * np.arange(len(walks), dtype=np.float64)
         piece = np.zeros(len(walks), dtype=np.int64)
-    make = _undrifted if drift else _curve
-    return make(walks, piece, dt=dt, quantity="translation", dof=walks.shape[2])
+    dof = walks.shape[2]
+    if drift is None or isinstance(drift, (bool, np.bool_)):
+        make = _undrifted if drift else _curve
+        return make(walks, time, piece, dt=dt, quantity="translation", dof=dof)
+    velocity = np.asarray(drift, dtype=np.float64)
+    if velocity.shape != (dof,) or not np.isfinite(velocity).all():
+        raise ValueError(
+            f"drift: expected True, False or a velocity of {dof} numbers (um/s), got {drift!r}"
+        )
+    still = walks - (time - time[0])[:, None, None] * velocity
+    curve = _curve(still, time, piece, dt=dt, quantity="translation", dof=dof)
+    return replace(curve, drift=tuple(float(v) for v in velocity))
 
 
 def msad(motion: RigidMotion, *, directions: ArrayLike | None = None) -> LagCurve:
@@ -167,7 +225,19 @@ def msad(motion: RigidMotion, *, directions: ArrayLike | None = None) -> LagCurv
     Raises
     ------
     ValueError
-        If a direction is zero or the frames are not evenly spaced.
+        If a direction is zero.
+
+    Warns
+    -----
+    PrecisionWarning
+        As `msd`.
+
+    Notes
+    -----
+    A direction p does not feel the rotation about itself: its MSAD grows as 2 (tr D - p.D p) t for
+    a rotational tensor D, and the mean over directions as 2 tr(D W) t with W = 1 - <p p^T>, which
+    is 4 D_R t (D_R a third of the trace) where the body is isotropic or the directions weigh all
+    axes alike. W is in ``LagCurve.weights``.
 
     Examples
     --------
@@ -177,14 +247,85 @@ def msad(motion: RigidMotion, *, directions: ArrayLike | None = None) -> LagCurv
     1.0
     """
     p = _directions(motion, directions)
-    phi, piece = on_grid(motion, motion.rotational_displacement(p))
-    planar = phi.shape[2] == 1
-    # Averaging directions p weighs a rotation vector w by |w|^2 - <(w.p)^2>.
-    unit = p / np.linalg.norm(p, axis=1, keepdims=True)
-    weight = np.eye(p.shape[1]) - unit.T @ unit / len(unit)
-    walks = 1.0 if planar else float(np.trace(weight) ** 2 / np.sum(weight * weight))
-    dof = 1 if planar else 2
-    return _curve(phi, piece, dt=motion.dt, quantity="rotation", dof=dof, independent=walks)
+    phi = motion.rotational_displacement(p)
+    if phi.shape[2] == 1:
+        return _turned(motion, phi, dof=1, independent=1.0)
+    weights = direction_weights(p)
+    walks = _independent_walks(motion, weights)
+    ratio = _axis_ratio(motion, weights)
+    return _turned(motion, phi, dof=2, independent=walks, weights=weights, ratio=ratio)
+
+
+def direction_weights(directions: Floats) -> Floats:
+    """Return W = 1 - <p p^T> (3, 3) of directions (K, 3), whose mean MSAD is 2 tr(D W) t.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> direction_weights(np.eye(3)[:1]).diagonal()
+    array([0., 1., 1.])
+    """
+    unit = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    return np.asarray(np.eye(3) - unit.T @ unit / len(unit))
+
+
+def weighs_alike(weights: Floats) -> bool:
+    """Return whether weights (3, 3) of the rotational tensor are those of all axes, to a hundredth.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> weighs_alike(2 / 3 * np.eye(3)), weighs_alike(np.diag([1.0, 0.5, 0.5]))
+    (True, False)
+    """
+    uneven = 3 / np.trace(weights) * weights - np.eye(3)
+    return bool(np.abs(np.linalg.eigvalsh(uneven)).max() < _EVEN_WEIGHTS)
+
+
+def _independent_walks(motion: RigidMotion, weights: Floats) -> float:
+    """Return n = (tr WS)^2 / tr WSWS, of how many equal walks a mean square w.W w has the error.
+
+    S is the covariance of a step's rotation vector w, free of what its own error adds to the
+    square; where the particles lie alike about all axes, the body is taken as isotropic.
+    """
+    stop = motion.steps()[1]
+    if weighs_alike(direction_weights(_directions(motion, None))) or len(stop) < 2:
+        return float(np.trace(weights) ** 2 / np.sum(weights * weights))
+    w = motion.step_vectors()[stop - 1]
+    count, product = len(w), weights @ (w.T @ w)
+    total = np.trace(product) ** 2
+    square = (count * np.sum(product * product.T) - total) / (count + 1)
+    return float(np.clip(total / square, 1.0, 3.0)) if square > 0 else 3.0
+
+
+def _axis_ratio(motion: RigidMotion, weights: Floats) -> tuple[float, float] | None:
+    """Return tr(D W)/tr W over tr(D)/3 and its standard error; None where W weighs axes evenly.
+
+    Mean products of steps (a) and of neighbouring steps (b), which take the noise off, stand for
+    D. The error is that of a quadratic form in Gaussian steps with these covariances: in the mode
+    of phase f the form is 1 + c cos f, c twice the steps per neighbouring pair, and the covariance
+    a + 2 b cos f.
+    """
+    if weighs_alike(weights):
+        return None
+    start, stop = motion.steps()
+    w = motion.step_vectors()[stop - 1]
+    linked = start[1:] == stop[:-1]
+    if linked.sum() < 2:
+        return 1.0, np.inf
+    own = w.T @ w / len(w)
+    beside = w[:-1][linked].T @ w[1:][linked] / linked.sum()
+    beside = 0.5 * (beside + beside.T)
+    tensor = own + 2 * beside
+    if not np.trace(tensor) > 0:
+        return 1.0, np.inf
+    uneven = 3 / np.trace(weights) * weights - np.eye(3)
+    more = float(np.sum(tensor * uneven) / np.trace(tensor))
+    cosine = np.cos(2 * np.pi * (np.arange(64) + 0.5) / 64)
+    form = 1 + 2 * len(w) / linked.sum() * cosine
+    both = (uneven - more * np.eye(3)) @ (own + 2 * linked.mean() * cosine[:, None, None] * beside)
+    variance = 2 * np.mean(form**2 * np.einsum("kij,kji->k", both, both)) / len(w)
+    return 1 + more, float(np.sqrt(max(variance, 0.0)) / np.trace(tensor))
 
 
 def msad_vector(motion: RigidMotion, *, threshold: float = 0.0) -> LagCurve:
@@ -208,7 +349,12 @@ def msad_vector(motion: RigidMotion, *, threshold: float = 0.0) -> LagCurve:
     Raises
     ------
     ValueError
-        If the frames are not evenly spaced, or for a threshold out of range.
+        For a threshold out of range.
+
+    Warns
+    -----
+    PrecisionWarning
+        As `msd`.
 
     Examples
     --------
@@ -217,10 +363,12 @@ def msad_vector(motion: RigidMotion, *, threshold: float = 0.0) -> LagCurve:
     >>> round(float(msad_vector(truth).value[9]) / (6 * 1e-3 * 10), 1)
     1.0
     """
-    angles = threshold_displacement(motion, threshold=threshold)
-    walk, piece = on_grid(motion, angles[:, None])
+    walk = threshold_displacement(motion, threshold=threshold)[:, None]
     dof = walk.shape[2]
-    return _curve(walk, piece, dt=motion.dt, quantity="rotation", dof=dof, independent=float(dof))
+    if dof == 1:
+        return _turned(motion, walk, dof=1, independent=1.0)
+    walks = _independent_walks(motion, np.eye(3))
+    return _turned(motion, walk, dof=3, independent=walks, weights=np.eye(3))
 
 
 def msad_axes(motion: RigidMotion, *, axes: ArrayLike | None = None) -> tuple[LagCurve, ...]:
@@ -234,7 +382,8 @@ def msad_axes(motion: RigidMotion, *, axes: ArrayLike | None = None) -> tuple[La
     motion : RigidMotion
     axes : array_like, shape (3,) or (K, 3), optional
         Body-fixed axes at the first fitted frame. Default: the principal axes of the particles'
-        gyration tensor, the longest first; in the plane the one there is.
+        gyration tensor, the shortest first: that about which the body turns slowest, as the axes of
+        a `DiffusionTensor` are ordered. In the plane the one there is.
 
     Returns
     -------
@@ -244,26 +393,30 @@ def msad_axes(motion: RigidMotion, *, axes: ArrayLike | None = None) -> tuple[La
     Raises
     ------
     ValueError
-        If an axis is zero, axes are given in the plane, or the frames are not evenly spaced.
+        If an axis is zero, or axes are given in the plane.
+
+    Warns
+    -----
+    PrecisionWarning
+        As `msd`.
 
     Examples
     --------
     >>> from perrin import Cluster, fit_line, simulate_motion
     >>> rod = Cluster.from_positions([[-3, 0, 0], [0, 0.5, 0], [0, 0, 0.5], [3, 0, 0]])
     >>> truth = simulate_motion(rod, D_R=[5e-3, 1e-3, 1e-3], dt=1.0, n_frames=20000, rng=0)
-    >>> along, *across = msad_axes(truth)
+    >>> *across, along = msad_axes(truth)
     >>> print(fit_line(along))
     D_R = 0.00501(9) rad^2/s [line, 20000 frames]
     """
-    walk, piece = on_grid(motion, motion.accumulated_rotation(axes="body")[:, None])
+    walk = motion.accumulated_rotation(axes="body")[:, None]
     if walk.shape[2] == 1:
         if axes is not None:
             raise ValueError("axes: a motion in the plane turns about one axis only")
-        unit = np.ones((1, 1))
-    else:
-        unit = _principal_axes(motion) if axes is None else _unit_vectors(axes)
+        return (_turned(motion, walk, dof=1, independent=1.0),)
+    unit = _principal_axes(motion) if axes is None else _unit_vectors(axes)
     return tuple(
-        _curve(walk @ a[:, None], piece, dt=motion.dt, quantity="rotation", dof=1, independent=1.0)
+        _turned(motion, walk @ a[:, None], dof=1, independent=1.0, weights=np.outer(a, a))
         for a in unit
     )
 
@@ -286,12 +439,17 @@ def orientation_correlation(
     -------
     LagCurve
         Dimensionless; decays as exp(-l (l + 1) D_R t). ``stderr`` is NaN: it is for display, the
-        steps tell D_R far better. ``dof`` is l (l + 1) / 2, half the rate over D_R.
+        steps give D_R with a far smaller error. ``dof`` is l (l + 1) / 2, half the rate over D_R.
 
     Raises
     ------
     ValueError
-        For another degree, a planar motion, or frames that are not evenly spaced.
+        For another degree, or a planar motion.
+
+    Warns
+    -----
+    PrecisionWarning
+        As `msd`.
 
     Examples
     --------
@@ -305,18 +463,26 @@ def orientation_correlation(
         raise ValueError(f"degree: expected 1 or 2, got {degree!r}")
     if motion.template.shape[1] != 3:
         raise ValueError("orientation_correlation is for motions in three dimensions")
-    p, piece = on_grid(motion, motion.orientation(_directions(motion, directions)))
-    value, pairs = _mean_products(p if degree == 1 else _quadrupole(p), piece)
+    p = motion.orientation(_directions(motion, directions))
+    features = p if degree == 1 else _quadrupole(p)
+    frames = _frames(motion.time, motion.piece, np.isfinite(motion.center[:, 0]), dt=motion.dt)
+    columns = features.reshape(len(p), -1)
+    sums = pair_sums(Products(columns, [[(i, i) for i in range(columns.shape[1])]]), frames)
+    _require_pairs(sums)
+    # A mean of cosines that rounds above one is one.
+    value = np.minimum(_mean(sums)[:, 0] / p.shape[1], 1.0)
     return LagCurve(
-        lagtime=np.arange(1, len(p), dtype=np.float64) * motion.dt,
+        lagtime=sums.lagtime,
         value=value,
         components=value[:, None].copy(),
         stderr=np.full_like(value, np.nan),
-        n_pairs=pairs,
+        n_pairs=sums.pairs,
         dof=degree * (degree + 1) // 2,
         quantity="orientation",
         unit="1",
         n_walks=1.0,
+        step=frames.step,
+        blocks=tuple(int(n) for n in frames.lengths),
     )
 
 
@@ -327,7 +493,7 @@ class VanHove:
     Attributes
     ----------
     lagtime : float
-        s.
+        Mean over the pairs, s.
     edges : ndarray, shape (B + 1,)
         Of the bins, rad or um.
     density : ndarray, shape (B,)
@@ -390,7 +556,7 @@ def van_hove(
     ----------
     motion : RigidMotion
     lag : float
-        s, a whole number of frames.
+        s, a whole number of frames; pairs within a tenth of dt of it are used.
     quantity : {"rotation", "translation"}
         Rotations are differences of the unbounded `RigidMotion.accumulated_rotation`, not the
         rotation vectors between both frames, which end at pi. Components along all lab axes are
@@ -418,20 +584,20 @@ def van_hove(
     >>> abs(result.alpha2) < 3 * result.alpha2_stderr
     True
     """
-    walk, piece, steps = _displaced(motion, lag=lag, quantity=quantity)
-    step = walk[steps:] - walk[:-steps]
-    x = step[np.isfinite(step[:, 0]) & (piece[steps:] == piece[:-steps])]
-    if not len(x):
+    walk = _walk(motion, lag=lag, quantity=quantity)
+    first, last = _pairs_apart(motion, lag)
+    if not len(first):
         raise TooFewFramesError(f"no two frames of one piece are {lag:g} s apart", 0)
+    x = walk[last] - walk[first]
     square = float(np.mean(x * x))
     if square == 0:
         raise ValueError("nothing moves: a distribution at rest has no width")
     edges = _bin_edges(bins, reach=float(np.abs(x).max()))
-    shared = _shared(walk, piece, steps, pairs=len(x)) / x.shape[1]
+    shared = _shared(motion, walk, lag, pairs=len(x)) / x.shape[1]
     expected, spread = _gaussian_bins(edges / np.sqrt(square), shared)
     width = np.diff(edges)
     return VanHove(
-        lagtime=steps * motion.dt,
+        lagtime=float(np.mean(motion.time[last] - motion.time[first])),
         edges=edges,
         density=np.histogram(x, edges)[0] / (x.size * width),
         stderr=spread / width,
@@ -444,19 +610,28 @@ def van_hove(
     )
 
 
-def _displaced(motion: RigidMotion, *, lag: float, quantity: str) -> tuple[Floats, Ints, int]:
-    """Return the walk of a quantity on the grid of frames, its pieces, and the lag in frames."""
+def _walk(motion: RigidMotion, *, lag: float, quantity: str) -> Floats:
+    """Return the walk (T, c) of a quantity; refuse a lag that is no whole number of frames."""
     if quantity not in ("rotation", "translation"):
         raise ValueError(f'quantity: expected "rotation" or "translation", got {quantity!r}')
-    walk = motion.accumulated_rotation() if quantity == "rotation" else motion.center
-    grid, piece = on_grid(motion, walk)
-    steps = round(lag / motion.dt)
-    if abs(steps * motion.dt - lag) > 1e-3 * motion.dt or not 1 <= steps < len(grid):
+    steps, span = round(lag / motion.dt), motion.time[-1] - motion.time[0]
+    if abs(steps * motion.dt - lag) > 1e-3 * motion.dt or not 1 <= steps <= span / motion.dt + NEAR:
         raise ValueError(
-            f"lag: expected a multiple of dt = {motion.dt:g} s up to "
-            f"{(len(grid) - 1) * motion.dt:g} s, got {lag!r}"
+            f"lag: expected a multiple of dt = {motion.dt:g} s up to {span:g} s, got {lag!r}"
         )
-    return grid, piece, steps
+    return motion.accumulated_rotation() if quantity == "rotation" else motion.center
+
+
+def _pairs_apart(motion: RigidMotion, lag: float) -> tuple[Ints, Ints]:
+    """Return first and last rows of the pairs with a pose and in one piece that lag apart."""
+    rows = motion.fitted
+    time = motion.time[rows]
+    low, high = (time + lag + sign * NEAR * motion.dt for sign in (-1, 1))
+    partner = np.searchsorted(time, low)
+    there = np.flatnonzero(partner < np.searchsorted(time, high, side="right"))
+    first, last = rows[there], rows[partner[there]]
+    same = motion.piece[first] == motion.piece[last]
+    return first[same], last[same]
 
 
 def _bin_edges(bins: int | ArrayLike, *, reach: float) -> Floats:
@@ -472,14 +647,16 @@ def _bin_edges(bins: int | ArrayLike, *, reach: float) -> Floats:
     return edges
 
 
-def _shared(walk: Floats, piece: Ints, steps: int, *, pairs: int) -> Floats:
+def _shared(motion: RigidMotion, walk: Floats, lag: float, *, pairs: int) -> Floats:
     """Return for k = 1.._ORDERS the mean over all pairs of displacements of correlation^k.
 
     It is the variance of the mean of the kth normalised Hermite polynomial of one component, if
     the motion is Gaussian.
     """
-    curve = _curve(walk[:, None], piece, dt=1.0, quantity="rotation", dof=1)
-    d, s = _first_look(curve.value / 2, curve.n_pairs)
+    curve = _turned(motion, walk[:, None], dof=1)
+    step = curve.step or motion.dt
+    steps = round(lag / step)
+    d, s = first_look(curve.lagtime / step, curve.value / 2, curve.n_pairs)
     apart = np.arange(steps + 1.0)
     correlation = d * (steps - apart)
     correlation[0] += s
@@ -516,8 +693,8 @@ def _unit_vectors(vectors: ArrayLike) -> Floats:
 
 
 def _principal_axes(motion: RigidMotion) -> Floats:
-    """Return the principal axes of the particles' gyration tensor as rows, the longest first."""
-    return np.asarray(np.linalg.eigh(motion.template.T @ motion.template)[1].T[::-1])
+    """Return the principal axes of the particles' gyration tensor as rows, the shortest first."""
+    return np.asarray(np.linalg.eigh(motion.template.T @ motion.template)[1].T)
 
 
 def _directions(motion: RigidMotion, directions: ArrayLike | None) -> Floats:
@@ -529,23 +706,51 @@ def _directions(motion: RigidMotion, directions: ArrayLike | None) -> Floats:
     return np.asarray(motion.template[length > 1e-6 * length.max()])
 
 
-def on_grid(motion: RigidMotion, walks: Floats) -> tuple[Floats, Ints]:
-    """Put walks (T, K, c) on the even grid of frames; frames without a row are missing."""
-    step = (motion.time - motion.time[0]) / motion.dt
-    row = np.rint(step).astype(np.int64)
-    if np.max(np.abs(step - row)) > 1e-3 or np.any(np.diff(row) < 1):
-        raise ValueError(
-            f"the frames are not evenly spaced (dt = {motion.dt:g} s): lag times mix; "
-            "estimate_diffusion takes the times as they are"
-        )
-    grid = np.full((int(row[-1]) + 1, *walks.shape[1:]), np.nan)
-    piece = np.zeros(len(grid), dtype=np.int64)
-    grid[row], piece[row] = walks, motion.piece
-    return grid, piece
+def _frames(time: Floats, piece: Ints, here: Bools, *, dt: float) -> Frames:
+    """Return the frames that are there on their grids of times; refuse fewer than two."""
+    if here.sum() < 2:
+        raise TooFewFramesError("no two frames in one piece: a pair needs two", int(here.sum()))
+    return place_frames(time, piece, here, dt=dt)
+
+
+def _require_pairs(sums: PairSums) -> None:
+    if not sums.pairs.any():
+        raise TooFewFramesError("no two frames in one piece: a pair needs two", 0)
+
+
+def _mean(sums: PairSums) -> Floats:
+    """Return sums over pairs; NaN where there are none."""
+    average = np.full_like(sums.sums, np.nan)
+    pairs = sums.pairs[:, None]
+    np.divide(sums.sums, pairs, out=average, where=pairs > 0)
+    return average
+
+
+def _turned(
+    motion: RigidMotion,
+    walks: Floats,
+    *,
+    dof: int,
+    independent: float | None = None,
+    weights: Floats | None = None,
+    ratio: tuple[float, float] | None = None,
+) -> LagCurve:
+    """Return the curve of angles (T, K, c) of a motion."""
+    curve = _curve(
+        walks,
+        motion.time,
+        motion.piece,
+        dt=motion.dt,
+        quantity="rotation",
+        dof=dof,
+        independent=independent,
+    )
+    return replace(curve, weights=weights, ratio=ratio)
 
 
 def _curve(
     walks: Floats,
+    time: Floats,
     piece: Ints,
     *,
     dt: float,
@@ -554,40 +759,42 @@ def _curve(
     independent: float | None = None,
 ) -> LagCurve:
     """Average walks (T, K, c) over time, pieces and the K walkers."""
-    squares, pairs = np.zeros((len(walks) - 1, walks.shape[2])), np.zeros(len(walks) - 1, np.int64)
-    for label in np.unique(piece):
-        inside = np.where((piece == label)[:, None, None], walks, np.nan)
-        more, count = _square_sums(inside)
-        squares, pairs = squares + more, pairs + count
-    if not pairs.any():
-        raise TooFewFramesError("no two frames in one piece: a displacement needs two", 0)
-    average = np.full_like(squares, np.nan)
-    np.divide(squares, pairs[:, None], out=average, where=pairs[:, None] > 0)
+    here = np.asarray(present(walks).any(axis=1))
+    frames = _frames(time, piece, here, dt=dt)
+    sums = pair_sums(Squares(walks), frames)
+    _require_pairs(sums)
+    average = _mean(sums)
     value = average.sum(axis=1)
     # Free particles are independent walkers; the directions of one body are not.
     walkers = walks.shape[1] if independent is None else 1
     n_walks = float(walks.shape[2] * walkers) if independent is None else independent
-    shared = pairs / walks.shape[1]
-    relative = _relative_error(value / (2 * dof), shared)
+    shared = sums.pairs / walks.shape[1]
+    relative = relative_error(sums, frames, value / (2 * dof), shared)
     return LagCurve(
-        lagtime=np.arange(1, len(walks), dtype=np.float64) * dt,
+        lagtime=sums.lagtime,
         value=value,
         components=average,
         stderr=value * relative / np.sqrt(n_walks),
-        n_pairs=pairs if independent is None else np.rint(shared).astype(np.int64),
+        n_pairs=sums.pairs if independent is None else np.rint(shared).astype(np.int64),
         dof=dof,
         quantity=quantity,
         unit="rad^2" if quantity == "rotation" else "um^2",
         n_walks=n_walks,
+        step=frames.step,
+        blocks=tuple(int(n) for n in frames.lengths),
     )
 
 
-def _undrifted(walks: Floats, piece: Ints, *, dt: float, quantity: str, dof: int) -> LagCurve:
+def _undrifted(
+    walks: Floats, time: Floats, piece: Ints, *, dt: float, quantity: str, dof: int
+) -> LagCurve:
     """Average walks as `_curve` does, without their mean velocity."""
-    velocity, lengths = _mean_step(walks, piece)
-    still = walks - np.arange(len(walks))[:, None, None] * velocity
-    curve = _curve(still, piece, dt=dt, quantity=quantity, dof=dof)
-    restored = _restored(curve.components, curve.n_pairs, lengths)
+    velocity, durations = _mean_velocity(walks, time, piece)
+    still = walks - (time - time[0])[:, None, None] * velocity
+    curve = _curve(still, time, piece, dt=dt, quantity=quantity, dof=dof)
+    restored = _restored(
+        curve.components, curve.n_pairs, lagtime=curve.lagtime, durations=durations
+    )
     value = restored.sum(axis=1)
     ratio = np.divide(value, curve.value, out=np.ones_like(value), where=curve.value > 0)
     return replace(
@@ -595,42 +802,43 @@ def _undrifted(walks: Floats, piece: Ints, *, dt: float, quantity: str, dof: int
         value=value,
         components=restored,
         stderr=curve.stderr * ratio,
-        drift=tuple(float(v) for v in velocity / dt),
+        drift=tuple(float(v) for v in velocity),
     )
 
 
-def _mean_step(walks: Floats, piece: Ints) -> tuple[Floats, Ints]:
-    """Return the mean step from first to last frames of every stretch, and the stretches' lengths.
+def _mean_velocity(walks: Floats, time: Floats, piece: Ints) -> tuple[Floats, Floats]:
+    """Return the mean velocity from first to last frames of every stretch, and their durations.
 
     For a Brownian walk no other estimate of the velocity has a smaller error.
     """
-    total, lengths = np.zeros(walks.shape[2]), []
+    total, durations = np.zeros(walks.shape[2]), []
     here = present(walks)
     for label in np.unique(piece):
         for k in range(walks.shape[1]):
             rows = np.flatnonzero(here[:, k] & (piece == label))
             if rows.size > 1:
                 total += walks[rows[-1], k] - walks[rows[0], k]
-                lengths.append(rows[-1] - rows[0])
-    if not lengths:
+                durations.append(time[rows[-1]] - time[rows[0]])
+    if not durations:
         raise TooFewFramesError("no two frames in one piece: a velocity needs two", 0)
-    return total / sum(lengths), np.sort(lengths)
+    return total / sum(durations), np.sort(durations)
 
 
-def _restored(components: Floats, pairs: Ints, lengths: Ints) -> Floats:
-    """Give back what a mean step takes of the MSD of noisy Brownian walks, (L, c).
+def _restored(components: Floats, pairs: Ints, *, lagtime: Floats, durations: Floats) -> Floats:
+    """Give back what a mean velocity takes of the MSD of noisy Brownian walks, (L, c).
 
-    A mean step from first to last frames, T steps in all stretches together, leaves
-    2 D n (1 - n/T) + o g(n) of 2 D n + o at lag n. In g the noise of the stretches' ends counts
+    A mean velocity from first to last frames, T of time in all stretches together, leaves
+    2 D t (1 - t/T) + o g(t) of 2 D t + o at lag t. In g the noise of the stretches' ends counts
     twice, with the displacements that begin or end there and with itself.
     """
-    n, total = np.arange(1.0, len(pairs) + 1), float(lengths.sum())
-    long_enough = len(lengths) - np.searchsorted(lengths, n)
+    total = float(durations.sum())
+    n = lagtime / total
+    long_enough = len(durations) - np.searchsorted(durations, lagtime * (1 - 1e-9))
     seen = np.maximum(pairs, 1)
-    g = 1 - 2 * n * long_enough / (total * seen) + n * n * len(lengths) / total**2
-    left = 1 - n / total
+    g = 1 - 2 * n * long_enough / seen + n * n * len(durations)
+    left = 1 - n
     # The whole of one stretch is drift, nothing of its displacement is left.
-    good = np.flatnonzero((pairs > 0) & (left > 0.5 / total))
+    good = np.flatnonzero((pairs > 0) & (left > 0.5 * n[0]))
     restored = np.full_like(components, np.nan)
     if good.size > 1:
         first, second = good[:2]
@@ -647,130 +855,3 @@ def _quadrupole(p: Floats) -> Floats:
     root = np.sqrt(3.0)
     five = [root * x * y, root * y * z, root * z * x, root / 2 * (x * x - y * y), 1.5 * z * z - 0.5]
     return np.stack(five, axis=-1)
-
-
-def _mean_products(walks: Floats, piece: Ints) -> tuple[Floats, Ints]:
-    """Return the mean dot product of walks (T, K, c) with themselves a lag apart, and the pairs."""
-    length, K = walks.shape[:2]
-    size = fast_size(2 * length)
-    sums, pairs = np.zeros(size // 2 + 1), np.zeros(size // 2 + 1)
-    here = present(walks)
-    for label in np.unique(piece):
-        inside = here & (piece == label)[:, None]
-        x = np.where(inside[..., None], walks, 0.0).reshape(length, -1)
-        sums += sum(np.abs(np.fft.rfft(column, size)) ** 2 for column in x.T)
-        pairs += np.abs(np.fft.rfft(inside[:, 0].astype(np.float64), size)) ** 2
-    total, count = (np.fft.irfft(a, size)[1:length] for a in (sums, pairs))
-    frames = np.rint(count).astype(np.int64)
-    if not frames.any():
-        raise TooFewFramesError("no two frames in one piece: a correlation needs two", 0)
-    mean = np.full(length - 1, np.nan)
-    np.divide(total, K * frames, out=mean, where=frames > 0)
-    # A mean of cosines that rounds above one is one.
-    return np.minimum(mean, 1.0), frames
-
-
-def _square_sums(walks: Floats) -> tuple[Floats, Ints]:
-    """Return sum |x(t + lag) - x(t)|^2 per component and the pairs, all lags from 1, walkers added.
-
-    With m the presence, the sum is corr(m x^2, m) + corr(m, m x^2) - 2 corr(m x, m x). The mean is
-    taken off first: squares of a far origin would swallow the displacements.
-    """
-    length = len(walks)
-    here = present(walks)
-    mask = here.astype(np.float64)
-    mean = np.where(here[..., None], walks, 0.0).sum(0) / np.maximum(mask.sum(0), 1)[:, None]
-    x = np.where(here[..., None], walks - mean, 0.0)
-    size = fast_size(2 * length)
-    m = np.fft.rfft(mask, size, axis=0)[..., None]
-    f, g = np.fft.rfft(x, size, axis=0), np.fft.rfft(x * x, size, axis=0)
-    spectrum = 2 * np.real(np.conj(m) * g) - 2 * np.abs(f) ** 2
-    sums = np.fft.irfft(spectrum.sum(1), size, axis=0)[1:length]
-    counts = np.fft.irfft((np.abs(m) ** 2).sum((1, 2)), size)[1:length]
-    # A sum of squares that rounds below zero is zero.
-    return np.maximum(sums, 0.0), np.rint(counts).astype(np.int64)
-
-
-def fast_size(least: int) -> int:
-    """Return the smallest 2^a 3^b 5^c that is at least `least`: such transforms are fast."""
-    best = 1 << (least - 1).bit_length()
-    five = 1
-    while five < best:
-        three = five
-        while three < best:
-            two = -(-least // three)
-            best = min(best, three << (two - 1).bit_length())
-            three *= 3
-        five *= 5
-    return best
-
-
-def overlap_sums(
-    lag: Floats, steps: int, *, seen: Floats, D: float, s: float
-) -> tuple[Floats, Floats, Floats]:
-    """Return what the covariance of an MSD at two lags is made of, as polynomials of the shorter.
-
-    One-dimensional displacements over a and b >= a frames of which j are shared have covariance
-    2 D j, + s for a common first or last frame, - s where one ends at the other's beginning. The
-    covariance of their mean squares is 2 S(a, b) over the displacements of a track without gaps,
-    steps + 1 - a and steps + 1 - b. S sums the squared covariances over all pairs of displacements;
-    where frames are missing at random, those that share one or both frames weigh more, since they
-    are missing together.
-
-    Parameters
-    ----------
-    lag : ndarray, shape (L,)
-        The longer lags b, frames.
-    steps : int
-        Of the track.
-    seen : ndarray, shape (L,)
-        The part of the frames that is there, from 0 to 1: the root of that of the displacements.
-    D, s : float
-        Diffusion coefficient times dt, and variance of one coordinate from noise.
-
-    Returns
-    -------
-    near, far : ndarray, shape (5, L)
-        Coefficients of a^0 .. a^4 in S(a, b), for a <= steps + 1 - b and from there on.
-    itself : ndarray, shape (L,)
-        What comes on top where a = b.
-    """
-    b, p = lag, steps + 1 - lag
-    gap, zero = 1 / seen - 1, np.zeros_like(lag)
-    squares, noise, cross = 4 * D * D, 2 * s * s, 8 * D * s * p * (1 + gap)
-    near = squares * np.stack([zero, p / 3, p * b + 1 / 6, -p / 3, zero - 1 / 6])
-    near[:2] += 2 * noise * p * (1 + gap), cross - noise * (1 + gap)
-    once, twice = p * (p - 1) / 2, p * (p * p - 1) / 3
-    far = squares * np.stack([p * twice / 2, -2 * twice, p * (b + 1) + 2 * once, -p, zero])
-    far[:2] += noise * p * (1 + gap), cross
-    for polynomial in (near, far):
-        polynomial[2] += 2 * squares * p * gap
-    same = (gap * gap + 2 * gap) * (2 * D * b + 2 * s) ** 2 - 2 * gap * (2 * D * b + s) ** 2
-    return near, far, p * (noise + same)
-
-
-def _relative_error(half: Floats, pairs: Floats) -> Floats:
-    """Return the relative standard error of a one-dimensional MSD at every lag.
-
-    `half` is the MSD over 2, that is D t + s; D dt and s come from the first two lags.
-    """
-    steps = len(half)
-    n = np.arange(1, steps + 1, dtype=np.float64)
-    whole = steps + 1 - n
-    d, s = _first_look(half, pairs)
-    seen = np.sqrt(np.where(pairs > 0, pairs, whole) / whole)
-    near, far, itself = overlap_sums(n, steps, seen=seen, D=d, s=s)
-    total = np.where(n <= whole, *(polyval(n, c, tensor=False) for c in (near, far))) + itself
-    mean = 2 * (d * n + s)
-    relative = np.full_like(half, np.nan)
-    np.divide(np.sqrt(2 * total) / whole, mean, out=relative, where=(pairs > 0) & (mean > 0))
-    return relative
-
-
-def _first_look(half: Floats, pairs: Floats | Ints) -> tuple[float, float]:
-    """Return D dt and s of half an MSD, D t + s, from its first two lags; neither is negative."""
-    good = np.flatnonzero(pairs > 0)
-    first, second = (good[0], good[1]) if good.size > 1 else (good[0], good[0])
-    rise = (half[second] - half[first]) / max(second - first, 1)
-    d = min(max(rise, 0.0), half[first] / (first + 1))
-    return float(d), float(half[first] - d * (first + 1))

@@ -166,13 +166,16 @@ def trace_estimate(
 def _cosines(motion: RigidMotion, lag: int) -> Floats:
     """Return tr(R^T R')/d of every frame and the one `lag` dt later; NaN where there is none.
 
-    Two empty rows at the end keep the frames of different motions apart.
+    Two empty rows at the end keep the frames of different motions apart; longer holes between
+    frames are cut to two empty rows, so that absent frames take no room.
     """
     rows = motion.fitted
     slot: Ints = np.rint((motion.time[rows] - motion.time[rows[0]]) / motion.dt).astype(np.int64)
     exact = np.abs(motion.time[rows] - motion.time[rows[0]] - slot * motion.dt) < 1e-3 * motion.dt
-    where = np.full(int(slot.max()) + 3, -1)
-    where[slot[exact]] = rows[exact]
+    used = slot[exact]
+    place = np.append(0, np.cumsum(np.minimum(np.diff(used), 3)))
+    where = np.full(int(place[-1]) + 3, -1)
+    where[place] = rows[exact]
     first, last = where[:-lag], where[lag:]
     both = (first >= 0) & (last >= 0) & (motion.piece[first] == motion.piece[last])
     found = np.full(len(where), np.nan)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -11,6 +11,7 @@ from matplotlib.figure import Figure as Figure  # rooms below annotate with it
 from matplotlib.ticker import LogLocator, NullFormatter
 
 from perrin.diffusion import with_error
+from perrin.lagged import weighs_alike
 from perrin.motion import degrees_of_freedom
 
 if TYPE_CHECKING:
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
     from perrin.results import ClusterResult, Pooled, Report
     from perrin.sampling import SamplingPlan
     from perrin.shapes import Cluster
+    from perrin.tensors import DiffusionTensor
 
 # Okabe and Ito's colours, told apart by colour-blind readers and in grey print.
 INK, BLUE, RED, GREY = "#222222", "#0072B2", "#D55E00", "#8a8a8a"
@@ -61,6 +63,7 @@ def plot_lag_curve(
     estimate: DiffusionEstimate | None = None,
     floor: float | None = None,
     label: str | None = None,
+    tensor: DiffusionTensor | None = None,
 ) -> Axes:
     """Draw an MSD or MSAD against lag time, log-log, with its fit and its noise floor.
 
@@ -76,21 +79,27 @@ def plot_lag_curve(
         Noise floor, in the unit of the curve: a horizontal line.
     label : str, optional
         Name of the points in the legend; default MSAD or MSD.
+    tensor : DiffusionTensor, optional
+        Of rotation, for a curve whose directions weigh the body's axes unequally: the line and the
+        circles are then what it predicts for those directions, with a band of one standard error,
+        and not those of `estimate`, which counts all axes alike. Their <D> is the mean of the
+        tensor over the axes across the directions.
 
     Returns
     -------
     matplotlib.axes.Axes
     """
     _draw_points(curve, ax=ax, label=label)
-    if estimate is not None:
-        _draw_estimate(curve, estimate, ax=ax)
+    line = _model_line(curve, estimate, tensor)
+    if line is not None:
+        _draw_line(curve, line, ax=ax)
     unit = unit_text(curve.unit)
     if floor is not None and floor > 0:
         said = f"noise floor {number_text(floor)} {unit}"
         ax.axhline(floor, color=RED, lw=1.1, ls="--", label=said)
     ax.set(xscale="log", yscale="log", xlabel="lag time (s)")
     ax.set_ylabel(f"{_NAMES[curve.quantity][0]} ({unit})")
-    _set_range(ax, curve, estimate, floor)
+    _set_range(ax, curve, line, floor)
     legend_above(ax, ncols=2)
     return ax
 
@@ -513,7 +522,8 @@ def _thinned(curve: LagCurve) -> Ints:
     count = len(curve.lagtime)
     kept = np.arange(count)
     if count > _POINTS:
-        kept = np.unique(np.rint(np.geomspace(1, count, _POINTS)).astype(np.int64)) - 1
+        even = np.geomspace(curve.lagtime[0], curve.lagtime[-1], _POINTS)
+        kept = np.unique(np.rint(np.interp(even, curve.lagtime, kept)).astype(np.int64))
     return kept[curve.value[kept] > 0]
 
 
@@ -535,19 +545,55 @@ def _draw_points(curve: LagCurve, *, ax: Axes, label: str | None) -> None:
     ax.fill_between(t[rest], low[rest], high[rest], alpha=0.15, **band)
 
 
-def _draw_estimate(curve: LagCurve, estimate: DiffusionEstimate, *, ax: Axes) -> None:
-    """Add the fitted line, and pure diffusion where the coefficient is resolved."""
-    symbol, slope = _NAMES[curve.quantity][1], 2 * curve.dof
-    first, last = curve.lagtime[0], curve.lagtime[-1]
-    t = np.geomspace(first, last, _POINTS)
-    line = slope * (estimate.value * t + estimate.offset)
+class _Line(NamedTuple):
+    """A straight line 2 dof (D t + offset), the standard error of D to show, and its name."""
+
+    D: float
+    offset: float
+    stderr: float
+    resolved: bool
+    symbol: str
+    text: str
+
+
+def _model_line(
+    curve: LagCurve, estimate: DiffusionEstimate | None, tensor: DiffusionTensor | None
+) -> _Line | None:
+    """Return the line to draw: the tensor's for directions that weigh axes unequally, or the fit.
+
+    D of the line is tr(D W)/dof with the weights W of the curve.
+    """
+    resolved = estimate is None or estimate.resolved
+    uneven = curve.weights is not None and not weighs_alike(curve.weights)
+    if tensor is not None and curve.weights is not None and uneven and resolved:
+        D, stderr = tensor.weighted(curve.weights)
+        offset = float(np.einsum("ij,ij->", curve.weights, tensor.offset)) / curve.dof
+        symbol = r"$\langle D\rangle$"
+        said = f"tensor {symbol} = {number_text(D, stderr)} {unit_text(tensor.unit)}"
+        return _Line(D, offset, stderr, True, symbol, said)
+    if estimate is None:
+        return None
+    symbol = _NAMES[curve.quantity][1]
     method = _METHODS.get(estimate.method, estimate.method)
     said = f"{method} {symbol} {'= ' if estimate.resolved else ''}{value_text(estimate)}"
+    return _Line(estimate.value, estimate.offset, 0.0, estimate.resolved, symbol, said)
+
+
+def _draw_line(curve: LagCurve, line: _Line, *, ax: Axes) -> None:
+    """Add a line with its band, and pure diffusion where the coefficient is resolved."""
+    slope = 2 * curve.dof
+    first, last = curve.lagtime[0], curve.lagtime[-1]
+    t = np.geomspace(first, last, _POINTS)
+    value = slope * (line.D * t + line.offset)
     # Blur can make the offset so negative that the line has no logarithm at short lags.
-    ax.plot(t, np.where(line > 0, line, np.nan), color=BLUE, lw=1.4, label=said)
-    if estimate.resolved:
+    ax.plot(t, np.where(value > 0, value, np.nan), color=BLUE, lw=1.4, label=line.text)
+    if line.stderr > 0:
+        half = slope * line.stderr * t
+        low = np.maximum(value - half, 1e-2 * np.abs(value))
+        ax.fill_between(t, low, value + half, color=BLUE, lw=0, alpha=0.25)
+    if line.resolved:
         sparse = np.geomspace(first, last, 12)
-        pure, said = slope * estimate.value * sparse, f"pure diffusion {slope} {symbol} t"
+        pure, said = slope * line.D * sparse, f"pure diffusion {slope} {line.symbol} t"
         ax.plot(sparse, pure, "o", mfc="none", mec=BLUE, ms=5, mew=0.9, label=said)
 
 
@@ -587,17 +633,15 @@ def legend_above(ax: Axes, *, ncols: int) -> None:
     )
 
 
-def _set_range(
-    ax: Axes, curve: LagCurve, estimate: DiffusionEstimate | None, floor: float | None
-) -> None:
+def _set_range(ax: Axes, curve: LagCurve, line: _Line | None, floor: float | None) -> None:
     """Let points, fit and floor set the range; a band as wide as its values must not."""
     shown = curve.value[curve.value > 0]
     if shown.size == 0:
         return
     low = high = shown
-    if estimate is not None:
+    if line is not None:
         ends = np.array([curve.lagtime[0], curve.lagtime[-1]])
-        ends = 2 * curve.dof * (estimate.value * ends + estimate.offset)
+        ends = 2 * curve.dof * (line.D * ends + line.offset)
         low = high = np.append(shown, ends[ends > 0])
     if floor is not None and floor > 0:
         low = np.append(low, floor)
@@ -719,7 +763,11 @@ def _curve_figure(result: ClusterResult) -> Figure:
     """Draw MSAD and MSD side by side."""
     figure = new_figure(10, 4.6)
     left, right = figure.subplots(1, 2)
-    plot_lag_curve(result.msad, ax=left, estimate=result.D_R, floor=result.noise.phi2)
+    weights, floor = result.msad.weights, result.noise.phi2
+    if weights is not None:
+        # Both ends of a turn carry the error of the orientation, across the directions averaged.
+        floor = 2 * float(np.einsum("ij,ij->", weights, result.noise.covariance))
+    plot_lag_curve(result.msad, ax=left, estimate=result.D_R, floor=floor, tensor=result.tensor)
     motion = result.motion
     # Both ends of a displacement carry the centre's error, on each axis.
     floor = 2 * motion.template.shape[1] * float(np.mean(motion.center_variance[motion.fitted]))

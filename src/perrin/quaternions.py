@@ -7,11 +7,14 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from perrin._arrays import TooFewFramesError
-from perrin.lagged import fast_size, on_grid
+from perrin.pairs import Products, pair_sums, place_frames
 
 if TYPE_CHECKING:
-    from perrin._arrays import Bools, Floats, Ints
+    from perrin._arrays import Floats, Ints
     from perrin.motion import RigidMotion
+
+
+_LOWER = [(i, j) for i in range(3) for j in range(i + 1)]
 
 
 class QuaternionCovariance(NamedTuple):
@@ -46,7 +49,7 @@ def quaternion_covariance(
     motion : RigidMotion
         In three dimensions; frames without a pose are left out.
     n_lags : int, optional
-        Number of lags from one frame on; default all.
+        Number of lags from one step between frames on; default all.
 
     Returns
     -------
@@ -55,8 +58,7 @@ def quaternion_covariance(
     Raises
     ------
     ValueError
-        For a planar motion, a number of lags that is not 1 or more, or frames that are not evenly
-        spaced.
+        For a planar motion, or a number of lags that is not 1 or more.
     TooFewFramesError
         If no two frames in one piece have a pose.
 
@@ -74,38 +76,20 @@ def quaternion_covariance(
         raise ValueError("quaternion_covariance is for motions in three dimensions")
     if n_lags is not None and (n_lags != int(n_lags) or n_lags < 1):
         raise ValueError(f"n_lags: expected a whole number >= 1, got {n_lags!r}")
-    grid, piece = on_grid(motion, motion.rotation)
-    count = len(grid) - 1 if n_lags is None else min(int(n_lags), len(grid) - 1)
-    sums, pairs = np.zeros((count, 3, 3)), np.zeros(count, np.int64)
-    for label in np.unique(piece):
-        inside = (piece == label) & np.isfinite(grid[:, 0, 0])
-        more, found = _relative_sums(grid, inside, count)
-        sums, pairs = sums + more, pairs + found
-    if not pairs.any():
-        raise TooFewFramesError("no two frames in one piece: a relative rotation needs two", 0)
-    mean = np.full_like(sums, np.nan)
-    np.divide(sums, pairs[:, None, None], out=mean, where=pairs[:, None, None] > 0)
+    none = "no two frames in one piece: a relative rotation needs two"
+    if motion.fitted.size < 2:
+        raise TooFewFramesError(none, int(motion.fitted.size))
+    here = np.isfinite(motion.center[:, 0])
+    frames = place_frames(motion.time, motion.piece, here, dt=motion.dt)
+    # Element (i, j) of R_k^T R_{k+n} is the sum of products of column i and column j.
+    groups = [[(3 * a + i, 3 * a + j) for a in range(3)] for i, j in _LOWER]
+    sums = pair_sums(Products(motion.rotation.reshape(-1, 9), groups), frames, most=n_lags)
+    if not sums.pairs.any():
+        raise TooFewFramesError(none, 0)
+    mean = np.full((len(sums.pairs), 3, 3), np.nan)
+    seen = sums.pairs > 0
+    for k, (i, j) in enumerate(_LOWER):
+        mean[seen, i, j] = mean[seen, j, i] = sums.sums[seen, k] / sums.pairs[seen]
     trace = np.trace(mean, axis1=1, axis2=2)[:, None, None]
     covariance = 0.5 * mean - 0.25 * (trace - 1) * np.eye(3)
-    lagtime = np.arange(1, count + 1, dtype=np.float64) * motion.dt
-    return QuaternionCovariance(lagtime, covariance, pairs)
-
-
-def _relative_sums(grid: Floats, inside: Bools, count: int) -> tuple[Floats, Ints]:
-    """Return the summed sym(R_k^T R_{k+n}) for n = 1..count over frames inside, and the pairs."""
-    rows = np.flatnonzero(inside)
-    if rows.size < 2:
-        return np.zeros((count, 3, 3)), np.zeros(count, np.int64)
-    here = inside[rows[0] : rows[-1] + 1]
-    size = fast_size(len(here) + count)
-    element = np.where(here, np.moveaxis(grid[rows[0] : rows[-1] + 1], 0, -1), 0.0)
-    f = np.fft.rfft(element, size)
-    m = np.fft.rfft(here.astype(np.float64), size)
-    sums = np.empty((count, 3, 3))
-    for i in range(3):
-        for j in range(i + 1):
-            # The transform of a sum over k and its transpose's is the real part.
-            power = (f[:, i].real * f[:, j].real + f[:, i].imag * f[:, j].imag).sum(axis=0)
-            sums[:, i, j] = sums[:, j, i] = np.fft.irfft(power, size)[1 : count + 1]
-    pairs = np.fft.irfft(m.real**2 + m.imag**2, size)[1 : count + 1]
-    return sums, np.rint(pairs).astype(np.int64)
+    return QuaternionCovariance(sums.lagtime, covariance, sums.pairs)

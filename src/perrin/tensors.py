@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
+from itertools import permutations
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 
-from perrin._arrays import Bools, Floats, PrecisionWarning, TooFewFramesError, frozen
+from perrin._arrays import Bools, Floats, Ints, PrecisionWarning, TooFewFramesError, frozen
 from perrin.diffusion import UNITS, with_error
 from perrin.motion import RigidMotion
 from perrin.rotations import exp_map, kabsch, skew
@@ -58,8 +59,9 @@ class DiffusionTensor:
     tensor : ndarray, shape (3, 3)
         rad^2/s or um^2/s.
     principal_values : ndarray, shape (3,)
-        Rising. Sorted values of an isotropic body differ by their errors alone: read them with
-        `p_isotropic`, `p_axial` and `resolved_axes`.
+        Rising: axis 1 is the one about (or along) which the body diffuses slowest, as in
+        `Mobility`, in predictions and in `msad_axes`. Sorted values of an isotropic body differ by
+        their errors alone: read them with `p_isotropic`, `p_axial` and `resolved_axes`.
     axes : ndarray, shape (3, 3)
         Column a is the body axis of principal value a; right-handed.
     stderr : ndarray, shape (3,)
@@ -140,18 +142,39 @@ class DiffusionTensor:
         if p.shape != (3,) or not 0 < np.linalg.norm(p) < np.inf:
             raise ValueError(f"direction: expected 3 numbers, not all zero, got {direction!r}")
         p = p / np.linalg.norm(p)
-        weight = np.array([p[i] * p[j] * (1 + (i != j)) for i, j in _ELEMENTS])
-        return float(p @ self.tensor @ p), float(np.sqrt(weight @ self.covariance @ weight))
+        return self.weighted(np.outer(p, p))
+
+    def weighted(self, weights: ArrayLike) -> tuple[float, float]:
+        """Return the mean tr(D W)/tr W of the coefficients, and its standard error.
+
+        Parameters
+        ----------
+        weights : array_like, shape (3, 3)
+            Symmetric, body axes, with a positive trace: p p^T for one direction, the identity for
+            the mean of all axes, ``LagCurve.weights`` for what a curve grows by.
+        """
+        w = np.asarray(weights, dtype=np.float64)
+        if w.shape != (3, 3) or not 0 < np.trace(w) < np.inf:
+            raise ValueError(f"weights: expected (3, 3) with a positive trace, got {weights!r}")
+        w = w / np.trace(w)
+        row = np.array([w[i, j] * (1 + (i != j)) for i, j in _ELEMENTS])
+        value = float(np.einsum("ij,ij->", w, self.tensor))
+        return value, float(np.sqrt(row @ self.covariance @ row))
 
     def __str__(self) -> str:
+        first, *rest = self.summary.split("\n")
+        mean = f"mean {with_error(self.mean, self.mean_stderr)}"
+        return "\n".join([first, f"{mean}, {rest[0]}", *rest[1:]])
+
+    @property
+    def summary(self) -> str:
+        """What `str` gives without the mean, for use beside the D of `estimate_diffusion`."""
         name = "D_R" if self.quantity == "rotation" else "D_T"
         pairs = zip(self.principal_values, self.stderr, strict=True)
         values = ", ".join(with_error(value, stderr) for value, stderr in pairs)
         return (
             f"{name} = {values} {self.unit} [{self.n_frames} frames, symmetry {self.symmetry}]\n"
-            f"mean {with_error(self.mean, self.mean_stderr)}, "
-            f"isotropic: {_probability(self.p_isotropic)}, "
-            f"axial: {_probability(self.p_axial)}\n"
+            f"isotropic: {_probability(self.p_isotropic)}, axial: {_probability(self.p_axial)}\n"
             f"{self.statement}"
         )
 
@@ -173,8 +196,13 @@ class DiffusionTensor:
                 f"normal, axis {known[0] + 1}, to {worst[known[0]]:.0f} degrees"
             )
         if equal:
-            return f"the values are equal by symmetry {self.symmetry}: read the mean"
-        return "the axes cannot be told apart: read the mean, not the three sorted values"
+            return f"the values are equal by symmetry {self.symmetry}: read {self._mean_name}"
+        return f"the axes cannot be told apart: read {self._mean_name}, not the three sorted values"
+
+    @property
+    def _mean_name(self) -> str:
+        """The mean over axes, by the name it has beside a tensor."""
+        return "D_R, the mean" if self.quantity == "rotation" else "D_T, the mean"
 
 
 def _probability(p: float) -> str:
@@ -387,6 +415,28 @@ def coupled_tensor(
         point=where,
         n_frames=int(motion.fitted.size),
     )
+
+
+def axes_like(axes: Floats, reference: Floats) -> Ints:
+    """Return the order of the columns of `axes` in which each lies nearest to the reference's.
+
+    Axes sorted by their own values are named by it as those of another tensor of the same body:
+    "axis 1" is then the same axis of the body.
+
+    Parameters
+    ----------
+    axes, reference : ndarray, shape (3, 3)
+        Unit axes as columns; their signs do not matter.
+
+    Examples
+    --------
+    >>> axes_like(np.eye(3)[:, [2, 0, 1]], np.eye(3))
+    array([1, 2, 0])
+    """
+    overlap = (reference.T @ axes) ** 2
+    orders = list(permutations(range(3)))
+    best = max(orders, key=lambda order: float(overlap[range(3), order].sum()))
+    return np.array(best, dtype=np.int64)
 
 
 def shifted(tensor: Floats, point: ArrayLike) -> Floats:
