@@ -23,9 +23,7 @@ UNITS = {"rotation": "rad^2/s", "translation": "um^2/s"}
 _CHI2 = {0.68: 0.9889, 0.95: 3.8415}  # quantiles of chi-squared with one degree of freedom
 NORMAL = {0.68: 0.9945, 0.95: 1.9600}
 
-# Adding noisy body-frame steps turns noise into diffusion at second order: a motionless tetrahedron
-# reads D = 0.04 (sigma/R)^4/dt. Below ten times that a D_R is not resolved.
-_FLOOR = 0.04
+# Below ten times its resolution floor a D_R is not resolved.
 _RESOLVED = 10.0
 
 # Where an estimate needs a word: angular step 4 D_R dt, signal-to-noise ratio, number of steps.
@@ -377,17 +375,15 @@ def _judged(
     exposure: float | None,
 ) -> DiffusionEstimate:
     """Judge what was found: floor, resolution, signal-to-noise ratio, warnings."""
-    intervals = [s.usual_duration for s in steps]
     floor = None
     if quantity == "rotation":
-        squares = [_FLOOR * (m.sigma / m.R) ** 4 for m in motions]
-        floor = float(np.mean(np.divide(squares, intervals)))
+        floor = float(np.mean([m.resolution_floor for m in motions]))
     estimate = DiffusionEstimate.judged(
         found,
         quantity=quantity,
         method=method,
         n_frames=sum(m.fitted.size for m in motions),
-        dt=float(np.mean(intervals)),
+        dt=float(np.mean([m.usual_interval for m in motions])),
         noise_variance=_spread(motions, steps, noise),
         resolution_floor=floor,
         noise=noise if isinstance(noise, str) else f"{noise:g} um",

@@ -194,9 +194,13 @@ def msd(
         time = dt * np.arange(len(walks), dtype=np.float64)
         piece = np.zeros(len(walks), dtype=np.int64)
     dof = walks.shape[2]
+    noise = np.nan
+    if isinstance(motion_or_positions, RigidMotion):
+        noise = motion_or_positions.center_noise
     if drift is None or isinstance(drift, (bool, np.bool_)):
         make = _undrifted if drift else _curve
-        return make(walks, time, piece, dt=dt, quantity="translation", dof=dof)
+        made = make(walks, time, piece, dt=dt, quantity="translation", dof=dof)
+        return replace(made, noise=noise)
     velocity = np.asarray(drift, dtype=np.float64)
     if velocity.shape != (dof,) or not np.isfinite(velocity).all():
         raise ValueError(
@@ -204,7 +208,7 @@ def msd(
         )
     still = walks - (time - time[0])[:, None, None] * velocity
     curve = _curve(still, time, piece, dt=dt, quantity="translation", dof=dof)
-    return replace(curve, drift=tuple(float(v) for v in velocity))
+    return replace(curve, drift=tuple(float(v) for v in velocity), noise=noise)
 
 
 def msad(motion: RigidMotion, *, directions: ArrayLike | None = None) -> LagCurve:
@@ -745,7 +749,18 @@ def _turned(
         dof=dof,
         independent=independent,
     )
-    return replace(curve, weights=weights, ratio=ratio)
+    noise = motion.orientation_noise
+    # In a component that weighs the axes by W the noise counts with the same weights.
+    weighed = (
+        np.trace(noise @ weights) / dof if weights is not None else np.trace(noise) / len(noise)
+    )
+    return replace(
+        curve,
+        weights=weights,
+        ratio=ratio,
+        noise=float(weighed),
+        resolution_floor=motion.resolution_floor,
+    )
 
 
 def _curve(

@@ -38,6 +38,8 @@ _CONVERGED = 1e-13  # rad: a Gauss-Newton step this short has arrived
 # within the noise, and the small-angle theory of every error has lost its meaning.
 _LOST_AXIS = 0.3
 
+_FLOOR = 0.04  # of D_R dt over (sigma/R)^4, for a body at rest
+
 
 @dataclass(frozen=True, eq=False)
 class RigidMotion:
@@ -118,6 +120,32 @@ class RigidMotion:
         """
         first_order = 6 * self.sigma / np.sqrt(self.fitted.size)
         return float(first_order + 2 * self.sigma**2 / self.R + 1e-6 * self.R)
+
+    @property
+    def usual_interval(self) -> float:
+        """The median time between neighbouring poses of one piece, s; dt where there is no step."""
+        start, stop = self.steps()
+        return float(np.median(self.time[stop] - self.time[start])) if start.size else self.dt
+
+    @property
+    def orientation_noise(self) -> Floats:
+        """The covariance of one orientation, mean over the ends of all steps, rad^2, (3, 3)."""
+        rows = np.concatenate(self.steps())
+        return np.asarray(self.covariance[rows].mean(axis=0))
+
+    @property
+    def center_noise(self) -> float:
+        """The variance of one centre coordinate, mean over the ends of all steps, um^2."""
+        return float(self.center_variance[np.concatenate(self.steps())].mean())
+
+    @property
+    def resolution_floor(self) -> float:
+        """The D_R that a motionless cluster would read, rad^2/s.
+
+        Adding noisy body-frame steps turns noise into diffusion at second order: a tetrahedron at
+        rest reads 0.04 (sigma/R)^4/dt.
+        """
+        return float(_FLOOR * (self.sigma / self.R) ** 4 / self.usual_interval)
 
     def steps(self) -> tuple[Ints, Ints]:
         """Return the first and last frame index of every step between neighbouring poses.

@@ -612,6 +612,11 @@ def judge_sampling(estimate: DiffusionEstimate, *, axes: int = 3) -> SamplingVer
             f"estimate: expected a time between frames and a D above 0, or a limit to it, got "
             f"dt = {estimate.dt:g} s and D = {D:g} {estimate.unit}; use estimate_diffusion"
         )
+    if np.isnan(estimate.snr):
+        raise ValueError(
+            "estimate: the localisation noise under it is not known (a curve of positions has no "
+            "rigid-fit residuals); use estimate_diffusion on a motion"
+        )
     # Without a value the offset is all there is; that of a straight line may lie below zero.
     no_value = max(estimate.offset, 0.0)
     spread = estimate.value * estimate.dt / estimate.snr if estimate.value > 0 else no_value

@@ -56,11 +56,6 @@ class Steps:
     dt: float
     steady: Floats
 
-    @property
-    def usual_duration(self) -> float:
-        """The median duration of a step, s: the time between the frames that exist."""
-        return float(np.median(self.duration))
-
     def without_steady_motion(self) -> tuple[Steps, Floats]:
         """Return the steps less their least-squares steady motion, and that motion (p,).
 
