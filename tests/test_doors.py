@@ -30,6 +30,7 @@ ROOMS = [
     "bonds",
     "linking",
     "grouping",
+    "residuals",
     "quality",
     "lagged",
     "quaternions",
