@@ -16,6 +16,7 @@ from perrin.residuals import (
     autocorrelation,
     axis_noise,
     fit_projector,
+    lagged_products,
     measure_scan,
     measure_stretch,
     sample_residuals,
@@ -33,7 +34,7 @@ if TYPE_CHECKING:
 _SOFT_SIZE, _SOFT_SMOOTH, _SOFT_FACTOR = 0.03, 0.3, 2.0
 # A particle that moves against the others: root mean square of the part that is smooth in time,
 # over R.
-_FLEXING = 0.03
+_FLEXING = 0.02
 # Share of the detections trimmed (winsorised) as outliers of each particle.
 _TRIMMED = 0.05
 # A detection fits badly beyond this multiple of the distance that most detections keep.
@@ -193,7 +194,7 @@ def judge_quality(
     everything = _with_detections(body, x / right, detections, right)
     sample = stretch.sample if stretched else sample_residuals(motion, x)
     smooth = _lag_one(sample)
-    drift, pair, ends = _bond_drift(x / right, body.sigma, smooth)
+    drift, pair, ends = _bond_drift(x / right)
     noise = axis_noise(stretch.sample)
     sigma_xyz = _sigma_per_axis(noise, right)
     blur = _scan_blur(noise, right, sigma if sigma_ratio is None else sigma_ratio)
@@ -375,73 +376,83 @@ def _flexing(motion: RigidMotion, x: Floats) -> list[str]:
     """
     from scipy.stats import t
 
+    n, d = motion.template.shape
     keeps = fit_projector(motion.template)
     vector = np.einsum("nmij,tmj->tni", keeps, body_residuals(motion, x))
+    whole = np.isfinite(vector).all(axis=(1, 2))
     # What each particle's variance contributes to the mean squares of all residuals.
     share = np.einsum("nmij,nmij->nm", keeps, keeps)
-    whole = np.isfinite(vector).all(axis=(1, 2))
-    pairs = np.flatnonzero(whole[1:] & whole[:-1])
-    n, d = motion.template.shape
-    if pairs.size < 10 or np.linalg.cond(share) > 1e6:
+    first = (np.cumsum(whole) - 1)[:-1][whole[1:] & whole[:-1]]
+    if first.size < 10 or np.linalg.cond(share) > 1e6:
         return []
-    vector = _winsorised(vector - np.nanmean(vector, axis=0))
-    product = np.linalg.solve(share, (vector[pairs] * vector[pairs + 1]).sum(axis=2).T).T
-    mean = product.mean(axis=0)
-    worst, middle = int(mean.argmax()), int(np.argsort(mean)[(n - 1) // 2])
-    contrast = product[:, worst] - product[:, middle]
-    excess, error = float(contrast.mean()), _error_of_mean(contrast)
+    vector = _winsorised(vector[whole] - np.median(vector[whole], axis=0))
+    inverse = np.linalg.inv(share)
+    product = (vector[first] * vector[first + 1]).sum(axis=2) @ inverse
+    order = np.argsort(product.mean(axis=0))
+    worst, middle = int(order[-1]), int(order[(n - 1) // 2])
+    excess = float(np.mean(product[:, worst] - product[:, middle]))
     size = float(np.sqrt(max(d * excess, 0.0)))
     if not size > _FLEXING * motion.R:
         return []
-    if not excess > t.isf(LEVEL / n, pairs.size - 1) * error:
+    # Equal noise gives the products the covariance `inverse` times a number; the number is that of
+    # the median particle, and its autocorrelation that of the other particles, as the error of
+    # the worst would contain what is tested.
+    unit = float(np.sort(product.var(axis=0) / np.diag(inverse))[(n - 1) // 2])
+    others = np.delete(vector, worst, axis=1)
+    rho = autocorrelation(lagged_products(others), d * (n - 1) / 2)
+    repeats = 1.0 + 2.0 * float(rho @ rho)
+    contrast = inverse[worst, worst] + inverse[middle, middle] - 2 * inverse[worst, middle]
+    error = float(np.sqrt(unit * contrast * repeats / first.size))
+    if not excess > t.isf(LEVEL / n, max(first.size / repeats, 1.0)) * error:
         return []
     return [
-        f"not rigid: particle {worst} (counted from 0) moves against the others by {size:.3g} +- "
-        f"{0.5 * size * error / excess:.2g} um ({size / motion.R:.3f} of R, over {_FLEXING}), "
-        "smoothly in time"
+        f"not rigid: particle {worst} (counted from 0) moves against the others by {size:.3g} um "
+        f"smoothly in time ({size / motion.R:.3f} of R, over {_FLEXING}; {excess / error:.1f} "
+        "standard errors)"
     ]
 
 
 def _winsorised(vector: Floats) -> Floats:
     """Shorten the longest 5 % of every particle's vectors (T, n, d) to the length of the next."""
     length = np.linalg.norm(vector, axis=2, keepdims=True)
-    limit = np.nanquantile(length, 1 - _TRIMMED, axis=0)
+    limit = np.quantile(length, 1 - _TRIMMED, axis=0)
     short: Floats = vector * np.minimum(1.0, limit / np.maximum(length, 1e-300))
     return short
 
 
-def _error_of_mean(values: Floats) -> float:
-    """Return the standard error of the mean of values that may be correlated in time."""
-    from_mean = values - values.mean()
-    rho = autocorrelation(from_mean[:, None, None], 1)
-    variance = float(from_mean @ from_mean) / (len(values) - 1) / len(values)
-    return float(np.sqrt(variance * (1.0 + 2.0 * float(rho.sum()))))
-
-
-def _bond_drift(
-    x: Floats, sigma: float, smooth: Slope
-) -> tuple[float, tuple[int, ...], tuple[float, ...]]:
+def _bond_drift(x: Floats) -> tuple[float, tuple[int, ...], tuple[float, ...]]:
     """Return the largest relative drift of a pair's distance, the pair, and the two distances.
 
-    Medians of eighths of the time are compared. Their noise is that of the medians, wider by the
-    autocorrelation of the residuals.
+    Medians of eighths of the time are compared with the scatter inside the eighths, which does
+    not contain the drift between them.
     """
     worst: tuple[float, tuple[int, ...], tuple[float, ...]] = (0.0, (0, 1), (0.0, 0.0))
     blocks = np.array_split(np.arange(len(x)), min(_BLOCKS, max(1, len(x) // 5)))
-    rho = float(np.clip(np.nan_to_num(smooth.value), 0.0, 0.999))
-    spread = np.nan_to_num(sigma) * np.sqrt(np.pi / 2 * (1 + rho) / (1 - rho))
     for i, j in zip(*np.triu_indices(x.shape[1], 1), strict=True):
         distance = np.linalg.norm(x[:, i] - x[:, j], axis=1)
-        kept = [distance[b][np.isfinite(distance[b])] for b in blocks]
-        medians = [(float(np.median(k)), k.size) for k in kept if k.size]
-        if len(medians) < 2:
+        kept = [k for k in (distance[b][np.isfinite(distance[b])] for b in blocks) if k.size]
+        if len(kept) < 2:
             continue
+        medians = [(float(np.median(k)), k.size) for k in kept]
         (low, few), (high, more) = min(medians), max(medians)
-        noise = _BEYOND * spread * np.sqrt(2 / few + 2 / more)
+        noise = _BEYOND * _median_noise(kept) * np.sqrt(1 / few + 1 / more)
         drift = (high - low) / low if high - low > noise and low > 0 else 0.0
         if drift > worst[0]:
             worst = (float(drift), (int(i), int(j)), (low, high))
     return worst
+
+
+def _median_noise(blocks: list[Floats]) -> float:
+    """Return the standard error of a median times the root of the number of values.
+
+    From the median absolute deviations inside the blocks, wider by their autocorrelation.
+    """
+    off = [b - np.median(b) for b in blocks]
+    scatter = 1.4826 * float(np.median(np.abs(np.concatenate(off))))
+    power = sum(float(e @ e) for e in off)
+    rho = sum(float(e[:-1] @ e[1:]) for e in off) / power if power > 0 else 0.0
+    rho = min(max(rho, 0.0), 0.9)  # a block of a dozen values measures no more
+    return scatter * float(np.sqrt(np.pi / 2 * (1 + rho) / (1 - rho)))
 
 
 def _broken(pair: tuple[int, ...], drift: float, ends: tuple[float, ...]) -> list[str]:

@@ -165,17 +165,17 @@ def _velocity(motion: RigidMotion) -> Floats:
     return velocity
 
 
-def autocorrelation(vectors: Floats, freedom: int) -> Floats:
-    """Return the autocorrelation of residuals (K, n, d) at the lags where it exceeds its error.
+def autocorrelation(sums: Floats, freedom: float) -> Floats:
+    """Return the autocorrelation of residuals at the lags up to where it is lost in its error.
 
     The mean taken off every component lowers it by about the variance of that mean, which is
     added back.
 
     Parameters
     ----------
-    vectors : ndarray, shape (K, n, d)
-        Residuals, lab axes.
-    freedom : int
+    sums : ndarray, shape (K,)
+        Sums of products of K residuals at the lags 0, ..., K - 1 (`lagged_products`).
+    freedom : float
         Degrees of freedom of one frame.
 
     Returns
@@ -187,16 +187,14 @@ def autocorrelation(vectors: Floats, freedom: int) -> Floats:
     --------
     >>> import numpy as np
     >>> white = np.random.default_rng(1).normal(size=(300, 4, 3))
-    >>> bool(np.abs(autocorrelation(white, 6)).sum() < 0.1)
+    >>> bool(np.abs(autocorrelation(lagged_products(white), 6)).sum() < 0.1)
     True
     """
-    count = len(vectors)
-    sums = lagged_products(vectors)
+    count = len(sums)
     if not sums[0] > 0:
         return np.zeros(0)
     rho = sums[1 : max(2, count // 2)] / sums[0]
-    noise = 2.0 / np.sqrt(max(count * freedom, 1))
-    below = np.flatnonzero(rho < noise)
+    below = np.flatnonzero(rho < 2.0 / np.sqrt(max(count * freedom, 1.0)))
     kept = rho[: int(below[0]) if below.size else rho.size]
     lost = 0.0
     for _ in range(20 if kept.size else 0):
@@ -245,7 +243,7 @@ def regress(
     slope = (float((left * sample.vector).sum()) - offset) / power
     rest = sample.vector - slope * left
     lab = _turned(sample.rotation, rest)
-    rho = autocorrelation(lab, sample.freedom)
+    rho = autocorrelation(lagged_products(lab), sample.freedom)
     count = len(left)
     share = (left**2).sum(axis=(1, 2)) / total  # leverage of every frame
     scores = (left * rest).sum(axis=(1, 2)) / (1.0 - share)
@@ -301,7 +299,7 @@ def axis_noise(sample: Residuals) -> AxisNoise | None:
     inverse = np.linalg.inv(total)
     variance = inverse @ square.sum(axis=0)
     scores = square - mix @ variance
-    rho = autocorrelation(lab, sample.freedom)
+    rho = autocorrelation(lagged_products(lab), sample.freedom)
     spread = inverse @ scores.T @ scores @ inverse.T * (1.0 + 2.0 * float(rho @ rho))
     return AxisNoise(variance, spread)
 
