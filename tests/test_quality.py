@@ -158,7 +158,7 @@ def test_the_symmetry_of_a_noisy_shape_is_found(cluster, symbol):
 
 
 def stuck(seed, *, ratio=3.0, n_frames=300):
-    """A tetrahedron that does not move, sigma_z a multiple of sigma_xy."""
+    """Return a tetrahedron that does not move, sigma_z a multiple of sigma_xy."""
     body = perrin.Cluster.tetrahedron(1.5).positions
     rng = np.random.default_rng(seed)
     return body + rng.normal(size=(n_frames, 4, 3)) * [0.02, 0.02, 0.02 * ratio]
@@ -205,7 +205,7 @@ def test_worse_noise_along_z_is_no_stretch_and_no_scan(body, ratio):
 
 
 def test_the_ratio_of_the_noise_is_a_note_unless_another_was_stated():
-    """sigma_z three times sigma_xy: a note with its error; a warning against a stated ratio of 1."""
+    """sigma_z three times sigma_xy: a note with its error; a warning where 1 is stated."""
     x = noisy(31, sigma=(0.03, 0.03, 0.09))
     quality = judged(x)
     assert quality.warnings == ()
@@ -216,7 +216,7 @@ def test_the_ratio_of_the_noise_is_a_note_unless_another_was_stated():
 
 
 def soft_arm(seed, *, amplitude, memory, n_frames=300):
-    """A tetrahedron whose last particle swings about its place, with its memory in frames."""
+    """Return a tetrahedron whose last particle swings about its place (memory in frames)."""
     rng = np.random.default_rng(seed)
     truth = perrin.simulate_motion(
         perrin.Cluster.tetrahedron(1.5), D_R=5e-3, D_T=0.04, dt=0.73, n_frames=n_frames, rng=rng
