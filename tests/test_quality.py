@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import perrin
+from perrin.residuals import lag_one_autocorrelation
 
 
 def judged(x, **options):
@@ -272,3 +273,14 @@ def test_old_run_folders_are_read():
     old = perrin.Quality.from_dict(entry)
     assert old.notes == ()
     assert old.scan_delay is None
+
+
+def test_autocorrelation_of_a_known_series():
+    """An AR(1) series gives its coefficient back; gaps are not bridged."""
+    rng = np.random.default_rng(0)
+    x = np.zeros((5000, 4, 3))
+    for k in range(1, len(x)):
+        x[k] = 0.8 * x[k - 1] + rng.normal(size=(4, 3))
+    assert lag_one_autocorrelation(x).value == pytest.approx(0.8, abs=0.02)
+    x[::2] = np.nan
+    assert np.isnan(lag_one_autocorrelation(x).value)

@@ -16,6 +16,7 @@ from perrin.residuals import (
     autocorrelation,
     axis_noise,
     fit_projector,
+    lag_one_autocorrelation,
     lagged_products,
     measure_scan,
     measure_stretch,
@@ -193,7 +194,7 @@ def judge_quality(
     body = stretch.motion if stretched else motion
     everything = _with_detections(body, x / right, detections, right)
     sample = stretch.sample if stretched else sample_residuals(motion, x)
-    smooth = _lag_one(sample)
+    smooth = lag_one_autocorrelation(body_residuals(body, x / right))
     drift, pair, ends = _bond_drift(x / right)
     noise = axis_noise(stretch.sample)
     sigma_xyz = _sigma_per_axis(noise, right)
@@ -281,17 +282,6 @@ def _usual_sigma(sample: Residuals) -> float:
         return np.nan
     square = float(np.median((sample.vector**2).sum(axis=(1, 2)))) * count / (count - 1)
     return float(np.sqrt(square / (freedom * (1 - 2 / (9 * freedom)) ** 3)))
-
-
-def _lag_one(sample: Residuals) -> Slope:
-    """Return the lag-1 autocorrelation of residual vectors and its error; NaN without pairs."""
-    before, after = sample.vector[:-1], sample.vector[1:]
-    power = 0.5 * float((before**2).sum() + (after**2).sum())
-    if not power > 0:
-        return Slope(np.nan, np.nan, 0.0)
-    freedom = float(max(len(before) * sample.freedom, 1))
-    value = float((before * after).sum()) / power
-    return Slope(value, float(np.sqrt(max(1 - value**2, 0.0) / freedom)), freedom)
 
 
 def _with_detections(

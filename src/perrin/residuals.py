@@ -204,6 +204,35 @@ def autocorrelation(sums: Floats, freedom: float) -> Floats:
     return raised
 
 
+def lag_one_autocorrelation(residuals: Floats) -> Slope:
+    """Return the autocorrelation of residuals between neighbouring frames, and its error.
+
+    Parameters
+    ----------
+    residuals : ndarray, shape (T, n, d)
+        Body axes, NaN where missing; gaps are not bridged.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> white = np.random.default_rng(1).normal(size=(300, 4, 3))
+    >>> found = lag_one_autocorrelation(white)
+    >>> bool(abs(found.value) < 4 * found.stderr)
+    True
+    """
+    before, after = residuals[:-1], residuals[1:]
+    both = np.isfinite(before) & np.isfinite(after)
+    a, b = before[both], after[both]
+    power = 0.5 * float(a @ a + b @ b)
+    n, d = residuals.shape[1:]
+    freedom = a.size * float(degrees_of_freedom(np.array(n), d)) / (n * d)
+    if not power > 0:
+        return _UNKNOWN
+    value = float(a @ b) / power
+    error = np.sqrt(max(1 - value**2, 0.0) / freedom) if freedom > 0 else np.inf
+    return Slope(value, float(error), freedom)
+
+
 def lagged_products(vectors: Floats) -> Floats:
     """Return sum_k v_k . v_{k+lag} of vectors (K, ...) for the lags 0, ..., K - 1."""
     flat = vectors.reshape(len(vectors), -1)
