@@ -10,7 +10,6 @@ import pandas as pd
 import pytest
 
 import perrin
-from perrin.quality import _autocorrelation
 from perrin.report import render_html
 
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data" / "optitrack"
@@ -424,17 +423,6 @@ def test_text_clusters_are_numbered_and_named(base):
     report = perrin.analyze(table, dt=0.73)
     assert [(c.cluster, c.label) for c in report.clusters] == [(0, "knee"), (1, "leg")]
     assert any("belong to no cluster" in w for w in report.notes)
-
-
-def test_autocorrelation_of_a_known_series():
-    """An AR(1) series gives its coefficient back; gaps are not bridged."""
-    rng = np.random.default_rng(0)
-    x = np.zeros((20000, 1, 1))
-    for k in range(1, len(x)):
-        x[k] = 0.8 * x[k - 1] + rng.normal()
-    assert _autocorrelation(x) == pytest.approx(0.8, abs=0.02)
-    x[::2] = np.nan
-    assert np.isnan(_autocorrelation(x))
 
 
 @pytest.mark.parametrize("bad", [{"dt": 0.0}, {"dt": -1.0}, {"dt": np.nan}, {"scale": 0.0}])

@@ -35,6 +35,7 @@ ROOMS = [
     "linking",
     "screening",
     "grouping",
+    "residuals",
     "quality",
     "pairs",
     "lagged",

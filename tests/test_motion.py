@@ -444,7 +444,7 @@ def test_refused_frames_say_why():
     assert motion.reason[3] == "no particles"
     assert motion.reason[5] == "1 of 5 particles, 3 needed"
     assert motion.reason[7] == "2 of 5 particles, 3 needed"
-    assert "3 particles present lie on one line within the noise" in motion.reason[9]
+    assert "3 particles present lie too near one line" in motion.reason[9]
     lost = [3, 5, 7, 9]
     assert [k for k, reason in enumerate(motion.reason) if reason] == lost
     np.testing.assert_array_equal(np.delete(np.arange(120), lost), motion.fitted)
@@ -937,3 +937,38 @@ def test_pieces_are_taken_over():
         assert start.size == 18
     with pytest.raises(ValueError, match="piece: expected 20 whole numbers"):
         perrin.track_rotation(truth.positions(), dt=1.0, piece=piece[1:])
+
+
+def _tumbling(body, seed):
+    truth = simulate_motion(body, D_R=0.02, D_T=0.04, dt=0.73, n_frames=200, rng=seed)
+    return add_noise(truth.positions(), sigma=0.03, rng=seed + 1)
+
+
+@pytest.mark.parametrize("unit", [0.01, 0.1, 6.0, 100.0])
+def test_a_z_in_another_unit_is_named_with_its_factor(unit):
+    """Z in plane numbers or pixels: the refusal gives the factor that makes distances constant."""
+    x = _tumbling(Cluster.touching(5, 2.45), 1) * [1.0, 1.0, unit]
+    with pytest.raises(DegenerateClusterError, match="z is in another unit") as caught:
+        track_rotation(x, dt=0.73)
+    factor = float(str(caught.value).split("multiplied by ")[1].split()[0])
+    # Noise of 0.03 on 2.45 um biases the factor by 1e-3; three digits are printed.
+    assert factor == pytest.approx(1 / unit, rel=0.02)
+    assert "line" not in str(caught.value)
+
+
+def test_two_bodies_under_one_number_do_not_lie_on_a_line():
+    """Two pairs that diffuse apart: the pair whose distance changes is named."""
+    x = _tumbling(Cluster.tetrahedron(1.5), 3)
+    rng = np.random.default_rng(4)
+    x[:, 2:] += np.cumsum(rng.normal(size=(200, 1, 3)) * 0.6, axis=0)
+    with pytest.raises(DegenerateClusterError, match="more than one body under this number"):
+        track_rotation(x, dt=0.73)
+
+
+def test_a_line_is_stated_with_length_width_and_error():
+    """Particles on a line within the noise: the numbers that decide are in the message."""
+    x = np.zeros((200, 4, 3)) + np.arange(4)[None, :, None] * [2.0, 0, 0]
+    x += np.random.default_rng(5).normal(size=x.shape) * 0.03
+    with pytest.raises(DegenerateClusterError, match=r"one line .* length 2\.2.* error 0\.0") as e:
+        track_rotation(x, dt=0.73)
+    assert "rigid body" not in str(e.value)

@@ -34,6 +34,9 @@ Weights = Literal["equal", "sigma"]
 
 _CONVERGED = 1e-13  # rad: a Gauss-Newton step this short has arrived
 
+# Standard deviation of a pair's distance over its mean from which on a body is not rigid.
+_CHANGES = 0.2
+
 # An axis whose orientation is this uncertain (rad) is not determined: the particles lie on a line
 # within the noise, and the small-angle theory of every error has lost its meaning.
 _LOST_AXIS = 0.3
@@ -727,12 +730,17 @@ def _chain_steps(x: Floats, seen: Bools) -> tuple[Ints, Floats]:
 
 
 def _no_rotation(x: Floats) -> DegenerateClusterError:
+    """Return the refusal of frames that no rotation joins, with its cause."""
     _, n, d = x.shape
-    return DegenerateClusterError(
-        f"no rotation can be found: the {n} particles lie on one line, or no frame "
-        f"shares {d} of them with the others",
-        (n,),
-    )
+    seen = present(x).astype(np.float64)
+    shared = seen @ seen[np.argmax(seen.sum(axis=1))]
+    if np.sum(shared >= d) < 2:
+        text = f"no frame shares {d} of the {n} particles with the frame that shows most of them"
+    elif d == 3:
+        text = f"the {n} particles lie on one line"
+    else:
+        text = f"the {n} particles are in one place"
+    return DegenerateClusterError(f"no rotation can be found: {text}", (n,))
 
 
 def _too_few(count: int) -> TooFewFramesError:
@@ -893,10 +901,8 @@ def _measured(
     lost = worst > _LOST_AXIS
     fitted = np.isfinite(fit.rotation[:, 0, 0]) & ~lost
     if fitted.sum() < 2:
-        width = np.linalg.svd(fit.template, compute_uv=False)[d - 2] / np.sqrt(len(fit.template))
         raise DegenerateClusterError(
-            f"the {len(fit.template)} particles lie on one line within the noise: width "
-            f"{width:.3g} um, localisation error {np.sqrt(noise.mean()):.3g} um",
+            _no_orientation(x, fit.template, float(np.sqrt(noise.mean()))),
             tuple(int(k) for k in np.flatnonzero(lost)),
         )
     square = np.where(seen[..., None], fit.residual, np.nan) ** 2
@@ -916,6 +922,65 @@ def _measured(
         noise=np.sqrt(noise),
         dt=float(dt),
     )
+
+
+def _no_orientation(x: Floats, template: Floats, noise: float) -> str:
+    """State why no frame fixes the orientation: distances that change, or particles on a line."""
+    n, d = template.shape
+    change, pair, scale = _distance_changes(x)
+    if change > _CHANGES:
+        cause = (
+            "more than one body under this number, or labels that change?"
+            if scale is None
+            else f"with z multiplied by {scale:.3g} all are constant: z is in another unit?"
+        )
+        return (
+            f"the {n} particles are no rigid body: the distance of particles {pair[0]} and "
+            f"{pair[1]} (counted from 0) changes by {change:.0%} (standard deviation over mean): "
+            f"{cause}"
+        )
+    extent = np.linalg.svd(template, compute_uv=False) / np.sqrt(n)
+    if d == 2:
+        return (
+            f"the {n} particles are in one place within the noise: extent {extent[0]:.3g} um, "
+            f"localisation error {noise:.3g} um"
+        )
+    return (
+        f"the {n} particles lie on one line within the noise: length {extent[0]:.3g} um, width "
+        f"{extent[1]:.3g} um (root mean squares), localisation error {noise:.3g} um"
+    )
+
+
+def _distance_changes(x: Floats) -> tuple[float, tuple[int, int], float | None]:
+    """Return the largest relative scatter of a pair's distance, the pair, and the scale of z.
+
+    The scale is the factor on z that makes the squared distances most constant, where it makes
+    them constant within a tenth of their scatter: of w . (x^2 + y^2, z^2) the ratio of mean square
+    to variance is largest for the w of a generalised eigenvector.
+    """
+    i, j = np.triu_indices(x.shape[1], 1)
+    square = (x[:, i] - x[:, j]) ** 2
+    distance = np.sqrt(square.sum(axis=2))
+    mean = _nan_mean(distance, axis=0)
+    scatter = np.sqrt(_nan_mean((distance - mean) ** 2, axis=0))
+    change = np.divide(scatter, mean, out=np.zeros_like(mean), where=mean > 0)
+    k = int(np.argmax(np.nan_to_num(change)))
+    worst, pair = float(np.nan_to_num(change)[k]), (int(i[k]), int(j[k]))
+    if x.shape[2] == 2 or not worst > 0:
+        return worst, pair, None
+    parts = np.stack([square[..., :2].sum(axis=2), square[..., 2]], axis=-1)
+    middle = _nan_mean(parts, axis=0)
+    off = (parts - middle)[np.isfinite(parts).all(axis=2)]
+    variance, power = off.T @ off, middle.T @ middle
+    if not np.linalg.cond(variance) < 1e12:
+        return worst, pair, None
+    value, vector = np.linalg.eig(np.linalg.solve(variance, power))
+    w = vector[:, int(np.argmax(value.real))].real
+    left = float(w @ variance @ w) / float(w @ power @ w)
+    before = float(variance.sum()) / float(power.sum())
+    if not (w[0] * w[1] > 0 and left < 0.01 * before):
+        return worst, pair, None
+    return worst, pair, float(np.sqrt(w[1] / w[0]))
 
 
 def _pose_errors(fit: _Fit, seen: Bools, noise: Floats) -> tuple[Floats, Floats]:
@@ -944,7 +1009,10 @@ def _reasons(seen: Bools, fitted: Bools, lost: Bools, d: int) -> tuple[str, ...]
         if count < d:
             return f"{count} of {n} particles, {d} needed" if count else "no particles"
         if blurred:
-            return f"the {count} particles present lie on one line within the noise"
+            return (
+                f"the {count} particles present lie too near one line for their noise: the "
+                f"orientation is uncertain by over {_LOST_AXIS} rad"
+            )
         return f"the {count} particles present do not fix a rotation"
 
     rows = zip(seen.sum(axis=1), fitted, lost, strict=True)
