@@ -587,6 +587,8 @@ def _fit_body(tracks: _Tracks, cluster: int, label: str | None, conditions: Cond
         positions,
         sigma=conditions.sigma,
         sigma_ratio=conditions.sigma_ratio,
+        detections=tracks.positions,
+        unsettled=tuple(identity.unsettled.tolist()),
         swaps=tuple(frames[identity.swaps].tolist()),
         cuts=tuple(frames[1:][changed].tolist()),
         extra=tuple(frames[identity.extra].tolist()),
@@ -601,7 +603,7 @@ def _fit_body(tracks: _Tracks, cluster: int, label: str | None, conditions: Cond
         motion,
         quality,
         (*warnings, *quality.warnings),
-        (*tracks.far_text(conditions.first_frame), *notes, *getattr(quality, "notes", ())),
+        (*tracks.far_text(conditions.first_frame), *notes, *quality.notes),
         centred=centre_removed(tracks.positions),
     )
 

@@ -845,7 +845,7 @@ def _show(report: Report, output: Path, command: Callable[..., None]) -> None:
     for result in report.clusters[:_SHOWN]:
         console.print(_cluster_table(result))
         if result.tensor is not None and result.tensor.p_isotropic < _UNEQUAL:
-            axes = f"rotation about the body's axes: {result.tensor}\n"
+            axes = f"rotation about the body's axes: {result.tensor.summary}\n"
             console.print(escape(axes), soft_wrap=True)
     if report.pooled is not None and len(report.clusters) > 1:
         console.print(_pooled_table(report.pooled))
@@ -936,7 +936,7 @@ def _prediction_rows(result: ClusterResult) -> Iterator[tuple[str, ...]]:
             yield f"{name}, predicted", f"{compared.predicted:.4g}", _pull_text(compared)
         for k, one in enumerate(axes, start=1):
             measured = f"measured {one.measured:.3g}"
-            yield f"  principal {k}", f"{one.predicted:.4g}", _pull_text(one), measured
+            yield f"  axis {k}", f"{one.predicted:.4g}", _pull_text(one), measured
 
 
 def _pull_text(compared: Compared) -> str:
@@ -950,14 +950,18 @@ def _show_prediction(body: Mobility, *, name: str) -> None:
     from rich.markup import escape
     from rich.table import Table
 
+    from perrin.tensors import axes_like
+
     title = f"{escape(name)}, {len(body.radius)} spheres of {body.sphere_diameter:.4g} um"
     table = Table(
         "", "mean", "principal values", title=title, title_justify="left", box=SIMPLE_HEAD
     )
     table.columns[0].no_wrap = True
+    turn, path = body.principal_D_R, body.principal_D_T
+    same_axes = axes_like(path.axes, turn.axes)
     for label, values in (
-        ("D_T (um^2/s)", body.principal_D_T.values),
-        ("D_R (rad^2/s)", body.principal_D_R.values),
+        ("D_T (um^2/s)", path.values[same_axes]),
+        ("D_R (rad^2/s)", turn.values),
     ):
         shown = ", ".join(f"{value:.5g}" for value in values)
         table.add_row(label, f"{values.mean():.5g}", shown)

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from perrin._arrays import Ints
 
 # Times that are off an even grid by less than this share of dt are on it.
-EVEN = 5e-4
+_EVEN = 5e-4
 # The usual interval of the column may differ from dt by this share: what clocks and rounding do.
 _AGREES = 0.01
 _LISTED = 5
@@ -69,10 +69,9 @@ def read_clock(table: pd.DataFrame, *, dt: float) -> Clock:
             f"the column time: {'; '.join(faults)}. Correct it or dt, or leave the column out",
             tuple(faults),
         )
-    since = time - time[0]
-    grid = dt * (frame - frame[0])
-    if np.all(np.abs(since - grid) <= EVEN * dt):
+    if evenly_spaced(time, frame, dt=dt):
         return Clock(None, ())
+    since = time - time[0]
     last = int(table["frame"].max())
     numbers = np.arange(last + 1)
     times = np.interp(numbers, frame, since)
@@ -85,9 +84,22 @@ def read_clock(table: pd.DataFrame, *, dt: float) -> Clock:
     ]
     if not known.all():
         notes.append(f"{(~known).sum()} frames have no time; theirs is interpolated")
-    if spread > EVEN * dt:
+    if spread > _EVEN * dt:
         notes.append(f"the times of one frame differ by up to {spread:.3g} s; their mean is used")
     return Clock(times, tuple(notes))
+
+
+def evenly_spaced(times: Floats, frames: Ints, *, dt: float) -> bool:
+    """Return whether frames were recorded dt apart, counted from the first.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> evenly_spaced(np.array([3.0, 3.5, 4.5]), np.array([0, 1, 3]), dt=0.5)
+    True
+    """
+    grid = times[0] + dt * (frames - frames[0])
+    return bool(np.all(np.abs(times - grid) <= _EVEN * dt))
 
 
 def _faults(frame: Ints, time: Floats, *, missing: int, spread: float, dt: float) -> list[str]:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from perrin._arrays import Floats, PrecisionWarning, UnitWarning
+from perrin._arrays import Floats, Ints, PrecisionWarning, UnitWarning
 from perrin.hydrodynamics import (
     Size,
     neighbour_distance,
@@ -16,14 +16,14 @@ from perrin.hydrodynamics import (
     size_from_rotation,
     size_from_translation,
 )
-from perrin.mobility import Mobility, cluster_mobility
+from perrin.mobility import Mobility, Principal, cluster_mobility
 from perrin.shapes import matching_rotation
+from perrin.tensors import axes_like
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from perrin.diffusion import DiffusionEstimate
-    from perrin.mobility import Principal
     from perrin.tensors import DiffusionTensor
 
 # Shapes are alike if particles differ by less than this many standard errors; one in 10^5 is missed
@@ -302,6 +302,11 @@ def compare_body(
     Prediction
     """
     T, R = mobility.principal_D_T, mobility.principal_D_R
+    # "Axis 1" is the same axis of the body in every table: that of the measured tensor of rotation
+    # where its axes are known, else the one about which the body should turn slowest.
+    known = tensor_R is not None and bool(tensor_R.resolved_axes.all())
+    reference = tensor_R.axes if known and tensor_R is not None else R.axes
+    T, R = (_ordered(principal, axes_like(principal.axes, reference)) for principal in (T, R))
     return Prediction(
         diameter=mobility.sphere_diameter,
         error=mobility.error,
@@ -343,6 +348,10 @@ def are_unequal(principal_values: Floats) -> bool:
 def _beside(predicted: float, estimate: DiffusionEstimate) -> Compared:
     error = estimate.stderr if is_known(estimate) else float("nan")
     return Compared(predicted, estimate.value, error)
+
+
+def _ordered(principal: Principal, order: Ints) -> Principal:
+    return Principal(principal.values[order], principal.axes[:, order])
 
 
 def _principal(values: Principal, tensor: DiffusionTensor | None) -> tuple[Compared, ...]:

@@ -6,14 +6,13 @@ import json
 import os
 import shutil
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from perrin.clock import EVEN
 from perrin.diffusion import DiffusionEstimate, with_error
 from perrin.hydrodynamics import Size
 from perrin.images.imaging import Imaging, read_imaging, write_imaging
@@ -29,8 +28,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     import pandas as pd
-
-    from perrin._arrays import Floats
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,12 +78,12 @@ class ClusterResult:
     @cached_property
     def msad(self) -> LagCurve:
         """The MSAD averaged over the particles' directions."""
-        return msad(counted(self.motion))
+        return msad(self.motion)
 
     @cached_property
     def msd(self) -> LagCurve:
         """The MSD of the centre."""
-        return msd(counted(self.motion))
+        return msd(self.motion, drift=self.D_T.drift is not None)
 
     @property
     def phi2_measured(self) -> float:
@@ -461,19 +458,6 @@ def perp_text(rod: RodResult) -> str:
     """Return a rod's coefficients as one line."""
     shown = with_error(rod.D_perp.value, rod.D_perp.stderr)
     return f"rod {rod.name}: D_perp = {shown} {rod.D_perp.unit}; {rod.D_T}"
-
-
-def counted(motion: RigidMotion) -> RigidMotion:
-    """Return a motion of every frame with uneven times as one of even times, for lags in frames."""
-    if evenly_spaced(motion.time, dt=motion.dt):
-        return motion
-    return replace(motion, time=motion.dt * np.arange(len(motion.time), dtype=np.float64))
-
-
-def evenly_spaced(times: Floats, *, dt: float) -> bool:
-    """Return whether times are those of neighbouring frames dt apart, from the first on."""
-    grid = times[0] + dt * np.arange(len(times))
-    return bool(np.all(np.abs(times - grid) <= EVEN * dt))
 
 
 def predicted_noise(motion: RigidMotion) -> NoiseFloor:

@@ -13,6 +13,7 @@ import numpy as np
 import perrin.images.checks as checks
 from perrin._arrays import Floats, IdentityError, TooFewFramesError
 from perrin.analysis import Conditions, check_arguments, measure_table, told_conditions
+from perrin.clock import evenly_spaced
 from perrin.images.bodies import Bodies, find_bodies, stated_errors, tracks_of
 from perrin.images.imaging import Imaging, View
 from perrin.images.locate import NO_FLAT_MODEL, Search, check_search, is_flat
@@ -20,7 +21,6 @@ from perrin.images.parts import PartsError
 from perrin.images.stacks import digest
 from perrin.images.stages import Located, Workplace, fit_poses, locate_frames
 from perrin.images.workers import check_workers
-from perrin.results import evenly_spaced
 from perrin.steps import choice_faults
 
 if TYPE_CHECKING:
@@ -187,7 +187,7 @@ def _listed(count: int, frames: tuple[int | None, int | None] | None) -> list[in
 
 def _uneven(stack: Stack) -> Floats | None:
     """Return the times of the frames where they are not evenly spaced."""
-    return None if evenly_spaced(stack.times, dt=stack.dt) else stack.times
+    return None if evenly_spaced(stack.times, np.arange(len(stack)), dt=stack.dt) else stack.times
 
 
 def _check(
