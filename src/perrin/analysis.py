@@ -509,7 +509,7 @@ class _Failure(NamedTuple):
 
     @property
     def reason(self) -> str:
-        return str(self.error).removeprefix("motion 0: ")
+        return str(self.error)
 
 
 def _failures_text(failures: list[_Failure]) -> list[str]:
@@ -654,14 +654,13 @@ def _estimate_body(body: _Body, conditions: Conditions, done: _Estimated, *, bod
     D_R, D_T = turn.estimate, path.estimate
     noise = predicted_noise(motion)
     tensor, unfound = _tensor(turn.motion, conditions)
-    other_motion = turn.steady or turn.jumps.rows.size
+    # The offset of steps that contain another motion, or of a body that bends, is no noise.
+    floor: list[str] = []
+    if body.quality.rigid and not (turn.steady or turn.jumps.rows.size):
+        floor = _floor_mismatch(motion, D_R, noise, stated=conditions.sigma is not None)
     warnings = (
         *body.warnings,
-        *(
-            []
-            if other_motion
-            else _floor_mismatch(motion, D_R, noise, stated=conditions.sigma is not None)
-        ),
+        *floor,
         *turn.warnings,
         *path.warnings,
         *_limits_text(D_R, D_T),

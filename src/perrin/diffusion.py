@@ -287,7 +287,7 @@ def estimate_diffusion(
     """
     motions = [motion] if isinstance(motion, RigidMotion) else list(motion)
     _check(motions, quantity=quantity, method=method, noise=noise, exposure=exposure, drift=drift)
-    steps = [_steps(i, m, quantity) for i, m in enumerate(motions)]
+    steps = [_steps(i if len(motions) > 1 else None, m, quantity) for i, m in enumerate(motions)]
     if method == "mle":
         tracks = [track_of(s, noise=noise, exposure=exposure, drift=drift) for s in steps]
         found = by_likelihood(tracks)
@@ -436,11 +436,12 @@ def _coarse(step: float, *, planar: bool) -> list[str]:
     ]
 
 
-def _steps(number: int, motion: RigidMotion, quantity: Quantity) -> Steps:
+def _steps(number: int | None, motion: RigidMotion, quantity: Quantity) -> Steps:
     try:
         return steps_of(motion, quantity)
     except TooFewFramesError as error:
-        raise TooFewFramesError(f"motion {number}: {error}", error.n_frames) from None
+        where = "" if number is None else f"motion {number}: "
+        raise TooFewFramesError(f"{where}{error}", error.n_frames) from None
 
 
 def _check(
