@@ -1,0 +1,297 @@
+"""Small tables with right values: what a table may hold, and what the answer must then be.
+
+Every table is made here with numpy and scipy alone. The right values were derived by taking the
+trait away by hand (a table without the jump, the placeholder) or are those that were planted.
+"""
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy.signal import lfilter
+from scipy.spatial.transform import Rotation
+
+import perrin
+
+DT = 0.73
+D_R = 5e-3
+TETRA = 1.5 * np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / np.sqrt(3)
+EVEN = np.arange(300) * DT
+
+
+def triangle(a, b, c):
+    x = (a * a + b * b - c * c) / (2 * a)
+    corners = np.array([[0, 0, 0], [a, 0, 0], [x, np.sqrt(b * b - x * x), 0]])
+    return corners - corners.mean(axis=0)
+
+
+def brownian(body, times, D_T, rng, *, D=D_R):
+    """Return the places (T, n, 3) of a body that turns and moves without noise."""
+    turn, centre, places = Rotation.identity(), np.zeros(3), [body]
+    for step in np.diff(times):
+        parts = max(1, int(np.ceil(4 * D * step / 0.02)))
+        for _ in range(parts):
+            turn *= Rotation.from_rotvec(rng.normal(size=3) * np.sqrt(2 * D * step / parts))
+        centre = centre + rng.normal(size=3) * np.sqrt(2 * D_T * step)
+        places.append(turn.apply(body) + centre)
+    return np.array(places)
+
+
+def table(x, **columns):
+    frames, n, _ = x.shape
+    numbers = np.indices((frames, n)).reshape(2, -1)
+    rows = pd.DataFrame({"frame": numbers[0], "particle": numbers[1]})
+    rows[["x", "y", "z"]] = x.reshape(-1, 3).round(5)
+    return rows.assign(**{name: np.repeat(values, n) for name, values in columns.items()})
+
+
+def tetrahedra(seed, D_T, *, times=EVEN, offset=0.0):
+    rng = np.random.default_rng(seed)
+    x = brownian(TETRA, times, D_T, rng)
+    return x + rng.normal(size=x.shape) * 0.03 + offset, rng
+
+
+def only(report):
+    (cluster,) = report.clusters
+    return cluster
+
+
+def texts(report):
+    return [*report.warnings, *(w for c in report.clusters for w in c.warnings)]
+
+
+def notes(report):
+    return [*report.notes, *(n for c in report.clusters for n in c.notes)]
+
+
+def near(estimate, planted, errors=3.5):
+    """Return whether a planted value is within 3.5 errors: by chance it is not once in 2000."""
+    return abs(estimate.value - planted) < errors * estimate.stderr
+
+
+def test_right_labels_of_an_uneven_trimer_stay():
+    """Sides of 2.40, 2.50, 2.45 um, 3 % of the frames four times as noisy: nothing is exchanged."""
+    rng = np.random.default_rng(2)
+    x = brownian(triangle(2.40, 2.50, 2.45), np.arange(600) * DT, 0.04, rng)
+    noise = rng.normal(size=x.shape) * 0.02
+    noise[rng.random(600) < 0.03] *= 4
+    report = perrin.analyze(table(x + noise), dt=DT)
+    cluster = only(report)
+    assert near(cluster.D_R, D_R)
+    assert cluster.D_R.stderr < 4e-4
+    assert cluster.quality.swaps == ()
+    assert cluster.quality.cuts == ()
+    assert not texts(report)
+
+
+def test_a_flow_is_named_and_its_removal_exact():
+    """1 um/s: named with its error; with drift=True the answer of the table without it."""
+    x, _ = tetrahedra(88, 0.02)
+    flow = x + EVEN[:, None, None] * [1.0, 0, 0]
+    still = only(perrin.analyze(table(x), dt=DT, drift=True))
+    report = perrin.analyze(table(flow), dt=DT)
+    assert only(report).D_T.value > 5 * still.D_T.value
+    (text,) = texts(report)
+    assert "the centre moves steadily at 0.98" in text
+    assert "um/s" in text
+    off = only(perrin.analyze(table(flow), dt=DT, drift=True))
+    # The tables are rounded to 1e-5 um, which makes the last digits of both differ.
+    for one, other in ((off.D_T, still.D_T), (off.D_R, still.D_R)):
+        assert [one.value, one.stderr, *one.ci95] == pytest.approx(
+            [other.value, other.stderr, *other.ci95], rel=1e-4
+        )
+    np.testing.assert_allclose(off.msd.value, still.msd.value, rtol=1e-3, atol=1e-5)
+    np.testing.assert_allclose(off.msd.stderr[:20], still.msd.stderr[:20], rtol=1e-3)
+
+
+def test_a_stage_jump_is_named_and_left_out():
+    """3 um between frames 149 and 150: D_T of the table without it but for one step in 299."""
+    x, _ = tetrahedra(88, 0.02)
+    clean = only(perrin.analyze(table(x), dt=DT))
+    x[150:, :, 0] += 3
+    report = perrin.analyze(table(x), dt=DT)
+    assert only(report).D_T.value == pytest.approx(clean.D_T.value, rel=0.01)
+    assert only(report).jumps == {"translation": (150,)}
+    (text,) = texts(report)
+    assert text.startswith("jump: the centre moves by 2.96 um")
+    assert "frame 150" in text
+    kept = perrin.analyze(table(x), dt=DT, keep_jumps=True)
+    assert only(kept).D_T.value > 1.25 * clean.D_T.value
+    assert only(kept).jumps == {}
+    assert any("jump" in text for text in texts(kept))
+
+
+def test_the_frames_of_a_jump_bear_the_tables_own_numbers():
+    """A table that begins at frame 1000 has its jump at frame 1150."""
+    x, _ = tetrahedra(88, 0.02)
+    x[150:, :, 0] += 3
+    rows = table(x)
+    report = perrin.analyze(rows.assign(frame=rows["frame"] + 1000), dt=DT)
+    assert "frame 1150" in texts(report)[0]
+
+
+def test_the_column_time_is_used():
+    """Every 30th interval is a pause of 20 s."""
+    gaps = np.full(299, DT)
+    gaps[29::30] = 20.0
+    times = np.append(0, gaps.cumsum())
+    x, _ = tetrahedra(5100, 0.02, times=times)
+    report = perrin.analyze(table(x, time=times.round(5)), dt=DT)
+    cluster = only(report)
+    assert near(cluster.D_R, D_R)
+    assert near(cluster.D_T, 0.02)
+    assert any("column time" in note for note in notes(report))
+    # Lags are times: the first is the usual interval, and the curve is that of the same D.
+    assert cluster.msd.lagtime[0] == pytest.approx(DT, rel=1e-3)
+    line = 6 * cluster.D_T.value * cluster.msd.lagtime[:20] + 6 * cluster.D_T.offset
+    assert np.all(np.abs(cluster.msd.value[:20] - line) < 4 * cluster.msd.stderr[:20])
+    with pytest.raises(perrin.TrackTableError, match=r"0\.73 s a frame, .* dt = 0\.5 s"):
+        perrin.analyze(table(x, time=times.round(5)), dt=0.5)
+
+
+def test_a_body_at_rest_is_one_body():
+    """A trimer at rest whose error of 2 nm is smooth in time: one body of 3, sigma right.
+
+    Its 250 frames are worth about 3 independent ones per coordinate of 3 degrees of freedom.
+    """
+    e = np.random.default_rng(5).normal(size=(250, 3, 3))
+    smooth = lfilter([np.sqrt(1 - 0.98**2)], [1, -0.98], e, axis=0)
+    cluster = only(perrin.analyze(table(triangle(2.45, 2.45, 2.45) + 0.002 * smooth), dt=DT))
+    assert len(cluster.motion.template) == 3
+    assert cluster.motion.sigma == pytest.approx(0.0016, rel=0.05)
+    assert cluster.quality.rigid
+
+
+@pytest.mark.parametrize("trait", ["left out", "zeros", "last place"])
+def test_lost_particles_however_written(trait):
+    """5 % of the particles lost: rows left out, (0, 0, 0), or the last place: one answer."""
+    x, rng = tetrahedra(227, 0.04, offset=20.0)
+    lost = rng.random((300, 4)) < 0.05
+    if trait == "zeros":
+        report = perrin.analyze(table(np.where(lost[..., None], 0.0, x)), dt=DT)
+        assert any(f"{lost.sum()} rows" in w and "(0, 0, 0)" in w for w in report.warnings)
+    elif trait == "last place":
+        y = x.round(5)
+        for k in range(1, 300):
+            y[k, lost[k]] = y[k - 1, lost[k]]
+        report = perrin.analyze(table(y), dt=DT)
+        assert any(f"{lost[1:].sum()} rows" in w and "previous" in w for w in report.warnings)
+    else:
+        report = perrin.analyze(table(x)[~lost.ravel()], dt=DT)
+        assert not texts(report)
+    cluster = only(report)
+    reference = only(perrin.analyze(table(x)[~lost.ravel()], dt=DT))
+    assert near(cluster.D_R, D_R)
+    # A frame in which the first particle was lost differs between the tables.
+    assert cluster.D_R.value == pytest.approx(reference.D_R.value, rel=0.01)
+    assert not cluster.warnings
+
+
+def test_a_centred_table_has_no_translation():
+    """The centre was taken off in every frame: D_R stands, D_T is none, in words."""
+    x, _ = tetrahedra(227, 0.04)
+    rows = table(x - x.mean(axis=1, keepdims=True))
+    report = perrin.analyze(rows, dt=DT)
+    cluster = only(report)
+    assert near(cluster.D_R, D_R)
+    assert np.isnan(cluster.D_T.value)
+    assert str(cluster.D_T) == "D_T: none (the centre does not move)"
+    assert report.to_dict()["clusters"][0]["D_T"]["value"] is None
+    (text,) = texts(report)
+    assert "the centre does not move" in text
+
+
+def test_a_report_without_translation_comes_back(tmp_path):
+    """What a run folder keeps of an absent D_T is read back as absent, pictures and page made."""
+    x, _ = tetrahedra(227, 0.04)
+    report = perrin.analyze(table(x - x.mean(axis=1, keepdims=True)), dt=DT)
+    perrin.write_run(report, tmp_path / "run")
+    back = perrin.load_run(tmp_path / "run")
+    assert np.isnan(only(back).D_T.value)
+    assert str(only(back).D_T) == str(only(report).D_T)
+
+
+def test_frame_numbers_in_steps_of_five():
+    """Frames 0, 5, 10, ...: the signal-to-noise ratio is that of the steps there are."""
+    x, _ = tetrahedra(227, 0.04)
+    one = perrin.analyze(table(x), dt=DT)
+    rows = table(x)
+    five = perrin.analyze(rows.assign(frame=5 * rows["frame"]), dt=DT)
+    assert only(five).D_R.snr == pytest.approx(only(one).D_R.snr, rel=1e-9)
+    assert 5 * only(five).D_R.value == pytest.approx(only(one).D_R.value, rel=1e-9)
+    assert any("multiples of 5" in note for note in five.notes)
+    assert not any("no pose" in note for note in notes(five))
+
+
+def test_a_steady_turn_is_named_and_taken_off():
+    """0.2 rad/s about the lab's z beside D_R = 0.005."""
+    rng = np.random.default_rng(258)
+    turn, places = Rotation.identity(), [TETRA]
+    for _ in range(299):
+        for _ in range(4):
+            turn *= Rotation.from_rotvec(rng.normal(size=3) * np.sqrt(2 * D_R * DT / 4))
+            turn = Rotation.from_rotvec([0, 0, 0.2 * DT / 4]) * turn
+        places.append(turn.apply(TETRA))
+    x = np.array(places) + np.cumsum(rng.normal(size=(300, 1, 3)) * np.sqrt(0.04 * DT), axis=0)
+    rows = table(x + rng.normal(size=x.shape) * 0.03)
+    (text,) = texts(perrin.analyze(rows, dt=DT))
+    assert "the body turns steadily at 0.20" in text
+    assert "rad/s" in text
+    report = perrin.analyze(rows, dt=DT, drift=True)
+    assert near(only(report).D_R, D_R)
+    assert abs(only(report).D_R.drift[0][2] - 0.2) < 4 * only(report).D_R.drift_stderr[0][2]
+    assert not texts(report)
+
+
+def test_a_slow_body_with_worse_z_is_one_body():
+    """sigma_z four times sigma_xy on an upright trimer that hardly turns: one body of 3."""
+    rng = np.random.default_rng(3)
+    body = np.array([[-1.225, 0, 0], [1.225, 0, 0], [0, 0, 2.122]])
+    x = brownian(body, np.arange(250) * DT, 1e-4, rng, D=1e-5)
+    report = perrin.analyze(table(x + rng.normal(size=x.shape) * [0.02, 0.02, 0.08]), dt=DT)
+    assert len(only(report).motion.template) == 3
+    assert not report.rods
+    assert not any("z scale" in text or "scan" in text for text in texts(report))
+
+
+def test_a_stuck_body_says_nothing_of_the_scale_of_z():
+    """sigma_z three times sigma_xy on a body that does not turn: no z scale, no warning."""
+    rng = np.random.default_rng(12)
+    report = perrin.analyze(table(TETRA + rng.normal(size=(300, 4, 3)) * [0.02, 0.02, 0.06]), dt=DT)
+    assert only(report).quality.z_scale is None
+    assert not texts(report)
+
+
+def test_two_clusters_that_exchange_labels_are_named():
+    """Bodies that take each other's numbers from frame 200 on jump there, in opposite ways."""
+    one, _ = tetrahedra(2, 0.02)
+    other, _ = tetrahedra(3, 0.02, offset=6.0)
+    first = np.concatenate([one[:200], other[200:]])
+    second = np.concatenate([other[:200], one[200:]])
+    rows = pd.concat(
+        [table(first).assign(cluster=0), table(second).assign(cluster=1)], ignore_index=True
+    )
+    rows["particle"] += 10 * rows["cluster"]
+    report = perrin.analyze(rows, dt=DT)
+    assert any("frame 200: their labels were exchanged" in text for text in report.warnings)
+    for cluster in report.clusters:
+        assert near(cluster.D_T, 0.02)
+        assert near(cluster.D_R, D_R)
+
+
+def test_nothing_is_pooled_where_no_cluster_is_rigid():
+    """Soft bodies stay in the report, without a pooled value, and that is the first warning."""
+    bodies = []
+    for seed in (3, 4):
+        x, rng = tetrahedra(seed, 0.02)
+        soft = lfilter([np.sqrt(1 - 0.9**2)], [1, -0.9], rng.normal(size=x.shape), axis=0)
+        bodies.append(table(x + 0.3 * soft).assign(cluster=seed))
+    rows = pd.concat(bodies, ignore_index=True)
+    rows["particle"] += 10 * rows["cluster"]
+    report = perrin.analyze(rows, dt=DT)
+    assert [c.quality.rigid for c in report.clusters] == [False, False]
+    assert report.pooled is None
+    assert "none of the 2 clusters is a rigid body" in report.warnings[0]
+    rigid = table(tetrahedra(5, 0.02)[0]).assign(cluster=9)
+    rigid["particle"] += 90
+    mixed = perrin.analyze(pd.concat([rows, rigid], ignore_index=True), dt=DT)
+    assert mixed.pooled.clusters == (9,)
