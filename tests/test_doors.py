@@ -23,7 +23,6 @@ ROOMS = [
     "_text",
     "_units",
     "_arrays",
-    "_text",
     "clock",
     "rotations",
     "shapes",

@@ -7,17 +7,18 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from perrin._arrays import Floats, TrackTableError
+from perrin._text import frames_text
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from perrin._arrays import Ints
+    from perrin._text import frames_text
+from perrin._arrays import Ints
 
 # Times that are off an even grid by less than this share of dt are on it.
 _EVEN = 5e-4
 # The usual interval of the column may differ from dt by this share: what clocks and rounding do.
 _AGREES = 0.01
-_LISTED = 5
 
 
 class Clock(NamedTuple):
@@ -111,9 +112,7 @@ def _faults(frame: Ints, time: Floats, *, missing: int, spread: float, dt: float
         return []
     back = np.flatnonzero(step <= 0)
     if back.size:
-        listed = ", ".join(str(k) for k in frame[back[:_LISTED] + 1])
-        more = f" and {back.size - _LISTED} more" if back.size > _LISTED else ""
-        return [f"it does not rise from one frame to the next at frames {listed}{more}"]
+        return [f"it does not rise from one frame to the next at {frames_text(frame[back + 1])}"]
     usual = float(np.median(step / number))
     faults = []
     if abs(usual - dt) > _AGREES * dt:
