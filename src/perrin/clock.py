@@ -12,8 +12,7 @@ from perrin._text import frames_text
 if TYPE_CHECKING:
     import pandas as pd
 
-    from perrin._text import frames_text
-from perrin._arrays import Ints
+    from perrin._arrays import Ints
 
 # Times that are off an even grid by less than this share of dt are on it.
 _EVEN = 5e-4
