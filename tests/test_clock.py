@@ -33,7 +33,7 @@ def test_pauses_are_kept_and_missing_frames_interpolated():
     [
         (0.5 * np.arange(9), ["0.5 s a frame", "dt = 0.73"]),
         (730.0 * np.arange(9), ["730 s a frame", "dt = 0.73"]),
-        (0.73 * np.array([0, 1, 2, 2, 3]), ["does not rise", "frames 3"]),
+        (0.73 * np.array([0, 1, 2, 2, 3]), ["does not rise", "frame 3"]),
         (0.73 * np.array([0, 1, 2, 1.5, 3]), ["does not rise"]),
     ],
 )
