@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import combinations, permutations
+from math import lgamma
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -18,16 +19,22 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike
 
-# A fit is noise-like up to so many times the usual mean square residual: chance does not reach it,
-# and a swapped pair (1000 times and more) is far above.
+# A fit is noise-like up to this multiple of the usual mean square residual: chance does not reach
+# it in a frame of usual quality, and an exchanged pair (1000 times and more) is far above.
 _NOISE = 16.0
+# Degrees of freedom of the Student law of the misfit of a frame. The variance of a frame is then
+# over 20 times the usual one with probability 0.005, and the odds between two assignments of a bad
+# frame depend on the ratio of their misfits, not on the difference in units of usual noise.
+_STUDENT = 4.0
 # Up to so many particles every assignment is tried, and so many frames at most build the template.
 _ALL, _MODELS = 6, 300
 # Log-odds: an assignment is settled when the next best is a hundred times less likely, and lasting
 # labels are trusted e^10 times more than an exchange of them.
 _DOUBT, _TRUST = float(np.log(100.0)), 10.0
-# A step of over four standard deviations of an axis (squared) counts as one of four.
-_LEAP = 16.0
+# A least turn of over this many standard deviations of an axis (squared) widens the law of the step
+# to itself. Lasting labels that turn the body 75 degrees are kept against an exchange that leaves
+# 45 (a tetrahedron), and replaced where the exchange leaves a third or less of the turn.
+_LEAP_UNLABELLED, _LEAP_LABELLED = 16.0, 4.0
 # A step of under 0.4 of the least angle between two assignments cannot be mistaken.
 _SHORT = 0.4
 _BATCH = 100_000
@@ -144,8 +151,10 @@ def settle_identity(
     body = _body(frames, seed, labelled=labelled)
     lists = _assignments(frames, body, labelled=labelled)
     answer = _chained(frames, body, lists, time, labelled=labelled)
-    if labelled and not answer.cuts.size:
+    seat = _completed(body.seat, answer.order) if labelled else body.seat
+    if labelled and not answer.cuts.size and (seat == body.seat).all():
         return answer
+    body = body._replace(seat=seat)
     # The first shape mixes equivalent views of the body; the second keeps its small irregularities.
     body = _remade(body, answer, x)
     lists = _assignments(frames, body, labelled=labelled)
@@ -173,21 +182,29 @@ class _Frames(NamedTuple):
 
 
 class _Body(NamedTuple):
-    """The shape, its noise, its near-symmetries as permutations, and the label of each particle."""
+    """The shape, its noise, its near-symmetries as permutations, and the particle of each column.
+
+    `seat` (m,) holds the particle that each column is meant to be, -1 where that is unknown.
+    """
 
     template: Floats
     sigma2: float
     group: Ints
-    label: Ints
+    seat: Ints
 
 
 class _Lists(NamedTuple):
-    """The noise-like assignments of every frame, padded to (T, C): places in `_Frames`, fits."""
+    """The candidate assignments of every frame, padded to (T, C).
+
+    `place` is the position in `_Frames` of each particle, `cost` minus the log-likelihood of the
+    misfit, infinite where there is no candidate. `own` are the rows whose first candidate is the
+    labels as given, with a noise-like misfit.
+    """
 
     place: Ints
     rotation: Floats
-    misfit: Floats
-    own: Ints  # rows whose first assignment is their labels
+    cost: Floats
+    own: Ints
 
 
 def _size(seen: Bools) -> int:
@@ -374,7 +391,24 @@ def _body_as_given(frames: _Frames) -> _Body | None:
     usual = max(lowest, _TINY**2 * float((template**2).sum()))
     if not misfit.max() <= 2 * _NOISE * usual:
         return None
-    return _body_of(_mean_shape(points, rotation), points, label)
+    seat = _seats(label, int(frames.column.max()) + 1)
+    return _body_of(_mean_shape(points, rotation), points, seat)
+
+
+def _seats(label: Ints, count: int) -> Ints:
+    """Return the particle of each of so many columns, given the column of each particle."""
+    seat = np.full(count, -1, dtype=np.int64)
+    seat[label] = np.arange(label.size)
+    return seat
+
+
+def _completed(seat: Ints, order: Ints) -> Ints:
+    """Give a column of unknown particle the one it was most often assigned to."""
+    count = np.zeros((seat.size, order.shape[1]), dtype=np.int64)
+    row, particle = np.nonzero(order >= 0)
+    np.add.at(count, (order[row, particle], particle), 1)
+    found = np.where(count.any(axis=1), count.argmax(axis=1), -1)
+    return np.where(seat >= 0, seat, found)
 
 
 def _body(frames: _Frames, seed: int, *, labelled: bool) -> _Body:
@@ -387,7 +421,8 @@ def _body(frames: _Frames, seed: int, *, labelled: bool) -> _Body:
     template = frames.x[seed, :n] - frames.x[seed, :n].mean(axis=0)
     freedom = _freedom(n, d)
     sigma2 = float(np.median(_best(some, template)[1])) / _median_chi2(freedom)
-    rough = _Body(template, sigma2, _group(template, sigma2), label)
+    seat = _seats(label, int(frames.column.max()) + 1)
+    rough = _Body(template, sigma2, _group(template, sigma2), seat)
     order = np.broadcast_to(np.arange(n), (rows.size, n)).copy()
     same = (frames.column[rows, :n] == label).all(axis=1) & labelled
     misfit = np.full(rows.size, np.inf)
@@ -396,16 +431,16 @@ def _body(frames: _Frames, seed: int, *, labelled: bool) -> _Body:
     order[odd], misfit[odd] = _base(frames.x[rows[odd], :n], rough)
     good = misfit <= 2 * _NOISE * sigma2 * freedom
     points = _seated(frames.x[rows[good]], order[good][:, None])[:, 0]
-    return _averaged(points, template, label)
+    return _averaged(points, template, seat)
 
 
-def _averaged(points: Floats, shape: Floats, label: Ints) -> _Body:
+def _averaged(points: Floats, shape: Floats, seat: Ints) -> _Body:
     """Average complete frames (K, n, d), in order, to a shape; find its noise and symmetries."""
     rotation, misfit = _fits(points, shape)
     fits = np.isfinite(misfit)
     if fits.any():
         shape = _mean_shape(points[fits], rotation[fits])
-    return _body_of(shape, points, label)
+    return _body_of(shape, points, seat)
 
 
 def _mean_shape(points: Floats, rotation: Floats) -> Floats:
@@ -415,13 +450,13 @@ def _mean_shape(points: Floats, rotation: Floats) -> Floats:
     return mean
 
 
-def _body_of(shape: Floats, points: Floats, label: Ints) -> _Body:
+def _body_of(shape: Floats, points: Floats, seat: Ints) -> _Body:
     """Find the noise of frames about a shape, and its symmetries within that noise."""
     n, d = shape.shape
     # Rounding takes the place of noise where there is none.
     sigma2 = float(np.median(_fits(points, shape)[1])) / _median_chi2(_freedom(n, d))
     sigma2 = max(sigma2, (1e-7 * float(np.abs(shape).max())) ** 2)
-    return _Body(shape, sigma2, _group(shape, sigma2), label)
+    return _Body(shape, sigma2, _group(shape, sigma2), seat)
 
 
 def _remade(body: _Body, answer: Identity, x: Floats) -> _Body:
@@ -433,7 +468,7 @@ def _remade(body: _Body, answer: Identity, x: Floats) -> _Body:
         return body
     rows = rows[np.linspace(0, rows.size - 1, min(rows.size, _MODELS)).astype(int)]
     points = np.take_along_axis(x[rows], answer.order[rows][..., None], axis=1)
-    return _averaged(points, body.template, body.label)
+    return _averaged(points, body.template, body.seat)
 
 
 def _freedom(n: int, d: int) -> float:
@@ -462,14 +497,17 @@ def _group(template: Floats, sigma2: float) -> Ints:
     return np.array(found, dtype=np.int64)
 
 
-def _places(frames: _Frames, label: Ints) -> Ints:
-    """Return where (T, n) each labelled column stands among the detections; -1 where it is not."""
-    match = frames.column[:, None, :] == label[None, :, None]
-    return np.where(match.any(axis=2), match.argmax(axis=2), -1)
+def _places(frames: _Frames, seat: Ints) -> Ints:
+    """Return where (T, n) each particle stands among the detections by the labels, or -1."""
+    particle = np.where(frames.column >= 0, seat[frames.column], -1)
+    place = np.full((len(particle), frames.n), -1, dtype=np.int64)
+    row, detection = np.nonzero(particle >= 0)
+    place[row, particle[row, detection]] = detection
+    return place
 
 
 def _known(frames: _Frames, place: Ints) -> Bools:
-    """Return the frames whose every detection has a label of the seed's."""
+    """Return the frames whose every detection has a label of a particle of its own."""
     return np.asarray((place >= 0).sum(axis=1) == frames.shown)
 
 
@@ -483,7 +521,7 @@ def _undoubted(frames: _Frames, body: _Body | None) -> bool:
     """Return whether the labels fit everywhere and no step is long enough to be mistaken."""
     if body is None:
         return False
-    place = _places(frames, body.label)
+    place = _places(frames, body.seat)
     rows = np.flatnonzero(frames.shown >= body.template.shape[1])
     if not _known(frames, place).all():
         return False
@@ -520,14 +558,18 @@ def _square_angle(one: Floats, other: Floats) -> Floats:
 
 
 def _assignments(frames: _Frames, body: _Body, *, labelled: bool) -> _Lists:
-    """List the noise-like assignments of every frame."""
+    """List the candidates of every frame that fits noise-like in some assignment.
+
+    These are its noise-like assignments and, whatever their misfit, the labels as given.
+    """
     n = frames.n
     found: dict[int, Ints] = {}
-    place = _places(frames, body.label)
+    place = _places(frames, body.seat)
     misfit = np.full(len(frames.x), np.inf)
     trusted = np.flatnonzero(_known(frames, place) & (frames.shown > 0) & labelled)
     seated = _seated(frames.x[trusted], place[trusted, None])[:, 0]
     misfit[trusted] = _fits(seated, body.template)[1]
+    given = np.flatnonzero(np.isfinite(misfit))
     fits = misfit <= _limit(frames.shown, body)
     whole = np.flatnonzero(frames.shown == n)
     base = place.copy()
@@ -540,7 +582,11 @@ def _assignments(frames: _Frames, body: _Body, *, labelled: bool) -> _Lists:
         _search(frames, body, found, drop=1)
     else:
         _patch(frames, body, found, place, fits)
-    return _padded(frames, body, found, np.flatnonzero(fits & (frames.shown == n)))
+    for k in given.tolist():
+        if k in found and (found[k][0] != place[k]).any():
+            others = (found[k] != place[k]).any(axis=1)
+            found[k] = np.concatenate([place[k][None], found[k][others]])
+    return _padded(frames, body, found, np.flatnonzero(fits))
 
 
 def _base(points: Floats, body: _Body) -> tuple[Ints, Floats]:
@@ -623,7 +669,7 @@ def _strays(points: Floats, table: Ints, rotation: Floats, template: Floats) -> 
     return np.asarray(far)
 
 
-def _padded(frames: _Frames, body: _Body, found: dict[int, Ints], labelled: Ints) -> _Lists:
+def _padded(frames: _Frames, body: _Body, found: dict[int, Ints], own: Ints) -> _Lists:
     """Lay the lists of all frames side by side, with their fits."""
     width = max((len(table) for table in found.values()), default=1) + 1
     count, d = len(frames.x), frames.x.shape[2]
@@ -636,14 +682,32 @@ def _padded(frames: _Frames, body: _Body, found: dict[int, Ints], labelled: Ints
         at = rows[part], listed[part]
         seated = _seated(frames.x[at[0]], place[at][:, None])[:, 0]
         rotation[at], misfit[at] = _fits(seated, body.template)
-    return _Lists(place, rotation, misfit, labelled)
+    used = (place >= 0).sum(axis=2)
+    return _Lists(place, rotation, _misfit_cost(misfit, used, frames.shown, body), own)
+
+
+def _misfit_cost(misfit: Floats, used: Ints, shown: Ints, body: _Body) -> Floats:
+    """Return minus the log-likelihood of squared residuals (T, C) of so many particles.
+
+    The residuals of a frame follow a multivariate Student law of the usual noise: a frame as a
+    whole may be worse than others. A detection left out lies anywhere within the body's extent.
+    """
+    n, d = body.template.shape
+    freedom = np.maximum(degrees_of_freedom(np.arange(n + 1), d), 0).astype(np.float64)
+    scale = _STUDENT * body.sigma2
+    gamma = np.array([lgamma((_STUDENT + f) / 2) - lgamma(_STUDENT / 2) for f in freedom])
+    norm = freedom / 2 * np.log(np.pi * scale) - gamma
+    extent = 2 * float(np.linalg.norm(body.template, axis=1).max())
+    strays = d * np.log(extent) * (shown[:, None] - used)
+    cost: Floats = norm[used] + strays
+    return cost + (_STUDENT + freedom[used]) / 2 * np.log1p(misfit / scale)
 
 
 def _chained(
     frames: _Frames, body: _Body, lists: _Lists, time: Floats, *, labelled: bool
 ) -> Identity:
     """Follow the most likely assignment from frame to frame; cut where it is in doubt."""
-    rows = np.flatnonzero(np.isfinite(lists.misfit).any(axis=1))
+    rows = np.flatnonzero(np.isfinite(lists.cost).any(axis=1))
     choice, sure = _followed(frames, body, lists, time, rows, labelled=labelled)
     order = np.full((len(frames.x), frames.n), -1, dtype=np.int64)
     order[rows] = _columns(frames, lists, rows)[np.arange(rows.size), choice]
@@ -671,26 +735,32 @@ def _followed(
         return [], np.empty(0, dtype=np.bool_)
     spread = _spread(lists, time[rows], rows, labelled=labelled)
     choice, sure = [_first_choice(frames, body, lists, rows[0], labelled=labelled)], [True]
-    for part in _batches(rows.size - 1, lists.misfit.shape[1] ** 2):
+    for part in _batches(rows.size - 1, lists.cost.shape[1] ** 2):
         chain = rows[part.start : part.stop + 1]
-        cost = _costs(lists, chain, spread[part], body.sigma2)
+        column = _columns(frames, lists, chain)
+        cost = _costs(lists, chain, spread[part], labelled=labelled)
         if labelled:
-            cost += _TRUST * _differ(_columns(frames, lists, chain))
-        ranked = np.argsort(cost, axis=2)[:, :, :2]
-        two = np.take_along_axis(cost, ranked, axis=2)
-        clear = two[:, :, 1] - two[:, :, 0] > _DOUBT
-        for following, beyond in zip(ranked[:, :, 0].tolist(), clear.tolist(), strict=True):
-            sure.append(beyond[choice[-1]])
-            choice.append(following[choice[-1]])
+            cost += _TRUST * _differ(column[:-1], column[1:])
+        best = np.argmin(cost, axis=2)
+        # Two candidates that agree on every particle both of them place are in no conflict.
+        rival = _differ(column[1:], column[1:])
+        for step, following, conflict in zip(cost, best.tolist(), rival, strict=True):
+            now = following[choice[-1]]
+            odds = step[choice[-1]] - step[choice[-1], now]
+            sure.append(bool((odds[conflict[now]] > _DOUBT).all()))
+            choice.append(now)
     return choice, np.array(sure)
 
 
 def _first_choice(frames: _Frames, body: _Body, lists: _Lists, row: int, *, labelled: bool) -> int:
-    """Return the assignment to begin with: nearest to the labels, then the best fit."""
-    column = _columns(frames, lists, np.array([row]))[0]
-    wrong = ((column != body.label) & (column >= 0)).sum(axis=1) * labelled
-    wrong = np.where(np.isfinite(lists.misfit[row]), wrong, len(body.label) + 1)
-    return int(np.lexsort((lists.misfit[row], wrong))[0])
+    """Return the assignment to begin with: the labels unless another is e^10 times likelier."""
+    cost = lists.cost[row]
+    if labelled:
+        column = _columns(frames, lists, np.array([row]))[0]
+        particle = np.where(column >= 0, body.seat[column], -1)
+        wrong = ((particle != np.arange(frames.n)) & (column >= 0)).sum(axis=1)
+        cost = cost + _TRUST * (wrong > 0) + wrong
+    return int(np.argmin(cost))
 
 
 def _columns(frames: _Frames, lists: _Lists, rows: Ints) -> Ints:
@@ -705,7 +775,7 @@ def _spread(lists: _Lists, time: Floats, rows: Ints, *, labelled: bool) -> Float
     d = lists.rotation.shape[-1]
     first, second = lists.rotation[rows[:-1]], lists.rotation[rows[1:]]
     square = _square_angle(first[:, :1], second)
-    square = np.where(np.isfinite(lists.misfit[rows[1:]]), square, np.inf)
+    square = np.where(np.isfinite(lists.cost[rows[1:]]), square, np.inf)
     own = np.isin(rows, lists.own)
     steps = square[own[:-1] & own[1:], 0]
     if not (labelled and 2 * steps.size > rows.size):
@@ -718,28 +788,27 @@ def _spread(lists: _Lists, time: Floats, rows: Ints, *, labelled: bool) -> Float
     return spread
 
 
-def _costs(lists: _Lists, chain: Ints, spread: Floats, sigma2: float) -> Floats:
+def _costs(lists: _Lists, chain: Ints, spread: Floats, *, labelled: bool) -> Floats:
     """Return minus the log-likelihood (K, C, C) of every choice after every choice before."""
     d = lists.rotation.shape[-1]
     flat = lists.rotation[chain].reshape(len(chain), -1, d * d)
     trace = flat[:-1] @ np.swapaxes(flat[1:], -1, -2)
     half = np.sqrt(np.clip((d - trace) / 4, 0.0, 1.0))
     square = (2 * np.arcsin(half)) ** 2
-    misfit = lists.misfit[chain[1:]][:, None, :]
+    misfit = lists.cost[chain[1:]][:, None, :]
     # A body that leaps follows no law of its small steps: those of the leap's own size decide.
     least = np.where(np.isfinite(misfit), square, np.inf).min(axis=2, keepdims=True)
-    wide = np.maximum(spread[:, None, None], least / _LEAP)
+    leap = _LEAP_LABELLED if labelled else _LEAP_UNLABELLED
+    wide = np.maximum(spread[:, None, None], least / leap)
     cost: Floats = square / (2 * wide)
-    return cost + misfit / (2 * sigma2)
+    return cost + misfit
 
 
-def _differ(column: Ints) -> Bools:
-    """Return which choices (K - 1, C, C) move a column to another particle."""
-    n = column.shape[2]
-    before, after = column[:-1, :, None], column[1:, None]
-    moved = np.zeros((len(before), column.shape[1], column.shape[1]), dtype=np.bool_)
-    for i, j in permutations(range(n), 2):
-        moved |= (before[..., i] == after[..., j]) & (before[..., i] >= 0)
+def _differ(before: Ints, after: Ints) -> Bools:
+    """Return which pairs of choices (K, C, n) make a column two particles, (K, C, C)."""
+    moved = np.zeros((len(before), before.shape[1], after.shape[1]), dtype=np.bool_)
+    for i, j in permutations(range(before.shape[2]), 2):
+        moved |= (before[:, :, None, i] == after[:, None, :, j]) & (before[:, :, None, i] >= 0)
     return moved
 
 
