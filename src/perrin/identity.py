@@ -22,15 +22,16 @@ if TYPE_CHECKING:
 # A fit is noise-like up to this multiple of the usual mean square residual: chance does not reach
 # it in a frame of usual quality, and an exchanged pair (1000 times and more) is far above.
 _NOISE = 16.0
-# Degrees of freedom of the Student law of the misfit of a frame. The variance of a frame is then
-# over 20 times the usual one with probability 0.005, and the odds between two assignments of a bad
-# frame depend on the ratio of their misfits, not on the difference in units of usual noise.
-_STUDENT = 4.0
+# Degrees of freedom of the Student law of a frame's misfit: the odds between two assignments of a
+# bad frame depend on the ratio of their misfits, not on their difference in units of usual noise.
+_STUDENT = 8.0
 # Up to so many particles every assignment is tried, and so many frames at most build the template.
 _ALL, _MODELS = 6, 300
 # Log-odds: an assignment is settled when the next best is a hundred times less likely, and lasting
-# labels are trusted e^10 times more than an exchange of them.
-_DOUBT, _TRUST = float(np.log(100.0)), 10.0
+# labels are trusted e^18 times more than an exchange of them. Right labels are then doubted when
+# chance makes another assignment e^18/100 = 6.6e5 times likelier, in at most 300 x 11/6.6e5 = 0.5 %
+# of the tracks of 300 frames of a tetrahedron (likelihood ratios exceed c with probability 1/c).
+_DOUBT, _TRUST = float(np.log(100.0)), 18.0
 # A least turn of over this many standard deviations of an axis (squared) widens the law of the step
 # to itself. Lasting labels that turn the body 75 degrees are kept against an exchange that leaves
 # 45 (a tetrahedron), and replaced where the exchange leaves a third or less of the turn.
@@ -107,7 +108,7 @@ def settle_identity(
         if every two of them are seen together, else the most seen together in 5 % of the rows.
     labelled : bool
         Whether a column is meant to be one particle throughout. It then stays one unless an
-        exchange is e^10 times more likely.
+        exchange is e^18 times more likely.
 
     Returns
     -------
@@ -734,26 +735,51 @@ def _followed(
     if not rows.size:
         return [], np.empty(0, dtype=np.bool_)
     spread = _spread(lists, time[rows], rows, labelled=labelled)
+    column = _columns(frames, lists, rows)
     choice, sure = [_first_choice(frames, body, lists, rows[0], labelled=labelled)], [True]
-    for part in _batches(rows.size - 1, lists.cost.shape[1] ** 2):
-        chain = rows[part.start : part.stop + 1]
-        column = _columns(frames, lists, chain)
-        cost = _costs(lists, chain, spread[part], labelled=labelled)
+    held = _taken(column[0, choice[0]], body.seat)
+    for i in range(1, rows.size):
+        rotation = lists.rotation[rows[i - 1], choice[-1]]
+        cost = _step_cost(lists, rotation, int(rows[i]), float(spread[i - 1]), labelled=labelled)
         if labelled:
-            cost += _TRUST * _differ(column[:-1], column[1:])
-        best = np.argmin(cost, axis=2)
+            cost += _TRUST * _against(held, column[i], frames.column[rows[i]])
+        now = int(np.argmin(cost))
         # Two candidates that agree on every particle both of them place are in no conflict.
-        rival = _differ(column[1:], column[1:])
-        for step, following, conflict in zip(cost, best.tolist(), rival, strict=True):
-            now = following[choice[-1]]
-            odds = step[choice[-1]] - step[choice[-1], now]
-            sure.append(bool((odds[conflict[now]] > _DOUBT).all()))
-            choice.append(now)
+        near = column[i, cost <= cost[now] + _DOUBT]
+        nowhere = np.full(held.size, -1)
+        rivals = len(near) > 1 and _moved(_taken(column[i, now], nowhere), near).any()
+        choice.append(now)
+        sure.append(not rivals)
+        held = _taken(column[i, now], held)
     return choice, np.array(sure)
 
 
+def _taken(column: Ints, held: Ints) -> Ints:
+    """Return the particle (m,) of each column once the particles are in the columns given."""
+    seat = held.copy()
+    seat[np.isin(held, np.flatnonzero(column >= 0))] = -1
+    seat[column[column >= 0]] = np.flatnonzero(column >= 0)
+    return seat
+
+
+def _moved(held: Ints, column: Ints) -> Bools:
+    """Return which candidates (C, n) give a column another particle than it is held to be."""
+    before = np.where(column >= 0, held[column], -1)
+    return np.asarray(((before >= 0) & (before != np.arange(column.shape[1]))).any(axis=1))
+
+
+def _against(held: Ints, column: Ints, shown: Ints) -> Bools:
+    """Return which candidates (C, n) contradict the labels: by another particle, or by none.
+
+    Of the columns `shown`, those of known particles are meant to be placed, at most n of them.
+    """
+    known = ((shown >= 0) & (held[shown] >= 0)).sum()
+    placed = ((column >= 0) & (held[column] >= 0)).sum(axis=1)
+    return np.asarray(_moved(held, column) | (placed < min(known, column.shape[1])))
+
+
 def _first_choice(frames: _Frames, body: _Body, lists: _Lists, row: int, *, labelled: bool) -> int:
-    """Return the assignment to begin with: the labels unless another is e^10 times likelier."""
+    """Return the assignment to begin with: the labels unless another is e^18 times likelier."""
     cost = lists.cost[row]
     if labelled:
         column = _columns(frames, lists, np.array([row]))[0]
@@ -788,28 +814,16 @@ def _spread(lists: _Lists, time: Floats, rows: Ints, *, labelled: bool) -> Float
     return spread
 
 
-def _costs(lists: _Lists, chain: Ints, spread: Floats, *, labelled: bool) -> Floats:
-    """Return minus the log-likelihood (K, C, C) of every choice after every choice before."""
-    d = lists.rotation.shape[-1]
-    flat = lists.rotation[chain].reshape(len(chain), -1, d * d)
-    trace = flat[:-1] @ np.swapaxes(flat[1:], -1, -2)
-    half = np.sqrt(np.clip((d - trace) / 4, 0.0, 1.0))
-    square = (2 * np.arcsin(half)) ** 2
-    misfit = lists.cost[chain[1:]][:, None, :]
+def _step_cost(
+    lists: _Lists, rotation: Floats, row: int, spread: float, *, labelled: bool
+) -> Floats:
+    """Return minus the log-likelihood (C,) of a frame's candidates after a rotation (d, d)."""
+    square = _square_angle(rotation, lists.rotation[row])
+    misfit = lists.cost[row]
     # A body that leaps follows no law of its small steps: those of the leap's own size decide.
-    least = np.where(np.isfinite(misfit), square, np.inf).min(axis=2, keepdims=True)
-    leap = _LEAP_LABELLED if labelled else _LEAP_UNLABELLED
-    wide = np.maximum(spread[:, None, None], least / leap)
-    cost: Floats = square / (2 * wide)
-    return cost + misfit
-
-
-def _differ(before: Ints, after: Ints) -> Bools:
-    """Return which pairs of choices (K, C, n) make a column two particles, (K, C, C)."""
-    moved = np.zeros((len(before), before.shape[1], after.shape[1]), dtype=np.bool_)
-    for i, j in permutations(range(before.shape[2]), 2):
-        moved |= (before[:, :, None, i] == after[:, None, :, j]) & (before[:, :, None, i] >= 0)
-    return moved
+    least = float(square[np.isfinite(misfit)].min())
+    wide = max(spread, least / (_LEAP_LABELLED if labelled else _LEAP_UNLABELLED))
+    return np.asarray(square / (2 * wide) + misfit)
 
 
 def _sites(order: Ints) -> Ints:
