@@ -63,7 +63,8 @@ class Identity:
     extra : ndarray of int
         Rows in which a detection is no particle of the body.
     unsettled : ndarray of int
-        Rows with enough detections for a pose that fit the body in no assignment.
+        Rows with enough detections for a pose whose misfit is over 16 times the usual mean square.
+        They keep their labels.
     """
 
     order: Ints
@@ -198,13 +199,14 @@ class _Lists(NamedTuple):
     """The candidate assignments of every frame, padded to (T, C).
 
     `place` is the position in `_Frames` of each particle, `cost` minus the log-likelihood of the
-    misfit, infinite where there is no candidate. `own` are the rows whose first candidate is the
-    labels as given, with a noise-like misfit.
+    misfit, infinite where there is no candidate, `fits` whether the misfit is noise-like. `own` are
+    the rows whose first candidate is the labels as given, with a noise-like misfit.
     """
 
     place: Ints
     rotation: Floats
     cost: Floats
+    fits: Bools
     own: Ints
 
 
@@ -684,7 +686,8 @@ def _padded(frames: _Frames, body: _Body, found: dict[int, Ints], own: Ints) -> 
         seated = _seated(frames.x[at[0]], place[at][:, None])[:, 0]
         rotation[at], misfit[at] = _fits(seated, body.template)
     used = (place >= 0).sum(axis=2)
-    return _Lists(place, rotation, _misfit_cost(misfit, used, frames.shown, body), own)
+    cost = _misfit_cost(misfit, used, frames.shown, body)
+    return _Lists(place, rotation, cost, misfit <= _limit(used, body), own)
 
 
 def _misfit_cost(misfit: Floats, used: Ints, shown: Ints, body: _Body) -> Floats:
@@ -712,6 +715,7 @@ def _chained(
     choice, sure = _followed(frames, body, lists, time, rows, labelled=labelled)
     order = np.full((len(frames.x), frames.n), -1, dtype=np.int64)
     order[rows] = _columns(frames, lists, rows)[np.arange(rows.size), choice]
+    settled = rows[lists.fits[rows, choice]]
     used = (order >= 0).sum(axis=1)
     site = _sites(order)
     if labelled:
@@ -724,7 +728,7 @@ def _chained(
         swaps=np.setdiff1d(_exchanges(site), rows[~sure]) if labelled else rows[:0],
         cuts=rows[~sure],
         extra=rows[frames.shown[rows] > used[rows]],
-        unsettled=np.setdiff1d(np.flatnonzero(frames.shown >= frames.x.shape[2]), rows),
+        unsettled=np.setdiff1d(np.flatnonzero(frames.shown >= frames.x.shape[2]), settled),
     )
 
 
@@ -785,7 +789,7 @@ def _first_choice(frames: _Frames, body: _Body, lists: _Lists, row: int, *, labe
         column = _columns(frames, lists, np.array([row]))[0]
         particle = np.where(column >= 0, body.seat[column], -1)
         wrong = ((particle != np.arange(frames.n)) & (column >= 0)).sum(axis=1)
-        cost = cost + _TRUST * (wrong > 0) + wrong
+        cost = cost + _TRUST * _against(body.seat, column, frames.column[row]) + wrong
     return int(np.argmin(cost))
 
 
