@@ -742,7 +742,12 @@ def _followed(
     column = _columns(frames, lists, rows)
     choice, sure = [_first_choice(frames, body, lists, rows[0], labelled=labelled)], [True]
     held = _taken(column[0, choice[0]], body.seat)
+    plain = _plain(lists, rows, spread)
     for i in range(1, rows.size):
+        if labelled and plain[i - 1] and choice[-1] == 0 and (held == body.seat).all():
+            choice.append(0)
+            sure.append(True)
+            continue
         rotation = lists.rotation[rows[i - 1], choice[-1]]
         cost = _step_cost(lists, rotation, int(rows[i]), float(spread[i - 1]), labelled=labelled)
         if labelled:
@@ -756,6 +761,18 @@ def _followed(
         sure.append(not rivals)
         held = _taken(column[i, now], held)
     return choice, np.array(sure)
+
+
+def _plain(lists: _Lists, rows: Ints, spread: Floats) -> Bools:
+    """Return the steps between rows whose own labels are beyond doubt whatever the other angles.
+
+    Every other candidate bears the whole weight of the labels, so its misfit is compared alone.
+    """
+    square = _square_angle(lists.rotation[rows[:-1], 0], lists.rotation[rows[1:], 0])
+    cost = lists.cost[rows[1:]]
+    own = np.isin(rows, lists.own)
+    sure = square / (2 * spread) + cost[:, 0] + _DOUBT < cost[:, 1:].min(axis=1) + _TRUST
+    return np.asarray(own[:-1] & own[1:] & sure)
 
 
 def _taken(column: Ints, held: Ints) -> Ints:
