@@ -673,7 +673,7 @@ def _strays(points: Floats, table: Ints, rotation: Floats, template: Floats) -> 
 
 
 def _padded(frames: _Frames, body: _Body, found: dict[int, Ints], own: Ints) -> _Lists:
-    """Lay the lists of all frames side by side, with their fits."""
+    """Lay the lists of all frames side by side, with their fits; the last place stays empty."""
     width = max((len(table) for table in found.values()), default=1) + 1
     count, d = len(frames.x), frames.x.shape[2]
     place = np.full((count, width, frames.n), -1, dtype=np.int64)
@@ -739,28 +739,46 @@ def _followed(
     if not rows.size:
         return [], np.empty(0, dtype=np.bool_)
     spread = _spread(lists, time[rows], rows, labelled=labelled)
-    column = _columns(frames, lists, rows)
     choice, sure = [_first_choice(frames, body, lists, rows[0], labelled=labelled)], [True]
-    held = _taken(column[0, choice[0]], body.seat)
-    plain = _plain(lists, rows, spread)
+    held = _taken(_columns(frames, lists, rows[:1])[0, choice[0]], body.seat)
+    plain = _plain(lists, rows, spread) & labelled
     for i in range(1, rows.size):
-        if labelled and plain[i - 1] and choice[-1] == 0 and (held == body.seat).all():
+        shown = frames.column[rows[i]]
+        if plain[i - 1] and choice[-1] == 0 and (held == body.seat)[shown].all():
             choice.append(0)
             sure.append(True)
             continue
-        rotation = lists.rotation[rows[i - 1], choice[-1]]
-        cost = _step_cost(lists, rotation, int(rows[i]), float(spread[i - 1]), labelled=labelled)
         if labelled:
-            cost += _TRUST * _against(held, column[i], frames.column[rows[i]])
+            _list_held(frames, body, lists, rows[i], held)
+        column = _columns(frames, lists, rows[i : i + 1])[0]
+        rotation = lists.rotation[rows[i - 1], choice[-1]]
+        cost = _step_cost(lists, rotation, rows[i], spread[i - 1], labelled=labelled)
+        cost += _TRUST * labelled * _against(held, column, shown)
         now = int(np.argmin(cost))
         # Two candidates that agree on every particle both of them place are in no conflict.
-        near = column[i, cost <= cost[now] + _DOUBT]
+        near = column[cost <= cost[now] + _DOUBT]
         nowhere = np.full(held.size, -1)
-        rivals = len(near) > 1 and _moved(_taken(column[i, now], nowhere), near).any()
+        rivals = len(near) > 1 and _moved(_taken(column[now], nowhere), near).any()
         choice.append(now)
         sure.append(not rivals)
-        held = _taken(column[i, now], held)
+        held = _taken(column[now], held)
     return choice, np.array(sure)
+
+
+def _list_held(frames: _Frames, body: _Body, lists: _Lists, row: int, held: Ints) -> None:
+    """Add the labels as they were last held to the candidates of a frame, whatever their misfit.
+
+    They are the labels as given until an exchange. The last place of every list is kept for them.
+    """
+    one = slice(row, row + 1)
+    place = _places(frames._replace(column=frames.column[one]), held)
+    if (place >= 0).sum() != frames.shown[row] or (lists.place[row] == place).all(axis=1).any():
+        return
+    rotation, misfit = _fits(_seated(frames.x[one], place[:, None])[0], body.template)
+    used = (place >= 0).sum(axis=1)[:, None]
+    lists.place[row, -1], lists.rotation[row, -1] = place[0], rotation[0]
+    lists.cost[row, -1] = _misfit_cost(misfit[:, None], used, frames.shown[one], body)[0, 0]
+    lists.fits[row, -1] = misfit[0] <= _limit(used, body)[0, 0]
 
 
 def _plain(lists: _Lists, rows: Ints, spread: Floats) -> Bools:
