@@ -561,9 +561,10 @@ def _square_angle(one: Floats, other: Floats) -> Floats:
 
 
 def _assignments(frames: _Frames, body: _Body, *, labelled: bool) -> _Lists:
-    """List the candidates of every frame that fits noise-like in some assignment.
+    """List the candidates of every frame: the noise-like assignments and the labels as given.
 
-    These are its noise-like assignments and, whatever their misfit, the labels as given.
+    A frame in which nothing is noise-like still shows how far the body has turned. Its candidates
+    are the labels as given and what the symmetries of the body make of them.
     """
     n = frames.n
     found: dict[int, Ints] = {}
@@ -586,7 +587,9 @@ def _assignments(frames: _Frames, body: _Body, *, labelled: bool) -> _Lists:
     else:
         _patch(frames, body, found, place, fits)
     for k in given.tolist():
-        if k in found and (found[k][0] != place[k]).any():
+        if k not in found:
+            found[k] = place[k][body.group]
+        elif (found[k][0] != place[k]).any():
             others = (found[k] != place[k]).any(axis=1)
             found[k] = np.concatenate([place[k][None], found[k][others]])
     return _padded(frames, body, found, np.flatnonzero(fits))
@@ -742,7 +745,9 @@ def _followed(
     choice, sure = [_first_choice(frames, body, lists, rows[0], labelled=labelled)], [True]
     held = _taken(_columns(frames, lists, rows[:1])[0, choice[0]], body.seat)
     plain = _plain(lists, rows, spread) & labelled
+    nowhere, poses = np.full(held.size, -1), list[_Pose]()
     for i in range(1, rows.size):
+        poses = _reached(poses, lists, rows[i - 1], choice[-1], spread[i - 1])
         shown = frames.column[rows[i]]
         if plain[i - 1] and choice[-1] == 0 and (held == body.seat)[shown].all():
             choice.append(0)
@@ -751,18 +756,39 @@ def _followed(
         if labelled:
             _list_held(frames, body, lists, rows[i], held)
         column = _columns(frames, lists, rows[i : i + 1])[0]
-        rotation = lists.rotation[rows[i - 1], choice[-1]]
-        cost = _step_cost(lists, rotation, rows[i], spread[i - 1], labelled=labelled)
-        cost += _TRUST * labelled * _against(held, column, shown)
+        cost = _step_cost(lists, poses, rows[i], labelled=labelled)
+        if labelled:
+            cost += _TRUST * _against(held, column, shown)
         now = int(np.argmin(cost))
         # Two candidates that agree on every particle both of them place are in no conflict.
         near = column[cost <= cost[now] + _DOUBT]
-        nowhere = np.full(held.size, -1)
         rivals = len(near) > 1 and _moved(_taken(column[now], nowhere), near).any()
         choice.append(now)
         sure.append(not rivals)
-        held = _taken(column[now], held)
+        if labelled:
+            held = _taken(column[now], held)
     return choice, np.array(sure)
+
+
+class _Pose(NamedTuple):
+    """A rotation reached before, and the variance of a component of the turn since then."""
+
+    rotation: Floats
+    spread: float
+
+
+def _reached(
+    poses: list[_Pose], lists: _Lists, row: int, choice: int, spread: float
+) -> list[_Pose]:
+    """Return the poses a step may start from: the last noise-like one and the last of all.
+
+    A single frame may have a wrong rotation, and over many bad frames the body turns far: the step
+    is as likely as from the nearer of the two.
+    """
+    pose = _Pose(lists.rotation[row, choice], spread)
+    if lists.fits[row, choice] or not poses:
+        return [pose]
+    return [_Pose(poses[0].rotation, poses[0].spread + spread), pose]
 
 
 def _list_held(frames: _Frames, body: _Body, lists: _Lists, row: int, held: Ints) -> None:
@@ -795,9 +821,9 @@ def _plain(lists: _Lists, rows: Ints, spread: Floats) -> Bools:
 
 def _taken(column: Ints, held: Ints) -> Ints:
     """Return the particle (m,) of each column once the particles are in the columns given."""
-    seat = held.copy()
-    seat[np.isin(held, np.flatnonzero(column >= 0))] = -1
-    seat[column[column >= 0]] = np.flatnonzero(column >= 0)
+    filled = column >= 0
+    seat = np.where((held >= 0) & filled[held], -1, held)
+    seat[column[filled]] = np.flatnonzero(filled)
     return seat
 
 
@@ -853,16 +879,17 @@ def _spread(lists: _Lists, time: Floats, rows: Ints, *, labelled: bool) -> Float
     return spread
 
 
-def _step_cost(
-    lists: _Lists, rotation: Floats, row: int, spread: float, *, labelled: bool
-) -> Floats:
-    """Return minus the log-likelihood (C,) of a frame's candidates after a rotation (d, d)."""
-    square = _square_angle(rotation, lists.rotation[row])
+def _step_cost(lists: _Lists, poses: list[_Pose], row: int, *, labelled: bool) -> Floats:
+    """Return minus the log-likelihood (C,) of a frame's candidates after the poses before it."""
     misfit = lists.cost[row]
-    # A body that leaps follows no law of its small steps: those of the leap's own size decide.
-    least = float(square[np.isfinite(misfit)].min())
-    wide = max(spread, least / (_LEAP_LABELLED if labelled else _LEAP_UNLABELLED))
-    return np.asarray(square / (2 * wide) + misfit)
+    turns = np.full(misfit.shape, np.inf)
+    for pose in poses:
+        square = _square_angle(pose.rotation, lists.rotation[row])
+        # A body that leaps follows no law of its small steps: those of the leap's own size decide.
+        least = float(square[np.isfinite(misfit)].min())
+        wide = max(pose.spread, least / (_LEAP_LABELLED if labelled else _LEAP_UNLABELLED))
+        turns = np.minimum(turns, square / (2 * wide))
+    return np.asarray(turns + misfit)
 
 
 def _sites(order: Ints) -> Ints:
