@@ -57,11 +57,11 @@ class Identity:
     piece : ndarray of int, shape (T,)
         Stretches of doubtless identity.
     swaps : ndarray of int
-        Rows at which the labels changed hands and were put right.
+        Rows at which a label passes to another particle; `order` corrects it.
     cuts : ndarray of int
         Rows that begin a new piece: two assignments were about as likely.
     extra : ndarray of int
-        Rows in which a detection is no particle of the body.
+        Rows in which a detection is left out as no particle of the body.
     unsettled : ndarray of int
         Rows with enough detections for a pose whose misfit is over 16 times the usual mean square.
         They keep their labels.
@@ -122,10 +122,13 @@ def settle_identity(
 
     Notes
     -----
-    The likelihood of an assignment is exp(-S/(2 sigma^2) - theta^2/(2 s^2)) with S the squared
-    residual of the fit, sigma^2 from its median, theta the angle of the step and s^2 from the
-    median step, growing with the time across gaps, and at least theta^2/16 of the least turn: a
-    leap is not judged by the law of small steps. All assignments are tried for up to 6
+    The likelihood of an assignment is (1 + S/(8 sigma^2))^(-(8 + f)/2) exp(-theta^2/(2 s^2)): S is
+    the squared residual of the fit with f degrees of freedom, sigma^2 from its median, theta the
+    angle of the step and s^2 from the median step, growing with the time across gaps. The misfit
+    follows a Student law, so that a frame noisier than the others is no evidence for another
+    assignment. s^2 is at least 1/16 of the least squared turn (1/4 with labels): a leap is not
+    judged by the law of small steps. With labels the assignment last held is always a candidate,
+    in a frame in which nothing fits as well. All assignments are tried for up to 6
     particles; beyond, linear assignment and rigid fit in turn, from many orientations.
 
     Examples
