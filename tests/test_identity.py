@@ -352,3 +352,15 @@ def test_a_particle_under_a_second_label_keeps_it_in_bad_frames():
     found = settle_identity(broken)
     np.testing.assert_array_equal(found.order[60:], np.tile([0, 4, 2, 3], (len(x) - 60, 1)))
     assert found.swaps.size + found.cuts.size + found.extra.size == 0
+
+
+def test_labels_of_a_minority_of_the_frames_do_not_widen_the_law_of_the_steps():
+    """A pair and a cycle exchanged for good: the labels of the shape fit in few frames only."""
+    for seed in range(5):
+        x, rng = track(seed, n_frames=150)
+        some, mixed = rng.permutation(4), x.copy()
+        mixed[40:, some[:2]] = mixed[40:, some[1::-1]]
+        mixed[77:, some[1:]] = mixed[77:, np.roll(some[1:], 1)]
+        found = settle_identity(mixed)
+        assert found.swaps.tolist() == [40, 77]
+        assert not found.cuts.size

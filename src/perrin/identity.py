@@ -744,7 +744,7 @@ def _followed(
     """Return the choice in each settled frame, and whether the step to it is beyond doubt."""
     if not rows.size:
         return [], np.empty(0, dtype=np.bool_)
-    spread = _spread(lists, time[rows], rows, labelled=labelled)
+    spread = _spread(frames, lists, time[rows], rows, labelled=labelled)
     choice, sure = [_first_choice(frames, body, lists, rows[0], labelled=labelled)], [True]
     held = _taken(_columns(frames, lists, rows[:1])[0, choice[0]], body.seat)
     plain = _plain(lists, rows, spread) & labelled
@@ -864,22 +864,35 @@ def _columns(frames: _Frames, lists: _Lists, rows: Ints) -> Ints:
     return np.where(place >= 0, column, -1)
 
 
-def _spread(lists: _Lists, time: Floats, rows: Ints, *, labelled: bool) -> Floats:
-    """Return the variance of one component of each step's rotation vector, from the median."""
-    d = lists.rotation.shape[-1]
-    first, second = lists.rotation[rows[:-1]], lists.rotation[rows[1:]]
-    square = _square_angle(first[:, :1], second)
-    square = np.where(np.isfinite(lists.cost[rows[1:]]), square, np.inf)
-    own = np.isin(rows, lists.own)
-    steps = square[own[:-1] & own[1:], 0]
-    if not (labelled and 2 * steps.size > rows.size):
-        steps = square.min(axis=1)
+def _spread(frames: _Frames, lists: _Lists, time: Floats, rows: Ints, *, labelled: bool) -> Floats:
+    """Return the variance of one component of each step's rotation vector, from the median.
+
+    Columns that are lasting particles show the turn between two frames even where their labels are
+    not those of the shape; of detections without labels the least turn counts.
+    """
+    steps = _labelled_turns(frames, rows) if labelled else rows[:0]
+    if not 2 * steps.size > rows.size:
+        fits = lists.fits[rows]
+        first = lists.rotation[rows[:-1], np.argmax(fits[:-1], axis=1)]
+        square = _square_angle(first[:, None], lists.rotation[rows[1:]])
+        square = np.where(fits[1:], square, np.inf).min(axis=1)
+        steps = square[fits[:-1].any(axis=1) & fits[1:].any(axis=1)]
     gap = np.diff(time)
     usual = float(np.median(gap)) if gap.size else 1.0
     median = float(np.median(steps)) if steps.size else 0.0
-    typical = median / _median_chi2(3.0 if d == 3 else 1.0)
+    typical = median / _median_chi2(3.0 if frames.x.shape[2] == 3 else 1.0)
     spread: Floats = max(typical, _TINY**2) * np.maximum(gap / usual, 1.0)
     return spread
+
+
+def _labelled_turns(frames: _Frames, rows: Ints) -> Floats:
+    """Return the squared angles of the steps between rows that columns seen in both fix."""
+    count, d = int(frames.column.max()) + 1, frames.x.shape[2]
+    points = np.full((rows.size, count, d), np.nan)
+    row, detection = np.nonzero(frames.column[rows] >= 0)
+    points[row, frames.column[rows[row], detection]] = frames.x[rows[row], detection]
+    rotation, misfit = _fits(points[1:], points[:-1])
+    return _square_angle(rotation[np.isfinite(misfit)], np.eye(d))
 
 
 def _step_cost(lists: _Lists, poses: list[_Pose], row: int, *, labelled: bool) -> Floats:
