@@ -133,3 +133,16 @@ def test_a_rod_survives_a_table():
     assert again.reason == motion.reason
     with pytest.raises(ValueError, match="not made by to_frame"):
         RodMotion.from_frame(motion.to_frame().drop(columns="u_x"))
+
+
+def test_a_single_long_turn_of_a_quiet_rod_is_judged_by_its_own_size():
+    """Turned by 100 degrees the labels are believed, by 160 an exchange and a turn by 20 is."""
+    for degrees, swaps in ((100, []), (160, [20])):
+        angle = np.deg2rad(degrees)
+        ends = np.outer([-1.0, 1.0], [1.0, 0.0, 0.0])
+        turned = np.outer([-1.0, 1.0], [np.cos(angle), np.sin(angle), 0.0])
+        x = np.concatenate([np.stack([ends] * 20), np.stack([turned] * 20)])
+        x = x + 0.01 * np.random.default_rng(degrees).normal(size=x.shape)
+        motion = perrin.track_direction(x, dt=DT)
+        assert motion.swaps.tolist() == swaps
+        assert not motion.piece.any()

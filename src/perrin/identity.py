@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import combinations, permutations
+from math import lgamma
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -18,16 +19,23 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike
 
-# A fit is noise-like up to so many times the usual mean square residual: chance does not reach it,
-# and a swapped pair (1000 times and more) is far above.
+# A fit is noise-like up to this multiple of the usual mean square residual: chance does not reach
+# it in a frame of usual quality, and an exchanged pair (1000 times and more) is far above.
 _NOISE = 16.0
+# Degrees of freedom of the Student law of a frame's misfit: the odds between two assignments of a
+# bad frame depend on the ratio of their misfits, not on their difference in units of usual noise.
+_STUDENT = 8.0
 # Up to so many particles every assignment is tried, and so many frames at most build the template.
 _ALL, _MODELS = 6, 300
 # Log-odds: an assignment is settled when the next best is a hundred times less likely, and lasting
-# labels are trusted e^10 times more than an exchange of them.
-_DOUBT, _TRUST = float(np.log(100.0)), 10.0
-# A step of over four standard deviations of an axis (squared) counts as one of four.
-_LEAP = 16.0
+# labels are trusted e^18 times more than an exchange of them. Right labels are then doubted when
+# chance makes another assignment e^18/100 = 6.6e5 times likelier, in at most 300 x 11/6.6e5 = 0.5 %
+# of the tracks of 300 frames of a tetrahedron (likelihood ratios exceed c with probability 1/c).
+_DOUBT, _TRUST = float(np.log(100.0)), 18.0
+# A least turn of over this many standard deviations of an axis (squared) widens the law of the step
+# to itself. Lasting labels that turn the body 75 degrees are kept against an exchange that leaves
+# 45 (a tetrahedron), and replaced where the exchange leaves a third or less of the turn.
+_LEAP_UNLABELLED, _LEAP_LABELLED = 16.0, 4.0
 # A step of under 0.4 of the least angle between two assignments cannot be mistaken.
 _SHORT = 0.4
 _BATCH = 100_000
@@ -49,13 +57,14 @@ class Identity:
     piece : ndarray of int, shape (T,)
         Stretches of doubtless identity.
     swaps : ndarray of int
-        Rows at which the labels changed hands and were put right.
+        Rows at which a label passes to another particle; `order` corrects it.
     cuts : ndarray of int
         Rows that begin a new piece: two assignments were about as likely.
     extra : ndarray of int
-        Rows in which a detection is no particle of the body.
+        Rows in which a detection is left out as no particle of the body.
     unsettled : ndarray of int
-        Rows with enough detections for a pose that fit the body in no assignment.
+        Rows with enough detections for a pose whose misfit is over 16 times the usual mean square.
+        They keep their labels.
     """
 
     order: Ints
@@ -100,7 +109,7 @@ def settle_identity(
         if every two of them are seen together, else the most seen together in 5 % of the rows.
     labelled : bool
         Whether a column is meant to be one particle throughout. It then stays one unless an
-        exchange is e^10 times more likely.
+        exchange is e^18 times more likely.
 
     Returns
     -------
@@ -113,10 +122,13 @@ def settle_identity(
 
     Notes
     -----
-    The likelihood of an assignment is exp(-S/(2 sigma^2) - theta^2/(2 s^2)) with S the squared
-    residual of the fit, sigma^2 from its median, theta the angle of the step and s^2 from the
-    median step, growing with the time across gaps, and at least theta^2/16 of the least turn: a
-    leap is not judged by the law of small steps. All assignments are tried for up to 6
+    The likelihood of an assignment is (1 + S/(8 sigma^2))^(-(8 + f)/2) exp(-theta^2/(2 s^2)): S is
+    the squared residual of the fit with f degrees of freedom, sigma^2 from its median, theta the
+    angle of the step and s^2 from the median step, growing with the time across gaps. The misfit
+    follows a Student law, so that a frame noisier than the others is no evidence for another
+    assignment. s^2 is at least 1/16 of the least squared turn (1/4 with labels): a leap is not
+    judged by the law of small steps. With labels the assignment last held is always a candidate,
+    in a frame in which nothing fits as well. All assignments are tried for up to 6
     particles; beyond, linear assignment and rigid fit in turn, from many orientations.
 
     Examples
@@ -144,8 +156,10 @@ def settle_identity(
     body = _body(frames, seed, labelled=labelled)
     lists = _assignments(frames, body, labelled=labelled)
     answer = _chained(frames, body, lists, time, labelled=labelled)
-    if labelled and not answer.cuts.size:
+    seat = _completed(body.seat, answer.order) if labelled else body.seat
+    if labelled and not answer.cuts.size and (seat == body.seat).all():
         return answer
+    body = body._replace(seat=seat)
     # The first shape mixes equivalent views of the body; the second keeps its small irregularities.
     body = _remade(body, answer, x)
     lists = _assignments(frames, body, labelled=labelled)
@@ -173,21 +187,30 @@ class _Frames(NamedTuple):
 
 
 class _Body(NamedTuple):
-    """The shape, its noise, its near-symmetries as permutations, and the label of each particle."""
+    """The shape, its noise, its near-symmetries as permutations, and the particle of each column.
+
+    `seat` (m,) holds the particle that each column is meant to be, -1 where that is unknown.
+    """
 
     template: Floats
     sigma2: float
     group: Ints
-    label: Ints
+    seat: Ints
 
 
 class _Lists(NamedTuple):
-    """The noise-like assignments of every frame, padded to (T, C): places in `_Frames`, fits."""
+    """The candidate assignments of every frame, padded to (T, C).
+
+    `place` is the position in `_Frames` of each particle, `cost` minus the log-likelihood of the
+    misfit, infinite where there is no candidate, `fits` whether the misfit is noise-like. `own` are
+    the rows whose first candidate is the labels as given, with a noise-like misfit.
+    """
 
     place: Ints
     rotation: Floats
-    misfit: Floats
-    own: Ints  # rows whose first assignment is their labels
+    cost: Floats
+    fits: Bools
+    own: Ints
 
 
 def _size(seen: Bools) -> int:
@@ -374,7 +397,24 @@ def _body_as_given(frames: _Frames) -> _Body | None:
     usual = max(lowest, _TINY**2 * float((template**2).sum()))
     if not misfit.max() <= 2 * _NOISE * usual:
         return None
-    return _body_of(_mean_shape(points, rotation), points, label)
+    seat = _seats(label, int(frames.column.max()) + 1)
+    return _body_of(_mean_shape(points, rotation), points, seat)
+
+
+def _seats(label: Ints, count: int) -> Ints:
+    """Return the particle of each of so many columns, given the column of each particle."""
+    seat = np.full(count, -1, dtype=np.int64)
+    seat[label] = np.arange(label.size)
+    return seat
+
+
+def _completed(seat: Ints, order: Ints) -> Ints:
+    """Give a column of unknown particle the one it was most often assigned to."""
+    count = np.zeros((seat.size, order.shape[1]), dtype=np.int64)
+    row, particle = np.nonzero(order >= 0)
+    np.add.at(count, (order[row, particle], particle), 1)
+    found = np.where(count.any(axis=1), count.argmax(axis=1), -1)
+    return np.where(seat >= 0, seat, found)
 
 
 def _body(frames: _Frames, seed: int, *, labelled: bool) -> _Body:
@@ -387,7 +427,8 @@ def _body(frames: _Frames, seed: int, *, labelled: bool) -> _Body:
     template = frames.x[seed, :n] - frames.x[seed, :n].mean(axis=0)
     freedom = _freedom(n, d)
     sigma2 = float(np.median(_best(some, template)[1])) / _median_chi2(freedom)
-    rough = _Body(template, sigma2, _group(template, sigma2), label)
+    seat = _seats(label, int(frames.column.max()) + 1)
+    rough = _Body(template, sigma2, _group(template, sigma2), seat)
     order = np.broadcast_to(np.arange(n), (rows.size, n)).copy()
     same = (frames.column[rows, :n] == label).all(axis=1) & labelled
     misfit = np.full(rows.size, np.inf)
@@ -396,16 +437,16 @@ def _body(frames: _Frames, seed: int, *, labelled: bool) -> _Body:
     order[odd], misfit[odd] = _base(frames.x[rows[odd], :n], rough)
     good = misfit <= 2 * _NOISE * sigma2 * freedom
     points = _seated(frames.x[rows[good]], order[good][:, None])[:, 0]
-    return _averaged(points, template, label)
+    return _averaged(points, template, seat)
 
 
-def _averaged(points: Floats, shape: Floats, label: Ints) -> _Body:
+def _averaged(points: Floats, shape: Floats, seat: Ints) -> _Body:
     """Average complete frames (K, n, d), in order, to a shape; find its noise and symmetries."""
     rotation, misfit = _fits(points, shape)
     fits = np.isfinite(misfit)
     if fits.any():
         shape = _mean_shape(points[fits], rotation[fits])
-    return _body_of(shape, points, label)
+    return _body_of(shape, points, seat)
 
 
 def _mean_shape(points: Floats, rotation: Floats) -> Floats:
@@ -415,13 +456,13 @@ def _mean_shape(points: Floats, rotation: Floats) -> Floats:
     return mean
 
 
-def _body_of(shape: Floats, points: Floats, label: Ints) -> _Body:
+def _body_of(shape: Floats, points: Floats, seat: Ints) -> _Body:
     """Find the noise of frames about a shape, and its symmetries within that noise."""
     n, d = shape.shape
     # Rounding takes the place of noise where there is none.
     sigma2 = float(np.median(_fits(points, shape)[1])) / _median_chi2(_freedom(n, d))
     sigma2 = max(sigma2, (1e-7 * float(np.abs(shape).max())) ** 2)
-    return _Body(shape, sigma2, _group(shape, sigma2), label)
+    return _Body(shape, sigma2, _group(shape, sigma2), seat)
 
 
 def _remade(body: _Body, answer: Identity, x: Floats) -> _Body:
@@ -433,7 +474,7 @@ def _remade(body: _Body, answer: Identity, x: Floats) -> _Body:
         return body
     rows = rows[np.linspace(0, rows.size - 1, min(rows.size, _MODELS)).astype(int)]
     points = np.take_along_axis(x[rows], answer.order[rows][..., None], axis=1)
-    return _averaged(points, body.template, body.label)
+    return _averaged(points, body.template, body.seat)
 
 
 def _freedom(n: int, d: int) -> float:
@@ -462,14 +503,17 @@ def _group(template: Floats, sigma2: float) -> Ints:
     return np.array(found, dtype=np.int64)
 
 
-def _places(frames: _Frames, label: Ints) -> Ints:
-    """Return where (T, n) each labelled column stands among the detections; -1 where it is not."""
-    match = frames.column[:, None, :] == label[None, :, None]
-    return np.where(match.any(axis=2), match.argmax(axis=2), -1)
+def _places(frames: _Frames, seat: Ints) -> Ints:
+    """Return where (T, n) each particle stands among the detections by the labels, or -1."""
+    particle = np.where(frames.column >= 0, seat[frames.column], -1)
+    place = np.full((len(particle), frames.n), -1, dtype=np.int64)
+    row, detection = np.nonzero(particle >= 0)
+    place[row, particle[row, detection]] = detection
+    return place
 
 
 def _known(frames: _Frames, place: Ints) -> Bools:
-    """Return the frames whose every detection has a label of the seed's."""
+    """Return the frames whose every detection has a label of a particle of its own."""
     return np.asarray((place >= 0).sum(axis=1) == frames.shown)
 
 
@@ -483,7 +527,7 @@ def _undoubted(frames: _Frames, body: _Body | None) -> bool:
     """Return whether the labels fit everywhere and no step is long enough to be mistaken."""
     if body is None:
         return False
-    place = _places(frames, body.label)
+    place = _places(frames, body.seat)
     rows = np.flatnonzero(frames.shown >= body.template.shape[1])
     if not _known(frames, place).all():
         return False
@@ -520,14 +564,19 @@ def _square_angle(one: Floats, other: Floats) -> Floats:
 
 
 def _assignments(frames: _Frames, body: _Body, *, labelled: bool) -> _Lists:
-    """List the noise-like assignments of every frame."""
+    """List the candidates of every frame: the noise-like assignments and the labels as given.
+
+    A frame in which nothing is noise-like still shows how far the body has turned. Its candidates
+    are the labels as given and what the symmetries of the body make of them.
+    """
     n = frames.n
     found: dict[int, Ints] = {}
-    place = _places(frames, body.label)
+    place = _places(frames, body.seat)
     misfit = np.full(len(frames.x), np.inf)
     trusted = np.flatnonzero(_known(frames, place) & (frames.shown > 0) & labelled)
     seated = _seated(frames.x[trusted], place[trusted, None])[:, 0]
     misfit[trusted] = _fits(seated, body.template)[1]
+    given = np.flatnonzero(np.isfinite(misfit))
     fits = misfit <= _limit(frames.shown, body)
     whole = np.flatnonzero(frames.shown == n)
     base = place.copy()
@@ -540,7 +589,13 @@ def _assignments(frames: _Frames, body: _Body, *, labelled: bool) -> _Lists:
         _search(frames, body, found, drop=1)
     else:
         _patch(frames, body, found, place, fits)
-    return _padded(frames, body, found, np.flatnonzero(fits & (frames.shown == n)))
+    for k in given.tolist():
+        if k not in found:
+            found[k] = place[k][body.group]
+        elif (found[k][0] != place[k]).any():
+            others = (found[k] != place[k]).any(axis=1)
+            found[k] = np.concatenate([place[k][None], found[k][others]])
+    return _padded(frames, body, found, np.flatnonzero(fits))
 
 
 def _base(points: Floats, body: _Body) -> tuple[Ints, Floats]:
@@ -623,8 +678,8 @@ def _strays(points: Floats, table: Ints, rotation: Floats, template: Floats) -> 
     return np.asarray(far)
 
 
-def _padded(frames: _Frames, body: _Body, found: dict[int, Ints], labelled: Ints) -> _Lists:
-    """Lay the lists of all frames side by side, with their fits."""
+def _padded(frames: _Frames, body: _Body, found: dict[int, Ints], own: Ints) -> _Lists:
+    """Lay the lists of all frames side by side, with their fits; the last place stays empty."""
     width = max((len(table) for table in found.values()), default=1) + 1
     count, d = len(frames.x), frames.x.shape[2]
     place = np.full((count, width, frames.n), -1, dtype=np.int64)
@@ -636,17 +691,37 @@ def _padded(frames: _Frames, body: _Body, found: dict[int, Ints], labelled: Ints
         at = rows[part], listed[part]
         seated = _seated(frames.x[at[0]], place[at][:, None])[:, 0]
         rotation[at], misfit[at] = _fits(seated, body.template)
-    return _Lists(place, rotation, misfit, labelled)
+    used = (place >= 0).sum(axis=2)
+    cost = _misfit_cost(misfit, used, frames.shown, body)
+    return _Lists(place, rotation, cost, misfit <= _limit(used, body), own)
+
+
+def _misfit_cost(misfit: Floats, used: Ints, shown: Ints, body: _Body) -> Floats:
+    """Return minus the log-likelihood of squared residuals (T, C) of so many particles.
+
+    The residuals of a frame follow a multivariate Student law of the usual noise: a frame as a
+    whole may be worse than others. A detection left out lies anywhere within the body's extent.
+    """
+    n, d = body.template.shape
+    freedom = np.maximum(degrees_of_freedom(np.arange(n + 1), d), 0).astype(np.float64)
+    scale = _STUDENT * body.sigma2
+    gamma = np.array([lgamma((_STUDENT + f) / 2) - lgamma(_STUDENT / 2) for f in freedom])
+    norm = freedom / 2 * np.log(np.pi * scale) - gamma
+    extent = 2 * float(np.linalg.norm(body.template, axis=1).max())
+    strays = d * np.log(extent) * (shown[:, None] - used)
+    cost: Floats = norm[used] + strays
+    return cost + (_STUDENT + freedom[used]) / 2 * np.log1p(misfit / scale)
 
 
 def _chained(
     frames: _Frames, body: _Body, lists: _Lists, time: Floats, *, labelled: bool
 ) -> Identity:
     """Follow the most likely assignment from frame to frame; cut where it is in doubt."""
-    rows = np.flatnonzero(np.isfinite(lists.misfit).any(axis=1))
+    rows = np.flatnonzero(np.isfinite(lists.cost).any(axis=1))
     choice, sure = _followed(frames, body, lists, time, rows, labelled=labelled)
     order = np.full((len(frames.x), frames.n), -1, dtype=np.int64)
     order[rows] = _columns(frames, lists, rows)[np.arange(rows.size), choice]
+    settled = rows[lists.fits[rows, choice]]
     used = (order >= 0).sum(axis=1)
     site = _sites(order)
     if labelled:
@@ -659,7 +734,7 @@ def _chained(
         swaps=np.setdiff1d(_exchanges(site), rows[~sure]) if labelled else rows[:0],
         cuts=rows[~sure],
         extra=rows[frames.shown[rows] > used[rows]],
-        unsettled=np.setdiff1d(np.flatnonzero(frames.shown >= frames.x.shape[2]), rows),
+        unsettled=np.setdiff1d(np.flatnonzero(frames.shown >= frames.x.shape[2]), settled),
     )
 
 
@@ -669,28 +744,117 @@ def _followed(
     """Return the choice in each settled frame, and whether the step to it is beyond doubt."""
     if not rows.size:
         return [], np.empty(0, dtype=np.bool_)
-    spread = _spread(lists, time[rows], rows, labelled=labelled)
+    spread = _spread(frames, lists, time[rows], rows, labelled=labelled)
     choice, sure = [_first_choice(frames, body, lists, rows[0], labelled=labelled)], [True]
-    for part in _batches(rows.size - 1, lists.misfit.shape[1] ** 2):
-        chain = rows[part.start : part.stop + 1]
-        cost = _costs(lists, chain, spread[part], body.sigma2)
+    held = _taken(_columns(frames, lists, rows[:1])[0, choice[0]], body.seat)
+    plain = _plain(lists, rows, spread) & labelled
+    nowhere, poses = np.full(held.size, -1), list[_Pose]()
+    for i in range(1, rows.size):
+        poses = _reached(poses, lists, rows[i - 1], choice[-1], spread[i - 1])
+        shown = frames.column[rows[i]]
+        if plain[i - 1] and choice[-1] == 0 and (held == body.seat)[shown].all():
+            choice.append(0)
+            sure.append(True)
+            continue
         if labelled:
-            cost += _TRUST * _differ(_columns(frames, lists, chain))
-        ranked = np.argsort(cost, axis=2)[:, :, :2]
-        two = np.take_along_axis(cost, ranked, axis=2)
-        clear = two[:, :, 1] - two[:, :, 0] > _DOUBT
-        for following, beyond in zip(ranked[:, :, 0].tolist(), clear.tolist(), strict=True):
-            sure.append(beyond[choice[-1]])
-            choice.append(following[choice[-1]])
+            _list_held(frames, body, lists, rows[i], held)
+        column = _columns(frames, lists, rows[i : i + 1])[0]
+        cost = _step_cost(lists, poses, rows[i], labelled=labelled)
+        if labelled:
+            cost += _TRUST * _against(held, column, shown)
+        now = int(np.argmin(cost))
+        # Two candidates that agree on every particle both of them place are in no conflict.
+        near = column[cost <= cost[now] + _DOUBT]
+        rivals = len(near) > 1 and _moved(_taken(column[now], nowhere), near).any()
+        choice.append(now)
+        sure.append(not rivals)
+        if labelled:
+            held = _taken(column[now], held)
     return choice, np.array(sure)
 
 
+class _Pose(NamedTuple):
+    """A rotation reached before, and the variance of a component of the turn since then."""
+
+    rotation: Floats
+    spread: float
+
+
+def _reached(
+    poses: list[_Pose], lists: _Lists, row: int, choice: int, spread: float
+) -> list[_Pose]:
+    """Return the poses a step may start from: the last noise-like one and the last of all.
+
+    A single frame may have a wrong rotation, and over many bad frames the body turns far: the step
+    is as likely as from the nearer of the two.
+    """
+    pose = _Pose(lists.rotation[row, choice], spread)
+    if lists.fits[row, choice] or not poses:
+        return [pose]
+    return [_Pose(poses[0].rotation, poses[0].spread + spread), pose]
+
+
+def _list_held(frames: _Frames, body: _Body, lists: _Lists, row: int, held: Ints) -> None:
+    """Add the labels as they were last held to the candidates of a frame, whatever their misfit.
+
+    They are the labels as given until an exchange. The last place of every list is kept for them.
+    """
+    one = slice(row, row + 1)
+    place = _places(frames._replace(column=frames.column[one]), held)
+    if (place >= 0).sum() != frames.shown[row] or (lists.place[row] == place).all(axis=1).any():
+        return
+    rotation, misfit = _fits(_seated(frames.x[one], place[:, None])[0], body.template)
+    used = (place >= 0).sum(axis=1)[:, None]
+    lists.place[row, -1], lists.rotation[row, -1] = place[0], rotation[0]
+    lists.cost[row, -1] = _misfit_cost(misfit[:, None], used, frames.shown[one], body)[0, 0]
+    lists.fits[row, -1] = misfit[0] <= _limit(used, body)[0, 0]
+
+
+def _plain(lists: _Lists, rows: Ints, spread: Floats) -> Bools:
+    """Return the steps between rows whose own labels are beyond doubt whatever the other angles.
+
+    Every other candidate bears the whole weight of the labels, so its misfit is compared alone.
+    """
+    square = _square_angle(lists.rotation[rows[:-1], 0], lists.rotation[rows[1:], 0])
+    cost = lists.cost[rows[1:]]
+    own = np.isin(rows, lists.own)
+    sure = square / (2 * spread) + cost[:, 0] + _DOUBT < cost[:, 1:].min(axis=1) + _TRUST
+    return np.asarray(own[:-1] & own[1:] & sure)
+
+
+def _taken(column: Ints, held: Ints) -> Ints:
+    """Return the particle (m,) of each column once the particles are in the columns given."""
+    filled = column >= 0
+    seat = np.where((held >= 0) & filled[held], -1, held)
+    seat[column[filled]] = np.flatnonzero(filled)
+    return seat
+
+
+def _moved(held: Ints, column: Ints) -> Bools:
+    """Return which candidates (C, n) give a column another particle than it is held to be."""
+    before = np.where(column >= 0, held[column], -1)
+    return np.asarray(((before >= 0) & (before != np.arange(column.shape[1]))).any(axis=1))
+
+
+def _against(held: Ints, column: Ints, shown: Ints) -> Bools:
+    """Return which candidates (C, n) contradict the labels: by another particle, or by none.
+
+    Of the columns `shown`, those of known particles are meant to be placed, at most n of them.
+    """
+    known = ((shown >= 0) & (held[shown] >= 0)).sum()
+    placed = ((column >= 0) & (held[column] >= 0)).sum(axis=1)
+    return np.asarray(_moved(held, column) | (placed < min(known, column.shape[1])))
+
+
 def _first_choice(frames: _Frames, body: _Body, lists: _Lists, row: int, *, labelled: bool) -> int:
-    """Return the assignment to begin with: nearest to the labels, then the best fit."""
-    column = _columns(frames, lists, np.array([row]))[0]
-    wrong = ((column != body.label) & (column >= 0)).sum(axis=1) * labelled
-    wrong = np.where(np.isfinite(lists.misfit[row]), wrong, len(body.label) + 1)
-    return int(np.lexsort((lists.misfit[row], wrong))[0])
+    """Return the assignment to begin with: the labels unless another is e^18 times likelier."""
+    cost = lists.cost[row]
+    if labelled:
+        column = _columns(frames, lists, np.array([row]))[0]
+        particle = np.where(column >= 0, body.seat[column], -1)
+        wrong = ((particle != np.arange(frames.n)) & (column >= 0)).sum(axis=1)
+        cost = cost + _TRUST * _against(body.seat, column, frames.column[row]) + wrong
+    return int(np.argmin(cost))
 
 
 def _columns(frames: _Frames, lists: _Lists, rows: Ints) -> Ints:
@@ -700,47 +864,48 @@ def _columns(frames: _Frames, lists: _Lists, rows: Ints) -> Ints:
     return np.where(place >= 0, column, -1)
 
 
-def _spread(lists: _Lists, time: Floats, rows: Ints, *, labelled: bool) -> Floats:
-    """Return the variance of one component of each step's rotation vector, from the median."""
-    d = lists.rotation.shape[-1]
-    first, second = lists.rotation[rows[:-1]], lists.rotation[rows[1:]]
-    square = _square_angle(first[:, :1], second)
-    square = np.where(np.isfinite(lists.misfit[rows[1:]]), square, np.inf)
-    own = np.isin(rows, lists.own)
-    steps = square[own[:-1] & own[1:], 0]
-    if not (labelled and 2 * steps.size > rows.size):
-        steps = square.min(axis=1)
+def _spread(frames: _Frames, lists: _Lists, time: Floats, rows: Ints, *, labelled: bool) -> Floats:
+    """Return the variance of one component of each step's rotation vector, from the median.
+
+    Columns that are lasting particles show the turn between two frames even where their labels are
+    not those of the shape; of detections without labels the least turn counts.
+    """
+    steps = _labelled_turns(frames, rows) if labelled else rows[:0]
+    if not 2 * steps.size > rows.size:
+        fits = lists.fits[rows]
+        first = lists.rotation[rows[:-1], np.argmax(fits[:-1], axis=1)]
+        square = _square_angle(first[:, None], lists.rotation[rows[1:]])
+        square = np.where(fits[1:], square, np.inf).min(axis=1)
+        steps = square[fits[:-1].any(axis=1) & fits[1:].any(axis=1)]
     gap = np.diff(time)
     usual = float(np.median(gap)) if gap.size else 1.0
     median = float(np.median(steps)) if steps.size else 0.0
-    typical = median / _median_chi2(3.0 if d == 3 else 1.0)
+    typical = median / _median_chi2(3.0 if frames.x.shape[2] == 3 else 1.0)
     spread: Floats = max(typical, _TINY**2) * np.maximum(gap / usual, 1.0)
     return spread
 
 
-def _costs(lists: _Lists, chain: Ints, spread: Floats, sigma2: float) -> Floats:
-    """Return minus the log-likelihood (K, C, C) of every choice after every choice before."""
-    d = lists.rotation.shape[-1]
-    flat = lists.rotation[chain].reshape(len(chain), -1, d * d)
-    trace = flat[:-1] @ np.swapaxes(flat[1:], -1, -2)
-    half = np.sqrt(np.clip((d - trace) / 4, 0.0, 1.0))
-    square = (2 * np.arcsin(half)) ** 2
-    misfit = lists.misfit[chain[1:]][:, None, :]
-    # A body that leaps follows no law of its small steps: those of the leap's own size decide.
-    least = np.where(np.isfinite(misfit), square, np.inf).min(axis=2, keepdims=True)
-    wide = np.maximum(spread[:, None, None], least / _LEAP)
-    cost: Floats = square / (2 * wide)
-    return cost + misfit / (2 * sigma2)
+def _labelled_turns(frames: _Frames, rows: Ints) -> Floats:
+    """Return the squared angles of the steps between rows that columns seen in both fix."""
+    count, d = int(frames.column.max()) + 1, frames.x.shape[2]
+    points = np.full((rows.size, count, d), np.nan)
+    row, detection = np.nonzero(frames.column[rows] >= 0)
+    points[row, frames.column[rows[row], detection]] = frames.x[rows[row], detection]
+    rotation, misfit = _fits(points[1:], points[:-1])
+    return _square_angle(rotation[np.isfinite(misfit)], np.eye(d))
 
 
-def _differ(column: Ints) -> Bools:
-    """Return which choices (K - 1, C, C) move a column to another particle."""
-    n = column.shape[2]
-    before, after = column[:-1, :, None], column[1:, None]
-    moved = np.zeros((len(before), column.shape[1], column.shape[1]), dtype=np.bool_)
-    for i, j in permutations(range(n), 2):
-        moved |= (before[..., i] == after[..., j]) & (before[..., i] >= 0)
-    return moved
+def _step_cost(lists: _Lists, poses: list[_Pose], row: int, *, labelled: bool) -> Floats:
+    """Return minus the log-likelihood (C,) of a frame's candidates after the poses before it."""
+    misfit = lists.cost[row]
+    turns = np.full(misfit.shape, np.inf)
+    for pose in poses:
+        square = _square_angle(pose.rotation, lists.rotation[row])
+        # A body that leaps follows no law of its small steps: those of the leap's own size decide.
+        least = float(square[np.isfinite(misfit)].min())
+        wide = max(pose.spread, least / (_LEAP_LABELLED if labelled else _LEAP_UNLABELLED))
+        turns = np.minimum(turns, square / (2 * wide))
+    return np.asarray(turns + misfit)
 
 
 def _sites(order: Ints) -> Ints:

@@ -25,8 +25,11 @@ if TYPE_CHECKING:
     import pandas as pd
     from numpy.typing import ArrayLike
 
-# Log-odds as in identity: a hundred to one settles, and labels weigh e^10.
-_DOUBT, _TRUST = float(np.log(100.0)), 10.0
+# Log-odds as in identity: a hundred to one settles, and labels weigh e^18.
+_DOUBT, _TRUST = float(np.log(100.0)), 18.0
+# A least turn of over this many standard deviations (squared) widens the law of the step to itself,
+# as in identity.
+_LEAP_UNLABELLED, _LEAP_LABELLED = 16.0, 4.0
 # Particles that leave their line by more than so much of its length (a coordinate) form no line.
 _BENT = 0.1
 # A chain looks alike from both ends if its places do within so much of its length.
@@ -193,7 +196,7 @@ def track_direction(
         Known localisation error, um; default: from the residuals (of a pair: from its length).
     labelled : bool
         Whether columns are meant to be lasting particles. The two ends of a symmetric chain are
-        told apart by least rotation; with labels only against odds of e^10.
+        told apart by least rotation; with labels only against odds of e^18.
 
     Returns
     -------
@@ -312,6 +315,9 @@ def _ends(
     gap = np.diff(time)
     typical = float(np.median((angle if labelled else least) ** 2)) / _MEDIAN_2
     spread = max(typical, 1e-12) * np.maximum(gap / np.median(gap), 1.0)
+    # One long turn follows no law of the short ones: its own size decides.
+    leap = _LEAP_LABELLED if labelled else _LEAP_UNLABELLED
+    spread = np.maximum(spread, least**2 / leap)
     # Odds of "kept" against "exchanged".
     odds = ((np.pi - angle) ** 2 - angle**2) / (2 * spread) + (_TRUST if labelled else 0.0)
     sign = np.concatenate([[1.0], np.where(odds < 0, -1.0, 1.0)])
