@@ -47,13 +47,13 @@ import perrin
 # What a warning is about, by its words. A text belongs to the first kind that it matches; a fault
 # is named when a text matches one of the kinds that it expects, whatever else the text matches.
 KINDS = {
-    "velocity": r"mean velocity|\bflow\b|drifts? (at|by|with)",
+    "velocity": r"mean velocity|\bflow\b|centre moves steadily",
     "spin": r"\bspin|mean turn|turns? steadily|steady (turn|rotation)|rad/s\b",
     "hopping": r"another kind of motion|no Brownian motion|not Brownian",
     "jump": r"\bjumps?\b(?! (of|by) the )|Brownian motion cannot",
     "time": r"column '?time|time column|\btimes?\b.*contradict",
     "stride": r"multiples? of \d|every \d+(th|rd|nd)",
-    "repeat": r"last place|previous place|repeats? .*(place|position)|same place as",
+    "repeat": r"particle's previous row",
     "zeros": r"\(0(\.0)?, 0(\.0)?(, 0(\.0)?)?\)|exactly (0|zero|\()",
     "constant": r"(same|one|constant) (point|place|position)|exactly \(|constant point",
     "centred": r"centre (does|of .* does) not move|\bcentred\b|centre .*(removed|subtracted)",

@@ -19,11 +19,16 @@ class DegenerateClusterError(ValueError):
     ----------
     indices : tuple of int
         The offending rows (frames), or the particles' count where one number says it all.
+    collinear : bool
+        Whether the particles lie on one line within the noise: they may still have a direction.
     """
 
-    def __init__(self, message: str, indices: tuple[int, ...] = ()) -> None:
+    def __init__(
+        self, message: str, indices: tuple[int, ...] = (), *, collinear: bool = False
+    ) -> None:
         super().__init__(message)
         self.indices = indices
+        self.collinear = collinear
 
 
 class TooFewFramesError(ValueError):

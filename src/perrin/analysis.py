@@ -69,6 +69,7 @@ from perrin.step_tests import (
     SteadyMotion,
     cut_at,
     find_jumps,
+    offset_gain,
     steady_motion,
 )
 from perrin.steps import residual_freedom
@@ -103,7 +104,7 @@ _FEW_FRAMES = 0.01
 # Jumps of a length that differs by less than this share are all of one length.
 _ONE_LENGTH = 0.3
 _SHOWN_JUMPS = 5
-# The noise floor is tested at this many standard errors (0.05 % of clean tracks), and for any
+# The noise floor is tested at this many standard errors (0.05 % of clean tracks), for any ratio
 # sigma_z/sigma_xy up to this one.
 _FLOOR_ERRORS, _NOISE_RATIO = 3.5, 5.0
 
@@ -562,6 +563,8 @@ def _fit(
     try:
         return _fit_body(tracks, cluster, label, conditions)
     except DegenerateClusterError as error:
+        if not error.collinear:
+            raise
         try:
             return _measure_rod(tracks, cluster, label, conditions)
         except (DegenerateClusterError, ValueError):
@@ -713,7 +716,9 @@ def _diffusion(
         none = Jumps(nothing, np.empty((0, 3)), np.empty(0), 0)
         return _Diffusion(estimate, motion, none, nothing, False, (), ())
     estimate = conditions.estimate(motion, quantity)
-    jumps = find_jumps(motion, estimate)
+    # Doubt about the labels cuts the track, but the centre's path goes on across it.
+    path = motion if quantity == "rotation" else replace(motion, piece=np.zeros_like(motion.piece))
+    jumps = find_jumps(path, estimate)
     left_out = jumps.rows[:0]
     warnings: list[str] = []
     if jumps.rows.size:
@@ -925,10 +930,10 @@ def _identity_remarks(
         )
     unsettled = tracks.frames[identity.unsettled]
     if unsettled.size:
-        remark(
-            unsettled,
+        # How many bad frames a rigid body may have is judged by its quality.
+        notes.append(
             f"identity: {unsettled.size} of {count} frames fit the common shape in no assignment "
-            f"({at(unsettled.tolist())}); they keep their labels",
+            f"({at(unsettled.tolist())}); they keep their labels"
         )
     if len(quality.cuts) > _MANY_CUTS * count:
         warnings.append(
@@ -993,23 +998,32 @@ def _floor_mismatch(
     """Warn where the offset of the steps is not the noise that the residuals (or sigma) predict.
 
     Where sigma is not stated, any sigma_z/sigma_xy up to 5 may be behind the residuals: a body that
-    does not turn tells them apart by nothing else.
+    does not turn tells them apart by nothing else. A likelihood-ratio test with one degree of
+    freedom.
     """
-    factor = floor_factor(motion)
-    measured, error = factor * D_R.offset, factor * D_R.offset_stderr
-    low = high = noise.phi2
+    if D_R.noise != "joint" or not D_R.value > 0:
+        return []
+    low = high = 1.0
     if not stated:
         if motion.template.shape[1] == 3:
-            ends = floor_range(motion.template, motion.rotation[motion.fitted], ratio=_NOISE_RATIO)
-            low, high = (end * noise.phi2 for end in ends)
-        error = float(np.hypot(error, high * np.sqrt(2 / max(residual_freedom(motion), 1))))
-    if not (measured - high > _FLOOR_ERRORS * error or low - measured > _FLOOR_ERRORS * error):
+            rotation = motion.rotation[motion.fitted]
+            low, high = floor_range(motion.template, rotation, ratio=_NOISE_RATIO)
+        unsure = _FLOOR_ERRORS * np.sqrt(2 / max(residual_freedom(motion), 1))
+        low, high = low * max(1 - unsure, 0.0), high * (1 + unsure)
+    measured = floor_factor(motion) * D_R.offset
+    if low * noise.phi2 <= measured <= high * noise.phi2:
         return []
-    predicted = f"{low:.3g}" if high < 1.01 * low else f"{low:.3g} to {high:.3g}"
+    nearest = high if measured > high * noise.phi2 else low
+    sigma = float(np.sqrt(nearest * np.mean(motion.noise**2)))
+    gain = offset_gain(motion, D_R, sigma=sigma)
+    if gain < _FLOOR_ERRORS**2:
+        return []
+    error = floor_factor(motion) * D_R.offset_stderr
     return [
         f"noise floor: the steps show Phi^2 = {measured:.3g} +- {error:.2g} rad^2, the "
-        f"localisation error predicts {predicted}; motion blur lowers it, particles recorded "
-        "one after another or noise that is smooth in time change it"
+        f"localisation error predicts {noise.phi2:.3g} (likelihood ratio, {np.sqrt(gain):.1f} "
+        "standard errors); motion blur lowers it, particles recorded one after another or noise "
+        "that is smooth in time change it"
     ]
 
 

@@ -416,9 +416,13 @@ def _limits(
             "than a step; sample less often"
         )
     if quantity == "rotation" and estimate.method != "trace":
-        time = float(sum(np.sum(s.duration**2) for s in steps))
-        mean = time / float(sum(np.sum(s.duration) for s in steps))
-        limits += _coarse(estimate.value * mean, planar=steps[0].size.shape[1] == 1)
+        durations = np.concatenate([s.duration for s in steps])
+        # A step counts as the square of the share of diffusion in its variance.
+        snr = max(estimate.snr, 0.0) * durations / estimate.dt
+        share = np.divide(snr, snr + 1, out=np.ones_like(snr), where=np.isfinite(snr))
+        weight = share**2
+        usual = float(np.average(durations, weights=weight)) if weight.any() else estimate.dt
+        limits += _coarse(estimate.value * usual, planar=steps[0].size.shape[1] == 1)
     return tuple(limits)
 
 

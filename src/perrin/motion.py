@@ -36,6 +36,9 @@ _CONVERGED = 1e-13  # rad: a Gauss-Newton step this short has arrived
 
 # Standard deviation of a pair's distance over its mean from which on a body is not rigid.
 _CHANGES = 0.2
+# The width of particles on a line, over their localisation error: that of the mean shape is below 2
+# by the noise alone, and sigma_z may be three times the sigma that a distance across it shows.
+_WIDE = 6.0
 
 # An axis whose orientation is this uncertain (rad) is not determined: the particles lie on a line
 # within the noise, and the small-angle theory of every error has lost its meaning.
@@ -740,7 +743,9 @@ def _no_rotation(x: Floats) -> DegenerateClusterError:
         text = f"the {n} particles lie on one line"
     else:
         text = f"the {n} particles are in one place"
-    return DegenerateClusterError(f"no rotation can be found: {text}", (n,))
+    return DegenerateClusterError(
+        f"no rotation can be found: {text}", (n,), collinear=text.endswith("line")
+    )
 
 
 def _too_few(count: int) -> TooFewFramesError:
@@ -901,9 +906,8 @@ def _measured(
     lost = worst > _LOST_AXIS
     fitted = np.isfinite(fit.rotation[:, 0, 0]) & ~lost
     if fitted.sum() < 2:
-        raise DegenerateClusterError(
-            _no_orientation(x, fit.template, float(np.sqrt(noise.mean()))),
-            tuple(int(k) for k in np.flatnonzero(lost)),
+        raise _no_orientation(
+            x, fit.template, float(np.sqrt(noise.mean())), tuple(np.flatnonzero(lost).tolist())
         )
     square = np.where(seen[..., None], fit.residual, np.nan) ** 2
     nan = np.where(fitted, 0.0, np.nan)
@@ -924,31 +928,55 @@ def _measured(
     )
 
 
-def _no_orientation(x: Floats, template: Floats, noise: float) -> str:
-    """State why no frame fixes the orientation: distances that change, or particles on a line."""
+def _no_orientation(
+    x: Floats, template: Floats, noise: float, lost: tuple[int, ...]
+) -> DegenerateClusterError:
+    """Return the refusal of a body of which no frame fixes the orientation, with its cause.
+
+    Distances that change, or particles on a line: their width is then of the order of the noise
+    that the steadiest distance shows.
+    """
     n, d = template.shape
     change, pair, scale = _distance_changes(x)
-    if change > _CHANGES:
+    extent = np.linalg.svd(template, compute_uv=False) / np.sqrt(n)
+    wide = d == 3 and extent[1] > _WIDE * _steadiest_noise(x)
+    if change > _CHANGES or (wide and change > 0):
         cause = (
             "more than one body under this number, or labels that change?"
             if scale is None
             else f"with z multiplied by {scale:.3g} all are constant: z is in another unit?"
         )
-        return (
+        return DegenerateClusterError(
             f"the {n} particles are no rigid body: the distance of particles {pair[0]} and "
             f"{pair[1]} (counted from 0) changes by {change:.0%} (standard deviation over mean): "
-            f"{cause}"
+            f"{cause}",
+            lost,
         )
-    extent = np.linalg.svd(template, compute_uv=False) / np.sqrt(n)
     if d == 2:
-        return (
+        return DegenerateClusterError(
             f"the {n} particles are in one place within the noise: extent {extent[0]:.3g} um, "
-            f"localisation error {noise:.3g} um"
+            f"localisation error {noise:.3g} um",
+            lost,
         )
-    return (
+    return DegenerateClusterError(
         f"the {n} particles lie on one line within the noise: length {extent[0]:.3g} um, width "
-        f"{extent[1]:.3g} um (root mean squares), localisation error {noise:.3g} um"
+        f"{extent[1]:.3g} um (root mean squares), localisation error {noise:.3g} um",
+        lost,
+        collinear=True,
     )
+
+
+def _steadiest_noise(x: Floats) -> float:
+    """Return the localisation error of one coordinate that the steadiest pair of particles shows.
+
+    The distance of two particles scatters by sqrt(2) of it; half of the absolute deviations from
+    the median are below 0.6745 of that.
+    """
+    i, j = np.triu_indices(x.shape[1], 1)
+    distance = np.linalg.norm(x[:, i] - x[:, j], axis=2)
+    distance = distance[:, np.isfinite(distance).any(axis=0)]
+    off = np.nanmedian(np.abs(distance - np.nanmedian(distance, axis=0)), axis=0)
+    return float(off.min(initial=np.inf) / 0.6745 / np.sqrt(2))
 
 
 def _distance_changes(x: Floats) -> tuple[float, tuple[int, int], float | None]:

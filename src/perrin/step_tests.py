@@ -200,6 +200,41 @@ def steady_motion(motion: RigidMotion, estimate: DiffusionEstimate) -> SteadyMot
     return _steady(motion, _estimated(motion, estimate, drift=True))
 
 
+def offset_gain(motion: RigidMotion, estimate: DiffusionEstimate, *, sigma: float) -> float:
+    """Return twice the log-likelihood that the noise offset, left free, gains over a known noise.
+
+    Parameters
+    ----------
+    motion : RigidMotion
+    estimate : DiffusionEstimate
+        D of this motion with noise "joint"; its other settings hold.
+    sigma : float
+        Localisation error, um (rms over axes).
+
+    Returns
+    -------
+    float
+        Chi-squared with one degree of freedom if sigma is right: the offset's own standard error
+        is too small where motion blur makes it negative and few steps bound it.
+
+    Examples
+    --------
+    >>> from perrin import Cluster, add_noise, estimate_diffusion, simulate_motion, track_rotation
+    >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=1e-3, dt=0.7, n_frames=100, rng=3)
+    >>> motion = track_rotation(add_noise(truth.positions(), sigma=0.03, rng=4), dt=0.7)
+    >>> estimate = estimate_diffusion(motion)
+    >>> [round(offset_gain(motion, estimate, sigma=s)) for s in (0.03, 0.06)]
+    [0, 23]
+    """
+    steps = steps_of(motion, _quantity(estimate))
+    drift = estimate.drift is not None
+    known = track_of(steps, noise=sigma, exposure=estimate.exposure, drift=drift)
+    free, fixed = (
+        float(Likelihood.of([track]).best().value[0]) for track in (_track(motion, estimate), known)
+    )
+    return max(2 * (free - fixed), 0.0)
+
+
 def _steady(motion: RigidMotion, estimate: DiffusionEstimate) -> SteadyMotion:
     """Return the generalised least-squares steady motion at the D and noise of an estimate."""
     from scipy.special import fdtrc
