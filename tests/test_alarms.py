@@ -213,7 +213,6 @@ def test_a_name_of_no_case_is_refused(capsys):
     assert "no case has 'no such case' in its name" in capsys.readouterr().err
 
 
-@pytest.mark.xfail(reason="faults without a warning and false warnings are being mended")
 def test_every_fault_is_named_and_clean_data_are_quiet(capsys):
     """Two tables of every case; a line is broken where the count excludes it."""
     status = NAMES.main(["--quick"])

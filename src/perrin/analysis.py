@@ -71,6 +71,7 @@ from perrin.step_tests import (
     find_jumps,
     offset_gain,
     steady_motion,
+    without_spin,
 )
 from perrin.steps import residual_freedom
 from perrin.tensors import DiffusionTensor, diffusion_tensor
@@ -656,7 +657,10 @@ def _estimate_body(body: _Body, conditions: Conditions, done: _Estimated, *, bod
     path = _diffusion(body, "translation", conditions, bodies=bodies)
     D_R, D_T = turn.estimate, path.estimate
     noise = predicted_noise(motion)
-    tensor, unfound = _tensor(turn.motion, conditions)
+    turning = turn.motion
+    if D_R.drift is not None:
+        turning = without_spin(turning, D_R.drift[0])
+    tensor, unfound = _tensor(turning, conditions)
     # The offset of steps that contain another motion, or of a body that bends, is no noise.
     floor: list[str] = []
     if body.quality.rigid and not (turn.steady or turn.jumps.rows.size):
@@ -1066,17 +1070,30 @@ def _with_sizes(result: ClusterResult, body: Body, conditions: Conditions) -> Cl
         return replace(result, warnings=(*result.warnings, f"{lacking}: {body.reason}"))
     D_T, D_R = result.D_T, result.D_R
     sizes = conditions.sizes(body.mobility, D_T=D_T, D_R=D_R)
-    limits = " and ".join(k for k, D in (("D_R", D_R), ("D_T", D_T)) if not is_known(D))
-    told = [f"no size{' from' if sizes else 's:'} {limits}: an upper limit only"] if limits else []
+    limited = [
+        name
+        for name, D in (("D_R", D_R), ("D_T", D_T))
+        if D.absent_because is None and not is_known(D)
+    ]
+    notes = []
+    if limited:
+        which = " from" if sizes else "s:"
+        notes.append(f"no size{which} {' and '.join(limited)}: an upper limit only")
+    warnings = [*result.warnings, *body.told]
     prediction = None
     if conditions.diameter is not None:
         tensor_T, more = _translation_tensor(result.motion, body.mobility, conditions)
         prediction = compare_body(
             body.mobility, D_T=D_T, D_R=D_R, tensor_T=tensor_T, tensor_R=result.tensor
         )
-        told += more
-    warnings = (*result.warnings, *body.told, *told)
-    return replace(result, sizes=sizes or None, prediction=prediction, warnings=warnings)
+        notes += more
+    return replace(
+        result,
+        sizes=sizes or None,
+        prediction=prediction,
+        warnings=tuple(warnings),
+        notes=(*result.notes, *notes),
+    )
 
 
 def _translation_tensor(

@@ -1003,6 +1003,8 @@ def _estimate_cells(estimate: DiffusionEstimate) -> tuple[str, str, str]:
     """Return value and intervals as text; an unresolved value is an upper limit."""
     from perrin.diffusion import with_error
 
+    if estimate.absent_because is not None:
+        return "none", estimate.absent_because, ""
     value = with_error(estimate.value, estimate.stderr)
     if not estimate.resolved:
         value = f"< {estimate.ci95[1]:.2g} (95 %)"

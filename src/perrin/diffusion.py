@@ -180,10 +180,15 @@ class DiffusionEstimate:
             warnings=(reason,),
         )
 
+    @property
+    def absent_because(self) -> str | None:
+        """Why the data cannot show the coefficient at all; None where there is a value."""
+        return self.warnings[0].partition(":")[0] if np.isnan(self.value) else None
+
     def __str__(self) -> str:
         name = "D_R" if self.unit == UNITS["rotation"] else "D_T"
-        if np.isnan(self.value):
-            return f"{name}: none ({self.warnings[0].partition(':')[0]})"
+        if self.absent_because is not None:
+            return f"{name}: none ({self.absent_because})"
         how = self.method if self.noise == "joint" else f"{self.method}, {self.noise} noise"
         taken = "mean spin" if name == "D_R" else "drift"
         how += f", {taken} removed" if self.drift else ""

@@ -265,7 +265,11 @@ def plot_forest(
         Intervals of 68 % thick, 95 % thin; a triangle is a 95 % upper limit of what is not
         resolved; an arrowhead at the edge is an end out of the picture.
     """
-    estimates = [c.D_R if quantity == "rotation" else c.D_T for c in clusters]
+    both = [(c.D_R if quantity == "rotation" else c.D_T, c) for c in clusters]
+    estimates = [e for e, _ in both if e.absent_because is None]
+    clusters = [c for e, c in both if e.absent_because is None]
+    if not estimates:
+        return _without_data(ax, f"no {_NAMES[quantity][1]}: {both[0][0].absent_because}")
     many = len(clusters) > _MANY
     rows = np.argsort([e.value for e in estimates]) if many else np.arange(len(estimates))
     ordered = [estimates[i] for i in rows]
@@ -288,6 +292,13 @@ def plot_forest(
     # A name is the user's text: dollars in it are no formula.
     ax.set_yticks(np.arange(len(rows)), names, parse_math=False)
     ax.set(ylabel="cluster")
+    return ax
+
+
+def _without_data(ax: Axes, reason: str) -> Axes:
+    """State in an empty picture why there is nothing to draw."""
+    ax.set_axis_off()
+    ax.text(0.5, 0.5, reason, ha="center", va="center", transform=ax.transAxes)
     return ax
 
 
@@ -447,12 +458,16 @@ def value_text(estimate: DiffusionEstimate) -> str:
     -------
     str
     """
+    if estimate.absent_because is not None:
+        return "none"
     limit = "" if estimate.resolved else " (95 %)"
     return f"{bare_text(estimate)} {unit_text(estimate.unit)}{limit}"
 
 
 def bare_text(estimate: DiffusionEstimate) -> str:
     """Write an estimate as `value_text` does, without its unit."""
+    if estimate.absent_because is not None:
+        return "none"
     if estimate.resolved:
         return number_text(estimate.value, estimate.stderr)
     return f"< {number_text(estimate.ci95[1], digits=2)}".replace("inf", "∞")
@@ -768,6 +783,9 @@ def _curve_figure(result: ClusterResult) -> Figure:
         # Both ends of a turn carry the error of the orientation, across the directions averaged.
         floor = 2 * float(np.einsum("ij,ij->", weights, result.noise.covariance))
     plot_lag_curve(result.msad, ax=left, estimate=result.D_R, floor=floor, tensor=result.tensor)
+    if result.D_T.absent_because is not None:
+        _without_data(right, f"no {_NAMES['translation'][1]}: {result.D_T.absent_because}")
+        return figure
     motion = result.motion
     # Both ends of a displacement carry the centre's error, on each axis.
     floor = 2 * motion.template.shape[1] * float(np.mean(motion.center_variance[motion.fitted]))

@@ -304,6 +304,12 @@ def _section(
 
 def _estimate(estimate: DiffusionEstimate) -> dict[str, Any]:
     """Return an estimate in words: value, standard error and both intervals, one power of ten."""
+    if estimate.absent_because is not None:
+        words = dict.fromkeys(("value", "bare"), "none") | dict.fromkeys(
+            ("stderr", "ci68", "ci95"), "–"
+        )
+        unit = unit_text(estimate.unit)
+        return {"resolved": False, "unit": unit, "absent": estimate.absent_because} | words
     high = estimate.ci95[1]
     power = power_of(estimate.value if estimate.resolved or not np.isfinite(high) else high)
     stderr = "–"
@@ -317,6 +323,7 @@ def _estimate(estimate: DiffusionEstimate) -> dict[str, Any]:
         "ci68": _interval(estimate.ci68, power),
         "ci95": _interval(estimate.ci95, power),
         "unit": unit_text(estimate.unit),
+        "absent": None,
     }
 
 

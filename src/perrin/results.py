@@ -22,6 +22,7 @@ from perrin.noise import NoiseFloor, floor_of
 from perrin.predictions import Prediction
 from perrin.quality import Quality
 from perrin.rods import RodMotion
+from perrin.step_tests import without_spin
 from perrin.tensors import DiffusionTensor
 
 if TYPE_CHECKING:
@@ -77,12 +78,14 @@ class ClusterResult:
 
     @cached_property
     def msad(self) -> LagCurve:
-        """The MSAD averaged over the particles' directions."""
-        return msad(self.motion)
+        """The MSAD averaged over the particles' directions, without a mean spin taken off D_R."""
+        if self.D_R.drift is None:
+            return msad(self.motion)
+        return msad(without_spin(self.motion, self.D_R.drift[0]))
 
     @cached_property
     def msd(self) -> LagCurve:
-        """The MSD of the centre."""
+        """The MSD of the centre, without a mean velocity taken off D_T."""
         return msd(self.motion, drift=self.D_T.drift is not None)
 
     @property

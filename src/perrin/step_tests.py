@@ -11,9 +11,12 @@ import numpy as np
 from perrin._arrays import PrecisionWarning, TooFewFramesError, frozen
 from perrin.diffusion import UNITS, DiffusionEstimate, estimate_diffusion, track_of
 from perrin.likelihood import Likelihood, Track, covariance_bands
+from perrin.rotations import exp_map
 from perrin.steps import Quantity, steps_of
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from perrin._arrays import Bools, Floats, Ints
     from perrin.motion import RigidMotion
 
@@ -160,6 +163,27 @@ def cut_at(motion: RigidMotion, rows: Ints) -> RigidMotion:
     begins = np.zeros(len(motion.time), dtype=np.int64)
     begins[rows] = 1
     return replace(motion, piece=motion.piece + np.cumsum(begins))
+
+
+def without_spin(motion: RigidMotion, spin: Sequence[float]) -> RigidMotion:
+    """Return the motion as seen from axes that turn with a steady spin about the lab's axes.
+
+    Parameters
+    ----------
+    motion : RigidMotion
+    spin : sequence of float
+        rad/s about x, y, z; in the plane one number.
+
+    Examples
+    --------
+    >>> from perrin import Cluster, estimate_diffusion, simulate_motion
+    >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=100, rng=3)
+    >>> turning = without_spin(truth, [0, 0, -0.2])
+    >>> round(estimate_diffusion(turning, drift=True).drift[0][2], 1)
+    0.2
+    """
+    rotation = exp_map(-np.outer(motion.time - motion.time[0], spin)) @ motion.rotation
+    return replace(motion, rotation=rotation)
 
 
 def steady_motion(motion: RigidMotion, estimate: DiffusionEstimate) -> SteadyMotion:
