@@ -231,3 +231,17 @@ def test_trackpy_is_known_by_two_of_its_columns():
     """One column of mass or size may be anyone's."""
     assert has_trackpy_columns(["frame", "x", "y", "mass", "ecc"])
     assert not has_trackpy_columns(["frame", "x", "y", "size"])
+
+
+def test_particles_at_rest_on_a_cameras_grid_are_measured():
+    """Markers that stand and walk in turns on a grid of 0.145: repeats are measurements."""
+    rng = np.random.default_rng(31)
+    walking = (np.arange(1500) // 100) % 2 == 1
+    path = np.cumsum(
+        np.where(walking[:, None, None], 10.0, 0.003) * rng.normal(size=(1500, 4, 3)), 0
+    )
+    x = (np.round((path + 500) / 0.14490) * 0.14490).round(4)
+    still = (np.diff(x, axis=0) == 0).all(axis=2)
+    assert still.sum() > 500
+    table = perrin.positions_table(x)
+    assert screen_rows(table).warnings == ()

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 _SOFT_SIZE, _SOFT_SMOOTH, _SOFT_FACTOR = 0.03, 0.3, 2.0
 # A particle that moves against the others: root mean square of the part that is smooth in time,
 # over R.
-_FLEXING = 0.02
+_FLEXING = 0.03
 # Share of the detections trimmed (winsorised) as outliers of each particle.
 _TRIMMED = 0.05
 # A detection fits badly beyond this multiple of the distance that most detections keep.

@@ -33,6 +33,9 @@ _LEAP, _ROWS = 5.0, 3
 # A particle needs this number of steps before its repeats are judged; steps up to this number of
 # rows from a repeat tell how often a coordinate stays by rounding alone.
 _FEWEST, _AROUND = 8, 5
+# A tenth of the steps of a moving particle are shorter than 0.13 of their standard deviation on an
+# axis; the step that follows a repeat is usually over 5 times as long on one of the axes.
+_SMALL, _MOVING = 0.1, 5.0
 # A repeat by rounding has to be exceeded by this factor.
 _EXCESS = 3.0
 # A coordinate farther from every other particle than this number of body sizes is no measurement.
@@ -425,7 +428,7 @@ def _repeats(code: Ints, x: Floats) -> Bools:
     for particle in np.unique(code[1:][held]):
         rows = np.arange(*np.searchsorted(code, [particle, particle + 1]))
         stays = held[rows[1:] - 1]
-        if np.count_nonzero(~stays) < _FEWEST:
+        if np.count_nonzero(~stays) < _FEWEST or not _moves_on(x[rows], stays):
             continue
         chance = _chances(x[rows])
         by_rounding = len(stays) * float(np.prod(chance))
@@ -437,6 +440,18 @@ def _repeats(code: Ints, x: Floats) -> Bools:
         if too_many or by_rounding * particles < _CHANCE:
             repeated[rows[1:]] = stays
     return repeated
+
+
+def _moves_on(x: Floats, held: Bools) -> bool:
+    """Return whether the steps that end repeats are steps of a moving particle.
+
+    A particle at rest on the grid of a camera repeats its place too, and leaves it by one unit of
+    the grid, which is also the smallest of its steps.
+    """
+    step = np.abs(np.diff(x, axis=0))
+    unit = [np.quantile(s[s > 0], _SMALL) if (s > 0).any() else np.inf for s in step.T]
+    after = step[1:][held[:-1] & ~held[1:]]
+    return bool(len(after)) and float(np.median((after / unit).max(axis=1))) >= _MOVING
 
 
 def _chances(x: Floats) -> Floats:

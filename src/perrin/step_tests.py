@@ -384,17 +384,22 @@ def _jump_probability(residuals: _Residuals, likely: Bools) -> Floats:
 
     z, rest = residuals.step[likely], residuals.step[~likely]
     count, d = rest.shape
-    square = np.sum((z @ _inverse_root(rest.T @ rest / count)) ** 2, axis=1)
+    # Of a body at rest the residuals are a slow wave, of which one track shows few periods: M may
+    # then be small by chance, but not smaller than 1, what it is where the fit is right.
+    square = np.sum((z @ _inverse_root(rest.T @ rest / count, least=1.0)) ** 2, axis=1)
     freedom = count - d + 1
     p = fdtrc(d, freedom, square * freedom / (d * count))
     return np.asarray(np.minimum(len(residuals.step) * p, 1.0))
 
 
-def _inverse_root(a: Floats) -> Floats:
-    """Return A^(-1/2) of a covariance; axes without any motion are left out."""
+def _inverse_root(a: Floats, *, least: float = 0.0) -> Floats:
+    """Return A^(-1/2) of a covariance with eigenvalues of `least` or more.
+
+    Axes without any motion are left out.
+    """
     values, axes = np.linalg.eigh(a)
     moves = values > 1e-12 * max(float(values[-1]), 1e-300)
-    return np.asarray(axes[:, moves] / np.sqrt(values[moves]))
+    return np.asarray(axes[:, moves] / np.sqrt(np.maximum(values[moves], least)))
 
 
 def _sizes(motion: RigidMotion, quantity: Quantity, stop: Ints) -> Floats:
