@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import perrin
 from perrin import (
     Cluster,
     DegenerateClusterError,
@@ -392,3 +393,34 @@ def test_lengths_that_look_like_nanometres_are_named():
         warnings.simplefilter("error")
         for diameter in (0.06, 2.45, 49.0):
             plan_sampling(Cluster.touching(4, diameter), D_R=D_R, sigma=0.01 * diameter)
+
+
+def test_every_estimate_of_one_track_gets_one_verdict():
+    """A line, least squares of a curve and the likelihood share the noise, so all say oversampled.
+
+    Frames 10 ms apart at SNR 0.2: the offset of a curve is negative in some of these tracks and
+    says nothing of the noise.
+    """
+    body = Cluster.tetrahedron(1.5)
+    for seed in range(12):
+        truth = simulate_motion(body, D_R=5e-3, D_T=0.04, dt=0.01, n_frames=300, rng=seed)
+        motion = track_rotation(add_noise(truth.positions(), sigma=0.03, rng=seed + 90), dt=0.01)
+        estimates = [
+            perrin.fit_line(perrin.msad(motion)),
+            perrin.fit_gls(perrin.msad(motion)),
+            perrin.estimate_diffusion(motion),
+        ]
+        # One noise variance, with the D that each found; the directions that a curve averages
+        # weigh the axes of the noisy shape a little unequally.
+        noise = [e.value * e.dt / e.snr for e in estimates]
+        assert noise == pytest.approx([noise[0]] * 3, rel=1e-4)
+        assert all(str(judge_sampling(e)).startswith("Oversampled") for e in estimates)
+
+
+def test_a_curve_of_positions_does_not_know_its_noise():
+    """Free particles have no rigid-fit residuals: no SNR, and no verdict on the sampling."""
+    walk = np.random.default_rng(2).normal(size=(100, 3, 3)).cumsum(axis=0)
+    estimate = perrin.fit_line(perrin.msd(walk, dt=0.5))
+    assert np.isnan(estimate.snr)
+    with pytest.raises(ValueError, match="noise under it is not known"):
+        judge_sampling(estimate)
