@@ -16,16 +16,17 @@ def table(times, frames=None):
 def test_even_times_are_the_frames():
     """Times dt apart, to rounding, change nothing."""
     times = (0.73 * np.arange(50)).round(4)
-    assert read_clock(table(times), dt=0.73).times is None
-    assert read_clock(table(times + 17.3), dt=0.73).times is None
+    assert read_clock(table(times), dt=0.73) == (None, ())
+    assert read_clock(table(times + 17.3), dt=0.73) == (None, ())
     assert read_clock(pd.DataFrame({"frame": [0, 1]}), dt=0.73) == (None, ())
 
 
 def test_pauses_are_kept_and_missing_frames_interpolated():
     """The times of the rows, from 0; a frame without rows stands between its neighbours."""
-    clock = read_clock(table([5.0, 6.0, 7.0, 27.0, 29.0], [0, 1, 2, 3, 5]), dt=1.0)
-    assert clock.times.tolist() == [0.0, 1.0, 2.0, 22.0, 23.0, 24.0]
-    assert "from 1 to 20 s" in clock.notes[0]
+    clock, notes = read_clock(table([5.0, 6.0, 7.0, 27.0, 29.0], [0, 1, 2, 3, 5]), dt=1.0)
+    assert clock.at(np.arange(-1, 7)).tolist() == [4.0, 5.0, 6.0, 7.0, 27.0, 28.0, 29.0, 30.0]
+    assert clock.from_frame(2).at(np.array([0, 1, 3])).tolist() == [0.0, 20.0, 22.0]
+    assert "from 1 to 20 s" in notes[0]
 
 
 @pytest.mark.parametrize(

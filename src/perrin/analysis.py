@@ -24,7 +24,7 @@ from perrin._arrays import (
 )
 from perrin._text import frames_text, listed
 from perrin._units import viscosity_remarks
-from perrin.clock import frame_stride, read_clock
+from perrin.clock import Clock, frame_stride, read_clock
 from perrin.diffusion import DiffusionEstimate, estimate_diffusion, with_error
 from perrin.files import check_tracks, read_tracks
 from perrin.grouping import each_cluster, find_clusters
@@ -123,14 +123,14 @@ class Conditions:
     exposure: float | None
     drift: bool
     keep_jumps: bool = False
-    times: Floats | None = None  # of every frame, s, where they are not dt apart
+    times: Clock | None = None  # where frames are not dt apart
     sigma_ratio: ArrayLike | None = None  # of the axes, where that alone is known
     first_frame: int = 0  # what the table calls its first frame
-    recorded: Bools | None = None  # (frames,), the frames that any row of the table has
+    recorded: Ints | None = None  # the frames that any row of the table has
 
     def clock(self, frames: Ints) -> Floats:
         """Return the times of frames, s."""
-        return np.asarray(frames * self.dt if self.times is None else self.times[frames])
+        return np.asarray(frames * self.dt if self.times is None else self.times.at(frames))
 
     def estimate(
         self, motion: RigidMotion | list[RigidMotion], quantity: Quantity
@@ -252,17 +252,14 @@ def analyze(
     check_arguments(
         dt=dt, contact=contact, viscosity=viscosity, temperature=temperature, diameter=diameter
     )
-    table, source, remarks = _table(tracks, scale=scale, columns=columns)
+    table, source, remarks = _table(tracks, scale=scale, columns=columns, frames=frames)
     conditions = Conditions(
         dt, sigma, viscosity, temperature, diameter, noise, exposure, drift, keep_jumps
     )
-    table = _sliced(table, frames)
-    screened = screen_rows(table)
-    remarks = Remarks([*screened.warnings, *remarks.warnings], [*remarks.notes, *screened.notes])
     arguments = told_conditions(conditions) | {"contact": contact, "frames": frames}
     arguments |= {"columns": columns, "scale": _plain(scale)}
     return measure_table(
-        screened.table,
+        table,
         conditions,
         contact=contact,
         source=source,
@@ -303,16 +300,14 @@ def measure_table(
     remarks = Remarks([*remarks.warnings, *more.warnings], [*remarks.notes, *more.notes])
     first = int(table["frame"].min())
     table["frame"] -= first
-    if conditions.times is not None:
-        since = conditions.times[first:] - conditions.times[first]
-        conditions = replace(conditions, times=since)
-    else:
-        clock = read_clock(table, dt=conditions.dt)
-        conditions = replace(conditions, times=clock.times)
-        remarks.notes.extend(clock.notes)
-    recorded = np.bincount(table["frame"]) > 0
+    clock = None if conditions.times is None else conditions.times.from_frame(first)
+    if clock is None:
+        clock, notes = read_clock(table, dt=conditions.dt)
+        clock = None if clock is None else clock.from_frame(0)
+        remarks.notes.extend(notes)
+    recorded = np.unique(table["frame"].to_numpy(dtype=np.int64))
     remarks.notes.extend(_absent_frames(recorded, frame_stride(table), first))
-    conditions = replace(conditions, first_frame=first, recorded=recorded)
+    conditions = replace(conditions, times=clock, first_frame=first, recorded=recorded)
     bodies, rods, failures = _fitted(table, labels, conditions)
     if improved is not None:
         motions = improved({b.cluster: (b.motion, b.frames + first) for b in bodies})
@@ -330,9 +325,11 @@ def measure_table(
         *_common_jumps(done.jumps),
         *viscosity_remarks(conditions.viscosity),
     )
-    notes = (*remarks.notes, *_assumed_exposure(conditions))
+    remarks.notes.extend(_assumed_exposure(conditions))
     settings = _settings(source, arguments=arguments, first_frame=first)
-    return Report(tuple(results), pooled, warnings, table, settings, tuple(rods), notes=notes)
+    return Report(
+        tuple(results), pooled, warnings, table, settings, tuple(rods), notes=tuple(remarks.notes)
+    )
 
 
 def told_conditions(conditions: Conditions) -> dict[str, Any]:
@@ -364,8 +361,12 @@ def _table(
     *,
     scale: ArrayLike,
     columns: Mapping[str, str | int] | None,
+    frames: tuple[int | None, int | None] | None,
 ) -> tuple[pd.DataFrame, dict[str, str | None], Remarks]:
-    """Read or check the table; return where it came from, and what reading it brought up."""
+    """Read or check the table, and take out rows that are no measurements.
+
+    Returns as well where it came from, and the remarks on it.
+    """
     if isinstance(tracks, str | os.PathLike):
         table = read_tracks(tracks, scale=scale, columns=columns)
         digest = hashlib.sha256(Path(tracks).read_bytes()).hexdigest()
@@ -378,12 +379,17 @@ def _table(
         source, names = {"path": None, "sha256": None}, map(str, tracks.columns)
         if "piece" in tracks:  # where `identify` was in doubt
             table["piece"] = tracks["piece"].to_numpy()
+    remarks = Remarks([], list(table.attrs.get("notes", ())))
+    table = _sliced(table, frames)
+    screened = screen_rows(table)
     notes, warnings = distance_notes(
-        table,
+        screened.table,
         scale_given=bool(np.any(np.asarray(scale) != 1)),
         trackpy_columns=has_trackpy_columns(names),
     )
-    return table, source, Remarks(list(warnings), [*table.attrs.get("notes", ()), *notes])
+    remarks.warnings.extend((*screened.warnings, *warnings))
+    remarks.notes.extend((*screened.notes, *notes))
+    return screened.table, source, remarks
 
 
 def _sliced(table: pd.DataFrame, frames: tuple[int | None, int | None] | None) -> pd.DataFrame:
@@ -400,13 +406,17 @@ def _sliced(table: pd.DataFrame, frames: tuple[int | None, int | None] | None) -
     return table[keep].reset_index(drop=True)
 
 
-def _absent_frames(recorded: Bools, stride: tuple[str, ...], first: int) -> list[str]:
+def _absent_frames(recorded: Ints, stride: tuple[str, ...], first: int) -> list[str]:
     """Report frame numbers that no row has; where they have a stride, that explains them."""
-    absent = np.flatnonzero(~recorded) + first
-    if stride or not absent.size:
+    absent = int(recorded[-1]) + 1 - len(recorded)
+    if stride or not absent:
         return list(stride)
-    count = "1 frame number has" if absent.size == 1 else f"{absent.size} frame numbers have"
-    return [f"{count} no row ({frames_text(absent)}): a step across them is one longer step"]
+    before = recorded[np.flatnonzero(np.diff(recorded) > 1)[:1]]
+    count = "1 frame number has" if absent == 1 else f"{absent} frame numbers have"
+    return [
+        f"{count} no row (the first is {int(before[0]) + 1 + first}): a step across them is one "
+        "longer step"
+    ]
 
 
 def _clustered(
@@ -575,7 +585,7 @@ def _fit(
 def _fit_body(tracks: _Tracks, cluster: int, label: str | None, conditions: Conditions) -> _Body:
     """Settle which label belongs to which particle, fit the common shape, and judge the fits."""
     frames = tracks.frames
-    identity = settle_identity(tracks.positions, times=frames)
+    identity = settle_identity(tracks.positions, times=conditions.clock(frames))
     positions = identity.arranged(tracks.positions)
     changed = (np.diff(tracks.piece) != 0) | (np.diff(identity.piece) != 0)
     piece = np.append(0, np.cumsum(changed)).astype(np.int64)
@@ -987,7 +997,7 @@ def _missing(motion: RigidMotion | RodMotion, frames: Ints, conditions: Conditio
     """State how many of the frames that were recorded have no pose, and why."""
     recorded = np.ones(len(frames), dtype=np.bool_)
     if conditions.recorded is not None:
-        recorded = conditions.recorded[frames]
+        recorded = np.isin(frames, conditions.recorded)
     reasons = [r for r, seen in zip(motion.reason, recorded, strict=True) if r and seen]
     if not reasons:
         return []

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -20,27 +21,53 @@ _EVEN = 5e-4
 _AGREES = 0.01
 
 
-class Clock(NamedTuple):
-    """Times of all frames, s, from frame 0 on; None where they are dt apart. What informs of it."""
+@dataclass(frozen=True, eq=False)
+class Clock:
+    """When frames were recorded.
 
-    times: Floats | None
-    notes: tuple[str, ...]
+    Attributes
+    ----------
+    frames : ndarray of int, shape (K,)
+        Frames whose time is known, rising.
+    times : ndarray, shape (K,)
+        s.
+    dt : float
+        Time between the frames before the first and after the last of these, s.
+    """
+
+    frames: Ints
+    times: Floats
+    dt: float
+
+    def at(self, frames: Ints) -> Floats:
+        """Return the times of frames, s, interpolated between those that are known."""
+        before = np.minimum(frames - self.frames[0], 0)
+        after = np.maximum(frames - self.frames[-1], 0)
+        known = np.interp(frames, self.frames, self.times)
+        return np.asarray(known + self.dt * (before + after))
+
+    def from_frame(self, first: int) -> Clock:
+        """Return the clock for frames counted from `first`, whose time becomes 0."""
+        start = float(self.at(np.array([first]))[0])
+        return Clock(self.frames - first, self.times - start, self.dt)
 
 
-def read_clock(table: pd.DataFrame, *, dt: float) -> Clock:
-    """Return the times of all frames from the column ``time`` of a table.
+def read_clock(table: pd.DataFrame, *, dt: float) -> tuple[Clock | None, tuple[str, ...]]:
+    """Return the times of the frames from the column ``time`` of a table, and notes on them.
 
     Parameters
     ----------
     table : pandas.DataFrame
-        A clean track table; frames from 0 on. Without a column ``time`` frames are dt apart.
+        A clean track table.
     dt : float
         Time between successive frame numbers, s, which the column must agree with.
 
     Returns
     -------
-    Clock
-        The time of a frame is the mean over its rows; frames without a time are interpolated.
+    clock : Clock or None
+        The time of a frame is the mean over its rows. None without a column ``time``, and where
+        frames are dt apart.
+    notes : tuple of str
 
     Raises
     ------
@@ -50,14 +77,16 @@ def read_clock(table: pd.DataFrame, *, dt: float) -> Clock:
 
     Examples
     --------
+    >>> import numpy as np
     >>> import pandas as pd
     >>> from perrin.clock import read_clock
     >>> table = pd.DataFrame({"frame": [0, 1, 2, 3], "time": [0.0, 0.5, 1.0, 9.0]})
-    >>> read_clock(table, dt=0.5).times.tolist()
-    [0.0, 0.5, 1.0, 9.0]
+    >>> clock, notes = read_clock(table, dt=0.5)
+    >>> clock.at(np.array([0, 2, 3, 4])).tolist()
+    [0.0, 1.0, 9.0, 9.5]
     """
     if "time" not in table or not table["time"].notna().any():
-        return Clock(None, ())
+        return None, ()
     by_frame = table.groupby("frame")["time"]
     mean, known = by_frame.mean(), by_frame.mean().notna().to_numpy()
     frame = mean.index.to_numpy(dtype=np.int64)[known]
@@ -70,13 +99,7 @@ def read_clock(table: pd.DataFrame, *, dt: float) -> Clock:
             tuple(faults),
         )
     if evenly_spaced(time, frame, dt=dt):
-        return Clock(None, ())
-    since = time - time[0]
-    last = int(table["frame"].max())
-    numbers = np.arange(last + 1)
-    times = np.interp(numbers, frame, since)
-    # Before the first and after the last known time frames are dt apart.
-    times += dt * (np.minimum(numbers - frame[0], 0) + np.maximum(numbers - frame[-1], 0))
+        return None, ()
     gaps = np.diff(time) / np.diff(frame)
     notes = [
         f"the column time is used: intervals between frames run from {gaps.min():.4g} to "
@@ -86,7 +109,7 @@ def read_clock(table: pd.DataFrame, *, dt: float) -> Clock:
         notes.append(f"{(~known).sum()} frames have no time; theirs is interpolated")
     if spread > _EVEN * dt:
         notes.append(f"the times of one frame differ by up to {spread:.3g} s; their mean is used")
-    return Clock(times, tuple(notes))
+    return Clock(frame, time, dt), tuple(notes)
 
 
 def evenly_spaced(times: Floats, frames: Ints, *, dt: float) -> bool:

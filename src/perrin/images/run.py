@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 import perrin.images.checks as checks
-from perrin._arrays import Floats, IdentityError, TooFewFramesError
+from perrin._arrays import IdentityError, TooFewFramesError
 from perrin.analysis import Conditions, check_arguments, measure_table, told_conditions
-from perrin.clock import evenly_spaced
+from perrin.clock import Clock, evenly_spaced
 from perrin.images.bodies import Bodies, find_bodies, stated_errors, tracks_of
 from perrin.images.imaging import Imaging, View
 from perrin.images.locate import NO_FLAT_MODEL, Search, check_search, is_flat
@@ -185,9 +185,12 @@ def _listed(count: int, frames: tuple[int | None, int | None] | None) -> list[in
     return listed
 
 
-def _uneven(stack: Stack) -> Floats | None:
+def _uneven(stack: Stack) -> Clock | None:
     """Return the times of the frames where they are not evenly spaced."""
-    return None if evenly_spaced(stack.times, np.arange(len(stack)), dt=stack.dt) else stack.times
+    frames = np.arange(len(stack))
+    if evenly_spaced(stack.times, frames, dt=stack.dt):
+        return None
+    return Clock(frames, stack.times, stack.dt)
 
 
 def _check(
