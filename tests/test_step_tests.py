@@ -18,19 +18,20 @@ FLAT = np.array([[0.0, 0.0], [2.0, 0.0], [1.0, 1.6]]) - [1.0, 1.6 / 3]
 def brownian(seed, *, frames=300, D_R=5e-3, D_T=0.02, spin=(0, 0, 0), sigma=0.03, bad=0.0):
     """Return noisy places (T, 4, 3) of a tetrahedron; a share `bad` of the frames is 6 times worse.
 
-    An independent simulator: steps in body axes, the spin in lab axes, four substeps a frame.
+    An independent simulator: steps in body axes, four a frame, seen from axes that turn with the
+    spin.
     """
     rng = np.random.default_rng([seed, 11])
-    turn, places = Rotation.identity(), [TETRA]
-    for _ in range(frames - 1):
-        for _ in range(4):
-            turn = turn * Rotation.from_rotvec(rng.normal(size=3) * np.sqrt(2 * D_R * DT / 4))
-            turn = Rotation.from_rotvec(np.array(spin) * DT / 4) * turn
-        places.append(turn.apply(TETRA))
+    steps = rng.normal(size=(4 * (frames - 1), 3)) * np.sqrt(2 * D_R * DT / 4)
+    turn = [np.eye(3)]
+    for step in Rotation.from_rotvec(steps).as_matrix():
+        turn.append(turn[-1] @ step)
+    spun = Rotation.from_rotvec(DT * np.arange(frames)[:, None] * np.array(spin)).as_matrix()
+    places = np.einsum("tij,tjk,nk->tni", spun, np.array(turn[::4]), TETRA)
     path = np.cumsum(rng.normal(size=(frames, 1, 3)) * np.sqrt(2 * D_T * DT), axis=0)
     noise = rng.normal(size=(frames, 4, 3)) * sigma
     noise[rng.random(frames) < bad] *= 6
-    return np.array(places) + path + noise
+    return places + path + noise
 
 
 def jumps_of(x, quantity, **given):
@@ -194,13 +195,13 @@ def test_a_spin_in_the_plane():
 
 @pytest.mark.parametrize("quantity", ["rotation", "translation"])
 def test_the_test_for_a_steady_motion_keeps_its_level(quantity):
-    """Of 150 Brownian tracks of 100 frames 5 % have p < 0.05; 15 or more are chance of 0.6 %."""
+    """Of 80 Brownian tracks of 100 frames 4 have p < 0.05; 12 or more, or none, with 0.1 and 2 %."""
     p = [
         steady_motion(m, perrin.estimate_diffusion(m, quantity=quantity)).p
-        for m in (track_rotation(brownian(s, frames=100), dt=DT) for s in range(150))
+        for m in (track_rotation(brownian(s, frames=100), dt=DT) for s in range(80))
     ]
-    assert np.count_nonzero(np.array(p) < 0.05) < 15
-    assert np.count_nonzero(np.array(p) < 0.05) > 1
+    assert np.count_nonzero(np.array(p) < 0.05) < 12
+    assert np.count_nonzero(np.array(p) < 0.05) > 0
 
 
 def test_a_velocity_changes_nothing_but_the_drift():
