@@ -195,7 +195,7 @@ def test_a_spin_in_the_plane():
 
 @pytest.mark.parametrize("quantity", ["rotation", "translation"])
 def test_the_test_for_a_steady_motion_keeps_its_level(quantity):
-    """Of 80 Brownian tracks of 100 frames 4 have p < 0.05; 12 or more, or none, with 0.1 and 2 %."""
+    """Of 80 Brownian tracks 4 have p < 0.05; 12 or more (0.06 %) or none (1.7 %) would be odd."""
     p = [
         steady_motion(m, perrin.estimate_diffusion(m, quantity=quantity)).p
         for m in (track_rotation(brownian(s, frames=100), dt=DT) for s in range(80))
