@@ -383,8 +383,8 @@ def test_noise_and_exposure_are_options(csv, tmp_path):
     assert result.returncode == 0, result.stderr
     report = perrin.load_run(tmp_path / "run")
     D_R, D_T = report.clusters[0].D_R, report.clusters[0].D_T
-    assert (D_R.noise, D_R.exposure, D_R.drift) == ("residual", 0.2, None)
-    assert len(D_T.drift[0]) == 3
+    assert (D_R.noise, D_R.exposure) == ("residual", 0.2)
+    assert len(D_R.drift[0]) == len(D_T.drift[0]) == 3
     for wrong in (("--noise", "loud"), ("--noise", "-1"), ("--exposure", "2")):
         refused(
             run("analyze", csv, "--dt", "0.73", *wrong, "-o", "b", cwd=tmp_path), 2, wrong[0][2:]

@@ -274,10 +274,11 @@ def test_the_interval_ends_where_the_value_is_too_far_in_their_own_error(offset)
 @pytest.mark.parametrize("fit", FITS)
 def test_fits_follow_the_units(fit):
     """Lengths in another unit, times in another: value, interval and offset follow to 1e-9."""
-    curve = noisy_msd(np.random.default_rng(3), snr=0.3)
+    curve = dataclasses.replace(noisy_msd(np.random.default_rng(3), snr=0.3), noise=0.7)
     length2, time = 1e-12, 86400.0
     other = dataclasses.replace(
         curve,
+        noise=curve.noise * length2,
         lagtime=curve.lagtime * time,
         step=curve.step * time,
         value=curve.value * length2,

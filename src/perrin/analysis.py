@@ -70,6 +70,7 @@ from perrin.step_tests import (
     cut_at,
     find_jumps,
     offset_gain,
+    persistence_gain,
     steady_motion,
     without_spin,
 )
@@ -105,6 +106,8 @@ _FEW_FRAMES = 0.01
 # Jumps of a length that differs by less than this share are all of one length.
 _ONE_LENGTH = 0.3
 _SHOWN_JUMPS = 5
+# Of frame numbers at least one in this many occurs; numbers that are times in ms have fewer.
+_SPARSE = 100
 # The noise floor is tested at this many standard errors (0.05 % of clean tracks), for any ratio
 # sigma_z/sigma_xy up to this one.
 _FLOOR_ERRORS, _NOISE_RATIO = 3.5, 5.0
@@ -306,7 +309,9 @@ def measure_table(
         clock = None if clock is None else clock.from_frame(0)
         remarks.notes.extend(notes)
     recorded = np.unique(table["frame"].to_numpy(dtype=np.int64))
-    remarks.notes.extend(_absent_frames(recorded, frame_stride(table), first))
+    stride = frame_stride(table)
+    remarks.notes.extend(_absent_frames(recorded, stride, first))
+    remarks.warnings.extend(_sparse_frames(recorded))
     conditions = replace(conditions, times=clock, first_frame=first, recorded=recorded)
     bodies, rods, failures = _fitted(table, labels, conditions)
     if improved is not None:
@@ -409,13 +414,25 @@ def _sliced(table: pd.DataFrame, frames: tuple[int | None, int | None] | None) -
 def _absent_frames(recorded: Ints, stride: tuple[str, ...], first: int) -> list[str]:
     """Report frame numbers that no row has; where they have a stride, that explains them."""
     absent = int(recorded[-1]) + 1 - len(recorded)
-    if stride or not absent:
+    if stride or not absent or absent > _SPARSE * len(recorded):
         return list(stride)
     before = recorded[np.flatnonzero(np.diff(recorded) > 1)[:1]]
     count = "1 frame number has" if absent == 1 else f"{absent} frame numbers have"
     return [
         f"{count} no row (the first is {int(before[0]) + 1 + first}): a step across them is one "
         "longer step"
+    ]
+
+
+def _sparse_frames(recorded: Ints) -> list[str]:
+    """Warn of numbers of which so few occur that they are hardly numbers of frames."""
+    span = int(recorded[-1]) + 1
+    if span <= _SPARSE * len(recorded) or len(recorded) < 2:
+        return []
+    return [
+        f"frame numbers: only {len(recorded)} of the {span} numbers from the first to the last "
+        "occur, and each counts dt; if they are times, number the frames 0, 1, 2, ... and state "
+        "the times in a column time"
     ]
 
 
@@ -656,6 +673,7 @@ class _Diffusion:
     jumps: Jumps
     left_out: Ints
     steady: bool
+    persistent: bool
     warnings: tuple[str, ...]
     notes: tuple[str, ...]
 
@@ -673,7 +691,7 @@ def _estimate_body(body: _Body, conditions: Conditions, done: _Estimated, *, bod
     tensor, unfound = _tensor(turning, conditions)
     # The offset of steps that contain another motion, or of a body that bends, is no noise.
     floor: list[str] = []
-    if body.quality.rigid and not (turn.steady or turn.jumps.rows.size):
+    if body.quality.rigid and not (turn.steady or turn.persistent or turn.jumps.rows.size):
         floor = _floor_mismatch(motion, D_R, noise, stated=conditions.sigma is not None)
     warnings = (
         *body.warnings,
@@ -728,7 +746,7 @@ def _diffusion(
             quantity=quantity, n_frames=int(motion.fitted.size), reason=CENTRE_REMOVED
         )
         none = Jumps(nothing, np.empty((0, 3)), np.empty(0), 0)
-        return _Diffusion(estimate, motion, none, nothing, False, (), ())
+        return _Diffusion(estimate, motion, none, nothing, False, False, (), ())
     estimate = conditions.estimate(motion, quantity)
     # Doubt about the labels cuts the track, but the centre's path goes on across it.
     path = motion if quantity == "rotation" else replace(motion, piece=np.zeros_like(motion.piece))
@@ -746,11 +764,27 @@ def _diffusion(
     if not estimate.resolved:
         notes.append(f"not resolved: {estimate}")
     steady = False
+    persistent = 0.0 if jumps.many else persistence_gain(motion, estimate)
     if not (conditions.drift or jumps.many):
         found = steady_motion(motion, estimate)
         steady = found.p < _STEADY / bodies
+        if steady and persistent > _FLOOR_ERRORS**2:
+            # A steady motion makes steps alike as well; what is left without it decides.
+            persistent = persistence_gain(motion, estimate, drift=True)
+            steady = persistent < _FLOOR_ERRORS**2
         warnings += [_steady_text(found, quantity)] if steady else []
-    return _Diffusion(estimate, motion, jumps, left_out, steady, tuple(warnings), tuple(notes))
+    if persistent > _FLOOR_ERRORS**2 and not steady:
+        warnings.append(_persistent_text(persistent, quantity))
+    return _Diffusion(
+        estimate=estimate,
+        motion=motion,
+        jumps=jumps,
+        left_out=left_out,
+        steady=steady,
+        persistent=persistent > _FLOOR_ERRORS**2 and not steady,
+        warnings=tuple(warnings),
+        notes=tuple(notes),
+    )
 
 
 def _limits_text(D_R: DiffusionEstimate, D_T: DiffusionEstimate) -> list[str]:
@@ -775,10 +809,10 @@ def _jumps_text(jumps: Jumps, frames: Ints, quantity: Quantity, *, kept: bool) -
     shown = _amounts(length, unit)
     if jumps.many:
         return (
-            f"steps: {what} in {len(frames)} of {jumps.n_steps} steps farther than Brownian "
-            f"motion can (the longest {length.max():.3g} {unit}, at frame "
-            f"{frames[np.argmax(length)]}){_wrapping(jumps, quantity)}: no jumps but another kind "
-            f"of motion (hops, a changing D, heavy tails), which one {name} does not describe"
+            f"steps: {what} in {len(frames)} of {jumps.n_steps} steps farther than Brownian motion "
+            f"can (the longest {length.max():.3g} {unit}, at frame {frames[np.argmax(length)]})"
+            f"{_wrapping(jumps, quantity)}: so many are usually another kind of motion (hops, a "
+            f"changing D, heavy tails), which one {name} does not describe; they are left in"
         )
     done = f"{name} contains them" if kept else f"{name} leaves them out (keep_jumps keeps them)"
     if len(frames) == 1:
@@ -805,6 +839,17 @@ def _wrapping(jumps: Jumps, quantity: Quantity) -> str:
     if alike < 0.8 or np.mean(np.sort(size, axis=1)[:, -2] < 0.5 * largest) < 0.8:
         return ""
     return f", most of them by about {usual:.3g} um along one axis, as coordinates wrapped in a box"
+
+
+def _persistent_text(gain: float, quantity: Quantity) -> str:
+    """Name steps that are more alike than motion blur can make them."""
+    turn = quantity == "rotation"
+    return (
+        f"steps: successive {'turns of the body' if turn else 'displacements of the centre'} are "
+        "more alike than a shutter that is open all the time makes them (likelihood ratio, "
+        f"{np.sqrt(gain):.1f} standard errors): smoothed or interpolated tracks, or a persistent "
+        f"motion; {'D_R' if turn else 'D_T'} does not describe it"
+    )
 
 
 def _steady_text(found: SteadyMotion, quantity: Quantity) -> str:
@@ -894,7 +939,10 @@ def _measure_rod(
         f"no D_R: {len(motion.places)} particles on one line have a direction but no full "
         "orientation; D_perp is how fast that direction diffuses",
     ]
+    notes.append("jumps and a steady motion of a rod are not tested for")
     warnings: list[str] = []
+    if conditions.drift:
+        warnings.append("drift=True is not applied to rods: D_T and D_perp contain a mean motion")
     if motion.swaps.size:
         swaps = frames[motion.swaps] + first
         text = f"identity: the ends exchange labels at {frames_text(swaps)}; corrected"
@@ -1024,7 +1072,9 @@ def _floor_mismatch(
             low, high = floor_range(motion.template, rotation, ratio=_NOISE_RATIO)
         unsure = _FLOOR_ERRORS * np.sqrt(2 / max(residual_freedom(motion), 1))
         low, high = low * max(1 - unsure, 0.0), high * (1 + unsure)
-    measured = floor_factor(motion) * D_R.offset
+    # A stated exposure takes b D, b = exposure dt/3, from the noise of every frame.
+    blur = (D_R.exposure or 0.0) * motion.dt / 3 * D_R.value
+    measured = floor_factor(motion) * (D_R.offset + blur)
     if low * noise.phi2 <= measured <= high * noise.phi2:
         return []
     nearest = high if measured > high * noise.phi2 else low
@@ -1033,11 +1083,11 @@ def _floor_mismatch(
     if gain < _FLOOR_ERRORS**2:
         return []
     error = floor_factor(motion) * D_R.offset_stderr
+    shown = f"{measured:.3g} +- {error:.2g}" if np.isfinite(error) else f"{measured:.3g}"
     return [
-        f"noise floor: the steps show Phi^2 = {measured:.3g} +- {error:.2g} rad^2, the "
-        f"localisation error predicts {noise.phi2:.3g} (likelihood ratio, {np.sqrt(gain):.1f} "
-        "standard errors); motion blur lowers it, particles recorded one after another or noise "
-        "that is smooth in time change it"
+        f"noise floor: the steps show Phi^2 = {shown} rad^2, the localisation error predicts "
+        f"{noise.phi2:.3g} (likelihood ratio, {np.sqrt(gain):.1f} standard errors); motion blur "
+        "lowers it, particles recorded one after another or noise that is smooth in time change it"
     ]
 
 

@@ -372,7 +372,9 @@ def msad_vector(motion: RigidMotion, *, threshold: float = 0.0) -> LagCurve:
     if dof == 1:
         return _turned(motion, walk, dof=1, independent=1.0)
     walks = _independent_walks(motion, np.eye(3))
-    return _turned(motion, walk, dof=3, independent=walks, weights=np.eye(3))
+    curve = _turned(motion, walk, dof=3, independent=walks, weights=np.eye(3))
+    # What returns within the threshold adds up to nothing.
+    return replace(curve, resolution_floor=None) if threshold > 0 else curve
 
 
 def msad_axes(motion: RigidMotion, *, axes: ArrayLike | None = None) -> tuple[LagCurve, ...]:

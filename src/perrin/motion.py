@@ -137,12 +137,14 @@ class RigidMotion:
     def orientation_noise(self) -> Floats:
         """The covariance of one orientation, mean over the ends of all steps, rad^2, (3, 3)."""
         rows = np.concatenate(self.steps())
+        rows = rows if rows.size else self.fitted
         return np.asarray(self.covariance[rows].mean(axis=0))
 
     @property
     def center_noise(self) -> float:
         """The variance of one centre coordinate, mean over the ends of all steps, um^2."""
-        return float(self.center_variance[np.concatenate(self.steps())].mean())
+        rows = np.concatenate(self.steps())
+        return float(self.center_variance[rows if rows.size else self.fitted].mean())
 
     @property
     def resolution_floor(self) -> float:

@@ -259,6 +259,54 @@ def offset_gain(motion: RigidMotion, estimate: DiffusionEstimate, *, sigma: floa
     return max(2 * (free - fixed), 0.0)
 
 
+def persistence_gain(
+    motion: RigidMotion, estimate: DiffusionEstimate, *, drift: bool = False
+) -> float:
+    """Return twice the log-likelihood that steps gain by being more alike than blur makes them.
+
+    Parameters
+    ----------
+    motion : RigidMotion
+    estimate : DiffusionEstimate
+        D of this motion with noise "joint"; its settings hold.
+    drift : bool
+        Whether to leave a steady motion free where the estimate did not.
+
+    Returns
+    -------
+    float
+        Chi-squared with one degree of freedom at most in Brownian motion: a shutter that is open
+        all the time lowers the noise offset to -D dt/3, smoothing the tracks below that. 0 where
+        the offset is above, or the noise not free.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from perrin import Cluster, add_noise, estimate_diffusion, simulate_motion, track_rotation
+    >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=200, rng=3)
+    >>> x = add_noise(truth.positions(), sigma=0.03, rng=4)
+    >>> smooth = np.stack([x[:-2], x[1:-1], x[2:]]).mean(axis=0)
+    >>> [
+    ...     persistence_gain(m, estimate_diffusion(m)) > 20
+    ...     for m in (track_rotation(x, dt=0.7), track_rotation(smooth, dt=0.7))
+    ... ]
+    [False, True]
+    """
+    limit = -estimate.value * motion.usual_interval / 3
+    if estimate.noise != "joint" or not estimate.value > 0 or estimate.offset >= limit:
+        return 0.0
+    steps = steps_of(motion, _quantity(estimate))
+    taken = drift or estimate.drift is not None
+    free, blurred = (
+        float(Likelihood.of([track]).best().value[0])
+        for track in (
+            Track.free(steps, blur=blur, drift=taken)
+            for blur in (float(steps.duration.min()) / 2, float(steps.duration.min()) / 3)
+        )
+    )
+    return max(2 * (free - blurred), 0.0)
+
+
 def _steady(motion: RigidMotion, estimate: DiffusionEstimate) -> SteadyMotion:
     """Return the generalised least-squares steady motion at the D and noise of an estimate."""
     from scipy.special import fdtrc
