@@ -645,3 +645,12 @@ def test_help_and_version():
     for name in ("demo", "analyze", "simulate", "plan", "predict", "convert"):
         assert name in result.stdout
     assert run("--version", cwd=Path.cwd()).stdout.strip() == perrin.__version__
+
+
+def test_names_with_square_brackets_are_printed_as_they_are(csv, tmp_path):
+    """A cluster called a[/]b is no markup of the terminal's library."""
+    table = perrin.read_tracks(csv)
+    perrin.write_tracks(table.assign(cluster="a[/]b [bold]"), tmp_path / "named.csv")
+    result = run("analyze", "named.csv", "--dt", "0.73", "-o", "run", cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    assert "cluster a[/]b [bold]:" in result.stdout

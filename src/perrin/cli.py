@@ -847,6 +847,8 @@ def _show(report: Report, output: Path, command: Callable[..., None]) -> None:
         if result.tensor is not None and result.tensor.p_isotropic < _UNEQUAL:
             axes = f"rotation about the body's axes: {result.tensor.summary}\n"
             console.print(escape(axes), soft_wrap=True)
+    if len(report.clusters) > _SHOWN:
+        console.print(f"and {len(report.clusters) - _SHOWN} more clusters in report.html\n")
     if report.pooled is not None and len(report.clusters) > 1:
         console.print(_pooled_table(report.pooled))
     for rod in report.rods[:_SHOWN]:
@@ -888,11 +890,13 @@ def _show_remarks(report: Report, command: Callable[..., None], console: Console
 def _cluster_table(result: ClusterResult) -> Table:
     """Return the short table of one cluster: coefficients, noise, sizes."""
     from rich.box import SIMPLE_HEAD
+    from rich.markup import escape
     from rich.table import Table
 
     from perrin.diffusion import with_error
 
-    title = f"cluster {result.name}: {result.motion.fitted.size} frames"
+    # A name is the user's text: square brackets in it are no markup.
+    title = f"cluster {escape(result.name)}: {result.motion.fitted.size} frames"
     table = Table("", "value", "68 %", "95 %", title=title, title_justify="left", box=SIMPLE_HEAD)
     table.columns[0].no_wrap = True
     for name, estimate in (("D_R", result.D_R), ("D_T", result.D_T)):
