@@ -17,6 +17,7 @@ from perrin._arrays import (
     present,
     require_positive,
 )
+from perrin._text import listed
 from perrin.bonds import rigid_groups
 from perrin.identity import settle_identity
 from perrin.linking import link_clusters
@@ -401,8 +402,7 @@ def _one_cluster(table: pd.DataFrame, cluster: int | str | None) -> pd.DataFrame
 def _listed(labels: list[Any], limit: int = 20) -> str:
     if not labels:
         return "no cluster: every row is loose (-1 or missing)"
-    more = f" and {len(labels) - limit} more" if len(labels) > limit else ""
-    return f"the {len(labels)} clusters {', '.join(map(repr, labels[:limit]))}{more}"
+    return f"the {len(labels)} clusters {listed(map(repr, labels), most=limit)}"
 
 
 def _span(frame: Ints) -> tuple[int, int]:

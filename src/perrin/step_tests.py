@@ -253,10 +253,7 @@ def offset_gain(motion: RigidMotion, estimate: DiffusionEstimate, *, sigma: floa
     steps = steps_of(motion, _quantity(estimate))
     drift = estimate.drift is not None
     known = track_of(steps, noise=sigma, exposure=estimate.exposure, drift=drift)
-    free, fixed = (
-        float(Likelihood.of([track]).best().value[0]) for track in (_track(motion, estimate), known)
-    )
-    return max(2 * (free - fixed), 0.0)
+    return _likelihood_ratio(_track(motion, estimate), known)
 
 
 def persistence_gain(
@@ -298,13 +295,16 @@ def persistence_gain(
     steps = steps_of(motion, _quantity(estimate))
     taken = drift or estimate.drift is not None
     free, blurred = (
-        float(Likelihood.of([track]).best().value[0])
-        for track in (
-            Track.free(steps, blur=blur, drift=taken)
-            for blur in (float(steps.duration.min()) / 2, float(steps.duration.min()) / 3)
-        )
+        Track.free(steps, blur=float(steps.duration.min()) * share, drift=taken)
+        for share in (1 / 2, 1 / 3)
     )
-    return max(2 * (free - blurred), 0.0)
+    return _likelihood_ratio(free, blurred)
+
+
+def _likelihood_ratio(free: Track, restricted: Track) -> float:
+    """Return twice the log-likelihood that the best fit of one track gains over another's."""
+    values = [float(Likelihood.of([track]).best().value[0]) for track in (free, restricted)]
+    return max(2 * (values[0] - values[1]), 0.0)
 
 
 def _steady(motion: RigidMotion, estimate: DiffusionEstimate) -> SteadyMotion:
@@ -344,9 +344,7 @@ def _residuals(motion: RigidMotion, estimate: DiffusionEstimate, *, without: Boo
     s = track.steps
     size = s.size
     if estimate.drift is not None and without.any():
-        kept = ~without
-        rows = s.steady[kept].reshape(int(kept.sum()) * size.shape[1], -1)
-        size = size - s.steady @ np.linalg.lstsq(rows, size[kept].ravel(), rcond=None)[0]
+        size = s.without_steady_motion(kept=~without)[0].size
     diagonal, beside = covariance_bands(
         estimate.value,
         _theta(track, estimate),

@@ -56,14 +56,19 @@ class Steps:
     dt: float
     steady: Floats
 
-    def without_steady_motion(self) -> tuple[Steps, Floats]:
+    def without_steady_motion(self, *, kept: Bools | None = None) -> tuple[Steps, Floats]:
         """Return the steps less their least-squares steady motion, and that motion (p,).
+
+        `kept` (S,) marks the steps that it is fitted to; all by default.
 
         The restricted likelihood is the same for both; its searches begin from the steps' own size,
         and every other statistic of the steps would contain the steady motion.
         """
-        rows = self.steady.reshape(self.size.size, -1)
-        mean: Floats = np.linalg.lstsq(rows, self.size.ravel(), rcond=None)[0].astype(np.float64)
+        steady, size = self.steady, self.size
+        if kept is not None:
+            steady, size = steady[kept], size[kept]
+        rows = steady.reshape(size.size, -1)
+        mean: Floats = np.linalg.lstsq(rows, size.ravel(), rcond=None)[0].astype(np.float64)
         return replace(self, size=self.size - self.steady @ mean), mean
 
     @property
