@@ -12,10 +12,11 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from perrin._text import listed
 from perrin.grouping import REACH
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Mapping
 
     import pandas as pd
 
@@ -83,22 +84,9 @@ def of_clusters(verdicts: Mapping[str, Verdict | None]) -> dict[str, str]:
         return {name: verdict.text for name, verdict in met.items()}
     worst = max(met, key=lambda name: met[name].size)
     return {
-        "": f"{len(met)} of {len(verdicts)} clusters ({capped(met)}), the worst is cluster "
+        "": f"{len(met)} of {len(verdicts)} clusters ({listed(met)}), the worst is cluster "
         f"{worst}: {met[worst].text}"
     }
-
-
-def capped(names: Iterable[object]) -> str:
-    """List up to ten things.
-
-    Examples
-    --------
-    >>> capped(range(12))
-    '0, 1, 2, 3, 4, 5, 6, 7, 8, 9 and 2 more'
-    """
-    listed = [str(name) for name in names]
-    more = f" and {len(listed) - _LISTED} more" if len(listed) > _LISTED else ""
-    return ", ".join(listed[:_LISTED]) + more
 
 
 def at(frames: Ints | list[int]) -> str:
@@ -109,13 +97,13 @@ def at(frames: Ints | list[int]) -> str:
     >>> at([3, 4, 5, 9]), at([7])
     ('frames 3 to 5, 9', 'frame 7')
     """
-    listed = np.unique(np.asarray(frames, dtype=np.int64))
-    runs = np.split(listed, np.flatnonzero(np.diff(listed) > 1) + 1)
+    every = np.unique(np.asarray(frames, dtype=np.int64))
+    runs = np.split(every, np.flatnonzero(np.diff(every) > 1) + 1)
     numbers = np.cumsum([min(len(run), 2) for run in runs])
     shown = int((numbers <= _LISTED).sum())
     words = [f"{r[0]}" if len(r) == 1 else f"{r[0]} to {r[-1]}" for r in runs[:shown]]
     more = f" and {sum(map(len, runs[shown:]))} more" if len(runs) > shown else ""
-    return f"frame{'s' if len(listed) > 1 else ''} {', '.join(words)}{more}"
+    return f"frame{'s' if len(every) > 1 else ''} {', '.join(words)}{more}"
 
 
 def unreadable(frames: pd.DataFrame) -> Findings:
@@ -378,11 +366,11 @@ def counts(features: pd.DataFrame, *, size: int, contact: float, frames: Ints) -
             texts[int(cluster)] = ", ".join(said)
     if not texts:
         return _NOTHING
-    listed = "; ".join(f"cluster {c}: {text}" for c, text in list(texts.items())[:_LISTED])
+    shown = "; ".join(f"cluster {c}: {text}" for c, text in list(texts.items())[:_LISTED])
     more = f"; and {len(texts) - _LISTED} more" if len(texts) > _LISTED else ""
     text = (
         f"{100 * missing / expected:.2g} % of the spheres are missing, {size} expected in each of "
-        f"{tracked['cluster'].nunique()} clusters; {listed}{more}"
+        f"{tracked['cluster'].nunique()} clusters; {shown}{more}"
     )
     return Findings((text,)) if missing > _MISSING * expected else Findings(notes=(text,))
 
