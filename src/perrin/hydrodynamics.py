@@ -5,13 +5,12 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Literal, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 
 from perrin._arrays import UnitWarning
 from perrin._units import viscosity_remarks
-from perrin.diffusion import DiffusionEstimate
 from perrin.mobility import BOLTZMANN, Mobility, cluster_mobility, condition_faults
 from perrin.shapes import Cluster, is_tetrahedron
 
@@ -20,7 +19,20 @@ if TYPE_CHECKING:
 
     from perrin._arrays import Floats
 
-Measured: TypeAlias = DiffusionEstimate | float | tuple[float, float]
+
+class HasStandardError(Protocol):
+    """A measured number with its standard error, as a `DiffusionEstimate` has them."""
+
+    @property
+    def value(self) -> float:
+        """The measured value."""
+
+    @property
+    def stderr(self) -> float:
+        """Its standard error."""
+
+
+Measured: TypeAlias = HasStandardError | float | tuple[float, float]
 Viscosity: TypeAlias = float | tuple[float, float] | Callable[[float], float]
 Factor: TypeAlias = Literal["exact", "hoffmann2009"]
 
@@ -303,7 +315,7 @@ def _known(
 
 def _pair(measured: Measured) -> tuple[float, float]:
     """Return a value and its standard error, 0 for a bare number."""
-    if isinstance(measured, DiffusionEstimate):
+    if hasattr(measured, "stderr"):
         return measured.value, measured.stderr
     if np.shape(measured) == (2,):
         value, stderr = measured  # type: ignore[misc]

@@ -49,7 +49,7 @@ NO_FLAT_MODEL = (
 _UNSETTLED, _MOVED, _DARK = "fit did not settle", "moved over half a radius", "no light of its own"
 
 
-class Stack(Protocol):
+class StackLike(Protocol):
     """What is asked of a movie: sizes, and one frame at a time."""
 
     @property
@@ -159,7 +159,7 @@ class Method:
     refine: Refine = "model"
     optics: Optics | None = None
 
-    def look(self, stack: Stack, i: int) -> Found:
+    def look(self, stack: StackLike, i: int) -> Found:
         """Find and refine the spheres of frame i.
 
         Raises
@@ -193,7 +193,7 @@ class Method:
         return places | {"mass": found.mass}
 
 
-def sample_frames(stack: Stack, search: Search, frames: Sequence[int]) -> list[Sampled]:
+def sample_frames(stack: StackLike, search: Search, frames: Sequence[int]) -> list[Sampled]:
     """Look at a few frames all over the movie, as far as they can be read.
 
     Raises
@@ -217,7 +217,7 @@ def sample_frames(stack: Stack, search: Search, frames: Sequence[int]) -> list[S
 
 
 def choose_method(
-    stack: Stack,
+    stack: StackLike,
     search: Search,
     sample: Sequence[Sampled],
     *,
@@ -245,7 +245,7 @@ def choose_method(
 
 
 def locate(
-    stack: Stack,
+    stack: StackLike,
     *,
     diameter: float,
     contact: float,
@@ -350,7 +350,7 @@ def locate(
     return table
 
 
-def _looked(stack: Stack, frames: Sequence[int], method: Method) -> list[Found]:
+def _looked(stack: StackLike, frames: Sequence[int], method: Method) -> list[Found]:
     """Return what every frame holds; one that cannot be read is a warning."""
     found, faults = [], []
     for i in frames:
@@ -539,7 +539,7 @@ def frame_digest(data: NDArray[Any]) -> str:
     return hashlib.blake2b(np.ascontiguousarray(data).tobytes(), digest_size=16).hexdigest()
 
 
-def is_flat(stack: Stack) -> bool:
+def is_flat(stack: StackLike) -> bool:
     """Return whether a movie is two-dimensional: one plane, of no height."""
     return bool(np.isnan(stack.voxel[0]))
 
@@ -558,7 +558,7 @@ def found_table(found: Iterable[Found]) -> pd.DataFrame:
     return pd.concat(parts, ignore_index=True)
 
 
-def _voxel(stack: Stack) -> _Voxel:
+def _voxel(stack: StackLike) -> _Voxel:
     z, y, x = (float(h) for h in stack.voxel)
     return z, y, x
 
@@ -568,7 +568,7 @@ def _spread(count: int, wanted: int = _LEARN_FRAMES) -> list[int]:
     return sorted(set(np.linspace(0, count - 1, min(wanted, count)).round().astype(int).tolist()))
 
 
-def _listed(stack: Stack, frames: Iterable[int] | None) -> list[int]:
+def _listed(stack: StackLike, frames: Iterable[int] | None) -> list[int]:
     listed = list(range(stack.shape[0])) if frames is None else [int(i) for i in frames]
     outside = [i for i in listed if not 0 <= i < stack.shape[0]]
     if outside:
@@ -580,7 +580,7 @@ def _listed(stack: Stack, frames: Iterable[int] | None) -> list[int]:
 
 
 def check_search(
-    stack: Stack, search: Search, refine: Refine, *, optics: Optics | None = None
+    stack: StackLike, search: Search, refine: Refine, *, optics: Optics | None = None
 ) -> None:
     """Raise one error with every fault of the arguments of a search."""
     if len(stack.shape) != 4:
@@ -600,7 +600,7 @@ def check_search(
         raise ValueError("; ".join(faults))
 
 
-def _size_faults(stack: Stack, search: Search, optics: Optics | None) -> list[str]:
+def _size_faults(stack: StackLike, search: Search, optics: Optics | None) -> list[str]:
     """Return what does not fit into the stack or between its voxels: lengths in another unit.
 
     Windows, masks and tables grow with the cube of the diameter in voxels: this comes before any
