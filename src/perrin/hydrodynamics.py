@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal, NamedTuple, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Literal, NamedTuple, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from perrin._arrays import Floats
 
 
+@runtime_checkable
 class HasStandardError(Protocol):
     """A measured number with its standard error, as a `DiffusionEstimate` has them."""
 
@@ -315,7 +316,7 @@ def _known(
 
 def _pair(measured: Measured) -> tuple[float, float]:
     """Return a value and its standard error, 0 for a bare number."""
-    if hasattr(measured, "stderr"):
+    if isinstance(measured, HasStandardError):
         return measured.value, measured.stderr
     if np.shape(measured) == (2,):
         value, stderr = measured  # type: ignore[misc]

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from perrin._arrays import Floats, Ints
     from perrin.images.image_fit import CameraNoise
-    from perrin.images.locate import Stack
+    from perrin.images.locate import StackLike
     from perrin.images.optics import Optics
     from perrin.images.sphere_image import SphereImage
     from perrin.motion import RigidMotion
@@ -44,7 +44,7 @@ class Pose(NamedTuple):
 
 
 def fit_pose(
-    stack: Stack,
+    stack: StackLike,
     motion: RigidMotion,
     *,
     optics: Optics,
