@@ -3,8 +3,8 @@
 Usage: python benchmarks/alarms.py [--repeats 200] [--only NAME] [--jobs 2] [--seed 0] [--quick]
                                    [--images] [--texts]
 
-Every fault and every clean case is simulated with numpy and scipy alone (nothing is shared with
-perrin.simulate), analysed, and its warnings are sorted into KINDS. Printed are, for every fault,
+Every fault and every clean case is simulated with numpy and scipy alone (without
+`simulate_motion`), analysed, and its warnings are sorted into KINDS. Printed are, for every fault,
 how often it is named, which other warnings stand beside it, and, for every clean case, which
 warnings appear. Lines that must hold:
 
@@ -493,7 +493,7 @@ def planned(data, **_):
     """Return the sentences that the command line prints for a plan."""
     from typer.testing import CliRunner
 
-    from perrin.cli import app
+    from perrin.cli.app import app
 
     printed = " ".join(CliRunner().invoke(app, ["plan", *data]).output.split())
     return Said(tuple(printed.split(". ")))

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial.distance import cdist
 
 import perrin
-from perrin.images.locate import Search, choose_method, sample_frames
+from perrin.images.spheres.localisation import Search, choose_method, sample_frames
 
 DIAMETER = 2.45
 VOXEL = np.array([0.25, 0.2, 0.2])

@@ -22,7 +22,7 @@ import numpy as np
 from scipy.spatial.distance import cdist
 
 import perrin
-from perrin.rotations import exp_map, log_map
+from perrin.geometry.rotations import exp_map, log_map
 
 DIAMETER, DT = 2.45, 0.73
 VOXEL = np.array([0.25, 0.2, 0.2])

@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 
 import perrin
-from perrin.grouping import each_cluster
+from perrin.tracks.clusters import each_cluster
 
 D_R, D_T, DT, SIGMA = 4.9e-3, 3.85e-2, 0.73, (0.03, 0.03, 0.04)
 DIAMETER, FRAMES = 2.45, 300

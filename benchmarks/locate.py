@@ -22,11 +22,11 @@ from scipy.ndimage import gaussian_filter
 from scipy.spatial.distance import cdist
 
 import perrin
-from perrin.images.conventional import refine_by_trackpy
-from perrin.images.features import at_contact
-from perrin.images.image_fit import FreeCenters, cut_window, fit_window
-from perrin.images.locate import Search, choose_method, sample_frames
-from perrin.rotations import exp_map, log_map
+from perrin.geometry.rotations import exp_map, log_map
+from perrin.images.optics.window_fit import FreeCenters, cut_window, fit_window
+from perrin.images.spheres.by_trackpy import refine_by_trackpy
+from perrin.images.spheres.localisation import Search, choose_method, sample_frames
+from perrin.images.spheres.spots import at_contact
 
 VOXEL = np.array([0.25, 0.2, 0.2])
 PSF = np.array([0.4, 0.15, 0.15])

@@ -20,10 +20,10 @@ from PIL import Image, ImageSequence
 from scipy.spatial.distance import cdist
 
 import perrin
-from perrin.images.conventional import find_features
-from perrin.images.crowd import fit_crowd
-from perrin.images.crowd_light import first_light
-from perrin.images.locate import Search, choose_method, sample_frames
+from perrin.images.optics.crowd_equations import first_light
+from perrin.images.optics.crowd_fit import fit_crowd
+from perrin.images.spheres.by_trackpy import find_features
+from perrin.images.spheres.localisation import Search, choose_method, sample_frames
 
 D = 11.0  # voxels, as said of the spheres in the walkthrough
 VOXEL = (1.0, 1.0, 1.0)

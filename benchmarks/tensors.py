@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 import perrin
-from perrin.rotations import exp_map
+from perrin.geometry.rotations import exp_map
 
 SLANT = exp_map(np.array([0.4, -0.7, 0.3]))
 BODY = perrin.Cluster.from_positions(np.random.default_rng(5).normal(size=(6, 3)))

@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 
 import perrin
-from perrin.report import render_html
+from perrin.report.page import render_html
 
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data" / "optitrack"
 
@@ -286,7 +286,7 @@ def test_like_clusters_share_one_solution(monkeypatch):
         solved.append(len(positions))
         return perrin.cluster_mobility(positions, **known)
 
-    monkeypatch.setattr("perrin.predictions.cluster_mobility", counted)
+    monkeypatch.setattr("perrin.run.predictions.cluster_mobility", counted)
     report = perrin.analyze(pd.concat(tables), dt=0.73, diameter=2.45, **KNOWN)
     assert solved == [4, 3]
     values = [c.prediction.D_R.predicted for c in report.clusters]
@@ -302,7 +302,7 @@ def test_a_shared_solution_is_turned_into_the_axes_of_each_body(monkeypatch):
     other = spheres(body, seed=35, n_frames=150, cluster=1)
     other = other.assign(particle=other["particle"].map({100: 102, 101: 100, 102: 103, 103: 101}))
     both = perrin.analyze(pd.concat([one, other]), dt=0.5, diameter=2.0, **KNOWN).clusters
-    monkeypatch.setattr("perrin.predictions.matching_rotation", lambda *_, **__: None)
+    monkeypatch.setattr("perrin.run.predictions.matching_rotation", lambda *_, **__: None)
     alone = perrin.analyze(pd.concat([one, other]), dt=0.5, diameter=2.0, **KNOWN).clusters
     # The templates differ by 20 nm/sqrt(150) a coordinate, a thousandth of the diameter.
     for shared, own in zip(both, alone, strict=True):
@@ -343,11 +343,11 @@ def test_shapes_that_cannot_be_solved_are_told(base, monkeypatch):
     assert "would overlap" in told(diameter=3.0)[1]
     assert "do not touch" in told(diameter=1.2)[1]
     assert told(diameter=2.45)[1] == ""
-    monkeypatch.setattr("perrin.resistance._MOST_UNKNOWNS", 430)
+    monkeypatch.setattr("perrin.hydrodynamics.resistance._MOST_UNKNOWNS", 430)
     rough, words = told(diameter=2.45)
     assert rough.prediction.error > 1e-4
     assert "predicted flow: degree 5 leaves a relative error" in words
-    monkeypatch.setattr("perrin.resistance._MOST_UNKNOWNS", 300)
+    monkeypatch.setattr("perrin.hydrodynamics.resistance._MOST_UNKNOWNS", 300)
     refused, words = told()
     assert refused.sizes is None
     assert "no sizes: cluster_mobility refuses this shape: centers: 4 spheres" in words

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import perrin
-from perrin.bonds import rigid_groups
-from perrin.grouping import find_clusters
+from perrin.tracks.bonds import rigid_groups
+from perrin.tracks.clusters import find_clusters
 
 
 def bodies(count, *, n_frames=100, loose=0, seed=0, apart=10.0, sigma=0.03):

@@ -8,14 +8,8 @@ import pandas as pd
 import pytest
 from scipy.spatial.transform import Rotation
 
-from perrin import (
-    DegenerateClusterError,
-    TooFewFramesError,
-    msd,
-    remove_rotation,
-    similarity,
-)
-from perrin.rotations import exp_map, log_map
+from perrin import DegenerateClusterError, TooFewFramesError, msd, remove_rotation, similarity
+from perrin.geometry.rotations import exp_map, log_map
 
 WATER = Path(__file__).resolve().parents[2] / "shared" / "data" / "trackpy_bulk_water"
 OMEGA = {3: np.array([0.02, -0.03, 0.05]), 2: np.array([0.06])}

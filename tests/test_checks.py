@@ -10,11 +10,11 @@ import pytest
 from scipy.stats import t
 
 import perrin
-from perrin.images import checks
-from perrin.images.bodies import group_sizes
-from perrin.images.features import mass_cut
-from perrin.images.optics import saturated_share
-from perrin.rotations import exp_map
+from perrin.geometry.rotations import exp_map
+from perrin.images.optics.learn import saturated_share
+from perrin.images.spheres.spots import mass_cut
+from perrin.movie import checks
+from perrin.movie.bodies import group_sizes
 
 CONTACT, DT = 2.45, 0.73
 

@@ -19,7 +19,8 @@ import pandas as pd
 import pytest
 
 import perrin
-from perrin.cli import _show, analyze, app
+from perrin.cli.app import analyze, app
+from perrin.cli.tables import _show
 
 
 class Outcome(NamedTuple):
@@ -563,7 +564,7 @@ def test_predict_refuses_in_one_line(tmp_path, options, words):
 
 def test_predict_says_when_the_accuracy_is_not_reached(tmp_path, monkeypatch):
     """A warning is one line beside the result."""
-    monkeypatch.setattr("perrin.resistance._MOST_UNKNOWNS", 300)
+    monkeypatch.setattr("perrin.hydrodynamics.resistance._MOST_UNKNOWNS", 300)
     result = run("predict", "dimer", "--diameter", 2, *CONDITIONS, cwd=tmp_path)
     assert result.returncode == 0
     assert result.stderr.startswith("warning: degree 5 leaves a relative error of")

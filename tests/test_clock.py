@@ -5,7 +5,7 @@ import pandas as pd
 import pytest
 
 import perrin
-from perrin.clock import frame_stride, read_clock
+from perrin.tracks.clock import frame_stride, read_clock
 
 
 def table(times, frames=None):

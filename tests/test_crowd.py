@@ -10,10 +10,10 @@ import pytest
 from scipy.spatial.distance import cdist
 
 import perrin
-from perrin.images.crowd import fit_crowd
-from perrin.images.crowd_light import normal_equations
-from perrin.images.image_fit import CameraNoise
-from perrin.images.locate import Search, choose_method, sample_frames
+from perrin.images.optics.crowd_equations import normal_equations
+from perrin.images.optics.crowd_fit import fit_crowd
+from perrin.images.optics.optics import CameraNoise
+from perrin.images.spheres.localisation import Search, choose_method, sample_frames
 
 pytest.importorskip("trackpy")
 

@@ -22,7 +22,7 @@ from perrin import (
     simulate_motion,
     track_rotation,
 )
-from perrin.curve_fits import _covariance, _quadratic_variance
+from perrin.diffusion.curve_fits import _covariance, _quadratic_variance
 
 
 def straight(D, offset, n=200, dt=0.5, dof=2):

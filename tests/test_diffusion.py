@@ -19,9 +19,10 @@ from perrin import (
     simulate_motion,
     track_rotation,
 )
-from perrin.diffusion import with_error
-from perrin.likelihood import Likelihood, Track
-from perrin.steps import steps_of
+from perrin._text import with_error
+from perrin.diffusion.likelihood import Likelihood
+from perrin.diffusion.step_kernels import Track
+from perrin.diffusion.steps import steps_of
 
 TETRAHEDRON = Cluster.tetrahedron(1.5)
 SIGMA = 0.03  # sigma/R = 0.02

@@ -13,8 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from perrin._arrays import TrackTableError
-from perrin.files import check_tracks, read_tracks, write_tracks
+from perrin.errors import TrackTableError
+from perrin.tracks.files import check_tracks, read_tracks, write_tracks
 
 
 def tracks(n_frames=3, n_particles=2, axes="xyz", seed=0):
@@ -205,7 +205,7 @@ def test_a_faulty_table_is_not_written(tmp_path):
 def test_reading_a_file_needs_no_pandas_at_import():
     """Importing the module loads numpy alone."""
     code = (
-        "import sys, perrin.files, perrin.grouping; "
+        "import sys, perrin.tracks.files, perrin.tracks.clusters; "
         "print(sorted({'pandas', 'scipy', 'pyarrow'} & set(sys.modules)))"
     )
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

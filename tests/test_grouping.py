@@ -6,8 +6,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from perrin._arrays import TrackTableError
-from perrin.grouping import cluster_positions, find_clusters
+from perrin.errors import TrackTableError
+from perrin.tracks.clusters import cluster_positions, find_clusters
 
 TETRAHEDRON = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / np.sqrt(8)
 

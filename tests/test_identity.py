@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import perrin
-from perrin.identity import _table, settle_identity
-from perrin.rotations import exp_map
+from perrin.geometry.rotations import exp_map
+from perrin.tracks.identity import _table, settle_identity
 
 BODIES = {n: perrin.Cluster.touching(n, 2.45) for n in (3, 4, 5, 6, 7)}
 SLOW = 4.9e-3 * 0.73  # D_R dt of the paper's experiment

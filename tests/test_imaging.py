@@ -8,9 +8,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from perrin.images.image_fit import CameraNoise
 from perrin.images.imaging import Imaging, View, read_imaging, write_imaging
-from perrin.images.optics import Optics
+from perrin.images.optics.optics import CameraNoise, Optics
 
 
 def imaging(**changes):

@@ -28,8 +28,8 @@ from perrin import (
     track_rotation,
     van_hove,
 )
-from perrin.lagged import _restored
-from perrin.rotations import cumulative_product, exp_map
+from perrin.curves.displacement import _restored
+from perrin.geometry.rotations import cumulative_product, exp_map
 
 TETRAHEDRON = Cluster.tetrahedron(1.5)
 SMALL = settings(max_examples=25, deadline=None, derandomize=True)

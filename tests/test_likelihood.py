@@ -7,8 +7,9 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from perrin import Cluster, add_noise, simulate_motion, track_rotation
-from perrin.likelihood import Likelihood, Track, _Sines, _Tridiagonal
-from perrin.steps import steps_of
+from perrin.diffusion.likelihood import Likelihood
+from perrin.diffusion.step_kernels import Track, _Sines, _Tridiagonal
+from perrin.diffusion.steps import steps_of
 
 QUANTITIES = ("rotation", "translation")
 SIGMA = 0.03

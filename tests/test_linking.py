@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 import perrin
-from perrin.linking import touching_groups
+from perrin.tracks.linking import touching_groups
 
 DIAMETER = 2.45
 

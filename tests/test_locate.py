@@ -11,17 +11,12 @@ from scipy.ndimage import gaussian_filter
 from scipy.spatial.distance import cdist
 
 import perrin
-from perrin.images.features import mass_cut
-from perrin.images.image_fit import (
-    CameraNoise,
-    FreeCenters,
-    RigidCenters,
-    cut_window,
-    fit_window,
-)
-from perrin.images.locate import Search, choose_method, sample_frames
-from perrin.images.sphere_image import sphere_image
-from perrin.rotations import exp_map, log_map
+from perrin.geometry.rotations import exp_map, log_map
+from perrin.images.optics.ball_image import sphere_image
+from perrin.images.optics.optics import CameraNoise
+from perrin.images.optics.window_fit import FreeCenters, RigidCenters, cut_window, fit_window
+from perrin.images.spheres.localisation import Search, choose_method, sample_frames
+from perrin.images.spheres.spots import mass_cut
 
 pytest.importorskip("trackpy")
 

@@ -10,14 +10,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from perrin import (
-    Cluster,
-    Mobility,
-    PrecisionWarning,
-    apparent_translation,
-    cluster_mobility,
-    resistance,
-)
+from perrin import Cluster, Mobility, PrecisionWarning, apparent_translation, cluster_mobility
+from perrin.hydrodynamics import resistance
 
 WATERY = {"viscosity": 1e-3, "temperature": 300.0}
 KT_OVER_ETA = 1.380649e-23 * 300 / 1e-3 * 1e18  # um^3/s

@@ -20,8 +20,8 @@ from perrin import (
     simulate_motion,
     track_rotation,
 )
-from perrin.motion import body_residuals
-from perrin.rotations import exp_map, log_map
+from perrin.geometry.rotations import exp_map, log_map
+from perrin.motion.residuals import body_residuals
 
 TETRA = Cluster.tetrahedron(1.5)
 TRIMER = Cluster.trimer(1.5)

@@ -7,8 +7,9 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from perrin import Cluster, DegenerateClusterError, kabsch, noise_floor
-from perrin.noise import center_variance, floor_of, orientation_covariance
-from perrin.rotations import log_map
+from perrin.geometry.rigid import center_variance, orientation_covariance
+from perrin.geometry.rotations import log_map
+from perrin.motion.floor import floor_of
 
 IRREGULAR = np.random.default_rng(5).normal(size=(6, 3)) * [1.5, 1.0, 0.7]
 laws = settings(max_examples=25, deadline=None, derandomize=True)

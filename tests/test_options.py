@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 import perrin
-from perrin import cli
-from perrin.options import in_options, options_of
+from perrin.cli import app as cli
+from perrin.cli.messages import in_options, options_of
 
 SOURCE = Path(perrin.__file__).parent
 COMMANDS = {

@@ -17,7 +17,7 @@ from perrin import (
     simulate_motion,
     track_rotation,
 )
-from perrin.rotations import cumulative_product, exp_map
+from perrin.geometry.rotations import cumulative_product, exp_map
 
 TETRA = Cluster.tetrahedron(1.5)
 FLAT = Cluster.from_positions([[0.0, 0.0], [2.0, 0.1], [0.5, 1.2], [-0.7, 0.9]])

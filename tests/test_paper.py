@@ -10,12 +10,12 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from perrin.claims import Claim, Study, statistical
-from perrin.paper import ITEMS, reproduce
-from perrin.paper_experiment import conclusion
-from perrin.paper_method import challis, simulation
-from perrin.paper_noise import sampling
-from perrin.paper_orientations import appendix, axes, correlation, figure_2, figure_6
+from perrin.paper.claims import Claim, Study, statistical
+from perrin.paper.experiment import conclusion
+from perrin.paper.method import challis, simulation
+from perrin.paper.noise import sampling
+from perrin.paper.orientations import appendix, axes, correlation, figure_2, figure_6
+from perrin.paper.remake import ITEMS, reproduce
 
 DOCS = Path(__file__).resolve().parents[1] / "docs" / "paper.md"
 

@@ -12,8 +12,8 @@ from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 
 import perrin
-from perrin import plot
-from perrin.diffusion import DiffusionEstimate
+from perrin.diffusion.estimate import DiffusionEstimate
+from perrin.plot import results as plot
 
 
 def measured(*, clusters=1, frames=80, planar=False, labels=None, D_R=0.02, gaps=False):

@@ -13,10 +13,10 @@ from matplotlib.figure import Figure
 from scipy.stats import halfnorm, maxwell
 
 import perrin
-from perrin import plot, plot_images
-from perrin.images.image_fit import CameraNoise
 from perrin.images.imaging import Imaging, View
-from perrin.images.optics import Optics
+from perrin.images.optics.optics import CameraNoise, Optics
+from perrin.plot import imaging as plot_images
+from perrin.plot import results as plot
 
 VOXEL, BALL = (0.25, 0.2, 0.2), 2.45
 
@@ -296,7 +296,7 @@ def test_an_exchange_of_spheres_stands_at_the_least_turn(report):
     """A third of a turn about a threefold axis from frame 20 on: the line, and where it happens."""
     motion = report.clusters[0].motion
     axis = motion.template[0] / np.linalg.norm(motion.template[0])
-    turn = perrin.rotations.exp_map(2 * np.pi / 3 * axis)
+    turn = perrin.geometry.rotations.exp_map(2 * np.pi / 3 * axis)
     rotation = motion.rotation.copy()
     rotation[20:] = rotation[20:] @ turn
     ax = axes()

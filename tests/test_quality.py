@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import perrin
-from perrin.residuals import lag_one_autocorrelation
+from perrin.motion.residuals import lag_one_autocorrelation
 
 
 def judged(x, **options):

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 import perrin
-from perrin import report as reports
-from perrin.plot import number_text
-from perrin.quality_page import render_quality
+from perrin._text import number_text
+from perrin.report import page as reports
+from perrin.report.imaging_page import render_quality
 from test_plot_images import BALL, seen
 from test_report import Page, pictures
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from perrin._text import frames_text, listed
-from perrin.remarks import condensed, grouped, merged
+from perrin.run.remarks import condensed, grouped, merged
 
 
 def poses(k: int) -> str:

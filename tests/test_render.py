@@ -10,7 +10,7 @@ import pytest
 from scipy.special import erf
 
 from perrin import Cluster, render_stack, simulate_motion
-from perrin.images.render import ball_image
+from perrin.images.optics.render import ball_image
 
 VOXEL, PSF, BALL = (0.25, 0.2, 0.2), (0.4, 0.15, 0.15), 2.45
 SHAPE = (32, 28, 30)
@@ -165,7 +165,7 @@ def test_blur_is_the_mean_over_the_exposure():
 def test_turns_between_frames_are_the_shortest():
     """Half-way between two orientations the body is half turned."""
     truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=0.2, D_T=0.0, dt=1, n_frames=2, rng=3)
-    from perrin.rotations import exp_map, log_map
+    from perrin.geometry.rotations import exp_map, log_map
 
     half = exp_map(0.5 * log_map(truth.rotation[1])) @ truth.rotation[0]
     turned = truth.template @ half.T + MIDDLE

@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 
 import perrin
-from perrin import plot, report
-from perrin.results import write_data
+from perrin.plot import results as plot
+from perrin.report import page as report
+from perrin.run.results import write_data
 from test_plot import estimate, measured
 
 PNG = base64.b64decode(

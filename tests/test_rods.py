@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 import perrin
-from perrin.rods import RodMotion, direction_steps
+from perrin.diffusion.steps import direction_steps
+from perrin.motion.rods import RodMotion
 
 D_PERP, DT = 0.01, 0.5
 

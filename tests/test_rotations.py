@@ -10,7 +10,7 @@ from hypothesis.extra.numpy import arrays
 from scipy.spatial.transform import Rotation
 
 from perrin import Cluster, DegenerateClusterError, axis_angle, kabsch, similarity
-from perrin.rotations import cumulative_product, exp_map, fit_rotations, log_map, skew
+from perrin.geometry.rotations import cumulative_product, exp_map, fit_rotations, log_map, skew
 
 TETRA = Cluster.tetrahedron(1.0).positions
 TRIMER = Cluster.trimer(1.0).positions

@@ -22,12 +22,13 @@ import pandas as pd
 import pytest
 
 import perrin
-from perrin.images import stages, workers
-from perrin.images.image_fit import CameraNoise
-from perrin.images.locate import Method
-from perrin.images.parts import PartWriter, open_parts, read_parts
-from perrin.plot_images import _frame_numbers
-from perrin.results import check_resumable, filled_folder, motion_table
+from perrin.images.optics.optics import CameraNoise
+from perrin.images.spheres.localisation import Method
+from perrin.movie import stages, workers
+from perrin.movie.parts import PartWriter, open_parts, read_parts
+from perrin.plot.imaging import _frame_numbers
+from perrin.run.folders import check_resumable, filled_folder
+from perrin.run.results import motion_table
 
 pytest.importorskip("tifffile")
 pytest.importorskip("trackpy")
@@ -195,7 +196,7 @@ def test_a_killed_run_goes_on_and_gives_the_same(tmp_path, movie_file, whole, co
     script.write_text(
         "from perrin.cli import main\n"
         "from perrin.images import stages\n"
-        "from perrin.images.parts import PartWriter\n"
+        "from perrin.movie.parts import PartWriter\n"
         "stages.PartWriter = lambda folder: PartWriter(folder, seconds=0.0)\n"
         "main()\n"
     )
@@ -215,7 +216,7 @@ def test_a_killed_run_goes_on_and_gives_the_same(tmp_path, movie_file, whole, co
 
 def test_a_full_disk_is_told_and_the_run_goes_on(tmp_path, movie_file, whole, monkeypatch, capsys):
     """What was written before stays; one line says what to do; the second call ends the work."""
-    from perrin.cli import app
+    from perrin.cli.app import app
 
     monkeypatch.setattr(stages, "PartWriter", lambda folder: PartWriter(folder, seconds=0.0))
     sync, written = os.fsync, []
@@ -585,7 +586,7 @@ def test_what_cannot_be_is_said_in_one_line(tmp_path, capsys, options, status, t
     """A bare TIFF without a sphere: what is missing, what is wrong; no folder is left by that."""
     import tifffile
 
-    from perrin.cli import app
+    from perrin.cli.app import app
 
     path = tmp_path / "bare.tif"
     tifffile.imwrite(path, np.full((3, 16, 32, 32), 7, dtype=np.uint8), metadata={"axes": "TZYX"})

@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 import perrin
-from perrin.screening import (
+from perrin.tracks.screening import (
     centre_removed,
     distance_notes,
     far_points,

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from perrin import Cluster, point_group, rotation_group
-from perrin.rotations import exp_map
-from perrin.shapes import is_tetrahedron, matching_rotation, symmetry_elements
+from perrin.geometry.rotations import exp_map
+from perrin.geometry.shapes import is_tetrahedron
+from perrin.geometry.symmetry import matching_rotation, symmetry_elements
 
 
 def distances(cluster):

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from perrin import Cluster, add_noise, apparent_translation, cluster_mobility, simulate_motion
-from perrin.rotations import log_map
+from perrin.geometry.rotations import log_map
 
 BODY = Cluster.tetrahedron(1.5)
 PLANE = Cluster.from_positions([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])

@@ -7,8 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import perrin
-from perrin.motion import track_rotation
-from perrin.step_tests import cut_at, find_jumps, steady_motion
+from perrin.diffusion.step_tests import cut_at, find_jumps, steady_motion
+from perrin.motion.tracking import track_rotation
 
 DT = 0.73
 TETRA = 1.5 * np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / np.sqrt(3)

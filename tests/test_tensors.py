@@ -20,9 +20,10 @@ from perrin import (
     simulate_motion,
     track_rotation,
 )
-from perrin.rotations import exp_map, skew
-from perrin.tensor_likelihood import Source, VectorSteps, axial, maximise, spread, squares
-from perrin.tensors import axes_like, diffusion_center, shifted
+from perrin.diffusion.tensor_likelihood import Source, VectorSteps, axial, maximise, spread, squares
+from perrin.diffusion.tensors import axes_like
+from perrin.geometry.rigid import diffusion_center, shifted
+from perrin.geometry.rotations import exp_map, skew
 
 SLANT = exp_map(np.array([0.4, -0.7, 0.3]))
 BODY = Cluster.from_positions(np.random.default_rng(5).normal(size=(6, 3)))

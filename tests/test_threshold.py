@@ -15,8 +15,8 @@ from perrin import (
     threshold_displacement,
     track_rotation,
 )
-from perrin.motion import _references
-from perrin.rotations import exp_map
+from perrin.geometry.rotations import exp_map
+from perrin.motion.rigid_motion import _references
 
 TETRA = Cluster.tetrahedron(1.5)
 FLAT = Cluster.from_positions([[0.0, 0.0], [2.0, 0.1], [0.5, 1.2], [-0.7, 0.9]])

@@ -1,17 +1,45 @@
 """perrin: measure how rigid clusters of colloidal particles diffuse and turn.
 
 Positions (T, n, d) become a `RigidMotion`, which makes every `LagCurve` and
-`DiffusionEstimate`; tables, files, pictures and the command line stand at the doors.
+`DiffusionEstimate`; tables, files, images, pictures and the command line are the boundary.
 Units: um, s, rad, K, Pa s.
 
-Each name is loaded from its room when it is first asked for, so that `import perrin` and the
-command line's help cost next to nothing.
+Each name is imported from its subpackage when it is first used, so that `import perrin` imports no
+other package.
 """
 
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from perrin._arrays import (
+    from perrin.curves import (
+        LagCurve,
+        QuaternionCovariance,
+        VanHove,
+        msad,
+        msad_axes,
+        msad_vector,
+        msd,
+        orientation_correlation,
+        quaternion_covariance,
+        van_hove,
+    )
+    from perrin.diffusion import (
+        CoupledTensor,
+        DiffusionEstimate,
+        DiffusionTensor,
+        SamplingPlan,
+        SamplingVerdict,
+        coupled_tensor,
+        cramer_rao,
+        diffusion_tensor,
+        estimate_diffusion,
+        estimate_rod,
+        fit_gls,
+        fit_line,
+        judge_sampling,
+        plan_sampling,
+    )
+    from perrin.errors import (
         DegenerateClusterError,
         FrameError,
         IdentityError,
@@ -22,58 +50,58 @@ if TYPE_CHECKING:
         TrackTableError,
         UnitWarning,
     )
-    from perrin.analysis import analyze
-    from perrin.bounds import cramer_rao
-    from perrin.curve_fits import fit_gls, fit_line
-    from perrin.diffusion import DiffusionEstimate, estimate_diffusion
-    from perrin.files import read_tracks, write_tracks
-    from perrin.grouping import cluster_positions, find_clusters, identify, positions_table
+    from perrin.geometry import (
+        Cluster,
+        Similarity,
+        axis_angle,
+        kabsch,
+        point_group,
+        rotation_group,
+        similarity,
+    )
     from perrin.hydrodynamics import (
+        Mobility,
         Size,
+        WallFactor,
+        apparent_translation,
+        cluster_mobility,
+        gravitational_height,
+        settling_velocity,
         size_and_viscosity,
         size_from_rotation,
         size_from_translation,
-    )
-    from perrin.identity import Identity, settle_identity
-    from perrin.images.locate import locate
-    from perrin.images.optics import Optics
-    from perrin.images.poses import fit_pose
-    from perrin.images.render import render_stack
-    from perrin.images.run import analyze_stack
-    from perrin.images.stacks import Stack, open_stack, write_stack
-    from perrin.lagged import (
-        LagCurve,
-        VanHove,
-        msad,
-        msad_axes,
-        msad_vector,
-        msd,
-        orientation_correlation,
-        van_hove,
-    )
-    from perrin.mobility import Mobility, apparent_translation, cluster_mobility
-    from perrin.motion import RigidMotion, remove_rotation, threshold_displacement, track_rotation
-    from perrin.noise import NoiseFloor, noise_floor
-    from perrin.predictions import Compared, Prediction
-    from perrin.quality import Quality, judge_quality
-    from perrin.quaternions import QuaternionCovariance, quaternion_covariance
-    from perrin.report import write_run
-    from perrin.results import ClusterResult, Report, RodResult, load_run
-    from perrin.rod_diffusion import estimate_rod
-    from perrin.rods import RodMotion, track_direction
-    from perrin.rotations import Similarity, axis_angle, kabsch, similarity
-    from perrin.sampling import SamplingPlan, SamplingVerdict, judge_sampling, plan_sampling
-    from perrin.shapes import Cluster, point_group, rotation_group
-    from perrin.simulate import add_noise, simulate_motion
-    from perrin.surroundings import (
-        WallFactor,
-        gravitational_height,
-        settling_velocity,
         wall_diffusion,
         wall_factor,
         water_viscosity,
     )
-    from perrin.tensors import CoupledTensor, DiffusionTensor, coupled_tensor, diffusion_tensor
+    from perrin.images import Optics, Stack, fit_pose, locate, open_stack, render_stack, write_stack
+    from perrin.motion import (
+        NoiseFloor,
+        Quality,
+        RigidMotion,
+        RodMotion,
+        add_noise,
+        judge_quality,
+        noise_floor,
+        remove_rotation,
+        simulate_motion,
+        threshold_displacement,
+        track_direction,
+        track_rotation,
+    )
+    from perrin.movie import analyze_stack
+    from perrin.report import write_run
+    from perrin.run import ClusterResult, Compared, Prediction, Report, RodResult, analyze, load_run
+    from perrin.tracks import (
+        Identity,
+        cluster_positions,
+        find_clusters,
+        identify,
+        positions_table,
+        read_tracks,
+        settle_identity,
+        write_tracks,
+    )
 
 __version__ = "0.1.0"
 
@@ -169,9 +197,9 @@ __all__ = [
     "write_tracks",
 ]
 
-# Which room a name is in, rooms in the order of the house.
-_ROOMS = {
-    "_arrays": (
+# The public names of every subpackage.
+_FACES = {
+    "errors": (
         "DegenerateClusterError",
         "FrameError",
         "IdentityError",
@@ -182,73 +210,119 @@ _ROOMS = {
         "TrackTableError",
         "UnitWarning",
     ),
-    "rotations": ("Similarity", "axis_angle", "kabsch", "similarity"),
-    "shapes": ("Cluster", "point_group", "rotation_group"),
-    "noise": ("NoiseFloor", "noise_floor"),
-    "motion": ("RigidMotion", "remove_rotation", "threshold_displacement", "track_rotation"),
-    "identity": ("Identity", "settle_identity"),
-    "rods": ("RodMotion", "track_direction"),
-    "grouping": ("cluster_positions", "find_clusters", "identify", "positions_table"),
-    "quality": ("Quality", "judge_quality"),
-    "lagged": (
+    "geometry": (
+        "Cluster",
+        "Similarity",
+        "axis_angle",
+        "kabsch",
+        "point_group",
+        "rotation_group",
+        "similarity",
+    ),
+    "hydrodynamics": (
+        "Mobility",
+        "Size",
+        "WallFactor",
+        "apparent_translation",
+        "cluster_mobility",
+        "gravitational_height",
+        "settling_velocity",
+        "size_and_viscosity",
+        "size_from_rotation",
+        "size_from_translation",
+        "wall_diffusion",
+        "wall_factor",
+        "water_viscosity",
+    ),
+    "motion": (
+        "NoiseFloor",
+        "Quality",
+        "RigidMotion",
+        "RodMotion",
+        "add_noise",
+        "judge_quality",
+        "noise_floor",
+        "remove_rotation",
+        "simulate_motion",
+        "threshold_displacement",
+        "track_direction",
+        "track_rotation",
+    ),
+    "tracks": (
+        "Identity",
+        "cluster_positions",
+        "find_clusters",
+        "identify",
+        "positions_table",
+        "read_tracks",
+        "settle_identity",
+        "write_tracks",
+    ),
+    "curves": (
         "LagCurve",
+        "QuaternionCovariance",
         "VanHove",
         "msad",
         "msad_axes",
         "msad_vector",
         "msd",
         "orientation_correlation",
+        "quaternion_covariance",
         "van_hove",
     ),
-    "quaternions": ("QuaternionCovariance", "quaternion_covariance"),
-    "diffusion": ("DiffusionEstimate", "estimate_diffusion"),
-    "rod_diffusion": ("estimate_rod",),
-    "curve_fits": ("fit_gls", "fit_line"),
-    "tensors": ("CoupledTensor", "DiffusionTensor", "coupled_tensor", "diffusion_tensor"),
-    "bounds": ("cramer_rao",),
-    "sampling": ("SamplingPlan", "SamplingVerdict", "judge_sampling", "plan_sampling"),
-    "mobility": ("Mobility", "apparent_translation", "cluster_mobility"),
-    "hydrodynamics": (
-        "Size",
-        "size_and_viscosity",
-        "size_from_rotation",
-        "size_from_translation",
+    "diffusion": (
+        "CoupledTensor",
+        "DiffusionEstimate",
+        "DiffusionTensor",
+        "SamplingPlan",
+        "SamplingVerdict",
+        "coupled_tensor",
+        "cramer_rao",
+        "diffusion_tensor",
+        "estimate_diffusion",
+        "estimate_rod",
+        "fit_gls",
+        "fit_line",
+        "judge_sampling",
+        "plan_sampling",
     ),
-    "predictions": ("Compared", "Prediction"),
-    "surroundings": (
-        "WallFactor",
-        "gravitational_height",
-        "settling_velocity",
-        "wall_diffusion",
-        "wall_factor",
-        "water_viscosity",
+    "images": (
+        "Optics",
+        "Stack",
+        "fit_pose",
+        "locate",
+        "open_stack",
+        "render_stack",
+        "write_stack",
     ),
-    "simulate": ("add_noise", "simulate_motion"),
-    "files": ("read_tracks", "write_tracks"),
-    "images.stacks": ("Stack", "open_stack", "write_stack"),
-    "images.render": ("render_stack",),
-    "images.optics": ("Optics",),
-    "images.locate": ("locate",),
-    "images.poses": ("fit_pose",),
-    "images.run": ("analyze_stack",),
-    "results": ("ClusterResult", "Report", "RodResult", "load_run"),
-    "analysis": ("analyze",),
+    "run": (
+        "ClusterResult",
+        "Compared",
+        "Prediction",
+        "Report",
+        "RodResult",
+        "analyze",
+        "load_run",
+    ),
+    "movie": ("analyze_stack",),
     "report": ("write_run",),
 }
 
 
 def __getattr__(name: str) -> Any:  # noqa: ANN401 (a module's attributes have any type)
-    """Load a public name from its room."""
+    """Import a public name or a subpackage when it is first used."""
     from importlib import import_module
 
-    for room, names in _ROOMS.items():
+    if name in _FACES:
+        return import_module(f"perrin.{name}")
+    for subpackage, names in _FACES.items():
         if name in names:
-            value = getattr(import_module(f"perrin.{room}"), name)
+            value = getattr(import_module(f"perrin.{subpackage}"), name)
             globals()[name] = value
             return value
     raise AttributeError(f"module 'perrin' has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:
-    """List the public names, loaded or not."""
-    return sorted([*globals(), *__all__])
+    """List the public names, imported or not."""
+    return sorted(__all__)

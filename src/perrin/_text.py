@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
@@ -51,3 +53,101 @@ def frames_text(frames: Iterable[int], *, most: int = 10) -> str:
     """
     numbers = [int(frame) for frame in frames]
     return f"frame{'s' if len(numbers) != 1 else ''} {listed(numbers, most=most)}"
+
+
+def with_error(value: float, stderr: float) -> str:
+    """Write a value with its standard error in the last digits: 0.0047(5).
+
+    Examples
+    --------
+    >>> with_error(0.00471, 0.00052), with_error(38.5, 12.0), with_error(0.0385, 0.0019)
+    ('0.0047(5)', '38(12)', '0.0385(19)')
+    """
+    if not (np.isfinite(stderr) and stderr > 0):
+        return f"{value:.3g}"
+    exponent = int(np.floor(np.log10(stderr)))
+    # Two digits of an error below 20, one above: the last digit then says 5 to 50 %.
+    digits = -exponent + (1 if round(stderr / 10**exponent, 1) < 2 else 0)
+    shown = round(stderr * 10.0**digits)
+    if digits <= 0:
+        return f"{round(value, digits):.0f}({shown * 10**-digits})"
+    return f"{value:.{digits}f}({shown})"
+
+
+def number_text(value: float, stderr: float = np.nan, *, digits: int = 3) -> str:
+    """Write a number, with its standard error in the last digits, and a power of ten if need be.
+
+    Parameters
+    ----------
+    value : float
+    stderr : float, optional
+        NaN or 0: the value alone.
+    digits : int
+        Significant digits of a value alone.
+
+    Returns
+    -------
+    str
+
+    Examples
+    --------
+    >>> number_text(0.00471, 0.00052), number_text(4.71e-7, 5.2e-8), number_text(-1840.0)
+    ('0.0047(5)', '4.7(5) × 10⁻⁷', '−1840')
+    """
+    known = bool(np.isfinite(stderr)) and stderr > 0
+    if not np.isfinite(value) or (value == 0 and not known):
+        return f"{value:g}"
+    power = power_of(max(abs(value), stderr) if known else value)
+    shown = value / 10.0**power
+    text = with_error(shown, stderr / 10.0**power) if known else significant(shown, digits)
+    return (f"{text} × {ten_to(power)}" if power else text).replace("-", "−")
+
+
+def significant(value: float, digits: int) -> str:
+    """Write a number with so many significant digits and no exponent: 1840, not 1.84e+03."""
+    text = np.format_float_positional(
+        value, precision=digits, fractional=False, unique=False, trim="k"
+    )
+    return text.rstrip(".")
+
+
+def power_of(value: float) -> int:
+    """Return the power of ten to write before a value; 0 where plain digits read well."""
+    if not np.isfinite(value) or value == 0 or 1e-3 <= abs(value) < 1e5:
+        return 0
+    return int(np.floor(np.log10(abs(value))))
+
+
+def ten_to(power: int) -> str:
+    """Write a power of ten with raised digits."""
+    return "10" + str(power).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
+
+
+def unit_text(ascii_unit: str) -> str:
+    """Return a unit as print shows it: um^2/s becomes µm²/s."""
+    return ascii_unit.replace("um", "µm").replace("^2", "²")
+
+
+def shortened(name: str, *, most: int = 24) -> str:
+    """Return a user's name for a cluster, cut where it is too long for a picture."""
+    return name if len(name) <= most else name[: most - 1] + "…"
+
+
+def _number(value: float) -> float | None:
+    """Return a number that JSON can hold; None where it is unbounded or unknown."""
+    return float(value) if np.isfinite(value) else None
+
+
+def _ordinal(n: int) -> str:
+    ending = "th" if n % 100 in (11, 12, 13) else {1: "st", 2: "nd", 3: "rd"}.get(n % 10, "th")
+    return f"{n}{ending}"
+
+
+def _short(value: float) -> str:
+    """Write a number with two digits, and no exponent where it is large."""
+    return f"{value:.2g}" if value < 99.5 else f"{value:.0f}"
+
+
+def percent(share: float) -> str:
+    """Write a share in percent with two digits: 8.3 %, 23 %, 0.45 %."""
+    return f"{100 * share:#.2g} %".replace(". %", " %")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from perrin.images.optics import Optics
+from perrin.images.optics.optics import Optics
 
 if TYPE_CHECKING:
     from pathlib import Path

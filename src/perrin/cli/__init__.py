@@ -1,0 +1,7 @@
+"""The command line."""
+
+from perrin.cli.app import main
+
+__all__ = [
+    "main",
+]

@@ -1,0 +1,225 @@
+"""Options of the command line: their types, their help texts, and what their texts mean."""
+
+from __future__ import annotations
+
+import sys
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal, cast
+
+import typer
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from numpy.typing import ArrayLike
+
+    from perrin.geometry.shapes import Cluster
+    from perrin.images.optics.optics import Optics
+
+
+_SHAPES = ("tetrahedron", "pentahedron", "trimer")
+
+
+_TOUCHING = ("dimer", "trimer", "tetrahedron", "bipyramid", "octahedron", "pentagonal-bipyramid")
+
+
+_PICTURES = (".png", ".pdf", ".svg")
+
+
+Tracks = Annotated[Path, typer.Argument(help="Track table: .csv, .csv.gz, .parquet or .gdf.")]
+
+
+Interval = Annotated[float, typer.Option("--dt", help="Time between frames, s.")]
+
+
+Output = Annotated[Path, typer.Option("-o", "--output", help="Folder for the run.")]
+
+
+Scale = Annotated[
+    str, typer.Option(help="um per unit of the coordinates; one number or x,y,z, e.g. 1000 for mm.")
+]
+
+
+Columns = Annotated[
+    str | None,
+    typer.Option(help="Names or numbers of the file's columns: x=0,y=1,z=2,frame=-2,particle=-1."),
+]
+
+
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an existing run folder.")]
+
+
+OverwriteFile = Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")]
+
+
+Noise = Annotated[
+    str,
+    typer.Option(
+        help="How the noise under D is known: joint (free), residual (from the rigid fit; "
+        "right only if all particles of a frame are seen at once), or sigma in um."
+    ),
+]
+
+
+Exposure = Annotated[
+    float | None, typer.Option(help="Open fraction of dt, 0 to 1; unknown if left out.")
+]
+
+
+Drift = Annotated[
+    bool,
+    typer.Option(
+        "--drift",
+        help="Take a mean velocity (flow) off D_T and a mean spin off D_R; both are stated.",
+    ),
+]
+
+
+KeepJumps = Annotated[
+    bool,
+    typer.Option(
+        "--keep-jumps", help="Keep steps in D that Brownian motion cannot make (stage jumps)."
+    ),
+]
+
+
+def _optics(text: str | None) -> Optics | None:
+    """Read diameter, point spread along z and in the plane, gain and floor of the noise."""
+    from perrin.images.optics.optics import CameraNoise, Optics
+
+    if text is None:
+        return None
+    values = _numbers("--optics", text)
+    if not isinstance(values, list) or len(values) != 5:
+        raise ValueError(f"--optics: expected diameter,psf_z,psf,gain,floor, got {text!r}")
+    diameter, psf_z, psf, gain, floor = values
+    return Optics(diameter, (psf_z, psf), CameraNoise(gain, floor))
+
+
+@contextmanager
+def _frames_kept(output: Path) -> Iterator[None]:
+    """State, when a run is stopped from outside, that finished frames are kept."""
+    try:
+        yield
+    except (OSError, KeyboardInterrupt) as stop:
+        kept = any((output / "located").glob("part-*"))
+        if kept and not (output / "run.json").exists():
+            print(
+                f"Finished frames are kept in {output}: the same command goes on from there.",
+                file=sys.stderr,
+            )
+        if isinstance(stop, OSError):
+            raise
+        raise typer.Exit(130) from None
+
+
+def _spheres(
+    shape: str | None, *, diameter: float | None, positions: Path | None
+) -> tuple[ArrayLike, ArrayLike]:
+    """Return centres and radius of a named body of touching spheres, or those of a file."""
+    import perrin
+    from perrin._arrays import require_positive
+    from perrin.tracks.files import read_spheres
+
+    if diameter is not None:
+        require_positive(diameter=diameter)
+    if positions is None and shape in _TOUCHING:
+        if diameter is None:
+            raise ValueError("--diameter: the sphere diameter (um) is needed")
+        return perrin.Cluster.touching(_TOUCHING.index(shape) + 2, diameter).positions, diameter / 2
+    if positions is None or shape is not None:
+        raise ValueError(
+            f"expected one of {', '.join(_TOUCHING)}, or --positions FILE, got {shape!r}"
+            + ("" if positions is None else f" and {positions}")
+        )
+    centers, radius = read_spheres(positions)
+    if radius is not None and diameter is None:
+        return centers, radius
+    if radius is None and diameter is not None:
+        return centers, diameter / 2
+    there = "has none" if radius is None else "has one"
+    raise ValueError(
+        f"the size: expected --diameter or a column radius, one of them; {positions} {there}"
+    )
+
+
+def _numbers(option: str, text: str) -> float | list[float]:
+    """Read one number, or several separated by commas."""
+    try:
+        values = [float(part) for part in text.split(",")]
+    except ValueError:
+        raise ValueError(f"{option}: expected a number or x,y,z, got {text!r}") from None
+    return values[0] if len(values) == 1 else values
+
+
+def _noise(text: str) -> Literal["joint", "residual"] | float:
+    """Read joint, residual, or a number."""
+    if text in ("joint", "residual"):
+        return cast('Literal["joint", "residual"]', text)
+    try:
+        return float(text)
+    except ValueError:
+        raise ValueError(
+            f"--noise: expected joint, residual or sigma in um, got {text!r}"
+        ) from None
+
+
+def _whole_numbers(option: str, text: str | None) -> list[int]:
+    """Read whole numbers separated by commas."""
+    try:
+        return [int(part) for part in (text or "").split(",") if part.strip()]
+    except ValueError:
+        raise ValueError(f"{option}: expected numbers like 3,7, got {text!r}") from None
+
+
+def _refine(text: str) -> Literal["model", "trackpy"] | None:
+    """Read model, trackpy or none."""
+    if text not in ("model", "trackpy", "none"):
+        raise ValueError(f"--refine: expected model, trackpy or none, got {text!r}")
+    return None if text == "none" else cast('Literal["model", "trackpy"]', text)
+
+
+def _columns(text: str | None) -> dict[str, str | int] | None:
+    """Read name=column pairs; a column that is a whole number is a position."""
+    if text is None:
+        return None
+    pairs = [part.partition("=") for part in text.split(",")]
+    if not all(name and column for name, _, column in pairs):
+        raise ValueError(f"--columns: expected pairs like x=0,y=1,frame=-2, got {text!r}")
+
+    def place(column: str) -> str | int:
+        return int(column) if column.lstrip("-").isdecimal() else column
+
+    return {name.strip(): place(column.strip()) for name, _, column in pairs}
+
+
+def _body(shape: str, *, radius: float | None, diameter: float | None) -> Cluster:
+    """Return the named body of that radius, or of touching spheres of that diameter."""
+    from perrin import Cluster
+
+    faults = []
+    if shape not in _SHAPES:
+        faults.append(f"shape: expected {', '.join(_SHAPES)}, got {shape!r}")
+    if (radius is None) == (diameter is None):
+        faults.append("expected either --radius or --diameter (touching spheres)")
+    if faults:
+        raise ValueError("; ".join(faults))
+    if diameter is not None:
+        return Cluster.touching({"trimer": 3, "tetrahedron": 4, "pentahedron": 5}[shape], diameter)
+    body: Cluster = getattr(Cluster, shape)(radius)
+    return body
+
+
+def _slice(text: str | None) -> tuple[int | None, int | None] | None:
+    """Read A:B."""
+    if text is None:
+        return None
+    first, colon, stop = text.partition(":")
+    try:
+        ends = [int(end) if end.strip() else None for end in (first, stop)]
+    except ValueError:
+        ends = []
+    if not colon or not ends:
+        raise ValueError(f"--frames: expected A:B with whole numbers, got {text!r}")
+    return ends[0], ends[1]

@@ -1,0 +1,237 @@
+"""Tables that the command line prints."""
+
+from __future__ import annotations
+
+from math import isfinite
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from pathlib import Path
+
+    from rich.console import Console
+    from rich.table import Table
+
+    from perrin.diffusion.estimate import DiffusionEstimate
+    from perrin.diffusion.sampling import SamplingPlan
+    from perrin.hydrodynamics.mobility import Mobility
+    from perrin.run.predictions import Compared
+    from perrin.run.results import ClusterResult, Pooled, Report
+
+
+_SHOWN, _SHOWN_WARNINGS, _SHOWN_NOTES = 5, 20, 10
+
+
+_UNEQUAL = 0.05  # below this probability of equal axes the tensor is worth a look
+
+
+def _show_plan(plan: SamplingPlan) -> None:
+    """Print the plan as a short table, and its reasons."""
+    from rich.box import SIMPLE_HEAD
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    from perrin._text import percent
+
+    title = f"best: {plan.n_frames} frames every {plan.dt_best:.3g} s"
+    names = ("noise:", "estimated (default)", "from residuals")
+    table = Table(*names, title=title, title_justify="left", box=SIMPLE_HEAD)
+    table.columns[0].no_wrap = True
+    errors = percent(plan.expected_error), percent(plan.expected_error_residual)
+    table.add_row("expected error of D_R", *errors)
+    for share in (0.1, 0.03, 0.01):
+        counts = (str(plan.frames_for(share, noise=noise)) for noise in ("joint", "residual"))
+        table.add_row(f"frames needed for {100 * share:g} %", *counts)
+    table.add_section()
+    window = f"{plan.dt_min:.3g} to {plan.dt_max:.3g} s"
+    table.add_row("window of dt", "empty" if plan.dt_min > plan.dt_max else window)
+    table.add_row("the paper's rules", f"{plan.paper_dt_min:.3g} to {plan.paper_dt_max:.3g} s")
+    table.add_row("SNR at the best dt", f"{plan.snr:.3g}")
+    table.add_row("noise floor Phi^2", f"{plan.phi2:.3g} rad^2")
+    console = Console(highlight=False)
+    console.print(table)
+    for reason in plan.reasons:
+        console.print(f"- {escape(reason)}", soft_wrap=True)
+
+
+def _show(report: Report, output: Path, command: Callable[..., None]) -> None:
+    """Print the short tables, the warnings, the notes, and where the rest is."""
+    from rich.console import Console
+    from rich.markup import escape
+
+    from perrin.run.results import perp_text
+
+    console = Console(highlight=False)
+    for result in report.clusters[:_SHOWN]:
+        console.print(_cluster_table(result))
+        if result.tensor is not None and result.tensor.p_isotropic < _UNEQUAL:
+            axes = f"rotation about the body's axes: {result.tensor.summary}\n"
+            console.print(escape(axes), soft_wrap=True)
+    if len(report.clusters) > _SHOWN:
+        console.print(f"and {len(report.clusters) - _SHOWN} more clusters in report.html\n")
+    if report.pooled is not None and len(report.clusters) > 1:
+        console.print(_pooled_table(report.pooled))
+    for rod in report.rods[:_SHOWN]:
+        console.print(escape(perp_text(rod)))
+        if rod.prediction is not None:
+            console.print(escape(f"  {rod.prediction}"), soft_wrap=True)
+    _show_remarks(report, command, console)
+    pages = "report.html" if report.imaging is None else "report.html, quality.html"
+    console.print(f"Written to {escape(str(output))}: {pages}, figures, summary.json, tables.")
+
+
+def _show_remarks(report: Report, command: Callable[..., None], console: Console) -> None:
+    """Print the warnings, then the notes, with those of several clusters in one line."""
+    from rich.markup import escape
+
+    from perrin.cli.messages import in_options, options_of
+    from perrin.run.remarks import condensed, merged
+
+    options = options_of(command)
+    warnings = [
+        *condensed(report.warnings),
+        *merged({result.name: result.warnings for result in report.results}),
+    ]
+    notes = [
+        *condensed(report.notes),
+        *merged({result.name: result.notes for result in report.results}),
+    ]
+    for text in warnings[:_SHOWN_WARNINGS]:
+        shown = escape(in_options(text, options))
+        console.print(f"[bold yellow]! warning:[/] {shown}", soft_wrap=True)
+    if len(warnings) > _SHOWN_WARNINGS:
+        console.print(f"and {len(warnings) - _SHOWN_WARNINGS} more warnings in summary.json")
+    for text in notes[:_SHOWN_NOTES]:
+        console.print(f"[dim]note: {escape(in_options(text, options))}[/]", soft_wrap=True)
+    if len(notes) > _SHOWN_NOTES:
+        console.print(f"[dim]and {len(notes) - _SHOWN_NOTES} more notes in summary.json[/]")
+
+
+def _cluster_table(result: ClusterResult) -> Table:
+    """Return the short table of one cluster: coefficients, noise, sizes."""
+    from rich.box import SIMPLE_HEAD
+    from rich.markup import escape
+    from rich.table import Table
+
+    from perrin._text import with_error
+
+    # A name is the user's text: square brackets in it are no markup.
+    title = f"cluster {escape(result.name)}: {result.motion.fitted.size} frames"
+    table = Table("", "value", "68 %", "95 %", title=title, title_justify="left", box=SIMPLE_HEAD)
+    table.columns[0].no_wrap = True
+    for name, estimate in (("D_R", result.D_R), ("D_T", result.D_T)):
+        table.add_row(f"{name} ({estimate.unit})", *_estimate_cells(estimate))
+    table.add_row("sigma (nm)", f"{1e3 * result.motion.sigma:.3g}")
+    table.add_row("Phi^2 (rad^2)", f"{result.noise.phi2:.3g}", "predicted noise floor")
+    measured = with_error(result.phi2_measured, result.phi2_stderr)
+    table.add_row("", measured, "measured noise floor")
+    for row in (*_size_rows(result), *_prediction_rows(result)):
+        table.add_row(*row)
+    if result.sizes:
+        table.caption = "* diameter, for equal spheres at the measured places"
+        table.caption_justify = "left"
+    return table
+
+
+def _size_rows(result: ClusterResult) -> Iterator[tuple[str, ...]]:
+    """Yield a line for each size, and the viscosity that both coefficients imply."""
+    from perrin._text import with_error
+
+    sizes = result.sizes or {}
+    for mode, name in (("translation", "D_T"), ("rotation", "D_R"), ("both", "both")):
+        if mode in sizes:
+            size = sizes[mode]
+            yield f"sphere*, {name} (um)", with_error(size.sphere, size.sphere_stderr)
+            if size.viscosity is not None and size.viscosity_stderr is not None:
+                shown = with_error(1e3 * size.viscosity, 1e3 * size.viscosity_stderr)
+                yield "viscosity (mPa s)", shown, "from both"
+
+
+def _prediction_rows(result: ClusterResult) -> Iterator[tuple[str, ...]]:
+    """Yield a line for each predicted coefficient: value, and the measured one's pull."""
+    prediction = result.prediction
+    if prediction is None:
+        return
+    for name, compared, axes in (
+        ("D_R", prediction.D_R, prediction.principal_D_R),
+        ("D_T", prediction.D_T, prediction.principal_D_T),
+    ):
+        if compared is not None:
+            yield f"{name}, predicted", f"{compared.predicted:.4g}", _pull_text(compared)
+        for k, one in enumerate(axes, start=1):
+            measured = f"measured {one.measured:.3g}"
+            yield f"  axis {k}", f"{one.predicted:.4g}", _pull_text(one), measured
+
+
+def _pull_text(compared: Compared) -> str:
+    return f"pull {compared.pull:+.1f}" if isfinite(compared.pull) else "not resolved"
+
+
+def _show_prediction(body: Mobility, *, name: str) -> None:
+    """Print the short table of a prediction."""
+    from rich.box import SIMPLE_HEAD
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    from perrin.diffusion.tensors import axes_like
+
+    title = f"{escape(name)}, {len(body.radius)} spheres of {body.sphere_diameter:.4g} um"
+    table = Table(
+        "", "mean", "principal values", title=title, title_justify="left", box=SIMPLE_HEAD
+    )
+    table.columns[0].no_wrap = True
+    turn, path = body.principal_D_R, body.principal_D_T
+    same_axes = axes_like(path.axes, turn.axes)
+    for label, values in (
+        ("D_T (um^2/s)", path.values[same_axes]),
+        ("D_R (rad^2/s)", turn.values),
+    ):
+        shown = ", ".join(f"{value:.5g}" for value in values)
+        table.add_row(label, f"{values.mean():.5g}", shown)
+    for mode, diameter, factor in (
+        ("D_T", body.diameter_T, body.diameter_factor_T),
+        ("D_R", body.diameter_R, body.diameter_factor_R),
+    ):
+        table.add_row(f"cluster diameter, {mode} (um)", f"{diameter:.4f}")
+        table.add_row(f"over the sphere's, {mode}", f"{factor:.4f}")
+    place = ", ".join(f"{round(x, 4) + 0.0:.4f}" for x in body.center - body.centroid)
+    table.add_row("centre of diffusion* (um)", "", place)
+    table.caption = (
+        f"* from the centroid of the spheres. Relative error about {body.error:.1g} (degree "
+        f"{body.degree})"
+    )
+    Console(highlight=False).print(table)
+
+
+def _pooled_table(pooled: Pooled) -> Table:
+    """Return the table of the values pooled over clusters."""
+    from rich.box import SIMPLE_HEAD
+    from rich.table import Table
+
+    count = len(pooled.clusters)
+    title = f"{count} clusters pooled"
+    table = Table("", "value", "68 %", "95 %", title=title, title_justify="left", box=SIMPLE_HEAD)
+    table.columns[0].no_wrap = True
+    same = []
+    for name, estimate in (("D_R", pooled.D_R), ("D_T", pooled.D_T)):
+        table.add_row(f"{name} ({estimate.unit})", *_estimate_cells(estimate))
+        same += [] if estimate.p_same is None else [f"{name} {estimate.p_same:.2g}"]
+    if same:
+        table.caption = f"chance of such a scatter about one value: {', '.join(same)}"
+        table.caption_justify = "left"
+    return table
+
+
+def _estimate_cells(estimate: DiffusionEstimate) -> tuple[str, str, str]:
+    """Return value and intervals as text; an unresolved value is an upper limit."""
+    from perrin._text import with_error
+
+    if estimate.absent_because is not None:
+        return "none", estimate.absent_because, ""
+    value = with_error(estimate.value, estimate.stderr)
+    if not estimate.resolved:
+        value = f"< {estimate.ci95[1]:.2g} (95 %)"
+    (low68, high68), (low95, high95) = estimate.ci68, estimate.ci95
+    return value, f"{low68:.3g} to {high68:.3g}", f"{low95:.3g} to {high95:.3g}"

@@ -1,0 +1,251 @@
+"""DiffusionEstimate: one diffusion coefficient with its interval."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from perrin._text import _number, number_text, unit_text, with_error
+
+UNITS = {"rotation": "rad^2/s", "translation": "um^2/s"}
+
+
+_CHI2 = {0.68: 0.9889, 0.95: 3.8415}  # quantiles of chi-squared with one degree of freedom
+
+
+NORMAL = {0.68: 0.9945, 0.95: 1.9600}
+
+
+# Below ten times its resolution floor a D_R is not resolved.
+_RESOLVED = 10.0
+
+
+@dataclass(frozen=True)
+class Found:
+    """What an estimator found, before it is judged."""
+
+    value: float
+    ci68: tuple[float, float]
+    ci95: tuple[float, float]
+    offset: float
+    offset_stderr: float
+    drift: tuple[tuple[float, ...], ...] | None = None
+    drift_stderr: tuple[tuple[float, ...], ...] | None = None
+    p_same: float | None = None
+    stderr: float | None = None  # half the width of ci68 unless given
+
+
+@dataclass(frozen=True)
+class DiffusionEstimate:
+    """A diffusion coefficient with what it rests on.
+
+    Attributes
+    ----------
+    value : float
+        D_R in rad^2/s or D_T in um^2/s.
+    ci68, ci95 : tuple of float
+        Confidence intervals; an end that the data do not bound is 0 or inf.
+    stderr : float
+        Half the width of the 68 % interval.
+    offset : float
+        Variance of one orientation (rad^2) or centre coordinate (um^2) from noise, mean over axes;
+        negative where motion blur outweighs the noise.
+    offset_stderr : float
+        Its standard error; NaN where it lies on the edge of what is possible.
+    resolution_floor : float or None
+        The D_R that a motionless cluster would read; None for D_T.
+    resolved : bool
+        Whether the value stands clear of that floor and of 0; if not, read it as an upper limit.
+    unit, method : str
+    n_frames : int
+        Frames with a pose, of all motions.
+    snr : float
+        D dt/s, s the noise variance of one orientation or centre coordinate that the rigid-fit
+        residuals predict (or the stated sigma); inf without noise, NaN where it is not known.
+    dt : float
+        Time between the frames that exist, s: the median step, mean over motions.
+    noise : str
+        How the noise was known: "joint", "residual", or the sigma in um.
+    exposure : float or None
+        The open fraction of dt as stated; None for unknown.
+    drift, drift_stderr : tuple of tuple of float, or None
+        Where it was left free, the mean velocity of every motion along x, y, z, um/s; for D_R the
+        mean spin about the lab's x, y, z, rad/s (in the plane one number).
+    p_same : float or None
+        Pooled motions: how probable it is that equal coefficients scatter as much as these do
+        (likelihood ratio); None for one motion and for other methods than "mle".
+    warnings : tuple of str
+        What should be known before the number is used.
+    """
+
+    value: float
+    ci68: tuple[float, float]
+    ci95: tuple[float, float]
+    stderr: float
+    offset: float
+    offset_stderr: float
+    resolution_floor: float | None
+    resolved: bool
+    unit: str
+    method: str
+    n_frames: int
+    snr: float
+    dt: float = np.nan
+    noise: str = "joint"
+    exposure: float | None = None
+    drift: tuple[tuple[float, ...], ...] | None = None
+    drift_stderr: tuple[tuple[float, ...], ...] | None = None
+    p_same: float | None = None
+    warnings: tuple[str, ...] = ()
+
+    @classmethod
+    def judged(
+        cls,
+        found: Found,
+        *,
+        quantity: Literal["rotation", "translation"],
+        method: str,
+        n_frames: int,
+        dt: float,
+        noise_variance: float,
+        resolution_floor: float | None = None,
+        noise: str = "joint",
+        exposure: float | None = None,
+        warnings: tuple[str, ...] = (),
+    ) -> DiffusionEstimate:
+        """Make an estimate of what an estimator found; the one place where snr and resolved arise.
+
+        Parameters
+        ----------
+        found : Found
+        quantity, method, n_frames, dt, resolution_floor, noise, exposure, warnings
+            As in the attributes.
+        noise_variance : float
+            Of one orientation (rad^2) or centre coordinate (um^2); NaN where it is not known.
+        """
+        if np.isnan(noise_variance):
+            snr = np.nan
+        else:
+            snr = found.value * dt / noise_variance if noise_variance > 0 else np.inf
+        half_width = (found.ci68[1] - found.ci68[0]) / 2
+        floor = _RESOLVED * (resolution_floor or 0.0)
+        return cls(
+            value=found.value,
+            ci68=found.ci68,
+            ci95=found.ci95,
+            stderr=half_width if found.stderr is None else found.stderr,
+            offset=found.offset,
+            offset_stderr=found.offset_stderr,
+            resolution_floor=resolution_floor,
+            resolved=bool(found.ci95[0] > 0 and found.value > floor),
+            unit=UNITS[quantity],
+            method=method,
+            n_frames=n_frames,
+            snr=float(snr),
+            dt=dt,
+            noise=noise,
+            exposure=exposure,
+            drift=found.drift,
+            drift_stderr=found.drift_stderr,
+            p_same=found.p_same,
+            warnings=warnings,
+        )
+
+    @classmethod
+    def absent(
+        cls, *, quantity: Literal["rotation", "translation"], n_frames: int, reason: str
+    ) -> DiffusionEstimate:
+        """Return the estimate of a coefficient that the data cannot show, all numbers NaN."""
+        nothing = (np.nan, np.nan)
+        found = Found(np.nan, nothing, nothing, np.nan, np.nan)
+        return cls.judged(
+            found,
+            quantity=quantity,
+            method="none",
+            n_frames=n_frames,
+            dt=np.nan,
+            noise_variance=np.nan,
+            warnings=(reason,),
+        )
+
+    @property
+    def absent_because(self) -> str | None:
+        """Why the data cannot show the coefficient at all; None where there is a value."""
+        return self.warnings[0].partition(":")[0] if np.isnan(self.value) else None
+
+    def __str__(self) -> str:
+        name = "D_R" if self.unit == UNITS["rotation"] else "D_T"
+        if self.absent_because is not None:
+            return f"{name}: none ({self.absent_because})"
+        how = self.method if self.noise == "joint" else f"{self.method}, {self.noise} noise"
+        taken = "mean spin" if name == "D_R" else "drift"
+        how += f", {taken} removed" if self.drift else ""
+        tail = f"{self.unit} [{how}, {self.n_frames} frames]"
+        if not self.resolved and self.ci95[1] > 0:
+            return f"{name} < {self.ci95[1]:.2g} {tail}, 95 % limit"
+        return f"{name} = {with_error(self.value, self.stderr)} {tail}"
+
+    def __float__(self) -> float:
+        return self.value
+
+
+def value_text(estimate: DiffusionEstimate) -> str:
+    """Write an estimate with the error in its last digits, or as an upper limit, and its unit.
+
+    Parameters
+    ----------
+    estimate : DiffusionEstimate
+        rad^2/s or um^2/s.
+
+    Returns
+    -------
+    str
+    """
+    if estimate.absent_because is not None:
+        return "none"
+    limit = "" if estimate.resolved else " (95 %)"
+    return f"{bare_text(estimate)} {unit_text(estimate.unit)}{limit}"
+
+
+def bare_text(estimate: DiffusionEstimate) -> str:
+    """Write an estimate as `value_text` does, without its unit."""
+    if estimate.absent_because is not None:
+        return "none"
+    if estimate.resolved:
+        return number_text(estimate.value, estimate.stderr)
+    return f"< {number_text(estimate.ci95[1], digits=2)}".replace("inf", "∞")
+
+
+def _estimate_dict(estimate: DiffusionEstimate) -> dict[str, Any]:
+    """Return an estimate for JSON, ends of intervals without bound as None."""
+    entry = asdict(estimate)
+    for name in ("value", "stderr", "offset", "offset_stderr", "snr", "dt"):
+        entry[name] = _number(entry[name])
+    for name in ("ci68", "ci95"):
+        entry[name] = [_number(end) for end in entry[name]]
+    entry["warnings"] = list(estimate.warnings)
+    for name in ("drift", "drift_stderr"):
+        if entry[name] is not None:
+            entry[name] = [list(row) for row in entry[name]]
+    return entry
+
+
+def _estimate_from(entry: dict[str, Any]) -> DiffusionEstimate:
+    """Read back what `_estimate_dict` wrote."""
+    read = dict(entry)
+    for name in ("ci68", "ci95"):
+        low, high = read[name]
+        read[name] = (low, np.inf if high is None else high) if low is not None else (np.nan,) * 2
+    for name in ("value", "offset", "offset_stderr", "dt"):
+        read[name] = np.nan if entry[name] is None else entry[name]
+    # Without a value nothing is known; beside one, what JSON cannot hold is unbounded.
+    unbounded = np.nan if entry["value"] is None else np.inf
+    for name in ("stderr", "snr"):
+        read[name] = unbounded if entry[name] is None else entry[name]
+    read["warnings"] = tuple(entry["warnings"])
+    for name in ("drift", "drift_stderr"):
+        if entry[name] is not None:
+            read[name] = tuple(map(tuple, entry[name]))
+    return DiffusionEstimate(**read)

@@ -1,0 +1,516 @@
+"""Which steps Brownian motion cannot make: jumps, and a steady velocity or spin."""
+
+from __future__ import annotations
+
+import warnings as python_warnings
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+import numpy as np
+
+from perrin._arrays import frozen
+from perrin.diffusion.estimate import UNITS, DiffusionEstimate
+from perrin.diffusion.estimators import estimate_diffusion, track_of
+from perrin.diffusion.likelihood import Likelihood
+from perrin.diffusion.step_kernels import Track, covariance_bands
+from perrin.diffusion.steps import Quantity, steps_of
+from perrin.errors import PrecisionWarning, TooFewFramesError
+from perrin.geometry.rotations import exp_map
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from perrin._arrays import Bools, Floats, Ints
+    from perrin.motion.rigid_motion import RigidMotion
+
+
+# A jump is a step that has this probability, at most, in the whole of a Brownian track.
+JUMP_LEVEL = 1e-6
+
+
+# More jumps than this share of the steps (and more than one) are another kind of motion.
+MOST_JUMPS = 0.01
+
+
+# Candidates are steps beyond this level, judged by a scale that up to half of the steps leave
+# untouched; they are then tested against the diffusion of all other steps.
+_CANDIDATE = 1e-3
+
+
+_FEWEST = 8  # steps, below which no scale is known
+
+
+_ROUNDS = 10  # of finding candidates beside the diffusion of the steps that are none
+
+
+# Above this p-value, at the D that contains the steady motion, no fit without it is made: it would
+# change D, and with it p, by a few parts in N.
+_SCREEN = 0.05
+
+
+# A displaced frame is a matter of localisation up to so many times the variance that its own
+# residual explains; beyond it the body itself was elsewhere for one frame.
+_BADLY_MEASURED = 100.0
+
+
+# A variance so many times its own takes a step out of the prediction of the others.
+_LEFT_OUT = 1e6
+
+
+@dataclass(frozen=True, eq=False)
+class Jumps:
+    """Steps of one motion that Brownian motion cannot make.
+
+    Attributes
+    ----------
+    rows : ndarray of int, shape (K,)
+        Rows of the motion at which these steps end.
+    size : ndarray, shape (K, d) or (K, 3)
+        Displacement of the centre along lab axes, um, or rotation vector in body axes, rad
+        ((K, 1) in the plane).
+    p : ndarray, shape (K,)
+        Probability of a step at least as long anywhere in a Brownian track.
+    n_steps : int
+        Steps of the motion.
+    """
+
+    rows: Ints
+    size: Floats
+    p: Floats
+    n_steps: int
+
+    def __post_init__(self) -> None:
+        frozen(self.rows, self.size, self.p)
+
+    @property
+    def many(self) -> bool:
+        """Whether there are more than 1 % of such steps: then they are another kind of motion."""
+        return len(self.rows) > max(1, round(MOST_JUMPS * self.n_steps))
+
+    @property
+    def length(self) -> Floats:
+        """Length of each jump, um or rad, shape (K,)."""
+        return np.asarray(np.linalg.norm(self.size, axis=1))
+
+
+@dataclass(frozen=True)
+class SteadyMotion:
+    """A mean velocity or spin with the test of whether there is one.
+
+    Attributes
+    ----------
+    value, stderr : tuple of float
+        Along the lab axes, um/s or rad/s.
+    p : float
+        Probability of at least this much in a body that only diffuses (F test).
+    """
+
+    value: tuple[float, ...]
+    stderr: tuple[float, ...]
+    p: float
+
+
+def find_jumps(motion: RigidMotion, estimate: DiffusionEstimate) -> Jumps:
+    """Find the steps that Brownian motion cannot make.
+
+    Parameters
+    ----------
+    motion : RigidMotion
+    estimate : DiffusionEstimate
+        D of this motion by maximum likelihood, whose settings (quantity, noise, exposure, drift)
+        hold for the test.
+
+    Returns
+    -------
+    Jumps
+        Steps of family-wise p < 1e-6; a frame measured badly, which makes two opposite steps, is
+        no jump.
+
+    Notes
+    -----
+    The residual of each step given all others, z = (C^-1 y) / (C^-1)_jj over the root of its
+    variance 1/(C^-1)_jj, is chi-squared with d degrees of freedom in z M^-1 z, M the mean of
+    z z^T, which also takes up unequal axes. A first M comes from the half of the steps with the
+    smallest z, so that jumps do not hide each other; the final one from all steps that are no
+    candidates, with D and noise fitted to them, and the p-value is that of Hotelling's T^2.
+    Candidates are left out of the prediction of their neighbours. A displaced frame has the
+    residual of a step and its successor with opposite signs; where that one is larger, and the
+    residual of the rigid fit can explain it, the frame was measured badly.
+
+    Examples
+    --------
+    >>> from dataclasses import replace
+    >>> from perrin import Cluster, estimate_diffusion, simulate_motion
+    >>> from perrin.diffusion.step_tests import find_jumps
+    >>> truth = simulate_motion(
+    ...     Cluster.tetrahedron(1.5), D_R=5e-3, D_T=0.02, dt=0.7, n_frames=100, rng=3
+    ... )
+    >>> center = truth.center.copy()
+    >>> center[40:] += [3.0, 0.0, 0.0]
+    >>> moved = replace(truth, center=center)
+    >>> jumps = find_jumps(moved, estimate_diffusion(moved, quantity="translation"))
+    >>> jumps.rows.tolist(), jumps.many
+    ([40], False)
+    """
+    quantity = _quantity(estimate)
+    _, stop = motion.steps()
+    size = _sizes(motion, quantity, stop)
+    none = Jumps(stop[:0], size[:0], np.empty(0), len(stop))
+    if len(stop) < _FEWEST or not estimate.value > 0:
+        return none
+    likely = np.zeros(len(stop), dtype=np.bool_)
+    rest = estimate
+    for _ in range(_ROUNDS):
+        more = _candidates(_residuals(motion, rest, without=likely), likely)
+        if not more.any() or 2 * np.count_nonzero(likely | more) > len(stop):
+            break
+        likely |= more
+        try:
+            rest = _estimated(cut_at(motion, stop[likely]), estimate)
+        except TooFewFramesError:
+            return none
+    if not likely.any():
+        return none
+    p = _jump_probability(_residuals(motion, rest, without=likely), likely)
+    found = np.flatnonzero(likely)[p < JUMP_LEVEL]
+    return Jumps(stop[found], size[found], p[p < JUMP_LEVEL], len(stop))
+
+
+def cut_at(motion: RigidMotion, rows: Ints) -> RigidMotion:
+    """Return the motion with a new piece at each of the rows, so that no step ends there."""
+    begins = np.zeros(len(motion.time), dtype=np.int64)
+    begins[rows] = 1
+    return replace(motion, piece=motion.piece + np.cumsum(begins))
+
+
+def without_spin(motion: RigidMotion, spin: Sequence[float]) -> RigidMotion:
+    """Return the motion as seen from axes that turn with a steady spin about the lab's axes.
+
+    Parameters
+    ----------
+    motion : RigidMotion
+    spin : sequence of float
+        rad/s about x, y, z; in the plane one number.
+
+    Examples
+    --------
+    >>> from perrin import Cluster, estimate_diffusion, simulate_motion
+    >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=100, rng=3)
+    >>> turning = without_spin(truth, [0, 0, -0.2])
+    >>> round(estimate_diffusion(turning, drift=True).drift[0][2], 1)
+    0.2
+    """
+    rotation = exp_map(-np.outer(motion.time - motion.time[0], spin)) @ motion.rotation
+    return replace(motion, rotation=rotation)
+
+
+def steady_motion(motion: RigidMotion, estimate: DiffusionEstimate) -> SteadyMotion:
+    """Test for a mean velocity of the centre or a mean spin in the lab frame.
+
+    Parameters
+    ----------
+    motion : RigidMotion
+    estimate : DiffusionEstimate
+        D of this motion, with the mean motion left in; its settings hold for the test.
+
+    Returns
+    -------
+    SteadyMotion
+
+    Notes
+    -----
+    Generalised least squares of the steps on X_k = Q_k^T tau_k (Q_k the rotation to the lab; the
+    identity for the centre) with the covariance of diffusion and noise fitted beside it; the
+    information over d is F(d, nu) with nu = 2 / (relative variance of D).
+
+    Examples
+    --------
+    >>> from dataclasses import replace
+    >>> from perrin import Cluster, estimate_diffusion, simulate_motion
+    >>> from perrin.diffusion.step_tests import steady_motion
+    >>> truth = simulate_motion(
+    ...     Cluster.tetrahedron(1.5), D_R=5e-3, D_T=0.02, dt=0.7, n_frames=100, rng=3
+    ... )
+    >>> flow = replace(truth, center=truth.center + truth.time[:, None] * [1.0, 0.0, 0.0])
+    >>> found = steady_motion(flow, estimate_diffusion(flow, quantity="translation"))
+    >>> found.p < 1e-6, abs(found.value[0] - 1) < 4 * found.stderr[0]
+    (True, True)
+    """
+    found = _steady(motion, estimate)
+    if found.p > _SCREEN or not estimate.value > 0:
+        return found
+    return _steady(motion, _estimated(motion, estimate, drift=True))
+
+
+def offset_gain(motion: RigidMotion, estimate: DiffusionEstimate, *, sigma: float) -> float:
+    """Return twice the log-likelihood that the noise offset, left free, gains over a known noise.
+
+    Parameters
+    ----------
+    motion : RigidMotion
+    estimate : DiffusionEstimate
+        D of this motion with noise "joint"; its other settings hold.
+    sigma : float
+        Localisation error, um (rms over axes).
+
+    Returns
+    -------
+    float
+        Chi-squared with one degree of freedom if sigma is right: the offset's own standard error
+        is too small where motion blur makes it negative and few steps bound it.
+
+    Examples
+    --------
+    >>> from perrin import Cluster, add_noise, estimate_diffusion, simulate_motion, track_rotation
+    >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=1e-3, dt=0.7, n_frames=100, rng=3)
+    >>> motion = track_rotation(add_noise(truth.positions(), sigma=0.03, rng=4), dt=0.7)
+    >>> estimate = estimate_diffusion(motion)
+    >>> [round(offset_gain(motion, estimate, sigma=s)) for s in (0.03, 0.06)]
+    [0, 23]
+    """
+    steps = steps_of(motion, _quantity(estimate))
+    drift = estimate.drift is not None
+    known = track_of(steps, noise=sigma, exposure=estimate.exposure, drift=drift)
+    return _likelihood_ratio(_track(motion, estimate), known)
+
+
+def persistence_gain(
+    motion: RigidMotion, estimate: DiffusionEstimate, *, drift: bool = False
+) -> float:
+    """Return twice the log-likelihood that steps gain by being more alike than blur makes them.
+
+    Parameters
+    ----------
+    motion : RigidMotion
+    estimate : DiffusionEstimate
+        D of this motion with noise "joint"; its settings hold.
+    drift : bool
+        Whether to leave a steady motion free where the estimate did not.
+
+    Returns
+    -------
+    float
+        Chi-squared with one degree of freedom at most in Brownian motion: a shutter that is open
+        all the time lowers the noise offset to -D dt/3, smoothing the tracks below that. 0 where
+        the offset is above, or the noise not free.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from perrin import Cluster, add_noise, estimate_diffusion, simulate_motion, track_rotation
+    >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=200, rng=3)
+    >>> x = add_noise(truth.positions(), sigma=0.03, rng=4)
+    >>> smooth = np.stack([x[:-2], x[1:-1], x[2:]]).mean(axis=0)
+    >>> [
+    ...     persistence_gain(m, estimate_diffusion(m)) > 20
+    ...     for m in (track_rotation(x, dt=0.7), track_rotation(smooth, dt=0.7))
+    ... ]
+    [False, True]
+    """
+    limit = -estimate.value * motion.usual_interval / 3
+    if estimate.noise != "joint" or not estimate.value > 0 or estimate.offset >= limit:
+        return 0.0
+    steps = steps_of(motion, _quantity(estimate))
+    taken = drift or estimate.drift is not None
+    free, blurred = (
+        Track.free(steps, blur=float(steps.duration.min()) * share, drift=taken)
+        for share in (1 / 2, 1 / 3)
+    )
+    return _likelihood_ratio(free, blurred)
+
+
+def _likelihood_ratio(free: Track, restricted: Track) -> float:
+    """Return twice the log-likelihood that the best fit of one track gains over another's."""
+    values = [float(Likelihood.of([track]).best().value[0]) for track in (free, restricted)]
+    return max(2 * (values[0] - values[1]), 0.0)
+
+
+def _steady(motion: RigidMotion, estimate: DiffusionEstimate) -> SteadyMotion:
+    """Return the generalised least-squares steady motion at the D and noise of an estimate."""
+    from scipy.special import fdtrc
+
+    track = _track(motion, replace(estimate, drift=None), drift=True)
+    likelihood = Likelihood.of([track])
+    D = max(estimate.value, 1e-12 * float(likelihood.scale[0]))
+    mean, information = likelihood.steady_motion_at(D, _theta(track, estimate))
+    count, d = len(track.steps.duration), len(mean)
+    square = float(mean @ information @ mean) * (count - 1) / count
+    freedom = 2 * (estimate.value / estimate.stderr) ** 2 if estimate.stderr > 0 else np.inf
+    p = float(fdtrc(d, min(max(freedom, 1.0), 1e9), square / d))
+    error = np.sqrt(np.diagonal(np.linalg.inv(information)))
+    return SteadyMotion(tuple(mean.tolist()), tuple(error.tolist()), p)
+
+
+class _Residuals(NamedTuple):
+    """Standardised residuals of steps (S, A), and of displaced frames where two steps meet."""
+
+    step: Floats
+    length: Floats  # (S, A): the steps themselves, over their standard deviation
+    frame: Floats  # (S - 1, A)
+    linked: Bools  # (S - 1,), whether the two steps share that frame
+    measured_badly: Bools  # (S - 1,), whether localisation explains how far that frame lies off
+
+
+def _residuals(motion: RigidMotion, estimate: DiffusionEstimate, *, without: Bools) -> _Residuals:
+    """Return the residual of each step given all others but those `without`, standardised.
+
+    An estimate with drift was fitted without them as well.
+    """
+    from scipy.linalg.lapack import dpttrf, dpttrs
+
+    track = _track(motion, estimate)
+    s = track.steps
+    size = s.size
+    if estimate.drift is not None and without.any():
+        size = s.without_steady_motion(kept=~without)[0].size
+    diagonal, beside = covariance_bands(
+        estimate.value,
+        _theta(track, estimate),
+        s.duration[:, None],
+        s.linked[:, None],
+        blur=track.blur,
+        weight=track.weight,
+        known=track.known,
+    )
+    step, frame = np.empty_like(size), np.zeros((len(size) - 1, size.shape[1]))
+    for axis in range(size.shape[1]):
+        extra = _LEFT_OUT * diagonal[:, axis] * without
+        a, b = diagonal[:, axis] + extra, beside[:, axis]
+        d, lower, bad = dpttrf(a, b)
+        up, _, bad_up = dpttrf(a[::-1], b[::-1])
+        if bad or bad_up:
+            none = np.zeros_like(size)
+            return _Residuals(none, none, frame, s.linked[:-1], s.linked[:-1])
+        z, _ = dpttrs(d, lower, size[:, axis])
+        inverse = 1 / (d + up[::-1] - a)
+        corner = -lower * inverse[1:]
+        step[:, axis] = z / inverse / np.sqrt(1 / inverse - extra)
+        variance = inverse[:-1] + inverse[1:] - 2 * corner
+        frame[:, axis] = (z[:-1] - z[1:]) / np.sqrt(variance)
+    length = size / np.sqrt(diagonal)
+    return _Residuals(step, length, frame, s.linked[:-1], _measured_badly(motion, size, s.after))
+
+
+def _measured_badly(motion: RigidMotion, size: Floats, noise: Floats) -> Bools:
+    """Return where localisation, as the frame's own residual shows it, explains its displacement.
+
+    `noise` (S, A) is the variance of the frame in which each step ends, per um^2 of sigma^2.
+    """
+    _, stop = motion.steps()
+    displacement = 0.25 * np.sum((size[:-1] - size[1:]) ** 2, axis=1)
+    residual = motion.residual[stop[:-1]]
+    usual = float(np.nanmedian(motion.residual))
+    worse = np.maximum(residual / usual, 1.0) ** 2 if usual > 0 else np.ones_like(residual)
+    expected = motion.sigma**2 * noise[:-1].sum(axis=1) * worse
+    return np.asarray(displacement <= _BADLY_MEASURED * expected)
+
+
+def _candidates(residuals: _Residuals, known: Bools) -> Bools:
+    """Return more steps that stand out from the bulk and are not due to one displaced frame."""
+    from scipy.special import chdtri
+
+    count = len(known)
+    displaced = np.where(
+        residuals.linked & residuals.measured_badly,
+        _bulk_square(residuals.frame, residuals.step),
+        0.0,
+    )
+    around = np.maximum(np.append(displaced, 0.0), np.append(0.0, displaced))
+    # The first and the last frame of a piece belong to one step only: a jump there isolates one
+    # frame, and a badly measured frame explains it as well.
+    inside = np.append(False, residuals.linked) & np.append(residuals.linked, False)
+    limit = chdtri(residuals.step.shape[1], _CANDIDATE / count)
+    given_others = _bulk_square(residuals.step, residuals.step)
+    # Jumps back and forth resemble noise once the noise is fitted to them: the length alone.
+    alone = np.where(around == 0, _bulk_square(residuals.length, residuals.length), 0.0)
+    # A jump spoils the prediction of its neighbours: the largest of them is taken first.
+    largest = np.maximum(np.append(given_others[1:], 0.0), np.append(0.0, given_others[:-1]))
+    likely = (given_others > limit) & (given_others > around) & (given_others > largest)
+    return np.asarray((likely | (alone > limit)) & inside & ~known)
+
+
+def _bulk_square(z: Floats, bulk: Floats) -> Floats:
+    """Return z^T M^-1 z with M from the half of `bulk` that is shortest, scaled to chi-squared."""
+    from scipy.special import chdtri
+
+    power = np.sum(bulk**2 / np.maximum(np.median(bulk**2, axis=0), 1e-300), axis=1)
+    short = bulk[power <= np.median(power)]
+    root = _inverse_root(short.T @ short / len(short))
+    median = float(np.median(np.sum((bulk @ root) ** 2, axis=1)))
+    if not median > 0:
+        return np.zeros(len(z))
+    return np.asarray(np.sum((z @ root) ** 2, axis=1) * chdtri(z.shape[1], 0.5) / median)
+
+
+def _jump_probability(residuals: _Residuals, likely: Bools) -> Floats:
+    """Return the family-wise p-value of every candidate by Hotelling's T^2."""
+    from scipy.special import fdtrc
+
+    z, rest = residuals.step[likely], residuals.step[~likely]
+    count, d = rest.shape
+    # Of a body at rest the residuals are a slow wave, of which one track shows few periods: M may
+    # then be small by chance, but not smaller than 1, what it is where the fit is right.
+    square = np.sum((z @ _inverse_root(rest.T @ rest / count, least=1.0)) ** 2, axis=1)
+    freedom = count - d + 1
+    p = fdtrc(d, freedom, square * freedom / (d * count))
+    return np.asarray(np.minimum(len(residuals.step) * p, 1.0))
+
+
+def _inverse_root(a: Floats, *, least: float = 0.0) -> Floats:
+    """Return A^(-1/2) of a covariance with eigenvalues of `least` or more.
+
+    Axes without any motion are left out.
+    """
+    values, axes = np.linalg.eigh(a)
+    moves = values > 1e-12 * max(float(values[-1]), 1e-300)
+    return np.asarray(axes[:, moves] / np.sqrt(np.maximum(values[moves], least)))
+
+
+def _sizes(motion: RigidMotion, quantity: Quantity, stop: Ints) -> Floats:
+    """Return the steps in the units that users read: rotation vectors, or displacements."""
+    if quantity == "rotation":
+        return motion.step_vectors()[stop - 1]
+    start, end = motion.steps()
+    return np.asarray(motion.center[end] - motion.center[start])
+
+
+def _quantity(estimate: DiffusionEstimate) -> Quantity:
+    return "rotation" if estimate.unit == UNITS["rotation"] else "translation"
+
+
+def _noise(estimate: DiffusionEstimate) -> Literal["joint", "residual"] | float:
+    """Return the noise setting of an estimate as `estimate_diffusion` takes it."""
+    if estimate.noise in ("joint", "residual"):
+        return "joint" if estimate.noise == "joint" else "residual"
+    return float(estimate.noise.split()[0])
+
+
+def _settings(estimate: DiffusionEstimate) -> dict[str, Any]:
+    return {"noise": _noise(estimate), "exposure": estimate.exposure}
+
+
+def _track(motion: RigidMotion, estimate: DiffusionEstimate, *, drift: bool = False) -> Track:
+    """Return the steps of a motion with what the settings of an estimate say of their noise."""
+    steps = steps_of(motion, _quantity(estimate))
+    return track_of(steps, **_settings(estimate), drift=drift or estimate.drift is not None)
+
+
+def _theta(track: Track, estimate: DiffusionEstimate) -> float:
+    """Return the free part of the noise: the offset is theta + level - blur D."""
+    if np.isinf(track.freedom):
+        return 0.0
+    return max(estimate.offset - track.level + track.blur * estimate.value, 0.0)
+
+
+def _estimated(
+    motion: RigidMotion, like: DiffusionEstimate, *, drift: bool = False
+) -> DiffusionEstimate:
+    """Estimate a motion with the settings of another estimate."""
+    with python_warnings.catch_warnings():
+        python_warnings.simplefilter("ignore", PrecisionWarning)
+        return estimate_diffusion(
+            motion,
+            quantity=_quantity(like),
+            **_settings(like),
+            drift=drift or like.drift is not None,
+        )

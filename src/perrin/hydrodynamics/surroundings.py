@@ -1,0 +1,256 @@
+"""What a sample cell does to a body: the slowing by a wall, gravity, water's viscosity."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from perrin.hydrodynamics.mobility import BOLTZMANN, Mobility, condition_faults
+
+if TYPE_CHECKING:
+    from perrin._arrays import Floats
+
+
+_GRAVITY = 9.80665  # m/s^2, standard
+
+
+# Below this height, in hydrodynamic radii, the series of a sphere is off by more than 2 % for the
+# translation of a cluster along the normal.
+_LOWEST = 2.5
+
+
+# Liquid water at 0.1 MPa in uPa s: sum of a (T/300 K)^b, 253.15 K to 383.15 K
+# (IAPWS SR6-08, Revised Supplementary Release on Properties of Liquid Water at 0.1 MPa).
+_WATER = ((280.68, -1.9), (511.45, -7.7), (61.131, -19.6), (0.45903, -40.0))
+
+
+_WATER_RANGE = (253.15, 383.15)
+
+
+@dataclass(frozen=True)
+class WallFactor:
+    """D near one flat wall over D far from it.
+
+    Attributes
+    ----------
+    T_parallel, T_perpendicular : float
+        Translation along the wall and along its normal.
+    R_parallel, R_perpendicular : float
+        Rotation about an axis along the wall and about the normal.
+    height : float
+        Of the body's centre above the wall, um.
+    """
+
+    T_parallel: float
+    T_perpendicular: float
+    R_parallel: float
+    R_perpendicular: float
+    height: float
+
+
+def wall_factor(body: Mobility | float, *, height: float) -> WallFactor:
+    """Return how much a flat no-slip wall slows a body down.
+
+    Parameters
+    ----------
+    body : Mobility or float
+        A cluster, averaged over its orientations, or the diameter of a sphere, um.
+    height : float
+        Of its centre above the wall, um; at least 2.5 hydrodynamic radii.
+
+    Returns
+    -------
+    WallFactor
+
+    Raises
+    ------
+    ValueError
+        If a number is not positive, or the body is so near the wall that the series fails.
+
+    Notes
+    -----
+    The series of a sphere in x = radius/height: 1 - 9x/16 + x^3/8 - 45x^4/256 - x^5/16 along the
+    wall (Faxen), 1 - 9x/8 + x^3/2 - x^5/8 along the normal, 1 - 5x^3/16 and 1 - x^3/8 for rotation
+    about an axis along the wall and about the normal; with the cluster's hydrodynamic radius of
+    each mode it holds within 1 % for compact clusters three hydrodynamic radii away. A second wall
+    adds, roughly, its own deficit.
+
+    Examples
+    --------
+    >>> near = wall_factor(2.45, height=5.0)
+    >>> round(near.T_parallel, 3), round(near.T_perpendicular, 3)
+    (0.863, 0.732)
+    """
+    by_T, by_R = (
+        (body.diameter_T / 2, body.diameter_R / 2)
+        if isinstance(body, Mobility)
+        else (body / 2, body / 2)
+    )
+    faults = condition_faults(diameter=2 * by_T, height=height)
+    if not faults and height < _LOWEST * max(by_T, by_R):
+        faults.append(
+            f"height: the series needs at least {_LOWEST:g} hydrodynamic radii, "
+            f"{_LOWEST * max(by_T, by_R):.3g} um, got {height:g} um; nearer to the wall trust D_R"
+        )
+    if faults:
+        raise ValueError("; ".join(faults))
+    x, y = by_T / height, by_R / height
+    return WallFactor(
+        T_parallel=1 - 9 * x / 16 + x**3 / 8 - 45 * x**4 / 256 - x**5 / 16,
+        T_perpendicular=1 - 9 * x / 8 + x**3 / 2 - x**5 / 8,
+        R_parallel=1 - 5 * y**3 / 16,
+        R_perpendicular=1 - y**3 / 8,
+        height=float(height),
+    )
+
+
+def wall_diffusion(
+    body: Mobility, *, height: float, normal: Literal["x", "y", "z"] = "z"
+) -> tuple[Floats, Floats]:
+    """Return D_T and D_R along and about each lab axis near a wall, over all orientations.
+
+    A D along the normal below the two others is the signature of a wall; it needs no model.
+
+    Parameters
+    ----------
+    body : Mobility
+    height : float
+        Of its centre above the wall, um.
+    normal : {"x", "y", "z"}
+        Lab axis across the wall.
+
+    Returns
+    -------
+    D_T, D_R : ndarray, shape (3,)
+        um^2/s and rad^2/s along and about x, y, z.
+
+    Raises
+    ------
+    ValueError
+        As in `wall_factor`, or for another axis.
+
+    Examples
+    --------
+    >>> from perrin import Cluster, cluster_mobility
+    >>> body = cluster_mobility(
+    ...     Cluster.touching(4, 2.45), radius=1.225, viscosity=2.18e-3, temperature=295
+    ... )
+    >>> D_T, D_R = wall_diffusion(body, height=7.5)
+    >>> D_T.round(3)
+    array([0.038, 0.038, 0.031])
+    """
+    if normal not in ("x", "y", "z"):
+        raise ValueError(f'normal: expected "x", "y" or "z", got {normal!r}')
+    near = wall_factor(body, height=height)
+    across = np.array([axis == normal for axis in "xyz"])
+    D_T = np.where(across, near.T_perpendicular, near.T_parallel) * np.trace(body.D_T) / 3
+    D_R = np.where(across, near.R_perpendicular, near.R_parallel) * np.trace(body.D_R) / 3
+    return D_T, D_R
+
+
+def gravitational_height(body: Mobility, *, density_difference: float) -> float:
+    """Return the height over which gravity thins clusters out by a factor e, kT/(F - buoyancy).
+
+    Parameters
+    ----------
+    body : Mobility
+        Gives volume and temperature.
+    density_difference : float
+        Particle less solvent, kg/m^3. Of either sign: what floats gathers at the top.
+
+    Returns
+    -------
+    float
+        um; inf for matched densities.
+
+    Raises
+    ------
+    ValueError
+        If the difference is not finite.
+
+    Examples
+    --------
+    >>> from perrin import Cluster, cluster_mobility
+    >>> body = cluster_mobility(
+    ...     Cluster.touching(4, 2.45), radius=1.225, viscosity=2.18e-3, temperature=295
+    ... )
+    >>> round(gravitational_height(body, density_difference=10.0), 2)
+    1.35
+    """
+    force = abs(_weight(body, density_difference))
+    return BOLTZMANN * body.temperature / force * 1e6 if force else float("inf")
+
+
+def settling_velocity(body: Mobility, *, density_difference: float) -> float:
+    """Return the speed at which gravity drags a cluster down, over all orientations.
+
+    Parameters
+    ----------
+    body : Mobility
+    density_difference : float
+        Particle less solvent, kg/m^3.
+
+    Returns
+    -------
+    float
+        um/s, negative for what rises: D_T (F - buoyancy)/kT.
+
+    Raises
+    ------
+    ValueError
+        If the difference is not finite.
+
+    Examples
+    --------
+    >>> from perrin import Cluster, cluster_mobility
+    >>> body = cluster_mobility(
+    ...     Cluster.touching(4, 2.45), radius=1.225, viscosity=2.18e-3, temperature=295
+    ... )
+    >>> round(settling_velocity(body, density_difference=10.0), 3)
+    0.034
+    """
+    weight = _weight(body, density_difference)
+    return float(np.trace(body.D_T)) / 3 * weight / (BOLTZMANN * body.temperature) * 1e-6
+
+
+def water_viscosity(temperature: float) -> float:
+    """Return the viscosity of water at 0.1 MPa (IAPWS SR6-08).
+
+    Parameters
+    ----------
+    temperature : float
+        K, from 253.15 to 383.15.
+
+    Returns
+    -------
+    float
+        Pa s.
+
+    Raises
+    ------
+    ValueError
+        If the temperature is outside that range.
+
+    Examples
+    --------
+    >>> round(1e3 * water_viscosity(293.15), 4), round(1e3 * water_viscosity(298.15), 4)
+    (1.0016, 0.89)
+    """
+    faults = condition_faults(temperature=temperature)
+    low, high = _WATER_RANGE
+    if not faults and not low <= temperature <= high:
+        faults.append(f"temperature: expected {low} to {high} K, liquid water, got {temperature!r}")
+    if faults:
+        raise ValueError("; ".join(faults))
+    return float(sum(a * (temperature / 300) ** b for a, b in _WATER)) * 1e-6
+
+
+def _weight(body: Mobility, density_difference: float) -> float:
+    """Return the weight of a body less its buoyancy, N."""
+    if not (np.ndim(density_difference) == 0 and np.isfinite(density_difference)):
+        raise ValueError(
+            f"density_difference: expected a finite number (kg/m^3), got {density_difference!r}"
+        )
+    return density_difference * _GRAVITY * body.volume * 1e-18

@@ -1,0 +1,77 @@
+"""The image of a sphere: optics, noise, fits to images, and rendered movies."""
+
+from perrin.images.optics.ball_image import SphereImage, SphereSpot, sphere_image
+from perrin.images.optics.crowd_equations import (
+    Light,
+    Scene,
+    brightness_numbers,
+    cut_scene,
+    first_light,
+    in_sight,
+    left_over,
+    normal_equations,
+    own_misfit,
+    project,
+    shine,
+    standard_errors,
+    told_apart,
+    told_by,
+    total,
+)
+from perrin.images.optics.crowd_fit import CrowdFit, fit_crowd, piece_of
+from perrin.images.optics.learn import CrowdSample, Sample, Told, fit_samples, saturated_share
+from perrin.images.optics.optics import CameraNoise, Optics
+from perrin.images.optics.render import ball_image, render_stack
+from perrin.images.optics.window_fit import (
+    Arrangement,
+    FreeCenters,
+    ImageFit,
+    RigidCenters,
+    Window,
+    box_around,
+    cut_window,
+    fit_window,
+    within,
+)
+
+__all__ = [
+    "Arrangement",
+    "CameraNoise",
+    "CrowdFit",
+    "CrowdSample",
+    "FreeCenters",
+    "ImageFit",
+    "Light",
+    "Optics",
+    "RigidCenters",
+    "Sample",
+    "Scene",
+    "SphereImage",
+    "SphereSpot",
+    "Told",
+    "Window",
+    "ball_image",
+    "box_around",
+    "brightness_numbers",
+    "cut_scene",
+    "cut_window",
+    "first_light",
+    "fit_crowd",
+    "fit_samples",
+    "fit_window",
+    "in_sight",
+    "left_over",
+    "normal_equations",
+    "own_misfit",
+    "piece_of",
+    "project",
+    "render_stack",
+    "saturated_share",
+    "shine",
+    "sphere_image",
+    "standard_errors",
+    "told_apart",
+    "told_by",
+    "total",
+    "within",
+]

@@ -1,0 +1,145 @@
+"""How well an orientation can be known: the noise of a rigid fit, the floor under an MSAD."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from perrin._arrays import Floats, as_sigma, frozen
+from perrin.errors import DegenerateClusterError
+from perrin.geometry.rigid import _inertia, orientation_covariance
+from perrin.geometry.shapes import Cluster
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseFloor:
+    """The mean square angle that a motionless cluster seems to turn, from localisation error alone.
+
+    Attributes
+    ----------
+    phi2 : float
+        Phi^2, rad^2: the noise floor of the MSAD, averaged over all directions (Hunter 2011,
+        Eqs. 21-23; exact for any shape).
+    covariance : ndarray, shape (3, 3) or (1, 1)
+        Covariance of one fitted orientation as a rotation vector in body axes, rad^2.
+    """
+
+    phi2: float
+    covariance: Floats
+
+    def along(self, direction: ArrayLike) -> float:
+        """Return Phi^2 (rad^2) of the MSAD of one body-fixed direction, 2 (tr C - p.C.p).
+
+        Parameters
+        ----------
+        direction : array_like, shape (d,)
+            Any length but zero, in body axes. In the plane every direction has the same floor.
+        """
+        if self.covariance.shape == (1, 1):
+            return self.phi2
+        p = np.asarray(direction, dtype=np.float64)
+        if p.shape != (3,) or not 0 < np.linalg.norm(p) < np.inf:
+            raise ValueError(f"direction: expected 3 numbers, not all zero, got {direction!r}")
+        p = p / np.linalg.norm(p)
+        return float(2 * (np.trace(self.covariance) - p @ self.covariance @ p))
+
+
+def noise_floor(cluster: Cluster | ArrayLike, *, sigma: ArrayLike) -> NoiseFloor:
+    """Predict the noise floor Phi^2 of the MSAD from a cluster's shape and localisation error.
+
+    Parameters
+    ----------
+    cluster : Cluster or array_like, shape (n, d)
+        The body; positions in um.
+    sigma : float or array_like, shape (d,)
+        Localisation error (standard deviation) of one coordinate, um; one number or one per
+        axis of the body frame.
+
+    Returns
+    -------
+    NoiseFloor
+
+    Raises
+    ------
+    DegenerateClusterError
+        If the particles are collinear or fewer than 3 (2 in the plane).
+
+    Notes
+    -----
+    First order in sigma/R, any shape: cov = M^-1 (sum [r]x S [r]x^T) M^-1 with
+    M = sum (r^2 - r r^T). For a tetrahedron this is 6 sigma^2/(n R^2) (Hunter 2011, Eq. 23); for
+    bodies that are not spherical tops that formula is only approximate.
+
+    Examples
+    --------
+    >>> floor = noise_floor(Cluster.tetrahedron(1.5), sigma=0.03)
+    >>> round(floor.phi2 / (6 * 0.03**2 / (4 * 1.5**2)), 12)
+    1.0
+    >>> round(noise_floor(Cluster.trimer(1.0), sigma=0.01).phi2 / 0.01**2, 9)  # 20/9
+    2.222222222
+    """
+    body = cluster if isinstance(cluster, Cluster) else Cluster.from_positions(cluster)
+    d = body.positions.shape[1]
+    noise = np.diag(as_sigma(sigma, d) ** 2)
+    _require_planes(body.positions)
+    covariance = orientation_covariance(body.positions, noise)
+    frozen(covariance)
+    return NoiseFloor(float(floor_of(covariance)), covariance)
+
+
+def floor_of(covariance: Floats) -> Floats:
+    """Return Phi^2 averaged over directions, (4/3) tr C, or 2 C in the plane; shape (...)."""
+    factor = 2.0 if covariance.shape[-1] == 1 else 4.0 / 3.0
+    floor: Floats = factor * np.trace(covariance, axis1=-2, axis2=-1)
+    return floor
+
+
+def floor_range(template: Floats, rotation: Floats, *, ratio: float) -> tuple[float, float]:
+    """Return by how much an unknown sigma_z/sigma_xy changes the floor that residuals predict.
+
+    Parameters
+    ----------
+    template : ndarray, shape (n, 3)
+        Centred.
+    rotation : ndarray, shape (T, 3, 3)
+        Lab from body, without NaN.
+    ratio : float
+        sigma_z over sigma_xy lies between 1/ratio and ratio.
+
+    Returns
+    -------
+    tuple of float
+        Least and greatest Phi^2 over the one of equal errors, for the same mean square residual.
+
+    Notes
+    -----
+    Orientation covariance C and expected square residual, (n - 1) tr S - tr M C, are both linear in
+    the noise S in body axes, so their ratio is monotonic in (sigma_z/sigma_xy)^2.
+    """
+    along_z = np.einsum("ti,tj->ij", rotation[:, 2], rotation[:, 2]) / len(rotation)
+    inertia = _inertia(template)
+
+    def floor_per_residual(square: float) -> float:
+        noise = np.eye(3) + (square - 1) * along_z
+        covariance = orientation_covariance(template, noise)
+        left = (len(template) - 1) * np.trace(noise) - np.trace(inertia @ covariance)
+        return float(np.trace(covariance) / left)
+
+    equal = floor_per_residual(1.0)
+    ends = [floor_per_residual(square) / equal for square in (ratio**-2, ratio**2)]
+    return min(1.0, *ends), max(1.0, *ends)
+
+
+def _require_planes(positions: Floats) -> None:
+    """Refuse bodies whose orientation is not determined: too few particles, or all on a line."""
+    n, d = positions.shape
+    spread = np.linalg.svd(positions, compute_uv=False)
+    needed = 1 if d == 2 else 2
+    if n <= needed or spread[needed - 1] <= 1e-9 * spread[0] or spread[0] == 0:
+        raise DegenerateClusterError(
+            f"the cluster's {n} particles do not fix an orientation: {d} dimensions need at "
+            f"least {d} particles" + (", not on one line" if d == 3 else " apart"),
+            (n,),
+        )

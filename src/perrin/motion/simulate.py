@@ -1,0 +1,268 @@
+"""Brownian clusters with a known truth: motions whose D is planted, and localisation noise."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from perrin._arrays import Floats, as_positions, as_sigma, require_positive
+from perrin.geometry.rotations import cumulative_product, exp_map, successive_product
+from perrin.hydrodynamics.mobility import Mobility
+from perrin.motion.rigid_motion import RigidMotion
+
+if TYPE_CHECKING:
+    from perrin.geometry.shapes import Cluster
+
+
+# The largest D dt of one substep of an anisotropic rotor: Gaussian rotation vectors are exact to
+# first order in D dt, and the error of E[R] left over at this step is about 1e-6.
+_SUBSTEP = 0.002
+
+
+def simulate_motion(
+    cluster: Cluster | Mobility,
+    *,
+    D_R: ArrayLike | None = None,
+    D_T: float = 0.0,
+    dt: float,
+    n_frames: int,
+    scheme: Literal["brownian", "euler"] = "brownian",
+    rng: np.random.Generator | int,
+) -> RigidMotion:
+    """Simulate free Brownian rotation and translation of a rigid cluster.
+
+    Parameters
+    ----------
+    cluster : Cluster or Mobility
+        The body. A `Mobility` moves by its own 6x6 tensor, anisotropic and coupled, about its
+        centre of diffusion.
+    D_R : float or array_like, shape (3,) or (3, 3)
+        Rotational diffusion coefficient, rad^2/s; three values or a tensor are in body axes. Needed
+        with a `Cluster`; like D_T not to be given with a `Mobility`.
+    D_T : float
+        Translational diffusion coefficient, um^2/s.
+    dt : float
+        Time between frames, s.
+    n_frames : int
+        Number of frames; frame 0, at the origin and unturned, counts.
+    scheme : {"brownian", "euler"}
+        "brownian" has the exact step law at any D_R dt for one D_R (angles from the heat kernel on
+        SO(3)), and substeps with D dt <= 0.002 for a tensor. "euler" is the paper's: R_x R_y R_z
+        with three Gaussian angles (Hunter 2011, Eq. 16), for one D_R only.
+    rng : numpy.random.Generator or int
+        Source of random numbers, or a seed.
+
+    Returns
+    -------
+    RigidMotion
+        The truth, with sigma = 0; ``.positions()`` gives the particles.
+
+    Raises
+    ------
+    ValueError
+        For bad values, a tensor that is not positive semidefinite, a tensor with "euler", or
+        coefficients beside a `Mobility`.
+
+    Examples
+    --------
+    >>> from perrin import Cluster
+    >>> truth = simulate_motion(
+    ...     Cluster.tetrahedron(1.5), D_R=5e-3, D_T=0.04, dt=0.7, n_frames=100, rng=1
+    ... )
+    >>> truth.positions().shape
+    (100, 4, 3)
+    """
+    require_positive(dt=dt, n_frames=n_frames)
+    if n_frames != int(n_frames):
+        raise ValueError(f"n_frames: expected a whole number, got {n_frames!r}")
+    if scheme not in ("brownian", "euler"):
+        raise ValueError(f'scheme: expected "brownian" or "euler", got {scheme!r}')
+    generator, n = np.random.default_rng(rng), int(n_frames)
+    if isinstance(cluster, Mobility):
+        if D_R is not None or D_T != 0 or scheme != "brownian":
+            raise ValueError(
+                'a Mobility has its own D_R, D_T and scheme ("brownian"); leave them out'
+            )
+        template = cluster.centers - cluster.centroid
+        center, rotation = _coupled(cluster, n - 1, dt=dt, generator=generator)
+    else:
+        template = cluster.positions.copy()
+        center, rotation = _uncoupled(
+            template.shape[1], n - 1, D_R=D_R, D_T=D_T, dt=dt, scheme=scheme, generator=generator
+        )
+    return _truth(center, rotation, template, dt=float(dt))
+
+
+def _truth(center: Floats, rotation: Floats, template: Floats, *, dt: float) -> RigidMotion:
+    """Return a motion without noise or gaps."""
+    n, angles = len(center), 3 if template.shape[1] == 3 else 1
+    return RigidMotion(
+        time=np.arange(n, dtype=np.float64) * dt,
+        center=center,
+        rotation=rotation,
+        residual=np.zeros(n),
+        n_present=np.full(n, len(template)),
+        covariance=np.zeros((n, angles, angles)),
+        center_variance=np.zeros(n),
+        piece=np.zeros(n, dtype=np.int64),
+        reason=("",) * n,
+        template=template,
+        sigma=0.0,
+        noise=np.zeros(template.shape[1]),
+        dt=dt,
+    )
+
+
+def add_noise(positions: ArrayLike, *, sigma: ArrayLike, rng: np.random.Generator | int) -> Floats:
+    """Add Gaussian localisation errors to particle positions.
+
+    Parameters
+    ----------
+    positions : array_like, shape (T, n, d)
+        um.
+    sigma : float or array_like, shape (d,)
+        Standard deviation of one coordinate, um; one number or one per axis.
+    rng : numpy.random.Generator or int
+        Source of random numbers, or a seed.
+
+    Returns
+    -------
+    ndarray, shape (T, n, d)
+
+    Examples
+    --------
+    >>> noisy = add_noise([[[0.0, 0.0, 0.0]]] * 10000, sigma=(0.03, 0.03, 0.04), rng=1)
+    >>> noisy.std(axis=0).round(2)
+    array([[0.03, 0.03, 0.04]])
+    """
+    x = as_positions(positions)
+    s = as_sigma(sigma, x.shape[2])
+    return x + np.random.default_rng(rng).normal(size=x.shape) * s
+
+
+def _uncoupled(
+    d: int,
+    count: int,
+    *,
+    D_R: ArrayLike | None,
+    D_T: float,
+    dt: float,
+    scheme: str,
+    generator: np.random.Generator,
+) -> tuple[Floats, Floats]:
+    """Return centres and orientations that diffuse independently, count + 1 of them."""
+    if D_R is None:
+        raise ValueError("D_R: needed with a Cluster (rad^2/s); only a Mobility has its own")
+    if not (np.ndim(D_T) == 0 and np.isfinite(D_T) and D_T >= 0):
+        raise ValueError(f"D_T: expected a finite number >= 0 (um^2/s), got {D_T!r}")
+    rotation = _rotations(_tensor(D_R, d) * dt, count, scheme=scheme, generator=generator)
+    jumps = generator.normal(scale=np.sqrt(2 * D_T * dt), size=(count, d))
+    return np.concatenate([np.zeros((1, d)), np.cumsum(jumps, axis=0)]), rotation
+
+
+def _coupled(
+    body: Mobility, count: int, *, dt: float, generator: np.random.Generator
+) -> tuple[Floats, Floats]:
+    """Return centroids and orientations that diffuse by a 6x6 tensor, count + 1 of them.
+
+    A substep is a screw in body axes with Gaussian displacement and turn about the centre of
+    diffusion, where the coupling is symmetric and no drift arises; half of its turn comes before
+    its displacement.
+    """
+    substeps = int(np.ceil(np.linalg.eigvalsh(body.D_R)[-1] * dt / _SUBSTEP))
+    root = np.linalg.cholesky(2 * body.D * dt / substeps)
+    turn, shift = np.broadcast_to(np.eye(3), (count, 3, 3)), np.zeros((count, 3, 1))
+    for _ in range(substeps):
+        screw = generator.normal(size=(count, 6)) @ root.T
+        halfway = turn @ exp_map(0.5 * screw[:, 3:])
+        shift = shift + halfway @ screw[:, :3, None]
+        turn = turn @ exp_map(screw[:, 3:])
+    rotation = cumulative_product(turn)
+    path = np.concatenate([np.zeros((1, 3)), np.cumsum((rotation[:-1] @ shift)[..., 0], axis=0)])
+    arm = body.centroid - body.center
+    return path + rotation @ arm - arm, rotation
+
+
+def _tensor(D_R: ArrayLike, d: int) -> Floats:
+    """Return D_R as a matrix, (3, 3) in space and (1, 1) in the plane."""
+    value = np.asarray(D_R, dtype=np.float64)
+    angles = 3 if d == 3 else 1
+    if value.ndim == 0:
+        value = np.diag(np.full(angles, value))
+    elif value.shape == (angles,):
+        value = np.diag(value)
+    if value.shape != (angles, angles) or not np.isfinite(value).all():
+        raise ValueError(
+            f"D_R: expected a finite number, {angles} values or a ({angles}, {angles}) tensor in "
+            f"body axes (rad^2/s), got {D_R!r}"
+        )
+    lowest = float(np.linalg.eigvalsh(value)[0])
+    if not np.allclose(value, value.T) or lowest < -1e-12 * float(np.abs(value).max()):
+        raise ValueError(f"D_R: expected a symmetric tensor without negative values, got {D_R!r}")
+    return value
+
+
+def _rotations(D: Floats, count: int, *, scheme: str, generator: np.random.Generator) -> Floats:
+    """Return count + 1 orientations, the first one the identity; D is per frame."""
+    isotropic = np.allclose(D, D[0, 0] * np.eye(len(D)), rtol=0.0, atol=1e-12 * np.trace(D))
+    if scheme == "euler":
+        if len(D) != 3 or not isotropic:
+            raise ValueError('scheme="euler" (Eq. 16) knows one D_R in three dimensions only')
+        left = _euler_steps(float(D[0, 0]), count, generator=generator)
+        return successive_product(left)
+    if len(D) == 1 or float(np.trace(D)) == 0:
+        normal = generator.normal(size=(count, len(D)))
+        return cumulative_product(exp_map(normal * np.sqrt(2 * D[0, 0])))
+    if isotropic:
+        return cumulative_product(_heat_kernel_steps(float(D[0, 0]), count, generator=generator))
+    return _substepped(D, count, generator=generator)
+
+
+def _euler_steps(D: float, count: int, *, generator: np.random.Generator) -> Floats:
+    """Return R_x(alpha) R_y(beta) R_z(gamma) with Gaussian angles of variance 2 D (Eq. 16)."""
+    angles = generator.normal(scale=np.sqrt(2 * D), size=(count, 3))
+    x, y, z = (exp_map(angles[:, i, None] * np.eye(3)[i]) for i in range(3))
+    return np.asarray(x @ y @ z)
+
+
+def _substepped(D: Floats, count: int, *, generator: np.random.Generator) -> Floats:
+    """Compose Gaussian body-frame rotation vectors, each short enough to be exact."""
+    substeps = int(np.ceil(np.linalg.eigvalsh(D)[-1] / _SUBSTEP))
+    values, axes = np.linalg.eigh(2 * D / substeps)
+    root = axes * np.sqrt(np.maximum(values, 0.0))
+    step = np.broadcast_to(np.eye(3), (count, 3, 3))
+    for _ in range(substeps):
+        step = step @ exp_map(generator.normal(size=(count, 3)) @ root.T)
+    return cumulative_product(step)
+
+
+def _heat_kernel_steps(D: float, count: int, *, generator: np.random.Generator) -> Floats:
+    """Return rotations by angles from the heat kernel on SO(3) about uniform axes; D is D_R dt."""
+    angle, cdf = _angle_law(D)
+    drawn = np.interp(generator.random(count), cdf, angle)
+    axis = generator.normal(size=(count, 3))
+    axis /= np.linalg.norm(axis, axis=1, keepdims=True)
+    return exp_map(axis * drawn[:, None])
+
+
+def _angle_law(D: float) -> tuple[Floats, Floats]:
+    """Return angles and their cumulative probability under the heat kernel at D = D_R t.
+
+    The density is proportional to sin(a/2) sum_n (-1)^n (a + 2 pi n) exp(-(a + 2 pi n)^2 / 4D), the
+    character series sum (2l + 1) exp(-l(l+1)D) sin((l + 1/2)a) sin(a/2) summed over images
+    (Poisson). Images converge fast for small D, the series for large D; at D = 1 either is exact.
+    """
+    angle = np.linspace(0.0, min(np.pi, 14 * np.sqrt(2 * D)), 20001)
+    if D < 1:
+        n = np.arange(-3, 4)[:, None]
+        image = angle + 2 * np.pi * n
+        wave = np.sum((-1.0) ** n * image * np.exp(-(image**2) / (4 * D)), axis=0)
+    else:
+        degree = np.arange(8)[:, None]
+        weight = (2 * degree + 1) * np.exp(-degree * (degree + 1) * D)
+        wave = np.sum(weight * np.sin((degree + 0.5) * angle), axis=0)
+    density = np.maximum(wave * np.sin(angle / 2), 0.0)
+    cdf = np.concatenate([[0.0], np.cumsum(density[1:] + density[:-1])])
+    return angle, cdf / cdf[-1]

@@ -1,0 +1,86 @@
+"""Hunter et al. 2011 remade: every equation, figure and table, from the public functions."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING
+
+from perrin import __version__
+from perrin.paper.claims import Study, write_claims, write_item
+from perrin.paper.experiment import conclusion, figure_5, table_1
+from perrin.paper.method import challis, figure_1, localisation, product, simulation
+from perrin.paper.noise import bodies, constancy, figure_3, figure_4, sampling
+from perrin.paper.orientations import appendix, axes, correlation, figure_2, figure_6
+from perrin.run.folders import staged_folder
+
+if TYPE_CHECKING:
+    import os
+    from collections.abc import Callable
+
+    from perrin.paper.claims import Claim, Item
+
+
+# In the order of the paper.
+ITEMS: tuple[Callable[[Study], Item], ...] = (
+    figure_1, challis, product, localisation, simulation, figure_2, axes, correlation,
+    figure_3, figure_4, bodies, constancy, sampling, figure_5, table_1, conclusion, appendix,
+    figure_6,
+)  # fmt: skip
+
+
+_HEADING = """# The paper, claim by claim
+
+G. L. Hunter, K. V. Edmond, M. T. Elsesser and E. R. Weeks, "Tracking rotational diffusion of
+colloidal clusters", Optics Express 19, 17189 (2011), remade by `perrin paper`. Every number under
+"measured" comes from that run; a claim holds where it differs from the expected one by no more
+than the tolerance. Statistical tolerances are three standard errors: of more than a
+hundred claims one may fail by chance with another seed."""
+
+
+def reproduce(
+    folder: str | os.PathLike[str],
+    *,
+    seed: int = 2011,
+    planted_error: float = 0.0,
+    overwrite: bool = False,
+    progress: Callable[[int, int, str], None] | None = None,
+) -> tuple[Claim, ...]:
+    """Remake the paper into a folder, which appears whole or not at all.
+
+    Parameters
+    ----------
+    folder : path
+        Gets a PNG, PDF and CSV for each item, ``claims.json``, ``claims.md`` and ``run.json``.
+    seed : int
+        Of all random numbers; items draw independently of each other.
+    planted_error : float
+        Relative error put on every D_R that is simulated while the expected values stay, to see
+        that the claims notice.
+    overwrite : bool
+        Replace a folder that an earlier run has written.
+    progress : callable, optional
+        Called with the number of items done, their total and the title of the one just finished.
+
+    Returns
+    -------
+    tuple of Claim
+        In the order of the paper.
+
+    Raises
+    ------
+    FileExistsError
+        If the folder exists and `overwrite` is not set, or is not one that perrin wrote.
+    """
+    study = Study(seed=seed, planted_error=planted_error)
+    items: list[Item] = []
+    with staged_folder(folder, overwrite=overwrite) as stage:
+        for number, make in enumerate(ITEMS, start=1):
+            items.append(make(study))
+            write_item(items[-1], stage)
+            if progress is not None:
+                progress(number, len(ITEMS), items[-1].title)
+        write_claims(items, stage, heading=_HEADING)
+        settings = {"made": "paper", "perrin": __version__, "seed": seed,
+                    "planted_error": planted_error}  # fmt: skip
+        (stage / "run.json").write_text(json.dumps(settings, indent=2) + "\n", encoding="utf-8")
+    return tuple(claim for item in items for claim in item.claims)

@@ -1,0 +1,68 @@
+"""Run folders with pictures and one self-contained page."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from perrin.plot.imaging import save_image_figures
+from perrin.plot.results import save_figures
+from perrin.report.imaging_page import render_quality
+from perrin.report.page import render_html
+from perrin.run.folders import filled_folder, staged_folder
+from perrin.run.results import write_data
+
+if TYPE_CHECKING:
+    import os
+    from pathlib import Path
+
+    from perrin.run.results import Report
+
+
+def write_run(report: Report, folder: str | os.PathLike[str], *, overwrite: bool = False) -> None:
+    """Write a run folder: the data, the figures and the HTML report; whole or not at all.
+
+    Parameters
+    ----------
+    report : Report
+    folder : path
+        Made new. Figures go to ``figures/``, the report to ``report.html``; how the spheres were
+        seen, where the run began with images, to ``quality.html``.
+    overwrite : bool
+        Replace an existing run folder.
+
+    Raises
+    ------
+    FileExistsError
+        If the folder exists and `overwrite` is not set, or is not a run folder.
+    """
+    with staged_folder(folder, overwrite=overwrite) as stage:
+        _write(report, stage)
+
+
+def complete_run(report: Report, folder: str | os.PathLike[str]) -> None:
+    """Write a run into the folder that holds its finished frames: as `write_run`, in their place.
+
+    Parameters
+    ----------
+    report : Report
+    folder : path
+        As given to `analyze_stack` as `keep`.
+
+    Raises
+    ------
+    OSError
+        If it cannot be written; the finished frames stay.
+    """
+    with filled_folder(folder) as stage:
+        _write(report, stage)
+
+
+def _write(report: Report, stage: Path) -> None:
+    write_data(report, stage)
+    place = stage / "figures"
+    place.mkdir()
+    html = render_html(report, save_figures(report, place))
+    (stage / "report.html").write_text(html, encoding="utf-8")
+    if report.imaging is not None:
+        html = render_quality(report, save_image_figures(report, place))
+        (stage / "quality.html").write_text(html, encoding="utf-8")

@@ -1,0 +1,429 @@
+"""What a run found: the report, its clusters, and the folder that holds them."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from perrin._text import _number, with_error
+from perrin.curves.displacement import LagCurve, msad, msd
+from perrin.diffusion.estimate import DiffusionEstimate, _estimate_dict, _estimate_from
+from perrin.diffusion.step_tests import without_spin
+from perrin.diffusion.tensor_results import DiffusionTensor, _tensor_dict, _tensor_from
+from perrin.hydrodynamics.sizes import Size, _sizes_dict, _sizes_from
+from perrin.images.imaging import Imaging, read_imaging, write_imaging
+from perrin.motion.floor import NoiseFloor, floor_of
+from perrin.motion.rigid_motion import RigidMotion
+from perrin.motion.rigidity import Quality
+from perrin.motion.rods import RodMotion
+from perrin.run.folders import staged_folder
+from perrin.run.predictions import Prediction
+
+if TYPE_CHECKING:
+    import os
+
+    import pandas as pd
+
+
+@dataclass(frozen=True, eq=False)
+class ClusterResult:
+    """What was measured on one cluster.
+
+    Attributes
+    ----------
+    cluster : int
+    motion : RigidMotion
+    D_R, D_T : DiffusionEstimate
+    tensor : DiffusionTensor or None
+        Of rotation, in body axes; None in the plane and where there are too few steps.
+    noise : NoiseFloor
+        Predicted from sigma and the shape.
+    sizes : dict of Size or None
+        "translation" and "rotation", where the viscosity is known, and "both", with the viscosity
+        that both coefficients imply; of equal spheres of the measured shape. None without any.
+    warnings : tuple of str
+        What speaks against the numbers.
+    label : str or None
+        The cluster's name in the table, where it is text.
+    quality : Quality or None
+        Rigidity, errors per axis, and what was repaired.
+    prediction : Prediction or None
+        What spheres of the stated diameter would do; None if none was stated.
+    notes : tuple of str
+        What informs: how the table was read, what was left out or corrected.
+    jumps : dict of tuple of int
+        "rotation" and "translation": the frames (from 0) at which a step was left out of the
+        estimates because Brownian motion cannot make it.
+    """
+
+    cluster: int
+    motion: RigidMotion
+    D_R: DiffusionEstimate
+    D_T: DiffusionEstimate
+    tensor: DiffusionTensor | None
+    noise: NoiseFloor
+    sizes: dict[str, Size] | None
+    warnings: tuple[str, ...]
+    label: str | None = None
+    quality: Quality | None = None
+    prediction: Prediction | None = None
+    notes: tuple[str, ...] = ()
+    jumps: dict[str, tuple[int, ...]] = field(default_factory=dict)
+
+    @cached_property
+    def msad(self) -> LagCurve:
+        """The MSAD averaged over the particles' directions, without a mean spin taken off D_R."""
+        if self.D_R.drift is None:
+            return msad(self.motion)
+        return msad(without_spin(self.motion, self.D_R.drift[0]))
+
+    @cached_property
+    def msd(self) -> LagCurve:
+        """The MSD of the centre, without a mean velocity taken off D_T."""
+        return msd(self.motion, drift=self.D_T.drift is not None)
+
+    @property
+    def phi2_measured(self) -> float:
+        """The noise floor Phi^2 (rad^2) that the steps themselves show."""
+        return self.D_R.offset * floor_factor(self.motion)
+
+    @property
+    def phi2_stderr(self) -> float:
+        """The standard error of `phi2_measured`, rad^2; NaN at the edge of what is possible."""
+        return self.D_R.offset_stderr * floor_factor(self.motion)
+
+    @property
+    def name(self) -> str:
+        """The cluster's number, or its label."""
+        return self.label or str(self.cluster)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the cluster's entry of ``summary.json``."""
+        xyz = None if self.quality is None else self.quality.sigma_xyz
+        return {
+            "cluster": self.cluster,
+            "label": self.label,
+            "n_particles": len(self.motion.template),
+            "n_frames": int(self.motion.fitted.size),
+            "D_R": _estimate_dict(self.D_R),
+            "D_T": _estimate_dict(self.D_T),
+            "sigma": _number(self.motion.sigma),
+            "sigma_xyz": None if xyz is None else list(xyz),
+            "phi2": {"measured": _number(self.phi2_measured), "predicted": self.noise.phi2},
+            "snr": _number(self.D_R.snr),
+            "tensor": None if self.tensor is None else _tensor_dict(self.tensor),
+            "sizes": None if self.sizes is None else _sizes_dict(self.sizes),
+            "size_factor": next((s.factor for s in (self.sizes or {}).values()), None),
+            "prediction": None if self.prediction is None else self.prediction.to_dict(),
+            "quality": None if self.quality is None else self.quality.to_dict(),
+            "jumps": {name: list(frames) for name, frames in self.jumps.items()},
+            "warnings": list(self.warnings),
+            "notes": list(self.notes),
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class RodResult:
+    """What was measured on one rod or straight chain: it has a direction, no full orientation.
+
+    Attributes
+    ----------
+    cluster : int
+    motion : RodMotion
+    D_perp, D_T : DiffusionEstimate
+        Of the direction (``<|du|^2>`` = 4 D_perp dt) and of the centre.
+    warnings : tuple of str
+    label : str or None
+    prediction : Prediction or None
+        What spheres of the stated diameter would do; None if none was stated.
+    notes : tuple of str
+        What only informs, beside the warnings.
+    """
+
+    cluster: int
+    motion: RodMotion
+    D_perp: DiffusionEstimate
+    D_T: DiffusionEstimate
+    warnings: tuple[str, ...]
+    label: str | None = None
+    prediction: Prediction | None = None
+    notes: tuple[str, ...] = ()
+
+    @property
+    def name(self) -> str:
+        """The rod's number, or its label."""
+        return self.label or str(self.cluster)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the rod's entry of ``summary.json``."""
+        return {
+            "cluster": self.cluster,
+            "label": self.label,
+            "n_particles": len(self.motion.places),
+            "n_frames": int(self.motion.fitted.size),
+            "D_R": None,
+            "D_perp": _estimate_dict(self.D_perp),
+            "D_T": _estimate_dict(self.D_T),
+            "length": self.motion.length,
+            "sigma": _number(self.motion.sigma),
+            "sigma_xyz": None,
+            "snr": _number(self.D_perp.snr),
+            "tensor": None,
+            "sizes": None,
+            "prediction": None if self.prediction is None else self.prediction.to_dict(),
+            "warnings": list(self.warnings),
+            "notes": list(self.notes),
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class Pooled:
+    """One D_R and D_T for all rigid clusters together, each with its own noise.
+
+    Attributes
+    ----------
+    D_R, D_T : DiffusionEstimate
+    clusters : tuple of int
+        Which clusters went in.
+    """
+
+    D_R: DiffusionEstimate
+    D_T: DiffusionEstimate
+    clusters: tuple[int, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Report:
+    """The result of a run: a result per cluster, pooled values, warnings, and where they come from.
+
+    Attributes
+    ----------
+    clusters : tuple of ClusterResult
+    pooled : Pooled or None
+        None where there are only rods.
+    warnings : tuple of str
+        What concerns the whole table; each cluster has its own besides.
+    tracks : pandas.DataFrame
+        The positions used: frame from 0, particle, cluster, x, y[, z], um.
+    settings : dict
+        Arguments, versions, and the input with its SHA-256.
+    rods : tuple of RodResult
+        Pairs and straight chains in three dimensions, which have no full rotation.
+    imaging : Imaging or None
+        How the spheres were seen, where the run began with images.
+    notes : tuple of str
+        What informs of the whole table: how it was read, what was left out.
+    """
+
+    clusters: tuple[ClusterResult, ...]
+    pooled: Pooled | None
+    warnings: tuple[str, ...]
+    tracks: pd.DataFrame
+    settings: dict[str, Any] = field(default_factory=dict)
+    rods: tuple[RodResult, ...] = ()
+    imaging: Imaging | None = None
+    notes: tuple[str, ...] = ()
+
+    @property
+    def results(self) -> tuple[ClusterResult | RodResult, ...]:
+        """Bodies and rods together."""
+        both: list[ClusterResult | RodResult] = [*self.clusters, *self.rods]
+        return tuple(both)
+
+    def __repr__(self) -> str:
+        count = len(self.warnings) + sum(len(c.warnings) for c in self.results)
+        lines = [f"Report({len(self.results)} clusters, {count} warnings)"]
+        lines += [f"  cluster {c.name}: {c.D_R}; {c.D_T}" for c in self.clusters[:10]]
+        lines += [f"  {perp_text(rod)}" for rod in self.rods[:10]]
+        if self.pooled is not None and len(self.clusters) > 1:
+            lines.append(f"  pooled: {self.pooled.D_R}; {self.pooled.D_T}")
+        return "\n".join(lines)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return ``summary.json`` as a dictionary: plain numbers, null for what is unknown."""
+        entries = [result.to_dict() for result in self.results]
+        pooled = self.pooled
+        return {
+            "clusters": sorted(entries, key=lambda entry: int(entry["cluster"])),
+            "pooled": {
+                "D_R": None if pooled is None else _estimate_dict(pooled.D_R),
+                "D_T": None if pooled is None else _estimate_dict(pooled.D_T),
+                "p_same": None if pooled is None else pooled.D_R.p_same,
+                "clusters": [] if pooled is None else list(pooled.clusters),
+            },
+            "warnings": list(self.warnings),
+            "notes": list(self.notes),
+        }
+
+    def save(self, folder: str | os.PathLike[str], *, overwrite: bool = False) -> None:
+        """Write the run's data (no pictures) to a new folder, which appears whole or not at all.
+
+        Raises
+        ------
+        FileExistsError
+            If the folder exists and `overwrite` is not set, or is not a run folder.
+        """
+        with staged_folder(folder, overwrite=overwrite) as stage:
+            write_data(self, stage)
+
+
+def load_run(folder: str | os.PathLike[str]) -> Report:
+    """Read a run folder back.
+
+    Raises
+    ------
+    FileNotFoundError
+        If the folder or one of its files is missing.
+    """
+    import pandas as pd
+
+    path = Path(folder)
+    summary = json.loads((path / "summary.json").read_text(encoding="utf-8"))
+    settings = json.loads((path / "run.json").read_text(encoding="utf-8"))
+    motions = pd.read_parquet(path / "motion.parquet")
+    attributes = motions.attrs["clusters"]
+    results: list[ClusterResult] = []
+    rods: list[RodResult] = []
+    for entry in summary["clusters"]:
+        rows = motions[motions["cluster"] == entry["cluster"]].reset_index(drop=True)
+        rows.attrs = attributes[str(entry["cluster"])]
+        if "D_perp" in entry:
+            rods.append(_rod_from(entry, RodMotion.from_frame(rows)))
+        else:
+            results.append(_result_from(entry, RigidMotion.from_frame(rows)))
+    return Report(
+        clusters=tuple(results),
+        rods=tuple(rods),
+        pooled=_pooled_from(summary["pooled"]),
+        warnings=tuple(summary["warnings"]),
+        tracks=pd.read_parquet(path / "tracks.parquet"),
+        settings=settings,
+        imaging=read_imaging(path) if (path / "imaging.json").is_file() else None,
+        notes=_notes_from(summary),
+    )
+
+
+def write_data(report: Report, folder: Path) -> None:
+    """Write summary.json, tracks.parquet, motion.parquet, curves.csv and run.json to a folder."""
+    _write_json(folder / "summary.json", report.to_dict())
+    _write_json(folder / "run.json", report.settings)
+    report.tracks.to_parquet(folder / "tracks.parquet", index=False)
+    motion_table(report).to_parquet(folder / "motion.parquet", index=False)
+    curve_table(report).to_csv(folder / "curves.csv", index=False)
+    if report.imaging is not None:
+        write_imaging(report.imaging, folder)
+
+
+def motion_table(report: Report) -> pd.DataFrame:
+    """Return the motion of all clusters, a row per cluster and frame; templates in ``attrs``."""
+    import pandas as pd
+
+    parts, attributes = [], {}
+    # A motion has every frame from its cluster's first to its last.
+    whole = report.tracks.dropna(subset=["x", "y"])
+    first = whole.groupby("cluster")["frame"].min()
+    for result in report.results:
+        part = result.motion.to_frame()
+        attributes[str(result.cluster)] = part.attrs
+        part.attrs = {}
+        part.insert(0, "cluster", result.cluster)
+        part.insert(1, "frame", first[result.cluster] + np.arange(len(part), dtype=np.int64))
+        parts.append(part)
+    table = pd.concat(parts, ignore_index=True)
+    table.attrs = {"clusters": attributes}
+    return table
+
+
+def curve_table(report: Report) -> pd.DataFrame:
+    """Return the MSD and MSAD of all clusters, a row per cluster, quantity and lag."""
+    import pandas as pd
+
+    parts = []
+    for result in report.clusters:
+        for name, curve in (("msad", result.msad), ("msd", result.msd)):
+            part = curve.to_frame()
+            part.insert(0, "cluster", result.cluster)
+            part.insert(1, "quantity", name)
+            parts.append(part)
+    if not parts:
+        return pd.DataFrame(columns=["cluster", "quantity"])
+    return pd.concat(parts, ignore_index=True)
+
+
+def perp_text(rod: RodResult) -> str:
+    """Return a rod's coefficients as one line."""
+    shown = with_error(rod.D_perp.value, rod.D_perp.stderr)
+    return f"rod {rod.name}: D_perp = {shown} {rod.D_perp.unit}; {rod.D_T}"
+
+
+def predicted_noise(motion: RigidMotion) -> NoiseFloor:
+    """Return the noise floor that sigma and the shape predict, averaged over the poses."""
+    covariance = np.mean(motion.covariance[motion.fitted], axis=0)
+    return NoiseFloor(float(floor_of(covariance)), covariance)
+
+
+def floor_factor(motion: RigidMotion) -> float:
+    """Return Phi^2 over the variance of one orientation angle: 4, or 2 in the plane."""
+    return 2.0 if motion.covariance.shape[-1] == 1 else 4.0
+
+
+def _result_from(entry: dict[str, Any], motion: RigidMotion) -> ClusterResult:
+    """Rebuild one cluster's result from its summary and its motion."""
+    return ClusterResult(
+        cluster=entry["cluster"],
+        motion=motion,
+        D_R=_estimate_from(entry["D_R"]),
+        D_T=_estimate_from(entry["D_T"]),
+        tensor=None if entry["tensor"] is None else _tensor_from(entry["tensor"]),
+        noise=predicted_noise(motion),
+        sizes=None if entry["sizes"] is None else _sizes_from(entry),
+        warnings=tuple(entry["warnings"]),
+        label=entry["label"],
+        quality=None if entry["quality"] is None else Quality.from_dict(entry["quality"]),
+        prediction=_prediction_from(entry),
+        notes=_notes_from(entry),
+        jumps={name: tuple(frames) for name, frames in entry.get("jumps", {}).items()},
+    )
+
+
+def _rod_from(entry: dict[str, Any], motion: RodMotion) -> RodResult:
+    """Rebuild one rod's result from its summary and its motion."""
+    return RodResult(
+        cluster=entry["cluster"],
+        motion=motion,
+        D_perp=_estimate_from(entry["D_perp"]),
+        D_T=_estimate_from(entry["D_T"]),
+        warnings=tuple(entry["warnings"]),
+        label=entry["label"],
+        prediction=_prediction_from(entry),
+        notes=_notes_from(entry),
+    )
+
+
+def _prediction_from(entry: dict[str, Any]) -> Prediction | None:
+    """Read back a prediction; runs without one may lack the key."""
+    given = entry.get("prediction")
+    return None if given is None else Prediction.from_dict(given)
+
+
+def _notes_from(entry: dict[str, Any]) -> tuple[str, ...]:
+    """Read back notes; runs of earlier versions have none."""
+    return tuple(entry.get("notes", ()))
+
+
+def _pooled_from(entry: dict[str, Any]) -> Pooled | None:
+    """Rebuild the pooled values; None where there were only rods."""
+    if entry["D_R"] is None:
+        return None
+    estimates = _estimate_from(entry["D_R"]), _estimate_from(entry["D_T"])
+    return Pooled(*estimates, tuple(entry["clusters"]))
+
+
+def _write_json(path: Path, content: dict[str, Any]) -> None:
+    text = json.dumps(content, indent=2, allow_nan=False, ensure_ascii=False)
+    path.write_text(text + "\n", encoding="utf-8")

@@ -1,0 +1,169 @@
+"""When the frames of a track table were recorded: the column time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from perrin._text import frames_text
+from perrin.errors import TrackTableError
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from perrin._arrays import Floats, Ints
+
+
+# Times that are off an even grid by less than this share of dt are on it.
+_EVEN = 5e-4
+
+
+# The usual interval of the column may differ from dt by this share: what clocks and rounding do.
+_AGREES = 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class Clock:
+    """When frames were recorded.
+
+    Attributes
+    ----------
+    frames : ndarray of int, shape (K,)
+        Frames whose time is known, rising.
+    times : ndarray, shape (K,)
+        s.
+    dt : float
+        Time between the frames before the first and after the last of these, s.
+    """
+
+    frames: Ints
+    times: Floats
+    dt: float
+
+    def at(self, frames: Ints) -> Floats:
+        """Return the times of frames, s, interpolated between those that are known."""
+        before = np.minimum(frames - self.frames[0], 0)
+        after = np.maximum(frames - self.frames[-1], 0)
+        known = np.interp(frames, self.frames, self.times)
+        return np.asarray(known + self.dt * (before + after))
+
+    def from_frame(self, first: int) -> Clock:
+        """Return the clock for frames counted from `first`, whose time becomes 0."""
+        start = float(self.at(np.array([first]))[0])
+        return Clock(self.frames - first, self.times - start, self.dt)
+
+
+def read_clock(table: pd.DataFrame, *, dt: float) -> tuple[Clock | None, tuple[str, ...]]:
+    """Return the times of the frames from the column ``time`` of a table, and notes on them.
+
+    Parameters
+    ----------
+    table : pandas.DataFrame
+        A clean track table.
+    dt : float
+        Time between successive frame numbers, s, which the column must agree with.
+
+    Returns
+    -------
+    clock : Clock or None
+        The time of a frame is the mean over its rows. None without a column ``time``, and where
+        frames are dt apart.
+    notes : tuple of str
+
+    Raises
+    ------
+    TrackTableError
+        If times do not rise with the frame numbers, are missing in more than half of the frames,
+        or if the median interval of neighbouring frames differs from dt by more than 1 %.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import pandas as pd
+    >>> from perrin.tracks.clock import read_clock
+    >>> table = pd.DataFrame({"frame": [0, 1, 2, 3], "time": [0.0, 0.5, 1.0, 9.0]})
+    >>> clock, notes = read_clock(table, dt=0.5)
+    >>> clock.at(np.array([0, 2, 3, 4])).tolist()
+    [0.0, 1.0, 9.0, 9.5]
+    """
+    if "time" not in table or not table["time"].notna().any():
+        return None, ()
+    by_frame = table.groupby("frame")["time"]
+    mean, known = by_frame.mean(), by_frame.mean().notna().to_numpy()
+    frame = mean.index.to_numpy(dtype=np.int64)[known]
+    time = mean.to_numpy(dtype=np.float64)[known]
+    spread = float((by_frame.max() - by_frame.min()).max())
+    faults = _faults(frame, time, missing=int((~known).sum()), spread=spread, dt=dt)
+    if faults:
+        raise TrackTableError(
+            f"the column time: {'; '.join(faults)}. Correct it or dt, or leave the column out",
+            tuple(faults),
+        )
+    if evenly_spaced(time, frame, dt=dt):
+        return None, ()
+    gaps = np.diff(time) / np.diff(frame)
+    notes = [
+        f"the column time is used: intervals between frames run from {gaps.min():.4g} to "
+        f"{gaps.max():.4g} s (median {np.median(gaps):.4g} s)"
+    ]
+    if not known.all():
+        notes.append(f"{(~known).sum()} frames have no time; theirs is interpolated")
+    if spread > _EVEN * dt:
+        notes.append(f"the times of one frame differ by up to {spread:.3g} s; their mean is used")
+    return Clock(frame, time, dt), tuple(notes)
+
+
+def evenly_spaced(times: Floats, frames: Ints, *, dt: float) -> bool:
+    """Return whether frames were recorded dt apart, counted from the first.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> evenly_spaced(np.array([3.0, 3.5, 4.5]), np.array([0, 1, 3]), dt=0.5)
+    True
+    """
+    grid = times[0] + dt * (frames - frames[0])
+    return bool(np.all(np.abs(times - grid) <= _EVEN * dt))
+
+
+def _faults(frame: Ints, time: Floats, *, missing: int, spread: float, dt: float) -> list[str]:
+    """Return what keeps the times from being those of the frames."""
+    if missing > len(time):
+        return [f"{missing} of {missing + len(time)} frames have none"]
+    step, number = np.diff(time), np.diff(frame)
+    if not len(step):
+        return []
+    back = np.flatnonzero(step <= 0)
+    if back.size:
+        return [f"it does not rise from one frame to the next at {frames_text(frame[back + 1])}"]
+    usual = float(np.median(step / number))
+    faults = []
+    if abs(usual - dt) > _AGREES * dt:
+        faults.append(
+            f"its median interval is {usual:.6g} s a frame, which contradicts dt = {dt:g} s"
+        )
+    if spread > usual:
+        faults.append(f"rows of one frame differ by up to {spread:.3g} s, more than an interval")
+    return faults
+
+
+def frame_stride(table: pd.DataFrame) -> tuple[str, ...]:
+    """State in words where all frame numbers are multiples of a number, counted from the first.
+
+    Examples
+    --------
+    >>> import pandas as pd
+    >>> from perrin.tracks.clock import frame_stride
+    >>> frame_stride(pd.DataFrame({"frame": [0, 5, 10, 20]}))[0][:36]
+    'frame numbers are multiples of 5: a '
+    """
+    frame = np.unique(table["frame"].to_numpy(dtype=np.int64))
+    stride = int(np.gcd.reduce(np.diff(frame))) if len(frame) > 2 else 1
+    if stride == 1:
+        return ()
+    return (
+        f"frame numbers are multiples of {stride}: a step between neighbouring rows takes "
+        f"{stride} dt; if dt is the time between these rows, number the frames 0, 1, 2, ...",
+    )

@@ -1,0 +1,560 @@
+"""Which rows of a track table are no measurements, and what its distances say of its unit."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from perrin._arrays import Bools, Floats, Ints, as_positions, present
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    import pandas as pd
+    from numpy.typing import ArrayLike
+
+
+# Columns that trackpy writes beside its coordinates, which are pixels.
+TRACKPY_COLUMNS = ("mass", "size", "ecc", "signal", "raw_mass", "ep")
+
+
+CENTRE_REMOVED = (
+    "the centre does not move: no D_T (the mean of the particles' coordinates is the same in every "
+    "frame to rounding, as in a table that was centred or from which the common drift was "
+    "subtracted)"
+)
+
+
+# Colloidal particles are this far apart, um.
+_NEAR, _FAR = 0.05, 50.0
+
+
+# Expected number of coincidences, and probability, below which coincidences are no accident.
+_CHANCE = 1e-3
+
+
+# A placeholder is entered and left by steps of over 5 times the particle's median step, which a
+# Brownian step in three dimensions exceeds with a probability of 1e-12; one point is a placeholder
+# if that happens in 3 rows, the origin in one.
+_LEAP, _ROWS = 5.0, 3
+
+
+# A particle needs this number of steps before its repeats are judged; steps up to this number of
+# rows from a repeat tell how often a coordinate stays by rounding alone.
+_FEWEST, _AROUND = 8, 5
+
+
+# A tenth of the steps of a moving particle are shorter than 0.13 of their standard deviation on an
+# axis; the step that follows a repeat is usually over 5 times as long on one of the axes.
+_SMALL, _MOVING = 0.1, 5.0
+
+
+# A repeat by rounding has to be exceeded by this factor.
+_EXCESS = 3.0
+
+
+# A coordinate farther from every other particle than this number of body sizes is no measurement.
+_TOO_FAR = 20.0
+
+
+# Particles move if they spread over this number of rounding errors; a centre that varies by less
+# than this share of the spread was removed, whatever the rounding.
+_MOVES, _STILL = 10.0, 1e-6
+
+
+# Values lie on a lattice if their differences are multiples of one step to this share of it.
+_LATTICE, _NEARLY = 1e-3, 0.02
+
+
+_FRAMES = 60  # in which the nearest particles are searched for
+
+
+@dataclass(frozen=True, eq=False)
+class Screened:
+    """A track table without rows that are no measurements, and what was found.
+
+    Attributes
+    ----------
+    table : pandas.DataFrame
+        The same rows; the coordinates of those that are no measurements are NaN.
+    notes : tuple of str
+        What informs: rows that came without coordinates.
+    warnings : tuple of str
+        One sentence per kind of row whose coordinates are no measurements.
+    """
+
+    table: pd.DataFrame
+    notes: tuple[str, ...]
+    warnings: tuple[str, ...]
+
+
+def screen_rows(table: pd.DataFrame) -> Screened:
+    """Find the rows of a track table whose coordinates are no measurements.
+
+    Parameters
+    ----------
+    table : pandas.DataFrame
+        Columns frame, particle, x, y[, z] and perhaps cluster, as `check_tracks` returns it.
+
+    Returns
+    -------
+    Screened
+
+    Notes
+    -----
+    Two kinds are found. A *placeholder* is a point that stands for a lost particle, such as
+    (0, 0, 0): rows at exactly the same place that is entered and left by steps of more than 5 times
+    the particle's median step, in 3 rows or more (the origin: in one), or to which a particle
+    returns more often than the resolution of the table allows. A *repeat* has all coordinates of
+    the particle's previous row.
+
+    A particle at rest in a table of few digits repeats its place as well. The number of repeats by
+    rounding is n product_a p_a for n steps, with p_a the probability that coordinate a stays:
+    the resolution over the median step or, if larger, the share of steps near the repeats in which
+    a alone (not all coordinates) stays. Repeats are reported where resolution and step allow fewer
+    than 0.001, or where the episodes of repeats exceed the expected number with a probability
+    (Poisson) of less than 0.001 for the table.
+
+    Examples
+    --------
+    >>> import pandas as pd
+    >>> x = 9 + np.random.default_rng(0).normal(size=(40, 2)).cumsum(axis=0)
+    >>> x[20] = x[19]
+    >>> table = pd.DataFrame({"frame": range(40), "particle": 0, "x": x[:, 0], "y": x[:, 1]})
+    >>> screened = screen_rows(table)
+    >>> screened.warnings[0][:56]
+    '1 row of 1 particle with all coordinates of the particle'
+    >>> int(screened.table["x"].isna().sum())
+    1
+    """
+    axes = [axis for axis in ("x", "y", "z") if axis in table]
+    x = table[axes].to_numpy(dtype=np.float64, na_value=np.nan)
+    frame = table["frame"].to_numpy(dtype=np.int64)
+    names = ["particle", "cluster"] if "cluster" in table else ["particle"]
+    code = table.groupby(names, sort=False, dropna=False).ngroup().to_numpy(dtype=np.int64)
+    empty = ~present(x)
+    rows = np.lexsort((frame, code))
+    rows = rows[~empty[rows]]
+    at_placeholder = _placeholders(code[rows], x[rows])
+    filled, rest = rows[at_placeholder], rows[~at_placeholder]
+    repeated = rest[_repeats(code[rest], x[rest])]
+    notes = _sentence(
+        np.flatnonzero(empty), frame, code, "without coordinates (NaN)", "they count as missing"
+    )
+    placeholders = _sentence(
+        filled,
+        frame,
+        code,
+        f"at exactly {_points(x[filled])}",
+        "a placeholder for a lost particle, no measurement; they count as missing",
+    )
+    repeats = _sentence(
+        repeated,
+        frame,
+        code,
+        "with all coordinates of the particle's previous row, to the last digit",
+        "no measurements; they count as missing",
+    )
+    bad = np.concatenate([filled, repeated])
+    return Screened(_without(table, axes, bad), notes, placeholders + repeats)
+
+
+def _without(table: pd.DataFrame, axes: list[str], rows: Ints) -> pd.DataFrame:
+    """Return the table with the coordinates of some rows missing."""
+    if not rows.size:
+        return table
+    table = table.copy()
+    for axis in axes:
+        values = table[axis].to_numpy(dtype=np.float64, na_value=np.nan, copy=True)
+        values[rows] = np.nan
+        table[axis] = values
+    return table
+
+
+def far_points(positions: ArrayLike) -> Bools:
+    """Mark the points of one cluster that are farther from the rest than 20 times its size.
+
+    The size is the largest of the median distances between its particles. A point is marked where
+    it is that far from every other particle seen in the frame; where all are that far from each
+    other none can be trusted, and all are marked.
+
+    Parameters
+    ----------
+    positions : array_like, shape (T, n, d)
+        um, NaN where missing.
+
+    Returns
+    -------
+    ndarray of bool, shape (T, n)
+
+    Examples
+    --------
+    >>> x = np.tile([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]], (9, 1, 1))
+    >>> x[4, 2] = 900.0
+    >>> np.argwhere(far_points(x)).tolist()
+    [[4, 2]]
+    """
+    x = as_positions(positions)
+    n = x.shape[1]
+    nearest = np.full(x.shape[:2], np.inf)
+    size = 0.0
+    for i in range(n - 1):
+        distance = np.linalg.norm(x[:, i + 1 :] - x[:, i : i + 1], axis=2)
+        for k in np.flatnonzero(np.isfinite(distance).any(axis=0)):
+            size = max(size, float(np.nanmedian(distance[:, k])))
+        distance = np.where(np.isfinite(distance), distance, np.inf)
+        nearest[:, i] = np.minimum(nearest[:, i], distance.min(axis=1))
+        nearest[:, i + 1 :] = np.minimum(nearest[:, i + 1 :], distance)
+    return np.asarray(np.isfinite(nearest) & (nearest > _TOO_FAR * size))
+
+
+def far_sentence(far: Bools, frames: Ints) -> str:
+    """State which points of one cluster are left out because they are too far from the rest.
+
+    Parameters
+    ----------
+    far : ndarray of bool, shape (T, n)
+        As `far_points` returns it, with at least one point marked.
+    frames : ndarray of int, shape (T,)
+
+    Returns
+    -------
+    str
+
+    Examples
+    --------
+    >>> far_sentence(np.array([[False, False], [True, False]]), np.array([7, 8]))[:51]
+    '1 point of 1 particle is farther from the rest than'
+    """
+    points, particles = int(far.sum()), int(far.any(axis=0).sum())
+    first = int(frames[np.flatnonzero(far.any(axis=1))[0]])
+    verb = "is" if points == 1 else "are"
+    kind = "no measurement" if points == 1 else "no measurements"
+    return (
+        f"{_number(points, 'point')} of {_number(particles, 'particle')} {verb} farther from the "
+        f"rest than {_TOO_FAR:.0f} times the body's size, first in frame {first}: {kind}; left out"
+    )
+
+
+def centre_removed(positions: ArrayLike) -> bool:
+    """Return whether the mean of the particles stays the same to rounding while they move.
+
+    Parameters
+    ----------
+    positions : array_like, shape (T, n, d)
+        Of one cluster, um, NaN where missing.
+
+    Returns
+    -------
+    bool
+        Of two frames or fewer, and of a single particle, nothing can be said: False.
+
+    Notes
+    -----
+    Coordinates with rounding errors of at most q / 2 have a mean with an error of at most q / 2,
+    where q is the resolution of the table. Particles move if the median of their standard
+    deviations is over 10 times that. Means are taken over the frames that hold all particles, or,
+    if these are not constant, over the particles seen in each frame.
+
+    Examples
+    --------
+    >>> x = np.random.default_rng(1).normal(size=(50, 4, 3)).cumsum(axis=0)
+    >>> centre_removed(x), centre_removed(x - x.mean(axis=1, keepdims=True))
+    (False, True)
+    """
+    x = as_positions(positions)
+    seen = present(x)
+    held = seen.sum(axis=1) >= 2
+    whole = seen.all(axis=1) & held
+    return any(_is_still(x[rows]) for rows in (whole, held) if rows.sum() > 2)
+
+
+def _is_still(x: Floats) -> bool:
+    """Return whether the centre of frames (T, n, d) is constant to rounding, their points not."""
+    seen = present(x)
+    rounding = np.array([_resolution(axis[seen]) for axis in np.moveaxis(x, 2, 0)]) / 2
+    centre = np.nanmean(x, axis=1)
+    spread = np.sqrt(np.nanmedian(np.nanvar(x, axis=0), axis=0))
+    still = np.ptp(centre, axis=0) <= np.maximum(2 * rounding, _STILL * spread)
+    return bool(still.all() and (spread > _MOVES * rounding).any())
+
+
+def distance_notes(
+    table: pd.DataFrame, *, scale_given: bool, trackpy_columns: bool
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """State how far apart the nearest particles are, and warn where that is no colloid.
+
+    Parameters
+    ----------
+    table : pandas.DataFrame
+        Columns frame, particle, x, y[, z]; coordinates in um after scaling.
+    scale_given : bool
+        Whether a scale other than 1 was stated.
+    trackpy_columns : bool
+        Whether the table came with trackpy's own columns: `has_trackpy_columns`.
+
+    Returns
+    -------
+    notes, warnings : tuple of str
+        The distance is that to the nearest particle in the same frame, the median over up to 60
+        frames for each particle, and the mean over the particles. No notes where no frame holds two
+        particles.
+
+    Examples
+    --------
+    >>> import pandas as pd
+    >>> table = pd.DataFrame({"frame": 0, "particle": [0, 1], "x": [0.0, 2.5], "y": 0.0})
+    >>> distance_notes(table, scale_given=False, trackpy_columns=False)
+    (('nearest particles are 2.5 um apart on average',), ())
+    """
+    apart = _nearest(table)
+    if apart is None:
+        return (), ()
+    text = f"nearest particles are {apart:.3g} um apart on average"
+    warnings = []
+    if trackpy_columns and not scale_given:
+        warnings.append(
+            "the table has columns that trackpy writes, whose coordinates are pixels, but the "
+            f"scale is 1 um per unit ({text}): state the um per pixel with scale"
+        )
+    if not _NEAR <= apart <= _FAR:
+        remedy = "correct scale" if scale_given else "state the um per unit with scale"
+        warnings.append(
+            f"{text}, outside {_NEAR:g} to {_FAR:g} um: the coordinates are probably not in um; "
+            f"{remedy}"
+        )
+    return (text,), tuple(warnings)
+
+
+def has_trackpy_columns(columns: Iterable[object]) -> bool:
+    """Return whether column names are those of trackpy: two or more of its own.
+
+    Examples
+    --------
+    >>> has_trackpy_columns(["y", "x", "mass", "size", "ecc", "frame", "particle"])
+    True
+    """
+    return len(set(columns) & set(TRACKPY_COLUMNS)) >= 2
+
+
+def _nearest(table: pd.DataFrame) -> float | None:
+    """Return the mean over the particles of the distance to the nearest one, um."""
+    from scipy.spatial import cKDTree
+
+    axes = [axis for axis in ("x", "y", "z") if axis in table]
+    x = table[axes].to_numpy(dtype=np.float64, na_value=np.nan)
+    frame = table["frame"].to_numpy(dtype=np.int64)
+    frames = np.unique(frame)
+    some = frames[np.linspace(0, len(frames) - 1, _FRAMES).astype(int)] if len(frames) else frames
+    rows = np.flatnonzero(present(x) & np.isin(frame, some))
+    rows = rows[np.argsort(frame[rows], kind="stable")]
+    code = table["particle"].iloc[rows].factorize()[0].astype(np.int64)
+    apart = np.full(len(rows), np.nan)
+    for part in np.split(np.arange(len(rows)), np.flatnonzero(np.diff(frame[rows])) + 1):
+        if len(part) > 1:
+            apart[part] = cKDTree(x[rows[part]]).query(x[rows[part]], 2)[0][:, 1]
+    known = np.isfinite(apart)
+    if not known.any():
+        return None
+    medians = _medians(code[known], apart[known], int(code.max()) + 1)
+    return float(np.nanmean(medians))
+
+
+def _placeholders(code: Ints, x: Floats) -> Bools:
+    """Mark the rows, sorted by particle and frame, at points that stand for lost particles."""
+    if not len(code):
+        return np.zeros(0, dtype=np.bool_)
+    place = _places(x)
+    visits = _visits(code, place, x)
+    at, count = visits.place, int(place.max()) + 1
+    rows = np.bincount(place, minlength=count)
+    known = np.bincount(at, weights=np.isfinite(visits.leap), minlength=count)
+    leaps = np.bincount(at, weights=visits.leap > _LEAP, minlength=count)
+    origin = np.zeros(count, dtype=np.bool_)
+    origin[place] = (x == 0).all(axis=1)
+    brisk = 2 * np.bincount(at, weights=visits.leap >= 1, minlength=count) > known
+    reached = ((rows >= _ROWS) | origin) & (2 * leaps > known)
+    often = _revisited(code, x, visits, origin)
+    reached[often] |= brisk[often]
+    marked: Bools = reached[place]
+    return marked
+
+
+def _revisited(code: Ints, x: Floats, visits: _Visits, origin: Bools) -> Ints:
+    """Return the places to which a particle came back more often than rounding explains."""
+    from scipy.special import pdtrc
+
+    particles = int(code.max()) + 1
+    both, times = np.unique(visits.place * particles + visits.code, return_counts=True)
+    place, who = np.divmod(both[times > 1], particles)
+    times = times[times > 1]
+    found = [np.empty(0, dtype=np.int64)]
+    for particle in np.unique(who):
+        own = who == particle
+        start, stop = np.searchsorted(code, [particle, particle + 1])
+        rows = int(stop - start)
+        returns = rows * float(np.prod(_chances(x[start:stop])))
+        # The origin is known beforehand; any other row may be the first visit.
+        known = origin[place[own]]
+        level = pdtrc(times[own] - np.where(known, 1, 2), returns) * np.where(known, 1, rows)
+        found.append(place[own][level * particles < _CHANCE])
+    return np.unique(np.concatenate(found))
+
+
+def _places(x: Floats) -> Ints:
+    """Return a number for each distinct point among x, shape (N, d)."""
+    order = np.lexsort(x.T)
+    other = (np.diff(x[order], axis=0) != 0).any(axis=1)
+    place = np.empty(len(x), dtype=np.int64)
+    place[order] = np.append(0, np.cumsum(other))
+    return place
+
+
+class _Visits(NamedTuple):
+    """Unbroken stays of particles at one place; one entry per stay."""
+
+    code: Ints
+    place: Ints
+    leap: Floats  # the smaller of the steps there and away, over the particle's median step
+
+
+def _visits(code: Ints, place: Ints, x: Floats) -> _Visits:
+    """Divide tracks into stays at one place."""
+    begins = np.append(True, (np.diff(code) != 0) | (np.diff(place) != 0))
+    first = np.flatnonzero(begins)
+    who = code[first]
+    step = np.linalg.norm(np.diff(x[first], axis=0), axis=1)
+    same = np.diff(who) == 0
+    count = int(code.max()) + 1
+    usual = _medians(who[1:][same], step[same], count)
+    few = np.bincount(who[1:][same], minlength=count) < _FEWEST
+    usual[few] = np.inf
+    step[~same] = np.inf
+    leap = np.minimum(np.append(np.inf, step), np.append(step, np.inf))
+    leap[np.isinf(leap)] = np.nan
+    leap /= usual[who]
+    return _Visits(who, place[first], leap)
+
+
+def _repeats(code: Ints, x: Floats) -> Bools:
+    """Mark the rows, sorted by particle and frame, that repeat the one before."""
+    from scipy.special import pdtrc
+
+    repeated = np.zeros(len(code), dtype=np.bool_)
+    if len(code) < 2:
+        return repeated
+    same = np.diff(code) == 0
+    held = same & (np.diff(x, axis=0) == 0).all(axis=1)
+    particles = int(code.max()) + 1
+    for particle in np.unique(code[1:][held]):
+        rows = np.arange(*np.searchsorted(code, [particle, particle + 1]))
+        stays = held[rows[1:] - 1]
+        if np.count_nonzero(~stays) < _FEWEST or not _moves_on(x[rows], stays):
+            continue
+        chance = _chances(x[rows])
+        by_rounding = len(stays) * float(np.prod(chance))
+        near_by = len(stays) * float(np.prod(np.maximum(chance, _stays_alone(x[rows], stays))))
+        episodes = int(np.count_nonzero(np.diff(np.append(0, stays)) == 1))
+        too_many = stays.sum() >= _EXCESS * near_by and (
+            float(pdtrc(episodes - 1, near_by)) * particles < _CHANCE
+        )
+        if too_many or by_rounding * particles < _CHANCE:
+            repeated[rows[1:]] = stays
+    return repeated
+
+
+def _moves_on(x: Floats, held: Bools) -> bool:
+    """Return whether the steps that end repeats are steps of a moving particle.
+
+    A particle at rest on the grid of a camera repeats its place too, and leaves it by one unit of
+    the grid, which is also the smallest of its steps.
+    """
+    step = np.abs(np.diff(x, axis=0))
+    unit = [np.quantile(s[s > 0], _SMALL) if (s > 0).any() else np.inf for s in step.T]
+    after = step[1:][held[:-1] & ~held[1:]]
+    return bool(len(after)) and float(np.median((after / unit).max(axis=1))) >= _MOVING
+
+
+def _chances(x: Floats) -> Floats:
+    """Return how likely a step leaves each coordinate of a track (T, d) as it is, by rounding."""
+    step = np.abs(np.diff(x, axis=0))
+    median = np.median(step[step.any(axis=1)], axis=0) if step.any() else np.zeros(x.shape[1])
+    # Where digits count from the first that is not zero, the largest values are the coarsest.
+    large = np.abs(x) >= np.median(np.abs(x), axis=0)
+    lattice = [
+        max(_resolution(values), _resolution(values[upper]))
+        for values, upper in zip(x.T, large.T, strict=True)
+    ]
+    chance = np.divide(lattice, median, out=np.ones(len(median)), where=median > 0)
+    return np.asarray(np.minimum(chance, 1.0))
+
+
+def _stays_alone(x: Floats, held: Bools) -> Floats:
+    """Return the share of steps near repeats in which a coordinate stays but others do not."""
+    around = np.convolve(held, np.ones(2 * _AROUND + 1), mode="full")[_AROUND : _AROUND + len(held)]
+    zero = np.diff(x, axis=0)[(around > 0.5) & ~held] == 0
+    shares = []
+    for axis in range(x.shape[1]):
+        others_move = ~np.delete(zero, axis, axis=1).all(axis=1)
+        kept = zero[others_move, axis]
+        shares.append((kept.sum() + 1) / (len(kept) + 1))
+    return np.array(shares)
+
+
+def _resolution(values: Floats) -> float:
+    """Return the step of the lattice on which all values lie, or their rounding error."""
+    distinct = np.unique(values)
+    rounding = 8 * float(np.finfo(np.float64).eps) * float(np.abs(values).max(initial=0.0))
+    gaps = np.diff(distinct)
+    gaps = gaps[gaps > rounding]
+    if not gaps.size:
+        return rounding
+    step = float(gaps.min())
+    # Euclid's algorithm for all differences; a step that divides the smallest and the largest is
+    # refined by them, so that rounding errors do not grow.
+    while rounding < _LATTICE * step:
+        off = np.abs(gaps - np.round(gaps / step) * step)
+        off = off[off > _LATTICE * step]
+        if not off.size:
+            return step
+        finer = float(off.min())
+        for gap in (float(gaps.min()), float(gaps.max())):
+            times = round(gap / finer)
+            finer = gap / times if abs(gap - times * finer) <= _NEARLY * finer else finer
+        step = min(finer, 0.75 * step)
+    return rounding
+
+
+def _medians(group: Ints, values: Floats, count: int) -> Floats:
+    """Return the median of the values in each group, NaN for none."""
+    size = np.bincount(group, minlength=count)
+    ordered = np.append(values[np.lexsort((values, group))], np.nan)
+    start = np.cumsum(size) - size
+    middle = 0.5 * (ordered[start + np.maximum(size - 1, 0) // 2] + ordered[start + size // 2])
+    medians: Floats = np.where(size > 0, middle, np.nan)
+    return medians
+
+
+def _sentence(rows: Ints, frame: Ints, code: Ints, what: str, meaning: str) -> tuple[str, ...]:
+    """State how many rows of how many particles are of a kind, and the first frame."""
+    if not rows.size:
+        return ()
+    counted = f"{_number(rows.size, 'row')} of {_number(np.unique(code[rows]).size, 'particle')}"
+    return (f"{counted} {what}, first in frame {frame[rows].min()}: {meaning}",)
+
+
+def _points(x: Floats, limit: int = 3) -> str:
+    """List the distinct points among x, the most frequent first."""
+    points, times = np.unique(x, axis=0, return_counts=True)
+    listed = [
+        f"({', '.join(f'{c:.6g}' for c in point)})"
+        for point in points[np.argsort(-times, kind="stable")[:limit]]
+    ]
+    more = f" or {len(points) - limit} more points" if len(points) > limit else ""
+    return " or ".join(listed) + more
+
+
+def _number(count: int, noun: str) -> str:
+    return f"{count} {noun}{'' if count == 1 else 's'}"
