@@ -1,18 +1,15 @@
-"""The doorway of every array: types, shape checks, and the errors and warnings of the house."""
+"""Arrays and numbers at the boundary: types, shapes, ranges, and what JSON holds of them."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Floats: TypeAlias = NDArray[np.float64]
-
-
 Ints: TypeAlias = NDArray[np.int64]
-
-
 Bools: TypeAlias = NDArray[np.bool_]
 
 
@@ -69,6 +66,139 @@ def require_positive(**values: float) -> None:
     ]
     if bad:
         raise ValueError("expected a finite number > 0: " + ", ".join(bad))
+
+
+def number_fault(
+    name: str,
+    value: object,
+    *,
+    above: float | None = None,
+    least: float | None = None,
+    below: float | None = None,
+    most: float | None = None,
+    whole: bool = False,
+    unit: str = "",
+) -> list[str]:
+    """Return one line where a value is not a finite number of a range, or no line.
+
+    Parameters
+    ----------
+    name : str
+        The argument's name, with which the line begins.
+    value : object
+        What the user gave.
+    above, least, below, most : float, optional
+        Bounds: value > above, value >= least, value < below, value <= most.
+    whole : bool
+        Only integers are accepted.
+    unit : str
+        Unit named in the line.
+
+    Returns
+    -------
+    list of str
+        Empty, or one line.
+
+    Examples
+    --------
+    >>> number_fault("dt", 2.0, above=0, unit="s")
+    []
+    >>> number_fault("dt", -2.0, above=0, unit="s")
+    ['dt: expected a finite number > 0 (s), got -2.0']
+    >>> number_fault("n_frames", 2.5, least=3, whole=True)
+    ['n_frames: expected a whole number >= 3, got 2.5']
+    """
+    kinds = (int, np.integer) if whole else (int, float, np.integer, np.floating)
+    sound = (
+        isinstance(value, kinds)
+        and not isinstance(value, bool)
+        and bool(np.isfinite(value))
+        and (above is None or value > above)
+        and (least is None or value >= least)
+        and (below is None or value < below)
+        and (most is None or value <= most)
+    )
+    if sound:
+        return []
+    bounds = {">": above, ">=": least, "<": below, "<=": most}
+    wanted = " and ".join(
+        f"{sign} {bound:g}" for sign, bound in bounds.items() if bound is not None
+    )
+    kind = "a whole number" if whole else "a finite number"
+    text = " ".join(part for part in (kind, wanted, f"({unit})" if unit else "") if part)
+    return [f"{name}: expected {text}, got {value!r}"]
+
+
+def choice_fault(name: str, value: object, offered: Iterable[object]) -> list[str]:
+    """Return one line where a value is none of those offered, or no line.
+
+    Examples
+    --------
+    >>> choice_fault("method", "fast", ("mle", "cve"))
+    ["method: expected 'mle' or 'cve', got 'fast'"]
+    """
+    offered = list(offered)
+    if any(
+        value is choice or (type(value) is type(choice) and value == choice) for choice in offered
+    ):
+        return []
+    return [f"{name}: expected {' or '.join(map(repr, offered))}, got {value!r}"]
+
+
+def refuse(faults: Iterable[str], *, error: type[ValueError] = ValueError) -> None:
+    """Raise one error that lists all faults, if there are any."""
+    lines = list(faults)
+    if lines:
+        raise error("; ".join(lines))
+
+
+def finite_or_none(value: float) -> float | None:
+    """Return a number that JSON can hold; None where it is infinite or missing.
+
+    Examples
+    --------
+    >>> finite_or_none(2.0), finite_or_none(float("inf"))
+    (2.0, None)
+    """
+    return float(value) if np.isfinite(value) else None
+
+
+def to_plain(value: Any) -> Any:  # noqa: ANN401 (whatever a result holds)
+    """Return what JSON holds of a value: lists for arrays, None for what is not finite.
+
+    Objects that have a method ``to_dict`` are written by it.
+
+    Examples
+    --------
+    >>> to_plain({"value": np.array([1.0, np.nan]), "n": np.int64(3), "pair": (1, "a")})
+    {'value': [1.0, None], 'n': 3, 'pair': [1, 'a']}
+    """
+    if hasattr(value, "to_dict"):
+        return value.to_dict()
+    if isinstance(value, np.ndarray):
+        return to_plain(value.tolist())
+    if isinstance(value, np.generic):
+        return to_plain(value.item())
+    if isinstance(value, float):
+        return finite_or_none(value)
+    if isinstance(value, Mapping):
+        return {key: to_plain(inner) for key, inner in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [to_plain(inner) for inner in value]
+    return value
+
+
+def from_plain(value: Any, *, dtype: type = np.float64) -> NDArray[Any]:  # noqa: ANN401
+    """Return the array that `to_plain` wrote, read-only; None becomes NaN.
+
+    Examples
+    --------
+    >>> from_plain([1.0, None])
+    array([ 1., nan])
+    """
+    array: NDArray[Any] = np.array(value, dtype=np.float64).astype(dtype)
+    frozen(array)
+    return array
 
 
 def frozen(*arrays: NDArray[Any]) -> None:

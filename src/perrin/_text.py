@@ -1,4 +1,4 @@
-"""Lists in messages: the first items and the number of the rest."""
+"""How numbers, units, lists and frames are written."""
 
 from __future__ import annotations
 
@@ -133,17 +133,12 @@ def shortened(name: str, *, most: int = 24) -> str:
     return name if len(name) <= most else name[: most - 1] + "…"
 
 
-def _number(value: float) -> float | None:
-    """Return a number that JSON can hold; None where it is unbounded or unknown."""
-    return float(value) if np.isfinite(value) else None
-
-
-def _ordinal(n: int) -> str:
+def ordinal(n: int) -> str:
     ending = "th" if n % 100 in (11, 12, 13) else {1: "st", 2: "nd", 3: "rd"}.get(n % 10, "th")
     return f"{n}{ending}"
 
 
-def _short(value: float) -> str:
+def short(value: float) -> str:
     """Write a number with two digits, and no exponent where it is large."""
     return f"{value:.2g}" if value < 99.5 else f"{value:.0f}"
 

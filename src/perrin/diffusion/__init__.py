@@ -6,7 +6,7 @@ from perrin.diffusion.estimate import DiffusionEstimate, Found, bare_text, value
 from perrin.diffusion.estimators import by_likelihood, estimate_diffusion, track_of
 from perrin.diffusion.likelihood import Likelihood, Peak, excess_scatter
 from perrin.diffusion.moments import Moments, covariance_estimate, trace_estimate
-from perrin.diffusion.noise_model import choice_faults
+from perrin.diffusion.noise_model import Noise, choice_faults
 from perrin.diffusion.rods import estimate_rod
 from perrin.diffusion.sampling import SamplingPlan, SamplingVerdict, judge_sampling, plan_sampling
 from perrin.diffusion.step_kernels import Sums, Track, covariance_bands
@@ -54,6 +54,7 @@ __all__ = [
     "Likelihood",
     "Maximum",
     "Moments",
+    "Noise",
     "Peak",
     "SamplingPlan",
     "SamplingVerdict",

@@ -7,7 +7,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from perrin._text import _number, number_text, unit_text, with_error
+from perrin._arrays import finite_or_none
+from perrin._text import number_text, unit_text, with_error
 
 UNITS = {"rotation": "rad^2/s", "translation": "um^2/s"}
 
@@ -222,9 +223,9 @@ def _estimate_dict(estimate: DiffusionEstimate) -> dict[str, Any]:
     """Return an estimate for JSON, ends of intervals without bound as None."""
     entry = asdict(estimate)
     for name in ("value", "stderr", "offset", "offset_stderr", "snr", "dt"):
-        entry[name] = _number(entry[name])
+        entry[name] = finite_or_none(entry[name])
     for name in ("ci68", "ci95"):
-        entry[name] = [_number(end) for end in entry[name]]
+        entry[name] = [finite_or_none(end) for end in entry[name]]
     entry["warnings"] = list(estimate.warnings)
     for name in ("drift", "drift_stderr"):
         if entry[name] is not None:

@@ -2,11 +2,48 @@
 
 from __future__ import annotations
 
-from typing import Any, get_args
+from dataclasses import dataclass
+from typing import Any, Literal, get_args
 
 import numpy as np
 
+from perrin._arrays import refuse
 from perrin.diffusion.steps import Quantity
+
+
+@dataclass(frozen=True)
+class Noise:
+    """What is assumed of the measurement noise under a diffusion coefficient.
+
+    Parameters
+    ----------
+    model : "joint", "residual" or float
+        "joint": the noise is fitted together with D. "residual": it is taken from the residuals
+        of the rigid fits, which is right only where all particles of a frame are seen at once. A
+        number is the known localisation error of one coordinate, um.
+    exposure : float, optional
+        Open fraction of the time between frames, 0 to 1; None where it is unknown.
+    drift : bool
+        Subtract a steady velocity or spin, which costs one degree of freedom an axis.
+
+    Raises
+    ------
+    ValueError
+        If a value is out of its range; all faults in one message.
+
+    Examples
+    --------
+    >>> Noise(0.02, exposure=0.5)
+    Noise(model=0.02, exposure=0.5, drift=False)
+    """
+
+    model: Literal["joint", "residual"] | float = "joint"
+    exposure: float | None = None
+    drift: bool = False
+
+    def __post_init__(self) -> None:
+        """Refuse values out of range."""
+        refuse(choice_faults(quantity="rotation", noise=self.model, exposure=self.exposure))
 
 
 def choice_faults(*, quantity: object, noise: object, exposure: object) -> list[str]:

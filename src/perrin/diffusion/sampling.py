@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from perrin._arrays import Floats, as_sigma, frozen, require_positive
-from perrin._text import _ordinal, _short, percent
+from perrin._text import ordinal, percent, short
 from perrin.diffusion.bounds import NoiseKnowledge, cramer_rao, whole
 from perrin.diffusion.estimate import UNITS
 from perrin.errors import UnitWarning
@@ -521,10 +521,10 @@ def _about_both(plan: SamplingPlan, total_time: float) -> str:
             f"stretching them over all of {total_time:.3g} s would gain little or lose particles."
         )
     below = plan.dt_best < plan.dt_min
-    short = " That is below the window: time more than frames limits the error." if below else ""
+    limited = " That is below the window: time more than frames limits the error." if below else ""
     return (
         f"Given frames and time: all {plan.n_frames} frames, evenly over {total_time:.3g} s, "
-        f"SNR {_short(plan.snr)}.{short}"
+        f"SNR {short(plan.snr)}.{limited}"
     )
 
 
@@ -661,7 +661,7 @@ def _about_step(
     verdict: SamplingVerdict, estimate: DiffusionEstimate, *, axes: int, step: float
 ) -> str:
     """Say how dt compares with the window; `step` is 4 D_R dt, 0 for D_T."""
-    state = f"SNR {_short(verdict.snr)}" + (f", 4 D_R dt = {step:.2g}" if step else "")
+    state = f"SNR {short(verdict.snr)}" + (f", 4 D_R dt = {step:.2g}" if step else "")
     if step > 4 * _LONGEST:
         return _about_long_steps(verdict, state, step)
     if verdict.snr >= _LEAST_SNR:
@@ -670,10 +670,10 @@ def _about_step(
     every = max(round(verdict.factor), 1)
     thinned = _bound(max(estimate.n_frames // every, 3), every * verdict.snr, axes)
     return (
-        f"Oversampled {least}{_short(verdict.factor)} times ({state}): in a longer movie every "
-        f"{_ordinal(every)} frame would have done; as many frames every {verdict.dt_best:.3g} s "
+        f"Oversampled {least}{short(verdict.factor)} times ({state}): in a longer movie every "
+        f"{ordinal(every)} frame would have done; as many frames every {verdict.dt_best:.3g} s "
         f"could have given {percent(verdict.bound_best)} instead of {percent(verdict.bound)}. Of "
-        f"this movie use all frames: every {_ordinal(every)} alone gives {percent(thinned)}."
+        f"this movie use all frames: every {ordinal(every)} alone gives {percent(thinned)}."
     )
 
 
@@ -681,7 +681,7 @@ def _about_long_steps(verdict: SamplingVerdict, state: str, step: float) -> str:
     slow = f" and D_R reads {percent(step / 24)} low" if step > 0.2 else ""
     said = (
         f"Undersampled ({state}): beyond 4 D_R dt = {4 * _LONGEST:g} particles can be confused"
-        f"{slow}. Take frames every {verdict.dt_best:.3g} s, {_short(1 / verdict.factor)} times "
+        f"{slow}. Take frames every {verdict.dt_best:.3g} s, {short(1 / verdict.factor)} times "
         "closer."
     )
     if verdict.snr * verdict.factor < _LEAST_SNR:

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from perrin._arrays import Bools, Floats, frozen
-from perrin._text import _number, with_error
+from perrin._arrays import Bools, Floats, finite_or_none, frozen
+from perrin._text import with_error
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -48,7 +48,7 @@ def _tensor_dict(tensor: DiffusionTensor) -> dict[str, Any]:
         array[~np.isfinite(entry[name])] = None
         entry[name] = array.tolist()
     for name in ("p_isotropic", "p_axial"):
-        entry[name] = _number(entry[name])
+        entry[name] = finite_or_none(entry[name])
     return entry
 
 

@@ -19,7 +19,7 @@ from perrin.geometry.rotations import (
     skew,
     successive_product,
 )
-from perrin.geometry.shapes import Cluster, is_tetrahedron
+from perrin.geometry.shapes import Cluster, is_tetrahedron, pair_distances
 from perrin.geometry.symmetry import (
     matching_rotation,
     point_group,
@@ -43,6 +43,7 @@ __all__ = [
     "log_map",
     "matching_rotation",
     "orientation_covariance",
+    "pair_distances",
     "point_group",
     "rotation_group",
     "schoenflies",

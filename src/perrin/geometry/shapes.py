@@ -169,6 +169,28 @@ def _touching_unit(n: int) -> tuple[Floats, str]:
     return _bipyramid(n - 2, radius, np.sqrt(1 - radius**2)), symmetry
 
 
+def pair_distances(points: Floats) -> Floats:
+    """Return the distances of all pairs of points.
+
+    Parameters
+    ----------
+    points : array of shape (..., n, d)
+
+    Returns
+    -------
+    array of shape (..., n (n - 1) / 2)
+        In the order (0, 1), (0, 2), ..., (1, 2), ...; NaN where a point is missing.
+
+    Examples
+    --------
+    >>> pair_distances(np.array([[0.0, 0.0], [3.0, 0.0], [0.0, 4.0]]))
+    array([3., 4., 5.])
+    """
+    first, second = np.triu_indices(points.shape[-2], 1)
+    distances: Floats = np.linalg.norm(points[..., first, :] - points[..., second, :], axis=-1)
+    return distances
+
+
 def is_tetrahedron(positions: Floats, *, tolerance: float = 0.1) -> bool:
     """Return whether four particles in space have six pair distances alike, within `tolerance`."""
     if positions.shape != (4, 3):

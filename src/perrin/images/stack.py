@@ -18,6 +18,7 @@ from perrin.errors import FrameError, PrecisionWarning
 from perrin.images.formats.contents import Contents, Pick, even_times, needed
 from perrin.images.formats.tiff import sequence, sequence_files, tiff
 from perrin.images.formats.vendors import vendor
+from perrin.tracks.writing import written_whole
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -480,24 +481,22 @@ def write_stack(stack: Stack, path: _PathLike) -> None:
     if stack.dtype.name not in _OME_TYPES:
         raise ValueError(f"{target}: OME-TIFF has no {stack.dtype}: expected one of {_OME_TYPES}")
     tifffile = needed("tifffile", "images")
-    beside = target.with_name(f".{target.name}.{os.getpid()}.part")
     n_bytes = int(np.prod(stack.shape)) * stack.dtype.itemsize
     described: bytes | None = _ome_header(stack, tifffile)
-    try:
-        with tifffile.TiffWriter(beside, bigtiff=n_bytes > 2**31) as file:
-            # Every plane with its own header before it: a file that is cut short keeps the rest.
-            for plane in (plane for frame in stack for plane in frame):
-                file.write(
-                    plane,
-                    description=described,
-                    photometric="minisblack",
-                    metadata=None,
-                    contiguous=False,
-                )
-                described = None
-        beside.replace(target)
-    finally:
-        beside.unlink(missing_ok=True)
+    with (
+        written_whole(target) as beside,
+        tifffile.TiffWriter(beside, bigtiff=n_bytes > 2**31) as file,
+    ):
+        # Every plane with its own header before it: a file that is cut short keeps the rest.
+        for plane in (plane for frame in stack for plane in frame):
+            file.write(
+                plane,
+                description=described,
+                photometric="minisblack",
+                metadata=None,
+                contiguous=False,
+            )
+            described = None
 
 
 def _ome_header(stack: Stack, tifffile: Any) -> bytes:  # noqa: ANN401 (an untyped library)

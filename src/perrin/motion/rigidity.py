@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from perrin._arrays import Floats, Ints, as_positions, as_sigma, present
+from perrin._arrays import Floats, Ints, as_positions, as_sigma, finite_or_none, present
 from perrin.geometry.symmetry import point_group
 from perrin.motion.residuals import (
     LEVEL,
@@ -228,13 +228,13 @@ def judge_quality(
         reasons=tuple(soft),
         residual_over_R=motion.sigma / motion.R,
         residual_over_sigma=_over_stated(motion, sigma),
-        autocorrelation=_known(smooth.value),
+        autocorrelation=finite_or_none(smooth.value),
         bond_drift=drift,
         drifting_pair=pair,
         sigma_xyz=sigma_xyz,
-        z_scale=_known(stretch.scale.value),
-        z_scale_stderr=_known(stretch.scale.stderr),
-        scan_blur=_known(blur.value),
+        z_scale=finite_or_none(stretch.scale.value),
+        z_scale_stderr=finite_or_none(stretch.scale.stderr),
+        scan_blur=finite_or_none(blur.value),
         swaps=swaps,
         cuts=cuts,
         extra=extra,
@@ -242,22 +242,18 @@ def judge_quality(
         fraction=motion.fitted.size / len(motion.time),
         warnings=(*soft, *_odd_scale(stretch.scale), *_scanned(delay), *_blurred(blur, stated)),
         notes=(*_misfits_noted(misfit, soft, body), *_ratio_noted(blur, stated)),
-        scan_blur_stderr=_known(blur.stderr),
-        scan_delay=_known(delay.value),
-        scan_delay_stderr=_known(delay.stderr),
+        scan_blur_stderr=finite_or_none(blur.stderr),
+        scan_delay=finite_or_none(delay.value),
+        scan_delay_stderr=finite_or_none(delay.stderr),
         misfits=int(misfit.any(axis=1).sum()),
     )
-
-
-def _known(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None
 
 
 def _over_stated(motion: RigidMotion, sigma: ArrayLike | None) -> float | None:
     if sigma is None:
         return None
     stated = float(np.sqrt(np.mean(as_sigma(sigma, motion.template.shape[1]) ** 2)))
-    return _known(motion.sigma / stated) if stated > 0 else None
+    return finite_or_none(motion.sigma / stated) if stated > 0 else None
 
 
 def _softness(

@@ -28,7 +28,7 @@ from perrin.movie.checks import (
     unrefined,
     unsettled,
 )
-from perrin.movie.parts import PartWriter, open_parts, read_parts, write_whole
+from perrin.movie.parts import PartWriter, open_parts, read_parts
 from perrin.movie.stacks import analyze_stack
 from perrin.movie.stages import Located, Workplace, fit_poses, locate_frames
 from perrin.movie.workers import check_workers, work_through
@@ -74,5 +74,4 @@ __all__ = [
     "unrefined",
     "unsettled",
     "work_through",
-    "write_whole",
 ]

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import json
-import os
 import time
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from perrin.errors import PartsError
+from perrin.tracks.writing import written_whole
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -56,7 +56,8 @@ def open_parts(folder: Path, settings: Mapping[str, Any]) -> set[str]:
         if told:
             raise PartsError(f"{folder} holds the parts of another run: {'; '.join(told)}")
     else:
-        write_whole(place, json.dumps(plain, indent=2).encode())
+        with written_whole(place) as beside:
+            beside.write_text(json.dumps(plain, indent=2), encoding="utf-8")
     return {p.name for p in folder.glob("part-*.parquet")}
 
 
@@ -139,43 +140,8 @@ class PartWriter:
         part = pd.concat(tables, ignore_index=True)
         part.attrs = {"entries": self._entries}
         first = min(int(e["frame"]) for e in self._entries)
-        write_whole(
-            self.folder / f"part-{first:07d}-{uuid.uuid4().hex[:8]}.parquet",
-            part.to_parquet(index=False),
-        )
+        place = self.folder / f"part-{first:07d}-{uuid.uuid4().hex[:8]}.parquet"
+        with written_whole(place) as beside:
+            part.to_parquet(beside, index=False)
         self._tables, self._entries = [], []
         self._written = time.monotonic()
-
-
-def write_whole(place: Path, content: bytes) -> None:
-    """Write a file that appears whole or not at all, and outlasts a power cut once it is there.
-
-    Raises
-    ------
-    OSError
-        If it cannot be written.
-    """
-    beside = place.with_name(f".{place.name}.{os.getpid()}.tmp")
-    try:
-        with open(beside, "wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        beside.replace(place)
-        _sync_folder(place.parent)
-    except OSError as fault:
-        # A write says what is wrong, but not where.
-        raise OSError(fault.errno, fault.strerror, str(place)) from fault
-    finally:
-        beside.unlink(missing_ok=True)
-
-
-def _sync_folder(folder: Path) -> None:
-    """Make the renaming itself outlast a power cut, where the system can."""
-    if os.name != "posix":
-        return
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)

@@ -15,8 +15,9 @@ from perrin.images.optics.optics import Optics
 from perrin.images.optics.window_fit import RigidCenters
 from perrin.images.spheres.localisation import Method, choose_method, found_table, sample_frames
 from perrin.images.spheres.poses import Pose, pose_in, with_poses
-from perrin.movie.parts import PartWriter, open_parts, read_parts, write_whole
+from perrin.movie.parts import PartWriter, open_parts, read_parts
 from perrin.movie.workers import work_through
+from perrin.tracks.writing import written_whole
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -154,7 +155,8 @@ def locate_frames(
         place.tell(0, 0, "learning mass cut and optics")
         learned = _learned(stack, search, refine=refine, optics=optics, frames=frames)
         open_parts(place.folder, settings)
-        write_whole(known, json.dumps(learned).encode())
+        with written_whole(known) as beside:
+            beside.write_text(json.dumps(learned), encoding="utf-8")
     found = learned["optics"]
     method = Method(
         replace(search, minmass=learned["minmass"]),

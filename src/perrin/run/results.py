@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from perrin._text import _number, with_error
+from perrin._arrays import finite_or_none
+from perrin._text import with_error
 from perrin.curves.displacement import LagCurve, msad, msd
 from perrin.diffusion.estimate import DiffusionEstimate, _estimate_dict, _estimate_from
 from perrin.diffusion.step_tests import without_spin
@@ -112,10 +113,10 @@ class ClusterResult:
             "n_frames": int(self.motion.fitted.size),
             "D_R": _estimate_dict(self.D_R),
             "D_T": _estimate_dict(self.D_T),
-            "sigma": _number(self.motion.sigma),
+            "sigma": finite_or_none(self.motion.sigma),
             "sigma_xyz": None if xyz is None else list(xyz),
-            "phi2": {"measured": _number(self.phi2_measured), "predicted": self.noise.phi2},
-            "snr": _number(self.D_R.snr),
+            "phi2": {"measured": finite_or_none(self.phi2_measured), "predicted": self.noise.phi2},
+            "snr": finite_or_none(self.D_R.snr),
             "tensor": None if self.tensor is None else _tensor_dict(self.tensor),
             "sizes": None if self.sizes is None else _sizes_dict(self.sizes),
             "size_factor": next((s.factor for s in (self.sizes or {}).values()), None),
@@ -170,9 +171,9 @@ class RodResult:
             "D_perp": _estimate_dict(self.D_perp),
             "D_T": _estimate_dict(self.D_T),
             "length": self.motion.length,
-            "sigma": _number(self.motion.sigma),
+            "sigma": finite_or_none(self.motion.sigma),
             "sigma_xyz": None,
-            "snr": _number(self.D_perp.snr),
+            "snr": finite_or_none(self.D_perp.snr),
             "tensor": None,
             "sizes": None,
             "prediction": None if self.prediction is None else self.prediction.to_dict(),

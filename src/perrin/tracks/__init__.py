@@ -23,6 +23,7 @@ from perrin.tracks.screening import (
     has_trackpy_columns,
     screen_rows,
 )
+from perrin.tracks.writing import written_whole
 
 __all__ = [
     "Clock",
@@ -58,4 +59,5 @@ __all__ = [
     "touching_groups",
     "unit_faults",
     "write_tracks",
+    "written_whole",
 ]

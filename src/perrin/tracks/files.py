@@ -16,6 +16,7 @@ from perrin._text import listed
 from perrin.errors import table_error
 from perrin.tracks.column_names import COLUMNS, Spelling, recognise_columns, seconds, unit_faults
 from perrin.tracks.gdf import gdf_bytes, parse_gdf
+from perrin.tracks.writing import written_whole
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -210,12 +211,8 @@ def write_tracks(table: pd.DataFrame, path: _PathLike) -> None:
     target = Path(path)
     to_bytes = _WRITERS[_suffix(target.name)]
     data = to_bytes(check_tracks(table, source="the table"), os.fspath(path))
-    beside = target.with_name(f".{target.name}.{os.getpid()}.part")
-    try:
+    with written_whole(target) as beside:
         beside.write_bytes(data)
-        beside.replace(target)
-    finally:
-        beside.unlink(missing_ok=True)
 
 
 def read_spheres(path: _PathLike) -> tuple[Floats, Floats | None]:
