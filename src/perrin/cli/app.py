@@ -642,7 +642,3 @@ def _check_demo(folder: Path) -> None:
         f"{folder} is not what a demo wrote ({reason}): not overwritten; move it away, or choose "
         "another folder with -o"
     )
-
-
-if __name__ == "__main__":
-    main()

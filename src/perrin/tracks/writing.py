@@ -41,6 +41,8 @@ def written_whole(place: Path) -> Iterator[Path]:
         if os.name == "posix":
             _flush(place.parent)
     except OSError as fault:
+        if fault.errno is None:
+            raise
         # The system's message names the path beside, or none.
         raise type(fault)(fault.errno, fault.strerror, str(place)) from fault
     finally:
