@@ -195,7 +195,7 @@ def test_a_killed_run_goes_on_and_gives_the_same(tmp_path, movie_file, whole, co
     script = tmp_path / "script.py"
     script.write_text(
         "from perrin.cli import main\n"
-        "from perrin.images import stages\n"
+        "from perrin.movie import stages\n"
         "from perrin.movie.parts import PartWriter\n"
         "stages.PartWriter = lambda folder: PartWriter(folder, seconds=0.0)\n"
         "main()\n"
