@@ -81,6 +81,11 @@ class RigidMotion:
         )
 
     @property
+    def dimension(self) -> int:
+        """Number of coordinates of a point: 2 or 3."""
+        return int(self.template.shape[1])
+
+    @property
     def fitted(self) -> Ints:
         """Indices of the frames that have a pose."""
         return np.flatnonzero(np.isfinite(self.center[:, 0]))
@@ -165,7 +170,7 @@ class RigidMotion:
             Unit vectors in the lab frame.
         """
         p = np.atleast_1d(np.asarray(p0, dtype=np.float64))
-        d = self.template.shape[1]
+        d = self.dimension
         length = np.linalg.norm(p, axis=-1, keepdims=True)
         if p.ndim > 2 or p.shape[-1] != d or not np.all((length > 0) & (length < np.inf)):
             raise ValueError(f"p0: expected directions ({d},) or (K, {d}), none zero, got {p0!r}")
@@ -235,7 +240,7 @@ class RigidMotion:
         """Return the fitted rotations as a scipy `Rotation`, and their frame indices."""
         from scipy.spatial.transform import Rotation
 
-        if self.template.shape[1] != 3:
+        if self.dimension != 3:
             raise ValueError("scipy rotations are three-dimensional; this motion is in the plane")
         return Rotation.from_matrix(self.rotation[self.fitted]), self.fitted
 
@@ -243,7 +248,7 @@ class RigidMotion:
         """Return a table with a row per frame; what belongs to all of them is in ``attrs``."""
         import pandas as pd
 
-        axes = "xyz"[: self.template.shape[1]]
+        axes = "xyz"[: self.dimension]
         columns: dict[str, object] = {"time": self.time}
         columns |= {a: self.center[:, i] for i, a in enumerate(axes)}
         columns |= {

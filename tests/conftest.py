@@ -1,0 +1,21 @@
+"""The two lengths of the Monte-Carlo tests: quick for every change, long before a release."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pytest
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Add the option --long."""
+    parser.addoption("--long", action="store_true", help="all repeats of the Monte-Carlo tests")
+
+
+@pytest.fixture(scope="session")
+def repeats(request: pytest.FixtureRequest) -> Callable[[int, int], int]:
+    """Choose between two numbers of repeats: the first, or with --long the second."""
+    return lambda quick, long: long if request.config.getoption("--long") else quick
