@@ -133,7 +133,7 @@ def module_of(path: Path) -> str:
     return ".".join(path.relative_to(SOURCE).with_suffix("").parts)
 
 
-SOURCES = [p for p in SOURCE.rglob("*.py") if p.stem != "__init__"]
+SOURCES = [p for p in SOURCE.rglob("*.py") if p.stem not in ("__init__", "__main__")]
 
 
 def test_subpackages_import_only_those_above_them():
