@@ -1,4 +1,4 @@
-# The workshop. `make` alone lists what can be made; settings of the tools are in pyproject.toml.
+# Every command of development. `make` alone lists them; settings of the tools are in pyproject.toml.
 # PYTHON=/path/to/python chooses the interpreter; otherwise the first one that will do is taken.
 
 SHELL := /bin/sh
@@ -31,7 +31,7 @@ venv_works = $(shell $(1)/bin/python -c 'import sys, pip; sys.exit(sys.version_i
 make_venv = $(if $(call venv_works,$(1)),:,$(call new_venv,$(1),$(find_python)))
 new_venv = $(call check_python,$(2))rm -rf $(1); $(2) -m venv $(1) || { echo '$(call no_venv,$(2))' >&2; exit 1; }
 
-.PHONY: help demo test test-lowest coverage lint types doctests docs lock clean
+.PHONY: help demo test test-lowest benchmarks long lint types doctests docs lock clean
 
 help:  ## list these targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1 - \2/p' Makefile | awk -F ' - ' '{printf "%-18s %s\n", $$1, $$2}'
@@ -39,8 +39,8 @@ help:  ## list these targets
 demo: .venv/.demo  ## the main job on an embedded table, into perrin-demo/
 	$(BIN)/perrin demo
 
-test: .venv/.test  ## the whole suite
-	$(RUN) pytest -q
+test: .venv/.test  ## the whole suite, on all cores
+	OMP_NUM_THREADS=1 $(RUN) pytest -q -n auto --dist loadfile
 
 test-lowest:  ## the suite on the oldest dependencies allowed (Python 3.11)
 	@$(call make_venv,.venv-lowest)
@@ -49,8 +49,16 @@ test-lowest:  ## the suite on the oldest dependencies allowed (Python 3.11)
 	.venv-lowest/bin/python -m pip install --quiet --disable-pip-version-check --no-deps -e .
 	.venv-lowest/bin/python -m pytest -q
 
-coverage: .venv/.test  ## do intervals cover? a quick look (docs/validation.md has the long one)
+benchmarks: .venv/.test  ## the quick benchmarks: coverage of intervals, warnings, the paper's claims
 	$(BIN)/python benchmarks/intervals.py --quick
+	$(BIN)/python benchmarks/alarms.py --quick --jobs 2
+	$(BIN)/python benchmarks/paper.py
+	$(BIN)/python benchmarks/structure.py
+
+long: .venv/.test  ## the Monte-Carlo tests with all repeats, and 40 tables of every warning (hours)
+	OMP_NUM_THREADS=1 $(RUN) pytest -q --long -n auto --dist loadfile
+	$(BIN)/python benchmarks/intervals.py
+	$(BIN)/python benchmarks/alarms.py --repeats 40 --jobs 2
 
 lint: .venv/.test  ## ruff: rules and format
 	$(RUN) ruff check .
