@@ -36,7 +36,7 @@ def as_positions(positions: ArrayLike, *, name: str = "positions") -> Floats:
 
 
 def present(points: Floats) -> Bools:
-    """Return which points (..., d) are there: those without a NaN, shape (...)."""
+    """Return which points (..., d) are present, those without a NaN: shape (...)."""
     return np.asarray(~np.isnan(points).any(axis=-1), dtype=np.bool_)
 
 
@@ -202,6 +202,6 @@ def from_plain(value: Any, *, dtype: type = np.float64) -> NDArray[Any]:  # noqa
 
 
 def frozen(*arrays: NDArray[Any]) -> None:
-    """Make the arrays of a result read-only, so that a result cannot change after the fact."""
+    """Make the arrays of a result read-only."""
     for array in arrays:
         array.setflags(write=False)

@@ -34,7 +34,7 @@ def listed(items: Iterable[object], *, most: int = 10) -> str:
 
 
 def frames_text(frames: Iterable[int], *, most: int = 10) -> str:
-    """Return frame numbers as they stand in a sentence, at most `most` of them.
+    """Return frame numbers for a sentence, at most `most` of them.
 
     Parameters
     ----------
@@ -66,7 +66,7 @@ def with_error(value: float, stderr: float) -> str:
     if not (np.isfinite(stderr) and stderr > 0):
         return f"{value:.3g}"
     exponent = int(np.floor(np.log10(stderr)))
-    # Two digits of an error below 20, one above: the last digit then says 5 to 50 %.
+    # Two digits for 10 to 19, one otherwise: rounding then changes the error by less than 25 %.
     digits = -exponent + (1 if round(stderr / 10**exponent, 1) < 2 else 0)
     shown = round(stderr * 10.0**digits)
     if digits <= 0:
@@ -75,7 +75,7 @@ def with_error(value: float, stderr: float) -> str:
 
 
 def number_text(value: float, stderr: float = np.nan, *, digits: int = 3) -> str:
-    """Write a number, with its standard error in the last digits, and a power of ten if need be.
+    """Write a number, with its standard error in the last digits, and a power of ten where it is needed.
 
     Parameters
     ----------
@@ -104,7 +104,7 @@ def number_text(value: float, stderr: float = np.nan, *, digits: int = 3) -> str
 
 
 def significant(value: float, digits: int) -> str:
-    """Write a number with so many significant digits and no exponent: 1840, not 1.84e+03."""
+    """Write a number with `digits` significant digits and no exponent: 1840, not 1.84e+03."""
     text = np.format_float_positional(
         value, precision=digits, fractional=False, unique=False, trim="k"
     )
@@ -112,7 +112,7 @@ def significant(value: float, digits: int) -> str:
 
 
 def power_of(value: float) -> int:
-    """Return the power of ten to write before a value; 0 where plain digits read well."""
+    """Return the power of ten to write after a value; 0 for values from 0.001 to 100000."""
     if not np.isfinite(value) or value == 0 or 1e-3 <= abs(value) < 1e5:
         return 0
     return int(np.floor(np.log10(abs(value))))
@@ -124,7 +124,7 @@ def ten_to(power: int) -> str:
 
 
 def unit_text(ascii_unit: str) -> str:
-    """Return a unit as print shows it: um^2/s becomes µm²/s."""
+    """Return a unit in typographic form: um^2/s becomes µm²/s."""
     return ascii_unit.replace("um", "µm").replace("^2", "²")
 
 

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 
 class DegenerateClusterError(ValueError):
-    """Too few particles, or collinear ones: the orientation has no unique answer.
+    """Fewer than three particles, or collinear ones: the orientation is not unique.
 
     Attributes
     ----------
     indices : tuple of int
-        The offending rows (frames), or the particles' count where one number says it all.
+        Rows (frames) without a unique orientation, or the number of particles where no row has one.
     collinear : bool
-        Whether the particles lie on one line within the noise: they may still have a direction.
+        Whether the particles lie on one line within the noise; a line still has a direction.
     """
 
     def __init__(
@@ -23,12 +23,12 @@ class DegenerateClusterError(ValueError):
 
 
 class TooFewFramesError(ValueError):
-    """Too few frames with a pose to answer the question.
+    """Fewer frames with a pose than the estimate needs.
 
     Attributes
     ----------
     n_frames : int
-        The frames that were there.
+        Number of frames with a pose.
     """
 
     def __init__(self, message: str, n_frames: int = 0) -> None:
@@ -37,12 +37,12 @@ class TooFewFramesError(ValueError):
 
 
 class TrackTableError(ValueError):
-    """A track table that cannot be read as one; the message lists every fault found.
+    """A table that is no track table; the message lists every fault.
 
     Attributes
     ----------
     faults : tuple of str
-        One line per fault.
+        One line for each fault.
     """
 
     def __init__(self, message: str, faults: tuple[str, ...] = ()) -> None:
@@ -51,22 +51,22 @@ class TrackTableError(ValueError):
 
 
 class NoSpheresError(ValueError):
-    """The images show no spheres that could be measured in the way that was asked for."""
+    """The images show no spheres that can be measured with the given arguments."""
 
 
 class IdentityError(ValueError):
-    """Which particle is which cannot be told: frames are too far apart."""
+    """The labels of particles cannot be determined: the frames are too far apart."""
 
 
 class FrameError(ValueError):
-    """One frame of a stack cannot be read; the others may be.
+    """One frame of a stack cannot be read; the other frames may be readable.
 
     Attributes
     ----------
     frame : int
-        Which frame, from 0.
+        Number of the frame, counted from 0.
     source : str
-        The file.
+        Path of the file.
     """
 
     def __init__(self, message: str, frame: int = 0, source: str = "") -> None:
@@ -84,16 +84,16 @@ def table_error(source: str, *faults: str) -> TrackTableError:
 
 
 class PrecisionWarning(UserWarning):
-    """The number is right but says less than it seems to."""
+    """A number is correct, but less precise or less general than it seems."""
 
 
 class UnitWarning(PrecisionWarning):
-    """A number is possible, but usual only in another unit."""
+    """A number is possible, but it is usual only in another unit."""
 
 
 class IdentityWarning(UserWarning):
-    """Which particle is which, or what belongs together, was assumed and not measured."""
+    """Labels of particles, or their grouping into clusters, were corrected or assumed."""
 
 
 class PartsError(ValueError):
-    """The parts of another run stand in the folder."""
+    """The folder holds the unfinished parts of another run."""
