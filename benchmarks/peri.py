@@ -20,7 +20,7 @@ from PIL import Image, ImageSequence
 from scipy.spatial.distance import cdist
 
 import perrin
-from perrin.images.optics.crowd_equations import first_light
+from perrin.images.optics.crowd_equations import fit_brightness
 from perrin.images.optics.crowd_fit import fit_crowd
 from perrin.images.spheres.by_trackpy import find_features
 from perrin.images.spheres.localisation import Search, choose_method, sample_frames
@@ -71,13 +71,13 @@ def report(name, places, listed):
 
 def misfit_at(fit, places):
     """Return chi-squared per voxel with the spheres at other places, their brightness refitted."""
-    centers = fit.light.centers.copy()
+    centers = fit.intensity.centers.copy()
     distance = cdist(places, centers)
     for place, k, near in zip(places, distance.argmin(1), distance.min(1), strict=True):
         if near < D / 3:
             centers[k] = place
-    light = first_light(fit.scene, centers)
-    return fit.light.misfit(fit.scene, light.expected) / fit.light.counted
+    state = fit_brightness(fit.window, centers)
+    return fit.intensity.chi2(fit.window, state.expected) / fit.intensity.n_voxels
 
 
 def draw(frame, places, listed, path):
@@ -136,13 +136,13 @@ def main():
     fit = fit_crowd(frame, first, others=nobody, contact=D, image=image, noise=optics.noise)
     for name, places in (("refined", fit.centers), ("found first", first), ("listed", listed)):
         print(f"chi2 with the spheres at the places {name}: {misfit_at(fit, places):.3f}")
-    left = (fit.scene.data - fit.light.expected)[fit.scene.mask].std()
+    left = (fit.window.data - fit.intensity.expected)[fit.window.mask].std()
     white = [np.diff(frame, 2, axis=axis).std() / np.sqrt(6) for axis in range(3)]
     print(f"left over by the model {left:.2f} grey levels; second differences of the image along")
     print("z, y, x, which know no model, say that its noise is", np.round(white, 2).tolist())
     rng = np.random.default_rng(args.seed)
-    noise = rng.normal(size=frame.shape) / np.sqrt(optics.noise.weight(fit.light.expected))
-    twin = np.clip(np.round(fit.light.expected + noise), 0, 255)
+    noise = rng.normal(size=frame.shape) / np.sqrt(optics.noise.weight(fit.intensity.expected))
+    twin = np.clip(np.round(fit.intensity.expected + noise), 0, 255)
     search = {"diameter": D, "contact": D, "voxel": VOXEL, "dark": True}
     again = find_features(twin, percentile=95, border=True, **search)
     bright = again.centers[again.mass > 0.5 * np.median(again.mass)]

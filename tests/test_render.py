@@ -10,7 +10,7 @@ import pytest
 from scipy.special import erf
 
 from perrin import Cluster, render_stack, simulate_motion
-from perrin.images.optics.render import ball_image
+from perrin.images.optics.render import blurred_ball
 
 VOXEL, PSF, BALL = (0.25, 0.2, 0.2), (0.4, 0.15, 0.15), 2.45
 SHAPE = (32, 28, 30)
@@ -71,7 +71,7 @@ def test_a_sphere_is_exact(radius, psf):
     rng = np.random.default_rng(2)
     offsets = tuple(rng.uniform(-1, 1, 5) * (radius + 2 * s) for s in psf)
     z, y, x = offsets
-    image = ball_image(
+    image = blurred_ball(
         (z, np.tile(y, (5, 1)), np.tile(x, (5, 1))), radius=radius, psf=np.array(psf)
     )
     points = np.stack(np.meshgrid(*offsets, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -84,7 +84,7 @@ def test_light_is_kept_and_its_centre_is_the_sphere():
     """The sum is the volume of the ball, the centre of light is its place, the peak is stated."""
     frame = render_stack([[MIDDLE]], photons=40.0, **BARE).frame(0)
     one = np.zeros((1, 1))
-    peak = ball_image((one[0], one, one), radius=BALL / 2, psf=np.array(PSF)).item()
+    peak = blurred_ball((one[0], one, one), radius=BALL / 2, psf=np.array(PSF)).item()
     volume = np.pi / 6 * BALL**3 / np.prod(VOXEL)
     # The voxel grid is a trapezoidal rule: exact to exp(-2 pi^2 sigma^2 / h^2) = 2e-5 in x and y;
     # tails are cut at 5 sigma.
