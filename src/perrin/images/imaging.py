@@ -148,7 +148,9 @@ class Imaging:
 _TABLES = ("features", "frames", "spots")
 
 
-_IMAGING_SETTINGS = tuple(field.name for field in fields(Imaging) if field.name not in (*_TABLES, "views"))
+_IMAGING_SETTINGS = tuple(
+    field.name for field in fields(Imaging) if field.name not in (*_TABLES, "views")
+)
 
 
 def _settings_from(entry: Mapping[str, Any]) -> dict[str, Any]:
