@@ -189,14 +189,19 @@ def test_axes_without_names_keep_every_image_in_its_place(tmp_path, name, writte
 @pytest.mark.parametrize(
     ("shape", "axes", "asked", "message"),
     [
-        ((5, 12, 16), None, {}, "does not say whether its 5 images are times or planes: pass plan"),
+        (
+            (5, 12, 16),
+            None,
+            {},
+            "does not state whether its 5 images are times or planes: pass plan",
+        ),
         ((5, 4, 12, 16), None, {}, "4 images along axis 1 tifffile took for colours: pass planes"),
-        ((2, 3, 5, 12, 16), None, {}, "does not say what its axes of 2, 3, 5 images are: pass"),
-        ((2, 3, 5, 12, 16), None, {"planes": 5}, "does not say what its axes of 2, 3, 5 images"),
-        ((2, 5, 5, 12, 16), None, {"planes": 5, "channel": 1}, "does not say what its axes of 2"),
-        ((2, 1, 5, 12, 16), None, {}, "does not say what its axes of 2, 5 images are"),
+        ((2, 3, 5, 12, 16), None, {}, "does not state what its axes of 2, 3, 5 images are: pass"),
+        ((2, 3, 5, 12, 16), None, {"planes": 5}, "does not state what its axes of 2, 3, 5 images"),
+        ((2, 5, 5, 12, 16), None, {"planes": 5, "channel": 1}, "does not state what its axes of 2"),
+        ((2, 1, 5, 12, 16), None, {}, "does not state what its axes of 2, 5 images are"),
         ((2, 5, 12, 16), None, {"planes": 1}, "has 5 planes a frame, not planes=1"),
-        ((2, 5, 12, 16), "TQYX", {}, "does not say what its axes of 5 images are"),
+        ((2, 5, 12, 16), "TQYX", {}, "does not state what its axes of 5 images are"),
         ((2, 5, 12, 16), "TTYX", {}, "has axes TTYX, several of one name"),
     ],
 )

@@ -32,6 +32,12 @@ class View:
         Number of the frame in the stack.
     xy, xz, yz : ndarray, shapes (y, x), (z, x), (z, y)
         Grey levels.
+
+    Examples
+    --------
+    >>> view = View(7, np.ones((4, 5)), np.ones((3, 5)), np.ones((3, 4)))
+    >>> View.from_dict(view.to_dict()).xz.shape
+    (3, 5)
     """
 
     frame: int

@@ -355,6 +355,12 @@ def array_contents(given: Any, pick: Pick) -> tuple[Contents, _ArrayFrames]:  # 
     ------
     ValueError
         For another number of axes, or choices that are for files.
+
+    Examples
+    --------
+    >>> contents, read = array_contents(np.zeros((5, 12, 16)), Pick(planes=1))
+    >>> contents.shape, read(4).shape
+    ((5, 1, 12, 16), (1, 12, 16))
     """
     array = given if hasattr(given, "shape") else np.asarray(given)
     if pick.channel is not None or pick.image is not None:

@@ -56,6 +56,11 @@ class Pick(NamedTuple):
         Number of planes of a frame, where the file does not distinguish times from planes.
     image : int or str or None
         Number or name of the image in a file that holds several.
+
+    Examples
+    --------
+    >>> Pick(planes=4)
+    Pick(channel=None, planes=4, image=None)
     """
 
     channel: int | None = None
@@ -239,6 +244,15 @@ def layout(sizes: Mapping[str, int], pick: Pick, *, cut: bool = False) -> Layout
     ValueError
         If there are several channels and none is chosen, if an axis is neither time, plane nor
         channel, or if images could be times as well as planes.
+
+    Examples
+    --------
+    >>> where = layout({"T": 5, "Z": 4, "Y": 12, "X": 16}, Pick())
+    >>> where.t, where.z, where.at(3, 1)
+    (5, 4, {'T': 3, 'Z': 1, 'C': 0})
+    >>> where = layout({"I": 20, "Y": 12, "X": 16}, Pick(planes=4))
+    >>> where.t, where.z, where.at(3, 1)
+    (5, 4, {'I': 13, 'C': 0})
     """
     size = {axis: n for axis, n in sizes.items() if n > 1 and axis not in "YX"}
     fixed = channel_index({a: size.pop(a) for a in "CS" if a in size}, pick.channel)
@@ -249,7 +263,7 @@ def layout(sizes: Mapping[str, int], pick: Pick, *, cut: bool = False) -> Layout
             "as a file of its own"
         )
     if len(size) > 1 and set(size) - set("TZ"):
-        raise ValueError(f"does not say which of its axes {size} are times and which planes")
+        raise ValueError(f"does not state which of its axes {size} are times and which planes")
     unnamed = not set(size) <= set("TZ")
     cut = cut and (unnamed or not size)
     if cut and not size and pick.planes is None:
@@ -257,8 +271,8 @@ def layout(sizes: Mapping[str, int], pick: Pick, *, cut: bool = False) -> Layout
     if unnamed and pick.planes is None:
         n = prod(size.values())
         raise ValueError(
-            f"does not say whether its {n} images are times or planes: pass planes=1 (a 2-D movie),"
-            f" planes={n} (one stack) or the number of planes of one frame"
+            f"does not state whether its {n} images are times or planes: pass planes=1 (a 2-D "
+            f"movie), planes={n} (one stack) or the number of planes of one frame"
         )
     t, z = size.get("T", 1), size.get("Z", 1)
     if pick.planes is None or (not unnamed and pick.planes == z):
@@ -290,6 +304,12 @@ def frames_of_planes(
     ------
     ValueError
         If the images do not make whole frames.
+
+    Examples
+    --------
+    >>> where = frames_of_planes({"I": 20}, 4, {}, cut=False)
+    >>> where.t, where.at(3, 1)
+    (5, {'I': 13})
     """
     if len(size) > 1:
         raise ValueError(f"has {size['Z']} planes a frame, not planes={planes}")
@@ -320,6 +340,11 @@ def channel_index(size: dict[str, int], channel: int | None) -> dict[str, int]:
     ------
     ValueError
         If the channel does not exist, or none of several is chosen.
+
+    Examples
+    --------
+    >>> channel_index({"C": 2}, 1), channel_index({}, None)
+    ({'C': 1}, {'C': 0})
     """
     if len(size) > 1:
         raise ValueError("has channels of several colours each: save one channel as grey values")
@@ -338,6 +363,11 @@ def chosen(names: list[str], image: int | str | None) -> int:
     ------
     ValueError
         If there is no such image, or none of several is chosen.
+
+    Examples
+    --------
+    >>> chosen(["overview", "stack"], "stack"), chosen(["overview", "stack"], 0)
+    (1, 0)
     """
     if image is None and len(names) == 1:
         return 0
@@ -355,6 +385,11 @@ def needed(module: str, extra: str) -> Any:  # noqa: ANN401 (any module)
     ------
     ImportError
         If it is not installed, with the command that installs it.
+
+    Examples
+    --------
+    >>> needed("numpy", "images").__name__
+    'numpy'
     """
     try:
         return import_module(module)
@@ -367,12 +402,24 @@ def needed(module: str, extra: str) -> Any:  # noqa: ANN401 (any module)
 
 
 def in_um(value: object, unit: str | None) -> float:
-    """Return a positive length in um; NaN where there is none or its unit is not a length."""
+    """Return a positive length in um; NaN where there is none or its unit is not a length.
+
+    Examples
+    --------
+    >>> in_um(250, "nm"), in_um("2e-7", "m"), in_um(1.0, "pixel")
+    (0.25, 0.19999999999999998, nan)
+    """
     return _converted(value, unit, _UM_PER_UNIT)
 
 
 def in_seconds(value: object, unit: str | None) -> float:
-    """Return a positive time in seconds; NaN where there is none or its unit is not a time."""
+    """Return a positive time in seconds; NaN where there is none or its unit is not a time.
+
+    Examples
+    --------
+    >>> in_seconds(730, "ms"), in_seconds(2, "min"), in_seconds(None, "s")
+    (0.73, 120.0, nan)
+    """
     return _converted(value, unit, _SECONDS_PER_UNIT)
 
 
@@ -388,7 +435,13 @@ def _converted(value: object, unit: str | None, table: Mapping[str, float]) -> f
 
 
 def even_times(n: int, dt: float) -> Floats | None:
-    """Return n even times from 0; None for an unknown interval, unless one frame needs none."""
+    """Return n even times from 0; None for an unknown interval, unless one frame needs none.
+
+    Examples
+    --------
+    >>> even_times(3, 0.5), even_times(3, np.nan), even_times(1, np.nan)
+    (array([0. , 0.5, 1. ]), None, array([0.]))
+    """
     if n == 1:
         return np.zeros(1)
     return np.arange(n, dtype=np.float64) * dt if np.isfinite(dt) else None

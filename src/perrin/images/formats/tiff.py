@@ -216,6 +216,11 @@ def axis_roles(
     ------
     ValueError
         If `pick` does not decide.
+
+    Examples
+    --------
+    >>> axis_roles([0, 1, 2], [], (2, 3, 5, 12, 16), Pick(planes=5, channel=1))
+    {0: 'T', 1: 'C', 2: 'Z'}
     """
     if not unknown or (len(unknown) == 1 and not known):
         return dict.fromkeys(unknown, "Q")
@@ -232,7 +237,7 @@ def axis_roles(
     }.get((len(unknown), tuple(known)), "")
     if not roles:
         raise ValueError(
-            f"has shape {shape} and does not say what its axes of "
+            f"has shape {shape} and does not state what its axes of "
             f"{', '.join(map(str, sizes))} images are: pass planes=, the number of planes of one "
             "frame, and channel= if one of them is channels (times come first then), or write the "
             "file with its axes, as in imwrite(..., metadata={'axes': 'TZYX'})"
@@ -337,6 +342,16 @@ def ome_scale(xml: str, number: int, where: Layout, channel: int) -> HeaderScale
     -------
     HeaderScale
         The measured times where every frame has one, else even ones.
+
+    Examples
+    --------
+    >>> xml = (
+    ...     '<OME xmlns="a"><Image><Pixels PhysicalSizeZ="0.25" PhysicalSizeY="200" '
+    ...     'PhysicalSizeYUnit="nm" TimeIncrement="0.5"/></Image></OME>'
+    ... )
+    >>> scale = ome_scale(xml, 0, layout({"T": 3, "Z": 4}, Pick()), 0)
+    >>> scale.voxel, scale.times
+    (array([0.25, 0.2 ,  nan]), array([0. , 0.5, 1. ]))
     """
     from xml.etree import ElementTree
 

@@ -274,6 +274,13 @@ def ngff_scale(scales: Any, n: int) -> Floats:  # noqa: ANN401 (a JSON header)
     Returns
     -------
     ndarray, shape (n,)
+
+    Examples
+    --------
+    >>> scale = {"type": "scale", "scale": [1.0, 0.25, 0.2, 0.2]}
+    >>> dataset = {"path": "0", "coordinateTransformations": [scale]}
+    >>> ngff_scale({"datasets": [dataset]}, 4)
+    array([1.  , 0.25, 0.2 , 0.2 ])
     """
     total = np.ones(n)
     for holder in (scales["datasets"][0], scales):
@@ -301,7 +308,13 @@ _READERS: dict[str, Callable[[str, Pick], Contents]] = {
 
 
 def vendor(path: str) -> Callable[[str, Pick], Contents] | None:
-    """Return the reader of a file by its suffix; None for all other files."""
+    """Return the reader of a file by its suffix; None for all other files.
+
+    Examples
+    --------
+    >>> vendor("movie.lif").__name__, vendor("movie.tif")
+    ('lif', None)
+    """
     if (Path(path) / ".zgroup").exists() or (Path(path) / "zarr.json").exists():
         return ome_zarr
     return _READERS.get(Path(path).suffix.lower())

@@ -56,6 +56,13 @@ class SphereImage:
         Voxel size (z, y, x), um.
     blur : tuple of float
         Standard deviations of point spread and voxel together, (z, plane), um.
+
+    Examples
+    --------
+    >>> image = sphere_image(diameter=2.0, psf=(0.4, 0.15), voxel=(0.25, 0.2, 0.2))
+    >>> spot = image.spot(np.array([3.0, 3.0, 3.0]), (24, 32, 32))
+    >>> spot.value.shape, round(float(spot.value.max()), 2)
+    ((23, 17, 17), 0.98)
     """
 
     diameter: float

@@ -135,6 +135,21 @@ def fit_crowd(
     and spheres are added where one more of them decreases chi-squared most. Spheres may lie beyond
     the border of the frame if their images reach into it; they are not among the positions
     returned.
+
+    Examples
+    --------
+    >>> from perrin.images import CameraNoise, sphere_image
+    >>> image = sphere_image(diameter=2.0, psf=(0.4, 0.15), voxel=(0.25, 0.2, 0.2))
+    >>> truth = np.array([[3.0, 3.0, 2.5], [3.0, 3.0, 4.5]])
+    >>> frame = np.full((24, 31, 36), 9.0)
+    >>> for spot in (image.spot(center, frame.shape) for center in truth):
+    ...     frame[spot.box] += 100 * spot.value
+    >>> noise, others = CameraNoise(1.0, 0.0), np.empty((0, 3))
+    >>> crowd = fit_crowd(
+    ...     frame, truth[:1] + 0.1, others=others, contact=2.0, image=image, noise=noise
+    ... )
+    >>> crowd.centers.round(3).tolist(), crowd.origin.tolist()
+    ([[3.0, 3.0, 2.5], [3.0, 3.0, 4.5]], [0, -1])
     """
     window = cut_crowd_window(frame, image, noise, centers, others)
     state, start = fit_brightness(window, centers), centers
@@ -332,6 +347,13 @@ def crowd_piece(
         The voxels of the box.
     centers : ndarray, shape (k, 3)
         Positions in the box, um.
+
+    Examples
+    --------
+    >>> row = np.stack([np.full(9, 2.0), np.full(9, 2.0), np.arange(9.0)], axis=1)
+    >>> piece, centers = crowd_piece(np.zeros((5, 5, 9)), row, (1.0, 1.0, 1.0), count=3)
+    >>> piece.shape, centers[:, 2]
+    ((1, 1, 3), array([0., 1., 2.]))
     """
     step = np.array(voxel)
     distance = np.linalg.norm(centers - np.median(centers, axis=0), axis=1)

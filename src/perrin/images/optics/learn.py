@@ -298,7 +298,7 @@ def fit_samples(
         raise NoSpheresError(
             "no spheres to learn the optics from: none was found, or none has voxels to itself; "
             "check diameter, contact and minmass, and whether spheres are dark (dark=True), state "
-            "the optics (optics=), or take the places as found (refine=None)"
+            "the optics (optics=), or keep the positions found first (refine=None)"
         )
     mean = float(np.mean([s.frame.mean() for s in samples]))
     noise = CameraNoise(1.0, 0.05 * abs(mean))
@@ -318,11 +318,11 @@ def fit_samples(
             break
     else:
         raise NoSpheresError(
-            f"sphere size and point spread do not settle: diameter {np.exp(log[0]):.3g}, psf "
+            f"sphere size and point spread do not converge: diameter {np.exp(log[0]):.3g}, psf "
             f"({np.exp(log[1]):.3g}, {np.exp(log[2]):.3g}) um after {_MAX_LEARNING_ROUNDS} rounds "
             f"on {len(samples)} groups: are these spheres, bright enough, or dark (dark=True), and "
-            "is the voxel size right? State the optics (optics=), or take the places as found "
-            "(refine=None)"
+            "is the voxel size right? State the optics (optics=), or keep the positions found "
+            "first (refine=None)"
         )
     size, psf_z, psf = (float(v) for v in np.exp(log))
     error = np.exp(log) * np.sqrt(np.diag(np.linalg.inv(information)))

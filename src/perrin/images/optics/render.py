@@ -428,6 +428,13 @@ def drawing_faults(diameter: float, psf: Floats, *, extent: Floats) -> list[str]
     -------
     list of str
         Empty, or one line.
+
+    Examples
+    --------
+    >>> drawing_faults(1.0, np.full(3, 0.2), extent=np.full(3, 8.0))
+    []
+    >>> drawing_faults(2450.0, np.full(3, 0.2), extent=np.full(3, 8.0))[0][:44]
+    'a sphere of 2450 um is larger than the stack'
     """
     sides = " x ".join(f"{side:.4g}" for side in extent)
     if diameter > extent.max():
@@ -467,6 +474,12 @@ def sphere_paths(
     ------
     ValueError
         For motions in the plane or of different times, or shapes that do not match.
+
+    Examples
+    --------
+    >>> paths, time, n = sphere_paths([[[0.0, 0.0, 0.0]], [[1.0, 0.0, 0.0]]], None, 0.5)
+    >>> time, n, paths(np.array([0.25]))
+    (array([0. , 0.5]), 1, array([[[0.5, 0. , 0. ]]]))
     """
     bodies: tuple[RigidMotion, ...] = ()
     if isinstance(motions, RigidMotion):

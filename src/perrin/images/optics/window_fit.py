@@ -89,7 +89,13 @@ class Arrangement(Protocol):
 
 @dataclass(frozen=True)
 class FreeCenters:
-    """Spheres whose positions are independent."""
+    """Spheres whose positions are independent.
+
+    Examples
+    --------
+    >>> FreeCenters(np.zeros((1, 3))).moved(np.array([0.1, 0.0, 0.2])).centers
+    array([[0.1, 0. , 0.2]])
+    """
 
     centers: Floats
     slope: None = None
@@ -101,7 +107,14 @@ class FreeCenters:
 
 @dataclass(frozen=True)
 class RigidCenters:
-    """Spheres that are points of one rigid body; centre and rotation are in (x, y, z)."""
+    """Spheres that are points of one rigid body; centre and rotation are in (x, y, z).
+
+    Examples
+    --------
+    >>> body = RigidCenters(np.array([1.0, 2.0, 3.0]), np.eye(3), np.array([[0.5, 0.0, 0.0]]))
+    >>> body.centers, body.slope.shape
+    (array([[3. , 2. , 1.5]]), (6, 3))
+    """
 
     center: Floats
     rotation: Floats
@@ -193,14 +206,29 @@ def cut_window(frame: Floats, image: SphereImage, centers: Floats, *, others: Fl
 def box_around(
     centers: Floats, extent: Floats, voxel: tuple[float, float, float], shape: tuple[int, ...]
 ) -> tuple[slice, ...]:
-    """Return the box of voxels that reaches `extent` (3,) beyond the centres, inside `shape`."""
+    """Return the box of voxels that reaches `extent` (3,) beyond the centres, inside `shape`.
+
+    Examples
+    --------
+    >>> centers = np.array([[2.0, 2.0, 2.0]])
+    >>> box = box_around(centers, np.full(3, 1.0), (0.25, 0.2, 0.2), (40, 40, 12))
+    >>> [(int(s.start), int(s.stop)) for s in box]
+    [(4, 13), (5, 16), (5, 12)]
+    """
     low = np.clip(np.floor((centers.min(0) - extent) / voxel), 0, None).astype(int)
     high = np.minimum(np.ceil((centers.max(0) + extent) / voxel) + 1, shape).astype(int)
     return tuple(slice(a, b) for a, b in zip(low, high, strict=True))
 
 
 def within(grid: list[Floats], centers: Floats, extent: Floats) -> Bools:
-    """Return which voxels of a grid lie in the ellipsoid `extent` around any of the centres."""
+    """Return which voxels of a grid lie in the ellipsoid `extent` around any of the centres.
+
+    Examples
+    --------
+    >>> line = np.arange(3.0)
+    >>> within([line, line, line], np.array([[1.0, 1.0, 1.0]]), np.full(3, 1.1)).sum()
+    np.int64(7)
+    """
     mask = np.zeros(tuple(len(g) for g in grid), dtype=np.bool_)
     for center in centers:
         z, y, x = (((g - c) / e) ** 2 for g, c, e in zip(grid, center, extent, strict=True))
@@ -233,6 +261,19 @@ def fit_window(
     Fisher scoring with Levenberg-Marquardt damping. The weights follow the expected intensity, so
     that the fixed point is the root of the score of the Poisson likelihood shifted by the camera's
     floor; the covariance is the inverse Fisher information there.
+
+    Examples
+    --------
+    >>> from perrin.images import CameraNoise, sphere_image
+    >>> image = sphere_image(diameter=2.0, psf=(0.4, 0.15), voxel=(0.25, 0.2, 0.2))
+    >>> truth, frame = np.array([[3.01, 3.12, 3.23]]), np.full((24, 32, 32), 9.0)
+    >>> spot = image.spot(truth[0], frame.shape)
+    >>> frame[spot.box] += 100 * spot.value
+    >>> window = cut_window(frame, image, truth, others=np.empty((0, 3)))
+    >>> start = FreeCenters(truth + 0.1)
+    >>> fit = fit_window(window, image, CameraNoise(1.0, 0.0), start)
+    >>> fit.centers.round(4), fit.brightness.round(2)
+    (array([[3.01, 3.12, 3.23]]), array([100.]))
     """
     state = _fit_state(window, image, noise, start)
     damping, converged = 1e-3, False

@@ -113,6 +113,11 @@ class Search:
         Spheres that the border of the stack cuts are located too.
     crowds : bool
         Spheres in chains of over 16 are refined too.
+
+    Examples
+    --------
+    >>> Search(2.45, 2.5, dark=True).crowds
+    False
     """
 
     diameter: float
@@ -454,8 +459,9 @@ def locate(
     if untried:
         warnings.warn(
             f"{untried} of {len(table)} spheres touch in chains of over 16 (crowds=True refines "
-            "them) or have no voxels to themselves: they stay where found, some hundredths of a "
-            "sphere off, up to a tenth; the column `reason` says which",
+            "them) or have no voxels of their own: they keep the positions found first, whose "
+            "errors are some hundredths of a sphere, up to a tenth; the column `reason` states "
+            "the cause",
             PrecisionWarning,
             stacklevel=2,
         )
@@ -622,12 +628,25 @@ def _finite_frame(data: NDArray[Any], i: int) -> Floats:
 
 
 def frame_digest(data: NDArray[Any]) -> str:
-    """Return a digest of the voxels of a frame."""
+    """Return a digest of the voxels of a frame.
+
+    Examples
+    --------
+    >>> frame_digest(np.zeros((2, 2), dtype=np.uint8)) == frame_digest(np.zeros((2, 2)))
+    False
+    """
     return hashlib.blake2b(np.ascontiguousarray(data).tobytes(), digest_size=16).hexdigest()
 
 
 def is_flat(stack: StackLike) -> bool:
-    """Return whether a movie is two-dimensional: one plane, whose z has no size."""
+    """Return whether a movie is two-dimensional: one plane, whose z has no size.
+
+    Examples
+    --------
+    >>> from perrin.images import open_stack
+    >>> is_flat(open_stack(np.zeros((3, 8, 8)), voxel=(0.2, 0.2), dt=1.0))
+    True
+    """
     return bool(np.isnan(stack.voxel[0]))
 
 
@@ -637,7 +656,15 @@ def _axis_columns(centers: Floats, prefix: str = "") -> Columns:
 
 
 def found_table(located: Iterable[LocatedFrame]) -> pd.DataFrame:
-    """Return the spheres of several frames as the table of `locate`."""
+    """Return the spheres of several frames as the table of `locate`.
+
+    Examples
+    --------
+    >>> columns = {"frame": np.array([3]), "x": np.array([1.5]), "mass": np.array([800.0])}
+    >>> found_table([LocatedFrame(columns, spots=5, level=9.0, saturated=0.0, digest="")])
+       frame    x   mass
+    0      3  1.5  800.0
+    """
     import pandas as pd
 
     parts = [pd.DataFrame(frame.columns) for frame in located]
@@ -714,6 +741,15 @@ def size_faults(stack: StackLike, search: Search, optics: Optics | None) -> list
     -------
     list of str
         Empty, or one line.
+
+    Examples
+    --------
+    >>> from perrin.images import open_stack
+    >>> stack = open_stack(np.zeros((1, 16, 32, 32)), voxel=(0.25, 0.2, 0.2))
+    >>> size_faults(stack, Search(2.45, 2.45), None)
+    []
+    >>> size_faults(stack, Search(2450.0, 2.45), None)[0][:45]
+    'diameter 2450 um does not fit into the stack:'
     """
     voxel = np.asarray(stack.voxel, dtype=np.float64)
     there = np.isfinite(voxel)

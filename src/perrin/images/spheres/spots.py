@@ -114,7 +114,7 @@ class Spots:
         return cls(**entry)
 
 
-# The single keywords that stand for the fields of `Spots`.
+# The single keywords in place of the fields of `Spots`.
 SPOT_KEYWORDS = tuple(field.name for field in fields(Spots))
 
 
