@@ -1,4 +1,4 @@
-"""What the microscope recorded: image stacks, and the spheres in them."""
+"""Image stacks of a microscope, and the spheres in them."""
 
 from perrin.images.formats.contents import (
     Contents,

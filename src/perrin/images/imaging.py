@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from perrin._arrays import to_plain
+from perrin._arrays import from_plain, to_plain
 from perrin.images.optics.optics import Optics
 
 if TYPE_CHECKING:
@@ -62,8 +62,7 @@ class View:
         -------
         View
         """
-        sides = {side: np.array(entry[side], dtype=np.float64) for side in _SIDES}
-        return cls(frame=entry["frame"], **sides)
+        return cls(entry["frame"], *(from_plain(entry[side]) for side in _SIDES))
 
 
 _SIDES = ("xy", "xz", "yz")

@@ -142,8 +142,7 @@ class Light:
         photons: Floats = self.background + z[:, None, None] + y[:, None] + x
         if photons.min() < 0:
             raise ValueError(
-                "render_stack: the gradient takes the background down to "
-                f"{photons.min():.3g} photons"
+                f"the gradient takes the background down to {photons.min():.3g} photons"
             )
         return photons
 

@@ -1,4 +1,4 @@
-"""Where the spheres and clusters of a stack are."""
+"""Positions of the spheres and poses of the clusters of a stack."""
 
 from perrin.images.spheres.by_trackpy import Features, find_features, refine_by_trackpy
 from perrin.images.spheres.localisation import (

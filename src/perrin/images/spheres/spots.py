@@ -10,6 +10,7 @@ import numpy as np
 
 from perrin._arrays import choice_fault, number_fault, refuse, to_plain
 from perrin.errors import PrecisionWarning
+from perrin.geometry.shapes import pair_distances
 from perrin.tracks.clusters import REACH
 from perrin.tracks.linking import touching_groups
 
@@ -250,8 +251,8 @@ def at_contact(centers: Floats, *, contact: float) -> Floats:
     >>> at_contact(np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.1]]), contact=1.0)[:, 2].round(12)
     array([0.05, 1.05])
     """
-    distance = np.linalg.norm(centers[:, None] - centers, axis=-1)
-    near = distance[np.triu(distance < REACH * contact, 1)]
+    distance = pair_distances(centers)
+    near = distance[distance < REACH * contact]
     scale = min(contact / near.mean(), 1.0) if near.size else 1.0
     middle = centers.mean(axis=0)
     return np.asarray(middle + scale * (centers - middle))
