@@ -1,10 +1,11 @@
-"""Crowds of touching spheres in rendered images: missed, false, how far from the truth, how fast.
+"""Crowds of touching spheres in rendered images: missed and false ones, errors, and speed.
 
 Random packings of 2.45 um balls, pushed apart until they overlap by at most 3 %, one a frame; voxel
 0.25 x 0.2 x 0.2 um (z, y, x), point spread 0.4 and 0.15 um, 40 photons, 8 % spread of brightness,
 15 % depth loss, uneven background, gain 3, read noise 2. With --cut the stack ends within the
-packing on all sides, and spheres beyond it shine in. Told are a diameter 3 % wrong and the contact
-distance. Errors are those about their mean; the stated ones (Fisher) are the photons' floor.
+packing on all sides, and the images of spheres beyond its border reach into it. Given are a
+diameter 3 % wrong and the contact distance. Errors are those about their mean; the stated ones
+(Fisher) are the limit by photon noise.
 
 Usage: python benchmarks/crowd.py [--spheres 36] [--crowds 4] [--cut] [--seed 0]
 """

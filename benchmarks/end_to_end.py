@@ -1,10 +1,11 @@
-"""A whole movie through the pipeline: what is found, against what the true positions give.
+"""A whole movie through the pipeline: its results, compared with those of the true positions.
 
 Twelve touching tetrahedra of balls 2.45 um diffuse (D_R 0.0049 rad^2/s, D_T 0.0385 um^2/s) for 40
 frames, 0.73 s apart, in 64 x 256 x 256 voxels of 0.25 x 0.2 x 0.2 um (z, y, x). Point spread 0.4
 and 0.15 um, 40 photons, background 2 to 6 photons along x, gain 3, read noise 2, 30 % bleaching,
-8 % spread of brightness, 15 % loss of light over depth, 8 bits. Point spread, gain and background
-are not told. The movie is kept as OME-TIFF, its true positions beside it, and rendered only once.
+8 % spread of brightness, 15 % loss of intensity over depth, 8 bits. Point spread, gain and
+background are unknown to the analysis. The movie is kept as OME-TIFF, with a file of its true
+positions, and rendered only once.
 
 The same estimator takes the true positions of the same paths: differences between the two are in
 units of the standard errors that it states for the true positions.
@@ -38,11 +39,11 @@ SAME = DIAMETER / 2
 
 
 def paths(clusters, n_frames, shape, rng):
-    """Return motions and the places of their origins; all stay a contact from each other.
+    """Return motions and the positions of their origins; all stay a contact from each other.
 
-    A path that comes nearer to another one or to the border is drawn again as a whole. What is left
-    diffuses a little less than planted, which does not matter here: results are compared with those
-    of the true positions of the same paths, not with the planted values.
+    A path that comes nearer to another one or to the border is drawn again as a whole. The paths
+    kept diffuse a little less than planted, which does not matter here: results are compared with
+    those of the true positions of the same paths, not with the planted values.
     """
     box = (np.array(shape) - 1)[::-1] * VOXEL[::-1]
     motions, places, taken = [], [], []
@@ -80,7 +81,7 @@ def rendered(*, clusters=12, n_frames=40, shape=SHAPE, photons=40.0, seed=0):
 
 
 def kept(movie, **recipe):
-    """Return the movie's file and its true positions, rendered now unless they were before."""
+    """Return the movie's file and its true positions, rendered if they do not exist yet."""
     beside = movie.with_name(movie.name.partition(".")[0] + "-truth.npz")
     if not (movie.exists() and beside.exists()):
         stack, truth = rendered(**recipe)
@@ -109,7 +110,7 @@ def pipeline(stack):
 
 
 def true_report(truth):
-    """Return what the same estimator says of the true positions."""
+    """Return the report of the same estimators for the true positions."""
     import pandas as pd
 
     tables = [perrin.positions_table(x).assign(cluster=c) for c, x in enumerate(truth)]
@@ -160,8 +161,8 @@ def place_errors(table, truth):
     return np.concatenate(errors), np.concatenate(stated)
 
 
-def tell_spheres(table, truth):
-    """Print how many spheres there are, and how far from the true ones."""
+def print_spheres(table, truth):
+    """Print the number of spheres, and the errors of their positions."""
     spheres = truth.shape[0] * truth.shape[1] * truth.shape[2]
     print(f"spheres: {len(table)}, true {spheres}, not refined {int((~table['refined']).sum())}")
     errors, stated = (1e3 * e for e in place_errors(table, truth))
@@ -171,7 +172,7 @@ def tell_spheres(table, truth):
     print(f"; chi2 {table['chi2'].mean():.3f}")
 
 
-def tell_coefficients(report, true, truth):
+def print_coefficients(report, true, truth):
     """Print D_R and D_T, found and true, pooled and of every cluster."""
     pairs, false = matched(report, truth)
     print(f"clusters: {len(pairs)} of {len(truth)} found, {len(false)} false")
@@ -196,14 +197,14 @@ def pose_errors(motion, true):
     """Return errors of the centre, nm, and of the turn, mrad, both (T, 3)."""
     rows = frames_of(motion)
     apart = np.swapaxes(true.rotation[rows], -1, -2) @ motion.rotation
-    # The body's own axes are a matter of choice: one turn for all frames, the mean one.
+    # The body's own axes are arbitrary: the mean rotation of all frames is removed.
     first = apart[motion.fitted[0]]
     axes = first @ exp_map(np.nanmean(log_map(first.T @ apart), axis=0))
     turn = log_map(axes.T @ apart)
     return 1e3 * (motion.center - true.center[rows]), 1e3 * turn
 
 
-def tell_poses(report, true, truth):
+def print_poses(report, true, truth):
     """Print the errors of the poses from the free centres, and of those fitted to the images."""
     spheres = report.imaging.features
     free = perrin.analyze(spheres[spheres["cluster"] >= 0], dt=DT)
@@ -228,9 +229,9 @@ def main():
     # Linux counts in kB.
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     true = true_report(truth)
-    tell_spheres(report.imaging.features, truth)
-    tell_coefficients(report, true, truth)
-    tell_poses(report, true, truth)
+    print_spheres(report.imaging.features, truth)
+    print_coefficients(report, true, truth)
+    print_poses(report, true, truth)
     for stage, spent in seconds.items():
         print(f"{stage:32s}{spent:8.2f} s{1e3 * spent / truth.shape[1]:8.0f} ms/frame")
     print(f"peak memory {peak:.0f} MB")

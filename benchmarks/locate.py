@@ -1,15 +1,15 @@
-"""Spheres in simulated images: how far from the truth, how near the photons' limit, how fast.
+"""Spheres in simulated images: errors of positions, their limit by photon noise, and speed.
 
 Touching tetrahedra at random poses, one a frame, drawn by brute force: balls on a grid four times
 finer than the voxels, blurred there, averaged over voxels; nothing is shared with the model that is
 fitted. Balls 2.45 um, voxel 0.25 x 0.2 x 0.2 um (z, y, x), point spread 0.4 and 0.15 um, background
 2 to 6 photons with a gradient along x, gain 3, read noise 2, 8 % spread of brightness, 15 % depth
-loss, 30 % bleaching over the movie, 8 bits. Point spread, gain and background are not told to the
-fit, and the diameter is told 3 % wrong. Places are compared after subtraction of the constant
+loss, 30 % bleaching over the movie, 8 bits. Point spread, gain and background are unknown to the
+fit, and the diameter given is 3 % wrong. Positions are compared after subtraction of the constant
 offset, which is printed. The floor is the Fisher information of the brute-force image, by finite
-differences, brightness and a flat background free.
+differences, with brightness and a flat background free.
 
-With --core the spheres are core-shell: only a core of that diameter, um, is seen.
+With --core the spheres are core-shell: only a core of that diameter, um, is fluorescent.
 
 Usage: python benchmarks/locate.py [--frames 60] [--photons 40] [--core 1.2] [--seed 0]
 """
@@ -47,24 +47,24 @@ class Movie:
         return self.frames[i]
 
 
-def rendered(places, brightness, seen, depth_loss=0.15):
-    """Return the light of balls seen `seen` um wide at places (n, 3), x, y, z in um."""
+def rendered(places, brightness, fluorescent, depth_loss=0.15):
+    """Return the photons of balls of diameter `fluorescent` at positions (n, 3), x, y, z in um."""
     grid = [
         ((np.arange(n * FINE) + 0.5) / FINE - 0.5) * h for n, h in zip(SHAPE, VOXEL, strict=True)
     ]
-    light = np.zeros([n * FINE for n in SHAPE], dtype=np.float32)
+    photons = np.zeros([n * FINE for n in SHAPE], dtype=np.float32)
     for (x, y, z), bright in zip(places, brightness, strict=True):
         r2 = ((grid[0] - z) ** 2)[:, None, None] + ((grid[1] - y) ** 2)[:, None]
         r = np.sqrt(r2 + (grid[2] - x) ** 2)
-        light += bright * np.clip((seen / 2 - r) / 0.05 + 0.5, 0, 1)
+        photons += bright * np.clip((fluorescent / 2 - r) / 0.05 + 0.5, 0, 1)
     # Across the whole of a stack of 64 planes.
-    light *= (1 - depth_loss * grid[0] / 16)[:, None, None]
-    blurred = gaussian_filter(light, PSF / VOXEL * FINE, truncate=5)
+    photons *= (1 - depth_loss * grid[0] / 16)[:, None, None]
+    blurred = gaussian_filter(photons, PSF / VOXEL * FINE, truncate=5)
     return blurred.reshape([k for n in SHAPE for k in (n, FINE)]).mean(axis=(1, 3, 5))
 
 
-def simulated(n_frames, photons, seen, rng):
-    """Return a movie, its rotations and its true places."""
+def simulated(n_frames, photons, fluorescent, rng):
+    """Return a movie, its rotations and its true positions."""
     rotation = exp_map(rng.normal(size=(n_frames, 3)) * 2)
     middle = VOXEL[::-1] * (np.array(SHAPE[::-1]) / 2) + rng.uniform(-0.1, 0.1, (n_frames, 3))
     places = middle[:, None] + np.einsum("tij,nj->tni", rotation, BODY.positions)
@@ -72,24 +72,26 @@ def simulated(n_frames, photons, seen, rng):
     background = 2 + 4 * np.arange(SHAPE[2]) / 256
     frames = []
     for i, where in enumerate(places):
-        light = rendered(where, own * (1 - 0.3 * i / n_frames), seen) + background
-        grey = GAIN * rng.poisson(light) + rng.normal(0, READ, SHAPE)
+        expected = rendered(where, own * (1 - 0.3 * i / n_frames), fluorescent) + background
+        grey = GAIN * rng.poisson(expected) + rng.normal(0, READ, SHAPE)
         frames.append(np.clip(np.round(grey), 0, 255).astype(np.uint8))
     return Movie(frames), rotation, places
 
 
-def numerical_floor(places, photons, seen):
+def numerical_floor(places, photons, fluorescent):
     """Return standard errors: of free centres (rms of the spheres), and of the pose first six."""
     step = 0.02
-    base = rendered(places, np.full(4, photons), seen)
+    base = rendered(places, np.full(4, photons), fluorescent)
     slopes = []
     for i in range(4):
         for axis in range(3):
             shift = np.zeros((4, 3))
             shift[i, axis] = step
-            up, down = (rendered(places + s * shift, np.full(4, photons), seen) for s in (1, -1))
+            up, down = (
+                rendered(places + s * shift, np.full(4, photons), fluorescent) for s in (1, -1)
+            )
             slopes.append((up - down) / (2 * step))
-    columns = [rendered(places[[i]], np.ones(1), seen) for i in range(4)] + [np.ones(SHAPE)]
+    columns = [rendered(places[[i]], np.ones(1), fluorescent) for i in range(4)] + [np.ones(SHAPE)]
     jacobian = np.array([c.ravel() for c in slopes + columns]) * GAIN
     weight = 1 / (GAIN**2 * (base + 4) + READ**2).ravel()
     arm = places - places.mean(axis=0)
@@ -104,7 +106,7 @@ def errors(jacobian, weight):
 
 
 def in_true_order(table, places):
-    """Return located places in the order of the true ones; NaN in frames not of four spheres."""
+    """Return located positions in the order of the true ones; NaN where four were not found."""
     found = np.full_like(places, np.nan)
     for i, truth in enumerate(places):
         part = table.loc[table["frame"] == i, ["x", "y", "z"]].to_numpy()
@@ -139,7 +141,7 @@ def pose_errors(motion, rotation, places):
     return 1e3 * (off - np.nanmean(off, axis=0)), 1e3 * turn
 
 
-def speed(movie, table, optics, seen):
+def print_speed(movie, table, optics, fluorescent):
     """Print the time of one cluster's refinement in one frame, by the model and by trackpy."""
     image = optics.image(movie.voxel)
     contact = {"contact": DIAMETER}
@@ -154,7 +156,7 @@ def speed(movie, table, optics, seen):
 
     def discs(i):
         frame, near = movie.frame(i).astype(float), at_contact(start(i), **contact)
-        refine_by_trackpy(frame, near, diameter=seen, voxel=movie.voxel, **contact)
+        refine_by_trackpy(frame, near, diameter=fluorescent, voxel=movie.voxel, **contact)
 
     count = range(min(10, len(movie.frames)))
     own, theirs = timed(model, count), timed(discs, count)
@@ -175,9 +177,9 @@ def main():
     rng = np.random.default_rng(args.seed)
     movie, rotation, places = simulated(args.frames, args.photons, args.core, rng)
     search = {"diameter": 1.03 * args.core, "contact": DIAMETER}
-    looked_for = Search(**search)
-    sample = sample_frames(movie, looked_for, range(args.frames))
-    optics = choose_method(movie, looked_for, sample).optics
+    options = Search(**search)
+    sample = sample_frames(movie, options, range(args.frames))
+    optics = choose_method(movie, options, sample).optics
     print(optics)
     # Bleaching takes 15 % on average, depth 9 %.
     floor, rigid = numerical_floor(places[0], 0.85 * args.photons, args.core)
@@ -196,7 +198,7 @@ def main():
         spread = [np.nanstd(e, axis=0).round(2) for e in (center, turn)]
         print(f"{name}: centre {spread[0]} nm, turn {spread[1]} mrad")
     print("floor of the pose", (1e3 * rigid[:6]).round(2))
-    speed(movie, tables[None], optics, args.core)
+    print_speed(movie, tables[None], optics, args.core)
 
 
 if __name__ == "__main__":

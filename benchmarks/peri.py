@@ -1,10 +1,10 @@
-"""Close-packed dark spheres in a real confocal stack: which are found, and how well.
+"""Close-packed dark spheres in a real confocal stack: number found, and errors of positions.
 
 The folder holds `small_confocal_image.tif` (48 x 64 x 64) and `particle-positions.npy`, 37 starting
-places (z, y, x), voxels, of the walkthrough of PERI (peri-source/peri, docs/_static); by its
-authors' account they are centroids by trackpy of most of the spheres. Distances to them say which
-spheres are met. How well places are known is said by the image itself, and by a twin: the fitted
-spheres drawn anew with noise, whose places are known.
+positions (z, y, x), voxels, of the walkthrough of PERI (peri-source/peri, docs/_static); its
+authors state that they are centroids by trackpy of most of the spheres. Distances to them show
+which spheres are found. Errors of positions follow from the image itself, and from a simulated
+copy: the fitted spheres drawn again with noise, whose positions are known.
 
 Usage: python benchmarks/peri.py FOLDER [--out peri.png] [--seed 0]
 """
@@ -20,12 +20,12 @@ from PIL import Image, ImageSequence
 from scipy.spatial.distance import cdist
 
 import perrin
-from perrin.images.optics.crowd_equations import first_light
+from perrin.images.optics.crowd_equations import fit_brightness
 from perrin.images.optics.crowd_fit import fit_crowd
 from perrin.images.spheres.by_trackpy import find_features
 from perrin.images.spheres.localisation import Search, choose_method, sample_frames
 
-D = 11.0  # voxels, as said of the spheres in the walkthrough
+D = 11.0  # voxels, the diameter stated in the walkthrough
 VOXEL = (1.0, 1.0, 1.0)
 
 
@@ -62,7 +62,7 @@ def zyx(table):
 
 
 def report(name, places, listed):
-    """Print how many of the listed are met, and how near to each other spheres are."""
+    """Print the number of listed spheres that are found, and the least distance of two spheres."""
     off = cdist(listed, places).min(axis=1)
     apart = cdist(places, places) + np.diag(np.full(len(places), np.inf))
     met = "".join(f"{np.sum(off < r):5d}" for r in (1, 2, D / 2))
@@ -71,13 +71,13 @@ def report(name, places, listed):
 
 def misfit_at(fit, places):
     """Return chi-squared per voxel with the spheres at other places, their brightness refitted."""
-    centers = fit.light.centers.copy()
+    centers = fit.intensity.centers.copy()
     distance = cdist(places, centers)
     for place, k, near in zip(places, distance.argmin(1), distance.min(1), strict=True):
         if near < D / 3:
             centers[k] = place
-    light = first_light(fit.scene, centers)
-    return fit.light.misfit(fit.scene, light.expected) / fit.light.counted
+    state = fit_brightness(fit.window, centers)
+    return fit.intensity.chi2(fit.window, state.expected) / fit.intensity.n_voxels
 
 
 def draw(frame, places, listed, path):
@@ -131,26 +131,26 @@ def main():
     print(optics)
     print(f"optics {learned - start:.1f} s, refined {seconds:.1f} s")
     print("stated errors, x, y, z:", table.filter(like="sigma").mean().round(3).tolist(), "voxels")
-    nobody = np.empty((0, 3))
+    none = np.empty((0, 3))
     image = optics.image(VOXEL)
-    fit = fit_crowd(frame, first, others=nobody, contact=D, image=image, noise=optics.noise)
+    fit = fit_crowd(frame, first, others=none, contact=D, image=image, noise=optics.noise)
     for name, places in (("refined", fit.centers), ("found first", first), ("listed", listed)):
         print(f"chi2 with the spheres at the places {name}: {misfit_at(fit, places):.3f}")
-    left = (fit.scene.data - fit.light.expected)[fit.scene.mask].std()
+    left = (fit.window.data - fit.intensity.expected)[fit.window.mask].std()
     white = [np.diff(frame, 2, axis=axis).std() / np.sqrt(6) for axis in range(3)]
     print(f"left over by the model {left:.2f} grey levels; second differences of the image along")
-    print("z, y, x, which know no model, say that its noise is", np.round(white, 2).tolist())
+    print("z, y, x, which need no model, give a noise of", np.round(white, 2).tolist())
     rng = np.random.default_rng(args.seed)
-    noise = rng.normal(size=frame.shape) / np.sqrt(optics.noise.weight(fit.light.expected))
-    twin = np.clip(np.round(fit.light.expected + noise), 0, 255)
+    noise = rng.normal(size=frame.shape) / np.sqrt(optics.noise.weight(fit.intensity.expected))
+    copy = np.clip(np.round(fit.intensity.expected + noise), 0, 255)
     search = {"diameter": D, "contact": D, "voxel": VOXEL, "dark": True}
-    again = find_features(twin, percentile=95, border=True, **search)
+    again = find_features(copy, percentile=95, border=True, **search)
     bright = again.centers[again.mass > 0.5 * np.median(again.mass)]
-    refit = fit_crowd(twin, bright, others=nobody, contact=D, image=image, noise=optics.noise)
+    refit = fit_crowd(copy, bright, others=none, contact=D, image=image, noise=optics.noise)
     for name, places in (("found first", bright), ("refined", refit.centers)):
         off = fit.centers - places[cdist(fit.centers, places).argmin(axis=1)]
         rms = np.sqrt(np.median(off**2, axis=0) / 0.455)
-        print(f"errors on the twin, z, y, x, {name}: {rms.round(3)} voxels")
+        print(f"errors on the simulated copy, z, y, x, {name}: {rms.round(3)} voxels")
     draw(frame, zyx(table), listed, args.out)
 
 

@@ -1,4 +1,4 @@
-"""Crowds: many touching spheres fitted together, on rendered packings and on a real stack."""
+"""Crowds: many touching spheres fitted together, in rendered packings and in a real stack."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ pytest.importorskip("trackpy")
 
 VOXEL = (0.25, 0.2, 0.2)
 DIAMETER = 2.45
-NOBODY = np.empty((0, 3))
+NO_OTHERS = np.empty((0, 3))
 OPTICS = perrin.Optics(DIAMETER, (0.393, 0.139), CameraNoise(3.0, 4.0))
 REAL = Path(__file__).resolve().parents[2] / "shared" / "data" / "peri_confocal"
 
@@ -48,9 +48,10 @@ def packed(n, side, rng):
 
 
 @pytest.fixture(scope="module")
-def pack():
-    """Thirty touching balls at 40 photons: the places (x, y, z) and the frame."""
-    places = packed(30, 7.5, np.random.default_rng(5))
+def pack(repeats):
+    """Return positions (x, y, z) of touching balls, and their frame at 40 photons."""
+    n = repeats(18, 30)
+    places = packed(n, 7.5 * (n / 30) ** (1 / 3), np.random.default_rng(5))
     shape = tuple(
         int(np.ceil(e / h)) for e, h in zip(places.max(0)[::-1] + 1.8, VOXEL, strict=True)
     )
@@ -66,7 +67,7 @@ def fitted(frame, start, optics=OPTICS):
     return fit_crowd(
         frame,
         start,
-        others=NOBODY,
+        others=NO_OTHERS,
         contact=DIAMETER,
         image=optics.image(VOXEL),
         noise=optics.noise,
@@ -82,11 +83,12 @@ def normal(table, places):
 
 
 def test_a_crowd_is_located_within_the_stated_errors(pack):
-    """Nothing but diameter and contact told: no sphere missed or false, errors of stated size.
+    """With diameter and contact given, no sphere is missed or false, and errors are as stated.
 
-    The mean square of 90 has standard error sqrt(2/90); its tolerance is four of them. A
-    filtered centroid is off by over 80 nm (the bias of touching balls), and a sphere in the light
-    of a dozen others may be known 1.2 times worse than one of four (4.3, 4.3, 5.7 nm) at most.
+    The mean square of the n normalised errors has the standard error sqrt(2/n); its tolerance is
+    four of them. A filtered centroid is off by over 80 nm (the bias of touching balls). The
+    standard errors of a sphere whose image overlaps a dozen others are at most 1.2 times those of
+    one in a group of four (4.3, 4.3, 5.7 nm).
     """
     places, frame = pack
     stack, asked = Movie(frame), {"diameter": 1.03 * DIAMETER, "contact": DIAMETER}
@@ -94,7 +96,7 @@ def test_a_crowd_is_located_within_the_stated_errors(pack):
     sample = sample_frames(stack, search, range(stack.shape[0]))
     optics = choose_method(stack, search, sample).optics
     got = np.array([optics.diameter, *optics.psf])
-    # A rendered voxel is the light at its centre: the voxel's own blur is not in it.
+    # A rendered voxel has the intensity at its centre: the blur by the voxel is not included.
     width = np.sqrt(np.array([0.4, 0.15]) ** 2 - np.array([0.25, 0.2]) ** 2 / 12)
     assert np.all(np.abs(got - [DIAMETER, *width]) < 4 * np.array(optics.stderr))
     with warnings.catch_warnings():
@@ -110,59 +112,54 @@ def test_a_crowd_is_located_within_the_stated_errors(pack):
     assert np.median(cdist(places, first).min(axis=1)) > 0.08
 
 
-def test_missed_spheres_are_found_and_false_ones_left_out(pack):
-    """Five spheres withheld and four invented: the fit ends where that of all true ones does."""
+def test_missing_spheres_are_added_and_false_ones_removed(pack):
+    """From a start without five spheres and with four false ones the fit ends at the same place."""
     places, frame = pack
     start = places[:, ::-1] + np.random.default_rng(0).normal(0, 0.05, places.shape)
     whole = fitted(frame, start)
-    assert whole.origin.tolist() == list(range(30))
-    invented = start[[0, 8, 17]] + [0.9, 0.0, 0.9]
+    assert whole.origin.tolist() == list(range(len(places)))
+    invented = start[[0, 8, 16]] + [0.9, 0.0, 0.9]
     again = fitted(frame, np.concatenate([start[5:], invented, [[0.2, 0.2, 0.2]]]))
     nearest = cdist(whole.centers, again.centers).argmin(axis=1)
-    assert len(again.centers) == 30
-    # Both stop at steps below 1e-4 of the blur, 15 pm; convergence is linear at worst.
+    assert len(again.centers) == len(places)
+    # Both searches end at steps below 1e-4 of the blur, 15 pm; convergence is at least linear.
     assert np.allclose(again.centers[nearest], whole.centers, atol=1e-4)
-    assert np.all(again.settled)
+    assert np.all(again.converged)
 
 
-def test_noise_is_no_crowd():
-    """Of spots in noise alone, and in no light at all, nothing is left."""
+def test_no_sphere_remains_in_noise():
+    """Spots in noise alone, and in a frame of zeros, are all removed."""
     rng = np.random.default_rng(0)
-    start = rng.uniform(1, 8, (20, 3))
-    for frame in (3.0 * rng.poisson(5, (40, 50, 50)), np.zeros((40, 50, 50))):
+    start, shape = rng.uniform(1, 5, (6, 3)), (24, 30, 30)
+    for frame in (3.0 * rng.poisson(5, shape), np.zeros(shape)):
         assert len(fitted(frame, start).centers) == 0
 
 
 def test_dark_spheres_are_found_as_bright_ones_are(pack):
-    """The negative of an image has the same spheres."""
+    """The negative of a frame has the same spheres."""
     places, frame = pack
     even = perrin.Optics(DIAMETER, OPTICS.psf, CameraNoise(0.0, 200.0))
     bright, dark = (fitted(f, places[:, ::-1], even) for f in (frame, 300 - frame))
     assert np.allclose(bright.centers, dark.centers, atol=1e-5)
-    assert np.all(dark.light.brightness < 0)
+    assert np.all(dark.intensity.brightness < 0)
 
 
-def test_spheres_that_the_border_cuts_do_not_mislead(pack):
-    """Cut through the packing: the spheres inside are all found, their errors still as stated."""
+def test_a_border_through_the_crowd_adds_no_bias(pack):
+    """All spheres inside the border are found, with the stated errors."""
     places, frame = pack
     low = np.array([8, 10, 10])
     part = places - (low * VOXEL)[::-1]
     end = (np.array(frame.shape) - low - 1) * VOXEL
     inside = np.all((part >= 0) & (part <= end[::-1]), axis=1)
-    table = perrin.locate(
-        Movie(frame[8:, 10:, 10:]),
-        diameter=DIAMETER,
-        contact=DIAMETER,
-        optics=OPTICS,
-        crowds=True,
-    )
-    off = normal(table, part[inside])
-    assert len(table) == inside.sum()
+    found = fitted(frame[8:, 10:, 10:], part[inside][:, ::-1] + 0.03)
+    nearest = cdist(part[inside], found.centers[:, ::-1]).argmin(axis=1)
+    off = (found.centers[nearest] - part[inside][:, ::-1]) / found.sigma[nearest]
+    assert len(found.centers) == inside.sum()
     assert np.mean(off**2) == pytest.approx(1.0, abs=4 * np.sqrt(2 / off.size))
 
 
-def test_crowds_stay_where_they_are_found_unless_asked_for(pack):
-    """No seconds of work that nobody asked for; what is not refined says so, and why."""
+def test_crowds_are_not_refined_by_default(pack):
+    """Their spheres keep the positions found first, and the table states the reason."""
     frame = pack[1]
     asked = {"diameter": DIAMETER, "contact": DIAMETER}
     with pytest.warns(perrin.PrecisionWarning, match=r"crowds=True refines"):
@@ -175,34 +172,34 @@ def test_crowds_stay_where_they_are_found_unless_asked_for(pack):
 
 
 def test_the_normal_equations_are_those_of_finite_differences(pack):
-    """The score is minus half the slope of chi-squared, and places' errors those of all numbers."""
+    """The score is minus half the derivative of chi-squared; errors are those of all parameters."""
     places, frame = pack
     found = fitted(frame, places[:, ::-1])
-    scene, rng = found.scene, np.random.default_rng(1)
-    light = found.light.moved(scene, rng.normal(0, 0.01, 4 * 30 + scene.n_background))
-    information, score = normal_equations(scene, light)
-    for k in (0, 5, 43, 4 * 30 + 3, len(score) - 1):
+    window, rng, n = found.window, np.random.default_rng(1), 4 * len(places)
+    state = found.intensity.moved(window, rng.normal(0, 0.01, n + window.n_background))
+    information, score = normal_equations(window, state)
+    for k in (0, 5, 43, n + 3, len(score) - 1):
         step = np.zeros_like(score)
         step[k] = 1e-4
-        up, down = (light.misfit(scene, light.moved(scene, s * step).expected) for s in (1, -1))
+        up, down = (state.chi2(window, state.moved(window, s * step).expected) for s in (1, -1))
         assert (down - up) / 4e-4 == pytest.approx(score[k], rel=1e-5, abs=1e-3)
-        assert (up + down - 2 * light.misfit(scene, light.expected)) / 2e-8 == pytest.approx(
+        assert (up + down - 2 * state.chi2(window, state.expected)) / 2e-8 == pytest.approx(
             information[k, k], rel=0.2
         )
-    information, _ = normal_equations(scene, found.light)
+    information, _ = normal_equations(window, found.intensity)
     exact = np.sqrt(np.diag(np.linalg.inv(information.toarray())))
-    # What lies beyond a sphere's neighbours is taken as known.
-    assert np.allclose(found.sigma, exact[:120].reshape(30, 4)[:, :3], rtol=0.01)
+    # Spheres beyond a sphere's neighbours are taken as known.
+    assert np.allclose(found.sigma, exact[:n].reshape(-1, 4)[:, :3], rtol=0.01)
 
 
-@pytest.mark.skipif(not REAL.exists(), reason="the real confocal stack is not here")
-def test_a_real_stack_of_dark_spheres():
-    """Starting places listed for another program: 35 of 37 are met, by spheres that do not overlap.
+@pytest.mark.skipif(not REAL.exists(), reason="the real confocal stack is not available")
+def test_a_real_stack_of_dark_spheres(repeats):
+    """Spheres that do not overlap are found at almost all positions listed for another program.
 
-    The list was made by centroids, by its authors' account, and has pairs at 0.64 and 0.9
-    diameters: it says which spheres there are, not to a voxel where. Hard spheres do not overlap;
-    5 % are left to their spread of size. The noise stated was learned from this stack, so that chi2
-    is 1 wherever the fit is as good as it was then.
+    Its authors made the list by centroids, and it has pairs at 0.64 and 0.9 diameters: the list is
+    complete, but not accurate to a voxel. Hard spheres do not overlap; 5 % are allowed for their
+    distribution of size. The stated noise was learned from this stack, so that chi2 is 1 where the
+    fit is as good as it was then. The quick form fits a part of the stack.
     """
     from PIL import Image, ImageSequence
 
@@ -212,17 +209,20 @@ def test_a_real_stack_of_dark_spheres():
         listed = np.load(REAL / "particle-positions.npy")[:, ::-1]
     with Image.open(REAL / "small_confocal_image.tif") as pages:
         frame = np.array([np.array(page) for page in ImageSequence.Iterator(pages)])
+    frame = frame[: repeats(32, 48), : repeats(50, 64), : repeats(50, 64)]
+    listed = listed[np.all((listed >= 0) & (listed < frame.shape[::-1]), axis=1)]
+    assert len(listed) == repeats(21, 37)
     stack = Movie(frame, voxel=(1.0, 1.0, 1.0))
     asked = {"diameter": 11, "contact": 11, "dark": True}
     first = perrin.locate(stack, refine=None, **asked)[["x", "y", "z"]]
-    assert np.sum(cdist(listed, first).min(axis=1) < 1) >= 20
+    assert np.sum(cdist(listed, first).min(axis=1) < 1) >= repeats(9, 20)
     optics = perrin.Optics(11.17, (3.66, 1.2), CameraNoise(0.09, 12.7))
     table = perrin.locate(stack, optics=optics, crowds=True, **asked)
     found = table[["x", "y", "z"]].to_numpy()
     off = cdist(listed, found).min(axis=1)
     assert table["refined"].all()
-    assert np.sum(off < 2) >= 25
-    assert np.sum(off < 5.5) >= 35
+    assert np.sum(off < 2) >= repeats(14, 25)
+    assert np.sum(off < 5.5) >= repeats(19, 35)
     apart = cdist(found, found) + np.diag(np.full(len(found), np.inf))
     assert apart.min() > 0.95 * optics.diameter
     assert table["chi2"].median() == pytest.approx(1.0, abs=0.1)

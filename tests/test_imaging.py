@@ -1,7 +1,8 @@
-"""What a run remembers of its images is read back as it was written."""
+"""The imaging results of a run are read back as they were written."""
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -66,6 +67,33 @@ def test_the_round_trip_is_exact(tmp_path, changes):
     assert np.array_equal(back.voxel, written.voxel, equal_nan=True)
     for name in ("optics", "minmass", "diameter", "contact", "dark", "refine"):
         assert getattr(back, name) == getattr(written, name), name
+
+
+def test_the_results_survive_json():
+    """What `from_dict` reads from the JSON of `to_dict` equals the original, gaps included."""
+    written = imaging(voxel=(np.nan, 0.2, 0.2))
+    back = Imaging.from_dict(json.loads(json.dumps(written.to_dict())))
+    for name in ("features", "frames", "spots"):
+        pd.testing.assert_frame_equal(getattr(back, name), getattr(written, name), check_exact=True)
+    for one, other in zip(back.views, written.views, strict=True):
+        assert one.frame == other.frame
+        assert all(np.array_equal(getattr(one, s), getattr(other, s)) for s in ("xy", "xz", "yz"))
+    assert np.array_equal(back.voxel, written.voxel, equal_nan=True)
+    for name in ("optics", "minmass", "diameter", "contact", "dark", "refine"):
+        assert getattr(back, name) == getattr(written, name), name
+
+
+def test_imaging_json_keeps_its_keys(tmp_path):
+    """The file of earlier versions has the same text."""
+    written = imaging()
+    write_imaging(written, tmp_path)
+    entry = json.loads((tmp_path / "imaging.json").read_text())
+    assert list(entry) == [
+        "optics", "minmass", "voxel", "diameter", "contact", "dark", "refine",
+    ]  # fmt: skip
+    assert entry["optics"] == {
+        "diameter": 2.4, "psf": [0.41, 0.152], "noise": [3.1, -2.0], "stderr": [0.1, 0.2, 0.3],
+    }  # fmt: skip
 
 
 def test_a_missing_file_is_named(tmp_path):

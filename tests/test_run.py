@@ -183,11 +183,13 @@ def test_a_run_folder_is_whole_and_reads_back(tmp_path, movie_file, whole):
 
 @pytest.fixture
 def counted(monkeypatch):
-    """Count the frames that are looked at."""
-    looked = []
-    look = Method.look
-    monkeypatch.setattr(Method, "look", lambda m, s, i: (looked.append(i), look(m, s, i))[1])
-    return looked
+    """Record the numbers of the frames in which spheres are located."""
+    numbers = []
+    locate_in = Method.locate_in
+    monkeypatch.setattr(
+        Method, "locate_in", lambda m, s, i: (numbers.append(i), locate_in(m, s, i))[1]
+    )
+    return numbers
 
 
 def test_a_killed_run_goes_on_and_gives_the_same(tmp_path, movie_file, whole, counted):

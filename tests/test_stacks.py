@@ -1,4 +1,4 @@
-"""Stacks of every format come back as they were written, and say what is wrong with them."""
+"""Stacks of every format are read as they were written, and their faults are reported."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def test_thin_stacks_read_back(tmp_path, shape):
         assert_same(again, movie, voxel=voxel)
 
 
-def test_values_that_ome_has_no_type_for_are_refused(tmp_path, movie):
+def test_types_that_ome_does_not_have_are_refused(tmp_path, movie):
     with pytest.raises(ValueError, match="OME-TIFF has no bool"):
         write_stack(open_stack(movie > 5, **GIVEN), tmp_path / "a.ome.tif")
     with pytest.raises(ValueError, match=r"written as \.ome\.tif"):
@@ -90,7 +90,7 @@ def test_a_bad_frame_leaves_no_file(tmp_path, movie):
 
 @pytest.mark.parametrize("axes", ["TZYX", "ZTYX"])
 def test_ome_axes_units_and_interval(tmp_path, movie, axes):
-    """An OME file says which axis is time; units are converted."""
+    """An OME file states which axis is time; units are converted."""
     header = {"axes": axes, "TimeIncrement": DT * 1e3, "TimeIncrementUnit": "ms"}
     for axis, length in zip("ZYX", VOXEL, strict=True):
         header |= {f"PhysicalSize{axis}": length * 1e3, f"PhysicalSize{axis}Unit": "nm"}
@@ -116,7 +116,7 @@ def test_imagej_hyperstack(tmp_path, movie, byteorder):
         assert_same(stack, movie)
 
 
-def test_channels_are_chosen_not_guessed(tmp_path, movie):
+def test_a_channel_must_be_chosen(tmp_path, movie):
     """Several channels are refused unless one is named."""
     both = np.stack([movie, movie[::-1]], axis=2)
     path = tmp_path / "a.tif"
@@ -130,8 +130,8 @@ def test_channels_are_chosen_not_guessed(tmp_path, movie):
             assert_same(stack, wanted)
 
 
-def test_a_plain_tiff_says_nothing_and_nothing_is_guessed(tmp_path, movie):
-    """Pages may be times or planes; sizes and times are asked for, all at once."""
+def test_a_plain_tiff_states_nothing_and_nothing_is_guessed(tmp_path, movie):
+    """Pages may be times or planes; sizes and times are requested in one message."""
     path = tmp_path / "a.tif"
     with tifffile.TiffWriter(path) as file:
         for page in movie.reshape(-1, 12, 16):
@@ -187,30 +187,35 @@ def test_axes_without_names_keep_every_image_in_its_place(tmp_path, name, writte
 
 
 @pytest.mark.parametrize(
-    ("shape", "axes", "asked", "told"),
+    ("shape", "axes", "asked", "message"),
     [
-        ((5, 12, 16), None, {}, "does not say whether its 5 images are times or planes: pass plan"),
+        (
+            (5, 12, 16),
+            None,
+            {},
+            "does not state whether its 5 images are times or planes: pass plan",
+        ),
         ((5, 4, 12, 16), None, {}, "4 images along axis 1 tifffile took for colours: pass planes"),
-        ((2, 3, 5, 12, 16), None, {}, "does not say what its axes of 2, 3, 5 images are: pass"),
-        ((2, 3, 5, 12, 16), None, {"planes": 5}, "does not say what its axes of 2, 3, 5 images"),
-        ((2, 5, 5, 12, 16), None, {"planes": 5, "channel": 1}, "does not say what its axes of 2"),
-        ((2, 1, 5, 12, 16), None, {}, "does not say what its axes of 2, 5 images are"),
+        ((2, 3, 5, 12, 16), None, {}, "does not state what its axes of 2, 3, 5 images are: pass"),
+        ((2, 3, 5, 12, 16), None, {"planes": 5}, "does not state what its axes of 2, 3, 5 images"),
+        ((2, 5, 5, 12, 16), None, {"planes": 5, "channel": 1}, "does not state what its axes of 2"),
+        ((2, 1, 5, 12, 16), None, {}, "does not state what its axes of 2, 5 images are"),
         ((2, 5, 12, 16), None, {"planes": 1}, "has 5 planes a frame, not planes=1"),
-        ((2, 5, 12, 16), "TQYX", {}, "does not say what its axes of 5 images are"),
+        ((2, 5, 12, 16), "TQYX", {}, "does not state what its axes of 5 images are"),
         ((2, 5, 12, 16), "TTYX", {}, "has axes TTYX, several of one name"),
     ],
 )
-def test_axes_that_cannot_be_known_are_asked_for(tmp_path, shape, axes, asked, told):
+def test_undecided_axes_are_refused(tmp_path, shape, axes, asked, message):
     path = tmp_path / "a.tif"
     named = {} if axes is None else {"metadata": {"axes": axes}}
-    colours = as_colours("colours" in told)
+    colours = as_colours("colours" in message)
     tifffile.imwrite(path, np.zeros(shape, dtype=np.uint16), **named, **colours)
-    with pytest.raises(ValueError, match=told):
+    with pytest.raises(ValueError, match=message):
         open_stack(path, voxel=VOXEL, dt=DT, **asked)
 
 
 @pytest.mark.parametrize(("axes", "order"), [("TZYX", (0, 1)), ("ZTYX", (1, 0)), ("TQYX", (0, 1))])
-def test_axes_with_names_are_taken_at_their_word(tmp_path, movie, axes, order):
+def test_named_axes_are_kept(tmp_path, movie, axes, order):
     data, named = movie.transpose(*order, 2, 3), {"metadata": {"axes": axes}}
     tifffile.imwrite(tmp_path / "a.tif", data, **named, **as_colours(axes == "TZYX"))
     with open_stack(tmp_path / "a.tif", planes=4, **GIVEN) as stack:
@@ -242,14 +247,14 @@ def test_sequence_of_files(tmp_path, movie, as_glob):
             stack.frame(3)
 
 
-def test_values_given_win_and_are_told(tmp_path, movie):
-    """The user's voxel size and interval are used beside the file's; the difference is told."""
+def test_given_values_replace_those_of_the_file_with_a_warning(tmp_path, movie):
+    """The user's voxel size and interval are used; a warning states the difference."""
     write_stack(open_stack(movie, **GIVEN), tmp_path / "a.ome.tif")
     with pytest.warns(PrecisionWarning, match=r"voxel z 0.3 \(in the file 0.25\); dt 0.7 \(in"):
         stack = open_stack(tmp_path / "a.ome.tif", voxel=(0.3, 0.2, 0.1), dt=0.7)
     with stack:
         assert_same(stack, movie, voxel=(0.3, 0.2, 0.1), dt=0.7)
-    with open_stack(tmp_path / "a.ome.tif", **GIVEN) as stack:  # the same values: no word
+    with open_stack(tmp_path / "a.ome.tif", **GIVEN) as stack:  # the same values: no warning
         assert_same(stack, movie)
 
 
@@ -259,7 +264,7 @@ def test_values_given_win_and_are_told(tmp_path, movie):
         ({"voxel": (0, 0.2, 0.2), "dt": 1}, "expected lengths > 0"),
         ({"voxel": (0.2, 0.2), "dt": 1}, "has no frames of planes=1"),
         ({"voxel": 0.2, "dt": 1}, r"voxel: expected \(z, y, x\)"),
-        ({"voxel": VOXEL, "dt": -1}, "dt: expected seconds > 0"),
+        ({"voxel": VOXEL, "dt": -1}, r"dt: expected a finite number > 0 \(s\), got -1"),
         ({"voxel": VOXEL, "dt": 1, "plane_time": -1}, "plane_time: expected"),
         ({}, "pass voxel=.*pass dt="),
     ],
@@ -295,7 +300,7 @@ def test_an_imagej_file_cut_short_keeps_its_good_frames(tmp_path, movie):
 
 
 def test_pages_cut_short_keep_their_good_frames(tmp_path, movie):
-    """A file that does not say how many frames it had: the one in which it ends is the last."""
+    """If a file does not state its number of frames, the one in which it ends is the last."""
     path = tmp_path / "a.tif"
     with tifffile.TiffWriter(path) as file:
         for page in movie.reshape(-1, 12, 16):
@@ -327,7 +332,7 @@ def test_an_ome_chain_cut_short_keeps_its_good_frames(tmp_path, movie):
 
 
 def test_an_ome_file_without_its_header_is_refused(tmp_path, movie):
-    """Where the header is at the end, as tifffile leaves it, half the file is no stack."""
+    """If the header is at the end, as tifffile writes it, half the file is not a stack."""
     path = tmp_path / "a.ome.tif"
     tifffile.imwrite(path, movie, ome=True, metadata={"axes": "TZYX"})
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
@@ -338,7 +343,7 @@ def test_an_ome_file_without_its_header_is_refused(tmp_path, movie):
 
 @pytest.mark.parametrize("share", [0.35, 0.48, 0.65, 0.8, 0.95])
 def test_a_written_stack_that_is_cut_short_keeps_its_good_frames(tmp_path, movie, share):
-    """All it says of itself stands first, and each image behind its own header."""
+    """The OME header comes first, and each image follows its own header."""
     path = tmp_path / "a.ome.tif"
     write_stack(open_stack(movie, **GIVEN), path)
     content = path.read_bytes()
@@ -387,7 +392,7 @@ def test_corrupt_frame_is_named(tmp_path, movie):
 
 @pytest.mark.parametrize("content", [b"", b"not a tiff at all", b"II*\x00\x08\x00\x00\x00\xff"])
 def test_no_tiff_at_all(tmp_path, content):
-    """Files that are none are refused under their name; a missing one is missing."""
+    """Other files are refused by name; for a missing file there is a FileNotFoundError."""
     (tmp_path / "a.tif").write_bytes(content)
     with pytest.raises(ValueError, match=r"a\.tif: "):
         open_stack(tmp_path / "a.tif", **GIVEN)
@@ -412,7 +417,7 @@ def test_memory_stays_under_three_frames(tmp_path):
 
 
 def test_another_process_opens_the_file_again(tmp_path, movie):
-    """A stack is sent as a path, whatever it has open."""
+    """An open stack is pickled as the path of its file."""
     write_stack(open_stack(movie, **GIVEN), tmp_path / "a.ome.tif")
     with open_stack(tmp_path / "a.ome.tif") as stack:
         sent = pickle.dumps(stack)
@@ -422,7 +427,7 @@ def test_another_process_opens_the_file_again(tmp_path, movie):
 
 
 def test_missing_reader_is_named(tmp_path, monkeypatch):
-    """Without the library of a format the error says what to install."""
+    """Without the library of a format the error names the package to install."""
     for suffix, module in ((".lif", "liffile"), (".nd2", "nd2"), (".ims", "h5py")):
         monkeypatch.setitem(sys.modules, module, None)
         with pytest.raises(ImportError, match=rf"{module}.*pip install 'perrin\[{suffix[1:]}\]'"):
@@ -527,7 +532,7 @@ class NikonFile:
 
 
 def test_nikon(tmp_path, movie, monkeypatch):
-    """Planes, channel and times as nd2 gives them; an axis not calibrated is asked for."""
+    """Planes, channel and times as nd2 gives them; an uncalibrated axis needs a voxel size."""
     monkeypatch.setitem(sys.modules, "nd2", SimpleNamespace(ND2File=NikonFile))
     with open(tmp_path / "a.nd2", "wb") as file:
         np.save(file, movie)
@@ -595,7 +600,7 @@ def test_leica(tmp_path, movie):
 
 
 def test_zarr_folder_without_scales(tmp_path):
-    """A zarr folder that is no OME-Zarr is refused with the way out."""
+    """A zarr folder without OME-Zarr metadata is refused, and the message says what to pass."""
     pytest.importorskip("zarr")
     (tmp_path / "a.zarr").mkdir()
     header = {"zarr_format": 3, "node_type": "group", "attributes": {}}
@@ -605,7 +610,7 @@ def test_zarr_folder_without_scales(tmp_path):
 
 
 def test_the_page_about_stacks_runs():
-    """The example of docs/stacks.md prints what the page says."""
+    """The example of docs/stacks.md prints the output on the page."""
     page = Path(__file__).resolve().parents[1] / "docs" / "stacks.md"
     result = doctest.testfile(str(page), module_relative=False)
     assert result.attempted > 0

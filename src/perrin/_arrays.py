@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from typing import Any, TypeAlias
+from collections.abc import Iterable, Mapping, MutableSequence
+from dataclasses import fields
+from difflib import get_close_matches
+from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -11,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 Floats: TypeAlias = NDArray[np.float64]
 Ints: TypeAlias = NDArray[np.int64]
 Bools: TypeAlias = NDArray[np.bool_]
+Options = TypeVar("Options")
 
 
 def as_positions(positions: ArrayLike, *, name: str = "positions") -> Floats:
@@ -150,6 +153,82 @@ def refuse(faults: Iterable[str], *, error: type[ValueError] = ValueError) -> No
     lines = list(faults)
     if lines:
         raise error("; ".join(lines))
+
+
+def options_from(
+    kind: type[Options],
+    given: Options | None,
+    settings: Mapping[str, object],
+    *,
+    name: str,
+    faults: MutableSequence[str],
+) -> Options:
+    """Return the options of a function: an object, or one made from single keywords.
+
+    Parameters
+    ----------
+    kind : type
+        The dataclass of the options.
+    given : object of that type or None
+        The object that the user passed.
+    settings : mapping
+        Single keywords that the user passed; those that are no fields of `kind` are ignored.
+    name : str
+        The argument in which the object is passed.
+    faults : list of str
+        Receives the faults: a value out of range, or an option stated in both ways.
+
+    Returns
+    -------
+    object of type `kind`
+        The defaults where there are faults.
+
+    Examples
+    --------
+    >>> from dataclasses import dataclass
+    >>> @dataclass(frozen=True, kw_only=True)
+    ... class Scan:
+    ...     exposure: float = 0.0
+    >>> faults = []
+    >>> options_from(Scan, None, {"exposure": 0.1}, name="scan", faults=faults), faults
+    (Scan(exposure=0.1), [])
+    >>> _ = options_from(Scan, Scan(), {"exposure": 0.1}, name="scan", faults=faults)
+    >>> faults
+    ['exposure: stated in scan= and as a keyword; state it once']
+    """
+    names = [field.name for field in fields(kind)]  # type: ignore[arg-type]
+    own = {key: value for key, value in settings.items() if key in names}
+    if given is not None:
+        faults.extend(f"{key}: stated in {name}= and as a keyword; state it once" for key in own)
+        if not isinstance(given, kind):
+            faults.append(f"{name}: expected {kind.__name__}(...), got {given!r}")
+            return kind()
+        return given
+    try:
+        return kind(**own)
+    except ValueError as fault:
+        faults.append(str(fault))
+        return kind()
+
+
+def refuse_unknown(function: str, settings: Iterable[str], known: Iterable[str]) -> None:
+    """Raise a TypeError that names a keyword which a function does not have, and the nearest one.
+
+    Examples
+    --------
+    >>> refuse_unknown("render_stack", ["photon"], ["photons", "gain"])
+    Traceback (most recent call last):
+    TypeError: render_stack: unknown keyword 'photon'; the nearest known one is 'photons'
+    """
+    known = list(known)
+    lines = [
+        f"unknown keyword {key!r}; the nearest known one is "
+        f"{get_close_matches(key, known, n=1, cutoff=0.0)[0]!r}"
+        for key in settings
+        if key not in known
+    ]
+    if lines:
+        raise TypeError(f"{function}: " + "; ".join(lines))
 
 
 def finite_or_none(value: float) -> float | None:

@@ -1,16 +1,18 @@
-"""How the spheres of a movie were seen: what was found in its frames, and what they look like."""
+"""Results of the imaging part of a run: the spheres of its frames, and their images."""
 
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from perrin._arrays import from_plain, to_plain
 from perrin.images.optics.optics import Optics
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
     from pathlib import Path
 
     import pandas as pd
@@ -20,16 +22,22 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """One frame seen along its three axes: brightest voxels on each line of sight.
+    """Projections of one frame along its three axes: the brightest voxel of each line of voxels.
 
-    Of dark spheres the darkest. A 2-D frame has only `xy`; the others have one row.
+    For dark spheres the darkest voxel. A 2-D frame has only `xy`; the others have one row.
 
     Attributes
     ----------
     frame : int
-        Number in the stack.
+        Number of the frame in the stack.
     xy, xz, yz : ndarray, shapes (y, x), (z, x), (z, y)
         Grey levels.
+
+    Examples
+    --------
+    >>> view = View(7, np.ones((4, 5)), np.ones((3, 5)), np.ones((3, 4)))
+    >>> View.from_dict(view.to_dict()).xz.shape
+    (3, 5)
     """
 
     frame: int
@@ -37,36 +45,61 @@ class View:
     xz: Floats
     yz: Floats
 
+    def to_dict(self) -> dict[str, Any]:
+        """Return the projections as values that JSON holds."""
+        return {name: to_plain(getattr(self, name)) for name in ("frame", *_SIDES)}
+
+    @classmethod
+    def from_dict(cls, entry: Mapping[str, Any]) -> View:
+        """Return the projections that `to_dict` wrote, as float64.
+
+        Parameters
+        ----------
+        entry : mapping
+            The dictionary of `to_dict`.
+
+        Returns
+        -------
+        View
+        """
+        return cls(entry["frame"], *(from_plain(entry[side]) for side in _SIDES))
+
+
+_SIDES = ("xy", "xz", "yz")
+
 
 @dataclass(frozen=True, eq=False)
 class Imaging:
-    """How the spheres of a movie were seen.
+    """Results of the imaging part of a run.
 
     Attributes
     ----------
     features : pandas.DataFrame
-        A row per sphere found: ``frame`` (of the stack), ``x, y, z`` (um), ``mass``, what `locate`
-        says besides, and ``cluster, particle, piece`` (cluster -1: of none).
+        One row per sphere: ``frame`` (of the stack), ``x, y, z`` (um), ``mass``, the other columns
+        of `locate`, and ``cluster, particle, piece`` (cluster -1: no cluster).
     frames : pandas.DataFrame
-        A row per frame used: ``frame``, ``time`` (s), ``spots`` (before the mass cut), ``spheres``,
-        ``level`` (median grey level), ``saturated`` (share of voxels clipped at the highest value),
-        ``fault`` (why it could not be read, or ""), ``copy_of`` (the earlier frame that it repeats
-        exactly, or -1; such a frame has no features).
+        One row per frame used: ``frame``, ``time`` (s), ``spots`` (before the mass cut),
+        ``spheres``, ``level`` (median grey level), ``saturated`` (fraction of voxels clipped at the
+        highest grey level), ``fault`` (why it could not be read, or ""), ``copy_of`` (the earlier
+        frame that it repeats exactly, or -1; such a frame has no features).
     spots : pandas.DataFrame
-        ``frame, mass`` of all spots, noise included, of a few frames all over the movie.
+        ``frame, mass`` of all spots, noise included, in a few frames all over the movie.
     views : tuple of View
-        A few frames all over the movie.
+        Projections of a few frames all over the movie.
     optics : Optics or None
-        How a sphere is seen; None without refinement by the model.
+        Size, point spread and noise of the image of a sphere; None without refinement by the model.
     minmass : float
-        The mass cut; 0: nothing is cut.
+        The mass cut; 0 where no spot is cut.
     voxel : tuple of float
-        (z, y, x), um; z is NaN in the plane.
-    diameter, contact : float
-        What was looked for, um.
+        Voxel size (z, y, x), um; z is NaN for a 2-D movie.
+    diameter : float
+        Diameter of the fluorescent sphere in the search, um.
+    contact : float
+        Centre distance of touching spheres in the search, um.
     dark : bool
-        Spheres are darker than what surrounds them.
+        Spheres are darker than their surroundings.
     refine : str or None
+        How positions were refined, as in `locate`.
     """
 
     features: pd.DataFrame
@@ -81,34 +114,89 @@ class Imaging:
     dark: bool
     refine: str | None
 
+    def to_dict(self) -> dict[str, Any]:
+        """Return everything as values that JSON holds: tables as lists by column."""
+        entry: dict[str, Any] = {
+            name: {column: to_plain(getattr(self, name)[column].tolist()) for column in columns}
+            for name, columns in ((table, getattr(self, table).columns) for table in _TABLES)
+        }
+        return entry | {"views": [view.to_dict() for view in self.views]} | self.settings()
+
+    @classmethod
+    def from_dict(cls, entry: Mapping[str, Any]) -> Imaging:
+        """Return the imaging results that `to_dict` wrote.
+
+        Parameters
+        ----------
+        entry : mapping
+            The dictionary of `to_dict`.
+
+        Returns
+        -------
+        Imaging
+        """
+        import pandas as pd
+
+        tables = {name: pd.DataFrame(entry[name]) for name in _TABLES}
+        for table in tables.values():
+            # JSON has no NaN: a number that is missing is null.
+            for column in table.columns[table.isna().any()]:
+                table[column] = table[column].astype(np.float64)
+        views = tuple(View.from_dict(view) for view in entry["views"])
+        return cls(**tables, views=views, **_settings_from(entry))
+
+    def settings(self) -> dict[str, Any]:
+        """Return all but tables and views as values that JSON holds: the file imaging.json."""
+        return {name: to_plain(getattr(self, name)) for name in _IMAGING_SETTINGS}
+
 
 _TABLES = ("features", "frames", "spots")
 
 
+_IMAGING_SETTINGS = tuple(
+    field.name for field in fields(Imaging) if field.name not in (*_TABLES, "views")
+)
+
+
+def _settings_from(entry: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the fields that `Imaging.settings` wrote."""
+    optics, voxel = entry["optics"], entry["voxel"]
+    z, y, x = (np.nan if size is None else float(size) for size in voxel)
+    return {name: entry[name] for name in _IMAGING_SETTINGS} | {
+        "optics": None if optics is None else Optics.from_dict(optics),
+        "voxel": (z, y, x),
+    }
+
+
 def write_imaging(imaging: Imaging, folder: Path) -> None:
-    """Write features.parquet, frames.parquet, spots.parquet, views.npz and imaging.json."""
+    """Write features.parquet, frames.parquet, spots.parquet, views.npz and imaging.json.
+
+    Parameters
+    ----------
+    imaging : Imaging
+        The results.
+    folder : Path
+        An existing folder.
+    """
     for name in _TABLES:
         getattr(imaging, name).to_parquet(folder / f"{name}.parquet", index=False)
     views = {f"{v.frame}-{side}": getattr(v, side) for v in imaging.views for side in _SIDES}
     np.savez_compressed(folder / "views.npz", **views)
-    entry: dict[str, Any] = {
-        "optics": None if imaging.optics is None else asdict(imaging.optics),
-        "minmass": imaging.minmass,
-        "voxel": [v if np.isfinite(v) else None for v in imaging.voxel],
-        "diameter": imaging.diameter,
-        "contact": imaging.contact,
-        "dark": imaging.dark,
-        "refine": imaging.refine,
-    }
-    text = json.dumps(entry, indent=2, allow_nan=False)
+    text = json.dumps(imaging.settings(), indent=2, allow_nan=False)
     (folder / "imaging.json").write_text(text + "\n", encoding="utf-8")
 
 
-_SIDES = ("xy", "xz", "yz")
-
-
 def read_imaging(folder: Path) -> Imaging:
-    """Read back what `write_imaging` wrote.
+    """Read the files that `write_imaging` wrote.
+
+    Parameters
+    ----------
+    folder : Path
+        The folder.
+
+    Returns
+    -------
+    Imaging
 
     Raises
     ------
@@ -118,16 +206,8 @@ def read_imaging(folder: Path) -> Imaging:
     import pandas as pd
 
     entry = json.loads((folder / "imaging.json").read_text(encoding="utf-8"))
-    optics = entry.pop("optics")
-    z, y, x = (np.nan if v is None else float(v) for v in entry.pop("voxel"))
     with np.load(folder / "views.npz") as stored:
         frames = sorted({int(name.partition("-")[0]) for name in stored})
         views = tuple(View(k, *(stored[f"{k}-{side}"] for side in _SIDES)) for k in frames)
     tables = {name: pd.read_parquet(folder / f"{name}.parquet") for name in _TABLES}
-    return Imaging(
-        **tables,
-        views=views,
-        optics=None if optics is None else Optics.from_dict(optics),
-        voxel=(z, y, x),
-        **entry,
-    )
+    return Imaging(**tables, views=views, **_settings_from(entry))

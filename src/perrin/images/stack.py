@@ -1,4 +1,4 @@
-"""Image stacks of every format as one thing: frames (z, y, x) with voxel size and times."""
+"""Image stacks of all formats: frames (z, y, x) with voxel size and times."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from perrin._arrays import Floats, frozen
+from perrin._arrays import Floats, frozen, number_fault
 from perrin.errors import FrameError, PrecisionWarning
 from perrin.images.formats.contents import Contents, Pick, even_times, needed
 from perrin.images.formats.tiff import sequence, sequence_files, tiff
@@ -28,8 +28,8 @@ if TYPE_CHECKING:
 _PathLike: TypeAlias = str | os.PathLike[str]
 
 
-# A value of the user's further than this from the file's is told.
-_TELL = 1e-3
+# Relative difference of the user's values from those of the file above which a warning is given.
+_HEADER_TOLERANCE = 1e-3
 
 
 _OME_TYPES = ("uint8", "int8", "uint16", "int16", "uint32", "int32", "float32", "float64")
@@ -39,26 +39,33 @@ _OME_TYPES = ("uint8", "int8", "uint16", "int16", "uint32", "int32", "float32", 
 class Stack:
     """A movie of image stacks, read frame by frame.
 
-    A context manager: ``with open_stack(path) as stack`` lets go of the file at the end.
+    A context manager: ``with open_stack(path) as stack`` closes the file at the end.
 
     Attributes
     ----------
     shape : tuple of int
-        (t, z, y, x); a 2-D movie has z = 1.
+        Number of frames, and voxels of a frame: (t, z, y, x); a 2-D movie has z = 1.
     dtype : numpy.dtype
-        Of the voxels.
+        Type of the grey levels.
     voxel : ndarray, shape (3,)
         Voxel size (z, y, x), um; NaN for the z of a 2-D movie.
     times : ndarray, shape (t,)
-        When the first plane of each frame was taken, s.
+        Time at which the first plane of each frame was recorded, s.
     plane_time : float or None
-        Time from one plane to the next, s; None where it is not known.
+        Time from one plane to the next, s; None where it is unknown.
     source : str
-        Where the frames come from.
+        Name of the file, folder or other source of the frames.
     read : callable
-        ``read(i)`` returns frame i; `frame` is the safe way to it.
+        ``read(i)`` returns frame i without the checks of `frame`.
     notes : tuple of str
-        How the file was read where it does not say, for instance which of its axes are times.
+        How the file was interpreted where it does not name its axes.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> stack = open_stack(np.zeros((3, 4, 8, 8), np.uint8), voxel=(0.3, 0.1, 0.1), dt=0.5)
+    >>> len(stack), stack.dt, [frame.shape for frame in stack][0]
+    (3, 0.5, (4, 8, 8))
     """
 
     shape: tuple[int, int, int, int]
@@ -94,12 +101,12 @@ class Stack:
 
     @property
     def path(self) -> Path | None:
-        """The file, folder or glob that is read; None for what is in memory."""
+        """The file, folder or glob that is read; None for a stack in memory."""
         return Path(self.read.path) if isinstance(self.read, _FileFrames) else None
 
     @property
     def choice(self) -> dict[str, int | str | None]:
-        """What was chosen of the file: channel, planes, image; empty for what is in memory."""
+        """The user's choices: channel, planes, image; empty for a stack in memory."""
         return self.read.pick._asdict() if isinstance(self.read, _FileFrames) else {}
 
     @property
@@ -113,9 +120,9 @@ class Stack:
         Raises
         ------
         FrameError
-            If this frame cannot be read: catch it to go on with the next one.
+            If this frame cannot be read; other frames may be readable.
         OSError
-            If the whole file is out of reach where the stack was sent.
+            If the whole file cannot be opened, as on another machine.
         IndexError
             If there is no such frame.
         """
@@ -125,7 +132,7 @@ class Stack:
             data = self.read(int(i))
         except (MemoryError, _UnopenedError):
             raise
-        # The readers of damaged files raise whatever their decoders do.
+        # The decoders of damaged files raise errors of any class.
         except Exception as fault:
             raise FrameError(
                 f"{self.source}: frame {i} of {len(self)} cannot be read: {fault}", i, self.source
@@ -139,17 +146,17 @@ class Stack:
         return data
 
     def close(self) -> None:
-        """Let go of the file."""
+        """Close the file."""
         if isinstance(self.read, _FileFrames):
             self.read.close()
 
 
 class _UnopenedError(OSError):
-    """A whole file is out of reach, as on another machine: no fault of one frame."""
+    """A whole file cannot be opened, as on another machine; no frame is at fault."""
 
 
 class _FileFrames:
-    """Frames of an open file: one reader at a time, and opened anew where it is unpickled."""
+    """Frames of an open file: one reader at a time; the file is opened again after unpickling."""
 
     def __init__(self, path: str, pick: Pick, contents: Contents | None = None) -> None:
         self.path, self.pick, self._contents = path, pick, contents
@@ -158,15 +165,12 @@ class _FileFrames:
     def __call__(self, i: int) -> NDArray[Any]:
         with self._lock:
             if self._contents is None:
-                self._contents = self._opened()
+                try:
+                    self._contents = file_contents(self.path, self.pick)
+                # The decoders of damaged files raise errors of any class.
+                except Exception as fault:
+                    raise _UnopenedError(f"{self.path} cannot be opened here: {fault}") from fault
             return self._contents.frame(i)
-
-    def _opened(self) -> Contents:
-        try:
-            return _contents(self.path, self.pick)
-        # The readers of damaged files raise whatever their decoders do.
-        except Exception as fault:
-            raise _UnopenedError(f"{self.path} cannot be opened here: {fault}") from fault
 
     def __reduce__(self) -> tuple[type[_FileFrames], tuple[str, Pick]]:
         return _FileFrames, (self.path, self.pick)
@@ -180,7 +184,7 @@ class _FileFrames:
 
 @dataclass(frozen=True, eq=False)
 class _ArrayFrames:
-    """Frames of anything that is indexed like an array (t, z, y, x)."""
+    """Frames of an array (t, z, y, x) of any library."""
 
     array: Any
     shape: tuple[int, int, int, int]
@@ -202,9 +206,9 @@ def open_stack(
     channel: int | None = None,
     image: int | str | None = None,
 ) -> Stack:
-    """Open a movie of image stacks of any format; nothing is read but its header.
+    """Open a movie of image stacks of any format; only its header is read.
 
-    Voxel size and times come from the file or from the user, never from a guess.
+    Voxel size and times come from the file or from the user, never from a default.
 
     Parameters
     ----------
@@ -213,33 +217,36 @@ def open_stack(
         numbers in their names); Leica ``.lif``, Nikon ``.nd2``, Zeiss ``.czi``, Imaris ``.ims``,
         OME-Zarr; or an array (t, z, y, x) or (z, y, x), also of dask, zarr or a memory map.
     voxel : array_like, shape (3,) or (2,), optional
-        Voxel size (z, y, x), um; (y, x) for a 2-D movie. Needed where the file does not say, and
-        used where it says otherwise.
+        Voxel size (z, y, x), um; (y, x) for a 2-D movie. Required where the file does not state
+        it, and used where the file states another one.
     dt : float, optional
-        Time between frames, s. Needed where the file does not say and there are several frames.
+        Time between frames, s. Required where the file does not state it and there are several
+        frames.
     plane_time : float, optional
-        Time from one plane to the next, s; used for nothing but what asks for it.
+        Time from one plane to the next, s.
     planes : int, optional
-        Planes of one frame, where the file does not tell times from planes; 1 for a 2-D movie.
+        Number of planes of one frame, where the file does not distinguish times from planes; 1 for
+        a 2-D movie.
     channel : int, optional
-        Which channel, from 0; needed where there are several.
+        Number of the channel, from 0; required where there are several.
     image : int or str, optional
-        Which image of a file that holds several, by number or name.
+        Number or name of the image in a file that holds several.
 
     Returns
     -------
     Stack
-        Reads a frame when asked for it. Can be sent to another process, where it opens the file
-        again.
+        Frames are read one by one, when they are used. It can be sent to another process, where it
+        opens the file again.
 
     Raises
     ------
     ValueError
-        If the file cannot be read, or what it leaves open is not given; all faults in one message.
+        If the file cannot be read, or a value that it does not state is not given; all faults in
+        one message.
     ImportError
         If the reader of this format is not installed, with the command that installs it.
     FileNotFoundError
-        If there is nothing at `path`.
+        If there is no file at `path`.
 
     Warns
     -----
@@ -260,36 +267,66 @@ def open_stack(
     pick = Pick(channel=channel, planes=planes, image=image)
     if isinstance(path, (str, os.PathLike)):
         source = os.fspath(path)
-        contents = _opened(source, pick)
+        try:
+            contents = file_contents(source, pick)
+        except (FileNotFoundError, PermissionError, IsADirectoryError):
+            raise
+        except ImportError as missing:
+            raise ImportError(f"{source}: {missing}") from missing
+        # The decoders of damaged files raise errors of any class.
+        except Exception as fault:
+            raise ValueError(f"{source}: {fault}") from fault
         read: Callable[[int], NDArray[Any]] = _FileFrames(os.path.abspath(source), pick, contents)
     else:
         source = "array"
-        contents, read = _array_contents(path, pick)
+        contents, read = array_contents(path, pick)
     try:
-        settled = _settled(source, contents, voxel=size, dt=dt, plane_time=plane_time)
+        settled, faults = contents.settled_voxel(size)
+        times, more = contents.settled_times(dt)
+        faults += more
+        if plane_time is None:
+            plane_time = contents.plane_time
+        else:
+            faults += number_fault("plane_time", plane_time, least=0, unit="s")
+        if faults:
+            raise ValueError(f"{source}: " + "; ".join(faults))
+        unequal = contents.differences(settled, times, plane_time, tolerance=_HEADER_TOLERANCE)
+        if unequal:
+            warnings.warn(
+                f"{source}: the values given are used: " + "; ".join(unequal),
+                PrecisionWarning,
+                stacklevel=2,
+            )
     except Exception:
         contents.close()
         raise
     return Stack(
-        contents.shape, contents.dtype, *settled, source=source, read=read, notes=contents.notes
+        shape=contents.shape,
+        dtype=contents.dtype,
+        voxel=settled,
+        times=times,
+        plane_time=plane_time,
+        source=source,
+        read=read,
+        notes=contents.notes,
     )
 
 
-def _opened(source: str, pick: Pick) -> Contents:
-    """Describe the file at `source`, every fault under its name."""
-    try:
-        return _contents(source, pick)
-    except (FileNotFoundError, PermissionError, IsADirectoryError):
-        raise
-    except ImportError as missing:
-        raise ImportError(f"{source}: {missing}") from missing
-    # The readers of damaged files raise whatever their decoders do.
-    except Exception as fault:
-        raise ValueError(f"{source}: {fault}") from fault
+def file_contents(source: str, pick: Pick) -> Contents:
+    """Return the contents of a file or folder, read by the reader of its format.
 
+    Parameters
+    ----------
+    source : str
+        Path of a file or folder, or a glob. The suffix decides among the vendors' formats; all
+        other files are read as TIFF.
+    pick : Pick
+        The user's choices.
 
-def _contents(source: str, pick: Pick) -> Contents:
-    """Choose the reader: by suffix for the vendors' formats, TIFF for all else."""
+    Returns
+    -------
+    Contents
+    """
     reader = vendor(source)
     if reader is not None:
         return reader(source, pick)
@@ -298,8 +335,33 @@ def _contents(source: str, pick: Pick) -> Contents:
     return tiff(source, pick)
 
 
-def _array_contents(given: Any, pick: Pick) -> tuple[Contents, _ArrayFrames]:  # noqa: ANN401
-    """Take an array for a movie (t, z, y, x), or (t, y, x) with planes=1, or one frame."""
+def array_contents(given: Any, pick: Pick) -> tuple[Contents, _ArrayFrames]:  # noqa: ANN401
+    """Interpret an array as a movie (t, z, y, x), or (t, y, x) with planes=1, or one frame.
+
+    Parameters
+    ----------
+    given : array_like
+        An array of numpy or another library.
+    pick : Pick
+        The user's choices.
+
+    Returns
+    -------
+    contents : Contents
+    read : callable
+        ``read(i)`` returns frame i.
+
+    Raises
+    ------
+    ValueError
+        For another number of axes, or choices that are for files.
+
+    Examples
+    --------
+    >>> contents, read = array_contents(np.zeros((5, 12, 16)), Pick(planes=1))
+    >>> contents.shape, read(4).shape
+    ((5, 1, 12, 16), (1, 12, 16))
+    """
     array = given if hasattr(given, "shape") else np.asarray(given)
     if pick.channel is not None or pick.image is not None:
         raise ValueError("array: channel and image are for files; pass the part of the array")
@@ -329,95 +391,17 @@ def _array_contents(given: Any, pick: Pick) -> tuple[Contents, _ArrayFrames]:  #
     return contents, read
 
 
-def _settled(
-    source: str,
-    contents: Contents,
-    *,
-    voxel: Floats | None,
-    dt: float | None,
-    plane_time: float | None,
-) -> tuple[Floats, Floats, float | None]:
-    """Return voxel, times and time per plane of file and user, all faults in one error."""
-    size, faults = _voxel(contents, voxel)
-    times, more = _times(contents, dt)
-    per_plane = contents.plane_time if plane_time is None else plane_time
-    faults += more
-    if per_plane is not None and not (np.isfinite(per_plane) and per_plane >= 0):
-        faults.append(f"plane_time: expected seconds >= 0, got {per_plane!r}")
-    if faults:
-        raise ValueError(f"{source}: " + "; ".join(faults))
-    told = _differences(contents, size, times, per_plane)
-    if told:
-        warnings.warn(
-            f"{source}: the values given are used: " + "; ".join(told),
-            PrecisionWarning,
-            stacklevel=3,
-        )
-    return size, times, per_plane
-
-
-def _voxel(contents: Contents, given: Floats | None) -> tuple[Floats, list[str]]:
-    """Return the voxel size (z, y, x) and what is wrong with it."""
-    flat = contents.shape[1] == 1
-    size = contents.voxel.copy()
-    if given is not None:
-        if given.shape not in ((3,), (2,)) or (given.shape == (2,) and not flat):
-            return size, [f"voxel: expected (z, y, x) in um, got {given.tolist()}"]
-        size[3 - len(given) :] = given
-    bad = [
-        axis
-        for axis, length in zip("zyx", size, strict=True)
-        if not (np.isfinite(length) and length > 0) and not (flat and axis == "z")
-    ]
-    if bad and given is not None:
-        return size, [f"voxel: expected lengths > 0 in um, got {given.tolist()}"]
-    if bad:
-        wanted = "(y, x)" if flat else "(z, y, x)"
-        # ImageJ calls the images of a movie slices unless told otherwise.
-        movie = f", or (y, x) if its {contents.shape[1]} images are times"
-        hint = movie if contents.shape[0] == 1 and not flat else ""
-        return size, [f"no voxel size along {', '.join(bad)}: pass voxel={wanted} in um{hint}"]
-    return size, []
-
-
-def _times(contents: Contents, dt: float | None) -> tuple[Floats, list[str]]:
-    """Return the times of the frames and what is wrong with them."""
-    n = contents.shape[0]
-    if dt is not None:
-        if not (np.isfinite(dt) and dt > 0):
-            return np.zeros(n), [f"dt: expected seconds > 0, got {dt!r}"]
-        return np.arange(n, dtype=np.float64) * float(dt), []
-    if contents.times is None:
-        return np.zeros(n), [f"no times of its {n} frames: pass dt= in s"]
-    if np.any(np.diff(contents.times) <= 0):
-        late = int(np.flatnonzero(np.diff(contents.times) <= 0)[0]) + 1
-        return np.zeros(n), [f"the times do not grow at frame {late}: pass dt= in s"]
-    return contents.times, []
-
-
-def _differences(
-    contents: Contents, voxel: Floats, times: Floats, plane_time: float | None
-) -> list[str]:
-    """Say where the values in use are not the file's."""
-    interval = float(np.median(np.diff(times))) if len(times) > 1 else np.nan
-    other = contents.times
-    file_interval = np.nan if other is None or len(times) < 2 else np.median(np.diff(other))
-    pairs = {
-        f"voxel {a}": pair
-        for a, pair in zip("zyx", zip(voxel, contents.voxel, strict=True), strict=True)
-    }
-    pairs["dt"] = (interval, float(file_interval))
-    if plane_time is not None and contents.plane_time is not None:
-        pairs["plane_time"] = (plane_time, contents.plane_time)
-    return [
-        f"{name} {used:.6g} (in the file {there:.6g})"
-        for name, (used, there) in pairs.items()
-        if abs(used - there) > _TELL * abs(there)
-    ]
-
-
 def digest(stack: Stack) -> str:
-    """Return the SHA-256 of what a stack is read from: its files with their names, or its frames.
+    """Return the SHA-256 of a stack: of its files with their names, or of its frames in memory.
+
+    Parameters
+    ----------
+    stack : Stack
+
+    Returns
+    -------
+    str
+        Hexadecimal digits.
 
     Examples
     --------
@@ -444,25 +428,39 @@ def digest(stack: Stack) -> str:
 
 
 def write_stack(stack: Stack, path: _PathLike) -> None:
-    """Write a stack as OME-TIFF with voxel size and times, which `open_stack` reads back exactly.
+    """Write a stack as an OME-TIFF file with voxel size and times.
 
-    Written frame by frame, beside its place and renamed, so that a half-written one never stands.
+    `open_stack` reads grey levels, voxel size and times back exactly. The frames are read and
+    written one by one, so that a movie need not fit into memory. They are written to a temporary
+    file in the same folder, which is renamed when it is complete: an incomplete file never appears
+    at `path`, and an existing file is replaced only by a complete one. The OME header comes first
+    and every plane follows its own header, so that a copy of the file that was cut short can still
+    be opened, with its complete frames.
 
     Parameters
     ----------
     stack : Stack
-        The movie; integers of 8 to 32 bits, or floats of 32 or 64.
+        The movie; its grey levels are integers of 8, 16 or 32 bits or floats of 32 or 64 bits. A
+        voxel size of NaN along z (a 2-D movie) is not written.
     path : str or path
-        Where to, ending in ``.ome.tif`` or ``.ome.tiff``.
+        The file to write; its name ends in ``.ome.tif`` or ``.ome.tiff``. Files of more than 2 GB
+        are written as BigTIFF.
 
     Raises
     ------
     ValueError
-        For another suffix, or voxels that OME-TIFF has no type for.
+        For another suffix, or grey levels of a type that OME-TIFF does not have.
     FrameError
-        If a frame of the stack cannot be read; nothing is written then.
+        If a frame of the stack cannot be read; no file is written then.
+    OSError
+        If the file cannot be written, as on a full disk.
     ImportError
         If tifffile is not installed.
+
+    See Also
+    --------
+    open_stack : Read the file.
+    render_stack : Make a movie of spheres whose positions are known.
 
     Examples
     --------
@@ -481,26 +479,7 @@ def write_stack(stack: Stack, path: _PathLike) -> None:
     if stack.dtype.name not in _OME_TYPES:
         raise ValueError(f"{target}: OME-TIFF has no {stack.dtype}: expected one of {_OME_TYPES}")
     tifffile = needed("tifffile", "images")
-    n_bytes = int(np.prod(stack.shape)) * stack.dtype.itemsize
-    described: bytes | None = _ome_header(stack, tifffile)
-    with (
-        written_whole(target) as beside,
-        tifffile.TiffWriter(beside, bigtiff=n_bytes > 2**31) as file,
-    ):
-        # Every plane with its own header before it: a file that is cut short keeps the rest.
-        for plane in (plane for frame in stack for plane in frame):
-            file.write(
-                plane,
-                description=described,
-                photometric="minisblack",
-                metadata=None,
-                contiguous=False,
-            )
-            described = None
-
-
-def _ome_header(stack: Stack, tifffile: Any) -> bytes:  # noqa: ANN401 (an untyped library)
-    """Return axes, sizes and times in the words of OME."""
+    # Axes, sizes and times in the terms of OME.
     header: dict[str, Any] = {"axes": "TZYX"}
     for axis, length in zip("ZYX", stack.voxel, strict=True):
         if np.isfinite(length):
@@ -510,7 +489,21 @@ def _ome_header(stack: Stack, tifffile: Any) -> bytes:  # noqa: ANN401 (an untyp
     delay = np.arange(stack.shape[1]) * (stack.plane_time or 0.0)
     clock = (stack.times[:, None] + delay).ravel()
     header["Plane"] = {"DeltaT": clock.tolist(), "DeltaTUnit": ["s"] * clock.size}
-    xml = tifffile.OmeXml()
     t, z, y, x = stack.shape
+    xml = tifffile.OmeXml()
     xml.addimage(stack.dtype, stack.shape, (t * z, 1, 1, y, x, 1), **header)
-    return bytes(xml.tostring(declaration=True).encode())
+    description: bytes | None = bytes(xml.tostring(declaration=True).encode())
+    n_bytes = t * z * y * x * stack.dtype.itemsize
+    with (
+        written_whole(target) as beside,
+        tifffile.TiffWriter(beside, bigtiff=n_bytes > 2**31) as file,
+    ):
+        for plane in (plane for frame in stack for plane in frame):
+            file.write(
+                plane,
+                description=description,
+                photometric="minisblack",
+                metadata=None,
+                contiguous=False,
+            )
+            description = None

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from perrin._arrays import Floats, Ints
-    from perrin.images.spheres.localisation import Refine, Sampled, Search
+    from perrin.images.spheres.localisation import Refine, SampledFrame, Search
     from perrin.images.stack import Stack
     from perrin.motion.rigid_motion import RigidMotion
 
@@ -211,7 +211,7 @@ def _learned(
     }
 
 
-def _refuse_still(stack: Stack, sample: Sequence[Sampled], frames: Sequence[int]) -> None:
+def _refuse_still(stack: Stack, sample: Sequence[SampledFrame], frames: Sequence[int]) -> None:
     """Refuse a movie all of whose frames are the same image; one without any contrast is not one.
 
     Raises
@@ -245,7 +245,7 @@ class _Locate:
     def __call__(self, i: int) -> tuple[pd.DataFrame, dict[str, Any]]:
         entry: dict[str, Any] = {"frame": i, "spots": 0, "spheres": 0}
         try:
-            found = self.method.look(self.stack, i)
+            found = self.method.locate_in(self.stack, i)
         except FrameError as fault:
             nothing = {"level": np.nan, "saturated": np.nan, "digest": "", "fault": str(fault)}
             return found_table([]), entry | nothing

@@ -1,4 +1,4 @@
-"""What a microscope file says of itself, before anything is asked of the user."""
+"""Contents of a microscope file: shape, axes, voxel size and times, from the file and the user."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from perrin._arrays import number_fault
+
 if TYPE_CHECKING:
     from perrin._arrays import Floats
 
@@ -18,11 +20,11 @@ if TYPE_CHECKING:
 Plane: TypeAlias = Callable[[int, int], NDArray[Any]]
 
 
-# Axes that may be times or planes: the letters by which tifffile says that it does not know.
+# Letters by which tifffile marks axes of unknown meaning: times or planes.
 UNNAMED = "IQ"
 
 
-_UM = {
+_UM_PER_UNIT = {
     **dict.fromkeys(("m", "meter", "metre"), 1e6),
     **dict.fromkeys(("cm", "centimeter", "centimetre"), 1e4),
     **dict.fromkeys(("mm", "millimeter", "millimetre"), 1e3),
@@ -33,7 +35,7 @@ _UM = {
 }
 
 
-_SECONDS = {
+_SECONDS_PER_UNIT = {
     **dict.fromkeys(("h", "hour"), 3600.0),
     **dict.fromkeys(("min", "minute"), 60.0),
     **dict.fromkeys(("s", "sec", "second"), 1.0),
@@ -44,7 +46,22 @@ _SECONDS = {
 
 
 class Pick(NamedTuple):
-    """What the user chose among the things that a file holds; None where nothing was chosen."""
+    """The user's choices among the contents of a file.
+
+    Attributes
+    ----------
+    channel : int or None
+        Number of the channel, from 0.
+    planes : int or None
+        Number of planes of a frame, where the file does not distinguish times from planes.
+    image : int or str or None
+        Number or name of the image in a file that holds several.
+
+    Examples
+    --------
+    >>> Pick(planes=4)
+    Pick(channel=None, planes=4, image=None)
+    """
 
     channel: int | None = None
     planes: int | None = None
@@ -53,26 +70,26 @@ class Pick(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Contents:
-    """A file as it describes itself.
+    """Contents of a file, as its header describes them.
 
     Attributes
     ----------
     shape : tuple of int
-        (t, z, y, x).
+        Number of frames, and voxels of a frame: (t, z, y, x).
     dtype : numpy.dtype
-        Of the voxels.
+        Type of the grey levels.
     plane : callable
         ``plane(t, z)`` reads one image (y, x).
     close : callable
-        Lets go of the file.
+        Closes the file.
     voxel : ndarray, shape (3,)
-        (z, y, x), um; NaN where the file does not say.
+        Voxel size (z, y, x), um; NaN where the file does not state it.
     times : ndarray, shape (t,), or None
-        Seconds.
+        Times of the frames, s; None where the file does not state them.
     plane_time : float or None
-        Seconds from one plane to the next.
+        Time from one plane to the next, s; None where the file does not state it.
     notes : tuple of str
-        How it was read where the file does not say.
+        How the file was interpreted where it does not name its axes.
     """
 
     shape: tuple[int, int, int, int]
@@ -91,9 +108,114 @@ class Contents:
             out[z] = self.plane(t, z)
         return out
 
+    def settled_voxel(self, given: Floats | None) -> tuple[Floats, list[str]]:
+        """Return the voxel size of the user or of the file, and the faults of it.
+
+        Parameters
+        ----------
+        given : ndarray, shape (3,) or (2,), or None
+            The user's voxel size (z, y, x), or (y, x) for a 2-D movie, um.
+
+        Returns
+        -------
+        voxel : ndarray, shape (3,)
+            Voxel size (z, y, x), um.
+        faults : list of str
+            Empty, or one line.
+        """
+        flat = self.shape[1] == 1
+        size = self.voxel.copy()
+        if given is not None:
+            if given.shape not in ((3,), (2,)) or (given.shape == (2,) and not flat):
+                return size, [f"voxel: expected (z, y, x) in um, got {given.tolist()}"]
+            size[3 - len(given) :] = given
+        bad = [
+            axis
+            for axis, length in zip("zyx", size, strict=True)
+            if not (np.isfinite(length) and length > 0) and not (flat and axis == "z")
+        ]
+        if bad and given is not None:
+            return size, [f"voxel: expected lengths > 0 in um, got {given.tolist()}"]
+        if bad:
+            wanted = "(y, x)" if flat else "(z, y, x)"
+            # ImageJ calls the images of a movie slices by default.
+            movie = f", or (y, x) if its {self.shape[1]} images are times"
+            hint = movie if self.shape[0] == 1 and not flat else ""
+            return size, [f"no voxel size along {', '.join(bad)}: pass voxel={wanted} in um{hint}"]
+        return size, []
+
+    def settled_times(self, dt: float | None) -> tuple[Floats, list[str]]:
+        """Return the times of the frames from the user's interval or the file, and the faults.
+
+        Parameters
+        ----------
+        dt : float or None
+            The user's time between frames, s.
+
+        Returns
+        -------
+        times : ndarray, shape (t,)
+            Times of the frames, s.
+        faults : list of str
+            Empty, or one line.
+        """
+        n = self.shape[0]
+        if dt is not None:
+            faults = number_fault("dt", dt, above=0, unit="s")
+            if faults:
+                return np.zeros(n), faults
+            return np.arange(n, dtype=np.float64) * float(dt), []
+        if self.times is None:
+            return np.zeros(n), [f"no times of its {n} frames: pass dt= in s"]
+        if np.any(np.diff(self.times) <= 0):
+            late = int(np.flatnonzero(np.diff(self.times) <= 0)[0]) + 1
+            return np.zeros(n), [f"the times do not grow at frame {late}: pass dt= in s"]
+        return self.times, []
+
+    def differences(
+        self, voxel: Floats, times: Floats, plane_time: float | None, *, tolerance: float
+    ) -> list[str]:
+        """Return a line for each value in use that differs from the file's.
+
+        Parameters
+        ----------
+        voxel, times, plane_time
+            The values in use.
+        tolerance : float
+            Largest relative difference that is not listed.
+
+        Returns
+        -------
+        list of str
+        """
+        interval = float(np.median(np.diff(times))) if len(times) > 1 else np.nan
+        file_interval = np.nan
+        if self.times is not None and len(times) > 1:
+            file_interval = float(np.median(np.diff(self.times)))
+        pairs = {
+            f"voxel {axis}": (float(used), float(there))
+            for axis, used, there in zip("zyx", voxel, self.voxel, strict=True)
+        }
+        pairs["dt"] = (interval, file_interval)
+        if plane_time is not None and self.plane_time is not None:
+            pairs["plane_time"] = (plane_time, self.plane_time)
+        return [
+            f"{name} {used:.6g} (in the file {there:.6g})"
+            for name, (used, there) in pairs.items()
+            if abs(used - there) > tolerance * abs(there)
+        ]
+
 
 class Layout(NamedTuple):
-    """Where the plane z of frame t is among the axes of a file."""
+    """The images of a file as planes of frames.
+
+    Attributes
+    ----------
+    t, z : int
+        Number of frames, and of planes of a frame.
+    at : callable
+        ``at(t, z)`` returns the index of plane z of frame t along every axis of the file.
+    """
 
     t: int
     z: int
@@ -101,19 +223,39 @@ class Layout(NamedTuple):
 
 
 def layout(sizes: Mapping[str, int], pick: Pick, *, cut: bool = False) -> Layout:
-    """Tell times, planes and channels among named axes; X and Y are the image and left alone.
+    """Assign times, planes and channels to named axes; X and Y are those of the images.
 
-    Of a file that was cut short (`cut`) and does not name its axes, the frame in which it ends
-    counts, so that its loss is met.
+    Parameters
+    ----------
+    sizes : mapping of str to int
+        Size of the file along each axis.
+    pick : Pick
+        The user's choices.
+    cut : bool
+        The file was cut short. If it does not name its axes, the incomplete frame at its end is
+        counted, so that reading it raises an error.
+
+    Returns
+    -------
+    Layout
 
     Raises
     ------
     ValueError
         If there are several channels and none is chosen, if an axis is neither time, plane nor
         channel, or if images could be times as well as planes.
+
+    Examples
+    --------
+    >>> where = layout({"T": 5, "Z": 4, "Y": 12, "X": 16}, Pick())
+    >>> where.t, where.z, where.at(3, 1)
+    (5, 4, {'T': 3, 'Z': 1, 'C': 0})
+    >>> where = layout({"I": 20, "Y": 12, "X": 16}, Pick(planes=4))
+    >>> where.t, where.z, where.at(3, 1)
+    (5, 4, {'I': 13, 'C': 0})
     """
     size = {axis: n for axis, n in sizes.items() if n > 1 and axis not in "YX"}
-    fixed = _channel({a: size.pop(a) for a in "CS" if a in size}, pick.channel)
+    fixed = channel_index({a: size.pop(a) for a in "CS" if a in size}, pick.channel)
     strange = {a: n for a, n in size.items() if a not in "TZ" + UNNAMED}
     if strange:
         raise ValueError(
@@ -121,7 +263,7 @@ def layout(sizes: Mapping[str, int], pick: Pick, *, cut: bool = False) -> Layout
             "as a file of its own"
         )
     if len(size) > 1 and set(size) - set("TZ"):
-        raise ValueError(f"does not say which of its axes {size} are times and which planes")
+        raise ValueError(f"does not state which of its axes {size} are times and which planes")
     unnamed = not set(size) <= set("TZ")
     cut = cut and (unnamed or not size)
     if cut and not size and pick.planes is None:
@@ -129,17 +271,46 @@ def layout(sizes: Mapping[str, int], pick: Pick, *, cut: bool = False) -> Layout
     if unnamed and pick.planes is None:
         n = prod(size.values())
         raise ValueError(
-            f"does not say whether its {n} images are times or planes: pass planes=1 (a 2-D movie),"
-            f" planes={n} (one stack) or the number of planes of one frame"
+            f"does not state whether its {n} images are times or planes: pass planes=1 (a 2-D "
+            f"movie), planes={n} (one stack) or the number of planes of one frame"
         )
     t, z = size.get("T", 1), size.get("Z", 1)
     if pick.planes is None or (not unnamed and pick.planes == z):
         return Layout(t, z, lambda i, k: {"T": i, "Z": k, **fixed})
-    return _regrouped(size, pick.planes, fixed, cut=cut)
+    return frames_of_planes(size, pick.planes, fixed, cut=cut)
 
 
-def _regrouped(size: dict[str, int], planes: int, fixed: dict[str, int], *, cut: bool) -> Layout:
-    """Cut one run of images into frames of so many planes."""
+def frames_of_planes(
+    size: dict[str, int], planes: int, fixed: dict[str, int], *, cut: bool
+) -> Layout:
+    """Divide a sequence of images into frames of equally many planes.
+
+    Parameters
+    ----------
+    size : dict of str to int
+        Size of the file along the axes of the sequence.
+    planes : int
+        Number of planes of a frame.
+    fixed : dict of str to int
+        Index along the axis of the channels.
+    cut : bool
+        The file was cut short; the incomplete frame at its end is counted.
+
+    Returns
+    -------
+    Layout
+
+    Raises
+    ------
+    ValueError
+        If the images do not make whole frames.
+
+    Examples
+    --------
+    >>> where = frames_of_planes({"I": 20}, 4, {}, cut=False)
+    >>> where.t, where.at(3, 1)
+    (5, {'I': 13})
+    """
     if len(size) > 1:
         raise ValueError(f"has {size['Z']} planes a frame, not planes={planes}")
     axis, n = next(iter(size.items()), ("T", 1))
@@ -151,8 +322,30 @@ def _regrouped(size: dict[str, int], planes: int, fixed: dict[str, int], *, cut:
     return Layout(n // planes, planes, lambda i, k: {axis: i * planes + k, **fixed})
 
 
-def _channel(size: dict[str, int], channel: int | None) -> dict[str, int]:
-    """Return the index of the chosen channel."""
+def channel_index(size: dict[str, int], channel: int | None) -> dict[str, int]:
+    """Return the index of the chosen channel, by the name of its axis.
+
+    Parameters
+    ----------
+    size : dict of str to int
+        Size along the axes of channels and colours.
+    channel : int or None
+        Number of the chosen channel, from 0.
+
+    Returns
+    -------
+    dict of str to int
+
+    Raises
+    ------
+    ValueError
+        If the channel does not exist, or none of several is chosen.
+
+    Examples
+    --------
+    >>> channel_index({"C": 2}, 1), channel_index({}, None)
+    ({'C': 1}, {'C': 0})
+    """
     if len(size) > 1:
         raise ValueError("has channels of several colours each: save one channel as grey values")
     axis, n = next(iter(size.items()), ("C", 1))
@@ -164,7 +357,18 @@ def _channel(size: dict[str, int], channel: int | None) -> dict[str, int]:
 
 
 def chosen(names: list[str], image: int | str | None) -> int:
-    """Return which image of a file is meant."""
+    """Return the number of the image that the user chose, by number or name.
+
+    Raises
+    ------
+    ValueError
+        If there is no such image, or none of several is chosen.
+
+    Examples
+    --------
+    >>> chosen(["overview", "stack"], "stack"), chosen(["overview", "stack"], 0)
+    (1, 0)
+    """
     if image is None and len(names) == 1:
         return 0
     if isinstance(image, int) and 0 <= image < len(names):
@@ -181,6 +385,11 @@ def needed(module: str, extra: str) -> Any:  # noqa: ANN401 (any module)
     ------
     ImportError
         If it is not installed, with the command that installs it.
+
+    Examples
+    --------
+    >>> needed("numpy", "images").__name__
+    'numpy'
     """
     try:
         return import_module(module)
@@ -193,16 +402,29 @@ def needed(module: str, extra: str) -> Any:  # noqa: ANN401 (any module)
 
 
 def in_um(value: object, unit: str | None) -> float:
-    """Return a positive length in um; NaN where there is none or its unit is not a length."""
-    return _in(value, unit, _UM)
+    """Return a positive length in um; NaN where there is none or its unit is not a length.
+
+    Examples
+    --------
+    >>> in_um(250, "nm"), in_um("2e-7", "m"), in_um(1.0, "pixel")
+    (0.25, 0.19999999999999998, nan)
+    """
+    return _converted(value, unit, _UM_PER_UNIT)
 
 
 def in_seconds(value: object, unit: str | None) -> float:
-    """Return a positive time in seconds; NaN where there is none or its unit is not a time."""
-    return _in(value, unit, _SECONDS)
+    """Return a positive time in seconds; NaN where there is none or its unit is not a time.
+
+    Examples
+    --------
+    >>> in_seconds(730, "ms"), in_seconds(2, "min"), in_seconds(None, "s")
+    (0.73, 120.0, nan)
+    """
+    return _converted(value, unit, _SECONDS_PER_UNIT)
 
 
-def _in(value: object, unit: str | None, table: Mapping[str, float]) -> float:
+def _converted(value: object, unit: str | None, table: Mapping[str, float]) -> float:
+    """Return a positive number in the unit of the table; NaN where there is none."""
     if value is None or unit is None:
         return np.nan
     word = unit.strip()
@@ -213,7 +435,13 @@ def _in(value: object, unit: str | None, table: Mapping[str, float]) -> float:
 
 
 def even_times(n: int, dt: float) -> Floats | None:
-    """Return n even times from 0; None for an unknown interval, unless one frame needs none."""
+    """Return n even times from 0; None for an unknown interval, unless one frame needs none.
+
+    Examples
+    --------
+    >>> even_times(3, 0.5), even_times(3, np.nan), even_times(1, np.nan)
+    (array([0. , 0.5, 1. ]), None, array([0.]))
+    """
     if n == 1:
         return np.zeros(1)
     return np.arange(n, dtype=np.float64) * dt if np.isfinite(dt) else None

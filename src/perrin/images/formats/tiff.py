@@ -1,4 +1,4 @@
-"""TIFF in its dialects: plain, OME, ImageJ, and sequences of files."""
+"""TIFF files: plain, OME, ImageJ, and sequences of files."""
 
 from __future__ import annotations
 
@@ -26,21 +26,41 @@ from perrin.images.formats.contents import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from perrin._arrays import Floats
 
 
-class _Scale(NamedTuple):
-    """What a header says of lengths and times."""
+class HeaderScale(NamedTuple):
+    """Lengths and times that the header of a file states.
+
+    Attributes
+    ----------
+    voxel : ndarray, shape (3,)
+        Voxel size (z, y, x), um; NaN where it is not stated.
+    times : ndarray, shape (t,), or None
+        Times of the frames, s.
+    plane_time : float or None
+        Time from one plane to the next, s.
+    """
 
     voxel: Floats
     times: Floats | None = None
     plane_time: float | None = None
 
 
-class _Declared(NamedTuple):
-    """Images one after the other in a file, as its header declares them."""
+class DeclaredSeries(NamedTuple):
+    """Contiguous images of a file, as its header declares them.
+
+    Attributes
+    ----------
+    axes : str
+        Letter of each axis.
+    shape : tuple of int
+        Size along each axis.
+    dtype : numpy.dtype
+        Type of the grey levels.
+    dataoffset : int
+        Position of the first image in the file, bytes.
+    """
 
     axes: str
     shape: tuple[int, ...]
@@ -48,20 +68,26 @@ class _Declared(NamedTuple):
     dataoffset: int
 
 
-_SILENT = _Scale(np.full(3, np.nan))
-
-
 def tiff(path: str, pick: Pick, *, one_frame: bool = False) -> Contents:
     """Describe one TIFF file; with `one_frame` all its images are the planes of a single frame."""
     file = needed("tifffile", "images").TiffFile(path)
     try:
         number = chosen([str(series.name) for series in file.series], pick.image)
-        series = _imagej_series(file) or file.series[number]
-        names, notes = _named_axes(series, pick)
+        series = declared_imagej_series(file) or file.series[number]
+        names, notes = named_axes(series, pick)
         sizes = dict(zip(names, series.shape, strict=True))
-        choice = _whole(sizes, pick) if one_frame else pick
-        where = layout(sizes, choice, cut=_cut_short(file))
-        scale = _scale(file, number, where, pick.channel or 0)
+        if one_frame:
+            if sizes.get("T", 1) > 1:
+                raise ValueError(f"is a movie of {sizes['T']} frames, where one frame was expected")
+            planes = prod(n for axis, n in sizes.items() if axis not in "CSYX")
+            where = layout(sizes, pick._replace(planes=planes), cut=is_cut_short(file))
+        else:
+            where = layout(sizes, pick, cut=is_cut_short(file))
+        scale = HeaderScale(np.full(3, np.nan))
+        if file.is_ome:
+            scale = ome_scale(file.ome_metadata, number, where, pick.channel or 0)
+        elif file.is_imagej:
+            scale = imagej_scale(file, where)
     except struct.error as fault:
         file.close()
         raise ValueError("is cut short, within the header of an image: copy it again") from fault
@@ -70,7 +96,7 @@ def tiff(path: str, pick: Pick, *, one_frame: bool = False) -> Contents:
         raise
 
     def plane(t: int, z: int) -> NDArray[Any]:
-        return _plane(file, series, names, where.at(t, z))
+        return read_plane(file, series, names, where.at(t, z))
 
     return Contents(
         shape=(where.t, where.z, sizes["Y"], sizes["X"]),
@@ -84,14 +110,31 @@ def tiff(path: str, pick: Pick, *, one_frame: bool = False) -> Contents:
     )
 
 
-def _named_axes(series: Any, pick: Pick) -> tuple[list[str], tuple[str, ...]]:  # noqa: ANN401
-    """Return a name of its own for every axis of a series, and how unnamed ones were read.
+def named_axes(series: Any, pick: Pick) -> tuple[list[str], tuple[str, ...]]:  # noqa: ANN401
+    """Return a unique name for every axis of a series, and how unnamed axes were interpreted.
 
-    tifffile names axes of an unknown meaning Q or I, several of them alike: what `imwrite` makes of
-    an array (t, z, y, x) has the axes QQYX. Two of them are times and planes in the order of the
-    array; three, or one beside a named one, only where `pick` settles which is which.
+    tifffile gives axes of unknown meaning the letters Q or I, several axes the same one: an array
+    (t, z, y, x) written by `imwrite` has the axes QQYX. Two of them are times and planes in the
+    order of the array; three, or one besides a named one, only if `pick` decides which is which.
+
+    Parameters
+    ----------
+    series : tifffile.TiffPageSeries or DeclaredSeries
+    pick : Pick
+        The user's choices.
+
+    Returns
+    -------
+    names : list of str
+    notes : tuple of str
+        Empty where the file names its axes.
+
+    Raises
+    ------
+    ValueError
+        If several axes have one name, or unnamed axes are left undecided.
     """
-    axes = _without_colours(series, pick)
+    axes = axes_without_colours(series, pick)
     named = [axis for axis in axes if axis not in UNNAMED]
     if len(set(named)) < len(named):
         raise ValueError(f"has axes {series.axes}, several of one name")
@@ -101,8 +144,8 @@ def _named_axes(series: Any, pick: Pick) -> tuple[list[str], tuple[str, ...]]:  
     if len(unknown) == 2 and not known:
         roles = dict(zip(unknown, "TZ", strict=True))
     else:
-        roles = _settled_roles([k for k in unknown if shape[k] > 1], known, shape, pick)
-    # Axes of one element that are left are no choice: any name of their own will do.
+        roles = axis_roles([k for k in unknown if shape[k] > 1], known, shape, pick)
+    # Unnamed axes of one element get any unique name.
     answer = [roles.get(k, f"{axis}{k}" if k in unknown else axis) for k, axis in enumerate(axes)]
     if not {"T", "Z"} & set(roles.values()):
         return answer, ()
@@ -112,10 +155,25 @@ def _named_axes(series: Any, pick: Pick) -> tuple[list[str], tuple[str, ...]]:  
     return answer, (f"the file does not name the axes of its shape {shape}: read as ({read})",)
 
 
-def _without_colours(series: Any, pick: Pick) -> list[str]:  # noqa: ANN401
-    """Return the letters of the axes, Q for what only `imwrite` took for the colours of an image.
+def axes_without_colours(series: Any, pick: Pick) -> list[str]:  # noqa: ANN401
+    """Return the letters of the axes, with Q for planes or times that tifffile took for colours.
 
-    Of three or four images in a row, not named by their writer, tifffile makes colours.
+    tifffile takes three or four successive images without named axes for colours.
+
+    Parameters
+    ----------
+    series : tifffile.TiffPageSeries or DeclaredSeries
+    pick : Pick
+        The user's choices.
+
+    Returns
+    -------
+    list of str
+
+    Raises
+    ------
+    ValueError
+        If `pick` does not decide whether they are colours.
     """
     axes = list(series.axes)
     if getattr(series, "kind", "") != "shaped" or set(axes) & set("TZC") or "S" not in axes:
@@ -134,28 +192,52 @@ def _without_colours(series: Any, pick: Pick) -> list[str]:  # noqa: ANN401
     return axes
 
 
-def _settled_roles(
+def axis_roles(
     unknown: list[int], known: list[str], shape: tuple[int, ...], pick: Pick
 ) -> dict[int, str]:
-    """Return which of the unnamed axes are times, planes and channels, as far as `pick` says so.
+    """Return which of the unnamed axes are times, planes and channels, as `pick` decides.
+
+    Parameters
+    ----------
+    unknown : list of int
+        Unnamed axes of more than one element; a single one is left to `layout`.
+    known : list of str
+        Those of the letters T and Z that name an axis.
+    shape : tuple of int
+        Size of the file along all axes.
+    pick : Pick
+        The user's choices.
+
+    Returns
+    -------
+    dict of int to str
 
     Raises
     ------
     ValueError
-        If it does not; a single unnamed axis is left to `layout`.
+        If `pick` does not decide.
+
+    Examples
+    --------
+    >>> axis_roles([0, 1, 2], [], (2, 3, 5, 12, 16), Pick(planes=5, channel=1))
+    {0: 'T', 1: 'C', 2: 'Z'}
     """
     if not unknown or (len(unknown) == 1 and not known):
         return dict.fromkeys(unknown, "Q")
     sizes = [shape[k] for k in unknown]
+    # Of three axes the first is times; the inner ones are planes and channels in either order.
+    order_of_three = ""
+    if pick.channel is not None and sizes[1:].count(pick.planes or 0) == 1:
+        order_of_three = "TZC" if sizes[1] == pick.planes else "TCZ"
     roles = {
         (1, ("T",)): "Z" if pick.planes == sizes[0] else "",
         (1, ("Z",)): "T" if pick.planes is not None else "",
         (2, ()): "TZ" if pick.planes == sizes[-1] else "",
-        (3, ()): _order_of_three(sizes[1:], pick),
+        (3, ()): order_of_three,
     }.get((len(unknown), tuple(known)), "")
     if not roles:
         raise ValueError(
-            f"has shape {shape} and does not say what its axes of "
+            f"has shape {shape} and does not state what its axes of "
             f"{', '.join(map(str, sizes))} images are: pass planes=, the number of planes of one "
             "frame, and channel= if one of them is channels (times come first then), or write the "
             "file with its axes, as in imwrite(..., metadata={'axes': 'TZYX'})"
@@ -163,15 +245,8 @@ def _settled_roles(
     return dict(zip(unknown, roles, strict=True))
 
 
-def _order_of_three(inner: list[int], pick: Pick) -> str:
-    """Return which of the two inner axes are planes and channels; "" where it is open."""
-    if pick.channel is None or inner.count(pick.planes or 0) != 1:
-        return ""
-    return "TZC" if inner[0] == pick.planes else "TCZ"
-
-
-def _cut_short(file: Any) -> bool:  # noqa: ANN401 (tifffile is untyped here)
-    """Return whether the chain of images ends otherwise than with the zero that ends it."""
+def is_cut_short(file: Any) -> bool:  # noqa: ANN401 (tifffile is untyped here)
+    """Return whether the chain of images does not end with the zero that ends a complete one."""
     end = file.pages.next_page_offset
     if end is None:
         return False
@@ -179,8 +254,8 @@ def _cut_short(file: Any) -> bool:  # noqa: ANN401 (tifffile is untyped here)
     return any(file.filehandle.read(file.tiff.offsetsize))
 
 
-def _imagej_series(file: Any) -> _Declared | None:  # noqa: ANN401
-    """Return the images that an ImageJ header declares where the file ends before their last."""
+def declared_imagej_series(file: Any) -> DeclaredSeries | None:  # noqa: ANN401
+    """Return the images that an ImageJ header declares, if the file ends before the last one."""
     header = file.imagej_metadata if file.is_imagej else None
     page = file.pages.first
     if not header or len(file.pages) > 1 or not page.is_contiguous:
@@ -191,72 +266,93 @@ def _imagej_series(file: Any) -> _Declared | None:  # noqa: ANN401
     whole = prod(shape) * np.dtype(page.dtype).itemsize
     if page.axes != "YX" or start + whole <= file.filehandle.size:
         return None
-    return _Declared("TZCYX", shape, page.dtype, start)
+    return DeclaredSeries("TZCYX", shape, page.dtype, start)
 
 
-def _whole(sizes: Mapping[str, int], pick: Pick) -> Pick:
-    """Return the choice that takes a file for one frame."""
-    if sizes.get("T", 1) > 1:
-        raise ValueError(f"is a movie of {sizes['T']} frames, where one frame was expected")
-    return pick._replace(planes=prod(n for axis, n in sizes.items() if axis not in "CSYX"))
-
-
-def _plane(
+def read_plane(
     file: Any,  # noqa: ANN401
     series: Any,  # noqa: ANN401
     names: list[str],
     at: dict[str, int],
 ) -> NDArray[Any]:
-    """Read one image (y, x) of a series, whose axes have these names."""
+    """Read one image of a series.
+
+    Parameters
+    ----------
+    file : tifffile.TiffFile
+    series : tifffile.TiffPageSeries or DeclaredSeries
+    names : list of str
+        Names of the axes of the series.
+    at : dict of str to int
+        Index along these axes; 0 where an axis is missing.
+
+    Returns
+    -------
+    ndarray, shape (y, x)
+
+    Raises
+    ------
+    ValueError
+        If the file ends before the image.
+    """
     index = [at.get(name, 0) for name in names]
     if any(i >= n for i, n in zip(index, series.shape, strict=True)):
         raise ValueError("the file ends before it")
-    lead = _leading(series)
+    # The leading axes count images; the others lie within one: Y, X and colours.
+    inner = "YX" + ("S" if "S" in series.axes else "")
+    lead = min(str(series.axes).index(axis) for axis in inner)
     number = int(np.ravel_multi_index(index[:lead], series.shape[:lead])) if lead else 0
-    block = _stretch(file, series, number, lead)
-    inside = (
-        slice(None) if axis in "YX" else i
-        for axis, i in zip(series.axes[lead:], index[lead:], strict=True)
-    )
-    return np.asarray(block[tuple(inside)])
-
-
-def _leading(series: Any) -> int:  # noqa: ANN401
-    """Return how many axes count images; the others lie within one (Y, X, colours)."""
-    return min(str(series.axes).index(axis) for axis in "YX" + ("S" if "S" in series.axes else ""))
-
-
-def _stretch(file: Any, series: Any, number: int, lead: int) -> NDArray[Any]:  # noqa: ANN401
-    """Read the images that belong to one index, (Y, X) or with colours.
-
-    Of a contiguous file the header may list the first page only, so the bytes are counted.
-    """
     block = series.shape[lead:]
     if series.dataoffset is None:
         page = series.pages[number] if number < len(series.pages) else None
         if page is None:
             raise ValueError(f"image {number} is not in the file")
-        return np.asarray(page.asarray().reshape(block))
-    dtype = np.dtype(series.dtype).newbyteorder(file.byteorder)
-    n_bytes = prod(block) * dtype.itemsize
-    file.filehandle.seek(series.dataoffset + number * n_bytes)
-    data = file.filehandle.read(n_bytes)
-    if len(data) < n_bytes:
-        raise ValueError(f"the file ends before or within image {number}")
-    return np.frombuffer(data, dtype=dtype).reshape(block)
+        image = np.asarray(page.asarray().reshape(block))
+    else:
+        # The header of a contiguous file may list the first page only: the bytes are counted.
+        dtype = np.dtype(series.dtype).newbyteorder(file.byteorder)
+        n_bytes = prod(block) * dtype.itemsize
+        file.filehandle.seek(series.dataoffset + number * n_bytes)
+        data = file.filehandle.read(n_bytes)
+        if len(data) < n_bytes:
+            raise ValueError(f"the file ends before or within image {number}")
+        image = np.frombuffer(data, dtype=dtype).reshape(block)
+    inside = (
+        slice(None) if axis in "YX" else i
+        for axis, i in zip(series.axes[lead:], index[lead:], strict=True)
+    )
+    return np.asarray(image[tuple(inside)])
 
 
-def _scale(file: Any, number: int, where: Layout, channel: int) -> _Scale:  # noqa: ANN401
-    """Read voxel size and times from the dialect of the file."""
-    if file.is_ome:
-        return _ome(file.ome_metadata, number, where, channel)
-    if file.is_imagej:
-        return _imagej(file, where)
-    return _SILENT
+def ome_scale(xml: str, number: int, where: Layout, channel: int) -> HeaderScale:
+    """Read an OME header: pixel sizes, and the measured times of planes or an interval.
 
+    Parameters
+    ----------
+    xml : str
+        The header.
+    number : int
+        Number of the image.
+    where : Layout
+        Times and planes of the image.
+    channel : int
+        Number of the channel, whose times are read.
 
-def _ome(xml: str, number: int, where: Layout, channel: int) -> _Scale:
-    """Read the OME header: pixel sizes, and times measured plane by plane or an interval."""
+    Returns
+    -------
+    HeaderScale
+        The measured times where every frame has one, else even ones.
+
+    Examples
+    --------
+    >>> xml = (
+    ...     '<OME xmlns="a"><Image><Pixels PhysicalSizeZ="0.25" PhysicalSizeY="200" '
+    ...     'PhysicalSizeYUnit="nm" TimeIncrement="0.5"/></Image></OME>'
+    ... )
+    >>> scale = ome_scale(xml, 0, layout({"T": 3, "Z": 4}, Pick()), 0)
+    >>> scale.voxel, scale.times
+    (array([0.25, 0.2 ,  nan]), array([0. , 0.5, 1. ]))
+    """
     from xml.etree import ElementTree
 
     pixels = [e for e in ElementTree.fromstring(xml).iter() if e.tag.endswith("}Pixels")][number]
@@ -268,7 +364,7 @@ def _ome(xml: str, number: int, where: Layout, channel: int) -> _Scale:
             for axis in "ZYX"
         ]
     )
-    step = in_seconds(pixels.get("TimeIncrement"), pixels.get("TimeIncrementUnit", "s"))
+    interval = in_seconds(pixels.get("TimeIncrement"), pixels.get("TimeIncrementUnit", "s"))
     clock = np.full((where.t, where.z), np.nan)
     for e in pixels:
         if e.tag.endswith("}Plane") and e.get("DeltaT") and int(e.get("TheC", 0)) == channel:
@@ -276,35 +372,43 @@ def _ome(xml: str, number: int, where: Layout, channel: int) -> _Scale:
             if t < where.t and z < where.z:
                 unit = in_seconds(1.0, e.get("DeltaTUnit", "s"))
                 clock[t, z] = float(e.get("DeltaT", "nan")) * unit
-    return _clocked(voxel, clock, even_times(where.t, step))
-
-
-def _clocked(voxel: Floats, clock: Floats, even: Floats | None) -> _Scale:
-    """Take the times of planes (t, z) where all frames have them, else the even ones."""
     start = clock[:, 0]
     steps = np.diff(clock, axis=1)
     steps = steps[np.isfinite(steps)]
-    per_plane = float(np.median(steps)) if steps.size else 0.0
+    plane_time = float(np.median(steps)) if steps.size else 0.0
     measured = bool(np.all(np.isfinite(start)) and np.all(np.diff(start) > 0))
-    return _Scale(voxel, start if measured else even, per_plane if per_plane > 0 else None)
+    times = start if measured else even_times(where.t, interval)
+    return HeaderScale(voxel, times, plane_time if plane_time > 0 else None)
 
 
-def _imagej(file: Any, where: Layout) -> _Scale:  # noqa: ANN401
-    """Read the ImageJ header: unit, spacing, interval, and the resolution tags in that unit."""
+def imagej_scale(file: Any, where: Layout) -> HeaderScale:  # noqa: ANN401
+    """Read an ImageJ header: unit, spacing, interval, and the resolution tags in that unit.
+
+    Parameters
+    ----------
+    file : tifffile.TiffFile
+    where : Layout
+        Times and planes of the file.
+
+    Returns
+    -------
+    HeaderScale
+    """
     header = file.imagej_metadata or {}
     unit = header.get("unit")
     tags = file.pages[0].tags
 
-    def size(tag: str) -> float:
+    def pixel_size(tag: str) -> float:
         if tag not in tags or not all(tags[tag].value):
             return float("nan")
         count, length = tags[tag].value
         return in_um(length / count, unit)
 
-    voxel = np.array([in_um(header.get("spacing"), unit), size("YResolution"), size("XResolution")])
+    spacing = in_um(header.get("spacing"), unit)
+    voxel = np.array([spacing, pixel_size("YResolution"), pixel_size("XResolution")])
     rate = float(header.get("fps") or 0)
-    step = in_seconds(header.get("finterval") or (1 / rate if rate > 0 else None), "s")
-    return _Scale(voxel, even_times(where.t, step))
+    interval = in_seconds(header.get("finterval") or (1 / rate if rate > 0 else None), "s")
+    return HeaderScale(voxel, even_times(where.t, interval))
 
 
 def sequence_files(path: str) -> list[str]:
@@ -312,24 +416,23 @@ def sequence_files(path: str) -> list[str]:
     from glob import glob
 
     inside = Path(path).iterdir() if Path(path).is_dir() else map(Path, glob(path))
-    # Names that begin with a dot are an operating system's own, and halves of files being written.
+    # Names that begin with a dot belong to the operating system or to files being written.
     files = [
         str(f)
         for f in inside
         if f.suffix.lower() in (".tif", ".tiff") and f.is_file() and not f.name.startswith(".")
     ]
-    return sorted(files, key=_counted)
 
+    def numbered(path: str) -> list[int | str]:
+        return [int(part) if part.isdigit() else part for part in re.split(r"([0-9]+)", path)]
 
-def _counted(path: str) -> list[int | str]:
-    """Sort key that puts t9 before t10."""
-    return [int(part) if part.isdigit() else part for part in re.split(r"([0-9]+)", path)]
+    return sorted(files, key=numbered)
 
 
 def sequence(path: str, pick: Pick) -> Contents:
     """Describe a folder or glob of TIFF files.
 
-    A file of several images is one frame; files of one image each are counted in `pick.planes`.
+    A file of several images is one frame; of files of one image each, `pick.planes` are a frame.
     """
     files = sequence_files(path)
     if not files:

@@ -1,4 +1,4 @@
-"""Leica, Nikon, Zeiss, Imaris and OME-Zarr files, each read by the library that knows it."""
+"""Leica, Nikon, Zeiss, Imaris and OME-Zarr files, each read by the library of its format."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 # Imaris blocks are several planes deep: with a smaller cache each is unpacked once per plane.
-_CACHE = 2**25
+_IMARIS_CACHE = 2**25
 
 
 def lif(path: str, pick: Pick) -> Contents:
@@ -60,7 +60,7 @@ def lif(path: str, pick: Pick) -> Contents:
 
 
 def nd2(path: str, pick: Pick) -> Contents:
-    """Describe a Nikon .nd2 file (nd2); the time of every plane is in it."""
+    """Describe a Nikon .nd2 file (nd2), which states the time of every plane."""
     file = needed("nd2", "nd2").ND2File(path)
     try:
         sizes = dict(file.sizes)
@@ -117,8 +117,10 @@ def czi(path: str, pick: Pick) -> Contents:
         box = {axis: stop - start for axis, (start, stop) in file.total_bounding_box.items()}
         where = layout(box, pick)
         scale = file.metadata["ImageDocument"]["Metadata"]
-        lengths = {e["@Id"]: e.get("Value") for e in _listed(scale, "Scaling", "Items", "Distance")}
-        step = _listed(
+        lengths = {
+            e["@Id"]: e.get("Value") for e in _header_items(scale, "Scaling", "Items", "Distance")
+        }
+        step = _header_items(
             scale, "Information", "Image", "Dimensions", "T", "Positions", "Interval", "Increment"
         )
         dtype = np.asarray(file.read(plane={"T": 0, "Z": 0, "C": pick.channel or 0})).dtype
@@ -145,11 +147,11 @@ def czi(path: str, pick: Pick) -> Contents:
 
 def ims(path: str, pick: Pick) -> Contents:
     """Describe an Imaris .ims file: HDF5, finest resolution, padded blocks cut to the image."""
-    file = needed("h5py", "ims").File(path, "r", rdcc_nbytes=_CACHE)
+    file = needed("h5py", "ims").File(path, "r", rdcc_nbytes=_IMARIS_CACHE)
     try:
         finest = file["DataSet"]["ResolutionLevel 0"]
         about = file["DataSetInfo"]
-        image = {key: _text(value) for key, value in about["Image"].attrs.items()}
+        image = {key: _imaris_text(value) for key, value in about["Image"].attrs.items()}
         size = {axis: int(image[axis]) for axis in "ZYX"}
         n_channels = len(finest["TimePoint 0"])
         where = layout({"T": len(finest), "C": n_channels, **size}, pick)
@@ -163,7 +165,7 @@ def ims(path: str, pick: Pick) -> Contents:
         if len(extent) == 3:
             per_axis = zip(extent, size.values(), strict=True)
             voxel = np.array([in_um(e / n, image.get("Unit", "um")) for e, n in per_axis])
-        times = _ims_times(about, where.t)
+        times = imaris_times(about, where.t)
     except Exception:
         file.close()
         raise
@@ -183,21 +185,35 @@ def ims(path: str, pick: Pick) -> Contents:
     )
 
 
-def _ims_times(about: Any, n: int) -> Floats | None:  # noqa: ANN401 (an HDF5 group)
-    """Read the wall-clock times of the frames."""
+def imaris_times(about: Any, n: int) -> Floats | None:  # noqa: ANN401 (an HDF5 group)
+    """Read the times of the frames from their dates in an Imaris file.
+
+    Parameters
+    ----------
+    about : h5py.Group
+        The group DataSetInfo of the file.
+    n : int
+        Number of frames.
+
+    Returns
+    -------
+    ndarray, shape (n,), or None
+        Times since the first frame, s; None where a frame has no date.
+    """
     from datetime import datetime
 
     if n == 1:
         return np.zeros(1)
     attributes = about["TimeInfo"].attrs if "TimeInfo" in about else {}
-    stamps = [_text(attributes.get(f"TimePoint{i + 1}", "")) for i in range(n)]
+    stamps = [_imaris_text(attributes.get(f"TimePoint{i + 1}", "")) for i in range(n)]
     if not all(stamps):
         return None
     start, *_ = moments = [datetime.fromisoformat(stamp.strip()) for stamp in stamps]
     return np.array([(moment - start).total_seconds() for moment in moments])
 
 
-def _text(value: Any) -> str:  # noqa: ANN401 (Imaris writes arrays of single characters)
+def _imaris_text(value: Any) -> str:  # noqa: ANN401 (Imaris writes arrays of single characters)
+    """Return an attribute of an Imaris file as text."""
     if isinstance(value, np.ndarray):
         return b"".join(np.atleast_1d(value).astype("S1")).decode()
     return value.decode() if isinstance(value, bytes) else str(value)
@@ -212,13 +228,13 @@ def ome_zarr(path: str, pick: Pick) -> Contents:
     scales = header["multiscales"][0]
     axes = {a["name"].upper(): a.get("unit") for a in scales["axes"]}
     array = group[scales["datasets"][0]["path"]]
-    step = dict(zip(axes, _total_scale(scales, len(axes)), strict=True))
+    step = dict(zip(axes, ngff_scale(scales, len(axes)), strict=True))
     sizes = dict(zip(axes, array.shape, strict=True))
     where = layout(sizes, pick)
 
     depth = array.chunks[list(axes).index("Z")] if "Z" in axes else 1
 
-    # Blocks may be many planes deep: the last one read is kept.
+    # Blocks may be many planes deep: the block read last is cached.
     @lru_cache(maxsize=1)
     def block(others: tuple[int, ...], number: int) -> NDArray[Any]:
         rest = iter(others)
@@ -245,8 +261,27 @@ def ome_zarr(path: str, pick: Pick) -> Contents:
     )
 
 
-def _total_scale(scales: Any, n: int) -> Floats:  # noqa: ANN401 (a JSON header)
-    """Return the product of the scale of the finest level and that of the whole image."""
+def ngff_scale(scales: Any, n: int) -> Floats:  # noqa: ANN401 (a JSON header)
+    """Return the product of the scale of the finest level and that of the whole image.
+
+    Parameters
+    ----------
+    scales : dict
+        The first entry of `multiscales` in the header of an OME-Zarr folder.
+    n : int
+        Number of axes.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+
+    Examples
+    --------
+    >>> scale = {"type": "scale", "scale": [1.0, 0.25, 0.2, 0.2]}
+    >>> dataset = {"path": "0", "coordinateTransformations": [scale]}
+    >>> ngff_scale({"datasets": [dataset]}, 4)
+    array([1.  , 0.25, 0.2 , 0.2 ])
+    """
     total = np.ones(n)
     for holder in (scales["datasets"][0], scales):
         for change in holder.get("coordinateTransformations", []):
@@ -255,8 +290,8 @@ def _total_scale(scales: Any, n: int) -> Floats:  # noqa: ANN401 (a JSON header)
     return total
 
 
-def _listed(tree: Any, *keys: str) -> list[Any]:  # noqa: ANN401 (a parsed XML header)
-    """Follow keys into a header; what is there as a list, empty where a key is missing."""
+def _header_items(tree: Any, *keys: str) -> list[Any]:  # noqa: ANN401 (a parsed XML header)
+    """Return the items under a path of keys of a header; empty where a key is missing."""
     for key in keys:
         if not isinstance(tree, dict) or key not in tree:
             return []
@@ -264,7 +299,7 @@ def _listed(tree: Any, *keys: str) -> list[Any]:  # noqa: ANN401 (a parsed XML h
     return tree if isinstance(tree, list) else [tree]
 
 
-_BY_SUFFIX: dict[str, Callable[[str, Pick], Contents]] = {
+_READERS: dict[str, Callable[[str, Pick], Contents]] = {
     ".lif": lif,
     ".nd2": nd2,
     ".czi": czi,
@@ -273,7 +308,13 @@ _BY_SUFFIX: dict[str, Callable[[str, Pick], Contents]] = {
 
 
 def vendor(path: str) -> Callable[[str, Pick], Contents] | None:
-    """Return the reader of a file by its suffix, None where it is none of these."""
+    """Return the reader of a file by its suffix; None for all other files.
+
+    Examples
+    --------
+    >>> vendor("movie.lif").__name__, vendor("movie.tif")
+    ('lif', None)
+    """
     if (Path(path) / ".zgroup").exists() or (Path(path) / "zarr.json").exists():
         return ome_zarr
-    return _BY_SUFFIX.get(Path(path).suffix.lower())
+    return _READERS.get(Path(path).suffix.lower())

@@ -1,6 +1,6 @@
-"""What a sphere looks like in a confocal image: a ball blurred by the optics and the voxels.
+"""The confocal image of a sphere: a ball blurred by the optics and the voxels.
 
-Inside the images rooms an array's axes are (z, y, x), and so are centres and point spreads.
+In `perrin.images` the axes of arrays, centres and point spreads are (z, y, x).
 """
 
 from __future__ import annotations
@@ -12,21 +12,34 @@ import numpy as np
 
 from perrin._arrays import Floats, frozen, require_positive
 
-_STEP = 0.25  # spacing of the table's knots in units of the narrower blur; cubic error under 1e-4
+# Spacing of the table's knots in units of the blur along each axis; the cubic error is below 1e-4.
+_KNOT_SPACING = 0.25
 
 
-_WINDOW = 3.5  # voxels within so many blurs of a sphere's surface are its own
+# A fit uses the voxels up to this many blurs outside a sphere's surface.
+_FIT_RANGE = 3.5
 
 
-_REACH = 4.5  # the table ends this many blurs outside the sphere, where under 1e-5 is left
+# The table ends this many blurs outside the sphere, where less than 1e-5 is left.
+_TABLE_RANGE = 4.5
 
 
 class SphereSpot(NamedTuple):
-    """A unit sphere's image in a box of voxels, and how it changes as the sphere moves."""
+    """The image of a unit-bright sphere in a box of voxels, and its derivatives by the centre.
+
+    Attributes
+    ----------
+    box : tuple of slice
+        The voxels (z, y, x) that the image covers.
+    value : ndarray, shape (nz, ny, nx)
+        Intensity of the sphere.
+    gradient : ndarray, shape (3, nz, ny, nx)
+        Derivatives of the intensity by the centre's (z, y, x), per um.
+    """
 
     box: tuple[slice, slice, slice]
-    value: Floats  # (nz, ny, nx)
-    gradient: Floats  # (3, nz, ny, nx): by the centre's z, y, x, per um
+    value: Floats
+    gradient: Floats
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,13 +49,20 @@ class SphereImage:
     Attributes
     ----------
     diameter : float
-        Of the fluorescent ball (the core of a core-shell sphere), um.
+        Diameter of the fluorescent sphere (the core of a core-shell sphere), um.
     psf : tuple of float
         Standard deviations of the Gaussian point spread along z and within the plane, um.
     voxel : tuple of float
-        (z, y, x), um.
+        Voxel size (z, y, x), um.
     blur : tuple of float
-        Point spread and voxel together, z and plane, um.
+        Standard deviations of point spread and voxel together, (z, plane), um.
+
+    Examples
+    --------
+    >>> image = sphere_image(diameter=2.0, psf=(0.4, 0.15), voxel=(0.25, 0.2, 0.2))
+    >>> spot = image.spot(np.array([3.0, 3.0, 3.0]), (24, 32, 32))
+    >>> spot.value.shape, round(float(spot.value.max()), 2)
+    ((23, 17, 17), 0.98)
     """
 
     diameter: float
@@ -54,14 +74,14 @@ class SphereImage:
 
     @property
     def reach(self) -> tuple[float, float, float]:
-        """Distance from the centre beyond which nothing is left, along z, y and x, um."""
-        z, plane = (self.diameter / 2 + _REACH * blur for blur in self.blur)
+        """Distances from the centre along z, y and x at which the image ends, um."""
+        z, plane = (self.diameter / 2 + _TABLE_RANGE * blur for blur in self.blur)
         return z, plane, plane
 
     @property
     def extent(self) -> Floats:
-        """Half axes (z, y, x) of the ellipsoid of voxels that a fit asks for, um."""
-        return self.diameter / 2 + _WINDOW * np.array([self.blur[0], self.blur[1], self.blur[1]])
+        """Half axes (z, y, x) of the ellipsoid of voxels that a fit uses, um."""
+        return self.diameter / 2 + _FIT_RANGE * np.array([self.blur[0], self.blur[1], self.blur[1]])
 
     def spot(self, center: Floats, shape: tuple[int, ...]) -> SphereSpot:
         """Return the image of a sphere at `center` (z, y, x), um, inside an array of `shape`.
@@ -86,9 +106,9 @@ class SphereImage:
     def at(self, z: Floats, y: Floats, x: Floats) -> tuple[Floats, Floats]:
         """Return image and gradient on the grid of offsets z, y, x from the centre, um.
 
-        The image is one sum of spline products, because the blurred ball is round about z: a
-        matrix of splines in abs(z), the table's knots, and a matrix of splines in the distance
-        from the axis.
+        The blurred ball has the symmetry of rotation about z, so that the image is one sum of
+        spline products: a matrix of splines in abs(z), the table's knots, and a matrix of splines
+        in the distance from the axis.
 
         Returns
         -------
@@ -98,8 +118,8 @@ class SphereImage:
         """
         rho = np.hypot(y[:, None], x)
         shape = (len(z), *rho.shape)
-        along, along_slope = _splines(np.abs(z) / self._spacing[0], self._knots.shape[0])
-        across, across_slope = _splines(rho.ravel() / self._spacing[1], self._knots.shape[1])
+        along, along_slope = _cubic_splines(np.abs(z) / self._spacing[0], self._knots.shape[0])
+        across, across_slope = _cubic_splines(rho.ravel() / self._spacing[1], self._knots.shape[1])
         profile = along @ self._knots
         by_z = along_slope @ self._knots * (-np.sign(z) / self._spacing[0])[:, None]
         outward = across_slope / (self._spacing[1] * np.where(rho > 0, rho, 1.0)).reshape(-1, 1)
@@ -123,11 +143,11 @@ def sphere_image(
     Parameters
     ----------
     diameter : float
-        Of the fluorescent ball, um.
+        Diameter of the fluorescent sphere, um.
     psf : tuple of float
         Standard deviations of the point spread, (z, plane), um.
     voxel : tuple of float
-        (z, y, x), um.
+        Voxel size (z, y, x), um.
 
     Returns
     -------
@@ -145,8 +165,8 @@ def sphere_image(
 
         (erf(b/s√2) + erf(a/s√2))/2 - s/(r√2π) (exp(-a²/2s²) - exp(-b²/2s²))
 
-    (the integral of a Gaussian over a ball); what the blur along z has in excess of s is added by
-    one numerical convolution.
+    (the integral of a Gaussian over a ball); the blur along z in excess of s is added by one
+    numerical convolution.
 
     Examples
     --------
@@ -156,6 +176,9 @@ def sphere_image(
     >>> value.round(2).tolist()
     [[[1.0, 0.34, 0.0]]]
     """
+    from scipy.ndimage import spline_filter1d
+    from scipy.special import erf
+
     require_positive(diameter=diameter, **{"psf[z]": psf[0], "psf[plane]": psf[1]})
     require_positive(**{f"voxel[{axis}]": h for axis, h in zip("zyx", voxel, strict=True)})
     blur_z = float(np.sqrt(psf[0] ** 2 + voxel[0] ** 2 / 12))
@@ -165,30 +188,32 @@ def sphere_image(
             f"psf: expected (z, plane) with the larger blur along z, as in every microscope, got "
             f"{psf} um, with the voxel {blur_z:.3g} and {blur:.3g}; are the two exchanged?"
         )
-    knots, spacing = _table(diameter / 2, blur_z, blur)
+    # The ball blurred by `blur` along all axes, over abs(z) and the distance rho from the axis.
+    radius = diameter / 2
+    spacing = _KNOT_SPACING * blur_z, _KNOT_SPACING * blur
+    z, rho = (
+        h * np.arange(int(np.ceil((radius + _TABLE_RANGE * s) / h)) + 2)
+        for h, s in zip(spacing, (blur_z, blur), strict=True)
+    )
+    nodes, weights = _gaussian_nodes(float(np.sqrt(blur_z**2 - blur**2)), blur)
+    r = np.hypot((z[:, None] - nodes)[..., None], rho)
+    a, b = (radius - r) / blur, (radius + r) / blur
+    # Near the centre the difference of exponentials over r is its limit, the derivative.
+    small = r < 1e-4 * blur
+    safe = np.where(small, blur, r)
+    edge = blur / safe * (np.exp(-0.5 * a**2) - np.exp(-0.5 * b**2))
+    edge = np.where(small, 2 * radius / blur * np.exp(-0.5 * (radius / blur) ** 2), edge)
+    ball = 0.5 * (erf(b / np.sqrt(2)) + erf(a / np.sqrt(2))) - edge / np.sqrt(2 * np.pi)
+    table = np.einsum("k,zkr->zr", weights, ball)
+    for axis in (0, 1):
+        table = spline_filter1d(table, axis=axis, mode="mirror")
+    # The image is even in z and in rho: the knot before the first equals the one after it.
+    knots = np.pad(table, 1, mode="reflect")
     frozen(knots)
     return SphereImage(diameter, psf, voxel, (blur_z, blur), knots, spacing)
 
 
-def _table(radius: float, blur_z: float, blur: float) -> tuple[Floats, tuple[float, float]]:
-    """Return the spline knots of the blurred ball over (abs(z), rho), and their spacing."""
-    from scipy.ndimage import spline_filter1d
-
-    spacing = _STEP * blur_z, _STEP * blur
-    z, rho = (
-        h * np.arange(int(np.ceil((radius + _REACH * s) / h)) + 2)
-        for h, s in zip(spacing, (blur_z, blur), strict=True)
-    )
-    nodes, weights = _extra_blur(float(np.sqrt(blur_z**2 - blur**2)), blur)
-    r = np.hypot((z[:, None] - nodes)[..., None], rho)
-    table = np.einsum("k,zkr->zr", weights, _even_blur(r, radius, blur))
-    for axis in (0, 1):
-        table = spline_filter1d(table, axis=axis, mode="mirror")
-    # The image is even in z and in rho: the knot before the first is the one after it.
-    return np.pad(table, 1, mode="reflect"), spacing
-
-
-def _extra_blur(width: float, blur: float) -> tuple[Floats, Floats]:
+def _gaussian_nodes(width: float, blur: float) -> tuple[Floats, Floats]:
     """Return nodes and weights that convolve with a Gaussian; the sum converges exponentially."""
     if width < 1e-6 * blur:
         return np.zeros(1), np.ones(1)
@@ -199,21 +224,7 @@ def _extra_blur(width: float, blur: float) -> tuple[Floats, Floats]:
     return nodes, weights / weights.sum()
 
 
-def _even_blur(r: Floats, radius: float, s: float) -> Floats:
-    """Return a unit ball of `radius` convolved with an isotropic Gaussian s, at distance r."""
-    from scipy.special import erf
-
-    a, b = (radius - r) / s, (radius + r) / s
-    # Near the centre the difference of exponentials over r is its limit, the derivative.
-    small = r < 1e-4 * s
-    safe = np.where(small, s, r)
-    edge = s / safe * (np.exp(-0.5 * a**2) - np.exp(-0.5 * b**2))
-    edge = np.where(small, 2 * radius / s * np.exp(-0.5 * (radius / s) ** 2), edge)
-    inside: Floats = 0.5 * (erf(b / np.sqrt(2)) + erf(a / np.sqrt(2))) - edge / np.sqrt(2 * np.pi)
-    return inside
-
-
-def _splines(t: Floats, count: int) -> tuple[Floats, Floats]:
+def _cubic_splines(t: Floats, count: int) -> tuple[Floats, Floats]:
     """Return the cubic B-splines (len(t), count) of padded knots at t, and their slopes."""
     first = np.minimum(t.astype(np.int64), count - 4)
     u = np.minimum(t - first, 1.0)

@@ -1,6 +1,6 @@
-"""Where the spheres of a crowd are: of so many touching ones that each needs all the others' light.
+"""Positions of the spheres of a crowd: touching spheres whose images are fitted all together.
 
-Arrays' axes and centres are (z, y, x), um, the origin at the centre of voxel (0, 0, 0).
+Axes of arrays and centres are (z, y, x), um, with the origin at the centre of voxel (0, 0, 0).
 """
 
 from __future__ import annotations
@@ -10,18 +10,18 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from perrin.images.optics.crowd_equations import (
-    Light,
-    Scene,
-    brightness_numbers,
-    cut_scene,
-    first_light,
-    in_sight,
-    left_over,
+    CrowdIntensity,
+    CrowdWindow,
+    brightness_parameters,
+    crowd_intensity,
+    cut_crowd_window,
+    detection_chi2,
+    fit_brightness,
     normal_equations,
-    own_misfit,
-    shine,
+    residual_maps,
+    sphere_chi2,
     standard_errors,
-    told_by,
+    visible_fraction,
 )
 from perrin.images.optics.window_fit import within
 
@@ -31,65 +31,70 @@ if TYPE_CHECKING:
     from perrin.images.optics.optics import CameraNoise
 
 
-_ROUNDS = 40
+# Rounds of the last search, and between two searches of the residuals for missing spheres.
+_MAX_CROWD_ROUNDS, _INTERIM_ROUNDS = 40, 8
 
 
-_GLANCE = 8  # rounds between two looks at what is left over
+# Step of a sphere over the blur at which the last search ends, as for smaller groups, and the
+# interim ones.
+_CROWD_STEP_CONVERGED, _INTERIM_STEP = 1e-4, 1e-2
 
 
-_CONVERGED = 1e-4  # last step of a sphere over the blur, as for smaller groups
+# Least visible fraction of a sphere that is added, and of one that is kept.
+_ADDED_VISIBLE, _KEPT_VISIBLE = 0.05, 0.01
 
 
-_NEARLY = 1e-2  # ... between two looks
+# Relative standard deviation of brightness in the prior.
+_BRIGHTNESS_SPREAD = 0.3
 
 
-_NEW_SIGHT, _OLD_SIGHT = 0.05, 0.01  # part of a sphere that has to be in sight
+# The brightness of a sphere is within this factor of the median.
+_BRIGHTNESS_FACTOR = 4.0
 
 
-_ALIKE = 0.3  # relative spread of brightness
+# Least distance of two spheres, in contact distances.
+_MIN_DISTANCE = 0.7
 
 
-_FACTOR = 4.0  # a sphere is within this factor as bright as the usual one
+# No sphere is added within this fraction of the least distance from a position given up before.
+_RETRY_FRACTION = 0.3
 
 
-_APART = 0.7  # two spheres are at least so many contact distances apart
+# Least decrease of chi-squared by a sphere: five standard errors of its brightness.
+_MIN_DETECTION_CHI2 = 25.0
 
 
-_AGAIN = 0.3  # ... and by this part of that from where one was tried before and given up
-
-
-_SEEN = 25.0  # a sphere lowers chi-squared by this, five standard errors of its brightness
-
-
-_SHARE = (
-    0.005  # ... and by this part of what one wholly in sight does: more than flaws of the model
-)
+# Least decrease of chi-squared by an added sphere, as a fraction of that by a wholly visible one:
+# more than flaws of the model.
+_MIN_DETECTION_FRACTION = 0.005
 
 
 class CrowdFit(NamedTuple):
-    """The spheres of a crowd.
+    """The fitted spheres of a crowd.
 
     Attributes
     ----------
     centers, sigma : ndarray, shape (n, 3)
-        (z, y, x), um, and standard errors from the Fisher information.
+        Positions (z, y, x), um, and their standard errors from the Fisher information.
     chi2 : ndarray, shape (n,)
-        Per voxel, of the voxels that a sphere lights.
-    settled : ndarray of bool, shape (n,)
-        The last step was far below the blur.
+        Chi-squared per voxel, averaged over the voxels of each sphere.
+    converged : ndarray of bool, shape (n,)
+        Whether the last step of each sphere was far below the blur.
     origin : ndarray of int, shape (n,)
-        Which of the spheres at the start it is; -1: found in the light left over.
-    scene, light
-        What was fitted, and the fit.
+        Index of each sphere among those at the start; -1 where it was found in the residuals.
+    window : CrowdWindow
+        The voxels that were fitted.
+    intensity : CrowdIntensity
+        The fit, with the spheres beyond the border of the frame.
     """
 
     centers: Floats
     sigma: Floats
     chi2: Floats
-    settled: Bools
+    converged: Bools
     origin: Ints
-    scene: Scene
-    light: Light
+    window: CrowdWindow
+    intensity: CrowdIntensity
 
 
 def fit_crowd(
@@ -100,195 +105,255 @@ def fit_crowd(
     contact: float,
     image: SphereImage,
     noise: CameraNoise,
-    looks: int = 8,
+    searches: int = 8,
 ) -> CrowdFit:
-    """Find all spheres of a crowd together, those that were missed too.
+    """Fit all spheres of a crowd together, and add those that are missing at the start.
 
     Parameters
     ----------
     frame : ndarray, shape (nz, ny, nx)
+        Grey levels.
     centers, others : ndarray, shape (n, 3), (m, 3)
-        Where the crowd was found, and spheres whose light is left out.
+        Positions of the crowd at the start, and of spheres whose voxels are not used, um.
     contact : float
         Centre distance of touching spheres, um.
     image : SphereImage
+        The image of a sphere.
     noise : CameraNoise
-    looks : int
-        At what is left over, at most.
+        The variance of a voxel.
+    searches : int
+        Largest number of searches of the residuals.
+
+    Returns
+    -------
+    CrowdFit
 
     Notes
     -----
-    Fisher scoring as in `image_fit.fit_window`, its normal equations sparse. Between rounds,
-    spheres much dimmer or brighter than the usual one and the dimmer of two at one place go, and
-    spheres are put where one more of them takes most of chi-squared away. Spheres may stand beyond
-    the frame's border, where their light comes from; they are not among the places returned.
+    Fisher scoring as in `fit_window`, with sparse normal equations. Between rounds, spheres much
+    dimmer or brighter than the median and the dimmer one of two at the same position are removed,
+    and spheres are added where one more of them decreases chi-squared most. Spheres may lie beyond
+    the border of the frame if their images reach into it; they are not among the positions
+    returned.
+
+    Examples
+    --------
+    >>> from perrin.images import CameraNoise, sphere_image
+    >>> image = sphere_image(diameter=2.0, psf=(0.4, 0.15), voxel=(0.25, 0.2, 0.2))
+    >>> truth = np.array([[3.0, 3.0, 2.5], [3.0, 3.0, 4.5]])
+    >>> frame = np.full((24, 31, 36), 9.0)
+    >>> for spot in (image.spot(center, frame.shape) for center in truth):
+    ...     frame[spot.box] += 100 * spot.value
+    >>> noise, others = CameraNoise(1.0, 0.0), np.empty((0, 3))
+    >>> crowd = fit_crowd(
+    ...     frame, truth[:1] + 0.1, others=others, contact=2.0, image=image, noise=noise
+    ... )
+    >>> crowd.centers.round(3).tolist(), crowd.origin.tolist()
+    ([[3.0, 3.0, 2.5], [3.0, 3.0, 4.5]], [0, -1])
     """
-    scene = cut_scene(frame, image, noise, centers, others)
-    light, start = first_light(scene, centers), centers
+    window = cut_crowd_window(frame, image, noise, centers, others)
+    state, start = fit_brightness(window, centers), centers
     origin, given_up = np.arange(len(centers)), np.empty((0, 3))
-    for _ in range(looks):
-        light, _ = _settle(scene, light, _GLANCE, _NEARLY)
-        keep = _present(scene, light, contact)
+    for _ in range(searches):
+        state, _ = _scored(window, state, _INTERIM_ROUNDS, _INTERIM_STEP)
+        keep = plausible_spheres(window, state, contact)
         given_up = np.concatenate([given_up, start[~keep]])
         if not keep.any():
             break
-        new = _missed(scene, light, keep, contact, given_up)
+        new = missing_spheres(window, state, keep, contact, given_up)
         if keep.all() and not len(new):
             break
-        light = _changed(scene, light, keep, new)
+        state = crowd_intensity(
+            window,
+            np.concatenate([state.centers[keep], new]),
+            np.append(state.brightness[keep], np.full(len(new), _median_brightness(state))),
+            state.background,
+        )
         start = np.concatenate([start[keep], new])
         origin = np.append(origin[keep], np.full(len(new), -1))
-    light, settled = _settle(scene, light, _ROUNDS, _CONVERGED)
-    return _inside(frame.shape, scene, light, contact, settled, origin)
+    state, converged = _scored(window, state, _MAX_CROWD_ROUNDS, _CROWD_STEP_CONVERGED)
+    information, _ = normal_equations(window, state)
+    last = (np.array(frame.shape) - 1) * image.voxel
+    inside = np.all((state.centers >= 0) & (state.centers <= last), axis=1)
+    inside &= plausible_spheres(window, state, contact)
+    return CrowdFit(
+        state.centers[inside],
+        standard_errors(information, state)[inside],
+        sphere_chi2(window, state)[inside],
+        converged[inside],
+        origin[inside],
+        window,
+        state,
+    )
 
 
-def _settle(scene: Scene, light: Light, rounds: int, part: float) -> tuple[Light, Bools]:
-    """Return the light after some rounds of the search, and which spheres came to rest.
+def _scored(
+    window: CrowdWindow, state: CrowdIntensity, rounds: int, tolerance: float
+) -> tuple[CrowdIntensity, Bools]:
+    """Return the state after some rounds of Fisher scoring, and which spheres have converged.
 
-    The search ends when all spheres within the scene move by less than a `part` of the blur: one
-    beyond its border, of which little is seen, may go on wandering.
+    The search ends when all spheres within the window move by less than `tolerance` blurs; spheres
+    beyond its border, of which little is visible, may move by more.
     """
     from scipy.sparse import diags_array
     from scipy.sparse.linalg import splu
 
-    damping, step = 1e-3, np.full(len(light.centers), np.inf)
-    usual = _usual(light)
-    information, score = _informed(scene, light, usual)
+    damping, step = 1e-3, np.full(len(state.centers), np.inf)
+    median = _median_brightness(state)
+    information, score = _with_prior(window, state, median)
     for _ in range(rounds):
         scale = information.diagonal()
-        # A number that no voxel tells of stays as it is.
+        # A parameter without information keeps its value.
         ridge = np.where(scale > 0, (damping + 1e-12) * scale, 1.0)
-        trial = light.moved(scene, splu((information + diags_array(ridge)).tocsc()).solve(score))
-        if _cost(scene, light, trial, usual) > _cost(scene, light, light, usual) * (1 + 1e-12):
+        trial = state.moved(window, splu((information + diags_array(ridge)).tocsc()).solve(score))
+        if _penalised_chi2(window, state, trial, median) > _penalised_chi2(
+            window, state, state, median
+        ) * (1 + 1e-12):
             damping *= 10.0
             continue
-        step = np.abs(trial.centers - light.centers).max(axis=1)
-        light, damping = trial, damping / 10.0
-        if np.all(step[scene.holds(light.centers)] < part * scene.image.blur[1]):
+        step = np.abs(trial.centers - state.centers).max(axis=1)
+        state, damping = trial, damping / 10.0
+        if np.all(step[window.holds(state.centers)] < tolerance * window.image.blur[1]):
             break
-        information, score = _informed(scene, light, usual)
-    return light, step < part * scene.image.blur[1]
+        information, score = _with_prior(window, state, median)
+    return state, step < tolerance * window.image.blur[1]
 
 
-def _informed(scene: Scene, light: Light, usual: float) -> tuple[Any, Floats]:
-    """Return the normal equations, in which every sphere is somewhat as bright as the usual one.
+def _with_prior(window: CrowdWindow, state: CrowdIntensity, median: float) -> tuple[Any, Floats]:
+    """Return the normal equations with a Gaussian prior of brightness about the median.
 
-    Where a border leaves little of a sphere in sight, its brightness and its place cannot be told
-    from each other; of all others the image itself tells some hundred times more.
+    Where a border leaves little of a sphere visible, its brightness and its position cannot be
+    distinguished; for all other spheres the information of the image is some hundred times that of
+    the prior.
     """
     from scipy.sparse import diags_array
 
-    information, score = normal_equations(scene, light)
-    told = np.zeros_like(score)
-    told[brightness_numbers(light)] = (_ALIKE * usual) ** -2
-    score[brightness_numbers(light)] += (usual - light.brightness) / (_ALIKE * usual) ** 2
-    return information + diags_array(told), score
+    information, score = normal_equations(window, state)
+    prior = np.zeros_like(score)
+    prior[brightness_parameters(state)] = (_BRIGHTNESS_SPREAD * median) ** -2
+    score[brightness_parameters(state)] += (median - state.brightness) / (
+        _BRIGHTNESS_SPREAD * median
+    ) ** 2
+    return information + diags_array(prior), score
 
 
-def _cost(scene: Scene, now: Light, then: Light, usual: float) -> float:
-    """Return the misfit by the weights of now, with what is known of brightness."""
-    unlike = (then.brightness - usual) / (_ALIKE * usual)
-    return now.misfit(scene, then.expected) + float(np.sum(unlike**2))
+def _penalised_chi2(
+    window: CrowdWindow, state: CrowdIntensity, trial: CrowdIntensity, median: float
+) -> float:
+    """Return chi-squared of a trial with the weights of a state, and the prior of brightness."""
+    deviation = (trial.brightness - median) / (_BRIGHTNESS_SPREAD * median)
+    return state.chi2(window, trial.expected) + float(np.sum(deviation**2))
 
 
-def _usual(light: Light) -> float:
-    """Return the usual brightness, which is negative for dark spheres."""
-    # Of an image without any light any will do: nothing is found there.
-    return float(np.median(light.brightness)) or 1.0
+def _median_brightness(state: CrowdIntensity) -> float:
+    """Return the median brightness, which is negative for dark spheres."""
+    # In an image without any intensity any value serves: no sphere is found there.
+    return float(np.median(state.brightness)) or 1.0
 
 
-def _present(scene: Scene, light: Light, contact: float) -> Bools:
-    """Return which spheres are there: as bright as usual, in sight, each by itself."""
-    relative = light.brightness / _usual(light)
-    keep = (relative > 1 / _FACTOR) & (relative < _FACTOR) & (in_sight(scene, light) > _OLD_SIGHT)
-    keep &= told_by(light) > _SEEN
-    for i, j in _overlapping(light.centers, _APART * contact):
+def plausible_spheres(window: CrowdWindow, state: CrowdIntensity, contact: float) -> Bools:
+    """Return which spheres (n,) are kept: of usual brightness, visible, and not two at one place.
+
+    Parameters
+    ----------
+    window : CrowdWindow
+    state : CrowdIntensity
+    contact : float
+        Centre distance of touching spheres, um.
+
+    Returns
+    -------
+    ndarray of bool, shape (n,)
+    """
+    from scipy.spatial import cKDTree
+
+    relative = state.brightness / _median_brightness(state)
+    keep = (relative > 1 / _BRIGHTNESS_FACTOR) & (relative < _BRIGHTNESS_FACTOR)
+    keep &= visible_fraction(window, state) > _KEPT_VISIBLE
+    keep &= detection_chi2(state) > _MIN_DETECTION_CHI2
+    pairs = cKDTree(state.centers).query_pairs(_MIN_DISTANCE * contact, output_type="ndarray")
+    for i, j in pairs:
         if keep[i] and keep[j]:
             keep[i if relative[i] < relative[j] else j] = False
     return np.asarray(keep)
 
 
-def _overlapping(centers: Floats, reach: float) -> Ints:
-    from scipy.spatial import cKDTree
+def missing_spheres(
+    window: CrowdWindow, state: CrowdIntensity, keep: Bools, contact: float, given_up: Floats
+) -> Floats:
+    """Return positions (k, 3) where one more sphere is detected in the residuals, best first.
 
-    return np.asarray(cKDTree(centers).query_pairs(reach, output_type="ndarray"), dtype=np.int64)
+    Parameters
+    ----------
+    window : CrowdWindow
+    state : CrowdIntensity
+    keep : ndarray of bool, shape (n,)
+        The spheres of the state that are kept; none is added too close to them.
+    contact : float
+        Centre distance of touching spheres, um.
+    given_up : ndarray, shape (m, 3)
+        Starting positions that were removed before; none is added at them, um.
 
-
-def _missed(scene: Scene, light: Light, keep: Bools, contact: float, given_up: Floats) -> Floats:
-    """Return places (k, 3) where one more sphere is seen in the light left over, best first."""
+    Returns
+    -------
+    ndarray, shape (k, 3)
+    """
     from scipy.ndimage import maximum_filter
 
-    brightness, gain, corner, known = left_over(scene, light, _NEW_SIGHT)
-    whole = known * _usual(light) ** 2
+    brightness, gain, corner, known = residual_maps(window, state, _ADDED_VISIBLE)
+    whole = known * _median_brightness(state) ** 2
     grid = [
-        c + h * np.arange(n) for c, h, n in zip(corner, scene.image.voxel, gain.shape, strict=True)
+        c + h * np.arange(n) for c, h, n in zip(corner, window.image.voxel, gain.shape, strict=True)
     ]
-    apart = np.full(3, _APART * contact)
-    closed = within(grid, light.centers[keep], apart) | within(grid, given_up, apart * _AGAIN)
-    # What is brighter than expected is no dark sphere, and what is known needs no second sphere.
-    relative = np.where(closed, 0.0, brightness / _usual(light))
-    gain = np.where((relative > 1 / _FACTOR) & (relative < _FACTOR), gain, 0.0)
-    size = np.maximum(apart / scene.image.voxel, 3).astype(int)
-    least = max(_SEEN, _SHARE * whole)
+    distance = np.full(3, _MIN_DISTANCE * contact)
+    closed = within(grid, state.centers[keep], distance)
+    closed |= within(grid, given_up, distance * _RETRY_FRACTION)
+    # A residual of the wrong sign is no sphere, and a position already occupied needs no second.
+    relative = np.where(closed, 0.0, brightness / _median_brightness(state))
+    gain = np.where(
+        (relative > 1 / _BRIGHTNESS_FACTOR) & (relative < _BRIGHTNESS_FACTOR), gain, 0.0
+    )
+    size = np.maximum(distance / window.image.voxel, 3).astype(int)
+    least = max(_MIN_DETECTION_CHI2, _MIN_DETECTION_FRACTION * whole)
     index = np.argwhere((gain > least) & (gain == maximum_filter(gain, tuple(size))))
     best = index[np.argsort(-gain[tuple(index.T)])]
-    return _thinned(corner + best * scene.image.voxel, _APART * contact)
+    added: list[Floats] = []
+    for position in corner + best * window.image.voxel:
+        if all(np.linalg.norm(position - other) > _MIN_DISTANCE * contact for other in added):
+            added.append(position)
+    return np.array(added).reshape(-1, 3)
 
 
-def _thinned(places: Floats, apart: float) -> Floats:
-    """Return the places that are not too near to an earlier one."""
-    kept: list[Floats] = []
-    for place in places:
-        if all(np.linalg.norm(place - other) > apart for other in kept):
-            kept.append(place)
-    return np.array(kept).reshape(-1, 3)
-
-
-def _changed(scene: Scene, light: Light, keep: Bools, new: Floats) -> Light:
-    return shine(
-        scene,
-        np.concatenate([light.centers[keep], new]),
-        np.append(light.brightness[keep], np.full(len(new), _usual(light))),
-        light.background,
-    )
-
-
-def _inside(
-    shape: tuple[int, ...],
-    scene: Scene,
-    light: Light,
-    contact: float,
-    settled: Bools,
-    origin: Ints,
-) -> CrowdFit:
-    information, _ = normal_equations(scene, light)
-    last = (np.array(shape) - 1) * scene.image.voxel
-    inside = np.all((light.centers >= 0) & (light.centers <= last), axis=1)
-    inside &= _present(scene, light, contact)
-    return CrowdFit(
-        light.centers[inside],
-        standard_errors(information, light)[inside],
-        own_misfit(scene, light)[inside],
-        settled[inside],
-        origin[inside],
-        scene,
-        light,
-    )
-
-
-def piece_of(
+def crowd_piece(
     frame: Floats, centers: Floats, voxel: tuple[float, float, float], *, count: int
 ) -> tuple[Floats, Floats]:
-    """Return the box of a frame that holds the spheres in a crowd's middle, and those in it.
+    """Return a box in the middle of a crowd, and the spheres of the crowd in it.
 
     Parameters
     ----------
     frame : ndarray, shape (nz, ny, nx)
+        Grey levels.
     centers : ndarray, shape (n, 3)
+        Positions of the crowd, um.
     voxel : tuple of float
-        (z, y, x), um.
+        Voxel size (z, y, x), um.
     count : int
-        The box is drawn around so many spheres; all of the crowd in it are returned.
+        Number of spheres around which the box is drawn; all spheres of the crowd in it are
+        returned.
+
+    Returns
+    -------
+    piece : ndarray
+        The voxels of the box.
+    centers : ndarray, shape (k, 3)
+        Positions in the box, um.
+
+    Examples
+    --------
+    >>> row = np.stack([np.full(9, 2.0), np.full(9, 2.0), np.arange(9.0)], axis=1)
+    >>> piece, centers = crowd_piece(np.zeros((5, 5, 9)), row, (1.0, 1.0, 1.0), count=3)
+    >>> piece.shape, centers[:, 2]
+    ((1, 1, 3), array([0., 1., 2.]))
     """
     step = np.array(voxel)
     distance = np.linalg.norm(centers - np.median(centers, axis=0), axis=1)

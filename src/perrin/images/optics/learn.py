@@ -1,4 +1,4 @@
-"""What microscope and camera make of a sphere: its size in the light, point spread and noise."""
+"""Optics learned from frames: sphere diameter, point spread and camera noise; and saturation."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from perrin.errors import NoSpheresError
 from perrin.images.optics.ball_image import SphereImage, sphere_image
-from perrin.images.optics.crowd_equations import told_apart, total
+from perrin.images.optics.crowd_equations import profile_information, sum_of_spheres
 from perrin.images.optics.crowd_fit import fit_crowd
 from perrin.images.optics.optics import CameraNoise, Optics
 from perrin.images.optics.window_fit import FreeCenters, cut_window, fit_window
@@ -22,51 +22,57 @@ if TYPE_CHECKING:
     from perrin.images.optics.window_fit import Window
 
 
-_PROBE = 0.01  # change of a logarithm for a central difference
+# Change of a logarithm for the central differences.
+_LOG_DIFFERENCE = 0.01
 
 
-_LONGEST = 0.25  # longest step of a logarithm
+# Largest step of a logarithm, and the step at which the search ends.
+_MAX_LOG_STEP, _LOG_STEP_CONVERGED = 0.25, 1e-3
 
 
-_CONVERGED = 1e-3
+_MAX_LEARNING_ROUNDS = 15
 
 
-_ROUNDS = 15
+# Searches of a crowd's residuals for missing spheres, in every round.
+_LEARNING_SEARCHES = 2
 
 
-_LOOKS = 2  # at the light left over by a crowd, in every round
+# Saturation below this number of voxels, or this fraction of them, does not affect any position.
+_MIN_CLIPPED, _MIN_CLIPPED_FRACTION = 10, 1e-5
 
 
-# Saturation: fewer voxels, or a smaller share, spoil no place.
-_FEWEST_CLIPPED, _LEAST_CLIPPED = 10, 1e-5
+# Number of occupied grey levels below the highest, with which it is compared.
+_COMPARED_LEVELS = 3
 
 
-_LEVELS = 3  # occupied grey levels below the highest, with which it is compared
-
-
-_PILED_UP = 1e-6  # level of the test in one frame: movies have thousands
+# Level of the saturation test in one frame: movies have thousands of frames.
+_SATURATION_LEVEL = 1e-6
 
 
 def saturated_share(data: NDArray[Any]) -> float:
-    """Return the share of voxels whose light was clipped at the highest value; 0 where none was.
+    """Return the fraction of voxels that are clipped at the highest grey level; 0 where none is.
 
     Parameters
     ----------
     data : ndarray
         One frame, in the type in which it was recorded.
 
+    Returns
+    -------
+    float
+
     Notes
     -----
-    The largest value of a frame is always somebody's. It is the end of the range where it is the
-    largest of an integer type, or where significantly more voxels have it than have any of the
-    three occupied grey levels below it: without clipping, fewer voxels are brighter, level by
+    The highest grey level of a frame is the end of the camera's range where it is the largest value
+    of an integer type, or where significantly more voxels have it than have any of the three
+    occupied grey levels below it: without clipping, the number of voxels decreases from level to
     level. The numbers of voxels at two levels are compared by the binomial test.
 
     Examples
     --------
     >>> import numpy as np
-    >>> light = np.random.default_rng(1).poisson(200.0, size=100_000).astype(np.uint16)
-    >>> saturated_share(light), round(saturated_share(np.minimum(light, 230)), 3)
+    >>> frame = np.random.default_rng(1).poisson(200.0, size=100_000).astype(np.uint16)
+    >>> saturated_share(frame), round(saturated_share(np.minimum(frame, 230)), 3)
     (0.0, 0.02)
     """
     from scipy.special import bdtrc
@@ -74,45 +80,114 @@ def saturated_share(data: NDArray[Any]) -> float:
     top = data.max()
     count = int(np.count_nonzero(data == top))
     share = count / data.size
-    if count < _FEWEST_CLIPPED or share <= _LEAST_CLIPPED:
+    if count < _MIN_CLIPPED or share <= _MIN_CLIPPED_FRACTION:
         return 0.0
     if data.dtype.kind in "iu" and top == np.iinfo(data.dtype).max:
         return share
     numbers = np.unique(data, return_counts=True)[1]
     if len(numbers) == 1:
         return 0.0
-    most = int(numbers[-1 - _LEVELS : -1].max())
-    # One of the voxels is there by the choice of the level.
-    return share if bdtrc(count - 2, count - 1 + most, 0.5) < _PILED_UP else 0.0
+    most = int(numbers[-1 - _COMPARED_LEVELS : -1].max())
+    # The level is the highest because one voxel has it: that voxel is no evidence.
+    return share if bdtrc(count - 2, count - 1 + most, 0.5) < _SATURATION_LEVEL else 0.0
 
 
-class Told(NamedTuple):
-    """What one look at a sample tells."""
+class SampleFit(NamedTuple):
+    """A fit to one sample of a frame, and its information on the optics.
+
+    Attributes
+    ----------
+    centers : ndarray, shape (n, 3)
+        Fitted positions (z, y, x), um.
+    information : ndarray, shape (3, 3)
+        Information on the logarithms of diameter, psf z and psf plane, the parameters of the
+        spheres eliminated.
+    score : ndarray, shape (3,)
+        Score of these logarithms.
+    expected : ndarray, shape (m,)
+        Expected grey levels of the voxels of the fit.
+    squared_residual : ndarray, shape (m,)
+        Squared differences of grey levels and expected grey levels.
+    """
 
     centers: Floats
-    information: Floats  # (3, 3), on the logarithms of diameter, psf z and psf plane
-    score: Floats  # (3,)
-    light: Floats  # expected, of every voxel that counts
-    square: Floats  # and the squared residual there
+    information: Floats
+    score: Floats
+    expected: Floats
+    squared_residual: Floats
 
 
-class Sample(NamedTuple):
-    """One group of spheres in one frame, to learn from."""
+class ImageVariations(NamedTuple):
+    """The sphere's image, and the images with each logarithm slightly larger and smaller.
+
+    The logarithms are those of diameter, psf z and psf plane.
+
+    Attributes
+    ----------
+    image : SphereImage
+        The image at the present values.
+    pairs : list of tuple of SphereImage
+        The image with one logarithm larger, and with it smaller, for each of the three.
+    """
+
+    image: SphereImage
+    pairs: list[tuple[SphereImage, ...]]
+
+    @classmethod
+    def about(cls, log: Floats, voxel: tuple[float, float, float]) -> ImageVariations:
+        """Return the variations about logarithms (3,), for voxels (z, y, x), um."""
+        steps = _LOG_DIFFERENCE * np.eye(3)
+        pairs = [tuple(_image_at(log + s * d, voxel) for s in (1, -1)) for d in steps]
+        return cls(_image_at(log, voxel), pairs)
+
+    def derivatives(self, intensity: Callable[[SphereImage], Floats]) -> Floats:
+        """Return the derivatives (3, ...) of an intensity by the logarithms."""
+        return np.stack(
+            [
+                (intensity(larger) - intensity(smaller)) / (2 * _LOG_DIFFERENCE)
+                for larger, smaller in self.pairs
+            ]
+        )
+
+
+class GroupSample(NamedTuple):
+    """One group of spheres in one frame, from which the optics are learned.
+
+    Attributes
+    ----------
+    frame : ndarray, shape (nz, ny, nx)
+        Grey levels.
+    centers, others : ndarray, shape (n, 3), (m, 3)
+        Positions (z, y, x) of the group and of all other spheres, um.
+    """
 
     frame: Floats
     centers: Floats
     others: Floats
 
-    def shows(self, image: SphereImage) -> bool:
-        """Return whether there are voxels enough."""
-        return self._window(image).shows(len(self.centers))
+    def window(self, image: SphereImage) -> Window:
+        """Return the voxels of the fit."""
+        return cut_window(self.frame, image, self.centers, others=self.others)
 
-    def look(self, lens: _Lens, noise: CameraNoise) -> Told:
-        """Fit places and background, and tell what the rest says of the optics."""
-        image = lens.image
-        window = self._window(image)
+    def fit(self, variations: ImageVariations, noise: CameraNoise) -> SampleFit:
+        """Fit positions, brightness and background, and return the information on the optics.
+
+        Parameters
+        ----------
+        variations : ImageVariations
+        noise : CameraNoise
+
+        Returns
+        -------
+        SampleFit
+        """
+        image = variations.image
+        window = self.window(image)
         fit = fit_window(window, image, noise, FreeCenters(self.centers))
-        slope = lens.slope(lambda shifted: fit.brightness @ window.spots(shifted, fit.centers)[0])
+        slope = variations.derivatives(
+            lambda varied: fit.brightness @ window.spots(varied, fit.centers)[0]
+        )
+        # The Schur complement of the information, with the fit's own parameters eliminated.
         weighted = slope * fit.weight
         nuisance = fit.jacobian * fit.weight
         shared = nuisance @ slope.T
@@ -120,147 +195,177 @@ class Sample(NamedTuple):
         residual = window.data - fit.expected
         information = weighted @ slope.T - shared.T @ taken
         score = weighted @ residual - taken.T @ (nuisance @ residual)
-        return Told(fit.centers, information, score, fit.expected, residual**2)
-
-    def _window(self, image: SphereImage) -> Window:
-        return cut_window(self.frame, image, self.centers, others=self.others)
+        return SampleFit(fit.centers, information, score, fit.expected, residual**2)
 
 
 class CrowdSample(NamedTuple):
-    """A piece of a frame full of touching spheres, to learn from."""
+    """A piece of a frame full of touching spheres, from which the optics are learned.
+
+    Attributes
+    ----------
+    frame : ndarray, shape (nz, ny, nx)
+        Grey levels.
+    centers, others : ndarray, shape (n, 3), (m, 3)
+        Positions (z, y, x) of the crowd and of all other spheres, um.
+    contact : float
+        Centre distance of touching spheres, um.
+    """
 
     frame: Floats
     centers: Floats
     others: Floats
     contact: float
 
-    def look(self, lens: _Lens, noise: CameraNoise) -> Told:
-        """Fit places and background, and tell what the rest says of the optics."""
+    def fit(self, variations: ImageVariations, noise: CameraNoise) -> SampleFit:
+        """Fit positions, brightness and background, and return the information on the optics.
+
+        Parameters
+        ----------
+        variations : ImageVariations
+        noise : CameraNoise
+
+        Returns
+        -------
+        SampleFit
+        """
         found = fit_crowd(
             self.frame,
             self.centers,
             others=self.others,
             contact=self.contact,
-            image=lens.image,
+            image=variations.image,
             noise=noise,
-            looks=_LOOKS,
+            searches=_LEARNING_SEARCHES,
         )
-        scene, light = found.scene, found.light
-        slope = lens.slope(
-            lambda shifted: total(scene, scene.spots(shifted, light.centers), light.brightness)
+        window, state = found.window, found.intensity
+        slope = variations.derivatives(
+            lambda varied: sum_of_spheres(
+                window, window.spots(varied, state.centers), state.brightness
+            )
         )
-        information, score = told_apart(scene, light, slope)
-        count = scene.mask
-        residual = (scene.data - light.expected)[count]
-        return Told(light.centers, information, score, light.expected[count], residual**2)
+        information, score = profile_information(window, state, slope)
+        used = window.mask
+        residual = (window.data - state.expected)[used]
+        return SampleFit(state.centers, information, score, state.expected[used], residual**2)
 
 
-class _Lens(NamedTuple):
-    """The sphere's image where the search stands, and with each logarithm a little up and down."""
-
-    image: SphereImage
-    pairs: list[tuple[SphereImage, ...]]
-
-    @classmethod
-    def at(cls, log: Floats, voxel: tuple[float, float, float]) -> _Lens:
-        """Return it for the logarithms of diameter, psf z and psf plane."""
-        steps = _PROBE * np.eye(3)
-        pairs = [tuple(_image(log + s * d, voxel) for s in (1, -1)) for d in steps]
-        return cls(_image(log, voxel), pairs)
-
-    def slope(self, light: Callable[[SphereImage], Floats]) -> Floats:
-        """Return the central differences (3, ...) of some light by the logarithms."""
-        return np.stack([(light(up) - light(down)) / (2 * _PROBE) for up, down in self.pairs])
-
-
-def _image(log: Floats, voxel: tuple[float, float, float]) -> SphereImage:
+def _image_at(log: Floats, voxel: tuple[float, float, float]) -> SphereImage:
+    """Return the image for the logarithms of diameter, psf z and psf plane."""
     size, psf_z, psf = np.exp(log)
     return sphere_image(diameter=float(size), psf=(float(psf_z), float(psf)), voxel=voxel)
 
 
 def fit_samples(
-    samples: Sequence[Sample | CrowdSample], *, diameter: float, voxel: tuple[float, float, float]
+    samples: Sequence[GroupSample | CrowdSample],
+    *,
+    diameter: float,
+    voxel: tuple[float, float, float],
 ) -> Optics:
-    """Find sphere diameter, point spread and noise of greatest likelihood for all samples.
+    """Find the sphere diameter, point spread and noise of greatest likelihood for all samples.
 
     Parameters
     ----------
-    samples : sequence of Sample or CrowdSample
+    samples : sequence of GroupSample or CrowdSample
+        Pieces of frames.
     diameter : float
-        Where the search starts, um; the answer is the diameter seen.
+        Diameter at the start of the search, um; the diameter of the result is fitted.
     voxel : tuple of float
-        (z, y, x), um.
+        Voxel size (z, y, x), um.
+
+    Returns
+    -------
+    Optics
 
     Raises
     ------
     NoSpheresError
-        Without samples, or where the search does not settle.
+        Without samples, or where the search does not converge.
 
     Notes
     -----
-    Gauss-Newton steps in the logarithms of the three lengths, with every sphere's place and
+    Gauss-Newton steps in the logarithms of the three lengths, with every sphere's position and
     brightness and every background eliminated exactly (the Schur complement of the information).
     """
     log = np.log([diameter, max(voxel[0], 0.15 * diameter), max(voxel[1] / 2, 0.06 * diameter)])
-    log[1] = max(log[1], _roundest(log[2], voxel))
-    image = _image(log, voxel)
-    samples = [s for s in samples if isinstance(s, CrowdSample) or s.shows(image)]
+    log[1] = max(log[1], _least_log_psf_z(log[2], voxel))
+    image = _image_at(log, voxel)
+    samples = [
+        s
+        for s in samples
+        if isinstance(s, CrowdSample) or s.window(image).has_enough_voxels(len(s.centers))
+    ]
     if not samples:
         raise NoSpheresError(
             "no spheres to learn the optics from: none was found, or none has voxels to itself; "
             "check diameter, contact and minmass, and whether spheres are dark (dark=True), state "
-            "the optics (optics=), or take the places as found (refine=None)"
+            "the optics (optics=), or keep the positions found first (refine=None)"
         )
     mean = float(np.mean([s.frame.mean() for s in samples]))
     noise = CameraNoise(1.0, 0.05 * abs(mean))
-    for _ in range(_ROUNDS):
-        lens = _Lens.at(log, voxel)
-        looks = [s.look(lens, noise) for s in samples]
-        samples = [s._replace(centers=k.centers) for s, k in zip(samples, looks, strict=True)]
-        information = np.sum([k.information for k in looks], axis=0)
-        step = np.linalg.solve(information, np.sum([k.score for k in looks], axis=0))
-        noise = _noise(looks)
-        log = log + step * min(1.0, _LONGEST / np.abs(step).max())
-        log[1] = max(log[1], _roundest(log[2], voxel))
-        if np.abs(step).max() < _CONVERGED:
+    for _ in range(_MAX_LEARNING_ROUNDS):
+        variations = ImageVariations.about(log, voxel)
+        fits = [s.fit(variations, noise) for s in samples]
+        samples = [s._replace(centers=fit.centers) for s, fit in zip(samples, fits, strict=True)]
+        information = np.sum([fit.information for fit in fits], axis=0)
+        step = np.linalg.solve(information, np.sum([fit.score for fit in fits], axis=0))
+        noise = photon_transfer(
+            np.concatenate([fit.expected for fit in fits]),
+            np.concatenate([fit.squared_residual for fit in fits]),
+        )
+        log = log + step * min(1.0, _MAX_LOG_STEP / np.abs(step).max())
+        log[1] = max(log[1], _least_log_psf_z(log[2], voxel))
+        if np.abs(step).max() < _LOG_STEP_CONVERGED:
             break
     else:
         raise NoSpheresError(
-            f"sphere size and point spread do not settle: diameter {np.exp(log[0]):.3g}, psf "
-            f"({np.exp(log[1]):.3g}, {np.exp(log[2]):.3g}) um after {_ROUNDS} rounds on "
-            f"{len(samples)} groups: are these spheres, bright enough, or dark (dark=True), and is "
-            "the voxel size right? State the optics (optics=), or take the places as found "
-            "(refine=None)"
+            f"sphere size and point spread do not converge: diameter {np.exp(log[0]):.3g}, psf "
+            f"({np.exp(log[1]):.3g}, {np.exp(log[2]):.3g}) um after {_MAX_LEARNING_ROUNDS} rounds "
+            f"on {len(samples)} groups: are these spheres, bright enough, or dark (dark=True), and "
+            "is the voxel size right? State the optics (optics=), or keep the positions found "
+            "first (refine=None)"
         )
     size, psf_z, psf = (float(v) for v in np.exp(log))
     error = np.exp(log) * np.sqrt(np.diag(np.linalg.inv(information)))
     return Optics(size, (psf_z, psf), noise, (float(error[0]), float(error[1]), float(error[2])))
 
 
-def _roundest(log_psf: float, voxel: tuple[float, float, float]) -> float:
-    """Return the logarithm of the least point spread along z: flatter is no microscope's.
+def _least_log_psf_z(log_psf: float, voxel: tuple[float, float, float]) -> float:
+    """Return the logarithm of the least point spread along z: that of a microscope is elongated.
 
-    With the widths of the voxels the blur along z stays the larger one, probes included.
+    With the widths of the voxels the blur along z stays the larger one, in all variations too.
     """
-    plane = np.exp(2 * (log_psf + _PROBE)) + (voxel[1] * voxel[2] - voxel[0] ** 2) / 12
+    plane = np.exp(2 * (log_psf + _LOG_DIFFERENCE)) + (voxel[1] * voxel[2] - voxel[0] ** 2) / 12
     narrowest = np.exp(2 * log_psf)
-    return 0.5 * float(np.log(max(plane, narrowest))) + _PROBE + 1e-3
+    return 0.5 * float(np.log(max(plane, narrowest))) + _LOG_DIFFERENCE + 1e-3
 
 
-def _noise(looks: Sequence[Told]) -> CameraNoise:
-    """Return gain and floor from how squared residuals grow with the expected light.
+def photon_transfer(expected: Floats, squared_residual: Floats) -> CameraNoise:
+    """Return gain and floor of the camera from the growth of the variance with the mean.
 
-    A gain below nothing (a processed image) is nothing, and so is a floor that would make the
-    variance of the darkest voxels negative.
+    Parameters
+    ----------
+    expected : ndarray, shape (m,)
+        Expected grey levels.
+    squared_residual : ndarray, shape (m,)
+        Squared differences of grey levels and expected grey levels.
+
+    Returns
+    -------
+    CameraNoise
+        A negative gain (of a processed image) is replaced by 0 and a constant variance.
+
+    Examples
+    --------
+    >>> noise = photon_transfer(np.array([10.0, 20.0, 30.0]), np.array([34.0, 64.0, 94.0]))
+    >>> round(noise.gain, 6), round(noise.floor, 6)
+    (3.0, 4.0)
     """
-    light = np.concatenate([look.light for look in looks])
-    square = np.concatenate([look.square for look in looks])
-    design = np.stack([light, np.ones_like(light)])
-    noise = CameraNoise(0.0, float(square.mean()))
+    design = np.stack([expected, np.ones_like(expected)])
+    noise = CameraNoise(0.0, float(squared_residual.mean()))
     for _ in range(4):
-        weighted = design * noise.weight(light) ** 2
-        gain, floor = np.linalg.solve(weighted @ design.T, weighted @ square)
+        weighted = design * noise.weight(expected) ** 2
+        gain, floor = np.linalg.solve(weighted @ design.T, weighted @ squared_residual)
         if gain <= 0:
-            return CameraNoise(0.0, float(square.mean()))
+            return CameraNoise(0.0, float(squared_residual.mean()))
         noise = CameraNoise(float(gain), float(floor))
     return noise

@@ -1,7 +1,7 @@
-"""Where the spheres of one cluster are, by the likelihood of their image.
+"""Positions of the spheres of one cluster, by the likelihood of their image.
 
-Arrays' axes and centres are (z, y, x), um, the origin at the centre of voxel (0, 0, 0); only the
-pose, which belongs to a body in (x, y, z), turns them round.
+Axes of arrays and centres are (z, y, x), um, with the origin at the centre of voxel (0, 0, 0); only
+poses, which belong to a body, are in (x, y, z).
 """
 
 from __future__ import annotations
@@ -19,29 +19,44 @@ if TYPE_CHECKING:
     from perrin.images.optics.optics import CameraNoise
 
 
-_CONVERGED = 1e-4  # last step of a sphere over the blur: far below what any photons tell
+# Step of a sphere over the blur at which the search ends: far below any standard error.
+_WINDOW_STEP_CONVERGED = 1e-4
 
 
-_ROUNDS = 40
+_MAX_WINDOW_ROUNDS = 40
 
 
-_ENOUGH = 5  # voxels for each number that is fitted
+# Least number of voxels for each fitted parameter.
+_VOXELS_PER_PARAMETER = 5
 
 
-_BACKGROUND = 4  # a level and its slope along z, y and x
+# Parameters of the background: a level and its slope along z, y and x.
+_N_BACKGROUND = 4
 
 
 class Window(NamedTuple):
-    """The voxels of one fit: a box of the frame and those of its voxels that count."""
+    """The voxels of one fit.
+
+    Attributes
+    ----------
+    box : tuple of slice
+        The box of the frame that holds them.
+    mask : ndarray of bool, shape (nz, ny, nx)
+        The m voxels of the box that the fit uses.
+    data : ndarray, shape (m,)
+        Grey levels.
+    background : ndarray, shape (4, m)
+        The background's basis: a level and its slope along z, y and x.
+    """
 
     box: tuple[slice, ...]
     mask: Bools
-    data: Floats  # (m,)
-    background: Floats  # (4, m)
+    data: Floats
+    background: Floats
 
-    def shows(self, count: int) -> bool:
-        """Return whether enough voxels are left to fit `count` spheres."""
-        return len(self.data) >= _ENOUGH * (4 * count + _BACKGROUND)
+    def has_enough_voxels(self, count: int) -> bool:
+        """Return whether there are enough voxels to fit `count` spheres."""
+        return len(self.data) >= _VOXELS_PER_PARAMETER * (4 * count + _N_BACKGROUND)
 
     def spots(self, image: SphereImage, centers: Floats) -> tuple[Floats, Floats]:
         """Return unit images (n, m) of spheres on these voxels and their gradients (n, 3, m)."""
@@ -58,23 +73,29 @@ class Window(NamedTuple):
 
 
 class Arrangement(Protocol):
-    """Spheres whose places follow from a few numbers."""
+    """Spheres whose positions follow from a few parameters."""
 
     @property
     def centers(self) -> Floats:
-        """Places (n, 3) as (z, y, x)."""
+        """Positions (n, 3) as (z, y, x), um."""
 
     @property
     def slope(self) -> Floats | None:
-        """Derivatives of the flattened places by the numbers, (k, 3 n); None is the identity."""
+        """Derivatives of the flattened positions by the parameters, (k, 3 n); None is identity."""
 
     def moved(self, step: Floats) -> Arrangement:
-        """Return the arrangement after a small step (k,) of its numbers."""
+        """Return the arrangement after a small step (k,) of its parameters."""
 
 
 @dataclass(frozen=True)
 class FreeCenters:
-    """Every sphere moves for itself."""
+    """Spheres whose positions are independent.
+
+    Examples
+    --------
+    >>> FreeCenters(np.zeros((1, 3))).moved(np.array([0.1, 0.0, 0.2])).centers
+    array([[0.1, 0. , 0.2]])
+    """
 
     centers: Floats
     slope: None = None
@@ -86,7 +107,14 @@ class FreeCenters:
 
 @dataclass(frozen=True)
 class RigidCenters:
-    """The spheres are points of one body, which moves and turns: center and rotation in x, y, z."""
+    """Spheres that are points of one rigid body; centre and rotation are in (x, y, z).
+
+    Examples
+    --------
+    >>> body = RigidCenters(np.array([1.0, 2.0, 3.0]), np.eye(3), np.array([[0.5, 0.0, 0.0]]))
+    >>> body.centers, body.slope.shape
+    (array([[3. , 2. , 1.5]]), (6, 3))
+    """
 
     center: Floats
     rotation: Floats
@@ -94,38 +122,58 @@ class RigidCenters:
 
     @property
     def centers(self) -> Floats:
-        """Places (n, 3) as (z, y, x)."""
+        """Positions (n, 3) as (z, y, x), um."""
         return (self.center + self.template @ self.rotation.T)[:, ::-1]
 
     @property
     def slope(self) -> Floats:
-        """By the centre's x, y, z and by a small turn about the lab's x, y, z: (6, 3 n)."""
+        """Derivatives (6, 3 n) by the centre and by a small rotation about the lab's axes."""
         arm = skew(self.template @ self.rotation.T)
         by_center = np.broadcast_to(np.eye(3), arm.shape)
-        # A turn w moves the point r by w x r, whose derivative by w is skew(r).
+        # A small rotation w moves the point r by w x r, whose derivative by w is skew(r).
         return np.concatenate([by_center, arm], axis=1)[..., ::-1].swapaxes(0, 1).reshape(6, -1)
 
     def moved(self, step: Floats) -> RigidCenters:
-        """Shift the centre and turn the body; step (6,)."""
+        """Shift the centre and rotate the body; step (6,)."""
         turned = exp_map(step[3:]) @ self.rotation
         return RigidCenters(self.center + step[:3], turned, self.template)
 
 
 class ImageFit(NamedTuple):
-    """A fitted window; `covariance` (k, k) is that of the arrangement's numbers."""
+    """A fit to the voxels of a window.
+
+    Attributes
+    ----------
+    arrangement : Arrangement
+        The fitted positions.
+    brightness : ndarray, shape (n,)
+        Intensity inside each sphere, grey levels.
+    covariance : ndarray, shape (k, k)
+        Covariance of the arrangement's parameters.
+    converged : bool
+        Whether the last step was far below the blur.
+    chi2 : float
+        Chi-squared per degree of freedom.
+    expected : ndarray, shape (m,)
+        Expected grey levels.
+    weight : ndarray, shape (m,)
+        Inverse variances of the voxels.
+    jacobian : ndarray, shape (p, m)
+        Derivatives of the expected grey levels by all parameters.
+    """
 
     arrangement: Arrangement
-    brightness: Floats  # (n,)
+    brightness: Floats
     covariance: Floats
     converged: bool
-    chi2: float  # per degree of freedom
-    expected: Floats  # (m,)
-    weight: Floats  # (m,)
-    jacobian: Floats  # (p, m)
+    chi2: float
+    expected: Floats
+    weight: Floats
+    jacobian: Floats
 
     @property
     def centers(self) -> Floats:
-        """Places (n, 3) as (z, y, x), um."""
+        """Positions (n, 3) as (z, y, x), um."""
         return self.arrangement.centers
 
 
@@ -137,7 +185,11 @@ def cut_window(frame: Floats, image: SphereImage, centers: Floats, *, others: Fl
     frame : ndarray, shape (nz, ny, nx)
     image : SphereImage
     centers, others : ndarray, shape (n, 3), (m, 3)
-        (z, y, x), um.
+        Positions (z, y, x) of the spheres of the fit and of all others, um.
+
+    Returns
+    -------
+    Window
     """
     extent, voxel = image.extent, np.array(image.voxel)
     box = box_around(centers, extent, image.voxel, frame.shape)
@@ -154,14 +206,29 @@ def cut_window(frame: Floats, image: SphereImage, centers: Floats, *, others: Fl
 def box_around(
     centers: Floats, extent: Floats, voxel: tuple[float, float, float], shape: tuple[int, ...]
 ) -> tuple[slice, ...]:
-    """Return the box of voxels that reaches `extent` (3,) beyond the centres, inside `shape`."""
+    """Return the box of voxels that reaches `extent` (3,) beyond the centres, inside `shape`.
+
+    Examples
+    --------
+    >>> centers = np.array([[2.0, 2.0, 2.0]])
+    >>> box = box_around(centers, np.full(3, 1.0), (0.25, 0.2, 0.2), (40, 40, 12))
+    >>> [(int(s.start), int(s.stop)) for s in box]
+    [(4, 13), (5, 16), (5, 12)]
+    """
     low = np.clip(np.floor((centers.min(0) - extent) / voxel), 0, None).astype(int)
     high = np.minimum(np.ceil((centers.max(0) + extent) / voxel) + 1, shape).astype(int)
     return tuple(slice(a, b) for a, b in zip(low, high, strict=True))
 
 
 def within(grid: list[Floats], centers: Floats, extent: Floats) -> Bools:
-    """Return which voxels of a grid lie in the ellipsoid `extent` around any of the centres."""
+    """Return which voxels of a grid lie in the ellipsoid `extent` around any of the centres.
+
+    Examples
+    --------
+    >>> line = np.arange(3.0)
+    >>> within([line, line, line], np.array([[1.0, 1.0, 1.0]]), np.full(3, 1.1)).sum()
+    np.int64(7)
+    """
     mask = np.zeros(tuple(len(g) for g in grid), dtype=np.bool_)
     for center in centers:
         z, y, x = (((g - c) / e) ** 2 for g, c, e in zip(grid, center, extent, strict=True))
@@ -174,37 +241,77 @@ def fit_window(
 ) -> ImageFit:
     """Find the arrangement, the spheres' brightness and the background of greatest likelihood.
 
+    Parameters
+    ----------
+    window : Window
+        The voxels of the fit.
+    image : SphereImage
+        The image of a sphere.
+    noise : CameraNoise
+        The variance of a voxel.
+    start : Arrangement
+        Positions at the start.
+
+    Returns
+    -------
+    ImageFit
+
     Notes
     -----
-    Fisher scoring with Levenberg-Marquardt damping. The weights follow the expected light, so that
-    the fixed point is the root of the score of the Poisson likelihood shifted by the camera's
+    Fisher scoring with Levenberg-Marquardt damping. The weights follow the expected intensity, so
+    that the fixed point is the root of the score of the Poisson likelihood shifted by the camera's
     floor; the covariance is the inverse Fisher information there.
+
+    Examples
+    --------
+    >>> from perrin.images import CameraNoise, sphere_image
+    >>> image = sphere_image(diameter=2.0, psf=(0.4, 0.15), voxel=(0.25, 0.2, 0.2))
+    >>> truth, frame = np.array([[3.01, 3.12, 3.23]]), np.full((24, 32, 32), 9.0)
+    >>> spot = image.spot(truth[0], frame.shape)
+    >>> frame[spot.box] += 100 * spot.value
+    >>> window = cut_window(frame, image, truth, others=np.empty((0, 3)))
+    >>> start = FreeCenters(truth + 0.1)
+    >>> fit = fit_window(window, image, CameraNoise(1.0, 0.0), start)
+    >>> fit.centers.round(4), fit.brightness.round(2)
+    (array([[3.01, 3.12, 3.23]]), array([100.]))
     """
-    state = _linear_fit(window, image, noise, start)
-    damping, settled = 1e-3, False
-    for _ in range(_ROUNDS):
-        information, score = _normal_equations(window, state)
+    state = _fit_state(window, image, noise, start)
+    damping, converged = 1e-3, False
+    for _ in range(_MAX_WINDOW_ROUNDS):
+        information, score = state.normal_equations(window)
         scale = np.diag(information)
-        if not scale.min() > 0:  # a sphere without light in the window: nothing to be found
+        if not scale.min() > 0:  # a sphere without intensity in the window has no position
             break
         damped = information + np.diag((damping + 1e-12) * scale)
         step = np.asarray(np.linalg.solve(damped, score), dtype=np.float64)
-        trial = _stepped(window, image, noise, state, step)
-        if _misfit(window, trial.expected, state.weight) > _misfit(
-            window, state.expected, state.weight
-        ) * (1 + 1e-12):
+        k = state.n_arrangement
+        moved = state.arrangement.moved(step[:k])
+        trial = _fit_state(window, image, noise, moved, linear=state.linear + step[k:])
+        if state.chi2(window, trial.expected) > state.chi2(window, state.expected) * (1 + 1e-12):
             damping *= 10.0
             continue
-        moved = np.abs(trial.arrangement.centers - state.arrangement.centers).max()
+        change = np.abs(trial.arrangement.centers - state.arrangement.centers).max()
         state, damping = trial, damping / 10.0
-        if moved < _CONVERGED * image.blur[1]:
-            settled = True
+        if change < _WINDOW_STEP_CONVERGED * image.blur[1]:
+            converged = True
             break
-    return _finished(window, state, settled)
+    information, _ = state.normal_equations(window)
+    k = state.n_arrangement
+    freedom = max(len(window.data) - len(state.jacobian), 1)
+    return ImageFit(
+        state.arrangement,
+        state.linear[: len(state.linear) - _N_BACKGROUND],
+        np.asarray(np.linalg.pinv(information, hermitian=True)[:k, :k], dtype=np.float64),
+        converged,
+        state.chi2(window, state.expected) / freedom,
+        state.expected,
+        state.weight,
+        state.jacobian,
+    )
 
 
-class _State(NamedTuple):
-    """Where the search stands."""
+class _FitState(NamedTuple):
+    """Parameters of a fit, and the expected intensity that follows from them."""
 
     arrangement: Arrangement
     linear: Floats  # brightness (n,) and background (4,)
@@ -212,52 +319,45 @@ class _State(NamedTuple):
     weight: Floats
     jacobian: Floats
 
+    @property
+    def n_arrangement(self) -> int:
+        """Number of parameters of the arrangement."""
+        return len(self.jacobian) - len(self.linear)
 
-def _numbers(state: _State) -> int:
-    return len(state.jacobian) - len(state.linear)
+    def chi2(self, window: Window, expected: Floats) -> float:
+        """Return chi-squared of an expected intensity, with the weights of this state."""
+        return float(self.weight @ (window.data - expected) ** 2)
 
-
-def _misfit(window: Window, expected: Floats, weight: Floats) -> float:
-    return float(weight @ (window.data - expected) ** 2)
-
-
-def _normal_equations(window: Window, state: _State) -> tuple[Floats, Floats]:
-    weighted = state.jacobian * state.weight
-    return weighted @ state.jacobian.T, weighted @ (window.data - state.expected)
-
-
-def _linear_fit(
-    window: Window, image: SphereImage, noise: CameraNoise, start: Arrangement
-) -> _State:
-    """Return the start: places as given, brightness and background by least squares."""
-    value, gradient = window.spots(image, start.centers)
-    design = np.concatenate([value, window.background])
-    expected = np.full_like(window.data, window.data.mean())
-    for _ in range(2):
-        weighted = design * noise.weight(expected)
-        # A sphere that is not there has no brightness to find; lstsq leaves it at nought.
-        linear = np.linalg.lstsq(weighted @ design.T, weighted @ window.data, rcond=None)[0]
-        expected = linear @ design
-    return _state(start, linear, value, gradient, window, noise)
+    def normal_equations(self, window: Window) -> tuple[Floats, Floats]:
+        """Return the Fisher information and the score."""
+        weighted = self.jacobian * self.weight
+        return weighted @ self.jacobian.T, weighted @ (window.data - self.expected)
 
 
-def _stepped(
-    window: Window, image: SphereImage, noise: CameraNoise, state: _State, step: Floats
-) -> _State:
-    k = _numbers(state)
-    arrangement = state.arrangement.moved(step[:k])
-    value, gradient = window.spots(image, arrangement.centers)
-    return _state(arrangement, state.linear + step[k:], value, gradient, window, noise)
+def _least_squares(data: Floats, design: Floats, noise: CameraNoise, expected: Floats) -> Floats:
+    """Return the coefficients of the rows of `design`, with the weights of an expected intensity.
+
+    The brightness of a sphere outside the window is undetermined; lstsq leaves it at 0.
+    """
+    weighted = design * noise.weight(expected)
+    return np.asarray(np.linalg.lstsq(weighted @ design.T, weighted @ data, rcond=None)[0])
 
 
-def _state(
-    arrangement: Arrangement,
-    linear: Floats,
-    value: Floats,
-    gradient: Floats,
+def _fit_state(
     window: Window,
+    image: SphereImage,
     noise: CameraNoise,
-) -> _State:
+    arrangement: Arrangement,
+    *,
+    linear: Floats | None = None,
+) -> _FitState:
+    """Return the state of an arrangement; `linear` None is fitted by least squares."""
+    value, gradient = window.spots(image, arrangement.centers)
+    if linear is None:
+        design = np.concatenate([value, window.background])
+        flat = np.full_like(window.data, window.data.mean())
+        linear = _least_squares(window.data, design, noise, flat)
+        linear = _least_squares(window.data, design, noise, np.asarray(linear @ design))
     slope, n = arrangement.slope, len(value)
     k = 3 * n if slope is None else len(slope)
     jacobian = np.empty((k + len(linear), len(window.data)))
@@ -268,20 +368,4 @@ def _state(
         np.matmul(slope, (brightness * gradient).reshape(3 * n, -1), out=jacobian[:k])
     jacobian[k : k + n], jacobian[k + n :] = value, window.background
     expected = linear @ jacobian[k:]
-    return _State(arrangement, linear, expected, noise.weight(expected), jacobian)
-
-
-def _finished(window: Window, state: _State, settled: bool) -> ImageFit:
-    information, _ = _normal_equations(window, state)
-    k = _numbers(state)
-    freedom = max(len(window.data) - len(state.jacobian), 1)
-    return ImageFit(
-        state.arrangement,
-        state.linear[: len(state.linear) - _BACKGROUND],
-        np.asarray(np.linalg.pinv(information, hermitian=True)[:k, :k], dtype=np.float64),
-        settled,
-        _misfit(window, state.expected, state.weight) / freedom,
-        state.expected,
-        state.weight,
-        state.jacobian,
-    )
+    return _FitState(arrangement, linear, expected, noise.weight(expected), jacobian)

@@ -1,10 +1,10 @@
-"""Where the spheres and clusters of a stack are."""
+"""Positions of the spheres and poses of the clusters of a stack."""
 
 from perrin.images.spheres.by_trackpy import Features, find_features, refine_by_trackpy
 from perrin.images.spheres.localisation import (
-    Found,
+    LocatedFrame,
     Method,
-    Sampled,
+    SampledFrame,
     Search,
     StackLike,
     check_search,
@@ -12,20 +12,30 @@ from perrin.images.spheres.localisation import (
     fit_optics,
     found_table,
     frame_digest,
+    group_columns,
     is_flat,
     locate,
     sample_frames,
+    size_faults,
+    with_crowds,
 )
 from perrin.images.spheres.poses import Pose, fit_pose, pose_in, start_of, with_poses
-from perrin.images.spheres.spots import at_contact, groups_and_crowds, mass_cut, touching_together
+from perrin.images.spheres.spots import (
+    Spots,
+    at_contact,
+    groups_and_crowds,
+    mass_cut,
+    touching_together,
+)
 
 __all__ = [
     "Features",
-    "Found",
+    "LocatedFrame",
     "Method",
     "Pose",
-    "Sampled",
+    "SampledFrame",
     "Search",
+    "Spots",
     "StackLike",
     "at_contact",
     "check_search",
@@ -35,6 +45,7 @@ __all__ = [
     "fit_pose",
     "found_table",
     "frame_digest",
+    "group_columns",
     "groups_and_crowds",
     "is_flat",
     "locate",
@@ -42,7 +53,9 @@ __all__ = [
     "pose_in",
     "refine_by_trackpy",
     "sample_frames",
+    "size_faults",
     "start_of",
     "touching_together",
+    "with_crowds",
     "with_poses",
 ]

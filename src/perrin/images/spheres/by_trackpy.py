@@ -1,4 +1,4 @@
-"""Where spheres are by the conventional routines: trackpy's locate and least-squares refinement."""
+"""Positions of spheres by trackpy: its locate, and its least-squares refinement."""
 
 from __future__ import annotations
 
@@ -9,17 +9,28 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from perrin.tracks.clusters import REACH
+
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from perrin._arrays import Floats
 
 
-_EDGE = 0.7  # part of a disc's size that is flat; the rest falls off as a Gaussian
+# Fraction of a disc's size that is flat; the rest decays as a Gaussian.
+_FLAT_FRACTION = 0.7
 
 
 class Features(NamedTuple):
-    """Spots of one frame: centers (n, 3) as (z, y, x) in um, and their integrated brightness."""
+    """Spots of one frame.
+
+    Attributes
+    ----------
+    centers : ndarray, shape (n, 3)
+        Positions (z, y, x), um.
+    mass : ndarray, shape (n,)
+        Integrated brightness, grey levels.
+    """
 
     centers: Floats
     mass: Floats
@@ -40,35 +51,43 @@ def find_features(
     Parameters
     ----------
     frame : ndarray, shape (nz, ny, nx)
-    diameter, contact : float
-        Of the visible ball, and centre to centre of touching spheres, um.
+        Grey levels.
+    diameter : float
+        Diameter of the fluorescent sphere, um.
+    contact : float
+        Centre distance of touching spheres, um.
     voxel : tuple of float
-        (z, y, x), um; a z of NaN says that the frame is one plane, whose spots have z = 0.
+        Voxel size (z, y, x), um; a z of NaN means that the frame is one plane, whose spots have
+        z = 0.
     dark : bool
-        Spheres are darker than what surrounds them.
+        Spheres are darker than their surroundings.
     percentile : float
-        Of the voxels that are no candidates.
+        Percentile of the grey levels below which a voxel is not the centre of a spot.
     border : bool
-        Also spheres that the frame's border cuts, but for their centre.
+        Spheres that the border of the frame cuts are found too, if their centre is inside.
+
+    Returns
+    -------
+    Features
 
     Raises
     ------
     ModuleNotFoundError
-        Where trackpy is not installed.
+        If trackpy is not installed.
 
     Notes
     -----
     The separation is 0.7 of the contact distance: trackpy's own default, over a diameter, loses
-    touching spheres. `characterize` is off, as with it trackpy 0.7 answers rows of NaN and errors
-    of other rows wherever voxels are not cubes.
+    touching spheres. `characterize` is off, because with it trackpy 0.7 returns rows of NaN and the
+    errors of other rows wherever voxels are not cubes.
     """
     trackpy = _trackpy()
     frame, step = _of_plane(frame, voxel)
-    # A core smaller than its sphere looks larger than it is by the blur; touching balls may not.
+    # The blur enlarges the image of a core; the mask of touching spheres may not be enlarged.
     size = np.ceil(diameter / step).astype(int) + (2 if diameter < 0.8 * contact else 0)
     size += 1 - size % 2
     padding = size // 2 + 3 if border else np.zeros_like(size)
-    # trackpy's own inversion is announced to go.
+    # trackpy's own inversion is deprecated.
     bright = frame.max() - frame if dark else frame
     with _quiet():
         found = trackpy.locate(
@@ -79,7 +98,7 @@ def find_features(
             minmass=0,
             characterize=False,
         )
-    centers = found[_axes(step)].to_numpy(dtype=np.float64) - padding
+    centers = found[list("zyx"[-len(step) :])].to_numpy(dtype=np.float64) - padding
     inside = np.all((centers >= 0) & (centers <= np.array(frame.shape) - 1), axis=1)
     mass = found["mass"].to_numpy(dtype=np.float64)[inside]
     return Features(_in_space(centers[inside] * step), mass)
@@ -93,27 +112,31 @@ def refine_by_trackpy(
     contact: float,
     voxel: tuple[float, float, float],
 ) -> Floats:
-    """Refine places by trackpy's disc model, groups of touching spheres together.
+    """Refine positions by trackpy's disc model, groups of touching spheres together.
 
     Parameters
     ----------
     frame : ndarray, shape (nz, ny, nx)
+        Grey levels.
     centers : ndarray, shape (n, 3)
-        (z, y, x), um.
-    diameter, contact : float
-        um.
+        Positions (z, y, x), um.
+    diameter : float
+        Diameter of the fluorescent sphere, um.
+    contact : float
+        Centre distance of touching spheres, um.
     voxel : tuple of float
-        (z, y, x), um; a z of NaN says that the frame is one plane.
+        Voxel size (z, y, x), um; a z of NaN means that the frame is one plane.
 
     Returns
     -------
     ndarray, shape (n, 3)
-        (z, y, x), um; where trackpy's fit fails, the place is the one given.
+        Positions (z, y, x), um; where trackpy's fit fails, the position is the one given.
 
     Notes
     -----
-    Discs have half their height at the ball's surface; their size is fixed, as trackpy's default
-    is. The groups reach to 1.3 contact distances, for a first place is a tenth too far out.
+    Discs have half their height at the surface of the sphere; their size is fixed, as is trackpy's
+    default. Groups are chains of distances up to 1.3 contacts, because the positions found first
+    are a tenth too far apart.
     """
     import pandas as pd
 
@@ -121,11 +144,11 @@ def refine_by_trackpy(
     if not len(centers):
         return centers
     frame, step = _of_plane(frame, voxel)
-    axes, places = _axes(step), centers[:, -len(step) :] / step
+    axes, places = list("zyx"[-len(step) :]), centers[:, -len(step) :] / step
     mask = np.ceil(diameter / step).astype(int) + 2
     mask += 1 - mask % 2
     # A disc of size s is at half its height where r = s (edge + (1 - edge) sqrt(2 log 2 / 3)).
-    half = _EDGE + (1 - _EDGE) * np.sqrt(2 * np.log(2) / 3)
+    half = _FLAT_FRACTION + (1 - _FLAT_FRACTION) * np.sqrt(2 * np.log(2) / 3)
     size = diameter / 2 / half / step
     table = pd.DataFrame(places, columns=axes)
     table["frame"] = 0
@@ -139,21 +162,21 @@ def refine_by_trackpy(
             table,
             _OneFrame(frame),
             tuple(int(m) for m in mask),
-            separation=tuple(1.3 * contact / step),
+            separation=tuple(REACH * contact / step),
             fit_function="disc",
-            param_val={"disc_size": _EDGE, "background": float(np.percentile(frame, 50)), **known},
+            param_val={
+                "disc_size": _FLAT_FRACTION,
+                "background": float(np.percentile(frame, 50)),
+                **known,
+            },
         )
     return _in_space(refined[axes].to_numpy(dtype=np.float64) * step)
 
 
 def _of_plane(frame: Floats, voxel: tuple[float, float, float]) -> tuple[Floats, Floats]:
-    """Return frame and voxel without the z axis where they are those of a plane."""
+    """Return frame and voxel size, without the z axis for a frame of one plane."""
     step = np.array(voxel)
     return (frame[0], step[1:]) if np.isnan(step[0]) else (frame, step)
-
-
-def _axes(step: Floats) -> list[str]:
-    return list("zyx"[-len(step) :])
 
 
 def _in_space(centers: Floats) -> Floats:
@@ -163,7 +186,7 @@ def _in_space(centers: Floats) -> Floats:
 
 @dataclass(frozen=True)
 class _OneFrame:
-    """What trackpy asks of a reader."""
+    """A reader of one frame, with the methods that trackpy needs."""
 
     image: Floats
 
@@ -188,7 +211,7 @@ def _trackpy() -> Any:  # noqa: ANN401 (a module without types)
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Keep trackpy's use of pandas and its progress to itself: a user could do nothing about it."""
+    """Suppress trackpy's warnings about pandas and its log messages, which a user cannot act on."""
     import logging
 
     logger = logging.getLogger("trackpy")
@@ -198,7 +221,7 @@ def _quiet() -> Iterator[None]:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", DeprecationWarning)
             warnings.simplefilter("ignore", FutureWarning)
-            # A frame without a spot is an answer: it has no rows.
+            # A frame without a spot is a valid result: a table without rows.
             warnings.simplefilter("ignore", UserWarning)
             yield
     finally:

@@ -1,24 +1,39 @@
-"""Where every sphere of a stack is, and how well that is known."""
+"""Positions of every sphere of a stack, and their standard errors."""
 
 from __future__ import annotations
 
 import hashlib
 import warnings
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol, Unpack
 
 import numpy as np
 
-from perrin._arrays import Floats, require_positive
+from perrin._arrays import (
+    Floats,
+    choice_fault,
+    number_fault,
+    options_from,
+    refuse,
+    refuse_unknown,
+)
+from perrin._text import listed
 from perrin.errors import FrameError, PrecisionWarning
-from perrin.images.optics.crowd_fit import CrowdFit, fit_crowd, piece_of
-from perrin.images.optics.learn import CrowdSample, Sample, fit_samples, saturated_share
-from perrin.images.optics.window_fit import FreeCenters, ImageFit, cut_window, fit_window
+from perrin.images.optics.crowd_fit import crowd_piece, fit_crowd
+from perrin.images.optics.learn import CrowdSample, GroupSample, fit_samples, saturated_share
+from perrin.images.optics.window_fit import FreeCenters, fit_window
 from perrin.images.spheres.by_trackpy import Features, find_features, refine_by_trackpy
-from perrin.images.spheres.spots import at_contact, groups_and_crowds, mass_cut
+from perrin.images.spheres.spots import (
+    SPOT_KEYWORDS,
+    Spots,
+    SpotSettings,
+    at_contact,
+    groups_and_crowds,
+    mass_cut,
+)
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
+    from collections.abc import Iterable, Sequence
     from typing import TypeAlias
 
     import pandas as pd
@@ -36,20 +51,25 @@ Refine = Literal["model", "trackpy"] | None
 _Voxel = tuple[float, float, float]
 
 
-_LEARN_FRAMES = 5  # frames looked at to set the mass cut and to learn the optics
+# Number of frames from which the mass cut and the optics are learned.
+_LEARNING_FRAMES = 5
 
 
-_LEARN_GROUPS = 15  # groups of spheres the optics are learned from
+# Number of groups of spheres, or of pieces of crowds, from which the optics are learned.
+_LEARNING_GROUPS, _LEARNING_CROWDS = 15, 2
 
 
-_LEARN_CROWDS = 2  # pieces of crowds the optics are learned from where there are no small groups
+# Number of spheres in a piece of a crowd.
+_PIECE_SPHERES = 30
 
 
-_PIECE = 30  # spheres in such a piece
-
-
-# Why a sphere stays where it was found.
-_CROWDED, _HIDDEN = "in a crowd", "no voxels of its own"
+# Reasons for which a sphere is not refined.
+_IN_A_CROWD, _NO_OWN_VOXELS = "in a crowd", "no voxels of its own"
+_NOT_CONVERGED, _MOVED, _DARK = (
+    "fit did not settle",
+    "moved over half a radius",
+    "no light of its own",
+)
 
 
 NO_FLAT_MODEL = (
@@ -58,19 +78,16 @@ NO_FLAT_MODEL = (
 )
 
 
-_UNSETTLED, _MOVED, _DARK = "fit did not settle", "moved over half a radius", "no light of its own"
-
-
 class StackLike(Protocol):
-    """What is asked of a movie: sizes, and one frame at a time."""
+    """A movie from which spheres can be located: sizes, and one frame at a time."""
 
     @property
     def shape(self) -> tuple[int, int, int, int]:
-        """(t, z, y, x)."""
+        """Number of frames, and voxels of a frame: (t, z, y, x)."""
 
     @property
     def voxel(self) -> Floats | tuple[float, float, float]:
-        """(z, y, x), um; z is NaN of a 2-D movie."""
+        """Voxel size (z, y, x), um; z is NaN for a 2-D movie."""
 
     def frame(self, i: int, /) -> Floats:
         """Return frame i, (z, y, x)."""
@@ -78,22 +95,29 @@ class StackLike(Protocol):
 
 @dataclass(frozen=True)
 class Search:
-    """What to look for.
+    """Options of a search for spheres.
 
     Attributes
     ----------
-    diameter, contact : float
-        Of the ball that is seen, and centre to centre of touching spheres, um.
+    diameter : float
+        Diameter of the fluorescent sphere, um.
+    contact : float
+        Centre distance of touching spheres, um.
     dark : bool
-        Spheres are darker than what surrounds them.
+        Spheres are darker than their surroundings.
     percentile : float
-        Of voxels too dim to be a sphere's middle.
+        Percentile of the grey levels below which a voxel is not the centre of a sphere.
     minmass : float or None
         Least integrated brightness of a sphere; None is the widest gap.
     border : bool
-        Also spheres cut by the stack's border.
+        Spheres that the border of the stack cuts are located too.
     crowds : bool
-        Also refine spheres in chains of over 16.
+        Spheres in chains of over 16 are refined too.
+
+    Examples
+    --------
+    >>> Search(2.45, 2.5, dark=True).crowds
+    False
     """
 
     diameter: float
@@ -117,34 +141,44 @@ class Search:
         )
 
     def spheres(self, spots: Features) -> Features:
-        """Return the spots of enough mass."""
+        """Return the spots of at least the least mass."""
         keep = spots.mass >= (self.minmass or 0.0)
         return Features(spots.centers[keep], spots.mass[keep])
 
 
-class Sampled(NamedTuple):
-    """A frame looked at to learn from, in the stack's own type, and its spots."""
+class SampledFrame(NamedTuple):
+    """A frame from which the method is learned.
+
+    Attributes
+    ----------
+    number : int
+        Number of the frame in the stack.
+    frame : ndarray, shape (nz, ny, nx)
+        Grey levels, in the stack's own type.
+    spots : Features
+        The spots of the frame, noise among them.
+    """
 
     number: int
     frame: NDArray[Any]
     spots: Features
 
 
-class Found(NamedTuple):
-    """What one frame holds.
+class LocatedFrame(NamedTuple):
+    """The spheres of one frame.
 
     Attributes
     ----------
     columns : dict of ndarray
-        The frame's part of the table of `locate`.
+        The rows of this frame in the table of `locate`.
     spots : int
-        Before the mass cut.
+        Number of spots before the mass cut.
     level : float
         Median grey level.
     saturated : float
-        Share of the voxels that were clipped at the highest value.
+        Fraction of voxels that are clipped at the highest grey level.
     digest : str
-        Of the voxels: equal for equal frames only.
+        Digest of the voxels, which only equal frames share.
     """
 
     columns: dict[str, NDArray[Any]]
@@ -156,92 +190,123 @@ class Found(NamedTuple):
 
 @dataclass(frozen=True)
 class Method:
-    """How every frame is treated: the same for all, and each for itself.
+    """The treatment of every frame: the same for all frames, each frame independently.
 
     Attributes
     ----------
     search : Search
-        With its mass cut.
+        Options of the search, with the mass cut.
     refine : {"model", "trackpy", None}
+        How positions are refined.
     optics : Optics or None
-        For "model".
+        The optics for refinement by the model.
     """
 
     search: Search
     refine: Refine = "model"
     optics: Optics | None = None
 
-    def look(self, stack: StackLike, i: int) -> Found:
+    def locate_in(self, stack: StackLike, i: int) -> LocatedFrame:
         """Find and refine the spheres of frame i.
+
+        Parameters
+        ----------
+        stack : Stack
+        i : int
+            Number of the frame.
+
+        Returns
+        -------
+        LocatedFrame
 
         Raises
         ------
         FrameError
             If the frame cannot be read.
         """
-        data, voxel = np.asarray(stack.frame(i)), _voxel(stack)
-        frame = _numbers(data, i)
+        data, voxel = np.asarray(stack.frame(i)), _voxel_size(stack)
+        frame = _finite_frame(data, i)
         spots = self.search.spots(frame, voxel)
-        columns = self._columns(frame, self.search.spheres(spots), voxel)
+        found = self.search.spheres(spots)
+        if self.refine == "model":
+            columns = group_columns(frame, found, self.search.contact, self.optics, voxel)
+            if self.optics is not None and self.search.crowds:
+                columns = with_crowds(columns, frame, found, self.search, self.optics, voxel)
+        else:
+            centers = found.centers
+            if self.refine == "trackpy":
+                lengths = {"diameter": self.search.diameter, "contact": self.search.contact}
+                centers = refine_by_trackpy(frame, centers, voxel=voxel, **lengths)
+            columns = _axis_columns(centers) | {"mass": found.mass}
+            if np.isnan(voxel[0]):
+                del columns["z"]
         columns = {"frame": np.full(len(columns["mass"]), i, dtype=np.int64)} | columns
         level = float(np.median(data))
-        return Found(columns, len(spots.mass), level, saturated_share(data), frame_digest(data))
-
-    def _columns(self, frame: Floats, found: Features, voxel: _Voxel) -> dict[str, NDArray[Any]]:
-        contact = self.search.contact
-        if self.refine == "model":
-            columns = _by_model(frame, found, contact, self.optics, voxel)
-            if self.optics is None or not self.search.crowds:
-                return columns
-            return _with_crowds(columns, frame, found, self.search, self.optics, voxel)
-        centers = found.centers
-        if self.refine == "trackpy":
-            centers = refine_by_trackpy(
-                frame, centers, diameter=self.search.diameter, contact=contact, voxel=voxel
-            )
-        places = _places(centers)
-        if np.isnan(voxel[0]):
-            del places["z"]
-        return places | {"mass": found.mass}
+        return LocatedFrame(
+            columns, len(spots.mass), level, saturated_share(data), frame_digest(data)
+        )
 
 
-def sample_frames(stack: StackLike, search: Search, frames: Sequence[int]) -> list[Sampled]:
-    """Look at a few frames all over the movie, as far as they can be read.
+def sample_frames(stack: StackLike, search: Search, frames: Sequence[int]) -> list[SampledFrame]:
+    """Return a few frames all over the movie with their spots, as far as they can be read.
+
+    Parameters
+    ----------
+    stack : Stack
+    search : Search
+    frames : sequence of int
+        The frames among which they are chosen.
+
+    Returns
+    -------
+    list of SampledFrame
 
     Raises
     ------
     FrameError
-        If none of them can.
+        If none of them can be read.
     """
-    seen = []
+    sample = []
     fault: FrameError | None = None
-    for k in _spread(len(frames)):
+    for k in _evenly_spaced(len(frames), _LEARNING_FRAMES):
         try:
             data = np.asarray(stack.frame(frames[k]))
-            spots = search.spots(_numbers(data, frames[k]), _voxel(stack))
+            spots = search.spots(_finite_frame(data, frames[k]), _voxel_size(stack))
         except FrameError as error:
             fault = fault or error
             continue
-        seen.append(Sampled(frames[k], data, spots))
-    if fault is not None and not seen:
+        sample.append(SampledFrame(frames[k], data, spots))
+    if fault is not None and not sample:
         raise fault
-    return seen
+    return sample
 
 
 def choose_method(
     stack: StackLike,
     search: Search,
-    sample: Sequence[Sampled],
+    sample: Sequence[SampledFrame],
     *,
     refine: Refine = "model",
     optics: Optics | None = None,
 ) -> Method:
-    """Set what was left open, mass cut and optics, from a few frames.
+    """Learn what was not stated, mass cut and optics, from a few frames.
+
+    Parameters
+    ----------
+    stack : Stack
+    search : Search
+    sample : sequence of SampledFrame
+    refine : {"model", "trackpy", None}
+    optics : Optics, optional
+
+    Returns
+    -------
+    Method
 
     Raises
     ------
     ValueError
-        Where no sphere is found, or the optics do not settle.
+        Where no sphere is found, or the search for the optics does not converge.
 
     Warns
     -----
@@ -249,11 +314,21 @@ def choose_method(
         As in `mass_cut`.
     """
     if search.minmass is None:
-        masses = [seen.spots.mass for seen in sample]
+        masses = [sampled.spots.mass for sampled in sample]
         search = replace(search, minmass=mass_cut(np.concatenate([np.empty(0), *masses])))
-    if refine == "model" and optics is None and not _crowded(sample, search):
-        optics = fit_optics(sample, search, voxel=_voxel(stack))
-    return Method(search, refine, optics if refine == "model" else None)
+    if refine != "model":
+        return Method(search, refine, None)
+    if optics is None:
+        in_crowds = in_groups = 0
+        for sampled in sample:
+            found = search.spheres(sampled.spots).centers
+            groups, crowds = groups_and_crowds(found, contact=search.contact)
+            in_crowds += sum(map(len, crowds))
+            in_groups += sum(map(len, groups))
+        # Where most spheres are in crowds that are not to be refined, no optics are needed.
+        if search.crowds or in_crowds <= in_groups:
+            optics = fit_optics(sample, search, voxel=_voxel_size(stack))
+    return Method(search, refine, optics)
 
 
 def locate(
@@ -263,74 +338,72 @@ def locate(
     contact: float,
     refine: Refine = "model",
     optics: Optics | None = None,
-    dark: bool = False,
-    minmass: float | None = None,
-    percentile: float = 95.0,
-    border: bool = True,
+    spots: Spots | None = None,
     crowds: bool = False,
     frames: Iterable[int] | None = None,
+    **settings: Unpack[SpotSettings],
 ) -> pd.DataFrame:
-    """Find every sphere of a stack, and refine its place by the model of its image.
+    """Find every sphere of a stack, and refine its position by the model of its image.
 
     Parameters
     ----------
     stack : Stack
         Anything with ``shape (t, z, y, x)``, ``voxel (z, y, x)`` in um and ``frame(i)``.
     diameter : float
-        Of the ball that is seen, um: the whole sphere, or the fluorescent core of it.
+        Diameter of the fluorescent sphere, um: the whole sphere, or its fluorescent core.
     contact : float
         Centre distance of touching spheres, um. Spheres within 1.3 times that are fitted together.
     refine : {"model", "trackpy", None}
-        "model" fits the ball blurred by the optics; "trackpy" its least-squares fit of discs;
-        None leaves the filtered centroid, which is off by a tenth of the contact distance where
-        balls touch.
+        "model" fits the ball blurred by the optics; "trackpy" uses its least-squares fit of discs;
+        None keeps the filtered centroid, whose error is a tenth of the contact distance where
+        spheres touch.
     optics : Optics, optional
-        How a sphere is seen; by default learned from a few frames (`fit_optics`).
-    dark : bool
-        Spheres are darker than what surrounds them.
-    minmass : float, optional
-        Least integrated brightness; by default the widest gap between spheres and noise.
-    percentile : float
-        Of voxels too dim to be a sphere's middle; lower it where spheres fill the field.
-    border : bool
-        Also spheres whose centre is inside the stack but which its border cuts; without them their
-        neighbours' light is misread, which `chi2` shows.
+        Size, point spread and noise of the image of a sphere; by default learned from a few frames
+        (`fit_optics`).
+    spots : Spots, optional
+        Which spots are taken for spheres.
     crowds : bool
-        Also refine crowds, see the notes: some seconds for each of them in a frame. Otherwise they
-        stay where they were found.
+        Crowds are refined too (see the notes), which takes some seconds for each crowd of a frame.
+        Otherwise their spheres keep the positions found first.
     frames : iterable of int, optional
-        Frames to do; default all.
+        The frames to analyse; by default all.
+    **settings
+        Single fields of `Spots` in place of this object: `dark`, `minmass`, `percentile`, `border`.
 
     Returns
     -------
     DataFrame
-        ``frame, x, y, z`` (no z of a 2-D movie) in um, the origin at the centre of voxel (0, 0, 0),
-        ``mass``; and for "model" ``sigma_x, sigma_y, sigma_z`` in um (from the Fisher information),
-        ``chi2`` of the group's image per degree of freedom, and ``refined``: False where the fit
-        did not settle, left by over half a radius, found no sphere, or was not tried, and the place
-        found first was kept, without errors; `reason` says which of these. Of crowds see the notes.
+        ``frame, x, y, z`` (no z for a 2-D movie) in um, with the origin at the centre of voxel
+        (0, 0, 0), and ``mass``; with "model" also ``sigma_x, sigma_y, sigma_z`` in um (from the
+        Fisher information), ``chi2`` of the group's image per degree of freedom, and ``refined``.
+        `refined` is False where the fit did not converge, moved the sphere by over half a radius,
+        found no intensity, or was not attempted: the position found first is kept, without errors,
+        and `reason` names the cause. For crowds see the notes.
 
     Raises
     ------
     ValueError
-        For arguments that cannot be, or where the optics cannot be learned.
+        For arguments out of range, all in one message, an option stated both in `spots` and as a
+        keyword, or where the optics cannot be learned.
+    TypeError
+        For an unknown keyword.
     ModuleNotFoundError
-        Without trackpy.
+        If trackpy is not installed.
 
     Warns
     -----
     PrecisionWarning
-        Where a frame cannot be read: it is left out. Where the masses show no gap between spheres
-        and noise. Where spheres stay where they were found: those of crowds, and what has no
-        voxels to itself. Where the model is asked for in a 2-D movie.
+        Where a frame cannot be read and is left out. Where the masses show no gap between spheres
+        and noise. Where spheres keep the positions found first: those in crowds, and those that
+        have no voxels of their own. Where the model is requested for a 2-D movie.
 
     Notes
     -----
     More than 16 spheres in a chain, neighbours within 1.6 times `contact`, are a crowd. With
-    `crowds` it is fitted until its image has nothing left over: spots that turn out to be no
-    spheres are left out, and spheres that were missed are added, with a `mass` of NaN. Its `chi2`
-    is that of each sphere's own voxels. Its background has a level of its own in every plane; what
-    shines there without being a sphere is misread as one if it is bright enough.
+    `crowds` it is fitted until its residuals show no further sphere: spots that are no spheres are
+    removed, and missing spheres are added, with a `mass` of NaN. Its `chi2` is that of each
+    sphere's own voxels. Its background has a level of its own in every plane; any other bright
+    structure is taken for a sphere if it is bright enough.
 
     Examples
     --------
@@ -341,132 +414,146 @@ def locate(
     ...     def frame(self, i):
     ...         ball = sphere_image(diameter=2.0, psf=(0.4, 0.15), voxel=self.voxel)
     ...         spot = ball.spot(np.array([3.01, 3.12, 3.23]), self.shape[1:])
-    ...         light = np.full(self.shape[1:], 9.0)
-    ...         light[spot.box] += 100 * spot.value
-    ...         return np.random.default_rng(i).poisson(light)
+    ...         photons = np.full(self.shape[1:], 9.0)
+    ...         photons[spot.box] += 100 * spot.value
+    ...         return np.random.default_rng(i).poisson(photons)
     >>> found = locate(Still(), diameter=2.0, contact=2.0)
     >>> found[["x", "y", "z"]].round(1).values.tolist()
     [[3.2, 3.1, 3.0]]
     """
-    search = Search(diameter, contact, dark, percentile, minmass, border, crowds)
-    check_search(stack, search, refine, optics=optics)
+    refuse_unknown("locate", settings, SPOT_KEYWORDS)
+    faults: list[str] = []
+    spots = options_from(Spots, spots, settings, name="spots", faults=faults)
+    search = Search(
+        diameter, contact, spots.dark, spots.percentile, spots.minmass, spots.border, crowds
+    )
+    check_search(stack, search, refine, optics=optics, faults=faults)
     if refine == "model" and is_flat(stack):
         refine = None
         warnings.warn(NO_FLAT_MODEL, PrecisionWarning, stacklevel=2)
-    listed = _listed(stack, frames)
-    sample = sample_frames(stack, search, listed)
+    n_frames = stack.shape[0]
+    numbers = list(range(n_frames)) if frames is None else [int(i) for i in frames]
+    outside = [i for i in numbers if not 0 <= i < n_frames]
+    if outside:
+        raise ValueError(
+            f"frames: expected 0 to {n_frames - 1}, as the stack has {n_frames}, got "
+            f"{listed(outside, most=5)}"
+        )
+    sample = sample_frames(stack, search, numbers)
     method = choose_method(stack, search, sample, refine=refine, optics=optics)
-    table = found_table(_looked(stack, listed, method))
-    if refine == "model" and len(table):
-        _warn_of_untried(table)
+    located, unread = [], []
+    for i in numbers:
+        try:
+            located.append(method.locate_in(stack, i))
+        except FrameError as fault:
+            unread.append(str(fault))
+    if unread:
+        warnings.warn(
+            f"{len(unread)} of {len(numbers)} frames are left out: {'; '.join(unread[:3])}"
+            f"{f' and {len(unread) - 3} more' if len(unread) > 3 else ''}",
+            PrecisionWarning,
+            stacklevel=2,
+        )
+    table = found_table(located)
+    untried = int(table["chi2"].isna().sum()) if refine == "model" and len(table) else 0
+    if untried:
+        warnings.warn(
+            f"{untried} of {len(table)} spheres touch in chains of over 16 (crowds=True refines "
+            "them) or have no voxels of their own: they keep the positions found first, whose "
+            "errors are some hundredths of a sphere, up to a tenth; the column `reason` states "
+            "the cause",
+            PrecisionWarning,
+            stacklevel=2,
+        )
     return table
 
 
-def _looked(stack: StackLike, frames: Sequence[int], method: Method) -> list[Found]:
-    """Return what every frame holds; one that cannot be read is a warning."""
-    found, faults = [], []
-    for i in frames:
-        try:
-            found.append(method.look(stack, i))
-        except FrameError as fault:
-            faults.append(str(fault))
-    if faults:
-        warnings.warn(
-            f"{len(faults)} of {len(frames)} frames are left out: {'; '.join(faults[:3])}"
-            f"{f' and {len(faults) - 3} more' if len(faults) > 3 else ''}",
-            PrecisionWarning,
-            stacklevel=3,
-        )
-    return found
+def fit_optics(sample: Sequence[SampledFrame], search: Search, *, voxel: _Voxel) -> Optics:
+    """Learn the diameter of the fluorescent sphere, the point spread and the noise.
 
+    Parameters
+    ----------
+    sample : sequence of SampledFrame
+        A few frames all over the movie.
+    search : Search
+        Options of the search, with the mass cut.
+    voxel : tuple of float
+        Voxel size (z, y, x), um.
 
-def fit_optics(sample: Sequence[Sampled], search: Search, *, voxel: _Voxel) -> Optics:
-    """Learn the sphere's size in the light, the point spread and the noise from a few frames.
+    Returns
+    -------
+    Optics
 
     Raises
     ------
     ValueError
-        Where no sphere is found, or the search does not settle.
+        Where no sphere is found, or the search does not converge.
     """
-    samples: list[Sample | CrowdSample] = []
-    crowds: list[Sample | CrowdSample] = []
-    for seen in sample:
-        found = search.spheres(seen.spots)
-        groups, crowded = groups_and_crowds(found.centers, contact=search.contact)
-        samples += [_sample(seen.frame, found, group, search.contact) for group in groups]
-        if search.crowds:
-            crowds += [_piece(seen.frame, found, group, search, voxel) for group in crowded]
-    most = _LEARN_GROUPS
-    if sum(len(s.centers) for s in samples) < sum(len(s.centers) for s in crowds):
-        samples, most = crowds, _LEARN_CROWDS
-    learned = [samples[k] for k in _spread(len(samples), most)]
-    return fit_samples(learned, diameter=search.diameter, voxel=voxel)
+    samples: list[GroupSample | CrowdSample] = []
+    pieces: list[GroupSample | CrowdSample] = []
+    for sampled in sample:
+        found = search.spheres(sampled.spots)
+        groups, crowds = groups_and_crowds(found.centers, contact=search.contact)
+        samples += [_group_sample(sampled.frame, found, group, search.contact) for group in groups]
+        for crowd in crowds if search.crowds else []:
+            piece = crowd_piece(sampled.frame, found.centers[crowd], voxel, count=_PIECE_SPHERES)
+            pieces.append(CrowdSample(*piece, np.empty((0, 3)), search.contact))
+    most = _LEARNING_GROUPS
+    if sum(len(s.centers) for s in samples) < sum(len(s.centers) for s in pieces):
+        samples, most = pieces, _LEARNING_CROWDS
+    chosen = [samples[k] for k in _evenly_spaced(len(samples), most)]
+    return fit_samples(chosen, diameter=search.diameter, voxel=voxel)
 
 
-def _crowded(sample: Sequence[Sampled], search: Search) -> bool:
-    """Return whether most spheres are in crowds that are not to be refined."""
-    inside = outside = 0
-    for seen in sample:
-        found = search.spheres(seen.spots).centers
-        groups, crowds = groups_and_crowds(found, contact=search.contact)
-        inside, outside = inside + sum(map(len, crowds)), outside + sum(map(len, groups))
-    return not search.crowds and inside > outside
-
-
-def _by_model(
+def group_columns(
     frame: Floats, found: Features, contact: float, optics: Optics | None, voxel: _Voxel
-) -> dict[str, NDArray[Any]]:
-    """Fit every group of touching spheres; return the columns of the table."""
+) -> Columns:
+    """Fit every group of touching spheres by the model of its image.
+
+    Parameters
+    ----------
+    frame : ndarray, shape (nz, ny, nx)
+        Grey levels.
+    found : Features
+        The spheres of the frame as they were found first.
+    contact : float
+        Centre distance of touching spheres, um.
+    optics : Optics or None
+        None: no group is fitted.
+    voxel : tuple of float
+        Voxel size (z, y, x), um.
+
+    Returns
+    -------
+    dict of ndarray
+        The columns of the table of `locate`.
+    """
     centers, sigma = found.centers.copy(), np.full_like(found.centers, np.nan)
-    chi2, reason = np.full(len(centers), np.nan), np.full(len(centers), _CROWDED, dtype=object)
-    for group, fit in _fits(frame, found, contact, optics, voxel) if optics is not None else ():
-        if fit is None:
-            reason[group] = _HIDDEN
+    chi2 = np.full(len(centers), np.nan)
+    reason = np.full(len(centers), _IN_A_CROWD, dtype=object)
+    groups = [] if optics is None else groups_and_crowds(found.centers, contact=contact)[0]
+    if optics is not None:
+        image, noise, furthest = optics.image(voxel), optics.noise, optics.diameter / 4
+    for group in groups:
+        sample = _group_sample(frame, found, group, contact)
+        window = sample.window(image)
+        if not window.has_enough_voxels(len(group)):
+            reason[group] = _NO_OWN_VOXELS
             continue
+        fit = fit_window(window, image, noise, FreeCenters(sample.centers))
+        moved = np.linalg.norm(fit.centers - sample.centers, axis=1) >= furthest
+        dark = ~(fit.brightness / np.median(fit.brightness) > 0.1)
+        faults = np.where(dark, _DARK, np.where(moved, _MOVED, "")).astype(object)
+        reason[group] = faults if fit.converged else _NOT_CONVERGED
         chi2[group] = fit.chi2
-        reason[group] = fit.doubts
-        good = fit.doubts == ""
+        good = reason[group] == ""
         centers[group[good]] = fit.centers[good]
-        sigma[group[good]] = fit.sigma[good]
-    columns = _places(centers) | {"mass": found.mass} | _places(sigma, "sigma_")
+        sigma[group[good]] = np.sqrt(np.diag(fit.covariance)).reshape(-1, 3)[good]
+    columns = _axis_columns(centers) | {"mass": found.mass} | _axis_columns(sigma, "sigma_")
     return columns | {"chi2": chi2, "refined": reason == "", "reason": reason}
 
 
-class _GroupFit(NamedTuple):
-    """Refined spheres of one group: places and errors (n, 3), and why one is not to be believed."""
-
-    centers: Floats
-    sigma: Floats
-    chi2: float
-    doubts: NDArray[np.object_]
-
-
-def _fits(
-    frame: Floats, found: Features, contact: float, optics: Optics, voxel: _Voxel
-) -> Iterator[tuple[Ints, _GroupFit | None]]:
-    """Yield every group of touching spheres with its fit; None without enough voxels."""
-    image = optics.image(voxel)
-    for group in groups_and_crowds(found.centers, contact=contact)[0]:
-        sample = _sample(frame, found, group, contact)
-        window = cut_window(frame, image, sample.centers, others=sample.others)
-        if not window.shows(len(group)):
-            yield group, None
-            continue
-        fit = fit_window(window, image, optics.noise, FreeCenters(sample.centers))
-        sigma = np.sqrt(np.diag(fit.covariance)).reshape(-1, 3)
-        doubts = _doubts(fit, sample.centers, optics.diameter / 4)
-        yield group, _GroupFit(fit.centers, sigma, fit.chi2, doubts)
-
-
-def _doubts(fit: ImageFit, start: Floats, furthest: float) -> NDArray[np.object_]:
-    """Return why each sphere of a fit is not to be believed; "" where it is."""
-    moved = np.linalg.norm(fit.centers - start, axis=1) >= furthest
-    dark = ~(fit.brightness / np.median(fit.brightness) > 0.1)
-    why = np.where(dark, _DARK, np.where(moved, _MOVED, "")).astype(object)
-    return why if fit.converged else np.full(len(start), _UNSETTLED, dtype=object)
-
-
-def _with_crowds(
+def with_crowds(
     columns: Columns,
     frame: Floats,
     found: Features,
@@ -474,8 +561,33 @@ def _with_crowds(
     optics: Optics,
     voxel: _Voxel,
 ) -> Columns:
-    """Return the columns with the rows of every crowd replaced by those of its fit."""
+    """Return the columns with the rows of every crowd replaced by those of its fit.
+
+    A sphere whose fit did not converge keeps the position found first, or is left out where it was
+    not found first; without `border` a sphere that the border cuts is left out too.
+
+    Parameters
+    ----------
+    columns : dict of ndarray
+        The columns of `group_columns`.
+    frame : ndarray, shape (nz, ny, nx)
+        Grey levels.
+    found : Features
+        The spheres of the frame as they were found first.
+    search : Search
+        Options of the search.
+    optics : Optics
+        Size, point spread and noise of the image of a sphere.
+    voxel : tuple of float
+        Voxel size (z, y, x), um.
+
+    Returns
+    -------
+    dict of ndarray
+    """
     _, crowds = groups_and_crowds(found.centers, contact=search.contact)
+    last = (np.array(frame.shape) - 1) * np.array(voxel)
+    margin = 0.0 if search.border else search.diameter / 2
     for group in crowds:
         crowd = fit_crowd(
             frame,
@@ -485,60 +597,29 @@ def _with_crowds(
             image=optics.image(voxel),
             noise=optics.noise,
         )
-        last = (np.array(frame.shape) - 1) * np.array(voxel)
-        theirs = _crowd_columns(crowd, found.centers[group], found.mass[group], search, last)
-        columns = {k: np.concatenate([columns[k], theirs[k]]) for k in columns}
+        first = crowd.origin >= 0
+        good = crowd.converged & np.isfinite(crowd.sigma).all(axis=1)
+        centers = np.where(good[:, None], crowd.centers, found.centers[group][crowd.origin])
+        sigma = np.where(good[:, None], crowd.sigma, np.nan)
+        kept = np.all((centers >= margin) & (centers <= last - margin), axis=1) & (good | first)
+        mass = np.where(first, found.mass[group][crowd.origin], np.nan)
+        own = _axis_columns(centers) | {"mass": mass} | _axis_columns(sigma, "sigma_")
+        own |= {"chi2": crowd.chi2, "refined": good}
+        own["reason"] = np.where(good, "", _NOT_CONVERGED).astype(object)
+        columns = {k: np.concatenate([columns[k], own[k][kept]]) for k in columns}
     stays = np.ones(len(columns["mass"]), dtype=np.bool_)
     stays[np.concatenate([np.empty(0, dtype=np.int64), *crowds])] = False
     return {k: column[stays] for k, column in columns.items()}
 
 
-def _crowd_columns(
-    crowd: CrowdFit, start: Floats, mass: Floats, search: Search, last: Floats
-) -> Columns:
-    """Return the columns of a crowd that was found at `start`, in a stack that ends at `last`.
-
-    A sphere whose fit did not settle stays where it was found first, or is left out where it was
-    not; without `border` so is one that the border cuts.
-    """
-    first = crowd.origin >= 0
-    good = crowd.settled & np.isfinite(crowd.sigma).all(axis=1)
-    centers = np.where(good[:, None], crowd.centers, start[crowd.origin])
-    sigma = np.where(good[:, None], crowd.sigma, np.nan)
-    margin = 0.0 if search.border else search.diameter / 2
-    kept = np.all((centers >= margin) & (centers <= last - margin), axis=1) & (good | first)
-    columns = _places(centers) | {"mass": np.where(first, mass[crowd.origin], np.nan)}
-    columns |= _places(sigma, "sigma_") | {"chi2": crowd.chi2, "refined": good}
-    columns["reason"] = np.where(good, "", _UNSETTLED).astype(object)
-    return {k: column[kept] for k, column in columns.items()}
-
-
-def _warn_of_untried(table: pd.DataFrame) -> None:
-    untried = int(table["chi2"].isna().sum())
-    if untried:
-        warnings.warn(
-            f"{untried} of {len(table)} spheres touch in chains of over 16 (crowds=True refines "
-            "them) or have no voxels to themselves: they stay where found, some hundredths of a "
-            "sphere off, up to a tenth; the column `reason` says which",
-            PrecisionWarning,
-            stacklevel=3,
-        )
-
-
-def _sample(frame: Floats, found: Features, group: Ints, contact: float) -> Sample:
+def _group_sample(frame: Floats, found: Features, group: Ints, contact: float) -> GroupSample:
+    """Return a group of touching spheres, contracted to contact, and all other spheres."""
     others = np.delete(found.centers, group, axis=0)
-    return Sample(frame, at_contact(found.centers[group], contact=contact), others)
+    return GroupSample(frame, at_contact(found.centers[group], contact=contact), others)
 
 
-def _piece(
-    frame: NDArray[Any], found: Features, group: Ints, search: Search, voxel: _Voxel
-) -> CrowdSample:
-    piece, centers = piece_of(frame, found.centers[group], voxel, count=_PIECE)
-    return CrowdSample(piece, centers, np.empty((0, 3)), search.contact)
-
-
-def _numbers(data: NDArray[Any], i: int) -> Floats:
-    """Return a frame as floats; voxels without a number would be bright or dark by chance."""
+def _finite_frame(data: NDArray[Any], i: int) -> Floats:
+    """Return a frame as floats; NaN or infinite voxels, neither bright nor dark, are refused."""
     frame = np.asarray(data, dtype=np.float64)
     lost = int(np.count_nonzero(~np.isfinite(frame)))
     if lost:
@@ -547,88 +628,139 @@ def _numbers(data: NDArray[Any], i: int) -> Floats:
 
 
 def frame_digest(data: NDArray[Any]) -> str:
-    """Return a digest of the voxels of a frame."""
+    """Return a digest of the voxels of a frame.
+
+    Examples
+    --------
+    >>> frame_digest(np.zeros((2, 2), dtype=np.uint8)) == frame_digest(np.zeros((2, 2)))
+    False
+    """
     return hashlib.blake2b(np.ascontiguousarray(data).tobytes(), digest_size=16).hexdigest()
 
 
 def is_flat(stack: StackLike) -> bool:
-    """Return whether a movie is two-dimensional: one plane, of no height."""
+    """Return whether a movie is two-dimensional: one plane, whose z has no size.
+
+    Examples
+    --------
+    >>> from perrin.images import open_stack
+    >>> is_flat(open_stack(np.zeros((3, 8, 8)), voxel=(0.2, 0.2), dt=1.0))
+    True
+    """
     return bool(np.isnan(stack.voxel[0]))
 
 
-def _places(centers: Floats, prefix: str = "") -> dict[str, NDArray[Any]]:
+def _axis_columns(centers: Floats, prefix: str = "") -> Columns:
+    """Return columns x, y, z of an array (n, 3) of (z, y, x)."""
     return {f"{prefix}{axis}": centers[:, k] for axis, k in zip("xyz", (2, 1, 0), strict=True)}
 
 
-def found_table(found: Iterable[Found]) -> pd.DataFrame:
-    """Return what frames hold as the table of `locate`."""
+def found_table(located: Iterable[LocatedFrame]) -> pd.DataFrame:
+    """Return the spheres of several frames as the table of `locate`.
+
+    Examples
+    --------
+    >>> columns = {"frame": np.array([3]), "x": np.array([1.5]), "mass": np.array([800.0])}
+    >>> found_table([LocatedFrame(columns, spots=5, level=9.0, saturated=0.0, digest="")])
+       frame    x   mass
+    0      3  1.5  800.0
+    """
     import pandas as pd
 
-    parts = [pd.DataFrame(f.columns) for f in found]
+    parts = [pd.DataFrame(frame.columns) for frame in located]
     if not parts:
         return pd.DataFrame(columns=["frame", "x", "y", "z", "mass"])
     return pd.concat(parts, ignore_index=True)
 
 
-def _voxel(stack: StackLike) -> _Voxel:
+def _voxel_size(stack: StackLike) -> _Voxel:
+    """Return the voxel size (z, y, x) as floats, um."""
     z, y, x = (float(h) for h in stack.voxel)
     return z, y, x
 
 
-def _spread(count: int, wanted: int = _LEARN_FRAMES) -> list[int]:
-    """Return up to so many indices, evenly over 0 ... count - 1."""
-    return sorted(set(np.linspace(0, count - 1, min(wanted, count)).round().astype(int).tolist()))
-
-
-def _listed(stack: StackLike, frames: Iterable[int] | None) -> list[int]:
-    listed = list(range(stack.shape[0])) if frames is None else [int(i) for i in frames]
-    outside = [i for i in listed if not 0 <= i < stack.shape[0]]
-    if outside:
-        raise ValueError(
-            f"frames: expected 0 to {stack.shape[0] - 1}, as the stack has {stack.shape[0]}, got "
-            f"{', '.join(map(str, outside[:5]))}"
-        )
-    return listed
+def _evenly_spaced(count: int, most: int) -> list[int]:
+    """Return up to `most` indices, evenly over 0 ... count - 1."""
+    return sorted(set(np.linspace(0, count - 1, min(most, count)).round().astype(int).tolist()))
 
 
 def check_search(
-    stack: StackLike, search: Search, refine: Refine, *, optics: Optics | None = None
+    stack: StackLike,
+    search: Search,
+    refine: Refine,
+    *,
+    optics: Optics | None = None,
+    faults: Iterable[str] = (),
 ) -> None:
-    """Raise one error with every fault of the arguments of a search."""
+    """Raise one error with every fault of the arguments of a search.
+
+    Parameters
+    ----------
+    stack : Stack
+    search : Search
+    refine : {"model", "trackpy", None}
+    optics : Optics, optional
+    faults : iterable of str
+        Faults found before, which are listed first.
+
+    Raises
+    ------
+    ValueError
+    """
+    faults = list(faults)
     if len(stack.shape) != 4:
-        raise ValueError(f"stack: expected shape (t, z, y, x), got {stack.shape}")
-    require_positive(diameter=search.diameter, contact=search.contact)
-    faults = _size_faults(stack, search, optics)
-    if refine not in ("model", "trackpy", None):
-        faults.append(f"refine: expected 'model', 'trackpy' or None, got {refine!r}")
-    if search.diameter > 1.2 * search.contact:
+        faults.append(f"stack: expected shape (t, z, y, x), got {stack.shape}")
+    lengths = number_fault("diameter", search.diameter, above=0, unit="um")
+    lengths += number_fault("contact", search.contact, above=0, unit="um")
+    faults += lengths + choice_fault("refine", refine, ("model", "trackpy", None))
+    if not lengths and search.diameter > 1.2 * search.contact:
         faults.append(
             f"diameter {search.diameter} um is more than contact {search.contact} um: balls do not "
             "overlap; are the two exchanged?"
         )
-    if not 0 <= search.percentile < 100:
-        faults.append(f"percentile: expected 0 <= percentile < 100, got {search.percentile}")
-    if faults:
-        raise ValueError("; ".join(faults))
+    faults += number_fault("percentile", search.percentile, least=0, below=100)
+    if not lengths and len(stack.shape) == 4:
+        faults += size_faults(stack, search, optics)
+    refuse(faults)
 
 
-def _size_faults(stack: StackLike, search: Search, optics: Optics | None) -> list[str]:
-    """Return what does not fit into the stack or between its voxels: lengths in another unit.
+def size_faults(stack: StackLike, search: Search, optics: Optics | None) -> list[str]:
+    """Return the lengths that do not fit the stack or its voxels: lengths in another unit.
 
-    Windows, masks and tables grow with the cube of the diameter in voxels: this comes before any
-    of them. Two touching spheres are seen together where the stack's diagonal is longer than
-    `contact`; half a voxel is far below what any microscope shows as a sphere.
+    Windows, masks and tables grow with the cube of the diameter in voxels, so that this check
+    comes before any of them. Two touching spheres are in the stack together if its diagonal is
+    longer than `contact`; half a voxel is far below the size of any visible sphere.
+
+    Parameters
+    ----------
+    stack : Stack
+    search : Search
+    optics : Optics or None
+
+    Returns
+    -------
+    list of str
+        Empty, or one line.
+
+    Examples
+    --------
+    >>> from perrin.images import open_stack
+    >>> stack = open_stack(np.zeros((1, 16, 32, 32)), voxel=(0.25, 0.2, 0.2))
+    >>> size_faults(stack, Search(2.45, 2.45), None)
+    []
+    >>> size_faults(stack, Search(2450.0, 2.45), None)[0][:45]
+    'diameter 2450 um does not fit into the stack:'
     """
     voxel = np.asarray(stack.voxel, dtype=np.float64)
     there = np.isfinite(voxel)
     voxel, extent = voxel[there], (np.array(stack.shape[1:]) * voxel)[there]
-    spheres = {"diameter": search.diameter}
+    lengths = {"diameter": search.diameter}
     if optics is not None:
-        spheres["optics: diameter"] = optics.diameter
-        spheres["optics: point spread"] = max(optics.psf)
+        lengths["optics: diameter"] = optics.diameter
+        lengths["optics: point spread"] = max(optics.psf)
     faults = [
         f"{name} {length:g} um does not fit into the stack"
-        for name, length in spheres.items()
+        for name, length in lengths.items()
         if length > extent.min()
     ]
     if search.diameter < voxel.max() / 2:
@@ -638,11 +770,10 @@ def _size_faults(stack: StackLike, search: Search, optics: Optics | None) -> lis
     if not faults:
         return []
     axes = "z, y, x" if there.all() else "y, x"
+    stack_size, voxel_size = (
+        " x ".join(f"{length:.4g}" for length in sizes) for sizes in (extent, voxel)
+    )
     return [
-        f"{', '.join(faults)}: the stack is {_lengths(extent)} um ({axes}), its voxels are "
-        f"{_lengths(voxel)} um; are the lengths in um?"
+        f"{', '.join(faults)}: the stack is {stack_size} um ({axes}), its voxels are "
+        f"{voxel_size} um; are the lengths in um?"
     ]
-
-
-def _lengths(values: Floats) -> str:
-    return " x ".join(f"{value:.4g}" for value in values)

@@ -1,4 +1,4 @@
-"""How rigid clusters stand and are turned, by the likelihood of their image."""
+"""Poses of rigid clusters, by the likelihood of their image."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ if TYPE_CHECKING:
 
 
 class Pose(NamedTuple):
-    """Where one body is in one frame: x, y, z.
+    """Pose of one body in one frame.
 
     Attributes
     ----------
     center : ndarray, shape (3,)
-        um.
+        Position (x, y, z) of the centre, um.
     rotation : ndarray, shape (3, 3)
-        Lab from body.
+        Rotation matrix, lab from body.
     turn_covariance : ndarray, shape (3, 3)
-        Of a small turn about the lab's axes, rad^2.
+        Covariance of a small rotation about the lab's axes, rad^2.
     center_variance : float
-        Of one coordinate of the centre, um^2.
+        Variance of one coordinate of the centre, um^2.
     """
 
     center: Floats
@@ -50,30 +50,47 @@ def fit_pose(
     frames: Ints | None = None,
     others: pd.DataFrame | None = None,
 ) -> RigidMotion:
-    """Fit the six numbers of a rigid cluster's pose to the images themselves.
+    """Fit the six parameters of a rigid cluster's pose to the images.
 
     Parameters
     ----------
     stack : Stack
     motion : RigidMotion
-        Of the free centres: the common shape, and every frame's start.
+        Motion of the free centres: the common shape, and the pose at which every fit starts.
     optics : Optics
-        How a sphere is seen.
+        Size, point spread and noise of the image of a sphere.
     frames : ndarray of int, shape (T,), optional
-        The stack's frame of each row of `motion`; default 0, 1, ...
+        Frame of the stack for each row of `motion`; by default 0, 1, ...
     others : DataFrame, optional
-        Spheres (``frame, x, y, z``) of other clusters, whose light is left out.
+        Spheres (``frame, x, y, z``) of other clusters, whose voxels are not used.
 
     Returns
     -------
     RigidMotion
-        The same with `center`, `rotation`, `covariance` and `center_variance` from the images; a
-        frame whose fit does not settle has no pose and says so in `reason`.
+        The same motion with `center`, `rotation`, `covariance` and `center_variance` from the
+        images; a frame whose fit does not converge has no pose, and `reason` gives the cause.
 
     Notes
     -----
-    The shape is taken as known: an error in it goes into the pose unseen. `residual` stays that of
-    the free centres, which shows whether the cluster is rigid at all.
+    The shape is taken as known: an error in it biases the pose. `residual` stays that of the free
+    centres, which shows whether the cluster is rigid.
+
+    Examples
+    --------
+    >>> import perrin
+    >>> from perrin.images import CameraNoise
+    >>> body, optics = perrin.Cluster.touching(3, 2.0), perrin.Optics(
+    ...     2.0, (0.4, 0.15), CameraNoise(1.0, 0.0)
+    ... )
+    >>> truth = perrin.simulate_motion(body, D_R=0.01, D_T=0.01, dt=1.0, n_frames=2, rng=1)
+    >>> movie = perrin.render_stack(
+    ...     truth, centers=[[3.0, 3.0, 3.0]], voxel=(0.25, 0.2, 0.2), shape=(25, 30, 30),
+    ...     diameter=2.0, psf=(0.4, 0.15, 0.15), rng=1,
+    ... )
+    >>> start = perrin.track_rotation(truth.positions() + 3.0, dt=1.0)
+    >>> posed = fit_pose(movie, start, optics=optics)
+    >>> bool(abs(posed.center - truth.center - 3.0).max() < 0.03)
+    True
     """
     number = np.arange(len(motion.time)) if frames is None else np.asarray(frames)
     z, y, x = (float(h) for h in stack.voxel)
@@ -92,47 +109,61 @@ def fit_pose(
 
 
 def start_of(motion: RigidMotion, row: int) -> RigidCenters:
-    """Return a body's pose in one row of its motion."""
+    """Return the pose of a body in one row of its motion, at which a fit starts."""
     return RigidCenters(motion.center[row], motion.rotation[row], motion.template)
 
 
 def pose_in(
     frame: Floats, start: RigidCenters, image: SphereImage, noise: CameraNoise, *, others: Floats
 ) -> Pose | None:
-    """Fit one pose to one frame; None where the fit does not settle.
+    """Fit one pose to one frame.
 
     Parameters
     ----------
     frame : ndarray, shape (nz, ny, nx)
+        Grey levels.
     start : RigidCenters
+        The pose at the start.
     image : SphereImage
+        The image of a sphere.
     noise : CameraNoise
+        The variance of a voxel.
     others : ndarray, shape (m, 3)
-        Places (x, y, z) of spheres of other clusters, um.
+        Positions (x, y, z) of spheres of other clusters, um.
+
+    Returns
+    -------
+    Pose or None
+        None where the fit does not converge.
     """
     window = cut_window(frame, image, start.centers, others=others[:, ::-1])
-    if not window.shows(len(start.template)):
+    if not window.has_enough_voxels(len(start.template)):
         return None
     fit = fit_window(window, image, noise, start)
     pose = fit.arrangement
     if not (fit.converged and isinstance(pose, RigidCenters)):
         return None
-    spread = fit.covariance
-    return Pose(pose.center, pose.rotation, spread[3:, 3:], float(np.trace(spread[:3, :3]) / 3))
+    turn, variance = fit.covariance[3:, 3:], float(np.trace(fit.covariance[:3, :3]) / 3)
+    return Pose(pose.center, pose.rotation, turn, variance)
 
 
 def with_poses(
     motion: RigidMotion, poses: Mapping[int, Pose], *, lost: Mapping[int, str] | None = None
 ) -> RigidMotion:
-    """Return the motion with other poses in some rows, its first one the identity again.
+    """Return a motion with other poses in some rows, its first rotation the identity.
 
     Parameters
     ----------
     motion : RigidMotion
-    poses : mapping
-        By row.
-    lost : mapping, optional
-        Rows that have no pose any more, and why.
+        The motion.
+    poses : mapping of int to Pose
+        The new poses, by row.
+    lost : mapping of int to str, optional
+        Rows that have no pose any more, and the reason.
+
+    Returns
+    -------
+    RigidMotion
     """
     rotation, center = motion.rotation.copy(), motion.center.copy()
     covariance, variance = motion.covariance.copy(), motion.center_variance.copy()

@@ -1,44 +1,144 @@
-"""Which spots of a frame are spheres, and which of them have to be looked at together."""
+"""Which spots of a frame are spheres, and which of them have to be fitted together."""
 
 from __future__ import annotations
 
 import warnings
-from typing import TYPE_CHECKING
+from dataclasses import asdict, dataclass, fields
+from typing import TYPE_CHECKING, Any, TypedDict
 
 import numpy as np
 
+from perrin._arrays import choice_fault, number_fault, refuse, to_plain
 from perrin.errors import PrecisionWarning
+from perrin.geometry.shapes import pair_distances
 from perrin.tracks.clusters import REACH
+from perrin.tracks.linking import touching_groups
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from typing import Self
+
     from perrin._arrays import Floats, Ints
 
 
-_IN_SIGHT = 1.6  # closer than this their images overlap, blur and all
+# Distance in contacts below which the images of two spheres overlap, with their blur.
+_IMAGE_OVERLAP = 1.6
 
 
-_CROWD = 16  # spheres in a longer chain of overlapping images are a crowd
+# Largest number of spheres in a chain of overlapping images that is fitted group by group.
+_MAX_CHAIN = 16
 
 
-_CLEAR_GAP = 2.0  # ratio of neighbouring masses that parts spheres from noise
+# Least ratio of neighbouring masses that separates spheres from noise.
+_CLEAR_GAP = 2.0
 
 
-_ALIKE = 4.0  # masses all within this ratio are spheres all of them
+# Masses that are all within this ratio are all of spheres.
+_SAME_MASS_RATIO = 4.0
 
 
-_FAINT = 20.0  # a gap that much below the largest mass parts noise from noise
+# Ratio to the largest mass below which a gap separates noise from noise.
+_FAINT_RATIO = 20.0
+
+
+class SpotSettings(TypedDict, total=False):
+    """Single keywords of `locate` that are fields of `Spots`."""
+
+    dark: bool
+    minmass: float | None
+    percentile: float
+    border: bool
+
+
+@dataclass(frozen=True, kw_only=True)
+class Spots:
+    """Which spots of a frame are taken for spheres.
+
+    Parameters
+    ----------
+    dark : bool
+        Spheres are darker than their surroundings.
+    minmass : float, optional
+        Least integrated brightness of a sphere; by default the widest gap between spheres and
+        noise.
+    percentile : float
+        Percentile of the grey levels below which a voxel is not the centre of a sphere; lower it
+        where spheres fill the field.
+    border : bool
+        Spheres that the border of the stack cuts are located too, if their centre is inside. If
+        they are left out, their intensity disturbs the fits of their neighbours, which `chi2`
+        shows.
+
+    Raises
+    ------
+    ValueError
+        If a value is out of its range; all faults in one message.
+
+    Examples
+    --------
+    >>> Spots(dark=True, percentile=80.0)
+    Spots(dark=True, minmass=None, percentile=80.0, border=True)
+    """
+
+    dark: bool = False
+    minmass: float | None = None
+    percentile: float = 95.0
+    border: bool = True
+
+    def __post_init__(self) -> None:
+        """Refuse values out of range."""
+        refuse(
+            choice_fault("dark", self.dark, (False, True))
+            + ([] if self.minmass is None else number_fault("minmass", self.minmass))
+            + number_fault("percentile", self.percentile, least=0, below=100)
+            + choice_fault("border", self.border, (False, True))
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the options as values that JSON holds."""
+        plain: dict[str, Any] = to_plain(asdict(self))
+        return plain
+
+    @classmethod
+    def from_dict(cls, entry: Mapping[str, Any]) -> Self:
+        """Return the options that `to_dict` wrote.
+
+        Parameters
+        ----------
+        entry : mapping
+            The dictionary of `to_dict`.
+
+        Returns
+        -------
+        Spots
+        """
+        return cls(**entry)
+
+
+# The single keywords in place of the fields of `Spots`.
+SPOT_KEYWORDS = tuple(field.name for field in fields(Spots))
 
 
 def mass_cut(mass: Floats) -> float:
-    """Return the mass that parts spheres from noise: the middle of the widest gap in log mass.
+    """Return the mass that separates spheres from noise: the middle of the widest gap in log mass.
 
-    Masses all within a factor 4 are spheres; what other frames hold below a quarter of the least of
-    them is noise.
+    Masses all within a factor of 4 are spheres; a quarter of the least of them then separates them
+    from the noise of other frames.
+
+    Parameters
+    ----------
+    mass : ndarray
+        Integrated brightness of the spots of several frames.
+
+    Returns
+    -------
+    float
 
     Warns
     -----
     PrecisionWarning
-        Where masses differ more but no two neighbouring ones twofold; then nothing is cut.
+        Where masses differ by more but no two neighbouring ones by a factor of 2; then no spot is
+        cut.
 
     Examples
     --------
@@ -49,9 +149,9 @@ def mass_cut(mass: Floats) -> float:
     ordered = np.sort(mass[mass > 0])
     if not ordered.size:
         return 0.0
-    if ordered[-1] < _ALIKE * ordered[0]:
-        return float(ordered[0] / _ALIKE)
-    ratio = np.where(ordered[1:] > ordered[-1] / _FAINT, ordered[1:] / ordered[:-1], 1.0)
+    if ordered[-1] < _SAME_MASS_RATIO * ordered[0]:
+        return float(ordered[0] / _SAME_MASS_RATIO)
+    ratio = np.where(ordered[1:] > ordered[-1] / _FAINT_RATIO, ordered[1:] / ordered[:-1], 1.0)
     if ratio.max() < _CLEAR_GAP:
         warnings.warn(
             f"the masses of the {mass.size} spots found have no clear gap between spheres and "
@@ -64,8 +164,22 @@ def mass_cut(mass: Floats) -> float:
     return float(np.sqrt(ordered[k] * ordered[k + 1]))
 
 
-def touching_together(centers: Floats, *, contact: float) -> list[Ints]:
-    """Return the spheres of one frame as groups to be fitted together: chains of touching ones.
+def touching_together(centers: Floats, *, contact: float, reach: float = REACH) -> list[Ints]:
+    """Return the spheres of one frame as groups: chains of touching spheres.
+
+    Parameters
+    ----------
+    centers : ndarray, shape (n, d)
+        Positions, um.
+    contact : float
+        Centre distance of touching spheres, um.
+    reach : float
+        Largest distance of neighbours in a chain, in contact distances.
+
+    Returns
+    -------
+    list of ndarray of int
+        Indices of the spheres of each group.
 
     Examples
     --------
@@ -74,14 +188,29 @@ def touching_together(centers: Floats, *, contact: float) -> list[Ints]:
     >>> [group.tolist() for group in touching_together(x, contact=1.0)]
     [[0, 1], [2]]
     """
-    return _chains(centers, REACH * contact)
+    if not len(centers):
+        return []
+    label = touching_groups(centers, reach=reach * contact, size=len(centers), smallest=1)
+    return [np.flatnonzero(label == k) for k in range(label.max() + 1)]
 
 
 def groups_and_crowds(centers: Floats, *, contact: float) -> tuple[list[Ints], list[Ints]]:
     """Return the spheres of one frame as groups to be fitted together, and as crowds.
 
-    A crowd is a chain of over 16 spheres whose images overlap (closer than 1.6 contacts): each
-    stands in the light of some others, which stand in that of yet others.
+    A crowd is a chain of over 16 spheres whose images overlap (closer than 1.6 contacts), so that
+    the image of each depends on some others, which depend on further ones.
+
+    Parameters
+    ----------
+    centers : ndarray, shape (n, 3)
+        Positions, um.
+    contact : float
+        Centre distance of touching spheres, um.
+
+    Returns
+    -------
+    groups, crowds : list of ndarray of int
+        Indices of the spheres of each.
 
     Examples
     --------
@@ -91,28 +220,30 @@ def groups_and_crowds(centers: Floats, *, contact: float) -> tuple[list[Ints], l
     >>> groups[0].tolist(), len(crowds[0])
     ([0, 1], 20)
     """
-    chains = _chains(centers, _IN_SIGHT * contact)
-    crowds = [chain for chain in chains if len(chain) > _CROWD]
+    chains = touching_together(centers, contact=contact, reach=_IMAGE_OVERLAP)
+    crowds = [chain for chain in chains if len(chain) > _MAX_CHAIN]
     crowded = np.zeros(len(centers), dtype=np.bool_)
     crowded[np.concatenate([np.empty(0, dtype=np.int64), *crowds])] = True
     together = touching_together(centers, contact=contact)
     return [group for group in together if not crowded[group[0]]], crowds
 
 
-def _chains(centers: Floats, reach: float) -> list[Ints]:
-    from perrin.tracks.linking import touching_groups
-
-    if not len(centers):
-        return []
-    label = touching_groups(centers, reach=reach, size=len(centers), smallest=1)
-    return [np.flatnonzero(label == k) for k in range(label.max() + 1)]
-
-
 def at_contact(centers: Floats, *, contact: float) -> Floats:
-    """Return the group drawn together about its middle until neighbours touch, on average.
+    """Return the group contracted about its centre until neighbours touch, on average.
 
-    Filtering drives the maxima of touching balls apart by a tenth; a fit starts nearer to the
+    Filtering moves the maxima of touching spheres apart by a tenth; a fit starts nearer to the
     truth from here. Distances already below contact stay.
+
+    Parameters
+    ----------
+    centers : ndarray, shape (n, 3)
+        Positions, um.
+    contact : float
+        Centre distance of touching spheres, um.
+
+    Returns
+    -------
+    ndarray, shape (n, 3)
 
     Examples
     --------
@@ -120,8 +251,8 @@ def at_contact(centers: Floats, *, contact: float) -> Floats:
     >>> at_contact(np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.1]]), contact=1.0)[:, 2].round(12)
     array([0.05, 1.05])
     """
-    distance = np.linalg.norm(centers[:, None] - centers, axis=-1)
-    near = distance[np.triu(distance < REACH * contact, 1)]
+    distance = pair_distances(centers)
+    near = distance[distance < REACH * contact]
     scale = min(contact / near.mean(), 1.0) if near.size else 1.0
     middle = centers.mean(axis=0)
     return np.asarray(middle + scale * (centers - middle))
