@@ -22,7 +22,7 @@ from perrin import (
     simulate_motion,
     track_rotation,
 )
-from perrin.diffusion.curve_fits import _covariance, _quadratic_variance
+from perrin.diffusion.curve_fits import msd_covariance, weighted_variance
 
 
 def straight(D, offset, n=200, dt=0.5, dof=2):
@@ -125,7 +125,7 @@ def test_the_covariance_of_lags_is_a_dense_trace(N, s):
     QC = dense_forms(N) @ C
     expected = 2 * np.einsum("nij,mji->nm", QC, QC)
     lags, complete = np.arange(1.0, N + 1), np.ones(N)
-    found = _covariance(lags, N, seen=complete, D=0.7, s=s)
+    found = msd_covariance(lags, N, present=complete, D=0.7, s=s)
     np.testing.assert_allclose(found, expected, rtol=1e-12)
 
 
@@ -135,8 +135,8 @@ def test_both_ways_to_a_variance_agree(seen):
     rng = np.random.default_rng(4)
     for use in (np.arange(30), np.array([0, 3, 4, 17, 29]), np.array([25, 28])):
         weights, part = rng.normal(size=use.size), np.full(use.size, seen)
-        covariance = _covariance(use + 1.0, 30, seen=part, D=0.7, s=0.3)
-        short = _quadratic_variance(weights, use + 1.0, 30, seen=part, D=0.7, s=0.3)
+        covariance = msd_covariance(use + 1.0, 30, present=part, D=0.7, s=0.3)
+        short = weighted_variance(weights, use + 1.0, 30, present=part, D=0.7, s=0.3)
         assert short == pytest.approx(weights @ covariance @ weights, rel=1e-10)
 
 
@@ -159,7 +159,7 @@ def test_missing_frames_add_the_covariance_they_should():
         cross = np.einsum("nia,ab,mjb->nmij", step, position, step, optimize=True)
         pairs.append(2 * np.sum(cross**2, axis=(2, 3)))
     mean, error = np.mean(pairs, axis=0), np.std(pairs, axis=0) / np.sqrt(len(pairs))
-    found = _covariance(np.arange(1.0, 6), N, seen=np.full(5, f), D=D, s=s)
+    found = msd_covariance(np.arange(1.0, 6), N, present=np.full(5, f), D=D, s=s)
     assert np.all(np.abs(found - mean) < 4 * error)
 
 

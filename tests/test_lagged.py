@@ -28,7 +28,7 @@ from perrin import (
     track_rotation,
     van_hove,
 )
-from perrin.curves.displacement import _restored
+from perrin.curves.displacement import drift_corrected
 from perrin.geometry.rotations import cumulative_product, exp_map
 
 TETRAHEDRON = Cluster.tetrahedron(1.5)
@@ -721,7 +721,7 @@ def test_what_a_mean_velocity_takes_is_given_back_exactly(pieces):
         expected[lag - 1], pairs[lag - 1] = square.mean(), len(i)
     lengths = np.full(pieces, T // pieces - 1.0)
     lagtime = np.arange(1.0, T)
-    found = _restored(expected, pairs, lagtime=lagtime, durations=lengths)[:, 0]
+    found = drift_corrected(expected, pairs, lagtime=lagtime, durations=lengths)[:, 0]
     n = np.arange(1, T // pieces)
     last = n.size if pieces > 1 else n.size - 1  # all of one piece is its own drift
     np.testing.assert_allclose(found[:last], 2 * D * n[:last] + 2 * s, rtol=1e-9)

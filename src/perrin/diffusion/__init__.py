@@ -1,7 +1,17 @@
 """How fast a body diffuses: coefficients, tensors, their errors, and tests of the steps."""
 
 from perrin.diffusion.bounds import cramer_rao, whole
-from perrin.diffusion.curve_fits import fit_gls, fit_line
+from perrin.diffusion.curve_fits import (
+    GridLags,
+    best_window,
+    fit_gls,
+    fit_line,
+    gls_weights,
+    line_weights,
+    msd_covariance,
+    slope_interval,
+    weighted_variance,
+)
 from perrin.diffusion.estimate import DiffusionEstimate, Found, bare_text, value_text
 from perrin.diffusion.estimators import by_likelihood, estimate_diffusion, track_of
 from perrin.diffusion.likelihood import Likelihood, Peak, excess_scatter
@@ -50,6 +60,7 @@ __all__ = [
     "DiffusionEstimate",
     "DiffusionTensor",
     "Found",
+    "GridLags",
     "Jumps",
     "Likelihood",
     "Maximum",
@@ -69,6 +80,7 @@ __all__ = [
     "axes_like",
     "axial",
     "bare_text",
+    "best_window",
     "by_likelihood",
     "center_steps",
     "choice_faults",
@@ -85,12 +97,16 @@ __all__ = [
     "find_jumps",
     "fit_gls",
     "fit_line",
+    "gls_weights",
     "judge_sampling",
+    "line_weights",
     "maximise",
+    "msd_covariance",
     "offset_gain",
     "persistence_gain",
     "plan_sampling",
     "residual_freedom",
+    "slope_interval",
     "spread",
     "squares",
     "steady_motion",
@@ -100,6 +116,7 @@ __all__ = [
     "unit_center_variance",
     "unit_covariance",
     "value_text",
+    "weighted_variance",
     "whole",
     "without_spin",
 ]
