@@ -18,7 +18,14 @@ from perrin.diffusion.likelihood import Likelihood, Peak, excess_scatter
 from perrin.diffusion.moments import Moments, covariance_estimate, trace_estimate
 from perrin.diffusion.noise_model import Noise, choice_faults
 from perrin.diffusion.rods import estimate_rod
-from perrin.diffusion.sampling import SamplingPlan, SamplingVerdict, judge_sampling, plan_sampling
+from perrin.diffusion.sampling import (
+    SamplingBudget,
+    SamplingPlan,
+    SamplingVerdict,
+    identity_limits,
+    judge_sampling,
+    plan_sampling,
+)
 from perrin.diffusion.step_kernels import Sums, Track, covariance_bands
 from perrin.diffusion.step_tests import (
     Jumps,
@@ -67,6 +74,7 @@ __all__ = [
     "Moments",
     "Noise",
     "Peak",
+    "SamplingBudget",
     "SamplingPlan",
     "SamplingVerdict",
     "Slopes",
@@ -98,6 +106,7 @@ __all__ = [
     "fit_gls",
     "fit_line",
     "gls_weights",
+    "identity_limits",
     "judge_sampling",
     "line_weights",
     "maximise",
