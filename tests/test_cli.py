@@ -599,7 +599,7 @@ def test_plan_takes_either_size_and_every_budget(tmp_path):
     assert run(*by_radius, cwd=tmp_path).stdout == run(*PLAN, cwd=tmp_path).stdout
     assert "no optimum" in run(*PLAN, "--time", 220, cwd=tmp_path).stdout
     light = run(*PLAN, "--time", 220, "--frames", 300, "--photons", cwd=tmp_path)
-    assert "Given light" in light.stdout
+    assert "Limited photons" in light.stdout
 
 
 def test_plan_draws_and_never_overwrites_silently(tmp_path):
