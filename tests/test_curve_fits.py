@@ -225,13 +225,13 @@ def test_the_papers_window_gains_nothing_from_a_longer_run():
 
 
 def test_best_window_and_gls_reach_the_bound(repeats):
-    """40 tracks (long: 200) of 300 frames at SNR 0.2: all within 3 Monte-Carlo errors.
+    """30 tracks (long: 200) of 300 frames at SNR 0.2: all within 3 Monte-Carlo errors.
 
     Efficiency (bound over variance) 0.87 for the best line, 0.96 for GLS, and below 0.5 in the
     paper's window (a quarter in truth); no bias; the stated error is the scatter; the 68 % and 95 %
     intervals cover that much.
     """
-    rng, n = np.random.default_rng(21), repeats(40, 200)
+    rng, n = np.random.default_rng(21), repeats(30, 200)
     curves = [noisy_msd(rng, snr=0.2) for _ in range(n)]
     bound = cramer_rao(n_frames=300, snr=0.2)
     efficiency, within = {}, 3 / np.sqrt(2 * n)
@@ -252,8 +252,8 @@ def test_best_window_and_gls_reach_the_bound(repeats):
 
 
 def test_missing_frames_are_in_the_error(repeats):
-    """40 % of the frames missing, 25 tracks (long: 100): bias, error and coverage, 3 errors."""
-    rng, n = np.random.default_rng(8), repeats(25, 100)
+    """40 % of the frames missing, 20 tracks (long: 100): bias, error and coverage, 3 errors."""
+    rng, n = np.random.default_rng(8), repeats(20, 100)
     curves = [noisy_msd(rng, snr=0.5, missing=0.4) for _ in range(n)]
     for fit in FITS.values():
         found = [fit(curve) for curve in curves]
@@ -304,14 +304,14 @@ def test_fits_follow_the_units(fit):
 def noise_curves(repeats):
     """Return MSDs of noise without motion."""
     rng = np.random.default_rng(6)
-    return [msd(rng.normal(size=(200, 1, 3)), dt=1.0) for _ in range(repeats(10, 40))]
+    return [msd(rng.normal(size=(200, 1, 3)), dt=1.0) for _ in range(repeats(8, 40))]
 
 
 @pytest.mark.parametrize("fit", FITS)
 def test_noise_alone_is_an_upper_limit(fit, noise_curves):
-    """Of tracks of noise without motion at most 10 % resolve D, and all have a limit."""
+    """Of tracks of noise without motion at most 10 % (or one) resolve D, and all have a limit."""
     found = [FITS[fit](curve) for curve in noise_curves]
-    assert sum(e.resolved for e in found) <= 0.1 * len(found)
+    assert sum(e.resolved for e in found) <= max(1, 0.1 * len(found))
     assert all(np.isfinite(e.ci95).all() and e.ci68[0] <= e.value <= e.ci68[1] for e in found)
 
 

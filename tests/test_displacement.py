@@ -163,10 +163,10 @@ def test_in_the_plane_there_is_one_angle(repeats):
 def test_stderr_is_the_scatter_between_tracks(gaps, slack, repeats):
     """The mean stderr of noisy tracks is the scatter of MSD and MSAD at lags 1, 3, 10, N/4.
 
-    Within 3.7 Monte-Carlo errors of a standard deviation from 50 tracks (long: 300); with gaps the
+    Within 3.7 Monte-Carlo errors of a standard deviation from 40 tracks (long: 300); with gaps the
     formula itself counts pairs only, hence 10 % more.
     """
-    lags, found, n = np.array([1, 3, 10, 30]), [], repeats(50, 300)
+    lags, found, n = np.array([1, 3, 10, 30]), [], repeats(40, 300)
     for seed in range(n):
         motion = brownian_motion(
             seed, np.arange(120.0), D_R=2e-3, D_T=0.03, angle_noise=6e-4, center_noise=9e-4,

@@ -105,8 +105,8 @@ def test_a_steady_turn_gives_the_square_of_its_angle():
 
 
 def test_it_grows_as_6_d_t_and_its_errors_are_right(repeats):
-    """40 Brownian runs (long: 80): mean 6 D t at all lags, scatter as stated within 3.2 errors."""
-    n = repeats(40, 80)
+    """30 Brownian runs (long: 80): mean 6 D t at all lags, scatter as stated within 3.2 errors."""
+    n = repeats(30, 80)
     curves = [msad_vector(brownian(seed, D_R=2e-3)) for seed in range(n)]
     lag = np.array([1, 2, 5, 10, 30, 100])
     values = np.array([c.value[lag - 1] for c in curves])

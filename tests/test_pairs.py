@@ -33,7 +33,7 @@ from perrin import (
     van_hove,
 )
 
-SMALL = settings(max_examples=10, deadline=None, derandomize=True)
+SMALL = settings(max_examples=8, deadline=None, derandomize=True)
 
 
 # ---- the kernel ---------------------------------------------------------------------------------
@@ -328,12 +328,12 @@ def test_nearly_even_times_state_their_mean_lags():
 
 
 def test_pauses_leave_curve_and_fit_unbiased_with_their_true_error(repeats):
-    """16 walks (long: 120) with pauses of 20 s: mean 6 (D t + s), stated errors, intervals right.
+    """28 walks (long: 120) with pauses of 20 s: mean 6 (D t + s), stated errors, intervals right.
 
     Stated errors within 3.2 Monte-Carlo errors of the scatter, the mean of each lag within 4, of
-    the fit within 3; the coverage of the 95 % interval within 3.
+    the fit (long: also GLS) within 3; the coverage of the 95 % interval within 3.
     """
-    time, D, s, n = pauses(), 0.02, 2e-4, repeats(16, 120)
+    time, D, s, n = pauses(), 0.02, 2e-4, repeats(28, 120)
     curves = [walk_msd(time, k, D=D, s=s) for k in range(n)]
     within = 3.2 / np.sqrt(2 * n)
     use = np.array([0, 3, 11, 28, 60, 130])
@@ -344,7 +344,7 @@ def test_pauses_leave_curve_and_fit_unbiased_with_their_true_error(repeats):
     expected = 6 * (D * curves[0].lagtime[use] + s)
     assert np.all(np.abs(value.mean(axis=0) - expected) < 4 * scatter / np.sqrt(n))
     np.testing.assert_allclose(stderr.mean(axis=0) / scatter, 1, atol=within)
-    for fit in (fit_line, fit_gls):
+    for fit in repeats((fit_line,), (fit_line, fit_gls)):
         found = [fit(c) for c in curves]
         values = np.array([e.value for e in found])
         assert abs(values.mean() - D) < 3 * values.std() / np.sqrt(n)

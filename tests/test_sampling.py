@@ -117,15 +117,15 @@ def test_the_table_of_budgets():
         [20, 41.37, 14.68, 3.28, 9.25],
     ])  # fmt: skip
     time = plan_sampling(paper_body(), **PAPER, total_time=1e5)
-    light = plan_sampling(paper_body(), **PAPER, n_frames=10**5, total_time=1e5, photons=True)
+    dose = plan_sampling(paper_body(), **PAPER, n_frames=10**5, total_time=1e5, photons=True)
     stated = 1e5 / (10**5 - 1)
     at_snr = {
         "time": table[:, 0] * paper_phi2() / (4 * D_R),
-        "light": np.sqrt(table[:, 0] * paper_phi2() / (4 * D_R) * stated),
+        "dose": np.sqrt(table[:, 0] * paper_phi2() / (4 * D_R) * stated),
     }
     for plan, dt, error, column in (
         (time, "time", "error", 1), (time, "time", "error_residual", 2),
-        (light, "light", "error_residual", 3), (light, "light", "error", 4),
+        (dose, "dose", "error_residual", 3), (dose, "dose", "error", 4),
     ):  # fmt: skip
         curve = np.log(getattr(plan, error))
         variance = np.exp(2 * np.interp(np.log(at_snr[dt]), np.log(plan.dt), curve))
@@ -204,7 +204,7 @@ def test_linking_is_wrong_in_004_percent_of_the_steps_at_its_limit(n, D_T, repea
     """Simulated steps of touching spheres, turned and shifted, at the stated limit."""
     body = Cluster.touching(n, 1.0)
     dt = plan_sampling(body, D_R=1.0, D_T=D_T, sigma=0.01).dt_link
-    steps, rng = repeats(20_000, 40_000), np.random.default_rng(n)
+    steps, rng = repeats(15_000, 40_000), np.random.default_rng(n)
     turn = exp_map(rng.normal(scale=np.sqrt(2 * dt), size=(steps, 3)))
     shift = rng.normal(scale=np.sqrt(2 * D_T * dt), size=(steps, 1, 3))
     after = np.swapaxes(turn @ body.positions.T, 1, 2) + shift
@@ -300,10 +300,10 @@ def test_every_fault_is_in_one_message():
 
 @pytest.fixture(scope="module")
 def at_the_best_dt(repeats):
-    """Return a plan of 100 frames, and the estimates of 20 clusters (long: 120) measured by it."""
+    """Return a plan of 100 frames, and the estimates of 16 clusters (long: 120) measured by it."""
     plan = plan_sampling(paper_body(), **PAPER, n_frames=100)
     rng, found = np.random.default_rng(4), []
-    for _ in range(repeats(20, 120)):
+    for _ in range(repeats(16, 120)):
         truth = simulate_motion(paper_body(), D_R=D_R, dt=plan.dt_best, n_frames=100, rng=rng)
         noisy = add_noise(truth.positions(), sigma=PAPER["sigma"], rng=rng)
         found.append(estimate_diffusion(track_rotation(noisy, dt=plan.dt_best)))

@@ -415,8 +415,9 @@ def line_weights(steps: Floats) -> Floats:
     >>> line_weights(np.array([1.0, 2.0, 3.0])) @ [5.0, 7.0, 9.0]  # 2 n + 3
     array([2., 3.])
     """
-    slope = (steps - steps.mean()) / np.sum((steps - steps.mean()) ** 2)
-    return np.stack([slope, 1 / steps.size - slope * steps.mean()])
+    mean = steps.mean()
+    slope = (steps - mean) / np.sum((steps - mean) ** 2)
+    return np.stack([slope, 1 / steps.size - slope * mean])
 
 
 def gls_weights(lags: GridLags, *, D: float, s: float) -> Floats:
