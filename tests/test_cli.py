@@ -619,11 +619,14 @@ def test_plan_draws_and_never_overwrites_silently(tmp_path):
     [
         (("--radius", "1"), ("--radius", "--diameter")),
         (("--frames", "2"), ("--frames:",)),
-        (("--time", "-3", "--photons"), ("--time -3.0", "--photons: expected --frames and --time")),
+        (
+            ("--time", "-3", "--photons"),
+            ("--time: ", "-3.0", "--photons: expected --frames and --time"),
+        ),
         (("--d-t", "-1"), ("--d-t:",)),
         (("--sigma", "a"), ("--sigma",)),
         (("--sigma", "0"), ("sigma", "more than 0")),
-        (("--d-r", "0"), ("--d-r 0.0",)),
+        (("--d-r", "0"), ("--d-r: ", "got 0.0")),
         (("-o", "plan.doc"), ("plan.doc", ".png")),
         (("-o", "nowhere/plan.png"), ("nowhere",)),
     ],

@@ -474,7 +474,7 @@ def _plan_faults(
             f"sigma: expected one number >= 0 or {d} of them (one per axis), in um, got {sigma!r}"
         )
     elif not any(values):
-        faults.append("sigma: expected more than 0 um; without noise every dt is good enough")
+        faults.append("sigma: expected more than 0 um (without noise there is nothing to plan)")
     if D_T is not None:
         faults += number_fault("D_T", D_T, least=0, unit="um^2/s")
     if n_frames is not None:
