@@ -164,8 +164,8 @@ def test_missing_frames_add_the_covariance_they_should(repeats):
     assert np.all(np.abs(found - mean) < 4 * error)
 
 
-def test_a_correlation_is_no_line():
-    """fit_line refuses an orientation correlation, which is no straight line."""
+def test_a_correlation_is_not_fitted_by_a_line():
+    """fit_line refuses an orientation correlation, which is not a straight line."""
     truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=1.0, n_frames=30, rng=1)
     with pytest.raises(ValueError, match="correlation"):
         fit_line(orientation_correlation(truth), lag_range=(1, 10))
@@ -324,7 +324,7 @@ def test_a_walk_that_is_not_brownian_has_a_finite_D(fit):
     assert np.isfinite([steady.value, steady.stderr, *steady.ci95]).all()
 
 
-def test_a_window_that_is_no_window_is_refused():
+def test_bad_windows_are_refused():
     """Unknown words, correlations and a single lag: refused in one line."""
     curve = straight(1.0, 0.1)
     with pytest.raises(ValueError, match=r'"best", "paper" or two lag times.*\'short\''):

@@ -237,7 +237,7 @@ def test_a_curve_is_the_same_after_json():
 
 
 def test_a_curve_cannot_be_changed():
-    """Results are read-only, down to their arrays."""
+    """Fields cannot be assigned, and arrays are read-only."""
     curve = msd(tracked_motion(9, n_frames=30))
     with pytest.raises(ValueError, match="read-only"):
         curve.value[0] = 1.0

@@ -174,7 +174,7 @@ def test_brownian_curves_lie_above_those_of_any_direction(repeats):
 
 
 def test_the_order_of_whole_curves_does_not_always_hold():
-    """Coning: omega that goes round sums to nothing, a tilted direction's angle grows past it.
+    """Coning: an omega that rotates sums to zero, the angle of a tilted direction grows past it.
 
     The appendix's "always" holds for steps, and for diffusion on average; not for every motion.
     """

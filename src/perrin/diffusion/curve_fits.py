@@ -230,7 +230,7 @@ class GridLags:
             If there are fewer than two such lags, or the curve is a correlation.
         """
         if curve.quantity not in UNITS:
-            raise ValueError("curve: expected an MSD or MSAD; a correlation is no straight line")
+            raise ValueError("curve: expected an MSD or MSAD; a correlation is not a straight line")
         step = float(curve.lagtime[0]) if curve.step is None else curve.step
         blocks = np.array(curve.blocks or (len(curve.lagtime),), dtype=np.int64)
         n = curve.lagtime / step
