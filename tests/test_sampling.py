@@ -239,7 +239,7 @@ def test_translation_shortens_linking_only():
     {"n_frames": 400, "total_time": 100.0, "photons": True},
 ])  # fmt: skip
 def test_units_rescale_the_plan(budget):
-    """With times 60 and lengths 1000 times larger, the plan is rescaled and nothing else changes."""
+    """With times 60 and lengths 1000 times larger, the plan is only rescaled."""
     usual = plan_sampling(paper_body(), **PAPER, D_T=0.04, **budget)
     scaled = dict(budget)
     if "total_time" in scaled:
@@ -413,7 +413,7 @@ def test_the_estimate_carries_its_dt():
 
 
 def test_lengths_that_look_like_nanometres_are_named():
-    """A sigma larger than the body and spheres of 2450 um warn with both numbers; usual lengths do not."""
+    """A sigma larger than the body and spheres of 2450 um warn; usual lengths do not."""
     with pytest.warns(UnitWarning, match=r"sigma: 30 um .* R = 1\.5 um.* state 0\.03"):
         plan_sampling(paper_body(), D_R=D_R, sigma=30.0)
     with pytest.warns(UnitWarning, match=r"nearest particles, 2450 um, .* it is 2\.45 um"):
