@@ -599,7 +599,7 @@ def test_plan_takes_either_size_and_every_budget(tmp_path):
     assert run(*by_radius, cwd=tmp_path).stdout == run(*PLAN, cwd=tmp_path).stdout
     assert "no optimum" in run(*PLAN, "--time", 220, cwd=tmp_path).stdout
     light = run(*PLAN, "--time", 220, "--frames", 300, "--photons", cwd=tmp_path)
-    assert "Given light" in light.stdout
+    assert "Limited photons" in light.stdout
 
 
 def test_plan_draws_and_never_overwrites_silently(tmp_path):
@@ -619,11 +619,14 @@ def test_plan_draws_and_never_overwrites_silently(tmp_path):
     [
         (("--radius", "1"), ("--radius", "--diameter")),
         (("--frames", "2"), ("--frames:",)),
-        (("--time", "-3", "--photons"), ("--time -3.0", "--photons: expected --frames and --time")),
+        (
+            ("--time", "-3", "--photons"),
+            ("--time: ", "-3.0", "--photons: expected --frames and --time"),
+        ),
         (("--d-t", "-1"), ("--d-t:",)),
         (("--sigma", "a"), ("--sigma",)),
         (("--sigma", "0"), ("sigma", "more than 0")),
-        (("--d-r", "0"), ("--d-r 0.0",)),
+        (("--d-r", "0"), ("--d-r: ", "got 0.0")),
         (("-o", "plan.doc"), ("plan.doc", ".png")),
         (("-o", "nowhere/plan.png"), ("nowhere",)),
     ],

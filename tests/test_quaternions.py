@@ -1,31 +1,20 @@
 """The covariance of relative quaternions: direct sums, and Favro's law."""
 
 import dataclasses
+import json
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from brownian_motions import assert_same_fields, brownian_motion, motion_with_gaps, tracked_motion
 from perrin import (
     Cluster,
+    QuaternionCovariance,
     TooFewFramesError,
-    add_noise,
     quaternion_covariance,
     simulate_motion,
-    track_rotation,
 )
-
-TETRAHEDRON = Cluster.tetrahedron(1.5)
-
-
-def noisy(seed, n_frames=200, D_R=2e-3, D_T=0.03, sigma=0.06, cluster=TETRAHEDRON, gaps=0.0):
-    """Return a tracked Brownian cluster, whole frames missing at random (never the ends)."""
-    rng = np.random.default_rng(seed)
-    truth = simulate_motion(cluster, D_R=D_R, D_T=D_T, dt=1.0, n_frames=n_frames, rng=rng)
-    x = add_noise(truth.positions(), sigma=sigma, rng=rng)
-    lost = np.flatnonzero(rng.random(n_frames) < gaps)
-    x[lost[(lost > 0) & (lost < n_frames - 1)]] = np.nan
-    return track_rotation(x, dt=1.0)
 
 
 def direct_quaternions(motion, lag):
@@ -44,7 +33,7 @@ def direct_quaternions(motion, lag):
 @pytest.mark.parametrize("gaps", [0.0, 0.3])
 def test_quaternion_covariance_equals_direct_sums(gaps, pieces):
     """All lags, gaps and pieces: within 1e-12 of the quaternions pair by pair, pairs exact."""
-    motion = noisy(3, n_frames=60, D_R=0.05, gaps=gaps)
+    motion = tracked_motion(3, n_frames=60, D_R=0.05, gaps=gaps)
     if pieces:
         motion = dataclasses.replace(motion, piece=np.repeat([0, 1], [25, 35]))
     found = quaternion_covariance(motion)
@@ -61,33 +50,40 @@ def test_quaternion_covariance_equals_direct_sums(gaps, pieces):
         assert found.n_pairs[-1] == 0
 
 
-def test_quaternion_covariance_is_favros():
+def test_quaternion_covariance_is_favros(repeats):
     """A body that turns at (1, 2, 4)e-3: Favro's formula to 5 Monte-Carlo errors at all lags."""
-    D, count = np.array([1e-3, 2e-3, 4e-3]), 20000
-    runs = []
-    for seed in range(8):
-        truth = simulate_motion(TETRAHEDRON, D_R=D, dt=1.0, n_frames=count, rng=seed)
-        runs.append(quaternion_covariance(truth, n_lags=300).covariance)
-    t = quaternion_covariance(truth, n_lags=300).lagtime[:, None]
+    D, n, t = np.array([1e-3, 2e-3, 4e-3]), repeats(8, 16), np.arange(1.0, 301)[:, None]
+    runs = [
+        quaternion_covariance(brownian_motion(seed, np.arange(20_000.0), D_R=D), n_lags=300)
+        for seed in range(n)
+    ]
+    covariance = np.array([run.covariance for run in runs])
     others = D.sum() - D
     decay = np.exp(-others * t)  # exp(-(D_j + D_k) t)
     expected = (1 + 2 * decay - decay.sum(axis=1, keepdims=True)) / 4
-    diagonal = np.diagonal(np.array(runs), axis1=2, axis2=3)
-    error = diagonal.std(axis=0, ddof=1) / 8**0.5
+    diagonal = np.diagonal(covariance, axis1=2, axis2=3)
+    error = diagonal.std(axis=0, ddof=1) / n**0.5
     assert np.all(np.abs(diagonal.mean(axis=0) - expected) < 5 * error)
     assert np.all(error < 0.05 * expected)
-    off = np.array(runs)[:, :, [0, 0, 1], [1, 2, 2]]
-    assert np.all(np.abs(off.mean(axis=0)) < 6 * off.std(axis=0, ddof=1) / 8**0.5)
+    off = covariance[:, :, [0, 0, 1], [1, 2, 2]]
+    assert np.all(np.abs(off.mean(axis=0)) < 6 * off.std(axis=0, ddof=1) / n**0.5)
 
 
-def test_quaternion_covariance_refuses_what_it_cannot_answer():
-    """Planar motions, lags that are none, and motions without a pair."""
+def test_the_covariance_is_the_same_after_json():
+    """Every field; lags without a pair are null in between."""
+    found = quaternion_covariance(motion_with_gaps(1))
+    text = json.dumps(found.to_dict(), allow_nan=False)
+    assert_same_fields(QuaternionCovariance.from_dict(json.loads(text)), found)
+
+
+def test_bad_arguments_of_the_covariance_are_refused():
+    """Planar motions, bad numbers of lags, and motions without a pair are refused."""
     flat = simulate_motion(
         Cluster.from_positions([[0, 0], [2, 0]]), D_R=0.1, dt=1, n_frames=9, rng=1
     )
     with pytest.raises(ValueError, match="three dimensions"):
         quaternion_covariance(flat)
-    motion = noisy(1, n_frames=20)
+    motion = tracked_motion(1, n_frames=20)
     for n_lags in (0, -1, 2.5):
         with pytest.raises(ValueError, match="n_lags"):
             quaternion_covariance(motion, n_lags=n_lags)

@@ -1,39 +1,79 @@
-"""How relative orientations spread with lag time: the covariance of their quaternions."""
+"""Correlations of orientations and covariances of relative quaternions against lag time."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from perrin.curves.displacement import LagCurve, _directions, _frames, _mean, _require_pairs
-from perrin.curves.pairs import Products, pair_sums, place_frames
-from perrin.errors import TooFewFramesError
+from perrin._arrays import from_plain, number_fault, refuse, to_plain
+from perrin.curves.displacement import LagCurve, body_directions
+from perrin.curves.grids import place_frames
+from perrin.curves.pairs import Products, pair_sums
 
 if TYPE_CHECKING:
     from perrin._arrays import Floats, Ints
     from perrin.motion.rigid_motion import RigidMotion
 
 
-_LOWER = [(i, j) for i in range(3) for j in range(i + 1)]
-
-
 class QuaternionCovariance(NamedTuple):
-    """<q q^T> of the vector part of the relative body-frame quaternion, against lag time.
+    """Covariance <q q^T> of the vector part q of relative quaternions against lag time.
 
     Attributes
     ----------
     lagtime : ndarray, shape (L,)
-        s.
+        Mean time between the frames of the pairs, s.
     covariance : ndarray, shape (L, 3, 3)
-        Body axes; NaN at a lag without a pair.
+        Covariance of the vector part in body axes; NaN at a lag without a pair.
     n_pairs : ndarray of int, shape (L,)
+        Number of pairs of frames at each lag.
     """
 
     lagtime: Floats
     covariance: Floats
     n_pairs: Ints
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the covariance as JSON holds it: lists for arrays, None for NaN.
+
+        Returns
+        -------
+        dict
+            An entry per attribute.
+
+        Examples
+        --------
+        >>> still = QuaternionCovariance(np.ones(1), np.zeros((1, 3, 3)), np.array([4]))
+        >>> still.to_dict()["n_pairs"]
+        [4]
+        """
+        return {name: to_plain(values) for name, values in self._asdict().items()}
+
+    @classmethod
+    def from_dict(cls, entry: dict[str, Any]) -> QuaternionCovariance:
+        """Return the covariance that `to_dict` wrote.
+
+        Parameters
+        ----------
+        entry : dict
+            From `to_dict`, also after JSON.
+
+        Returns
+        -------
+        QuaternionCovariance
+
+        Examples
+        --------
+        >>> still = QuaternionCovariance(np.ones(1), np.zeros((1, 3, 3)), np.array([4]))
+        >>> QuaternionCovariance.from_dict(still.to_dict()).n_pairs
+        array([4])
+        """
+        return cls(
+            lagtime=from_plain(entry["lagtime"]),
+            covariance=from_plain(entry["covariance"]),
+            n_pairs=from_plain(entry["n_pairs"], dtype=np.int64),
+        )
 
 
 def quaternion_covariance(
@@ -51,7 +91,7 @@ def quaternion_covariance(
     motion : RigidMotion
         In three dimensions; frames without a pose are left out.
     n_lags : int, optional
-        Number of lags from one step between frames on; default all.
+        Number of lags, counted from one step between frames; default all.
 
     Returns
     -------
@@ -74,24 +114,20 @@ def quaternion_covariance(
     >>> (first.diagonal() / 0.5e-3).round(1)  # q is half the rotation vector: D t/2
     array([1., 2., 4.])
     """
-    if motion.template.shape[1] != 3:
+    if motion.dimension != 3:
         raise ValueError("quaternion_covariance is for motions in three dimensions")
-    if n_lags is not None and (n_lags != int(n_lags) or n_lags < 1):
-        raise ValueError(f"n_lags: expected a whole number >= 1, got {n_lags!r}")
-    none = "no two frames in one piece: a relative rotation needs two"
-    if motion.fitted.size < 2:
-        raise TooFewFramesError(none, int(motion.fitted.size))
+    if n_lags is not None:
+        refuse(number_fault("n_lags", n_lags, least=1, whole=True))
     here = np.isfinite(motion.center[:, 0])
     frames = place_frames(motion.time, motion.piece, here, dt=motion.dt)
     # Element (i, j) of R_k^T R_{k+n} is the sum of products of column i and column j.
-    groups = [[(3 * a + i, 3 * a + j) for a in range(3)] for i, j in _LOWER]
+    lower = [(i, j) for i in range(3) for j in range(i + 1)]
+    groups = [[(3 * a + i, 3 * a + j) for a in range(3)] for i, j in lower]
     sums = pair_sums(Products(motion.rotation.reshape(-1, 9), groups), frames, most=n_lags)
-    if not sums.pairs.any():
-        raise TooFewFramesError(none, 0)
-    mean = np.full((len(sums.pairs), 3, 3), np.nan)
-    seen = sums.pairs > 0
-    for k, (i, j) in enumerate(_LOWER):
-        mean[seen, i, j] = mean[seen, j, i] = sums.sums[seen, k] / sums.pairs[seen]
+    elements = sums.mean
+    mean = np.empty((len(elements), 3, 3))
+    for k, (i, j) in enumerate(lower):
+        mean[:, i, j] = mean[:, j, i] = elements[:, k]
     trace = np.trace(mean, axis1=1, axis2=2)[:, None, None]
     covariance = 0.5 * mean - 0.25 * (trace - 1) * np.eye(3)
     return QuaternionCovariance(sums.lagtime, covariance, sums.pairs)
@@ -114,8 +150,9 @@ def orientation_correlation(
     Returns
     -------
     LagCurve
-        Dimensionless; decays as exp(-l (l + 1) D_R t). ``stderr`` is NaN: it is for display, the
-        steps give D_R with a far smaller error. ``dof`` is l (l + 1) / 2, half the rate over D_R.
+        Dimensionless; decays as exp(-l (l + 1) D_R t). ``stderr`` is NaN: the curve is for display,
+        the steps give D_R with a far smaller error. ``dof`` is l (l + 1) / 2, half the rate over
+        D_R.
 
     Raises
     ------
@@ -137,16 +174,21 @@ def orientation_correlation(
     """
     if degree not in (1, 2):
         raise ValueError(f"degree: expected 1 or 2, got {degree!r}")
-    if motion.template.shape[1] != 3:
+    if motion.dimension != 3:
         raise ValueError("orientation_correlation is for motions in three dimensions")
-    p = motion.orientation(_directions(motion, directions))
-    features = p if degree == 1 else _quadrupole(p)
-    frames = _frames(motion.time, motion.piece, np.isfinite(motion.center[:, 0]), dt=motion.dt)
+    features = p = motion.orientation(body_directions(motion, directions))
+    if degree == 2:
+        # The five components of the quadrupole p p^T - 1/3, scaled so that their product is P_2.
+        x, y, z = np.moveaxis(p, -1, 0)
+        root = np.sqrt(3.0)
+        squares = [root / 2 * (x * x - y * y), 1.5 * z * z - 0.5]
+        features = np.stack([root * x * y, root * y * z, root * z * x, *squares], axis=-1)
+    here = np.isfinite(motion.center[:, 0])
+    frames = place_frames(motion.time, motion.piece, here, dt=motion.dt)
     columns = features.reshape(len(p), -1)
     sums = pair_sums(Products(columns, [[(i, i) for i in range(columns.shape[1])]]), frames)
-    _require_pairs(sums)
     # A mean of cosines that rounds above one is one.
-    value = np.minimum(_mean(sums)[:, 0] / p.shape[1], 1.0)
+    value = np.minimum(sums.mean[:, 0] / p.shape[1], 1.0)
     return LagCurve(
         lagtime=sums.lagtime,
         value=value,
@@ -160,11 +202,3 @@ def orientation_correlation(
         step=frames.step,
         blocks=tuple(int(n) for n in frames.lengths),
     )
-
-
-def _quadrupole(p: Floats) -> Floats:
-    """Return the five components of directions' squares whose product is P_2 of the cosine."""
-    x, y, z = np.moveaxis(p, -1, 0)
-    root = np.sqrt(3.0)
-    five = [root * x * y, root * y * z, root * z * x, root / 2 * (x * x - y * y), 1.5 * z * z - 0.5]
-    return np.stack(five, axis=-1)

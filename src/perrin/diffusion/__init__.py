@@ -1,14 +1,31 @@
 """How fast a body diffuses: coefficients, tensors, their errors, and tests of the steps."""
 
 from perrin.diffusion.bounds import cramer_rao, whole
-from perrin.diffusion.curve_fits import fit_gls, fit_line
+from perrin.diffusion.curve_fits import (
+    GridLags,
+    best_window,
+    fit_gls,
+    fit_line,
+    gls_weights,
+    line_weights,
+    msd_covariance,
+    slope_interval,
+    weighted_variance,
+)
 from perrin.diffusion.estimate import DiffusionEstimate, Found, bare_text, value_text
 from perrin.diffusion.estimators import by_likelihood, estimate_diffusion, track_of
 from perrin.diffusion.likelihood import Likelihood, Peak, excess_scatter
 from perrin.diffusion.moments import Moments, covariance_estimate, trace_estimate
 from perrin.diffusion.noise_model import Noise, choice_faults
 from perrin.diffusion.rods import estimate_rod
-from perrin.diffusion.sampling import SamplingPlan, SamplingVerdict, judge_sampling, plan_sampling
+from perrin.diffusion.sampling import (
+    SamplingBudget,
+    SamplingPlan,
+    SamplingVerdict,
+    identity_limits,
+    judge_sampling,
+    plan_sampling,
+)
 from perrin.diffusion.step_kernels import Sums, Track, covariance_bands
 from perrin.diffusion.step_tests import (
     Jumps,
@@ -50,12 +67,14 @@ __all__ = [
     "DiffusionEstimate",
     "DiffusionTensor",
     "Found",
+    "GridLags",
     "Jumps",
     "Likelihood",
     "Maximum",
     "Moments",
     "Noise",
     "Peak",
+    "SamplingBudget",
     "SamplingPlan",
     "SamplingVerdict",
     "Slopes",
@@ -69,6 +88,7 @@ __all__ = [
     "axes_like",
     "axial",
     "bare_text",
+    "best_window",
     "by_likelihood",
     "center_steps",
     "choice_faults",
@@ -85,12 +105,17 @@ __all__ = [
     "find_jumps",
     "fit_gls",
     "fit_line",
+    "gls_weights",
+    "identity_limits",
     "judge_sampling",
+    "line_weights",
     "maximise",
+    "msd_covariance",
     "offset_gain",
     "persistence_gain",
     "plan_sampling",
     "residual_freedom",
+    "slope_interval",
     "spread",
     "squares",
     "steady_motion",
@@ -100,6 +125,7 @@ __all__ = [
     "unit_center_variance",
     "unit_covariance",
     "value_text",
+    "weighted_variance",
     "whole",
     "without_spin",
 ]

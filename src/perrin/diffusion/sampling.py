@@ -1,26 +1,33 @@
-"""How to sample: which time between frames, how many frames, and what data in hand lack."""
+"""When to take frames: the best time between frames, their number, and a verdict on given data."""
 
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from perrin._arrays import Floats, as_sigma, frozen, require_positive
+from perrin._arrays import (
+    Floats,
+    as_sigma,
+    from_plain,
+    frozen,
+    number_fault,
+    refuse,
+    require_positive,
+    to_plain,
+)
 from perrin._text import ordinal, percent, short
-from perrin.diffusion.bounds import NoiseKnowledge, cramer_rao, whole
+from perrin.diffusion.bounds import NoiseKnowledge, cramer_rao
 from perrin.diffusion.estimate import UNITS
 from perrin.errors import UnitWarning
 from perrin.geometry.rigid import degrees_of_freedom
-from perrin.geometry.shapes import Cluster
+from perrin.geometry.shapes import Cluster, pair_distances
 from perrin.hydrodynamics.units import length_remarks
 from perrin.motion.floor import noise_floor
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from numpy.typing import ArrayLike
 
     from perrin.diffusion.estimate import DiffusionEstimate
@@ -31,65 +38,79 @@ if TYPE_CHECKING:
 _LEAST_SNR, _AMPLE_SNR = 5.0, 20.0
 
 
-# The same light divided among more frames: the error is 17 % above its limit at the first SNR and
+# The same photons divided among more frames: the error is 17 % above its limit at the first SNR and
 # 7 % at the second. With the noise from the residuals it is flat within 2 % below the third.
-_LIGHT_SNR, _FAINT_SNR, _LIGHT_SNR_RESIDUAL = 0.5, 0.1, 2.0
+_PHOTON_SNR, _LEAST_PHOTON_SNR, _PHOTON_SNR_RESIDUAL = 0.5, 0.1, 2.0
 
 
-_LONGEST = 0.1 / 4  # D_R dt up to which steps are small and particles can be told apart
+# D_R dt up to which steps are small and nearest neighbours are linked correctly: 4 D_R dt = 0.1.
+_LONGEST_STEP = 0.1 / 4
 
 
 # Half the angle (or distance) to a neighbour, in standard deviations of one step, at which a step
 # is confused: by nearest neighbours in 0.04 % of the steps at most, by rigid fits in 0.5 %.
-_LINKED, _FITTED = 4.2, 3.3
+_LINKING_DEVIATIONS, _FITTING_DEVIATIONS = 4.2, 3.3
 
 
 # Highest rotation axis of the bodies whose symmetry is known: a rigid fit confuses a turn by more
 # than half of its angle with a permutation of the particles.
-_FOLD = {"T_d": 3, "D_3h": 3, "O_h": 4, "D_5h": 5}
+_HIGHEST_FOLD = {"T_d": 3, "D_3h": 3, "O_h": 4, "D_5h": 5}
 
 
-_USUAL_FRAMES = 300  # stated where neither frames nor time are given
+_DEFAULT_FRAMES = 300  # where neither frames nor time are given
 
 
-_POINTS = 121  # of the curve
+_CURVE_POINTS = 121  # of the errors against the time between frames
 
 
 @dataclass(frozen=True, eq=False)
 class SamplingPlan:
-    """When to take frames, and how well D_R can then be known.
+    """When to take frames, and the expected error of D_R.
 
     Times are between frames, in s; errors are standard errors over D_R: the least that any
     estimator can have, which `estimate_diffusion` reaches.
 
     Attributes
     ----------
-    dt_min, dt_max : float
-        The window: below `dt_min` noise hides the steps (SNR 5; for a given amount of light 0.1),
-        above `dt_max` they are too long (4 D_R dt = 0.1, or less where a body of high symmetry is
-        confused earlier). It is empty where dt_min > dt_max.
+    dt_min : float
+        Shortest time between frames of the recommended window, s. Below it noise hides the steps:
+        SNR 5, or 0.1 for a given number of photons. The window is empty where dt_min > dt_max.
+    dt_max : float
+        Longest time between frames of the recommended window, s. Above it steps are too long:
+        4 D_R dt = 0.1, or less where a body of high symmetry is confused earlier.
     dt_best : float
-        The advice.
+        Recommended time between frames, s.
     n_frames : int
-        Frames that the budget allows at `dt_best`.
+        Number of frames that the budget allows at `dt_best`.
     snr : float
-        D_R dt/s at `dt_best`, s the noise variance of one orientation angle; in space this is
-        4 D_R dt/Phi^2.
+        Signal-to-noise ratio D_R dt/s at `dt_best`, s the noise variance of one orientation angle;
+        in space this is 4 D_R dt/Phi^2.
     phi2 : float
         Noise floor of the MSAD for the stated sigma, rad^2.
-    dt_link, dt_rigid : float
-        Longest times over which particles keep their identity: by nearest neighbours (0.04 % of the
-        steps wrong at most; where D_T is given the centre moves too), and by the best rigid fit
-        (0.5 %).
-    paper_dt_min, paper_dt_max : float
-        The two rules of Hunter 2011, section 4.1: 4 D_R dt = Phi^2 and 4 D_R dt = 1.
-    dt, error, error_residual : ndarray, shape (K,)
-        Time between frames, and the error there with the noise estimated along (the default of
-        `estimate_diffusion`) and taken from the residuals of the rigid fits.
-    axes, residual_dof : int
-        Angles that share D_R, and degrees of freedom of one frame's residuals.
+    dt_link : float
+        Longest time between frames at which nearest-neighbour linking is wrong in at most 0.04 % of
+        the steps, s; where D_T is given the motion of the centre counts too.
+    dt_rigid : float
+        Longest time between frames at which assignment by the best rigid fit is wrong in at most
+        0.5 % of the steps, s.
+    paper_dt_min : float
+        Shortest time between frames by Hunter 2011, section 4.1: 4 D_R dt = Phi^2, s.
+    paper_dt_max : float
+        Longest time between frames by Hunter 2011, section 4.1: 4 D_R dt = 1, s.
+    dt : ndarray, shape (K,)
+        Times between frames at which the errors below are given, s.
+    error : ndarray, shape (K,)
+        Relative standard error of D_R at each `dt` with the noise fitted together with D_R (the
+        default of `estimate_diffusion`).
+    error_residual : ndarray, shape (K,)
+        Relative standard error of D_R at each `dt` with the noise from the residuals of the rigid
+        fits.
+    axes : int
+        Number of angles that share D_R.
+    residual_dof : int
+        Degrees of freedom of one frame's residuals.
     reasons : tuple of str
-        Why, and what else to know.
+        Sentences that explain the plan.
     """
 
     dt_min: float
@@ -109,6 +130,9 @@ class SamplingPlan:
     residual_dof: int
     reasons: tuple[str, ...] = ()
 
+    def __post_init__(self) -> None:
+        frozen(self.dt, self.error, self.error_residual)
+
     def __str__(self) -> str:
         head = (
             f"{self.n_frames} frames every {self.dt_best:.3g} s: D_R to "
@@ -120,15 +144,15 @@ class SamplingPlan:
     @property
     def expected_error(self) -> float:
         """Standard error over D_R of the default estimator at `dt_best`."""
-        return self._error(self.n_frames, "joint")
+        return self.error_of(self.n_frames)
 
     @property
     def expected_error_residual(self) -> float:
-        """The same with the noise taken from the residuals of the rigid fits."""
-        return self._error(self.n_frames, "residual")
+        """Standard error over D_R at `dt_best` with the noise from the residuals of rigid fits."""
+        return self.error_of(self.n_frames, noise="residual")
 
     def frames_for(self, relative_error: float, *, noise: NoiseKnowledge = "joint") -> int:
-        """Return how many frames, `dt_best` apart, bring the standard error down to a share of D_R.
+        """Return the number of frames, `dt_best` apart, for a given relative standard error.
 
         Parameters
         ----------
@@ -149,15 +173,28 @@ class SamplingPlan:
         """
         require_positive(relative_error=relative_error)
         low, high = 2, 3
-        while self._error(high, noise) > relative_error:
+        while self.error_of(high, noise=noise) > relative_error:
             low, high = high, 2 * high
         while high - low > 1:
             middle = (low + high) // 2
-            enough = self._error(middle, noise) <= relative_error
+            enough = self.error_of(middle, noise=noise) <= relative_error
             low, high = (low, middle) if enough else (middle, high)
         return high
 
-    def _error(self, n_frames: int, noise: NoiseKnowledge) -> float:
+    def error_of(self, n_frames: int, *, noise: NoiseKnowledge = "joint") -> float:
+        """Return the standard error over D_R of a number of frames, `dt_best` apart.
+
+        Parameters
+        ----------
+        n_frames : int
+            Number of frames, at least 3.
+        noise : {"joint", "residual", "known"}
+            As in `cramer_rao`.
+
+        Returns
+        -------
+        float
+        """
         return cramer_rao(
             n_frames=n_frames,
             snr=self.snr,
@@ -166,65 +203,100 @@ class SamplingPlan:
             residual_dof=self.residual_dof,
         )
 
+    def to_dict(self) -> dict[str, Any]:
+        """Return the plan as JSON holds it: lists for arrays and tuples.
+
+        Returns
+        -------
+        dict
+            An entry per attribute.
+
+        Examples
+        --------
+        >>> plan = plan_sampling(Cluster.touching(4, 2.45), D_R=4.93e-3, sigma=0.03, n_frames=300)
+        >>> plan.to_dict()["n_frames"]
+        300
+        """
+        return {field.name: to_plain(getattr(self, field.name)) for field in fields(self)}
+
+    @classmethod
+    def from_dict(cls, entry: dict[str, Any]) -> SamplingPlan:
+        """Return the plan that `to_dict` wrote.
+
+        Parameters
+        ----------
+        entry : dict
+            From `to_dict`, also after JSON.
+
+        Returns
+        -------
+        SamplingPlan
+
+        Examples
+        --------
+        >>> plan = plan_sampling(Cluster.touching(4, 2.45), D_R=4.93e-3, sigma=0.03, n_frames=300)
+        >>> SamplingPlan.from_dict(plan.to_dict()).dt_best == plan.dt_best
+        True
+        """
+        arrays = {name: from_plain(entry[name]) for name in ("dt", "error", "error_residual")}
+        return cls(**(entry | arrays | {"reasons": tuple(entry["reasons"])}))
+
 
 @dataclass(frozen=True)
-class _Experiment:
-    """What limits a measurement: D_R, noise, and the budget.
+class SamplingBudget:
+    """What limits a measurement of D_R: the noise, and the number of frames, time or photons.
 
-    `spread` is the noise variance of one orientation angle; with `photons` that of the movie with
-    `n_frames` frames in `total_time`, whose light is then divided anew.
+    Attributes
+    ----------
+    D_R : float
+        Rotational diffusion coefficient, rad^2/s.
+    noise_variance : float
+        Noise variance of one orientation angle, rad^2; with `photons` that of the movie with
+        `n_frames` frames in `total_time`, whose photons are then divided among other frames.
+    axes : int
+        Number of angles that share D_R.
+    residual_dof : int
+        Degrees of freedom of one frame's residuals.
+    n_frames : int or None
+        Largest number of frames; None where only the time is limited.
+    total_time : float or None
+        Longest movie, s; None where only the number of frames is limited.
+    photons : bool
+        Whether the number of photons is limited instead of the number of frames.
     """
 
     D_R: float
-    spread: float
+    noise_variance: float
     axes: int
     residual_dof: int
     n_frames: int | None
     total_time: float | None
     photons: bool
 
-    @classmethod
-    def of(
-        cls,
-        body: Cluster,
-        spread: float,
-        *,
-        D_R: float,
-        n_frames: int | None,
-        total_time: float | None,
-        photons: bool,
-    ) -> _Experiment:
-        """Add what follows from the body, and the usual budget where none was given."""
-        n, d = body.positions.shape
-        if n_frames is None and total_time is None:
-            n_frames = _USUAL_FRAMES
-        dof = int(degrees_of_freedom(np.array(n), d))
-        return cls(D_R, spread, 2 * d - 3, dof, n_frames, total_time, photons)
-
     @property
     def dt_stated(self) -> float | None:
-        """The time between frames at which a photon budget's sigma is stated, s."""
+        """Time between frames at which a photon budget's sigma is stated, s; else None."""
         if not self.photons or self.total_time is None or self.n_frames is None:
             return None
         return self.total_time / (self.n_frames - 1)
 
     @property
     def msad_rate(self) -> float:
-        """The slope of the MSAD, rad^2/s."""
+        """Slope of the MSAD, rad^2/s."""
         return (4 if self.axes == 3 else 2) * self.D_R
 
     def snr(self, dt: float) -> float:
         """Return D_R dt over the noise variance that a frame has at that dt."""
         longer_exposure = 1.0 if self.dt_stated is None else dt / self.dt_stated
-        return self.D_R * dt / self.spread * longer_exposure
+        return self.D_R * dt / self.noise_variance * longer_exposure
 
     def dt_at(self, snr: float) -> float:
-        """Return the time between frames at which the SNR is that."""
-        dt = snr * self.spread / self.D_R
+        """Return the time between frames with a given SNR, s."""
+        dt = snr * self.noise_variance / self.D_R
         return dt if self.dt_stated is None else float(np.sqrt(dt * self.dt_stated))
 
     def frames(self, dt: float) -> int:
-        """Return how many frames the budget allows."""
+        """Return the number of frames that the budget allows."""
         in_time = np.inf
         if self.total_time is not None:
             # A time that is a whole number of dt up to rounding holds that many steps.
@@ -233,7 +305,7 @@ class _Experiment:
         return int(min(in_time, limit))
 
     def error(self, dt: float, noise: NoiseKnowledge) -> float:
-        """Return the relative standard error at that dt."""
+        """Return the relative standard error of D_R at that dt."""
         return cramer_rao(
             n_frames=self.frames(dt),
             snr=self.snr(dt),
@@ -243,9 +315,9 @@ class _Experiment:
         )
 
     def best_dt(self, longest: float) -> float:
-        """Return the time between frames that the budget calls for, at most `longest`."""
+        """Return the best time between frames of at most `longest`, s."""
         if self.photons:
-            return min(self.dt_at(_LIGHT_SNR), longest)
+            return min(self.dt_at(_PHOTON_SNR), longest)
         if self.n_frames is None:
             return min(self.dt_at(_LEAST_SNR), longest)
         ample = min(self.dt_at(_AMPLE_SNR), longest)
@@ -269,29 +341,30 @@ def plan_sampling(
     Parameters
     ----------
     cluster : Cluster or array_like, shape (n, d)
-        The body; positions in um.
+        The rigid body; positions in um.
     D_R : float
-        Rotational diffusion coefficient as far as it is known, rad^2/s.
+        Approximate rotational diffusion coefficient, rad^2/s.
     sigma : float or array_like, shape (d,)
         Localisation error of one coordinate in one frame, um; one number or one per axis.
     D_T : float, optional
-        Translational diffusion coefficient, um^2/s: how far particles travel between frames then
-        counts for linking.
+        Translational diffusion coefficient, um^2/s: the displacement of the particles between
+        frames then limits linking too.
     n_frames : int, optional
-        The most frames that can be taken.
+        Largest number of frames that can be taken.
     total_time : float, optional
-        The longest movie, s. With `n_frames` both are limits. Neither: 300 frames.
+        Longest movie, s. With `n_frames` both are limits. Neither: 300 frames.
     photons : bool
-        A given amount of light instead of frames (the dye bleaches): it lasts for `total_time` and
-        may be divided among any number of frames, sigma^2 being inversely proportional to a frame's
-        share. `sigma` is then that of the movie with `n_frames` frames; all three are needed.
+        A given number of photons instead of frames (the dye bleaches): they last for `total_time`
+        and may be divided among any number of frames, sigma^2 being inversely proportional to the
+        photons of a frame. `sigma` is then that of the movie with `n_frames` frames; all three are
+        needed.
 
     Returns
     -------
     SamplingPlan
         For a given number of frames dt is as long as steps stay small, up to SNR 20. For a given
         time it is the short end of the window (there is no optimum: more frames always help). For
-        given light it is where more frames bring little more, SNR 0.5.
+        a given number of photons it is where more frames reduce the error little, SNR 0.5.
 
     Raises
     ------
@@ -324,48 +397,63 @@ def plan_sampling(
     (8.3, 2297)
     """
     body = cluster if isinstance(cluster, Cluster) else Cluster.from_positions(cluster)
-    _check(body, D_R, sigma, D_T, n_frames, total_time, photons=photons)
-    for remark in _unit_remarks(body, sigma):
+    n, d = body.positions.shape
+    refuse(_plan_faults(body, D_R, sigma, D_T, n_frames, total_time, photons=photons))
+    distances = pair_distances(body.positions)
+    remarks = length_remarks("the distance of the nearest particles", float(distances.min()))
+    largest = as_sigma(sigma, d).max()
+    if largest > body.R:
+        remarks.append(
+            f"sigma: {largest:.4g} um is more than the mean distance of the particles to the "
+            f"centre, R = {body.R:.4g} um: no orientation can be measured so; if sigma is in nm, "
+            f"state {1e-3 * largest:.4g}"
+        )
+    for remark in remarks:
         warnings.warn(remark, UnitWarning, stacklevel=2)
+
     floor = noise_floor(body, sigma=sigma)
-    experiment = _Experiment.of(
-        body,
-        float(np.trace(floor.covariance)) / len(floor.covariance),
+    budget = SamplingBudget(
         D_R=D_R,
-        n_frames=n_frames,
+        noise_variance=float(np.trace(floor.covariance)) / len(floor.covariance),
+        axes=2 * d - 3,
+        residual_dof=int(degrees_of_freedom(np.array(n), d)),
+        n_frames=_DEFAULT_FRAMES if n_frames is None and total_time is None else n_frames,
         total_time=total_time,
         photons=photons,
     )
-    dt_link, dt_rigid = _identity_limits(body, D_R, D_T or 0.0)
-    dt_max = min(_LONGEST / D_R, dt_rigid)
-    dt_best = experiment.best_dt(dt_max)
-    if experiment.frames(dt_best) < 3:
+    dt_link, dt_rigid = identity_limits(body, D_R=D_R, D_T=D_T or 0.0)
+    dt_max = min(_LONGEST_STEP / D_R, dt_rigid)
+    dt_best = budget.best_dt(dt_max)
+    if budget.frames(dt_best) < 3:
         raise ValueError(
-            f"total_time = {total_time!r} s holds fewer than 3 frames at their best distance, "
-            f"{dt_best:.3g} s: the cluster hardly turns in it"
+            f"total_time = {total_time!r} s holds fewer than 3 frames at the best time between "
+            f"frames, {dt_best:.3g} s: the cluster hardly turns in it"
         )
-    dt, error, error_residual = _curve(experiment, dt_best, 1.5 / experiment.msad_rate)
+    shortest, longest = min(dt_best, budget.dt_at(1.0)) / 4, 1.5 / budget.msad_rate
+    if total_time is not None:
+        longest = min(longest, total_time / 9)  # below ten frames the error is no smooth curve
+    dt = np.geomspace(shortest, max(longest, dt_best), _CURVE_POINTS)
     plan = SamplingPlan(
-        dt_min=experiment.dt_at(_FAINT_SNR if photons else _LEAST_SNR),
+        dt_min=budget.dt_at(_LEAST_PHOTON_SNR if photons else _LEAST_SNR),
         dt_max=dt_max,
         dt_best=dt_best,
-        n_frames=experiment.frames(dt_best),
-        snr=experiment.snr(dt_best),
+        n_frames=budget.frames(dt_best),
+        snr=budget.snr(dt_best),
         phi2=floor.phi2,
         dt_link=dt_link,
         dt_rigid=dt_rigid,
-        paper_dt_min=experiment.dt_at(1.0),
-        paper_dt_max=1 / experiment.msad_rate,
+        paper_dt_min=budget.dt_at(1.0),
+        paper_dt_max=1 / budget.msad_rate,
         dt=dt,
-        error=error,
-        error_residual=error_residual,
-        axes=experiment.axes,
-        residual_dof=experiment.residual_dof,
+        error=np.array([budget.error(float(t), "joint") for t in dt]),
+        error_residual=np.array([budget.error(float(t), "residual") for t in dt]),
+        axes=budget.axes,
+        residual_dof=budget.residual_dof,
     )
-    return replace(plan, reasons=_reasons(plan, experiment, body, D_T))
+    return replace(plan, reasons=_plan_reasons(plan, budget, body, D_T))
 
 
-def _check(
+def _plan_faults(
     body: Cluster,
     D_R: float,
     sigma: ArrayLike,
@@ -374,185 +462,152 @@ def _check(
     total_time: float | None,
     *,
     photons: bool,
-) -> None:
-    """Refuse values out of range and budgets that contradict themselves, all in one message."""
-    positive = {"D_R": D_R} | ({} if total_time is None else {"total_time": total_time})
-    faults = _faults(lambda: require_positive(**positive))
-    faults += _faults(lambda: _require_noise(sigma, body.positions.shape[1]))
-    if D_T is not None and not (np.ndim(D_T) == 0 and 0 <= D_T < np.inf):
-        faults.append(f"D_T: expected a finite number >= 0 (um^2/s), got {D_T!r}")
-    if n_frames is not None and not whole(n_frames, least=3):
-        faults.append(f"n_frames: expected a whole number >= 3, got {n_frames!r}")
+) -> list[str]:
+    """Return a line for each value out of range, and for a budget that contradicts itself."""
+    d = body.positions.shape[1]
+    faults = number_fault("D_R", D_R, above=0, unit="rad^2/s")
+    if total_time is not None:
+        faults += number_fault("total_time", total_time, above=0, unit="s")
+    values = np.ravel(sigma).tolist()
+    if np.shape(sigma) not in ((), (d,)) or any(number_fault("sigma", v, least=0) for v in values):
+        faults.append(
+            f"sigma: expected one number >= 0 or {d} of them (one per axis), in um, got {sigma!r}"
+        )
+    elif not any(values):
+        faults.append("sigma: expected more than 0 um (without noise there is nothing to plan)")
+    if D_T is not None:
+        faults += number_fault("D_T", D_T, least=0, unit="um^2/s")
+    if n_frames is not None:
+        faults += number_fault("n_frames", n_frames, least=3, whole=True)
     if photons and (n_frames is None or total_time is None):
         faults.append(
             "photons: expected n_frames and total_time too, the movie for which sigma is stated"
         )
-    if not _distances(body).all():
+    if not pair_distances(body.positions).all():
         faults.append("cluster: two of its particles are at the same place")
-    if faults:
-        raise ValueError("; ".join(faults))
+    return faults
 
 
-def _faults(check: Callable[[], None]) -> list[str]:
-    """Return what a check complains about."""
-    try:
-        check()
-    except ValueError as error:
-        return [str(error)]
-    return []
-
-
-def _require_noise(sigma: ArrayLike, dimensions: int) -> None:
-    if not as_sigma(sigma, dimensions).any():
-        raise ValueError("sigma: expected more than 0 um; without noise there is nothing to plan")
-
-
-def _unit_remarks(body: Cluster, sigma: ArrayLike) -> list[str]:
-    """Return a line for each length that is possible, but usual only in another unit."""
-    remarks = length_remarks("the distance of the nearest particles", float(_distances(body).min()))
-    largest = as_sigma(sigma, body.positions.shape[1]).max()
-    if largest > body.R:
-        remarks.append(
-            f"sigma: {largest:.4g} um is more than the mean distance of the particles to the "
-            f"centre, R = {body.R:.4g} um: no orientation can be measured so; if sigma is in nm, "
-            f"state {1e-3 * largest:.4g}"
-        )
-    return remarks
-
-
-def _distances(body: Cluster) -> Floats:
-    """Return the distances (um) of all pairs of particles."""
-    first, second = np.triu_indices(len(body.positions), 1)
-    distances: Floats = np.linalg.norm(body.positions[first] - body.positions[second], axis=1)
-    return distances
-
-
-def _identity_limits(body: Cluster, D_R: float, D_T: float) -> tuple[float, float]:
+def identity_limits(body: Cluster, *, D_R: float, D_T: float) -> tuple[float, float]:
     """Return the longest dt for linking by nearest neighbours, and for assignment by rigid fits.
 
-    A turn by `angle` brings a particle half the way to another one, as does a shift by `half`.
+    A particle is linked to a wrong one where its step covers half the distance to it, by a turn of
+    the body or by a shift; a rigid fit is wrong where the body turns by half an angle of symmetry.
+
+    Parameters
+    ----------
+    body : Cluster
+        Positions in um.
+    D_R : float
+        Rotational diffusion coefficient, rad^2/s.
+    D_T : float
+        Translational diffusion coefficient, um^2/s; 0 where the motion of the centre is removed.
+
+    Returns
+    -------
+    dt_link, dt_rigid : float
+        Times between frames, s.
+
+    Examples
+    --------
+    >>> link, rigid = identity_limits(Cluster.touching(4, 1.0), D_R=1.0, D_T=0.0)
+    >>> round(4 * link, 3), round(4 * rigid, 3)  # 4 D_R dt
+    (0.103, 0.201)
     """
     first, second = np.triu_indices(len(body.positions), 1)
     start, way = body.positions[first], body.positions[second] - body.positions[first]
-    half = _distances(body) / 2
+    half = pair_distances(body.positions) / 2
     middle = start + way * (-np.sum(start * way, axis=1) / (4 * half**2))[:, None]
     angle = np.arctan2(half, np.linalg.norm(middle, axis=1))
-    spread = 2 * D_T + 2 * D_R * (half / angle) ** 2
+    variance_rate = 2 * D_T + 2 * D_R * (half / angle) ** 2
     # Without a known symmetry: no permutation turns the body by less than neighbours are apart.
-    turn = np.pi / _FOLD[body.symmetry] if body.symmetry in _FOLD else float(angle.min())
-    dt_link = float(np.min(half**2 / spread)) / _LINKED**2
-    return dt_link, float(turn**2 / (2 * D_R)) / _FITTED**2
+    fold = _HIGHEST_FOLD.get(body.symmetry or "")
+    turn = float(angle.min()) if fold is None else np.pi / fold
+    dt_link = float(np.min(half**2 / variance_rate)) / _LINKING_DEVIATIONS**2
+    return dt_link, float(turn**2 / (2 * D_R)) / _FITTING_DEVIATIONS**2
 
 
-def _curve(
-    experiment: _Experiment, dt_best: float, longest: float
-) -> tuple[Floats, Floats, Floats]:
-    """Return dt and the two errors there, from a little below what anyone would try."""
-    low, high = min(dt_best, experiment.dt_at(1.0)) / 4, longest
-    if experiment.total_time is not None:
-        high = min(high, experiment.total_time / 9)  # ten frames: fewer go in visible jumps
-    dt = np.geomspace(low, max(high, dt_best), _POINTS)
-    joint = np.array([experiment.error(float(t), "joint") for t in dt])
-    residual = np.array([experiment.error(float(t), "residual") for t in dt])
-    frozen(dt, joint, residual)
-    return dt, joint, residual
-
-
-def _reasons(
-    plan: SamplingPlan, experiment: _Experiment, body: Cluster, D_T: float | None
+def _plan_reasons(
+    plan: SamplingPlan, budget: SamplingBudget, body: Cluster, D_T: float | None
 ) -> tuple[str, ...]:
-    """Say in words why the plan is what it is."""
-    said = [_about_window(plan, experiment), _about_budget(plan, experiment)]
-    said.append(_about_identity(plan, centre_moves=D_T is not None))
-    if D_T is not None:
-        said.append(_about_travel(plan, experiment, body, D_T))
-    said.append(_about_paper(plan, experiment))
-    bias = experiment.D_R * plan.dt_best / 6
-    if experiment.axes == 3 and bias > plan.expected_error / 3:
-        said.append(
-            f"Steps of this length make D_R {percent(bias)} too small, which counts beside the "
-            "expected error: take shorter steps or correct for it."
-        )
-    return tuple(said)
-
-
-def _about_window(plan: SamplingPlan, experiment: _Experiment) -> str:
-    least = _FAINT_SNR if experiment.photons else _LEAST_SNR
+    """Return the sentences that explain a plan."""
+    least = _LEAST_PHOTON_SNR if budget.photons else _LEAST_SNR
     if plan.dt_min > plan.dt_max:
-        return (
-            f"The window is empty: SNR {least:g} needs {plan.dt_min:.3g} s, but steps are small "
-            f"and particles told apart only up to {plan.dt_max:.3g} s. Stay there, and buy frames "
-            "or particles (more clusters, or larger ones)."
+        window = (
+            f"The window is empty: SNR {least:g} needs {plan.dt_min:.3g} s, but only up to "
+            f"{plan.dt_max:.3g} s steps are small and particles keep their identity. Use that "
+            "time, and take more frames or particles (more clusters, or larger ones)."
         )
-    return (
-        f"Window {plan.dt_min:.3g} to {plan.dt_max:.3g} s: from SNR = {least:g} to 4 D_R dt = "
-        f"{4 * experiment.D_R * plan.dt_max:.2g}."
+    else:
+        window = (
+            f"Window {plan.dt_min:.3g} to {plan.dt_max:.3g} s: from SNR = {least:g} to 4 D_R dt = "
+            f"{4 * budget.D_R * plan.dt_max:.2g}."
+        )
+    centre = "" if D_T is not None else ", if the centre's motion is removed first"
+    verdict = ": do that here" if plan.dt_best > plan.dt_link else ""
+    reasons = [
+        window,
+        _budget_reason(plan, budget),
+        f"Identity: nearest-neighbour linking is reliable up to {plan.dt_link:.3g} s{centre}; "
+        f"assignment by the best rigid fit up to {plan.dt_rigid:.3g} s{verdict}.",
+    ]
+    if D_T is not None:
+        shift = np.sqrt(2 * body.positions.shape[1] * D_T * plan.dt_best)
+        turn = body.R * np.sqrt(budget.msad_rate * plan.dt_best)
+        nearest = pair_distances(body.positions).min()
+        reasons.append(
+            f"Between frames the centre moves {shift:.2g} um and the turn moves a particle "
+            f"{turn:.2g} um (rms); the nearest particles are {nearest:.3g} um apart."
+        )
+    cost = ""
+    if budget.frames(plan.paper_dt_min) >= 3:
+        cost = f", error {percent(budget.error(plan.paper_dt_min, 'joint'))}"
+    reasons.append(
+        f"The paper's rules: {plan.paper_dt_min:.3g} s (SNR 1{cost}) to {plan.paper_dt_max:.3g} "
+        "s, at which nearest-neighbour linking is wrong in a third of the steps or more."
     )
-
-
-def _about_budget(plan: SamplingPlan, experiment: _Experiment) -> str:
-    if experiment.photons:
-        return (
-            f"Given light: the error is nearly flat below SNR {_LIGHT_SNR:g}, and below SNR "
-            f"{_LIGHT_SNR_RESIDUAL:g} ({experiment.dt_at(_LIGHT_SNR_RESIDUAL):.3g} s) with the "
-            "noise from the residuals. The camera's own noise is not counted: it is a reason for "
-            "fewer frames."
+    bias = budget.D_R * plan.dt_best / 6
+    if budget.axes == 3 and bias > plan.expected_error / 3:
+        reasons.append(
+            f"Steps of this length make D_R {percent(bias)} too small, which is more than a third "
+            "of the expected error: take shorter steps or correct for it."
         )
-    if experiment.n_frames is None:
+    return tuple(reasons)
+
+
+def _budget_reason(plan: SamplingPlan, budget: SamplingBudget) -> str:
+    """Return the sentence that explains dt_best from what is limited."""
+    if budget.photons:
+        return (
+            f"Limited photons: the error is nearly constant below SNR {_PHOTON_SNR:g}, and below "
+            f"SNR {_PHOTON_SNR_RESIDUAL:g} ({budget.dt_at(_PHOTON_SNR_RESIDUAL):.3g} s) with the "
+            "noise from the residuals. The camera's own noise is not included: where it matters, "
+            "take fewer frames."
+        )
+    if budget.n_frames is None:
         more = plan.dt_best / 5
         return (
-            "Given time: there is no optimum, more frames always help, but slowly: five times as "
-            f"many (every {more:.3g} s) would give {percent(experiment.error(more, 'joint'))}. "
-            "Disk and bleaching set dt."
+            "Limited time: there is no optimum, more frames always help, but slowly: five times "
+            f"as many (every {more:.3g} s) would give {percent(budget.error(more, 'joint'))}. "
+            "Storage and bleaching limit the number of frames."
         )
-    if experiment.total_time is not None:
-        return _about_both(plan, experiment.total_time)
-    return (
-        f"Given frames ({experiment.n_frames}): longer steps are better; beyond SNR "
-        f"{_AMPLE_SNR:g} the error falls by less than 2 % of itself."
-    )
-
-
-def _about_both(plan: SamplingPlan, total_time: float) -> str:
-    lasts = plan.dt_best * (plan.n_frames - 1)
-    if lasts < 0.999 * total_time:
+    if budget.total_time is None:
         return (
-            f"Given frames and time: the {plan.n_frames} frames are taken in {lasts:.3g} s; "
-            f"stretching them over all of {total_time:.3g} s would gain little or lose particles."
+            f"Limited frames ({budget.n_frames}): longer steps are better; beyond SNR "
+            f"{_AMPLE_SNR:g} the error falls by less than 2 % of itself."
+        )
+    lasts = plan.dt_best * (plan.n_frames - 1)
+    if lasts < 0.999 * budget.total_time:
+        return (
+            f"Limited frames and time: the {plan.n_frames} frames are taken in {lasts:.3g} s; "
+            f"stretching them over all of {budget.total_time:.3g} s would gain little or lose the "
+            "identity of particles."
         )
     below = plan.dt_best < plan.dt_min
     limited = " That is below the window: time more than frames limits the error." if below else ""
     return (
-        f"Given frames and time: all {plan.n_frames} frames, evenly over {total_time:.3g} s, "
-        f"SNR {short(plan.snr)}.{limited}"
-    )
-
-
-def _about_identity(plan: SamplingPlan, *, centre_moves: bool) -> str:
-    proviso = "" if centre_moves else ", if the centre's motion is removed first"
-    verdict = ": do that here" if plan.dt_best > plan.dt_link else ""
-    return (
-        f"Identity: nearest-neighbour linking keeps particles apart up to {plan.dt_link:.3g} s"
-        f"{proviso}; assignment by the best rigid fit up to {plan.dt_rigid:.3g} s{verdict}."
-    )
-
-
-def _about_travel(plan: SamplingPlan, experiment: _Experiment, body: Cluster, D_T: float) -> str:
-    shift = np.sqrt(2 * body.positions.shape[1] * D_T * plan.dt_best)
-    turn = body.R * np.sqrt(experiment.msad_rate * plan.dt_best)
-    return (
-        f"Between frames the centre moves {shift:.2g} um and the turn moves a particle "
-        f"{turn:.2g} um (rms); the nearest particles are {_distances(body).min():.3g} um apart."
-    )
-
-
-def _about_paper(plan: SamplingPlan, experiment: _Experiment) -> str:
-    cost = ""
-    if experiment.frames(plan.paper_dt_min) >= 3:
-        cost = f", error {percent(experiment.error(plan.paper_dt_min, 'joint'))}"
-    return (
-        f"The paper's rules: {plan.paper_dt_min:.3g} s (SNR 1{cost}) to {plan.paper_dt_max:.3g} s, "
-        "at which nearest-neighbour linking is wrong in a third of the steps or more."
+        f"Limited frames and time: all {plan.n_frames} frames, evenly over "
+        f"{budget.total_time:.3g} s, SNR {short(plan.snr)}.{limited}"
     )
 
 
@@ -563,16 +618,21 @@ class SamplingVerdict:
     Attributes
     ----------
     text : str
-        The verdict in words; also what ``print`` shows.
+        Verdict in words; ``print`` shows it.
     factor : float
-        The best time between frames over that of the data: above 1 the data are oversampled.
-    dt, dt_best : float
-        Both times, s.
+        Best time between frames over that of the data: above 1 the data are oversampled.
+    dt : float
+        Time between frames of the data, s.
+    dt_best : float
+        Best time between frames, s.
     snr : float
-        D dt/s of the data.
-    error, bound, bound_best : float
-        Standard error over D: as estimated; the Cramér-Rao bound with the noise unknown; that bound
-        for as many frames, `dt_best` apart.
+        Signal-to-noise ratio D dt/s of the data; inf without noise.
+    error : float
+        Estimated standard error over D; inf where D is not above 0.
+    bound : float
+        Cramér-Rao bound of the standard error over D for the data, with the noise unknown.
+    bound_best : float
+        Cramér-Rao bound of the standard error over D for as many frames, `dt_best` apart.
     """
 
     text: str
@@ -587,15 +647,53 @@ class SamplingVerdict:
     def __str__(self) -> str:
         return self.text
 
+    def to_dict(self) -> dict[str, Any]:
+        """Return the verdict as JSON holds it: None for what is infinite.
+
+        Returns
+        -------
+        dict
+            An entry per attribute.
+
+        Examples
+        --------
+        >>> verdict = SamplingVerdict("Well sampled", 1.0, 0.5, 0.5, np.inf, 0.1, 0.1, 0.1)
+        >>> verdict.to_dict()["snr"], verdict.to_dict()["error"]
+        (None, 0.1)
+        """
+        return {field.name: to_plain(getattr(self, field.name)) for field in fields(self)}
+
+    @classmethod
+    def from_dict(cls, entry: dict[str, Any]) -> SamplingVerdict:
+        """Return the verdict that `to_dict` wrote.
+
+        Parameters
+        ----------
+        entry : dict
+            From `to_dict`, also after JSON.
+
+        Returns
+        -------
+        SamplingVerdict
+
+        Examples
+        --------
+        >>> verdict = SamplingVerdict("Well sampled", 1.0, 0.5, 0.5, 20.0, np.inf, 0.1, 0.1)
+        >>> SamplingVerdict.from_dict(verdict.to_dict()) == verdict
+        True
+        """
+        read: dict[str, Any] = {k: np.inf if v is None else v for k, v in entry.items()}
+        return cls(**read)
+
 
 def judge_sampling(estimate: DiffusionEstimate, *, axes: int = 3) -> SamplingVerdict:
-    """Say whether the frames of a measurement were too close, too far apart, or right.
+    """Judge whether the frames of a measurement were too close, too far apart, or well chosen.
 
     Parameters
     ----------
     estimate : DiffusionEstimate
-        D_R or D_T, from `estimate_diffusion`. Where it is not resolved its 95 % limit is taken for
-        D, and the verdict is on the cautious side.
+        Estimate of D_R or D_T. Where it is not resolved, D is replaced by its 95 % limit, which
+        makes the verdict cautious.
     axes : {3, 2, 1}
         Axes that share D: 3 in space; in the plane 1 for D_R and 2 for D_T.
 
@@ -608,7 +706,7 @@ def judge_sampling(estimate: DiffusionEstimate, *, axes: int = 3) -> SamplingVer
     Raises
     ------
     ValueError
-        If the estimate carries no dt, or has neither a value nor an upper limit.
+        If the estimate has no dt, no noise, or neither a value nor an upper limit.
 
     Examples
     --------
@@ -627,15 +725,19 @@ def judge_sampling(estimate: DiffusionEstimate, *, axes: int = 3) -> SamplingVer
         )
     if np.isnan(estimate.snr):
         raise ValueError(
-            "estimate: the localisation noise under it is not known (a curve of positions has no "
+            "estimate: its localisation noise is not known (a curve of positions has no "
             "rigid-fit residuals); use estimate_diffusion on a motion"
         )
-    # Without a value the offset is all there is; that of a straight line may lie below zero.
-    no_value = max(estimate.offset, 0.0)
-    spread = estimate.value * estimate.dt / estimate.snr if estimate.value > 0 else no_value
+    if estimate.value > 0:
+        noise_variance = estimate.value * estimate.dt / estimate.snr
+    else:  # only the offset is known; that of a straight line may lie below zero
+        noise_variance = max(estimate.offset, 0.0)
     rotation = estimate.unit == UNITS["rotation"]
-    dt_best = min(_AMPLE_SNR * spread / D, _LONGEST / D if rotation else np.inf)
-    snr, best_snr = (D * t / spread if spread > 0 else np.inf for t in (estimate.dt, dt_best))
+    longest = _LONGEST_STEP / D if rotation else np.inf
+    dt_best = min(_AMPLE_SNR * noise_variance / D, longest)
+    snr, best_snr = (
+        D * t / noise_variance if noise_variance > 0 else np.inf for t in (estimate.dt, dt_best)
+    )
     verdict = SamplingVerdict(
         text="",
         factor=dt_best / estimate.dt,
@@ -646,60 +748,53 @@ def judge_sampling(estimate: DiffusionEstimate, *, axes: int = 3) -> SamplingVer
         bound=_bound(estimate.n_frames, snr, axes),
         bound_best=_bound(estimate.n_frames, best_snr, axes),
     )
-    said = [] if estimate.resolved else ["Not resolved: judged at the 95 % limit of D."]
-    said += [_about_step(verdict, estimate, axes=axes, step=4 * D * estimate.dt * rotation)]
-    said += [_about_error(verdict, estimate)]
-    return replace(verdict, text=" ".join(said))
+    text = _verdict_text(verdict, estimate, axes=axes, step=4 * D * estimate.dt * rotation)
+    return replace(verdict, text=text)
 
 
 def _bound(n_frames: int, snr: float, axes: int) -> float:
-    """Return the bound, to rounding that without noise where the SNR is beyond any measurement."""
+    """Return the bound; at an SNR beyond any measurement that without noise, to rounding."""
     return cramer_rao(n_frames=n_frames, snr=min(snr, 1e12), axes=axes)
 
 
-def _about_step(
+def _verdict_text(
     verdict: SamplingVerdict, estimate: DiffusionEstimate, *, axes: int, step: float
 ) -> str:
-    """Say how dt compares with the window; `step` is 4 D_R dt, 0 for D_T."""
+    """Return a verdict in words; `step` is 4 D_R dt, 0 for D_T."""
+    text = "" if estimate.resolved else "Not resolved: judged at the 95 % limit of D. "
     state = f"SNR {short(verdict.snr)}" + (f", 4 D_R dt = {step:.2g}" if step else "")
-    if step > 4 * _LONGEST:
-        return _about_long_steps(verdict, state, step)
-    if verdict.snr >= _LEAST_SNR:
-        return f"Well sampled ({state}): more frames are all that would help."
-    least = "" if estimate.resolved else "at least "
-    every = max(round(verdict.factor), 1)
-    thinned = _bound(max(estimate.n_frames // every, 3), every * verdict.snr, axes)
-    return (
-        f"Oversampled {least}{short(verdict.factor)} times ({state}): in a longer movie every "
-        f"{ordinal(every)} frame would have done; as many frames every {verdict.dt_best:.3g} s "
-        f"could have given {percent(verdict.bound_best)} instead of {percent(verdict.bound)}. Of "
-        f"this movie use all frames: every {ordinal(every)} alone gives {percent(thinned)}."
-    )
-
-
-def _about_long_steps(verdict: SamplingVerdict, state: str, step: float) -> str:
-    slow = f" and D_R reads {percent(step / 24)} low" if step > 0.2 else ""
-    said = (
-        f"Undersampled ({state}): beyond 4 D_R dt = {4 * _LONGEST:g} particles can be confused"
-        f"{slow}. Take frames every {verdict.dt_best:.3g} s, {short(1 / verdict.factor)} times "
-        "closer."
-    )
-    if verdict.snr * verdict.factor < _LEAST_SNR:
-        said += " Noise is then large: buy frames or particles."
-    return said
-
-
-def _about_error(verdict: SamplingVerdict, estimate: DiffusionEstimate) -> str:
+    if step > 4 * _LONGEST_STEP:
+        slow = f" and D_R is {percent(step / 24)} too low" if step > 0.2 else ""
+        text += (
+            f"Undersampled ({state}): beyond 4 D_R dt = {4 * _LONGEST_STEP:g} particles can be "
+            f"confused{slow}. Take frames every {verdict.dt_best:.3g} s, "
+            f"{short(1 / verdict.factor)} times closer."
+        )
+        if verdict.snr * verdict.factor < _LEAST_SNR:
+            text += " Noise is then large: take more frames or particles."
+    elif verdict.snr >= _LEAST_SNR:
+        text += f"Well sampled ({state}): only more frames would reduce the error."
+    else:
+        least = "" if estimate.resolved else "at least "
+        every = max(round(verdict.factor), 1)
+        thinned = _bound(max(estimate.n_frames // every, 3), every * verdict.snr, axes)
+        text += (
+            f"Oversampled {least}{short(verdict.factor)} times ({state}): in a longer movie every "
+            f"{ordinal(every)} frame would have been enough; as many frames every "
+            f"{verdict.dt_best:.3g} s could have given {percent(verdict.bound_best)} instead of "
+            f"{percent(verdict.bound)}. Of this movie use all frames: every {ordinal(every)} alone "
+            f"gives {percent(thinned)}."
+        )
     if verdict.error == np.inf:
-        return f"The bound for {estimate.n_frames} frames is {percent(verdict.bound)}."
-    said = (
-        f"Standard error {percent(verdict.error)}, the bound with the noise unknown "
+        return text + f" The bound for {estimate.n_frames} frames is {percent(verdict.bound)}."
+    text += (
+        f" Standard error {percent(verdict.error)}, the bound with the noise unknown "
         f"{percent(verdict.bound)}."
     )
-    worth = (verdict.bound / verdict.error) ** 2
-    if worth < 0.6:
-        said += (
-            f" The estimate [{estimate.method}] is worth {percent(worth)} of its frames: look at "
+    efficiency = (verdict.bound / verdict.error) ** 2
+    if efficiency < 0.6:
+        text += (
+            f" The efficiency of the estimate [{estimate.method}] is {percent(efficiency)}: check "
             "gaps, missing particles and the method."
         )
-    return said
+    return text

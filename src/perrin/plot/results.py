@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.ticker import LogLocator, NullFormatter
 
 from perrin._text import number_text, shortened, unit_text
-from perrin.curves.displacement import weighs_alike
+from perrin.curves.displacement import axes_weighted_equally
 from perrin.diffusion.estimate import value_text
 from perrin.geometry.rigid import degrees_of_freedom
 from perrin.plot.style import BLUE, GREY, INK, PALETTE, RED, legend_above, new_figure, save_figure
@@ -468,7 +468,7 @@ def _model_line(
     D of the line is tr(D W)/dof with the weights W of the curve.
     """
     resolved = estimate is None or estimate.resolved
-    uneven = curve.weights is not None and not weighs_alike(curve.weights)
+    uneven = curve.weights is not None and not axes_weighted_equally(curve.weights)
     if tensor is not None and curve.weights is not None and uneven and resolved:
         D, stderr = tensor.weighted(curve.weights)
         offset = float(np.einsum("ij,ij->", curve.weights, tensor.offset)) / curve.dof

@@ -1,0 +1,250 @@
+"""Standard errors of mean squares over overlapping pairs of frames of a Brownian motion."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.polynomial.polynomial import polyval
+
+if TYPE_CHECKING:
+    from perrin._arrays import Floats, Ints
+    from perrin.curves.grids import Frames
+    from perrin.curves.pairs import ListedPairs, PairSums
+
+
+# Starts of displacements are compared as whole numbers below this: exact sums of their squares.
+_INTEGER_RANGE = 1 << 22
+
+
+def relative_error(sums: PairSums, frames: Frames, half: Floats, pairs: Floats) -> Floats:
+    """Return the relative standard error of a one-dimensional MSD at every lag.
+
+    The variance of a mean of squares is twice the sum of the squared covariances of all pairs of
+    displacements, over the squared number of displacements.
+
+    Parameters
+    ----------
+    sums : PairSums
+        Sums of the squared displacements.
+    frames : Frames
+        Frames that form the pairs.
+    half : ndarray, shape (L,)
+        Half of the MSD, D t + s; D per step and s are estimated from its first two lags.
+    pairs : ndarray, shape (L,)
+        Number of pairs of one walker.
+
+    Returns
+    -------
+    ndarray, shape (L,)
+        NaN at a lag without a pair.
+
+    Examples
+    --------
+    >>> from perrin.curves import Squares, pair_sums, place_frames
+    >>> time, piece, here = np.arange(101.0), np.zeros(101, dtype=int), np.ones(101, dtype=bool)
+    >>> walk = np.random.default_rng(1).normal(size=(101, 1, 1)).cumsum(axis=0)
+    >>> frames = place_frames(time, piece, here, dt=1.0)
+    >>> sums = pair_sums(Squares(walk), frames)
+    >>> error = relative_error(sums, frames, sums.mean[:, 0] / 2, sums.pairs)
+    >>> bool(abs(error[0] - np.sqrt(2 / 100)) < 1e-3)  # 100 independent squares
+    True
+    """
+    lag = sums.lagtime / frames.step
+    d, s = two_lag_fit(lag, half, pairs)
+    share = np.divide(sums.on_grid, sums.pairs, out=np.zeros_like(half), where=sums.pairs > 0)
+    on_grid = share * pairs
+    steps = np.maximum(np.rint(lag), 1.0)
+    complete = displacement_counts(frames.lengths, steps)
+    present = np.sqrt(
+        np.where((on_grid > 0) & (complete > 0), on_grid / np.maximum(complete, 1), 1.0)
+    )
+    total = np.zeros_like(lag)
+    for length, times in zip(*np.unique(frames.lengths, return_counts=True), strict=True):
+        use = np.flatnonzero((steps <= length) & (on_grid > 0))
+        b, p = steps[use], length + 1 - steps[use]
+        near, far, same = covariance_polynomials(b, int(length), present=present[use], D=d, s=s)
+        own = np.where(b <= p, *(polyval(b, c, tensor=False) for c in (near, far))) + same
+        total[use] += times * own
+    total = np.asarray(total * present**4)
+    if sums.listed is not None:
+        total += _listed_covariances(sums.listed, frames, lag, d=d, s=s)
+    mean = 2 * (d * lag + s)
+    relative = np.full_like(half, np.nan)
+    good = (pairs > 0) & (mean > 0)
+    np.divide(np.sqrt(2 * total), pairs * mean, out=relative, where=good)
+    return relative
+
+
+def two_lag_fit(lag: Floats, half: Floats, pairs: Floats | Ints) -> tuple[float, float]:
+    """Return D per step and s of half an MSD, D t + s, from its first two lags, neither negative.
+
+    Parameters
+    ----------
+    lag : ndarray, shape (L,)
+        Lags in steps.
+    half : ndarray, shape (L,)
+        Half of the MSD.
+    pairs : ndarray, shape (L,)
+        Number of pairs at each lag; lags without a pair are skipped.
+
+    Returns
+    -------
+    D, s : float
+
+    Examples
+    --------
+    >>> two_lag_fit(np.array([1.0, 2.0]), np.array([0.75, 1.25]), np.array([9, 8]))
+    (0.5, 0.25)
+    """
+    good = np.flatnonzero(pairs > 0)
+    first, second = (good[0], good[1]) if good.size > 1 else (good[0], good[0])
+    rise = (half[second] - half[first]) / max(lag[second] - lag[first], 1e-9)
+    d = min(max(rise, 0.0), half[first] / lag[first])
+    return float(d), float(half[first] - d * lag[first])
+
+
+def displacement_counts(lengths: Ints, lag: Floats) -> Floats:
+    """Return how many displacements of each lag fit into blocks without missing frames.
+
+    Parameters
+    ----------
+    lengths : ndarray of int, shape (B,)
+        Steps from the first to the last frame of each block.
+    lag : ndarray, shape (L,)
+        Lags in steps.
+
+    Returns
+    -------
+    ndarray, shape (L,)
+
+    Examples
+    --------
+    >>> displacement_counts(np.array([3, 5]), np.array([1.0, 4.0]))
+    array([8., 2.])
+    """
+    rising = np.sort(lengths)
+    left = np.append(np.cumsum(rising[::-1])[::-1], 0)
+    shorter = np.searchsorted(rising, lag - 0.5)
+    return np.asarray(left[shorter] + (len(rising) - shorter) * (1 - lag))
+
+
+def _listed_covariances(
+    pairs: ListedPairs, frames: Frames, lag: Floats, *, d: float, s: float
+) -> Floats:
+    """Return the squared covariances of displacements of one bin, summed over pairs of them.
+
+    Displacements of length l that begin a time a apart share l - a; with a common first or last
+    frame the noise s is shared too, and where one ends at the other's beginning it counts once.
+    """
+    count = np.bincount(pairs.lag, minlength=len(lag)).astype(np.float64)
+    total = count * (2 * d * lag + 2 * s) ** 2
+    total += 2 * (2 * d) ** 2 * squared_shared_times(pairs, frames, lag)
+    size = int(max(pairs.last.max(initial=0), pairs.first.max(initial=0))) + 1
+
+    def common_frames(one: Ints, other: Ints) -> Floats:
+        """Return how many pairs of displacements of one bin have a frame in common."""
+        rising = np.sort(pairs.lag * size + other)
+        wanted = pairs.lag * size + one
+        found = np.searchsorted(rising, wanted, side="right") - np.searchsorted(rising, wanted)
+        itself = 1.0 if one is other else 0.0
+        return np.asarray(np.bincount(pairs.lag, found - itself, minlength=len(lag)), np.float64)
+
+    for ends in (pairs.first, pairs.last):
+        total += common_frames(ends, ends) * (4 * d * lag * s + s * s)
+    return np.asarray(total + 2 * common_frames(pairs.last, pairs.first) * s * s)
+
+
+def squared_shared_times(pairs: ListedPairs, frames: Frames, lag: Floats) -> Floats:
+    """Return the sum of (shared time)^2 over pairs of displacements of a bin, each pair once.
+
+    Displacements are cut into clusters that share nothing; their starts become whole numbers, so
+    that differences of cumulative sums of squares are exact, modulo 2^64.
+
+    Parameters
+    ----------
+    pairs : ListedPairs
+        Displacements in order of lag and first frame.
+    frames : Frames
+        Frames that form the pairs.
+    lag : ndarray, shape (L,)
+        Lags in steps.
+
+    Returns
+    -------
+    ndarray, shape (L,)
+        In steps squared.
+    """
+    start = frames.time[pairs.first] / frames.step
+    length = lag[pairs.lag]
+    fresh = np.append(True, np.diff(start) >= length[1:])
+    fresh |= np.append(True, np.diff(pairs.lag) > 0)
+    fresh |= np.append(True, np.diff(frames.piece[pairs.first]) > 0)
+    cluster = np.cumsum(fresh) - 1
+    start = start - start[fresh][cluster]
+    extent = np.zeros(len(lag))
+    np.maximum.at(extent, pairs.lag, start)
+    scale = _INTEGER_RANGE / np.maximum(extent, lag)
+    a = np.rint(start * scale[pairs.lag]).astype(np.int64)
+    whole = np.rint(length * scale[pairs.lag]).astype(np.int64)
+    key = cluster * (4 * _INTEGER_RANGE) + a
+    begin = np.searchsorted(key, key - whole, side="right")
+    here = np.arange(len(a))
+    once, twice = (np.append(0, np.cumsum(x)) for x in (a, a * a))
+    rest = whole - a
+    shared = (here - begin) * rest * rest + 2 * rest * (once[here] - once[begin])
+    shared += twice[here] - twice[begin]
+    square = np.bincount(pairs.lag, shared.astype(np.float64), minlength=len(lag))
+    return np.asarray(square / scale**2)
+
+
+def covariance_polynomials(
+    lag: Floats, steps: int, *, present: Floats, D: float, s: float
+) -> tuple[Floats, Floats, Floats]:
+    """Return the covariance of an MSD at two lags as polynomials of the shorter lag.
+
+    One-dimensional displacements over a and b >= a frames of which j are shared have covariance
+    2 D j, + s for a common first or last frame, - s where one ends at the other's beginning. The
+    covariance of their mean squares is 2 S(a, b) over the displacements of a track without gaps,
+    steps + 1 - a and steps + 1 - b. S sums the squared covariances over all pairs of displacements;
+    where frames are missing at random, those that share one or both frames weigh more, since they
+    are missing together.
+
+    Parameters
+    ----------
+    lag : ndarray, shape (L,)
+        The longer lags b, frames.
+    steps : int
+        Steps of the track.
+    present : ndarray, shape (L,)
+        Fraction of the frames that is present, from 0 to 1: the root of that of the displacements.
+    D, s : float
+        Diffusion coefficient times dt, and variance of one coordinate from noise.
+
+    Returns
+    -------
+    near, far : ndarray, shape (5, L)
+        Coefficients of a^0 .. a^4 in S(a, b), for a <= steps + 1 - b and for longer a.
+    same : ndarray, shape (L,)
+        Term that is added where a = b.
+
+    Examples
+    --------
+    >>> near, far, same = covariance_polynomials(
+    ...     np.array([1.0]), 10, present=np.ones(1), D=0.5, s=0.0
+    ... )
+    >>> float(near.sum() + same[0])  # a = b = 1: ten independent squares, each of variance 1
+    10.0
+    """
+    b, p = lag, steps + 1 - lag
+    gap, zero = 1 / present - 1, np.zeros_like(lag)
+    squares, noise, cross = 4 * D * D, 2 * s * s, 8 * D * s * p * (1 + gap)
+    near = squares * np.stack([zero, p / 3, p * b + 1 / 6, -p / 3, zero - 1 / 6])
+    near[:2] += 2 * noise * p * (1 + gap), cross - noise * (1 + gap)
+    once, twice = p * (p - 1) / 2, p * (p * p - 1) / 3
+    far = squares * np.stack([p * twice / 2, -2 * twice, p * (b + 1) + 2 * once, -p, zero])
+    far[:2] += noise * p * (1 + gap), cross
+    for polynomial in (near, far):
+        polynomial[2] += 2 * squares * p * gap
+    same = (gap * gap + 2 * gap) * (2 * D * b + 2 * s) ** 2 - 2 * gap * (2 * D * b + s) ** 2
+    return near, far, p * (noise + same)
