@@ -29,10 +29,18 @@ from perrin.tracks.column_names import (
     unit_faults,
 )
 from perrin.tracks.files import (
+    RowNumbers,
     check_tracks,
     read_spheres,
     read_tracks,
     write_tracks,
+)
+from perrin.tracks.formats import (
+    SUFFIXES,
+    parse_csv,
+    parse_table,
+    table_bytes,
+    table_suffix,
 )
 from perrin.tracks.gdf import (
     gdf_bytes,
@@ -75,12 +83,18 @@ from perrin.tracks.linking import (
     step_variance,
 )
 from perrin.tracks.screening import (
+    CENTRE_REMOVED,
+    TRACKPY_COLUMNS,
     Screened,
     centre_removed,
     distance_notes,
     far_points,
     far_sentence,
     has_trackpy_columns,
+    lattice_step,
+    placeholder_rows,
+    repeated_rows,
+    rounding_chances,
     screen_rows,
 )
 from perrin.tracks.writing import (
@@ -88,7 +102,10 @@ from perrin.tracks.writing import (
 )
 
 __all__ = [
+    "CENTRE_REMOVED",
+    "SUFFIXES",
     "TOUCHING_REACH",
+    "TRACKPY_COLUMNS",
     "BodyModel",
     "Candidates",
     "Centers",
@@ -97,6 +114,7 @@ __all__ = [
     "Identity",
     "Pairs",
     "Pose",
+    "RowNumbers",
     "Screened",
     "Spelling",
     "all_assignments",
@@ -127,6 +145,7 @@ __all__ = [
     "joined_pairs",
     "labels_are_certain",
     "labels_in_time",
+    "lattice_step",
     "link_clusters",
     "linked_tracks",
     "median_chi2",
@@ -134,20 +153,27 @@ __all__ = [
     "most_likely_path",
     "neighbour_pairs",
     "noise_along",
+    "parse_csv",
     "parse_gdf",
+    "parse_table",
+    "placeholder_rows",
     "positions_table",
     "read_clock",
     "read_spheres",
     "read_tracks",
     "recognise_columns",
+    "repeated_rows",
     "rigid_fits",
     "rigid_groups",
+    "rounding_chances",
     "screen_rows",
     "seconds",
     "settle_identity",
     "shape_symmetry",
     "squared_angle",
     "step_variance",
+    "table_bytes",
+    "table_suffix",
     "touching_groups",
     "unit_faults",
     "write_tracks",
