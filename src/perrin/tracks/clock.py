@@ -16,12 +16,12 @@ if TYPE_CHECKING:
     from perrin._arrays import Floats, Ints
 
 
-# Times that are off an even grid by less than this share of dt are on it.
-_EVEN = 5e-4
+# Times that differ from an even grid by less than this share of dt are even.
+_GRID_TOLERANCE = 5e-4
 
 
-# The usual interval of the column may differ from dt by this share: what clocks and rounding do.
-_AGREES = 0.01
+# The median interval of the column may differ from dt by this share: clocks are not exact.
+_DT_TOLERANCE = 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,9 +31,9 @@ class Clock:
     Attributes
     ----------
     frames : ndarray of int, shape (K,)
-        Frames whose time is known, rising.
+        Frames whose time is known, in rising order.
     times : ndarray, shape (K,)
-        s.
+        Times of these frames, s.
     dt : float
         Time between the frames before the first and after the last of these, s.
     """
@@ -71,6 +71,7 @@ def read_clock(table: pd.DataFrame, *, dt: float) -> tuple[Clock | None, tuple[s
         The time of a frame is the mean over its rows. None without a column ``time``, and where
         frames are dt apart.
     notes : tuple of str
+        Sentences on how the column is used.
 
     Raises
     ------
@@ -95,7 +96,24 @@ def read_clock(table: pd.DataFrame, *, dt: float) -> tuple[Clock | None, tuple[s
     frame = mean.index.to_numpy(dtype=np.int64)[known]
     time = mean.to_numpy(dtype=np.float64)[known]
     spread = float((by_frame.max() - by_frame.min()).max())
-    faults = _faults(frame, time, missing=int((~known).sum()), spread=spread, dt=dt)
+    missing, step = int((~known).sum()), np.diff(time)
+    usual = float(np.median(step / np.diff(frame))) if step.size else dt
+    back = np.flatnonzero(step <= 0)
+    faults = []
+    if missing > len(time):
+        faults.append(f"{missing} of {missing + len(time)} frames have none")
+    elif back.size:
+        where = frames_text(frame[back + 1])
+        faults.append(f"it does not rise from one frame to the next at {where}")
+    else:
+        if abs(usual - dt) > _DT_TOLERANCE * dt:
+            faults.append(
+                f"its median interval is {usual:.6g} s a frame, which contradicts dt = {dt:g} s"
+            )
+        if step.size and spread > usual:
+            faults.append(
+                f"rows of one frame differ by up to {spread:.3g} s, more than an interval"
+            )
     if faults:
         raise TrackTableError(
             f"the column time: {'; '.join(faults)}. Correct it or dt, or leave the column out",
@@ -110,7 +128,7 @@ def read_clock(table: pd.DataFrame, *, dt: float) -> tuple[Clock | None, tuple[s
     ]
     if not known.all():
         notes.append(f"{(~known).sum()} frames have no time; theirs is interpolated")
-    if spread > _EVEN * dt:
+    if spread > _GRID_TOLERANCE * dt:
         notes.append(f"the times of one frame differ by up to {spread:.3g} s; their mean is used")
     return Clock(frame, time, dt), tuple(notes)
 
@@ -125,32 +143,11 @@ def evenly_spaced(times: Floats, frames: Ints, *, dt: float) -> bool:
     True
     """
     grid = times[0] + dt * (frames - frames[0])
-    return bool(np.all(np.abs(times - grid) <= _EVEN * dt))
-
-
-def _faults(frame: Ints, time: Floats, *, missing: int, spread: float, dt: float) -> list[str]:
-    """Return what keeps the times from being those of the frames."""
-    if missing > len(time):
-        return [f"{missing} of {missing + len(time)} frames have none"]
-    step, number = np.diff(time), np.diff(frame)
-    if not len(step):
-        return []
-    back = np.flatnonzero(step <= 0)
-    if back.size:
-        return [f"it does not rise from one frame to the next at {frames_text(frame[back + 1])}"]
-    usual = float(np.median(step / number))
-    faults = []
-    if abs(usual - dt) > _AGREES * dt:
-        faults.append(
-            f"its median interval is {usual:.6g} s a frame, which contradicts dt = {dt:g} s"
-        )
-    if spread > usual:
-        faults.append(f"rows of one frame differ by up to {spread:.3g} s, more than an interval")
-    return faults
+    return bool(np.all(np.abs(times - grid) <= _GRID_TOLERANCE * dt))
 
 
 def frame_stride(table: pd.DataFrame) -> tuple[str, ...]:
-    """State in words where all frame numbers are multiples of a number, counted from the first.
+    """Return a sentence where all frame numbers are multiples of a number, counted from the first.
 
     Examples
     --------

@@ -12,6 +12,7 @@ from perrin._arrays import (
     Floats,
     Ints,
     as_positions,
+    number_fault,
     present,
     refuse,
     require_positive,
@@ -33,7 +34,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     import pandas as pd
-    from numpy.typing import ArrayLike, NDArray
+    from numpy.typing import ArrayLike
 
 
 REACH = TOUCHING_REACH  # the former name
@@ -252,9 +253,9 @@ def find_clusters(
     if contact is not None:
         require_positive(contact=contact)
     if size is not None:
-        refuse(_size_faults(size))
+        refuse(number_fault("size", size, least=2, whole=True))
     tracks = _columns_of(table)
-    smallest = min(3, tracks.x.shape[1]) if size is None else int(size)
+    smallest = min(3, tracks.x.shape[1]) if size is None else size
     count = tracks.n_particles
     if contact is None:
         rows = np.flatnonzero(tracks.seen)
@@ -325,8 +326,7 @@ def identify(table: pd.DataFrame, *, contact: float, size: int) -> pd.DataFrame:
     [50, 50, 50, 50]
     """
     require_positive(contact=contact)
-    refuse(_size_faults(size))
-    size = int(size)
+    refuse(number_fault("size", size, least=2, whole=True))
     columns = _columns_of(table.assign(particle=np.arange(len(table))))
     rows = np.flatnonzero(columns.seen)
     frame, x = columns.frame[rows], columns.x[rows]
@@ -334,17 +334,26 @@ def identify(table: pd.DataFrame, *, contact: float, size: int) -> pd.DataFrame:
     cluster = link_clusters(frame, x, reach=reach, contact=contact, size=size)
     own, piece = np.full(len(rows), -1, dtype=np.int64), np.zeros(len(rows), dtype=np.int64)
     for inside in _rows_by_label(cluster):
-        own[inside], piece[inside] = _particles_of(frame[inside], x[inside], size)
+        own[inside], piece[inside] = _particles_and_pieces(frame[inside], x[inside], size)
     known = own >= 0
     particle = np.full(len(table), -1, dtype=np.int64)
     particle[rows[known]] = cluster[known] * size + own[known]
     if "particle" in table:
-        _warn_of_corrected_labels(
+        given, found, at = (
             table["particle"].to_numpy()[rows[known]],
             particle[rows[known]],
             piece[known],
-            frame[known],
         )
+        order = np.lexsort((frame[known], at, found))
+        same = (np.diff(found[order]) == 0) & (np.diff(at[order]) == 0)
+        passed = order[1:][same & (given[order[1:]] != given[order[:-1]])]
+        if passed.size:
+            warnings.warn(
+                f"identity: {passed.size} labels of the column particle pass to another particle, "
+                f"in {frames_text(np.unique(frame[known][passed]))}; they are corrected",
+                IdentityWarning,
+                stacklevel=2,
+            )
     loose = np.flatnonzero(particle < 0)
     particle[loose] = int(cluster.max(initial=-1) + 1) * size + np.arange(loose.size)
     in_cluster = np.full(len(table), -1, dtype=np.int64)
@@ -352,27 +361,6 @@ def identify(table: pd.DataFrame, *, contact: float, size: int) -> pd.DataFrame:
     in_piece = np.zeros(len(table), dtype=np.int64)
     in_piece[rows] = piece
     return table.assign(particle=particle, cluster=in_cluster, piece=in_piece)
-
-
-def _warn_of_corrected_labels(given: NDArray[Any], found: Ints, piece: Ints, frame: Ints) -> None:
-    """Warn where the labels of a table pass from one of the particles found to another."""
-    order = np.lexsort((frame, piece, found))
-    same = (np.diff(found[order]) == 0) & (np.diff(piece[order]) == 0)
-    passed = order[1:][same & (given[order[1:]] != given[order[:-1]])]
-    if passed.size:
-        warnings.warn(
-            f"identity: {passed.size} labels of the column particle pass to another particle, in "
-            f"{frames_text(np.unique(frame[passed]))}; they are corrected",
-            IdentityWarning,
-            stacklevel=3,
-        )
-
-
-def _size_faults(size: int) -> list[str]:
-    """Return the fault of a number of particles."""
-    if np.ndim(size) == 0 and size == int(size) and size >= 2:
-        return []
-    return [f"size: expected a whole number of particles, at least 2, got {size!r}"]
 
 
 def _rows_by_label(label: Ints) -> Iterator[Ints]:
@@ -383,7 +371,7 @@ def _rows_by_label(label: Ints) -> Iterator[Ints]:
         yield from np.split(order, np.flatnonzero(np.diff(label[order])) + 1)
 
 
-def _particles_of(frame: Ints, x: Floats, size: int) -> tuple[Ints, Ints]:
+def _particles_and_pieces(frame: Ints, x: Floats, size: int) -> tuple[Ints, Ints]:
     """Return the particle (0 to size - 1, or -1) and the piece of each detection of one cluster."""
     order = np.argsort(frame, kind="stable")
     times, row, counts = np.unique(frame[order], return_inverse=True, return_counts=True)

@@ -247,7 +247,7 @@ def settle_identity(
     given = BodyModel.of_labels(detections) if labelled else None
     if given is not None and labels_are_certain(detections, given):
         return _without_assignment(seen, n, labelled=labelled)
-    start = _model_row(x, seen, n)
+    start = _medoid_row(x, seen, n)
     if start is None:
         return _without_assignment(seen, n, labelled=labelled)
     body = BodyModel.of_row(detections, start, labelled=labelled)
@@ -315,7 +315,7 @@ def _without_assignment(seen: Bools, n: int, *, labelled: bool) -> Identity:
     return Identity(order, piece, none, none.copy(), none.copy(), unsettled)
 
 
-def _model_row(x: Floats, seen: Bools, n: int) -> int | None:
+def _medoid_row(x: Floats, seen: Bools, n: int) -> int | None:
     """Return a complete row to begin with: of a few, the one that most other rows resemble."""
     d = x.shape[2]
     rows = np.flatnonzero(seen.sum(axis=1) == n)
@@ -1075,7 +1075,14 @@ def most_likely_identity(
     if labelled:
         changed = (label[1:] != label[:-1]) & (label[:-1] >= 0)
         swaps = np.setdiff1d(np.flatnonzero(changed.any(axis=1)) + 1, rows[~certain])
-        order = _kept_labels(detections, order, label)
+        # Rows without assignment keep the labels that held before them (at the start, after).
+        first = np.argmax(label >= 0, axis=0)
+        opening = label[first, np.arange(label.shape[1])]
+        for k in np.flatnonzero((order < 0).all(axis=1) & (detections.shown > 0)).tolist():
+            held = np.where(label[k] >= 0, label[k], opening)
+            for column in detections.column[k, : detections.shown[k]].tolist():
+                if column < len(held) and held[column] >= 0 and order[k, held[column]] < 0:
+                    order[k, held[column]] = column
     piece = np.zeros(len(detections.x), dtype=np.int64)
     piece[rows[~certain]] = 1
     return Identity(
@@ -1111,20 +1118,6 @@ def labels_in_time(order: Ints) -> Ints:
     last = np.maximum.accumulate(np.where(label >= 0, np.arange(len(label))[:, None], -1), axis=0)
     held = np.take_along_axis(label, np.maximum(last, 0), axis=0)
     return np.where(last >= 0, held, -1)
-
-
-def _kept_labels(detections: Detections, order: Ints, label: Ints) -> Ints:
-    """Give rows without assignment the labels that held before them (at the start, after)."""
-    out = order.copy()
-    rows = np.flatnonzero((order < 0).all(axis=1) & (detections.shown > 0))
-    first = np.argmax(label >= 0, axis=0)
-    opening = label[first, np.arange(label.shape[1])]
-    for k in rows.tolist():
-        held = np.where(label[k] >= 0, label[k], opening)
-        for column in detections.column[k, : detections.shown[k]].tolist():
-            if column < len(held) and held[column] >= 0 and out[k, held[column]] < 0:
-                out[k, held[column]] = column
-    return out
 
 
 class Pose(NamedTuple):
@@ -1192,7 +1185,13 @@ def most_likely_path(
         cost = cost + _LABEL_LOG_ODDS * against + wrong
     choice, certain = [int(np.argmin(cost))], [True]
     label = _passed_on(body.label, order[choice[0]])
-    obvious = _obvious_steps(candidates, rows, variance) & labelled
+    # A step between rows with the labels as given is obvious where it is likelier than all others,
+    # whatever their angles: every other candidate contradicts the labels.
+    turned, misfit = candidates.rotation[rows, 0], candidates.cost[rows[1:]]
+    given = np.isin(rows, candidates.given) & labelled
+    own = squared_angle(turned[:-1], turned[1:]) / (2 * variance) + misfit[:, 0]
+    sure = own + _SETTLED_LOG_ODDS < misfit[:, 1:].min(axis=1) + _LABEL_LOG_ODDS
+    obvious = given[:-1] & given[1:] & sure
     nowhere, poses = np.full(label.size, -1), list[Pose]()
     for i in range(1, rows.size):
         # A step begins at the last noise-like pose or at the last of all, whichever is likelier:
@@ -1223,18 +1222,6 @@ def most_likely_path(
         if labelled:
             label = _passed_on(label, order[best])
     return choice, np.array(certain)
-
-
-def _obvious_steps(candidates: Candidates, rows: Ints, variance: Floats) -> Bools:
-    """Return the steps between rows whose labels are certain whatever the other angles are.
-
-    Every other candidate contradicts the labels, so its misfit is compared alone.
-    """
-    rotation, cost = candidates.rotation[rows, 0], candidates.cost[rows[1:]]
-    given = np.isin(rows, candidates.given)
-    own = squared_angle(rotation[:-1], rotation[1:]) / (2 * variance) + cost[:, 0]
-    sure = own + _SETTLED_LOG_ODDS < cost[:, 1:].min(axis=1) + _LABEL_LOG_ODDS
-    return np.asarray(given[:-1] & given[1:] & sure)
 
 
 def _passed_on(label: Ints, order: Ints) -> Ints:

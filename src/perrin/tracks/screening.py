@@ -70,6 +70,9 @@ _MOVING_SPREAD, _STILL_SHARE = 10.0, 1e-6
 _LATTICE_TOLERANCE, _WHOLE_TOLERANCE = 1e-3, 0.02
 
 
+_POINTS_SHOWN = 3  # placeholders that a warning names
+
+
 _DISTANCE_FRAMES = 60  # in which the nearest particles are searched for
 
 
@@ -145,11 +148,16 @@ def screen_rows(table: pd.DataFrame) -> Screened:
     notes = _rows_sentence(
         np.flatnonzero(empty), frame, code, "without coordinates (NaN)", "they count as missing"
     )
+    points, times = np.unique(x[filled], axis=0, return_counts=True)
+    frequent = points[np.argsort(-times, kind="stable")[:_POINTS_SHOWN]]
+    places = [f"({', '.join(f'{c:.6g}' for c in point)})" for point in frequent]
+    if len(points) > _POINTS_SHOWN:
+        places[-1] += f" or {len(points) - _POINTS_SHOWN} more points"
     placeholders = _rows_sentence(
         filled,
         frame,
         code,
-        f"at exactly {_points_text(x[filled])}",
+        f"at exactly {' or '.join(places)}",
         "a placeholder for a lost particle, no measurement; they count as missing",
     )
     repeats = _rows_sentence(
@@ -229,7 +237,7 @@ def far_sentence(far: Bools, frames: Ints) -> str:
     verb = "is" if points == 1 else "are"
     kind = "no measurement" if points == 1 else "no measurements"
     return (
-        f"{_counted(points, 'point')} of {_counted(particles, 'particle')} {verb} farther from the "
+        f"{_count(points, 'point')} of {_count(particles, 'particle')} {verb} farther from the "
         f"rest than {_FAR_SIZES:.0f} times the body's size, first in frame {first}: {kind}; left "
         "out"
     )
@@ -586,20 +594,9 @@ def _rows_sentence(rows: Ints, frame: Ints, code: Ints, what: str, meaning: str)
     """State how many rows of how many particles are of a kind, and the first frame."""
     if not rows.size:
         return ()
-    counted = f"{_counted(rows.size, 'row')} of {_counted(np.unique(code[rows]).size, 'particle')}"
+    counted = f"{_count(rows.size, 'row')} of {_count(np.unique(code[rows]).size, 'particle')}"
     return (f"{counted} {what}, first in frame {frame[rows].min()}: {meaning}",)
 
 
-def _points_text(x: Floats, limit: int = 3) -> str:
-    """List the distinct points among x, the most frequent first."""
-    points, times = np.unique(x, axis=0, return_counts=True)
-    listed = [
-        f"({', '.join(f'{c:.6g}' for c in point)})"
-        for point in points[np.argsort(-times, kind="stable")[:limit]]
-    ]
-    more = f" or {len(points) - limit} more points" if len(points) > limit else ""
-    return " or ".join(listed) + more
-
-
-def _counted(count: int, noun: str) -> str:
+def _count(count: int, noun: str) -> str:
     return f"{count} {noun}{'' if count == 1 else 's'}"
