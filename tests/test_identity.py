@@ -42,10 +42,10 @@ def wrong_steps(found, particle):
 
 
 @pytest.mark.parametrize("body", [3, 4, 5, 6])
-def test_labels_shuffled_in_every_frame_are_sorted_out(body):
+def test_labels_shuffled_in_every_frame_are_sorted_out(body, repeats):
     """At the paper's sampling and 4 times slower no assignment is wrong; all frames are settled."""
     for factor in (1, 4):
-        x, rng = track(body, body, D_R=factor * SLOW)
+        x, rng = track(body, body, D_R=factor * SLOW, n_frames=repeats(50, 120))
         mixed, particle = shuffled(x, rng)
         found = settle_identity(mixed, labelled=False)
         assert wrong_steps(found, particle) == 0
@@ -55,7 +55,7 @@ def test_labels_shuffled_in_every_frame_are_sorted_out(body):
 
 def test_seven_particles_are_assigned_without_trying_all_orders():
     """Beyond six, linear assignment and rigid fit in turn do the same."""
-    x, rng = track(1, 7, n_frames=12)
+    x, rng = track(1, 7, n_frames=8)
     mixed, particle = shuffled(x, rng)
     found = settle_identity(mixed, labelled=False)
     assert wrong_steps(found, particle) == 0
@@ -140,7 +140,7 @@ def test_an_identity_comes_back_from_json():
 def test_large_bodies_with_missing_particles(repeats):
     """Many particles, 2 % missing, one exchange: found, and every frame settled."""
     rng = np.random.default_rng(1)
-    n = repeats(15, 30)
+    n = repeats(9, 30)
     body = perrin.Cluster.from_positions(rng.normal(scale=3.0, size=(n, 3)))
     truth = perrin.simulate_motion(body, D_R=1e-3, dt=1.0, n_frames=2 * n, rng=rng)
     x = perrin.add_noise(truth.positions(), sigma=0.03, rng=rng)
@@ -158,9 +158,9 @@ def test_large_bodies_with_missing_particles(repeats):
 
 @pytest.mark.parametrize("body", [3, 4, 6])
 @pytest.mark.parametrize("D_R", [SLOW, 0.1, 1.0])
-def test_right_labels_are_left_alone_however_far_the_body_turns(body, D_R):
-    """Lasting labels outweigh a shorter rotation: no step of a long stride is changed."""
-    x, rng = track(20, body, D_R=D_R)
+def test_right_labels_are_left_alone_however_far_the_body_turns(body, D_R, repeats):
+    """Lasting labels outweigh a shorter rotation: no label is changed after a long step."""
+    x, rng = track(20, body, D_R=D_R, n_frames=repeats(60, 120))
     x[rng.random(x.shape[:2]) < 0.02] = np.nan
     found = settle_identity(x)
     placed = found.order >= 0
@@ -245,7 +245,7 @@ def test_bodies_in_the_plane(n):
 
 def test_turning_moving_and_scaling_space_changes_nothing():
     """The order is the same in other axes, at another place, and in another unit."""
-    x, rng = track(8)
+    x, rng = track(8, n_frames=40)
     mixed, _ = shuffled(x, rng)
     turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
     turn *= np.linalg.det(turn)

@@ -909,6 +909,48 @@ class Candidates(NamedTuple):
         self.cost[row, -1] = cost[0, 0]
         self.fits[row, -1] = misfit[0] <= body.misfit_limit(used)[0, 0]
 
+    def step_variance(
+        self, detections: Detections, time: Floats, rows: Ints, *, labelled: bool
+    ) -> Floats:
+        """Return the variance of one component of each step's rotation vector, from the median.
+
+        Columns that are lasting particles measure the turn between two rows even where their labels
+        are not those of the shape; of detections without labels the least turn counts.
+        """
+        d = detections.x.shape[2]
+        square = np.empty(0)
+        if labelled:
+            points = np.full((rows.size, int(detections.column.max()) + 1, d), np.nan)
+            row, detection = np.nonzero(detections.column[rows] >= 0)
+            column = detections.column[rows[row], detection]
+            points[row, column] = detections.x[rows[row], detection]
+            rotation, misfit = rigid_fits(points[1:], points[:-1])
+            square = squared_angle(rotation[np.isfinite(misfit)], np.eye(d))
+        if not 2 * square.size > rows.size:
+            fits = self.fits[rows]
+            first = self.rotation[rows[:-1], np.argmax(fits[:-1], axis=1)]
+            square = squared_angle(first[:, None], self.rotation[rows[1:]])
+            square = np.where(fits[1:], square, np.inf).min(axis=1)
+            square = square[fits[:-1].any(axis=1) & fits[1:].any(axis=1)]
+        gap = np.diff(time)
+        usual = float(np.median(gap)) if gap.size else 1.0
+        median = float(np.median(square)) if square.size else 0.0
+        typical = median / median_chi2(3.0 if d == 3 else 1.0)
+        variance: Floats = max(typical, _ROUNDING_ANGLE**2) * np.maximum(gap / usual, 1.0)
+        return variance
+
+    def step_cost(self, poses: list[Pose], row: int, *, labelled: bool) -> Floats:
+        """Return minus the log-likelihood (C,) of a row's candidates after the poses before it."""
+        misfit = self.cost[row]
+        turns = np.full(misfit.shape, np.inf)
+        for pose in poses:
+            square = squared_angle(pose.rotation, self.rotation[row])
+            # The law of small steps does not hold for a leap: its own size counts.
+            least = float(square[np.isfinite(misfit)].min())
+            wide = max(pose.variance, least / (_LEAP_LABELLED if labelled else _LEAP_UNLABELLED))
+            turns = np.minimum(turns, square / (2 * wide))
+        return np.asarray(turns + misfit)
+
 
 def candidate_assignments(detections: Detections, body: BodyModel, *, labelled: bool) -> Candidates:
     """List the candidates of every row: the noise-like assignments and the labels as given.
@@ -1175,7 +1217,7 @@ def most_likely_path(
     """
     if not rows.size:
         return [], np.empty(0, dtype=np.bool_)
-    variance = _step_variance(detections, candidates, time[rows], rows, labelled=labelled)
+    variance = candidates.step_variance(detections, time[rows], rows, labelled=labelled)
     order = candidates.order(detections, rows[:1])[0]
     cost = candidates.cost[rows[0]]
     if labelled:
@@ -1210,7 +1252,7 @@ def most_likely_path(
         if labelled:
             candidates.include(detections, body, rows[i], label)
         order = candidates.order(detections, rows[i : i + 1])[0]
-        cost = _step_cost(candidates, poses, rows[i], labelled=labelled)
+        cost = candidates.step_cost(poses, rows[i], labelled=labelled)
         if labelled:
             cost += _LABEL_LOG_ODDS * _contradict(label, order, shown)
         best = int(np.argmin(cost))
@@ -1246,47 +1288,3 @@ def _contradict(label: Ints, order: Ints, shown: Ints) -> Bools:
     known = ((shown >= 0) & (label[shown] >= 0)).sum()
     placed = ((order >= 0) & (label[order] >= 0)).sum(axis=1)
     return np.asarray(_relabel(label, order) | (placed < min(known, order.shape[1])))
-
-
-def _step_variance(
-    detections: Detections, candidates: Candidates, time: Floats, rows: Ints, *, labelled: bool
-) -> Floats:
-    """Return the variance of one component of each step's rotation vector, from the median.
-
-    Columns that are lasting particles measure the turn between two rows even where their labels
-    are not those of the shape; of detections without labels the least turn counts.
-    """
-    d = detections.x.shape[2]
-    square = np.empty(0)
-    if labelled:
-        points = np.full((rows.size, int(detections.column.max()) + 1, d), np.nan)
-        row, detection = np.nonzero(detections.column[rows] >= 0)
-        column = detections.column[rows[row], detection]
-        points[row, column] = detections.x[rows[row], detection]
-        rotation, misfit = rigid_fits(points[1:], points[:-1])
-        square = squared_angle(rotation[np.isfinite(misfit)], np.eye(d))
-    if not 2 * square.size > rows.size:
-        fits = candidates.fits[rows]
-        first = candidates.rotation[rows[:-1], np.argmax(fits[:-1], axis=1)]
-        square = squared_angle(first[:, None], candidates.rotation[rows[1:]])
-        square = np.where(fits[1:], square, np.inf).min(axis=1)
-        square = square[fits[:-1].any(axis=1) & fits[1:].any(axis=1)]
-    gap = np.diff(time)
-    usual = float(np.median(gap)) if gap.size else 1.0
-    median = float(np.median(square)) if square.size else 0.0
-    typical = median / median_chi2(3.0 if d == 3 else 1.0)
-    variance: Floats = max(typical, _ROUNDING_ANGLE**2) * np.maximum(gap / usual, 1.0)
-    return variance
-
-
-def _step_cost(candidates: Candidates, poses: list[Pose], row: int, *, labelled: bool) -> Floats:
-    """Return minus the log-likelihood (C,) of a row's candidates after the poses before it."""
-    misfit = candidates.cost[row]
-    turns = np.full(misfit.shape, np.inf)
-    for pose in poses:
-        square = squared_angle(pose.rotation, candidates.rotation[row])
-        # A body that leaps follows no law of its small steps: those of the leap's own size decide.
-        least = float(square[np.isfinite(misfit)].min())
-        wide = max(pose.variance, least / (_LEAP_LABELLED if labelled else _LEAP_UNLABELLED))
-        turns = np.minimum(turns, square / (2 * wide))
-    return np.asarray(turns + misfit)
