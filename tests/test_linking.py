@@ -81,14 +81,16 @@ def test_two_clusters_that_pass_are_never_mistaken():
     assert found["cluster"].nunique() == 2
 
 
-def test_analysis_of_raw_detections_is_that_of_the_labelled_tracks():
-    """Raw detections give the same D_R as the true labels do."""
+def test_raw_detections_give_the_result_of_the_labelled_tracks():
+    """D_R is the same with the particles found and with the true labels."""
     rng = np.random.default_rng(2)
-    x = track(rng, n_frames=60)
+    x = track(rng)
     found = perrin.identify(raw([x], rng), contact=DIAMETER, size=4)
-    labelled = perrin.analyze(perrin.positions_table(x), dt=0.73).clusters[0]
-    result = perrin.analyze(found, dt=0.73).clusters[0]
-    np.testing.assert_allclose(result.D_R.value, labelled.D_R.value, rtol=1e-6)
+    values = [
+        perrin.estimate_diffusion(perrin.track_rotation(positions, dt=0.73)).value
+        for positions in (x, perrin.cluster_positions(found, cluster=0)[0])
+    ]
+    assert values[1] == pytest.approx(values[0], rel=1e-6)
 
 
 def test_cuts_of_identify_reach_the_analysis():
@@ -142,17 +144,6 @@ def test_labels_that_pass_to_another_particle_are_a_warning():
         "corrected"
     )
     assert warning.filename == __file__
-
-
-def test_analyses_report_corrected_labels_without_a_warning():
-    """The report states the exchange; IdentityWarning, an error in the tests, is not raised."""
-    x = track(np.random.default_rng(7), n_frames=60)
-    x[30:, [0, 1]] = x[30:, [1, 0]]
-    (result,) = perrin.analyze(perrin.positions_table(x), dt=0.73).clusters
-    assert result.quality.swaps == (30,)
-    texts = [text for text in (*result.warnings, *result.notes) if "identity" in text]
-    assert len(texts) == 1
-    assert "frame 30" in texts[0]
 
 
 def test_groups_stop_growing_at_their_size():
