@@ -55,8 +55,8 @@ _REST_SHARE = 2e-3
 _MOST_EXCESS, _SLOW_TEST_LEVEL = 2.5, 1e-3
 
 
-# A group varying by over 6 times what the tightest does is a body only if its distances vary less
-# (variance) than the separations along the axes: trapped particles vary alike in both.
+# A group whose distances vary by over 6 times those of the tightest group is a body only if they
+# vary less (variance) than the separations along the axes: of trapped particles both vary alike.
 _LOOSE_RATIO, _TURNING_SHARE = 6.0, 0.7
 
 
@@ -194,8 +194,8 @@ def rigid_groups(frame: Ints, code: Ints, x: Floats, *, count: int, smallest: in
     from block to block of time. Fluctuations are compared in units of the localisation error along
     the pair's direction: the ratio of that error along one axis to the others is fitted to all
     steady pairs. What a pair does for a while is averaged over all frames it shares, so bodies may
-    pass each other. Particles at rest beside each other keep their distances, too: they cannot be
-    told from a body at rest.
+    pass each other. Particles at rest next to each other keep their distances, too: they cannot be
+    distinguished from a body at rest.
 
     Examples
     --------

@@ -72,10 +72,10 @@ def cluster_positions(
     Raises
     ------
     ValueError
-        If the table holds several clusters and `cluster` does not say which, or not that one.
+        If the table holds several clusters and `cluster` is none of them or not given.
     TrackTableError
-        If the table is not a clean track table, holds no coordinates, or has frame numbers so
-        sparse that they look like times or ids.
+        If the table is not a clean track table, holds no coordinates, or has sparse frame numbers
+        that look like times or ids.
 
     Examples
     --------

@@ -11,14 +11,8 @@ import numpy as np
 from perrin._text import listed
 from perrin.errors import table_error
 from perrin.tracks.column_names import COLUMNS, Spelling, recognise_columns, seconds, unit_faults
-from perrin.tracks.formats import (
-    LARGEST_EXACT,
-    SUFFIXES,
-    parse_csv,
-    parse_table,
-    table_bytes,
-    table_suffix,
-)
+from perrin.tracks.formats import LARGEST_EXACT, parse_csv, parse_table, table_bytes, table_suffix
+from perrin.tracks.formats import SUFFIXES as SUFFIXES
 from perrin.tracks.writing import written_whole
 
 if TYPE_CHECKING:
@@ -28,9 +22,6 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
     from perrin._arrays import Bools, Floats, Ints
-
-
-__all__ = ["SUFFIXES", "check_tracks", "read_spheres", "read_tracks", "write_tracks"]
 
 
 _AXES = ("x", "y", "z")

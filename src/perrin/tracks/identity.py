@@ -91,7 +91,7 @@ _BATCH_FITS = 100_000  # rigid fits at a time: bounds the memory
 _LASTING_SHARE = 0.05
 
 
-_ROUNDING_ANGLE = 1e-6  # rad: what rounding leaves of a rotation
+_ROUNDING_ANGLE = 1e-6  # rotations by less than this, rad, are rounding errors
 
 
 # A fit of a large body this close (of the least particle distance) is right, and ends a search that
@@ -701,7 +701,7 @@ def icp_fit(x: Floats, template: Floats, rotation: Floats) -> tuple[Ints, Floats
     assignment, misfit = np.arange(len(template)), np.inf
     y, t = x - x.mean(axis=0), template - template.mean(axis=0)
     for _ in range(20):
-        # The squared distances differ from this by what does not depend on the assignment.
+        # The squared distances differ from this by terms that do not depend on the assignment.
         new = linear_sum_assignment(-(t @ rotation.T) @ y.T)[1]
         if np.isfinite(misfit) and (new == assignment).all():
             break
@@ -956,7 +956,7 @@ def candidate_assignments(detections: Detections, body: BodyModel, *, labelled: 
     """List the candidates of every row: the noise-like assignments and the labels as given.
 
     A row in which nothing is noise-like still shows how far the body has turned. Its candidates
-    are the labels as given and what the symmetries of the body make of them.
+    are the labels as given and the assignments that the symmetries of the body make of them.
 
     Parameters
     ----------

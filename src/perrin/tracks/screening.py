@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
 
-# Columns that trackpy writes beside its coordinates, which are pixels.
+# Columns that trackpy writes in addition to its coordinates, which are in pixels.
 TRACKPY_COLUMNS = ("mass", "size", "ecc", "signal", "raw_mass", "ep")
 
 
@@ -78,7 +78,7 @@ _DISTANCE_FRAMES = 60  # in which the nearest particles are searched for
 
 @dataclass(frozen=True, eq=False)
 class Screened:
-    """A track table without rows that are no measurements, and what was found.
+    """A track table without rows that are no measurements, and sentences on these rows.
 
     Attributes
     ----------
@@ -109,7 +109,7 @@ def screen_rows(table: pd.DataFrame) -> Screened:
 
     Notes
     -----
-    Two kinds are found. A *placeholder* is a point that stands for a lost particle, such as
+    Two kinds are found. A *placeholder* is a point that is written for a lost particle, such as
     (0, 0, 0): rows at exactly the same place that is entered and left by steps of more than 5 times
     the particle's median step, in 3 rows or more (the origin: in one), or to which a particle
     returns more often than the resolution of the table allows. A *repeat* has all coordinates of
@@ -363,7 +363,7 @@ def has_trackpy_columns(columns: Iterable[object]) -> bool:
 
 
 def placeholder_rows(code: Ints, x: Floats) -> Bools:
-    """Mark the rows at points that stand for lost particles, such as (0, 0, 0).
+    """Mark the rows at points that are written for lost particles, such as (0, 0, 0).
 
     Parameters
     ----------
