@@ -1,5 +1,7 @@
 """Laws of the column time."""
 
+import json
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -22,11 +24,15 @@ def test_even_times_are_the_frames():
 
 
 def test_pauses_are_kept_and_missing_frames_interpolated():
-    """The times of the rows, from 0; a frame without rows stands between its neighbours."""
+    """The times of the rows; a frame without rows is interpolated; the clock survives JSON."""
     clock, notes = read_clock(table([5.0, 6.0, 7.0, 27.0, 29.0], [0, 1, 2, 3, 5]), dt=1.0)
     assert clock.at(np.arange(-1, 7)).tolist() == [4.0, 5.0, 6.0, 7.0, 27.0, 28.0, 29.0, 30.0]
     assert clock.from_frame(2).at(np.array([0, 1, 3])).tolist() == [0.0, 20.0, 22.0]
     assert "from 1 to 20 s" in notes[0]
+    back = type(clock).from_dict(json.loads(json.dumps(clock.to_dict())))
+    np.testing.assert_array_equal(back.frames, clock.frames)
+    np.testing.assert_array_equal(back.times, clock.times)
+    assert back.dt == clock.dt
 
 
 @pytest.mark.parametrize(
@@ -39,7 +45,7 @@ def test_pauses_are_kept_and_missing_frames_interpolated():
     ],
 )
 def test_times_that_contradict_are_refused(times, words):
-    """A column in other units, or one that stands still, is refused with both numbers."""
+    """A column in other units, or one that does not rise, is refused with both numbers."""
     with pytest.raises(perrin.TrackTableError) as error:
         read_clock(table(times), dt=0.73)
     assert all(word in str(error.value) for word in words)

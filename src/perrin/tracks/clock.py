@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from perrin._arrays import from_plain, to_plain
 from perrin._text import frames_text
 from perrin.errors import TrackTableError
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     import pandas as pd
 
     from perrin._arrays import Floats, Ints
@@ -53,6 +56,39 @@ class Clock:
         """Return the clock for frames counted from `first`, whose time becomes 0."""
         start = float(self.at(np.array([first]))[0])
         return Clock(self.frames - first, self.times - start, self.dt)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the attributes as lists and numbers, which JSON can hold.
+
+        Returns
+        -------
+        dict
+            One entry per attribute.
+        """
+        plain: dict[str, Any] = to_plain(vars(self))
+        return plain
+
+    @classmethod
+    def from_dict(cls, entry: Mapping[str, Any]) -> Clock:
+        """Return the clock that `to_dict` wrote.
+
+        Parameters
+        ----------
+        entry : mapping
+            As `to_dict` returns it, also after a round trip through JSON.
+
+        Returns
+        -------
+        Clock
+
+        Examples
+        --------
+        >>> clock = Clock(np.array([0, 2]), np.array([0.0, 1.5]), 0.7)
+        >>> Clock.from_dict(clock.to_dict()).times
+        array([0. , 1.5])
+        """
+        frames = from_plain(entry["frames"], dtype=np.int64)
+        return cls(frames, from_plain(entry["times"]), float(entry["dt"]))
 
 
 def read_clock(table: pd.DataFrame, *, dt: float) -> tuple[Clock | None, tuple[str, ...]]:

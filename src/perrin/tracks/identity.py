@@ -1168,6 +1168,7 @@ class Pose(NamedTuple):
     Attributes
     ----------
     rotation : ndarray, shape (d, d)
+        Rotation from the axes of the body to those of the laboratory.
     variance : float
         Variance of one component of the rotation vector from this rotation to the next, rad^2.
     """
@@ -1221,6 +1222,7 @@ def most_likely_path(
     order = candidates.order(detections, rows[:1])[0]
     cost = candidates.cost[rows[0]]
     if labelled:
+        # Of equivalent candidates the one is chosen that agrees with the labels of most particles.
         particle = np.where(order >= 0, body.label[order], -1)
         wrong = ((particle != np.arange(detections.n)) & (order >= 0)).sum(axis=1)
         against = _contradict(body.label, order, detections.column[rows[0]])
