@@ -617,7 +617,8 @@ def test_a_cut_says_how_far_the_body_turned():
         perrin.Cluster.touching(4, 2.45), D_R=0.08, dt=0.73, n_frames=100, rng=1
     )
     x = perrin.add_noise(truth.positions(), sigma=0.03, rng=1)
-    found = perrin.identify(perrin.positions_table(x), contact=2.45, size=4)
+    raw = perrin.positions_table(x).drop(columns="particle")
+    found = perrin.identify(raw, contact=2.45, size=4)
     report = perrin.analyze(found, dt=0.73)
     (told,) = (w for w in report.clusters[0].warnings if "in doubt" in w)
     angles = re.search(r"step angles ([0-9, ]+), \.\.\. deg: a jump of the body's symmetry", told)

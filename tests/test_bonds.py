@@ -40,9 +40,9 @@ def found_in(x, **options):
 
 
 @pytest.mark.parametrize(("count", "loose", "n_frames"), [(1, 0, 10), (8, 25, 100), (27, 20, 60)])
-def test_bodies_among_loose_particles_are_found(count, loose, n_frames):
+def test_bodies_among_loose_particles_are_found(count, loose, n_frames, repeats):
     """Every body and no other, with few particles (all pairs) and many (neighbours only)."""
-    for seed in range(2):
+    for seed in range(repeats(1, 2)):
         x, truth = bodies(count, loose=loose, n_frames=n_frames, seed=seed)
         np.testing.assert_array_equal(found_in(x), truth)
 
@@ -125,11 +125,11 @@ def test_a_body_at_rest_with_smooth_error_is_one_body(seed):
 
 @pytest.mark.parametrize("ratio", [1 / 4, 3, 4])
 @pytest.mark.parametrize("axis", [0, 2])
-def test_one_axis_may_be_measured_worse(ratio, axis):
+def test_one_axis_may_be_measured_worse(ratio, axis, repeats):
     """A slow upright trimer and a slow tetrahedron, one lab axis 3 to 4 times worse or better."""
     sigma = np.full(3, 0.02)
     sigma[axis] *= ratio
-    for seed in range(3):
+    for seed in range(repeats(1, 3)):
         rng = np.random.default_rng(seed)
         for body in (UPRIGHT, perrin.Cluster.touching(4, 2.45).positions):
             x = moving(body, D_R=1e-5, seed=rng)
@@ -138,9 +138,9 @@ def test_one_axis_may_be_measured_worse(ratio, axis):
 
 
 @pytest.mark.parametrize("D_R", [1e-5, 5e-3])
-def test_a_few_bad_coordinates_do_not_decide(D_R):
+def test_a_few_bad_coordinates_do_not_decide(D_R, repeats):
     """Three of 1200 coordinates, and one percent of them, off by 1 to 1000 um."""
-    for seed in range(4):
+    for seed in range(repeats(2, 4)):
         rng = np.random.default_rng(seed)
         x = moving(perrin.Cluster.touching(4, 2.45).positions, D_R=D_R, seed=rng, n_frames=300)
         x = perrin.add_noise(x, sigma=0.03, rng=rng)
@@ -160,17 +160,17 @@ def test_bodies_of_very_different_noise_are_all_found():
         np.testing.assert_array_equal(found_in(x), truth)
 
 
-def test_particles_that_drift_together_are_no_body():
+def test_particles_that_drift_together_are_no_body(repeats):
     """A common flow does not tie free particles to each other."""
-    for seed in range(3):
+    for seed in range(repeats(1, 3)):
         x, truth = bodies(0, loose=20, n_frames=250, seed=seed)
         x[..., 0] += 0.3 * np.arange(250)[:, None]
         np.testing.assert_array_equal(found_in(x), truth)
 
 
-def test_trapped_particles_among_bodies_are_loose():
+def test_trapped_particles_among_bodies_are_loose(repeats):
     """Trapped particles keep their distances within a tenth, but in no direction better."""
-    for seed in range(3):
+    for seed in range(repeats(1, 3)):
         x, _ = bodies(3, seed=seed, n_frames=250)
         rng = np.random.default_rng(seed)
         traps = np.array([[60, 0, 0], [70, 0, 0], [60, 10, 0], [70, 10, 0], [65, 5, 8]])
@@ -179,9 +179,9 @@ def test_trapped_particles_among_bodies_are_loose():
         assert found_in(both).tolist() == [0] * 4 + [1] * 4 + [2] * 4 + [-1] * 5
 
 
-def test_slow_bodies_beside_each_other_are_two_where_they_wander_apart():
+def test_slow_bodies_beside_each_other_are_two_where_they_wander_apart(repeats):
     """Their distance wanders by more than its noise, from block to block of time."""
-    for seed in range(4):
+    for seed in range(repeats(2, 4)):
         rng = np.random.default_rng(seed)
         body = perrin.Cluster.touching(4, 2.45).positions
         x = [moving(body, D_R=1e-4, seed=rng) + 5.0 * k * np.eye(3)[0] for k in range(2)]

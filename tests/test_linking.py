@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 import perrin
-from perrin.tracks.linking import touching_groups
+from perrin.tracks.groups import touching_groups
 
 DIAMETER = 2.45
 
@@ -42,13 +42,13 @@ def track(rng, n_frames=100, body=4, factor=1.0):
 
 def wrong(found):
     """Count the particles that are two within one piece."""
-    seated = found[found["cluster"] >= 0]
-    truth = seated["body"] * 100 + seated["site"]
-    return int((truth.groupby([seated["particle"], seated["piece"]]).nunique() > 1).sum())
+    known = found[found["cluster"] >= 0]
+    truth = known["body"] * 100 + known["site"]
+    return int((truth.groupby([known["particle"], known["piece"]]).nunique() > 1).sum())
 
 
 def test_shuffled_rows_become_lasting_particles():
-    """Three clusters, 1 % lost, stray detections about: every particle keeps to itself."""
+    """Three clusters, 1 % lost, stray detections: every particle keeps its id."""
     rng = np.random.default_rng(0)
     table = raw([track(rng) + np.array([25.0 * k, 0, 0]) for k in range(3)], rng, extra=60)
     table = table[rng.random(len(table)) > 0.01]
@@ -81,30 +81,32 @@ def test_two_clusters_that_pass_are_never_mistaken():
     assert found["cluster"].nunique() == 2
 
 
-def test_analysis_of_raw_detections_is_that_of_the_labelled_tracks():
-    """Raw detections give the same D_R as the true labels do."""
+def test_raw_detections_give_the_result_of_the_labelled_tracks():
+    """D_R is the same with the particles found and with the true labels."""
     rng = np.random.default_rng(2)
     x = track(rng)
     found = perrin.identify(raw([x], rng), contact=DIAMETER, size=4)
-    labelled = perrin.analyze(perrin.positions_table(x), dt=0.73).clusters[0]
-    result = perrin.analyze(found, dt=0.73).clusters[0]
-    np.testing.assert_allclose(result.D_R.value, labelled.D_R.value, rtol=1e-6)
+    values = [
+        perrin.estimate_diffusion(perrin.track_rotation(positions, dt=0.73)).value
+        for positions in (x, perrin.cluster_positions(found, cluster=0)[0])
+    ]
+    assert values[1] == pytest.approx(values[0], rel=1e-6)
 
 
 def test_cuts_of_identify_reach_the_analysis():
     """Sampled too slowly for its symmetry a cluster is cut; no step joins two pieces."""
     rng = np.random.default_rng(3)
-    found = perrin.identify(raw([track(rng, factor=16)], rng), contact=DIAMETER, size=4)
+    found = perrin.identify(raw([track(rng, 60, factor=16)], rng), contact=DIAMETER, size=4)
     assert found["piece"].max() > 0
     (result,) = perrin.analyze(found, dt=16 * 0.73).clusters
     assert result.motion.piece.max() >= found["piece"].max()
     assert len(result.quality.cuts) == result.motion.piece.max()
-    told = [w for w in result.warnings if "identity" in w and "cut" in w]
-    assert all(str(frame) in told[0] for frame in result.quality.cuts)
+    texts = [w for w in result.warnings if "identity" in w and "cut" in w]
+    assert all(str(frame) in texts[0] for frame in result.quality.cuts)
 
 
 def test_rods_have_two_ends():
-    """size=2 tells the ends of dumbbells apart by least rotation."""
+    """With size=2 the ends of dumbbells are distinguished by least rotation."""
     rng = np.random.default_rng(4)
     found = perrin.identify(raw([track(rng, body=2)], rng), contact=DIAMETER, size=2)
     assert wrong(found) == 0
@@ -125,6 +127,23 @@ def test_other_columns_stay_and_the_input_is_untouched():
         perrin.identify(table, contact=0.0, size=4)
     with pytest.raises(ValueError, match="size: expected"):
         perrin.identify(table, contact=1.0, size=2.5)
+
+
+def test_labels_that_pass_to_another_particle_are_a_warning():
+    """Ids exchanged from frame 12 on: two labels; ids that last under other numbers: none."""
+    table = perrin.positions_table(track(np.random.default_rng(6), n_frames=30))
+    renamed = table.assign(particle=7 - table["particle"])
+    assert perrin.identify(renamed, contact=DIAMETER, size=4)["cluster"].eq(0).all()
+    late = table["frame"] >= 12
+    exchanged = table["particle"].mask(late, table["particle"].map({0: 1, 1: 0, 2: 2, 3: 3}))
+    with pytest.warns(perrin.IdentityWarning) as caught:
+        perrin.identify(table.assign(particle=exchanged), contact=DIAMETER, size=4)
+    (warning,) = caught
+    assert str(warning.message) == (
+        "identity: 2 labels of the column particle pass to another particle, in frame 12; they are "
+        "corrected"
+    )
+    assert warning.filename == __file__
 
 
 def test_groups_stop_growing_at_their_size():

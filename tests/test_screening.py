@@ -1,4 +1,4 @@
-"""Which rows of a table are no measurements, and what its distances say of the unit."""
+"""Which rows of a table are no measurements, and whether its distances are in um."""
 
 from __future__ import annotations
 
@@ -100,25 +100,25 @@ def test_a_table_with_repeats_is_that_without_these_rows():
 
 @pytest.mark.parametrize("scale", [1.0, 0.107])
 @pytest.mark.parametrize(("digits", "D_R"), [(0, 1e-5), (1, 1e-3), (2, 1e-8), (2, 5e-3), (5, 5e-3)])
-def test_repeats_by_rounding_are_measurements(digits, D_R, scale):
+def test_repeats_by_rounding_are_measurements(digits, D_R, scale, repeats):
     """Pixels, few digits, bodies that hardly move or not at all: coincidences are no repeats."""
-    for seed in range(4):
+    for seed in range(repeats(2, 4)):
         x = np.round(tracks(seed, D_R=D_R, D_T=8 * D_R), digits) * scale
         screened = screen_rows(table_of(x, 15))
         assert screened.warnings == ()
         assert not screened.table["x"].isna().any()
 
 
-def test_a_particle_that_sticks_is_measured():
+def test_a_particle_that_sticks_is_measured(repeats):
     """In pixels, a particle that moves and then sticks repeats its place for good reason."""
-    for seed in range(4):
+    for seed in range(repeats(2, 4)):
         x = tracks(seed)
         x[150:] = x[150] + np.random.default_rng(seed).normal(scale=0.1, size=x[150:].shape)
         assert screen_rows(table_of(x, 0)).warnings == ()
 
 
 def test_a_particle_that_never_moves_is_kept():
-    """A place held in every row is a place, and no statement is made about it."""
+    """The same position in every row is a measurement, without a warning."""
     x = tracks(8)
     x[:, 3] = 17.0
     assert screen_rows(table_of(x)).warnings == ()
@@ -165,7 +165,7 @@ def test_far_points_are_those_beyond_twenty_sizes():
 
 
 def test_of_two_points_far_from_each_other_none_is_trusted():
-    """Nothing says which of two ends is wrong."""
+    """Which of two points is wrong is unknown."""
     x = tracks(12, n=2)
     x[7, 0] += 500.0
     assert np.argwhere(far_points(x)).tolist() == [[7, 0], [7, 1]]
@@ -188,9 +188,9 @@ def test_a_removed_centre_is_found_at_every_resolution(digits):
 
 
 @pytest.mark.parametrize("digits", [0, 1, 2, 5])
-def test_a_body_at_rest_has_its_centre(digits):
-    """A centre that rests because the body does was not removed."""
-    for seed in range(4):
+def test_a_body_at_rest_has_its_centre(digits, repeats):
+    """The centre of a body at rest is at rest, and was not removed."""
+    for seed in range(repeats(2, 4)):
         x = tracks(seed, D_R=1e-9, D_T=1e-9, sigma=0.005, n_frames=60)
         assert not centre_removed(np.round(x, digits))
     assert not centre_removed(np.zeros((50, 4, 3)))
@@ -210,7 +210,7 @@ def test_the_nearest_distance_is_stated():
 
 
 def test_units_that_are_no_colloids_warn():
-    """Pixels of trackpy with scale 1, metres, nanometres: one line each; the scale silences it."""
+    """Pixels of trackpy with scale 1, metres, nanometres: one line each; none with a scale."""
     table = table_of(tracks(15))
     (text,) = distance_notes(table, scale_given=False, trackpy_columns=True)[1]
     assert "columns that trackpy writes, whose coordinates are pixels" in text
@@ -228,7 +228,7 @@ def test_units_that_are_no_colloids_warn():
 
 
 def test_trackpy_is_known_by_two_of_its_columns():
-    """One column of mass or size may be anyone's."""
+    """Other programs write one column of mass or size, too."""
     assert has_trackpy_columns(["frame", "x", "y", "mass", "ecc"])
     assert not has_trackpy_columns(["frame", "x", "y", "size"])
 

@@ -28,6 +28,7 @@ from perrin.diffusion.steps import residual_freedom
 from perrin.diffusion.tensors import diffusion_tensor
 from perrin.errors import (
     DegenerateClusterError,
+    IdentityWarning,
     PrecisionWarning,
     TooFewFramesError,
     TrackTableError,
@@ -376,7 +377,9 @@ def _fit(
 def _fit_body(tracks: _Tracks, cluster: int, label: str | None, conditions: Conditions) -> _Body:
     """Settle which label belongs to which particle, fit the common shape, and judge the fits."""
     frames = tracks.frames
-    identity = settle_identity(tracks.positions, times=conditions.clock(frames))
+    # The remarks on identity state what this warning would.
+    with python_warnings.catch_warnings(action="ignore", category=IdentityWarning):
+        identity = settle_identity(tracks.positions, times=conditions.clock(frames))
     positions = identity.arranged(tracks.positions)
     changed = (np.diff(tracks.piece) != 0) | (np.diff(identity.piece) != 0)
     piece = np.append(0, np.cumsum(changed)).astype(np.int64)

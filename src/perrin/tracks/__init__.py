@@ -1,7 +1,20 @@
 """Track tables: which particle is which, and which particles form a cluster."""
 
-from perrin.tracks.bonds import Pairs, frames_of, rigid_groups
-from perrin.tracks.clock import Clock, evenly_spaced, frame_stride, read_clock
+from perrin.tracks.bonds import (
+    Pairs,
+    are_one_body,
+    followed_pairs,
+    joined_pairs,
+    neighbour_pairs,
+    noise_along,
+    rigid_groups,
+)
+from perrin.tracks.clock import (
+    Clock,
+    evenly_spaced,
+    frame_stride,
+    read_clock,
+)
 from perrin.tracks.clusters import (
     cluster_positions,
     each_cluster,
@@ -9,53 +22,158 @@ from perrin.tracks.clusters import (
     identify,
     positions_table,
 )
-from perrin.tracks.column_names import Spelling, recognise_columns, seconds, unit_faults
-from perrin.tracks.files import check_tracks, read_spheres, read_tracks, write_tracks
-from perrin.tracks.gdf import gdf_bytes, parse_gdf
-from perrin.tracks.identity import Identity, settle_identity
-from perrin.tracks.linking import link_clusters, touching_groups
+from perrin.tracks.column_names import (
+    Spelling,
+    recognise_columns,
+    seconds,
+    unit_faults,
+)
+from perrin.tracks.files import (
+    RowNumbers,
+    check_tracks,
+    read_spheres,
+    read_tracks,
+    write_tracks,
+)
+from perrin.tracks.formats import (
+    SUFFIXES,
+    parse_csv,
+    parse_table,
+    table_bytes,
+    table_suffix,
+)
+from perrin.tracks.gdf import (
+    gdf_bytes,
+    parse_gdf,
+)
+from perrin.tracks.groups import (
+    TOUCHING_REACH,
+    connected_groups,
+    frames_of,
+    touching_groups,
+)
+from perrin.tracks.identity import (
+    BodyModel,
+    Candidates,
+    Detections,
+    Identity,
+    Pose,
+    all_assignments,
+    assigned_points,
+    best_assignments,
+    body_size,
+    candidate_assignments,
+    covering_rotations,
+    icp_fit,
+    icp_search,
+    labels_are_certain,
+    labels_in_time,
+    median_chi2,
+    most_likely_identity,
+    most_likely_path,
+    rigid_fits,
+    settle_identity,
+    shape_symmetry,
+    squared_angle,
+)
+from perrin.tracks.linking import (
+    Centers,
+    link_clusters,
+    linked_tracks,
+    step_variance,
+)
 from perrin.tracks.screening import (
+    CENTRE_REMOVED,
+    TRACKPY_COLUMNS,
     Screened,
     centre_removed,
     distance_notes,
     far_points,
     far_sentence,
     has_trackpy_columns,
+    lattice_step,
+    placeholder_rows,
+    repeated_rows,
+    rounding_chances,
     screen_rows,
 )
-from perrin.tracks.writing import written_whole
+from perrin.tracks.writing import (
+    written_whole,
+)
 
 __all__ = [
+    "CENTRE_REMOVED",
+    "SUFFIXES",
+    "TOUCHING_REACH",
+    "TRACKPY_COLUMNS",
+    "BodyModel",
+    "Candidates",
+    "Centers",
     "Clock",
+    "Detections",
     "Identity",
     "Pairs",
+    "Pose",
+    "RowNumbers",
     "Screened",
     "Spelling",
+    "all_assignments",
+    "are_one_body",
+    "assigned_points",
+    "best_assignments",
+    "body_size",
+    "candidate_assignments",
     "centre_removed",
     "check_tracks",
     "cluster_positions",
+    "connected_groups",
+    "covering_rotations",
     "distance_notes",
     "each_cluster",
     "evenly_spaced",
     "far_points",
     "far_sentence",
     "find_clusters",
+    "followed_pairs",
     "frame_stride",
     "frames_of",
     "gdf_bytes",
     "has_trackpy_columns",
+    "icp_fit",
+    "icp_search",
     "identify",
+    "joined_pairs",
+    "labels_are_certain",
+    "labels_in_time",
+    "lattice_step",
     "link_clusters",
+    "linked_tracks",
+    "median_chi2",
+    "most_likely_identity",
+    "most_likely_path",
+    "neighbour_pairs",
+    "noise_along",
+    "parse_csv",
     "parse_gdf",
+    "parse_table",
+    "placeholder_rows",
     "positions_table",
     "read_clock",
     "read_spheres",
     "read_tracks",
     "recognise_columns",
+    "repeated_rows",
+    "rigid_fits",
     "rigid_groups",
+    "rounding_chances",
     "screen_rows",
     "seconds",
     "settle_identity",
+    "shape_symmetry",
+    "squared_angle",
+    "step_variance",
+    "table_bytes",
+    "table_suffix",
     "touching_groups",
     "unit_faults",
     "write_tracks",

@@ -3,25 +3,28 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from perrin._arrays import from_plain, to_plain
 from perrin._text import frames_text
 from perrin.errors import TrackTableError
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     import pandas as pd
 
     from perrin._arrays import Floats, Ints
 
 
-# Times that are off an even grid by less than this share of dt are on it.
-_EVEN = 5e-4
+# Times that differ from an even grid by less than this share of dt are even.
+_GRID_TOLERANCE = 5e-4
 
 
-# The usual interval of the column may differ from dt by this share: what clocks and rounding do.
-_AGREES = 0.01
+# The median interval of the column may differ from dt by this share: clocks are not exact.
+_DT_TOLERANCE = 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,9 +34,9 @@ class Clock:
     Attributes
     ----------
     frames : ndarray of int, shape (K,)
-        Frames whose time is known, rising.
+        Frames whose time is known, in rising order.
     times : ndarray, shape (K,)
-        s.
+        Times of these frames, s.
     dt : float
         Time between the frames before the first and after the last of these, s.
     """
@@ -54,6 +57,39 @@ class Clock:
         start = float(self.at(np.array([first]))[0])
         return Clock(self.frames - first, self.times - start, self.dt)
 
+    def to_dict(self) -> dict[str, Any]:
+        """Return the attributes as lists and numbers, which JSON can hold.
+
+        Returns
+        -------
+        dict
+            One entry per attribute.
+        """
+        plain: dict[str, Any] = to_plain(vars(self))
+        return plain
+
+    @classmethod
+    def from_dict(cls, entry: Mapping[str, Any]) -> Clock:
+        """Return the clock that `to_dict` wrote.
+
+        Parameters
+        ----------
+        entry : mapping
+            As `to_dict` returns it, also after a round trip through JSON.
+
+        Returns
+        -------
+        Clock
+
+        Examples
+        --------
+        >>> clock = Clock(np.array([0, 2]), np.array([0.0, 1.5]), 0.7)
+        >>> Clock.from_dict(clock.to_dict()).times
+        array([0. , 1.5])
+        """
+        frames = from_plain(entry["frames"], dtype=np.int64)
+        return cls(frames, from_plain(entry["times"]), float(entry["dt"]))
+
 
 def read_clock(table: pd.DataFrame, *, dt: float) -> tuple[Clock | None, tuple[str, ...]]:
     """Return the times of the frames from the column ``time`` of a table, and notes on them.
@@ -71,6 +107,7 @@ def read_clock(table: pd.DataFrame, *, dt: float) -> tuple[Clock | None, tuple[s
         The time of a frame is the mean over its rows. None without a column ``time``, and where
         frames are dt apart.
     notes : tuple of str
+        Sentences on how the column is used.
 
     Raises
     ------
@@ -95,7 +132,24 @@ def read_clock(table: pd.DataFrame, *, dt: float) -> tuple[Clock | None, tuple[s
     frame = mean.index.to_numpy(dtype=np.int64)[known]
     time = mean.to_numpy(dtype=np.float64)[known]
     spread = float((by_frame.max() - by_frame.min()).max())
-    faults = _faults(frame, time, missing=int((~known).sum()), spread=spread, dt=dt)
+    missing, step = int((~known).sum()), np.diff(time)
+    usual = float(np.median(step / np.diff(frame))) if step.size else dt
+    back = np.flatnonzero(step <= 0)
+    faults = []
+    if missing > len(time):
+        faults.append(f"{missing} of {missing + len(time)} frames have none")
+    elif back.size:
+        where = frames_text(frame[back + 1])
+        faults.append(f"it does not rise from one frame to the next at {where}")
+    else:
+        if abs(usual - dt) > _DT_TOLERANCE * dt:
+            faults.append(
+                f"its median interval is {usual:.6g} s a frame, which contradicts dt = {dt:g} s"
+            )
+        if step.size and spread > usual:
+            faults.append(
+                f"rows of one frame differ by up to {spread:.3g} s, more than an interval"
+            )
     if faults:
         raise TrackTableError(
             f"the column time: {'; '.join(faults)}. Correct it or dt, or leave the column out",
@@ -110,7 +164,7 @@ def read_clock(table: pd.DataFrame, *, dt: float) -> tuple[Clock | None, tuple[s
     ]
     if not known.all():
         notes.append(f"{(~known).sum()} frames have no time; theirs is interpolated")
-    if spread > _EVEN * dt:
+    if spread > _GRID_TOLERANCE * dt:
         notes.append(f"the times of one frame differ by up to {spread:.3g} s; their mean is used")
     return Clock(frame, time, dt), tuple(notes)
 
@@ -125,32 +179,11 @@ def evenly_spaced(times: Floats, frames: Ints, *, dt: float) -> bool:
     True
     """
     grid = times[0] + dt * (frames - frames[0])
-    return bool(np.all(np.abs(times - grid) <= _EVEN * dt))
-
-
-def _faults(frame: Ints, time: Floats, *, missing: int, spread: float, dt: float) -> list[str]:
-    """Return what keeps the times from being those of the frames."""
-    if missing > len(time):
-        return [f"{missing} of {missing + len(time)} frames have none"]
-    step, number = np.diff(time), np.diff(frame)
-    if not len(step):
-        return []
-    back = np.flatnonzero(step <= 0)
-    if back.size:
-        return [f"it does not rise from one frame to the next at {frames_text(frame[back + 1])}"]
-    usual = float(np.median(step / number))
-    faults = []
-    if abs(usual - dt) > _AGREES * dt:
-        faults.append(
-            f"its median interval is {usual:.6g} s a frame, which contradicts dt = {dt:g} s"
-        )
-    if spread > usual:
-        faults.append(f"rows of one frame differ by up to {spread:.3g} s, more than an interval")
-    return faults
+    return bool(np.all(np.abs(times - grid) <= _GRID_TOLERANCE * dt))
 
 
 def frame_stride(table: pd.DataFrame) -> tuple[str, ...]:
-    """State in words where all frame numbers are multiples of a number, counted from the first.
+    """Return a sentence where all frame numbers are multiples of a number, counted from the first.
 
     Examples
     --------

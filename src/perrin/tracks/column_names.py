@@ -1,4 +1,4 @@
-"""Which column of a track table is which: names in other spellings, and the units they state."""
+"""Which column of a track table is which: other spellings of names, and units in names."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ COLUMNS = ("frame", "particle", "x", "y", "z", "cluster", "time")
 
 
 # Spellings are compared without regard to case, blanks, underscores and units.
-_SPELLINGS = {
+_OURS_BY_SPELLING = {
     **{name: name for name in COLUMNS},
     "framenumber": "frame",
     "particleid": "particle",
@@ -24,7 +24,7 @@ _SPELLINGS = {
 }
 
 
-_UM: dict[str, float | None] = {
+_UNIT_UM: dict[str, float | None] = {
     **dict.fromkeys(("um", "\u03bcm", "micron", "microns", "micrometer", "micrometre"), 1.0),
     **dict.fromkeys(("nm", "nanometer", "nanometre"), 1e-3),
     **dict.fromkeys(("mm", "millimeter", "millimetre"), 1e3),
@@ -35,7 +35,7 @@ _UM: dict[str, float | None] = {
 }
 
 
-_SECONDS = {
+_UNIT_SECONDS = {
     **dict.fromkeys(("s", "sec", "second", "seconds"), 1.0),
     **dict.fromkeys(("ms", "msec"), 1e-3),
     **dict.fromkeys(("min", "minute", "minutes"), 60.0),
@@ -43,7 +43,12 @@ _SECONDS = {
 }
 
 
-_UNITS: dict[str, Mapping[str, float | None]] = {"x": _UM, "y": _UM, "z": _UM, "time": _SECONDS}
+_UNITS_OF: dict[str, Mapping[str, float | None]] = {
+    "x": _UNIT_UM,
+    "y": _UNIT_UM,
+    "z": _UNIT_UM,
+    "time": _UNIT_SECONDS,
+}
 
 
 # A unit at the end of a name: in brackets, or one of these after an underscore, as in x_um.
@@ -53,21 +58,23 @@ _IN_BRACKETS = re.compile(r"(.*?)[\s_]*(?:\(([^()]*)\)|\[([^\[\]]*)\])")
 _AFTER_UNDERSCORE = re.compile(r"(.*)_(um|\u03bcm|nm|mm|px|pixels?|s|ms)")
 
 
-_ROUNDING = 1e-6  # relative difference of two scales that are the same
+_SCALE_ROUNDING = 1e-6  # relative difference of two scales that are the same
 
 
 @dataclass(frozen=True)
 class Spelling:
-    """Which columns of a table are ours in another spelling, and the units that their names state.
+    """Columns of a table that are ours in another spelling, and the units in their names.
 
     Attributes
     ----------
     renamed : mapping of str to str
-        The name in the table to ours.
+        Our name for each name in the table.
     units : mapping of str to (str, str)
-        Our name to the name in the table and its unit, for the coordinates and the time.
-    notes, faults : tuple of str
-        What was recognised, and where two columns could be the same one of ours.
+        Name in the table and its unit, for our names of coordinates and the time.
+    notes : tuple of str
+        Sentences on the columns that were recognised, left out or converted.
+    faults : tuple of str
+        Sentences on columns that could be the same one of ours.
     """
 
     renamed: Mapping[str, str]
@@ -86,8 +93,8 @@ def recognise_columns(
     names : iterable
         Names of the columns; those that are no text are none of ours.
     taken : mapping, optional
-        Our names that are already given to columns, which `names` lacks, to the names of these in
-        the table; None where that name does not count.
+        Names in the table of the columns, not among `names`, to which our names are already given;
+        None where that name does not count.
 
     Returns
     -------
@@ -105,7 +112,7 @@ def recognise_columns(
     """
     given, taken = list(names), taken or {}
     renamed, units, left, faults = {}, _units_of(taken), [], []
-    for ours, found in _candidates(given).items():
+    for ours, found in _other_spellings(given).items():
         if ours in taken:
             continue
         if ours in given:
@@ -118,7 +125,18 @@ def recognise_columns(
         else:
             renamed[found[0]] = ours
             units |= _units_of({ours: found[0]})
-    return Spelling(renamed, units, _notes(renamed, left, units), tuple(faults))
+    notes = []
+    if renamed:
+        pairs = listed(f"{theirs!r} as {ours}" for theirs, ours in renamed.items())
+        notes.append(f"columns recognised: {pairs}")
+    if left:
+        notes.append(
+            f"columns left out beside others with exactly our names: {listed(map(repr, left))}"
+        )
+    if seconds(units) != 1:
+        name, unit = units["time"]
+        notes.append(f"column {name!r} is converted from {unit} to s")
+    return Spelling(renamed, units, tuple(notes), tuple(faults))
 
 
 def unit_faults(units: Mapping[str, tuple[str, str]], scale: Mapping[str, float]) -> list[str]:
@@ -142,14 +160,14 @@ def unit_faults(units: Mapping[str, tuple[str, str]], scale: Mapping[str, float]
     >>> unit_faults({"x": ("x (um)", "um")}, {"x": 0.1, "y": 0.1})[0].partition(";")[0]
     "scale: 'x (um)' is in um, but the scale is 0.1 um per unit"
     """
-    stated = {axis: _UM[units[axis][1]] for axis in scale if axis in units}
+    stated = {axis: _UNIT_UM[units[axis][1]] for axis in scale if axis in units}
     # 1 for all axes is the default; a pixel of 1 um beside other sizes is a statement.
     given = any(value != 1 for value in scale.values())
     unknown = [axis for axis, um in stated.items() if um is None and not given]
     wrong = [
         axis
         for axis, um in stated.items()
-        if um is not None and abs(scale[axis] / um - 1) > _ROUNDING
+        if um is not None and abs(scale[axis] / um - 1) > _SCALE_ROUNDING
     ]
     faults = []
     if unknown:
@@ -176,18 +194,18 @@ def seconds(units: Mapping[str, tuple[str, str]]) -> float:
     >>> seconds({"time": ("time (ms)", "ms")}), seconds({})
     (0.001, 1.0)
     """
-    return _SECONDS[units["time"][1]] if "time" in units else 1.0
+    return _UNIT_SECONDS[units["time"][1]] if "time" in units else 1.0
 
 
-def _candidates(names: list[object]) -> dict[str, list[str]]:
+def _other_spellings(names: list[object]) -> dict[str, list[str]]:
     """Return, for each of our names, the columns with it in another spelling."""
     found: dict[str, list[str]] = {}
     for name in names:
         if not isinstance(name, str):
             continue
         base, unit = _base_and_unit(name)
-        ours = _SPELLINGS.get(base)
-        if ours is not None and name != ours and (not unit or unit in _UNITS.get(ours, {})):
+        ours = _OURS_BY_SPELLING.get(base)
+        if ours is not None and name != ours and (not unit or unit in _UNITS_OF.get(ours, {})):
             found.setdefault(ours, []).append(name)
     return found
 
@@ -201,7 +219,7 @@ def _base_and_unit(name: str) -> tuple[str, str]:
     found = _IN_BRACKETS.fullmatch(base) or _AFTER_UNDERSCORE.fullmatch(base)
     if found:
         ending = next(part for part in found.groups()[1:] if part is not None).strip()
-        if ending in _UM or ending in _SECONDS:
+        if ending in _UNIT_UM or ending in _UNIT_SECONDS:
             base, unit = found[1], ending
     return re.sub(r"[\s_]+", "", base), unit
 
@@ -211,7 +229,7 @@ def _units_of(taken: Mapping[str, str | None]) -> dict[str, tuple[str, str]]:
     stated = {}
     for ours, name in taken.items():
         unit = _base_and_unit(name)[1] if name is not None else ""
-        if name is not None and unit in _UNITS.get(ours, {}):
+        if name is not None and unit in _UNITS_OF.get(ours, {}):
             stated[ours] = name, unit
     return stated
 
@@ -225,21 +243,3 @@ def _contradiction(
     given = listed(dict.fromkeys(f"{scale[axis]:g}" for axis in axes))
     verb = "is" if len(axes) == 1 else "are"
     return f"scale: {names} {verb} in {kinds}, but the scale is {given} um per unit"
-
-
-def _notes(
-    renamed: Mapping[str, str], left: list[str], units: Mapping[str, tuple[str, str]]
-) -> tuple[str, ...]:
-    """State which columns were recognised, left out beside one of our names, or converted."""
-    notes = []
-    if renamed:
-        pairs = listed(f"{theirs!r} as {ours}" for theirs, ours in renamed.items())
-        notes.append(f"columns recognised: {pairs}")
-    if left:
-        notes.append(
-            f"columns left out beside others with exactly our names: {listed(map(repr, left))}"
-        )
-    if seconds(units) != 1:
-        name, unit = units["time"]
-        notes.append(f"column {name!r} is converted from {unit} to s")
-    return tuple(notes)

@@ -7,8 +7,7 @@ order of the magic number is that of the file.
 
 from __future__ import annotations
 
-import math
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,10 +16,10 @@ from perrin.errors import table_error
 if TYPE_CHECKING:
     from perrin._arrays import Floats
 
-_MAGIC = 82991
+_GDF_MAGIC = 82991
 
 
-_TYPES = {1: "u1", 2: "i2", 3: "i4", 4: "f4", 5: "f8"}
+_GDF_TYPES = {1: "u1", 2: "i2", 3: "i4", 4: "f4", 5: "f8"}
 
 
 def parse_gdf(data: bytes, source: str) -> Floats:
@@ -30,27 +29,27 @@ def parse_gdf(data: bytes, source: str) -> Floats:
     ------
     TrackTableError
         If these are not the bytes of a whole binary .gdf file; `source` is its name.
+
+    Examples
+    --------
+    >>> parse_gdf(gdf_bytes(np.array([[0.5, 1.5, 0.0, 7.0]])), "t.gdf")
+    array([[0.5, 1.5, 0. , 7. ]])
     """
     if data.startswith(b"GDF v. 1.0"):
         raise table_error(
             source, "the ASCII variant of GDF; write it again in binary, without /ascii"
         )
-    shape, dtype, offset = _header(data, source)
-    expected, found = math.prod(shape) * dtype.itemsize, len(data) - offset
-    if found != expected:
-        what = "cut short" if found < expected else "too long"
+    orders = {_GDF_MAGIC.to_bytes(4, "little"): "<", _GDF_MAGIC.to_bytes(4, "big"): ">"}
+    if data[:4] not in orders:
         raise table_error(
             source,
-            f"{what}: {shape[0]} rows of {shape[1]} columns ({dtype.name}) take {expected} bytes "
-            f"after the header, the file has {found}; copy or write it again",
+            f"not a .gdf file: it does not begin with the magic number {_GDF_MAGIC} in either "
+            f"byte order, but with the bytes {data[:4].hex(' ') or '(none)'}",
         )
-    values = np.frombuffer(data, dtype=dtype, offset=offset).reshape(shape)
-    return values.astype(np.float64)
-
-
-def _header(data: bytes, source: str) -> tuple[tuple[int, int], np.dtype[Any], int]:
-    """Return (rows, columns), the type of the numbers, and where they begin."""
-    words = _words(data, source)
+    order = orders[data[:4]]
+    # As many words as the header of a table of two dimensions has.
+    head = data[: min(24, len(data) // 4 * 4)]
+    words = [int(word) for word in np.frombuffer(head, dtype=f"{order}i4")]
     n_dims = words[1] if len(words) > 1 else 0
     if len(words) > 1 and n_dims not in (1, 2):
         raise table_error(
@@ -62,8 +61,8 @@ def _header(data: bytes, source: str) -> tuple[tuple[int, int], np.dtype[Any], i
     n_columns, n_rows = (*words[2 : 2 + n_dims], 1)[:2]
     code, count = words[2 + n_dims : 4 + n_dims]
     faults = []
-    if code not in _TYPES:
-        kinds = ", ".join(f"{c} {np.dtype(t).name}" for c, t in _TYPES.items())
+    if code not in _GDF_TYPES:
+        kinds = ", ".join(f"{c} {np.dtype(t).name}" for c, t in _GDF_TYPES.items())
         faults.append(f"unknown type code {code} in the header; expected one of {kinds}")
     if min(n_columns, n_rows) < 0 or count != n_columns * n_rows:
         faults.append(
@@ -72,30 +71,26 @@ def _header(data: bytes, source: str) -> tuple[tuple[int, int], np.dtype[Any], i
         )
     if faults:
         raise table_error(source, *faults)
-    order = _byte_order(data)
-    return (n_rows, n_columns), np.dtype(f"{order}{_TYPES[code]}"), 4 * (n_dims + 4)
-
-
-def _byte_order(data: bytes) -> str:
-    """Return "<" or ">" by the magic number, "" without it."""
-    orders = {_MAGIC.to_bytes(4, "little"): "<", _MAGIC.to_bytes(4, "big"): ">"}
-    return orders.get(data[:4], "")
-
-
-def _words(data: bytes, source: str) -> list[int]:
-    """Return the first words of the file, as many as a header of two dimensions has."""
-    order = _byte_order(data)
-    if not order:
+    dtype, offset = np.dtype(f"{order}{_GDF_TYPES[code]}"), 4 * (n_dims + 4)
+    expected, found = n_rows * n_columns * dtype.itemsize, len(data) - offset
+    if found != expected:
+        what = "cut short" if found < expected else "too long"
         raise table_error(
             source,
-            f"not a .gdf file: it does not begin with the magic number {_MAGIC} in either "
-            f"byte order, but with the bytes {data[:4].hex(' ') or '(none)'}",
+            f"{what}: {n_rows} rows of {n_columns} columns ({dtype.name}) take {expected} bytes "
+            f"after the header, the file has {found}; copy or write it again",
         )
-    head = data[: min(24, len(data) // 4 * 4)]
-    return [int(word) for word in np.frombuffer(head, dtype=f"{order}i4")]
+    values = np.frombuffer(data, dtype=dtype, offset=offset).reshape((n_rows, n_columns))
+    return values.astype(np.float64)
 
 
 def gdf_bytes(values: Floats) -> bytes:
-    """Return a table (rows, columns) as a little-endian .gdf file of float64 numbers."""
-    header = [_MAGIC, 2, values.shape[1], values.shape[0], 5, values.size]
+    """Return a table (rows, columns) as a little-endian .gdf file of float64 numbers.
+
+    Examples
+    --------
+    >>> gdf_bytes(np.array([[0.5, 1.5]])).hex(" ", 4)[:35]
+    '2f440100 02000000 02000000 01000000'
+    """
+    header = [_GDF_MAGIC, 2, values.shape[1], values.shape[0], 5, values.size]
     return np.array(header, dtype="<i4").tobytes() + values.astype("<f8").tobytes()

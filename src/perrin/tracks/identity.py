@@ -1,44 +1,77 @@
-"""Which detection is which particle of a body, in every frame."""
+"""Which detection is which particle of a rigid body, in every frame.
+
+The integers of this module, one word for one meaning:
+
+=============  ===========  ======================================================================
+word           range        meaning
+=============  ===========  ======================================================================
+row            0 to T - 1   frame, as the first index of the array of positions
+column         0 to m - 1   second index of that array; in a track table one particle id
+detection      0 to w - 1   point of a row, counted without the missing ones (`Detections`)
+particle       0 to n - 1   point of the shape of the body (`BodyModel`)
+candidate      0 to C - 1   one of the assignments that are compared in a row (`Candidates`)
+=============  ===========  ======================================================================
+
+and the arrays of these integers:
+
+=============  ===========  ======================================================================
+word           shape        meaning
+=============  ===========  ======================================================================
+assignment     (..., n)     detection of each particle, -1 where it is missing
+order          (..., n)     column of each particle, -1 where it is missing
+label          (..., m)     particle of each column, -1 where unknown: the inverse of an order
+symmetry       (G, n)       permutations of the particles that leave the shape unchanged
+shown          (T,)         number of detections of each row
+used           (...)        number of detections that an assignment uses
+=============  ===========  ======================================================================
+"""
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import combinations, permutations
 from math import lgamma
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from perrin._arrays import Bools, Floats, Ints, as_positions, frozen, present
+from perrin._arrays import Bools, Floats, Ints, as_positions, from_plain, frozen, present, to_plain
+from perrin._text import frames_text
+from perrin.errors import IdentityWarning
 from perrin.geometry.rigid import degrees_of_freedom
 from perrin.geometry.rotations import fit_rotations
+from perrin.geometry.shapes import pair_distances
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Mapping
 
     from numpy.typing import ArrayLike
 
 
 # A fit is noise-like up to this multiple of the usual mean square residual: chance does not reach
 # it in a frame of usual quality, and an exchanged pair (1000 times and more) is far above.
-_NOISE = 16.0
+_NOISE_LIKE = 16.0
 
 
 # Degrees of freedom of the Student law of a frame's misfit: the odds between two assignments of a
 # bad frame depend on the ratio of their misfits, not on their difference in units of usual noise.
-_STUDENT = 8.0
+_STUDENT_FREEDOM = 8.0
 
 
-# Up to so many particles every assignment is tried, and so many frames at most build the template.
-_ALL, _MODELS = 6, 300
+# Every assignment is tried for bodies of up to this number of particles.
+_MOST_PERMUTED = 6
+
+
+_MOST_MODEL_ROWS = 300  # rows from which the shape is averaged
 
 
 # Log-odds: an assignment is settled when the next best is a hundred times less likely, and lasting
 # labels are trusted e^18 times more than an exchange of them. Right labels are then doubted when
 # chance makes another assignment e^18/100 = 6.6e5 times likelier, in at most 300 x 11/6.6e5 = 0.5 %
 # of the tracks of 300 frames of a tetrahedron (likelihood ratios exceed c with probability 1/c).
-_DOUBT, _TRUST = float(np.log(100.0)), 18.0
+_SETTLED_LOG_ODDS, _LABEL_LOG_ODDS = float(np.log(100.0)), 18.0
 
 
 # A least turn of over this many standard deviations of an axis (squared) widens the law of the step
@@ -48,21 +81,22 @@ _LEAP_UNLABELLED, _LEAP_LABELLED = 16.0, 4.0
 
 
 # A step of under 0.4 of the least angle between two assignments cannot be mistaken.
-_SHORT = 0.4
+_SHORT_STEP = 0.4
 
 
-_BATCH = 100_000
+_BATCH_FITS = 100_000  # rigid fits at a time: bounds the memory
 
 
-_COMPLETE = 0.05
+# A column with points in this share of the rows is a particle.
+_LASTING_SHARE = 0.05
 
 
-_TINY = 1e-6  # rad: what rounding leaves of a rotation
+_ROUNDING_ANGLE = 1e-6  # rotations by less than this, rad, are rounding errors
 
 
-# Of large bodies a fit this near (of the least particle distance) is right; searched from one in
-# five of the orientations.
-_CLOSE, _COARSE = 0.1, 5
+# A fit of a large body this close (of the least particle distance) is right, and ends a search that
+# begins at one in this number of the covering rotations.
+_CLOSE_FIT, _ROTATION_STRIDE = 0.1, 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,13 +108,13 @@ class Identity:
     order : ndarray of int, shape (T, n)
         The column of each particle; -1 where it is missing.
     piece : ndarray of int, shape (T,)
-        Stretches of doubtless identity.
+        Number of the piece that each row belongs to; within a piece the identity is certain.
     swaps : ndarray of int
         Rows at which a label passes to another particle; `order` corrects it.
     cuts : ndarray of int
         Rows that begin a new piece: two assignments were about as likely.
     extra : ndarray of int
-        Rows in which a detection is left out as no particle of the body.
+        Rows in which a detection is left out because it is no particle of the body.
     unsettled : ndarray of int
         Rows with enough detections for a pose whose misfit is over 16 times the usual mean square.
         They keep their labels.
@@ -102,6 +136,41 @@ class Identity:
         taken = np.take_along_axis(x, np.maximum(self.order, 0)[..., None], axis=1)
         return np.where(self.order[..., None] >= 0, taken, np.nan)
 
+    def to_dict(self) -> dict[str, Any]:
+        """Return the attributes as lists, which JSON can hold.
+
+        Returns
+        -------
+        dict
+            One entry per attribute.
+        """
+        plain: dict[str, Any] = to_plain(vars(self))
+        return plain
+
+    @classmethod
+    def from_dict(cls, entry: Mapping[str, Any]) -> Identity:
+        """Return the identity that `to_dict` wrote.
+
+        Parameters
+        ----------
+        entry : mapping
+            As `to_dict` returns it, also after a round trip through JSON.
+
+        Returns
+        -------
+        Identity
+
+        Examples
+        --------
+        >>> import perrin
+        >>> found = settle_identity(perrin.Cluster.tetrahedron(1.5).positions[None])
+        >>> Identity.from_dict(found.to_dict()).order
+        array([[0, 1, 2, 3]])
+        """
+        order = from_plain(entry["order"], dtype=np.int64)
+        names = ("piece", "swaps", "cuts", "extra", "unsettled")
+        return cls(order, *(from_plain(entry[name], dtype=np.int64) for name in names))
+
 
 def settle_identity(
     positions: ArrayLike,
@@ -120,12 +189,13 @@ def settle_identity(
     ----------
     positions : array_like, shape (T, m, d)
         Detections of one body, um; NaN where there is none. Columns mean nothing where `labelled`
-        is False. Columns that are never seen together may be the same particle.
+        is False. Columns that never occur in the same row may be the same particle.
     times : array_like, shape (T,), optional
         Time of each row, any unit; default 0, 1, 2, ...
     size : int, optional
         Number of particles n of the body; default: the columns with points in over 5 % of the rows
-        if every two of them are seen together, else the most seen together in 5 % of the rows.
+        if every two of them occur together, else the number of points in the fullest 5 % of the
+        rows.
     labelled : bool
         Whether a column is meant to be one particle throughout. It then stays one unless an
         exchange is e^18 times more likely.
@@ -139,6 +209,11 @@ def settle_identity(
     ValueError
         For bad shapes.
 
+    Warns
+    -----
+    IdentityWarning
+        Where labels were corrected; the message states how many, and in which frames.
+
     Notes
     -----
     The likelihood of an assignment is (1 + S/(8 sigma^2))^(-(8 + f)/2) exp(-theta^2/(2 s^2)): S is
@@ -146,47 +221,127 @@ def settle_identity(
     angle of the step and s^2 from the median step, growing with the time across gaps. The misfit
     follows a Student law, so that a frame noisier than the others is no evidence for another
     assignment. s^2 is at least 1/16 of the least squared turn (1/4 with labels): a leap is not
-    judged by the law of small steps. With labels the assignment last held is always a candidate,
-    in a frame in which nothing fits as well. All assignments are tried for up to 6
-    particles; beyond, linear assignment and rigid fit in turn, from many orientations.
+    judged by the law of small steps. With labels the assignment of the last frame is always a
+    candidate, also in a frame in which nothing fits as well. All assignments are tried for up to 6
+    particles; for more, linear assignment and rigid fit alternate, from many orientations.
 
     Examples
     --------
+    >>> import warnings
     >>> import numpy as np
-    >>> from perrin import Cluster, simulate_motion
+    >>> from perrin import Cluster, IdentityWarning, simulate_motion
     >>> from perrin.tracks.identity import settle_identity
     >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=40, rng=1)
     >>> x = truth.positions() + 0.01 * np.random.default_rng(1).normal(size=(40, 4, 3))
     >>> x[25:] = x[25:, [1, 0, 2, 3]]
-    >>> found = settle_identity(x)
+    >>> with warnings.catch_warnings(action="ignore", category=IdentityWarning):
+    ...     found = settle_identity(x)
     >>> found.swaps.tolist(), found.order[24].tolist(), found.order[25].tolist()
     ([25], [0, 1, 2, 3], [1, 0, 2, 3])
     """
     x = as_positions(positions)
     seen = present(x)
     time = np.arange(len(x), dtype=np.float64) if times is None else np.asarray(times, np.float64)
-    n = _size(seen) if size is None else size
-    frames = _Frames.of(x, seen, n)
-    if labelled and _undoubted(frames, _body_as_given(frames)):
-        return _as_given(seen, n)
-    seed = _seed(x, seen, n)
-    if seed is None:
-        return _as_given(seen, n) if labelled else _unknown(seen, n)
-    body = _body(frames, seed, labelled=labelled)
-    lists = _assignments(frames, body, labelled=labelled)
-    answer = _chained(frames, body, lists, time, labelled=labelled)
-    seat = _completed(body.seat, answer.order) if labelled else body.seat
-    if labelled and not answer.cuts.size and (seat == body.seat).all():
-        return answer
-    body = body._replace(seat=seat)
-    # The first shape mixes equivalent views of the body; the second keeps its small irregularities.
-    body = _remade(body, answer, x)
-    lists = _assignments(frames, body, labelled=labelled)
-    return _chained(frames, body, lists, time, labelled=labelled)
+    n = body_size(seen) if size is None else size
+    detections = Detections.of(x, n)
+    given = BodyModel.of_labels(detections) if labelled else None
+    if given is not None and labels_are_certain(detections, given):
+        return _without_assignment(seen, n, labelled=labelled)
+    start = _medoid_row(x, seen, n)
+    if start is None:
+        return _without_assignment(seen, n, labelled=labelled)
+    body = BodyModel.of_row(detections, start, labelled=labelled)
+    found = most_likely_identity(detections, body, time, labelled=labelled)
+    label = body.label
+    if labelled:
+        # A column of unknown particle gets the one to which it was most often assigned.
+        count = np.zeros((label.size, n), dtype=np.int64)
+        row, particle = np.nonzero(found.order >= 0)
+        np.add.at(count, (found.order[row, particle], particle), 1)
+        usual = np.where(count.any(axis=1), count.argmax(axis=1), -1)
+        label = np.where(label >= 0, label, usual)
+    if not labelled or found.cuts.size or (label != body.label).any():
+        # The first shape mixes equivalent poses of the body; the second, from the longest piece,
+        # keeps its small irregularities.
+        body = body._replace(label=label).of_piece(found, x)
+        found = most_likely_identity(detections, body, time, labelled=labelled)
+    if found.swaps.size:
+        passed = np.diff(labels_in_time(found.order), axis=0)[found.swaps - 1] != 0
+        warnings.warn(
+            f"identity: {passed.sum()} labels pass to another particle, in "
+            f"{frames_text(found.swaps)} counted from 0; they are corrected",
+            IdentityWarning,
+            stacklevel=2,
+        )
+    return found
 
 
-class _Frames(NamedTuple):
-    """Detections moved to the left: x (T, w, d), the columns they came from, and how many."""
+def body_size(seen: Bools) -> int:
+    """Return the number of particles of a body.
+
+    Parameters
+    ----------
+    seen : ndarray of bool, shape (T, m)
+        Where a column has a point. Columns that never occur in the same row may be one particle,
+        and a column with points in few rows may be none.
+
+    Returns
+    -------
+    int
+
+    Examples
+    --------
+    >>> body_size(np.array([[True, True, False], [True, False, True]]))
+    2
+    """
+    lasting = seen[:, seen.sum(axis=0) > _LASTING_SHARE * len(seen)].astype(np.float64)
+    if lasting.size and (lasting.T @ lasting > 0).all():
+        return int(lasting.shape[1])
+    counts = np.sort(seen.sum(axis=1))
+    counts = counts[counts > 0]
+    return int(counts[-max(1, int(np.ceil(_LASTING_SHARE * len(counts))))]) if counts.size else 0
+
+
+def _without_assignment(seen: Bools, n: int, *, labelled: bool) -> Identity:
+    """Return the labels as given, one particle a column; without labels nothing is assigned."""
+    none = np.empty(0, dtype=np.int64)
+    if labelled:
+        order = np.where(seen, np.arange(seen.shape[1]), -1)
+        unsettled = none.copy() if n == seen.shape[1] else np.arange(len(seen))
+    else:
+        order = np.full((len(seen), n), -1, dtype=np.int64)
+        unsettled = np.flatnonzero(seen.any(axis=1))
+    piece = np.zeros(len(seen), dtype=np.int64)
+    return Identity(order, piece, none, none.copy(), none.copy(), unsettled)
+
+
+def _medoid_row(x: Floats, seen: Bools, n: int) -> int | None:
+    """Return a complete row to begin with: of a few, the one that most other rows resemble."""
+    d = x.shape[2]
+    rows = np.flatnonzero(seen.sum(axis=1) == n)
+    if n < d or n > seen.shape[1] or rows.size < 2:
+        return None
+    rows = rows[np.linspace(0, rows.size - 1, min(rows.size, 15)).astype(int)]
+    points = np.stack([x[k][seen[k]] for k in rows])
+    misfit = [np.median(best_assignments(points, points[k])[1]) for k in range(min(5, rows.size))]
+    best = int(np.argmin(misfit))
+    return int(rows[best]) if np.isfinite(misfit[best]) else None
+
+
+class Detections(NamedTuple):
+    """The points of every row without the missing ones, moved to the left of the array.
+
+    Attributes
+    ----------
+    x : ndarray, shape (T, w, d)
+        Coordinates of each detection, um; NaN beyond the last.
+    column : ndarray of int, shape (T, w)
+        Column of each detection; -1 beyond the last.
+    shown : ndarray of int, shape (T,)
+        Number of detections of each row.
+    n : int
+        Number of particles of the body.
+    """
 
     x: Floats
     column: Ints
@@ -194,7 +349,9 @@ class _Frames(NamedTuple):
     n: int
 
     @classmethod
-    def of(cls, x: Floats, seen: Bools, n: int) -> _Frames:
+    def of(cls, x: Floats, n: int) -> Detections:
+        """Return the detections in positions (T, m, d) of a body of n particles."""
+        seen = present(x)
         width = max(int(seen.sum(axis=1).max()), n)
         column = np.argsort(~seen, axis=1, kind="stable")[:, :width]
         here = np.take_along_axis(seen, column, axis=1)
@@ -204,79 +361,179 @@ class _Frames(NamedTuple):
         points = np.pad(points, ((0, 0), (0, pad), (0, 0)), constant_values=np.nan)
         return cls(np.where((column >= 0)[..., None], points, np.nan), column, here.sum(axis=1), n)
 
+    def assignment(self, label: Ints) -> Ints:
+        """Return the assignment (T, n) by the labels (m,): the detection of each particle."""
+        particle = np.where(self.column >= 0, label[self.column], -1)
+        assignment = np.full((len(particle), self.n), -1, dtype=np.int64)
+        row, detection = np.nonzero(particle >= 0)
+        assignment[row, particle[row, detection]] = detection
+        return assignment
 
-class _Body(NamedTuple):
-    """The shape, its noise, its near-symmetries as permutations, and the particle of each column.
 
-    `seat` (m,) holds the particle that each column is meant to be, -1 where that is unknown.
+class BodyModel(NamedTuple):
+    """The shape of a body, its noise and symmetry, and the particle of each column.
+
+    Attributes
+    ----------
+    template : ndarray, shape (n, d)
+        Coordinates of the particles in the axes of the body, um.
+    sigma2 : float
+        Variance of one coordinate about the shape, um^2.
+    symmetry : ndarray of int, shape (G, n)
+        Permutations that leave the shape as it is within noise, the identity first.
+    label : ndarray of int, shape (m,)
+        Particle that each column is meant to be, -1 where that is unknown.
     """
 
     template: Floats
     sigma2: float
-    group: Ints
-    seat: Ints
+    symmetry: Ints
+    label: Ints
+
+    @classmethod
+    def averaged(cls, points: Floats, shape: Floats, label: Ints) -> BodyModel:
+        """Average complete rows (K, n, d), in the order of a shape; find noise and symmetry."""
+        rotation, misfit = rigid_fits(points, shape)
+        fits = np.isfinite(misfit)
+        if fits.any():
+            centred = points[fits] - points[fits].mean(axis=1, keepdims=True)
+            shape = np.einsum("tij,tni->tnj", rotation[fits], centred).mean(axis=0)
+        freedom = float(degrees_of_freedom(np.array(len(shape)), shape.shape[1]))
+        # Rounding takes the place of noise where there is none.
+        sigma2 = float(np.median(rigid_fits(points, shape)[1])) / median_chi2(freedom)
+        sigma2 = max(sigma2, (1e-7 * float(np.abs(shape).max())) ** 2)
+        return cls(shape, sigma2, shape_symmetry(shape, sigma2), label)
+
+    @classmethod
+    def of_labels(cls, detections: Detections) -> BodyModel | None:
+        """Return the shape that follows if all labels are right; None if they are not."""
+        n, d = detections.n, detections.x.shape[2]
+        rows = np.flatnonzero(detections.shown == n)
+        if n < d or rows.size < 2 or detections.x.shape[1] != n:
+            return None
+        rows = _evenly(rows)
+        order = detections.column[rows[0]]
+        if not (detections.column[rows] == order).all():
+            return None
+        points = detections.x[rows]
+        template = points[0] - points[0].mean(axis=0)
+        misfit = rigid_fits(points, template)[1]
+        # Of two labellings that share the time, neither is right for all: the lower tenth of the
+        # misfits belongs to one.
+        lowest = float(np.sort(misfit[1:])[(rows.size - 1) // 10])
+        usual = max(lowest, _ROUNDING_ANGLE**2 * float((template**2).sum()))
+        if not misfit.max() <= 2 * _NOISE_LIKE * usual:
+            return None
+        return cls.averaged(points, template, _label_of(order, detections))
+
+    @classmethod
+    def of_row(cls, detections: Detections, start: int, *, labelled: bool) -> BodyModel:
+        """Return the shape from the rows that can be assigned to one complete row."""
+        n, d = detections.n, detections.x.shape[2]
+        order = detections.column[start, :n]
+        rows = _evenly(np.flatnonzero(detections.shown == n))
+        some = detections.x[rows[:: max(1, rows.size // 15)], :n]
+        template = detections.x[start, :n] - detections.x[start, :n].mean(axis=0)
+        freedom = float(degrees_of_freedom(np.array(n), d))
+        sigma2 = float(np.median(best_assignments(some, template)[1])) / median_chi2(freedom)
+        symmetry = shape_symmetry(template, sigma2)
+        assignment = np.broadcast_to(np.arange(n), (rows.size, n)).copy()
+        same = (detections.column[rows, :n] == order).all(axis=1) & labelled
+        misfit = np.full(rows.size, np.inf)
+        misfit[same] = rigid_fits(detections.x[rows[same], :n], template)[1]
+        odd = np.flatnonzero(misfit > _NOISE_LIKE * sigma2 * freedom)
+        assignment[odd], misfit[odd] = best_assignments(
+            detections.x[rows[odd], :n], template, symmetry=symmetry
+        )
+        good = misfit <= 2 * _NOISE_LIKE * sigma2 * freedom
+        points = assigned_points(detections.x[rows[good]], assignment[good][:, None])[:, 0]
+        return cls.averaged(points, template, _label_of(order, detections))
+
+    def of_piece(self, found: Identity, x: Floats) -> BodyModel:
+        """Return the shape averaged over the longest piece of an identity."""
+        complete = (found.order >= 0).all(axis=1)
+        longest = np.bincount(found.piece[complete], minlength=1).argmax()
+        rows = np.flatnonzero(complete & (found.piece == longest))
+        if rows.size < 2:
+            return self
+        rows = _evenly(rows)
+        points = np.take_along_axis(x[rows], found.order[rows][..., None], axis=1)
+        return BodyModel.averaged(points, self.template, self.label)
+
+    def misfit_limit(self, used: Ints) -> Floats:
+        """Return the misfit up to which an assignment of `used` detections is noise-like."""
+        freedom = degrees_of_freedom(used, self.template.shape[1])
+        return np.asarray(_NOISE_LIKE * self.sigma2 * freedom, dtype=np.float64)
+
+    def misfit_cost(self, misfit: Floats, used: Ints, shown: Ints) -> Floats:
+        """Return minus the log-likelihood of squared residuals (T, C) of assignments.
+
+        The residuals of a row follow a multivariate Student law of the usual noise: a row as a
+        whole may be worse than others. A detection left out is anywhere within the body's extent.
+        """
+        n, d = self.template.shape
+        freedom = degrees_of_freedom(np.arange(n + 1), d).astype(np.float64)
+        scale = _STUDENT_FREEDOM * self.sigma2
+        gamma = np.array(
+            [lgamma((_STUDENT_FREEDOM + f) / 2) - lgamma(_STUDENT_FREEDOM / 2) for f in freedom]
+        )
+        norm = freedom / 2 * np.log(np.pi * scale) - gamma
+        extent = 2 * float(np.linalg.norm(self.template, axis=1).max())
+        strays = d * np.log(extent) * (shown[:, None] - used)
+        cost: Floats = norm[used] + strays
+        return cost + (_STUDENT_FREEDOM + freedom[used]) / 2 * np.log1p(misfit / scale)
+
+    def least_angle(self, particles: Ints) -> float:
+        """Return the least angle, rad, between two noise-like assignments of some particles."""
+        n = len(self.template)
+        if n > _MOST_PERMUTED:
+            particles = np.arange(n)
+        used = particles.size
+        tried = self.symmetry if used == n else all_assignments(used, n, used)
+        points = self.template if used == n else self.template[particles]
+        rotation, misfit = rigid_fits(assigned_points(points[None], tried)[0], self.template)
+        angle = np.sqrt(squared_angle(rotation, np.eye(len(rotation[0]))))
+        own = np.full(n, -1)
+        own[particles] = np.arange(used)
+        other = (tried != own).any(axis=1) & (misfit <= 2 * self.misfit_limit(np.array(used)))
+        return float(angle[other].min(initial=np.pi))
 
 
-class _Lists(NamedTuple):
-    """The candidate assignments of every frame, padded to (T, C).
+def _evenly(rows: Ints) -> Ints:
+    """Return evenly spaced ones of some rows, as many as the shape is averaged from at most."""
+    spaced: Ints = rows[np.linspace(0, rows.size - 1, min(rows.size, _MOST_MODEL_ROWS)).astype(int)]
+    return spaced
 
-    `place` is the position in `_Frames` of each particle, `cost` minus the log-likelihood of the
-    misfit, infinite where there is no candidate, `fits` whether the misfit is noise-like. `own` are
-    the rows whose first candidate is the labels as given, with a noise-like misfit.
+
+def _label_of(order: Ints, detections: Detections) -> Ints:
+    """Return the particle of each column, given the column of each particle."""
+    label = np.full(int(detections.column.max()) + 1, -1, dtype=np.int64)
+    label[order] = np.arange(order.size)
+    return label
+
+
+def rigid_fits(points: Floats, template: Floats) -> tuple[Floats, Floats]:
+    """Fit a template to sets of points by proper rotations.
+
+    Parameters
+    ----------
+    points : ndarray, shape (..., n, d)
+        NaN where missing.
+    template : ndarray, shape (..., n, d)
+
+    Returns
+    -------
+    rotation : ndarray, shape (..., d, d)
+    misfit : ndarray, shape (...)
+        Squared residual of each fit, um^2; inf where the rotation is not unique.
+
+    Examples
+    --------
+    >>> square = np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]])
+    >>> rotation, misfit = rigid_fits(square[[1, 2, 3, 0]], square)
+    >>> rotation.round(12).tolist(), float(misfit.round(12))
+    ([[0.0, -1.0], [1.0, 0.0]], 0.0)
     """
-
-    place: Ints
-    rotation: Floats
-    cost: Floats
-    fits: Bools
-    own: Ints
-
-
-def _size(seen: Bools) -> int:
-    """Return how many particles the body has.
-
-    Columns never seen together may be one particle, and one seen in few frames may be none.
-    """
-    lasting = seen[:, seen.sum(axis=0) > _COMPLETE * len(seen)].astype(np.float64)
-    if lasting.size and (lasting.T @ lasting > 0).all():
-        return int(lasting.shape[1])
-    counts = np.sort(seen.sum(axis=1))
-    counts = counts[counts > 0]
-    return int(counts[-max(1, int(np.ceil(_COMPLETE * len(counts))))]) if counts.size else 0
-
-
-def _seed(x: Floats, seen: Bools, n: int) -> int | None:
-    """Return a complete frame to begin with: of a few, the one that most frames look like."""
-    d = x.shape[2]
-    rows = np.flatnonzero(seen.sum(axis=1) == n)
-    if n < d or n > seen.shape[1] or rows.size < 2:
-        return None
-    rows = rows[np.linspace(0, rows.size - 1, min(rows.size, 15)).astype(int)]
-    points = np.stack([x[k][seen[k]] for k in rows])
-    misfit = [np.median(_best(points, points[k])[1]) for k in range(min(5, rows.size))]
-    best = int(np.argmin(misfit))
-    return int(rows[best]) if np.isfinite(misfit[best]) else None
-
-
-def _as_given(seen: Bools, n: int) -> Identity:
-    """Leave the columns as they are: one particle each."""
-    none = np.empty(0, dtype=np.int64)
-    order = np.where(seen, np.arange(seen.shape[1]), -1)
-    piece = np.zeros(len(seen), dtype=np.int64)
-    unsettled = none if n == seen.shape[1] else np.arange(len(seen))
-    return Identity(order, piece, none, none.copy(), none.copy(), unsettled)
-
-
-def _unknown(seen: Bools, n: int) -> Identity:
-    """Settle nothing: no frame shows the whole body."""
-    none = np.empty(0, dtype=np.int64)
-    order = np.full((len(seen), n), -1, dtype=np.int64)
-    piece = np.zeros(len(seen), dtype=np.int64)
-    return Identity(order, piece, none, none.copy(), none.copy(), np.flatnonzero(seen.any(axis=1)))
-
-
-def _fits(points: Floats, template: Floats) -> tuple[Floats, Floats]:
-    """Return the rotation and the squared residual of each rigid fit; inf where not unique."""
     rotation, unique = fit_rotations(points, template)
     here = present(points) & present(template)
     weight = here[..., None] / np.maximum(here.sum(axis=-1), 1)[..., None, None]
@@ -288,95 +545,184 @@ def _fits(points: Floats, template: Floats) -> tuple[Floats, Floats]:
 
 
 @lru_cache(maxsize=64)
-def _table(m: int, n: int, used: int) -> Ints:
-    """Return all ways (C, n) to seat `used` of m detections on n particles; -1 is an empty seat."""
+def all_assignments(shown: int, n: int, used: int) -> Ints:
+    """Return all assignments of `used` out of `shown` detections to n particles, shape (C, n).
+
+    Examples
+    --------
+    >>> all_assignments(2, 2, 2).tolist(), len(all_assignments(3, 3, 2))
+    ([[0, 1], [1, 0]], 18)
+    """
     rows = []
-    for seats in combinations(range(n), used):
-        for taken in permutations(range(m), used):
+    for particles in combinations(range(n), used):
+        for taken in permutations(range(shown), used):
             row = [-1] * n
-            for seat, detection in zip(seats, taken, strict=True):
-                row[seat] = detection
+            for particle, detection in zip(particles, taken, strict=True):
+                row[particle] = detection
             rows.append(row)
-    table = np.array(rows, dtype=np.int64)
+    table: Ints = np.array(rows, dtype=np.int64)
     frozen(table)
     return table
 
 
-def _seated(points: Floats, order: Ints) -> Floats:
-    """Return points (K, w, d) in the places that order (K, C, n) or (C, n) says, (K, C, n, d)."""
-    index = np.broadcast_to(order, (len(points), *order.shape[-2:]))
+def assigned_points(points: Floats, assignment: Ints) -> Floats:
+    """Return detections as particles, for several assignments of each row.
+
+    Parameters
+    ----------
+    points : ndarray, shape (K, w, d)
+    assignment : ndarray of int, shape (C, n) or (K, C, n)
+
+    Returns
+    -------
+    ndarray, shape (K, C, n, d)
+        NaN where a particle is missing.
+
+    Examples
+    --------
+    >>> assigned_points(np.array([[[1.0, 2.0], [3.0, 4.0]]]), np.array([[1, -1, 0]])).tolist()
+    [[[[3.0, 4.0], [nan, nan], [1.0, 2.0]]]]
+    """
+    index = np.broadcast_to(assignment, (len(points), *assignment.shape[-2:]))
     rows = np.arange(len(points))[:, None, None]
     return np.where((index >= 0)[..., None], points[rows, np.maximum(index, 0)], np.nan)
 
 
-def _batches(count: int, width: int) -> Iterator[slice]:
-    step = max(1, _BATCH // max(width, 1))
-    return (slice(low, low + step) for low in range(0, count, step))
+def best_assignments(
+    points: Floats, template: Floats, *, symmetry: Ints | None = None
+) -> tuple[Ints, Floats]:
+    """Return the assignment of least misfit of every complete row, and that misfit.
 
+    Parameters
+    ----------
+    points : ndarray, shape (K, n, d)
+    template : ndarray, shape (n, d)
+    symmetry : ndarray of int, shape (G, n), optional
+        Of the assignments that it makes equivalent only one is tried.
 
-def _best(points: Floats, template: Floats) -> tuple[Ints, Floats]:
-    """Return the best assignment (K, n) of complete frames (K, n, d), and its misfit (K,)."""
+    Returns
+    -------
+    assignment : ndarray of int, shape (K, n)
+    misfit : ndarray, shape (K,)
+
+    Examples
+    --------
+    >>> triangle = np.array([[0.0, 0.0], [2.0, 0.0], [0.0, 1.0]])
+    >>> best_assignments(triangle[None, [2, 0, 1]], triangle)[0].tolist()
+    [[1, 2, 0]]
+    """
     n = len(template)
-    return _matched(points, template) if n > _ALL else _best_of(points, template, _table(n, n, n))
-
-
-def _best_of(points: Floats, template: Floats, table: Ints) -> tuple[Ints, Floats]:
-    """Return the best of the assignments in a table (C, n) for every frame, and its misfit."""
-    best, least = np.empty((len(points), len(template)), np.int64), np.empty(len(points))
-    for rows in _batches(len(points), len(table)):
-        misfit = _fits(_seated(points[rows], table), template)[1]
+    if n > _MOST_PERMUTED:
+        return icp_search(points, template)
+    tried = all_assignments(n, n, n)
+    if symmetry is not None:
+        rest = dict.fromkeys(map(tuple, tried.tolist()))
+        chosen = []
+        while rest:
+            row = np.array(next(iter(rest)))
+            chosen.append(row)
+            for other in row[symmetry].tolist():
+                rest.pop(tuple(other), None)
+        tried = np.array(chosen)
+    best, least = np.empty((len(points), n), np.int64), np.empty(len(points))
+    for rows in _batches(len(points), len(tried)):
+        misfit = rigid_fits(assigned_points(points[rows], tried), template)[1]
         choice = np.argmin(misfit, axis=1)
-        best[rows], least[rows] = (
-            table[choice],
-            np.take_along_axis(misfit, choice[:, None], 1)[:, 0],
-        )
+        best[rows] = tried[choice]
+        least[rows] = np.take_along_axis(misfit, choice[:, None], 1)[:, 0]
     return best, least
 
 
-def _matched(points: Floats, template: Floats) -> tuple[Ints, Floats]:
-    """Assign large bodies by linear assignment and rigid fit in turn, from many orientations.
+def _batches(count: int, width: int) -> Iterator[slice]:
+    """Yield slices of `count` rows with `width` rigid fits each, as many as memory is to hold."""
+    step = max(1, _BATCH_FITS // max(width, 1))
+    return (slice(low, low + step) for low in range(0, count, step))
 
-    The last frame's rotation comes first; a fit much closer than any wrong one ends the search.
+
+def icp_search(points: Floats, template: Floats) -> tuple[Ints, Floats]:
+    """Return the best assignment of every complete row by `icp_fit` from many rotations.
+
+    The rotation of the last row comes first; a fit much closer than any wrong one ends the search.
+
+    Parameters
+    ----------
+    points : ndarray, shape (K, n, d)
+    template : ndarray, shape (n, d)
+
+    Returns
+    -------
+    assignment : ndarray of int, shape (K, n)
+    misfit : ndarray, shape (K,)
+
+    Examples
+    --------
+    >>> triangle = np.array([[0.0, 0.0], [2.0, 0.0], [0.0, 1.0]])
+    >>> icp_search(triangle[None, [2, 0, 1]], triangle)[0].tolist()
+    [[1, 2, 0]]
     """
     n, d = template.shape
     best, least = np.zeros((len(points), n), np.int64), np.full(len(points), np.inf)
-    apart = np.linalg.norm(template[:, None] - template, axis=2) + np.diag(np.full(n, np.inf))
-    enough = (_CLOSE * float(apart.min())) ** 2 * _freedom(n, d)
+    nearest = float(pair_distances(template).min())
+    enough = (_CLOSE_FIT * nearest) ** 2 * float(degrees_of_freedom(np.array(n), d))
     last = np.eye(d)
     for k, x in enumerate(points):
-        for rotation in (last, *_orientations(d)[::_COARSE]):
-            order, turned, misfit = _refined(x, template, rotation)
+        for rotation in (last, *covering_rotations(d)[::_ROTATION_STRIDE]):
+            assignment, turned, misfit = icp_fit(x, template, rotation)
             if misfit < least[k]:
-                best[k], least[k], last = order, misfit, turned
+                best[k], least[k], last = assignment, misfit, turned
             if least[k] <= enough:
                 break
     return best, least
 
 
-def _refined(x: Floats, template: Floats, rotation: Floats) -> tuple[Ints, Floats, float]:
-    """Assign and fit in turn until the assignment rests."""
+def icp_fit(x: Floats, template: Floats, rotation: Floats) -> tuple[Ints, Floats, float]:
+    """Assign and fit in turn until the assignment no longer changes (iterative closest points).
+
+    Parameters
+    ----------
+    x, template : ndarray, shape (n, d)
+    rotation : ndarray, shape (d, d)
+        Where to begin.
+
+    Returns
+    -------
+    assignment : ndarray of int, shape (n,)
+    rotation : ndarray, shape (d, d)
+    misfit : float
+
+    Examples
+    --------
+    >>> triangle = np.array([[0.0, 0.0], [2.0, 0.0], [0.0, 1.0]])
+    >>> icp_fit(triangle[[2, 0, 1]], triangle, np.eye(2))[0].tolist()
+    [1, 2, 0]
+    """
     from scipy.optimize import linear_sum_assignment
 
-    order, misfit = np.arange(len(template)), np.inf
+    assignment, misfit = np.arange(len(template)), np.inf
     y, t = x - x.mean(axis=0), template - template.mean(axis=0)
     for _ in range(20):
-        # The squared distances differ from this by what does not depend on the assignment.
+        # The squared distances differ from this by terms that do not depend on the assignment.
         new = linear_sum_assignment(-(t @ rotation.T) @ y.T)[1]
-        if np.isfinite(misfit) and (new == order).all():
+        if np.isfinite(misfit) and (new == assignment).all():
             break
-        order = new
-        rotation, value = _fits(y[order], t)
+        assignment = new
+        rotation, value = rigid_fits(y[assignment], t)
         misfit = float(value)
         if not np.isfinite(misfit):
             break
-    return order, rotation, misfit
+    return assignment, rotation, misfit
 
 
 @lru_cache(maxsize=2)
-def _orientations(d: int) -> Floats:
-    """Return orientations that cover all rotations: every one has a start within about 30 degrees.
+def covering_rotations(d: int) -> Floats:
+    """Return rotations of which one is within about 30 degrees of any rotation, shape (K, d, d).
 
     Super-Fibonacci spirals in three dimensions (Alexa, CVPR 2022).
+
+    Examples
+    --------
+    >>> covering_rotations(2).shape, covering_rotations(3).shape
+    ((30, 2, 2), (300, 3, 3))
     """
     count = 300
     s = np.arange(count) + 0.5
@@ -398,560 +744,549 @@ def _orientations(d: int) -> Floats:
     return turns
 
 
-def _body_as_given(frames: _Frames) -> _Body | None:
-    """Build the shape as if all labels were right; None if they are not."""
-    n, d = frames.n, frames.x.shape[2]
-    rows = np.flatnonzero(frames.shown == n)
-    if n < d or rows.size < 2 or frames.x.shape[1] != n:
-        return None
-    rows = rows[np.linspace(0, rows.size - 1, min(rows.size, _MODELS)).astype(int)]
-    label = frames.column[rows[0]]
-    if not (frames.column[rows] == label).all():
-        return None
-    points = frames.x[rows]
-    template = points[0] - points[0].mean(axis=0)
-    rotation, misfit = _fits(points, template)
-    # Of two labellings that share the time, neither is right for all: the lower tenth shows one.
-    lowest = float(np.sort(misfit[1:])[(rows.size - 1) // 10])
-    usual = max(lowest, _TINY**2 * float((template**2).sum()))
-    if not misfit.max() <= 2 * _NOISE * usual:
-        return None
-    seat = _seats(label, int(frames.column.max()) + 1)
-    return _body_of(_mean_shape(points, rotation), points, seat)
+def median_chi2(freedom: float) -> float:
+    """Return the median of chi squared (Wilson and Hilferty, 1931; within 3 % from 1 on).
 
-
-def _seats(label: Ints, count: int) -> Ints:
-    """Return the particle of each of so many columns, given the column of each particle."""
-    seat = np.full(count, -1, dtype=np.int64)
-    seat[label] = np.arange(label.size)
-    return seat
-
-
-def _completed(seat: Ints, order: Ints) -> Ints:
-    """Give a column of unknown particle the one it was most often assigned to."""
-    count = np.zeros((seat.size, order.shape[1]), dtype=np.int64)
-    row, particle = np.nonzero(order >= 0)
-    np.add.at(count, (order[row, particle], particle), 1)
-    found = np.where(count.any(axis=1), count.argmax(axis=1), -1)
-    return np.where(seat >= 0, seat, found)
-
-
-def _body(frames: _Frames, seed: int, *, labelled: bool) -> _Body:
-    """Build the shape from frames assigned to the seed, and find its symmetries within noise."""
-    n, d = frames.n, frames.x.shape[2]
-    label = frames.column[seed, :n]
-    rows = np.flatnonzero(frames.shown == n)
-    rows = rows[np.linspace(0, rows.size - 1, min(rows.size, _MODELS)).astype(int)]
-    some = frames.x[rows[:: max(1, rows.size // 15)], :n]
-    template = frames.x[seed, :n] - frames.x[seed, :n].mean(axis=0)
-    freedom = _freedom(n, d)
-    sigma2 = float(np.median(_best(some, template)[1])) / _median_chi2(freedom)
-    seat = _seats(label, int(frames.column.max()) + 1)
-    rough = _Body(template, sigma2, _group(template, sigma2), seat)
-    order = np.broadcast_to(np.arange(n), (rows.size, n)).copy()
-    same = (frames.column[rows, :n] == label).all(axis=1) & labelled
-    misfit = np.full(rows.size, np.inf)
-    misfit[same] = _fits(frames.x[rows[same], :n], template)[1]
-    odd = np.flatnonzero(misfit > _NOISE * sigma2 * freedom)
-    order[odd], misfit[odd] = _base(frames.x[rows[odd], :n], rough)
-    good = misfit <= 2 * _NOISE * sigma2 * freedom
-    points = _seated(frames.x[rows[good]], order[good][:, None])[:, 0]
-    return _averaged(points, template, seat)
-
-
-def _averaged(points: Floats, shape: Floats, seat: Ints) -> _Body:
-    """Average complete frames (K, n, d), in order, to a shape; find its noise and symmetries."""
-    rotation, misfit = _fits(points, shape)
-    fits = np.isfinite(misfit)
-    if fits.any():
-        shape = _mean_shape(points[fits], rotation[fits])
-    return _body_of(shape, points, seat)
-
-
-def _mean_shape(points: Floats, rotation: Floats) -> Floats:
-    """Average complete frames in the axes of the body."""
-    centred = points - points.mean(axis=1, keepdims=True)
-    mean: Floats = np.einsum("tij,tni->tnj", rotation, centred).mean(axis=0)
-    return mean
-
-
-def _body_of(shape: Floats, points: Floats, seat: Ints) -> _Body:
-    """Find the noise of frames about a shape, and its symmetries within that noise."""
-    n, d = shape.shape
-    # Rounding takes the place of noise where there is none.
-    sigma2 = float(np.median(_fits(points, shape)[1])) / _median_chi2(_freedom(n, d))
-    sigma2 = max(sigma2, (1e-7 * float(np.abs(shape).max())) ** 2)
-    return _Body(shape, sigma2, _group(shape, sigma2), seat)
-
-
-def _remade(body: _Body, answer: Identity, x: Floats) -> _Body:
-    """Build the shape again, from the longest stretch without a cut."""
-    whole = (answer.order >= 0).all(axis=1)
-    longest = np.bincount(answer.piece[whole], minlength=1).argmax()
-    rows = np.flatnonzero(whole & (answer.piece == longest))
-    if rows.size < 2:
-        return body
-    rows = rows[np.linspace(0, rows.size - 1, min(rows.size, _MODELS)).astype(int)]
-    points = np.take_along_axis(x[rows], answer.order[rows][..., None], axis=1)
-    return _averaged(points, body.template, body.seat)
-
-
-def _freedom(n: int, d: int) -> float:
-    return max(float(degrees_of_freedom(np.array(n), d)), 1.0)
-
-
-def _median_chi2(freedom: float) -> float:
-    """Return the median of chi squared (Wilson and Hilferty, 1931; within 3 % from 1 on)."""
+    Examples
+    --------
+    >>> round(median_chi2(3.0), 2)  # exact: 2.37
+    2.38
+    """
     return freedom * (1 - 2 / (9 * freedom)) ** 3
 
 
-def _group(template: Floats, sigma2: float) -> Ints:
-    """Return the permutations (G, n) that leave the shape as it is within noise, identity first."""
+def shape_symmetry(template: Floats, sigma2: float) -> Ints:
+    """Return the permutations that leave a shape as it is within noise, the identity first.
+
+    Parameters
+    ----------
+    template : ndarray, shape (n, d)
+    sigma2 : float
+        Variance of one coordinate, um^2.
+
+    Returns
+    -------
+    ndarray of int, shape (G, n)
+
+    Examples
+    --------
+    >>> isosceles = np.array([[-1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 3.0, 0.0]])
+    >>> shape_symmetry(isosceles, 1e-4).tolist()
+    [[0, 1, 2], [1, 0, 2]]
+    """
     n, d = template.shape
-    limit = 2 * _NOISE * sigma2 * float(degrees_of_freedom(np.array(n), d))
-    if n <= _ALL:
-        table = _table(n, n, n)
-        alike = _fits(template[table], template)[1] <= limit
+    limit = 2 * _NOISE_LIKE * sigma2 * float(degrees_of_freedom(np.array(n), d))
+    if n <= _MOST_PERMUTED:
+        tried = all_assignments(n, n, n)
+        alike = rigid_fits(template[tried], template)[1] <= limit
         alike[0] = True
-        return np.asarray(table[alike])
+        return np.asarray(tried[alike])
     found = [tuple(range(n))]
-    for start in _orientations(d):
-        order, _, misfit = _refined(template, template, start)
+    for start in covering_rotations(d):
+        order, _, misfit = icp_fit(template, template, start)
         if misfit <= limit and tuple(order.tolist()) not in found:
             found.append(tuple(order.tolist()))
     return np.array(found, dtype=np.int64)
 
 
-def _places(frames: _Frames, seat: Ints) -> Ints:
-    """Return where (T, n) each particle stands among the detections by the labels, or -1."""
-    particle = np.where(frames.column >= 0, seat[frames.column], -1)
-    place = np.full((len(particle), frames.n), -1, dtype=np.int64)
-    row, detection = np.nonzero(particle >= 0)
-    place[row, particle[row, detection]] = detection
-    return place
+def squared_angle(one: Floats, other: Floats) -> Floats:
+    """Return the squared angle between rotations; sin^2(angle / 2) = (d - tr(A^T B)) / 4.
 
+    Parameters
+    ----------
+    one, other : ndarray, shape (..., d, d)
 
-def _known(frames: _Frames, place: Ints) -> Bools:
-    """Return the frames whose every detection has a label of a particle of its own."""
-    return np.asarray((place >= 0).sum(axis=1) == frames.shown)
+    Returns
+    -------
+    ndarray, shape (...)
+        rad^2
 
-
-def _limit(count: Ints, body: _Body) -> Floats:
-    """Return the misfit up to which a frame with so many particles is noise-like."""
-    freedom = degrees_of_freedom(count, body.template.shape[1])
-    return np.asarray(_NOISE * body.sigma2 * freedom, dtype=np.float64)
-
-
-def _undoubted(frames: _Frames, body: _Body | None) -> bool:
-    """Return whether the labels fit everywhere and no step is long enough to be mistaken."""
-    if body is None:
-        return False
-    place = _places(frames, body.seat)
-    rows = np.flatnonzero(frames.shown >= body.template.shape[1])
-    if not _known(frames, place).all():
-        return False
-    rotation, misfit = _fits(_seated(frames.x[rows], place[rows, None])[:, 0], body.template)
-    if not (misfit <= _limit(frames.shown[rows], body)).all():
-        return False
-    seats, which = np.unique(place[rows] >= 0, axis=0, return_inverse=True)
-    least = np.array([_least_angle(body, tuple(s.tolist())) for s in seats])[which.ravel()]
-    angle = np.sqrt(_square_angle(rotation[:-1], rotation[1:]))
-    return bool((angle < _SHORT * np.minimum(least[:-1], least[1:])).all())
-
-
-def _least_angle(body: _Body, here: tuple[bool, ...]) -> float:
-    """Return the least angle between two noise-like assignments of the particles that are here."""
-    seats = np.flatnonzero(here)
-    n = len(body.template)
-    if n > _ALL:
-        seats = np.arange(n)
-    table = body.group if seats.size == n else _table(seats.size, n, seats.size)
-    points = body.template if seats.size == n else body.template[seats]
-    rotation, misfit = _fits(_seated(points[None], table)[0], body.template)
-    angle = np.sqrt(_square_angle(rotation, np.eye(len(rotation[0]))))
-    own = np.full(n, -1)
-    own[seats] = np.arange(seats.size)
-    other = (table != own).any(axis=1) & (misfit <= 2 * _limit(np.array(seats.size), body))
-    return float(angle[other].min(initial=np.pi))
-
-
-def _square_angle(one: Floats, other: Floats) -> Floats:
-    """Return the squared angle between rotations; sin^2(angle / 2) = (d - tr(A^T B)) / 4."""
+    Examples
+    --------
+    >>> float(squared_angle(np.eye(2), -np.eye(2)) / np.pi**2)
+    1.0
+    """
     trace = np.einsum("...ij,...ij->...", one, other)
     half = np.sqrt(np.clip((one.shape[-1] - trace) / 4, 0.0, 1.0))
     return np.asarray((2 * np.arcsin(half)) ** 2)
 
 
-def _assignments(frames: _Frames, body: _Body, *, labelled: bool) -> _Lists:
-    """List the candidates of every frame: the noise-like assignments and the labels as given.
+def labels_are_certain(detections: Detections, body: BodyModel) -> bool:
+    """Return whether the labels fit everywhere and no step is long enough to be mistaken.
 
-    A frame in which nothing is noise-like still shows how far the body has turned. Its candidates
-    are the labels as given and what the symmetries of the body make of them.
+    Parameters
+    ----------
+    detections : Detections
+    body : BodyModel
+
+    Returns
+    -------
+    bool
+
+    Examples
+    --------
+    >>> import perrin
+    >>> x = np.stack([perrin.Cluster.tetrahedron(1.5).positions] * 9)
+    >>> detections = Detections.of(x, 4)
+    >>> labels_are_certain(detections, BodyModel.of_labels(detections))
+    True
     """
-    n = frames.n
+    assignment = detections.assignment(body.label)
+    if not ((assignment >= 0).sum(axis=1) == detections.shown).all():
+        return False
+    rows = np.flatnonzero(detections.shown >= body.template.shape[1])
+    points = assigned_points(detections.x[rows], assignment[rows, None])[:, 0]
+    rotation, misfit = rigid_fits(points, body.template)
+    if not (misfit <= body.misfit_limit(detections.shown[rows])).all():
+        return False
+    sets, which = np.unique(assignment[rows] >= 0, axis=0, return_inverse=True)
+    least = np.array([body.least_angle(np.flatnonzero(here)) for here in sets])[which.ravel()]
+    angle = np.sqrt(squared_angle(rotation[:-1], rotation[1:]))
+    return bool((angle < _SHORT_STEP * np.minimum(least[:-1], least[1:])).all())
+
+
+class Candidates(NamedTuple):
+    """The assignments that are compared in every row, C at most, the last one reserved.
+
+    Attributes
+    ----------
+    assignment : ndarray of int, shape (T, C, n)
+        Detection of each particle.
+    rotation : ndarray, shape (T, C, d, d)
+        Rotation of the fit of each candidate.
+    cost : ndarray, shape (T, C)
+        Minus the log-likelihood of the misfit; inf where there is no candidate.
+    fits : ndarray of bool, shape (T, C)
+        Whether the misfit is noise-like.
+    given : ndarray of int
+        Rows whose first candidate is the labels as given, with a noise-like misfit.
+    """
+
+    assignment: Ints
+    rotation: Floats
+    cost: Floats
+    fits: Bools
+    given: Ints
+
+    @classmethod
+    def of(
+        cls, detections: Detections, body: BodyModel, found: Mapping[int, Ints], given: Ints
+    ) -> Candidates:
+        """Fit the assignments (C, n) found for each row."""
+        width = max((len(table) for table in found.values()), default=1) + 1
+        count, d = len(detections.x), detections.x.shape[2]
+        assignment = np.full((count, width, detections.n), -1, dtype=np.int64)
+        for k, table in found.items():
+            assignment[k, : len(table)] = table
+        rotation, misfit = np.zeros((count, width, d, d)), np.full((count, width), np.inf)
+        rows, listed = np.nonzero((assignment >= 0).any(axis=2))
+        for part in _batches(rows.size, 1):
+            at = rows[part], listed[part]
+            points = assigned_points(detections.x[at[0]], assignment[at][:, None])[:, 0]
+            rotation[at], misfit[at] = rigid_fits(points, body.template)
+        used = (assignment >= 0).sum(axis=2)
+        cost = body.misfit_cost(misfit, used, detections.shown)
+        return cls(assignment, rotation, cost, misfit <= body.misfit_limit(used), given)
+
+    def order(self, detections: Detections, rows: Ints) -> Ints:
+        """Return the column of each particle in the candidates of some rows, (K, C, n)."""
+        assignment = self.assignment[rows]
+        column = detections.column[rows[:, None, None], np.maximum(assignment, 0)]
+        return np.where(assignment >= 0, column, -1)
+
+    def include(self, detections: Detections, body: BodyModel, row: int, label: Ints) -> None:
+        """Add the assignment by these labels to the candidates of a row, whatever its misfit."""
+        one = slice(row, row + 1)
+        assignment = detections._replace(column=detections.column[one]).assignment(label)
+        known = (assignment >= 0).sum() == detections.shown[row]
+        if not known or (self.assignment[row] == assignment).all(axis=1).any():
+            return
+        points = assigned_points(detections.x[one], assignment[:, None])[0]
+        rotation, misfit = rigid_fits(points, body.template)
+        used = (assignment >= 0).sum(axis=1)[:, None]
+        self.assignment[row, -1], self.rotation[row, -1] = assignment[0], rotation[0]
+        cost = body.misfit_cost(misfit[:, None], used, detections.shown[one])
+        self.cost[row, -1] = cost[0, 0]
+        self.fits[row, -1] = misfit[0] <= body.misfit_limit(used)[0, 0]
+
+    def step_variance(
+        self, detections: Detections, time: Floats, rows: Ints, *, labelled: bool
+    ) -> Floats:
+        """Return the variance of one component of each step's rotation vector, from the median.
+
+        Columns that are lasting particles measure the turn between two rows even where their labels
+        are not those of the shape; of detections without labels the least turn counts.
+        """
+        d = detections.x.shape[2]
+        square = np.empty(0)
+        if labelled:
+            points = np.full((rows.size, int(detections.column.max()) + 1, d), np.nan)
+            row, detection = np.nonzero(detections.column[rows] >= 0)
+            column = detections.column[rows[row], detection]
+            points[row, column] = detections.x[rows[row], detection]
+            rotation, misfit = rigid_fits(points[1:], points[:-1])
+            square = squared_angle(rotation[np.isfinite(misfit)], np.eye(d))
+        if not 2 * square.size > rows.size:
+            fits = self.fits[rows]
+            first = self.rotation[rows[:-1], np.argmax(fits[:-1], axis=1)]
+            square = squared_angle(first[:, None], self.rotation[rows[1:]])
+            square = np.where(fits[1:], square, np.inf).min(axis=1)
+            square = square[fits[:-1].any(axis=1) & fits[1:].any(axis=1)]
+        gap = np.diff(time)
+        usual = float(np.median(gap)) if gap.size else 1.0
+        median = float(np.median(square)) if square.size else 0.0
+        typical = median / median_chi2(3.0 if d == 3 else 1.0)
+        variance: Floats = max(typical, _ROUNDING_ANGLE**2) * np.maximum(gap / usual, 1.0)
+        return variance
+
+    def step_cost(self, poses: list[Pose], row: int, *, labelled: bool) -> Floats:
+        """Return minus the log-likelihood (C,) of a row's candidates after the poses before it."""
+        misfit = self.cost[row]
+        turns = np.full(misfit.shape, np.inf)
+        for pose in poses:
+            square = squared_angle(pose.rotation, self.rotation[row])
+            # The law of small steps does not hold for a leap: its own size counts.
+            least = float(square[np.isfinite(misfit)].min())
+            wide = max(pose.variance, least / (_LEAP_LABELLED if labelled else _LEAP_UNLABELLED))
+            turns = np.minimum(turns, square / (2 * wide))
+        return np.asarray(turns + misfit)
+
+
+def candidate_assignments(detections: Detections, body: BodyModel, *, labelled: bool) -> Candidates:
+    """List the candidates of every row: the noise-like assignments and the labels as given.
+
+    A row in which nothing is noise-like still shows how far the body has turned. Its candidates
+    are the labels as given and the assignments that the symmetries of the body make of them.
+
+    Parameters
+    ----------
+    detections : Detections
+    body : BodyModel
+    labelled : bool
+        Whether the labels of the body are candidates.
+
+    Returns
+    -------
+    Candidates
+
+    Examples
+    --------
+    >>> import perrin
+    >>> detections = Detections.of(perrin.Cluster.tetrahedron(1.5).positions[None].repeat(2, 0), 4)
+    >>> body = BodyModel.of_row(detections, 0, labelled=True)
+    >>> int(candidate_assignments(detections, body, labelled=True).fits[0].sum())
+    12
+    """
+    n = detections.n
     found: dict[int, Ints] = {}
-    place = _places(frames, body.seat)
-    misfit = np.full(len(frames.x), np.inf)
-    trusted = np.flatnonzero(_known(frames, place) & (frames.shown > 0) & labelled)
-    seated = _seated(frames.x[trusted], place[trusted, None])[:, 0]
-    misfit[trusted] = _fits(seated, body.template)[1]
+    by_label = detections.assignment(body.label)
+    known = (by_label >= 0).sum(axis=1) == detections.shown
+    trusted = np.flatnonzero(known & (detections.shown > 0) & labelled)
+    points = assigned_points(detections.x[trusted], by_label[trusted, None])[:, 0]
+    misfit = np.full(len(detections.x), np.inf)
+    misfit[trusted] = rigid_fits(points, body.template)[1]
     given = np.flatnonzero(np.isfinite(misfit))
-    fits = misfit <= _limit(frames.shown, body)
-    whole = np.flatnonzero(frames.shown == n)
-    base = place.copy()
-    odd = whole[~fits[whole]]
-    base[odd], misfit[odd] = _base(frames.x[odd, :n], body)
-    for k in whole[misfit[whole] <= _limit(frames.shown[whole], body)]:
-        found[int(k)] = base[k][body.group]
-    if n <= _ALL:
-        _search(frames, body, found, drop=0)
-        _search(frames, body, found, drop=1)
+    limit = body.misfit_limit(detections.shown)
+    fits = misfit <= limit
+    complete = np.flatnonzero(detections.shown == n)
+    best = by_label.copy()
+    odd = complete[~fits[complete]]
+    best[odd], misfit[odd] = best_assignments(
+        detections.x[odd, :n], body.template, symmetry=body.symmetry
+    )
+    for k in complete[misfit[complete] <= limit[complete]].tolist():
+        found[k] = best[k][body.symmetry]
+    if n <= _MOST_PERMUTED:
+        _search_all(detections, body, found, left_out=0)
+        _search_all(detections, body, found, left_out=1)
     else:
-        _patch(frames, body, found, place, fits)
+        _search_near_labels(detections, body, found, by_label, fits)
     for k in given.tolist():
         if k not in found:
-            found[k] = place[k][body.group]
-        elif (found[k][0] != place[k]).any():
-            others = (found[k] != place[k]).any(axis=1)
-            found[k] = np.concatenate([place[k][None], found[k][others]])
-    return _padded(frames, body, found, np.flatnonzero(fits))
+            found[k] = by_label[k][body.symmetry]
+        elif (found[k][0] != by_label[k]).any():
+            others = (found[k] != by_label[k]).any(axis=1)
+            found[k] = np.concatenate([by_label[k][None], found[k][others]])
+    return Candidates.of(detections, body, found, np.flatnonzero(fits))
 
 
-def _base(points: Floats, body: _Body) -> tuple[Ints, Floats]:
-    """Return one assignment that fits; up to symmetry only one in |G| has to be tried."""
-    n = len(body.template)
-    if n > _ALL:
-        return _matched(points, body.template)
-    rest = dict.fromkeys(map(tuple, _table(n, n, n).tolist()))
-    chosen = []
-    while rest:
-        row = np.array(next(iter(rest)))
-        chosen.append(row)
-        for other in row[body.group].tolist():
-            rest.pop(tuple(other), None)
-    return _best_of(points, body.template, np.array(chosen))
-
-
-def _search(frames: _Frames, body: _Body, found: dict[int, Ints], *, drop: int) -> None:
-    """Try every assignment of the frames that have none yet, leaving `drop` detections out."""
+def _search_all(
+    detections: Detections, body: BodyModel, found: dict[int, Ints], *, left_out: int
+) -> None:
+    """Try every assignment of the rows that have none yet, with some detections left out."""
     n, d = body.template.shape
-    for count in np.unique(frames.shown).tolist():
-        used = min(count, n) - drop
-        rows = np.array([k for k in np.flatnonzero(frames.shown == count) if k not in found], int)
-        if used < d or count > _ALL + 1 or not rows.size:
+    for count in np.unique(detections.shown).tolist():
+        used = min(count, n) - left_out
+        rows = np.flatnonzero(detections.shown == count)
+        rows = np.array([k for k in rows if k not in found], int)
+        if used < d or count > _MOST_PERMUTED + 1 or not rows.size:
             continue
-        table = _table(count, n, used)
-        limit = float(_limit(np.array(used), body))
-        for part in _batches(rows.size, len(table)):
-            points = frames.x[rows[part]]
-            rotation, misfit = _fits(_seated(points, table), body.template)
+        tried = all_assignments(count, n, used)
+        limit = float(body.misfit_limit(np.array(used)))
+        for part in _batches(rows.size, len(tried)):
+            points = detections.x[rows[part]]
+            rotation, misfit = rigid_fits(assigned_points(points, tried), body.template)
             fits = misfit <= limit
-            if drop and count <= n:
-                fits &= _strays(points[:, :count], table, rotation, body.template)
+            if left_out and count <= n:
+                fits &= _are_strays(points[:, :count], tried, rotation, body.template)
             for k, fit in zip(rows[part].tolist(), fits, strict=True):
                 if fit.any():
-                    found[k] = table[fit]
+                    found[k] = tried[fit]
 
 
-def _patch(frames: _Frames, body: _Body, found: dict[int, Ints], place: Ints, fits: Bools) -> None:
-    """Seat the detections of incomplete frames of large bodies, near where their labels say."""
-    from scipy.optimize import linear_sum_assignment
-
-    d = body.template.shape[1]
-    for k in np.flatnonzero((frames.shown >= d) & (frames.shown <= frames.n)).tolist():
-        if k in found:
-            continue
-        x, order = frames.x[k, : frames.shown[k]], place[k]
-        for _ in range(0 if fits[k] else 10):
-            seated = _seated(frames.x[k][None], order[None])[0, 0]
-            rotation, misfit = _fits(seated, body.template)
-            if not np.isfinite(misfit):
-                break
-            lab = body.template @ rotation.T
-            away = lab + np.nanmean(seated - lab, axis=0) - x[:, None]
-            detection, seat = linear_sum_assignment((away**2).sum(axis=2))
-            order = np.full(frames.n, -1, dtype=np.int64)
-            order[seat] = detection
-        misfit = _fits(_seated(frames.x[k][None], order[None])[0, 0], body.template)[1]
-        if misfit <= float(_limit(frames.shown[k], body)):
-            found[k] = order[None]
-
-
-def _strays(points: Floats, table: Ints, rotation: Floats, template: Floats) -> Bools:
-    """Return where the detection left out is over half a particle distance from all empty seats.
+def _are_strays(points: Floats, tried: Ints, rotation: Floats, template: Floats) -> Bools:
+    """Return where the detection left out is over half a particle distance from all free particles.
 
     Nearer it is one of the body's particles, measured badly.
     """
-    n, count = len(template), points.shape[1]
-    taken = (table[:, :, None] == np.arange(count)).any(axis=1)
+    count = points.shape[1]
+    taken = (tried[:, :, None] == np.arange(count)).any(axis=1)
     left = points[:, np.argmin(taken, axis=1)]
-    seated = _seated(points, table)
-    here = (table >= 0)[..., None]
+    here = (tried >= 0)[..., None]
     share = here / here.sum(axis=1, keepdims=True)
-    center = (np.nan_to_num(seated) * share).sum(axis=2)
+    center = (np.nan_to_num(assigned_points(points, tried)) * share).sum(axis=2)
     arms = template[None] - (template[None] * share).sum(axis=1, keepdims=True)
-    seats = center[:, :, None] + np.einsum("kcij,cnj->kcni", rotation, arms)
-    distance = np.linalg.norm(seats - left[:, :, None], axis=3)
-    apart = np.linalg.norm(template[:, None] - template, axis=2) + np.diag(np.full(n, np.inf))
-    far = np.where(table < 0, distance, np.inf).min(axis=2) > 0.5 * apart.min()
-    return np.asarray(far)
+    places = center[:, :, None] + np.einsum("kcij,cnj->kcni", rotation, arms)
+    distance = np.linalg.norm(places - left[:, :, None], axis=3)
+    least = np.where(tried < 0, distance, np.inf).min(axis=2)
+    return np.asarray(least > 0.5 * pair_distances(template).min())
 
 
-def _padded(frames: _Frames, body: _Body, found: dict[int, Ints], own: Ints) -> _Lists:
-    """Lay the lists of all frames side by side, with their fits; the last place stays empty."""
-    width = max((len(table) for table in found.values()), default=1) + 1
-    count, d = len(frames.x), frames.x.shape[2]
-    place = np.full((count, width, frames.n), -1, dtype=np.int64)
-    for k, table in found.items():
-        place[k, : len(table)] = table
-    rotation, misfit = np.zeros((count, width, d, d)), np.full((count, width), np.inf)
-    rows, listed = np.nonzero((place >= 0).any(axis=2))
-    for part in _batches(rows.size, 1):
-        at = rows[part], listed[part]
-        seated = _seated(frames.x[at[0]], place[at][:, None])[:, 0]
-        rotation[at], misfit[at] = _fits(seated, body.template)
-    used = (place >= 0).sum(axis=2)
-    cost = _misfit_cost(misfit, used, frames.shown, body)
-    return _Lists(place, rotation, cost, misfit <= _limit(used, body), own)
+def _search_near_labels(
+    detections: Detections, body: BodyModel, found: dict[int, Ints], by_label: Ints, fits: Bools
+) -> None:
+    """Assign and fit in turn the incomplete rows of large bodies, beginning with the labels."""
+    from scipy.optimize import linear_sum_assignment
 
-
-def _misfit_cost(misfit: Floats, used: Ints, shown: Ints, body: _Body) -> Floats:
-    """Return minus the log-likelihood of squared residuals (T, C) of so many particles.
-
-    The residuals of a frame follow a multivariate Student law of the usual noise: a frame as a
-    whole may be worse than others. A detection left out lies anywhere within the body's extent.
-    """
     n, d = body.template.shape
-    freedom = np.maximum(degrees_of_freedom(np.arange(n + 1), d), 0).astype(np.float64)
-    scale = _STUDENT * body.sigma2
-    gamma = np.array([lgamma((_STUDENT + f) / 2) - lgamma(_STUDENT / 2) for f in freedom])
-    norm = freedom / 2 * np.log(np.pi * scale) - gamma
-    extent = 2 * float(np.linalg.norm(body.template, axis=1).max())
-    strays = d * np.log(extent) * (shown[:, None] - used)
-    cost: Floats = norm[used] + strays
-    return cost + (_STUDENT + freedom[used]) / 2 * np.log1p(misfit / scale)
+    for k in np.flatnonzero((detections.shown >= d) & (detections.shown <= n)).tolist():
+        if k in found:
+            continue
+        row = detections.x[k][None]
+        x, assignment = detections.x[k, : detections.shown[k]], by_label[k]
+        for _ in range(0 if fits[k] else 10):
+            points = assigned_points(row, assignment[None])[0, 0]
+            rotation, misfit = rigid_fits(points, body.template)
+            if not np.isfinite(misfit):
+                break
+            lab = body.template @ rotation.T
+            away = lab + np.nanmean(points - lab, axis=0) - x[:, None]
+            detection, particle = linear_sum_assignment((away**2).sum(axis=2))
+            assignment = np.full(n, -1, dtype=np.int64)
+            assignment[particle] = detection
+        misfit = rigid_fits(assigned_points(row, assignment[None])[0, 0], body.template)[1]
+        if misfit <= float(body.misfit_limit(detections.shown[k])):
+            found[k] = assignment[None]
 
 
-def _chained(
-    frames: _Frames, body: _Body, lists: _Lists, time: Floats, *, labelled: bool
+def most_likely_identity(
+    detections: Detections, body: BodyModel, time: Floats, *, labelled: bool
 ) -> Identity:
-    """Follow the most likely assignment from frame to frame; cut where it is in doubt."""
-    rows = np.flatnonzero(np.isfinite(lists.cost).any(axis=1))
-    choice, sure = _followed(frames, body, lists, time, rows, labelled=labelled)
-    order = np.full((len(frames.x), frames.n), -1, dtype=np.int64)
-    order[rows] = _columns(frames, lists, rows)[np.arange(rows.size), choice]
-    settled = rows[lists.fits[rows, choice]]
+    """Follow the most likely assignment from row to row; cut where it is in doubt.
+
+    Parameters
+    ----------
+    detections : Detections
+    body : BodyModel
+    time : ndarray, shape (T,)
+    labelled : bool
+        Whether the labels of the body last.
+
+    Returns
+    -------
+    Identity
+
+    Examples
+    --------
+    >>> import perrin
+    >>> x = perrin.Cluster.tetrahedron(1.5).positions[None].repeat(3, 0)
+    >>> detections = Detections.of(x, 4)
+    >>> body = BodyModel.of_row(detections, 0, labelled=True)
+    >>> most_likely_identity(detections, body, np.arange(3.0), labelled=True).order[2].tolist()
+    [0, 1, 2, 3]
+    """
+    candidates = candidate_assignments(detections, body, labelled=labelled)
+    rows = np.flatnonzero(np.isfinite(candidates.cost).any(axis=1))
+    choice, certain = most_likely_path(detections, body, candidates, time, rows, labelled=labelled)
+    order = np.full((len(detections.x), detections.n), -1, dtype=np.int64)
+    order[rows] = candidates.order(detections, rows)[np.arange(rows.size), choice]
+    settled = rows[candidates.fits[rows, choice]]
     used = (order >= 0).sum(axis=1)
-    site = _sites(order)
+    label = labels_in_time(order)
+    swaps = rows[:0]
     if labelled:
-        order = _kept(frames, order, site)
-    piece = np.zeros(len(frames.x), dtype=np.int64)
-    piece[rows[~sure]] = 1
+        changed = (label[1:] != label[:-1]) & (label[:-1] >= 0)
+        swaps = np.setdiff1d(np.flatnonzero(changed.any(axis=1)) + 1, rows[~certain])
+        # Rows without assignment keep the labels that held before them (at the start, after).
+        first = np.argmax(label >= 0, axis=0)
+        opening = label[first, np.arange(label.shape[1])]
+        for k in np.flatnonzero((order < 0).all(axis=1) & (detections.shown > 0)).tolist():
+            held = np.where(label[k] >= 0, label[k], opening)
+            for column in detections.column[k, : detections.shown[k]].tolist():
+                if column < len(held) and held[column] >= 0 and order[k, held[column]] < 0:
+                    order[k, held[column]] = column
+    piece = np.zeros(len(detections.x), dtype=np.int64)
+    piece[rows[~certain]] = 1
     return Identity(
         order=order,
         piece=np.cumsum(piece),
-        swaps=np.setdiff1d(_exchanges(site), rows[~sure]) if labelled else rows[:0],
-        cuts=rows[~sure],
-        extra=rows[frames.shown[rows] > used[rows]],
-        unsettled=np.setdiff1d(np.flatnonzero(frames.shown >= frames.x.shape[2]), settled),
+        swaps=swaps,
+        cuts=rows[~certain],
+        extra=rows[detections.shown[rows] > used[rows]],
+        unsettled=np.setdiff1d(np.flatnonzero(detections.shown >= detections.x.shape[2]), settled),
     )
 
 
-def _followed(
-    frames: _Frames, body: _Body, lists: _Lists, time: Floats, rows: Ints, *, labelled: bool
-) -> tuple[list[int], Bools]:
-    """Return the choice in each settled frame, and whether the step to it is beyond doubt."""
-    if not rows.size:
-        return [], np.empty(0, dtype=np.bool_)
-    spread = _spread(frames, lists, time[rows], rows, labelled=labelled)
-    choice, sure = [_first_choice(frames, body, lists, rows[0], labelled=labelled)], [True]
-    held = _taken(_columns(frames, lists, rows[:1])[0, choice[0]], body.seat)
-    plain = _plain(lists, rows, spread) & labelled
-    nowhere, poses = np.full(held.size, -1), list[_Pose]()
-    for i in range(1, rows.size):
-        poses = _reached(poses, lists, rows[i - 1], choice[-1], spread[i - 1])
-        shown = frames.column[rows[i]]
-        if plain[i - 1] and choice[-1] == 0 and (held == body.seat)[shown].all():
-            choice.append(0)
-            sure.append(True)
-            continue
-        if labelled:
-            _list_held(frames, body, lists, rows[i], held)
-        column = _columns(frames, lists, rows[i : i + 1])[0]
-        cost = _step_cost(lists, poses, rows[i], labelled=labelled)
-        if labelled:
-            cost += _TRUST * _against(held, column, shown)
-        now = int(np.argmin(cost))
-        # Two candidates that agree on every particle both of them place are in no conflict.
-        near = column[cost <= cost[now] + _DOUBT]
-        rivals = len(near) > 1 and _moved(_taken(column[now], nowhere), near).any()
-        choice.append(now)
-        sure.append(not rivals)
-        if labelled:
-            held = _taken(column[now], held)
-    return choice, np.array(sure)
+def labels_in_time(order: Ints) -> Ints:
+    """Return the particle that each column last was.
+
+    Parameters
+    ----------
+    order : ndarray of int, shape (T, n)
+
+    Returns
+    -------
+    ndarray of int, shape (T, m)
+        -1 before the first row in which a column is a particle.
+
+    Examples
+    --------
+    >>> labels_in_time(np.array([[0, -1], [-1, -1], [1, 0]])).tolist()
+    [[0, -1], [0, -1], [1, 0]]
+    """
+    label = np.full((len(order), int(order.max(initial=0)) + 1), -1, dtype=np.int64)
+    row, particle = np.nonzero(order >= 0)
+    label[row, order[row, particle]] = particle
+    last = np.maximum.accumulate(np.where(label >= 0, np.arange(len(label))[:, None], -1), axis=0)
+    held = np.take_along_axis(label, np.maximum(last, 0), axis=0)
+    return np.where(last >= 0, held, -1)
 
 
-class _Pose(NamedTuple):
-    """A rotation reached before, and the variance of a component of the turn since then."""
+class Pose(NamedTuple):
+    """A rotation that was reached, and the variance of the turn since then.
+
+    Attributes
+    ----------
+    rotation : ndarray, shape (d, d)
+        Rotation from the axes of the body to those of the laboratory.
+    variance : float
+        Variance of one component of the rotation vector from this rotation to the next, rad^2.
+    """
 
     rotation: Floats
-    spread: float
+    variance: float
 
 
-def _reached(
-    poses: list[_Pose], lists: _Lists, row: int, choice: int, spread: float
-) -> list[_Pose]:
-    """Return the poses a step may start from: the last noise-like one and the last of all.
+def most_likely_path(
+    detections: Detections,
+    body: BodyModel,
+    candidates: Candidates,
+    time: Floats,
+    rows: Ints,
+    *,
+    labelled: bool,
+) -> tuple[list[int], Bools]:
+    """Choose the most likely candidate of each row, given that of the row before.
 
-    A single frame may have a wrong rotation, and over many bad frames the body turns far: the step
-    is as likely as from the nearer of the two.
+    Parameters
+    ----------
+    detections : Detections
+    body : BodyModel
+    candidates : Candidates
+        With labels, the assignment of the row before is added where it is missing.
+    time : ndarray, shape (T,)
+    rows : ndarray of int, shape (K,)
+        Rows that have candidates.
+    labelled : bool
+
+    Returns
+    -------
+    choice : list of int
+        The candidate of each of the rows.
+    certain : ndarray of bool, shape (K,)
+        False where a candidate in conflict with the chosen one is nearly as likely.
+
+    Examples
+    --------
+    >>> import perrin
+    >>> x = perrin.Cluster.tetrahedron(1.5).positions[None].repeat(3, 0)
+    >>> detections = Detections.of(x, 4)
+    >>> body = BodyModel.of_row(detections, 0, labelled=True)
+    >>> candidates = candidate_assignments(detections, body, labelled=True)
+    >>> most_likely_path(detections, body, candidates, np.arange(3), np.arange(3), labelled=True)
+    ([0, 0, 0], array([ True,  True,  True]))
     """
-    pose = _Pose(lists.rotation[row, choice], spread)
-    if lists.fits[row, choice] or not poses:
-        return [pose]
-    return [_Pose(poses[0].rotation, poses[0].spread + spread), pose]
+    if not rows.size:
+        return [], np.empty(0, dtype=np.bool_)
+    variance = candidates.step_variance(detections, time[rows], rows, labelled=labelled)
+    order = candidates.order(detections, rows[:1])[0]
+    cost = candidates.cost[rows[0]]
+    if labelled:
+        # Of equivalent candidates the one is chosen that agrees with the labels of most particles.
+        particle = np.where(order >= 0, body.label[order], -1)
+        wrong = ((particle != np.arange(detections.n)) & (order >= 0)).sum(axis=1)
+        against = _contradict(body.label, order, detections.column[rows[0]])
+        cost = cost + _LABEL_LOG_ODDS * against + wrong
+    choice, certain = [int(np.argmin(cost))], [True]
+    label = _passed_on(body.label, order[choice[0]])
+    # A step between rows with the labels as given is obvious where it is likelier than all others,
+    # whatever their angles: every other candidate contradicts the labels.
+    turned, misfit = candidates.rotation[rows, 0], candidates.cost[rows[1:]]
+    given = np.isin(rows, candidates.given) & labelled
+    own = squared_angle(turned[:-1], turned[1:]) / (2 * variance) + misfit[:, 0]
+    sure = own + _SETTLED_LOG_ODDS < misfit[:, 1:].min(axis=1) + _LABEL_LOG_ODDS
+    obvious = given[:-1] & given[1:] & sure
+    nowhere, poses = np.full(label.size, -1), list[Pose]()
+    for i in range(1, rows.size):
+        # A step begins at the last noise-like pose or at the last of all, whichever is likelier:
+        # a single row may have a wrong rotation, and over many bad rows the body turns far.
+        before = rows[i - 1], choice[-1]
+        pose = Pose(candidates.rotation[before], variance[i - 1])
+        if candidates.fits[before] or not poses:
+            poses = [pose]
+        else:
+            poses = [Pose(poses[0].rotation, poses[0].variance + variance[i - 1]), pose]
+        shown = detections.column[rows[i]]
+        if obvious[i - 1] and choice[-1] == 0 and (label == body.label)[shown].all():
+            choice.append(0)
+            certain.append(True)
+            continue
+        if labelled:
+            candidates.include(detections, body, rows[i], label)
+        order = candidates.order(detections, rows[i : i + 1])[0]
+        cost = candidates.step_cost(poses, rows[i], labelled=labelled)
+        if labelled:
+            cost += _LABEL_LOG_ODDS * _contradict(label, order, shown)
+        best = int(np.argmin(cost))
+        # Two candidates that agree on every particle both of them place are in no conflict.
+        near = order[cost <= cost[best] + _SETTLED_LOG_ODDS]
+        rivals = len(near) > 1 and _relabel(_passed_on(nowhere, order[best]), near).any()
+        choice.append(best)
+        certain.append(not rivals)
+        if labelled:
+            label = _passed_on(label, order[best])
+    return choice, np.array(certain)
 
 
-def _list_held(frames: _Frames, body: _Body, lists: _Lists, row: int, held: Ints) -> None:
-    """Add the labels as they were last held to the candidates of a frame, whatever their misfit.
-
-    They are the labels as given until an exchange. The last place of every list is kept for them.
-    """
-    one = slice(row, row + 1)
-    place = _places(frames._replace(column=frames.column[one]), held)
-    if (place >= 0).sum() != frames.shown[row] or (lists.place[row] == place).all(axis=1).any():
-        return
-    rotation, misfit = _fits(_seated(frames.x[one], place[:, None])[0], body.template)
-    used = (place >= 0).sum(axis=1)[:, None]
-    lists.place[row, -1], lists.rotation[row, -1] = place[0], rotation[0]
-    lists.cost[row, -1] = _misfit_cost(misfit[:, None], used, frames.shown[one], body)[0, 0]
-    lists.fits[row, -1] = misfit[0] <= _limit(used, body)[0, 0]
+def _passed_on(label: Ints, order: Ints) -> Ints:
+    """Return the labels (m,) after a row in which the particles are in the columns of an order."""
+    placed = order >= 0
+    new = np.where((label >= 0) & placed[label], -1, label)
+    new[order[placed]] = np.flatnonzero(placed)
+    return new
 
 
-def _plain(lists: _Lists, rows: Ints, spread: Floats) -> Bools:
-    """Return the steps between rows whose own labels are beyond doubt whatever the other angles.
-
-    Every other candidate bears the whole weight of the labels, so its misfit is compared alone.
-    """
-    square = _square_angle(lists.rotation[rows[:-1], 0], lists.rotation[rows[1:], 0])
-    cost = lists.cost[rows[1:]]
-    own = np.isin(rows, lists.own)
-    sure = square / (2 * spread) + cost[:, 0] + _DOUBT < cost[:, 1:].min(axis=1) + _TRUST
-    return np.asarray(own[:-1] & own[1:] & sure)
+def _relabel(label: Ints, order: Ints) -> Bools:
+    """Return which candidates (C, n) give a column another particle than its label."""
+    before = np.where(order >= 0, label[order], -1)
+    return np.asarray(((before >= 0) & (before != np.arange(order.shape[1]))).any(axis=1))
 
 
-def _taken(column: Ints, held: Ints) -> Ints:
-    """Return the particle (m,) of each column once the particles are in the columns given."""
-    filled = column >= 0
-    seat = np.where((held >= 0) & filled[held], -1, held)
-    seat[column[filled]] = np.flatnonzero(filled)
-    return seat
-
-
-def _moved(held: Ints, column: Ints) -> Bools:
-    """Return which candidates (C, n) give a column another particle than it is held to be."""
-    before = np.where(column >= 0, held[column], -1)
-    return np.asarray(((before >= 0) & (before != np.arange(column.shape[1]))).any(axis=1))
-
-
-def _against(held: Ints, column: Ints, shown: Ints) -> Bools:
+def _contradict(label: Ints, order: Ints, shown: Ints) -> Bools:
     """Return which candidates (C, n) contradict the labels: by another particle, or by none.
 
     Of the columns `shown`, those of known particles are meant to be placed, at most n of them.
     """
-    known = ((shown >= 0) & (held[shown] >= 0)).sum()
-    placed = ((column >= 0) & (held[column] >= 0)).sum(axis=1)
-    return np.asarray(_moved(held, column) | (placed < min(known, column.shape[1])))
-
-
-def _first_choice(frames: _Frames, body: _Body, lists: _Lists, row: int, *, labelled: bool) -> int:
-    """Return the assignment to begin with: the labels unless another is e^18 times likelier."""
-    cost = lists.cost[row]
-    if labelled:
-        column = _columns(frames, lists, np.array([row]))[0]
-        particle = np.where(column >= 0, body.seat[column], -1)
-        wrong = ((particle != np.arange(frames.n)) & (column >= 0)).sum(axis=1)
-        cost = cost + _TRUST * _against(body.seat, column, frames.column[row]) + wrong
-    return int(np.argmin(cost))
-
-
-def _columns(frames: _Frames, lists: _Lists, rows: Ints) -> Ints:
-    """Return the columns that the listed assignments of some frames take, (K, C, n)."""
-    place = lists.place[rows]
-    column = frames.column[rows[:, None, None], np.maximum(place, 0)]
-    return np.where(place >= 0, column, -1)
-
-
-def _spread(frames: _Frames, lists: _Lists, time: Floats, rows: Ints, *, labelled: bool) -> Floats:
-    """Return the variance of one component of each step's rotation vector, from the median.
-
-    Columns that are lasting particles show the turn between two frames even where their labels are
-    not those of the shape; of detections without labels the least turn counts.
-    """
-    steps = _labelled_turns(frames, rows) if labelled else rows[:0]
-    if not 2 * steps.size > rows.size:
-        fits = lists.fits[rows]
-        first = lists.rotation[rows[:-1], np.argmax(fits[:-1], axis=1)]
-        square = _square_angle(first[:, None], lists.rotation[rows[1:]])
-        square = np.where(fits[1:], square, np.inf).min(axis=1)
-        steps = square[fits[:-1].any(axis=1) & fits[1:].any(axis=1)]
-    gap = np.diff(time)
-    usual = float(np.median(gap)) if gap.size else 1.0
-    median = float(np.median(steps)) if steps.size else 0.0
-    typical = median / _median_chi2(3.0 if frames.x.shape[2] == 3 else 1.0)
-    spread: Floats = max(typical, _TINY**2) * np.maximum(gap / usual, 1.0)
-    return spread
-
-
-def _labelled_turns(frames: _Frames, rows: Ints) -> Floats:
-    """Return the squared angles of the steps between rows that columns seen in both fix."""
-    count, d = int(frames.column.max()) + 1, frames.x.shape[2]
-    points = np.full((rows.size, count, d), np.nan)
-    row, detection = np.nonzero(frames.column[rows] >= 0)
-    points[row, frames.column[rows[row], detection]] = frames.x[rows[row], detection]
-    rotation, misfit = _fits(points[1:], points[:-1])
-    return _square_angle(rotation[np.isfinite(misfit)], np.eye(d))
-
-
-def _step_cost(lists: _Lists, poses: list[_Pose], row: int, *, labelled: bool) -> Floats:
-    """Return minus the log-likelihood (C,) of a frame's candidates after the poses before it."""
-    misfit = lists.cost[row]
-    turns = np.full(misfit.shape, np.inf)
-    for pose in poses:
-        square = _square_angle(pose.rotation, lists.rotation[row])
-        # A body that leaps follows no law of its small steps: those of the leap's own size decide.
-        least = float(square[np.isfinite(misfit)].min())
-        wide = max(pose.spread, least / (_LEAP_LABELLED if labelled else _LEAP_UNLABELLED))
-        turns = np.minimum(turns, square / (2 * wide))
-    return np.asarray(turns + misfit)
-
-
-def _sites(order: Ints) -> Ints:
-    """Return the particle that each column was last (T, m); -1 before its first."""
-    site = np.full((len(order), int(order.max(initial=0)) + 1), -1, dtype=np.int64)
-    row, particle = np.nonzero(order >= 0)
-    site[row, order[row, particle]] = particle
-    last = np.maximum.accumulate(np.where(site >= 0, np.arange(len(site))[:, None], -1), axis=0)
-    held = np.take_along_axis(site, np.maximum(last, 0), axis=0)
-    return np.where(last >= 0, held, -1)
-
-
-def _exchanges(site: Ints) -> Ints:
-    """Return the rows at which a column becomes another particle than it last was."""
-    changed = (site[1:] != site[:-1]) & (site[:-1] >= 0)
-    return np.flatnonzero(changed.any(axis=1)) + 1
-
-
-def _kept(frames: _Frames, order: Ints, site: Ints) -> Ints:
-    """Give frames without assignment the labels that held before them (at the start, after)."""
-    out = order.copy()
-    rows = np.flatnonzero((order < 0).all(axis=1) & (frames.shown > 0))
-    first = np.argmax(site >= 0, axis=0)
-    opening = site[first, np.arange(site.shape[1])]
-    for k in rows.tolist():
-        held = np.where(site[k] >= 0, site[k], opening)
-        for column in frames.column[k, : frames.shown[k]].tolist():
-            if column < len(held) and held[column] >= 0 and out[k, held[column]] < 0:
-                out[k, held[column]] = column
-    return out
+    known = ((shown >= 0) & (label[shown] >= 0)).sum()
+    placed = ((order >= 0) & (label[order] >= 0)).sum(axis=1)
+    return np.asarray(_relabel(label, order) | (placed < min(known, order.shape[1])))

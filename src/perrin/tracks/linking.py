@@ -1,4 +1,4 @@
-"""Which detections are one cluster, and which cluster of the next frame it is: no ids needed."""
+"""Which detections form one cluster, and which cluster of the next frame it is."""
 
 from __future__ import annotations
 
@@ -6,7 +6,9 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from perrin.tracks.bonds import frames_of
+from perrin.tracks.groups import connected_groups, frames_of
+from perrin.tracks.groups import touching_groups as touching_groups
+from perrin.tracks.identity import median_chi2
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -14,23 +16,24 @@ if TYPE_CHECKING:
     from perrin._arrays import Floats, Ints
 
 
-# A centre is looked for within six standard deviations, for so many frames after it was lost; a
-# link is sure when the other way round is a hundred times less likely.
-_GATE, _MEMORY = 36.0, 10
+# A centre is searched for within six standard deviations (squared: the gate), for this number of
+# frames after it was lost.
+_GATE, _FRAMES_REMEMBERED = 36.0, 10
 
 
-_DOUBT = float(np.log(100.0))
+# Log-odds: a link is certain when the best assignment without it is a hundred times less likely.
+_CERTAIN_LOG_ODDS = float(np.log(100.0))
 
 
 # A centre of the particles found is off by up to this share of the contact distance for each one
 # missing over each one found.
-_LOPSIDED = 0.6
+_OFF_PER_MISSING = 0.6
 
 
-_FEWEST = 3
+_FEWEST_FRAMES = 3  # of a track that is kept
 
 
-_NEVER = 1e6  # the cost of a link that is none
+_NO_LINK = 1e6  # the cost of a link that is excluded
 
 
 def link_clusters(frame: Ints, x: Floats, *, reach: float, contact: float, size: int) -> Ints:
@@ -41,13 +44,13 @@ def link_clusters(frame: Ints, x: Floats, *, reach: float, contact: float, size:
     frame : ndarray of int, shape (N,)
         Frame number of each detection.
     x : ndarray, shape (N, d)
-        Where it is, um; no NaN.
+        Coordinates of each detection, um; no NaN.
     reach : float
         Particles of a cluster are chained by distances up to this, um.
     contact : float
         Centre distance of touching particles, um.
     size : int
-        Particles of a cluster.
+        Number of particles of a cluster.
 
     Returns
     -------
@@ -60,6 +63,12 @@ def link_clusters(frame: Ints, x: Floats, *, reach: float, contact: float, size:
     that pass each other stay apart as long as their spheres are nearer to their own than to the
     other's. Centres are linked by least squared distance over the variance of a step (from the
     median step, growing with time). Where another link is nearly as likely all tracks involved end.
+
+    Examples
+    --------
+    >>> x = np.array([[0.0], [1.0], [9.0], [0.1], [1.1], [0.2], [1.2]])
+    >>> link_clusters(np.array([0, 0, 0, 1, 1, 2, 2]), x, reach=1.3, contact=1.0, size=2)
+    array([ 0,  0, -1,  0,  0,  0,  0])
     """
     smallest = min(size, x.shape[1])
     group = np.full(len(frame), -1, dtype=np.int64)
@@ -70,99 +79,65 @@ def link_clusters(frame: Ints, x: Floats, *, reach: float, contact: float, size:
         count += int(label.max(initial=-1)) + 1
     if not count:
         return group
-    track = _linked(_centers(frame, x, group, count, size=size, contact=contact))
-    lasting = np.bincount(track, minlength=1) >= _FEWEST
+    rows = np.flatnonzero(group >= 0)
+    n = np.bincount(group[rows], minlength=count)
+    position = [np.bincount(group[rows], weights=a, minlength=count) / n for a in x[rows].T]
+    when = np.zeros(count, dtype=np.int64)
+    when[group[rows]] = frame[rows]
+    extra = (_OFF_PER_MISSING * contact * (size - n) / n) ** 2 / x.shape[1]
+    track = linked_tracks(Centers(when, np.stack(position, axis=1), extra))
+    lasting = np.bincount(track, minlength=1) >= _FEWEST_FRAMES
     number = np.where(lasting, np.cumsum(lasting) - 1, -1)
     return np.where(group >= 0, number[track[np.maximum(group, 0)]], -1)
 
 
-def touching_groups(x: Floats, *, reach: float, size: int, smallest: int) -> Ints:
-    """Group the points of one frame: chains of distances up to `reach`, of at most `size` points.
+class Centers(NamedTuple):
+    """Centres of the groups of all frames.
 
-    Parameters
+    Attributes
     ----------
-    x : ndarray, shape (N, d)
-    reach : float
-    size, smallest : int
-        Groups of fewer than `smallest` points are loose.
-
-    Returns
-    -------
-    ndarray of int64, shape (N,)
-        Group of each point from 0 on, -1 for loose points.
-
-    Examples
-    --------
-    >>> x = np.array([[0.0], [1.0], [2.2], [3.2]])
-    >>> touching_groups(x, reach=1.3, size=2, smallest=2)
-    array([0, 0, 1, 1])
+    frame : ndarray of int, shape (G,)
+        Frame number of each group.
+    position : ndarray, shape (G, d)
+        Mean position of the particles found, um.
+    extra : ndarray, shape (G,)
+        Variance of the centre that missing particles cause, um^2; 0 for complete groups.
     """
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-    from scipy.spatial import cKDTree
-
-    pairs = cKDTree(x).query_pairs(reach, output_type="ndarray")
-    links = coo_array((np.ones(len(pairs)), tuple(pairs.T)), shape=(len(x), len(x)))
-    label = connected_components(links, directed=False)[1].astype(np.int64)
-    crowded = np.flatnonzero(np.bincount(label) > size)
-    if crowded.size:
-        inside = np.isin(label[pairs[:, 0]], crowded)
-        label = _capped(x, pairs[inside], label, size=size)
-    _, label, members = np.unique(label, return_inverse=True, return_counts=True)
-    number = np.where(members >= smallest, np.cumsum(members >= smallest) - 1, -1)
-    return np.asarray(number[label], dtype=np.int64)
-
-
-def _capped(x: Floats, pairs: Ints, label: Ints, *, size: int) -> Ints:
-    """Join points along the shortest pairs first, but never to more than `size`."""
-    length = np.linalg.norm(x[pairs[:, 0]] - x[pairs[:, 1]], axis=1)
-    points = np.unique(pairs).tolist()
-    out = label.copy()
-    first = int(label.max()) + 1
-    out[points] = first + np.arange(len(points))
-    members = {first + k: [p] for k, p in enumerate(points)}
-    for i, j in pairs[np.argsort(length, kind="stable")].tolist():
-        a, b = int(out[i]), int(out[j])
-        if a != b and len(members[a]) + len(members[b]) <= size:
-            out[members[b]] = a
-            members[a] += members.pop(b)
-    return out
-
-
-class _Centers(NamedTuple):
-    """Groups of all frames: when, where, and the variance of their place from missing particles."""
 
     frame: Ints
-    place: Floats
+    position: Floats
     extra: Floats
 
 
-def _centers(
-    frame: Ints, x: Floats, group: Ints, count: int, *, size: int, contact: float
-) -> _Centers:
-    rows = np.flatnonzero(group >= 0)
-    n = np.bincount(group[rows], minlength=count)
-    place = np.stack(
-        [np.bincount(group[rows], weights=a, minlength=count) / n for a in x[rows].T], axis=1
-    )
-    when = np.zeros(count, dtype=np.int64)
-    when[group[rows]] = frame[rows]
-    return _Centers(when, place, (_LOPSIDED * contact * (size - n) / n) ** 2 / x.shape[1])
+def linked_tracks(centers: Centers) -> Ints:
+    """Link centres through time by least squares.
 
+    Parameters
+    ----------
+    centers : Centers
 
-def _linked(centers: _Centers) -> Ints:
-    """Return the track of each group."""
-    variance = _step_variance(centers)
+    Returns
+    -------
+    ndarray of int64, shape (G,)
+        Track of each group, numbered by first appearance.
+
+    Examples
+    --------
+    >>> position = np.array([[0.0], [5.0], [5.1], [0.1]])
+    >>> linked_tracks(Centers(np.array([0, 0, 1, 1]), position, np.zeros(4)))
+    array([0, 1, 1, 0])
+    """
+    variance = step_variance(centers)
     track = np.full(len(centers.frame), -1, dtype=np.int64)
     active = np.empty(0, dtype=np.int64)
     count = 0
     for groups in frames_of(centers.frame):
         now = int(centers.frame[groups[0]])
-        active = active[centers.frame[active] >= now - _MEMORY]
+        active = active[centers.frame[active] >= now - _FRAMES_REMEMBERED]
         ended = []
-        for old, new, sure in _links(centers, active, groups, variance):
+        for old, new, certain in _links(centers, active, groups, variance):
             ended.append(old)
-            if sure:
+            if certain:
                 track[new] = track[old]
         fresh = groups[track[groups] < 0]
         track[fresh] = count + np.arange(fresh.size)
@@ -171,40 +146,57 @@ def _linked(centers: _Centers) -> Ints:
     return track
 
 
-def _step_variance(centers: _Centers) -> float:
-    """Return the variance of one coordinate of a step of one frame, from the median step."""
+def step_variance(centers: Centers) -> float:
+    """Return the variance of one coordinate of a step of one frame, from the median step.
+
+    Only steps between complete groups that are each other's nearest count.
+
+    Parameters
+    ----------
+    centers : Centers
+
+    Returns
+    -------
+    float
+        um^2; inf where there is no such step.
+
+    Examples
+    --------
+    >>> steps = np.random.default_rng(0).normal(size=(4000, 3))
+    >>> centers = Centers(np.arange(4000), steps.cumsum(axis=0), np.zeros(4000))
+    >>> round(step_variance(centers), 1)
+    1.0
+    """
     from scipy.spatial import cKDTree
 
     squares = []
     before: Ints | None = None
     for groups in frames_of(centers.frame):
-        whole = groups[centers.extra[groups] == 0]
-        if before is not None and before.size and whole.size:
-            gap = int(centers.frame[whole[0]] - centers.frame[before[0]])
-            there, nearest = cKDTree(centers.place[before]).query(centers.place[whole])
-            back = cKDTree(centers.place[whole]).query(centers.place[before])[1]
-            mutual = back[nearest] == np.arange(whole.size)
-            squares.append(there[mutual] ** 2 / gap)
-        before = whole
-    d = centers.place.shape[1]
-    median_chi2 = float(d * (1 - 2 / (9 * d)) ** 3)
+        complete = groups[centers.extra[groups] == 0]
+        if before is not None and before.size and complete.size:
+            gap = int(centers.frame[complete[0]] - centers.frame[before[0]])
+            old, new = centers.position[before], centers.position[complete]
+            distance, nearest = cKDTree(old).query(new)
+            mutual = cKDTree(new).query(old)[1][nearest] == np.arange(complete.size)
+            squares.append(distance[mutual] ** 2 / gap)
+        before = complete
     if not squares:
         return np.inf
-    return float(np.median(np.concatenate(squares))) / median_chi2
+    return float(np.median(np.concatenate(squares))) / median_chi2(centers.position.shape[1])
 
 
 def _links(
-    centers: _Centers, old: Ints, new: Ints, variance: float
+    centers: Centers, old: Ints, new: Ints, variance: float
 ) -> Iterator[tuple[int, int, bool]]:
-    """Yield the likeliest links of tracks' last groups to groups of this frame, and if sure."""
+    """Yield the likeliest links of tracks' last groups to groups of this frame, and if certain."""
     from scipy.optimize import linear_sum_assignment
 
-    for rows, columns, cost in _contests(centers, old, new, variance):
+    for rows, columns, cost in _link_costs(centers, old, new, variance):
         n, m = cost.shape
         if n == m == 1:
             yield int(old[rows[0]]), int(new[columns[0]]), True
             continue
-        # Nobody has to be linked: leaving one out costs what lies at the gate.
+        # No group has to be linked: leaving one out costs as much as a link at the gate.
         full = np.full((n + m, n + m), _GATE / 2)
         full[:n, :m] = cost
         full[n:, m:] = 0.0
@@ -213,20 +205,22 @@ def _links(
         for a, b in zip(i.tolist(), j.tolist(), strict=True):
             if a < n and b < m:
                 other = full.copy()
-                other[a, b] = _NEVER
+                other[a, b] = _NO_LINK
                 rival = other[linear_sum_assignment(other)].sum()
-                yield int(old[rows[a]]), int(new[columns[b]]), bool(rival - best > _DOUBT)
+                yield (
+                    int(old[rows[a]]),
+                    int(new[columns[b]]),
+                    bool(rival - best > _CERTAIN_LOG_ODDS),
+                )
 
 
-def _contests(
-    centers: _Centers, old: Ints, new: Ints, variance: float
+def _link_costs(
+    centers: Centers, old: Ints, new: Ints, variance: float
 ) -> Iterator[tuple[Ints, Ints, Floats]]:
     """Yield independent sets of last groups and new groups within each other's gates, with costs.
 
     A cost is half the squared distance over its variance; out of the gate it is above all others.
     """
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
     from scipy.spatial import cKDTree
 
     if not old.size or not new.size:
@@ -234,22 +228,20 @@ def _contests(
     gap = float(centers.frame[new[0]] - centers.frame[old].min())
     widest = variance * gap + 2 * float(centers.extra.max())
     reach = float(np.sqrt(_GATE * min(widest, 1e300)))
-    near = cKDTree(centers.place[old]).sparse_distance_matrix(
-        cKDTree(centers.place[new]), reach, output_type="coo_matrix"
+    near = cKDTree(centers.position[old]).sparse_distance_matrix(
+        cKDTree(centers.position[new]), reach, output_type="coo_matrix"
     )
     step = variance * (centers.frame[new[near.col]] - centers.frame[old[near.row]])
-    spread = step + centers.extra[old[near.row]] + centers.extra[new[near.col]]
-    half = 0.5 * near.data**2 / np.maximum(spread, 1e-300)
+    total = step + centers.extra[old[near.row]] + centers.extra[new[near.col]]
+    half = 0.5 * near.data**2 / np.maximum(total, 1e-300)
     kept = half <= _GATE / 2
     i, j, half = near.row[kept], near.col[kept], half[kept]
-    total = old.size + new.size
-    graph = coo_array((np.ones(i.size), (i, old.size + j)), shape=(total, total))
-    part = connected_components(graph, directed=False)[1]
+    part = connected_groups(i, old.size + j, count=old.size + new.size)
     order = np.argsort(part[i], kind="stable")
     for edges in np.split(order, np.flatnonzero(np.diff(part[i[order]])) + 1):
         if edges.size:
             rows, a = np.unique(i[edges], return_inverse=True)
             columns, b = np.unique(j[edges], return_inverse=True)
-            cost = np.full((rows.size, columns.size), _NEVER)
+            cost = np.full((rows.size, columns.size), _NO_LINK)
             cost[a, b] = half[edges]
             yield rows, columns, cost

@@ -1,13 +1,14 @@
-"""Which rows of a track table are no measurements, and what its distances say of its unit."""
+"""Which rows of a track table are no measurements, and whether its distances are in um."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from perrin._arrays import Bools, Floats, Ints, as_positions, present
+from perrin.tracks.groups import frames_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -16,7 +17,7 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
 
-# Columns that trackpy writes beside its coordinates, which are pixels.
+# Columns that trackpy writes in addition to its coordinates, which are in pixels.
 TRACKPY_COLUMNS = ("mass", "size", "ecc", "signal", "raw_mass", "ep")
 
 
@@ -27,60 +28,64 @@ CENTRE_REMOVED = (
 )
 
 
-# Colloidal particles are this far apart, um.
-_NEAR, _FAR = 0.05, 50.0
+# Colloidal particles are between these distances apart, um.
+_LEAST_DISTANCE, _MOST_DISTANCE = 0.05, 50.0
 
 
 # Expected number of coincidences, and probability, below which coincidences are no accident.
-_CHANCE = 1e-3
+_COINCIDENCE_LEVEL = 1e-3
 
 
 # A placeholder is entered and left by steps of over 5 times the particle's median step, which a
 # Brownian step in three dimensions exceeds with a probability of 1e-12; one point is a placeholder
 # if that happens in 3 rows, the origin in one.
-_LEAP, _ROWS = 5.0, 3
+_PLACEHOLDER_STEP, _PLACEHOLDER_ROWS = 5.0, 3
 
 
-# A particle needs this number of steps before its repeats are judged; steps up to this number of
-# rows from a repeat tell how often a coordinate stays by rounding alone.
-_FEWEST, _AROUND = 8, 5
+# A particle needs this number of steps before its repeats are judged; from steps up to this number
+# of rows from a repeat follows how often a coordinate stays the same by rounding alone.
+_FEWEST_STEPS, _ROWS_AROUND = 8, 5
 
 
 # A tenth of the steps of a moving particle are shorter than 0.13 of their standard deviation on an
 # axis; the step that follows a repeat is usually over 5 times as long on one of the axes.
-_SMALL, _MOVING = 0.1, 5.0
+_SMALL_STEP_QUANTILE, _MOVING_STEP = 0.1, 5.0
 
 
 # A repeat by rounding has to be exceeded by this factor.
-_EXCESS = 3.0
+_REPEAT_EXCESS = 3.0
 
 
 # A coordinate farther from every other particle than this number of body sizes is no measurement.
-_TOO_FAR = 20.0
+_FAR_SIZES = 20.0
 
 
 # Particles move if they spread over this number of rounding errors; a centre that varies by less
 # than this share of the spread was removed, whatever the rounding.
-_MOVES, _STILL = 10.0, 1e-6
+_MOVING_SPREAD, _STILL_SHARE = 10.0, 1e-6
 
 
-# Values lie on a lattice if their differences are multiples of one step to this share of it.
-_LATTICE, _NEARLY = 1e-3, 0.02
+# Values lie on a lattice if their differences are multiples of one step to the first share of it; a
+# ratio of two steps is whole to the second.
+_LATTICE_TOLERANCE, _WHOLE_TOLERANCE = 1e-3, 0.02
 
 
-_FRAMES = 60  # in which the nearest particles are searched for
+_POINTS_SHOWN = 3  # placeholders that a warning names
+
+
+_DISTANCE_FRAMES = 60  # in which the nearest particles are searched for
 
 
 @dataclass(frozen=True, eq=False)
 class Screened:
-    """A track table without rows that are no measurements, and what was found.
+    """A track table without rows that are no measurements, and sentences on these rows.
 
     Attributes
     ----------
     table : pandas.DataFrame
         The same rows; the coordinates of those that are no measurements are NaN.
     notes : tuple of str
-        What informs: rows that came without coordinates.
+        Sentence on rows without coordinates.
     warnings : tuple of str
         One sentence per kind of row whose coordinates are no measurements.
     """
@@ -104,7 +109,7 @@ def screen_rows(table: pd.DataFrame) -> Screened:
 
     Notes
     -----
-    Two kinds are found. A *placeholder* is a point that stands for a lost particle, such as
+    Two kinds are found. A *placeholder* is a point that is written for a lost particle, such as
     (0, 0, 0): rows at exactly the same place that is entered and left by steps of more than 5 times
     the particle's median step, in 3 rows or more (the origin: in one), or to which a particle
     returns more often than the resolution of the table allows. A *repeat* has all coordinates of
@@ -137,20 +142,25 @@ def screen_rows(table: pd.DataFrame) -> Screened:
     empty = ~present(x)
     rows = np.lexsort((frame, code))
     rows = rows[~empty[rows]]
-    at_placeholder = _placeholders(code[rows], x[rows])
+    at_placeholder = placeholder_rows(code[rows], x[rows])
     filled, rest = rows[at_placeholder], rows[~at_placeholder]
-    repeated = rest[_repeats(code[rest], x[rest])]
-    notes = _sentence(
+    repeated = rest[repeated_rows(code[rest], x[rest])]
+    notes = _rows_sentence(
         np.flatnonzero(empty), frame, code, "without coordinates (NaN)", "they count as missing"
     )
-    placeholders = _sentence(
+    points, times = np.unique(x[filled], axis=0, return_counts=True)
+    frequent = points[np.argsort(-times, kind="stable")[:_POINTS_SHOWN]]
+    places = [f"({', '.join(f'{c:.6g}' for c in point)})" for point in frequent]
+    if len(points) > _POINTS_SHOWN:
+        places[-1] += f" or {len(points) - _POINTS_SHOWN} more points"
+    placeholders = _rows_sentence(
         filled,
         frame,
         code,
-        f"at exactly {_points(x[filled])}",
+        f"at exactly {' or '.join(places)}",
         "a placeholder for a lost particle, no measurement; they count as missing",
     )
-    repeats = _sentence(
+    repeats = _rows_sentence(
         repeated,
         frame,
         code,
@@ -158,27 +168,21 @@ def screen_rows(table: pd.DataFrame) -> Screened:
         "no measurements; they count as missing",
     )
     bad = np.concatenate([filled, repeated])
-    return Screened(_without(table, axes, bad), notes, placeholders + repeats)
-
-
-def _without(table: pd.DataFrame, axes: list[str], rows: Ints) -> pd.DataFrame:
-    """Return the table with the coordinates of some rows missing."""
-    if not rows.size:
-        return table
-    table = table.copy()
-    for axis in axes:
+    if bad.size:
+        table = table.copy()
+    for axis in axes if bad.size else []:
         values = table[axis].to_numpy(dtype=np.float64, na_value=np.nan, copy=True)
-        values[rows] = np.nan
+        values[bad] = np.nan
         table[axis] = values
-    return table
+    return Screened(table, notes, placeholders + repeats)
 
 
 def far_points(positions: ArrayLike) -> Bools:
     """Mark the points of one cluster that are farther from the rest than 20 times its size.
 
     The size is the largest of the median distances between its particles. A point is marked where
-    it is that far from every other particle seen in the frame; where all are that far from each
-    other none can be trusted, and all are marked.
+    it is that far from every other particle of the frame; where all are that far from each other it
+    is unknown which are right, and all are marked.
 
     Parameters
     ----------
@@ -207,7 +211,7 @@ def far_points(positions: ArrayLike) -> Bools:
         distance = np.where(np.isfinite(distance), distance, np.inf)
         nearest[:, i] = np.minimum(nearest[:, i], distance.min(axis=1))
         nearest[:, i + 1 :] = np.minimum(nearest[:, i + 1 :], distance)
-    return np.asarray(np.isfinite(nearest) & (nearest > _TOO_FAR * size))
+    return np.asarray(np.isfinite(nearest) & (nearest > _FAR_SIZES * size))
 
 
 def far_sentence(far: Bools, frames: Ints) -> str:
@@ -233,8 +237,9 @@ def far_sentence(far: Bools, frames: Ints) -> str:
     verb = "is" if points == 1 else "are"
     kind = "no measurement" if points == 1 else "no measurements"
     return (
-        f"{_number(points, 'point')} of {_number(particles, 'particle')} {verb} farther from the "
-        f"rest than {_TOO_FAR:.0f} times the body's size, first in frame {first}: {kind}; left out"
+        f"{_count(points, 'point')} of {_count(particles, 'particle')} {verb} farther from the "
+        f"rest than {_FAR_SIZES:.0f} times the body's size, first in frame {first}: {kind}; left "
+        "out"
     )
 
 
@@ -244,12 +249,12 @@ def centre_removed(positions: ArrayLike) -> bool:
     Parameters
     ----------
     positions : array_like, shape (T, n, d)
-        Of one cluster, um, NaN where missing.
+        Coordinates of the particles of one cluster, um, NaN where missing.
 
     Returns
     -------
     bool
-        Of two frames or fewer, and of a single particle, nothing can be said: False.
+        False also for two frames or fewer, and for a single particle, where it is unknown.
 
     Notes
     -----
@@ -266,34 +271,34 @@ def centre_removed(positions: ArrayLike) -> bool:
     """
     x = as_positions(positions)
     seen = present(x)
-    held = seen.sum(axis=1) >= 2
-    whole = seen.all(axis=1) & held
-    return any(_is_still(x[rows]) for rows in (whole, held) if rows.sum() > 2)
-
-
-def _is_still(x: Floats) -> bool:
-    """Return whether the centre of frames (T, n, d) is constant to rounding, their points not."""
-    seen = present(x)
-    rounding = np.array([_resolution(axis[seen]) for axis in np.moveaxis(x, 2, 0)]) / 2
-    centre = np.nanmean(x, axis=1)
-    spread = np.sqrt(np.nanmedian(np.nanvar(x, axis=0), axis=0))
-    still = np.ptp(centre, axis=0) <= np.maximum(2 * rounding, _STILL * spread)
-    return bool(still.all() and (spread > _MOVES * rounding).any())
+    several = seen.sum(axis=1) >= 2
+    for rows in (seen.all(axis=1) & several, several):
+        if rows.sum() <= 2:
+            continue
+        some, here = x[rows], seen[rows]
+        steps = [lattice_step(axis[here]) for axis in np.moveaxis(some, 2, 0)]
+        rounding = np.array(steps) / 2
+        centre = np.nanmean(some, axis=1)
+        spread = np.sqrt(np.nanmedian(np.nanvar(some, axis=0), axis=0))
+        still = np.ptp(centre, axis=0) <= np.maximum(2 * rounding, _STILL_SHARE * spread)
+        if still.all() and (spread > _MOVING_SPREAD * rounding).any():
+            return True
+    return False
 
 
 def distance_notes(
     table: pd.DataFrame, *, scale_given: bool, trackpy_columns: bool
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """State how far apart the nearest particles are, and warn where that is no colloid.
+    """State the distance of nearest particles, and warn where it is unusual for colloids.
 
     Parameters
     ----------
     table : pandas.DataFrame
         Columns frame, particle, x, y[, z]; coordinates in um after scaling.
     scale_given : bool
-        Whether a scale other than 1 was stated.
+        Whether a scale other than 1 was given.
     trackpy_columns : bool
-        Whether the table came with trackpy's own columns: `has_trackpy_columns`.
+        Whether the table has trackpy's own columns: `has_trackpy_columns`.
 
     Returns
     -------
@@ -309,9 +314,27 @@ def distance_notes(
     >>> distance_notes(table, scale_given=False, trackpy_columns=False)
     (('nearest particles are 2.5 um apart on average',), ())
     """
-    apart = _nearest(table)
-    if apart is None:
+    from scipy.spatial import cKDTree
+
+    axes = [axis for axis in ("x", "y", "z") if axis in table]
+    x = table[axes].to_numpy(dtype=np.float64, na_value=np.nan)
+    frame = table["frame"].to_numpy(dtype=np.int64)
+    frames = np.unique(frame)
+    spaced = np.linspace(0, len(frames) - 1, _DISTANCE_FRAMES).astype(int)
+    some = frames[spaced] if len(frames) else frames
+    rows = np.flatnonzero(present(x) & np.isin(frame, some))
+    rows = rows[np.argsort(frame[rows], kind="stable")]
+    code = table["particle"].iloc[rows].factorize()[0].astype(np.int64)
+    nearest = np.full(len(rows), np.nan)
+    for part in frames_of(frame[rows]):
+        if len(part) > 1:
+            near = x[rows[part]]
+            nearest[part] = cKDTree(near).query(near, 2)[0][:, 1]
+    known = np.isfinite(nearest)
+    if not known.any():
         return (), ()
+    medians = _group_medians(code[known], nearest[known], int(code.max()) + 1)
+    apart = float(np.nanmean(medians))
     text = f"nearest particles are {apart:.3g} um apart on average"
     warnings = []
     if trackpy_columns and not scale_given:
@@ -319,11 +342,11 @@ def distance_notes(
             "the table has columns that trackpy writes, whose coordinates are pixels, but the "
             f"scale is 1 um per unit ({text}): state the um per pixel with scale"
         )
-    if not _NEAR <= apart <= _FAR:
+    if not _LEAST_DISTANCE <= apart <= _MOST_DISTANCE:
         remedy = "correct scale" if scale_given else "state the um per unit with scale"
         warnings.append(
-            f"{text}, outside {_NEAR:g} to {_FAR:g} um: the coordinates are probably not in um; "
-            f"{remedy}"
+            f"{text}, outside {_LEAST_DISTANCE:g} to {_MOST_DISTANCE:g} um: the coordinates are "
+            f"probably not in um; {remedy}"
         )
     return (text,), tuple(warnings)
 
@@ -339,162 +362,149 @@ def has_trackpy_columns(columns: Iterable[object]) -> bool:
     return len(set(columns) & set(TRACKPY_COLUMNS)) >= 2
 
 
-def _nearest(table: pd.DataFrame) -> float | None:
-    """Return the mean over the particles of the distance to the nearest one, um."""
-    from scipy.spatial import cKDTree
+def placeholder_rows(code: Ints, x: Floats) -> Bools:
+    """Mark the rows at points that are written for lost particles, such as (0, 0, 0).
 
-    axes = [axis for axis in ("x", "y", "z") if axis in table]
-    x = table[axes].to_numpy(dtype=np.float64, na_value=np.nan)
-    frame = table["frame"].to_numpy(dtype=np.int64)
-    frames = np.unique(frame)
-    some = frames[np.linspace(0, len(frames) - 1, _FRAMES).astype(int)] if len(frames) else frames
-    rows = np.flatnonzero(present(x) & np.isin(frame, some))
-    rows = rows[np.argsort(frame[rows], kind="stable")]
-    code = table["particle"].iloc[rows].factorize()[0].astype(np.int64)
-    apart = np.full(len(rows), np.nan)
-    for part in np.split(np.arange(len(rows)), np.flatnonzero(np.diff(frame[rows])) + 1):
-        if len(part) > 1:
-            apart[part] = cKDTree(x[rows[part]]).query(x[rows[part]], 2)[0][:, 1]
-    known = np.isfinite(apart)
-    if not known.any():
-        return None
-    medians = _medians(code[known], apart[known], int(code.max()) + 1)
-    return float(np.nanmean(medians))
+    Parameters
+    ----------
+    code : ndarray of int, shape (N,)
+        Particle of each row, from 0; rows are sorted by particle and frame.
+    x : ndarray, shape (N, d)
+        No NaN.
 
+    Returns
+    -------
+    ndarray of bool, shape (N,)
 
-def _placeholders(code: Ints, x: Floats) -> Bools:
-    """Mark the rows, sorted by particle and frame, at points that stand for lost particles."""
+    Examples
+    --------
+    >>> x = 9 + np.random.default_rng(0).normal(size=(40, 2)).cumsum(axis=0)
+    >>> x[20] = 0.0
+    >>> np.flatnonzero(placeholder_rows(np.zeros(40, dtype=int), x)).tolist()
+    [20]
+    """
     if not len(code):
         return np.zeros(0, dtype=np.bool_)
-    place = _places(x)
-    visits = _visits(code, place, x)
-    at, count = visits.place, int(place.max()) + 1
+    # A number for each distinct point.
+    order = np.lexsort(x.T)
+    place = np.empty(len(x), dtype=np.int64)
+    place[order] = np.append(0, np.cumsum((np.diff(x[order], axis=0) != 0).any(axis=1)))
+    # Unbroken stays of particles at one place, with the smaller of the steps there and away in
+    # units of the particle's median step.
+    first = np.flatnonzero(np.append(True, (np.diff(code) != 0) | (np.diff(place) != 0)))
+    particle, at = code[first], place[first]
+    step = np.linalg.norm(np.diff(x[first], axis=0), axis=1)
+    same = np.diff(particle) == 0
+    particles = int(code.max()) + 1
+    usual = _group_medians(particle[1:][same], step[same], particles)
+    usual[np.bincount(particle[1:][same], minlength=particles) < _FEWEST_STEPS] = np.inf
+    step[~same] = np.inf
+    leap = np.minimum(np.append(np.inf, step), np.append(step, np.inf))
+    leap[np.isinf(leap)] = np.nan
+    leap /= usual[particle]
+    count = int(place.max()) + 1
     rows = np.bincount(place, minlength=count)
-    known = np.bincount(at, weights=np.isfinite(visits.leap), minlength=count)
-    leaps = np.bincount(at, weights=visits.leap > _LEAP, minlength=count)
+    known = np.bincount(at, weights=np.isfinite(leap), minlength=count)
+    leaps = np.bincount(at, weights=leap > _PLACEHOLDER_STEP, minlength=count)
     origin = np.zeros(count, dtype=np.bool_)
     origin[place] = (x == 0).all(axis=1)
-    brisk = 2 * np.bincount(at, weights=visits.leap >= 1, minlength=count) > known
-    reached = ((rows >= _ROWS) | origin) & (2 * leaps > known)
-    often = _revisited(code, x, visits, origin)
+    brisk = 2 * np.bincount(at, weights=leap >= 1, minlength=count) > known
+    reached = ((rows >= _PLACEHOLDER_ROWS) | origin) & (2 * leaps > known)
+    often = _revisited_places(code, x, particle, at, origin)
     reached[often] |= brisk[often]
     marked: Bools = reached[place]
     return marked
 
 
-def _revisited(code: Ints, x: Floats, visits: _Visits, origin: Bools) -> Ints:
-    """Return the places to which a particle came back more often than rounding explains."""
+def _revisited_places(code: Ints, x: Floats, particle: Ints, place: Ints, origin: Bools) -> Ints:
+    """Return the places to which a particle returned more often than rounding explains.
+
+    `particle` and `place` are those of each stay, `origin` marks the place at the origin.
+    """
     from scipy.special import pdtrc
 
     particles = int(code.max()) + 1
-    both, times = np.unique(visits.place * particles + visits.code, return_counts=True)
-    place, who = np.divmod(both[times > 1], particles)
+    both, times = np.unique(place * particles + particle, return_counts=True)
+    place, particle = np.divmod(both[times > 1], particles)
     times = times[times > 1]
     found = [np.empty(0, dtype=np.int64)]
-    for particle in np.unique(who):
-        own = who == particle
-        start, stop = np.searchsorted(code, [particle, particle + 1])
+    for one in np.unique(particle):
+        own = particle == one
+        start, stop = np.searchsorted(code, [one, one + 1])
         rows = int(stop - start)
-        returns = rows * float(np.prod(_chances(x[start:stop])))
+        returns = rows * float(np.prod(rounding_chances(x[start:stop])))
         # The origin is known beforehand; any other row may be the first visit.
         known = origin[place[own]]
         level = pdtrc(times[own] - np.where(known, 1, 2), returns) * np.where(known, 1, rows)
-        found.append(place[own][level * particles < _CHANCE])
+        found.append(place[own][level * particles < _COINCIDENCE_LEVEL])
     return np.unique(np.concatenate(found))
 
 
-def _places(x: Floats) -> Ints:
-    """Return a number for each distinct point among x, shape (N, d)."""
-    order = np.lexsort(x.T)
-    other = (np.diff(x[order], axis=0) != 0).any(axis=1)
-    place = np.empty(len(x), dtype=np.int64)
-    place[order] = np.append(0, np.cumsum(other))
-    return place
+def repeated_rows(code: Ints, x: Floats) -> Bools:
+    """Mark the rows that repeat the previous row of their particle.
 
+    Parameters
+    ----------
+    code : ndarray of int, shape (N,)
+        Particle of each row, from 0; rows are sorted by particle and frame.
+    x : ndarray, shape (N, d)
+        No NaN.
 
-class _Visits(NamedTuple):
-    """Unbroken stays of particles at one place; one entry per stay."""
+    Returns
+    -------
+    ndarray of bool, shape (N,)
 
-    code: Ints
-    place: Ints
-    leap: Floats  # the smaller of the steps there and away, over the particle's median step
-
-
-def _visits(code: Ints, place: Ints, x: Floats) -> _Visits:
-    """Divide tracks into stays at one place."""
-    begins = np.append(True, (np.diff(code) != 0) | (np.diff(place) != 0))
-    first = np.flatnonzero(begins)
-    who = code[first]
-    step = np.linalg.norm(np.diff(x[first], axis=0), axis=1)
-    same = np.diff(who) == 0
-    count = int(code.max()) + 1
-    usual = _medians(who[1:][same], step[same], count)
-    few = np.bincount(who[1:][same], minlength=count) < _FEWEST
-    usual[few] = np.inf
-    step[~same] = np.inf
-    leap = np.minimum(np.append(np.inf, step), np.append(step, np.inf))
-    leap[np.isinf(leap)] = np.nan
-    leap /= usual[who]
-    return _Visits(who, place[first], leap)
-
-
-def _repeats(code: Ints, x: Floats) -> Bools:
-    """Mark the rows, sorted by particle and frame, that repeat the one before."""
+    Examples
+    --------
+    >>> x = np.random.default_rng(0).normal(size=(40, 2)).cumsum(axis=0)
+    >>> x[20] = x[19]
+    >>> np.flatnonzero(repeated_rows(np.zeros(40, dtype=int), x)).tolist()
+    [20]
+    """
     from scipy.special import pdtrc
 
     repeated = np.zeros(len(code), dtype=np.bool_)
     if len(code) < 2:
         return repeated
-    same = np.diff(code) == 0
-    held = same & (np.diff(x, axis=0) == 0).all(axis=1)
+    held = (np.diff(code) == 0) & (np.diff(x, axis=0) == 0).all(axis=1)
     particles = int(code.max()) + 1
     for particle in np.unique(code[1:][held]):
         rows = np.arange(*np.searchsorted(code, [particle, particle + 1]))
         stays = held[rows[1:] - 1]
-        if np.count_nonzero(~stays) < _FEWEST or not _moves_on(x[rows], stays):
+        if np.count_nonzero(~stays) < _FEWEST_STEPS or not _moves_after_stays(x[rows], stays):
             continue
-        chance = _chances(x[rows])
+        chance = rounding_chances(x[rows])
+        alone = _lone_stays(x[rows], stays)
         by_rounding = len(stays) * float(np.prod(chance))
-        near_by = len(stays) * float(np.prod(np.maximum(chance, _stays_alone(x[rows], stays))))
+        near_by = len(stays) * float(np.prod(np.maximum(chance, alone)))
         episodes = int(np.count_nonzero(np.diff(np.append(0, stays)) == 1))
-        too_many = stays.sum() >= _EXCESS * near_by and (
-            float(pdtrc(episodes - 1, near_by)) * particles < _CHANCE
+        too_many = stays.sum() >= _REPEAT_EXCESS * near_by and (
+            float(pdtrc(episodes - 1, near_by)) * particles < _COINCIDENCE_LEVEL
         )
-        if too_many or by_rounding * particles < _CHANCE:
+        if too_many or by_rounding * particles < _COINCIDENCE_LEVEL:
             repeated[rows[1:]] = stays
     return repeated
 
 
-def _moves_on(x: Floats, held: Bools) -> bool:
+def _moves_after_stays(x: Floats, stays: Bools) -> bool:
     """Return whether the steps that end repeats are steps of a moving particle.
 
     A particle at rest on the grid of a camera repeats its place too, and leaves it by one unit of
     the grid, which is also the smallest of its steps.
     """
     step = np.abs(np.diff(x, axis=0))
-    unit = [np.quantile(s[s > 0], _SMALL) if (s > 0).any() else np.inf for s in step.T]
-    after = step[1:][held[:-1] & ~held[1:]]
-    return bool(len(after)) and float(np.median((after / unit).max(axis=1))) >= _MOVING
-
-
-def _chances(x: Floats) -> Floats:
-    """Return how likely a step leaves each coordinate of a track (T, d) as it is, by rounding."""
-    step = np.abs(np.diff(x, axis=0))
-    median = np.median(step[step.any(axis=1)], axis=0) if step.any() else np.zeros(x.shape[1])
-    # Where digits count from the first that is not zero, the largest values are the coarsest.
-    large = np.abs(x) >= np.median(np.abs(x), axis=0)
-    lattice = [
-        max(_resolution(values), _resolution(values[upper]))
-        for values, upper in zip(x.T, large.T, strict=True)
+    small = [
+        np.quantile(s[s > 0], _SMALL_STEP_QUANTILE) if (s > 0).any() else np.inf for s in step.T
     ]
-    chance = np.divide(lattice, median, out=np.ones(len(median)), where=median > 0)
-    return np.asarray(np.minimum(chance, 1.0))
+    after = step[1:][stays[:-1] & ~stays[1:]]
+    return bool(len(after)) and float(np.median((after / small).max(axis=1))) >= _MOVING_STEP
 
 
-def _stays_alone(x: Floats, held: Bools) -> Floats:
+def _lone_stays(x: Floats, stays: Bools) -> Floats:
     """Return the share of steps near repeats in which a coordinate stays but others do not."""
-    around = np.convolve(held, np.ones(2 * _AROUND + 1), mode="full")[_AROUND : _AROUND + len(held)]
-    zero = np.diff(x, axis=0)[(around > 0.5) & ~held] == 0
+    window = np.ones(2 * _ROWS_AROUND + 1)
+    around = np.convolve(stays, window, mode="full")[_ROWS_AROUND : _ROWS_AROUND + len(stays)]
+    zero = np.diff(x, axis=0)[(around > 0.5) & ~stays] == 0
     shares = []
     for axis in range(x.shape[1]):
         others_move = ~np.delete(zero, axis, axis=1).all(axis=1)
@@ -503,8 +513,51 @@ def _stays_alone(x: Floats, held: Bools) -> Floats:
     return np.array(shares)
 
 
-def _resolution(values: Floats) -> float:
-    """Return the step of the lattice on which all values lie, or their rounding error."""
+def rounding_chances(x: Floats) -> Floats:
+    """Return the probability that a step leaves each coordinate of a track the same by rounding.
+
+    Parameters
+    ----------
+    x : ndarray, shape (T, d)
+
+    Returns
+    -------
+    ndarray, shape (d,)
+
+    Examples
+    --------
+    >>> x = np.array([[0.0, 0.0], [0.5, 1.0], [1.0, 3.0], [1.5, 4.0], [2.1, 6.0]])
+    >>> rounding_chances(x).round(2).tolist()
+    [0.2, 0.67]
+    """
+    step = np.abs(np.diff(x, axis=0))
+    median = np.median(step[step.any(axis=1)], axis=0) if step.any() else np.zeros(x.shape[1])
+    # Where digits count from the first that is not zero, the largest values are the coarsest.
+    large = np.abs(x) >= np.median(np.abs(x), axis=0)
+    lattice = [
+        max(lattice_step(values), lattice_step(values[upper]))
+        for values, upper in zip(x.T, large.T, strict=True)
+    ]
+    chance = np.divide(lattice, median, out=np.ones(len(median)), where=median > 0)
+    return np.asarray(np.minimum(chance, 1.0))
+
+
+def lattice_step(values: Floats) -> float:
+    """Return the step of the lattice on which all values lie, or their rounding error.
+
+    Parameters
+    ----------
+    values : ndarray, shape (N,)
+
+    Returns
+    -------
+    float
+
+    Examples
+    --------
+    >>> round(lattice_step(np.array([0.3, 0.9, 1.2])), 12)
+    0.3
+    """
     distinct = np.unique(values)
     rounding = 8 * float(np.finfo(np.float64).eps) * float(np.abs(values).max(initial=0.0))
     gaps = np.diff(distinct)
@@ -514,20 +567,20 @@ def _resolution(values: Floats) -> float:
     step = float(gaps.min())
     # Euclid's algorithm for all differences; a step that divides the smallest and the largest is
     # refined by them, so that rounding errors do not grow.
-    while rounding < _LATTICE * step:
+    while rounding < _LATTICE_TOLERANCE * step:
         off = np.abs(gaps - np.round(gaps / step) * step)
-        off = off[off > _LATTICE * step]
+        off = off[off > _LATTICE_TOLERANCE * step]
         if not off.size:
             return step
         finer = float(off.min())
         for gap in (float(gaps.min()), float(gaps.max())):
             times = round(gap / finer)
-            finer = gap / times if abs(gap - times * finer) <= _NEARLY * finer else finer
+            finer = gap / times if abs(gap - times * finer) <= _WHOLE_TOLERANCE * finer else finer
         step = min(finer, 0.75 * step)
     return rounding
 
 
-def _medians(group: Ints, values: Floats, count: int) -> Floats:
+def _group_medians(group: Ints, values: Floats, count: int) -> Floats:
     """Return the median of the values in each group, NaN for none."""
     size = np.bincount(group, minlength=count)
     ordered = np.append(values[np.lexsort((values, group))], np.nan)
@@ -537,24 +590,13 @@ def _medians(group: Ints, values: Floats, count: int) -> Floats:
     return medians
 
 
-def _sentence(rows: Ints, frame: Ints, code: Ints, what: str, meaning: str) -> tuple[str, ...]:
+def _rows_sentence(rows: Ints, frame: Ints, code: Ints, what: str, meaning: str) -> tuple[str, ...]:
     """State how many rows of how many particles are of a kind, and the first frame."""
     if not rows.size:
         return ()
-    counted = f"{_number(rows.size, 'row')} of {_number(np.unique(code[rows]).size, 'particle')}"
+    counted = f"{_count(rows.size, 'row')} of {_count(np.unique(code[rows]).size, 'particle')}"
     return (f"{counted} {what}, first in frame {frame[rows].min()}: {meaning}",)
 
 
-def _points(x: Floats, limit: int = 3) -> str:
-    """List the distinct points among x, the most frequent first."""
-    points, times = np.unique(x, axis=0, return_counts=True)
-    listed = [
-        f"({', '.join(f'{c:.6g}' for c in point)})"
-        for point in points[np.argsort(-times, kind="stable")[:limit]]
-    ]
-    more = f" or {len(points) - limit} more points" if len(points) > limit else ""
-    return " or ".join(listed) + more
-
-
-def _number(count: int, noun: str) -> str:
+def _count(count: int, noun: str) -> str:
     return f"{count} {noun}{'' if count == 1 else 's'}"

@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all."""
+"""Writing files so that they appear whole or not at all."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ if TYPE_CHECKING:
 
 
 @contextmanager
-def written_whole(place: Path) -> Iterator[Path]:
-    """Give a path to write to, which is renamed to `place` when all has been written.
+def written_whole(path: Path) -> Iterator[Path]:
+    """Give a path to write to, which is renamed to `path` when all has been written.
 
-    The file is on the disk before it is renamed, and the renaming before the function returns, so
-    that a power cut leaves the old file or the new one.
+    The file is flushed to the disk before it is renamed, and its folder afterwards, so that a power
+    cut leaves the old file or the new one.
 
     Parameters
     ----------
-    place : Path
-        Where the file is to appear.
+    path : Path
+        Final path of the file.
 
     Yields
     ------
@@ -31,22 +31,22 @@ def written_whole(place: Path) -> Iterator[Path]:
     Raises
     ------
     OSError
-        If the file cannot be written; the message names `place`.
+        If the file cannot be written; the message names `path`.
     """
-    beside = place.with_name(f".{place.name}.{os.getpid()}.part")
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
-        yield beside
-        _flush(beside)
-        beside.replace(place)
+        yield part
+        _flush(part)
+        part.replace(path)
         if os.name == "posix":
-            _flush(place.parent)
+            _flush(path.parent)
     except OSError as fault:
         if fault.errno is None:
             raise
-        # The system's message names the path beside, or none.
-        raise type(fault)(fault.errno, fault.strerror, str(place)) from fault
+        # The system's message names the temporary path, or none.
+        raise type(fault)(fault.errno, fault.strerror, str(path)) from fault
     finally:
-        beside.unlink(missing_ok=True)
+        part.unlink(missing_ok=True)
 
 
 def _flush(path: Path) -> None:

@@ -1,0 +1,112 @@
+"""Points in groups: the rows of one frame, connected pairs, and touching particles."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from perrin._arrays import Floats, Ints
+
+
+# Particles nearer than this number of contact distances touch. The next shell of a packing begins
+# at 1.41 diameters.
+TOUCHING_REACH = 1.3
+
+
+def frames_of(frame: Ints) -> Iterator[Ints]:
+    """Yield the rows of each frame, in the order of the frame numbers.
+
+    Parameters
+    ----------
+    frame : ndarray of int, shape (N,)
+        Frame number of each row.
+
+    Yields
+    ------
+    ndarray of int
+        Rows of one frame, in their order.
+
+    Examples
+    --------
+    >>> [rows.tolist() for rows in frames_of(np.array([5, 3, 5]))]
+    [[1], [0, 2]]
+    """
+    order = np.argsort(frame, kind="stable")
+    yield from np.split(order, np.flatnonzero(np.diff(frame[order])) + 1)
+
+
+def connected_groups(first: Ints, second: Ints, *, count: int) -> Ints:
+    """Return the connected component of each of `count` points that are joined in pairs.
+
+    Parameters
+    ----------
+    first, second : ndarray of int, shape (P,)
+        The two points of each pair.
+    count : int
+        Number of points.
+
+    Returns
+    -------
+    ndarray of int64, shape (count,)
+
+    Examples
+    --------
+    >>> connected_groups(np.array([0, 2]), np.array([2, 4]), count=5)
+    array([0, 1, 0, 2, 0])
+    """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    graph = coo_array((np.ones(len(first)), (first, second)), shape=(count, count))
+    return np.asarray(connected_components(graph, directed=False)[1], dtype=np.int64)
+
+
+def touching_groups(x: Floats, *, reach: float, size: int, smallest: int) -> Ints:
+    """Group the points of one frame: chains of distances up to `reach`, of at most `size` points.
+
+    Chains of more points are divided: points are joined from the nearest pair on, but never to
+    more than `size`.
+
+    Parameters
+    ----------
+    x : ndarray, shape (N, d)
+    reach : float
+        Largest distance of touching points, in the unit of `x`.
+    size, smallest : int
+        Largest and smallest number of points of a group; points of smaller groups are loose.
+
+    Returns
+    -------
+    ndarray of int64, shape (N,)
+        Group of each point from 0 on, -1 for loose points.
+
+    Examples
+    --------
+    >>> x = np.array([[0.0], [1.0], [2.2], [3.2]])
+    >>> touching_groups(x, reach=1.3, size=2, smallest=2)
+    array([0, 0, 1, 1])
+    """
+    from scipy.spatial import cKDTree
+
+    pairs = cKDTree(x).query_pairs(reach, output_type="ndarray")
+    label = connected_groups(pairs[:, 0], pairs[:, 1], count=len(x))
+    crowded = np.flatnonzero(np.bincount(label) > size)
+    if crowded.size:
+        pairs = pairs[np.isin(label[pairs[:, 0]], crowded)]
+        length = np.linalg.norm(x[pairs[:, 0]] - x[pairs[:, 1]], axis=1)
+        points = np.unique(pairs).tolist()
+        fresh = int(label.max()) + 1
+        label[points] = fresh + np.arange(len(points))
+        members = {fresh + k: [point] for k, point in enumerate(points)}
+        for i, j in pairs[np.argsort(length, kind="stable")].tolist():
+            a, b = int(label[i]), int(label[j])
+            if a != b and len(members[a]) + len(members[b]) <= size:
+                label[members[b]] = a
+                members[a] += members.pop(b)
+    _, label, counts = np.unique(label, return_inverse=True, return_counts=True)
+    number = np.where(counts >= smallest, np.cumsum(counts >= smallest) - 1, -1)
+    return np.asarray(number[label], dtype=np.int64)
