@@ -65,24 +65,24 @@ def motion(D_R=5e-3, D_T=0.0, dt=DT, n_frames=200, sigma=0.0, contact=CONTACT):
 
 
 def test_frames_are_named_in_runs():
-    assert checks.at([4]) == "frame 4"
-    assert checks.at([9, 3, 4, 5]) == "frames 3 to 5, 9"
-    assert checks.at(list(range(0, 60, 2))).endswith("18 and 20 more")
+    assert checks.frame_runs_text([4]) == "frame 4"
+    assert checks.frame_runs_text([9, 3, 4, 5]) == "frames 3 to 5, 9"
+    assert checks.frame_runs_text(list(range(0, 60, 2))).endswith("18 and 20 more")
     apart = [k for k in range(60) if k % 3]  # runs of two: ten numbers are five runs
-    assert checks.at(apart).endswith("13 to 14 and 30 more")
+    assert checks.frame_runs_text(apart).endswith("13 to 14 and 30 more")
 
 
 def test_unreadable_frames_are_named():
-    assert checks.unreadable(frames()) == NOTHING
+    assert checks.unreadable_frames(frames()) == NOTHING
     fault = [""] * 7 + ["movie.tif: frame 7 cannot be read: gone"] * 3
-    told = warned(checks.unreadable(frames(fault=fault)))
+    told = warned(checks.unreadable_frames(frames(fault=fault)))
     assert told.startswith("3 of 10 frames cannot be read and are left out: frames 7 to 9 (")
     assert "gone" in told
 
 
 def test_frames_that_repeat_another_are_named():
-    assert checks.repeated(frames()) == NOTHING
-    told = warned(checks.repeated(frames(copy_of=[-1, -1, 1, 1, -1, -1, -1, 0, -1, -1])))
+    assert checks.repeated_frames(frames()) == NOTHING
+    told = warned(checks.repeated_frames(frames(copy_of=[-1, -1, 1, 1, -1, -1, -1, 0, -1, -1])))
     assert told.startswith("3 of 10 frames repeat an earlier frame exactly, voxel by voxel (first:")
     assert "(first: frame 2, as frame 1)" in told
     assert told.endswith("frames 2 to 3, 7")
@@ -90,9 +90,9 @@ def test_frames_that_repeat_another_are_named():
 
 def test_frames_without_particles_are_named():
     """A frame that could not be read is not one in which nothing passed the cut."""
-    assert checks.empty(frames(), minmass=50.0) == NOTHING
+    assert checks.empty_frames(frames(), minmass=50.0) == NOTHING
     spheres, fault = [4] * 6 + [0] * 4, [""] * 8 + ["gone"] * 2
-    told = warned(checks.empty(frames(spheres=spheres, fault=fault), minmass=50.0))
+    told = warned(checks.empty_frames(frames(spheres=spheres, fault=fault), minmass=50.0))
     assert told.startswith("no particles passed the mass cut (50) in 2 of 8 frames: frames 6 to")
 
 
@@ -102,8 +102,8 @@ def test_a_mass_histogram_without_a_gap_is_told():
 
 
 def test_saturated_voxels_are_told():
-    assert checks.saturated(frames()) == NOTHING
-    told = warned(checks.saturated(frames(saturated=[0.0] * 4 + [0.002] * 5 + [np.nan])))
+    assert checks.saturated_frames(frames()) == NOTHING
+    told = warned(checks.saturated_frames(frames(saturated=[0.0] * 4 + [0.002] * 5 + [np.nan])))
     assert "saturated voxels: up to 0.2 % of a frame" in told
     assert "5 of 10 frames" in told
 
@@ -158,11 +158,11 @@ def test_the_end_of_an_integer_type_is_saturation():
 
 def test_bleaching_is_told():
     fading = np.repeat(np.linspace(1.0, 0.7, 10), 4)
-    assert checks.faded(table()) == NOTHING
+    assert checks.bleached(table()) == NOTHING
     own = np.tile([0.99, 1.0, 1.01, 1.0], 10) ** np.repeat(np.arange(10), 4)
-    told = warned(checks.faded(table(mass=1000 * fading * own)))
+    told = warned(checks.bleached(table(mass=1000 * fading * own)))
     assert "brightness fell by 30 +- 3 % from the first tenth of the movie to the last" in told
-    assert checks.faded(table(mass=1000 / fading)) == NOTHING
+    assert checks.bleached(table(mass=1000 / fading)) == NOTHING
     # What belongs to no cluster, and spheres that come and go, do not change the number.
     stray = table(mass=1000 * fading).assign(cluster=-1, mass=np.geomspace(1, 1e6, 40))
     both = pd.concat([table(mass=1000 * fading), stray])
@@ -179,7 +179,7 @@ def test_bleaching_is_measured_within_its_error():
     for _ in range(150):
         wander = np.exp(0.05 * rng.normal(size=(20, 4)).cumsum(axis=0) / np.sqrt(20))
         still = table(20, mass=(1000 * rng.uniform(0.5, 2, 4) * wander).ravel())
-        assert checks.faded(still) == NOTHING
+        assert checks.bleached(still) == NOTHING
         fall = np.linspace(0, np.log(0.7), 20)
         faded = still.assign(mass=still["mass"] * np.repeat(np.exp(fall), 4))
         found = checks.bleaching(faded)
@@ -194,12 +194,12 @@ def test_brightness_that_changes_with_depth_is_told():
     rng = np.random.default_rng(1)
     z, own = rng.uniform(0, 16, 400), 1 + 0.08 * rng.normal(size=400)
     spheres = pd.DataFrame({"frame": np.repeat(np.arange(10), 40), "z": z, "mass": 1000 * own})
-    assert checks.dimmed_with_depth(spheres) == NOTHING
+    assert checks.depth_dimming(spheres) == NOTHING
     deep = spheres.assign(mass=1000 * own * (1 - 0.3 * z / 16))
-    assert "amplitude changes with depth, by -3" in warned(checks.dimmed_with_depth(deep))
+    assert "amplitude changes with depth, by -3" in warned(checks.depth_dimming(deep))
     # The same spheres in every frame are not more spheres.
     still = spheres.assign(z=np.tile(z[:40], 10), mass=1000 * np.tile(own[:40], 10))
-    assert checks.dimmed_with_depth(still) == NOTHING
+    assert checks.depth_dimming(still) == NOTHING
 
 
 def test_few_spheres_of_uneven_brightness_show_no_depth():
@@ -208,22 +208,22 @@ def test_few_spheres_of_uneven_brightness_show_no_depth():
     false = 0
     for _ in range(100):
         own = np.tile(rng.normal(1000, 150, 4), 10)
-        false += checks.dimmed_with_depth(table(mass=own)) != NOTHING
+        false += checks.depth_dimming(table(mass=own)) != NOTHING
     assert false <= 3
 
 
 def test_fits_that_failed_are_counted_by_reason():
     """Up to 1 % of them inform, more warn."""
     reason = ["", "did not settle"] * 18 + ["moved over half a radius"] * 4
-    assert checks.unrefined(table()) == NOTHING
-    assert checks.unrefined(table(reason="")) == NOTHING
-    told = warned(checks.unrefined(table(reason=reason)))
+    assert checks.unrefined_spheres(table()) == NOTHING
+    assert checks.unrefined_spheres(table(reason="")) == NOTHING
+    told = warned(checks.unrefined_spheres(table(reason=reason)))
     assert told.startswith("22 of 40 places are as found, not refined (18 x did not settle; 4 x")
     one = table(30, reason=[*[""] * 119, "did not settle"])
-    assert noted(checks.unrefined(one)).startswith("1 of 120 places")
-    assert checks.unsettled(0, 40) == NOTHING
-    assert noted(checks.unsettled(1, 120)).startswith("1 of 120 poses did not settle")
-    assert warned(checks.unsettled(2, 120)).startswith("2 of 120 poses did not settle")
+    assert noted(checks.unrefined_spheres(one)).startswith("1 of 120 places")
+    assert checks.unsettled_poses(0, 40) == NOTHING
+    assert noted(checks.unsettled_poses(1, 120)).startswith("1 of 120 poses did not settle")
+    assert warned(checks.unsettled_poses(2, 120)).startswith("2 of 120 poses did not settle")
 
 
 @pytest.mark.parametrize(
@@ -234,15 +234,15 @@ def test_a_wrong_pair_distance_is_told(refine, advice):
     """Within 3 % nothing is reported; locate alone reads 11 % too much."""
     x = table()
     ask = {"contact": CONTACT, "refine": refine, "axes": ["x", "y", "z"]}
-    assert checks.pair_distance(x, **ask) == NOTHING
+    assert checks.pair_distance_bias(x, **ask) == NOTHING
     for factor, told in ((1.02, False), (1.11, True), (0.9, True)):
         wide = x.assign(**{a: 5 + factor * (x[a] - 5) for a in "xyz"})
-        said = checks.pair_distance(wide, **ask)
+        said = checks.pair_distance_bias(wide, **ask)
         assert bool(said.warnings) == told
         if told:
             assert f"expected 2.45 ({100 * (factor - 1):+.1f} +- " in warned(said)
             assert warned(said).endswith(advice) or f"%): {advice}" in warned(said)
-    assert checks.pair_distance(x.assign(cluster=-1), **ask) == NOTHING
+    assert checks.pair_distance_bias(x.assign(cluster=-1), **ask) == NOTHING
 
 
 def test_the_mean_pair_distance_knows_its_error():
@@ -265,21 +265,23 @@ def test_the_mean_pair_distance_knows_its_error():
 def test_clusters_with_other_numbers_of_spheres_are_told():
     """Fewer, none, and more, as where two clusters meet."""
     x = table(20)
-    assert checks.counts(x, size=4, contact=CONTACT, frames=np.arange(20)) == NOTHING
+    assert checks.missing_spheres(x, size=4, contact=CONTACT, frames=np.arange(20)) == NOTHING
     lost = x.drop(index=[4 * k for k in range(3, 15)])  # one sphere in 12 frames
     lost = lost[~lost["frame"].isin([1, 5])]  # frame 5 could not be read
     meeting = lost.assign(together=np.where(lost["frame"] >= 18, 8, lost["together"]))
-    told = checks.counts(meeting, size=4, contact=CONTACT, frames=np.delete(np.arange(26), 5))
+    told = checks.missing_spheres(
+        meeting, size=4, contact=CONTACT, frames=np.delete(np.arange(26), 5)
+    )
     # Of 19 frames of 4 spheres one lacks 4, and 11 lack one.
     assert warned(told) == (
         "20 % of the spheres are missing, 4 expected in each of 1 clusters; cluster 0: 3 found in "
         "11 frames, none placed in 1 frame, 8 found in 2 frames (two clusters within 3.2 um), lost "
         "after frame 19"
     )
-    one = checks.counts(x.drop(index=8), size=4, contact=CONTACT, frames=np.arange(20))
+    one = checks.missing_spheres(x.drop(index=8), size=4, contact=CONTACT, frames=np.arange(20))
     assert noted(one).startswith("1.2 % of the spheres are missing")
     many = pd.concat([x.drop(index=8).assign(cluster=k) for k in range(40)])
-    said = noted(checks.counts(many, size=4, contact=CONTACT, frames=np.arange(20)))
+    said = noted(checks.missing_spheres(many, size=4, contact=CONTACT, frames=np.arange(20)))
     assert said.endswith("cluster 9: 3 found in 1 frame; and 30 more")
 
 
@@ -295,15 +297,15 @@ def test_groups_of_touching_spheres_are_counted():
 
 
 def test_clusters_at_the_border_are_noted():
-    assert checks.at_border(table(), margin=1.5, dropped={}) == NOTHING
+    assert checks.clusters_near_border(table(), margin=1.5, dropped={}) == NOTHING
     near = table(border=np.where(np.arange(40) // 4 >= 7, 1.0, 5.0))
-    told = noted(checks.at_border(near, margin=1.5, dropped={0: np.array([12, 13])}))
+    told = noted(checks.clusters_near_border(near, margin=1.5, dropped={0: np.array([12, 13])}))
     assert told == (
         "centre within d/2 + 2 sigma (1.5 um) of the border, cluster 0 in frames 7 to 9, 12 to 13; "
         "dropped, as spheres are out of view: frames 12 to 13"
     )
     many = pd.concat([near.assign(cluster=k) for k in range(40)])
-    told = noted(checks.at_border(many, margin=1.5, dropped={}))
+    told = noted(checks.clusters_near_border(many, margin=1.5, dropped={}))
     assert "40 of 40 clusters (0, 1, 2, 3, 4, 5, 6, 7, 8, 9 and 30 more)" in told
 
 
@@ -341,8 +343,8 @@ def test_long_steps_are_told_and_longer_ones_refused():
         "over a quarter of the contact distance 2.45 um: identities are unsafe at dt = 0.73"
         in checks.long_steps(quick, contact=CONTACT).text
     )
-    assert checks.refused(quick, contact=CONTACT) == ""
-    assert "is over half of the contact distance 2.45 um" in checks.refused(wild, contact=CONTACT)
+    assert checks.refusal(quick, contact=CONTACT) == ""
+    assert "is over half of the contact distance 2.45 um" in checks.refusal(wild, contact=CONTACT)
     # In other units of length and time the same is reported.
     big = motion(D_T=0.15 * 100, contact=10 * CONTACT)
     assert checks.step_length(big, contact=10 * CONTACT) == pytest.approx(over[1], rel=1e-9)
@@ -352,7 +354,7 @@ def test_steps_on_the_bound_are_told_at_the_level():
     """1 % of Gaussian steps whose true rms is the bound: of 4000, 0.4 to 1.6 % (4 errors)."""
     rng = np.random.default_rng(6)
     rms = np.sqrt((rng.normal(size=(4000, 21)) ** 2).mean(axis=1))
-    share = np.mean([checks._certainly_over(r, 1.0, freedom=21) for r in rms])
+    share = np.mean([checks.exceeds_rms(r, 1.0, freedom=21) for r in rms])
     assert 0.004 < share < 0.016
 
 

@@ -55,7 +55,7 @@ def rotation_group(positions: ArrayLike, *, tolerance: float) -> Floats:
     >>> rotation_group(Cluster.tetrahedron(1.5).positions, tolerance=0.01).shape
     (12, 3, 3)
     """
-    x = _centred(positions, tolerance)
+    x = _centred_positions(positions, tolerance)
     d = x.shape[1]
     line = _projected_on_line(x, tolerance)
     if line is not None:
@@ -97,7 +97,7 @@ def point_group(positions: ArrayLike, *, tolerance: float | None = None) -> str:
     >>> point_group([[0, 0, 0], [2, 0, 0], [1, 1.5, 0]])
     'C_2v'
     """
-    x = _centred(positions, 0.0 if tolerance is None else tolerance)
+    x = _centred_positions(positions, 0.0 if tolerance is None else tolerance)
     x = np.pad(x, ((0, 0), (0, 3 - x.shape[1])))
     allowed = 1e-6 * float(np.linalg.norm(x, axis=1).mean()) if tolerance is None else tolerance
     line = _projected_on_line(x, allowed)
@@ -137,7 +137,7 @@ def matching_rotation(x: Floats, onto: Floats, *, tolerance: float) -> Floats | 
     return rotation
 
 
-def _centred(positions: ArrayLike, tolerance: float) -> Floats:
+def _centred_positions(positions: ArrayLike, tolerance: float) -> Floats:
     """Check positions and tolerance; return the positions with their mean at the origin."""
     refuse(number_fault("tolerance", tolerance, least=0, unit="um"))
     return Cluster.from_positions(positions).positions

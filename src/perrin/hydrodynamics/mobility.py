@@ -285,7 +285,7 @@ def cluster_mobility(
         faults.append(f"accuracy: expected a relative error between 0 and 1, got {accuracy}")
     elif degree is not None and degree not in range(1, _HIGHEST_DEGREE + 1):
         faults.append(f"degree: expected 1 to {_HIGHEST_DEGREE}, got {degree!r}")
-    x, a = _spheres(centers, radius, faults)
+    x, a = _valid_spheres(centers, radius, faults)
     for remark in viscosity_remarks(viscosity):
         warnings.warn(remark, UnitWarning, stacklevel=2)
     # With the mean radius as the unit of length no power of a length can overflow.
@@ -391,7 +391,7 @@ def _thermal_volume(viscosity: float, temperature: float) -> float:
     return BOLTZMANN * temperature / viscosity * 1e18
 
 
-def _spheres(
+def _valid_spheres(
     centers: ArrayLike | Cluster, radius: ArrayLike, faults: list[str]
 ) -> tuple[Floats, Floats]:
     """Return centres (n, 3) and radii (n,) of a body, or raise all faults in one error."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -62,6 +63,28 @@ def mass_cut(mass: Floats) -> float:
         return 0.0
     k = int(ratio.argmax())
     return float(np.sqrt(ordered[k] * ordered[k + 1]))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Spots:
+    """How spheres are distinguished from noise.
+
+    Parameters
+    ----------
+    dark : bool
+        Spheres are darker than the medium around them.
+    minmass : float, optional
+        Least integrated intensity of a sphere; by default the widest gap between spheres and noise.
+    percentile : float
+        Percentile of voxels that are too dim to be the centre of a sphere.
+    border : bool
+        Include spheres that the border of the stack cuts.
+    """
+
+    dark: bool = False
+    minmass: float | None = None
+    percentile: float = 95.0
+    border: bool = True
 
 
 def touching_together(centers: Floats, *, contact: float) -> list[Ints]:
