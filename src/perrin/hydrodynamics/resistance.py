@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from perrin._arrays import Floats, frozen
+from perrin._arrays import Floats, from_plain, frozen, to_plain
 from perrin.errors import PrecisionWarning
 from perrin.geometry.rotations import skew
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Mapping
+    from typing import Self
 
     from numpy.typing import NDArray
 
@@ -89,8 +90,24 @@ class Resistance:
     @property
     def error(self) -> float:
         """Estimated relative error of the resistance in its worst direction of motion."""
-        noise = float(np.finfo(np.float64).eps)
-        return max(_ERROR_PER_CHANGE * self.change, _ERROR_PER_ASYMMETRY * self.asymmetry, noise)
+        rounding = float(np.finfo(np.float64).eps)
+        by_asymmetry = _ERROR_PER_ASYMMETRY * self.asymmetry
+        return max(_ERROR_PER_CHANGE * self.change, by_asymmetry, rounding)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the solution for JSON: plain numbers and lists."""
+        return {**to_plain(asdict(self)), "error": self.error}
+
+    @classmethod
+    def from_dict(cls, entry: Mapping[str, Any]) -> Self:
+        """Return the solution that `to_dict` wrote.
+
+        Parameters
+        ----------
+        entry : mapping
+        """
+        known = {name: entry[name] for name in ("degree", "asymmetry", "change", "residual")}
+        return cls(matrix=from_plain(entry["matrix"]), **known)
 
 
 @dataclass(frozen=True, eq=False)

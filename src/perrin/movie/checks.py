@@ -7,6 +7,7 @@ level of 1 % (`_TEST_LEVEL`) for a true value on the bound itself.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -16,13 +17,14 @@ from perrin.geometry.shapes import pair_distances
 from perrin.tracks.clusters import REACH
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Mapping, Sequence
 
     import pandas as pd
 
     from perrin._arrays import Floats, Ints
     from perrin.diffusion.estimate import DiffusionEstimate
     from perrin.motion.rigid_motion import RigidMotion
+    from perrin.run.results import ClusterResult
 
 
 _LISTED_ITEMS = 10  # largest number of frames or clusters that a message lists
@@ -779,6 +781,51 @@ def fast_sampling(motion: RigidMotion, *, phi2: float) -> Verdict | None:
         "too fast, steps are mostly noise; take fewer frames over a longer time"
     )
     return Verdict(text, phi2 / first if first > 0 else np.inf)
+
+
+def check_clusters(
+    results: Sequence[ClusterResult],
+    *,
+    contact: float,
+    plane_time: float | None,
+    height: float,
+    diameter: float,
+) -> tuple[tuple[ClusterResult, ...], Findings]:
+    """Run the checks of steps, sampling and scan on every cluster.
+
+    Parameters
+    ----------
+    results : sequence of ClusterResult
+    contact : float
+        Centre distance of touching spheres, um.
+    plane_time, height, diameter
+        As in `scan_blur`.
+
+    Returns
+    -------
+    results : tuple of ClusterResult
+        With the warnings about one cluster.
+    findings : Findings
+        Warnings about several clusters, and all notes.
+    """
+    own, found = {r.name: r.warnings for r in results}, Findings()
+    alarms: tuple[Callable[[ClusterResult], Verdict | None], ...] = (
+        lambda r: long_steps(r.motion, contact=contact),
+        lambda r: slow_sampling(r.motion),
+        lambda r: scan_blur(
+            r.motion, D_T=r.D_T, plane_time=plane_time, height=height, diameter=diameter
+        ),
+    )
+    for check in alarms:
+        for name, text in combined_verdicts({r.name: check(r) for r in results}).items():
+            if name:
+                own[name] = (*own[name], text)
+            else:
+                found += Findings((text,))
+    fast = {r.name: fast_sampling(r.motion, phi2=r.noise.phi2) for r in results}
+    for name, text in combined_verdicts(fast).items():
+        found += Findings(notes=(f"cluster {name}: {text}" if name else text,))
+    return tuple(replace(r, warnings=own[r.name]) for r in results), found
 
 
 def _step_angles(motion: RigidMotion) -> Floats:

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from perrin.images.stack import Stack
     from perrin.motion.rigid_motion import RigidMotion
     from perrin.movie.workers import Progress
-    from perrin.run.results import ClusterResult, Report
+    from perrin.run.results import Report
 
 
 _VIEWS = 8  # frames that are kept as pictures
@@ -183,7 +183,10 @@ def analyze_stack(
     conditions, wrong = _conditions(stack, experiment, contact)
     faults += _faults_of(check_search, stack, search, refine, optics=optics) + wrong
     if size is not None:
-        faults += number_fault("size", size, least=2, whole=not float(size).is_integer())
+        number: Any = size
+        if isinstance(number, float) and number.is_integer():
+            number = int(number)
+        faults += number_fault("size", number, least=2, whole=True)
     refuse(faults)
     check_workers(work)
 
@@ -473,8 +476,14 @@ def _with_checks(
         + checks.clusters_near_border(features, margin=bodies.margin, dropped=bodies.dropped)
         + findings
     )
-    clusters, of_clusters = _cluster_checks(report.clusters, imaging, stack)
-    found += of_clusters
+    clusters, of_several = checks.check_clusters(
+        report.clusters,
+        contact=contact,
+        plane_time=stack.plane_time,
+        height=imaging.voxel[0],
+        diameter=imaging.diameter,
+    )
+    found += of_several
     return replace(
         report,
         clusters=clusters,
@@ -507,31 +516,3 @@ def _imaging(stack: Stack, located: Located, bodies: Bodies, search: Search) -> 
         dark=search.dark,
         refine=located.method.refine,
     )
-
-
-def _cluster_checks(
-    results: Sequence[ClusterResult], imaging: Imaging, stack: Stack
-) -> tuple[tuple[ClusterResult, ...], checks.Findings]:
-    """Return the clusters with the warnings of one of them, and the findings about several."""
-    contact, own, found = imaging.contact, {r.name: r.warnings for r in results}, checks.Findings()
-    alarms: tuple[Callable[[ClusterResult], checks.Verdict | None], ...] = (
-        lambda r: checks.long_steps(r.motion, contact=contact),
-        lambda r: checks.slow_sampling(r.motion),
-        lambda r: checks.scan_blur(
-            r.motion,
-            D_T=r.D_T,
-            plane_time=stack.plane_time,
-            height=imaging.voxel[0],
-            diameter=imaging.diameter,
-        ),
-    )
-    for check in alarms:
-        for name, text in checks.combined_verdicts({r.name: check(r) for r in results}).items():
-            if name:
-                own[name] = (*own[name], text)
-            else:
-                found += checks.Findings((text,))
-    fast = {r.name: checks.fast_sampling(r.motion, phi2=r.noise.phi2) for r in results}
-    for name, text in checks.combined_verdicts(fast).items():
-        found += checks.Findings(notes=(f"cluster {name}: {text}" if name else text,))
-    return tuple(replace(r, warnings=own[r.name]) for r in results), found

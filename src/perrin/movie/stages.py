@@ -222,8 +222,17 @@ def learn_method(
     """
     sample = sample_frames(stack, search, frames)
     first = sample[0].frame
-    constant = first.min() == first.max()
-    if len(frames) > 1 and not constant and _all_equal(stack, sample, frames):
+    equal = (
+        len(frames) > 1
+        and first.min() < first.max()
+        and all(np.array_equal(seen.frame, first) for seen in sample)
+    )
+    if equal:
+        try:
+            equal = all(np.array_equal(stack.frame(i), first) for i in frames)
+        except FrameError:
+            equal = False  # a frame that cannot be read counts as a different image
+    if equal:
         raise TooFewFramesError(
             f"all {len(frames)} frames are exactly the same image, voxel by voxel: the movie shows "
             f"no motion, one image was written {len(frames)} times",
@@ -238,17 +247,6 @@ def learn_method(
         "spots": [[seen.number, mass] for seen in sample for mass in seen.spots.mass.tolist()],
         "told": [str(warning.message) for warning in caught],
     }
-
-
-def _all_equal(stack: Stack, sample: Sequence[Sampled], frames: Sequence[int]) -> bool:
-    """Return whether all frames are the same image; frames that cannot be read differ."""
-    first = sample[0].frame
-    if not all(np.array_equal(seen.frame, first) for seen in sample):
-        return False
-    try:
-        return all(np.array_equal(stack.frame(i), first) for i in frames)
-    except FrameError:
-        return False
 
 
 @dataclass(frozen=True)
