@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from perrin._arrays import Floats, Ints
-    from perrin.images.spheres.localisation import Refine, Sampled, Search
+    from perrin.images.spheres.localisation import Refine, Search
     from perrin.images.stack import Stack
     from perrin.motion.rigid_motion import RigidMotion
     from perrin.movie.workers import Work
