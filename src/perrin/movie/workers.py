@@ -232,7 +232,10 @@ def _client(workers: int, scheduler: str | None) -> Iterator[Any]:
     }
     with dask.config.set({"distributed.nanny.pre-spawn-environ": environ}):
         cluster = LocalCluster(
-            n_workers=workers, threads_per_worker=1, dashboard_address=None, silence_logs=50
+            n_workers=workers,
+            threads_per_worker=1,
+            dashboard_address="127.0.0.1:0",
+            silence_logs=50,
         )
     with cluster, Client(cluster, set_as_default=False) as client:
         yield client
