@@ -227,7 +227,7 @@ def test_fits_that_failed_are_counted_by_reason():
 
 
 @pytest.mark.parametrize(
-    ("refine", "advice"), [(None, "centroid bias of touching balls; run refinement"),
+    ("refine", "advice"), [(None, "centroid bias of touching spheres; run refinement"),
                            ("model", "the contact distance, the voxel size or the diameter")],
 )  # fmt: skip
 def test_a_wrong_pair_distance_is_reported(refine, advice):
@@ -372,7 +372,7 @@ def test_sampling_too_slow_and_too_fast_is_reported():
     assert "sampling too fast" in checks.fast_sampling(fast, phi2=phi2).text
 
 
-def test_a_gap_is_no_long_step():
+def test_a_gap_is_not_a_step():
     """A frame that is missing joins no step; a cut neither."""
     whole = motion(D_T=0.05)
     x = whole.positions()

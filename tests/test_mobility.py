@@ -16,7 +16,7 @@ from perrin.hydrodynamics import resistance
 WATERY = {"viscosity": 1e-3, "temperature": 300.0}
 KT_OVER_ETA = 1.380649e-23 * 300 / 1e-3 * 1e18  # um^3/s
 TURN = Rotation.from_rotvec([0.3, -1.1, 0.7]).as_matrix()
-# A body without any symmetry, of unequal spheres that touch, overlap and stand apart.
+# A body without any symmetry, of unequal spheres that touch, overlap and are separate.
 ODD = np.array([[0.0, 0, 0], [2.2, 0, 0], [2.2, 1.7, 0.3], [-0.4, 1.2, 1.9]])
 ODD_RADII = np.array([1.0, 1.2, 0.7, 0.9])
 
@@ -293,7 +293,7 @@ def test_a_tracked_sphere_and_the_centroid(name, ratio):
 
 
 @pytest.mark.parametrize("name", ["dimer", "line 3", "triangle", "tetrahedron"])
-def test_the_error_estimate_is_honest(name, repeats):
+def test_the_error_estimate_bounds_the_error(name, repeats):
     """At degrees 1 to 8 the estimate is never under a third of the error (against degree 11).
 
     The quick form takes four of these degrees, against degree 10.
@@ -399,7 +399,7 @@ def test_a_cluster_is_its_positions():
         ({"centers": np.arange(300.0).reshape(100, 3)}, ["100 spheres", "state a degree"]),
     ],
 )
-def test_what_is_no_body_is_refused(options, words):
+def test_invalid_bodies_are_refused(options, words):
     """Every fault is named, all of them in one message."""
     given = {"centers": line(3), "radius": 1.0} | WATERY | options
     with pytest.raises(ValueError) as error:  # noqa: PT011 (the words are checked below)

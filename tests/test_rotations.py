@@ -200,7 +200,7 @@ def test_no_rotation_fits_better(seed):
 
 @laws
 @given(seed=seeds, d=st.sampled_from([2, 3]))
-def test_weights_mean_what_they_say(seed, d):
+def test_weights_are_those_of_the_squares(seed, d):
     """Weight 0 is absence, an integer weight is a repeated point, a common factor is nothing."""
     rng = np.random.default_rng(seed)
     x = rng.normal(size=(6, d))
@@ -275,7 +275,7 @@ def test_an_empty_batch_gives_an_empty_answer():
 
 @pytest.mark.parametrize("count", [1, 2047, 2048, 2049, 4097])
 def test_chunks_leave_no_seam(count):
-    """A row's answer does not depend on how many rows stand beside it."""
+    """The rotation of a row does not depend on the number of other rows."""
     q = random_rotations(count)
     np.testing.assert_allclose(kabsch(turned(TETRA, q), TETRA), q, rtol=0, atol=1e-14)
 
@@ -579,7 +579,7 @@ def test_similarity_recovers_what_was_planted(d, batch):
 
 @pytest.mark.parametrize("d", [2, 3])
 def test_similarity_leaves_out_nan_rows(d):
-    """A NaN in either set takes the particle out, whatever stands in the other set."""
+    """A NaN in either set takes the particle out, whatever the other set has."""
     x, y, truth = planted(d, (40,))
     y[:, 1] = np.nan
     y[::2, 4, 0] = np.nan

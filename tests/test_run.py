@@ -475,7 +475,7 @@ def test_a_movie_without_a_fault_has_no_warning_of_its_images(whole):
     assert found == []
 
 
-def test_a_larger_body_is_no_cluster_of_the_size_looked_for():
+def test_spheres_of_a_larger_body_are_no_cluster():
     """Beside a trimer a bipyramid: none of its spheres is one, and no warning is of them."""
     bodies = [perrin.Cluster.touching(3, DIAMETER), perrin.Cluster.touching(5, DIAMETER)]
     truth = [
@@ -730,7 +730,7 @@ def test_missing_workers_are_reported(tmp_path, monkeypatch, movie_file):
         assert not (tmp_path / "run").exists()
 
 
-def test_a_file_out_of_a_workers_reach_is_no_bad_frame(tmp_path, movie_file):
+def test_a_file_that_a_worker_cannot_open_is_an_error(tmp_path, movie_file):
     """Where the whole file is missing every frame would count as damaged."""
     path = tmp_path / "movie.ome.tif"
     path.write_bytes(movie_file[0].read_bytes())

@@ -19,7 +19,7 @@ def distances(cluster):
 @pytest.mark.parametrize(("n", "contacts"), [(2, 1), (3, 3), (4, 6), (5, 9), (6, 12), (7, 15)])
 @pytest.mark.parametrize("diameter", [1e-9, 2.45, 1e9])
 def test_touching_spheres_touch_and_do_not_overlap(n, contacts, diameter):
-    """So many pairs stand exactly one diameter apart (3n - 6 from n = 3), and none is closer."""
+    """The right number of pairs (3n - 6 from n = 3) is one diameter apart, and none is closer."""
     cluster = Cluster.touching(n, diameter)
     gap = distances(cluster) / diameter - 1
     assert np.sum(np.abs(gap) < 1e-14) == contacts

@@ -22,7 +22,7 @@ def kabsch(points: ArrayLike, reference: ArrayLike, *, weights: ArrayLike | None
 
     Both sets are centred (with the weights) and the rotation minimises the weighted squared
     distance ``sum w |points - R reference|^2`` with ``det R = +1``, also for planar sets and for
-    data that look mirrored.
+    mirrored data.
 
     Parameters
     ----------

@@ -155,18 +155,18 @@ class Mobility:
     @cached_property
     def volume(self) -> float:
         """Volume of the body, um^3; volume shared by several spheres is counted once."""
-        balls = 4 / 3 * np.pi * self.radius**3
-        i, j = np.triu_indices(len(balls), 1)
+        volumes = 4 / 3 * np.pi * self.radius**3
+        i, j = np.triu_indices(len(volumes), 1)
         sum_of_radii = self.radius[i] + self.radius[j]
         # Spheres that touch may overlap by rounding.
         if not (pair_distances(self.centers) < sum_of_radii - 1e-9 * sum_of_radii).any():
-            return float(balls.sum())
+            return float(volumes.sum())
         # Divergence theorem: a third of the flux of the position vector through the surface.
         total = 0.0
         for k, points in exposed_surface(self.centers, self.radius, count=_VOLUME_POINTS):
             outward = (points - self.centers[k]) / self.radius[k]
             flux = np.sum((points - self.centroid) * outward)
-            total += float(flux) * balls[k] / self.radius[k] / _VOLUME_POINTS
+            total += float(flux) * volumes[k] / self.radius[k] / _VOLUME_POINTS
         return total
 
     def to_dict(self) -> dict[str, Any]:

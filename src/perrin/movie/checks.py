@@ -403,7 +403,7 @@ def unrefined_spheres(features: pd.DataFrame) -> Findings:
     kinds = "; ".join(f"{count} x {why}" for why, count in failed.items())
     text = (
         f"{failed.sum()} of {len(features)} places are as found, not refined ({kinds}); the "
-        "column reason of features.parquet says which; those of tried fits are not used"
+        "column reason of features.parquet lists them; those of tried fits are not used"
     )
     return _fit_failures(text, failed.sum() / len(features))
 
@@ -447,7 +447,7 @@ def pair_distance_bias(
     if not abs(off) > _PAIR_BIAS + _NORMAL_QUANTILE * error / contact:
         return _NOTHING
     why = (
-        "centroid bias of touching balls; run refinement (refine='model')"
+        "centroid bias of touching spheres; run refinement (refine='model')"
         if refine is None
         else "the contact distance, the voxel size or the diameter may be wrong"
     )
