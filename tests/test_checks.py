@@ -65,47 +65,47 @@ def motion(D_R=5e-3, D_T=0.0, dt=DT, n_frames=200, sigma=0.0, contact=CONTACT):
 
 
 def test_frames_are_named_in_runs():
-    assert checks.at([4]) == "frame 4"
-    assert checks.at([9, 3, 4, 5]) == "frames 3 to 5, 9"
-    assert checks.at(list(range(0, 60, 2))).endswith("18 and 20 more")
+    assert checks.frame_runs_text([4]) == "frame 4"
+    assert checks.frame_runs_text([9, 3, 4, 5]) == "frames 3 to 5, 9"
+    assert checks.frame_runs_text(list(range(0, 60, 2))).endswith("18 and 20 more")
     apart = [k for k in range(60) if k % 3]  # runs of two: ten numbers are five runs
-    assert checks.at(apart).endswith("13 to 14 and 30 more")
+    assert checks.frame_runs_text(apart).endswith("13 to 14 and 30 more")
 
 
 def test_unreadable_frames_are_named():
-    assert checks.unreadable(frames()) == NOTHING
+    assert checks.unreadable_frames(frames()) == NOTHING
     fault = [""] * 7 + ["movie.tif: frame 7 cannot be read: gone"] * 3
-    told = warned(checks.unreadable(frames(fault=fault)))
-    assert told.startswith("3 of 10 frames cannot be read and are left out: frames 7 to 9 (")
-    assert "gone" in told
+    text = warned(checks.unreadable_frames(frames(fault=fault)))
+    assert text.startswith("3 of 10 frames cannot be read and are left out: frames 7 to 9 (")
+    assert "gone" in text
 
 
 def test_frames_that_repeat_another_are_named():
-    assert checks.repeated(frames()) == NOTHING
-    told = warned(checks.repeated(frames(copy_of=[-1, -1, 1, 1, -1, -1, -1, 0, -1, -1])))
-    assert told.startswith("3 of 10 frames repeat an earlier frame exactly, voxel by voxel (first:")
-    assert "(first: frame 2, as frame 1)" in told
-    assert told.endswith("frames 2 to 3, 7")
+    assert checks.repeated_frames(frames()) == NOTHING
+    text = warned(checks.repeated_frames(frames(copy_of=[-1, -1, 1, 1, -1, -1, -1, 0, -1, -1])))
+    assert text.startswith("3 of 10 frames repeat an earlier frame exactly, voxel by voxel (first:")
+    assert "(first: frame 2, as frame 1)" in text
+    assert text.endswith("frames 2 to 3, 7")
 
 
 def test_frames_without_particles_are_named():
     """A frame that could not be read is not one in which nothing passed the cut."""
-    assert checks.empty(frames(), minmass=50.0) == NOTHING
+    assert checks.empty_frames(frames(), minmass=50.0) == NOTHING
     spheres, fault = [4] * 6 + [0] * 4, [""] * 8 + ["gone"] * 2
-    told = warned(checks.empty(frames(spheres=spheres, fault=fault), minmass=50.0))
-    assert told.startswith("no particles passed the mass cut (50) in 2 of 8 frames: frames 6 to")
+    text = warned(checks.empty_frames(frames(spheres=spheres, fault=fault), minmass=50.0))
+    assert text.startswith("no particles passed the mass cut (50) in 2 of 8 frames: frames 6 to")
 
 
-def test_a_mass_histogram_without_a_gap_is_told():
+def test_a_mass_histogram_without_a_gap_is_reported():
     with pytest.warns(perrin.PrecisionWarning, match="400 spots found have no clear gap.*minmass"):
         assert mass_cut(np.geomspace(10, 1000, 400)) == 0.0
 
 
-def test_saturated_voxels_are_told():
-    assert checks.saturated(frames()) == NOTHING
-    told = warned(checks.saturated(frames(saturated=[0.0] * 4 + [0.002] * 5 + [np.nan])))
-    assert "saturated voxels: up to 0.2 % of a frame" in told
-    assert "5 of 10 frames" in told
+def test_saturated_voxels_are_reported():
+    assert checks.saturated_frames(frames()) == NOTHING
+    text = warned(checks.saturated_frames(frames(saturated=[0.0] * 4 + [0.002] * 5 + [np.nan])))
+    assert "saturated voxels: up to 0.2 % of a frame" in text
+    assert "5 of 10 frames" in text
 
 
 SCENES = {
@@ -156,50 +156,50 @@ def test_the_end_of_an_integer_type_is_saturation():
     assert saturated_share(np.full((4, 5, 6), 7)) == 0.0
 
 
-def test_bleaching_is_told():
+def test_bleaching_is_reported():
     fading = np.repeat(np.linspace(1.0, 0.7, 10), 4)
-    assert checks.faded(table()) == NOTHING
+    assert checks.bleached(table()) == NOTHING
     own = np.tile([0.99, 1.0, 1.01, 1.0], 10) ** np.repeat(np.arange(10), 4)
-    told = warned(checks.faded(table(mass=1000 * fading * own)))
-    assert "brightness fell by 30 +- 3 % from the first tenth of the movie to the last" in told
-    assert checks.faded(table(mass=1000 / fading)) == NOTHING
+    text = warned(checks.bleached(table(mass=1000 * fading * own)))
+    assert "brightness fell by 30 +- 3 % from the first tenth of the movie to the last" in text
+    assert checks.bleached(table(mass=1000 / fading)) == NOTHING
     # What belongs to no cluster, and spheres that come and go, do not change the number.
     stray = table(mass=1000 * fading).assign(cluster=-1, mass=np.geomspace(1, 1e6, 40))
     both = pd.concat([table(mass=1000 * fading), stray])
     assert checks.bleaching(both).value == pytest.approx(-0.3, rel=1e-9)
 
 
-def test_bleaching_is_measured_within_its_error():
+def test_bleaching_is_measured_within_its_error(repeats):
     """Planted fall of 30 %, spheres whose brightness wanders by 5 %: 95 % intervals hold it.
 
-    Of 150 movies between 90.7 and 99.3 % (2.4 standard errors); no clean one of 150 warns.
+    The share of 50 or 150 movies is within 2.4 standard errors; no clean movie warns.
     """
     rng = np.random.default_rng(3)
-    inside = 0
-    for _ in range(150):
+    inside, count = 0, repeats(50, 150)
+    for _ in range(count):
         wander = np.exp(0.05 * rng.normal(size=(20, 4)).cumsum(axis=0) / np.sqrt(20))
         still = table(20, mass=(1000 * rng.uniform(0.5, 2, 4) * wander).ravel())
-        assert checks.faded(still) == NOTHING
+        assert checks.bleached(still) == NOTHING
         fall = np.linspace(0, np.log(0.7), 20)
         faded = still.assign(mass=still["mass"] * np.repeat(np.exp(fall), 4))
         found = checks.bleaching(faded)
         # The tenths are two frames: their middles are 18 of 19 intervals apart.
         planted = 0.7 ** (18 / 19) - 1
         inside += abs(found.value - planted) < t.isf(0.025, found.freedom) * found.stderr
-    assert 0.907 < inside / 150 < 0.993
+    assert abs(inside / count - 0.95) < 2.4 * np.sqrt(0.05 * 0.95 / count)
 
 
-def test_brightness_that_changes_with_depth_is_told():
+def test_brightness_that_changes_with_depth_is_reported():
     """A spread of the spheres' own brightness is no change with depth."""
     rng = np.random.default_rng(1)
     z, own = rng.uniform(0, 16, 400), 1 + 0.08 * rng.normal(size=400)
     spheres = pd.DataFrame({"frame": np.repeat(np.arange(10), 40), "z": z, "mass": 1000 * own})
-    assert checks.dimmed_with_depth(spheres) == NOTHING
+    assert checks.depth_dimming(spheres) == NOTHING
     deep = spheres.assign(mass=1000 * own * (1 - 0.3 * z / 16))
-    assert "amplitude changes with depth, by -3" in warned(checks.dimmed_with_depth(deep))
+    assert "amplitude changes with depth, by -3" in warned(checks.depth_dimming(deep))
     # The same spheres in every frame are not more spheres.
     still = spheres.assign(z=np.tile(z[:40], 10), mass=1000 * np.tile(own[:40], 10))
-    assert checks.dimmed_with_depth(still) == NOTHING
+    assert checks.depth_dimming(still) == NOTHING
 
 
 def test_few_spheres_of_uneven_brightness_show_no_depth():
@@ -208,79 +208,82 @@ def test_few_spheres_of_uneven_brightness_show_no_depth():
     false = 0
     for _ in range(100):
         own = np.tile(rng.normal(1000, 150, 4), 10)
-        false += checks.dimmed_with_depth(table(mass=own)) != NOTHING
+        false += checks.depth_dimming(table(mass=own)) != NOTHING
     assert false <= 3
 
 
 def test_fits_that_failed_are_counted_by_reason():
     """Up to 1 % of them inform, more warn."""
     reason = ["", "did not settle"] * 18 + ["moved over half a radius"] * 4
-    assert checks.unrefined(table()) == NOTHING
-    assert checks.unrefined(table(reason="")) == NOTHING
-    told = warned(checks.unrefined(table(reason=reason)))
-    assert told.startswith("22 of 40 places are as found, not refined (18 x did not settle; 4 x")
+    assert checks.unrefined_spheres(table()) == NOTHING
+    assert checks.unrefined_spheres(table(reason="")) == NOTHING
+    text = warned(checks.unrefined_spheres(table(reason=reason)))
+    assert text.startswith("22 of 40 places are as found, not refined (18 x did not settle; 4 x")
     one = table(30, reason=[*[""] * 119, "did not settle"])
-    assert noted(checks.unrefined(one)).startswith("1 of 120 places")
-    assert checks.unsettled(0, 40) == NOTHING
-    assert noted(checks.unsettled(1, 120)).startswith("1 of 120 poses did not settle")
-    assert warned(checks.unsettled(2, 120)).startswith("2 of 120 poses did not settle")
+    assert noted(checks.unrefined_spheres(one)).startswith("1 of 120 places")
+    assert checks.unsettled_poses(0, 40) == NOTHING
+    assert noted(checks.unsettled_poses(1, 120)).startswith("1 of 120 poses did not settle")
+    assert warned(checks.unsettled_poses(2, 120)).startswith("2 of 120 poses did not settle")
 
 
 @pytest.mark.parametrize(
-    ("refine", "advice"), [(None, "centroid bias of touching balls; run refinement"),
+    ("refine", "advice"), [(None, "centroid bias of touching spheres; run refinement"),
                            ("model", "the contact distance, the voxel size or the diameter")],
 )  # fmt: skip
-def test_a_wrong_pair_distance_is_told(refine, advice):
+def test_a_wrong_pair_distance_is_reported(refine, advice):
     """Within 3 % nothing is reported; locate alone reads 11 % too much."""
     x = table()
     ask = {"contact": CONTACT, "refine": refine, "axes": ["x", "y", "z"]}
-    assert checks.pair_distance(x, **ask) == NOTHING
-    for factor, told in ((1.02, False), (1.11, True), (0.9, True)):
+    assert checks.pair_distance_bias(x, **ask) == NOTHING
+    for factor, differs in ((1.02, False), (1.11, True), (0.9, True)):
         wide = x.assign(**{a: 5 + factor * (x[a] - 5) for a in "xyz"})
-        said = checks.pair_distance(wide, **ask)
-        assert bool(said.warnings) == told
-        if told:
-            assert f"expected 2.45 ({100 * (factor - 1):+.1f} +- " in warned(said)
-            assert warned(said).endswith(advice) or f"%): {advice}" in warned(said)
-    assert checks.pair_distance(x.assign(cluster=-1), **ask) == NOTHING
+        found = checks.pair_distance_bias(wide, **ask)
+        assert bool(found.warnings) == differs
+        if differs:
+            assert f"expected 2.45 ({100 * (factor - 1):+.1f} +- " in warned(found)
+            assert warned(found).endswith(advice) or f"%): {advice}" in warned(found)
+    assert checks.pair_distance_bias(x.assign(cluster=-1), **ask) == NOTHING
 
 
-def test_the_mean_pair_distance_knows_its_error():
-    """Errors of 60 nm that last over all frames: over 100 tetrahedra they scatter as stated.
+def test_the_mean_pair_distance_knows_its_error(repeats):
+    """Errors of 60 nm that last over all frames: over 30 or 100 tetrahedra they scatter as stated.
 
     The stated error has five degrees of freedom, which widen its quotients by 1.3.
     """
     rng = np.random.default_rng(5)
     off = []
-    for _ in range(100):
+    for _ in range(repeats(30, 100)):
         x = table(3)
         for axis in "xyz":
             x[axis] += np.tile(rng.normal(0, 0.06, 4), 3) + rng.normal(0, 0.02, 12)
         mean, error = checks.mean_pair_distance(x, contact=CONTACT, axes=["x", "y", "z"])
         # Errors across a pair lengthen it by their square over its length.
         off.append((mean - CONTACT - 2 * (0.06**2 + 0.02**2) / CONTACT) / error)
+    # The scatter of 30 is known to 13 %.
     assert 0.8 < np.std(off) < 1.5
 
 
-def test_clusters_with_other_numbers_of_spheres_are_told():
+def test_clusters_with_other_numbers_of_spheres_are_reported():
     """Fewer, none, and more, as where two clusters meet."""
     x = table(20)
-    assert checks.counts(x, size=4, contact=CONTACT, frames=np.arange(20)) == NOTHING
+    assert checks.missing_spheres(x, size=4, contact=CONTACT, frames=np.arange(20)) == NOTHING
     lost = x.drop(index=[4 * k for k in range(3, 15)])  # one sphere in 12 frames
     lost = lost[~lost["frame"].isin([1, 5])]  # frame 5 could not be read
     meeting = lost.assign(together=np.where(lost["frame"] >= 18, 8, lost["together"]))
-    told = checks.counts(meeting, size=4, contact=CONTACT, frames=np.delete(np.arange(26), 5))
+    found = checks.missing_spheres(
+        meeting, size=4, contact=CONTACT, frames=np.delete(np.arange(26), 5)
+    )
     # Of 19 frames of 4 spheres one lacks 4, and 11 lack one.
-    assert warned(told) == (
+    assert warned(found) == (
         "20 % of the spheres are missing, 4 expected in each of 1 clusters; cluster 0: 3 found in "
         "11 frames, none placed in 1 frame, 8 found in 2 frames (two clusters within 3.2 um), lost "
         "after frame 19"
     )
-    one = checks.counts(x.drop(index=8), size=4, contact=CONTACT, frames=np.arange(20))
+    one = checks.missing_spheres(x.drop(index=8), size=4, contact=CONTACT, frames=np.arange(20))
     assert noted(one).startswith("1.2 % of the spheres are missing")
     many = pd.concat([x.drop(index=8).assign(cluster=k) for k in range(40)])
-    said = noted(checks.counts(many, size=4, contact=CONTACT, frames=np.arange(20)))
-    assert said.endswith("cluster 9: 3 found in 1 frame; and 30 more")
+    text = noted(checks.missing_spheres(many, size=4, contact=CONTACT, frames=np.arange(20)))
+    assert text.endswith("cluster 9: 3 found in 1 frame; and 30 more")
 
 
 def test_groups_of_touching_spheres_are_counted():
@@ -295,16 +298,16 @@ def test_groups_of_touching_spheres_are_counted():
 
 
 def test_clusters_at_the_border_are_noted():
-    assert checks.at_border(table(), margin=1.5, dropped={}) == NOTHING
+    assert checks.clusters_near_border(table(), margin=1.5, dropped={}) == NOTHING
     near = table(border=np.where(np.arange(40) // 4 >= 7, 1.0, 5.0))
-    told = noted(checks.at_border(near, margin=1.5, dropped={0: np.array([12, 13])}))
-    assert told == (
+    text = noted(checks.clusters_near_border(near, margin=1.5, dropped={0: np.array([12, 13])}))
+    assert text == (
         "centre within d/2 + 2 sigma (1.5 um) of the border, cluster 0 in frames 7 to 9, 12 to 13; "
         "dropped, as spheres are out of view: frames 12 to 13"
     )
     many = pd.concat([near.assign(cluster=k) for k in range(40)])
-    told = noted(checks.at_border(many, margin=1.5, dropped={}))
-    assert "40 of 40 clusters (0, 1, 2, 3, 4, 5, 6, 7, 8, 9 and 30 more)" in told
+    text = noted(checks.clusters_near_border(many, margin=1.5, dropped={}))
+    assert "40 of 40 clusters (0, 1, 2, 3, 4, 5, 6, 7, 8, 9 and 30 more)" in text
 
 
 def coefficient(value, stderr=0.0):
@@ -312,15 +315,15 @@ def coefficient(value, stderr=0.0):
     return SimpleNamespace(value=value, stderr=stderr)
 
 
-def test_a_slow_scan_is_told():
+def test_a_slow_scan_is_reported():
     """Only where the time per plane is known and the cluster moves more than sigma meanwhile."""
     still = motion(sigma=0.03)
     ask = {"height": 0.25, "diameter": CONTACT}
-    told = checks.scan_blur(still, D_T=coefficient(0.04, 0.004), plane_time=0.73 / 64, **ask).text
+    text = checks.scan_blur(still, D_T=coefficient(0.04, 0.004), plane_time=0.73 / 64, **ask).text
     planes = (2 * still.R + CONTACT) / 0.25
     blur = np.sqrt(2 * 0.04 * planes * 0.73 / 64)
-    assert f"{planes:.0f} planes" in told
-    assert f"motion blur about {1e3 * blur:.0f} +- {50 * blur:.1g} nm > sigma" in told
+    assert f"{planes:.0f} planes" in text
+    assert f"motion blur about {1e3 * blur:.0f} +- {50 * blur:.1g} nm > sigma" in text
     assert checks.scan_blur(still, D_T=coefficient(0.04), plane_time=None, **ask) is None
     assert checks.scan_blur(still, D_T=coefficient(0.04), plane_time=0.0, **ask) is None
     assert checks.scan_blur(still, D_T=coefficient(0.04), plane_time=1e-5, **ask) is None
@@ -329,7 +332,7 @@ def test_a_slow_scan_is_told():
     assert checks.scan_blur(still, D_T=vague, plane_time=0.73 / 64, **ask) is None
 
 
-def test_long_steps_are_told_and_longer_ones_refused():
+def test_long_steps_are_reported_and_longer_ones_refused():
     """A quarter of the contact distance warns, a half refuses; both name a dt that is safe."""
     slow, quick, wild = motion(D_T=0.01), motion(D_T=0.15), motion(D_T=0.5)
     over = [checks.step_length(m, contact=CONTACT) for m in (slow, quick, wild)]
@@ -341,22 +344,22 @@ def test_long_steps_are_told_and_longer_ones_refused():
         "over a quarter of the contact distance 2.45 um: identities are unsafe at dt = 0.73"
         in checks.long_steps(quick, contact=CONTACT).text
     )
-    assert checks.refused(quick, contact=CONTACT) == ""
-    assert "is over half of the contact distance 2.45 um" in checks.refused(wild, contact=CONTACT)
+    assert checks.refusal(quick, contact=CONTACT) == ""
+    assert "is over half of the contact distance 2.45 um" in checks.refusal(wild, contact=CONTACT)
     # In other units of length and time the same is reported.
     big = motion(D_T=0.15 * 100, contact=10 * CONTACT)
     assert checks.step_length(big, contact=10 * CONTACT) == pytest.approx(over[1], rel=1e-9)
 
 
-def test_steps_on_the_bound_are_told_at_the_level():
+def test_steps_on_the_bound_are_reported_at_the_level():
     """1 % of Gaussian steps whose true rms is the bound: of 4000, 0.4 to 1.6 % (4 errors)."""
     rng = np.random.default_rng(6)
     rms = np.sqrt((rng.normal(size=(4000, 21)) ** 2).mean(axis=1))
-    share = np.mean([checks._certainly_over(r, 1.0, freedom=21) for r in rms])
+    share = np.mean([checks.exceeds_rms(r, 1.0, freedom=21) for r in rms])
     assert 0.004 < share < 0.016
 
 
-def test_sampling_too_slow_and_too_fast_is_told():
+def test_sampling_too_slow_and_too_fast_is_reported():
     good = motion()
     assert checks.slow_sampling(good) is None
     assert checks.fast_sampling(good, phi2=1e-5) is None
@@ -369,7 +372,7 @@ def test_sampling_too_slow_and_too_fast_is_told():
     assert "sampling too fast" in checks.fast_sampling(fast, phi2=phi2).text
 
 
-def test_a_gap_is_no_long_step():
+def test_a_gap_is_not_a_step():
     """A frame that is missing joins no step; a cut neither."""
     whole = motion(D_T=0.05)
     x = whole.positions()

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 BENCHMARK = Path(__file__).resolve().parents[1] / "benchmarks" / "end_to_end.py"
-RECIPE = {"clusters": 2, "n_frames": 12, "shape": (40, 64, 96), "photons": 40.0, "seed": 0}
+RECIPE = {"clusters": 2, "n_frames": 6, "shape": (40, 60, 100), "photons": 40.0, "seed": 0}
 
 
 @pytest.fixture(scope="module")
@@ -40,12 +40,14 @@ def test_both_clusters_are_found_as_they_move(names, found):
         assert np.abs(names["deviations"](result, true.clusters[c])).max() < 0.2
 
 
-def test_places_err_as_they_say(names, found):
-    """96 places an axis: their spread over the stated one is 1 within four errors of 7 %."""
+def test_stated_errors_of_positions_are_right(names, found):
+    """48 positions an axis: their scatter over the stated one is 1 within 4 errors."""
     report, truth = found
     errors, stated = names["place_errors"](report.imaging.features, truth)
     assert len(errors) == truth[..., 0].size
-    assert np.allclose(errors.std(axis=0) / stated.mean(axis=0), 1, atol=0.29)
+    assert np.allclose(
+        errors.std(axis=0) / stated.mean(axis=0), 1, atol=4 / np.sqrt(2 * len(errors))
+    )
 
 
 def test_another_recipe_is_not_taken_for_the_kept_one(names, tmp_path):

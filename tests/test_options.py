@@ -24,8 +24,8 @@ COMMANDS = {
 }
 # Arguments that the command line sets by itself, or takes as words without an option.
 WITHOUT_OPTION = {
-    "border", "cluster", "degree", "keep", "path", "positions", "progress", "radius", "rng",
-    "scheme", "stack", "tracks",
+    "border", "cluster", "degree", "experiment", "keep", "path", "positions", "progress", "radius",
+    "rng", "scheme", "settings", "spots", "stack", "tracks", "work",
 }  # fmt: skip
 
 

@@ -1,12 +1,15 @@
 """A movie of stacks gives the D of its true positions, in one piece or in many, here or elsewhere.
 
-The movie is small: two touching tetrahedra, eight frames, written as an OME-TIFF.
+The movie is small: two touching tetrahedra, eight frames, written as an OME-TIFF. Figures are
+drawn with --long only.
 """
 
 from __future__ import annotations
 
 import doctest
 import json
+import math
+import multiprocessing
 import os
 import pickle
 import re
@@ -22,11 +25,15 @@ import pandas as pd
 import pytest
 
 import perrin
+from perrin.diffusion.noise_model import Noise
 from perrin.images.optics.optics import CameraNoise
 from perrin.images.spheres.localisation import Method
+from perrin.images.spheres.spots import Spots
 from perrin.movie import stages, workers
 from perrin.movie.parts import PartWriter, open_parts, read_parts
+from perrin.movie.workers import Work, work_through
 from perrin.plot.imaging import _frame_numbers
+from perrin.run.experiment import Experiment
 from perrin.run.folders import check_resumable, filled_folder
 from perrin.run.results import motion_table
 
@@ -37,15 +44,30 @@ pytest.importorskip("threadpoolctl")
 DIAMETER, DT, FRAMES = 2.45, 0.73, 8
 SEARCH = {"diameter": DIAMETER, "contact": DIAMETER}
 OPTIONS = ["--diameter", "2.45", "--contact", "2.45"]
-CENTERS = [(4.4, 4.4, 4.8), (9.6, 9.6, 4.8)]
+CENTERS = [(4.0, 4.0, 4.0), (9.0, 9.0, 4.0)]
+VOXEL, SHAPE = (0.3, 0.25, 0.25), (27, 52, 52)
 SCENE = {
-    "voxel": (0.25, 0.2, 0.2),
+    "voxel": VOXEL,
     "diameter": DIAMETER,
     "psf": (0.4, 0.15, 0.15),
-    "photons": 40,
-    "background": 3,
+    "photons": 75,
+    "background": 5,
     "gain": 3,
 }
+
+
+@pytest.fixture(autouse=True)
+def undrawn(request, monkeypatch):
+    """Write no figures except with --long: they are tested with the plots."""
+    if not request.config.getoption("--long"):
+        for name in ("save_figures", "save_image_figures"):
+            monkeypatch.setattr(f"perrin.report.write.{name}", no_figures)
+
+
+def no_figures(_, folder):
+    """Make the folder of the figures."""
+    Path(folder).mkdir(exist_ok=True)
+    return []
 
 
 def rendered(n_frames=FRAMES, seed=0, **changed):
@@ -59,7 +81,7 @@ def rendered(n_frames=FRAMES, seed=0, **changed):
     movie = perrin.render_stack(
         motions,
         centers=CENTERS,
-        shape=(38, 68, 70),
+        shape=SHAPE,
         rng=seed + 7,
         **settings | changed,
     )
@@ -85,8 +107,24 @@ def whole(movie_file):
 
 @pytest.fixture(scope="module")
 def learned(whole):
-    """Return what a run learns from a few frames, to be given to others."""
-    return SEARCH | {"optics": whole.imaging.optics, "minmass": whole.imaging.minmass}
+    """Return the settings that a run learns from a few frames, for other runs."""
+    optics = replace(whole.imaging.optics, stderr=(0.0, 0.0, 0.0))
+    return SEARCH | {"optics": optics, "minmass": whole.imaging.minmass}
+
+
+@pytest.fixture(scope="module")
+def known(movie_file, learned):
+    """Run in one piece with these settings stated."""
+    with perrin.open_stack(movie_file[0]) as stack:
+        return perrin.analyze_stack(stack, **learned)
+
+
+@pytest.fixture(scope="module")
+def stated(learned):
+    """Return these settings as options of the command line."""
+    optics = learned["optics"]
+    numbers = (optics.diameter, *optics.psf, optics.noise.gain, optics.noise.floor)
+    return [*OPTIONS, "--optics", ",".join(map(repr, numbers)), "--minmass", learned["minmass"]]
 
 
 def assert_identical(report, other):
@@ -101,10 +139,13 @@ def assert_identical(report, other):
         pd.testing.assert_frame_equal(one, two, check_exact=True)
 
 
-def run(*arguments, **settings):
-    """Call the command line in a process of its own."""
-    command = [sys.executable, "-m", "perrin.cli", "run", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, check=False, **settings)
+def run(*arguments):
+    """Call the command line; return its exit status."""
+    from perrin.cli.app import app
+
+    with pytest.raises(SystemExit) as stopped:
+        app(["run", *map(str, arguments)])
+    return stopped.value.code or 0
 
 
 def test_the_movie_gives_what_its_true_positions_give(movie_file, whole):
@@ -125,7 +166,7 @@ def test_the_movie_gives_what_its_true_positions_give(movie_file, whole):
         assert np.abs(off.mean(axis=0)).max() < 12
 
 
-def test_the_run_says_how_spheres_were_seen(whole):
+def test_the_run_describes_the_images_of_the_spheres(whole):
     """Counts, places and optics are those of the movie."""
     imaging = whole.imaging
     assert imaging.frames["spheres"].tolist() == [8] * FRAMES
@@ -135,15 +176,15 @@ def test_the_run_says_how_spheres_were_seen(whole):
     assert imaging.optics.diameter == pytest.approx(DIAMETER, abs=0.02)
     assert len(imaging.spots) > 8  # noise among them
     assert {v.frame for v in imaging.views} <= set(range(FRAMES))
-    assert imaging.views[0].xy.shape == (68, 70)
-    assert imaging.views[0].xz.shape == (38, 70)
-    assert imaging.views[0].yz.shape == (38, 68)
+    assert imaging.views[0].xy.shape == SHAPE[1:]
+    assert imaging.views[0].xz.shape == (SHAPE[0], SHAPE[2])
+    assert imaging.views[0].yz.shape == SHAPE[:2]
 
 
 def test_frames_and_clusters_can_be_left_out(movie_file, learned):
     """A slice of frames counts from its own first one; other clusters keep their number."""
     with perrin.open_stack(movie_file[0]) as stack:
-        part = perrin.analyze_stack(stack, **learned, frames=(2, 7), exclude=[0])
+        part = perrin.analyze_stack(stack, **learned, refine=None, frames=(2, 7), exclude=[0])
     assert [c.cluster for c in part.clusters] == [1]
     assert part.settings["first_frame"] == 2
     assert part.imaging.frames["frame"].tolist() == list(range(2, 7))
@@ -151,20 +192,19 @@ def test_frames_and_clusters_can_be_left_out(movie_file, learned):
     assert set(part.imaging.features["cluster"]) == {0, 1}
     with perrin.open_stack(movie_file[0]) as stack:
         with pytest.raises(ValueError, match=r"exclude: there is no cluster 7; found \[0, 1\]"):
-            perrin.analyze_stack(stack, **learned, frames=(0, 3), exclude=[7])
+            perrin.analyze_stack(stack, **learned, refine=None, frames=(0, 3), exclude=[7])
         with pytest.raises(ValueError, match="frames 40:50 hold none of the stack's, 0 to 7"):
             perrin.analyze_stack(stack, **SEARCH, frames=(40, 50))
         with pytest.raises(perrin.TooFewFramesError, match="one frame shows no motion"):
             perrin.analyze_stack(stack, **SEARCH, frames=(3, 4))
 
 
-def test_a_run_folder_is_whole_and_reads_back(tmp_path, movie_file, whole):
+def test_a_run_folder_is_whole_and_reads_back(tmp_path, movie_file, known, stated, capsys):
     """The command line writes what the function returns; a finished run is not overwritten."""
-    done = run(movie_file[0], *OPTIONS, "-o", tmp_path / "run")
-    assert done.returncode == 0, done.stderr
-    assert "Traceback" not in done.stderr
+    assert run(movie_file[0], *stated, "-o", tmp_path / "run") == 0
+    assert "Traceback" not in capsys.readouterr().err
     again = perrin.load_run(tmp_path / "run")
-    assert_identical(again, whole)
+    assert_identical(again, known)
     names = {p.name for p in (tmp_path / "run").iterdir()}
     wanted = {"summary.json", "tracks.parquet", "motion.parquet", "curves.csv", "figures"}
     assert wanted | {"report.html", "run.json", "features.parquet"} <= names
@@ -175,10 +215,10 @@ def test_a_run_folder_is_whole_and_reads_back(tmp_path, movie_file, whole):
     assert settings["arguments"]["diameter"] == DIAMETER
     assert len(settings["input"]["sha256"]) == 64
 
-    refused = run(movie_file[0], *OPTIONS, "-o", tmp_path / "run")
-    assert refused.returncode == 2
-    assert "exists" in refused.stderr
-    assert refused.stderr.count("\n") == 1
+    assert run(movie_file[0], *OPTIONS, "-o", tmp_path / "run") == 2
+    error = capsys.readouterr().err
+    assert "exists" in error
+    assert error.count("\n") == 1
 
 
 @pytest.fixture
@@ -192,34 +232,46 @@ def counted(monkeypatch):
     return numbers
 
 
-def test_a_killed_run_goes_on_and_gives_the_same(tmp_path, movie_file, whole, counted):
-    """After kill -9 only what was not finished is done again; every bit is the same."""
-    script = tmp_path / "script.py"
-    script.write_text(
-        "from perrin.cli import main\n"
-        "from perrin.movie import stages\n"
-        "from perrin.movie.parts import PartWriter\n"
-        "stages.PartWriter = lambda folder: PartWriter(folder, seconds=0.0)\n"
-        "main()\n"
-    )
-    command = [sys.executable, script, "run", movie_file[0], *OPTIONS, "-o", tmp_path / "run"]
-    located = tmp_path / "run" / "located"
-    with subprocess.Popen(command, stderr=subprocess.DEVNULL) as process:
-        while process.poll() is None and len(list(located.glob("part-*"))) < 2:
-            time.sleep(0.01)
-        process.send_signal(signal.SIGKILL)
-    finished = {int(e["frame"]) for e in read_parts(located)[1]}
-    assert 0 < len(finished) < FRAMES, "killed too late to test anything"
+class KilledAtThirdPart(PartWriter):
+    """Write parts of one frame, and kill the process after the third."""
+
+    parts = 0
+
+    def flush(self):
+        super().flush()
+        self.parts += 1
+        if self.parts == 3:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+
+def run_and_be_killed(path, settings, folder):
+    """Run in another process until it is killed."""
+    stages.PartWriter = lambda folder: KilledAtThirdPart(folder, seconds=0.0)
+    with perrin.open_stack(path) as stack:
+        perrin.analyze_stack(stack, **settings, keep=folder)
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork and kill")
+def test_a_killed_run_resumes_and_gives_the_same(tmp_path, movie_file, known, learned, counted):
+    """After kill -9 only unfinished frames are done again; every bit is the same."""
+    folder = tmp_path / "run"
+    arguments = (movie_file[0], learned, folder)
+    process = multiprocessing.get_context("fork").Process(target=run_and_be_killed, args=arguments)
+    process.start()
+    process.join()
+    assert process.exitcode == -signal.SIGKILL
+    finished = {int(e["frame"]) for e in read_parts(folder / "located")[1]}
+    assert len(finished) == 3
     with perrin.open_stack(movie_file[0]) as stack:
-        report = perrin.analyze_stack(stack, **SEARCH, keep=tmp_path / "run")
+        report = perrin.analyze_stack(stack, **learned, keep=folder)
     assert sorted(counted) == sorted(set(range(FRAMES)) - finished)
-    assert_identical(report, whole)
+    assert_identical(report, known)
 
 
-def test_a_full_disk_is_told_and_the_run_goes_on(tmp_path, movie_file, whole, monkeypatch, capsys):
-    """What was written before stays; one line says what to do; the second call ends the work."""
-    from perrin.cli.app import app
-
+def test_a_full_disk_is_reported_and_the_run_resumes(
+    tmp_path, movie_file, known, learned, stated, monkeypatch, capsys
+):
+    """Parts written before remain; one line names the remedy; the second call ends the work."""
     monkeypatch.setattr(stages, "PartWriter", lambda folder: PartWriter(folder, seconds=0.0))
     sync, written = os.fsync, []
 
@@ -232,18 +284,57 @@ def test_a_full_disk_is_told_and_the_run_goes_on(tmp_path, movie_file, whole, mo
     folder = tmp_path / "run"
     with monkeypatch.context() as patched:
         patched.setattr(os, "fsync", full)
-        with pytest.raises(SystemExit) as stopped:
-            app(["run", str(movie_file[0]), *OPTIONS, "-o", str(folder)])
-    assert stopped.value.code == 2
-    told = capsys.readouterr().err
-    assert "No space left on device" in told
-    assert "the same command goes on" in told
+        assert run(movie_file[0], *stated, "-o", folder) == 2
+    error = capsys.readouterr().err
+    assert "No space left on device" in error
+    assert "the same command" in error
     kept = len(list((folder / "located").glob("part-*")))
     assert 0 < kept < FRAMES
     assert not list((folder / "located").glob(".*"))
     with perrin.open_stack(movie_file[0]) as stack:
-        report = perrin.analyze_stack(stack, **SEARCH, keep=folder)
-    assert_identical(report, whole)
+        report = perrin.analyze_stack(stack, **learned, keep=folder)
+    assert_identical(report, known)
+
+
+def test_options_objects_are_the_same_as_keywords(movie_file):
+    """Every field in its object, and as a keyword: the same report, and the same refusals."""
+    keywords = {
+        "percentile": 94.0, "minmass": 50.0, "border": False, "noise": "residual", "exposure": 0.1,
+        "drift": True, "keep_jumps": True, "viscosity": 1e-3, "temperature": 295.0,
+    }  # fmt: skip
+    asked = SEARCH | {"refine": None, "frames": (0, 4), "exclude": [1]}
+    seen = []
+    objects = {
+        "spots": Spots(percentile=94.0, minmass=50.0, border=False),
+        "experiment": Experiment(
+            noise=Noise("residual", exposure=0.1, drift=True),
+            keep_jumps=True,
+            viscosity=1e-3,
+            temperature=295.0,
+        ),
+        "work": Work(progress=lambda *state: seen.append(state)),
+    }
+    with perrin.open_stack(movie_file[0]) as stack:
+        report = perrin.analyze_stack(stack, **asked, **keywords)
+        assert_identical(perrin.analyze_stack(stack, **asked, **objects), report)
+        assert report.settings["arguments"]["drift"] is True
+        assert (4, 4, "locating spheres") in seen
+        for name, value in (keywords | {"workers": 0, "keep": None}).items():
+            with pytest.raises(ValueError, match=rf"^{name}: given as a keyword and in \w+;"):
+                perrin.analyze_stack(stack, **asked, **objects, **{name: value})
+        wrong = Experiment(dt=9.0, sigma=0.1, diameter=1.0)
+        with pytest.raises(ValueError, match=r"dt is that of .*; .*sigma.*; .*the diameter is"):
+            perrin.analyze_stack(stack, **asked, experiment=wrong)
+        with pytest.raises(TypeError, match="argument 'exposur'; the nearest one is 'exposure'"):
+            perrin.analyze_stack(stack, **asked, exposur=0.1)
+
+
+def test_work_is_checked_when_it_is_made():
+    """All faults in one message."""
+    with pytest.raises(ValueError, match=r"workers: expected a whole number >= 0.*; scheduler: ex"):
+        Work(workers=-1, scheduler="node")
+    with pytest.raises(ValueError, match="workers: expected processes of this machine"):
+        Work(workers=2, scheduler="tcp://node7:8786")
 
 
 def test_parts_of_other_settings_or_input_are_refused(tmp_path, movie_file):
@@ -257,7 +348,7 @@ def test_parts_of_other_settings_or_input_are_refused(tmp_path, movie_file):
         assert anew.settings["arguments"]["percentile"] == 90.0
     with perrin.open_stack(movie_file[0]) as stack:
         mirrored = np.stack([frame[:, ::-1] for frame in stack])
-    other = perrin.open_stack(mirrored, voxel=(0.25, 0.2, 0.2), dt=DT)
+    other = perrin.open_stack(mirrored, voxel=VOXEL, dt=DT)
     with pytest.raises(ValueError, match=r"another run: sha256 '.*' there, '.*' now"):
         perrin.analyze_stack(other, **SEARCH, **short, percentile=90.0)
 
@@ -267,10 +358,10 @@ def test_parts_of_another_channel_are_refused_those_of_a_moved_file_taken(tmp_pa
     import tifffile
 
     movie, _ = rendered(n_frames=3)
-    both = np.stack([np.stack([f, f[:, ::-1]], axis=1) for f in movie])
+    both = np.stack([np.stack([f, f[:, ::-1]], axis=1)[..., :32, :32] for f in movie])
     path = tmp_path / "two.ome.tif"
     tifffile.imwrite(path, both, ome=True, metadata={"axes": "TZCYX"})
-    opened = {"voxel": (0.25, 0.2, 0.2), "dt": DT}
+    opened = {"voxel": VOXEL, "dt": DT}
     asked = SEARCH | {"refine": None, "keep": tmp_path / "run"}
     with perrin.open_stack(path, channel=0, **opened) as stack:
         first = perrin.analyze_stack(stack, **asked)
@@ -286,13 +377,13 @@ def test_parts_of_another_channel_are_refused_those_of_a_moved_file_taken(tmp_pa
     assert counted == []
 
 
-def test_all_faults_are_told_at_the_door(movie_file, counted):
-    """Not after hours of work, and not one by one."""
+def test_all_faults_are_in_one_message_before_any_work(movie_file, counted):
+    """Arguments are checked together, before the first frame is read."""
     wrong = {"size": 1, "noise": "loud", "exposure": 2.0, "viscosity": -1.0, "percentile": 100.0}
-    with perrin.open_stack(movie_file[0]) as stack, pytest.raises(ValueError, match=r".") as told:
+    with perrin.open_stack(movie_file[0]) as stack, pytest.raises(ValueError, match=r".") as caught:
         perrin.analyze_stack(stack, **SEARCH, **wrong, workers=2, scheduler="tcp://127.0.0.1:9")
     for name in (*wrong, "workers"):
-        assert f"{name}: expected" in str(told.value)
+        assert f"{name}: expected" in str(caught.value)
     assert counted == []
 
 
@@ -301,7 +392,7 @@ def test_uneven_times_are_those_of_the_stack(tmp_path, movie_file, learned):
     with perrin.open_stack(movie_file[0]) as stack:
         times = stack.times + np.array([0, 0, 0, 5, 5, 9, 9, 9]) * DT + 100.0
         uneven = replace(stack, times=times)
-        report = perrin.analyze_stack(uneven, **learned, frames=(1, None))
+        report = perrin.analyze_stack(uneven, **learned, refine=None, frames=(1, None))
     for result in report.clusters:
         np.testing.assert_allclose(result.motion.time, times[1:] - times[1], rtol=1e-12)
     table = motion_table(report)
@@ -317,8 +408,8 @@ def test_uneven_times_are_those_of_the_stack(tmp_path, movie_file, learned):
 
 
 def copied(stack, frames):
-    """Return a movie of some frames of another, in memory."""
-    movie = np.stack([stack.frame(i) for i in frames])
+    """Return a movie in memory: some frames of another, with one of its clusters."""
+    movie = np.stack([stack.frame(i)[:, :32, :32] for i in frames])
     return perrin.open_stack(movie, voxel=stack.voxel, dt=DT)
 
 
@@ -341,8 +432,8 @@ def test_frames_that_repeat_another_are_missing_frames(movie_file, learned):
         copies = perrin.analyze_stack(copied(stack, order), **learned, refine=None)
         whole = copied(stack, [0, 1, 5, 2, 3, 6, 7, 4])
         apart = perrin.analyze_stack(whole, **learned, refine=None)
-    (told,) = [text for text in copies.warnings if "repeat" in text]
-    assert told == (
+    (message,) = [text for text in copies.warnings if "repeat" in text]
+    assert message == (
         "3 of 8 frames repeat an earlier frame exactly, voxel by voxel (first: frame 2, as frame "
         "1): they are no measurements and are treated as missing: frames 2, 5 to 6"
     )
@@ -354,7 +445,7 @@ def test_frames_that_repeat_another_are_missing_frames(movie_file, learned):
 
 
 @pytest.mark.parametrize(
-    ("changed", "told"),
+    ("changed", "message"),
     [
         ({"diameter": 2450.0, "contact": 2450.0}, "diameter 2450 um does not fit into the stack"),
         ({"diameter": 10.0, "contact": 10.0}, "diameter 10 um does not fit into the stack: the st"),
@@ -367,55 +458,60 @@ def test_frames_that_repeat_another_are_missing_frames(movie_file, learned):
     ],
 )
 @pytest.mark.parametrize("find", [perrin.analyze_stack, perrin.locate])
-def test_lengths_in_another_unit_are_refused_at_the_door(movie_file, counted, find, changed, told):
+def test_lengths_in_another_unit_are_refused(movie_file, counted, find, changed, message):
     """In one message with the stack's extent, before anything is read or allocated."""
-    with perrin.open_stack(movie_file[0]) as stack, pytest.raises(ValueError, match=told) as failed:
+    with (
+        perrin.open_stack(movie_file[0]) as stack,
+        pytest.raises(ValueError, match=message) as failed,
+    ):
         find(stack, **SEARCH | changed)
-    sizes = "the stack is 9.5 x 13.6 x 14 um (z, y, x), its voxels are 0.25 x 0.2 x 0.2 um"
+    sizes = "the stack is 8.1 x 13 x 13 um (z, y, x), its voxels are 0.3 x 0.25 x 0.25 um"
     assert sizes in str(failed.value)
     assert counted == []
 
 
-def test_a_movie_by_steps_without_a_fault_has_no_warning_of_its_images(whole):
-    """What a run of images adds to that of its tracks: nothing, or notes."""
-    spoken = ("mass", "saturated", "bright", "depth", "refined", "pair", "missing", "scan", "step ")
-    told = [text for text in whole.warnings if any(word in text for word in spoken)]
-    assert told == []
+def test_a_movie_without_a_fault_has_no_warning_of_its_images(whole):
+    """A run of images adds to that of its tracks no warnings, only notes."""
+    words = ("mass", "saturated", "bright", "depth", "refined", "pair", "missing", "scan", "step ")
+    found = [text for text in whole.warnings if any(word in text for word in words)]
+    assert found == []
 
 
-def test_a_larger_body_is_no_cluster_of_the_size_looked_for():
-    """Beside a trimer a bipyramid: neither threes of it nor a doubt about its speed are told."""
+def test_spheres_of_a_larger_body_are_no_cluster():
+    """Beside a trimer a bipyramid: none of its spheres is one, and no warning is of them."""
     bodies = [perrin.Cluster.touching(3, DIAMETER), perrin.Cluster.touching(5, DIAMETER)]
     truth = [
-        perrin.simulate_motion(b, D_R=5e-3, D_T=0.01, dt=DT, n_frames=FRAMES, rng=k)
+        perrin.simulate_motion(b, D_R=5e-3, D_T=0.01, dt=DT, n_frames=5, rng=k)
         for k, b in enumerate(bodies)
     ]
     movie = perrin.render_stack(
         truth,
         centers=CENTERS,
-        shape=(40, 70, 70),
+        shape=(30, 54, 54),
         rng=1,
         **SCENE,
     )
-    by_default = perrin.analyze_stack(movie, **SEARCH)
+    frames = np.stack(list(movie))
+    movie = perrin.open_stack(frames, voxel=VOXEL, dt=DT)
+    by_default = perrin.analyze_stack(movie, **SEARCH, refine=None)
     assert [len(c.motion.template) for c in by_default.clusters] == [5]  # the larger of equals
-    report = perrin.analyze_stack(movie, **SEARCH, size=3)
+    report = perrin.analyze_stack(movie, **SEARCH, refine=None, size=3)
     (only,) = report.clusters
     assert len(only.motion.template) == 3
     assert np.linalg.norm(only.motion.center[0] - CENTERS[0]) < 0.5
-    told = " ".join(report.warnings)
-    assert "larger bodies are left out (touching spheres: 5 in 8 frames)" in told
-    assert "two clusters within" not in told
-    assert "refused" not in told
+    message = " ".join(report.warnings)
+    assert "larger bodies are left out (touching spheres: 5 in 5 frames)" in message
+    assert "two clusters within" not in message
+    assert "refused" not in message
 
 
 def test_voxels_without_a_number_make_a_frame_unreadable(movie_file, learned):
-    """A NaN is neither bright nor dark; the frame is a gap and its reason is told."""
+    """A NaN is neither bright nor dark; the frame is a gap and a warning gives the reason."""
     with perrin.open_stack(movie_file[0]) as stack:
-        frames = np.stack(list(stack)).astype(np.float32)
+        frames = np.stack(list(copied(stack, range(FRAMES)))).astype(np.float32)
     frames[3, 2, 5, 7] = np.nan
-    movie = perrin.open_stack(frames, voxel=(0.25, 0.2, 0.2), dt=DT)
-    report = perrin.analyze_stack(movie, **learned)
+    movie = perrin.open_stack(frames, voxel=VOXEL, dt=DT)
+    report = perrin.analyze_stack(movie, **learned, refine=None)
     assert report.clusters[0].motion.fitted.tolist() == [0, 1, 2, 4, 5, 6, 7]
     assert any("frame 3 has 1 voxels without a number" in text for text in report.warnings)
 
@@ -426,20 +522,20 @@ def test_a_movie_of_pairs_gives_rods():
     truth = perrin.simulate_motion(body, D_R=0.02, D_T=0.02, dt=DT, n_frames=FRAMES, rng=3)
     movie = perrin.render_stack(
         truth,
-        centers=[(4.4, 4.4, 4.8)],
-        shape=(38, 44, 44),
+        centers=[CENTERS[0]],
+        shape=(27, 32, 32),
         rng=1,
         **SCENE,
     )
     report = perrin.analyze_stack(movie, **SEARCH)
     assert report.clusters == ()
     (rod,) = report.rods
-    off = rod.motion.center - truth.center - [4.4, 4.4, 4.8]
+    off = rod.motion.center - truth.center - CENTERS[0]
     assert np.abs(off - off.mean(axis=0)).max() < 0.02  # 4 nm a sphere
 
 
-def test_a_movie_in_the_plane_goes_the_whole_way(tmp_path):
-    """Triangles of bright discs: places are centroids, the angle follows, and it is told."""
+def test_a_movie_in_the_plane_is_measured(tmp_path):
+    """Triangles of bright discs: positions are centroids, the angle follows, and a note says so."""
     body = perrin.Cluster([[0.0, 0.0], [1.2, 0.0], [0.3, 1.1]])
     truth = perrin.simulate_motion(body, D_R=0.01, D_T=0.005, dt=1.0, n_frames=12, rng=4)
     places = truth.positions() + 5.0
@@ -461,8 +557,8 @@ def test_a_movie_in_the_plane_goes_the_whole_way(tmp_path):
     assert (tmp_path / "run" / "quality.html").is_file()
 
 
-def test_a_damaged_part_is_made_anew(tmp_path):
-    """A part that a failing disk cut short counts as not there."""
+def test_a_damaged_part_is_computed_again(tmp_path):
+    """A truncated part counts as missing, and is removed."""
     open_parts(tmp_path, {"a": 1})
     with PartWriter(tmp_path, seconds=0.0) as writer:
         for k in range(3):
@@ -476,32 +572,34 @@ def test_a_damaged_part_is_made_anew(tmp_path):
     assert not victim.exists()
 
 
-def test_a_frame_that_cannot_be_read_is_told_and_skipped(tmp_path, movie_file):
+def test_a_frame_that_cannot_be_read_is_reported_and_skipped(tmp_path, movie_file):
     """A file of a sequence that was cut short loses its frame only, which is a gap."""
     import tifffile
 
     with perrin.open_stack(movie_file[0]) as stack:
-        for i, frame in enumerate(stack):
+        for i, frame in enumerate(copied(stack, range(FRAMES))):
             tifffile.imwrite(tmp_path / f"t{i}.tif", frame)
     victim = tmp_path / "t4.tif"
-    victim.write_bytes(victim.read_bytes()[:50_000])
-    with perrin.open_stack(tmp_path, voxel=(0.25, 0.2, 0.2), dt=DT) as stack:
+    victim.write_bytes(victim.read_bytes()[:20_000])
+    with perrin.open_stack(tmp_path, voxel=VOXEL, dt=DT) as stack:
         report = perrin.analyze_stack(stack, **SEARCH, refine=None)
         table = report.imaging.frames
         assert table.loc[table["fault"] != "", "frame"].tolist() == [4]
         for result in report.clusters:
             assert result.motion.fitted.tolist() == [0, 1, 2, 3, 5, 6, 7]
-        told = [text for text in report.warnings if "1 of 8 frames cannot be read" in text]
-        assert "frame 4" in told[0]
-        assert "t4.tif" in told[0]
+        message = [text for text in report.warnings if "1 of 8 frames cannot be read" in text]
+        assert "frame 4" in message[0]
+        assert "t4.tif" in message[0]
         with pytest.warns(perrin.PrecisionWarning, match="1 of 8 frames are left out: .*t4"):
             found = perrin.locate(stack, **SEARCH, refine=None)
     assert sorted(found["frame"].unique()) == [0, 1, 2, 3, 5, 6, 7]
 
 
-def test_many_workers_give_what_one_gives(movie_file):
-    """Two processes of this machine: every bit is the same."""
+def test_many_workers_give_what_one_gives(movie_file, request):
+    """Two processes of this machine: every bit is the same. With --long only."""
     pytest.importorskip("distributed")
+    if not request.config.getoption("--long"):
+        pytest.skip("starts two processes, with --long only")
     conventional = SEARCH | {"refine": None, "frames": (0, 5)}
     with perrin.open_stack(movie_file[0]) as stack:
         alone = perrin.analyze_stack(stack, **conventional)
@@ -509,9 +607,11 @@ def test_many_workers_give_what_one_gives(movie_file):
 
 
 @pytest.fixture
-def cluster(tmp_path):
-    """Start a Dask scheduler and two workers on the loopback address; yield address and workers."""
+def cluster(tmp_path, request):
+    """Start a Dask scheduler and two workers; give address and workers. With --long only."""
     pytest.importorskip("distributed")
+    if not request.config.getoption("--long"):
+        pytest.skip("starts three processes, with --long only")
     file = tmp_path / "scheduler.json"
     logs = open(tmp_path / "log", "w")  # noqa: SIM115 (closed below)
     flags = {"stdout": logs, "stderr": logs}
@@ -532,44 +632,55 @@ def cluster(tmp_path):
     logs.close()
 
 
-def test_a_dask_cluster_that_loses_a_worker_gives_the_same(movie_file, whole, learned, cluster):
-    """One of two workers is killed half-way; every bit is that of the serial run."""
-    address, workers = cluster
-    killed = []
+def test_the_workers_of_a_scheduler_do_the_work():
+    """A scheduler in this process with one worker: all results, from a few items at once."""
+    distributed = pytest.importorskip("distributed")
+    numbers = np.arange(11.0).tolist()
+    with distributed.LocalCluster(
+        n_workers=1, threads_per_worker=1, processes=False, dashboard_address="127.0.0.1:0"
+    ) as cluster:
+        done = list(work_through(math.exp, numbers, scheduler=cluster.scheduler_address))
+    assert sorted(done) == list(map(math.exp, numbers))
 
-    def kill_half_way(done, total, title):
-        if title == "locating spheres" and 0 < done < total and not killed:
-            workers[0].send_signal(signal.SIGKILL)
-            killed.append(done)
+
+def test_a_dask_cluster_that_loses_a_worker_gives_the_same(movie_file, known, learned, cluster):
+    """One of two workers is killed after the first result; every bit is that of the serial run."""
+    address, workers = cluster
+    victim = workers[0]
+
+    def kill_at_first_result(done, total, title):
+        if title == "locating spheres" and 0 < done < total and victim.poll() is None:
+            victim.send_signal(signal.SIGKILL)
+            victim.wait()
 
     with perrin.open_stack(movie_file[0]) as stack:
-        report = perrin.analyze_stack(stack, **learned, scheduler=address, progress=kill_half_way)
-    assert killed
-    assert killed[0] < FRAMES
-    assert workers[0].wait() == -signal.SIGKILL
-    assert_identical(report, whole)
+        report = perrin.analyze_stack(
+            stack, **learned, scheduler=address, progress=kill_at_first_result
+        )
+    assert victim.wait() == -signal.SIGKILL
+    assert_identical(report, known)
 
 
-def test_the_page_tells_the_truth():
-    """The example of docs/run.md prints what the page says, and every option of it is one."""
+def test_the_page_is_right(request):
+    """Every option in docs/run.md exists; with --long its example prints the same."""
+    from typer.testing import CliRunner
+
+    from perrin.cli.app import app
+
     page = Path(__file__).resolve().parents[1] / "docs" / "run.md"
-    result = doctest.testfile(str(page), module_relative=False)
-    assert result.attempted > 0
-    assert result.failed == 0
-    offered = subprocess.run(
-        [sys.executable, "-m", "perrin.cli", "run", "--help"],
-        capture_output=True,
-        text=True,
-        check=True,
-        env=os.environ | {"COLUMNS": "200", "TERMINAL_WIDTH": "200"},
-    ).stdout
+    if request.config.getoption("--long"):
+        result = doctest.testfile(str(page), module_relative=False)
+        assert result.attempted > 0
+        assert result.failed == 0
+    wide = {"COLUMNS": "200", "TERMINAL_WIDTH": "200"}
+    offered = CliRunner().invoke(app, ["run", "--help"], env=wide).output
     named = set(re.findall(r"(?<![\w-])--[a-z][a-z-]+", page.read_text())) - {"--help"}
     assert len(named) > 12
     assert [option for option in sorted(named) if option not in offered] == []
 
 
 @pytest.mark.parametrize(
-    ("options", "status", "told"),
+    ("options", "status", "message"),
     [
         ([], 2, "no voxel size along z, y, x: pass --voxel z,y,x in um; no times of its"),
         (["--voxel", "0.25,0.2,0.2"], 2, "no times of its 3 frames: pass --dt in s"),
@@ -584,8 +695,10 @@ def test_the_page_tells_the_truth():
         (["--voxel", "0.25,0.2,0.2", "--dt", "0.7", "--refine", "none"], 1, "no particles"),
     ],
 )
-def test_what_cannot_be_is_said_in_one_line(tmp_path, capsys, options, status, told):
-    """A bare TIFF without a sphere: what is missing, what is wrong; no folder is left by that."""
+def test_a_movie_without_spheres_or_scale_is_refused_in_one_line(
+    tmp_path, capsys, options, status, message
+):
+    """A bare TIFF without a sphere: the message names what is missing or wrong."""
     import tifffile
 
     from perrin.cli.app import app
@@ -596,12 +709,12 @@ def test_what_cannot_be_is_said_in_one_line(tmp_path, capsys, options, status, t
         app(["run", str(path), *OPTIONS, "-o", str(tmp_path / "run"), *options])
     error = capsys.readouterr().err
     assert stopped.value.code == status
-    assert f"perrin: {path}: {told}" in error or f"perrin: {told}" in error
+    assert f"perrin: {path}: {message}" in error or f"perrin: {message}" in error
     assert "Traceback" not in error
     assert "the same command goes on" not in error
 
 
-def test_workers_that_are_not_there_are_told(tmp_path, monkeypatch, movie_file):
+def test_missing_workers_are_reported(tmp_path, monkeypatch, movie_file):
     """Without dask the command to install it; without a scheduler, its address."""
     monkeypatch.setitem(sys.modules, "distributed", None)
     with perrin.open_stack(movie_file[0]) as stack:
@@ -619,7 +732,7 @@ def test_workers_that_are_not_there_are_told(tmp_path, monkeypatch, movie_file):
         assert not (tmp_path / "run").exists()
 
 
-def test_a_file_out_of_a_workers_reach_is_no_bad_frame(tmp_path, movie_file):
+def test_a_file_that_a_worker_cannot_open_is_an_error(tmp_path, movie_file):
     """Where the whole file is missing every frame would count as damaged."""
     path = tmp_path / "movie.ome.tif"
     path.write_bytes(movie_file[0].read_bytes())
@@ -632,12 +745,12 @@ def test_a_file_out_of_a_workers_reach_is_no_bad_frame(tmp_path, movie_file):
 
 
 def test_steps_over_half_a_contact_are_refused(learned):
-    """A cluster that leaps to and fro by 0.6 contact distances: nobody can tell who is who."""
+    """A cluster that moves to and fro by 0.6 contact distances: labels cannot be assigned."""
     body = perrin.Cluster.touching(4, DIAMETER).positions
     leap = np.where(np.arange(FRAMES) % 2, 0.3, -0.3)[:, None] * [DIAMETER, 0.0, 0.0]
     wild = perrin.render_stack(
-        body + leap[:, None] + [7.0, 7.0, 4.8],
-        shape=(38, 68, 70),
+        body + leap[:, None] + [6.5, 6.5, 4.0],
+        shape=SHAPE,
         dt=DT,
         rng=1,
         **SCENE,

@@ -1,25 +1,25 @@
 """The paper's bodies, touching spheres, and any arrangement."""
 
+import json
+
 import numpy as np
 import pytest
 
 from perrin import Cluster, point_group, rotation_group
 from perrin.geometry.rotations import exp_map
-from perrin.geometry.shapes import is_tetrahedron
+from perrin.geometry.shapes import is_tetrahedron, pair_distances
 from perrin.geometry.symmetry import matching_rotation, symmetry_elements
 
 
 def distances(cluster):
     """Return all pair distances."""
-    x = cluster.positions
-    i, j = np.triu_indices(len(x), 1)
-    return np.linalg.norm(x[i] - x[j], axis=1)
+    return pair_distances(cluster.positions)
 
 
 @pytest.mark.parametrize(("n", "contacts"), [(2, 1), (3, 3), (4, 6), (5, 9), (6, 12), (7, 15)])
 @pytest.mark.parametrize("diameter", [1e-9, 2.45, 1e9])
 def test_touching_spheres_touch_and_do_not_overlap(n, contacts, diameter):
-    """So many pairs stand exactly one diameter apart (3n - 6 from n = 3), and none is closer."""
+    """The right number of pairs (3n - 6 from n = 3) is one diameter apart, and none is closer."""
     cluster = Cluster.touching(n, diameter)
     gap = distances(cluster) / diameter - 1
     assert np.sum(np.abs(gap) < 1e-14) == contacts
@@ -294,3 +294,12 @@ def test_a_body_is_carried_onto_its_relabelled_copy_and_not_onto_its_mirror_imag
     moved = (x @ turn.T)[rng.permutation(6)]
     np.testing.assert_allclose(matching_rotation(x, moved, tolerance=1e-6), turn, atol=1e-12)
     assert matching_rotation(x, -moved, tolerance=1e-2) is None
+
+
+@pytest.mark.parametrize("cluster", [Cluster.touching(5, 2.45), Cluster([[0.1, 0], [1, 0.3]])])
+def test_a_cluster_comes_back_from_json(cluster):
+    """Positions to the last bit, symmetry and diameter."""
+    back = Cluster.from_dict(json.loads(json.dumps(cluster.to_dict())))
+    np.testing.assert_array_equal(back.positions, cluster.positions)
+    assert (back.symmetry, back.diameter) == (cluster.symmetry, cluster.diameter)
+    assert not back.positions.flags.writeable

@@ -18,6 +18,7 @@ from perrin.geometry.rotations import (
     similarity,
     skew,
     successive_product,
+    unit_quaternion,
 )
 from perrin.geometry.shapes import Cluster, is_tetrahedron, pair_distances
 from perrin.geometry.symmetry import (
@@ -27,15 +28,26 @@ from perrin.geometry.symmetry import (
     schoenflies,
     symmetry_elements,
 )
+from perrin.geometry.wahba import (
+    certified_rotation,
+    characteristic_root,
+    dispersion,
+    planar_rotation,
+    spatial_rotation,
+    svd_rotation,
+)
 
 __all__ = [
     "Cluster",
     "Similarity",
     "axis_angle",
     "center_variance",
+    "certified_rotation",
+    "characteristic_root",
     "cumulative_product",
     "degrees_of_freedom",
     "diffusion_center",
+    "dispersion",
     "exp_map",
     "fit_rotations",
     "is_tetrahedron",
@@ -44,12 +56,16 @@ __all__ = [
     "matching_rotation",
     "orientation_covariance",
     "pair_distances",
+    "planar_rotation",
     "point_group",
     "rotation_group",
     "schoenflies",
     "shifted",
     "similarity",
     "skew",
+    "spatial_rotation",
     "successive_product",
+    "svd_rotation",
     "symmetry_elements",
+    "unit_quaternion",
 ]

@@ -1,4 +1,4 @@
-"""Which rotation carries one point set onto another, and the maps between rotations and vectors.
+"""Rotations: the one that carries a point set onto another, and maps to vectors and back.
 
 Rotations are active matrices, lab from body: ``x = R x0``. All functions take leading batch axes.
 """
@@ -12,11 +12,9 @@ from numpy.typing import ArrayLike
 
 from perrin._arrays import Bools, Floats, present
 from perrin.errors import DegenerateClusterError
+from perrin.geometry.wahba import planar_rotation, spatial_rotation
 
-_CHUNK = 2048  # rows whose working arrays stay in the second-level cache
-
-
-_EPS = float(np.finfo(np.float64).eps)
+_CACHED_ROWS = 2048  # rows whose working arrays fit into the second-level cache
 
 
 def kabsch(points: ArrayLike, reference: ArrayLike, *, weights: ArrayLike | None = None) -> Floats:
@@ -24,7 +22,7 @@ def kabsch(points: ArrayLike, reference: ArrayLike, *, weights: ArrayLike | None
 
     Both sets are centred (with the weights) and the rotation minimises the weighted squared
     distance ``sum w |points - R reference|^2`` with ``det R = +1``, also for planar sets and for
-    data that look mirrored.
+    mirrored data.
 
     Parameters
     ----------
@@ -45,7 +43,7 @@ def kabsch(points: ArrayLike, reference: ArrayLike, *, weights: ArrayLike | None
     ValueError
         If shapes do not fit, a coordinate is infinite, or a weight is negative or not finite.
     DegenerateClusterError
-        If a row has no unique answer (too few particles, collinear ones, an exact mirror image);
+        If a row has no unique rotation (too few particles, collinear ones, a mirror image);
         ``indices`` names the rows, counted along the flattened leading axes.
 
     Notes
@@ -130,7 +128,7 @@ def similarity(points: ArrayLike, reference: ArrayLike) -> Similarity:
 def fit_rotations(
     points: ArrayLike, reference: ArrayLike, *, weights: ArrayLike | None = None
 ) -> tuple[Floats, Bools]:
-    """Do the work of `kabsch` without raising: rotations, and which of them are unique.
+    """Return the rotations of `kabsch` and which of them are unique, without raising.
 
     Parameters
     ----------
@@ -142,7 +140,7 @@ def fit_rotations(
     rotation : ndarray, shape (..., d, d)
         NaN where the answer is not unique.
     unique : ndarray of bool, shape (...)
-        Whether the row has one answer.
+        Whether the row has a unique rotation.
     """
     y, x, w = _paired(points, reference, weights)
     batch = np.broadcast_shapes(y.shape[:-2], x.shape[:-2], () if w is None else w.shape[:-1])
@@ -151,9 +149,9 @@ def fit_rotations(
     unique = np.empty(size, dtype=np.bool_)
     y_rows, x_rows = _rows(y, batch), _rows(x, batch)
     w_rows = None if w is None else _rows(w[..., None], batch)
-    solve = _solve_planar if d == 2 else _solve_spatial
-    for low in range(0, size, _CHUNK):
-        rows = slice(low, low + _CHUNK)
+    solve = planar_rotation if d == 2 else spatial_rotation
+    for low in range(0, size, _CACHED_ROWS):
+        rows = slice(low, low + _CACHED_ROWS)
         chunk_w = None if w_rows is None else _transposed(w_rows, rows)
         sets = _transposed(y_rows, rows), _transposed(x_rows, rows), chunk_w
         rotation[rows], unique[rows] = solve(*sets)
@@ -215,7 +213,7 @@ def log_map(rotation: ArrayLike) -> Floats:
     r = np.asarray(rotation, dtype=np.float64)
     if r.shape[-1] == 2:
         return np.arctan2(r[..., 1, 0], r[..., 0, 0])[..., None]
-    q = _quaternion(r)
+    q = unit_quaternion(r)
     v, w = q[..., 1:], q[..., 0]
     sine = np.linalg.norm(v, axis=-1)
     angle = 2.0 * np.arctan2(sine, w)
@@ -255,7 +253,7 @@ def axis_angle(rotation: ArrayLike) -> tuple[Floats, Floats]:
     if r.shape[-2:] != (3, 3):
         raise ValueError(f"rotation: expected matrices (..., 3, 3), got shape {r.shape}")
     vector = log_map(r)
-    # hypot does not square: an angle of 1e-200 is one too.
+    # hypot does not square, so that an angle of 1e-200 is not rounded to 0.
     angle = np.asarray(np.minimum(np.hypot.reduce(vector, axis=-1), np.pi))
     axis = np.full_like(vector, np.nan)
     np.divide(vector, angle[..., None], out=axis, where=angle[..., None] > 0)
@@ -263,11 +261,58 @@ def axis_angle(rotation: ArrayLike) -> tuple[Floats, Floats]:
 
 
 def skew(vector: Floats) -> Floats:
-    """Return the matrix [v]x with [v]x u = v x u, shape (..., 3, 3)."""
+    """Return the matrix [v]x of the cross product: [v]x u = v x u.
+
+    Parameters
+    ----------
+    vector : ndarray, shape (..., 3)
+
+    Returns
+    -------
+    ndarray, shape (..., 3, 3)
+
+    Examples
+    --------
+    >>> skew(np.array([0.0, 0.0, 2.0])) @ [1.0, 0.0, 0.0]
+    array([0., 2., 0.])
+    """
     zero = np.zeros(vector.shape[:-1])
     x, y, z = np.moveaxis(vector, -1, 0)
     rows = [(zero, -z, y), (z, zero, -x), (-y, x, zero)]
     return np.stack([np.stack(row, -1) for row in rows], -2)
+
+
+def unit_quaternion(rotation: Floats) -> Floats:
+    """Return the unit quaternion (w, x, y, z), w >= 0, of a rotation matrix.
+
+    It is read from the best-conditioned column of q q^T, which is accurate at every angle.
+
+    Parameters
+    ----------
+    rotation : ndarray, shape (..., 3, 3)
+
+    Returns
+    -------
+    ndarray, shape (..., 4)
+
+    Examples
+    --------
+    >>> unit_quaternion(np.diag([1.0, -1.0, -1.0]))
+    array([0., 1., 0., 0.])
+    """
+    r = rotation
+    t = np.trace(r, axis1=-2, axis2=-1)
+    k = np.empty((*r.shape[:-2], 4, 4))
+    k[..., 0, 0] = 1.0 + t
+    for i, (a, b) in enumerate(((2, 1), (0, 2), (1, 0))):
+        k[..., i + 1, i + 1] = 1.0 + 2.0 * r[..., i, i] - t
+        k[..., 0, i + 1] = k[..., i + 1, 0] = r[..., a, b] - r[..., b, a]
+    for i, j in ((0, 1), (0, 2), (1, 2)):
+        k[..., i + 1, j + 1] = k[..., j + 1, i + 1] = r[..., i, j] + r[..., j, i]
+    best = np.argmax(np.einsum("...ii->...i", k), axis=-1)
+    q: Floats = np.take_along_axis(k, best[..., None, None], axis=-1)[..., 0]
+    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    return np.where(q[..., :1] < 0, -q, q)
 
 
 def cumulative_product(steps: Floats) -> Floats:
@@ -283,7 +328,7 @@ def cumulative_product(steps: Floats) -> Floats:
 
     Notes
     -----
-    Two levels of blocks, so that the Python loops have about sqrt(K) turns.
+    Two levels of blocks, so that the Python loops have about sqrt(K) passes.
     """
     count, d = steps.shape[0], steps.shape[-1]
     length = max(1, int(np.ceil(np.sqrt(count))))
@@ -307,7 +352,7 @@ def successive_product(steps: Floats) -> Floats:
     Parameters
     ----------
     steps : ndarray, shape (K, d, d)
-        In lab axes.
+        Rotations R^k of the steps, in lab axes.
 
     Returns
     -------
@@ -319,7 +364,7 @@ def successive_product(steps: Floats) -> Floats:
 def _paired(
     points: ArrayLike, reference: ArrayLike, weights: ArrayLike | None
 ) -> tuple[Floats, Floats, Floats | None]:
-    """Coerce and check the three inputs; absent particles get weight 0 and coordinate 0."""
+    """Check the three inputs; absent particles get weight 0 and coordinate 0."""
     y, x = np.asarray(points, dtype=np.float64), np.asarray(reference, dtype=np.float64)
     if y.ndim < 2 or y.shape[-2:] != x.shape[-2:] or y.shape[-1] not in (2, 3) or not y.shape[-2]:
         raise ValueError(
@@ -352,155 +397,3 @@ def _transposed(a: Floats, rows: slice) -> Floats:
     """Return (n, d, B) with the batch last: every component one contiguous vector."""
     part = a if a.shape[0] == 1 else a[rows]
     return np.ascontiguousarray(part.transpose(1, 2, 0))
-
-
-def _dispersion(y: Floats, x: Floats, w: Floats | None) -> tuple[Floats, Floats]:
-    """Return the cross-dispersion C = sum w y x^T (Eq. 8), (d, d, B), and its rounding error, (B,).
-
-    Centring a set at distance L leaves it uncertain by eps L.
-    """
-    total = float(y.shape[0]) if w is None else np.maximum(w.sum(0), 1e-300)
-    y0 = (y if w is None else y * w).sum(0) / total
-    x0 = (x if w is None else x * w).sum(0) / total
-    y, x = y - y0, x - x0
-    x_weighted = x if w is None else x * w
-    c: Floats = y[0][:, None] * x_weighted[0][None]
-    for i in range(1, y.shape[0]):
-        c = c + y[i][:, None] * x_weighted[i][None]
-    y_size, x_size = _reach(y, w), _reach(x, w)
-    near = np.abs(y).max((0, 1)) * x_size * y.shape[0]
-    far = np.abs(y0).max(0) * x_size + np.abs(x0).max(0) * y_size
-    return c, 8 * _EPS * (near + far)
-
-
-def _reach(centred: Floats, w: Floats | None) -> Floats:
-    """Return the weighted sum of the absolute coordinates, (B,)."""
-    size: Floats = np.abs(centred if w is None else centred * w).sum((0, 1))
-    return size
-
-
-def _solve_planar(y: Floats, x: Floats, w: Floats | None) -> tuple[Floats, Bools]:
-    """Maximise Tr(R^T C) over rotations of the plane: one angle."""
-    c, error = _dispersion(y, x, w)
-    cosine, sine = c[0, 0] + c[1, 1], c[1, 0] - c[0, 1]
-    length = np.hypot(cosine, sine)
-    unique = length > error
-    length = np.where(unique, length, 1.0)
-    cosine, sine = cosine / length, sine / length
-    return np.stack([cosine, -sine, sine, cosine], -1).reshape(-1, 2, 2), unique
-
-
-def _solve_spatial(y: Floats, x: Floats, w: Floats | None) -> tuple[Floats, Bools]:
-    """Maximise Tr(R^T C) over SO(3): fast path with a certificate, SVD for the rows without one."""
-    c, error = _dispersion(y, x, w)
-    rotation, certain = _newton(c, error)
-    out = np.ascontiguousarray(rotation.transpose(2, 0, 1))
-    rest = np.flatnonzero(~certain)
-    if rest.size:
-        out[rest], certain[rest] = _svd(c[:, :, rest].transpose(2, 0, 1), error[rest])
-    return out, certain
-
-
-def _svd(c: Floats, error: Floats) -> tuple[Floats, Bools]:
-    """Solve Eqs. 9 and 10; the answer is unique where s_2 + det(U V^T) s_3 > 0 beyond rounding."""
-    u, s, vt = np.linalg.svd(c)
-    sign = np.where(np.linalg.det(u @ vt) < 0, -1.0, 1.0)
-    u[:, :, 2] *= sign[:, None]
-    return u @ vt, s[:, 1] + sign * s[:, 2] > error
-
-
-def _newton(c: Floats, error: Floats) -> tuple[Floats, Bools]:
-    """Return rotations (3, 3, B) and whether each is proven to be the one maximum."""
-    largest = np.abs(c).max((0, 1))
-    b = c / np.where(largest > 0, largest, 1.0)
-    norm = np.sqrt((b * b).sum((0, 1)))
-    b = b / np.where(norm > 0, norm, 1.0)
-    cofactor = _cofactor(b)
-    det = (b[0] * cofactor[0]).sum(0)
-    root, gap = _largest_root(det, (cofactor * cofactor).sum((0, 1)))
-    # Markley's closed form with |B| = 1: ((k + 1) B + l cof B - B B^T B) / gap, k = (l^2 - 1)/2.
-    gram = _product(b.transpose(1, 0, 2), b)
-    r = 0.5 * (root * root + 1.0) * b + root * cofactor - _product(b, gram)
-    r = r / np.maximum(gap, 1e-12)
-    # One Newton-Schulz step squares away the rounding that a small gap lets in.
-    schulz = 0.5 * (r - _product(r, _product(r.transpose(1, 0, 2), r)))
-    r = r + schulz
-    step, definite = _newton_step(_product(r.transpose(1, 0, 2), b))
-    # Both steps are quadratic: short ones land within rounding, and a long one betrays a root
-    # that has not settled. The error left by the second grows as the gap closes.
-    settled = ((schulz * schulz).sum((0, 1)) < 1e-16) & ((step * step).sum(0) < 1e-14 * gap)
-    # |B| = 1 bounds two factors of the gap by sqrt(2), so the third, s2 + s3, is over gap / 2.
-    certain = definite & settled & (gap > 1e-7) & (0.5 * gap * norm * largest > error)
-    turned = r + np.stack([_cross(r[i], step) for i in range(3)])
-    return turned, certain
-
-
-def _largest_root(det: Floats, cofactor2: Floats) -> tuple[Floats, Floats]:
-    """Return the largest root l of (l^2 - 1)^2 - 8 l det - 4 |cof|^2 and (its slope)/8, the gap.
-
-    sqrt(3) bounds the root from above, from where Newton's method falls monotonically; the gap is
-    (s1 + s2)(s2 + s3)(s3 + s1) of the signed singular values, zero where the answer is not unique.
-    """
-    root = np.full_like(det, np.sqrt(3.0))
-    for _ in range(30):
-        square = root * root - 1.0
-        slope = 0.5 * root * square - det
-        value = 0.125 * square * square - root * det - 0.5 * cofactor2
-        change = value / np.maximum(slope, 1e-12)
-        root = root - change
-        # Rows near a double root creep; they fail the certificate and go through the SVD.
-        if np.count_nonzero(np.abs(change) > 1e-9) <= change.size // 100:
-            break
-    return root, 0.5 * root * (root * root - 1.0) - det
-
-
-def _newton_step(s: Floats) -> tuple[Floats, Bools]:
-    """Solve (tr S - sym S) w = axial(S - S^T), S = R^T C; say if it is positive definite."""
-    trace = s[0, 0] + s[1, 1] + s[2, 2]
-    p, q, r = trace - s[0, 0], trace - s[1, 1], trace - s[2, 2]
-    f, g, h = (-0.5 * (s[i, j] + s[j, i]) for i, j in ((0, 1), (0, 2), (1, 2)))
-    a = np.stack([s[2, 1] - s[1, 2], s[0, 2] - s[2, 0], s[1, 0] - s[0, 1]])
-    m00, m01, m02 = q * r - h * h, g * h - f * r, f * h - g * q
-    m11, m12, m22 = p * r - g * g, f * g - p * h, p * q - f * f
-    det = p * m00 + f * m01 + g * m02
-    w = np.stack(
-        [
-            m00 * a[0] + m01 * a[1] + m02 * a[2],
-            m01 * a[0] + m11 * a[1] + m12 * a[2],
-            m02 * a[0] + m12 * a[1] + m22 * a[2],
-        ]
-    ) / np.where(det != 0, det, 1.0)
-    return w, (p > 0) & (m22 > 0) & (det > 0)
-
-
-def _product(a: Floats, b: Floats) -> Floats:
-    """Multiply matrices with the batch last, (3, 3, B)."""
-    product: Floats = a[:, 0, None] * b[0] + a[:, 1, None] * b[1] + a[:, 2, None] * b[2]
-    return product
-
-
-def _cross(a: Floats, b: Floats) -> Floats:
-    """Return a x b of vectors with the batch last, (3, B)."""
-    return np.stack(
-        [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
-    )
-
-
-def _cofactor(b: Floats) -> Floats:
-    return np.stack([_cross(b[1], b[2]), _cross(b[2], b[0]), _cross(b[0], b[1])])
-
-
-def _quaternion(r: Floats) -> Floats:
-    """Return unit quaternions (w, x, y, z), w >= 0, from the best-conditioned column of q q^T."""
-    t = np.trace(r, axis1=-2, axis2=-1)
-    k = np.empty((*r.shape[:-2], 4, 4))
-    k[..., 0, 0] = 1.0 + t
-    for i, (a, b) in enumerate(((2, 1), (0, 2), (1, 0))):
-        k[..., i + 1, i + 1] = 1.0 + 2.0 * r[..., i, i] - t
-        k[..., 0, i + 1] = k[..., i + 1, 0] = r[..., a, b] - r[..., b, a]
-    for i, j in ((0, 1), (0, 2), (1, 2)):
-        k[..., i + 1, j + 1] = k[..., j + 1, i + 1] = r[..., i, j] + r[..., j, i]
-    best = np.argmax(np.einsum("...ii->...i", k), axis=-1)
-    q: Floats = np.take_along_axis(k, best[..., None, None], axis=-1)[..., 0]
-    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
-    return np.where(q[..., :1] < 0, -q, q)

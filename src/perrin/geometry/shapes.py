@@ -1,13 +1,18 @@
-"""What a cluster looks like: the paper's bodies, touching spheres, measured shapes, symmetry."""
+"""Shapes of clusters: the paper's bodies, touching spheres, measured arrangements."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from perrin._arrays import Floats, frozen, require_positive
+from perrin._arrays import Floats, from_plain, frozen, require_positive
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from typing import Self
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,9 +24,9 @@ class Cluster:
     positions : ndarray, shape (n, d)
         Centres, um, with their mean at the origin.
     symmetry : str or None
-        Schoenflies symbol of the point group, None where nobody has determined it.
+        Schoenflies symbol of the point group; None if it is not known.
     diameter : float or None
-        Sphere diameter, um, where it is known (touching spheres).
+        Sphere diameter, um; None if it is not known.
 
     Examples
     --------
@@ -122,12 +127,22 @@ class Cluster:
         require_positive(diameter=diameter)
         if n not in range(2, 8):
             raise ValueError(f"n: expected 2 to 7 touching spheres, got {n!r}; use from_positions")
-        unit, symmetry = _touching_unit(n)
+        symmetry = {2: "D_inf_h", 3: "D_3h", 4: "T_d", 5: "D_3h", 6: "O_h", 7: "D_5h"}[n]
+        if n == 2:
+            unit = np.array([[0.0, 0.0, 0.5], [0.0, 0.0, -0.5]])
+        elif n == 3:
+            unit = _ring(3, 1 / np.sqrt(3))
+        elif n == 4:
+            unit = cls.tetrahedron(np.sqrt(3 / 8)).positions
+        else:
+            # Ring and pole spheres touch, so height^2 + radius^2 = 1.
+            radius = 0.5 / np.sin(np.pi / (n - 2))
+            unit = _bipyramid(n - 2, radius, np.sqrt(1 - radius**2))
         return cls(unit * diameter, symmetry, float(diameter))
 
     @classmethod
     def from_positions(cls, positions: ArrayLike) -> Cluster:
-        """Take any measured or planned arrangement; the centre is moved to the origin.
+        """Return any arrangement of particles as a cluster; its centre is moved to the origin.
 
         Parameters
         ----------
@@ -141,6 +156,38 @@ class Cluster:
         """
         return cls(np.asarray(positions, dtype=np.float64))
 
+    def to_dict(self) -> dict[str, Any]:
+        """Return the cluster for JSON: plain numbers, lists, units in the names.
+
+        Examples
+        --------
+        >>> Cluster.touching(2, 2.0).to_dict()["positions_um"]
+        [[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]]
+        """
+        return {
+            "positions_um": self.positions.tolist(),
+            "symmetry": self.symmetry,
+            "diameter_um": self.diameter,
+        }
+
+    @classmethod
+    def from_dict(cls, entry: Mapping[str, Any]) -> Self:
+        """Return the cluster that `to_dict` wrote.
+
+        Parameters
+        ----------
+        entry : mapping
+
+        Examples
+        --------
+        >>> Cluster.from_dict(Cluster.tetrahedron(1.5).to_dict())
+        Cluster(n=4, d=3, R=1.5 um, T_d)
+        """
+        cluster = cls(entry["positions_um"], entry["symmetry"], entry["diameter_um"])
+        # Centring once more could change the last bit.
+        object.__setattr__(cluster, "positions", from_plain(entry["positions_um"]))
+        return cluster
+
 
 def _ring(n: int, radius: float) -> Floats:
     """Place n particles on a circle in the plane z = 0."""
@@ -151,22 +198,6 @@ def _ring(n: int, radius: float) -> Floats:
 def _bipyramid(n: int, radius: float, height: float) -> Floats:
     """Return a ring of n and two poles at z = +-height."""
     return np.concatenate([_ring(n, radius), [[0, 0, height], [0, 0, -height]]])
-
-
-def _touching_unit(n: int) -> tuple[Floats, str]:
-    """Return n touching spheres of diameter 1 and their point group.
-
-    In the bipyramids ring and pole spheres touch, so height^2 + radius^2 = 1.
-    """
-    if n == 2:
-        return np.array([[0.0, 0.0, 0.5], [0.0, 0.0, -0.5]]), "D_inf_h"
-    if n == 3:
-        return _ring(3, 1 / np.sqrt(3)), "D_3h"
-    if n == 4:
-        return Cluster.tetrahedron(np.sqrt(3 / 8)).positions, "T_d"
-    radius = 0.5 / np.sin(np.pi / (n - 2))
-    symmetry = {5: "D_3h", 6: "O_h", 7: "D_5h"}[n]
-    return _bipyramid(n - 2, radius, np.sqrt(1 - radius**2)), symmetry
 
 
 def pair_distances(points: Floats) -> Floats:
@@ -192,9 +223,20 @@ def pair_distances(points: Floats) -> Floats:
 
 
 def is_tetrahedron(positions: Floats, *, tolerance: float = 0.1) -> bool:
-    """Return whether four particles in space have six pair distances alike, within `tolerance`."""
+    """Return whether four particles in space have six equal pair distances, within a tolerance.
+
+    Parameters
+    ----------
+    positions : ndarray, shape (n, d)
+    tolerance : float
+        Largest spread of the distances, relative to their mean.
+
+    Examples
+    --------
+    >>> is_tetrahedron(Cluster.touching(4, 2.45).positions)
+    True
+    """
     if positions.shape != (4, 3):
         return False
-    first, second = np.triu_indices(4, 1)
-    distance = np.linalg.norm(positions[first] - positions[second], axis=1)
+    distance = pair_distances(positions)
     return bool(distance.max() - distance.min() < tolerance * distance.mean())

@@ -1,4 +1,8 @@
-"""Rotational symmetry of a set of points: its rotation group and point group."""
+"""Symmetry of a set of points: its rotation group and its point group.
+
+A symmetry element is found as a permutation of the particles, with a sign: +1 for a rotation, -1
+for a rotation times the inversion. On a body that is not a line the two determine the matrix.
+"""
 
 from __future__ import annotations
 
@@ -7,13 +11,14 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike
 
+from perrin._arrays import number_fault, refuse
 from perrin.geometry.rotations import axis_angle, fit_rotations
 from perrin.geometry.shapes import Cluster
 
 if TYPE_CHECKING:
-    from perrin._arrays import Bools, Floats, Ints
+    from perrin._arrays import Floats, Ints
 
-# A symmetry element: its sign, then the number of the particle that each particle comes to.
+# Sign of a symmetry element, then for each particle the number of the one it is mapped to.
 _Element: TypeAlias = tuple[int, ...]
 
 
@@ -25,14 +30,13 @@ def rotation_group(positions: ArrayLike, *, tolerance: float) -> Floats:
     positions : array_like, shape (n, d)
         Centres, um; their mean is taken as the origin.
     tolerance : float
-        How far (um) a turned particle may be from the place of another one.
+        Largest distance (um) of a rotated particle from the one it is mapped to.
 
     Returns
     -------
     ndarray, shape (g, d, d)
-        Exact rotations that form a group, the identity first. Of the turns about the line of a
-        collinear body, which move nothing, only the identity is given, and of those that exchange
-        its ends only one.
+        Exact rotations that form a group, the identity first. For a collinear body, all rotations
+        about its line are represented by the identity, and all that exchange its ends by one.
 
     Raises
     ------
@@ -42,20 +46,20 @@ def rotation_group(positions: ArrayLike, *, tolerance: float) -> Floats:
     Notes
     -----
     Every rotation carries a pair of particles onto another pair, so all pairs are tried, each
-    refined by a fit to all particles. Rotations within the tolerance are admitted, best first,
-    where all their products stay within twice the tolerance; the body is then averaged over the
-    group, which makes the rotations exact.
+    refined by a fit to all particles. Rotations within the tolerance are accepted, best first, if
+    all their products are within twice the tolerance; the body is then averaged over the group,
+    which makes the rotations exact.
 
     Examples
     --------
     >>> rotation_group(Cluster.tetrahedron(1.5).positions, tolerance=0.01).shape
     (12, 3, 3)
     """
-    x = _checked(positions, tolerance)
+    x = _centred_positions(positions, tolerance)
     d = x.shape[1]
-    line = _along_line(x, tolerance)
+    line = _projected_on_line(x, tolerance)
     if line is not None:
-        return _line_group(line, d, tolerance)
+        return _line_rotations(line, d, tolerance)
     spatial = np.pad(x, ((0, 0), (0, 3 - d)))
     elements = symmetry_elements(spatial, tolerance)
     proper: Floats = elements[np.linalg.det(elements) > 0]
@@ -72,8 +76,8 @@ def point_group(positions: ArrayLike, *, tolerance: float | None = None) -> str:
     positions : array_like, shape (n, d)
         Centres, um; points of the plane are a flat body in space.
     tolerance : float, optional
-        How far (um) a mapped particle may be from the place of another one; default a millionth
-        of the mean distance to the centre.
+        Largest distance (um) of a mapped particle from the one it is mapped to; default a
+        millionth of the mean distance to the centre.
 
     Returns
     -------
@@ -93,31 +97,31 @@ def point_group(positions: ArrayLike, *, tolerance: float | None = None) -> str:
     >>> point_group([[0, 0, 0], [2, 0, 0], [1, 1.5, 0]])
     'C_2v'
     """
-    x = _checked(positions, 0.0 if tolerance is None else tolerance)
+    x = _centred_positions(positions, 0.0 if tolerance is None else tolerance)
     x = np.pad(x, ((0, 0), (0, 3 - x.shape[1])))
     allowed = 1e-6 * float(np.linalg.norm(x, axis=1).mean()) if tolerance is None else tolerance
-    line = _along_line(x, allowed)
+    line = _projected_on_line(x, allowed)
     if line is not None:
         if np.abs(line).max() <= allowed:
             return "K_h"
-        return "D_inf_h" if len(_line_group(line, 3, allowed)) == 2 else "C_inf_v"
+        return "D_inf_h" if len(_line_rotations(line, 3, allowed)) == 2 else "C_inf_v"
     return schoenflies(symmetry_elements(x, allowed))
 
 
 def matching_rotation(x: Floats, onto: Floats, *, tolerance: float) -> Floats | None:
-    """Return the rotation that carries a body onto another one, whatever their labels.
+    """Return the rotation that carries a body onto another one, in any order of the particles.
 
     Parameters
     ----------
     x, onto : ndarray, shape (n, 3)
-        Centred, of indistinguishable particles, not on one line.
+        Centred positions of indistinguishable particles that are not on one line.
     tolerance : float
-        How far (um) a turned particle may be from its place.
+        Largest distance (um) of a rotated particle from the one it is mapped to.
 
     Returns
     -------
     ndarray, shape (3, 3), or None
-        onto = R x but for the order, the best one of several; None where there is none.
+        R with onto = R x up to the order, the best one of several; None if there is none.
 
     Examples
     --------
@@ -126,121 +130,108 @@ def matching_rotation(x: Floats, onto: Floats, *, tolerance: float) -> Floats | 
     >>> np.allclose(np.sort((x @ R.T)[:, 0]), np.sort(x[:, 1]))
     True
     """
-    order, miss = _mappings(x, onto, tolerance)
+    order, miss = _congruences(x, onto, tolerance)
     if not miss.size:
         return None
     rotation: Floats = fit_rotations(onto[order[np.argmin(miss)]][None], x)[0][0]
     return rotation
 
 
-def _checked(positions: ArrayLike, tolerance: float) -> Floats:
-    """Return centred positions after checking them and the tolerance."""
-    if not (np.ndim(tolerance) == 0 and np.isfinite(tolerance) and tolerance >= 0):
-        raise ValueError(f"tolerance: expected a finite number >= 0 (um), got {tolerance!r}")
+def _centred_positions(positions: ArrayLike, tolerance: float) -> Floats:
+    """Check positions and tolerance; return the positions with their mean at the origin."""
+    refuse(number_fault("tolerance", tolerance, least=0, unit="um"))
     return Cluster.from_positions(positions).positions
 
 
-def _along_line(x: Floats, tolerance: float) -> Floats | None:
-    """Return places along the line if all particles lie on one within the tolerance, else None."""
+def _projected_on_line(x: Floats, tolerance: float) -> Floats | None:
+    """Return the projections on the line of a collinear body, None for any other body."""
     axis = np.linalg.svd(x)[2][0]
-    place = x @ axis
-    off = np.linalg.norm(x - place[:, None] * axis, axis=1).max()
-    return place[:, None] * axis if off <= max(tolerance, 1e-12 * np.abs(x).max()) else None
+    along = x @ axis
+    off = np.linalg.norm(x - along[:, None] * axis, axis=1).max()
+    return along[:, None] * axis if off <= max(tolerance, 1e-12 * np.abs(x).max()) else None
 
 
-def _line_group(line: Floats, d: int, tolerance: float) -> Floats:
-    """Return the identity, and a half turn across the line if that exchanges like ends."""
+def _line_rotations(line: Floats, d: int, tolerance: float) -> Floats:
+    """Return the identity and, if the two ends of a line are alike, a half turn across it."""
     axis = np.linalg.svd(line)[2][0]
-    place = np.sort(line @ axis)
-    if not place.any() or np.abs(place + place[::-1]).max() > max(tolerance, 1e-12 * place.max()):
+    along = np.sort(line @ axis)
+    if not along.any() or np.abs(along + along[::-1]).max() > max(tolerance, 1e-12 * along.max()):
         return np.eye(d)[None]
     across = np.linalg.svd(axis[None])[2][-1]
     half = -np.eye(2) if d == 2 else 2 * np.outer(across, across) - np.eye(3)
     return np.stack([np.eye(d), half])
 
 
-def symmetry_elements(x: Floats, tolerance: float) -> Floats:
-    """Return the point group as orthogonal matrices (g, 3, 3), the identity first.
+def _congruences(x: Floats, onto: Floats, tolerance: float) -> tuple[Ints, Floats]:
+    """Return the permutations p with R x_i = onto_p(i) for a rotation R, and their largest misfit.
 
-    An element is known by its sign (-1 for a rotation times the inversion) and by the particles'
-    permutation: on a body that is not a line the two fix the matrix.
+    Two particles that are not on one line with the origin determine R. Each pair of `onto` at the
+    same distances is tried as their image, and the permutation of all particles is refined.
     """
-    tolerance = max(tolerance, 1e-12 * float(np.abs(x).max()))
-    found = {
-        (sign, *map(int, order)): worst
-        for sign in (1, -1)
-        for order, worst in zip(*_mappings(x, sign * x, 2 * tolerance), strict=True)
-    }
-    identity = (1, *range(len(x)))
-    group = {identity}
-    for element in sorted(found, key=lambda e: (found[e], e)):
-        if found[element] > tolerance:
-            break
-        if element not in group:
-            group = _closure(group | {element}, set(found)) or group
-    ordered = [identity, *sorted(group - {identity}, reverse=True)]
-    return _exact_matrices(x, np.array(ordered))
-
-
-def _mappings(x: Floats, onto: Floats, tolerance: float) -> tuple[Ints, Floats]:
-    """Return the permutations with R x_i = onto_p(i) within the tolerance, and the worst miss."""
-    i, j = _widest_pair(x)
-    gap, reach = np.linalg.norm(x[i] - x[j]), np.linalg.norm(x[[i, j]], axis=1)
-    there = np.linalg.norm(onto, axis=1)
-    like = (
-        (np.abs(there[:, None] - reach[0]) <= 2 * tolerance)
-        & (np.abs(there - reach[1]) <= 2 * tolerance)
+    # The pair with the largest cross product determines R most precisely.
+    area = np.linalg.norm(np.cross(x[:, None], x[None]), axis=2)
+    i, j = map(int, np.unravel_index(np.argmax(area), area.shape))
+    gap, radius = np.linalg.norm(x[i] - x[j]), np.linalg.norm(x[[i, j]], axis=1)
+    onto_radius = np.linalg.norm(onto, axis=1)
+    alike = (
+        (np.abs(onto_radius[:, None] - radius[0]) <= 2 * tolerance)
+        & (np.abs(onto_radius - radius[1]) <= 2 * tolerance)
         & (np.abs(np.linalg.norm(onto[:, None] - onto, axis=2) - gap) <= 4 * tolerance)
     )
-    k, m = np.nonzero(like)
+    k, m = np.nonzero(alike)
     origin = np.zeros((len(k), 3))
     rotation, unique = fit_rotations(
         np.stack([origin, onto[k], onto[m]], axis=1), np.stack([np.zeros(3), x[i], x[j]])
     )
     rotation = rotation[unique]
     for _ in range(3):
-        order = _nearest(rotation, x, onto)
+        rotated = x @ np.swapaxes(rotation, 1, 2)
+        order = np.argmin(np.linalg.norm(rotated[:, :, None] - onto, axis=3), axis=2)
         order = order[(np.sort(order, axis=1) == np.arange(len(x))).all(axis=1)]
         rotation, unique = fit_rotations(onto[order], x)
         order, rotation = order[unique], rotation[unique]
-    miss = np.linalg.norm(x @ np.swapaxes(rotation, 1, 2) - onto[order], axis=2).max(axis=1)
-    return order[miss <= tolerance], miss[miss <= tolerance]
+    misfit = np.linalg.norm(x @ np.swapaxes(rotation, 1, 2) - onto[order], axis=2).max(axis=1)
+    return order[misfit <= tolerance], misfit[misfit <= tolerance]
 
 
-def _nearest(rotation: Floats, x: Floats, onto: Floats) -> Ints:
-    """Return which place each turned particle is nearest to, (K, n)."""
-    turned = x @ np.swapaxes(rotation, 1, 2)
-    return np.asarray(np.argmin(np.linalg.norm(turned[:, :, None] - onto, axis=3), axis=2))
+def symmetry_elements(x: Floats, tolerance: float) -> Floats:
+    """Return the point group of a body as orthogonal matrices.
 
+    Parameters
+    ----------
+    x : ndarray, shape (n, 3)
+        Centred positions of indistinguishable particles that are not on one line.
+    tolerance : float
+        Largest distance (um) of a mapped particle from the one it is mapped to.
 
-def _widest_pair(x: Floats) -> tuple[int, int]:
-    """Return the two particles that fix a frame best: the largest cross product."""
-    area = np.linalg.norm(np.cross(x[:, None], x[None]), axis=2)
-    i, j = np.unravel_index(np.argmax(area), area.shape)
-    return int(i), int(j)
+    Returns
+    -------
+    ndarray, shape (g, 3, 3)
+        The identity first.
 
-
-def _closure(group: set[_Element], allowed: set[_Element]) -> set[_Element] | None:
-    """Return the group that some elements generate, or None if it leaves the allowed ones."""
-    closed, fresh = set(group), set(group)
-    while fresh:
-        fresh = {_product(a, b) for a in closed for b in fresh} - closed
-        if not fresh <= allowed:
-            return None
-        closed |= fresh
-    return closed
-
-
-def _product(a: _Element, b: _Element) -> _Element:
-    """Return the element that does b first, then a."""
-    return (a[0] * b[0], *(a[1 + i] for i in b[1:]))
-
-
-def _exact_matrices(x: Floats, elements: Ints) -> Floats:
-    """Average the body over its group until it is symmetric to rounding; return the matrices."""
+    Examples
+    --------
+    >>> symmetry_elements(Cluster.tetrahedron(1.5).positions, 0.01).shape
+    (24, 3, 3)
+    """
+    tolerance = max(tolerance, 1e-12 * float(np.abs(x).max()))
+    misfit = {
+        (sign, *map(int, order)): largest
+        for sign in (1, -1)
+        for order, largest in zip(*_congruences(x, sign * x, 2 * tolerance), strict=True)
+    }
+    identity = (1, *range(len(x)))
+    group = {identity}
+    for element in sorted(misfit, key=lambda e: (misfit[e], e)):
+        if misfit[element] > tolerance:
+            break
+        if element not in group:
+            group = _generated_group(group | {element}, set(misfit)) or group
+    elements = np.array([identity, *sorted(group - {identity}, reverse=True)])
+    # Averaging the body over the group makes it symmetric, and the matrices exact, to rounding.
     sign, order = elements[:, 0, None, None], elements[:, 1:]
     for _ in range(50):
-        matrix = sign * fit_rotations(sign * x[order], x)[0]
+        matrix: Floats = sign * fit_rotations(sign * x[order], x)[0]
         mean = np.einsum("gji,gnj->ni", matrix, x[order]) / len(elements)
         change = np.abs(mean - x).max()
         x = mean
@@ -249,40 +240,53 @@ def _exact_matrices(x: Floats, elements: Ints) -> Floats:
     return matrix
 
 
+def _generated_group(generators: set[_Element], allowed: set[_Element]) -> set[_Element] | None:
+    """Return the group that some elements generate, or None if it is not a subset of `allowed`."""
+    group, fresh = set(generators), set(generators)
+    while fresh:
+        products = {(a[0] * b[0], *(a[1 + i] for i in b[1:])) for a in group for b in fresh}
+        fresh = products - group
+        if not fresh <= allowed:
+            return None
+        group |= fresh
+    return group
+
+
 def schoenflies(elements: Floats) -> str:
-    """Name a finite point group from its matrices."""
-    proper = elements[np.linalg.det(elements) > 0]
-    mirrors = _axes(-elements[_is_trace(elements, 1.0) & (np.linalg.det(elements) < 0)])
-    inverted = bool(_is_trace(elements, -3.0).any())
+    """Return the Schoenflies symbol of a finite point group.
+
+    Parameters
+    ----------
+    elements : ndarray, shape (g, 3, 3)
+        All its orthogonal matrices.
+
+    Examples
+    --------
+    >>> schoenflies(np.stack([np.eye(3), np.diag([-1.0, -1.0, 1.0]), -np.eye(3),
+    ...                       np.diag([1.0, 1.0, -1.0])]))
+    'C_2h'
+    """
+    trace = np.trace(elements, axis1=1, axis2=2)
+    det = np.linalg.det(elements)
+    proper = elements[det > 0]
+    # A mirror is the inversion times a half turn about its normal.
+    normals = axis_angle(-elements[(np.abs(trace - 1.0) < 1e-3) & (det < 0)])[0]
+    inversion = bool((np.abs(trace + 3.0) < 1e-3).any())
     angle = np.arccos(np.clip((np.trace(proper, axis1=1, axis2=2) - 1) / 2, -1, 1))
     orders = np.rint(2 * np.pi / np.where(angle > 1e-3, angle, 2 * np.pi)).astype(np.int64)
     n, size = int(orders.max()), len(proper)
     improper = len(elements) > size
     if size in (12, 24, 60) and size // n in (4, 6, 12):
         family = {12: "T", 24: "O", 60: "I"}[size]
-        return family + (("_d" if family == "T" and not inverted else "_h") if improper else "")
-    flat = bool((np.abs(mirrors @ _axes(proper[orders == n]).T) > 0.99).any()) if n > 1 else False
-    if size == n:
-        return _cyclic(n, improper=improper, flat=flat, mirrors=len(mirrors), inverted=inverted)
-    return f"D_{n}" + (("h" if flat else "d") if improper else "")
-
-
-def _cyclic(n: int, *, improper: bool, flat: bool, mirrors: int, inverted: bool) -> str:
-    """Name a group with a single axis of order n; `flat`: a mirror stands across that axis."""
+        return family + (("_d" if family == "T" and not inversion else "_h") if improper else "")
+    main_axes = axis_angle(proper[orders == n])[0]
+    horizontal = n > 1 and bool((np.abs(normals @ main_axes.T) > 0.99).any())
+    if size > n:
+        return f"D_{n}" + (("h" if horizontal else "d") if improper else "")
     if not improper:
         return f"C_{n}"
     if n == 1:
-        return "C_i" if inverted else "C_s"
-    if flat:
+        return "C_i" if inversion else "C_s"
+    if horizontal:
         return f"C_{n}h"
-    return f"C_{n}v" if mirrors else f"S_{2 * n}"
-
-
-def _is_trace(matrix: Floats, value: float) -> Bools:
-    """Return which matrices have this trace."""
-    return np.asarray(np.abs(np.trace(matrix, axis1=1, axis2=2) - value) < 1e-3)
-
-
-def _axes(rotation: Floats) -> Floats:
-    """Return the axes of rotations, (K, 3)."""
-    return axis_angle(rotation)[0]
+    return f"C_{n}v" if len(normals) else f"S_{2 * n}"

@@ -12,6 +12,9 @@ from perrin.hydrodynamics.resistance import (
     converge_resistance,
     even_directions,
     exposed_surface,
+    flow_forces,
+    lamb_flows,
+    solid_harmonics,
     solve_resistance,
 )
 from perrin.hydrodynamics.sizes import (
@@ -21,6 +24,8 @@ from perrin.hydrodynamics.sizes import (
     size_and_viscosity,
     size_from_rotation,
     size_from_translation,
+    sizes_from_dict,
+    sizes_to_dict,
 )
 from perrin.hydrodynamics.surroundings import (
     WallFactor,
@@ -45,13 +50,18 @@ __all__ = [
     "converge_resistance",
     "even_directions",
     "exposed_surface",
+    "flow_forces",
     "gravitational_height",
+    "lamb_flows",
     "length_remarks",
     "neighbour_distance",
     "settling_velocity",
     "size_and_viscosity",
     "size_from_rotation",
     "size_from_translation",
+    "sizes_from_dict",
+    "sizes_to_dict",
+    "solid_harmonics",
     "solve_resistance",
     "viscosity_remarks",
     "wall_diffusion",

@@ -9,35 +9,36 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from perrin._arrays import Floats, frozen
+from perrin._arrays import Floats, from_plain, frozen, number_fault, refuse
 from perrin.errors import UnitWarning
-from perrin.geometry.rotations import skew
-from perrin.geometry.shapes import Cluster
+from perrin.geometry.rigid import diffusion_center, shifted
+from perrin.geometry.shapes import Cluster, pair_distances
 from perrin.hydrodynamics.resistance import converge_resistance, exposed_surface, solve_resistance
 from perrin.hydrodynamics.units import viscosity_remarks
 
 if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
+    from collections.abc import Mapping
+    from typing import Self
 
-    from perrin.hydrodynamics.resistance import Resistance
+    from numpy.typing import ArrayLike
 
 
 BOLTZMANN = 1.380649e-23  # J/K, exact in the SI
 
 
-# Liquids that anyone looks at through a microscope; degrees Celsius fall outside.
+# Temperatures of liquids under a microscope, K; values in degrees Celsius are outside.
 _COLDEST, _HOTTEST = 200.0, 500.0
 
 
 _HIGHEST_DEGREE = 40
 
 
-# Surface points a sphere of an overlapping body has for its volume: 1e-4 and better.
+# Surface points of a sphere from which the volume of an overlapping body is computed, to 1e-4.
 _VOLUME_POINTS = 20_000
 
 
 class Principal(NamedTuple):
-    """Principal values, rising, and unit axes of a tensor, one axis a column."""
+    """Principal values of a tensor in increasing order, and unit axes as columns."""
 
     values: Floats
     axes: Floats
@@ -45,28 +46,30 @@ class Principal(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Mobility:
-    """The diffusion tensor of a rigid body of spheres, and what follows from it.
+    """The predicted diffusion tensor of a rigid body of spheres.
 
     Attributes
     ----------
     D : ndarray, shape (6, 6)
-        About the centre of diffusion, in the axes of `centers`: translation (um^2/s) first,
-        rotation (rad^2/s) last, their coupling (um rad/s) beside.
+        Diffusion tensor about the centre of diffusion, in the axes of `centers`: translation
+        (um^2/s) first, rotation (rad^2/s) last, their coupling (um rad/s) off the diagonal.
     center : ndarray, shape (3,)
-        The centre of diffusion, um: the point about which the coupling is symmetric.
+        Centre of diffusion, um: the point about which the coupling is symmetric.
     centers : ndarray, shape (n, 3)
-        The spheres, um.
+        Centres of the spheres, um.
     radius : ndarray, shape (n,)
-        Their radii, um.
-    viscosity, temperature : float
-        Pa s, K.
+        Radii of the spheres, um.
+    viscosity : float
+        Viscosity of the fluid, Pa s.
+    temperature : float
+        Temperature of the fluid, K.
     degree : int
         Highest degree of the harmonics used.
     error : float
-        Estimated relative error of D in its worst direction: the larger of three quarters of what
-        the last two degrees changed and three times the violation of reciprocity.
+        Estimated relative error of D in its worst direction: the larger of three quarters of the
+        change over the last two degrees and three times the violation of reciprocity.
     residual : float
-        Root mean square velocity on the surface that the solution leaves over, relative.
+        Root mean square residual velocity on the surface, relative.
     """
 
     D: Floats
@@ -100,7 +103,7 @@ class Mobility:
 
     @property
     def coupling(self) -> Floats:
-        """Translation from torque, (3, 3), um rad/s; symmetric, 0 for most symmetric bodies."""
+        """Coupling of translation and rotation, (3, 3), um rad/s; 0 for most symmetric bodies."""
         return self.D[:3, 3:]
 
     @property
@@ -120,17 +123,17 @@ class Mobility:
 
     def at(self, point: ArrayLike) -> Floats:
         """Return the 6x6 tensor about another point of the body (um), such as its centroid."""
-        return _moved(self.D, np.asarray(point, dtype=np.float64) - self.center)
+        return shifted(self.D, np.asarray(point, dtype=np.float64) - self.center)
 
     @property
     def diameter_T(self) -> float:
-        """Diameter (um) of the sphere whose D_T is a third of the trace."""
+        """Diameter (um) of the sphere whose D_T is a third of the trace of this D_T."""
         volume = _thermal_volume(self.viscosity, self.temperature)
         return volume / float(np.pi * np.trace(self.D_T))
 
     @property
     def diameter_R(self) -> float:
-        """Diameter (um) of the sphere whose D_R is a third of the trace."""
+        """Diameter (um) of the sphere whose D_R is a third of the trace of this D_R."""
         volume = _thermal_volume(self.viscosity, self.temperature)
         return float(np.cbrt(3 * volume / (np.pi * np.trace(self.D_R))))
 
@@ -141,26 +144,29 @@ class Mobility:
 
     @property
     def diameter_factor_T(self) -> float:
-        """`diameter_T` over the mean sphere diameter."""
+        """Ratio of `diameter_T` to the mean sphere diameter."""
         return self.diameter_T / self.sphere_diameter
 
     @property
     def diameter_factor_R(self) -> float:
-        """`diameter_R` over the mean sphere diameter."""
+        """Ratio of `diameter_R` to the mean sphere diameter."""
         return self.diameter_R / self.sphere_diameter
 
     @cached_property
     def volume(self) -> float:
-        """Volume of the body, um^3, what overlaps counted once."""
-        balls = 4 / 3 * np.pi * self.radius**3
-        if not len(_pairs(self.centers, self.radius, overlapping=True)):
-            return float(balls.sum())
+        """Volume of the body, um^3; volume shared by several spheres is counted once."""
+        volumes = 4 / 3 * np.pi * self.radius**3
+        i, j = np.triu_indices(len(volumes), 1)
+        sum_of_radii = self.radius[i] + self.radius[j]
+        # Spheres that touch may overlap by rounding.
+        if not (pair_distances(self.centers) < sum_of_radii - 1e-9 * sum_of_radii).any():
+            return float(volumes.sum())
         # Divergence theorem: a third of the flux of the position vector through the surface.
         total = 0.0
-        for i, points in exposed_surface(self.centers, self.radius, count=_VOLUME_POINTS):
-            outward = (points - self.centers[i]) / self.radius[i]
+        for k, points in exposed_surface(self.centers, self.radius, count=_VOLUME_POINTS):
+            outward = (points - self.centers[k]) / self.radius[k]
             flux = np.sum((points - self.centroid) * outward)
-            total += float(flux) * balls[i] / self.radius[i] / _VOLUME_POINTS
+            total += float(flux) * volumes[k] / self.radius[k] / _VOLUME_POINTS
         return total
 
     def to_dict(self) -> dict[str, Any]:
@@ -195,6 +201,26 @@ class Mobility:
         }
         return numbers | {name: array.tolist() for name, array in arrays.items()}
 
+    @classmethod
+    def from_dict(cls, entry: Mapping[str, Any]) -> Self:
+        """Return the prediction that `to_dict` wrote.
+
+        Parameters
+        ----------
+        entry : mapping
+        """
+        return cls(
+            D=from_plain(entry["D"]),
+            center=from_plain(entry["center_of_diffusion_um"]),
+            centers=from_plain(entry["centers_um"]),
+            radius=from_plain(entry["radius_um"]),
+            viscosity=entry["viscosity_Pa_s"],
+            temperature=entry["temperature_K"],
+            degree=entry["degree"],
+            error=entry["error"],
+            residual=entry["residual"],
+        )
+
 
 def cluster_mobility(
     centers: ArrayLike | Cluster,
@@ -218,10 +244,10 @@ def cluster_mobility(
     temperature : float
         K.
     degree : int, optional
-        Highest degree of the harmonics about each sphere, 1 to 40. Default: it rises until the
+        Highest degree of the harmonics about each sphere, 1 to 40. Default: the first one whose
         error estimate is under `accuracy`.
     accuracy : float
-        Relative error aimed at in the worst direction of motion, where no degree is stated.
+        Required relative error in the worst direction of motion; not used with a degree.
 
     Returns
     -------
@@ -230,8 +256,8 @@ def cluster_mobility(
     Raises
     ------
     ValueError
-        For bad shapes or values, centres that coincide, a sphere inside another one, a temperature
-        that is not in kelvin, or more spheres than can be served.
+        For wrong shapes or values, centres that coincide, a sphere inside another one, a
+        temperature that is not in kelvin, or too many spheres for an error estimate.
 
     Warns
     -----
@@ -243,8 +269,8 @@ def cluster_mobility(
     Notes
     -----
     The flow is a sum of Lamb's solutions about every sphere, fitted by least squares to rigid
-    motion at points spread evenly over the exposed surface. Forces and torques of six motions give
-    the resistance, its inverse D/kT (Einstein).
+    motion at points spread evenly over the exposed surface. The forces and torques of six motions
+    are the resistance; its inverse times kT is D (Einstein).
 
     Examples
     --------
@@ -254,19 +280,27 @@ def cluster_mobility(
     >>> round(body.diameter_factor_T, 3), round(body.diameter_factor_R, 3)
     (1.784, 1.818)
     """
-    x, a = _body(centers, radius, viscosity=viscosity, temperature=temperature)
+    faults = condition_faults(viscosity=viscosity, temperature=temperature)
+    if degree is None and not (np.ndim(accuracy) == 0 and 0 < accuracy < 1):
+        faults.append(f"accuracy: expected a relative error between 0 and 1, got {accuracy}")
+    elif degree is not None and degree not in range(1, _HIGHEST_DEGREE + 1):
+        faults.append(f"degree: expected 1 to {_HIGHEST_DEGREE}, got {degree!r}")
+    x, a = _valid_spheres(centers, radius, faults)
     for remark in viscosity_remarks(viscosity):
         warnings.warn(remark, UnitWarning, stacklevel=2)
-    # Lengths in mean radii, so that no power of a unit can overflow or look small.
+    # With the mean radius as the unit of length no power of a length can overflow.
     unit = float(a.mean())
     scaled, relative = (x - x.mean(0)) / unit, a / unit
-    solution = _solution(scaled, relative, degree=degree, accuracy=accuracy)
+    if degree is None:
+        solution = converge_resistance(scaled, relative, accuracy=accuracy)
+    else:
+        solution = solve_resistance(scaled, relative, degree=int(degree))
     thermal = _thermal_volume(viscosity, temperature)
     lengths = np.repeat([unit**-0.5, unit**-1.5], 3)
     D = thermal * np.linalg.inv(solution.matrix) * lengths[:, None] * lengths
-    arm = _center_of_diffusion(D)
+    arm = diffusion_center(D)
     return Mobility(
-        D=_moved(D, arm),
+        D=shifted(D, arm),
         center=x.mean(0) + arm,
         centers=x,
         radius=a,
@@ -279,7 +313,7 @@ def cluster_mobility(
 
 
 def apparent_translation(mobility: Mobility, *, point: ArrayLike) -> float:
-    """Return the D_T that a tracked point of the body shows at short lag times.
+    """Return the apparent D_T of a tracked point of the body at short lag times.
 
     Parameters
     ----------
@@ -299,7 +333,7 @@ def apparent_translation(mobility: Mobility, *, point: ArrayLike) -> float:
 
     Notes
     -----
-    The excess comes from rotation. It ends after a time of about 1/(2 D_R): for one D_R the mean
+    The excess comes from rotation and lasts for about 1/(2 D_R): for an isotropic D_R the mean
     square displacement is 6 D_T t + 2 r^2 (1 - exp(-2 D_R t)), so a fit of late lag times is
     unbiased and a fit of early ones is not.
 
@@ -318,100 +352,73 @@ def apparent_translation(mobility: Mobility, *, point: ArrayLike) -> float:
     return float(np.trace(mobility.at(at)[:3, :3])) / 3
 
 
-def condition_faults(**values: float) -> list[str]:
-    """Return what is wrong with numbers that must be positive; a temperature must be in kelvin."""
-    faults = [
-        f"{name}: expected a finite number > 0, got {value!r}"
-        for name, value in values.items()
-        if not (np.ndim(value) == 0 and np.isfinite(value) and value > 0)
-    ]
-    kelvin = values.get("temperature", _COLDEST)
-    if np.ndim(kelvin) == 0 and (0 < kelvin < _COLDEST or _HOTTEST < kelvin < np.inf):
-        hint = f"; if it is in degrees Celsius, say {kelvin + 273.15:g}"
-        faults.append(
-            f"temperature: expected kelvin, {_COLDEST:g} to {_HOTTEST:g}, got {kelvin!r}"
-            + (hint if kelvin < _COLDEST else "")
-        )
+def condition_faults(**values: object) -> list[str]:
+    """Return one line for each value that is not a positive number, or not in kelvin.
+
+    Parameters
+    ----------
+    **values
+        Physical conditions by their names; ``temperature`` must be in kelvin.
+
+    Returns
+    -------
+    list of str
+        Empty if there is no fault.
+
+    Examples
+    --------
+    >>> condition_faults(viscosity=1e-3, temperature=300.0)
+    []
+    >>> condition_faults(temperature=22)
+    ['temperature: expected kelvin, 200 to 500, got 22; if it is in degrees Celsius, use 295.15']
+    """
+    faults = []
+    for name, value in values.items():
+        number = value.item() if isinstance(value, np.ndarray) and value.ndim == 0 else value
+        fault = number_fault(name, number, above=0)
+        faults += fault
+        if name == "temperature" and not fault and not _COLDEST <= number <= _HOTTEST:  # type: ignore[operator]
+            hint = f"; if it is in degrees Celsius, use {number + 273.15:g}"  # type: ignore[operator]
+            faults.append(
+                f"temperature: expected kelvin, {_COLDEST:g} to {_HOTTEST:g}, got {value!r}"
+                + (hint if number < _COLDEST else "")  # type: ignore[operator]
+            )
     return faults
 
 
 def _thermal_volume(viscosity: float, temperature: float) -> float:
-    """Return kT over viscosity, um^3/s."""
+    """Return kT/eta, um^3/s."""
     return BOLTZMANN * temperature / viscosity * 1e18
 
 
-def _solution(centers: Floats, radii: Floats, *, degree: int | None, accuracy: float) -> Resistance:
-    """Solve with the degree that is stated, or with the one that reaches the accuracy."""
-    if degree is None:
-        if not (np.ndim(accuracy) == 0 and 0 < accuracy < 1):
-            raise ValueError(f"accuracy: expected a relative error between 0 and 1, got {accuracy}")
-        return converge_resistance(centers, radii, accuracy=accuracy)
-    if degree not in range(1, _HIGHEST_DEGREE + 1):
-        raise ValueError(f"degree: expected 1 to {_HIGHEST_DEGREE}, got {degree!r}")
-    return solve_resistance(centers, radii, degree=int(degree))
-
-
-def _moved(D: Floats, arm: Floats) -> Floats:
-    """Return the tensor about a point at `arm` from the one it refers to: v' = v + w x arm."""
-    shift = np.eye(6)
-    shift[:3, 3:] = -skew(arm)
-    return np.asarray(shift @ D @ shift.T)
-
-
-def _center_of_diffusion(D: Floats) -> Floats:
-    """Return where the coupling is symmetric, from the point that D refers to.
-
-    Moving by r takes [r]x D_R off the coupling; its antisymmetric part is
-    [(tr(D_R) - D_R) r / 2]x.
-    """
-    odd = D[:3, 3:] - D[3:, :3]
-    vector = np.array([odd[2, 1], odd[0, 2], odd[1, 0]])
-    rotation = D[3:, 3:]
-    return np.asarray(np.linalg.solve(np.trace(rotation) * np.eye(3) - rotation, vector))
-
-
-def _body(
-    centers: ArrayLike | Cluster, radius: ArrayLike, **conditions: float
+def _valid_spheres(
+    centers: ArrayLike | Cluster, radius: ArrayLike, faults: list[str]
 ) -> tuple[Floats, Floats]:
-    """Return centres (n, 3) and radii (n,) that can be one body, under conditions that can be."""
+    """Return centres (n, 3) and radii (n,) of a body, or raise all faults in one error."""
     given = centers.positions if isinstance(centers, Cluster) else centers
     x, a = np.array(given, dtype=np.float64), np.array(radius, dtype=np.float64)
-    faults = []
+    wrong = []
     if x.ndim != 2 or x.shape[1] != 3 or len(x) < 1 or not np.isfinite(x).all():
-        faults.append(
+        wrong.append(
             "centers: expected finite coordinates of shape (n, 3), one row a sphere (z = 0 in a "
             f"plane), got shape {x.shape}{'' if np.isfinite(x).all() else ' with NaN or inf'}"
         )
     if a.shape not in ((), x.shape[:1]) or not (np.isfinite(a) & (a > 0)).all():
-        faults.append(
-            f"radius: expected one number > 0 or one for each centre (um), got {radius!r}"
+        wrong.append(f"radius: expected one number > 0 or one for each centre (um), got {radius!r}")
+    refuse(wrong + faults if wrong else [])
+    a = np.broadcast_to(a, len(x)).copy()
+    first, second = np.triu_indices(len(x), 1)
+    sum_of_radii, distance = a[first] + a[second], pair_distances(x)
+    inside = distance < np.abs(a[first] - a[second]) + 1e-9 * sum_of_radii
+    for i, j in zip(first[inside].tolist(), second[inside].tolist(), strict=True):
+        if np.array_equal(x[i], x[j]):
+            wrong.append(f"centers: spheres {i} and {j} are both at {x[i].tolist()}; remove one")
+            continue
+        small, large = (i, j) if a[i] <= a[j] else (j, i)
+        wrong.append(
+            f"centers: sphere {small} (radius {a[small]:g}) lies inside sphere {large} (radius "
+            f"{a[large]:g}, {np.linalg.norm(x[i] - x[j]):.3g} um away); remove it or correct the "
+            "radii"
         )
-    if not faults:
-        a = np.broadcast_to(a, len(x)).copy()
-        faults += [_pair_fault(i, j, x, a) for i, j in _pairs(x, a, overlapping=False)]
-    faults += condition_faults(**conditions)
-    if faults:
-        raise ValueError("; ".join(faults))
+    refuse(wrong + faults)
     return x, a
-
-
-def _pairs(x: Floats, a: Floats, *, overlapping: bool) -> list[tuple[int, int]]:
-    """Return the pairs of spheres that overlap, or of which one lies inside the other."""
-    i, j = np.triu_indices(len(x), 1)
-    distance = np.linalg.norm(x[i] - x[j], axis=1)
-    limit = a[i] + a[j] if overlapping else np.abs(a[i] - a[j])
-    # Spheres that touch do not overlap, though rounding may say so.
-    rounding = 1e-9 * (a[i] + a[j]) * (-1 if overlapping else 1)
-    found = distance < limit + rounding
-    return list(zip(i[found].tolist(), j[found].tolist(), strict=True))
-
-
-def _pair_fault(i: int, j: int, x: Floats, a: Floats) -> str:
-    """Say what is wrong with two spheres."""
-    if np.array_equal(x[i], x[j]):
-        return f"centers: spheres {i} and {j} are both at {x[i].tolist()}; remove one"
-    small, large = (i, j) if a[i] <= a[j] else (j, i)
-    return (
-        f"centers: sphere {small} (radius {a[small]:g}) lies inside sphere {large} (radius "
-        f"{a[large]:g}, {np.linalg.norm(x[i] - x[j]):.3g} um away); remove it or correct the radii"
-    )

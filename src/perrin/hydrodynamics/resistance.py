@@ -1,60 +1,62 @@
-"""What resistance a rigid body of spheres meets in a viscous fluid: Lamb's flows, least squares."""
+"""Resistance of a rigid body of spheres in a viscous fluid, from Lamb's solutions."""
 
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from perrin._arrays import Floats, frozen
+from perrin._arrays import Floats, from_plain, frozen, to_plain
 from perrin.errors import PrecisionWarning
 from perrin.geometry.rotations import skew
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Mapping
+    from typing import Self
 
     from numpy.typing import NDArray
 
 
-# Surface points over a third of the unknowns, per sphere. At 2 the points add less to the error
-# than the degree does, for touching spheres; at 3 the error falls by a tenth.
+# Surface points of a sphere over a third of its unknowns. At 2 the error from the points is below
+# that from the degree, for touching spheres; at 3 the error is a tenth smaller.
 _OVERSAMPLING = 2.0
 
 
-# A sphere of which less than this fraction shows is sampled no more densely.
+# Exposed fraction of a sphere below which the density of its points does not increase further.
 _LEAST_EXPOSED = 0.05
 
 
-_PROBES = 2000
+_PROBES = 2000  # points from which the exposed fraction of a sphere is computed
 
 
-# On normal equations with a unit diagonal. Flows about spheres deep inside each other nearly
-# coincide; this shifts the forces by less than 1e-7 and keeps the factorisation positive.
+# Added to normal equations with a unit diagonal. Flows about spheres that overlap deeply are nearly
+# equal; this shifts the forces by less than 1e-7 and keeps the factorisation positive.
 _RIDGE = 1e-13
 
 
-# Two degrees change at least 1.8 times the error that they leave where spheres are alike, 0.6 times
-# it at radii 1:10 (benchmarks/mobility.py); this keeps the estimate above a third of the error.
-_CHANGE = 0.75
+# Error over the change from two degrees below. The change is at least 1.8 times the remaining error
+# for equal spheres and 0.6 times for radii 1:10 (benchmarks/mobility.py), so that the estimate is
+# above a third of the error.
+_ERROR_PER_CHANGE = 0.75
 
 
-# The antisymmetric part shows a third or less of the error that the surface points make where
-# spheres overlap.
-_ASYMMETRY = 3.0
+# Error over the antisymmetric part, which is a third or less of the error from the surface points
+# of overlapping spheres.
+_ERROR_PER_ASYMMETRY = 3.0
 
 
-# Degrees tried. Equal touching spheres end at 7, unequal ones higher.
+# Degrees in the order in which they are tried. Equal touching spheres converge at 7.
 _DEGREES = (5, 7, *range(8, 42, 2))
 
 
-# Unknowns that a solution of rising degree may reach: a minute and half a gigabyte.
+# Largest number of unknowns of a solution of increasing degree: a minute and half a gigabyte.
 _MOST_UNKNOWNS = 7000
 
 
-_BLOCK = 4_000_000
+_LARGEST_BLOCK = 4_000_000  # flow components of the surface points that are held at once
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +75,7 @@ class Resistance:
         Largest relative change of the resistance, over all directions of motion, from the solution
         two degrees lower (from degree 1 for degree 2, from degree 2 for degree 1).
     residual : float
-        Root mean square velocity left over on the surface, relative, the worst of six motions.
+        Root mean square residual velocity on the surface, relative, of the worst of six motions.
     """
 
     matrix: Floats
@@ -88,20 +90,36 @@ class Resistance:
     @property
     def error(self) -> float:
         """Estimated relative error of the resistance in its worst direction of motion."""
-        noise = float(np.finfo(np.float64).eps)
-        return max(_CHANGE * self.change, _ASYMMETRY * self.asymmetry, noise)
+        rounding = float(np.finfo(np.float64).eps)
+        by_asymmetry = _ERROR_PER_ASYMMETRY * self.asymmetry
+        return max(_ERROR_PER_CHANGE * self.change, by_asymmetry, rounding)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the solution for JSON: plain numbers and lists."""
+        return {**to_plain(asdict(self)), "error": self.error}
+
+    @classmethod
+    def from_dict(cls, entry: Mapping[str, Any]) -> Self:
+        """Return the solution that `to_dict` wrote.
+
+        Parameters
+        ----------
+        entry : mapping
+        """
+        known = {name: entry[name] for name in ("degree", "asymmetry", "change", "residual")}
+        return cls(matrix=from_plain(entry["matrix"]), **known)
 
 
 @dataclass(frozen=True, eq=False)
-class _Solution:
-    """One least-squares solution: its raw 6x6 matrix and the rms of what is left over."""
+class _FlowFit:
+    """One least-squares solution: its raw 6x6 resistance and the rms of the residual velocity."""
 
     raw: Floats
     residual: float
 
     @property
     def matrix(self) -> Floats:
-        """The symmetric part."""
+        """Symmetric part of the raw resistance."""
         return 0.5 * (self.raw + self.raw.T)
 
 
@@ -127,13 +145,13 @@ def solve_resistance(centers: Floats, radii: Floats, *, degree: int) -> Resistan
     >>> (np.diag(sphere.matrix) / np.pi).round(6)
     array([6., 6., 6., 8., 8., 8.])
     """
-    # Of degree 1 nothing lower exists; the step up from it is its error.
-    other = _solve(centers, radii, max(degree - 2, 1) if degree > 1 else 2)
-    return _compared(_solve(centers, radii, degree), other, degree)
+    # No degree is lower than 1, whose error is the change to degree 2.
+    other = _fit_flows(centers, radii, max(degree - 2, 1) if degree > 1 else 2)
+    return _with_error_estimate(_fit_flows(centers, radii, degree), other, degree)
 
 
 def converge_resistance(centers: Floats, radii: Floats, *, accuracy: float) -> Resistance:
-    """Raise the degree from 5 until the error estimate is under `accuracy`.
+    """Solve with increasing degree from 5 on until the error estimate is under `accuracy`.
 
     Parameters
     ----------
@@ -149,26 +167,26 @@ def converge_resistance(centers: Floats, radii: Floats, *, accuracy: float) -> R
     Raises
     ------
     ValueError
-        If there are more spheres than degree 5 can serve.
+        If there are too many spheres for degree 5.
 
     Warns
     -----
     PrecisionWarning
-        If the largest system that is tried does not reach `accuracy`.
+        If `accuracy` is not reached at the largest number of unknowns.
     """
     lowest = _DEGREES[0]
     most = _MOST_UNKNOWNS // _unknowns(lowest)
     if len(centers) > most:
         raise ValueError(
-            f"centers: {len(centers)} spheres; up to {most} are served with an error estimate; "
+            f"centers: {len(centers)} spheres; an error estimate is possible for up to {most}; "
             f"state a degree (1 to {lowest - 1}) for more"
         )
-    solved = {lowest - 2: _solve(centers, radii, lowest - 2)}
+    solved = {lowest - 2: _fit_flows(centers, radii, lowest - 2)}
     for degree, further in pairwise(_DEGREES):
         for needed in (degree - 2, degree):
             if needed not in solved:
-                solved[needed] = _solve(centers, radii, needed)
-        result = _compared(solved[degree], solved[degree - 2], degree)
+                solved[needed] = _fit_flows(centers, radii, needed)
+        result = _with_error_estimate(solved[degree], solved[degree - 2], degree)
         if result.error <= accuracy:
             return result
         if _unknowns(further) * len(centers) > _MOST_UNKNOWNS:
@@ -183,15 +201,15 @@ def converge_resistance(centers: Floats, radii: Floats, *, accuracy: float) -> R
 
 
 def _unknowns(degree: int) -> int:
-    """Count the flows about one sphere: three kinds, degree 1 to `degree`, all orders."""
+    """Return the number of flows about one sphere: three kinds, all orders up to `degree`."""
     return 3 * degree * (degree + 2)
 
 
-def _compared(solution: _Solution, other: _Solution, degree: int) -> Resistance:
-    """Measure reciprocity and the change between two solutions in every direction of motion.
+def _with_error_estimate(solution: _FlowFit, other: _FlowFit, degree: int) -> Resistance:
+    """Return a solution with its asymmetry and its change from another degree.
 
-    Both are relative to the dissipation of a motion, so that no unit and no point of reference
-    enters.
+    Both are relative to the dissipation of a motion, so that they depend on no unit and on no point
+    of reference.
     """
     from scipy.linalg import eigh
 
@@ -208,13 +226,44 @@ def _compared(solution: _Solution, other: _Solution, degree: int) -> Resistance:
     )
 
 
-def _solve(centers: Floats, radii: Floats, degree: int) -> _Solution:
-    """Fit the flows of all spheres to rigid motion on the surface and add up their forces."""
+def _fit_flows(centers: Floats, radii: Floats, degree: int) -> _FlowFit:
+    """Fit the flows about all spheres to rigid motion on the surface and sum their forces.
+
+    The flows are nearly orthogonal, so that normal equations are as accurate as a QR factorisation,
+    and several times faster.
+    """
     from scipy.linalg import cho_factor, cho_solve
 
-    points, weight, shows = _surface(centers, radii, degree)
-    spheres = list(zip(centers[shows], radii[shows], strict=True))
-    normal, right, power = _normal_equations(spheres, points, weight, degree)
+    on_surface, weights, spheres = [], [], []
+    for i, (center, radius) in enumerate(zip(centers, radii, strict=True)):
+        fraction = _exposed(i, centers, radii, _PROBES)[1]
+        if fraction == 0:
+            continue
+        wanted = _OVERSAMPLING * _unknowns(degree) / 3
+        count = int(np.ceil(wanted / max(fraction, _LEAST_EXPOSED)))
+        exposed = _exposed(i, centers, radii, count)[0]
+        on_surface.append(exposed)
+        weights.append(np.full(len(exposed), 1 / count))
+        spheres.append((center, radius))
+    points, weight = np.concatenate(on_surface), np.concatenate(weights)
+
+    # Products of all flows with each other and with six rigid motions, block by block of points.
+    size = _unknowns(degree) * len(spheres)
+    normal, right, power = np.zeros((size, size)), np.zeros((size, 6)), np.zeros(6)
+    step = max(1, _LARGEST_BLOCK // (3 * size))
+    for start in range(0, len(points), step):
+        block = slice(start, start + step)
+        x, root = points[block], np.sqrt(weight[block])
+        flow = np.concatenate([lamb_flows((x - c) / a, degree) for c, a in spheres])
+        flow = (flow * root).reshape(size, -1)
+        translations = np.broadcast_to(np.eye(3)[:, :, None], (3, 3, len(x)))
+        # The columns of -[r]x are e_k x r.
+        rotations = np.moveaxis(-skew(x), 0, -1).swapaxes(0, 1)
+        motion = (np.concatenate([translations, rotations]) * root).reshape(6, -1).T
+        normal += flow @ flow.T
+        right += flow @ motion
+        power += np.sum(motion**2, axis=0)
+
     scale = 1 / np.sqrt(np.diag(normal))
     normal *= scale[:, None]
     normal *= scale
@@ -222,84 +271,46 @@ def _solve(centers: Floats, radii: Floats, degree: int) -> _Solution:
     right *= scale[:, None]
     factor = cho_factor(normal, lower=True, overwrite_a=True, check_finite=False)
     strength = cho_solve(factor, right, check_finite=False)
-    # Rounding may leave a residual of -1e-16 where the fit is exact, as for one sphere.
-    left = np.maximum(1 - np.sum(right * strength, axis=0) / power, 0.0)
-    raw = _forces(spheres, degree) @ (scale[:, None] * strength)
-    return _Solution(raw, float(np.sqrt(left.max())))
+    # Rounding may give a residual of -1e-16 for an exact fit, such as that of one sphere.
+    residual = np.maximum(1 - np.sum(right * strength, axis=0) / power, 0.0)
+    raw = flow_forces(spheres, degree) @ (scale[:, None] * strength)
+    return _FlowFit(raw, float(np.sqrt(residual.max())))
 
 
-def _normal_equations(
-    spheres: list[tuple[Floats, float]], points: Floats, weight: Floats, degree: int
-) -> tuple[Floats, Floats, Floats]:
-    """Return products of all flows with each other and with the six motions, and the motions' own.
-
-    The flows are nearly orthogonal, so that normal equations are as good as a QR factorisation, and
-    several times faster.
-    """
-    size = _unknowns(degree) * len(spheres)
-    normal, right, power = np.zeros((size, size)), np.zeros((size, 6)), np.zeros(6)
-    for rows in _blocks(len(points), size):
-        at, root = points[rows], np.sqrt(weight[rows])
-        flow = np.concatenate([_flows((at - c) / a, degree) for c, a in spheres])
-        flow = (flow * root).reshape(size, -1)
-        wanted = (_rigid_motions(at) * root).reshape(6, -1).T
-        normal += flow @ flow.T
-        right += flow @ wanted
-        power += np.sum(wanted**2, axis=0)
-    return normal, right, power
-
-
-def _blocks(count: int, width: int) -> Iterator[slice]:
-    """Cut the surface points into pieces whose flows fit into a moderate memory."""
-    step = max(1, _BLOCK // (3 * width))
-    return (slice(start, start + step) for start in range(0, count, step))
-
-
-def _surface(
-    centers: Floats, radii: Floats, degree: int
-) -> tuple[Floats, Floats, NDArray[np.bool_]]:
-    """Return points on the outer surface, the weight of each, and which spheres show at all."""
-    points, weights, shows = [], [], np.ones(len(centers), dtype=np.bool_)
-    for i, (center, radius) in enumerate(zip(centers, radii, strict=True)):
-        distance = np.linalg.norm(centers - center, axis=1)
-        near = (distance < radii + radius) & (np.arange(len(centers)) != i)
-        covers = list(zip(centers[near], radii[near], strict=True))
-        fraction = _exposed(center, radius, covers, _PROBES)[1] if covers else 1.0
-        if fraction == 0:
-            shows[i] = False
-            continue
-        wanted = _OVERSAMPLING * _unknowns(degree) / 3
-        count = int(np.ceil(wanted / max(fraction, _LEAST_EXPOSED)))
-        at = _exposed(center, radius, covers, count)[0]
-        points.append(at)
-        weights.append(np.full(len(at), 1 / count))
-    return np.concatenate(points), np.concatenate(weights), shows
-
-
-def _exposed(
-    center: Floats, radius: float, covers: list[tuple[Floats, float]], count: int
-) -> tuple[Floats, float]:
-    """Return those of `count` even points on a sphere outside its neighbours, and their share."""
-    points = center + radius * even_directions(count)
+def _exposed(i: int, centers: Floats, radii: Floats, count: int) -> tuple[Floats, float]:
+    """Return the points of sphere i, of `count` even ones, outside all others, and their share."""
+    points = centers[i] + radii[i] * even_directions(count)
     outside = np.ones(count, dtype=np.bool_)
-    for at, reach in covers:
-        outside &= np.sum((points - at) ** 2, axis=1) >= reach**2 * (1 - 1e-9)
+    near = np.linalg.norm(centers - centers[i], axis=1) < radii + radii[i]
+    near[i] = False
+    for center, radius in zip(centers[near], radii[near], strict=True):
+        outside &= np.sum((points - center) ** 2, axis=1) >= radius**2 * (1 - 1e-9)
     return points[outside], float(outside.mean())
 
 
 def exposed_surface(centers: Floats, radii: Floats, *, count: int) -> Iterator[tuple[int, Floats]]:
-    """Yield, sphere by sphere, its number and those of `count` even points that show.
+    """Yield the number of every sphere and its points on the outer surface of the body.
 
     Parameters
     ----------
     centers : ndarray, shape (n, 3)
     radii : ndarray, shape (n,)
     count : int
-        Points on a whole sphere.
+        Number of even points on a whole sphere.
+
+    Yields
+    ------
+    i : int
+    points : ndarray, shape (m, 3)
+
+    Examples
+    --------
+    >>> pair = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    >>> [len(points) for _, points in exposed_surface(pair, np.ones(2), count=100)]
+    [75, 75]
     """
-    for i, (center, radius) in enumerate(zip(centers, radii, strict=True)):
-        others = [(centers[j], radii[j]) for j in range(len(centers)) if j != i]
-        yield i, _exposed(center, radius, others, count)[0]
+    for i in range(len(centers)):
+        yield i, _exposed(i, centers, radii, count)[0]
 
 
 def even_directions(count: int) -> Floats:
@@ -318,25 +329,36 @@ def even_directions(count: int) -> Floats:
     return np.stack([ring * np.cos(angle), ring * np.sin(angle), z], axis=1)
 
 
-def _rigid_motions(points: Floats) -> Floats:
-    """Return the velocities (6, 3, P) of unit translations, and of unit rotations about 0."""
-    shift = np.broadcast_to(np.eye(3)[:, :, None], (3, 3, len(points)))
-    # The columns of -[r]x are e_k x r.
-    turn = np.moveaxis(-skew(points), 0, -1).swapaxes(0, 1)
-    return np.concatenate([shift, turn])
+def lamb_flows(x: Floats, degree: int) -> Floats:
+    """Return Lamb's flows outside a unit sphere.
 
+    Parameters
+    ----------
+    x : ndarray, shape (P, 3)
+        Points outside the sphere, in its radii from its centre.
+    degree : int
+        Highest degree of the harmonics.
 
-def _flows(x: Floats, degree: int) -> Floats:
-    """Return Lamb's flows outside a unit sphere, shape (3 degree (degree + 2), 3, P).
+    Returns
+    -------
+    ndarray, shape (3 degree (degree + 2), 3, P)
 
+    Notes
+    -----
     With a solid harmonic J of degree -(n + 1) they are a flow with pressure J,
     (n + 1)/(n(2n - 1)) r J - (n - 2)/(2n(2n - 1)) r^2 grad J, the potential flow grad J, and the
     toroidal flow grad J x r (Lamb, Hydrodynamics, art. 336; Happel and Brenner, section 3-2).
+
+    Examples
+    --------
+    >>> lamb_flows(np.array([[0.0, 0.0, 2.0]]), 1)[0, :, 0]  # of a force along z: 1/r
+    array([0. , 0. , 0.5])
     """
-    n, m = _orders(degree)
-    harmonic = _solid_harmonics(x, degree + 1)
+    pairs = [(n, m) for n in range(1, degree + 1) for m in range(n + 1)]
+    n, m = np.array(pairs, dtype=np.int64).T
+    harmonic = solid_harmonics(x, degree + 1)
     J = harmonic[n, m]
-    # (d/dx + i d/dy) J, (d/dx - i d/dy) J and d/dz J are harmonics one degree on.
+    # (d/dx + i d/dy) J, (d/dx - i d/dy) J and d/dz J are harmonics of the next degree.
     up, along = -harmonic[n + 1, m + 1], -harmonic[n + 1, m]
     down = np.where((m > 0)[:, None], harmonic[n + 1, np.abs(m - 1)], up.conj())
     gradient = np.stack([0.5 * (up + down), -0.5j * (up - down), along], axis=1)
@@ -349,17 +371,25 @@ def _flows(x: Floats, degree: int) -> Floats:
     return np.concatenate([flow.real, flow.imag[np.tile(m, 3) > 0]])
 
 
-def _orders(degree: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return degree n and order m >= 0 of the complex harmonics, n = 1 to `degree`."""
-    pairs = [(n, m) for n in range(1, degree + 1) for m in range(n + 1)]
-    n, m = np.array(pairs, dtype=np.int64).T
-    return n, m
-
-
-def _solid_harmonics(x: Floats, degree: int) -> NDArray[np.complex128]:
-    """Return (n - m)! P_n^m(cos theta) exp(i m phi)/r^(n + 1), shape (degree + 1, degree + 1, P).
+def solid_harmonics(x: Floats, degree: int) -> NDArray[np.complex128]:
+    """Return the irregular solid harmonics (n - m)! P_n^m(cos theta) exp(i m phi)/r^(n + 1).
 
     In this norm, and without the sign (-1)^m, derivatives are harmonics without factors.
+
+    Parameters
+    ----------
+    x : ndarray, shape (P, 3)
+    degree : int
+
+    Returns
+    -------
+    ndarray, shape (degree + 1, degree + 1, P)
+        Of degree n and order m; zero for m > n.
+
+    Examples
+    --------
+    >>> solid_harmonics(np.array([[0.0, 0.0, 2.0]]), 2)[:, 0, 0].real
+    array([0.5 , 0.25, 0.25])
     """
     r2 = np.sum(x**2, axis=1)
     sideways, upward = (x[:, 0] + 1j * x[:, 1]) / r2, x[:, 2] / r2
@@ -374,15 +404,31 @@ def _solid_harmonics(x: Floats, degree: int) -> NDArray[np.complex128]:
     return value
 
 
-def _forces(spheres: list[tuple[Floats, float]], degree: int) -> Floats:
-    """Return force and torque about the origin that each flow takes, shape (6, unknowns).
+def flow_forces(spheres: list[tuple[Floats, float]], degree: int) -> Floats:
+    """Return the force and the torque about the origin of each of Lamb's flows.
 
-    Of a flow with pressure x/r^3 about a sphere of radius a the force is 4 pi a, of the toroidal
-    flow of x/r^3 the torque 8 pi a^2; all others take none.
+    The force of a flow with pressure x/r^3 about a sphere of radius a is 4 pi a, the torque of the
+    toroidal flow of x/r^3 is 8 pi a^2; those of all other flows are zero.
+
+    Parameters
+    ----------
+    spheres : list of (center, radius)
+    degree : int
+
+    Returns
+    -------
+    ndarray, shape (6, 3 degree (degree + 2) len(spheres))
+        The flows of each sphere in the order of `lamb_flows`.
+
+    Examples
+    --------
+    >>> flow_forces([(np.zeros(3), 1.0)], 1)[2].round(3)
+    array([12.566,  0.   ,  0.   ,  0.   ,  0.   ,  0.   ,  0.   ,  0.   ,
+            0.   ])
     """
     whole = degree * (degree + 3) // 2  # complex harmonics, whose real parts come first
     part = degree * (degree + 1) // 2  # those with an imaginary part
-    # Places of the real and imaginary part of order 1 and of order 0: the x, y and z directions.
+    # Indices of the real and imaginary part of order 1 and of order 0: the x, y and z directions.
     pressure = np.array([1, 3 * whole, 0])
     toroidal = np.array([2 * whole + 1, 3 * whole + 2 * part, 2 * whole])
     width = _unknowns(degree)

@@ -4,37 +4,48 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol, TypeAlias, runtime_checkable
+from dataclasses import asdict, dataclass, fields
+from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 
+from perrin._arrays import refuse
 from perrin.errors import UnitWarning
-from perrin.geometry.shapes import Cluster, is_tetrahedron
+from perrin.geometry.shapes import Cluster, is_tetrahedron, pair_distances
 from perrin.hydrodynamics.mobility import BOLTZMANN, Mobility, cluster_mobility, condition_faults
 from perrin.hydrodynamics.units import viscosity_remarks
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from numpy.typing import ArrayLike
 
     from perrin._arrays import Floats
 
 
-# From which coefficients a size follows, and what its keys in the summary end in.
+# Coefficients that determine a size, and the ending of its keys in the summary.
 _SIZE_KEYS = {"translation": "T", "rotation": "R", "both": "TR"}
+
+
+# Units of the numbers of a `Size`, as they end its keys in JSON.
+_SIZE_UNITS = {
+    **dict.fromkeys(("cluster", "cluster_stderr", "sphere", "sphere_stderr"), "_um"),
+    **dict.fromkeys(("viscosity", "viscosity_stderr"), "_Pa_s"),
+    "shared_stderr": "_um",
+}
 
 
 @runtime_checkable
 class HasStandardError(Protocol):
-    """A measured number with its standard error, as a `DiffusionEstimate` has them."""
+    """A measured number with its standard error, such as a `DiffusionEstimate`."""
 
     @property
     def value(self) -> float:
-        """The measured value."""
+        """Measured value."""
 
     @property
     def stderr(self) -> float:
-        """Its standard error."""
+        """Standard error of the value."""
 
 
 Measured: TypeAlias = HasStandardError | float | tuple[float, float]
@@ -46,19 +57,19 @@ Viscosity: TypeAlias = float | tuple[float, float] | Callable[[float], float]
 Factor: TypeAlias = Literal["exact", "hoffmann2009"]
 
 
-# d_tetra / d_sphere of Hunter 2011, Eq. 25. One number for both modes is the paper's: resolved
-# hydrodynamics of touching spheres gives 1.784 for translation and 1.818 for rotation.
+# d_tetra / d_sphere of Hunter 2011, Eq. 25, for both modes. Resolved hydrodynamics of touching
+# spheres gives 1.784 for translation and 1.818 for rotation.
 _HOFFMANN = 1.844
 
 
-# Pairs up to this much farther apart than the closest one count as touching. Spheres of one kind
-# vary by a few per cent; the next neighbours in compact clusters are 1.41 diameters away, those of
-# the paper's pentahedron 1.22.
-_TOUCHING = 1.2
+# Largest distance of touching spheres over the smallest pair distance. Diameters vary by a few per
+# cent; the next neighbours in compact clusters are 1.41 diameters away, those of the paper's
+# pentahedron 1.22.
+_NEIGHBOUR_RATIO = 1.2
 
 
-# Half the interval (K) over which the slope of a viscosity is taken.
-_SLOPE = 0.01
+# Half the interval (K) of the central difference of a viscosity.
+_HALF_INTERVAL = 0.01
 
 
 @dataclass(frozen=True)
@@ -67,18 +78,24 @@ class Size:
 
     Attributes
     ----------
-    cluster, cluster_stderr : float
-        Diameter of the sphere that diffuses as fast as the cluster, um; by translation where both
-        coefficients went in.
-    sphere, sphere_stderr : float
-        Diameter of one of its particles, um; the mean one where they differ.
+    cluster : float
+        Diameter of the sphere that diffuses as fast as the cluster, um; by translation if both
+        coefficients were used.
+    cluster_stderr : float
+        Standard error of `cluster`, um.
+    sphere : float
+        Diameter of one particle of the cluster, um; the mean diameter if they differ.
+    sphere_stderr : float
+        Standard error of `sphere`, um.
     factor : str
-        Where cluster/sphere comes from.
-    viscosity, viscosity_stderr : float or None
-        Pa s, where it was found along with the size.
+        Source of the ratio cluster/sphere: "exact" or "hoffmann2009".
+    viscosity : float or None
+        Viscosity, Pa s, if it was determined together with the size.
+    viscosity_stderr : float or None
+        Standard error of `viscosity`, Pa s.
     shared_stderr : float
-        The part of `sphere_stderr` that comes from temperature and viscosity, um. It moves the
-        sizes from D_T and D_R the same way: their covariance is the product of their shared parts.
+        Part of `sphere_stderr` from temperature and viscosity, um. Sizes from D_T and D_R share it:
+        their covariance is the product of their shared parts.
     """
 
     cluster: float
@@ -91,10 +108,10 @@ class Size:
     shared_stderr: float = 0.0
 
     def difference(self, other: Size) -> tuple[float, float]:
-        """Return by how much this sphere diameter exceeds another's, and the standard error.
+        """Return the difference of two sphere diameters and its standard error.
 
-        For two sizes under the same conditions: what temperature and viscosity do to both is
-        counted once. Errors of the coefficients are taken as independent.
+        Both sizes must be under the same conditions: errors of temperature and viscosity are common
+        to them. Errors of the coefficients are taken as independent.
 
         Examples
         --------
@@ -110,15 +127,28 @@ class Size:
             variance += size.sphere_stderr**2 - size.shared_stderr**2
         return self.sphere - other.sphere, float(np.sqrt(variance))
 
+    def to_dict(self) -> dict[str, Any]:
+        """Return the size for JSON, units in the names.
 
-class _Known(NamedTuple):
-    """A coefficient and the conditions it was measured under, with their relative errors."""
+        Examples
+        --------
+        >>> size_from_translation(
+        ...     3.85e-2, cluster=Cluster.tetrahedron(1.5), viscosity=2.18e-3, temperature=295
+        ... ).to_dict()["factor"]
+        'exact'
+        """
+        entry = asdict(self)
+        return {name + _SIZE_UNITS.get(name, ""): value for name, value in entry.items()}
 
-    value: float
-    viscosity: float
-    temperature: float
-    by_value: float
-    by_conditions: float
+    @classmethod
+    def from_dict(cls, entry: Mapping[str, Any]) -> Size:
+        """Return the size that `to_dict` wrote.
+
+        Parameters
+        ----------
+        entry : mapping
+        """
+        return cls(**{f.name: entry[f.name + _SIZE_UNITS.get(f.name, "")] for f in fields(cls)})
 
 
 def size_from_translation(
@@ -136,17 +166,17 @@ def size_from_translation(
     D : DiffusionEstimate, float or (value, stderr)
         D_T, um^2/s, for an anisotropic body a third of the trace; a bare number has no error.
     cluster : Cluster, Mobility or array_like, shape (n, 3)
-        The shape. Equal spheres of ``cluster.diameter``; without one they touch: their diameter is
-        the mean distance of neighbours. A `Mobility` says it for any spheres. The whole body is
-        scaled to the D measured.
+        Shape of the cluster: equal spheres of ``cluster.diameter``, or without one, touching
+        spheres, whose diameter is the mean distance of neighbours. A `Mobility` may have any
+        spheres. The whole body is scaled to the measured D.
     viscosity : float, (value, stderr) or callable
-        Pa s; a function of the temperature in K, such as `water_viscosity`, takes the error of the
-        temperature into account.
+        Viscosity, Pa s. With a function of the temperature in K, such as `water_viscosity`, the
+        error of the temperature is included in that of the viscosity.
     temperature : float or (value, stderr)
-        K.
+        Temperature, K.
     factor : {"exact", "hoffmann2009"}
-        Cluster over sphere diameter: from `cluster_mobility`, or the paper's 1.844, for tetrahedra
-        only and to compare with the paper.
+        Ratio of cluster to sphere diameter: from `cluster_mobility`, or the paper's 1.844, which is
+        for tetrahedra only and for a comparison with the paper.
 
     Returns
     -------
@@ -155,8 +185,8 @@ def size_from_translation(
     Raises
     ------
     ValueError
-        If a number is not positive, the temperature is not in kelvin, the shape cannot be used, or
-        the paper's factor is asked for another body than a tetrahedron.
+        If a number is not positive, the temperature is not in kelvin, the shape is no rigid body,
+        or the paper's factor is requested for another body than a tetrahedron.
 
     Warns
     -----
@@ -172,11 +202,7 @@ def size_from_translation(
     >>> round(size.cluster, 2), round(size.sphere, 2)
     (5.15, 2.79)
     """
-    known = _known(D, viscosity, temperature, factor)
-    thermal = BOLTZMANN * known.temperature
-    diameter = thermal / (3 * np.pi * known.viscosity * known.value * 1e-12) * 1e6
-    ratio = _HOFFMANN if _is_papers(factor, cluster) else _body(cluster).diameter_factor_T
-    return _size(diameter, known, ratio=ratio, order=1, factor=factor)
+    return _stokes_einstein(D, cluster, viscosity, temperature, factor, mode="translation")
 
 
 def size_from_rotation(
@@ -193,7 +219,7 @@ def size_from_rotation(
     ----------
     D : DiffusionEstimate, float or (value, stderr)
         D_R, rad^2/s, for an anisotropic body a third of the trace (which the MSAD of the particles'
-        directions is not). A third of every relative error carries.
+        directions is not). The relative error of the size is a third of that of D_R.
     cluster, viscosity, temperature, factor
         As in `size_from_translation`.
 
@@ -220,11 +246,7 @@ def size_from_rotation(
     >>> round(size.cluster, 2), round(size.sphere, 2)
     (4.94, 2.68)
     """
-    known = _known(D, viscosity, temperature, factor)
-    thermal = BOLTZMANN * known.temperature
-    diameter = float(np.cbrt(thermal / (np.pi * known.viscosity * known.value))) * 1e6
-    ratio = _HOFFMANN if _is_papers(factor, cluster) else _body(cluster).diameter_factor_R
-    return _size(diameter, known, ratio=ratio, order=3, factor=factor)
+    return _stokes_einstein(D, cluster, viscosity, temperature, factor, mode="rotation")
 
 
 def size_and_viscosity(
@@ -234,7 +256,7 @@ def size_and_viscosity(
     cluster: Cluster | Mobility | ArrayLike,
     temperature: float | tuple[float, float],
 ) -> Size:
-    """Return the size that D_T and D_R imply together, and the viscosity, without knowing either.
+    """Return the size and the viscosity that D_T and D_R imply together.
 
     Parameters
     ----------
@@ -243,12 +265,12 @@ def size_and_viscosity(
     cluster : Cluster, Mobility or array_like, shape (n, 3)
         As in `size_from_translation`.
     temperature : float or (value, stderr)
-        K; enters the viscosity only.
+        Temperature, K; only the viscosity depends on it.
 
     Returns
     -------
     Size
-        With `viscosity`, Pa s.
+        With its `viscosity`, Pa s.
 
     Raises
     ------
@@ -258,7 +280,7 @@ def size_and_viscosity(
     Notes
     -----
     With the diameter factors c_T and c_R of the body d = sqrt(3 c_T D_T/(c_R^3 D_R)) and
-    eta = kT/(3 pi c_T d D_T). A wall, which slows translation most, makes d too small and eta too
+    eta = kT/(3 pi c_T d D_T). Near a wall, which slows translation most, d is too small and eta too
     large.
 
     Examples
@@ -271,28 +293,65 @@ def size_and_viscosity(
     (2.64, 0.21, 2.39)
     """
     (d_t, e_t), (d_r, e_r), (kelvin, e_k) = _pair(D_T), _pair(D_R), _pair(temperature)
-    _require([], D_T=(d_t, e_t), D_R=(d_r, e_r), temperature=(kelvin, e_k))
-    body = _body(cluster)
+    refuse(_pair_faults(D_T=(d_t, e_t), D_R=(d_r, e_r), temperature=(kelvin, e_k)))
+    body = _unit_mobility(cluster)
     c_t, c_r = body.diameter_factor_T, body.diameter_factor_R
     sphere = float(np.sqrt(3 * c_t * d_t / (c_r**3 * d_r)))
     viscosity = BOLTZMANN * kelvin / (3 * np.pi * c_t * sphere * d_t) * 1e18
     by_t, by_r, by_k = e_t / d_t, e_r / d_r, e_k / kelvin
-    spread = 0.5 * float(np.hypot(by_t, by_r))
-    thickness = float(np.sqrt((1.5 * by_t) ** 2 + (0.5 * by_r) ** 2 + by_k**2))
+    size_error = 0.5 * float(np.hypot(by_t, by_r))
+    viscosity_error = float(np.sqrt((1.5 * by_t) ** 2 + (0.5 * by_r) ** 2 + by_k**2))
     return Size(
         cluster=c_t * sphere,
-        cluster_stderr=c_t * sphere * spread,
+        cluster_stderr=c_t * sphere * size_error,
         sphere=sphere,
-        sphere_stderr=sphere * spread,
+        sphere_stderr=sphere * size_error,
         factor="exact",
         viscosity=viscosity,
-        viscosity_stderr=viscosity * thickness,
+        viscosity_stderr=viscosity * viscosity_error,
     )
 
 
-def _size(diameter: float, known: _Known, *, ratio: float, order: int, factor: str) -> Size:
-    """Return the sizes for d^order = kT/(eta D) up to a factor, errors carried along."""
-    relative = float(np.hypot(known.by_value, known.by_conditions)) / order
+def _stokes_einstein(
+    D: Measured,
+    cluster: Cluster | Mobility | ArrayLike,
+    viscosity: Viscosity,
+    temperature: float | tuple[float, float],
+    factor: Factor,
+    *,
+    mode: Literal["translation", "rotation"],
+) -> Size:
+    """Return the sizes with d = kT/(3 pi eta D_T), or d^3 = kT/(pi eta D_R), and their errors."""
+    (value, error), (kelvin, kelvin_error) = _pair(D), _pair(temperature)
+    eta, eta_error = (1.0, 0.0) if callable(viscosity) else _pair(viscosity)
+    faults = [] if factor in ("exact", "hoffmann2009") else [f"factor: {factor!r} is unknown"]
+    faults += _pair_faults(
+        D=(value, error), viscosity=(eta, eta_error), temperature=(kelvin, kelvin_error)
+    )
+    refuse(faults)
+    by_conditions = float(np.hypot(kelvin_error / kelvin, eta_error / eta))
+    if callable(viscosity):
+        eta = viscosity(kelvin)
+        refuse(_pair_faults(viscosity=(eta, 0.0)))
+        rise = viscosity(kelvin + _HALF_INTERVAL) - viscosity(kelvin - _HALF_INTERVAL)
+        by_conditions = abs(1 / kelvin - rise / (2 * _HALF_INTERVAL * eta)) * kelvin_error
+    for remark in viscosity_remarks(eta):
+        warnings.warn(remark, UnitWarning, stacklevel=3)
+
+    thermal = BOLTZMANN * kelvin
+    if mode == "translation":
+        diameter, order = thermal / (3 * np.pi * eta * value * 1e-12) * 1e6, 1
+    else:
+        diameter, order = float(np.cbrt(thermal / (np.pi * eta * value))) * 1e6, 3
+    if factor == "exact":
+        body = _unit_mobility(cluster)
+        ratio = body.diameter_factor_T if mode == "translation" else body.diameter_factor_R
+    elif is_tetrahedron(_centers_of(cluster)):
+        ratio = _HOFFMANN
+    else:
+        raise ValueError('factor="hoffmann2009" holds for tetrahedra only (Hunter 2011, Eq. 25)')
+
+    relative = float(np.hypot(error / value, by_conditions)) / order
     sphere = diameter / ratio
     return Size(
         cluster=diameter,
@@ -300,29 +359,8 @@ def _size(diameter: float, known: _Known, *, ratio: float, order: int, factor: s
         sphere=sphere,
         sphere_stderr=sphere * relative,
         factor=factor,
-        shared_stderr=sphere * (known.by_conditions / order),
+        shared_stderr=sphere * (by_conditions / order),
     )
-
-
-def _known(
-    D: Measured, viscosity: Viscosity, temperature: float | tuple[float, float], factor: str
-) -> _Known:
-    """Return the numbers that go into a size, all of them fit for it."""
-    (value, error), (kelvin, kelvin_error) = _pair(D), _pair(temperature)
-    eta, eta_error = (1.0, 0.0) if callable(viscosity) else _pair(viscosity)
-    wrong = [] if factor in ("exact", "hoffmann2009") else [f"factor: {factor!r} is unknown"]
-    _require(
-        wrong, D=(value, error), viscosity=(eta, eta_error), temperature=(kelvin, kelvin_error)
-    )
-    by_conditions = float(np.hypot(kelvin_error / kelvin, eta_error / eta))
-    if callable(viscosity):
-        eta = viscosity(kelvin)
-        _require([], viscosity=(eta, 0.0))
-        rise = viscosity(kelvin + _SLOPE) - viscosity(kelvin - _SLOPE)
-        by_conditions = abs(1 / kelvin - rise / (2 * _SLOPE * eta)) * kelvin_error
-    for remark in viscosity_remarks(eta):
-        warnings.warn(remark, UnitWarning, stacklevel=3)
-    return _Known(value, eta, kelvin, error / value, by_conditions)
 
 
 def _pair(measured: Measured) -> tuple[float, float]:
@@ -335,73 +373,98 @@ def _pair(measured: Measured) -> tuple[float, float]:
     return measured, 0.0  # type: ignore[return-value]
 
 
-def _require(faults: list[str], **pairs: tuple[float, float]) -> None:
-    """Raise one ValueError for all faults of values and their standard errors."""
-    faults = faults + condition_faults(**{name: value for name, (value, _) in pairs.items()})
-    faults += [
+def _pair_faults(**pairs: tuple[float, float]) -> list[str]:
+    """Return the faults of values and their standard errors."""
+    faults = condition_faults(**{name: value for name, (value, _) in pairs.items()})
+    return faults + [
         f"{name}: expected a finite standard error >= 0, got {stderr!r}"
         for name, (_, stderr) in pairs.items()
         if not (np.isfinite(stderr) and stderr >= 0)
     ]
-    if faults:
-        raise ValueError("; ".join(faults))
 
 
-def _is_papers(factor: str, cluster: Cluster | Mobility | ArrayLike) -> bool:
-    """Return whether the paper's factor is asked for; refuse it for what is no tetrahedron."""
-    if factor != "hoffmann2009":
-        return False
-    if not is_tetrahedron(_centers(cluster)):
-        raise ValueError('factor="hoffmann2009" holds for tetrahedra only (Hunter 2011, Eq. 25)')
-    return True
-
-
-def _centers(cluster: Cluster | Mobility | ArrayLike) -> Floats:
+def _centers_of(cluster: Cluster | Mobility | ArrayLike) -> Floats:
     if isinstance(cluster, Mobility):
         return cluster.centers
     return (cluster if isinstance(cluster, Cluster) else Cluster.from_positions(cluster)).positions
 
 
-def _body(cluster: Cluster | Mobility | ArrayLike) -> Mobility:
-    """Return a body of the cluster's shape; neither its size nor its conditions matter here."""
+def _unit_mobility(cluster: Cluster | Mobility | ArrayLike) -> Mobility:
+    """Return a mobility of the cluster's shape; its scale and conditions cancel in ratios."""
     if isinstance(cluster, Mobility):
         return cluster
     known = cluster.diameter if isinstance(cluster, Cluster) else None
-    positions = _centers(cluster)
+    positions = _centers_of(cluster)
     diameter = neighbour_distance(positions) if known is None else known
     return cluster_mobility(positions, radius=diameter / 2, viscosity=1e-3, temperature=300.0)
 
 
 def neighbour_distance(positions: Floats) -> float:
-    """Return the mean distance of spheres that touch; 1 for a single sphere."""
-    first, second = np.triu_indices(len(positions), 1)
-    distance = np.linalg.norm(positions[first] - positions[second], axis=1)
+    """Return the mean distance of touching spheres; 1 for a single sphere.
+
+    Parameters
+    ----------
+    positions : ndarray, shape (n, d)
+
+    Examples
+    --------
+    >>> round(neighbour_distance(Cluster.touching(6, 2.45).positions), 12)
+    2.45
+    """
+    distance = pair_distances(positions)
     if not len(distance) or distance.min() == 0:
-        return 1.0  # a single sphere; coincident ones are refused where the body is made
-    return float(distance[distance < _TOUCHING * distance.min()].mean())
+        return 1.0  # coincident spheres are refused by `cluster_mobility`
+    return float(distance[distance < _NEIGHBOUR_RATIO * distance.min()].mean())
 
 
-def _sizes_dict(sizes: dict[str, Size]) -> dict[str, Any]:
-    """Return sizes for JSON; None for those that were not found."""
+def sizes_to_dict(sizes: Mapping[str, Size]) -> dict[str, Any]:
+    """Return the sizes of one cluster for JSON, as summary.json has them.
+
+    Parameters
+    ----------
+    sizes : mapping
+        By "translation", "rotation" and "both".
+
+    Returns
+    -------
+    dict
+        Values and standard errors, um and Pa s; None for sizes that were not determined.
+
+    Examples
+    --------
+    >>> sizes_to_dict({})["sphere_T"] is None
+    True
+    """
     entry: dict[str, Any] = {}
     for mode, letters in _SIZE_KEYS.items():
         size = sizes.get(mode)
-        for what in ("sphere", "cluster"):
-            entry[f"{what}_{letters}"] = size and {
-                "value": getattr(size, what),
-                "stderr": getattr(size, f"{what}_stderr"),
+        for name in ("sphere", "cluster"):
+            entry[f"{name}_{letters}"] = size and {
+                "value": getattr(size, name),
+                "stderr": getattr(size, f"{name}_stderr"),
             }
     both = sizes.get("both")
     entry["viscosity_TR"] = both and {"value": both.viscosity, "stderr": both.viscosity_stderr}
     return entry
 
 
-def _sizes_from(entry: dict[str, Any]) -> dict[str, Size]:
-    """Read back what `_sizes_dict` wrote."""
+def sizes_from_dict(entry: Mapping[str, Any]) -> dict[str, Size]:
+    """Return the sizes that `sizes_to_dict` wrote.
+
+    Parameters
+    ----------
+    entry : mapping
+        With ``sizes`` from `sizes_to_dict`, and ``size_factor``.
+
+    Examples
+    --------
+    >>> sizes_from_dict({"sizes": sizes_to_dict({}), "size_factor": None})
+    {}
+    """
     found = {}
     for mode, letters in _SIZE_KEYS.items():
-        sphere, cluster = (entry["sizes"][f"{what}_{letters}"] for what in ("sphere", "cluster"))
-        thickness = entry["sizes"]["viscosity_TR"] if mode == "both" else None
+        sphere, cluster = (entry["sizes"][f"{name}_{letters}"] for name in ("sphere", "cluster"))
+        viscosity = entry["sizes"]["viscosity_TR"] if mode == "both" else None
         if sphere is not None:
             found[mode] = Size(
                 cluster=cluster["value"],
@@ -409,7 +472,7 @@ def _sizes_from(entry: dict[str, Any]) -> dict[str, Size]:
                 sphere=sphere["value"],
                 sphere_stderr=sphere["stderr"],
                 factor=entry["size_factor"],
-                viscosity=thickness and thickness["value"],
-                viscosity_stderr=thickness and thickness["stderr"],
+                viscosity=viscosity and viscosity["value"],
+                viscosity_stderr=viscosity and viscosity["stderr"],
             )
     return found

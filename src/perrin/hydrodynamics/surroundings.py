@@ -1,29 +1,33 @@
-"""What a sample cell does to a body: the slowing by a wall, gravity, water's viscosity."""
+"""Effects of a sample cell on a body: slowing by a wall, gravity, viscosity of water."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from perrin._arrays import choice_fault, number_fault, refuse
 from perrin.hydrodynamics.mobility import BOLTZMANN, Mobility, condition_faults
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from typing import Self
+
     from perrin._arrays import Floats
 
 
 _GRAVITY = 9.80665  # m/s^2, standard
 
 
-# Below this height, in hydrodynamic radii, the series of a sphere is off by more than 2 % for the
-# translation of a cluster along the normal.
-_LOWEST = 2.5
+# Height over the hydrodynamic radius below which the series of a sphere has an error above 2 % for
+# the translation of a cluster along the normal.
+_LOWEST_HEIGHT = 2.5
 
 
 # Liquid water at 0.1 MPa in uPa s: sum of a (T/300 K)^b, 253.15 K to 383.15 K
 # (IAPWS SR6-08, Revised Supplementary Release on Properties of Liquid Water at 0.1 MPa).
-_WATER = ((280.68, -1.9), (511.45, -7.7), (61.131, -19.6), (0.45903, -40.0))
+_WATER_TERMS = ((280.68, -1.9), (511.45, -7.7), (61.131, -19.6), (0.45903, -40.0))
 
 
 _WATER_RANGE = (253.15, 383.15)
@@ -35,12 +39,16 @@ class WallFactor:
 
     Attributes
     ----------
-    T_parallel, T_perpendicular : float
-        Translation along the wall and along its normal.
-    R_parallel, R_perpendicular : float
-        Rotation about an axis along the wall and about the normal.
+    T_parallel : float
+        Factor of the translation along the wall.
+    T_perpendicular : float
+        Factor of the translation along the normal of the wall.
+    R_parallel : float
+        Factor of the rotation about an axis along the wall.
+    R_perpendicular : float
+        Factor of the rotation about the normal of the wall.
     height : float
-        Of the body's centre above the wall, um.
+        Height of the body's centre above the wall, um.
     """
 
     T_parallel: float
@@ -49,16 +57,42 @@ class WallFactor:
     R_perpendicular: float
     height: float
 
+    def to_dict(self) -> dict[str, float]:
+        """Return the factors for JSON, units in the names.
+
+        Examples
+        --------
+        >>> wall_factor(2.45, height=5.0).to_dict()["height_um"]
+        5.0
+        """
+        entry = asdict(self)
+        return {name: entry[name] for name in entry if name != "height"} | {
+            "height_um": self.height
+        }
+
+    @classmethod
+    def from_dict(cls, entry: Mapping[str, float]) -> Self:
+        """Return the factors that `to_dict` wrote.
+
+        Parameters
+        ----------
+        entry : mapping
+        """
+        return cls(
+            **{name: value for name, value in entry.items() if name != "height_um"},
+            height=entry["height_um"],
+        )
+
 
 def wall_factor(body: Mobility | float, *, height: float) -> WallFactor:
-    """Return how much a flat no-slip wall slows a body down.
+    """Return by what factors a flat no-slip wall reduces the diffusion of a body.
 
     Parameters
     ----------
     body : Mobility or float
         A cluster, averaged over its orientations, or the diameter of a sphere, um.
     height : float
-        Of its centre above the wall, um; at least 2.5 hydrodynamic radii.
+        Height of its centre above the wall, um; at least 2.5 hydrodynamic radii.
 
     Returns
     -------
@@ -67,15 +101,15 @@ def wall_factor(body: Mobility | float, *, height: float) -> WallFactor:
     Raises
     ------
     ValueError
-        If a number is not positive, or the body is so near the wall that the series fails.
+        If a number is not positive, or the body is too near the wall for the series.
 
     Notes
     -----
     The series of a sphere in x = radius/height: 1 - 9x/16 + x^3/8 - 45x^4/256 - x^5/16 along the
     wall (Faxen), 1 - 9x/8 + x^3/2 - x^5/8 along the normal, 1 - 5x^3/16 and 1 - x^3/8 for rotation
-    about an axis along the wall and about the normal; with the cluster's hydrodynamic radius of
-    each mode it holds within 1 % for compact clusters three hydrodynamic radii away. A second wall
-    adds, roughly, its own deficit.
+    about an axis along the wall and about the normal. With the cluster's hydrodynamic radius of
+    each mode its error is below 1 % for compact clusters three hydrodynamic radii away. The
+    deficits of two walls add up approximately.
 
     Examples
     --------
@@ -89,13 +123,13 @@ def wall_factor(body: Mobility | float, *, height: float) -> WallFactor:
         else (body / 2, body / 2)
     )
     faults = condition_faults(diameter=2 * by_T, height=height)
-    if not faults and height < _LOWEST * max(by_T, by_R):
+    if not faults and height < _LOWEST_HEIGHT * max(by_T, by_R):
         faults.append(
-            f"height: the series needs at least {_LOWEST:g} hydrodynamic radii, "
-            f"{_LOWEST * max(by_T, by_R):.3g} um, got {height:g} um; nearer to the wall trust D_R"
+            f"height: the series needs at least {_LOWEST_HEIGHT:g} hydrodynamic radii, "
+            f"{_LOWEST_HEIGHT * max(by_T, by_R):.3g} um, got {height:g} um; nearer to the wall use "
+            "D_R"
         )
-    if faults:
-        raise ValueError("; ".join(faults))
+    refuse(faults)
     x, y = by_T / height, by_R / height
     return WallFactor(
         T_parallel=1 - 9 * x / 16 + x**3 / 8 - 45 * x**4 / 256 - x**5 / 16,
@@ -111,15 +145,15 @@ def wall_diffusion(
 ) -> tuple[Floats, Floats]:
     """Return D_T and D_R along and about each lab axis near a wall, over all orientations.
 
-    A D along the normal below the two others is the signature of a wall; it needs no model.
+    A D along the normal below the two others indicates a wall without any model.
 
     Parameters
     ----------
     body : Mobility
     height : float
-        Of its centre above the wall, um.
+        Height of its centre above the wall, um.
     normal : {"x", "y", "z"}
-        Lab axis across the wall.
+        Lab axis perpendicular to the wall.
 
     Returns
     -------
@@ -141,8 +175,7 @@ def wall_diffusion(
     >>> D_T.round(3)
     array([0.038, 0.038, 0.031])
     """
-    if normal not in ("x", "y", "z"):
-        raise ValueError(f'normal: expected "x", "y" or "z", got {normal!r}')
+    refuse(choice_fault("normal", normal, "xyz"))
     near = wall_factor(body, height=height)
     across = np.array([axis == normal for axis in "xyz"])
     D_T = np.where(across, near.T_perpendicular, near.T_parallel) * np.trace(body.D_T) / 3
@@ -151,14 +184,14 @@ def wall_diffusion(
 
 
 def gravitational_height(body: Mobility, *, density_difference: float) -> float:
-    """Return the height over which gravity thins clusters out by a factor e, kT/(F - buoyancy).
+    """Return the height over which the density of clusters falls by a factor e: kT/(F - buoyancy).
 
     Parameters
     ----------
     body : Mobility
-        Gives volume and temperature.
+        Volume and temperature are used.
     density_difference : float
-        Particle less solvent, kg/m^3. Of either sign: what floats gathers at the top.
+        Density of the particles less that of the solvent, kg/m^3; negative if they rise.
 
     Returns
     -------
@@ -184,18 +217,18 @@ def gravitational_height(body: Mobility, *, density_difference: float) -> float:
 
 
 def settling_velocity(body: Mobility, *, density_difference: float) -> float:
-    """Return the speed at which gravity drags a cluster down, over all orientations.
+    """Return the mean sedimentation velocity of a cluster over all orientations.
 
     Parameters
     ----------
     body : Mobility
     density_difference : float
-        Particle less solvent, kg/m^3.
+        Density of the particles less that of the solvent, kg/m^3.
 
     Returns
     -------
     float
-        um/s, negative for what rises: D_T (F - buoyancy)/kT.
+        um/s, negative if the cluster rises: D_T (F - buoyancy)/kT.
 
     Raises
     ------
@@ -221,7 +254,7 @@ def water_viscosity(temperature: float) -> float:
     Parameters
     ----------
     temperature : float
-        K, from 253.15 to 383.15.
+        Temperature, K, from 253.15 to 383.15.
 
     Returns
     -------
@@ -242,15 +275,11 @@ def water_viscosity(temperature: float) -> float:
     low, high = _WATER_RANGE
     if not faults and not low <= temperature <= high:
         faults.append(f"temperature: expected {low} to {high} K, liquid water, got {temperature!r}")
-    if faults:
-        raise ValueError("; ".join(faults))
-    return float(sum(a * (temperature / 300) ** b for a, b in _WATER)) * 1e-6
+    refuse(faults)
+    return float(sum(a * (temperature / 300) ** b for a, b in _WATER_TERMS)) * 1e-6
 
 
 def _weight(body: Mobility, density_difference: float) -> float:
     """Return the weight of a body less its buoyancy, N."""
-    if not (np.ndim(density_difference) == 0 and np.isfinite(density_difference)):
-        raise ValueError(
-            f"density_difference: expected a finite number (kg/m^3), got {density_difference!r}"
-        )
+    refuse(number_fault("density_difference", density_difference, unit="kg/m^3"))
     return density_difference * _GRAVITY * body.volume * 1e-18

@@ -1,4 +1,4 @@
-"""Which of the spheres found in a movie make up its clusters."""
+"""Clusters of the spheres that were found in a movie."""
 
 from __future__ import annotations
 
@@ -8,44 +8,45 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from perrin.errors import DegenerateClusterError, NoSpheresError
-from perrin.images.spheres.spots import touching_together
-from perrin.tracks.clusters import identify
+from perrin.tracks.clusters import REACH, identify
 from perrin.tracks.files import check_tracks
+from perrin.tracks.linking import touching_groups
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     import pandas as pd
 
-    from perrin._arrays import Bools, Floats, Ints
+    from perrin._arrays import Floats, Ints
     from perrin.images.optics.optics import Optics
     from perrin.images.spheres.localisation import Search
     from perrin.images.stack import Stack
 
 
-_SURE = 0.95  # groups of other sizes are reported where less than this share has the size taken
+_CLEAR_MAJORITY = 0.95  # share of the groups with the most common size that needs no note
 
 
 @dataclass(frozen=True, eq=False)
 class Bodies:
-    """Spheres that were found, which cluster each is of, and what was noticed on the way.
+    """Spheres that were found, the cluster of each, and remarks.
 
     Attributes
     ----------
     features : DataFrame
-        As in `Imaging`, and ``together`` (spheres in a chain of touching ones), ``border``
-        (distance of the centre to it, um).
+        Table of the spheres as in `Imaging`, with ``together`` (number of spheres in the chain of
+        touching ones) and ``border`` (distance of the centre to the border, um).
     axes : list of str
+        Columns of the coordinates.
     size : int
-        Spheres of a cluster.
+        Number of spheres of a cluster.
     margin : float
-        Centres nearer to the border than this belong to spheres that it cuts, um.
+        Largest distance to the border of the centre of a sphere that the border cuts, um.
     dropped : dict of ndarray
-        Frames of each cluster that lack spheres at the border.
+        Frames of each cluster that are dropped because spheres are missing at the border.
     warnings : list of str
-        What is left out.
+        Warnings about bodies that are left out.
     notes : list of str
-        How the size was found.
+        Notes about the choice of the size.
     """
 
     features: pd.DataFrame
@@ -65,50 +66,63 @@ def find_bodies(
     optics: Optics | None,
     size: int | None = None,
 ) -> Bodies:
-    """Say which spheres of a movie are of which cluster.
+    """Assign the spheres of a movie to its clusters.
 
     Parameters
     ----------
     features : DataFrame
-        As `locate` returns it.
+        Table of the spheres, as `locate` returns it.
     stack : Stack
     search : Search
     optics : Optics or None
     size : int, optional
-        Spheres of a cluster; default: the most common number of touching ones.
+        Number of spheres of a cluster; default: the most common number of touching spheres.
+
+    Returns
+    -------
+    Bodies
 
     Raises
     ------
     NoSpheresError, DegenerateClusterError
         If nothing was found, or no spheres touch.
     """
-    usable = _usable(features)
+    usable = np.ones(len(features), dtype=np.bool_)
+    if "refined" in features:
+        tried = features["chi2"].notna().to_numpy()
+        usable = np.asarray(features["refined"].to_numpy(dtype=np.bool_) | ~tried)
     if not usable.any():
         raise NoSpheresError(
             f"no particles: {len(features)} places were found and none of them shows a sphere; "
-            "look at diameter and minmass, and whether the spheres are dark (dark=True)"
+            "check diameter and minmass, and whether the spheres are dark (dark=True)"
         )
     axes = [axis for axis in "xyz" if axis in features]
     together = np.ones(len(features), dtype=np.int64)
     together[usable] = group_sizes(features[usable], contact=search.contact, axes=axes)
     notes: list[str] = []
     if size is None:
-        size, notes = _common_size(together[usable], dimension=len(axes))
+        size, notes = most_common_size(together[usable], dimension=len(axes))
     found = identify(features.loc[usable, ["frame", *axes]], contact=search.contact, size=size)
     columns = {"cluster": -1, "particle": -1, "piece": 0}
     features = features.assign(together=together, **columns)
     features.loc[usable, list(columns)] = found[list(columns)]
-    features, warnings = _without_larger(features, size=size)
+    features, warnings = _without_larger_bodies(features, size=size)
     features.loc[features["cluster"] < 0, ["particle", "piece"]] = (-1, 0)
-    features["border"] = _to_border(features, stack, axes)
+    length = dict(zip("zyx", np.array(stack.shape[1:]) * stack.voxel, strict=True))
+    half = dict(zip("zyx", stack.voxel / 2, strict=True))
+    sides = [
+        np.minimum(features[a] + half[a], length[a] - half[a] - features[a]).to_numpy()
+        for a in axes
+    ]
+    features["border"] = np.min(sides, axis=0)
     blur = 0.0 if optics is None else optics.psf[0]
     margin = search.diameter / 2 + 2 * blur
     features, dropped = _without_cut_bodies(features, size=size, margin=margin)
     return Bodies(features, axes, size, margin, dropped, warnings, notes)
 
 
-def _without_larger(features: pd.DataFrame, *, size: int) -> tuple[pd.DataFrame, list[str]]:
-    """Loosen what stands in a larger group in most of its frames: a part of another body."""
+def _without_larger_bodies(features: pd.DataFrame, *, size: int) -> tuple[pd.DataFrame, list[str]]:
+    """Assign no cluster to spheres that are in a larger group in most of their frames."""
     tracked = features[features["cluster"] >= 0]
     usual = tracked.groupby(["cluster", "frame"])["together"].max().groupby("cluster").median()
     larger = usual[usual > size]
@@ -125,30 +139,47 @@ def _without_larger(features: pd.DataFrame, *, size: int) -> tuple[pd.DataFrame,
     ]
 
 
-def _usable(features: pd.DataFrame) -> Bools:
-    """Return the rows whose places are good: where a fit was tried and failed they are not."""
-    if "refined" not in features:
-        return np.ones(len(features), dtype=np.bool_)
-    tried = features["chi2"].notna().to_numpy()
-    return np.asarray(features["refined"].to_numpy(dtype=np.bool_) | ~tried)
+def most_common_size(together: Ints, *, dimension: int) -> tuple[int, list[str]]:
+    """Return the most common number of touching spheres, and a note if there are other numbers.
 
+    Parameters
+    ----------
+    together : ndarray of int
+        Number of spheres in the group of each sphere, in all frames.
+    dimension : int
+        2 or 3. Groups of fewer spheres, which have no orientation, are chosen only if there are no
+        larger ones.
 
-def _common_size(together: Ints, *, dimension: int) -> tuple[int, list[str]]:
-    """Return the most common number of touching spheres, and what was seen besides."""
+    Returns
+    -------
+    size : int
+        The largest of several that are equally common.
+    notes : list of str
+
+    Raises
+    ------
+    DegenerateClusterError
+        If no spheres touch.
+
+    Examples
+    --------
+    >>> most_common_size(np.repeat([4, 8], [400, 8]), dimension=3)
+    (4, [])
+    """
     counted = np.bincount(together)
     groups = np.round(counted / np.maximum(np.arange(len(counted)), 1)).astype(int)
     groups[:2] = 0
     if not groups.any():
         raise DegenerateClusterError(
-            f"no spheres touch: all {len(together)} found are over 1.3 contact distances apart; "
-            "correct contact or the voxel size"
+            f"no spheres touch: all {len(together)} found are over {REACH} contact distances "
+            "apart; correct contact or the voxel size"
         )
     bodies = groups.copy()
     bodies[:dimension] = 0
     counts = bodies if bodies.any() else groups
     size = int(np.flatnonzero(counts == counts.max())[-1])
     share = groups[size] / groups.sum()
-    if share >= _SURE:
+    if share >= _CLEAR_MAJORITY:
         return size, []
     listed = ", ".join(f"{count} of {n}" for n, count in enumerate(groups) if count)
     return size, [
@@ -157,47 +188,67 @@ def _common_size(together: Ints, *, dimension: int) -> tuple[int, list[str]]:
     ]
 
 
-def _to_border(features: pd.DataFrame, stack: Stack, axes: list[str]) -> Floats:
-    """Return how far each centre is from the nearest border of the stack, um."""
-    length = dict(zip("zyx", np.array(stack.shape[1:]) * stack.voxel, strict=True))
-    half = dict(zip("zyx", stack.voxel / 2, strict=True))
-    sides = [
-        np.minimum(features[a] + half[a], length[a] - half[a] - features[a]).to_numpy()
-        for a in axes
-    ]
-    return np.asarray(np.min(sides, axis=0), dtype=np.float64)
-
-
 def _without_cut_bodies(
     features: pd.DataFrame, *, size: int, margin: float
 ) -> tuple[pd.DataFrame, dict[int, Ints]]:
-    """Loosen bodies at the border some of whose spheres are out of view.
+    """Assign no cluster to bodies with spheres outside the border, in the frames concerned.
 
-    Their unseen light misleads the fits of the spheres that are left.
+    The intensity of spheres outside the stack biases the fits of the others.
     """
     tracked = features[features["cluster"] >= 0]
     bodies = tracked.groupby(["cluster", "frame"]).agg(n=("x", "size"), border=("border", "min"))
     cut = bodies[(bodies["n"] < size) & (bodies["border"] < margin)].reset_index()
-    gone = features.set_index(["cluster", "frame"]).index.isin(
+    in_cut_body = features.set_index(["cluster", "frame"]).index.isin(
         cut.set_index(["cluster", "frame"]).index
     )
     features = features.copy()
-    features.loc[gone, ["cluster", "particle", "piece"]] = (-1, -1, 0)
+    features.loc[in_cut_body, ["cluster", "particle", "piece"]] = (-1, -1, 0)
     return features, {int(c): part.to_numpy() for c, part in cut.groupby("cluster")["frame"]}
 
 
 def group_sizes(features: pd.DataFrame, *, contact: float, axes: list[str]) -> Ints:
-    """Return for every row how many spheres touch in its chain, itself counted."""
+    """Return the number of spheres in the chain of touching ones of every sphere, itself included.
+
+    Parameters
+    ----------
+    features : pandas.DataFrame
+        With ``frame`` and the coordinates.
+    contact : float
+        Centre distance of touching spheres, um.
+    axes : list of str
+        Columns of the coordinates.
+
+    Returns
+    -------
+    ndarray of int64
+
+    Examples
+    --------
+    >>> import pandas as pd
+    >>> table = pd.DataFrame({"frame": 0, "x": [0.0, 1.0, 5.0], "y": 0.0})
+    >>> group_sizes(table, contact=1.0, axes=["x", "y"])
+    array([2, 2, 1])
+    """
     out = np.zeros(len(features), dtype=np.int64)
     x = features[axes].to_numpy(dtype=np.float64)
     for rows in features.reset_index(drop=True).groupby("frame").indices.values():
-        for group in touching_together(x[rows], contact=contact):
-            out[rows[group]] = len(group)
+        label = touching_groups(x[rows], reach=REACH * contact, size=len(rows), smallest=1)
+        out[rows] = np.bincount(label)[label]
     return out
 
 
 def stated_errors(bodies: Bodies) -> Floats | None:
-    """Return the median stated errors of the axes, um, where places were refined."""
+    """Return the median standard errors of the positions along each axis, um.
+
+    Parameters
+    ----------
+    bodies : Bodies
+
+    Returns
+    -------
+    ndarray, shape (d,), or None
+        None if the positions were not refined by the model.
+    """
     names = [f"sigma_{axis}" for axis in bodies.axes]
     if not set(names) <= set(bodies.features):
         return None
@@ -206,14 +257,25 @@ def stated_errors(bodies: Bodies) -> Floats | None:
 
 
 def tracks_of(bodies: Bodies, *, exclude: Sequence[int]) -> pd.DataFrame:
-    """Return the table of tracks, clusters that are not wanted left out.
+    """Return the table of tracks without the excluded clusters.
+
+    Parameters
+    ----------
+    bodies : Bodies
+    exclude : sequence of int
+        Numbers of clusters to leave out.
+
+    Returns
+    -------
+    pandas.DataFrame
+        As `check_tracks` returns it, with ``cluster`` and ``piece``.
 
     Raises
     ------
     DegenerateClusterError
         If there is no cluster.
     ValueError
-        If one to be left out does not exist, or none is left.
+        If an excluded cluster does not exist, or no cluster is left.
     """
     features = bodies.features
     found = set(features.loc[features["cluster"] >= 0, "cluster"].unique().tolist())

@@ -1,76 +1,78 @@
-"""What speaks against a measurement made from images, and what informs about it.
+"""Warnings and notes about a movie and its clusters.
 
-Every check returns `Findings`, or a `Verdict` where it is of one cluster. A warning that rests on a
-noisy number is a test: it appears where the number exceeds its bound by more than its error allows,
-at a level of 1 % (`_LEVEL`) for a true value on the bound itself; movies without the fault lie far
-inside.
+Every check returns `Findings`, or a `Verdict` for one cluster. A warning that depends on a noisy
+number is a statistical test: the number must exceed its bound by more than its error allows, at a
+level of 1 % (`_TEST_LEVEL`) for a true value on the bound itself.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from perrin._text import listed
+from perrin.geometry.shapes import pair_distances
 from perrin.tracks.clusters import REACH
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Mapping, Sequence
 
     import pandas as pd
 
     from perrin._arrays import Floats, Ints
     from perrin.diffusion.estimate import DiffusionEstimate
     from perrin.motion.rigid_motion import RigidMotion
+    from perrin.run.results import ClusterResult
 
 
-_LISTED = 10  # numbers of frames or clusters in one message
+_LISTED_ITEMS = 10  # largest number of frames or clusters that a message lists
 
 
-_LEVEL = 0.01  # of the tests, one-sided
+_TEST_LEVEL = 0.01  # one-sided level of the tests
 
 
-_NORMAL = 2.326  # standard errors at that level
+_NORMAL_QUANTILE = 2.326  # of the normal distribution at that level
 
 
-_PAIR = 0.03  # relative error of the mean pair distance
+_PAIR_BIAS = 0.03  # relative error of the mean pair distance
 
 
-_FADED = 0.1  # loss of brightness over the movie
+_BLEACHED = 0.1  # relative loss of brightness over the movie
 
 
-_DEPTH = 0.1  # change of brightness over the depth of the stack
+_DEPTH_CHANGE = 0.1  # relative change of brightness over the depth of the spheres
 
 
-_MISSING = 0.1  # share of the spheres of the clusters
+_MISSING_SHARE = 0.1  # of the spheres of the clusters
 
 
-_FAILED = 0.01  # share of the fits
+_FAILED_SHARE = 0.01  # of the fits
 
 
-_QUARTER, _HALF = 0.25, 0.5  # of the contact distance: steps that endanger identities
+_UNSAFE_STEP, _REFUSED_STEP = 0.25, 0.5  # rms step over the contact distance
 
 
-_FAST, _SLOW = 2.0, 0.5  # MSAD at one lag over Phi^2; rms rotation per frame, rad
+_FAST_RATIO, _SLOW_ROTATION = 2.0, 0.5  # MSAD at the first lag over Phi^2; rms rotation, rad
 
 
 class Findings(NamedTuple):
-    """What is to be reported of a run.
+    """Warnings and notes of one or more checks.
 
     Attributes
     ----------
     warnings : tuple of str
-        What casts doubt on a result.
+        Reasons to doubt a result.
     notes : tuple of str
-        What informs.
+        Information about a result.
     """
 
     warnings: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
 
     def __add__(self, other: object) -> Findings:
-        """Return both together, in their order."""
+        """Return the findings of both, in their order."""
         if not isinstance(other, Findings):
             return NotImplemented
         return Findings(self.warnings + other.warnings, self.notes + other.notes)
@@ -80,22 +82,31 @@ _NOTHING = Findings()
 
 
 class Verdict(NamedTuple):
-    """What a check says of one cluster, and how grave it is beside that of others."""
+    """Warning or note of a check about one cluster, and its size among those of other clusters."""
 
     text: str
     size: float
 
 
-def of_clusters(verdicts: Mapping[str, Verdict | None]) -> dict[str, str]:
-    """Return one text where a check speaks of several clusters; each by the cluster it stands for.
+def combined_verdicts(verdicts: Mapping[str, Verdict | None]) -> dict[str, str]:
+    """Combine the verdicts of one check on several clusters into one text.
 
-    The key is "" for the text about several, whose gravest case is quoted.
+    Parameters
+    ----------
+    verdicts : mapping
+        Verdict on each cluster by its name; None if the check found nothing.
+
+    Returns
+    -------
+    dict of str to str
+        The text by the name of the cluster, or by "" if it is about several; such a text quotes the
+        largest case.
 
     Examples
     --------
-    >>> of_clusters({"0": Verdict("too fast", 1.0), "1": None})
+    >>> combined_verdicts({"0": Verdict("too fast", 1.0), "1": None})
     {'0': 'too fast'}
-    >>> of_clusters({"0": Verdict("0.3 um", 0.3), "1": Verdict("0.4 um", 0.4), "2": None})
+    >>> combined_verdicts({"0": Verdict("0.3 um", 0.3), "1": Verdict("0.4 um", 0.4), "2": None})
     {'': '2 of 3 clusters (0, 1), the worst is cluster 1: 0.4 um'}
     """
     met = {name: verdict for name, verdict in verdicts.items() if verdict is not None}
@@ -108,39 +119,58 @@ def of_clusters(verdicts: Mapping[str, Verdict | None]) -> dict[str, str]:
     }
 
 
-def at(frames: Ints | list[int]) -> str:
-    """Name frames in words, runs of neighbours as one, by ten numbers at most.
+def frame_runs_text(frames: Ints | list[int]) -> str:
+    """Return frame numbers for a sentence, successive ones as a range; at most ten numbers.
+
+    Parameters
+    ----------
+    frames : sequence of int
+
+    Returns
+    -------
+    str
 
     Examples
     --------
-    >>> at([3, 4, 5, 9]), at([7])
+    >>> frame_runs_text([3, 4, 5, 9]), frame_runs_text([7])
     ('frames 3 to 5, 9', 'frame 7')
     """
     every = np.unique(np.asarray(frames, dtype=np.int64))
     runs = np.split(every, np.flatnonzero(np.diff(every) > 1) + 1)
     numbers = np.cumsum([min(len(run), 2) for run in runs])
-    shown = int((numbers <= _LISTED).sum())
+    shown = int((numbers <= _LISTED_ITEMS).sum())
     words = [f"{r[0]}" if len(r) == 1 else f"{r[0]} to {r[-1]}" for r in runs[:shown]]
     more = f" and {sum(map(len, runs[shown:]))} more" if len(runs) > shown else ""
     return f"frame{'s' if len(every) > 1 else ''} {', '.join(words)}{more}"
 
 
-def unreadable(frames: pd.DataFrame) -> Findings:
-    """Name the frames that could not be read, and why."""
+def unreadable_frames(frames: pd.DataFrame) -> Findings:
+    """Warn of frames that could not be read.
+
+    Parameters
+    ----------
+    frames : pandas.DataFrame
+        As in `Imaging`.
+    """
     lost = frames[frames["fault"] != ""]
     if not len(lost):
         return _NOTHING
     text = (
         f"{len(lost)} of {len(frames)} frames cannot be read and are left out: "
-        f"{at(lost['frame'].to_numpy())} ({lost['fault'].iloc[0]})"
+        f"{frame_runs_text(lost['frame'].to_numpy())} ({lost['fault'].iloc[0]})"
     )
     return Findings((text,))
 
 
-def repeated(frames: pd.DataFrame) -> Findings:
-    """Name the frames that are copies of an earlier one.
+def repeated_frames(frames: pd.DataFrame) -> Findings:
+    """Warn of frames that are exact copies of an earlier one.
 
-    Noise never repeats: such a frame is no measurement of its time.
+    Noise never repeats, so that such a frame is no measurement.
+
+    Parameters
+    ----------
+    frames : pandas.DataFrame
+        As in `Imaging`.
     """
     copies = frames[frames["copy_of"] >= 0]
     if not len(copies):
@@ -149,26 +179,41 @@ def repeated(frames: pd.DataFrame) -> Findings:
     text = (
         f"{len(copies)} of {len(frames)} frames repeat an earlier frame exactly, voxel by voxel "
         f"(first: frame {first['frame']}, as frame {first['copy_of']}): they are no measurements "
-        f"and are treated as missing: {at(copies['frame'].to_numpy())}"
+        f"and are treated as missing: {frame_runs_text(copies['frame'].to_numpy())}"
     )
     return Findings((text,))
 
 
-def empty(frames: pd.DataFrame, *, minmass: float) -> Findings:
-    """Name the frames in which nothing passed the mass cut."""
+def empty_frames(frames: pd.DataFrame, *, minmass: float) -> Findings:
+    """Warn of frames without any spot above the mass cut.
+
+    Parameters
+    ----------
+    frames : pandas.DataFrame
+        As in `Imaging`.
+    minmass : float
+        Mass cut.
+    """
     read = frames[frames["fault"] == ""]
     none = read[read["spheres"] == 0]
     if not len(none):
         return _NOTHING
     text = (
         f"no particles passed the mass cut ({minmass:.3g}) in {len(none)} of {len(read)} frames: "
-        f"{at(none['frame'].to_numpy())}; look at the mass histogram, set minmass or leave them out"
+        f"{frame_runs_text(none['frame'].to_numpy())}; look at the mass histogram, set minmass or "
+        "leave them out"
     )
     return Findings((text,))
 
 
-def saturated(frames: pd.DataFrame) -> Findings:
-    """Say which share of the voxels was clipped (`optics.saturated_share`)."""
+def saturated_frames(frames: pd.DataFrame) -> Findings:
+    """Warn of frames with voxels clipped at the highest value (`optics.saturated_share`).
+
+    Parameters
+    ----------
+    frames : pandas.DataFrame
+        As in `Imaging`.
+    """
     share = frames["saturated"].to_numpy(dtype=np.float64)
     over = share > 0
     if not over.any():
@@ -176,36 +221,56 @@ def saturated(frames: pd.DataFrame) -> Findings:
     text = (
         f"saturated voxels: up to {100 * np.nanmax(share):.2g} % of a frame pile up at its highest "
         f"value, in {over.sum()} of {len(frames)} frames (chance of one such frame without "
-        "saturation under 1e-6); their light is lost and places may be off: less gain or laser "
-        "power"
+        "saturation under 1e-6); their intensity is lost and positions may be biased; reduce gain "
+        "or laser power"
     )
     return Findings((text,))
 
 
 class Change(NamedTuple):
-    """A relative change of brightness, its standard error, and the error's degrees of freedom."""
+    """A relative change of brightness.
+
+    Attributes
+    ----------
+    value : float
+        Relative change: -0.3 for a fall by 30 %.
+    stderr : float
+        Standard error of the change.
+    freedom : int
+        Degrees of freedom of the standard error.
+    """
 
     value: float
     stderr: float
     freedom: int
 
     def exceeds(self, bound: float) -> bool:
-        """Return whether the change is certainly larger than `bound`, up or down."""
+        """Return whether the change is significantly larger than `bound`, up or down (t test)."""
         from scipy.stats import t
 
-        doubt = float(t.isf(_LEVEL / 2, self.freedom)) * self.stderr
-        return abs(self.value) - doubt > bound
+        margin = float(t.isf(_TEST_LEVEL / 2, self.freedom)) * self.stderr
+        return abs(self.value) - margin > bound
 
     def percent(self) -> str:
-        """Write the change with its error, in percent."""
+        """Return the change with its error in percent: "-30 +- 3 %"."""
         return f"{100 * self.value:+.0f} +- {100 * self.stderr:.1g} %"
 
 
 def bleaching(features: pd.DataFrame) -> Change | None:
-    """Return how the spheres' brightness changed from the first tenth of the frames to the last.
+    """Return the change of the spheres' brightness from the first tenth of the frames to the last.
 
-    The change is that of a sphere seen in both, mean over the tracked spheres in logarithms; their
-    scatter gives the error. None for fewer than four frames or two such spheres.
+    It is the mean over the tracked spheres that are seen in both, in logarithms, and the error is
+    that of this mean.
+
+    Parameters
+    ----------
+    features : pandas.DataFrame
+        As in `Imaging`.
+
+    Returns
+    -------
+    Change or None
+        None for fewer than four frames or two such spheres.
 
     Examples
     --------
@@ -220,10 +285,10 @@ def bleaching(features: pd.DataFrame) -> Change | None:
     if len(numbers) < 4:
         return None
     tenth = max(1, len(numbers) // 10)
-    light = np.log(seen["mass"].to_numpy(dtype=np.float64))
-    of = seen.assign(light=light).set_index("frame").sort_index()
+    log_mass = np.log(seen["mass"].to_numpy(dtype=np.float64))
+    by_frame = seen.assign(log_mass=log_mass).set_index("frame").sort_index()
     ends = [
-        of.loc[part[0] : part[-1]].groupby(["cluster", "particle"])["light"].mean()
+        by_frame.loc[part[0] : part[-1]].groupby(["cluster", "particle"])["log_mass"].mean()
         for part in (numbers[:tenth], numbers[-tenth:])
     ]
     change = (ends[1] - ends[0]).dropna().to_numpy()
@@ -234,47 +299,85 @@ def bleaching(features: pd.DataFrame) -> Change | None:
     return Change(ratio - 1, error, len(change) - 1)
 
 
-def faded(features: pd.DataFrame) -> Findings:
-    """Say by how much brightness fell from the first tenth of the frames to the last."""
-    change = bleaching(features)
-    if change is None or change.value > 0 or not change.exceeds(_FADED):
-        return _NOTHING
-    text = (
-        f"brightness fell by {-100 * change.value:.0f} +- {100 * change.stderr:.1g} % from the "
-        "first tenth of the movie to the last (bleaching): late frames are less exact"
+def bleaching_text(change: Change) -> str:
+    """Return the words for a change of brightness over the movie.
+
+    Examples
+    --------
+    >>> bleaching_text(Change(-0.3, 0.03, 7))
+    'brightness fell by 30 +- 3 % from the first tenth of the movie to the last'
+    >>> bleaching_text(Change(0.1, 0.02, 7))
+    'brightness rose by 10 +- 2 % from the first tenth of the movie to the last'
+    """
+    verb = "fell" if change.value <= 0 else "rose"
+    return (
+        f"brightness {verb} by {abs(100 * change.value):.0f} +- {100 * change.stderr:.1g} % from "
+        "the first tenth of the movie to the last"
     )
-    return Findings((text,))
+
+
+def bleached(features: pd.DataFrame) -> Findings:
+    """Warn if the brightness fell significantly from the start of the movie to its end.
+
+    Parameters
+    ----------
+    features : pandas.DataFrame
+        As in `Imaging`.
+    """
+    change = bleaching(features)
+    if change is None or change.value > 0 or not change.exceeds(_BLEACHED):
+        return _NOTHING
+    return Findings((f"{bleaching_text(change)} (bleaching): late frames are less exact",))
 
 
 def depth_change(features: pd.DataFrame) -> tuple[Change, float] | None:
     """Return the change of brightness from the lowest sphere to the highest, and their distance.
 
-    One sphere keeps its brightness over the frames, so that only the spheres of one frame are
-    independent; None where they are fewer than three or do not differ in height.
+    A sphere keeps its brightness over the frames, so that only the spheres of one frame are
+    independent.
+
+    Parameters
+    ----------
+    features : pandas.DataFrame
+        As in `Imaging`.
+
+    Returns
+    -------
+    change : Change
+    span : float
+        Height of the highest sphere above the lowest, um.
+
+    None is returned for fewer than three spheres in a frame, or if all have the same height.
     """
-    # What was found in the light left over by a crowd has no mass.
+    # Spheres found in the residual image of a crowd have no mass.
     features = features[features["mass"].notna()]
     count = len(features) // max(1, features["frame"].nunique())
     if "z" not in features or count < 3:
         return None
     relative = features["mass"] / features.groupby("frame")["mass"].transform("median")
     z, y = features["z"].to_numpy(dtype=np.float64), np.log(relative.to_numpy(dtype=np.float64))
-    off = z - z.mean()
-    power, span = float(off @ off), float(np.ptp(z))
-    if not power > 0:
+    height = z - z.mean()
+    square_sum, span = float(height @ height), float(np.ptp(z))
+    if not square_sum > 0:
         return None
-    slope = float(off @ y) / power
-    left = y - y.mean() - slope * off
+    slope = float(height @ y) / square_sum
+    residual = y - y.mean() - slope * height
     freedom = count - 2
-    error = float(np.sqrt(left @ left / power / freedom))
+    error = float(np.sqrt(residual @ residual / square_sum / freedom))
     ratio = float(np.exp(slope * span))
     return Change(ratio - 1, ratio * error * span, freedom), span
 
 
-def dimmed_with_depth(features: pd.DataFrame) -> Findings:
-    """Say by how much brightness changes from the lowest sphere to the highest."""
+def depth_dimming(features: pd.DataFrame) -> Findings:
+    """Warn if the brightness changes significantly from the lowest sphere to the highest.
+
+    Parameters
+    ----------
+    features : pandas.DataFrame
+        As in `Imaging`.
+    """
     found = depth_change(features)
-    if found is None or not found[0].exceeds(_DEPTH):
+    if found is None or not found[0].exceeds(_DEPTH_CHANGE):
         return _NOTHING
     change, span = found
     text = (
@@ -284,8 +387,14 @@ def dimmed_with_depth(features: pd.DataFrame) -> Findings:
     return Findings((text,))
 
 
-def unrefined(features: pd.DataFrame) -> Findings:
-    """Count the fits that failed, by reason; a warning where they are over 1 %."""
+def unrefined_spheres(features: pd.DataFrame) -> Findings:
+    """Count the fits of spheres that failed, by reason; a warning above 1 %, else a note.
+
+    Parameters
+    ----------
+    features : pandas.DataFrame
+        As in `Imaging`.
+    """
     if "reason" not in features:
         return _NOTHING
     failed = features.loc[features["reason"] != "", "reason"].value_counts()
@@ -294,33 +403,51 @@ def unrefined(features: pd.DataFrame) -> Findings:
     kinds = "; ".join(f"{count} x {why}" for why, count in failed.items())
     text = (
         f"{failed.sum()} of {len(features)} places are as found, not refined ({kinds}); the "
-        "column reason of features.parquet says which; those of tried fits are not used"
+        "column reason of features.parquet lists them; those of tried fits are not used"
     )
-    return _by_share(text, failed.sum() / len(features))
+    return _fit_failures(text, failed.sum() / len(features))
 
 
-def unsettled(count: int, of: int) -> Findings:
-    """Count the poses whose fit to the image failed; a warning where they are over 1 %."""
+def unsettled_poses(count: int, of: int) -> Findings:
+    """Count the fits of poses that failed; a warning above 1 %, else a note.
+
+    Parameters
+    ----------
+    count, of : int
+        Number of failed fits, and of all fits.
+    """
     if not count:
         return _NOTHING
     text = f"{count} of {of} poses did not settle in the image and are those of the free centres"
-    return _by_share(text, count / of)
+    return _fit_failures(text, count / of)
 
 
-def _by_share(text: str, share: float) -> Findings:
-    return Findings((text,)) if share > _FAILED else Findings(notes=(text,))
+def _fit_failures(text: str, share: float) -> Findings:
+    return Findings((text,)) if share > _FAILED_SHARE else Findings(notes=(text,))
 
 
-def pair_distance(
+def pair_distance_bias(
     features: pd.DataFrame, *, contact: float, refine: str | None, axes: list[str]
 ) -> Findings:
-    """Compare the mean distance of touching spheres of the clusters to the contact distance."""
+    """Warn if the mean distance of touching spheres differs from the contact distance.
+
+    Parameters
+    ----------
+    features : pandas.DataFrame
+        As in `Imaging`.
+    contact : float
+        Centre distance of touching spheres, um.
+    refine : {"model", "trackpy", None}
+        Refinement of the positions.
+    axes : list of str
+        Columns of the coordinates.
+    """
     mean, error = mean_pair_distance(features, contact=contact, axes=axes)
     off = mean / contact - 1
-    if not abs(off) > _PAIR + _NORMAL * error / contact:
+    if not abs(off) > _PAIR_BIAS + _NORMAL_QUANTILE * error / contact:
         return _NOTHING
     why = (
-        "centroid bias of touching balls; run refinement (refine='model')"
+        "centroid bias of touching spheres; run refinement (refine='model')"
         if refine is None
         else "the contact distance, the voxel size or the diameter may be wrong"
     )
@@ -334,11 +461,25 @@ def pair_distance(
 def mean_pair_distance(
     features: pd.DataFrame, *, contact: float, axes: list[str]
 ) -> tuple[float, float]:
-    """Return the mean distance of touching spheres of the same cluster, um, and its error.
+    """Return the mean distance of touching spheres of the same cluster, and its standard error.
 
-    The error of a place may last over all frames, and a sphere touches several others: the scatter
-    of the pairs' mean distances gives the error, with half as many independent ones as there are
-    spheres; where there is one pair, the scatter of the frames. Both are NaN without any.
+    The error of a position may be the same in all frames, and a sphere touches several others.
+    Therefore the error is the scatter of the pairs' mean distances, with half as many independent
+    ones as there are spheres; for a single pair it is the scatter over the frames.
+
+    Parameters
+    ----------
+    features : pandas.DataFrame
+        As in `Imaging`.
+    contact : float
+        Centre distance of touching spheres, um.
+    axes : list of str
+        Columns of the coordinates.
+
+    Returns
+    -------
+    mean, stderr : float
+        um; NaN if no spheres touch.
     """
     distances, pairs = [np.empty(0)], [np.empty(0, dtype=np.int64)]
     tracked = features[features["cluster"] >= 0].sort_values(["frame", "cluster", "particle"])
@@ -346,9 +487,9 @@ def mean_pair_distance(
     for (_, cluster), rows in tracked.groupby(["frame", "cluster"]):
         x, particle = rows[axes].to_numpy(dtype=np.float64), rows["particle"].to_numpy()
         first, second = np.triu_indices(len(x), 1)
-        apart = np.linalg.norm(x[first] - x[second], axis=-1)
-        near = apart < REACH * contact
-        distances.append(apart[near])
+        distance = pair_distances(x)
+        near = distance < REACH * contact
+        distances.append(distance[near])
         pairs.append(((int(cluster) * most + particle[first]) * most + particle[second])[near])
     every, pair = np.concatenate(distances), np.concatenate(pairs)
     if not every.size:
@@ -362,11 +503,22 @@ def mean_pair_distance(
     return mean, scatter / np.sqrt(spheres / 2)
 
 
-def counts(features: pd.DataFrame, *, size: int, contact: float, frames: Ints) -> Findings:
-    """Say in which frames clusters have not as many spheres as they should, or are not there.
+def missing_spheres(features: pd.DataFrame, *, size: int, contact: float, frames: Ints) -> Findings:
+    """Report the frames in which clusters have missing or additional spheres, or are missing.
 
-    `features` is that of `Bodies`, `frames` all that could be read. It is a warning where over 10 %
-    of the spheres of the clusters are missing between their first and their last frame.
+    It is a warning if over 10 % of the spheres of the clusters are missing between their first and
+    their last frame, else a note.
+
+    Parameters
+    ----------
+    features : pandas.DataFrame
+        As in `Bodies`.
+    size : int
+        Number of spheres of a cluster.
+    contact : float
+        Centre distance of touching spheres, um.
+    frames : ndarray of int
+        All frames that could be read.
     """
     texts: dict[int, str] = {}
     missing = expected = 0
@@ -375,47 +527,54 @@ def counts(features: pd.DataFrame, *, size: int, contact: float, frames: Ints) -
         present = rows.groupby("frame").size()
         first, last = int(present.index.min()), int(present.index.max())
         due = int(((frames >= first) & (frames <= last)).sum())
+        absent = due - len(present)
         few = present[present < size]
-        missing += size * (due - len(present)) + int((size - few).sum())
+        crowd = rows.groupby("frame")["together"].max().loc[lambda n: n > size]
+        missing += size * absent + int((size - few).sum())
         expected += size * due
-        said = _unusual(rows, few, size=size, absent=due - len(present), contact=contact)
-        said += [f"first seen in frame {first}"] if first > frames.min() else []
-        said += [f"lost after frame {last}"] if last < frames.max() else []
-        if said:
-            texts[int(cluster)] = ", ".join(said)
+        parts = [
+            f"{n} found in {_frame_count(k)}" for n, k in few.value_counts().sort_index().items()
+        ]
+        if absent:
+            parts.append(f"none placed in {_frame_count(absent)}")
+        parts += [
+            f"{n} found in {_frame_count(k)} (two clusters within {REACH * contact:.2g} um)"
+            for n, k in crowd.value_counts().sort_index().items()
+        ]
+        if first > frames.min():
+            parts.append(f"first seen in frame {first}")
+        if last < frames.max():
+            parts.append(f"lost after frame {last}")
+        if parts:
+            texts[int(cluster)] = ", ".join(parts)
     if not texts:
         return _NOTHING
-    shown = "; ".join(f"cluster {c}: {text}" for c, text in list(texts.items())[:_LISTED])
-    more = f"; and {len(texts) - _LISTED} more" if len(texts) > _LISTED else ""
+    shown = "; ".join(f"cluster {c}: {text}" for c, text in list(texts.items())[:_LISTED_ITEMS])
+    more = f"; and {len(texts) - _LISTED_ITEMS} more" if len(texts) > _LISTED_ITEMS else ""
     text = (
         f"{100 * missing / expected:.2g} % of the spheres are missing, {size} expected in each of "
         f"{tracked['cluster'].nunique()} clusters; {shown}{more}"
     )
-    return Findings((text,)) if missing > _MISSING * expected else Findings(notes=(text,))
+    return Findings((text,)) if missing > _MISSING_SHARE * expected else Findings(notes=(text,))
 
 
-def _unusual(
-    rows: pd.DataFrame, few: pd.Series[int], *, size: int, absent: int, contact: float
-) -> list[str]:
-    """Say in how many frames one cluster has fewer spheres, none, or more than it should."""
-    crowd = rows.groupby("frame")["together"].max().loc[lambda n: n > size]
-    said = [f"{n} found in {_frames(k)}" for n, k in few.value_counts().sort_index().items()]
-    said += [f"none placed in {_frames(absent)}"] if absent else []
-    said += [
-        f"{n} found in {_frames(k)} (two clusters within {REACH * contact:.2g} um)"
-        for n, k in crowd.value_counts().sort_index().items()
-    ]
-    return said
-
-
-def _frames(count: int) -> str:
+def _frame_count(count: int) -> str:
     return f"{count} frame{'' if count == 1 else 's'}"
 
 
-def at_border(features: pd.DataFrame, *, margin: float, dropped: Mapping[int, Ints]) -> Findings:
-    """Note which clusters come near the border, and which of their frames were dropped.
+def clusters_near_border(
+    features: pd.DataFrame, *, margin: float, dropped: Mapping[int, Ints]
+) -> Findings:
+    """Note the clusters near the border, and those of their frames that are dropped.
 
-    `features` is that of `Bodies`.
+    Parameters
+    ----------
+    features : pandas.DataFrame
+        As in `Bodies`.
+    margin : float
+        Largest distance to the border of a centre whose sphere may be cut, um.
+    dropped : mapping
+        Dropped frames of each cluster.
     """
     tracked = features[features["cluster"] >= 0]
     near = tracked[tracked["border"] < margin].groupby("cluster")["frame"]
@@ -424,17 +583,17 @@ def at_border(features: pd.DataFrame, *, margin: float, dropped: Mapping[int, In
         str(c): None for c in sorted({*tracked["cluster"].unique().tolist(), *dropped})
     }
     for cluster in sorted({*touched, *dropped}):
-        gone = dropped.get(cluster, np.empty(0, dtype=np.int64))
-        frames = np.union1d(touched.get(cluster, np.empty(0, dtype=np.int64)), gone)
-        text = f"in {at(frames)}"
-        if len(gone):
-            text += f"; dropped, as spheres are out of view: {at(gone)}"
+        cut = dropped.get(cluster, np.empty(0, dtype=np.int64))
+        frames = np.union1d(touched.get(cluster, np.empty(0, dtype=np.int64)), cut)
+        text = f"in {frame_runs_text(frames)}"
+        if len(cut):
+            text += f"; dropped, as spheres are out of view: {frame_runs_text(cut)}"
         verdicts[str(cluster)] = Verdict(text, float(len(frames)))
     return Findings(
         notes=tuple(
             f"centre within d/2 + 2 sigma ({margin:.2g} um) of the border, "
             f"{f'cluster {name} ' if name else ''}{text}"
-            for name, text in of_clusters(verdicts).items()
+            for name, text in combined_verdicts(verdicts).items()
         )
     )
 
@@ -447,7 +606,20 @@ def scan_blur(
     height: float,
     diameter: float,
 ) -> Verdict | None:
-    """Say how far a cluster moves while its planes are scanned; `height` of a plane, um."""
+    """Warn if a cluster moves significantly while its planes are scanned.
+
+    Parameters
+    ----------
+    motion : RigidMotion
+    D_T : DiffusionEstimate
+        Translational diffusion coefficient, um^2/s.
+    plane_time : float or None
+        Time between planes, s.
+    height : float
+        Distance of planes, um.
+    diameter : float
+        Sphere diameter, um.
+    """
     if plane_time is None or motion.template.shape[1] != 3 or not D_T.value > 0:
         return None
     planes = (2 * motion.R + diameter) / height
@@ -457,7 +629,7 @@ def scan_blur(
     blur_error = blur * D_T.stderr / (2 * D_T.value)
     n, freedom = len(motion.template), max(1, motion.fitted.size - 1)
     sigma_error = sigma / np.sqrt(2 * max(1, 3 * n - 6) * freedom)
-    if not blur - sigma > _NORMAL * np.hypot(blur_error, sigma_error):
+    if not blur - sigma > _NORMAL_QUANTILE * np.hypot(blur_error, sigma_error):
         return None
     text = (
         f"cluster scanned in {scan:.2g} s ({planes:.0f} planes of {plane_time:.2g} s): motion blur "
@@ -469,17 +641,36 @@ def scan_blur(
 
 
 def step_length(motion: RigidMotion, *, contact: float) -> float:
-    """Return the rms displacement of a particle between neighbouring frames over the contact."""
-    square, _ = _squares(motion)
+    """Return the rms displacement of a particle between neighbouring frames over the contact.
+
+    Parameters
+    ----------
+    motion : RigidMotion
+    contact : float
+        Centre distance of touching spheres, um.
+
+    Returns
+    -------
+    float
+        0 if no two neighbouring frames have a pose.
+    """
+    square, _ = _mean_square_step(motion)
     return float(np.sqrt(square)) / contact if np.isfinite(square) else 0.0
 
 
 def long_steps(motion: RigidMotion, *, contact: float) -> Verdict | None:
-    """Warn of steps over a quarter of the contact distance, which endanger identities."""
-    over, count = step_length(motion, contact=contact), _squares(motion)[1]
-    if not _certainly_over(over, _QUARTER, freedom=count * motion.template.shape[1]):
+    """Warn of an rms step over a quarter of the contact distance, which makes identities unsafe.
+
+    Parameters
+    ----------
+    motion : RigidMotion
+    contact : float
+        Centre distance of touching spheres, um.
+    """
+    over, count = step_length(motion, contact=contact), _mean_square_step(motion)[1]
+    if not exceeds_rms(over, _UNSAFE_STEP, freedom=count * motion.template.shape[1]):
         return None
-    safe = motion.dt * (_QUARTER / over) ** 2
+    safe = motion.dt * (_UNSAFE_STEP / over) ** 2
     error = over * contact / np.sqrt(2 * count * motion.template.shape[1])
     text = (
         f"rms step {over * contact:.3g} +- {error:.1g} um is over a quarter of the contact "
@@ -489,58 +680,92 @@ def long_steps(motion: RigidMotion, *, contact: float) -> Verdict | None:
     return Verdict(text, over)
 
 
-def _certainly_over(rms: float, bound: float, *, freedom: int) -> bool:
-    """Return whether Gaussian steps of this rms, with so many squares, are longer than `bound`."""
+def exceeds_rms(rms: float, bound: float, *, freedom: int) -> bool:
+    """Return whether Gaussian steps have an rms above a bound (chi-square test, level 1 %).
+
+    Parameters
+    ----------
+    rms : float
+        Measured root mean square.
+    bound : float
+        Bound of the true value.
+    freedom : int
+        Number of independent squares.
+
+    Examples
+    --------
+    >>> exceeds_rms(1.1, 1.0, freedom=10), exceeds_rms(1.1, 1.0, freedom=1000)
+    (False, True)
+    """
     from scipy.special import chdtri
 
-    return freedom > 0 and bool(freedom * (rms / bound) ** 2 > chdtri(freedom, _LEVEL))
+    return freedom > 0 and bool(freedom * (rms / bound) ** 2 > chdtri(freedom, _TEST_LEVEL))
 
 
-def refused(motion: RigidMotion, *, contact: float) -> str:
-    """Return why a cluster is refused for steps over half the contact distance; "" if it is not."""
+def refusal(motion: RigidMotion, *, contact: float) -> str:
+    """Return the reason to refuse a cluster with steps over half the contact distance, or "".
+
+    Parameters
+    ----------
+    motion : RigidMotion
+    contact : float
+        Centre distance of touching spheres, um.
+    """
     over = step_length(motion, contact=contact)
-    if over <= _HALF:
+    if over <= _REFUSED_STEP:
         return ""
-    fast = motion.dt * (_QUARTER / over) ** 2
+    fast = motion.dt * (_UNSAFE_STEP / over) ** 2
     return (
         f"rms step {over * contact:.3g} um is over half of the contact distance {contact:.3g} um: "
         f"which label belongs to which particle cannot be known; take frames every {fast:.2g} s"
     )
 
 
-def _squares(motion: RigidMotion) -> tuple[float, int]:
+def _mean_square_step(motion: RigidMotion) -> tuple[float, int]:
     """Return the mean square displacement of the particles over one frame, um^2, and the steps."""
-    start, stop = _neighbours(motion)
+    start, stop = _frame_steps(motion)
     x = motion.positions()
     square = ((x[stop] - x[start]) ** 2).sum(axis=-1)
     return (float(square.mean()) if square.size else np.nan), len(start)
 
 
-def _neighbours(motion: RigidMotion) -> tuple[Ints, Ints]:
-    """Return the rows of the steps that join neighbouring frames."""
+def _frame_steps(motion: RigidMotion) -> tuple[Ints, Ints]:
+    """Return the rows of the poses before and after each step of one frame."""
     start, stop = motion.steps()
     near = motion.time[stop] - motion.time[start] < 1.5 * motion.dt
     return start[near], stop[near]
 
 
 def slow_sampling(motion: RigidMotion) -> Verdict | None:
-    """Say where frames are too far apart for the rotation."""
+    """Warn if the rotation between neighbouring frames is too large.
+
+    Parameters
+    ----------
+    motion : RigidMotion
+    """
     angles = _step_angles(motion)
     if motion.template.shape[1] != 3 or not angles.size:
         return None
     rms = float(np.sqrt(np.mean(angles**2)))
-    if not _certainly_over(rms, _SLOW, freedom=3 * angles.size):
+    if not exceeds_rms(rms, _SLOW_ROTATION, freedom=3 * angles.size):
         return None
     error = rms / np.sqrt(6 * angles.size)
     text = (
-        f"rms rotation per frame {rms:.2g} +- {error:.1g} rad is over {_SLOW}: sampling too slow, "
-        "D_R biased low; take frames more often"
+        f"rms rotation per frame {rms:.2g} +- {error:.1g} rad is over {_SLOW_ROTATION}: "
+        "sampling too slow, D_R biased low; take frames more often"
     )
     return Verdict(text, rms)
 
 
 def fast_sampling(motion: RigidMotion, *, phi2: float) -> Verdict | None:
-    """Note where frames are so close that their steps are mostly noise."""
+    """Note if the steps between neighbouring frames are mostly noise.
+
+    Parameters
+    ----------
+    motion : RigidMotion
+    phi2 : float
+        Noise of the MSAD, rad^2.
+    """
     angles = _step_angles(motion)
     if not (angles.size and phi2 > 0):
         return None
@@ -549,16 +774,61 @@ def fast_sampling(motion: RigidMotion, *, phi2: float) -> Verdict | None:
     first = float(np.mean(angles**2)) * (2 / 3 if solid else 1)
     # Neighbouring steps of noise share a pose: 1.5 times the variance of independent ones.
     error = first * np.sqrt(1.5 * 2 / ((3 if solid else 1) * angles.size))
-    if not first + _NORMAL * error < _FAST * phi2:
+    if not first + _NORMAL_QUANTILE * error < _FAST_RATIO * phi2:
         return None
     text = (
         f"MSAD at first lag {first:.2g} +- {error:.1g} rad^2 < 2 x Phi^2 ({phi2:.2g}): sampling "
-        "too fast, steps are mostly noise; fewer frames over a longer time tell more"
+        "too fast, steps are mostly noise; take fewer frames over a longer time"
     )
     return Verdict(text, phi2 / first if first > 0 else np.inf)
 
 
+def check_clusters(
+    results: Sequence[ClusterResult],
+    *,
+    contact: float,
+    plane_time: float | None,
+    height: float,
+    diameter: float,
+) -> tuple[tuple[ClusterResult, ...], Findings]:
+    """Run the checks of steps, sampling and scan on every cluster.
+
+    Parameters
+    ----------
+    results : sequence of ClusterResult
+    contact : float
+        Centre distance of touching spheres, um.
+    plane_time, height, diameter
+        As in `scan_blur`.
+
+    Returns
+    -------
+    results : tuple of ClusterResult
+        With the warnings about one cluster.
+    findings : Findings
+        Warnings about several clusters, and all notes.
+    """
+    own, found = {r.name: r.warnings for r in results}, Findings()
+    alarms: tuple[Callable[[ClusterResult], Verdict | None], ...] = (
+        lambda r: long_steps(r.motion, contact=contact),
+        lambda r: slow_sampling(r.motion),
+        lambda r: scan_blur(
+            r.motion, D_T=r.D_T, plane_time=plane_time, height=height, diameter=diameter
+        ),
+    )
+    for check in alarms:
+        for name, text in combined_verdicts({r.name: check(r) for r in results}).items():
+            if name:
+                own[name] = (*own[name], text)
+            else:
+                found += Findings((text,))
+    fast = {r.name: fast_sampling(r.motion, phi2=r.noise.phi2) for r in results}
+    for name, text in combined_verdicts(fast).items():
+        found += Findings(notes=(f"cluster {name}: {text}" if name else text,))
+    return tuple(replace(r, warnings=own[r.name]) for r in results), found
+
+
 def _step_angles(motion: RigidMotion) -> Floats:
     """Return the rotation angles between neighbouring frames, rad."""
-    _, stop = _neighbours(motion)
+    _, stop = _frame_steps(motion)
     return np.asarray(np.linalg.norm(motion.step_vectors()[stop - 1], axis=-1))

@@ -1,4 +1,4 @@
-"""Which frames of a run are done: tables kept piece by piece, so that a run can go on."""
+"""Tables of finished frames, written in parts, so that an interrupted run can be resumed."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 _SETTINGS = "settings.json"
 
 
-_SECONDS = 2.0  # between two parts: the most work that a power cut takes
+_PART_SECONDS = 2.0  # between two parts; at most this much work is lost in a power cut
 
 
 def open_parts(folder: Path, settings: Mapping[str, Any]) -> set[str]:
@@ -31,30 +31,30 @@ def open_parts(folder: Path, settings: Mapping[str, Any]) -> set[str]:
     ----------
     folder : Path
     settings : mapping
-        What the parts depend on; plain values as JSON holds them.
+        All settings that the parts depend on; values that JSON can hold.
 
     Returns
     -------
     set of str
-        The names of the parts that stand there.
+        Names of the parts in the folder.
 
     Raises
     ------
     PartsError
-        If its parts are of other settings; the message names those that differ.
+        If its parts have other settings; the message names those that differ.
     """
     folder.mkdir(parents=True, exist_ok=True)
     place = folder / _SETTINGS
     plain = json.loads(json.dumps(settings))
     if place.exists():
         there = json.loads(place.read_text(encoding="utf-8"))
-        told = [
+        different = [
             f"{name} {there.get(name)!r} there, {plain.get(name)!r} now"
             for name in sorted({*there, *plain})
             if there.get(name) != plain.get(name)
         ]
-        if told:
-            raise PartsError(f"{folder} holds the parts of another run: {'; '.join(told)}")
+        if different:
+            raise PartsError(f"{folder} holds the parts of another run: {'; '.join(different)}")
     else:
         with written_whole(place) as beside:
             beside.write_text(json.dumps(plain, indent=2), encoding="utf-8")
@@ -64,14 +64,19 @@ def open_parts(folder: Path, settings: Mapping[str, Any]) -> set[str]:
 def read_parts(folder: Path) -> tuple[pd.DataFrame, list[dict[str, Any]], list[str]]:
     """Read every part.
 
+    Parameters
+    ----------
+    folder : Path
+
     Returns
     -------
-    table : DataFrame
-        The rows of all parts, those of an item once.
+    table : pandas.DataFrame
+        The rows of all parts, those of a frame once.
     entries : list of dict
-        What `PartWriter.add` was told of each item.
+        The entry of each frame, as given to `PartWriter.add`.
     damaged : list of str
-        Parts that cannot be read; they were removed, for their items have to be done again.
+        Names of parts that cannot be read; they were removed, so that their frames are processed
+        again.
     """
     import pandas as pd
 
@@ -80,31 +85,38 @@ def read_parts(folder: Path) -> tuple[pd.DataFrame, list[dict[str, Any]], list[s
     for path in sorted(folder.glob("part-*.parquet")):
         try:
             table = pd.read_parquet(path)
-        # A file that a failing disk left behind raises whatever its decoder does.
+        # The decoder of a damaged file may raise any exception.
         except Exception:
             path.unlink()
             damaged.append(path.name)
             continue
-        told = [e for e in table.attrs["entries"] if e["frame"] not in seen]
-        fresh = {int(e["frame"]) for e in told}
+        added = [e for e in table.attrs["entries"] if e["frame"] not in seen]
+        fresh = {int(e["frame"]) for e in added}
         seen |= fresh
-        entries += told
+        entries += added
         table.attrs = {}
         tables.append(table[table["frame"].isin(fresh)])
-    # Empty tables have no types to add.
+    # The columns of empty tables have no types.
     filled = [t for t in tables if len(t)] or tables[:1] or [pd.DataFrame()]
     return pd.concat(filled, ignore_index=True), entries, damaged
 
 
 @dataclass
 class PartWriter:
-    """Collects finished frames and writes them every few seconds, and at the end.
+    """A context manager that collects finished frames and writes them every few seconds.
 
-    A context manager: what was collected is written even when the work is interrupted.
+    At the end, also after an exception, the frames collected since then are written.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder of the parts.
+    seconds : float
+        Least time between two parts, s.
     """
 
     folder: Path
-    seconds: float = _SECONDS
+    seconds: float = _PART_SECONDS
     _tables: list[pd.DataFrame] = field(default_factory=list)
     _entries: list[dict[str, Any]] = field(default_factory=list)
     _written: float = field(default_factory=time.monotonic)
@@ -116,19 +128,26 @@ class PartWriter:
         self.flush()
 
     def add(self, table: pd.DataFrame, entry: dict[str, Any]) -> None:
-        """Keep the rows of one frame, and what else is to be remembered of it (``frame`` in it)."""
+        """Keep the rows of one frame.
+
+        Parameters
+        ----------
+        table : pandas.DataFrame
+        entry : dict
+            Other values of the frame, with ``frame``.
+        """
         self._tables.append(table)
         self._entries.append(entry)
         if time.monotonic() - self._written >= self.seconds:
             self.flush()
 
     def flush(self) -> None:
-        """Write what was collected as one part, which appears whole or not at all.
+        """Write the collected frames as one part; an incomplete part never appears.
 
         Raises
         ------
         OSError
-            Where it cannot be written, as on a full disk; parts written before stay good.
+            If it cannot be written, as on a full disk; parts written before remain valid.
         """
         import uuid
 

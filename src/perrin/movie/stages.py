@@ -1,4 +1,4 @@
-"""The long stages of a run, frame by frame and kept as they go: finding spheres, fitting poses."""
+"""The two long stages of a run, frame by frame: finding spheres and fitting poses."""
 
 from __future__ import annotations
 
@@ -15,107 +15,105 @@ from perrin.images.optics.optics import Optics
 from perrin.images.optics.window_fit import RigidCenters
 from perrin.images.spheres.localisation import Method, choose_method, found_table, sample_frames
 from perrin.images.spheres.poses import Pose, pose_in, with_poses
+from perrin.movie.checks import Findings, unsettled_poses
 from perrin.movie.parts import PartWriter, open_parts, read_parts
 from perrin.movie.workers import work_through
 from perrin.tracks.writing import written_whole
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
     from pathlib import Path
 
     import pandas as pd
 
     from perrin._arrays import Floats, Ints
-    from perrin.images.spheres.localisation import Refine, SampledFrame, Search
+    from perrin.images.spheres.localisation import Refine, Search
     from perrin.images.stack import Stack
     from perrin.motion.rigid_motion import RigidMotion
-
-    Progress = Callable[[int, int, str], None]
-
+    from perrin.movie.workers import Work
 
 S = TypeVar("S")
 
 
-_METHOD = "method.json"
+_METHOD_FILE = "method.json"
 
 
-@dataclass(frozen=True)
-class Workplace:
-    """Where the work is done and kept.
+def run_frames(
+    task: Callable[[S], tuple[pd.DataFrame, dict[str, Any]]],
+    items: Mapping[int, S],
+    *,
+    folder: Path,
+    work: Work,
+    title: str,
+) -> tuple[pd.DataFrame, pd.DataFrame, list[str]]:
+    """Run a task for all frames that have no finished part yet, and read all parts.
 
-    Attributes
+    Parameters
     ----------
+    task : callable
+        ``task(item)`` returns the rows of a frame, and an entry with ``frame`` and other values.
+    items : mapping
+        Item of each frame.
     folder : Path
-        Of the finished parts.
-    workers : int
-        Processes of this machine; 0 is this one.
-    scheduler : str or None
-        Address of a Dask scheduler.
-    progress : callable or None
-        Called with (done, total, title).
+        Folder of the parts.
+    work : Work
+    title : str
+        Name of the task for the progress.
+
+    Returns
+    -------
+    rows, entries : pandas.DataFrame
+        Results of the task for all items, in the order of the frames.
+    repeated : list of str
+        A note if damaged parts had to be computed again.
     """
+    import pandas as pd
 
-    folder: Path
-    workers: int = 0
-    scheduler: str | None = None
-    progress: Progress | None = None
-
-    def kept(
-        self,
-        task: Callable[[S], tuple[pd.DataFrame, dict[str, Any]]],
-        items: Mapping[int, S],
-        *,
-        title: str,
-    ) -> tuple[pd.DataFrame, pd.DataFrame, list[str]]:
-        """Do what is not done yet, item by item, each known by its frame.
-
-        Returns
-        -------
-        rows, entries : DataFrame
-            What the task made of all items, in the order of the frames.
-        remade : list of str
-            Which parts had to be made again.
-        """
-        import pandas as pd
-
-        table, entries, damaged = read_parts(self.folder)
-        done = {int(e["frame"]) for e in entries}
-        todo = [item for frame, item in items.items() if frame not in done]
-        count = len(items) - len(todo)
-        self.tell(count, len(items), title)
-        if todo:
-            with PartWriter(self.folder) as writer:
-                for rows, entry in work_through(
-                    task, todo, workers=self.workers, scheduler=self.scheduler
-                ):
-                    writer.add(rows, entry)
-                    count += 1
-                    self.tell(count, len(items), title)
-            table, entries, _ = read_parts(self.folder)
-        listed = pd.DataFrame(entries).sort_values("frame", ignore_index=True)
-        rows = table.sort_values("frame", kind="stable", ignore_index=True)
-        remade = f"{len(damaged)} damaged parts in {self.folder} were made again"
-        return rows, listed, [remade] if damaged else []
-
-    def tell(self, done: int, total: int, title: str) -> None:
-        """Say how far the work is."""
-        if self.progress is not None:
-            self.progress(done, total, title)
+    table, entries, damaged = read_parts(folder)
+    done = {int(e["frame"]) for e in entries}
+    remaining = [item for frame, item in items.items() if frame not in done]
+    count = len(items) - len(remaining)
+    work.report(count, len(items), title)
+    if remaining:
+        with PartWriter(folder) as writer:
+            for rows, entry in work_through(
+                task, remaining, workers=work.workers, scheduler=work.scheduler
+            ):
+                writer.add(rows, entry)
+                count += 1
+                work.report(count, len(items), title)
+        table, entries, _ = read_parts(folder)
+    listed = pd.DataFrame(entries).sort_values("frame", ignore_index=True)
+    rows = table.sort_values("frame", kind="stable", ignore_index=True)
+    note = f"{len(damaged)} damaged parts in {folder} were computed again"
+    return rows, listed, [note] if damaged else []
 
 
 class Located(NamedTuple):
-    """What `locate_frames` found.
+    """Spheres of a movie.
 
-    `features` is the table of `locate`, `frames` and `spots` are those of `Imaging`, `told` what
-    was doubtful in choosing the method, `remade` which parts had to be made again.
+    Attributes
+    ----------
+    method : Method
+        How every frame was processed.
+    features : pandas.DataFrame
+        Table of the spheres, as `locate` returns it.
+    frames : pandas.DataFrame
+        Table of the frames, as in `Imaging`.
+    spots : pandas.DataFrame
+        Spots of a few frames, as in `Imaging`.
+    warnings : list of str
+        Warnings about the choice of the method.
+    notes : list of str
+        A note if damaged parts had to be computed again.
     """
 
     method: Method
     features: pd.DataFrame
     frames: pd.DataFrame
     spots: pd.DataFrame
-    told: list[str]
-    remade: list[str]
+    warnings: list[str]
+    notes: list[str]
 
 
 def locate_frames(
@@ -126,19 +124,26 @@ def locate_frames(
     optics: Optics | None,
     frames: Sequence[int],
     settings: Mapping[str, Any],
-    place: Workplace,
+    folder: Path,
+    work: Work,
 ) -> Located:
-    """Find and refine the spheres of many frames, going on where an earlier call stopped.
+    """Find and refine the spheres of many frames; finished frames in the folder are kept.
 
     Parameters
     ----------
     stack : Stack
     search, refine, optics
-        As in `choose_method`; what is open is learned once and kept with the parts.
+        As in `choose_method`; missing settings are learned once and kept with the parts.
     frames : sequence of int
     settings : mapping
-        All that the answer depends on; parts of other settings are refused.
-    place : Workplace
+        All settings that the result depends on; parts of other settings are refused.
+    folder : Path
+        Folder of the parts.
+    work : Work
+
+    Returns
+    -------
+    Located
 
     Raises
     ------
@@ -147,14 +152,14 @@ def locate_frames(
     """
     import pandas as pd
 
-    known = place.folder / _METHOD
+    known = folder / _METHOD_FILE
     if known.exists():
-        open_parts(place.folder, settings)
+        open_parts(folder, settings)
         learned = json.loads(known.read_text(encoding="utf-8"))
     else:
-        place.tell(0, 0, "learning mass cut and optics")
-        learned = _learned(stack, search, refine=refine, optics=optics, frames=frames)
-        open_parts(place.folder, settings)
+        work.report(0, 0, "learning mass cut and optics")
+        learned = learn_method(stack, search, refine=refine, optics=optics, frames=frames)
+        open_parts(folder, settings)
         with written_whole(known) as beside:
             beside.write_text(json.dumps(learned), encoding="utf-8")
     found = learned["optics"]
@@ -163,10 +168,18 @@ def locate_frames(
         refine,
         None if found is None else Optics.from_dict(found),
     )
-    task = _Locate(_light(stack), method)
-    rows, entries, remade = place.kept(task, {i: i for i in frames}, title="locating spheres")
+    rows, entries, notes = run_frames(
+        _LocateTask(_without_times(stack), method),
+        {i: i for i in frames},
+        folder=folder,
+        work=work,
+        title="locating spheres",
+    )
     entries.insert(1, "time", stack.times[entries["frame"].to_numpy()])
-    entries["copy_of"] = _first_alike(entries)
+    # A frame with an earlier one's digest is its copy. Frames without a sphere count as empty.
+    first = entries.groupby("digest")["frame"].transform("min")
+    repeats = (entries["digest"] != "") & (entries["spheres"] > 0) & (first < entries["frame"])
+    entries["copy_of"] = np.where(repeats, first, -1).astype(np.int64)
     rows = rows[~rows["frame"].isin(entries.loc[entries["copy_of"] >= 0, "frame"])]
     spots = pd.DataFrame(learned["spots"], columns=["frame", "mass"])
     return Located(
@@ -175,21 +188,11 @@ def locate_frames(
         entries.drop(columns="digest"),
         spots,
         learned["told"],
-        remade,
+        notes,
     )
 
 
-def _first_alike(entries: pd.DataFrame) -> Ints:
-    """Return the earlier frame that each frame repeats exactly; -1 where it repeats none.
-
-    Frames without a sphere are empty, whether they are alike or not.
-    """
-    first = entries.groupby("digest")["frame"].transform("min")
-    alike = (entries["digest"] != "") & (entries["spheres"] > 0) & (first < entries["frame"])
-    return np.where(alike, first, -1).astype(np.int64)
-
-
-def _learned(
+def learn_method(
     stack: Stack,
     search: Search,
     *,
@@ -197,47 +200,58 @@ def _learned(
     optics: Optics | None,
     frames: Sequence[int],
 ) -> dict[str, Any]:
-    """Learn from a few frames how all are to be treated; plain values as JSON holds them."""
+    """Choose mass cut and optics from a few frames.
+
+    Parameters
+    ----------
+    stack, search, refine, optics
+        As in `choose_method`.
+    frames : sequence of int
+        Frames of the run.
+
+    Returns
+    -------
+    dict
+        Values that JSON can hold: ``minmass``, ``optics``, the ``spots`` of the sampled frames as
+        (frame, mass), and the warnings under ``told``.
+
+    Raises
+    ------
+    TooFewFramesError
+        If all frames are the same image; images without any contrast are not compared.
+    """
     sample = sample_frames(stack, search, frames)
-    _refuse_still(stack, sample, frames)
-    with warnings.catch_warnings(record=True) as said:
+    first = sample[0].frame
+    equal = (
+        len(frames) > 1
+        and first.min() < first.max()
+        and all(np.array_equal(seen.frame, first) for seen in sample)
+    )
+    if equal:
+        try:
+            equal = all(np.array_equal(stack.frame(i), first) for i in frames)
+        except FrameError:
+            equal = False  # a frame that cannot be read counts as a different image
+    if equal:
+        raise TooFewFramesError(
+            f"all {len(frames)} frames are exactly the same image, voxel by voxel: the movie shows "
+            f"no motion, one image was written {len(frames)} times",
+            1,
+        )
+    with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", PrecisionWarning)
         method = choose_method(stack, search, sample, refine=refine, optics=optics)
     return {
         "minmass": method.search.minmass,
         "optics": None if method.optics is None else asdict(method.optics),
         "spots": [[seen.number, mass] for seen in sample for mass in seen.spots.mass.tolist()],
-        "told": [str(one.message) for one in said],
+        "told": [str(warning.message) for warning in caught],
     }
 
 
-def _refuse_still(stack: Stack, sample: Sequence[SampledFrame], frames: Sequence[int]) -> None:
-    """Refuse a movie all of whose frames are the same image; one without any contrast is not one.
-
-    Raises
-    ------
-    TooFewFramesError
-    """
-    first = sample[0].frame
-    if first.min() == first.max() or len(frames) < 2:
-        return
-    if not all(np.array_equal(seen.frame, first) for seen in sample):
-        return
-    try:
-        same = all(np.array_equal(stack.frame(i), first) for i in frames)
-    except FrameError:
-        return
-    if same:
-        raise TooFewFramesError(
-            f"all {len(frames)} frames are exactly the same image, voxel by voxel: the movie shows "
-            f"no motion, one image was written {len(frames)} times",
-            1,
-        )
-
-
 @dataclass(frozen=True)
-class _Locate:
-    """Finds the spheres of one frame."""
+class _LocateTask:
+    """Find the spheres of one frame."""
 
     stack: Stack
     method: Method
@@ -247,28 +261,28 @@ class _Locate:
         try:
             found = self.method.locate_in(self.stack, i)
         except FrameError as fault:
-            nothing = {"level": np.nan, "saturated": np.nan, "digest": "", "fault": str(fault)}
-            return found_table([]), entry | nothing
+            missing = {"level": np.nan, "saturated": np.nan, "digest": "", "fault": str(fault)}
+            return found_table([]), entry | missing
         entry |= {"spots": found.spots, "spheres": len(found.columns["mass"])}
         entry |= {"level": found.level, "saturated": found.saturated, "digest": found.digest}
         entry["fault"] = ""
         return found_table([found]), entry
 
 
-def _light(stack: Stack) -> Stack:
-    """Return the stack without its times, which workers need not be sent."""
+def _without_times(stack: Stack) -> Stack:
+    """Return the stack without its times, which workers do not need."""
     return replace(stack, times=np.empty(0))
 
 
-class _Standing(NamedTuple):
-    """One frame's bodies (which, centres, rotations) and all its spheres, x, y, z."""
+class _FramePoses(NamedTuple):
+    """Start of the fits of one frame: poses of its bodies, and all its spheres."""
 
     frame: int
     body: Ints
     center: Floats
     rotation: Floats
     spheres: Floats
-    owner: Ints
+    owner: Ints  # body of each sphere, -1 for none
 
 
 def fit_poses(
@@ -277,55 +291,71 @@ def fit_poses(
     *,
     optics: Optics,
     features: pd.DataFrame,
-    place: Workplace,
-) -> tuple[dict[int, RigidMotion], int, int, list[str]]:
+    folder: Path,
+    work: Work,
+) -> tuple[dict[int, RigidMotion], Findings]:
     """Fit the pose of every body in every frame to the images.
 
     Parameters
     ----------
     stack : Stack
     motions : mapping
-        Motion of each cluster and the stack's frame of each of its rows.
+        Motion of each cluster, and the stack's frame of each of its rows.
     optics : Optics
-    features : DataFrame
-        All spheres, with ``cluster``: light of other spheres is left out of a body's fit.
-    place : Workplace
+    features : pandas.DataFrame
+        All spheres, with ``cluster``: the intensity of other spheres is excluded from the fit of a
+        body.
+    folder : Path
+        Folder of the parts. Parts of other bodies are removed.
+    work : Work
 
     Returns
     -------
     motions : dict of RigidMotion
-        Where a fit does not settle the pose of the free centres stays.
-    unsettled, count : int
-        How many fits did not settle, of how many.
-    remade : list of str
-        Which parts had to be made again.
+        If a fit does not converge, the pose of the free centres remains.
+    findings : Findings
+        Number of fits that did not converge, and damaged parts.
     """
     templates = {c: motion.template for c, (motion, _) in motions.items()}
-    items = _standing(motions, features)
-    settings = {"starts": _digest(templates, items.values()), "optics": asdict(optics)}
-    if place.folder.exists() and not _same(place.folder, settings):
-        import shutil
-
-        # Poses follow from what was located: those of other bodies are of no use to anybody.
-        shutil.rmtree(place.folder)
-    open_parts(place.folder, settings)
-    task = _Stand(_light(stack), optics, templates)
-    rows, _, remade = place.kept(task, items, title="fitting poses")
-    return _reposed(motions, rows), int(rows["x"].isna().sum()), len(rows), remade
-
-
-def _same(folder: Path, settings: Mapping[str, Any]) -> bool:
+    starts = _poses_by_frame(motions, features)
+    total = hashlib.sha256()
+    for cluster, template in templates.items():
+        total.update(np.int64(cluster).tobytes() + template.tobytes())
+    for start in starts.values():
+        for part in start[1:]:
+            total.update(np.ascontiguousarray(part).tobytes())
+    settings = {"starts": total.hexdigest(), "optics": asdict(optics)}
     try:
         open_parts(folder, settings)
     except ValueError:
-        return False
-    return True
+        import shutil
+
+        # Poses follow from the located spheres; those of other bodies are useless.
+        shutil.rmtree(folder)
+        open_parts(folder, settings)
+    task = _PoseTask(_without_times(stack), optics, templates)
+    rows, _, notes = run_frames(task, starts, folder=folder, work=work, title="fitting poses")
+
+    fitted = {}
+    for cluster, (motion, frames) in motions.items():
+        mine = rows[(rows["cluster"] == cluster) & rows["x"].notna()]
+        row_of = {int(frame): k for k, frame in enumerate(frames)}
+        number = mine["frame"].to_numpy()
+        pose = mine[list(_POSE)].to_numpy(dtype=np.float64)
+        spread = mine[list(_SPREAD)].to_numpy(dtype=np.float64)
+        poses = {
+            row_of[int(i)]: Pose(p[:3], p[3:].reshape(3, 3), s[:9].reshape(3, 3), float(s[9]))
+            for i, p, s in zip(number, pose, spread, strict=True)
+        }
+        fitted[cluster] = with_poses(motion, poses)
+    findings = unsettled_poses(int(rows["x"].isna().sum()), len(rows))
+    return fitted, findings + Findings(notes=tuple(notes))
 
 
-def _standing(
+def _poses_by_frame(
     motions: Mapping[int, tuple[RigidMotion, Ints]], features: pd.DataFrame
-) -> dict[int, _Standing]:
-    """Return for every frame with a body what its fits start from."""
+) -> dict[int, _FramePoses]:
+    """Return the start of the fits for every frame with a body."""
     starts: dict[int, list[tuple[int, Floats, Floats]]] = {}
     for cluster, (motion, frames) in motions.items():
         for row in motion.fitted.tolist():
@@ -335,7 +365,7 @@ def _standing(
     owner = features["cluster"].to_numpy(dtype=np.int64)
     rows = features.reset_index(drop=True).groupby("frame").indices
     return {
-        i: _Standing(
+        i: _FramePoses(
             i,
             np.array([c for c, _, _ in starts[i]]),
             np.array([x for _, x, _ in starts[i]]),
@@ -347,31 +377,23 @@ def _standing(
     }
 
 
-def _digest(templates: Mapping[int, Floats], items: Iterable[_Standing]) -> str:
-    total = hashlib.sha256()
-    for cluster, template in templates.items():
-        total.update(np.int64(cluster).tobytes() + template.tobytes())
-    for item in items:
-        for part in item[1:]:
-            total.update(np.ascontiguousarray(part).tobytes())
-    return total.hexdigest()
-
-
+# Columns of a pose: centre and rotation matrix.
 _POSE = ("x", "y", "z", *(f"r{i}{j}" for i in range(3) for j in range(3)))
 
 
+# Columns of its error: covariance of the rotation vector, and variance of the centre.
 _SPREAD = (*(f"c{i}{j}" for i in range(3) for j in range(3)), "variance")
 
 
 @dataclass(frozen=True)
-class _Stand:
-    """Fits the poses of one frame."""
+class _PoseTask:
+    """Fit the poses of one frame."""
 
     stack: Stack
     optics: Optics
     templates: Mapping[int, Floats]
 
-    def __call__(self, item: _Standing) -> tuple[pd.DataFrame, dict[str, Any]]:
+    def __call__(self, item: _FramePoses) -> tuple[pd.DataFrame, dict[str, Any]]:
         import pandas as pd
 
         frame = np.asarray(self.stack.frame(item.frame), dtype=np.float64)
@@ -391,21 +413,3 @@ class _Stand:
         table.insert(0, "frame", item.frame)
         table.insert(1, "cluster", item.body)
         return table, {"frame": item.frame}
-
-
-def _reposed(
-    motions: Mapping[int, tuple[RigidMotion, Ints]], rows: pd.DataFrame
-) -> dict[int, RigidMotion]:
-    answer = {}
-    for cluster, (motion, frames) in motions.items():
-        mine = rows[(rows["cluster"] == cluster) & rows["x"].notna()]
-        row_of = {int(frame): k for k, frame in enumerate(frames)}
-        number = mine["frame"].to_numpy()
-        pose = mine[list(_POSE)].to_numpy(dtype=np.float64)
-        spread = mine[list(_SPREAD)].to_numpy(dtype=np.float64)
-        poses = {
-            row_of[int(i)]: Pose(p[:3], p[3:].reshape(3, 3), s[:9].reshape(3, 3), float(s[9]))
-            for i, p, s in zip(number, pose, spread, strict=True)
-        }
-        answer[cluster] = with_poses(motion, poses)
-    return answer

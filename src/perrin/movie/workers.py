@@ -1,12 +1,19 @@
-"""Where independent pieces of work are done: here, on several cores, or on a Dask cluster."""
+"""Independent tasks: in this process, on several cores, or on a Dask cluster."""
 
 from __future__ import annotations
 
 from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from perrin._arrays import number_fault, refuse
+
 if TYPE_CHECKING:
+    import os
     from collections.abc import Callable, Iterator, Sequence
+    from typing import TypeAlias
+
+    Progress: TypeAlias = Callable[[int, int, str], None]
 
 
 S = TypeVar("S")
@@ -15,13 +22,81 @@ S = TypeVar("S")
 T = TypeVar("T")
 
 
-_CHUNK = 4  # items a worker takes at once: a file is opened once for all of them
+_ITEMS_AT_ONCE = 4  # items that a worker gets at once; it opens the file once for all of them
 
 
 _TIMEOUT = 15  # s, to find the scheduler
 
 
-_KEPT = 2**28  # bytes that a worker's memory allocator does not give back
+_KEPT_MEMORY = 2**28  # bytes that the memory allocator of a worker does not give back
+
+
+@dataclass(frozen=True, kw_only=True)
+class Work:
+    """Where the work of a movie is done, and where its results are kept.
+
+    Parameters
+    ----------
+    keep : path, optional
+        Folder of finished frames: the same call resumes there. None keeps nothing.
+    anew : bool
+        Remove the parts of another input or of other settings in the folder, instead of an error.
+    workers : int
+        Number of processes of this machine; 0 does the work in this one.
+    scheduler : str, optional
+        Address of a Dask scheduler whose workers do the work; they must be able to read the file.
+    progress : callable, optional
+        Called with (done, total, title) while the work is done.
+
+    Raises
+    ------
+    ValueError
+        If a value is out of its range; all faults in one message.
+
+    Examples
+    --------
+    >>> Work(workers=8).workers
+    8
+    >>> Work(scheduler="node7")
+    Traceback (most recent call last):
+        ...
+    ValueError: scheduler: expected an address like tcp://node7:8786, got 'node7'
+    """
+
+    keep: str | os.PathLike[str] | None = None
+    anew: bool = False
+    workers: int = 0
+    scheduler: str | None = None
+    progress: Progress | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse values out of range."""
+        import re
+
+        faults = number_fault("workers", self.workers, least=0, whole=True)
+        if not faults and self.workers and self.scheduler is not None:
+            faults.append(
+                "workers: expected processes of this machine, 0 or more, or a scheduler instead, "
+                f"got {self.workers} and {self.scheduler!r}"
+            )
+        if self.scheduler is not None and not re.fullmatch(r"\w+://\S+:\d+", self.scheduler):
+            faults.append(
+                f"scheduler: expected an address like tcp://node7:8786, got {self.scheduler!r}"
+            )
+        refuse(faults)
+
+    def report(self, done: int, total: int, title: str) -> None:
+        """Report the progress of the work.
+
+        Parameters
+        ----------
+        done, total : int
+            Number of finished items, and of all items; 0 of 0 if it is not known.
+        title : str
+            Name of the work.
+        """
+        if self.progress is not None:
+            self.progress(done, total, title)
 
 
 def work_through(
@@ -31,30 +106,31 @@ def work_through(
     workers: int = 0,
     scheduler: str | None = None,
 ) -> Iterator[T]:
-    """Yield what the task makes of every item, in the order in which they are done.
+    """Yield the result of a task for every item, in the order in which they are finished.
 
     Parameters
     ----------
     task : callable
-        ``task(item)``; all three can be pickled where they go to other processes.
+        ``task(item)``; task, items and results can be pickled for other processes.
     items : sequence
     workers : int
-        Processes of this machine; 0 does the work in this one.
+        Number of processes of this machine; 0 does the work in this one.
     scheduler : str, optional
-        Address of a running Dask scheduler, as in ``tcp://node7:8786``; its workers do the work.
+        Address of a running Dask scheduler, such as ``tcp://node7:8786``, whose workers do the
+        work.
 
     Raises
     ------
     ModuleNotFoundError
         If dask.distributed is needed and not installed.
     OSError
-        If the scheduler does not answer, or workers die over a task again and again.
+        If the scheduler does not answer, or a task kills its workers repeatedly.
 
     Notes
     -----
-    Numerical libraries use one thread for each item wherever it is done, so that sums are taken in
-    the same order and results do not depend on the place. Work that a lost worker had is repeated
-    by another one (Dask's own doing).
+    Numerical libraries use one thread for each item everywhere, so that sums are taken in the same
+    order and results do not depend on the number of workers. Dask repeats the work of a lost worker
+    on another one.
 
     Examples
     --------
@@ -65,30 +141,50 @@ def work_through(
         for item in items:
             yield _one_thread(task, item)
         return
+    from concurrent.futures import CancelledError
+
     with _client(workers, scheduler) as client:
-        yield from _spread_out(client, task, items)
+        from distributed import KilledWorker, as_completed
+
+        starts = range(0, len(items), _ITEMS_AT_ONCE)
+        chunks = [list(items[k : k + _ITEMS_AT_ONCE]) for k in starts]
+        tasks = [task] * len(chunks)
+        futures = client.map(_several_items, tasks, chunks, pure=False, retries=0)
+        try:
+            for future in as_completed(futures, loop=client.loop):
+                yield from future.result()
+                future.release()
+        except KilledWorker as fault:
+            raise OSError(
+                "workers were killed repeatedly by the same piece of work (out of memory, or out "
+                f"of time?): {fault}"
+            ) from fault
+        except CancelledError as fault:
+            raise ConnectionError(
+                "the Dask scheduler has stopped; finished frames are kept"
+            ) from fault
 
 
-def check_workers(workers: int, scheduler: str | None) -> None:
-    """Find out, before any work is done, whether dask is there and the scheduler answers.
+def check_workers(work: Work) -> None:
+    """Check, before any work is done, that dask is installed and the scheduler answers.
+
+    Parameters
+    ----------
+    work : Work
 
     Raises
     ------
-    ValueError
-        For an address that is none.
     ModuleNotFoundError, OSError
         As in `work_through`.
-    """
-    import re
 
-    if scheduler is not None:
-        if not re.fullmatch(r"\w+://\S+:\d+", scheduler):
-            raise ValueError(
-                f"scheduler: expected an address like tcp://node7:8786, got {scheduler!r}"
-            )
-        with _client(0, scheduler):
+    Examples
+    --------
+    >>> check_workers(Work())
+    """
+    if work.scheduler is not None:
+        with _client(0, work.scheduler):
             pass
-    elif workers:
+    elif work.workers:
         _dask()
 
 
@@ -116,53 +212,30 @@ def _one_thread(task: Callable[[S], T], item: S) -> T:
         return task(item)
 
 
-def _chunk_done(task: Callable[[S], T], chunk: list[S]) -> list[T]:
-    return [_one_thread(task, item) for item in chunk]
-
-
-def _spread_out(
-    client: Any,  # noqa: ANN401 (a library that is not always there)
-    task: Callable[[S], T],
-    items: Sequence[S],
-) -> Iterator[T]:
-    from concurrent.futures import CancelledError
-
-    from distributed import KilledWorker, as_completed
-
-    chunks = [list(items[k : k + _CHUNK]) for k in range(0, len(items), _CHUNK)]
-    futures = client.map(_chunk_done, [task] * len(chunks), chunks, pure=False, retries=0)
-    try:
-        for future in as_completed(futures, loop=client.loop):
-            yield from future.result()
-            future.release()
-    except KilledWorker as fault:
-        raise OSError(
-            "workers die again and again over the same piece of work (out of memory, or out of "
-            f"time?): {fault}"
-        ) from fault
-    except CancelledError as fault:
-        raise ConnectionError("the Dask scheduler is gone; what was done is kept") from fault
+def _several_items(task: Callable[[S], T], items: list[S]) -> list[T]:
+    return [_one_thread(task, item) for item in items]
 
 
 @contextmanager
 def _client(workers: int, scheduler: str | None) -> Iterator[Any]:
-    """Give a client of the cluster at that address, or of processes started here."""
+    """Give a client of the cluster at an address, or of processes started on this machine."""
     dask, Client, LocalCluster = _dask()
     if scheduler is not None:
         with Client(scheduler, timeout=_TIMEOUT, set_as_default=False) as client:
             yield client
         return
-    with dask.config.set({"distributed.nanny.pre-spawn-environ": _memory()}):
+    # Returning the memory of every array, Dask's default, takes a third of the time.
+    environ = {
+        **dask.config.get("distributed.nanny.pre-spawn-environ", {}),
+        "MALLOC_TRIM_THRESHOLD_": _KEPT_MEMORY,
+        "MALLOC_MMAP_THRESHOLD_": _KEPT_MEMORY,
+    }
+    with dask.config.set({"distributed.nanny.pre-spawn-environ": environ}):
         cluster = LocalCluster(
-            n_workers=workers, threads_per_worker=1, dashboard_address=None, silence_logs=50
+            n_workers=workers,
+            threads_per_worker=1,
+            dashboard_address="127.0.0.1:0",
+            silence_logs=50,
         )
     with cluster, Client(cluster, set_as_default=False) as client:
         yield client
-
-
-def _memory() -> dict[str, int]:
-    """Let workers keep their memory: Dask's default gives every array back, a third of the time."""
-    import dask
-
-    default = dask.config.get("distributed.nanny.pre-spawn-environ", {})
-    return {**default, "MALLOC_TRIM_THRESHOLD_": _KEPT, "MALLOC_MMAP_THRESHOLD_": _KEPT}

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import warnings as python_warnings
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from perrin.diffusion.estimators import estimate_diffusion
+from perrin.diffusion.noise_model import Noise
 from perrin.errors import PrecisionWarning
 from perrin.hydrodynamics.mobility import Mobility, condition_faults
 from perrin.run.predictions import Body, Shape, find_sizes, solve_bodies
@@ -22,6 +23,37 @@ if TYPE_CHECKING:
     from perrin.hydrodynamics.sizes import Size
     from perrin.motion.rigid_motion import RigidMotion
     from perrin.tracks.clock import Clock
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Experiment:
+    """Known conditions of an experiment.
+
+    Parameters
+    ----------
+    dt : float, optional
+        Time between frames, s.
+    sigma : array_like, optional
+        Known localisation error, um, one number or one per axis.
+    viscosity : float, optional
+        Viscosity of the fluid, Pa s.
+    temperature : float, optional
+        Temperature of the fluid, K.
+    diameter : float, optional
+        Sphere diameter, um.
+    noise : Noise
+        Assumptions on the measurement noise.
+    keep_jumps : bool
+        Include steps in the estimates that Brownian motion cannot make.
+    """
+
+    dt: float | None = None
+    sigma: ArrayLike | None = None
+    viscosity: float | None = None
+    temperature: float | None = None
+    diameter: float | None = None
+    noise: Noise = field(default_factory=Noise)
+    keep_jumps: bool = False
 
 
 @dataclass(frozen=True, eq=False)

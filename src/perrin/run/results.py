@@ -16,7 +16,7 @@ from perrin.curves.displacement import LagCurve, msad, msd
 from perrin.diffusion.estimate import DiffusionEstimate, _estimate_dict, _estimate_from
 from perrin.diffusion.step_tests import without_spin
 from perrin.diffusion.tensor_results import DiffusionTensor, _tensor_dict, _tensor_from
-from perrin.hydrodynamics.sizes import Size, _sizes_dict, _sizes_from
+from perrin.hydrodynamics.sizes import Size, sizes_from_dict, sizes_to_dict
 from perrin.images.imaging import Imaging, read_imaging, write_imaging
 from perrin.motion.floor import NoiseFloor, floor_of
 from perrin.motion.rigid_motion import RigidMotion
@@ -118,7 +118,7 @@ class ClusterResult:
             "phi2": {"measured": finite_or_none(self.phi2_measured), "predicted": self.noise.phi2},
             "snr": finite_or_none(self.D_R.snr),
             "tensor": None if self.tensor is None else _tensor_dict(self.tensor),
-            "sizes": None if self.sizes is None else _sizes_dict(self.sizes),
+            "sizes": None if self.sizes is None else sizes_to_dict(self.sizes),
             "size_factor": next((s.factor for s in (self.sizes or {}).values()), None),
             "prediction": None if self.prediction is None else self.prediction.to_dict(),
             "quality": None if self.quality is None else self.quality.to_dict(),
@@ -382,7 +382,7 @@ def _result_from(entry: dict[str, Any], motion: RigidMotion) -> ClusterResult:
         D_T=_estimate_from(entry["D_T"]),
         tensor=None if entry["tensor"] is None else _tensor_from(entry["tensor"]),
         noise=predicted_noise(motion),
-        sizes=None if entry["sizes"] is None else _sizes_from(entry),
+        sizes=None if entry["sizes"] is None else sizes_from_dict(entry),
         warnings=tuple(entry["warnings"]),
         label=entry["label"],
         quality=None if entry["quality"] is None else Quality.from_dict(entry["quality"]),
