@@ -75,7 +75,7 @@ def with_error(value: float, stderr: float) -> str:
 
 
 def number_text(value: float, stderr: float = np.nan, *, digits: int = 3) -> str:
-    """Write a number, with its standard error in the last digits, and a power of ten where it is needed.
+    """Write a number, with its standard error in the last digits, and a power of ten if needed.
 
     Parameters
     ----------
