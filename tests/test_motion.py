@@ -920,7 +920,7 @@ def test_weights_need_a_sigma():
         perrin.track_rotation(x, dt=1.0, weights="sigma")
     with pytest.raises(ValueError, match="finite numbers > 0"):
         perrin.track_rotation(x, dt=1.0, sigma=0.0, weights="sigma")
-    with pytest.raises(ValueError, match='"equal" or "sigma"'):
+    with pytest.raises(ValueError, match="'equal' or 'sigma'"):
         perrin.track_rotation(x, dt=1.0, weights="other")
 
 

@@ -16,7 +16,7 @@ from perrin import (
     track_rotation,
 )
 from perrin.geometry.rotations import exp_map
-from perrin.motion.rigid_motion import _references
+from perrin.motion.rigid_motion import threshold_references
 
 TETRA = Cluster.tetrahedron(1.5)
 FLAT = Cluster.from_positions([[0.0, 0.0], [2.0, 0.1], [0.5, 1.2], [-0.7, 0.9]])
@@ -128,7 +128,7 @@ def test_the_long_time_diffusion_falls_as_the_first_passage_says():
     """
     D = 5e-3
     truth = simulate_motion(TETRA, D_R=D, dt=1.0, n_frames=240_000, rng=10)
-    origins = np.unique(_references(truth.rotation, truth.piece, 2.0))
+    origins = np.unique(threshold_references(truth.rotation, truth.piece, threshold=2.0))
     passage = np.diff(threshold_displacement(truth, threshold=2.0)[origins], axis=0)
     square, duration = np.sum(passage**2, axis=1), np.diff(origins)
     ratio = square.sum() / (6 * D * duration.sum())

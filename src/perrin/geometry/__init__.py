@@ -4,7 +4,9 @@ from perrin.geometry.rigid import (
     center_variance,
     degrees_of_freedom,
     diffusion_center,
+    inertia_tensor,
     orientation_covariance,
+    pose_slopes,
     shifted,
 )
 from perrin.geometry.rotations import (
@@ -38,6 +40,7 @@ __all__ = [
     "diffusion_center",
     "exp_map",
     "fit_rotations",
+    "inertia_tensor",
     "is_tetrahedron",
     "kabsch",
     "log_map",
@@ -45,6 +48,7 @@ __all__ = [
     "orientation_covariance",
     "pair_distances",
     "point_group",
+    "pose_slopes",
     "rotation_group",
     "schoenflies",
     "shifted",
