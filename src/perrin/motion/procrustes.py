@@ -82,7 +82,7 @@ def fit_template(x: Floats, seen: Bools) -> PoseFit:
         rotation, unique = fit_rotations(x, shape)
         if not unique.any():
             return shape
-        new = _mean_shape(_in_body(x, seen, rotation, shape))
+        new = _centred_mean(_in_body(x, seen, rotation, shape))
         turn, known = fit_rotations(shape, new)
         return new @ turn.T if known else new
 
@@ -125,7 +125,7 @@ def fit_chain(x: Floats, seen: Bools) -> PoseFit:
     rows, step = chain_steps(x, seen)
     rotation = np.full((len(x), x.shape[2], x.shape[2]), np.nan)
     rotation[rows] = successive_product(step)
-    shape = _fixed_point(lambda s: _mean_shape(_in_body(x, seen, rotation, s)), x[rows[0]])
+    shape = _fixed_point(lambda s: _centred_mean(_in_body(x, seen, rotation, s)), x[rows[0]])
     _, residual, sigma2 = step_residuals(x, seen, rows, step)
     return _fit_of(x, seen, rotation, shape)._replace(residual=residual, sigma2=sigma2)
 
@@ -193,7 +193,7 @@ def step_residuals(
     >>> triangle = np.array([[0.0, 0.0], [2.0, 0.0], [0.0, 1.0]])
     >>> x, seen = np.stack([triangle, triangle + 1.0]), np.ones((2, 3), dtype=bool)
     >>> shift, _, sigma2 = step_residuals(x, seen, *chain_steps(x, seen))
-    >>> shift.round(12), round(sigma2, 12)
+    >>> shift.round(12), round(float(sigma2), 12)
     (array([[1., 1.]]), 0.0)
     """
     both = (seen[rows[1:]] & seen[rows[:-1]])[..., None]
@@ -346,7 +346,7 @@ def _shape_centers(x: Floats, rotation: Floats, shape: Floats) -> Floats:
     return center
 
 
-def _mean_shape(body: Floats) -> Floats:
+def _centred_mean(body: Floats) -> Floats:
     """Average the frames, and move the centre of the shape to the origin."""
     shape = mean_present(body, axis=0)
     centred: Floats = shape - mean_present(shape, axis=-2)

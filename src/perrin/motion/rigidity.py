@@ -245,7 +245,7 @@ def judge_quality(
     if detections is not None:
         found = as_positions(detections, name="detections") / unit
         all_detections = _restored_detections(body, corrected, found)
-    misfit = _misplaced_detections(body, all_detections)
+    misfit = misplaced_detections(body, all_detections)
     misfit[np.asarray(unsettled, dtype=np.int64)] = True
     misfit_rows = np.flatnonzero(misfit.any(axis=1))
     smooth = lag_one_autocorrelation(body_residuals(body, corrected))
@@ -268,37 +268,13 @@ def judge_quality(
             f"from 0) changes in time between {drift.distances[0]:.3g} and "
             f"{drift.distances[1]:.3g} um; a bond breaks, or a label moves to another particle"
         )
-    warnings, notes = list(soft), []
-    if stretched:
-        warnings.append(
-            f"z scale: the shape changes with its orientation as if z were {scale.value:.3f} +- "
-            f"{scale.stderr:.2g} times too long; check the voxel size or the refractive index"
-        )
-    if delay.differs_from(0.0):
-        warnings.append(
-            "scan: the particles of a frame are recorded one after another along z: their "
-            "residuals follow the velocity of the body times their height, "
-            f"{abs(delay.value):.2g} +- {delay.stderr:.2g} s/um; sigma then includes motion, and D "
-            "with noise from the residuals is too low"
-        )
+    warnings, notes = _imaging_texts(scale if stretched else None, delay, blur, ratio is not None)
     if misfit_rows.size and not soft:
-        notes.append(
+        notes.insert(
+            0,
             f"{misfit_rows.size} of {body.fitted.size} frames fit the common shape badly (first at "
             f"{body.time[misfit_rows[0]]:g} s): a particle is over {_MISPLACED_MULTIPLE:g} times "
-            f"as far from its place as {_USUAL_SHARE:.0%} of all detections are"
-        )
-    # Tested on the logarithm, whose error does not grow with the ratio.
-    unequal = Slope(np.log(blur.value), blur.stderr / blur.value, np.inf).differs_from(0.0)
-    if unequal and ratio is None:
-        notes.append(
-            f"localisation error: sigma_z is {blur.value:.2f} +- {blur.stderr:.2g} times sigma_xy"
-        )
-    elif unequal and blur.value > _RATIO_EXCESS:
-        warnings.append(
-            f"noise along z: sigma_z over sigma_xy is {blur.value:.2f} +- {blur.stderr:.2g} times "
-            "the stated ratio; z is located worse than stated, or the particles of a frame are "
-            "recorded one after another (sequential scan): then sigma includes motion, and D with "
-            "noise from the residuals is too low"
+            f"as far from its place as {_USUAL_SHARE:.0%} of all detections are",
         )
     return Quality(
         rigid=not soft,
@@ -317,13 +293,46 @@ def judge_quality(
         extra=extra,
         symmetry=point_group(motion.template, tolerance=motion.template_error),
         fraction=motion.fitted.size / len(motion.time),
-        warnings=tuple(warnings),
+        warnings=(*soft, *warnings),
         notes=tuple(notes),
         scan_blur_stderr=finite_or_none(blur.stderr),
         scan_delay=finite_or_none(delay.value),
         scan_delay_stderr=finite_or_none(delay.stderr),
         misfits=misfit_rows.size,
     )
+
+
+def _imaging_texts(
+    scale: Slope | None, delay: Slope, blur: Slope, stated: bool
+) -> tuple[list[str], list[str]]:
+    """Return warnings and notes on the imaging: scale of z, sequential scan, noise along z."""
+    warnings, notes = [], []
+    if scale is not None:
+        warnings.append(
+            f"z scale: the shape changes with its orientation as if z were {scale.value:.3f} +- "
+            f"{scale.stderr:.2g} times too long; check the voxel size or the refractive index"
+        )
+    if delay.differs_from(0.0):
+        warnings.append(
+            "scan: the particles of a frame are recorded one after another along z: their "
+            "residuals follow the velocity of the body times their height, "
+            f"{abs(delay.value):.2g} +- {delay.stderr:.2g} s/um; sigma then includes motion, and D "
+            "with noise from the residuals is too low"
+        )
+    # Tested on the logarithm, whose error does not grow with the ratio.
+    unequal = Slope(np.log(blur.value), blur.stderr / blur.value, np.inf).differs_from(0.0)
+    if unequal and not stated:
+        notes.append(
+            f"localisation error: sigma_z is {blur.value:.2f} +- {blur.stderr:.2g} times sigma_xy"
+        )
+    elif unequal and blur.value > _RATIO_EXCESS:
+        warnings.append(
+            f"noise along z: sigma_z over sigma_xy is {blur.value:.2f} +- {blur.stderr:.2g} times "
+            "the stated ratio; z is located worse than stated, or the particles of a frame are "
+            "recorded one after another (sequential scan): then sigma includes motion, and D with "
+            "noise from the residuals is too low"
+        )
+    return warnings, notes
 
 
 def _residual_test(
@@ -374,8 +383,28 @@ def _restored_detections(motion: RigidMotion, x: Floats, found: Floats) -> Float
     return filled
 
 
-def _misplaced_detections(motion: RigidMotion, x: Floats) -> Bools:
-    """Return which detections (T, n) are far from their positions in the common shape."""
+def misplaced_detections(motion: RigidMotion, x: Floats) -> Bools:
+    """Return which detections are far from their positions in the common shape.
+
+    Parameters
+    ----------
+    motion : RigidMotion
+    x : ndarray, shape (T, n, d)
+        The positions that the motion was fitted to, um.
+
+    Returns
+    -------
+    ndarray of bool, shape (T, n)
+
+    Examples
+    --------
+    >>> from perrin import Cluster, simulate_motion
+    >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=0.02, dt=0.7, n_frames=50, rng=1)
+    >>> x = truth.positions()
+    >>> x[7, 2] += 1.0
+    >>> np.argwhere(misplaced_detections(truth, x))
+    array([[7, 2]])
+    """
     distance = np.linalg.norm(body_residuals(motion, x), axis=2)
     seen = np.isfinite(distance)
     usual = float(np.quantile(distance[seen], _USUAL_SHARE)) if seen.any() else np.inf
