@@ -1,6 +1,6 @@
 """Motion of a body: its position and orientation in every frame, their errors, its rigidity."""
 
-from perrin.motion.degenerate import distance_change
+from perrin.motion.degenerate import distance_change, no_orientation, no_rotation
 from perrin.motion.floor import (
     NoiseFloor,
     floor_of,
@@ -42,6 +42,7 @@ from perrin.motion.rigidity import (
     Quality,
     bond_drift,
     judge_quality,
+    misplaced_detections,
 )
 from perrin.motion.rods import (
     RodMotion,
@@ -88,6 +89,9 @@ __all__ = [
     "lagged_products",
     "measure_scan",
     "measure_stretch",
+    "misplaced_detections",
+    "no_orientation",
+    "no_rotation",
     "noise_floor",
     "pose_errors",
     "regress",

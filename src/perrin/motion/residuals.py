@@ -267,7 +267,21 @@ def lag_one_autocorrelation(residuals: Floats) -> Slope:
 
 
 def lagged_products(vectors: Floats) -> Floats:
-    """Return sum_k v_k . v_{k+lag} of vectors (K, ...) for the lags 0, ..., K - 1."""
+    """Return sum_k v_k . v_{k+lag} of vectors for the lags 0, ..., K - 1.
+
+    Parameters
+    ----------
+    vectors : ndarray, shape (K, ...)
+
+    Returns
+    -------
+    ndarray, shape (K,)
+
+    Examples
+    --------
+    >>> lagged_products(np.array([[1.0], [2.0], [3.0]])).round(12)
+    array([14.,  8.,  3.])
+    """
     flat = vectors.reshape(len(vectors), -1)
     spectrum = np.fft.rfft(flat, n=2 * len(flat), axis=0)
     power = (spectrum.real**2 + spectrum.imag**2).sum(axis=1)
