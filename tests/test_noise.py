@@ -67,7 +67,7 @@ def test_trimer_and_pentahedron():
     ],
 )
 def test_single_directions(body, direction, expected):
-    """Phi^2(p) over the paper's formula, as tabled in facts/estimation.md, 1a."""
+    """Phi^2(p) over the paper's formula, from 2 (tr C - p.C.p) of the two shapes."""
     ratio = noise_floor(body, sigma=0.03).along(direction) / paper_formula(body, 0.03)
     assert ratio == pytest.approx(expected, abs=5e-4)
 

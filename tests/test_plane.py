@@ -21,8 +21,8 @@ class Plane:
     def __init__(self, places, rng):
         grid = PIXEL * np.arange(120)
         near = [np.exp(-0.5 * ((grid - places[..., k, None]) / 0.15) ** 2) for k in (1, 0)]
-        light = np.einsum("tny,tnx->tyx", *near) * 2000 * PIXEL**2 / (2 * np.pi * 0.15**2)
-        self.frames = rng.poisson(light + 10)[:, None]
+        photons = np.einsum("tny,tnx->tyx", *near) * 2000 * PIXEL**2 / (2 * np.pi * 0.15**2)
+        self.frames = rng.poisson(photons + 10)[:, None]
         self.shape, self.voxel = self.frames.shape, (np.nan, PIXEL, PIXEL)
 
     def frame(self, i):
@@ -31,7 +31,7 @@ class Plane:
 
 @pytest.fixture
 def triangles():
-    """Let a triangle turn for 30 frames: the motion, its places, the movie."""
+    """Return the motion of a triangle over 30 frames, its positions, and the movie."""
     body = perrin.Cluster([[0.0, 0.0], [1.6, 0.0], [0.3, 1.3]])
     truth = perrin.simulate_motion(body, D_R=0.02, D_T=0.01, dt=1.0, n_frames=30, rng=4)
     places = truth.positions() + 6.0
@@ -69,8 +69,8 @@ def test_a_planar_body_turns_as_it_did(triangles):
     assert np.abs(angle).max() < 4 * np.sqrt(2) * motion.sigma / np.linalg.norm(motion.template)
 
 
-def test_the_model_of_a_volume_gives_way_in_a_plane(triangles):
-    """It is said, and the places are those of the centroid; trackpy's own fit stays available."""
+def test_a_plane_has_centroids_in_place_of_the_model_of_a_volume(triangles):
+    """A warning states it, the positions are centroids; trackpy's own fit stays available."""
     _, places, movie = triangles
     asked = {"diameter": 0.9, "contact": 0.9, "frames": [0, 1]}
     with pytest.warns(perrin.PrecisionWarning, match="2-D movie places are filtered centroids"):
@@ -86,7 +86,7 @@ def test_the_model_of_a_volume_gives_way_in_a_plane(triangles):
 
 @pytest.mark.skipif(not STUCK.exists(), reason="the movie of stuck beads is not here")
 def test_stuck_beads_are_a_body_at_rest():
-    """Real beads on a glass: all found in all five frames, the body's angle as quiet as they are.
+    """Real beads on a glass: all found in all five frames, the angle scatters by their noise.
 
     Of the 45 places the rms angle is sigma/(sqrt(n) R_rms), within 3 of its standard errors of
     1/sqrt(2 * 4).

@@ -41,7 +41,7 @@ def test_direction_centre_and_noise_come_back(places):
 
 
 def test_d_perp_comes_back_with_its_intervals(repeats):
-    """20 dumbbells (quick: 8): the mean within 3 errors, at most 4 (3) beyond their 95 % interval."""
+    """20 dumbbells (quick: 8): mean within 3 errors, at most 4 (3) beyond their 95 % interval."""
     count = repeats(8, 20)
     motions = [perrin.track_direction(rod(s)[0], dt=DT) for s in range(count)]
     for quantity, planted in (("direction", D_PERP), ("translation", 0.03)):
