@@ -73,20 +73,21 @@ def consistent(body, motion, x):
 
 @pytest.mark.parametrize("drift", [0.0, 1.0])
 @pytest.mark.parametrize(("d", "seed"), [(3, 0), (3, 1), (2, 2)])
-def test_the_particles_diffusion_comes_back(d, seed, drift):
+def test_the_particles_diffusion_comes_back(d, seed, drift, repeats):
     """D within 2 %, with and without drift: 9 (2-D: 8) Monte-Carlo errors of the first lag.
 
-    500 walkers and 299 steps know D to sqrt(2/(d 500 299)), 0.21 % in space. The fit takes d drift
-    and d(d - 1)/2 turning coordinates off every frame, 0.4 % of the 1500: the walkers' own squared
-    steps come back less exactly that share.
+    500 walkers and 299 (quick: 119) steps give D to sqrt(2/(d 500 299)), 0.21 % in space. The fit
+    removes d drift and d(d - 1)/2 turning coordinates of every frame, 0.4 % of the 1500: the
+    walkers' own squared steps come back less exactly that share.
     """
-    y = walkers(d, seed=seed)
+    frames = repeats(120, 300)
+    y = walkers(d, n_frames=frames, seed=seed)
     x = carried(y, drift)
     body, motion = remove_rotation(x, dt=1.0)
     consistent(body, motion, x)
     curve = msd(body, dt=1.0)
-    monte_carlo = np.sqrt(2 / (d * 500 * 299))
-    assert 0.02 / monte_carlo > 7.5
+    monte_carlo = np.sqrt(2 / (d * 500 * (frames - 1)))
+    assert 0.02 / monte_carlo > repeats(4.5, 7.5)
     found = curve.value[0] / (2 * d)
     assert found == pytest.approx(0.05, rel=0.02)
     share = (d + d * (d - 1) / 2) / (d * 500)
@@ -130,10 +131,10 @@ def test_the_frames_rotation_is_recovered(d):
 def test_particles_may_come_and_go(d, repeats):
     """Tracks of 40 to 150 frames with 30 % missing: D within 2 %, 7 (2-D: 6) Monte-Carlo errors.
 
-    Of 2500 tracks about 310 a frame are present in it and in the next one. The quick form has half
-    of the frames.
+    Of 2500 tracks about 310 a frame are present in it and in the next one. The quick form has a
+    third of the frames.
     """
-    frames = repeats(150, 300)
+    frames = repeats(100, 300)
     y = walkers(d, n=2500, n_frames=frames, seed=4)
     x = come_and_go(carried(y))
     body, motion = remove_rotation(x, dt=1.0)
@@ -141,7 +142,7 @@ def test_particles_may_come_and_go(d, repeats):
     assert motion.fitted.size == frames
     total, count = square_steps(body)
     monte_carlo = np.sqrt(2 / (d * count))
-    assert 0.02 / monte_carlo > repeats(4, 6)
+    assert 0.02 / monte_carlo > repeats(3, 6)
     assert total / (2 * d * count) == pytest.approx(0.05, rel=0.02)
     own, _ = square_steps(y, mask=x)
     share = (frames - 1) * (d + d * (d - 1) / 2) / (d * count)
@@ -160,9 +161,10 @@ def test_particles_may_come_and_go(d, repeats):
 
 @pytest.mark.parametrize("offset", [0.0, 1e3])
 @pytest.mark.parametrize("d", [3, 2])
-def test_a_rigid_turn_is_removed_exactly(d, offset):
+def test_a_rigid_turn_is_removed_exactly(d, offset, repeats):
     """Without noise the particles stand still (1e-10) and the planted motion is found."""
-    still = np.broadcast_to(walkers(d, n=60, n_frames=2, seed=5)[0], (400, 60, d))
+    frames = repeats(150, 400)
+    still = np.broadcast_to(walkers(d, n=60, n_frames=2, seed=5)[0], (frames, 60, d))
     x = carried(still) + offset
     x[np.random.default_rng(6).random(x.shape[:2]) < 0.3] = np.nan
     x[100:110] = np.nan
@@ -172,14 +174,14 @@ def test_a_rigid_turn_is_removed_exactly(d, offset):
     np.testing.assert_allclose(
         body[here], np.broadcast_to(motion.template, body.shape)[here], rtol=0, atol=1e-10
     )
-    turn, center = frame_motion(d, 400)
+    turn, center = frame_motion(d, frames)
     rows = motion.fitted
-    assert rows.size == 390
+    assert rows.size == frames - 10
     expected = turn[rows] @ turn[0].T
     np.testing.assert_allclose(motion.rotation[rows], expected, rtol=0, atol=1e-12)
     middle = np.einsum("tij,j->ti", turn, still[0].mean(axis=0)) + center + offset
     np.testing.assert_allclose(motion.center[rows], middle[rows], rtol=0, atol=1e-9)
-    np.testing.assert_array_equal(motion.time, 0.5 * np.arange(400))
+    np.testing.assert_array_equal(motion.time, 0.5 * np.arange(frames))
     assert motion.sigma < 1e-9
     consistent(body, motion, x)
 
@@ -188,11 +190,11 @@ def test_a_rigid_turn_is_removed_exactly(d, offset):
 def test_any_motion_of_the_lab_is_taken_off(d):
     """Turn and shift every frame at random, or change the unit: what remains is the same (1e-8)."""
     rng = np.random.default_rng(7)
-    x = come_and_go(walkers(d, n=200, n_frames=120, seed=8))
+    x = come_and_go(walkers(d, n=150, n_frames=80, seed=8))
     body, _ = remove_rotation(x)
-    turn = exp_map(rng.normal(size=(120, 3 if d == 3 else 1)))
+    turn = exp_map(rng.normal(size=(80, 3 if d == 3 else 1)))
     turn[0] = np.eye(d)
-    shaken = np.einsum("tij,tnj->tni", turn, x) + 50 * rng.normal(size=(120, 1, d))
+    shaken = np.einsum("tij,tnj->tni", turn, x) + 50 * rng.normal(size=(80, 1, d))
     again, motion = remove_rotation(shaken)
     np.testing.assert_allclose(again, body, rtol=0, atol=1e-8)
     consistent(again, motion, shaken)
@@ -200,7 +202,7 @@ def test_any_motion_of_the_lab_is_taken_off(d):
     # A lab turned for good turns the answer, and the order of the particles is nothing.
     q = exp_map(rng.normal(size=3 if d == 3 else 1))
     np.testing.assert_allclose(remove_rotation(x @ q.T)[0], body @ q.T, rtol=0, atol=1e-8)
-    order = rng.permutation(200)
+    order = rng.permutation(150)
     np.testing.assert_allclose(remove_rotation(x[:, order])[0], body[:, order], rtol=0, atol=1e-8)
 
 
@@ -360,8 +362,9 @@ def test_trackpys_bulk_water_is_unchanged_by_a_turn(water, repeats):
 
     The walkthrough removes the drift too; the turn takes one more of the 520 coordinates of a
     frame, 0.2 % of A, and contains the 0.2 degrees by which the real beads turned together. The
-    quick form measures n and A of the 60 longest tracks.
+    quick form measures n and A of the 60 longest tracks in 100 frames.
     """
+    water = water[water["frame"] < repeats(100, 300)]
     longest = water["particle"].value_counts(sort=True).index
     kept = longest[: repeats(60, len(longest))]
     n_before, A_before = power_law(water, kept=kept)
@@ -369,7 +372,7 @@ def test_trackpys_bulk_water_is_unchanged_by_a_turn(water, repeats):
         assert (n_before, A_before) == pytest.approx((1.08024, 1.602365), rel=2e-6)
     x, row, column = on_a_grid(water)
     body, motion = remove_rotation(spun(x, 2.0, [400.0, 200.0]), dt=1 / 24)
-    assert motion.fitted.size == 300
+    assert motion.fitted.size == len(x)
     cleaned = water.assign(x=body[row, column, 0], y=body[row, column, 1])
     assert cleaned[["x", "y"]].notna().all(axis=None)
     n, A = power_law(cleaned, kept=kept)

@@ -32,8 +32,8 @@ def paper_track(seed):
 
 @pytest.fixture(scope="module")
 def estimates(repeats):
-    """Return D_R and D_T of 40 (quick: 20) tracks."""
-    motions = [paper_track(seed) for seed in range(repeats(20, 40))]
+    """Return D_R and D_T of 40 (quick: 16) tracks."""
+    motions = [paper_track(seed) for seed in range(repeats(16, 40))]
     return {
         quantity: [estimate_diffusion(m, quantity=quantity) for m in motions]
         for quantity in ("rotation", "translation")
@@ -42,14 +42,14 @@ def estimates(repeats):
 
 @pytest.mark.parametrize(("quantity", "truth"), [("rotation", D_R), ("translation", D_T)])
 def test_planted_values_come_back(estimates, quantity, truth, repeats):
-    """The mean within 3 standard errors of the truth; 95 % covers at least 33 of 40 (15 of 20).
+    """The mean within 3 standard errors of the truth; 95 % covers at least 33 of 40 (12 of 16).
 
-    Fewer are covered with a probability of 0.001 (0.0003).
+    Fewer are covered with a probability of 0.001 (0.0002).
     """
     found = estimates[quantity]
     values = np.array([e.value for e in found])
     assert abs(values.mean() - truth) < 3 * values.std(ddof=1) / np.sqrt(len(found))
-    assert sum(e.ci95[0] < truth < e.ci95[1] for e in found) >= repeats(15, 33)
+    assert sum(e.ci95[0] < truth < e.ci95[1] for e in found) >= repeats(12, 33)
     assert all(e.resolved for e in found)
 
 
@@ -106,7 +106,7 @@ def test_the_papers_line_scatters_more_than_the_likelihood(estimates):
 
 
 def test_all_clusters_pooled(estimates):
-    """Pooled, 40 clusters (quick: 20) give D_R to 1.3 %, and the interval contains the truth."""
+    """Pooled, 40 clusters (quick: 16) give D_R to 1.3 %, and the interval contains the truth."""
     count = len(estimates["rotation"])
     pooled = estimate_diffusion([paper_track(seed) for seed in range(count)])
     assert pooled.n_frames == count * FRAMES
@@ -118,13 +118,13 @@ def test_all_clusters_pooled(estimates):
 def test_both_schemes_of_simulation_agree(scheme, repeats):
     """The paper's Euler steps (Eq. 16) and exact Brownian ones plant the same D_R at D_R dt = 4e-3.
 
-    Within 3 standard errors of the mean of 40 (quick: 15) tracks, without noise; finite steps
+    Within 3 standard errors of the mean of 40 (quick: 12) tracks, without noise; finite steps
     lower it by 0.06 %.
     """
     values = [
         estimate_diffusion(
             simulate_motion(CLUSTER, D_R=D_R, dt=DT, n_frames=FRAMES, scheme=scheme, rng=seed)
         ).value
-        for seed in range(repeats(15, 40))
+        for seed in range(repeats(12, 40))
     ]
     assert abs(np.mean(values) - D_R) < 3 * np.std(values, ddof=1) / np.sqrt(len(values))

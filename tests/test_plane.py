@@ -29,7 +29,7 @@ class Plane:
         return self.frames[i]
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def triangles():
     """Return the motion of a triangle over 30 frames, its positions, and the movie."""
     body = perrin.Cluster([[0.0, 0.0], [1.6, 0.0], [0.3, 1.3]])
@@ -38,13 +38,19 @@ def triangles():
     return truth, places, Plane(places, np.random.default_rng(1))
 
 
-def test_spots_of_a_plane_are_found_where_they_are(triangles):
+@pytest.fixture(scope="module")
+def spots(triangles):
+    """Return the table of the spots in that movie."""
+    return perrin.locate(triangles[2], diameter=0.9, contact=0.9, refine=None)
+
+
+def test_spots_of_a_plane_are_found_where_they_are(triangles, spots):
     """All spots and no others, no z; errors within 1.3 of what photons allow the centroid.
 
     Those of the spot, 0.15 um/sqrt(2000), and of 10 in each pixel of the mask, 0.9 um wide.
     """
-    _, places, movie = triangles
-    table = perrin.locate(movie, diameter=0.9, contact=0.9, refine=None)
+    _, places, _ = triangles
+    table = spots
     assert list(table) == ["frame", "x", "y", "mass"]
     assert (table.groupby("frame").size() == 3).all()
     off = []
@@ -56,11 +62,10 @@ def test_spots_of_a_plane_are_found_where_they_are(triangles):
     assert np.sqrt(np.mean(np.square(off))) < 1.3 * np.sqrt(allowed)
 
 
-def test_a_planar_body_turns_as_it_did(triangles):
+def test_a_planar_body_turns_as_it_did(triangles, spots):
     """From images to the angle of every step: within four times what places so known allow."""
-    truth, _, movie = triangles
-    table = perrin.locate(movie, diameter=0.9, contact=0.9, refine=None)
-    known = perrin.identify(table, contact=1.6, size=3)
+    truth, _, _ = triangles
+    known = perrin.identify(spots, contact=1.6, size=3)
     assert known["cluster"].nunique() == 1
     motion = perrin.track_rotation(perrin.cluster_positions(known, cluster=0)[0], dt=1.0)
     step, true = (np.swapaxes(m.rotation[:-1], 1, 2) @ m.rotation[1:] for m in (motion, truth))

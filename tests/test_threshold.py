@@ -91,12 +91,13 @@ def test_in_the_plane_rotations_add_up_whatever_the_threshold():
         np.testing.assert_allclose(walk[:, 0], angle - angle[0], atol=1e-9)
 
 
-def test_noise_on_a_body_at_rest_does_not_add_up():
+def test_noise_on_a_body_at_rest_does_not_add_up(repeats):
     """sigma/R = 0.15: the sum of steps has D = 0.04 (sigma/R)^4 a frame, the threshold rule 0.
 
-    The slope between lags of 200 and 2000 frames, within 3 of its stated errors, 20000 frames.
+    The slope between lags of 200 and 2000 frames, within 3 of its stated errors, 20000 (quick:
+    12000) frames.
     """
-    still = np.tile(TETRA.positions, (20_000, 1, 1))
+    still = np.tile(TETRA.positions, (repeats(12_000, 20_000), 1, 1))
     motion = track_rotation(add_noise(still, sigma=0.15 * TETRA.R, rng=6), dt=1.0)
     every, held = (
         fit_line(msad_vector(motion, threshold=t), lag_range=(200, 2000)) for t in (0.0, 1.0)
@@ -140,12 +141,13 @@ def test_the_long_time_diffusion_is_that_of_first_passages(repeats):
     assert abs(ratio - (1 - 4 / 60)) < 3 * error
 
 
-def test_jumps_of_a_caged_rotor_are_counted_and_its_rattling_is_not():
+def test_jumps_of_a_caged_rotor_are_counted_and_its_rattling_is_not(repeats):
     """Rattling by 0.2 rad per axis, 8 jumps by 2.2 rad: the end is the sum of the jumps to 4 rad.
 
     Each jump contains the rattling at both its ends (1.4 rad in all); the sum of all steps differs
-    by 11 rad after 50000 frames.
+    by 11 rad after 50000 frames (quick: over 4 rad after 25000).
     """
+    frames = repeats(25_000, 50_000)
     rng = np.random.default_rng(8)
     jump = rng.normal(size=(8, 3))
     jump *= 2.2 / np.linalg.norm(jump, axis=1, keepdims=True)
@@ -153,8 +155,8 @@ def test_jumps_of_a_caged_rotor_are_counted_and_its_rattling_is_not():
     for turn in exp_map(jump):
         cage = turn @ cage
         cages.append(cage)
-    place = np.arange(50_000) * 9 // 50_000
-    rattle = exp_map(0.2 * rng.normal(size=(50_000, 3)))
+    place = np.arange(frames) * 9 // frames
+    rattle = exp_map(0.2 * rng.normal(size=(frames, 3)))
     motion = turned(np.array(cages)[place] @ rattle)
     off = {
         t: np.linalg.norm(threshold_displacement(motion, threshold=t)[-1] - jump.sum(axis=0))
