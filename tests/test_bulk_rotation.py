@@ -228,17 +228,17 @@ def test_time_may_run_backwards():
 def test_gaps_in_the_frame_numbers_are_empty_frames():
     """Left-out rows with their numbers, and rows of NaN, are the same data."""
     x = carried(walkers(n=100, n_frames=80, seed=11))
-    gone = np.r_[10:13, 40, 60:75]
-    kept = np.delete(np.arange(80), gone)
+    absent = np.r_[10:13, 40, 60:75]
+    kept = np.delete(np.arange(80), absent)
     holes = x.copy()
-    holes[gone] = np.nan
+    holes[absent] = np.nan
     body, motion = remove_rotation(holes, dt=0.25)
     short, other = remove_rotation(x[kept], dt=0.25, frames=kept)
     np.testing.assert_allclose(short, body[kept], rtol=0, atol=1e-10)
     np.testing.assert_allclose(other.rotation, motion.rotation[kept], rtol=0, atol=1e-12)
     np.testing.assert_array_equal(other.time, 0.25 * kept)
     np.testing.assert_array_equal(motion.fitted, kept)
-    assert {motion.reason[k] for k in gone} == {"no particles"}
+    assert {motion.reason[k] for k in absent} == {"no particles"}
     np.testing.assert_allclose(
         other.accumulated_rotation(), motion.accumulated_rotation()[kept], rtol=0, atol=1e-10
     )

@@ -59,7 +59,7 @@ def test_planted_values_come_back(estimates, quantity, truth, repeats):
 def test_the_scatter_is_the_cramer_rao_bound(estimates, quantity, truth, bound):
     """The scatter of the estimates is 8.3 % (D_R) and 8.2 % (D_T), within 3 errors of a scatter.
 
-    The stated standard error says the same, within 10 %.
+    The stated standard error is the same, within 10 %.
     """
     found = estimates[quantity]
     scatter = np.std([e.value / truth for e in found], ddof=1)

@@ -24,7 +24,7 @@ def paper_formula(cluster, sigma):
 
 
 def fitted_orientations(body, sigma, count, seed, kept=None):
-    """Return rotation vectors (count, 3 or 1) of fits to a body that stands still."""
+    """Return rotation vectors (count, 3 or 1) of fits to a body at rest."""
     noise = np.random.default_rng(seed).normal(size=(count, *body.shape)) * sigma
     kept = np.arange(len(body)) if kept is None else kept
     return log_map(kabsch((body + noise)[:, kept], body[kept]))

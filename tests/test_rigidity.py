@@ -135,7 +135,8 @@ def test_bodies_in_the_plane_are_judged_too():
 def test_quality_survives_json():
     """to_dict and from_dict are inverse."""
     quality = judged(noisy(8), swaps=(4, 9))
-    assert perrin.Quality.from_dict(json.loads(json.dumps(quality.to_dict()))) == quality
+    text = json.dumps(quality.to_dict(), allow_nan=False)
+    assert perrin.Quality.from_dict(json.loads(text)) == quality
 
 
 @pytest.mark.parametrize(
@@ -178,13 +179,13 @@ def test_a_body_that_does_not_turn_has_no_scale_of_z(repeats):
 @pytest.mark.parametrize("D_R", [0.005, 0.02])
 def test_every_stretch_is_found_and_returned(scale, D_R, repeats):
     """100 frames: from 3 % on z is reported, its scale is right within the error over repeats."""
-    count = repeats(2, 10)
+    count = repeats(1, 10)
     found = [
         judged(noisy(s, D_R=D_R, n_frames=100, sigma=0.03) * [1.0, 1.0, scale])
         for s in range(count)
     ]
     named = [any("z scale" in w for w in q.warnings) for q in found]
-    assert sum(named) >= count - 1
+    assert sum(named) >= max(count - 1, 1)
     pull = [(q.z_scale - scale) / q.z_scale_stderr for q in found]
     assert abs(np.mean(pull)) < 3.5 / np.sqrt(count)
     # A wrong height does not make the body soft.
@@ -197,7 +198,7 @@ def test_worse_noise_along_z_is_no_stretch_and_no_scan(body, ratio, repeats):
     """The pulls of scale and delay have mean 0 and unit spread with unequal noise of the axes."""
     found = [
         judged(noisy(s, body=body, n_frames=150, sigma=(0.03, 0.03, 0.03 * ratio)))
-        for s in range(100, 100 + repeats(6, 20))
+        for s in range(100, 100 + repeats(5, 20))
     ]
     assert all(q.warnings == () for q in found)
     scale = [(q.z_scale - 1) / q.z_scale_stderr for q in found if q.z_scale is not None]

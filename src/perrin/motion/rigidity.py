@@ -172,10 +172,16 @@ class Quality:
         Parameters
         ----------
         entry : dict
+
+        Returns
+        -------
+        Quality
         """
         values: dict[str, Any] = {
             k: tuple(v) if isinstance(v, list) else v for k, v in entry.items()
         }
+        if values["residual_over_R"] is None:
+            values["residual_over_R"] = np.nan
         return cls(**values)
 
 
