@@ -1,14 +1,16 @@
 """The noise floor: published numbers, exact tops, and fits to noisy bodies."""
 
+import json
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from perrin import Cluster, DegenerateClusterError, kabsch, noise_floor
-from perrin.geometry.rigid import center_variance, orientation_covariance
-from perrin.geometry.rotations import log_map
+from perrin import Cluster, DegenerateClusterError, NoiseFloor, kabsch, noise_floor
+from perrin.geometry.rigid import center_variance, orientation_covariance, pose_slopes
+from perrin.geometry.rotations import exp_map, log_map
 from perrin.motion.floor import floor_of
 
 IRREGULAR = np.random.default_rng(5).normal(size=(6, 3)) * [1.5, 1.0, 0.7]
@@ -22,7 +24,7 @@ def paper_formula(cluster, sigma):
 
 
 def fitted_orientations(body, sigma, count, seed, kept=None):
-    """Return rotation vectors (count, 3 or 1) of fits to a body that stands still."""
+    """Return rotation vectors (count, 3 or 1) of fits to a body at rest."""
     noise = np.random.default_rng(seed).normal(size=(count, *body.shape)) * sigma
     kept = np.arange(len(body)) if kept is None else kept
     return log_map(kabsch((body + noise)[:, kept], body[kept]))
@@ -65,7 +67,7 @@ def test_trimer_and_pentahedron():
     ],
 )
 def test_single_directions(body, direction, expected):
-    """Phi^2(p) over the paper's formula, as tabled in facts/estimation.md, 1a."""
+    """Phi^2(p) over the paper's formula, from 2 (tr C - p.C.p) of the two shapes."""
     ratio = noise_floor(body, sigma=0.03).along(direction) / paper_formula(body, 0.03)
     assert ratio == pytest.approx(expected, abs=5e-4)
 
@@ -78,7 +80,7 @@ def test_phi_of_the_papers_experiment():
 
 @laws
 @given(st.tuples(sizes, sizes, sizes))
-def test_a_tetrahedron_sees_the_mean_variance(sigma):
+def test_the_floor_of_a_tetrahedron_is_that_of_the_mean_variance(sigma):
     """Per-axis sigma on a tetrahedron: Phi^2 is that of the mean of the three variances."""
     body = Cluster.tetrahedron(2e3)
     variance = np.square(sigma)
@@ -194,6 +196,19 @@ def test_floors_of_many_covariances_at_once():
     np.testing.assert_allclose(floor_of(np.full((5, 1, 1), 0.3)), np.full(5, 0.6))
 
 
+@pytest.mark.parametrize("d", [2, 3])
+def test_the_slopes_of_a_pose_are_its_derivatives(d):
+    """Small rotations and shifts move the particles by the slopes, to second order (1e-9)."""
+    body = IRREGULAR[:, :d]
+    slopes = pose_slopes(body)
+    angles = d * (d - 1) // 2
+    assert slopes.shape == (6, d, angles + d)
+    change = 1e-5 * np.random.default_rng(4).normal(size=angles + d)
+    moved = body @ exp_map(change[:angles]).T + change[angles:]
+    np.testing.assert_allclose(moved - body, slopes @ change, rtol=0, atol=1e-9)
+    np.testing.assert_array_equal(pose_slopes(np.stack([body, 2 * body]))[0], slopes)
+
+
 # ---- refusals -----------------------------------------------------------------------------------
 
 
@@ -212,7 +227,7 @@ def test_bodies_without_an_orientation_are_refused(offset, unit):
 
 
 @pytest.mark.parametrize("sigma", [-0.01, np.nan, np.inf, (0.01, 0.01), (0.01, -0.01, 0.01), [[1]]])
-def test_sigma_must_be_an_error(sigma):
+def test_invalid_sigmas_are_refused(sigma):
     """Negative, infinite or misshapen sigma is refused; zero is allowed and gives zero."""
     with pytest.raises(ValueError, match="sigma"):
         noise_floor(Cluster.tetrahedron(1.0), sigma=sigma)
@@ -220,10 +235,20 @@ def test_sigma_must_be_an_error(sigma):
 
 
 @pytest.mark.parametrize("p", [[0, 0, 0], [1, 0], [np.nan, 0, 1], [np.inf, 0, 0], 1.0])
-def test_directions_must_point(p):
+def test_invalid_directions_are_refused(p):
     """A direction that is zero, not finite or misshapen is refused."""
     with pytest.raises(ValueError, match="direction"):
         noise_floor(Cluster.trimer(1.0), sigma=0.01).along(p)
+
+
+@pytest.mark.parametrize("body", [Cluster.trimer(1.0), [[0.0, 0.0], [2.0, 0.0]]])
+def test_a_floor_survives_json(body):
+    """to_dict, through JSON, and from_dict give back the same floor."""
+    floor = noise_floor(body, sigma=0.03)
+    back = NoiseFloor.from_dict(json.loads(json.dumps(floor.to_dict())))
+    assert back.phi2 == floor.phi2
+    np.testing.assert_array_equal(back.covariance, floor.covariance)
+    assert not back.covariance.flags.writeable
 
 
 def test_the_covariance_is_read_only():

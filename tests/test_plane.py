@@ -21,30 +21,36 @@ class Plane:
     def __init__(self, places, rng):
         grid = PIXEL * np.arange(120)
         near = [np.exp(-0.5 * ((grid - places[..., k, None]) / 0.15) ** 2) for k in (1, 0)]
-        light = np.einsum("tny,tnx->tyx", *near) * 2000 * PIXEL**2 / (2 * np.pi * 0.15**2)
-        self.frames = rng.poisson(light + 10)[:, None]
+        photons = np.einsum("tny,tnx->tyx", *near) * 2000 * PIXEL**2 / (2 * np.pi * 0.15**2)
+        self.frames = rng.poisson(photons + 10)[:, None]
         self.shape, self.voxel = self.frames.shape, (np.nan, PIXEL, PIXEL)
 
     def frame(self, i):
         return self.frames[i]
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def triangles():
-    """Let a triangle turn for 30 frames: the motion, its places, the movie."""
+    """Return the motion of a triangle over 30 frames, its positions, and the movie."""
     body = perrin.Cluster([[0.0, 0.0], [1.6, 0.0], [0.3, 1.3]])
     truth = perrin.simulate_motion(body, D_R=0.02, D_T=0.01, dt=1.0, n_frames=30, rng=4)
     places = truth.positions() + 6.0
     return truth, places, Plane(places, np.random.default_rng(1))
 
 
-def test_spots_of_a_plane_are_found_where_they_are(triangles):
+@pytest.fixture(scope="module")
+def spots(triangles):
+    """Return the table of the spots in that movie."""
+    return perrin.locate(triangles[2], diameter=0.9, contact=0.9, refine=None)
+
+
+def test_spots_of_a_plane_are_found_where_they_are(triangles, spots):
     """All spots and no others, no z; errors within 1.3 of what photons allow the centroid.
 
     Those of the spot, 0.15 um/sqrt(2000), and of 10 in each pixel of the mask, 0.9 um wide.
     """
-    _, places, movie = triangles
-    table = perrin.locate(movie, diameter=0.9, contact=0.9, refine=None)
+    _, places, _ = triangles
+    table = spots
     assert list(table) == ["frame", "x", "y", "mass"]
     assert (table.groupby("frame").size() == 3).all()
     off = []
@@ -56,11 +62,10 @@ def test_spots_of_a_plane_are_found_where_they_are(triangles):
     assert np.sqrt(np.mean(np.square(off))) < 1.3 * np.sqrt(allowed)
 
 
-def test_a_planar_body_turns_as_it_did(triangles):
+def test_a_planar_body_turns_as_it_did(triangles, spots):
     """From images to the angle of every step: within four times what places so known allow."""
-    truth, _, movie = triangles
-    table = perrin.locate(movie, diameter=0.9, contact=0.9, refine=None)
-    known = perrin.identify(table, contact=1.6, size=3)
+    truth, _, _ = triangles
+    known = perrin.identify(spots, contact=1.6, size=3)
     assert known["cluster"].nunique() == 1
     motion = perrin.track_rotation(perrin.cluster_positions(known, cluster=0)[0], dt=1.0)
     step, true = (np.swapaxes(m.rotation[:-1], 1, 2) @ m.rotation[1:] for m in (motion, truth))
@@ -69,8 +74,8 @@ def test_a_planar_body_turns_as_it_did(triangles):
     assert np.abs(angle).max() < 4 * np.sqrt(2) * motion.sigma / np.linalg.norm(motion.template)
 
 
-def test_the_model_of_a_volume_gives_way_in_a_plane(triangles):
-    """It is said, and the places are those of the centroid; trackpy's own fit stays available."""
+def test_a_plane_has_centroids_in_place_of_the_model_of_a_volume(triangles):
+    """A warning states it, the positions are centroids; trackpy's own fit stays available."""
     _, places, movie = triangles
     asked = {"diameter": 0.9, "contact": 0.9, "frames": [0, 1]}
     with pytest.warns(perrin.PrecisionWarning, match="2-D movie places are filtered centroids"):
@@ -86,7 +91,7 @@ def test_the_model_of_a_volume_gives_way_in_a_plane(triangles):
 
 @pytest.mark.skipif(not STUCK.exists(), reason="the movie of stuck beads is not here")
 def test_stuck_beads_are_a_body_at_rest():
-    """Real beads on a glass: all found in all five frames, the body's angle as quiet as they are.
+    """Real beads on a glass: all found in all five frames, the angle scatters by their noise.
 
     Of the 45 places the rms angle is sigma/(sqrt(n) R_rms), within 3 of its standard errors of
     1/sqrt(2 * 4).

@@ -1,6 +1,9 @@
-"""Rods: the direction is followed, its diffusion comes back, ends are told apart."""
+"""Rods: direction and its diffusion are measured, the two ends are identified."""
 
 from __future__ import annotations
+
+import json
+from dataclasses import fields
 
 import numpy as np
 import pytest
@@ -37,15 +40,17 @@ def test_direction_centre_and_noise_come_back(places):
     np.testing.assert_allclose(motion.places, np.array(places) - np.mean(places), atol=0.01)
 
 
-def test_d_perp_comes_back_with_honest_intervals():
-    """Twenty dumbbells: the mean within 3 standard errors, at most 4 beyond their 95 % interval."""
-    motions = [perrin.track_direction(rod(s)[0], dt=DT) for s in range(20)]
+def test_d_perp_comes_back_with_its_intervals(repeats):
+    """20 dumbbells (quick: 8): mean within 3 errors, at most 4 (3) beyond their 95 % interval."""
+    count = repeats(8, 20)
+    motions = [perrin.track_direction(rod(s)[0], dt=DT) for s in range(count)]
     for quantity, planted in (("direction", D_PERP), ("translation", 0.03)):
         found = [perrin.estimate_rod(m, quantity=quantity) for m in motions]
         mean = np.mean([e.value for e in found])
-        assert abs(mean - planted) < 3 * np.mean([e.stderr for e in found]) / np.sqrt(20)
+        assert abs(mean - planted) < 3 * np.mean([e.stderr for e in found]) / np.sqrt(count)
         outside = sum(not e.ci95[0] < planted < e.ci95[1] for e in found)
-        assert outside <= 4  # 5 or more of 20 at 5 % each: probability 0.003
+        # 5 or more of 20, or 4 or more of 8, at 5 % each: probability 0.003 and 0.0004.
+        assert outside <= repeats(3, 4)
 
 
 def test_the_turn_about_the_own_axis_does_not_enter():
@@ -65,8 +70,8 @@ def test_steps_of_a_known_path():
     np.testing.assert_allclose(steps.y, np.broadcast_to(steps.y[0], (19, 2)), atol=1e-12)
 
 
-def test_exchanged_ends_are_put_right():
-    """Labels that change ends for good: told, put right, and D_perp as if nothing had happened."""
+def test_exchanged_ends_are_corrected():
+    """Labels that are exchanged for good are reported and corrected; the direction is the same."""
     x, _ = rod(3)
     mixed = x.copy()
     for k in (50, 51, 200):
@@ -77,7 +82,7 @@ def test_exchanged_ends_are_put_right():
 
 
 def test_right_ends_are_left_alone_and_unlabelled_ones_cut():
-    """Fast turning: labels are trusted; without labels the doubt is a cut."""
+    """Fast turning: labels are trusted; without labels uncertain ends cut the track."""
     x, truth = rod(4, D_perp=1.0)
     motion = perrin.track_direction(x, dt=DT)
     assert (np.einsum("ti,ti->t", motion.direction, truth.rotation[:, :, 2]) > 0).all()
@@ -85,7 +90,7 @@ def test_right_ends_are_left_alone_and_unlabelled_ones_cut():
     assert perrin.track_direction(x, dt=DT, labelled=False).piece[-1] > 50
 
 
-def test_a_chain_that_tells_its_ends_keeps_its_labels():
+def test_a_chain_with_different_ends_keeps_its_labels():
     """Unequal spacings: half turns are real."""
     x, _ = rod(5, places=(0.0, 1.0, 4.0))
     x[100:] = 2 * x[100:101].mean(axis=1, keepdims=True) - x[100:]
@@ -106,7 +111,7 @@ def test_missing_particles_and_frames():
     assert np.isnan(motion.direction[20]).all()
 
 
-def test_what_is_no_line_is_refused():
+def test_particles_off_a_line_are_refused():
     """A triangle, particles in one place, a plane, a lone frame."""
     x, _ = rod(7, places=(0.0, 1.0, 2.0))
     bent = x.copy()
@@ -121,6 +126,22 @@ def test_what_is_no_line_is_refused():
         perrin.track_direction(x[..., :2], dt=DT)
     with pytest.raises(perrin.TooFewFramesError, match="too few steps"):
         perrin.estimate_rod(perrin.track_direction(x[:2], dt=DT))
+
+
+def test_a_rod_survives_json():
+    """to_dict, through JSON, and from_dict give back the same bits; NaN is null."""
+    x, _ = rod(8, n_frames=30)
+    x[5] = np.nan
+    motion = perrin.track_direction(x, dt=DT)
+    text = json.dumps(motion.to_dict(), allow_nan=False)
+    back = RodMotion.from_dict(json.loads(text))
+    for field in fields(RodMotion):
+        a, b = getattr(back, field.name), getattr(motion, field.name)
+        if isinstance(b, np.ndarray):
+            assert a.dtype == b.dtype
+            np.testing.assert_array_equal(a, b, err_msg=field.name)
+        else:
+            assert a == b, field.name
 
 
 def test_a_rod_survives_a_table():

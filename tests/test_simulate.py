@@ -1,4 +1,4 @@
-"""Simulated motions obey the law they were planted with."""
+"""Simulated motions have the coefficients and laws that they were simulated with."""
 
 from dataclasses import replace
 
@@ -34,9 +34,9 @@ def mean_and_error(sample):
 
 
 @pytest.mark.parametrize("scale", [1e-6, 1e-4, 1e-2, 0.1, 0.5, 0.99, 1.01, 2.0, 20.0])
-def test_the_step_law_at_any_step(scale):
+def test_the_step_law_at_any_step(scale, repeats):
     """<cos> = (3 exp(-2 D dt) - 1)/2 and degree 2 decays by exp(-6 D dt), within 4 errors."""
-    motion = simulate(D_R=scale / 0.7, dt=0.7, n_frames=100_001, rng=31)
+    motion = simulate(D_R=scale / 0.7, dt=0.7, n_frames=repeats(20_001, 100_001), rng=31)
     angle = np.linalg.norm(log_map(steps(motion)), axis=1)
     # 1 - <cos> by the half angle, so that nothing cancels at D dt = 1e-6.
     loss, error = mean_and_error(2 * np.sin(angle / 2) ** 2)
@@ -48,9 +48,9 @@ def test_the_step_law_at_any_step(scale):
 
 
 @pytest.mark.parametrize("scale", [1e-6, 0.3, 1.5])
-def test_the_axes_of_the_steps_are_uniform(scale):
-    """Isotropic steps point nowhere in particular: <u> = 0, <u u^T> = 1/3, within 4.5 errors."""
-    v = log_map(steps(simulate(D_R=scale, n_frames=50_001, rng=32)))
+def test_the_axes_of_the_steps_are_uniform(scale, repeats):
+    """Isotropic steps have no preferred axis: <u> = 0, <u u^T> = 1/3, within 4.5 errors."""
+    v = log_map(steps(simulate(D_R=scale, n_frames=repeats(20_001, 50_001), rng=32)))
     u = v / np.linalg.norm(v, axis=1, keepdims=True)
     mean, error = mean_and_error(u)
     assert np.all(np.abs(mean) < 4.5 * error)
@@ -59,23 +59,23 @@ def test_the_axes_of_the_steps_are_uniform(scale):
 
 
 @pytest.mark.parametrize("tensor", [TENSOR, np.diag(TENSOR), 1e-3, [1e-3, 0.0, 0.0]])
-def test_the_planted_tensor_is_in_the_steps(tensor):
+def test_the_planted_tensor_is_in_the_steps(tensor, repeats):
     """<theta theta^T> = 2 D dt in body axes, within 4.5 errors and the second order in D dt."""
     dt = 0.5
     planted = np.asarray(tensor)
     if planted.ndim < 2:
         planted = np.diag(np.broadcast_to(planted, 3))
-    v = log_map(steps(simulate(D_R=tensor, dt=dt, n_frames=40_001, rng=33)))
+    v = log_map(steps(simulate(D_R=tensor, dt=dt, n_frames=repeats(20_001, 40_001), rng=33)))
     mean, error = mean_and_error(v[:, :, None] * v[:, None])
     assert np.all(
         np.abs(mean - 2 * planted * dt) <= 4.5 * error + 4 * (np.trace(planted) * dt) ** 2
     )
 
 
-def test_a_large_anisotropic_step_decays_by_its_tensor():
+def test_a_large_anisotropic_step_decays_by_its_tensor(repeats):
     """E[R] = exp(-(tr D - D) dt) for any tensor, also when 2 D dt is of order one (4.5 errors)."""
     dt = 200.0
-    r = steps(simulate(D_R=TENSOR, dt=dt, n_frames=20_001, rng=34))
+    r = steps(simulate(D_R=TENSOR, dt=dt, n_frames=repeats(3001, 20_001), rng=34))
     values, axes = np.linalg.eigh(np.trace(TENSOR) * np.eye(3) - TENSOR)
     expected = axes @ np.diag(np.exp(-values * dt)) @ axes.T
     mean, error = mean_and_error(r)
@@ -83,7 +83,7 @@ def test_a_large_anisotropic_step_decays_by_its_tensor():
     assert expected.max() < 0.6
 
 
-def test_body_axes_are_meant():
+def test_tensors_are_in_body_axes():
     """The tensor is fixed in the body: lab-frame steps of a body that turned are isotropic."""
     motion = simulate(D_R=[0.0, 0.0, 0.01], n_frames=1000, rng=35)
     z = motion.rotation[:, :, 2]
@@ -105,9 +105,9 @@ def test_a_tensor_of_equal_values_is_the_number():
     np.testing.assert_allclose(rounded.rotation, one.rotation, atol=1e-12)
 
 
-def test_steps_compose():
+def test_steps_compose(repeats):
     """Two steps of dt have the law of one step of 2 dt: E over pairs = exp(-4 D dt), 4 errors."""
-    r = simulate(D_R=0.1, n_frames=100_001, rng=37).rotation
+    r = simulate(D_R=0.1, n_frames=repeats(40_001, 100_001), rng=37).rotation
     two = np.einsum("tii->t", np.swapaxes(r[:-2:2], 1, 2) @ r[2::2]) / 3
     mean, error = mean_and_error(two)
     assert abs(mean - np.exp(-0.4)) < 4 * error
@@ -117,23 +117,23 @@ def test_steps_compose():
 
 
 @pytest.mark.parametrize("scale", [1e-3, 0.05, 0.25])
-def test_eulers_scheme_has_the_right_mean(scale):
+def test_eulers_scheme_has_the_right_mean(scale, repeats):
     """Eq. 16: E[R] = exp(-2 D dt) 1 exactly, within 4.5 errors."""
-    r = simulate(D_R=scale, n_frames=50_001, scheme="euler", rng=38).rotation
+    r = simulate(D_R=scale, n_frames=repeats(20_001, 50_001), scheme="euler", rng=38).rotation
     # The paper multiplies in the lab, so its steps are R_{k+1} R_k^T.
     left = r[1:] @ np.swapaxes(r[:-1], -1, -2)
     mean, error = mean_and_error(left)
     assert np.all(np.abs(mean - np.exp(-2 * scale) * np.eye(3)) < 4.5 * error)
 
 
-def test_finite_steps_of_both_schemes():
+def test_finite_steps_of_both_schemes(repeats):
     """At D dt = 0.25 <alpha^2>/4 D dt of a lab axis is 0.913 for Brownian steps, about any axis.
 
-    (facts/estimation.md, 1c.) Euler's scheme is not isotropic there: its y axis differs from z.
+    Euler's scheme is not isotropic there: its y axis differs from z.
     """
     z, y = np.eye(3)[2], np.eye(3)[1]
-    r = simulate(D_R=0.25, n_frames=200_001, rng=40).rotation
-    s = simulate(D_R=0.25, n_frames=200_001, scheme="euler", rng=39).rotation
+    r = simulate(D_R=0.25, n_frames=repeats(40_001, 200_001), rng=40).rotation
+    s = simulate(D_R=0.25, n_frames=repeats(40_001, 200_001), scheme="euler", rng=39).rotation
     brownian, euler = (q[1:] @ np.swapaxes(q[:-1], 1, 2) for q in (r, s))
     ratio, error = mean_and_error(np.sum(log_map(brownian) ** 2, axis=1) / 1.5)
     assert abs(ratio - 0.9582) < 4 * error + 5e-5
@@ -159,10 +159,10 @@ def test_eulers_scheme_is_equation_16():
 
 
 @pytest.mark.parametrize("cluster", [BODY, PLANE])
-def test_translation_variance(cluster):
+def test_translation_variance(cluster, repeats):
     """Each coordinate of the centre moves by 2 D_T dt a step, within 4.5 errors, uncorrelated."""
     d = cluster.positions.shape[1]
-    motion = simulate(cluster, D_T=0.04, dt=0.7, n_frames=50_001, rng=42)
+    motion = simulate(cluster, D_T=0.04, dt=0.7, n_frames=repeats(20_001, 50_001), rng=42)
     jump = np.diff(motion.center, axis=0)
     mean, error = mean_and_error(jump[:, :, None] * jump[:, None])
     assert np.all(np.abs(mean - 2 * 0.04 * 0.7 * np.eye(d)) < 4.5 * error)
@@ -173,10 +173,11 @@ def test_translation_variance(cluster):
 
 
 @pytest.mark.parametrize("scale", [1e-5, 0.1, 2.0])
-def test_the_plane_has_one_angle(scale):
+def test_the_plane_has_one_angle(scale, repeats):
     """In 2-D the turn of a step is Gaussian of variance 2 D dt: <cos> = exp(-D dt), 4 errors."""
-    motion = simulate(PLANE, D_R=scale, n_frames=50_001, rng=43)
-    assert motion.rotation.shape == (50_001, 2, 2)
+    frames = repeats(20_001, 50_001)
+    motion = simulate(PLANE, D_R=scale, n_frames=frames, rng=43)
+    assert motion.rotation.shape == (frames, 2, 2)
     angle = log_map(steps(motion))[:, 0]
     mean, error = mean_and_error(2 * np.sin(angle / 2) ** 2)
     assert abs(mean + np.expm1(-scale)) < 4 * error
@@ -200,9 +201,9 @@ def test_the_truth_is_a_rigid_body():
     assert simulate(n_frames=1).positions().shape == (1, 4, 3)
 
 
-def test_long_products_stay_rotations():
-    """After 300 000 steps the matrices are orthogonal to 1e-12."""
-    r = simulate(D_R=0.1, n_frames=300_001).rotation[-10:]
+def test_long_products_stay_rotations(repeats):
+    """After 300 000 (quick: 100 000) steps the matrices are orthogonal to 1e-12."""
+    r = simulate(D_R=0.1, n_frames=repeats(100_001, 300_001)).rotation[-10:]
     np.testing.assert_allclose(
         r @ np.swapaxes(r, 1, 2), np.broadcast_to(np.eye(3), r.shape), atol=1e-12
     )
@@ -253,7 +254,7 @@ def test_one_seed_one_motion(options):
         ({"scheme": "verlet"}, "scheme"),
     ],
 )
-def test_what_has_no_meaning_is_refused(options, word):
+def test_invalid_options_are_refused(options, word):
     """Bad numbers, bad tensors and unknown schemes raise a ValueError that names them."""
     with pytest.raises(ValueError, match=word):
         simulate(**options)
@@ -288,26 +289,28 @@ def screws(motion, body):
     return np.concatenate([shift, log_map(before @ motion.rotation[1:])], axis=1)
 
 
-@pytest.mark.parametrize(("name", "frames"), [("chain", 300_001), ("propeller", 40_001)])
-def test_the_planted_6x6_tensor_is_in_the_steps(name, frames, request):
+@pytest.mark.parametrize(
+    ("name", "quick", "long"), [("chain", 120_001, 300_001), ("propeller", 15_001, 40_001)]
+)
+def test_the_planted_6x6_tensor_is_in_the_steps(name, quick, long, request, repeats):
     """Covariances of body-frame screws are 2 D dt in all 36 places, within 4.5 errors."""
     body = request.getfixturevalue(name)
     dt = 1e-3 / np.trace(body.D_R)  # the second order in D dt is then below the errors
-    step = screws(simulate_motion(body, dt=dt, n_frames=frames, rng=60), body)
+    step = screws(simulate_motion(body, dt=dt, n_frames=repeats(quick, long), rng=60), body)
     mean, error = mean_and_error(step[:, :, None] * step[:, None])
     assert np.all(np.abs(mean - 2 * body.D * dt) < 4.5 * error)
-    # The coupling is seen, so that its sign is tested.
+    # The coupling is measured, so that its sign is tested.
     place = np.unravel_index(np.abs(body.coupling).argmax(), (3, 3))
-    seen, unsure = mean[:3, 3:][place], error[:3, 3:][place]
-    assert abs(seen) > 6 * unsure
+    measured, stderr = mean[:3, 3:][place], error[:3, 3:][place]
+    assert abs(measured) > repeats(4, 6) * stderr
     drift, error = mean_and_error(step)
     assert np.all(np.abs(drift) < 4.5 * error)
 
 
-def test_long_steps_of_a_coupled_body(propeller):
+def test_long_steps_of_a_coupled_body(propeller, repeats):
     """At any dt the centre of diffusion has <x^2> = 2 tr(D_T) dt, <R> = exp(-(tr D_R - D_R) dt)."""
     dt = 0.4 / np.trace(propeller.D_R)
-    motion = simulate_motion(propeller, dt=dt, n_frames=8001, rng=61)
+    motion = simulate_motion(propeller, dt=dt, n_frames=repeats(2001, 8001), rng=61)
     step = screws(motion, propeller)
     mean, error = mean_and_error(np.sum(step[:, :3] ** 2, axis=1))
     assert abs(mean - 2 * np.trace(propeller.D_T) * dt) < 4.5 * error
@@ -317,14 +320,18 @@ def test_long_steps_of_a_coupled_body(propeller):
     assert np.all(np.abs(mean - expected) < 4.5 * error)
 
 
-def test_a_tracked_point_off_the_centre_of_diffusion():
+def test_a_tracked_point_off_the_centre_of_diffusion(repeats):
     """The centroid of a 1:3 dimer moves by 6 D_T t + 2 r^2 (1 - exp(-2 D_R t)), D_R across it.
 
     At short times that is the apparent D_T, at long ones a constant more than the true one.
     """
     body = cluster_mobility([[0, 0, 0], [0, 0, 4]], radius=[1.0, 3.0], **KNOWN)
     across, r = body.D_R[0, 0], np.linalg.norm(body.center - body.centroid)
-    for scale, frames in ((1e-3, 15_001), (0.2, 4001), (1.0, 1001)):
+    for scale, frames in (
+        (1e-3, repeats(8001, 15_001)),
+        (0.2, repeats(1001, 4001)),
+        (1.0, repeats(301, 1001)),
+    ):
         t = scale / across
         motion = simulate_motion(body, dt=t, n_frames=frames, rng=62)
         mean, error = mean_and_error(np.sum(np.diff(motion.center, axis=0) ** 2, axis=1))
@@ -349,7 +356,7 @@ def test_the_motion_of_a_mobility_is_a_rigid_body(chain):
 
 
 def test_a_mobility_has_its_own_coefficients(chain):
-    """D_R, D_T or another scheme beside a Mobility are refused, and a Cluster needs D_R."""
+    """D_R, D_T or another scheme with a Mobility are refused, and a Cluster needs D_R."""
     for options in ({"D_R": 1e-3}, {"D_T": 0.1}, {"scheme": "euler"}):
         with pytest.raises(ValueError, match="Mobility"):
             simulate_motion(chain, dt=1.0, n_frames=5, rng=1, **options)
@@ -371,7 +378,7 @@ def test_noise_has_its_sigma_on_every_axis():
     assert np.all(np.abs(mean) < 4.5 * error)
 
 
-def test_noise_leaves_its_input_and_its_holes():
+def test_noise_changes_neither_its_input_nor_missing_points():
     """The input stays, missing points stay missing, sigma 0 adds nothing, one seed one answer."""
     x = np.zeros((5, 2, 3))
     x[2, 1] = np.nan
@@ -385,7 +392,7 @@ def test_noise_leaves_its_input_and_its_holes():
 
 
 @pytest.mark.parametrize("sigma", [-1, np.nan, [1, 2], np.ones((5, 2, 3))])
-def test_noise_refuses_what_is_no_sigma(sigma):
+def test_invalid_sigmas_are_refused(sigma):
     """A negative, missing or misshapen sigma, and positions of the wrong shape, are refused."""
     with pytest.raises(ValueError, match="sigma"):
         add_noise(np.zeros((5, 2, 3)), sigma=sigma, rng=1)

@@ -1,4 +1,4 @@
-"""The threshold rule: rotation counted from a reference that is renewed once it is exceeded."""
+"""The threshold rule: rotation from a reference that is renewed where a threshold is exceeded."""
 
 from dataclasses import replace
 
@@ -16,7 +16,7 @@ from perrin import (
     track_rotation,
 )
 from perrin.geometry.rotations import exp_map
-from perrin.motion.rigid_motion import _references
+from perrin.motion.rigid_motion import threshold_references
 
 TETRA = Cluster.tetrahedron(1.5)
 FLAT = Cluster.from_positions([[0.0, 0.0], [2.0, 0.1], [0.5, 1.2], [-0.7, 0.9]])
@@ -38,7 +38,7 @@ def turned(rotations):
 
 
 @pytest.mark.parametrize("threshold", [0.1, 0.7, 2.0])
-def test_it_is_the_rule_said_frame_by_frame(threshold):
+def test_it_is_the_rule_frame_by_frame(threshold):
     """Gaps and pieces: equal to a loop over scipy rotations that restarts its reference."""
     motion = gappy(1)
     walk = threshold_displacement(motion, threshold=threshold)
@@ -68,8 +68,8 @@ def test_its_ends_are_the_sum_of_all_steps_and_the_rotation_vector():
     )
 
 
-def test_it_follows_the_lab_and_not_the_unit():
-    """A turned lab turns the displacement; unit, origin and particle order leave it alone."""
+def test_it_turns_with_the_lab_and_has_no_unit():
+    """A turned lab turns the displacement; unit, origin and particle order do not change it."""
     rng = np.random.default_rng(3)
     truth = simulate_motion(TETRA, D_R=2e-2, dt=1.0, n_frames=200, rng=rng)
     x = add_noise(truth.positions(), sigma=0.03, rng=rng)
@@ -91,26 +91,27 @@ def test_in_the_plane_rotations_add_up_whatever_the_threshold():
         np.testing.assert_allclose(walk[:, 0], angle - angle[0], atol=1e-9)
 
 
-def test_noise_on_a_body_at_rest_does_not_add_up():
-    """sigma/R = 0.15: the sum of steps reads D = 0.04 (sigma/R)^4 a frame, the threshold rule 0.
+def test_noise_on_a_body_at_rest_does_not_add_up(repeats):
+    """sigma/R = 0.15: the sum of steps has D = 0.04 (sigma/R)^4 a frame, the threshold rule 0.
 
-    The slope between lags of 200 and 2000 frames, within 3 of its stated errors, 20000 frames.
+    The slope between lags of 200 and 2000 frames, within 3 of its stated errors, 20000 (quick:
+    12000) frames.
     """
-    still = np.tile(TETRA.positions, (20_000, 1, 1))
+    still = np.tile(TETRA.positions, (repeats(12_000, 20_000), 1, 1))
     motion = track_rotation(add_noise(still, sigma=0.15 * TETRA.R, rng=6), dt=1.0)
     every, held = (
         fit_line(msad_vector(motion, threshold=t), lag_range=(200, 2000)) for t in (0.0, 1.0)
     )
     assert abs(every.value - 0.04 * 0.15**4) < 3 * every.stderr
     assert every.ci95[0] > 0
-    # Such a D is what noise alone makes: an upper limit, and printed as one.
+    # Noise alone has such a D: it is an upper limit, and printed as one.
     assert not every.resolved
     assert every.resolution_floor == pytest.approx(0.04 * 0.15**4, rel=0.1)
     assert abs(held.value) < 0.01 * every.value
 
 
-def test_free_diffusion_is_seen_as_well():
-    """Both rules read the planted D at lags beyond threshold^2/(6 D) = 83 frames, within 3 errors.
+def test_free_diffusion_is_measured_too():
+    """Both rules measure D at lags beyond threshold^2/(6 D) = 83 frames, within 3 errors.
 
     The rule itself lowers D by threshold^2/60 = 1.7 %, a sixth of the error.
     """
@@ -121,14 +122,16 @@ def test_free_diffusion_is_seen_as_well():
         assert found.stderr < 0.12 * 2e-3
 
 
-def test_the_long_time_diffusion_falls_as_the_first_passage_says():
+def test_the_long_time_diffusion_is_that_of_first_passages(repeats):
     """Threshold 2: D (1 - threshold^2/60) = 0.93 D, within 3 errors, which are below 2 %.
 
     Passages are independent and isotropic, so that D is their mean square over six mean durations.
+    The quick form has as many passages in frames four times as long.
     """
-    D = 5e-3
-    truth = simulate_motion(TETRA, D_R=D, dt=1.0, n_frames=240_000, rng=10)
-    origins = np.unique(_references(truth.rotation, truth.piece, 2.0))
+    shorter = repeats(4, 1)
+    D = 5e-3 * shorter
+    truth = simulate_motion(TETRA, D_R=D, dt=1.0, n_frames=240_000 // shorter, rng=10)
+    origins = np.unique(threshold_references(truth.rotation, truth.piece, threshold=2.0))
     passage = np.diff(threshold_displacement(truth, threshold=2.0)[origins], axis=0)
     square, duration = np.sum(passage**2, axis=1), np.diff(origins)
     ratio = square.sum() / (6 * D * duration.sum())
@@ -138,12 +141,13 @@ def test_the_long_time_diffusion_falls_as_the_first_passage_says():
     assert abs(ratio - (1 - 4 / 60)) < 3 * error
 
 
-def test_jumps_of_a_caged_rotor_are_counted_and_its_rattling_is_not():
+def test_jumps_of_a_caged_rotor_are_counted_and_its_rattling_is_not(repeats):
     """Rattling by 0.2 rad per axis, 8 jumps by 2.2 rad: the end is the sum of the jumps to 4 rad.
 
-    Each jump is seen with the rattle at both its ends (1.4 rad in all); the sum of all steps
-    wanders off by 11 rad in 50000 frames.
+    Each jump contains the rattling at both its ends (1.4 rad in all); the sum of all steps differs
+    by 11 rad after 50000 frames (quick: over 4 rad after 25000).
     """
+    frames = repeats(25_000, 50_000)
     rng = np.random.default_rng(8)
     jump = rng.normal(size=(8, 3))
     jump *= 2.2 / np.linalg.norm(jump, axis=1, keepdims=True)
@@ -151,8 +155,8 @@ def test_jumps_of_a_caged_rotor_are_counted_and_its_rattling_is_not():
     for turn in exp_map(jump):
         cage = turn @ cage
         cages.append(cage)
-    place = np.arange(50_000) * 9 // 50_000
-    rattle = exp_map(0.2 * rng.normal(size=(50_000, 3)))
+    place = np.arange(frames) * 9 // frames
+    rattle = exp_map(0.2 * rng.normal(size=(frames, 3)))
     motion = turned(np.array(cages)[place] @ rattle)
     off = {
         t: np.linalg.norm(threshold_displacement(motion, threshold=t)[-1] - jump.sum(axis=0))
@@ -162,7 +166,7 @@ def test_jumps_of_a_caged_rotor_are_counted_and_its_rattling_is_not():
 
 
 @pytest.mark.parametrize("threshold", [-0.1, 3.2, np.nan])
-def test_a_threshold_that_is_no_angle_is_refused(threshold):
+def test_invalid_thresholds_are_refused(threshold):
     """Below 0, above pi, NaN: refused with the value."""
     motion = gappy(9, n_frames=200)
     with pytest.raises(ValueError, match=r"threshold: expected an angle from 0 to pi.*got"):

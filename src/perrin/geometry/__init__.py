@@ -4,7 +4,9 @@ from perrin.geometry.rigid import (
     center_variance,
     degrees_of_freedom,
     diffusion_center,
+    inertia_tensor,
     orientation_covariance,
+    pose_slopes,
     shifted,
 )
 from perrin.geometry.rotations import (
@@ -50,6 +52,7 @@ __all__ = [
     "dispersion",
     "exp_map",
     "fit_rotations",
+    "inertia_tensor",
     "is_tetrahedron",
     "kabsch",
     "log_map",
@@ -58,6 +61,7 @@ __all__ = [
     "pair_distances",
     "planar_rotation",
     "point_group",
+    "pose_slopes",
     "rotation_group",
     "schoenflies",
     "shifted",

@@ -1,4 +1,4 @@
-"""Rigid bodies of points: uncertainty of a pose, and 6x6 tensors moved to another point."""
+"""Rigid bodies of points: slopes and errors of a pose, 6x6 tensors moved to another point."""
 
 from __future__ import annotations
 
@@ -15,18 +15,71 @@ if TYPE_CHECKING:
 
 
 def degrees_of_freedom(n_present: Ints, d: int) -> Ints:
-    """Return the degrees of freedom that a rigid fit leaves: 3n - 6 a frame (2n - 3 in 2-D)."""
+    """Return the degrees of freedom that a rigid fit leaves in each frame.
+
+    Parameters
+    ----------
+    n_present : ndarray of int
+        Number of particles present in each frame.
+    d : int
+        Number of coordinates of a particle, 2 or 3.
+
+    Returns
+    -------
+    ndarray of int
+        3n - 6, or 2n - 3 in the plane; never negative.
+
+    Examples
+    --------
+    >>> degrees_of_freedom(np.array([1, 3, 4]), 3)
+    array([0, 3, 6])
+    """
     return np.maximum(d * n_present - d * (d + 1) // 2, 0)
 
 
-def _pose_slopes(arm: Floats) -> Floats:
-    """Return the change of each coordinate (T, n, d) with rotation vector and centre."""
-    t, n, d = arm.shape
-    unit = np.broadcast_to(np.eye(d), (t, n, d, d))
-    if d == 2:
-        across = np.stack([-arm[..., 1], arm[..., 0]], axis=-1)[..., None]
-        return np.concatenate([across, unit], axis=-1)
-    return np.concatenate([-skew(arm), unit], axis=-1)
+def pose_slopes(arm: Floats) -> Floats:
+    """Return how a small rotation and a shift of a rigid body move each of its particles.
+
+    Parameters
+    ----------
+    arm : ndarray, shape (..., n, d)
+        Positions of the particles relative to the point that the body turns about.
+
+    Returns
+    -------
+    ndarray, shape (..., n, d, k)
+        Derivatives of every coordinate by the k = 6 components of the rotation vector and of the
+        shift, in this order; k = 3 (one angle, two shifts) in the plane.
+
+    Notes
+    -----
+    A rotation vector w moves the point r by w x r, whose derivative by w is -[r]x.
+
+    Examples
+    --------
+    >>> slopes = pose_slopes(np.array([[0.0, 2.0, 0.0]]))
+    >>> slopes[0] @ [0.1, 0, 0, 0, 0, 0.5]  # turned about x by 0.1 rad, lifted by 0.5
+    array([0. , 0. , 0.7])
+    """
+    d = arm.shape[-1]
+    turn = np.stack([-arm[..., 1], arm[..., 0]], axis=-1)[..., None] if d == 2 else -skew(arm)
+    return np.concatenate([turn, np.broadcast_to(np.eye(d), (*arm.shape, d))], axis=-1)
+
+
+def inertia_tensor(arm: Floats) -> Floats:
+    """Return the inertia tensor M = sum (r^2 1 - r r^T) of particles of unit mass, um^2.
+
+    Parameters
+    ----------
+    arm : ndarray, shape (n, 3)
+        Positions relative to their centre, um.
+
+    Examples
+    --------
+    >>> inertia_tensor(np.array([[0.0, 0, 1.0], [0, 0, -1.0]])).diagonal()
+    array([2., 2., 0.])
+    """
+    return np.sum(arm * arm) * np.eye(3) - arm.T @ arm
 
 
 def orientation_covariance(positions: Floats, noise: Floats) -> Floats:
@@ -42,16 +95,27 @@ def orientation_covariance(positions: Floats, noise: Floats) -> Floats:
     Returns
     -------
     ndarray, shape (..., 3, 3) or (..., 1, 1)
+
+    Notes
+    -----
+    The fitted rotation vector errs by sum A_i e_i, with A_i = M^-1 [r_i]x the inertia tensor M and
+    the slopes of the pose -[r_i]x.
+
+    Examples
+    --------
+    >>> pair = np.array([[1.0, 0.0], [-1.0, 0.0]])
+    >>> orientation_covariance(pair, 0.01 * np.eye(2))
+    array([[0.005]])
     """
     r = positions - positions.mean(0)
+    slopes = pose_slopes(r)
     if r.shape[1] == 2:
-        across = np.stack([-r[:, 1], r[:, 0]], axis=1)
+        across = slopes[..., 0]
         inertia = float((r * r).sum())
         variance = np.einsum("ia,...ab,ib->...", across, noise, across) / inertia**2
         return np.asarray(variance)[..., None, None]
-    inverse = np.linalg.inv(_inertia(r))
-    arms = inverse @ skew(r)
-    covariance: Floats = np.einsum("iab,...bc,idc->...ad", arms, noise, arms)
+    response = np.linalg.inv(inertia_tensor(r)) @ np.swapaxes(slopes[..., :3], -1, -2)
+    covariance: Floats = np.einsum("iab,...bc,idc->...ad", response, noise, response)
     # Symmetric to the last bit, as tables store one triangle of it.
     return 0.5 * (covariance + np.swapaxes(covariance, -1, -2))
 
@@ -61,6 +125,23 @@ def center_variance(positions: Floats, present: Bools, sigma: float) -> float:
 
     With particles missing the centre is extrapolated along the body, so the error of the
     orientation enters through the lever from the centroid of those present to the centre.
+
+    Parameters
+    ----------
+    positions : ndarray, shape (n, d)
+        All particles of the body, um, their centre at the origin.
+    present : ndarray of bool, shape (n,)
+        Which particles the pose is fitted to.
+    sigma : float
+        Localisation error of one coordinate, um.
+
+    Examples
+    --------
+    >>> body = np.array([[1.0, 0.0], [-0.5, 0.8], [-0.5, -0.8]])
+    >>> all_three = center_variance(body, np.ones(3, dtype=bool), 0.03)
+    >>> two = center_variance(body, np.array([True, True, False]), 0.03)
+    >>> bool(all_three < two)
+    True
     """
     seen = positions[present]
     lever = seen.mean(0)
@@ -70,13 +151,8 @@ def center_variance(positions: Floats, present: Bools, sigma: float) -> float:
     covariance = orientation_covariance(seen, sigma**2 * np.eye(positions.shape[1]))
     if positions.shape[1] == 2:
         return float(variance + lever @ lever * covariance[0, 0] / 2)
-    arm = skew(lever)
+    arm = pose_slopes(lever)[:, :3]
     return float(variance + np.trace(arm @ covariance @ arm.T) / 3)
-
-
-def _inertia(r: Floats) -> Floats:
-    """Return M = sum (r^2 1 - r r^T) of centred positions."""
-    return np.sum(r * r) * np.eye(3) - r.T @ r
 
 
 def shifted(tensor: Floats, point: ArrayLike) -> Floats:

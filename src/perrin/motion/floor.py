@@ -1,15 +1,16 @@
-"""How well an orientation can be known: the noise of a rigid fit, the floor under an MSAD."""
+"""Noise floor of the MSAD: the apparent rotation of a motionless cluster, from its shape."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from perrin._arrays import Floats, as_sigma, frozen
+from perrin._arrays import Floats, as_sigma, from_plain, frozen, to_plain
 from perrin.errors import DegenerateClusterError
-from perrin.geometry.rigid import _inertia, orientation_covariance
+from perrin.geometry.rigid import inertia_tensor, orientation_covariance
 from perrin.geometry.shapes import Cluster
 
 
@@ -20,7 +21,7 @@ class NoiseFloor:
     Attributes
     ----------
     phi2 : float
-        Phi^2, rad^2: the noise floor of the MSAD, averaged over all directions (Hunter 2011,
+        Noise floor Phi^2 of the MSAD, rad^2, averaged over all directions (Hunter 2011,
         Eqs. 21-23; exact for any shape).
     covariance : ndarray, shape (3, 3) or (1, 1)
         Covariance of one fitted orientation as a rotation vector in body axes, rad^2.
@@ -28,6 +29,9 @@ class NoiseFloor:
 
     phi2: float
     covariance: Floats
+
+    def __post_init__(self) -> None:
+        frozen(self.covariance)
 
     def along(self, direction: ArrayLike) -> float:
         """Return Phi^2 (rad^2) of the MSAD of one body-fixed direction, 2 (tr C - p.C.p).
@@ -44,6 +48,31 @@ class NoiseFloor:
             raise ValueError(f"direction: expected 3 numbers, not all zero, got {direction!r}")
         p = p / np.linalg.norm(p)
         return float(2 * (np.trace(self.covariance) - p @ self.covariance @ p))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the floor as JSON holds it.
+
+        Examples
+        --------
+        >>> NoiseFloor(0.25, np.array([[0.125]])).to_dict()
+        {'phi2': 0.25, 'covariance': [[0.125]]}
+        """
+        return {"phi2": to_plain(self.phi2), "covariance": to_plain(self.covariance)}
+
+    @classmethod
+    def from_dict(cls, entry: dict[str, Any]) -> NoiseFloor:
+        """Return the floor that `to_dict` wrote.
+
+        Parameters
+        ----------
+        entry : dict
+
+        Examples
+        --------
+        >>> NoiseFloor.from_dict({"phi2": 0.25, "covariance": [[0.125]]}).phi2
+        0.25
+        """
+        return cls(float(from_plain(entry["phi2"])), from_plain(entry["covariance"]))
 
 
 def noise_floor(cluster: Cluster | ArrayLike, *, sigma: ArrayLike) -> NoiseFloor:
@@ -81,28 +110,49 @@ def noise_floor(cluster: Cluster | ArrayLike, *, sigma: ArrayLike) -> NoiseFloor
     2.222222222
     """
     body = cluster if isinstance(cluster, Cluster) else Cluster.from_positions(cluster)
-    d = body.positions.shape[1]
+    n, d = body.positions.shape
     noise = np.diag(as_sigma(sigma, d) ** 2)
-    _require_planes(body.positions)
+    extent = np.linalg.svd(body.positions, compute_uv=False)
+    needed = 1 if d == 2 else 2  # extents that must differ from 0
+    if n <= needed or extent[needed - 1] <= 1e-9 * extent[0] or extent[0] == 0:
+        raise DegenerateClusterError(
+            f"the cluster's {n} particles do not fix an orientation: {d} dimensions need at "
+            f"least {d} particles" + (" apart" if d == 2 else ", not on one line"),
+            (n,),
+        )
     covariance = orientation_covariance(body.positions, noise)
-    frozen(covariance)
     return NoiseFloor(float(floor_of(covariance)), covariance)
 
 
 def floor_of(covariance: Floats) -> Floats:
-    """Return Phi^2 averaged over directions, (4/3) tr C, or 2 C in the plane; shape (...)."""
+    """Return Phi^2 (rad^2) averaged over directions, (4/3) tr C, or 2 C in the plane.
+
+    Parameters
+    ----------
+    covariance : ndarray, shape (..., 3, 3) or (..., 1, 1)
+        Covariance of an orientation, rad^2.
+
+    Returns
+    -------
+    ndarray, shape (...)
+
+    Examples
+    --------
+    >>> floor_of(np.diag([0.25, 0.25, 0.25]))
+    np.float64(1.0)
+    """
     factor = 2.0 if covariance.shape[-1] == 1 else 4.0 / 3.0
     floor: Floats = factor * np.trace(covariance, axis1=-2, axis2=-1)
     return floor
 
 
 def floor_range(template: Floats, rotation: Floats, *, ratio: float) -> tuple[float, float]:
-    """Return by how much an unknown sigma_z/sigma_xy changes the floor that residuals predict.
+    """Return by which factors an unknown sigma_z/sigma_xy may change the predicted floor.
 
     Parameters
     ----------
     template : ndarray, shape (n, 3)
-        Centred.
+        Particles of the body, um, their centre at the origin.
     rotation : ndarray, shape (T, 3, 3)
         Lab from body, without NaN.
     ratio : float
@@ -117,9 +167,15 @@ def floor_range(template: Floats, rotation: Floats, *, ratio: float) -> tuple[fl
     -----
     Orientation covariance C and expected square residual, (n - 1) tr S - tr M C, are both linear in
     the noise S in body axes, so their ratio is monotonic in (sigma_z/sigma_xy)^2.
+
+    Examples
+    --------
+    >>> body, still = Cluster.tetrahedron(1.5).positions, np.eye(3)[None]
+    >>> [round(factor, 9) for factor in floor_range(body, still, ratio=3.0)]
+    [1.0, 1.0]
     """
     along_z = np.einsum("ti,tj->ij", rotation[:, 2], rotation[:, 2]) / len(rotation)
-    inertia = _inertia(template)
+    inertia = inertia_tensor(template)
 
     def floor_per_residual(square: float) -> float:
         noise = np.eye(3) + (square - 1) * along_z
@@ -130,16 +186,3 @@ def floor_range(template: Floats, rotation: Floats, *, ratio: float) -> tuple[fl
     equal = floor_per_residual(1.0)
     ends = [floor_per_residual(square) / equal for square in (ratio**-2, ratio**2)]
     return min(1.0, *ends), max(1.0, *ends)
-
-
-def _require_planes(positions: Floats) -> None:
-    """Refuse bodies whose orientation is not determined: too few particles, or all on a line."""
-    n, d = positions.shape
-    spread = np.linalg.svd(positions, compute_uv=False)
-    needed = 1 if d == 2 else 2
-    if n <= needed or spread[needed - 1] <= 1e-9 * spread[0] or spread[0] == 0:
-        raise DegenerateClusterError(
-            f"the cluster's {n} particles do not fix an orientation: {d} dimensions need at "
-            f"least {d} particles" + (", not on one line" if d == 3 else " apart"),
-            (n,),
-        )

@@ -1,4 +1,4 @@
-"""What the residuals of rigid fits show: noise of each axis, a stretched z, a sequential scan."""
+"""Residuals of rigid fits: localisation error of each axis, a stretched z, a sequential scan."""
 
 from __future__ import annotations
 
@@ -6,40 +6,47 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from perrin._arrays import Floats, as_positions, frozen
+from perrin._arrays import Floats, frozen
 from perrin.errors import DegenerateClusterError, TooFewFramesError
-from perrin.geometry.rigid import degrees_of_freedom
+from perrin.geometry.rigid import degrees_of_freedom, inertia_tensor, pose_slopes
 from perrin.geometry.rotations import skew
-from perrin.motion.tracking import track_rotation
+from perrin.motion.tracking import template_motion
 
 if TYPE_CHECKING:
     from perrin.motion.rigid_motion import RigidMotion
 
-_FRAMES = 2000  # frames sampled: enough for every average here
+
+# Most frames sampled: the standard error of every average here is then below 2 % of its scatter.
+_SAMPLED_FRAMES = 2000
 
 
-# Two-sided probability below which a slope counts as different from zero.
-LEVEL = 1e-3
+# Two-sided probability below which a slope is taken to differ from zero.
+SIGNIFICANCE = 1e-3
 
 
-# A slope is measured only where the motion of the body shows it: this multiple of what noise in
-# the fitted orientation imitates, and a standard error of the stretch below `_USEFUL`.
-_ABOVE_NOISE, _USEFUL = 4.0, 0.1
+# Least power (um^2) of a displacement over what noise of the fitted orientation adds to it: below
+# this factor the body turns or moves too little to measure the slope.
+_LEAST_POWER = 4.0
 
 
-# Spread of the variances of the axes over the mean square residual before they are measured: that
-# of a body that lies in the plane x y hardly contains the noise along z, up to ten times as large.
-_UNEQUAL = 6.0
+# Largest standard error of the stretch (relative) that is still reported as measured.
+_STRETCH_ERROR = 0.1
 
 
-# Relative error of a variance up to which the noise of an axis counts as measured.
-_MEASURED = 0.3
+# Spread of the variances of the axes, over the mean square residual, that is assumed before they
+# are measured: residuals of a body in the plane x y hardly contain the noise along z, which may be
+# up to ten times as large.
+_VARIANCE_SPREAD = 6.0
 
 
-# Velocities above this multiple of the median are jumps, which say nothing about a scan.
-_FASTEST = 6.0
+# Largest relative standard error of a variance that is still reported as measured.
+_VARIANCE_ERROR = 0.3
+
+
+# Largest speed of the centre over the median speed: faster ones are jumps, not the motion that a
+# sequential scan displaces particles by.
+_JUMP_SPEED = 6.0
 
 
 _LEVI_CIVITA = -skew(np.eye(3))
@@ -47,21 +54,21 @@ _LEVI_CIVITA = -skew(np.eye(3))
 
 @dataclass(frozen=True, eq=False)
 class Residuals:
-    """Residual vectors of the complete frames of one body, body axes.
+    """Residual vectors of the complete frames of one body, in body axes.
 
     Attributes
     ----------
     rotation : ndarray, shape (K, d, d)
-        Lab from body.
+        Orientation of the body, lab from body.
     vector : ndarray, shape (K, n, d)
-        Measured places less the template's, um.
+        Measured positions minus those of the template, um.
     velocity : ndarray, shape (K, d)
         Velocity of the centre from the neighbouring poses, about its mean, um/s, lab axes; 0 at
         the ends and at jumps.
     template : ndarray, shape (n, d)
-        um.
+        Particles of the common shape, um.
     keeps : ndarray, shape (n, n, d, d)
-        Projector of a rigid fit: what it leaves of displacements of the particles.
+        Projector on the residuals of a rigid fit: what it leaves of displacements of the particles.
     """
 
     rotation: Floats
@@ -79,15 +86,29 @@ class Residuals:
         n, d = self.template.shape
         return int(degrees_of_freedom(np.array(n), d))
 
+    @property
+    def median_sigma(self) -> float:
+        """Localisation error of one coordinate (um) from the median frame; NaN where unknown.
+
+        A few bad frames hardly change it. The median of chi-squared with f degrees of freedom is
+        f (1 - 2/(9 f))^3 (Wilson and Hilferty).
+        """
+        freedom, count = self.freedom, len(self.vector)
+        if count < 2 or freedom == 0:
+            return np.nan
+        square = float(np.median((self.vector**2).sum(axis=(1, 2)))) * count / (count - 1)
+        return float(np.sqrt(square / (freedom * (1 - 2 / (9 * freedom)) ** 3)))
+
     def left_of(self, displacement: Floats) -> Floats:
         """Return what a rigid fit leaves of displacements (K, n, d), less their mean shape."""
         left = np.einsum("nmij,tmj->tni", self.keeps, displacement)
         from_mean: Floats = left - left.mean(axis=0)
         return from_mean
 
-    def lab(self) -> Floats:
-        """Return the residual vectors along the axes of the lab, (K, n, d)."""
-        return _turned(self.rotation, self.vector)
+    def in_lab(self, vectors: Floats) -> Floats:
+        """Return vectors (K, n, d) given in body axes along the axes of the lab."""
+        turned: Floats = np.einsum("tij,tnj->tni", self.rotation, vectors)
+        return turned
 
 
 class Slope(NamedTuple):
@@ -103,20 +124,17 @@ class Slope(NamedTuple):
         return bool(np.isfinite(self.stderr))
 
     def differs_from(self, expected: float) -> bool:
-        """Test the coefficient at `LEVEL`, two-sided (Student's t)."""
+        """Test at the level `SIGNIFICANCE` whether the coefficient differs (Student's t)."""
         from scipy.stats import t
 
         if not self.known:
             return False
-        return bool(abs(self.value - expected) > t.isf(LEVEL / 2, self.freedom) * self.stderr)
+        return bool(
+            abs(self.value - expected) > t.isf(SIGNIFICANCE / 2, self.freedom) * self.stderr
+        )
 
 
-_UNKNOWN = Slope(np.nan, np.nan, 0.0)
-
-
-def _turned(rotation: Floats, vectors: Floats) -> Floats:
-    turned: Floats = np.einsum("tij,tnj->tni", rotation, vectors)
-    return turned
+UNKNOWN_SLOPE = Slope(np.nan, np.nan, 0.0)
 
 
 def sample_residuals(motion: RigidMotion, positions: Floats) -> Residuals:
@@ -138,52 +156,54 @@ def sample_residuals(motion: RigidMotion, positions: Floats) -> Residuals:
     """
     vector = body_residuals(motion, positions)
     rows = np.flatnonzero(np.isfinite(vector).all(axis=(1, 2)))
-    rows = rows[np.unique(np.linspace(0, max(rows.size - 1, 0), _FRAMES).astype(int))[: rows.size]]
-    keeps = fit_projector(motion.template)
+    even = np.linspace(0, max(rows.size - 1, 0), _SAMPLED_FRAMES).astype(int)
+    rows = rows[np.unique(even)[: rows.size]]
+    # Velocity of the centre between the poses before and after, about its mean.
+    velocity, fitted = np.zeros_like(motion.center), motion.fitted
+    if fitted.size >= 3:
+        step = motion.center[fitted[2:]] - motion.center[fitted[:-2]]
+        v = step / (motion.time[fitted[2:]] - motion.time[fitted[:-2]])[:, None]
+        v = v - np.median(v, axis=0)
+        speed = np.linalg.norm(v, axis=1)
+        usual = speed <= _JUMP_SPEED * np.median(speed)
+        velocity[fitted[1:-1][usual]] = v[usual] - v[usual].mean(axis=0)
     return Residuals(
-        motion.rotation[rows], vector[rows], _velocity(motion)[rows], motion.template.copy(), keeps
+        motion.rotation[rows],
+        vector[rows],
+        velocity[rows],
+        motion.template.copy(),
+        fit_projector(motion.template),
     )
 
 
 def fit_projector(template: Floats) -> Floats:
-    """Return what a rigid fit leaves of small displacements of the particles, (n, n, d, d).
+    """Return the projector on what a rigid fit leaves of small displacements of the particles.
+
+    Parameters
+    ----------
+    template : ndarray, shape (n, d)
+
+    Returns
+    -------
+    ndarray, shape (n, n, d, d)
 
     Examples
     --------
-    >>> import numpy as np
     >>> triangle = np.array([[1.0, 0.0], [-0.5, 0.75**0.5], [-0.5, -(0.75**0.5)]])
     >>> round(float(np.einsum("nnii->", fit_projector(triangle))), 9)  # 2 n - 3
     3.0
     """
     n, d = template.shape
-    across = np.stack([-template[:, 1], template[:, 0]], axis=1)[..., None]
-    turns = across if d == 2 else -skew(template)
-    slopes = np.concatenate([turns, np.broadcast_to(np.eye(d), (n, d, d))], axis=2)
-    flat = slopes.reshape(n * d, -1)
-    left = np.eye(n * d) - flat @ np.linalg.pinv(flat)
+    slopes = pose_slopes(template).reshape(n * d, -1)
+    left = np.eye(n * d) - slopes @ np.linalg.pinv(slopes)
     blocks: Floats = left.reshape(n, d, n, d).transpose(0, 2, 1, 3).copy()
     return blocks
 
 
-def _velocity(motion: RigidMotion) -> Floats:
-    """Return the velocity of the centre between the poses before and after, about its mean."""
-    rows = motion.fitted
-    velocity = np.zeros_like(motion.center)
-    if rows.size < 3:
-        return velocity
-    step = motion.center[rows[2:]] - motion.center[rows[:-2]]
-    v = step / (motion.time[rows[2:]] - motion.time[rows[:-2]])[:, None]
-    v = v - np.median(v, axis=0)
-    speed = np.linalg.norm(v, axis=1)
-    usual = speed <= _FASTEST * np.median(speed)
-    velocity[rows[1:-1][usual]] = v[usual] - v[usual].mean(axis=0)
-    return velocity
-
-
 def autocorrelation(sums: Floats, freedom: float) -> Floats:
-    """Return the autocorrelation of residuals at the lags up to where it is lost in its error.
+    """Return the autocorrelation of residuals up to the lag where it falls below its error.
 
-    The mean taken off every component lowers it by about the variance of that mean, which is
+    Subtracting the mean of every component lowers it by about the variance of that mean, which is
     added back.
 
     Parameters
@@ -200,7 +220,6 @@ def autocorrelation(sums: Floats, freedom: float) -> Floats:
 
     Examples
     --------
-    >>> import numpy as np
     >>> white = np.random.default_rng(1).normal(size=(300, 4, 3))
     >>> bool(np.abs(autocorrelation(lagged_products(white), 6)).sum() < 0.1)
     True
@@ -229,7 +248,6 @@ def lag_one_autocorrelation(residuals: Floats) -> Slope:
 
     Examples
     --------
-    >>> import numpy as np
     >>> white = np.random.default_rng(1).normal(size=(300, 4, 3))
     >>> found = lag_one_autocorrelation(white)
     >>> bool(abs(found.value) < 4 * found.stderr)
@@ -242,14 +260,28 @@ def lag_one_autocorrelation(residuals: Floats) -> Slope:
     n, d = residuals.shape[1:]
     freedom = a.size * float(degrees_of_freedom(np.array(n), d)) / (n * d)
     if not power > 0:
-        return _UNKNOWN
+        return UNKNOWN_SLOPE
     value = float(a @ b) / power
     error = np.sqrt(max(1 - value**2, 0.0) / freedom) if freedom > 0 else np.inf
     return Slope(value, float(error), freedom)
 
 
 def lagged_products(vectors: Floats) -> Floats:
-    """Return sum_k v_k . v_{k+lag} of vectors (K, ...) for the lags 0, ..., K - 1."""
+    """Return sum_k v_k . v_{k+lag} of vectors for the lags 0, ..., K - 1.
+
+    Parameters
+    ----------
+    vectors : ndarray, shape (K, ...)
+
+    Returns
+    -------
+    ndarray, shape (K,)
+
+    Examples
+    --------
+    >>> lagged_products(np.array([[1.0], [2.0], [3.0]])).round(12)
+    array([14.,  8.,  3.])
+    """
     flat = vectors.reshape(len(vectors), -1)
     spectrum = np.fft.rfft(flat, n=2 * len(flat), axis=0)
     power = (spectrum.real**2 + spectrum.imag**2).sum(axis=1)
@@ -262,10 +294,10 @@ def regress(
 ) -> Slope:
     """Regress the residuals on what a rigid fit leaves of a displacement; return slope and error.
 
-    The error is that of residuals without the displacement: the larger of the one from the scores
-    of all frames (each over 1 less its leverage) and the one from their mean square, both widened
-    by the autocorrelation that the residuals share with the displacement. The degrees of freedom
-    are the number of independent frames that the displacement is spread over.
+    The error is the larger of two: from the scores of all frames (each over 1 less its leverage),
+    and from the mean square of the residuals without the displacement. Both are widened by the
+    autocorrelation that the residuals share with the displacement. The degrees of freedom are the
+    number of independent frames that the displacement is spread over.
 
     Parameters
     ----------
@@ -275,25 +307,41 @@ def regress(
     offset : float
         Expectation of the product of residuals and displacement for a slope of 0.
     imitated : float
-        Square of the displacement that is due to noise of the fitted orientation alone.
+        Square of the displacement that noise of the fitted orientation alone contributes.
+
+    Returns
+    -------
+    Slope
+        NaN where the displacement is too small to measure it.
+
+    Examples
+    --------
+    >>> from perrin import Cluster, add_noise, simulate_motion, track_rotation
+    >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=0.02, dt=0.7, n_frames=300, rng=1)
+    >>> x = add_noise(truth.positions(), sigma=0.03, rng=2)
+    >>> sample = sample_residuals(track_rotation(x, dt=0.7), x)
+    >>> moved = np.zeros(sample.vector.shape)
+    >>> moved[::2, 0] = 1.0  # the first particle, in every second frame
+    >>> bool(abs(regress(sample, moved).value) < 0.01)
+    True
     """
     left = sample.left_of(displacement)
     total = float((left**2).sum())
     power = total - imitated
     if len(left) < 3 or sample.freedom == 0:
-        return _UNKNOWN
-    if not power > max(_ABOVE_NOISE * imitated, 1e-9 * float((displacement**2).sum())):
-        return _UNKNOWN
+        return UNKNOWN_SLOPE
+    if not power > max(_LEAST_POWER * imitated, 1e-9 * float((displacement**2).sum())):
+        return UNKNOWN_SLOPE
     slope = (float((left * sample.vector).sum()) - offset) / power
     rest = sample.vector - slope * left
-    lab = _turned(sample.rotation, rest)
+    lab = sample.in_lab(rest)
     rho = autocorrelation(lagged_products(lab), sample.freedom)
     count = len(left)
     share = (left**2).sum(axis=(1, 2)) / total  # leverage of every frame
     scores = (left * rest).sum(axis=(1, 2)) / (1.0 - share)
     mean_square = float((rest**2).sum()) / (sample.freedom * (count - 1))
     variance = max(float(scores @ scores), mean_square * total)
-    shared = lagged_products(_turned(sample.rotation, left))[1 : rho.size + 1]
+    shared = lagged_products(sample.in_lab(left))[1 : rho.size + 1]
     inflation = max(1.0 + 2.0 * float(rho @ shared) / total, 1.0)
     mean_lost = 1.0 + (1.0 + 2.0 * float(rho.sum())) / count
     freedom = 1.0 / float(share @ share) / (1.0 + 2.0 * float(rho @ rho))
@@ -308,23 +356,47 @@ class AxisNoise(NamedTuple):
 
     @property
     def known(self) -> bool:
-        """Whether every variance is positive and known to 30 %."""
+        """Whether every variance is positive and its relative standard error at most 30 %."""
         if not (self.variance > 0).all():
             return False
         error = np.sqrt(np.diag(self.covariance))
-        return bool((error <= _MEASURED * self.variance).all())
+        return bool((error <= _VARIANCE_ERROR * self.variance).all())
+
+    def z_ratio(self, unit: Floats) -> Slope:
+        """Return sigma_z over sigma_xy, each times a unit (3,) of its axis, and its error."""
+        square = unit**2
+        v = self.variance * square
+        across = v[:2].sum()
+        ratio = float(np.sqrt(2 * v[2] / across))
+        # Slope of the logarithm of the squared ratio.
+        slope = np.array([-1 / across, -1 / across, 1 / v[2]]) * square
+        error = 0.5 * ratio * float(np.sqrt(slope @ self.covariance @ slope))
+        return Slope(ratio, error, np.inf)
 
 
 def axis_noise(sample: Residuals) -> AxisNoise | None:
-    """Measure the localisation error of each lab axis; None where the residuals cannot tell.
+    """Measure the localisation error of each lab axis; None where the residuals leave it open.
 
     The squares of a frame's residuals along the lab axes are a linear function of the variances
-    through the projector of the fit. The covariance is that of the squares found, widened by
+    through the projector of the fit. The covariance is that of the measured squares, widened by
     their autocorrelation.
 
     Parameters
     ----------
     sample : Residuals
+
+    Returns
+    -------
+    AxisNoise or None
+
+    Examples
+    --------
+    >>> from perrin import Cluster, add_noise, simulate_motion, track_rotation
+    >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=0.02, dt=0.7, n_frames=300, rng=1)
+    >>> x = add_noise(truth.positions(), sigma=(0.03, 0.03, 0.06), rng=2)
+    >>> noise = axis_noise(sample_residuals(track_rotation(x, dt=0.7), x))
+    >>> (noise.variance**0.5).round(3)
+    array([0.031, 0.032, 0.059])
     """
     turn, count = sample.rotation, len(sample.rotation)
     d = turn.shape[-1]
@@ -335,7 +407,7 @@ def axis_noise(sample: Residuals) -> AxisNoise | None:
     for row in sample.keeps:
         for block in row:
             mix += (turn @ block @ back) ** 2
-    lab = sample.lab()
+    lab = sample.in_lab(sample.vector)
     square = (lab**2).sum(axis=1) * count / (count - 1)
     total = mix.sum(axis=0)
     if np.linalg.cond(total) > 1e8:
@@ -349,7 +421,7 @@ def axis_noise(sample: Residuals) -> AxisNoise | None:
 
 
 class Stretch(NamedTuple):
-    """How much too long z is, the residuals of the body with z corrected, and its motion."""
+    """Scale of z, the residuals of the body with z corrected, and its motion."""
 
     scale: Slope
     sample: Residuals
@@ -357,11 +429,10 @@ class Stretch(NamedTuple):
 
 
 def measure_stretch(motion: RigidMotion, positions: Floats) -> Stretch:
-    """Measure by how much z is stretched against x and y, from shapes that change as a body turns.
+    """Measure the scale of z against x and y from the change of a body's shape as it turns.
 
-    Least squares in scale, template and poses, by Gauss-Newton steps in the scale and rigid fits
-    in turn. What noise alone contributes at second order, which differs between axes, is taken
-    off.
+    Least squares in scale, template and poses: Gauss-Newton steps in the scale alternate with
+    rigid fits. The second-order contribution of noise, which differs between axes, is subtracted.
 
     Parameters
     ----------
@@ -373,7 +444,7 @@ def measure_stretch(motion: RigidMotion, positions: Floats) -> Stretch:
     -------
     Stretch
         The scale (1: not stretched) is unknown (NaN) in the plane and for a body that turns too
-        little to show it.
+        little to determine it.
 
     Examples
     --------
@@ -385,21 +456,21 @@ def measure_stretch(motion: RigidMotion, positions: Floats) -> Stretch:
     (1.1, True)
     """
     sample = sample_residuals(motion, positions)
-    if positions.shape[2] != 3 or len(sample.vector) < 3:
-        return Stretch(_UNKNOWN, sample, motion)
-    first, scale, step = (motion, sample), 1.0, _UNKNOWN
+    if motion.dimension == 2 or len(sample.vector) < 3:
+        return Stretch(UNKNOWN_SLOPE, sample, motion)
+    first, scale, step = (motion, sample), 1.0, UNKNOWN_SLOPE
     for _ in range(10):
         step, left = _stretch_step(sample)
-        if not step.known or step.stderr > _USEFUL:
-            return Stretch(_UNKNOWN, first[1], first[0])
-        # The step is linear in the stretch; what is left of second order vanishes in the error.
+        if not step.known or step.stderr > _STRETCH_ERROR:
+            return Stretch(UNKNOWN_SLOPE, first[1], first[0])
+        # The step is linear in the stretch; its second order is then small against the error.
         if step.value**2 <= 0.1 * step.stderr:
             break
         scale *= float(np.clip(1.0 + step.value, 0.5, 2.0))
         try:
-            motion = track_rotation(positions / [1.0, 1.0, scale], dt=motion.dt, times=motion.time)
+            motion = template_motion(positions / [1.0, 1.0, scale], time=motion.time, dt=motion.dt)
         except (DegenerateClusterError, TooFewFramesError):
-            return Stretch(_UNKNOWN, first[1], first[0])
+            return Stretch(UNKNOWN_SLOPE, first[1], first[0])
         sample = sample_residuals(motion, positions / [1.0, 1.0, scale])
     rest = replace(sample, vector=sample.vector - step.value * left)
     found = Slope(scale * (1.0 + step.value), scale * step.stderr, step.freedom)
@@ -407,7 +478,7 @@ def measure_stretch(motion: RigidMotion, positions: Floats) -> Stretch:
 
 
 def _stretch_step(sample: Residuals) -> tuple[Slope, Floats]:
-    """Return the stretch of z that the residuals show, and what a fit leaves of a unit stretch."""
+    """Return the stretch of z from the residuals, and what a rigid fit leaves of a unit stretch."""
     up = sample.rotation[:, 2]  # the lab's z axis in body axes
     height = up @ sample.template.T
     displacement = height[..., None] * up[:, None]
@@ -416,36 +487,30 @@ def _stretch_step(sample: Residuals) -> tuple[Slope, Floats]:
     if not plain.known:
         return plain, left
     rest = replace(sample, vector=sample.vector - plain.value * left)
-    noise = _shrunk(axis_noise(rest), rest)
+    # The noise of the axes is shrunk to equal noise, the more the larger its error. A body whose
+    # residuals do not separate the axes (a trimer that hardly turns) is left with equal noise, and
+    # with an error that allows standard deviations of 1 : 1 : 3.
+    mean = float((rest.vector**2).sum()) / (sample.freedom * max(len(rest.vector) - 1, 1))
+    variance, covariance = np.full(3, mean), (_VARIANCE_SPREAD * mean) ** 2 * np.eye(3)
+    noise = axis_noise(rest)
+    if noise is not None:
+        gain = np.linalg.solve(covariance + noise.covariance, covariance).T
+        variance = np.maximum(variance + gain @ (noise.variance - variance), 0.0)
+        covariance = covariance - gain @ covariance
     products, squares = _noise_products(sample, left)
     found = regress(
         sample,
         displacement,
-        offset=float(products @ noise.variance),
-        imitated=float(squares @ noise.variance),
+        offset=float(products @ variance),
+        imitated=float(squares @ variance),
     )
-    power = float((left**2).sum()) - float(squares @ noise.variance)
-    doubt = float(products @ noise.covariance @ products) / power**2
-    return found._replace(stderr=float(np.sqrt(found.stderr**2 + doubt))), left
-
-
-def _shrunk(noise: AxisNoise | None, sample: Residuals) -> AxisNoise:
-    """Combine the noise of the axes with equal noise, the better the less they are known.
-
-    A body whose residuals cannot tell the axes apart (a trimer that hardly turns) is left with
-    equal noise, and with an error that allows standard deviations of 1 : 1 : 3.
-    """
-    mean = float((sample.vector**2).sum()) / (sample.freedom * max(len(sample.vector) - 1, 1))
-    equal, doubt = np.full(3, mean), (_UNEQUAL * mean) ** 2 * np.eye(3)
-    if noise is None:
-        return AxisNoise(equal, doubt)
-    gain = np.linalg.solve(doubt + noise.covariance, doubt).T
-    variance = np.maximum(equal + gain @ (noise.variance - equal), 0.0)
-    return AxisNoise(variance, doubt - gain @ doubt)
+    power = float((left**2).sum()) - float(squares @ variance)
+    noise_error = float(products @ covariance @ products) / power**2
+    return found._replace(stderr=float(np.sqrt(found.stderr**2 + noise_error))), left
 
 
 def _noise_products(sample: Residuals, left: Floats) -> tuple[Floats, Floats]:
-    """Return what unit noise of each lab axis adds to residual times stretch, and stretch squared.
+    """Return the mean of residual times stretch, and of stretch squared, for unit noise by axis.
 
     Second order in the noise: the fitted orientation errs by delta = sum A_i e_i with
     A_i = M^-1 [r_i]x, so that the residual has the mean (C - tr C) r_i / 2 - <delta x e_i>
@@ -453,8 +518,7 @@ def _noise_products(sample: Residuals, left: Floats) -> tuple[Floats, Floats]:
     correlated with the residual where the axes of the lab have unequal noise.
     """
     turn, r = sample.rotation, sample.template
-    inertia = np.sum(r * r) * np.eye(3) - r.T @ r
-    arm = np.linalg.pinv(inertia) @ skew(r)
+    arm = np.linalg.pinv(inertia_tensor(r)) @ skew(r)
     # The derivative of u (u . r) with u -> u - delta x u; its last index is that of delta.
     up = turn[:, 2]
     turned = np.einsum("abd,td->tab", _LEVI_CIVITA, up)
@@ -476,11 +540,11 @@ def _noise_products(sample: Residuals, left: Floats) -> tuple[Floats, Floats]:
 
 
 def measure_scan(sample: Residuals) -> Slope:
-    """Measure how much later a frame's particles are recorded with height, s/um.
+    """Measure how much later a particle is recorded the higher it is, s/um.
 
-    A plane that sweeps through the body meets a particle at height h by h/v later than its
-    centre, so that it is found displaced by the body's velocity times h/v. Noise, whatever its
-    size along z, is not related to the velocity between the frames before and after.
+    A plane that sweeps through the body with the velocity v reaches a particle at height h later
+    than its centre by h/v, so that the particle is displaced by the body's velocity times h/v.
+    Noise of any size along z is independent of the velocity between the frames before and after.
 
     Parameters
     ----------
@@ -490,23 +554,44 @@ def measure_scan(sample: Residuals) -> Slope:
     -------
     Slope
         1/v with its sign; NaN in the plane and for a body at rest.
+
+    Examples
+    --------
+    >>> from perrin import Cluster, add_noise, simulate_motion, track_rotation
+    >>> truth = simulate_motion(
+    ...     Cluster.tetrahedron(1.5), D_R=0.02, D_T=0.04, dt=0.7, n_frames=300, rng=1
+    ... )
+    >>> x = add_noise(truth.positions(), sigma=0.03, rng=2)  # all recorded at once
+    >>> measure_scan(sample_residuals(track_rotation(x, dt=0.7), x)).differs_from(0.0)
+    False
     """
     if sample.rotation.shape[-1] != 3 or len(sample.vector) < 3:
-        return _UNKNOWN
+        return UNKNOWN_SLOPE
     height = sample.rotation[:, 2] @ sample.template.T
     velocity = np.einsum("tij,ti->tj", sample.rotation, sample.velocity)
     return regress(sample, height[..., None] * velocity[:, None])
 
 
-def body_residuals(motion: RigidMotion, positions: ArrayLike) -> Floats:
-    """Return where the particles sit beside their places in the template, (T, n, d), um, body axes.
+def body_residuals(motion: RigidMotion, positions: Floats) -> Floats:
+    """Return the measured minus the fitted positions in body axes, um.
 
     Parameters
     ----------
     motion : RigidMotion
-    positions : array_like, shape (T, n, d)
-        The positions that the motion was fitted to.
+    positions : ndarray, shape (T, n, d)
+        The positions that the motion was fitted to, um.
+
+    Returns
+    -------
+    ndarray, shape (T, n, d)
+        NaN where a particle or a pose is missing.
+
+    Examples
+    --------
+    >>> from perrin import Cluster, simulate_motion
+    >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=0.02, dt=0.7, n_frames=5, rng=1)
+    >>> bool(np.allclose(body_residuals(truth, truth.positions()), 0.0))
+    True
     """
-    x = as_positions(positions)
-    out: Floats = np.einsum("tij,tni->tnj", motion.rotation, x - motion.center[:, None])
+    out: Floats = np.einsum("tij,tni->tnj", motion.rotation, positions - motion.center[:, None])
     return out - motion.template

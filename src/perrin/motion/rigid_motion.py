@@ -1,14 +1,14 @@
-"""RigidMotion: where a cluster is and how it is turned in every frame."""
+"""Position and orientation of one rigid cluster in every frame."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from perrin._arrays import Floats, Ints, frozen
+from perrin._arrays import Floats, Ints, from_plain, frozen, to_plain
 from perrin.geometry.rotations import log_map
 
 if TYPE_CHECKING:
@@ -16,7 +16,11 @@ if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
 
-_FLOOR = 0.04  # of D_R dt over (sigma/R)^4, for a body at rest
+# Apparent D_R dt of a tetrahedron at rest, over (sigma/R)^4.
+_RESTING_DIFFUSION = 0.04
+
+
+_WHOLE_NUMBERS = ("n_present", "piece")
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,7 +30,7 @@ class RigidMotion:
     Attributes
     ----------
     time : ndarray, shape (T,)
-        Seconds.
+        Time of each frame, s.
     center : ndarray, shape (T, d)
         Centre of the whole template, um.
     rotation : ndarray, shape (T, d, d)
@@ -35,22 +39,23 @@ class RigidMotion:
         Root mean square distance of the particles present to the fitted body, um. For
         ``reference="previous"`` the residual of the step that ends here, over sqrt(2).
     n_present : ndarray of int, shape (T,)
-        Particles seen.
+        Number of particles present.
     covariance : ndarray, shape (T, 3, 3) or (T, 1, 1)
         Covariance of the fitted orientation, rad^2, body axes.
     center_variance : ndarray, shape (T,)
         Variance of the centre from localisation error, um^2, mean over axes.
     piece : ndarray of int, shape (T,)
-        Stretches of doubtless identity; no pair of frames is formed across two pieces.
+        Number of the track piece that the frame belongs to. Within a piece the identity of the
+        particles is certain; no pair of frames is formed across two pieces.
     reason : tuple of str, length T
         Why a frame has no pose; empty where it has one.
     template : ndarray, shape (n, d)
-        The common shape, um, centred.
+        Particles of the common shape, um, their centre at the origin.
     sigma : float
         Localisation error of one coordinate from the rigid-fit residuals, um.
     noise : ndarray, shape (d,)
-        Localisation error of each lab axis behind `covariance` and `center_variance`, um: the one
-        stated, or sigma.
+        Localisation error of each lab axis that `covariance` and `center_variance` assume, um: the
+        known one where it was given, else sigma.
     dt : float
         Time between frames, s.
     """
@@ -97,9 +102,9 @@ class RigidMotion:
 
     @property
     def template_error(self) -> float:
-        """How far the template's places may be off, um.
+        """Bound of the error of the template's positions, um.
 
-        Six standard errors, what noise inflates the shape by at second order, and rounding.
+        Six standard errors, the second-order inflation of the shape by noise, and rounding.
         """
         first_order = 6 * self.sigma / np.sqrt(self.fitted.size)
         return float(first_order + 2 * self.sigma**2 / self.R + 1e-6 * self.R)
@@ -125,12 +130,12 @@ class RigidMotion:
 
     @property
     def resolution_floor(self) -> float:
-        """The D_R that a motionless cluster would read, rad^2/s.
+        """The apparent D_R of a motionless cluster, rad^2/s.
 
-        Adding noisy body-frame steps turns noise into diffusion at second order: a tetrahedron at
-        rest reads 0.04 (sigma/R)^4/dt.
+        The sum of noisy body-frame steps diffuses at second order in the noise: a tetrahedron at
+        rest has the apparent D_R 0.04 (sigma/R)^4/dt.
         """
-        return float(_FLOOR * (self.sigma / self.R) ** 4 / self.usual_interval)
+        return float(_RESTING_DIFFUSION * (self.sigma / self.R) ** 4 / self.usual_interval)
 
     def steps(self) -> tuple[Ints, Ints]:
         """Return the first and last frame index of every step between neighbouring poses.
@@ -196,8 +201,22 @@ class RigidMotion:
         """
         p = self.orientation(p0)
         start, stop = self.steps()
-        step = self.rotation[stop] @ np.swapaxes(self.rotation[start], -1, -2)
-        return self._summed(_angle_vectors(p[start], p[stop], step))
+        before, after = p[start], p[stop]
+        dot = np.sum(before * after, axis=-1, keepdims=True)
+        if self.dimension == 2:
+            cross = before[..., :1] * after[..., 1:] - before[..., 1:] * after[..., :1]
+            return self._summed(np.arctan2(cross, dot))
+        normal = np.cross(before, after)
+        sine = np.linalg.norm(normal, axis=-1, keepdims=True)
+        axis = np.divide(normal, sine, out=np.zeros_like(normal), where=sine > 0)
+        opposite = (sine < 1e-12 * -dot) & (dot < 0)
+        if opposite.any():
+            # p(t) and p(t + dt) = -p(t) span no plane, or one of rounding: the axis is that of the
+            # rotation itself.
+            step = self.rotation[stop] @ np.swapaxes(self.rotation[start], -1, -2)
+            own = (log_map(step) / np.pi).reshape(len(step), *[1] * (p.ndim - 2), 3)
+            axis = np.where(opposite, own, axis)
+        return self._summed(np.arctan2(sine, dot) * axis)
 
     def accumulated_rotation(self, *, axes: Literal["lab", "body"] = "lab") -> Floats:
         """Add up the rotation vectors of all steps (Hunter 2011, appendix).
@@ -205,8 +224,8 @@ class RigidMotion:
         Parameters
         ----------
         axes : {"lab", "body"}
-            Axes of the components. In those of the body each adds up the turns about one axis of
-            the cluster, whose diffusion coefficient is its own.
+            Axes of the components. In body axes each component is the sum of the rotations about
+            one axis of the cluster, which has its own diffusion coefficient.
 
         Returns
         -------
@@ -240,12 +259,12 @@ class RigidMotion:
         """Return the fitted rotations as a scipy `Rotation`, and their frame indices."""
         from scipy.spatial.transform import Rotation
 
-        if self.dimension != 3:
+        if self.dimension == 2:
             raise ValueError("scipy rotations are three-dimensional; this motion is in the plane")
         return Rotation.from_matrix(self.rotation[self.fitted]), self.fitted
 
     def to_frame(self) -> pd.DataFrame:
-        """Return a table with a row per frame; what belongs to all of them is in ``attrs``."""
+        """Return a table with a row per frame; template, sigma, noise and dt are in ``attrs``."""
         import pandas as pd
 
         axes = "xyz"[: self.dimension]
@@ -273,63 +292,93 @@ class RigidMotion:
 
     @classmethod
     def from_frame(cls, table: pd.DataFrame) -> RigidMotion:
-        """Read back what `to_frame` wrote.
+        """Return the motion that `to_frame` wrote.
+
+        Parameters
+        ----------
+        table : DataFrame
 
         Raises
         ------
         ValueError
             If ``attrs`` lacks the template, sigma, noise or dt, or a column is missing.
         """
-        missing = {"template", "sigma", "noise", "dt"} - set(table.attrs)
+        missing = sorted({"template", "sigma", "noise", "dt"} - set(table.attrs))
         if missing:
-            raise ValueError(f"this table was not made by to_frame: attrs lack {sorted(missing)}")
+            raise ValueError(f"this table was not made by to_frame: attrs lack {missing}")
         template = np.array(table.attrs["template"], dtype=np.float64)
         axes = "xyz"[: template.shape[1]]
         angles = "xyz" if len(axes) == 3 else "z"
+        rotation = [[f"r_{a}{b}" for b in axes] for a in axes]
+        covariance = [[f"cov_{min(a, b)}{max(a, b)}" for b in angles] for a in angles]
+        plain = ("time", *axes, "residual", "n_present", "center_variance", "piece", "reason")
+        matrix = {name for row in (*rotation, *covariance) for name in row}
+        missing = sorted({*plain, *matrix} - set(table))
+        if missing:
+            raise ValueError(f"this table was not made by to_frame: it lacks the columns {missing}")
 
-        def column(name: str, dtype: type = np.float64) -> NDArray[Any]:
-            if name not in table:
-                raise ValueError(f"this table was not made by to_frame: it lacks column {name!r}")
-            return np.array(table[name], dtype=dtype)
-
-        def matrices(prefix: str, names: str, *, symmetric: bool) -> Floats:
-            def name(a: str, b: str) -> str:
-                return f"{prefix}_{min(a, b)}{max(a, b)}" if symmetric else f"{prefix}_{a}{b}"
-
-            rows = [[column(name(a, b)) for b in names] for a in names]
+        def matrices(names: list[list[str]]) -> Floats:
+            rows = [[np.array(table[name], dtype=np.float64) for name in row] for row in names]
             return np.moveaxis(np.array(rows), -1, 0).copy()
 
         return cls(
-            time=column("time"),
-            center=np.stack([column(a) for a in axes], axis=1),
-            rotation=matrices("r", axes, symmetric=False),
-            residual=column("residual"),
-            n_present=column("n_present", np.int64),
-            covariance=matrices("cov", angles, symmetric=True),
-            center_variance=column("center_variance"),
-            piece=column("piece", np.int64),
-            reason=tuple(column("reason", str).tolist()),
+            time=np.array(table["time"], dtype=np.float64),
+            center=np.stack([np.array(table[a], dtype=np.float64) for a in axes], axis=1),
+            rotation=matrices(rotation),
+            residual=np.array(table["residual"], dtype=np.float64),
+            n_present=np.array(table["n_present"], dtype=np.int64),
+            covariance=matrices(covariance),
+            center_variance=np.array(table["center_variance"], dtype=np.float64),
+            piece=np.array(table["piece"], dtype=np.int64),
+            reason=tuple(np.array(table["reason"], dtype=str).tolist()),
             template=template,
             sigma=float(table.attrs["sigma"]),
             noise=np.array(table.attrs["noise"], dtype=np.float64),
             dt=float(table.attrs["dt"]),
         )
 
+    def to_dict(self) -> dict[str, Any]:
+        """Return the motion as JSON holds it: lists for arrays, None for NaN."""
+        return {field.name: to_plain(getattr(self, field.name)) for field in fields(self)}
+
+    @classmethod
+    def from_dict(cls, entry: dict[str, Any]) -> RigidMotion:
+        """Return the motion that `to_dict` wrote.
+
+        Parameters
+        ----------
+        entry : dict
+
+        Examples
+        --------
+        >>> from perrin import Cluster, simulate_motion
+        >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=0.01, dt=0.5, n_frames=9, rng=1)
+        >>> RigidMotion.from_dict(truth.to_dict())
+        RigidMotion(n=4, d=3, 9 of 9 frames, dt=0.5 s, sigma=0 um)
+        """
+        arrays = {
+            name: from_plain(value, dtype=np.int64 if name in _WHOLE_NUMBERS else np.float64)
+            for name, value in entry.items()
+            if name not in ("reason", "sigma", "dt")
+        }
+        sigma, dt = (float(from_plain(entry[name])) for name in ("sigma", "dt"))
+        return cls(reason=tuple(entry["reason"]), sigma=sigma, dt=dt, **arrays)
+
 
 def threshold_displacement(motion: RigidMotion, *, threshold: float) -> Floats:
-    """Add up rotation vectors from a reference that is renewed once the turn exceeds a threshold.
+    """Add up rotation vectors from a reference that is renewed where a threshold is exceeded.
 
-    The sum of all steps, `RigidMotion.accumulated_rotation`, counts every rattle: rotations do not
-    commute, so that motion in a cage, or localisation noise, adds up to a diffusion that is not
-    there. Here the rotation is taken from the last reference, and only when it exceeds the
-    threshold does its end become the next reference: what returns leaves nothing behind.
+    In the sum of all steps, `RigidMotion.accumulated_rotation`, motion in a cage and localisation
+    noise appear as diffusion, because rotations do not commute. Here the rotation is measured from
+    the last reference, and only where it exceeds the threshold does its end become the next
+    reference: a rotation that returns adds nothing.
 
     Parameters
     ----------
     motion : RigidMotion
     threshold : float
-        rad, 0 to pi: above the rattle, below the turns of interest. 0 is the sum of all steps; pi
-        is the rotation vector from the first frame of the piece, which is bounded.
+        rad, 0 to pi: above the rotations in a cage, below those of interest. 0 is the sum of all
+        steps; pi is the rotation vector from the first frame of the piece, which is bounded.
 
     Returns
     -------
@@ -362,7 +411,7 @@ def threshold_displacement(motion: RigidMotion, *, threshold: float) -> Floats:
         return motion.accumulated_rotation()
     rows = motion.fitted
     rotation = motion.rotation[rows]
-    reference = _references(rotation, motion.piece[rows], threshold)
+    reference = threshold_references(rotation, motion.piece[rows], threshold=threshold)
     turn = log_map(rotation @ np.swapaxes(rotation[reference], -1, -2))
     origins = np.unique(reference)
     total = np.cumsum(turn[origins], axis=0)
@@ -373,10 +422,32 @@ def threshold_displacement(motion: RigidMotion, *, threshold: float) -> Floats:
     return walk
 
 
-def _references(rotation: Floats, piece: Ints, threshold: float) -> Ints:
-    """Return for every pose the row that its rotation is measured from; a piece's first is itself.
+def threshold_references(rotation: Floats, piece: Ints, *, threshold: float) -> Ints:
+    """Return for every pose the pose that its rotation is measured from.
 
+    Parameters
+    ----------
+    rotation : ndarray, shape (K, d, d)
+        Rotations of the fitted frames, without NaN.
+    piece : ndarray of int, shape (K,)
+        Pieces; the reference of the first pose of a piece is itself.
+    threshold : float
+        rad.
+
+    Returns
+    -------
+    ndarray of int, shape (K,)
+
+    Notes
+    -----
     The trace of the relative rotation, d - 2 + 2 cos(angle), is a dot product of nine numbers.
+
+    Examples
+    --------
+    >>> from perrin.geometry import exp_map
+    >>> turn = exp_map(np.outer([0.0, 0.2, 0.5, 0.6, 0.9], [0, 0, 1.0]))
+    >>> threshold_references(turn, np.zeros(5, dtype=np.int64), threshold=0.4)
+    array([0, 0, 0, 2, 2])
     """
     flat = rotation.reshape(len(rotation), -1)
     # Less a rounding error: half a turn exceeds no threshold of pi.
@@ -390,21 +461,3 @@ def _references(rotation: Floats, piece: Ints, threshold: float) -> Ints:
         if flat[row] @ flat[origin] < least:
             origin = row
     return reference
-
-
-def _angle_vectors(p: Floats, q: Floats, step: Floats) -> Floats:
-    """Return the angle from p to q as a vector along p x q; in the plane as one signed number."""
-    dot = np.sum(p * q, axis=-1, keepdims=True)
-    if p.shape[-1] == 2:
-        cross = p[..., :1] * q[..., 1:] - p[..., 1:] * q[..., :1]
-        return np.asarray(np.arctan2(cross, dot))
-    normal = np.cross(p, q)
-    sine = np.linalg.norm(normal, axis=-1, keepdims=True)
-    axis = np.divide(normal, sine, out=np.zeros_like(normal), where=sine > 0)
-    opposite = (sine < 1e-12 * -dot) & (dot < 0)
-    if opposite.any():
-        # p and q = -p span no plane, or one of rounding; only the rotation itself knows its axis.
-        own = (log_map(step) / np.pi).reshape(len(step), *[1] * (p.ndim - 2), 3)
-        axis = np.where(opposite, own, axis)
-    turn: Floats = np.arctan2(sine, dot) * axis
-    return turn

@@ -1,9 +1,9 @@
-"""How a line of particles points: rods and straight chains, whose full orientation nobody sees."""
+"""Direction of a straight line of particles in every frame: rods and straight chains."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -13,9 +13,11 @@ from perrin._arrays import (
     Ints,
     as_positions,
     as_sigma,
+    from_plain,
     frozen,
     present,
     require_positive,
+    to_plain,
 )
 from perrin.errors import DegenerateClusterError, TooFewFramesError
 
@@ -24,21 +26,28 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
 
-# Log-odds as in identity: a hundred to one settles, and labels weigh e^18.
-_DOUBT, _TRUST = float(np.log(100.0)), 18.0
+# Log-odds above which the two ends count as identified: a hundred to one, as in
+# `settle_identity`.
+_CERTAIN_ENDS = float(np.log(100.0))
 
 
-# A least turn of over this many standard deviations (squared) widens the law of the step to itself,
-# as in identity.
-_LEAP_UNLABELLED, _LEAP_LABELLED = 16.0, 4.0
+# Log-odds in favour of the labels in the table, as in `settle_identity`.
+_LABEL_ODDS = 18.0
 
 
-# Particles that leave their line by more than so much of its length (a coordinate) form no line.
+# Largest ratio of the squared least turn of a step to its assumed variance, as in
+# `settle_identity`: above it the variance is widened, because one long turn follows no law of the
+# short ones.
+_LONGEST_TURN_LABELLED, _LONGEST_TURN_UNLABELLED = 4.0, 16.0
+
+
+# Largest root mean square distance of the particles from their line, a coordinate, over its length.
 _BENT = 0.1
 
 
-# A chain looks alike from both ends if its places do within so much of its length.
-_ALIKE = 0.05
+# Largest difference of the positions along a chain, over its length, from those of the chain turned
+# end for end at which its two ends count as equal.
+_EQUAL_ENDS = 0.05
 
 
 _MEDIAN_2 = 2 * float(np.log(2.0))  # median of chi squared with 2 degrees of freedom
@@ -51,31 +60,33 @@ _COLUMNS = ("residual", "n_present", "variance", "center_variance", "piece")
 class RodMotion:
     """Centre and direction of a rod or straight chain in every frame; missing frames are NaN.
 
-    The turn about its own axis cannot be seen: a rod has a direction but no full orientation.
+    Rotation about the rod's own axis is not measured: a rod has a direction, no full orientation.
 
     Attributes
     ----------
     time : ndarray, shape (T,)
-        Seconds.
+        Time of each frame, s.
     center : ndarray, shape (T, 3)
         Centre of all particles, um.
     direction : ndarray, shape (T, 3)
         Unit vectors in the lab frame, from the first particle to the last.
     residual : ndarray, shape (T,)
-        Root mean square distance of the particles present to their places on the line, um.
+        Root mean square distance of the particles present to their positions on the line, um.
     n_present : ndarray of int, shape (T,)
+        Number of particles present.
     variance : ndarray, shape (T,)
         Variance of each of the two angles of the direction from localisation error, rad^2.
     center_variance : ndarray, shape (T,)
         Variance of one coordinate of the centre, um^2.
     piece : ndarray of int, shape (T,)
-        Stretches in which the two ends are doubtless told apart.
+        Number of the track piece that the frame belongs to. Within a piece the two ends are
+        identified with certainty; no pair of frames is formed across two pieces.
     swaps : ndarray of int
-        Frames (rows) at which the ends changed labels and were put right.
+        Frames (rows) from which on the labels of the two ends were exchanged; they are corrected.
     reason : tuple of str, length T
         Why a frame has no direction; empty where it has one.
     places : ndarray, shape (n,)
-        The particles along the axis, um, mean 0.
+        Positions of the particles along the axis, um, mean 0.
     sigma : float
         Localisation error of one coordinate from the residuals, um.
     dt : float
@@ -123,7 +134,7 @@ class RodMotion:
         return rows[:-1][same], rows[1:][same]
 
     def to_frame(self) -> pd.DataFrame:
-        """Return a table with a row per frame; places, swaps, sigma and dt travel in ``attrs``."""
+        """Return a table with a row per frame; places, swaps, sigma and dt are in ``attrs``."""
         import pandas as pd
 
         columns: dict[str, object] = {"time": self.time}
@@ -141,7 +152,11 @@ class RodMotion:
 
     @classmethod
     def from_frame(cls, table: pd.DataFrame) -> RodMotion:
-        """Read back what `to_frame` wrote.
+        """Return the motion that `to_frame` wrote.
+
+        Parameters
+        ----------
+        table : DataFrame
 
         Raises
         ------
@@ -149,7 +164,8 @@ class RodMotion:
             If ``attrs`` lacks the places, swaps, sigma or dt, or a column is missing.
         """
         missing = {"places", "swaps", "sigma", "dt"} - set(table.attrs)
-        missing |= {"time", "x", "u_x", "reason", *_COLUMNS} - set(table)
+        vectors = ("x", "y", "z", "u_x", "u_y", "u_z")
+        missing |= {"time", "reason", *vectors, *_COLUMNS} - set(table)
         if missing:
             raise ValueError(f"this table was not made by to_frame: it lacks {sorted(missing)}")
         whole = {"n_present", "piece"}
@@ -166,6 +182,33 @@ class RodMotion:
             **{name: np.array(values) for name, values in numbers.items()},
         )
 
+    def to_dict(self) -> dict[str, Any]:
+        """Return the motion as JSON holds it: lists for arrays, None for NaN."""
+        return {field.name: to_plain(getattr(self, field.name)) for field in fields(self)}
+
+    @classmethod
+    def from_dict(cls, entry: dict[str, Any]) -> RodMotion:
+        """Return the motion that `to_dict` wrote.
+
+        Parameters
+        ----------
+        entry : dict
+
+        Examples
+        --------
+        >>> ends = np.array([[[0.0, 0, 0], [2, 0, 0]], [[0, 0, 0], [2, 0.1, 0]]])
+        >>> RodMotion.from_dict(track_direction(ends, dt=0.5, sigma=0.03).to_dict()).fitted
+        array([0, 1])
+        """
+        whole = {"n_present", "piece", "swaps"}
+        arrays = {
+            name: from_plain(value, dtype=np.int64 if name in whole else np.float64)
+            for name, value in entry.items()
+            if name not in ("reason", "sigma", "dt")
+        }
+        sigma, dt = (float(from_plain(entry[name])) for name in ("sigma", "dt"))
+        return cls(reason=tuple(entry["reason"]), sigma=sigma, dt=dt, **arrays)
+
 
 def track_direction(
     positions: ArrayLike,
@@ -175,7 +218,7 @@ def track_direction(
     sigma: ArrayLike | None = None,
     labelled: bool = True,
 ) -> RodMotion:
-    """Fit a straight line of particles in every frame and return how its direction moves.
+    """Fit a straight line of particles in every frame and return the motion of its direction.
 
     Parameters
     ----------
@@ -188,8 +231,8 @@ def track_direction(
     sigma : float or array_like, shape (3,), optional
         Known localisation error, um; default: from the residuals (of a pair: from its length).
     labelled : bool
-        Whether columns are meant to be lasting particles. The two ends of a symmetric chain are
-        told apart by least rotation; with labels only against odds of e^18.
+        Whether a column is the same particle in all frames. The two ends of a symmetric chain are
+        identified by the smallest rotation; labels are then changed only against odds of e^18.
 
     Returns
     -------
@@ -226,15 +269,55 @@ def track_direction(
     rows = np.flatnonzero(seen.sum(axis=1) >= 2)
     if rows.size < 2:
         raise TooFewFramesError(f"{rows.size} frames show two particles: 2 are needed", rows.size)
-    places, direction = _on_a_line(x[rows], seen[rows])
-    sign, piece, swaps = _ends(direction, places, time[rows], labelled=labelled)
-    line = _Line(rows, places, direction * sign[:, None], sign, piece, swaps)
-    given = None if sigma is None else as_sigma(sigma, 3)
-    return _measured(x, seen, line, time=time, dt=dt, given=given)
+    places, direction = _common_axis(x[rows], seen[rows])
+    sign, row_piece, swaps = _end_labels(direction, places, time[rows], labelled=labelled)
+    direction = direction * sign[:, None]
+    along = np.where(seen[rows], places * sign[:, None], np.nan)
+    shift = np.nanmean(along, axis=1)
+    center = np.nanmean(x[rows], axis=1) - shift[:, None] * direction
+    e = x[rows] - center[:, None] - along[..., None] * direction[:, None]
+    square, count = np.nansum(e * e, axis=(1, 2)), seen[rows].sum(axis=1)
+    # Three coordinates and two angles are fitted in each frame, and the n - 1 distances once.
+    freedom = float((3 * count - 5).sum() - (len(places) - 1))
+    measured = float(np.sqrt(square.sum() / freedom)) if freedom > 0 else np.nan
+    if measured > _BENT * np.ptp(places):
+        raise DegenerateClusterError(
+            f"the {len(places)} particles lie on no line: their distance from it is "
+            f"{measured:.3g} um a coordinate (root mean square), over {_BENT} of its length",
+            (len(places),),
+        )
+    noise = measured**2 if sigma is None else float(np.mean(as_sigma(sigma, 3) ** 2))
+    lever = np.nansum((along - shift[:, None]) ** 2, axis=1)
+
+    def in_all_frames(values: Floats) -> Floats:
+        out = np.full((len(x), *values.shape[1:]), np.nan)
+        out[rows] = values
+        return out
+
+    piece = np.zeros(len(x), dtype=np.int64)
+    piece[rows] = row_piece
+    return RodMotion(
+        time=time,
+        center=in_all_frames(center),
+        direction=in_all_frames(direction),
+        residual=in_all_frames(np.sqrt(square / count)),
+        n_present=seen.sum(axis=1),
+        variance=in_all_frames(noise / lever),
+        center_variance=in_all_frames(noise / count + shift**2 * (2 / 3) * noise / lever),
+        piece=np.maximum.accumulate(piece),
+        swaps=rows[swaps],
+        reason=tuple(
+            "" if k >= 2 else f"{k} of {len(places)} particles, 2 needed"
+            for k in seen.sum(axis=1).tolist()
+        ),
+        places=places,
+        sigma=measured,
+        dt=float(dt),
+    )
 
 
-def _on_a_line(x: Floats, seen: Bools) -> tuple[Floats, Floats]:
-    """Return the places along the common axis, and the direction of every frame."""
+def _common_axis(x: Floats, seen: Bools) -> tuple[Floats, Floats]:
+    """Return the positions along the common axis, and its direction in every frame."""
     fullest = x[np.argmax(seen.sum(axis=1))]
     middle = np.nanmean(fullest, axis=0)
     axis = np.linalg.svd(np.nan_to_num(fullest - middle))[2][0]
@@ -260,16 +343,17 @@ def _on_a_line(x: Floats, seen: Bools) -> tuple[Floats, Floats]:
     return places, direction
 
 
-def _ends(
+def _end_labels(
     direction: Floats, places: Floats, time: Floats, *, labelled: bool
 ) -> tuple[Floats, Ints, Ints]:
-    """Tell the two ends apart: a sign for every frame, pieces, and where labels changed hands.
+    """Identify the two ends: the sign of every direction, pieces, and exchanged labels.
 
-    Only a chain that looks the same from both ends can be mistaken; others keep their labels.
+    Only the ends of a chain that looks the same from both can be exchanged; others keep their
+    labels.
     """
     one, none = np.ones(len(direction)), np.empty(0, dtype=np.int64)
     ordered = np.sort(places)
-    if not np.allclose(ordered, -ordered[::-1], atol=_ALIKE * float(np.ptp(places))):
+    if not np.allclose(ordered, -ordered[::-1], atol=_EQUAL_ENDS * float(np.ptp(places))):
         return one, np.zeros(len(direction), dtype=np.int64), none
     dot = np.einsum("ti,ti->t", direction[:-1], direction[1:])
     angle = np.arctan2(np.linalg.norm(np.cross(direction[:-1], direction[1:]), axis=1), dot)
@@ -277,78 +361,11 @@ def _ends(
     gap = np.diff(time)
     typical = float(np.median((angle if labelled else least) ** 2)) / _MEDIAN_2
     spread = max(typical, 1e-12) * np.maximum(gap / np.median(gap), 1.0)
-    # One long turn follows no law of the short ones: its own size decides.
-    leap = _LEAP_LABELLED if labelled else _LEAP_UNLABELLED
-    spread = np.maximum(spread, least**2 / leap)
-    # Odds of "kept" against "exchanged".
-    odds = ((np.pi - angle) ** 2 - angle**2) / (2 * spread) + (_TRUST if labelled else 0.0)
+    longest = _LONGEST_TURN_LABELLED if labelled else _LONGEST_TURN_UNLABELLED
+    spread = np.maximum(spread, least**2 / longest)
+    # Log-odds of kept against exchanged ends.
+    odds = ((np.pi - angle) ** 2 - angle**2) / (2 * spread) + (_LABEL_ODDS if labelled else 0.0)
     sign = np.concatenate([[1.0], np.where(odds < 0, -1.0, 1.0)])
-    doubtful = np.append(False, np.abs(odds) <= _DOUBT)
-    swaps = np.flatnonzero((sign < 0) & ~doubtful) if labelled else none
-    return np.cumprod(sign), np.cumsum(doubtful).astype(np.int64), swaps
-
-
-class _Line(NamedTuple):
-    """Places on the axis, and for the rows with two particles: direction, sign, piece; swaps."""
-
-    rows: Ints
-    places: Floats
-    direction: Floats
-    sign: Floats
-    piece: Ints
-    swaps: Ints
-
-
-def _measured(
-    x: Floats, seen: Bools, line: _Line, *, time: Floats, dt: float, given: Floats | None
-) -> RodMotion:
-    """Place the centre, measure residual and noise, and build the result."""
-    rows, places = line.rows, line.places
-    seat = np.where(seen[rows], places * line.sign[:, None], np.nan)
-    shift = np.nanmean(seat, axis=1)
-    center = np.nanmean(x[rows], axis=1) - shift[:, None] * line.direction
-    e = x[rows] - center[:, None] - seat[..., None] * line.direction[:, None]
-    square, count = np.nansum(e * e, axis=(1, 2)), seen[rows].sum(axis=1)
-    sigma = _noise(square, count, places)
-    noise = sigma**2 if given is None else float(np.mean(given**2))
-    lever = np.nansum((seat - shift[:, None]) ** 2, axis=1)
-
-    def spread(values: Floats) -> Floats:
-        out = np.full((len(x), *values.shape[1:]), np.nan)
-        out[rows] = values
-        return out
-
-    piece = np.zeros(len(x), dtype=np.int64)
-    piece[rows] = line.piece
-    return RodMotion(
-        time=time,
-        center=spread(center),
-        direction=spread(line.direction),
-        residual=spread(np.sqrt(square / count)),
-        n_present=seen.sum(axis=1),
-        variance=spread(noise / lever),
-        center_variance=spread(noise / count + shift**2 * (2 / 3) * noise / lever),
-        piece=np.maximum.accumulate(piece),
-        swaps=rows[line.swaps],
-        reason=tuple(
-            "" if k >= 2 else f"{k} of {len(places)} particles, 2 needed"
-            for k in seen.sum(axis=1).tolist()
-        ),
-        places=places,
-        sigma=sigma,
-        dt=float(dt),
-    )
-
-
-def _noise(square: Floats, count: Ints, places: Floats) -> float:
-    """Return the localisation error of one coordinate; refuse what is no line."""
-    # Three coordinates and two angles are fitted in each frame, and the n - 1 distances once.
-    freedom = float((3 * count - 5).sum() - (len(places) - 1))
-    sigma = float(np.sqrt(square.sum() / freedom)) if freedom > 0 else np.nan
-    if sigma > _BENT * np.ptp(places):
-        raise DegenerateClusterError(
-            f"the {len(places)} particles lie on no line either: they leave it by {sigma:.3g} um a "
-            "coordinate",
-            (len(places),),
-        )
-    return sigma
+    uncertain = np.append(False, np.abs(odds) <= _CERTAIN_ENDS)
+    swaps = np.flatnonzero((sign < 0) & ~uncertain) if labelled else none
+    return np.cumprod(sign), np.cumsum(uncertain).astype(np.int64), swaps

@@ -1,4 +1,4 @@
-"""Brownian clusters with a known truth: motions whose D is planted, and localisation noise."""
+"""Simulated Brownian motion of rigid clusters with known coefficients, and localisation noise."""
 
 from __future__ import annotations
 
@@ -7,7 +7,15 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from perrin._arrays import Floats, as_positions, as_sigma, require_positive
+from perrin._arrays import (
+    Floats,
+    as_positions,
+    as_sigma,
+    choice_fault,
+    number_fault,
+    refuse,
+    require_positive,
+)
 from perrin.geometry.rotations import cumulative_product, exp_map, successive_product
 from perrin.hydrodynamics.mobility import Mobility
 from perrin.motion.rigid_motion import RigidMotion
@@ -16,8 +24,8 @@ if TYPE_CHECKING:
     from perrin.geometry.shapes import Cluster
 
 
-# The largest D dt of one substep of an anisotropic rotor: Gaussian rotation vectors are exact to
-# first order in D dt, and the error of E[R] left over at this step is about 1e-6.
+# Largest D dt of one substep of an anisotropic rotor: Gaussian rotation vectors are exact to first
+# order in D dt, and the remaining error of E[R] at this step is about 1e-6.
 _SUBSTEP = 0.002
 
 
@@ -36,17 +44,17 @@ def simulate_motion(
     Parameters
     ----------
     cluster : Cluster or Mobility
-        The body. A `Mobility` moves by its own 6x6 tensor, anisotropic and coupled, about its
+        The body. A `Mobility` diffuses by its own 6x6 tensor, anisotropic and coupled, about its
         centre of diffusion.
     D_R : float or array_like, shape (3,) or (3, 3)
         Rotational diffusion coefficient, rad^2/s; three values or a tensor are in body axes. Needed
-        with a `Cluster`; like D_T not to be given with a `Mobility`.
+        with a `Cluster`; neither D_R nor D_T is given with a `Mobility`.
     D_T : float
         Translational diffusion coefficient, um^2/s.
     dt : float
         Time between frames, s.
     n_frames : int
-        Number of frames; frame 0, at the origin and unturned, counts.
+        Number of frames, including frame 0, which is at the origin and not rotated.
     scheme : {"brownian", "euler"}
         "brownian" has the exact step law at any D_R dt for one D_R (angles from the heat kernel on
         SO(3)), and substeps with D dt <= 0.002 for a tensor. "euler" is the paper's: R_x R_y R_z
@@ -63,7 +71,7 @@ def simulate_motion(
     ------
     ValueError
         For bad values, a tensor that is not positive semidefinite, a tensor with "euler", or
-        coefficients beside a `Mobility`.
+        coefficients given with a `Mobility`.
 
     Examples
     --------
@@ -77,8 +85,7 @@ def simulate_motion(
     require_positive(dt=dt, n_frames=n_frames)
     if n_frames != int(n_frames):
         raise ValueError(f"n_frames: expected a whole number, got {n_frames!r}")
-    if scheme not in ("brownian", "euler"):
-        raise ValueError(f'scheme: expected "brownian" or "euler", got {scheme!r}')
+    refuse(choice_fault("scheme", scheme, ("brownian", "euler")))
     generator, n = np.random.default_rng(rng), int(n_frames)
     if isinstance(cluster, Mobility):
         if D_R is not None or D_T != 0 or scheme != "brownian":
@@ -86,20 +93,20 @@ def simulate_motion(
                 'a Mobility has its own D_R, D_T and scheme ("brownian"); leave them out'
             )
         template = cluster.centers - cluster.centroid
-        center, rotation = _coupled(cluster, n - 1, dt=dt, generator=generator)
+        center, rotation = _coupled_walk(cluster, n - 1, dt=dt, generator=generator)
     else:
+        if D_R is None:
+            raise ValueError("D_R: needed with a Cluster (rad^2/s); only a Mobility has its own")
+        refuse(number_fault("D_T", D_T, least=0, unit="um^2/s"))
         template = cluster.positions.copy()
-        center, rotation = _uncoupled(
-            template.shape[1], n - 1, D_R=D_R, D_T=D_T, dt=dt, scheme=scheme, generator=generator
-        )
-    return _truth(center, rotation, template, dt=float(dt))
-
-
-def _truth(center: Floats, rotation: Floats, template: Floats, *, dt: float) -> RigidMotion:
-    """Return a motion without noise or gaps."""
-    n, angles = len(center), 3 if template.shape[1] == 3 else 1
+        d = template.shape[1]
+        D = _rotation_tensor(D_R, d) * dt
+        rotation = _free_rotations(D, n - 1, scheme=scheme, generator=generator)
+        jumps = generator.normal(scale=np.sqrt(2 * D_T * dt), size=(n - 1, d))
+        center = np.concatenate([np.zeros((1, d)), np.cumsum(jumps, axis=0)])
+    angles = 3 if template.shape[1] == 3 else 1
     return RigidMotion(
-        time=np.arange(n, dtype=np.float64) * dt,
+        time=np.arange(n, dtype=np.float64) * float(dt),
         center=center,
         rotation=rotation,
         residual=np.zeros(n),
@@ -111,7 +118,7 @@ def _truth(center: Floats, rotation: Floats, template: Floats, *, dt: float) -> 
         template=template,
         sigma=0.0,
         noise=np.zeros(template.shape[1]),
-        dt=dt,
+        dt=float(dt),
     )
 
 
@@ -142,27 +149,7 @@ def add_noise(positions: ArrayLike, *, sigma: ArrayLike, rng: np.random.Generato
     return x + np.random.default_rng(rng).normal(size=x.shape) * s
 
 
-def _uncoupled(
-    d: int,
-    count: int,
-    *,
-    D_R: ArrayLike | None,
-    D_T: float,
-    dt: float,
-    scheme: str,
-    generator: np.random.Generator,
-) -> tuple[Floats, Floats]:
-    """Return centres and orientations that diffuse independently, count + 1 of them."""
-    if D_R is None:
-        raise ValueError("D_R: needed with a Cluster (rad^2/s); only a Mobility has its own")
-    if not (np.ndim(D_T) == 0 and np.isfinite(D_T) and D_T >= 0):
-        raise ValueError(f"D_T: expected a finite number >= 0 (um^2/s), got {D_T!r}")
-    rotation = _rotations(_tensor(D_R, d) * dt, count, scheme=scheme, generator=generator)
-    jumps = generator.normal(scale=np.sqrt(2 * D_T * dt), size=(count, d))
-    return np.concatenate([np.zeros((1, d)), np.cumsum(jumps, axis=0)]), rotation
-
-
-def _coupled(
+def _coupled_walk(
     body: Mobility, count: int, *, dt: float, generator: np.random.Generator
 ) -> tuple[Floats, Floats]:
     """Return centroids and orientations that diffuse by a 6x6 tensor, count + 1 of them.
@@ -185,7 +172,7 @@ def _coupled(
     return path + rotation @ arm - arm, rotation
 
 
-def _tensor(D_R: ArrayLike, d: int) -> Floats:
+def _rotation_tensor(D_R: ArrayLike, d: int) -> Floats:
     """Return D_R as a matrix, (3, 3) in space and (1, 1) in the plane."""
     value = np.asarray(D_R, dtype=np.float64)
     angles = 3 if d == 3 else 1
@@ -204,31 +191,29 @@ def _tensor(D_R: ArrayLike, d: int) -> Floats:
     return value
 
 
-def _rotations(D: Floats, count: int, *, scheme: str, generator: np.random.Generator) -> Floats:
-    """Return count + 1 orientations, the first one the identity; D is per frame."""
+def _free_rotations(
+    D: Floats, count: int, *, scheme: str, generator: np.random.Generator
+) -> Floats:
+    """Return count + 1 orientations, the first one the identity; D is the tensor times dt."""
     isotropic = np.allclose(D, D[0, 0] * np.eye(len(D)), rtol=0.0, atol=1e-12 * np.trace(D))
     if scheme == "euler":
         if len(D) != 3 or not isotropic:
-            raise ValueError('scheme="euler" (Eq. 16) knows one D_R in three dimensions only')
-        left = _euler_steps(float(D[0, 0]), count, generator=generator)
-        return successive_product(left)
+            raise ValueError('scheme="euler" (Eq. 16) is for one D_R in three dimensions only')
+        # R_x(alpha) R_y(beta) R_z(gamma) with Gaussian angles of variance 2 D.
+        angles = generator.normal(scale=np.sqrt(2 * float(D[0, 0])), size=(count, 3))
+        x, y, z = (exp_map(angles[:, i, None] * np.eye(3)[i]) for i in range(3))
+        return successive_product(np.asarray(x @ y @ z))
     if len(D) == 1 or float(np.trace(D)) == 0:
         normal = generator.normal(size=(count, len(D)))
         return cumulative_product(exp_map(normal * np.sqrt(2 * D[0, 0])))
     if isotropic:
-        return cumulative_product(_heat_kernel_steps(float(D[0, 0]), count, generator=generator))
-    return _substepped(D, count, generator=generator)
-
-
-def _euler_steps(D: float, count: int, *, generator: np.random.Generator) -> Floats:
-    """Return R_x(alpha) R_y(beta) R_z(gamma) with Gaussian angles of variance 2 D (Eq. 16)."""
-    angles = generator.normal(scale=np.sqrt(2 * D), size=(count, 3))
-    x, y, z = (exp_map(angles[:, i, None] * np.eye(3)[i]) for i in range(3))
-    return np.asarray(x @ y @ z)
-
-
-def _substepped(D: Floats, count: int, *, generator: np.random.Generator) -> Floats:
-    """Compose Gaussian body-frame rotation vectors, each short enough to be exact."""
+        # Angles from the heat kernel, about uniform axes.
+        angle, cdf = heat_kernel_angles(float(D[0, 0]))
+        drawn = np.interp(generator.random(count), cdf, angle)
+        axis = generator.normal(size=(count, 3))
+        axis /= np.linalg.norm(axis, axis=1, keepdims=True)
+        return cumulative_product(exp_map(axis * drawn[:, None]))
+    # Gaussian body-frame rotation vectors, each short enough to be exact.
     substeps = int(np.ceil(np.linalg.eigvalsh(D)[-1] / _SUBSTEP))
     values, axes = np.linalg.eigh(2 * D / substeps)
     root = axes * np.sqrt(np.maximum(values, 0.0))
@@ -238,21 +223,31 @@ def _substepped(D: Floats, count: int, *, generator: np.random.Generator) -> Flo
     return cumulative_product(step)
 
 
-def _heat_kernel_steps(D: float, count: int, *, generator: np.random.Generator) -> Floats:
-    """Return rotations by angles from the heat kernel on SO(3) about uniform axes; D is D_R dt."""
-    angle, cdf = _angle_law(D)
-    drawn = np.interp(generator.random(count), cdf, angle)
-    axis = generator.normal(size=(count, 3))
-    axis /= np.linalg.norm(axis, axis=1, keepdims=True)
-    return exp_map(axis * drawn[:, None])
+def heat_kernel_angles(D: float) -> tuple[Floats, Floats]:
+    """Return rotation angles and their cumulative probability under the heat kernel on SO(3).
 
+    Parameters
+    ----------
+    D : float
+        D_R t, rad^2.
 
-def _angle_law(D: float) -> tuple[Floats, Floats]:
-    """Return angles and their cumulative probability under the heat kernel at D = D_R t.
+    Returns
+    -------
+    angle : ndarray, shape (20001,)
+        rad.
+    cdf : ndarray, shape (20001,)
 
+    Notes
+    -----
     The density is proportional to sin(a/2) sum_n (-1)^n (a + 2 pi n) exp(-(a + 2 pi n)^2 / 4D), the
     character series sum (2l + 1) exp(-l(l+1)D) sin((l + 1/2)a) sin(a/2) summed over images
     (Poisson). Images converge fast for small D, the series for large D; at D = 1 either is exact.
+
+    Examples
+    --------
+    >>> angle, cdf = heat_kernel_angles(50.0)  # uniform rotations: (a - sin a)/pi
+    >>> bool(np.allclose(cdf, (angle - np.sin(angle)) / np.pi, atol=1e-6))
+    True
     """
     angle = np.linspace(0.0, min(np.pi, 14 * np.sqrt(2 * D)), 20001)
     if D < 1:

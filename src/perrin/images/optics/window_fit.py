@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
 
-from perrin.geometry.rotations import exp_map, skew
+from perrin.geometry.rigid import pose_slopes
+from perrin.geometry.rotations import exp_map
 
 if TYPE_CHECKING:
     from perrin._arrays import Bools, Floats
@@ -128,10 +129,8 @@ class RigidCenters:
     @property
     def slope(self) -> Floats:
         """Derivatives (6, 3 n) by the centre and by a small rotation about the lab's axes."""
-        arm = skew(self.template @ self.rotation.T)
-        by_center = np.broadcast_to(np.eye(3), arm.shape)
-        # A small rotation w moves the point r by w x r, whose derivative by w is skew(r).
-        return np.concatenate([by_center, arm], axis=1)[..., ::-1].swapaxes(0, 1).reshape(6, -1)
+        slopes = np.roll(pose_slopes(self.template @ self.rotation.T), 3, axis=-1)
+        return np.moveaxis(slopes[:, ::-1], -1, 0).reshape(6, -1)
 
     def moved(self, step: Floats) -> RigidCenters:
         """Shift the centre and rotate the body; step (6,)."""

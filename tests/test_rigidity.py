@@ -1,6 +1,8 @@
-"""What is said of a fit is so: noise per axis, stretched z, blurred scans, broken bonds."""
+"""Rigidity of a fitted body: noise of each axis, stretched z, sequential scans, broken bonds."""
 
 from __future__ import annotations
+
+import json
 
 import numpy as np
 import pytest
@@ -21,27 +23,28 @@ def noisy(seed, *, body=4, D_R=4.9e-3, n_frames=300, sigma=(0.03, 0.03, 0.04)):
 
 
 @pytest.mark.parametrize("body", [3, 4, 6])
-def test_a_good_cluster_raises_no_word(body):
-    """Rigid, equal scales, simultaneous particles: no warning on five clusters of each kind."""
-    for seed in range(5):
+def test_a_good_cluster_has_no_warning(body, repeats):
+    """Rigid, equal scales, simultaneous particles: no warning on 5 (quick: 2) clusters each."""
+    for seed in range(repeats(2, 5)):
         assert judged(noisy(seed, body=body)).warnings == ()
 
 
 @pytest.mark.parametrize("sigma", [(0.03, 0.03, 0.03), (0.02, 0.04, 0.06)])
-def test_sigma_per_axis_comes_back(sigma):
+def test_sigma_per_axis_comes_back(sigma, repeats):
     """The planted errors, to 4 times the spread that the projector predicts (9 % at most)."""
-    found = np.mean([judged(noisy(s, sigma=sigma)).sigma_xyz for s in range(6)], axis=0)
-    np.testing.assert_allclose(found, sigma, rtol=4 * 0.09 / np.sqrt(6))
+    count = repeats(3, 6)
+    found = np.mean([judged(noisy(s, sigma=sigma)).sigma_xyz for s in range(count)], axis=0)
+    np.testing.assert_allclose(found, sigma, rtol=4 * 0.09 / np.sqrt(count))
 
 
-def test_a_trimer_that_hardly_turns_cannot_tell_sigma_per_axis():
+def test_a_trimer_that_hardly_turns_has_no_sigma_per_axis():
     """Its residuals lie in its plane, which stays where it is."""
     assert judged(noisy(1, body=3, D_R=1e-5)).sigma_xyz is None
     assert judged(noisy(1, body=3, D_R=0.02)).sigma_xyz is not None
 
 
 def test_a_stretched_z_is_measured():
-    """3 % come back within 3 standard errors and are told; without a stretch 1 does."""
+    """3 % come back within 3 standard errors and are reported; without a stretch the scale is 1."""
     x = noisy(2)
     stretched, plain = judged(x * [1.0, 1.0, 1.03]), judged(x)
     assert abs(stretched.z_scale - 1.03) < 3 * stretched.z_scale_stderr
@@ -107,7 +110,7 @@ def test_a_stated_sigma_decides():
 @pytest.mark.parametrize("seed", range(2))
 def test_labels_and_axes_of_the_lab_do_not_matter(seed):
     """Particles renamed, the lab turned about z: the same verdict."""
-    x = noisy(seed + 20)
+    x = noisy(seed + 20, n_frames=150)
     base = judged(x)
     c, s = np.cos(0.7), np.sin(0.7)
     turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]])
@@ -121,7 +124,7 @@ def test_labels_and_axes_of_the_lab_do_not_matter(seed):
 
 
 def test_bodies_in_the_plane_are_judged_too():
-    """Two dimensions know no z; the rest holds."""
+    """In two dimensions there is no scale of z; the noise of each axis is measured."""
     flat = perrin.Cluster.from_positions([[0, 0], [2, 0], [1, 1.7]])
     truth = perrin.simulate_motion(flat, D_R=0.02, D_T=0.03, dt=1.0, n_frames=300, rng=1)
     quality = judged(perrin.add_noise(truth.positions(), sigma=(0.02, 0.04), rng=2))
@@ -131,10 +134,9 @@ def test_bodies_in_the_plane_are_judged_too():
 
 def test_quality_survives_json():
     """to_dict and from_dict are inverse."""
-    import json
-
     quality = judged(noisy(8), swaps=(4, 9))
-    assert perrin.Quality.from_dict(json.loads(json.dumps(quality.to_dict()))) == quality
+    text = json.dumps(quality.to_dict(), allow_nan=False)
+    assert perrin.Quality.from_dict(json.loads(text)) == quality
 
 
 @pytest.mark.parametrize(
@@ -151,7 +153,7 @@ def test_quality_survives_json():
 def test_the_symmetry_of_a_noisy_shape_is_found(cluster, symbol):
     """The point group from the measured shape, in space and in the plane, whatever the labels."""
     rng = np.random.default_rng(3)
-    truth = perrin.simulate_motion(cluster, D_R=5e-3, dt=1.0, n_frames=200, rng=rng)
+    truth = perrin.simulate_motion(cluster, D_R=5e-3, dt=1.0, n_frames=100, rng=rng)
     x = perrin.add_noise(truth.positions(), sigma=0.03, rng=rng)
     for order in (slice(None), rng.permutation(len(cluster.positions))):
         motion = perrin.track_rotation(x[:, order], dt=1.0)
@@ -165,9 +167,9 @@ def stuck(seed, *, ratio=3.0, n_frames=300):
     return body + rng.normal(size=(n_frames, 4, 3)) * [0.02, 0.02, 0.02 * ratio]
 
 
-def test_a_body_that_does_not_turn_has_no_scale_of_z():
-    """Noise of the fitted orientation imitates no stretch, whatever sigma_z."""
-    for seed in range(10):
+def test_a_body_that_does_not_turn_has_no_scale_of_z(repeats):
+    """Noise of the fitted orientation is not taken for a stretch, whatever sigma_z."""
+    for seed in range(repeats(3, 10)):
         quality = judged(stuck(seed))
         assert quality.warnings == ()
         assert quality.z_scale is None
@@ -175,32 +177,34 @@ def test_a_body_that_does_not_turn_has_no_scale_of_z():
 
 @pytest.mark.parametrize("scale", [1.03, 1.05, 1.1, 1.2, 0.9])
 @pytest.mark.parametrize("D_R", [0.005, 0.02])
-def test_every_stretch_is_found_and_returned(scale, D_R):
+def test_every_stretch_is_found_and_returned(scale, D_R, repeats):
     """100 frames: from 3 % on z is reported, its scale is right within the error over repeats."""
+    count = repeats(1, 10)
     found = [
-        judged(noisy(s, D_R=D_R, n_frames=100, sigma=0.03) * [1.0, 1.0, scale]) for s in range(10)
+        judged(noisy(s, D_R=D_R, n_frames=100, sigma=0.03) * [1.0, 1.0, scale])
+        for s in range(count)
     ]
     named = [any("z scale" in w for w in q.warnings) for q in found]
-    assert sum(named) >= 9
+    assert sum(named) >= max(count - 1, 1)
     pull = [(q.z_scale - scale) / q.z_scale_stderr for q in found]
-    assert abs(np.mean(pull)) < 3.5 / np.sqrt(10)
+    assert abs(np.mean(pull)) < 3.5 / np.sqrt(count)
     # A wrong height does not make the body soft.
     assert all(q.rigid for q in found)
 
 
 @pytest.mark.parametrize("ratio", [1.0, 3.0])
 @pytest.mark.parametrize("body", [3, 4])
-def test_worse_noise_along_z_is_no_stretch_and_no_scan(body, ratio):
+def test_worse_noise_along_z_is_no_stretch_and_no_scan(body, ratio, repeats):
     """The pulls of scale and delay have mean 0 and unit spread with unequal noise of the axes."""
     found = [
         judged(noisy(s, body=body, n_frames=150, sigma=(0.03, 0.03, 0.03 * ratio)))
-        for s in range(100, 120)
+        for s in range(100, 100 + repeats(5, 20))
     ]
     assert all(q.warnings == () for q in found)
     scale = [(q.z_scale - 1) / q.z_scale_stderr for q in found if q.z_scale is not None]
     delay = [q.scan_delay / q.scan_delay_stderr for q in found]
     for pull in (scale, delay):
-        # Four standard errors of mean and spread of 20 normal numbers, and 0.3 of third order.
+        # Four standard errors of mean and spread of normal numbers, and 0.3 of third order.
         assert abs(np.mean(pull)) < 4 / np.sqrt(len(pull)) + 0.3
         assert np.std(pull) < 1 + 4 / np.sqrt(2 * len(pull))
 
@@ -234,10 +238,10 @@ def soft_arm(seed, *, amplitude, memory, n_frames=300):
 
 
 @pytest.mark.parametrize("memory", [5, 50])
-def test_a_soft_arm_is_not_rigid(memory):
-    """A fifth of R: found also where the frames that show it were thrown away before the fit."""
+def test_a_soft_arm_is_not_rigid(memory, repeats):
+    """A fifth of R: found also where the detections that show it were left out of the fit."""
     found = []
-    for seed in range(6):
+    for seed in range(repeats(2, 6)):
         x = soft_arm(seed, amplitude=0.2, memory=memory)
         kept = x.copy()
         motion = perrin.track_rotation(x, dt=0.73)
@@ -245,13 +249,13 @@ def test_a_soft_arm_is_not_rigid(memory):
         kept[off > np.quantile(off, 0.87), 3] = np.nan
         quality = perrin.judge_quality(perrin.track_rotation(kept, dt=0.73), kept, detections=x)
         found.append(not quality.rigid)
-    assert sum(found) >= 5
+    assert sum(found) >= len(found) - 1
 
 
 @pytest.mark.parametrize("fault", ["bad frames", "outliers"])
-def test_bad_frames_and_outliers_do_not_make_a_body_soft(fault):
+def test_bad_frames_and_outliers_do_not_make_a_body_soft(fault, repeats):
     """3 % of frames at six times the noise, or 1 % of detections far off: rigid, and a note."""
-    for seed in range(6):
+    for seed in range(repeats(2, 6)):
         x, rng = noisy(seed + 60, sigma=0.03), np.random.default_rng(seed)
         if fault == "bad frames":
             bad = rng.random(len(x)) < 0.03
