@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 
+from perrin._arrays import to_plain
 from perrin.errors import UnitWarning
 from perrin.geometry.shapes import Cluster, is_tetrahedron
 from perrin.hydrodynamics.mobility import BOLTZMANN, Mobility, cluster_mobility, condition_faults
@@ -18,10 +19,6 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from perrin._arrays import Floats
-
-
-# From which coefficients a size follows, and what its keys in the summary end in.
-_SIZE_KEYS = {"translation": "T", "rotation": "R", "both": "TR"}
 
 
 @runtime_checkable
@@ -109,6 +106,25 @@ class Size:
         for size in (self, other):
             variance += size.sphere_stderr**2 - size.shared_stderr**2
         return self.sphere - other.sphere, float(np.sqrt(variance))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the size for JSON; what is not finite is None.
+
+        Examples
+        --------
+        >>> Size(4.4, 0.1, 2.45, 0.06, "exact").to_dict()["sphere"]
+        2.45
+        """
+        return {name: to_plain(value) for name, value in asdict(self).items()}
+
+    @classmethod
+    def from_dict(cls, entry: dict[str, Any]) -> Size:
+        """Read back what `to_dict` wrote; a diameter or an error that is None becomes NaN."""
+        optional = ("factor", "viscosity", "viscosity_stderr")
+        read: dict[str, Any] = {
+            k: np.nan if v is None and k not in optional else v for k, v in entry.items()
+        }
+        return cls(**read)
 
 
 class _Known(NamedTuple):
@@ -379,37 +395,3 @@ def neighbour_distance(positions: Floats) -> float:
     if not len(distance) or distance.min() == 0:
         return 1.0  # a single sphere; coincident ones are refused where the body is made
     return float(distance[distance < _TOUCHING * distance.min()].mean())
-
-
-def _sizes_dict(sizes: dict[str, Size]) -> dict[str, Any]:
-    """Return sizes for JSON; None for those that were not found."""
-    entry: dict[str, Any] = {}
-    for mode, letters in _SIZE_KEYS.items():
-        size = sizes.get(mode)
-        for what in ("sphere", "cluster"):
-            entry[f"{what}_{letters}"] = size and {
-                "value": getattr(size, what),
-                "stderr": getattr(size, f"{what}_stderr"),
-            }
-    both = sizes.get("both")
-    entry["viscosity_TR"] = both and {"value": both.viscosity, "stderr": both.viscosity_stderr}
-    return entry
-
-
-def _sizes_from(entry: dict[str, Any]) -> dict[str, Size]:
-    """Read back what `_sizes_dict` wrote."""
-    found = {}
-    for mode, letters in _SIZE_KEYS.items():
-        sphere, cluster = (entry["sizes"][f"{what}_{letters}"] for what in ("sphere", "cluster"))
-        thickness = entry["sizes"]["viscosity_TR"] if mode == "both" else None
-        if sphere is not None:
-            found[mode] = Size(
-                cluster=cluster["value"],
-                cluster_stderr=cluster["stderr"],
-                sphere=sphere["value"],
-                sphere_stderr=sphere["stderr"],
-                factor=entry["size_factor"],
-                viscosity=thickness and thickness["value"],
-                viscosity_stderr=thickness and thickness["stderr"],
-            )
-    return found

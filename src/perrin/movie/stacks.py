@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 import perrin.movie.checks as checks
-from perrin.diffusion.noise_model import choice_faults
 from perrin.errors import IdentityError, PartsError, TooFewFramesError
 from perrin.images.imaging import Imaging, View
 from perrin.images.spheres.localisation import NO_FLAT_MODEL, Search, check_search, is_flat
@@ -19,7 +18,7 @@ from perrin.images.stack import digest
 from perrin.movie.bodies import Bodies, find_bodies, stated_errors, tracks_of
 from perrin.movie.stages import Located, Workplace, fit_poses, locate_frames
 from perrin.movie.workers import check_workers
-from perrin.run.experiment import Conditions, check_arguments, told_conditions
+from perrin.run.experiment import Experiment, Recording, merged_experiment
 from perrin.run.measure import measure_table
 from perrin.tracks.clock import Clock, evenly_spaced
 
@@ -145,14 +144,13 @@ def analyze_stack(
     """
     # Clusters that meet may be a crowd for some frames.
     search = Search(diameter, contact, dark, percentile, minmass, border, crowds=True)
+    known: dict[str, Any] = {
+        "dt": stack.dt, "viscosity": viscosity, "temperature": temperature, "noise": noise,
+        "exposure": exposure, "drift": drift, "keep_jumps": keep_jumps,
+    }  # fmt: skip
+    _check(stack, search, refine, optics, known, size=size, workers=workers, scheduler=scheduler)
     sphere = contact if viscosity is not None and temperature is not None else None
-    conditions = Conditions(
-        stack.dt, None, viscosity, temperature, sphere, noise, exposure, drift, keep_jumps,
-        times=_uneven(stack),
-    )  # fmt: skip
-    _check(
-        stack, search, refine, optics, conditions, size=size, workers=workers, scheduler=scheduler
-    )
+    experiment = merged_experiment(None, diameter=sphere, **known)
     flat = refine == "model" and is_flat(stack)
     refine = None if flat else refine
     listed, out = _listed(len(stack), frames), sorted({int(c) for c in exclude})
@@ -172,9 +170,10 @@ def analyze_stack(
         poses = _Poses(stack, method.optics, bodies, contact, folder / _POSED, place)
         report = measure_table(
             tracks_of(bodies, exclude=out),
-            replace(conditions, sigma_ratio=stated_errors(bodies)),
+            experiment,
+            recording=Recording(stack.dt, _uneven(stack), stated_errors(bodies)),
             source={"path": stack.source if stack.path else None, "sha256": depends["sha256"]},
-            arguments=_arguments(conditions, depends, bodies.size, out),
+            arguments=_arguments(experiment, depends, bodies.size, out),
             improved=poses.improved,
         )
     imaging = _imaging(stack, located, bodies, search)
@@ -207,7 +206,7 @@ def _check(
     search: Search,
     refine: Refine,
     optics: Optics | None,
-    conditions: Conditions,
+    known: Mapping[str, Any],
     *,
     size: int | None,
     workers: int,
@@ -216,12 +215,8 @@ def _check(
     """Raise one error with every fault of the arguments, before hours of work."""
     if len(stack) < 2:
         raise TooFewFramesError("one frame shows no motion: two or more are needed", len(stack))
-    faults = choice_faults(
-        quantity="rotation", noise=conditions.noise, exposure=conditions.exposure
-    )
-    given = {"viscosity": conditions.viscosity, "temperature": conditions.temperature}
-    faults += _faults_of(check_search, stack, search, refine, optics=optics)
-    faults += _faults_of(check_arguments, dt=conditions.dt, **given)
+    faults = _faults_of(check_search, stack, search, refine, optics=optics)
+    faults += _faults_of(merged_experiment, None, **known)
     if size is not None and not (size == int(size) and size >= 2):
         faults.append(f"size: expected a whole number of spheres, at least 2, got {size!r}")
     if workers < 0 or (workers and scheduler is not None):
@@ -245,7 +240,7 @@ def _unevenness(stack: Stack) -> list[str]:
     ]
 
 
-def _faults_of(check: Callable[..., None], *arguments: object, **named: object) -> list[str]:
+def _faults_of(check: Callable[..., object], *arguments: object, **named: object) -> list[str]:
     try:
         check(*arguments, **named)
     except ValueError as fault:
@@ -359,11 +354,11 @@ class _Poses:
 
 
 def _arguments(
-    conditions: Conditions, depends: Mapping[str, Any], size: int, out: Sequence[int]
+    experiment: Experiment, depends: Mapping[str, Any], size: int, out: Sequence[int]
 ) -> dict[str, Any]:
     """Return what run.json keeps of the arguments."""
     mine = {k: v for k, v in depends.items() if k not in ("sha256", "versions")}
-    return told_conditions(conditions) | mine | {"size": size, "exclude": list(out)}
+    return experiment.to_dict() | mine | {"size": size, "exclude": list(out)}
 
 
 def _imaging(stack: Stack, located: Located, bodies: Bodies, search: Search) -> Imaging:
