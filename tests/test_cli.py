@@ -20,7 +20,7 @@ import pytest
 
 import perrin
 from perrin.cli.app import analyze, app
-from perrin.cli.tables import _show
+from perrin.cli.tables import show_report
 
 
 class Outcome(NamedTuple):
@@ -306,7 +306,7 @@ def test_the_screen_merges_warnings_and_sets_notes_apart(table, capsys, count):
     recognised = "columns recognised: 'Frame' as frame"
     lost = tuple(f"cluster {50 + k} was left out: {k} frames" for k in range(30))
     report = report_of(table, count, warnings=lost, notes=(recognised,))
-    _show(report, Path("folder"), analyze)
+    show_report(report, Path("folder"), analyze)
     lines = [
         line for line in capsys.readouterr().out.splitlines() if line.startswith(("! ", "note"))
     ]

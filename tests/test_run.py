@@ -235,7 +235,7 @@ def test_a_full_disk_is_told_and_the_run_goes_on(tmp_path, movie_file, whole, mo
     assert stopped.value.code == 2
     told = capsys.readouterr().err
     assert "No space left on device" in told
-    assert "the same command goes on" in told
+    assert "the same command resumes" in told
     kept = len(list((folder / "located").glob("part-*")))
     assert 0 < kept < FRAMES
     assert not list((folder / "located").glob(".*"))
@@ -596,7 +596,7 @@ def test_what_cannot_be_is_said_in_one_line(tmp_path, capsys, options, status, t
     assert stopped.value.code == status
     assert f"perrin: {path}: {told}" in error or f"perrin: {told}" in error
     assert "Traceback" not in error
-    assert "the same command goes on" not in error
+    assert "the same command resumes" not in error
 
 
 def test_workers_that_are_not_there_are_told(tmp_path, monkeypatch, movie_file):
