@@ -154,7 +154,7 @@ def test_texts_are_sorted_by_what_they_are_about():
     kind = NAMES.kind_of
     assert kind("not resolved: D_R < 0.1 rad^2/s") == "unresolved"
     assert kind("the centre jumps by 3.1(2) um between frames 149 and 150") == "jump"
-    cut = "in doubt; the track is cut (a jump of the body's symmetry cannot be told)"
+    cut = "in doubt; the track is cut (a jump of the body's symmetry cannot be distinguished)"
     assert kind(cut) == "cut"
     assert kind("signal-to-noise ratio 0.1: the noise is far larger than a step") == "noisy"
     assert kind("something new") == "other"

@@ -649,7 +649,7 @@ def test_a_cut_reports_how_far_the_body_turned():
     angles = re.search(r"step angles ([0-9, ]+), \.\.\. deg: a jump of the body's symmetry", text)
     # The least angle between two assignments of a tetrahedron is 120 degrees.
     assert all(40 < float(word) < 90 for word in angles.group(1).split(","))
-    assert "cannot be told from a real turn" in text
+    assert "cannot be distinguished from a real turn" in text
 
 
 def test_an_experiment_states_what_arguments_state(base):

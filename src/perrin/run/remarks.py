@@ -388,7 +388,7 @@ def cut_text(frames: Ints, *, angles: Floats, symmetry: str) -> str:
         more = ", ..." if angles.size > _ANGLES_SHOWN else ""
         turns = (
             f" (step angle{'s' if angles.size > 1 else ''} {shown}{more} deg: a jump of the body's "
-            f"symmetry, {symmetry}, cannot be told from a real turn)"
+            f"symmetry, {symmetry}, cannot be distinguished from a real turn)"
         )
     return (
         "identity: which label belongs to which particle is in doubt at "
