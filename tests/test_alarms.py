@@ -25,6 +25,8 @@ class Benchmark:
     """The benchmark as a module."""
 
     def __getattr__(self, name):
+        if name.startswith("__"):
+            raise AttributeError(name)
         return benchmark()[name]
 
 
