@@ -21,7 +21,7 @@ from perrin import (
     track_rotation,
     water_viscosity,
 )
-from perrin.hydrodynamics import Size, sizes_from_dict, sizes_to_dict
+from perrin.hydrodynamics import Size
 
 PAPER = {"viscosity": 2.18e-3, "temperature": 295.0}
 TETRAHEDRON = Cluster.touching(4, 2.45)
@@ -117,14 +117,11 @@ def test_spheres_that_do_not_touch_and_unequal_ones():
 
 
 def test_sizes_come_back_from_json():
-    """Every field of a Size, with its viscosity and without, and the summary's sizes."""
+    """Every field of a Size, with its viscosity and without."""
     t = size_from_translation(D_T, cluster=TETRAHEDRON, factor="hoffmann2009", **HOT)
     joint = size_and_viscosity(D_T, D_R, cluster=[[0.0, 0, 0], [0, 0, 2]], temperature=295.0)
     for size in (t, joint):
         assert Size.from_dict(json.loads(json.dumps(size.to_dict()))) == size
-    sizes = {"translation": replace(t, factor="exact", shared_stderr=0.0), "both": joint}
-    entry = json.loads(json.dumps({"sizes": sizes_to_dict(sizes), "size_factor": "exact"}))
-    assert sizes_from_dict(entry) == sizes
 
 
 def test_neighbours_set_the_scale():

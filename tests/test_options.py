@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 import inspect
 import re
 from pathlib import Path
@@ -115,11 +116,12 @@ def test_statements_about_data_stay(text):
     assert in_options(text, options_of(cli.analyze)) == text
 
 
-def literals() -> list[str]:
+@functools.cache
+def literals() -> tuple[str, ...]:
     """Return every text in the library's code but docstrings, 7 in the place of values."""
     found = []
     for path in SOURCE.rglob("*.py"):
-        if path.stem in ("cli", "options"):
+        if path.relative_to(SOURCE).parts[0] == "cli":
             continue
         tree = ast.parse(path.read_text(encoding="utf-8"))
         inside: set[int] = set()
@@ -134,7 +136,7 @@ def literals() -> list[str]:
                 found.append("".join(parts))
             elif isinstance(node, ast.Constant) and isinstance(node.value, str):
                 found.append(node.value)
-    return [text for text in found if " " in text]
+    return tuple(text for text in found if " " in text)
 
 
 @pytest.mark.parametrize("command", COMMANDS, ids=lambda c: c.__name__)
@@ -151,3 +153,34 @@ def test_no_message_of_the_source_keeps_an_argument(command):
     for text in named:
         assert not python.search(in_options(text, options)), text
         assert "--" in in_options(text, options)
+
+
+def test_no_message_of_the_library_names_an_option():
+    """A message names arguments; the command line translates them."""
+    assert [text for text in literals() if re.search(r"(?<![\w-])--[a-z]", text)] == []
+
+
+@pytest.mark.parametrize(
+    ("command", "headings"),
+    [
+        (
+            cli.analyze,
+            ["Arguments", "Input", "Noise and estimates", "Sizes and predictions", "Output"],
+        ),
+        (
+            cli.run,
+            ["Arguments", "Input", "Spheres and clusters", "Noise and estimates",
+             "Sizes and predictions", "Work", "Output"],
+        ),
+        (cli.predict, ["Arguments", "Options"]),
+    ],
+)  # fmt: skip
+def test_many_options_are_shown_in_groups(command, headings):
+    """Every option is in one group of the help, under its heading."""
+    from typer.testing import CliRunner
+
+    text = CliRunner().invoke(cli.app, [command.__name__, "--help"]).output
+    shown = re.findall(r"^(\w[\w ]*):$", text, re.MULTILINE)
+    assert [heading for heading in shown if heading != "Other options"] == headings
+    options = re.findall(r"^  (?:-o, )?(--[a-z][a-z-]*)", text, re.MULTILINE)
+    assert sorted(options) == sorted({*options_of(command).values(), "--help"})

@@ -45,7 +45,7 @@ def test_lists_plurals_and_names_do_not_distinguish(first, second):
 
 
 def test_other_words_are_other_lines():
-    """What differs in words stays apart, and nothing is lost: every text is in one remark."""
+    """Texts with other words are not merged, and nothing is lost: every text is in one remark."""
     texts = {"a": ["no size from D_R: a limit", "5 rows"], "b": ["no size from D_T: a limit"]}
     assert merged(texts) == [
         "cluster a: no size from D_R: a limit",

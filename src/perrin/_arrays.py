@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, MutableSequence
 from dataclasses import fields
-from difflib import get_close_matches
 from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
@@ -220,6 +219,8 @@ def refuse_unknown(function: str, settings: Iterable[str], known: Iterable[str])
     Traceback (most recent call last):
     TypeError: render_stack: unknown keyword 'photon'; the nearest known one is 'photons'
     """
+    from difflib import get_close_matches
+
     known = list(known)
     lines = [
         f"unknown keyword {key!r}; the nearest known one is "

@@ -1,23 +1,30 @@
-"""The command line: parse, call, print; no physics."""
+"""The commands: parse, call, print; no physics."""
 
 from __future__ import annotations
 
 import os
 import re
-import sys
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from perrin.cli.messages import messages_of, state_kept_frames
 from perrin.cli.options import (
-    _PICTURES,
-    _SHAPES,
-    _TOUCHING,
+    INPUT,
+    OUTPUT,
+    PICTURE_SUFFIXES,
+    SHAPES,
+    SIZES,
+    SPHERES,
+    TOUCHING_SHAPES,
+    WORK,
     Columns,
     Drift,
     Exposure,
+    Frames,
+    GroupedCommand,
     Interval,
     KeepJumps,
     Noise,
@@ -25,23 +32,26 @@ from perrin.cli.options import (
     Overwrite,
     OverwriteFile,
     Scale,
+    Seed,
+    Shape,
+    Sigma,
+    Temperature,
     Tracks,
-    _body,
-    _columns,
-    _frames_kept,
-    _noise,
-    _numbers,
-    _optics,
-    _refine,
-    _slice,
-    _spheres,
-    _whole_numbers,
+    Viscosity,
+    body_of,
+    read_columns,
+    read_noise,
+    read_numbers,
+    read_optics,
+    read_refine,
+    read_slice,
+    read_whole_numbers,
+    spheres_of,
 )
-from perrin.cli.tables import _show, _show_plan, _show_prediction
+from perrin.cli.tables import show_plan, show_prediction, show_report
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
-    from typing import TextIO
 
     from rich.progress import TaskID
 
@@ -57,8 +67,8 @@ app = typer.Typer(
 )
 
 
-# What a run of the demo writes, by which the folder of an earlier one is recognised.
-_DEMO = "perrin-demo"
+# Default folder of the demo, and the files that it writes there, by which it is recognised.
+_DEMO_FOLDER = "perrin-demo"
 
 
 _DEMO_FILES = re.compile(
@@ -72,8 +82,8 @@ def main() -> None:
     app()
 
 
-def _version(asked: bool) -> None:
-    if asked:
+def _print_version(wanted: bool) -> None:
+    if wanted:
         from perrin import __version__
 
         print(__version__)
@@ -81,12 +91,15 @@ def _version(asked: bool) -> None:
 
 
 @app.callback()
-def _root(
+def common_options(
     version: Annotated[
-        bool, typer.Option("--version", help="Print the version.", callback=_version, is_eager=True)
+        bool,
+        typer.Option(
+            "--version", help="Print the version.", callback=_print_version, is_eager=True
+        ),
     ] = False,
 ) -> None:
-    pass
+    """Measure how rigid clusters of colloidal particles diffuse and turn."""
 
 
 @app.command()
@@ -94,7 +107,9 @@ def demo(
     output: Annotated[
         Path | None,
         typer.Option(
-            "-o", "--output", help=f"Folder for the run; {_DEMO} if left out, replaced if a demo's."
+            "-o",
+            "--output",
+            help=f"Folder for the run; {_DEMO_FOLDER} if left out, replaced if a demo's.",
         ),
     ] = None,
     overwrite: Overwrite = False,
@@ -106,52 +121,47 @@ def demo(
     import perrin
     from perrin.run.folders import check_place
 
-    with _messages(demo), as_file(files("perrin") / "data" / "demo_tracks.csv.gz") as path:
-        place = output or Path(_DEMO)
+    with messages_of(demo), as_file(files("perrin") / "data" / "demo_tracks.csv.gz") as path:
+        place = output or Path(_DEMO_FOLDER)
         if output is None and place.exists() and not overwrite:
-            _check_demo(place)
+            check_demo_folder(place)
             overwrite = True
         check_place(place, overwrite=overwrite)
         report = perrin.analyze(path, dt=0.73, viscosity=2.18e-3, temperature=295.0, diameter=2.45)
         report = replace(report, settings=report.settings | {"made": "demo"})
         perrin.write_run(report, place, overwrite=overwrite)
-        _show(report, place, demo)
+        show_report(report, place, demo)
         print("Planted in the simulation: D_R = 0.00493 rad^2/s, D_T = 0.0385 um^2/s.")
 
 
-@app.command()
+@app.command(cls=GroupedCommand)
 def analyze(
     tracks: Tracks,
     dt: Interval,
     output: Output,
     scale: Scale = "1",
     columns: Columns = None,
+    frames: Frames = None,
     contact: Annotated[
         float | None,
-        typer.Option(help="Centre distance of touching particles, um: finds the clusters."),
-    ] = None,
-    sigma: Annotated[
-        str | None,
         typer.Option(
-            help="Known localisation error, um, one number or x,y,z: for the predicted noise floor "
-            "and the test of rigidity."
+            help="Centre distance of touching particles, um: finds the clusters.",
+            rich_help_panel=INPUT,
         ),
     ] = None,
+    sigma: Sigma = None,
     noise: Noise = "joint",
     exposure: Exposure = None,
     drift: Drift = False,
     keep_jumps: KeepJumps = False,
-    viscosity: Annotated[float | None, typer.Option(help="Pa s, for sizes.")] = None,
-    temperature: Annotated[
-        float | None,
-        typer.Option(help="K, for sizes; alone it gives size and viscosity from D_T and D_R."),
-    ] = None,
+    viscosity: Viscosity = None,
+    temperature: Temperature = None,
     diameter: Annotated[
         float | None,
-        typer.Option(help="Of one sphere, um: predicted D_T and D_R beside the measured ones."),
-    ] = None,
-    frames: Annotated[
-        str | None, typer.Option(help="A:B uses the frames A <= frame < B; A or B may be left out.")
+        typer.Option(
+            help="Sphere diameter, um: predicted D_T and D_R, to compare with the measured ones.",
+            rich_help_panel=SIZES,
+        ),
     ] = None,
     overwrite: Overwrite = False,
 ) -> None:
@@ -159,134 +169,188 @@ def analyze(
     import perrin
     from perrin.run.folders import check_place
 
-    with _messages(analyze):
+    with messages_of(analyze):
         check_place(output, overwrite=overwrite)
         report = perrin.analyze(
             tracks,
             dt=dt,
-            scale=_numbers("--scale", scale),
-            columns=_columns(columns),
+            scale=read_numbers("--scale", scale),
+            columns=read_columns(columns),
             contact=contact,
-            sigma=None if sigma is None else _numbers("--sigma", sigma),
-            noise=_noise(noise),
+            sigma=None if sigma is None else read_numbers("--sigma", sigma),
+            noise=read_noise(noise),
             exposure=exposure,
             drift=drift,
             keep_jumps=keep_jumps,
             viscosity=viscosity,
             temperature=temperature,
             diameter=diameter,
-            frames=_slice(frames),
+            frames=read_slice(frames),
         )
         perrin.write_run(report, output, overwrite=overwrite)
-        _show(report, output, analyze)
+        show_report(report, output, analyze)
 
 
-@app.command()
+@app.command(cls=GroupedCommand)
 def run(
     stack: Annotated[
         Path, typer.Argument(help="Movie of stacks: TIFF, OME-TIFF, .lif, .nd2, .czi, .ims, .zarr.")
     ],
-    diameter: Annotated[float, typer.Option(help="Of the ball that is seen, um.")],
-    contact: Annotated[float, typer.Option(help="Centre distance of touching spheres, um.")],
+    diameter: Annotated[
+        float,
+        typer.Option(help="Diameter of the fluorescent sphere, um.", rich_help_panel=SPHERES),
+    ],
+    contact: Annotated[
+        float,
+        typer.Option(help="Centre distance of touching spheres, um.", rich_help_panel=SPHERES),
+    ],
     output: Annotated[
         Path,
-        typer.Option("-o", "--output", help="Folder for the run; one that was stopped goes on."),
+        typer.Option(
+            "-o",
+            "--output",
+            help="Folder for the run; a run that was stopped is resumed.",
+            rich_help_panel=OUTPUT,
+        ),
     ],
     voxel: Annotated[
         str | None,
-        typer.Option(help="Voxel size z,y,x (y,x in the plane), um, if not in the file."),
+        typer.Option(
+            help="Voxel size z,y,x (y,x in the plane), um, if not in the file.",
+            rich_help_panel=INPUT,
+        ),
     ] = None,
     dt: Annotated[
-        float | None, typer.Option("--dt", help="Time between frames, s, if not in the file.")
+        float | None,
+        typer.Option(
+            "--dt", help="Time between frames, s, if not in the file.", rich_help_panel=INPUT
+        ),
     ] = None,
     plane_time: Annotated[
-        float | None, typer.Option(help="Time from one plane to the next, s.")
+        float | None,
+        typer.Option(help="Time from one plane to the next, s.", rich_help_panel=INPUT),
     ] = None,
     planes: Annotated[
-        int | None, typer.Option(help="Planes of a frame, if not in the file.")
+        int | None,
+        typer.Option(
+            help="Number of planes of a frame, if not in the file.", rich_help_panel=INPUT
+        ),
     ] = None,
-    channel: Annotated[int | None, typer.Option(help="Channel, from 0.")] = None,
+    channel: Annotated[
+        int | None, typer.Option(help="Number of the channel, from 0.", rich_help_panel=INPUT)
+    ] = None,
     image: Annotated[
-        str | None, typer.Option(help="Image of a file with several, by number or name.")
+        str | None,
+        typer.Option(
+            help="Image of a file with several, by number or name.", rich_help_panel=INPUT
+        ),
     ] = None,
+    frames: Frames = None,
     size: Annotated[
-        int | None, typer.Option(help="Spheres of a cluster; the most common number if left out.")
-    ] = None,
-    frames: Annotated[
-        str | None, typer.Option(help="A:B uses the frames A <= frame < B; A or B may be left out.")
+        int | None,
+        typer.Option(
+            help="Number of spheres of a cluster; the most common one if left out.",
+            rich_help_panel=SPHERES,
+        ),
     ] = None,
     exclude: Annotated[
-        str | None, typer.Option(help="Clusters to leave out, by number: 3,7.")
+        str | None,
+        typer.Option(help="Clusters to leave out, by number: 3,7.", rich_help_panel=SPHERES),
     ] = None,
     refine: Annotated[
         str,
-        typer.Option(help="model: fit the image; trackpy: its disc model; none: places as found."),
+        typer.Option(
+            help="model: fit the image; trackpy: its disc model; none: places as found.",
+            rich_help_panel=SPHERES,
+        ),
     ] = "model",
     dark: Annotated[
-        bool, typer.Option("--dark", help="Spheres are darker than what surrounds them.")
+        bool,
+        typer.Option(
+            "--dark",
+            help="Spheres are darker than the background.",
+            rich_help_panel=SPHERES,
+        ),
     ] = False,
     minmass: Annotated[
-        float | None, typer.Option(help="Least mass of a sphere; the widest gap if left out.")
+        float | None,
+        typer.Option(
+            help="Least mass of a sphere; in the widest gap of the masses if left out.",
+            rich_help_panel=SPHERES,
+        ),
     ] = None,
     percentile: Annotated[
-        float, typer.Option(help="Of voxels too dim for a sphere's middle; lower in full fields.")
+        float,
+        typer.Option(
+            help="Percentage of the voxels that are too dim for the middle of a sphere; lower it "
+            "for fields full of spheres.",
+            rich_help_panel=SPHERES,
+        ),
     ] = 95.0,
     optics: Annotated[
         str | None,
         typer.Option(
-            help="How a sphere is seen, learned if left out: diameter,psf_z,psf (um), and the "
-            "noise's gain,floor (a voxel's variance is gain times its light plus floor)."
+            help="Image of a sphere, learned if left out: diameter,psf_z,psf (um), and gain,floor "
+            "of the noise (variance of a voxel: gain times its intensity plus floor).",
+            rich_help_panel=SPHERES,
         ),
     ] = None,
     noise: Noise = "joint",
     exposure: Exposure = None,
     drift: Drift = False,
     keep_jumps: KeepJumps = False,
-    viscosity: Annotated[
-        float | None, typer.Option(help="Pa s: with the temperature, sizes and predictions.")
-    ] = None,
-    temperature: Annotated[float | None, typer.Option(help="K.")] = None,
+    viscosity: Viscosity = None,
+    temperature: Temperature = None,
     workers: Annotated[
-        int, typer.Option(min=0, help="Processes of this machine that share the work.")
+        int,
+        typer.Option(
+            min=0,
+            help="Number of processes of this machine that share the work.",
+            rich_help_panel=WORK,
+        ),
     ] = 0,
     scheduler: Annotated[
-        str | None, typer.Option(help="Dask scheduler that does the work: tcp://host:8786.")
+        str | None,
+        typer.Option(
+            help="Address of a Dask scheduler that does the work: tcp://host:8786.",
+            rich_help_panel=WORK,
+        ),
     ] = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Measure D_R and D_T of every cluster in a movie of image stacks.
 
-    Finished frames are kept in the output folder: after an interruption the same command goes on.
+    Finished frames are kept in the output folder: after an interruption the same command resumes.
     """
     import perrin
     from perrin.report.write import complete_run
     from perrin.run.folders import check_resumable
 
-    with _messages(run), _frames_kept(output):
+    with messages_of(run), state_kept_frames(output):
         check_resumable(output, parts="located", overwrite=overwrite)
         movie = perrin.open_stack(
             stack,
-            voxel=None if voxel is None else _numbers("--voxel", voxel),
+            voxel=None if voxel is None else read_numbers("--voxel", voxel),
             dt=dt,
             plane_time=plane_time,
             planes=planes,
             channel=channel,
             image=int(image) if image is not None and image.isdecimal() else image,
         )
-        with movie, _progress() as progress:
+        with movie, progress_bar() as progress:
             report = perrin.analyze_stack(
                 movie,
                 diameter=diameter,
                 contact=contact,
                 size=size,
-                frames=_slice(frames),
-                exclude=_whole_numbers("--exclude", exclude),
-                refine=_refine(refine),
-                optics=_optics(optics),
+                frames=read_slice(frames),
+                exclude=read_whole_numbers("--exclude", exclude),
+                refine=read_refine(refine),
+                optics=read_optics(optics),
                 dark=dark,
                 minmass=minmass,
                 percentile=percentile,
-                noise=_noise(noise),
+                noise=read_noise(noise),
                 exposure=exposure,
                 drift=drift,
                 keep_jumps=keep_jumps,
@@ -300,12 +364,12 @@ def run(
             )
             progress(0, 0, "writing the report")
             complete_run(report, output)
-        _show(report, output, run)
+        show_report(report, output, run)
 
 
 @contextmanager
-def _progress() -> Iterator[Callable[[int, int, str], None]]:
-    """Give a function that shows how far the work is, how fast, and how long it will take."""
+def progress_bar() -> Iterator[Callable[[int, int, str], None]]:
+    """Give a function that shows progress, rate and remaining time of the work."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -319,9 +383,9 @@ def _progress() -> Iterator[Callable[[int, int, str], None]]:
     with Progress(*columns, console=Console(stderr=True, highlight=False)) as bar:
         tasks: dict[str, TaskID] = {}
 
-        def tell(done: int, total: int, title: str) -> None:
+        def show(done: int, total: int, title: str) -> None:
             if title not in tasks:
-                for task in bar.tasks:  # what came before is over
+                for task in bar.tasks:  # earlier tasks are done
                     bar.update(task.id, total=task.total or 1, completed=task.total or 1)
                 tasks[title] = bar.add_task(
                     title, total=total or None, completed=done, count="", rate=""
@@ -331,12 +395,12 @@ def _progress() -> Iterator[Callable[[int, int, str], None]]:
             count = f"{done}/{total}" if total else ""
             bar.update(task.id, completed=done, total=total or None, count=count, rate=rate)
 
-        yield tell
+        yield show
 
 
 @app.command()
 def simulate(
-    shape: Annotated[str, typer.Argument(help=f"{', '.join(_SHAPES)}.")],
+    shape: Shape,
     radius: Annotated[float, typer.Option(help="Mean distance of particles to the centre, um.")],
     d_r: Annotated[float, typer.Option("--d-r", help="D_R, rad^2/s.")],
     dt: Interval,
@@ -346,7 +410,7 @@ def simulate(
     d_t: Annotated[float, typer.Option("--d-t", help="D_T, um^2/s.")] = 0.0,
     sigma: Annotated[str, typer.Option(help="Localisation error, um, one number or x,y,z.")] = "0",
     frames: Annotated[int, typer.Option(help="Number of frames.")] = 300,
-    seed: Annotated[int, typer.Option(help="Seed of the random numbers.")] = 0,
+    seed: Seed = 0,
     overwrite: OverwriteFile = False,
 ) -> None:
     """Write the track table of one simulated Brownian cluster with localisation noise."""
@@ -355,10 +419,10 @@ def simulate(
     import perrin
     from perrin.tracks.files import SUFFIXES
 
-    with _messages(simulate):
-        _check_file(output, SUFFIXES, overwrite=overwrite)
-        if shape not in _SHAPES:
-            raise ValueError(f"shape: expected {', '.join(_SHAPES)}, got {shape!r}")
+    with messages_of(simulate):
+        check_new_file(output, SUFFIXES, overwrite=overwrite)
+        if shape not in SHAPES:
+            raise ValueError(f"shape: expected {', '.join(SHAPES)}, got {shape!r}")
         rng = np.random.default_rng(seed)
         truth = perrin.simulate_motion(
             getattr(perrin.Cluster, shape)(radius),
@@ -368,9 +432,11 @@ def simulate(
             n_frames=frames,
             rng=rng,
         )
-        positions = perrin.add_noise(truth.positions(), sigma=_numbers("--sigma", sigma), rng=rng)
+        positions = perrin.add_noise(
+            truth.positions(), sigma=read_numbers("--sigma", sigma), rng=rng
+        )
         table = perrin.positions_table(positions)
-        if output.suffix.lower() == ".gdf":  # a format without room for a cluster column
+        if output.suffix.lower() == ".gdf":  # a format without a cluster column
             table = table.drop(columns="cluster")
         perrin.write_tracks(table, output)
         print(f"{frames} frames of one {shape} written to {output}")
@@ -378,33 +444,33 @@ def simulate(
 
 @app.command()
 def predict(
-    viscosity: Annotated[float, typer.Option(help="Pa s.")],
-    temperature: Annotated[float, typer.Option(help="K.")],
+    viscosity: Annotated[float, typer.Option(help="Viscosity, Pa s.")],
+    temperature: Annotated[float, typer.Option(help="Temperature, K.")],
     shape: Annotated[
-        str | None, typer.Argument(help=f"Touching spheres: {', '.join(_TOUCHING)}.")
+        str | None, typer.Argument(help=f"Touching spheres: {', '.join(TOUCHING_SHAPES)}.")
     ] = None,
     diameter: Annotated[float | None, typer.Option(help="Sphere diameter, um.")] = None,
     positions: Annotated[
         Path | None,
         typer.Option(help="Any other body: csv with columns x,y,z (um), perhaps radius."),
     ] = None,
-    accuracy: Annotated[float, typer.Option(help="Relative error aimed at.")] = 1e-4,
+    accuracy: Annotated[float, typer.Option(help="Relative numerical error to reach.")] = 1e-4,
     output: Annotated[Path | None, typer.Option("-o", "--output", help="JSON file.")] = None,
     overwrite: OverwriteFile = False,
 ) -> None:
     """Predict how a rigid cluster of spheres diffuses: D_T, D_R, hydrodynamic diameters."""
-    import json
     import warnings
 
     import numpy as np
 
     import perrin
     from perrin.hydrodynamics.units import length_remarks
+    from perrin.run.folders import write_json
 
-    with _messages(predict):
+    with messages_of(predict):
         if output is not None:
-            _check_file(output, overwrite=overwrite)
-        centers, radius = _spheres(shape, diameter=diameter, positions=positions)
+            check_new_file(output, overwrite=overwrite)
+        centers, radius = spheres_of(shape, diameter=diameter, positions=positions)
         for remark in length_remarks("the diameter of a sphere", 2 * np.asarray(radius).mean()):
             warnings.warn(remark, perrin.UnitWarning, stacklevel=2)
         body = perrin.cluster_mobility(
@@ -415,17 +481,16 @@ def predict(
             accuracy=accuracy,
         )
         if output is not None:
-            text = json.dumps(body.to_dict(), indent=2, allow_nan=False)
-            output.write_text(text + "\n", encoding="utf-8")
-        _show_prediction(body, name=shape or str(positions))
+            write_json(output, body.to_dict())
+        show_prediction(body, name=shape or str(positions))
         if output is not None:
             print(f"Written to {output}")
 
 
 @app.command()
 def plan(
-    shape: Annotated[str, typer.Argument(help=f"{', '.join(_SHAPES)}.")],
-    d_r: Annotated[float, typer.Option("--d-r", help="D_R as far as it is known, rad^2/s.")],
+    shape: Shape,
+    d_r: Annotated[float, typer.Option("--d-r", help="D_R, estimated beforehand, rad^2/s.")],
     sigma: Annotated[str, typer.Option(help="Localisation error, um, one number or x,y,z.")],
     radius: Annotated[
         float | None, typer.Option(help="Mean distance of particles to the centre, um.")
@@ -434,16 +499,19 @@ def plan(
         float | None, typer.Option(help="Instead of the radius: diameter of touching spheres, um.")
     ] = None,
     d_t: Annotated[
-        float | None, typer.Option("--d-t", help="D_T, um^2/s: travel then counts for linking.")
+        float | None,
+        typer.Option(
+            "--d-t", help="D_T, um^2/s: the displacements between frames then limit dt as well."
+        ),
     ] = None,
-    frames: Annotated[int | None, typer.Option(help="The most frames that can be taken.")] = None,
-    time: Annotated[float | None, typer.Option(help="The longest movie, s.")] = None,
+    frames: Annotated[int | None, typer.Option(help="Largest number of frames.")] = None,
+    time: Annotated[float | None, typer.Option(help="Longest duration of the movie, s.")] = None,
     photons: Annotated[
         bool,
         typer.Option(
             "--photons",
-            help="The light is limited: that of --frames frames in --time s, each with --sigma, "
-            "can be divided among any number of frames.",
+            help="The number of photons is limited: that of --frames frames in --time s, each with "
+            "--sigma, can be divided among any number of frames.",
         ),
     ] = False,
     output: Annotated[
@@ -452,22 +520,22 @@ def plan(
     ] = None,
     overwrite: OverwriteFile = False,
 ) -> None:
-    """Say how often and how many times to look, and how well D_R will be known."""
+    """Recommend time step and number of frames, and predict the error of D_R."""
     import perrin
 
-    with _messages(plan):
+    with messages_of(plan):
         if output is not None:
-            _check_file(output, _PICTURES, overwrite=overwrite)
+            check_new_file(output, PICTURE_SUFFIXES, overwrite=overwrite)
         found = perrin.plan_sampling(
-            _body(shape, radius=radius, diameter=diameter),
+            body_of(shape, radius=radius, diameter=diameter),
             D_R=d_r,
-            sigma=_numbers("--sigma", sigma),
+            sigma=read_numbers("--sigma", sigma),
             D_T=d_t,
             n_frames=frames,
             total_time=time,
             photons=photons,
         )
-        _show_plan(found)
+        show_plan(found)
         if output is not None:
             from perrin.plot.results import plot_plan
             from perrin.plot.style import new_figure
@@ -481,7 +549,7 @@ def plan(
 @app.command()
 def paper(
     output: Annotated[Path, typer.Option("-o", "--output", help="Folder for figures and claims.")],
-    seed: Annotated[int, typer.Option(help="Seed of the random numbers.")] = 2011,
+    seed: Seed = 2011,
     overwrite: Overwrite = False,
 ) -> None:
     """Remake every figure, table and claim of Hunter et al. 2011."""
@@ -495,7 +563,7 @@ def paper(
     console = Console(highlight=False)
     columns = BarColumn(), TextColumn("{task.completed}/{task.total}"), TimeElapsedColumn()
     bar = Progress(*columns, TextColumn("{task.description}"), console=console)
-    with _messages(paper):
+    with messages_of(paper):
         check_place(output, overwrite=overwrite)
         with bar:
             task = bar.add_task("starting", total=None)
@@ -518,7 +586,9 @@ def paper(
 @app.command()
 def convert(
     source: Annotated[Path, typer.Argument(help="Track table to read.")],
-    target: Annotated[Path, typer.Argument(help="Track table to write, kind by its suffix.")],
+    target: Annotated[
+        Path, typer.Argument(help="Track table to write; its suffix states the format.")
+    ],
     scale: Scale = "1",
     columns: Columns = None,
     overwrite: OverwriteFile = False,
@@ -527,10 +597,10 @@ def convert(
     import perrin
     from perrin.tracks.files import SUFFIXES
 
-    with _messages(convert):
-        _check_file(target, SUFFIXES, overwrite=overwrite)
+    with messages_of(convert):
+        check_new_file(target, SUFFIXES, overwrite=overwrite)
         table = perrin.read_tracks(
-            source, scale=_numbers("--scale", scale), columns=_columns(columns)
+            source, scale=read_numbers("--scale", scale), columns=read_columns(columns)
         )
         perrin.write_tracks(table, target)
         for note in table.attrs.get("notes", ()):
@@ -538,94 +608,38 @@ def convert(
         print(f"{len(table)} rows written to {target}")
 
 
-@contextmanager
-def _messages(command: Callable[..., None]) -> Iterator[None]:
-    """Print warnings and an error in one line each, in the words of the command line.
+def check_new_file(path: Path, endings: tuple[str, ...] = (), *, overwrite: bool) -> None:
+    """Refuse, before any work is done, a file that cannot or must not be written.
 
-    Exit status 1: the data cannot answer; 2: the input or the place of the output is wrong.
+    Parameters
+    ----------
+    path : Path
+    endings : tuple of str
+        Endings of which the name must have one; none: any name.
+    overwrite : bool
+        Accept a file that exists.
+
+    Raises
+    ------
+    ValueError, OSError
     """
-    import perrin
-    from perrin.cli.messages import in_options, options_of
-
-    no_answer = (
-        perrin.DegenerateClusterError,
-        perrin.IdentityError,
-        perrin.NoSpheresError,
-        perrin.TooFewFramesError,
-    )
-
-    options = options_of(command)
-    try:
-        with _warnings_in_one_line(options):
-            yield
-    except BrokenPipeError:
-        # The reader has gone (a pipe into head); the run itself is written. Python's own flush at
-        # the end would complain again.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    except (ValueError, OSError, ImportError) as error:
-        print(f"perrin: {in_options(_one_line(error), options)}", file=sys.stderr)
-        raise typer.Exit(1 if isinstance(error, no_answer) else 2) from None
-
-
-@contextmanager
-def _warnings_in_one_line(options: dict[str, str]) -> Iterator[None]:
-    """Print the library's warnings when they are given, each text once."""
-    import warnings
-
-    import perrin
-    from perrin.cli.messages import in_options
-
-    ours = (perrin.PrecisionWarning, perrin.IdentityWarning)
-    printed: set[str] = set()
-    with warnings.catch_warnings():
-        usual = warnings.showwarning
-
-        def show(
-            message: Warning | str,
-            category: type[Warning],
-            filename: str,
-            lineno: int,
-            file: TextIO | None = None,
-            line: str | None = None,
-        ) -> None:
-            if not issubclass(category, ours):
-                usual(message, category, filename, lineno, file, line)
-                return
-            text = in_options(" ".join(str(message).split()), options)
-            if text not in printed:
-                print(f"warning: {text}", file=sys.stderr)
-                printed.add(text)
-
-        for category in ours:
-            warnings.simplefilter("always", category)
-        warnings.showwarning = show
-        yield
-
-
-def _one_line(error: Exception) -> str:
-    """Return an error's message on one line, the system's with the file first."""
-    if isinstance(error, OSError) and error.strerror and error.filename:
-        return f"{error.filename}: {error.strerror}"
-    return "; ".join(line.strip().removeprefix("- ") for line in str(error).splitlines())
-
-
-def _check_file(path: Path, endings: tuple[str, ...] = (), *, overwrite: bool) -> None:
-    """Refuse, before any work is done, a file that cannot or must not be written."""
     if endings and not path.name.lower().endswith(endings):
         raise ValueError(f"{path}: expected a name that ends in {', '.join(endings)}")
     if path.is_dir():
         raise IsADirectoryError(f"{path} is a folder: state the name of a file")
     if path.exists() and not overwrite:
-        raise FileExistsError(f"{path} exists: choose another name, or --overwrite")
+        raise FileExistsError(f"{path} exists: choose another name, or overwrite=True")
     if not path.parent.is_dir():
         raise FileNotFoundError(f"{path}: there is no folder {path.parent}")
     if not os.access(path.parent, os.W_OK):
         raise PermissionError(f"{path}: the folder {path.parent} is not writable")
 
 
-def _check_demo(folder: Path) -> None:
+def check_demo_folder(folder: Path) -> None:
     """Refuse to replace a folder unless it is empty or all in it was written by the demo."""
     import json
+
+    from perrin._text import listed
 
     found = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*"))
     foreign = [name for name in found if not _DEMO_FILES.fullmatch(name)]
@@ -635,8 +649,6 @@ def _check_demo(folder: Path) -> None:
         made = False
     if (made and not foreign) or (not found and folder.is_dir()):
         return
-    from perrin._text import listed
-
     reason = f"it holds {listed(foreign)}" if made else "no run.json in it names the demo"
     raise FileExistsError(
         f"{folder} is not what a demo wrote ({reason}): not overwritten; move it away, or choose "

@@ -1,16 +1,23 @@
-"""Messages of the library in the words of the command line: arguments become options."""
+"""Errors and warnings of the library, in the words of the command line and in one line each."""
 
 from __future__ import annotations
 
+import os
 import re
+import sys
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, get_type_hints
 
+import typer
+
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Iterator, Mapping
+    from pathlib import Path
+    from typing import TextIO
 
 
-# Arguments of the library that are called otherwise on the command line.
-_RENAMED = {
+# Arguments of the library that have another name on the command line.
+_RENAMED_ARGUMENTS = {
     "n_frames": "--frames",
     "total_time": "--time",
     "D_R": "--d-r",
@@ -23,17 +30,17 @@ _RENAMED = {
 
 # Arguments whose names are symbols of physics: "dt = 0.5 s" may be a statement about the data,
 # except in a list of arguments that are not positive.
-_SYMBOLS = ("dt", "sigma", "D_R", "D_T", "R")
+_PHYSICAL_SYMBOLS = ("dt", "sigma", "D_R", "D_T", "R")
 
 
-_NOT_POSITIVE = re.compile(r"(?<=expected a finite number > 0: )[^;]*")
+_LIST_OF_FAULTS = re.compile(r"(?<=expected a finite number > 0: )[^;]*")
 
 
 # Arguments whose names are no words of the language, and name nothing else.
-_PYTHON_ONLY = ("n_frames", "total_time", "plane_time", "minmass", "keep_jumps")
+_ARGUMENTS_ALONE = ("n_frames", "total_time", "plane_time", "minmass", "keep_jumps")
 
 
-_VALUE = r"\{[^{}]*\}|\([^()]*\)|\[[^\[\]]*\]|'[^']*'|\"[^\"]*\"|[^\s,;:()]*"
+_ARGUMENT_VALUE = r"\{[^{}]*\}|\([^()]*\)|\[[^\[\]]*\]|'[^']*'|\"[^\"]*\"|[^\s,;:()]*"
 
 
 def options_of(command: Callable[..., object]) -> dict[str, str]:
@@ -42,7 +49,7 @@ def options_of(command: Callable[..., object]) -> dict[str, str]:
     Parameters
     ----------
     command : callable
-        A function whose options are annotated in the way of typer.
+        A function whose options are annotated for typer.
 
     Returns
     -------
@@ -65,7 +72,9 @@ def options_of(command: Callable[..., object]) -> dict[str, str]:
                 default = f"--{name.replace('_', '-')}"
                 options[name] = max(about.param_decls or (default,), key=len)
     return options | {
-        argument: option for argument, option in _RENAMED.items() if option in options.values()
+        argument: option
+        for argument, option in _RENAMED_ARGUMENTS.items()
+        if option in options.values()
     }
 
 
@@ -99,25 +108,131 @@ def in_options(text: str, options: Mapping[str, str]) -> str:
         return options[match[1]]
 
     def with_value(match: re.Match[str]) -> str:
-        value = _plain_value(match[2])
-        return f"{options[match[1]]} {value}" if value else options[match[1]]
+        # A value of Python becomes one behind an option; True needs none.
+        name, value = options[match[1]], match[2]
+        if value.startswith("{"):
+            pairs = re.findall(r"['\"]?(\w+)['\"]?: *['\"]?([^,'\"}]+)['\"]?", value)
+            value = ",".join(f"{key}={column}" for key, column in pairs)
+        elif value.startswith(("(", "[")):
+            value = value[1:-1].replace(" ", "")
+        else:
+            value = {"True": "", "None": "none"}.get(value, value.strip("'\""))
+        return f"{name} {value}" if value else name
 
     # name=value anywhere, "name: " where a clause begins, "name = value".
-    text = re.sub(rf"(?<![\w-])({names})=({_VALUE})", with_value, text)
+    text = re.sub(rf"(?<![\w-])({names})=({_ARGUMENT_VALUE})", with_value, text)
     text = re.sub(rf"(?:(?<=[:;] )|(?<=- )|^)({names})(?=: )", option, text)
-    text = _NOT_POSITIVE.sub(lambda found: re.sub(rf"\b({names}) =(?= )", option, found[0]), text)
-    words = "|".join(name for name in options if name not in _SYMBOLS)
+    text = _LIST_OF_FAULTS.sub(lambda found: re.sub(rf"\b({names}) =(?= )", option, found[0]), text)
+    words = "|".join(name for name in options if name not in _PHYSICAL_SYMBOLS)
     if words:
         text = re.sub(rf"(?<![\w-])({words}) =(?= )", option, text)
-    alone = "|".join(name for name in _PYTHON_ONLY if name in options)
+    alone = "|".join(name for name in _ARGUMENTS_ALONE if name in options)
     return re.sub(rf"(?<![\w-])({alone})\b", option, text) if alone else text
 
 
-def _plain_value(value: str) -> str:
-    """Return a value of Python as it is written behind an option; nothing for True."""
-    if value.startswith("{"):
-        pairs = re.findall(r"['\"]?(\w+)['\"]?: *['\"]?([^,'\"}]+)['\"]?", value)
-        return ",".join(f"{name}={column}" for name, column in pairs)
-    if value.startswith(("(", "[")):
-        return value[1:-1].replace(" ", "")
-    return {"True": "", "None": "none"}.get(value, value.strip("'\""))
+@contextmanager
+def messages_of(command: Callable[..., object]) -> Iterator[None]:
+    """Print warnings and an error in one line each, in the words of the command line.
+
+    Parameters
+    ----------
+    command : callable
+        The command that runs inside.
+
+    Raises
+    ------
+    typer.Exit
+        With status 1 where the data cannot answer, 2 where the input or the place of the output is
+        wrong.
+    """
+    import perrin
+
+    no_answer = (
+        perrin.DegenerateClusterError,
+        perrin.IdentityError,
+        perrin.NoSpheresError,
+        perrin.TooFewFramesError,
+    )
+    options = options_of(command)
+    try:
+        with warnings_in_one_line(options):
+            yield
+    except BrokenPipeError:
+        # The reader has stopped (a pipe into head); the run itself is written. Python's own flush
+        # at the end would complain again.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except (ValueError, OSError, ImportError) as error:
+        if isinstance(error, OSError) and error.strerror and error.filename:
+            text = f"{error.filename}: {error.strerror}"
+        else:
+            text = "; ".join(line.strip().removeprefix("- ") for line in str(error).splitlines())
+        print(f"perrin: {in_options(text, options)}", file=sys.stderr)
+        raise typer.Exit(1 if isinstance(error, no_answer) else 2) from None
+
+
+@contextmanager
+def warnings_in_one_line(options: Mapping[str, str]) -> Iterator[None]:
+    """Print the library's warnings when they are raised, each text once.
+
+    Parameters
+    ----------
+    options : mapping of str to str
+        From `options_of`.
+    """
+    import warnings
+
+    import perrin
+
+    ours = (perrin.PrecisionWarning, perrin.IdentityWarning)
+    printed: set[str] = set()
+    with warnings.catch_warnings():
+        usual = warnings.showwarning
+
+        def show(
+            message: Warning | str,
+            category: type[Warning],
+            filename: str,
+            lineno: int,
+            file: TextIO | None = None,
+            line: str | None = None,
+        ) -> None:
+            if not issubclass(category, ours):
+                usual(message, category, filename, lineno, file, line)
+                return
+            text = in_options(" ".join(str(message).split()), options)
+            if text not in printed:
+                print(f"warning: {text}", file=sys.stderr)
+                printed.add(text)
+
+        for category in ours:
+            warnings.simplefilter("always", category)
+        warnings.showwarning = show
+        yield
+
+
+@contextmanager
+def state_kept_frames(output: Path) -> Iterator[None]:
+    """State, when a run is stopped from outside, that its finished frames are kept.
+
+    Parameters
+    ----------
+    output : Path
+        The run folder.
+
+    Raises
+    ------
+    typer.Exit
+        With status 130 after an interruption from the keyboard.
+    """
+    try:
+        yield
+    except (OSError, KeyboardInterrupt) as stop:
+        kept = any((output / "located").glob("part-*"))
+        if kept and not (output / "run.json").exists():
+            print(
+                f"Finished frames are kept in {output}: the same command resumes the run.",
+                file=sys.stderr,
+            )
+        if isinstance(stop, OSError):
+            raise
+        raise typer.Exit(130) from None

@@ -1,69 +1,132 @@
-"""Options of the command line: their types, their help texts, and what their texts mean."""
+"""Options of the command line: their types, groups and help texts, and what their texts mean."""
 
 from __future__ import annotations
 
-import sys
-from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, cast
+from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 
 import typer
+from typer.core import TyperCommand
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from numpy.typing import ArrayLike
 
     from perrin.geometry.shapes import Cluster
     from perrin.images.optics.optics import Optics
 
 
-_SHAPES = ("tetrahedron", "pentahedron", "trimer")
+SHAPES = ("tetrahedron", "pentahedron", "trimer")
 
 
-_TOUCHING = ("dimer", "trimer", "tetrahedron", "bipyramid", "octahedron", "pentagonal-bipyramid")
+TOUCHING_SHAPES = (
+    "dimer", "trimer", "tetrahedron", "bipyramid", "octahedron", "pentagonal-bipyramid",
+)  # fmt: skip
 
 
-_PICTURES = (".png", ".pdf", ".svg")
+PICTURE_SUFFIXES = (".png", ".pdf", ".svg")
+
+
+# Headings of the options in the help of commands with many of them, in this order.
+INPUT, SPHERES = "Input", "Spheres and clusters"
+ESTIMATES, SIZES, WORK, OUTPUT = (
+    "Noise and estimates", "Sizes and predictions", "Work", "Output",
+)  # fmt: skip
+_GROUPS = (INPUT, SPHERES, ESTIMATES, SIZES, WORK, OUTPUT, "Other options")
+
+
+class GroupedCommand(TyperCommand):
+    """A command whose help shows its options under headings: their `rich_help_panel`."""
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:  # noqa: ANN401 (click's own types)
+        """Write the arguments, and the options group by group."""
+        groups: dict[str, list[tuple[str, str]]] = {g: [] for g in ("Arguments", *_GROUPS)}
+        for parameter in self.get_params(ctx):
+            record = parameter.get_help_record(ctx)
+            if parameter.param_type_name == "argument":
+                heading = "Arguments"
+            else:
+                heading = getattr(parameter, "rich_help_panel", None) or _GROUPS[-1]
+            if record is not None:
+                groups[heading].append(record)
+        for heading, records in groups.items():
+            if records:
+                with formatter.section(heading):
+                    formatter.write_dl(records)
 
 
 Tracks = Annotated[Path, typer.Argument(help="Track table: .csv, .csv.gz, .parquet or .gdf.")]
 
 
-Interval = Annotated[float, typer.Option("--dt", help="Time between frames, s.")]
+Interval = Annotated[
+    float, typer.Option("--dt", help="Time between frames, s.", rich_help_panel=INPUT)
+]
 
 
-Output = Annotated[Path, typer.Option("-o", "--output", help="Folder for the run.")]
+Output = Annotated[
+    Path, typer.Option("-o", "--output", help="Folder for the run.", rich_help_panel=OUTPUT)
+]
 
 
 Scale = Annotated[
-    str, typer.Option(help="um per unit of the coordinates; one number or x,y,z, e.g. 1000 for mm.")
+    str,
+    typer.Option(
+        help="um per unit of the coordinates; one number or x,y,z, e.g. 1000 for mm.",
+        rich_help_panel=INPUT,
+    ),
 ]
 
 
 Columns = Annotated[
     str | None,
-    typer.Option(help="Names or numbers of the file's columns: x=0,y=1,z=2,frame=-2,particle=-1."),
+    typer.Option(
+        help="Names or numbers of the file's columns: x=0,y=1,z=2,frame=-2,particle=-1.",
+        rich_help_panel=INPUT,
+    ),
 ]
 
 
-Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an existing run folder.")]
+Frames = Annotated[
+    str | None,
+    typer.Option(
+        help="A:B uses the frames A <= frame < B; A or B may be left out.", rich_help_panel=INPUT
+    ),
+]
+
+
+Overwrite = Annotated[
+    bool,
+    typer.Option("--overwrite", help="Replace an existing run folder.", rich_help_panel=OUTPUT),
+]
 
 
 OverwriteFile = Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")]
+
+
+Sigma = Annotated[
+    str | None,
+    typer.Option(
+        help="Known localisation error, um, one number or x,y,z: for the predicted noise floor "
+        "and the test of rigidity.",
+        rich_help_panel=ESTIMATES,
+    ),
+]
 
 
 Noise = Annotated[
     str,
     typer.Option(
         help="How the noise under D is known: joint (free), residual (from the rigid fit; "
-        "right only if all particles of a frame are seen at once), or sigma in um."
+        "right only if all particles of a frame are recorded at once), or sigma in um.",
+        rich_help_panel=ESTIMATES,
     ),
 ]
 
 
 Exposure = Annotated[
-    float | None, typer.Option(help="Open fraction of dt, 0 to 1; unknown if left out.")
+    float | None,
+    typer.Option(
+        help="Open fraction of dt, 0 to 1; unknown if left out.", rich_help_panel=ESTIMATES
+    ),
 ]
 
 
@@ -71,7 +134,9 @@ Drift = Annotated[
     bool,
     typer.Option(
         "--drift",
-        help="Take a mean velocity (flow) off D_T and a mean spin off D_R; both are stated.",
+        help="Subtract a mean velocity (flow) from D_T and a mean spin from D_R; both are "
+        "reported.",
+        rich_help_panel=ESTIMATES,
     ),
 ]
 
@@ -79,42 +144,50 @@ Drift = Annotated[
 KeepJumps = Annotated[
     bool,
     typer.Option(
-        "--keep-jumps", help="Keep steps in D that Brownian motion cannot make (stage jumps)."
+        "--keep-jumps",
+        help="Keep steps in D that Brownian motion cannot make (stage jumps).",
+        rich_help_panel=ESTIMATES,
     ),
 ]
 
 
-def _optics(text: str | None) -> Optics | None:
+Viscosity = Annotated[
+    float | None,
+    typer.Option(
+        help="Viscosity, Pa s: with the temperature, sizes and predictions.", rich_help_panel=SIZES
+    ),
+]
+
+
+Temperature = Annotated[
+    float | None,
+    typer.Option(
+        help="Temperature, K; alone it gives size and viscosity from D_T and D_R together.",
+        rich_help_panel=SIZES,
+    ),
+]
+
+
+Seed = Annotated[int, typer.Option(help="Seed of the random numbers.")]
+
+
+Shape = Annotated[str, typer.Argument(help=f"{', '.join(SHAPES)}.")]
+
+
+def read_optics(text: str | None) -> Optics | None:
     """Read diameter, point spread along z and in the plane, gain and floor of the noise."""
     from perrin.images.optics.optics import CameraNoise, Optics
 
     if text is None:
         return None
-    values = _numbers("--optics", text)
+    values = read_numbers("--optics", text)
     if not isinstance(values, list) or len(values) != 5:
         raise ValueError(f"--optics: expected diameter,psf_z,psf,gain,floor, got {text!r}")
     diameter, psf_z, psf, gain, floor = values
     return Optics(diameter, (psf_z, psf), CameraNoise(gain, floor))
 
 
-@contextmanager
-def _frames_kept(output: Path) -> Iterator[None]:
-    """State, when a run is stopped from outside, that finished frames are kept."""
-    try:
-        yield
-    except (OSError, KeyboardInterrupt) as stop:
-        kept = any((output / "located").glob("part-*"))
-        if kept and not (output / "run.json").exists():
-            print(
-                f"Finished frames are kept in {output}: the same command goes on from there.",
-                file=sys.stderr,
-            )
-        if isinstance(stop, OSError):
-            raise
-        raise typer.Exit(130) from None
-
-
-def _spheres(
+def spheres_of(
     shape: str | None, *, diameter: float | None, positions: Path | None
 ) -> tuple[ArrayLike, ArrayLike]:
     """Return centres and radius of a named body of touching spheres, or those of a file."""
@@ -124,13 +197,15 @@ def _spheres(
 
     if diameter is not None:
         require_positive(diameter=diameter)
-    if positions is None and shape in _TOUCHING:
+    if positions is None and shape in TOUCHING_SHAPES:
         if diameter is None:
             raise ValueError("--diameter: the sphere diameter (um) is needed")
-        return perrin.Cluster.touching(_TOUCHING.index(shape) + 2, diameter).positions, diameter / 2
+        return perrin.Cluster.touching(
+            TOUCHING_SHAPES.index(shape) + 2, diameter
+        ).positions, diameter / 2
     if positions is None or shape is not None:
         raise ValueError(
-            f"expected one of {', '.join(_TOUCHING)}, or --positions FILE, got {shape!r}"
+            f"expected one of {', '.join(TOUCHING_SHAPES)}, or --positions FILE, got {shape!r}"
             + ("" if positions is None else f" and {positions}")
         )
     centers, radius = read_spheres(positions)
@@ -138,13 +213,13 @@ def _spheres(
         return centers, radius
     if radius is None and diameter is not None:
         return centers, diameter / 2
-    there = "has none" if radius is None else "has one"
+    state = "has none" if radius is None else "has one"
     raise ValueError(
-        f"the size: expected --diameter or a column radius, one of them; {positions} {there}"
+        f"the size: expected --diameter or a column radius, one of them; {positions} {state}"
     )
 
 
-def _numbers(option: str, text: str) -> float | list[float]:
+def read_numbers(option: str, text: str) -> float | list[float]:
     """Read one number, or several separated by commas."""
     try:
         values = [float(part) for part in text.split(",")]
@@ -153,7 +228,7 @@ def _numbers(option: str, text: str) -> float | list[float]:
     return values[0] if len(values) == 1 else values
 
 
-def _noise(text: str) -> Literal["joint", "residual"] | float:
+def read_noise(text: str) -> Literal["joint", "residual"] | float:
     """Read joint, residual, or a number."""
     if text in ("joint", "residual"):
         return cast('Literal["joint", "residual"]', text)
@@ -165,7 +240,7 @@ def _noise(text: str) -> Literal["joint", "residual"] | float:
         ) from None
 
 
-def _whole_numbers(option: str, text: str | None) -> list[int]:
+def read_whole_numbers(option: str, text: str | None) -> list[int]:
     """Read whole numbers separated by commas."""
     try:
         return [int(part) for part in (text or "").split(",") if part.strip()]
@@ -173,14 +248,14 @@ def _whole_numbers(option: str, text: str | None) -> list[int]:
         raise ValueError(f"{option}: expected numbers like 3,7, got {text!r}") from None
 
 
-def _refine(text: str) -> Literal["model", "trackpy"] | None:
+def read_refine(text: str) -> Literal["model", "trackpy"] | None:
     """Read model, trackpy or none."""
     if text not in ("model", "trackpy", "none"):
         raise ValueError(f"--refine: expected model, trackpy or none, got {text!r}")
     return None if text == "none" else cast('Literal["model", "trackpy"]', text)
 
 
-def _columns(text: str | None) -> dict[str, str | int] | None:
+def read_columns(text: str | None) -> dict[str, str | int] | None:
     """Read name=column pairs; a column that is a whole number is a position."""
     if text is None:
         return None
@@ -194,13 +269,13 @@ def _columns(text: str | None) -> dict[str, str | int] | None:
     return {name.strip(): place(column.strip()) for name, _, column in pairs}
 
 
-def _body(shape: str, *, radius: float | None, diameter: float | None) -> Cluster:
+def body_of(shape: str, *, radius: float | None, diameter: float | None) -> Cluster:
     """Return the named body of that radius, or of touching spheres of that diameter."""
     from perrin import Cluster
 
     faults = []
-    if shape not in _SHAPES:
-        faults.append(f"shape: expected {', '.join(_SHAPES)}, got {shape!r}")
+    if shape not in SHAPES:
+        faults.append(f"shape: expected {', '.join(SHAPES)}, got {shape!r}")
     if (radius is None) == (diameter is None):
         faults.append("expected either --radius or --diameter (touching spheres)")
     if faults:
@@ -211,7 +286,7 @@ def _body(shape: str, *, radius: float | None, diameter: float | None) -> Cluste
     return body
 
 
-def _slice(text: str | None) -> tuple[int | None, int | None] | None:
+def read_slice(text: str | None) -> tuple[int | None, int | None] | None:
     """Read A:B."""
     if text is None:
         return None

@@ -6,7 +6,7 @@ from math import isfinite
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable
     from pathlib import Path
 
     from rich.console import Console
@@ -19,13 +19,14 @@ if TYPE_CHECKING:
     from perrin.run.results import ClusterResult, Pooled, Report
 
 
-_SHOWN, _SHOWN_WARNINGS, _SHOWN_NOTES = 5, 20, 10
+_CLUSTERS_SHOWN, _WARNINGS_SHOWN, _NOTES_SHOWN = 5, 20, 10
 
 
-_UNEQUAL = 0.05  # below this probability of equal axes the tensor is worth a look
+# Values about the body's axes are shown below this probability of equal axes.
+_EQUAL_AXES = 0.05
 
 
-def _show_plan(plan: SamplingPlan) -> None:
+def show_plan(plan: SamplingPlan) -> None:
     """Print the plan as a short table, and its reasons."""
     from rich.box import SIMPLE_HEAD
     from rich.console import Console
@@ -55,33 +56,35 @@ def _show_plan(plan: SamplingPlan) -> None:
         console.print(f"- {escape(reason)}", soft_wrap=True)
 
 
-def _show(report: Report, output: Path, command: Callable[..., None]) -> None:
-    """Print the short tables, the warnings, the notes, and where the rest is."""
+def show_report(report: Report, output: Path, command: Callable[..., None]) -> None:
+    """Print the short tables, the warnings, the notes, and where the run is written."""
     from rich.console import Console
     from rich.markup import escape
 
     from perrin.run.results import perp_text
 
     console = Console(highlight=False)
-    for result in report.clusters[:_SHOWN]:
-        console.print(_cluster_table(result))
-        if result.tensor is not None and result.tensor.p_isotropic < _UNEQUAL:
+    for result in report.clusters[:_CLUSTERS_SHOWN]:
+        console.print(cluster_table(result))
+        if result.tensor is not None and result.tensor.p_isotropic < _EQUAL_AXES:
             axes = f"rotation about the body's axes: {result.tensor.summary}\n"
             console.print(escape(axes), soft_wrap=True)
-    if len(report.clusters) > _SHOWN:
-        console.print(f"and {len(report.clusters) - _SHOWN} more clusters in report.html\n")
+    if len(report.clusters) > _CLUSTERS_SHOWN:
+        console.print(
+            f"and {len(report.clusters) - _CLUSTERS_SHOWN} more clusters in report.html\n"
+        )
     if report.pooled is not None and len(report.clusters) > 1:
-        console.print(_pooled_table(report.pooled))
-    for rod in report.rods[:_SHOWN]:
+        console.print(pooled_table(report.pooled))
+    for rod in report.rods[:_CLUSTERS_SHOWN]:
         console.print(escape(perp_text(rod)))
         if rod.prediction is not None:
             console.print(escape(f"  {rod.prediction}"), soft_wrap=True)
-    _show_remarks(report, command, console)
+    show_remarks(report, command, console)
     pages = "report.html" if report.imaging is None else "report.html, quality.html"
     console.print(f"Written to {escape(str(output))}: {pages}, figures, summary.json, tables.")
 
 
-def _show_remarks(report: Report, command: Callable[..., None], console: Console) -> None:
+def show_remarks(report: Report, command: Callable[..., None], console: Console) -> None:
     """Print the warnings, then the notes, with those of several clusters in one line."""
     from rich.markup import escape
 
@@ -97,18 +100,18 @@ def _show_remarks(report: Report, command: Callable[..., None], console: Console
         *condensed(report.notes),
         *merged({result.name: result.notes for result in report.results}),
     ]
-    for text in warnings[:_SHOWN_WARNINGS]:
+    for text in warnings[:_WARNINGS_SHOWN]:
         shown = escape(in_options(text, options))
         console.print(f"[bold yellow]! warning:[/] {shown}", soft_wrap=True)
-    if len(warnings) > _SHOWN_WARNINGS:
-        console.print(f"and {len(warnings) - _SHOWN_WARNINGS} more warnings in summary.json")
-    for text in notes[:_SHOWN_NOTES]:
+    if len(warnings) > _WARNINGS_SHOWN:
+        console.print(f"and {len(warnings) - _WARNINGS_SHOWN} more warnings in summary.json")
+    for text in notes[:_NOTES_SHOWN]:
         console.print(f"[dim]note: {escape(in_options(text, options))}[/]", soft_wrap=True)
-    if len(notes) > _SHOWN_NOTES:
-        console.print(f"[dim]and {len(notes) - _SHOWN_NOTES} more notes in summary.json[/]")
+    if len(notes) > _NOTES_SHOWN:
+        console.print(f"[dim]and {len(notes) - _NOTES_SHOWN} more notes in summary.json[/]")
 
 
-def _cluster_table(result: ClusterResult) -> Table:
+def cluster_table(result: ClusterResult) -> Table:
     """Return the short table of one cluster: coefficients, noise, sizes."""
     from rich.box import SIMPLE_HEAD
     from rich.markup import escape
@@ -126,49 +129,36 @@ def _cluster_table(result: ClusterResult) -> Table:
     table.add_row("Phi^2 (rad^2)", f"{result.noise.phi2:.3g}", "predicted noise floor")
     measured = with_error(result.phi2_measured, result.phi2_stderr)
     table.add_row("", measured, "measured noise floor")
-    for row in (*_size_rows(result), *_prediction_rows(result)):
-        table.add_row(*row)
+    sizes, prediction = result.sizes or {}, result.prediction
+    for mode, name in (("translation", "D_T"), ("rotation", "D_R"), ("both", "both")):
+        if mode in sizes:
+            size = sizes[mode]
+            table.add_row(f"sphere*, {name} (um)", with_error(size.sphere, size.sphere_stderr))
+            if size.viscosity is not None and size.viscosity_stderr is not None:
+                shown = with_error(1e3 * size.viscosity, 1e3 * size.viscosity_stderr)
+                table.add_row("viscosity (mPa s)", shown, "from both")
+    if prediction is not None:
+        for name, compared, axes in (
+            ("D_R", prediction.D_R, prediction.principal_D_R),
+            ("D_T", prediction.D_T, prediction.principal_D_T),
+        ):
+            if compared is not None:
+                shown = f"{compared.predicted:.4g}"
+                table.add_row(f"{name}, predicted", shown, _pull_text(compared))
+            for k, one in enumerate(axes, start=1):
+                shown = f"measured {one.measured:.3g}"
+                table.add_row(f"  axis {k}", f"{one.predicted:.4g}", _pull_text(one), shown)
     if result.sizes:
         table.caption = "* diameter, for equal spheres at the measured places"
         table.caption_justify = "left"
     return table
 
 
-def _size_rows(result: ClusterResult) -> Iterator[tuple[str, ...]]:
-    """Yield a line for each size, and the viscosity that both coefficients imply."""
-    from perrin._text import with_error
-
-    sizes = result.sizes or {}
-    for mode, name in (("translation", "D_T"), ("rotation", "D_R"), ("both", "both")):
-        if mode in sizes:
-            size = sizes[mode]
-            yield f"sphere*, {name} (um)", with_error(size.sphere, size.sphere_stderr)
-            if size.viscosity is not None and size.viscosity_stderr is not None:
-                shown = with_error(1e3 * size.viscosity, 1e3 * size.viscosity_stderr)
-                yield "viscosity (mPa s)", shown, "from both"
-
-
-def _prediction_rows(result: ClusterResult) -> Iterator[tuple[str, ...]]:
-    """Yield a line for each predicted coefficient: value, and the measured one's pull."""
-    prediction = result.prediction
-    if prediction is None:
-        return
-    for name, compared, axes in (
-        ("D_R", prediction.D_R, prediction.principal_D_R),
-        ("D_T", prediction.D_T, prediction.principal_D_T),
-    ):
-        if compared is not None:
-            yield f"{name}, predicted", f"{compared.predicted:.4g}", _pull_text(compared)
-        for k, one in enumerate(axes, start=1):
-            measured = f"measured {one.measured:.3g}"
-            yield f"  axis {k}", f"{one.predicted:.4g}", _pull_text(one), measured
-
-
 def _pull_text(compared: Compared) -> str:
     return f"pull {compared.pull:+.1f}" if isfinite(compared.pull) else "not resolved"
 
 
-def _show_prediction(body: Mobility, *, name: str) -> None:
+def show_prediction(body: Mobility, *, name: str) -> None:
     """Print the short table of a prediction."""
     from rich.box import SIMPLE_HEAD
     from rich.console import Console
@@ -205,7 +195,7 @@ def _show_prediction(body: Mobility, *, name: str) -> None:
     Console(highlight=False).print(table)
 
 
-def _pooled_table(pooled: Pooled) -> Table:
+def pooled_table(pooled: Pooled) -> Table:
     """Return the table of the values pooled over clusters."""
     from rich.box import SIMPLE_HEAD
     from rich.table import Table

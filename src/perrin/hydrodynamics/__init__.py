@@ -24,8 +24,6 @@ from perrin.hydrodynamics.sizes import (
     size_and_viscosity,
     size_from_rotation,
     size_from_translation,
-    sizes_from_dict,
-    sizes_to_dict,
 )
 from perrin.hydrodynamics.surroundings import (
     WallFactor,
@@ -59,8 +57,6 @@ __all__ = [
     "size_and_viscosity",
     "size_from_rotation",
     "size_from_translation",
-    "sizes_from_dict",
-    "sizes_to_dict",
     "solid_harmonics",
     "solve_resistance",
     "viscosity_remarks",

@@ -23,10 +23,6 @@ if TYPE_CHECKING:
     from perrin._arrays import Floats
 
 
-# Coefficients that determine a size, and the ending of its keys in the summary.
-_SIZE_KEYS = {"translation": "T", "rotation": "R", "both": "TR"}
-
-
 # Units of the numbers of a `Size`, as they end its keys in JSON.
 _SIZE_UNITS = {
     **dict.fromkeys(("cluster", "cluster_stderr", "sphere", "sphere_stderr"), "_um"),
@@ -415,64 +411,3 @@ def neighbour_distance(positions: Floats) -> float:
     if not len(distance) or distance.min() == 0:
         return 1.0  # coincident spheres are refused by `cluster_mobility`
     return float(distance[distance < _NEIGHBOUR_RATIO * distance.min()].mean())
-
-
-def sizes_to_dict(sizes: Mapping[str, Size]) -> dict[str, Any]:
-    """Return the sizes of one cluster for JSON, as summary.json has them.
-
-    Parameters
-    ----------
-    sizes : mapping
-        By "translation", "rotation" and "both".
-
-    Returns
-    -------
-    dict
-        Values and standard errors, um and Pa s; None for sizes that were not determined.
-
-    Examples
-    --------
-    >>> sizes_to_dict({})["sphere_T"] is None
-    True
-    """
-    entry: dict[str, Any] = {}
-    for mode, letters in _SIZE_KEYS.items():
-        size = sizes.get(mode)
-        for name in ("sphere", "cluster"):
-            entry[f"{name}_{letters}"] = size and {
-                "value": getattr(size, name),
-                "stderr": getattr(size, f"{name}_stderr"),
-            }
-    both = sizes.get("both")
-    entry["viscosity_TR"] = both and {"value": both.viscosity, "stderr": both.viscosity_stderr}
-    return entry
-
-
-def sizes_from_dict(entry: Mapping[str, Any]) -> dict[str, Size]:
-    """Return the sizes that `sizes_to_dict` wrote.
-
-    Parameters
-    ----------
-    entry : mapping
-        With ``sizes`` from `sizes_to_dict`, and ``size_factor``.
-
-    Examples
-    --------
-    >>> sizes_from_dict({"sizes": sizes_to_dict({}), "size_factor": None})
-    {}
-    """
-    found = {}
-    for mode, letters in _SIZE_KEYS.items():
-        sphere, cluster = (entry["sizes"][f"{name}_{letters}"] for name in ("sphere", "cluster"))
-        viscosity = entry["sizes"]["viscosity_TR"] if mode == "both" else None
-        if sphere is not None:
-            found[mode] = Size(
-                cluster=cluster["value"],
-                cluster_stderr=cluster["stderr"],
-                sphere=sphere["value"],
-                sphere_stderr=sphere["stderr"],
-                factor=entry["size_factor"],
-                viscosity=viscosity and viscosity["value"],
-                viscosity_stderr=viscosity and viscosity["stderr"],
-            )
-    return found

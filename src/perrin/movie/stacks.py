@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import inspect
 import shutil
-import tempfile
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -13,8 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypedDict
 import numpy as np
 
 import perrin.movie.checks as checks
-from perrin._arrays import finite_or_none, number_fault, refuse
-from perrin.diffusion.noise_model import Noise
+from perrin._arrays import finite_or_none, number_fault, options_from, refuse, refuse_unknown
 from perrin.errors import IdentityError, PartsError, TooFewFramesError
 from perrin.images.imaging import Imaging, View
 from perrin.images.spheres.localisation import NO_FLAT_MODEL, Search, check_search, is_flat
@@ -23,7 +21,7 @@ from perrin.images.stack import digest
 from perrin.movie.bodies import Bodies, find_bodies, stated_errors, tracks_of
 from perrin.movie.stages import Located, fit_poses, locate_frames
 from perrin.movie.workers import Work, check_workers
-from perrin.run.experiment import Conditions, Experiment, check_arguments, told_conditions
+from perrin.run.experiment import Experiment, Recording, merged_experiment
 from perrin.run.measure import measure_table
 from perrin.tracks.clock import Clock, evenly_spaced
 
@@ -77,10 +75,7 @@ class Settings(TypedDict, total=False):
 
 
 # Keywords that belong to the fields of each object.
-_SPOTS_NAMES = ("dark", "minmass", "percentile", "border")
-_NOISE_NAMES = ("noise", "exposure", "drift")
-_EXPERIMENT_NAMES = ("keep_jumps", "viscosity", "temperature")
-_WORK_NAMES = ("keep", "anew", "workers", "scheduler", "progress")
+_EXPERIMENT_KEYWORDS = ("noise", "exposure", "drift", "keep_jumps", "viscosity", "temperature")
 
 
 def analyze_stack(
@@ -170,7 +165,12 @@ def analyze_stack(
     """
     if len(stack) < 2:
         raise TooFewFramesError("one frame shows no motion: two or more are needed", len(stack))
-    spots, experiment, work, faults = _options(spots, experiment, work, settings)
+    known = [*inspect.signature(analyze_stack).parameters, *Settings.__annotations__]
+    refuse_unknown("analyze_stack", settings, known)
+    faults: list[str] = []
+    spots = options_from(Spots, spots, settings, name="spots", faults=faults)
+    work = options_from(Work, work, settings, name="work", faults=faults)
+    experiment = _stack_experiment(stack, experiment, settings, contact, faults)
     search = Search(
         diameter=diameter,
         contact=contact,
@@ -180,8 +180,7 @@ def analyze_stack(
         border=spots.border,
         crowds=True,  # clusters that meet may be a crowd for some frames
     )
-    conditions, wrong = _conditions(stack, experiment, contact)
-    faults += _faults_of(check_search, stack, search, refine, optics=optics) + wrong
+    faults += _faults_of(check_search, stack, search, refine, optics=optics)
     if size is not None:
         number: Any = size
         if isinstance(number, float) and number.is_integer():
@@ -195,6 +194,8 @@ def analyze_stack(
     numbers, excluded = _selected_frames(len(stack), frames), sorted({int(c) for c in exclude})
     work.report(0, 0, "taking the file's SHA-256")
     depends = _dependencies(stack, search, refine, optics, numbers)
+    import tempfile
+
     with (
         nullcontext(work.keep)
         if work.keep is not None
@@ -207,9 +208,10 @@ def analyze_stack(
         poses = _PoseFits(stack, method.optics, bodies, contact, folder / _POSED, work)
         report = measure_table(
             tracks_of(bodies, exclude=excluded),
-            replace(conditions, sigma_ratio=stated_errors(bodies)),
+            experiment,
+            recording=Recording(stack.dt, _uneven_clock(stack), stated_errors(bodies)),
             source={"path": stack.source if stack.path else None, "sha256": depends["sha256"]},
-            arguments=told_conditions(conditions)
+            arguments=experiment.to_dict()
             | {k: v for k, v in depends.items() if k not in ("sha256", "versions")}
             | {"size": bodies.size, "exclude": excluded},
             improved=poses.improved,
@@ -218,91 +220,38 @@ def analyze_stack(
     return _with_checks(report, stack, located, bodies, search, findings)
 
 
-def _options(
-    spots: Spots | None, experiment: Experiment | None, work: Work | None, settings: Settings
-) -> tuple[Spots, Experiment, Work, list[str]]:
-    """Return the options objects with the keywords in them, and the faults of both.
-
-    Raises
-    ------
-    TypeError
-        For an unknown keyword.
-    """
-    given: dict[str, Any] = dict(settings)
-    for name in given:
-        if name not in Settings.__annotations__:
-            from difflib import get_close_matches
-
-            known = [*inspect.signature(analyze_stack).parameters, *Settings.__annotations__]
-            nearest = get_close_matches(name, known, n=1, cutoff=0.0)[0]
-            raise TypeError(
-                f"analyze_stack() got an unexpected keyword argument {name!r}; the nearest one is "
-                f"{nearest!r}"
-            )
-    faults: list[str] = []
-
-    def fields(names: Sequence[str], owner: str, option: object) -> dict[str, Any]:
-        found = {name: given[name] for name in names if name in given}
-        if option is not None and found:
-            faults.append(
-                f"{', '.join(found)}: given as a keyword and in {owner}; use only one of them"
-            )
-            return {}
-        return found
-
-    def made(kind: Callable[..., Any], named: Mapping[str, Any]) -> Any:  # noqa: ANN401
-        try:
-            return kind(**named)
-        except ValueError as fault:
-            faults.append(str(fault))
-            return kind()
-
-    spots_fields = fields(_SPOTS_NAMES, "spots", spots)
-    noise_fields = fields(_NOISE_NAMES, "experiment", experiment)
-    if "noise" in noise_fields:
-        noise_fields["model"] = noise_fields.pop("noise")
-    experiment_fields = fields(_EXPERIMENT_NAMES, "experiment", experiment)
-    work_fields = fields(_WORK_NAMES, "work", work)
-    spots = spots if spots is not None else made(Spots, spots_fields)
-    if experiment is None:
-        experiment_fields["noise"] = made(Noise, noise_fields)
-        experiment = made(Experiment, experiment_fields)
-    work = work if work is not None else made(Work, work_fields)
-    return spots, experiment, work, faults
-
-
-def _conditions(
-    stack: Stack, experiment: Experiment, contact: float
-) -> tuple[Conditions, list[str]]:
-    """Return the conditions of a stack's tracks, and the faults of the experiment."""
-    wrong = []
-    if experiment.dt is not None and experiment.dt != stack.dt:
-        wrong.append(f"experiment: dt is that of the stack, {stack.dt:g} s, got {experiment.dt!r}")
-    if experiment.sigma is not None:
-        wrong.append("experiment: sigma is computed from the images and cannot be stated")
-    if experiment.diameter is not None and experiment.diameter != contact:
-        wrong.append(
+def _stack_experiment(
+    stack: Stack,
+    experiment: Experiment | None,
+    settings: Settings,
+    contact: float,
+    faults: list[str],
+) -> Experiment:
+    """Return the experiment with the interval of the stack and the keywords; collect its faults."""
+    stated: dict[str, Any] = {k: v for k, v in settings.items() if k in _EXPERIMENT_KEYWORDS}
+    try:
+        known = merged_experiment(experiment, **stated)
+    except ValueError as fault:
+        faults.append(str(fault))
+        return Experiment(dt=stack.dt)
+    if known.dt is not None and known.dt != stack.dt:
+        faults.append(f"experiment: dt is that of the stack, {stack.dt:g} s, got {known.dt!r}")
+    if known.sigma is not None:
+        faults.append("experiment: sigma is computed from the images and cannot be stated")
+    if known.diameter is not None and known.diameter != contact:
+        faults.append(
             f"experiment: the diameter is the contact distance, {contact:g} um, got "
-            f"{experiment.diameter!r}"
+            f"{known.diameter!r}"
         )
-    viscosity, temperature = experiment.viscosity, experiment.temperature
-    wrong += _faults_of(check_arguments, dt=stack.dt, viscosity=viscosity, temperature=temperature)
-    conditions = Conditions(
-        dt=stack.dt,
-        sigma=None,
-        viscosity=viscosity,
-        temperature=temperature,
-        diameter=None if viscosity is None or temperature is None else contact,
-        noise=experiment.noise.model,
-        exposure=experiment.noise.exposure,
-        drift=experiment.noise.drift,
-        keep_jumps=experiment.keep_jumps,
-        times=_uneven_clock(stack),
-    )
-    return conditions, wrong
+    predicted = known.viscosity is not None and known.temperature is not None
+    try:
+        return replace(known, dt=stack.dt, sigma=None, diameter=contact if predicted else None)
+    except ValueError as fault:
+        faults.append(str(fault))
+        return known
 
 
-def _faults_of(check: Callable[..., None], *arguments: object, **named: object) -> list[str]:
+def _faults_of(check: Callable[..., object], *arguments: object, **named: object) -> list[str]:
     try:
         check(*arguments, **named)
     except ValueError as fault:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 from zlib import crc32
@@ -10,6 +9,7 @@ from zlib import crc32
 import numpy as np
 
 from perrin.plot.style import new_figure, save_figure
+from perrin.run.folders import write_json
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -178,8 +178,7 @@ def write_claims(items: Sequence[Item], folder: Path, *, heading: str) -> None:
         First lines of ``claims.md``.
     """
     claims = [claim.to_dict() for item in items for claim in item.claims]
-    text = json.dumps(claims, indent=2, allow_nan=False, ensure_ascii=False)
-    (folder / "claims.json").write_text(text + "\n", encoding="utf-8")
+    write_json(folder / "claims.json", claims)
     (folder / "claims.md").write_text(claims_page(items, heading=heading), encoding="utf-8")
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from typing import TYPE_CHECKING
 
 from perrin import __version__
@@ -11,7 +10,7 @@ from perrin.paper.experiment import conclusion, figure_5, table_1
 from perrin.paper.method import challis, figure_1, localisation, product, simulation
 from perrin.paper.noise import bodies, constancy, figure_3, figure_4, sampling
 from perrin.paper.orientations import appendix, axes, correlation, figure_2, figure_6
-from perrin.run.folders import staged_folder
+from perrin.run.folders import staged_folder, write_json
 
 if TYPE_CHECKING:
     import os
@@ -82,5 +81,5 @@ def reproduce(
         write_claims(items, stage, heading=_HEADING)
         settings = {"made": "paper", "perrin": __version__, "seed": seed,
                     "planted_error": planted_error}  # fmt: skip
-        (stage / "run.json").write_text(json.dumps(settings, indent=2) + "\n", encoding="utf-8")
+        write_json(stage / "run.json", settings)
     return tuple(claim for item in items for claim in item.claims)

@@ -1,126 +1,234 @@
-"""What is known about an experiment beside its positions."""
+"""What the user knows of an experiment, and what the recording of a table adds."""
 
 from __future__ import annotations
 
-import warnings as python_warnings
-from dataclasses import asdict, dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Literal
+from dataclasses import MISSING, dataclass, field, fields
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from perrin.diffusion.estimators import estimate_diffusion
+from perrin._arrays import refuse
 from perrin.diffusion.noise_model import Noise
-from perrin.errors import PrecisionWarning
-from perrin.hydrodynamics.mobility import Mobility, condition_faults
-from perrin.run.predictions import Body, Shape, find_sizes, solve_bodies
+from perrin.hydrodynamics.mobility import condition_faults
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from numpy.typing import ArrayLike
 
-    from perrin._arrays import Floats, Ints
-    from perrin.diffusion.estimate import DiffusionEstimate
-    from perrin.diffusion.steps import Quantity
-    from perrin.hydrodynamics.sizes import Size
-    from perrin.motion.rigid_motion import RigidMotion
+    from perrin._arrays import Bools, Floats, Ints
     from perrin.tracks.clock import Clock
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, kw_only=True)
 class Experiment:
-    """Known conditions of an experiment.
+    """What is known of an experiment besides the positions.
 
     Parameters
     ----------
     dt : float, optional
-        Time between frames, s.
-    sigma : array_like, optional
-        Known localisation error, um, one number or one per axis.
+        Time between successive frame numbers, s; None where a movie's file states it.
+    sigma : float or sequence of float, optional
+        Known localisation error, um, one number or one per axis: for the predicted noise floor and
+        the test of rigidity, not for the estimates.
     viscosity : float, optional
         Viscosity of the fluid, Pa s.
     temperature : float, optional
-        Temperature of the fluid, K.
+        Temperature of the fluid, K. With the viscosity, sizes follow from D_T and from D_R; alone
+        it gives the size and the viscosity that both coefficients imply together.
     diameter : float, optional
-        Sphere diameter, um.
+        Sphere diameter, um, from which D_T and D_R are predicted.
     noise : Noise
-        Assumptions on the measurement noise.
+        What the estimates assume of the measurement noise, the exposure and a drift.
     keep_jumps : bool
-        Include steps in the estimates that Brownian motion cannot make.
+        Whether steps that Brownian motion cannot make stay in the estimates.
+
+    Raises
+    ------
+    ValueError
+        If values are out of range or incomplete; all faults in one message.
+
+    Examples
+    --------
+    >>> from perrin.diffusion.noise_model import Noise
+    >>> experiment = Experiment(dt=0.73, sigma=[0.03, 0.03, 0.04], noise=Noise(exposure=0.5))
+    >>> experiment.sigma, experiment.noise.exposure
+    ((0.03, 0.03, 0.04), 0.5)
     """
 
     dt: float | None = None
-    sigma: ArrayLike | None = None
+    sigma: float | tuple[float, ...] | None = None
     viscosity: float | None = None
     temperature: float | None = None
     diameter: float | None = None
     noise: Noise = field(default_factory=Noise)
     keep_jumps: bool = False
 
+    def __post_init__(self) -> None:
+        faults = argument_faults(
+            dt=self.dt,
+            viscosity=self.viscosity,
+            temperature=self.temperature,
+            diameter=self.diameter,
+        )
+        if not isinstance(self.noise, Noise):
+            faults.append(f"noise: expected Noise(...), got {self.noise!r}")
+        if self.sigma is not None:
+            try:
+                plain = np.asarray(self.sigma, dtype=np.float64)
+            except (TypeError, ValueError):
+                plain = np.array([[np.nan]])
+            if plain.ndim > 1 or not (np.isfinite(plain) & (plain >= 0)).all():
+                faults.append(
+                    "sigma: expected one number >= 0 or one per axis, in um, got "
+                    f"{np.asarray(self.sigma).tolist()!r}"
+                )
+            given = plain.tolist()
+            object.__setattr__(self, "sigma", tuple(given) if plain.ndim else given)
+        refuse(faults)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the experiment as ``run.json`` keeps it, the parts of the noise among the others.
+
+        Examples
+        --------
+        >>> entry = Experiment(dt=0.5).to_dict()
+        >>> entry["dt"], entry["noise"], entry["drift"]
+        (0.5, 'joint', False)
+        """
+        return {
+            "dt": self.dt,
+            "sigma": list(self.sigma) if isinstance(self.sigma, tuple) else self.sigma,
+            "viscosity": self.viscosity,
+            "temperature": self.temperature,
+            "diameter": self.diameter,
+            "noise": self.noise.model,
+            "exposure": self.noise.exposure,
+            "drift": self.noise.drift,
+            "keep_jumps": self.keep_jumps,
+        }
+
+    @classmethod
+    def from_dict(cls, entry: Mapping[str, Any]) -> Experiment:
+        """Read back what `to_dict` wrote; further keys of ``run.json`` are ignored."""
+        own = {one.name: entry[one.name] for one in fields(cls) if one.name != "noise"}
+        noise = Noise(entry["noise"], exposure=entry["exposure"], drift=entry["drift"])
+        return cls(**own, noise=noise)
+
+
+def merged_experiment(experiment: Experiment | None, **given: Any) -> Experiment:  # noqa: ANN401
+    """Return one experiment from an `Experiment` and from arguments stated one by one.
+
+    Parameters
+    ----------
+    experiment : Experiment or None
+    **given
+        Values by the names of the fields, of `Noise` (``exposure``, ``drift``; ``noise`` is its
+        model) and of further lengths that must be positive (``contact``).
+
+    Returns
+    -------
+    Experiment
+        Every value is the one that is not its default.
+
+    Raises
+    ------
+    ValueError
+        If a value is stated both ways, or out of range; all faults in one message.
+
+    Examples
+    --------
+    >>> merged_experiment(Experiment(temperature=295.0), dt=0.73, noise="residual").noise.model
+    'residual'
+    >>> merged_experiment(Experiment(dt=0.5), dt=0.73)
+    Traceback (most recent call last):
+        ...
+    ValueError: dt: stated as dt=0.73 and in experiment (0.5); state it once
+    """
+    defaults = {f.name: f.default for f in fields(Experiment) if f.default is not MISSING}
+    defaults |= {"noise": "joint", "exposure": None, "drift": False}
+    known = defaults if experiment is None else experiment.to_dict()
+    faults, values = [], dict(known)
+    for name, value in given.items():
+        is_default = isinstance(value, str | bool) and value == defaults.get(name)
+        stated = value is not None and not is_default
+        if stated and name in known and known[name] != defaults[name]:
+            faults.append(
+                f"{name}: stated as {name}={value!r} and in experiment ({known[name]!r}); state it "
+                "once"
+            )
+        elif stated:
+            values[name] = value
+    lengths = {name: values.pop(name) for name in set(values) - set(defaults)}
+    faults += argument_faults(**lengths)
+    parts = {name: values.pop(name) for name in ("exposure", "drift")}
+    try:
+        noise = Noise(values.pop("noise"), **parts)
+    except ValueError as fault:
+        faults.append(str(fault))
+        noise = Noise()
+    try:
+        whole = Experiment(**values | {"noise": noise})
+    except ValueError as fault:
+        faults.insert(0, str(fault))
+    refuse(faults)
+    return whole
+
 
 @dataclass(frozen=True, eq=False)
-class Conditions:
-    """What the user knows of the experiment: see `analyze`."""
+class Recording:
+    """What a table or a movie states of its frames and axes.
+
+    Attributes
+    ----------
+    dt : float
+        Time between successive frame numbers, s.
+    times : Clock or None
+        Times of the frames where they are not `dt` apart.
+    sigma_ratio : array_like or None
+        Localisation errors of the axes over each other, where only their ratio is known.
+    first_frame : int
+        The table's own number of its first frame.
+    recorded : ndarray of int or None
+        Frames, counted from the first, that any row of the table has.
+    """
 
     dt: float
-    sigma: ArrayLike | None
-    viscosity: float | None
-    temperature: float | None
-    diameter: float | None
-    noise: Literal["joint", "residual"] | float
-    exposure: float | None
-    drift: bool
-    keep_jumps: bool = False
-    times: Clock | None = None  # where frames are not dt apart
-    sigma_ratio: ArrayLike | None = None  # of the axes, where that alone is known
-    first_frame: int = 0  # what the table calls its first frame
-    recorded: Ints | None = None  # the frames that any row of the table has
+    times: Clock | None = None
+    sigma_ratio: ArrayLike | None = None
+    first_frame: int = 0
+    recorded: Ints | None = None
 
     def clock(self, frames: Ints) -> Floats:
         """Return the times of frames, s."""
         return np.asarray(frames * self.dt if self.times is None else self.times.at(frames))
 
-    def estimate(
-        self, motion: RigidMotion | list[RigidMotion], quantity: Quantity
-    ) -> DiffusionEstimate:
-        """Estimate D_R or D_T; what has to be known of it goes into the report's own warnings."""
-        with python_warnings.catch_warnings():
-            python_warnings.simplefilter("ignore", PrecisionWarning)
-            return estimate_diffusion(
-                motion,
-                quantity=quantity,
-                noise=self.noise,
-                exposure=self.exposure,
-                drift=self.drift,
-            )
-
-    def bodies(self, shapes: list[Shape]) -> list[Body]:
-        """Solve for the flow around every shape; only for a stated temperature."""
-        # Without a viscosity the bodies give ratios of sizes only, in which it cancels.
-        assumed = {"viscosity": self.viscosity or 1e-3, "temperature": self.temperature or 300.0}
-        return solve_bodies(shapes, diameter=self.diameter, **assumed)
-
-    def sizes(
-        self, mobility: Mobility, *, D_T: DiffusionEstimate, D_R: DiffusionEstimate
-    ) -> dict[str, Size]:
-        """Return the sizes that the coefficients imply under these conditions."""
-        if self.temperature is None:
-            return {}
-        return find_sizes(
-            mobility, D_T=D_T, D_R=D_R, viscosity=self.viscosity, temperature=self.temperature
-        )
+    def has(self, frames: Ints) -> Bools:
+        """Return which frames any row of the table has."""
+        if self.recorded is None:
+            return np.ones(len(frames), dtype=np.bool_)
+        return np.isin(frames, self.recorded)
 
 
-def told_conditions(conditions: Conditions) -> dict[str, Any]:
-    """Return the conditions as run.json keeps them."""
-    entry = asdict(replace(conditions, times=None, sigma_ratio=None, recorded=None))
-    for name in ("times", "sigma_ratio", "first_frame", "recorded"):
-        del entry[name]
-    return entry | {"sigma": _plain(conditions.sigma)}
+def argument_faults(**given: float | None) -> list[str]:
+    """Return what is wrong with conditions of an experiment, one line each.
 
+    Parameters
+    ----------
+    **given
+        Numbers that must be positive, by name; None where they are not stated.
 
-def check_arguments(*, dt: float, **given: float | None) -> None:
-    """Refuse arguments out of range, all in one message."""
+    Returns
+    -------
+    list of str
+
+    Examples
+    --------
+    >>> argument_faults(dt=0.5, viscosity=1e-3, temperature=None)
+    ['sizes need both viscosity (Pa s) and temperature (K): the temperature is missing']
+    """
     known = {name: value for name, value in given.items() if value is not None}
-    faults = condition_faults(dt=dt, **known)
+    faults = condition_faults(**known)
     if "viscosity" in known and "temperature" not in known:
         faults.append(
             "sizes need both viscosity (Pa s) and temperature (K): the temperature is missing"
@@ -129,9 +237,4 @@ def check_arguments(*, dt: float, **given: float | None) -> None:
         faults.append(
             "diameter: a prediction needs the viscosity (Pa s) and the temperature (K) as well"
         )
-    if faults:
-        raise ValueError("; ".join(faults))
-
-
-def _plain(given: ArrayLike | None) -> Any:  # noqa: ANN401 (whatever JSON holds)
-    return None if given is None else np.asarray(given, dtype=np.float64).tolist()
+    return faults

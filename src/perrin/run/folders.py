@@ -1,7 +1,8 @@
-"""Run folders: written beside their place and renamed, or resumed."""
+"""Run folders and their JSON files: written whole, or resumed."""
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 from contextlib import contextmanager
@@ -14,14 +15,26 @@ if TYPE_CHECKING:
 
 @contextmanager
 def staged_folder(folder: str | os.PathLike[str], *, overwrite: bool = False) -> Iterator[Path]:
-    """Give a folder to write into that takes its place, whole, when all has been written.
+    """Give a folder to write into, which is renamed to `folder` when all has been written.
+
+    Parameters
+    ----------
+    folder : path
+        Where the files are to appear.
+    overwrite : bool
+        Replace an existing run folder.
+
+    Yields
+    ------
+    Path
+        A new folder beside it; it is removed if the writing fails.
 
     Raises
     ------
     FileExistsError
-        If the place is taken and `overwrite` is not set, or what stands there is no run folder.
+        If the folder exists and `overwrite` is not set, or is no run folder.
     OSError
-        If the place cannot be written.
+        If the folder cannot be written.
     """
     place = Path(folder)
     check_place(place, overwrite=overwrite)
@@ -43,18 +56,29 @@ def staged_folder(folder: str | os.PathLike[str], *, overwrite: bool = False) ->
 
 @contextmanager
 def filled_folder(folder: str | os.PathLike[str]) -> Iterator[Path]:
-    """Give a folder to write into, whose files then go into an unfinished run folder.
+    """Give a folder to write into, whose files are then moved into an unfinished run folder.
 
-    ``run.json`` goes last and makes the folder a finished one; what else stands there stays.
+    ``run.json`` is moved last and makes the folder a finished one; other files of the folder are
+    kept.
+
+    Parameters
+    ----------
+    folder : path
+        The run folder.
+
+    Yields
+    ------
+    Path
+        A new folder inside it; it is removed if the writing fails.
 
     Raises
     ------
     OSError
-        If the place cannot be written.
+        If the folder cannot be written.
     """
     place = Path(folder)
     place.mkdir(parents=True, exist_ok=True)
-    for left in place.glob(".*.part"):  # by one that was killed
+    for left in place.glob(".*.part"):  # by a process that was stopped
         shutil.rmtree(left)
     stage = place / f".{os.getpid()}.part"
     stage.mkdir()
@@ -77,9 +101,9 @@ def check_resumable(folder: str | os.PathLike[str], *, parts: str, overwrite: bo
     ----------
     folder : path
     parts : str
-        The folder inside that an unfinished run has.
+        Name of the folder inside that an unfinished run has.
     overwrite : bool
-        A finished one will do as well.
+        Accept a finished run as well.
 
     Raises
     ------
@@ -94,7 +118,7 @@ def check_resumable(folder: str | os.PathLike[str], *, parts: str, overwrite: bo
 
 
 def check_place(folder: str | os.PathLike[str], *, overwrite: bool = False) -> None:
-    """Refuse, before any work is done, an output folder that stands already.
+    """Refuse, before any work is done, an output folder that exists or cannot be made.
 
     Raises
     ------
@@ -111,3 +135,15 @@ def check_place(folder: str | os.PathLike[str], *, overwrite: bool = False) -> N
         raise FileExistsError(f"{place} exists: choose another folder, or overwrite=True")
     if not place.is_dir() or (any(place.iterdir()) and not (place / "run.json").is_file()):
         raise FileExistsError(f"{place} is no run folder of perrin (no run.json): not overwritten")
+
+
+def write_json(path: Path, content: object) -> None:
+    """Write a file of JSON in UTF-8, indented, in which no number is infinite or missing.
+
+    Raises
+    ------
+    ValueError
+        If a number is not finite.
+    """
+    text = json.dumps(content, indent=2, allow_nan=False, ensure_ascii=False)
+    path.write_text(text + "\n", encoding="utf-8")

@@ -1,4 +1,4 @@
-"""What a cluster's shape implies: sizes from its D, and the D that spheres of a known size have."""
+"""Sizes that follow from measured coefficients, and coefficients predicted for known spheres."""
 
 from __future__ import annotations
 
@@ -8,10 +8,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from perrin._arrays import finite_or_none
 from perrin.diffusion.tensors import axes_like
 from perrin.errors import PrecisionWarning, UnitWarning
+from perrin.geometry.shapes import pair_distances
 from perrin.geometry.symmetry import matching_rotation
-from perrin.hydrodynamics.mobility import Mobility, Principal, cluster_mobility
+from perrin.hydrodynamics.mobility import Mobility, cluster_mobility
 from perrin.hydrodynamics.sizes import (
     Size,
     neighbour_distance,
@@ -19,46 +21,48 @@ from perrin.hydrodynamics.sizes import (
     size_from_rotation,
     size_from_translation,
 )
+from perrin.run.remarks import flow_warnings, unfit_diameter_text
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from perrin._arrays import Floats, Ints
+    from perrin._arrays import Floats
     from perrin.diffusion.estimate import DiffusionEstimate
     from perrin.diffusion.tensor_results import DiffusionTensor
 
 
-# Shapes are alike if particles differ by less than this many standard errors; one in 10^5 is missed
-# and costs a solution, nothing else.
-_ALIKE = 5.0
+# Two shapes are the same if particles differ by less than this number of standard errors. One pair
+# in 10^5 is missed, which costs a further solution and changes no result.
+_SHAPE_ERRORS = 5.0
 
 
-# Distances (relative) that no diffusion coefficient can tell apart, for tables without noise.
-_SAME = 1e-4
+# Relative differences of distances that no diffusion coefficient shows, for tables without noise.
+_SHAPE_ROUNDING = 1e-4
 
 
-# Principal values closer than this (relative) cannot be told apart in a track of 10^4 frames.
-_UNEQUAL = 0.02
+# Principal values closer than this (relative) cannot be distinguished in a track of 10^4 frames.
+_UNEQUAL_AXES = 0.02
 
 
-# Spheres that would overlap, or stand apart, by more than the spread of any batch of particles.
-_OVERLAP, _APART = 1.1, 1.5
+# A diameter over this multiple of the distance of neighbours, or under the distance by this factor,
+# is farther off than the spread of any batch of particles.
+_OVERLAPPING, _SEPARATE = 1.1, 1.5
 
 
-# From here on a diameter is no property of these particles but a wrong unit.
-_ABSURD = 2.0
+# A diameter over this multiple of the distance of neighbours is in another unit.
+_IMPOSSIBLE = 2.0
 
 
 @dataclass(frozen=True)
 class Compared:
-    """A predicted coefficient beside the measured one.
+    """A predicted coefficient and the measured one.
 
     Attributes
     ----------
     predicted, measured : float
-        um^2/s or rad^2/s.
+        Predicted and measured coefficient, um^2/s or rad^2/s.
     stderr : float
-        Standard error of the measured value; NaN where that is an upper limit only.
+        Standard error of the measured coefficient; NaN where that is an upper limit only.
 
     Examples
     --------
@@ -80,7 +84,7 @@ class Compared:
     def to_dict(self) -> dict[str, float | None]:
         """Return the four numbers for JSON, None for the unknown."""
         numbers = asdict(self) | {"pull": self.pull}
-        return {name: x if np.isfinite(x) else None for name, x in numbers.items()}
+        return {name: finite_or_none(x) for name, x in numbers.items()}
 
     @classmethod
     def from_dict(cls, entry: dict[str, float | None]) -> Compared:
@@ -96,19 +100,20 @@ class Prediction:
     Attributes
     ----------
     diameter : float
-        Of one sphere, as stated, um.
+        Stated sphere diameter, um.
     error : float
-        Relative error of the predicted values for exactly this body and these conditions. Errors of
-        diameter, viscosity and temperature are in no pull.
+        Relative numerical error of the predicted values. The pulls contain no errors of the
+        diameter, the viscosity and the temperature.
     D_T : Compared
-        A third of the trace, about the centre of diffusion, in an unbounded fluid.
+        Translational coefficient: a third of the trace, about the centre of diffusion, in an
+        unbounded fluid.
     D_R : Compared or None
-        A third of the trace; None for a rod.
+        Rotational coefficient: a third of the trace; None for a rod.
     D_perp : Compared or None
-        Of a rod's direction; None for a body.
+        Coefficient of a rod's direction; None for a body.
     principal_D_T, principal_D_R : tuple of Compared
-        Predicted principal values, rising, and what was measured along their axes; empty where the
-        body is nearly isotropic or no tensor was measured.
+        Predicted principal values, rising, and the values measured along their axes; empty where
+        the body is nearly isotropic or no tensor was measured.
     """
 
     diameter: float
@@ -121,8 +126,8 @@ class Prediction:
 
     def __str__(self) -> str:
         pairs = (("D_T", self.D_T), ("D_R", self.D_R), ("D_perp", self.D_perp))
-        told = (f"{name} {c.predicted:.4g} (pull {c.pull:+.1f})" for name, c in pairs if c)
-        return f"predicted for spheres of {self.diameter:.4g} um: {', '.join(told)}"
+        shown = (f"{name} {c.predicted:.4g} (pull {c.pull:+.1f})" for name, c in pairs if c)
+        return f"predicted for spheres of {self.diameter:.4g} um: {', '.join(shown)}"
 
     def to_dict(self) -> dict[str, Any]:
         """Return the prediction for JSON."""
@@ -146,72 +151,84 @@ class Prediction:
 
 
 class Shape(NamedTuple):
-    """Places (n, d) of the particles of a body, um, and the standard error of a coordinate."""
+    """Places of the particles of a body.
+
+    Attributes
+    ----------
+    positions : ndarray, shape (n, d)
+        Particle positions in body axes, um.
+    error : float
+        Standard error of one coordinate, um.
+    """
 
     positions: Floats
     error: float
 
 
 @dataclass(frozen=True, eq=False)
-class Body:
-    """How spheres at a shape's places move, or the reason why that is not known.
+class ShapeMobility:
+    """The mobility of spheres at the places of a shape, or the reason why it is not known.
 
     Attributes
     ----------
     mobility : Mobility or None
+        Mobility in the axes of the shape.
     reason : str
-        Why there is none.
-    told : tuple of str
-        What should be known of it.
+        Why there is no mobility; empty where there is one.
+    warnings : tuple of str
+        Sentences that speak against the mobility.
     """
 
     mobility: Mobility | None
     reason: str = ""
-    told: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
 
+    def turned_onto(self, shape: Shape, known: Shape) -> ShapeMobility | None:
+        """Return this solution of `known` in the axes of a shape that is the same within errors.
 
-class _Solved(NamedTuple):
-    """A shape with its sorted pair distances, and the body it makes."""
-
-    shape: Shape
-    distances: Floats
-    body: Body
-
-    def turned_onto(self, shape: Shape, distances: Floats) -> Body | None:
-        """Return the body in the axes of a shape that is alike within errors; None if it is not."""
-        if len(distances) != len(self.distances):
+        Returns None if the shapes differ.
+        """
+        if len(shape.positions) != len(known.positions):
             return None
-        error = float(np.hypot(shape.error, self.shape.error))
-        tolerance = max(_ALIKE * error, _SAME * float(distances.mean()))
-        # A quick look: two particles move a distance by twice the tolerance at most.
-        if np.abs(distances - self.distances).max() > 2 * tolerance:
+        distances, others = (np.sort(pair_distances(x.positions)) for x in (shape, known))
+        error = float(np.hypot(shape.error, known.error))
+        tolerance = max(_SHAPE_ERRORS * error, _SHAPE_ROUNDING * float(distances.mean()))
+        # Two particles change their distance by twice the tolerance at most.
+        if np.abs(distances - others).max() > 2 * tolerance:
             return None
-        if np.linalg.norm(shape.positions - self.shape.positions, axis=1).max() <= tolerance:
-            return self.body
-        if self.body.mobility is None or shape.positions.shape[1] != 3:
-            return self.body
-        turn = matching_rotation(self.shape.positions, shape.positions, tolerance=tolerance)
+        if np.linalg.norm(shape.positions - known.positions, axis=1).max() <= tolerance:
+            return self
+        if self.mobility is None or shape.positions.shape[1] != 3:
+            return self
+        turn = matching_rotation(known.positions, shape.positions, tolerance=tolerance)
         if turn is None:
             return None
-        return replace(self.body, mobility=_turned(self.body.mobility, turn))
+        both = np.kron(np.eye(2), turn)
+        turned = replace(
+            self.mobility,
+            D=both @ self.mobility.D @ both.T,
+            center=turn @ self.mobility.center,
+            centers=self.mobility.centers @ turn.T,
+        )
+        return replace(self, mobility=turned)
 
 
 def solve_bodies(
     shapes: Sequence[Shape], *, diameter: float | None, viscosity: float, temperature: float
-) -> list[Body]:
-    """Return a body for each shape; shapes alike within their errors share one solution.
+) -> list[ShapeMobility]:
+    """Return the mobility of each shape; shapes that are the same within errors are solved once.
 
     Parameters
     ----------
     shapes : sequence of Shape
     diameter : float or None
-        Of one sphere, um; None for spheres that touch.
+        Sphere diameter, um; None for spheres that touch.
     viscosity, temperature : float
-        Pa s, K.
+        Viscosity, Pa s, and temperature, K.
 
     Returns
     -------
-    list of Body
+    list of ShapeMobility
 
     Notes
     -----
@@ -227,17 +244,62 @@ def solve_bodies(
     >>> one.mobility.error == other.mobility.error, round(one.mobility.diameter_factor_R, 3)
     (True, 1.818)
     """
-    solved: list[_Solved] = []
-    bodies = []
+    solved: list[tuple[Shape, ShapeMobility]] = []
+    found = []
     for shape in shapes:
-        distances = _sorted_distances(shape.positions)
-        shared = (known.turned_onto(shape, distances) for known in solved)
+        shared = (solution.turned_onto(shape, known) for known, solution in solved)
         body = next((one for one in shared if one is not None), None)
         if body is None:
-            body = _solve(shape.positions, diameter, viscosity, temperature)
-            solved.append(_Solved(shape, distances, body))
-        bodies.append(body)
-    return bodies
+            body = solve_shape(
+                shape.positions, diameter=diameter, viscosity=viscosity, temperature=temperature
+            )
+            solved.append((shape, body))
+        found.append(body)
+    return found
+
+
+def solve_shape(
+    positions: Floats, *, diameter: float | None, viscosity: float, temperature: float
+) -> ShapeMobility:
+    """Solve for the flow around equal spheres at measured places.
+
+    Parameters
+    ----------
+    positions : ndarray, shape (n, d)
+        Particle positions in body axes, um.
+    diameter : float or None
+        Sphere diameter, um; None for spheres that touch.
+    viscosity, temperature : float
+        Viscosity, Pa s, and temperature, K.
+
+    Returns
+    -------
+    ShapeMobility
+        With the reason where the flow cannot be solved.
+    """
+    if positions.shape[1] != 3:
+        return ShapeMobility(None, "they follow from motion in three dimensions")
+    distance = neighbour_distance(positions)
+    ratio = 1.0 if diameter is None else diameter / distance
+    if diameter is not None and ratio > _IMPOSSIBLE:
+        return ShapeMobility(None, unfit_diameter_text(distance, diameter, impossible=True))
+    try:
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always", PrecisionWarning)
+            # A viscosity in another unit concerns the whole table, not each of its shapes.
+            warnings.simplefilter("ignore", UnitWarning)
+            mobility = cluster_mobility(
+                positions,
+                radius=ratio * distance / 2,
+                viscosity=viscosity,
+                temperature=temperature,
+            )
+    except (ValueError, np.linalg.LinAlgError) as error:
+        return ShapeMobility(None, f"cluster_mobility refuses this shape: {error}")
+    remarks = flow_warnings(w.message for w in caught)
+    if diameter is not None and (ratio > _OVERLAPPING or ratio < 1 / _SEPARATE):
+        remarks.append(unfit_diameter_text(distance, diameter, impossible=False))
+    return ShapeMobility(mobility, warnings=tuple(remarks))
 
 
 def find_sizes(
@@ -253,12 +315,12 @@ def find_sizes(
     Parameters
     ----------
     mobility : Mobility
-        Of the shape, at any size.
+        Mobility of the shape, at any size.
     D_T, D_R : DiffusionEstimate
     viscosity : float or None
-        Pa s.
+        Viscosity, Pa s.
     temperature : float
-        K.
+        Temperature, K.
 
     Returns
     -------
@@ -298,12 +360,12 @@ def compare_body(
     tensor_T: DiffusionTensor | None = None,
     tensor_R: DiffusionTensor | None = None,
 ) -> Prediction:
-    """Put what a mobility predicts beside what was measured on a body.
+    """Compare what a mobility predicts with what was measured on a body.
 
     Parameters
     ----------
     mobility : Mobility
-        In the axes of the motion's template.
+        Mobility in the axes of the motion's template.
     D_T, D_R : DiffusionEstimate
     tensor_T, tensor_R : DiffusionTensor, optional
 
@@ -316,26 +378,26 @@ def compare_body(
     # where its axes are known, else the one about which the body should turn slowest.
     known = tensor_R is not None and bool(tensor_R.resolved_axes.all())
     reference = tensor_R.axes if known and tensor_R is not None else R.axes
-    T, R = (_ordered(principal, axes_like(principal.axes, reference)) for principal in (T, R))
+    order_T, order_R = axes_like(T.axes, reference), axes_like(R.axes, reference)
     return Prediction(
         diameter=mobility.sphere_diameter,
         error=mobility.error,
-        D_T=_beside(float(T.values.mean()), D_T),
-        D_R=_beside(float(R.values.mean()), D_R),
-        principal_D_T=_principal(T, tensor_T),
-        principal_D_R=_principal(R, tensor_R),
+        D_T=compare_value(float(T.values[order_T].mean()), D_T),
+        D_R=compare_value(float(R.values[order_R].mean()), D_R),
+        principal_D_T=compare_axes(T.values[order_T], T.axes[:, order_T], tensor_T),
+        principal_D_R=compare_axes(R.values[order_R], R.axes[:, order_R], tensor_R),
     )
 
 
 def compare_rod(
     mobility: Mobility, *, D_T: DiffusionEstimate, D_perp: DiffusionEstimate
 ) -> Prediction:
-    """Put what a mobility predicts beside what was measured on a rod.
+    """Compare what a mobility predicts with what was measured on a rod.
 
     Parameters
     ----------
     mobility : Mobility
-        Of spheres on a line, which turn fastest about it.
+        Mobility of spheres on a line, which turn fastest about it.
     D_T, D_perp : DiffusionEstimate
 
     Returns
@@ -345,87 +407,49 @@ def compare_rod(
     return Prediction(
         diameter=mobility.sphere_diameter,
         error=mobility.error,
-        D_T=_beside(float(np.trace(mobility.D_T)) / 3, D_T),
-        D_perp=_beside(float(mobility.principal_D_R.values[:2].mean()), D_perp),
+        D_T=compare_value(float(np.trace(mobility.D_T)) / 3, D_T),
+        D_perp=compare_value(float(mobility.principal_D_R.values[:2].mean()), D_perp),
     )
 
 
-def are_unequal(principal_values: Floats) -> bool:
-    """Return whether principal values differ by more than any track could show."""
-    return bool(np.ptp(principal_values) > _UNEQUAL * principal_values.mean())
-
-
-def _beside(predicted: float, estimate: DiffusionEstimate) -> Compared:
+def compare_value(predicted: float, estimate: DiffusionEstimate) -> Compared:
+    """Compare a predicted coefficient with an estimate, whose upper limit has no error."""
     error = estimate.stderr if is_known(estimate) else float("nan")
     return Compared(predicted, estimate.value, error)
 
 
-def _ordered(principal: Principal, order: Ints) -> Principal:
-    return Principal(principal.values[order], principal.axes[:, order])
-
-
-def _principal(values: Principal, tensor: DiffusionTensor | None) -> tuple[Compared, ...]:
-    """Compare along the predicted axes where the body has unequal ones and a tensor was measured.
+def compare_axes(
+    predicted: Floats, axes: Floats, tensor: DiffusionTensor | None
+) -> tuple[Compared, ...]:
+    """Compare predicted principal values with a measured tensor along the predicted axes.
 
     Sorted measured values would be of other axes wherever errors exchange two of them.
+
+    Parameters
+    ----------
+    predicted : ndarray, shape (3,)
+        Predicted principal values.
+    axes : ndarray, shape (3, 3)
+        Their axes as columns, in body axes.
+    tensor : DiffusionTensor or None
+        The measured tensor.
+
+    Returns
+    -------
+    tuple of Compared
+        Empty where the body is nearly isotropic or no tensor was measured.
     """
-    if tensor is None or not are_unequal(values.values):
+    if tensor is None or not are_unequal(predicted):
         return ()
-    x, y, z = values.axes
-    # What the elements xx, yy, zz, xy, xz, yz weigh in a value along an axis.
+    x, y, z = axes
+    # Weights of the elements xx, yy, zz, xy, xz, yz in a value along an axis.
     weight = np.stack([x * x, y * y, z * z, 2 * x * y, 2 * x * z, 2 * y * z], axis=1)
-    measured = np.einsum("ik,ij,jk->k", values.axes, tensor.tensor, values.axes)
+    measured = np.einsum("ik,ij,jk->k", axes, tensor.tensor, axes)
     variance = np.einsum("ke,ef,kf->k", weight, tensor.covariance, weight)
-    rows = zip(values.values, measured, np.sqrt(variance), strict=True)
+    rows = zip(predicted, measured, np.sqrt(variance), strict=True)
     return tuple(Compared(*map(float, row)) for row in rows)
 
 
-def _turned(mobility: Mobility, rotation: Floats) -> Mobility:
-    """Return the same body turned about the origin."""
-    both = np.kron(np.eye(2), rotation)
-    return replace(
-        mobility,
-        D=both @ mobility.D @ both.T,
-        center=rotation @ mobility.center,
-        centers=mobility.centers @ rotation.T,
-    )
-
-
-def _sorted_distances(positions: Floats) -> Floats:
-    first, second = np.triu_indices(len(positions), 1)
-    return np.sort(np.linalg.norm(positions[first] - positions[second], axis=1))
-
-
-def _solve(positions: Floats, diameter: float | None, viscosity: float, temperature: float) -> Body:
-    """Solve for one shape; what cannot be solved, or not well, is told."""
-    if positions.shape[1] != 3:
-        return Body(None, "they follow from motion in three dimensions")
-    distance = neighbour_distance(positions)
-    ratio = 1.0 if diameter is None else diameter / distance
-    if ratio > _ABSURD:
-        return Body(
-            None,
-            f"neighbours are {distance:.3g} um apart, which spheres of {diameter:g} um cannot be; "
-            "correct the diameter (um) or the scale",
-        )
-    try:
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always", PrecisionWarning)
-            # A viscosity in another unit concerns the whole table, not each of its shapes.
-            warnings.simplefilter("ignore", UnitWarning)
-            mobility = cluster_mobility(
-                positions,
-                radius=ratio * distance / 2,
-                viscosity=viscosity,
-                temperature=temperature,
-            )
-    except (ValueError, np.linalg.LinAlgError) as error:
-        return Body(None, f"cluster_mobility refuses this shape: {error}")
-    told = [f"predicted flow: {w.message}" for w in caught]
-    if ratio > _OVERLAP or ratio < 1 / _APART:
-        would = "would overlap" if ratio > 1 else "do not touch"
-        told.append(
-            f"neighbours are {distance:.3g} um apart, where spheres of {diameter:g} um {would}; "
-            "check the diameter and the scale"
-        )
-    return Body(mobility, told=tuple(told))
+def are_unequal(principal_values: Floats) -> bool:
+    """Return whether principal values differ by more than 2 % of their mean."""
+    return bool(np.ptp(principal_values) > _UNEQUAL_AXES * principal_values.mean())

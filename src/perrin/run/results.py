@@ -1,4 +1,4 @@
-"""What a run found: the report, its clusters, and the folder that holds them."""
+"""The results of a run: the report, its clusters and rods, and the files that hold them."""
 
 from __future__ import annotations
 
@@ -16,19 +16,24 @@ from perrin.curves.displacement import LagCurve, msad, msd
 from perrin.diffusion.estimate import DiffusionEstimate, _estimate_dict, _estimate_from
 from perrin.diffusion.step_tests import without_spin
 from perrin.diffusion.tensor_results import DiffusionTensor, _tensor_dict, _tensor_from
-from perrin.hydrodynamics.sizes import Size, sizes_from_dict, sizes_to_dict
+from perrin.hydrodynamics.sizes import Size
 from perrin.images.imaging import Imaging, read_imaging, write_imaging
 from perrin.motion.floor import NoiseFloor, floor_of
 from perrin.motion.rigid_motion import RigidMotion
 from perrin.motion.rigidity import Quality
 from perrin.motion.rods import RodMotion
-from perrin.run.folders import staged_folder
+from perrin.run.folders import staged_folder, write_json
 from perrin.run.predictions import Prediction
 
 if TYPE_CHECKING:
     import os
+    from collections.abc import Mapping
 
     import pandas as pd
+
+
+# The coefficients that a size follows from, and the ends of its keys in ``summary.json``.
+_SIZE_ENDINGS = {"translation": "T", "rotation": "R", "both": "TR"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,28 +43,32 @@ class ClusterResult:
     Attributes
     ----------
     cluster : int
+        Cluster number.
     motion : RigidMotion
+        Fitted positions and orientations.
     D_R, D_T : DiffusionEstimate
+        Rotational and translational diffusion coefficient.
     tensor : DiffusionTensor or None
-        Of rotation, in body axes; None in the plane and where there are too few steps.
+        Rotational diffusion tensor in body axes; None in the plane and for too few steps.
     noise : NoiseFloor
-        Predicted from sigma and the shape.
+        Noise floor predicted from sigma and the shape.
     sizes : dict of Size or None
-        "translation" and "rotation", where the viscosity is known, and "both", with the viscosity
-        that both coefficients imply; of equal spheres of the measured shape. None without any.
+        Sizes "translation" and "rotation", where the viscosity is known, and "both", with the
+        viscosity that both coefficients imply, for equal spheres at the measured places. None
+        without any.
     warnings : tuple of str
-        What speaks against the numbers.
+        Sentences that speak against the numbers.
     label : str or None
-        The cluster's name in the table, where it is text.
+        Cluster name in the table, where it is text.
     quality : Quality or None
-        Rigidity, errors per axis, and what was repaired.
+        Rigidity, errors per axis, and what was corrected.
     prediction : Prediction or None
-        What spheres of the stated diameter would do; None if none was stated.
+        Coefficients predicted for spheres of the stated diameter; None if none was stated.
     notes : tuple of str
-        What informs: how the table was read, what was left out or corrected.
+        Sentences that inform: how the table was read, what was left out or corrected.
     jumps : dict of tuple of int
-        "rotation" and "translation": the frames (from 0) at which a step was left out of the
-        estimates because Brownian motion cannot make it.
+        Frames (from 0) at which a step was left out of the estimate of "rotation" or
+        "translation" because Brownian motion cannot make it.
     """
 
     cluster: int
@@ -78,34 +87,49 @@ class ClusterResult:
 
     @cached_property
     def msad(self) -> LagCurve:
-        """The MSAD averaged over the particles' directions, without a mean spin taken off D_R."""
+        """The MSAD averaged over the particles' directions, without a spin that D_R leaves out."""
         if self.D_R.drift is None:
             return msad(self.motion)
         return msad(without_spin(self.motion, self.D_R.drift[0]))
 
     @cached_property
     def msd(self) -> LagCurve:
-        """The MSD of the centre, without a mean velocity taken off D_T."""
+        """The MSD of the centre, without a velocity that D_T leaves out."""
         return msd(self.motion, drift=self.D_T.drift is not None)
 
     @property
     def phi2_measured(self) -> float:
-        """The noise floor Phi^2 (rad^2) that the steps themselves show."""
+        """Noise floor Phi^2 measured from the steps, rad^2."""
         return self.D_R.offset * floor_factor(self.motion)
 
     @property
     def phi2_stderr(self) -> float:
-        """The standard error of `phi2_measured`, rad^2; NaN at the edge of what is possible."""
+        """Standard error of `phi2_measured`, rad^2; NaN where the offset lies on its bound."""
         return self.D_R.offset_stderr * floor_factor(self.motion)
 
     @property
     def name(self) -> str:
-        """The cluster's number, or its label."""
+        """Cluster label, or the number where there is none."""
         return self.label or str(self.cluster)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the cluster's entry of ``summary.json``."""
         xyz = None if self.quality is None else self.quality.sigma_xyz
+        sizes: dict[str, Any] | None = None
+        if self.sizes is not None:
+            sizes = {}
+            for mode, ending in _SIZE_ENDINGS.items():
+                size = self.sizes.get(mode)
+                for what in ("sphere", "cluster"):
+                    sizes[f"{what}_{ending}"] = size and {
+                        "value": getattr(size, what),
+                        "stderr": getattr(size, f"{what}_stderr"),
+                    }
+            both = self.sizes.get("both")
+            sizes["viscosity_TR"] = both and {
+                "value": both.viscosity,
+                "stderr": both.viscosity_stderr,
+            }
         return {
             "cluster": self.cluster,
             "label": self.label,
@@ -118,7 +142,7 @@ class ClusterResult:
             "phi2": {"measured": finite_or_none(self.phi2_measured), "predicted": self.noise.phi2},
             "snr": finite_or_none(self.D_R.snr),
             "tensor": None if self.tensor is None else _tensor_dict(self.tensor),
-            "sizes": None if self.sizes is None else sizes_to_dict(self.sizes),
+            "sizes": sizes,
             "size_factor": next((s.factor for s in (self.sizes or {}).values()), None),
             "prediction": None if self.prediction is None else self.prediction.to_dict(),
             "quality": None if self.quality is None else self.quality.to_dict(),
@@ -126,6 +150,41 @@ class ClusterResult:
             "warnings": list(self.warnings),
             "notes": list(self.notes),
         }
+
+    @classmethod
+    def from_dict(cls, entry: Mapping[str, Any], motion: RigidMotion) -> ClusterResult:
+        """Read back what `to_dict` wrote, with the motion, which ``motion.parquet`` holds."""
+        sizes: dict[str, Size] = {}
+        for mode, ending in _SIZE_ENDINGS.items() if entry["sizes"] is not None else ():
+            sphere, cluster = (entry["sizes"][f"{what}_{ending}"] for what in ("sphere", "cluster"))
+            thickness = entry["sizes"]["viscosity_TR"] if mode == "both" else None
+            if sphere is not None:
+                sizes[mode] = Size(
+                    cluster=cluster["value"],
+                    cluster_stderr=cluster["stderr"],
+                    sphere=sphere["value"],
+                    sphere_stderr=sphere["stderr"],
+                    factor=entry["size_factor"],
+                    viscosity=thickness and thickness["value"],
+                    viscosity_stderr=thickness and thickness["stderr"],
+                )
+        prediction = entry.get("prediction")
+        return cls(
+            cluster=entry["cluster"],
+            motion=motion,
+            D_R=_estimate_from(entry["D_R"]),
+            D_T=_estimate_from(entry["D_T"]),
+            tensor=None if entry["tensor"] is None else _tensor_from(entry["tensor"]),
+            noise=predicted_noise(motion),
+            sizes=None if entry["sizes"] is None else sizes,
+            warnings=tuple(entry["warnings"]),
+            label=entry["label"],
+            quality=None if entry["quality"] is None else Quality.from_dict(entry["quality"]),
+            prediction=None if prediction is None else Prediction.from_dict(prediction),
+            # Runs of earlier versions have no notes and no jumps.
+            notes=tuple(entry.get("notes", ())),
+            jumps={name: tuple(frames) for name, frames in entry.get("jumps", {}).items()},
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,15 +194,19 @@ class RodResult:
     Attributes
     ----------
     cluster : int
+        Cluster number.
     motion : RodMotion
+        Fitted centres and directions.
     D_perp, D_T : DiffusionEstimate
-        Of the direction (``<|du|^2>`` = 4 D_perp dt) and of the centre.
+        Diffusion coefficient of the direction (``<|du|^2>`` = 4 D_perp dt) and of the centre.
     warnings : tuple of str
+        Sentences that speak against the numbers.
     label : str or None
+        Cluster name in the table, where it is text.
     prediction : Prediction or None
-        What spheres of the stated diameter would do; None if none was stated.
+        Coefficients predicted for spheres of the stated diameter; None if none was stated.
     notes : tuple of str
-        What only informs, beside the warnings.
+        Sentences that inform: how the table was read, what was left out or corrected.
     """
 
     cluster: int
@@ -157,7 +220,7 @@ class RodResult:
 
     @property
     def name(self) -> str:
-        """The rod's number, or its label."""
+        """Rod label, or the number where there is none."""
         return self.label or str(self.cluster)
 
     def to_dict(self) -> dict[str, Any]:
@@ -181,6 +244,21 @@ class RodResult:
             "notes": list(self.notes),
         }
 
+    @classmethod
+    def from_dict(cls, entry: Mapping[str, Any], motion: RodMotion) -> RodResult:
+        """Read back what `to_dict` wrote, with the motion, which ``motion.parquet`` holds."""
+        prediction = entry.get("prediction")
+        return cls(
+            cluster=entry["cluster"],
+            motion=motion,
+            D_perp=_estimate_from(entry["D_perp"]),
+            D_T=_estimate_from(entry["D_T"]),
+            warnings=tuple(entry["warnings"]),
+            label=entry["label"],
+            prediction=None if prediction is None else Prediction.from_dict(prediction),
+            notes=tuple(entry.get("notes", ())),
+        )
+
 
 @dataclass(frozen=True, eq=False)
 class Pooled:
@@ -189,13 +267,29 @@ class Pooled:
     Attributes
     ----------
     D_R, D_T : DiffusionEstimate
+        Rotational and translational diffusion coefficient of all these clusters.
     clusters : tuple of int
-        Which clusters went in.
+        Numbers of the clusters that are pooled.
     """
 
     D_R: DiffusionEstimate
     D_T: DiffusionEstimate
     clusters: tuple[int, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the entry "pooled" of ``summary.json``."""
+        return {
+            "D_R": _estimate_dict(self.D_R),
+            "D_T": _estimate_dict(self.D_T),
+            "p_same": self.D_R.p_same,
+            "clusters": list(self.clusters),
+        }
+
+    @classmethod
+    def from_dict(cls, entry: Mapping[str, Any]) -> Pooled:
+        """Read back what `to_dict` wrote."""
+        D_R, D_T = _estimate_from(entry["D_R"]), _estimate_from(entry["D_T"])
+        return cls(D_R, D_T, tuple(entry["clusters"]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,20 +299,21 @@ class Report:
     Attributes
     ----------
     clusters : tuple of ClusterResult
+        Results of the clusters.
     pooled : Pooled or None
-        None where there are only rods.
+        Values of all rigid clusters together; None where there is no rigid cluster.
     warnings : tuple of str
-        What concerns the whole table; each cluster has its own besides.
+        Sentences that speak against the whole table; those of one cluster are in its result.
     tracks : pandas.DataFrame
-        The positions used: frame from 0, particle, cluster, x, y[, z], um.
+        Positions used: frame from 0, particle, cluster, x, y[, z], um.
     settings : dict
         Arguments, versions, and the input with its SHA-256.
     rods : tuple of RodResult
-        Pairs and straight chains in three dimensions, which have no full rotation.
+        Results of pairs and straight chains in three dimensions, which have no full rotation.
     imaging : Imaging or None
-        How the spheres were seen, where the run began with images.
+        Features, images and optics, where the run began with images.
     notes : tuple of str
-        What informs of the whole table: how it was read, what was left out.
+        Sentences that inform on the whole table: how it was read, what was left out.
     """
 
     clusters: tuple[ClusterResult, ...]
@@ -232,7 +327,7 @@ class Report:
 
     @property
     def results(self) -> tuple[ClusterResult | RodResult, ...]:
-        """Bodies and rods together."""
+        """Results of clusters and rods together."""
         both: list[ClusterResult | RodResult] = [*self.clusters, *self.rods]
         return tuple(both)
 
@@ -248,18 +343,61 @@ class Report:
     def to_dict(self) -> dict[str, Any]:
         """Return ``summary.json`` as a dictionary: plain numbers, null for what is unknown."""
         entries = [result.to_dict() for result in self.results]
-        pooled = self.pooled
+        nothing: dict[str, Any] = {"D_R": None, "D_T": None, "p_same": None, "clusters": []}
         return {
             "clusters": sorted(entries, key=lambda entry: int(entry["cluster"])),
-            "pooled": {
-                "D_R": None if pooled is None else _estimate_dict(pooled.D_R),
-                "D_T": None if pooled is None else _estimate_dict(pooled.D_T),
-                "p_same": None if pooled is None else pooled.D_R.p_same,
-                "clusters": [] if pooled is None else list(pooled.clusters),
-            },
+            "pooled": nothing if self.pooled is None else self.pooled.to_dict(),
             "warnings": list(self.warnings),
             "notes": list(self.notes),
         }
+
+    @classmethod
+    def from_dict(
+        cls,
+        entry: Mapping[str, Any],
+        *,
+        motions: Mapping[int, RigidMotion | RodMotion],
+        tracks: pd.DataFrame,
+        settings: dict[str, Any] | None = None,
+        imaging: Imaging | None = None,
+    ) -> Report:
+        """Read back what `to_dict` wrote, with what other files of a run folder hold.
+
+        Parameters
+        ----------
+        entry : mapping
+            The content of ``summary.json``.
+        motions : mapping
+            The motion of every cluster by its number, from ``motion.parquet``.
+        tracks : pandas.DataFrame
+            The positions used, from ``tracks.parquet``.
+        settings : dict, optional
+            The content of ``run.json``.
+        imaging : Imaging, optional
+
+        Returns
+        -------
+        Report
+        """
+        clusters: list[ClusterResult] = []
+        rods: list[RodResult] = []
+        for one in entry["clusters"]:
+            motion = motions[one["cluster"]]
+            if isinstance(motion, RodMotion):
+                rods.append(RodResult.from_dict(one, motion))
+            else:
+                clusters.append(ClusterResult.from_dict(one, motion))
+        pooled = entry["pooled"]
+        return cls(
+            clusters=tuple(clusters),
+            rods=tuple(rods),
+            pooled=None if pooled["D_R"] is None else Pooled.from_dict(pooled),
+            warnings=tuple(entry["warnings"]),
+            tracks=tracks,
+            settings={} if settings is None else settings,
+            imaging=imaging,
+            notes=tuple(entry.get("notes", ())),
+        )
 
     def save(self, folder: str | os.PathLike[str], *, overwrite: bool = False) -> None:
         """Write the run's data (no pictures) to a new folder, which appears whole or not at all.
@@ -286,33 +424,27 @@ def load_run(folder: str | os.PathLike[str]) -> Report:
     path = Path(folder)
     summary = json.loads((path / "summary.json").read_text(encoding="utf-8"))
     settings = json.loads((path / "run.json").read_text(encoding="utf-8"))
-    motions = pd.read_parquet(path / "motion.parquet")
-    attributes = motions.attrs["clusters"]
-    results: list[ClusterResult] = []
-    rods: list[RodResult] = []
+    table = pd.read_parquet(path / "motion.parquet")
+    attributes = table.attrs["clusters"]
+    motions: dict[int, RigidMotion | RodMotion] = {}
     for entry in summary["clusters"]:
-        rows = motions[motions["cluster"] == entry["cluster"]].reset_index(drop=True)
+        rows = table[table["cluster"] == entry["cluster"]].reset_index(drop=True)
         rows.attrs = attributes[str(entry["cluster"])]
-        if "D_perp" in entry:
-            rods.append(_rod_from(entry, RodMotion.from_frame(rows)))
-        else:
-            results.append(_result_from(entry, RigidMotion.from_frame(rows)))
-    return Report(
-        clusters=tuple(results),
-        rods=tuple(rods),
-        pooled=_pooled_from(summary["pooled"]),
-        warnings=tuple(summary["warnings"]),
+        kind = RodMotion if "D_perp" in entry else RigidMotion
+        motions[entry["cluster"]] = kind.from_frame(rows)
+    return Report.from_dict(
+        summary,
+        motions=motions,
         tracks=pd.read_parquet(path / "tracks.parquet"),
         settings=settings,
         imaging=read_imaging(path) if (path / "imaging.json").is_file() else None,
-        notes=_notes_from(summary),
     )
 
 
 def write_data(report: Report, folder: Path) -> None:
     """Write summary.json, tracks.parquet, motion.parquet, curves.csv and run.json to a folder."""
-    _write_json(folder / "summary.json", report.to_dict())
-    _write_json(folder / "run.json", report.settings)
+    write_json(folder / "summary.json", report.to_dict())
+    write_json(folder / "run.json", report.settings)
     report.tracks.to_parquet(folder / "tracks.parquet", index=False)
     motion_table(report).to_parquet(folder / "motion.parquet", index=False)
     curve_table(report).to_csv(folder / "curves.csv", index=False)
@@ -371,60 +503,3 @@ def predicted_noise(motion: RigidMotion) -> NoiseFloor:
 def floor_factor(motion: RigidMotion) -> float:
     """Return Phi^2 over the variance of one orientation angle: 4, or 2 in the plane."""
     return 2.0 if motion.covariance.shape[-1] == 1 else 4.0
-
-
-def _result_from(entry: dict[str, Any], motion: RigidMotion) -> ClusterResult:
-    """Rebuild one cluster's result from its summary and its motion."""
-    return ClusterResult(
-        cluster=entry["cluster"],
-        motion=motion,
-        D_R=_estimate_from(entry["D_R"]),
-        D_T=_estimate_from(entry["D_T"]),
-        tensor=None if entry["tensor"] is None else _tensor_from(entry["tensor"]),
-        noise=predicted_noise(motion),
-        sizes=None if entry["sizes"] is None else sizes_from_dict(entry),
-        warnings=tuple(entry["warnings"]),
-        label=entry["label"],
-        quality=None if entry["quality"] is None else Quality.from_dict(entry["quality"]),
-        prediction=_prediction_from(entry),
-        notes=_notes_from(entry),
-        jumps={name: tuple(frames) for name, frames in entry.get("jumps", {}).items()},
-    )
-
-
-def _rod_from(entry: dict[str, Any], motion: RodMotion) -> RodResult:
-    """Rebuild one rod's result from its summary and its motion."""
-    return RodResult(
-        cluster=entry["cluster"],
-        motion=motion,
-        D_perp=_estimate_from(entry["D_perp"]),
-        D_T=_estimate_from(entry["D_T"]),
-        warnings=tuple(entry["warnings"]),
-        label=entry["label"],
-        prediction=_prediction_from(entry),
-        notes=_notes_from(entry),
-    )
-
-
-def _prediction_from(entry: dict[str, Any]) -> Prediction | None:
-    """Read back a prediction; runs without one may lack the key."""
-    given = entry.get("prediction")
-    return None if given is None else Prediction.from_dict(given)
-
-
-def _notes_from(entry: dict[str, Any]) -> tuple[str, ...]:
-    """Read back notes; runs of earlier versions have none."""
-    return tuple(entry.get("notes", ()))
-
-
-def _pooled_from(entry: dict[str, Any]) -> Pooled | None:
-    """Rebuild the pooled values; None where there were only rods."""
-    if entry["D_R"] is None:
-        return None
-    estimates = _estimate_from(entry["D_R"]), _estimate_from(entry["D_T"])
-    return Pooled(*estimates, tuple(entry["clusters"]))
-
-
-def _write_json(path: Path, content: dict[str, Any]) -> None:
-    text = json.dumps(content, indent=2, allow_nan=False, ensure_ascii=False)
-    path.write_text(text + "\n", encoding="utf-8")

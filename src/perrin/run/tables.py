@@ -1,4 +1,4 @@
-"""The main job: from a track table to a Report."""
+"""From a track table to a Report: the main job, as a user calls it."""
 
 from __future__ import annotations
 
@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from perrin.run.experiment import Conditions, _plain, check_arguments, told_conditions
-from perrin.run.measure import Remarks, measure_table
+from perrin.run.experiment import Recording, merged_experiment
+from perrin.run.measure import measure_table
+from perrin.run.remarks import Remarks
 from perrin.tracks.files import check_tracks, read_tracks
 from perrin.tracks.screening import distance_notes, has_trackpy_columns, screen_rows
 
@@ -20,13 +21,14 @@ if TYPE_CHECKING:
     import pandas as pd
     from numpy.typing import ArrayLike
 
+    from perrin.run.experiment import Experiment
     from perrin.run.results import Report
 
 
 def analyze(
     tracks: str | os.PathLike[str] | pd.DataFrame,
     *,
-    dt: float,
+    dt: float | None = None,
     scale: ArrayLike = 1.0,
     columns: Mapping[str, str | int] | None = None,
     contact: float | None = None,
@@ -39,6 +41,7 @@ def analyze(
     temperature: float | None = None,
     diameter: float | None = None,
     frames: tuple[int | None, int | None] | None = None,
+    experiment: Experiment | None = None,
 ) -> Report:
     """Measure D_R and D_T of every cluster in a track table.
 
@@ -52,7 +55,7 @@ def analyze(
     scale : float or array_like
         um per unit of the coordinates, one number or one per axis.
     columns : mapping, optional
-        Our column names to the file's names or column numbers (files only).
+        Names or numbers of the file's columns by perrin's names (files only).
     contact : float, optional
         Centre distance of touching particles, um: finds the clusters in a table without a
         cluster column. Without it they are found by the distances that stay the same.
@@ -65,7 +68,7 @@ def analyze(
     exposure : float, optional
         Open fraction of dt, 0 to 1; unknown by default.
     drift : bool
-        Take a mean velocity off D_T (flow, sedimentation) and a mean spin off D_R; both are
+        Subtract a mean velocity (flow, sedimentation) from D_T and a mean spin from D_R; both are
         reported.
     keep_jumps : bool
         Leave steps in the estimates that Brownian motion cannot make (a jump of the stage, an
@@ -75,10 +78,13 @@ def analyze(
         shape, in three dimensions. The temperature alone gives the size and the viscosity that D_T
         and D_R imply together.
     diameter : float, optional
-        Of one sphere, um: with viscosity and temperature, every cluster's predicted D_T and D_R
-        stand beside the measured ones. Without it, sizes are those of spheres that touch.
+        Sphere diameter, um: with viscosity and temperature, the measured D_T and D_R of every
+        cluster are compared with predicted ones. Without it, sizes are those of spheres that touch.
     frames : tuple of int or None, optional
-        First frame and first frame not used any more, as in a slice.
+        First frame and first frame that is not used, as in a slice.
+    experiment : Experiment, optional
+        dt, sigma, noise, exposure, drift, keep_jumps, viscosity, temperature and diameter in one
+        object; a value is stated here or as its own argument, not both.
 
     Returns
     -------
@@ -87,11 +93,11 @@ def analyze(
     Raises
     ------
     TrackTableError
-        If the table cannot be read or does not say which particles belong together.
+        If the table cannot be read, or if its particles belong to no cluster.
     DegenerateClusterError, TooFewFramesError
-        If no cluster can be measured; among good ones a bad one is a warning.
+        If no cluster can be measured; a cluster that cannot be measured among others is a warning.
     ValueError
-        For arguments out of range.
+        For arguments out of range or stated twice.
 
     Examples
     --------
@@ -101,35 +107,61 @@ def analyze(
     >>> print(report.clusters[0].D_R)
     D_R = 0.0051(4) rad^2/s [mle, 300 frames]
     """
-    check_arguments(
-        dt=dt, contact=contact, viscosity=viscosity, temperature=temperature, diameter=diameter
+    experiment = merged_experiment(
+        experiment,
+        dt=dt,
+        sigma=sigma,
+        noise=noise,
+        exposure=exposure,
+        drift=drift,
+        keep_jumps=keep_jumps,
+        viscosity=viscosity,
+        temperature=temperature,
+        diameter=diameter,
+        contact=contact,
     )
-    table, source, remarks = _table(tracks, scale=scale, columns=columns, frames=frames)
-    conditions = Conditions(
-        dt, sigma, viscosity, temperature, diameter, noise, exposure, drift, keep_jumps
-    )
-    arguments = told_conditions(conditions) | {"contact": contact, "frames": frames}
-    arguments |= {"columns": columns, "scale": _plain(scale)}
+    if experiment.dt is None:
+        raise ValueError("dt: needed, the time between successive frame numbers, s")
+    table, source, remarks = read_table(tracks, scale=scale, columns=columns, frames=frames)
+    plain_scale = np.asarray(scale, dtype=np.float64).tolist()
     return measure_table(
         table,
-        conditions,
-        contact=contact,
+        experiment,
         source=source,
-        arguments=arguments,
+        arguments=experiment.to_dict()
+        | {"contact": contact, "frames": frames, "columns": columns, "scale": plain_scale},
+        contact=contact,
+        recording=Recording(dt=experiment.dt),
         remarks=remarks,
     )
 
 
-def _table(
+def read_table(
     tracks: str | os.PathLike[str] | pd.DataFrame,
     *,
-    scale: ArrayLike,
-    columns: Mapping[str, str | int] | None,
-    frames: tuple[int | None, int | None] | None,
+    scale: ArrayLike = 1.0,
+    columns: Mapping[str, str | int] | None = None,
+    frames: tuple[int | None, int | None] | None = None,
 ) -> tuple[pd.DataFrame, dict[str, str | None], Remarks]:
-    """Read or check the table, and take out rows that are no measurements.
+    """Read or check a track table, and mark the rows that are no measurements.
 
-    Returns as well where it came from, and the remarks on it.
+    Parameters
+    ----------
+    tracks, scale, columns, frames
+        As in `analyze`.
+
+    Returns
+    -------
+    table : pandas.DataFrame
+        Clean table, um.
+    source : dict
+        Path of the file and its SHA-256; None for a table.
+    remarks : Remarks
+
+    Raises
+    ------
+    TrackTableError, ValueError
+        As in `analyze`.
     """
     if isinstance(tracks, str | os.PathLike):
         table = read_tracks(tracks, scale=scale, columns=columns)
@@ -143,21 +175,7 @@ def _table(
         source, names = {"path": None, "sha256": None}, map(str, tracks.columns)
         if "piece" in tracks:  # where `identify` was in doubt
             table["piece"] = tracks["piece"].to_numpy()
-    remarks = Remarks([], list(table.attrs.get("notes", ())))
-    table = _sliced(table, frames)
-    screened = screen_rows(table)
-    notes, warnings = distance_notes(
-        screened.table,
-        scale_given=bool(np.any(np.asarray(scale) != 1)),
-        trackpy_columns=has_trackpy_columns(names),
-    )
-    remarks.warnings.extend((*screened.warnings, *warnings))
-    remarks.notes.extend((*screened.notes, *notes))
-    return screened.table, source, remarks
-
-
-def _sliced(table: pd.DataFrame, frames: tuple[int | None, int | None] | None) -> pd.DataFrame:
-    """Keep the frames first <= frame < stop."""
+    read_notes = list(table.attrs.get("notes", ()))
     first, stop = frames or (None, None)
     keep = np.ones(len(table), dtype=np.bool_)
     if first is not None:
@@ -167,4 +185,11 @@ def _sliced(table: pd.DataFrame, frames: tuple[int | None, int | None] | None) -
     if not keep.any():
         low, high = int(table["frame"].min()), int(table["frame"].max())
         raise ValueError(f"frames {first}:{stop} hold no rows; the table runs from {low} to {high}")
-    return table[keep].reset_index(drop=True)
+    screened = screen_rows(table[keep].reset_index(drop=True))
+    notes, warnings = distance_notes(
+        screened.table,
+        scale_given=bool(np.any(np.asarray(scale) != 1)),
+        trackpy_columns=has_trackpy_columns(names),
+    )
+    remarks = Remarks([*screened.warnings, *warnings], [*read_notes, *screened.notes, *notes])
+    return screened.table, source, remarks

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gzip
 import io
 import zlib
 from typing import TYPE_CHECKING
@@ -85,6 +84,8 @@ def parse_table(data: bytes, suffix: str, source: str) -> pd.DataFrame:
             reason = str(error).strip().splitlines()[0]
             raise table_error(source, f"not a parquet file that can be read ({reason})") from None
     if suffix == ".csv.gz":
+        import gzip
+
         try:
             data = gzip.decompress(data)
         except (gzip.BadGzipFile, EOFError, zlib.error) as error:
@@ -229,6 +230,8 @@ def table_bytes(table: pd.DataFrame, suffix: str, target: str) -> bytes:
     text: str = table.to_csv(index=False, lineterminator="\n")
     if suffix == ".csv":
         return text.encode("utf-8")
+    import gzip
+
     # Without time and name in the header, equal tables make equal files.
     with gzip.GzipFile("", "wb", compresslevel=6, fileobj=buffer, mtime=0) as packed:
         packed.write(text.encode("utf-8"))

@@ -1,0 +1,91 @@
+"""Which cluster every row of a table belongs to."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from perrin.errors import TrackTableError
+from perrin.run.remarks import (
+    CONSTANT_Z,
+    Remarks,
+    grouping_note,
+    loose_particles_note,
+    no_cluster_text,
+)
+from perrin.tracks.clusters import find_clusters
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+# With at most this number of particles in fewer than this number of frames, all particles of a
+# table without a cluster column may be one body: distances in so few frames do not show it.
+_PARTICLES_OF_ONE_BODY, _FRAMES_FOR_DISTANCES = 20, 8
+
+
+def assign_clusters(
+    table: pd.DataFrame, *, contact: float | None = None
+) -> tuple[pd.DataFrame, dict[int, str], Remarks]:
+    """Give every row of a table a cluster number.
+
+    Parameters
+    ----------
+    table : pandas.DataFrame
+        A clean track table. A column cluster of texts is numbered in the order of the texts.
+    contact : float, optional
+        Centre distance of touching particles, um, for a table without that column. Without it
+        clusters are found by the distances that stay the same; pairs where there is nothing larger.
+
+    Returns
+    -------
+    table : pandas.DataFrame
+        With a column cluster of whole numbers; -1 for particles that belong to none.
+    labels : dict of int to str
+        The texts by cluster number.
+    remarks : Remarks
+
+    Raises
+    ------
+    TrackTableError
+        If no particle belongs to a cluster.
+
+    Examples
+    --------
+    >>> import pandas as pd
+    >>> table = pd.DataFrame({"frame": [0, 0], "particle": [0, 1], "cluster": ["knee", "foot"]})
+    >>> assign_clusters(table)[0]["cluster"].tolist(), assign_clusters(table)[1]
+    ([1, 0], {0: 'foot', 1: 'knee'})
+    """
+    import pandas as pd
+
+    remarks = Remarks()
+    if "z" in table and table["z"].nunique() == 1:
+        remarks.warnings.append(CONSTANT_Z)
+    labels: dict[int, str] = {}
+    marked = "cluster" in table
+    if marked and pd.api.types.is_numeric_dtype(table["cluster"]):
+        table = table.astype({"cluster": np.int64})
+    elif marked:
+        codes, names = pd.factorize(table["cluster"], sort=True)
+        labels = {number: str(name) for number, name in enumerate(names)}
+        table = table.assign(cluster=codes.astype(np.int64))
+    else:
+        count, frames = table["particle"].nunique(), table["frame"].nunique()
+        if contact is None and frames < _FRAMES_FOR_DISTANCES and count <= _PARTICLES_OF_ONE_BODY:
+            table = table.assign(cluster=0)
+        else:
+            found = find_clusters(table, contact=contact)
+            none = (found["cluster"] == -1).all()
+            table = find_clusters(table, contact=contact, size=2) if none else found
+        if contact is None:
+            remarks.notes.append(
+                grouping_note(table["cluster"].to_numpy(dtype=np.int64), particles=count)
+            )
+    loose = table["cluster"] == -1
+    if loose.all():
+        raise TrackTableError(no_cluster_text(contact, marked=marked))
+    if loose.any():
+        remarks.notes.append(loose_particles_note(table.loc[loose, "particle"].nunique()))
+    return table, labels, remarks
