@@ -21,7 +21,7 @@ from perrin import (
 )
 from perrin._text import with_error
 from perrin.diffusion.likelihood import Likelihood
-from perrin.diffusion.step_kernels import Track
+from perrin.diffusion.noise_model import NoisySteps
 from perrin.diffusion.steps import steps_of
 
 TETRAHEDRON = Cluster.tetrahedron(1.5)
@@ -185,7 +185,7 @@ def test_a_cut_loses_only_the_step_between(quantity):
     motion = tracked(cloud(5, n_frames=120))
     piece = np.repeat([0, 1], [50, 70])
     whole, cut = (steps_of(m, quantity) for m in (motion, dataclasses.replace(motion, piece=piece)))
-    assert len(whole.size) - len(cut.size) == 1
+    assert len(whole.vectors) - len(cut.vectors) == 1
     assert np.flatnonzero(~whole.linked).tolist() == [118]
     assert np.flatnonzero(~cut.linked).tolist() == [48, 117]
     steady = dataclasses.replace(motion, piece=piece)
@@ -741,11 +741,11 @@ def test_a_long_track_is_solved_from_any_guess():
     noise = np.random.default_rng(2).normal(scale=0.015, size=truth.center.shape)
     motion = dataclasses.replace(truth, center=truth.center + noise)
     steps = steps_of(motion, "translation")
-    likelihood = Likelihood.of([Track.free(steps, blur=0.0, drift=False)])
-    start = likelihood.ridge(np.zeros(1))
-    assert start.theta > 100 * np.mean(steps.size**2)
+    likelihood = Likelihood.of([NoisySteps.free(steps, blur=0.0, drift=False)])
+    start = likelihood.profile(np.zeros(1))
+    assert start.theta > 100 * np.mean(steps.vectors**2)
     D = np.array([4.5e-3])
-    found, fresh = likelihood.ridge(D, start).theta, likelihood.ridge(D).theta
+    found, fresh = likelihood.profile(D, start).theta, likelihood.profile(D).theta
     assert found == pytest.approx(fresh, rel=1e-8)
     assert found == pytest.approx(0.015**2, abs=4 * 0.002 * 4.5e-3)
 

@@ -8,7 +8,8 @@ from scipy.stats import multivariate_normal
 
 from perrin import Cluster, add_noise, simulate_motion, track_rotation
 from perrin.diffusion.likelihood import Likelihood
-from perrin.diffusion.step_kernels import Track, _Sines, _Tridiagonal
+from perrin.diffusion.noise_model import NoisySteps
+from perrin.diffusion.step_kernels import SineModes, TridiagonalCovariance
 from perrin.diffusion.steps import steps_of
 
 QUANTITIES = ("rotation", "translation")
@@ -48,10 +49,10 @@ def cases():
 
 CASES = cases()
 MODES = {
-    "joint": lambda s: Track.free(s, blur=s.duration.min() / 2, drift=False),
-    "exposed": lambda s: Track.free(s, blur=0.8 * s.dt / 3, drift=False),
-    "residual": lambda s: Track.informed(s, blur=0.1, drift=False),
-    "known": lambda s: Track.fixed(s, sigma=0.04, blur=0.2, drift=False),
+    "joint": lambda s: NoisySteps.free(s, blur=s.duration.min() / 2, drift=False),
+    "exposed": lambda s: NoisySteps.free(s, blur=0.8 * s.dt / 3, drift=False),
+    "residual": lambda s: NoisySteps.from_residuals(s, blur=0.1, drift=False),
+    "known": lambda s: NoisySteps.fixed(s, sigma=0.04, blur=0.2, drift=False),
 }
 
 
@@ -106,7 +107,7 @@ def dense_value(case, quantity, mode, likelihood, D, theta):
     """Return the log-density of all steps, and of the residuals, without the constants."""
     total = 0.0
     for motion, track, t in zip(CASES[case], likelihood.tracks, theta, strict=True):
-        y = track.steps.size
+        y = track.steps.vectors
         for column, block in zip(y.T, dense_covariance(motion, quantity, D, t, mode), strict=True):
             total += multivariate_normal(cov=block).logpdf(column)
             total += 0.5 * len(column) * np.log(2 * np.pi)
@@ -159,7 +160,9 @@ def test_both_kernels_agree(case, mode, quantity):
     """Sine transform and tridiagonal elimination give the same value and slopes to 1e-10."""
     tracks = built(case, quantity, mode).tracks
     D, theta = np.array([2e-3]), np.array([3e-4])
-    one, two = (kernel.of(tracks, [0]).sums(D, theta) for kernel in (_Sines, _Tridiagonal))
+    one, two = (
+        kernel.of(tracks, [0]).sums(D, theta) for kernel in (SineModes, TridiagonalCovariance)
+    )
     for a, b in zip(one, two, strict=True):
         assert a == pytest.approx(b, rel=1e-10)
 
@@ -172,8 +175,8 @@ def test_a_free_mean_velocity_is_the_restricted_likelihood(case):
     each axis, is added; dense QR finds the contrasts.
     """
     steps = [steps_of(m, "translation") for m in CASES[case]]
-    likelihood = Likelihood.of([Track.free(s, blur=0.2, drift=True) for s in steps])
-    plain = Likelihood.of([Track.free(s, blur=0.2, drift=False) for s in steps])
+    likelihood = Likelihood.of([NoisySteps.free(s, blur=0.2, drift=True) for s in steps])
+    plain = Likelihood.of([NoisySteps.free(s, blur=0.2, drift=False) for s in steps])
     for D, theta in points(likelihood):
         expected = 0.0
         for motion, track, t in zip(CASES[case], likelihood.tracks, theta, strict=True):
@@ -184,7 +187,7 @@ def test_a_free_mean_velocity_is_the_restricted_likelihood(case):
             start, stop = motion.steps()
             take = np.zeros((len(start), len(motion.time)))
             take[np.arange(len(start)), start], take[np.arange(len(start)), stop] = -1, 1
-            for y, axis in zip(track.steps.size.T, noise.T, strict=True):
+            for y, axis in zip(track.steps.vectors.T, noise.T, strict=True):
                 C = (take * np.nan_to_num(axis)) @ take.T + np.diag(2 * D[0] * tau)
                 small = contrasts.T @ C @ contrasts
                 expected += multivariate_normal(cov=small).logpdf(contrasts.T @ y)
@@ -205,7 +208,7 @@ def brute(likelihood, D):
     """Return the profile log-likelihood by brute force: every theta by itself, grid on grid."""
     total, count = 0.0, len(likelihood.tracks)
     for g in range(count):
-        scale = float(np.mean(likelihood.tracks[g].steps.size ** 2))
+        scale = float(np.mean(likelihood.tracks[g].steps.vectors ** 2))
         grid = np.geomspace(1e-9, 1e3, 60)
         for _ in range(5):
             alone = Likelihood.of([likelihood.tracks[g]])

@@ -20,7 +20,8 @@ from perrin import (
     simulate_motion,
     track_rotation,
 )
-from perrin.diffusion.tensor_likelihood import Source, VectorSteps, axial, maximise, spread, squares
+from perrin.diffusion.steps import Steps
+from perrin.diffusion.tensor_likelihood import NoisyVectors, axial, maximise, spread, squares
 from perrin.diffusion.tensors import axes_like
 from perrin.geometry.rigid import diffusion_center, shifted
 from perrin.geometry.rotations import exp_map, skew
@@ -66,29 +67,39 @@ def spd(rng, b):
 def steps_of(seed, b=3, r=1, count=9, *, even=False, pieces=False):
     """Return random steps: even ones, or with gaps, frames of different noise and two pieces."""
     rng = np.random.default_rng(seed)
-    noise = np.array([[spd(rng, b) for _ in range(count + 1)] for _ in range(r)])
-    tau, linked = rng.integers(1, 4, count) * 0.7, np.arange(count) < count - 1
+    start = np.arange(count)
+    if pieces:
+        start[count // 2 + 1 :] += 1  # one frame more: these steps do not share it
+    noise = np.array([[spd(rng, b) for _ in range(start[-1] + 2)] for _ in range(r)])
+    duration = rng.integers(1, 4, count) * 0.7
     if even:
         noise[:] = noise[:, :1]
-        tau[:] = 0.7
-    if pieces:
-        linked[count // 2] = False
-    begin, end = noise[:, :-1].copy(), noise[:, 1:].copy()
-    return VectorSteps(rng.normal(size=(count, b)), tau, begin, end, linked, 0.7)
+        duration[:] = 0.7
+    return made(rng.normal(size=(count, b)), duration, start, noise, dt=0.7)
+
+
+def made(vectors, duration, start, noise, *, dt):
+    """Return steps between neighbouring frames with this noise."""
+    return Steps(vectors, duration, start, start + 1, noise, dt=dt, sigma=1.0, freedom=0)
+
+
+def noisy(steps, B=0.0):
+    """Return steps with noise amplitudes to be guessed."""
+    return NoisyVectors(steps, np.ones(len(steps.noise)), 0.0, B)
 
 
 def dense_value(steps, D, theta, B):
     """Return the log-density of the steps from their covariance written out."""
-    count, b = steps.y.shape
-    first = np.tensordot(theta, steps.begin, 1) - 2 * B * steps.dt * D
-    last = np.tensordot(theta, steps.end, 1) - 2 * B * steps.dt * D
+    count, b = steps.vectors.shape
+    first = np.tensordot(theta, steps.before, 1) - 2 * B * steps.dt * D
+    last = np.tensordot(theta, steps.after, 1) - 2 * B * steps.dt * D
     cov = np.zeros((count, b, count, b))
     for i in range(count):
-        cov[i, :, i] = 2 * D * steps.tau[i] + first[i] + last[i]
+        cov[i, :, i] = 2 * D * steps.duration[i] + first[i] + last[i]
         if steps.linked[i]:
             cov[i, :, i + 1] = cov[i + 1, :, i] = -last[i]
     normal = multivariate_normal(np.zeros(count * b), cov.reshape(count * b, -1))
-    return normal.logpdf(steps.y.ravel()) + 0.5 * count * b * np.log(2 * np.pi)
+    return normal.logpdf(steps.vectors.ravel()) + 0.5 * count * b * np.log(2 * np.pi)
 
 
 # ---- the likelihood -----------------------------------------------------------------------------
@@ -101,11 +112,11 @@ def test_the_likelihood_is_the_normal_density(b, r, how):
     steps = steps_of(1, b, r, **how)
     rng = np.random.default_rng(2)
     D, theta, B = spd(rng, b), rng.uniform(0.2, 0.5, r), 0.1
-    found = steps.by_bands(D, theta, B)
+    found = noisy(steps).by_bands(D, theta, B)
     assert found.value == pytest.approx(dense_value(steps, D, theta, B), abs=1e-10)
     assert steps.even == bool(how.get("even"))
     if steps.even:
-        quick = steps.by_sines(D, theta, B)
+        quick = noisy(steps).by_sines(D, theta, B)
         for one, other in zip(quick, found, strict=True):
             np.testing.assert_allclose(one, other, rtol=1e-11, atol=1e-11)
 
@@ -116,11 +127,14 @@ def test_the_slopes_are_those_of_the_likelihood(how):
     steps = steps_of(3, r=2, **how)
     rng = np.random.default_rng(4)
     D, theta, B, h = spd(rng, 3), np.array([0.3, 0.4]), 0.1, 1e-6
-    found = steps.slopes(D, theta, B)
+    found = noisy(steps).by_tensor(D, theta, B)
     to = spd(rng, 3)
 
     def rise(dD=0.0, dtheta=0.0, dB=0.0):
-        ends = [steps.slopes(D + s * dD, theta + s * dtheta, B + s * dB).value for s in (h, -h)]
+        ends = [
+            noisy(steps).by_tensor(D + s * dD, theta + s * dtheta, B + s * dB).value
+            for s in (h, -h)
+        ]
         return (ends[0] - ends[1]) / (2 * h)
 
     assert np.sum(found.D * to) == pytest.approx(rise(dD=to), rel=1e-6, abs=1e-6)
@@ -132,7 +146,7 @@ def test_the_slopes_are_those_of_the_likelihood(how):
 def test_a_covariance_that_is_none_has_no_likelihood():
     """Outside the positive definite both kernels say minus infinity."""
     steps = steps_of(1, even=True)
-    for slopes in (steps.by_sines, steps.by_bands):
+    for slopes in (noisy(steps).by_sines, noisy(steps).by_bands):
         assert slopes(-np.eye(3), np.array([0.1]), 0.0).value == -np.inf
         assert slopes(np.diag([1.0, 1, -0.1]), np.array([0.1]), 0.0).value == -np.inf
 
@@ -141,7 +155,7 @@ def test_a_covariance_that_is_none_has_no_likelihood():
 @pytest.mark.parametrize("B", [None, 0.1])
 def test_the_slopes_of_a_source_and_of_a_family(weight, B):
     """With squares, angles and a measured amplitude the chain of derivatives holds."""
-    source = Source(steps_of(5, r=2, even=True), np.array([0.3, 0.2]), weight, B)
+    source = NoisyVectors(steps_of(5, r=2, even=True), np.array([0.3, 0.2]), weight, B)
     own, q, h = source.start() + 0.1, np.array([0.6, 0.9, 0.2, -0.1]), 1e-6
     family = axial(SLANT[:, 0])
 
@@ -160,9 +174,9 @@ def test_the_maximum_and_its_spread_without_noise():
     """Known absent noise: the best D is the mean square over 2 tau, its errors those of Wishart."""
     rng = np.random.default_rng(6)
     y = rng.normal(size=(400, 3)) @ np.diag([1.0, 1.5, 2.0])
-    zero = np.zeros((1, 400, 3, 3))
-    steps = VectorSteps(y, np.full(400, 0.5), zero, zero, np.arange(400) < 399, 0.5)
-    source = Source(steps, np.zeros(1), np.inf, 0.0)
+    zero = np.zeros((1, 401, 3, 3))
+    steps = made(y, np.full(400, 0.5), np.arange(400), zero, dt=0.5)
+    source = NoisyVectors(steps, np.zeros(1), np.inf, 0.0)
     basis = np.array([np.diag(e) for e in np.eye(3)])
     best = maximise([source], squares(basis), np.ones(3), np.zeros((1, 0)))
     expected = (y * y).mean(axis=0)
@@ -212,8 +226,8 @@ def test_answers_repeat_from_anywhere():
     steps = steps_of(8, count=300, even=True)
     y = np.random.default_rng(1).normal(size=(301, 3)) * 0.3
     y = np.diff(y, axis=0) + np.random.default_rng(2).normal(size=(300, 3)) * [1, 1.2, 2]
-    steps = dataclasses.replace(steps, y=y)
-    source = Source(steps, np.array([0.1]), 0.0, None)
+    steps = dataclasses.replace(steps, vectors=y)
+    source = NoisyVectors(steps, np.array([0.1]), 0.0, None)
     basis = np.array([np.diag(e) for e in np.eye(3)])
     found = [
         maximise([source], squares(basis), np.array(q), np.array([[t, 0.6]])).D
@@ -500,13 +514,13 @@ def test_moving_the_point():
 def test_the_search_takes_few_passes(monkeypatch):
     """A tensor with errors and p-values: under 200 passes over the steps (35 ms for 300 frames)."""
     passes = []
-    slopes = VectorSteps.slopes
+    slopes = NoisyVectors.by_tensor
 
     def counted(self, D, theta, B):
         passes.append(1)
         return slopes(self, D, theta, B)
 
-    monkeypatch.setattr(VectorSteps, "slopes", counted)
+    monkeypatch.setattr(NoisyVectors, "by_tensor", counted)
     for seed in range(5):
         motion = tracked(seed)
         passes.clear()

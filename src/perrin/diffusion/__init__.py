@@ -1,20 +1,68 @@
 """How fast a body diffuses: coefficients, tensors, their errors, and tests of the steps."""
 
-from perrin.diffusion.bounds import cramer_rao, whole
-from perrin.diffusion.curve_fits import fit_gls, fit_line
-from perrin.diffusion.estimate import DiffusionEstimate, Found, bare_text, value_text
-from perrin.diffusion.estimators import by_likelihood, estimate_diffusion, track_of
-from perrin.diffusion.likelihood import Likelihood, Peak, excess_scatter
-from perrin.diffusion.moments import Moments, covariance_estimate, trace_estimate
-from perrin.diffusion.noise_model import Noise, choice_faults
-from perrin.diffusion.rods import estimate_rod
-from perrin.diffusion.sampling import SamplingPlan, SamplingVerdict, judge_sampling, plan_sampling
-from perrin.diffusion.step_kernels import Sums, Track, covariance_bands
+from perrin.diffusion.bounds import (
+    cramer_rao,
+    whole,
+)
+from perrin.diffusion.curve_fits import (
+    fit_gls,
+    fit_line,
+)
+from perrin.diffusion.estimate import (
+    DiffusionEstimate,
+    Found,
+    bare_text,
+    value_text,
+)
+from perrin.diffusion.estimators import (
+    by_likelihood,
+    estimate_diffusion,
+    precision_limits,
+)
+from perrin.diffusion.likelihood import (
+    Likelihood,
+    ProfilePoint,
+    excess_scatter,
+    log_slope_ratio,
+    newton_crossing,
+    secant_trial,
+)
+from perrin.diffusion.moments import (
+    Moments,
+    covariance_estimate,
+    step_cosines,
+    trace_estimate,
+)
+from perrin.diffusion.noise_model import (
+    Noise,
+    NoisySteps,
+    noise_faults,
+)
+from perrin.diffusion.rods import (
+    estimate_rod,
+)
+from perrin.diffusion.sampling import (
+    SamplingPlan,
+    SamplingVerdict,
+    judge_sampling,
+    plan_sampling,
+)
+from perrin.diffusion.step_kernels import (
+    GroupSlopes,
+    SineModes,
+    StepKernel,
+    TridiagonalCovariance,
+    covariance_bands,
+    difference_eigenvalues,
+    equal_columns,
+)
 from perrin.diffusion.step_tests import (
     Jumps,
     SteadyMotion,
+    StepResiduals,
     cut_at,
     find_jumps,
+    leave_one_out_residuals,
     offset_gain,
     persistence_gain,
     steady_motion,
@@ -22,81 +70,123 @@ from perrin.diffusion.step_tests import (
 )
 from perrin.diffusion.steps import (
     Steps,
-    Walk,
+    body_steps,
     center_steps,
     direction_steps,
+    pooled_steps,
     residual_freedom,
     steps_of,
     unit_center_variance,
     unit_covariance,
 )
 from perrin.diffusion.tensor_likelihood import (
-    Arrow,
+    ArrowHessian,
     Maximum,
-    Slopes,
-    Source,
-    VectorSteps,
+    NoisyVectors,
+    PooledLikelihood,
+    TensorSlopes,
     axial,
+    band_factor,
+    bfgs_update,
     maximise,
     spread,
     squares,
+    symmetric_inverses,
 )
-from perrin.diffusion.tensor_results import CoupledTensor, DiffusionTensor
-from perrin.diffusion.tensors import axes_like, coupled_tensor, diffusion_tensor
+from perrin.diffusion.tensor_results import (
+    CoupledTensor,
+    DiffusionTensor,
+)
+from perrin.diffusion.tensors import (
+    ScaledTracks,
+    axes_like,
+    axis_errors,
+    coupled_tensor,
+    diffusion_tensor,
+    element_variance,
+    imposed_symmetry,
+    invariant_basis,
+    neighbour_products,
+    symmetric_basis,
+    template_alignments,
+)
 
 __all__ = [
-    "Arrow",
+    "ArrowHessian",
     "CoupledTensor",
     "DiffusionEstimate",
     "DiffusionTensor",
     "Found",
+    "GroupSlopes",
     "Jumps",
     "Likelihood",
     "Maximum",
     "Moments",
     "Noise",
-    "Peak",
+    "NoisySteps",
+    "NoisyVectors",
+    "PooledLikelihood",
+    "ProfilePoint",
     "SamplingPlan",
     "SamplingVerdict",
-    "Slopes",
-    "Source",
+    "ScaledTracks",
+    "SineModes",
     "SteadyMotion",
+    "StepKernel",
+    "StepResiduals",
     "Steps",
-    "Sums",
-    "Track",
-    "VectorSteps",
-    "Walk",
+    "TensorSlopes",
+    "TridiagonalCovariance",
     "axes_like",
     "axial",
+    "axis_errors",
+    "band_factor",
     "bare_text",
+    "bfgs_update",
+    "body_steps",
     "by_likelihood",
     "center_steps",
-    "choice_faults",
     "coupled_tensor",
     "covariance_bands",
     "covariance_estimate",
     "cramer_rao",
     "cut_at",
+    "difference_eigenvalues",
     "diffusion_tensor",
     "direction_steps",
+    "element_variance",
+    "equal_columns",
     "estimate_diffusion",
     "estimate_rod",
     "excess_scatter",
     "find_jumps",
     "fit_gls",
     "fit_line",
+    "imposed_symmetry",
+    "invariant_basis",
     "judge_sampling",
+    "leave_one_out_residuals",
+    "log_slope_ratio",
     "maximise",
+    "neighbour_products",
+    "newton_crossing",
+    "noise_faults",
     "offset_gain",
     "persistence_gain",
     "plan_sampling",
+    "pooled_steps",
+    "precision_limits",
     "residual_freedom",
+    "secant_trial",
     "spread",
     "squares",
     "steady_motion",
+    "step_cosines",
     "steps_of",
+    "symmetric_basis",
+    "symmetric_inverses",
+    "template_alignments",
     "trace_estimate",
-    "track_of",
     "unit_center_variance",
     "unit_covariance",
     "value_text",

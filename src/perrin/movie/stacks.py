@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 import perrin.movie.checks as checks
-from perrin.diffusion.noise_model import choice_faults
+from perrin.diffusion.noise_model import noise_faults
 from perrin.errors import IdentityError, PartsError, TooFewFramesError
 from perrin.images.imaging import Imaging, View
 from perrin.images.spheres.localisation import NO_FLAT_MODEL, Search, check_search, is_flat
@@ -216,9 +216,7 @@ def _check(
     """Raise one error with every fault of the arguments, before hours of work."""
     if len(stack) < 2:
         raise TooFewFramesError("one frame shows no motion: two or more are needed", len(stack))
-    faults = choice_faults(
-        quantity="rotation", noise=conditions.noise, exposure=conditions.exposure
-    )
+    faults = noise_faults(conditions.noise, conditions.exposure)
     given = {"viscosity": conditions.viscosity, "temperature": conditions.temperature}
     faults += _faults_of(check_search, stack, search, refine, optics=optics)
     faults += _faults_of(check_arguments, dt=conditions.dt, **given)

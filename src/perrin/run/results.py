@@ -13,9 +13,9 @@ import numpy as np
 from perrin._arrays import finite_or_none
 from perrin._text import with_error
 from perrin.curves.displacement import LagCurve, msad, msd
-from perrin.diffusion.estimate import DiffusionEstimate, _estimate_dict, _estimate_from
+from perrin.diffusion.estimate import DiffusionEstimate
 from perrin.diffusion.step_tests import without_spin
-from perrin.diffusion.tensor_results import DiffusionTensor, _tensor_dict, _tensor_from
+from perrin.diffusion.tensor_results import DiffusionTensor
 from perrin.hydrodynamics.sizes import Size, _sizes_dict, _sizes_from
 from perrin.images.imaging import Imaging, read_imaging, write_imaging
 from perrin.motion.floor import NoiseFloor, floor_of
@@ -111,13 +111,13 @@ class ClusterResult:
             "label": self.label,
             "n_particles": len(self.motion.template),
             "n_frames": int(self.motion.fitted.size),
-            "D_R": _estimate_dict(self.D_R),
-            "D_T": _estimate_dict(self.D_T),
+            "D_R": self.D_R.to_dict(),
+            "D_T": self.D_T.to_dict(),
             "sigma": finite_or_none(self.motion.sigma),
             "sigma_xyz": None if xyz is None else list(xyz),
             "phi2": {"measured": finite_or_none(self.phi2_measured), "predicted": self.noise.phi2},
             "snr": finite_or_none(self.D_R.snr),
-            "tensor": None if self.tensor is None else _tensor_dict(self.tensor),
+            "tensor": None if self.tensor is None else self.tensor.to_dict(),
             "sizes": None if self.sizes is None else _sizes_dict(self.sizes),
             "size_factor": next((s.factor for s in (self.sizes or {}).values()), None),
             "prediction": None if self.prediction is None else self.prediction.to_dict(),
@@ -168,8 +168,8 @@ class RodResult:
             "n_particles": len(self.motion.places),
             "n_frames": int(self.motion.fitted.size),
             "D_R": None,
-            "D_perp": _estimate_dict(self.D_perp),
-            "D_T": _estimate_dict(self.D_T),
+            "D_perp": self.D_perp.to_dict(),
+            "D_T": self.D_T.to_dict(),
             "length": self.motion.length,
             "sigma": finite_or_none(self.motion.sigma),
             "sigma_xyz": None,
@@ -252,8 +252,8 @@ class Report:
         return {
             "clusters": sorted(entries, key=lambda entry: int(entry["cluster"])),
             "pooled": {
-                "D_R": None if pooled is None else _estimate_dict(pooled.D_R),
-                "D_T": None if pooled is None else _estimate_dict(pooled.D_T),
+                "D_R": None if pooled is None else pooled.D_R.to_dict(),
+                "D_T": None if pooled is None else pooled.D_T.to_dict(),
                 "p_same": None if pooled is None else pooled.D_R.p_same,
                 "clusters": [] if pooled is None else list(pooled.clusters),
             },
@@ -378,9 +378,9 @@ def _result_from(entry: dict[str, Any], motion: RigidMotion) -> ClusterResult:
     return ClusterResult(
         cluster=entry["cluster"],
         motion=motion,
-        D_R=_estimate_from(entry["D_R"]),
-        D_T=_estimate_from(entry["D_T"]),
-        tensor=None if entry["tensor"] is None else _tensor_from(entry["tensor"]),
+        D_R=DiffusionEstimate.from_dict(entry["D_R"]),
+        D_T=DiffusionEstimate.from_dict(entry["D_T"]),
+        tensor=None if entry["tensor"] is None else DiffusionTensor.from_dict(entry["tensor"]),
         noise=predicted_noise(motion),
         sizes=None if entry["sizes"] is None else _sizes_from(entry),
         warnings=tuple(entry["warnings"]),
@@ -397,8 +397,8 @@ def _rod_from(entry: dict[str, Any], motion: RodMotion) -> RodResult:
     return RodResult(
         cluster=entry["cluster"],
         motion=motion,
-        D_perp=_estimate_from(entry["D_perp"]),
-        D_T=_estimate_from(entry["D_T"]),
+        D_perp=DiffusionEstimate.from_dict(entry["D_perp"]),
+        D_T=DiffusionEstimate.from_dict(entry["D_T"]),
         warnings=tuple(entry["warnings"]),
         label=entry["label"],
         prediction=_prediction_from(entry),
@@ -421,7 +421,7 @@ def _pooled_from(entry: dict[str, Any]) -> Pooled | None:
     """Rebuild the pooled values; None where there were only rods."""
     if entry["D_R"] is None:
         return None
-    estimates = _estimate_from(entry["D_R"]), _estimate_from(entry["D_T"])
+    estimates = DiffusionEstimate.from_dict(entry["D_R"]), DiffusionEstimate.from_dict(entry["D_T"])
     return Pooled(*estimates, tuple(entry["clusters"]))
 
 
