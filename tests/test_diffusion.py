@@ -21,8 +21,7 @@ from perrin import (
 )
 from perrin._text import with_error
 from perrin.diffusion.likelihood import Likelihood
-from perrin.diffusion.noise_model import NoisySteps
-from perrin.diffusion.steps import steps_of
+from perrin.diffusion.steps import NoisySteps, steps_of
 
 TETRAHEDRON = Cluster.tetrahedron(1.5)
 SIGMA = 0.03  # sigma/R = 0.02

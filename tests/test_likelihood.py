@@ -8,9 +8,8 @@ from scipy.stats import multivariate_normal
 
 from perrin import Cluster, add_noise, simulate_motion, track_rotation
 from perrin.diffusion.likelihood import Likelihood
-from perrin.diffusion.noise_model import NoisySteps
 from perrin.diffusion.step_kernels import SineModes, TridiagonalCovariance
-from perrin.diffusion.steps import steps_of
+from perrin.diffusion.steps import NoisySteps, steps_of
 
 QUANTITIES = ("rotation", "translation")
 SIGMA = 0.03

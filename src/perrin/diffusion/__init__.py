@@ -33,11 +33,7 @@ from perrin.diffusion.moments import (
     step_cosines,
     trace_estimate,
 )
-from perrin.diffusion.noise_model import (
-    Noise,
-    NoisySteps,
-    noise_faults,
-)
+from perrin.diffusion.noise_model import Noise, noise_faults
 from perrin.diffusion.rods import (
     estimate_rod,
 )
@@ -69,6 +65,7 @@ from perrin.diffusion.step_tests import (
     without_spin,
 )
 from perrin.diffusion.steps import (
+    NoisySteps,
     Steps,
     body_steps,
     center_steps,

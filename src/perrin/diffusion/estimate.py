@@ -38,6 +38,15 @@ class Found:
     p_same: float | None = None
     stderr: float | None = None  # half the width of ci68 unless given
 
+    @classmethod
+    def normal(cls, value: float, stderr: float, offset: float, offset_stderr: float) -> Found:
+        """Return a value with the intervals of a normal distribution."""
+        ci68, ci95 = (
+            (float(value - z * stderr), float(value + z * stderr))
+            for z in (NORMAL[0.68], NORMAL[0.95])
+        )
+        return cls(float(value), ci68, ci95, offset, offset_stderr)
+
 
 @dataclass(frozen=True)
 class DiffusionEstimate:

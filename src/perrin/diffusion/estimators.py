@@ -12,8 +12,8 @@ from perrin._arrays import choice_fault, refuse
 from perrin.diffusion.estimate import CHI2, DiffusionEstimate, Found
 from perrin.diffusion.likelihood import Likelihood, excess_scatter
 from perrin.diffusion.moments import covariance_estimate, trace_estimate
-from perrin.diffusion.noise_model import Noise, NoisySteps, noise_faults
-from perrin.diffusion.steps import Quantity, Steps, pooled_steps
+from perrin.diffusion.noise_model import Noise, noise_faults
+from perrin.diffusion.steps import NoisySteps, Quantity, Steps, pooled_steps
 from perrin.errors import PrecisionWarning
 from perrin.motion.rigid_motion import RigidMotion
 
@@ -141,13 +141,13 @@ def _found(
     if method == "trace":
         blur = (settings.exposure or 0.0) * motions[0].dt / 3
         if settings.model == "joint":
-            return trace_estimate(motions, noise=None, blur=blur).with_normal_intervals()
+            return Found.normal(*trace_estimate(motions, noise=None, blur=blur))
         sigma = [s.sigma if isinstance(settings.model, str) else settings.model for s in steps]
         given = [one**2 * s.complete for one, s in zip(sigma, steps, strict=True)]
-        return trace_estimate(motions, noise=given, blur=blur).with_normal_intervals()
+        return Found.normal(*trace_estimate(motions, noise=given, blur=blur))
     tracks = [NoisySteps.of(s, settings) for s in steps]
     if method == "cve":
-        return covariance_estimate(tracks).with_normal_intervals()
+        return Found.normal(*covariance_estimate(tracks))
     return by_likelihood(tracks)
 
 

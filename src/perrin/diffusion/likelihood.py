@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from perrin._arrays import Bools, Floats
-    from perrin.diffusion.noise_model import NoisySteps
+    from perrin.diffusion.steps import NoisySteps
 
 
 # Lowest and highest logarithm of an offset theta in units of the mean square step. Without

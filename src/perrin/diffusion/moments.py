@@ -6,13 +6,11 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from perrin.diffusion.estimate import NORMAL, Found
-
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from perrin._arrays import Floats, Ints
-    from perrin.diffusion.noise_model import NoisySteps
+    from perrin.diffusion.steps import NoisySteps
     from perrin.motion.rigid_motion import RigidMotion
 
 
@@ -23,14 +21,6 @@ class Moments(NamedTuple):
     stderr: float
     offset: float
     offset_stderr: float
-
-    def with_normal_intervals(self) -> Found:
-        """Return the value with the intervals of a normal distribution."""
-        ci68, ci95 = (
-            (float(self.value - z * self.stderr), float(self.value + z * self.stderr))
-            for z in (NORMAL[0.68], NORMAL[0.95])
-        )
-        return Found(float(self.value), ci68, ci95, self.offset, self.offset_stderr)
 
 
 class _QuadraticForm(NamedTuple):

@@ -8,8 +8,8 @@ import numpy as np
 
 from perrin.diffusion.estimate import DiffusionEstimate
 from perrin.diffusion.estimators import by_likelihood
-from perrin.diffusion.noise_model import Noise, NoisySteps
-from perrin.diffusion.steps import center_steps, direction_steps
+from perrin.diffusion.noise_model import Noise
+from perrin.diffusion.steps import NoisySteps, center_steps, direction_steps
 from perrin.errors import TooFewFramesError
 
 if TYPE_CHECKING:

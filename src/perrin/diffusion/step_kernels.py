@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from perrin._arrays import Bools, Floats, Ints
-    from perrin.diffusion.noise_model import NoisySteps
+    from perrin.diffusion.steps import NoisySteps
 
 
 # Lower bound of every eigenvalue: zero noise and no diffusion give no density.

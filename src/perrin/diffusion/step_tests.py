@@ -11,9 +11,8 @@ import numpy as np
 from perrin._arrays import from_plain, frozen, to_plain
 from perrin.diffusion.estimators import estimate_diffusion
 from perrin.diffusion.likelihood import Likelihood
-from perrin.diffusion.noise_model import NoisySteps
 from perrin.diffusion.step_kernels import covariance_bands
-from perrin.diffusion.steps import steps_of
+from perrin.diffusion.steps import NoisySteps, steps_of
 from perrin.errors import PrecisionWarning, TooFewFramesError
 from perrin.geometry.rotations import exp_map
 

@@ -1,4 +1,4 @@
-"""Steps of a motion: their vectors, durations and links, and the noise of their frames."""
+"""Steps of a motion: their vectors, durations and links, the noise of their frames, its model."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from perrin._arrays import Bools, Floats, Ints
+    from perrin.diffusion.noise_model import Noise
     from perrin.motion.rigid_motion import RigidMotion
     from perrin.motion.rods import RodMotion
 
@@ -123,6 +124,99 @@ class Steps:
         rows = steady.reshape(vectors.size, -1)
         mean: Floats = np.linalg.lstsq(rows, vectors.ravel(), rcond=None)[0].astype(np.float64)
         return replace(self, vectors=self.vectors - self.steady @ mean), mean
+
+
+@dataclass(frozen=True, eq=False)
+class NoisySteps:
+    """The steps of one motion with what is known of their noise, for a single D.
+
+    The noise variance of a frame is s = weight theta + known, and its offset s - b D where motion
+    blur takes b D from it. Only the diagonal of the noise covariances is used.
+
+    Attributes
+    ----------
+    steps : Steps
+        Steps along axes in which the noise is diagonal, without their steady motion where that is
+        free.
+    weight : tuple of ndarray, shape (S, A)
+        Noise variance of the frames before and after each step, per unit of theta.
+    known : tuple of ndarray, shape (S, A)
+        Known part of these variances.
+    blur : float
+        b of the offset s - b D, s.
+    theta : float
+        Value of a fixed theta, or the estimate of a free one from the residuals.
+    freedom : float
+        Degrees of freedom of that estimate: 0 where there is none, inf where theta is fixed.
+    level : float
+        Mean of `known` over the frames that show the most particles.
+    drift : bool
+        Whether a steady velocity or spin is free.
+    steady : ndarray, shape (p,)
+        Least-squares steady motion that was subtracted; zeros without drift.
+    """
+
+    steps: Steps
+    weight: tuple[Floats, Floats]
+    known: tuple[Floats, Floats]
+    blur: float
+    theta: float
+    freedom: float
+    level: float
+    drift: bool = False
+    steady: Floats = field(default_factory=lambda: np.zeros(0))
+
+    @classmethod
+    def of(cls, steps: Steps, noise: Noise) -> NoisySteps:
+        """Return the steps with the noise that the options state; blur takes b D from it."""
+        if noise.model == "joint":
+            # An unknown exposure may blur up to the limit at which steps stop being possible.
+            unknown = noise.exposure is None
+            blur = steps.duration.min() / 2 if unknown else (noise.exposure or 0.0) * steps.dt / 3
+            return cls.free(steps, blur=float(blur), drift=noise.drift)
+        blur = (noise.exposure or 0.0) * steps.dt / 3
+        if noise.model == "residual":
+            return cls.from_residuals(steps, blur=blur, drift=noise.drift)
+        return cls.fixed(steps, sigma=float(noise.model), blur=blur, drift=noise.drift)
+
+    @classmethod
+    def free(cls, steps: Steps, *, blur: float, drift: bool) -> NoisySteps:
+        """Leave the offset free; known is by how much a frame exceeds the least noisy one."""
+        noise = [steps.sigma**2 * n for n in steps.variances]
+        least = min(float(n.min()) for n in noise)
+        one = np.ones_like(noise[0])
+        known = noise[0] - least, noise[1] - least
+        level = steps.sigma**2 * steps.complete - least
+        steps, steady = _subtracted(steps, drift=drift)
+        return cls(steps, (one, one), known, blur, 0.0, 0.0, level, drift, steady)
+
+    @classmethod
+    def from_residuals(cls, steps: Steps, *, blur: float, drift: bool) -> NoisySteps:
+        """Estimate theta from the rigid-fit residuals, with their degrees of freedom."""
+        theta = steps.sigma**2 * steps.complete
+        if theta == 0:
+            return cls.fixed(steps, sigma=0.0, blur=blur, drift=drift)
+        before, after = steps.variances
+        weight = before / steps.complete, after / steps.complete
+        none = np.zeros_like(before)
+        freedom = float(steps.freedom)
+        steps, steady = _subtracted(steps, drift=drift)
+        return cls(steps, weight, (none, none), blur, theta, freedom, 0.0, drift, steady)
+
+    @classmethod
+    def fixed(cls, steps: Steps, *, sigma: float, blur: float, drift: bool) -> NoisySteps:
+        """Take the localisation error sigma (um) as known."""
+        before, after = steps.variances
+        known = sigma**2 * before, sigma**2 * after
+        none = np.zeros_like(before)
+        level = sigma**2 * steps.complete
+        steps, steady = _subtracted(steps, drift=drift)
+        return cls(steps, (none, none), known, blur, 0.0, np.inf, level, drift, steady)
+
+
+def _subtracted(steps: Steps, *, drift: bool) -> tuple[Steps, Floats]:
+    """Return the steps without their steady motion, and that motion; unchanged without drift."""
+    return steps.without_steady_motion() if drift else (steps, np.zeros(steps.steady.shape[2]))
 
 
 def steps_of(motion: RigidMotion, quantity: Quantity) -> Steps:
