@@ -301,7 +301,13 @@ class Likelihood:
 
 
 def log_slope_ratio(rise: Floats, fall: Floats) -> Floats:
-    """Return the logarithm of rise over fall; negative where both are zero."""
+    """Return the logarithm of rise over fall; negative where both are zero.
+
+    Examples
+    --------
+    >>> log_slope_ratio(np.array([1.0, 0.0]), np.array([1.0, 0.0]))
+    array([  0., -60.])
+    """
     ratio = rise / np.maximum(fall, LEAST_EIGENVALUE)
     return np.asarray(
         np.log(np.minimum(np.maximum(ratio, _LEAST_SLOPE_RATIO), 1 / _LEAST_SLOPE_RATIO))
@@ -311,7 +317,14 @@ def log_slope_ratio(rise: Floats, fall: Floats) -> Floats:
 def secant_trial(
     t: Floats, slope: Floats, old: Floats, old_slope: Floats, low: Floats, high: Floats
 ) -> Floats:
-    """Return the next trial: the secant step, or the middle of the bracket where that leaves it."""
+    """Return the next trial: the secant step, or the middle of the bracket where that leaves it.
+
+    Examples
+    --------
+    >>> t, slope, old, old_slope, low, high = np.array([[1.0], [2.0], [0.0], [4.0], [1.0], [9.0]])
+    >>> secant_trial(t, slope, old, old_slope, low, high)
+    array([2.])
+    """
     rise, run = slope - old_slope, t - old
     step = np.divide(slope * run, rise, out=np.full_like(t, np.nan), where=rise != 0)
     target = np.where(rise * run < 0, t - step, np.nan)
@@ -328,6 +341,11 @@ def newton_crossing(
     """Return where a height falls through zero between `inside` (> 0) and `outside` (< 0).
 
     Newton steps, halved into the bracket, or doubled away from `inside` while there is no bracket.
+
+    Examples
+    --------
+    >>> newton_crossing(lambda x: (2 - x * x, -2 * x), inside=1.0, start=3.0, outside=np.inf)
+    1.414213562373095
     """
     x = start if min(inside, outside) < start < max(inside, outside) else (inside + outside) / 2
     for _ in range(200):
@@ -363,6 +381,16 @@ def excess_scatter(tracks: Sequence[NoisySteps], D: float, theta: Floats) -> flo
     -------
     float
         At least 1.
+
+    Examples
+    --------
+    >>> from perrin import Cluster, simulate_motion
+    >>> from perrin.diffusion import Noise, NoisySteps, steps_of
+    >>> D_R = [1e-3, 1e-3, 1e-2]
+    >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=D_R, dt=0.7, n_frames=300, rng=3)
+    >>> track = NoisySteps.of(steps_of(truth, "rotation"), Noise())
+    >>> excess_scatter([track], 4e-3, np.zeros(1)) > 1.4
+    True
     """
     parts = [_squared_deviations(t, D, float(own)) for t, own in zip(tracks, theta, strict=True)]
     excess, scale = np.sum(parts, axis=0)

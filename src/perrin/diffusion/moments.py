@@ -38,7 +38,7 @@ def covariance_estimate(tracks: Sequence[NoisySteps]) -> Moments:
     """Estimate D from mean squares and products of neighbouring steps.
 
     With the noise free, D = <y^2>/2t + <y y'>/t (Vestergaard, Blainey and Flyvbjerg 2014): the
-    negative correlation that the shared frame gives two steps takes the noise off. With the noise
+    negative correlation that the shared frame gives two steps subtracts the noise. With the noise
     given, D = (<y^2> - 2 s)/2t. Gaps enter with their durations.
 
     The errors are those of a quadratic form in Gaussian steps with the covariance found.
@@ -116,7 +116,7 @@ def _form_variance(track: NoisySteps, form: _QuadraticForm, D: float, offset: fl
     diagonal = q * a + rb
     upper = q * b + r * a[1:]
     lower = q * b + r * a[:-1]
-    # Two beside the diagonal: Q_{i,i+1} C_{i+1,i+2}, and back.
+    # Second off-diagonal: Q_{i,i+1} C_{i+1,i+2}, and its transpose.
     far = (r[:-1] * b[1:]) * (r[1:] * b[:-1])
     return 2 * float(np.sum(diagonal**2) + 2 * np.sum(upper * lower) + 2 * np.sum(far))
 
@@ -128,7 +128,7 @@ def trace_estimate(
 
     For Brownian rotation <tr R_k^T R_{k+1}>/3 = exp(-2 D t) whatever D t is (in the plane
     <cos> = exp(-D t)). Noise adds 2 s (s in the plane) to the exponent: with the noise free it is
-    taken off as the difference between two steps and one.
+    subtracted as the difference between two steps and one.
 
     Parameters
     ----------

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from perrin._arrays import choice_fault, refuse
 from perrin.diffusion.estimate import DiffusionEstimate
 from perrin.diffusion.estimators import by_likelihood
 from perrin.diffusion.noise_model import Noise
@@ -36,6 +37,8 @@ def estimate_rod(
     ------
     TooFewFramesError
         Fewer than 3 frames in a row.
+    ValueError
+        For another quantity.
 
     Examples
     --------
@@ -45,11 +48,12 @@ def estimate_rod(
     >>> estimate.ci95[0] < 0.01 < estimate.ci95[1]
     True
     """
+    refuse(choice_fault("quantity", quantity, ("direction", "translation")))
     steps = direction_steps(motion) if quantity == "direction" else center_steps(motion)
     if len(steps.duration) < 2:
         raise TooFewFramesError(
             f"{motion.fitted.size} frames show the rod in too few steps: at least 3 in a row "
-            "(gaps allowed) are needed to tell diffusion from noise",
+            "(gaps allowed) are needed to separate diffusion from noise",
             int(motion.fitted.size),
         )
     return DiffusionEstimate.judged(

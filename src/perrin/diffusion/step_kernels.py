@@ -22,7 +22,7 @@ def difference_eigenvalues(n_steps: int) -> Floats:
     """Return 1 - cos(k pi/(N + 1)) for k = 1..N, the noise of N even steps by sine mode.
 
     The noise of independent frames, of variance 1, gives N steps the covariance 2 on the diagonal
-    and -1 beside it, the second difference. Its eigenvectors are the modes of the sine transform
+    and -1 next to it, the second difference. Its eigenvectors are the modes of the sine transform
     (DST-I), and these numbers are half its eigenvalues.
 
     Examples
@@ -92,7 +92,7 @@ class SineModes:
     count : ndarray, shape (M,)
         Number of those axes.
     by_D, by_theta, given : ndarray, shape (M,)
-        Slopes of the eigenvalue in D and in theta, and the known rest of it.
+        Slopes of the eigenvalue in D and in theta, and its known part.
     """
 
     groups: Ints
@@ -239,7 +239,7 @@ class TridiagonalCovariance:
     def sums(self, D: Floats, theta: Floats) -> GroupSlopes:
         """Evaluate all motions at the D and the theta of each.
 
-        The slopes need z z^T and C^-1, z = C^-1 y, on the diagonal and beside it, summed over the
+        The slopes need z z^T and C^-1, z = C^-1 y, on both diagonals, summed over the
         columns of a block.
         """
         from scipy.linalg.lapack import dpttrf, dpttrs
@@ -302,7 +302,7 @@ class TridiagonalCovariance:
         return mean, gram
 
     def bands(self, D: Floats, theta: Floats) -> tuple[Floats, Floats]:
-        """Return the diagonal of the covariance of all steps and the one beside it."""
+        """Return the diagonal and the first off-diagonal of the covariance of all steps."""
         D, theta, blur = (self.by_row(x) for x in (D, theta, self.blur))
         return covariance_bands(
             D, theta, self.tau, self.linked, blur=blur, weight=self.weight, known=self.known
@@ -323,10 +323,16 @@ def covariance_bands(
     weight: tuple[Floats, Floats],
     known: tuple[Floats, Floats],
 ) -> tuple[Floats, Floats]:
-    """Return the diagonal of the covariance of steps and the one beside it, along the first axis.
+    """Return diagonal and first off-diagonal of the covariance of steps, along the first axis.
 
     The variance is 2 D tau + o_before + o_after and the covariance with the next step -o_after,
     o = weight theta + known - blur D.
+
+    Examples
+    --------
+    >>> one = np.ones(3)
+    >>> covariance_bands(2.0, 0.5, one, one, blur=0.0, weight=(one, one), known=(0 * one, 0 * one))
+    (array([5., 5., 5.]), array([-0.5, -0.5]))
     """
     before, after = (w * theta + k - blur * D for w, k in zip(weight, known, strict=True))
     return 2 * D * tau + before + after, -(after * linked)[:-1]

@@ -101,7 +101,7 @@ class Jumps:
     def from_dict(cls, entry: dict[str, Any]) -> Jumps:
         """Return the jumps that `to_dict` wrote."""
         rows = from_plain(entry["rows"], dtype=np.int64)
-        size = from_plain(entry["size"]).reshape(len(rows), -1)
+        size = from_plain(entry["size"]).reshape(len(rows), -1 if len(rows) else 0)
         return cls(rows, size, from_plain(entry["p"]), entry["n_steps"])
 
 
@@ -156,7 +156,7 @@ def find_jumps(motion: RigidMotion, estimate: DiffusionEstimate) -> Jumps:
     The residual of each step given all others, z = (C^-1 y) / (C^-1)_jj over the root of its
     variance 1/(C^-1)_jj, is chi-squared with d degrees of freedom in z M^-1 z, M the mean of
     z z^T, which also takes up unequal axes. A first M comes from the half of the steps with the
-    smallest z, so that jumps do not hide each other; the final one from all steps that are no
+    smallest z, so that one jump does not mask another; the final one from all steps that are no
     candidates, with D and noise fitted to them, and the p-value is that of Hotelling's T^2.
     Candidates are left out of the prediction of their neighbours. A displaced frame has the
     residual of a step and its successor with opposite signs; where that one is larger, and the
@@ -188,19 +188,21 @@ def find_jumps(motion: RigidMotion, estimate: DiffusionEstimate) -> Jumps:
     if len(stop) < _FEWEST_STEPS or not estimate.value > 0:
         return none
     likely = np.zeros(len(stop), dtype=np.bool_)
-    rest = estimate
+    without_jumps = estimate
     for _ in range(_MOST_CANDIDATE_ROUNDS):
-        more = _jump_candidates(leave_one_out_residuals(motion, rest, without=likely), likely)
+        more = _jump_candidates(
+            leave_one_out_residuals(motion, without_jumps, without=likely), likely
+        )
         if not more.any() or 2 * np.count_nonzero(likely | more) > len(stop):
             break
         likely |= more
         try:
-            rest = _estimated_alike(cut_at(motion, stop[likely]), estimate)
+            without_jumps = _estimated_alike(cut_at(motion, stop[likely]), estimate)
         except TooFewFramesError:
             return none
     if not likely.any():
         return none
-    residuals = leave_one_out_residuals(motion, rest, without=likely).step
+    residuals = leave_one_out_residuals(motion, without_jumps, without=likely).step
     z, others = residuals[likely], residuals[~likely]
     count, d = others.shape
     # Of a body at rest the residuals are a slow wave, of which one track shows few periods: M may
@@ -214,7 +216,15 @@ def find_jumps(motion: RigidMotion, estimate: DiffusionEstimate) -> Jumps:
 
 
 def cut_at(motion: RigidMotion, rows: Ints) -> RigidMotion:
-    """Return the motion with a new piece at each of the rows, so that no step ends there."""
+    """Return the motion with a new piece at each of the rows, so that no step ends there.
+
+    Examples
+    --------
+    >>> from perrin import Cluster, simulate_motion
+    >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=5, rng=3)
+    >>> cut_at(truth, np.array([2])).steps()[1].tolist()
+    [1, 3, 4]
+    """
     begins = np.zeros(len(motion.time), dtype=np.int64)
     begins[rows] = 1
     return replace(motion, piece=motion.piece + np.cumsum(begins))
@@ -257,7 +267,7 @@ def steady_motion(motion: RigidMotion, estimate: DiffusionEstimate) -> SteadyMot
     Notes
     -----
     Generalised least squares of the steps on X_k = Q_k^T tau_k (Q_k the rotation to the lab; the
-    identity for the centre) with the covariance of diffusion and noise fitted beside it; the
+    identity for the centre) with the covariance of diffusion and noise fitted together with it; the
     information over d is F(d, nu) with nu = 2 / (relative variance of D).
 
     Examples

@@ -243,7 +243,7 @@ def steps_of(motion: RigidMotion, quantity: Quantity) -> Steps:
     if len(start) < 2:
         raise TooFewFramesError(
             f"{motion.fitted.size} frames with a pose in too few steps: at least 3 in a row (gaps "
-            "allowed) are needed to tell diffusion from noise",
+            "allowed) are needed to separate diffusion from noise",
             int(motion.fitted.size),
         )
     fitted = np.isfinite(motion.center[:, 0])
@@ -280,7 +280,15 @@ def steps_of(motion: RigidMotion, quantity: Quantity) -> Steps:
 
 
 def pooled_steps(motions: Sequence[RigidMotion], quantity: Quantity) -> list[Steps]:
-    """Return the steps of every motion; an error names the motion where there are several."""
+    """Return the steps of every motion; an error names the motion where there are several.
+
+    Examples
+    --------
+    >>> from perrin import Cluster, simulate_motion
+    >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=9, rng=3)
+    >>> [len(steps.duration) for steps in pooled_steps([truth, truth], "translation")]
+    [8, 8]
+    """
     steps = []
     for number, motion in enumerate(motions):
         try:
@@ -309,6 +317,14 @@ def body_steps(motion: RigidMotion, quantity: Quantity | Literal["both"], turn: 
     -----
     The translation of a logarithm is V^-1 R_k^T (x_{k+1} - x_k) with
     V^-1 = 1 - [w]/2 + (1 - (a/2) cot(a/2)) [w]^2/a^2 for the rotation vector w of angle a.
+
+    Examples
+    --------
+    >>> from perrin import Cluster, simulate_motion
+    >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=9, rng=3)
+    >>> steps = body_steps(truth, "both", np.eye(3))
+    >>> steps.vectors.shape, steps.noise.shape
+    ((8, 6), (2, 9, 6, 6))
     """
     start, stop = motion.steps()
     w = motion.step_vectors()[stop - 1]
@@ -353,6 +369,14 @@ def direction_steps(motion: RodMotion) -> Steps:
     in two axes perpendicular to u that are carried by the least rotations (parallel transport),
     so that the noise of one frame enters two neighbouring steps with opposite signs. The noise is
     known as such, not as a multiple of sigma^2: sigma is 1.
+
+    Examples
+    --------
+    >>> from perrin import Cluster, simulate_motion, track_direction
+    >>> truth = simulate_motion(Cluster.touching(2, 2.0), D_R=0.01, dt=0.5, n_frames=9, rng=2)
+    >>> rod = track_direction(truth.positions(), dt=0.5)
+    >>> direction_steps(rod).vectors.shape, center_steps(rod).vectors.shape
+    ((8, 2), (8, 3))
     """
     rows = motion.fitted
     u, v = motion.direction[rows[:-1]], motion.direction[rows[1:]]
@@ -391,7 +415,16 @@ def _rod_steps(motion: RodMotion, vectors: Floats, variance: Floats) -> Steps:
 
 
 def residual_freedom(motion: RigidMotion) -> int:
-    """Return the degrees of freedom of all rigid-fit residuals; the template costs those of one."""
+    """Return the degrees of freedom of all rigid-fit residuals; the template costs those of one.
+
+    Examples
+    --------
+    >>> from perrin import Cluster, simulate_motion
+    >>> residual_freedom(
+    ...     simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=9, rng=3)
+    ... )
+    48
+    """
     n, d = motion.template.shape
     freedom = degrees_of_freedom(motion.n_present[motion.fitted], d).sum()
     return int(freedom - degrees_of_freedom(np.array(n), d))

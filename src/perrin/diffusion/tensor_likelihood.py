@@ -26,12 +26,12 @@ _MOST_BLUR = 0.25
 
 
 # Where D and noise have the same shape only noise less blur is determined; then this slope of the
-# log-likelihood chooses the answer with the least blur. It weighs 0.025 in all.
+# log-likelihood selects the least blur. It changes the log-likelihood by 0.025 at most.
 _LEAST_BLUR = 0.1
 
 
 # A search has converged where another step would gain this much: 5e-9 standard errors. A gain below
-# the second number is hidden by rounding, and steps are accepted without one.
+# the second number is hidden by rounding, and steps are accepted without it.
 _CONVERGED_GAIN, _ROUNDING_GAIN = 1e-17, 1e-9
 
 
@@ -101,7 +101,7 @@ class NoisyVectors:
         return value, by_D, np.concatenate([np.empty(0), *out])
 
     def noise(self, D: Floats, own: Floats) -> Floats:
-        """Return the mean noise O of a frame, (b, b), blur taken off."""
+        """Return the mean noise O of a frame, less its blur, (b, b)."""
         free = np.isfinite(self.freedom)
         theta = own[: len(self.theta)] ** 2 if free else self.theta
         B = _MOST_BLUR * float(np.sin(own[-1])) ** 2 if self.B is None else self.B
@@ -155,8 +155,8 @@ class NoisyVectors:
         """Evaluate any steps by banded Cholesky factors of their covariance.
 
         With P and Q the pivot blocks of the elimination from above and from below and A the
-        diagonal blocks, the diagonal blocks of the inverse are (P + Q - A)^-1; those beside them
-        are -P^-1 times the block beside A times the next diagonal one.
+        diagonal blocks, the diagonal blocks of the inverse are (P + Q - A)^-1; those next to them
+        are -P^-1 times the block next to A times the next diagonal one.
         """
         from scipy.linalg.lapack import dpbtrs
 
@@ -191,7 +191,14 @@ def _undefined(D: Floats, theta: Floats) -> TensorSlopes:
 
 
 def band_factor(diagonal: Floats, beside: Floats) -> tuple[Floats, Floats, float]:
-    """Return the banded Cholesky factor of a block tridiagonal matrix, its pivots and log det."""
+    """Return the banded Cholesky factor of a block tridiagonal matrix, its pivots and log det.
+
+    Examples
+    --------
+    >>> factor, pivots, log_det = band_factor(4 * np.ones((2, 1, 1)), 2 * np.ones((1, 1, 1)))
+    >>> pivots.ravel(), round(float(np.exp(log_det)), 6)
+    (array([4., 3.]), 12.0)
+    """
     from scipy.linalg.lapack import dpbtrf
 
     count, b, _ = diagonal.shape
@@ -210,7 +217,13 @@ def band_factor(diagonal: Floats, beside: Floats) -> tuple[Floats, Floats, float
 
 
 def symmetric_inverses(a: Floats) -> Floats:
-    """Return the inverses of symmetric matrices (S, b, b), by cofactors where b = 3."""
+    """Return the inverses of symmetric matrices (S, b, b), by cofactors where b = 3.
+
+    Examples
+    --------
+    >>> symmetric_inverses(np.diag([1.0, 2.0, 4.0])[None])[0].diagonal()
+    array([1.  , 0.5 , 0.25])
+    """
     if a.shape[1] != 3:
         return np.asarray(np.linalg.inv(a))
     i, j = np.array([1, 2, 0]), np.array([2, 0, 1])
@@ -223,8 +236,14 @@ def symmetric_inverses(a: Floats) -> Floats:
 def squares(basis: Floats) -> Family:
     """Return the family D = L^2 with L = sum q_j E_j: all tensors >= 0 that share a symmetry.
 
-    The basis (m, b, b) spans the symmetric matrices that the symmetry leaves alone; with L also
-    L^2 is left alone.
+    The basis (m, b, b) spans the symmetric matrices that are invariant under the symmetry; with L
+    also L^2 is invariant.
+
+    Examples
+    --------
+    >>> D, slopes = squares(np.eye(3)[None])(np.array([2.0]))
+    >>> D.diagonal(), slopes[0].diagonal()
+    (array([4., 4., 4.]), array([4., 4., 4.]))
     """
 
     def family(q: Floats) -> tuple[Floats, Floats]:
@@ -239,6 +258,12 @@ def axial(axis: Floats) -> Family:
     """Return the tensors a^2 across and c^2 along an axis that may tilt away from this one.
 
     The parameters are a, c and the tilt along the two directions across.
+
+    Examples
+    --------
+    >>> D, slopes = axial(np.array([0.0, 0.0, 1.0]))(np.array([1.0, 2.0, 0.0, 0.0]))
+    >>> D.diagonal(), slopes.shape
+    (array([1., 1., 4.]), (4, 3, 3))
     """
     across = np.linalg.svd(axis[None])[2][1:]
 
@@ -290,8 +315,8 @@ def maximise(tracks: Sequence[NoisyVectors], family: Family, q: Floats, own: Flo
         return Maximum(value, *problem.tensor_and_noise(p))
     raise ValueError(
         f"the likelihood of these {sum(len(t.steps.vectors) for t in tracks)} steps has no maximum "
-        "that a search settles at: they hold too little about diffusion and noise; take longer "
-        "tracks"
+        "at which a search converges: they hold too little information about diffusion and noise; "
+        "take longer tracks"
     )
 
 
@@ -439,6 +464,12 @@ def bfgs_update(inverse: Floats, step: Floats, fall: Floats) -> Floats:
     """Return the BFGS update of an inverse Hessian; unchanged where the curvature is not positive.
 
     `fall` is the fall of the slopes along the step.
+
+    Examples
+    --------
+    >>> bfgs_update(np.eye(2), np.array([1.0, 0.0]), np.array([4.0, 0.0]))
+    array([[0.25, 0.  ],
+           [0.  , 1.  ]])
     """
     along = float(step @ fall)
     if not along > 1e-14 * float(np.linalg.norm(step) * np.linalg.norm(fall)):

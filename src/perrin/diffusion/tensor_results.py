@@ -184,7 +184,7 @@ class DiffusionTensor:
             return "axes known to " + ", ".join(f"{w:.0f}" for w in worst) + " degrees"
         if known.size == 1:
             a, b = (k + 1 for k in range(3) if k != known[0])
-            why = f"are equal by symmetry {self.symmetry}" if equal else "cannot be told apart"
+            why = f"are equal by symmetry {self.symmetry}" if equal else "cannot be distinguished"
             return (
                 f"values {a} and {b} {why}: the plane of their axes is known, not the axes; its "
                 f"normal, axis {known[0] + 1}, to {worst[known[0]]:.0f} degrees"
@@ -192,7 +192,7 @@ class DiffusionTensor:
         mean = "D_R, the mean" if self.quantity == "rotation" else "D_T, the mean"
         if equal:
             return f"the values are equal by symmetry {self.symmetry}: read {mean}"
-        return f"the axes cannot be told apart: read {mean}, not the three sorted values"
+        return f"the axes cannot be distinguished: read {mean}, not the three sorted values"
 
     def to_dict(self) -> dict[str, Any]:
         """Return the tensor as JSON holds it; unknown errors are None."""

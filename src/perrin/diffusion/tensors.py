@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from perrin.diffusion.steps import Steps
 
 
-# Noise this far below a step (variance) is none: simulated truth, whose residuals are rounding.
+# Noise below this variance, relative to a step's, is rounding: that of simulated truth.
 _NOISELESS = 1e-8
 
 
@@ -65,7 +65,7 @@ def diffusion_tensor(
         tensor, each with its own noise; their templates are turned onto the first.
     quantity : {"rotation", "translation"}
         From body-frame rotation vectors, or from the centre's displacements in the axes that the
-        body has half way through each step; a drift of the sample is not taken off.
+        body has half way through each step; a drift of the sample is not subtracted.
     noise : {"joint", "residual"}, float or Noise
         "joint": the noise is predicted from the template but for one amplitude, which is estimated
         along with D. "residual": that amplitude is measured by the residuals of the rigid fit
@@ -77,20 +77,20 @@ def diffusion_tensor(
         as 0.
     symmetry : str, optional
         Schoenflies symbol of the point group that the tensor shares. Default: that of the template
-        within its error. "C_1" gives the tensor no symmetry. Another symbol is looked for with
+        within its error. "C_1" gives the tensor no symmetry. Another symbol is searched for with
         growing tolerance, as real clusters of unequal spheres need.
 
     Returns
     -------
     DiffusionTensor
-        The p-values are those of the fit without symmetry: they also say whether the data agree
+        The p-values are those of the fit without symmetry: they also test whether the data agree
         with a symmetry that makes values equal.
 
     Raises
     ------
     ValueError
         For planar motions, unknown choices, bodies that differ, a symmetry that the template has
-        not, or steps that hold too little.
+        not, or steps without enough information.
     TooFewFramesError
         Fewer than 12 steps in all, or fewer than 2 of a motion.
 
@@ -173,7 +173,7 @@ def coupled_tensor(
     Raises
     ------
     ValueError
-        For planar motions, an unknown point, or steps that hold too little.
+        For planar motions, an unknown point, or steps without enough information.
     TooFewFramesError
         Fewer than 50 steps.
 
@@ -241,8 +241,8 @@ def coupled_tensor(
 def axes_like(axes: Floats, reference: Floats) -> Ints:
     """Return the order of the columns of `axes` in which each lies nearest to the reference's.
 
-    Axes sorted by their own values are named by it as those of another tensor of the same body:
-    "axis 1" is then the same axis of the body.
+    It numbers axes that are sorted by their own values like those of another tensor of the same
+    body: "axis 1" is then the same axis of the body.
 
     Parameters
     ----------
@@ -318,12 +318,19 @@ def imposed_symmetry(motion: RigidMotion, wanted: str | None) -> tuple[str, Floa
         tolerance *= 1.3
     raise ValueError(
         f"symmetry: the template is not {wanted!r} within 0.3 of its closest distance; it is "
-        f"{' or '.join(dict.fromkeys(seen)) or 'too noisy to tell'} (C_1 asks for no symmetry)"
+        f"{' or '.join(dict.fromkeys(seen)) or 'too noisy to decide'} (C_1 imposes no symmetry)"
     )
 
 
 def symmetric_basis(b: int) -> Floats:
-    """Return a basis of the symmetric matrices, orthonormal, (b (b + 1) / 2, b, b)."""
+    """Return a basis of the symmetric matrices, orthonormal, (b (b + 1) / 2, b, b).
+
+    Examples
+    --------
+    >>> basis = symmetric_basis(3)
+    >>> bool(np.allclose(np.einsum("mij,nij->mn", basis, basis), np.eye(6)))
+    True
+    """
     unit = np.eye(b)
     pairs = zip(*np.tril_indices(b), strict=True)
     return np.array(
@@ -335,7 +342,13 @@ def symmetric_basis(b: int) -> Floats:
 
 
 def invariant_basis(elements: Floats) -> Floats:
-    """Return an orthonormal basis of the symmetric matrices that a point group leaves alone."""
+    """Return an orthonormal basis of the symmetric matrices that are invariant under a point group.
+
+    Examples
+    --------
+    >>> len(invariant_basis(np.array([np.eye(3), np.diag([-1.0, -1.0, 1.0])])))
+    4
+    """
     basis = symmetric_basis(3)
     mapped = np.einsum("gij,mjk,glk->mil", elements, basis, elements) / len(elements)
     share, mix = np.linalg.eigh(np.einsum("mij,nij->mn", basis, mapped))
@@ -401,7 +414,7 @@ class ScaledTracks:
         if len({np.isinf(track.freedom) for track in tracks}) > 1:
             raise ValueError(
                 "noise='residual': some motions show no noise at all (simulated truth) and others "
-                "do; pool them apart"
+                "do; pool these two kinds separately"
             )
         return cls(tracks, scale, time)
 
@@ -470,13 +483,27 @@ class ScaledTracks:
 
 
 def neighbour_products(steps: Steps) -> Floats:
-    """Return the summed products of neighbouring steps that share a frame, symmetric, (b, b)."""
+    """Return the summed products of neighbouring steps that share a frame, symmetric, (b, b).
+
+    Examples
+    --------
+    >>> from perrin import Cluster, simulate_motion
+    >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=30, rng=3)
+    >>> neighbour_products(body_steps(truth, "rotation", np.eye(3))).shape
+    (3, 3)
+    """
     product = (steps.vectors[:-1] * steps.linked[:-1, None]).T @ steps.vectors[1:]
     return np.asarray(0.5 * (product + product.T))
 
 
 def element_variance(covariance: Floats, a: Floats, b: Floats) -> float:
-    """Return the variance of a.D.b from the covariance of the elements of D."""
+    """Return the variance of a.D.b from the covariance of the elements of D.
+
+    Examples
+    --------
+    >>> element_variance(np.diag([1.0, 2, 3, 4, 5, 6]), np.eye(3)[0], np.eye(3)[1])
+    4.0
+    """
     weight = np.array(
         [a[i] * b[j] + (a[j] * b[i] if i != j else 0.0) for i, j in SYMMETRIC_ELEMENTS]
     )
@@ -484,9 +511,16 @@ def element_variance(covariance: Floats, a: Floats, b: Floats) -> float:
 
 
 def axis_errors(values: Floats, axes: Floats, covariance: Floats) -> Floats:
-    """Return by how many degrees one standard error of D_ab turns axes a and b.
+    """Return the angle, in degrees, by which one standard error of D_ab turns axes a and b.
 
     The angle is half the one whose tangent is 2 D_ab/(D_a - D_b).
+
+    Examples
+    --------
+    >>> axis_errors(np.array([1.0, 2, 4]), np.eye(3), 0.01 * np.eye(6)).round(1)
+    array([[0. , 5.7, 1.9],
+           [5.7, 0. , 2.9],
+           [1.9, 2.9, 0. ]])
     """
     errors = np.zeros((3, 3))
     rounding = 1e-9 * values[2]
