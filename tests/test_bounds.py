@@ -100,7 +100,7 @@ def test_the_limits_at_high_snr():
 
 
 def test_what_is_known_helps():
-    """Known noise is worth more than residuals, many residuals more than few, few than none."""
+    """Known noise lowers the bound more than residuals, many residuals more than few."""
     case = {"n_frames": 100, "snr": 0.7}
     residual = [cramer_rao(**case, noise="residual", residual_dof=dof) for dof in (1, 3, 6, 10**9)]
     bounds = [cramer_rao(**case), *residual]

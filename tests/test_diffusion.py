@@ -1,4 +1,4 @@
-"""D_R and D_T: the likelihood is what it claims, its answer follows every law, its errors cover."""
+"""D_R and D_T: estimates follow every law, planted values come back, intervals cover."""
 
 import dataclasses
 import json
@@ -309,7 +309,7 @@ def test_noisy_offsets_equal_the_floor(quantity, noisy):
 
 
 @pytest.mark.parametrize("quantity", QUANTITIES)
-def test_a_pool_of_five_is_worth_five(standard, quantity):
+def test_five_pooled_tracks_have_their_common_error(standard, quantity):
     """5 tracks pooled: 1/sqrt(5) of the error within 10 %; 8 (20) pools cover 6 (16) times."""
     motions, found = standard
     truth = planted(quantity)
@@ -361,7 +361,7 @@ def test_missing_particles_do_not_bias(blur, repeats):
     check_unbiased(
         [
             tracked(lossy(s, particles=0.15, cluster=cluster, substeps=blur))
-            for s in range(repeats(6, 30))
+            for s in range(repeats(5, 30))
         ]
     )
 
@@ -430,7 +430,8 @@ def test_an_anisotropic_body_has_a_third_of_the_trace(repeats):
     tensor = tensor @ np.diag([1e-3, 1e-3, 10e-3]) @ tensor.T
     found = []
     for seed in range(repeats(60, 150)):
-        m = simulate_motion(TETRAHEDRON, D_R=tensor, dt=1.0, n_frames=300, rng=seed)
+        frames = repeats(150, 300)
+        m = simulate_motion(TETRAHEDRON, D_R=tensor, dt=1.0, n_frames=frames, rng=seed)
         x = add_noise(m.positions(), sigma=SIGMA, rng=500 + seed)
         found.append(estimate_diffusion(tracked(x)))
     values = np.array([e.value for e in found])
@@ -489,7 +490,7 @@ def relative(motions, truth, **how):
 
 @pytest.mark.parametrize("method", ["mle", "cve"])
 @pytest.mark.parametrize("noise", ["residual", SIGMA])
-def test_known_noise_is_worth_three_times_the_frames(standard, method, noise):
+def test_known_noise_saves_two_thirds_of_the_frames(standard, method, noise):
     """At SNR 20 the spread falls from 8.3 % to the bound of 4.9 %, and the interval covers.
 
     Within three Monte-Carlo errors: 15 % of the spread of 200 tracks, and a cover of 0.90.
@@ -513,12 +514,13 @@ def test_stated_exposure_undoes_the_blur(repeats):
 
     Stated to the joint estimate it changes only the range of the noise offset.
     """
-    motions = [tracked(cloud(s, substeps=20, snr=5.0)) for s in range(repeats(10, 40))]
+    frames = repeats(150, 300)
+    motions = [tracked(cloud(s, frames, substeps=20, snr=5.0)) for s in range(repeats(12, 40))]
     truth = planted("rotation", 5.0)
     unstated = relative(motions, truth, noise="residual")
     stated = relative(motions, truth, noise="residual", exposure=1.0)
     joint = relative(motions, truth, exposure=1.0)
-    assert unstated[0] == pytest.approx(0.74, abs=repeats(0.05, 0.03))
+    assert unstated[0] == pytest.approx(0.74, abs=repeats(0.07, 0.03))
     assert abs(stated[0] - 1) < 3 * stated[1]
     assert abs(joint[0] - 1) < 3 * joint[1]
     assert stated[2] < joint[2]
@@ -567,8 +569,8 @@ def test_mean_cosines_are_exact_at_any_step(noise, repeats):
     mean, error, spread, cover = relative(tracks, 0.5, method="trace", noise=noise)
     assert abs(mean - 1) < 3 * error
     assert cover > least_cover(len(tracks))
-    stated = np.mean([estimate_diffusion(m, method="trace", noise=noise).stderr for m in tracks])
-    assert stated / 0.5 == pytest.approx(spread, rel=sd_error(len(tracks)))
+    stated = [estimate_diffusion(m, method="trace", noise=noise).stderr for m in tracks[:5]]
+    assert np.mean(stated) / 0.5 == pytest.approx(spread, rel=sd_error(len(tracks)))
     biased, biased_error, *_ = relative(tracks, 0.5, noise=noise)
     assert abs(biased - 0.9015) < 3 * biased_error
 
@@ -599,7 +601,7 @@ def test_drift_is_subtracted_and_reported(repeats):
     """
     flow = np.array([0.9, -0.3, 1.2]) * 5 * np.sqrt(2 * planted("translation"))
     time = np.arange(300.0)[:, None, None]
-    motions = [tracked(cloud(s) + flow * time) for s in range(repeats(10, 60))]
+    motions = [tracked(cloud(s) + flow * time) for s in range(repeats(8, 60))]
     truth = planted("translation")
     mean, error, _, cover = relative(motions, truth, quantity="translation", drift=True)
     assert abs(mean - 1) < 3 * error
@@ -626,7 +628,7 @@ def test_drift_by_reversal_and_time_unit():
 def test_the_probability_that_pooled_motions_agree(repeats):
     """p_same is uniform for equal D (pools of 5; Kolmogorov 1 %), and tiny for D that differ."""
     count = repeats(10, 40)
-    motions = [tracked(cloud(2000 + s, n_frames=60)) for s in range(5 * count)]
+    motions = [tracked(cloud(2000 + s, n_frames=repeats(50, 100))) for s in range(5 * count)]
     pools = [motions[5 * k : 5 * k + 5] for k in range(count)]
     p = np.sort([estimate_diffusion(pool).p_same for pool in pools])
     ranks = np.arange(1, count + 1) / count
@@ -812,7 +814,7 @@ def test_a_long_track_is_solved_from_any_guess():
 
 
 def test_too_few_frames_are_refused():
-    """Two poses, or three in pieces of two and one, cannot tell diffusion from noise."""
+    """Two poses, or three in pieces of two and one, cannot separate diffusion from noise."""
     two = tracked(cloud(1, n_frames=2))
     with pytest.raises(TooFewFramesError, match="2 frames") as caught:
         estimate_diffusion(two)
@@ -959,7 +961,7 @@ def test_an_estimate_comes_back_from_json():
     ],
 )
 def test_with_error(value, stderr, text):
-    """The error stands in brackets in units of the last digit; without one the value is alone."""
+    """The error is in brackets, in units of the last digit; without one there is only the value."""
     assert with_error(value, stderr) == text
 
 
@@ -987,7 +989,7 @@ def test_missing_frames_are_not_counted():
 @pytest.mark.parametrize("quantity", QUANTITIES)
 def test_an_estimate_takes_few_passes(standard, quantity, passes):
     """An estimate with both intervals takes under 250 passes over the steps."""
-    for motion in standard[0][:15]:
+    for motion in standard[0][:8]:
         passes.clear()
         estimate_diffusion(motion, quantity=quantity)
         assert len(passes) < 250

@@ -210,10 +210,10 @@ def brute(likelihood, D):
         scale = float(np.mean(likelihood.tracks[g].steps.vectors ** 2))
         grid = np.geomspace(1e-9, 1e3, 60)
         alone = Likelihood.of([likelihood.tracks[g]])
-        for _ in range(4):
+        for _ in range(5):
             values = [alone.sums(np.array([D]), np.array([scale * t])).value[0] for t in grid]
             k = int(np.argmax(values))
-            grid = np.geomspace(grid[max(k - 1, 0)], grid[min(k + 1, len(grid) - 1)], 12)
+            grid = np.geomspace(grid[max(k - 1, 0)], grid[min(k + 1, len(grid) - 1)], 14)
         total += max(values)
     return total
 
