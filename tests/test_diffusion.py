@@ -423,13 +423,13 @@ def test_an_anisotropic_body_has_a_third_of_the_trace(repeats):
     """D = (1, 1, 10)e-3 rad^2/s: the mean value is 4e-3, and the stated error is the scatter.
 
     Unequal axes scatter sqrt(34/16 x 3)/sqrt(3) = 1.46 times as widely as equal ones: the stated
-    error of an isotropic body would be 32 % low, beyond three Monte-Carlo errors (27 % of 60
+    error of an isotropic body would be 32 % low, beyond three Monte-Carlo errors (30 % of 50
     tracks, 17 % of 150), and its interval would cover 0.50 instead of 0.68.
     """
     tensor = kabsch(*np.random.default_rng(5).normal(size=(2, 5, 3)))
     tensor = tensor @ np.diag([1e-3, 1e-3, 10e-3]) @ tensor.T
     found = []
-    for seed in range(repeats(60, 150)):
+    for seed in range(repeats(50, 150)):
         frames = repeats(150, 300)
         m = simulate_motion(TETRAHEDRON, D_R=tensor, dt=1.0, n_frames=frames, rng=seed)
         x = add_noise(m.positions(), sigma=SIGMA, rng=500 + seed)
@@ -774,8 +774,8 @@ def test_a_body_at_rest_has_D_zero():
 @pytest.mark.parametrize("quantity", QUANTITIES)
 def test_a_pool_with_a_body_at_rest_is_finite(quantity):
     """One body that never moves gives D = 0 with certainty, and so does the pool."""
-    still = simulate_motion(TETRAHEDRON, D_R=0.0, dt=1.0, n_frames=50, rng=0)
-    found = estimate_diffusion([tracked(cloud(1, n_frames=50)), still], quantity=quantity)
+    still = simulate_motion(TETRAHEDRON, D_R=0.0, dt=1.0, n_frames=20, rng=0)
+    found = estimate_diffusion([tracked(cloud(1, n_frames=20)), still], quantity=quantity)
     assert_sane(found)
     assert not found.resolved
 
