@@ -565,7 +565,7 @@ def test_noise_exposure_and_drift_reach_the_estimates(base, whole):
     assert any("exposure is not stated" in w for w in held.notes)
     stated = perrin.analyze(base, dt=0.73, noise=0.03, exposure=0.0)
     assert stated.warnings == ()
-    assert stated.clusters[0].D_R.noise == "0.03 um"
+    assert stated.clusters[0].D_R.noise == 0.03
     moving = base.assign(x=base["x"] + 0.5 * base["frame"])
     flow = perrin.analyze(moving, dt=0.73, drift=True).clusters[0]
     assert flow.D_T.value == pytest.approx(free.D_T.value, rel=0.05)

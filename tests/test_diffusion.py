@@ -1,7 +1,7 @@
-"""D_R and D_T: the likelihood is what it claims, its answer follows every law, its errors cover."""
+"""D_R and D_T: estimates follow every law, planted values come back, intervals cover."""
 
 import dataclasses
-import time
+import json
 import warnings
 
 import numpy as np
@@ -9,6 +9,7 @@ import pytest
 
 from perrin import (
     Cluster,
+    DiffusionEstimate,
     PrecisionWarning,
     RigidMotion,
     TooFewFramesError,
@@ -20,9 +21,10 @@ from perrin import (
     track_rotation,
 )
 from perrin._text import with_error
+from perrin.diffusion.estimate import Found
 from perrin.diffusion.likelihood import Likelihood
-from perrin.diffusion.step_kernels import Track
-from perrin.diffusion.steps import steps_of
+from perrin.diffusion.noise_model import Noise
+from perrin.diffusion.steps import NoisySteps, steps_of
 
 TETRAHEDRON = Cluster.tetrahedron(1.5)
 SIGMA = 0.03  # sigma/R = 0.02
@@ -82,6 +84,29 @@ def standard_error(values):
     return np.std(values, ddof=1) / np.sqrt(len(values))
 
 
+def least_cover(count, level=0.95, errors=3):
+    """Return the share of intervals at a level, less this many Monte-Carlo errors."""
+    return level - errors * np.sqrt(level * (1 - level) / count)
+
+
+def sd_error(count, errors=3):
+    """Return the relative Monte-Carlo error of a standard deviation, this many times."""
+    return errors / np.sqrt(2 * count)
+
+
+@pytest.fixture
+def passes(monkeypatch):
+    """Return a list that grows by one item with every evaluation of the likelihood."""
+    found, evaluate = [], Likelihood.sums
+
+    def counted(self, D, theta):
+        found.append(1)
+        return evaluate(self, D, theta)
+
+    monkeypatch.setattr(Likelihood, "sums", counted)
+    return found
+
+
 # ---- laws ---------------------------------------------------------------------------------------
 
 
@@ -89,8 +114,15 @@ def standard_error(values):
 def positions(request):
     """Return positions of one track, complete or with frames and particles missing."""
     if request.param == "complete":
-        return cloud(11, n_frames=200, sigma=(0.03, 0.03, 0.06))
-    return lossy(12, frames=0.15, particles=0.04, n_frames=200, cluster=Cluster.touching(5, 2.45))
+        return cloud(11, n_frames=100, sigma=(0.03, 0.03, 0.06))
+    return lossy(12, frames=0.15, particles=0.04, n_frames=100, cluster=Cluster.touching(5, 2.45))
+
+
+@pytest.fixture(scope="module")
+def measured(positions):
+    """Return D_R and D_T of these positions."""
+    motion = tracked(positions)
+    return {q: estimate_diffusion(motion, quantity=q) for q in QUANTITIES}
 
 
 def renumbered(x):
@@ -112,9 +144,9 @@ SAME = {
 
 @pytest.mark.parametrize("quantity", QUANTITIES)
 @pytest.mark.parametrize("change", SAME)
-def test_the_answer_does_not_depend_on_the_view(positions, change, quantity):
+def test_the_answer_does_not_depend_on_the_view(positions, measured, change, quantity):
     """Turned, moved, relabelled, mirrored, backwards or renumbered: the same numbers to 1e-9."""
-    before = estimate_diffusion(tracked(positions), quantity=quantity)
+    before = measured[quantity]
     after = estimate_diffusion(SAME[change](positions), quantity=quantity)
     assert np.allclose(numbers(after), numbers(before), rtol=1e-9, atol=0)
     assert after.offset == pytest.approx(before.offset, rel=1e-7, abs=1e-9 * before.value)
@@ -123,11 +155,12 @@ def test_the_answer_does_not_depend_on_the_view(positions, change, quantity):
 
 
 @pytest.mark.parametrize("unit", [1e-6, 1e-3, 1e3, 1e9])
-def test_the_length_unit_scales_D_T_and_leaves_D_R(positions, unit):
+def test_the_length_unit_scales_D_T_and_leaves_D_R(positions, measured, unit):
     """Metres, millimetres or nanometres for microns: D_R the same, D_T by the square, to 1e-9."""
+    motion = tracked(positions * unit)
     for quantity, factor in (("rotation", 1.0), ("translation", unit**2)):
-        before = estimate_diffusion(tracked(positions), quantity=quantity)
-        after = estimate_diffusion(tracked(positions * unit), quantity=quantity)
+        before = measured[quantity]
+        after = estimate_diffusion(motion, quantity=quantity)
         assert np.allclose(numbers(after), numbers(before) * factor, rtol=1e-9, atol=0)
         assert after.offset == pytest.approx(before.offset * factor, rel=1e-7)
         assert after.resolved == before.resolved
@@ -135,9 +168,9 @@ def test_the_length_unit_scales_D_T_and_leaves_D_R(positions, unit):
 
 @pytest.mark.parametrize("quantity", QUANTITIES)
 @pytest.mark.parametrize("dt", [1e-9, 1e-3, 60.0, 1e9])
-def test_the_time_unit_scales_D(positions, quantity, dt):
+def test_the_time_unit_scales_D(positions, measured, quantity, dt):
     """D is per time: the same frames dt apart instead of 1 s have D/dt and the same offset."""
-    before = estimate_diffusion(tracked(positions), quantity=quantity)
+    before = measured[quantity]
     after = estimate_diffusion(tracked(positions, dt=dt), quantity=quantity)
     assert np.allclose(numbers(after) * dt, numbers(before), rtol=1e-9, atol=0)
     assert after.offset == pytest.approx(before.offset, rel=1e-7, abs=1e-9 * before.value)
@@ -145,7 +178,7 @@ def test_the_time_unit_scales_D(positions, quantity, dt):
 
 
 @pytest.mark.parametrize("quantity", QUANTITIES)
-def test_times_and_frames_say_the_same(positions, quantity):
+def test_times_and_frames_are_equivalent(positions, quantity):
     """Times of the rows instead of frame numbers give the same answer."""
     a = estimate_diffusion(tracked(positions, dt=0.7), quantity=quantity)
     times = 100 + 0.7 * np.arange(len(positions))
@@ -185,7 +218,7 @@ def test_a_cut_loses_only_the_step_between(quantity):
     motion = tracked(cloud(5, n_frames=120))
     piece = np.repeat([0, 1], [50, 70])
     whole, cut = (steps_of(m, quantity) for m in (motion, dataclasses.replace(motion, piece=piece)))
-    assert len(whole.size) - len(cut.size) == 1
+    assert len(whole.vectors) - len(cut.vectors) == 1
     assert np.flatnonzero(~whole.linked).tolist() == [118]
     assert np.flatnonzero(~cut.linked).tolist() == [48, 117]
     steady = dataclasses.replace(motion, piece=piece)
@@ -201,40 +234,41 @@ def test_a_cut_loses_only_the_step_between(quantity):
 
 
 @pytest.fixture(scope="module")
-def standard():
-    """Return 200 tracks (N = 300, SNR 20, sigma/R = 0.02) and their D_R and D_T."""
-    motions = [tracked(cloud(1000 + seed)) for seed in range(200)]
+def standard(repeats):
+    """Return 40 or 200 tracks (N = 300, SNR 20, sigma/R = 0.02) and their D_R and D_T."""
+    motions = [tracked(cloud(1000 + seed)) for seed in range(repeats(40, 200))]
     found = {q: [estimate_diffusion(m, quantity=q) for m in motions] for q in QUANTITIES}
     return motions, found
 
 
 @pytest.mark.parametrize("quantity", QUANTITIES)
 def test_intervals_cover(standard, quantity):
-    """Of 200 tracks 95 % intervals hold the truth in >= 91 %, 68 % intervals in 58 to 78 %.
+    """95 % intervals hold the truth in 95 % of the tracks, 68 % intervals in 68 %.
 
-    2.6 and 3 Monte-Carlo errors (1.5 and 3.3 %) from the nominal values.
+    Within 2.6 and 3 Monte-Carlo errors: of 200 tracks in >= 91 %, and in 58 to 78 %.
     """
     truth, found = planted(quantity), standard[1][quantity]
     wide = np.mean([e.ci95[0] < truth < e.ci95[1] for e in found])
     narrow = np.mean([e.ci68[0] < truth < e.ci68[1] for e in found])
     print(f"{quantity}: coverage {narrow:.3f} / {wide:.3f}")
-    assert wide >= 0.91
-    assert 0.58 <= narrow <= 0.78
+    assert wide >= least_cover(len(found), errors=2.6)
+    assert abs(narrow - 0.68) <= 0.68 - least_cover(len(found), 0.68)
 
 
 @pytest.mark.parametrize("quantity", QUANTITIES)
 def test_errors_reach_the_cramer_rao_bound(standard, quantity):
-    """The rms error is 8.3 % (joint bound, N = 300, SNR 20) within 15 %, 3 Monte-Carlo errors.
+    """The rms error is 8.3 % (joint bound, N = 300, SNR 20) within 3 Monte-Carlo errors.
 
-    (value - truth)/stderr has an rms of 0.85 to 1.2; the mean is within 3 standard errors.
+    (value - truth)/stderr has an rms of 1 within 3 (4 above); the mean is within 3 standard errors.
+    Of 200 tracks one Monte-Carlo error of an rms is 5 %.
     """
     truth, found = planted(quantity), standard[1][quantity]
     values = np.array([e.value for e in found]) / truth
     pull = np.array([(e.value - truth) / e.stderr for e in found])
     rms = np.sqrt(np.mean((values - 1) ** 2))
     print(f"{quantity}: rms/bound {rms / 0.083:.3f}, rms pull {np.sqrt(np.mean(pull**2)):.3f}")
-    assert rms == pytest.approx(0.083, rel=0.15)
-    assert 0.85 <= np.sqrt(np.mean(pull**2)) <= 1.2
+    assert rms == pytest.approx(0.083, rel=sd_error(len(found)))
+    assert -sd_error(len(found)) <= np.sqrt(np.mean(pull**2)) - 1 <= sd_error(len(found), 4)
     assert abs(values.mean() - 1) < 3 * standard_error(values)
 
 
@@ -250,33 +284,41 @@ def test_offsets_scatter_about_the_planted_noise(standard, quantity):
     found = standard[1][quantity]
     z = np.array([(e.offset - s) / e.offset_stderr for e in found])
     print(f"{quantity}: offset z {z.mean():.3f} +- {z.std():.3f}")
-    assert abs(z.mean()) < 3 / np.sqrt(200)
-    assert abs(z.std() - 1) < 3 / np.sqrt(400)
+    assert abs(z.mean()) < 3 / np.sqrt(len(z))
+    assert abs(z.std() - 1) < sd_error(len(z))
+
+
+@pytest.fixture(scope="module")
+def noisy(repeats):
+    """Return tracks at a signal-to-noise ratio of 0.3."""
+    return [tracked(cloud(s, snr=0.3)) for s in range(repeats(12, 40))]
 
 
 @pytest.mark.parametrize("quantity", QUANTITIES)
-def test_noisy_offsets_equal_the_floor(quantity):
-    """At SNR 0.3 noise rules: the offset is the planted floor within 3 standard errors, sd 1.
+def test_noisy_offsets_equal_the_floor(quantity, noisy):
+    """At SNR 0.3 noise dominates: the offset is the planted floor within 3 standard errors, sd 1.
 
-    The z-score's sd of 40 tracks is 1 within 3 errors (34 %).
+    The sd of the z-scores is 1 within 3 errors (34 % of 40 tracks).
     """
-    found = [estimate_diffusion(tracked(cloud(s, snr=0.3)), quantity=quantity) for s in range(40)]
+    found = [estimate_diffusion(m, quantity=quantity) for m in noisy]
     s = S_R if quantity == "rotation" else S_T
     offsets = np.array([e.offset for e in found])
     z = (offsets - s) / [e.offset_stderr for e in found]
     assert abs(offsets.mean() - s) < 3 * standard_error(offsets)
-    assert abs(z.std(ddof=1) - 1) < 3 / np.sqrt(2 * 39)
+    assert abs(z.std(ddof=1) - 1) < sd_error(len(z) - 1)
 
 
 @pytest.mark.parametrize("quantity", QUANTITIES)
-def test_a_pool_of_five_is_worth_five(standard, quantity):
-    """5 tracks pooled: 1/sqrt(5) of the error within 10 %; 20 pools cover at least 16 times."""
+def test_five_pooled_tracks_have_their_common_error(standard, quantity):
+    """5 tracks pooled: 1/sqrt(5) of the error within 10 %; 8 (20) pools cover 6 (16) times."""
     motions, found = standard
     truth = planted(quantity)
-    pools = [estimate_diffusion(motions[5 * i : 5 * i + 5], quantity=quantity) for i in range(20)]
+    count = min(len(motions) // 5, 20)
+    starts = 5 * np.arange(count)
+    pools = [estimate_diffusion(motions[i : i + 5], quantity=quantity) for i in starts]
     single = np.mean([e.stderr for e in found[quantity]])
     assert np.mean([e.stderr for e in pools]) == pytest.approx(single / np.sqrt(5), rel=0.1)
-    assert sum(e.ci95[0] < truth < e.ci95[1] for e in pools) >= 16
+    assert np.mean([e.ci95[0] < truth < e.ci95[1] for e in pools]) >= least_cover(count)
     values = np.array([e.value for e in pools])
     assert abs(values.mean() - truth) < 3 * standard_error(values)
     assert all(e.n_frames == 1500 for e in pools)
@@ -285,9 +327,9 @@ def test_a_pool_of_five_is_worth_five(standard, quantity):
 # ---- planted truths: gaps, missing particles, blur, bodies, the plane ---------------------------
 
 
-def check_unbiased(motions, truths=None, least=0.85):
+def check_unbiased(motions, truths=None):
     """Check that D_R and D_T are within 3 standard errors of the truth, and intervals cover."""
-    every = {}
+    every, least = {}, min(least_cover(len(motions)), 0.85)
     for quantity in QUANTITIES:
         truth = (truths or {}).get(quantity, planted(quantity))
         found = [estimate_diffusion(m, quantity=quantity) for m in motions]
@@ -298,35 +340,39 @@ def check_unbiased(motions, truths=None, least=0.85):
     return every
 
 
-def test_missing_frames_do_not_bias():
-    """30 % of the frames missing: the mean of 100 tracks is the truth within 3 standard errors.
+def test_missing_frames_do_not_bias(repeats):
+    """30 % of the frames missing: the mean of the tracks is the truth within 3 standard errors.
 
-    A gap taken for one step would add 45 %, 45 standard errors.
+    A gap taken for one step would add 45 %, 45 standard errors of 100 tracks and 13 of 8.
     """
     check_unbiased(
-        [tracked(lossy(s, frames=0.3, snr=5.0)) for s in range(100)],
+        [tracked(lossy(s, frames=0.3, snr=5.0)) for s in range(repeats(8, 100))],
         {q: planted(q, 5.0) for q in QUANTITIES},
     )
 
 
 @pytest.mark.parametrize("blur", [1, 8])
-def test_missing_particles_do_not_bias(blur):
-    """15 % of the particles of a bipyramid missing, with and without blur: 30 tracks, unbiased.
+def test_missing_particles_do_not_bias(blur, repeats):
+    """15 % of the particles of a bipyramid missing, with and without blur: D is unbiased.
 
     Its noise differs by axis and frame, blur does not: taken for one another they cost 20 %.
     """
     cluster = Cluster.touching(5, 2.45)
     check_unbiased(
-        [tracked(lossy(s, particles=0.15, cluster=cluster, substeps=blur)) for s in range(30)]
+        [
+            tracked(lossy(s, particles=0.15, cluster=cluster, substeps=blur))
+            for s in range(repeats(5, 30))
+        ]
     )
 
 
 @pytest.mark.parametrize(
     "cluster", [TETRAHEDRON, Cluster.trimer(1.5)], ids=["tetrahedron", "trimer"]
 )
-def test_blur_makes_negative_offsets_and_no_bias(cluster):
-    """A shutter that never closes: the offset is s - D dt/3 < 0 and D is unbiased (30 tracks)."""
-    motions = [tracked(cloud(s, cluster=cluster, substeps=8, snr=50.0)) for s in range(30)]
+def test_blur_makes_negative_offsets_and_no_bias(cluster, repeats):
+    """A shutter that never closes: the offset is s - D dt/3 < 0 and D is unbiased."""
+    count = repeats(6, 30)
+    motions = [tracked(cloud(s, cluster=cluster, substeps=8, snr=50.0)) for s in range(count)]
     every = check_unbiased(motions, {q: planted(q, 50.0) for q in QUANTITIES})
     for quantity, found in every.items():
         offsets = [e.offset / planted(quantity, 50.0) for e in found]
@@ -335,79 +381,87 @@ def test_blur_makes_negative_offsets_and_no_bias(cluster):
         assert np.mean(offsets) == pytest.approx(expected, abs=3 * standard_error(offsets) + 0.01)
 
 
-def test_noise_that_differs_by_axis_is_told_from_blur():
+def test_noise_that_differs_by_axis_is_distinguished_from_blur(repeats):
     """A slender body with 7 times the noise about its long axis, blurred: D_R is still unbiased."""
     body = Cluster.from_positions(
         [[-1.5, 0.3, 0], [-0.5, -0.3, 0.3], [0.5, 0.3, -0.3], [1.5, -0.3, 0]]
     )
-    check_unbiased([tracked(cloud(s, cluster=body, substeps=8)) for s in range(30)])
+    check_unbiased([tracked(cloud(s, cluster=body, substeps=8)) for s in range(repeats(6, 30))])
 
 
-def test_poor_z_does_not_spoil_D_T():
+def test_poor_z_does_not_bias_D_T(repeats):
     """With sigma_z = 4 sigma_xy D_T is unbiased and covers, however the laboratory is turned."""
-    motions = [tracked(cloud(s, sigma=(0.03, 0.03, 0.12), snr=2.0) @ TURN.T) for s in range(60)]
+    motions = [
+        tracked(cloud(s, sigma=(0.03, 0.03, 0.12), snr=2.0) @ TURN.T)
+        for s in range(repeats(12, 60))
+    ]
     truth = planted("translation", 2.0)
     found = [estimate_diffusion(m, quantity="translation") for m in motions]
     values = np.array([e.value for e in found]) / truth
     assert abs(values.mean() - 1) < 3 * standard_error(values)
-    assert np.mean([e.ci95[0] < truth < e.ci95[1] for e in found]) >= 0.87
+    assert np.mean([e.ci95[0] < truth < e.ci95[1] for e in found]) >= least_cover(len(found))
 
 
-def test_in_the_plane_one_angle_and_two_coordinates():
-    """2-D: D_R with 2 D t and D_T with 4 D t come back, 40 tracks; rms error sqrt(6/N), sqrt(6/2N).
+def test_in_the_plane_one_angle_and_two_coordinates(repeats):
+    """2-D: D_R with 2 D t and D_T with 4 D t come back; rms error sqrt(6/N), sqrt(6/2N).
 
-    The known limits of joint estimates (facts, section 2) within 3 Monte-Carlo errors (34 %).
+    The known limits of joint estimates within 3 Monte-Carlo errors (34 % of 40 tracks).
     """
     flat, motions = Cluster.from_positions([[0, 0], [2, 0], [1, 1.6]]), []
     truth = {"rotation": 4e-3, "translation": 0.03}
-    for seed in range(40):
+    for seed in range(repeats(12, 40)):
         m = simulate_motion(flat, D_R=4e-3, D_T=0.03, dt=1.0, n_frames=300, rng=seed)
         motions.append(tracked(add_noise(m.positions(), sigma=0.02, rng=900 + seed)))
     every = check_unbiased(motions, truth)
     for quantity, angles in (("rotation", 1), ("translation", 2)):
         values = np.array([e.value for e in every[quantity]])
         rms = np.sqrt(np.mean((values / truth[quantity] - 1) ** 2))
-        assert rms == pytest.approx(np.sqrt(6 / (300 * angles)), rel=0.34)
+        assert rms == pytest.approx(np.sqrt(6 / (300 * angles)), rel=sd_error(len(values)))
 
 
-def test_an_anisotropic_body_has_a_third_of_the_trace():
-    """D = (1, 1, 10)e-3 rad^2/s: the mean of 150 values is 4e-3, and their scatter is stated.
+def test_an_anisotropic_body_has_a_third_of_the_trace(repeats):
+    """D = (1, 1, 10)e-3 rad^2/s: the mean value is 4e-3, and the stated error is the scatter.
 
-    Unequal axes scatter sqrt(34/16 x 3)/sqrt(3) = 1.46 times as widely as equal ones; the interval
-    of an isotropic body would cover 0.50 instead of 0.68. 0.57 is three Monte-Carlo errors low.
+    Unequal axes scatter sqrt(34/16 x 3)/sqrt(3) = 1.46 times as widely as equal ones: the stated
+    error of an isotropic body would be 32 % low, beyond three Monte-Carlo errors (30 % of 50
+    tracks, 17 % of 150), and its interval would cover 0.50 instead of 0.68.
     """
     tensor = kabsch(*np.random.default_rng(5).normal(size=(2, 5, 3)))
     tensor = tensor @ np.diag([1e-3, 1e-3, 10e-3]) @ tensor.T
     found = []
-    for seed in range(150):
-        m = simulate_motion(TETRAHEDRON, D_R=tensor, dt=1.0, n_frames=300, rng=seed)
+    for seed in range(repeats(50, 150)):
+        frames = repeats(150, 300)
+        m = simulate_motion(TETRAHEDRON, D_R=tensor, dt=1.0, n_frames=frames, rng=seed)
         x = add_noise(m.positions(), sigma=SIGMA, rng=500 + seed)
         found.append(estimate_diffusion(tracked(x)))
     values = np.array([e.value for e in found])
     # The longest axis turns by 4 D dt = 0.04: rotation vectors read the mean low by 0.1 %.
     assert abs(values.mean() - 4e-3) < 3 * standard_error(values)
-    assert np.mean([e.stderr for e in found]) == pytest.approx(values.std(), rel=0.2)
-    assert np.mean([e.ci68[0] < 4e-3 < e.ci68[1] for e in found]) > 0.57
+    assert np.mean([e.stderr for e in found]) == pytest.approx(
+        values.std(), rel=sd_error(len(found))
+    )
+    cover = np.mean([e.ci68[0] < 4e-3 < e.ci68[1] for e in found])
+    assert cover > least_cover(len(found), 0.68)
 
 
-def test_uneven_times_are_taken_as_they_are():
-    """Frames at random times: D is unbiased over 40 tracks, where equal steps would not be."""
+def test_uneven_times_are_taken_as_they_are(repeats):
+    """Frames at random times: D is unbiased, where equal steps would not be."""
     motions = []
-    for seed in range(40):
+    for seed in range(repeats(8, 40)):
         keep = np.flatnonzero(np.random.default_rng(seed).random(600) < 0.4)
         x = cloud(seed, n_frames=600)[keep]
         motions.append(tracked(x, times=keep.astype(float)))
     check_unbiased(motions)
 
 
-def test_a_motionless_cluster_gets_an_upper_limit():
+def test_a_motionless_cluster_gets_an_upper_limit(repeats):
     """D = 0 with noise: not resolved, an upper limit in print; one in 20 may exclude 0 for D_T.
 
     For D_R adding noisy steps reads up to 0.04 (sigma/R)^4/dt: an interval that excludes 0 lies
     below ten such floors.
     """
-    beyond = 0
-    for seed in range(30):
+    beyond, count = 0, repeats(12, 30)
+    for seed in range(count):
         motion = tracked(cloud(seed, snr=0.0))
         spin, drift = (estimate_diffusion(motion, quantity=q) for q in QUANTITIES)
         assert spin.resolution_floor == pytest.approx(0.04 * 0.02**4, rel=0.2)
@@ -420,7 +474,7 @@ def test_a_motionless_cluster_gets_an_upper_limit():
         assert drift.resolution_floor is None
         assert drift.resolved == (drift.ci95[0] > 0)
         beyond += drift.resolved
-    assert beyond <= 4
+    assert beyond <= repeats(3, 4)
 
 
 # ---- what is known of the noise -----------------------------------------------------------------
@@ -436,37 +490,37 @@ def relative(motions, truth, **how):
 
 @pytest.mark.parametrize("method", ["mle", "cve"])
 @pytest.mark.parametrize("noise", ["residual", SIGMA])
-def test_known_noise_is_worth_three_times_the_frames(standard, method, noise):
+def test_known_noise_saves_two_thirds_of_the_frames(standard, method, noise):
     """At SNR 20 the spread falls from 8.3 % to the bound of 4.9 %, and the interval covers.
 
-    The spread of 200 tracks has an error of 5 %, its bound here three of them; cover 0.90 is three
-    Monte-Carlo errors under 0.95.
+    Within three Monte-Carlo errors: 15 % of the spread of 200 tracks, and a cover of 0.90.
     """
     truth = planted("rotation")
     mean, error, spread, cover = relative(standard[0], truth, method=method, noise=noise)
     assert abs(mean - 1) < 3 * error
-    assert spread == pytest.approx(0.049, rel=0.17)
-    assert cover > 0.90
+    assert spread == pytest.approx(0.049, rel=sd_error(len(standard[0])) + 0.02)
+    assert cover > least_cover(len(standard[0]))
 
 
-def test_a_wrong_sigma_moves_D_the_other_way():
+def test_a_wrong_sigma_moves_D_the_other_way(repeats):
     """Noise held 10 % too high lowers D at SNR 1: d ln D/d ln s = -0.5, so by 10 %."""
-    motions = [tracked(cloud(s, snr=1.0)) for s in range(60)]
+    motions = [tracked(cloud(s, snr=1.0)) for s in range(repeats(10, 60))]
     right, high = (relative(motions, planted("rotation", 1.0), noise=k * SIGMA) for k in (1, 1.1))
     assert high[0] - right[0] == pytest.approx(-0.10, abs=0.02)
 
 
-def test_stated_exposure_undoes_the_blur():
-    """A shutter open all the time, noise from the residuals: -26 % if unsaid, right if stated.
+def test_stated_exposure_undoes_the_blur(repeats):
+    """A shutter open all the time, noise from the residuals: -26 % if unstated, right if stated.
 
-    Stated to the joint estimate it changes nothing but the reach of the noise: 20 tracks.
+    Stated to the joint estimate it changes only the range of the noise offset.
     """
-    motions = [tracked(cloud(s, substeps=20, snr=5.0)) for s in range(40)]
+    frames = repeats(150, 300)
+    motions = [tracked(cloud(s, frames, substeps=20, snr=5.0)) for s in range(repeats(12, 40))]
     truth = planted("rotation", 5.0)
-    unsaid = relative(motions, truth, noise="residual")
+    unstated = relative(motions, truth, noise="residual")
     stated = relative(motions, truth, noise="residual", exposure=1.0)
     joint = relative(motions, truth, exposure=1.0)
-    assert unsaid[0] == pytest.approx(0.74, abs=0.03)
+    assert unstated[0] == pytest.approx(0.74, abs=repeats(0.07, 0.03))
     assert abs(stated[0] - 1) < 3 * stated[1]
     assert abs(joint[0] - 1) < 3 * joint[1]
     assert stated[2] < joint[2]
@@ -474,43 +528,49 @@ def test_stated_exposure_undoes_the_blur():
 
 def test_exposure_zero_keeps_the_offset_above_zero(standard):
     """Frozen frames cannot have negative noise; unknown exposure may, in some of 60 tracks."""
-    free = [estimate_diffusion(m, quantity="translation") for m in standard[0][:60]]
+    free = standard[1]["translation"][:60]
     kept = [estimate_diffusion(m, quantity="translation", exposure=0) for m in standard[0][:60]]
     assert min(e.offset for e in free) < 0 <= min(e.offset for e in kept)
 
 
 def test_covariances_agree_with_the_likelihood_where_they_should(standard):
-    """At SNR 20 CVE is as good as likelihood: equal spread within 10 %, its interval covers."""
+    """At SNR 20 CVE is as good as likelihood: equal spread within 15 %, its interval covers."""
     truth = planted("rotation")
     mean, error, spread, cover = relative(standard[0], truth, method="cve")
     assert abs(mean - 1) < 3 * error
-    assert spread == pytest.approx(relative(standard[0], truth)[2], rel=0.1)
-    assert cover > 0.90
+    likelihood = np.std([e.value / truth for e in standard[1]["rotation"]])
+    assert spread == pytest.approx(likelihood, rel=0.15)
+    assert cover > least_cover(len(standard[0]))
+
+
+@pytest.fixture(scope="module")
+def gapped(repeats):
+    """Return tracks with 30 % of frames and 3 % of particles missing at SNR 2."""
+    return [tracked(lossy(s, frames=0.3, particles=0.03, snr=2.0)) for s in range(repeats(12, 100))]
 
 
 @pytest.mark.parametrize("noise", ["joint", "residual"])
-def test_covariances_stand_gaps_partial_frames_and_low_signal(noise):
+def test_covariances_take_gaps_partial_frames_and_low_signal(noise, gapped):
     """CVE with 30 % of frames and 3 % of particles missing at SNR 2: unbiased, and it covers."""
-    motions = [tracked(lossy(s, frames=0.3, particles=0.03, snr=2.0)) for s in range(100)]
     mean, error, _, cover = relative(
-        motions, planted("rotation", 2.0), method="cve", noise=noise, exposure=0.0
+        gapped, planted("rotation", 2.0), method="cve", noise=noise, exposure=0.0
     )
     assert abs(mean - 1) < 3 * error
-    assert cover > 0.88
+    assert cover > least_cover(len(gapped))
 
 
 @pytest.mark.parametrize("noise", ["joint", "residual"])
-def test_mean_cosines_are_exact_at_any_step(noise):
+def test_mean_cosines_are_exact_at_any_step(noise, repeats):
     """At D_R dt = 0.5 likelihood reads 10 % low (heat kernel: 0.9015), the mean cosine is right."""
     tracks = []
-    for seed in range(30):
+    for seed in range(repeats(16, 30)):
         m = simulate_motion(TETRAHEDRON, D_R=0.5, dt=1.0, n_frames=400, rng=seed)
         tracks.append(tracked(add_noise(m.positions(), sigma=SIGMA, rng=900 + seed)))
     mean, error, spread, cover = relative(tracks, 0.5, method="trace", noise=noise)
     assert abs(mean - 1) < 3 * error
-    assert cover > 0.83  # three Monte-Carlo errors under 0.95
-    stated = np.mean([estimate_diffusion(m, method="trace", noise=noise).stderr for m in tracks])
-    assert stated / 0.5 == pytest.approx(spread, rel=0.4)
+    assert cover > least_cover(len(tracks))
+    stated = [estimate_diffusion(m, method="trace", noise=noise).stderr for m in tracks[:5]]
+    assert np.mean(stated) / 0.5 == pytest.approx(spread, rel=sd_error(len(tracks)))
     biased, biased_error, *_ = relative(tracks, 0.5, noise=noise)
     assert abs(biased - 0.9015) < 3 * biased_error
 
@@ -527,25 +587,25 @@ def test_mean_cosines_take_gaps_and_the_plane():
     assert found.stderr < 0.02
 
 
-def test_a_lost_orientation_is_said():
+def test_a_lost_orientation_is_an_error():
     """Steps so long that the mean cosine is not positive have no D_R."""
     truth = simulate_motion(TETRAHEDRON, D_R=30.0, dt=1.0, n_frames=40, rng=3)
     with pytest.raises(ValueError, match="orientation is lost between frames"):
         estimate_diffusion(truth, method="trace")
 
 
-def test_drift_is_taken_off_and_told():
-    """A flow of 5 rms steps a frame: D_T unbiased over 60 tracks with drift, the velocity told.
+def test_drift_is_subtracted_and_reported(repeats):
+    """A flow of 5 rms steps a frame: D_T is unbiased with drift, and the velocity is reported.
 
     Without drift D_T would be 25 times too large.
     """
     flow = np.array([0.9, -0.3, 1.2]) * 5 * np.sqrt(2 * planted("translation"))
     time = np.arange(300.0)[:, None, None]
-    motions = [tracked(cloud(s) + flow * time) for s in range(60)]
+    motions = [tracked(cloud(s) + flow * time) for s in range(repeats(8, 60))]
     truth = planted("translation")
     mean, error, _, cover = relative(motions, truth, quantity="translation", drift=True)
     assert abs(mean - 1) < 3 * error
-    assert cover > 0.86
+    assert cover > least_cover(len(motions))
     found = estimate_diffusion(motions[0], quantity="translation", drift=True)
     z = (np.array(found.drift[0]) - flow) / np.array(found.drift_stderr[0])
     assert np.all(np.abs(z) < 3.5)
@@ -554,7 +614,7 @@ def test_drift_is_taken_off_and_told():
 
 
 def test_drift_by_reversal_and_time_unit():
-    """Time reversal turns the drift round, a longer second shrinks it; D_T does as it should."""
+    """Time reversal changes the sign of the drift, dt divides it; D_T stays and is divided."""
     x = cloud(3)
     kept = estimate_diffusion(tracked(x), quantity="translation", drift=True)
     back = estimate_diffusion(tracked(x[::-1]), quantity="translation", drift=True)
@@ -565,13 +625,14 @@ def test_drift_by_reversal_and_time_unit():
     assert np.allclose(slow.drift, np.array(kept.drift) / 60, rtol=1e-9)
 
 
-def test_pooled_motions_say_whether_they_agree():
-    """p_same is uniform for equal D (40 pools of 5; Kolmogorov 1 %), and tiny for D that differ."""
-    motions = [tracked(cloud(2000 + s, n_frames=100)) for s in range(200)]
-    pools = [motions[5 * k : 5 * k + 5] for k in range(40)]
+def test_the_probability_that_pooled_motions_agree(repeats):
+    """p_same is uniform for equal D (pools of 5; Kolmogorov 1 %), and tiny for D that differ."""
+    count = repeats(10, 40)
+    motions = [tracked(cloud(2000 + s, n_frames=repeats(50, 100))) for s in range(5 * count)]
+    pools = [motions[5 * k : 5 * k + 5] for k in range(count)]
     p = np.sort([estimate_diffusion(pool).p_same for pool in pools])
-    ranks = np.arange(1, 41) / 40
-    assert max(np.max(ranks - p), np.max(p - ranks + 1 / 40)) < 1.63 / np.sqrt(40)
+    ranks = np.arange(1, count + 1) / count
+    assert max(np.max(ranks - p), np.max(p - ranks + 1 / count)) < 1.63 / np.sqrt(count)
     fast = [tracked(cloud(s, n_frames=300, snr=40.0)) for s in range(3)]
     assert estimate_diffusion([*motions[:3], *fast]).p_same < 1e-4
     assert estimate_diffusion(motions[0]).p_same is None
@@ -582,8 +643,8 @@ def test_pooled_motions_say_whether_they_agree():
     [(31, 20.0, 0.02, None), (30, 20.0, 0.02, "29 steps"), (900, 0.4, 0.02, None),
      (900, 0.1, 0.02, "signal-to-noise"), (900, 500.0, 0.17, None), (900, 500.0, 0.23, "trace")],
 )  # fmt: skip
-def test_warnings_stand_on_the_right_side_of_their_thresholds(frames, snr, step, word):
-    """Few steps, low SNR and coarse sampling are each told beyond their threshold only.
+def test_warnings_appear_beyond_their_thresholds_only(frames, snr, step, word):
+    """Few steps, low SNR and coarse sampling are each warned of beyond their threshold only.
 
     The planted values keep the estimate on its side of the threshold (seed fixed): SNR 0.2,
     4 D_R dt = 0.2, 30 steps.
@@ -605,39 +666,39 @@ def test_warnings_stand_on_the_right_side_of_their_thresholds(frames, snr, step,
 
 
 def test_the_trace_needs_no_warning_for_coarse_steps():
-    """The mean cosine is exact there, and says nothing."""
+    """The mean cosine is exact there, and gives no warning."""
     truth = simulate_motion(TETRAHEDRON, D_R=0.1, dt=1.0, n_frames=300, rng=1)
     assert estimate_diffusion(truth, method="trace").warnings == ()
 
 
 def test_turning_in_the_plane_has_no_finite_step_bias():
-    """Angles about one axis add up: 4 D_R dt = 0.4 is no matter in the plane; 2.4 is."""
+    """Angles about one axis add up: in the plane 4 D_R dt = 0.4 gives no warning; 2.4 does."""
     flat = Cluster.from_positions([[0, 0], [2, 0], [1, 1.6]])
-    for D, told in ((0.1, False), (0.6, True)):
+    for D, warned in ((0.1, False), (0.6, True)):
         truth = simulate_motion(flat, D_R=D, dt=1.0, n_frames=3000, rng=4)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             found = estimate_diffusion(truth)
-        assert bool(found.warnings) is told
-        if not told:
+        assert bool(found.warnings) is warned
+        if not warned:
             assert abs(found.value - D) < 3 * found.stderr
 
 
-# ---- the solver under attack --------------------------------------------------------------------
+# ---- the solver on extreme input ----------------------------------------------------------------
 
 
 @pytest.mark.parametrize("quantity", QUANTITIES)
 @pytest.mark.parametrize("n_frames", [3, 4, 5, 8])
 @pytest.mark.parametrize("snr", [0.01, 20.0])
-def test_a_handful_of_frames_gives_finite_nested_intervals(n_frames, snr, quantity):
-    """3, 4, 5 or 8 frames, ten tracks each: finite, nested, no warning; most cannot exclude 0."""
-    for seed in range(10):
+def test_a_handful_of_frames_gives_finite_nested_intervals(n_frames, snr, quantity, repeats):
+    """3, 4, 5 or 8 frames, 3 or 10 tracks each: finite, nested; most cannot exclude 0."""
+    for seed in range(repeats(3, 10)):
         motion = tracked(cloud(seed, n_frames=n_frames, snr=snr))
         assert_sane(estimate_diffusion(motion, quantity=quantity))
 
 
-def clumsy(kind):
-    """Return motions that strain a solver."""
+def extreme(kind):
+    """Return a motion that is difficult for a solver."""
     x, rng = cloud(21, n_frames=150), np.random.default_rng(0)
     row = np.arange(150)[:, None, None]
     half = np.where(row < 75, x.mean(axis=1, keepdims=True), 0)
@@ -679,20 +740,19 @@ KINDS = [
 
 @pytest.mark.parametrize("quantity", QUANTITIES)
 @pytest.mark.parametrize("kind", KINDS)
-def test_strange_motions_get_finite_answers(kind, quantity):
-    """Whatever moves, and however: finite numbers, nested intervals, no warning, within 3 s."""
-    motion = clumsy(kind)
-    begin = time.perf_counter()
+def test_strange_motions_get_finite_answers(kind, quantity, passes):
+    """Finite numbers, nested intervals, no warning, and at most 600 passes over the steps."""
+    motion = extreme(kind)
     assert_sane(estimate_diffusion(motion, quantity=quantity))
-    assert time.perf_counter() - begin < 3
+    assert len(passes) < 600
 
 
 @pytest.mark.parametrize("quantity", QUANTITIES)
-def test_random_strange_motions(quantity):
-    """40 random mixtures of few frames, odd units, SNR 1e-3 to 1e6 and body: finite and nested."""
+def test_random_strange_motions(quantity, repeats):
+    """Random mixtures of few frames, odd units, SNR 1e-3 to 1e6 and body: finite and nested."""
     rng = np.random.default_rng(99)
     bodies = [TETRAHEDRON, Cluster.trimer(1.0), Cluster.touching(5, 2.45), Cluster.touching(7, 2.0)]
-    for seed in range(40):
+    for seed in range(repeats(15, 40)):
         snr, unit = 10 ** rng.uniform(-3, 6), 10.0 ** rng.integers(-9, 9)
         sigma = min(SIGMA, SIGMA * np.sqrt(2e3 / snr))
         x = cloud(seed, n_frames=int(rng.choice([3, 4, 6, 12, 60])), cluster=bodies[seed % 4],
@@ -713,9 +773,9 @@ def test_a_body_at_rest_has_D_zero():
 
 @pytest.mark.parametrize("quantity", QUANTITIES)
 def test_a_pool_with_a_body_at_rest_is_finite(quantity):
-    """One body that never moves says D = 0 with certainty; the pool agrees, without a warning."""
-    still = simulate_motion(TETRAHEDRON, D_R=0.0, dt=1.0, n_frames=50, rng=0)
-    found = estimate_diffusion([tracked(cloud(1, n_frames=50)), still], quantity=quantity)
+    """One body that never moves gives D = 0 with certainty, and so does the pool."""
+    still = simulate_motion(TETRAHEDRON, D_R=0.0, dt=1.0, n_frames=20, rng=0)
+    found = estimate_diffusion([tracked(cloud(1, n_frames=20)), still], quantity=quantity)
     assert_sane(found)
     assert not found.resolved
 
@@ -741,11 +801,11 @@ def test_a_long_track_is_solved_from_any_guess():
     noise = np.random.default_rng(2).normal(scale=0.015, size=truth.center.shape)
     motion = dataclasses.replace(truth, center=truth.center + noise)
     steps = steps_of(motion, "translation")
-    likelihood = Likelihood.of([Track.free(steps, blur=0.0, drift=False)])
-    start = likelihood.ridge(np.zeros(1))
-    assert start.theta > 100 * np.mean(steps.size**2)
+    likelihood = Likelihood.of([NoisySteps.free(steps, blur=0.0, drift=False)])
+    start = likelihood.profile(np.zeros(1))
+    assert start.theta > 100 * np.mean(steps.vectors**2)
     D = np.array([4.5e-3])
-    found, fresh = likelihood.ridge(D, start).theta, likelihood.ridge(D).theta
+    found, fresh = likelihood.profile(D, start).theta, likelihood.profile(D).theta
     assert found == pytest.approx(fresh, rel=1e-8)
     assert found == pytest.approx(0.015**2, abs=4 * 0.002 * 4.5e-3)
 
@@ -754,7 +814,7 @@ def test_a_long_track_is_solved_from_any_guess():
 
 
 def test_too_few_frames_are_refused():
-    """Two poses, or three in pieces of two and one, cannot tell diffusion from noise."""
+    """Two poses, or three in pieces of two and one, cannot separate diffusion from noise."""
     two = tracked(cloud(1, n_frames=2))
     with pytest.raises(TooFewFramesError, match="2 frames") as caught:
         estimate_diffusion(two)
@@ -804,6 +864,76 @@ def test_two_and_three_dimensions_do_not_pool():
         estimate_diffusion([])
 
 
+# ---- options and results as JSON ----------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "options",
+    [Noise(), Noise("residual", exposure=0.5), Noise(0.03, drift=True), Noise(exposure=0.0)],
+    ids=str,
+)
+def test_a_noise_is_its_three_keywords(options):
+    """Noise, exposure and drift stated together give the estimate that the keywords give."""
+    motion = tracked(cloud(1, n_frames=60))
+    together = estimate_diffusion(motion, noise=options)
+    apart = estimate_diffusion(
+        motion, noise=options.model, exposure=options.exposure, drift=options.drift
+    )
+    assert together == apart
+    assert together.settings == options
+
+
+def test_a_noise_and_its_keywords_together_are_refused():
+    """What is stated twice is named; the faults of a Noise are those of the keywords."""
+    motion = tracked(cloud(1, n_frames=60))
+    with pytest.raises(ValueError, match=r"exposure: stated both in noise.*; drift: stated both"):
+        estimate_diffusion(motion, noise=Noise(exposure=0.5), exposure=0.5, drift=True)
+    with pytest.raises(ValueError, match='drift=True needs method="mle"'):
+        estimate_diffusion(motion, noise=Noise(drift=True), method="cve")
+    with pytest.raises(ValueError, match=r"noise: .*loud.*; exposure: .*1.5"):
+        Noise("loud", exposure=1.5)
+
+
+def estimates():
+    """Return estimates of every kind: pooled, with drift, without bound, absent, at rest."""
+    motion = tracked(cloud(1, n_frames=60))
+    still = simulate_motion(TETRAHEDRON, D_R=0.0, dt=1.0, n_frames=20, rng=0)
+    return {
+        "joint": estimate_diffusion(motion),
+        "sigma": estimate_diffusion(motion, noise=0.03, exposure=0.5),
+        "residual": estimate_diffusion(motion, noise="residual"),
+        "drift": estimate_diffusion(motion, quantity="translation", drift=True),
+        "pooled": estimate_diffusion([motion, tracked(cloud(2, n_frames=60))]),
+        "trace": estimate_diffusion(motion, method="trace"),
+        "three frames": estimate_diffusion(tracked(cloud(1, n_frames=3))),
+        "at rest": estimate_diffusion(still),
+        "without noise": estimate_diffusion(
+            simulate_motion(TETRAHEDRON, D_R=5e-3, dt=1.0, n_frames=60, rng=0)
+        ),
+        "absent": DiffusionEstimate.absent(quantity="rotation", n_frames=3, reason="why: so"),
+        "curve": DiffusionEstimate.judged(
+            Found.normal(1e-3, 1e-4, 0.0, 1e-5),
+            quantity="rotation",
+            method="line",
+            n_frames=9,
+            dt=1.0,
+            noise_variance=np.nan,
+        ),
+    }
+
+
+@pytest.mark.filterwarnings("ignore::perrin.PrecisionWarning")
+def test_an_estimate_comes_back_from_json():
+    """Every field of an estimate survives to_dict, JSON and from_dict, whatever is unknown."""
+    for name, estimate in estimates().items():
+        back = DiffusionEstimate.from_dict(json.loads(json.dumps(estimate.to_dict())))
+        for field in dataclasses.fields(estimate):
+            np.testing.assert_equal(
+                getattr(back, field.name), getattr(estimate, field.name), err_msg=name
+            )
+        assert str(back) == str(estimate)
+
+
 # ---- print and speed ----------------------------------------------------------------------------
 
 
@@ -831,7 +961,7 @@ def test_two_and_three_dimensions_do_not_pool():
     ],
 )
 def test_with_error(value, stderr, text):
-    """The error stands in brackets in units of the last digit; without one the value is alone."""
+    """The error is in brackets, in units of the last digit; without one there is only the value."""
     assert with_error(value, stderr) == text
 
 
@@ -857,16 +987,9 @@ def test_missing_frames_are_not_counted():
 
 
 @pytest.mark.parametrize("quantity", QUANTITIES)
-def test_an_estimate_takes_few_passes(standard, quantity, monkeypatch):
-    """An estimate with both intervals looks at the steps under 250 times, whatever the machine."""
-    passes, evaluate = [], Likelihood.sums
-
-    def counted(self, D, theta):
-        passes[-1] += 1
-        return evaluate(self, D, theta)
-
-    monkeypatch.setattr(Likelihood, "sums", counted)
-    for motion in standard[0][:15]:
-        passes.append(0)
+def test_an_estimate_takes_few_passes(standard, quantity, passes):
+    """An estimate with both intervals takes under 250 passes over the steps."""
+    for motion in standard[0][:8]:
+        passes.clear()
         estimate_diffusion(motion, quantity=quantity)
-    assert max(passes) < 250, passes
+        assert len(passes) < 250

@@ -1,4 +1,4 @@
-"""The likelihood of steps is the normal density it claims to be, and its top is found."""
+"""The likelihood of steps is the normal density, and its maximum is found."""
 
 import dataclasses
 
@@ -8,8 +8,8 @@ from scipy.stats import multivariate_normal
 
 from perrin import Cluster, add_noise, simulate_motion, track_rotation
 from perrin.diffusion.likelihood import Likelihood
-from perrin.diffusion.step_kernels import Track, _Sines, _Tridiagonal
-from perrin.diffusion.steps import steps_of
+from perrin.diffusion.step_kernels import SineModes, TridiagonalCovariance
+from perrin.diffusion.steps import NoisySteps, steps_of
 
 QUANTITIES = ("rotation", "translation")
 SIGMA = 0.03
@@ -48,10 +48,10 @@ def cases():
 
 CASES = cases()
 MODES = {
-    "joint": lambda s: Track.free(s, blur=s.duration.min() / 2, drift=False),
-    "exposed": lambda s: Track.free(s, blur=0.8 * s.dt / 3, drift=False),
-    "residual": lambda s: Track.informed(s, blur=0.1, drift=False),
-    "known": lambda s: Track.fixed(s, sigma=0.04, blur=0.2, drift=False),
+    "joint": lambda s: NoisySteps.free(s, blur=s.duration.min() / 2, drift=False),
+    "exposed": lambda s: NoisySteps.free(s, blur=0.8 * s.dt / 3, drift=False),
+    "residual": lambda s: NoisySteps.from_residuals(s, blur=0.1, drift=False),
+    "known": lambda s: NoisySteps.fixed(s, sigma=0.04, blur=0.2, drift=False),
 }
 
 
@@ -106,7 +106,7 @@ def dense_value(case, quantity, mode, likelihood, D, theta):
     """Return the log-density of all steps, and of the residuals, without the constants."""
     total = 0.0
     for motion, track, t in zip(CASES[case], likelihood.tracks, theta, strict=True):
-        y = track.steps.size
+        y = track.steps.vectors
         for column, block in zip(y.T, dense_covariance(motion, quantity, D, t, mode), strict=True):
             total += multivariate_normal(cov=block).logpdf(column)
             total += 0.5 * len(column) * np.log(2 * np.pi)
@@ -159,7 +159,9 @@ def test_both_kernels_agree(case, mode, quantity):
     """Sine transform and tridiagonal elimination give the same value and slopes to 1e-10."""
     tracks = built(case, quantity, mode).tracks
     D, theta = np.array([2e-3]), np.array([3e-4])
-    one, two = (kernel.of(tracks, [0]).sums(D, theta) for kernel in (_Sines, _Tridiagonal))
+    one, two = (
+        kernel.of(tracks, [0]).sums(D, theta) for kernel in (SineModes, TridiagonalCovariance)
+    )
     for a, b in zip(one, two, strict=True):
         assert a == pytest.approx(b, rel=1e-10)
 
@@ -172,8 +174,8 @@ def test_a_free_mean_velocity_is_the_restricted_likelihood(case):
     each axis, is added; dense QR finds the contrasts.
     """
     steps = [steps_of(m, "translation") for m in CASES[case]]
-    likelihood = Likelihood.of([Track.free(s, blur=0.2, drift=True) for s in steps])
-    plain = Likelihood.of([Track.free(s, blur=0.2, drift=False) for s in steps])
+    likelihood = Likelihood.of([NoisySteps.free(s, blur=0.2, drift=True) for s in steps])
+    plain = Likelihood.of([NoisySteps.free(s, blur=0.2, drift=False) for s in steps])
     for D, theta in points(likelihood):
         expected = 0.0
         for motion, track, t in zip(CASES[case], likelihood.tracks, theta, strict=True):
@@ -184,7 +186,7 @@ def test_a_free_mean_velocity_is_the_restricted_likelihood(case):
             start, stop = motion.steps()
             take = np.zeros((len(start), len(motion.time)))
             take[np.arange(len(start)), start], take[np.arange(len(start)), stop] = -1, 1
-            for y, axis in zip(track.steps.size.T, noise.T, strict=True):
+            for y, axis in zip(track.steps.vectors.T, noise.T, strict=True):
                 C = (take * np.nan_to_num(axis)) @ take.T + np.diag(2 * D[0] * tau)
                 small = contrasts.T @ C @ contrasts
                 expected += multivariate_normal(cov=small).logpdf(contrasts.T @ y)
@@ -205,30 +207,30 @@ def brute(likelihood, D):
     """Return the profile log-likelihood by brute force: every theta by itself, grid on grid."""
     total, count = 0.0, len(likelihood.tracks)
     for g in range(count):
-        scale = float(np.mean(likelihood.tracks[g].steps.size ** 2))
+        scale = float(np.mean(likelihood.tracks[g].steps.vectors ** 2))
         grid = np.geomspace(1e-9, 1e3, 60)
+        alone = Likelihood.of([likelihood.tracks[g]])
         for _ in range(5):
-            alone = Likelihood.of([likelihood.tracks[g]])
             values = [alone.sums(np.array([D]), np.array([scale * t])).value[0] for t in grid]
             k = int(np.argmax(values))
-            grid = np.geomspace(grid[max(k - 1, 0)], grid[min(k + 1, len(grid) - 1)], 25)
+            grid = np.geomspace(grid[max(k - 1, 0)], grid[min(k + 1, len(grid) - 1)], 14)
         total += max(values)
     return total
 
 
 @pytest.mark.parametrize("mode", ["joint", "exposed", "residual"])
 @pytest.mark.parametrize(("seed", "n_frames"), [(1, 60), (2, 25), (3, 5), (0, 8)])
-def test_top_and_intervals_are_those_of_a_brute_force_profile(mode, seed, n_frames):
-    """The value is the top of a profile on a grid; interval ends lie 0.99/2 and 3.84/2 below.
+def test_maximum_and_intervals_are_those_of_a_brute_force_profile(mode, seed, n_frames, repeats):
+    """The value is the maximum of a profile on a grid; interval ends are 0.99/2 and 3.84/2 below.
 
-    With 5 and 8 frames the profile can have several tops: the highest counts.
+    With 5 and 8 frames the profile can have several maxima: the highest counts.
     """
     motion = cloud(seed, n_frames=n_frames)
     likelihood = Likelihood.of([MODES[mode](steps_of(motion, "rotation"))])
     best = likelihood.best()
     top = brute(likelihood, best.D[0])
     assert best.value[0] == pytest.approx(top, abs=1e-4)
-    grid = likelihood.scale[0] * np.geomspace(1e-4, 10, 40)
+    grid = likelihood.scale[0] * np.geomspace(1e-4, 10, repeats(15, 40))
     assert max(brute(likelihood, D) for D in grid) <= top + 1e-6
     for drop in (0.98894, 3.84146):
         low, high = likelihood.interval(best, drop)
@@ -239,7 +241,7 @@ def test_top_and_intervals_are_those_of_a_brute_force_profile(mode, seed, n_fram
             assert brute(likelihood, 1e-9 * likelihood.scale[0]) >= top - drop / 2 - 1e-3
 
 
-def test_apart_finds_the_top_of_every_motion():
+def test_apart_finds_the_maximum_of_every_motion():
     """A D for every group gives what each motion gives alone, to 1e-9."""
     steps = [steps_of(m, "rotation") for m in (cloud(i, n_frames=60) for i in range(4))]
     tracks = [MODES["joint"](s) for s in steps] + [

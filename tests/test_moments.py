@@ -7,8 +7,8 @@ import numpy as np
 from perrin import Cluster, estimate_diffusion, simulate_motion, track_rotation
 
 
-def test_a_hole_of_absent_frames_takes_no_room_in_the_mean_cosine():
-    """Frames 0 to 99 and 10^8 on: the estimate is that with a hole of 10 frames, under 2 MB."""
+def test_a_long_gap_takes_no_memory_in_the_mean_cosine():
+    """Frames 0 to 99 and 10^8 on: the estimate is that with a gap of 10 frames, under 2 MB."""
     x = simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=200, rng=1).positions()
     frame = np.arange(200)
     near, far = (

@@ -1,4 +1,4 @@
-"""The likelihood of a rod's steps: units and gaps (its recovery of D stands in test_rods)."""
+"""The likelihood of a rod's steps: units and gaps (test_rods tests that D comes back)."""
 
 from __future__ import annotations
 

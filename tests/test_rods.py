@@ -57,7 +57,7 @@ def test_the_turn_about_the_own_axis_does_not_enter():
     """The steps of a still direction are noise only, however the particles' frame turns."""
     x, _ = rod(2, D_perp=0.0, sigma=0.0)
     steps = direction_steps(perrin.track_direction(x, dt=DT))
-    np.testing.assert_allclose(steps.y, 0.0, atol=1e-7)
+    np.testing.assert_allclose(steps.vectors, 0.0, atol=1e-7)
 
 
 def test_steps_of_a_known_path():
@@ -66,8 +66,10 @@ def test_steps_of_a_known_path():
     u = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
     x = np.stack([-u, u], axis=1) + np.arange(20)[:, None, None]
     steps = direction_steps(perrin.track_direction(x, dt=1.0))
-    np.testing.assert_allclose(np.linalg.norm(steps.y, axis=1), 0.1)
-    np.testing.assert_allclose(steps.y, np.broadcast_to(steps.y[0], (19, 2)), atol=1e-12)
+    np.testing.assert_allclose(np.linalg.norm(steps.vectors, axis=1), 0.1)
+    np.testing.assert_allclose(
+        steps.vectors, np.broadcast_to(steps.vectors[0], (19, 2)), atol=1e-12
+    )
 
 
 def test_exchanged_ends_are_corrected():

@@ -1,10 +1,13 @@
-"""How well D could be known at best: the Cramér-Rao bound."""
+"""The least standard error that an estimate of D can have: the Cramér-Rao bound."""
 
 from __future__ import annotations
 
 from typing import Literal, get_args
 
 import numpy as np
+
+from perrin._arrays import choice_fault, number_fault, refuse
+from perrin.diffusion.step_kernels import difference_eigenvalues
 
 NoiseKnowledge = Literal["joint", "residual", "known"]
 
@@ -30,8 +33,8 @@ def cramer_rao(
         Independent axes that share D and s: 3 for the mean D_R or D_T, 2 or 1 for a principal
         value.
     noise : {"joint", "residual", "known"}
-        Whether s has to be found from the steps along with D, is measured besides by the residuals
-        of the rigid fits, or is known.
+        Whether s is estimated from the steps together with D, is measured by the residuals of the
+        rigid fits as well, or is known.
     exposure : float, optional
         Fraction of dt during which the shutter is open, 0 to 1; None as 0, no motion blur.
     residual_dof : int
@@ -56,9 +59,9 @@ def cramer_rao(
     Fisher information of ln D and ln s is half the sum over k of products of their slopes. The
     residuals of N frames, fitted to one common shape, add (N - 1) residual_dof/2 to that of ln s.
 
-    With "joint" noise a stated exposure buys nothing here: s - 2 B D dt is one free offset, and
-    which name it has does not matter to D. The exposure then only says which truth `snr` belongs
-    to; where it is not known, the bound is that of exposure 0 with D dt over the offset as `snr`.
+    With "joint" noise a stated exposure does not lower the bound: s - 2 B D dt is one free offset,
+    whatever its parts. The exposure then only defines the s of `snr`; where it is not known, the
+    bound is that of exposure 0 with D dt over the offset as `snr`.
 
     Examples
     --------
@@ -68,9 +71,24 @@ def cramer_rao(
     residual 7.79
     known 7.62
     """
-    _check(n_frames, snr, axes, noise, exposure, residual_dof)
+    refuse(
+        [
+            *number_fault("n_frames", n_frames, least=3, whole=True),
+            *number_fault("snr", snr, above=0),
+            *([] if axes in (1, 2, 3) else choice_fault("axes", axes, (1, 2, 3))),
+            *choice_fault("noise", noise, get_args(NoiseKnowledge)),
+            *([] if exposure is None else number_fault("exposure", exposure, least=0, most=1)),
+            *number_fault("residual_dof", residual_dof, least=1, whole=True),
+        ]
+    )
     blur = (exposure or 0.0) / 3
-    bend, weight = _spectrum(n_frames, snr)
+    # The summands are periodic in k and smooth over about sqrt(snr) radian. The trapezoidal rule is
+    # then exact to rounding with far fewer than N nodes; with all N of them it is the sum itself.
+    nodes = min(n_frames, int(1000 + 30 / np.sqrt(snr)))
+    bend = np.concatenate([[0.0], difference_eigenvalues(nodes - 1), [2.0]])
+    share = n_frames / nodes
+    weight = np.full(nodes + 1, share)
+    weight[[0, -1]] = (share - 1) / 2
     eigenvalue = 1 + (1 / snr - blur) * bend  # over 2 D dt
     by_D, by_s = (1 - blur * bend) / eigenvalue, bend / (snr * eigenvalue)
     information = axes / 2 * float(weight @ by_D**2)
@@ -82,38 +100,6 @@ def cramer_rao(
     return float(information**-0.5)
 
 
-def _spectrum(n_frames: int, snr: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return 1 - cos(k pi/N) and the weights with which sums over it are those over k = 1..N-1.
-
-    The summands are periodic and smooth over about sqrt(snr) radian. The trapezoidal rule is then
-    exact to rounding with far fewer than N nodes; with all N of them it is the sum itself.
-    """
-    nodes = min(n_frames, int(1000 + 30 / np.sqrt(snr)))
-    share = n_frames / nodes
-    weight = np.full(nodes + 1, share)
-    weight[[0, -1]] = (share - 1) / 2
-    return 1 - np.cos(np.pi * np.arange(nodes + 1) / nodes), weight
-
-
-def _check(
-    n_frames: int, snr: float, axes: int, noise: str, exposure: float | None, residual_dof: int
-) -> None:
-    """Refuse values out of range, all in one message."""
-    offered = get_args(NoiseKnowledge)
-    sound = {
-        f"n_frames: a whole number >= 3, got {n_frames!r}": whole(n_frames, least=3),
-        f"snr: a finite number > 0, got {snr!r}": np.ndim(snr) == 0 and 0 < snr < np.inf,
-        f"axes: 1, 2 or 3, got {axes!r}": axes in (1, 2, 3),
-        f"noise: {' or '.join(map(repr, offered))}, got {noise!r}": noise in offered,
-        f"exposure: None or 0 to 1, got {exposure!r}": exposure is None or 0 <= exposure <= 1,
-        f"residual_dof: a whole number >= 1, got {residual_dof!r}": whole(residual_dof, least=1),
-    }
-    faults = [said for said, right in sound.items() if not right]
-    if faults:
-        raise ValueError("expected " + "; ".join(faults))
-
-
 def whole(value: object, *, least: int) -> bool:
-    """Return whether a value is a whole number of at least so much."""
-    number = isinstance(value, int | np.integer) and not isinstance(value, bool)
-    return number and bool(value >= least)  # type: ignore[operator]
+    """Return whether a value is a whole number of at least `least`."""
+    return not number_fault("", value, least=least, whole=True)

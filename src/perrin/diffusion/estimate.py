@@ -7,25 +7,26 @@ from typing import Any, Literal
 
 import numpy as np
 
-from perrin._arrays import finite_or_none
+from perrin._arrays import to_plain
 from perrin._text import number_text, unit_text, with_error
+from perrin.diffusion.noise_model import Noise
 
 UNITS = {"rotation": "rad^2/s", "translation": "um^2/s"}
 
 
-_CHI2 = {0.68: 0.9889, 0.95: 3.8415}  # quantiles of chi-squared with one degree of freedom
+CHI2 = {0.68: 0.9889, 0.95: 3.8415}  # quantiles of chi-squared with one degree of freedom
 
 
-NORMAL = {0.68: 0.9945, 0.95: 1.9600}
+NORMAL = {0.68: 0.9945, 0.95: 1.9600}  # half widths of intervals in standard errors
 
 
 # Below ten times its resolution floor a D_R is not resolved.
-_RESOLVED = 10.0
+_RESOLVED_FLOORS = 10.0
 
 
 @dataclass(frozen=True)
 class Found:
-    """What an estimator found, before it is judged."""
+    """A value with its intervals, offset and drift, before the signal-to-noise ratio is known."""
 
     value: float
     ci68: tuple[float, float]
@@ -37,10 +38,19 @@ class Found:
     p_same: float | None = None
     stderr: float | None = None  # half the width of ci68 unless given
 
+    @classmethod
+    def normal(cls, value: float, stderr: float, offset: float, offset_stderr: float) -> Found:
+        """Return a value with the intervals of a normal distribution."""
+        ci68, ci95 = (
+            (float(value - z * stderr), float(value + z * stderr))
+            for z in (NORMAL[0.68], NORMAL[0.95])
+        )
+        return cls(float(value), ci68, ci95, offset, offset_stderr)
+
 
 @dataclass(frozen=True)
 class DiffusionEstimate:
-    """A diffusion coefficient with what it rests on.
+    """A diffusion coefficient with its intervals, and the data and noise that they are based on.
 
     Attributes
     ----------
@@ -54,31 +64,39 @@ class DiffusionEstimate:
         Variance of one orientation (rad^2) or centre coordinate (um^2) from noise, mean over axes;
         negative where motion blur outweighs the noise.
     offset_stderr : float
-        Its standard error; NaN where it lies on the edge of what is possible.
+        Standard error of the offset; NaN where the offset lies on the edge of its range.
     resolution_floor : float or None
         The D_R that a motionless cluster would read; None for D_T.
     resolved : bool
-        Whether the value stands clear of that floor and of 0; if not, read it as an upper limit.
-    unit, method : str
+        Whether the value is above ten such floors and its 95 % interval above 0; if not, it is an
+        upper limit.
+    unit : str
+        Unit of the value: "rad^2/s" or "um^2/s".
+    method : str
+        Estimator: "mle", "cve" or "trace"; "line" or "gls" for a fit to a curve; "none" where the
+        data show no value.
     n_frames : int
         Frames with a pose, of all motions.
     snr : float
         D dt/s, s the noise variance of one orientation or centre coordinate that the rigid-fit
-        residuals predict (or the stated sigma); inf without noise, NaN where it is not known.
+        residuals predict (or the stated sigma); inf without noise, NaN where s is not known.
     dt : float
         Time between the frames that exist, s: the median step, mean over motions.
-    noise : str
-        How the noise was known: "joint", "residual", or the sigma in um.
+    noise : "joint", "residual" or float
+        Model of the noise: fitted with D, from the residuals of the rigid fits, or the known
+        localisation error, um.
     exposure : float or None
-        The open fraction of dt as stated; None for unknown.
-    drift, drift_stderr : tuple of tuple of float, or None
-        Where it was left free, the mean velocity of every motion along x, y, z, um/s; for D_R the
-        mean spin about the lab's x, y, z, rad/s (in the plane one number).
+        Open fraction of dt as stated; None for unknown.
+    drift : tuple of tuple of float, or None
+        Mean velocity of every motion along x, y, z, um/s; for D_R mean spin about the lab's x, y,
+        z, rad/s (in the plane one number); None where it was not fitted.
+    drift_stderr : tuple of tuple of float, or None
+        Standard errors of the drift.
     p_same : float or None
-        Pooled motions: how probable it is that equal coefficients scatter as much as these do
+        Pooled motions: probability that equal coefficients scatter at least as much as these do
         (likelihood ratio); None for one motion and for other methods than "mle".
     warnings : tuple of str
-        What should be known before the number is used.
+        Conditions of the estimate that are not fulfilled; for an absent value the reason.
     """
 
     value: float
@@ -94,7 +112,7 @@ class DiffusionEstimate:
     n_frames: int
     snr: float
     dt: float = np.nan
-    noise: str = "joint"
+    noise: Literal["joint", "residual"] | float = "joint"
     exposure: float | None = None
     drift: tuple[tuple[float, ...], ...] | None = None
     drift_stderr: tuple[tuple[float, ...], ...] | None = None
@@ -112,26 +130,29 @@ class DiffusionEstimate:
         dt: float,
         noise_variance: float,
         resolution_floor: float | None = None,
-        noise: str = "joint",
-        exposure: float | None = None,
+        noise: Noise | None = None,
         warnings: tuple[str, ...] = (),
     ) -> DiffusionEstimate:
-        """Make an estimate of what an estimator found; the one place where snr and resolved arise.
+        """Return the estimate with its signal-to-noise ratio, and whether it is resolved.
 
         Parameters
         ----------
         found : Found
-        quantity, method, n_frames, dt, resolution_floor, noise, exposure, warnings
+        quantity, method, n_frames, dt, resolution_floor, warnings
             As in the attributes.
         noise_variance : float
-            Of one orientation (rad^2) or centre coordinate (um^2); NaN where it is not known.
+            Noise variance of one orientation (rad^2) or centre coordinate (um^2); NaN where it is
+            not known.
+        noise : Noise, optional
+            Model of the noise and exposure; by default fitted with D, the exposure unknown.
         """
+        noise = Noise() if noise is None else noise
         if np.isnan(noise_variance):
             snr = np.nan
         else:
             snr = found.value * dt / noise_variance if noise_variance > 0 else np.inf
         half_width = (found.ci68[1] - found.ci68[0]) / 2
-        floor = _RESOLVED * (resolution_floor or 0.0)
+        floor = _RESOLVED_FLOORS * (resolution_floor or 0.0)
         return cls(
             value=found.value,
             ci68=found.ci68,
@@ -146,8 +167,8 @@ class DiffusionEstimate:
             n_frames=n_frames,
             snr=float(snr),
             dt=dt,
-            noise=noise,
-            exposure=exposure,
+            noise=noise.model,
+            exposure=noise.exposure,
             drift=found.drift,
             drift_stderr=found.drift_stderr,
             p_same=found.p_same,
@@ -173,14 +194,59 @@ class DiffusionEstimate:
 
     @property
     def absent_because(self) -> str | None:
-        """Why the data cannot show the coefficient at all; None where there is a value."""
+        """Reason why the data show no value; None where there is a value."""
         return self.warnings[0].partition(":")[0] if np.isnan(self.value) else None
 
+    @property
+    def quantity(self) -> Literal["rotation", "translation"]:
+        """Motion that diffuses: "rotation" or "translation"."""
+        return "rotation" if self.unit == UNITS["rotation"] else "translation"
+
+    @property
+    def settings(self) -> Noise:
+        """Options of the noise with which the value was estimated."""
+        return Noise(self.noise, self.exposure, self.drift is not None)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the estimate as JSON holds it.
+
+        An end of an interval, an error or a signal-to-noise ratio without bound is None; a stated
+        sigma is text with its unit and six digits.
+        """
+        entry: dict[str, Any] = to_plain(asdict(self)) | {"noise": self.settings.text}
+        if np.isnan(self.snr) and not np.isnan(self.value):
+            del entry["snr"]  # None would mean that there is no noise
+        return entry
+
+    @classmethod
+    def from_dict(cls, entry: dict[str, Any]) -> DiffusionEstimate:
+        """Return the estimate that `to_dict` wrote."""
+        read = dict(entry)
+        for name in ("ci68", "ci95"):
+            low, high = read[name]
+            nothing = low is None
+            read[name] = (np.nan,) * 2 if nothing else (low, np.inf if high is None else high)
+        for name in ("value", "offset", "offset_stderr", "dt"):
+            read[name] = np.nan if entry[name] is None else entry[name]
+        # Without a value nothing is known; with one, what JSON cannot hold is unbounded.
+        unbounded = np.nan if entry["value"] is None else np.inf
+        for name in ("stderr", "snr"):
+            number = entry.get(name, np.nan)
+            read[name] = unbounded if number is None else number
+        read["warnings"] = tuple(entry["warnings"])
+        for name in ("drift", "drift_stderr"):
+            if entry[name] is not None:
+                read[name] = tuple(map(tuple, entry[name]))
+        if entry["noise"] not in ("joint", "residual"):
+            read["noise"] = float(entry["noise"].removesuffix(" um"))
+        return cls(**read)
+
     def __str__(self) -> str:
-        name = "D_R" if self.unit == UNITS["rotation"] else "D_T"
+        name = "D_R" if self.quantity == "rotation" else "D_T"
         if self.absent_because is not None:
             return f"{name}: none ({self.absent_because})"
-        how = self.method if self.noise == "joint" else f"{self.method}, {self.noise} noise"
+        text = self.settings.text
+        how = self.method if text == "joint" else f"{self.method}, {text} noise"
         taken = "mean spin" if name == "D_R" else "drift"
         how += f", {taken} removed" if self.drift else ""
         tail = f"{self.unit} [{how}, {self.n_frames} frames]"
@@ -217,36 +283,3 @@ def bare_text(estimate: DiffusionEstimate) -> str:
     if estimate.resolved:
         return number_text(estimate.value, estimate.stderr)
     return f"< {number_text(estimate.ci95[1], digits=2)}".replace("inf", "∞")
-
-
-def _estimate_dict(estimate: DiffusionEstimate) -> dict[str, Any]:
-    """Return an estimate for JSON, ends of intervals without bound as None."""
-    entry = asdict(estimate)
-    for name in ("value", "stderr", "offset", "offset_stderr", "snr", "dt"):
-        entry[name] = finite_or_none(entry[name])
-    for name in ("ci68", "ci95"):
-        entry[name] = [finite_or_none(end) for end in entry[name]]
-    entry["warnings"] = list(estimate.warnings)
-    for name in ("drift", "drift_stderr"):
-        if entry[name] is not None:
-            entry[name] = [list(row) for row in entry[name]]
-    return entry
-
-
-def _estimate_from(entry: dict[str, Any]) -> DiffusionEstimate:
-    """Read back what `_estimate_dict` wrote."""
-    read = dict(entry)
-    for name in ("ci68", "ci95"):
-        low, high = read[name]
-        read[name] = (low, np.inf if high is None else high) if low is not None else (np.nan,) * 2
-    for name in ("value", "offset", "offset_stderr", "dt"):
-        read[name] = np.nan if entry[name] is None else entry[name]
-    # Without a value nothing is known; beside one, what JSON cannot hold is unbounded.
-    unbounded = np.nan if entry["value"] is None else np.inf
-    for name in ("stderr", "snr"):
-        read[name] = unbounded if entry[name] is None else entry[name]
-    read["warnings"] = tuple(entry["warnings"])
-    for name in ("drift", "drift_stderr"):
-        if entry[name] is not None:
-            read[name] = tuple(map(tuple, entry[name]))
-    return DiffusionEstimate(**read)

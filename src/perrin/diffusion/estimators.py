@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
 
-from perrin.diffusion.estimate import _CHI2, NORMAL, DiffusionEstimate, Found
-from perrin.diffusion.likelihood import Likelihood, Peak, excess_scatter
-from perrin.diffusion.moments import Moments, covariance_estimate, trace_estimate
-from perrin.diffusion.noise_model import choice_faults
-from perrin.diffusion.step_kernels import Track
-from perrin.diffusion.steps import Quantity, Steps, steps_of
-from perrin.errors import PrecisionWarning, TooFewFramesError
+from perrin._arrays import choice_fault, refuse
+from perrin.diffusion.estimate import CHI2, DiffusionEstimate, Found
+from perrin.diffusion.likelihood import Likelihood, excess_scatter
+from perrin.diffusion.moments import covariance_estimate, trace_estimate
+from perrin.diffusion.noise_model import Noise, noise_faults
+from perrin.diffusion.steps import NoisySteps, Quantity, Steps, pooled_steps
+from perrin.errors import PrecisionWarning
 from perrin.motion.rigid_motion import RigidMotion
 
 if TYPE_CHECKING:
@@ -24,12 +24,9 @@ if TYPE_CHECKING:
 Method = Literal["mle", "cve", "trace"]
 
 
-# Where an estimate needs a word: angular step 4 D_R dt, signal-to-noise ratio, number of steps.
-_COARSE, _NOISY, _FEW = 0.2, 0.2, 30
-
-
-# In the plane angles add up exactly; only whole turns within a step (4 D_R dt = 2) go wrong.
-_COARSE_IN_PLANE = 2.0
+# Beyond these an estimate warns: angular step 4 D_R dt, signal-to-noise ratio, number of steps. In
+# the plane angles add up exactly; only whole turns within a step (4 D_R dt = 2) are lost.
+_COARSE_STEP, _COARSE_STEP_IN_PLANE, _LOW_SNR, _FEW_STEPS = 0.2, 2.0, 0.2, 30
 
 
 def estimate_diffusion(
@@ -37,7 +34,7 @@ def estimate_diffusion(
     *,
     quantity: Quantity = "rotation",
     method: Method = "mle",
-    noise: Literal["joint", "residual"] | float = "joint",
+    noise: Literal["joint", "residual"] | float | Noise = "joint",
     exposure: float | None = None,
     drift: bool = False,
 ) -> DiffusionEstimate:
@@ -54,17 +51,18 @@ def estimate_diffusion(
         Maximum likelihood (at the statistical limit); the covariance-based estimator in closed
         form, good at a signal-to-noise ratio above 1; or, for D_R, the mean cosine of the step
         angle, exact for coarse sampling (4 D_R dt > 0.2).
-    noise : {"joint", "residual"} or float
-        "joint" estimates the noise offset along with D. "residual" takes what the rigid-fit
-        residuals say of it, up to three times fewer frames for the same error, but only right if
-        all particles of a frame are seen at the same instant. A number is the localisation error
-        sigma, um (rms over axes).
+    noise : {"joint", "residual"}, float or Noise
+        "joint" estimates the noise offset along with D. "residual" takes it from the rigid-fit
+        residuals: up to three times fewer frames for the same error, but only right if all
+        particles of a frame are seen at the same instant. A number is the localisation error
+        sigma, um (rms over axes). A `Noise` holds exposure and drift as well, which are then not
+        stated by their own keywords.
     exposure : float, optional
         Open fraction of dt, 0 to 1. Unknown (None) leaves the joint offset free, negative too, as
         motion blur makes it; with the noise given it is taken as 0.
     drift : bool
         Leave a mean velocity along each axis free (flow, sedimentation), for D_R a mean spin about
-        each lab axis; the result states it. The likelihood is then the restricted one.
+        each lab axis; it is part of the result. The likelihood is then the restricted one.
 
     Returns
     -------
@@ -92,8 +90,8 @@ def estimate_diffusion(
     which a gap is one longer step. o_k is the noise of the frame less b D, b = exposure dt/3. In
     the joint mode o_k = o + e_k; the offset o, one for each motion, is free above -D t/2, and e_k
     is by how much the noise predicted from the rigid-fit residuals exceeds that of the best known
-    frame and axis (particles missing, a body with unequal axes). docs/theory/estimators.md tells
-    which estimator fails when.
+    frame and axis (particles missing, a body with unequal axes). docs/theory/estimators.md compares
+    the conditions of the estimators.
 
     Examples
     --------
@@ -103,187 +101,121 @@ def estimate_diffusion(
     D_R = 0.0050(4) rad^2/s [mle, 300 frames]
     """
     motions = [motion] if isinstance(motion, RigidMotion) else list(motion)
-    _check(motions, quantity=quantity, method=method, noise=noise, exposure=exposure, drift=drift)
-    steps = [_steps(i if len(motions) > 1 else None, m, quantity) for i, m in enumerate(motions)]
-    if method == "mle":
-        tracks = [track_of(s, noise=noise, exposure=exposure, drift=drift) for s in steps]
-        found = by_likelihood(tracks)
-    elif method == "cve":
-        found = _by_moments(
-            covariance_estimate([track_of(s, noise=noise, exposure=exposure) for s in steps])
-        )
-    else:
-        given = None if noise == "joint" else [_orientation_noise(s, noise) for s in steps]
-        blur = (exposure or 0.0) * motions[0].dt / 3
-        found = _by_moments(trace_estimate(motions, noise=given, blur=blur))
-    return _judged(
-        found, motions, steps, quantity=quantity, method=method, noise=noise, exposure=exposure
+    stated_drift = noise.drift if isinstance(noise, Noise) else drift
+    faults = [
+        *choice_fault("quantity", quantity, get_args(Quantity)),
+        *noise_faults(noise, exposure, drift=drift),
+        *choice_fault("method", method, get_args(Method)),
+    ]
+    if method == "trace" and quantity == "translation":
+        faults.append('method="trace" is for quantity="rotation"')
+    if stated_drift and method != "mle":
+        faults.append('drift=True needs method="mle"')
+    if len({m.dimension for m in motions}) != 1:
+        faults.append("motion: expected one or more motions, all in 2 or all in 3 dimensions")
+    refuse(faults)
+    settings = Noise.of(noise, exposure=exposure, drift=drift)
+    steps = pooled_steps(motions, quantity)
+    estimate = DiffusionEstimate.judged(
+        _found(motions, steps, method, settings),
+        quantity=quantity,
+        method=method,
+        n_frames=sum(m.fitted.size for m in motions),
+        dt=float(np.mean([m.usual_interval for m in motions])),
+        noise_variance=_noise_variance(motions, steps, settings),
+        resolution_floor=float(np.mean([m.resolution_floor for m in motions]))
+        if quantity == "rotation"
+        else None,
+        noise=settings,
     )
+    limits = precision_limits(estimate, steps)
+    for text in limits:
+        python_warnings.warn(text, PrecisionWarning, stacklevel=2)
+    return replace(estimate, warnings=limits)
 
 
-def by_likelihood(tracks: Sequence[Track]) -> Found:
+def _found(
+    motions: Sequence[RigidMotion], steps: Sequence[Steps], method: Method, settings: Noise
+) -> Found:
+    """Return the value of one method with its intervals."""
+    if method == "trace":
+        blur = (settings.exposure or 0.0) * motions[0].dt / 3
+        if settings.model == "joint":
+            return Found.normal(*trace_estimate(motions, noise=None, blur=blur))
+        sigma = [s.sigma if isinstance(settings.model, str) else settings.model for s in steps]
+        given = [one**2 * s.complete for one, s in zip(sigma, steps, strict=True)]
+        return Found.normal(*trace_estimate(motions, noise=given, blur=blur))
+    tracks = [NoisySteps.of(s, settings) for s in steps]
+    if method == "cve":
+        return Found.normal(*covariance_estimate(tracks))
+    return by_likelihood(tracks)
+
+
+def _noise_variance(
+    motions: Sequence[RigidMotion], steps: Sequence[Steps], settings: Noise
+) -> float:
+    """Return the noise variance of one orientation or centre coordinate, mean over frames, axes."""
+    model = settings.model
+    squares = [float(np.mean(m.noise**2)) if isinstance(model, str) else model**2 for m in motions]
+    means = [
+        0.5 * float(np.mean(before) + np.mean(after))
+        for before, after in (s.variances for s in steps)
+    ]
+    return float(np.mean(np.multiply(squares, means)))
+
+
+def by_likelihood(tracks: Sequence[NoisySteps]) -> Found:
     """Maximise the likelihood; intervals from its profile, widened by unequal axes."""
+    from scipy.special import chdtrc
+
     likelihood = Likelihood.of(tracks)
     if not likelihood.scale[0] > 0:
         return Found(0.0, (0.0, 0.0), (0.0, 0.0), 0.0, np.nan)
     best = likelihood.best()
     value = float(best.D[0])
     wider = excess_scatter(tracks, value, best.theta)
-    ci68, ci95 = (likelihood.interval(best, wider * _CHI2[level]) for level in (0.68, 0.95))
+    ci68, ci95 = (likelihood.interval(best, wider * CHI2[level]) for level in (0.68, 0.95))
     offsets, offset_stderr = likelihood.offsets(best)
-    drift, drift_stderr = _steady(likelihood, best) if tracks[0].drift else (None, None)
-    p_same = _probability_same(likelihood, best) if len(tracks) > 1 else None
-    return Found(
-        value, ci68, ci95, float(offsets.mean()), offset_stderr, drift, drift_stderr, p_same
-    )
+    found = Found(value, ci68, ci95, float(offsets.mean()), offset_stderr)
+    if tracks[0].drift:
+        mean, information = likelihood.steady_motion(value, best.theta)
+        errors = np.sqrt(np.diagonal(np.linalg.inv(information), axis1=1, axis2=2))
+        drift, drift_stderr = (tuple(map(tuple, x.tolist())) for x in (mean, errors))
+        found = replace(found, drift=drift, drift_stderr=drift_stderr)
+    if len(tracks) > 1:
+        gain = float(likelihood.apart().best().value.sum() - best.value[0])
+        found = replace(found, p_same=float(chdtrc(len(tracks) - 1, max(2 * gain, 0.0))))
+    return found
 
 
-def _steady(likelihood: Likelihood, best: Peak) -> tuple[tuple[tuple[float, ...], ...], ...]:
-    """Return the steady motion of every track and its standard errors."""
-    mean, information = likelihood.steady_motion(best)
-    errors = np.sqrt(np.diagonal(np.linalg.inv(information), axis1=1, axis2=2))
-    return tuple(map(tuple, mean.tolist())), tuple(map(tuple, errors.tolist()))
-
-
-def _probability_same(likelihood: Likelihood, best: Peak) -> float:
-    """Return the p-value of equal D by the likelihood ratio."""
-    from scipy.special import chdtrc
-
-    gain = float(likelihood.apart().best().value.sum() - best.value[0])
-    return float(chdtrc(len(likelihood.tracks) - 1, max(2 * gain, 0.0)))
-
-
-def _by_moments(moments: Moments) -> Found:
-    """Give a closed-form estimate its normal intervals."""
-    value, stderr = moments.value, moments.stderr
-    ci68, ci95 = (
-        (float(value - z * stderr), float(value + z * stderr)) for z in (NORMAL[0.68], NORMAL[0.95])
-    )
-    return Found(float(value), ci68, ci95, moments.offset, moments.offset_stderr)
-
-
-def track_of(
-    steps: Steps, *, noise: str | float, exposure: float | None, drift: bool = False
-) -> Track:
-    """Return the steps with what is known of their noise; blur takes b D from its variance."""
-    if noise == "joint":
-        # An unknown exposure may blur up to the limit at which steps stop being possible at all.
-        blur = steps.duration.min() / 2 if exposure is None else exposure * steps.dt / 3
-        return Track.free(steps, blur=float(blur), drift=drift)
-    blur = (exposure or 0.0) * steps.dt / 3
-    if noise == "residual":
-        return Track.informed(steps, blur=blur, drift=drift)
-    return Track.fixed(steps, sigma=float(noise), blur=blur, drift=drift)
-
-
-def _orientation_noise(steps: Steps, noise: str | float) -> float:
-    sigma = steps.sigma if noise == "residual" else float(noise)
-    return sigma**2 * steps.complete
-
-
-def _judged(
-    found: Found,
-    motions: Sequence[RigidMotion],
-    steps: Sequence[Steps],
-    *,
-    quantity: Quantity,
-    method: str,
-    noise: str | float,
-    exposure: float | None,
-) -> DiffusionEstimate:
-    """Judge what was found: floor, resolution, signal-to-noise ratio, warnings."""
-    floor = None
-    if quantity == "rotation":
-        floor = float(np.mean([m.resolution_floor for m in motions]))
-    estimate = DiffusionEstimate.judged(
-        found,
-        quantity=quantity,
-        method=method,
-        n_frames=sum(m.fitted.size for m in motions),
-        dt=float(np.mean([m.usual_interval for m in motions])),
-        noise_variance=_spread(motions, steps, noise),
-        resolution_floor=floor,
-        noise=noise if isinstance(noise, str) else f"{noise:g} um",
-        exposure=exposure,
-    )
-    limits = _limits(estimate, steps, quantity=quantity)
-    for text in limits:
-        python_warnings.warn(text, PrecisionWarning, stacklevel=3)
-    return replace(estimate, warnings=limits)
-
-
-def _spread(motions: Sequence[RigidMotion], steps: Sequence[Steps], noise: str | float) -> float:
-    """Return the noise variance of one orientation or centre coordinate, mean over frames, axes."""
-    squares = [float(np.mean(m.noise**2)) if isinstance(noise, str) else noise**2 for m in motions]
-    means = [0.5 * float(np.mean(s.before) + np.mean(s.after)) for s in steps]
-    return float(np.mean(np.multiply(squares, means)))
-
-
-def _limits(
-    estimate: DiffusionEstimate, steps: Sequence[Steps], *, quantity: str
-) -> tuple[str, ...]:
-    """State where the estimate leaves the conditions under which it is exact."""
+def precision_limits(estimate: DiffusionEstimate, steps: Sequence[Steps]) -> tuple[str, ...]:
+    """Return one line for each condition of an exact estimate that is not fulfilled."""
     limits = []
     count = sum(len(s.duration) for s in steps)
-    if count < _FEW:
-        limits.append(f"{count} steps, fewer than {_FEW}: the interval is approximate")
-    if estimate.snr < _NOISY:
+    if count < _FEW_STEPS:
+        limits.append(f"{count} steps, fewer than {_FEW_STEPS}: the interval is approximate")
+    if estimate.snr < _LOW_SNR:
         limits.append(
-            f"signal-to-noise ratio {estimate.snr:.2g} under {_NOISY}: the noise is far larger "
+            f"signal-to-noise ratio {estimate.snr:.2g} under {_LOW_SNR}: the noise is far larger "
             "than a step; sample less often"
         )
-    if quantity == "rotation" and estimate.method != "trace":
-        durations = np.concatenate([s.duration for s in steps])
-        # A step counts as the square of the share of diffusion in its variance.
-        snr = max(estimate.snr, 0.0) * durations / estimate.dt
-        share = np.divide(snr, snr + 1, out=np.ones_like(snr), where=np.isfinite(snr))
-        weight = share**2
-        usual = float(np.average(durations, weights=weight)) if weight.any() else estimate.dt
-        limits += _coarse(estimate.value * usual, planar=steps[0].size.shape[1] == 1)
+    if estimate.quantity != "rotation" or estimate.method == "trace":
+        return tuple(limits)
+    durations = np.concatenate([s.duration for s in steps])
+    # A step counts as the square of the share of diffusion in its variance.
+    snr = max(estimate.snr, 0.0) * durations / estimate.dt
+    share = np.divide(snr, snr + 1, out=np.ones_like(snr), where=np.isfinite(snr))
+    weight = share**2
+    usual = float(np.average(durations, weights=weight)) if weight.any() else estimate.dt
+    step = estimate.value * usual
+    planar = steps[0].vectors.shape[1] == 1
+    if planar and 4 * step > _COARSE_STEP_IN_PLANE:
+        limits.append(
+            f"4 D_R dt = {4 * step:.2g} over {_COARSE_STEP_IN_PLANE}: whole turns between frames"
+        )
+    elif not planar and 4 * step > _COARSE_STEP:
+        limits.append(
+            f"4 D_R dt = {4 * step:.2g} over {_COARSE_STEP}: rotation vectors between frames read "
+            f'D_R low by about {100 * step / 6:.1f} %; method="trace" is exact at any step length'
+        )
     return tuple(limits)
-
-
-def _coarse(step: float, *, planar: bool) -> list[str]:
-    """Say where steps are so long that rotation vectors read low; `step` is D_R dt."""
-    if planar:
-        if 4 * step <= _COARSE_IN_PLANE:
-            return []
-        return [f"4 D_R dt = {4 * step:.2g} over {_COARSE_IN_PLANE}: whole turns between frames"]
-    if 4 * step <= _COARSE:
-        return []
-    return [
-        f"4 D_R dt = {4 * step:.2g} over {_COARSE}: rotation vectors between frames read D_R low "
-        f'by about {100 * step / 6:.1f} %; method="trace" is exact at any step length'
-    ]
-
-
-def _steps(number: int | None, motion: RigidMotion, quantity: Quantity) -> Steps:
-    try:
-        return steps_of(motion, quantity)
-    except TooFewFramesError as error:
-        where = "" if number is None else f"motion {number}: "
-        raise TooFewFramesError(f"{where}{error}", error.n_frames) from None
-
-
-def _check(
-    motions: Sequence[RigidMotion],
-    *,
-    quantity: str,
-    method: str,
-    noise: object,
-    exposure: object,
-    drift: bool,
-) -> None:
-    """Refuse what is not offered or does not go together, all in one message."""
-    faults = choice_faults(quantity=quantity, noise=noise, exposure=exposure)
-    if method not in get_args(Method):
-        offered = " or ".join(map(repr, get_args(Method)))
-        faults.append(f"method: expected {offered}, got {method!r}")
-    if method == "trace" and quantity == "translation":
-        faults.append('method="trace" is for quantity="rotation"')
-    if drift and method != "mle":
-        faults.append('drift=True needs method="mle"')
-    if len({m.template.shape[1] for m in motions}) != 1:
-        faults.append("motion: expected one or more motions, all in 2 or all in 3 dimensions")
-    if faults:
-        raise ValueError("; ".join(faults))

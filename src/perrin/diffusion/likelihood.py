@@ -14,180 +14,196 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from perrin.diffusion.step_kernels import _TINY, Sums, Track, _Kernel, _Sines, _Tridiagonal
+from perrin.diffusion.step_kernels import (
+    LEAST_EIGENVALUE,
+    GroupSlopes,
+    SineModes,
+    StepKernel,
+    TridiagonalCovariance,
+    difference_eigenvalues,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from perrin._arrays import Bools, Floats
+    from perrin.diffusion.steps import NoisySteps
 
 
 # Lowest and highest logarithm of an offset theta in units of the mean square step. Without
 # diffusion a long track needs an offset far above that.
-_EDGE, _TOP = -30.0, 60.0
+_LEAST_LOG_OFFSET, _MOST_LOG_OFFSET = -30.0, 60.0
 
 
-# A group of steps this much smaller (mean square) than another one's does not move at all.
-_REST = 1e-24
+# The steps of a body whose mean square is this much smaller than another one's are rounding.
+_SMALLEST_STEP_RATIO = 1e-24
 
 
-_LEAST_RATIO = float(np.exp(-_TOP))
+_LEAST_SLOPE_RATIO = float(np.exp(-_MOST_LOG_OFFSET))
 
 
-class Peak(NamedTuple):
-    """A point of the ridge: the likelihood maximised over theta at given D.
+class ProfilePoint(NamedTuple):
+    """A point of the profile likelihood: the likelihood maximised over theta at given D.
 
-    `slope` is that of the value in D and `tilt` the logarithm of its rise over its fall; `bend` is
-    how fast the tilt of theta changed with log theta, where the next search begins.
+    `slope` is that of the value in D and `log_ratio` the logarithm of its rise over its fall;
+    `curvature` is the slope of the log ratio of theta in log theta, with which the next search
+    begins.
     """
 
     D: Floats
     value: Floats
     slope: Floats
-    tilt: Floats
+    log_ratio: Floats
     theta: Floats
-    bend: Floats
+    curvature: Floats
 
 
 @dataclass(frozen=True, eq=False)
 class Likelihood:
     """The likelihood of the steps of several motions (groups), theta profiled out.
 
-    With `own` every group has a D of its own, else they share one; arrays over "units" have the
+    With `own` every motion has a D of its own, else they share one; arrays over "units" have the
     length of the number of different D.
     """
 
-    tracks: tuple[Track, ...]
-    kernels: tuple[_Kernel, ...]
+    tracks: tuple[NoisySteps, ...]
+    kernels: tuple[StepKernel, ...]
     own: bool = False
 
     @classmethod
-    def of(cls, tracks: Sequence[Track]) -> Likelihood:
-        """Give the even tracks and the rest their kernels."""
+    def of(cls, tracks: Sequence[NoisySteps]) -> Likelihood:
+        """Give even steps the sine transform and all others the tridiagonal elimination."""
         even = [i for i, t in enumerate(tracks) if t.steps.even and not t.drift]
         rest = sorted(set(range(len(tracks))) - set(even))
-        found: list[_Kernel] = []
+        found: list[StepKernel] = []
         if even:
-            found.append(_Sines.of([tracks[i] for i in even], even))
+            found.append(SineModes.of([tracks[i] for i in even], even))
         if rest:
-            found.append(_Tridiagonal.of([tracks[i] for i in rest], rest))
+            found.append(TridiagonalCovariance.of([tracks[i] for i in rest], rest))
         return cls(tuple(tracks), tuple(found))
 
     def apart(self) -> Likelihood:
-        """Return the same likelihood with a D for every group."""
+        """Return the same likelihood with a D for every motion."""
         return replace(self, own=True)
 
     @cached_property
-    def _power(self) -> Floats:
-        """Mean square step of each group: the scale of its theta."""
-        power = np.array([np.mean(t.steps.size**2) for t in self.tracks])
-        floor: Floats = np.maximum(power, _REST * power.max())
+    def mean_square(self) -> Floats:
+        """Mean square step of each motion: the scale of its theta."""
+        square = np.array([np.mean(t.steps.vectors**2) for t in self.tracks])
+        floor: Floats = np.maximum(square, _SMALLEST_STEP_RATIO * square.max())
         return floor
 
     @cached_property
     def scale(self) -> Floats:
         """Return the D of each unit that explains all of its motion without noise."""
-        moved = np.array([np.sum(t.steps.size**2) for t in self.tracks])
-        spent = [2 * t.steps.size.shape[1] * np.sum(t.steps.duration) for t in self.tracks]
-        return self._units(moved) / self._units(np.array(spent))
+        moved = np.array([np.sum(t.steps.vectors**2) for t in self.tracks])
+        spent = [2 * t.steps.vectors.shape[1] * np.sum(t.steps.duration) for t in self.tracks]
+        return self.by_unit(moved) / self.by_unit(np.array(spent))
 
     @cached_property
-    def _known(self) -> Bools:
+    def fixed(self) -> Bools:
+        """Whether theta is fixed, by motion."""
         return np.array([np.isinf(t.freedom) for t in self.tracks])
 
     @cached_property
-    def _prior(self) -> tuple[Floats, Floats]:
+    def prior(self) -> tuple[Floats, Floats]:
         """Degrees of freedom and value of theta from the residuals; none where it is fixed."""
         freedom = np.array([t.freedom for t in self.tracks])
-        return np.where(self._known, 0.0, freedom), np.array([t.theta for t in self.tracks])
+        return np.where(self.fixed, 0.0, freedom), np.array([t.theta for t in self.tracks])
 
-    def _units(self, x: Floats) -> Floats:
-        """Sum over the groups that share a D."""
+    def by_unit(self, x: Floats) -> Floats:
+        """Sum over the motions that share a D."""
         return x if self.own else np.atleast_1d(x.sum())
 
-    def sums(self, D: Floats, theta: Floats) -> Sums:
-        """Evaluate all groups at the D of each unit and the theta of each group."""
+    def sums(self, D: Floats, theta: Floats) -> GroupSlopes:
+        """Evaluate all motions at the D of each unit and the theta of each motion."""
         D = D if len(D) == len(theta) else np.full(len(theta), D[0])
         if len(self.kernels) == 1:
             total = self.kernels[0].sums(D, theta)
         else:
-            total = Sums(*np.empty((5, len(theta))))
+            total = GroupSlopes(*np.empty((5, len(theta))))
             for kernel in self.kernels:
                 part = kernel.sums(D[kernel.groups], theta[kernel.groups])
-                for whole, piece in zip(total, part, strict=True):
-                    whole[kernel.groups] = piece
-        freedom, value = self._prior
+                for of_all, of_some in zip(total, part, strict=True):
+                    of_all[kernel.groups] = of_some
+        freedom, value = self.prior
         if freedom.any():
-            # What rigid-fit residuals know of theta: chi-squared with their degrees of freedom.
-            safe = np.maximum(theta, _TINY)
+            # The residuals of the rigid fits: chi-squared with their degrees of freedom in theta.
+            safe = np.maximum(theta, LEAST_EIGENVALUE)
             total.value[:] -= 0.5 * freedom * (np.log(safe) + value / safe)
             total.rise[:] += 0.5 * freedom * (value / safe) / safe
             total.fall[:] += 0.5 * freedom / safe
         return total
 
-    def ridge(self, D: Floats, near: Peak | None = None, tolerance: float = 1e-12) -> Peak:
-        """Maximise over theta at given D, starting from the theta and the bend of `near`.
+    def profile(
+        self, D: Floats, near: ProfilePoint | None = None, tolerance: float = 1e-12
+    ) -> ProfilePoint:
+        """Maximise over theta at given D, starting from the theta and the curvature of `near`.
 
-        Each theta is the root of its own rise less fall, all groups at once, by secant steps
+        Each theta is the root of its own rise less fall, all motions at once, by secant steps
         inside a shrinking bracket in log theta; the logarithm of rise over fall makes the secant
         nearly straight. Towards theta = 0 the root may not exist; the edge is then the answer.
         """
-        power, known = self._power, self._known
-        if known.all():
-            theta = self._prior[1]
-            return self._peak(D, self.sums(D, theta), theta, np.zeros_like(theta))
-        low, high = np.full(len(power), _EDGE), np.full(len(power), _TOP)
-        start = 0.5 * power if near is None else near.theta
-        old = np.log(np.maximum(start / power, 1e-6))
-        old_tilt = _tilt(*self.sums(D, self._theta(old))[3:])
-        move = np.copysign(1e-3, old_tilt)
+        square, fixed = self.mean_square, self.fixed
+
+        def theta_at(t: Floats) -> Floats:
+            return np.where(fixed, self.prior[1], square * np.exp(t))
+
+        def point(sums: GroupSlopes, theta: Floats, curvature: Floats) -> ProfilePoint:
+            rise, fall = self.by_unit(sums.rise_D), self.by_unit(sums.fall_D)
+            value, ratio = self.by_unit(sums.value), log_slope_ratio(rise, fall)
+            return ProfilePoint(D, value, rise - fall, ratio, theta, curvature)
+
+        if fixed.all():
+            theta = self.prior[1]
+            return point(self.sums(D, theta), theta, np.zeros_like(theta))
+        low = np.full(len(square), _LEAST_LOG_OFFSET)
+        high = np.full(len(square), _MOST_LOG_OFFSET)
+        start = 0.5 * square if near is None else near.theta
+        old = np.log(np.maximum(start / square, 1e-6))
+        old_ratio = log_slope_ratio(*self.sums(D, theta_at(old))[3:])
+        move = np.copysign(1e-3, old_ratio)
         if near is not None:
-            newton = np.divide(-old_tilt, near.bend, out=move.copy(), where=near.bend < -0.01)
+            steep = near.curvature < -0.01
+            newton = np.divide(-old_ratio, near.curvature, out=move.copy(), where=steep)
             move = np.where(newton == 0, move, np.clip(newton, -1.0, 1.0))
         t = np.clip(old + move, low, high)
-        bend = np.full(len(power), np.nan)
+        curvature = np.full(len(square), np.nan)
         for _ in range(100):
-            theta = self._theta(t)
+            theta = theta_at(t)
             sums = self.sums(D, theta)
-            tilt = _tilt(sums.rise, sums.fall)
-            low, high = np.where(tilt > 0, t, low), np.where(tilt > 0, high, t)
-            np.divide(tilt - old_tilt, t - old, out=bend, where=np.abs(t - old) > 1e-9)
-            target = _secant(t, tilt, old, old_tilt, low, high)
+            ratio = log_slope_ratio(sums.rise, sums.fall)
+            low, high = np.where(ratio > 0, t, low), np.where(ratio > 0, high, t)
+            np.divide(ratio - old_ratio, t - old, out=curvature, where=np.abs(t - old) > 1e-9)
+            target = secant_trial(t, ratio, old, old_ratio, low, high)
             moves = np.minimum(np.abs(target - t), np.abs(t - old))
-            done = (moves <= tolerance) | (high <= _EDGE) | known
+            done = (moves <= tolerance) | (high <= _LEAST_LOG_OFFSET) | fixed
             if done.all():
                 break
-            old, old_tilt, t = t, tilt, np.where(done, t, target)
-        return self._peak(D, sums, theta, bend)
+            old, old_ratio, t = t, ratio, np.where(done, t, target)
+        return point(sums, theta, curvature)
 
-    def _theta(self, t: Floats) -> Floats:
-        return np.where(self._known, self._prior[1], self._power * np.exp(t))
+    def continued_profile(self, tolerance: float) -> Callable[[Floats], ProfilePoint]:
+        """Return `profile` as a function of D that starts where its last two calls ended."""
+        trail: list[ProfilePoint] = []
 
-    def _peak(self, D: Floats, sums: Sums, theta: Floats, bend: Floats) -> Peak:
-        rise, fall = self._units(sums.rise_D), self._units(sums.fall_D)
-        return Peak(D, self._units(sums.value), rise - fall, _tilt(rise, fall), theta, bend)
-
-    def _follower(self, tolerance: float) -> Callable[[Floats], Peak]:
-        """Return `ridge` as a function of D that starts from where its last two calls ended."""
-        trail: list[Peak] = []
-
-        def follow(D: Floats) -> Peak:
+        def follow(D: Floats) -> ProfilePoint:
             near = trail[-1] if trail else None
             if len(trail) > 1 and not self.own and trail[-1].D[0] != trail[-2].D[0]:
                 one, two = trail[-2:]
                 ahead = (two.theta - one.theta) * (D - two.D) / (two.D - one.D)
                 near = two._replace(theta=two.theta + ahead)
-            trail.append(self.ridge(D, near, tolerance))
+            trail.append(self.profile(D, near, tolerance))
             return trail[-1]
 
         return follow
 
-    def best(self) -> Peak:
-        """Return the D of greatest likelihood of every unit: the highest top of its ridge, or 0.
+    def best(self) -> ProfilePoint:
+        """Return the D of greatest likelihood of every unit: the highest maximum, or 0.
 
-        Short tracks can have several tops, so the whole range is searched.
+        Short tracks can have several maxima, so the whole range is searched.
         """
-        coarse, fine = self._follower(1e-3), self._follower(1e-12)
+        coarse, fine = self.continued_profile(1e-3), self.continued_profile(1e-12)
         best = np.zeros_like(self.scale)
         seen = [coarse(best)]
         for power in range(-7, 60):
@@ -195,20 +211,33 @@ class Likelihood:
                 break
             seen.append(coarse(self.scale * 4.0**power))
         height = np.where(seen[0].slope <= 0, seen[0].value, -np.inf)
-        for low, high in _falls(seen):
-            peak = self._root(fine, low, high)
+        # Brackets in which a unit's slope falls through zero, in the order of D; a unit that has
+        # no more of them gets a bracket of length 0.
+        D = np.array([p.D for p in seen])
+        slope = np.array([p.log_ratio for p in seen])
+        falls = (slope[:-1] > 0) & (slope[1:] <= 0)
+        order, unit = np.argsort(~falls, axis=0, kind="stable"), np.arange(D.shape[1])
+        for row in order[: int(falls.sum(axis=0).max(initial=0))]:
+            low = D[row, unit]
+            high = np.where(falls[row, unit], D[row + 1, unit], low)
+            peak = self.maximum_between(low, high, fine)
             higher = (peak.value > height) & (high > low)
             best, height = np.where(higher, peak.D, best), np.where(higher, peak.value, height)
         return fine(best)
 
-    def _root(self, follow: Callable[[Floats], Peak], low: Floats, high: Floats) -> Peak:
-        """Return the top of the ridge between `low` and `high`; units where they agree rest."""
+    def maximum_between(
+        self, low: Floats, high: Floats, follow: Callable[[Floats], ProfilePoint]
+    ) -> ProfilePoint:
+        """Return the maximum of the profile between `low` and `high`, by bracketed secant steps.
+
+        Units whose `low` and `high` agree stay there.
+        """
         first, last = follow(low), follow(high)
         old, peak = first, last
         for _ in range(200):
             D = peak.D
-            low, high = np.where(peak.tilt > 0, D, low), np.where(peak.tilt > 0, high, D)
-            target = _secant(D, peak.tilt, old.D, old.tilt, low, high)
+            low, high = np.where(peak.log_ratio > 0, D, low), np.where(peak.log_ratio > 0, high, D)
+            target = secant_trial(D, peak.log_ratio, old.D, old.log_ratio, low, high)
             moves = np.minimum(np.abs(target - D), np.abs(D - old.D))
             done = (moves <= 1e-13 * np.abs(D)) | (high <= low)
             if done.all():
@@ -216,55 +245,49 @@ class Likelihood:
             old, peak = peak, follow(np.where(done, D, target))
         return peak
 
-    def interval(self, best: Peak, drop: float) -> tuple[float, float]:
+    def interval(self, best: ProfilePoint, drop: float) -> tuple[float, float]:
         """Return where twice the profile log-likelihood has fallen by `drop`; 0 if it never has."""
-        # The height is flat in theta on the ridge: half the digits of theta give all of its own.
-        follow = self._follower(1e-6)
+        # At the maximum over theta the value is flat: half the digits of theta give all of its own.
+        follow = self.continued_profile(1e-6)
         value, top = float(best.D[0]), float(best.value[0])
 
         def height(D: float) -> tuple[float, float]:
             peak = follow(np.array([D]))
             return float(peak.value[0]) - top + drop / 2, float(peak.slope[0])
 
-        count = sum(t.steps.size.size for t in self.tracks)
+        count = sum(t.steps.vectors.size for t in self.tracks)
         near = 0.02 * value if value else float(self.scale[0]) / count
         curvature = -height(value + near)[1] / near
         reach = np.sqrt(drop / curvature) if curvature > 0 else near
-        high = _crossing(height, inside=value, start=value + reach, outside=np.inf)
+        high = newton_crossing(height, inside=value, start=value + reach, outside=np.inf)
         if value == 0 or height(0.0)[0] > 0:
             return 0.0, high
-        return _crossing(height, inside=value, start=value - reach, outside=0.0), high
+        return newton_crossing(height, inside=value, start=value - reach, outside=0.0), high
 
-    def steady_motion(self, best: Peak) -> tuple[Floats, Floats]:
-        """Return the steady velocity or spin of every group (G, p), lab axes, and its information.
+    def steady_motion(self, D: float, theta: Floats) -> tuple[Floats, Floats]:
+        """Return the steady velocity or spin of every motion (G, p), lab axes, and its information.
 
-        The information (G, p, p) is the inverse of the covariance at the D and noise of `best`.
+        The information (G, p, p) is the inverse of the covariance at this D and theta.
         """
-        kernel = next(k for k in self.kernels if isinstance(k, _Tridiagonal))
-        mean, gram = kernel.steady_motion(np.full(len(best.theta), best.D[0]), best.theta)
-        return mean + np.array([t.steady for t in self.tracks]), gram
+        kernel = next(k for k in self.kernels if isinstance(k, TridiagonalCovariance))
+        mean, information = kernel.steady_motion(np.full(len(theta), D), theta)
+        return mean + np.array([t.steady for t in self.tracks]), information
 
-    def steady_motion_at(self, D: float, theta: float) -> tuple[Floats, Floats]:
-        """Return the steady motion (p,) of a single track at D and theta, and its information."""
-        kernel = next(k for k in self.kernels if isinstance(k, _Tridiagonal))
-        mean, gram = kernel.steady_motion(np.array([D]), np.array([theta]))
-        return mean[0] + self.tracks[0].steady, gram[0]
+    def offsets(self, best: ProfilePoint) -> tuple[Floats, float]:
+        """Return the noise offset of each motion, and the standard error of their mean.
 
-    def offsets(self, best: Peak) -> tuple[Floats, float]:
-        """Return the noise offset of each group, and the standard error of their mean.
-
-        The observed information is arrow-shaped (one D, a theta for each group); it comes from
+        The observed information is arrow-shaped (one D, a theta for each motion); it comes from
         central differences of the slopes. NaN where a theta lies on its edge.
         """
         blur = np.array([t.blur for t in self.tracks])
         level = np.array([t.level for t in self.tracks])
-        free = np.where(self._known, 0.0, best.theta)
+        free = np.where(self.fixed, 0.0, best.theta)
         offset = free + level - blur * best.D
-        D, theta, free = best.D, best.theta, ~self._known
-        if D[0] == 0 or np.any(free & (theta <= 1e-3 * self._power)):
+        D, theta, free = best.D, best.theta, ~self.fixed
+        if D[0] == 0 or np.any(free & (theta <= 1e-3 * self.mean_square)):
             return offset, np.nan
-        more, less = (self.sums(D, theta + k * 1e-4 * self._power * free) for k in (1, -1))
-        h_oo = (less.rise - less.fall - more.rise + more.fall) / (2e-4 * self._power)
+        more, less = (self.sums(D, theta + k * 1e-4 * self.mean_square * free) for k in (1, -1))
+        h_oo = (less.rise - less.fall - more.rise + more.fall) / (2e-4 * self.mean_square)
         more, less = (self.sums(D * (1 + k * 1e-4), theta) for k in (1, -1))
         slope_D = less.rise_D - less.fall_D - more.rise_D + more.fall_D
         slope_o = less.rise - less.fall - more.rise + more.fall
@@ -277,50 +300,52 @@ class Likelihood:
         return offset, float(np.sqrt(own + np.mean(turn + blur) ** 2 / left))
 
 
-def _falls(seen: Sequence[Peak]) -> list[tuple[Floats, Floats]]:
-    """Return the brackets in which a unit's slope falls through zero, the first of each unit first.
+def log_slope_ratio(rise: Floats, fall: Floats) -> Floats:
+    """Return the logarithm of rise over fall; negative where both are zero.
 
-    A unit that has no more of them rests at one point.
+    Examples
+    --------
+    >>> log_slope_ratio(np.array([1.0, 0.0]), np.array([1.0, 0.0]))
+    array([  0., -60.])
     """
-    D = np.array([p.D for p in seen])
-    slope = np.array([p.tilt for p in seen])
-    falls = (slope[:-1] > 0) & (slope[1:] <= 0)
-    order = np.argsort(~falls, axis=0, kind="stable")
-    found = []
-    for layer in range(int(falls.sum(axis=0).max(initial=0))):
-        row = order[layer]
-        unit = np.arange(D.shape[1])
-        here = falls[row, unit]
-        low = D[row, unit]
-        found.append((low, np.where(here, D[row + 1, unit], low)))
-    return found
+    ratio = rise / np.maximum(fall, LEAST_EIGENVALUE)
+    return np.asarray(
+        np.log(np.minimum(np.maximum(ratio, _LEAST_SLOPE_RATIO), 1 / _LEAST_SLOPE_RATIO))
+    )
 
 
-def _tilt(rise: Floats, fall: Floats) -> Floats:
-    """Return the logarithm of rise over fall; where nothing moves it is downhill."""
-    ratio = rise / np.maximum(fall, _TINY)
-    return np.asarray(np.log(np.minimum(np.maximum(ratio, _LEAST_RATIO), 1 / _LEAST_RATIO)))
-
-
-def _secant(
+def secant_trial(
     t: Floats, slope: Floats, old: Floats, old_slope: Floats, low: Floats, high: Floats
 ) -> Floats:
-    """Return the next trial: the secant step, or the middle of the bracket where that leaves it."""
+    """Return the next trial: the secant step, or the middle of the bracket where that leaves it.
+
+    Examples
+    --------
+    >>> t, slope, old, old_slope, low, high = np.array([[1.0], [2.0], [0.0], [4.0], [1.0], [9.0]])
+    >>> secant_trial(t, slope, old, old_slope, low, high)
+    array([2.])
+    """
     rise, run = slope - old_slope, t - old
     step = np.divide(slope * run, rise, out=np.full_like(t, np.nan), where=rise != 0)
     target = np.where(rise * run < 0, t - step, np.nan)
     inside = (target > low) & (target < high)
     # Falling slopes that never cross zero lead down to the edge, which is then the answer.
-    target = np.where((target <= low) & (low <= _EDGE), _EDGE, target)
-    return np.where(inside | (target == _EDGE), target, 0.5 * (low + high))
+    edge = _LEAST_LOG_OFFSET
+    target = np.where((target <= low) & (low <= edge), edge, target)
+    return np.where(inside | (target == edge), target, 0.5 * (low + high))
 
 
-def _crossing(
+def newton_crossing(
     height: Callable[[float], tuple[float, float]], *, inside: float, start: float, outside: float
 ) -> float:
     """Return where a height falls through zero between `inside` (> 0) and `outside` (< 0).
 
     Newton steps, halved into the bracket, or doubled away from `inside` while there is no bracket.
+
+    Examples
+    --------
+    >>> newton_crossing(lambda x: (2 - x * x, -2 * x), inside=1.0, start=3.0, outside=np.inf)
+    1.414213562373095
     """
     x = start if min(inside, outside) < start < max(inside, outside) else (inside + outside) / 2
     for _ in range(200):
@@ -335,39 +360,51 @@ def _crossing(
     return float(x)
 
 
-def excess_scatter(tracks: Sequence[Track], D: float, theta: Floats) -> float:
+def excess_scatter(tracks: Sequence[NoisySteps], D: float, theta: Floats) -> float:
     """Return the factor by which unequal axes raise the variance of their common D.
 
     The likelihood of one D for all axes finds the mean over axes (trace/3) whatever the tensor is,
     for the deviations of the axes cancel in its score. They do not cancel in the score's variance,
     which in sine mode k is sum_ab Lambda_ab^2 over A lambda^2 times that of equal axes. The
-    deviations of D and of the noise are fitted to the cross powers of the axes, and what chance
-    alone puts there is taken off: equal axes give 1 on average.
+    deviations of D and of the noise are fitted to the cross powers of the axes, and the part that
+    is expected by chance is subtracted: equal axes give 1 on average.
 
     Parameters
     ----------
-    tracks : sequence of Track
+    tracks : sequence of NoisySteps
         Of one quantity.
     D : float
     theta : ndarray, shape (G,)
-        Noise of each track, as the likelihood found it.
+        Noise of each motion, as the likelihood found it.
 
     Returns
     -------
     float
         At least 1.
+
+    Examples
+    --------
+    >>> from perrin import Cluster, simulate_motion
+    >>> from perrin.diffusion import Noise, NoisySteps, steps_of
+    >>> D_R = [1e-3, 1e-3, 1e-2]
+    >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=D_R, dt=0.7, n_frames=300, rng=3)
+    >>> track = NoisySteps.of(steps_of(truth, "rotation"), Noise())
+    >>> excess_scatter([track], 4e-3, np.zeros(1)) > 1.4
+    True
     """
-    parts = [_excess(track, D, float(t)) for track, t in zip(tracks, theta, strict=True)]
+    parts = [_squared_deviations(t, D, float(own)) for t, own in zip(tracks, theta, strict=True)]
     excess, scale = np.sum(parts, axis=0)
     return 1.0 + max(0.0, float(excess / scale)) if scale > 0 else 1.0
 
 
-def _excess(track: Track, D: float, theta: float) -> tuple[float, float]:
-    """Return sums over modes of the squared deviations, chance taken off, and of their scale."""
-    count, axes = track.steps.size.shape
+def _squared_deviations(track: NoisySteps, D: float, theta: float) -> tuple[float, float]:
+    """Return sums over modes of the squared deviations, chance subtracted, and of their scale."""
+    from scipy.fft import dst
+
+    count, axes = track.steps.vectors.shape
     if axes == 1 or count < 5:
         return 0.0, 0.0
-    c = 1 - np.cos(np.pi * np.arange(1, count + 1) / (count + 1))
+    c = difference_eigenvalues(count)
     weight, known = (
         np.mean([pair[0].mean(axis=0), pair[1].mean(axis=0)], axis=0)
         for pair in (track.weight, track.known)
@@ -378,31 +415,23 @@ def _excess(track: Track, D: float, theta: float) -> tuple[float, float]:
     eigen = by_D * D + by_noise * noise.mean()
     if not np.all(eigen > 0):
         return 0.0, 0.0
+    modes = dst(track.steps.vectors, type=1, norm="ortho", axis=0)
+    powers = modes[:, :, None] * modes[:, None, :]
+    powers -= by_noise[:, None, None] * np.diag(noise - noise.mean())
+    powers -= np.trace(powers, axis1=1, axis2=2)[:, None, None] / axes * np.eye(axes)
     rows = np.stack([by_D, by_noise])
-    seen = _cross_powers(track.steps.size) - by_noise[:, None, None] * np.diag(noise - noise.mean())
-    seen -= np.trace(seen, axis1=1, axis2=2)[:, None, None] / axes * np.eye(axes)
     fisher = np.linalg.inv((rows / eigen) @ (rows / eigen).T)
-    found = np.einsum("kab,pk->pab", seen, fisher @ (rows / eigen**2))
+    found = np.einsum("kab,pk->pab", powers, fisher @ (rows / eigen**2))
     deviation = np.einsum("pab,pk->kab", found, rows)
     chance = (axes - 1) * (axes + 2) * np.einsum("pk,pq,qk->k", rows, fisher, rows)
-    score = _score(track, theta, by_D, by_noise * weight.mean(), eigen)
+    # Weights of the modes in the score of D with theta profiled out.
+    score = by_D / eigen**2
+    if np.isfinite(track.freedom):
+        by_theta = by_noise * weight.mean()
+        known_theta = track.freedom / (axes * theta**2) if theta > 0 else 0.0
+        shared = np.sum(by_D * by_theta / eigen**2) / (
+            np.sum((by_theta / eigen) ** 2) + known_theta
+        )
+        score = (by_D - shared * by_theta) / eigen**2
     excess = np.sum(score**2 * (np.sum(deviation**2, axis=(1, 2)) - chance))
     return float(excess), float(axes * np.sum((score * eigen) ** 2))
-
-
-def _cross_powers(size: Floats) -> Floats:
-    """Return the products of the axes' sine transforms, (M, A, A)."""
-    from scipy.fft import dst
-
-    modes = dst(size, type=1, norm="ortho", axis=0)
-    return np.asarray(modes[:, :, None] * modes[:, None, :])
-
-
-def _score(track: Track, theta: float, by_D: Floats, by_theta: Floats, eigen: Floats) -> Floats:
-    """Return the weights of the modes in the score of D with theta profiled out."""
-    if np.isinf(track.freedom):
-        return by_D / eigen**2
-    axes = track.steps.size.shape[1]
-    known = track.freedom / (axes * theta**2) if theta > 0 else 0.0
-    shared = np.sum(by_D * by_theta / eigen**2) / (np.sum((by_theta / eigen) ** 2) + known)
-    return np.asarray((by_D - shared * by_theta) / eigen**2)

@@ -1,4 +1,4 @@
-"""What D averages over steps show: the covariance estimator and the mean cosine, in closed form."""
+"""D from averages over steps in closed form: the covariance estimator and the mean cosine."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from perrin._arrays import Floats, Ints
-    from perrin.diffusion.step_kernels import Track
+    from perrin.diffusion.steps import NoisySteps
     from perrin.motion.rigid_motion import RigidMotion
 
 
 class Moments(NamedTuple):
-    """A value of D with its standard error, and the noise variance with its own."""
+    """A value of D with its standard error, and the noise offset with its own."""
 
     value: float
     stderr: float
@@ -23,88 +23,84 @@ class Moments(NamedTuple):
     offset_stderr: float
 
 
-def covariance_estimate(tracks: Sequence[Track]) -> Moments:
-    """Estimate D from mean squares and products of neighbouring steps.
+class _QuadraticForm(NamedTuple):
+    """A quadratic form in the steps of each axis: its value, and weights of squares and products.
 
-    With the noise free, D = <y^2>/2t + <y y'>/t (Vestergaard, Blainey and Flyvbjerg 2014): the
-    negative correlation that the shared frame gives two steps takes the noise off. With the noise
-    given, D = (<y^2> - 2 s)/2t. Gaps enter with their durations.
-
-    The errors are those of a quadratic form in Gaussian steps with the covariance found.
+    Products are those of neighbouring steps, which share a frame.
     """
-    free = tracks[0].freedom == 0
-    total = 2 * sum(
-        t.steps.size.shape[1] * float(np.sum(t.steps.duration - (0 if free else t.blur)))
-        for t in tracks
-    )
-    forms = [_form(t, free=free) for t in tracks]
-    value = sum(form.value for form in forms) / total
-    offsets = [_offset(t, value, free=free) for t in tracks]
-    variance = sum(
-        _variance(t, form, value, offset.value)
-        for t, form, offset in zip(tracks, forms, offsets, strict=True)
-    )
-    spread = 0.0
-    for t, offset in zip(tracks, offsets, strict=True):
-        spread += _variance(t, offset.form, value, offset.value) if free else 0.0
-        if 0 < t.freedom < np.inf:
-            noise = sum(float(w.sum()) for w in t.weight) * t.theta
-            variance += 2 / t.freedom * noise**2
-            spread += 2 / t.freedom * t.theta**2
-    return Moments(
-        value,
-        float(np.sqrt(variance)) / total,
-        float(np.mean([offset.value + t.level for offset, t in zip(offsets, tracks, strict=True)])),
-        float(np.sqrt(spread)) / len(tracks),
-    )
-
-
-class _Form(NamedTuple):
-    """A quadratic form in the steps of each axis: weights of squares and of neighbours."""
 
     value: float
     square: float
     cross: float
 
 
-class _Offset(NamedTuple):
-    value: float
-    form: _Form
+def covariance_estimate(tracks: Sequence[NoisySteps]) -> Moments:
+    """Estimate D from mean squares and products of neighbouring steps.
+
+    With the noise free, D = <y^2>/2t + <y y'>/t (Vestergaard, Blainey and Flyvbjerg 2014): the
+    negative correlation that the shared frame gives two steps subtracts the noise. With the noise
+    given, D = (<y^2> - 2 s)/2t. Gaps enter with their durations.
+
+    The errors are those of a quadratic form in Gaussian steps with the covariance found.
+    """
+    free = tracks[0].freedom == 0
+    total = 2 * sum(
+        t.steps.vectors.shape[1] * float(np.sum(t.steps.duration - (0 if free else t.blur)))
+        for t in tracks
+    )
+    forms = [_form_of_D(t, free=free) for t in tracks]
+    value = sum(form.value for form in forms) / total
+    variance, offset_variance, offsets = 0.0, 0.0, []
+    for track, form in zip(tracks, forms, strict=True):
+        if free:
+            pairs = int(track.steps.linked[:-1].sum()) * track.steps.vectors.shape[1]
+            pairs = max(pairs, 1)
+            offset = -(_neighbour_products(track) + _known_at_links(track)) / pairs
+            product = _QuadraticForm(offset, 0.0, 0.5 / pairs)
+            offset_variance += _form_variance(track, product, value, offset)
+        else:
+            offset = track.theta - track.blur * value
+        offsets.append(offset + track.level)
+        variance += _form_variance(track, form, value, offset)
+        if 0 < track.freedom < np.inf:
+            noise = sum(float(w.sum()) for w in track.weight) * track.theta
+            variance += 2 / track.freedom * noise**2
+            offset_variance += 2 / track.freedom * track.theta**2
+    return Moments(
+        value,
+        float(np.sqrt(variance)) / total,
+        float(np.mean(offsets)),
+        float(np.sqrt(offset_variance)) / len(tracks),
+    )
 
 
-def _form(track: Track, *, free: bool) -> _Form:
-    """Return the sum whose mean is D times twice the time spent."""
-    y, linked = track.steps.size, track.steps.linked[:-1]
+def _form_of_D(track: NoisySteps, *, free: bool) -> _QuadraticForm:
+    """Return the form whose mean is D times twice the time spent, all axes together."""
+    y, linked = track.steps.vectors, track.steps.linked[:-1]
     squares = float(np.sum(y * y))
     if not free:
         noise = sum(
             float(np.sum(w * track.theta + k))
             for w, k in zip(track.weight, track.known, strict=True)
         )
-        return _Form(squares - noise, 1.0, 0.0)
+        return _QuadraticForm(squares - noise, 1.0, 0.0)
     share = len(y) / max(int(linked.sum()), 1)
-    excess = sum(float(k.sum()) for k in track.known)
-    excess -= 2 * share * float(track.known[1][:-1][linked].sum())
-    return _Form(squares + 2 * share * _neighbours(track) - excess, 1.0, share)
+    excess = sum(float(k.sum()) for k in track.known) - 2 * share * _known_at_links(track)
+    return _QuadraticForm(squares + 2 * share * _neighbour_products(track) - excess, 1.0, share)
 
 
-def _offset(track: Track, D: float, *, free: bool) -> _Offset:
-    """Return the free part of the noise offset, from the products of neighbours, or as given."""
-    if not free:
-        return _Offset(track.theta - track.blur * D, _Form(0.0, 0.0, 0.0))
-    links = track.steps.linked[:-1]
-    pairs = max(int(links.sum()) * track.steps.size.shape[1], 1)
-    excess = float(track.known[1][:-1][links].sum())
-    value = -(_neighbours(track) + excess) / pairs
-    return _Offset(value, _Form(value, 0.0, 0.5 / pairs))
+def _known_at_links(track: NoisySteps) -> float:
+    """Return the known noise variance of the frames that two steps share, summed."""
+    return float(track.known[1][:-1][track.steps.linked[:-1]].sum())
 
 
-def _neighbours(track: Track) -> float:
-    y = track.steps.size
+def _neighbour_products(track: NoisySteps) -> float:
+    """Return the products of neighbouring steps that share a frame, summed over steps and axes."""
+    y = track.steps.vectors
     return float(np.sum((y[:-1] * y[1:])[track.steps.linked[:-1]]))
 
 
-def _variance(track: Track, form: _Form, D: float, offset: float) -> float:
+def _form_variance(track: NoisySteps, form: _QuadraticForm, D: float, offset: float) -> float:
     """Return the variance of a form, 2 tr (QC)^2 for every axis, with both matrices banded."""
     s = track.steps
     linked = s.linked[:-1, None]
@@ -120,7 +116,7 @@ def _variance(track: Track, form: _Form, D: float, offset: float) -> float:
     diagonal = q * a + rb
     upper = q * b + r * a[1:]
     lower = q * b + r * a[:-1]
-    # Two beside the diagonal: Q_{i,i+1} C_{i+1,i+2}, and back.
+    # Second off-diagonal: Q_{i,i+1} C_{i+1,i+2}, and its transpose.
     far = (r[:-1] * b[1:]) * (r[1:] * b[:-1])
     return 2 * float(np.sum(diagonal**2) + 2 * np.sum(upper * lower) + 2 * np.sum(far))
 
@@ -132,7 +128,7 @@ def trace_estimate(
 
     For Brownian rotation <tr R_k^T R_{k+1}>/3 = exp(-2 D t) whatever D t is (in the plane
     <cos> = exp(-D t)). Noise adds 2 s (s in the plane) to the exponent: with the noise free it is
-    taken off as the difference between two steps and one.
+    subtracted as the difference between two steps and one.
 
     Parameters
     ----------
@@ -146,28 +142,31 @@ def trace_estimate(
     dt = motions[0].dt
     if any(abs(m.dt - dt) > 1e-9 * dt for m in motions):
         raise ValueError('method="trace" needs one dt for all motions')
-    lags = [_cosines(m, lag) for m in motions for lag in (1, 2)]
+    lags = [step_cosines(m, lag) for m in motions for lag in (1, 2)]
     one, two = np.concatenate(lags[0::2]), np.concatenate(lags[1::2])
     rate = 1.0 if motions[0].template.shape[1] == 2 else 2.0
     if not np.isfinite(one).any() or not np.isfinite(two).any():
         raise ValueError('method="trace" needs frames one and two dt apart')
-    f1, v1 = _exponent(one)
-    f2, v2 = _exponent(two)
+    f1, v1 = _cosine_exponent(one)
+    f2, v2 = _cosine_exponent(two)
     if noise is None:
         value = (f2 - f1) / (rate * dt)
         return Moments(
-            value, _error(v2 - v1) / (rate * dt), (2 * f1 - f2) / rate, _error(2 * v1 - v2) / rate
+            value,
+            _correlated_error(v2 - v1) / (rate * dt),
+            (2 * f1 - f2) / rate,
+            _correlated_error(2 * v1 - v2) / rate,
         )
     s = float(np.mean(noise))
     value = (f1 / rate - s) / (dt - blur)
-    return Moments(value, _error(v1) / (rate * (dt - blur)), s - blur * value, np.nan)
+    return Moments(value, _correlated_error(v1) / (rate * (dt - blur)), s - blur * value, np.nan)
 
 
-def _cosines(motion: RigidMotion, lag: int) -> Floats:
+def step_cosines(motion: RigidMotion, lag: int) -> Floats:
     """Return tr(R^T R')/d of every frame and the one `lag` dt later; NaN where there is none.
 
-    Two empty rows at the end keep the frames of different motions apart; longer holes between
-    frames are cut to two empty rows, so that absent frames take no room.
+    Two empty rows at the end keep the frames of different motions apart; longer gaps between
+    frames are cut to two empty rows, so that absent frames need no memory.
     """
     rows = motion.fitted
     slot: Ints = np.rint((motion.time[rows] - motion.time[rows[0]]) / motion.dt).astype(np.int64)
@@ -184,8 +183,8 @@ def _cosines(motion: RigidMotion, lag: int) -> Floats:
     return found
 
 
-def _exponent(cosine: Floats) -> tuple[float, Floats]:
-    """Return -log of the mean, and what every pair adds to its error."""
+def _cosine_exponent(cosine: Floats) -> tuple[float, Floats]:
+    """Return -log of the mean cosine, and the contribution of every pair to its error."""
     here = np.isfinite(cosine)
     mean, spread = float(cosine[here].mean()), float(cosine[here].std())
     if mean <= 3 * spread / np.sqrt(here.sum()):
@@ -197,8 +196,8 @@ def _exponent(cosine: Floats) -> tuple[float, Floats]:
     return -np.log(mean), np.where(here, (mean - cosine) / (mean * here.sum()), 0.0)
 
 
-def _error(influence: Floats) -> float:
-    """Return the standard error of a sum of terms that depend on each other up to two frames on."""
+def _correlated_error(influence: Floats) -> float:
+    """Return the standard error of a sum of terms that are correlated up to two frames apart."""
     own = float(influence @ influence)
     total = own + 2 * sum(float(influence[:-k] @ influence[k:]) for k in (1, 2))
     return float(np.sqrt(total if total > 0 else own))

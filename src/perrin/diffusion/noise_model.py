@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import numpy as np
 
 from perrin._arrays import refuse
-from perrin.diffusion.steps import Quantity
 
 
 @dataclass(frozen=True)
@@ -43,23 +42,68 @@ class Noise:
 
     def __post_init__(self) -> None:
         """Refuse values out of range."""
-        refuse(choice_faults(quantity="rotation", noise=self.model, exposure=self.exposure))
+        refuse(noise_faults(self.model, self.exposure))
+
+    @property
+    def text(self) -> str:
+        """The model in words: "joint", "residual", or the localisation error with its unit."""
+        return self.model if isinstance(self.model, str) else f"{self.model:g} um"
+
+    @classmethod
+    def of(cls, noise: object, *, exposure: float | None = None, drift: bool = False) -> Noise:
+        """Return the options of an estimator that takes them together or as three keywords.
+
+        Parameters
+        ----------
+        noise : Noise, or "joint", "residual" or float
+        exposure : float, optional
+        drift : bool
+
+        Raises
+        ------
+        ValueError
+            If a value is out of its range, or stated both in `noise` and by its own keyword.
+
+        Examples
+        --------
+        >>> Noise.of(0.02, exposure=0.5) == Noise.of(Noise(0.02, exposure=0.5))
+        True
+        """
+        refuse(noise_faults(noise, exposure, drift=drift))
+        return noise if isinstance(noise, Noise) else cls(noise, exposure, drift)  # type: ignore[arg-type]
 
 
-def choice_faults(*, quantity: object, noise: object, exposure: object) -> list[str]:
-    """Say which choices of an estimate from steps are not on offer."""
+def noise_faults(noise: object, exposure: object, *, drift: object = False) -> list[str]:
+    """Return one line for each of these options that is out of its range or stated twice.
+
+    Examples
+    --------
+    >>> noise_faults("loud", 1.5)
+    ["noise: expected 'joint', 'residual' or sigma in um, got 'loud'", 'exposure: expected a fraction of dt, 0 to 1, got 1.5']
+    >>> noise_faults(Noise(exposure=0.5), 0.5)
+    ['exposure: stated both in noise = Noise(...) and as exposure; state it once']
+    """  # noqa: E501 (what Python prints)
+    if isinstance(noise, Noise):
+        given = {"exposure": exposure is not None, "drift": drift}
+        return [
+            f"{name}: stated both in noise = Noise(...) and as {name}; state it once"
+            for name, stated in given.items()
+            if stated
+        ]
     faults = []
-    if quantity not in get_args(Quantity):
-        offered = " or ".join(map(repr, get_args(Quantity)))
-        faults.append(f"quantity: expected {offered}, got {quantity!r}")
-    if not (noise in ("joint", "residual") if isinstance(noise, str) else _within(noise, np.inf)):
+    offered = (
+        noise in ("joint", "residual")
+        if isinstance(noise, str)
+        else _is_number_up_to(noise, np.inf)
+    )
+    if not offered:
         faults.append(f"noise: expected 'joint', 'residual' or sigma in um, got {noise!r}")
-    if exposure is not None and not _within(exposure, 1.0):
+    if exposure is not None and not _is_number_up_to(exposure, 1.0):
         faults.append(f"exposure: expected a fraction of dt, 0 to 1, got {exposure!r}")
     return faults
 
 
-def _within(value: Any, most: float) -> bool:  # noqa: ANN401 (a user's argument)
+def _is_number_up_to(value: Any, most: float) -> bool:  # noqa: ANN401 (a user's argument)
     """Return whether a value is one finite number from 0 to `most`."""
     try:
         number = np.nan if isinstance(value, str) else float(value)

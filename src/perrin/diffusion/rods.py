@@ -6,14 +6,14 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from perrin._arrays import choice_fault, refuse
 from perrin.diffusion.estimate import DiffusionEstimate
 from perrin.diffusion.estimators import by_likelihood
-from perrin.diffusion.step_kernels import Track
-from perrin.diffusion.steps import Steps, center_steps, direction_steps
+from perrin.diffusion.noise_model import Noise
+from perrin.diffusion.steps import NoisySteps, center_steps, direction_steps
 from perrin.errors import TooFewFramesError
 
 if TYPE_CHECKING:
-    from perrin.diffusion.steps import Walk
     from perrin.motion.rods import RodMotion
 
 
@@ -37,6 +37,8 @@ def estimate_rod(
     ------
     TooFewFramesError
         Fewer than 3 frames in a row.
+    ValueError
+        For another quantity.
 
     Examples
     --------
@@ -46,44 +48,19 @@ def estimate_rod(
     >>> estimate.ci95[0] < 0.01 < estimate.ci95[1]
     True
     """
-    walk = direction_steps(motion) if quantity == "direction" else center_steps(motion)
-    if len(walk.tau) < 2:
+    refuse(choice_fault("quantity", quantity, ("direction", "translation")))
+    steps = direction_steps(motion) if quantity == "direction" else center_steps(motion)
+    if len(steps.duration) < 2:
         raise TooFewFramesError(
             f"{motion.fitted.size} frames show the rod in too few steps: at least 3 in a row "
-            "(gaps allowed) are needed to tell diffusion from noise",
+            "(gaps allowed) are needed to separate diffusion from noise",
             int(motion.fitted.size),
         )
-    blur = float(walk.tau.min()) / 2  # the exposure is unknown: see estimate_diffusion
-    found = by_likelihood([Track.free(_steps(walk, motion), blur=blur, drift=False)])
     return DiffusionEstimate.judged(
-        found,
+        by_likelihood([NoisySteps.of(steps, Noise())]),
         quantity="rotation" if quantity == "direction" else "translation",
         method="mle",
         n_frames=int(motion.fitted.size),
-        dt=float(np.median(walk.tau)),
-        noise_variance=float(np.nanmean(walk.variance)),
-    )
-
-
-def _steps(walk: Walk, motion: RodMotion) -> Steps:
-    """Return the walk as the likelihood that serves all motions takes it.
-
-    Its noise is known as such, not as a multiple of sigma^2: sigma is 1.
-    """
-    components = walk.y.shape[1]
-    before, after = (
-        np.repeat(walk.variance[rows][:, None], components, axis=1)
-        for rows in (walk.start, walk.stop)
-    )
-    return Steps(
-        size=walk.y,
-        duration=walk.tau,
-        linked=np.append(walk.start[1:] == walk.stop[:-1], False),
-        before=before,
-        after=after,
-        complete=float(np.nanmean(walk.variance)),
-        sigma=1.0,
-        freedom=0,
-        dt=motion.dt,
-        steady=np.zeros((*walk.y.shape, 0)),
+        dt=float(np.median(steps.duration)),
+        noise_variance=steps.complete,
     )

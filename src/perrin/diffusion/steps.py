@@ -1,18 +1,23 @@
-"""The steps of a motion as estimators take them: size, duration, noise of both ends."""
+"""Steps of a motion: their vectors, durations and links, the noise of their frames, its model."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from perrin._arrays import frozen
 from perrin.errors import TooFewFramesError
 from perrin.geometry.rigid import degrees_of_freedom, orientation_covariance
 from perrin.geometry.rotations import exp_map, successive_product
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from perrin._arrays import Bools, Floats, Ints
+    from perrin.diffusion.noise_model import Noise
     from perrin.motion.rigid_motion import RigidMotion
     from perrin.motion.rods import RodMotion
 
@@ -21,46 +26,89 @@ Quantity = Literal["rotation", "translation"]
 
 # Axes whose noise differs by less than this are equally noisy: the errors of the common shape make
 # such differences, and their effect on D is of the order of their square.
-_ALIKE = 0.02
+_EQUALLY_NOISY_AXES = 0.02
+
+
+# Steps are even, and a sine transform serves, if times and noise agree to this.
+_EVEN_STEPS = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
 class Steps:
-    """The S steps of one motion along A axes.
+    """The S steps of one motion: vectors of c components, and the noise of the T frames.
+
+    A step over the time t has covariance 2 D t plus the noise of its two frames; the frame that two
+    neighbours share enters them with opposite signs. The tensor likelihood takes the covariances as
+    they are, the likelihood of a single D their diagonal.
 
     Attributes
     ----------
-    size : ndarray, shape (S, A)
-        Rotation angles (rad) about body axes, or displacements of the centre (um) along lab axes.
+    vectors : ndarray, shape (S, c)
+        Rotation vectors (rad), displacements (um), or both, translation first.
     duration : ndarray, shape (S,)
-        s; a gap is one longer step.
-    linked : ndarray of bool, shape (S,)
-        Whether the next step begins with the frame that this one ends with.
-    before, after : ndarray, shape (S, A)
-        Noise variance of the frame at the beginning and at the end, per um^2 of sigma^2.
-    complete : float
-        Mean noise variance of the frames that show the most particles, per um^2 of sigma^2.
+        Time between the two frames of each step, s; a gap is one longer step.
+    start, stop : ndarray of int, shape (S,)
+        Frame in which each step begins, and in which it ends.
+    noise : ndarray, shape (r, T, c, c)
+        Noise covariance of every frame for an amplitude of 1, by independent source: per um^2 of
+        sigma^2, or with an amplitude that is known to be 1.
+    dt : float
+        Time between frames, s.
     sigma : float
         Localisation error from the rigid-fit residuals, um.
     freedom : int
         Degrees of freedom of those residuals.
-    dt : float
-        Time between frames, s.
-    steady : ndarray, shape (S, A, p)
+    complete : float
+        Mean noise variance of the frames that show the most particles, for an amplitude of 1; NaN
+        for steps in body axes, whose likelihood does not need it.
+    steady : ndarray, shape (S, c, p)
         What each component of a steady velocity (um/s) or spin (rad/s) along the p lab axes adds to
-        each step: the time it takes, and for a rotation the turn from lab to body axes.
+        each step: the time it takes, and for a rotation the turn from lab to body axes. Empty where
+        a steady motion cannot be removed.
     """
 
-    size: Floats
+    vectors: Floats
     duration: Floats
-    linked: Bools
-    before: Floats
-    after: Floats
-    complete: float
+    start: Ints
+    stop: Ints
+    noise: Floats
+    dt: float
     sigma: float
     freedom: int
-    dt: float
-    steady: Floats
+    complete: float = np.nan
+    steady: Floats = field(default_factory=lambda: np.zeros((0, 0, 0)))
+
+    def __post_init__(self) -> None:
+        frozen(self.vectors, self.duration, self.start, self.stop, self.noise, self.steady)
+
+    @cached_property
+    def linked(self) -> Bools:
+        """Whether the next step begins with the frame that this one ends with, (S,)."""
+        return np.append(self.start[1:] == self.stop[:-1], False)
+
+    @cached_property
+    def before(self) -> Floats:
+        """Noise covariance of the frame in which each step begins, (r, S, c, c)."""
+        return self.noise[:, self.start]
+
+    @cached_property
+    def after(self) -> Floats:
+        """Noise covariance of the frame in which each step ends, (r, S, c, c)."""
+        return self.noise[:, self.stop]
+
+    @cached_property
+    def variances(self) -> tuple[Floats, Floats]:
+        """Noise variances of the first and the last frame of each step by component, (S, c)."""
+        diagonal = np.ascontiguousarray(np.einsum("tcc->tc", self.noise[0]))
+        return diagonal[self.start], diagonal[self.stop]
+
+    @cached_property
+    def even(self) -> bool:
+        """Whether all steps are linked, equally long and equally noisy."""
+        noise = self.noise[:, np.union1d(self.start, self.stop)]
+        same_noise = np.ptp(noise, axis=1).max() <= _EVEN_STEPS * np.abs(noise).max()
+        same_time = np.ptp(self.duration) <= _EVEN_STEPS * self.duration[0]
+        return bool(same_time and same_noise and self.linked[:-1].all())
 
     def without_steady_motion(self, *, kept: Bools | None = None) -> tuple[Steps, Floats]:
         """Return the steps less their least-squares steady motion, and that motion (p,).
@@ -70,61 +118,313 @@ class Steps:
         The restricted likelihood is the same for both; its searches begin from the steps' own size,
         and every other statistic of the steps would contain the steady motion.
         """
-        steady, size = self.steady, self.size
+        steady, vectors = self.steady, self.vectors
         if kept is not None:
-            steady, size = steady[kept], size[kept]
-        rows = steady.reshape(size.size, -1)
-        mean: Floats = np.linalg.lstsq(rows, size.ravel(), rcond=None)[0].astype(np.float64)
-        return replace(self, size=self.size - self.steady @ mean), mean
+            steady, vectors = steady[kept], vectors[kept]
+        rows = steady.reshape(vectors.size, -1)
+        mean: Floats = np.linalg.lstsq(rows, vectors.ravel(), rcond=None)[0].astype(np.float64)
+        return replace(self, vectors=self.vectors - self.steady @ mean), mean
 
-    @property
-    def even(self) -> bool:
-        """Whether all steps take equally long, hang together, and are equally noisy."""
-        same_time = np.ptp(self.duration) <= 1e-9 * self.duration[0]
-        noise = np.concatenate([self.before, self.after])
-        same_noise = np.all(np.ptp(noise, axis=0) <= 1e-9 * noise.max())
-        return bool(same_time and same_noise and self.linked[:-1].all())
+
+@dataclass(frozen=True, eq=False)
+class NoisySteps:
+    """The steps of one motion with what is known of their noise, for a single D.
+
+    The noise variance of a frame is s = weight theta + known, and its offset s - b D where motion
+    blur takes b D from it. Only the diagonal of the noise covariances is used.
+
+    Attributes
+    ----------
+    steps : Steps
+        Steps along axes in which the noise is diagonal, without their steady motion where that is
+        free.
+    weight : tuple of ndarray, shape (S, A)
+        Noise variance of the frames before and after each step, per unit of theta.
+    known : tuple of ndarray, shape (S, A)
+        Known part of these variances.
+    blur : float
+        b of the offset s - b D, s.
+    theta : float
+        Value of a fixed theta, or the estimate of a free one from the residuals.
+    freedom : float
+        Degrees of freedom of that estimate: 0 where there is none, inf where theta is fixed.
+    level : float
+        Mean of `known` over the frames that show the most particles.
+    drift : bool
+        Whether a steady velocity or spin is free.
+    steady : ndarray, shape (p,)
+        Least-squares steady motion that was subtracted; zeros without drift.
+    """
+
+    steps: Steps
+    weight: tuple[Floats, Floats]
+    known: tuple[Floats, Floats]
+    blur: float
+    theta: float
+    freedom: float
+    level: float
+    drift: bool = False
+    steady: Floats = field(default_factory=lambda: np.zeros(0))
+
+    @classmethod
+    def of(cls, steps: Steps, noise: Noise) -> NoisySteps:
+        """Return the steps with the noise that the options state; blur takes b D from it."""
+        if noise.model == "joint":
+            # An unknown exposure may blur up to the limit at which steps stop being possible.
+            unknown = noise.exposure is None
+            blur = steps.duration.min() / 2 if unknown else (noise.exposure or 0.0) * steps.dt / 3
+            return cls.free(steps, blur=float(blur), drift=noise.drift)
+        blur = (noise.exposure or 0.0) * steps.dt / 3
+        if noise.model == "residual":
+            return cls.from_residuals(steps, blur=blur, drift=noise.drift)
+        return cls.fixed(steps, sigma=float(noise.model), blur=blur, drift=noise.drift)
+
+    @classmethod
+    def free(cls, steps: Steps, *, blur: float, drift: bool) -> NoisySteps:
+        """Leave the offset free; known is by how much a frame exceeds the least noisy one."""
+        noise = [steps.sigma**2 * n for n in steps.variances]
+        least = min(float(n.min()) for n in noise)
+        one = np.ones_like(noise[0])
+        known = noise[0] - least, noise[1] - least
+        level = steps.sigma**2 * steps.complete - least
+        steps, steady = _subtracted(steps, drift=drift)
+        return cls(steps, (one, one), known, blur, 0.0, 0.0, level, drift, steady)
+
+    @classmethod
+    def from_residuals(cls, steps: Steps, *, blur: float, drift: bool) -> NoisySteps:
+        """Estimate theta from the rigid-fit residuals, with their degrees of freedom."""
+        theta = steps.sigma**2 * steps.complete
+        if theta == 0:
+            return cls.fixed(steps, sigma=0.0, blur=blur, drift=drift)
+        before, after = steps.variances
+        weight = before / steps.complete, after / steps.complete
+        none = np.zeros_like(before)
+        freedom = float(steps.freedom)
+        steps, steady = _subtracted(steps, drift=drift)
+        return cls(steps, weight, (none, none), blur, theta, freedom, 0.0, drift, steady)
+
+    @classmethod
+    def fixed(cls, steps: Steps, *, sigma: float, blur: float, drift: bool) -> NoisySteps:
+        """Take the localisation error sigma (um) as known."""
+        before, after = steps.variances
+        known = sigma**2 * before, sigma**2 * after
+        none = np.zeros_like(before)
+        level = sigma**2 * steps.complete
+        steps, steady = _subtracted(steps, drift=drift)
+        return cls(steps, (none, none), known, blur, 0.0, np.inf, level, drift, steady)
+
+
+def _subtracted(steps: Steps, *, drift: bool) -> tuple[Steps, Floats]:
+    """Return the steps without their steady motion, and that motion; unchanged without drift."""
+    return steps.without_steady_motion() if drift else (steps, np.zeros(steps.steady.shape[2]))
 
 
 def steps_of(motion: RigidMotion, quantity: Quantity) -> Steps:
-    """Return the steps of a motion and the noise of their frames.
+    """Return the steps of a motion along axes in which their noise is diagonal.
 
-    Rotation: body-frame rotation vectors along the axes in which the covariance of the orientation
-    is diagonal, so that one number an axis describes the noise. Translation: the centre.
+    Rotation: body-frame rotation vectors along the axes in which the mean covariance of the
+    orientation of complete frames is diagonal; only the variances along them are kept, and those
+    that differ by less than 2 % are taken as equal. Translation: the centre, in lab axes.
+
+    Raises
+    ------
+    TooFewFramesError
+        For fewer than two steps.
+
+    Examples
+    --------
+    >>> from perrin import Cluster, simulate_motion
+    >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=100, rng=3)
+    >>> steps = steps_of(truth, "rotation")
+    >>> steps.vectors.shape, steps.even
+    ((99, 3), True)
     """
     start, stop = motion.steps()
     if len(start) < 2:
         raise TooFewFramesError(
             f"{motion.fitted.size} frames with a pose in too few steps: at least 3 in a row (gaps "
-            "allowed) are needed to tell diffusion from noise",
+            "allowed) are needed to separate diffusion from noise",
             int(motion.fitted.size),
         )
+    fitted = np.isfinite(motion.center[:, 0])
+    complete = fitted & (motion.n_present == motion.n_present[fitted].max())
     duration = motion.time[stop] - motion.time[start]
     if quantity == "rotation":
-        axes, noise = _noise_axes(motion)
-        size = motion.step_vectors()[stop - 1] @ axes
+        covariance = unit_covariance(motion)
+        values, axes = np.linalg.eigh(np.mean(covariance[complete], axis=0))
+        noise = np.einsum("ji,tjk,ki->ti", axes, covariance, axes)
+        apart = np.diff(values) > _EQUALLY_NOISY_AXES * values[1:]
+        for group in np.split(np.arange(len(values)), 1 + np.flatnonzero(apart)):
+            noise[np.ix_(complete, group)] = noise[np.ix_(complete, group)].mean(axis=1)[:, None]
+        vectors = motion.step_vectors()[stop - 1] @ axes
         # A spin of the lab moves the body by R^T of it; in the plane both are one number.
         turned = motion.rotation[start] @ axes if len(axes) == 3 else np.ones((len(start), 1, 1))
         steady = np.swapaxes(turned, -1, -2) * duration[:, None, None]
     else:
-        size, noise = _displacements(motion, start, stop)
-        steady = np.eye(size.shape[1]) * duration[:, None, None]
+        vectors = motion.center[stop] - motion.center[start]
+        d = vectors.shape[1]
+        noise = np.repeat(unit_center_variance(motion)[:, None], d, axis=1)
+        steady = np.eye(d) * duration[:, None, None]
     return Steps(
-        size=size,
+        vectors=vectors,
         duration=duration,
-        linked=np.append(start[1:] == stop[:-1], False),
-        before=noise[start],
-        after=noise[stop],
-        complete=float(np.mean(noise[_complete(motion)])),
+        start=start,
+        stop=stop,
+        noise=(noise[..., None] * np.eye(noise.shape[1]))[None],
+        dt=motion.dt,
         sigma=motion.sigma,
         freedom=residual_freedom(motion),
-        dt=motion.dt,
+        complete=float(np.mean(noise[complete])),
         steady=steady,
     )
 
 
+def pooled_steps(motions: Sequence[RigidMotion], quantity: Quantity) -> list[Steps]:
+    """Return the steps of every motion; an error names the motion where there are several.
+
+    Examples
+    --------
+    >>> from perrin import Cluster, simulate_motion
+    >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=9, rng=3)
+    >>> [len(steps.duration) for steps in pooled_steps([truth, truth], "translation")]
+    [8, 8]
+    """
+    steps = []
+    for number, motion in enumerate(motions):
+        try:
+            steps.append(steps_of(motion, quantity))
+        except TooFewFramesError as error:
+            if len(motions) == 1:
+                raise
+            raise TooFewFramesError(f"motion {number}: {error}", error.n_frames) from None
+    return steps
+
+
+def body_steps(motion: RigidMotion, quantity: Quantity | Literal["both"], turn: Floats) -> Steps:
+    """Return the steps of a motion in three dimensions in body axes, with their full covariances.
+
+    Parameters
+    ----------
+    motion : RigidMotion
+    quantity : {"rotation", "translation", "both"}
+        Rotation vectors; displacements of the centre in the axes that the body has half way through
+        each step; or SE(3) logarithms, translation first, with one source of noise for the centre
+        and one for the orientation.
+    turn : ndarray, shape (3, 3)
+        Rotation from the axes of the template to those of the steps; not for "both".
+
+    Notes
+    -----
+    The translation of a logarithm is V^-1 R_k^T (x_{k+1} - x_k) with
+    V^-1 = 1 - [w]/2 + (1 - (a/2) cot(a/2)) [w]^2/a^2 for the rotation vector w of angle a.
+
+    Examples
+    --------
+    >>> from perrin import Cluster, simulate_motion
+    >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=9, rng=3)
+    >>> steps = body_steps(truth, "both", np.eye(3))
+    >>> steps.vectors.shape, steps.noise.shape
+    ((8, 6), (2, 9, 6, 6))
+    """
+    start, stop = motion.steps()
+    w = motion.step_vectors()[stop - 1]
+    displacement = motion.center[stop] - motion.center[start]
+    center_noise = unit_center_variance(motion)[:, None, None] * np.eye(3)
+    if quantity == "rotation":
+        vectors = w @ turn.T
+        noise = (turn @ unit_covariance(motion) @ turn.T)[None]
+    elif quantity == "translation":
+        middle = motion.rotation[start] @ exp_map(0.5 * w)
+        vectors = np.einsum("sji,sj->si", middle, displacement) @ turn.T
+        noise = center_noise[None]
+    else:
+        jump = np.einsum("sji,sj->si", motion.rotation[start], displacement)
+        half = 0.5 * np.linalg.norm(w, axis=1)
+        # (1 - h cot h)/(2h)^2 -> 1/12 (1 + h^2/15) at small h, where the quotient loses its digits.
+        small = half < 1e-3
+        h = np.where(small, 1.0, half)
+        factor = np.where(small, (1 + half**2 / 15) / 12, (1 - h / np.tan(h)) / (4 * h * h))
+        once = np.cross(w, jump)
+        u = jump - 0.5 * once + factor[:, None] * np.cross(w, once)
+        vectors = np.concatenate([u, w], axis=1)
+        noise = np.zeros((2, len(motion.time), 6, 6))
+        noise[0, :, :3, :3] = center_noise
+        noise[1, :, 3:, 3:] = unit_covariance(motion)
+    return Steps(
+        vectors=vectors,
+        duration=motion.time[stop] - motion.time[start],
+        start=start,
+        stop=stop,
+        noise=noise,
+        dt=motion.dt,
+        sigma=motion.sigma,
+        freedom=residual_freedom(motion),
+    )
+
+
+def direction_steps(motion: RodMotion) -> Steps:
+    """Return the steps of a rod's direction as two angles, in axes carried along without turning.
+
+    Each step is the vector along u(t) x (u(t + dt) x u(t)) as long as the angle between the two,
+    in two axes perpendicular to u that are carried by the least rotations (parallel transport),
+    so that the noise of one frame enters two neighbouring steps with opposite signs. The noise is
+    known as such, not as a multiple of sigma^2: sigma is 1.
+
+    Examples
+    --------
+    >>> from perrin import Cluster, simulate_motion, track_direction
+    >>> truth = simulate_motion(Cluster.touching(2, 2.0), D_R=0.01, dt=0.5, n_frames=9, rng=2)
+    >>> rod = track_direction(truth.positions(), dt=0.5)
+    >>> direction_steps(rod).vectors.shape, center_steps(rod).vectors.shape
+    ((8, 2), (8, 3))
+    """
+    rows = motion.fitted
+    u, v = motion.direction[rows[:-1]], motion.direction[rows[1:]]
+    cross = np.cross(u, v)
+    sine = np.linalg.norm(cross, axis=1)
+    angle = np.arctan2(sine, np.einsum("ti,ti->t", u, v))
+    turn = cross * np.divide(angle, sine, out=np.ones_like(sine), where=sine > 0)[:, None]
+    carried = successive_product(exp_map(turn))[:-1]
+    first = motion.direction[rows[0]]
+    axes = np.linalg.svd(first[None])[2][1:]
+    vectors = np.einsum("tij,aj,ti->ta", carried, axes, turn)[np.isin(rows[1:], motion.steps()[1])]
+    return _rod_steps(motion, vectors, motion.variance)
+
+
+def center_steps(motion: RodMotion) -> Steps:
+    """Return the steps of a rod's centre, with noise known as such: sigma is 1."""
+    start, stop = motion.steps()
+    return _rod_steps(motion, motion.center[stop] - motion.center[start], motion.center_variance)
+
+
+def _rod_steps(motion: RodMotion, vectors: Floats, variance: Floats) -> Steps:
+    """Return steps of a rod whose components have this noise variance in every frame, (T,)."""
+    start, stop = motion.steps()
+    return Steps(
+        vectors=vectors,
+        duration=motion.time[stop] - motion.time[start],
+        start=start,
+        stop=stop,
+        noise=(variance[:, None, None] * np.eye(vectors.shape[1]))[None],
+        dt=motion.dt,
+        sigma=1.0,
+        freedom=0,
+        complete=float(np.nanmean(variance)),
+        steady=np.zeros((*vectors.shape, 0)),
+    )
+
+
 def residual_freedom(motion: RigidMotion) -> int:
-    """Return the degrees of freedom of all rigid-fit residuals; the template costs those of one."""
+    """Return the degrees of freedom of all rigid-fit residuals; the template costs those of one.
+
+    Examples
+    --------
+    >>> from perrin import Cluster, simulate_motion
+    >>> residual_freedom(
+    ...     simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=9, rng=3)
+    ... )
+    48
+    """
     n, d = motion.template.shape
     freedom = degrees_of_freedom(motion.n_present[motion.fitted], d).sum()
     return int(freedom - degrees_of_freedom(np.array(n), d))
@@ -145,80 +445,3 @@ def unit_center_variance(motion: RigidMotion) -> Floats:
     if square > 0:
         return np.asarray(motion.center_variance / square)
     return np.full(len(motion.time), 1 / len(motion.template))
-
-
-def _noise_axes(motion: RigidMotion) -> tuple[Floats, Floats]:
-    """Return the axes (A, A) of the mean covariance, and the noise (T, A) along them."""
-    c = unit_covariance(motion)
-    complete = _complete(motion)
-    values, axes = np.linalg.eigh(np.mean(c[complete], axis=0))
-    noise = np.einsum("ji,tjk,ki->ti", axes, c, axes)
-    for group in np.split(np.arange(len(values)), 1 + np.flatnonzero(_apart(values))):
-        noise[np.ix_(complete, group)] = noise[np.ix_(complete, group)].mean(axis=1)[:, None]
-    return axes, noise
-
-
-def _apart(values: Floats) -> Bools:
-    """Return whether each of the rising values stands clear of the one before."""
-    clear: Bools = np.diff(values) > _ALIKE * values[1:]
-    return clear
-
-
-def _displacements(
-    motion: RigidMotion, start: np.ndarray, stop: np.ndarray
-) -> tuple[Floats, Floats]:
-    """Return displacements of the centre (S, A) and its noise (T, A)."""
-    size = motion.center[stop] - motion.center[start]
-    return size, np.repeat(unit_center_variance(motion)[:, None], size.shape[1], axis=1)
-
-
-def _complete(motion: RigidMotion) -> Bools:
-    """Return the fitted frames that show the most particles."""
-    fitted = np.isfinite(motion.center[:, 0])
-    complete: Bools = fitted & (motion.n_present == motion.n_present[fitted].max())
-    return complete
-
-
-class Walk(NamedTuple):
-    """Steps of one walk whose noise is known: what a likelihood needs.
-
-    Step i goes from frame start[i] to stop[i] in tau[i] seconds; y (S, c) are its c components,
-    each of variance 2 D tau plus the noise of its two frames, `variance` (T,) apart from an offset.
-    """
-
-    y: Floats
-    tau: Floats
-    start: Ints
-    stop: Ints
-    variance: Floats
-
-
-def direction_steps(motion: RodMotion) -> Walk:
-    """Return the steps of the direction as two angles, in axes carried along without turning.
-
-    Each step is the vector along u(t) x (u(t + dt) x u(t)) as long as the angle between the two,
-    in two axes perpendicular to u that are carried by the least rotations (parallel transport),
-    so that the noise of one frame enters two neighbouring steps with opposite signs.
-    """
-    start, stop = motion.steps()
-    rows = motion.fitted
-    u, v = motion.direction[rows[:-1]], motion.direction[rows[1:]]
-    cross = np.cross(u, v)
-    sine = np.linalg.norm(cross, axis=1)
-    angle = np.arctan2(sine, np.einsum("ti,ti->t", u, v))
-    turn = cross * np.divide(angle, sine, out=np.ones_like(sine), where=sine > 0)[:, None]
-    carried = successive_product(exp_map(turn))[:-1]
-    first = motion.direction[rows[0]]
-    axes = np.linalg.svd(first[None])[2][1:]
-    y = np.einsum("tij,aj,ti->ta", carried, axes, turn)
-    here = np.isin(rows[1:], stop)
-    tau = motion.time[stop] - motion.time[start]
-    return Walk(y[here], tau, start, stop, motion.variance)
-
-
-def center_steps(motion: RodMotion) -> Walk:
-    """Return the steps of the centre."""
-    start, stop = motion.steps()
-    tau = motion.time[stop] - motion.time[start]
-    y = motion.center[stop] - motion.center[start]
-    return Walk(y, tau, start, stop, motion.center_variance)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from perrin._arrays import Bools, Floats, finite_or_none, frozen
+from perrin._arrays import Bools, Floats, from_plain, frozen, to_plain
 from perrin._text import with_error
 
 if TYPE_CHECKING:
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 # Elements of a symmetric matrix in the order of `DiffusionTensor.covariance`.
-_ELEMENTS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+SYMMETRIC_ELEMENTS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 
 # An axis that an error of one standard deviation turns by more than this (degrees) is not known.
@@ -25,41 +25,14 @@ _KNOWN_AXIS = 20.0
 
 
 # The error in degrees of the axes of equal values: any direction of their plane will do.
-_EQUAL = 45.0
+EQUAL_AXES_ERROR = 45.0
 
 
-_NO_ERRORS = "no errors are known: a value lies on its edge, 0; take longer tracks or longer steps"
+NO_ERRORS = "no errors are known: a value lies on its edge, 0; take longer tracks or longer steps"
 
 
-# Values are told apart at this level.
-_LEVEL = 0.05
-
-
-_TENSOR_ARRAYS = (
-    "tensor", "principal_values", "axes", "stderr", "covariance", "axis_errors", "offset",
-)  # fmt: skip
-
-
-def _tensor_dict(tensor: DiffusionTensor) -> dict[str, Any]:
-    """Return a tensor for JSON; unknown errors as None. Column a of axes is axis a."""
-    entry = {f.name: getattr(tensor, f.name) for f in fields(tensor)}
-    for name in _TENSOR_ARRAYS:
-        array = entry[name].astype(object)
-        array[~np.isfinite(entry[name])] = None
-        entry[name] = array.tolist()
-    for name in ("p_isotropic", "p_axial"):
-        entry[name] = finite_or_none(entry[name])
-    return entry
-
-
-def _tensor_from(entry: dict[str, Any]) -> DiffusionTensor:
-    """Read back what `_tensor_dict` wrote."""
-    read = dict(entry)
-    for name in _TENSOR_ARRAYS:
-        read[name] = np.array(entry[name], dtype=np.float64)
-    for name in ("p_isotropic", "p_axial"):
-        read[name] = np.nan if entry[name] is None else entry[name]
-    return DiffusionTensor(**read)
+# Values are distinguished at this level.
+_ISOTROPY_LEVEL = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,20 +55,24 @@ class DiffusionTensor:
         Probability of data this anisotropic if all three values were equal (likelihood ratio,
         chi-squared with 5 degrees of freedom).
     p_axial : float
-        The same if two values were equal, about any axis (2 degrees of freedom).
+        Probability of data this far from axial symmetry if two values were equal, about any axis
+        (2 degrees of freedom).
     covariance : ndarray, shape (6, 6)
-        Of the elements xx, yy, zz, xy, xz, yz.
+        Covariance of the elements xx, yy, zz, xy, xz, yz.
     axis_errors : ndarray, shape (3, 3)
-        How far, in degrees, one standard error turns axes a and b in their common plane; 45 where
-        symmetry makes their values equal, 0 where it fixes the axes.
+        Angle, in degrees, by which one standard error turns axes a and b in their common plane; 45
+        where symmetry makes their values equal, 0 where it fixes the axes.
     symmetry : str
-        The point group whose symmetry the tensor was given; "C_1" for none.
+        Point group whose symmetry was imposed on the tensor; "C_1" for none.
     offset : ndarray, shape (3, 3)
-        Noise of one frame less blur, rad^2 or um^2, body axes, mean over frames and motions.
+        Noise covariance of one frame less blur, rad^2 or um^2, body axes, mean over frames and
+        motions.
     quantity : {"rotation", "translation"}
+        Motion that the tensor describes.
     unit : str
+        Unit of the tensor: "rad^2/s" or "um^2/s".
     n_frames : int
-        Frames with a pose, of all motions.
+        Number of frames with a pose, of all motions.
     """
 
     tensor: Floats
@@ -118,7 +95,7 @@ class DiffusionTensor:
 
     @property
     def mean(self) -> float:
-        """A third of the trace."""
+        """Mean over the axes, a third of the trace."""
         return float(np.trace(self.tensor)) / 3
 
     @property
@@ -128,15 +105,17 @@ class DiffusionTensor:
 
     @property
     def resolved_axes(self) -> Bools:
-        """Which axes (3,) are known.
+        """Whether each axis is known, shape (3,).
 
-        Those that symmetry fixes, and those whose values the tests tell apart (p < 0.05) and whose
-        errors are below 20 degrees in both planes that they lie in. Errors alone would not do:
-        sorted values keep a distance that makes the axes of an isotropic body look known.
+        Known are axes that symmetry fixes, and those whose values the tests distinguish (p < 0.05)
+        and whose errors are below 20 degrees in both planes that they lie in. Errors alone are not
+        enough: sorted values differ, so that the axes of an isotropic body would seem known.
         """
-        known = self.axis_errors < _KNOWN_AXIS if self.p_isotropic < _LEVEL else np.eye(3) > 0
+        known = (
+            self.axis_errors < _KNOWN_AXIS if self.p_isotropic < _ISOTROPY_LEVEL else np.eye(3) > 0
+        )
         near = 0 if np.diff(self.principal_values).argmin() == 0 else 1
-        if self.p_axial >= _LEVEL:
+        if self.p_axial >= _ISOTROPY_LEVEL:
             known[near, near + 1] = known[near + 1, near] = False
         return np.asarray((known | (self.axis_errors == 0)).all(axis=1))
 
@@ -169,7 +148,7 @@ class DiffusionTensor:
         if w.shape != (3, 3) or not 0 < np.trace(w) < np.inf:
             raise ValueError(f"weights: expected (3, 3) with a positive trace, got {weights!r}")
         w = w / np.trace(w)
-        row = np.array([w[i, j] * (1 + (i != j)) for i, j in _ELEMENTS])
+        row = np.array([w[i, j] * (1 + (i != j)) for i, j in SYMMETRIC_ELEMENTS])
         value = float(np.einsum("ij,ij->", w, self.tensor))
         return value, float(np.sqrt(row @ self.covariance @ row))
 
@@ -180,45 +159,55 @@ class DiffusionTensor:
 
     @property
     def summary(self) -> str:
-        """What `str` gives without the mean, for use beside the D of `estimate_diffusion`."""
+        """Text of `str` without the mean, which `estimate_diffusion` gives as D."""
         name = "D_R" if self.quantity == "rotation" else "D_T"
         pairs = zip(self.principal_values, self.stderr, strict=True)
         values = ", ".join(with_error(value, stderr) for value, stderr in pairs)
+        isotropic, axial = (
+            f"p = {p:.2g}" if p >= 1e-6 else "p < 1e-6" for p in (self.p_isotropic, self.p_axial)
+        )
         return (
             f"{name} = {values} {self.unit} [{self.n_frames} frames, symmetry {self.symmetry}]\n"
-            f"isotropic: {_probability(self.p_isotropic)}, axial: {_probability(self.p_axial)}\n"
+            f"isotropic: {isotropic}, axial: {axial}\n"
             f"{self.statement}"
         )
 
     @property
     def statement(self) -> str:
-        """Which axes are known, in words; where two cannot be told apart, the plane."""
+        """Text on which axes are known; where two values are not distinguished, the plane."""
         if np.isnan(self.stderr).any():
-            return _NO_ERRORS
+            return NO_ERRORS
         known = np.flatnonzero(self.resolved_axes)
         worst = self.axis_errors.max(axis=1)
-        equal = (self.axis_errors == _EQUAL).any() and self.symmetry != "C_1"
+        equal = (self.axis_errors == EQUAL_AXES_ERROR).any() and self.symmetry != "C_1"
         if known.size == 3:
             return "axes known to " + ", ".join(f"{w:.0f}" for w in worst) + " degrees"
         if known.size == 1:
             a, b = (k + 1 for k in range(3) if k != known[0])
-            why = f"are equal by symmetry {self.symmetry}" if equal else "cannot be told apart"
+            why = f"are equal by symmetry {self.symmetry}" if equal else "cannot be distinguished"
             return (
                 f"values {a} and {b} {why}: the plane of their axes is known, not the axes; its "
                 f"normal, axis {known[0] + 1}, to {worst[known[0]]:.0f} degrees"
             )
+        mean = "D_R, the mean" if self.quantity == "rotation" else "D_T, the mean"
         if equal:
-            return f"the values are equal by symmetry {self.symmetry}: read {self._mean_name}"
-        return f"the axes cannot be told apart: read {self._mean_name}, not the three sorted values"
+            return f"the values are equal by symmetry {self.symmetry}: read {mean}"
+        return f"the axes cannot be distinguished: read {mean}, not the three sorted values"
 
-    @property
-    def _mean_name(self) -> str:
-        """The mean over axes, by the name it has beside a tensor."""
-        return "D_R, the mean" if self.quantity == "rotation" else "D_T, the mean"
+    def to_dict(self) -> dict[str, Any]:
+        """Return the tensor as JSON holds it; unknown errors are None."""
+        plain: dict[str, Any] = to_plain({f.name: getattr(self, f.name) for f in fields(self)})
+        return plain
 
-
-def _probability(p: float) -> str:
-    return f"p = {p:.2g}" if p >= 1e-6 else "p < 1e-6"
+    @classmethod
+    def from_dict(cls, entry: dict[str, Any]) -> DiffusionTensor:
+        """Return the tensor that `to_dict` wrote."""
+        read: dict[str, Any] = {
+            k: from_plain(v) if isinstance(v, list) else v for k, v in entry.items()
+        }
+        for name in ("p_isotropic", "p_axial"):
+            read[name] = np.nan if entry[name] is None else entry[name]
+        return cls(**read)
 
 
 @dataclass(frozen=True, eq=False)
@@ -230,11 +219,11 @@ class CoupledTensor:
     tensor : ndarray, shape (6, 6)
         Translation first: um^2/s, um rad/s, rad^2/s.
     stderr : ndarray, shape (6, 6)
-        Standard errors of the elements; where the point was estimated, its error included.
+        Standard errors of the elements, with the error of the point where it was estimated.
     point : ndarray, shape (3,)
-        The point of the body whose translation this is, from the centre of the template, um.
+        Point of the body whose translation is described, from the centre of the template, um.
     n_frames : int
-        Frames with a pose.
+        Number of frames with a pose.
     """
 
     tensor: Floats
@@ -247,15 +236,28 @@ class CoupledTensor:
 
     @property
     def D_T(self) -> Floats:
-        """Translation, (3, 3), um^2/s."""
+        """Translational block of the tensor, (3, 3), um^2/s."""
         return self.tensor[:3, :3]
 
     @property
     def D_R(self) -> Floats:
-        """Rotation, (3, 3), rad^2/s; the same for every point."""
+        """Rotational block of the tensor, (3, 3), rad^2/s; the same for every point."""
         return self.tensor[3:, 3:]
 
     @property
     def D_C(self) -> Floats:
-        """Coupling, (3, 3), um rad/s: row the translation, column the rotation."""
+        """Coupling block, (3, 3), um rad/s: row the translation, column the rotation."""
         return self.tensor[:3, 3:]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the tensor as JSON holds it; unknown errors are None."""
+        plain: dict[str, Any] = to_plain({f.name: getattr(self, f.name) for f in fields(self)})
+        return plain
+
+    @classmethod
+    def from_dict(cls, entry: dict[str, Any]) -> CoupledTensor:
+        """Return the tensor that `to_dict` wrote."""
+        read: dict[str, Any] = {
+            k: from_plain(v) if isinstance(v, list) else v for k, v in entry.items()
+        }
+        return cls(**read)

@@ -3,34 +3,35 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import permutations
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
 
+from perrin._arrays import choice_fault, refuse
 from perrin.diffusion.estimate import UNITS
-from perrin.diffusion.noise_model import choice_faults
-from perrin.diffusion.steps import residual_freedom, unit_center_variance, unit_covariance
+from perrin.diffusion.noise_model import Noise, noise_faults
+from perrin.diffusion.steps import Quantity, body_steps
 from perrin.diffusion.tensor_likelihood import (
     Maximum,
-    Source,
-    VectorSteps,
+    NoisyVectors,
     axial,
     maximise,
     spread,
     squares,
 )
 from perrin.diffusion.tensor_results import (
-    _ELEMENTS,
-    _EQUAL,
-    _NO_ERRORS,
+    EQUAL_AXES_ERROR,
+    NO_ERRORS,
+    SYMMETRIC_ELEMENTS,
     CoupledTensor,
     DiffusionTensor,
 )
 from perrin.errors import PrecisionWarning, TooFewFramesError
 from perrin.geometry.rigid import diffusion_center, shifted
-from perrin.geometry.rotations import exp_map, kabsch
+from perrin.geometry.rotations import kabsch
+from perrin.geometry.shapes import pair_distances
 from perrin.geometry.symmetry import point_group, schoenflies, symmetry_elements
 from perrin.motion.rigid_motion import RigidMotion
 
@@ -40,10 +41,10 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from perrin._arrays import Floats, Ints
-    from perrin.diffusion.steps import Quantity
+    from perrin.diffusion.steps import Steps
 
 
-# Noise this far below a step (variance) is none: simulated truth, whose residuals are rounding.
+# Noise below this variance, relative to a step's, is rounding: that of simulated truth.
 _NOISELESS = 1e-8
 
 
@@ -51,7 +52,7 @@ def diffusion_tensor(
     motion: RigidMotion | Sequence[RigidMotion],
     *,
     quantity: Quantity = "rotation",
-    noise: Literal["joint", "residual"] | float = "joint",
+    noise: Literal["joint", "residual"] | float | Noise = "joint",
     exposure: float | None = None,
     symmetry: str | None = None,
 ) -> DiffusionTensor:
@@ -64,32 +65,32 @@ def diffusion_tensor(
         tensor, each with its own noise; their templates are turned onto the first.
     quantity : {"rotation", "translation"}
         From body-frame rotation vectors, or from the centre's displacements in the axes that the
-        body has half way through each step; a drift of the sample is not taken off.
-    noise : {"joint", "residual"} or float
+        body has half way through each step; a drift of the sample is not subtracted.
+    noise : {"joint", "residual"}, float or Noise
         "joint": the noise is predicted from the template but for one amplitude, which is estimated
         along with D. "residual": that amplitude is measured by the residuals of the rigid fit
         (right only if all particles of a frame are seen at the same instant). A number: the
-        localisation error of one coordinate, um.
+        localisation error of one coordinate, um. A `Noise` holds the exposure as well.
     exposure : float, optional
         Open fraction of dt, 0 to 1: motion blur is exposure/6. Unknown (None) leaves the blur of
         the joint fit free, between none and the largest possible; with the noise given it is taken
         as 0.
     symmetry : str, optional
         Schoenflies symbol of the point group that the tensor shares. Default: that of the template
-        within its error. "C_1" gives the tensor no symmetry. Another symbol is looked for with
+        within its error. "C_1" gives the tensor no symmetry. Another symbol is searched for with
         growing tolerance, as real clusters of unequal spheres need.
 
     Returns
     -------
     DiffusionTensor
-        The p-values are those of the fit without symmetry: they also say whether the data agree
+        The p-values are those of the fit without symmetry: they also test whether the data agree
         with a symmetry that makes values equal.
 
     Raises
     ------
     ValueError
         For planar motions, unknown choices, bodies that differ, a symmetry that the template has
-        not, or steps that hold too little.
+        not, or steps without enough information.
     TooFewFramesError
         Fewer than 12 steps in all, or fewer than 2 of a motion.
 
@@ -116,18 +117,22 @@ def diffusion_tensor(
     axes known to 3, 3, 2 degrees
     """
     motions = [motion] if isinstance(motion, RigidMotion) else list(motion)
-    _check_choices(motions, quantity=quantity, noise=noise, exposure=exposure)
-    turns = _alignments(motions)
-    symbol, basis = _symmetry(motions[0], symmetry)
-    vectors = [_vectors(m, quantity, turn) for m, turn in zip(motions, turns, strict=True)]
-    data = _collected(motions, vectors, noise=noise, exposure=exposure)
-    free = data.fit(_symmetric_basis(3))
-    p_isotropic, p_axial = _tests(data, free)
+    faults = [*choice_fault("quantity", quantity, get_args(Quantity))]
+    faults += noise_faults(noise, exposure)
+    if isinstance(noise, Noise) and noise.drift:
+        faults.append("noise: a drift is not subtracted from a tensor; leave drift out of it")
+    _refuse_motions(motions, faults, needed=12)
+    turns = template_alignments(motions)
+    symbol, basis = imposed_symmetry(motions[0], symmetry)
+    steps = [body_steps(m, quantity, turn) for m, turn in zip(motions, turns, strict=True)]
+    data = ScaledTracks.of(steps, Noise.of(noise, exposure=exposure))
+    free = data.fit(symmetric_basis(3))
+    p_isotropic, p_axial = data.p_values(free)
     best = free if len(basis) == 6 else data.fit(basis, near=free)
     tensor = data.in_units(best.D)
-    covariance = data.covariance(best, basis, _ELEMENTS)
+    covariance = data.covariance(best, basis, SYMMETRIC_ELEMENTS)
     if np.isnan(covariance).any():
-        warnings.warn(f"diffusion_tensor: {_NO_ERRORS}", PrecisionWarning, stacklevel=2)
+        warnings.warn(f"diffusion_tensor: {NO_ERRORS}", PrecisionWarning, stacklevel=2)
     values, axes = np.linalg.eigh(tensor)
     values = np.maximum(values, 0.0)  # the tensor is a square: below 0 is rounding
     axes = axes * np.sign(np.linalg.det(axes))
@@ -135,11 +140,11 @@ def diffusion_tensor(
         tensor=tensor,
         principal_values=values,
         axes=axes,
-        stderr=np.sqrt([_variance(covariance, a, a) for a in axes.T]),
+        stderr=np.sqrt([element_variance(covariance, a, a) for a in axes.T]),
         p_isotropic=p_isotropic,
         p_axial=p_axial,
         covariance=covariance,
-        axis_errors=_axis_errors(values, axes, covariance),
+        axis_errors=axis_errors(values, axes, covariance),
         symmetry=symbol,
         offset=data.mean_noise(best),
         quantity=quantity,
@@ -168,7 +173,7 @@ def coupled_tensor(
     Raises
     ------
     ValueError
-        For planar motions, an unknown point, or steps that hold too little.
+        For planar motions, an unknown point, or steps without enough information.
     TooFewFramesError
         Fewer than 50 steps.
 
@@ -197,19 +202,37 @@ def coupled_tensor(
     >>> bool(abs(coupled.D_C / coupled.stderr[:3, 3:]).max() < 4)
     True
     """
-    _check_choices([motion], quantity="rotation", noise="joint", exposure=None, needed=50)
-    place = _place(point)
-    data = _collected([motion], [_screws(motion)], noise="joint", exposure=None)
-    basis = _symmetric_basis(6)
+    _refuse_motions([motion], [], needed=50)
+    named = isinstance(point, str) and point in ("diffusion", "centroid")
+    place = np.zeros(3) if named else np.array([] if isinstance(point, str) else point, dtype=float)
+    if place.shape != (3,) or not np.isfinite(place).all():
+        raise ValueError(
+            f"point: expected 'diffusion', 'centroid' or 3 numbers (body axes, um), got {point!r}"
+        )
+    at_center = isinstance(point, str) and point == "diffusion"
+    data = ScaledTracks.of([body_steps(motion, "both", np.eye(3))], Noise())
+    basis = symmetric_basis(6)
     best = data.fit(basis)
     elements = [(i, j) for i in range(6) for j in range(i + 1)]
     tensor, covariance = data.in_units(best.D), data.covariance(best, basis, elements)
     if np.isnan(covariance).any():
-        warnings.warn(f"coupled_tensor: {_NO_ERRORS}", PrecisionWarning, stacklevel=2)
-    where = diffusion_center(tensor) if place is None else place
+        warnings.warn(f"coupled_tensor: {NO_ERRORS}", PrecisionWarning, stacklevel=2)
+
+    def moved(tensor: Floats) -> Floats:
+        return shifted(tensor, diffusion_center(tensor) if at_center else place)
+
+    # Standard errors after the move, by central differences in the elements.
+    rows, columns = np.tril_indices(6)
+    slopes = []
+    for i, j, h in zip(rows, columns, 1e-3 * np.sqrt(np.diag(covariance)), strict=True):
+        change = np.zeros((6, 6))
+        change[i, j] = change[j, i] = h
+        slopes.append((moved(tensor + change) - moved(tensor - change)) / (2 * h))
+    variance = np.einsum("kab,kl,lab->ab", slopes, covariance, slopes)
+    where = diffusion_center(tensor) if at_center else place
     return CoupledTensor(
         tensor=shifted(tensor, where),
-        stderr=_shifted_errors(tensor, covariance, place),
+        stderr=np.sqrt(np.maximum(variance, 0.0)),
         point=where,
         n_frames=int(motion.fitted.size),
     )
@@ -218,8 +241,8 @@ def coupled_tensor(
 def axes_like(axes: Floats, reference: Floats) -> Ints:
     """Return the order of the columns of `axes` in which each lies nearest to the reference's.
 
-    Axes sorted by their own values are named by it as those of another tensor of the same body:
-    "axis 1" is then the same axis of the body.
+    It numbers axes that are sorted by their own values like those of another tensor of the same
+    body: "axis 1" is then the same axis of the body.
 
     Parameters
     ----------
@@ -237,23 +260,14 @@ def axes_like(axes: Floats, reference: Floats) -> Ints:
     return np.array(best, dtype=np.int64)
 
 
-def _check_choices(
-    motions: Sequence[RigidMotion],
-    *,
-    quantity: str,
-    noise: str | float,
-    exposure: float | None,
-    needed: int = 12,
-) -> None:
-    """Refuse what is not offered, all faults at once, and motions that are too short."""
-    faults = choice_faults(quantity=quantity, noise=noise, exposure=exposure)
-    if not motions or any(m.template.shape[1] != 3 for m in motions):
+def _refuse_motions(motions: Sequence[RigidMotion], faults: list[str], *, needed: int) -> None:
+    """Refuse planar motions and other faults, all at once, and motions with too few steps."""
+    if not motions or any(m.dimension != 3 for m in motions):
         faults.append(
             "motion: expected one or more motions in three dimensions; in the plane there is one "
             "angle and no tensor, see estimate_diffusion"
         )
-    if faults:
-        raise ValueError("; ".join(faults))
+    refuse(faults)
     counts = [len(m.steps()[0]) for m in motions]
     if sum(counts) < needed or min(counts) < 2:
         raise TooFewFramesError(
@@ -263,19 +277,7 @@ def _check_choices(
         )
 
 
-def _place(point: Literal["diffusion", "centroid"] | ArrayLike) -> Floats | None:
-    """Return the point asked for in body axes; None for the centre of diffusion."""
-    if isinstance(point, str) and point in ("diffusion", "centroid"):
-        return None if point == "diffusion" else np.zeros(3)
-    place = np.array(point, dtype=np.float64) if not isinstance(point, str) else np.empty(0)
-    if place.shape != (3,) or not np.isfinite(place).all():
-        raise ValueError(
-            f"point: expected 'diffusion', 'centroid' or 3 numbers (body axes, um), got {point!r}"
-        )
-    return place
-
-
-def _alignments(motions: Sequence[RigidMotion]) -> list[Floats]:
+def template_alignments(motions: Sequence[RigidMotion]) -> list[Floats]:
     """Return the rotations that turn the templates onto the first; refuse bodies that differ."""
     first = motions[0]
     turns = []
@@ -298,31 +300,37 @@ def _alignments(motions: Sequence[RigidMotion]) -> list[Floats]:
     return turns
 
 
-def _symmetry(motion: RigidMotion, wanted: str | None) -> tuple[str, Floats]:
+def imposed_symmetry(motion: RigidMotion, wanted: str | None) -> tuple[str, Floats]:
     """Return the point group to impose and a basis (m, 3, 3) of the tensors that have it."""
     if wanted == "C_1":
-        return "C_1", _symmetric_basis(3)
+        return "C_1", symmetric_basis(3)
     tolerance = motion.template_error
     if wanted is None:
         elements = symmetry_elements(motion.template, tolerance)
-        return schoenflies(elements), _invariant_basis(elements)
+        return schoenflies(elements), invariant_basis(elements)
     seen = []
-    first, second = np.triu_indices(len(motion.template), 1)
-    gap = np.linalg.norm(motion.template[first] - motion.template[second], axis=1).min()
+    gap = pair_distances(motion.template).min()
     while tolerance <= 0.3 * gap:
         symbol = point_group(motion.template, tolerance=tolerance)
         if symbol == wanted:
-            return symbol, _invariant_basis(symmetry_elements(motion.template, tolerance))
+            return symbol, invariant_basis(symmetry_elements(motion.template, tolerance))
         seen.append(symbol)
         tolerance *= 1.3
     raise ValueError(
         f"symmetry: the template is not {wanted!r} within 0.3 of its closest distance; it is "
-        f"{' or '.join(dict.fromkeys(seen)) or 'too noisy to tell'} (C_1 asks for no symmetry)"
+        f"{' or '.join(dict.fromkeys(seen)) or 'too noisy to decide'} (C_1 imposes no symmetry)"
     )
 
 
-def _symmetric_basis(b: int) -> Floats:
-    """Return a basis of the symmetric matrices, orthonormal, (b (b + 1) / 2, b, b)."""
+def symmetric_basis(b: int) -> Floats:
+    """Return a basis of the symmetric matrices, orthonormal, (b (b + 1) / 2, b, b).
+
+    Examples
+    --------
+    >>> basis = symmetric_basis(3)
+    >>> bool(np.allclose(np.einsum("mij,nij->mn", basis, basis), np.eye(6)))
+    True
+    """
     unit = np.eye(b)
     pairs = zip(*np.tril_indices(b), strict=True)
     return np.array(
@@ -333,91 +341,103 @@ def _symmetric_basis(b: int) -> Floats:
     )
 
 
-def _invariant_basis(elements: Floats) -> Floats:
-    """Return an orthonormal basis of the symmetric matrices that a point group leaves alone."""
-    basis = _symmetric_basis(3)
+def invariant_basis(elements: Floats) -> Floats:
+    """Return an orthonormal basis of the symmetric matrices that are invariant under a point group.
+
+    Examples
+    --------
+    >>> len(invariant_basis(np.array([np.eye(3), np.diag([-1.0, -1.0, 1.0])])))
+    4
+    """
+    basis = symmetric_basis(3)
     mapped = np.einsum("gij,mjk,glk->mil", elements, basis, elements) / len(elements)
     share, mix = np.linalg.eigh(np.einsum("mij,nij->mn", basis, mapped))
     invariant: Floats = np.einsum("mn,mij->nij", mix[:, share > 0.5], basis)
     return invariant
 
 
-class _Vectors(NamedTuple):
-    """Steps (S, b) in body axes and the shapes (r, T, b, b) of the noise of every frame.
-
-    The shapes are for a localisation error of 1 um.
-    """
-
-    y: Floats
-    shapes: Floats
-
-
-def _vectors(motion: RigidMotion, quantity: Quantity, turn: Floats) -> _Vectors:
-    """Return the steps of a motion and their noise in the axes of the first template."""
-    start, stop = motion.steps()
-    theta = motion.step_vectors()[stop - 1]
-    if quantity == "rotation":
-        shape = turn @ unit_covariance(motion) @ turn.T
-        return _Vectors(theta @ turn.T, shape[None])
-    middle = motion.rotation[start] @ exp_map(0.5 * theta)
-    jump = np.einsum("sji,sj->si", middle, motion.center[stop] - motion.center[start])
-    return _Vectors(jump @ turn.T, _center_shape(motion)[None])
-
-
-def _center_shape(motion: RigidMotion) -> Floats:
-    """Return the covariance of every centre for a localisation error of 1 um, (T, 3, 3)."""
-    return np.asarray(unit_center_variance(motion)[:, None, None] * np.eye(3))
-
-
-def _screws(motion: RigidMotion) -> _Vectors:
-    """Return SE(3) logarithms, translation first, and the noise of centre and orientation.
-
-    The translation is V^-1 R_k^T (x_{k+1} - x_k) with
-    V^-1 = 1 - [w]/2 + (1 - (a/2) cot(a/2)) [w]^2/a^2 for the rotation vector w of angle a.
-    """
-    start, stop = motion.steps()
-    w = motion.step_vectors()[stop - 1]
-    jump = np.einsum(
-        "sji,sj->si", motion.rotation[start], motion.center[stop] - motion.center[start]
-    )
-    half = 0.5 * np.linalg.norm(w, axis=1)
-    # (1 - h cot h) / (2h)^2 -> 1/12 (1 + h^2/15) at small h, where the quotient loses its digits.
-    small = half < 1e-3
-    h = np.where(small, 1.0, half)
-    factor = np.where(small, (1 + half**2 / 15) / 12, (1 - h / np.tan(h)) / (4 * h * h))
-    once = np.cross(w, jump)
-    u = jump - 0.5 * once + factor[:, None] * np.cross(w, once)
-    shapes = np.zeros((2, len(motion.time), 6, 6))
-    shapes[0, :, :3, :3] = _center_shape(motion)
-    shapes[1, :, 3:, 3:] = unit_covariance(motion)
-    return _Vectors(np.concatenate([u, w], axis=1), shapes)
-
-
 @dataclass(frozen=True, eq=False)
-class _Data:
-    """Steps of all motions in units of their own size, so that all numbers are of order 1.
+class ScaledTracks:
+    """Steps of several motions in units of their own size, so that all numbers are of order 1.
 
     Attributes
     ----------
-    sources : list of Source
+    tracks : list of NoisyVectors
+        Steps of every motion and what is known of their noise.
     scale : ndarray, shape (b,)
-        Unit of each component of a step.
+        Unit of each component of a step, um or rad.
     time : float
         Unit of time, s.
     """
 
-    sources: list[Source]
+    tracks: list[NoisyVectors]
     scale: Floats
     time: float
 
+    @classmethod
+    def of(cls, steps: Sequence[Steps], noise: Noise) -> ScaledTracks:
+        """Scale the steps of every motion by their common size, and add what is known of the noise.
+
+        The unit of a component is the root mean square of its triple, and an amplitude of 1 is
+        noise as large as a step.
+        """
+        vectors = np.concatenate([s.vectors for s in steps])
+        triple = np.sqrt((vectors.reshape(len(vectors), -1, 3) ** 2).mean(axis=(0, 2)))
+        if not triple.all():
+            raise ValueError("the body does not move at all: there is no tensor to estimate")
+        scale = np.repeat(triple, 3)
+        time = float(np.mean([s.dt for s in steps]))
+        unknown = noise.exposure is None and noise.model == "joint"
+        B = None if unknown else (noise.exposure or 0.0) / 6
+        tracks = []
+        for one in steps:
+            shapes = one.noise / np.outer(scale, scale)
+            size = np.nanmean(np.trace(shapes, axis1=2, axis2=3), axis=1) / 3
+            scaled = replace(
+                one,
+                vectors=one.vectors / scale,
+                duration=one.duration / time,
+                noise=shapes / size[:, None, None, None],
+                dt=one.dt / time,
+            )
+            if noise.model == "joint":
+                # Neighbours' covariance is minus the noise; a little more keeps the start inside.
+                square = -np.trace(neighbour_products(scaled)) / max(scaled.linked.sum(), 1)
+                square = square / scaled.vectors.shape[1]
+                theta, freedom = np.full(len(size), max(float(square), 0.0) + 0.05), 0.0
+            elif noise.model == "residual":
+                theta = one.sigma**2 * size
+                freedom = float(one.freedom) if theta.min() > _NOISELESS else np.inf
+            else:
+                theta, freedom = float(noise.model) ** 2 * size, np.inf
+            tracks.append(NoisyVectors(scaled, theta, freedom, B))
+        if len({np.isinf(track.freedom) for track in tracks}) > 1:
+            raise ValueError(
+                "noise='residual': some motions show no noise at all (simulated truth) and others "
+                "do; pool these two kinds separately"
+            )
+        return cls(tracks, scale, time)
+
     def fit(self, basis: Floats, near: Maximum | None = None) -> Maximum:
-        """Return the best tensor >= 0 in the span of a basis."""
-        D = self._first_guess() if near is None else near.D
-        own = np.array([s.start() for s in self.sources]) if near is None else near.own
+        """Return the best tensor >= 0 in the span of a basis.
+
+        Without a maximum to start from, D comes from the covariance of steps and of neighbours,
+        kept positive.
+        """
+        if near is None:
+            duration = sum(float(t.steps.duration.sum()) for t in self.tracks)
+            products = [t.steps.vectors.T @ t.steps.vectors for t in self.tracks]
+            now = np.sum(products, axis=0) / duration
+            beside = np.sum([neighbour_products(t.steps) for t in self.tracks], axis=0) / duration
+            values, axes = np.linalg.eigh(0.5 * now + beside)
+            D = (axes * np.maximum(values, 0.05 * np.trace(now) / len(now))) @ axes.T
+            own = np.array([t.start() for t in self.tracks])
+        else:
+            D, own = near.D, near.own
         values, axes = np.linalg.eigh(D)
         root = (axes * np.sqrt(np.maximum(values, 1e-3 * values[-1]))) @ axes.T
         q = np.einsum("mij,ij->m", basis, root)
-        return maximise(self.sources, squares(basis), q, own)
+        return maximise(self.tracks, squares(basis), q, own)
 
     def fit_axial(self, near: Maximum) -> Maximum:
         """Return the best tensor with two values equal, about any axis."""
@@ -426,18 +446,19 @@ class _Data:
         found = []
         for k, others in ((0, [1, 2]), (2, [0, 1])):
             q = np.array([values[others].mean(), values[k], 0.0, 0.0]) ** [0.5, 0.5, 1, 1]
-            found.append(maximise(self.sources, axial(axes[:, k]), q, near.own))
+            found.append(maximise(self.tracks, axial(axes[:, k]), q, near.own))
         return max(found, key=lambda m: m.value)
 
-    def _first_guess(self) -> Floats:
-        """Return D from the covariance of steps and of neighbours, kept positive."""
-        duration = sum(float(s.steps.tau.sum()) for s in self.sources)
-        now = np.sum([s.steps.y.T @ s.steps.y for s in self.sources], axis=0) / duration
-        beside = np.sum([_neighbours(s.steps) for s in self.sources], axis=0) / duration
-        values, axes = np.linalg.eigh(0.5 * now + beside)
-        floor = 0.05 * np.trace(now) / len(now)
-        guess: Floats = (axes * np.maximum(values, floor)) @ axes.T
-        return guess
+    def p_values(self, free: Maximum) -> tuple[float, float]:
+        """Return the p-values of isotropy and of axial symmetry from likelihood ratios."""
+        from scipy.special import chdtrc
+
+        isotropic = self.fit(np.eye(3)[None] / 3**0.5, near=free)
+        p_isotropic, p_axial = (
+            float(chdtrc(freedom, max(2 * (free.value - restricted.value), 0.0)))
+            for freedom, restricted in ((5, isotropic), (2, self.fit_axial(free)))
+        )
+        return p_isotropic, p_axial
 
     def in_units(self, D: Floats) -> Floats:
         """Return a tensor in um, rad and s."""
@@ -448,132 +469,67 @@ class _Data:
         self, best: Maximum, basis: Floats, elements: Sequence[tuple[int, int]]
     ) -> Floats:
         """Return the covariance of elements of D in um, rad and s; NaN where it is not known."""
-        directions, errors = spread(self.sources, best, basis)
+        directions, errors = spread(self.tracks, best, basis)
         slopes = np.array([[self.in_units(e)[i, j] for e in directions] for i, j in elements])
         covariance: Floats = slopes @ errors @ slopes.T
         return covariance
 
     def mean_noise(self, best: Maximum) -> Floats:
         """Return the noise of one frame less blur in um and rad, mean over motions."""
-        pairs = zip(self.sources, best.own, strict=True)
-        noise = np.mean([s.noise(best.D, own) for s, own in pairs], axis=0)
+        pairs = zip(self.tracks, best.own, strict=True)
+        noise = np.mean([t.noise(best.D, own) for t, own in pairs], axis=0)
         out: Floats = noise * np.outer(self.scale, self.scale)
         return out
 
 
-def _neighbours(steps: VectorSteps) -> Floats:
-    """Return the summed products of neighbouring steps, symmetric."""
-    product = (steps.y[:-1] * steps.linked[:-1, None]).T @ steps.y[1:]
-    return 0.5 * (product + product.T)
+def neighbour_products(steps: Steps) -> Floats:
+    """Return the summed products of neighbouring steps that share a frame, symmetric, (b, b).
+
+    Examples
+    --------
+    >>> from perrin import Cluster, simulate_motion
+    >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=30, rng=3)
+    >>> neighbour_products(body_steps(truth, "rotation", np.eye(3))).shape
+    (3, 3)
+    """
+    product = (steps.vectors[:-1] * steps.linked[:-1, None]).T @ steps.vectors[1:]
+    return np.asarray(0.5 * (product + product.T))
 
 
-def _collected(
-    motions: Sequence[RigidMotion],
-    vectors: Sequence[_Vectors],
-    *,
-    noise: str | float,
-    exposure: float | None,
-) -> _Data:
-    """Bring the steps of all motions to their own units, and say what is known of their noise."""
-    y = np.concatenate([v.y for v in vectors])
-    scale = _scale(y)
-    time = float(np.mean([m.dt for m in motions]))
-    unknown = exposure is None and noise == "joint"
-    B = None if unknown else (exposure or 0.0) / 6
-    sources = []
-    for m, v in zip(motions, vectors, strict=True):
-        shapes = v.shapes / np.outer(scale, scale)
-        # An amplitude of 1 is then noise as large as a step, in the three components it has.
-        size = np.nanmean(np.trace(shapes, axis1=2, axis2=3), axis=1) / 3
-        start, stop = m.steps()
-        shapes = shapes / size[:, None, None, None]
-        steps = VectorSteps(
-            y=v.y / scale,
-            tau=(m.time[stop] - m.time[start]) / time,
-            begin=shapes[:, start],
-            end=shapes[:, stop],
-            linked=np.append(start[1:] == stop[:-1], False),
-            dt=m.dt / time,
-        )
-        theta, weight = _known_noise(m, steps, noise=noise, size=size)
-        sources.append(Source(steps, theta, weight, B))
-    if len({np.isinf(source.weight) for source in sources}) > 1:
-        raise ValueError(
-            "noise='residual': some motions show no noise at all (simulated truth) and others do; "
-            "pool them apart"
-        )
-    return _Data(sources, scale, time)
+def element_variance(covariance: Floats, a: Floats, b: Floats) -> float:
+    """Return the variance of a.D.b from the covariance of the elements of D.
 
-
-def _scale(y: Floats) -> Floats:
-    """Return the root mean square component of each triple of a step."""
-    triple = np.sqrt((y.reshape(len(y), -1, 3) ** 2).mean(axis=(0, 2)))
-    if not triple.all():
-        raise ValueError("the body does not move at all: there is no tensor to estimate")
-    return np.repeat(triple, 3)
-
-
-def _known_noise(
-    motion: RigidMotion, steps: VectorSteps, *, noise: str | float, size: Floats
-) -> tuple[Floats, float]:
-    """Return the noise amplitudes and the degrees of freedom that they are known with."""
-    if noise == "joint":
-        # The neighbours' covariance is minus the noise; a little more keeps the start inside.
-        square = -np.trace(_neighbours(steps)) / max(steps.linked.sum(), 1)
-        square = square / steps.y.shape[1]
-        return np.full(len(size), max(float(square), 0.0) + 0.05), 0.0
-    if noise == "residual":
-        theta = motion.sigma**2 * size
-        return theta, float(residual_freedom(motion)) if theta.min() > _NOISELESS else np.inf
-    return float(noise) ** 2 * size, np.inf
-
-
-def _tests(data: _Data, free: Maximum) -> tuple[float, float]:
-    """Return the p-values of isotropy and of axial symmetry from likelihood ratios."""
-    from scipy.special import chdtrc
-
-    def p_value(restricted: Maximum, freedom: int) -> float:
-        return float(chdtrc(freedom, max(2 * (free.value - restricted.value), 0.0)))
-
-    isotropic = data.fit(np.eye(3)[None] / 3**0.5, near=free)
-    return p_value(isotropic, 5), p_value(data.fit_axial(free), 2)
-
-
-def _variance(covariance: Floats, a: Floats, b: Floats) -> float:
-    """Return the variance of a.D.b from the covariance of the elements of D."""
-    weight = np.array([a[i] * b[j] + (a[j] * b[i] if i != j else 0.0) for i, j in _ELEMENTS])
+    Examples
+    --------
+    >>> element_variance(np.diag([1.0, 2, 3, 4, 5, 6]), np.eye(3)[0], np.eye(3)[1])
+    4.0
+    """
+    weight = np.array(
+        [a[i] * b[j] + (a[j] * b[i] if i != j else 0.0) for i, j in SYMMETRIC_ELEMENTS]
+    )
     return float(weight @ covariance @ weight)
 
 
-def _axis_errors(values: Floats, axes: Floats, covariance: Floats) -> Floats:
-    """Return by how many degrees one standard error of D_ab turns axes a and b.
+def axis_errors(values: Floats, axes: Floats, covariance: Floats) -> Floats:
+    """Return the angle, in degrees, by which one standard error of D_ab turns axes a and b.
 
     The angle is half the one whose tangent is 2 D_ab/(D_a - D_b).
+
+    Examples
+    --------
+    >>> axis_errors(np.array([1.0, 2, 4]), np.eye(3), 0.01 * np.eye(6)).round(1)
+    array([[0. , 5.7, 1.9],
+           [5.7, 0. , 2.9],
+           [1.9, 2.9, 0. ]])
     """
     errors = np.zeros((3, 3))
     rounding = 1e-9 * values[2]
     for a, b in ((0, 1), (0, 2), (1, 2)):
-        variance = _variance(covariance, axes[:, a], axes[:, b])
+        variance = element_variance(covariance, axes[:, a], axes[:, b])
         apart = values[b] - values[a]
         off = np.sqrt(variance) if not variance < rounding**2 else 0.0
-        angle = _EQUAL if apart <= rounding else np.degrees(0.5 * np.arctan2(2 * off, apart))
+        angle = (
+            EQUAL_AXES_ERROR if apart <= rounding else np.degrees(0.5 * np.arctan2(2 * off, apart))
+        )
         errors[a, b] = errors[b, a] = angle
-    return errors
-
-
-def _shifted_errors(tensor: Floats, covariance: Floats, place: Floats | None) -> Floats:
-    """Return the standard errors (6, 6) after the move, by central differences in the elements."""
-    lower = np.tril_indices(6)
-    sd = np.sqrt(np.diag(covariance))
-
-    def moved(element: int, change: float) -> Floats:
-        other = tensor.copy()
-        i, j = lower[0][element], lower[1][element]
-        other[i, j] += change
-        other[j, i] = other[i, j]
-        return shifted(other, diffusion_center(other) if place is None else place)
-
-    slopes = np.array([(moved(k, h) - moved(k, -h)) / (2 * h) for k, h in enumerate(1e-3 * sd)])
-    variance = np.einsum("kab,kl,lab->ab", slopes, covariance, slopes)
-    errors: Floats = np.sqrt(np.maximum(variance, 0.0))
     return errors

@@ -127,7 +127,7 @@ def _method(report: Report) -> dict[str, Any]:
     if one is None:
         return {"noise": "joint", "exposure": None, "drift": False}
     return {
-        "noise": one.D_R.noise,
+        "noise": one.D_R.settings.text,
         "exposure": one.D_R.exposure,
         "drift": one.D_T.drift is not None,
     }
@@ -309,7 +309,7 @@ def _noise_facts(result: ClusterResult) -> list[tuple[str, str, str]]:
     known = bool(np.isfinite(error))
     measured = _floor(result.phi2_measured, error if known else 0.0)
     held = {"joint": "free in the fit", "residual": "the residuals weighed in"}
-    remark = f"offset of the steps, {held.get(estimate.noise, 'held')}"
+    remark = f"offset of the steps, {held.get(estimate.settings.text, 'held')}"
     remark += "" if known else "; its error is unknown: it lies on the edge of the possible"
     snr = number_text(estimate.snr) if np.isfinite(estimate.snr) else "without bound"
     facts = [

@@ -13,9 +13,9 @@ import numpy as np
 from perrin._arrays import finite_or_none
 from perrin._text import with_error
 from perrin.curves.displacement import LagCurve, msad, msd
-from perrin.diffusion.estimate import DiffusionEstimate, _estimate_dict, _estimate_from
+from perrin.diffusion.estimate import DiffusionEstimate
 from perrin.diffusion.step_tests import without_spin
-from perrin.diffusion.tensor_results import DiffusionTensor, _tensor_dict, _tensor_from
+from perrin.diffusion.tensor_results import DiffusionTensor
 from perrin.hydrodynamics.sizes import Size
 from perrin.images.imaging import Imaging, read_imaging, write_imaging
 from perrin.motion.floor import NoiseFloor, floor_of
@@ -135,13 +135,13 @@ class ClusterResult:
             "label": self.label,
             "n_particles": len(self.motion.template),
             "n_frames": int(self.motion.fitted.size),
-            "D_R": _estimate_dict(self.D_R),
-            "D_T": _estimate_dict(self.D_T),
+            "D_R": self.D_R.to_dict(),
+            "D_T": self.D_T.to_dict(),
             "sigma": finite_or_none(self.motion.sigma),
             "sigma_xyz": None if xyz is None else list(xyz),
             "phi2": {"measured": finite_or_none(self.phi2_measured), "predicted": self.noise.phi2},
             "snr": finite_or_none(self.D_R.snr),
-            "tensor": None if self.tensor is None else _tensor_dict(self.tensor),
+            "tensor": None if self.tensor is None else self.tensor.to_dict(),
             "sizes": sizes,
             "size_factor": next((s.factor for s in (self.sizes or {}).values()), None),
             "prediction": None if self.prediction is None else self.prediction.to_dict(),
@@ -172,9 +172,9 @@ class ClusterResult:
         return cls(
             cluster=entry["cluster"],
             motion=motion,
-            D_R=_estimate_from(entry["D_R"]),
-            D_T=_estimate_from(entry["D_T"]),
-            tensor=None if entry["tensor"] is None else _tensor_from(entry["tensor"]),
+            D_R=DiffusionEstimate.from_dict(entry["D_R"]),
+            D_T=DiffusionEstimate.from_dict(entry["D_T"]),
+            tensor=None if entry["tensor"] is None else DiffusionTensor.from_dict(entry["tensor"]),
             noise=predicted_noise(motion),
             sizes=None if entry["sizes"] is None else sizes,
             warnings=tuple(entry["warnings"]),
@@ -231,8 +231,8 @@ class RodResult:
             "n_particles": len(self.motion.places),
             "n_frames": int(self.motion.fitted.size),
             "D_R": None,
-            "D_perp": _estimate_dict(self.D_perp),
-            "D_T": _estimate_dict(self.D_T),
+            "D_perp": self.D_perp.to_dict(),
+            "D_T": self.D_T.to_dict(),
             "length": self.motion.length,
             "sigma": finite_or_none(self.motion.sigma),
             "sigma_xyz": None,
@@ -251,8 +251,8 @@ class RodResult:
         return cls(
             cluster=entry["cluster"],
             motion=motion,
-            D_perp=_estimate_from(entry["D_perp"]),
-            D_T=_estimate_from(entry["D_T"]),
+            D_perp=DiffusionEstimate.from_dict(entry["D_perp"]),
+            D_T=DiffusionEstimate.from_dict(entry["D_T"]),
             warnings=tuple(entry["warnings"]),
             label=entry["label"],
             prediction=None if prediction is None else Prediction.from_dict(prediction),
@@ -279,8 +279,8 @@ class Pooled:
     def to_dict(self) -> dict[str, Any]:
         """Return the entry "pooled" of ``summary.json``."""
         return {
-            "D_R": _estimate_dict(self.D_R),
-            "D_T": _estimate_dict(self.D_T),
+            "D_R": self.D_R.to_dict(),
+            "D_T": self.D_T.to_dict(),
             "p_same": self.D_R.p_same,
             "clusters": list(self.clusters),
         }
@@ -288,7 +288,7 @@ class Pooled:
     @classmethod
     def from_dict(cls, entry: Mapping[str, Any]) -> Pooled:
         """Read back what `to_dict` wrote."""
-        D_R, D_T = _estimate_from(entry["D_R"]), _estimate_from(entry["D_T"])
+        D_R, D_T = DiffusionEstimate.from_dict(entry["D_R"]), DiffusionEstimate.from_dict(entry["D_T"])
         return cls(D_R, D_T, tuple(entry["clusters"]))
 
 
