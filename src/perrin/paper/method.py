@@ -258,7 +258,7 @@ def product(study: Study) -> Item:
               "Eq. 13, section 2.2", 0.0, previous, 1e-10, "1e-10 um"),
     ]  # fmt: skip
     expected = ((0.02, 1.72, 2.3, 1.2), (0.05, 4.30, 11.7, 3.0))
-    for part, (ratio, one, late, common) in zip(drift, expected, strict=True):
+    for part, (ratio, one, late, fitted) in zip(drift, expected, strict=True):
         last = part.iloc[-1]
         source, where = "Eq. 13, section 2.2", f"sigma/R = {ratio}"
         # 8 repeats of 1000 frames with 3 angles each, twice.
@@ -274,7 +274,7 @@ def product(study: Study) -> Item:
                   "The errors of successive rotations do not cancel at second order: after 5000 "
                   f"steps the product is {last['product_deg']:.1f} degrees off, one step "
                   f"{last['one_step_deg']:.2f}."),
-            Claim(f"rms error of the fit to a common shape (degrees), {where}", source, common,
+            Claim(f"rms error of the fit to a common shape (degrees), {where}", source, fitted,
                   last["common_deg"], 0.05, "rounding"),
             statistical("the common shape's error does not grow: last over first 1000 of 5000 "
                         f"steps, {where}", source, expected=1.0, measured=last["common_growth"],

@@ -201,9 +201,9 @@ def figure_4(study: Study) -> Item:
 
     text = (
         f"(a) Phi^2 at lag 1 of {_STATIONARY_FRAMES} frames of stationary clusters, R = 1.0, 1.5 "
-        "and 2.5 um, noise 10 to 100 nm (sigma/R at most 0.1), by the product of successive rotations; filled "
-        "symbols tetrahedra, open ones pentahedra. (b) The MSADs of Fig. 3 less the Phi^2 that "
-        "their sigma predicts."
+        "and 2.5 um, noise 10 to 100 nm (sigma/R at most 0.1), by the product of successive "
+        "rotations; filled symbols tetrahedra, open ones pentahedra. (b) The MSADs of Fig. 3 less "
+        "the Phi^2 that their sigma predicts."
     )
     return Item("fig4", _NOISE_SECTION, "Fig. 4: the noise floor and its subtraction", text, table,
                 draw, tuple(claims), size=(11, 4.8))  # fmt: skip
@@ -550,8 +550,8 @@ def sampling(study: Study) -> Item:
     text = (
         "Noise-free clusters with one step every dt: the apparent diffusion, and how often the "
         "particle nearest to the last position of a particle is another one. Expected at "
-        "4 D_R dt = 1: 0.9131 from the heat kernel on SO(3), 0.9126 from the law of Eq. 16 by quadrature. At the "
-        "two limits the Cramer-Rao bound for 300 frames is given as well."
+        "4 D_R dt = 1: 0.9131 from the heat kernel on SO(3), 0.9126 from the law of Eq. 16 by "
+        "quadrature. At the two limits the Cramer-Rao bound for 300 frames is given as well."
     )
     return Item("sampling", _NOISE_SECTION, "Sampling rules", text, table, draw, tuple(claims),
                 size=(10, 4.4))  # fmt: skip
