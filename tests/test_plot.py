@@ -12,7 +12,8 @@ from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 
 import perrin
-from perrin.diffusion.estimate import DiffusionEstimate
+from perrin._text import number_text
+from perrin.diffusion.estimate import DiffusionEstimate, bare_text, value_text
 from perrin.plot import results as plot
 
 
@@ -146,7 +147,7 @@ def rod():
 
 def test_the_msad_of_an_anisotropic_body_is_compared_with_its_tensor(rod):
     """Line, circles and floor are those of the directions averaged: W = 1 - <p p^T>."""
-    left = plot._curve_figure(rod).axes[0]
+    left = plot.curve_figure(rod).axes[0]
     unit = rod.motion.template / np.linalg.norm(rod.motion.template, axis=1, keepdims=True)
     W = np.eye(3) - unit.T @ unit / len(unit)
     D, noise = np.trace(rod.tensor.tensor @ W), np.trace(rod.tensor.offset @ W)
@@ -156,7 +157,7 @@ def test_the_msad_of_an_anisotropic_body_is_compared_with_its_tensor(rod):
     np.testing.assert_allclose(pure, 2 * D * t, rtol=1e-9)
     (floor,) = set(line(left, "noise floor").get_ydata())
     assert floor == pytest.approx(2 * np.trace(rod.noise.covariance @ W), rel=1e-9)
-    shown = plot.number_text(*rod.tensor.weighted(W))
+    shown = number_text(*rod.tensor.weighted(W))
     assert shown in line(left, "tensor").get_label()
     assert not [x for x in left.lines if str(x.get_label()).startswith("ML fit")]
     value, stderr = rod.tensor.weighted(W)
@@ -393,13 +394,13 @@ def test_every_plan_can_be_drawn(budget):
 
 
 def test_numbers_in_words():
-    assert plot.value_text(estimate()) == "0.0100(10) rad²/s"
+    assert value_text(estimate()) == "0.0100(10) rad²/s"
     small = estimate(value=4.7e-7, stderr=5e-8, unit="um^2/s")
-    assert plot.value_text(small) == "4.7(5) × 10⁻⁷ µm²/s"
+    assert value_text(small) == "4.7(5) × 10⁻⁷ µm²/s"
     unbounded = estimate(value=0.0, ci95=(0.0, np.inf), resolved=False)
-    assert plot.bare_text(unbounded) == "< ∞"
-    assert plot.number_text(5e-5, 9e-4) == "0(9) × 10⁻⁴"
-    assert [plot.number_text(v) for v in (0.0, 30, -1843, 2.5e9)] == [
+    assert bare_text(unbounded) == "< ∞"
+    assert number_text(5e-5, 9e-4) == "0(9) × 10⁻⁴"
+    assert [number_text(v) for v in (0.0, 30, -1843, 2.5e9)] == [
         "0", "30.0", "−1840", "2.50 × 10⁹"
     ]  # fmt: skip
 

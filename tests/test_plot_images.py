@@ -341,7 +341,7 @@ def test_paths_end_at_the_views_frame(report):
 
 
 def test_paths_are_no_longer_than_their_tail(report, monkeypatch):
-    monkeypatch.setattr(plot_images, "_TRAIL", 10)
+    monkeypatch.setattr(plot_images, "_PATH_FRAMES", 10)
     view = next(v for v in report.imaging.views if v.frame == 20)
     ax = axes()
     plot_images.plot_tracks(report, view, ax=ax)
