@@ -1,4 +1,4 @@
-"""The HTML report says what was measured, safely and in one file; the run folder is all or none."""
+"""The report page shows the results, escaped and in one file; a run folder is whole or absent."""
 
 from __future__ import annotations
 
@@ -12,8 +12,10 @@ import numpy as np
 import pytest
 
 import perrin
-from perrin.plot import results as plot
+from perrin._text import number_text
+from perrin.diffusion.estimate import bare_text
 from perrin.report import page as report
+from perrin.report import write
 from perrin.run.results import write_data
 from test_plot import estimate, measured
 
@@ -23,7 +25,7 @@ PNG = base64.b64decode(
 
 
 class Page(HTMLParser):
-    """Collects text, tags, and everything that could fetch."""
+    """Collects text, tags, and all attributes that could load a resource."""
 
     def __init__(self, html):
         super().__init__()
@@ -74,15 +76,15 @@ def test_the_page_holds_the_numbers(single):
     (found,) = single.clusters
     assert page.open == []
     for one in (found.D_R, found.D_T):
-        assert plot.bare_text(one) in page.text
+        assert bare_text(one) in page.text
         for end in (*one.ci68, *one.ci95):
             # The ends as print rounds them.
             shown = [float(n) for n in re.findall(r"\d+\.\d+", page.text)]
             assert min(abs(n - end) for n in shown) < 0.02 * one.stderr + 5e-3 * end
-    assert plot.number_text(1e3 * found.motion.sigma) + " nm" in page.text
-    assert plot.number_text(found.noise.phi2) in page.text
+    assert number_text(1e3 * found.motion.sigma) + " nm" in page.text
+    assert number_text(found.noise.phi2) in page.text
     degrees = np.rad2deg(np.sqrt(found.noise.phi2))
-    assert f"Φ = {plot.number_text(degrees)}°" in page.text
+    assert f"Φ = {number_text(degrees)}°" in page.text
     assert "60 of 60" in page.text
     assert "ab" * 32 in page.text
     assert "2026-01-02 03:04 UTC" in page.text
@@ -221,7 +223,7 @@ def test_many_clusters_are_listed_pooled_and_the_figures_counted(single, tmp_pat
 
 def test_the_run_folder_is_complete(single, tmp_path):
     place = tmp_path / "run"
-    report.write_run(single, place)
+    write.write_run(single, place)
     names = {f.name for f in place.iterdir()}
     assert names == {
         "summary.json", "tracks.parquet", "motion.parquet", "curves.csv", "run.json", "figures",
@@ -236,13 +238,13 @@ def test_the_run_folder_is_complete(single, tmp_path):
 
 
 def test_an_existing_folder_is_refused_or_replaced(single, tmp_path, monkeypatch):
-    monkeypatch.setattr(report, "save_figures", lambda *_: [])
+    monkeypatch.setattr(write, "save_figures", lambda *_: [])
     place = tmp_path / "run"
-    report.write_run(single, place)
+    write.write_run(single, place)
     (place / "old").touch()
     with pytest.raises(FileExistsError, match="overwrite"):
-        report.write_run(single, place)
-    report.write_run(single, place, overwrite=True)
+        write.write_run(single, place)
+    write.write_run(single, place, overwrite=True)
     assert not (place / "old").exists()
 
 
@@ -255,11 +257,11 @@ def test_a_failure_leaves_nothing_behind_and_keeps_what_stood(single, tmp_path, 
     def fail(*_):
         raise RuntimeError("disk full")
 
-    monkeypatch.setattr(report, "save_figures", lambda *_: [])
-    monkeypatch.setattr(report, step, fail)
+    monkeypatch.setattr(write, "save_figures", lambda *_: [])
+    monkeypatch.setattr(write, step, fail)
     for target in (place, tmp_path / "new"):
         with pytest.raises(RuntimeError, match="disk full"):
-            report.write_run(single, target, overwrite=True)
+            write.write_run(single, target, overwrite=True)
     assert [p.name for p in tmp_path.iterdir()] == ["run"]
     assert (place / "summary.json").is_file()
 

@@ -302,7 +302,7 @@ def plot_step_angles(report: Report, *, ax: Axes) -> Axes:
     bottom = ax.get_xaxis_transform()
     ax.plot(largest, np.zeros(len(largest)), "|", label=label, transform=bottom, **style)
     for turn in [t for t in least_turns(report) if t < top]:
-        label = f"turn onto itself, {number_text(turn)}°"
+        label = f"symmetry rotation, {number_text(turn)}°"
         ax.axvline(turn, color=INK, lw=1.2, ls=":", label=label)
     ax.set(xlabel="angle between successive poses (°)", ylabel="steps")
     ax.set_xlim(0, edges[-1])
