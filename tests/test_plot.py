@@ -15,6 +15,7 @@ import perrin
 from perrin._text import number_text
 from perrin.diffusion.estimate import DiffusionEstimate, bare_text, value_text
 from perrin.plot import results as plot
+from perrin.plot import style
 
 
 def measured(*, clusters=1, frames=80, planar=False, labels=None, D_R=0.02, gaps=False):
@@ -318,8 +319,20 @@ def test_forest_of_many_clusters_is_ordered_by_value(space):
     assert "ordered" in ax.get_ylabel()
 
 
+def without_layout(figure):
+    figure.set_layout_engine("none")
+    return figure
+
+
 @pytest.mark.parametrize("planar", [False, True])
-def test_save_figures_names_its_files_and_changes_no_setting(tmp_path, planar):
+def test_save_figures_names_its_files_and_changes_no_setting(
+    tmp_path, planar, monkeypatch, repeats
+):
+    monkeypatch.setattr(style, "DPI", repeats(30, 150))
+    if planar and repeats(True, False):
+        # The layout of the figures takes most of the time.
+        figure = plot.new_figure
+        monkeypatch.setattr(plot, "new_figure", lambda *size: without_layout(figure(*size)))
     before = dict(rcParams)
     files = plot.save_figures(measured(planar=planar, frames=20), tmp_path)
     kinds = ("curves", "residuals", "orientations")
@@ -332,8 +345,9 @@ def test_save_figures_names_its_files_and_changes_no_setting(tmp_path, planar):
 
 def test_save_figures_draws_the_first_clusters_and_all_in_one(tmp_path, monkeypatch):
     monkeypatch.setattr(plot, "MAX_CLUSTERS", 1)
+    monkeypatch.setattr(plot, "save_figure", lambda _, stem: [stem])
     files = plot.save_figures(measured(clusters=3, frames=20), tmp_path)
-    stems = {f.stem for f in files}
+    stems = {f.name for f in files}
     assert "clusters" in stems
     assert {s.split("-")[1] for s in stems if "-" in s} == {"0"}
 
