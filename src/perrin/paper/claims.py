@@ -236,7 +236,7 @@ def claims_page(items: Sequence[Item], *, heading: str) -> str:
     failed = [claim for claim in claims if not claim.holds]
     lines = [heading, "", f"{len(claims)} claims, {len(claims) - len(failed)} hold.", ""]
     if failed:
-        lines += ["## What does not hold", ""]
+        lines += ["## Claims that do not hold", ""]
         for c in failed:
             expected = f"{c.expected:.4g} ± {c.tolerance:.4g}"
             measured = f"{c.measured:.4g} was measured, {expected} expected."

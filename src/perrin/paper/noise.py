@@ -288,7 +288,7 @@ def _floor_claims(table: pd.DataFrame) -> list[Claim]:
             statistical(f"Phi^2 over 6 sigma^2/(n R^2), {shape}, all directions, {where}",
                         source, expected=1.0, measured=mean, stderr=error,
                         remark=f"Over all directions Phi^2 is {100 * mean - 100:+.2f} % off Eq. "
-                               f"23, as the exact expression says ({100 * exact - 100:+.2f} %)."),
+                               f"23, as the exact expression states ({100 * exact - 100:+.2f} %)."),
             statistical(f"Phi^2 over the exact expression, {shape}, all directions, {where}",
                         source, expected=1.0, measured=mean / exact, stderr=error),
         ]  # fmt: skip

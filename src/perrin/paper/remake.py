@@ -31,9 +31,9 @@ ITEMS: tuple[Callable[[Study], Item], ...] = (
 _HEADING = """# The paper, claim by claim
 
 G. L. Hunter, K. V. Edmond, M. T. Elsesser and E. R. Weeks, "Tracking rotational diffusion of
-colloidal clusters", Optics Express 19, 17189 (2011), remade by `perrin paper`. Every number under
-"measured" comes from that run; a claim holds where it differs from the expected one by no more
-than the tolerance. Statistical tolerances are three standard errors: of more than a
+colloidal clusters", Optics Express 19, 17189 (2011), reproduced by `perrin paper`. Every number
+under "measured" is a result of that run. A claim holds if it differs from the expected number by no
+more than the tolerance. Statistical tolerances are three standard errors: of more than a
 hundred claims one may fail by chance with another seed."""
 
 
