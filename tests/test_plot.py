@@ -1,4 +1,4 @@
-"""Pictures show the numbers they claim to show."""
+"""Figures of results show the numbers of the results."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ def test_lag_curve_in_the_plane_has_its_own_factors(plane):
     assert line(ax, "my data").get_marker() == "."
 
 
-def test_lag_curve_with_a_negative_offset_leaves_out_what_has_no_logarithm(space):
+def test_lag_curve_with_a_negative_offset_has_no_points_without_a_logarithm(space):
     ax = axes()
     plot.plot_lag_curve(space.msad, ax=ax, estimate=estimate(offset=-0.02), floor=0.0)
     t, fitted = line(ax, "ML fit").get_data()
@@ -133,7 +133,7 @@ def test_an_unresolved_estimate_is_a_limit_without_pure_diffusion(space):
 
 @pytest.fixture(scope="module")
 def rod():
-    """Return the result of a body that turns ten times faster about its long axis."""
+    """Return the result of a body that rotates ten times faster about its long axis."""
     body = perrin.Cluster.from_positions([[-3, 0, 0], [0, 0.5, 0.3], [0.2, -0.6, 0.4], [3, 0, 0]])
     rng = np.random.default_rng(5)
     truth = perrin.simulate_motion(
@@ -204,7 +204,7 @@ def test_long_curves_are_thinned_evenly_on_the_logarithm():
     assert value[-1] == curve.value[np.searchsorted(curve.lagtime, line(ax, "MSD").get_xdata()[-1])]
 
 
-def test_a_curve_of_zeros_is_no_crash():
+def test_a_curve_of_zeros_can_be_drawn():
     curve = perrin.msd(np.zeros((10, 1, 3)), dt=1.0)
     drawn(plot.plot_lag_curve(curve, ax=axes()))
 
@@ -221,7 +221,7 @@ def test_residuals_presence_and_refused_frames(space):
     expected = line(ax, "expected").get_ydata()
     assert expected[0] == pytest.approx(1e3 * motion.sigma * np.sqrt(6 / 4))
     assert expected[50] == pytest.approx(1e3 * motion.sigma * np.sqrt(3 / 3))
-    # It is what the residuals are on average.
+    # The residuals agree with it on average.
     ratio = np.nanmean(motion.residual**2) / np.nanmean((expected / 1e3) ** 2)
     assert ratio == pytest.approx(1, abs=0.1)
     ax = axes()
@@ -407,7 +407,7 @@ def test_every_plan_can_be_drawn(budget):
     drawn(ax)
 
 
-def test_numbers_in_words():
+def test_texts_of_estimates():
     assert value_text(estimate()) == "0.0100(10) rad²/s"
     small = estimate(value=4.7e-7, stderr=5e-8, unit="um^2/s")
     assert value_text(small) == "4.7(5) × 10⁻⁷ µm²/s"

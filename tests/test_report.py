@@ -130,8 +130,8 @@ def test_sizes_and_the_viscosity_they_imply_are_shown(single):
     assert "No hydrodynamic sizes: viscosity and temperature were not given" in text
 
 
-def test_predictions_stand_beside_the_measured_values(single):
-    """A line a coefficient and principal axis; what is not resolved has no pull."""
+def test_predictions_are_listed_with_the_measured_values(single):
+    """Each coefficient and principal axis has a line; one that is not resolved has no pull."""
     D_R = perrin.Compared(0.00673, 0.0051, 0.0004)
     prediction = perrin.Prediction(
         2.45, 1e-5, D_T=perrin.Compared(0.0453, 0.0, np.nan), D_R=D_R, principal_D_R=(D_R,) * 3
@@ -146,7 +146,7 @@ def test_predictions_stand_beside_the_measured_values(single):
     assert "pull" not in Page(report.render_html(single, [])).text
 
 
-def test_the_page_fetches_nothing_and_runs_nothing(single, tmp_path):
+def test_the_page_loads_nothing_and_runs_nothing(single, tmp_path):
     files = pictures(tmp_path, "cluster-0-curves", "cluster-0-residuals", "cluster-0-orientations")
     html = report.render_html(single, [*files, tmp_path / "cluster-0-curves.pdf"])
     page = Page(html)
@@ -158,7 +158,7 @@ def test_the_page_fetches_nothing_and_runs_nothing(single, tmp_path):
     assert page.text.count("What to look for:") == 3
 
 
-def test_what_users_wrote_is_escaped(single):
+def test_text_of_users_is_escaped(single):
     html = report.render_html(single, [])
     assert "<my>" not in html
     assert "&lt;my&gt; &amp; &#34;tracks&#34;.csv" in html
@@ -173,17 +173,17 @@ def test_what_users_wrote_is_escaped(single):
         assert page.open == []
 
 
-def test_warnings_stand_in_a_box(single):
-    said = "not rigid: it bends"
-    one = replace(single.clusters[0], warnings=(said,))
+def test_warnings_are_in_a_box(single):
+    text = "not rigid: it bends"
+    one = replace(single.clusters[0], warnings=(text,))
     html = report.render_html(replace(single, clusters=(one,), warnings=("rows are missing",)), [])
     box = html[html.index('<div class="warning"') :]
-    assert said in box[: box.index("</div>")]
+    assert text in box[: box.index("</div>")]
     assert "rows are missing" in box[: box.index("</div>")]
     assert '<div class="warning"' not in report.render_html(single, [])
 
 
-def test_limits_open_ends_and_unknown_errors_are_words(single):
+def test_limits_open_ends_and_unknown_errors_are_text(single):
     unbounded = estimate(
         value=0.0, ci68=(0, np.inf), ci95=(0, np.inf), stderr=np.inf, resolved=False,
         offset_stderr=np.nan, snr=0.0,
@@ -207,7 +207,7 @@ def test_limits_open_ends_and_unknown_errors_are_words(single):
     assert "without bound" in text
 
 
-def test_two_dimensions_have_their_own_words():
+def test_two_dimensions_have_their_own_text():
     found = measured(planar=True, frames=40)
     text = Page(report.render_html(found, [])).text
     assert "MSAD = 2" in text
@@ -260,7 +260,9 @@ def test_an_existing_folder_is_refused_or_replaced(single, tmp_path, monkeypatch
 
 
 @pytest.mark.parametrize("step", ["save_figures", "render_html"])
-def test_a_failure_leaves_nothing_behind_and_keeps_what_stood(single, tmp_path, monkeypatch, step):
+def test_a_failure_leaves_no_files_and_keeps_an_existing_folder(
+    single, tmp_path, monkeypatch, step
+):
     place = tmp_path / "run"
     place.mkdir()
     write_data(single, place)
@@ -278,8 +280,8 @@ def test_a_failure_leaves_nothing_behind_and_keeps_what_stood(single, tmp_path, 
 
 
 @pytest.mark.parametrize("count", [1, 40])
-def test_notes_stand_apart_and_are_not_counted(single, count):
-    """Notes have a box of their own after the warnings; the table counts warnings only."""
+def test_notes_are_separate_and_not_counted(single, count):
+    """Notes are in a separate box after the warnings; the table counts warnings only."""
     one = single.clusters[0]
     many = tuple(
         replace(one, cluster=k, notes=(f"{k + 3} rows are missing",), warnings=("bends",) * (k > 1))
@@ -306,7 +308,7 @@ def test_notes_stand_apart_and_are_not_counted(single, count):
 
 
 def test_several_clusters_without_a_pooled_value(single):
-    """Where nothing is pooled the page says so in the first place, and shows every cluster."""
+    """The headline states that no value is pooled, and the page shows every cluster."""
     many = tuple(replace(single.clusters[0], cluster=k) for k in range(3))
     page = Page(report.render_html(replace(single, clusters=many, pooled=None), []))
     assert "No values are pooled; those of the single clusters follow" in page.text
@@ -315,7 +317,7 @@ def test_several_clusters_without_a_pooled_value(single):
 
 
 def test_notes_are_kept_and_older_runs_have_none(single, tmp_path):
-    """Notes read back; a run folder without the key is read as one without notes."""
+    """Notes are read back; a run folder without the key is read as one without notes."""
     one = replace(single.clusters[0], notes=("5 rows",))
     found = replace(single, clusters=(one,), notes=("columns recognised",))
     found.save(tmp_path / "run")

@@ -300,7 +300,7 @@ def rigid_body_facts(report: Report) -> list[Fact]:
     facts = []
     sigma = [c.motion.sigma for c in report.clusters if np.isfinite(c.motion.sigma)]
     if sigma:
-        remark = "of one coordinate, median of the clusters; includes errors other than image noise"
+        remark = "of one coordinate, median of the clusters; not only image noise"
         value = f"{number_text(1e3 * float(np.median(sigma)), digits=2)} nm"
         facts.append(("error from rigid bodies", value, remark))
     contact = imaging_of(report).contact
@@ -314,6 +314,6 @@ def rigid_body_facts(report: Report) -> list[Fact]:
         remark = f"mean of {distance.size} pairs; contact is {number_text(contact)} µm ({off})"
         facts.append(("distance of touching spheres", f"{number_text(mean, digits=4)} µm", remark))
     for turn in least_turns(report)[:1]:
-        remark = "a step of half of it or more cannot be distinguished from an exchange of spheres"
+        remark = "a step of half of it or more may be an exchange of spheres"
         facts.append(("smallest symmetry rotation", f"{number_text(turn)}°", remark))
     return facts
