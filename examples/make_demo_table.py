@@ -1,8 +1,9 @@
-"""The recipe of the demo's table: one simulated tetrahedron under the conditions of the paper.
+"""Simulate the table of the demo: one tetrahedron under the conditions of the paper.
 
 Hunter et al. 2011, section 5: touching spheres of 2.45 um, D_R = 4.93e-3 rad^2/s,
 D_T = 3.85e-2 um^2/s, 300 frames 0.73 s apart, localisation errors of 30, 30 and 40 nm. Positions
-are rounded to 0.1 nm. `python examples/make_demo_table.py FILE` writes it again; a test compares.
+are rounded to 0.1 nm. `python examples/make_demo_table.py FILE` writes the table; a test compares
+it with the one of the package.
 """
 
 import sys

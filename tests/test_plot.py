@@ -1,4 +1,4 @@
-"""Pictures show the numbers they claim to show."""
+"""Figures of results show the numbers of the results."""
 
 from __future__ import annotations
 
@@ -12,8 +12,10 @@ from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 
 import perrin
-from perrin.diffusion.estimate import DiffusionEstimate
+from perrin._text import number_text
+from perrin.diffusion.estimate import DiffusionEstimate, bare_text, value_text
 from perrin.plot import results as plot
+from perrin.plot import style
 
 
 def measured(*, clusters=1, frames=80, planar=False, labels=None, D_R=0.02, gaps=False):
@@ -112,7 +114,7 @@ def test_lag_curve_in_the_plane_has_its_own_factors(plane):
     assert line(ax, "my data").get_marker() == "."
 
 
-def test_lag_curve_with_a_negative_offset_leaves_out_what_has_no_logarithm(space):
+def test_lag_curve_with_a_negative_offset_has_no_points_without_a_logarithm(space):
     ax = axes()
     plot.plot_lag_curve(space.msad, ax=ax, estimate=estimate(offset=-0.02), floor=0.0)
     t, fitted = line(ax, "ML fit").get_data()
@@ -131,7 +133,7 @@ def test_an_unresolved_estimate_is_a_limit_without_pure_diffusion(space):
 
 @pytest.fixture(scope="module")
 def rod():
-    """Return the result of a body that turns ten times faster about its long axis."""
+    """Return the result of a body that rotates ten times faster about its long axis."""
     body = perrin.Cluster.from_positions([[-3, 0, 0], [0, 0.5, 0.3], [0.2, -0.6, 0.4], [3, 0, 0]])
     rng = np.random.default_rng(5)
     truth = perrin.simulate_motion(
@@ -146,7 +148,7 @@ def rod():
 
 def test_the_msad_of_an_anisotropic_body_is_compared_with_its_tensor(rod):
     """Line, circles and floor are those of the directions averaged: W = 1 - <p p^T>."""
-    left = plot._curve_figure(rod).axes[0]
+    left = plot.curve_figure(rod).axes[0]
     unit = rod.motion.template / np.linalg.norm(rod.motion.template, axis=1, keepdims=True)
     W = np.eye(3) - unit.T @ unit / len(unit)
     D, noise = np.trace(rod.tensor.tensor @ W), np.trace(rod.tensor.offset @ W)
@@ -156,7 +158,7 @@ def test_the_msad_of_an_anisotropic_body_is_compared_with_its_tensor(rod):
     np.testing.assert_allclose(pure, 2 * D * t, rtol=1e-9)
     (floor,) = set(line(left, "noise floor").get_ydata())
     assert floor == pytest.approx(2 * np.trace(rod.noise.covariance @ W), rel=1e-9)
-    shown = plot.number_text(*rod.tensor.weighted(W))
+    shown = number_text(*rod.tensor.weighted(W))
     assert shown in line(left, "tensor").get_label()
     assert not [x for x in left.lines if str(x.get_label()).startswith("ML fit")]
     value, stderr = rod.tensor.weighted(W)
@@ -202,7 +204,7 @@ def test_long_curves_are_thinned_evenly_on_the_logarithm():
     assert value[-1] == curve.value[np.searchsorted(curve.lagtime, line(ax, "MSD").get_xdata()[-1])]
 
 
-def test_a_curve_of_zeros_is_no_crash():
+def test_a_curve_of_zeros_can_be_drawn():
     curve = perrin.msd(np.zeros((10, 1, 3)), dt=1.0)
     drawn(plot.plot_lag_curve(curve, ax=axes()))
 
@@ -219,7 +221,7 @@ def test_residuals_presence_and_refused_frames(space):
     expected = line(ax, "expected").get_ydata()
     assert expected[0] == pytest.approx(1e3 * motion.sigma * np.sqrt(6 / 4))
     assert expected[50] == pytest.approx(1e3 * motion.sigma * np.sqrt(3 / 3))
-    # It is what the residuals are on average.
+    # The residuals agree with it on average.
     ratio = np.nanmean(motion.residual**2) / np.nanmean((expected / 1e3) ** 2)
     assert ratio == pytest.approx(1, abs=0.1)
     ax = axes()
@@ -317,8 +319,20 @@ def test_forest_of_many_clusters_is_ordered_by_value(space):
     assert "ordered" in ax.get_ylabel()
 
 
+def without_layout(figure):
+    figure.set_layout_engine("none")
+    return figure
+
+
 @pytest.mark.parametrize("planar", [False, True])
-def test_save_figures_names_its_files_and_changes_no_setting(tmp_path, planar):
+def test_save_figures_names_its_files_and_changes_no_setting(
+    tmp_path, planar, monkeypatch, repeats
+):
+    monkeypatch.setattr(style, "DPI", repeats(30, 150))
+    if planar and repeats(True, False):
+        # The layout of the figures takes most of the time.
+        figure = plot.new_figure
+        monkeypatch.setattr(plot, "new_figure", lambda *size: without_layout(figure(*size)))
     before = dict(rcParams)
     files = plot.save_figures(measured(planar=planar, frames=20), tmp_path)
     kinds = ("curves", "residuals", "orientations")
@@ -331,8 +345,9 @@ def test_save_figures_names_its_files_and_changes_no_setting(tmp_path, planar):
 
 def test_save_figures_draws_the_first_clusters_and_all_in_one(tmp_path, monkeypatch):
     monkeypatch.setattr(plot, "MAX_CLUSTERS", 1)
+    monkeypatch.setattr(plot, "save_figure", lambda _, stem: [stem])
     files = plot.save_figures(measured(clusters=3, frames=20), tmp_path)
-    stems = {f.stem for f in files}
+    stems = {f.name for f in files}
     assert "clusters" in stems
     assert {s.split("-")[1] for s in stems if "-" in s} == {"0"}
 
@@ -392,14 +407,14 @@ def test_every_plan_can_be_drawn(budget):
     drawn(ax)
 
 
-def test_numbers_in_words():
-    assert plot.value_text(estimate()) == "0.0100(10) rad²/s"
+def test_texts_of_estimates():
+    assert value_text(estimate()) == "0.0100(10) rad²/s"
     small = estimate(value=4.7e-7, stderr=5e-8, unit="um^2/s")
-    assert plot.value_text(small) == "4.7(5) × 10⁻⁷ µm²/s"
+    assert value_text(small) == "4.7(5) × 10⁻⁷ µm²/s"
     unbounded = estimate(value=0.0, ci95=(0.0, np.inf), resolved=False)
-    assert plot.bare_text(unbounded) == "< ∞"
-    assert plot.number_text(5e-5, 9e-4) == "0(9) × 10⁻⁴"
-    assert [plot.number_text(v) for v in (0.0, 30, -1843, 2.5e9)] == [
+    assert bare_text(unbounded) == "< ∞"
+    assert number_text(5e-5, 9e-4) == "0(9) × 10⁻⁴"
+    assert [number_text(v) for v in (0.0, 30, -1843, 2.5e9)] == [
         "0", "30.0", "−1840", "2.50 × 10⁹"
     ]  # fmt: skip
 

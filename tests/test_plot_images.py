@@ -1,4 +1,4 @@
-"""Pictures of how spheres were seen put them where they are, and count what the tables count."""
+"""Figures of imaging quality show spheres at their positions and the numbers of the tables."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from perrin.plot import results as plot
 VOXEL, BALL = (0.25, 0.2, 0.2), 2.45
 
 
-def shadow(centers, shape, step):
-    """Draw discs of the spheres' size on one projection, rows and columns as in `centers`."""
+def projection(centers, shape, step):
+    """Return one projection with discs of the spheres' size, rows and columns as in `centers`."""
     rows, columns = (np.arange(n) * s for n, s in zip(shape, step, strict=True))
-    light = np.full(shape, 10.0)
+    image = np.full(shape, 10.0)
     for row, column in centers:
         inside = np.hypot(rows[:, None] - row, columns - column) < BALL / 2
-        light[inside] = 100.0
-    return light
+        image[inside] = 100.0
+    return image
 
 
 def views_of(features, shape, voxel, frames):
@@ -39,7 +39,7 @@ def views_of(features, shape, voxel, frames):
         sides = {"xy": ("yx", (y, x)), "xz": ("zx", (z, x)), "yz": ("zy", (z, y))}
         size = dict(zip("zyx", shape, strict=True))
         drawn = {
-            side: shadow(here[list(axes)].to_numpy(), [size[a] for a in axes], step)
+            side: projection(here[list(axes)].to_numpy(), [size[a] for a in axes], step)
             if np.isfinite(z) or side == "xy"
             else np.zeros((1, 1))
             for side, (axes, step) in sides.items()
@@ -49,7 +49,7 @@ def views_of(features, shape, voxel, frames):
 
 
 def seen(*, clusters=2, frames=40, planar=False, refine="model", size=16.0, seed=3):
-    """Return a report of tetrahedra (squares in the plane) seen in a stack, without rendering."""
+    """Return the report of a movie of tetrahedra (squares in the plane) without rendering it."""
     rng = np.random.default_rng(seed)
     square = BALL / 2 * np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, -1.0], [-1.0, 1.0]])
     body = perrin.Cluster.from_positions(square) if planar else perrin.Cluster.touching(4, BALL)
@@ -125,7 +125,7 @@ def line(ax, start):
 
 
 def circles(ax):
-    """Return the collections of loose and of clustered spheres, and the halo of the loose."""
+    """Return the circles of free and of clustered spheres, and the outline of the free ones."""
     halo, loose, clustered = ax.collections
     return loose, clustered, halo
 
@@ -139,7 +139,7 @@ def with_motion(report, **changes):
 
 @pytest.mark.parametrize("side", ["xy", "xz", "yz"])
 def test_a_circle_lies_on_its_sphere_on_every_side(report, side):
-    """A sphere in the middle of a voxel: the middle of its pixels is the circle's."""
+    """The centre of a sphere's pixels is the centre of its circle."""
     imaging = report.imaging
     one = imaging.features.iloc[:1].assign(x=6.2, y=9.6, z=4.5)
     (view,) = views_of(one, (40, 80, 90), VOXEL, [0])
@@ -147,12 +147,12 @@ def test_a_circle_lies_on_its_sphere_on_every_side(report, side):
     assert plot_images.plot_found(replace(imaging, features=one), view, ax=ax, side=side) is ax
     (image,) = ax.images
     left, right, bottom, top = image.get_extent()
-    light = np.asarray(image.get_array())
+    pixels = np.asarray(image.get_array())
     down, across = (
         np.linspace(a, b, n, endpoint=False) + (b - a) / (2 * n)
-        for a, b, n in zip((top, left), (bottom, right), light.shape, strict=True)
+        for a, b, n in zip((top, left), (bottom, right), pixels.shape, strict=True)
     )
-    rows, columns = np.nonzero(light > 50)
+    rows, columns = np.nonzero(pixels > 50)
     (place,) = circles(ax)[1].get_offsets()
     assert np.allclose(place, (across[columns].mean(), down[rows].mean()), rtol=1e-12)
     far = np.hypot(across[columns] - place[0], down[rows] - place[1]).max()
@@ -164,7 +164,7 @@ def test_a_circle_lies_on_its_sphere_on_every_side(report, side):
 
 
 def test_circles_are_drawn_true_to_scale(report):
-    """The outermost coloured pixels are a diameter apart, to a line's width."""
+    """The outermost coloured pixels are a diameter apart, to within the width of a line."""
     imaging = report.imaging
     one = imaging.features.iloc[:1].assign(x=7.0, y=8.0)
     ax = axes()
@@ -182,7 +182,7 @@ def test_circles_are_drawn_true_to_scale(report):
     assert (right + left) / 2 == pytest.approx(7.0, abs=2 * pixel)
 
 
-def test_clusters_have_colours_and_numbers_and_loose_spheres_dashes(report):
+def test_clusters_have_colours_and_numbers_and_free_spheres_are_dashed(report):
     loose = report.imaging.features["particle"] == 5
     features = report.imaging.features.assign(cluster=lambda t: t["cluster"].mask(loose, -1))
     imaging, ax = replace(report.imaging, features=features), axes()
@@ -199,8 +199,8 @@ def test_clusters_have_colours_and_numbers_and_loose_spheres_dashes(report):
     assert [t.get_text() for t in ax.texts] == ["0", "1"]
 
 
-def test_dark_and_bright_spheres_look_alike(report):
-    """The negative of a movie of bright spheres, called dark, is the same picture."""
+def test_dark_and_bright_spheres_give_the_same_picture(report):
+    """The negative of a movie of bright spheres, declared dark, gives the same picture."""
     pictures = []
     for dark in (False, True):
         views = report.imaging.views[:1]
@@ -216,7 +216,7 @@ def test_dark_and_bright_spheres_look_alike(report):
     assert ball < 0.5 < 0.8 < ground
 
 
-def test_the_histogram_counts_every_spot_on_its_side_of_the_cut(report):
+def test_the_histogram_counts_every_spot_on_the_correct_side_of_the_cut(report):
     ax, mass = axes(), report.imaging.spots["mass"].to_numpy()
     cut = report.imaging.minmass
     plot_images.plot_masses(report.imaging, ax=ax)
@@ -233,22 +233,22 @@ def test_the_histogram_counts_every_spot_on_its_side_of_the_cut(report):
     assert not ax.lines
 
 
-def test_misfit_is_the_tables(report):
+def test_misfit_is_that_of_the_table(report):
     features = report.imaging.features.copy()
     features.loc[features["frame"] == 11, "chi2"] = np.nan
     ax = axes()
     plot_images.plot_misfit(replace(report.imaging, features=features), ax=ax)
-    told = features.groupby("frame")["chi2"].agg(["min", "median", "max"]).dropna()
+    chi2 = features.groupby("frame")["chi2"].agg(["min", "median", "max"]).dropna()
     time, median = line(ax, "median").get_data()
-    assert np.allclose(time, 0.7 * told.index)
-    assert np.array_equal(median, told["median"])
+    assert np.allclose(time, 0.7 * chi2.index)
+    assert np.array_equal(median, chi2["median"])
     corners = ax.collections[0].get_paths()[0].vertices
-    assert corners[:, 1].min() == told["min"].min()
-    assert corners[:, 1].max() == told["max"].max()
+    assert corners[:, 1].min() == chi2["min"].min()
+    assert corners[:, 1].max() == chi2["max"].max()
 
 
-def test_rigid_residuals_are_those_of_all_clusters_in_the_stacks_time(report):
-    """Tracks that begin at frame 7 of the stack are drawn at its time, 4.9 s on."""
+def test_rigid_residuals_of_all_clusters_are_drawn_in_the_time_of_the_stack(report):
+    """Tracks that begin at frame 7 of the stack are drawn 4.9 s later."""
     cut = replace(report, settings={**report.settings, "first_frame": 7})
     ax = axes()
     plot_images.plot_rigidity(cut, ax=ax)
@@ -273,8 +273,8 @@ def test_many_residuals_have_their_median(report):
 
 
 @pytest.mark.parametrize(("name", "law"), [("report", maxwell), ("plane", halfnorm)])
-def test_step_angles_and_their_law(name, law, request):
-    """The columns hold every step; the line is the exact law of the pooled D_R and its noise."""
+def test_step_angles_and_their_distribution(name, law, request):
+    """The histogram counts every step; the line is Maxwell's law or half a Gaussian."""
     report, ax = request.getfixturevalue(name), axes()
     plot_images.plot_step_angles(report, ax=ax)
     vectors = [c.motion.step_vectors() for c in report.clusters]
@@ -289,11 +289,11 @@ def test_step_angles_and_their_law(name, law, request):
     assert np.allclose(drawn, angle.size * width * law.pdf(x, scale=scale), rtol=1e-6)
     ticks = line(ax, "largest").get_xdata()
     assert np.allclose(ticks, np.sort(angle)[-10:])
-    assert not [x for x in ax.lines if "onto itself" in str(x.get_label())]
+    assert not [x for x in ax.lines if "symmetry rotation" in str(x.get_label())]
 
 
-def test_an_exchange_of_spheres_stands_at_the_least_turn(report):
-    """A third of a turn about a threefold axis from frame 20 on: the line, and where it happens."""
+def test_an_exchange_of_spheres_is_at_the_symmetry_rotation(report):
+    """A rotation by 120 degrees about a threefold axis at frame 20 is marked with its frame."""
     motion = report.clusters[0].motion
     axis = motion.template[0] / np.linalg.norm(motion.template[0])
     turn = perrin.geometry.rotations.exp_map(2 * np.pi / 3 * axis)
@@ -301,11 +301,11 @@ def test_an_exchange_of_spheres_stands_at_the_least_turn(report):
     rotation[20:] = rotation[20:] @ turn
     ax = axes()
     plot_images.plot_step_angles(with_motion(report, rotation=rotation), ax=ax)
-    assert list(line(ax, "turn onto itself, 120°").get_xdata()) == [120, 120]
+    assert list(line(ax, "symmetry rotation, 120°").get_xdata()) == [120, 120]
     assert "(cluster 0, frame 20)" in line(ax, "largest").get_label()
-    # The law's tail, which has no logarithm out there, does not stretch the axis.
+    # The tail of the distribution does not determine the range of the axis.
     assert ax.get_ylim()[1] < 78
-    # The pose before and the step itself turn by some degrees of Brownian motion.
+    # Brownian motion adds some degrees.
     assert line(ax, "largest").get_xdata()[-1] == pytest.approx(120, abs=15)
 
 
@@ -319,13 +319,13 @@ def test_least_turns(group, turn):
 
 
 def test_in_the_plane_only_turns_in_the_plane_count(plane):
-    """A square comes onto itself by 90 degrees; a kite only by turning over, which it cannot."""
+    """A square has a rotation by 90 degrees; that of a kite is out of the plane."""
     assert plot_images.least_turns(plane) == [90]
     kite = [replace(c, quality=replace(c.quality, symmetry="C_2v")) for c in plane.clusters]
     assert plot_images.least_turns(replace(plane, clusters=tuple(kite))) == []
 
 
-def test_paths_end_at_the_views_frame(report):
+def test_paths_end_at_the_frame_of_the_view(report):
     """Tracks that begin at frame 7 of the stack have their row 13 at its frame 20."""
     cut = replace(report, settings={**report.settings, "first_frame": 7})
     view = next(v for v in report.imaging.views if v.frame == 20)
@@ -340,15 +340,15 @@ def test_paths_end_at_the_views_frame(report):
     assert ax.get_title() == "frame 20, 14.0 s"
 
 
-def test_paths_are_no_longer_than_their_tail(report, monkeypatch):
-    monkeypatch.setattr(plot_images, "_TRAIL", 10)
+def test_paths_have_a_limited_length(report, monkeypatch):
+    monkeypatch.setattr(plot_images, "_PATH_FRAMES", 10)
     view = next(v for v in report.imaging.views if v.frame == 20)
     ax = axes()
     plot_images.plot_tracks(report, view, ax=ax)
     assert np.array_equal(ax.lines[1].get_xydata(), report.clusters[0].motion.center[11:21, :2])
 
 
-def test_health_is_the_tables(report):
+def test_series_of_the_frames_are_those_of_the_table(report):
     frames = report.imaging.frames.assign(
         spheres=np.arange(40), saturated=np.linspace(0, 0.02, 40), level=10 - 0.1 * np.arange(40)
     )
@@ -372,12 +372,12 @@ def test_health_is_the_tables(report):
         assert np.allclose(crosses.get_xdata(), [2.8, 6.3])
 
 
-def test_nothing_found_is_said(report):
+def test_empty_figures_have_a_reason(report):
     none = replace(
         report.imaging, features=report.imaging.features[:0], spots=report.imaging.spots[:0]
     )
     empty = replace(report, clusters=(), pooled=None, imaging=none)
-    for draw, data, said in (
+    for draw, data, reason in (
         (plot_images.plot_masses, none, "no spots"),
         (plot_images.plot_misfit, none, "no image"),
         (plot_images.plot_rigidity, empty, "no cluster"),
@@ -385,18 +385,24 @@ def test_nothing_found_is_said(report):
     ):
         ax = axes()
         draw(data, ax=ax)
-        assert ax.texts[0].get_text().startswith(said)
+        assert ax.texts[0].get_text().startswith(reason)
     ax = axes()
     plot_images.plot_found(none, none.views[0], ax=ax)
     assert len(circles(ax)[1].get_offsets()) == 0
     plot_images.plot_health(none, ax=axes(), series="brightness")
 
 
-def test_a_movie_in_the_plane_has_one_projection_and_no_misfit(plane, tmp_path, monkeypatch):
+def test_a_movie_in_the_plane_has_one_projection_and_no_misfit(
+    plane, tmp_path, monkeypatch, repeats
+):
     figures = {}
 
     def keep(figure, stem):
         figures[stem.name] = figure
+        if repeats(True, False):
+            # The layout of the figures takes most of the time.
+            figure.set_dpi(30)
+            figure.set_layout_engine("none")
         FigureCanvasAgg(figure).draw()
         return [stem]
 

@@ -1,4 +1,4 @@
-"""The HTML report says what was measured, safely and in one file; the run folder is all or none."""
+"""The report page shows the results, escaped and in one file; a run folder is whole or absent."""
 
 from __future__ import annotations
 
@@ -12,8 +12,11 @@ import numpy as np
 import pytest
 
 import perrin
-from perrin.plot import results as plot
+from perrin._text import number_text
+from perrin.diffusion.estimate import bare_text
+from perrin.plot import results
 from perrin.report import page as report
+from perrin.report import write
 from perrin.run.results import write_data
 from test_plot import estimate, measured
 
@@ -23,7 +26,7 @@ PNG = base64.b64decode(
 
 
 class Page(HTMLParser):
-    """Collects text, tags, and everything that could fetch."""
+    """Collects text, tags, and all attributes that could load a resource."""
 
     def __init__(self, html):
         super().__init__()
@@ -69,20 +72,28 @@ def pictures(folder, *stems):
     return [folder / f"{stem}.png" for stem in stems]
 
 
+def save_blank(_, stem):
+    """Write a picture of one pixel in place of a figure, under the names of `save_figure`."""
+    files = [stem.with_name(stem.name + suffix) for suffix in (".png", ".pdf")]
+    for file in files:
+        file.write_bytes(PNG)
+    return files
+
+
 def test_the_page_holds_the_numbers(single):
     page = Page(report.render_html(single, []))
     (found,) = single.clusters
     assert page.open == []
     for one in (found.D_R, found.D_T):
-        assert plot.bare_text(one) in page.text
+        assert bare_text(one) in page.text
         for end in (*one.ci68, *one.ci95):
             # The ends as print rounds them.
             shown = [float(n) for n in re.findall(r"\d+\.\d+", page.text)]
             assert min(abs(n - end) for n in shown) < 0.02 * one.stderr + 5e-3 * end
-    assert plot.number_text(1e3 * found.motion.sigma) + " nm" in page.text
-    assert plot.number_text(found.noise.phi2) in page.text
+    assert number_text(1e3 * found.motion.sigma) + " nm" in page.text
+    assert number_text(found.noise.phi2) in page.text
     degrees = np.rad2deg(np.sqrt(found.noise.phi2))
-    assert f"Φ = {plot.number_text(degrees)}°" in page.text
+    assert f"Φ = {number_text(degrees)}°" in page.text
     assert "60 of 60" in page.text
     assert "ab" * 32 in page.text
     assert "2026-01-02 03:04 UTC" in page.text
@@ -119,8 +130,8 @@ def test_sizes_and_the_viscosity_they_imply_are_shown(single):
     assert "No hydrodynamic sizes: viscosity and temperature were not given" in text
 
 
-def test_predictions_stand_beside_the_measured_values(single):
-    """A line a coefficient and principal axis; what is not resolved has no pull."""
+def test_predictions_are_listed_with_the_measured_values(single):
+    """Each coefficient and principal axis has a line; one that is not resolved has no pull."""
     D_R = perrin.Compared(0.00673, 0.0051, 0.0004)
     prediction = perrin.Prediction(
         2.45, 1e-5, D_T=perrin.Compared(0.0453, 0.0, np.nan), D_R=D_R, principal_D_R=(D_R,) * 3
@@ -135,7 +146,7 @@ def test_predictions_stand_beside_the_measured_values(single):
     assert "pull" not in Page(report.render_html(single, [])).text
 
 
-def test_the_page_fetches_nothing_and_runs_nothing(single, tmp_path):
+def test_the_page_loads_nothing_and_runs_nothing(single, tmp_path):
     files = pictures(tmp_path, "cluster-0-curves", "cluster-0-residuals", "cluster-0-orientations")
     html = report.render_html(single, [*files, tmp_path / "cluster-0-curves.pdf"])
     page = Page(html)
@@ -147,7 +158,7 @@ def test_the_page_fetches_nothing_and_runs_nothing(single, tmp_path):
     assert page.text.count("What to look for:") == 3
 
 
-def test_what_users_wrote_is_escaped(single):
+def test_text_of_users_is_escaped(single):
     html = report.render_html(single, [])
     assert "<my>" not in html
     assert "&lt;my&gt; &amp; &#34;tracks&#34;.csv" in html
@@ -162,17 +173,17 @@ def test_what_users_wrote_is_escaped(single):
         assert page.open == []
 
 
-def test_warnings_stand_in_a_box(single):
-    said = "not rigid: it bends"
-    one = replace(single.clusters[0], warnings=(said,))
+def test_warnings_are_in_a_box(single):
+    text = "not rigid: it bends"
+    one = replace(single.clusters[0], warnings=(text,))
     html = report.render_html(replace(single, clusters=(one,), warnings=("rows are missing",)), [])
     box = html[html.index('<div class="warning"') :]
-    assert said in box[: box.index("</div>")]
+    assert text in box[: box.index("</div>")]
     assert "rows are missing" in box[: box.index("</div>")]
     assert '<div class="warning"' not in report.render_html(single, [])
 
 
-def test_limits_open_ends_and_unknown_errors_are_words(single):
+def test_limits_open_ends_and_unknown_errors_are_text(single):
     unbounded = estimate(
         value=0.0, ci68=(0, np.inf), ci95=(0, np.inf), stderr=np.inf, resolved=False,
         offset_stderr=np.nan, snr=0.0,
@@ -196,7 +207,7 @@ def test_limits_open_ends_and_unknown_errors_are_words(single):
     assert "without bound" in text
 
 
-def test_two_dimensions_have_their_own_words():
+def test_two_dimensions_have_their_own_text():
     found = measured(planar=True, frames=40)
     text = Page(report.render_html(found, [])).text
     assert "MSAD = 2" in text
@@ -219,9 +230,11 @@ def test_many_clusters_are_listed_pooled_and_the_figures_counted(single, tmp_pat
     assert page.text.count("What to look for:") == 2
 
 
-def test_the_run_folder_is_complete(single, tmp_path):
+def test_the_run_folder_is_complete(single, tmp_path, monkeypatch, repeats):
+    if repeats(True, False):
+        monkeypatch.setattr(results, "save_figure", save_blank)
     place = tmp_path / "run"
-    report.write_run(single, place)
+    write.write_run(single, place)
     names = {f.name for f in place.iterdir()}
     assert names == {
         "summary.json", "tracks.parquet", "motion.parquet", "curves.csv", "run.json", "figures",
@@ -236,18 +249,20 @@ def test_the_run_folder_is_complete(single, tmp_path):
 
 
 def test_an_existing_folder_is_refused_or_replaced(single, tmp_path, monkeypatch):
-    monkeypatch.setattr(report, "save_figures", lambda *_: [])
+    monkeypatch.setattr(write, "save_figures", lambda *_: [])
     place = tmp_path / "run"
-    report.write_run(single, place)
+    write.write_run(single, place)
     (place / "old").touch()
     with pytest.raises(FileExistsError, match="overwrite"):
-        report.write_run(single, place)
-    report.write_run(single, place, overwrite=True)
+        write.write_run(single, place)
+    write.write_run(single, place, overwrite=True)
     assert not (place / "old").exists()
 
 
 @pytest.mark.parametrize("step", ["save_figures", "render_html"])
-def test_a_failure_leaves_nothing_behind_and_keeps_what_stood(single, tmp_path, monkeypatch, step):
+def test_a_failure_leaves_no_files_and_keeps_an_existing_folder(
+    single, tmp_path, monkeypatch, step
+):
     place = tmp_path / "run"
     place.mkdir()
     write_data(single, place)
@@ -255,18 +270,18 @@ def test_a_failure_leaves_nothing_behind_and_keeps_what_stood(single, tmp_path, 
     def fail(*_):
         raise RuntimeError("disk full")
 
-    monkeypatch.setattr(report, "save_figures", lambda *_: [])
-    monkeypatch.setattr(report, step, fail)
+    monkeypatch.setattr(write, "save_figures", lambda *_: [])
+    monkeypatch.setattr(write, step, fail)
     for target in (place, tmp_path / "new"):
         with pytest.raises(RuntimeError, match="disk full"):
-            report.write_run(single, target, overwrite=True)
+            write.write_run(single, target, overwrite=True)
     assert [p.name for p in tmp_path.iterdir()] == ["run"]
     assert (place / "summary.json").is_file()
 
 
 @pytest.mark.parametrize("count", [1, 40])
-def test_notes_stand_apart_and_are_not_counted(single, count):
-    """Notes have a box of their own after the warnings; the table counts warnings only."""
+def test_notes_are_separate_and_not_counted(single, count):
+    """Notes are in a separate box after the warnings; the table counts warnings only."""
     one = single.clusters[0]
     many = tuple(
         replace(one, cluster=k, notes=(f"{k + 3} rows are missing",), warnings=("bends",) * (k > 1))
@@ -293,7 +308,7 @@ def test_notes_stand_apart_and_are_not_counted(single, count):
 
 
 def test_several_clusters_without_a_pooled_value(single):
-    """Where nothing is pooled the page says so in the first place, and shows every cluster."""
+    """The headline states that no value is pooled, and the page shows every cluster."""
     many = tuple(replace(single.clusters[0], cluster=k) for k in range(3))
     page = Page(report.render_html(replace(single, clusters=many, pooled=None), []))
     assert "No values are pooled; those of the single clusters follow" in page.text
@@ -302,7 +317,7 @@ def test_several_clusters_without_a_pooled_value(single):
 
 
 def test_notes_are_kept_and_older_runs_have_none(single, tmp_path):
-    """Notes read back; a run folder without the key is read as one without notes."""
+    """Notes are read back; a run folder without the key is read as one without notes."""
     one = replace(single.clusters[0], notes=("5 rows",))
     found = replace(single, clusters=(one,), notes=("columns recognised",))
     found.save(tmp_path / "run")

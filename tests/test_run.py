@@ -32,7 +32,7 @@ from perrin.images.spheres.spots import Spots
 from perrin.movie import stages, workers
 from perrin.movie.parts import PartWriter, open_parts, read_parts
 from perrin.movie.workers import Work, work_through
-from perrin.plot.imaging import _frame_numbers
+from perrin.plot.imaging import stack_frames
 from perrin.run.experiment import Experiment
 from perrin.run.folders import check_resumable, filled_folder
 from perrin.run.results import motion_table
@@ -406,7 +406,7 @@ def test_uneven_times_are_those_of_the_stack(tmp_path, movie_file, learned):
     np.testing.assert_allclose(curve.lagtime[curve.n_pairs > 0], DT * apart[apart > 0])
     perrin.write_run(report, tmp_path / "run")
     assert perrin.load_run(tmp_path / "run").to_dict() == report.to_dict()
-    np.testing.assert_array_equal(_frame_numbers(report, report.clusters[0].motion), range(1, 8))
+    np.testing.assert_array_equal(stack_frames(report, report.clusters[0].motion), range(1, 8))
 
 
 def copied(stack, frames):

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
         CoupledTensor,
         DiffusionEstimate,
         DiffusionTensor,
+        Noise,
         SamplingPlan,
         SamplingVerdict,
         coupled_tensor,
@@ -74,7 +75,19 @@ if TYPE_CHECKING:
         wall_factor,
         water_viscosity,
     )
-    from perrin.images import Optics, Stack, fit_pose, locate, open_stack, render_stack, write_stack
+    from perrin.images import (
+        Camera,
+        Light,
+        Optics,
+        Scan,
+        Spots,
+        Stack,
+        fit_pose,
+        locate,
+        open_stack,
+        render_stack,
+        write_stack,
+    )
     from perrin.motion import (
         NoiseFloor,
         Quality,
@@ -89,9 +102,18 @@ if TYPE_CHECKING:
         track_direction,
         track_rotation,
     )
-    from perrin.movie import analyze_stack
+    from perrin.movie import Work, analyze_stack
     from perrin.report import write_run
-    from perrin.run import ClusterResult, Compared, Prediction, Report, RodResult, analyze, load_run
+    from perrin.run import (
+        ClusterResult,
+        Compared,
+        Experiment,
+        Prediction,
+        Report,
+        RodResult,
+        analyze,
+        load_run,
+    )
     from perrin.tracks import (
         Identity,
         cluster_positions,
@@ -106,6 +128,7 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 __all__ = [
+    "Camera",
     "Cluster",
     "ClusterResult",
     "Compared",
@@ -113,13 +136,16 @@ __all__ = [
     "DegenerateClusterError",
     "DiffusionEstimate",
     "DiffusionTensor",
+    "Experiment",
     "FrameError",
     "Identity",
     "IdentityError",
     "IdentityWarning",
     "LagCurve",
+    "Light",
     "Mobility",
     "NoSpheresError",
+    "Noise",
     "NoiseFloor",
     "Optics",
     "PrecisionWarning",
@@ -132,14 +158,17 @@ __all__ = [
     "RodResult",
     "SamplingPlan",
     "SamplingVerdict",
+    "Scan",
     "Similarity",
     "Size",
+    "Spots",
     "Stack",
     "TooFewFramesError",
     "TrackTableError",
     "UnitWarning",
     "VanHove",
     "WallFactor",
+    "Work",
     "add_noise",
     "analyze",
     "analyze_stack",
@@ -274,6 +303,7 @@ _FACES = {
         "CoupledTensor",
         "DiffusionEstimate",
         "DiffusionTensor",
+        "Noise",
         "SamplingPlan",
         "SamplingVerdict",
         "coupled_tensor",
@@ -287,7 +317,11 @@ _FACES = {
         "plan_sampling",
     ),
     "images": (
+        "Camera",
+        "Light",
         "Optics",
+        "Scan",
+        "Spots",
         "Stack",
         "fit_pose",
         "locate",
@@ -298,13 +332,17 @@ _FACES = {
     "run": (
         "ClusterResult",
         "Compared",
+        "Experiment",
         "Prediction",
         "Report",
         "RodResult",
         "analyze",
         "load_run",
     ),
-    "movie": ("analyze_stack",),
+    "movie": (
+        "Work",
+        "analyze_stack",
+    ),
     "report": ("write_run",),
 }
 

@@ -146,3 +146,69 @@ def short(value: float) -> str:
 def percent(share: float) -> str:
     """Write a share in percent with two digits: 8.3 %, 23 %, 0.45 %."""
     return f"{100 * share:#.2g} %".replace(". %", " %")
+
+
+def scaled_text(text: str, power: int) -> str:
+    """Append a power of ten to a number, or to an interval in brackets.
+
+    Examples
+    --------
+    >>> scaled_text("4.7", -7), scaled_text("3.9 to 5.7", -7), scaled_text("4.7", 0)
+    ('4.7 × 10⁻⁷', '(3.9 to 5.7) × 10⁻⁷', '4.7')
+    """
+    if not power:
+        return text
+    return f"({text}) × {ten_to(power)}" if " " in text else f"{text} × {ten_to(power)}"
+
+
+def interval_text(ends: tuple[float, float], *, power: int = 0) -> str:
+    """Write an interval with two digits of its half width, and a power of ten.
+
+    Parameters
+    ----------
+    ends : tuple of float
+        The upper end may be infinite.
+    power : int
+        Power of ten that is taken out of both ends.
+
+    Returns
+    -------
+    str
+
+    Examples
+    --------
+    >>> interval_text((0.00434, 0.00601)), interval_text((2.0, np.inf))
+    ('0.00434 to 0.00601', 'above 2.0')
+    """
+    low, high = (end / 10.0**power for end in ends)
+    if not np.isfinite(high):
+        return f"above {scaled_text(significant(low, 2), power)}" if low > 0 else "not bounded"
+    half = (high - low) / 2
+    decimals = max(1 - int(np.floor(np.log10(half))), 0) if half > 0 else 2
+    # An end that is exactly 0 has no decimals.
+    first = f"{low:.{decimals}f}" if low else "0"
+    return scaled_text(f"{first} to {high:.{decimals}f}", power)
+
+
+def length_text(um: float) -> str:
+    """Write a length given in um, in nm below 10 um.
+
+    Examples
+    --------
+    >>> length_text(0.0341), length_text(12.5), length_text(float("nan"))
+    ('34.1 nm', '12.5 µm', 'unknown')
+    """
+    if not np.isfinite(um):
+        return "unknown"
+    return f"{number_text(1e3 * um)} nm" if um < 10 else f"{number_text(um)} µm"
+
+
+def signed_text(value: float) -> str:
+    """Write a number with its sign and one decimal.
+
+    Examples
+    --------
+    >>> signed_text(-4.12), signed_text(0.3)
+    ('−4.1', '+0.3')
+    """
+    return f"{value:+.1f}".replace("-", "−")

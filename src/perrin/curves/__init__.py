@@ -21,12 +21,7 @@ from perrin.curves.displacement import (
     msad_vector,
     msd,
 )
-from perrin.curves.distributions import (
-    VanHove,
-    gaussian_bins,
-    mean_correlation_powers,
-    van_hove,
-)
+from perrin.curves.distributions import VanHove, gaussian_bins, mean_correlation_powers, van_hove
 from perrin.curves.grids import GRID_TOLERANCE, Frames, grid_step, place_frames
 from perrin.curves.pairs import (
     Kernel,

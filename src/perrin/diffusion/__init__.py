@@ -1,24 +1,19 @@
 """How fast a body diffuses: coefficients, tensors, their errors, and tests of the steps."""
 
-from perrin.diffusion.bounds import (
-    cramer_rao,
-    whole,
-)
+from perrin.diffusion.bounds import cramer_rao, whole
 from perrin.diffusion.curve_fits import (
+    GridLags,
+    best_window,
     fit_gls,
     fit_line,
+    gls_weights,
+    line_weights,
+    msd_covariance,
+    slope_interval,
+    weighted_variance,
 )
-from perrin.diffusion.estimate import (
-    DiffusionEstimate,
-    Found,
-    bare_text,
-    value_text,
-)
-from perrin.diffusion.estimators import (
-    by_likelihood,
-    estimate_diffusion,
-    precision_limits,
-)
+from perrin.diffusion.estimate import DiffusionEstimate, Found, bare_text, value_text
+from perrin.diffusion.estimators import by_likelihood, estimate_diffusion, precision_limits
 from perrin.diffusion.likelihood import (
     Likelihood,
     ProfilePoint,
@@ -27,19 +22,14 @@ from perrin.diffusion.likelihood import (
     newton_crossing,
     secant_trial,
 )
-from perrin.diffusion.moments import (
-    Moments,
-    covariance_estimate,
-    step_cosines,
-    trace_estimate,
-)
+from perrin.diffusion.moments import Moments, covariance_estimate, step_cosines, trace_estimate
 from perrin.diffusion.noise_model import Noise, noise_faults
-from perrin.diffusion.rods import (
-    estimate_rod,
-)
+from perrin.diffusion.rods import estimate_rod
 from perrin.diffusion.sampling import (
+    SamplingBudget,
     SamplingPlan,
     SamplingVerdict,
+    identity_limits,
     judge_sampling,
     plan_sampling,
 )
@@ -53,6 +43,7 @@ from perrin.diffusion.step_kernels import (
     equal_columns,
 )
 from perrin.diffusion.step_tests import (
+    JUMP_LEVEL,
     Jumps,
     SteadyMotion,
     StepResiduals,
@@ -90,10 +81,7 @@ from perrin.diffusion.tensor_likelihood import (
     squares,
     symmetric_inverses,
 )
-from perrin.diffusion.tensor_results import (
-    CoupledTensor,
-    DiffusionTensor,
-)
+from perrin.diffusion.tensor_results import CoupledTensor, DiffusionTensor
 from perrin.diffusion.tensors import (
     ScaledTracks,
     axes_like,
@@ -109,11 +97,13 @@ from perrin.diffusion.tensors import (
 )
 
 __all__ = [
+    "JUMP_LEVEL",
     "ArrowHessian",
     "CoupledTensor",
     "DiffusionEstimate",
     "DiffusionTensor",
     "Found",
+    "GridLags",
     "GroupSlopes",
     "Jumps",
     "Likelihood",
@@ -124,6 +114,7 @@ __all__ = [
     "NoisyVectors",
     "PooledLikelihood",
     "ProfilePoint",
+    "SamplingBudget",
     "SamplingPlan",
     "SamplingVerdict",
     "ScaledTracks",
@@ -139,6 +130,7 @@ __all__ = [
     "axis_errors",
     "band_factor",
     "bare_text",
+    "best_window",
     "bfgs_update",
     "body_steps",
     "by_likelihood",
@@ -159,12 +151,16 @@ __all__ = [
     "find_jumps",
     "fit_gls",
     "fit_line",
+    "gls_weights",
+    "identity_limits",
     "imposed_symmetry",
     "invariant_basis",
     "judge_sampling",
     "leave_one_out_residuals",
+    "line_weights",
     "log_slope_ratio",
     "maximise",
+    "msd_covariance",
     "neighbour_products",
     "newton_crossing",
     "noise_faults",
@@ -175,6 +171,7 @@ __all__ = [
     "precision_limits",
     "residual_freedom",
     "secant_trial",
+    "slope_interval",
     "spread",
     "squares",
     "steady_motion",

@@ -95,6 +95,7 @@ from perrin.images.optics.window_fit import (
 )
 from perrin.images.spheres.by_trackpy import Features, find_features, refine_by_trackpy
 from perrin.images.spheres.localisation import (
+    NO_FLAT_MODEL,
     LocatedFrame,
     Method,
     SampledFrame,
@@ -130,6 +131,7 @@ from perrin.images.stack import (
 )
 
 __all__ = [
+    "NO_FLAT_MODEL",
     "Arrangement",
     "Camera",
     "CameraNoise",

@@ -1,12 +1,13 @@
 """Motion of a body: its position and orientation in every frame, their errors, its rigidity."""
 
-from perrin.motion.degenerate import distance_change, no_orientation, no_rotation
-from perrin.motion.floor import (
-    NoiseFloor,
-    floor_of,
-    floor_range,
-    noise_floor,
+from perrin.motion.degenerate import (
+    distance_change,
+    mean_present,
+    no_orientation,
+    no_rotation,
+    require_points,
 )
+from perrin.motion.floor import NoiseFloor, floor_of, floor_range, noise_floor
 from perrin.motion.procrustes import (
     PoseFit,
     chain_steps,
@@ -32,11 +33,7 @@ from perrin.motion.residuals import (
     regress,
     sample_residuals,
 )
-from perrin.motion.rigid_motion import (
-    RigidMotion,
-    threshold_displacement,
-    threshold_references,
-)
+from perrin.motion.rigid_motion import RigidMotion, threshold_displacement, threshold_references
 from perrin.motion.rigidity import (
     BondDrift,
     Quality,
@@ -44,20 +41,9 @@ from perrin.motion.rigidity import (
     judge_quality,
     misplaced_detections,
 )
-from perrin.motion.rods import (
-    RodMotion,
-    track_direction,
-)
-from perrin.motion.simulate import (
-    add_noise,
-    heat_kernel_angles,
-    simulate_motion,
-)
-from perrin.motion.tracking import (
-    remove_rotation,
-    template_motion,
-    track_rotation,
-)
+from perrin.motion.rods import RodMotion, track_direction
+from perrin.motion.simulate import add_noise, heat_kernel_angles, simulate_motion
+from perrin.motion.tracking import remove_rotation, template_motion, track_rotation
 
 __all__ = [
     "AxisNoise",
@@ -87,6 +73,7 @@ __all__ = [
     "judge_quality",
     "lag_one_autocorrelation",
     "lagged_products",
+    "mean_present",
     "measure_scan",
     "measure_stretch",
     "misplaced_detections",
@@ -96,6 +83,7 @@ __all__ = [
     "pose_errors",
     "regress",
     "remove_rotation",
+    "require_points",
     "sample_residuals",
     "simulate_motion",
     "step_residuals",

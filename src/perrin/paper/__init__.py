@@ -11,15 +11,29 @@ from perrin.paper.claims import (
 )
 from perrin.paper.experiment import conclusion, figure_5, table_1
 from perrin.paper.method import (
+    accumulated_error,
     challis,
+    cost_rise,
     figure_1,
     localisation,
+    log_lags,
     product,
     random_rotations,
     simulation,
+    svd_rotation,
+    transformation_errors,
     unit,
 )
-from perrin.paper.noise import bodies, constancy, figure_3, figure_4, sampling
+from perrin.paper.noise import (
+    bodies,
+    constancy,
+    figure_3,
+    figure_4,
+    linking_error,
+    measured_floor,
+    product_motion,
+    sampling,
+)
 from perrin.paper.orientations import appendix, axes, correlation, figure_2, figure_6
 from perrin.paper.remake import reproduce
 
@@ -27,6 +41,7 @@ __all__ = [
     "Claim",
     "Item",
     "Study",
+    "accumulated_error",
     "appendix",
     "axes",
     "bodies",
@@ -35,20 +50,27 @@ __all__ = [
     "conclusion",
     "constancy",
     "correlation",
+    "cost_rise",
     "figure_1",
     "figure_2",
     "figure_3",
     "figure_4",
     "figure_5",
     "figure_6",
+    "linking_error",
     "localisation",
+    "log_lags",
+    "measured_floor",
     "product",
+    "product_motion",
     "random_rotations",
     "reproduce",
     "sampling",
     "simulation",
     "statistical",
+    "svd_rotation",
     "table_1",
+    "transformation_errors",
     "unit",
     "write_claims",
     "write_item",

@@ -1,9 +1,9 @@
-"""What a claim is, how it is judged, and how claims, figures and tables are written to a folder."""
+"""Claims of the paper: how they are judged, and how figures and tables are written."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 from zlib import crc32
 
 import numpy as np
@@ -12,7 +12,7 @@ from perrin.plot.style import new_figure, save_figure
 from perrin.run.folders import write_json
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Mapping, Sequence
     from pathlib import Path
 
     import pandas as pd
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Claim:
-    """One statement with a number, beside the number found.
+    """One statement of the paper with its number, and the number that was measured.
 
     Attributes
     ----------
@@ -29,11 +29,16 @@ class Claim:
         The statement, with the unit of its number.
     source : str
         Section, equation, figure or table of the paper: "Eqs. 1-4, section 2.1".
-    expected, measured, tolerance : float
+    expected : float
+        Number that the paper states or its theory predicts.
+    measured : float
+        Number that the reproduction found.
+    tolerance : float
+        Largest difference at which the claim still holds.
     basis : str
-        Where the tolerance comes from.
+        Reason for the tolerance: "rounding", "3 standard errors", "2 %".
     remark : str
-        One sentence for the case that the claim does not hold.
+        One sentence that explains why the claim does not hold; shown only then.
 
     Examples
     --------
@@ -55,7 +60,13 @@ class Claim:
         return bool(abs(self.measured - self.expected) <= self.tolerance)
 
     def to_dict(self) -> dict[str, str | float | bool]:
-        """Return the claim's line in ``claims.json``."""
+        """Return the claim's entry in ``claims.json``.
+
+        Returns
+        -------
+        dict
+            The attributes, and whether the claim "holds".
+        """
         return {
             "claim": self.claim,
             "source": self.source,
@@ -63,13 +74,36 @@ class Claim:
             "measured": float(self.measured),
             "tolerance": float(self.tolerance),
             "holds": self.holds,
+            "basis": self.basis,
+            "remark": self.remark,
         }
+
+    @classmethod
+    def from_dict(cls, entry: Mapping[str, Any]) -> Claim:
+        """Return the claim that `to_dict` wrote.
+
+        Parameters
+        ----------
+        entry : mapping
+            One entry of ``claims.json``.
+
+        Returns
+        -------
+        Claim
+
+        Examples
+        --------
+        >>> claim = Claim("det R", "Eq. 4", expected=1.0, measured=1.1, tolerance=0.2)
+        >>> Claim.from_dict(claim.to_dict()) == claim
+        True
+        """
+        return cls(**{key: value for key, value in entry.items() if key != "holds"})
 
 
 def statistical(
     claim: str, source: str, *, expected: float, measured: float, stderr: float, remark: str = ""
 ) -> Claim:
-    """Return a claim that may be off by three standard errors.
+    """Return a claim whose tolerance is three standard errors.
 
     Parameters
     ----------
@@ -88,21 +122,24 @@ def statistical(
 
 @dataclass(frozen=True, eq=False)
 class Item:
-    """One figure with its data and the claims that rest on it.
+    """One figure or table of the paper, its data, and the claims that it tests.
 
     Attributes
     ----------
     name : str
-        Stem of its files.
+        Name of its files without suffix.
     section : str
-        Where in the paper it belongs, as a heading.
-    title, text : str
-        What it shows; what was done.
+        Heading: number and title of the section of the paper.
+    title : str
+        Heading: what the figure shows.
+    text : str
+        How the data were made.
     table : pandas.DataFrame
-        The data.
+        Data of the figure, written as CSV.
     draw : callable
-        Draws the data on an empty figure.
+        Function that draws the data on an empty figure.
     claims : tuple of Claim
+        Claims that the data test.
     size : tuple of float
         Width and height of the figure, inches.
     """
@@ -119,17 +156,17 @@ class Item:
 
 @dataclass(frozen=True)
 class Study:
-    """What a run of the paper depends on.
+    """Settings of a reproduction of the paper.
 
     Attributes
     ----------
     seed : int
-        Of all random numbers.
+        Seed of all random numbers.
     planted_error : float
-        Relative error put on every D_R that is simulated, while the expected values stay: a claim
-        that is worth its name must notice.
+        Relative error of every simulated D_R while the expected values stay the same. It tests
+        whether the claims detect such an error.
     scale : float
-        Multiplies the number of repeats, for short runs.
+        Factor of the numbers of repeats; below 1 for short runs.
     """
 
     seed: int = 2011
@@ -137,7 +174,7 @@ class Study:
     scale: float = 1.0
 
     def rng(self, name: str) -> np.random.Generator:
-        """Return random numbers of an item's own, whatever other items drew."""
+        """Return the random-number generator of an item, independent of those of other items."""
         key = (crc32(name.encode()),)
         return np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=key))
 
@@ -146,7 +183,7 @@ class Study:
         return D_R * (1 + self.planted_error)
 
     def repeats(self, full: int) -> int:
-        """Return how many repeats to make where a full run makes `full`."""
+        """Return the number of repeats, `full` times `scale` but at least 8."""
         return max(8, round(full * self.scale))
 
 
@@ -157,7 +194,7 @@ def write_item(item: Item, folder: Path) -> None:
     ----------
     item : Item
     folder : Path
-        Exists.
+        An existing folder.
     """
     figure = new_figure(*item.size)
     item.draw(figure)
@@ -173,7 +210,7 @@ def write_claims(items: Sequence[Item], folder: Path, *, heading: str) -> None:
     items : sequence of Item
         In the order of the paper.
     folder : Path
-        Exists.
+        An existing folder.
     heading : str
         First lines of ``claims.md``.
     """
@@ -183,7 +220,7 @@ def write_claims(items: Sequence[Item], folder: Path, *, heading: str) -> None:
 
 
 def claims_page(items: Sequence[Item], *, heading: str) -> str:
-    """Return the claims as a Markdown page: what does not hold first, then section by section.
+    """Return the claims as a Markdown page: those that do not hold first, then by section.
 
     Parameters
     ----------
@@ -198,8 +235,11 @@ def claims_page(items: Sequence[Item], *, heading: str) -> str:
     failed = [claim for claim in claims if not claim.holds]
     lines = [heading, "", f"{len(claims)} claims, {len(claims) - len(failed)} hold.", ""]
     if failed:
-        lines += ["## What does not hold", ""]
-        lines += [f"- {c.claim} ({c.source}): {_verdict(c)}" for c in failed]
+        lines += ["## Claims that do not hold", ""]
+        for c in failed:
+            expected = f"{c.expected:.4g} ± {c.tolerance:.4g}"
+            measured = f"{c.measured:.4g} was measured, {expected} expected."
+            lines += [f"- {c.claim} ({c.source}): {c.remark or measured}"]
         lines += [""]
     section = ""
     for item in items:
@@ -208,28 +248,13 @@ def claims_page(items: Sequence[Item], *, heading: str) -> str:
             lines += [f"## {section}", ""]
         lines += [f"### {item.title}", "", item.text, ""]
         lines += [f"Figure `{item.name}.png`, `{item.name}.pdf`; data `{item.name}.csv`.", ""]
-        lines += _claim_table(item.claims)
+        lines += ["| claim | source | expected | measured | tolerance | holds |"]
+        lines += ["|---|---|---|---|---|---|"]
+        for c in item.claims:
+            allowed = f"{c.tolerance:.4g}" + (f" ({c.basis})" if c.basis else "")
+            cells = [c.claim, c.source, f"{c.expected:.4g}", f"{c.measured:.4g}", allowed]
+            cells += ["yes" if c.holds else "**no**"]
+            # A bar in a cell would end it.
+            lines += ["| " + " | ".join(cell.replace("|", r"\|") for cell in cells) + " |"]
+        lines += [""]
     return "\n".join(lines).rstrip() + "\n"
-
-
-def _verdict(claim: Claim) -> str:
-    return claim.remark or (
-        f"{_number(claim.measured)} was measured, {_number(claim.expected)} ± "
-        f"{_number(claim.tolerance)} expected."
-    )
-
-
-def _claim_table(claims: Sequence[Claim]) -> list[str]:
-    """Return a Markdown table; a bar in a cell would end it."""
-    lines = ["| claim | source | expected | measured | tolerance | holds |"]
-    lines += ["|---|---|---|---|---|---|"]
-    for c in claims:
-        allowed = _number(c.tolerance) + (f" ({c.basis})" if c.basis else "")
-        numbers = [_number(c.expected), _number(c.measured), allowed]
-        cells = [c.claim, c.source, *numbers, "yes" if c.holds else "**no**"]
-        lines.append("| " + " | ".join(cell.replace("|", r"\|") for cell in cells) + " |")
-    return [*lines, ""]
-
-
-def _number(value: float) -> str:
-    return f"{value:.4g}"

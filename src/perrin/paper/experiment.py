@@ -1,9 +1,8 @@
-"""Hunter et al. 2011, what does the experiment say? Sections 5 and 6, Fig. 5, Table 1."""
+"""Hunter et al. 2011, sections 5 and 6: the experiment (Fig. 5, Table 1) and bulk rotation."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,30 +18,30 @@ from perrin.motion.floor import noise_floor
 from perrin.motion.simulate import add_noise, simulate_motion
 from perrin.motion.tracking import remove_rotation, track_rotation
 from perrin.paper.claims import Claim, Item, Study, statistical
+from perrin.paper.method import log_lags
 from perrin.plot.style import PALETTE
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
     from perrin._arrays import Floats
     from perrin.curves.displacement import LagCurve
     from perrin.diffusion.estimate import DiffusionEstimate
-    from perrin.hydrodynamics.sizes import Size
     from perrin.motion.rigid_motion import RigidMotion
 
 
-_SECTION = "5 Experimental application"
+_EXPERIMENT = "5 Experimental application"
 
 
 _CONCLUSION = "6 Conclusion"
 
 
 # The experiment: one tetrahedron of 2.45 um spheres, "less than 300 timesteps" in 220 s.
+# Lengths in um, times in s, Pa s, K.
 _DIAMETER, _SIGMA = 2.45, (0.03, 0.03, 0.04)
 
 
-_DT, _FRAMES, _WINDOW = 0.73, 300, (3.0, 22.0)
+_DT, _EXPERIMENT_FRAMES, _FIT_LAGS = 0.73, 300, (3.0, 22.0)
 
 
 _VISCOSITY, _TEMPERATURE = 2.18e-3, 295.0
@@ -75,56 +74,64 @@ def figure_5(study: Study) -> Item:
     rng, repeats = study.rng("fig5"), study.repeats(300)
     first = _tracked(study, rng)
     curves = {"rotation": msad(first), "translation": msd(first)}
-    fits = {name: fit_line(curve, lag_range=_WINDOW) for name, curve in curves.items()}
-    slopes = np.array([_slopes(_tracked(study, rng)) for _ in range(repeats)])
+    fits = {name: fit_line(curve, lag_range=_FIT_LAGS) for name, curve in curves.items()}
+    slopes = np.array([_line_coefficients(_tracked(study, rng)) for _ in range(repeats)])
     table = pd.concat(
         [pd.DataFrame({"quantity": name, "lag_s": c.lagtime, "value": c.value, "stderr": c.stderr})
          for name, c in curves.items()], ignore_index=True,
     )  # fmt: skip
-    claims = (*_line_claims(curves, fits), *_spread_claims(slopes), *_precision_claims(slopes))
+    claims = _line_claims(curves, fits)
+    claims += _scatter_claims(slopes)
 
-    draw = partial(_draw_figure_5, curves=curves, fits=fits, slopes=slopes)
+    def draw(figure: Figure) -> None:
+        left, right = figure.subplots(1, 2)
+        names = {"translation": ("s", "MSD (µm²)"), "rotation": ("o", "MSAD (rad²)")}
+        t = np.array(_FIT_LAGS)
+        for color, (kind, (marker, label)) in zip(reversed(_COLORS), names.items(), strict=True):
+            curve, fit = curves[kind], fits[kind]
+            lags = log_lags(len(curve.lagtime), 50) - 1
+            left.loglog(curve.lagtime[lags], curve.value[lags], marker, mfc="none", mec=color,
+                        ms=5, label=label)  # fmt: skip
+            line = 2 * curve.dof * (fit.value * t + fit.offset)
+            left.loglog(t, line, "-", color="#222222", lw=1.8)
+        left.plot([], [], "-", color="#222222", label="straight lines, 3-22 s")
+        left.set(xlabel="Δt (s)", ylabel="MSD (µm²), MSAD (rad²)")
+        left.legend(frameon=False)
+        bins = np.linspace(0, 2.2, 34)
+        for i, name in ((1, "MSD, $D_T$"), (0, "MSAD, $D_R$")):
+            right.hist(slopes[:, i] / (_D_R, _D_T)[i], bins, histtype="step", lw=1.6,
+                       color=_COLORS[i], label=name)  # fmt: skip
+        right.axvspan(0.9, 1.1, color="#dddddd", lw=0, label="printed error of $D_R$")
+        right.set(xlabel="fitted / planted coefficient", ylabel=f"of {len(slopes)} repeats")
+        right.legend(frameon=False)
+
     text = (
-        f"A tetrahedron of {_DIAMETER} um spheres under the experiment's conditions ({_FRAMES} "
-        f"frames every {_DT} s, noise 30, 30 and 40 nm, Table 1's coefficients planted), by the "
+        f"A tetrahedron of {_DIAMETER} um spheres under the experiment's conditions "
+        f"({_EXPERIMENT_FRAMES} frames every {_DT} s, noise 30, 30 and 40 nm, Table 1's "
+        "coefficients planted), by the "
         "product of successive rotations, MSAD over the particles' directions, straight lines from "
         f"3 to 22 s with free offsets; then {repeats} repeats of the same."
     )
-    return Item("fig5", _SECTION, "Fig. 5: MSD and MSAD of a tetrahedral cluster", text, table,
+    return Item("fig5", _EXPERIMENT, "Fig. 5: MSD and MSAD of a tetrahedral cluster", text, table,
                 draw, claims, size=(10.5, 4.8))  # fmt: skip
-
-
-def _draw_figure_5(
-    figure: Figure, curves: dict[str, LagCurve], fits: dict[str, DiffusionEstimate], slopes: Floats
-) -> None:
-    """Draw the one track beside the coefficients of all repeats."""
-    left, right = figure.subplots(1, 2)
-    _draw_experiment(left, curves, fits)
-    bins = np.linspace(0, 2.2, 34)
-    for i, name in ((1, "MSD, $D_T$"), (0, "MSAD, $D_R$")):
-        right.hist(slopes[:, i] / (_D_R, _D_T)[i], bins, histtype="step", lw=1.6,
-                   color=_COLORS[i], label=name)  # fmt: skip
-    right.axvspan(0.9, 1.1, color="#dddddd", lw=0, label="printed error of $D_R$")
-    right.set(xlabel="fitted / planted coefficient", ylabel=f"of {len(slopes)} repeats")
-    right.legend(frameon=False)
 
 
 _COLORS = (PALETTE[1], PALETTE[0])
 
 
 def _tracked(study: Study, rng: np.random.Generator) -> RigidMotion:
-    """Return one simulated experiment, tracked as the paper does."""
+    """Return one simulated experiment, tracked by the product of successive rotations."""
     truth = simulate_motion(Cluster.touching(4, _DIAMETER), D_R=study.planted(_D_R), D_T=_D_T,
-                            dt=_DT, n_frames=_FRAMES, rng=rng)  # fmt: skip
+                            dt=_DT, n_frames=_EXPERIMENT_FRAMES, rng=rng)  # fmt: skip
     noisy = add_noise(truth.positions(), sigma=_SIGMA, rng=rng)
     return track_rotation(noisy, dt=_DT, reference="previous")
 
 
-def _slopes(motion: RigidMotion) -> tuple[float, float]:
+def _line_coefficients(motion: RigidMotion) -> tuple[float, float]:
     """Return D_R and D_T from plain straight lines over the paper's lag times."""
     found = []
     for curve in (msad(motion), msd(motion)):
-        use = (curve.lagtime >= _WINDOW[0]) & (curve.lagtime <= _WINDOW[1])
+        use = (curve.lagtime >= _FIT_LAGS[0]) & (curve.lagtime <= _FIT_LAGS[1])
         slope = np.polyfit(curve.lagtime[use], curve.value[use], 1)[0]
         found.append(float(slope) / (2 * curve.dof))
     return found[0], found[1]
@@ -156,11 +163,13 @@ def _line_claims(
     )  # fmt: skip
 
 
-def _spread_claims(slopes: Floats) -> tuple[Claim, ...]:
-    """Compare the true spread of the paper's procedure with the errors it prints."""
+def _scatter_claims(slopes: Floats) -> tuple[Claim, ...]:
+    """Compare the true scatter of the paper's procedure with the errors it prints."""
     count = len(slopes)
     mean, spread = slopes.mean(axis=0), slopes.std(axis=0, ddof=1)
     relative = spread / (_D_R, _D_T)
+    # Sizes are proportional to D_T^-1 and D_R^(-1/3) (Eqs. 26 and 27).
+    size_errors = relative / (3, 1)
     error = 1 / np.sqrt(2 * count)
     return (
         statistical("mean D_R of the repeats over the planted one", "Table 1, section 5",
@@ -180,16 +189,6 @@ def _spread_claims(slopes: Floats) -> tuple[Claim, ...]:
                     stderr=float(relative[1] * error),
                     remark=f"D_T of the paper's procedure scatters by {100 * relative[1]:.0f} % "
                            f"over {count} repeats, not by the printed 13 %."),
-    )  # fmt: skip
-
-
-def _precision_claims(slopes: Floats) -> tuple[Claim, ...]:
-    """Check why the rotational size is the more precise one."""
-    relative = slopes.std(axis=0, ddof=1) / (_D_R, _D_T)
-    # Sizes go as D_T^-1 and D_R^(-1/3) (Eqs. 26 and 27).
-    size_errors = relative / (3, 1)
-    error = 1 / np.sqrt(2 * len(slopes))
-    return (
         statistical("least squares over all particles explains why the rotational size is the more "
                     "precise one, by a factor 3: relative spread of D_R over that of D_T",
                     "section 5", expected=1 / 3,
@@ -205,75 +204,24 @@ def _precision_claims(slopes: Floats) -> tuple[Claim, ...]:
     )  # fmt: skip
 
 
-def _draw_experiment(
-    ax: Axes, curves: dict[str, LagCurve], fits: dict[str, DiffusionEstimate]
-) -> None:
-    """Draw both curves and the fitted lines, as Fig. 5 does."""
-    names = {"translation": ("s", "MSD (µm²)"), "rotation": ("o", "MSAD (rad²)")}
-    t = np.array(_WINDOW)
-    for color, (kind, (marker, label)) in zip(reversed(_COLORS), names.items(), strict=True):
-        curve, fit = curves[kind], fits[kind]
-        lags = np.unique(np.rint(np.geomspace(1, len(curve.lagtime), 50)).astype(int)) - 1
-        ax.loglog(curve.lagtime[lags], curve.value[lags], marker, mfc="none", mec=color, ms=5,
-                  label=label)  # fmt: skip
-        ax.loglog(t, 2 * curve.dof * (fit.value * t + fit.offset), "-", color="#222222", lw=1.8)
-    ax.plot([], [], "-", color="#222222", label="straight lines, 3-22 s")
-    ax.set(xlabel="Δt (s)", ylabel="MSD (µm²), MSAD (rad²)")
-    ax.legend(frameon=False)
-
-
 def table_1(study: Study) -> Item:
     """Redo the arithmetic of Table 1 from its printed coefficients (Eqs. 23 and 25-27).
 
     Parameters
     ----------
     study : Study
-        Lends the random numbers of a track whose estimate carries the printed values.
+        Its random numbers make a track, whose estimates then get the printed values.
 
     Returns
     -------
     Item
     """
-    sizes = _printed_sizes(study)
-    table = _size_table(sizes)
-    claims = [claim for _, row in table.iterrows() for claim in _size_claims(row)]
-    claims += _stokes_claims(sizes["translation"].cluster, sizes["rotation"].cluster)
-    claims += _sphere_claims(sizes)
-
-    draw = partial(_draw_table_1, table=table)
-    text = (
-        "T = 295 K, viscosity 2.18 mPa s, d_tetra = 1.844 d_sphere. The sizes follow from the "
-        "printed D_T = 0.0385(49) um^2/s and D_R = 0.00493(49) rad^2/s."
-    )
-    return Item("table1", _SECTION, "Table 1: sizes of the tetrahedral cluster", text, table, draw,
-                tuple(claims), size=(7, 4.6))  # fmt: skip
-
-
-def _draw_table_1(figure: Figure, table: pd.DataFrame) -> None:
-    """Draw the printed sizes beside those that follow from the printed coefficients."""
-    ax = figure.subplots()
-    place = np.arange(len(table))
-    look: dict[str, Any] = {"fmt": "o", "capsize": 4}
-    ax.errorbar(place - 0.1, table["printed_um"], table["printed_error_um"], **look,
-                color=PALETTE[1], label="printed")  # fmt: skip
-    ax.errorbar(place + 0.1, table["from_D_um"], table["propagated_error_um"], **look,
-                color=PALETTE[0], label="from the printed D, errors propagated")  # fmt: skip
-    ax.axhline(_DIAMETER, color="#222222", ls="--", lw=1, label="2.45 µm (light scattering)")
-    names = [f"{m}\n$d_{{\\rm {'tetra' if w == 'cluster' else 'sphere'}}}$"
-             for m, w in zip(table["mode"], table["diameter_of"], strict=True)]  # fmt: skip
-    ax.set_xticks(place, names)
-    ax.set(ylabel="diameter (µm)", ylim=(2, 6.2))
-    ax.legend(frameon=False)
-
-
-def _printed_sizes(study: Study) -> dict[str, Size]:
-    """Return the sizes that the printed coefficients with their errors imply."""
     motion = _tracked(study, study.rng("table1"))
-    rotation = fit_line(msad(motion), lag_range=_WINDOW)
-    translation = fit_line(msd(motion), lag_range=_WINDOW)
+    rotation = fit_line(msad(motion), lag_range=_FIT_LAGS)
+    translation = fit_line(msd(motion), lag_range=_FIT_LAGS)
     known = {"viscosity": _VISCOSITY, "temperature": _TEMPERATURE}
     body = Cluster.touching(4, _DIAMETER)
-    return {
+    sizes = {
         "translation": size_from_translation(
             replace(translation, value=_D_T, stderr=_D_T_ERROR),
             cluster=body, factor="hoffmann2009", **known),
@@ -281,10 +229,6 @@ def _printed_sizes(study: Study) -> dict[str, Size]:
             replace(rotation, value=_D_R, stderr=_D_R_ERROR),
             cluster=body, factor="hoffmann2009", **known),
     }  # fmt: skip
-
-
-def _size_table(sizes: dict[str, Size]) -> pd.DataFrame:
-    """Return the printed sizes beside those that follow from the printed coefficients."""
     rows = []
     for mode, size in sizes.items():
         for what in ("cluster", "sphere"):
@@ -294,39 +238,28 @@ def _size_table(sizes: dict[str, Size]) -> pd.DataFrame:
                 "from_D_um": getattr(size, what), "propagated_error_um":
                 getattr(size, f"{what}_stderr"),
             })  # fmt: skip
-    return pd.DataFrame(rows)
-
-
-def _size_claims(row: pd.Series) -> list[Claim]:
-    """Compare one printed size and its error with what follows from the printed coefficient."""
-    name = f"d_{'tetra' if row['diameter_of'] == 'cluster' else 'sphere'}, {row['mode']}"
-    source = "Table 1, section 5"
-    printed, error = row["printed_error_um"], row["propagated_error_um"]
-    return [
-        Claim(f"{name} (um)", f"Eqs. 25-27, {source}", row["printed_um"], row["from_D_um"], 0.005,
-              "rounding"),
-        Claim(f"error of {name} (um)", source, printed, error, 0.005, "rounding",
-              f"From the printed error of D follows ±{error:.2f} um for {name}, not the printed "
-              f"±{printed:.2f}."),
-    ]  # fmt: skip
-
-
-def _stokes_claims(translation: float, rotation: float) -> list[Claim]:
-    """Put the sizes (um) back into Eqs. 26 and 27."""
+    table = pd.DataFrame(rows)
+    claims, source = [], "Table 1, section 5"
+    for _, row in table.iterrows():
+        name = f"d_{'tetra' if row['diameter_of'] == 'cluster' else 'sphere'}, {row['mode']}"
+        printed, error = row["printed_error_um"], row["propagated_error_um"]
+        claims += [
+            Claim(f"{name} (um)", f"Eqs. 25-27, {source}", row["printed_um"], row["from_D_um"],
+                  0.005, "rounding"),
+            Claim(f"error of {name} (um)", source, printed, error, 0.005, "rounding",
+                  f"From the printed error of D follows ±{error:.2f} um for {name}, not the "
+                  f"printed ±{printed:.2f}."),
+        ]  # fmt: skip
     thermal = Boltzmann * _TEMPERATURE / (np.pi * _VISCOSITY) * 1e18
-    return [
+    claims += [
         Claim("D_T of the translational d_tetra (um^2/s)", "Eq. 26, section 5", _D_T,
-              thermal / (3 * translation), 1e-9, "rounding"),
+              thermal / (3 * sizes["translation"].cluster), 1e-9, "rounding"),
         Claim("D_R of the rotational d_tetra (rad^2/s)", "Eq. 27, section 5", _D_R,
-              thermal / rotation**3, 1e-9, "rounding"),
+              thermal / sizes["rotation"].cluster**3, 1e-9, "rounding"),
     ]  # fmt: skip
-
-
-def _sphere_claims(sizes: dict[str, Size]) -> list[Claim]:
-    """Compare the sizes with each other and with 2.45 um, and check the angular resolution."""
     trans, rot = sizes["translation"].sphere, sizes["rotation"].sphere
     phi = float(np.sqrt(noise_floor(Cluster.touching(4, _DIAMETER), sigma=_SIGMA).phi2))
-    return [
+    claims += [
         Claim("d_tetra over d_sphere", "Eq. 25, section 5", 1.844,
               sizes["rotation"].cluster / rot, 1e-9, "rounding"),
         Claim("the two sizes agree within 4 %: their difference (%)", "Table 1, section 5", 4.0,
@@ -340,6 +273,28 @@ def _sphere_claims(sizes: dict[str, Size]) -> list[Claim]:
         Claim("the same in degrees", "Eq. 23, section 5", 1.6, float(np.rad2deg(phi)), 0.05,
               "rounding"),
     ]  # fmt: skip
+
+    def draw(figure: Figure) -> None:
+        ax = figure.subplots()
+        place = np.arange(len(table))
+        style: dict[str, Any] = {"fmt": "o", "capsize": 4}
+        ax.errorbar(place - 0.1, table["printed_um"], table["printed_error_um"], **style,
+                    color=PALETTE[1], label="printed")  # fmt: skip
+        ax.errorbar(place + 0.1, table["from_D_um"], table["propagated_error_um"], **style,
+                    color=PALETTE[0], label="from the printed D, errors propagated")  # fmt: skip
+        ax.axhline(_DIAMETER, color="#222222", ls="--", lw=1, label="2.45 µm (light scattering)")
+        names = [f"{m}\n$d_{{\\rm {'tetra' if w == 'cluster' else 'sphere'}}}$"
+                 for m, w in zip(table["mode"], table["diameter_of"], strict=True)]  # fmt: skip
+        ax.set_xticks(place, names)
+        ax.set(ylabel="diameter (µm)", ylim=(2, 6.2))
+        ax.legend(frameon=False)
+
+    text = (
+        "T = 295 K, viscosity 2.18 mPa s, d_tetra = 1.844 d_sphere. The sizes follow from the "
+        "printed D_T = 0.0385(49) um^2/s and D_R = 0.00493(49) rad^2/s."
+    )
+    return Item("table1", _EXPERIMENT, "Table 1: sizes of the tetrahedral cluster", text, table,
+                draw, tuple(claims), size=(7, 4.6))  # fmt: skip
 
 
 def conclusion(study: Study) -> Item:
@@ -368,36 +323,28 @@ def conclusion(study: Study) -> Item:
         table[f"seen {name}"], table[f"removed {name}"] = raw.value, clean.value
         found = fit_line(clean, lag_range=(1, 10)).value
         angle = np.linalg.norm(motion.step_vectors(), axis=1).mean()
-        claims += _removal_claims(name, diffusion=found / D, angle=float(angle), turns=turns)
+        claims += [
+            Claim("diffusion of the particles after the bulk rotation is removed, over the "
+                  f"planted one, {name}", "section 6", 1.0, found / D, 0.02, "2 %"),
+            Claim(f"rotation per frame that was removed (rad), {name}", "section 6", turns,
+                  float(angle), 0.02 * turns, "2 %"),
+        ]  # fmt: skip
 
-    draw = partial(_draw_conclusion, table=table, D=D)
+    def draw(figure: Figure) -> None:
+        ax = figure.subplots()
+        shown = log_lags((len(table) + 1) / 2, 30) - 1
+        t = table["lag_s"][shown]
+        for color, name in zip(PALETTE, ("without drift", "with drift"), strict=False):
+            ax.loglog(t, table[f"seen {name}"][shown], "--", color=color, label=f"seen, {name}")
+            ax.loglog(t, table[f"removed {name}"][shown], "-", color=color,
+                      label=f"rotation removed, {name}")  # fmt: skip
+        ax.loglog(t[::2], 6 * D * t[::2], "o", mfc="none", mec="#222222", label="6 D Δt")
+        ax.set(xlabel="Δt (s)", ylabel="MSD (µm²)")
+        ax.legend(frameon=False)
+
     text = (
         "500 independent particles (D = 0.01 um^2/s) in a box of 20 um that turns by 0.01 rad a "
         "frame, without and with a drift: MSD as seen, and after `remove_rotation`."
     )
     return Item("conclusion", _CONCLUSION, "Bulk rotation of a many-body system", text, table, draw,
                 tuple(claims), size=(6.5, 4.8))  # fmt: skip
-
-
-def _removal_claims(name: str, *, diffusion: float, angle: float, turns: float) -> list[Claim]:
-    """Check the relative diffusion that is left and the angle per frame that was removed."""
-    return [
-        Claim("diffusion of the particles after the bulk rotation is removed, over the "
-              f"planted one, {name}", "section 6", 1.0, diffusion, 0.02, "2 %"),
-        Claim(f"rotation per frame that was removed (rad), {name}", "section 6", turns,
-              angle, 0.02 * turns, "2 %"),
-    ]  # fmt: skip
-
-
-def _draw_conclusion(figure: Figure, table: pd.DataFrame, *, D: float) -> None:
-    """Draw the MSDs as seen and with the rotation removed."""
-    ax = figure.subplots()
-    shown = np.unique(np.rint(np.geomspace(1, (len(table) + 1) / 2, 30)).astype(int)) - 1
-    t = table["lag_s"][shown]
-    for color, name in zip(PALETTE, ("without drift", "with drift"), strict=False):
-        ax.loglog(t, table[f"seen {name}"][shown], "--", color=color, label=f"seen, {name}")
-        ax.loglog(t, table[f"removed {name}"][shown], "-", color=color,
-                  label=f"rotation removed, {name}")  # fmt: skip
-    ax.loglog(t[::2], 6 * D * t[::2], "o", mfc="none", mec="#222222", label="6 D Δt")
-    ax.set(xlabel="Δt (s)", ylabel="MSD (µm²)")
-    ax.legend(frameon=False)

@@ -1,8 +1,7 @@
-"""Hunter et al. 2011, does the method give back the rotation? Sections 1 to 3."""
+"""Hunter et al. 2011, sections 1 to 3: recovery of a known rotation, and the simulation."""
 
 from __future__ import annotations
 
-from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from perrin.errors import DegenerateClusterError
 from perrin.geometry.rotations import axis_angle, kabsch, similarity, successive_product
-from perrin.geometry.shapes import Cluster
+from perrin.geometry.shapes import Cluster, pair_distances
 from perrin.motion.simulate import add_noise, simulate_motion
 from perrin.motion.tracking import track_rotation
 from perrin.paper.claims import Claim, Item, Study, statistical
@@ -24,13 +23,16 @@ if TYPE_CHECKING:
     from perrin._arrays import Floats, Ints
 
 
-# The paper does not print R: touching spheres of 2 um, as in its Fig. 1.
+# Distance of a particle to the centre, um. The paper does not print it; this value is that of
+# touching spheres of 2 um, as in its Fig. 1.
 R = Cluster.touching(4, 2.0).R
 
 
+# Localisation errors that the paper simulates, um.
 NOISES = (0.01, 0.03, 0.05, 0.07, 0.10)
 
 
+# Steps of the paper's simulations.
 STEPS = 10_000
 
 
@@ -55,29 +57,13 @@ def challis(study: Study) -> Item:
     Item
     """
     rng = study.rng("challis")
-    rows = [_fitted_sets(n, rng=rng) for n in range(3, 8)]
-    table = pd.DataFrame(rows)
-    angle, rise = _cost_around(rng)
+    table = pd.DataFrame([transformation_errors(n, rng=rng) for n in range(3, 8)])
+    angle, rise = cost_rise(rng)
     line = rng.normal(size=(200, 1, 3)) * rng.normal(size=(200, 5, 1))
     pair = rng.normal(size=(200, 2, 3))
-    refused = _refused(line) + _refused(pair)
-    claims = _challis_claims(table, rise, refused)
-
-    draw = partial(_draw_challis, table=table, angle=angle, rise=rise)
-    text = (
-        "Random sets of points are scaled, turned and shifted by known amounts; `similarity` and "
-        "`kabsch` find the transformation again. Noisy sets have noise of a tenth of their size; "
-        "Eqs. 9-10 are evaluated with numpy's SVD beside `kabsch`, which has none."
-    )
-    return Item("challis", _CHALLIS, "Rigid transformations", text, table, draw, claims)
-
-
-def _challis_claims(table: pd.DataFrame, rise: Floats, refused: int) -> tuple[Claim, ...]:
-    """Check the largest errors of the fits, that they are minima, and which sets are solved."""
-    worst = table.max()
-    section = "section 2.1"
-    rounding = "rounding"
-    return (
+    refused = _degenerate_sets(line) + _degenerate_sets(pair)
+    worst, section, rounding = table.max(), "section 2.1", "rounding"
+    claims = (
         Claim("y = s R x + v: largest error of s, R and v, 1000 noise-free sets of 3 to 7 points",
               f"Eq. 1, {section}", 0.0, worst["similarity"], 1e-12, rounding),
         Claim("y = R x (s = 1, v = 0): largest error of R", f"Eq. 2, {section}", 0.0,
@@ -98,29 +84,53 @@ def _challis_claims(table: pd.DataFrame, rise: Floats, refused: int) -> tuple[Cl
               refused / 400, 0.0, "exact"),
     )  # fmt: skip
 
+    def draw(figure: Figure) -> None:
+        left, right = figure.subplots(1, 2)
+        labels = {
+            "similarity": "s, R, v (Eq. 1)",
+            "rotation": "R (Eq. 2)",
+            "svd": "noisy: R beside the SVD (Eqs. 9-10)",
+        }
+        for color, (name, label) in zip(PALETTE, labels.items(), strict=False):
+            left.semilogy(table["n"], table[name], "o-", color=color, label=label)
+        left.set(xlabel="points n", ylabel="largest error in 200 sets", ylim=(1e-16, 1e-11))
+        left.set_xticks(table["n"])
+        left.legend(frameon=False)
+        right.loglog(np.rad2deg(angle), rise, ".", ms=2, color=PALETTE[0], rasterized=True)
+        right.set(xlabel="turned away from R (degrees)")
+        right.set_ylabel("rise of the squared distance (relative)")
 
-def _draw_challis(figure: Figure, table: pd.DataFrame, angle: Floats, rise: Floats) -> None:
-    """Draw the errors of the fits, and how the squared distance rises around them."""
-    left, right = figure.subplots(1, 2)
-    for color, name in zip(PALETTE, ("similarity", "rotation", "svd"), strict=False):
-        left.semilogy(table["n"], table[name], "o-", color=color, label=_ERRORS[name])
-    left.set(xlabel="points n", ylabel="largest error in 200 sets", ylim=(1e-16, 1e-11))
-    left.set_xticks(table["n"])
-    left.legend(frameon=False)
-    right.loglog(np.rad2deg(angle), rise, ".", ms=2, color=PALETTE[0], rasterized=True)
-    right.set(xlabel="turned away from R (degrees)")
-    right.set_ylabel("rise of the squared distance (relative)")
+    text = (
+        "Random sets of points are scaled, turned and shifted by known amounts; `similarity` and "
+        "`kabsch` find the transformation again. Noisy sets have noise of a tenth of their size; "
+        "Eqs. 9-10 are evaluated with numpy's SVD beside `kabsch`, which has none."
+    )
+    return Item("challis", _CHALLIS, "Rigid transformations", text, table, draw, claims)
 
 
-_ERRORS = {
-    "similarity": "s, R, v (Eq. 1)",
-    "rotation": "R (Eq. 2)",
-    "svd": "noisy: R beside the SVD (Eqs. 9-10)",
-}
+def transformation_errors(n: int, *, rng: np.random.Generator) -> dict[str, float]:
+    """Return the largest errors of fitted transformations over 200 sets of n points.
 
+    Parameters
+    ----------
+    n : int
+        Number of points in a set.
+    rng : numpy.random.Generator
 
-def _fitted_sets(n: int, *, rng: np.random.Generator) -> dict[str, float]:
-    """Return the largest errors over 200 sets of n points."""
+    Returns
+    -------
+    dict
+        The number of points; the largest error of s, R and v of noise-free sets ("similarity"), of
+        R alone ("rotation"), and for noisy sets the deviation from an orthogonal matrix of
+        determinant 1, from the expanded sum of squares and from Eq. 10; the share of sets that
+        were solved.
+
+    Examples
+    --------
+    >>> errors = transformation_errors(4, rng=np.random.default_rng(1))
+    >>> errors["similarity"] < 1e-12, errors["solved"]
+    (True, 1.0)
+    """
     x = rng.normal(size=(200, n, 3))
     planted = random_rotations(200, rng)
     s, v = rng.uniform(0.5, 2.0, 200), rng.normal(size=(200, 3))
@@ -135,7 +145,7 @@ def _fitted_sets(n: int, *, rng: np.random.Generator) -> dict[str, float]:
     square = np.sum((y0 - np.einsum("kij,knj->kni", fitted, x0)) ** 2, axis=(1, 2))
     sizes = np.sum(y0**2 + x0**2, axis=(1, 2))
     expanded = sizes - 2 * np.einsum("kij,kij->k", fitted, dispersion)
-    # Sets on a plane, and sets beside their mirror image: where a reflection would fit better.
+    # A reflection would fit better to planar sets and to mirror images.
     flat, mirrored = x * [1.0, 1.0, 0.0], x * [1.0, 1.0, -1.0]
     special = np.concatenate([fitted, kabsch(flat, y), kabsch(mirrored, x)])
     return {
@@ -145,21 +155,54 @@ def _fitted_sets(n: int, *, rng: np.random.Generator) -> dict[str, float]:
         "orthonormal": float(np.abs(fitted @ np.swapaxes(fitted, 1, 2) - np.eye(3)).max()),
         "determinant": float(np.abs(np.linalg.det(special) - 1).max()),
         "expansion": float(np.abs((square - expanded) / sizes).max()),
-        "svd": float(np.abs(fitted - _by_svd(dispersion)).max()),
+        "svd": float(np.abs(fitted - svd_rotation(dispersion)).max()),
         "solved": float(np.isfinite(fitted).all(axis=(1, 2)).mean()),
     }
 
 
-def _by_svd(dispersion: Floats) -> Floats:
-    """Return the rotations of Eq. 10, evaluated as printed."""
+def svd_rotation(dispersion: Floats) -> Floats:
+    """Return the rotations of Eq. 10, evaluated as printed.
+
+    Parameters
+    ----------
+    dispersion : array of shape (k, 3, 3)
+        C = sum(y x^T) of each set, points measured from their mean.
+
+    Returns
+    -------
+    array of shape (k, 3, 3)
+
+    Examples
+    --------
+    >>> svd_rotation(2.0 * np.eye(3)[None])[0].round(12).tolist()
+    [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
+    """
     u, _, vt = np.linalg.svd(dispersion)
     middle = np.ones((len(u), 3))
     middle[:, 2] = np.linalg.det(u @ vt)
     return np.asarray((u * middle[:, None]) @ vt)
 
 
-def _cost_around(rng: np.random.Generator) -> tuple[Floats, Floats]:
-    """Return angles from the fitted rotation of 25 000 others, and how much worse they fit."""
+def cost_rise(rng: np.random.Generator) -> tuple[Floats, Floats]:
+    """Return how the squared distance (Eq. 5) rises around its minimum.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+
+    Returns
+    -------
+    angle : array of shape (25000,)
+        Angles of 25 000 rotations from the fitted ones, rad.
+    rise : array of shape (25000,)
+        Their squared distance over that of the fitted rotation, less 1.
+
+    Examples
+    --------
+    >>> angle, rise = cost_rise(np.random.default_rng(1))
+    >>> bool(rise.min() >= 0)
+    True
+    """
     x = rng.normal(size=(500, 4, 3))
     y = x + 0.1 * rng.normal(size=x.shape)
     y, x = y - y.mean(1, keepdims=True), x - x.mean(1, keepdims=True)
@@ -173,8 +216,8 @@ def _cost_around(rng: np.random.Generator) -> tuple[Floats, Floats]:
     return angle.ravel(), (cost / best[:, None] - 1).ravel()
 
 
-def _refused(points: Floats) -> int:
-    """Return how many sets `kabsch` refuses."""
+def _degenerate_sets(points: Floats) -> int:
+    """Return the number of sets whose rotation `kabsch` does not determine."""
     try:
         kabsch(points, points)
     except DegenerateClusterError as error:
@@ -194,70 +237,95 @@ def product(study: Study) -> Item:
     Item
     """
     rng = study.rng("product")
-    closing = _closing(rng)
-    steps = np.unique(np.rint(np.geomspace(1, 5000, 30)).astype(int))
-    drift = [_drift(r, steps, repeats=study.repeats(200), rng=rng) for r in (0.02, 0.05)]
-    table = pd.concat(drift, ignore_index=True)
-    claims = _closing_claims(closing)
-    expected = ((0.02, 1.72, 2.3, 1.2), (0.05, 4.30, 11.7, 3.0))
-    for part, (ratio, one, late, common) in zip(drift, expected, strict=True):
-        claims += _drift_claims(part, ratio=ratio, one=one, late=late, common=common)
-
-    draw = partial(_draw_product, drift=drift)
-    text = (
-        "A tetrahedron that diffuses and turns for 10^4 steps (Eq. 16) without noise, by "
-        '`track_rotation(reference="previous")`; then a stationary one with noise: rms angle '
-        "between fitted and planted orientation (the identity) after so many steps, 200 repeats of "
-        "the product, 8 of the fit to one common shape."
-    )
-    return Item("product", _CLUSTERS, "The product of successive rotations", text, table, draw,
-                tuple(claims), size=(6.5, 4.6))  # fmt: skip
-
-
-def _draw_product(figure: Figure, drift: list[pd.DataFrame]) -> None:
-    """Draw the orientation errors of both noise levels."""
-    ax = figure.subplots()
-    for color, part in zip(PALETTE, drift, strict=False):
-        ratio = part["sigma_over_R"].iloc[0]
-        ax.loglog(part["steps"], part["product_deg"], "-", color=color, lw=1.5,
-                  label=f"product of rotations, σ/R = {ratio}")  # fmt: skip
-        ax.loglog(part["steps"], part["common_deg"], "--", color=color, lw=1.5,
-                  label=f"common shape, σ/R = {ratio}")  # fmt: skip
-    ax.set(xlabel="steps", ylabel="rms angle to the planted orientation (degrees)")
-    ax.set_yticks([1, 2, 5, 10], ["1", "2", "5", "10"])
-    ax.set_yticks([], minor=True)
-    ax.legend(frameon=False)
-
-
-def _closing(rng: np.random.Generator) -> dict[str, float]:
-    """Return by how much noise-free trajectories fail to close, um."""
     truth = simulate_motion(Cluster.tetrahedron(R), D_R=1e-3, D_T=0.01, dt=1.0,
                             n_frames=STEPS + 1, scheme="euler", rng=rng)  # fmt: skip
     x = truth.positions()
     chain = track_rotation(x, dt=1.0, reference="previous")
     common = track_rotation(x, dt=1.0)
-    return {
-        "center": float(np.abs(chain.center - x.mean(axis=1)).max()),
-        "template": float(np.abs(common.positions() - x).max()),
-        "previous": float(np.abs(chain.positions() - x).max()),
-    }
-
-
-def _closing_claims(closing: dict[str, float]) -> list[Claim]:
-    """Check that noise-free trajectories close."""
+    center = float(np.abs(chain.center - x.mean(axis=1)).max())
+    template = float(np.abs(common.positions() - x).max())
+    previous = float(np.abs(chain.positions() - x).max())
+    steps, repeats = log_lags(5000, 30), study.repeats(200)
+    drift = [accumulated_error(r, steps, repeats=repeats, rng=rng) for r in (0.02, 0.05)]
+    table = pd.concat(drift, ignore_index=True)
     closed = "1e4 noise-free steps (um)"
-    return [
+    claims = [
         Claim(f"the centre of mass is the mean of the particles, {closed}", "Eq. 11, section 2.2",
-              0.0, closing["center"], 1e-10, "1e-10 um"),
-        Claim(f"x_i = R x_i^0, {closed}", "Eq. 12, section 2.2", 0.0, closing["template"], 1e-10,
+              0.0, center, 1e-10, "1e-10 um"),
+        Claim(f"x_i = R x_i^0, {closed}", "Eq. 12, section 2.2", 0.0, template, 1e-10,
               "1e-10 um"),
         Claim(f"x_i(t) is the product of successive rotations on x_i^0, {closed}",
-              "Eq. 13, section 2.2", 0.0, closing["previous"], 1e-10, "1e-10 um"),
+              "Eq. 13, section 2.2", 0.0, previous, 1e-10, "1e-10 um"),
     ]  # fmt: skip
+    expected = ((0.02, 1.72, 2.3, 1.2), (0.05, 4.30, 11.7, 3.0))
+    for part, (ratio, one, late, fitted) in zip(drift, expected, strict=True):
+        last = part.iloc[-1]
+        source, where = "Eq. 13, section 2.2", f"sigma/R = {ratio}"
+        # 8 repeats of 1000 frames with 3 angles each, twice.
+        growth_error = float(np.sqrt(2 * 2 / (3 * 8000)) / 2)
+        claims += [
+            Claim(f"noise of one step (degrees), {where}", source, one, last["one_step_deg"],
+                  0.08 * one, "8 %"),
+            Claim(f"rms error of the product after 5000 steps (degrees), {where}", source, late,
+                  last["product_deg"], 0.2 * late, "20 %"),
+            Claim("the product reconstructs the entire trajectory: rms error after 5000 steps "
+                  f"over that of one, {where}", source, 1.0,
+                  last["product_deg"] / last["one_step_deg"], 0.1, "10 %",
+                  "The errors of successive rotations do not cancel at second order: after 5000 "
+                  f"steps the product is {last['product_deg']:.1f} degrees off, one step "
+                  f"{last['one_step_deg']:.2f}."),
+            Claim(f"rms error of the fit to a common shape (degrees), {where}", source, fitted,
+                  last["common_deg"], 0.05, "rounding"),
+            statistical("the common shape's error does not grow: last over first 1000 of 5000 "
+                        f"steps, {where}", source, expected=1.0, measured=last["common_growth"],
+                        stderr=growth_error),
+        ]  # fmt: skip
+
+    def draw(figure: Figure) -> None:
+        ax = figure.subplots()
+        for color, part in zip(PALETTE, drift, strict=False):
+            ratio = part["sigma_over_R"].iloc[0]
+            ax.loglog(part["steps"], part["product_deg"], "-", color=color, lw=1.5,
+                      label=f"product of rotations, σ/R = {ratio}")  # fmt: skip
+            ax.loglog(part["steps"], part["common_deg"], "--", color=color, lw=1.5,
+                      label=f"common shape, σ/R = {ratio}")  # fmt: skip
+        ax.set(xlabel="steps", ylabel="rms angle to the planted orientation (degrees)")
+        ax.set_yticks([1, 2, 5, 10], ["1", "2", "5", "10"])
+        ax.set_yticks([], minor=True)
+        ax.legend(frameon=False)
+
+    text = (
+        "A tetrahedron that diffuses and turns for 10^4 steps (Eq. 16) without noise, by "
+        '`track_rotation(reference="previous")`; then a stationary one with noise: rms angle '
+        "between fitted and planted orientation (the identity) against the number of steps, 200 "
+        "repeats of the product, 8 of the fit to one common shape."
+    )
+    return Item("product", _CLUSTERS, "The product of successive rotations", text, table, draw,
+                tuple(claims), size=(6.5, 4.6))  # fmt: skip
 
 
-def _drift(ratio: float, steps: Ints, *, repeats: int, rng: np.random.Generator) -> pd.DataFrame:
-    """Return rms orientation errors (degrees) of product and common shape after so many steps."""
+def accumulated_error(
+    ratio: float, steps: Ints, *, repeats: int, rng: np.random.Generator
+) -> pd.DataFrame:
+    """Return the orientation error of a stationary tetrahedron against the number of steps.
+
+    Parameters
+    ----------
+    ratio : float
+        Localisation error over the distance of the particles to the centre.
+    steps : array of int
+        Numbers of steps; the last is the longest.
+    repeats : int
+        Number of simulated tracks, at least 8.
+    rng : numpy.random.Generator
+
+    Returns
+    -------
+    pandas.DataFrame
+        Rms angles in degrees: of the product of successive rotations after each number of steps,
+        of one step, and of the fit to a common shape; and the ratio of the latter in the last 1000
+        steps to that in the first 1000.
+    """
     body = Cluster.tetrahedron(1.0)
     still = np.broadcast_to(body.positions, (int(steps[-1]) + 1, 4, 3))
     square, one, common = np.zeros(len(steps)), 0.0, []
@@ -280,40 +348,13 @@ def _drift(ratio: float, steps: Ints, *, repeats: int, rng: np.random.Generator)
     return table
 
 
-def _drift_claims(
-    table: pd.DataFrame, *, ratio: float, one: float, late: float, common: float
-) -> list[Claim]:
-    """Compare one noise level with what first- and second-order theory expect."""
-    last = table.iloc[-1]
-    source, where = "Eq. 13, section 2.2", f"sigma/R = {ratio}"
-    # 8 repeats of 1000 frames with 3 angles each, twice.
-    growth_error = float(np.sqrt(2 * 2 / (3 * 8000)) / 2)
-    return [
-        Claim(f"noise of one step (degrees), {where}", source, one, last["one_step_deg"],
-              0.08 * one, "8 %"),
-        Claim(f"rms error of the product after 5000 steps (degrees), {where}", source, late,
-              last["product_deg"], 0.2 * late, "20 %"),
-        Claim(f"the product reconstructs the entire trajectory: rms error after 5000 steps over "
-              f"that of one, {where}", source, 1.0, last["product_deg"] / last["one_step_deg"],
-              0.1, "10 %",
-              f"The errors of successive rotations do not cancel at second order: after 5000 steps "
-              f"the product is {last['product_deg']:.1f} degrees off, one step "
-              f"{last['one_step_deg']:.2f}."),
-        Claim(f"rms error of the fit to a common shape (degrees), {where}", source, common,
-              last["common_deg"], 0.05, "rounding"),
-        statistical(f"the common shape's error does not grow: last over first 1000 of 5000 steps, "
-                    f"{where}", source, expected=1.0, measured=last["common_growth"],
-                    stderr=growth_error),
-    ]  # fmt: skip
-
-
 def localisation(study: Study) -> Item:
     """Evaluate the least localisation error, a pixel over the object's width (section 3).
 
     Parameters
     ----------
     study : Study
-        Nothing in it matters here.
+        Not used.
 
     Returns
     -------
@@ -332,24 +373,22 @@ def localisation(study: Study) -> Item:
               "section 3", 1.0, covered, 0.0, "exact"),
     )  # fmt: skip
 
-    draw = partial(_draw_localisation, table=table, limit=limit)
-    text = "(um per pixel)/N: the paper's rule of thumb, taken as it states it."
+    def draw(figure: Figure) -> None:
+        ax = figure.subplots()
+        ax.axhspan(20, 60, color="#dddddd", lw=0, label="typical in experiments")
+        ax.plot(table["width_px"], table["limit_nm"], color=PALETTE[0],
+                label="(0.2 µm per pixel)/N")  # fmt: skip
+        ax.plot(10, limit, "o", mfc="white", mec=PALETTE[0], ms=8, label="the paper's example")
+        for sigma in NOISES:
+            ax.axhline(1e3 * sigma, color=PALETTE[1], lw=0.8, ls=":")
+        ax.plot([], [], ":", color=PALETTE[1], lw=0.8, label="levels simulated")
+        ax.set(xlabel="width of the object N (pixels)", ylabel="localisation error (nm)")
+        ax.set(ylim=(0, 110), xlim=(5, 30))
+        ax.legend(frameon=False, loc="upper right", bbox_to_anchor=(1, 0.9))
+
+    text = "(um per pixel)/N: the rule of thumb that the paper states."
     return Item("localisation", _TESTS, "Localisation error", text, table, draw, claims,
                 size=(6.5, 4.2))  # fmt: skip
-
-
-def _draw_localisation(figure: Figure, table: pd.DataFrame, limit: float) -> None:
-    """Draw the rule of thumb beside the noise levels simulated."""
-    ax = figure.subplots()
-    ax.axhspan(20, 60, color="#dddddd", lw=0, label="typical in experiments")
-    ax.plot(table["width_px"], table["limit_nm"], color=PALETTE[0], label="(0.2 µm per pixel)/N")
-    ax.plot(10, limit, "o", mfc="white", mec=PALETTE[0], ms=8, label="the paper's example")
-    for sigma in NOISES:
-        ax.axhline(1e3 * sigma, color=PALETTE[1], lw=0.8, ls=":")
-    ax.plot([], [], ":", color=PALETTE[1], lw=0.8, label="levels simulated")
-    ax.set(xlabel="width of the object N (pixels)", ylabel="localisation error (nm)")
-    ax.set(ylim=(0, 110), xlim=(5, 30))
-    ax.legend(frameon=False, loc="upper right", bbox_to_anchor=(1, 0.9))
 
 
 def simulation(study: Study) -> Item:
@@ -370,35 +409,51 @@ def simulation(study: Study) -> Item:
         truth = simulate_motion(body, D_R=study.planted(D), dt=1.0, n_frames=STEPS + 1,
                                 scheme="euler", rng=rng)  # fmt: skip
         step = truth.rotation[1:] @ np.swapaxes(truth.rotation[:-1], 1, 2)
-        # Capitals: about the turned axes, R_x R_y R_z.
+        # Upper-case letters mean rotations about the turned axes: R_x R_y R_z.
         angles[name] = Rotation.from_matrix(step).as_euler("XYZ") / np.sqrt(2 * D)
     table = pd.concat(
         [pd.DataFrame(a, columns=["alpha", "beta", "gamma"]).assign(body=n)
          for n, a in angles.items()], ignore_index=True,
     )  # fmt: skip
-    claims = (*_simulation_claims(bodies, angles), _noise_claim(rng))
+    claims = [
+        Claim("coordinates of the tetrahedron: largest deviation (um)", "Eq. 14, section 3", 0.0,
+              _coordinate_error(bodies["tetrahedron"], _PRINTED_TETRAHEDRON), 1e-12, "rounding"),
+        Claim("coordinates of the pentahedron: largest deviation (um)", "Eq. 15, section 3", 0.0,
+              _coordinate_error(bodies["pentahedron"], _PRINTED_PENTAHEDRON), 1e-12, "rounding"),
+    ]  # fmt: skip
+    for name, a in angles.items():
+        claims.append(
+            statistical(f"standard deviation of the angles of R_x R_y R_z over sqrt(2 D_R), {name}",
+                        "Eq. 16, section 3", expected=1.0, measured=float(a.std()),
+                        stderr=float(1 / np.sqrt(2 * a.size)))
+        )  # fmt: skip
+    still = np.broadcast_to(Cluster.tetrahedron(R).positions, (STEPS, 4, 3))
+    ratio = [float((add_noise(still, sigma=s, rng=rng) - still).std()) / s for s in NOISES]
+    count = still.size * len(NOISES)
+    claims.append(
+        statistical("standard deviation of the noise added over sigma_x, mean of five levels",
+                    "section 3", expected=1.0, measured=float(np.mean(ratio)),
+                    stderr=float(1 / np.sqrt(2 * count)))
+    )  # fmt: skip
 
-    draw = partial(_draw_simulation, table=table)
+    def draw(figure: Figure) -> None:
+        ax = figure.subplots()
+        x = np.linspace(-4, 4, 200)
+        values = table[["alpha", "beta", "gamma"]].to_numpy()
+        ax.hist(values, 60, range=(-4, 4), density=True, histtype="step", color=PALETTE[:3],
+                label=["α about x", "β about y", "γ about z"])  # fmt: skip
+        ax.plot(x[::8], np.exp(-x[::8] ** 2 / 2) / np.sqrt(2 * np.pi), "o", mfc="none",
+                mec="#222222", label="Gaussian")  # fmt: skip
+        ax.set(xlabel="angle of a step / $(2 D_R)^{1/2}$", ylabel="probability density")
+        ax.legend(frameon=False)
+
     text = (
         f"Tetrahedra and pentahedra exactly as printed, R = {R:.3f} um (touching spheres of 2 um: "
         "the paper does not print R), 10^4 steps of three Gaussian angles, multiplied as "
         "R_x R_y R_z, and Gaussian noise of 10, 30, 50, 70 and 100 nm."
     )
-    return Item("simulation", _TESTS, "The simulation", text, table, draw, claims,
+    return Item("simulation", _TESTS, "The simulation", text, table, draw, tuple(claims),
                 size=(6.5, 4.2))  # fmt: skip
-
-
-def _draw_simulation(figure: Figure, table: pd.DataFrame) -> None:
-    """Draw the distribution of the angles of a step."""
-    ax = figure.subplots()
-    x = np.linspace(-4, 4, 200)
-    values = table[["alpha", "beta", "gamma"]].to_numpy()
-    ax.hist(values, 60, range=(-4, 4), density=True, histtype="step", color=PALETTE[:3],
-            label=["α about x", "β about y", "γ about z"])  # fmt: skip
-    ax.plot(x[::8], np.exp(-x[::8] ** 2 / 2) / np.sqrt(2 * np.pi), "o", mfc="none",
-            mec="#222222", label="Gaussian")  # fmt: skip
-    ax.set(xlabel="angle of a step / $(2 D_R)^{1/2}$", ylabel="probability density")
-    ax.legend(frameon=False)
 
 
 _PRINTED_TETRAHEDRON = np.array([(1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)]) / np.sqrt(3)
@@ -409,37 +464,10 @@ _PRINTED_PENTAHEDRON = np.array(
 )
 
 
-def _misplaced(body: Cluster, printed: Floats) -> float:
-    """Return how far the particles are from the printed places, in whatever order (um)."""
+def _coordinate_error(body: Cluster, printed: Floats) -> float:
+    """Return the largest distance (um) of a particle to the nearest printed one, and reverse."""
     distance = np.linalg.norm(body.positions[:, None] - R * printed, axis=2)
     return float(max(distance.min(axis=0).max(), distance.min(axis=1).max()))
-
-
-def _simulation_claims(bodies: dict[str, Cluster], angles: dict[str, Floats]) -> list[Claim]:
-    """Check the bodies against the printed ones, and the width of the angles (Eqs. 14-16)."""
-    claims = [
-        Claim("coordinates of the tetrahedron: largest deviation (um)", "Eq. 14, section 3", 0.0,
-              _misplaced(bodies["tetrahedron"], _PRINTED_TETRAHEDRON), 1e-12, "rounding"),
-        Claim("coordinates of the pentahedron: largest deviation (um)", "Eq. 15, section 3", 0.0,
-              _misplaced(bodies["pentahedron"], _PRINTED_PENTAHEDRON), 1e-12, "rounding"),
-    ]  # fmt: skip
-    for name, a in angles.items():
-        claims.append(
-            statistical(f"standard deviation of the angles of R_x R_y R_z over sqrt(2 D_R), {name}",
-                        "Eq. 16, section 3", expected=1.0, measured=float(a.std()),
-                        stderr=float(1 / np.sqrt(2 * a.size)))
-        )  # fmt: skip
-    return claims
-
-
-def _noise_claim(rng: np.random.Generator) -> Claim:
-    """Compare the noise added with the noise asked for, all five levels pooled."""
-    still = np.broadcast_to(Cluster.tetrahedron(R).positions, (STEPS, 4, 3))
-    ratio = [float((add_noise(still, sigma=s, rng=rng) - still).std()) / s for s in NOISES]
-    count = still.size * len(NOISES)
-    return statistical("standard deviation of the noise added over sigma_x, mean of five levels",
-                       "section 3", expected=1.0, measured=float(np.mean(ratio)),
-                       stderr=float(1 / np.sqrt(2 * count)))  # fmt: skip
 
 
 def figure_1(study: Study) -> Item:
@@ -448,7 +476,7 @@ def figure_1(study: Study) -> Item:
     Parameters
     ----------
     study : Study
-        Nothing in it matters here.
+        Not used.
 
     Returns
     -------
@@ -460,7 +488,8 @@ def figure_1(study: Study) -> Item:
         pd.DataFrame(b.positions, columns=["x", "y", "z"]).assign(n=len(b.positions))
         for b in bodies
     ]
-    spread = [_distance_ratio(b) for b in (bodies[1], Cluster.pentahedron(R))]
+    pairs = [pair_distances(b.positions) for b in (bodies[1], Cluster.pentahedron(R))]
+    spread = [float(distance.max() / distance.min()) for distance in pairs]
     remark = (
         f"The bipyramid of five touching spheres is longer than Eq. 15: its largest distance is "
         f"{spread[0]:.3f} times its smallest, that of Eq. 15 {spread[1]:.3f} times."
@@ -472,31 +501,72 @@ def figure_1(study: Study) -> Item:
               "between particles", "Fig. 1, section 1", spread[0], spread[1], 0.02, "2 %", remark),
     )  # fmt: skip
 
-    draw = partial(_draw_figure_1, bodies=bodies)
+    def draw(figure: Figure) -> None:
+        view = Rotation.from_euler("xyz", [-65, 20, 10], degrees=True).as_matrix()
+        for ax, body in zip(figure.subplots(1, 3), bodies, strict=True):
+            plot_cluster(body, ax=ax, diameter=2.0, view=view)
+            ax.set(title=f"n = {len(body.positions)}", xlim=(-3, 3), ylim=(-3, 3))
+
     text = "Solid spheres of 2 um in place of the paper's confocal micrographs."
     return Item("fig1", "1 Introduction", "Fig. 1: clusters with n = 4, 5 and 6", text,
                 pd.concat(parts, ignore_index=True), draw, claims, size=(10, 3.6))  # fmt: skip
 
 
-def _draw_figure_1(figure: Figure, bodies: list[Cluster]) -> None:
-    """Draw the clusters side by side."""
-    view = Rotation.from_euler("xyz", [-65, 20, 10], degrees=True).as_matrix()
-    for ax, body in zip(figure.subplots(1, 3), bodies, strict=True):
-        plot_cluster(body, ax=ax, diameter=2.0, view=view)
-        ax.set(title=f"n = {len(body.positions)}", xlim=(-3, 3), ylim=(-3, 3))
-
-
-def _distance_ratio(body: Cluster) -> float:
-    first, second = np.triu_indices(len(body.positions), 1)
-    distance = np.linalg.norm(body.positions[first] - body.positions[second], axis=1)
-    return float(distance.max() / distance.min())
-
-
 def unit(vector: Floats) -> Floats:
-    """Return vectors (..., 3) at length 1."""
+    """Return vectors scaled to length 1.
+
+    Parameters
+    ----------
+    vector : array of shape (..., 3)
+
+    Returns
+    -------
+    array of shape (..., 3)
+
+    Examples
+    --------
+    >>> unit(np.array([3.0, 0.0, 4.0])).tolist()
+    [0.6, 0.0, 0.8]
+    """
     return np.asarray(vector / np.linalg.norm(vector, axis=-1, keepdims=True))
 
 
 def random_rotations(count: int, rng: np.random.Generator) -> Floats:
-    """Return rotations uniform over all orientations: normal quaternions are."""
+    """Return random rotations, uniform over all orientations.
+
+    Parameters
+    ----------
+    count : int
+    rng : numpy.random.Generator
+
+    Returns
+    -------
+    array of shape (count, 3, 3)
+
+    Examples
+    --------
+    >>> random_rotations(5, np.random.default_rng(1)).shape
+    (5, 3, 3)
+    """
+    # A normally distributed quaternion has a uniformly distributed direction.
     return np.asarray(Rotation.from_quat(rng.normal(size=(count, 4))).as_matrix())
+
+
+def log_lags(longest: float, count: int) -> Ints:
+    """Return about `count` whole numbers from 1 to `longest`, evenly on a logarithmic scale.
+
+    Parameters
+    ----------
+    longest : float
+    count : int
+
+    Returns
+    -------
+    array of int
+
+    Examples
+    --------
+    >>> log_lags(100, 5).tolist()
+    [1, 3, 10, 32, 100]
+    """
+    return np.unique(np.rint(np.geomspace(1, longest, count)).astype(int))

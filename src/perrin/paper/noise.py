@@ -1,9 +1,9 @@
-"""Hunter et al. 2011, what do noise and sampling do? Section 4.1, Figs. 3 and 4, Eqs. 19 to 23."""
+"""Hunter et al. 2011, section 4.1: noise and sampling (Figs. 3 and 4, Eqs. 19 to 23)."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import lru_cache, partial
+from functools import lru_cache
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -17,7 +17,7 @@ from perrin.motion.floor import noise_floor
 from perrin.motion.simulate import add_noise, simulate_motion
 from perrin.motion.tracking import track_rotation
 from perrin.paper.claims import Claim, Item, Study, statistical
-from perrin.paper.method import NOISES, STEPS, R
+from perrin.paper.method import NOISES, STEPS, R, log_lags
 from perrin.plot.style import PALETTE
 
 if TYPE_CHECKING:
@@ -29,10 +29,11 @@ if TYPE_CHECKING:
     from perrin.motion.rigid_motion import RigidMotion
 
 
-_SECTION = "4.1 Noise, its subtraction, and sampling"
+_NOISE_SECTION = "4.1 Noise, its subtraction, and sampling"
 
 
-_SPEEDS = (1e-4, 1e-3)
+# Planted D_R of Figs. 3 and 4(b), rad^2 per time step.
+_PLANTED = (1e-4, 1e-3)
 
 
 _BODIES = {"tetrahedron": Cluster.tetrahedron, "pentahedron": Cluster.pentahedron}
@@ -45,19 +46,20 @@ _MARKERS = "osD^v"
 _RADII = (1.0, 1.5, 2.5)
 
 
-# Phi^2 is quadratic in the direction: x, y and z stand for all directions.
-_ALL = np.eye(3)
+# Phi^2 is quadratic in the direction, so the mean over x, y and z is that over all directions.
+_XYZ = np.eye(3)
 
 
-_STILL = 110_000  # frames: one value of Phi^2 is then known to 0.3 %
+# Frames of a stationary cluster: the relative error of one Phi^2 is then 0.3 %.
+_STATIONARY_FRAMES = 110_000
 
 
 @lru_cache(maxsize=4)  # Figs. 3 and 4(b) show the same tetrahedra
 def _noisy_curves(study: Study, shape: str, D: float) -> tuple[dict[float, LagCurve], ...]:
-    """Return the MSADs of one simulated body at every noise level, the first (0.0) without noise.
+    """Return the MSADs of one simulated body at every noise level (um), 0.0 included.
 
-    First those by the product of successive rotations, then, at the highest noise level, that by
-    the fit to a common shape.
+    The first dictionary holds those by the product of successive rotations, the second that by the
+    fit to a common shape, at the highest noise level.
     """
     rng = study.rng(f"{shape} {D}")
     truth = simulate_motion(_BODIES[shape](R), D_R=study.planted(D), dt=1.0, n_frames=STEPS + 1,
@@ -81,33 +83,32 @@ def figure_3(study: Study) -> Item:
     -------
     Item
     """
-    curves = {D: _noisy_curves(study, "tetrahedron", D)[0] for D in _SPEEDS}
+    curves = {D: _noisy_curves(study, "tetrahedron", D)[0] for D in _PLANTED}
     table = pd.concat(
         [_curve_rows(c, D, sigma) for D, each in curves.items() for sigma, c in each.items()],
         ignore_index=True,
     )
-    claims = [claim for D in _SPEEDS for claim in _diffusion_claims(curves[D], D)]
+    claims: list[Claim] = []
+    for D in _PLANTED:
+        claims += _diffusion_claims(curves[D], D)
 
-    draw = partial(_draw_figure_3, curves=curves)
+    def draw(figure: Figure) -> None:
+        for ax, D, panel in zip(figure.subplots(1, 2), _PLANTED, "ab", strict=True):
+            _draw_noisy(ax, curves[D], D)
+            ax.set_title(f"({panel}) $D_R$ = {D:g} rad²/ts", loc="left")
+            ax.legend(frameon=False)
+
     text = (
         f"Tetrahedra with R = {R:.3f} um, 10^4 steps, five noise levels, by the product of "
         "successive rotations."
     )
-    return Item("fig3", _SECTION, "Fig. 3: MSAD for different noise levels", text, table, draw,
-                tuple(claims), size=(10, 4.8))  # fmt: skip
-
-
-def _draw_figure_3(figure: Figure, curves: dict[float, dict[float, LagCurve]]) -> None:
-    """Draw the MSADs of each D_R on a panel of its own."""
-    for ax, D, panel in zip(figure.subplots(1, 2), _SPEEDS, "ab", strict=True):
-        _draw_noisy(ax, curves[D], D)
-        ax.set_title(f"({panel}) $D_R$ = {D:g} rad²/ts", loc="left")
-        ax.legend(frameon=False)
+    return Item("fig3", _NOISE_SECTION, "Fig. 3: MSAD for different noise levels", text, table,
+                draw, tuple(claims), size=(10, 4.8))  # fmt: skip
 
 
 def _curve_rows(curve: LagCurve, D: float, sigma: float) -> pd.DataFrame:
     """Return about 40 lags of a curve, evenly on a logarithmic scale."""
-    lags = np.unique(np.rint(np.geomspace(1, STEPS / 2, 40)).astype(int)) - 1
+    lags = log_lags(STEPS / 2, 40) - 1
     return pd.DataFrame({
         "D_R": D, "sigma_um": sigma, "lag_ts": curve.lagtime[lags], "msad": curve.value[lags],
         "stderr": curve.stderr[lags], "theory": 4 * D * curve.lagtime[lags],
@@ -149,7 +150,7 @@ def _draw_noisy(
     for color, sigma in zip(PALETTE, NOISES, strict=False):
         rows = _curve_rows(curves[sigma], D, sigma)
         value = rows["msad"] - (floors[sigma] if floors else 0.0)
-        # What the subtraction leaves below zero has no logarithm.
+        # Values that the subtraction makes negative have no logarithm.
         ax.loglog(rows["lag_ts"], value.where(value > 0), "-", color=color,
                   label=f"σ = {1e3 * sigma:.0f} nm")  # fmt: skip
     ax.loglog(rows["lag_ts"][::3], rows["theory"][::3], "o", mfc="none", mec="#222222",
@@ -168,65 +169,7 @@ def figure_4(study: Study) -> Item:
     -------
     Item
     """
-    table = _floors(study)
-    curves = {(s, D): _noisy_curves(study, s, D) for s in _BODIES for D in _SPEEDS}
-    claims = _floor_claims(table)
-    for (shape, D), each in curves.items():
-        claims += _collapse_claims(*each, shape=shape, D=D)
-
-    draw = partial(_draw_figure_4, table=table, curves=curves)
-    text = (
-        f"(a) Phi^2 at lag 1 of {_STILL} frames of stationary clusters, R = 1.0, 1.5 and 2.5 um, "
-        "noise 10 to 100 nm (sigma/R at most 0.1), by the product of successive rotations; filled "
-        "symbols tetrahedra, open ones pentahedra. (b) The MSADs of Fig. 3 less the Phi^2 that "
-        "their sigma predicts."
-    )
-    return Item("fig4", _SECTION, "Fig. 4: the noise floor and its subtraction", text, table, draw,
-                tuple(claims), size=(11, 4.8))  # fmt: skip
-
-
-def _draw_figure_4(
-    figure: Figure,
-    table: pd.DataFrame,
-    curves: dict[tuple[str, float], tuple[dict[float, LagCurve], ...]],
-) -> None:
-    """Draw the floors, and the MSADs of the tetrahedra less their floors."""
-    left, right = figure.subplots(1, 2)
-    _draw_floors(left, table)
-    floors = {s: noise_floor(Cluster.tetrahedron(R), sigma=s).phi2 for s in NOISES}
-    for D in _SPEEDS:
-        _draw_noisy(right, curves["tetrahedron", D][0], D, floors=floors)
-    right.set(ylabel="MSAD − $Φ^2$ (rad²)", ylim=(1e-4, None))
-    handles, labels = right.get_legend_handles_labels()
-    right.legend(handles[:6], labels[:6], frameon=False)
-    left.set_title("(a)", loc="left")
-    right.set_title("(b)", loc="left")
-
-
-def _chained(positions: Floats, body: Cluster) -> RigidMotion:
-    """Return the product of successive rotations of a stationary body as a motion (Eq. 13).
-
-    What `track_rotation` does besides (template, residuals, errors) is not needed here and would
-    take ten times as long.
-    """
-    step = kabsch(positions[1:], positions[:-1])
-    motion = simulate_motion(body, D_R=0.0, dt=1.0, n_frames=len(positions), rng=0)
-    return replace(motion, rotation=successive_product(step).copy())
-
-
-def _measured_floor(
-    body: Cluster, sigma: float, frames: int, rng: np.random.Generator, *, directions: Floats
-) -> float:
-    """Return the MSAD at lag 1 of a stationary body (Eqs. 19 and 21), rad^2."""
-    still = np.broadcast_to(body.positions, (frames, *body.positions.shape))
-    motion = _chained(add_noise(still, sigma=sigma, rng=rng), body)
-    walk = motion.rotational_displacement(directions)
-    return float(np.mean(np.sum(np.diff(walk, axis=0) ** 2, axis=2)))
-
-
-def _floors(study: Study) -> pd.DataFrame:
-    """Return measured and predicted Phi^2 for all bodies, sizes and noise levels."""
-    rng, frames, rows = study.rng("fig4"), study.repeats(_STILL), []
+    rng, frames, rows = study.rng("fig4"), study.repeats(_STATIONARY_FRAMES), []
     for shape, make in _BODIES.items():
         for radius in _RADII:
             body = make(radius)
@@ -234,12 +177,97 @@ def _floors(study: Study) -> pd.DataFrame:
                 n = len(body.positions)
                 rows.append({
                     "body": shape, "R_um": radius, "sigma_um": sigma,
-                    "phi2": _measured_floor(body, sigma, frames, rng, directions=_ALL),
+                    "phi2": measured_floor(body, sigma, frames, rng, directions=_XYZ),
                     "eq_23": 6 * sigma**2 / (n * radius**2),
                     "exact": noise_floor(body, sigma=sigma).phi2,
                 })  # fmt: skip
-    table = pd.DataFrame(rows)
-    return table.assign(ratio=table["phi2"] / table["eq_23"], stderr=1 / np.sqrt(frames))
+    table = pd.DataFrame(rows).eval("ratio = phi2 / eq_23").assign(stderr=1 / np.sqrt(frames))
+    curves = {(s, D): _noisy_curves(study, s, D) for s in _BODIES for D in _PLANTED}
+    claims = _floor_claims(table)
+    for (shape, D), (chain, common) in curves.items():
+        claims += _subtraction_claims(chain, common, shape=shape, D=D)
+
+    def draw(figure: Figure) -> None:
+        left, right = figure.subplots(1, 2)
+        _draw_floors(left, table)
+        floors = {s: noise_floor(Cluster.tetrahedron(R), sigma=s).phi2 for s in NOISES}
+        for D in _PLANTED:
+            _draw_noisy(right, curves["tetrahedron", D][0], D, floors=floors)
+        right.set(ylabel="MSAD − $Φ^2$ (rad²)", ylim=(1e-4, None))
+        handles, labels = right.get_legend_handles_labels()
+        right.legend(handles[:6], labels[:6], frameon=False)
+        left.set_title("(a)", loc="left")
+        right.set_title("(b)", loc="left")
+
+    text = (
+        f"(a) Phi^2 at lag 1 of {_STATIONARY_FRAMES} frames of stationary clusters, R = 1.0, 1.5 "
+        "and 2.5 um, noise 10 to 100 nm (sigma/R at most 0.1), by the product of successive "
+        "rotations; filled symbols tetrahedra, open ones pentahedra. (b) The MSADs of Fig. 3 less "
+        "the Phi^2 that their sigma predicts."
+    )
+    return Item("fig4", _NOISE_SECTION, "Fig. 4: the noise floor and its subtraction", text, table,
+                draw, tuple(claims), size=(11, 4.8))  # fmt: skip
+
+
+def product_motion(positions: Floats, body: Cluster) -> RigidMotion:
+    """Return the product of successive rotations of a stationary body as a motion (Eq. 13).
+
+    `track_rotation` computes the template, residuals and errors as well, which are not needed here
+    and take ten times as long.
+
+    Parameters
+    ----------
+    positions : array of shape (T, n, 3)
+        um.
+    body : Cluster
+        The body without noise.
+
+    Returns
+    -------
+    RigidMotion
+
+    Examples
+    --------
+    >>> body = Cluster.tetrahedron(1.0)
+    >>> motion = product_motion(np.broadcast_to(body.positions, (5, 4, 3)), body)
+    >>> bool(np.allclose(motion.rotation, np.eye(3)))
+    True
+    """
+    step = kabsch(positions[1:], positions[:-1])
+    motion = simulate_motion(body, D_R=0.0, dt=1.0, n_frames=len(positions), rng=0)
+    return replace(motion, rotation=successive_product(step).copy())
+
+
+def measured_floor(
+    body: Cluster, sigma: float, frames: int, rng: np.random.Generator, *, directions: Floats
+) -> float:
+    """Return the MSAD at lag 1 of a simulated stationary body (Eqs. 19 and 21), rad^2.
+
+    Parameters
+    ----------
+    body : Cluster
+    sigma : float
+        Localisation error, um.
+    frames : int
+    rng : numpy.random.Generator
+    directions : array of shape (k, 3)
+        Directions over which the MSAD is averaged.
+
+    Returns
+    -------
+    float
+
+    Examples
+    --------
+    >>> body, rng = Cluster.tetrahedron(1.0), np.random.default_rng(1)
+    >>> phi2 = measured_floor(body, 0.05, 4000, rng, directions=np.eye(3))
+    >>> abs(phi2 / (6 * 0.05**2 / 4) - 1) < 0.1
+    True
+    """
+    still = np.broadcast_to(body.positions, (frames, *body.positions.shape))
+    motion = product_motion(add_noise(still, sigma=sigma, rng=rng), body)
+    walk = motion.rotational_displacement(directions)
+    return float(np.mean(np.sum(np.diff(walk, axis=0) ** 2, axis=2)))
 
 
 def _floor_claims(table: pd.DataFrame) -> list[Claim]:
@@ -260,28 +288,24 @@ def _floor_claims(table: pd.DataFrame) -> list[Claim]:
             statistical(f"Phi^2 over 6 sigma^2/(n R^2), {shape}, all directions, {where}",
                         source, expected=1.0, measured=mean, stderr=error,
                         remark=f"Over all directions Phi^2 is {100 * mean - 100:+.2f} % off Eq. "
-                               f"23, as the exact expression says ({100 * exact - 100:+.2f} %)."),
+                               f"23, as the exact expression states ({100 * exact - 100:+.2f} %)."),
             statistical(f"Phi^2 over the exact expression, {shape}, all directions, {where}",
                         source, expected=1.0, measured=mean / exact, stderr=error),
         ]  # fmt: skip
-    return [*claims, _radius_claim(table)]
-
-
-def _radius_claim(table: pd.DataFrame) -> Claim:
-    """Check how Phi^2 of tetrahedra goes with their size."""
     tetra = table[(table["body"] == "tetrahedron") & (table["sigma_um"] == NOISES[0])]
     size = np.log(tetra["R_um"])
     slope = np.polyfit(size, np.log(tetra["phi2"]), 1)[0]
     error = float(tetra["stderr"].iloc[0] / np.sqrt(np.sum((size - size.mean()) ** 2)))
-    return statistical("exponent of Phi^2 in R, tetrahedra, sigma = 10 nm", "Eq. 23, section 4.1",
+    radius = statistical("exponent of Phi^2 in R, tetrahedra, sigma = 10 nm", "Eq. 23, section 4.1",
                        expected=-2.0, measured=float(slope), stderr=error)  # fmt: skip
+    return [*claims, radius]
 
 
-def _collapse_claims(
+def _subtraction_claims(
     chain: dict[float, LagCurve], common: dict[float, LagCurve], *, shape: str, D: float
 ) -> list[Claim]:
     """Compare the subtracted MSADs with 4 D_R dt: by product and by common shape."""
-    quiet, noisiest = NOISES[:-1], NOISES[-1:]
+    lags, quiet, noisiest = np.array([1, 2, 5, 10, 20, 50, 100]), NOISES[:-1], NOISES[-1:]
     body = _BODIES[shape](R)
     cases = (
         ("product, sigma = 10 to 70 nm", chain, quiet),
@@ -290,7 +314,13 @@ def _collapse_claims(
     )
     claims = []
     for name, curves, noises in cases:
-        worst, share = _worst_deviation(curves, noises, body, D)
+        deviations: list[tuple[float, float]] = []
+        for sigma in noises:
+            curve, floor = curves[sigma], noise_floor(body, sigma=sigma).phi2
+            excess = (curve.value - floor)[lags - 1] - 4 * D * lags
+            pulls, shares = excess / curve.stderr[lags - 1], excess / (4 * D * lags)
+            deviations += zip(pulls.tolist(), shares.tolist(), strict=True)
+        worst, share = max(deviations, key=lambda pair: abs(pair[0]))
         claims.append(
             Claim(
                 "MSAD less Phi^2 is 4 D_R dt: worst deviation in standard errors at seven "
@@ -301,20 +331,6 @@ def _collapse_claims(
             )
         )  # fmt: skip
     return claims
-
-
-def _worst_deviation(
-    curves: dict[float, LagCurve], noises: tuple[float, ...], body: Cluster, D: float
-) -> tuple[float, float]:
-    """Return the worst deviation of MSAD less Phi^2 in standard errors, and over 4 D_R dt."""
-    lags = np.array([1, 2, 5, 10, 20, 50, 100])
-    found = []
-    for sigma in noises:
-        curve, floor = curves[sigma], noise_floor(body, sigma=sigma).phi2
-        excess = (curve.value - floor)[lags - 1] - 4 * D * lags
-        found += list(zip(excess / curve.stderr[lags - 1], excess / (4 * D * lags), strict=True))
-    worst, share = max(found, key=lambda pair: abs(pair[0]))
-    return float(worst), float(share)
 
 
 def _draw_floors(ax: Axes, table: pd.DataFrame) -> None:
@@ -345,49 +361,20 @@ def bodies(study: Study) -> Item:
     -------
     Item
     """
-    rng, frames, sigma, rows = study.rng("bodies"), study.repeats(_STILL), 0.02, []
+    rng, frames, sigma, rows = study.rng("bodies"), study.repeats(_STATIONARY_FRAMES), 0.02, []
     clusters = {f"{n} touching spheres": Cluster.touching(n, 2.0) for n in range(3, 8)}
     clusters["pentahedron (Eq. 15)"] = Cluster.pentahedron(R)
     for name, body in clusters.items():
         n, own = len(body.positions), body.positions
         rows.append({
             "body": name, "n": n, "R_um": body.R,
-            "phi2": _measured_floor(body, sigma, frames, rng, directions=_ALL),
-            "phi2_particles": _measured_floor(body, sigma, frames, rng, directions=own),
+            "phi2": measured_floor(body, sigma, frames, rng, directions=_XYZ),
+            "phi2_particles": measured_floor(body, sigma, frames, rng, directions=own),
             "eq_23": 6 * sigma**2 / (n * body.R**2), "exact": noise_floor(body, sigma=sigma).phi2,
         })  # fmt: skip
     table = pd.DataFrame(rows)
-    # Unequal axes are fewer independent ones: at worst a trimer's, 4 % more error.
-    claims = _body_claims(table, 1.05 / np.sqrt(frames))
-
-    draw = partial(_draw_bodies, table=table, sigma=sigma)
-    text = (
-        "Stationary clusters of 3 to 7 touching spheres of 2 um, and the pentahedron of Eq. 15; "
-        "sigma = 20 nm, lag 1. Averaged over the directions of its own particles, the floor of a "
-        "body whose particles are all at R is 6 sigma^2/(n R^2) exactly; over all directions only "
-        "that of a spherical top is."
-    )
-    return Item("bodies", _SECTION, "The noise floor of other bodies", text, table, draw,
-                tuple(claims), size=(6.5, 4.6))  # fmt: skip
-
-
-def _draw_bodies(figure: Figure, table: pd.DataFrame, *, sigma: float) -> None:
-    """Draw measured, exact and approximate Phi^2 of each body."""
-    ax = figure.subplots()
-    x = table["n"] * table["R_um"] ** 2
-    ax.loglog(x, 6 * sigma**2 / x, "-", color="#222222", label="6 σ²/(n R²)")
-    ax.loglog(x, table["exact"], "x", color=PALETTE[1], ms=9, label="exact expression")
-    ax.loglog(x, table["phi2"], "o", mfc="none", mec=PALETTE[0], ms=9, label="measured")
-    for n, place, value in zip(table["n"][:5], x, table["phi2"], strict=False):
-        ax.annotate(f"n = {n}", (place, value), (8, 6), textcoords="offset points")
-    ax.annotate("Eq. 15", (x.iloc[5], table["phi2"].iloc[5]), (8, 6),
-                textcoords="offset points")  # fmt: skip
-    ax.set(xlabel="n R² (µm²)", ylabel="$Φ^2$ (rad²)")
-    ax.legend(frameon=False)
-
-
-def _body_claims(table: pd.DataFrame, error: float) -> list[Claim]:
-    """Compare Phi^2 of each body with Eq. 23, averaged in two ways, and with the exact one."""
+    # Unequal axes make the error larger, by 4 % at most (trimer).
+    error = 1.05 / np.sqrt(frames)
     claims, source = [], "Eq. 23, section 4.1"
     for _, row in table.iterrows():
         name, ratio = row["body"], row["phi2"] / row["eq_23"]
@@ -413,11 +400,32 @@ def _body_claims(table: pd.DataFrame, error: float) -> list[Claim]:
               "spheres, the particles' own directions", "Eq. 23, section 6", -1.0, slope, 0.02,
               "0.02")
     )  # fmt: skip
-    return claims
+
+    def draw(figure: Figure) -> None:
+        ax = figure.subplots()
+        x = table["n"] * table["R_um"] ** 2
+        ax.loglog(x, 6 * sigma**2 / x, "-", color="#222222", label="6 σ²/(n R²)")
+        ax.loglog(x, table["exact"], "x", color=PALETTE[1], ms=9, label="exact expression")
+        ax.loglog(x, table["phi2"], "o", mfc="none", mec=PALETTE[0], ms=9, label="measured")
+        for n, place, value in zip(table["n"][:5], x, table["phi2"], strict=False):
+            ax.annotate(f"n = {n}", (place, value), (8, 6), textcoords="offset points")
+        ax.annotate("Eq. 15", (x.iloc[5], table["phi2"].iloc[5]), (8, 6),
+                    textcoords="offset points")  # fmt: skip
+        ax.set(xlabel="n R² (µm²)", ylabel="$Φ^2$ (rad²)")
+        ax.legend(frameon=False)
+
+    text = (
+        "Stationary clusters of 3 to 7 touching spheres of 2 um, and the pentahedron of Eq. 15; "
+        "sigma = 20 nm, lag 1. Averaged over the directions of its own particles, the floor of a "
+        "body whose particles are all at R is 6 sigma^2/(n R^2) exactly; over all directions this "
+        "holds for a spherical top only."
+    )
+    return Item("bodies", _NOISE_SECTION, "The noise floor of other bodies", text, table, draw,
+                tuple(claims), size=(6.5, 4.6))  # fmt: skip
 
 
 def constancy(study: Study) -> Item:
-    """Follow the MSAD of stationary tetrahedra over lag time (Eq. 21).
+    """Compute the MSAD of stationary tetrahedra against lag time (Eq. 21).
 
     Parameters
     ----------
@@ -435,55 +443,45 @@ def constancy(study: Study) -> Item:
     for route, count in repeats.items():
         tracks = (add_noise(still, sigma=ratio, rng=rng) for _ in range(count))
         motions = (
-            _chained(x, body) if route == "product" else track_rotation(x, dt=1.0) for x in tracks
+            product_motion(x, body) if route == "product" else track_rotation(x, dt=1.0)
+            for x in tracks
         )
         values[route] = np.stack([msad(motion).value[:100] for motion in motions])
     table = pd.DataFrame({"lag_ts": np.arange(1, 101)})
+    reasons = {
+        "product": "errors of successive rotations do not cancel at second order",
+        "common shape": "the orientation does not drift, but phi is a sum of steps, whose noise "
+        "does not cancel at second order",
+    }
     claims = []
     for route, v in values.items():
         table[route.replace(" ", "_")] = v.mean(axis=0)
-        claims.append(_constancy_claim(route, v[:, 99] / v[:, 0].mean(), ratio=ratio))
+        rise = v[:, 99] / v[:, 0].mean()
+        claims.append(
+            statistical(
+                "MSADs of stationary clusters are constant over time: lag 100 over lag 1, "
+                f"{route}, sigma/R = {ratio}", "Eq. 21, section 4.1", expected=1.0,
+                measured=float(rise.mean()), stderr=float(rise.std(ddof=1) / np.sqrt(len(rise))),
+                remark=f"By the {route} the MSAD rises by {100 * (rise.mean() - 1):.0f} % from lag "
+                       f"1 to lag 100: {reasons[route]}.")
+        )  # fmt: skip
     floor = noise_floor(body, sigma=ratio).phi2
 
-    draw = partial(_draw_constancy, table=table, floor=floor)
+    def draw(figure: Figure) -> None:
+        ax = figure.subplots()
+        for color, route in zip(PALETTE, values, strict=False):
+            ax.plot(table["lag_ts"], table[route.replace(" ", "_")] / floor, color=color,
+                    label=route)  # fmt: skip
+        ax.axhline(1, color="#222222", lw=1, ls="--", label="$Φ^2$ (Eq. 23)")
+        ax.set(xlabel="Δt (ts)", ylabel="MSAD / $Φ^2$", ylim=(0.95, None))
+        ax.legend(frameon=False)
+
     text = (
         f"Stationary tetrahedra, sigma/R = {ratio}, 5000 steps, 40 repeats of the product and 24 "
         "of the fit to one common shape."
     )
-    return Item("constancy", _SECTION, "Is the noise floor constant over time?", text, table, draw,
-                tuple(claims), size=(6.5, 4.2))  # fmt: skip
-
-
-def _draw_constancy(figure: Figure, table: pd.DataFrame, *, floor: float) -> None:
-    """Draw the MSADs of both routes over the floor of Eq. 23."""
-    ax = figure.subplots()
-    for color, route in zip(PALETTE, _RISES, strict=False):
-        ax.plot(table["lag_ts"], table[route.replace(" ", "_")] / floor, color=color,
-                label=route)  # fmt: skip
-    ax.axhline(1, color="#222222", lw=1, ls="--", label="$Φ^2$ (Eq. 23)")
-    ax.set(xlabel="Δt (ts)", ylabel="MSAD / $Φ^2$", ylim=(0.95, None))
-    ax.legend(frameon=False)
-
-
-_RISES = {
-    "product": "errors of successive rotations do not cancel at second order",
-    "common shape": "the orientation does not drift, but phi adds up steps, whose noise does not "
-    "cancel at second order",
-}
-
-
-def _constancy_claim(route: str, rise: Floats, *, ratio: float) -> Claim:
-    """Check the rise of the MSAD from lag 1 to lag 100, one value for each repeat."""
-    return statistical(
-        f"MSADs of stationary clusters are constant over time: lag 100 over lag 1, {route}, "
-        f"sigma/R = {ratio}",
-        "Eq. 21, section 4.1",
-        expected=1.0,
-        measured=float(rise.mean()),
-        stderr=float(rise.std(ddof=1) / np.sqrt(len(rise))),
-        remark=f"By the {route} the MSAD rises by {100 * (rise.mean() - 1):.0f} % from lag 1 to "
-        f"lag 100: {_RISES[route]}.",
-    )
+    return Item("constancy", _NOISE_SECTION, "Is the noise floor constant over time?", text, table,
+                draw, tuple(claims), size=(6.5, 4.2))  # fmt: skip
 
 
 def sampling(study: Study) -> Item:
@@ -498,24 +496,9 @@ def sampling(study: Study) -> Item:
     Item
     """
     rng, steps = study.rng("sampling"), study.repeats(50_000)
-    parts = [_undersampled(x, scheme, steps if x < 1 else 10 * steps, study, rng)
+    parts = [_undersampled_motion(x, scheme, steps if x < 1 else 10 * steps, study, rng)
              for scheme in ("brownian", "euler") for x in (0.04, 0.1, 0.2, 0.4, 1.0)]  # fmt: skip
     table = pd.DataFrame(parts)
-    claims = _sampling_claims(table)
-
-    draw = partial(_draw_sampling, table=table)
-    text = (
-        "Noise-free clusters with one step every dt: how slow the motion appears, and how often "
-        "the particle nearest to where one was is another one. Expected at 4 D_R dt = 1: 0.9131 "
-        "from the heat kernel on SO(3), 0.9126 from the law of Eq. 16 by quadrature. Beside the "
-        "two rules stands the least error that 300 frames allow any estimator there."
-    )
-    return Item("sampling", _SECTION, "Sampling rules", text, table, draw, tuple(claims),
-                size=(10, 4.4))  # fmt: skip
-
-
-def _sampling_claims(table: pd.DataFrame) -> list[Claim]:
-    """Check the lower limit of the time between frames, and what happens at 4 D_R dt = 1."""
     last = table[table["msad_dt"] == 1.0].set_index("scheme")
     source = "section 4.1"
     shortest = noise_floor(Cluster.tetrahedron(R), sigma=0.1).phi2 / (4 * 1e-4)
@@ -534,20 +517,13 @@ def _sampling_claims(table: pd.DataFrame) -> list[Claim]:
         claims.append(
             Claim("particles are identified up to 4 D_R dt = 1: share of steps that nearest-"
                   f"neighbour linking gets wrong, {shape}", source, 0.0, lost, 0.01, "1 %",
-                  f"Nearest-neighbour linking loses a particle in "
-                  f"{100 * lost:.0f} % of the steps; 4 D_R dt <= 0.07 is safe.")
+                  f"Nearest-neighbour linking loses a particle in {100 * lost:.0f} % of the "
+                  "steps; 4 D_R dt <= 0.07 is safe.")
         )  # fmt: skip
-    return claims + _bound_claims()
-
-
-def _bound_claims() -> list[Claim]:
-    """Set the two rules beside the Cramer-Rao bound, 300 frames, noise unknown.
-
-    SNR = 4 D_R dt/Phi^2 is 1 at the lower limit; at the upper one it is 1/Phi^2, here 100.
-    """
-    source = "Eqs. 22-23, section 4.1"
+    # SNR = 4 D_R dt/Phi^2 is 1 at the lower limit and 1/Phi^2, here 100, at the upper one.
+    source = f"Eqs. 22-23, {source}"
     lower, upper, best = (cramer_rao(n_frames=300, snr=snr) for snr in (1.0, 100.0, 1e9))
-    return [
+    claims += [
         Claim("Cramer-Rao bound at the lower limit dt = Phi^2/(4 D_R): least relative error of D_R "
               "(%)", source, 10.0, 100 * lower, 0.005, "rounding"),
         Claim("Cramer-Rao bound at the upper limit dt = 1/(4 D_R) for Phi = 0.1 rad (%)", source,
@@ -556,32 +532,39 @@ def _bound_claims() -> list[Claim]:
               (lower / best) ** 2, 0.05, "rounding"),
     ]  # fmt: skip
 
+    def draw(figure: Figure) -> None:
+        left, right = figure.subplots(1, 2)
+        for color, (scheme, part) in zip(PALETTE, table.groupby("scheme"), strict=False):
+            label = {"brownian": "Brownian steps", "euler": "Eq. 16"}[scheme]
+            left.errorbar(part["msad_dt"], part["factor"], part["stderr"], fmt="o-", color=color,
+                          label=label)  # fmt: skip
+        left.set(xlabel="$4 D_R Δt$ (rad²)", ylabel="MSAD / $4 D_R Δt$")
+        left.legend(frameon=False)
+        brownian = table[table["scheme"] == "brownian"]
+        for color, shape in zip(PALETTE[2:], _BODIES, strict=False):
+            right.plot(brownian["msad_dt"], 100 * brownian[f"lost_{shape}"], "o-", color=color,
+                       label=shape)  # fmt: skip
+        right.set(xlabel="$4 D_R Δt$ (rad²)", ylabel="steps with a particle lost (%)")
+        right.legend(frameon=False)
 
-def _draw_sampling(figure: Figure, table: pd.DataFrame) -> None:
-    """Draw the apparent slowness and the share of steps lost."""
-    left, right = figure.subplots(1, 2)
-    for color, (scheme, part) in zip(PALETTE, table.groupby("scheme"), strict=False):
-        label = {"brownian": "Brownian steps", "euler": "Eq. 16"}[scheme]
-        left.errorbar(part["msad_dt"], part["factor"], part["stderr"], fmt="o-", color=color,
-                      label=label)  # fmt: skip
-    left.set(xlabel="$4 D_R Δt$ (rad²)", ylabel="MSAD / $4 D_R Δt$")
-    left.legend(frameon=False)
-    brownian = table[table["scheme"] == "brownian"]
-    for color, shape in zip(PALETTE[2:], _BODIES, strict=False):
-        right.plot(brownian["msad_dt"], 100 * brownian[f"lost_{shape}"], "o-", color=color,
-                   label=shape)  # fmt: skip
-    right.set(xlabel="$4 D_R Δt$ (rad²)", ylabel="steps with a particle lost (%)")
-    right.legend(frameon=False)
+    text = (
+        "Noise-free clusters with one step every dt: the apparent diffusion, and how often the "
+        "particle nearest to the last position of a particle is another one. Expected at "
+        "4 D_R dt = 1: 0.9131 from the heat kernel on SO(3), 0.9126 from the law of Eq. 16 by "
+        "quadrature. At the two limits the Cramer-Rao bound for 300 frames is given as well."
+    )
+    return Item("sampling", _NOISE_SECTION, "Sampling rules", text, table, draw, tuple(claims),
+                size=(10, 4.4))  # fmt: skip
 
 
-def _undersampled(
+def _undersampled_motion(
     x: float,
     scheme: Literal["brownian", "euler"],
     steps: int,
     study: Study,
     rng: np.random.Generator,
 ) -> dict[str, float | str]:
-    """Return the apparent slowness and the share of steps lost at 4 D_R dt = x."""
+    """Return MSAD/(4 D_R dt) and the share of wrongly linked steps at 4 D_R dt = x."""
     factors, lost = [], dict.fromkeys(_BODIES, 0.0)
     chunks = 10
     for _ in range(chunks):
@@ -590,15 +573,32 @@ def _undersampled(
         walk = truth.rotational_displacement(truth.template)
         factors.append(float(np.mean(np.sum(np.diff(walk, axis=0) ** 2, axis=2))) / x)
         for shape, make in _BODIES.items():
-            lost[shape] += _lost(truth.rotation, make(R).positions) / chunks
+            lost[shape] += linking_error(truth.rotation, make(R).positions) / chunks
     stderr = float(np.std(factors, ddof=1) / np.sqrt(chunks))
     return {"scheme": scheme, "msad_dt": x, "factor": float(np.mean(factors)), "stderr": stderr,
             **{f"lost_{shape}": share for shape, share in lost.items()}}  # fmt: skip
 
 
-def _lost(rotation: Floats, body: Floats) -> float:
-    """Return the share of steps in which a particle's nearest successor is another particle."""
+def linking_error(rotation: Floats, body: Floats) -> float:
+    """Return the share of steps in which a particle's nearest successor is another particle.
+
+    Parameters
+    ----------
+    rotation : array of shape (T, 3, 3)
+    body : array of shape (n, 3)
+        Positions of the particles, all at the same distance from the centre.
+
+    Returns
+    -------
+    float
+
+    Examples
+    --------
+    >>> half_turn = np.stack([np.eye(3), np.diag([-1.0, -1.0, 1.0])])
+    >>> linking_error(half_turn, np.array([[1.0, 0, 0], [-1.0, 0, 0]]))
+    1.0
+    """
     p = rotation @ body.T
-    # The nearest on a sphere has the largest dot product.
+    # On a sphere the nearest point has the largest dot product.
     near = np.argmax(np.swapaxes(p[:-1], 1, 2) @ p[1:], axis=2)
     return float(np.mean(np.any(near != np.arange(len(body)), axis=1)))

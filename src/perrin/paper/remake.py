@@ -1,4 +1,4 @@
-"""Hunter et al. 2011 remade: every equation, figure and table, from the public functions."""
+"""Reproduction of Hunter et al. 2011: every equation, figure and table."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from perrin.paper.claims import Claim, Item
 
 
-# In the order of the paper.
+# The items in the order of the paper.
 ITEMS: tuple[Callable[[Study], Item], ...] = (
     figure_1, challis, product, localisation, simulation, figure_2, axes, correlation,
     figure_3, figure_4, bodies, constancy, sampling, figure_5, table_1, conclusion, appendix,
@@ -30,9 +30,9 @@ ITEMS: tuple[Callable[[Study], Item], ...] = (
 _HEADING = """# The paper, claim by claim
 
 G. L. Hunter, K. V. Edmond, M. T. Elsesser and E. R. Weeks, "Tracking rotational diffusion of
-colloidal clusters", Optics Express 19, 17189 (2011), remade by `perrin paper`. Every number under
-"measured" comes from that run; a claim holds where it differs from the expected one by no more
-than the tolerance. Statistical tolerances are three standard errors: of more than a
+colloidal clusters", Optics Express 19, 17189 (2011), reproduced by `perrin paper`. Every number
+under "measured" is a result of that run. A claim holds if it differs from the expected number by no
+more than the tolerance. Statistical tolerances are three standard errors: of more than a
 hundred claims one may fail by chance with another seed."""
 
 
@@ -44,21 +44,22 @@ def reproduce(
     overwrite: bool = False,
     progress: Callable[[int, int, str], None] | None = None,
 ) -> tuple[Claim, ...]:
-    """Remake the paper into a folder, which appears whole or not at all.
+    """Reproduce the paper and write the results to a folder, complete or not at all.
 
     Parameters
     ----------
     folder : path
-        Gets a PNG, PDF and CSV for each item, ``claims.json``, ``claims.md`` and ``run.json``.
+        Place of a PNG, PDF and CSV file for each item, ``claims.json``, ``claims.md`` and
+        ``run.json``.
     seed : int
-        Of all random numbers; items draw independently of each other.
+        Seed of all random numbers; items draw independently of each other.
     planted_error : float
-        Relative error put on every D_R that is simulated while the expected values stay, to see
-        that the claims notice.
+        Relative error of every simulated D_R while the expected values stay the same, to test
+        whether the claims detect it.
     overwrite : bool
         Replace a folder that an earlier run has written.
     progress : callable, optional
-        Called with the number of items done, their total and the title of the one just finished.
+        Called with the number of finished items, their total, and the title of the last one.
 
     Returns
     -------

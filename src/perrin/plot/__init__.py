@@ -1,9 +1,12 @@
-"""Pictures of results and of images; the only subpackage that imports matplotlib."""
+"""Figures of results and of imaging quality; the only subpackage that imports matplotlib."""
 
 from perrin.plot.imaging import (
+    found_figure,
+    health_figure,
     imaging_of,
     least_turn,
     least_turns,
+    misfit_figure,
     plot_found,
     plot_health,
     plot_masses,
@@ -12,8 +15,18 @@ from perrin.plot.imaging import (
     plot_step_angles,
     plot_tracks,
     save_image_figures,
+    stack_frames,
+    step_angle_density,
+    tracks_figure,
 )
 from perrin.plot.results import (
+    MAX_CLUSTERS,
+    ModelLine,
+    curve_figure,
+    forest_figure,
+    model_line,
+    orientation_figure,
+    plot_angle,
     plot_cluster,
     plot_forest,
     plot_lag_curve,
@@ -22,16 +35,28 @@ from perrin.plot.results import (
     plot_presence,
     plot_residual,
     plot_van_hove,
+    residual_figure,
     save_figures,
 )
-from perrin.plot.style import legend_above, new_figure, save_figure
+from perrin.plot.style import PALETTE, legend_above, new_figure, save_figure, write_reason
 
 __all__ = [
+    "MAX_CLUSTERS",
+    "PALETTE",
+    "ModelLine",
+    "curve_figure",
+    "forest_figure",
+    "found_figure",
+    "health_figure",
     "imaging_of",
     "least_turn",
     "least_turns",
     "legend_above",
+    "misfit_figure",
+    "model_line",
     "new_figure",
+    "orientation_figure",
+    "plot_angle",
     "plot_cluster",
     "plot_forest",
     "plot_found",
@@ -47,7 +72,12 @@ __all__ = [
     "plot_step_angles",
     "plot_tracks",
     "plot_van_hove",
+    "residual_figure",
     "save_figure",
     "save_figures",
     "save_image_figures",
+    "stack_frames",
+    "step_angle_density",
+    "tracks_figure",
+    "write_reason",
 ]

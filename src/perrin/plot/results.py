@@ -1,4 +1,4 @@
-"""Pictures of results: functions that take an axes, draw one result on it, and return it."""
+"""Figures of results: each function draws one result on given axes and returns the axes."""
 
 from __future__ import annotations
 
@@ -12,7 +12,17 @@ from perrin._text import number_text, shortened, unit_text
 from perrin.curves.displacement import axes_weighted_equally
 from perrin.diffusion.estimate import value_text
 from perrin.geometry.rigid import degrees_of_freedom
-from perrin.plot.style import BLUE, GREY, INK, PALETTE, RED, legend_above, new_figure, save_figure
+from perrin.plot.style import (
+    BLUE,
+    GREY,
+    INK,
+    PALETTE,
+    RED,
+    legend_above,
+    new_figure,
+    save_figure,
+    write_reason,
+)
 
 if TYPE_CHECKING:
     import os
@@ -22,7 +32,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure as Figure
     from numpy.typing import ArrayLike
 
-    from perrin._arrays import Floats, Ints
+    from perrin._arrays import Ints
     from perrin.curves.displacement import LagCurve
     from perrin.curves.distributions import VanHove
     from perrin.diffusion.estimate import DiffusionEstimate
@@ -33,6 +43,7 @@ if TYPE_CHECKING:
     from perrin.run.results import ClusterResult, Pooled, Report
 
 
+# Style of the crosses that mark frames without a pose.
 _CROSS: dict[str, Any] = {
     "marker": "x",
     "ls": "none",
@@ -44,28 +55,30 @@ _CROSS: dict[str, Any] = {
 }
 
 
-_NAMES = {"rotation": ("MSAD", "$D_R$"), "translation": ("MSD", "$D_T$")}
+# Symbols of a curve and of its coefficient.
+_CURVE_NAMES = {"rotation": ("MSAD", "$D_R$"), "translation": ("MSD", "$D_T$")}
 
 
+# Names of methods in the legend.
 _METHODS = {"mle": "ML fit", "line": "line"}
 
 
 MAX_CLUSTERS = 12  # clusters that `save_figures` draws one by one
 
 
-_MANY = 60  # clusters beyond which a forest plot loses its names
+_NAMED_CLUSTERS = 60  # largest number of clusters whose names a forest plot shows
 
 
-_POINTS = 200  # lag times shown
+_SHOWN_LAGS = 200  # largest number of lag times shown
 
 
-_PATH = 5000  # frames of an orientation path shown
+_SHOWN_FRAMES = 5000  # largest number of frames of an orientation path shown
 
 
-_RASTER = 5000  # points beyond which a line is an image inside a PDF
+_VECTOR_FRAMES = 5000  # longer lines are images inside a PDF
 
 
-_PIXELS = 400  # of a drawn cluster, each way
+_CLUSTER_PIXELS = 400  # width and height of a drawn cluster
 
 
 def plot_lag_curve(
@@ -82,8 +95,8 @@ def plot_lag_curve(
     Parameters
     ----------
     curve : LagCurve
-        rad^2 or um^2. Lags beyond a quarter of the track are shown faint: few independent
-        displacements make them, and they wander together. About 200 lags are shown.
+        rad^2 or um^2. Lags beyond a quarter of the track are faint, because they are means over
+        few independent displacements. At most 200 lags are shown.
     ax : matplotlib.axes.Axes
     estimate : DiffusionEstimate, optional
         Adds the line 2 dof (D t + offset) and, as open circles, pure diffusion 2 dof D t.
@@ -92,32 +105,32 @@ def plot_lag_curve(
     label : str, optional
         Name of the points in the legend; default MSAD or MSD.
     tensor : DiffusionTensor, optional
-        Of rotation, for a curve whose directions weigh the body's axes unequally: the line and the
-        circles are then what it predicts for those directions, with a band of one standard error,
-        and not those of `estimate`, which counts all axes alike. Their <D> is the mean of the
-        tensor over the axes across the directions.
+        Rotational diffusion tensor, used for a curve whose directions weight the body's axes
+        unequally. Line and circles are then the prediction of the tensor for those directions,
+        with a band of one standard error, instead of those of `estimate`, which weights all axes
+        equally. <D> is the mean of the tensor over the axes perpendicular to the directions.
 
     Returns
     -------
     matplotlib.axes.Axes
     """
-    _draw_points(curve, ax=ax, label=label)
-    line = _model_line(curve, estimate, tensor)
+    _draw_curve_points(curve, ax=ax, label=label)
+    line = model_line(curve, estimate, tensor)
     if line is not None:
-        _draw_line(curve, line, ax=ax)
+        _draw_model_line(curve, line, ax=ax)
     unit = unit_text(curve.unit)
     if floor is not None and floor > 0:
-        said = f"noise floor {number_text(floor)} {unit}"
-        ax.axhline(floor, color=RED, lw=1.1, ls="--", label=said)
+        name = f"noise floor {number_text(floor)} {unit}"
+        ax.axhline(floor, color=RED, lw=1.1, ls="--", label=name)
     ax.set(xscale="log", yscale="log", xlabel="lag time (s)")
-    ax.set_ylabel(f"{_NAMES[curve.quantity][0]} ({unit})")
-    _set_range(ax, curve, line, floor)
+    ax.set_ylabel(f"{_CURVE_NAMES[curve.quantity][0]} ({unit})")
+    _set_curve_range(ax, curve, line, floor)
     legend_above(ax, ncols=2)
     return ax
 
 
 def plot_van_hove(result: VanHove, *, ax: Axes) -> Axes:
-    """Draw a distribution of rotations or displacements beside the Gaussian of the same width.
+    """Draw a distribution of rotations or displacements, and the Gaussian of the same width.
 
     Parameters
     ----------
@@ -127,11 +140,12 @@ def plot_van_hove(result: VanHove, *, ax: Axes) -> Axes:
     Returns
     -------
     matplotlib.axes.Axes
-        Logarithmic; empty bins are left out. The legend says alpha_2 and its error for a Gaussian.
+        Logarithmic; empty bins are left out. The legend has alpha_2 and its standard error for a
+        Gaussian.
     """
     middle = (result.edges[1:] + result.edges[:-1]) / 2
     full = result.density > 0
-    said = f"{result.n_pairs} pairs, α₂ = {number_text(result.alpha2, result.alpha2_stderr)}"
+    label = f"{result.n_pairs} pairs, α₂ = {number_text(result.alpha2, result.alpha2_stderr)}"
     ax.errorbar(
         middle[full],
         result.density[full],
@@ -140,7 +154,7 @@ def plot_van_hove(result: VanHove, *, ax: Axes) -> Axes:
         color=BLUE,
         ms=3.5,
         elinewidth=0.8,
-        label=said,
+        label=label,
     )
     ax.plot(middle, result.gaussian, "-", color=RED, lw=1.2, label="Gaussian of the same width")
     name = "rotation" if result.quantity == "rotation" else "displacement"
@@ -161,8 +175,8 @@ def plot_residual(motion: RigidMotion, *, ax: Axes) -> Axes:
     Parameters
     ----------
     motion : RigidMotion
-        Frames without a pose are marked by crosses at the bottom; the line is what sigma leads one
-        to expect of a frame with its number of particles.
+        Crosses at the bottom mark frames without a pose. The line is the residual that sigma
+        predicts for a frame with its number of particles.
     ax : matplotlib.axes.Axes
 
     Returns
@@ -173,20 +187,21 @@ def plot_residual(motion: RigidMotion, *, ax: Axes) -> Axes:
     rows = motion.fitted
     middle = float(np.median(motion.residual[rows]))
     scale, unit = (1e3, "nm") if middle < 1 else (1.0, "µm")
-    raster = len(motion.time) > _RASTER
+    raster = len(motion.time) > _VECTOR_FRAMES
     drawn = ax.plot(motion.time, scale * motion.residual, "-", color=BLUE, lw=0.7, marker=".")
     drawn[0].set(ms=2, rasterized=raster, label="rms residual of the frame")
-    expected = scale * _expected_residual(motion)
-    said = f"expected from σ = {number_text(scale * motion.sigma)} {unit}"
-    drawn = ax.plot(motion.time, expected, color=RED, lw=1.2, drawstyle="steps-mid", label=said)
-    drawn[0].set_rasterized(raster)
-    refused = _refused(motion)
-    if refused.size:
-        said = f"no pose ({refused.size} of {len(motion.time)} frames)"
+    # A pose has as many free coordinates as a rigid body, so n rms^2 = sigma^2 (d n - 6) in space.
+    n_present, expected = motion.n_present[rows], np.full(len(motion.time), np.nan)
+    free = degrees_of_freedom(n_present, motion.dimension)
+    expected[rows] = motion.sigma * np.sqrt(free / n_present)
+    label = f"expected from σ = {number_text(scale * motion.sigma)} {unit}"
+    style: dict[str, Any] = {"color": RED, "lw": 1.2, "drawstyle": "steps-mid"}
+    ax.plot(motion.time, scale * expected, label=label, rasterized=raster, **style)
+    absent = _without_pose(motion)
+    if absent.size:
+        label = f"no pose ({absent.size} of {len(motion.time)} frames)"
         bottom = ax.get_xaxis_transform()
-        ax.plot(
-            motion.time[refused], np.zeros(refused.size), **_CROSS, transform=bottom, label=said
-        )
+        ax.plot(motion.time[absent], np.zeros(absent.size), **_CROSS, transform=bottom, label=label)
     ax.set(xlabel="time (s)", ylabel=f"residual ({unit})")
     top = scale * float(np.max(motion.residual[rows]))
     ax.set_ylim(0, 1.08 * top if top > 0 else 1.0)
@@ -195,7 +210,7 @@ def plot_residual(motion: RigidMotion, *, ax: Axes) -> Axes:
 
 
 def plot_presence(motion: RigidMotion, *, ax: Axes) -> Axes:
-    """Draw the number of particles seen against time; crosses mark frames without a pose.
+    """Draw the number of detected particles against time; crosses mark frames without a pose.
 
     Parameters
     ----------
@@ -209,10 +224,10 @@ def plot_presence(motion: RigidMotion, *, ax: Axes) -> Axes:
     """
     n = len(motion.template)
     drawn = ax.plot(motion.time, motion.n_present, drawstyle="steps-mid", color=BLUE, lw=1)
-    drawn[0].set_rasterized(len(motion.time) > _RASTER)
-    refused = _refused(motion)
-    if refused.size:
-        ax.plot(motion.time[refused], motion.n_present[refused], **_CROSS)
+    drawn[0].set_rasterized(len(motion.time) > _VECTOR_FRAMES)
+    absent = _without_pose(motion)
+    if absent.size:
+        ax.plot(motion.time[absent], motion.n_present[absent], **_CROSS)
     ax.set(xlabel="time (s)", ylabel=f"seen (of {n})", ylim=(-0.3, n + 0.5))
     ax.set_yticks(np.arange(0, n + 1, max(1, n // 4)))
     return ax
@@ -226,29 +241,62 @@ def plot_orientations(motion: RigidMotion, *, ax: Axes) -> Axes:
     motion : RigidMotion
         At most 6 particles and 5000 frames are shown.
     ax : matplotlib.axes.Axes
-        With ``projection="3d"`` for a motion in space, ordinary for one in the plane.
+        Axes with ``projection="3d"`` for a motion in space, ordinary axes for one in the plane.
 
     Returns
     -------
     matplotlib.axes.Axes
         Lab axes without unit; in the plane rad against s.
     """
-    if motion.template.shape[1] == 2:
-        return _plot_angle(motion, ax=ax)
-    space: Any = ax  # matplotlib's 3-D axes carry no types
-    _draw_sphere(space)
+    if motion.dimension == 2:
+        return plot_angle(motion, ax=ax)
+    space: Any = ax  # matplotlib has no types for 3-D axes
+    _draw_unit_sphere(space)
+    up, turn = np.deg2rad([space.elev, space.azim])
+    viewer = np.array([np.cos(up) * np.cos(turn), np.cos(up) * np.sin(turn), np.sin(up)])
     length = np.linalg.norm(motion.template, axis=1)
     which = np.flatnonzero(length > 1e-6 * length.max())[: len(PALETTE)]
-    shown = np.arange(0, len(motion.time), -(-len(motion.time) // _PATH))
+    shown = np.arange(0, len(motion.time), -(-len(motion.time) // _SHOWN_FRAMES))
     shown = np.union1d(shown, motion.fitted[-1:])
     paths = motion.orientation(motion.template[which])
     for color, i, path in zip(PALETTE, which, np.swapaxes(paths, 0, 1), strict=False):
-        _draw_path(space, path[shown], color=color, label=f"particle {i}")
+        path = path[shown]
+        # A path is faint on the far side of the sphere and strong on the side of the viewer.
+        near = path @ viewer > 0
+        front = np.where(near[:, None], path, np.nan)
+        space.plot(*path.T, color=color, lw=0.5, alpha=0.35)
+        space.plot(*front.T, color=color, lw=1.0, label=f"particle {i}")
+        last = np.flatnonzero(np.isfinite(path[:, 0]))[-1]
+        end: dict[str, Any] = {"mec": color, "alpha": 1.0 if near[last] else 0.5}
+        space.plot(*path[[last]].T, "o", ms=8, mfc="white", mew=1.5, **end)
     space.plot([], [], "o", ms=6, mfc="white", mec=INK, label="last frame")
     space.legend(loc="upper left", frameon=False, fontsize="small", handlelength=1.2)
-    said = [f"particles 0 to {which[-1]} of {len(length)}"] if len(which) < len(length) else []
-    said += [f"{len(shown)} of {len(motion.time)} frames"] if len(shown) < len(motion.time) else []
-    space.text2D(0.98, 0.04, ", ".join(said), transform=ax.transAxes, ha="right", size="small")
+    parts = [f"particles 0 to {which[-1]} of {len(length)}"] if len(which) < len(length) else []
+    parts += [f"{len(shown)} of {len(motion.time)} frames"] if len(shown) < len(motion.time) else []
+    space.text2D(0.98, 0.04, ", ".join(parts), transform=ax.transAxes, ha="right", size="small")
+    return ax
+
+
+def plot_angle(motion: RigidMotion, *, ax: Axes) -> Axes:
+    """Draw the unbounded angle of a motion in the plane against time.
+
+    Parameters
+    ----------
+    motion : RigidMotion
+        Motion in the plane.
+    ax : matplotlib.axes.Axes
+
+    Returns
+    -------
+    matplotlib.axes.Axes
+        rad against s; a circle marks the last frame with a pose.
+    """
+    angle = motion.rotational_displacement([1.0, 0.0])[:, 0]
+    ax.plot(motion.time, angle, color=BLUE, lw=0.9, rasterized=len(angle) > _VECTOR_FRAMES)
+    last = motion.fitted[-1]
+    ax.plot(motion.time[last], angle[last], "o", ms=7, mfc="white", mec=BLUE, mew=1.4)
+    ax.axhline(0, color=GREY, lw=0.6)
+    ax.set(xlabel="time (s)", ylabel="angle φ (rad)")
     return ax
 
 
@@ -264,25 +312,26 @@ def plot_forest(
     Parameters
     ----------
     clusters : sequence of ClusterResult
-        One row each, the first on top; more than 60 are ordered by value and lose their names.
+        One row each, the first at the top. More than 60 are ordered by value, without names.
     ax : matplotlib.axes.Axes
     quantity : {"rotation", "translation"}
         D_R in rad^2/s or D_T in um^2/s.
     pooled : DiffusionEstimate, optional
-        A line with its 68 % and 95 % intervals as bands.
+        Drawn as a line with its 68 % and 95 % intervals as bands.
 
     Returns
     -------
     matplotlib.axes.Axes
-        Intervals of 68 % thick, 95 % thin; a triangle is a 95 % upper limit of what is not
-        resolved; an arrowhead at the edge is an end out of the picture.
+        Intervals of 68 % are thick, those of 95 % thin. A triangle is the 95 % upper limit of a
+        coefficient that is not resolved; an arrowhead at the edge marks the end of an interval
+        outside the axes.
     """
     both = [(c.D_R if quantity == "rotation" else c.D_T, c) for c in clusters]
     estimates = [e for e, _ in both if e.absent_because is None]
     clusters = [c for e, c in both if e.absent_because is None]
     if not estimates:
-        return _without_data(ax, f"no {_NAMES[quantity][1]}: {both[0][0].absent_because}")
-    many = len(clusters) > _MANY
+        return write_reason(ax, f"no {_CURVE_NAMES[quantity][1]}: {both[0][0].absent_because}")
+    many = len(clusters) > _NAMED_CLUSTERS
     rows = np.argsort([e.value for e in estimates]) if many else np.arange(len(estimates))
     ordered = [estimates[i] for i in rows]
     logarithmic, left, right = _forest_range([*ordered, *([pooled] if pooled else [])])
@@ -295,22 +344,15 @@ def plot_forest(
             ax.axvspan(low, high, color=RED, alpha=alpha, lw=0, zorder=0)
         ax.axvline(pooled.value, color=RED, lw=1, zorder=1, label=f"pooled, {value_text(pooled)}")
         ax.legend(loc="lower center", bbox_to_anchor=(0.5, 1), frameon=False, fontsize="small")
-    ax.set(xlabel=f"{_NAMES[quantity][1]} ({unit_text(estimates[0].unit)})")
+    ax.set(xlabel=f"{_CURVE_NAMES[quantity][1]} ({unit_text(estimates[0].unit)})")
     ax.set_ylim(len(rows) - 0.4, -0.6)
     if many:
         ax.set(ylabel="clusters, ordered by value")
         return ax
     names = [shortened(clusters[i].name) for i in rows]
-    # A name is the user's text: dollars in it are no formula.
+    # Names are text of the user: a dollar sign does not begin a formula.
     ax.set_yticks(np.arange(len(rows)), names, parse_math=False)
     ax.set(ylabel="cluster")
-    return ax
-
-
-def _without_data(ax: Axes, reason: str) -> Axes:
-    """State in an empty picture why there is nothing to draw."""
-    ax.set_axis_off()
-    ax.text(0.5, 0.5, reason, ha="center", va="center", transform=ax.transAxes)
     return ax
 
 
@@ -325,14 +367,22 @@ def plot_plan(plan: SamplingPlan, *, ax: Axes) -> Axes:
     Returns
     -------
     matplotlib.axes.Axes
-        s, and standard error over D_R in percent. The band is the window; the lines are broken
-        where particles cannot be told apart any more; dotted lines are the paper's two rules.
+        s, and standard error over D_R in percent. The band is the recommended window; lines are
+        dashed where particles can no longer be distinguished; dotted lines are the two limits of
+        Hunter et al. 2011.
     """
     if plan.dt_min < plan.dt_max:
-        said = f"window, {number_text(plan.dt_min)} to {number_text(plan.dt_max)} s"
-        ax.axvspan(plan.dt_min, plan.dt_max, color=GREY, alpha=0.18, lw=0, label=said)
-    _draw_errors(plan.error, plan, ax=ax, color=BLUE, label="noise estimated along (default)")
-    _draw_errors(plan.error_residual, plan, ax=ax, color=RED, label="noise from the residuals")
+        label = f"window, {number_text(plan.dt_min)} to {number_text(plan.dt_max)} s"
+        ax.axvspan(plan.dt_min, plan.dt_max, color=GREY, alpha=0.18, lw=0, label=label)
+    # Beyond dt_rigid particles can no longer be distinguished.
+    known = plan.dt <= plan.dt_rigid
+    rest = plan.dt >= plan.dt[known][-1]
+    for error, color, label in (
+        (plan.error, BLUE, "noise estimated along (default)"),
+        (plan.error_residual, RED, "noise from the residuals"),
+    ):
+        ax.plot(plan.dt[known], 100 * error[known], color=color, lw=1.8, label=label)
+        ax.plot(plan.dt[rest], 100 * error[rest], color=color, lw=1.4, ls=(0, (3, 2)))
     best: dict[str, Any] = {
         "mfc": "white",
         "mew": 1.6,
@@ -341,176 +391,14 @@ def plot_plan(plan: SamplingPlan, *, ax: Axes) -> Axes:
         "marker": "o",
         "zorder": 4,
     }
-    said = f"best, {number_text(plan.dt_best)} s"
-    ax.plot(plan.dt_best, 100 * plan.expected_error, mec=BLUE, label=said, **best)
+    label = f"best, {number_text(plan.dt_best)} s"
+    ax.plot(plan.dt_best, 100 * plan.expected_error, mec=BLUE, label=label, **best)
     ax.plot(plan.dt_best, 100 * plan.expected_error_residual, mec=RED, **best)
     lost: dict[str, Any] = {"color": GREY, "lw": 1.4, "ls": (0, (3, 2))}
-    ax.plot([], [], label="particles cannot be told apart", **lost)
+    ax.plot([], [], label="particles cannot be distinguished", **lost)
     rules = [plan.paper_dt_min, plan.paper_dt_max]
-    said = "rules of Hunter 2011, {} and {} s".format(*map(number_text, rules))
-    ax.vlines(rules, 0, 1, INK, lw=1.2, ls=":", label=said, transform=ax.get_xaxis_transform())
-    _scale_plan(plan, ax=ax)
-    legend_above(ax, ncols=2)
-    return ax
-
-
-def save_figures(report: Report, folder: str | os.PathLike[str]) -> list[Path]:
-    """Draw a report's figures into a folder that exists, each as PNG and PDF.
-
-    Parameters
-    ----------
-    report : Report
-        Of more than 12 clusters the first 12 are drawn one by one.
-    folder : path
-
-    Returns
-    -------
-    list of Path
-        ``clusters.*`` where there are several clusters, and for each cluster
-        ``cluster-<n>-curves.*``, ``-residuals.*`` and ``-orientations.*``.
-    """
-    place = Path(folder)
-    files: list[Path] = []
-    if report.pooled is not None and len(report.clusters) > 1:
-        files += save_figure(_forest_figure(report.clusters, report.pooled), place / "clusters")
-    kinds: dict[str, Callable[[ClusterResult], Figure]] = {
-        "curves": _curve_figure,
-        "residuals": _residual_figure,
-        "orientations": _orientation_figure,
-    }
-    for result in report.clusters[:MAX_CLUSTERS]:
-        for kind, draw in kinds.items():
-            files += save_figure(draw(result), place / f"cluster-{result.cluster}-{kind}")
-    return files
-
-
-def plot_cluster(cluster: Cluster, *, ax: Axes, diameter: float, view: ArrayLike) -> Axes:
-    """Draw a cluster as solid shaded spheres, seen without perspective.
-
-    Parameters
-    ----------
-    cluster : Cluster
-        In space.
-    ax : matplotlib.axes.Axes
-    diameter : float
-        Sphere diameter, um.
-    view : array_like, shape (3, 3)
-        Rotation that turns the body before it is seen along z, x to the right and y up.
-
-    Returns
-    -------
-    matplotlib.axes.Axes
-        um.
-    """
-    centers = cluster.positions @ np.asarray(view, dtype=np.float64).T
-    half = float(np.abs(centers).max()) + 0.6 * diameter
-    x = np.linspace(-half, half, _PIXELS)
-    height, color = np.full((_PIXELS, _PIXELS), -np.inf), np.ones((_PIXELS, _PIXELS, 3))
-    for i, center in enumerate(centers):
-        across = np.stack(np.meshgrid(x - center[0], x - center[1]), axis=-1) / (diameter / 2)
-        inside = np.sum(across**2, axis=-1)
-        up = np.sqrt(np.maximum(1 - inside, 0.0))
-        front = (inside < 1) & (center[2] + up * diameter / 2 > height)
-        height[front] = (center[2] + up * diameter / 2)[front]
-        # Light from over the left shoulder, and some from everywhere.
-        light = 0.35 + 0.65 * np.maximum((across @ [-0.4, 0.5] + up) / np.hypot(0.64, 1), 0)
-        own = np.array([int(PALETTE[i % len(PALETTE)][k : k + 2], 16) / 255 for k in (1, 3, 5)])
-        color[front] = (light[..., None] * own)[front]
-    ax.imshow(color, origin="lower", extent=(-half, half, -half, half), interpolation="bilinear")
-    ax.set(xlabel="x (µm)", ylabel="y (µm)")
-    return ax
-
-
-def _thinned(curve: LagCurve) -> Ints:
-    """Return the indices of the lags shown: those with a logarithm, evenly on its scale."""
-    count = len(curve.lagtime)
-    kept = np.arange(count)
-    if count > _POINTS:
-        even = np.geomspace(curve.lagtime[0], curve.lagtime[-1], _POINTS)
-        kept = np.unique(np.rint(np.interp(even, curve.lagtime, kept)).astype(np.int64))
-    return kept[curve.value[kept] > 0]
-
-
-def _draw_points(curve: LagCurve, *, ax: Axes, label: str | None) -> None:
-    """Draw the values and their band, faint beyond a quarter of the track."""
-    kept = _thinned(curve)
-    t, value, error = curve.lagtime[kept], curve.value[kept], curve.stderr[kept]
-    # A standard error as large as the value reaches zero, which a logarithm does not have.
-    low, high = np.maximum(value - error, 1e-2 * value), value + error
-    sure = t <= 0.25 * curve.lagtime[-1]
-    rest = t >= t[sure].max(initial=0.0)
-    points: dict[str, Any] = {"color": INK, "ms": 4, "mew": 0}
-    ax.plot(t[sure], value[sure], ".", label=label or _NAMES[curve.quantity][0], **points)
-    if not sure.all():
-        said = "beyond ¼ of the track"
-        ax.plot(t[~sure], value[~sure], ".", alpha=0.3, label=said, **points)
-    band: dict[str, Any] = {"color": GREY, "lw": 0}
-    ax.fill_between(t[sure], low[sure], high[sure], alpha=0.35, label="± 1 standard error", **band)
-    ax.fill_between(t[rest], low[rest], high[rest], alpha=0.15, **band)
-
-
-class _Line(NamedTuple):
-    """A straight line 2 dof (D t + offset), the standard error of D to show, and its name."""
-
-    D: float
-    offset: float
-    stderr: float
-    resolved: bool
-    symbol: str
-    text: str
-
-
-def _model_line(
-    curve: LagCurve, estimate: DiffusionEstimate | None, tensor: DiffusionTensor | None
-) -> _Line | None:
-    """Return the line to draw: the tensor's for directions that weigh axes unequally, or the fit.
-
-    D of the line is tr(D W)/dof with the weights W of the curve.
-    """
-    resolved = estimate is None or estimate.resolved
-    uneven = curve.weights is not None and not axes_weighted_equally(curve.weights)
-    if tensor is not None and curve.weights is not None and uneven and resolved:
-        D, stderr = tensor.weighted(curve.weights)
-        offset = float(np.einsum("ij,ij->", curve.weights, tensor.offset)) / curve.dof
-        symbol = r"$\langle D\rangle$"
-        said = f"tensor {symbol} = {number_text(D, stderr)} {unit_text(tensor.unit)}"
-        return _Line(D, offset, stderr, True, symbol, said)
-    if estimate is None:
-        return None
-    symbol = _NAMES[curve.quantity][1]
-    method = _METHODS.get(estimate.method, estimate.method)
-    said = f"{method} {symbol} {'= ' if estimate.resolved else ''}{value_text(estimate)}"
-    return _Line(estimate.value, estimate.offset, 0.0, estimate.resolved, symbol, said)
-
-
-def _draw_line(curve: LagCurve, line: _Line, *, ax: Axes) -> None:
-    """Add a line with its band, and pure diffusion where the coefficient is resolved."""
-    slope = 2 * curve.dof
-    first, last = curve.lagtime[0], curve.lagtime[-1]
-    t = np.geomspace(first, last, _POINTS)
-    value = slope * (line.D * t + line.offset)
-    # Blur can make the offset so negative that the line has no logarithm at short lags.
-    ax.plot(t, np.where(value > 0, value, np.nan), color=BLUE, lw=1.4, label=line.text)
-    if line.stderr > 0:
-        half = slope * line.stderr * t
-        low = np.maximum(value - half, 1e-2 * np.abs(value))
-        ax.fill_between(t, low, value + half, color=BLUE, lw=0, alpha=0.25)
-    if line.resolved:
-        sparse = np.geomspace(first, last, 12)
-        pure, said = slope * line.D * sparse, f"pure diffusion {slope} {line.symbol} t"
-        ax.plot(sparse, pure, "o", mfc="none", mec=BLUE, ms=5, mew=0.9, label=said)
-
-
-def _draw_errors(error: Floats, plan: SamplingPlan, *, ax: Axes, color: str, label: str) -> None:
-    """Draw an error in percent, broken where particles cannot be told apart any more."""
-    sure = plan.dt <= plan.dt_rigid
-    ax.plot(plan.dt[sure], 100 * error[sure], color=color, lw=1.8, label=label)
-    rest = plan.dt >= plan.dt[sure][-1]
-    ax.plot(plan.dt[rest], 100 * error[rest], color=color, lw=1.4, ls=(0, (3, 2)))
-
-
-def _scale_plan(plan: SamplingPlan, *, ax: Axes) -> None:
-    """Set axes on which both errors and the paper's rules are seen, with plain numbers."""
+    label = "rules of Hunter 2011, {} and {} s".format(*map(number_text, rules))
+    ax.vlines(rules, 0, 1, INK, lw=1.2, ls=":", label=label, transform=ax.get_xaxis_transform())
     ax.set(xscale="log", yscale="log", xlabel="time between frames (s)")
     ax.set_xlim(plan.dt[0], max(plan.dt[-1], 1.5 * plan.paper_dt_max))
     ax.set_ylabel("expected error of $D_R$ (%)")
@@ -521,10 +409,184 @@ def _scale_plan(plan: SamplingPlan, *, ax: Axes) -> None:
     ax.yaxis.set_minor_formatter(NullFormatter())
     ax.yaxis.set_major_formatter("{x:g}")
     ax.xaxis.set_major_formatter(lambda value, _: number_text(value, digits=1))
+    legend_above(ax, ncols=2)
+    return ax
 
 
-def _set_range(ax: Axes, curve: LagCurve, line: _Line | None, floor: float | None) -> None:
-    """Let points, fit and floor set the range; a band as wide as its values must not."""
+def save_figures(report: Report, folder: str | os.PathLike[str]) -> list[Path]:
+    """Write the figures of a report into an existing folder, each as PNG and PDF.
+
+    Parameters
+    ----------
+    report : Report
+        Of more than 12 clusters the first 12 get figures of their own.
+    folder : path
+
+    Returns
+    -------
+    list of Path
+        ``clusters.*`` if there are several clusters, and for each cluster
+        ``cluster-<n>-curves.*``, ``-residuals.*`` and ``-orientations.*``.
+    """
+    place = Path(folder)
+    files: list[Path] = []
+    if report.pooled is not None and len(report.clusters) > 1:
+        files += save_figure(forest_figure(report.clusters, report.pooled), place / "clusters")
+    kinds: dict[str, Callable[[ClusterResult], Figure]] = {
+        "curves": curve_figure,
+        "residuals": residual_figure,
+        "orientations": orientation_figure,
+    }
+    for result in report.clusters[:MAX_CLUSTERS]:
+        for kind, draw in kinds.items():
+            files += save_figure(draw(result), place / f"cluster-{result.cluster}-{kind}")
+    return files
+
+
+def plot_cluster(cluster: Cluster, *, ax: Axes, diameter: float, view: ArrayLike) -> Axes:
+    """Draw a cluster as shaded spheres in parallel projection.
+
+    Parameters
+    ----------
+    cluster : Cluster
+        Cluster in three dimensions.
+    ax : matplotlib.axes.Axes
+    diameter : float
+        Sphere diameter, um.
+    view : array_like, shape (3, 3)
+        Rotation of the body before the projection along z; x points to the right and y up.
+
+    Returns
+    -------
+    matplotlib.axes.Axes
+        um.
+    """
+    centers = cluster.positions @ np.asarray(view, dtype=np.float64).T
+    half = float(np.abs(centers).max()) + 0.6 * diameter
+    x = np.linspace(-half, half, _CLUSTER_PIXELS)
+    shape = (_CLUSTER_PIXELS, _CLUSTER_PIXELS)
+    height, color = np.full(shape, -np.inf), np.ones((*shape, 3))
+    for i, center in enumerate(centers):
+        across = np.stack(np.meshgrid(x - center[0], x - center[1]), axis=-1) / (diameter / 2)
+        inside = np.sum(across**2, axis=-1)
+        up = np.sqrt(np.maximum(1 - inside, 0.0))
+        front = (inside < 1) & (center[2] + up * diameter / 2 > height)
+        height[front] = (center[2] + up * diameter / 2)[front]
+        # Diffuse reflection of a lamp at the upper left, and ambient light.
+        brightness = 0.35 + 0.65 * np.maximum((across @ [-0.4, 0.5] + up) / np.hypot(0.64, 1), 0)
+        own = np.array([int(PALETTE[i % len(PALETTE)][k : k + 2], 16) / 255 for k in (1, 3, 5)])
+        color[front] = (brightness[..., None] * own)[front]
+    ax.imshow(color, origin="lower", extent=(-half, half, -half, half), interpolation="bilinear")
+    ax.set(xlabel="x (µm)", ylabel="y (µm)")
+    return ax
+
+
+class ModelLine(NamedTuple):
+    """Straight line of a curve against lag time, 2 dof (D t + offset).
+
+    Attributes
+    ----------
+    D : float
+        Diffusion coefficient of the line, rad^2/s or um^2/s.
+    offset : float
+        Noise variance of one coordinate, rad^2 or um^2.
+    stderr : float
+        Standard error of D that is shown as a band; 0 for no band.
+    resolved : bool
+        Whether D differs from zero.
+    symbol : str
+        Symbol of the coefficient in the legend.
+    text : str
+        Legend of the line.
+    """
+
+    D: float
+    offset: float
+    stderr: float
+    resolved: bool
+    symbol: str
+    text: str
+
+
+def model_line(
+    curve: LagCurve, estimate: DiffusionEstimate | None, tensor: DiffusionTensor | None
+) -> ModelLine | None:
+    """Return the line of a curve: that of the tensor where its directions weight axes unequally.
+
+    Parameters
+    ----------
+    curve : LagCurve
+    estimate : DiffusionEstimate or None
+    tensor : DiffusionTensor or None
+
+    Returns
+    -------
+    ModelLine or None
+        D is tr(D W)/dof with the weights W of the curve, or the estimate's value; None without an
+        estimate and a tensor that applies.
+    """
+    resolved = estimate is None or estimate.resolved
+    uneven = curve.weights is not None and not axes_weighted_equally(curve.weights)
+    if tensor is not None and curve.weights is not None and uneven and resolved:
+        D, stderr = tensor.weighted(curve.weights)
+        offset = float(np.einsum("ij,ij->", curve.weights, tensor.offset)) / curve.dof
+        symbol = r"$\langle D\rangle$"
+        text = f"tensor {symbol} = {number_text(D, stderr)} {unit_text(tensor.unit)}"
+        return ModelLine(D, offset, stderr, True, symbol, text)
+    if estimate is None:
+        return None
+    symbol = _CURVE_NAMES[curve.quantity][1]
+    method = _METHODS.get(estimate.method, estimate.method)
+    text = f"{method} {symbol} {'= ' if estimate.resolved else ''}{value_text(estimate)}"
+    return ModelLine(estimate.value, estimate.offset, 0.0, estimate.resolved, symbol, text)
+
+
+def _draw_curve_points(curve: LagCurve, *, ax: Axes, label: str | None) -> None:
+    """Draw the values and their band, faint beyond a quarter of the track."""
+    count = len(curve.lagtime)
+    kept = np.arange(count)
+    if count > _SHOWN_LAGS:
+        even = np.geomspace(curve.lagtime[0], curve.lagtime[-1], _SHOWN_LAGS)
+        kept = np.unique(np.rint(np.interp(even, curve.lagtime, kept)).astype(np.int64))
+    kept = kept[curve.value[kept] > 0]
+    t, value, error = curve.lagtime[kept], curve.value[kept], curve.stderr[kept]
+    # Where the standard error is as large as the value, the band would reach zero.
+    low, high = np.maximum(value - error, 1e-2 * value), value + error
+    sure = t <= 0.25 * curve.lagtime[-1]
+    rest = t >= t[sure].max(initial=0.0)
+    points: dict[str, Any] = {"color": INK, "ms": 4, "mew": 0}
+    name = label or _CURVE_NAMES[curve.quantity][0]
+    ax.plot(t[sure], value[sure], ".", label=name, **points)
+    if not sure.all():
+        name = "beyond ¼ of the track"
+        ax.plot(t[~sure], value[~sure], ".", alpha=0.3, label=name, **points)
+    band: dict[str, Any] = {"color": GREY, "lw": 0}
+    ax.fill_between(t[sure], low[sure], high[sure], alpha=0.35, label="± 1 standard error", **band)
+    ax.fill_between(t[rest], low[rest], high[rest], alpha=0.15, **band)
+
+
+def _draw_model_line(curve: LagCurve, line: ModelLine, *, ax: Axes) -> None:
+    """Draw a line with its band, and pure diffusion if the coefficient is resolved."""
+    slope = 2 * curve.dof
+    first, last = curve.lagtime[0], curve.lagtime[-1]
+    t = np.geomspace(first, last, _SHOWN_LAGS)
+    value = slope * (line.D * t + line.offset)
+    # With motion blur the offset can be so negative that the line is negative at short lags.
+    ax.plot(t, np.where(value > 0, value, np.nan), color=BLUE, lw=1.4, label=line.text)
+    if line.stderr > 0:
+        half = slope * line.stderr * t
+        low = np.maximum(value - half, 1e-2 * np.abs(value))
+        ax.fill_between(t, low, value + half, color=BLUE, lw=0, alpha=0.25)
+    if line.resolved:
+        sparse = np.geomspace(first, last, 12)
+        pure, name = slope * line.D * sparse, f"pure diffusion {slope} {line.symbol} t"
+        ax.plot(sparse, pure, "o", mfc="none", mec=BLUE, ms=5, mew=0.9, label=name)
+
+
+def _set_curve_range(
+    ax: Axes, curve: LagCurve, line: ModelLine | None, floor: float | None
+) -> None:
+    """Set the range from points, line and floor, without the band, which can be much wider."""
     shown = curve.value[curve.value > 0]
     if shown.size == 0:
         return
@@ -535,32 +597,19 @@ def _set_range(ax: Axes, curve: LagCurve, line: _Line | None, floor: float | Non
         low = high = np.append(shown, ends[ends > 0])
     if floor is not None and floor > 0:
         low = np.append(low, floor)
-    # What lies far below the curve would leave no room for the curve.
+    # A floor far below the curve is left out of the range.
     bottom, top = max(low.min(), 1e-4 * shown.min()), high.max()
     margin = max(top / bottom, 10) ** 0.06
     ax.set_ylim(bottom / margin, top * margin)
 
 
-def _refused(motion: RigidMotion) -> Ints:
+def _without_pose(motion: RigidMotion) -> Ints:
     """Return the indices of the frames without a pose."""
     return np.setdiff1d(np.arange(len(motion.time)), motion.fitted)
 
 
-def _expected_residual(motion: RigidMotion) -> Floats:
-    """Return the rms residual that sigma predicts for each frame, um.
-
-    Of the d n coordinates a pose takes up 6 (3 in the plane), so n rms^2 = sigma^2 (d n - 6).
-    """
-    d, n = motion.template.shape[1], motion.n_present
-    expected = np.full(len(n), np.nan)
-    rows = motion.fitted
-    free = degrees_of_freedom(n[rows], d)
-    expected[rows] = motion.sigma * np.sqrt(free / n[rows])
-    return expected
-
-
-def _draw_sphere(ax: Any) -> None:  # noqa: ANN401
-    """Draw a light sphere with lab axes, seen without perspective, and no box around it."""
+def _draw_unit_sphere(ax: Any) -> None:  # noqa: ANN401
+    """Draw a grid on the unit sphere with lab axes, in parallel projection, without a box."""
     polar, around = np.linspace(0, np.pi, 37), np.linspace(0, 2 * np.pi, 73)
     grid = {"color": "#cccccc", "lw": 0.4, "zorder": 0}
     for z in np.cos(polar[6:-1:6]):
@@ -578,30 +627,6 @@ def _draw_sphere(ax: Any) -> None:  # noqa: ANN401
     ax.set_axis_off()
 
 
-def _draw_path(ax: Any, path: Floats, *, color: str, label: str) -> None:  # noqa: ANN401
-    """Draw a path on the sphere and its end: faint behind, strong on the side of the viewer."""
-    up, turn = np.deg2rad([ax.elev, ax.azim])
-    viewer = np.array([np.cos(up) * np.cos(turn), np.cos(up) * np.sin(turn), np.sin(up)])
-    near = path @ viewer > 0
-    front = np.where(near[:, None], path, np.nan)
-    ax.plot(*path.T, color=color, lw=0.5, alpha=0.35)
-    ax.plot(*front.T, color=color, lw=1.0, label=label)
-    last = np.flatnonzero(np.isfinite(path[:, 0]))[-1]
-    strength = 1.0 if near[last] else 0.5
-    ax.plot(*path[[last]].T, "o", ms=8, mfc="white", mec=color, mew=1.5, alpha=strength)
-
-
-def _plot_angle(motion: RigidMotion, *, ax: Axes) -> Axes:
-    """Draw the unbounded angle of a motion in the plane."""
-    angle = motion.rotational_displacement([1.0, 0.0])[:, 0]
-    ax.plot(motion.time, angle, color=BLUE, lw=0.9, rasterized=len(angle) > _RASTER)
-    last = motion.fitted[-1]
-    ax.plot(motion.time[last], angle[last], "o", ms=7, mfc="white", mec=BLUE, mew=1.4)
-    ax.axhline(0, color=GREY, lw=0.6)
-    ax.set(xlabel="time (s)", ylabel="angle φ (rad)")
-    return ax
-
-
 def _forest_range(estimates: Sequence[DiffusionEstimate]) -> tuple[bool, float, float]:
     """Return whether the axis is logarithmic, and its two ends."""
     ends = np.array([(e.value, *e.ci95) for e in estimates])
@@ -611,7 +636,7 @@ def _forest_range(estimates: Sequence[DiffusionEstimate]) -> tuple[bool, float, 
         return False, -1.0, 1.0
     values = np.array([e.value for e in estimates if e.resolved and e.value > 0])
     if values.size and values.max() > 20 * values.min():
-        # Intervals that reach down to nearly nothing must not stretch the axis to them.
+        # The axis does not extend to the ends of intervals that almost reach zero.
         return True, max(positive.min(), 0.03 * values.min()) / 1.5, positive.max() * 1.5
     high = positive.max()
     if values.size:
@@ -624,7 +649,7 @@ def _forest_range(estimates: Sequence[DiffusionEstimate]) -> tuple[bool, float, 
 def _draw_intervals(
     estimates: Sequence[DiffusionEstimate], *, ax: Axes, left: float, right: float, thin: bool
 ) -> None:
-    """Draw values, intervals, limits, and arrowheads where an interval leaves the picture."""
+    """Draw values, intervals and limits, and arrowheads where an interval leaves the axes."""
     rows = np.arange(len(estimates))
     value = np.array([e.value for e in estimates])
     resolved = np.array([e.resolved for e in estimates], dtype=np.bool_)
@@ -633,43 +658,61 @@ def _draw_intervals(
         low, high = np.clip(ends, left, right).T
         seen = (low < right) & (high > left)
         ax.hlines(rows[seen], low[seen], high[seen], color=color, lw=width / (1 + thin))
-    look: dict[str, Any] = {"ms": 2, "color": "white"} if thin else {"ms": 5, "color": INK}
-    ax.plot(value[resolved], rows[resolved], "o", mew=0, **look)
+    dots: dict[str, Any] = {"ms": 2, "color": "white"} if thin else {"ms": 5, "color": INK}
+    ax.plot(value[resolved], rows[resolved], "o", mew=0, **dots)
     limits = np.minimum(ci95[:, 1], right)
     beyond, below = (ci95[:, 1] > right) & resolved, (ci95[:, 0] < left) & resolved
     edge: dict[str, Any] = {"ls": "none", "clip_on": False, "mec": BLUE, "mfc": BLUE, "ms": 4}
     limit = edge | {"mec": INK, "mfc": "white", "ms": 3 if thin else 7}
-    for which, x, marker, look in (
+    for which, x, marker, style in (
         (~resolved, limits, "<", limit),
         (beyond, np.full(len(rows), right), ">", edge),
         (below, np.full(len(rows), left), "<", edge),
     ):
-        # An unclipped line without points would still claim the figure's corner in the layout.
+        # The layout counts an empty unclipped line as a point in the corner of the figure.
         if which.any():
-            ax.plot(x[which], rows[which], marker=marker, **look)
+            ax.plot(x[which], rows[which], marker=marker, **style)
 
 
-def _curve_figure(result: ClusterResult) -> Figure:
-    """Draw MSAD and MSD side by side."""
+def curve_figure(result: ClusterResult) -> Figure:
+    """Return a figure of the MSAD and the MSD of a cluster.
+
+    Parameters
+    ----------
+    result : ClusterResult
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+    """
     figure = new_figure(10, 4.6)
     left, right = figure.subplots(1, 2)
     weights, floor = result.msad.weights, result.noise.phi2
     if weights is not None:
-        # Both ends of a turn carry the error of the orientation, across the directions averaged.
+        # Both ends of a rotation have the error of the orientation, perpendicular to a direction.
         floor = 2 * float(np.einsum("ij,ij->", weights, result.noise.covariance))
     plot_lag_curve(result.msad, ax=left, estimate=result.D_R, floor=floor, tensor=result.tensor)
     if result.D_T.absent_because is not None:
-        _without_data(right, f"no {_NAMES['translation'][1]}: {result.D_T.absent_because}")
+        write_reason(right, f"no {_CURVE_NAMES['translation'][1]}: {result.D_T.absent_because}")
         return figure
     motion = result.motion
-    # Both ends of a displacement carry the centre's error, on each axis.
-    floor = 2 * motion.template.shape[1] * float(np.mean(motion.center_variance[motion.fitted]))
+    # Both ends of a displacement have the error of the centre, along each axis.
+    floor = 2 * motion.dimension * float(np.mean(motion.center_variance[motion.fitted]))
     plot_lag_curve(result.msd, ax=right, estimate=result.D_T, floor=floor)
     return figure
 
 
-def _residual_figure(result: ClusterResult) -> Figure:
-    """Draw residual over presence, one time axis."""
+def residual_figure(result: ClusterResult) -> Figure:
+    """Return a figure of the residuals and of the number of detected particles against time.
+
+    Parameters
+    ----------
+    result : ClusterResult
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+    """
     figure = new_figure(10, 4.2)
     top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=[2.4, 1])
     plot_residual(result.motion, ax=top)
@@ -678,23 +721,42 @@ def _residual_figure(result: ClusterResult) -> Figure:
     return figure
 
 
-def _orientation_figure(result: ClusterResult) -> Figure:
-    """Draw the paths on the sphere, or the angle in the plane."""
-    planar = result.motion.template.shape[1] == 2
+def orientation_figure(result: ClusterResult) -> Figure:
+    """Return a figure of the paths on the unit sphere, or of the angle in the plane.
+
+    Parameters
+    ----------
+    result : ClusterResult
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+    """
+    planar = result.motion.dimension == 2
     figure = new_figure(10, 3.6) if planar else new_figure(6, 6)
     ax = figure.add_subplot() if planar else figure.add_subplot(projection="3d")
     plot_orientations(result.motion, ax=ax)
     return figure
 
 
-def _forest_figure(clusters: Sequence[ClusterResult], pooled: Pooled) -> Figure:
-    """Draw D_R and D_T of all clusters side by side, as high as the list is long."""
-    rows = len(clusters) if len(clusters) <= _MANY else 40
+def forest_figure(clusters: Sequence[ClusterResult], pooled: Pooled) -> Figure:
+    """Return a figure of D_R and D_T of all clusters, as high as the list is long.
+
+    Parameters
+    ----------
+    clusters : sequence of ClusterResult
+    pooled : Pooled
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+    """
+    rows = len(clusters) if len(clusters) <= _NAMED_CLUSTERS else 40
     figure = new_figure(10, 1.6 + 0.2 * rows)
     left, right = figure.subplots(1, 2)
     plot_forest(clusters, ax=left, quantity="rotation", pooled=pooled.D_R)
     plot_forest(clusters, ax=right, quantity="translation", pooled=pooled.D_T)
-    if len(clusters) <= _MANY:
+    if len(clusters) <= _NAMED_CLUSTERS:
         right.tick_params(labelleft=False)
         right.set_ylabel("")
     return figure

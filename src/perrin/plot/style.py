@@ -1,4 +1,4 @@
-"""Colours, figures and legends shared by all pictures."""
+"""Colours, figures and legends that all figures use."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes as Axes
 
 
-# Okabe and Ito's colours, told apart by colour-blind readers and in grey print.
+# Colours of Okabe and Ito, which colour-blind readers and grey prints distinguish.
 INK, BLUE, RED, GREY = "#222222", "#0072B2", "#D55E00", "#8a8a8a"
 
 
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 
 
-_DPI = 150
+DPI = 150  # resolution of PNG files
 
 
 def new_figure(width: float, height: float) -> Figure:
-    """Return an empty figure of a size in inches, laid out so that labels never collide.
+    """Return an empty figure whose layout keeps labels apart.
 
     Parameters
     ----------
     width, height : float
-        Inches.
+        Size in inches.
 
     Returns
     -------
@@ -45,7 +45,7 @@ def save_figure(figure: Figure, stem: Path) -> list[Path]:
     ----------
     figure : matplotlib.figure.Figure
     stem : Path
-        The files' path without its suffix.
+        Path of the files without suffix.
 
     Returns
     -------
@@ -54,14 +54,21 @@ def save_figure(figure: Figure, stem: Path) -> list[Path]:
     FigureCanvasAgg(figure)
     files = [stem.with_name(stem.name + suffix) for suffix in (".png", ".pdf")]
     for file in files:
-        figure.savefig(file, dpi=_DPI)
-        # The layout found for the first file serves the second.
+        figure.savefig(file, dpi=DPI)
+        # The layout of the first file is used for the second one.
         figure.set_layout_engine("none")
     return files
 
 
 def legend_above(ax: Axes, *, ncols: int) -> None:
-    """Put the legend over the axes, where it hides nothing."""
+    """Draw the legend above the axes.
+
+    Parameters
+    ----------
+    ax : matplotlib.axes.Axes
+    ncols : int
+        Number of columns of the legend.
+    """
     ax.legend(
         loc="lower left",
         bbox_to_anchor=(0, 1),
@@ -72,3 +79,26 @@ def legend_above(ax: Axes, *, ncols: int) -> None:
         handlelength=1.6,
         columnspacing=1.2,
     )
+
+
+def write_reason(ax: Axes, reason: str, *, framed: bool = False) -> Axes:
+    """Write on empty axes why there is nothing to draw.
+
+    Parameters
+    ----------
+    ax : matplotlib.axes.Axes
+    reason : str
+    framed : bool
+        Keep the frame of the axes and write in grey.
+
+    Returns
+    -------
+    matplotlib.axes.Axes
+    """
+    text = ax.text(0.5, 0.5, reason, ha="center", va="center", transform=ax.transAxes)
+    if framed:
+        text.set_color(GREY)
+        ax.set(xticks=[], yticks=[])
+    else:
+        ax.set_axis_off()
+    return ax

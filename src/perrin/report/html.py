@@ -1,4 +1,4 @@
-"""Pages of HTML that need no other file: their templates, and pictures put into their text."""
+"""HTML pages that need no other file: templates, and pictures as data URLs."""
 
 from __future__ import annotations
 
@@ -14,23 +14,26 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
 
-def render_page(template: str, **values: Any) -> str:  # noqa: ANN401 (whatever templates show)
+def render_page(template: str, **values: Any) -> str:  # noqa: ANN401 (values of any type)
     """Fill a template of the package.
 
     Parameters
     ----------
     template : str
-        "report" or "quality".
+        "report" or "imaging".
     **values
-        What the template shows. Text of users (labels, paths) goes through the template alone,
-        which escapes it.
+        Values of the template's variables. The template escapes them, because labels and paths
+        are text of users.
 
     Returns
     -------
     str
     """
+    folder = files("perrin.report") / "templates"
     environment = Environment(
-        loader=FunctionLoader(_source),
+        loader=FunctionLoader(
+            lambda name: (folder / f"{name}.html.jinja").read_text(encoding="utf-8")
+        ),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
@@ -40,14 +43,45 @@ def render_page(template: str, **values: Any) -> str:  # noqa: ANN401 (whatever 
 
 
 def inline_pictures(figures: Iterable[Path]) -> dict[str, str]:
-    """Return the PNGs among some files as data URLs, by their names without suffix."""
-    return {f.stem: _inline(f) for f in figures if f.suffix == ".png"}
+    """Return the PNGs among some files as data URLs.
+
+    Parameters
+    ----------
+    figures : iterable of Path
+
+    Returns
+    -------
+    dict
+        Data URL of each PNG, by its file name without suffix.
+    """
+    start = "data:image/png;base64,"
+    return {
+        f.stem: start + base64.b64encode(f.read_bytes()).decode("ascii")
+        for f in figures
+        if f.suffix == ".png"
+    }
 
 
 def captioned(
     pictures: Mapping[str, str], stem: str, kind: str, caption: tuple[str, str, str]
 ) -> dict[str, str] | None:
-    """Return a picture with its title, what it shows and what to look for; None if not drawn."""
+    """Return what a template needs of a picture, or None if it was not drawn.
+
+    Parameters
+    ----------
+    pictures : mapping
+        Data URLs of `inline_pictures`.
+    stem : str
+        File name of the picture without suffix.
+    kind : str
+        Kind of the picture, its class in the page.
+    caption : tuple of str
+        Title, what it shows, and what to look for.
+
+    Returns
+    -------
+    dict or None
+    """
     if stem not in pictures:
         return None
     title, shows, look_for = caption
@@ -61,17 +95,25 @@ def captioned(
 
 
 def byline(settings: Mapping[str, Any]) -> dict[str, str]:
-    """Return the name of a run's input and the date of the run, in words."""
+    """Return the name of a run's input and the date of the run as text.
+
+    Parameters
+    ----------
+    settings : mapping
+        `Report.settings`.
+
+    Returns
+    -------
+    dict
+        "input_name" and "date".
+
+    Examples
+    --------
+    >>> byline({"input": {"path": "data/tracks.csv"}})
+    {'input_name': 'tracks.csv', 'date': 'no date'}
+    """
     path, created = settings.get("input", {}).get("path"), settings.get("created")
     return {
         "input_name": Path(path).name if path else "table in memory",
         "date": f"{datetime.fromisoformat(created):%Y-%m-%d %H:%M} UTC" if created else "no date",
     }
-
-
-def _source(name: str) -> str:
-    return (files("perrin.report") / f"templates/{name}.html.jinja").read_text(encoding="utf-8")
-
-
-def _inline(file: Path) -> str:
-    return "data:image/png;base64," + base64.b64encode(file.read_bytes()).decode("ascii")

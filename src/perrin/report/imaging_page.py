@@ -1,4 +1,4 @@
-"""The quality page of a run: how its spheres were seen, in words, numbers and pictures."""
+"""The page of imaging quality: how well spheres were found and fitted in a movie."""
 
 from __future__ import annotations
 
@@ -7,319 +7,313 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from perrin._text import number_text
+from perrin.geometry.shapes import pair_distances
 from perrin.movie.checks import bleaching
 from perrin.plot.imaging import imaging_of, least_turns
 from perrin.report.html import byline, captioned, inline_pictures, render_page
 from perrin.run.remarks import condensed
+from perrin.tracks.clusters import REACH
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Mapping
     from pathlib import Path
 
-    from perrin._arrays import Floats
     from perrin.images.imaging import Imaging
-    from perrin.images.optics.optics import Optics
     from perrin.run.results import Report
 
 
-Fact = tuple[str, str, str]
+Fact = tuple[str, str, str]  # name, value and remark
 
 
-# What each figure is, what it shows, and what to look for.
-_CAPTIONS = {
+# Caption of each figure: its title, what it shows, and what to look for.
+_IMAGING_CAPTIONS = {
     "found": (
         "Spheres found.",
-        "One frame from the middle of the movie, the brightest voxels along each line of sight "
-        "(of dark spheres the darkest), from above and from two sides; spheres are drawn dark. "
-        "Circles have the diameter that was looked for, one colour a cluster, with its number; "
-        "dashed ones belong to no cluster.",
-        "Each sphere should fill its circle, on all three sides. Spheres without a circle are "
-        "missed: lower the mass cut. Circles on nothing are noise: raise it. Circles that all are "
-        "too large or too small mean a wrong diameter or voxel size, in z where only the sides "
-        "are off.",
+        "One frame from the middle of the movie in maximum projections (minimum projections for "
+        "dark spheres) along z, y and x; spheres are drawn dark. Circles have the expected "
+        "diameter, with one colour and number for each cluster; spheres of dashed circles belong "
+        "to no cluster.",
+        "Each sphere should fill its circle in all three projections. Spheres without a circle "
+        "were missed: lower the mass cut. Circles without a sphere are noise: raise it. If all "
+        "circles are too large or too small, the diameter or the voxel size is wrong; the voxel "
+        "size in z if only the side views disagree.",
     ),
     "tracks": (
         "Tracks on the images.",
-        "Some frames all over the movie, seen from above: the spheres of the frame, and the path "
-        "of each cluster's centre in the 100 frames before it. A cluster keeps its colour.",
+        "Frames evenly over the movie, projected along z: the spheres of the frame, and the path "
+        "of each cluster's centre in the last 100 frames. Each cluster has one colour.",
         "A cluster should keep its colour from frame to frame. A path that jumps from one cluster "
-        "to another is a mistake; paths that all lean one way are drift; a path that ends is a "
-        "cluster that was lost.",
+        "to another is an error of linking; a common direction of all paths is drift; a path that "
+        "ends is a cluster that was lost.",
     ),
     "masses": (
         "Brightness of the spots.",
-        "Integrated brightness of all spots of a few frames, noise included, and the cut between "
-        "noise and spheres (dashed). Both axes are logarithmic.",
-        "Two hills with a gap between them, and the cut in the gap. Without a gap, spheres are "
-        "lost or noise is kept whatever the cut; a hill at twice the mass is pairs seen as one.",
+        "Integrated brightness (mass) of all spots of a few frames, including noise, and the cut "
+        "between noise and spheres (dashed). Both axes are logarithmic.",
+        "Two peaks with a gap between them, and the cut in the gap. Without a gap every cut "
+        "loses spheres or keeps noise; a peak at twice the mass means that pairs of spheres were "
+        "found as one.",
     ),
     "residuals": (
         "Residuals.",
-        "How badly the model's image explains the voxels around the spheres (top, where images "
-        "were fitted), and how far the spheres are from the rigid body fitted to them (bottom).",
-        "The misfit should stay near 1; a larger one, the same in all frames, means that spheres "
-        "do not look like the model, and errors are understated by its root. A single spike "
-        "below is a bad frame, a step that stays an exchange of spheres, a slow rise means that "
-        "the body is not rigid or the light fades.",
+        "Misfit of the model image to the voxels around the spheres (top, if images were fitted), "
+        "and rms distance of the spheres to the fitted rigid body (bottom).",
+        "The misfit should be near 1. A larger value in all frames means that the model does not "
+        "describe the spheres; the stated errors are then too small by its square root. In the "
+        "residuals a single spike is a bad frame, a lasting step an exchange of spheres; a slow "
+        "rise means that the body is not rigid or that the dye bleaches.",
     ),
     "steps": (
         "Angles of the steps.",
-        "Angles that all bodies turned through from one pose to the next, and the numbers that "
-        "Brownian rotation with the pooled coefficient and noise gives (line). Ticks mark the "
-        "largest; a dotted line is the least turn that brings a body onto itself.",
-        "Columns should follow the line into its tail. Steps far beyond it are exchanged spheres: "
-        "look at their frames. Columns that reach half the turn of a body onto itself mean that "
-        "orientations cannot be told apart: take frames faster.",
+        "Rotation angles of all bodies from one pose to the next, and the expectation for "
+        "Brownian rotation with the pooled coefficient and noise (line). Ticks mark the "
+        "largest angles; a dotted line is the smallest rotation that maps a body onto itself.",
+        "The histogram should follow the line into its tail. Steps far beyond it are exchanged "
+        "spheres: inspect their frames. If the histogram reaches half of the smallest symmetry "
+        "rotation, orientations cannot be distinguished: take frames faster.",
     ),
     "health": (
         "Frame by frame.",
-        "Spheres found and all spots, the brightness of the spheres, the grey level of the frame, "
-        "and the share of voxels clipped at the end of the camera's range. Crosses mark frames "
-        "that could not be read.",
-        "Level lines. Brightness that falls is bleaching: errors grow with it. Spheres that come "
-        "and go cross the border or the mass cut. Saturated voxels flatten the spheres' image and "
-        "shift its fit.",
+        "Number of spheres and of all spots, brightness of the spheres, grey level of the frame, "
+        "and share of voxels at the end of the camera's range. Crosses mark frames that could "
+        "not be read.",
+        "Constant lines. Decreasing brightness is bleaching, which increases the errors. A "
+        "changing number of spheres means that spheres cross the border or the mass cut. "
+        "Saturated voxels distort the images of the spheres and bias their fits.",
     ),
 }
 
 
-_LISTED = 50  # frames whose faults are told
+_LISTED_FRAMES = 50  # largest number of unreadable frames in the table
 
 
-_TOUCHING = 1.3  # contact distances: spheres nearer touch
-
-
-def render_quality(report: Report, figures: Iterable[Path]) -> str:
-    """Return how a report's spheres were seen as one HTML page that needs no other file.
+def render_imaging_quality(report: Report, figures: Iterable[Path]) -> str:
+    """Return the imaging quality of a report as one HTML page that needs no other file.
 
     Parameters
     ----------
     report : Report
-        With `imaging`; it may lack clusters.
+        Report of a movie, with `imaging`; it may have no clusters.
     figures : iterable of Path
-        From `perrin.plot.imaging.save_image_figures`; the PNGs among them are put into the page.
+        Files of `perrin.plot.imaging.save_image_figures`; the page contains the PNGs among them.
 
     Returns
     -------
     str
     """
     imaging, pictures = imaging_of(report), inline_pictures(figures)
-    faults = imaging.frames[imaging.frames["fault"].fillna("") != ""]
-    drawn = [captioned(pictures, f"images-{k}", k, caption) for k, caption in _CAPTIONS.items()]
+    faults = imaging.frames[~_readable(imaging)]
+    cut: Fact = ("mass cut", "none", "all spots are taken for spheres")
+    if imaging.minmass > 0:
+        below = int((imaging.spots["mass"] < imaging.minmass).sum())
+        remark = f"{below} of {len(imaging.spots)} spots of the sampled frames lie below"
+        cut = ("mass cut", number_text(imaging.minmass), remark)
+    drawn = [
+        captioned(pictures, f"images-{kind}", kind, caption)
+        for kind, caption in _IMAGING_CAPTIONS.items()
+    ]
+    z, y, x = imaging.voxel
+    depth = bool(np.isfinite(z))
+    refined = {"model": "by the model of their image", "trackpy": "by trackpy's least squares"}
     return render_page(
-        "quality",
+        "imaging",
         **byline(report.settings),
-        headline=_headline(report),
+        headline=_headline_boxes(report),
         warnings=condensed(report.warnings),
         notes=condensed(report.notes),
         facts=[
-            *_light_facts(imaging),
-            _mass_cut(imaging),
-            *_fit_facts(imaging),
-            *_optics_facts(imaging),
-            *_body_facts(report),
+            *brightness_facts(imaging),
+            cut,
+            *fit_facts(imaging),
+            *optics_facts(imaging),
+            *rigid_body_facts(report),
         ],
         faults=[
             (row.frame, number_text(row.time), row.fault)
-            for row in faults.head(_LISTED).itertuples()
+            for row in faults.head(_LISTED_FRAMES).itertuples()
         ],
-        more_faults=max(len(faults) - _LISTED, 0),
+        more_faults=max(len(faults) - _LISTED_FRAMES, 0),
         figures=[f for f in drawn if f],
-        asked=_asked(imaging),
+        settings=[
+            ("diameter", f"{number_text(imaging.diameter)} µm"),
+            ("contact", f"{number_text(imaging.contact)} µm"),
+            ("spheres", f"{'darker' if imaging.dark else 'brighter'} than their surroundings"),
+            ("voxel, x × y × z", f"{x:g} × {y:g} × {z:g} µm")
+            if depth
+            else ("voxel, x × y", f"{x:g} × {y:g} µm"),
+            ("refined", refined.get(imaging.refine or "", "not: positions are filtered centroids")),
+        ],
     )
 
 
-def _headline(report: Report) -> list[tuple[str, str, str]]:
-    """Return label, value and note of what to read first."""
+def _readable(imaging: Imaging) -> Any:  # noqa: ANN401 (pandas has no types)
+    """Return which frames could be read."""
+    return imaging.frames["fault"].fillna("") == ""
+
+
+def _headline_boxes(report: Report) -> list[Fact]:
+    """Return the numbers of frames, spheres and clusters, and the stated error of a centre."""
     imaging = imaging_of(report)
-    frames = _read(imaging)
-    middle, span = _counts(frames["spheres"].to_numpy())
+    frames = imaging.frames[_readable(imaging)]
+    time = imaging.frames["time"].dropna().to_numpy(dtype=np.float64)
+    span = ""
+    if time.size:
+        lost = len(imaging.frames) - len(frames)
+        unread = f"; {lost} could not be read" if lost else ""
+        span = f"from {number_text(time.min())} to {number_text(time.max())} s{unread}"
+    count = frames["spheres"].to_numpy()
+    middle, spheres = "–", "no frame could be read"
+    if len(count):
+        low, high, empty = int(count.min()), int(count.max()), int((count == 0).sum())
+        middle = f"{np.median(count):g}"
+        spheres = f"median; {low} to {high}" if low < high else "in every frame"
+        if 0 < empty < len(count):
+            spheres += f"; none in {empty} frame{'s' * (empty > 1)}"
+    found, kept = len(imaging.features), int((imaging.features["cluster"] >= 0).sum())
+    share = f"{100 * kept / found:.3g} % of the spheres belong to one" if found else ""
+    if kept == found:
+        share = "all spheres belong to one" if found else "no sphere was found"
     boxes = [
-        ("Frames read", f"{len(frames)} of {len(imaging.frames)}", _times(imaging)),
-        ("Spheres in a frame", middle, span),
-        ("Clusters tracked", str(len(report.results)), _share(imaging)),
+        ("Frames read", f"{len(frames)} of {len(imaging.frames)}", span),
+        ("Spheres in a frame", middle, spheres),
+        ("Clusters tracked", str(len(report.results)), share),
     ]
     errors = _stated_errors(imaging)
     if errors:
         axes = ", ".join(errors)
-        values = ", ".join(_nanometres(v) for v in errors.values())
-        boxes.append(("Stated error of a centre", f"{values} nm", f"median, along {axes}"))
+        boxes.append(("Stated error of a centre", _nanometres(errors), f"median, along {axes}"))
     return boxes
 
 
-def _read(imaging: Imaging) -> Any:  # noqa: ANN401 (pandas carries no types)
-    """Return the rows of the frames that could be read."""
-    return imaging.frames[imaging.frames["fault"].fillna("") == ""]
-
-
-def _times(imaging: Imaging) -> str:
-    """Write when the first and the last frame were taken, and how many could not be read."""
-    time = imaging.frames["time"].dropna().to_numpy(dtype=np.float64)
-    if not time.size:
-        return ""
-    lost = len(imaging.frames) - len(_read(imaging))
-    said = f"; {lost} could not be read" if lost else ""
-    return f"from {number_text(time.min())} to {number_text(time.max())} s{said}"
-
-
-def _counts(count: Floats) -> tuple[str, str]:
-    """Write the median of the numbers of spheres, and their range."""
-    if not len(count):
-        return "–", "no frame could be read"
-    low, high, empty = int(count.min()), int(count.max()), int((count == 0).sum())
-    said = f"median; {low} to {high}" if low < high else "in every frame"
-    if 0 < empty < len(count):
-        said += f"; none in {empty} frame{'s' * (empty > 1)}"
-    return f"{np.median(count):g}", said
-
-
-def _share(imaging: Imaging) -> str:
-    """Write how many of the spheres found belong to clusters."""
-    found = len(imaging.features)
-    if not found:
-        return "no sphere was found"
-    kept = int((imaging.features["cluster"] >= 0).sum())
-    if kept == found:
-        return "all spheres found belong to one"
-    return f"{100 * kept / found:.3g} % of the spheres found belong to one"
-
-
 def _stated_errors(imaging: Imaging) -> dict[str, float]:
-    """Return the median error, um, that the fits state along each axis; empty where none does."""
+    """Return the median error, um, that the fits state along each axis; empty without errors."""
     columns = {a: f"sigma_{a}" for a in "xyz" if f"sigma_{a}" in imaging.features}
     median = {a: float(imaging.features[name].median()) for a, name in columns.items()}
     return {a: value for a, value in median.items() if np.isfinite(value)}
 
 
-def _nanometres(um: float) -> str:
-    return number_text(1e3 * um, digits=2)
+def _nanometres(errors: Mapping[str, float]) -> str:
+    """Write lengths given in um, in nm."""
+    return ", ".join(number_text(1e3 * um, digits=2) for um in errors.values()) + " nm"
 
 
-def _light_facts(imaging: Imaging) -> list[Fact]:
-    """Return name, value and remark of how bright the frames were."""
-    worst = 100 * float(_read(imaging)["saturated"].max())
+def brightness_facts(imaging: Imaging) -> list[Fact]:
+    """Return the share of saturated voxels, and the change of brightness over the movie.
+
+    Parameters
+    ----------
+    imaging : Imaging
+
+    Returns
+    -------
+    list of tuple of str
+        Name, value and remark of each quantity.
+    """
+    worst = 100 * float(imaging.frames.loc[_readable(imaging), "saturated"].max())
     if not np.isfinite(worst):
         return []
     value = f"{number_text(worst, digits=2)} %" if worst else "none"
-    return [("saturated voxels", value, "in the worst frame"), *_bleaching(imaging)]
-
-
-def _bleaching(imaging: Imaging) -> list[Fact]:
-    """Return the brightness of the last tenth of the movie against that of the first."""
+    facts = [("saturated voxels", value, "in the worst frame")]
     change = bleaching(imaging.features)
-    if change is None:
-        return []
-    error = f" ± {number_text(100 * change.stderr, digits=1)}" if change.stderr > 0 else ""
-    remark = "of the tracked spheres, last tenth of the movie against the first"
-    return [("brightness", f"{number_text(100 * (1 + change.value))}{error} %", remark)]
+    if change is not None:
+        error = f" ± {number_text(100 * change.stderr, digits=1)}" if change.stderr > 0 else ""
+        remark = "of the tracked spheres, last tenth of the movie over the first"
+        facts.append(("brightness", f"{number_text(100 * (1 + change.value))}{error} %", remark))
+    return facts
 
 
-def _mass_cut(imaging: Imaging) -> Fact:
-    """Return name, value and remark of the line between spheres and noise."""
-    if imaging.minmass <= 0:
-        return "mass cut", "none", "all spots are taken for spheres"
-    below = int((imaging.spots["mass"] < imaging.minmass).sum())
-    remark = f"{below} of {len(imaging.spots)} spots of the frames looked at lie below"
-    return "mass cut", number_text(imaging.minmass), remark
+def fit_facts(imaging: Imaging) -> list[Fact]:
+    """Return stated errors and misfit of the fitted images, and the number of rejected fits.
 
+    Parameters
+    ----------
+    imaging : Imaging
 
-def _fit_facts(imaging: Imaging) -> list[Fact]:
-    """Return name, value and remark of how the fits of the images went."""
-    features = imaging.features
-    errors = _stated_errors(imaging)
+    Returns
+    -------
+    list of tuple of str
+        Name, value and remark of each quantity.
+    """
+    features, errors = imaging.features, _stated_errors(imaging)
     facts = []
     if errors:
-        values = ", ".join(_nanometres(v) for v in errors.values())
-        remark = f"median along {', '.join(errors)}, from the light alone"
-        facts.append(("stated error", f"{values} nm", remark))
+        remark = f"median along {', '.join(errors)}, from the noise of the image alone"
+        facts.append(("stated error", _nanometres(errors), remark))
     if "chi2" in features and features["chi2"].notna().any():
         misfit = number_text(float(features["chi2"].median()))
         facts.append(("image misfit", misfit, "median χ² per degree of freedom; 1: to the noise"))
     if "refined" in features:
-        refused = features[~features["refined"].astype(bool)]
-        value = f"{len(refused)} of {len(features)}"
-        facts.append(("not refined", value, _reasons(refused)))
+        rejected = features[~features["refined"].astype(bool)]
+        remark = "all fits converged"
+        if len(rejected):
+            remark = "their unrefined positions were kept"
+            if "reason" in rejected:
+                reasons = rejected["reason"].fillna("").replace("", "no reason stated")
+                counts = reasons.value_counts().items()
+                remark += f": {', '.join(f'{reason} ({n})' for reason, n in counts)}"
+        facts.append(("not refined", f"{len(rejected)} of {len(features)}", remark))
     return facts
 
 
-def _reasons(refused: Any) -> str:  # noqa: ANN401 (pandas carries no types)
-    """Write why fits were refused, the commonest reason first."""
-    if not len(refused):
-        return "every fit settled"
-    said = "the places first found were kept"
-    if "reason" not in refused:
-        return said
-    counts = refused["reason"].fillna("").replace("", "no reason told").value_counts()
-    return f"{said}: {', '.join(f'{reason} ({n})' for reason, n in counts.items())}"
+def optics_facts(imaging: Imaging) -> list[Fact]:
+    """Return apparent diameter, point spread and camera noise.
 
+    Parameters
+    ----------
+    imaging : Imaging
 
-def _optics_facts(imaging: Imaging) -> list[Fact]:
-    """Return name, value and remark of how a sphere is seen."""
+    Returns
+    -------
+    list of tuple of str
+        Name, value and remark of each quantity.
+    """
     optics = imaging.optics
     if optics is None:
         return []
+    values = (optics.diameter, *optics.psf)
+    size, psf_z, psf = (number_text(v, e) for v, e in zip(values, optics.stderr, strict=True))
     learned = "learned from the images" if any(optics.stderr) else "as stated"
-    size, psf_z, psf = _with_errors(optics)
-    asked = f"{learned}; {number_text(imaging.diameter)} µm was looked for"
-    noise = f"a voxel's variance is {number_text(optics.noise.gain)} times its light"
+    gain, sign = number_text(optics.noise.gain), "−" if optics.noise.floor < 0 else "+"
     floor = number_text(abs(optics.noise.floor))
-    noise += f" {'−' if optics.noise.floor < 0 else '+'} {floor}, in grey levels"
+    noise = f"the variance of a voxel is {gain} times its signal {sign} {floor}, in grey levels"
+    expected = f"{learned}; the expected diameter is {number_text(imaging.diameter)} µm"
     return [
-        ("diameter seen", f"{size} µm", asked),
+        ("apparent diameter", f"{size} µm", expected),
         ("point spread", f"{psf} µm", f"standard deviation in the plane; {psf_z} µm along z"),
-        ("gain", number_text(optics.noise.gain), noise),
+        ("gain", gain, noise),
     ]
 
 
-def _with_errors(optics: Optics) -> tuple[str, str, str]:
-    """Write diameter, psf along z and psf in the plane, each with its error."""
-    values = (optics.diameter, *optics.psf)
-    size, z, plane = (number_text(v, e) for v, e in zip(values, optics.stderr, strict=True))
-    return size, z, plane
+def rigid_body_facts(report: Report) -> list[Fact]:
+    """Return what the rigid bodies imply: errors, contact distance and symmetry rotation.
 
+    Parameters
+    ----------
+    report : Report
+        Report of a movie, with `imaging`.
 
-def _body_facts(report: Report) -> list[Fact]:
-    """Return name, value and remark of what the tracked bodies say of the images."""
+    Returns
+    -------
+    list of tuple of str
+        Name, value and remark of each quantity.
+    """
     facts = []
     sigma = [c.motion.sigma for c in report.clusters if np.isfinite(c.motion.sigma)]
     if sigma:
-        remark = "of a coordinate, median of the clusters; above the stated: not only the light"
-        value = f"{_nanometres(float(np.median(sigma)))} nm"
-        facts.append(("error seen in rigid bodies", value, remark))
-    distance, contact = _touching(report), imaging_of(report).contact
+        remark = "of one coordinate, median of the clusters; not only image noise"
+        value = f"{number_text(1e3 * float(np.median(sigma)), digits=2)} nm"
+        facts.append(("error from rigid bodies", value, remark))
+    contact = imaging_of(report).contact
+    shapes = [c.motion.template for c in report.clusters]
+    shapes += [rod.motion.places[:, None] for rod in report.rods]
+    distance = np.concatenate([np.empty(0), *(pair_distances(shape) for shape in shapes)])
+    distance = distance[distance < REACH * contact]
     if distance.size:
         mean = float(distance.mean())
         off = f"{100 * (mean / contact - 1):+.2g} %".replace("-", "−")
         remark = f"mean of {distance.size} pairs; contact is {number_text(contact)} µm ({off})"
-        facts.append(("touching spheres apart", f"{number_text(mean, digits=4)} µm", remark))
+        facts.append(("distance of touching spheres", f"{number_text(mean, digits=4)} µm", remark))
     for turn in least_turns(report)[:1]:
-        remark = "a step of half of it or more cannot be told from an exchange of spheres"
-        facts.append(("least turn onto itself", f"{number_text(turn)}°", remark))
+        remark = "a step of half of it or more may be an exchange of spheres"
+        facts.append(("smallest symmetry rotation", f"{number_text(turn)}°", remark))
     return facts
-
-
-def _touching(report: Report) -> Floats:
-    """Return the distances of touching spheres in the bodies and rods fitted, um."""
-    reach = _TOUCHING * imaging_of(report).contact
-    shapes = [c.motion.template for c in report.clusters]
-    shapes += [rod.motion.places[:, None] for rod in report.rods]
-    found = [np.empty(0)]
-    for x in shapes:
-        first, second = np.triu_indices(len(x), 1)
-        found.append(np.linalg.norm(x[first] - x[second], axis=1))
-    distance = np.concatenate(found)
-    return distance[distance < reach]
-
-
-def _asked(imaging: Imaging) -> list[tuple[str, str]]:
-    """Return what was looked for, and how."""
-    z, y, x = imaging.voxel
-    how = {"model": "by the model of their image", "trackpy": "by trackpy's least squares"}
-    size = f"{x:g} × {y:g}" + (f" × {z:g}" if np.isfinite(z) else "")
-    return [
-        ("diameter", f"{number_text(imaging.diameter)} µm"),
-        ("contact", f"{number_text(imaging.contact)} µm"),
-        ("spheres", "darker than around them" if imaging.dark else "brighter than around them"),
-        ("voxel, x × y" + (" × z" if np.isfinite(z) else ""), f"{size} µm"),
-        ("refined", how.get(imaging.refine or "", "not: places are filtered centroids")),
-    ]

@@ -1,4 +1,4 @@
-"""Run folders with pictures and one self-contained page."""
+"""Run folders with data, figures and HTML pages."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from perrin.plot.imaging import save_image_figures
 from perrin.plot.results import save_figures
-from perrin.report.imaging_page import render_quality
+from perrin.report.imaging_page import render_imaging_quality
 from perrin.report.page import render_html
 from perrin.run.folders import filled_folder, staged_folder
 from perrin.run.results import write_data
@@ -19,14 +19,14 @@ if TYPE_CHECKING:
 
 
 def write_run(report: Report, folder: str | os.PathLike[str], *, overwrite: bool = False) -> None:
-    """Write a run folder: the data, the figures and the HTML report; whole or not at all.
+    """Write a run folder with data, figures and HTML pages, complete or not at all.
 
     Parameters
     ----------
     report : Report
     folder : path
-        Made new. Figures go to ``figures/``, the report to ``report.html``; how the spheres were
-        seen, where the run began with images, to ``quality.html``.
+        New folder. It gets the figures in ``figures/``, the report as ``report.html`` and, for a
+        run on images, the imaging quality as ``quality.html``.
     overwrite : bool
         Replace an existing run folder.
 
@@ -36,33 +36,34 @@ def write_run(report: Report, folder: str | os.PathLike[str], *, overwrite: bool
         If the folder exists and `overwrite` is not set, or is not a run folder.
     """
     with staged_folder(folder, overwrite=overwrite) as stage:
-        _write(report, stage)
+        _write_files(report, stage)
 
 
 def complete_run(report: Report, folder: str | os.PathLike[str]) -> None:
-    """Write a run into the folder that holds its finished frames: as `write_run`, in their place.
+    """Write a run, as `write_run` does, into the folder that holds its finished frames.
 
     Parameters
     ----------
     report : Report
     folder : path
-        As given to `analyze_stack` as `keep`.
+        Folder given to `analyze_stack` as `keep`.
 
     Raises
     ------
     OSError
-        If it cannot be written; the finished frames stay.
+        If the run cannot be written; the finished frames remain.
     """
     with filled_folder(folder) as stage:
-        _write(report, stage)
+        _write_files(report, stage)
 
 
-def _write(report: Report, stage: Path) -> None:
+def _write_files(report: Report, stage: Path) -> None:
+    """Write data, figures and pages into an empty folder."""
     write_data(report, stage)
     place = stage / "figures"
     place.mkdir()
     html = render_html(report, save_figures(report, place))
     (stage / "report.html").write_text(html, encoding="utf-8")
     if report.imaging is not None:
-        html = render_quality(report, save_image_figures(report, place))
+        html = render_imaging_quality(report, save_image_figures(report, place))
         (stage / "quality.html").write_text(html, encoding="utf-8")

@@ -288,7 +288,10 @@ class Pooled:
     @classmethod
     def from_dict(cls, entry: Mapping[str, Any]) -> Pooled:
         """Read back what `to_dict` wrote."""
-        D_R, D_T = DiffusionEstimate.from_dict(entry["D_R"]), DiffusionEstimate.from_dict(entry["D_T"])
+        D_R, D_T = (
+            DiffusionEstimate.from_dict(entry["D_R"]),
+            DiffusionEstimate.from_dict(entry["D_T"]),
+        )
         return cls(D_R, D_T, tuple(entry["clusters"]))
 
 

@@ -9,49 +9,20 @@ from perrin.tracks.bonds import (
     noise_along,
     rigid_groups,
 )
-from perrin.tracks.clock import (
-    Clock,
-    evenly_spaced,
-    frame_stride,
-    read_clock,
-)
+from perrin.tracks.clock import Clock, evenly_spaced, frame_stride, read_clock
 from perrin.tracks.clusters import (
+    REACH,
     cluster_positions,
     each_cluster,
     find_clusters,
     identify,
     positions_table,
 )
-from perrin.tracks.column_names import (
-    Spelling,
-    recognise_columns,
-    seconds,
-    unit_faults,
-)
-from perrin.tracks.files import (
-    RowNumbers,
-    check_tracks,
-    read_spheres,
-    read_tracks,
-    write_tracks,
-)
-from perrin.tracks.formats import (
-    SUFFIXES,
-    parse_csv,
-    parse_table,
-    table_bytes,
-    table_suffix,
-)
-from perrin.tracks.gdf import (
-    gdf_bytes,
-    parse_gdf,
-)
-from perrin.tracks.groups import (
-    TOUCHING_REACH,
-    connected_groups,
-    frames_of,
-    touching_groups,
-)
+from perrin.tracks.column_names import Spelling, recognise_columns, seconds, unit_faults
+from perrin.tracks.files import RowNumbers, check_tracks, read_spheres, read_tracks, write_tracks
+from perrin.tracks.formats import parse_csv, parse_table, table_bytes, table_suffix
+from perrin.tracks.gdf import gdf_bytes, parse_gdf
+from perrin.tracks.groups import connected_groups, frames_of, touching_groups
 from perrin.tracks.identity import (
     BodyModel,
     Candidates,
@@ -76,15 +47,9 @@ from perrin.tracks.identity import (
     shape_symmetry,
     squared_angle,
 )
-from perrin.tracks.linking import (
-    Centers,
-    link_clusters,
-    linked_tracks,
-    step_variance,
-)
+from perrin.tracks.linking import Centers, link_clusters, linked_tracks, step_variance
 from perrin.tracks.screening import (
     CENTRE_REMOVED,
-    TRACKPY_COLUMNS,
     Screened,
     centre_removed,
     distance_notes,
@@ -97,15 +62,11 @@ from perrin.tracks.screening import (
     rounding_chances,
     screen_rows,
 )
-from perrin.tracks.writing import (
-    written_whole,
-)
+from perrin.tracks.writing import written_whole
 
 __all__ = [
     "CENTRE_REMOVED",
-    "SUFFIXES",
-    "TOUCHING_REACH",
-    "TRACKPY_COLUMNS",
+    "REACH",
     "BodyModel",
     "Candidates",
     "Centers",

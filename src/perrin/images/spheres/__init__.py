@@ -2,6 +2,7 @@
 
 from perrin.images.spheres.by_trackpy import Features, find_features, refine_by_trackpy
 from perrin.images.spheres.localisation import (
+    NO_FLAT_MODEL,
     LocatedFrame,
     Method,
     SampledFrame,
@@ -29,6 +30,7 @@ from perrin.images.spheres.spots import (
 )
 
 __all__ = [
+    "NO_FLAT_MODEL",
     "Features",
     "LocatedFrame",
     "Method",

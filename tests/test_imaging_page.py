@@ -1,4 +1,4 @@
-"""The quality page says how the spheres were seen, safely and in one file."""
+"""The page of imaging quality shows the numbers of its tables, escaped and in one file."""
 
 from __future__ import annotations
 
@@ -10,10 +10,11 @@ import pytest
 
 import perrin
 from perrin._text import number_text
-from perrin.report import page as reports
-from perrin.report.imaging_page import render_quality
+from perrin.plot import imaging
+from perrin.report import write
+from perrin.report.imaging_page import render_imaging_quality
 from test_plot_images import BALL, seen
-from test_report import Page, pictures
+from test_report import Page, pictures, save_blank
 
 NAMES = ("found", "tracks", "masses", "residuals", "steps", "health")
 
@@ -24,7 +25,7 @@ def report():
 
 
 def text_of(report):
-    page = Page(render_quality(report, []))
+    page = Page(render_imaging_quality(report, []))
     assert page.open == []
     return page.text
 
@@ -33,30 +34,33 @@ def test_the_page_holds_the_numbers(report):
     text = text_of(report)
     assert "Frames read 40 of 40 from 0 to 27.3 s" in text
     assert "Spheres in a frame 8 in every frame" in text
-    assert "Clusters tracked 2 all spheres found belong to one" in text
+    assert "Clusters tracked 2 all spheres belong to one" in text
     assert "4.0, 5.0, 6.0 nm median, along x, y, z" in text
     assert "mass cut 2340 300 of 308 spots" in text
     assert "image misfit 1.00" in text
-    assert "not refined 0 of 320 every fit settled" in text
-    assert "diameter seen 2.440(2) µm learned from the images; 2.45 µm was looked for" in text
+    assert "not refined 0 of 320 all fits converged" in text
+    assert (
+        "apparent diameter 2.440(2) µm learned from the images; the expected diameter is 2.45"
+        in text
+    )
     assert "point spread 0.152(4) µm standard deviation in the plane; 0.410(3) µm along z" in text
-    assert "gain 3.10 a voxel's variance is 3.10 times its light + 12.0" in text
-    assert "least turn onto itself 120°" in text
+    assert "gain 3.10 the variance of a voxel is 3.10 times its signal + 12.0" in text
+    assert "smallest symmetry rotation 120°" in text
     assert "saturated voxels none" in text
     assert "0.2 × 0.2 × 0.25 µm" in text
     sigma = np.median([c.motion.sigma for c in report.clusters])
-    assert f"error seen in rigid bodies {number_text(1e3 * sigma, digits=2)} nm" in text
+    assert f"error from rigid bodies {number_text(1e3 * sigma, digits=2)} nm" in text
     assert "Warnings" not in text
 
 
-def test_touching_spheres_are_held_against_contact(report):
-    """Bodies stretched by a tenth touch at a tenth more than contact; all 12 pairs count."""
+def test_the_distance_of_touching_spheres_is_compared_with_the_contact_distance(report):
+    """Bodies stretched by 10 % have touching spheres 10 % beyond contact; all 12 pairs count."""
     wide = [
         replace(c, motion=replace(c.motion, template=1.1 * c.motion.template))
         for c in report.clusters
     ]
     found = re.search(
-        r"touching spheres apart (\S+) µm mean of 12 pairs; contact is 2\.45 µm \(\+(\S+) %\)",
+        r"touching spheres (\S+) µm mean of 12 pairs; contact is 2\.45 µm \(\+(\S+) %\)",
         text_of(replace(report, clusters=tuple(wide))),
     )
     # The template's own error is 10 nm / sqrt(40 frames) a particle.
@@ -64,8 +68,8 @@ def test_touching_spheres_are_held_against_contact(report):
     assert float(found[2]) == pytest.approx(10, abs=0.2)
 
 
-def test_what_went_wrong_is_told_and_escaped(report):
-    """Faults with their frames, refusals with their reasons, warnings; none of it is markup."""
+def test_faults_are_listed_and_escaped(report):
+    """Faults with their frames, rejected fits with their reasons, and warnings are plain text."""
     frames = report.imaging.frames.copy()
     frames.loc[[4, 9], "fault"] = "<script>page</script> & more"
     frames.loc[[1, 2, 3], "spheres"] = 0
@@ -77,27 +81,36 @@ def test_what_went_wrong_is_told_and_escaped(report):
     features.loc[:31, "cluster"] = -1
     features["mass"] = 1000.0 - 500 * (features["frame"] >= 20)
     imaging = replace(report.imaging, frames=frames, features=features)
-    page = Page(render_quality(replace(report, imaging=imaging, warnings=("no <gap> & so",)), []))
+    page = Page(
+        render_imaging_quality(replace(report, imaging=imaging, warnings=("no <gap> & so",)), [])
+    )
     assert "38 of 40 from 0 to 27.3 s; 2 could not be read" in page.text
     assert "8 median; 0 to 8; none in 3 frames" in page.text
     assert "9 6.30 <script>page</script> & more" in page.text
-    assert "90 % of the spheres found belong to one" in page.text
-    said = "not refined 5 of 320 the places first found were kept: did not <settle> (3)"
-    assert said in page.text
+    assert "90 % of the spheres belong to one" in page.text
+    text = "not refined 5 of 320 their unrefined positions were kept: did not <settle> (3)"
+    assert text in page.text
     assert "no sphere (1)" in page.text
-    assert "no reason told (1)" in page.text
+    assert "no reason stated (1)" in page.text
     assert "saturated voxels 1.2 %" in page.text
     assert "brightness 50.0 %" in page.text
     assert "Warnings no <gap> & so" in page.text
     assert not {"script", "settle", "gap"} & set(page.tags)
 
 
-def test_without_fits_and_without_clusters_there_are_no_empty_words(report):
+def test_without_fits_and_without_clusters_there_are_no_empty_values(report):
     bare = seen(planar=True, refine=None, clusters=1)
     text = text_of(bare)
-    for absent in ("stated error", "not refined", "diameter seen", "image misfit", "nan", "None"):
+    for absent in (
+        "stated error",
+        "not refined",
+        "apparent diameter",
+        "image misfit",
+        "nan",
+        "None",
+    ):
         assert absent not in text, absent
-    assert "not: places are filtered centroids" in text
+    assert "not: positions are filtered centroids" in text
     assert "voxel, x × y 0.2 × 0.2 µm" in text
     frames = report.imaging.frames.assign(fault="cut short", spheres=0)
     lost = replace(report.imaging, frames=frames, features=report.imaging.features[:0], minmass=0)
@@ -109,9 +122,9 @@ def test_without_fits_and_without_clusters_there_are_no_empty_words(report):
     assert not re.search(r"\bnan\b|\bNone\b", text)
 
 
-def test_pictures_are_inside_and_explained(report, tmp_path):
+def test_pictures_are_embedded_and_explained(report, tmp_path):
     files = pictures(tmp_path, *[f"images-{name}" for name in NAMES])
-    html = render_quality(report, [*files, tmp_path / "images-found.pdf"])
+    html = render_imaging_quality(report, [*files, tmp_path / "images-found.pdf"])
     page = Page(html)
     assert page.tags.count("img") == 6
     assert page.text.count("What to look for:") == 6
@@ -120,12 +133,14 @@ def test_pictures_are_inside_and_explained(report, tmp_path):
     assert not re.search(r"https?:|url\(|@import|javascript:", html)
 
 
-def test_the_page_stands_in_the_run_folder_where_there_were_images(report, tmp_path, monkeypatch):
-    """Written and linked both ways with images; neither without; read back it is the same page."""
-    monkeypatch.setattr(reports, "save_figures", lambda *_: [])
+def test_the_run_folder_has_the_page_for_a_movie_only(report, tmp_path, monkeypatch, repeats):
+    """For a movie it is written and linked both ways; read back it is the same page."""
+    monkeypatch.setattr(write, "save_figures", lambda *_: [])
+    if repeats(True, False):
+        monkeypatch.setattr(imaging, "save_figure", save_blank)
     few = replace(report, imaging=replace(report.imaging, views=report.imaging.views[:1]))
     for name, one in (("images", few), ("table", replace(report, imaging=None))):
-        reports.write_run(one, tmp_path / name)
+        write.write_run(one, tmp_path / name)
     linked = Page((tmp_path / "images" / "report.html").read_text(encoding="utf-8"))
     assert "quality.html" in linked.sources
     page = Page((tmp_path / "images" / "quality.html").read_text(encoding="utf-8"))
@@ -134,7 +149,7 @@ def test_the_page_stands_in_the_run_folder_where_there_were_images(report, tmp_p
     drawn = {f.name for f in (tmp_path / "images" / "figures").iterdir()}
     assert drawn == {f"images-{n}.{suffix}" for n in NAMES for suffix in ("png", "pdf")}
     again = perrin.load_run(tmp_path / "images")
-    assert render_quality(again, []) == render_quality(few, [])
+    assert render_imaging_quality(again, []) == render_imaging_quality(few, [])
     unlinked = Page((tmp_path / "table" / "report.html").read_text(encoding="utf-8"))
     assert "quality.html" not in unlinked.sources
     assert not (tmp_path / "table" / "quality.html").exists()
