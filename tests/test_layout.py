@@ -150,6 +150,14 @@ def test_subpackages_import_only_those_above_them():
                 assert used in FLAT, path
 
 
+def test_architecture_names_every_module():
+    """The tree of ARCHITECTURE.md holds every module of the package."""
+    tree = (ROOT / "ARCHITECTURE.md").read_text().split("```")[1]
+    named = set(re.findall(r"(\w+)\.py", tree))
+    modules = {p.stem for p in SOURCES if module_of(p) not in OLD_PATHS}
+    assert modules == named - {"__init__"}
+
+
 def test_imports_have_no_cycle():
     """The modules can be sorted so that each imports only modules before it."""
     names = {f"perrin.{module_of(p)}": p for p in SOURCES}

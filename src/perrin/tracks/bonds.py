@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 # Up to this number of particles every pair is followed; of more only the nearest neighbours, which
 # are searched for in some of the frames.
-_ALL_PAIRS, _NEAREST_FOLLOWED, _SAMPLED_FRAMES = 64, 12, 60
+_ALL_PAIRS, _NEAREST_FOLLOWED, _SCREENED_FRAMES = 64, 12, 60
 
 
 # Followed positions per chunk of pairs: bounds the memory.
@@ -408,7 +408,7 @@ def neighbour_pairs(frame: Ints, code: Ints, x: Floats, *, count: int) -> tuple[
         first, second = np.triu_indices(count, 1)
         return first.astype(np.int64), second.astype(np.int64)
     frames = np.unique(frame)
-    chosen = set(frames[np.linspace(0, len(frames) - 1, _SAMPLED_FRAMES).astype(int)].tolist())
+    chosen = set(frames[np.linspace(0, len(frames) - 1, _SCREENED_FRAMES).astype(int)].tolist())
     seen = np.zeros(count, dtype=np.bool_)
     seen[code[np.isin(frame, list(chosen))]] = True
     rest = np.flatnonzero(~seen[code])

@@ -44,7 +44,7 @@ _PLACEHOLDER_STEP, _PLACEHOLDER_ROWS = 5.0, 3
 
 # A particle needs this number of steps before its repeats are judged; from steps up to this number
 # of rows from a repeat follows how often a coordinate stays the same by rounding alone.
-_FEWEST_STEPS, _ROWS_AROUND = 8, 5
+_FEWEST_MOVES, _ROWS_AROUND = 8, 5
 
 
 # A tenth of the steps of a moving particle are shorter than 0.13 of their standard deviation on an
@@ -397,7 +397,7 @@ def placeholder_rows(code: Ints, x: Floats) -> Bools:
     same = np.diff(particle) == 0
     particles = int(code.max()) + 1
     usual = _group_medians(particle[1:][same], step[same], particles)
-    usual[np.bincount(particle[1:][same], minlength=particles) < _FEWEST_STEPS] = np.inf
+    usual[np.bincount(particle[1:][same], minlength=particles) < _FEWEST_MOVES] = np.inf
     step[~same] = np.inf
     leap = np.minimum(np.append(np.inf, step), np.append(step, np.inf))
     leap[np.isinf(leap)] = np.nan
@@ -471,7 +471,7 @@ def repeated_rows(code: Ints, x: Floats) -> Bools:
     for particle in np.unique(code[1:][held]):
         rows = np.arange(*np.searchsorted(code, [particle, particle + 1]))
         stays = held[rows[1:] - 1]
-        if np.count_nonzero(~stays) < _FEWEST_STEPS or not _moves_after_stays(x[rows], stays):
+        if np.count_nonzero(~stays) < _FEWEST_MOVES or not _moves_after_stays(x[rows], stays):
             continue
         chance = rounding_chances(x[rows])
         alone = _lone_stays(x[rows], stays)
