@@ -372,17 +372,18 @@ def condition_faults(**values: object) -> list[str]:
     >>> condition_faults(temperature=22)
     ['temperature: expected kelvin, 200 to 500, got 22; if it is in degrees Celsius, use 295.15']
     """
-    faults = []
-    for name, value in values.items():
-        number = value.item() if isinstance(value, np.ndarray) and value.ndim == 0 else value
-        fault = number_fault(name, number, above=0)
-        faults += fault
-        if name == "temperature" and not fault and not _COLDEST <= number <= _HOTTEST:  # type: ignore[operator]
-            hint = f"; if it is in degrees Celsius, use {number + 273.15:g}"  # type: ignore[operator]
-            faults.append(
-                f"temperature: expected kelvin, {_COLDEST:g} to {_HOTTEST:g}, got {value!r}"
-                + (hint if number < _COLDEST else "")  # type: ignore[operator]
-            )
+    numbers = {
+        name: value.item() if isinstance(value, np.ndarray) and value.ndim == 0 else value
+        for name, value in values.items()
+    }
+    faults = [fault for name, n in numbers.items() for fault in number_fault(name, n, above=0)]
+    kelvin = numbers.get("temperature", _COLDEST)
+    if not number_fault("", kelvin, above=0) and not _COLDEST <= kelvin <= _HOTTEST:
+        hint = f"; if it is in degrees Celsius, use {kelvin + 273.15:g}"
+        faults.append(
+            f"temperature: expected kelvin, {_COLDEST:g} to {_HOTTEST:g}, got {kelvin!r}"
+            + (hint if kelvin < _COLDEST else "")
+        )
     return faults
 
 
