@@ -372,7 +372,7 @@ def condition_faults(**values: object) -> list[str]:
     >>> condition_faults(temperature=22)
     ['temperature: expected kelvin, 200 to 500, got 22; if it is in degrees Celsius, use 295.15']
     """
-    numbers = {
+    numbers: dict[str, Any] = {
         name: value.item() if isinstance(value, np.ndarray) and value.ndim == 0 else value
         for name, value in values.items()
     }
