@@ -8,6 +8,7 @@ import re
 import runpy
 import subprocess
 import sys
+from functools import cache
 from graphlib import TopologicalSorter
 from pathlib import Path
 from types import ModuleType
@@ -117,6 +118,7 @@ def test_old_paths_work_and_warn(old, new):
             assert getattr(module, name) is value
 
 
+@cache
 def imports_of(path: Path) -> set[str]:
     """Return every module that a file imports, anywhere in it."""
     found = set()
