@@ -40,7 +40,7 @@ demo: .venv/.demo  ## the main job on an embedded table, into perrin-demo/
 	$(BIN)/perrin demo
 
 test: .venv/.test  ## the whole suite, on all cores
-	OMP_NUM_THREADS=1 $(RUN) pytest -q -n auto --dist loadfile
+	PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(RUN) pytest -q -n auto --dist loadfile
 
 test-lowest:  ## the suite on the oldest dependencies allowed (Python 3.11)
 	@$(call make_venv,.venv-lowest)
