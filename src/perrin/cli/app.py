@@ -66,10 +66,8 @@ app = typer.Typer(
     rich_markup_mode=None,
 )
 
-
 # Default folder of the demo, and the files that it writes there, by which it is recognised.
 _DEMO_FOLDER = "perrin-demo"
-
 
 _DEMO_FILES = re.compile(
     r"summary\.json|run\.json|report\.html|curves\.csv|(?:tracks|motion)\.parquet"

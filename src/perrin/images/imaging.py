@@ -152,7 +152,6 @@ class Imaging:
 
 _TABLES = ("features", "frames", "spots")
 
-
 _IMAGING_SETTINGS = tuple(
     field.name for field in fields(Imaging) if field.name not in (*_TABLES, "views")
 )

@@ -27,10 +27,8 @@ if TYPE_CHECKING:
 
 _PathLike: TypeAlias = str | os.PathLike[str]
 
-
 # Relative difference of the user's values from those of the file above which a warning is given.
 _HEADER_TOLERANCE = 1e-3
-
 
 _OME_TYPES = ("uint8", "int8", "uint16", "int16", "uint32", "int32", "float32", "float64")
 

@@ -19,8 +19,6 @@ if TYPE_CHECKING:
 
 
 _SETTINGS = "settings.json"
-
-
 _PART_SECONDS = 2.0  # between two parts; at most this much work is lost in a power cut
 
 

@@ -40,17 +40,9 @@ if TYPE_CHECKING:
 
 
 _VIEWS = 8  # frames that are kept as pictures
-
-
 _LIBRARIES = ("perrin", "numpy", "scipy", "trackpy")
-
-
 _FEWEST_IMAGES = 3  # different images that a movie must have
-
-
 _LISTED_REFUSALS = 10  # refused clusters that are listed one by one
-
-
 _LOCATED, _POSED = "located", "posed"
 
 

@@ -33,8 +33,6 @@ if TYPE_CHECKING:
     from perrin.movie.workers import Work
 
 S = TypeVar("S")
-
-
 _METHOD_FILE = "method.json"
 
 
@@ -379,7 +377,6 @@ def _poses_by_frame(
 
 # Columns of a pose: centre and rotation matrix.
 _POSE = ("x", "y", "z", *(f"r{i}{j}" for i in range(3) for j in range(3)))
-
 
 # Columns of its error: covariance of the rotation vector, and variance of the centre.
 _SPREAD = (*(f"c{i}{j}" for i in range(3) for j in range(3)), "variance")

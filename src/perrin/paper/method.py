@@ -27,21 +27,14 @@ if TYPE_CHECKING:
 # touching spheres of 2 um, as in its Fig. 1.
 R = Cluster.touching(4, 2.0).R
 
-
 # Localisation errors that the paper simulates, um.
 NOISES = (0.01, 0.03, 0.05, 0.07, 0.10)
-
 
 # Steps of the paper's simulations.
 STEPS = 10_000
 
-
 _CHALLIS = "2.1 Challis' procedure"
-
-
 _CLUSTERS = "2.2 Application to colloidal clusters"
-
-
 _TESTS = "3 Tests of the prescribed method"
 
 
@@ -457,7 +450,6 @@ def simulation(study: Study) -> Item:
 
 
 _PRINTED_TETRAHEDRON = np.array([(1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)]) / np.sqrt(3)
-
 
 _PRINTED_PENTAHEDRON = np.array(
     [(1, 0, 0), (-1 / 2, np.sqrt(3) / 2, 0), (-1 / 2, -np.sqrt(3) / 2, 0), (0, 0, 1), (0, 0, -1)]

@@ -26,7 +26,6 @@ ITEMS: tuple[Callable[[Study], Item], ...] = (
     figure_6,
 )  # fmt: skip
 
-
 _HEADING = """# The paper, claim by claim
 
 G. L. Hunter, K. V. Edmond, M. T. Elsesser and E. R. Weeks, "Tracking rotational diffusion of

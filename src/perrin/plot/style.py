@@ -16,10 +16,7 @@ if TYPE_CHECKING:
 # Colours of Okabe and Ito, which colour-blind readers and grey prints distinguish.
 INK, BLUE, RED, GREY = "#222222", "#0072B2", "#D55E00", "#8a8a8a"
 
-
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
-
-
 DPI = 150  # resolution of PNG files
 
 

@@ -24,7 +24,6 @@ if TYPE_CHECKING:
 
 Fact = tuple[str, str, str]  # name, value and remark
 
-
 # Caption of each figure: its title, what it shows, and what to look for.
 _IMAGING_CAPTIONS = {
     "found": (
@@ -82,7 +81,6 @@ _IMAGING_CAPTIONS = {
         "Saturated voxels distort the images of the spheres and bias their fits.",
     ),
 }
-
 
 _LISTED_FRAMES = 50  # largest number of unreadable frames in the table
 

@@ -80,9 +80,7 @@ _RESULT_CAPTIONS = {
     ),
 }
 
-
 _LINKED_CLUSTERS = 10  # largest number of clusters that one line links to
-
 
 # Units of the arguments of `analyze`.
 _ARGUMENT_UNITS = {

@@ -85,10 +85,8 @@ if TYPE_CHECKING:
 # Clusters have no common D if they agree less well than this by chance.
 _DISAGREEMENT = 0.003
 
-
 # A steady velocity or spin is reported below this p-value, shared by all clusters of a table.
 _STEADY_LEVEL = 1e-3
-
 
 # Noise floor and alike steps are tested at this number of standard errors (0.05 % of clean
 # tracks), the noise floor for any ratio sigma_z/sigma_xy up to this one.

@@ -23,34 +23,24 @@ if TYPE_CHECKING:
 
 
 CONSTANT_Z = "z never changes: leave the column out to analyse motion in the plane"
-
-
 ROD_TESTS = "jumps and a steady motion of a rod are not tested for"
-
-
 ROD_DRIFT = "drift=True is not applied to rods: D_T and D_perp contain a mean motion"
-
 
 TOO_FAST = (
     "identity: the body turns too far between frames for its symmetry; cutting the longest steps "
     "makes D_R too low: sample faster"
 )
 
-
 # A remark on at most this share of the frames is a note.
 _SHARE_FOR_NOTE = 0.01
-
 
 # Jumps whose lengths differ by less than this share are all of one length.
 _ONE_LENGTH = 0.3
 
-
 # A track is cut too often beyond this share of the frames.
 _SHARE_OF_CUTS = 0.02
 
-
 _ANGLES_SHOWN, _JUMPS_SHOWN = 5, 5
-
 
 # At least one of this number of frame numbers occurs; numbers that are times in ms are sparser.
 SPARSE = 100
@@ -80,7 +70,6 @@ class Remarks:
 
 
 _NUMBER_TEXT = re.compile(r"[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?(?:\(\d+\))?|\b(?:nan|inf)\b")
-
 
 # Words that change with a number beside them (lists, plurals, verbs), and what replaces them.
 _WORDS_BY_NUMBER = (

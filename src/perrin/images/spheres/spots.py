@@ -24,18 +24,14 @@ if TYPE_CHECKING:
 # Distance in contacts below which the images of two spheres overlap, with their blur.
 _IMAGE_OVERLAP = 1.6
 
-
 # Largest number of spheres in a chain of overlapping images that is fitted group by group.
 _MAX_CHAIN = 16
-
 
 # Least ratio of neighbouring masses that separates spheres from noise.
 _CLEAR_GAP = 2.0
 
-
 # Masses that are all within this ratio are all of spheres.
 _SAME_MASS_RATIO = 4.0
-
 
 # Ratio to the largest mass below which a gap separates noise from noise.
 _FAINT_RATIO = 20.0
