@@ -51,12 +51,12 @@ class Cell:
     quantity: str = "rotation"
 
     def __str__(self):
-        told = f"{self.body}, {self.frames} frames, SNR {self.snr:g}"
-        told += ", D_T" if self.quantity == "translation" else ""
-        told += f", axes {self.axes[0]:g}:{self.axes[1]:g}:{self.axes[2]:g}" if self.uneven else ""
-        told += f", sigma_z {self.sigma_z:g} times sigma_xy" if self.sigma_z != 1 else ""
-        told += f", {self.missing:.0%} missing" if self.missing else ""
-        return told + (", full blur" if self.substeps > 1 else "")
+        text = f"{self.body}, {self.frames} frames, SNR {self.snr:g}"
+        text += ", D_T" if self.quantity == "translation" else ""
+        text += f", axes {self.axes[0]:g}:{self.axes[1]:g}:{self.axes[2]:g}" if self.uneven else ""
+        text += f", sigma_z {self.sigma_z:g} times sigma_xy" if self.sigma_z != 1 else ""
+        text += f", {self.missing:.0%} missing" if self.missing else ""
+        return text + (", full blur" if self.substeps > 1 else "")
 
     @property
     def uneven(self):

@@ -74,7 +74,7 @@ def simulated(cell, rng):
 
 
 def measured(cell, rng):
-    """Return values and errors along the true axes, p-values, and what is said of the axes."""
+    """Return values and errors along the true axes, p-values, and the warnings about the axes."""
     motion, values = simulated(cell, rng)
     axes = perrin.kabsch(motion.template, BODY.positions) @ SLANT
     found = perrin.diffusion_tensor(motion, symmetry="C_1", **(cell.options or {}))

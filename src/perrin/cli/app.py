@@ -463,7 +463,7 @@ def predict(
 
     import perrin
     from perrin.hydrodynamics.units import length_remarks
-    from perrin.run.folders import write_json
+    from perrin.tracks.writing import write_json
 
     with messages_of(predict):
         if output is not None:

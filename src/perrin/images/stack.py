@@ -493,8 +493,8 @@ def write_stack(stack: Stack, path: _PathLike) -> None:
     description: bytes | None = bytes(xml.tostring(declaration=True).encode())
     n_bytes = t * z * y * x * stack.dtype.itemsize
     with (
-        written_whole(target) as beside,
-        tifffile.TiffWriter(beside, bigtiff=n_bytes > 2**31) as file,
+        written_whole(target) as part,
+        tifffile.TiffWriter(part, bigtiff=n_bytes > 2**31) as file,
     ):
         for plane in (plane for frame in stack for plane in frame):
             file.write(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import warnings
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -18,7 +18,7 @@ from perrin.images.spheres.poses import Pose, pose_in, with_poses
 from perrin.movie.checks import Findings, unsettled_poses
 from perrin.movie.parts import PartWriter, open_parts, read_parts
 from perrin.movie.workers import work_through
-from perrin.tracks.writing import written_whole
+from perrin.tracks.writing import write_json, written_whole
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -158,8 +158,8 @@ def locate_frames(
         work.report(0, 0, "learning mass cut and optics")
         learned = learn_method(stack, search, refine=refine, optics=optics, frames=frames)
         open_parts(folder, settings)
-        with written_whole(known) as beside:
-            beside.write_text(json.dumps(learned), encoding="utf-8")
+        with written_whole(known) as unfinished:
+            write_json(unfinished, learned)
     found = learned["optics"]
     method = Method(
         replace(search, minmass=learned["minmass"]),
@@ -241,7 +241,7 @@ def learn_method(
         method = choose_method(stack, search, sample, refine=refine, optics=optics)
     return {
         "minmass": method.search.minmass,
-        "optics": None if method.optics is None else asdict(method.optics),
+        "optics": None if method.optics is None else method.optics.to_dict(),
         "spots": [[seen.number, mass] for seen in sample for mass in seen.spots.mass.tolist()],
         "told": [str(warning.message) for warning in caught],
     }
@@ -322,7 +322,7 @@ def fit_poses(
     for start in starts.values():
         for part in start[1:]:
             total.update(np.ascontiguousarray(part).tobytes())
-    settings = {"starts": total.hexdigest(), "optics": asdict(optics)}
+    settings = {"starts": total.hexdigest(), "optics": optics.to_dict()}
     try:
         open_parts(folder, settings)
     except ValueError:

@@ -1,8 +1,7 @@
-"""Run folders and their JSON files: written whole, or resumed."""
+"""Run folders: written whole, or resumed."""
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 from contextlib import contextmanager
@@ -27,7 +26,7 @@ def staged_folder(folder: str | os.PathLike[str], *, overwrite: bool = False) ->
     Yields
     ------
     Path
-        A new folder beside it; it is removed if the writing fails.
+        A new folder in the same place; it is removed if the writing fails.
 
     Raises
     ------
@@ -135,15 +134,3 @@ def check_place(folder: str | os.PathLike[str], *, overwrite: bool = False) -> N
         raise FileExistsError(f"{place} exists: choose another folder, or overwrite=True")
     if not place.is_dir() or (any(place.iterdir()) and not (place / "run.json").is_file()):
         raise FileExistsError(f"{place} is no run folder of perrin (no run.json): not overwritten")
-
-
-def write_json(path: Path, content: object) -> None:
-    """Write a file of JSON in UTF-8, indented, in which no number is infinite or missing.
-
-    Raises
-    ------
-    ValueError
-        If a number is not finite.
-    """
-    text = json.dumps(content, indent=2, allow_nan=False, ensure_ascii=False)
-    path.write_text(text + "\n", encoding="utf-8")

@@ -22,8 +22,9 @@ from perrin.motion.floor import NoiseFloor, floor_of
 from perrin.motion.rigid_motion import RigidMotion
 from perrin.motion.rigidity import Quality
 from perrin.motion.rods import RodMotion
-from perrin.run.folders import staged_folder, write_json
+from perrin.run.folders import staged_folder
 from perrin.run.predictions import Prediction
+from perrin.tracks.writing import write_json
 
 if TYPE_CHECKING:
     import os

@@ -97,7 +97,7 @@ def analyze(
     DegenerateClusterError, TooFewFramesError
         If no cluster can be measured; a cluster that cannot be measured among others is a warning.
     ValueError
-        For arguments out of range or stated twice.
+        For arguments out of range, or stated both in `experiment` and as a keyword.
 
     Examples
     --------
