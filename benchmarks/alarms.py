@@ -1,4 +1,4 @@
-"""Does every fault raise its warning, and do clean data raise none? Planted faults, clean data.
+"""Shares of planted faults that raise their warning, and of clean data that raise any.
 
 Usage: python benchmarks/alarms.py [--repeats 200] [--only NAME] [--jobs 2] [--seed 0] [--quick]
                                    [--images] [--texts]
@@ -463,7 +463,7 @@ def with_times(measured, _, *, step=DT, pauses=0.0):
     return measured.assign(time=times[measured["frame"]].round(5))
 
 
-# Measurements: what is given back are the report's texts.
+# Measurements, which return the texts of the report.
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Which particle is which: simulated bodies with known truth, and the time it all takes.
+"""Which particle is which: errors for simulated bodies with known labels, and the time taken.
 
 Usage: python benchmarks/identity.py [--seed N] [--clusters N] [--only NAME]
 """

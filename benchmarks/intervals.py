@@ -1,11 +1,11 @@
-"""Are the estimates at the statistical limit, and do their intervals cover? Simulated truth.
+"""Efficiency, bias and coverage of the estimates, for simulated tracks with known values.
 
 Usage: python benchmarks/intervals.py [--tracks N] [--seed N] [--quick] [--paper]
 
 Prints a table for docs/validation.md: for each cell (body, frames, signal-to-noise ratio, what is
 done to the track) and each estimator the bias, the spread, the efficiency (Cramer-Rao bound over
-variance) and the cover of both intervals, each with its Monte-Carlo error in brackets. Lines that
-an estimator must keep are checked; the exit status is the number of figures that miss theirs by
+variance) and the coverage of both intervals, each with its Monte-Carlo error in brackets. Limits of
+an estimator are checked; the exit status is the number of figures that miss theirs by
 more than three Monte-Carlo errors. --quick takes 60 tracks a cell. --paper adds the paper's own
 procedure (chained rotations, straight line in the paper's window, error from the scatter about
 the line), which misses nearly all of them.

@@ -1,4 +1,4 @@
-"""The main job: a table in, the right clusters and coefficients out, bad tables refused."""
+"""`analyze`: the right clusters and coefficients of tables, and refused tables."""
 
 from __future__ import annotations
 
@@ -524,7 +524,7 @@ def test_ids_that_break_off_do_not_split_a_cluster(base, whole):
 
 
 def test_rods_are_measured_and_full_rotation_refused(tmp_path):
-    """A dumbbell beside a tetrahedron: D_perp in the summary, D_R null with the reason."""
+    """A dumbbell and a tetrahedron: D_perp in the summary, D_R null with the reason."""
     truth = perrin.simulate_motion(
         perrin.Cluster.touching(2, 2.45), D_R=0.01, D_T=0.05, dt=0.73, n_frames=150, rng=1
     )

@@ -64,7 +64,7 @@ Output = Annotated[
 Scale = Annotated[
     str,
     typer.Option(
-        help="um per unit of the coordinates; one number or x,y,z, e.g. 1000 for mm.",
+        help="Length of one unit of the coordinates, um; one number or x,y,z, e.g. 1000 for mm.",
         rich_help_panel=INPUT,
     ),
 ]
@@ -103,7 +103,7 @@ Sigma = Annotated[
 Noise = Annotated[
     str,
     typer.Option(
-        help="How the noise under D is known: joint (free), residual (from the rigid fit; "
+        help="Noise model: joint (fitted together with D), residual (from the rigid fit; "
         "right only if all particles of a frame are recorded at once), or sigma in um.",
         rich_help_panel=ESTIMATES,
     ),

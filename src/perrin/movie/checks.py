@@ -29,12 +29,12 @@ if TYPE_CHECKING:
 
 _LISTED_ITEMS = 10  # largest number of frames or clusters that a message lists
 _TEST_LEVEL = 0.01  # one-sided level of the tests
-_NORMAL_QUANTILE = 2.326  # of the normal distribution at that level
+_NORMAL_QUANTILE = 2.326  # quantile of the normal distribution at that level
 _PAIR_BIAS = 0.03  # relative error of the mean pair distance
 _BLEACHED = 0.1  # relative loss of brightness over the movie
 _DEPTH_CHANGE = 0.1  # relative change of brightness over the depth of the spheres
-_MISSING_SHARE = 0.1  # of the spheres of the clusters
-_FAILED_SHARE = 0.01  # of the fits
+_MISSING_SHARE = 0.1  # missing share of the spheres of the clusters
+_FAILED_SHARE = 0.01  # share of fits that did not converge
 _UNSAFE_STEP, _REFUSED_STEP = 0.25, 0.5  # rms step over the contact distance
 _FAST_RATIO, _SLOW_ROTATION = 2.0, 0.5  # MSAD at the first lag over Phi^2; rms rotation, rad
 
@@ -182,7 +182,7 @@ def empty_frames(frames: pd.DataFrame, *, minmass: float) -> Findings:
         return _NOTHING
     text = (
         f"no particles passed the mass cut ({minmass:.3g}) in {len(none)} of {len(read)} frames: "
-        f"{frame_runs_text(none['frame'].to_numpy())}; look at the mass histogram, set minmass or "
+        f"{frame_runs_text(none['frame'].to_numpy())}; inspect the mass histogram, set minmass or "
         "leave them out"
     )
     return Findings((text,))

@@ -1,4 +1,4 @@
-"""From a microscope stack to the diffusion of every cluster in it."""
+"""`analyze_stack`: from an image stack to the diffusion coefficients of every cluster."""
 
 from __future__ import annotations
 
@@ -397,8 +397,8 @@ def _with_checks(
     if _uneven_clock(stack) is not None:
         gaps = np.diff(stack.times)
         uneven.append(
-            f"times between frames run from {gaps.min():.4g} to {gaps.max():.4g} s: they are taken "
-            "as they are"
+            f"times between frames run from {gaps.min():.4g} to {gaps.max():.4g} s: these times "
+            "are used"
         )
     found = (
         checks.Findings(tuple(located.warnings), (*stack.notes, *located.notes))

@@ -1,4 +1,4 @@
-"""The two long stages of a run, frame by frame: finding spheres and fitting poses."""
+"""The two stages of a run that work frame by frame: locating spheres and fitting poses."""
 
 from __future__ import annotations
 

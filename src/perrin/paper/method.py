@@ -82,7 +82,7 @@ def challis(study: Study) -> Item:
         labels = {
             "similarity": "s, R, v (Eq. 1)",
             "rotation": "R (Eq. 2)",
-            "svd": "noisy: R beside the SVD (Eqs. 9-10)",
+            "svd": "noisy: R compared with the SVD (Eqs. 9-10)",
         }
         for color, (name, label) in zip(PALETTE, labels.items(), strict=False):
             left.semilogy(table["n"], table[name], "o-", color=color, label=label)
@@ -96,7 +96,7 @@ def challis(study: Study) -> Item:
     text = (
         "Random sets of points are scaled, turned and shifted by known amounts; `similarity` and "
         "`kabsch` find the transformation again. Noisy sets have noise of a tenth of their size; "
-        "Eqs. 9-10 are evaluated with numpy's SVD beside `kabsch`, which has none."
+        "Eqs. 9-10 are evaluated with numpy's SVD and compared with `kabsch`, which uses none."
     )
     return Item("challis", _CHALLIS, "Rigid transformations", text, table, draw, claims)
 

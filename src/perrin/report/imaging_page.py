@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 Fact = tuple[str, str, str]  # name, value and remark
 
-# Caption of each figure: its title, what it shows, and what to look for.
+# Caption of each figure: its title, what it shows, and what to check.
 _IMAGING_CAPTIONS = {
     "found": (
         "Spheres found.",

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from perrin.run.results import ClusterResult, Report
 
 
-# Caption of each figure: its title, what it shows, and what to look for.
+# Caption of each figure: its title, what it shows, and what to check.
 _RESULT_CAPTIONS = {
     "curves": (
         "Mean square displacements against lag time.",

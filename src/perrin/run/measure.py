@@ -108,7 +108,7 @@ class ClusterTracks:
     frames : ndarray of int, shape (T,)
         Frame of each row, counted from the table's first.
     piece : ndarray of int, shape (T,)
-        Stretches of doubtless identity that the table brought.
+        Number of the piece of each row: within a piece no label is in doubt.
     far : ndarray of bool, shape (T, n)
         Points that were left out because they lie far from the body.
     """

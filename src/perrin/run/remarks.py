@@ -1,4 +1,4 @@
-"""The words of every warning and note of the main job, and how those of one kind are merged."""
+"""Texts of all warnings and notes of `analyze`, and how those of one kind are merged."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class Remarks:
     Attributes
     ----------
     warnings : list of str
-        Sentences that speak against the numbers.
+        Sentences that give reasons to doubt the results.
     notes : list of str
         Sentences that inform: how the table was read, what was left out or corrected.
     """
@@ -71,7 +71,8 @@ class Remarks:
 
 _NUMBER_TEXT = re.compile(r"[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?(?:\(\d+\))?|\b(?:nan|inf)\b")
 
-# Words that change with a number beside them (lists, plurals, verbs), and what replaces them.
+# Words that change with the number before or after them (lists, plurals, verbs), and what
+# replaces them.
 _WORDS_BY_NUMBER = (
     (re.compile(r"\bcluster [^\s:,;]+"), "cluster #"),
     (re.compile(r"#(?:, #)*(?: and # more|, \.\.\.)?"), "#"),
@@ -468,7 +469,7 @@ def jump_warning(jumps: Jumps, frames: Ints, quantity: Quantity, *, kept: bool) 
         return (
             f"steps: {what} in {len(frames)} of {jumps.n_steps} steps farther than Brownian motion "
             f"can (the longest {length.max():.3g} {unit}, at frame {frames[np.argmax(length)]})"
-            f"{wrapped}: so many are usually another kind of motion (hops, a "
+            f"{wrapped}: this number of jumps usually indicates another kind of motion (hops, a "
             f"changing D, heavy tails), which one {name} does not describe; they are left in"
         )
     done = f"{name} contains them" if kept else f"{name} leaves them out (keep_jumps keeps them)"

@@ -1,4 +1,4 @@
-"""From a track table to a Report: the main job, as a user calls it."""
+"""`analyze`: from a track table to a Report."""
 
 from __future__ import annotations
 

@@ -151,7 +151,7 @@ def mass_cut(mass: Floats) -> float:
     if ratio.max() < _CLEAR_GAP:
         warnings.warn(
             f"the masses of the {mass.size} spots found have no clear gap between spheres and "
-            "noise: all are kept; look at their histogram and set minmass",
+            "noise: all are kept; inspect their histogram and set minmass",
             PrecisionWarning,
             stacklevel=4,
         )
