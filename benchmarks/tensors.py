@@ -4,8 +4,8 @@ An irregular body of six particles, sigma/R = 0.03, principal axes at a slant to
 the mean of D dt over the mean noise variance of an orientation angle. Columns: along each true axis
 the mean, the spread, the mean stated error (all over the planted value) and how often the 68 and
 95 % intervals (normal) hold it; how often isotropy and axial symmetry are rejected at 5 %; how
-often the error of an axis is given, and the true median error of these axes. Brackets: one Monte-Carlo standard
-error.
+often the error of an axis is given, and the true median error of these axes. Brackets: one
+Monte-Carlo standard error.
 
 Usage: python benchmarks/tensors.py [--tracks 2000] [--seed 0] [--cell NAME ...]
 """

@@ -451,8 +451,8 @@ def predict(
     positions: Annotated[
         Path | None,
         typer.Option(
-            help="Sphere centres of another body: csv with the columns x,y,z (um) and, if the radii "
-            "differ, radius (um)."
+            help="Sphere centres of another body: csv with the columns x,y,z (um) and, if the "
+            "radii differ, radius (um)."
         ),
     ] = None,
     accuracy: Annotated[float, typer.Option(help="Largest relative numerical error.")] = 1e-4,
@@ -513,8 +513,8 @@ def plan(
         bool,
         typer.Option(
             "--photons",
-            help="The number of photons is fixed: that of --frames frames in --time s with --sigma. "
-            "The plan divides them among any number of frames.",
+            help="The number of photons is fixed: that of --frames frames in --time s with "
+            "--sigma. The plan divides them among any number of frames.",
         ),
     ] = False,
     output: Annotated[

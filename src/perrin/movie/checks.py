@@ -133,6 +133,13 @@ def unreadable_frames(frames: pd.DataFrame) -> Findings:
     ----------
     frames : pandas.DataFrame
         As in `Imaging`.
+
+    Examples
+    --------
+    >>> import pandas as pd
+    >>> frames = pd.DataFrame({"frame": [0, 1, 2], "fault": ["", "page is cut short", ""]})
+    >>> unreadable_frames(frames).warnings[0]
+    '1 of 3 frames cannot be read and are left out: frame 1 (page is cut short)'
     """
     lost = frames[frames["fault"] != ""]
     if not len(lost):
@@ -153,6 +160,13 @@ def repeated_frames(frames: pd.DataFrame) -> Findings:
     ----------
     frames : pandas.DataFrame
         As in `Imaging`.
+
+    Examples
+    --------
+    >>> import pandas as pd
+    >>> frames = pd.DataFrame({"frame": [0, 1, 2], "copy_of": [-1, 0, -1]})
+    >>> repeated_frames(frames).warnings[0][:47]
+    '1 of 3 frames repeat an earlier frame exactly, '
     """
     copies = frames[frames["copy_of"] >= 0]
     if not len(copies):
@@ -175,6 +189,13 @@ def empty_frames(frames: pd.DataFrame, *, minmass: float) -> Findings:
         As in `Imaging`.
     minmass : float
         Mass cut.
+
+    Examples
+    --------
+    >>> import pandas as pd
+    >>> frames = pd.DataFrame({"frame": [0, 1], "fault": ["", ""], "spheres": [4, 0]})
+    >>> empty_frames(frames, minmass=50.0).warnings[0][:64]
+    'no particles passed the mass cut (50) in 1 of 2 frames: frame 1;'
     """
     read = frames[frames["fault"] == ""]
     none = read[read["spheres"] == 0]
@@ -189,12 +210,18 @@ def empty_frames(frames: pd.DataFrame, *, minmass: float) -> Findings:
 
 
 def saturated_frames(frames: pd.DataFrame) -> Findings:
-    """Warn of frames with voxels clipped at the highest value (`optics.saturated_share`).
+    """Warn of frames with voxels clipped at the highest value (see `saturated_share`).
 
     Parameters
     ----------
     frames : pandas.DataFrame
         As in `Imaging`.
+
+    Examples
+    --------
+    >>> import pandas as pd
+    >>> saturated_frames(pd.DataFrame({"saturated": [0.0, 0.0]}))
+    Findings(warnings=(), notes=())
     """
     share = frames["saturated"].to_numpy(dtype=np.float64)
     over = share > 0
@@ -400,7 +427,7 @@ def unsettled_poses(count: int, of: int) -> Findings:
     """
     if not count:
         return _NOTHING
-    text = f"{count} of {of} poses did not settle in the image and are those of the free centres"
+    text = f"{count} of {of} poses did not converge in the image and are those of the free centres"
     return _fit_failures(text, count / of)
 
 
@@ -617,7 +644,7 @@ def scan_blur(
     text = (
         f"cluster scanned in {scan:.2g} s ({planes:.0f} planes of {plane_time:.2g} s): motion blur "
         f"about {1e3 * blur:.0f} +- {1e3 * blur_error:.1g} nm > sigma {1e3 * sigma:.0f} +- "
-        f"{1e3 * sigma_error:.1g} nm; positions are of different moments; scan faster or take "
+        f"{1e3 * sigma_error:.1g} nm; positions are those of different times; scan faster or take "
         "fewer planes"
     )
     return Verdict(text, blur / sigma if sigma > 0 else np.inf)

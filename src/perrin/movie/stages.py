@@ -336,11 +336,11 @@ def fit_poses(
 
     fitted = {}
     for cluster, (motion, frames) in motions.items():
-        mine = rows[(rows["cluster"] == cluster) & rows["x"].notna()]
+        fits = rows[(rows["cluster"] == cluster) & rows["x"].notna()]
         row_of = {int(frame): k for k, frame in enumerate(frames)}
-        number = mine["frame"].to_numpy()
-        pose = mine[list(_POSE)].to_numpy(dtype=np.float64)
-        spread = mine[list(_SPREAD)].to_numpy(dtype=np.float64)
+        number = fits["frame"].to_numpy()
+        pose = fits[list(_POSE)].to_numpy(dtype=np.float64)
+        spread = fits[list(_SPREAD)].to_numpy(dtype=np.float64)
         poses = {
             row_of[int(i)]: Pose(p[:3], p[3:].reshape(3, 3), s[:9].reshape(3, 3), float(s[9]))
             for i, p, s in zip(number, pose, spread, strict=True)

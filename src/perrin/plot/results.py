@@ -215,7 +215,7 @@ def plot_presence(motion: RigidMotion, *, ax: Axes) -> Axes:
     absent = _without_pose(motion)
     if absent.size:
         ax.plot(motion.time[absent], motion.n_present[absent], **_CROSS)
-    ax.set(xlabel="time (s)", ylabel=f"seen (of {n})", ylim=(-0.3, n + 0.5))
+    ax.set(xlabel="time (s)", ylabel=f"present (of {n})", ylim=(-0.3, n + 0.5))
     ax.set_yticks(np.arange(0, n + 1, max(1, n // 4)))
     return ax
 

@@ -31,6 +31,11 @@ def new_figure(width: float, height: float) -> Figure:
     Returns
     -------
     matplotlib.figure.Figure
+
+    Examples
+    --------
+    >>> new_figure(4, 3).get_size_inches()
+    array([4., 3.])
     """
     return Figure(figsize=(width, height), layout="constrained")
 
@@ -47,6 +52,14 @@ def save_figure(figure: Figure, stem: Path) -> list[Path]:
     Returns
     -------
     list of Path
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     [file.name for file in save_figure(new_figure(2, 1), Path(folder, "empty"))]
+    ['empty.png', 'empty.pdf']
     """
     FigureCanvasAgg(figure)
     files = [stem.with_name(stem.name + suffix) for suffix in (".png", ".pdf")]
@@ -91,6 +104,11 @@ def write_reason(ax: Axes, reason: str, *, framed: bool = False) -> Axes:
     Returns
     -------
     matplotlib.axes.Axes
+
+    Examples
+    --------
+    >>> write_reason(new_figure(2, 1).add_subplot(), "no steps").texts[0].get_text()
+    'no steps'
     """
     text = ax.text(0.5, 0.5, reason, ha="center", va="center", transform=ax.transAxes)
     if framed:

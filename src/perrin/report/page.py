@@ -154,7 +154,7 @@ def render_html(report: Report, figures: Iterable[Path]) -> str:
             }
             for rod in report.rods
         ],
-        seen=report.imaging is not None,
+        has_images=report.imaging is not None,
         warnings=condensed(report.warnings),
         warned=_remarks(report, {c.name: c.warnings for c in report.results}),
         notes=condensed(report.notes),

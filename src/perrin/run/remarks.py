@@ -224,6 +224,11 @@ def grouping_note(cluster: Ints, *, particles: int) -> str:
         Cluster numbers of all rows.
     particles : int
         Number of particles of the table.
+
+    Examples
+    --------
+    >>> grouping_note(np.array([0, 0, 0]), particles=3)
+    'no cluster column and no contact distance: all 3 particles are taken as one cluster'
     """
     start = "no cluster column and no contact distance"
     if (cluster == 0).all():
@@ -235,7 +240,13 @@ def grouping_note(cluster: Ints, *, particles: int) -> str:
 
 
 def loose_particles_note(count: int) -> str:
-    """State how many particles belong to no cluster."""
+    """State how many particles belong to no cluster.
+
+    Examples
+    --------
+    >>> loose_particles_note(3)
+    '3 particles belong to no cluster and are left out'
+    """
     return f"{count} particles belong to no cluster and are left out"
 
 
@@ -248,6 +259,11 @@ def no_cluster_text(contact: float | None, *, marked: bool) -> str:
         The stated contact distance, um.
     marked : bool
         Whether the table has a column cluster.
+
+    Examples
+    --------
+    >>> no_cluster_text(2.0, marked=False)
+    'no cluster: every particle is loose at contact = 2.0 um; correct that, or the scale'
     """
     if marked:
         return "no cluster: every particle is marked as loose (-1); correct that, or the scale"
@@ -289,7 +305,20 @@ def absent_frames_notes(recorded: Ints, stride: Sequence[str], *, first_frame: i
 
 
 def sparse_frames_warnings(recorded: Ints) -> list[str]:
-    """Warn where fewer than one in 100 of the frame numbers occurs: they are hardly frames."""
+    """Warn where fewer than one in 100 of the frame numbers occurs: they are probably times.
+
+    Parameters
+    ----------
+    recorded : ndarray of int
+        Frames that have rows, counted from the first.
+
+    Examples
+    --------
+    >>> sparse_frames_warnings(np.array([0, 1, 2]))
+    []
+    >>> sparse_frames_warnings(np.array([0, 500, 1000]))[0][:50]
+    'frame numbers: only 3 of the 1001 numbers from the'
+    """
     span = int(recorded[-1]) + 1
     if span <= SPARSE * len(recorded) or len(recorded) < 2:
         return []
@@ -319,7 +348,16 @@ def left_out_warnings(failures: Iterable[tuple[str, Exception]]) -> list[str]:
 
 
 def assumed_exposure_notes(noise: Noise) -> list[str]:
-    """State which exposure is assumed where the noise is held and the exposure unknown."""
+    """State which exposure is assumed where the noise is not fitted and the exposure is unknown.
+
+    Examples
+    --------
+    >>> from perrin.diffusion.noise_model import Noise
+    >>> assumed_exposure_notes(Noise())
+    []
+    >>> assumed_exposure_notes(Noise("residual"))[0][:57]
+    'noise residual: the exposure is not stated and taken as 0'
+    """
     if noise.model == "joint" or noise.exposure is not None:
         return []
     return [
@@ -353,6 +391,11 @@ def corrected_labels_text(frames: Ints, *, misfit: float, usual: float) -> str:
     misfit, usual : float
         Largest residual that the labels as they came would have left, um (NaN where unknown), and
         the median residual of all frames, um.
+
+    Examples
+    --------
+    >>> corrected_labels_text(np.array([7]), misfit=np.nan, usual=0.02)
+    'identity: labels change particles at frame 7; corrected'
     """
     residual = ""
     if np.isfinite(misfit):
@@ -387,7 +430,13 @@ def cut_text(frames: Ints, *, angles: Floats, symmetry: str) -> str:
 
 
 def extra_detection_text(frames: Ints) -> str:
-    """State where a detection was left out because it is no particle of the body."""
+    """State where a detection was left out because it is no particle of the body.
+
+    Examples
+    --------
+    >>> extra_detection_text(np.array([7]))
+    'identity: a detection that is no particle of the body is left out at frame 7'
+    """
     return (
         f"identity: a detection that is no particle of the body is left out at "
         f"{frames_text(frames)}"
@@ -395,7 +444,13 @@ def extra_detection_text(frames: Ints) -> str:
 
 
 def unsettled_notes(frames: Ints, *, of: int) -> list[str]:
-    """State which of `of` frames fit the common shape in no assignment of labels."""
+    """State which of `of` frames fit the common shape in no assignment of labels.
+
+    Examples
+    --------
+    >>> unsettled_notes(np.array([7]), of=300)[0][:64]
+    'identity: 1 of 300 frames fit the common shape in no assignment '
+    """
     if not frames.size:
         return []
     return [
@@ -405,7 +460,13 @@ def unsettled_notes(frames: Ints, *, of: int) -> list[str]:
 
 
 def fast_turning_warnings(*, cuts: int, of: int) -> list[str]:
-    """Warn where the track is cut in more than 2 % of `of` frames."""
+    """Warn where the track is cut in more than 2 % of `of` frames.
+
+    Examples
+    --------
+    >>> fast_turning_warnings(cuts=6, of=300), len(fast_turning_warnings(cuts=7, of=300))
+    ([], 1)
+    """
     return [TOO_FAST] if cuts > _SHARE_OF_CUTS * of else []
 
 
