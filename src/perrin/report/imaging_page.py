@@ -76,8 +76,8 @@ _IMAGING_CAPTIONS = {
         "Number of spheres and of all spots, brightness of the spheres, grey level of the frame, "
         "and share of voxels at the end of the camera's range. Crosses mark frames that could "
         "not be read.",
-        "Constant lines. Decreasing brightness is bleaching, which increases the errors. A "
-        "changing number of spheres means that spheres cross the border or the mass cut. "
+        "All lines should be constant. Decreasing brightness is bleaching, which increases the "
+        "errors. A changing number of spheres means that spheres cross the border or the mass cut. "
         "Saturated voxels distort the images of the spheres and bias their fits.",
     ),
 }

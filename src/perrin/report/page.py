@@ -60,8 +60,7 @@ _RESULT_CAPTIONS = {
         "Paths of the particles' directions on the unit sphere in lab axes; strong on the side of "
         "the viewer, faint on the far side; an open circle marks the end of each path.",
         "A freely diffusing body has no preferred orientation. Long straight chords are jumps or "
-        "gaps; "
-        "rings about one axis are driven or hindered rotation.",
+        "gaps; rings about one axis are driven or hindered rotation.",
     ),
     "angle": (
         "Angle in the plane.",

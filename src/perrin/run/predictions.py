@@ -172,7 +172,7 @@ class ShapeMobility:
     reason : str
         Why there is no mobility; empty where there is one.
     warnings : tuple of str
-        Sentences that speak against the mobility.
+        Reasons to doubt the mobility.
     """
 
     mobility: Mobility | None

@@ -53,9 +53,9 @@ class Remarks:
     Attributes
     ----------
     warnings : list of str
-        Sentences that give reasons to doubt the results.
+        Reasons to doubt the results.
     notes : list of str
-        Sentences that inform: how the table was read, what was left out or corrected.
+        How the table was read, what was left out, and what was corrected.
     """
 
     warnings: list[str] = field(default_factory=list)
