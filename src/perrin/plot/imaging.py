@@ -49,7 +49,7 @@ _DARKEST = 0.6
 
 _PATH_FRAMES = 100  # length of a path; longer ones hide the spheres
 _SHOWN_VIEWS = 8  # largest number of views in the figure of tracks
-_VIEWS_IN_A_ROW = 4  # of the figure of tracks
+_VIEWS_IN_A_ROW = 4  # number of views in one row of the figure of tracks
 _NUMBERED_CLUSTERS = 12  # largest number of clusters that are numbered on every side
 _COLORED_CLUSTERS = 6  # largest number of clusters with a colour and a legend each
 _LEGEND_LETTERS = 12  # total length of the clusters' names in a legend of one line

@@ -34,6 +34,15 @@ def staged_folder(folder: str | os.PathLike[str], *, overwrite: bool = False) ->
         If the folder exists and `overwrite` is not set, or is no run folder.
     OSError
         If the folder cannot be written.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as parent:
+    ...     with staged_folder(Path(parent, "run")) as stage:
+    ...         _ = (stage / "run.json").write_text("{}")
+    ...     [path.name for path in Path(parent, "run").iterdir()]
+    ['run.json']
     """
     place = Path(folder)
     check_place(place, overwrite=overwrite)
@@ -117,12 +126,18 @@ def check_resumable(folder: str | os.PathLike[str], *, parts: str, overwrite: bo
 
 
 def check_place(folder: str | os.PathLike[str], *, overwrite: bool = False) -> None:
-    """Refuse, before any work is done, an output folder that exists or cannot be made.
+    """Refuse, before any work begins, an output folder that exists or cannot be made.
 
     Raises
     ------
     FileExistsError, PermissionError
         As in `staged_folder`.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     check_place(Path(folder, "new"))
     """
     place = Path(folder)
     if not place.exists():
