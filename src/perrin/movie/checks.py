@@ -427,7 +427,9 @@ def unsettled_poses(count: int, of: int) -> Findings:
     """
     if not count:
         return _NOTHING
-    text = f"{count} of {of} poses did not converge in the image and are those of the free centres"
+    text = (
+        f"{count} of {of} fits of poses did not converge; these poses are those of the free centres"
+    )
     return _fit_failures(text, count / of)
 
 
