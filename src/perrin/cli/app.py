@@ -555,7 +555,7 @@ def paper(
     seed: Seed = 2011,
     overwrite: Overwrite = False,
 ) -> None:
-    """Reproduce every figure, table and claim of the paper by Hunter et al. (2011)."""
+    """Reproduce all figures, tables and claims of the paper (Hunter 2011)."""
     from rich.console import Console
     from rich.markup import escape
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
