@@ -399,7 +399,7 @@ def test_uneven_times_are_those_of_the_stack(tmp_path, movie_file, learned):
         np.testing.assert_allclose(result.motion.time, times[1:] - times[1], rtol=1e-12)
     table = motion_table(report)
     assert table["frame"].tolist() == 2 * list(range(FRAMES - 1))
-    assert any("run from 0.73 to 4.38 s: they are taken" in text for text in report.notes)
+    assert any("run from 0.73 to 4.38 s: these times are" in text for text in report.notes)
     # Pairs are at the times between the seven frames.
     apart = np.unique(np.round(np.subtract.outer(times[1:], times[1:]) / DT)).astype(int)
     curve = report.clusters[0].msd
