@@ -255,7 +255,7 @@ def test_the_joint_errors_by_monte_carlo(tetrahedron, repeats):
     ],
 )
 def test_bad_input_is_refused(size, options, words):
-    """Every fault of the numbers is in one message; shapes that cannot be used are reported."""
+    """Every fault of the numbers is in one message; shapes that cannot be used are told."""
     given = {"D": 0.04, "cluster": TETRAHEDRON, **PAPER} | options
     with pytest.raises(ValueError) as error:  # noqa: PT011 (the words are checked below)
         size(given.pop("D"), **given)

@@ -10,8 +10,7 @@ import numpy as np
 from perrin.errors import DegenerateClusterError, NoSpheresError
 from perrin.tracks.clusters import identify
 from perrin.tracks.files import check_tracks
-from perrin.tracks.groups import TOUCHING_REACH
-from perrin.tracks.linking import touching_groups
+from perrin.tracks.groups import TOUCHING_REACH, touching_groups
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

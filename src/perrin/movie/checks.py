@@ -548,9 +548,9 @@ def missing_spheres(features: pd.DataFrame, *, size: int, contact: float, frames
         ]
         if absent:
             parts.append(f"none placed in {_frame_count(absent)}")
-        reach = TOUCHING_REACH * contact
         parts += [
-            f"{n} found in {_frame_count(k)} (two clusters within {reach:.2g} um)"
+            f"{n} found in {_frame_count(k)} "
+            f"(two clusters within {TOUCHING_REACH * contact:.2g} um)"
             for n, k in crowd.value_counts().sort_index().items()
         ]
         if first > frames.min():

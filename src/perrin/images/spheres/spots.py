@@ -11,8 +11,7 @@ import numpy as np
 from perrin._arrays import choice_fault, number_fault, refuse, to_plain
 from perrin.errors import PrecisionWarning
 from perrin.geometry.shapes import pair_distances
-from perrin.tracks.groups import TOUCHING_REACH
-from perrin.tracks.linking import touching_groups
+from perrin.tracks.groups import TOUCHING_REACH, touching_groups
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
