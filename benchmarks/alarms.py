@@ -1,11 +1,11 @@
-"""Does every fault raise its warning, and do clean data raise none? Planted faults, clean data.
+"""Shares of planted faults that raise their warning, and of clean data that raise any.
 
 Usage: python benchmarks/alarms.py [--repeats 200] [--only NAME] [--jobs 2] [--seed 0] [--quick]
                                    [--images] [--texts]
 
 Every fault and every clean case is simulated with numpy and scipy alone (without
 `simulate_motion`), analysed, and its warnings are sorted into KINDS. Printed are, for every fault,
-how often it is named, which other warnings stand beside it, and, for every clean case, which
+how often it is named, which other warnings its tables have, and, for every clean case, which
 warnings appear. Lines that must hold:
 
 * every fault is named in at least 95 % of its tables;
@@ -20,7 +20,7 @@ and warnings of more than 500 characters count as kinds of their own. The exit s
 line does not hold. --quick takes 2 tables of every case and calls a line broken where the count
 excludes it (p < 0.005).
 --only runs the cases whose name contains NAME. --images takes movies instead of tables (5 of each
-case unless --repeats says otherwise). --texts prints one text of every kind that should not be
+case unless --repeats is given). --texts prints one text of every kind that should not be
 there.
 """
 
@@ -463,11 +463,11 @@ def with_times(measured, _, *, step=DT, pauses=0.0):
     return measured.assign(time=times[measured["frame"]].round(5))
 
 
-# Measurements: what is given back are the report's texts.
+# Measurements, which return the texts of the report.
 
 
 @dataclass(frozen=True)
-class Said:
+class Texts:
     """Warnings, notes and the numbers of spheres of the bodies in a report."""
 
     warnings: tuple[str, ...]
@@ -482,7 +482,7 @@ def report_texts(report):
     rods = (len(r.motion.places) for r in report.rods)
     sizes = sorted([*(len(c.motion.template) for c in report.clusters), *rods])
     texts = (r.warnings for r in (report, *results))
-    return Said(tuple(sum(texts, ())), tuple(sum(notes, ())), tuple(sizes))
+    return Texts(tuple(sum(texts, ())), tuple(sum(notes, ())), tuple(sizes))
 
 
 def analyzed(data, **arguments):
@@ -496,13 +496,13 @@ def planned(data, **_):
     from perrin.cli.app import app
 
     printed = " ".join(CliRunner().invoke(app, ["plan", *data]).output.split())
-    return Said(tuple(printed.split(". ")))
+    return Texts(tuple(printed.split(". ")))
 
 
 def fitted_line(data, **_):
     """Return what a straight line through the MSAD warns of."""
     curve = perrin.msad(perrin.track_rotation(data, dt=DT))
-    return Said(perrin.fit_line(curve).warnings)
+    return Texts(perrin.fit_line(curve).warnings)
 
 
 def filmed(data, **arguments):
@@ -517,11 +517,11 @@ class Case:
     ----------
     name : str
     make : callable
-        From a random generator to the data.
+        Returns the data, from a random generator.
     expected : tuple of str
         Kinds of which one must appear; none for a clean case.
     arguments : dict
-        Of the measurement.
+        Arguments of the measurement.
     where : {"warnings", "notes"}
         Where the fault has to be named.
     allowed : tuple of str
@@ -529,7 +529,7 @@ class Case:
     sizes : tuple of int, optional
         Spheres of the bodies that must be found, in ascending order.
     measure : callable
-        From the data to `Said`.
+        Returns the `Texts` of the data.
     """
 
     name: str
@@ -770,15 +770,15 @@ class Tally:
 
 
 def measured(case, rng):
-    """Return what is said of one table; an error counts as a warning."""
+    """Return the warnings and notes of one table; an error counts as a warning."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         try:
-            said = case.measure(case.make(rng), **case.arguments)
+            report = case.measure(case.make(rng), **case.arguments)
         except Exception as error:
-            said = Said((f"refused: {type(error).__name__}: {error}",))
+            report = Texts((f"refused: {type(error).__name__}: {error}",))
     more = tuple(str(w.message) for w in caught if w.category.__module__.startswith("perrin"))
-    return Said((*said.warnings, *more), said.notes, said.sizes)
+    return Texts((*report.warnings, *more), report.notes, report.sizes)
 
 
 def kind_of(text):
@@ -796,16 +796,16 @@ def matches(texts, kinds):
 
 def tried(case, seed, repeat):
     """Make and measure one table of a case."""
-    said = measured(case, np.random.default_rng([seed, crc32(case.name.encode()), repeat]))
-    here, there = said.warnings, said.notes
+    report = measured(case, np.random.default_rng([seed, crc32(case.name.encode()), repeat]))
+    here, there = report.warnings, report.notes
     right = matches(here, case.expected)
     texts = {kind_of(t): t for t in here if t not in right}
     longest = max(here, key=len, default="")
     if len(longest) > LONGEST:
         texts["too long"] = longest
     texts = {k: t for k, t in texts.items() if k not in case.allowed}
-    if case.sizes is not None and said.sizes not in (None, case.sizes):
-        texts["wrong bodies"] = f"bodies of {said.sizes} spheres, planted {case.sizes}"
+    if case.sizes is not None and report.sizes not in (None, case.sizes):
+        texts["wrong bodies"] = f"bodies of {report.sizes} spheres, planted {case.sizes}"
     if case.where == "notes":
         here, there = there, here
     return Tally(

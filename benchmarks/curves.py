@@ -23,16 +23,16 @@ def scatter_error(curve):
     return D, stderr, (D - stderr, D + stderr), (D - 1.96 * stderr, D + 1.96 * stderr)
 
 
-def told(estimate):
+def with_interval(estimate):
     """Return value, error and intervals of an estimate."""
     return estimate.value, estimate.stderr, estimate.ci68, estimate.ci95
 
 
 FITS = {
     "paper's window, scatter about the line": scatter_error,
-    "paper's window": lambda curve: told(perrin.fit_line(curve, lag_range="paper")),
-    "best window": lambda curve: told(perrin.fit_line(curve)),
-    "gls": lambda curve: told(perrin.fit_gls(curve)),
+    "paper's window": lambda curve: with_interval(perrin.fit_line(curve, lag_range="paper")),
+    "best window": lambda curve: with_interval(perrin.fit_line(curve)),
+    "gls": lambda curve: with_interval(perrin.fit_gls(curve)),
 }
 
 

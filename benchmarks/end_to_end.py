@@ -82,12 +82,12 @@ def rendered(*, clusters=12, n_frames=40, shape=SHAPE, photons=40.0, seed=0):
 
 def kept(movie, **recipe):
     """Return the movie's file and its true positions, rendered if they do not exist yet."""
-    beside = movie.with_name(movie.name.partition(".")[0] + "-truth.npz")
-    if not (movie.exists() and beside.exists()):
+    positions_file = movie.with_name(movie.name.partition(".")[0] + "-truth.npz")
+    if not (movie.exists() and positions_file.exists()):
         stack, truth = rendered(**recipe)
         perrin.write_stack(stack, movie)
-        np.savez(beside, positions=truth, **recipe)
-    with np.load(beside) as known:
+        np.savez(positions_file, positions=truth, **recipe)
+    with np.load(positions_file) as known:
         other = {k: known[k].tolist() for k, v in recipe.items() if np.any(known[k] != v)}
         if other:
             raise SystemExit(f"{movie} is of another recipe: {other}")

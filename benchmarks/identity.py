@@ -1,4 +1,4 @@
-"""Which particle is which: simulated bodies with known truth, and the time it all takes.
+"""Which particle is which: errors for simulated bodies with known labels, and the time taken.
 
 Usage: python benchmarks/identity.py [--seed N] [--clusters N] [--only NAME]
 """
@@ -135,13 +135,13 @@ def swapped(rng, clusters):
             pair = rng.permutation(4)[:2]
             x[k:, pair] = x[k:, pair[::-1]]
         identity = perrin.settle_identity(x)
-        told = np.concatenate([identity.swaps, identity.cuts])
-        found, planted = found + np.isin(rows, told).sum(), planted + rows.size
-        false += (~np.isin(told, rows)).sum()
+        reported = np.concatenate([identity.swaps, identity.cuts])
+        found, planted = found + np.isin(rows, reported).sum(), planted + rows.size
+        false += (~np.isin(reported, rows)).sum()
         with contextlib.suppress(perrin.DegenerateClusterError):  # mirrored to a flat mean shape
             raw.append(perrin.track_rotation(x, dt=DT, reference="previous"))
         repaired.append(perrin.track_rotation(identity.arranged(x), dt=DT, piece=identity.piece))
-    print(f"pair swaps: {found} of {planted} found, {false} told that are none")
+    print(f"pair swaps: {found} of {planted} found, {false} reported that are none")
     against(repaired, "repaired")
     against(raw, "as they come, by successive rotations")
 

@@ -1,11 +1,11 @@
-"""Are the estimates at the statistical limit, and do their intervals cover? Simulated truth.
+"""Efficiency, bias and coverage of the estimates, for simulated tracks with known values.
 
 Usage: python benchmarks/intervals.py [--tracks N] [--seed N] [--quick] [--paper]
 
 Prints a table for docs/validation.md: for each cell (body, frames, signal-to-noise ratio, what is
 done to the track) and each estimator the bias, the spread, the efficiency (Cramer-Rao bound over
-variance) and the cover of both intervals, each with its Monte-Carlo error in brackets. Lines that
-an estimator must keep are checked; the exit status is the number of figures that miss theirs by
+variance) and the coverage of both intervals, each with its Monte-Carlo error in brackets. Limits of
+an estimator are checked; the exit status is the number of figures that miss theirs by
 more than three Monte-Carlo errors. --quick takes 60 tracks a cell. --paper adds the paper's own
 procedure (chained rotations, straight line in the paper's window, error from the scatter about
 the line), which misses nearly all of them.
@@ -51,12 +51,12 @@ class Cell:
     quantity: str = "rotation"
 
     def __str__(self):
-        told = f"{self.body}, {self.frames} frames, SNR {self.snr:g}"
-        told += ", D_T" if self.quantity == "translation" else ""
-        told += f", axes {self.axes[0]:g}:{self.axes[1]:g}:{self.axes[2]:g}" if self.uneven else ""
-        told += f", sigma_z {self.sigma_z:g} times sigma_xy" if self.sigma_z != 1 else ""
-        told += f", {self.missing:.0%} missing" if self.missing else ""
-        return told + (", full blur" if self.substeps > 1 else "")
+        text = f"{self.body}, {self.frames} frames, SNR {self.snr:g}"
+        text += ", D_T" if self.quantity == "translation" else ""
+        text += f", axes {self.axes[0]:g}:{self.axes[1]:g}:{self.axes[2]:g}" if self.uneven else ""
+        text += f", sigma_z {self.sigma_z:g} times sigma_xy" if self.sigma_z != 1 else ""
+        text += f", {self.missing:.0%} missing" if self.missing else ""
+        return text + (", full blur" if self.substeps > 1 else "")
 
     @property
     def uneven(self):

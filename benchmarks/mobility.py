@@ -1,4 +1,4 @@
-"""Checks that the mobility is right and its error estimate honest, and what it costs.
+"""Accuracy of the mobility, its error estimate compared with the true error, and its cost.
 
 Usage: OMP_NUM_THREADS=1 python benchmarks/mobility.py [BODIES] [SEED]
 """

@@ -1,4 +1,4 @@
-"""Movies taken as `plan_sampling` says know D_R as well as the plan promises.
+"""Errors of D_R in movies taken as `plan_sampling` recommends, compared with the planned error.
 
 Usage: python benchmarks/planning.py [TRACKS] [FIRST_SEED]
 """

@@ -1,4 +1,4 @@
-"""Do planted values come back with honest intervals? Tetrahedra under the demo's conditions.
+"""Recovery of planted values, and coverage of their intervals, for tetrahedra as in the demo.
 
 Usage: python benchmarks/recovery.py [TRACKS] [FIRST_SEED]
 """

@@ -1,11 +1,11 @@
-"""Planted tensors: do they come back, do errors cover, do the tests of symmetry hold their level.
+"""Planted tensors: bias, coverage of the errors, and levels of the tests of symmetry.
 
 An irregular body of six particles, sigma/R = 0.03, principal axes at a slant to everything. SNR is
 the mean of D dt over the mean noise variance of an orientation angle. Columns: along each true axis
 the mean, the spread, the mean stated error (all over the planted value) and how often the 68 and
 95 % intervals (normal) hold it; how often isotropy and axial symmetry are rejected at 5 %; how
-often an axis is called known, and its true median error then. Brackets: one Monte-Carlo standard
-error.
+often the error of an axis is given, and the true median error of these axes. Brackets: one
+Monte-Carlo standard error.
 
 Usage: python benchmarks/tensors.py [--tracks 2000] [--seed 0] [--cell NAME ...]
 """
@@ -74,7 +74,7 @@ def simulated(cell, rng):
 
 
 def measured(cell, rng):
-    """Return values and errors along the true axes, p-values, and what is said of the axes."""
+    """Return values and errors along the true axes, p-values, and the warnings about the axes."""
     motion, values = simulated(cell, rng)
     axes = perrin.kabsch(motion.template, BODY.positions) @ SLANT
     found = perrin.diffusion_tensor(motion, symmetry="C_1", **(cell.options or {}))

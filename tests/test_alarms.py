@@ -163,32 +163,32 @@ def test_texts_are_sorted_by_what_they_are_about():
     assert kind("refused: TrackTableError: something new") == "refused (other)"
 
 
-def planted(case, said):
-    """Return the tally of one table of a case whose measurement returns `said`."""
+def planted(case, report):
+    """Return the tally of one table of a case whose measurement returns `report`."""
     fake = NAMES.Case(
         case.name, lambda _: None, case.expected, {}, case.where, case.allowed, case.sizes,
-        lambda _: said,
+        lambda _: report,
     )  # fmt: skip
     return NAMES.tried(fake, 0, 0)
 
 
 def test_a_fault_is_named_by_its_kind_in_its_place():
     flow, stride = case_of("flow 1 um/s"), case_of("frames in steps of 5")
-    found = planted(flow, NAMES.Said(("mean velocity 1.0(1) um/s", "labels swap at frame 3")))
+    found = planted(flow, NAMES.Texts(("mean velocity 1.0(1) um/s", "labels swap at frame 3")))
     assert (found.named, found.alarmed, dict(found.kinds)) == (1, 1, {"labels": 1})
-    found = planted(stride, NAMES.Said(("frame numbers are multiples of 5",)))
+    found = planted(stride, NAMES.Texts(("frame numbers are multiples of 5",)))
     assert (found.named, found.elsewhere, found.alarmed) == (0, 1, 0)
-    found = planted(stride, NAMES.Said((), ("frame numbers are multiples of 5",)))
+    found = planted(stride, NAMES.Texts((), ("frame numbers are multiples of 5",)))
     assert (found.named, found.elsewhere) == (1, 0)
 
 
 def test_what_is_allowed_or_wrong_in_a_clean_table():
     rest = case_of("clean: unnamed, at rest, smooth error")
-    found = planted(rest, NAMES.Said(("not resolved: D_R < 1",), ("labels swap",), (3,)))
+    found = planted(rest, NAMES.Texts(("not resolved: D_R < 1",), ("labels swap",), (3,)))
     assert found.alarmed == 0
-    found = planted(rest, NAMES.Said(("not resolved" + 600 * ".",), (), (3,)))
+    found = planted(rest, NAMES.Texts(("not resolved" + 600 * ".",), (), (3,)))
     assert dict(found.kinds) == {"too long": 1}
-    found = planted(rest, NAMES.Said((), (), (2,)))
+    found = planted(rest, NAMES.Texts((), (), (2,)))
     assert dict(found.kinds) == {"wrong bodies": 1}
 
 
@@ -197,8 +197,8 @@ def test_an_error_is_a_warning_with_its_text():
         raise ValueError("the mean velocity is not known")
 
     rng = np.random.default_rng(0)
-    said = NAMES.measured(NAMES.Case("none", lambda _: None, measure=refuse), rng)
-    assert said.warnings == ("refused: ValueError: the mean velocity is not known",)
+    report = NAMES.measured(NAMES.Case("none", lambda _: None, measure=refuse), rng)
+    assert report.warnings == ("refused: ValueError: the mean velocity is not known",)
 
 
 def test_lines_break_where_they_should():

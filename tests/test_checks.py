@@ -213,7 +213,7 @@ def test_few_spheres_of_uneven_brightness_show_no_depth():
 
 
 def test_fits_that_failed_are_counted_by_reason():
-    """Up to 1 % of them inform, more warn."""
+    """Up to 1 % of failed fits cause a note, more a warning."""
     reason = ["", "did not settle"] * 18 + ["moved over half a radius"] * 4
     assert checks.unrefined_spheres(table()) == NOTHING
     assert checks.unrefined_spheres(table(reason="")) == NOTHING
@@ -222,8 +222,12 @@ def test_fits_that_failed_are_counted_by_reason():
     one = table(30, reason=[*[""] * 119, "did not settle"])
     assert noted(checks.unrefined_spheres(one)).startswith("1 of 120 places")
     assert checks.unsettled_poses(0, 40) == NOTHING
-    assert noted(checks.unsettled_poses(1, 120)).startswith("1 of 120 poses did not settle")
-    assert warned(checks.unsettled_poses(2, 120)).startswith("2 of 120 poses did not settle")
+    assert noted(checks.unsettled_poses(1, 120)).startswith(
+        "1 of 120 fits of poses did not converge"
+    )
+    assert warned(checks.unsettled_poses(2, 120)).startswith(
+        "2 of 120 fits of poses did not converge"
+    )
 
 
 @pytest.mark.parametrize(

@@ -118,7 +118,7 @@ def test_demo_prints_a_short_table(demo):
 
 
 def test_demo_writes_a_whole_run_folder(demo):
-    """Every file that a run folder promises is there, and nothing half-made beside it."""
+    """Every file that a run folder promises is there, and no unfinished file."""
     names = {p.name for p in demo[0].iterdir()}
     assert names == {
         "summary.json", "tracks.parquet", "motion.parquet", "curves.csv", "figures",
@@ -589,7 +589,7 @@ def test_predict_refuses_in_one_line(tmp_path, options, words):
 
 
 def test_predict_warns_when_the_accuracy_is_not_reached(tmp_path, monkeypatch):
-    """A warning is one line beside the result."""
+    """A warning is one line in addition to the result."""
     monkeypatch.setattr("perrin.hydrodynamics.resistance._MOST_UNKNOWNS", 300)
     result = run("predict", "dimer", "--diameter", 2, *CONDITIONS, cwd=tmp_path)
     assert result.returncode == 0

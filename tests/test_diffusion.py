@@ -886,7 +886,7 @@ def test_a_noise_is_its_three_keywords(options):
 def test_a_noise_and_its_keywords_together_are_refused():
     """What is stated twice is named; the faults of a Noise are those of the keywords."""
     motion = tracked(cloud(1, n_frames=60))
-    with pytest.raises(ValueError, match=r"exposure: stated both in noise.*; drift: stated both"):
+    with pytest.raises(ValueError, match=r"exposure: stated in noise=.*; drift: stated in noise="):
         estimate_diffusion(motion, noise=Noise(exposure=0.5), exposure=0.5, drift=True)
     with pytest.raises(ValueError, match='drift=True needs method="mle"'):
         estimate_diffusion(motion, noise=Noise(drift=True), method="cve")

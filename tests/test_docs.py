@@ -1,4 +1,4 @@
-"""The examples of the theory pages run, and print what the pages show."""
+"""The examples of the conventions and of the theory pages run, and print what the pages show."""
 
 import doctest
 import re
@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-PAGES = sorted((Path(__file__).resolve().parents[1] / "docs" / "theory").glob("*.md"))
+DOCS = Path(__file__).resolve().parents[1] / "docs"
+PAGES = [DOCS / "conventions.md", *sorted((DOCS / "theory").glob("*.md"))]
 BOX = re.compile(r"```python\n(.*?)```\n(?:\n?```(?:text)?\n(.*?)```\n)?", re.DOTALL)
 
 # Pages whose numbers are compared with --long only: each takes over 10 s.
@@ -14,7 +15,7 @@ SLOW = ("estimators",)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
-def test_theory_pages_print_what_they_show(page, capsys, repeats):
+def test_pages_print_what_they_show(page, capsys, repeats):
     """A page has doctests, or code whose output follows in a box or as comments.
 
     In the quick form a slow page has a tenth of its repeats and is only run.

@@ -175,7 +175,7 @@ def test_only_plot_imports_matplotlib():
 
 
 def test_the_readme_code_runs(tmp_path, monkeypatch, capsys):
-    """The README's Python example runs as it stands and prints what it says."""
+    """The README's Python example runs unchanged and prints the output on the page."""
     monkeypatch.chdir(tmp_path)
     (code,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
     exec(compile(code, "README.md", "exec"), {})

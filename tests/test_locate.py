@@ -25,7 +25,7 @@ VOXEL = (0.25, 0.2, 0.2)
 PSF = (0.4, 0.15)
 DIAMETER = 2.45
 GAIN, READ = 3.0, 2.0
-NOISE = CameraNoise(GAIN, READ**2)
+NOISE = perrin.Camera(gain=GAIN, read_noise=READ).variance_model()
 BODY = perrin.Cluster.touching(4, DIAMETER)
 NO_OTHERS = np.empty((0, 3))
 

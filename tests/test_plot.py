@@ -420,7 +420,7 @@ def test_texts_of_estimates():
 
 
 def test_van_hove_shows_the_bins_and_the_gaussian(space):
-    """Points at the bins' middles with their density, the Gaussian beside them, and alpha_2."""
+    """Points at the bins' middles with their density, the Gaussian, and alpha_2."""
     result = perrin.van_hove(space.motion, lag=1.0, bins=9)
     ax = drawn(plot.plot_van_hove(result, ax=axes()))
     (points,) = ax.containers

@@ -399,7 +399,7 @@ def test_uneven_times_are_those_of_the_stack(tmp_path, movie_file, learned):
         np.testing.assert_allclose(result.motion.time, times[1:] - times[1], rtol=1e-12)
     table = motion_table(report)
     assert table["frame"].tolist() == 2 * list(range(FRAMES - 1))
-    assert any("run from 0.73 to 4.38 s: they are taken" in text for text in report.notes)
+    assert any("run from 0.73 to 4.38 s: these times are" in text for text in report.notes)
     # Pairs are at the times between the seven frames.
     apart = np.unique(np.round(np.subtract.outer(times[1:], times[1:]) / DT)).astype(int)
     curve = report.clusters[0].msd
@@ -480,7 +480,7 @@ def test_a_movie_without_a_fault_has_no_warning_of_its_images(whole):
 
 
 def test_spheres_of_a_larger_body_are_no_cluster():
-    """Beside a trimer a bipyramid: none of its spheres is one, and no warning is of them."""
+    """A bipyramid in a movie of trimers is no cluster, and no warning is about its spheres."""
     bodies = [perrin.Cluster.touching(3, DIAMETER), perrin.Cluster.touching(5, DIAMETER)]
     truth = [
         perrin.simulate_motion(b, D_R=5e-3, D_T=0.01, dt=DT, n_frames=5, rng=k)
@@ -537,7 +537,7 @@ def test_a_movie_of_pairs_gives_rods():
 
 
 def test_a_movie_in_the_plane_is_measured(tmp_path):
-    """Triangles of bright discs: positions are centroids, the angle follows, and a note says so."""
+    """Triangles of bright discs: the angle is measured from centroids, and a note states this."""
     body = perrin.Cluster([[0.0, 0.0], [1.2, 0.0], [0.3, 1.1]])
     truth = perrin.simulate_motion(body, D_R=0.01, D_T=0.005, dt=1.0, n_frames=12, rng=4)
     places = truth.positions() + 5.0

@@ -286,7 +286,7 @@ def test_arrays(movie):
 
 
 def test_an_imagej_file_cut_short_keeps_its_good_frames(tmp_path, movie):
-    """The header says how many frames there were; the lost ones are FrameErrors."""
+    """The header states the number of frames; the lost ones are FrameErrors."""
     path = tmp_path / "a.tif"
     tifffile.imwrite(path, movie, imagej=True, metadata={"axes": "TZYX"})
     path.write_bytes(path.read_bytes()[: 1000 + 3 * movie[0].nbytes])
@@ -509,7 +509,7 @@ def test_zeiss(tmp_path, movie):
 
 
 class NikonFile:
-    """A stand-in for nd2.ND2File, with its axes, times and calibration as documented."""
+    """A replacement of nd2.ND2File, with its axes, times and calibration as documented."""
 
     def __init__(self, path):
         self.movie = np.load(path)
@@ -600,7 +600,7 @@ def test_leica(tmp_path, movie):
 
 
 def test_zarr_folder_without_scales(tmp_path):
-    """A zarr folder without OME-Zarr metadata is refused, and the message says what to pass."""
+    """A zarr folder without OME-Zarr metadata is refused, and the message states what to pass."""
     pytest.importorskip("zarr")
     (tmp_path / "a.zarr").mkdir()
     header = {"zarr_format": 3, "node_type": "group", "attributes": {}}

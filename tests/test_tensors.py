@@ -631,7 +631,7 @@ def test_a_tensor_takes_the_options_of_the_noise():
     one = diffusion_tensor(motion, noise=Noise("residual", exposure=0.5))
     two = diffusion_tensor(motion, noise="residual", exposure=0.5)
     np.testing.assert_array_equal(one.tensor, two.tensor)
-    with pytest.raises(ValueError, match="exposure: stated both in noise"):
+    with pytest.raises(ValueError, match="exposure: stated in noise="):
         diffusion_tensor(motion, noise=Noise(exposure=0.5), exposure=0.5)
     with pytest.raises(ValueError, match="a drift is not subtracted from a tensor"):
         diffusion_tensor(motion, noise=Noise(drift=True))

@@ -1,8 +1,8 @@
 """perrin: measure how rigid clusters of colloidal particles diffuse and turn.
 
-Positions (T, n, d) become a `RigidMotion`, which makes every `LagCurve` and
-`DiffusionEstimate`; tables, files, images, pictures and the command line are the boundary.
-Units: um, s, rad, K, Pa s.
+`track_rotation` fits a `RigidMotion` to particle positions (T, n, d); `msd` and `msad` compute a
+`LagCurve` from it, `estimate_diffusion` a `DiffusionEstimate`. `analyze` takes a table of tracks
+and `analyze_stack` an image stack; both return a `Report`. Units: um, s, rad, K, Pa s.
 
 Each name is imported from its subpackage when it is first used, so that `import perrin` imports no
 other package.

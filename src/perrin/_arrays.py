@@ -198,7 +198,7 @@ def options_from(
     names = [field.name for field in fields(kind)]  # type: ignore[arg-type]
     own = {key: value for key, value in settings.items() if key in names}
     if given is not None:
-        faults.extend(f"{key}: stated in {name}= and as a keyword; state it once" for key in own)
+        faults.extend(stated_twice(key, name) for key in own)
         if not isinstance(given, kind):
             faults.append(f"{name}: expected {kind.__name__}(...), got {given!r}")
             return kind()
@@ -208,6 +208,24 @@ def options_from(
     except ValueError as fault:
         faults.append(str(fault))
         return kind()
+
+
+def stated_twice(key: str, name: str) -> str:
+    """Return the fault of a value that is stated in an options object and as a keyword.
+
+    Parameters
+    ----------
+    key : str
+        Name of the value.
+    name : str
+        The argument in which the object is passed.
+
+    Examples
+    --------
+    >>> stated_twice("exposure", "noise")
+    'exposure: stated in noise= and as a keyword; state it once'
+    """
+    return f"{key}: stated in {name}= and as a keyword; state it once"
 
 
 def refuse_unknown(function: str, settings: Iterable[str], known: Iterable[str]) -> None:

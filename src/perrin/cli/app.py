@@ -66,10 +66,8 @@ app = typer.Typer(
     rich_markup_mode=None,
 )
 
-
 # Default folder of the demo, and the files that it writes there, by which it is recognised.
 _DEMO_FOLDER = "perrin-demo"
-
 
 _DEMO_FILES = re.compile(
     r"summary\.json|run\.json|report\.html|curves\.csv|(?:tracks|motion)\.parquet"
@@ -452,20 +450,25 @@ def predict(
     diameter: Annotated[float | None, typer.Option(help="Sphere diameter, um.")] = None,
     positions: Annotated[
         Path | None,
-        typer.Option(help="Any other body: csv with columns x,y,z (um), perhaps radius."),
+        typer.Option(
+            help="Sphere centres of another body: csv with the columns x,y,z (um) and, if the "
+            "radii differ, radius (um)."
+        ),
     ] = None,
-    accuracy: Annotated[float, typer.Option(help="Relative numerical error to reach.")] = 1e-4,
-    output: Annotated[Path | None, typer.Option("-o", "--output", help="JSON file.")] = None,
+    accuracy: Annotated[float, typer.Option(help="Largest relative numerical error.")] = 1e-4,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="JSON file of the results.")
+    ] = None,
     overwrite: OverwriteFile = False,
 ) -> None:
-    """Predict how a rigid cluster of spheres diffuses: D_T, D_R, hydrodynamic diameters."""
+    """Predict D_T, D_R and hydrodynamic diameters of a rigid cluster of spheres."""
     import warnings
 
     import numpy as np
 
     import perrin
     from perrin.hydrodynamics.units import length_remarks
-    from perrin.run.folders import write_json
+    from perrin.tracks.writing import write_json
 
     with messages_of(predict):
         if output is not None:
@@ -490,18 +493,18 @@ def predict(
 @app.command()
 def plan(
     shape: Shape,
-    d_r: Annotated[float, typer.Option("--d-r", help="D_R, estimated beforehand, rad^2/s.")],
+    d_r: Annotated[float, typer.Option("--d-r", help="Expected D_R, rad^2/s.")],
     sigma: Annotated[str, typer.Option(help="Localisation error, um, one number or x,y,z.")],
     radius: Annotated[
         float | None, typer.Option(help="Mean distance of particles to the centre, um.")
     ] = None,
     diameter: Annotated[
-        float | None, typer.Option(help="Instead of the radius: diameter of touching spheres, um.")
+        float | None, typer.Option(help="Diameter of touching spheres, um, instead of --radius.")
     ] = None,
     d_t: Annotated[
         float | None,
         typer.Option(
-            "--d-t", help="D_T, um^2/s: the displacements between frames then limit dt as well."
+            "--d-t", help="Expected D_T, um^2/s; displacements between frames then limit dt too."
         ),
     ] = None,
     frames: Annotated[int | None, typer.Option(help="Largest number of frames.")] = None,
@@ -510,17 +513,17 @@ def plan(
         bool,
         typer.Option(
             "--photons",
-            help="The number of photons is limited: that of --frames frames in --time s, each with "
-            "--sigma, can be divided among any number of frames.",
+            help="The number of photons is fixed: that of --frames frames in --time s with "
+            "--sigma. The plan divides them among any number of frames.",
         ),
     ] = False,
     output: Annotated[
         Path | None,
-        typer.Option("-o", "--output", help="Picture of error against dt: .png, .pdf or .svg."),
+        typer.Option("-o", "--output", help="Figure of the error against dt: .png, .pdf or .svg."),
     ] = None,
     overwrite: OverwriteFile = False,
 ) -> None:
-    """Recommend time step and number of frames, and predict the error of D_R."""
+    """Recommend the time between frames and their number, and predict the error of D_R."""
     import perrin
 
     with messages_of(plan):
@@ -552,7 +555,7 @@ def paper(
     seed: Seed = 2011,
     overwrite: Overwrite = False,
 ) -> None:
-    """Remake every figure, table and claim of Hunter et al. 2011."""
+    """Reproduce all figures, tables and claims of the paper (Hunter 2011)."""
     from rich.console import Console
     from rich.markup import escape
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn

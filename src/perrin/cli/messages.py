@@ -27,18 +27,14 @@ _RENAMED_ARGUMENTS = {
     "anew": "--overwrite",
 }
 
-
 # Arguments whose names are symbols of physics: "dt = 0.5 s" may be a statement about the data,
 # except in a list of arguments that are not positive.
 _PHYSICAL_SYMBOLS = ("dt", "sigma", "D_R", "D_T", "R")
 
-
 _LIST_OF_FAULTS = re.compile(r"(?<=expected a finite number > 0: )[^;]*")
-
 
 # Arguments whose names are no words of the language, and name nothing else.
 _ARGUMENTS_ALONE = ("n_frames", "total_time", "plane_time", "minmass", "keep_jumps")
-
 
 _ARGUMENT_VALUE = r"\{[^{}]*\}|\([^()]*\)|\[[^\[\]]*\]|'[^']*'|\"[^\"]*\"|[^\s,;:()]*"
 

@@ -17,14 +17,11 @@ if TYPE_CHECKING:
 
 SHAPES = ("tetrahedron", "pentahedron", "trimer")
 
-
 TOUCHING_SHAPES = (
     "dimer", "trimer", "tetrahedron", "bipyramid", "octahedron", "pentagonal-bipyramid",
 )  # fmt: skip
 
-
 PICTURE_SUFFIXES = (".png", ".pdf", ".svg")
-
 
 # Headings of the options in the help of commands with many of them, in this order.
 INPUT, SPHERES = "Input", "Spheres and clusters"
@@ -56,25 +53,21 @@ class GroupedCommand(TyperCommand):
 
 Tracks = Annotated[Path, typer.Argument(help="Track table: .csv, .csv.gz, .parquet or .gdf.")]
 
-
 Interval = Annotated[
     float, typer.Option("--dt", help="Time between frames, s.", rich_help_panel=INPUT)
 ]
-
 
 Output = Annotated[
     Path, typer.Option("-o", "--output", help="Folder for the run.", rich_help_panel=OUTPUT)
 ]
 
-
 Scale = Annotated[
     str,
     typer.Option(
-        help="um per unit of the coordinates; one number or x,y,z, e.g. 1000 for mm.",
+        help="Length of one unit of the coordinates, um; one number or x,y,z, e.g. 1000 for mm.",
         rich_help_panel=INPUT,
     ),
 ]
-
 
 Columns = Annotated[
     str | None,
@@ -84,7 +77,6 @@ Columns = Annotated[
     ),
 ]
 
-
 Frames = Annotated[
     str | None,
     typer.Option(
@@ -92,15 +84,12 @@ Frames = Annotated[
     ),
 ]
 
-
 Overwrite = Annotated[
     bool,
     typer.Option("--overwrite", help="Replace an existing run folder.", rich_help_panel=OUTPUT),
 ]
 
-
 OverwriteFile = Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")]
-
 
 Sigma = Annotated[
     str | None,
@@ -111,16 +100,14 @@ Sigma = Annotated[
     ),
 ]
 
-
 Noise = Annotated[
     str,
     typer.Option(
-        help="How the noise under D is known: joint (free), residual (from the rigid fit; "
+        help="Noise model: joint (fitted together with D), residual (from the rigid fit; "
         "right only if all particles of a frame are recorded at once), or sigma in um.",
         rich_help_panel=ESTIMATES,
     ),
 ]
-
 
 Exposure = Annotated[
     float | None,
@@ -128,7 +115,6 @@ Exposure = Annotated[
         help="Open fraction of dt, 0 to 1; unknown if left out.", rich_help_panel=ESTIMATES
     ),
 ]
-
 
 Drift = Annotated[
     bool,
@@ -140,7 +126,6 @@ Drift = Annotated[
     ),
 ]
 
-
 KeepJumps = Annotated[
     bool,
     typer.Option(
@@ -150,14 +135,12 @@ KeepJumps = Annotated[
     ),
 ]
 
-
 Viscosity = Annotated[
     float | None,
     typer.Option(
         help="Viscosity, Pa s: with the temperature, sizes and predictions.", rich_help_panel=SIZES
     ),
 ]
-
 
 Temperature = Annotated[
     float | None,
@@ -167,10 +150,7 @@ Temperature = Annotated[
     ),
 ]
 
-
 Seed = Annotated[int, typer.Option(help="Seed of the random numbers.")]
-
-
 Shape = Annotated[str, typer.Argument(help=f"{', '.join(SHAPES)}.")]
 
 

@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 
 _CLUSTERS_SHOWN, _WARNINGS_SHOWN, _NOTES_SHOWN = 5, 20, 10
 
-
 # Values about the body's axes are shown below this probability of equal axes.
 _EQUAL_AXES = 0.05
 

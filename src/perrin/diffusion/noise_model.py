@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from perrin._arrays import refuse
+from perrin._arrays import refuse, stated_twice
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class Noise:
         Raises
         ------
         ValueError
-            If a value is out of its range, or stated both in `noise` and by its own keyword.
+            If a value is out of its range, or stated both in `noise` and as a keyword.
 
         Examples
         --------
@@ -81,15 +81,11 @@ def noise_faults(noise: object, exposure: object, *, drift: object = False) -> l
     >>> noise_faults("loud", 1.5)
     ["noise: expected 'joint', 'residual' or sigma in um, got 'loud'", 'exposure: expected a fraction of dt, 0 to 1, got 1.5']
     >>> noise_faults(Noise(exposure=0.5), 0.5)
-    ['exposure: stated both in noise = Noise(...) and as exposure; state it once']
+    ['exposure: stated in noise= and as a keyword; state it once']
     """  # noqa: E501 (what Python prints)
     if isinstance(noise, Noise):
         given = {"exposure": exposure is not None, "drift": drift}
-        return [
-            f"{name}: stated both in noise = Noise(...) and as {name}; state it once"
-            for name, stated in given.items()
-            if stated
-        ]
+        return [stated_twice(name, "noise") for name, stated in given.items() if stated]
     faults = []
     offered = (
         noise in ("joint", "residual")

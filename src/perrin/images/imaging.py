@@ -10,6 +10,7 @@ import numpy as np
 
 from perrin._arrays import from_plain, to_plain
 from perrin.images.optics.optics import Optics
+from perrin.tracks.writing import write_json
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -152,7 +153,6 @@ class Imaging:
 
 _TABLES = ("features", "frames", "spots")
 
-
 _IMAGING_SETTINGS = tuple(
     field.name for field in fields(Imaging) if field.name not in (*_TABLES, "views")
 )
@@ -182,8 +182,7 @@ def write_imaging(imaging: Imaging, folder: Path) -> None:
         getattr(imaging, name).to_parquet(folder / f"{name}.parquet", index=False)
     views = {f"{v.frame}-{side}": getattr(v, side) for v in imaging.views for side in _SIDES}
     np.savez_compressed(folder / "views.npz", **views)
-    text = json.dumps(imaging.settings(), indent=2, allow_nan=False)
-    (folder / "imaging.json").write_text(text + "\n", encoding="utf-8")
+    write_json(folder / "imaging.json", imaging.settings())
 
 
 def read_imaging(folder: Path) -> Imaging:

@@ -27,10 +27,8 @@ if TYPE_CHECKING:
 
 _PathLike: TypeAlias = str | os.PathLike[str]
 
-
 # Relative difference of the user's values from those of the file above which a warning is given.
 _HEADER_TOLERANCE = 1e-3
-
 
 _OME_TYPES = ("uint8", "int8", "uint16", "int16", "uint32", "int32", "float32", "float64")
 
@@ -495,8 +493,8 @@ def write_stack(stack: Stack, path: _PathLike) -> None:
     description: bytes | None = bytes(xml.tostring(declaration=True).encode())
     n_bytes = t * z * y * x * stack.dtype.itemsize
     with (
-        written_whole(target) as beside,
-        tifffile.TiffWriter(beside, bigtiff=n_bytes > 2**31) as file,
+        written_whole(target) as part,
+        tifffile.TiffWriter(part, bigtiff=n_bytes > 2**31) as file,
     ):
         for plane in (plane for frame in stack for plane in frame):
             file.write(

@@ -14,7 +14,7 @@ import numpy as np
 
 from perrin._text import listed
 from perrin.geometry.shapes import pair_distances
-from perrin.tracks.clusters import REACH
+from perrin.tracks.groups import TOUCHING_REACH
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -28,32 +28,14 @@ if TYPE_CHECKING:
 
 
 _LISTED_ITEMS = 10  # largest number of frames or clusters that a message lists
-
-
 _TEST_LEVEL = 0.01  # one-sided level of the tests
-
-
-_NORMAL_QUANTILE = 2.326  # of the normal distribution at that level
-
-
+_NORMAL_QUANTILE = 2.326  # quantile of the normal distribution at that level
 _PAIR_BIAS = 0.03  # relative error of the mean pair distance
-
-
 _BLEACHED = 0.1  # relative loss of brightness over the movie
-
-
 _DEPTH_CHANGE = 0.1  # relative change of brightness over the depth of the spheres
-
-
-_MISSING_SHARE = 0.1  # of the spheres of the clusters
-
-
-_FAILED_SHARE = 0.01  # of the fits
-
-
+_MISSING_SHARE = 0.1  # missing share of the spheres of the clusters
+_FAILED_SHARE = 0.01  # share of fits that did not converge
 _UNSAFE_STEP, _REFUSED_STEP = 0.25, 0.5  # rms step over the contact distance
-
-
 _FAST_RATIO, _SLOW_ROTATION = 2.0, 0.5  # MSAD at the first lag over Phi^2; rms rotation, rad
 
 
@@ -151,6 +133,13 @@ def unreadable_frames(frames: pd.DataFrame) -> Findings:
     ----------
     frames : pandas.DataFrame
         As in `Imaging`.
+
+    Examples
+    --------
+    >>> import pandas as pd
+    >>> frames = pd.DataFrame({"frame": [0, 1, 2], "fault": ["", "page is cut short", ""]})
+    >>> unreadable_frames(frames).warnings[0]
+    '1 of 3 frames cannot be read and are left out: frame 1 (page is cut short)'
     """
     lost = frames[frames["fault"] != ""]
     if not len(lost):
@@ -171,6 +160,13 @@ def repeated_frames(frames: pd.DataFrame) -> Findings:
     ----------
     frames : pandas.DataFrame
         As in `Imaging`.
+
+    Examples
+    --------
+    >>> import pandas as pd
+    >>> frames = pd.DataFrame({"frame": [0, 1, 2], "copy_of": [-1, 0, -1]})
+    >>> repeated_frames(frames).warnings[0][:47]
+    '1 of 3 frames repeat an earlier frame exactly, '
     """
     copies = frames[frames["copy_of"] >= 0]
     if not len(copies):
@@ -193,6 +189,13 @@ def empty_frames(frames: pd.DataFrame, *, minmass: float) -> Findings:
         As in `Imaging`.
     minmass : float
         Mass cut.
+
+    Examples
+    --------
+    >>> import pandas as pd
+    >>> frames = pd.DataFrame({"frame": [0, 1], "fault": ["", ""], "spheres": [4, 0]})
+    >>> empty_frames(frames, minmass=50.0).warnings[0][:64]
+    'no particles passed the mass cut (50) in 1 of 2 frames: frame 1;'
     """
     read = frames[frames["fault"] == ""]
     none = read[read["spheres"] == 0]
@@ -200,19 +203,25 @@ def empty_frames(frames: pd.DataFrame, *, minmass: float) -> Findings:
         return _NOTHING
     text = (
         f"no particles passed the mass cut ({minmass:.3g}) in {len(none)} of {len(read)} frames: "
-        f"{frame_runs_text(none['frame'].to_numpy())}; look at the mass histogram, set minmass or "
+        f"{frame_runs_text(none['frame'].to_numpy())}; inspect the mass histogram, set minmass or "
         "leave them out"
     )
     return Findings((text,))
 
 
 def saturated_frames(frames: pd.DataFrame) -> Findings:
-    """Warn of frames with voxels clipped at the highest value (`optics.saturated_share`).
+    """Warn of frames with voxels clipped at the highest value (see `saturated_share`).
 
     Parameters
     ----------
     frames : pandas.DataFrame
         As in `Imaging`.
+
+    Examples
+    --------
+    >>> import pandas as pd
+    >>> saturated_frames(pd.DataFrame({"saturated": [0.0, 0.0]}))
+    Findings(warnings=(), notes=())
     """
     share = frames["saturated"].to_numpy(dtype=np.float64)
     over = share > 0
@@ -418,7 +427,9 @@ def unsettled_poses(count: int, of: int) -> Findings:
     """
     if not count:
         return _NOTHING
-    text = f"{count} of {of} poses did not settle in the image and are those of the free centres"
+    text = (
+        f"{count} of {of} fits of poses did not converge; these poses are those of the free centres"
+    )
     return _fit_failures(text, count / of)
 
 
@@ -488,7 +499,7 @@ def mean_pair_distance(
         x, particle = rows[axes].to_numpy(dtype=np.float64), rows["particle"].to_numpy()
         first, second = np.triu_indices(len(x), 1)
         distance = pair_distances(x)
-        near = distance < REACH * contact
+        near = distance < TOUCHING_REACH * contact
         distances.append(distance[near])
         pairs.append(((int(cluster) * most + particle[first]) * most + particle[second])[near])
     every, pair = np.concatenate(distances), np.concatenate(pairs)
@@ -538,7 +549,8 @@ def missing_spheres(features: pd.DataFrame, *, size: int, contact: float, frames
         if absent:
             parts.append(f"none placed in {_frame_count(absent)}")
         parts += [
-            f"{n} found in {_frame_count(k)} (two clusters within {REACH * contact:.2g} um)"
+            f"{n} found in {_frame_count(k)} "
+            f"(two clusters within {TOUCHING_REACH * contact:.2g} um)"
             for n, k in crowd.value_counts().sort_index().items()
         ]
         if first > frames.min():
@@ -634,7 +646,7 @@ def scan_blur(
     text = (
         f"cluster scanned in {scan:.2g} s ({planes:.0f} planes of {plane_time:.2g} s): motion blur "
         f"about {1e3 * blur:.0f} +- {1e3 * blur_error:.1g} nm > sigma {1e3 * sigma:.0f} +- "
-        f"{1e3 * sigma_error:.1g} nm; positions are of different moments; scan faster or take "
+        f"{1e3 * sigma_error:.1g} nm; positions are those of different times; scan faster or take "
         "fewer planes"
     )
     return Verdict(text, blur / sigma if sigma > 0 else np.inf)

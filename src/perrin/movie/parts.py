@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from perrin.errors import PartsError
-from perrin.tracks.writing import written_whole
+from perrin.tracks.writing import write_json, written_whole
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -19,8 +19,6 @@ if TYPE_CHECKING:
 
 
 _SETTINGS = "settings.json"
-
-
 _PART_SECONDS = 2.0  # between two parts; at most this much work is lost in a power cut
 
 
@@ -56,8 +54,8 @@ def open_parts(folder: Path, settings: Mapping[str, Any]) -> set[str]:
         if different:
             raise PartsError(f"{folder} holds the parts of another run: {'; '.join(different)}")
     else:
-        with written_whole(place) as beside:
-            beside.write_text(json.dumps(plain, indent=2), encoding="utf-8")
+        with written_whole(place) as unfinished:
+            write_json(unfinished, plain)
     return {p.name for p in folder.glob("part-*.parquet")}
 
 
@@ -160,7 +158,7 @@ class PartWriter:
         part.attrs = {"entries": self._entries}
         first = min(int(e["frame"]) for e in self._entries)
         place = self.folder / f"part-{first:07d}-{uuid.uuid4().hex[:8]}.parquet"
-        with written_whole(place) as beside:
-            part.to_parquet(beside, index=False)
+        with written_whole(place) as unfinished:
+            part.to_parquet(unfinished, index=False)
         self._tables, self._entries = [], []
         self._written = time.monotonic()

@@ -1,4 +1,4 @@
-"""From a microscope stack to the diffusion of every cluster in it."""
+"""`analyze_stack`: from an image stack to the diffusion coefficients of every cluster."""
 
 from __future__ import annotations
 
@@ -40,18 +40,10 @@ if TYPE_CHECKING:
 
 
 _VIEWS = 8  # frames that are kept as pictures
-
-
 _LIBRARIES = ("perrin", "numpy", "scipy", "trackpy")
-
-
 _FEWEST_IMAGES = 3  # different images that a movie must have
-
-
 _LISTED_REFUSALS = 10  # refused clusters that are listed one by one
-
-
-_LOCATED, _POSED = "located", "posed"
+_LOCATED, _POSED = "located", "posed"  # folders of finished frames
 
 
 class Settings(TypedDict, total=False):
@@ -74,7 +66,7 @@ class Settings(TypedDict, total=False):
     progress: Progress | None
 
 
-# Keywords that belong to the fields of each object.
+# Keywords of `analyze_stack` that are values of an `Experiment`.
 _EXPERIMENT_KEYWORDS = ("noise", "exposure", "drift", "keep_jumps", "viscosity", "temperature")
 
 
@@ -140,7 +132,7 @@ def analyze_stack(
     TypeError
         For an unknown keyword.
     ValueError
-        For arguments out of range, or given both in an object and as a keyword; if the folder of
+        For arguments out of range, or stated both in an object and as a keyword; if the folder of
         finished frames holds parts of another input or of other settings.
     NoSpheresError, DegenerateClusterError, TooFewFramesError
         If there are no spheres, none touch, or no cluster can be measured.
@@ -163,6 +155,8 @@ def analyze_stack(
     >>> len(report.clusters), len(report.clusters[0].motion.template)
     (1, 3)
     """
+    import tempfile
+
     if len(stack) < 2:
         raise TooFewFramesError("one frame shows no motion: two or more are needed", len(stack))
     known = [*inspect.signature(analyze_stack).parameters, *Settings.__annotations__]
@@ -194,8 +188,6 @@ def analyze_stack(
     numbers, excluded = _selected_frames(len(stack), frames), sorted({int(c) for c in exclude})
     work.report(0, 0, "taking the file's SHA-256")
     depends = _dependencies(stack, search, refine, optics, numbers)
-    import tempfile
-
     with (
         nullcontext(work.keep)
         if work.keep is not None
@@ -252,6 +244,7 @@ def _stack_experiment(
 
 
 def _faults_of(check: Callable[..., object], *arguments: object, **named: object) -> list[str]:
+    """Return the message of the ValueError that a check raises, if it raises one."""
     try:
         check(*arguments, **named)
     except ValueError as fault:
@@ -305,7 +298,7 @@ def _dependencies(
         "last_frame": frames[-1],
         **asdict(search),
         "refine": refine,
-        "optics": None if optics is None else asdict(optics),
+        "optics": None if optics is None else optics.to_dict(),
         "versions": versions,
     }
 
@@ -404,8 +397,8 @@ def _with_checks(
     if _uneven_clock(stack) is not None:
         gaps = np.diff(stack.times)
         uneven.append(
-            f"times between frames run from {gaps.min():.4g} to {gaps.max():.4g} s: they are taken "
-            "as they are"
+            f"times between frames run from {gaps.min():.4g} to {gaps.max():.4g} s: these times "
+            "are used"
         )
     found = (
         checks.Findings(tuple(located.warnings), (*stack.notes, *located.notes))
@@ -443,7 +436,7 @@ def _with_checks(
 
 
 def _imaging(stack: Stack, located: Located, bodies: Bodies, search: Search) -> Imaging:
-    """Return the tables of the run, and some frames seen along their three axes."""
+    """Return the tables of the run, and projections of some frames along their three axes."""
     z, y, x = (float(v) for v in stack.voxel)
     read = located.frames.loc[located.frames["fault"] == "", "frame"].to_numpy()
     shown = read[np.unique(np.linspace(0, len(read) - 1, min(_VIEWS, len(read))).astype(int))]

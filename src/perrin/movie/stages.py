@@ -1,11 +1,11 @@
-"""The two long stages of a run, frame by frame: finding spheres and fitting poses."""
+"""The two stages of a run that work frame by frame: locating spheres and fitting poses."""
 
 from __future__ import annotations
 
 import hashlib
 import json
 import warnings
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -18,7 +18,7 @@ from perrin.images.spheres.poses import Pose, pose_in, with_poses
 from perrin.movie.checks import Findings, unsettled_poses
 from perrin.movie.parts import PartWriter, open_parts, read_parts
 from perrin.movie.workers import work_through
-from perrin.tracks.writing import written_whole
+from perrin.tracks.writing import write_json, written_whole
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -33,8 +33,6 @@ if TYPE_CHECKING:
     from perrin.movie.workers import Work
 
 S = TypeVar("S")
-
-
 _METHOD_FILE = "method.json"
 
 
@@ -160,8 +158,8 @@ def locate_frames(
         work.report(0, 0, "learning mass cut and optics")
         learned = learn_method(stack, search, refine=refine, optics=optics, frames=frames)
         open_parts(folder, settings)
-        with written_whole(known) as beside:
-            beside.write_text(json.dumps(learned), encoding="utf-8")
+        with written_whole(known) as unfinished:
+            write_json(unfinished, learned)
     found = learned["optics"]
     method = Method(
         replace(search, minmass=learned["minmass"]),
@@ -243,7 +241,7 @@ def learn_method(
         method = choose_method(stack, search, sample, refine=refine, optics=optics)
     return {
         "minmass": method.search.minmass,
-        "optics": None if method.optics is None else asdict(method.optics),
+        "optics": None if method.optics is None else method.optics.to_dict(),
         "spots": [[seen.number, mass] for seen in sample for mass in seen.spots.mass.tolist()],
         "told": [str(warning.message) for warning in caught],
     }
@@ -324,7 +322,7 @@ def fit_poses(
     for start in starts.values():
         for part in start[1:]:
             total.update(np.ascontiguousarray(part).tobytes())
-    settings = {"starts": total.hexdigest(), "optics": asdict(optics)}
+    settings = {"starts": total.hexdigest(), "optics": optics.to_dict()}
     try:
         open_parts(folder, settings)
     except ValueError:
@@ -338,11 +336,11 @@ def fit_poses(
 
     fitted = {}
     for cluster, (motion, frames) in motions.items():
-        mine = rows[(rows["cluster"] == cluster) & rows["x"].notna()]
+        fits = rows[(rows["cluster"] == cluster) & rows["x"].notna()]
         row_of = {int(frame): k for k, frame in enumerate(frames)}
-        number = mine["frame"].to_numpy()
-        pose = mine[list(_POSE)].to_numpy(dtype=np.float64)
-        spread = mine[list(_SPREAD)].to_numpy(dtype=np.float64)
+        number = fits["frame"].to_numpy()
+        pose = fits[list(_POSE)].to_numpy(dtype=np.float64)
+        spread = fits[list(_SPREAD)].to_numpy(dtype=np.float64)
         poses = {
             row_of[int(i)]: Pose(p[:3], p[3:].reshape(3, 3), s[:9].reshape(3, 3), float(s[9]))
             for i, p, s in zip(number, pose, spread, strict=True)
@@ -379,7 +377,6 @@ def _poses_by_frame(
 
 # Columns of a pose: centre and rotation matrix.
 _POSE = ("x", "y", "z", *(f"r{i}{j}" for i in range(3) for j in range(3)))
-
 
 # Columns of its error: covariance of the rotation vector, and variance of the centre.
 _SPREAD = (*(f"c{i}{j}" for i in range(3) for j in range(3)), "variance")

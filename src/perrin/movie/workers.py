@@ -17,18 +17,10 @@ if TYPE_CHECKING:
 
 
 S = TypeVar("S")
-
-
 T = TypeVar("T")
-
-
 _ITEMS_AT_ONCE = 4  # items that a worker gets at once; it opens the file once for all of them
-
-
 _TIMEOUT = 15  # s, to find the scheduler
-
-
-_KEPT_MEMORY = 2**28  # bytes that the memory allocator of a worker does not give back
+_KEPT_MEMORY = 2**28  # bytes that the memory allocator of a worker does not return to the system
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,7 +30,7 @@ class Work:
     Parameters
     ----------
     keep : path, optional
-        Folder of finished frames: the same call resumes there. None keeps nothing.
+        Folder of finished frames: the same call resumes there. None uses a temporary folder.
     anew : bool
         Remove the parts of another input or of other settings in the folder, instead of an error.
     workers : int

@@ -9,7 +9,7 @@ from zlib import crc32
 import numpy as np
 
 from perrin.plot.style import new_figure, save_figure
-from perrin.run.folders import write_json
+from perrin.tracks.writing import write_json
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence

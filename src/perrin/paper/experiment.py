@@ -31,28 +31,19 @@ if TYPE_CHECKING:
 
 
 _EXPERIMENT = "5 Experimental application"
-
-
 _CONCLUSION = "6 Conclusion"
-
 
 # The experiment: one tetrahedron of 2.45 um spheres, "less than 300 timesteps" in 220 s.
 # Lengths in um, times in s, Pa s, K.
 _DIAMETER, _SIGMA = 2.45, (0.03, 0.03, 0.04)
 
-
 _DT, _EXPERIMENT_FRAMES, _FIT_LAGS = 0.73, 300, (3.0, 22.0)
-
-
 _VISCOSITY, _TEMPERATURE = 2.18e-3, 295.0
-
 
 # Table 1 as printed: coefficient and its error, then sizes with theirs, um.
 _D_T, _D_T_ERROR = 3.85e-2, 0.49e-2
 
-
 _D_R, _D_R_ERROR = 4.93e-3, 0.49e-3
-
 
 _PRINTED = {
     "translation": {"cluster": (5.15, 0.67), "sphere": (2.79, 0.13)},

@@ -27,21 +27,14 @@ if TYPE_CHECKING:
 # touching spheres of 2 um, as in its Fig. 1.
 R = Cluster.touching(4, 2.0).R
 
-
 # Localisation errors that the paper simulates, um.
 NOISES = (0.01, 0.03, 0.05, 0.07, 0.10)
-
 
 # Steps of the paper's simulations.
 STEPS = 10_000
 
-
 _CHALLIS = "2.1 Challis' procedure"
-
-
 _CLUSTERS = "2.2 Application to colloidal clusters"
-
-
 _TESTS = "3 Tests of the prescribed method"
 
 
@@ -89,7 +82,7 @@ def challis(study: Study) -> Item:
         labels = {
             "similarity": "s, R, v (Eq. 1)",
             "rotation": "R (Eq. 2)",
-            "svd": "noisy: R beside the SVD (Eqs. 9-10)",
+            "svd": "noisy: R compared with the SVD (Eqs. 9-10)",
         }
         for color, (name, label) in zip(PALETTE, labels.items(), strict=False):
             left.semilogy(table["n"], table[name], "o-", color=color, label=label)
@@ -103,7 +96,7 @@ def challis(study: Study) -> Item:
     text = (
         "Random sets of points are scaled, turned and shifted by known amounts; `similarity` and "
         "`kabsch` find the transformation again. Noisy sets have noise of a tenth of their size; "
-        "Eqs. 9-10 are evaluated with numpy's SVD beside `kabsch`, which has none."
+        "Eqs. 9-10 are evaluated with numpy's SVD and compared with `kabsch`, which uses none."
     )
     return Item("challis", _CHALLIS, "Rigid transformations", text, table, draw, claims)
 
@@ -457,7 +450,6 @@ def simulation(study: Study) -> Item:
 
 
 _PRINTED_TETRAHEDRON = np.array([(1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)]) / np.sqrt(3)
-
 
 _PRINTED_PENTAHEDRON = np.array(
     [(1, 0, 0), (-1 / 2, np.sqrt(3) / 2, 0), (-1 / 2, -np.sqrt(3) / 2, 0), (0, 0, 1), (0, 0, -1)]

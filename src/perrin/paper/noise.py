@@ -31,24 +31,17 @@ if TYPE_CHECKING:
 
 _NOISE_SECTION = "4.1 Noise, its subtraction, and sampling"
 
-
 # Planted D_R of Figs. 3 and 4(b), rad^2 per time step.
 _PLANTED = (1e-4, 1e-3)
 
-
 _BODIES = {"tetrahedron": Cluster.tetrahedron, "pentahedron": Cluster.pentahedron}
-
-
 _MARKERS = "osD^v"
-
 
 # Sizes of Fig. 4(a), um: sigma/R is 0.1 at most.
 _RADII = (1.0, 1.5, 2.5)
 
-
 # Phi^2 is quadratic in the direction, so the mean over x, y and z is that over all directions.
 _XYZ = np.eye(3)
-
 
 # Frames of a stationary cluster: the relative error of one Phi^2 is then 0.3 %.
 _STATIONARY_FRAMES = 110_000

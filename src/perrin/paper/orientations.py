@@ -25,8 +25,6 @@ if TYPE_CHECKING:
 
 
 _ORIENTATIONS = "4.1 Rotations via orientations"
-
-
 _APPENDIX = "Appendix: rotations via the rotation matrix"
 
 

@@ -10,7 +10,8 @@ from perrin.paper.experiment import conclusion, figure_5, table_1
 from perrin.paper.method import challis, figure_1, localisation, product, simulation
 from perrin.paper.noise import bodies, constancy, figure_3, figure_4, sampling
 from perrin.paper.orientations import appendix, axes, correlation, figure_2, figure_6
-from perrin.run.folders import staged_folder, write_json
+from perrin.run.folders import staged_folder
+from perrin.tracks.writing import write_json
 
 if TYPE_CHECKING:
     import os
@@ -25,7 +26,6 @@ ITEMS: tuple[Callable[[Study], Item], ...] = (
     figure_3, figure_4, bodies, constancy, sampling, figure_5, table_1, conclusion, appendix,
     figure_6,
 )  # fmt: skip
-
 
 _HEADING = """# The paper, claim by claim
 

@@ -39,48 +39,24 @@ if TYPE_CHECKING:
 
 
 Side = Literal["xy", "xz", "yz"]
-
-
 Series = Literal["spheres", "spots", "brightness", "level", "saturated"]
-
 
 # Horizontal and vertical axis of the picture of each side. xy and yz share the vertical axis y.
 _SIDE_AXES: dict[str, tuple[str, str]] = {"xy": ("x", "y"), "xz": ("x", "z"), "yz": ("z", "y")}
 
-
 # Largest share of black of a sphere, so that circles and numbers on it are visible.
 _DARKEST = 0.6
 
-
 _PATH_FRAMES = 100  # length of a path; longer ones hide the spheres
-
-
 _SHOWN_VIEWS = 8  # largest number of views in the figure of tracks
-
-
-_VIEWS_IN_A_ROW = 4  # of the figure of tracks
-
-
+_VIEWS_IN_A_ROW = 4  # number of views in one row of the figure of tracks
 _NUMBERED_CLUSTERS = 12  # largest number of clusters that are numbered on every side
-
-
 _COLORED_CLUSTERS = 6  # largest number of clusters with a colour and a legend each
-
-
 _LEGEND_LETTERS = 12  # total length of the clusters' names in a legend of one line
-
-
 _VECTOR_POINTS = 500  # longer lines are images inside a PDF
-
-
 _MASS_BINS = 40  # bins of the histogram of masses
-
-
 _MOST_ANGLE_BINS = 120  # largest number of bins of the histogram of angles
-
-
 _MARKED_STEPS = 10  # number of the largest steps that are marked
-
 
 # Axis label and title of each series of the figure of frames.
 _SERIES: dict[Series, tuple[str, str]] = {

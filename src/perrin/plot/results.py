@@ -54,30 +54,17 @@ _CROSS: dict[str, Any] = {
     "zorder": 4,
 }
 
-
 # Symbols of a curve and of its coefficient.
 _CURVE_NAMES = {"rotation": ("MSAD", "$D_R$"), "translation": ("MSD", "$D_T$")}
-
 
 # Names of methods in the legend.
 _METHODS = {"mle": "ML fit", "line": "line"}
 
-
 MAX_CLUSTERS = 12  # clusters that `save_figures` draws one by one
-
-
 _NAMED_CLUSTERS = 60  # largest number of clusters whose names a forest plot shows
-
-
 _SHOWN_LAGS = 200  # largest number of lag times shown
-
-
 _SHOWN_FRAMES = 5000  # largest number of frames of an orientation path shown
-
-
 _VECTOR_FRAMES = 5000  # longer lines are images inside a PDF
-
-
 _CLUSTER_PIXELS = 400  # width and height of a drawn cluster
 
 
@@ -228,7 +215,7 @@ def plot_presence(motion: RigidMotion, *, ax: Axes) -> Axes:
     absent = _without_pose(motion)
     if absent.size:
         ax.plot(motion.time[absent], motion.n_present[absent], **_CROSS)
-    ax.set(xlabel="time (s)", ylabel=f"seen (of {n})", ylim=(-0.3, n + 0.5))
+    ax.set(xlabel="time (s)", ylabel=f"present (of {n})", ylim=(-0.3, n + 0.5))
     ax.set_yticks(np.arange(0, n + 1, max(1, n // 4)))
     return ax
 

@@ -16,10 +16,7 @@ if TYPE_CHECKING:
 # Colours of Okabe and Ito, which colour-blind readers and grey prints distinguish.
 INK, BLUE, RED, GREY = "#222222", "#0072B2", "#D55E00", "#8a8a8a"
 
-
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
-
-
 DPI = 150  # resolution of PNG files
 
 
@@ -34,6 +31,11 @@ def new_figure(width: float, height: float) -> Figure:
     Returns
     -------
     matplotlib.figure.Figure
+
+    Examples
+    --------
+    >>> new_figure(4, 3).get_size_inches()
+    array([4., 3.])
     """
     return Figure(figsize=(width, height), layout="constrained")
 
@@ -50,6 +52,14 @@ def save_figure(figure: Figure, stem: Path) -> list[Path]:
     Returns
     -------
     list of Path
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     [file.name for file in save_figure(new_figure(2, 1), Path(folder, "empty"))]
+    ['empty.png', 'empty.pdf']
     """
     FigureCanvasAgg(figure)
     files = [stem.with_name(stem.name + suffix) for suffix in (".png", ".pdf")]
@@ -94,6 +104,11 @@ def write_reason(ax: Axes, reason: str, *, framed: bool = False) -> Axes:
     Returns
     -------
     matplotlib.axes.Axes
+
+    Examples
+    --------
+    >>> write_reason(new_figure(2, 1).add_subplot(), "no steps").texts[0].get_text()
+    'no steps'
     """
     text = ax.text(0.5, 0.5, reason, ha="center", va="center", transform=ax.transAxes)
     if framed:

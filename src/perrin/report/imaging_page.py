@@ -12,7 +12,7 @@ from perrin.movie.checks import bleaching
 from perrin.plot.imaging import imaging_of, least_turns
 from perrin.report.html import byline, captioned, inline_pictures, render_page
 from perrin.run.remarks import condensed
-from perrin.tracks.clusters import REACH
+from perrin.tracks.groups import TOUCHING_REACH
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -24,8 +24,7 @@ if TYPE_CHECKING:
 
 Fact = tuple[str, str, str]  # name, value and remark
 
-
-# Caption of each figure: its title, what it shows, and what to look for.
+# Caption of each figure: its title, what it shows, and what to check.
 _IMAGING_CAPTIONS = {
     "found": (
         "Spheres found.",
@@ -77,12 +76,11 @@ _IMAGING_CAPTIONS = {
         "Number of spheres and of all spots, brightness of the spheres, grey level of the frame, "
         "and share of voxels at the end of the camera's range. Crosses mark frames that could "
         "not be read.",
-        "Constant lines. Decreasing brightness is bleaching, which increases the errors. A "
-        "changing number of spheres means that spheres cross the border or the mass cut. "
+        "All lines should be constant. Decreasing brightness is bleaching, which increases the "
+        "errors. A changing number of spheres means that spheres cross the border or the mass cut. "
         "Saturated voxels distort the images of the spheres and bias their fits.",
     ),
 }
-
 
 _LISTED_FRAMES = 50  # largest number of unreadable frames in the table
 
@@ -307,7 +305,7 @@ def rigid_body_facts(report: Report) -> list[Fact]:
     shapes = [c.motion.template for c in report.clusters]
     shapes += [rod.motion.places[:, None] for rod in report.rods]
     distance = np.concatenate([np.empty(0), *(pair_distances(shape) for shape in shapes)])
-    distance = distance[distance < REACH * contact]
+    distance = distance[distance < TOUCHING_REACH * contact]
     if distance.size:
         mean = float(distance.mean())
         off = f"{100 * (mean / contact - 1):+.2g} %".replace("-", "−")

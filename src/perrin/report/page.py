@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from perrin.run.results import ClusterResult, Report
 
 
-# Caption of each figure: its title, what it shows, and what to look for.
+# Caption of each figure: its title, what it shows, and what to check.
 _RESULT_CAPTIONS = {
     "curves": (
         "Mean square displacements against lag time.",
@@ -60,8 +60,7 @@ _RESULT_CAPTIONS = {
         "Paths of the particles' directions on the unit sphere in lab axes; strong on the side of "
         "the viewer, faint on the far side; an open circle marks the end of each path.",
         "A freely diffusing body has no preferred orientation. Long straight chords are jumps or "
-        "gaps; "
-        "rings about one axis are driven or hindered rotation.",
+        "gaps; rings about one axis are driven or hindered rotation.",
     ),
     "angle": (
         "Angle in the plane.",
@@ -80,9 +79,7 @@ _RESULT_CAPTIONS = {
     ),
 }
 
-
 _LINKED_CLUSTERS = 10  # largest number of clusters that one line links to
-
 
 # Units of the arguments of `analyze`.
 _ARGUMENT_UNITS = {
@@ -156,7 +153,7 @@ def render_html(report: Report, figures: Iterable[Path]) -> str:
             }
             for rod in report.rods
         ],
-        seen=report.imaging is not None,
+        has_images=report.imaging is not None,
         warnings=condensed(report.warnings),
         warned=_remarks(report, {c.name: c.warnings for c in report.results}),
         notes=condensed(report.notes),

@@ -6,7 +6,6 @@ from perrin.run.folders import (
     check_resumable,
     filled_folder,
     staged_folder,
-    write_json,
 )
 from perrin.run.grouping import assign_clusters
 from perrin.run.measure import (
@@ -189,5 +188,4 @@ __all__ = [
     "with_sizes",
     "wrapped_box_text",
     "write_data",
-    "write_json",
 ]

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from perrin._arrays import refuse
+from perrin._arrays import refuse, stated_twice
 from perrin.diffusion.noise_model import Noise
 from perrin.hydrodynamics.mobility import condition_faults
 
@@ -117,7 +117,7 @@ class Experiment:
 
 
 def merged_experiment(experiment: Experiment | None, **given: Any) -> Experiment:  # noqa: ANN401
-    """Return one experiment from an `Experiment` and from arguments stated one by one.
+    """Return one experiment from an `Experiment` and from single keywords.
 
     Parameters
     ----------
@@ -134,7 +134,8 @@ def merged_experiment(experiment: Experiment | None, **given: Any) -> Experiment
     Raises
     ------
     ValueError
-        If a value is stated both ways, or out of range; all faults in one message.
+        If a value is stated both in `experiment` and as a keyword, or out of range; all faults in
+        one message.
 
     Examples
     --------
@@ -143,7 +144,7 @@ def merged_experiment(experiment: Experiment | None, **given: Any) -> Experiment
     >>> merged_experiment(Experiment(dt=0.5), dt=0.73)
     Traceback (most recent call last):
         ...
-    ValueError: dt: stated as dt=0.73 and in experiment (0.5); state it once
+    ValueError: dt: stated in experiment= and as a keyword; state it once
     """
     defaults = {f.name: f.default for f in fields(Experiment) if f.default is not MISSING}
     defaults |= {"noise": "joint", "exposure": None, "drift": False}
@@ -153,10 +154,7 @@ def merged_experiment(experiment: Experiment | None, **given: Any) -> Experiment
         is_default = isinstance(value, str | bool) and value == defaults.get(name)
         stated = value is not None and not is_default
         if stated and name in known and known[name] != defaults[name]:
-            faults.append(
-                f"{name}: stated as {name}={value!r} and in experiment ({known[name]!r}); state it "
-                "once"
-            )
+            faults.append(stated_twice(name, "experiment"))
         elif stated:
             values[name] = value
     lengths = {name: values.pop(name) for name in set(values) - set(defaults)}

@@ -1,8 +1,7 @@
-"""Run folders and their JSON files: written whole, or resumed."""
+"""Run folders: written whole, or resumed."""
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 from contextlib import contextmanager
@@ -27,7 +26,7 @@ def staged_folder(folder: str | os.PathLike[str], *, overwrite: bool = False) ->
     Yields
     ------
     Path
-        A new folder beside it; it is removed if the writing fails.
+        A new folder in the same place; it is removed if the writing fails.
 
     Raises
     ------
@@ -35,6 +34,15 @@ def staged_folder(folder: str | os.PathLike[str], *, overwrite: bool = False) ->
         If the folder exists and `overwrite` is not set, or is no run folder.
     OSError
         If the folder cannot be written.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as parent:
+    ...     with staged_folder(Path(parent, "run")) as stage:
+    ...         _ = (stage / "run.json").write_text("{}")
+    ...     [path.name for path in Path(parent, "run").iterdir()]
+    ['run.json']
     """
     place = Path(folder)
     check_place(place, overwrite=overwrite)
@@ -118,12 +126,18 @@ def check_resumable(folder: str | os.PathLike[str], *, parts: str, overwrite: bo
 
 
 def check_place(folder: str | os.PathLike[str], *, overwrite: bool = False) -> None:
-    """Refuse, before any work is done, an output folder that exists or cannot be made.
+    """Refuse, before any work begins, an output folder that exists or cannot be made.
 
     Raises
     ------
     FileExistsError, PermissionError
         As in `staged_folder`.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     check_place(Path(folder, "new"))
     """
     place = Path(folder)
     if not place.exists():
@@ -135,15 +149,3 @@ def check_place(folder: str | os.PathLike[str], *, overwrite: bool = False) -> N
         raise FileExistsError(f"{place} exists: choose another folder, or overwrite=True")
     if not place.is_dir() or (any(place.iterdir()) and not (place / "run.json").is_file()):
         raise FileExistsError(f"{place} is no run folder of perrin (no run.json): not overwritten")
-
-
-def write_json(path: Path, content: object) -> None:
-    """Write a file of JSON in UTF-8, indented, in which no number is infinite or missing.
-
-    Raises
-    ------
-    ValueError
-        If a number is not finite.
-    """
-    text = json.dumps(content, indent=2, allow_nan=False, ensure_ascii=False)
-    path.write_text(text + "\n", encoding="utf-8")

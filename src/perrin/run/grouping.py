@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 # With at most this number of particles in fewer than this number of frames, all particles of a
-# table without a cluster column may be one body: distances in so few frames do not show it.
+# table without a cluster column may be one body: distances in that few frames do not show it.
 _PARTICLES_OF_ONE_BODY, _FRAMES_FOR_DISTANCES = 20, 8
 
 

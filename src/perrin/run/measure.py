@@ -85,10 +85,8 @@ if TYPE_CHECKING:
 # Clusters have no common D if they agree less well than this by chance.
 _DISAGREEMENT = 0.003
 
-
 # A steady velocity or spin is reported below this p-value, shared by all clusters of a table.
 _STEADY_LEVEL = 1e-3
-
 
 # Noise floor and alike steps are tested at this number of standard errors (0.05 % of clean
 # tracks), the noise floor for any ratio sigma_z/sigma_xy up to this one.
@@ -110,7 +108,7 @@ class ClusterTracks:
     frames : ndarray of int, shape (T,)
         Frame of each row, counted from the table's first.
     piece : ndarray of int, shape (T,)
-        Stretches of doubtless identity that the table brought.
+        Number of the piece of each row: within a piece no label is in doubt.
     far : ndarray of bool, shape (T, n)
         Points that were left out because they lie far from the body.
     """

@@ -35,19 +35,15 @@ if TYPE_CHECKING:
 # in 10^5 is missed, which costs a further solution and changes no result.
 _SHAPE_ERRORS = 5.0
 
-
 # Relative differences of distances that no diffusion coefficient shows, for tables without noise.
 _SHAPE_ROUNDING = 1e-4
-
 
 # Principal values closer than this (relative) cannot be distinguished in a track of 10^4 frames.
 _UNEQUAL_AXES = 0.02
 
-
 # A diameter over this multiple of the distance of neighbours, or under the distance by this factor,
 # is farther off than the spread of any batch of particles.
 _OVERLAPPING, _SEPARATE = 1.1, 1.5
-
 
 # A diameter over this multiple of the distance of neighbours is in another unit.
 _IMPOSSIBLE = 2.0
@@ -176,7 +172,7 @@ class ShapeMobility:
     reason : str
         Why there is no mobility; empty where there is one.
     warnings : tuple of str
-        Sentences that speak against the mobility.
+        Reasons to doubt the mobility.
     """
 
     mobility: Mobility | None

@@ -1,4 +1,4 @@
-"""The words of every warning and note of the main job, and how those of one kind are merged."""
+"""Texts of all warnings and notes of `analyze`, and how those of one kind are merged."""
 
 from __future__ import annotations
 
@@ -23,34 +23,24 @@ if TYPE_CHECKING:
 
 
 CONSTANT_Z = "z never changes: leave the column out to analyse motion in the plane"
-
-
 ROD_TESTS = "jumps and a steady motion of a rod are not tested for"
-
-
 ROD_DRIFT = "drift=True is not applied to rods: D_T and D_perp contain a mean motion"
-
 
 TOO_FAST = (
     "identity: the body turns too far between frames for its symmetry; cutting the longest steps "
     "makes D_R too low: sample faster"
 )
 
-
 # A remark on at most this share of the frames is a note.
 _SHARE_FOR_NOTE = 0.01
-
 
 # Jumps whose lengths differ by less than this share are all of one length.
 _ONE_LENGTH = 0.3
 
-
 # A track is cut too often beyond this share of the frames.
 _SHARE_OF_CUTS = 0.02
 
-
 _ANGLES_SHOWN, _JUMPS_SHOWN = 5, 5
-
 
 # At least one of this number of frame numbers occurs; numbers that are times in ms are sparser.
 SPARSE = 100
@@ -63,9 +53,9 @@ class Remarks:
     Attributes
     ----------
     warnings : list of str
-        Sentences that speak against the numbers.
+        Reasons to doubt the results.
     notes : list of str
-        Sentences that inform: how the table was read, what was left out or corrected.
+        How the table was read, what was left out, and what was corrected.
     """
 
     warnings: list[str] = field(default_factory=list)
@@ -81,8 +71,8 @@ class Remarks:
 
 _NUMBER_TEXT = re.compile(r"[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?(?:\(\d+\))?|\b(?:nan|inf)\b")
 
-
-# Words that change with a number beside them (lists, plurals, verbs), and what replaces them.
+# Words that change with the number before or after them (lists, plurals, verbs), and what
+# replaces them.
 _WORDS_BY_NUMBER = (
     (re.compile(r"\bcluster [^\s:,;]+"), "cluster #"),
     (re.compile(r"#(?:, #)*(?: and # more|, \.\.\.)?"), "#"),
@@ -234,6 +224,11 @@ def grouping_note(cluster: Ints, *, particles: int) -> str:
         Cluster numbers of all rows.
     particles : int
         Number of particles of the table.
+
+    Examples
+    --------
+    >>> grouping_note(np.array([0, 0, 0]), particles=3)
+    'no cluster column and no contact distance: all 3 particles are taken as one cluster'
     """
     start = "no cluster column and no contact distance"
     if (cluster == 0).all():
@@ -245,7 +240,13 @@ def grouping_note(cluster: Ints, *, particles: int) -> str:
 
 
 def loose_particles_note(count: int) -> str:
-    """State how many particles belong to no cluster."""
+    """State how many particles belong to no cluster.
+
+    Examples
+    --------
+    >>> loose_particles_note(3)
+    '3 particles belong to no cluster and are left out'
+    """
     return f"{count} particles belong to no cluster and are left out"
 
 
@@ -258,6 +259,11 @@ def no_cluster_text(contact: float | None, *, marked: bool) -> str:
         The stated contact distance, um.
     marked : bool
         Whether the table has a column cluster.
+
+    Examples
+    --------
+    >>> no_cluster_text(2.0, marked=False)
+    'no cluster: every particle is loose at contact = 2.0 um; correct that, or the scale'
     """
     if marked:
         return "no cluster: every particle is marked as loose (-1); correct that, or the scale"
@@ -299,7 +305,20 @@ def absent_frames_notes(recorded: Ints, stride: Sequence[str], *, first_frame: i
 
 
 def sparse_frames_warnings(recorded: Ints) -> list[str]:
-    """Warn where fewer than one in 100 of the frame numbers occurs: they are hardly frames."""
+    """Warn where fewer than one in 100 of the frame numbers occurs: they are probably times.
+
+    Parameters
+    ----------
+    recorded : ndarray of int
+        Frames that have rows, counted from the first.
+
+    Examples
+    --------
+    >>> sparse_frames_warnings(np.array([0, 1, 2]))
+    []
+    >>> sparse_frames_warnings(np.array([0, 500, 1000]))[0][:50]
+    'frame numbers: only 3 of the 1001 numbers from the'
+    """
     span = int(recorded[-1]) + 1
     if span <= SPARSE * len(recorded) or len(recorded) < 2:
         return []
@@ -329,7 +348,16 @@ def left_out_warnings(failures: Iterable[tuple[str, Exception]]) -> list[str]:
 
 
 def assumed_exposure_notes(noise: Noise) -> list[str]:
-    """State which exposure is assumed where the noise is held and the exposure unknown."""
+    """State which exposure is assumed where the noise is not fitted and the exposure is unknown.
+
+    Examples
+    --------
+    >>> from perrin.diffusion.noise_model import Noise
+    >>> assumed_exposure_notes(Noise())
+    []
+    >>> assumed_exposure_notes(Noise("residual"))[0][:57]
+    'noise residual: the exposure is not stated and taken as 0'
+    """
     if noise.model == "joint" or noise.exposure is not None:
         return []
     return [
@@ -363,6 +391,11 @@ def corrected_labels_text(frames: Ints, *, misfit: float, usual: float) -> str:
     misfit, usual : float
         Largest residual that the labels as they came would have left, um (NaN where unknown), and
         the median residual of all frames, um.
+
+    Examples
+    --------
+    >>> corrected_labels_text(np.array([7]), misfit=np.nan, usual=0.02)
+    'identity: labels change particles at frame 7; corrected'
     """
     residual = ""
     if np.isfinite(misfit):
@@ -397,7 +430,13 @@ def cut_text(frames: Ints, *, angles: Floats, symmetry: str) -> str:
 
 
 def extra_detection_text(frames: Ints) -> str:
-    """State where a detection was left out because it is no particle of the body."""
+    """State where a detection was left out because it is no particle of the body.
+
+    Examples
+    --------
+    >>> extra_detection_text(np.array([7]))
+    'identity: a detection that is no particle of the body is left out at frame 7'
+    """
     return (
         f"identity: a detection that is no particle of the body is left out at "
         f"{frames_text(frames)}"
@@ -405,7 +444,13 @@ def extra_detection_text(frames: Ints) -> str:
 
 
 def unsettled_notes(frames: Ints, *, of: int) -> list[str]:
-    """State which of `of` frames fit the common shape in no assignment of labels."""
+    """State which of `of` frames fit the common shape in no assignment of labels.
+
+    Examples
+    --------
+    >>> unsettled_notes(np.array([7]), of=300)[0][:64]
+    'identity: 1 of 300 frames fit the common shape in no assignment '
+    """
     if not frames.size:
         return []
     return [
@@ -415,7 +460,13 @@ def unsettled_notes(frames: Ints, *, of: int) -> list[str]:
 
 
 def fast_turning_warnings(*, cuts: int, of: int) -> list[str]:
-    """Warn where the track is cut in more than 2 % of `of` frames."""
+    """Warn where the track is cut in more than 2 % of `of` frames.
+
+    Examples
+    --------
+    >>> fast_turning_warnings(cuts=6, of=300), len(fast_turning_warnings(cuts=7, of=300))
+    ([], 1)
+    """
     return [TOO_FAST] if cuts > _SHARE_OF_CUTS * of else []
 
 
@@ -479,7 +530,7 @@ def jump_warning(jumps: Jumps, frames: Ints, quantity: Quantity, *, kept: bool) 
         return (
             f"steps: {what} in {len(frames)} of {jumps.n_steps} steps farther than Brownian motion "
             f"can (the longest {length.max():.3g} {unit}, at frame {frames[np.argmax(length)]})"
-            f"{wrapped}: so many are usually another kind of motion (hops, a "
+            f"{wrapped}: this number of jumps usually indicates another kind of motion (hops, a "
             f"changing D, heavy tails), which one {name} does not describe; they are left in"
         )
     done = f"{name} contains them" if kept else f"{name} leaves them out (keep_jumps keeps them)"

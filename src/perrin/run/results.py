@@ -22,8 +22,9 @@ from perrin.motion.floor import NoiseFloor, floor_of
 from perrin.motion.rigid_motion import RigidMotion
 from perrin.motion.rigidity import Quality
 from perrin.motion.rods import RodMotion
-from perrin.run.folders import staged_folder, write_json
+from perrin.run.folders import staged_folder
 from perrin.run.predictions import Prediction
+from perrin.tracks.writing import write_json
 
 if TYPE_CHECKING:
     import os
@@ -57,7 +58,7 @@ class ClusterResult:
         viscosity that both coefficients imply, for equal spheres at the measured places. None
         without any.
     warnings : tuple of str
-        Sentences that speak against the numbers.
+        Reasons to doubt the results.
     label : str or None
         Cluster name in the table, where it is text.
     quality : Quality or None
@@ -65,7 +66,7 @@ class ClusterResult:
     prediction : Prediction or None
         Coefficients predicted for spheres of the stated diameter; None if none was stated.
     notes : tuple of str
-        Sentences that inform: how the table was read, what was left out or corrected.
+        How the table was read, what was left out, and what was corrected.
     jumps : dict of tuple of int
         Frames (from 0) at which a step was left out of the estimate of "rotation" or
         "translation" because Brownian motion cannot make it.
@@ -200,13 +201,13 @@ class RodResult:
     D_perp, D_T : DiffusionEstimate
         Diffusion coefficient of the direction (``<|du|^2>`` = 4 D_perp dt) and of the centre.
     warnings : tuple of str
-        Sentences that speak against the numbers.
+        Reasons to doubt the results.
     label : str or None
         Cluster name in the table, where it is text.
     prediction : Prediction or None
         Coefficients predicted for spheres of the stated diameter; None if none was stated.
     notes : tuple of str
-        Sentences that inform: how the table was read, what was left out or corrected.
+        How the table was read, what was left out, and what was corrected.
     """
 
     cluster: int
@@ -297,7 +298,7 @@ class Pooled:
 
 @dataclass(frozen=True, eq=False)
 class Report:
-    """The result of a run: a result per cluster, pooled values, warnings, and where they come from.
+    """The result of a run: a result per cluster, pooled values, warnings, notes and settings.
 
     Attributes
     ----------
@@ -306,7 +307,7 @@ class Report:
     pooled : Pooled or None
         Values of all rigid clusters together; None where there is no rigid cluster.
     warnings : tuple of str
-        Sentences that speak against the whole table; those of one cluster are in its result.
+        Reasons to doubt the results of the whole table; those of one cluster are in its result.
     tracks : pandas.DataFrame
         Positions used: frame from 0, particle, cluster, x, y[, z], um.
     settings : dict
@@ -316,7 +317,7 @@ class Report:
     imaging : Imaging or None
         Features, images and optics, where the run began with images.
     notes : tuple of str
-        Sentences that inform on the whole table: how it was read, what was left out.
+        How the whole table was read, what was left out, and what was corrected.
     """
 
     clusters: tuple[ClusterResult, ...]

@@ -1,4 +1,4 @@
-"""From a track table to a Report: the main job, as a user calls it."""
+"""`analyze`: from a track table to a Report."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ def analyze(
     DegenerateClusterError, TooFewFramesError
         If no cluster can be measured; a cluster that cannot be measured among others is a warning.
     ValueError
-        For arguments out of range or stated twice.
+        For arguments out of range, or stated both in `experiment` and as a keyword.
 
     Examples
     --------

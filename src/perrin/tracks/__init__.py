@@ -62,7 +62,7 @@ from perrin.tracks.screening import (
     rounding_chances,
     screen_rows,
 )
-from perrin.tracks.writing import written_whole
+from perrin.tracks.writing import write_json, written_whole
 
 __all__ = [
     "CENTRE_REMOVED",
@@ -137,6 +137,7 @@ __all__ = [
     "table_suffix",
     "touching_groups",
     "unit_faults",
+    "write_json",
     "write_tracks",
     "written_whole",
 ]

@@ -1,7 +1,8 @@
-"""Writing files so that they appear whole or not at all."""
+"""Files that appear whole or not at all, and files of JSON."""
 
 from __future__ import annotations
 
+import json
 import os
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
@@ -47,6 +48,34 @@ def written_whole(path: Path) -> Iterator[Path]:
         raise type(fault)(fault.errno, fault.strerror, str(path)) from fault
     finally:
         part.unlink(missing_ok=True)
+
+
+def write_json(path: Path, content: object) -> None:
+    r"""Write a file of JSON in UTF-8, indented, in which no number is infinite or missing.
+
+    Parameters
+    ----------
+    path : Path
+        File that is written.
+    content : object
+        Values that JSON can hold.
+
+    Raises
+    ------
+    ValueError
+        If a number is not finite.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     write_json(Path(folder, "sizes.json"), {"diameter": 2.45})
+    ...     Path(folder, "sizes.json").read_text()
+    '{\n  "diameter": 2.45\n}\n'
+    """
+    text = json.dumps(content, indent=2, allow_nan=False, ensure_ascii=False)
+    path.write_text(text + "\n", encoding="utf-8")
 
 
 def _flush(path: Path) -> None:

@@ -19,10 +19,8 @@ if TYPE_CHECKING:
 
 Plane: TypeAlias = Callable[[int, int], NDArray[Any]]
 
-
 # Letters by which tifffile marks axes of unknown meaning: times or planes.
 UNNAMED = "IQ"
-
 
 _UM_PER_UNIT = {
     **dict.fromkeys(("m", "meter", "metre"), 1e6),
@@ -33,7 +31,6 @@ _UM_PER_UNIT = {
     **dict.fromkeys(("nm", "nanometer", "nanometre"), 1e-3),
     "inch": 25400.0,
 }
-
 
 _SECONDS_PER_UNIT = {
     **dict.fromkeys(("h", "hour"), 3600.0),

@@ -15,10 +15,8 @@ from perrin._arrays import Floats, frozen, require_positive
 # Spacing of the table's knots in units of the blur along each axis; the cubic error is below 1e-4.
 _KNOT_SPACING = 0.25
 
-
 # A fit uses the voxels up to this many blurs outside a sphere's surface.
 _FIT_RANGE = 3.5
-
 
 # The table ends this many blurs outside the sphere, where less than 1e-5 is left.
 _TABLE_RANGE = 4.5

@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 # Parameters of a sphere: its position and its brightness.
 _PER_SPHERE = 4
 
-
 # Slopes and curvatures of the background within the plane.
 _N_TILTS = 5
 

@@ -34,35 +34,27 @@ if TYPE_CHECKING:
 # Rounds of the last search, and between two searches of the residuals for missing spheres.
 _MAX_CROWD_ROUNDS, _INTERIM_ROUNDS = 40, 8
 
-
 # Step of a sphere over the blur at which the last search ends, as for smaller groups, and the
 # interim ones.
 _CROWD_STEP_CONVERGED, _INTERIM_STEP = 1e-4, 1e-2
 
-
 # Least visible fraction of a sphere that is added, and of one that is kept.
 _ADDED_VISIBLE, _KEPT_VISIBLE = 0.05, 0.01
-
 
 # Relative standard deviation of brightness in the prior.
 _BRIGHTNESS_SPREAD = 0.3
 
-
 # The brightness of a sphere is within this factor of the median.
 _BRIGHTNESS_FACTOR = 4.0
-
 
 # Least distance of two spheres, in contact distances.
 _MIN_DISTANCE = 0.7
 
-
 # No sphere is added within this fraction of the least distance from a position given up before.
 _RETRY_FRACTION = 0.3
 
-
 # Least decrease of chi-squared by a sphere: five standard errors of its brightness.
 _MIN_DETECTION_CHI2 = 25.0
-
 
 # Least decrease of chi-squared by an added sphere, as a fraction of that by a wholly visible one:
 # more than flaws of the model.

@@ -25,25 +25,19 @@ if TYPE_CHECKING:
 # Change of a logarithm for the central differences.
 _LOG_DIFFERENCE = 0.01
 
-
 # Largest step of a logarithm, and the step at which the search ends.
 _MAX_LOG_STEP, _LOG_STEP_CONVERGED = 0.25, 1e-3
 
-
 _MAX_LEARNING_ROUNDS = 15
-
 
 # Searches of a crowd's residuals for missing spheres, in every round.
 _LEARNING_SEARCHES = 2
 
-
 # Saturation below this number of voxels, or this fraction of them, does not affect any position.
 _MIN_CLIPPED, _MIN_CLIPPED_FRACTION = 10, 1e-5
 
-
 # Number of occupied grey levels below the highest, with which it is compared.
 _COMPARED_LEVELS = 3
-
 
 # Level of the saturation test in one frame: movies have thousands of frames.
 _SATURATION_LEVEL = 1e-6

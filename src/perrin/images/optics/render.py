@@ -32,7 +32,6 @@ if TYPE_CHECKING:
 # Range of a Gaussian in standard deviations: 3e-7 of its peak is left there.
 _GAUSSIAN_RANGE = 5.0
 
-
 # Largest ratio of diameter to point spread: the table of a ball takes 200 MB there.
 _MAX_SHARPNESS = 280.0
 

@@ -23,13 +23,10 @@ if TYPE_CHECKING:
 # Step of a sphere over the blur at which the search ends: far below any standard error.
 _WINDOW_STEP_CONVERGED = 1e-4
 
-
 _MAX_WINDOW_ROUNDS = 40
-
 
 # Least number of voxels for each fitted parameter.
 _VOXELS_PER_PARAMETER = 5
-
 
 # Parameters of the background: a level and its slope along z, y and x.
 _N_BACKGROUND = 4

@@ -46,22 +46,16 @@ if TYPE_CHECKING:
 
 
 Refine = Literal["model", "trackpy"] | None
-
-
 _Voxel = tuple[float, float, float]
-
 
 # Number of frames from which the mass cut and the optics are learned.
 _LEARNING_FRAMES = 5
 
-
 # Number of groups of spheres, or of pieces of crowds, from which the optics are learned.
 _LEARNING_GROUPS, _LEARNING_CROWDS = 15, 2
 
-
 # Number of spheres in a piece of a crowd.
 _PIECE_SPHERES = 30
-
 
 # Reasons for which a sphere is not refined.
 _IN_A_CROWD, _NO_OWN_VOXELS = "in a crowd", "no voxels of its own"
@@ -70,7 +64,6 @@ _NOT_CONVERGED, _MOVED, _DARK = (
     "moved over half a radius",
     "no light of its own",
 )
-
 
 NO_FLAT_MODEL = (
     "the model of the image is that of a volume; in this 2-D movie places are filtered centroids: "

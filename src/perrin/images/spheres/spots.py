@@ -11,8 +11,7 @@ import numpy as np
 from perrin._arrays import choice_fault, number_fault, refuse, to_plain
 from perrin.errors import PrecisionWarning
 from perrin.geometry.shapes import pair_distances
-from perrin.tracks.clusters import REACH
-from perrin.tracks.linking import touching_groups
+from perrin.tracks.groups import TOUCHING_REACH, touching_groups
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -24,18 +23,14 @@ if TYPE_CHECKING:
 # Distance in contacts below which the images of two spheres overlap, with their blur.
 _IMAGE_OVERLAP = 1.6
 
-
 # Largest number of spheres in a chain of overlapping images that is fitted group by group.
 _MAX_CHAIN = 16
-
 
 # Least ratio of neighbouring masses that separates spheres from noise.
 _CLEAR_GAP = 2.0
 
-
 # Masses that are all within this ratio are all of spheres.
 _SAME_MASS_RATIO = 4.0
-
 
 # Ratio to the largest mass below which a gap separates noise from noise.
 _FAINT_RATIO = 20.0
@@ -155,7 +150,7 @@ def mass_cut(mass: Floats) -> float:
     if ratio.max() < _CLEAR_GAP:
         warnings.warn(
             f"the masses of the {mass.size} spots found have no clear gap between spheres and "
-            "noise: all are kept; look at their histogram and set minmass",
+            "noise: all are kept; inspect their histogram and set minmass",
             PrecisionWarning,
             stacklevel=4,
         )
@@ -164,7 +159,9 @@ def mass_cut(mass: Floats) -> float:
     return float(np.sqrt(ordered[k] * ordered[k + 1]))
 
 
-def touching_together(centers: Floats, *, contact: float, reach: float = REACH) -> list[Ints]:
+def touching_together(
+    centers: Floats, *, contact: float, reach: float = TOUCHING_REACH
+) -> list[Ints]:
     """Return the spheres of one frame as groups: chains of touching spheres.
 
     Parameters
@@ -252,7 +249,7 @@ def at_contact(centers: Floats, *, contact: float) -> Floats:
     array([0.05, 1.05])
     """
     distance = pair_distances(centers)
-    near = distance[distance < REACH * contact]
+    near = distance[distance < TOUCHING_REACH * contact]
     scale = min(contact / near.mean(), 1.0) if near.size else 1.0
     middle = centers.mean(axis=0)
     return np.asarray(middle + scale * (centers - middle))
