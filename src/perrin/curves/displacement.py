@@ -27,7 +27,6 @@ from perrin.motion.rigid_motion import RigidMotion, threshold_displacement
 if TYPE_CHECKING:
     import pandas as pd
 
-
 # Directions whose mean weighs the axes this evenly change a slope by at most this fraction.
 _EVEN_WEIGHTS = 0.01
 

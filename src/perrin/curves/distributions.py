@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 
     from perrin.motion.rigid_motion import RigidMotion
 
-
 _HERMITE_ORDERS = 100  # beyond which the error of a bin is bounded from above
 
 

@@ -14,14 +14,11 @@ from perrin.errors import TooFewFramesError
 if TYPE_CHECKING:
     from perrin._arrays import Bools, Floats, Ints
 
-
 # A time this close to a multiple of the step between frames (in steps) counts as that multiple.
 GRID_TOLERANCE = 0.1
 
-
 # Times that deviate from a grid by less than this (in dt) are those of frame numbers.
 _EXACT_GRID = 1e-3
-
 
 # A grid may have this many places per frame, and this many more; beyond, its holes are cut out, so
 # that arrays and lag axes are bounded by the number of frames present.

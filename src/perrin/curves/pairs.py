@@ -15,11 +15,9 @@ if TYPE_CHECKING:
     from perrin._arrays import Floats, Ints
     from perrin.curves.grids import Frames
 
-
 # Largest number of pairs formed one by one where frames lie on no common compact grid: a second and
 # 200 MB. All pairs of 1400 frames.
 _MOST_LISTED_PAIRS = 1_000_000
-
 
 _PAIRS_IN_MEMORY = 1 << 16  # pairs whose displacements are in memory at once
 

@@ -12,7 +12,6 @@ if TYPE_CHECKING:
     from perrin.curves.grids import Frames
     from perrin.curves.pairs import ListedPairs, PairSums
 
-
 # Starts of displacements are compared as whole numbers below this: exact sums of their squares.
 _INTEGER_RANGE = 1 << 22
 

@@ -21,30 +21,23 @@ if TYPE_CHECKING:
     from perrin._arrays import Floats, Ints
     from perrin.curves.displacement import LagCurve
 
-
 # The paper's window, 3 s to 22 s of a run of 220 s, as fractions of the duration.
 _PAPER_WINDOW = (3 / 220, 22 / 220)
-
 
 # The information on D in a curve at lag n falls as exp(-k n), cosh k = 1 + SNR: six decay lengths
 # leave out less than 0.3 % of the variance.
 _DECAY_LENGTHS = 6.0
 
-
 _MOST_GLS_LAGS = 600  # in generalised least squares; beyond, spaced geometrically
-
 
 # Motion blur lowers the offset at most to -D dt/3 (a shutter that never closes).
 _FULL_BLUR = -1 / 3
-
 
 # No window is so long that even without noise the error would be more than this part of D: the
 # interval would have no upper end.
 _LARGEST_ERROR = 0.4
 
-
 _MOST_GLS_ROUNDS = 100
-
 
 # A warning states that a slope is not D_R where the steps show it with this many standard errors (a
 # chance well below 1 % for an isotropic body of 60 frames, whose ratio has longer tails than a

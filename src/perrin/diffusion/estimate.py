@@ -13,12 +13,9 @@ from perrin.diffusion.noise_model import Noise
 
 UNITS = {"rotation": "rad^2/s", "translation": "um^2/s"}
 
-
 CHI2 = {0.68: 0.9889, 0.95: 3.8415}  # quantiles of chi-squared with one degree of freedom
 
-
 NORMAL = {0.68: 0.9945, 0.95: 1.9600}  # half widths of intervals in standard errors
-
 
 # Below ten times its resolution floor a D_R is not resolved.
 _RESOLVED_FLOORS = 10.0

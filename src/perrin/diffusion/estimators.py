@@ -20,9 +20,7 @@ from perrin.motion.rigid_motion import RigidMotion
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-
 Method = Literal["mle", "cve", "trace"]
-
 
 # Beyond these an estimate warns: angular step 4 D_R dt, signal-to-noise ratio, number of steps. In
 # the plane angles add up exactly; only whole turns within a step (4 D_R dt = 2) are lost.

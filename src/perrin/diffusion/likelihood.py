@@ -29,15 +29,12 @@ if TYPE_CHECKING:
     from perrin._arrays import Bools, Floats
     from perrin.diffusion.steps import NoisySteps
 
-
 # Lowest and highest logarithm of an offset theta in units of the mean square step. Without
 # diffusion a long track needs an offset far above that.
 _LEAST_LOG_OFFSET, _MOST_LOG_OFFSET = -30.0, 60.0
 
-
 # The steps of a body whose mean square is this much smaller than another one's are rounding.
 _SMALLEST_STEP_RATIO = 1e-24
-
 
 _LEAST_SLOPE_RATIO = float(np.exp(-_MOST_LOG_OFFSET))
 

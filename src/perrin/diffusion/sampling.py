@@ -32,33 +32,26 @@ if TYPE_CHECKING:
 
     from perrin.diffusion.estimate import DiffusionEstimate
 
-
 # The window in SNR = D_R dt/s. With a given number of frames the error is within 7 % of its limit
 # at the first, and within 2 % at the second.
 _LEAST_SNR, _AMPLE_SNR = 5.0, 20.0
-
 
 # The same photons divided among more frames: the error is 17 % above its limit at the first SNR and
 # 7 % at the second. With the noise from the residuals it is flat within 2 % below the third.
 _PHOTON_SNR, _LEAST_PHOTON_SNR, _PHOTON_SNR_RESIDUAL = 0.5, 0.1, 2.0
 
-
 # D_R dt up to which steps are small and nearest neighbours are linked correctly: 4 D_R dt = 0.1.
 _LONGEST_STEP = 0.1 / 4
-
 
 # Half the angle (or distance) to a neighbour, in standard deviations of one step, at which a step
 # is confused: by nearest neighbours in 0.04 % of the steps at most, by rigid fits in 0.5 %.
 _LINKING_DEVIATIONS, _FITTING_DEVIATIONS = 4.2, 3.3
 
-
 # Highest rotation axis of the bodies whose symmetry is known: a rigid fit confuses a turn by more
 # than half of its angle with a permutation of the particles.
 _HIGHEST_FOLD = {"T_d": 3, "D_3h": 3, "O_h": 4, "D_5h": 5}
 
-
 _DEFAULT_FRAMES = 300  # where neither frames nor time are given
-
 
 _CURVE_POINTS = 121  # of the errors against the time between frames
 

@@ -13,7 +13,6 @@ if TYPE_CHECKING:
     from perrin._arrays import Bools, Floats, Ints
     from perrin.diffusion.steps import NoisySteps
 
-
 # Lower bound of every eigenvalue: zero noise and no diffusion give no density.
 LEAST_EIGENVALUE = 1e-100
 

@@ -23,35 +23,27 @@ if TYPE_CHECKING:
     from perrin.diffusion.estimate import DiffusionEstimate
     from perrin.motion.rigid_motion import RigidMotion
 
-
 # A jump is a step that has this probability, at most, in the whole of a Brownian track.
 JUMP_LEVEL = 1e-6
 
-
 # More jumps than this share of the steps (and more than one) are another kind of motion.
 MOST_JUMPS = 0.01
-
 
 # Candidates are steps beyond this level, judged by a scale that up to half of the steps cannot
 # change; they are then tested against the diffusion of all other steps.
 _CANDIDATE_LEVEL = 1e-3
 
-
 _FEWEST_STEPS = 8  # no scale of the steps is known from fewer
 
-
 _MOST_CANDIDATE_ROUNDS = 10  # of finding candidates and estimating the diffusion of all other steps
-
 
 # Above this p-value, at the D that contains the steady motion, no fit without it is made: it would
 # change D, and with it p, by a few parts in N.
 _CLEARLY_STILL = 0.05
 
-
 # A displaced frame is attributed to localisation up to this multiple of the variance that its own
 # residual explains; beyond it the body itself was elsewhere for one frame.
 _BADLY_MEASURED = 100.0
-
 
 # A variance multiplied by this takes a step out of the prediction of the others.
 _LEFT_OUT = 1e6

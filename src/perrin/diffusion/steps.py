@@ -23,11 +23,9 @@ if TYPE_CHECKING:
 
 Quantity = Literal["rotation", "translation"]
 
-
 # Axes whose noise differs by less than this are equally noisy: the errors of the common shape make
 # such differences, and their effect on D is of the order of their square.
 _EQUALLY_NOISY_AXES = 0.02
-
 
 # Steps are even, and a sine transform serves, if times and noise agree to this.
 _EVEN_STEPS = 1e-9

@@ -20,20 +20,16 @@ if TYPE_CHECKING:
     # D (b, b) and its slopes (m, b, b) by the m parameters of a family of tensors.
     Family: TypeAlias = Callable[[Floats], tuple[Floats, Floats]]
 
-
 # The largest blur: all motion seen in the first and last instant of a frame (1/6: open shutter).
 _MOST_BLUR = 0.25
-
 
 # Where D and noise have the same shape only noise less blur is determined; then this slope of the
 # log-likelihood selects the least blur. It changes the log-likelihood by 0.025 at most.
 _LEAST_BLUR = 0.1
 
-
 # A search has converged where another step would gain this much: 5e-9 standard errors. A gain below
 # the second number is hidden by rounding, and steps are accepted without it.
 _CONVERGED_GAIN, _ROUNDING_GAIN = 1e-17, 1e-9
-
 
 # Step of numerical derivatives, in scaled units where all parameters are of order 1.
 _DIFFERENCE_STEP = 1e-5

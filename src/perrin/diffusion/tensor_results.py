@@ -15,21 +15,16 @@ if TYPE_CHECKING:
 
     from perrin.diffusion.steps import Quantity
 
-
 # Elements of a symmetric matrix in the order of `DiffusionTensor.covariance`.
 SYMMETRIC_ELEMENTS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
-
 
 # An axis that an error of one standard deviation turns by more than this (degrees) is not known.
 _KNOWN_AXIS = 20.0
 
-
 # The error in degrees of the axes of equal values: any direction of their plane will do.
 EQUAL_AXES_ERROR = 45.0
 
-
 NO_ERRORS = "no errors are known: a value lies on its edge, 0; take longer tracks or longer steps"
-
 
 # Values are distinguished at this level.
 _ISOTROPY_LEVEL = 0.05

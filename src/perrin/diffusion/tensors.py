@@ -43,7 +43,6 @@ if TYPE_CHECKING:
     from perrin._arrays import Floats, Ints
     from perrin.diffusion.steps import Steps
 
-
 # Noise below this variance, relative to a step's, is rounding: that of simulated truth.
 _NOISELESS = 1e-8
 

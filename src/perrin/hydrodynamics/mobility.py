@@ -22,16 +22,12 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike
 
-
 BOLTZMANN = 1.380649e-23  # J/K, exact in the SI
-
 
 # Temperatures of liquids under a microscope, K; values in degrees Celsius are outside.
 _COLDEST, _HOTTEST = 200.0, 500.0
 
-
 _HIGHEST_DEGREE = 40
-
 
 # Surface points of a sphere from which the volume of an overlapping body is computed, to 1e-4.
 _VOLUME_POINTS = 20_000

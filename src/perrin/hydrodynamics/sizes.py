@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 
     from perrin._arrays import Floats
 
-
 # Units of the numbers of a `Size`, as they end its keys in JSON.
 _SIZE_UNITS = {
     **dict.fromkeys(("cluster", "cluster_stderr", "sphere", "sphere_stderr"), "_um"),
@@ -46,23 +45,18 @@ class HasStandardError(Protocol):
 
 Measured: TypeAlias = HasStandardError | float | tuple[float, float]
 
-
 Viscosity: TypeAlias = float | tuple[float, float] | Callable[[float], float]
 
-
 Factor: TypeAlias = Literal["exact", "hoffmann2009"]
-
 
 # d_tetra / d_sphere of Hunter 2011, Eq. 25, for both modes. Resolved hydrodynamics of touching
 # spheres gives 1.784 for translation and 1.818 for rotation.
 _HOFFMANN = 1.844
 
-
 # Largest distance of touching spheres over the smallest pair distance. Diameters vary by a few per
 # cent; the next neighbours in compact clusters are 1.41 diameters away, those of the paper's
 # pentahedron 1.22.
 _NEIGHBOUR_RATIO = 1.2
-
 
 # Half the interval (K) of the central difference of a viscosity.
 _HALF_INTERVAL = 0.01

@@ -16,19 +16,15 @@ if TYPE_CHECKING:
 
     from perrin._arrays import Floats
 
-
 _GRAVITY = 9.80665  # m/s^2, standard
-
 
 # Height over the hydrodynamic radius below which the series of a sphere has an error above 2 % for
 # the translation of a cluster along the normal.
 _LOWEST_HEIGHT = 2.5
 
-
 # Liquid water at 0.1 MPa in uPa s: sum of a (T/300 K)^b, 253.15 K to 383.15 K
 # (IAPWS SR6-08, Revised Supplementary Release on Properties of Liquid Water at 0.1 MPa).
 _WATER_TERMS = ((280.68, -1.9), (511.45, -7.7), (61.131, -19.6), (0.45903, -40.0))
-
 
 _WATER_RANGE = (253.15, 383.15)
 

@@ -12,12 +12,10 @@ from perrin.geometry.shapes import pair_distances
 # rigid: localisation errors are below a tenth of the distance of two spheres.
 _DISTANCE_CHANGE = 0.2
 
-
 # Least width of particles on a line over their localisation error at which the line is no effect of
 # noise: noise alone keeps the width of the mean shape below 2, and sigma_z may be three times the
 # sigma of a distance across it.
 _LINE_WIDTH = 6.0
-
 
 # Ratio of median absolute deviation and standard deviation of Gaussian numbers.
 _MEDIAN_DEVIATION = 0.6745

@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 
     from perrin._arrays import Bools, Floats, Ints
 
-
 # Largest rotation (rad) of a last Gauss-Newton step: rounding of a rotation matrix.
 _LAST_TURN = 1e-13
 

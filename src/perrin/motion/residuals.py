@@ -16,38 +16,30 @@ from perrin.motion.tracking import template_motion
 if TYPE_CHECKING:
     from perrin.motion.rigid_motion import RigidMotion
 
-
 # Most frames sampled: the standard error of every average here is then below 2 % of its scatter.
 _SAMPLED_FRAMES = 2000
 
-
 # Two-sided probability below which a slope is taken to differ from zero.
 SIGNIFICANCE = 1e-3
-
 
 # Least power (um^2) of a displacement over what noise of the fitted orientation adds to it: below
 # this factor the body turns or moves too little to measure the slope.
 _LEAST_POWER = 4.0
 
-
 # Largest standard error of the stretch (relative) that is still reported as measured.
 _STRETCH_ERROR = 0.1
-
 
 # Spread of the variances of the axes, over the mean square residual, that is assumed before they
 # are measured: residuals of a body in the plane x y hardly contain the noise along z, which may be
 # up to ten times as large.
 _VARIANCE_SPREAD = 6.0
 
-
 # Largest relative standard error of a variance that is still reported as measured.
 _VARIANCE_ERROR = 0.3
-
 
 # Largest speed of the centre over the median speed: faster ones are jumps, not the motion that a
 # sequential scan displaces particles by.
 _JUMP_SPEED = 6.0
-
 
 _LEVI_CIVITA = -skew(np.eye(3))
 

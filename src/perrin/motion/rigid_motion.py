@@ -15,10 +15,8 @@ if TYPE_CHECKING:
     import pandas as pd
     from scipy.spatial.transform import Rotation
 
-
 # Apparent D_R dt of a tetrahedron at rest, over (sigma/R)^4.
 _RESTING_DIFFUSION = 0.04
-
 
 _WHOLE_NUMBERS = ("n_present", "piece")
 

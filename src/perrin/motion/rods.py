@@ -25,33 +25,26 @@ if TYPE_CHECKING:
     import pandas as pd
     from numpy.typing import ArrayLike
 
-
 # Log-odds above which the two ends count as identified: a hundred to one, as in
 # `settle_identity`.
 _CERTAIN_ENDS = float(np.log(100.0))
 
-
 # Log-odds in favour of the labels in the table, as in `settle_identity`.
 _LABEL_ODDS = 18.0
-
 
 # Largest ratio of the squared least turn of a step to its assumed variance, as in
 # `settle_identity`: above it the variance is widened, because one long turn follows no law of the
 # short ones.
 _LONGEST_TURN_LABELLED, _LONGEST_TURN_UNLABELLED = 4.0, 16.0
 
-
 # Largest root mean square distance of the particles from their line, a coordinate, over its length.
 _BENT = 0.1
-
 
 # Largest difference of the positions along a chain, over its length, from those of the chain turned
 # end for end at which its two ends count as equal.
 _EQUAL_ENDS = 0.05
 
-
 _MEDIAN_2 = 2 * float(np.log(2.0))  # median of chi squared with 2 degrees of freedom
-
 
 _COLUMNS = ("residual", "n_present", "variance", "center_variance", "piece")
 

@@ -23,7 +23,6 @@ from perrin.motion.rigid_motion import RigidMotion
 if TYPE_CHECKING:
     from perrin.geometry.shapes import Cluster
 
-
 # Largest D dt of one substep of an anisotropic rotor: Gaussian rotation vectors are exact to first
 # order in D dt, and the remaining error of E[R] at this step is about 1e-6.
 _SUBSTEP = 0.002

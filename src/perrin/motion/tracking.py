@@ -33,9 +33,7 @@ from perrin.motion.rigid_motion import RigidMotion
 
 Reference = Literal["template", "previous"]
 
-
 Weights = Literal["equal", "sigma"]
-
 
 # Standard deviation (rad) of the orientation about its most uncertain axis above which a pose is
 # refused: the particles lie on a line within the noise, and small-angle errors no longer hold.

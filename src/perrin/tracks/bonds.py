@@ -11,54 +11,43 @@ from perrin.tracks.groups import connected_groups, frames_of
 if TYPE_CHECKING:
     from perrin._arrays import Bools, Floats, Ints
 
-
 # Up to this number of particles every pair is followed; of more only the nearest neighbours, which
 # are searched for in some of the frames.
 _ALL_PAIRS, _NEAREST_FOLLOWED, _SCREENED_FRAMES = 64, 12, 60
 
-
 # Followed positions per chunk of pairs: bounds the memory.
 _CHUNK_ROWS = 1_000_000
-
 
 # A pair needs this number of shared frames. They are divided into blocks of time: white noise has
 # one of n - 1 parts of its variance per block between them, a random walk seven eighths.
 _FEWEST_SHARED, _MOST_BLOCKS, _BLOCK_FRAMES = 8, 8, 5
 
-
 # Distances farther from the median than 5 standard deviations (from the quantiles at 10 and 90 %)
 # are measured wrongly and do not count.
 _TAIL_QUANTILE, _GROSS_ERROR = 0.1, 5.0
 
-
 _NORMAL_RANGE = 2.563  # between these quantiles of a normal distribution, in standard deviations
-
 
 # A distance is constant where it varies by under a tenth of the distance to the nearest particle.
 _CONSTANT_SHARE = 0.1
-
 
 # Variations are slow where more than half of the variance lies between blocks of time. The
 # distance of two free particles then varies as their separation does along every axis; that of a
 # body by under a tenth of it (variance), or under 30 % of its slow part.
 _SLOW_SHARE, _TIED_SHARE, _SLOW_TIED_SHARE = 0.5, 0.1, 0.3
 
-
 # A pair whose distance varies by under 0.2 % of the distance to the nearest particle, less than any
 # localisation error, is at rest.
 _REST_SHARE = 2e-3
-
 
 # Two groups are one body unless the distances between them vary by over 2.5 times (rms) what the
 # distances inside vary; slow variations, of which there are few blocks, are compared by an F test
 # at this level.
 _MOST_EXCESS, _SLOW_TEST_LEVEL = 2.5, 1e-3
 
-
 # A group whose distances vary by over 6 times those of the tightest group is a body only if they
 # vary less (variance) than the separations along the axes: of trapped particles both vary alike.
 _LOOSE_RATIO, _TURNING_SHARE = 6.0, 0.7
-
 
 # The localisation error along one axis of the microscope is at most this factor from that along the
 # others. The logarithm of its square costs this share of a fluctuation's sampling error, so that

@@ -36,9 +36,7 @@ if TYPE_CHECKING:
     import pandas as pd
     from numpy.typing import ArrayLike
 
-
 REACH = TOUCHING_REACH  # the former name
-
 
 # Frame numbers that span more than this, and more than this multiple of the frames that occur, are
 # times or ids.

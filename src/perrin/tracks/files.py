@@ -23,18 +23,14 @@ if TYPE_CHECKING:
 
     from perrin._arrays import Bools, Floats, Ints
 
-
 _AXES = ("x", "y", "z")
-
 
 _GDF_NAMES = {
     4: ("x", "y", "frame", "particle"),
     5: ("x", "y", "z", "frame", "particle"),
 }
 
-
 _GDF_EXAMPLE = 'columns={"x": 0, "y": 1, "z": 2, "frame": -2, "particle": -1}'
-
 
 _PathLike: TypeAlias = str | os.PathLike[str]
 

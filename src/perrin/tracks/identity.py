@@ -49,23 +49,18 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike
 
-
 # A fit is noise-like up to this multiple of the usual mean square residual: chance does not reach
 # it in a frame of usual quality, and an exchanged pair (1000 times and more) is far above.
 _NOISE_LIKE = 16.0
-
 
 # Degrees of freedom of the Student law of a frame's misfit: the odds between two assignments of a
 # bad frame depend on the ratio of their misfits, not on their difference in units of usual noise.
 _STUDENT_FREEDOM = 8.0
 
-
 # Every assignment is tried for bodies of up to this number of particles.
 _MOST_PERMUTED = 6
 
-
 _MOST_MODEL_ROWS = 300  # rows from which the shape is averaged
-
 
 # Log-odds: an assignment is settled when the next best is a hundred times less likely, and lasting
 # labels are trusted e^18 times more than an exchange of them. Right labels are then doubted when
@@ -73,26 +68,20 @@ _MOST_MODEL_ROWS = 300  # rows from which the shape is averaged
 # of the tracks of 300 frames of a tetrahedron (likelihood ratios exceed c with probability 1/c).
 _SETTLED_LOG_ODDS, _LABEL_LOG_ODDS = float(np.log(100.0)), 18.0
 
-
 # A least turn of over this many standard deviations of an axis (squared) widens the law of the step
 # to itself. Lasting labels that turn the body 75 degrees are kept against an exchange that leaves
 # 45 (a tetrahedron), and replaced where the exchange leaves a third or less of the turn.
 _LEAP_UNLABELLED, _LEAP_LABELLED = 16.0, 4.0
 
-
 # A step of under 0.4 of the least angle between two assignments cannot be mistaken.
 _SHORT_STEP = 0.4
 
-
 _BATCH_FITS = 100_000  # rigid fits at a time: bounds the memory
-
 
 # A column with points in this share of the rows is a particle.
 _LASTING_SHARE = 0.05
 
-
 _ROUNDING_ANGLE = 1e-6  # rotations by less than this, rad, are rounding errors
-
 
 # A fit of a large body this close (of the least particle distance) is right, and ends a search that
 # begins at one in this number of the covering rotations.

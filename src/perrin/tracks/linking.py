@@ -15,23 +15,18 @@ if TYPE_CHECKING:
 
     from perrin._arrays import Floats, Ints
 
-
 # A centre is searched for within six standard deviations (squared: the gate), for this number of
 # frames after it was lost.
 _GATE, _FRAMES_REMEMBERED = 36.0, 10
 
-
 # Log-odds: a link is certain when the best assignment without it is a hundred times less likely.
 _CERTAIN_LOG_ODDS = float(np.log(100.0))
-
 
 # A centre of the particles found is off by up to this share of the contact distance for each one
 # missing over each one found.
 _OFF_PER_MISSING = 0.6
 
-
 _FEWEST_FRAMES = 3  # of a track that is kept
-
 
 _NO_LINK = 1e6  # the cost of a link that is excluded
 

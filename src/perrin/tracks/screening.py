@@ -16,10 +16,8 @@ if TYPE_CHECKING:
     import pandas as pd
     from numpy.typing import ArrayLike
 
-
 # Columns that trackpy writes in addition to its coordinates, which are in pixels.
 TRACKPY_COLUMNS = ("mass", "size", "ecc", "signal", "raw_mass", "ep")
-
 
 CENTRE_REMOVED = (
     "the centre does not move: no D_T (the mean of the particles' coordinates is the same in every "
@@ -27,51 +25,40 @@ CENTRE_REMOVED = (
     "subtracted)"
 )
 
-
 # Colloidal particles are between these distances apart, um.
 _LEAST_DISTANCE, _MOST_DISTANCE = 0.05, 50.0
 
-
 # Expected number of coincidences, and probability, below which coincidences are no accident.
 _COINCIDENCE_LEVEL = 1e-3
-
 
 # A placeholder is entered and left by steps of over 5 times the particle's median step, which a
 # Brownian step in three dimensions exceeds with a probability of 1e-12; one point is a placeholder
 # if that happens in 3 rows, the origin in one.
 _PLACEHOLDER_STEP, _PLACEHOLDER_ROWS = 5.0, 3
 
-
 # A particle needs this number of steps before its repeats are judged; from steps up to this number
 # of rows from a repeat follows how often a coordinate stays the same by rounding alone.
 _FEWEST_MOVES, _ROWS_AROUND = 8, 5
-
 
 # A tenth of the steps of a moving particle are shorter than 0.13 of their standard deviation on an
 # axis; the step that follows a repeat is usually over 5 times as long on one of the axes.
 _SMALL_STEP_QUANTILE, _MOVING_STEP = 0.1, 5.0
 
-
 # A repeat by rounding has to be exceeded by this factor.
 _REPEAT_EXCESS = 3.0
 
-
 # A coordinate farther from every other particle than this number of body sizes is no measurement.
 _FAR_SIZES = 20.0
-
 
 # Particles move if they spread over this number of rounding errors; a centre that varies by less
 # than this share of the spread was removed, whatever the rounding.
 _MOVING_SPREAD, _STILL_SHARE = 10.0, 1e-6
 
-
 # Values lie on a lattice if their differences are multiples of one step to the first share of it; a
 # ratio of two steps is whole to the second.
 _LATTICE_TOLERANCE, _WHOLE_TOLERANCE = 1e-3, 0.02
 
-
 _POINTS_SHOWN = 3  # placeholders that a warning names
-
 
 _DISTANCE_FRAMES = 60  # in which the nearest particles are searched for
 
