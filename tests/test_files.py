@@ -662,12 +662,12 @@ def test_spellings_that_differ_in_case_blanks_or_unit_are_read(tmp_path, names):
 
 
 def test_exact_names_win_and_the_others_are_noted():
-    """Beside a column with our name none of another spelling is read, and that is stated."""
+    """Where a column has our name, none of another spelling is read, and a note states that."""
     table = tracks().assign(X=7.0, **{"y (um)": 8.0})
     back = check_tracks(table, source="the table")
     pd.testing.assert_frame_equal(back, tracks())
     assert back.attrs["notes"] == [
-        "columns left out beside others with exactly our names: 'X', 'y (um)'"
+        "columns left out, because others have exactly our names: 'X', 'y (um)'"
     ]
 
 

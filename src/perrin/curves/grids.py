@@ -60,7 +60,7 @@ class Frames:
 
     @property
     def blocks(self) -> list[slice]:
-        """Elements of each block."""
+        """Slice of the frames that belong to each block."""
         edges = np.flatnonzero(np.diff(self.block, prepend=-1, append=self.block[-1] + 1))
         return [slice(int(a), int(b)) for a, b in pairwise(edges)]
 
@@ -95,7 +95,7 @@ def place_frames(time: Floats, piece: Ints, here: Bools, *, dt: float) -> Frames
     piece : ndarray of int, shape (T,)
         Piece of each row; no pair of frames joins two of them.
     here : ndarray of bool, shape (T,)
-        Which rows are used.
+        Whether each row is used.
     dt : float
         Time between frames, s.
 

@@ -339,6 +339,14 @@ def best_window(lags: GridLags) -> GridLags:
     Returns
     -------
     GridLags
+
+    Examples
+    --------
+    >>> from perrin import Cluster, simulate_motion
+    >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=300, rng=3)
+    >>> from perrin import msad
+    >>> best_window(GridLags.of(msad(truth)).longest_window()).size < 10
+    True
     """
     sizes = np.unique(np.rint(np.geomspace(2, lags.size, 200)).astype(np.int64))
     tried: list[int] = []
@@ -353,7 +361,7 @@ def best_window(lags: GridLags) -> GridLags:
             if variance > lowest:
                 break
             lowest, size = variance, int(m)
-    # Nothing distinguishes windows that alternate; the longest is least sensitive to the noise.
+    # Of windows that alternate the longest is least sensitive to the noise.
     return lags.take(slice(max(tried[tried.index(size) :])))
 
 
@@ -426,8 +434,18 @@ def gls_weights(lags: GridLags, *, D: float, s: float) -> Floats:
     Returns
     -------
     ndarray, shape (2, L)
+
+    Examples
+    --------
+    >>> from perrin import Cluster, simulate_motion
+    >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=300, rng=3)
+    >>> from perrin import msad
+    >>> lags = GridLags.of(msad(truth)).take(slice(4))
+    >>> weights = gls_weights(lags, D=3.5e-3, s=1e-3)
+    >>> bool(abs(weights[0] @ lags.steps - 1) < 1e-9)
+    True
     """
-    if D == s == 0:  # nothing moves: all weights are as good
+    if D == s == 0:  # without motion all weights are equally good
         return line_weights(lags.steps)
     design = np.stack([lags.steps, np.ones(lags.size)], axis=1)
     covariance = np.zeros((lags.size, lags.size))

@@ -1,4 +1,4 @@
-"""Which D and which noise explain noisy Brownian steps best: the likelihood and its maximum.
+"""The likelihood of noisy Brownian steps with one D, its maximum and its profile.
 
 Step i of a motion has variance 2 D tau + o_i + o_{i+1} and covariance -o_{i+1} with the next one,
 o = s - b D the noise variance s of a frame less what motion blur takes. s = weight theta + known:
@@ -369,7 +369,7 @@ def excess_scatter(tracks: Sequence[NoisySteps], D: float, theta: Floats) -> flo
     Parameters
     ----------
     tracks : sequence of NoisySteps
-        Of one quantity.
+        Steps of every motion, all of one quantity.
     D : float
     theta : ndarray, shape (G,)
         Noise of each motion, as the likelihood found it.
@@ -377,7 +377,7 @@ def excess_scatter(tracks: Sequence[NoisySteps], D: float, theta: Floats) -> flo
     Returns
     -------
     float
-        At least 1.
+        Ratio, at least 1.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""How fast a rod's direction and centre diffuse: the likelihood of their steps."""
+"""Diffusion coefficients of a rod's direction and centre from the likelihood of their steps."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ def estimate_rod(
     Returns
     -------
     DiffusionEstimate
-        With profile-likelihood intervals, the noise offset estimated along with D.
+        Estimate with profile-likelihood intervals; the noise offset is estimated along with D.
 
     Raises
     ------
     TooFewFramesError
-        Fewer than 3 frames in a row.
+        If there are fewer than 3 frames in a row.
     ValueError
-        For another quantity.
+        If the quantity is not one of these.
 
     Examples
     --------

@@ -247,8 +247,8 @@ class TridiagonalCovariance:
         d, lower, bad = dpttrf(a, b)
         up, _, bad_up = dpttrf(a[::-1], b[::-1])
         if bad or bad_up:
-            nothing = np.zeros(len(self.groups))
-            return GroupSlopes(nothing - np.inf, nothing + 1.0, nothing, nothing + 1.0, nothing)
+            zero = np.zeros(len(self.groups))
+            return GroupSlopes(zero - np.inf, zero + 1.0, zero, zero + 1.0, zero)
         z, _ = dpttrs(d, lower, self.y)
         inverse = 1 / (d + up[::-1] - a)
         corner = self.linked * np.append(-lower * inverse[1:], 0.0)

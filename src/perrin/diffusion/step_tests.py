@@ -388,11 +388,11 @@ class StepResiduals(NamedTuple):
     Attributes
     ----------
     step : ndarray, shape (S, A)
-        Each step less its prediction from all others.
+        Standardised difference of each step from its prediction from all others.
     length : ndarray, shape (S, A)
-        The steps themselves, over their standard deviation.
+        Each step over its standard deviation.
     frame : ndarray, shape (S - 1, A)
-        Displacement of the frame between two steps from its prediction.
+        Standardised displacement of the frame between two steps from its prediction.
     linked : ndarray of bool, shape (S - 1,)
         Whether the two steps share that frame.
     measured_badly : ndarray of bool, shape (S - 1,)
@@ -412,6 +412,16 @@ def leave_one_out_residuals(
     """Return the residual of each step given all others but those `without`, standardised.
 
     An estimate with drift was fitted without them as well.
+
+    Examples
+    --------
+    >>> from perrin import Cluster, simulate_motion
+    >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=300, rng=3)
+    >>> from perrin import estimate_diffusion
+    >>> none = np.zeros(299, dtype=bool)
+    >>> residuals = leave_one_out_residuals(truth, estimate_diffusion(truth), without=none)
+    >>> bool(abs(residuals.step.std() - 1) < 0.1)
+    True
     """
     from scipy.linalg.lapack import dpttrf, dpttrs
 
@@ -420,7 +430,7 @@ def leave_one_out_residuals(
     y, linked = s.vectors, s.linked[:-1]
     if estimate.drift is not None and without.any():
         y = s.without_steady_motion(kept=~without)[0].vectors
-    diagonal, beside = covariance_bands(
+    diagonal, off_diagonal = covariance_bands(
         estimate.value,
         _theta(track, estimate),
         s.duration[:, None],
@@ -432,7 +442,7 @@ def leave_one_out_residuals(
     step, frame = np.empty_like(y), np.zeros((len(y) - 1, y.shape[1]))
     for axis in range(y.shape[1]):
         extra = _LEFT_OUT * diagonal[:, axis] * without
-        a, b = diagonal[:, axis] + extra, beside[:, axis]
+        a, b = diagonal[:, axis] + extra, off_diagonal[:, axis]
         d, lower, bad = dpttrf(a, b)
         up, _, bad_up = dpttrf(a[::-1], b[::-1])
         if bad or bad_up:

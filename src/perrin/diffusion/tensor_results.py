@@ -190,7 +190,7 @@ class DiffusionTensor:
         return f"the axes cannot be distinguished: read {mean}, not the three sorted values"
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the tensor as JSON holds it; unknown errors are None."""
+        """Return the tensor for JSON; unknown errors are None."""
         plain: dict[str, Any] = to_plain({f.name: getattr(self, f.name) for f in fields(self)})
         return plain
 
@@ -245,7 +245,7 @@ class CoupledTensor:
         return self.tensor[:3, 3:]
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the tensor as JSON holds it; unknown errors are None."""
+        """Return the tensor for JSON; unknown errors are None."""
         plain: dict[str, Any] = to_plain({f.name: getattr(self, f.name) for f in fields(self)})
         return plain
 

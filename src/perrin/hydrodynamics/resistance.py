@@ -123,7 +123,7 @@ def solve_resistance(centers: Floats, radii: Floats, *, degree: int) -> Resistan
     radii : ndarray, shape (n,)
         Spheres may touch or overlap.
     degree : int
-        At least 1.
+        Highest degree of the harmonics, at least 1.
 
     Returns
     -------
@@ -149,7 +149,7 @@ def converge_resistance(centers: Floats, radii: Floats, *, accuracy: float) -> R
     centers, radii
         As in `solve_resistance`.
     accuracy : float
-        Relative.
+        Required relative error of the resistance.
 
     Returns
     -------
@@ -164,6 +164,12 @@ def converge_resistance(centers: Floats, radii: Floats, *, accuracy: float) -> R
     -----
     PrecisionWarning
         If `accuracy` is not reached at the largest number of unknowns.
+
+    Examples
+    --------
+    >>> found = converge_resistance(np.zeros((1, 3)), np.ones(1), accuracy=1e-6)
+    >>> bool(abs(found.matrix[0, 0] / (6 * np.pi) - 1) < 1e-6)  # Stokes
+    True
     """
     lowest = _DEGREES[0]
     most = _MOST_UNKNOWNS // _unknowns(lowest)
@@ -375,7 +381,7 @@ def solid_harmonics(x: Floats, degree: int) -> NDArray[np.complex128]:
     Returns
     -------
     ndarray, shape (degree + 1, degree + 1, P)
-        Of degree n and order m; zero for m > n.
+        The harmonic of degree n and order m; zero for m > n.
 
     Examples
     --------

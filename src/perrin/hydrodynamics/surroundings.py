@@ -88,7 +88,7 @@ def wall_factor(body: Mobility | float, *, height: float) -> WallFactor:
     body : Mobility or float
         A cluster, averaged over its orientations, or the diameter of a sphere, um.
     height : float
-        Height of its centre above the wall, um; at least 2.5 hydrodynamic radii.
+        Height of the body's centre above the wall, um; at least 2.5 hydrodynamic radii.
 
     Returns
     -------
@@ -147,7 +147,7 @@ def wall_diffusion(
     ----------
     body : Mobility
     height : float
-        Height of its centre above the wall, um.
+        Height of the body's centre above the wall, um.
     normal : {"x", "y", "z"}
         Lab axis perpendicular to the wall.
 
@@ -192,7 +192,7 @@ def gravitational_height(body: Mobility, *, density_difference: float) -> float:
     Returns
     -------
     float
-        um; inf for matched densities.
+        Height, um; inf for matched densities.
 
     Raises
     ------
@@ -224,7 +224,7 @@ def settling_velocity(body: Mobility, *, density_difference: float) -> float:
     Returns
     -------
     float
-        um/s, negative if the cluster rises: D_T (F - buoyancy)/kT.
+        Velocity D_T (F - buoyancy)/kT, um/s; negative if the cluster rises.
 
     Raises
     ------
@@ -255,7 +255,7 @@ def water_viscosity(temperature: float) -> float:
     Returns
     -------
     float
-        Pa s.
+        Viscosity, Pa s.
 
     Raises
     ------

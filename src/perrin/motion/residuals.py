@@ -44,6 +44,22 @@ _JUMP_SPEED = 6.0
 _LEVI_CIVITA = -skew(np.eye(3))
 
 
+def median_chi2(freedom: float) -> float:
+    """Return the median of chi squared (Wilson and Hilferty, 1931; within 3 % from 1 on).
+
+    Parameters
+    ----------
+    freedom : float
+        Degrees of freedom.
+
+    Examples
+    --------
+    >>> round(median_chi2(3.0), 2)  # exact: 2.37
+    2.38
+    """
+    return freedom * (1 - 2 / (9 * freedom)) ** 3
+
+
 @dataclass(frozen=True, eq=False)
 class Residuals:
     """Residual vectors of the complete frames of one body, in body axes.
@@ -82,14 +98,13 @@ class Residuals:
     def median_sigma(self) -> float:
         """Localisation error of one coordinate (um) from the median frame; NaN where unknown.
 
-        A few bad frames hardly change it. The median of chi-squared with f degrees of freedom is
-        f (1 - 2/(9 f))^3 (Wilson and Hilferty).
+        A few bad frames hardly change it.
         """
         freedom, count = self.freedom, len(self.vector)
         if count < 2 or freedom == 0:
             return np.nan
         square = float(np.median((self.vector**2).sum(axis=(1, 2)))) * count / (count - 1)
-        return float(np.sqrt(square / (freedom * (1 - 2 / (9 * freedom)) ** 3)))
+        return float(np.sqrt(square / median_chi2(freedom)))
 
     def left_of(self, displacement: Floats) -> Floats:
         """Return what a rigid fit leaves of displacements (K, n, d), less their mean shape."""
@@ -104,7 +119,17 @@ class Residuals:
 
 
 class Slope(NamedTuple):
-    """A regression coefficient of the residuals, its standard error and degrees of freedom."""
+    """A regression coefficient of the residuals.
+
+    Attributes
+    ----------
+    value : float
+        Coefficient; NaN where it is not determined.
+    stderr : float
+        Standard error of the coefficient.
+    freedom : float
+        Degrees of freedom of the standard error.
+    """
 
     value: float
     stderr: float
@@ -208,7 +233,7 @@ def autocorrelation(sums: Floats, freedom: float) -> Floats:
     Returns
     -------
     ndarray, shape (M,)
-        At the lags 1, ..., M.
+        Autocorrelation at the lags 1, ..., M.
 
     Examples
     --------
@@ -236,7 +261,7 @@ def lag_one_autocorrelation(residuals: Floats) -> Slope:
     Parameters
     ----------
     residuals : ndarray, shape (T, n, d)
-        Body axes, NaN where missing; gaps are not bridged.
+        Residuals in body axes, NaN where missing; gaps are not bridged.
 
     Examples
     --------
@@ -341,7 +366,15 @@ def regress(
 
 
 class AxisNoise(NamedTuple):
-    """Variance of the localisation error along each lab axis, um^2, and its covariance."""
+    """Variance of the localisation error along each lab axis.
+
+    Attributes
+    ----------
+    variance : ndarray, shape (d,)
+        Variance along each lab axis, um^2.
+    covariance : ndarray, shape (d, d)
+        Covariance of these variances, um^4.
+    """
 
     variance: Floats
     covariance: Floats
@@ -367,7 +400,7 @@ class AxisNoise(NamedTuple):
 
 
 def axis_noise(sample: Residuals) -> AxisNoise | None:
-    """Measure the localisation error of each lab axis; None where the residuals leave it open.
+    """Measure the localisation error of each lab axis; None where it is not determined.
 
     The squares of a frame's residuals along the lab axes are a linear function of the variances
     through the projector of the fit. The covariance is that of the measured squares, widened by
@@ -413,7 +446,17 @@ def axis_noise(sample: Residuals) -> AxisNoise | None:
 
 
 class Stretch(NamedTuple):
-    """Scale of z, the residuals of the body with z corrected, and its motion."""
+    """Scale of z against x and y, and the fit with z corrected.
+
+    Attributes
+    ----------
+    scale : Slope
+        Scale of z (1: not stretched).
+    sample : Residuals
+        Residuals of the body with z corrected.
+    motion : RigidMotion
+        Motion of the body with z corrected.
+    """
 
     scale: Slope
     sample: Residuals
@@ -545,7 +588,7 @@ def measure_scan(sample: Residuals) -> Slope:
     Returns
     -------
     Slope
-        1/v with its sign; NaN in the plane and for a body at rest.
+        Delay 1/v with its sign; NaN in the plane and for a body at rest.
 
     Examples
     --------

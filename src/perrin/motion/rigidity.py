@@ -185,7 +185,7 @@ def judge_quality(
     detections: ArrayLike | None = None,
     unsettled: ArrayLike = (),
 ) -> Quality:
-    """Judge a cluster's rigid fits.
+    """Test whether a cluster is rigid, and measure the errors of its positions.
 
     Parameters
     ----------
@@ -212,7 +212,7 @@ def judge_quality(
     Raises
     ------
     ValueError
-        For bad shapes or values.
+        If a shape or value is not valid.
 
     Examples
     --------

@@ -127,7 +127,7 @@ def add_noise(positions: ArrayLike, *, sigma: ArrayLike, rng: np.random.Generato
     Parameters
     ----------
     positions : array_like, shape (T, n, d)
-        um.
+        Particle positions, um.
     sigma : float or array_like, shape (d,)
         Standard deviation of one coordinate, um; one number or one per axis.
     rng : numpy.random.Generator or int
@@ -233,7 +233,7 @@ def heat_kernel_angles(D: float) -> tuple[Floats, Floats]:
     Returns
     -------
     angle : ndarray, shape (20001,)
-        rad.
+        Rotation angles, rad.
     cdf : ndarray, shape (20001,)
 
     Notes

@@ -91,7 +91,7 @@ def track_rotation(
     TooFewFramesError
         Fewer than 2 frames with a pose.
     ValueError
-        For bad shapes or values.
+        If a shape or value is not valid.
 
     Examples
     --------
@@ -144,7 +144,7 @@ def template_motion(x: Floats, *, time: Floats, dt: float) -> RigidMotion:
     x : ndarray, shape (T, n, d)
         Positions, um; every particle is present in some frame.
     time : ndarray, shape (T,)
-        s.
+        Time of each frame, s.
     dt : float
         Time between frames, s.
 
@@ -184,8 +184,8 @@ def remove_rotation(
     Returns
     -------
     positions : ndarray, shape (T, n, d)
-        In the axes of the first fitted frame, about the centre of the particles' mean positions,
-        um; NaN in frames without a pose.
+        Positions in the axes of the first fitted frame, about the centre of the particles' mean
+        positions, um; NaN in frames without a pose.
     motion : RigidMotion
         The motion that was removed.
 

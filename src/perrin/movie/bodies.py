@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from perrin.errors import DegenerateClusterError, NoSpheresError
-from perrin.tracks.clusters import REACH, identify
+from perrin.tracks.clusters import identify
 from perrin.tracks.files import check_tracks
-from perrin.tracks.linking import touching_groups
+from perrin.tracks.groups import TOUCHING_REACH, touching_groups
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -171,8 +171,8 @@ def most_common_size(together: Ints, *, dimension: int) -> tuple[int, list[str]]
     groups[:2] = 0
     if not groups.any():
         raise DegenerateClusterError(
-            f"no spheres touch: all {len(together)} found are over {REACH} contact distances "
-            "apart; correct contact or the voxel size"
+            f"no spheres touch: all {len(together)} found are over {TOUCHING_REACH} contact "
+            "distances apart; correct contact or the voxel size"
         )
     bodies = groups.copy()
     bodies[:dimension] = 0
@@ -232,7 +232,7 @@ def group_sizes(features: pd.DataFrame, *, contact: float, axes: list[str]) -> I
     out = np.zeros(len(features), dtype=np.int64)
     x = features[axes].to_numpy(dtype=np.float64)
     for rows in features.reset_index(drop=True).groupby("frame").indices.values():
-        label = touching_groups(x[rows], reach=REACH * contact, size=len(rows), smallest=1)
+        label = touching_groups(x[rows], reach=TOUCHING_REACH * contact, size=len(rows), smallest=1)
         out[rows] = np.bincount(label)[label]
     return out
 

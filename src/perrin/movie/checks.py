@@ -14,7 +14,7 @@ import numpy as np
 
 from perrin._text import listed
 from perrin.geometry.shapes import pair_distances
-from perrin.tracks.clusters import REACH
+from perrin.tracks.groups import TOUCHING_REACH
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -488,7 +488,7 @@ def mean_pair_distance(
         x, particle = rows[axes].to_numpy(dtype=np.float64), rows["particle"].to_numpy()
         first, second = np.triu_indices(len(x), 1)
         distance = pair_distances(x)
-        near = distance < REACH * contact
+        near = distance < TOUCHING_REACH * contact
         distances.append(distance[near])
         pairs.append(((int(cluster) * most + particle[first]) * most + particle[second])[near])
     every, pair = np.concatenate(distances), np.concatenate(pairs)
@@ -538,7 +538,8 @@ def missing_spheres(features: pd.DataFrame, *, size: int, contact: float, frames
         if absent:
             parts.append(f"none placed in {_frame_count(absent)}")
         parts += [
-            f"{n} found in {_frame_count(k)} (two clusters within {REACH * contact:.2g} um)"
+            f"{n} found in {_frame_count(k)} "
+            f"(two clusters within {TOUCHING_REACH * contact:.2g} um)"
             for n, k in crowd.value_counts().sort_index().items()
         ]
         if first > frames.min():

@@ -12,7 +12,7 @@ from perrin.movie.checks import bleaching
 from perrin.plot.imaging import imaging_of, least_turns
 from perrin.report.html import byline, captioned, inline_pictures, render_page
 from perrin.run.remarks import condensed
-from perrin.tracks.clusters import REACH
+from perrin.tracks.groups import TOUCHING_REACH
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -307,7 +307,7 @@ def rigid_body_facts(report: Report) -> list[Fact]:
     shapes = [c.motion.template for c in report.clusters]
     shapes += [rod.motion.places[:, None] for rod in report.rods]
     distance = np.concatenate([np.empty(0), *(pair_distances(shape) for shape in shapes)])
-    distance = distance[distance < REACH * contact]
+    distance = distance[distance < TOUCHING_REACH * contact]
     if distance.size:
         mean = float(distance.mean())
         off = f"{100 * (mean / contact - 1):+.2g} %".replace("-", "−")

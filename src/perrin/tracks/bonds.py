@@ -31,7 +31,7 @@ _NORMAL_RANGE = 2.563  # between these quantiles of a normal distribution, in st
 # A distance is constant where it varies by under a tenth of the distance to the nearest particle.
 _CONSTANT_SHARE = 0.1
 
-# Variations are slow where more than half of the variance lies between blocks of time. The
+# Variations are slow where more than half of the variance is between blocks of time. The
 # distance of two free particles then varies as their separation does along every axis; that of a
 # body by under a tenth of it (variance), or under 30 % of its slow part.
 _SLOW_SHARE, _TIED_SHARE, _SLOW_TIED_SHARE = 0.5, 0.1, 0.3
@@ -56,7 +56,7 @@ _WORST_AXIS_RATIO, _AXIS_STEPS, _AXIS_PRICE = 5.0, 12, 0.25
 
 
 class Pairs(NamedTuple):
-    """How the separations of pairs of particles vary; one entry per pair.
+    """Variances of the separations of pairs of particles, one entry per pair.
 
     Attributes
     ----------
@@ -73,7 +73,7 @@ class Pairs(NamedTuple):
     slow : ndarray
         Variance of the distance from the means of the blocks; equal to `variance` for white noise.
     free, free_slow : ndarray
-        The same of the separation along the axes, mean over the axes, um^2.
+        The same two variances for the separation along the axes, mean over the axes, um^2.
     direction : ndarray, shape (P, d)
         Mean squares of the components of the pair's direction.
     nearest : ndarray
@@ -129,7 +129,7 @@ class Pairs(NamedTuple):
     def share(self, slow: Floats, variance: Floats) -> Floats:
         """Return the share of a variance that lies between blocks of time."""
         between, total = slow * (self.blocks - 1), variance * (self.shared - 1)
-        # What does not change at all, to rounding, does not vary slowly.
+        # A separation that is constant to rounding does not vary slowly.
         still = total <= self.shared * (1e-12 * self.distance) ** 2
         return np.where(still, 0.0, between / np.where(still, 1.0, total))
 
@@ -284,7 +284,7 @@ def followed_pairs(frame: Ints, code: Ints, x: Floats, *, count: int) -> Pairs:
     Returns
     -------
     Pairs
-        Those that share frames.
+        Pairs that share frames.
 
     Examples
     --------
@@ -338,15 +338,15 @@ def _median_and_spread(pair: Ints, values: Floats, count: int) -> tuple[Floats, 
     ordered = values[np.lexsort((values, pair))]
     size = np.bincount(pair, minlength=count)
     start = np.cumsum(size) - size
-    at = []
+    quantiles = []
     for q in (_TAIL_QUANTILE, 0.5, 1 - _TAIL_QUANTILE):
         place = start + q * np.maximum(size - 1, 0)
         low = np.minimum(place.astype(np.int64), max(len(ordered) - 1, 0))
         high = np.minimum(low + 1, max(len(ordered) - 1, 0))
         low, high = (ordered[k] if len(ordered) else np.zeros(count) for k in (low, high))
         share = place % 1.0
-        at.append(np.where(share > 0, (1 - share) * low + share * high, low))
-    return at[1], (at[2] - at[0]) / _NORMAL_RANGE
+        quantiles.append(np.where(share > 0, (1 - share) * low + share * high, low))
+    return quantiles[1], (quantiles[2] - quantiles[0]) / _NORMAL_RANGE
 
 
 def _variances(

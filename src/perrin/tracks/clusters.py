@@ -36,8 +36,6 @@ if TYPE_CHECKING:
     import pandas as pd
     from numpy.typing import ArrayLike
 
-REACH = TOUCHING_REACH  # the former name
-
 # Frame numbers that span more than this, and more than this multiple of the frames that occur, are
 # times or ids.
 _LONGEST_SPAN, _SPARSEST_FRAMES = 1_000_000, 1000
@@ -179,7 +177,7 @@ def positions_table(positions: ArrayLike, *, frames: ArrayLike | None = None) ->
     Parameters
     ----------
     positions : array_like, shape (T, n, d)
-        um; points that are NaN have no row.
+        Positions, um; points that are NaN have no row.
     frames : array_like of int, shape (T,), optional
         Frame numbers; default 0, 1, 2, ...
 

@@ -123,7 +123,7 @@ def recognise_columns(
         notes.append(f"columns recognised: {pairs}")
     if left:
         notes.append(
-            f"columns left out beside others with exactly our names: {listed(map(repr, left))}"
+            f"columns left out, because others have exactly our names: {listed(map(repr, left))}"
         )
     if seconds(units) != 1:
         name, unit = units["time"]
@@ -153,7 +153,7 @@ def unit_faults(units: Mapping[str, tuple[str, str]], scale: Mapping[str, float]
     "scale: 'x (um)' is in um, but the scale is 0.1 um per unit"
     """
     stated = {axis: _UNIT_UM[units[axis][1]] for axis in scale if axis in units}
-    # 1 for all axes is the default; a pixel of 1 um beside other sizes is a statement.
+    # 1 for all axes is the default; together with other sizes a pixel of 1 um was stated.
     given = any(value != 1 for value in scale.values())
     unknown = [axis for axis, um in stated.items() if um is None and not given]
     wrong = [

@@ -174,7 +174,7 @@ def far_points(positions: ArrayLike) -> Bools:
     Parameters
     ----------
     positions : array_like, shape (T, n, d)
-        um, NaN where missing.
+        Positions, um, NaN where missing.
 
     Returns
     -------
@@ -357,7 +357,7 @@ def placeholder_rows(code: Ints, x: Floats) -> Bools:
     code : ndarray of int, shape (N,)
         Particle of each row, from 0; rows are sorted by particle and frame.
     x : ndarray, shape (N, d)
-        No NaN.
+        Coordinates without NaN.
 
     Returns
     -------
@@ -379,7 +379,7 @@ def placeholder_rows(code: Ints, x: Floats) -> Bools:
     # Unbroken stays of particles at one place, with the smaller of the steps there and away in
     # units of the particle's median step.
     first = np.flatnonzero(np.append(True, (np.diff(code) != 0) | (np.diff(place) != 0)))
-    particle, at = code[first], place[first]
+    particle, stay_place = code[first], place[first]
     step = np.linalg.norm(np.diff(x[first], axis=0), axis=1)
     same = np.diff(particle) == 0
     particles = int(code.max()) + 1
@@ -391,13 +391,13 @@ def placeholder_rows(code: Ints, x: Floats) -> Bools:
     leap /= usual[particle]
     count = int(place.max()) + 1
     rows = np.bincount(place, minlength=count)
-    known = np.bincount(at, weights=np.isfinite(leap), minlength=count)
-    leaps = np.bincount(at, weights=leap > _PLACEHOLDER_STEP, minlength=count)
+    known = np.bincount(stay_place, weights=np.isfinite(leap), minlength=count)
+    leaps = np.bincount(stay_place, weights=leap > _PLACEHOLDER_STEP, minlength=count)
     origin = np.zeros(count, dtype=np.bool_)
     origin[place] = (x == 0).all(axis=1)
-    brisk = 2 * np.bincount(at, weights=leap >= 1, minlength=count) > known
+    brisk = 2 * np.bincount(stay_place, weights=leap >= 1, minlength=count) > known
     reached = ((rows >= _PLACEHOLDER_ROWS) | origin) & (2 * leaps > known)
-    often = _revisited_places(code, x, particle, at, origin)
+    often = _revisited_places(code, x, particle, stay_place, origin)
     reached[often] |= brisk[often]
     marked: Bools = reached[place]
     return marked
@@ -435,7 +435,7 @@ def repeated_rows(code: Ints, x: Floats) -> Bools:
     code : ndarray of int, shape (N,)
         Particle of each row, from 0; rows are sorted by particle and frame.
     x : ndarray, shape (N, d)
-        No NaN.
+        Coordinates without NaN.
 
     Returns
     -------

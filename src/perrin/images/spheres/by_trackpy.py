@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from perrin.tracks.clusters import REACH
+from perrin.tracks.groups import TOUCHING_REACH
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -162,7 +162,7 @@ def refine_by_trackpy(
             table,
             _OneFrame(frame),
             tuple(int(m) for m in mask),
-            separation=tuple(REACH * contact / step),
+            separation=tuple(TOUCHING_REACH * contact / step),
             fit_function="disc",
             param_val={
                 "disc_size": _FLAT_FRACTION,

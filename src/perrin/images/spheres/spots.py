@@ -11,8 +11,7 @@ import numpy as np
 from perrin._arrays import choice_fault, number_fault, refuse, to_plain
 from perrin.errors import PrecisionWarning
 from perrin.geometry.shapes import pair_distances
-from perrin.tracks.clusters import REACH
-from perrin.tracks.linking import touching_groups
+from perrin.tracks.groups import TOUCHING_REACH, touching_groups
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -164,7 +163,9 @@ def mass_cut(mass: Floats) -> float:
     return float(np.sqrt(ordered[k] * ordered[k + 1]))
 
 
-def touching_together(centers: Floats, *, contact: float, reach: float = REACH) -> list[Ints]:
+def touching_together(
+    centers: Floats, *, contact: float, reach: float = TOUCHING_REACH
+) -> list[Ints]:
     """Return the spheres of one frame as groups: chains of touching spheres.
 
     Parameters
@@ -252,7 +253,7 @@ def at_contact(centers: Floats, *, contact: float) -> Floats:
     array([0.05, 1.05])
     """
     distance = pair_distances(centers)
-    near = distance[distance < REACH * contact]
+    near = distance[distance < TOUCHING_REACH * contact]
     scale = min(contact / near.mean(), 1.0) if near.size else 1.0
     middle = centers.mean(axis=0)
     return np.asarray(middle + scale * (centers - middle))
