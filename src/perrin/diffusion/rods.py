@@ -52,7 +52,7 @@ def estimate_rod(
     steps = direction_steps(motion) if quantity == "direction" else center_steps(motion)
     if len(steps.duration) < 2:
         raise TooFewFramesError(
-            f"{motion.fitted.size} frames show the rod in too few steps: at least 3 in a row "
+            f"{motion.fitted.size} frames contain the rod in too few steps: at least 3 in a row "
             "(gaps allowed) are needed to separate diffusion from noise",
             int(motion.fitted.size),
         )

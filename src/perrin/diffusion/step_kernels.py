@@ -33,7 +33,17 @@ def difference_eigenvalues(n_steps: int) -> Floats:
 
 
 class GroupSlopes(NamedTuple):
-    """The log-likelihood of every motion and its slopes, each as a rise less a fall, (G,) each."""
+    """The log-likelihood of every motion and its slopes, each slope as a rise less a fall.
+
+    Attributes
+    ----------
+    value : ndarray, shape (G,)
+        Log-likelihood of each motion.
+    rise_D, fall_D : ndarray, shape (G,)
+        Positive and negative part of the slope in D.
+    rise, fall : ndarray, shape (G,)
+        Positive and negative part of the slope in theta.
+    """
 
     value: Floats
     rise_D: Floats
@@ -105,7 +115,7 @@ class SineModes:
 
     @classmethod
     def of(cls, tracks: Sequence[NoisySteps], groups: Sequence[int]) -> SineModes:
-        """Transform the steps of these motions, which bear these numbers."""
+        """Transform the steps of these motions, which have these numbers."""
         from scipy.fft import dst
 
         rows = []
@@ -196,7 +206,7 @@ class TridiagonalCovariance:
 
     @classmethod
     def of(cls, tracks: Sequence[NoisySteps], groups: Sequence[int]) -> TridiagonalCovariance:
-        """Stack the steps of these motions, which bear these numbers."""
+        """Stack the steps of these motions, which have these numbers."""
         blocks = [
             (i, axes)
             for i, track in enumerate(tracks)

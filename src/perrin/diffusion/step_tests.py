@@ -85,7 +85,7 @@ class Jumps:
         return np.asarray(np.linalg.norm(self.size, axis=1))
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the jumps as JSON holds them."""
+        """Return the jumps for JSON."""
         plain: dict[str, Any] = to_plain({f.name: getattr(self, f.name) for f in fields(self)})
         return plain
 
@@ -99,7 +99,7 @@ class Jumps:
 
 @dataclass(frozen=True)
 class SteadyMotion:
-    """A mean velocity or spin with the test of whether there is one.
+    """A mean velocity or spin, and the test against a body without one.
 
     Attributes
     ----------
@@ -116,7 +116,7 @@ class SteadyMotion:
     p: float
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the motion and its test as JSON holds them."""
+        """Return the motion and its test for JSON."""
         plain: dict[str, Any] = to_plain(asdict(self))
         return plain
 
@@ -197,8 +197,8 @@ def find_jumps(motion: RigidMotion, estimate: DiffusionEstimate) -> Jumps:
     residuals = leave_one_out_residuals(motion, without_jumps, without=likely).step
     z, others = residuals[likely], residuals[~likely]
     count, d = others.shape
-    # Of a body at rest the residuals are a slow wave, of which one track shows few periods: M may
-    # then be small by chance, but not smaller than 1, its value where the fit is right.
+    # The residuals of a body at rest are a slow wave, of which one track has few periods: M may
+    # then be small by chance. It is not taken smaller than 1, its value where the fit is right.
     square = np.sum((z @ _inverse_root(others.T @ others / count, least=1.0)) ** 2, axis=1)
     freedom = count - d + 1  # of Hotelling's T^2
     p = fdtrc(d, freedom, square * freedom / (d * count))
@@ -229,7 +229,7 @@ def without_spin(motion: RigidMotion, spin: Sequence[float]) -> RigidMotion:
     ----------
     motion : RigidMotion
     spin : sequence of float
-        rad/s about x, y, z; in the plane one number.
+        Angular velocity about x, y, z, rad/s; in the plane one number.
 
     Examples
     --------
@@ -258,9 +258,10 @@ def steady_motion(motion: RigidMotion, estimate: DiffusionEstimate) -> SteadyMot
 
     Notes
     -----
-    Generalised least squares of the steps on X_k = Q_k^T tau_k (Q_k the rotation to the lab; the
-    identity for the centre) with the covariance of diffusion and noise fitted together with it; the
-    information over d is F(d, nu) with nu = 2 / (relative variance of D).
+    The steady motion is found by generalised least squares of the steps on X_k = Q_k^T tau_k (Q_k
+    the rotation to the lab; the identity for the centre) with the covariance of diffusion and noise
+    fitted together with it. The information over d is F(d, nu) with nu = 2 / (relative variance of
+    D).
 
     Examples
     --------

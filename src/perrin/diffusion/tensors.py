@@ -240,7 +240,7 @@ def coupled_tensor(
 
 
 def axes_like(axes: Floats, reference: Floats) -> Ints:
-    """Return the order of the columns of `axes` in which each lies nearest to the reference's.
+    """Return the order of the columns of `axes` in which each is nearest to the reference's.
 
     It numbers axes that are sorted by their own values like those of another tensor of the same
     body: "axis 1" is then the same axis of the body.

@@ -46,7 +46,7 @@ class RigidMotion:
         Number of the track piece that the frame belongs to. Within a piece the identity of the
         particles is certain; no pair of frames is formed across two pieces.
     reason : tuple of str, length T
-        Why a frame has no pose; empty where it has one.
+        Reason why a frame has no pose; empty where it has one.
     template : ndarray, shape (n, d)
         Particles of the common shape, um, their centre at the origin.
     sigma : float

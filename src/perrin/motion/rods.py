@@ -47,6 +47,7 @@ _EQUAL_ENDS = 0.05
 _MEDIAN_2 = 2 * float(np.log(2.0))  # median of chi squared with 2 degrees of freedom
 
 _COLUMNS = ("residual", "n_present", "variance", "center_variance", "piece")
+_INTEGER_FIELDS = ("n_present", "piece", "swaps")
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +78,7 @@ class RodMotion:
     swaps : ndarray of int
         Frames (rows) from which on the labels of the two ends were exchanged; they are corrected.
     reason : tuple of str, length T
-        Why a frame has no direction; empty where it has one.
+        Reason why a frame has no direction; empty where it has one.
     places : ndarray, shape (n,)
         Positions of the particles along the axis, um, mean 0.
     sigma : float
@@ -161,8 +162,10 @@ class RodMotion:
         missing |= {"time", "reason", *vectors, *_COLUMNS} - set(table)
         if missing:
             raise ValueError(f"this table was not made by to_frame: it lacks {sorted(missing)}")
-        whole = {"n_present", "piece"}
-        numbers = {c: table[c].to_numpy(np.int64 if c in whole else np.float64) for c in _COLUMNS}
+        numbers = {
+            name: table[name].to_numpy(np.int64 if name in _INTEGER_FIELDS else np.float64)
+            for name in _COLUMNS
+        }
         return cls(
             time=table["time"].to_numpy(np.float64),
             center=table[["x", "y", "z"]].to_numpy(np.float64),
@@ -193,9 +196,8 @@ class RodMotion:
         >>> RodMotion.from_dict(track_direction(ends, dt=0.5, sigma=0.03).to_dict()).fitted
         array([0, 1])
         """
-        whole = {"n_present", "piece", "swaps"}
         arrays = {
-            name: from_plain(value, dtype=np.int64 if name in whole else np.float64)
+            name: from_plain(value, dtype=np.int64 if name in _INTEGER_FIELDS else np.float64)
             for name, value in entry.items()
             if name not in ("reason", "sigma", "dt")
         }
@@ -236,7 +238,7 @@ def track_direction(
     DegenerateClusterError
         If the particles do not lie on one line within the noise, or are all in one place.
     TooFewFramesError
-        Fewer than 2 frames with 2 particles.
+        If there are fewer than 2 frames with 2 particles.
     ValueError
         If a shape or value is not valid.
 
@@ -261,7 +263,9 @@ def track_direction(
     seen = present(x)
     rows = np.flatnonzero(seen.sum(axis=1) >= 2)
     if rows.size < 2:
-        raise TooFewFramesError(f"{rows.size} frames show two particles: 2 are needed", rows.size)
+        raise TooFewFramesError(
+            f"{rows.size} frames contain two particles: 2 are needed", rows.size
+        )
     places, direction = _common_axis(x[rows], seen[rows])
     sign, row_piece, swaps = _end_labels(direction, places, time[rows], labelled=labelled)
     direction = direction * sign[:, None]

@@ -69,8 +69,8 @@ def simulate_motion(
     Raises
     ------
     ValueError
-        For bad values, a tensor that is not positive semidefinite, a tensor with "euler", or
-        coefficients given with a `Mobility`.
+        If a value is out of range, a tensor is not positive semidefinite or is given with "euler",
+        or coefficients are given with a `Mobility`.
 
     Examples
     --------

@@ -139,7 +139,7 @@ def unit_faults(units: Mapping[str, tuple[str, str]], scale: Mapping[str, float]
     units : mapping
         As in `Spelling`.
     scale : mapping of str to float
-        um per unit of the coordinates, of every axis.
+        Micrometres per unit of the coordinates, for every axis.
 
     Returns
     -------

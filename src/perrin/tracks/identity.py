@@ -850,9 +850,9 @@ class Candidates(NamedTuple):
         rotation, misfit = np.zeros((count, width, d, d)), np.full((count, width), np.inf)
         rows, listed = np.nonzero((assignment >= 0).any(axis=2))
         for part in _batches(rows.size, 1):
-            at = rows[part], listed[part]
-            points = assigned_points(detections.x[at[0]], assignment[at][:, None])[:, 0]
-            rotation[at], misfit[at] = rigid_fits(points, body.template)
+            entry = rows[part], listed[part]
+            points = assigned_points(detections.x[entry[0]], assignment[entry][:, None])[:, 0]
+            rotation[entry], misfit[entry] = rigid_fits(points, body.template)
         used = (assignment >= 0).sum(axis=2)
         cost = body.misfit_cost(misfit, used, detections.shown)
         return cls(assignment, rotation, cost, misfit <= body.misfit_limit(used), given)
@@ -914,7 +914,7 @@ class Candidates(NamedTuple):
         turns = np.full(misfit.shape, np.inf)
         for pose in poses:
             square = squared_angle(pose.rotation, self.rotation[row])
-            # The law of small steps does not hold for a leap: its own size counts.
+            # A leap does not follow the law of small steps: its own size is its variance.
             least = float(square[np.isfinite(misfit)].min())
             wide = max(pose.variance, least / (LEAP_LABELLED if labelled else LEAP_UNLABELLED))
             turns = np.minimum(turns, square / (2 * wide))
@@ -924,8 +924,9 @@ class Candidates(NamedTuple):
 def candidate_assignments(detections: Detections, body: BodyModel, *, labelled: bool) -> Candidates:
     """List the candidates of every row: the noise-like assignments and the labels as given.
 
-    A row in which nothing is noise-like still shows how far the body has turned. Its candidates
-    are the labels as given and the assignments that the symmetries of the body make of them.
+    A row without a noise-like assignment still determines how far the body has turned. Its
+    candidates are the labels as given, and the assignments that the symmetries of the body make of
+    them.
 
     Parameters
     ----------
@@ -1116,7 +1117,7 @@ def labels_in_time(order: Ints) -> Ints:
     Returns
     -------
     ndarray of int, shape (T, m)
-        -1 before the first row in which a column is a particle.
+        Particle of each column; -1 before the first row in which it is one.
 
     Examples
     --------
@@ -1162,7 +1163,8 @@ def most_likely_path(
     detections : Detections
     body : BodyModel
     candidates : Candidates
-        With labels, the assignment of the row before is added where it is missing.
+        Candidates of every row; with labels, the assignment of the row before is added where it is
+        missing.
     time : ndarray, shape (T,)
     rows : ndarray of int, shape (K,)
         Rows that have candidates.
@@ -1227,7 +1229,7 @@ def most_likely_path(
         if labelled:
             cost += LABEL_LOG_ODDS * _contradict(label, order, shown)
         best = int(np.argmin(cost))
-        # Two candidates that agree on every particle both of them place are in no conflict.
+        # Two candidates that agree on every particle that both of them place do not conflict.
         near = order[cost <= cost[best] + SETTLED_LOG_ODDS]
         rivals = len(near) > 1 and _relabel(_passed_on(nowhere, order[best]), near).any()
         choice.append(best)
