@@ -563,7 +563,7 @@ def test_covariances_take_gaps_partial_frames_and_low_signal(noise, gapped):
 
 @pytest.mark.parametrize("noise", ["joint", "residual"])
 def test_mean_cosines_are_exact_at_any_step(noise, repeats):
-    """At D_R dt = 0.5 likelihood is 10 % too low (heat kernel: 0.9015), the mean cosine is right."""
+    """At D_R dt = 0.5 likelihood is 10 % low (heat kernel: 0.9015), the mean cosine is right."""
     tracks = []
     for seed in range(repeats(16, 30)):
         m = simulate_motion(TETRAHEDRON, D_R=0.5, dt=1.0, n_frames=400, rng=seed)

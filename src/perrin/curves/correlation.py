@@ -89,7 +89,7 @@ def quaternion_covariance(
     Parameters
     ----------
     motion : RigidMotion
-        In three dimensions; frames without a pose are left out.
+        Motion in three dimensions; frames without a pose are left out.
     n_lags : int, optional
         Number of lags, counted from one step between frames; default all.
 
@@ -150,9 +150,9 @@ def orientation_correlation(
     Returns
     -------
     LagCurve
-        Dimensionless; decays as exp(-l (l + 1) D_R t). ``stderr`` is NaN: the curve is for display,
-        the steps give D_R with a far smaller error. ``dof`` is l (l + 1) / 2, half the rate over
-        D_R.
+        Dimensionless curve that decays as exp(-l (l + 1) D_R t). ``stderr`` is NaN: the curve is
+        for display, the steps give D_R with a far smaller error. ``dof`` is l (l + 1) / 2, half the
+        rate over D_R.
 
     Raises
     ------

@@ -23,7 +23,11 @@ _RESOLVED_FLOORS = 10.0
 
 @dataclass(frozen=True)
 class Found:
-    """A value with its intervals, offset and drift, before the signal-to-noise ratio is known."""
+    """A value with its intervals, offset and drift, before the signal-to-noise ratio is known.
+
+    The attributes are those of `DiffusionEstimate`; without a `stderr` it is half the width of
+    `ci68`.
+    """
 
     value: float
     ci68: tuple[float, float]

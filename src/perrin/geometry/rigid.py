@@ -88,7 +88,7 @@ def orientation_covariance(positions: Floats, noise: Floats) -> Floats:
     Parameters
     ----------
     positions : ndarray, shape (n, d)
-        The particles used, body axes; their mean need not be at the origin.
+        Particles used for the fit, body axes; their mean need not be at the origin.
     noise : ndarray, shape (..., d, d)
         Covariance of the localisation error in body axes.
 

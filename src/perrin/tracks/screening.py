@@ -28,7 +28,7 @@ CENTRE_REMOVED = (
 # Colloidal particles are between these distances apart, um.
 _LEAST_DISTANCE, _MOST_DISTANCE = 0.05, 50.0
 
-# Expected number of coincidences, and probability, below which coincidences are no accident.
+# Expected number, and probability, of coincidences below which they are not due to chance.
 _COINCIDENCE_LEVEL = 1e-3
 
 # A placeholder is entered and left by steps of over 5 times the particle's median step, which a
