@@ -191,7 +191,7 @@ def msd(
         without it. True: the mean velocity, the same in all pieces and for all particles (flow,
         stage drift, sedimentation), is estimated and subtracted. The part of the Brownian motion
         that an estimated velocity removes with it, t/T of the MSD in a run of length T, is
-        corrected for; at the longest lag of a single track nothing is left, and it is NaN.
+        corrected for; at the longest lag of a single track it is all of the MSD, which is NaN.
         ``stderr`` is then within 20 % up to half of the run, too small near its end. Either
         velocity is reported in ``LagCurve.drift``.
 

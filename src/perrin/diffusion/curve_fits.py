@@ -80,8 +80,8 @@ def fit_line(
     Warns
     -----
     PrecisionWarning
-        If the directions of an MSAD weigh the axes unequally and the steps show that the body does
-        not turn alike about them: the slope is then not D_R. The text is in ``warnings``.
+        If the directions of an MSAD weigh the axes unequally and the steps show that the body
+        turns unequally about them: the slope is then not D_R. The text is in ``warnings``.
 
     Notes
     -----

@@ -317,7 +317,7 @@ def offset_gain(motion: RigidMotion, estimate: DiffusionEstimate, *, sigma: floa
 def persistence_gain(
     motion: RigidMotion, estimate: DiffusionEstimate, *, drift: bool = False
 ) -> float:
-    """Return twice the log-likelihood that steps gain by being more alike than blur makes them.
+    """Return twice the log-likelihood gained by steps that are smoother than with motion blur.
 
     Parameters
     ----------

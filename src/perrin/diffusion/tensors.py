@@ -187,7 +187,7 @@ def coupled_tensor(
     -----
     The steps are the SE(3) logarithms of g_k^-1 g_{k+1}, in the likelihood of `diffusion_tensor`
     with noise of its own for centre and orientation (uncorrelated, as they are at the centroid for
-    localisation errors alike in all axes and all particles seen) and blur unknown. From the
+    equal localisation errors along all axes and all particles present) and blur unknown. From the
     centroid to a point r of the body, with the coupling C of row translation and column rotation
     and [r] u = r x u:
     D_R' = D_R, C' = C - [r] D_R, D_T' = D_T - [r] C^T + C [r] - [r] D_R [r]. The coupling is

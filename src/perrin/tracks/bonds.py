@@ -46,7 +46,8 @@ _REST_SHARE = 2e-3
 _MOST_EXCESS, _SLOW_TEST_LEVEL = 2.5, 1e-3
 
 # A group whose distances vary by over 6 times those of the tightest group is a body only if they
-# vary less (variance) than the separations along the axes: of trapped particles both vary alike.
+# vary less (variance) than the separations along the axes. For trapped particles both variances are
+# similar.
 _LOOSE_RATIO, _TURNING_SHARE = 6.0, 0.7
 
 # The localisation error along one axis of the microscope is at most this factor from that along the
@@ -107,7 +108,7 @@ class Pairs(NamedTuple):
         off = (distance - median[pair])[:, None]
         variance, slow = _variances(pair, block, off, shared, blocks)
         free, free_slow = _variances(pair, block, separation, shared, blocks)
-        # Two particles at one place have no direction: all axes count alike.
+        # Two particles at one place have no direction: all axes count equally.
         alike = np.where(distance == 0, 1 / np.sqrt(separation.shape[1]), 0.0)[:, None]
         unit = (separation / np.where(distance == 0, 1.0, distance)[:, None] + alike) ** 2
         n = np.maximum(shared, 1)

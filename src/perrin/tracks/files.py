@@ -183,8 +183,8 @@ def write_tracks(table: pd.DataFrame, path: _PathLike) -> None:
         Tracks, coordinates in um.
     path : str or path
         Name of the file, ending in ``.csv``, ``.csv.gz``, ``.parquet`` or ``.gdf`` (little endian,
-        float64, columns x, y[, z], frame, particle). In a csv, text ids that look like numbers come
-        back as numbers; parquet keeps them.
+        float64, columns x, y[, z], frame, particle). Text ids of digits in
+        a csv are read back as numbers; parquet keeps them.
 
     Raises
     ------

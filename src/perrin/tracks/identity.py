@@ -283,7 +283,7 @@ def body_size(seen: Bools) -> int:
 
 
 def _without_assignment(seen: Bools, n: int, *, labelled: bool) -> Identity:
-    """Return the labels as given, one particle a column; without labels nothing is assigned."""
+    """Return the labels as given, one particle a column; without labels none is assigned."""
     none = np.empty(0, dtype=np.int64)
     if labelled:
         order = np.where(seen, np.arange(seen.shape[1]), -1)
