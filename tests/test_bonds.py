@@ -161,7 +161,7 @@ def test_bodies_of_very_different_noise_are_all_found():
 
 
 def test_particles_that_drift_together_are_no_body(repeats):
-    """A common flow does not tie free particles to each other."""
+    """A common flow does not make free particles a body."""
     for seed in range(repeats(1, 3)):
         x, truth = bodies(0, loose=20, n_frames=250, seed=seed)
         x[..., 0] += 0.3 * np.arange(250)[:, None]
@@ -179,7 +179,7 @@ def test_trapped_particles_among_bodies_are_loose(repeats):
         assert found_in(both).tolist() == [0] * 4 + [1] * 4 + [2] * 4 + [-1] * 5
 
 
-def test_slow_bodies_beside_each_other_are_two_where_they_wander_apart(repeats):
+def test_slow_neighbouring_bodies_are_two_where_their_distance_wanders(repeats):
     """Their distance wanders by more than its noise, from block to block of time."""
     for seed in range(repeats(2, 4)):
         rng = np.random.default_rng(seed)
@@ -204,7 +204,7 @@ def test_the_result_does_not_depend_on_the_order_of_rows():
 
 
 def test_tables_without_pairs_have_no_bodies():
-    """No rows, one particle, two at the same place beside a body."""
+    """No rows, one particle, two at the same place together with a body."""
     none = np.empty(0, dtype=np.int64)
     assert rigid_groups(none, none, np.empty((0, 3)), count=2, smallest=2).tolist() == [-1, -1]
     assert found_in(np.zeros((20, 1, 2))).tolist() == [-1]

@@ -82,7 +82,7 @@ def test_few_nodes_give_the_whole_sum():
         assert cramer_rao(n_frames=n, snr=snr) == pytest.approx(information**-0.5, rel=1e-10)
 
 
-def test_an_unknown_exposure_costs_nothing_in_the_bound():
+def test_an_unknown_exposure_does_not_raise_the_bound():
     """With the offset o = s - 2BDdt free, the bound is that of no blur with D dt/o as SNR."""
     for exposure, snr in ((0.3, 0.5), (1.0, 2.0)):
         offset = 1 / snr - exposure / 3
@@ -99,7 +99,7 @@ def test_the_limits_at_high_snr():
             assert n * bound**2 == pytest.approx(limit, rel=1e-3)
 
 
-def test_what_is_known_helps():
+def test_knowledge_of_the_noise_lowers_the_bound():
     """Known noise lowers the bound more than residuals, many residuals more than few."""
     case = {"n_frames": 100, "snr": 0.7}
     residual = [cramer_rao(**case, noise="residual", residual_dof=dof) for dof in (1, 3, 6, 10**9)]
@@ -108,7 +108,7 @@ def test_what_is_known_helps():
     assert residual[-1] == pytest.approx(cramer_rao(**case, noise="known"), rel=1e-8)
 
 
-def test_the_bound_refuses_what_has_none():
+def test_invalid_arguments_of_the_bound_are_refused():
     """Each value out of range is named, all of them in one message."""
     bad = {
         "n_frames": 2, "snr": 0.0, "axes": 4, "noise": "guessed", "exposure": 1.5,

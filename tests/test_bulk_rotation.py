@@ -162,7 +162,7 @@ def test_particles_may_come_and_go(d, repeats):
 @pytest.mark.parametrize("offset", [0.0, 1e3])
 @pytest.mark.parametrize("d", [3, 2])
 def test_a_rigid_turn_is_removed_exactly(d, offset, repeats):
-    """Without noise the particles stand still (1e-10) and the planted motion is found."""
+    """Without noise the particles are at rest (1e-10) and the planted motion is found."""
     frames = repeats(150, 400)
     still = np.broadcast_to(walkers(d, n=60, n_frames=2, seed=5)[0], (frames, 60, d))
     x = carried(still) + offset
@@ -187,7 +187,7 @@ def test_a_rigid_turn_is_removed_exactly(d, offset, repeats):
 
 
 @pytest.mark.parametrize("d", [3, 2])
-def test_any_motion_of_the_lab_is_taken_off(d):
+def test_any_motion_of_the_lab_is_removed(d):
     """Turn and shift every frame at random, or change the unit: what remains is the same (1e-8)."""
     rng = np.random.default_rng(7)
     x = come_and_go(walkers(d, n=150, n_frames=80, seed=8))

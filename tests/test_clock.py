@@ -16,7 +16,7 @@ def table(times, frames=None):
 
 
 def test_even_times_are_the_frames():
-    """Times dt apart, to rounding, change nothing."""
+    """Times dt apart, to rounding, give the frames unchanged."""
     times = (0.73 * np.arange(50)).round(4)
     assert read_clock(table(times), dt=0.73) == (None, ())
     assert read_clock(table(times + 17.3), dt=0.73) == (None, ())

@@ -82,7 +82,7 @@ def test_the_reach_is_one_and_three_tenths_of_contact(ratio, cluster):
     ("n_near", "n_shared", "cluster"),
     [(1, 1, -1), (1, 2, -1), (2, 2, 0), (2, 3, 0), (2, 4, -1), (3, 5, 0), (5, 10, -1), (6, 10, 0)],
 )
-def test_together_is_more_than_half_of_the_shared_frames(n_near, n_shared, cluster):
+def test_pairs_are_near_in_more_than_half_of_the_shared_frames(n_near, n_shared, cluster):
     """Near in over half of the frames that hold both, at least 2 of them."""
     points = np.zeros((20, 2, 2))
     points[:, 1, 0] = np.where(np.arange(20) < n_near, 1.0, 8.0)
@@ -145,7 +145,7 @@ def test_ids_renamed_at_random_keep_the_partition():
     assert len(set(zip(found, renamed, strict=True))) == 4
 
 
-def test_a_particle_never_seen_is_loose():
+def test_a_particle_without_coordinates_is_loose():
     """A particle with rows of NaN only belongs to no cluster."""
     points = tetrahedra(1)
     points[:, 2] = np.nan
@@ -296,7 +296,7 @@ def test_found_clusters_have_the_positions_of_the_bodies():
         np.testing.assert_array_equal(positions, points[:, 4 * c : 4 * c + 4])
 
 
-def test_frames_that_look_like_times_are_refused():
+def test_frame_numbers_that_are_times_are_refused():
     """Two frames a billion apart would make an array of a billion rows."""
     table = table_of(np.zeros((2, 3, 3)))
     with pytest.raises(TrackTableError, match=r"from 0 to 1000000000, a span of 1000000001, but"):

@@ -77,7 +77,7 @@ def test_too_few_lags_are_refused_with_the_numbers():
 
 
 def test_lags_without_data_are_left_out():
-    """NaN lags inside the window change nothing on a straight line."""
+    """NaN lags inside the window do not change the fit of a straight line."""
     curve = straight(5e-3, 2e-4)
     holes = np.array(curve.value)
     holes[[7, 8, 20]] = np.nan

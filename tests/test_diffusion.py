@@ -144,7 +144,9 @@ SAME = {
 
 @pytest.mark.parametrize("quantity", QUANTITIES)
 @pytest.mark.parametrize("change", SAME)
-def test_the_answer_does_not_depend_on_the_view(positions, measured, change, quantity):
+def test_the_answer_does_not_depend_on_axes_labels_and_origin(
+    positions, measured, change, quantity
+):
     """Turned, moved, relabelled, mirrored, backwards or renumbered: the same numbers to 1e-9."""
     before = measured[quantity]
     after = estimate_diffusion(SAME[change](positions), quantity=quantity)
@@ -561,7 +563,7 @@ def test_covariances_take_gaps_partial_frames_and_low_signal(noise, gapped):
 
 @pytest.mark.parametrize("noise", ["joint", "residual"])
 def test_mean_cosines_are_exact_at_any_step(noise, repeats):
-    """At D_R dt = 0.5 likelihood reads 10 % low (heat kernel: 0.9015), the mean cosine is right."""
+    """At D_R dt = 0.5 likelihood is 10 % low (heat kernel: 0.9015), the mean cosine is right."""
     tracks = []
     for seed in range(repeats(16, 30)):
         m = simulate_motion(TETRAHEDRON, D_R=0.5, dt=1.0, n_frames=400, rng=seed)
@@ -763,7 +765,7 @@ def test_random_strange_motions(quantity, repeats):
 
 
 def test_a_body_at_rest_has_D_zero():
-    """What never moves has D = 0 with an empty interval, and is not resolved."""
+    """A body that never moves has D = 0 with an empty interval, and is not resolved."""
     still = simulate_motion(TETRAHEDRON, D_R=5e-3, D_T=0.0, dt=1.0, n_frames=100, rng=0)
     found = estimate_diffusion(still, quantity="translation")
     assert (found.value, found.ci68, found.ci95) == (0.0, (0.0, 0.0), (0.0, 0.0))
@@ -848,7 +850,7 @@ def test_all_faults_come_in_one_message():
         ({"method": "trace", "quantity": "translation"}, "trace"),
     ],
 )
-def test_choices_that_make_no_sense_are_refused(wrong, word):
+def test_invalid_choices_are_refused(wrong, word):
     """Negative noise, an exposure over 1, a drift of D_R: refused by name."""
     with pytest.raises(ValueError, match=word):
         estimate_diffusion(tracked(cloud(1, n_frames=9)), **wrong)
@@ -884,7 +886,7 @@ def test_a_noise_is_its_three_keywords(options):
 
 
 def test_a_noise_and_its_keywords_together_are_refused():
-    """What is stated twice is named; the faults of a Noise are those of the keywords."""
+    """An option stated twice is named; the faults of a Noise are those of the keywords."""
     motion = tracked(cloud(1, n_frames=60))
     with pytest.raises(ValueError, match=r"exposure: stated in noise=.*; drift: stated in noise="):
         estimate_diffusion(motion, noise=Noise(exposure=0.5), exposure=0.5, drift=True)

@@ -1,4 +1,4 @@
-"""Track tables: what goes in comes out, and what is wrong is named with its place."""
+"""Track tables: tables read back as written, and every fault is named with its place."""
 
 import gzip
 import os
@@ -180,7 +180,7 @@ def test_writing_leaves_no_other_file_and_replaces_the_old(tmp_path):
     assert len(read_tracks(tmp_path / "t.csv")) == 10
 
 
-def test_a_failed_rename_leaves_the_old_file_and_no_debris(tmp_path, monkeypatch):
+def test_a_failed_rename_leaves_the_old_file_and_no_other(tmp_path, monkeypatch):
     """The old file stays until the new one is whole."""
     write_tracks(tracks(), tmp_path / "t.csv")
     before = (tmp_path / "t.csv").read_bytes()
@@ -405,7 +405,7 @@ def test_checking_twice_changes_nothing():
 
 
 def test_permuted_rows_come_back_permuted():
-    """The check knows no order of rows."""
+    """The check does not depend on the order of the rows."""
     table, order = tracks(), [4, 2, 5, 0, 3, 1]
     clean = check_tracks(table, source="t")
     permuted = check_tracks(table.iloc[order], source="t")
@@ -435,7 +435,7 @@ def test_long_integer_ids_keep_all_their_digits():
 
 @pytest.mark.parametrize("dtype", [object, "string", "category"])
 def test_text_labels_of_any_dtype_are_kept(dtype):
-    """Text ids stay text, also where they look like numbers."""
+    """Text ids stay text, also where they consist of digits."""
     for labels in (["p1", "p2"] * 3, ["007", "7"] * 3):
         table = tracks().assign(particle=pd.Series(labels).astype(dtype))
         clean = check_tracks(table, source="t")
@@ -561,7 +561,7 @@ def test_clusters_are_ids_too():
         pd.Series([1j] * 6),
     ],
 )
-def test_what_is_neither_number_nor_text_is_refused(column):
+def test_values_that_are_neither_number_nor_text_are_refused(column):
     """Truth values, dates and complex numbers are no coordinates, frames or ids."""
     for name in ("frame", "particle", "x"):
         faults = faults_of(tracks().assign(**{name: column}))
@@ -629,7 +629,7 @@ def test_a_source_that_is_a_csv_counts_lines():
     assert "in line 3;" in faults_of(table, source="day1.csv")[0]
 
 
-def test_what_is_no_table_is_a_type_error():
+def test_another_type_than_a_table_is_a_type_error():
     """An array has no columns."""
     with pytest.raises(TypeError, match="expected a pandas DataFrame, got ndarray"):
         check_tracks(np.zeros((3, 4)), source="the table")
@@ -662,12 +662,12 @@ def test_spellings_that_differ_in_case_blanks_or_unit_are_read(tmp_path, names):
 
 
 def test_exact_names_win_and_the_others_are_noted():
-    """Beside a column with our name none of another spelling is read, and that is stated."""
+    """Where a column has our name, none of another spelling is read, and a note states that."""
     table = tracks().assign(X=7.0, **{"y (um)": 8.0})
     back = check_tracks(table, source="the table")
     pd.testing.assert_frame_equal(back, tracks())
     assert back.attrs["notes"] == [
-        "columns left out beside others with exactly our names: 'X', 'y (um)'"
+        "columns left out, because others have exactly our names: 'X', 'y (um)'"
     ]
 
 
@@ -727,7 +727,7 @@ def test_units_of_single_axes_are_judged_by_their_own_scale(tmp_path):
 
 
 def test_columns_by_name_keep_their_unit_and_by_number_do_not(tmp_path):
-    """A mapping by name is no way around the unit; one by number is."""
+    """A mapping by name is checked against the unit; one by number is not."""
     table = tracks().rename(columns={axis: f"POS_{axis} (nm)" for axis in "xyz"})
     table.to_csv(tmp_path / "t.csv", index=False)
     by_name = {axis: f"POS_{axis} (nm)" for axis in "xyz"}

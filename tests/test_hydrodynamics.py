@@ -106,7 +106,7 @@ def test_planted_sizes_come_back(bent, unit):
 
 
 def test_spheres_that_do_not_touch_and_unequal_ones():
-    """A stated diameter and a Mobility say what the positions alone do not."""
+    """A stated diameter and a Mobility determine the spheres that positions alone do not."""
     apart = Cluster(1.2 * BENT, diameter=2.0)
     mobility = cluster_mobility(0.6 * BENT, radius=0.5, **PAPER)
     got = size_from_rotation(means(mobility)[1], cluster=apart, **PAPER)
@@ -166,7 +166,7 @@ HOT = {"viscosity": (2.18e-3, 0.04 * 2.18e-3), "temperature": (295.0, 0.03 * 295
 
 
 def test_errors_of_the_conditions(tetrahedron):
-    """kT/eta is 5 % uncertain: so is d from D_T, and a third of it goes into d from D_R."""
+    """kT/eta is 5 % uncertain: so is d from D_T, and d from D_R by a third of that."""
     shape = {"cluster": tetrahedron}
     t = size_from_translation(D_T[0], **shape, **HOT)
     r = size_from_rotation(D_R[0], **shape, **HOT)
@@ -255,7 +255,7 @@ def test_the_joint_errors_by_monte_carlo(tetrahedron, repeats):
     ],
 )
 def test_bad_input_is_refused(size, options, words):
-    """Every fault of the numbers is in one message; shapes that cannot be used are told."""
+    """Every fault of the numbers is in one message; shapes that cannot be used are refused."""
     given = {"D": 0.04, "cluster": TETRAHEDRON, **PAPER} | options
     with pytest.raises(ValueError) as error:  # noqa: PT011 (the words are checked below)
         size(given.pop("D"), **given)
@@ -270,7 +270,7 @@ def test_bad_input_to_the_joint_size():
 
 
 @pytest.mark.parametrize("size", [size_from_translation, size_from_rotation])
-def test_a_viscosity_in_another_unit_is_named(size, tetrahedron):
+def test_a_viscosity_in_another_unit_is_warned_of(size, tetrahedron):
     """Above 0.5 Pa s each function warns with the value and what it is in mPa s; 0.2 is quiet."""
     for viscosity in (2.18, (2.18, 0.1), lambda kelvin: 2.18):
         with pytest.warns(UnitWarning, match=r"viscosity: 2\.18 Pa s .* state 0\.00218") as caught:

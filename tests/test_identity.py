@@ -164,7 +164,7 @@ def test_large_bodies_with_missing_particles(repeats):
 
 @pytest.mark.parametrize("body", [3, 4, 6])
 @pytest.mark.parametrize("D_R", [SLOW, 0.1, 1.0])
-def test_right_labels_are_left_alone_however_far_the_body_turns(body, D_R, repeats):
+def test_right_labels_are_kept_however_far_the_body_turns(body, D_R, repeats):
     """Lasting labels outweigh a shorter rotation: no label is changed after a long step."""
     x, rng = track(20, body, D_R=D_R, n_frames=repeats(60, 120))
     x[rng.random(x.shape[:2]) < 0.02] = np.nan
@@ -175,7 +175,7 @@ def test_right_labels_are_left_alone_however_far_the_body_turns(body, D_R, repea
 
 
 def test_missing_particles_do_not_matter():
-    """Labels shuffled and 3 % lost: three of four are enough, two are not."""
+    """Labels shuffled and 3 % lost: three of four particles are enough, two are not."""
     x, rng = track(3, n_frames=200)
     mixed, particle = shuffled(x, rng)
     mixed[rng.random(mixed.shape[:2]) < 0.03] = np.nan

@@ -13,7 +13,7 @@ DIAMETER = 2.45
 
 
 def raw(positions, rng, *, extra=0):
-    """Return the shuffled rows of bodies (T, n, 3) without ids, with the truth besides."""
+    """Return the shuffled rows of bodies (T, n, 3) without ids, and the truth."""
     parts = []
     for body, x in enumerate(positions):
         frame, site = np.indices(x.shape[:2])
@@ -61,7 +61,7 @@ def test_shuffled_rows_become_lasting_particles():
     assert not found.duplicated(["frame", "particle"]).any()
 
 
-def test_two_clusters_that_pass_are_never_mistaken():
+def test_two_clusters_that_pass_keep_their_identity():
     """Nearest sphere centres come to 1.2 diameters, within reach of the grouping."""
     rng = np.random.default_rng(1)
     one, other = (track(rng) for _ in range(2))

@@ -1,4 +1,4 @@
-"""The mobility of rigid clusters: published numbers, exact series, laws, honest errors."""
+"""The mobility of rigid clusters: published numbers, exact series, laws, error estimates."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def deviation(D, reference):
 
 @pytest.mark.parametrize("name", TABLE)
 def test_published_and_converged_values(name):
-    """Means and principal values of ten bodies come out within 1e-4 with nothing chosen."""
+    """Means and principal values of ten bodies come out within 1e-4 with the defaults."""
     mean_T, principal_T, mean_R, principal_R = TABLE[name]
     t, values_T, r, values_R = ratios(body(name))
     assert t == pytest.approx(mean_T, rel=1e-4)
@@ -217,7 +217,7 @@ def test_a_turned_and_a_mirrored_body(turn):
 
 
 def test_units():
-    """Lengths in another unit, a power of two: the same digits; D goes as kT/eta."""
+    """Lengths in another unit, a power of two: the same digits; D is proportional to kT/eta."""
     scaled = cluster_mobility(8 * ODD, radius=8 * ODD_RADII, **WATERY)
     units = np.repeat([8**-0.5, 8**-1.5], 3)
     np.testing.assert_allclose(scaled.D, odd().D * units[:, None] * units, rtol=1e-10, atol=1e-12)
@@ -367,7 +367,7 @@ def test_a_prediction_comes_back_from_json(result):
 
 
 def test_a_cluster_is_its_positions():
-    """A Cluster goes in as well as its positions."""
+    """A Cluster is accepted in place of its positions."""
     cluster = Cluster.touching(4, 2.0)
     mobility = cluster_mobility(cluster, radius=1.0, **WATERY)
     assert isinstance(mobility, Mobility)

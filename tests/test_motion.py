@@ -126,7 +126,7 @@ def test_missing_particles_and_frames_do_not_change_the_poses(name):
 
 
 def test_no_complete_frame_is_needed():
-    """A template whose particles are never all seen at once is still the whole body."""
+    """A template whose particles are never all present at once is still the whole body."""
     truth, x = simulated(BIPYRAMID, seed=4)
     for k in range(len(x)):
         x[k, k % 5] = np.nan
@@ -802,7 +802,7 @@ def measured(cluster):
 
 @pytest.mark.parametrize("cluster", [TETRA, FLAT])
 @pytest.mark.parametrize("through", ["memory", "parquet"])
-def test_tables_carry_every_bit(cluster, through, tmp_path):
+def test_tables_keep_every_bit(cluster, through, tmp_path):
     """to_frame, then from_frame, also through a Parquet file, gives back the same bits."""
     motion = measured(cluster)
     table = motion.to_frame()

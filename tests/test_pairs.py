@@ -159,7 +159,7 @@ def test_pieces_are_never_paired():
             assert np.allclose(curve.components[lag - 1], expected, rtol=1e-9, equal_nan=True)
 
 
-def test_a_jump_between_pieces_changes_nothing():
+def test_a_jump_between_pieces_does_not_change_the_curve():
     """The second piece set a kilometre away leaves the curve as it was."""
     motion = tracked_motion(2, n_frames=60)
     piece = np.repeat([0, 1], [30, 30])

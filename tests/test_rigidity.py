@@ -38,7 +38,7 @@ def test_sigma_per_axis_comes_back(sigma, repeats):
 
 
 def test_a_trimer_that_hardly_turns_has_no_sigma_per_axis():
-    """Its residuals lie in its plane, which stays where it is."""
+    """Its residuals lie in its plane, whose orientation hardly changes."""
     assert judged(noisy(1, body=3, D_R=1e-5)).sigma_xyz is None
     assert judged(noisy(1, body=3, D_R=0.02)).sigma_xyz is not None
 

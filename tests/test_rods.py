@@ -83,8 +83,8 @@ def test_exchanged_ends_are_corrected():
     np.testing.assert_allclose(found.direction, right.direction, atol=1e-3)
 
 
-def test_right_ends_are_left_alone_and_unlabelled_ones_cut():
-    """Fast turning: labels are trusted; without labels uncertain ends cut the track."""
+def test_right_labels_of_the_ends_are_kept_and_uncertain_ends_cut():
+    """Fast turning: labels are kept; without labels the track is cut at uncertain ends."""
     x, truth = rod(4, D_perp=1.0)
     motion = perrin.track_direction(x, dt=DT)
     assert (np.einsum("ti,ti->t", motion.direction, truth.rotation[:, :, 2]) > 0).all()
@@ -160,7 +160,7 @@ def test_a_rod_survives_a_table():
 
 
 def test_a_single_long_turn_of_a_quiet_rod_is_judged_by_its_own_size():
-    """Turned by 100 degrees the labels are believed, by 160 an exchange and a turn by 20 is."""
+    """Turned by 100 degrees the labels are kept, by 160 an exchange and a turn by 20 is found."""
     for degrees, swaps in ((100, []), (160, [20])):
         angle = np.deg2rad(degrees)
         ends = np.outer([-1.0, 1.0], [1.0, 0.0, 0.0])

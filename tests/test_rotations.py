@@ -130,7 +130,7 @@ def test_kabsch_agrees_with_an_svd_of_every_row(name, cases):
 
 
 @pytest.mark.parametrize("spread", [1e-2, 1e-3])
-def test_a_noisy_chain_is_not_certified_by_luck(spread, repeats):
+def test_a_noisy_chain_is_certified_only_where_newton_converged(spread, repeats):
     """Rows whose Newton iteration has not converged use the SVD: an error of eps/gap only."""
     count = repeats(1000, 4000)
     rng = np.random.default_rng(3)
@@ -201,7 +201,7 @@ def test_no_rotation_fits_better(seed):
 @laws
 @given(seed=seeds, d=st.sampled_from([2, 3]))
 def test_weights_are_those_of_the_squares(seed, d):
-    """Weight 0 is absence, an integer weight is a repeated point, a common factor is nothing."""
+    """Weight 0 is absence, an integer weight is a repeated point, a common factor has no effect."""
     rng = np.random.default_rng(seed)
     x = rng.normal(size=(6, d))
     y = x @ kabsch(*rng.normal(size=(2, 5, d))).T + 0.1 * rng.normal(size=(6, d))
@@ -274,14 +274,14 @@ def test_an_empty_batch_gives_an_empty_answer():
 
 
 @pytest.mark.parametrize("count", [1, 2047, 2048, 2049, 4097])
-def test_chunks_leave_no_seam(count):
+def test_the_size_of_the_batch_does_not_matter(count):
     """The rotation of a row does not depend on the number of other rows."""
     q = random_rotations(count)
     np.testing.assert_allclose(kabsch(turned(TETRA, q), TETRA), q, rtol=0, atol=1e-14)
 
 
-def test_the_inputs_are_left_alone():
-    """Neither set is written to, with NaN rows or without, and lists of integers will do."""
+def test_the_inputs_are_not_changed():
+    """Neither set is written to, with NaN rows or without; lists of integers are accepted."""
     y = turned(TETRA, random_rotations(3))
     y[1, 2] = np.nan
     before, reference = y.copy(), TETRA.copy()
@@ -409,7 +409,7 @@ def test_a_thin_body_far_away_is_answered_or_refused_but_never_wrong():
         (np.array([[np.inf, 0, 0], *TETRA[1:]]), TETRA, [0, 1, 1, 1]),
     ],
 )
-def test_what_does_not_fit_is_a_value_error(points, reference, weights):
+def test_inputs_that_do_not_fit_are_a_value_error(points, reference, weights):
     """Shapes that do not fit, bad weights and infinite coordinates are refused by name."""
     with pytest.raises(ValueError, match=r"expected|broadcast|infinite") as caught:
         kabsch(points, reference, weights=weights)
@@ -477,7 +477,7 @@ def test_turns_about_one_axis_add(v, a, b):
     + [np.pi - gap for gap in (1e-3, 1e-6, 1e-9, 1e-12)],
 )
 def test_log_undoes_exp_at_every_angle(angle):
-    """log(exp(v)) = v to a few eps relative to the angle, from nothing to nearly half a turn."""
+    """log(exp(v)) = v to a few eps relative to the angle, from 0 to nearly half a turn."""
     v = np.random.default_rng(21).normal(size=(500, 3))
     v *= angle / np.linalg.norm(v, axis=1, keepdims=True)
     back = log_map(exp_map(v))
@@ -672,7 +672,7 @@ def test_similarity_never_mirrors():
 
 
 @pytest.mark.parametrize("name", DEGENERATE)
-def test_similarity_refuses_what_has_no_answer(name):
+def test_similarity_refuses_degenerate_sets(name):
     """Collinear, coincident and exactly mirrored sets are refused with their rows."""
     points, reference = DEGENERATE[name]
     good = TETRA if len(points) == 4 else TRIMER

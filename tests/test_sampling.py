@@ -60,7 +60,7 @@ def test_the_window_is_the_rule():
 
 
 def test_an_empty_window_is_reported():
-    """With Phi^2 above 0.02 the best dt is 0.1/4D_R, and the plan asks for frames or particles."""
+    """With Phi^2 above 0.02 the best dt is 0.1/4D_R, with more frames or particles."""
     full, empty = (
         plan_sampling(paper_body(), D_R=D_R, sigma=sigma, n_frames=300)
         for sigma in np.sqrt(np.array([0.0199, 0.0201]) * 4 / 6) * paper_body().R
@@ -94,7 +94,7 @@ def test_published_frame_counts():
 
 
 def test_frames_for_is_the_least_number():
-    """One frame less misses the wanted error; nothing is below three frames."""
+    """One frame less misses the wanted error; the least number is three frames."""
     plan = plan_sampling(paper_body(), **PAPER, n_frames=300)
     n = plan.frames_for(plan.expected_error)
     assert n == 300
@@ -145,7 +145,7 @@ def test_given_time_more_frames_help_and_no_optimum_is_claimed():
 
 @pytest.mark.parametrize(("n_frames", "spread_out"), [(100, False), (600, True), (3000, True)])
 def test_given_frames_and_time_both_are_limits(n_frames, spread_out):
-    """All frames over all the time, unless that is longer than frames alone would ask for.
+    """All frames over all the time, unless that is longer than for frames alone.
 
     No dt of the curve has a smaller error than the best one, but for the last 2 % beyond SNR 20.
     """
@@ -161,7 +161,7 @@ def test_given_frames_and_time_both_are_limits(n_frames, spread_out):
 
 
 def test_with_limited_photons_the_stated_movie_is_a_point_of_the_curve():
-    """At the stated dt the error is that of the stated movie; sigma^2 goes as 1/dt elsewhere."""
+    """At the stated dt the error is that of the stated movie; sigma^2 is proportional to 1/dt."""
     plan = plan_sampling(paper_body(), **PAPER, n_frames=300, total_time=220, photons=True)
     stated = 220 / 299
     there = np.exp(np.interp(np.log(stated), np.log(plan.dt), np.log(plan.error)))
@@ -340,7 +340,7 @@ def estimate(**changes):
 
 
 def test_the_factor_is_the_ratio_to_the_planned_dt():
-    """plan_sampling with the D, noise and frames of the data asks for factor times their dt."""
+    """plan_sampling with the D, noise and frames of the data gives factor times their dt."""
     for snr, dt in ((1.7, 0.01), (0.2, 0.01), (60.0, 0.3), (8.0, 4.0), (1.0, 4.0)):
         data = estimate(snr=snr, dt=dt)
         sigma = np.sqrt(data.value * dt / snr / (noise_floor(paper_body(), sigma=1.0).phi2 / 4))
@@ -412,7 +412,7 @@ def test_the_estimate_carries_its_dt():
     assert estimate_diffusion(motions, quantity="translation").dt == pytest.approx(0.6)
 
 
-def test_lengths_that_look_like_nanometres_are_named():
+def test_lengths_that_may_be_in_nanometres_are_warned_of():
     """A sigma larger than the body and spheres of 2450 um warn; usual lengths do not."""
     with pytest.warns(UnitWarning, match=r"sigma: 30 um .* R = 1\.5 um.* state 0\.03"):
         plan_sampling(paper_body(), D_R=D_R, sigma=30.0)
@@ -425,7 +425,7 @@ def test_lengths_that_look_like_nanometres_are_named():
 
 
 def test_every_estimate_of_one_track_gets_one_verdict(repeats):
-    """A line, least squares of a curve and the likelihood share the noise, so all say oversampled.
+    """A line, least squares of a curve and the likelihood share the noise: all are oversampled.
 
     Frames 10 ms apart at SNR 0.2: the offset of a curve is negative in some of these tracks and
     does not measure the noise.
@@ -446,7 +446,7 @@ def test_every_estimate_of_one_track_gets_one_verdict(repeats):
         assert all(str(judge_sampling(e)).startswith("Oversampled") for e in estimates)
 
 
-def test_a_curve_of_positions_does_not_know_its_noise():
+def test_the_noise_of_a_curve_of_positions_is_not_known():
     """Free particles have no rigid-fit residuals: no SNR, and no verdict on the sampling."""
     walk = np.random.default_rng(2).normal(size=(100, 3, 3)).cumsum(axis=0)
     estimate = perrin.fit_line(perrin.msd(walk, dt=0.5))

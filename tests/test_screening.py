@@ -110,7 +110,7 @@ def test_repeats_by_rounding_are_measurements(digits, D_R, scale, repeats):
 
 
 def test_a_particle_that_sticks_is_measured(repeats):
-    """In pixels, a particle that moves and then sticks repeats its place for good reason."""
+    """In pixels, a particle that moves and then sticks repeats its place as a measurement."""
     for seed in range(repeats(2, 4)):
         x = tracks(seed)
         x[150:] = x[150] + np.random.default_rng(seed).normal(scale=0.1, size=x[150:].shape)
@@ -164,7 +164,7 @@ def test_far_points_are_those_beyond_twenty_sizes():
     np.testing.assert_array_equal(far_points(x[:, ::-1]), far[:, ::-1])
 
 
-def test_of_two_points_far_from_each_other_none_is_trusted():
+def test_of_two_points_far_from_each_other_none_is_kept():
     """Which of two points is wrong is unknown."""
     x = tracks(12, n=2)
     x[7, 0] += 500.0
@@ -227,14 +227,14 @@ def test_units_that_are_no_colloids_warn():
     assert distance_notes(alone, scale_given=False, trackpy_columns=False) == ((), ())
 
 
-def test_trackpy_is_known_by_two_of_its_columns():
+def test_trackpy_is_recognised_by_two_of_its_columns():
     """Other programs write one column of mass or size, too."""
     assert has_trackpy_columns(["frame", "x", "y", "mass", "ecc"])
     assert not has_trackpy_columns(["frame", "x", "y", "size"])
 
 
 def test_particles_at_rest_on_a_cameras_grid_are_measured():
-    """Markers that stand and walk in turns on a grid of 0.145: repeats are measurements."""
+    """Markers that rest and move in turns on a grid of 0.145: repeats are measurements."""
     rng = np.random.default_rng(31)
     walking = (np.arange(1500) // 100) % 2 == 1
     path = np.cumsum(

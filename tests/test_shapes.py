@@ -107,8 +107,8 @@ def test_sizes_must_be_positive(size):
 
 
 @pytest.mark.parametrize("n", [-2, 0, 1, 8, 2.5, "3"])
-def test_touching_knows_two_to_seven(n):
-    """Any other number of spheres is refused, with the way out."""
+def test_touching_takes_two_to_seven_spheres(n):
+    """Any other number of spheres is refused, with the alternative."""
     with pytest.raises(ValueError, match="from_positions"):
         Cluster.touching(n, 1.0)
 
@@ -123,7 +123,7 @@ def test_positions_must_be_points(positions):
 
 
 def test_which_bodies_are_tetrahedra():
-    """Alike pair distances within 10 % make one, in any pose and size; other bodies are none."""
+    """Pair distances equal within 10 % make one, in any pose and size; other bodies are none."""
     x = Cluster.touching(4, 2.45).positions
     turn = np.linalg.qr(np.random.default_rng(4).normal(size=(3, 3)))[0]
     assert is_tetrahedron(x)

@@ -274,7 +274,7 @@ def chain():
 
 @pytest.fixture(scope="module")
 def propeller(chain):
-    """Return the same spheres with a tensor of strong coupling, to see every term of the law."""
+    """Return the same spheres with a tensor in which every term of the law is large."""
     axes = Rotation.random(3, random_state=3).as_matrix()
     values = np.array([[0.05, 0.03, 0.02], [0.012, 0.006, 0.003], [0.006, -0.003, 0.002]])
     D_T, D_R, coupling = np.einsum("kij,kj,klj->kil", axes, values, axes)

@@ -71,7 +71,7 @@ def test_a_stage_jump_is_found_and_cut(size, drift):
 
 
 def test_one_large_turn_is_found():
-    """A turn of 57 degrees beside steps of 5 is a jump of the orientation, not of the centre."""
+    """A turn of 57 degrees among steps of 5 is a jump of the orientation, not of the centre."""
     x = brownian(2)
     x[120:] = turned(x[120:], [1.0, 0, 0])
     found, motion, _ = jumps_of(x, "rotation")

@@ -65,7 +65,7 @@ def test_a_sphere_near_a_wall():
 
 
 def test_the_walls_effect_fades():
-    """Far away nothing is left; nearer, translation slows more than rotation, normal most."""
+    """Far away there is no effect; nearer, translation slows more than rotation, normal most."""
     far = wall_factor(1.0, height=1e6)
     assert far.T_perpendicular == pytest.approx(1, abs=1e-6)
     for height in (1.3, 2.0, 10.0):
@@ -122,7 +122,7 @@ def test_water(celsius, millipascal):
     assert step == pytest.approx(1 - 0.024, abs=5e-4)
 
 
-def test_what_is_refused(bodies):
+def test_invalid_conditions_are_refused(bodies):
     """Too near a wall, no height, another axis, no number, Celsius, ice and steam."""
     for body in (bodies[4], bodies[6], 2.45):
         with pytest.raises(ValueError, match=r"2\.5 hydrodynamic radii"):

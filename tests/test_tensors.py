@@ -534,7 +534,7 @@ def test_the_search_takes_few_passes(monkeypatch):
 # ---- refusals -----------------------------------------------------------------------------------
 
 
-def test_what_cannot_be_answered_is_refused():
+def test_motions_without_a_tensor_are_refused():
     """All faults at once; planar motions; too few steps; a body at rest."""
     motion = tracked(1, n_frames=60)
     with pytest.raises(ValueError, match=r"quantity: .*; noise: .*; exposure: "):
@@ -580,7 +580,7 @@ def test_a_value_on_its_edge_is_warned_of():
 
 
 def test_steps_that_share_no_frame():
-    """Pieces of one step each have no neighbours to show the noise; stated, it is subtracted."""
+    """Pieces of one step each do not determine the noise; a stated noise is subtracted."""
     motion = tracked(4, n_frames=600)
     apart = dataclasses.replace(motion, piece=np.arange(600) // 2)
     found = diffusion_tensor(apart, noise=SIGMA, exposure=0.0)
@@ -589,7 +589,7 @@ def test_steps_that_share_no_frame():
     assert joint.mean_stderr > found.mean_stderr
 
 
-def test_truth_without_noise_is_served_by_every_option():
+def test_truth_without_noise_is_measured_with_every_option():
     """Simulated truth (sigma 0, covariance 0) and its rounding give the planted tensor."""
     truth = simulate_motion(BODY, D_R=planted(), D_T=0.02, dt=1.0, n_frames=2000, rng=1)
     values, axes = np.linalg.eigh(planted())
@@ -658,7 +658,7 @@ def test_a_weighted_mean_is_that_of_the_directions():
 
 
 def test_the_summary_has_no_second_mean():
-    """`summary` is the text without the mean, so that one mean is shown beside D_R."""
+    """`summary` is the text without the mean, so that only one mean is shown together with D_R."""
     truth = simulate_motion(Cluster.tetrahedron(1.0), D_R=1e-3, dt=1.0, n_frames=100, rng=1)
     found = diffusion_tensor(truth)
     assert str(found).count("\nmean ") == 1

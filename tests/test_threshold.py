@@ -38,7 +38,7 @@ def turned(rotations):
 
 
 @pytest.mark.parametrize("threshold", [0.1, 0.7, 2.0])
-def test_it_is_the_rule_frame_by_frame(threshold):
+def test_the_displacement_is_the_rule_frame_by_frame(threshold):
     """Gaps and pieces: equal to a loop over scipy rotations that restarts its reference."""
     motion = gappy(1)
     walk = threshold_displacement(motion, threshold=threshold)
@@ -54,7 +54,7 @@ def test_it_is_the_rule_frame_by_frame(threshold):
             reference, base = here, base + turn
 
 
-def test_its_ends_are_the_sum_of_all_steps_and_the_rotation_vector():
+def test_the_limits_are_the_sum_of_all_steps_and_the_rotation_vector():
     """Threshold 0, or one below every step, is accumulated_rotation; pi is log(R_k R_0^T)."""
     motion = gappy(2)
     every = motion.accumulated_rotation()
@@ -68,7 +68,7 @@ def test_its_ends_are_the_sum_of_all_steps_and_the_rotation_vector():
     )
 
 
-def test_it_turns_with_the_lab_and_has_no_unit():
+def test_the_displacement_turns_with_the_lab_and_has_no_unit():
     """A turned lab turns the displacement; unit, origin and particle order do not change it."""
     rng = np.random.default_rng(3)
     truth = simulate_motion(TETRA, D_R=2e-2, dt=1.0, n_frames=200, rng=rng)

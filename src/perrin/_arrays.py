@@ -1,4 +1,4 @@
-"""Arrays and numbers at the boundary: types, shapes, ranges, and what JSON holds of them."""
+"""Checks of the arrays and numbers that users pass, and their conversion to and from JSON."""
 
 from __future__ import annotations
 
@@ -50,13 +50,29 @@ def as_sigma(sigma: ArrayLike, dimensions: int) -> Floats:
     ValueError
         Unless it is one number, or one per axis, none of them negative or infinite.
     """
-    s = np.asarray(sigma, dtype=np.float64)
-    if s.shape not in ((), (dimensions,)) or not np.all(np.isfinite(s)) or np.any(s < 0):
-        raise ValueError(
-            f"sigma: expected one number >= 0 or {dimensions} of them (one per axis), in um, "
-            f"got {sigma!r}"
-        )
-    return np.broadcast_to(s, (dimensions,)).copy()
+    refuse(sigma_fault(sigma, dimensions))
+    return np.broadcast_to(np.asarray(sigma, dtype=np.float64), (dimensions,)).copy()
+
+
+def sigma_fault(sigma: ArrayLike, dimensions: int) -> list[str]:
+    """Return one line where a localisation error is neither one number >= 0 nor one per axis.
+
+    Examples
+    --------
+    >>> sigma_fault([0.02, 0.02, 0.05], 3), sigma_fault(0.02, 3)
+    ([], [])
+    >>> sigma_fault(-0.02, 3)
+    ['sigma: expected one number >= 0 or 3 of them (one per axis), in um, got -0.02']
+    """
+    sound = np.shape(sigma) in ((), (dimensions,)) and not any(
+        number_fault("sigma", value, least=0) for value in np.ravel(sigma).tolist()
+    )
+    if sound:
+        return []
+    return [
+        f"sigma: expected one number >= 0 or {dimensions} of them (one per axis), in um, "
+        f"got {sigma!r}"
+    ]
 
 
 def require_positive(**values: float) -> None:
@@ -88,7 +104,7 @@ def number_fault(
     name : str
         The argument's name, with which the line begins.
     value : object
-        What the user gave.
+        Value that the user passed.
     above, least, below, most : float, optional
         Bounds: value > above, value >= least, value < below, value <= most.
     whole : bool
@@ -262,9 +278,9 @@ def finite_or_none(value: float) -> float | None:
 
 
 def to_plain(value: Any) -> Any:  # noqa: ANN401 (whatever a result holds)
-    """Return what JSON holds of a value: lists for arrays, None for what is not finite.
+    """Return a value for JSON: lists for arrays, None for numbers that are not finite.
 
-    Objects that have a method ``to_dict`` are written by it.
+    Objects that have a method ``to_dict`` are converted by it.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""How numbers, units, lists and frames are written."""
+"""Texts of numbers, units, lists and frames."""
 
 from __future__ import annotations
 
@@ -129,11 +129,12 @@ def unit_text(ascii_unit: str) -> str:
 
 
 def shortened(name: str, *, most: int = 24) -> str:
-    """Return a user's name for a cluster, cut where it is too long for a picture."""
+    """Return a user's name for a cluster, shortened where it is too long for a figure."""
     return name if len(name) <= most else name[: most - 1] + "…"
 
 
 def ordinal(n: int) -> str:
+    """Return an ordinal number: 1st, 2nd, 3rd, 4th, 11th, 21st."""
     ending = "th" if n % 100 in (11, 12, 13) else {1: "st", 2: "nd", 3: "rd"}.get(n % 10, "th")
     return f"{n}{ending}"
 

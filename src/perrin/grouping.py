@@ -3,6 +3,7 @@
 import warnings
 
 from perrin.tracks.clusters import *  # noqa: F403
+from perrin.tracks.groups import TOUCHING_REACH as REACH  # noqa: F401
 
 warnings.warn(
     "perrin.grouping has moved to perrin.tracks.clusters; "

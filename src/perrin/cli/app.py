@@ -415,7 +415,7 @@ def simulate(
     import numpy as np
 
     import perrin
-    from perrin.tracks.files import SUFFIXES
+    from perrin.tracks.formats import SUFFIXES
 
     with messages_of(simulate):
         check_new_file(output, SUFFIXES, overwrite=overwrite)
@@ -598,7 +598,7 @@ def convert(
 ) -> None:
     """Convert a track table between .csv, .csv.gz, .parquet and .gdf."""
     import perrin
-    from perrin.tracks.files import SUFFIXES
+    from perrin.tracks.formats import SUFFIXES
 
     with messages_of(convert):
         check_new_file(target, SUFFIXES, overwrite=overwrite)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from perrin._arrays import from_plain, number_fault, refuse, to_plain
+from perrin._arrays import choice_fault, from_plain, number_fault, refuse, to_plain
 from perrin.curves.displacement import LagCurve, body_directions
 from perrin.curves.grids import place_frames
 from perrin.curves.pairs import Products, pair_sums
@@ -35,7 +35,7 @@ class QuaternionCovariance(NamedTuple):
     n_pairs: Ints
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the covariance as JSON holds it: lists for arrays, None for NaN.
+        """Return the covariance for JSON: lists for arrays, None for NaN.
 
         Returns
         -------
@@ -57,7 +57,7 @@ class QuaternionCovariance(NamedTuple):
         Parameters
         ----------
         entry : dict
-            From `to_dict`, also after JSON.
+            As `to_dict` returns it, also after a round trip through JSON.
 
         Returns
         -------
@@ -89,7 +89,7 @@ def quaternion_covariance(
     Parameters
     ----------
     motion : RigidMotion
-        In three dimensions; frames without a pose are left out.
+        Motion in three dimensions; frames without a pose are left out.
     n_lags : int, optional
         Number of lags, counted from one step between frames; default all.
 
@@ -141,7 +141,7 @@ def orientation_correlation(
     Parameters
     ----------
     motion : RigidMotion
-        In three dimensions.
+        Motion in three dimensions.
     degree : int
         l = 1 or 2 of the Legendre polynomial.
     directions : array_like, shape (3,) or (K, 3), optional
@@ -150,14 +150,14 @@ def orientation_correlation(
     Returns
     -------
     LagCurve
-        Dimensionless; decays as exp(-l (l + 1) D_R t). ``stderr`` is NaN: the curve is for display,
-        the steps give D_R with a far smaller error. ``dof`` is l (l + 1) / 2, half the rate over
-        D_R.
+        Dimensionless curve that decays as exp(-l (l + 1) D_R t). ``stderr`` is NaN: the curve is
+        for display, the steps give D_R with a far smaller error. ``dof`` is l (l + 1) / 2, half the
+        rate over D_R.
 
     Raises
     ------
     ValueError
-        For another degree, or a planar motion.
+        If the degree is not 1 or 2, or the motion is planar.
 
     Warns
     -----
@@ -173,7 +173,7 @@ def orientation_correlation(
     0.4
     """
     if degree not in (1, 2):
-        raise ValueError(f"degree: expected 1 or 2, got {degree!r}")
+        refuse(choice_fault("degree", degree, (1, 2)))
     if motion.dimension != 3:
         raise ValueError("orientation_correlation is for motions in three dimensions")
     features = p = motion.orientation(body_directions(motion, directions))

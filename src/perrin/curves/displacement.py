@@ -27,7 +27,6 @@ from perrin.motion.rigid_motion import RigidMotion, threshold_displacement
 if TYPE_CHECKING:
     import pandas as pd
 
-
 # Directions whose mean weighs the axes this evenly change a slope by at most this fraction.
 _EVEN_WEIGHTS = 0.01
 
@@ -124,7 +123,7 @@ class LagCurve:
         return pd.DataFrame(columns)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the curve as JSON holds it: lists for arrays, None for what is not finite.
+        """Return the curve for JSON: lists for arrays, None for values that are not finite.
 
         Returns
         -------
@@ -146,7 +145,7 @@ class LagCurve:
         Parameters
         ----------
         entry : dict
-            From `to_dict`, also after JSON.
+            As `to_dict` returns it, also after a round trip through JSON.
 
         Returns
         -------
@@ -192,7 +191,7 @@ def msd(
         without it. True: the mean velocity, the same in all pieces and for all particles (flow,
         stage drift, sedimentation), is estimated and subtracted. The part of the Brownian motion
         that an estimated velocity removes with it, t/T of the MSD in a run of length T, is
-        corrected for; at the longest lag of a single track nothing is left, and it is NaN.
+        corrected for; at the longest lag of a single track it is all of the MSD, which is NaN.
         ``stderr`` is then within 20 % up to half of the run, too small near its end. Either
         velocity is reported in ``LagCurve.drift``.
 
@@ -339,7 +338,7 @@ def msad_vector(motion: RigidMotion, *, threshold: float = 0.0) -> LagCurve:
     Raises
     ------
     ValueError
-        For a threshold out of range.
+        If the threshold is out of range.
 
     Warns
     -----
@@ -561,7 +560,14 @@ def body_directions(motion: RigidMotion, directions: ArrayLike | None = None) ->
     Returns
     -------
     ndarray, shape (K, d)
-        A particle at the centre has no direction and is left out.
+        Directions; a particle at the centre has none and is left out.
+
+    Examples
+    --------
+    >>> from perrin import Cluster, simulate_motion
+    >>> still = simulate_motion(Cluster.tetrahedron(1.0), D_R=1e-3, dt=1.0, n_frames=2, rng=0)
+    >>> body_directions(still).shape, body_directions(still, [0.0, 0.0, 1.0])
+    ((4, 3), array([[0., 0., 1.]]))
     """
     if directions is not None:
         return np.atleast_2d(np.asarray(directions, dtype=np.float64))
@@ -611,7 +617,15 @@ def independent_walks(motion: RigidMotion, weights: Floats) -> float:
     Returns
     -------
     float
-        From 1 to 3.
+        Number of walks, from 1 to 3.
+
+    Examples
+    --------
+    >>> from perrin import Cluster, simulate_motion
+    >>> body = Cluster.tetrahedron(1.0)
+    >>> truth = simulate_motion(body, D_R=1e-3, dt=1.0, n_frames=50, rng=0)
+    >>> independent_walks(truth, np.eye(3)), independent_walks(truth, np.diag([1.0, 1.0, 0.0]))
+    (3.0, 2.0)
     """
     stop = motion.steps()[1]
     if axes_weighted_equally(direction_weights(body_directions(motion))) or len(stop) < 2:
@@ -641,7 +655,16 @@ def axis_ratio(motion: RigidMotion, weights: Floats) -> tuple[float, float] | No
     Returns
     -------
     tuple of float, or None
-        (1, inf) where the steps show no diffusion.
+        Ratio and standard error; (1, inf) where the steps show no diffusion.
+
+    Examples
+    --------
+    >>> from perrin import Cluster, simulate_motion
+    >>> rod = Cluster.from_positions([[-3, 0, 0], [0, 0.5, 0], [0, 0, 0.5], [3, 0, 0]])
+    >>> truth = simulate_motion(rod, D_R=[4e-3, 1e-3, 1e-3], dt=1.0, n_frames=2000, rng=0)
+    >>> ratio, stderr = axis_ratio(truth, np.diag([1.0, 0.0, 0.0]))
+    >>> bool(abs(ratio - 2.0) < 3 * stderr)
+    True
     """
     if axes_weighted_equally(weights):
         return None
@@ -651,16 +674,18 @@ def axis_ratio(motion: RigidMotion, weights: Floats) -> tuple[float, float] | No
     if linked.sum() < 2:
         return 1.0, np.inf
     own = w.T @ w / len(w)
-    beside = w[:-1][linked].T @ w[1:][linked] / linked.sum()
-    beside = 0.5 * (beside + beside.T)
-    tensor = own + 2 * beside
+    neighbour = w[:-1][linked].T @ w[1:][linked] / linked.sum()
+    neighbour = 0.5 * (neighbour + neighbour.T)
+    tensor = own + 2 * neighbour
     if not np.trace(tensor) > 0:
         return 1.0, np.inf
     uneven = 3 / np.trace(weights) * weights - np.eye(3)
     more = float(np.sum(tensor * uneven) / np.trace(tensor))
     cosine = np.cos(2 * np.pi * (np.arange(64) + 0.5) / 64)
     form = 1 + 2 * len(w) / linked.sum() * cosine
-    both = (uneven - more * np.eye(3)) @ (own + 2 * linked.mean() * cosine[:, None, None] * beside)
+    both = (uneven - more * np.eye(3)) @ (
+        own + 2 * linked.mean() * cosine[:, None, None] * neighbour
+    )
     variance = 2 * np.mean(form**2 * np.einsum("kij,kji->k", both, both)) / len(w)
     return 1 + more, float(np.sqrt(max(variance, 0.0)) / np.trace(tensor))
 
@@ -733,7 +758,17 @@ def drift_corrected(
     Returns
     -------
     ndarray, shape (L, c)
-        NaN where nothing is left to correct: the whole of one stretch is its own drift.
+        Corrected MSD by axis, um^2; NaN at the lag of a whole track, all of whose displacement was
+        subtracted.
+
+    Examples
+    --------
+    >>> lagtime = np.array([1.0, 2.0, 3.0])
+    >>> left = (2 * lagtime * (1 - lagtime / 4))[:, None]  # 2 D t less its drift, D = 1, T = 4
+    >>> drift_corrected(
+    ...     left, np.array([4, 3, 2]), lagtime=lagtime, durations=np.array([4.0])
+    ... ).ravel().round(9)
+    array([2., 4., 6.])
     """
     total = float(durations.sum())
     n = lagtime / total

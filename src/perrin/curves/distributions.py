@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 
     from perrin.motion.rigid_motion import RigidMotion
 
-
 _HERMITE_ORDERS = 100  # beyond which the error of a bin is bounded from above
 
 
@@ -81,7 +80,7 @@ class VanHove:
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the distribution as JSON holds it: lists for arrays, None for what is not finite.
+        """Return the distribution for JSON: lists for arrays, None for what is not finite.
 
         Returns
         -------
@@ -104,7 +103,7 @@ class VanHove:
         Parameters
         ----------
         entry : dict
-            From `to_dict`, also after JSON.
+            As `to_dict` returns it, also after a round trip through JSON.
 
         Returns
         -------
@@ -190,7 +189,9 @@ def van_hove(
     x = walk[last] - walk[first]
     square = float(np.mean(x * x))
     if square == 0:
-        raise ValueError("nothing moves: the distribution of a body at rest has no width")
+        raise ValueError(
+            "the body does not move: the distribution of its displacements has no width"
+        )
     if edges is None:
         reach = float(np.abs(x).max())
         edges = np.linspace(-reach, reach, int(np.asarray(bins)) + 1)
@@ -222,7 +223,7 @@ def mean_correlation_powers(motion: RigidMotion, walk: Floats, lag: float, *, pa
     motion : RigidMotion
         Motion that the walk belongs to.
     walk : ndarray, shape (T, c)
-        Centre or accumulated rotation.
+        Centre (um) or accumulated rotation (rad) of the body.
     lag : float
         Lag time of the displacements, s.
     pairs : int
@@ -231,6 +232,16 @@ def mean_correlation_powers(motion: RigidMotion, walk: Floats, lag: float, *, pa
     Returns
     -------
     ndarray, shape (100,)
+
+    Examples
+    --------
+    >>> from perrin import Cluster, simulate_motion
+    >>> truth = simulate_motion(
+    ...     Cluster.tetrahedron(1.5), D_R=5e-3, D_T=0.04, dt=0.7, n_frames=300, rng=3
+    ... )
+    >>> powers = mean_correlation_powers(truth, truth.center, 0.7, pairs=299)
+    >>> bool(abs(299 * powers[99] - 1) < 0.01)  # they share no time
+    True
     """
     curve = angle_curve(motion, walk[:, None], dof=1)
     step = curve.step or motion.dt
@@ -246,7 +257,7 @@ def mean_correlation_powers(motion: RigidMotion, walk: Floats, lag: float, *, pa
 
 
 def gaussian_bins(z: Floats, powers: Floats) -> tuple[Floats, Floats]:
-    """Return the part of a unit Gaussian that lies in each bin, and the error of counting it.
+    """Return the part of a unit Gaussian in each bin, and the error of counting it.
 
     The variance of a count is the sum of its squared Hermite coefficients, each times the variance
     of the mean of that polynomial (Mehler); the orders left out have the variance of the last one.

@@ -14,14 +14,11 @@ from perrin.errors import TooFewFramesError
 if TYPE_CHECKING:
     from perrin._arrays import Bools, Floats, Ints
 
-
 # A time this close to a multiple of the step between frames (in steps) counts as that multiple.
 GRID_TOLERANCE = 0.1
 
-
 # Times that deviate from a grid by less than this (in dt) are those of frame numbers.
 _EXACT_GRID = 1e-3
-
 
 # A grid may have this many places per frame, and this many more; beyond, its holes are cut out, so
 # that arrays and lag axes are bounded by the number of frames present.
@@ -63,7 +60,7 @@ class Frames:
 
     @property
     def blocks(self) -> list[slice]:
-        """Elements of each block."""
+        """Slice of the frames that belong to each block."""
         edges = np.flatnonzero(np.diff(self.block, prepend=-1, append=self.block[-1] + 1))
         return [slice(int(a), int(b)) for a, b in pairwise(edges)]
 
@@ -98,7 +95,7 @@ def place_frames(time: Floats, piece: Ints, here: Bools, *, dt: float) -> Frames
     piece : ndarray of int, shape (T,)
         Piece of each row; no pair of frames joins two of them.
     here : ndarray of bool, shape (T,)
-        Which rows are used.
+        Whether each row is used.
     dt : float
         Time between frames, s.
 

@@ -15,11 +15,9 @@ if TYPE_CHECKING:
     from perrin._arrays import Floats, Ints
     from perrin.curves.grids import Frames
 
-
-# Largest number of pairs formed one by one where frames lie on no common compact grid: a second and
-# 200 MB. All pairs of 1400 frames.
+# Largest number of pairs formed one by one where frames lie on no common compact grid: all pairs
+# of 1400 frames, which take a second and 200 MB.
 _MOST_LISTED_PAIRS = 1_000_000
-
 
 _PAIRS_IN_MEMORY = 1 << 16  # pairs whose displacements are in memory at once
 
@@ -296,7 +294,8 @@ class Squares:
         """Return the sums by FFT.
 
         With m the presence, the sum is corr(m x^2, m) + corr(m, m x^2) - 2 corr(m x, m x). The
-        mean is subtracted first: squares of a far origin would swallow the displacements.
+        mean is subtracted first: the squares of coordinates far from the origin would lose digits
+        of the displacements.
         """
         walks = _on_grid(self.walks, rows, slots)
         here = present(walks)
@@ -325,7 +324,7 @@ class Products:
     Parameters
     ----------
     features : ndarray, shape (T, F)
-        Finite in all rows that are used.
+        Features, finite in all rows that are used.
     groups : sequence of sequence of (int, int)
         Result q is the sum of the products of column i of one frame and column j of the other,
         symmetric in the frames.

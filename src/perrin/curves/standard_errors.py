@@ -12,7 +12,6 @@ if TYPE_CHECKING:
     from perrin.curves.grids import Frames
     from perrin.curves.pairs import ListedPairs, PairSums
 
-
 # Starts of displacements are compared as whole numbers below this: exact sums of their squares.
 _INTEGER_RANGE = 1 << 22
 
@@ -158,8 +157,8 @@ def _listed_covariances(
 def squared_shared_times(pairs: ListedPairs, frames: Frames, lag: Floats) -> Floats:
     """Return the sum of (shared time)^2 over pairs of displacements of a bin, each pair once.
 
-    Displacements are cut into clusters that share nothing; their starts become whole numbers, so
-    that differences of cumulative sums of squares are exact, modulo 2^64.
+    Displacements are divided into groups that have no time in common. Their starts become whole
+    numbers, so that differences of cumulative sums of squares are exact, modulo 2^64.
 
     Parameters
     ----------
@@ -173,7 +172,16 @@ def squared_shared_times(pairs: ListedPairs, frames: Frames, lag: Floats) -> Flo
     Returns
     -------
     ndarray, shape (L,)
-        In steps squared.
+        Sum for each lag, steps squared.
+
+    Examples
+    --------
+    >>> from perrin.curves import ListedPairs, place_frames
+    >>> time, piece, here = np.arange(4.0), np.zeros(4, dtype=int), np.ones(4, dtype=bool)
+    >>> frames = place_frames(time, piece, here, dt=1.0)
+    >>> pairs = ListedPairs(np.zeros(2, dtype=int), np.array([0, 1]), np.array([2, 3]))
+    >>> squared_shared_times(pairs, frames, np.array([2.0])).round(6)  # from 1 to 2
+    array([1.])
     """
     start = frames.time[pairs.first] / frames.step
     length = lag[pairs.lag]

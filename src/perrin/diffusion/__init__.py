@@ -1,6 +1,6 @@
-"""How fast a body diffuses: coefficients, tensors, their errors, and tests of the steps."""
+"""Diffusion coefficients and tensors of a body, their errors, and tests of its steps."""
 
-from perrin.diffusion.bounds import cramer_rao, whole
+from perrin.diffusion.bounds import cramer_rao
 from perrin.diffusion.curve_fits import (
     GridLags,
     best_window,
@@ -185,6 +185,5 @@ __all__ = [
     "unit_covariance",
     "value_text",
     "weighted_variance",
-    "whole",
     "without_spin",
 ]

@@ -98,8 +98,3 @@ def cramer_rao(
             about_s += (n_frames - 1) * residual_dof / 2
         information -= (axes / 2 * float(weight @ (by_D * by_s))) ** 2 / about_s
     return float(information**-0.5)
-
-
-def whole(value: object, *, least: int) -> bool:
-    """Return whether a value is a whole number of at least `least`."""
-    return not number_fault("", value, least=least, whole=True)

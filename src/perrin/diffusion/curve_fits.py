@@ -21,30 +21,23 @@ if TYPE_CHECKING:
     from perrin._arrays import Floats, Ints
     from perrin.curves.displacement import LagCurve
 
-
 # The paper's window, 3 s to 22 s of a run of 220 s, as fractions of the duration.
 _PAPER_WINDOW = (3 / 220, 22 / 220)
-
 
 # The information on D in a curve at lag n falls as exp(-k n), cosh k = 1 + SNR: six decay lengths
 # leave out less than 0.3 % of the variance.
 _DECAY_LENGTHS = 6.0
 
-
 _MOST_GLS_LAGS = 600  # in generalised least squares; beyond, spaced geometrically
-
 
 # Motion blur lowers the offset at most to -D dt/3 (a shutter that never closes).
 _FULL_BLUR = -1 / 3
-
 
 # No window is so long that even without noise the error would be more than this part of D: the
 # interval would have no upper end.
 _LARGEST_ERROR = 0.4
 
-
 _MOST_GLS_ROUNDS = 100
-
 
 # A warning states that a slope is not D_R where the steps show it with this many standard errors (a
 # chance well below 1 % for an isotropic body of 60 frames, whose ratio has longer tails than a
@@ -87,8 +80,8 @@ def fit_line(
     Warns
     -----
     PrecisionWarning
-        If the directions of an MSAD weigh the axes unequally and the steps show that the body does
-        not turn alike about them: the slope is then not D_R. The text is in ``warnings``.
+        If the directions of an MSAD weigh the axes unequally and the steps show that the body
+        turns unequally about them: the slope is then not D_R. The text is in ``warnings``.
 
     Notes
     -----
@@ -346,6 +339,14 @@ def best_window(lags: GridLags) -> GridLags:
     Returns
     -------
     GridLags
+
+    Examples
+    --------
+    >>> from perrin import Cluster, simulate_motion
+    >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=300, rng=3)
+    >>> from perrin import msad
+    >>> best_window(GridLags.of(msad(truth)).longest_window()).size < 10
+    True
     """
     sizes = np.unique(np.rint(np.geomspace(2, lags.size, 200)).astype(np.int64))
     tried: list[int] = []
@@ -360,7 +361,7 @@ def best_window(lags: GridLags) -> GridLags:
             if variance > lowest:
                 break
             lowest, size = variance, int(m)
-    # Nothing distinguishes windows that alternate; the longest is least sensitive to the noise.
+    # Of windows that alternate the longest is least sensitive to the noise.
     return lags.take(slice(max(tried[tried.index(size) :])))
 
 
@@ -433,8 +434,18 @@ def gls_weights(lags: GridLags, *, D: float, s: float) -> Floats:
     Returns
     -------
     ndarray, shape (2, L)
+
+    Examples
+    --------
+    >>> from perrin import Cluster, simulate_motion
+    >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=300, rng=3)
+    >>> from perrin import msad
+    >>> lags = GridLags.of(msad(truth)).take(slice(4))
+    >>> weights = gls_weights(lags, D=3.5e-3, s=1e-3)
+    >>> bool(abs(weights[0] @ lags.steps - 1) < 1e-9)
+    True
     """
-    if D == s == 0:  # nothing moves: all weights are as good
+    if D == s == 0:  # without motion all weights are equally good
         return line_weights(lags.steps)
     design = np.stack([lags.steps, np.ones(lags.size)], axis=1)
     covariance = np.zeros((lags.size, lags.size))

@@ -13,12 +13,9 @@ from perrin.diffusion.noise_model import Noise
 
 UNITS = {"rotation": "rad^2/s", "translation": "um^2/s"}
 
-
 CHI2 = {0.68: 0.9889, 0.95: 3.8415}  # quantiles of chi-squared with one degree of freedom
 
-
 NORMAL = {0.68: 0.9945, 0.95: 1.9600}  # half widths of intervals in standard errors
-
 
 # Below ten times its resolution floor a D_R is not resolved.
 _RESOLVED_FLOORS = 10.0
@@ -26,7 +23,11 @@ _RESOLVED_FLOORS = 10.0
 
 @dataclass(frozen=True)
 class Found:
-    """A value with its intervals, offset and drift, before the signal-to-noise ratio is known."""
+    """A value with its intervals, offset and drift, before the signal-to-noise ratio is known.
+
+    The attributes are those of `DiffusionEstimate`; without a `stderr` it is half the width of
+    `ci68`.
+    """
 
     value: float
     ci68: tuple[float, float]
@@ -66,7 +67,7 @@ class DiffusionEstimate:
     offset_stderr : float
         Standard error of the offset; NaN where the offset lies on the edge of its range.
     resolution_floor : float or None
-        The D_R that a motionless cluster would read; None for D_T.
+        D_R that would be measured for a motionless cluster, rad^2/s; None for D_T.
     resolved : bool
         Whether the value is above ten such floors and its 95 % interval above 0; if not, it is an
         upper limit.
@@ -93,8 +94,8 @@ class DiffusionEstimate:
     drift_stderr : tuple of tuple of float, or None
         Standard errors of the drift.
     p_same : float or None
-        Pooled motions: probability that equal coefficients scatter at least as much as these do
-        (likelihood ratio); None for one motion and for other methods than "mle".
+        Probability that equal coefficients of the pooled motions scatter at least as much as these
+        do (likelihood ratio); None for one motion and for other methods than "mle".
     warnings : tuple of str
         Conditions of the estimate that are not fulfilled; for an absent value the reason.
     """
@@ -180,8 +181,8 @@ class DiffusionEstimate:
         cls, *, quantity: Literal["rotation", "translation"], n_frames: int, reason: str
     ) -> DiffusionEstimate:
         """Return the estimate of a coefficient that the data cannot show, all numbers NaN."""
-        nothing = (np.nan, np.nan)
-        found = Found(np.nan, nothing, nothing, np.nan, np.nan)
+        unknown = (np.nan, np.nan)
+        found = Found(np.nan, unknown, unknown, np.nan, np.nan)
         return cls.judged(
             found,
             quantity=quantity,
@@ -208,7 +209,7 @@ class DiffusionEstimate:
         return Noise(self.noise, self.exposure, self.drift is not None)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the estimate as JSON holds it.
+        """Return the estimate for JSON.
 
         An end of an interval, an error or a signal-to-noise ratio without bound is None; a stated
         sigma is text with its unit and six digits.
@@ -224,11 +225,11 @@ class DiffusionEstimate:
         read = dict(entry)
         for name in ("ci68", "ci95"):
             low, high = read[name]
-            nothing = low is None
-            read[name] = (np.nan,) * 2 if nothing else (low, np.inf if high is None else high)
+            unknown = low is None
+            read[name] = (np.nan,) * 2 if unknown else (low, np.inf if high is None else high)
         for name in ("value", "offset", "offset_stderr", "dt"):
             read[name] = np.nan if entry[name] is None else entry[name]
-        # Without a value nothing is known; with one, what JSON cannot hold is unbounded.
+        # Without a value None is an unknown number; with a value it is an infinite one.
         unbounded = np.nan if entry["value"] is None else np.inf
         for name in ("stderr", "snr"):
             number = entry.get(name, np.nan)
@@ -264,11 +265,19 @@ def value_text(estimate: DiffusionEstimate) -> str:
     Parameters
     ----------
     estimate : DiffusionEstimate
-        rad^2/s or um^2/s.
+        Estimate in rad^2/s or um^2/s.
 
     Returns
     -------
     str
+
+    Examples
+    --------
+    >>> found = Found.normal(5e-3, 4e-4, 0.0, 0.0)
+    >>> value_text(DiffusionEstimate.judged(
+    ...     found, quantity="rotation", method="mle", n_frames=300, dt=0.7, noise_variance=0.0
+    ... ))
+    '0.0050(4) rad²/s'
     """
     if estimate.absent_because is not None:
         return "none"
@@ -277,7 +286,16 @@ def value_text(estimate: DiffusionEstimate) -> str:
 
 
 def bare_text(estimate: DiffusionEstimate) -> str:
-    """Write an estimate as `value_text` does, without its unit."""
+    """Write an estimate as `value_text` does, without its unit.
+
+    Examples
+    --------
+    >>> found = Found.normal(5e-3, 4e-4, 0.0, 0.0)
+    >>> bare_text(DiffusionEstimate.judged(
+    ...     found, quantity="rotation", method="mle", n_frames=300, dt=0.7, noise_variance=0.0
+    ... ))
+    '0.0050(4)'
+    """
     if estimate.absent_because is not None:
         return "none"
     if estimate.resolved:

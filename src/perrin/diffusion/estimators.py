@@ -1,4 +1,4 @@
-"""How fast it diffuses: D_R and D_T from the steps of one motion or of many."""
+"""Diffusion coefficients D_R and D_T from the steps of one motion or of several."""
 
 from __future__ import annotations
 
@@ -20,9 +20,7 @@ from perrin.motion.rigid_motion import RigidMotion
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-
 Method = Literal["mle", "cve", "trace"]
-
 
 # Beyond these an estimate warns: angular step 4 D_R dt, signal-to-noise ratio, number of steps. In
 # the plane angles add up exactly; only whole turns within a step (4 D_R dt = 2) are lost.
@@ -43,7 +41,7 @@ def estimate_diffusion(
     Parameters
     ----------
     motion : RigidMotion or sequence of RigidMotion
-        Several are pooled: one D, each with its own noise.
+        Motion; several motions are pooled: they share one D, and each has its own noise.
     quantity : {"rotation", "translation"}
         D_R from body-frame rotation vectors, or D_T from the centre. For an anisotropic body the
         value is the mean over the three axes (trace/3), and the interval is that of the mean.
@@ -54,7 +52,7 @@ def estimate_diffusion(
     noise : {"joint", "residual"}, float or Noise
         "joint" estimates the noise offset along with D. "residual" takes it from the rigid-fit
         residuals: up to three times fewer frames for the same error, but only right if all
-        particles of a frame are seen at the same instant. A number is the localisation error
+        particles of a frame are recorded at the same instant. A number is the localisation error
         sigma, um (rms over axes). A `Noise` holds exposure and drift as well, which are then not
         stated by their own keywords.
     exposure : float, optional
@@ -67,12 +65,12 @@ def estimate_diffusion(
     Returns
     -------
     DiffusionEstimate
-        With profile-likelihood intervals ("mle"), or the value's normal ones.
+        Estimate with profile-likelihood intervals ("mle"), or those of a normal distribution.
 
     Raises
     ------
     TooFewFramesError
-        Fewer than 3 frames with a pose, or no step.
+        If there are fewer than 3 frames with a pose, or no step.
     ValueError
         For unknown or inconsistent choices, all in one message, or motions of 2 and 3 dimensions
         together.
@@ -80,8 +78,8 @@ def estimate_diffusion(
     Warns
     -----
     PrecisionWarning
-        4 D_R dt > 0.2 (rotation vectors read low), a signal-to-noise ratio under 0.2, fewer than
-        30 steps.
+        If 4 D_R dt > 0.2 (D_R from rotation vectors is then too low), the signal-to-noise ratio is
+        under 0.2, or there are fewer than 30 steps.
 
     Notes
     -----
@@ -165,7 +163,24 @@ def _noise_variance(
 
 
 def by_likelihood(tracks: Sequence[NoisySteps]) -> Found:
-    """Maximise the likelihood; intervals from its profile, widened by unequal axes."""
+    """Return the maximum of the likelihood, with intervals from its profile.
+
+    Axes that diffuse unequally widen the intervals.
+
+    Parameters
+    ----------
+    tracks : sequence of NoisySteps
+        Steps of every motion, all of one quantity.
+
+    Examples
+    --------
+    >>> from perrin import Cluster, simulate_motion
+    >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=300, rng=3)
+    >>> from perrin.diffusion import Noise, NoisySteps, steps_of
+    >>> found = by_likelihood([NoisySteps.of(steps_of(truth, "rotation"), Noise())])
+    >>> found.ci95[0] < 5e-3 < found.ci95[1]
+    True
+    """
     from scipy.special import chdtrc
 
     likelihood = Likelihood.of(tracks)
@@ -189,7 +204,16 @@ def by_likelihood(tracks: Sequence[NoisySteps]) -> Found:
 
 
 def precision_limits(estimate: DiffusionEstimate, steps: Sequence[Steps]) -> tuple[str, ...]:
-    """Return one line for each condition of an exact estimate that is not fulfilled."""
+    """Return one line for each condition of an exact estimate that is not fulfilled.
+
+    Examples
+    --------
+    >>> from perrin import Cluster, simulate_motion
+    >>> from perrin.diffusion import steps_of
+    >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=300, rng=3)
+    >>> precision_limits(estimate_diffusion(truth), [steps_of(truth, "rotation")])
+    ()
+    """
     limits = []
     count = sum(len(s.duration) for s in steps)
     if count < _FEW_STEPS:

@@ -1,4 +1,4 @@
-"""Which D and which noise explain noisy Brownian steps best: the likelihood and its maximum.
+"""The likelihood of noisy Brownian steps with one D, its maximum and its profile.
 
 Step i of a motion has variance 2 D tau + o_i + o_{i+1} and covariance -o_{i+1} with the next one,
 o = s - b D the noise variance s of a frame less what motion blur takes. s = weight theta + known:
@@ -29,15 +29,12 @@ if TYPE_CHECKING:
     from perrin._arrays import Bools, Floats
     from perrin.diffusion.steps import NoisySteps
 
-
 # Lowest and highest logarithm of an offset theta in units of the mean square step. Without
 # diffusion a long track needs an offset far above that.
 _LEAST_LOG_OFFSET, _MOST_LOG_OFFSET = -30.0, 60.0
 
-
 # The steps of a body whose mean square is this much smaller than another one's are rounding.
 _SMALLEST_STEP_RATIO = 1e-24
-
 
 _LEAST_SLOPE_RATIO = float(np.exp(-_MOST_LOG_OFFSET))
 
@@ -45,9 +42,20 @@ _LEAST_SLOPE_RATIO = float(np.exp(-_MOST_LOG_OFFSET))
 class ProfilePoint(NamedTuple):
     """A point of the profile likelihood: the likelihood maximised over theta at given D.
 
-    `slope` is that of the value in D and `log_ratio` the logarithm of its rise over its fall;
-    `curvature` is the slope of the log ratio of theta in log theta, with which the next search
-    begins.
+    Attributes
+    ----------
+    D : ndarray, shape (units,)
+        D of each unit: one for every motion, or one for all.
+    value : ndarray, shape (units,)
+        Profile log-likelihood.
+    slope : ndarray, shape (units,)
+        Slope of the value in D.
+    log_ratio : ndarray, shape (units,)
+        Logarithm of the rise over the fall of that slope.
+    theta : ndarray, shape (G,)
+        Noise parameter of each motion at the maximum.
+    curvature : ndarray, shape (G,)
+        Slope of the log ratio of theta in log theta, with which the next search begins.
     """
 
     D: Floats
@@ -62,8 +70,16 @@ class ProfilePoint(NamedTuple):
 class Likelihood:
     """The likelihood of the steps of several motions (groups), theta profiled out.
 
-    With `own` every motion has a D of its own, else they share one; arrays over "units" have the
-    length of the number of different D.
+    Arrays over "units" have the length of the number of different D.
+
+    Attributes
+    ----------
+    tracks : tuple of NoisySteps
+        Steps of every motion.
+    kernels : tuple of StepKernel
+        Objects that evaluate the motions, each some of them.
+    own : bool
+        Whether every motion has a D of its own; else they share one.
     """
 
     tracks: tuple[NoisySteps, ...]
@@ -72,7 +88,7 @@ class Likelihood:
 
     @classmethod
     def of(cls, tracks: Sequence[NoisySteps]) -> Likelihood:
-        """Give even steps the sine transform and all others the tridiagonal elimination."""
+        """Return the likelihood with the sine transform for even steps, else elimination."""
         even = [i for i, t in enumerate(tracks) if t.steps.even and not t.drift]
         rest = sorted(set(range(len(tracks))) - set(even))
         found: list[StepKernel] = []
@@ -95,7 +111,7 @@ class Likelihood:
 
     @cached_property
     def scale(self) -> Floats:
-        """Return the D of each unit that explains all of its motion without noise."""
+        """D of each unit that explains all of its motion without noise."""
         moved = np.array([np.sum(t.steps.vectors**2) for t in self.tracks])
         spent = [2 * t.steps.vectors.shape[1] * np.sum(t.steps.duration) for t in self.tracks]
         return self.by_unit(moved) / self.by_unit(np.array(spent))
@@ -230,7 +246,7 @@ class Likelihood:
     ) -> ProfilePoint:
         """Return the maximum of the profile between `low` and `high`, by bracketed secant steps.
 
-        Units whose `low` and `high` agree stay there.
+        A unit whose `low` and `high` agree keeps that D.
         """
         first, last = follow(low), follow(high)
         old, peak = first, last
@@ -329,7 +345,7 @@ def secant_trial(
     step = np.divide(slope * run, rise, out=np.full_like(t, np.nan), where=rise != 0)
     target = np.where(rise * run < 0, t - step, np.nan)
     inside = (target > low) & (target < high)
-    # Falling slopes that never cross zero lead down to the edge, which is then the answer.
+    # Where a falling slope does not cross zero, the maximum is at the edge.
     edge = _LEAST_LOG_OFFSET
     target = np.where((target <= low) & (low <= edge), edge, target)
     return np.where(inside | (target == edge), target, 0.5 * (low + high))
@@ -372,7 +388,7 @@ def excess_scatter(tracks: Sequence[NoisySteps], D: float, theta: Floats) -> flo
     Parameters
     ----------
     tracks : sequence of NoisySteps
-        Of one quantity.
+        Steps of every motion, all of one quantity.
     D : float
     theta : ndarray, shape (G,)
         Noise of each motion, as the likelihood found it.
@@ -380,7 +396,7 @@ def excess_scatter(tracks: Sequence[NoisySteps], D: float, theta: Floats) -> flo
     Returns
     -------
     float
-        At least 1.
+        Ratio, at least 1.
 
     Examples
     --------

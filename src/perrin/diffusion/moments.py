@@ -15,7 +15,19 @@ if TYPE_CHECKING:
 
 
 class Moments(NamedTuple):
-    """A value of D with its standard error, and the noise offset with its own."""
+    """A value of D and the noise offset, with their standard errors.
+
+    Attributes
+    ----------
+    value : float
+        D in um^2/s or rad^2/s.
+    stderr : float
+        Standard error of D.
+    offset : float
+        Noise variance of one centre coordinate (um^2) or orientation (rad^2) less motion blur.
+    offset_stderr : float
+        Standard error of the offset; NaN where it is not known.
+    """
 
     value: float
     stderr: float
@@ -42,6 +54,15 @@ def covariance_estimate(tracks: Sequence[NoisySteps]) -> Moments:
     given, D = (<y^2> - 2 s)/2t. Gaps enter with their durations.
 
     The errors are those of a quadratic form in Gaussian steps with the covariance found.
+
+    Examples
+    --------
+    >>> from perrin import Cluster, simulate_motion
+    >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=300, rng=3)
+    >>> from perrin.diffusion import Noise, NoisySteps, steps_of
+    >>> found = covariance_estimate([NoisySteps.of(steps_of(truth, "rotation"), Noise())])
+    >>> bool(abs(found.value - 5e-3) < 3 * found.stderr)
+    True
     """
     free = tracks[0].freedom == 0
     total = 2 * sum(
@@ -133,11 +154,19 @@ def trace_estimate(
     Parameters
     ----------
     motions : sequence of RigidMotion
-        With one common dt; only pairs exactly one or two dt apart are used.
+        Motions with one common dt; only pairs exactly one or two dt apart are used.
     noise : sequence of float, optional
         Orientation variance of each motion, rad^2; None leaves it free.
     blur : float
         b of the offset s - b D, s.
+
+    Examples
+    --------
+    >>> from perrin import Cluster, simulate_motion
+    >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=300, rng=3)
+    >>> found = trace_estimate([truth], noise=None, blur=0.0)
+    >>> bool(abs(found.value - 5e-3) < 3 * found.stderr)
+    True
     """
     dt = motions[0].dt
     if any(abs(m.dt - dt) > 1e-9 * dt for m in motions):
@@ -167,6 +196,13 @@ def step_cosines(motion: RigidMotion, lag: int) -> Floats:
 
     Two empty rows at the end keep the frames of different motions apart; longer gaps between
     frames are cut to two empty rows, so that absent frames need no memory.
+
+    Examples
+    --------
+    >>> from perrin import Cluster, simulate_motion
+    >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=1e-9, dt=0.7, n_frames=4, rng=3)
+    >>> step_cosines(truth, 2).round(3)
+    array([ 1.,  1., nan, nan, nan, nan])
     """
     rows = motion.fitted
     slot: Ints = np.rint((motion.time[rows] - motion.time[rows[0]]) / motion.dt).astype(np.int64)
@@ -190,8 +226,8 @@ def _cosine_exponent(cosine: Floats) -> tuple[float, Floats]:
     if mean <= 3 * spread / np.sqrt(here.sum()):
         raise ValueError(
             "the steps are so long that the orientation is lost between frames (mean cosine "
-            f"{mean:.2g} of {here.sum()} steps, not clear of 0): D_R cannot be read from them; "
-            "sample more often"
+            f"{mean:.2g} of {here.sum()} steps, not clear of 0): D_R cannot be determined from "
+            "them; sample more often"
         )
     return -np.log(mean), np.where(here, (mean - cosine) / (mean * here.sum()), 0.0)
 

@@ -1,4 +1,4 @@
-"""Which noise an estimator assumes: fitted, from residuals, or known."""
+"""Options of the noise that an estimator assumes: fitted, from residuals, or known."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from perrin._arrays import refuse, stated_twice
 
 @dataclass(frozen=True)
 class Noise:
-    """What is assumed of the measurement noise under a diffusion coefficient.
+    """Assumptions on the measurement noise in an estimate of a diffusion coefficient.
 
     Parameters
     ----------
     model : "joint", "residual" or float
         "joint": the noise is fitted together with D. "residual": it is taken from the residuals
-        of the rigid fits, which is right only where all particles of a frame are seen at once. A
-        number is the known localisation error of one coordinate, um.
+        of the rigid fits, which is right only where all particles of a frame are recorded at the
+        same instant. A number is the known localisation error of one coordinate, um.
     exposure : float, optional
         Open fraction of the time between frames, 0 to 1; None where it is unknown.
     drift : bool
-        Subtract a steady velocity or spin, which costs one degree of freedom an axis.
+        Whether a steady velocity or spin is subtracted, one degree of freedom per axis.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""How fast a rod's direction and centre diffuse: the likelihood of their steps."""
+"""Diffusion coefficients of a rod's direction and centre from the likelihood of their steps."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ def estimate_rod(
     Returns
     -------
     DiffusionEstimate
-        With profile-likelihood intervals, the noise offset estimated along with D.
+        Estimate with profile-likelihood intervals; the noise offset is estimated along with D.
 
     Raises
     ------
     TooFewFramesError
-        Fewer than 3 frames in a row.
+        If there are fewer than 3 frames in a row.
     ValueError
-        For another quantity.
+        If the quantity is not one of these.
 
     Examples
     --------
@@ -52,7 +52,7 @@ def estimate_rod(
     steps = direction_steps(motion) if quantity == "direction" else center_steps(motion)
     if len(steps.duration) < 2:
         raise TooFewFramesError(
-            f"{motion.fitted.size} frames show the rod in too few steps: at least 3 in a row "
+            f"{motion.fitted.size} frames contain the rod in too few steps: at least 3 in a row "
             "(gaps allowed) are needed to separate diffusion from noise",
             int(motion.fitted.size),
         )

@@ -1,4 +1,4 @@
-"""When to take frames: the best time between frames, their number, and a verdict on given data."""
+"""Planning of measurements: best time between frames, their number, a verdict on given data."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from perrin._arrays import (
     number_fault,
     refuse,
     require_positive,
+    sigma_fault,
     to_plain,
 )
 from perrin._text import ordinal, percent, short
@@ -32,40 +33,33 @@ if TYPE_CHECKING:
 
     from perrin.diffusion.estimate import DiffusionEstimate
 
-
 # The window in SNR = D_R dt/s. With a given number of frames the error is within 7 % of its limit
 # at the first, and within 2 % at the second.
 _LEAST_SNR, _AMPLE_SNR = 5.0, 20.0
-
 
 # The same photons divided among more frames: the error is 17 % above its limit at the first SNR and
 # 7 % at the second. With the noise from the residuals it is flat within 2 % below the third.
 _PHOTON_SNR, _LEAST_PHOTON_SNR, _PHOTON_SNR_RESIDUAL = 0.5, 0.1, 2.0
 
-
 # D_R dt up to which steps are small and nearest neighbours are linked correctly: 4 D_R dt = 0.1.
 _LONGEST_STEP = 0.1 / 4
-
 
 # Half the angle (or distance) to a neighbour, in standard deviations of one step, at which a step
 # is confused: by nearest neighbours in 0.04 % of the steps at most, by rigid fits in 0.5 %.
 _LINKING_DEVIATIONS, _FITTING_DEVIATIONS = 4.2, 3.3
 
-
 # Highest rotation axis of the bodies whose symmetry is known: a rigid fit confuses a turn by more
 # than half of its angle with a permutation of the particles.
 _HIGHEST_FOLD = {"T_d": 3, "D_3h": 3, "O_h": 4, "D_5h": 5}
 
-
 _DEFAULT_FRAMES = 300  # where neither frames nor time are given
-
 
 _CURVE_POINTS = 121  # of the errors against the time between frames
 
 
 @dataclass(frozen=True, eq=False)
 class SamplingPlan:
-    """When to take frames, and the expected error of D_R.
+    """Recommended time between frames, and the expected error of D_R.
 
     Times are between frames, in s; errors are standard errors over D_R: the least that any
     estimator can have, which `estimate_diffusion` reaches.
@@ -204,7 +198,7 @@ class SamplingPlan:
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the plan as JSON holds it: lists for arrays and tuples.
+        """Return the plan for JSON: lists for arrays and tuples.
 
         Returns
         -------
@@ -226,7 +220,7 @@ class SamplingPlan:
         Parameters
         ----------
         entry : dict
-            From `to_dict`, also after JSON.
+            As `to_dict` returns it, also after a round trip through JSON.
 
         Returns
         -------
@@ -468,12 +462,9 @@ def _plan_faults(
     faults = number_fault("D_R", D_R, above=0, unit="rad^2/s")
     if total_time is not None:
         faults += number_fault("total_time", total_time, above=0, unit="s")
-    values = np.ravel(sigma).tolist()
-    if np.shape(sigma) not in ((), (d,)) or any(number_fault("sigma", v, least=0) for v in values):
-        faults.append(
-            f"sigma: expected one number >= 0 or {d} of them (one per axis), in um, got {sigma!r}"
-        )
-    elif not any(values):
+    noise_faults = sigma_fault(sigma, d)
+    faults += noise_faults
+    if not (noise_faults or np.any(sigma)):
         faults.append("sigma: expected more than 0 um (without noise there is nothing to plan)")
     if D_T is not None:
         faults += number_fault("D_T", D_T, least=0, unit="um^2/s")
@@ -648,7 +639,7 @@ class SamplingVerdict:
         return self.text
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the verdict as JSON holds it: None for what is infinite.
+        """Return the verdict for JSON: None for what is infinite.
 
         Returns
         -------
@@ -670,7 +661,7 @@ class SamplingVerdict:
         Parameters
         ----------
         entry : dict
-            From `to_dict`, also after JSON.
+            As `to_dict` returns it, also after a round trip through JSON.
 
         Returns
         -------

@@ -13,7 +13,6 @@ if TYPE_CHECKING:
     from perrin._arrays import Bools, Floats, Ints
     from perrin.diffusion.steps import NoisySteps
 
-
 # Lower bound of every eigenvalue: zero noise and no diffusion give no density.
 LEAST_EIGENVALUE = 1e-100
 
@@ -34,7 +33,17 @@ def difference_eigenvalues(n_steps: int) -> Floats:
 
 
 class GroupSlopes(NamedTuple):
-    """The log-likelihood of every motion and its slopes, each as a rise less a fall, (G,) each."""
+    """The log-likelihood of every motion and its slopes, each slope as a rise less a fall.
+
+    Attributes
+    ----------
+    value : ndarray, shape (G,)
+        Log-likelihood of each motion.
+    rise_D, fall_D : ndarray, shape (G,)
+        Positive and negative part of the slope in D.
+    rise, fall : ndarray, shape (G,)
+        Positive and negative part of the slope in theta.
+    """
 
     value: Floats
     rise_D: Floats
@@ -106,7 +115,7 @@ class SineModes:
 
     @classmethod
     def of(cls, tracks: Sequence[NoisySteps], groups: Sequence[int]) -> SineModes:
-        """Transform the steps of these motions, which bear these numbers."""
+        """Transform the steps of these motions, which have these numbers."""
         from scipy.fft import dst
 
         rows = []
@@ -197,7 +206,7 @@ class TridiagonalCovariance:
 
     @classmethod
     def of(cls, tracks: Sequence[NoisySteps], groups: Sequence[int]) -> TridiagonalCovariance:
-        """Stack the steps of these motions, which bear these numbers."""
+        """Stack the steps of these motions, which have these numbers."""
         blocks = [
             (i, axes)
             for i, track in enumerate(tracks)
@@ -248,8 +257,8 @@ class TridiagonalCovariance:
         d, lower, bad = dpttrf(a, b)
         up, _, bad_up = dpttrf(a[::-1], b[::-1])
         if bad or bad_up:
-            nothing = np.zeros(len(self.groups))
-            return GroupSlopes(nothing - np.inf, nothing + 1.0, nothing, nothing + 1.0, nothing)
+            zero = np.zeros(len(self.groups))
+            return GroupSlopes(zero - np.inf, zero + 1.0, zero, zero + 1.0, zero)
         z, _ = dpttrs(d, lower, self.y)
         inverse = 1 / (d + up[::-1] - a)
         corner = self.linked * np.append(-lower * inverse[1:], 0.0)

@@ -23,35 +23,27 @@ if TYPE_CHECKING:
     from perrin.diffusion.estimate import DiffusionEstimate
     from perrin.motion.rigid_motion import RigidMotion
 
-
 # A jump is a step that has this probability, at most, in the whole of a Brownian track.
 JUMP_LEVEL = 1e-6
 
-
 # More jumps than this share of the steps (and more than one) are another kind of motion.
 MOST_JUMPS = 0.01
-
 
 # Candidates are steps beyond this level, judged by a scale that up to half of the steps cannot
 # change; they are then tested against the diffusion of all other steps.
 _CANDIDATE_LEVEL = 1e-3
 
-
 _FEWEST_STEPS = 8  # no scale of the steps is known from fewer
 
-
 _MOST_CANDIDATE_ROUNDS = 10  # of finding candidates and estimating the diffusion of all other steps
-
 
 # Above this p-value, at the D that contains the steady motion, no fit without it is made: it would
 # change D, and with it p, by a few parts in N.
 _CLEARLY_STILL = 0.05
 
-
 # A displaced frame is attributed to localisation up to this multiple of the variance that its own
 # residual explains; beyond it the body itself was elsewhere for one frame.
 _BADLY_MEASURED = 100.0
-
 
 # A variance multiplied by this takes a step out of the prediction of the others.
 _LEFT_OUT = 1e6
@@ -93,7 +85,7 @@ class Jumps:
         return np.asarray(np.linalg.norm(self.size, axis=1))
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the jumps as JSON holds them."""
+        """Return the jumps for JSON."""
         plain: dict[str, Any] = to_plain({f.name: getattr(self, f.name) for f in fields(self)})
         return plain
 
@@ -107,7 +99,7 @@ class Jumps:
 
 @dataclass(frozen=True)
 class SteadyMotion:
-    """A mean velocity or spin with the test of whether there is one.
+    """A mean velocity or spin, and the test against a body without one.
 
     Attributes
     ----------
@@ -124,7 +116,7 @@ class SteadyMotion:
     p: float
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the motion and its test as JSON holds them."""
+        """Return the motion and its test for JSON."""
         plain: dict[str, Any] = to_plain(asdict(self))
         return plain
 
@@ -205,8 +197,8 @@ def find_jumps(motion: RigidMotion, estimate: DiffusionEstimate) -> Jumps:
     residuals = leave_one_out_residuals(motion, without_jumps, without=likely).step
     z, others = residuals[likely], residuals[~likely]
     count, d = others.shape
-    # Of a body at rest the residuals are a slow wave, of which one track shows few periods: M may
-    # then be small by chance, but not smaller than 1, its value where the fit is right.
+    # The residuals of a body at rest are a slow wave, of which one track has few periods: M may
+    # then be small by chance. It is not taken smaller than 1, its value where the fit is right.
     square = np.sum((z @ _inverse_root(others.T @ others / count, least=1.0)) ** 2, axis=1)
     freedom = count - d + 1  # of Hotelling's T^2
     p = fdtrc(d, freedom, square * freedom / (d * count))
@@ -237,7 +229,7 @@ def without_spin(motion: RigidMotion, spin: Sequence[float]) -> RigidMotion:
     ----------
     motion : RigidMotion
     spin : sequence of float
-        rad/s about x, y, z; in the plane one number.
+        Angular velocity about x, y, z, rad/s; in the plane one number.
 
     Examples
     --------
@@ -266,9 +258,10 @@ def steady_motion(motion: RigidMotion, estimate: DiffusionEstimate) -> SteadyMot
 
     Notes
     -----
-    Generalised least squares of the steps on X_k = Q_k^T tau_k (Q_k the rotation to the lab; the
-    identity for the centre) with the covariance of diffusion and noise fitted together with it; the
-    information over d is F(d, nu) with nu = 2 / (relative variance of D).
+    The steady motion is found by generalised least squares of the steps on X_k = Q_k^T tau_k (Q_k
+    the rotation to the lab; the identity for the centre) with the covariance of diffusion and noise
+    fitted together with it. The information over d is F(d, nu) with nu = 2 / (relative variance of
+    D).
 
     Examples
     --------
@@ -324,7 +317,7 @@ def offset_gain(motion: RigidMotion, estimate: DiffusionEstimate, *, sigma: floa
 def persistence_gain(
     motion: RigidMotion, estimate: DiffusionEstimate, *, drift: bool = False
 ) -> float:
-    """Return twice the log-likelihood that steps gain by being more alike than blur makes them.
+    """Return twice the log-likelihood gained by steps that are smoother than with motion blur.
 
     Parameters
     ----------
@@ -396,11 +389,11 @@ class StepResiduals(NamedTuple):
     Attributes
     ----------
     step : ndarray, shape (S, A)
-        Each step less its prediction from all others.
+        Standardised difference of each step from its prediction from all others.
     length : ndarray, shape (S, A)
-        The steps themselves, over their standard deviation.
+        Each step over its standard deviation.
     frame : ndarray, shape (S - 1, A)
-        Displacement of the frame between two steps from its prediction.
+        Standardised displacement of the frame between two steps from its prediction.
     linked : ndarray of bool, shape (S - 1,)
         Whether the two steps share that frame.
     measured_badly : ndarray of bool, shape (S - 1,)
@@ -420,6 +413,16 @@ def leave_one_out_residuals(
     """Return the residual of each step given all others but those `without`, standardised.
 
     An estimate with drift was fitted without them as well.
+
+    Examples
+    --------
+    >>> from perrin import Cluster, simulate_motion
+    >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=300, rng=3)
+    >>> from perrin import estimate_diffusion
+    >>> none = np.zeros(299, dtype=bool)
+    >>> residuals = leave_one_out_residuals(truth, estimate_diffusion(truth), without=none)
+    >>> bool(abs(residuals.step.std() - 1) < 0.1)
+    True
     """
     from scipy.linalg.lapack import dpttrf, dpttrs
 
@@ -428,7 +431,7 @@ def leave_one_out_residuals(
     y, linked = s.vectors, s.linked[:-1]
     if estimate.drift is not None and without.any():
         y = s.without_steady_motion(kept=~without)[0].vectors
-    diagonal, beside = covariance_bands(
+    diagonal, off_diagonal = covariance_bands(
         estimate.value,
         _theta(track, estimate),
         s.duration[:, None],
@@ -440,7 +443,7 @@ def leave_one_out_residuals(
     step, frame = np.empty_like(y), np.zeros((len(y) - 1, y.shape[1]))
     for axis in range(y.shape[1]):
         extra = _LEFT_OUT * diagonal[:, axis] * without
-        a, b = diagonal[:, axis] + extra, beside[:, axis]
+        a, b = diagonal[:, axis] + extra, off_diagonal[:, axis]
         d, lower, bad = dpttrf(a, b)
         up, _, bad_up = dpttrf(a[::-1], b[::-1])
         if bad or bad_up:

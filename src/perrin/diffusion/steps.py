@@ -23,13 +23,11 @@ if TYPE_CHECKING:
 
 Quantity = Literal["rotation", "translation"]
 
-
 # Axes whose noise differs by less than this are equally noisy: the errors of the common shape make
 # such differences, and their effect on D is of the order of their square.
 _EQUALLY_NOISY_AXES = 0.02
 
-
-# Steps are even, and a sine transform serves, if times and noise agree to this.
+# Steps are even, and a sine transform is used, if times and noise agree to this.
 _EVEN_STEPS = 1e-9
 
 
@@ -59,7 +57,7 @@ class Steps:
     freedom : int
         Degrees of freedom of those residuals.
     complete : float
-        Mean noise variance of the frames that show the most particles, for an amplitude of 1; NaN
+        Mean noise variance of the frames with the most particles, for an amplitude of 1; NaN
         for steps in body axes, whose likelihood does not need it.
     steady : ndarray, shape (S, c, p)
         What each component of a steady velocity (um/s) or spin (rad/s) along the p lab axes adds to
@@ -149,7 +147,7 @@ class NoisySteps:
     freedom : float
         Degrees of freedom of that estimate: 0 where there is none, inf where theta is fixed.
     level : float
-        Mean of `known` over the frames that show the most particles.
+        Mean of `known` over the frames with the most particles.
     drift : bool
         Whether a steady velocity or spin is free.
     steady : ndarray, shape (p,)
@@ -222,14 +220,15 @@ def _subtracted(steps: Steps, *, drift: bool) -> tuple[Steps, Floats]:
 def steps_of(motion: RigidMotion, quantity: Quantity) -> Steps:
     """Return the steps of a motion along axes in which their noise is diagonal.
 
-    Rotation: body-frame rotation vectors along the axes in which the mean covariance of the
-    orientation of complete frames is diagonal; only the variances along them are kept, and those
-    that differ by less than 2 % are taken as equal. Translation: the centre, in lab axes.
+    The steps of a rotation are body-frame rotation vectors along the axes in which the mean
+    covariance of the orientation of complete frames is diagonal; only the variances along them are
+    kept, and those that differ by less than 2 % are taken as equal. The steps of a translation are
+    displacements of the centre, in lab axes.
 
     Raises
     ------
     TooFewFramesError
-        For fewer than two steps.
+        If there are fewer than two steps.
 
     Examples
     --------
@@ -367,16 +366,16 @@ def direction_steps(motion: RodMotion) -> Steps:
 
     Each step is the vector along u(t) x (u(t + dt) x u(t)) as long as the angle between the two,
     in two axes perpendicular to u that are carried by the least rotations (parallel transport),
-    so that the noise of one frame enters two neighbouring steps with opposite signs. The noise is
-    known as such, not as a multiple of sigma^2: sigma is 1.
+    so that the noise of one frame enters two neighbouring steps with opposite signs. The noise
+    variance is known, not a multiple of sigma^2, so that sigma is 1.
 
     Examples
     --------
     >>> from perrin import Cluster, simulate_motion, track_direction
     >>> truth = simulate_motion(Cluster.touching(2, 2.0), D_R=0.01, dt=0.5, n_frames=9, rng=2)
     >>> rod = track_direction(truth.positions(), dt=0.5)
-    >>> direction_steps(rod).vectors.shape, center_steps(rod).vectors.shape
-    ((8, 2), (8, 3))
+    >>> direction_steps(rod).vectors.shape
+    (8, 2)
     """
     rows = motion.fitted
     u, v = motion.direction[rows[:-1]], motion.direction[rows[1:]]
@@ -392,7 +391,15 @@ def direction_steps(motion: RodMotion) -> Steps:
 
 
 def center_steps(motion: RodMotion) -> Steps:
-    """Return the steps of a rod's centre, with noise known as such: sigma is 1."""
+    """Return the steps of a rod's centre; their noise variance is known, so that sigma is 1.
+
+    Examples
+    --------
+    >>> from perrin import Cluster, simulate_motion, track_direction
+    >>> truth = simulate_motion(Cluster.touching(2, 2.0), D_R=0.01, dt=0.5, n_frames=9, rng=2)
+    >>> center_steps(track_direction(truth.positions(), dt=0.5)).vectors.shape
+    (8, 3)
+    """
     start, stop = motion.steps()
     return _rod_steps(motion, motion.center[stop] - motion.center[start], motion.center_variance)
 
@@ -415,7 +422,7 @@ def _rod_steps(motion: RodMotion, vectors: Floats, variance: Floats) -> Steps:
 
 
 def residual_freedom(motion: RigidMotion) -> int:
-    """Return the degrees of freedom of all rigid-fit residuals; the template costs those of one.
+    """Return the degrees of freedom of all rigid-fit residuals, less those of the template.
 
     Examples
     --------
@@ -431,7 +438,15 @@ def residual_freedom(motion: RigidMotion) -> int:
 
 
 def unit_covariance(motion: RigidMotion) -> Floats:
-    """Return the covariance of every orientation for a localisation error of 1 um, (T, a, a)."""
+    """Return the covariance of every orientation for a localisation error of 1 um, (T, a, a).
+
+    Examples
+    --------
+    >>> from perrin import Cluster, simulate_motion
+    >>> truth = simulate_motion(Cluster.tetrahedron(1.0), D_R=5e-3, dt=0.7, n_frames=9, rng=3)
+    >>> unit_covariance(truth)[0].diagonal().round(9)
+    array([0.375, 0.375, 0.375])
+    """
     square = float(np.mean(motion.noise**2))
     if square > 0:
         return np.asarray(motion.covariance / square)
@@ -440,7 +455,15 @@ def unit_covariance(motion: RigidMotion) -> Floats:
 
 
 def unit_center_variance(motion: RigidMotion) -> Floats:
-    """Return the variance of every centre for a localisation error of 1 um, (T,)."""
+    """Return the variance of every centre for a localisation error of 1 um, (T,).
+
+    Examples
+    --------
+    >>> from perrin import Cluster, simulate_motion
+    >>> truth = simulate_motion(Cluster.tetrahedron(1.0), D_R=5e-3, dt=0.7, n_frames=2, rng=3)
+    >>> unit_center_variance(truth)
+    array([0.25, 0.25])
+    """
     square = float(np.mean(motion.noise**2))
     if square > 0:
         return np.asarray(motion.center_variance / square)

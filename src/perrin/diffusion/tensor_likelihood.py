@@ -20,20 +20,16 @@ if TYPE_CHECKING:
     # D (b, b) and its slopes (m, b, b) by the m parameters of a family of tensors.
     Family: TypeAlias = Callable[[Floats], tuple[Floats, Floats]]
 
-
 # The largest blur: all motion seen in the first and last instant of a frame (1/6: open shutter).
 _MOST_BLUR = 0.25
-
 
 # Where D and noise have the same shape only noise less blur is determined; then this slope of the
 # log-likelihood selects the least blur. It changes the log-likelihood by 0.025 at most.
 _LEAST_BLUR = 0.1
 
-
 # A search has converged where another step would gain this much: 5e-9 standard errors. A gain below
 # the second number is hidden by rounding, and steps are accepted without it.
 _CONVERGED_GAIN, _ROUNDING_GAIN = 1e-17, 1e-9
-
 
 # Step of numerical derivatives, in scaled units where all parameters are of order 1.
 _DIFFERENCE_STEP = 1e-5
@@ -165,15 +161,15 @@ class NoisyVectors:
         first = np.tensordot(theta, s.before, 1) - blur
         last = np.tensordot(theta, s.after, 1) - blur
         diagonal = 2 * D * s.duration[:, None, None] + first + last
-        beside = -last[:-1] * s.linked[:-1, None, None]
-        down, pivots, log_det = band_factor(diagonal, beside)
-        _, up_pivots, log_up = band_factor(diagonal[::-1], beside[::-1])
+        off_diagonal = -last[:-1] * s.linked[:-1, None, None]
+        down, pivots, log_det = band_factor(diagonal, off_diagonal)
+        _, up_pivots, log_up = band_factor(diagonal[::-1], off_diagonal[::-1])
         if not np.isfinite(log_det + log_up):
             return _undefined(D, theta)
         solved, _ = dpbtrs(down, s.vectors.reshape(-1), lower=1)
         z = solved.reshape(s.vectors.shape)
         inverse = symmetric_inverses(pivots + up_pivots[::-1] - diagonal)
-        across = -symmetric_inverses(pivots[:-1]) @ (beside @ inverse[1:])
+        across = -symmetric_inverses(pivots[:-1]) @ (off_diagonal @ inverse[1:])
         same = z[:, :, None] * z[:, None, :] - inverse
         next_one = (z[:-1, :, None] * z[1:, None, :] - across) * s.linked[:-1, None, None]
         value = -0.5 * (log_det + np.sum(s.vectors * z))
@@ -190,7 +186,7 @@ def _undefined(D: Floats, theta: Floats) -> TensorSlopes:
     return TensorSlopes(-np.inf, np.full_like(D, np.nan), np.full_like(theta, np.nan), np.nan)
 
 
-def band_factor(diagonal: Floats, beside: Floats) -> tuple[Floats, Floats, float]:
+def band_factor(diagonal: Floats, off_diagonal: Floats) -> tuple[Floats, Floats, float]:
     """Return the banded Cholesky factor of a block tridiagonal matrix, its pivots and log det.
 
     Examples
@@ -205,7 +201,7 @@ def band_factor(diagonal: Floats, beside: Floats) -> tuple[Floats, Floats, float
     band = np.zeros((count, b, 2 * b))
     for j in range(b):
         band[:, j, : b - j] = diagonal[:, j:, j]
-        band[:-1, j, b - j : 2 * b - j] = beside[:, :, j]
+        band[:-1, j, b - j : 2 * b - j] = off_diagonal[:, :, j]
     factor, bad = dpbtrf(band.reshape(-1, 2 * b).T, lower=1, overwrite_ab=1)
     if bad:
         return factor, diagonal, np.inf
@@ -282,7 +278,17 @@ def axial(axis: Floats) -> Family:
 
 
 class Maximum(NamedTuple):
-    """The greatest likelihood of a family: value, D (b, b), free noise parameters (G, c)."""
+    """The greatest likelihood of a family of tensors.
+
+    Attributes
+    ----------
+    value : float
+        Greatest log-likelihood.
+    D : ndarray, shape (b, b)
+        Tensor at the maximum.
+    own : ndarray, shape (G, c)
+        Free noise parameters of each motion.
+    """
 
     value: float
     D: Floats
@@ -292,8 +298,19 @@ class Maximum(NamedTuple):
 def maximise(tracks: Sequence[NoisyVectors], family: Family, q: Floats, own: Floats) -> Maximum:
     """Return the maximum over a family of D, common to all, and over the noise of each motion.
 
-    A quasi-Newton search (BFGS) from a true Hessian, which is computed again where no step raises
-    the likelihood, and after every 30 steps. It ends at a root of the slopes.
+    The search is quasi-Newton (BFGS) and begins with a true Hessian, which is computed again where
+    no step increases the likelihood, and after every 30 steps. It ends at a root of the slopes.
+
+    Examples
+    --------
+    >>> from perrin import Cluster, simulate_motion
+    >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=300, rng=3)
+    >>> from perrin.diffusion import Noise, ScaledTracks, body_steps
+    >>> data = ScaledTracks.of([body_steps(truth, "rotation", np.eye(3))], Noise())
+    >>> own = np.array([track.start() for track in data.tracks])
+    >>> best = maximise(data.tracks, squares(np.eye(3)[None]), np.ones(1), own)
+    >>> bool(abs(data.in_units(best.D)[0, 0] - 5e-3) < 1e-3)
+    True
     """
     problem = PooledLikelihood(tracks, family, len(q), own.shape)
     p = np.concatenate([q, own.ravel()])
@@ -323,9 +340,20 @@ def maximise(tracks: Sequence[NoisyVectors], family: Family, q: Floats, own: Flo
 def spread(tracks: Sequence[NoisyVectors], best: Maximum, basis: Floats) -> tuple[Floats, Floats]:
     """Return directions of D (m, b, b) and the covariance (m, m) of the error along them.
 
-    From the observed information, the noise left free. The directions F E_j F, with F the root of
-    D, are of the size of D itself: its small values may be thousands of times below the others. The
-    covariance is NaN where the information is not positive.
+    The covariance is that of the observed information with the noise left free, and NaN where the
+    information is not positive. The directions F E_j F, with F the root of D, are of the size of D
+    itself, whose small values may be thousands of times below the others.
+
+    Examples
+    --------
+    >>> from perrin import Cluster, simulate_motion
+    >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=300, rng=3)
+    >>> from perrin.diffusion import Noise, ScaledTracks, body_steps
+    >>> data = ScaledTracks.of([body_steps(truth, "rotation", np.eye(3))], Noise())
+    >>> basis = np.eye(3)[None]
+    >>> directions, covariance = spread(data.tracks, data.fit(basis), basis)
+    >>> bool(0.03 < covariance[0, 0] ** 0.5 < 0.1)  # relative, as the direction is D itself
+    True
     """
     values, axes = np.linalg.eigh(best.D)
     root = (axes * np.sqrt(np.maximum(values, 1e-4 * values[-1]))) @ axes.T

@@ -15,21 +15,16 @@ if TYPE_CHECKING:
 
     from perrin.diffusion.steps import Quantity
 
-
 # Elements of a symmetric matrix in the order of `DiffusionTensor.covariance`.
 SYMMETRIC_ELEMENTS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
-
 
 # An axis that an error of one standard deviation turns by more than this (degrees) is not known.
 _KNOWN_AXIS = 20.0
 
-
-# The error in degrees of the axes of equal values: any direction of their plane will do.
+# The error in degrees of the axes of equal values: no direction in their plane is distinguished.
 EQUAL_AXES_ERROR = 45.0
 
-
 NO_ERRORS = "no errors are known: a value lies on its edge, 0; take longer tracks or longer steps"
-
 
 # Values are distinguished at this level.
 _ISOTROPY_LEVEL = 0.05
@@ -42,11 +37,12 @@ class DiffusionTensor:
     Attributes
     ----------
     tensor : ndarray, shape (3, 3)
-        rad^2/s or um^2/s.
+        Diffusion tensor, rad^2/s or um^2/s.
     principal_values : ndarray, shape (3,)
-        Rising: axis 1 is the one about (or along) which the body diffuses slowest, as in
-        `Mobility`, in predictions and in `msad_axes`. Sorted values of an isotropic body differ by
-        their errors alone: read them with `p_isotropic`, `p_axial` and `resolved_axes`.
+        Principal values in rising order: axis 1 is the one about (or along) which the body diffuses
+        slowest, as in `Mobility`, in predictions and in `msad_axes`. Sorted values of an isotropic
+        body differ by their errors alone: read them with `p_isotropic`, `p_axial` and
+        `resolved_axes`.
     axes : ndarray, shape (3, 3)
         Column a is the body axis of principal value a; right-handed.
     stderr : ndarray, shape (3,)
@@ -122,12 +118,12 @@ class DiffusionTensor:
     def along(self, direction: ArrayLike) -> tuple[float, float]:
         """Return the coefficient along, or about, a body direction, and its standard error.
 
-        Free of the bias of sorted values: the direction is chosen beforehand.
+        The result has no bias of sorted values, because the direction is chosen beforehand.
 
         Parameters
         ----------
         direction : array_like, shape (3,)
-            Body axes, any length but zero.
+            Direction in body axes, of any length but zero.
         """
         p = np.asarray(direction, dtype=np.float64)
         if p.shape != (3,) or not 0 < np.linalg.norm(p) < np.inf:
@@ -141,8 +137,8 @@ class DiffusionTensor:
         Parameters
         ----------
         weights : array_like, shape (3, 3)
-            Symmetric, body axes, with a positive trace: p p^T for one direction, the identity for
-            the mean of all axes, ``LagCurve.weights`` for what a curve grows by.
+            Symmetric weights in body axes with a positive trace: p p^T for one direction, the
+            identity for the mean of all axes, ``LagCurve.weights`` for the slope of a curve.
         """
         w = np.asarray(weights, dtype=np.float64)
         if w.shape != (3, 3) or not 0 < np.trace(w) < np.inf:
@@ -195,7 +191,7 @@ class DiffusionTensor:
         return f"the axes cannot be distinguished: read {mean}, not the three sorted values"
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the tensor as JSON holds it; unknown errors are None."""
+        """Return the tensor for JSON; unknown errors are None."""
         plain: dict[str, Any] = to_plain({f.name: getattr(self, f.name) for f in fields(self)})
         return plain
 
@@ -217,7 +213,7 @@ class CoupledTensor:
     Attributes
     ----------
     tensor : ndarray, shape (6, 6)
-        Translation first: um^2/s, um rad/s, rad^2/s.
+        Diffusion tensor, translation first: um^2/s, um rad/s, rad^2/s.
     stderr : ndarray, shape (6, 6)
         Standard errors of the elements, with the error of the point where it was estimated.
     point : ndarray, shape (3,)
@@ -250,7 +246,7 @@ class CoupledTensor:
         return self.tensor[:3, 3:]
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the tensor as JSON holds it; unknown errors are None."""
+        """Return the tensor for JSON; unknown errors are None."""
         plain: dict[str, Any] = to_plain({f.name: getattr(self, f.name) for f in fields(self)})
         return plain
 

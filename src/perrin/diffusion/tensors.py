@@ -1,4 +1,4 @@
-"""How it diffuses in each direction: tensors of rotation, translation and both, in body axes."""
+"""Diffusion tensors of rotation, of translation, and of both with their coupling, in body axes."""
 
 from __future__ import annotations
 
@@ -43,7 +43,6 @@ if TYPE_CHECKING:
     from perrin._arrays import Floats, Ints
     from perrin.diffusion.steps import Steps
 
-
 # Noise below this variance, relative to a step's, is rounding: that of simulated truth.
 _NOISELESS = 1e-8
 
@@ -61,15 +60,17 @@ def diffusion_tensor(
     Parameters
     ----------
     motion : RigidMotion or sequence of RigidMotion
-        In three dimensions. Several of like bodies, particles in the same order, are pooled: one
-        tensor, each with its own noise; their templates are turned onto the first.
+        Motion in three dimensions. Several motions of like bodies, with their particles in the same
+        order, are pooled: they share one tensor, and each has its own noise. Their templates are
+        turned onto the first.
     quantity : {"rotation", "translation"}
-        From body-frame rotation vectors, or from the centre's displacements in the axes that the
-        body has half way through each step; a drift of the sample is not subtracted.
+        Tensor of rotation, from body-frame rotation vectors, or of translation, from the centre's
+        displacements in the axes that the body has half way through each step; a drift of the
+        sample is not subtracted.
     noise : {"joint", "residual"}, float or Noise
         "joint": the noise is predicted from the template but for one amplitude, which is estimated
         along with D. "residual": that amplitude is measured by the residuals of the rigid fit
-        (right only if all particles of a frame are seen at the same instant). A number: the
+        (right only if all particles of a frame are recorded at the same instant). A number: the
         localisation error of one coordinate, um. A `Noise` holds the exposure as well.
     exposure : float, optional
         Open fraction of dt, 0 to 1: motion blur is exposure/6. Unknown (None) leaves the blur of
@@ -92,7 +93,7 @@ def diffusion_tensor(
         For planar motions, unknown choices, bodies that differ, a symmetry that the template has
         not, or steps without enough information.
     TooFewFramesError
-        Fewer than 12 steps in all, or fewer than 2 of a motion.
+        If there are fewer than 12 steps in all, or fewer than 2 of a motion.
 
     Warns
     -----
@@ -161,10 +162,10 @@ def coupled_tensor(
     Parameters
     ----------
     motion : RigidMotion
-        In three dimensions.
+        Motion in three dimensions.
     point : {"diffusion", "centroid"} or array_like, shape (3,)
-        Whose translation: the centre of diffusion (where the coupling is symmetric), the centre
-        of the template, or a point of the body in template axes, um.
+        Point whose translation is described: the centre of diffusion (where the coupling is
+        symmetric), the centre of the template, or a point of the body in template axes, um.
 
     Returns
     -------
@@ -175,7 +176,7 @@ def coupled_tensor(
     ValueError
         For planar motions, an unknown point, or steps without enough information.
     TooFewFramesError
-        Fewer than 50 steps.
+        If there are fewer than 50 steps.
 
     Warns
     -----
@@ -186,7 +187,7 @@ def coupled_tensor(
     -----
     The steps are the SE(3) logarithms of g_k^-1 g_{k+1}, in the likelihood of `diffusion_tensor`
     with noise of its own for centre and orientation (uncorrelated, as they are at the centroid for
-    localisation errors alike in all axes and all particles seen) and blur unknown. From the
+    equal localisation errors along all axes and all particles present) and blur unknown. From the
     centroid to a point r of the body, with the coupling C of row translation and column rotation
     and [r] u = r x u:
     D_R' = D_R, C' = C - [r] D_R, D_T' = D_T - [r] C^T + C [r] - [r] D_R [r]. The coupling is
@@ -239,7 +240,7 @@ def coupled_tensor(
 
 
 def axes_like(axes: Floats, reference: Floats) -> Ints:
-    """Return the order of the columns of `axes` in which each lies nearest to the reference's.
+    """Return the order of the columns of `axes` in which each is nearest to the reference's.
 
     It numbers axes that are sorted by their own values like those of another tensor of the same
     body: "axis 1" is then the same axis of the body.
@@ -265,7 +266,7 @@ def _refuse_motions(motions: Sequence[RigidMotion], faults: list[str], *, needed
     if not motions or any(m.dimension != 3 for m in motions):
         faults.append(
             "motion: expected one or more motions in three dimensions; in the plane there is one "
-            "angle and no tensor, see estimate_diffusion"
+            "angle and no tensor; use estimate_diffusion"
         )
     refuse(faults)
     counts = [len(m.steps()[0]) for m in motions]
@@ -278,7 +279,15 @@ def _refuse_motions(motions: Sequence[RigidMotion], faults: list[str], *, needed
 
 
 def template_alignments(motions: Sequence[RigidMotion]) -> list[Floats]:
-    """Return the rotations that turn the templates onto the first; refuse bodies that differ."""
+    """Return the rotations that turn the templates onto the first; refuse bodies that differ.
+
+    Examples
+    --------
+    >>> from perrin import Cluster, simulate_motion
+    >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=300, rng=3)
+    >>> len(template_alignments([truth, truth]))
+    2
+    """
     first = motions[0]
     turns = []
     for number, m in enumerate(motions):
@@ -301,7 +310,16 @@ def template_alignments(motions: Sequence[RigidMotion]) -> list[Floats]:
 
 
 def imposed_symmetry(motion: RigidMotion, wanted: str | None) -> tuple[str, Floats]:
-    """Return the point group to impose and a basis (m, 3, 3) of the tensors that have it."""
+    """Return the point group to impose and a basis (m, 3, 3) of the tensors that have it.
+
+    Examples
+    --------
+    >>> from perrin import Cluster, simulate_motion
+    >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=300, rng=3)
+    >>> symbol, basis = imposed_symmetry(truth, None)
+    >>> symbol, len(basis)
+    ('T_d', 1)
+    """
     if wanted == "C_1":
         return "C_1", symmetric_basis(3)
     tolerance = motion.template_error
@@ -365,7 +383,7 @@ class ScaledTracks:
     tracks : list of NoisyVectors
         Steps of every motion and what is known of their noise.
     scale : ndarray, shape (b,)
-        Unit of each component of a step, um or rad.
+        Unit of each component of a step: a length, um, or an angle, rad.
     time : float
         Unit of time, s.
     """
@@ -428,8 +446,10 @@ class ScaledTracks:
             duration = sum(float(t.steps.duration.sum()) for t in self.tracks)
             products = [t.steps.vectors.T @ t.steps.vectors for t in self.tracks]
             now = np.sum(products, axis=0) / duration
-            beside = np.sum([neighbour_products(t.steps) for t in self.tracks], axis=0) / duration
-            values, axes = np.linalg.eigh(0.5 * now + beside)
+            neighbour = (
+                np.sum([neighbour_products(t.steps) for t in self.tracks], axis=0) / duration
+            )
+            values, axes = np.linalg.eigh(0.5 * now + neighbour)
             D = (axes * np.maximum(values, 0.05 * np.trace(now) / len(now))) @ axes.T
             own = np.array([t.start() for t in self.tracks])
         else:

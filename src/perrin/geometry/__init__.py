@@ -1,4 +1,4 @@
-"""Where points are and how they are turned: rotations, shapes, symmetry, rigid bodies."""
+"""Geometry of point sets: rotations, shapes, symmetry, rigid bodies."""
 
 from perrin.geometry.rigid import (
     center_variance,

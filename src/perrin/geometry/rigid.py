@@ -88,7 +88,7 @@ def orientation_covariance(positions: Floats, noise: Floats) -> Floats:
     Parameters
     ----------
     positions : ndarray, shape (n, d)
-        The particles used, body axes; their mean need not be at the origin.
+        Particles used for the fit, body axes; their mean need not be at the origin.
     noise : ndarray, shape (..., d, d)
         Covariance of the localisation error in body axes.
 
@@ -131,7 +131,7 @@ def center_variance(positions: Floats, present: Bools, sigma: float) -> float:
     positions : ndarray, shape (n, d)
         All particles of the body, um, their centre at the origin.
     present : ndarray of bool, shape (n,)
-        Which particles the pose is fitted to.
+        Whether the pose is fitted to each particle.
     sigma : float
         Localisation error of one coordinate, um.
 
@@ -163,7 +163,7 @@ def shifted(tensor: Floats, point: ArrayLike) -> Floats:
     tensor : ndarray, shape (6, 6)
         Translation first.
     point : array_like, shape (3,)
-        From the present point, um, body axes.
+        Position of the new point relative to the present one, um, body axes.
 
     Examples
     --------
@@ -177,9 +177,9 @@ def shifted(tensor: Floats, point: ArrayLike) -> Floats:
 
 
 def diffusion_center(tensor: Floats) -> Floats:
-    """Return the centre of diffusion (3,) of a coupled tensor from its present point, um.
+    """Return the centre of diffusion (3,), relative to the present point of a coupled tensor, um.
 
-    There the coupling is symmetric.
+    About the centre of diffusion the coupling is symmetric.
 
     Examples
     --------

@@ -75,7 +75,17 @@ def kabsch(points: ArrayLike, reference: ArrayLike, *, weights: ArrayLike | None
 
 
 class Similarity(NamedTuple):
-    """Scale, rotation and shift of ``y = s R x + v`` (Hunter 2011, Eq. 1)."""
+    """Scale, rotation and shift of ``y = s R x + v`` (Hunter 2011, Eq. 1).
+
+    Attributes
+    ----------
+    s : ndarray, shape (...)
+        Scale.
+    R : ndarray, shape (..., d, d)
+        Proper rotation matrices.
+    v : ndarray, shape (..., d)
+        Shift, in the unit of y.
+    """
 
     s: Floats
     R: Floats
@@ -141,6 +151,12 @@ def fit_rotations(
         NaN where the answer is not unique.
     unique : ndarray of bool, shape (...)
         Whether the row has a unique rotation.
+
+    Examples
+    --------
+    >>> square, line = np.eye(4, 2), np.zeros((4, 2))
+    >>> fit_rotations(np.stack([square, line]), square)[1]
+    array([ True, False])
     """
     y, x, w = _paired(points, reference, weights)
     batch = np.broadcast_shapes(y.shape[:-2], x.shape[:-2], () if w is None else w.shape[:-1])
@@ -203,7 +219,7 @@ def log_map(rotation: ArrayLike) -> Floats:
     Returns
     -------
     ndarray, shape (..., 3) or (..., 1)
-        rad. In the plane the angle is signed, in (-pi, pi].
+        Rotation vectors, rad. In the plane the angle is signed, in (-pi, pi].
 
     Examples
     --------
@@ -236,7 +252,7 @@ def axis_angle(rotation: ArrayLike) -> tuple[Floats, Floats]:
     axis : ndarray, shape (..., 3)
         Unit vectors; NaN where the angle is 0 and there is no axis.
     angle : ndarray, shape (...)
-        rad, in [0, pi]. At pi either sign of the axis is right.
+        Angles, rad, in [0, pi]. At pi either sign of the axis is right.
 
     Raises
     ------
@@ -328,7 +344,14 @@ def cumulative_product(steps: Floats) -> Floats:
 
     Notes
     -----
-    Two levels of blocks, so that the Python loops have about sqrt(K) passes.
+    The steps are multiplied in two levels of blocks, so that the Python loops have about sqrt(K)
+    passes.
+
+    Examples
+    --------
+    >>> eighth = exp_map([np.pi / 4])
+    >>> log_map(cumulative_product(np.stack([eighth, eighth]))).ravel().round(3)
+    array([0.   , 0.785, 1.571])
     """
     count, d = steps.shape[0], steps.shape[-1]
     length = max(1, int(np.ceil(np.sqrt(count))))
@@ -357,6 +380,13 @@ def successive_product(steps: Floats) -> Floats:
     Returns
     -------
     ndarray, shape (K + 1, d, d)
+
+    Examples
+    --------
+    >>> about_x, about_z = exp_map([np.pi / 2, 0, 0]), exp_map([0, 0, np.pi / 2])
+    >>> products = successive_product(np.stack([about_x, about_z]))
+    >>> np.allclose(products[2], about_z @ about_x)
+    True
     """
     return np.swapaxes(cumulative_product(np.swapaxes(steps, -1, -2)), -1, -2)
 

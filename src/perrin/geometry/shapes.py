@@ -61,7 +61,7 @@ class Cluster:
 
     @classmethod
     def tetrahedron(cls, R: float) -> Cluster:
-        """Four particles at distance `R` (um) from the centre (Hunter 2011, Eq. 14).
+        """Return four particles at distance `R` (um) from the centre (Hunter 2011, Eq. 14).
 
         Examples
         --------
@@ -77,7 +77,7 @@ class Cluster:
 
     @classmethod
     def pentahedron(cls, R: float) -> Cluster:
-        """Five particles, all at distance `R` (um) from the centre (Hunter 2011, Eq. 15).
+        """Return five particles, all at distance `R` (um) from the centre (Hunter 2011, Eq. 15).
 
         Real clusters of five touching spheres are `touching(5, diameter)`, a longer body.
 
@@ -91,7 +91,7 @@ class Cluster:
 
     @classmethod
     def trimer(cls, R: float) -> Cluster:
-        """Three particles in an equilateral triangle, at distance `R` (um) from the centre.
+        """Return three particles in an equilateral triangle, at distance `R` (um) from the centre.
 
         Examples
         --------
@@ -105,7 +105,8 @@ class Cluster:
     def touching(cls, n: int, diameter: float) -> Cluster:
         """Return `n` = 2..7 equal touching spheres in their usual compact arrangement.
 
-        Dumbbell, triangle, tetrahedron, trigonal bipyramid, octahedron, pentagonal bipyramid.
+        In the order of `n` these are the dumbbell, triangle, tetrahedron, trigonal bipyramid,
+        octahedron and pentagonal bipyramid.
 
         Parameters
         ----------
@@ -205,11 +206,11 @@ def pair_distances(points: Floats) -> Floats:
 
     Parameters
     ----------
-    points : array of shape (..., n, d)
+    points : ndarray, shape (..., n, d)
 
     Returns
     -------
-    array of shape (..., n (n - 1) / 2)
+    ndarray, shape (..., n (n - 1) / 2)
         In the order (0, 1), (0, 2), ..., (1, 2), ...; NaN where a point is missing.
 
     Examples

@@ -175,12 +175,12 @@ def certified_rotation(c: Floats, error: Floats) -> tuple[Floats, Bools]:
     gram = _matrix_product(b.transpose(1, 0, 2), b)
     r = 0.5 * (root * root + 1.0) * b + root * cofactor - _matrix_product(b, gram)
     r = r / np.maximum(gap, 1e-12)
-    # One Newton-Schulz step squares away the rounding that a small gap lets in.
+    # One Newton-Schulz step squares the rounding error, which a small gap makes large.
     schulz = 0.5 * (r - _matrix_product(r, _matrix_product(r.transpose(1, 0, 2), r)))
     r = r + schulz
     step, definite = _newton_step(_matrix_product(r.transpose(1, 0, 2), b))
-    # Both steps are quadratic: short ones land within rounding, and a long one shows a root
-    # that has not converged. The error left by the second grows as the gap closes.
+    # Both steps converge quadratically: after short steps the error is rounding, and a long step
+    # shows that the root has not converged. The error after the second grows as the gap closes.
     converged = ((schulz * schulz).sum((0, 1)) < 1e-16) & ((step * step).sum(0) < 1e-14 * gap)
     # |B| = 1 bounds two factors of the gap by sqrt(2), so the third, s2 + s3, is over gap / 2.
     certain = definite & converged & (gap > 1e-7) & (0.5 * gap * norm * largest > error)
@@ -192,7 +192,7 @@ def characteristic_root(det: Floats, cofactor2: Floats) -> tuple[Floats, Floats]
     """Return the largest root of Wahba's characteristic quartic, and the gap to the next one.
 
     The quartic of a matrix B with |B| = 1 is (l^2 - 1)^2 - 8 l det B - 4 |cof B|^2. Its roots are
-    at most sqrt(3); Newton's method falls from there monotonically.
+    at most sqrt(3), from where Newton's method decreases monotonically.
 
     Parameters
     ----------

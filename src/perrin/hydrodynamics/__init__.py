@@ -1,4 +1,4 @@
-"""What the fluid does to a body: resistance, mobility, walls, sizes."""
+"""Hydrodynamics of rigid bodies of spheres: resistance, mobility, walls, gravity, sizes."""
 
 from perrin.hydrodynamics.mobility import (
     Mobility,

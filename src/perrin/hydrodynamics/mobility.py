@@ -1,4 +1,4 @@
-"""How a rigid body of spheres moves in a viscous fluid: cluster_mobility -> Mobility."""
+"""Mobility of a rigid body of spheres in a viscous fluid: its 6x6 diffusion tensor."""
 
 from __future__ import annotations
 
@@ -22,23 +22,27 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike
 
-
 BOLTZMANN = 1.380649e-23  # J/K, exact in the SI
-
 
 # Temperatures of liquids under a microscope, K; values in degrees Celsius are outside.
 _COLDEST, _HOTTEST = 200.0, 500.0
 
-
-_HIGHEST_DEGREE = 40
-
+_HIGHEST_DEGREE = 40  # of the harmonics that a user may request
 
 # Surface points of a sphere from which the volume of an overlapping body is computed, to 1e-4.
 _VOLUME_POINTS = 20_000
 
 
 class Principal(NamedTuple):
-    """Principal values of a tensor in increasing order, and unit axes as columns."""
+    """Principal values of a tensor and its principal axes.
+
+    Attributes
+    ----------
+    values : ndarray, shape (3,)
+        Principal values in increasing order.
+    axes : ndarray, shape (3, 3)
+        Unit vectors along the principal axes, one per column.
+    """
 
     values: Floats
     axes: Floats
@@ -240,9 +244,9 @@ def cluster_mobility(
     radius : float or array_like, shape (n,)
         Sphere radius, um.
     viscosity : float
-        Pa s.
+        Viscosity of the fluid, Pa s.
     temperature : float
-        K.
+        Temperature of the fluid, K.
     degree : int, optional
         Highest degree of the harmonics about each sphere, 1 to 40. Default: the first one whose
         error estimate is under `accuracy`.
@@ -324,7 +328,7 @@ def apparent_translation(mobility: Mobility, *, point: ArrayLike) -> float:
     Returns
     -------
     float
-        um^2/s: D_T + (tr(D_R) r^2 - r D_R r)/3 at a distance r from the centre of diffusion.
+        D_T + (tr(D_R) r^2 - r D_R r)/3, um^2/s, at the distance r from the centre of diffusion.
 
     Raises
     ------
@@ -346,10 +350,10 @@ def apparent_translation(mobility: Mobility, *, point: ArrayLike) -> float:
     >>> print(round(3 * one / np.trace(body.D_T), 2))
     1.22
     """
-    at = np.asarray(point, dtype=np.float64)
-    if at.shape != (3,) or not np.isfinite(at).all():
+    location = np.asarray(point, dtype=np.float64)
+    if location.shape != (3,) or not np.isfinite(location).all():
         raise ValueError(f"point: expected three finite coordinates (um), got {point!r}")
-    return float(np.trace(mobility.at(at)[:3, :3])) / 3
+    return float(np.trace(mobility.at(location)[:3, :3])) / 3
 
 
 def condition_faults(**values: object) -> list[str]:

@@ -19,42 +19,33 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-
 # Surface points of a sphere over a third of its unknowns. At 2 the error from the points is below
 # that from the degree, for touching spheres; at 3 the error is a tenth smaller.
 _OVERSAMPLING = 2.0
 
-
 # Exposed fraction of a sphere below which the density of its points does not increase further.
 _LEAST_EXPOSED = 0.05
 
-
 _PROBES = 2000  # points from which the exposed fraction of a sphere is computed
-
 
 # Added to normal equations with a unit diagonal. Flows about spheres that overlap deeply are nearly
 # equal; this shifts the forces by less than 1e-7 and keeps the factorisation positive.
 _RIDGE = 1e-13
-
 
 # Error over the change from two degrees below. The change is at least 1.8 times the remaining error
 # for equal spheres and 0.6 times for radii 1:10 (benchmarks/mobility.py), so that the estimate is
 # above a third of the error.
 _ERROR_PER_CHANGE = 0.75
 
-
 # Error over the antisymmetric part, which is a third or less of the error from the surface points
 # of overlapping spheres.
 _ERROR_PER_ASYMMETRY = 3.0
 
-
 # Degrees in the order in which they are tried. Equal touching spheres converge at 7.
 _DEGREES = (5, 7, *range(8, 42, 2))
 
-
 # Largest number of unknowns of a solution of increasing degree: a minute and half a gigabyte.
 _MOST_UNKNOWNS = 7000
-
 
 _LARGEST_BLOCK = 4_000_000  # flow components of the surface points that are held at once
 
@@ -132,7 +123,7 @@ def solve_resistance(centers: Floats, radii: Floats, *, degree: int) -> Resistan
     radii : ndarray, shape (n,)
         Spheres may touch or overlap.
     degree : int
-        At least 1.
+        Highest degree of the harmonics, at least 1.
 
     Returns
     -------
@@ -158,7 +149,7 @@ def converge_resistance(centers: Floats, radii: Floats, *, accuracy: float) -> R
     centers, radii
         As in `solve_resistance`.
     accuracy : float
-        Relative.
+        Required relative error of the resistance.
 
     Returns
     -------
@@ -173,6 +164,12 @@ def converge_resistance(centers: Floats, radii: Floats, *, accuracy: float) -> R
     -----
     PrecisionWarning
         If `accuracy` is not reached at the largest number of unknowns.
+
+    Examples
+    --------
+    >>> found = converge_resistance(np.zeros((1, 3)), np.ones(1), accuracy=1e-6)
+    >>> bool(abs(found.matrix[0, 0] / (6 * np.pi) - 1) < 1e-6)  # Stokes
+    True
     """
     lowest = _DEGREES[0]
     most = _MOST_UNKNOWNS // _unknowns(lowest)
@@ -384,7 +381,7 @@ def solid_harmonics(x: Floats, degree: int) -> NDArray[np.complex128]:
     Returns
     -------
     ndarray, shape (degree + 1, degree + 1, P)
-        Of degree n and order m; zero for m > n.
+        The harmonic of degree n and order m; zero for m > n.
 
     Examples
     --------

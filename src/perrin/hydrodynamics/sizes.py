@@ -5,11 +5,11 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields
-from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeAlias, runtime_checkable
+from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeAlias, get_args, runtime_checkable
 
 import numpy as np
 
-from perrin._arrays import refuse
+from perrin._arrays import choice_fault, refuse
 from perrin.errors import UnitWarning
 from perrin.geometry.shapes import Cluster, is_tetrahedron, pair_distances
 from perrin.hydrodynamics.mobility import BOLTZMANN, Mobility, cluster_mobility, condition_faults
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from perrin._arrays import Floats
-
 
 # Units of the numbers of a `Size`, as they end its keys in JSON.
 _SIZE_UNITS = {
@@ -46,23 +45,18 @@ class HasStandardError(Protocol):
 
 Measured: TypeAlias = HasStandardError | float | tuple[float, float]
 
-
 Viscosity: TypeAlias = float | tuple[float, float] | Callable[[float], float]
 
-
 Factor: TypeAlias = Literal["exact", "hoffmann2009"]
-
 
 # d_tetra / d_sphere of Hunter 2011, Eq. 25, for both modes. Resolved hydrodynamics of touching
 # spheres gives 1.784 for translation and 1.818 for rotation.
 _HOFFMANN = 1.844
 
-
 # Largest distance of touching spheres over the smallest pair distance. Diameters vary by a few per
 # cent; the next neighbours in compact clusters are 1.41 diameters away, those of the paper's
 # pentahedron 1.22.
 _NEIGHBOUR_RATIO = 1.2
-
 
 # Half the interval (K) of the central difference of a viscosity.
 _HALF_INTERVAL = 0.01
@@ -266,7 +260,7 @@ def size_and_viscosity(
     Returns
     -------
     Size
-        With its `viscosity`, Pa s.
+        Size together with the `viscosity`, Pa s.
 
     Raises
     ------
@@ -317,10 +311,10 @@ def _stokes_einstein(
     *,
     mode: Literal["translation", "rotation"],
 ) -> Size:
-    """Return the sizes with d = kT/(3 pi eta D_T), or d^3 = kT/(pi eta D_R), and their errors."""
+    """Return the sizes from d = kT/(3 pi eta D_T), or d^3 = kT/(pi eta D_R), and their errors."""
     (value, error), (kelvin, kelvin_error) = _pair(D), _pair(temperature)
     eta, eta_error = (1.0, 0.0) if callable(viscosity) else _pair(viscosity)
-    faults = [] if factor in ("exact", "hoffmann2009") else [f"factor: {factor!r} is unknown"]
+    faults = choice_fault("factor", factor, get_args(Factor))
     faults += _pair_faults(
         D=(value, error), viscosity=(eta, eta_error), temperature=(kelvin, kelvin_error)
     )

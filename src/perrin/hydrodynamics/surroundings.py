@@ -16,19 +16,15 @@ if TYPE_CHECKING:
 
     from perrin._arrays import Floats
 
-
 _GRAVITY = 9.80665  # m/s^2, standard
-
 
 # Height over the hydrodynamic radius below which the series of a sphere has an error above 2 % for
 # the translation of a cluster along the normal.
 _LOWEST_HEIGHT = 2.5
 
-
 # Liquid water at 0.1 MPa in uPa s: sum of a (T/300 K)^b, 253.15 K to 383.15 K
 # (IAPWS SR6-08, Revised Supplementary Release on Properties of Liquid Water at 0.1 MPa).
 _WATER_TERMS = ((280.68, -1.9), (511.45, -7.7), (61.131, -19.6), (0.45903, -40.0))
-
 
 _WATER_RANGE = (253.15, 383.15)
 
@@ -92,7 +88,7 @@ def wall_factor(body: Mobility | float, *, height: float) -> WallFactor:
     body : Mobility or float
         A cluster, averaged over its orientations, or the diameter of a sphere, um.
     height : float
-        Height of its centre above the wall, um; at least 2.5 hydrodynamic radii.
+        Height of the body's centre above the wall, um; at least 2.5 hydrodynamic radii.
 
     Returns
     -------
@@ -151,7 +147,7 @@ def wall_diffusion(
     ----------
     body : Mobility
     height : float
-        Height of its centre above the wall, um.
+        Height of the body's centre above the wall, um.
     normal : {"x", "y", "z"}
         Lab axis perpendicular to the wall.
 
@@ -196,7 +192,7 @@ def gravitational_height(body: Mobility, *, density_difference: float) -> float:
     Returns
     -------
     float
-        um; inf for matched densities.
+        Height, um; inf for matched densities.
 
     Raises
     ------
@@ -228,7 +224,7 @@ def settling_velocity(body: Mobility, *, density_difference: float) -> float:
     Returns
     -------
     float
-        um/s, negative if the cluster rises: D_T (F - buoyancy)/kT.
+        Velocity D_T (F - buoyancy)/kT, um/s; negative if the cluster rises.
 
     Raises
     ------
@@ -259,7 +255,7 @@ def water_viscosity(temperature: float) -> float:
     Returns
     -------
     float
-        Pa s.
+        Viscosity, Pa s.
 
     Raises
     ------

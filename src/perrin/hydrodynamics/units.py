@@ -6,7 +6,6 @@ from __future__ import annotations
 # common solvents, 1.4 Pa s. A value in mPa s given as Pa s is 0.5 or more in every solvent.
 _HIGHEST_VISCOSITY, _WATER_VISCOSITY = 0.5, 1e-3
 
-
 # um. Spheres that a microscope resolves and that diffuse measurably have 0.2 to 10 um.
 _SMALLEST_LENGTH, _LARGEST_LENGTH = 0.05, 50.0
 

@@ -30,6 +30,7 @@ from perrin.motion.residuals import (
     lagged_products,
     measure_scan,
     measure_stretch,
+    median_chi2,
     regress,
     sample_residuals,
 )
@@ -76,6 +77,7 @@ __all__ = [
     "mean_present",
     "measure_scan",
     "measure_stretch",
+    "median_chi2",
     "misplaced_detections",
     "no_orientation",
     "no_rotation",

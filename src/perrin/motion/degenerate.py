@@ -1,4 +1,4 @@
-"""Why the particles of a cluster determine no orientation: the errors that refuse it."""
+"""Clusters whose particles determine no orientation: tests, and errors that state the cause."""
 
 from __future__ import annotations
 
@@ -12,12 +12,10 @@ from perrin.geometry.shapes import pair_distances
 # rigid: localisation errors are below a tenth of the distance of two spheres.
 _DISTANCE_CHANGE = 0.2
 
-
 # Least width of particles on a line over their localisation error at which the line is no effect of
 # noise: noise alone keeps the width of the mean shape below 2, and sigma_z may be three times the
 # sigma of a distance across it.
 _LINE_WIDTH = 6.0
-
 
 # Ratio of median absolute deviation and standard deviation of Gaussian numbers.
 _MEDIAN_DEVIATION = 0.6745
@@ -29,16 +27,22 @@ def require_points(seen: Bools, d: int) -> None:
     Parameters
     ----------
     seen : ndarray of bool, shape (T, n)
-        Which particles are present.
+        Whether each particle is present.
     d : int
         Number of coordinates, 2 or 3.
 
     Raises
     ------
     DegenerateClusterError
-        Fewer than d particles.
+        If there are fewer than d particles.
     ValueError
-        A particle without any row.
+        If a particle is missing in every row.
+
+    Examples
+    --------
+    >>> require_points(np.ones((2, 2), dtype=bool), 3)
+    Traceback (most recent call last):
+    perrin.errors.DegenerateClusterError: 2 particles: a rotation in 3 dimensions needs at least 3
     """
     n = seen.shape[1]
     if n < d:
@@ -69,7 +73,7 @@ def no_rotation(x: Floats) -> DegenerateClusterError:
     seen = present(x).astype(np.float64)
     shared = seen @ seen[np.argmax(seen.sum(axis=1))]
     if np.sum(shared >= d) < 2:
-        text = f"no frame shares {d} of the {n} particles with the frame that shows most of them"
+        text = f"no frame shares {d} of the {n} particles with the frame that contains most of them"
     elif d == 2:
         text = f"the {n} particles are in one place"
     else:
@@ -197,7 +201,13 @@ def distance_change(x: Floats) -> tuple[float, tuple[int, int], float | None]:
 
 
 def mean_present(x: Floats, *, axis: int) -> Floats:
-    """Return the mean over the values of an axis that are not NaN; NaN where there are none."""
+    """Return the mean over the values of an axis that are not NaN; NaN where there are none.
+
+    Examples
+    --------
+    >>> mean_present(np.array([[1.0, np.nan], [3.0, np.nan]]), axis=0)
+    array([ 2., nan])
+    """
     here = np.isfinite(x)
     count = here.sum(axis=axis)
     total = np.where(here, x, 0.0).sum(axis=axis)

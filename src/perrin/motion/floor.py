@@ -16,7 +16,7 @@ from perrin.geometry.shapes import Cluster
 
 @dataclass(frozen=True, eq=False)
 class NoiseFloor:
-    """The mean square angle that a motionless cluster seems to turn, from localisation error alone.
+    """Mean square angle by which a motionless cluster appears to turn, from localisation error.
 
     Attributes
     ----------
@@ -39,7 +39,8 @@ class NoiseFloor:
         Parameters
         ----------
         direction : array_like, shape (d,)
-            Any length but zero, in body axes. In the plane every direction has the same floor.
+            Direction in body axes, of any length but zero. In the plane every direction has the
+            same floor.
         """
         if self.covariance.shape == (1, 1):
             return self.phi2
@@ -50,7 +51,7 @@ class NoiseFloor:
         return float(2 * (np.trace(self.covariance) - p @ self.covariance @ p))
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the floor as JSON holds it.
+        """Return the floor for JSON.
 
         Examples
         --------
@@ -113,7 +114,7 @@ def noise_floor(cluster: Cluster | ArrayLike, *, sigma: ArrayLike) -> NoiseFloor
     n, d = body.positions.shape
     noise = np.diag(as_sigma(sigma, d) ** 2)
     extent = np.linalg.svd(body.positions, compute_uv=False)
-    needed = 1 if d == 2 else 2  # extents that must differ from 0
+    needed = 1 if d == 2 else 2  # number of extents that must differ from 0
     if n <= needed or extent[needed - 1] <= 1e-9 * extent[0] or extent[0] == 0:
         raise DegenerateClusterError(
             f"the cluster's {n} particles do not fix an orientation: {d} dimensions need at "
@@ -154,9 +155,9 @@ def floor_range(template: Floats, rotation: Floats, *, ratio: float) -> tuple[fl
     template : ndarray, shape (n, 3)
         Particles of the body, um, their centre at the origin.
     rotation : ndarray, shape (T, 3, 3)
-        Lab from body, without NaN.
+        Orientations, lab from body, without NaN.
     ratio : float
-        sigma_z over sigma_xy lies between 1/ratio and ratio.
+        Bound of sigma_z over sigma_xy, which is between 1/ratio and ratio.
 
     Returns
     -------

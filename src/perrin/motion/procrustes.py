@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 
     from perrin._arrays import Bools, Floats, Ints
 
-
 # Largest rotation (rad) of a last Gauss-Newton step: rounding of a rotation matrix.
 _LAST_TURN = 1e-13
 
@@ -32,7 +31,7 @@ class PoseFit(NamedTuple):
     Attributes
     ----------
     rotation : ndarray, shape (T, d, d)
-        Lab from body.
+        Orientation of the body, lab from body.
     center : ndarray, shape (T, d)
         Centre of the template, lab frame, um.
     template : ndarray, shape (n, d)
@@ -58,7 +57,7 @@ def fit_template(x: Floats, seen: Bools) -> PoseFit:
     x : ndarray, shape (T, n, d)
         Positions, um, NaN where missing.
     seen : ndarray of bool, shape (T, n)
-        Which particles are present.
+        Whether each particle is present.
 
     Returns
     -------
@@ -103,7 +102,7 @@ def fit_chain(x: Floats, seen: Bools) -> PoseFit:
     x : ndarray, shape (T, n, d)
         Positions, um, NaN where missing.
     seen : ndarray of bool, shape (T, n)
-        Which particles are present.
+        Whether each particle is present.
 
     Returns
     -------
@@ -141,8 +140,9 @@ def chain_steps(x: Floats, seen: Bools) -> tuple[Ints, Floats]:
     Returns
     -------
     rows : ndarray of int, shape (K,)
+        Frames that can be chained.
     rotation : ndarray, shape (K - 1, d, d)
-        Lab axes.
+        Rotation from each of these frames to the next, lab axes.
 
     Examples
     --------
@@ -177,7 +177,7 @@ def step_residuals(
     x : ndarray, shape (T, n, d)
     seen : ndarray of bool, shape (T, n)
     rows, step : ndarray
-        As from `chain_steps`.
+        Chained frames and the rotations between them, as `chain_steps` returns them.
 
     Returns
     -------
@@ -211,7 +211,7 @@ def fit_weighted(
 ) -> tuple[PoseFit, tuple[Floats, Floats]]:
     """Fit the poses again with weights 1/variance; return them with their errors.
 
-    Gauss-Newton steps in the rotation vector (lab axes) and the centre.
+    The fit takes Gauss-Newton steps in the rotation vector (lab axes) and the centre.
 
     Parameters
     ----------
@@ -220,7 +220,7 @@ def fit_weighted(
     x : ndarray, shape (T, n, d)
         Positions, um, NaN where missing.
     seen : ndarray of bool, shape (T, n)
-        Which particles are present.
+        Whether each particle is present.
     variance : ndarray, shape (n, d)
         Variance of the localisation error of every coordinate of every particle, um^2.
 
@@ -283,16 +283,16 @@ def pose_errors(fit: PoseFit, seen: Bools, noise: Floats) -> tuple[Floats, Float
     fit : PoseFit
         A fit with equal weights.
     seen : ndarray of bool, shape (T, n)
-        Which particles are present.
+        Whether each particle is present.
     noise : ndarray, shape (d,)
         Variance of the localisation error along each lab axis, um^2.
 
     Returns
     -------
     covariance : ndarray, shape (T, 3, 3) or (T, 1, 1)
-        rad^2, body axes.
+        Covariance of the orientation, rad^2, body axes.
     variance : ndarray, shape (T,)
-        um^2, mean over axes.
+        Variance of one coordinate of the centre, um^2, mean over axes.
 
     Examples
     --------
@@ -372,7 +372,7 @@ def _fit_of(x: Floats, seen: Bools, rotation: Floats, shape: Floats) -> PoseFit:
 
 def _too_few_poses(count: int) -> TooFewFramesError:
     return TooFewFramesError(
-        f"{count} frame{'s' if count != 1 else ''} with a pose: at least 2 are needed to see a "
+        f"{count} frame{'s' if count != 1 else ''} with a pose: at least 2 are needed for a "
         "rotation",
         count,
     )

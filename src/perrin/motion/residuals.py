@@ -16,40 +16,48 @@ from perrin.motion.tracking import template_motion
 if TYPE_CHECKING:
     from perrin.motion.rigid_motion import RigidMotion
 
-
 # Most frames sampled: the standard error of every average here is then below 2 % of its scatter.
 _SAMPLED_FRAMES = 2000
 
-
 # Two-sided probability below which a slope is taken to differ from zero.
 SIGNIFICANCE = 1e-3
-
 
 # Least power (um^2) of a displacement over what noise of the fitted orientation adds to it: below
 # this factor the body turns or moves too little to measure the slope.
 _LEAST_POWER = 4.0
 
-
 # Largest standard error of the stretch (relative) that is still reported as measured.
 _STRETCH_ERROR = 0.1
-
 
 # Spread of the variances of the axes, over the mean square residual, that is assumed before they
 # are measured: residuals of a body in the plane x y hardly contain the noise along z, which may be
 # up to ten times as large.
 _VARIANCE_SPREAD = 6.0
 
-
 # Largest relative standard error of a variance that is still reported as measured.
 _VARIANCE_ERROR = 0.3
-
 
 # Largest speed of the centre over the median speed: faster ones are jumps, not the motion that a
 # sequential scan displaces particles by.
 _JUMP_SPEED = 6.0
 
-
 _LEVI_CIVITA = -skew(np.eye(3))
+
+
+def median_chi2(freedom: float) -> float:
+    """Return the median of chi squared (Wilson and Hilferty, 1931; within 3 % from 1 on).
+
+    Parameters
+    ----------
+    freedom : float
+        Degrees of freedom.
+
+    Examples
+    --------
+    >>> round(median_chi2(3.0), 2)  # exact: 2.37
+    2.38
+    """
+    return freedom * (1 - 2 / (9 * freedom)) ** 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,14 +98,13 @@ class Residuals:
     def median_sigma(self) -> float:
         """Localisation error of one coordinate (um) from the median frame; NaN where unknown.
 
-        A few bad frames hardly change it. The median of chi-squared with f degrees of freedom is
-        f (1 - 2/(9 f))^3 (Wilson and Hilferty).
+        A few bad frames hardly change it.
         """
         freedom, count = self.freedom, len(self.vector)
         if count < 2 or freedom == 0:
             return np.nan
         square = float(np.median((self.vector**2).sum(axis=(1, 2)))) * count / (count - 1)
-        return float(np.sqrt(square / (freedom * (1 - 2 / (9 * freedom)) ** 3)))
+        return float(np.sqrt(square / median_chi2(freedom)))
 
     def left_of(self, displacement: Floats) -> Floats:
         """Return what a rigid fit leaves of displacements (K, n, d), less their mean shape."""
@@ -112,7 +119,17 @@ class Residuals:
 
 
 class Slope(NamedTuple):
-    """A regression coefficient of the residuals, its standard error and degrees of freedom."""
+    """A regression coefficient of the residuals.
+
+    Attributes
+    ----------
+    value : float
+        Coefficient; NaN where it is not determined.
+    stderr : float
+        Standard error of the coefficient.
+    freedom : float
+        Degrees of freedom of the standard error.
+    """
 
     value: float
     stderr: float
@@ -216,7 +233,7 @@ def autocorrelation(sums: Floats, freedom: float) -> Floats:
     Returns
     -------
     ndarray, shape (M,)
-        At the lags 1, ..., M.
+        Autocorrelation at the lags 1, ..., M.
 
     Examples
     --------
@@ -244,7 +261,7 @@ def lag_one_autocorrelation(residuals: Floats) -> Slope:
     Parameters
     ----------
     residuals : ndarray, shape (T, n, d)
-        Body axes, NaN where missing; gaps are not bridged.
+        Residuals in body axes, NaN where missing; gaps are not bridged.
 
     Examples
     --------
@@ -349,7 +366,15 @@ def regress(
 
 
 class AxisNoise(NamedTuple):
-    """Variance of the localisation error along each lab axis, um^2, and its covariance."""
+    """Variance of the localisation error along each lab axis.
+
+    Attributes
+    ----------
+    variance : ndarray, shape (d,)
+        Variance along each lab axis, um^2.
+    covariance : ndarray, shape (d, d)
+        Covariance of these variances, um^4.
+    """
 
     variance: Floats
     covariance: Floats
@@ -375,7 +400,7 @@ class AxisNoise(NamedTuple):
 
 
 def axis_noise(sample: Residuals) -> AxisNoise | None:
-    """Measure the localisation error of each lab axis; None where the residuals leave it open.
+    """Measure the localisation error of each lab axis; None where it is not determined.
 
     The squares of a frame's residuals along the lab axes are a linear function of the variances
     through the projector of the fit. The covariance is that of the measured squares, widened by
@@ -421,7 +446,17 @@ def axis_noise(sample: Residuals) -> AxisNoise | None:
 
 
 class Stretch(NamedTuple):
-    """Scale of z, the residuals of the body with z corrected, and its motion."""
+    """Scale of z against x and y, and the fit with z corrected.
+
+    Attributes
+    ----------
+    scale : Slope
+        Scale of z (1: not stretched).
+    sample : Residuals
+        Residuals of the body with z corrected.
+    motion : RigidMotion
+        Motion of the body with z corrected.
+    """
 
     scale: Slope
     sample: Residuals
@@ -553,7 +588,7 @@ def measure_scan(sample: Residuals) -> Slope:
     Returns
     -------
     Slope
-        1/v with its sign; NaN in the plane and for a body at rest.
+        Delay 1/v with its sign; NaN in the plane and for a body at rest.
 
     Examples
     --------

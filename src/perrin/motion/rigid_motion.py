@@ -15,10 +15,8 @@ if TYPE_CHECKING:
     import pandas as pd
     from scipy.spatial.transform import Rotation
 
-
 # Apparent D_R dt of a tetrahedron at rest, over (sigma/R)^4.
 _RESTING_DIFFUSION = 0.04
-
 
 _WHOLE_NUMBERS = ("n_present", "piece")
 
@@ -48,7 +46,7 @@ class RigidMotion:
         Number of the track piece that the frame belongs to. Within a piece the identity of the
         particles is certain; no pair of frames is formed across two pieces.
     reason : tuple of str, length T
-        Why a frame has no pose; empty where it has one.
+        Reason why a frame has no pose; empty where it has one.
     template : ndarray, shape (n, d)
         Particles of the common shape, um, their centre at the origin.
     sigma : float
@@ -197,7 +195,7 @@ class RigidMotion:
         Returns
         -------
         ndarray, shape (T, 3) or (T, K, 3); in the plane (T, 1) or (T, K, 1)
-            rad, lab axes.
+            Rotation vectors, rad, lab axes.
         """
         p = self.orientation(p0)
         start, stop = self.steps()
@@ -230,7 +228,8 @@ class RigidMotion:
         Returns
         -------
         ndarray, shape (T, 3); in the plane (T, 1)
-            rad; 0 at the beginning of every piece, NaN in frames without a pose.
+            Accumulated rotation, rad; 0 at the beginning of every piece, NaN in frames without a
+            pose.
         """
         start, stop = self.steps()
         before, after = self.rotation[start], self.rotation[stop]
@@ -338,7 +337,7 @@ class RigidMotion:
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the motion as JSON holds it: lists for arrays, None for NaN."""
+        """Return the motion for JSON: lists for arrays, None for NaN."""
         return {field.name: to_plain(getattr(self, field.name)) for field in fields(self)}
 
     @classmethod
@@ -377,18 +376,20 @@ def threshold_displacement(motion: RigidMotion, *, threshold: float) -> Floats:
     ----------
     motion : RigidMotion
     threshold : float
-        rad, 0 to pi: above the rotations in a cage, below those of interest. 0 is the sum of all
-        steps; pi is the rotation vector from the first frame of the piece, which is bounded.
+        Angle, rad, 0 to pi: above the rotations in a cage, below those of interest. With 0 all
+        steps are summed; with pi the result is the rotation vector from the first frame of the
+        piece, which is bounded.
 
     Returns
     -------
     ndarray, shape (T, 3); in the plane (T, 1)
-        rad, lab axes; 0 at the beginning of every piece, NaN in frames without a pose.
+        Sum of the rotation vectors, rad, lab axes; 0 at the beginning of every piece, NaN in
+        frames without a pose.
 
     Raises
     ------
     ValueError
-        For a threshold out of range.
+        If the threshold is out of range.
 
     Notes
     -----
@@ -432,7 +433,7 @@ def threshold_references(rotation: Floats, piece: Ints, *, threshold: float) -> 
     piece : ndarray of int, shape (K,)
         Pieces; the reference of the first pose of a piece is itself.
     threshold : float
-        rad.
+        Angle, rad, at which the reference changes.
 
     Returns
     -------

@@ -31,58 +31,46 @@ if TYPE_CHECKING:
 
     from perrin.motion.rigid_motion import RigidMotion
 
-
 # Largest residual of a rigid body, a coordinate, over R: the localisation errors of real cameras
 # reach half of it.
 _LARGEST_RESIDUAL = 0.03
 
-
 # Largest lag-1 autocorrelation of residuals that is still localisation error without memory.
 _SMOOTHEST_RESIDUAL = 0.3
-
 
 # Largest residual over the sigma stated by the user, which replaces both rules above: a stated
 # sigma is exact within this factor.
 _LARGEST_OVER_SIGMA = 2.0
 
-
 # Largest displacement of one particle against the others that is smooth in time (root mean square)
 # over R: as for the residuals of all.
 _LARGEST_FLEXING = 0.03
 
-
 # Share of the detections of each particle that are trimmed (winsorised) as outliers.
 _TRIMMED_SHARE = 0.05
-
 
 # A detection is misplaced beyond this multiple of the distance from its position in the common
 # shape that `_USUAL_SHARE` of all detections keep: 4.9 standard deviations where the noise is along
 # one axis, 7.5 where it is equal in three.
 _MISPLACED_MULTIPLE, _USUAL_SHARE = 3.0, 0.9
 
-
 # Largest share of the frames of a rigid body in which one particle, or any, is misplaced: detectors
 # fail as often.
 _MISPLACED_PARTICLE, _MISPLACED_FRAMES = 0.05, 0.1
 
-
 # Number of blocks of time whose median distances of a pair are compared.
 _TIME_BLOCKS = 8
 
-
 # Largest change of a pair's distance between blocks, over the distance, before a bond is broken.
 _LARGEST_DRIFT = 0.2
-
 
 # Standard errors by which a change of a distance must exceed its noise: 28 pairs of blocks of up to
 # dozens of pairs of particles are compared.
 _DRIFT_ERRORS = 5.0
 
-
 # Smallest relative error of the scale of z that is reported, where it is significant: refractive
 # indices are not known better.
 _SCALE_ERROR = 0.01
-
 
 # Largest ratio of sigma_z to sigma_xy, over the stated ratio, that is not reported: a stated ratio
 # is no more exact.
@@ -197,7 +185,7 @@ def judge_quality(
     detections: ArrayLike | None = None,
     unsettled: ArrayLike = (),
 ) -> Quality:
-    """Judge a cluster's rigid fits.
+    """Test whether a cluster is rigid, and measure the errors of its positions.
 
     Parameters
     ----------
@@ -224,7 +212,7 @@ def judge_quality(
     Raises
     ------
     ValueError
-        For bad shapes or values.
+        If a shape or value is not valid.
 
     Examples
     --------

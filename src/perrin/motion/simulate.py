@@ -23,7 +23,6 @@ from perrin.motion.rigid_motion import RigidMotion
 if TYPE_CHECKING:
     from perrin.geometry.shapes import Cluster
 
-
 # Largest D dt of one substep of an anisotropic rotor: Gaussian rotation vectors are exact to first
 # order in D dt, and the remaining error of E[R] at this step is about 1e-6.
 _SUBSTEP = 0.002
@@ -70,8 +69,8 @@ def simulate_motion(
     Raises
     ------
     ValueError
-        For bad values, a tensor that is not positive semidefinite, a tensor with "euler", or
-        coefficients given with a `Mobility`.
+        If a value is out of range, a tensor is not positive semidefinite or is given with "euler",
+        or coefficients are given with a `Mobility`.
 
     Examples
     --------
@@ -128,7 +127,7 @@ def add_noise(positions: ArrayLike, *, sigma: ArrayLike, rng: np.random.Generato
     Parameters
     ----------
     positions : array_like, shape (T, n, d)
-        um.
+        Particle positions, um.
     sigma : float or array_like, shape (d,)
         Standard deviation of one coordinate, um; one number or one per axis.
     rng : numpy.random.Generator or int
@@ -234,7 +233,7 @@ def heat_kernel_angles(D: float) -> tuple[Floats, Floats]:
     Returns
     -------
     angle : ndarray, shape (20001,)
-        rad.
+        Rotation angles, rad.
     cdf : ndarray, shape (20001,)
 
     Notes

@@ -33,9 +33,7 @@ from perrin.motion.rigid_motion import RigidMotion
 
 Reference = Literal["template", "previous"]
 
-
 Weights = Literal["equal", "sigma"]
-
 
 # Standard deviation (rad) of the orientation about its most uncertain axis above which a pose is
 # refused: the particles lie on a line within the noise, and small-angle errors no longer hold.
@@ -89,11 +87,12 @@ def track_rotation(
     Raises
     ------
     DegenerateClusterError
-        Fewer than 3 particles (2 in the plane), or particles on one line within the noise.
+        If there are fewer than 3 particles (2 in the plane), or they lie on one line within the
+        noise.
     TooFewFramesError
-        Fewer than 2 frames with a pose.
+        If there are fewer than 2 frames with a pose.
     ValueError
-        For bad shapes or values.
+        If a shape or value is not valid.
 
     Examples
     --------
@@ -146,7 +145,7 @@ def template_motion(x: Floats, *, time: Floats, dt: float) -> RigidMotion:
     x : ndarray, shape (T, n, d)
         Positions, um; every particle is present in some frame.
     time : ndarray, shape (T,)
-        s.
+        Time of each frame, s.
     dt : float
         Time between frames, s.
 
@@ -186,17 +185,17 @@ def remove_rotation(
     Returns
     -------
     positions : ndarray, shape (T, n, d)
-        In the axes of the first fitted frame, about the centre of the particles' mean positions,
-        um; NaN in frames without a pose.
+        Positions in the axes of the first fitted frame, about the centre of the particles' mean
+        positions, um; NaN in frames without a pose.
     motion : RigidMotion
-        The motion that was removed.
+        Motion that was removed.
 
     Raises
     ------
     DegenerateClusterError, TooFewFramesError
         As in `track_rotation`.
     ValueError
-        For bad shapes or values, and for particles present only in frames without a pose.
+        If a shape or value is not valid, or a particle is present only in frames without a pose.
 
     Examples
     --------
@@ -304,7 +303,7 @@ def _motion_of(
 
 
 def _missing_reasons(seen: Bools, fitted: Bools, lost: Bools, d: int) -> tuple[str, ...]:
-    """Return for every frame why it has no pose; empty where it has one."""
+    """Return for every frame the reason why it has no pose; empty where it has one."""
     n = seen.shape[1]
 
     def reason(count: int, ok: bool, blurred: bool) -> str:

@@ -11,7 +11,6 @@ from perrin.tracks.bonds import (
 )
 from perrin.tracks.clock import Clock, evenly_spaced, frame_stride, read_clock
 from perrin.tracks.clusters import (
-    REACH,
     cluster_positions,
     each_cluster,
     find_clusters,
@@ -39,7 +38,6 @@ from perrin.tracks.identity import (
     icp_search,
     labels_are_certain,
     labels_in_time,
-    median_chi2,
     most_likely_identity,
     most_likely_path,
     rigid_fits,
@@ -66,7 +64,6 @@ from perrin.tracks.writing import write_json, written_whole
 
 __all__ = [
     "CENTRE_REMOVED",
-    "REACH",
     "BodyModel",
     "Candidates",
     "Centers",
@@ -109,7 +106,6 @@ __all__ = [
     "lattice_step",
     "link_clusters",
     "linked_tracks",
-    "median_chi2",
     "most_likely_identity",
     "most_likely_path",
     "neighbour_pairs",

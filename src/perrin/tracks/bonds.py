@@ -11,54 +11,44 @@ from perrin.tracks.groups import connected_groups, frames_of
 if TYPE_CHECKING:
     from perrin._arrays import Bools, Floats, Ints
 
-
 # Up to this number of particles every pair is followed; of more only the nearest neighbours, which
 # are searched for in some of the frames.
 _ALL_PAIRS, _NEAREST_FOLLOWED, _SCREENED_FRAMES = 64, 12, 60
 
-
 # Followed positions per chunk of pairs: bounds the memory.
 _CHUNK_ROWS = 1_000_000
-
 
 # A pair needs this number of shared frames. They are divided into blocks of time: white noise has
 # one of n - 1 parts of its variance per block between them, a random walk seven eighths.
 _FEWEST_SHARED, _MOST_BLOCKS, _BLOCK_FRAMES = 8, 8, 5
 
-
 # Distances farther from the median than 5 standard deviations (from the quantiles at 10 and 90 %)
 # are measured wrongly and do not count.
 _TAIL_QUANTILE, _GROSS_ERROR = 0.1, 5.0
 
-
 _NORMAL_RANGE = 2.563  # between these quantiles of a normal distribution, in standard deviations
-
 
 # A distance is constant where it varies by under a tenth of the distance to the nearest particle.
 _CONSTANT_SHARE = 0.1
 
-
-# Variations are slow where more than half of the variance lies between blocks of time. The
+# Variations are slow where more than half of the variance is between blocks of time. The
 # distance of two free particles then varies as their separation does along every axis; that of a
 # body by under a tenth of it (variance), or under 30 % of its slow part.
 _SLOW_SHARE, _TIED_SHARE, _SLOW_TIED_SHARE = 0.5, 0.1, 0.3
 
-
 # A pair whose distance varies by under 0.2 % of the distance to the nearest particle, less than any
 # localisation error, is at rest.
 _REST_SHARE = 2e-3
-
 
 # Two groups are one body unless the distances between them vary by over 2.5 times (rms) what the
 # distances inside vary; slow variations, of which there are few blocks, are compared by an F test
 # at this level.
 _MOST_EXCESS, _SLOW_TEST_LEVEL = 2.5, 1e-3
 
-
 # A group whose distances vary by over 6 times those of the tightest group is a body only if they
-# vary less (variance) than the separations along the axes: of trapped particles both vary alike.
+# vary less (variance) than the separations along the axes. For trapped particles both variances are
+# similar.
 _LOOSE_RATIO, _TURNING_SHARE = 6.0, 0.7
-
 
 # The localisation error along one axis of the microscope is at most this factor from that along the
 # others. The logarithm of its square costs this share of a fluctuation's sampling error, so that
@@ -67,7 +57,7 @@ _WORST_AXIS_RATIO, _AXIS_STEPS, _AXIS_PRICE = 5.0, 12, 0.25
 
 
 class Pairs(NamedTuple):
-    """How the separations of pairs of particles vary; one entry per pair.
+    """Variances of the separations of pairs of particles, one entry per pair.
 
     Attributes
     ----------
@@ -84,7 +74,7 @@ class Pairs(NamedTuple):
     slow : ndarray
         Variance of the distance from the means of the blocks; equal to `variance` for white noise.
     free, free_slow : ndarray
-        The same of the separation along the axes, mean over the axes, um^2.
+        The same two variances for the separation along the axes, mean over the axes, um^2.
     direction : ndarray, shape (P, d)
         Mean squares of the components of the pair's direction.
     nearest : ndarray
@@ -118,7 +108,7 @@ class Pairs(NamedTuple):
         off = (distance - median[pair])[:, None]
         variance, slow = _variances(pair, block, off, shared, blocks)
         free, free_slow = _variances(pair, block, separation, shared, blocks)
-        # Two particles at one place have no direction: all axes count alike.
+        # Two particles at one place have no direction: all axes count equally.
         alike = np.where(distance == 0, 1 / np.sqrt(separation.shape[1]), 0.0)[:, None]
         unit = (separation / np.where(distance == 0, 1.0, distance)[:, None] + alike) ** 2
         n = np.maximum(shared, 1)
@@ -140,7 +130,7 @@ class Pairs(NamedTuple):
     def share(self, slow: Floats, variance: Floats) -> Floats:
         """Return the share of a variance that lies between blocks of time."""
         between, total = slow * (self.blocks - 1), variance * (self.shared - 1)
-        # What does not change at all, to rounding, does not vary slowly.
+        # A separation that is constant to rounding does not vary slowly.
         still = total <= self.shared * (1e-12 * self.distance) ** 2
         return np.where(still, 0.0, between / np.where(still, 1.0, total))
 
@@ -295,7 +285,7 @@ def followed_pairs(frame: Ints, code: Ints, x: Floats, *, count: int) -> Pairs:
     Returns
     -------
     Pairs
-        Those that share frames.
+        Pairs that share frames.
 
     Examples
     --------
@@ -349,15 +339,15 @@ def _median_and_spread(pair: Ints, values: Floats, count: int) -> tuple[Floats, 
     ordered = values[np.lexsort((values, pair))]
     size = np.bincount(pair, minlength=count)
     start = np.cumsum(size) - size
-    at = []
+    quantiles = []
     for q in (_TAIL_QUANTILE, 0.5, 1 - _TAIL_QUANTILE):
         place = start + q * np.maximum(size - 1, 0)
         low = np.minimum(place.astype(np.int64), max(len(ordered) - 1, 0))
         high = np.minimum(low + 1, max(len(ordered) - 1, 0))
         low, high = (ordered[k] if len(ordered) else np.zeros(count) for k in (low, high))
         share = place % 1.0
-        at.append(np.where(share > 0, (1 - share) * low + share * high, low))
-    return at[1], (at[2] - at[0]) / _NORMAL_RANGE
+        quantiles.append(np.where(share > 0, (1 - share) * low + share * high, low))
+    return quantiles[1], (quantiles[2] - quantiles[0]) / _NORMAL_RANGE
 
 
 def _variances(

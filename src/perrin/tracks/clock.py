@@ -18,10 +18,8 @@ if TYPE_CHECKING:
 
     from perrin._arrays import Floats, Ints
 
-
 # Times that differ from an even grid by less than this share of dt are even.
 _GRID_TOLERANCE = 5e-4
-
 
 # The median interval of the column may differ from dt by this share: clocks are not exact.
 _DT_TOLERANCE = 0.01

@@ -36,10 +36,6 @@ if TYPE_CHECKING:
     import pandas as pd
     from numpy.typing import ArrayLike
 
-
-REACH = TOUCHING_REACH  # the former name
-
-
 # Frame numbers that span more than this, and more than this multiple of the frames that occur, are
 # times or ids.
 _LONGEST_SPAN, _SPARSEST_FRAMES = 1_000_000, 1000
@@ -58,8 +54,8 @@ def cluster_positions(
     table : pandas.DataFrame
         Tracks as `read_tracks` and `check_tracks` return them, coordinates in um.
     cluster : int or str, optional
-        Which cluster, where the column ``cluster`` holds several. A table without that column is
-        one cluster.
+        Number or name of the cluster, where the column ``cluster`` holds several. A table without
+        that column is one cluster.
 
     Returns
     -------
@@ -67,7 +63,7 @@ def cluster_positions(
         Coordinates in um, NaN where missing; d is 3 where the table has a column ``z``, else 2.
         Particles are in the order of their ids.
     frames : ndarray of int64, shape (T,)
-        The frame number of each row.
+        Frame number of each row.
 
     Raises
     ------
@@ -146,10 +142,10 @@ def each_cluster(table: pd.DataFrame) -> Iterator[tuple[int, Floats, Ints, Ints]
         positions, frames = _as_array(tracks.frame[rows], tracks.code[rows], tracks.x[rows])
         piece = np.zeros(len(frames), dtype=np.int64)
         if stretch is not None:
-            at = tracks.frame[rows] - frames[0]
-            piece[at] = stretch[rows]
+            position = tracks.frame[rows] - frames[0]
+            piece[position] = stretch[rows]
             last = np.zeros(len(frames), dtype=np.int64)
-            last[at] = at
+            last[position] = position
             piece = piece[np.maximum.accumulate(last)]
         yield int(label[inside[0]]), positions, frames, piece
 
@@ -160,7 +156,7 @@ def _as_array(frame: Ints, code: Ints, x: Floats) -> tuple[Floats, Ints]:
     Numbers that cannot be frames are refused.
     """
     if not len(frame):
-        raise TrackTableError("no row has coordinates; nothing to follow", ("no coordinates",))
+        raise TrackTableError("no row has coordinates", ("no coordinates",))
     first, last = int(frame.min()), int(frame.max())
     span, distinct = last - first + 1, len(np.unique(frame))
     if span > max(_LONGEST_SPAN, _SPARSEST_FRAMES * distinct):
@@ -181,14 +177,14 @@ def positions_table(positions: ArrayLike, *, frames: ArrayLike | None = None) ->
     Parameters
     ----------
     positions : array_like, shape (T, n, d)
-        um; points that are NaN have no row.
+        Positions, um; points that are NaN have no row.
     frames : array_like of int, shape (T,), optional
         Frame numbers; default 0, 1, 2, ...
 
     Returns
     -------
     pandas.DataFrame
-        frame, particle, x, y[, z], cluster (0).
+        Columns frame, particle, x, y[, z] and cluster (0).
 
     Examples
     --------
@@ -339,13 +335,10 @@ def identify(table: pd.DataFrame, *, contact: float, size: int) -> pd.DataFrame:
     particle = np.full(len(table), -1, dtype=np.int64)
     particle[rows[known]] = cluster[known] * size + own[known]
     if "particle" in table:
-        given, found, at = (
-            table["particle"].to_numpy()[rows[known]],
-            particle[rows[known]],
-            piece[known],
-        )
-        order = np.lexsort((frame[known], at, found))
-        same = (np.diff(found[order]) == 0) & (np.diff(at[order]) == 0)
+        given = table["particle"].to_numpy()[rows[known]]
+        found, part = particle[rows[known]], piece[known]
+        order = np.lexsort((frame[known], part, found))
+        same = (np.diff(found[order]) == 0) & (np.diff(part[order]) == 0)
         passed = order[1:][same & (given[order[1:]] != given[order[:-1]])]
         if passed.size:
             warnings.warn(
@@ -384,8 +377,8 @@ def _particles_and_pieces(frame: Ints, x: Floats, size: int) -> tuple[Ints, Ints
         found = settle_identity(positions, times=times, size=size, labelled=False)
         taken, piece = found.order, found.piece
     particle = np.full((len(times), size), -1, dtype=np.int64)
-    at, number = np.nonzero(taken >= 0)
-    particle[at, taken[at, number]] = number
+    filled, number = np.nonzero(taken >= 0)
+    particle[filled, taken[filled, number]] = number
     out = np.empty((2, len(frame)), dtype=np.int64)
     out[:, order] = particle[row, column], piece[row]
     return out[0], out[1]

@@ -11,9 +11,7 @@ from perrin._text import listed
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
-
 COLUMNS = ("frame", "particle", "x", "y", "z", "cluster", "time")
-
 
 # Spellings are compared without regard to case, blanks, underscores and units.
 _OURS_BY_SPELLING = {
@@ -22,7 +20,6 @@ _OURS_BY_SPELLING = {
     "particleid": "particle",
     "clusterid": "cluster",
 }
-
 
 _UNIT_UM: dict[str, float | None] = {
     **dict.fromkeys(("um", "\u03bcm", "micron", "microns", "micrometer", "micrometre"), 1.0),
@@ -34,14 +31,12 @@ _UNIT_UM: dict[str, float | None] = {
     **dict.fromkeys(("px", "pix", "pixel", "pixels", "voxel", "voxels"), None),
 }
 
-
 _UNIT_SECONDS = {
     **dict.fromkeys(("s", "sec", "second", "seconds"), 1.0),
     **dict.fromkeys(("ms", "msec"), 1e-3),
     **dict.fromkeys(("min", "minute", "minutes"), 60.0),
     "h": 3600.0,
 }
-
 
 _UNITS_OF: dict[str, Mapping[str, float | None]] = {
     "x": _UNIT_UM,
@@ -50,13 +45,10 @@ _UNITS_OF: dict[str, Mapping[str, float | None]] = {
     "time": _UNIT_SECONDS,
 }
 
-
 # A unit at the end of a name: in brackets, or one of these after an underscore, as in x_um.
 _IN_BRACKETS = re.compile(r"(.*?)[\s_]*(?:\(([^()]*)\)|\[([^\[\]]*)\])")
 
-
 _AFTER_UNDERSCORE = re.compile(r"(.*)_(um|\u03bcm|nm|mm|px|pixels?|s|ms)")
-
 
 _SCALE_ROUNDING = 1e-6  # relative difference of two scales that are the same
 
@@ -131,7 +123,7 @@ def recognise_columns(
         notes.append(f"columns recognised: {pairs}")
     if left:
         notes.append(
-            f"columns left out beside others with exactly our names: {listed(map(repr, left))}"
+            f"columns left out, because others have exactly our names: {listed(map(repr, left))}"
         )
     if seconds(units) != 1:
         name, unit = units["time"]
@@ -147,7 +139,7 @@ def unit_faults(units: Mapping[str, tuple[str, str]], scale: Mapping[str, float]
     units : mapping
         As in `Spelling`.
     scale : mapping of str to float
-        um per unit of the coordinates, of every axis.
+        Micrometres per unit of the coordinates, for every axis.
 
     Returns
     -------
@@ -161,7 +153,7 @@ def unit_faults(units: Mapping[str, tuple[str, str]], scale: Mapping[str, float]
     "scale: 'x (um)' is in um, but the scale is 0.1 um per unit"
     """
     stated = {axis: _UNIT_UM[units[axis][1]] for axis in scale if axis in units}
-    # 1 for all axes is the default; a pixel of 1 um beside other sizes is a statement.
+    # 1 for all axes is the default; together with other sizes a pixel of 1 um was stated.
     given = any(value != 1 for value in scale.values())
     unknown = [axis for axis, um in stated.items() if um is None and not given]
     wrong = [

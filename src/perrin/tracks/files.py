@@ -12,7 +12,6 @@ from perrin._text import listed
 from perrin.errors import table_error
 from perrin.tracks.column_names import COLUMNS, Spelling, recognise_columns, seconds, unit_faults
 from perrin.tracks.formats import LARGEST_EXACT, parse_csv, parse_table, table_bytes, table_suffix
-from perrin.tracks.formats import SUFFIXES as SUFFIXES
 from perrin.tracks.writing import written_whole
 
 if TYPE_CHECKING:
@@ -23,18 +22,14 @@ if TYPE_CHECKING:
 
     from perrin._arrays import Bools, Floats, Ints
 
-
 _AXES = ("x", "y", "z")
-
 
 _GDF_NAMES = {
     4: ("x", "y", "frame", "particle"),
     5: ("x", "y", "z", "frame", "particle"),
 }
 
-
 _GDF_EXAMPLE = 'columns={"x": 0, "y": 1, "z": 2, "frame": -2, "particle": -1}'
-
 
 _PathLike: TypeAlias = str | os.PathLike[str]
 
@@ -139,7 +134,7 @@ def check_tracks(table: pd.DataFrame, *, source: str, scale: ArrayLike = 1.0) ->
         Name of the table in messages: the name of its file, or "the table". For a source ending in
         ``.csv`` or ``.csv.gz`` they count lines (the header is line 1), else rows from 0.
     scale : float or one float per axis
-        um per unit of the coordinates.
+        Micrometres per unit of the coordinates.
 
     Returns
     -------
@@ -188,8 +183,8 @@ def write_tracks(table: pd.DataFrame, path: _PathLike) -> None:
         Tracks, coordinates in um.
     path : str or path
         Name of the file, ending in ``.csv``, ``.csv.gz``, ``.parquet`` or ``.gdf`` (little endian,
-        float64, columns x, y[, z], frame, particle). In a csv, text ids that look like numbers come
-        back as numbers; parquet keeps them.
+        float64, columns x, y[, z], frame, particle). Text ids of digits in
+        a csv are read back as numbers; parquet keeps them.
 
     Raises
     ------
@@ -228,15 +223,16 @@ def read_spheres(path: _PathLike) -> tuple[Floats, Floats | None]:
     Returns
     -------
     centers : ndarray, shape (n, 3)
+        Sphere centres, um.
     radius : ndarray, shape (n,), or None
-        None where the file has no such column.
+        Radii, um; None where the file has no such column.
 
     Raises
     ------
     TrackTableError
         If the file is no such table; all faults are listed.
     OSError
-        If it cannot be read.
+        If the file cannot be read.
 
     Examples
     --------

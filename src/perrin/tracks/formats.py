@@ -14,9 +14,7 @@ from perrin.tracks.gdf import gdf_bytes, parse_gdf
 if TYPE_CHECKING:
     import pandas as pd
 
-
 SUFFIXES = (".csv", ".csv.gz", ".parquet", ".gdf")
-
 
 LARGEST_EXACT = 2**53  # whole numbers up to this are exact as float64
 

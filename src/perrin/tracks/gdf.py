@@ -18,7 +18,6 @@ if TYPE_CHECKING:
 
 _GDF_MAGIC = 82991
 
-
 _GDF_TYPES = {1: "u1", 2: "i2", 3: "i4", 4: "f4", 5: "f8"}
 
 

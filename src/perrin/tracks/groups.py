@@ -11,7 +11,6 @@ if TYPE_CHECKING:
 
     from perrin._arrays import Floats, Ints
 
-
 # Particles nearer than this number of contact distances touch. The next shell of a packing begins
 # at 1.41 diameters.
 TOUCHING_REACH = 1.3

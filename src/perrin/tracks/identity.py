@@ -43,56 +43,36 @@ from perrin.errors import IdentityWarning
 from perrin.geometry.rigid import degrees_of_freedom
 from perrin.geometry.rotations import fit_rotations
 from perrin.geometry.shapes import pair_distances
+from perrin.motion.residuals import median_chi2
+from perrin.motion.rods import LABEL_LOG_ODDS, LEAP_LABELLED, LEAP_UNLABELLED, SETTLED_LOG_ODDS
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
     from numpy.typing import ArrayLike
 
-
 # A fit is noise-like up to this multiple of the usual mean square residual: chance does not reach
 # it in a frame of usual quality, and an exchanged pair (1000 times and more) is far above.
 _NOISE_LIKE = 16.0
-
 
 # Degrees of freedom of the Student law of a frame's misfit: the odds between two assignments of a
 # bad frame depend on the ratio of their misfits, not on their difference in units of usual noise.
 _STUDENT_FREEDOM = 8.0
 
-
 # Every assignment is tried for bodies of up to this number of particles.
 _MOST_PERMUTED = 6
 
-
 _MOST_MODEL_ROWS = 300  # rows from which the shape is averaged
-
-
-# Log-odds: an assignment is settled when the next best is a hundred times less likely, and lasting
-# labels are trusted e^18 times more than an exchange of them. Right labels are then doubted when
-# chance makes another assignment e^18/100 = 6.6e5 times likelier, in at most 300 x 11/6.6e5 = 0.5 %
-# of the tracks of 300 frames of a tetrahedron (likelihood ratios exceed c with probability 1/c).
-_SETTLED_LOG_ODDS, _LABEL_LOG_ODDS = float(np.log(100.0)), 18.0
-
-
-# A least turn of over this many standard deviations of an axis (squared) widens the law of the step
-# to itself. Lasting labels that turn the body 75 degrees are kept against an exchange that leaves
-# 45 (a tetrahedron), and replaced where the exchange leaves a third or less of the turn.
-_LEAP_UNLABELLED, _LEAP_LABELLED = 16.0, 4.0
-
 
 # A step of under 0.4 of the least angle between two assignments cannot be mistaken.
 _SHORT_STEP = 0.4
 
-
 _BATCH_FITS = 100_000  # rigid fits at a time: bounds the memory
-
 
 # A column with points in this share of the rows is a particle.
 _LASTING_SHARE = 0.05
 
-
 _ROUNDING_ANGLE = 1e-6  # rotations by less than this, rad, are rounding errors
-
 
 # A fit of a large body this close (of the least particle distance) is right, and ends a search that
 # begins at one in this number of the covering rotations.
@@ -188,8 +168,8 @@ def settle_identity(
     Parameters
     ----------
     positions : array_like, shape (T, m, d)
-        Detections of one body, um; NaN where there is none. Columns mean nothing where `labelled`
-        is False. Columns that never occur in the same row may be the same particle.
+        Detections of one body, um; NaN where there is none. Columns have no meaning where
+        `labelled` is False. Columns that never occur in the same row may be the same particle.
     times : array_like, shape (T,), optional
         Time of each row, any unit; default 0, 1, 2, ...
     size : int, optional
@@ -207,7 +187,7 @@ def settle_identity(
     Raises
     ------
     ValueError
-        For bad shapes.
+        If a shape is not valid.
 
     Warns
     -----
@@ -222,8 +202,8 @@ def settle_identity(
     follows a Student law, so that a frame noisier than the others is no evidence for another
     assignment. s^2 is at least 1/16 of the least squared turn (1/4 with labels): a leap is not
     judged by the law of small steps. With labels the assignment of the last frame is always a
-    candidate, also in a frame in which nothing fits as well. All assignments are tried for up to 6
-    particles; for more, linear assignment and rigid fit alternate, from many orientations.
+    candidate, also in a frame in which no assignment is noise-like. All assignments are tried for
+    up to 6 particles; for more, linear assignment and rigid fit alternate, from many orientations.
 
     Examples
     --------
@@ -303,7 +283,7 @@ def body_size(seen: Bools) -> int:
 
 
 def _without_assignment(seen: Bools, n: int, *, labelled: bool) -> Identity:
-    """Return the labels as given, one particle a column; without labels nothing is assigned."""
+    """Return the labels as given, one particle a column; without labels none is assigned."""
     none = np.empty(0, dtype=np.int64)
     if labelled:
         order = np.where(seen, np.arange(seen.shape[1]), -1)
@@ -399,7 +379,7 @@ class BodyModel(NamedTuple):
             centred = points[fits] - points[fits].mean(axis=1, keepdims=True)
             shape = np.einsum("tij,tni->tnj", rotation[fits], centred).mean(axis=0)
         freedom = float(degrees_of_freedom(np.array(len(shape)), shape.shape[1]))
-        # Rounding takes the place of noise where there is none.
+        # Where there is no noise, the rounding error is taken as noise.
         sigma2 = float(np.median(rigid_fits(points, shape)[1])) / median_chi2(freedom)
         sigma2 = max(sigma2, (1e-7 * float(np.abs(shape).max())) ** 2)
         return cls(shape, sigma2, shape_symmetry(shape, sigma2), label)
@@ -500,7 +480,7 @@ class BodyModel(NamedTuple):
 
 
 def _evenly(rows: Ints) -> Ints:
-    """Return evenly spaced ones of some rows, as many as the shape is averaged from at most."""
+    """Return evenly spaced rows of some, at most as many as the shape is averaged from."""
     spaced: Ints = rows[np.linspace(0, rows.size - 1, min(rows.size, _MOST_MODEL_ROWS)).astype(int)]
     return spaced
 
@@ -518,7 +498,7 @@ def rigid_fits(points: Floats, template: Floats) -> tuple[Floats, Floats]:
     Parameters
     ----------
     points : ndarray, shape (..., n, d)
-        NaN where missing.
+        Points, um; NaN where missing.
     template : ndarray, shape (..., n, d)
 
     Returns
@@ -598,7 +578,7 @@ def best_assignments(
     points : ndarray, shape (K, n, d)
     template : ndarray, shape (n, d)
     symmetry : ndarray of int, shape (G, n), optional
-        Of the assignments that it makes equivalent only one is tried.
+        Permutations that leave the shape unchanged: of equivalent assignments one is tried.
 
     Returns
     -------
@@ -682,7 +662,7 @@ def icp_fit(x: Floats, template: Floats, rotation: Floats) -> tuple[Ints, Floats
     ----------
     x, template : ndarray, shape (n, d)
     rotation : ndarray, shape (d, d)
-        Where to begin.
+        Rotation with which the search begins.
 
     Returns
     -------
@@ -717,7 +697,7 @@ def icp_fit(x: Floats, template: Floats, rotation: Floats) -> tuple[Ints, Floats
 def covering_rotations(d: int) -> Floats:
     """Return rotations of which one is within about 30 degrees of any rotation, shape (K, d, d).
 
-    Super-Fibonacci spirals in three dimensions (Alexa, CVPR 2022).
+    In three dimensions they are super-Fibonacci spirals (Alexa, CVPR 2022).
 
     Examples
     --------
@@ -742,17 +722,6 @@ def covering_rotations(d: int) -> Floats:
     turns[:, 2] = np.stack([2 * (a * c - b * w), 2 * (b * c + a * w), 1 - 2 * (a * a + b * b)], -1)
     frozen(turns)
     return turns
-
-
-def median_chi2(freedom: float) -> float:
-    """Return the median of chi squared (Wilson and Hilferty, 1931; within 3 % from 1 on).
-
-    Examples
-    --------
-    >>> round(median_chi2(3.0), 2)  # exact: 2.37
-    2.38
-    """
-    return freedom * (1 - 2 / (9 * freedom)) ** 3
 
 
 def shape_symmetry(template: Floats, sigma2: float) -> Ints:
@@ -799,7 +768,7 @@ def squared_angle(one: Floats, other: Floats) -> Floats:
     Returns
     -------
     ndarray, shape (...)
-        rad^2
+        Squared angle, rad^2.
 
     Examples
     --------
@@ -881,9 +850,9 @@ class Candidates(NamedTuple):
         rotation, misfit = np.zeros((count, width, d, d)), np.full((count, width), np.inf)
         rows, listed = np.nonzero((assignment >= 0).any(axis=2))
         for part in _batches(rows.size, 1):
-            at = rows[part], listed[part]
-            points = assigned_points(detections.x[at[0]], assignment[at][:, None])[:, 0]
-            rotation[at], misfit[at] = rigid_fits(points, body.template)
+            entry = rows[part], listed[part]
+            points = assigned_points(detections.x[entry[0]], assignment[entry][:, None])[:, 0]
+            rotation[entry], misfit[entry] = rigid_fits(points, body.template)
         used = (assignment >= 0).sum(axis=2)
         cost = body.misfit_cost(misfit, used, detections.shown)
         return cls(assignment, rotation, cost, misfit <= body.misfit_limit(used), given)
@@ -945,9 +914,9 @@ class Candidates(NamedTuple):
         turns = np.full(misfit.shape, np.inf)
         for pose in poses:
             square = squared_angle(pose.rotation, self.rotation[row])
-            # The law of small steps does not hold for a leap: its own size counts.
+            # A leap does not follow the law of small steps: its own size is its variance.
             least = float(square[np.isfinite(misfit)].min())
-            wide = max(pose.variance, least / (_LEAP_LABELLED if labelled else _LEAP_UNLABELLED))
+            wide = max(pose.variance, least / (LEAP_LABELLED if labelled else LEAP_UNLABELLED))
             turns = np.minimum(turns, square / (2 * wide))
         return np.asarray(turns + misfit)
 
@@ -955,8 +924,9 @@ class Candidates(NamedTuple):
 def candidate_assignments(detections: Detections, body: BodyModel, *, labelled: bool) -> Candidates:
     """List the candidates of every row: the noise-like assignments and the labels as given.
 
-    A row in which nothing is noise-like still shows how far the body has turned. Its candidates
-    are the labels as given and the assignments that the symmetries of the body make of them.
+    A row without a noise-like assignment still determines how far the body has turned. Its
+    candidates are the labels as given, and the assignments that the symmetries of the body make of
+    them.
 
     Parameters
     ----------
@@ -1147,7 +1117,7 @@ def labels_in_time(order: Ints) -> Ints:
     Returns
     -------
     ndarray of int, shape (T, m)
-        -1 before the first row in which a column is a particle.
+        Particle of each column; -1 before the first row in which it is one.
 
     Examples
     --------
@@ -1193,7 +1163,8 @@ def most_likely_path(
     detections : Detections
     body : BodyModel
     candidates : Candidates
-        With labels, the assignment of the row before is added where it is missing.
+        Candidates of every row; with labels, the assignment of the row before is added where it is
+        missing.
     time : ndarray, shape (T,)
     rows : ndarray of int, shape (K,)
         Rows that have candidates.
@@ -1226,7 +1197,7 @@ def most_likely_path(
         particle = np.where(order >= 0, body.label[order], -1)
         wrong = ((particle != np.arange(detections.n)) & (order >= 0)).sum(axis=1)
         against = _contradict(body.label, order, detections.column[rows[0]])
-        cost = cost + _LABEL_LOG_ODDS * against + wrong
+        cost = cost + LABEL_LOG_ODDS * against + wrong
     choice, certain = [int(np.argmin(cost))], [True]
     label = _passed_on(body.label, order[choice[0]])
     # A step between rows with the labels as given is obvious where it is likelier than all others,
@@ -1234,7 +1205,7 @@ def most_likely_path(
     turned, misfit = candidates.rotation[rows, 0], candidates.cost[rows[1:]]
     given = np.isin(rows, candidates.given) & labelled
     own = squared_angle(turned[:-1], turned[1:]) / (2 * variance) + misfit[:, 0]
-    sure = own + _SETTLED_LOG_ODDS < misfit[:, 1:].min(axis=1) + _LABEL_LOG_ODDS
+    sure = own + SETTLED_LOG_ODDS < misfit[:, 1:].min(axis=1) + LABEL_LOG_ODDS
     obvious = given[:-1] & given[1:] & sure
     nowhere, poses = np.full(label.size, -1), list[Pose]()
     for i in range(1, rows.size):
@@ -1256,10 +1227,10 @@ def most_likely_path(
         order = candidates.order(detections, rows[i : i + 1])[0]
         cost = candidates.step_cost(poses, rows[i], labelled=labelled)
         if labelled:
-            cost += _LABEL_LOG_ODDS * _contradict(label, order, shown)
+            cost += LABEL_LOG_ODDS * _contradict(label, order, shown)
         best = int(np.argmin(cost))
-        # Two candidates that agree on every particle both of them place are in no conflict.
-        near = order[cost <= cost[best] + _SETTLED_LOG_ODDS]
+        # Two candidates that agree on every particle that both of them place do not conflict.
+        near = order[cost <= cost[best] + SETTLED_LOG_ODDS]
         rivals = len(near) > 1 and _relabel(_passed_on(nowhere, order[best]), near).any()
         choice.append(best)
         certain.append(not rivals)

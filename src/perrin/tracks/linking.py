@@ -6,32 +6,24 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from perrin.tracks.groups import connected_groups, frames_of
-from perrin.tracks.groups import touching_groups as touching_groups
-from perrin.tracks.identity import median_chi2
+from perrin.motion.residuals import median_chi2
+from perrin.motion.rods import SETTLED_LOG_ODDS
+from perrin.tracks.groups import connected_groups, frames_of, touching_groups
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from perrin._arrays import Floats, Ints
 
-
 # A centre is searched for within six standard deviations (squared: the gate), for this number of
 # frames after it was lost.
 _GATE, _FRAMES_REMEMBERED = 36.0, 10
-
-
-# Log-odds: a link is certain when the best assignment without it is a hundred times less likely.
-_CERTAIN_LOG_ODDS = float(np.log(100.0))
-
 
 # A centre of the particles found is off by up to this share of the contact distance for each one
 # missing over each one found.
 _OFF_PER_MISSING = 0.6
 
-
 _FEWEST_FRAMES = 3  # of a track that is kept
-
 
 _NO_LINK = 1e6  # the cost of a link that is excluded
 
@@ -158,7 +150,7 @@ def step_variance(centers: Centers) -> float:
     Returns
     -------
     float
-        um^2; inf where there is no such step.
+        Variance, um^2; inf where there is no such step.
 
     Examples
     --------
@@ -210,7 +202,7 @@ def _links(
                 yield (
                     int(old[rows[a]]),
                     int(new[columns[b]]),
-                    bool(rival - best > _CERTAIN_LOG_ODDS),
+                    bool(rival - best > SETTLED_LOG_ODDS),
                 )
 
 

@@ -16,10 +16,8 @@ if TYPE_CHECKING:
     import pandas as pd
     from numpy.typing import ArrayLike
 
-
 # Columns that trackpy writes in addition to its coordinates, which are in pixels.
 TRACKPY_COLUMNS = ("mass", "size", "ecc", "signal", "raw_mass", "ep")
-
 
 CENTRE_REMOVED = (
     "the centre does not move: no D_T (the mean of the particles' coordinates is the same in every "
@@ -27,51 +25,40 @@ CENTRE_REMOVED = (
     "subtracted)"
 )
 
-
 # Colloidal particles are between these distances apart, um.
 _LEAST_DISTANCE, _MOST_DISTANCE = 0.05, 50.0
 
-
-# Expected number of coincidences, and probability, below which coincidences are no accident.
+# Expected number, and probability, of coincidences below which they are not due to chance.
 _COINCIDENCE_LEVEL = 1e-3
-
 
 # A placeholder is entered and left by steps of over 5 times the particle's median step, which a
 # Brownian step in three dimensions exceeds with a probability of 1e-12; one point is a placeholder
 # if that happens in 3 rows, the origin in one.
 _PLACEHOLDER_STEP, _PLACEHOLDER_ROWS = 5.0, 3
 
-
 # A particle needs this number of steps before its repeats are judged; from steps up to this number
 # of rows from a repeat follows how often a coordinate stays the same by rounding alone.
 _FEWEST_MOVES, _ROWS_AROUND = 8, 5
-
 
 # A tenth of the steps of a moving particle are shorter than 0.13 of their standard deviation on an
 # axis; the step that follows a repeat is usually over 5 times as long on one of the axes.
 _SMALL_STEP_QUANTILE, _MOVING_STEP = 0.1, 5.0
 
-
 # A repeat by rounding has to be exceeded by this factor.
 _REPEAT_EXCESS = 3.0
 
-
 # A coordinate farther from every other particle than this number of body sizes is no measurement.
 _FAR_SIZES = 20.0
-
 
 # Particles move if they spread over this number of rounding errors; a centre that varies by less
 # than this share of the spread was removed, whatever the rounding.
 _MOVING_SPREAD, _STILL_SHARE = 10.0, 1e-6
 
-
 # Values lie on a lattice if their differences are multiples of one step to the first share of it; a
 # ratio of two steps is whole to the second.
 _LATTICE_TOLERANCE, _WHOLE_TOLERANCE = 1e-3, 0.02
 
-
 _POINTS_SHOWN = 3  # placeholders that a warning names
-
 
 _DISTANCE_FRAMES = 60  # in which the nearest particles are searched for
 
@@ -187,7 +174,7 @@ def far_points(positions: ArrayLike) -> Bools:
     Parameters
     ----------
     positions : array_like, shape (T, n, d)
-        um, NaN where missing.
+        Positions, um, NaN where missing.
 
     Returns
     -------
@@ -370,7 +357,7 @@ def placeholder_rows(code: Ints, x: Floats) -> Bools:
     code : ndarray of int, shape (N,)
         Particle of each row, from 0; rows are sorted by particle and frame.
     x : ndarray, shape (N, d)
-        No NaN.
+        Coordinates without NaN.
 
     Returns
     -------
@@ -392,7 +379,7 @@ def placeholder_rows(code: Ints, x: Floats) -> Bools:
     # Unbroken stays of particles at one place, with the smaller of the steps there and away in
     # units of the particle's median step.
     first = np.flatnonzero(np.append(True, (np.diff(code) != 0) | (np.diff(place) != 0)))
-    particle, at = code[first], place[first]
+    particle, stay_place = code[first], place[first]
     step = np.linalg.norm(np.diff(x[first], axis=0), axis=1)
     same = np.diff(particle) == 0
     particles = int(code.max()) + 1
@@ -404,13 +391,13 @@ def placeholder_rows(code: Ints, x: Floats) -> Bools:
     leap /= usual[particle]
     count = int(place.max()) + 1
     rows = np.bincount(place, minlength=count)
-    known = np.bincount(at, weights=np.isfinite(leap), minlength=count)
-    leaps = np.bincount(at, weights=leap > _PLACEHOLDER_STEP, minlength=count)
+    known = np.bincount(stay_place, weights=np.isfinite(leap), minlength=count)
+    leaps = np.bincount(stay_place, weights=leap > _PLACEHOLDER_STEP, minlength=count)
     origin = np.zeros(count, dtype=np.bool_)
     origin[place] = (x == 0).all(axis=1)
-    brisk = 2 * np.bincount(at, weights=leap >= 1, minlength=count) > known
+    brisk = 2 * np.bincount(stay_place, weights=leap >= 1, minlength=count) > known
     reached = ((rows >= _PLACEHOLDER_ROWS) | origin) & (2 * leaps > known)
-    often = _revisited_places(code, x, particle, at, origin)
+    often = _revisited_places(code, x, particle, stay_place, origin)
     reached[often] |= brisk[often]
     marked: Bools = reached[place]
     return marked
@@ -448,7 +435,7 @@ def repeated_rows(code: Ints, x: Floats) -> Bools:
     code : ndarray of int, shape (N,)
         Particle of each row, from 0; rows are sorted by particle and frame.
     x : ndarray, shape (N, d)
-        No NaN.
+        Coordinates without NaN.
 
     Returns
     -------

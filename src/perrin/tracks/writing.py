@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 @contextmanager
 def written_whole(path: Path) -> Iterator[Path]:
-    """Give a path to write to, which is renamed to `path` when all has been written.
+    """Provide a path to write to, which is renamed to `path` when all has been written.
 
     The file is flushed to the disk before it is renamed, and its folder afterwards, so that a power
     cut leaves the old file or the new one.
@@ -27,12 +27,22 @@ def written_whole(path: Path) -> Iterator[Path]:
     Yields
     ------
     Path
-        A path in the same folder; it is removed if the writing fails.
+        Path in the same folder; it is removed if the writing fails.
 
     Raises
     ------
     OSError
         If the file cannot be written; the message names `path`.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     with written_whole(Path(folder) / "a.txt") as part:
+    ...         _ = part.write_text("all of it")
+    ...     [path.name for path in Path(folder).iterdir()]
+    ['a.txt']
     """
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
