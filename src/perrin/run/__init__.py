@@ -1,12 +1,7 @@
 """From a track table to a Report, and the folder that holds it."""
 
 from perrin.run.experiment import Experiment, Recording, argument_faults, merged_experiment
-from perrin.run.folders import (
-    check_place,
-    check_resumable,
-    filled_folder,
-    staged_folder,
-)
+from perrin.run.folders import check_place, check_resumable, filled_folder, staged_folder
 from perrin.run.grouping import assign_clusters
 from perrin.run.measure import (
     ClusterTracks,

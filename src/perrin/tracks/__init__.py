@@ -19,9 +19,9 @@ from perrin.tracks.clusters import (
 )
 from perrin.tracks.column_names import Spelling, recognise_columns, seconds, unit_faults
 from perrin.tracks.files import RowNumbers, check_tracks, read_spheres, read_tracks, write_tracks
-from perrin.tracks.formats import parse_csv, parse_table, table_bytes, table_suffix
+from perrin.tracks.formats import SUFFIXES, parse_csv, parse_table, table_bytes, table_suffix
 from perrin.tracks.gdf import gdf_bytes, parse_gdf
-from perrin.tracks.groups import connected_groups, frames_of, touching_groups
+from perrin.tracks.groups import TOUCHING_REACH, connected_groups, frames_of, touching_groups
 from perrin.tracks.identity import (
     BodyModel,
     Candidates,
@@ -64,6 +64,8 @@ from perrin.tracks.writing import write_json, written_whole
 
 __all__ = [
     "CENTRE_REMOVED",
+    "SUFFIXES",
+    "TOUCHING_REACH",
     "BodyModel",
     "Candidates",
     "Centers",
