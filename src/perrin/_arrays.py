@@ -160,7 +160,44 @@ def choice_fault(name: str, value: object, offered: Iterable[object]) -> list[st
         value is choice or (type(value) is type(choice) and value == choice) for choice in offered
     ):
         return []
-    return [f"{name}: expected {' or '.join(map(repr, offered))}, got {value!r}"]
+    *first, last = map(repr, offered)
+    words = f"{', '.join(first)} or {last}" if first else last
+    return [f"{name}: expected {words}, got {value!r}"]
+
+
+def flag_fault(name: str, value: object) -> list[str]:
+    """Return one line where a value is neither True nor False, or no line.
+
+    Examples
+    --------
+    >>> flag_fault("drift", np.True_), flag_fault("drift", "no")
+    ([], ["drift: expected True or False, got 'no'"])
+    """
+    if isinstance(value, bool | np.bool_):
+        return []
+    return [f"{name}: expected True or False, got {value!r}"]
+
+
+def numpy_to_python(options: object) -> None:
+    """Replace NumPy scalars in the fields of a frozen dataclass by Python's numbers.
+
+    Examples
+    --------
+    >>> from dataclasses import dataclass
+    >>> @dataclass(frozen=True)
+    ... class Scan:
+    ...     exposure: float
+    ...     def __post_init__(self):
+    ...         numpy_to_python(self)
+    >>> Scan(np.float32(0.5))
+    Scan(exposure=0.5)
+    """
+    for field in fields(options):  # type: ignore[arg-type]
+        value = getattr(options, field.name)
+        if isinstance(value, np.floating):
+            object.__setattr__(options, field.name, float(value))
+        elif isinstance(value, np.generic):
+            object.__setattr__(options, field.name, value.item())
 
 
 def refuse(faults: Iterable[str], *, error: type[ValueError] = ValueError) -> None:
@@ -245,7 +282,7 @@ def stated_twice(key: str, name: str) -> str:
 
 
 def refuse_unknown(function: str, settings: Iterable[str], known: Iterable[str]) -> None:
-    """Raise a TypeError that names a keyword which a function does not have, and the nearest one.
+    """Raise a TypeError that names a keyword which a function does not have, and a similar one.
 
     Examples
     --------
@@ -256,12 +293,12 @@ def refuse_unknown(function: str, settings: Iterable[str], known: Iterable[str])
     from difflib import get_close_matches
 
     known = list(known)
-    lines = [
-        f"unknown keyword {key!r}; the nearest known one is "
-        f"{get_close_matches(key, known, n=1, cutoff=0.0)[0]!r}"
-        for key in settings
-        if key not in known
-    ]
+    lines = []
+    for key in settings:
+        if key not in known:
+            nearest = get_close_matches(key, known, n=1)
+            hint = f"; the nearest known one is {nearest[0]!r}" if nearest else ""
+            lines.append(f"unknown keyword {key!r}{hint}")
     if lines:
         raise TypeError(f"{function}: " + "; ".join(lines))
 
@@ -292,7 +329,7 @@ def to_plain(value: Any) -> Any:  # noqa: ANN401 (whatever a result holds)
     if isinstance(value, np.ndarray):
         return to_plain(value.tolist())
     if isinstance(value, np.generic):
-        return to_plain(value.item())
+        return to_plain(float(value) if isinstance(value, np.floating) else value.item())
     if isinstance(value, float):
         return finite_or_none(value)
     if isinstance(value, Mapping):

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, Literal
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any, Literal
 
-import numpy as np
+from perrin._arrays import flag_fault, number_fault, numpy_to_python, refuse, stated_twice
 
-from perrin._arrays import refuse, stated_twice
+if TYPE_CHECKING:
+    from collections.abc import Mapping
 
 
 @dataclass(frozen=True)
@@ -42,7 +43,23 @@ class Noise:
 
     def __post_init__(self) -> None:
         """Refuse values out of range."""
-        refuse(noise_faults(self.model, self.exposure))
+        refuse(noise_faults(self.model, self.exposure, drift=self.drift))
+        numpy_to_python(self)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the options as values that JSON holds."""
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, entry: Mapping[str, Any]) -> Noise:
+        """Return the options that `to_dict` wrote.
+
+        Examples
+        --------
+        >>> Noise.from_dict(Noise(0.02, drift=True).to_dict())
+        Noise(model=0.02, exposure=None, drift=True)
+        """
+        return cls(**entry)
 
     @property
     def text(self) -> str:
@@ -87,22 +104,12 @@ def noise_faults(noise: object, exposure: object, *, drift: object = False) -> l
         given = {"exposure": exposure is not None, "drift": drift}
         return [stated_twice(name, "noise") for name, stated in given.items() if stated]
     faults = []
-    offered = (
-        noise in ("joint", "residual")
+    if (
+        noise not in ("joint", "residual")
         if isinstance(noise, str)
-        else _is_number_up_to(noise, np.inf)
-    )
-    if not offered:
+        else number_fault("noise", noise, least=0)
+    ):
         faults.append(f"noise: expected 'joint', 'residual' or sigma in um, got {noise!r}")
-    if exposure is not None and not _is_number_up_to(exposure, 1.0):
+    if exposure is not None and number_fault("exposure", exposure, least=0, most=1):
         faults.append(f"exposure: expected a fraction of dt, 0 to 1, got {exposure!r}")
-    return faults
-
-
-def _is_number_up_to(value: Any, most: float) -> bool:  # noqa: ANN401 (a user's argument)
-    """Return whether a value is one finite number from 0 to `most`."""
-    try:
-        number = np.nan if isinstance(value, str) else float(value)
-    except (TypeError, ValueError):
-        return False
-    return bool(np.isfinite(number) and 0 <= number <= most)
+    return faults + flag_fault("drift", drift)

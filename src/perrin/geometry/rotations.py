@@ -5,14 +5,17 @@ Rotations are active matrices, lab from body: ``x = R x0``. All functions take l
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from perrin._arrays import Bools, Floats, present
+from perrin._arrays import Bools, Floats, from_plain, present, to_plain
 from perrin.errors import DegenerateClusterError
 from perrin.geometry.wahba import planar_rotation, spatial_rotation
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
 
 _CACHED_ROWS = 2048  # rows whose working arrays fit into the second-level cache
 
@@ -90,6 +93,27 @@ class Similarity(NamedTuple):
     s: Floats
     R: Floats
     v: Floats
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the similarity as values that JSON holds."""
+        plain: dict[str, Any] = to_plain(self._asdict())
+        return plain
+
+    @classmethod
+    def from_dict(cls, entry: Mapping[str, Any]) -> Similarity:
+        """Return the similarity that `to_dict` wrote.
+
+        Parameters
+        ----------
+        entry : mapping
+
+        Examples
+        --------
+        >>> found = similarity([[0.0, 0.0], [2.0, 0.0], [0.0, 2.0]], [[0, 0], [1, 0], [0, 1]])
+        >>> Similarity.from_dict(found.to_dict()).s
+        array(2.)
+        """
+        return cls(*(from_plain(entry[name]) for name in cls._fields))
 
 
 def similarity(points: ArrayLike, reference: ArrayLike) -> Similarity:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+import os
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from perrin._arrays import number_fault, refuse
+from perrin._arrays import flag_fault, number_fault, numpy_to_python, refuse
 
 if TYPE_CHECKING:
-    import os
     from collections.abc import Callable, Iterator, Sequence
     from typing import TypeAlias
 
@@ -71,11 +71,20 @@ class Work:
                 "workers: expected processes of this machine, 0 or more, or a scheduler instead, "
                 f"got {self.workers} and {self.scheduler!r}"
             )
-        if self.scheduler is not None and not re.fullmatch(r"\w+://\S+:\d+", self.scheduler):
+        is_address = isinstance(self.scheduler, str) and re.fullmatch(
+            r"\w+://\S+:\d+", self.scheduler
+        )
+        if self.scheduler is not None and not is_address:
             faults.append(
                 f"scheduler: expected an address like tcp://node7:8786, got {self.scheduler!r}"
             )
+        faults += flag_fault("anew", self.anew)
+        if self.keep is not None and not isinstance(self.keep, str | os.PathLike):
+            faults.append(f"keep: expected the path of a folder, got {self.keep!r}")
+        if self.progress is not None and not callable(self.progress):
+            faults.append(f"progress: expected a function, got {self.progress!r}")
         refuse(faults)
+        numpy_to_python(self)
 
     def report(self, done: int, total: int, title: str) -> None:
         """Report the progress of the work.

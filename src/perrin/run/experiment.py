@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from perrin._arrays import refuse, stated_twice
+from perrin._arrays import flag_fault, numpy_to_python, refuse, stated_twice
 from perrin.diffusion.noise_model import Noise
 from perrin.hydrodynamics.mobility import condition_faults
 
@@ -73,11 +73,18 @@ class Experiment:
         )
         if not isinstance(self.noise, Noise):
             faults.append(f"noise: expected Noise(...), got {self.noise!r}")
+        faults += flag_fault("keep_jumps", self.keep_jumps)
         if self.sigma is not None:
             try:
-                plain = np.asarray(self.sigma, dtype=np.float64)
+                plain = np.asarray(self.sigma)
+                # Text and booleans would become numbers without a fault.
+                plain = (
+                    plain.astype(np.float64)
+                    if plain.dtype.kind in "iuf"
+                    else np.full((1, 1), np.nan)
+                )
             except (TypeError, ValueError):
-                plain = np.array([[np.nan]])
+                plain = np.full((1, 1), np.nan)
             if plain.ndim > 1 or not (np.isfinite(plain) & (plain >= 0)).all():
                 faults.append(
                     "sigma: expected one number >= 0 or one per axis, in um, got "
@@ -86,6 +93,7 @@ class Experiment:
             given = plain.tolist()
             object.__setattr__(self, "sigma", tuple(given) if plain.ndim else given)
         refuse(faults)
+        numpy_to_python(self)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the experiment as ``run.json`` keeps it, the parts of the noise among the others.
@@ -129,7 +137,8 @@ def merged_experiment(experiment: Experiment | None, **given: Any) -> Experiment
     Returns
     -------
     Experiment
-        Every value is the one that is not its default.
+        Every value is the one that is not its default; a keyword that is its default does not
+        count as stated.
 
     Raises
     ------
@@ -148,6 +157,8 @@ def merged_experiment(experiment: Experiment | None, **given: Any) -> Experiment
     """
     defaults = {f.name: f.default for f in fields(Experiment) if f.default is not MISSING}
     defaults |= {"noise": "joint", "exposure": None, "drift": False}
+    if not isinstance(experiment, Experiment | None):
+        raise TypeError(f"experiment: expected Experiment(...), got {experiment!r}")
     known = defaults if experiment is None else experiment.to_dict()
     faults, values = [], dict(known)
     for name, value in given.items():

@@ -7,6 +7,8 @@ import os
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
+from perrin._arrays import to_plain
+
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
@@ -68,7 +70,7 @@ def write_json(path: Path, content: object) -> None:
     path : Path
         File that is written.
     content : object
-        Values that JSON can hold.
+        Values that JSON can hold, NumPy's numbers and arrays among them.
 
     Raises
     ------
@@ -84,7 +86,7 @@ def write_json(path: Path, content: object) -> None:
     ...     Path(folder, "sizes.json").read_text()
     '{\n  "diameter": 2.45\n}\n'
     """
-    text = json.dumps(content, indent=2, allow_nan=False, ensure_ascii=False)
+    text = json.dumps(content, indent=2, allow_nan=False, ensure_ascii=False, default=to_plain)
     path.write_text(text + "\n", encoding="utf-8")
 
 

@@ -8,7 +8,15 @@ from typing import TYPE_CHECKING, Any, Literal, TypedDict
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from perrin._arrays import Floats, choice_fault, number_fault, refuse, to_plain
+from perrin._arrays import (
+    Floats,
+    choice_fault,
+    flag_fault,
+    number_fault,
+    numpy_to_python,
+    refuse,
+    to_plain,
+)
 from perrin.images.optics.optics import CameraNoise
 
 if TYPE_CHECKING:
@@ -88,7 +96,10 @@ class Light:
             faults += number_fault(name, getattr(self, name), least=0)
         for name in ("bleaching", "depth_loss", "drop"):
             faults += number_fault(name, getattr(self, name), least=0, below=1)
-        slope = np.array(self.gradient, dtype=np.float64)
+        try:
+            slope = np.array(self.gradient, dtype=np.float64)
+        except (TypeError, ValueError):
+            slope = np.array(np.nan)
         if slope.shape != (3,) or not np.all(np.isfinite(slope)):
             faults.append(
                 "gradient: expected three finite numbers (z, y, x), photons per voxel per um, got "
@@ -96,6 +107,7 @@ class Light:
             )
         refuse(faults)
         object.__setattr__(self, "gradient", tuple(slope.tolist()))
+        numpy_to_python(self)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the options as values that JSON holds."""
@@ -220,6 +232,7 @@ class Scan:
             + number_fault("exposure", self.exposure, least=0, unit="s")
             + number_fault("substeps", self.substeps, above=0, whole=True)
         )
+        numpy_to_python(self)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the options as values that JSON holds."""
@@ -334,9 +347,11 @@ class Camera:
             number_fault("gain", self.gain, above=0)
             + number_fault("offset", self.offset)
             + number_fault("read_noise", self.read_noise, least=0)
+            + flag_fault("noise", self.noise)
             + choice_fault("dtype", dtype, ("uint8", "uint16", "float32", "float64"))
         )
         object.__setattr__(self, "dtype", dtype)
+        numpy_to_python(self)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the options as values that JSON holds."""

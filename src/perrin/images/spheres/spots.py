@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, TypedDict
 
 import numpy as np
 
-from perrin._arrays import choice_fault, number_fault, refuse, to_plain
+from perrin._arrays import flag_fault, number_fault, numpy_to_python, refuse, to_plain
 from perrin.errors import PrecisionWarning
 from perrin.geometry.shapes import pair_distances
 from perrin.tracks.groups import TOUCHING_REACH, touching_groups
@@ -83,11 +83,12 @@ class Spots:
     def __post_init__(self) -> None:
         """Refuse values out of range."""
         refuse(
-            choice_fault("dark", self.dark, (False, True))
+            flag_fault("dark", self.dark)
             + ([] if self.minmass is None else number_fault("minmass", self.minmass))
             + number_fault("percentile", self.percentile, least=0, below=100)
-            + choice_fault("border", self.border, (False, True))
+            + flag_fault("border", self.border)
         )
+        numpy_to_python(self)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the options as values that JSON holds."""
