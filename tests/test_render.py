@@ -328,7 +328,7 @@ def test_the_variance_model_of_the_camera_is_its_variance():
         ({"shape": (0, 5, 5)}, "shape: expected three whole numbers"),
         ({"voxel": (-1, 1, 1), "gain": 0, "substeps": 0}, "substeps: .*gain: .*voxel: "),
         ({"gradient": (1, 2)}, "gradient: expected three finite numbers"),
-        ({"dtype": "int8"}, "dtype: expected 'uint8' or"),
+        ({"dtype": "int8"}, "dtype: expected 'uint8', 'uint16'"),
         ({"bleaching": 1.0, "photons": -1}, "photons: .*>= 0.*bleaching: .*< 1"),
         ({"core": 3.0}, "core: 3.0 um is more than diameter"),
         ({"gradient": (1, 0, 0)}, "gradient takes the background down to"),

@@ -112,7 +112,7 @@ class Identity:
 
     def arranged(self, positions: ArrayLike) -> Floats:
         """Return the detections (T, m, d) as particles (T, n, d), NaN where missing."""
-        x = as_positions(positions)
+        x = np.asarray(positions, dtype=np.float64)
         taken = np.take_along_axis(x, np.maximum(self.order, 0)[..., None], axis=1)
         return np.where(self.order[..., None] >= 0, taken, np.nan)
 

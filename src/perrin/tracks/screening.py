@@ -7,14 +7,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from perrin._arrays import Bools, Floats, Ints, as_positions, present
+from perrin._arrays import Bools, Floats, Ints, present
 from perrin.tracks.groups import frames_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
     import pandas as pd
-    from numpy.typing import ArrayLike
 
 # Columns that trackpy writes in addition to its coordinates, which are in pixels.
 TRACKPY_COLUMNS = ("mass", "size", "ecc", "signal", "raw_mass", "ep")
@@ -164,7 +163,7 @@ def screen_rows(table: pd.DataFrame) -> Screened:
     return Screened(table, notes, placeholders + repeats)
 
 
-def far_points(positions: ArrayLike) -> Bools:
+def far_points(x: Floats) -> Bools:
     """Mark the points of one cluster that are farther from the rest than 20 times its size.
 
     The size is the largest of the median distances between its particles. A point is marked where
@@ -173,7 +172,7 @@ def far_points(positions: ArrayLike) -> Bools:
 
     Parameters
     ----------
-    positions : array_like, shape (T, n, d)
+    x : ndarray, shape (T, n, d)
         Positions, um, NaN where missing.
 
     Returns
@@ -187,7 +186,6 @@ def far_points(positions: ArrayLike) -> Bools:
     >>> np.argwhere(far_points(x)).tolist()
     [[4, 2]]
     """
-    x = as_positions(positions)
     n = x.shape[1]
     nearest = np.full(x.shape[:2], np.inf)
     size = 0.0
@@ -230,12 +228,12 @@ def far_sentence(far: Bools, frames: Ints) -> str:
     )
 
 
-def centre_removed(positions: ArrayLike) -> bool:
+def centre_removed(x: Floats) -> bool:
     """Return whether the mean of the particles stays the same to rounding while they move.
 
     Parameters
     ----------
-    positions : array_like, shape (T, n, d)
+    x : ndarray, shape (T, n, d)
         Coordinates of the particles of one cluster, um, NaN where missing.
 
     Returns
@@ -256,7 +254,6 @@ def centre_removed(positions: ArrayLike) -> bool:
     >>> centre_removed(x), centre_removed(x - x.mean(axis=1, keepdims=True))
     (False, True)
     """
-    x = as_positions(positions)
     seen = present(x)
     several = seen.sum(axis=1) >= 2
     for rows in (seen.all(axis=1) & several, several):
