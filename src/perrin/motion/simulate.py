@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -12,6 +13,7 @@ from perrin._arrays import (
     as_positions,
     as_sigma,
     choice_fault,
+    frozen,
     number_fault,
     refuse,
     require_positive,
@@ -222,6 +224,7 @@ def _free_rotations(
     return cumulative_product(step)
 
 
+@lru_cache(maxsize=8)
 def heat_kernel_angles(D: float) -> tuple[Floats, Floats]:
     """Return rotation angles and their cumulative probability under the heat kernel on SO(3).
 
@@ -258,5 +261,7 @@ def heat_kernel_angles(D: float) -> tuple[Floats, Floats]:
         weight = (2 * degree + 1) * np.exp(-degree * (degree + 1) * D)
         wave = np.sum(weight * np.sin((degree + 0.5) * angle), axis=0)
     density = np.maximum(wave * np.sin(angle / 2), 0.0)
-    cdf = np.concatenate([[0.0], np.cumsum(density[1:] + density[:-1])])
-    return angle, cdf / cdf[-1]
+    sums = np.concatenate([[0.0], np.cumsum(density[1:] + density[:-1])])
+    cdf = sums / sums[-1]
+    frozen(angle, cdf)
+    return angle, cdf
