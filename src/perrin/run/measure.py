@@ -6,6 +6,7 @@ import platform
 import warnings as python_warnings
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -821,6 +822,26 @@ def pool_clusters(
     return Pooled(D_R, D_T, clusters), warnings
 
 
+@cache
+def _library_version(name: str) -> str:
+    """Return the installed version of a library; reading it takes some milliseconds."""
+    from importlib.metadata import version
+
+    return version(name)
+
+
+def installed_versions() -> dict[str, str]:
+    """Return the versions of Python and of the libraries that determine the numbers.
+
+    Examples
+    --------
+    >>> sorted(installed_versions())
+    ['numpy', 'pandas', 'perrin', 'python', 'scipy']
+    """
+    names = ("perrin", "numpy", "scipy", "pandas")
+    return {"python": platform.python_version()} | {n: _library_version(n) for n in names}
+
+
 def run_settings(
     source: Mapping[str, str | None], *, arguments: Mapping[str, Any], first_frame: int
 ) -> dict[str, Any]:
@@ -839,14 +860,11 @@ def run_settings(
     -------
     dict
     """
-    from importlib.metadata import version
-
-    names = ("perrin", "numpy", "scipy", "pandas")
     return {
         "input": dict(source),
         "arguments": dict(arguments),
         "first_frame": first_frame,
-        "versions": {"python": platform.python_version()} | {n: version(n) for n in names},
+        "versions": installed_versions(),
         "created": datetime.now(UTC).isoformat(timespec="seconds"),
         "seed": None,
     }

@@ -426,6 +426,8 @@ def load_run(folder: str | os.PathLike[str]) -> Report:
     import pandas as pd
 
     path = Path(folder)
+    if not (path / "summary.json").is_file():
+        raise FileNotFoundError(f"{path}: not a run folder: it holds no summary.json")
     summary = json.loads((path / "summary.json").read_text(encoding="utf-8"))
     settings = json.loads((path / "run.json").read_text(encoding="utf-8"))
     table = pd.read_parquet(path / "motion.parquet")
