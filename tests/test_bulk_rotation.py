@@ -190,11 +190,11 @@ def test_a_rigid_turn_is_removed_exactly(d, offset, repeats):
 def test_any_motion_of_the_lab_is_removed(d):
     """Turn and shift every frame at random, or change the unit: what remains is the same (1e-8)."""
     rng = np.random.default_rng(7)
-    x = come_and_go(walkers(d, n=150, n_frames=80, seed=8))
+    x = come_and_go(walkers(d, n=60, n_frames=60, seed=8))
     body, _ = remove_rotation(x)
-    turn = exp_map(rng.normal(size=(80, 3 if d == 3 else 1)))
+    turn = exp_map(rng.normal(size=(60, 3 if d == 3 else 1)))
     turn[0] = np.eye(d)
-    shaken = np.einsum("tij,tnj->tni", turn, x) + 50 * rng.normal(size=(80, 1, d))
+    shaken = np.einsum("tij,tnj->tni", turn, x) + 50 * rng.normal(size=(60, 1, d))
     again, motion = remove_rotation(shaken)
     np.testing.assert_allclose(again, body, rtol=0, atol=1e-8)
     consistent(again, motion, shaken)
@@ -202,14 +202,14 @@ def test_any_motion_of_the_lab_is_removed(d):
     # A lab turned for good turns the answer, and the order of the particles is nothing.
     q = exp_map(rng.normal(size=3 if d == 3 else 1))
     np.testing.assert_allclose(remove_rotation(x @ q.T)[0], body @ q.T, rtol=0, atol=1e-8)
-    order = rng.permutation(150)
+    order = rng.permutation(60)
     np.testing.assert_allclose(remove_rotation(x[:, order])[0], body[:, order], rtol=0, atol=1e-8)
 
 
 @pytest.mark.parametrize("d", [3, 2])
 def test_a_second_removal_changes_nothing(d):
     """After the removal no bulk rotation or drift is left."""
-    body, _ = remove_rotation(carried(walkers(d, n=200, n_frames=100, seed=9)))
+    body, _ = remove_rotation(carried(walkers(d, n=100, n_frames=60, seed=9)))
     again, motion = remove_rotation(body)
     np.testing.assert_allclose(again, body, rtol=0, atol=1e-9)
     np.testing.assert_allclose(motion.accumulated_rotation(), 0, atol=1e-11)
@@ -218,7 +218,7 @@ def test_a_second_removal_changes_nothing(d):
 
 def test_time_may_run_backwards():
     """Reversed frames give the reversed result, in the axes of their own first frame."""
-    x = come_and_go(carried(walkers(n=200, n_frames=120, seed=10)), missing=0.1)
+    x = come_and_go(carried(walkers(n=100, n_frames=70, seed=10)), missing=0.1)
     forth, back = remove_rotation(x)[0], remove_rotation(x[::-1])[0][::-1]
     s, R, v = similarity(back.reshape(-1, 3), forth.reshape(-1, 3))
     assert float(s) == pytest.approx(1, abs=1e-10)

@@ -252,8 +252,8 @@ def test_best_window_and_gls_reach_the_bound(repeats):
 
 
 def test_missing_frames_are_in_the_error(repeats):
-    """40 % of the frames missing, 20 tracks (long: 100): bias, error and coverage, 3 errors."""
-    rng, n = np.random.default_rng(8), repeats(20, 100)
+    """40 % of the frames missing, 14 tracks (long: 100): bias, error and coverage, 3 errors."""
+    rng, n = np.random.default_rng(8), repeats(14, 100)
     curves = [noisy_msd(rng, snr=0.5, missing=0.4) for _ in range(n)]
     for fit in FITS.values():
         found = [fit(curve) for curve in curves]

@@ -1,6 +1,7 @@
 """D_R and D_T: estimates follow every law, planted values come back, intervals cover."""
 
 import dataclasses
+import functools
 import json
 import warnings
 
@@ -114,8 +115,8 @@ def passes(monkeypatch):
 def positions(request):
     """Return positions of one track, complete or with frames and particles missing."""
     if request.param == "complete":
-        return cloud(11, n_frames=100, sigma=(0.03, 0.03, 0.06))
-    return lossy(12, frames=0.15, particles=0.04, n_frames=100, cluster=Cluster.touching(5, 2.45))
+        return cloud(11, n_frames=60, sigma=(0.03, 0.03, 0.06))
+    return lossy(12, frames=0.15, particles=0.04, n_frames=60, cluster=Cluster.touching(5, 2.45))
 
 
 @pytest.fixture(scope="module")
@@ -142,41 +143,39 @@ SAME = {
 }
 
 
-@pytest.mark.parametrize("quantity", QUANTITIES)
 @pytest.mark.parametrize("change", SAME)
-def test_the_answer_does_not_depend_on_axes_labels_and_origin(
-    positions, measured, change, quantity
-):
+def test_the_answer_does_not_depend_on_axes_labels_and_origin(positions, measured, change):
     """Turned, moved, relabelled, mirrored, backwards or renumbered: the same numbers to 1e-9."""
-    before = measured[quantity]
-    after = estimate_diffusion(SAME[change](positions), quantity=quantity)
-    assert np.allclose(numbers(after), numbers(before), rtol=1e-9, atol=0)
-    assert after.offset == pytest.approx(before.offset, rel=1e-7, abs=1e-9 * before.value)
-    assert after.snr == pytest.approx(before.snr, rel=1e-9)
-    assert after.n_frames == before.n_frames
+    motion = SAME[change](positions)
+    for quantity in QUANTITIES:
+        before, after = measured[quantity], estimate_diffusion(motion, quantity=quantity)
+        assert np.allclose(numbers(after), numbers(before), rtol=1e-9, atol=0), quantity
+        assert after.offset == pytest.approx(before.offset, rel=1e-7, abs=1e-9 * before.value)
+        assert after.snr == pytest.approx(before.snr, rel=1e-9)
+        assert after.n_frames == before.n_frames
 
 
-@pytest.mark.parametrize("unit", [1e-6, 1e-3, 1e3, 1e9])
-def test_the_length_unit_scales_D_T_and_leaves_D_R(positions, measured, unit):
+def test_the_length_unit_scales_D_T_and_leaves_D_R(positions, measured, repeats):
     """Metres, millimetres or nanometres for microns: D_R the same, D_T by the square, to 1e-9."""
-    motion = tracked(positions * unit)
-    for quantity, factor in (("rotation", 1.0), ("translation", unit**2)):
-        before = measured[quantity]
-        after = estimate_diffusion(motion, quantity=quantity)
-        assert np.allclose(numbers(after), numbers(before) * factor, rtol=1e-9, atol=0)
-        assert after.offset == pytest.approx(before.offset * factor, rel=1e-7)
-        assert after.resolved == before.resolved
+    for unit in (1e-6, 1e9, 1e-3, 1e3)[: repeats(2, 4)]:
+        motion = tracked(positions * unit)
+        for quantity, factor in (("rotation", 1.0), ("translation", unit**2)):
+            before = measured[quantity]
+            after = estimate_diffusion(motion, quantity=quantity)
+            assert np.allclose(numbers(after), numbers(before) * factor, rtol=1e-9, atol=0), unit
+            assert after.offset == pytest.approx(before.offset * factor, rel=1e-7)
+            assert after.resolved == before.resolved
 
 
 @pytest.mark.parametrize("quantity", QUANTITIES)
-@pytest.mark.parametrize("dt", [1e-9, 1e-3, 60.0, 1e9])
-def test_the_time_unit_scales_D(positions, measured, quantity, dt):
+def test_the_time_unit_scales_D(positions, measured, quantity, repeats):
     """D is per time: the same frames dt apart instead of 1 s have D/dt and the same offset."""
     before = measured[quantity]
-    after = estimate_diffusion(tracked(positions, dt=dt), quantity=quantity)
-    assert np.allclose(numbers(after) * dt, numbers(before), rtol=1e-9, atol=0)
-    assert after.offset == pytest.approx(before.offset, rel=1e-7, abs=1e-9 * before.value)
-    assert after.snr == pytest.approx(before.snr, rel=1e-9)
+    for dt in (1e-9, 60.0, 1e9, 1e-3)[: repeats(2, 4)]:
+        after = estimate_diffusion(tracked(positions, dt=dt), quantity=quantity)
+        assert np.allclose(numbers(after) * dt, numbers(before), rtol=1e-9, atol=0), dt
+        assert after.offset == pytest.approx(before.offset, rel=1e-7, abs=1e-9 * before.value)
+        assert after.snr == pytest.approx(before.snr, rel=1e-9)
 
 
 @pytest.mark.parametrize("quantity", QUANTITIES)
@@ -191,7 +190,7 @@ def test_times_and_frames_are_equivalent(positions, quantity):
 @pytest.mark.parametrize("quantity", QUANTITIES)
 def test_the_order_of_pooled_motions_does_not_matter(quantity):
     """Three motions pooled in any order give the same numbers to 1e-9."""
-    motions = [tracked(lossy(s, frames=0.1, n_frames=100, snr=4.0 + s)) for s in range(3)]
+    motions = [tracked(lossy(s, frames=0.1, n_frames=40, snr=4.0 + s)) for s in range(3)]
     before = estimate_diffusion(motions, quantity=quantity)
     for order in ((2, 0, 1), (1, 0, 2)):
         after = estimate_diffusion([motions[i] for i in order], quantity=quantity)
@@ -237,8 +236,8 @@ def test_a_cut_loses_only_the_step_between(quantity):
 
 @pytest.fixture(scope="module")
 def standard(repeats):
-    """Return 40 or 200 tracks (N = 300, SNR 20, sigma/R = 0.02) and their D_R and D_T."""
-    motions = [tracked(cloud(1000 + seed)) for seed in range(repeats(40, 200))]
+    """Return 30 or 200 tracks (N = 300, SNR 20, sigma/R = 0.02) and their D_R and D_T."""
+    motions = [tracked(cloud(1000 + seed)) for seed in range(repeats(30, 200))]
     found = {q: [estimate_diffusion(m, quantity=q) for m in motions] for q in QUANTITIES}
     return motions, found
 
@@ -312,7 +311,7 @@ def test_noisy_offsets_equal_the_floor(quantity, noisy):
 
 @pytest.mark.parametrize("quantity", QUANTITIES)
 def test_five_pooled_tracks_have_their_common_error(standard, quantity):
-    """5 tracks pooled: 1/sqrt(5) of the error within 10 %; 8 (20) pools cover 6 (16) times."""
+    """5 tracks pooled: 1/sqrt(5) of the error within 10 %; 6 (20) pools cover 5 (16) times."""
     motions, found = standard
     truth = planted(quantity)
     count = min(len(motions) // 5, 20)
@@ -345,10 +344,13 @@ def check_unbiased(motions, truths=None):
 def test_missing_frames_do_not_bias(repeats):
     """30 % of the frames missing: the mean of the tracks is the truth within 3 standard errors.
 
-    A gap taken for one step would add 45 %, 45 standard errors of 100 tracks and 13 of 8.
+    A gap taken for one step would add 45 %, 45 standard errors of 100 tracks and 9 of 8 short ones.
     """
     check_unbiased(
-        [tracked(lossy(s, frames=0.3, snr=5.0)) for s in range(repeats(8, 100))],
+        [
+            tracked(lossy(s, frames=0.3, snr=5.0, n_frames=repeats(150, 300)))
+            for s in range(repeats(8, 100))
+        ],
         {q: planted(q, 5.0) for q in QUANTITIES},
     )
 
@@ -410,15 +412,15 @@ def test_in_the_plane_one_angle_and_two_coordinates(repeats):
     The known limits of joint estimates within 3 Monte-Carlo errors (34 % of 40 tracks).
     """
     flat, motions = Cluster.from_positions([[0, 0], [2, 0], [1, 1.6]]), []
-    truth = {"rotation": 4e-3, "translation": 0.03}
+    truth, frames = {"rotation": 4e-3, "translation": 0.03}, repeats(150, 300)
     for seed in range(repeats(12, 40)):
-        m = simulate_motion(flat, D_R=4e-3, D_T=0.03, dt=1.0, n_frames=300, rng=seed)
+        m = simulate_motion(flat, D_R=4e-3, D_T=0.03, dt=1.0, n_frames=frames, rng=seed)
         motions.append(tracked(add_noise(m.positions(), sigma=0.02, rng=900 + seed)))
     every = check_unbiased(motions, truth)
     for quantity, angles in (("rotation", 1), ("translation", 2)):
         values = np.array([e.value for e in every[quantity]])
         rms = np.sqrt(np.mean((values / truth[quantity] - 1) ** 2))
-        assert rms == pytest.approx(np.sqrt(6 / (300 * angles)), rel=sd_error(len(values)))
+        assert rms == pytest.approx(np.sqrt(6 / (frames * angles)), rel=sd_error(len(values)))
 
 
 def test_an_anisotropic_body_has_a_third_of_the_trace(repeats):
@@ -432,7 +434,7 @@ def test_an_anisotropic_body_has_a_third_of_the_trace(repeats):
     tensor = tensor @ np.diag([1e-3, 1e-3, 10e-3]) @ tensor.T
     found = []
     for seed in range(repeats(50, 150)):
-        frames = repeats(150, 300)
+        frames = repeats(100, 300)
         m = simulate_motion(TETRAHEDRON, D_R=tensor, dt=1.0, n_frames=frames, rng=seed)
         x = add_noise(m.positions(), sigma=SIGMA, rng=500 + seed)
         found.append(estimate_diffusion(tracked(x)))
@@ -448,10 +450,10 @@ def test_an_anisotropic_body_has_a_third_of_the_trace(repeats):
 
 def test_uneven_times_are_taken_as_they_are(repeats):
     """Frames at random times: D is unbiased, where equal steps would not be."""
-    motions = []
+    motions, frames = [], repeats(300, 600)
     for seed in range(repeats(8, 40)):
-        keep = np.flatnonzero(np.random.default_rng(seed).random(600) < 0.4)
-        x = cloud(seed, n_frames=600)[keep]
+        keep = np.flatnonzero(np.random.default_rng(seed).random(frames) < 0.4)
+        x = cloud(seed, n_frames=frames)[keep]
         motions.append(tracked(x, times=keep.astype(float)))
     check_unbiased(motions)
 
@@ -462,7 +464,7 @@ def test_a_motionless_cluster_gets_an_upper_limit(repeats):
     For D_R adding noisy steps reads up to 0.04 (sigma/R)^4/dt: an interval that excludes 0 lies
     below ten such floors.
     """
-    beyond, count = 0, repeats(12, 30)
+    beyond, count = 0, repeats(8, 30)
     for seed in range(count):
         motion = tracked(cloud(seed, snr=0.0))
         spin, drift = (estimate_diffusion(motion, quantity=q) for q in QUANTITIES)
@@ -476,7 +478,7 @@ def test_a_motionless_cluster_gets_an_upper_limit(repeats):
         assert drift.resolution_floor is None
         assert drift.resolved == (drift.ci95[0] > 0)
         beyond += drift.resolved
-    assert beyond <= repeats(3, 4)
+    assert beyond <= repeats(2, 4)
 
 
 # ---- what is known of the noise -----------------------------------------------------------------
@@ -516,8 +518,10 @@ def test_stated_exposure_undoes_the_blur(repeats):
 
     Stated to the joint estimate it changes only the range of the noise offset.
     """
-    frames = repeats(150, 300)
-    motions = [tracked(cloud(s, frames, substeps=20, snr=5.0)) for s in range(repeats(12, 40))]
+    frames, substeps = repeats(150, 300), repeats(10, 20)
+    motions = [
+        tracked(cloud(s, frames, substeps=substeps, snr=5.0)) for s in range(repeats(10, 40))
+    ]
     truth = planted("rotation", 5.0)
     unstated = relative(motions, truth, noise="residual")
     stated = relative(motions, truth, noise="residual", exposure=1.0)
@@ -528,11 +532,15 @@ def test_stated_exposure_undoes_the_blur(repeats):
     assert stated[2] < joint[2]
 
 
-def test_exposure_zero_keeps_the_offset_above_zero(standard):
-    """Frozen frames cannot have negative noise; unknown exposure may, in some of 60 tracks."""
-    free = standard[1]["translation"][:60]
-    kept = [estimate_diffusion(m, quantity="translation", exposure=0) for m in standard[0][:60]]
-    assert min(e.offset for e in free) < 0 <= min(e.offset for e in kept)
+def test_exposure_zero_keeps_the_offset_above_zero(standard, repeats):
+    """Frozen frames cannot have negative noise; unknown exposure may, in some of 60 tracks.
+
+    In the quick form only the 10 tracks with the lowest offsets are estimated again.
+    """
+    offsets = np.array([e.offset for e in standard[1]["translation"][:60]])
+    lowest = np.argsort(offsets)[: repeats(10, 60)]
+    kept = [estimate_diffusion(standard[0][i], quantity="translation", exposure=0) for i in lowest]
+    assert min(offsets) < 0 <= min(e.offset for e in kept)
 
 
 def test_covariances_agree_with_the_likelihood_where_they_should(standard):
@@ -561,13 +569,20 @@ def test_covariances_take_gaps_partial_frames_and_low_signal(noise, gapped):
     assert cover > least_cover(len(gapped))
 
 
-@pytest.mark.parametrize("noise", ["joint", "residual"])
-def test_mean_cosines_are_exact_at_any_step(noise, repeats):
-    """At D_R dt = 0.5 likelihood is 10 % low (heat kernel: 0.9015), the mean cosine is right."""
+@pytest.fixture(scope="module")
+def coarse(repeats):
+    """Return tracks with D_R dt = 0.5."""
     tracks = []
     for seed in range(repeats(16, 30)):
         m = simulate_motion(TETRAHEDRON, D_R=0.5, dt=1.0, n_frames=400, rng=seed)
         tracks.append(tracked(add_noise(m.positions(), sigma=SIGMA, rng=900 + seed)))
+    return tracks
+
+
+@pytest.mark.parametrize("noise", ["joint", "residual"])
+def test_mean_cosines_are_exact_at_any_step(noise, coarse):
+    """At D_R dt = 0.5 likelihood is 10 % low (heat kernel: 0.9015), the mean cosine is right."""
+    tracks = coarse
     mean, error, spread, cover = relative(tracks, 0.5, method="trace", noise=noise)
     assert abs(mean - 1) < 3 * error
     assert cover > least_cover(len(tracks))
@@ -602,8 +617,9 @@ def test_drift_is_subtracted_and_reported(repeats):
     Without drift D_T would be 25 times too large.
     """
     flow = np.array([0.9, -0.3, 1.2]) * 5 * np.sqrt(2 * planted("translation"))
-    time = np.arange(300.0)[:, None, None]
-    motions = [tracked(cloud(s) + flow * time) for s in range(repeats(8, 60))]
+    frames = repeats(150, 300)
+    time = np.arange(frames)[:, None, None]
+    motions = [tracked(cloud(s, frames) + flow * time) for s in range(repeats(8, 60))]
     truth = planted("translation")
     mean, error, _, cover = relative(motions, truth, quantity="translation", drift=True)
     assert abs(mean - 1) < 3 * error
@@ -628,10 +644,10 @@ def test_drift_by_reversal_and_time_unit():
 
 
 def test_the_probability_that_pooled_motions_agree(repeats):
-    """p_same is uniform for equal D (pools of 5; Kolmogorov 1 %), and tiny for D that differ."""
-    count = repeats(10, 40)
-    motions = [tracked(cloud(2000 + s, n_frames=repeats(50, 100))) for s in range(5 * count)]
-    pools = [motions[5 * k : 5 * k + 5] for k in range(count)]
+    """p_same is uniform for equal D (pools of 3 or 5; Kolmogorov 1 %), tiny for D that differ."""
+    count, size = repeats(10, 40), repeats(3, 5)
+    motions = [tracked(cloud(2000 + s, n_frames=repeats(50, 100))) for s in range(size * count)]
+    pools = [motions[size * k : size * (k + 1)] for k in range(count)]
     p = np.sort([estimate_diffusion(pool).p_same for pool in pools])
     ranks = np.arange(1, count + 1) / count
     assert max(np.max(ranks - p), np.max(p - ranks + 1 / count)) < 1.63 / np.sqrt(count)
@@ -689,16 +705,17 @@ def test_turning_in_the_plane_has_no_finite_step_bias():
 # ---- the solver on extreme input ----------------------------------------------------------------
 
 
-@pytest.mark.parametrize("quantity", QUANTITIES)
 @pytest.mark.parametrize("n_frames", [3, 4, 5, 8])
 @pytest.mark.parametrize("snr", [0.01, 20.0])
-def test_a_handful_of_frames_gives_finite_nested_intervals(n_frames, snr, quantity, repeats):
-    """3, 4, 5 or 8 frames, 3 or 10 tracks each: finite, nested; most cannot exclude 0."""
-    for seed in range(repeats(3, 10)):
+def test_a_handful_of_frames_gives_finite_nested_intervals(n_frames, snr, repeats):
+    """3, 4, 5 or 8 frames, 2 or 10 tracks each: finite, nested; most cannot exclude 0."""
+    for seed in range(repeats(2, 10)):
         motion = tracked(cloud(seed, n_frames=n_frames, snr=snr))
-        assert_sane(estimate_diffusion(motion, quantity=quantity))
+        for quantity in QUANTITIES:
+            assert_sane(estimate_diffusion(motion, quantity=quantity))
 
 
+@functools.cache
 def extreme(kind):
     """Return a motion that is difficult for a solver."""
     x, rng = cloud(21, n_frames=150), np.random.default_rng(0)
@@ -754,7 +771,7 @@ def test_random_strange_motions(quantity, repeats):
     """Random mixtures of few frames, odd units, SNR 1e-3 to 1e6 and body: finite and nested."""
     rng = np.random.default_rng(99)
     bodies = [TETRAHEDRON, Cluster.trimer(1.0), Cluster.touching(5, 2.45), Cluster.touching(7, 2.0)]
-    for seed in range(repeats(15, 40)):
+    for seed in range(repeats(10, 40)):
         snr, unit = 10 ** rng.uniform(-3, 6), 10.0 ** rng.integers(-9, 9)
         sigma = min(SIGMA, SIGMA * np.sqrt(2e3 / snr))
         x = cloud(seed, n_frames=int(rng.choice([3, 4, 6, 12, 60])), cluster=bodies[seed % 4],
@@ -989,9 +1006,9 @@ def test_missing_frames_are_not_counted():
 
 
 @pytest.mark.parametrize("quantity", QUANTITIES)
-def test_an_estimate_takes_few_passes(standard, quantity, passes):
+def test_an_estimate_takes_few_passes(standard, quantity, passes, repeats):
     """An estimate with both intervals takes under 250 passes over the steps."""
-    for motion in standard[0][:8]:
+    for motion in standard[0][: repeats(4, 8)]:
         passes.clear()
         estimate_diffusion(motion, quantity=quantity)
         assert len(passes) < 250

@@ -296,12 +296,12 @@ def test_a_tracked_sphere_and_the_centroid(name, ratio):
 def test_the_error_estimate_bounds_the_error(name, repeats):
     """At degrees 1 to 8 the estimate is never under a third of the error (against degree 11).
 
-    The quick form takes four of these degrees, against degree 10.
+    The quick form takes three of these degrees, against degree 8.
 
     benchmarks/mobility.py does the same for every row of the table and for unequal spheres.
     """
-    truth = body(name, repeats(10, 11)).D
-    for degree in repeats((1, 2, 5, 8), range(1, 9)):
+    truth = body(name, repeats(8, 11)).D
+    for degree in repeats((1, 2, 5), range(1, 9)):
         mobility = body(name, degree)
         assert mobility.error > deviation(mobility.D, truth) / 3
     assert body(name, 8).error < 1e-4
@@ -313,7 +313,7 @@ def test_the_error_of_unequal_and_fused_bodies(repeats):
         ([[0, 0, 0], [0, 0, 4.0]], [1.0, 3.0]),
         ([[0, 0, 0], [0, 0, 1.0], [0.9, 0, 0.3]], [1.0, 1.0, 0.8]),
     ):
-        truth = cluster_mobility(centers, radius=radius, degree=repeats(11, 12), **WATERY).D
+        truth = cluster_mobility(centers, radius=radius, degree=repeats(10, 12), **WATERY).D
         for degree in repeats((3, 6), (3, 4, 6, 8)):
             mobility = cluster_mobility(centers, radius=radius, degree=degree, **WATERY)
             assert mobility.error > deviation(mobility.D, truth) / 3

@@ -48,6 +48,11 @@ def plane():
     return measured(planar=True).clusters[0]
 
 
+@pytest.fixture(scope="module")
+def three():
+    return measured(clusters=3, frames=40, labels=["<b>", "a$_b$", "c"])
+
+
 def axes(**kwargs):
     return Figure().add_subplot(**kwargs)
 
@@ -266,9 +271,8 @@ def segments(ax):
     return [np.array(c.get_segments()) for c in ax.collections if hasattr(c, "get_segments")]
 
 
-def test_forest_shows_values_intervals_and_the_pooled_band():
-    report = measured(clusters=3, labels=["<b>", "a$_b$", "c"])
-    ax = axes()
+def test_forest_shows_values_intervals_and_the_pooled_band(three):
+    report, ax = three, axes()
     assert plot.plot_forest(report.clusters, ax=ax, pooled=report.pooled.D_R) is ax
     wide, narrow = segments(ax)
     for k, result in enumerate(report.clusters):
@@ -343,10 +347,10 @@ def test_save_figures_names_its_files_and_changes_no_setting(
     assert dict(rcParams) == before
 
 
-def test_save_figures_draws_the_first_clusters_and_all_in_one(tmp_path, monkeypatch):
+def test_save_figures_draws_the_first_clusters_and_all_in_one(three, tmp_path, monkeypatch):
     monkeypatch.setattr(plot, "MAX_CLUSTERS", 1)
     monkeypatch.setattr(plot, "save_figure", lambda _, stem: [stem])
-    files = plot.save_figures(measured(clusters=3, frames=20), tmp_path)
+    files = plot.save_figures(three, tmp_path)
     stems = {f.name for f in files}
     assert "clusters" in stems
     assert {s.split("-")[1] for s in stems if "-" in s} == {"0"}

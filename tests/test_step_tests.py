@@ -47,27 +47,26 @@ def turned(x, rotvec):
     return Rotation.from_rotvec(rotvec).apply((x - center).reshape(-1, 3)).reshape(x.shape) + center
 
 
-@pytest.mark.parametrize("size", [3.0, 50.0])
-@pytest.mark.parametrize("drift", [False, True])
-def test_a_stage_jump_is_found_and_cut(size, drift):
+def test_a_stage_jump_is_found_and_cut(repeats):
     """One jump, however long, is found at its frame with its size; D_T without it is the true one.
 
     D_T differs from that of the track without the jump by the one step that is left out, at most a
     hundredth of it (1/299, and what drift=True takes off).
     """
-    x = brownian(1)
-    x[150:] += [size, 0, 0]
-    found, motion, estimate = jumps_of(x, "translation", drift=drift)
-    assert found.rows.tolist() == [150]
-    assert not found.many
-    assert found.length[0] == pytest.approx(size, abs=4 * np.sqrt(2 * 0.02 * DT))
-    clean = perrin.estimate_diffusion(
-        track_rotation(brownian(1), dt=DT), quantity="translation", drift=drift
-    )
-    cut = perrin.estimate_diffusion(cut_at(motion, found.rows), quantity="translation", drift=drift)
-    assert cut.value == pytest.approx(clean.value, rel=0.01)
-    assert estimate.value > 1.2 * clean.value
-    assert not jumps_of(x, "rotation", drift=drift)[0].rows.size
+    cases = [(3.0, True), (50.0, False), (3.0, False), (50.0, True)]
+    for size, drift in cases[: repeats(2, 4)]:
+        given = {"quantity": "translation", "drift": drift}
+        x = brownian(1)
+        x[150:] += [size, 0, 0]
+        found, motion, estimate = jumps_of(x, **given)
+        assert found.rows.tolist() == [150], (size, drift)
+        assert not found.many
+        assert found.length[0] == pytest.approx(size, abs=4 * np.sqrt(2 * 0.02 * DT))
+        clean = perrin.estimate_diffusion(track_rotation(brownian(1), dt=DT), **given)
+        cut = perrin.estimate_diffusion(cut_at(motion, found.rows), **given)
+        assert cut.value == pytest.approx(clean.value, rel=0.01), (size, drift)
+        assert estimate.value > 1.2 * clean.value
+        assert not jumps_of(x, "rotation", drift=drift)[0].rows.size, (size, drift)
 
 
 def test_one_large_turn_is_found():
@@ -111,11 +110,11 @@ def test_coordinates_wrapped_in_a_box_are_found():
 
 @pytest.mark.parametrize("quantity", ["rotation", "translation"])
 def test_brownian_motion_and_badly_measured_frames_have_no_jumps(quantity, repeats):
-    """No jump in 12 or 40 tracks, of which half have 3 % of frames with six times the noise.
+    """No jump in 8 or 40 tracks, of which half have 3 % of frames with six times the noise.
 
     At the level of 1e-6 a track none is expected in any; slow bodies show the bad frames most.
     """
-    for seed in range(repeats(12, 40)):
+    for seed in range(repeats(8, 40)):
         slow = {"D_R": 1e-5, "D_T": 1e-4} if seed % 3 == 0 else {}
         x = brownian(seed, frames=(60, 150)[seed % 2], bad=0.03 * (seed % 4 > 1), **slow)
         assert not jumps_of(x, quantity)[0].rows.size, seed
@@ -205,7 +204,9 @@ def test_the_test_for_a_steady_motion_keeps_its_level(quantity, repeats):
     p = np.array(
         [
             steady_motion(m, perrin.estimate_diffusion(m, quantity=quantity)).p
-            for m in (track_rotation(brownian(s, frames=100), dt=DT) for s in range(count))
+            for m in (
+                track_rotation(brownian(s, frames=repeats(60, 100)), dt=DT) for s in range(count)
+            )
         ]
     )
     assert np.count_nonzero(p < 0.05) < repeats(5, 12)
@@ -215,12 +216,13 @@ def test_the_test_for_a_steady_motion_keeps_its_level(quantity, repeats):
 def test_a_velocity_changes_nothing_but_the_drift(repeats):
     """D_T, errors, intervals and p_same are the same to 1e-6 up to 10 um/s, gaps included."""
     rng = np.random.default_rng(9)
-    places = [brownian(s, frames=150) for s in (20, 21)]
+    frames = repeats(80, 150)
+    places = [brownian(s, frames=frames) for s in (20, 21)]
     for x in places:
-        x[rng.random(150) < 0.3] = np.nan
+        x[rng.random(frames) < 0.3] = np.nan
 
     def answer(velocity):
-        time = DT * np.arange(150)[:, None, None]
+        time = DT * np.arange(frames)[:, None, None]
         motions = [track_rotation(x + time * velocity, dt=DT) for x in places]
         return perrin.estimate_diffusion(motions, quantity="translation", drift=True)
 

@@ -32,7 +32,6 @@ SLANT = exp_map(np.array([0.4, -0.7, 0.3]))
 BODY = Cluster.from_positions(np.random.default_rng(5).normal(size=(6, 3)))
 SIGMA = 0.03 * BODY.R
 NOISE = float(np.trace(noise_floor(BODY, sigma=SIGMA).covariance)) / 3
-QUANTITIES = ("rotation", "translation")
 
 
 def planted(ratio=(1, 1.5, 3), snr=9.0):
@@ -201,11 +200,16 @@ def same(found, expected, tensor):
     assert found.p_isotropic == pytest.approx(expected.p_isotropic, rel=1e-4)
 
 
-@pytest.mark.parametrize("quantity", QUANTITIES)
-@pytest.mark.parametrize("missing", [0.0, 0.1])
-def test_laws(quantity, missing):
+def test_laws(repeats):
     """Turn and shift the lab, permute, reverse time, change units: the answer follows."""
-    x = cloud(1, missing=missing, n_frames=150)
+    cases = (("rotation", 0.1), ("translation", 0.0), ("rotation", 0.0), ("translation", 0.1))
+    for quantity, missing in cases[: repeats(2, 4)]:
+        laws_hold(quantity, missing)
+
+
+def laws_hold(quantity, missing):
+    """Assert the laws with this share of the frames missing."""
+    x = cloud(1, missing=missing, n_frames=80)
     motion = track_rotation(x, dt=1.0)
     found = diffusion_tensor(motion, quantity=quantity)
     turn = exp_map(np.array([1.0, -0.5, 2.0]))
@@ -309,7 +313,7 @@ def runs(repeats):
     """Return values, errors and p-values along the true axes: default and residual noise."""
     out = {"joint": [], "residual": []}
     truth = planted()
-    for seed in range(repeats(15, 40)):
+    for seed in range(repeats(10, 40)):
         motion = tracked(seed)
         tensor = in_body(motion, truth)
         values, axes = np.linalg.eigh(tensor)
@@ -355,14 +359,14 @@ def test_anisotropy_is_detected(runs):
 def test_isotropy_is_rejected_no_more_often_than_stated(repeats):
     """At the 5 % level at most 8 % of tracks of an isotropic body (benchmarks/tensors.py: 7 %).
 
-    More than 5 rejections of 20 tracks, or 10 of 60, would have probability 1e-3 at 7 %.
+    More than 4 rejections of 12 tracks, or 10 of 60, would have probability 1e-3 at 7 %.
     """
-    count = repeats(20, 60)
+    count = repeats(12, 60)
     p = [
         diffusion_tensor(tracked(seed, ratio=(1, 1, 1), n_frames=150), symmetry="C_1").p_isotropic
         for seed in range(count)
     ]
-    assert np.sum(np.array(p) < 0.05) <= repeats(5, 10)
+    assert np.sum(np.array(p) < 0.05) <= repeats(4, 10)
     assert abs(np.median(p) - 0.5) < 1.5 / count**0.5 + 0.05
 
 
@@ -382,8 +386,9 @@ def test_missing_frames_and_blur_do_not_bias_the_mean(repeats):
         x = truth.positions().reshape(600, 10, 6, 3).mean(axis=1)
         motion = track_rotation(add_noise(x, sigma=SIGMA, rng=seed), dt=1.0)
         ratio.append(diffusion_tensor(motion).mean / (np.trace(planted()) / 3))
-        stated = diffusion_tensor(motion, exposure=1.0)
-        assert stated.mean == pytest.approx(np.trace(planted()) / 3, rel=0.25)
+        if seed < repeats(1, 8):
+            stated = diffusion_tensor(motion, exposure=1.0)
+            assert stated.mean == pytest.approx(np.trace(planted()) / 3, rel=0.25)
     assert np.mean(ratio) == pytest.approx(1, abs=4 * 0.06 / count**0.5)
 
 
@@ -416,10 +421,11 @@ def test_the_statement_about_the_axes():
     assert even.p_isotropic > 0.05
     assert "read D_R, the mean, not the three sorted values" in str(even)
     assert not even.resolved_axes.any()
-    wide = diffusion_tensor(tracked(1, ratio=(1, 3, 9), n_frames=1000))
+    motion = tracked(1, ratio=(1, 3, 9), n_frames=1000)
+    wide = diffusion_tensor(motion)
     assert wide.resolved_axes.all()
     assert "axes known to" in str(wide)
-    truth = np.linalg.eigh(in_body(tracked(1, ratio=(1, 3, 9), n_frames=1000), planted((1, 3, 9))))
+    truth = np.linalg.eigh(in_body(motion, planted((1, 3, 9))))
     off = np.degrees(np.arccos(np.abs(np.sum(wide.axes * truth[1], axis=0))))
     assert np.all(off < 4 * wide.axis_errors.max(axis=1))
     assert np.linalg.det(wide.axes) == pytest.approx(1)
@@ -514,7 +520,7 @@ def test_moving_the_point():
     np.testing.assert_allclose(symmetric, symmetric.T, atol=1e-14)
 
 
-def test_the_search_takes_few_passes(monkeypatch):
+def test_the_search_takes_few_passes(monkeypatch, repeats):
     """A tensor with errors and p-values: under 200 passes over the steps (35 ms for 300 frames)."""
     passes = []
     slopes = NoisyVectors.by_tensor
@@ -524,7 +530,7 @@ def test_the_search_takes_few_passes(monkeypatch):
         return slopes(self, D, theta, B)
 
     monkeypatch.setattr(NoisyVectors, "by_tensor", counted)
-    for seed in range(3):
+    for seed in range(repeats(2, 3)):
         motion = tracked(seed)
         passes.clear()
         diffusion_tensor(motion)
@@ -581,8 +587,8 @@ def test_a_value_on_its_edge_is_warned_of():
 
 def test_steps_that_share_no_frame():
     """Pieces of one step each do not determine the noise; a stated noise is subtracted."""
-    motion = tracked(4, n_frames=600)
-    apart = dataclasses.replace(motion, piece=np.arange(600) // 2)
+    motion = tracked(4, n_frames=300)
+    apart = dataclasses.replace(motion, piece=np.arange(300) // 2)
     found = diffusion_tensor(apart, noise=SIGMA, exposure=0.0)
     assert abs(found.mean - np.trace(planted()) / 3) < 4 * found.mean_stderr
     joint = diffusion_tensor(apart)
@@ -591,7 +597,7 @@ def test_steps_that_share_no_frame():
 
 def test_truth_without_noise_is_measured_with_every_option():
     """Simulated truth (sigma 0, covariance 0) and its rounding give the planted tensor."""
-    truth = simulate_motion(BODY, D_R=planted(), D_T=0.02, dt=1.0, n_frames=2000, rng=1)
+    truth = simulate_motion(BODY, D_R=planted(), D_T=0.02, dt=1.0, n_frames=1000, rng=1)
     values, axes = np.linalg.eigh(planted())
     for motion in (truth, track_rotation(truth.positions(), dt=1.0)):
         for how in ({}, {"noise": "residual"}, {"noise": "residual", "exposure": 0.0}):
