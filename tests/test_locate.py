@@ -69,7 +69,7 @@ class Movie:
 @pytest.fixture(scope="module")
 def tetrahedra(repeats):
     """Return frames of a tetrahedron at random poses: movie, rotations, positions (T, 4, 3)."""
-    rng, n = np.random.default_rng(11), repeats(5, 10)
+    rng, n = np.random.default_rng(11), repeats(4, 10)
     rotation = exp_map(rng.normal(size=(n, 3)))
     middle = np.array([3.5, 3.5, 4.4]) + rng.uniform(-0.1, 0.1, (n, 3))
     places = middle[:, None] + np.einsum("tij,nj->tni", rotation, BODY.positions)

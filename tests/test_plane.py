@@ -30,10 +30,11 @@ class Plane:
 
 
 @pytest.fixture(scope="module")
-def triangles():
-    """Return the motion of a triangle over 30 frames, its positions, and the movie."""
+def triangles(repeats):
+    """Return the motion of a triangle over 12 or 30 frames, its positions, and the movie."""
     body = perrin.Cluster([[0.0, 0.0], [1.6, 0.0], [0.3, 1.3]])
-    truth = perrin.simulate_motion(body, D_R=0.02, D_T=0.01, dt=1.0, n_frames=30, rng=4)
+    frames = repeats(12, 30)
+    truth = perrin.simulate_motion(body, D_R=0.02, D_T=0.01, dt=1.0, n_frames=frames, rng=4)
     places = truth.positions() + 6.0
     return truth, places, Plane(places, np.random.default_rng(1))
 
