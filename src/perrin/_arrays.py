@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, MutableSequence
 from dataclasses import fields
-from typing import Any, TypeAlias, TypeVar
+from typing import Any, Self, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -198,6 +198,40 @@ def numpy_to_python(options: object) -> None:
             object.__setattr__(options, field.name, float(value))
         elif isinstance(value, np.generic):
             object.__setattr__(options, field.name, value.item())
+
+
+class PlainOptions:
+    """Base of the options objects whose fields are all values that JSON holds.
+
+    Examples
+    --------
+    >>> from dataclasses import dataclass
+    >>> @dataclass(frozen=True)
+    ... class Scan(PlainOptions):
+    ...     exposure: float = 0.0
+    >>> Scan.from_dict(Scan(exposure=0.5).to_dict())
+    Scan(exposure=0.5)
+    """
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the options as values that JSON holds."""
+        return {field.name: to_plain(getattr(self, field.name)) for field in fields(self)}  # type: ignore[arg-type]
+
+    @classmethod
+    def from_dict(cls, entry: Mapping[str, Any]) -> Self:
+        """Return the options that `to_dict` wrote.
+
+        Parameters
+        ----------
+        entry : mapping
+            The dictionary of `to_dict`.
+
+        Returns
+        -------
+        options
+            An object of the class.
+        """
+        return cls(**entry)
 
 
 def refuse(faults: Iterable[str], *, error: type[ValueError] = ValueError) -> None:

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from dataclasses import dataclass
+from typing import Literal
 
-from perrin._arrays import flag_fault, number_fault, numpy_to_python, refuse, stated_twice
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
+from perrin._arrays import (
+    PlainOptions,
+    flag_fault,
+    number_fault,
+    numpy_to_python,
+    refuse,
+    stated_twice,
+)
 
 
 @dataclass(frozen=True)
-class Noise:
+class Noise(PlainOptions):
     """Assumptions on the measurement noise in an estimate of a diffusion coefficient.
 
     Parameters
@@ -45,21 +49,6 @@ class Noise:
         """Refuse values out of range."""
         refuse(noise_faults(self.model, self.exposure, drift=self.drift))
         numpy_to_python(self)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the options as values that JSON holds."""
-        return asdict(self)
-
-    @classmethod
-    def from_dict(cls, entry: Mapping[str, Any]) -> Noise:
-        """Return the options that `to_dict` wrote.
-
-        Examples
-        --------
-        >>> Noise.from_dict(Noise(0.02, drift=True).to_dict())
-        Noise(model=0.02, exposure=None, drift=True)
-        """
-        return cls(**entry)
 
     @property
     def text(self) -> str:

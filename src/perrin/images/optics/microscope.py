@@ -2,27 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, fields
-from typing import TYPE_CHECKING, Any, Literal, TypedDict
+from dataclasses import dataclass, fields
+from typing import Any, Literal, TypedDict
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from perrin._arrays import (
     Floats,
+    PlainOptions,
     choice_fault,
     flag_fault,
     number_fault,
     numpy_to_python,
     refuse,
-    to_plain,
 )
 from perrin.images.optics.optics import CameraNoise
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-    from typing import Self
-
 
 _Dtype = Literal["uint8", "uint16", "float32", "float64"]
 
@@ -48,7 +43,7 @@ class RenderSettings(TypedDict, total=False):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Light:
+class Light(PlainOptions):
     """Intensity of the spheres and of the background of a rendered movie.
 
     Parameters
@@ -108,25 +103,6 @@ class Light:
         refuse(faults)
         object.__setattr__(self, "gradient", tuple(slope.tolist()))
         numpy_to_python(self)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the options as values that JSON holds."""
-        return _plain_fields(self)
-
-    @classmethod
-    def from_dict(cls, entry: Mapping[str, Any]) -> Self:
-        """Return the options that `to_dict` wrote.
-
-        Parameters
-        ----------
-        entry : mapping
-            The dictionary of `to_dict`.
-
-        Returns
-        -------
-        Light
-        """
-        return cls(**entry)
 
     def background_photons(self, shape: tuple[int, int, int], voxel: Floats) -> Floats:
         """Return the expected photons of the background in every voxel.
@@ -198,7 +174,7 @@ class Light:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Scan:
+class Scan(PlainOptions):
     """Times at which the planes of a rendered frame are recorded.
 
     Parameters
@@ -233,25 +209,6 @@ class Scan:
             + number_fault("substeps", self.substeps, above=0, whole=True)
         )
         numpy_to_python(self)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the options as values that JSON holds."""
-        return _plain_fields(self)
-
-    @classmethod
-    def from_dict(cls, entry: Mapping[str, Any]) -> Self:
-        """Return the options that `to_dict` wrote.
-
-        Parameters
-        ----------
-        entry : mapping
-            The dictionary of `to_dict`.
-
-        Returns
-        -------
-        Scan
-        """
-        return cls(**entry)
 
     def duration(self, n_planes: int) -> float:
         """Return the time that a frame takes, from the start of its first plane, s."""
@@ -306,7 +263,7 @@ class Scan:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Camera:
+class Camera(PlainOptions):
     """Conversion of photons into grey levels.
 
     Parameters
@@ -353,25 +310,6 @@ class Camera:
         object.__setattr__(self, "dtype", dtype)
         numpy_to_python(self)
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the options as values that JSON holds."""
-        return _plain_fields(self)
-
-    @classmethod
-    def from_dict(cls, entry: Mapping[str, Any]) -> Self:
-        """Return the options that `to_dict` wrote.
-
-        Parameters
-        ----------
-        entry : mapping
-            The dictionary of `to_dict`.
-
-        Returns
-        -------
-        Camera
-        """
-        return cls(**entry)
-
     def variance_model(self) -> CameraNoise:
         """Return the variance of a voxel as a function of its expected grey level.
 
@@ -405,12 +343,6 @@ class Camera:
         if dtype.kind != "f":
             counts = np.clip(np.rint(counts), 0, np.iinfo(dtype).max)
         return np.asarray(counts, dtype=dtype)
-
-
-def _plain_fields(options: Light | Scan | Camera) -> dict[str, Any]:
-    """Return the fields of an options object as values that JSON holds."""
-    plain: dict[str, Any] = to_plain(asdict(options))
-    return plain
 
 
 # The single keywords of `render_stack`.

@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import asdict, dataclass, fields
-from typing import TYPE_CHECKING, Any, TypedDict
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, TypedDict
 
 import numpy as np
 
-from perrin._arrays import flag_fault, number_fault, numpy_to_python, refuse, to_plain
+from perrin._arrays import PlainOptions, flag_fault, number_fault, numpy_to_python, refuse
 from perrin.errors import PrecisionWarning
 from perrin.geometry.shapes import pair_distances
 from perrin.tracks.groups import TOUCHING_REACH, touching_groups
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-    from typing import Self
-
     from perrin._arrays import Floats, Ints
 
 
@@ -46,7 +43,7 @@ class SpotSettings(TypedDict, total=False):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Spots:
+class Spots(PlainOptions):
     """Which spots of a frame are taken for spheres.
 
     Parameters
@@ -89,26 +86,6 @@ class Spots:
             + flag_fault("border", self.border)
         )
         numpy_to_python(self)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the options as values that JSON holds."""
-        plain: dict[str, Any] = to_plain(asdict(self))
-        return plain
-
-    @classmethod
-    def from_dict(cls, entry: Mapping[str, Any]) -> Self:
-        """Return the options that `to_dict` wrote.
-
-        Parameters
-        ----------
-        entry : mapping
-            The dictionary of `to_dict`.
-
-        Returns
-        -------
-        Spots
-        """
-        return cls(**entry)
 
 
 # The single keywords in place of the fields of `Spots`.
