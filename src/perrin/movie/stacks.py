@@ -22,7 +22,7 @@ from perrin.movie.bodies import Bodies, find_bodies, stated_errors, tracks_of
 from perrin.movie.stages import Located, fit_poses, locate_frames
 from perrin.movie.workers import Work, check_workers
 from perrin.run.experiment import Experiment, Recording, merged_experiment
-from perrin.run.measure import measure_table
+from perrin.run.measure import library_version, measure_table
 from perrin.tracks.clock import Clock, evenly_spaced
 
 if TYPE_CHECKING:
@@ -281,14 +281,6 @@ def _dependencies(
     frames: Sequence[int],
 ) -> dict[str, Any]:
     """Return all values that the located spheres depend on."""
-    from importlib.metadata import PackageNotFoundError, version
-
-    versions: dict[str, str | None] = {}
-    for name in _LIBRARIES:
-        try:
-            versions[name] = version(name)
-        except PackageNotFoundError:
-            versions[name] = None
     return {
         "sha256": digest(stack),
         **stack.choice,
@@ -299,7 +291,7 @@ def _dependencies(
         **asdict(search),
         "refine": refine,
         "optics": None if optics is None else optics.to_dict(),
-        "versions": versions,
+        "versions": {name: library_version(name) for name in _LIBRARIES},
     }
 
 

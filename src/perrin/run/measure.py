@@ -823,23 +823,22 @@ def pool_clusters(
 
 
 @cache
-def _library_version(name: str) -> str:
-    """Return the installed version of a library; reading it takes some milliseconds."""
-    from importlib.metadata import version
+def library_version(name: str) -> str | None:
+    """Return the installed version of a library, None where it is missing.
 
-    return version(name)
-
-
-def installed_versions() -> dict[str, str]:
-    """Return the versions of Python and of the libraries that determine the numbers.
+    Reading a version takes some milliseconds, so that each is read once.
 
     Examples
     --------
-    >>> sorted(installed_versions())
-    ['numpy', 'pandas', 'perrin', 'python', 'scipy']
+    >>> library_version("numpy") == np.__version__, library_version("no-such-library")
+    (True, None)
     """
-    names = ("perrin", "numpy", "scipy", "pandas")
-    return {"python": platform.python_version()} | {n: _library_version(n) for n in names}
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return None
 
 
 def run_settings(
@@ -864,7 +863,8 @@ def run_settings(
         "input": dict(source),
         "arguments": dict(arguments),
         "first_frame": first_frame,
-        "versions": installed_versions(),
+        "versions": {"python": platform.python_version()}
+        | {name: library_version(name) for name in ("perrin", "numpy", "scipy", "pandas")},
         "created": datetime.now(UTC).isoformat(timespec="seconds"),
         "seed": None,
     }
