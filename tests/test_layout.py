@@ -85,7 +85,7 @@ def test_public_names_are_the_ones_listed():
         r"    from perrin\.(\w+) import (?:\(([^)]*)\)|(.*))", (SOURCE / "__init__.py").read_text()
     )
     typed = {face: set(re.findall(r"\w+", many or few)) for face, many, few in block}
-    assert typed == {face: set(names) for face, names in perrin._FACES.items()}
+    assert typed == {face: set(names) for face, names in perrin._FACES.items() if names}
     for face, names in perrin._FACES.items():
         module = importlib.import_module(f"perrin.{face}")
         for name in names:
@@ -93,6 +93,12 @@ def test_public_names_are_the_ones_listed():
             assert name in getattr(module, "__all__", names)
     with pytest.raises(AttributeError, match="no attribute 'nonsense'"):
         _ = perrin.nonsense
+
+
+def test_every_subpackage_is_an_attribute():
+    """After `import perrin` alone, `perrin.plot` and the others are imported when first used."""
+    code = "; ".join(f"perrin.{name}" for names in SUBPACKAGES for name in sorted(names))
+    assert "perrin.plot.style" in loaded_after(f"import perrin; {code}")
 
 
 def test_names_survive_the_import_of_every_module():

@@ -344,6 +344,10 @@ _FACES = {
         "analyze_stack",
     ),
     "report": ("write_run",),
+    # These have no names in perrin itself.
+    "plot": (),
+    "paper": (),
+    "cli": (),
 }
 
 
