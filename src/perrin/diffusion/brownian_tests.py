@@ -1,0 +1,876 @@
+"""Tests of whether the steps of a motion are those of Brownian motion with constant noise.
+
+Every axis has its own D and noise offset. The tests look at what is left: the powers of the sine
+modes over their fitted variances, and the errors of predicting each step from those before it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
+from importlib.resources import files
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from perrin._arrays import frozen
+from perrin.diffusion.step_kernels import covariance_bands, difference_eigenvalues
+from perrin.diffusion.step_spectra import (
+    confined_autocovariance,
+    fractional_slope,
+    sine_spectrum,
+)
+from perrin.diffusion.steps import NoisySteps, Quantity, principal_steps
+from perrin.errors import TooFewFramesError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from perrin._arrays import Bools, Floats, Ints
+    from perrin.diffusion.noise_model import Noise
+    from perrin.motion.rigid_motion import RigidMotion
+
+# Names of the tests, in the order in which they are reported.
+TESTS = ("fractional", "cage", "steady", "clustering", "slow change", "tails", "largest", "line")
+
+_FEWEST_STEPS = 20  # eight tests of fewer steps say nothing
+
+# An axis whose mean square is this much smaller than another one's does not move.
+_SMALLEST_AXIS = 1e-20
+
+# Frames whose noise differs by less than this share of a step's variance (rms) count as equal: the
+# elements of the covariance off the diagonal of the sine modes are of that order.
+_EQUAL_NOISE = 0.05
+
+# The logarithm v of 1 + 2 o/(D tau), the ratio of the highest to the lowest sine mode, is searched
+# between these: below, neighbouring steps are one straight line; above, there is no diffusion.
+_LEAST_V, _MOST_V = -9.0, 14.0
+
+_CONFINED_RATE = 6.0  # relaxations per track of the cage that the cage test looks for
+
+_CLUSTERING_LAGS = 20
+
+# A track of which the dense score would need more than this is divided, and the scores are added.
+_DENSE_BLOCK = 1000
+
+# Below these the p-values are replaced by ranks among draws from the fit.
+_FEWEST_ASYMPTOTIC_STEPS, _LEAST_INFORMATION = 200, 10.0
+
+# Draws: as many numbers as can be judged in 0.1 s, in these limits; below the rank of _TAIL_RANK
+# the p-value of the draws is continued in proportion to the approximate one.
+_DRAWN_NUMBERS, _FEWEST_DRAWS, _MOST_DRAWS, _TAIL_RANK = 150_000, 199, 999, 10
+
+
+class Score(NamedTuple):
+    """The efficient score of an alternative, its information and its third cumulant, (B,) each."""
+
+    value: Floats
+    information: Floats
+    third: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class AxisFit:
+    """Steps of B data sets along A axes, and the D and noise offset fitted to each axis.
+
+    Attributes
+    ----------
+    y : ndarray, shape (B, A, N)
+        Steps, rad or um.
+    D : ndarray, shape (B, A)
+        Diffusion coefficients, rad^2/s or um^2/s.
+    offset : ndarray, shape (B, A)
+        Noise variance of the least noisy frame, less motion blur.
+    """
+
+    y: Floats
+    D: Floats
+    offset: Floats
+
+    def __post_init__(self) -> None:
+        frozen(self.y, self.D, self.offset)
+
+
+@dataclass(frozen=True, eq=False)
+class AxisModel:
+    """Brownian steps along A axes, each with a D and an offset of its own.
+
+    Attributes
+    ----------
+    start : ndarray, shape (N,)
+        Time at which each step begins, s.
+    tau : ndarray, shape (N,)
+        Duration of each step, s.
+    linked : ndarray of bool, shape (N,)
+        Whether the next step begins with the frame that this one ends with.
+    known : tuple of ndarray, shape (A, N)
+        Known part of the noise variances of the frames before and after each step.
+    blur : float
+        Motion blur takes this (s) times D from the known noise; 0 where the offset is free.
+    free : bool
+        Whether the offset is free; else the noise is known and the offset is 0.
+    steady : ndarray, shape (N, A, p)
+        What a steady velocity or spin along the lab axes adds to each step, per unit of it.
+    """
+
+    start: Floats
+    tau: Floats
+    linked: Bools
+    known: tuple[Floats, Floats]
+    blur: float
+    free: bool
+    steady: Floats
+
+    def __post_init__(self) -> None:
+        frozen(self.start, self.tau, self.linked, *self.known, self.steady)
+
+    @property
+    def n_steps(self) -> int:
+        """Number of steps N."""
+        return len(self.tau)
+
+    @cached_property
+    def even(self) -> bool:
+        """Whether all steps are linked and equally long."""
+        return bool(np.ptp(self.tau) <= 1e-9 * self.tau[0] and self.linked[:-1].all())
+
+    @cached_property
+    def differences(self) -> Floats:
+        """1 - cos w_k of the sine modes, (N,)."""
+        return difference_eigenvalues(self.n_steps)
+
+    @cached_property
+    def mean_known(self) -> Floats:
+        """Mean known noise variance of each axis, (A,)."""
+        return np.asarray(0.5 * (self.known[0] + self.known[1]).mean(axis=1))
+
+    def with_equal_noise(self) -> AxisModel:
+        """Return the model with the mean noise in all frames."""
+        level = np.broadcast_to(self.mean_known[:, None], self.known[0].shape)
+        return replace(self, known=(level, level))
+
+    def ratio(self, D: Floats, offset: Floats) -> Floats:
+        """Return v = ln(1 + 2 o/(D tau)), o the offset."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            v = np.log1p(2 * offset / (D * self.tau.mean()))
+        return np.asarray(np.clip(np.nan_to_num(v, nan=_MOST_V), _LEAST_V, _MOST_V))
+
+    def eigenvalues(self, D: Floats, offset: Floats) -> Floats:
+        """Return the variances of the sine modes for the mean duration and noise, (B, A, N)."""
+        noise = offset + self.mean_known - self.blur * D
+        return np.asarray(
+            2 * D[..., None] * self.tau.mean() + 2 * noise[..., None] * self.differences
+        )
+
+    def slopes(self, D: Floats, offset: Floats) -> tuple[Floats, Floats]:
+        """Return the derivatives of ln lambda_k in ln D and in the offset over D, (B, A, N)."""
+        eigen = self.eigenvalues(D, offset)
+        by_D = 2 * D[..., None] * (self.tau.mean() - self.blur * self.differences) / eigen
+        by_offset = 2 * D[..., None] * self.differences / eigen
+        return by_D, by_offset
+
+    def bands(self, D: Floats, offset: Floats) -> tuple[Floats, Floats]:
+        """Return diagonal and off-diagonal of the covariance of all rows, one after the other."""
+        shape = (*D.shape, self.n_steps)
+
+        def full(x: Floats) -> Floats:
+            return np.ascontiguousarray(np.broadcast_to(x, shape)).ravel()
+
+        linked = np.array(self.linked)
+        linked[-1] = False
+        one = np.ones(1)
+        return covariance_bands(
+            full(D[..., None]),
+            full(offset[..., None]),
+            full(self.tau),
+            full(linked),
+            blur=self.blur,
+            weight=(one, one),
+            known=(full(self.known[0]), full(self.known[1])),
+        )
+
+    def fit(self, y: Floats, *, near: AxisFit | None = None) -> AxisFit:
+        """Return the D and the offset of greatest likelihood of each axis of each data set.
+
+        Even steps are fitted in their sine modes, other steps by scoring on the tridiagonal
+        likelihood.
+
+        Parameters
+        ----------
+        y : ndarray, shape (B, A, N)
+            Steps.
+        near : AxisFit, optional
+            A fit of one data set from which to start; then three iterations suffice.
+        """
+        if self.even and np.ptp(self.known[0]) == 0:
+            return self._fit_modes(y, near)
+        return self._fit_tridiagonal(y, near)
+
+    def _fit_modes(self, y: Floats, near: AxisFit | None) -> AxisFit:
+        """Fit even steps: D follows from v, and v by scoring from the best of a grid."""
+        power = sine_powers(y)
+        tau, c, noise = self.tau.mean(), self.differences, self.mean_known
+
+        def relative(v: Floats) -> Floats:
+            return np.asarray(2 * tau * (1 + np.expm1(v)[..., None] / 2 * c))
+
+        def cost(v: Floats) -> Floats:
+            shape = relative(v)
+            return np.log(np.mean(power / shape, axis=-1)) + np.mean(np.log(shape), axis=-1)
+
+        if not self.free:
+            # One parameter: the root of the score in ln D, from the variance of the steps.
+            D = np.maximum(np.mean(power, axis=-1) / 2 - noise, 1e-3 * power.mean(axis=-1)) / tau
+            for _ in range(60):
+                g = self.slopes(D, 0 * D)[0]
+                r = power / self.eigenvalues(D, 0 * D) - 1
+                move = np.sum(g * r, axis=-1) / np.sum(g * g, axis=-1)
+                D = D * np.exp(np.clip(move, -1.0, 1.0))
+                if np.all(np.abs(move) < 1e-10):
+                    break
+            return AxisFit(y, D, np.zeros_like(D))
+        if near is None:
+            trials = np.linspace(-5.0, 9.0, 29)
+            v = trials[np.argmin([cost(np.full(y.shape[:2], t)) for t in trials], axis=0)]
+        else:
+            v = np.broadcast_to(self.ratio(near.D, near.offset + noise), y.shape[:2])
+        for _ in range(60 if near is None else 4):
+            shape = relative(v)
+            D = np.mean(power / shape, axis=-1)
+            g = tau * np.exp(v)[..., None] * c / shape
+            g = g - g.mean(axis=-1, keepdims=True)
+            r = power / (D[..., None] * shape)
+            move = np.sum(g * r, axis=-1) / np.sum(g * g, axis=-1)
+            v = np.clip(v + np.clip(move, -1.0, 1.0), _LEAST_V, _MOST_V)
+            if np.all(np.abs(move) < 1e-10):
+                break
+        D = np.mean(power / relative(v), axis=-1)
+        return AxisFit(y, D, D * tau * np.expm1(v) / 2 - noise)
+
+    def _fit_tridiagonal(self, y: Floats, near: AxisFit | None) -> AxisFit:
+        """Fit any steps by scoring, with the information of even steps of the mean duration."""
+        from scipy.linalg.lapack import dpttrf, dpttrs
+
+        tau, shape = self.tau.mean(), y.shape[:2]
+        if near is None:
+            start = self.with_equal_noise()
+            modes = replace(
+                start, tau=np.full(self.n_steps, tau), linked=np.ones(self.n_steps, bool)
+            )
+            near = modes._fit_modes(y, None)
+        D = np.array(np.broadcast_to(near.D, shape))
+        v = np.array(self.ratio(D, np.broadcast_to(near.offset, shape)))
+        starts = np.arange(0, y.size, self.n_steps)
+        for _ in range(60 if near.y is y else 4):
+            offset = D * tau * np.expm1(v) / 2 if self.free else np.zeros_like(D)
+            a, b = self.bands(D, offset)
+            d, lower, _ = dpttrf(a, b)
+            up = dpttrf(a[::-1], b[::-1])[0]
+            z = dpttrs(d, lower, y.reshape(-1, 1))[0][:, 0]
+            inverse = 1 / (d + up[::-1] - a)
+            corner = -lower * inverse[1:]
+            linked = np.tile(np.append(self.linked[:-1], False), len(starts))
+            excess, cross = z * z - inverse, np.append((z[:-1] * z[1:] - corner), 0.0) * linked
+            # Slopes of the log-likelihood in D and in the offset.
+            taus = np.tile(self.tau, len(starts))
+            in_D = np.add.reduceat((taus - self.blur) * excess + self.blur * cross, starts)
+            in_o = np.add.reduceat(excess - cross, starts)
+            in_D, in_o = in_D.reshape(shape), in_o.reshape(shape)
+            by_D, by_offset = self.slopes(D, offset)
+            if self.free:
+                share = tau * np.expm1(v) / 2
+                dv = tau * np.exp(v) / 2
+                g = np.stack([by_D + share[..., None] * by_offset, dv[..., None] * by_offset], -2)
+                score = np.stack([D * in_D + share * D * in_o, D * dv * in_o], axis=-1)
+                matrix = 0.5 * np.einsum("...ik,...jk->...ij", g, g)
+                move = np.linalg.solve(matrix, score[..., None])[..., 0]
+                move = np.clip(move, -1.0, 1.0)
+                v = np.clip(v + move[..., 1], _LEAST_V, _MOST_V)
+            else:
+                move = np.clip(D * in_D / (0.5 * np.sum(by_D**2, axis=-1)), -1, 1)[..., None]
+            D = D * np.exp(move[..., 0])
+            if np.all(np.abs(move) < 1e-9):
+                break
+        offset = D * tau * np.expm1(v) / 2 if self.free else np.zeros_like(D)
+        return AxisFit(y, D, offset)
+
+    def draws(self, fit: AxisFit, *, count: int, rng: np.random.Generator) -> Floats:
+        """Return steps of Brownian motion with the D and the offset of one fit, (count, A, N)."""
+        from scipy.linalg.lapack import dpttrf
+
+        d, lower, _ = dpttrf(*self.bands(fit.D, fit.offset))
+        axes = fit.D.shape[1]
+        d, lower = d.reshape(axes, -1), np.append(lower, 0.0).reshape(axes, -1)
+        # C = L diag(d) L^T with a bidiagonal L: each step takes up a part of the one before.
+        z = np.sqrt(d) * rng.standard_normal((count, axes, self.n_steps))
+        z[..., 1:] += lower[:, :-1] * z[..., :-1].copy()
+        return z
+
+    def log_likelihood(self, fit: AxisFit) -> float:
+        """Return the log-likelihood of the first data set at its fit, less a constant."""
+        from scipy.linalg.lapack import dpttrf, dpttrs
+
+        d, lower, _ = dpttrf(*self.bands(fit.D[:1], fit.offset[:1]))
+        y = fit.y[:1].reshape(-1, 1)
+        return -0.5 * float(np.sum(np.log(d)) + np.sum(y * dpttrs(d, lower, y)[0]))
+
+    def change_scores(self, fit: AxisFit) -> Floats:
+        """Return the scores of a linear change of D and of the noise offset in time, (2, B).
+
+        With t from -1 to 1 along the track and z = C^-1 y they are the sums over steps of
+        D t (z_j^2 - expected), and over shared frames of o t ((z_j - z_{j+1})^2 - expected)/2, the
+        expected values those of diffusion and noise that do not change.
+        """
+        from scipy.linalg.lapack import dpttrf, dpttrs
+
+        shape = fit.y.shape
+        D, offset = (np.broadcast_to(x, shape[:2]) for x in (fit.D, fit.offset))
+        a, b = self.bands(D, offset)
+        d, lower, _ = dpttrf(a, b)
+        up = dpttrf(a[::-1], b[::-1])[0]
+        z = dpttrs(d, lower, fit.y.reshape(-1, 1))[0].reshape(shape)
+        inverse = (1 / (d + up[::-1] - a)).reshape(shape)
+        corner = np.append(-lower * inverse.ravel()[1:], 0.0).reshape(shape)[..., :-1]
+        t = np.linspace(-1.0, 1.0, self.n_steps)
+        by_D = np.sum(D[..., None] * t * (z**2 - inverse), axis=(1, 2))
+        square = (z[..., :-1] - z[..., 1:]) ** 2
+        expected = inverse[..., :-1] + inverse[..., 1:] - 2 * corner
+        middle = 0.5 * (t[1:] + t[:-1]) * self.linked[:-1]
+        by_noise = 0.5 * np.sum(middle * (square - expected), axis=(1, 2))
+        return np.stack([by_D, by_noise])
+
+    def prediction_errors(self, fit: AxisFit) -> Floats:
+        """Return the errors of predicting each step from those before, over their scale (B, A, N).
+
+        They are independent standard normal numbers if the model is right, with gaps and unequal
+        noise. Each axis is scaled to a mean square of 1.
+        """
+        from scipy.linalg.lapack import dpttrf, dtbtrs
+
+        d, lower, _ = dpttrf(*self.bands(fit.D, fit.offset))
+        band = np.stack([np.ones_like(d), np.append(lower, 0.0)])
+        e = dtbtrs(band, fit.y.reshape(-1, 1), uplo="L", diag="U")[0][:, 0] / np.sqrt(d)
+        return _unit_mean_square(e.reshape(fit.y.shape))
+
+    def mode_ratios(self, fit: AxisFit) -> Floats:
+        """Return the powers of the sine modes over their variances, of mean 1, (B, A, N).
+
+        Where steps are uneven the modes are those of the prediction errors.
+        """
+        if not self.even:
+            ratio = sine_powers(self.prediction_errors(fit))
+            return ratio / ratio.mean(axis=-1, keepdims=True)
+        ratio = sine_powers(fit.y) / self.eigenvalues(fit.D, fit.offset)
+        ratio /= ratio.mean(axis=-1, keepdims=True)
+        # A large mode draws the fit to itself, by its leverage h beyond that of the mean: without
+        # its own part in its variance the ratio r is r (1 - h)/(1 - h r).
+        g = np.stack(self.slopes(fit.D, fit.offset)[: 1 + self.free], axis=-2)
+        solved = np.linalg.solve(np.einsum("...ik,...jk->...ij", g, g), g)
+        h = np.maximum(np.einsum("...ik,...ik->...k", g, solved) - 1 / self.n_steps, 0.0)
+        return np.asarray(ratio * (1 - h) / np.maximum(1 - h * ratio, 0.1))
+
+    def alternatives(self) -> Floats:
+        """Return the change of the sine spectrum of D = 1 by each alternative, (2, N), s.
+
+        The first is the derivative in the exponent of fractional motion at 1, the second the
+        difference of a cage that relaxes six times in the whole track.
+        """
+        n = self.n_steps
+        rate = _CONFINED_RATE / n
+        shapes = np.stack([fractional_slope(n), confined_autocovariance(rate, n)])
+        return np.asarray(self.tau.mean() * (sine_spectrum(shapes) - [[0.0], [2.0]]))
+
+    def score_shapes(self, fit: AxisFit) -> Floats:
+        """Return the relative change of each mode by each alternative, (2, B, A, N).
+
+        What a change of D and of the offset can do is removed.
+        """
+        by_D, by_offset = self.slopes(fit.D, fit.offset)
+        change = self.alternatives()[:, None, None] * fit.D[..., None]
+        g = change / self.eigenvalues(fit.D, fit.offset)
+        known = np.stack([by_D, by_offset] if self.free else [by_D], axis=-2)
+        gram = np.einsum("...ik,...jk->...ij", known, known)
+        right = np.einsum("...ik,x...k->x...i", known, g)
+        weight = np.linalg.solve(np.broadcast_to(gram, (2, *gram.shape)), right[..., None])[..., 0]
+        return np.asarray(g - np.einsum("x...i,...ik->x...k", weight, known))
+
+    def scores(self, fit: AxisFit) -> tuple[Score, Score]:
+        """Return the scores of fractional and of confined motion, summed over the axes.
+
+        U = 1/2 sum g (P/lambda - 1), I = 1/2 sum g^2 and the third cumulant sum g^3, g from
+        `score_shapes` and P the power of a mode of variance lambda.
+        """
+        g = self.score_shapes(fit)
+        r = sine_powers(fit.y) / self.eigenvalues(fit.D, fit.offset) - 1
+        value = 0.5 * np.sum(g * r, axis=(-2, -1))
+        information = 0.5 * np.sum(g * g, axis=(-2, -1))
+        third = np.sum(g**3, axis=(-2, -1))
+        return (
+            Score(value[0], information[0], third[0]),
+            Score(value[1], information[1], third[1]),
+        )
+
+    def dense_scores(self, fit: AxisFit, y: Floats) -> tuple[Score, Score]:
+        """Return the scores of fractional and of confined motion for steps of any durations.
+
+        Parameters
+        ----------
+        fit : AxisFit
+            Fit of one data set, at which the scores are taken.
+        y : ndarray, shape (B, A, N)
+            Steps of the data sets.
+
+        Notes
+        -----
+        With z = C^-1 y and a derivative C' of the covariance, U = 1/2 (z^T C' z - tr C^-1 C') and
+        I = 1/2 tr C^-1 C'_a C^-1 C'_b. What D and the offset can do is removed by regression of
+        the scores, which also corrects for a fit that is not that of y. A long track is divided
+        into blocks, whose scores are added; the third cumulants are those of even steps.
+        """
+        from scipy.linalg.lapack import dpttrf, dpttrs
+
+        blocks = np.array_split(np.arange(self.n_steps), -(-self.n_steps // _DENSE_BLOCK))
+        value, information = np.zeros((2, len(y))), np.zeros(2)
+        for rows in blocks:
+            changes = self._covariance_changes(rows)
+            for axis, (D, offset) in enumerate(zip(fit.D[0], fit.offset[0], strict=True)):
+                noise = self.known[0][axis, rows], self.known[1][axis, rows]
+                a, b = covariance_bands(
+                    D,
+                    offset,
+                    self.tau[rows],
+                    self.linked[rows],
+                    blur=self.blur,
+                    weight=(1.0, 1.0),
+                    known=noise,
+                )
+                d, lower, _ = dpttrf(a, b)
+                z = dpttrs(d, lower, y[:, axis, rows].T)[0]
+                scores, products = [], []
+                for change in changes:
+                    product = dpttrs(d, lower, D * change)[0]
+                    square = D * np.einsum("nb,nb->b", z, change @ z)
+                    scores.append(0.5 * (square - np.trace(product)))
+                    products.append(product)
+                U = np.stack(scores)
+                matrix = 0.5 * np.array([[np.sum(p * q.T) for q in products] for p in products])
+                known = slice(2, None)
+                weight = np.linalg.solve(matrix[known, known], matrix[known, :2])
+                value += U[:2] - weight.T @ U[known]
+                information += np.diag(matrix[:2, :2] - matrix[:2, known] @ weight)
+        third = np.sum(self.score_shapes(fit) ** 3, axis=(-2, -1))[:, 0]
+        fractional, confined = (
+            Score(value[i], np.full(len(y), information[i]), np.full(len(y), third[i]))
+            for i in range(2)
+        )
+        return fractional, confined
+
+    def _covariance_changes(self, rows: Ints) -> list[Floats]:
+        """Return derivatives of the covariance of some steps for D = 1, the alternatives first.
+
+        Then those in the logarithm of D and, where it is free, in the offset.
+        """
+        tau = self.tau.mean()
+        start, linked = self.start[rows], self.linked[rows]
+        stop = start + self.tau[rows]
+        rate = _CONFINED_RATE / (self.n_steps * tau)
+
+        def covariance(square: Callable[[Floats], Floats]) -> Floats:
+            def between(x: Floats, y: Floats) -> Floats:
+                return square(np.abs(x[:, None] - y))
+
+            inner = between(start, stop) + between(stop, start)
+            return np.asarray(0.5 * (inner - between(start, start) - between(stop, stop)))
+
+        duration = np.diag(2 * (stop - start))
+        chain = -(np.diag(linked[:-1].astype(np.float64), 1))
+        offset = 2 * np.eye(len(start)) + chain + chain.T
+        return [
+            covariance(lambda t: 2 * t * np.log(np.maximum(t / tau, 1e-12))),
+            covariance(lambda t: -2 * np.expm1(-rate * t) / rate) - duration,
+            duration - self.blur * offset,
+            *([offset] if self.free else []),
+        ]
+
+    def steady_motion(self, fit: AxisFit) -> tuple[Floats, Floats, Floats]:
+        """Return a steady velocity or spin, its information, and p of the F test.
+
+        Their shapes are (B, p), (B, p, p) and (B,). The motion is found by generalised least
+        squares on `steady`, with D and the offset fitted
+        once more to what is left. F has (p, nu) degrees of freedom, nu being twice the inverse
+        relative variance of D, summed over the axes.
+        """
+        from scipy.linalg.lapack import dpttrf, dpttrs
+        from scipy.special import fdtrc
+
+        shape, p = fit.y.shape, self.steady.shape[2]
+        x = np.moveaxis(self.steady, 0, 1)
+        rows = np.broadcast_to(x, (shape[0], *x.shape)).reshape(-1, p)
+        rest = fit
+        for _ in range(2):
+            d, lower, _ = dpttrf(*self.bands(rest.D, rest.offset))
+            unit = dpttrs(d, lower, rows)[0].reshape(*shape, p)
+            information = np.einsum("anp,banq->bpq", x, unit)
+            right = np.einsum("banp,ban->bp", unit, fit.y)
+            mean = np.linalg.solve(information, right[..., None])[..., 0]
+            rest = self.fit(fit.y - np.einsum("anp,bp->ban", x, mean), near=rest)
+        by_D, by_offset = self.slopes(rest.D, rest.offset)
+        g = np.stack([by_D, by_offset] if self.free else [by_D], axis=-2)
+        matrix = 0.5 * np.einsum("...ik,...jk->...ij", g, g)
+        nu = np.mean(2 / np.linalg.inv(matrix)[..., 0, 0], axis=1)
+        n = self.n_steps
+        square = np.einsum("bp,bpq,bq->b", mean, information, mean) * (n - 1) / (n * p)
+        return mean, information, np.asarray(fdtrc(p, nu, square))
+
+
+def axis_model(motion: RigidMotion, quantity: Quantity, noise: Noise) -> tuple[AxisModel, Floats]:
+    """Return the model of the steps of one motion along the axes of its D, and the steps (1, A, N).
+
+    An axis without any motion is left out.
+
+    Raises
+    ------
+    TooFewFramesError
+        If there are fewer than 20 steps.
+    ValueError
+        If the body does not move at all.
+
+    Examples
+    --------
+    >>> from perrin import Cluster, simulate_motion
+    >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=100, rng=3)
+    >>> model, y = axis_model(truth, "rotation", Noise())
+    >>> model.even, y.shape
+    (True, (1, 3, 99))
+    """
+    steps = principal_steps(motion, quantity)
+    count = len(steps.duration)
+    if count < _FEWEST_STEPS:
+        raise TooFewFramesError(
+            f"{count} steps: at least {_FEWEST_STEPS} are needed to tell what kind of motion they "
+            "belong to",
+            count + 1,
+        )
+    track = NoisySteps.of(steps, replace(noise, drift=False))
+    free = noise.model == "joint"
+    theta = 0.0 if free else track.theta
+    before, after = ((k + w * theta).T for k, w in zip(track.known, track.weight, strict=True))
+    square = np.mean(steps.vectors**2, axis=0)
+    if not square.max() > 0:
+        raise ValueError(f"the body does not move: there is no {quantity} to judge")
+    moves = square > _SMALLEST_AXIS * square.max()
+    model = AxisModel(
+        start=motion.time[steps.start],
+        tau=steps.duration,
+        linked=steps.linked,
+        known=(before[moves], after[moves]),
+        blur=0.0 if free else track.blur,
+        free=free,
+        steady=np.ascontiguousarray(steps.steady[:, moves]),
+    )
+    y = np.ascontiguousarray(steps.vectors.T[moves])[None]
+    spread = 0.5 * (model.known[0].std(axis=1) + model.known[1].std(axis=1))
+    if np.all(spread <= _EQUAL_NOISE * square[moves]):
+        model = model.with_equal_noise()
+    return model, y
+
+
+def sine_powers(y: Floats) -> Floats:
+    """Return the squared sine modes (orthonormal DST-I) of steps along the last axis.
+
+    Examples
+    --------
+    >>> sine_powers(np.array([[1.0, 2.0, 2.0]])).sum().round(12)
+    9.0
+    """
+    from scipy.fft import dst
+
+    return np.asarray(dst(y, type=1, norm="ortho", axis=-1) ** 2)
+
+
+def clustering(u: Floats) -> Floats:
+    """Return the weighted sum of the first 20 autocorrelations of u along the last axis.
+
+    Large and small values that come in groups make it positive.
+
+    Examples
+    --------
+    >>> u = np.repeat([1.0, 3.0, 1.0, 3.0], 50)
+    >>> bool(clustering(u) > 8)
+    True
+    """
+    n = u.shape[-1]
+    x = u - u.mean(axis=-1, keepdims=True)
+    lags = min(_CLUSTERING_LAGS, n - 1)
+    variance = np.sum(x * x, axis=-1)
+    total = np.zeros_like(variance)
+    for lag in range(1, lags + 1):
+        weight = 1 - lag / (lags + 1)
+        total += weight * np.einsum("...n,...n->...", x[..., lag:], x[..., :-lag])
+    return total / variance
+
+
+def slow_change(u: Floats, axes: int) -> Floats:
+    """Return the mean square of the cumulated u - mean, in its asymptotic unit.
+
+    For independent chi-squared numbers with `axes` degrees of freedom it has the Cramer-von Mises
+    law.
+
+    Examples
+    --------
+    >>> slow_change(np.array([2.0, 2.0, 2.0]), 2)
+    array(0.)
+    """
+    x = np.cumsum(u - u.mean(axis=-1, keepdims=True), axis=-1)
+    return np.asarray(np.mean(x * x, axis=-1) / (2 * axes * u.shape[-1]))
+
+
+def largest_share(u: Floats, axes: int) -> Floats:
+    """Return -ln p of the largest of N chi-squared numbers, given their sum.
+
+    The share of one in the sum has a Beta law.
+
+    Examples
+    --------
+    >>> largest_share(np.array([1.0, 1.0, 1.0]), 3)
+    array(0.)
+    """
+    from scipy.special import betainc
+
+    n = u.shape[-1]
+    share = u.max(axis=-1) / u.sum(axis=-1)
+    single = betainc((n - 1) * axes / 2, axes / 2, 1 - share)
+    return np.asarray(-np.log(np.maximum(-np.expm1(n * np.log1p(-single)), 1e-300)))
+
+
+def tabulated_statistics(u: Floats, axes: int) -> dict[str, Floats]:
+    """Return the statistics of u whose laws stand in the table, scaled to vary little with N.
+
+    Parameters
+    ----------
+    u : ndarray, shape (..., N)
+        Sums over the axes of squared prediction errors, of mean `axes`.
+    axes : int
+        Number of axes.
+
+    Returns
+    -------
+    dict of str to ndarray, shape (...,)
+        "clustering", "slow change" and "tails" (the mean square, Mardia's kurtosis).
+
+    Examples
+    --------
+    >>> sorted(tabulated_statistics(np.array([1.0, 2.0, 3.0]), 2))
+    ['clustering', 'slow change', 'tails']
+    """
+    root = np.sqrt(u.shape[-1])
+    return {
+        "clustering": root * clustering(u),
+        "slow change": slow_change(u, axes),
+        "tails": root * (np.mean(u * u, axis=-1) / (axes * (axes + 2)) - 1),
+    }
+
+
+@lru_cache(maxsize=1)
+def _quantile_table() -> dict[tuple[str, int], tuple[Floats, Floats]]:
+    """Return the lengths and the quantiles (lengths, probabilities) by statistic and axes."""
+    text = files("perrin.diffusion").joinpath("brownian_quantiles.csv").read_text("utf-8")
+    head, *lines = text.splitlines()
+    table: dict[tuple[str, int], list[list[float]]] = {}
+    for line in lines:
+        name, axes, *numbers = line.split(",")
+        table.setdefault((name, int(axes)), []).append([float(x) for x in numbers])
+    table["probability", 0] = [[0.0, *(float(x) for x in head.split(",")[3:])]]
+    arrays = {key: np.array(rows) for key, rows in table.items()}
+    return {key: (rows[:, 0], rows[:, 1:]) for key, rows in arrays.items()}
+
+
+def tabulated_p(name: str, statistic: Floats, *, axes: int, n_steps: int) -> Floats:
+    """Return the probability of a larger statistic, from the table of its law.
+
+    Quantiles are interpolated in 1/sqrt(N), logarithms of probabilities between quantiles; beyond
+    the last one, p = 0.001, the logarithm is continued as a straight line.
+
+    Parameters
+    ----------
+    name : str
+        A name in `tabulated_statistics`.
+    statistic : ndarray
+        Its values.
+    axes, n_steps : int
+        Axes and steps.
+
+    Examples
+    --------
+    >>> float(tabulated_p("slow change", np.array(0.4614), axes=3, n_steps=10**6).round(2))
+    0.05
+    """
+    table = _quantile_table()
+    probability = table["probability", 0][1][0]
+    lengths, rows = table[name, axes]
+    x, at = 1 / np.sqrt(lengths[::-1]), 1 / np.sqrt(n_steps)
+    quantiles = np.array([np.interp(at, x, column[::-1]) for column in rows.T])
+    log_p = np.log(probability)
+    inside = np.interp(statistic, quantiles, log_p, left=0.0)
+    slope = (log_p[-1] - log_p[-3]) / (quantiles[-1] - quantiles[-3])
+    beyond = log_p[-1] + slope * (statistic - quantiles[-1])
+    return np.asarray(np.exp(np.where(statistic > quantiles[-1], beyond, inside)))
+
+
+def score_p(score: Score, *, one_sided: bool) -> Floats:
+    """Return p-values of scores, (B,), by a gamma law with their third cumulant.
+
+    Examples
+    --------
+    >>> one = np.ones(1)
+    >>> score_p(Score(1.96 * one, one, 0 * one), one_sided=False).round(3)
+    array([0.05])
+    """
+    from scipy.special import gammainc, gammaincc, ndtr
+
+    z = score.value / np.sqrt(score.information)
+    skew = score.third / score.information**1.5
+    small = np.abs(skew) < 1e-3
+    shape = 4 / np.where(small, 1.0, skew) ** 2
+    # z = sign (gamma - shape)/sqrt(shape): a positive skewness has its long tail above.
+    x = np.maximum(shape + np.sign(skew) * z * np.sqrt(shape), 0.0)
+    below, above = gammainc(shape, x), gammaincc(shape, x)
+    upper = np.where(small, ndtr(-z), np.where(skew > 0, above, below))
+    lower = np.where(small, ndtr(z), np.where(skew > 0, below, above))
+    p = upper if one_sided else 2 * np.minimum(lower, upper)
+    return np.asarray(np.clip(p, 1e-300, 1.0))
+
+
+def holm(p: Floats) -> float:
+    """Return the family-wise p-value of the smallest of several p-values (Holm 1979).
+
+    Examples
+    --------
+    >>> holm(np.array([0.01, 0.5]))
+    0.02
+    """
+    known = p[np.isfinite(p)]
+    return float(min(1.0, known.size * known.min()))
+
+
+@dataclass(frozen=True, eq=False)
+class BrownianTests:
+    """The tests of one motion against Brownian motion with constant noise.
+
+    Attributes
+    ----------
+    p : dict of str to float
+        p-value of every test: "fractional" (exponent of the MSD, two-sided), "cage" (confinement),
+        "steady" (velocity or spin), "clustering" (of the variance), "slow change" (of the
+        variance), "tails", "largest" (step) and "line" (one line in the spectrum).
+    model : AxisModel
+    fit : AxisFit
+        D and offset of every axis.
+    scores : tuple of Score
+        Of fractional and of confined motion.
+    u : ndarray, shape (N,)
+        Sums over the axes of squared prediction errors, scaled to the number of axes on average.
+    ranked : bool
+        Whether the p-values come from draws.
+    """
+
+    p: dict[str, float]
+    model: AxisModel
+    fit: AxisFit
+    scores: tuple[Score, Score]
+    u: Floats
+    ranked: bool
+
+    def __post_init__(self) -> None:
+        frozen(self.u)
+
+    @property
+    def alpha_error(self) -> float:
+        """Standard error that an estimate of the exponent has at 1."""
+        return float(1 / np.sqrt(self.scores[0].information[0]))
+
+
+def brownian_tests(model: AxisModel, y: Floats) -> BrownianTests:
+    """Test the steps of one motion against Brownian motion.
+
+    Below 200 steps, or 10 steps times the signal-to-noise ratio, the p-values are ranks among those
+    of draws from the fit.
+
+    Parameters
+    ----------
+    model : AxisModel
+    y : ndarray, shape (1, A, N)
+        Steps.
+
+    Examples
+    --------
+    >>> from perrin import Cluster, simulate_motion
+    >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=300, rng=3)
+    >>> tests = brownian_tests(*axis_model(truth, "rotation", Noise()))
+    >>> holm(np.array(list(tests.p.values()))) > 0.05
+    True
+    """
+    fit = model.fit(y)
+    scores = model.scores(fit) if model.even else model.dense_scores(fit, y)
+    p = approximate_p(model, fit, scores)
+    n = model.n_steps
+    snr = float(
+        np.mean(fit.D) * model.tau.mean() / max(np.mean(fit.offset + model.mean_known), 1e-300)
+    )
+    ranked = n < _FEWEST_ASYMPTOTIC_STEPS or 0 < n * snr < _LEAST_INFORMATION
+    if ranked:
+        count = int(np.clip(_DRAWN_NUMBERS // y.size, _FEWEST_DRAWS, _MOST_DRAWS))
+        drawn = model.draws(fit, count=count, rng=np.random.default_rng(n))
+        near = model.fit(drawn, near=fit)
+        again = model.scores(near) if model.even else model.dense_scores(fit, drawn)
+        null = approximate_p(model, near, again)
+        p = {name: _rank(p[name][0], null[name]) for name in p}
+    u = np.sum(model.prediction_errors(fit) ** 2, axis=1)[0]
+    return BrownianTests(
+        {k: float(np.ravel(v)[0]) for k, v in p.items()}, model, fit, scores, u, ranked
+    )
+
+
+def approximate_p(model: AxisModel, fit: AxisFit, scores: tuple[Score, Score]) -> dict[str, Floats]:
+    """Return the p-values of every test of every data set by their approximate laws, (B,) each.
+
+    Examples
+    --------
+    >>> from perrin import Cluster, simulate_motion
+    >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=300, rng=3)
+    >>> model, y = axis_model(truth, "rotation", Noise())
+    >>> fit = model.fit(y)
+    >>> tuple(approximate_p(model, fit, model.scores(fit))) == TESTS
+    True
+    """
+    axes = fit.D.shape[1]
+    u = np.sum(model.prediction_errors(fit) ** 2, axis=1)
+    statistics = tabulated_statistics(u, axes)
+    by_table = {
+        name: tabulated_p(name, x, axes=axes, n_steps=model.n_steps)
+        for name, x in statistics.items()
+    }
+    modes = np.sum(model.mode_ratios(fit), axis=1)
+    return {
+        "fractional": score_p(scores[0], one_sided=False),
+        "cage": score_p(scores[1], one_sided=True),
+        "steady": model.steady_motion(fit)[2],
+        **by_table,
+        "largest": np.exp(-largest_share(u, axes)),
+        "line": np.exp(-largest_share(modes, axes)),
+    }
+
+
+def _rank(p: Floats, null: Floats) -> float:
+    """Return the rank of a p-value among those of draws, continued below the smallest of these."""
+    order = np.sort(null)
+    below = int(np.searchsorted(order, p, side="right"))
+    if below >= _TAIL_RANK:
+        return (1 + below) / (1 + len(null))
+    edge = order[_TAIL_RANK - 1]
+    return float(min(1.0, (1 + _TAIL_RANK) / (1 + len(null)) * p / edge)) if edge > 0 else 0.0
+
+
+def _unit_mean_square(e: Floats) -> Floats:
+    """Return errors scaled to a mean square of 1 along the last axis."""
+    return np.asarray(e / np.sqrt(np.mean(e * e, axis=-1, keepdims=True)))

@@ -1,0 +1,503 @@
+"""MotionVerdict: whether a motion is diffusion, and if not, what kind of motion it is."""
+
+from __future__ import annotations
+
+import warnings as python_warnings
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Literal, get_args
+
+import numpy as np
+
+from perrin._arrays import choice_fault, refuse, to_plain
+from perrin._text import frames_text, number_text
+from perrin.diffusion.anomalous import AnomalousEstimate, fit_anomalous
+from perrin.diffusion.brownian_tests import (
+    BrownianTests,
+    Score,
+    axis_model,
+    brownian_tests,
+    holm,
+    largest_share,
+    score_p,
+    tabulated_p,
+    tabulated_statistics,
+)
+from perrin.diffusion.confined import ConfinedEstimate, fit_confined
+from perrin.diffusion.estimate import DiffusionEstimate
+from perrin.diffusion.estimators import estimate_diffusion
+from perrin.diffusion.noise_model import Noise, noise_faults
+from perrin.diffusion.steps import Quantity
+from perrin.diffusion.switching import SwitchingEstimate, fit_switching
+from perrin.errors import PrecisionWarning
+from perrin.motion.rigid_motion import RigidMotion
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+
+Kind = Literal[
+    "diffusion",
+    "subdiffusion",
+    "superdiffusion",
+    "confined",
+    "drift",
+    "spin",
+    "changing D",
+    "jumps",
+    "vibration",
+]
+
+LEVEL = 0.05  # of the family of tests, and of the tests that decide between names
+
+# Power 80 % in tests at 5 %: standard errors of one number, and the root of the noncentrality of
+# an F test with three degrees of freedom.
+_DETECTED, _DETECTED_MEAN = 2.8, 3.3
+
+_RELAXATIONS_SEEN = 12.0  # steps per squared cage radius (in steps) that show a cage
+
+_SCATTER_DRAWS = 199  # draws that give the scatter of the two scores of a slow change
+
+_SHAPE_TESTS = ("fractional", "cage", "steady")
+
+_MODELS = {
+    "subdiffusion": AnomalousEstimate,
+    "superdiffusion": AnomalousEstimate,
+    "confined": ConfinedEstimate,
+    "drift": DiffusionEstimate,
+    "spin": DiffusionEstimate,
+    "changing D": SwitchingEstimate,
+}
+
+Model = AnomalousEstimate | ConfinedEstimate | DiffusionEstimate | SwitchingEstimate
+
+
+@dataclass(frozen=True, eq=False)
+class MotionVerdict:
+    """What kind of motion a track shows, by tests against Brownian motion.
+
+    Attributes
+    ----------
+    kind : str
+        "diffusion" where no test rejects it at 5 % of the family; else "subdiffusion",
+        "superdiffusion", "confined", "drift", "spin", "changing D", "jumps" or "vibration".
+    p : dict of str to float
+        p-value of every test: "fractional" (exponent of the mean squared displacement), "cage"
+        (confinement), "steady" (mean velocity or spin), "clustering" and "slow change" (of the step
+        lengths), "tails" (of their distribution), "largest" (step) and "line" (one period).
+    p_family : float
+        Probability, in Brownian motion, of a smallest p-value as small as this (Holm).
+    detectable : dict of str to float or None
+        What this track would have shown in 80 % of cases: exponents "alpha_below" and
+        "alpha_above", a "cage" of smaller rms radius (rad or um), and a faster "spin" (rad/s) or
+        "drift" (um/s).
+    model : AnomalousEstimate, ConfinedEstimate, DiffusionEstimate, SwitchingEstimate or None
+        Fitted alternative; a `DiffusionEstimate` with its drift where the motion is steady; None
+        for diffusion, jumps and vibration.
+    frames : tuple of int
+        Rows of the motion at which jumps end.
+    text : str
+        The verdict in one sentence.
+    quantity : {"rotation", "translation"}
+        The motion that was judged.
+    n_frames : int
+        Frames with a pose.
+    each : tuple of MotionVerdict
+        Verdict on every motion of a list; empty for one motion.
+    """
+
+    kind: Kind
+    p: dict[str, float]
+    p_family: float
+    detectable: dict[str, float | None]
+    model: Model | None
+    frames: tuple[int, ...]
+    text: str
+    quantity: Quantity
+    n_frames: int
+    each: tuple[MotionVerdict, ...] = ()
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the verdict for JSON; the fitted alternative is under "parameters"."""
+        entry: dict[str, Any] = {
+            "kind": self.kind,
+            "p": to_plain(self.p),
+            "p_family": self.p_family,
+            "text": self.text,
+            "detectable": to_plain(self.detectable),
+            "parameters": None if self.model is None else self.model.to_dict(),
+            "frames": [int(row) for row in self.frames],
+            "quantity": self.quantity,
+            "n_frames": self.n_frames,
+        }
+        if self.each:
+            entry["each"] = [one.to_dict() for one in self.each]
+        return entry
+
+    @classmethod
+    def from_dict(cls, entry: dict[str, Any]) -> MotionVerdict:
+        """Return the verdict that `to_dict` wrote."""
+        parameters = entry["parameters"]
+        return cls(
+            kind=entry["kind"],
+            p={name: np.nan if p is None else p for name, p in entry["p"].items()},
+            p_family=entry["p_family"],
+            detectable=dict(entry["detectable"]),
+            model=None if parameters is None else _MODELS[entry["kind"]].from_dict(parameters),
+            frames=tuple(entry["frames"]),
+            text=entry["text"],
+            quantity=entry["quantity"],
+            n_frames=entry["n_frames"],
+            each=tuple(cls.from_dict(one) for one in entry.get("each", ())),
+        )
+
+    def __str__(self) -> str:
+        return self.text
+
+
+def judge_motion(
+    motion: RigidMotion | Sequence[RigidMotion],
+    *,
+    quantity: Quantity = "rotation",
+    noise: Literal["joint", "residual"] | float | Noise = "joint",
+    exposure: float | None = None,
+) -> MotionVerdict:
+    """Judge whether a motion is diffusion, and name what it is if not.
+
+    Parameters
+    ----------
+    motion : RigidMotion or sequence of RigidMotion
+        Motion before any jump is cut; several motions get one verdict.
+    quantity : {"rotation", "translation"}
+        Steps that are tested: body-frame rotation vectors, or displacements of the centre.
+    noise : {"joint", "residual"}, float or Noise
+        "joint" fits the noise offset, which hides slow subdiffusion; "residual" takes the noise
+        from the rigid-fit residuals, a number is the localisation error sigma (um). A known noise
+        halves the error of the exponent, but is right only if all particles of a frame are
+        recorded at the same instant.
+    exposure : float, optional
+        Open fraction of the time between frames, with a known noise; a free offset contains it.
+
+    Returns
+    -------
+    MotionVerdict
+
+    Raises
+    ------
+    TooFewFramesError
+        If a motion has fewer than 20 steps.
+    ValueError
+        For unknown or inconsistent choices, all in one message, or a body that does not move.
+
+    Notes
+    -----
+    Eight tests, corrected together (Holm 1979) at 5 %, compare the steps with Brownian motion of
+    constant D and noise on each axis of the tensor. Fractional motion, a cage and a steady motion
+    are told apart by likelihood less half a logarithm of the number of steps for each parameter
+    (Schwarz 1978); a variance that changes from a few long steps by testing once more with these
+    shortened. "diffusion" means that none of the tests rejects it: `detectable` says what could
+    have been seen. docs/theory/motion.md has the laws, the power and the confusion matrix.
+
+    Examples
+    --------
+    >>> from perrin import Cluster, Spin, simulate_motion
+    >>> tetrahedron = Cluster.tetrahedron(1.5)
+    >>> free = simulate_motion(tetrahedron, D_R=5e-3, dt=0.7, n_frames=300, rng=3)
+    >>> judge_motion(free).kind
+    'diffusion'
+    >>> spinning = simulate_motion(
+    ...     tetrahedron, D_R=5e-3, dt=0.7, n_frames=300, dynamics=Spin(0.1), rng=3
+    ... )
+    >>> judge_motion(spinning).kind
+    'spin'
+    """
+    motions = [motion] if isinstance(motion, RigidMotion) else list(motion)
+    faults = [
+        *choice_fault("quantity", quantity, get_args(Quantity)),
+        *noise_faults(noise, exposure),
+    ]
+    if len({m.dimension for m in motions}) != 1:
+        faults.append("motion: expected one or more motions, all in 2 or all in 3 dimensions")
+    refuse(faults)
+    settings = Noise.of(noise, exposure=exposure)
+    tested = [brownian_tests(*axis_model(m, quantity, settings)) for m in motions]
+    each = tuple(
+        _verdict([m], [one], quantity, settings) for m, one in zip(motions, tested, strict=True)
+    )
+    if len(motions) == 1:
+        return each[0]
+    return replace(_verdict(motions, tested, quantity, settings), each=each)
+
+
+def _verdict(
+    motions: Sequence[RigidMotion],
+    tested: Sequence[BrownianTests],
+    quantity: Quantity,
+    settings: Noise,
+) -> MotionVerdict:
+    """Return the verdict on motions that were tested one by one."""
+    p = combined_p(tested)
+    p_family = holm(np.array(list(p.values())))
+    detectable = detectable_by(tested, quantity)
+    verdict = MotionVerdict(
+        kind="diffusion",
+        p=p,
+        p_family=p_family,
+        detectable=detectable,
+        model=None,
+        frames=(),
+        text=_diffusion_text(p_family, len(p), detectable, quantity),
+        quantity=quantity,
+        n_frames=sum(m.fitted.size for m in motions),
+    )
+    if p_family > LEVEL:
+        return verdict
+    first = min(p, key=lambda name: p[name])
+    if first == "line":
+        period = _period(tested)
+        text = f"{_SUBJECT[quantity]} vibrates with a period of {number_text(period)} s"
+        return replace(verdict, kind="vibration", text=_with_p(text, p_family))
+    if first in _SHAPE_TESTS:
+        kind, model = _shape(motions, tested, quantity, settings)
+        text = _model_text(kind, model, quantity)
+        return replace(verdict, kind=kind, model=model, text=_with_p(text, p_family))
+    return _variance(verdict, motions, tested, settings)
+
+
+def combined_p(tested: Sequence[BrownianTests]) -> dict[str, float]:
+    """Return the p-values of all motions together.
+
+    Scores and informations of the exponent and of the cage add; the p-values of the other tests are
+    combined by Fisher's method.
+
+    Examples
+    --------
+    >>> from perrin import Cluster, simulate_motion
+    >>> from perrin.diffusion import Noise, axis_model, brownian_tests
+    >>> tested = [
+    ...     brownian_tests(*axis_model(
+    ...         simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=300, rng=seed),
+    ...         "rotation", Noise()))
+    ...     for seed in (3, 4)
+    ... ]
+    >>> 0 < combined_p(tested)["cage"] < 1
+    True
+    """
+    from scipy.special import gammaincc
+
+    if len(tested) == 1:
+        return dict(tested[0].p)
+    p = {}
+    for name in tested[0].p:
+        logs = [-np.log(max(one.p[name], 1e-300)) for one in tested]
+        p[name] = float(gammaincc(len(tested), sum(logs)))
+    if sum(one.model.n_steps for one in tested) >= 200:
+        for i, name in enumerate(("fractional", "cage")):
+            total = Score(*np.sum([one.scores[i] for one in tested], axis=0))
+            p[name] = float(score_p(total, one_sided=name == "cage")[0])
+    return p
+
+
+def detectable_by(tested: Sequence[BrownianTests], quantity: Quantity) -> dict[str, float | None]:
+    """Return what these tracks together would have shown in 80 % of cases.
+
+    An exponent that differs from 1 by 2.8 standard errors; a cage of rms radius r with 12
+    (r/step)^2 steps in the longest track; a spin (rad/s) or drift (um/s) of 3.3 standard errors of
+    one component.
+
+    Examples
+    --------
+    >>> from perrin import Cluster, simulate_motion
+    >>> from perrin.diffusion import Noise, axis_model, brownian_tests
+    >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=300, rng=3)
+    >>> tests = brownian_tests(*axis_model(truth, "rotation", Noise()))
+    >>> {name: round(x, 2) for name, x in detectable_by([tests], "rotation").items() if x}
+    {'alpha_below': 0.77, 'alpha_above': 1.23, 'cage': 0.42, 'spin': 0.02}
+    """
+    information = sum(float(one.scores[0].information[0]) for one in tested)
+    reach = _DETECTED / np.sqrt(information)
+    lengths, speeds = [], []
+    for one in tested:
+        D, tau = float(np.mean(one.fit.D)), float(one.model.tau.mean())
+        n = one.model.n_steps
+        lengths.append(np.sqrt(2 * D * tau * n / _RELAXATIONS_SEEN))
+        speeds.append(_DETECTED_MEAN * np.sqrt(2 * D / (n * tau)))
+    steady = float(min(speeds))
+    return {
+        "alpha_below": max(0.0, float(1 - reach)),
+        "alpha_above": min(2.0, float(1 + reach)),
+        "cage": float(max(lengths)),
+        "spin": steady if quantity == "rotation" else None,
+        "drift": steady if quantity == "translation" else None,
+    }
+
+
+def _shape(
+    motions: Sequence[RigidMotion],
+    tested: Sequence[BrownianTests],
+    quantity: Quantity,
+    settings: Noise,
+) -> tuple[Kind, Model]:
+    """Name what bends the spectrum, by likelihood less half ln N for each parameter.
+
+    A steady motion is also the name where it explains the exponent: likelihood alone calls a spin
+    superdiffusion in a quarter of short tracks.
+    """
+    motion = list(motions) if len(motions) > 1 else motions[0]
+    penalty = 0.5 * np.log(sum(one.model.n_steps for one in tested))
+    gain, p_steady, p_rest = _steady_gain(tested)
+    gain -= penalty * sum(one.model.steady.shape[2] for one in tested)
+    anomalous = fit_anomalous(motion, quantity=quantity, noise=settings)
+    confined = None
+    if anomalous.alpha < 1:
+        confined = fit_confined(motion, quantity=quantity, noise=settings)
+    others = [one.log_likelihood_gain - penalty for one in (anomalous, confined) if one is not None]
+    if (p_steady < LEVEL and p_rest > LEVEL) or gain > max(others):
+        taken = replace(settings, drift=True)
+        with python_warnings.catch_warnings():
+            python_warnings.simplefilter("ignore", PrecisionWarning)
+            model = estimate_diffusion(motion, quantity=quantity, noise=taken)
+        return "spin" if quantity == "rotation" else "drift", model
+    if confined is not None and others[1] > others[0]:
+        return "confined", confined
+    return "subdiffusion" if anomalous.alpha < 1 else "superdiffusion", anomalous
+
+
+def _steady_gain(tested: Sequence[BrownianTests]) -> tuple[float, float, float]:
+    """Return the log-likelihood gained by a steady motion, its p, and p of the exponent then."""
+    from scipy.special import gammaincc
+
+    gain, logs, scores = 0.0, 0.0, []
+    for one in tested:
+        model, fit = one.model, one.fit
+        mean, _, p = model.steady_motion(fit)
+        rest = model.fit(fit.y - np.einsum("nap,bp->ban", model.steady, mean), near=fit)
+        gain += model.log_likelihood(rest) - model.log_likelihood(fit)
+        logs -= np.log(max(float(p[0]), 1e-300))
+        scores.append((model.scores(rest) if model.even else model.dense_scores(rest, rest.y))[0])
+    p_rest = score_p(Score(*np.sum(scores, axis=0)), one_sided=False)
+    return gain, float(gammaincc(len(tested), logs)), float(p_rest[0])
+
+
+def _variance(
+    verdict: MotionVerdict,
+    motions: Sequence[RigidMotion],
+    tested: Sequence[BrownianTests],
+    settings: Noise,
+) -> MotionVerdict:
+    """Tell a few long steps from a D that changes, and a D that changes from noise that does.
+
+    A test of clustering and of slow change with the longest steps shortened to what one Brownian
+    track of this length has decides.
+    """
+    from scipy.special import chdtri, gammaincc
+
+    quantity, logs, rows = verdict.quantity, np.zeros(2), []
+    for number, (m, one) in enumerate(zip(motions, tested, strict=True)):
+        axes, n = one.fit.D.shape[1], one.model.n_steps
+        limit = np.median(one.u) / chdtri(axes, 0.5) * chdtri(axes, 1 / n)
+        u = np.minimum(one.u, limit)
+        statistics = tabulated_statistics(u * axes / u.mean(), axes)
+        for i, name in enumerate(("clustering", "slow change")):
+            p = tabulated_p(name, statistics[name], axes=axes, n_steps=n)
+            logs[i] -= np.log(max(float(p), 1e-300))
+        rows += [(number, int(row)) for row in m.steps()[1][one.u > limit]]
+    clustering, slow_change = gammaincc(len(tested), logs)
+    if min(clustering, slow_change) > LEVEL:
+        frames = tuple(row for _, row in rows) if len(motions) == 1 else ()
+        where = f" (rows {frames_text(frames)} of the motion)" if frames else ""
+        text = (
+            f"A few steps of the {quantity} are too long for diffusion{where}: exchanged labels, "
+            "hops or heavy tails"
+        )
+        return replace(verdict, kind="jumps", frames=frames, text=_with_p(text, verdict.p_family))
+    if slow_change < clustering and _noise_changes(motions, tested):
+        text = (
+            f"{_SUBJECT[quantity]} is consistent with diffusion whose measurement noise changes "
+            "along the track"
+        )
+        return replace(verdict, text=_with_p(text, verdict.p_family))
+    motion = list(motions) if len(motions) > 1 else motions[0]
+    model = fit_switching(motion, quantity=quantity, noise=settings)
+    text = _model_text("changing D", model, quantity)
+    return replace(verdict, kind="changing D", model=model, text=_with_p(text, verdict.p_family))
+
+
+def _noise_changes(motions: Sequence[RigidMotion], tested: Sequence[BrownianTests]) -> bool:
+    """Tell noise that changes linearly along a track from a D that does, by the larger score.
+
+    The residuals of the rigid fits decide where they change beyond three standard errors.
+    """
+    z_D = z_noise = z_residual = 0.0
+    for m, one in zip(motions, tested, strict=True):
+        model, fit = one.model, one.fit
+        found = model.change_scores(fit)[:, 0]
+        drawn = model.draws(fit, count=_SCATTER_DRAWS, rng=np.random.default_rng(model.n_steps))
+        scatter = model.change_scores(replace(fit, y=drawn)).std(axis=1)
+        z_D += found[0] / scatter[0]
+        z_noise += found[1] / scatter[1]
+        square = m.residual[m.fitted] ** 2
+        if square.size > 2 and square.std() > 0:
+            t = np.linspace(-1.0, 1.0, square.size)
+            z_residual += float(np.corrcoef(t, square)[0, 1] * np.sqrt(square.size))
+    root = np.sqrt(len(tested))
+    if abs(z_residual) > 3 * root:
+        return bool(z_residual * z_noise > 0)
+    return bool(abs(z_noise) > abs(z_D))
+
+
+def _period(tested: Sequence[BrownianTests]) -> float:
+    """Return the period of the largest line, s."""
+    peaks = []
+    for one in tested:
+        modes = np.sum(one.model.mode_ratios(one.fit), axis=1)[0]
+        k = int(np.argmax(modes)) + 1
+        period = 2 * (one.model.n_steps + 1) * float(one.model.tau.mean()) / k
+        peaks.append((float(largest_share(modes, one.fit.D.shape[1])), period))
+    return max(peaks)[1]
+
+
+def _diffusion_text(
+    p_family: float, tests: int, detectable: dict[str, float | None], quantity: Quantity
+) -> str:
+    """Return the sentence on a track that no test rejects, with what it could have shown."""
+    unit = "rad" if quantity == "rotation" else "um"
+    steady = "spin" if quantity == "rotation" else "drift"
+    shown = [
+        f"an exponent below {detectable['alpha_below']:.2f} or above "
+        f"{detectable['alpha_above']:.2f}",
+        f"a cage under {number_text(detectable['cage'] or 0.0, digits=2)} {unit}",
+        f"a {steady} over {number_text(detectable[steady] or 0.0, digits=2)} {unit}/s",
+    ]
+    return (
+        f"{_SUBJECT[quantity]} is consistent with diffusion (p = {p_family:.2g} over {tests} "
+        f"tests); this track would have shown {shown[0]}, {shown[1]}, or {shown[2]}."
+    )
+
+
+def _model_text(kind: Kind, model: Model, quantity: Quantity) -> str:
+    """Return the sentence on a fitted alternative, without its end."""
+    if isinstance(model, DiffusionEstimate):
+        steady = model.drift[0] if model.drift else ()
+        errors = model.drift_stderr[0] if model.drift_stderr else ()
+        speed = float(np.linalg.norm(steady))
+        error = float(np.linalg.norm(np.multiply(steady, errors))) / speed if speed else np.nan
+        verb = "turns" if quantity == "rotation" else "moves"
+        unit = "rad/s" if quantity == "rotation" else "um/s"
+        return f"The body {verb} steadily at {number_text(speed, error)} {unit} while it diffuses"
+    subject = _SUBJECT[quantity]
+    words = {
+        "subdiffusion": f"{subject} is subdiffusive",
+        "superdiffusion": f"{subject} is superdiffusive",
+        "confined": f"{subject} is confined",
+        "changing D": f"The diffusion coefficient of the {quantity} changes in time",
+    }
+    return f"{words[kind]}: {model}"
+
+
+_SUBJECT = {"rotation": "The rotation", "translation": "The translation"}
+
+
+def _with_p(text: str, p_family: float) -> str:
+    """Return a sentence with the probability of the data in diffusion."""
+    p = f"p = {p_family:.2g}" if p_family >= 1e-6 else "p < 1e-6"
+    return f"{text} ({p} for diffusion with a constant D and noise)."
