@@ -24,6 +24,8 @@ if TYPE_CHECKING:
         van_hove,
     )
     from perrin.diffusion import (
+        AnomalousEstimate,
+        ConfinedEstimate,
         CoupledTensor,
         DiffusionEstimate,
         DiffusionTensor,
@@ -35,6 +37,8 @@ if TYPE_CHECKING:
         diffusion_tensor,
         estimate_diffusion,
         estimate_rod,
+        fit_anomalous,
+        fit_confined,
         fit_gls,
         fit_line,
         judge_sampling,
@@ -128,10 +132,12 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 __all__ = [
+    "AnomalousEstimate",
     "Camera",
     "Cluster",
     "ClusterResult",
     "Compared",
+    "ConfinedEstimate",
     "CoupledTensor",
     "DegenerateClusterError",
     "DiffusionEstimate",
@@ -182,6 +188,8 @@ __all__ = [
     "estimate_diffusion",
     "estimate_rod",
     "find_clusters",
+    "fit_anomalous",
+    "fit_confined",
     "fit_gls",
     "fit_line",
     "fit_pose",
@@ -300,6 +308,8 @@ _FACES = {
         "van_hove",
     ),
     "diffusion": (
+        "AnomalousEstimate",
+        "ConfinedEstimate",
         "CoupledTensor",
         "DiffusionEstimate",
         "DiffusionTensor",
@@ -311,6 +321,8 @@ _FACES = {
         "diffusion_tensor",
         "estimate_diffusion",
         "estimate_rod",
+        "fit_anomalous",
+        "fit_confined",
         "fit_gls",
         "fit_line",
         "judge_sampling",

@@ -7,7 +7,42 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from perrin._arrays import Floats
+
+
+def fractional_mean_square(lag: Floats, alpha: Floats | float, *, exposure: float = 0.0) -> Floats:
+    """Return the mean square displacement of fractional Brownian motion along one axis, D = 1.
+
+    It is 2 t^alpha. A shutter that is open for a part f of the frame time averages the path over
+    that part; for t >= f the mean square difference of two such averages is
+    2 [(|t + f|^b + |t - f|^b - 2 t^b)/f^2 - 2 f^alpha]/((alpha + 1) b), b = alpha + 2.
+
+    Parameters
+    ----------
+    lag : ndarray
+        Lag in frames, 0 or at least `exposure`.
+    alpha : float or ndarray
+        Exponent, 0 < alpha < 2; broadcast against `lag`.
+    exposure : float
+        Open fraction f of the frame time, 0 to 1.
+
+    Returns
+    -------
+    ndarray
+
+    Examples
+    --------
+    >>> fractional_mean_square(np.array([0.0, 1, 4]), 0.5)
+    array([0., 2., 4.])
+    """
+    if exposure == 0:
+        return np.asarray(2 * lag**alpha)
+    f, b = exposure, alpha + 2
+    outer = (lag + f) ** b + np.abs(lag - f) ** b - 2 * lag**b
+    square = 2 * (outer / f**2 - 2 * f**alpha) / ((alpha + 1) * b)
+    return np.where(lag == 0, 0.0, square)
 
 
 def fractional_autocovariance(
@@ -43,14 +78,7 @@ def fractional_autocovariance(
     """
     a = np.asarray(alpha, dtype=np.float64)[..., None]
     lag = np.arange(n_steps + 1.0)
-    if exposure == 0:
-        square = 2 * lag**a
-    else:
-        f, b = exposure, a + 2
-        outer = (lag + f) ** b + np.abs(lag - f) ** b - 2 * lag**b
-        square = 2 * (outer / (f * f * (a + 1) * b) - 2 * f**a / ((a + 1) * b))
-        square[..., 0] = 0.0
-    return _second_difference(square)
+    return step_autocovariance(fractional_mean_square(lag, a, exposure=exposure))
 
 
 def fractional_slope(n_steps: int) -> Floats:
@@ -63,10 +91,53 @@ def fractional_slope(n_steps: int) -> Floats:
     True
     """
     lag = np.arange(n_steps + 1.0)
-    return _second_difference(2 * lag * np.log(np.maximum(lag, 1.0)))
+    return step_autocovariance(2 * lag * np.log(np.maximum(lag, 1.0)))
 
 
-def confined_autocovariance(rate: Floats | float, n_steps: int) -> Floats:
+def confined_mean_square(lag: Floats, rate: Floats | float, *, exposure: float = 0.0) -> Floats:
+    """Return the mean square displacement of an Ornstein-Uhlenbeck process with D = 1, one axis.
+
+    The place relaxes to the centre of a harmonic well at the rate k; its variance is D/k and its
+    mean square displacement 2 (1 - exp(-k t))/k. Averaging over an open shutter, a part f of the
+    frame time, multiplies this by (sinh(x/2)/(x/2))^2, x = k f, and adds 4 f (x - sinh x)/x^3, for
+    t >= f; without confinement this is 2 (t - f/3).
+
+    Parameters
+    ----------
+    lag : ndarray
+        Lag in frames, 0 or at least `exposure`.
+    rate : float or ndarray
+        Relaxation rate per frame; 0 is free diffusion. Broadcast against `lag`.
+    exposure : float
+        Open fraction f of the frame time, 0 to 1.
+
+    Returns
+    -------
+    ndarray
+
+    Examples
+    --------
+    >>> confined_mean_square(np.array([0.0, 1, 30]), 0.5).round(4)
+    array([0.    , 1.5739, 4.    ])
+    >>> confined_mean_square(np.array([0.0, 1.0]), 1e-9, exposure=1.0).round(6)
+    array([0.      , 1.333333])
+    """
+    k = np.asarray(rate, dtype=np.float64)
+    free = k == 0
+    safe = np.where(free, 1.0, k)
+    square = np.where(free, 2 * lag, -2 * np.expm1(-safe * lag) / safe)
+    if exposure == 0:
+        return square
+    x = k * exposure
+    small = x < 0.05
+    far = np.where(small, 1.0, x)
+    factor = np.where(small, 1 + x**2 / 12 + x**4 / 360, (np.sinh(far / 2) / (far / 2)) ** 2)
+    series = -(1 + x**2 / 20 + x**4 / 840) / 6
+    less = 4 * exposure * np.where(small, series, (far - np.sinh(far)) / far**3)
+    return np.where(lag == 0, 0.0, factor * square + less)
+
+
+def confined_autocovariance(rate: Floats | float, n_steps: int, *, exposure: float = 0.0) -> Floats:
     """Return the autocovariance of the steps of an Ornstein-Uhlenbeck process with D = 1.
 
     The place relaxes to the centre of a harmonic well at this rate; its variance is D/rate.
@@ -77,6 +148,8 @@ def confined_autocovariance(rate: Floats | float, n_steps: int) -> Floats:
         Relaxation rate per frame; 0 is free diffusion.
     n_steps : int
         Number of lags, from 0.
+    exposure : float
+        Open fraction of the frame time, 0 to 1.
 
     Returns
     -------
@@ -91,15 +164,59 @@ def confined_autocovariance(rate: Floats | float, n_steps: int) -> Floats:
     """
     k = np.asarray(rate, dtype=np.float64)[..., None]
     lag = np.arange(n_steps + 1.0)
-    free = k == 0
-    safe = np.where(free, 1.0, k)
-    return _second_difference(np.where(free, 2 * lag, -2 * np.expm1(-safe * lag) / safe))
+    return step_autocovariance(confined_mean_square(lag, k, exposure=exposure))
 
 
-def _second_difference(square: Floats) -> Floats:
-    """Return (M(m + 1) + M(m - 1) - 2 M(m))/2 of an even mean squared displacement M."""
+def step_autocovariance(square: Floats) -> Floats:
+    """Return the autocovariance of steps from the mean square displacement M of one axis.
+
+    g_m = (M(m + 1) + M(m - 1) - 2 M(m))/2 for m = 0 to N - 1, M even.
+
+    Parameters
+    ----------
+    square : ndarray, shape (..., N + 1)
+        M at 0 to N frames.
+
+    Returns
+    -------
+    ndarray, shape (..., N)
+
+    Examples
+    --------
+    >>> step_autocovariance(np.array([0.0, 2, 4, 6]))
+    array([2., 0., 0.])
+    """
     before = np.concatenate([square[..., 1:2], square[..., :-2]], axis=-1)
     return np.asarray(0.5 * (square[..., 1:] + before) - square[..., :-1])
+
+
+def step_covariance(start: Floats, stop: Floats, mean_square: Callable[[Floats], Floats]) -> Floats:
+    """Return the covariance of steps between any times, from the mean square displacement M.
+
+    Steps from a to b and from c to d have covariance
+    (M(|a - d|) + M(|b - c|) - M(|a - c|) - M(|b - d|))/2.
+
+    Parameters
+    ----------
+    start, stop : ndarray, shape (S,)
+        Times of the first and the last frame of each step, in frames.
+    mean_square : callable
+        M as a function of the lag in frames.
+
+    Returns
+    -------
+    ndarray, shape (S, S)
+
+    Examples
+    --------
+    >>> step_covariance(np.array([0.0, 1]), np.array([1.0, 4]), lambda lag: 2 * lag)
+    array([[2., 0.],
+           [0., 6.]])
+    """
+    ends = np.concatenate([start, stop])
+    m = mean_square(np.abs(ends[:, None] - ends))
+    n = len(start)
+    return np.asarray(0.5 * (m[:n, n:] + m[n:, :n] - m[:n, :n] - m[n:, n:]))
 
 
 def sine_spectrum(autocovariance: Floats) -> Floats:

@@ -11,7 +11,8 @@ import numpy as np
 from perrin._arrays import frozen
 from perrin.errors import TooFewFramesError
 from perrin.geometry.rigid import degrees_of_freedom, orientation_covariance
-from perrin.geometry.rotations import exp_map, successive_product
+from perrin.geometry.rotations import exp_map, log_map, successive_product
+from perrin.geometry.wahba import svd_rotation
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from perrin.motion.rods import RodMotion
 
 Quantity = Literal["rotation", "translation"]
+MemoryFrame = Literal["body", "lab", "mean"]
 
 # Axes whose noise differs by less than this are equally noisy: the errors of the common shape make
 # such differences, and their effect on D is of the order of their square.
@@ -299,13 +301,23 @@ def pooled_steps(motions: Sequence[RigidMotion], quantity: Quantity) -> list[Ste
     return steps
 
 
-def principal_steps(motion: RigidMotion, quantity: Quantity) -> Steps:
+def principal_steps(
+    motion: RigidMotion, quantity: Quantity, *, frame: MemoryFrame = "body"
+) -> Steps:
     """Return the steps along axes in which the diffusion is diagonal, with the noise along them.
 
     The steps of a rotation are turned into the eigenvectors of the noise-corrected tensor
-    <w_j w_j^T>/2 + sym<w_j w_{j+1}^T> of body-frame rotation vectors w; those of a translation, and
-    of a rotation in the plane, keep their axes. Every axis then has its own D and noise, and the
-    noise of a frame along each axis follows the turning body.
+    <w_j w_j^T>/2 + sym<w_j w_{j+1}^T> of the steps w; those of a translation, and of a rotation in
+    the plane, keep their axes. Every axis then has its own D and noise, and the noise of a frame
+    along each axis follows the turning body.
+
+    Parameters
+    ----------
+    motion : RigidMotion
+    quantity : {"rotation", "translation"}
+    frame : {"body", "lab", "mean"}
+        Steps of a rotation: body-frame rotation vectors, the same vectors in lab axes, or
+        differences of the rotation vectors from the mean orientation of the piece.
 
     Raises
     ------
@@ -325,17 +337,51 @@ def principal_steps(motion: RigidMotion, quantity: Quantity) -> Steps:
     if quantity == "translation" or motion.dimension == 2:
         return steps
     w = motion.step_vectors()[steps.stop - 1]
+    # Rotation of the noise and of a spin, from body axes and from lab axes, into those of the steps
+    from_body, from_lab = np.eye(3)[None], np.swapaxes(motion.rotation, -1, -2)
+    if frame == "lab":
+        from_body, from_lab = motion.rotation, np.eye(3)[None]
+        w = np.einsum("sij,sj->si", motion.rotation[steps.start], w)
+    elif frame == "mean":
+        about = orientation_about_mean(motion)
+        w = about[steps.stop] - about[steps.start]
+        from_body = exp_map(about)
+        from_lab = from_body @ from_lab
     linked = steps.linked[:-1]
     tensor = 0.5 * w.T @ w + w[:-1][linked].T @ w[1:][linked]
     axes = np.linalg.eigh((tensor + tensor.T) / 2)[1]
-    turned = motion.rotation[steps.start] @ axes
-    noise = np.einsum("ia,tij,ja->ta", axes, unit_covariance(motion), axes)
+    turned = np.broadcast_to(axes.T @ from_lab, (len(motion.time), 3, 3))[steps.start]
+    from_body = axes.T @ from_body
+    noise = np.einsum(
+        "tai,tij,taj->ta", *np.broadcast_arrays(from_body, unit_covariance(motion), from_body)
+    )
     return replace(
         steps,
         vectors=w @ axes,
         noise=(noise[..., None] * np.eye(3))[None],
-        steady=np.swapaxes(turned, -1, -2) * steps.duration[:, None, None],
+        steady=turned * steps.duration[:, None, None],
     )
+
+
+def orientation_about_mean(motion: RigidMotion) -> Floats:
+    """Return the rotation vector of every frame from the mean orientation of its piece, (T, 3).
+
+    The mean is the rotation nearest to the mean matrix; the vectors are in its body axes, and NaN
+    for frames without a pose.
+
+    Examples
+    --------
+    >>> from perrin import Cluster, simulate_motion
+    >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=9, rng=3)
+    >>> orientation_about_mean(truth).shape
+    (9, 3)
+    """
+    about = np.full((len(motion.time), 3), np.nan)
+    for piece in np.unique(motion.piece[motion.fitted]):
+        rows = motion.fitted[motion.piece[motion.fitted] == piece]
+        mean = svd_rotation(motion.rotation[rows].mean(axis=0)[None], np.zeros(1))[0][0]
+        about[rows] = log_map(mean.T @ motion.rotation[rows])
+    return about
 
 
 def body_steps(motion: RigidMotion, quantity: Quantity | Literal["both"], turn: Floats) -> Steps:

@@ -1,0 +1,525 @@
+"""The likelihood of steps with memory, as a function of the shape of their spectrum.
+
+Along each axis the steps have covariance D V + o E: V the covariance of a motion with D = 1 and a
+frame time of 1, which depends on one shape parameter (the exponent of fractional motion, the
+logarithm of the relaxation rate of confined motion); E the covariance of differences of unit noise.
+Both are diagonal in the sine modes of even steps, to an error that is not measurable, and exactly
+in generalised eigenvectors of uneven ones. D and o of every axis are maximised over.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple, get_args
+
+import numpy as np
+
+from perrin._arrays import choice_fault, refuse
+from perrin.diffusion.estimate import CHI2
+from perrin.diffusion.likelihood import newton_crossing
+from perrin.diffusion.noise_model import Noise, noise_faults
+from perrin.diffusion.step_kernels import difference_eigenvalues
+from perrin.diffusion.step_spectra import sine_spectrum, step_autocovariance, step_covariance
+from perrin.diffusion.steps import Quantity, pooled_steps
+from perrin.motion.rigid_motion import RigidMotion
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from perrin._arrays import Bools, Floats
+    from perrin.diffusion.steps import Steps
+
+    MeanSquare = Callable[[Floats, float], Floats]
+
+# Uneven steps are diagonalised in blocks of this many, whose correlation is left out.
+_LONGEST_BLOCK = 500
+
+# Lowest logarithm of the ratio of noise to D, and of D to the mean square step; distance of the
+# trial values, less than the width of any maximum.
+_LEAST_LOG_RATIO, _LOG_STEP = -12.0, 0.8
+
+# Steps are even if their durations are one frame time to this.
+_EVEN_FRAMES = 1e-6
+
+# The steps along an axis whose mean square is this much smaller than another one's are rounding.
+_LEAST_STEP_RATIO = 1e-24
+
+# Change of the shape parameter for the derivative of the spectrum.
+_SHAPE_STEP = 1e-4
+
+
+class StepBlock(NamedTuple):
+    """Steps that follow each other without a break.
+
+    Attributes
+    ----------
+    vectors : ndarray, shape (S, A)
+        Components of the steps along the axes.
+    start, stop : ndarray, shape (S,)
+        Times of the first and the last frame of each step, in frames.
+    even : bool
+        Whether all steps are equally long.
+    """
+
+    vectors: Floats
+    start: Floats
+    stop: Floats
+    even: bool
+
+
+class StepModes(NamedTuple):
+    """Steps in coordinates in which their covariance D V + o E is diagonal.
+
+    Attributes
+    ----------
+    values : ndarray, shape (A, K)
+        Coordinates of each axis; their squares have the mean D spectrum + o noise.
+    spectrum, noise : ndarray, shape (K,)
+        Diagonals of V and of E.
+    slope : ndarray, shape (K,) or (K, K)
+        Derivative of V in the shape parameter, as a diagonal or in full.
+    """
+
+    values: Floats
+    spectrum: Floats
+    noise: Floats
+    slope: Floats
+
+
+class ScaleFit(NamedTuple):
+    """D and o of every axis at the maximum of the likelihood for one shape.
+
+    Attributes
+    ----------
+    value : ndarray, shape (A,)
+        Log-likelihood of each axis, but for a constant.
+    D, offset : ndarray, shape (A,)
+        Per frame.
+    variance : ndarray, shape (A,)
+        Variance of ln D for this shape, from the expected information.
+    """
+
+    value: Floats
+    D: Floats
+    offset: Floats
+    variance: Floats
+
+
+class ShapePoint(NamedTuple):
+    """The profile likelihood at one shape.
+
+    Attributes
+    ----------
+    shape, value, slope : float
+        Shape parameter, log-likelihood but for a constant, and its derivative.
+    D : float
+        Mean over axes and motions, weighted by the number of steps.
+    variance : float
+        Variance of ln D for this shape.
+    offset : float
+        Noise offset, mean likewise.
+    """
+
+    shape: float
+    value: float
+    slope: float
+    D: float
+    variance: float
+    offset: float
+
+
+@dataclass(frozen=True, eq=False)
+class ShapeLikelihood:
+    """The likelihood of the shape of a spectrum, D and o of every axis profiled out.
+
+    Attributes
+    ----------
+    motions : tuple of tuple of StepBlock
+        Blocks of every motion; its axes have one D and one o in all of them.
+    mean_square : callable
+        Mean square displacement for D = 1 as a function of lag in frames and shape parameter.
+    known : tuple of (ndarray or None)
+        Known offset of every axis of each motion; None where it is free.
+    n_axes : int
+        Axes along which each motion is known, with those along which it rests.
+    blurred : bool
+        Whether `mean_square` contains the motion blur, so that a free offset is not negative.
+    """
+
+    motions: tuple[tuple[StepBlock, ...], ...]
+    mean_square: MeanSquare
+    known: tuple[Floats | None, ...]
+    n_axes: int
+    blurred: bool = False
+
+    @classmethod
+    def of(
+        cls, tracks: Sequence[Steps], noise: Noise, mean_square: Callable[[float], MeanSquare]
+    ) -> ShapeLikelihood:
+        """Return the likelihood of the steps of some motions along their own axes.
+
+        Noise that differs between frames enters as its mean, which leaves the mean square of every
+        mode as it is, and so the estimate unbiased.
+
+        Parameters
+        ----------
+        tracks : sequence of Steps
+        noise : Noise
+        mean_square : callable
+            Mean square displacement as a function of the open fraction of the frame time.
+        """
+        known: list[Floats | None] = []
+        blocks = []
+        for steps in tracks:
+            square = np.mean(steps.vectors**2, axis=0)
+            moving = square > _LEAST_STEP_RATIO * max(square.max(), np.finfo(float).tiny)
+            if not moving.any():
+                raise ValueError("motion: all steps are 0; expected a body that moves")
+            blocks.append(step_blocks(steps, moving))
+            if noise.model == "joint":
+                known.append(None)
+                continue
+            sigma = steps.sigma if noise.model == "residual" else float(noise.model)
+            mean = 0.5 * np.sum([x.mean(axis=0) for x in steps.variances], axis=0)
+            known.append(sigma**2 * mean[moving])
+        return cls(
+            tuple(blocks),
+            mean_square(noise.exposure or 0.0),
+            tuple(known),
+            n_axes=tracks[0].vectors.shape[1],
+            blurred=noise.exposure is not None,
+        )
+
+    @property
+    def longest(self) -> int:
+        """Frames of the longest block."""
+        return max(int(b.stop[-1] - b.start[0]) for blocks in self.motions for b in blocks)
+
+    @property
+    def n_steps(self) -> int:
+        """Number of steps."""
+        return sum(len(b.vectors) for blocks in self.motions for b in blocks)
+
+    def at(self, shape: float) -> ShapePoint:
+        """Return the profile likelihood at one shape."""
+        value = slope = D = offset = variance = 0.0
+        for blocks, known in zip(self.motions, self.known, strict=True):
+            modes = [step_modes(block, self.mean_square, shape) for block in blocks]
+            parts = [np.concatenate(x, axis=-1) for x in list(zip(*modes, strict=True))[:3]]
+            if known is None:
+                fit = fit_scales(*parts, least_offset=0.0 if self.blurred else None)
+            else:
+                fit = fit_scales_known_noise(*parts, known)
+            value += float(fit.value.sum())
+            slope += sum(shape_slope(one, fit) for one in modes)
+            weight = parts[0].shape[1] / self.n_steps / self.n_axes
+            D += weight * float(fit.D.sum())
+            offset += weight * float(fit.offset.sum())
+            variance += weight**2 * float(np.sum(fit.D**2 * fit.variance))
+        return ShapePoint(shape, value, slope, D, variance / D**2 if D else np.inf, offset)
+
+    def best(self, shapes: Floats) -> tuple[ShapePoint, list[ShapePoint]]:
+        """Return the highest maximum over a range of shapes, and the points at `shapes`.
+
+        Parameters
+        ----------
+        shapes : ndarray
+            Trial values in rising order, nearer to each other than the width of a maximum.
+        """
+        from scipy.optimize import brentq
+
+        points = [self.at(float(shape)) for shape in shapes]
+        top = max(range(len(points)), key=lambda i: points[i].value)
+        best = points[top]
+        side = top + (1 if best.slope > 0 else -1)
+        if 0 <= side < len(points) and points[side].slope * best.slope < 0:
+            ends = (best.shape, points[side].shape)
+            peak = self.at(float(brentq(lambda x: self.at(x).slope, *ends, xtol=1e-10)))
+            best = max(best, peak, key=lambda point: point.value)
+        return best, points
+
+    def crossings(
+        self, best: ShapePoint, points: list[ShapePoint], drop: float
+    ) -> tuple[ShapePoint | None, ShapePoint | None]:
+        """Return the outermost points at which twice the value has fallen by `drop`; None if none.
+
+        Parameters
+        ----------
+        best, points
+            Result of `best`.
+        drop : float
+            Quantile of chi-squared with one degree of freedom.
+        """
+        least = best.value - drop / 2
+        ends: list[ShapePoint | None] = []
+        for side in (-1, 1):
+            outward = sorted(
+                [best, *(p for p in points if side * (p.shape - best.shape) > 0)],
+                key=lambda p: side * p.shape,
+            )
+            last = max(i for i, p in enumerate(outward) if p.value >= least)
+            if last == len(outward) - 1:
+                ends.append(None)
+                continue
+            inside, outside = outward[last], outward[last + 1]
+
+            def height(shape: float) -> tuple[float, float]:
+                point = self.at(shape)
+                return point.value - least, point.slope
+
+            share = (inside.value - least) / (inside.value - outside.value)
+            start = inside.shape + np.sqrt(max(share, 0.01)) * (outside.shape - inside.shape)
+            ends.append(
+                self.at(
+                    newton_crossing(
+                        height, inside=inside.shape, start=float(start), outside=outside.shape
+                    )
+                )
+            )
+        return ends[0], ends[1]
+
+    def intervals(
+        self, best: ShapePoint, points: list[ShapePoint]
+    ) -> dict[float, tuple[ShapePoint | None, ShapePoint | None]]:
+        """Return the ends of the 68 % and the 95 % interval; None where the data set no bound."""
+        return {level: self.crossings(best, points, drop) for level, drop in CHI2.items()}
+
+    def scale_slope(self, best: ShapePoint, reach: float) -> float:
+        """Return the slope of ln D in the shape parameter along the maximum of the likelihood."""
+        low, high = self.at(best.shape - reach), self.at(best.shape + reach)
+        if not (low.D > 0 and high.D > 0):
+            return np.nan
+        return float(np.log(high.D / low.D) / (2 * reach))
+
+
+def step_blocks(steps: Steps, moving: Bools) -> tuple[StepBlock, ...]:
+    """Return the steps of a motion in blocks: its pieces, and parts of long uneven ones.
+
+    Parameters
+    ----------
+    steps : Steps
+    moving : ndarray of bool, shape (A,)
+        Axes that are taken.
+
+    Examples
+    --------
+    >>> from perrin import Cluster, simulate_motion
+    >>> from perrin.diffusion import steps_of
+    >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=100, rng=3)
+    >>> blocks = step_blocks(steps_of(truth, "rotation"), np.array([True, True, False]))
+    >>> [(b.vectors.shape, b.even) for b in blocks]
+    [((99, 2), True)]
+    """
+    length = steps.duration / steps.dt
+    blocks = []
+    for rows in np.split(np.arange(len(length)), 1 + np.flatnonzero(~steps.linked[:-1])):
+        even = bool(np.all(np.abs(length[rows] - 1) <= _EVEN_FRAMES))
+        parts = 1 if even else -(-len(rows) // _LONGEST_BLOCK)
+        for part in np.array_split(rows, parts):
+            stop = np.cumsum(length[part])
+            blocks.append(
+                StepBlock(steps.vectors[part][:, moving], stop - length[part], stop, even)
+            )
+    return tuple(blocks)
+
+
+def step_modes(block: StepBlock, mean_square: MeanSquare, shape: float) -> StepModes:
+    """Return the steps of a block in coordinates in which their covariance is diagonal.
+
+    Even steps are taken to their sine modes; uneven ones to the generalised eigenvectors of V and
+    E, in which E is the identity.
+
+    Examples
+    --------
+    >>> from perrin.diffusion import fractional_mean_square
+    >>> time = np.arange(5.0)
+    >>> block = StepBlock(np.ones((4, 1)), time[:-1], time[1:], even=False)
+    >>> exact = step_modes(block, fractional_mean_square, 1.0)
+    >>> sine = step_modes(block._replace(even=True), fractional_mean_square, 1.0)
+    >>> bool(np.allclose(np.sort(sine.spectrum / sine.noise), exact.spectrum))
+    True
+    """
+    from scipy.fft import dst
+    from scipy.linalg import eigh
+
+    near = (shape - _SHAPE_STEP, shape + _SHAPE_STEP)
+    count = len(block.vectors)
+    if block.even:
+        lag = np.arange(count + 1.0)
+        square = np.stack([mean_square(lag, x) for x in (shape, *near)])
+        spectrum, less, more = sine_spectrum(step_autocovariance(square))
+        values = dst(block.vectors.T, type=1, norm="ortho", axis=1)
+        slope = (more - less) / (2 * _SHAPE_STEP)
+        return StepModes(values, spectrum, 2 * difference_eigenvalues(count), slope)
+    middle, less, more = (
+        step_covariance(block.start, block.stop, lambda lag, x=x: mean_square(lag, x))
+        for x in (shape, *near)
+    )
+    difference = 2 * np.eye(count) - np.eye(count, k=1) - np.eye(count, k=-1)
+    spectrum, axes = eigh(middle, difference)
+    slope = axes.T @ ((more - less) / (2 * _SHAPE_STEP)) @ axes
+    return StepModes((axes.T @ block.vectors).T, spectrum, np.ones(count), slope)
+
+
+def fit_scales(
+    values: Floats, spectrum: Floats, noise: Floats, *, least_offset: float | None = None
+) -> ScaleFit:
+    """Return the D and o of every axis at which coordinates of variance D spectrum + o noise fit.
+
+    With o = D h + t, h the lowest ratio at which all variances are positive, the likelihood is
+    maximised in ln(t/D), D by itself. It may have several maxima in short tracks: all of its range
+    is searched, then the highest maximum is found by Newton steps.
+
+    Parameters
+    ----------
+    values : ndarray, shape (A, K)
+    spectrum, noise : ndarray, shape (K,)
+    least_offset : float, optional
+        Lowest ratio h of o to D; by default where the first variance reaches 0.
+
+    Examples
+    --------
+    >>> noise = 2 * difference_eigenvalues(400)
+    >>> values = np.sqrt(0.5 * 2 + 0.1 * noise)[None] * np.random.default_rng(3).normal(size=400)
+    >>> fit = fit_scales(values, np.full(400, 2.0), noise)
+    >>> bool(abs(np.log(fit.D[0] / 0.5)) < 3 * np.sqrt(fit.variance[0]))
+    True
+    """
+    count = len(spectrum)
+    least = -float(np.min(spectrum / noise)) if least_offset is None else least_offset
+    rest = np.maximum(spectrum + least * noise, 0.0)
+    power = np.maximum(values**2, np.finfo(float).tiny)
+    trial = np.arange(_LEAST_LOG_RATIO, 2 * np.log(count) + 4, _LOG_STEP)
+    variance = rest + np.exp(trial)[:, None] * noise
+    mean = power @ (1 / variance).T / count
+    height = -0.5 * (np.log(variance).sum(axis=1) + count * np.log(mean))
+    top = np.argmax(height, axis=1)
+    low, high = (trial[np.clip(top + side, 0, len(trial) - 1)] for side in (-1, 1))
+    u = trial[top]
+    for _ in range(40):
+        scaled = np.exp(u)[:, None] * noise
+        variance = rest + scaled
+        share, weight = scaled / variance, power / variance
+        t0, t1, t2 = (np.sum(weight * share**k, axis=1) for k in range(3))
+        slope = -0.5 * (share.sum(axis=1) - count * t1 / t0)
+        bend = -0.5 * (
+            np.sum(share * (1 - share), axis=1) - count * ((t1 - 2 * t2) / t0 + (t1 / t0) ** 2)
+        )
+        low, high = np.where(slope > 0, u, low), np.where(slope > 0, high, u)
+        newton = u - np.divide(slope, bend, out=np.full_like(u, np.inf), where=bend < 0)
+        inside = (newton >= low) & (newton <= high)
+        target = np.where(inside, newton, 0.5 * (low + high))
+        moved = np.abs(target - u).max()
+        u = target
+        if moved < 1e-11:
+            break
+    variance = rest + np.exp(u)[:, None] * noise
+    D = np.mean(power / variance, axis=1)
+    value = -0.5 * (np.log(variance).sum(axis=1) + count * np.log(D) + count)
+    by_D, by_offset = spectrum / variance, noise / variance
+    shared = np.sum(by_D * by_offset, axis=1) ** 2 / np.sum(by_offset**2, axis=1)
+    with np.errstate(divide="ignore"):
+        spread = 2 / np.maximum(np.sum(by_D**2, axis=1) - shared, 0.0)
+    return ScaleFit(value, D, D * (np.exp(u) + least), spread)
+
+
+def fit_scales_known_noise(
+    values: Floats, spectrum: Floats, noise: Floats, offset: Floats
+) -> ScaleFit:
+    """Return the D of every axis at which coordinates of variance D spectrum + o noise fit.
+
+    Parameters
+    ----------
+    values : ndarray, shape (A, K)
+    spectrum, noise : ndarray, shape (K,)
+    offset : ndarray, shape (A,)
+        Known o of every axis, >= 0.
+
+    Examples
+    --------
+    >>> fit_scales_known_noise(np.ones((1, 5)), np.full(5, 2.0), np.ones(5), np.zeros(1)).D
+    array([0.5])
+    """
+    power = np.maximum(values**2, np.finfo(float).tiny)
+    known = offset[:, None] * noise
+    v = np.log(np.mean(power / spectrum, axis=1))
+    trial = v + np.arange(_LEAST_LOG_RATIO, 1.5, _LOG_STEP)[:, None]
+    variance = np.exp(trial)[..., None] * spectrum + known
+    height = -0.5 * np.sum(np.log(variance) + power / variance, axis=-1)
+    top = np.argmax(height, axis=0)
+    axis = np.arange(len(v))
+    low, high = (trial[np.clip(top + side, 0, len(trial) - 1), axis] for side in (-1, 1))
+    v = trial[top, axis]
+    for _ in range(40):
+        scaled = np.exp(v)[:, None] * spectrum
+        variance = scaled + known
+        share, weight = scaled / variance, power / variance
+        slope = -0.5 * np.sum(share * (1 - weight), axis=1)
+        bend = -0.5 * np.sum(share * (1 - share) * (1 - weight) + share**2 * weight, axis=1)
+        low, high = np.where(slope > 0, v, low), np.where(slope > 0, high, v)
+        newton = v - np.divide(slope, bend, out=np.full_like(v, np.inf), where=bend < 0)
+        inside = (newton >= low) & (newton <= high)
+        target = np.where(inside, newton, 0.5 * (low + high))
+        moved = np.abs(target - v).max()
+        v = target
+        if moved < 1e-11:
+            break
+    D = np.exp(v)
+    variance = D[:, None] * spectrum + known
+    value = -0.5 * np.sum(np.log(variance) + power / variance, axis=1)
+    return ScaleFit(value, D, offset, 2 / np.sum((D[:, None] * spectrum / variance) ** 2, axis=1))
+
+
+def shape_slope(modes: StepModes, fit: ScaleFit) -> float:
+    """Return the derivative of the log-likelihood in the shape parameter, D and o at their maximum.
+
+    Examples
+    --------
+    >>> modes = StepModes(np.ones((1, 3)), np.full(3, 2.0), np.ones(3), np.ones(3))
+    >>> fit = ScaleFit(np.zeros(1), np.full(1, 0.5), np.zeros(1), np.ones(1))
+    >>> shape_slope(modes, fit)
+    0.0
+    """
+    variance = fit.D[:, None] * modes.spectrum + fit.offset[:, None] * modes.noise
+    scaled = modes.values / variance
+    if modes.slope.ndim == 1:
+        return float(0.5 * np.sum(fit.D[:, None] * modes.slope * (scaled**2 - 1 / variance)))
+    square = np.einsum("ak,kl,al->a", scaled, modes.slope, scaled, optimize=True)
+    return float(0.5 * np.sum(fit.D * (square - (1 / variance) @ np.diagonal(modes.slope))))
+
+
+def motions_and_noise(
+    motion: RigidMotion | Sequence[RigidMotion],
+    quantity: Quantity,
+    noise: object,
+    exposure: float | None,
+) -> tuple[list[RigidMotion], Noise]:
+    """Return the motions and the options of the noise of a fit, or raise one error for all faults.
+
+    Raises
+    ------
+    TooFewFramesError
+        If a motion has fewer than two steps.
+    ValueError
+        For unknown or inconsistent choices, or motions of 2 and 3 dimensions together.
+
+    Examples
+    --------
+    >>> motions_and_noise([], "speed", "joint", None)
+    Traceback (most recent call last):
+    ValueError: quantity: expected 'rotation' or 'translation', got 'speed'; motion: expected one or more motions, all in 2 or all in 3 dimensions
+    """  # noqa: E501 (what Python prints)
+    motions = [motion] if isinstance(motion, RigidMotion) else list(motion)
+    faults = [
+        *choice_fault("quantity", quantity, get_args(Quantity)),
+        *noise_faults(noise, exposure),
+    ]
+    if isinstance(noise, Noise) and noise.drift:
+        faults.append(
+            "noise: expected drift=False; a steady motion is fitted by estimate_diffusion"
+        )
+    if len({m.dimension for m in motions}) != 1:
+        faults.append("motion: expected one or more motions, all in 2 or all in 3 dimensions")
+    refuse(faults)
+    pooled_steps(motions, quantity)
+    return motions, Noise.of(noise, exposure=exposure)
