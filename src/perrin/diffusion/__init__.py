@@ -67,6 +67,12 @@ from perrin.diffusion.steps import (
     unit_center_variance,
     unit_covariance,
 )
+from perrin.diffusion.switching import (
+    Parameter,
+    SwitchingEstimate,
+    SwitchingSteps,
+    fit_switching,
+)
 from perrin.diffusion.tensor_likelihood import (
     ArrowHessian,
     Maximum,
@@ -112,6 +118,7 @@ __all__ = [
     "Noise",
     "NoisySteps",
     "NoisyVectors",
+    "Parameter",
     "PooledLikelihood",
     "ProfilePoint",
     "SamplingBudget",
@@ -123,6 +130,8 @@ __all__ = [
     "StepKernel",
     "StepResiduals",
     "Steps",
+    "SwitchingEstimate",
+    "SwitchingSteps",
     "TensorSlopes",
     "TridiagonalCovariance",
     "axes_like",
@@ -151,6 +160,7 @@ __all__ = [
     "find_jumps",
     "fit_gls",
     "fit_line",
+    "fit_switching",
     "gls_weights",
     "identity_limits",
     "imposed_symmetry",
