@@ -22,6 +22,7 @@ from perrin.cli.options import (
     WORK,
     Columns,
     Drift,
+    Dynamics,
     Exposure,
     Frames,
     GroupedCommand,
@@ -40,6 +41,7 @@ from perrin.cli.options import (
     Viscosity,
     body_of,
     read_columns,
+    read_dynamics,
     read_noise,
     read_numbers,
     read_optics,
@@ -408,10 +410,11 @@ def simulate(
     d_t: Annotated[float, typer.Option("--d-t", help="D_T, um^2/s.")] = 0.0,
     sigma: Annotated[str, typer.Option(help="Localisation error, um, one number or x,y,z.")] = "0",
     frames: Annotated[int, typer.Option(help="Number of frames.")] = 300,
+    dynamics: Dynamics = None,
     seed: Seed = 0,
     overwrite: OverwriteFile = False,
 ) -> None:
-    """Write the track table of one simulated Brownian cluster with localisation noise."""
+    """Write the track table of one simulated cluster, Brownian by default, with noise."""
     import numpy as np
 
     import perrin
@@ -428,6 +431,7 @@ def simulate(
             D_T=d_t,
             dt=dt,
             n_frames=frames,
+            dynamics=read_dynamics(dynamics),
             rng=rng,
         )
         positions = perrin.add_noise(

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
 
     from perrin.geometry.shapes import Cluster
     from perrin.images.optics.optics import Optics
+    from perrin.motion.dynamics import Dynamics as PlantedDynamics
 
 
 SHAPES = ("tetrahedron", "pentahedron", "trimer")
@@ -150,6 +151,15 @@ Temperature = Annotated[
     ),
 ]
 
+Dynamics = Annotated[
+    str | None,
+    typer.Option(
+        help="Another motion than Brownian: fractional:ALPHA, confined:RELAXATION_TIME, spin:RATE "
+        "or spin:X,Y,Z, switching:RATIO,DWELL, hopping:ANGLE,INTERVAL or "
+        "hopping:ANGLE,INTERVAL,RELAXATION_TIME (rad, rad/s, s)."
+    ),
+]
+
 Seed = Annotated[int, typer.Option(help="Seed of the random numbers.")]
 Shape = Annotated[str, typer.Argument(help=f"{', '.join(SHAPES)}.")]
 
@@ -206,6 +216,27 @@ def read_numbers(option: str, text: str) -> float | list[float]:
     except ValueError:
         raise ValueError(f"{option}: expected a number or x,y,z, got {text!r}") from None
     return values[0] if len(values) == 1 else values
+
+
+def read_dynamics(text: str | None) -> PlantedDynamics | None:
+    """Read the name of a motion and its numbers, such as switching:10,14."""
+    from perrin import motion
+
+    if text is None:
+        return None
+    offered = ("fractional", "confined", "spin", "switching", "hopping")
+    name, _, numbers = text.partition(":")
+    if name not in offered:
+        raise ValueError(f"--dynamics: expected {', '.join(offered)} and numbers, got {text!r}")
+    values = read_numbers("--dynamics", numbers)
+    arguments = [values] if name == "spin" or isinstance(values, float) else values
+    try:
+        found: PlantedDynamics = getattr(motion, name.capitalize())(*arguments)
+    except TypeError:
+        raise ValueError(f"--dynamics: wrong number of values for {name}, got {text!r}") from None
+    except ValueError as fault:
+        raise ValueError(f"--dynamics: {fault}") from None
+    return found
 
 
 def read_noise(text: str) -> Literal["joint", "residual"] | float:

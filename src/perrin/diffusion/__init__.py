@@ -94,6 +94,12 @@ from perrin.diffusion.steps import (
     unit_center_variance,
     unit_covariance,
 )
+from perrin.diffusion.switching import (
+    Parameter,
+    SwitchingEstimate,
+    SwitchingSteps,
+    fit_switching,
+)
 from perrin.diffusion.tensor_likelihood import (
     ArrowHessian,
     Maximum,
@@ -141,6 +147,7 @@ __all__ = [
     "Noise",
     "NoisySteps",
     "NoisyVectors",
+    "Parameter",
     "PooledLikelihood",
     "ProfilePoint",
     "SamplingBudget",
@@ -157,6 +164,8 @@ __all__ = [
     "StepModes",
     "StepResiduals",
     "Steps",
+    "SwitchingEstimate",
+    "SwitchingSteps",
     "TensorSlopes",
     "TridiagonalCovariance",
     "axes_like",
@@ -195,6 +204,7 @@ __all__ = [
     "fractional_autocovariance",
     "fractional_mean_square",
     "fractional_slope",
+    "fit_switching",
     "gls_weights",
     "identity_limits",
     "imposed_symmetry",

@@ -1,4 +1,4 @@
-"""Simulated Brownian motion of rigid clusters with known coefficients, and localisation noise."""
+"""Simulated motion of rigid clusters with known coefficients, and localisation noise."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from perrin._arrays import (
+    Bools,
     Floats,
     as_positions,
     as_sigma,
@@ -20,6 +21,18 @@ from perrin._arrays import (
 )
 from perrin.geometry.rotations import cumulative_product, exp_map, successive_product
 from perrin.hydrodynamics.mobility import Mobility
+from perrin.motion.dynamics import (
+    Confined,
+    Dynamics,
+    Fractional,
+    Hopping,
+    Spin,
+    Switching,
+    fast_states,
+    fractional_noise,
+    hops,
+    relaxing_coordinates,
+)
 from perrin.motion.rigid_motion import RigidMotion
 
 if TYPE_CHECKING:
@@ -38,9 +51,10 @@ def simulate_motion(
     dt: float,
     n_frames: int,
     scheme: Literal["brownian", "euler"] = "brownian",
+    dynamics: Dynamics | None = None,
     rng: np.random.Generator | int,
 ) -> RigidMotion:
-    """Simulate free Brownian rotation and translation of a rigid cluster.
+    """Simulate Brownian rotation and translation of a rigid cluster, or another motion of it.
 
     Parameters
     ----------
@@ -60,6 +74,9 @@ def simulate_motion(
         "brownian" has the exact step law at any D_R dt for one D_R (angles from the heat kernel on
         SO(3)), and substeps with D dt <= 0.002 for a tensor. "euler" is the paper's: R_x R_y R_z
         with three Gaussian angles (Hunter 2011, Eq. 16), for one D_R only.
+    dynamics : Fractional, Confined, Spin, Switching or Hopping, optional
+        Another motion than free Brownian motion, of a `Cluster` with the "brownian" scheme. Its
+        class states what D_R and D_T then are. `Fractional` is for one D_R only.
     rng : numpy.random.Generator or int
         Source of random numbers, or a seed.
 
@@ -71,8 +88,9 @@ def simulate_motion(
     Raises
     ------
     ValueError
-        If a value is out of range, a tensor is not positive semidefinite or is given with "euler",
-        or coefficients are given with a `Mobility`.
+        If a value is out of range, a tensor is not positive semidefinite or is given with "euler"
+        or `Fractional`, coefficients or dynamics are given with a `Mobility`, or dynamics with
+        "euler".
 
     Examples
     --------
@@ -86,12 +104,22 @@ def simulate_motion(
     require_positive(dt=dt, n_frames=n_frames)
     if n_frames != int(n_frames):
         raise ValueError(f"n_frames: expected a whole number, got {n_frames!r}")
-    refuse(choice_fault("scheme", scheme, ("brownian", "euler")))
+    faults = choice_fault("scheme", scheme, ("brownian", "euler"))
+    if dynamics is not None:
+        if not isinstance(dynamics, Dynamics):
+            faults.append(
+                "dynamics: expected Fractional, Confined, Spin, Switching or Hopping, or None, "
+                f"got {dynamics!r}"
+            )
+        if scheme == "euler":
+            faults.append('scheme="euler" (Eq. 16) is for Brownian rotation; leave dynamics out')
+    refuse(faults)
     generator, n = np.random.default_rng(rng), int(n_frames)
     if isinstance(cluster, Mobility):
-        if D_R is not None or D_T != 0 or scheme != "brownian":
+        if D_R is not None or D_T != 0 or scheme != "brownian" or dynamics is not None:
             raise ValueError(
-                'a Mobility has its own D_R, D_T and scheme ("brownian"); leave them out'
+                'a Mobility has its own D_R, D_T, scheme ("brownian") and free dynamics; leave '
+                "them out"
             )
         template = cluster.centers - cluster.centroid
         center, rotation = _coupled_walk(cluster, n - 1, dt=dt, generator=generator)
@@ -102,9 +130,13 @@ def simulate_motion(
         template = cluster.positions.copy()
         d = template.shape[1]
         D = _rotation_tensor(D_R, d) * dt
-        rotation = _free_rotations(D, n - 1, scheme=scheme, generator=generator)
-        jumps = generator.normal(scale=np.sqrt(2 * D_T * dt), size=(n - 1, d))
-        center = np.concatenate([np.zeros((1, d)), np.cumsum(jumps, axis=0)])
+        if dynamics is None:
+            rotation = _free_rotations(D, n - 1, scheme=scheme, generator=generator)
+            center = _summed(generator.normal(scale=np.sqrt(2 * D_T * dt), size=(n - 1, d)))
+        else:
+            center, rotation = _planted_walk(
+                dynamics, D, D_T * dt, d=d, count=n - 1, dt=float(dt), generator=generator
+            )
     angles = 3 if template.shape[1] == 3 else 1
     return RigidMotion(
         time=np.arange(n, dtype=np.float64) * float(dt),
@@ -196,32 +228,129 @@ def _free_rotations(
     D: Floats, count: int, *, scheme: str, generator: np.random.Generator
 ) -> Floats:
     """Return count + 1 orientations, the first one the identity; D is the tensor times dt."""
-    isotropic = np.allclose(D, D[0, 0] * np.eye(len(D)), rtol=0.0, atol=1e-12 * np.trace(D))
-    if scheme == "euler":
-        if len(D) != 3 or not isotropic:
-            raise ValueError('scheme="euler" (Eq. 16) is for one D_R in three dimensions only')
-        # R_x(alpha) R_y(beta) R_z(gamma) with Gaussian angles of variance 2 D.
-        angles = generator.normal(scale=np.sqrt(2 * float(D[0, 0])), size=(count, 3))
-        x, y, z = (exp_map(angles[:, i, None] * np.eye(3)[i]) for i in range(3))
-        return successive_product(np.asarray(x @ y @ z))
+    if scheme == "brownian":
+        return cumulative_product(_free_steps(D, count, generator=generator))
+    if len(D) != 3 or not _isotropic(D):
+        raise ValueError('scheme="euler" (Eq. 16) is for one D_R in three dimensions only')
+    # R_x(alpha) R_y(beta) R_z(gamma) with Gaussian angles of variance 2 D.
+    angles = generator.normal(scale=np.sqrt(2 * float(D[0, 0])), size=(count, 3))
+    x, y, z = (exp_map(angles[:, i, None] * np.eye(3)[i]) for i in range(3))
+    return successive_product(np.asarray(x @ y @ z))
+
+
+def _isotropic(D: Floats) -> bool:
+    """Return whether a tensor is one number in all directions."""
+    return np.allclose(D, D[0, 0] * np.eye(len(D)), rtol=0.0, atol=1e-12 * np.trace(D))
+
+
+def _free_steps(D: Floats, count: int, *, generator: np.random.Generator) -> Floats:
+    """Return the body-frame rotations of count Brownian steps; D is the tensor times dt."""
     if len(D) == 1 or float(np.trace(D)) == 0:
         normal = generator.normal(size=(count, len(D)))
-        return cumulative_product(exp_map(normal * np.sqrt(2 * D[0, 0])))
-    if isotropic:
+        return exp_map(normal * np.sqrt(2 * D[0, 0]))
+    if _isotropic(D):
         # Angles from the heat kernel, about uniform axes.
         angle, cdf = heat_kernel_angles(float(D[0, 0]))
         drawn = np.interp(generator.random(count), cdf, angle)
         axis = generator.normal(size=(count, 3))
         axis /= np.linalg.norm(axis, axis=1, keepdims=True)
-        return cumulative_product(exp_map(axis * drawn[:, None]))
+        return exp_map(axis * drawn[:, None])
     # Gaussian body-frame rotation vectors, each short enough to be exact.
     substeps = int(np.ceil(np.linalg.eigvalsh(D)[-1] / _SUBSTEP))
-    values, axes = np.linalg.eigh(2 * D / substeps)
-    root = axes * np.sqrt(np.maximum(values, 0.0))
+    root = _root(2 * D / substeps)
     step = np.broadcast_to(np.eye(3), (count, 3, 3))
     for _ in range(substeps):
         step = step @ exp_map(generator.normal(size=(count, 3)) @ root.T)
-    return cumulative_product(step)
+    return step
+
+
+def _root(covariance: Floats) -> Floats:
+    """Return a square root A of a positive semidefinite matrix, A A^T."""
+    values, axes = np.linalg.eigh(covariance)
+    return np.asarray(axes * np.sqrt(np.maximum(values, 0.0)))
+
+
+def _summed(displacements: Floats) -> Floats:
+    """Return the path of these displacements from the origin."""
+    return np.concatenate([np.zeros((1, displacements.shape[1])), np.cumsum(displacements, axis=0)])
+
+
+def _planted_walk(
+    dynamics: Dynamics,
+    D: Floats,
+    D_T: float,
+    *,
+    d: int,
+    count: int,
+    dt: float,
+    generator: np.random.Generator,
+) -> tuple[Floats, Floats]:
+    """Return count + 1 centres and orientations; D and D_T are the coefficients times dt."""
+    match dynamics:
+        case Fractional():
+            return _fractional_walk(dynamics.alpha, D, D_T, d, count, generator)
+        case Switching():
+            fast = fast_states(dt / dynamics.dwell, count, generator=generator)
+            return _switching_walk(dynamics.ratio, fast, D, D_T, d, generator)
+        case Confined():
+            still = np.broadcast_to(exp_map(np.zeros(len(D))), (count + 1, d, d))
+            return _caged_walk(dt / dynamics.relaxation_time, still, D, D_T, generator)
+        case Hopping():
+            mean, shape = dt / dynamics.interval, (count, len(D))
+            turns = hops(dynamics.angle, mean, shape, generator=generator)
+            if dynamics.relaxation_time is not None:
+                decay = dt / dynamics.relaxation_time
+                return _caged_walk(decay, cumulative_product(turns), D, D_T, generator)
+            rotation = cumulative_product(_free_steps(D, count, generator=generator) @ turns)
+        case Spin():
+            rate = np.asarray(dynamics.rate)
+            if len(D) == 1 and rate[:2].any():
+                raise ValueError(f"rate: expected a spin about z in the plane, got {dynamics!r}")
+            turn = exp_map(np.arange(count + 1)[:, None] * dt * rate[-len(D) :])
+            rotation = turn @ _free_rotations(D, count, scheme="brownian", generator=generator)
+    return _summed(generator.normal(scale=np.sqrt(2 * D_T), size=(count, d))), rotation
+
+
+def _fractional_walk(
+    alpha: float, D: Floats, D_T: float, d: int, count: int, generator: np.random.Generator
+) -> tuple[Floats, Floats]:
+    """Return centres and orientations of fractional Brownian motion with its memory in the lab."""
+    if not _isotropic(D):
+        raise ValueError(
+            "D_R: Fractional has its memory in the lab frame and needs one D_R, not a tensor"
+        )
+    turns = np.sqrt(2 * D[0, 0]) * fractional_noise(alpha, (count, len(D)), generator=generator)
+    jumps = np.sqrt(2 * D_T) * fractional_noise(alpha, (count, d), generator=generator)
+    return _summed(jumps), successive_product(exp_map(turns))
+
+
+def _switching_walk(
+    ratio: float, fast: Bools, D: Floats, D_T: float, d: int, generator: np.random.Generator
+) -> tuple[Floats, Floats]:
+    """Return centres and orientations of Brownian steps of two sizes."""
+    slow_share, fast_share = 2 / (1 + ratio), 2 * ratio / (1 + ratio)
+    slow_steps = _free_steps(slow_share * D, len(fast), generator=generator)
+    fast_steps = _free_steps(fast_share * D, len(fast), generator=generator)
+    rotation = cumulative_product(np.where(fast[:, None, None], fast_steps, slow_steps))
+    scale = np.sqrt(2 * D_T * np.where(fast, fast_share, slow_share))
+    return _summed(scale[:, None] * generator.normal(size=(len(fast), d))), rotation
+
+
+def _caged_walk(
+    decay: float, mean: Floats, D: Floats, D_T: float, generator: np.random.Generator
+) -> tuple[Floats, Floats]:
+    """Return centres about one place, and orientations about mean ones.
+
+    Frame 0 is at the origin and not rotated, wherever in its cage the body begins.
+    """
+    count, d = len(mean), mean.shape[-1]
+    swing = exp_map(
+        relaxing_coordinates(decay, (count, len(D)), generator=generator) @ _root(D / decay).T
+    )
+    rotation = np.swapaxes(swing[0], -1, -2) @ mean @ swing
+    rotation[0] = np.eye(d)
+    place = relaxing_coordinates(decay, (count, d), generator=generator)
+    return np.sqrt(D_T / decay) * (place - place[0]), rotation
 
 
 @lru_cache(maxsize=8)

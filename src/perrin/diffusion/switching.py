@@ -1,0 +1,531 @@
+"""Brownian steps whose D switches between two states: a hidden Markov model with shared noise."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, Literal, get_args
+
+import numpy as np
+
+from perrin._arrays import choice_fault, finite_or_none, from_plain, frozen, refuse, to_plain
+from perrin._text import with_error
+from perrin.diffusion.estimate import NORMAL, UNITS
+from perrin.diffusion.likelihood import Likelihood
+from perrin.diffusion.noise_model import Noise, noise_faults
+from perrin.diffusion.steps import NoisySteps, Quantity, pooled_steps
+from perrin.errors import TooFewFramesError
+from perrin.motion.rigid_motion import RigidMotion
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from perrin._arrays import Bools, Floats, Ints
+
+# Fewer steps cannot show two states: an alternation of a few dwell times needs this many.
+_FEWEST_SWITCHING_STEPS = 20
+
+# Parameters of two states in excess of those of one D: a second D and two rates.
+_MORE_PARAMETERS = 3
+
+# Half the distance of the points, in logarithms of the parameters, whose values give slopes and
+# curvatures: the error of a slope is of the order of its square.
+_DIFFERENCE = 3e-3
+
+_NEWTON_ROUNDS = 60
+
+# The best of these is the start: D_slow and D_fast over the mean D, dwell time over the time
+# between frames, and the noise over that of one D.
+_START_SLOW = (0.1, 0.25, 0.4, 0.7)
+_START_FAST = (1.3, 1.8, 2.5)
+_START_DWELL = (4.0, 15.0, 60.0)
+_START_NOISE = (0.3, 1.0)
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A fitted parameter with its intervals.
+
+    Attributes
+    ----------
+    value : float
+        Most likely value.
+    ci68, ci95 : tuple of float
+        Confidence intervals; an end that the data do not bound is 0 or inf.
+    unit : str
+        Unit of the value.
+    """
+
+    value: float
+    ci68: tuple[float, float]
+    ci95: tuple[float, float]
+    unit: str
+
+    @classmethod
+    def log_normal(cls, value: float, error: float, unit: str) -> Parameter:
+        """Return a positive value whose logarithm has this standard error.
+
+        Parameters
+        ----------
+        value : float
+        error : float
+            Standard error of the logarithm; NaN or inf where the data do not bound the value.
+        unit : str
+        """
+        ends = []
+        for level in (0.68, 0.95):
+            reach = NORMAL[level] * error
+            # Beyond e^10 an end is no bound.
+            known = np.isfinite(reach) and reach < 10
+            ends.append(
+                (float(value * np.exp(-reach)), float(value * np.exp(reach)))
+                if known
+                else (0.0, np.inf)
+            )
+        return cls(float(value), ends[0], ends[1], unit)
+
+    @property
+    def stderr(self) -> float:
+        """Half the width of the 68 % interval."""
+        return (self.ci68[1] - self.ci68[0]) / 2
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the parameter for JSON; an end without bound is None."""
+        return {
+            "value": finite_or_none(self.value),
+            "ci68": to_plain(self.ci68),
+            "ci95": to_plain(self.ci95),
+            "unit": self.unit,
+        }
+
+    @classmethod
+    def from_dict(cls, entry: Mapping[str, Any]) -> Parameter:
+        """Return the parameter that `to_dict` wrote."""
+        ends = [
+            (float(low), np.inf if high is None else float(high))
+            for low, high in (entry["ci68"], entry["ci95"])
+        ]
+        return cls(float(entry["value"]), ends[0], ends[1], entry["unit"])
+
+    def __str__(self) -> str:
+        if not np.isfinite(self.stderr):
+            return f"{self.value:.2g} (not bounded) {self.unit}"
+        return f"{with_error(self.value, self.stderr)} {self.unit}"
+
+    def __float__(self) -> float:
+        return self.value
+
+
+@dataclass(frozen=True, eq=False)
+class SwitchingEstimate:
+    """Two diffusion coefficients between which a motion switches, and the state of every step.
+
+    Attributes
+    ----------
+    D_slow, D_fast : Parameter
+        Diffusion coefficients of the two states, rad^2/s or um^2/s.
+    D_mean : Parameter
+        Mean over the two states, weighted with their probabilities; its interval contains the
+        random number of dwells, and is wider than that of one D in `estimate_diffusion`.
+    dwell_slow, dwell_fast : Parameter
+        Mean time in a state before it changes, s.
+    states : tuple of ndarray of int, shape (T,)
+        For every motion the more probable state of the step that ends at each row: 0 slow, 1 fast,
+        -1 where no step ends.
+    probability : tuple of ndarray, shape (T,)
+        Probability of the fast state for the same steps; NaN where no step ends.
+    log_likelihood_gain : float
+        Logarithm of the likelihood of two states over that of one D.
+    bic_gain : float
+        The gain less 1.5 ln(number of steps), the penalty of three more parameters (Bayesian
+        information criterion); above 0 two states are the better description.
+    n_frames : int
+        Frames with a pose, of all motions.
+    unit : str
+        Unit of the coefficients, "rad^2/s" or "um^2/s".
+    """
+
+    D_slow: Parameter
+    D_fast: Parameter
+    D_mean: Parameter
+    dwell_slow: Parameter
+    dwell_fast: Parameter
+    states: tuple[Ints, ...]
+    probability: tuple[Floats, ...]
+    log_likelihood_gain: float
+    bic_gain: float
+    n_frames: int
+    unit: str
+
+    def __post_init__(self) -> None:
+        frozen(*self.states, *self.probability)
+
+    @property
+    def dwell(self) -> tuple[float, float]:
+        """Mean dwell times in the slow and in the fast state, s."""
+        return self.dwell_slow.value, self.dwell_fast.value
+
+    @property
+    def two_states(self) -> bool:
+        """Whether two states are the better description of the steps (bic_gain > 0)."""
+        return self.bic_gain > 0
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the estimate for JSON."""
+        plain: dict[str, Any] = to_plain({name: getattr(self, name) for name in self.__dict__})
+        return plain
+
+    @classmethod
+    def from_dict(cls, entry: Mapping[str, Any]) -> SwitchingEstimate:
+        """Return the estimate that `to_dict` wrote."""
+        read = dict(entry)
+        for name in ("D_slow", "D_fast", "D_mean", "dwell_slow", "dwell_fast"):
+            read[name] = Parameter.from_dict(entry[name])
+        read["states"] = tuple(from_plain(row, dtype=np.int64) for row in entry["states"])
+        read["probability"] = tuple(from_plain(row) for row in entry["probability"])
+        return cls(**read)
+
+    def __str__(self) -> str:
+        name = "D_R" if self.unit == UNITS["rotation"] else "D_T"
+        number = "two states" if self.two_states else "one D suffices"
+        return (
+            f"{name} switches between {self.D_slow} and {self.D_fast}, mean dwell "
+            f"{self.dwell_slow} and {self.dwell_fast} [{number}, {self.n_frames} frames]"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class SwitchingSteps:
+    """The steps of one motion for a model of two states, in the order of time.
+
+    Given the states, step j of state i has variance 2 D_i tau + 2 o per axis and covariance -o with
+    the next: the noise o of a frame is shared by its two steps, o = weight theta + known - b D_slow.
+    With a stated exposure blur also takes 2 b (D_fast - D_slow) from the variance of a fast step.
+
+    Attributes
+    ----------
+    track : NoisySteps
+        Steps with what is known of their noise.
+    elapsed : ndarray, shape (S,)
+        Time from the beginning of the step before to that of each step, s; 0 for the first.
+    follows : ndarray of bool, shape (S,)
+        Whether a step begins with the frame in which the one before ended.
+    exposed : float
+        b = exposure dt/3 where the exposure is stated, else 0, s.
+    """
+
+    track: NoisySteps
+    elapsed: Floats
+    follows: Bools
+    exposed: float
+
+    @classmethod
+    def of(cls, track: NoisySteps, time: Floats, *, exposed: float) -> SwitchingSteps:
+        """Return the steps of a motion whose rows have these times (T,)."""
+        start = time[track.steps.start]
+        elapsed = np.diff(start, prepend=start[0])
+        return cls(track, elapsed, np.append(False, track.steps.linked[:-1]), exposed)
+
+    @cached_property
+    def free(self) -> bool:
+        """Whether the noise parameter theta is fitted."""
+        return not np.isinf(self.track.freedom)
+
+    def filtered(self, points: Floats) -> tuple[Floats, Floats]:
+        """Return the log-likelihood at several points, and the weights of all pairs of states.
+
+        Parameters
+        ----------
+        points : ndarray, shape (P, 5)
+            Logarithms of D_slow, D_fast, the rates of leaving the slow and the fast state (1/s),
+            and theta.
+
+        Returns
+        -------
+        value : ndarray, shape (P,)
+        pairs : ndarray, shape (S, P, 2, 2)
+            For every step, the probability of its state (last axis) and its density, given the
+            state before, relative to the largest of the four.
+
+        Notes
+        -----
+        Given a state sequence the noise of the last frame is normal, with a mean and a variance
+        that a Kalman filter carries from step to step. One such pair is kept for each of the two
+        present states: the four combinations of last and present state are merged to two with the
+        mean and variance of their mixture (second-order generalised pseudo-Bayes; Bar-Shalom and
+        Li, Estimation and Tracking, section 11.6). Without noise this is the exact hidden Markov
+        model; with equal D it is the exact Brownian likelihood.
+        """
+        s, track = self.track.steps, self.track
+        D, rate = np.exp(points[:, :2]), np.exp(points[:, 2:4])
+        theta = np.exp(points[:, 4]) if self.free else np.full(len(points), track.theta)
+        weight, known = track.weight, track.known
+        blurred = track.blur * D[:, :1]
+        before, after = (
+            np.maximum(theta[:, None] * weight[k][:, None] + known[k][:, None], 0.0) - blurred
+            for k in (0, 1)
+        )
+        spread = 2 * D * s.duration[:, None, None] - 2 * self.exposed * (D - D[:, :1])
+        change = rate / rate.sum(axis=1, keepdims=True)
+        change = change * -np.expm1(-rate.sum(axis=1)[:, None] * self.elapsed[:, None, None])
+        stay = 1 - change
+        transition = np.stack(
+            [
+                np.stack([stay[..., 0], change[..., 0]], axis=-1),
+                np.stack([change[..., 1], stay[..., 1]], axis=-1),
+            ],
+            axis=-2,
+        )
+        # Last and present state are the second and third axis of what follows.
+        spread, after = spread[:, :, None, :, None], after[:, :, None, None, :]
+        probability = rate[:, ::-1] / rate.sum(axis=1, keepdims=True)
+        mean = np.zeros((len(points), 2, 1, s.vectors.shape[1]))
+        variance = np.broadcast_to(before[0][:, None, None], mean.shape)
+        value, pairs = np.zeros(len(points)), np.empty_like(transition)
+        for j, y in enumerate(s.vectors):
+            if not self.follows[j]:
+                mean = np.zeros_like(mean)
+                variance = np.broadcast_to(before[j][:, None, None], mean.shape)
+            surprise = y + mean
+            total = np.maximum(spread[j] + variance + after[j], 1e-100)
+            gain = after[j] / total
+            log_density = -0.5 * np.sum(np.log(total) + surprise**2 / total, axis=-1)
+            top = log_density.max(axis=(1, 2), keepdims=True)
+            pairs[j] = transition[j] * np.exp(log_density - top)
+            joint = probability[:, :, None] * pairs[j] + 1e-300
+            both = joint.sum(axis=1)
+            sum_of_all = both.sum(axis=1)
+            value += top[:, 0, 0] + np.log(sum_of_all)
+            probability = both / sum_of_all[:, None]
+            share = (joint / both[:, None])[..., None]
+            means = gain * surprise
+            mean = np.sum(share * means, axis=1)
+            variances = after[j] * (1 - gain) + (means - mean[:, None]) ** 2
+            mean, variance = mean[:, :, None], np.sum(share * variances, axis=1)[:, :, None]
+        if self.free and track.freedom:
+            value -= 0.5 * track.freedom * (np.log(theta) + track.theta / theta)
+        return value, pairs
+
+    def expansion(self, point: Floats) -> tuple[float, Floats, Floats]:
+        """Return the log-likelihood at a point (5,) with its slopes (5,) and curvatures (5, 5)."""
+        unit = _DIFFERENCE * np.eye(5)
+        first, second = np.triu_indices(5, k=1)
+        across = unit[first] + unit[second]
+        offsets = np.concatenate([np.zeros((1, 5)), unit, -unit, across, -across])
+        value = self.filtered(point + offsets)[0]
+        center, up, down = value[0], value[1:6], value[6:11]
+        bent = up + down - 2 * center
+        curvature = np.diag(bent)
+        both = 0.5 * (value[11:21] + value[21:31] - 2 * center - bent[first] - bent[second])
+        curvature[first, second] = curvature[second, first] = both
+        return float(center), (up - down) / (2 * _DIFFERENCE), curvature / _DIFFERENCE**2
+
+    def fast_probability(self, point: Floats) -> Floats:
+        """Return the probability of the fast state of every step, given all steps, (S,)."""
+        rate = np.exp(point[2:4])
+        forward, backward = rate[::-1] / rate.sum(), np.ones(2)
+        pairs = self.filtered(point[None])[1][:, 0]
+        seen = []
+        for pair in pairs:
+            forward = forward @ pair
+            forward = forward / forward.sum()
+            seen.append(forward)
+        fast = np.empty(len(pairs))
+        for j in range(len(pairs) - 1, -1, -1):
+            both = seen[j] * backward
+            fast[j] = both[1] / both.sum()
+            backward = pairs[j] @ backward
+            backward = backward / backward.sum()
+        return fast
+
+
+def fit_switching(
+    motion: RigidMotion | Sequence[RigidMotion],
+    *,
+    quantity: Quantity = "rotation",
+    noise: Literal["joint", "residual"] | float | Noise = "joint",
+    exposure: float | None = None,
+) -> SwitchingEstimate:
+    """Fit two diffusion coefficients between which a motion switches at random times.
+
+    Parameters
+    ----------
+    motion : RigidMotion or sequence of RigidMotion
+        Motion; several motions share the coefficients and rates, and each has its own noise.
+    quantity : {"rotation", "translation"}
+        Body-frame rotation vectors, or displacements of the centre.
+    noise : {"joint", "residual"}, float or Noise
+        As in `estimate_diffusion`; a `Noise` with drift is refused.
+    exposure : float, optional
+        Open fraction of dt, 0 to 1. Where it is unknown (None) the joint noise may be negative, but
+        is the same in both states, although motion blur is larger in the fast one.
+
+    Returns
+    -------
+    SwitchingEstimate
+
+    Raises
+    ------
+    TooFewFramesError
+        If there are fewer than 20 steps, or a motion has fewer than two.
+    ValueError
+        For unknown or inconsistent choices, all in one message; if motions of 2 and 3 dimensions
+        are given together; if nothing moves.
+
+    Notes
+    -----
+    A step has the state that the body has at its beginning; the state is a Markov process in
+    continuous time, so that a gap, or a cut, is a longer time in which it may change. The
+    likelihood contains the noise that neighbouring steps share, and is maximised by Newton's method
+    from the best point of a grid. Intervals come from its curvature in the logarithms of all
+    parameters, noise included. D is one number in each state: for an anisotropic body a mean over
+    axes.
+
+    Examples
+    --------
+    >>> from perrin import Cluster, Switching, simulate_motion
+    >>> truth = simulate_motion(
+    ...     Cluster.tetrahedron(1.5),
+    ...     D_R=1e-3,
+    ...     dt=1.0,
+    ...     n_frames=200,
+    ...     dynamics=Switching(10, dwell=20.0),
+    ...     rng=1,
+    ... )
+    >>> found = fit_switching(truth)
+    >>> found.two_states, found.D_slow.ci95[0] < 1e-3 * 2 / 11 < found.D_slow.ci95[1]
+    (True, True)
+    """
+    motions = [motion] if isinstance(motion, RigidMotion) else list(motion)
+    faults = [
+        *choice_fault("quantity", quantity, get_args(Quantity)),
+        *noise_faults(noise, exposure),
+    ]
+    if isinstance(noise, Noise) and noise.drift:
+        faults.append("noise: expected no drift; subtract a steady motion first")
+    if len({m.dimension for m in motions}) != 1:
+        faults.append("motion: expected one or more motions, all in 2 or all in 3 dimensions")
+    refuse(faults)
+    settings = Noise.of(noise, exposure=exposure)
+    tracks = [NoisySteps.of(s, settings) for s in pooled_steps(motions, quantity)]
+    count = sum(len(t.steps.duration) for t in tracks)
+    if count < _FEWEST_SWITCHING_STEPS:
+        raise TooFewFramesError(
+            f"{count} steps: two states need at least {_FEWEST_SWITCHING_STEPS}",
+            sum(m.fitted.size for m in motions),
+        )
+    likelihood = Likelihood.of(tracks)
+    one = likelihood.best()
+    if not one.D[0] > 0:
+        raise ValueError("motion: the steps are all noise, D = 0; two states cannot be told apart")
+    steps = [
+        SwitchingSteps.of(t, m.time, exposed=(settings.exposure or 0.0) * t.steps.dt / 3)
+        for t, m in zip(tracks, motions, strict=True)
+    ]
+    least = 1e-6 * likelihood.mean_square
+    shared, noises, value, covariance = _most_likely(
+        steps, float(one.D[0]), np.log(np.maximum(one.theta, least))
+    )
+    states, probability = [], []
+    for track, m, own in zip(steps, motions, noises, strict=True):
+        fast = np.full(len(m.time), np.nan)
+        fast[track.track.steps.stop] = track.fast_probability(np.append(shared, own))
+        probability.append(fast)
+        states.append(np.where(np.isnan(fast), -1, fast > 0.5).astype(np.int64))
+    gain = value - float(one.value[0])
+    errors = np.sqrt(np.diag(covariance)[:4])
+    D_slow, D_fast, leave_slow, leave_fast = np.exp(shared)
+    # D_mean = (k_fast D_slow + k_slow D_fast)/(k_slow + k_fast), and the slopes of its logarithm.
+    p_fast = leave_slow / (leave_slow + leave_fast)
+    mean = (1 - p_fast) * D_slow + p_fast * D_fast
+    tilt = p_fast * (1 - p_fast) * (D_fast - D_slow)
+    slopes = np.array([(1 - p_fast) * D_slow, p_fast * D_fast, tilt, -tilt]) / mean
+    mean_error = float(np.sqrt(slopes @ covariance[:4, :4] @ slopes))
+    unit = UNITS[quantity]
+    return SwitchingEstimate(
+        D_slow=Parameter.log_normal(D_slow, errors[0], unit),
+        D_fast=Parameter.log_normal(D_fast, errors[1], unit),
+        D_mean=Parameter.log_normal(mean, mean_error, unit),
+        dwell_slow=Parameter.log_normal(1 / leave_slow, errors[2], "s"),
+        dwell_fast=Parameter.log_normal(1 / leave_fast, errors[3], "s"),
+        states=tuple(states),
+        probability=tuple(probability),
+        log_likelihood_gain=gain,
+        bic_gain=gain - 0.5 * _MORE_PARAMETERS * float(np.log(count)),
+        n_frames=sum(m.fitted.size for m in motions),
+        unit=unit,
+    )
+
+
+def _most_likely(
+    steps: Sequence[SwitchingSteps], D: float, log_theta: Floats
+) -> tuple[Floats, Floats, float, Floats]:
+    """Return the most likely parameters: shared (4,), noise (G,), value, covariance.
+
+    `D` and `log_theta` (G,) are those of one D; the parameters are logarithms, and the covariance
+    is that of all of them, NaN where the data do not bound a parameter.
+    """
+    dt = float(np.median(np.concatenate([s.track.steps.duration for s in steps])))
+    grid = np.array(
+        [
+            (slow * D, fast * D, 1 / (dwell * dt), 1 / (dwell * dt), less)
+            for slow in _START_SLOW
+            for fast in _START_FAST
+            for dwell in _START_DWELL
+            for less in _START_NOISE
+        ]
+    )
+    moved = np.log(grid)
+    height = np.zeros(len(grid))
+    for track, own in zip(steps, log_theta, strict=True):
+        height += track.filtered(moved + np.array([0, 0, 0, 0, own]))[0]
+    best = moved[np.argmax(height)]
+    x = np.concatenate([best[:4], best[4] + log_theta])
+    longest = max(float(s.elapsed.sum()) for s in steps) + dt
+    slowest, quickest = np.log(0.1 / longest), np.log(3.0 / dt)
+    fixed = np.array([False] * 4 + [not s.free for s in steps])
+
+    def expanded(x: Floats) -> tuple[float, Floats, Floats]:
+        value, slope, curvature = 0.0, np.zeros(len(x)), np.zeros((len(x), len(x)))
+        for g, track in enumerate(steps):
+            rows = np.array([0, 1, 2, 3, 4 + g])
+            part = track.expansion(x[rows])
+            value += part[0]
+            slope[rows] += part[1]
+            curvature[np.ix_(rows, rows)] += part[2]
+        return value, np.where(fixed, 0.0, slope), curvature
+
+    here, damping = expanded(x), 1e-3
+    for _ in range(_NEWTON_ROUNDS):
+        value, slope, curvature = here
+        free = ~fixed
+        # A rate at the end of its range stays there unless the slope leads away from it.
+        free[2:4] &= ~((x[2:4] <= slowest) & (slope[2:4] < 0))
+        free[2:4] &= ~((x[2:4] >= quickest) & (slope[2:4] > 0))
+        kept = np.ix_(free, free)
+        scale = np.diag(np.abs(np.diag(curvature)[free]) + 1e-6)
+        values, axes = np.linalg.eigh(-curvature[kept] + damping * scale)
+        step = np.zeros(len(x))
+        step[free] = axes @ ((axes.T @ slope[free]) / np.maximum(np.abs(values), 1e-3))
+        step *= min(1.0, 1.0 / max(float(np.abs(step).max()), 1e-300))
+        trial = x + step
+        trial[2:4] = np.clip(trial[2:4], slowest, quickest)
+        there = expanded(trial) if trial[0] <= trial[1] else (-np.inf, slope, curvature)
+        if there[0] >= value:
+            gained = there[0] - value
+            x, here, damping = trial, there, damping / 10
+            if gained < 1e-8 and np.abs(step).max() < 1e-4:
+                break
+        else:
+            damping *= 10
+            if damping > 1e8:
+                break
+    information = -here[2][np.ix_(~fixed, ~fixed)]
+    covariance = np.zeros((len(x), len(x)))
+    try:
+        inverse = np.linalg.inv(information)
+    except np.linalg.LinAlgError:
+        inverse = np.full_like(information, np.nan)
+    inverse[np.diag(inverse) <= 0] = np.nan
+    covariance[np.ix_(~fixed, ~fixed)] = inverse
+    return x[:4], x[4:], here[0], covariance
