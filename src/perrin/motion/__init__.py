@@ -53,20 +53,11 @@ from perrin.motion.rigidity import (
     judge_quality,
     misplaced_detections,
 )
-from perrin.motion.rods import (
-    LABEL_LOG_ODDS,
-    LEAP_LABELLED,
-    LEAP_UNLABELLED,
-    SETTLED_LOG_ODDS,
-    RodMotion,
-    track_direction,
-)
+from perrin.motion.rods import LEAP_UNLABELLED, SETTLED_LOG_ODDS, RodMotion, track_direction
 from perrin.motion.simulate import add_noise, heat_kernel_angles, simulate_motion
 from perrin.motion.tracking import remove_rotation, template_motion, track_rotation
 
 __all__ = [
-    "LABEL_LOG_ODDS",
-    "LEAP_LABELLED",
     "LEAP_UNLABELLED",
     "SETTLED_LOG_ODDS",
     "AxisNoise",
