@@ -58,7 +58,7 @@ _FEWEST_ASYMPTOTIC_STEPS, _LEAST_INFORMATION = 200, 10.0
 
 # Draws: as many numbers as can be judged in 0.1 s, in these limits; below the rank of _TAIL_RANK
 # the p-value of the draws is continued in proportion to the approximate one.
-_DRAWN_NUMBERS, _FEWEST_DRAWS, _MOST_DRAWS, _TAIL_RANK = 150_000, 199, 999, 10
+_DRAWN_NUMBERS, _FEWEST_DRAWS, _MOST_DRAWS, _TAIL_RANK = 100_000, 199, 999, 10
 
 
 class Score(NamedTuple):
@@ -202,7 +202,7 @@ class AxisModel:
         near : AxisFit, optional
             A fit of one data set from which to start; then three iterations suffice.
         """
-        if self.even and np.ptp(self.known[0]) == 0:
+        if self.even and np.all(np.ptp(self.known[0], axis=1) == 0):
             return self._fit_modes(y, near)
         return self._fit_tridiagonal(y, near)
 
