@@ -2,7 +2,21 @@
 
 from perrin.diffusion.anomalous import AnomalousEstimate, fit_anomalous
 from perrin.diffusion.bounds import cramer_rao
-from perrin.diffusion.brownian_tests import (
+from perrin.diffusion.confined import ConfinedEstimate, cage_size, fit_confined
+from perrin.diffusion.curve_fits import (
+    GridLags,
+    best_window,
+    fit_gls,
+    fit_line,
+    gls_weights,
+    line_weights,
+    msd_covariance,
+    slope_interval,
+    weighted_variance,
+)
+from perrin.diffusion.estimate import DiffusionEstimate, Found, bare_text, value_text
+from perrin.diffusion.estimators import by_likelihood, estimate_diffusion, precision_limits
+from perrin.diffusion.goodness_of_fit import (
     AxisFit,
     AxisModel,
     BrownianTests,
@@ -19,20 +33,6 @@ from perrin.diffusion.brownian_tests import (
     tabulated_p,
     tabulated_statistics,
 )
-from perrin.diffusion.confined import ConfinedEstimate, cage_size, fit_confined
-from perrin.diffusion.curve_fits import (
-    GridLags,
-    best_window,
-    fit_gls,
-    fit_line,
-    gls_weights,
-    line_weights,
-    msd_covariance,
-    slope_interval,
-    weighted_variance,
-)
-from perrin.diffusion.estimate import DiffusionEstimate, Found, bare_text, value_text
-from perrin.diffusion.estimators import by_likelihood, estimate_diffusion, precision_limits
 from perrin.diffusion.likelihood import (
     Likelihood,
     ProfilePoint,

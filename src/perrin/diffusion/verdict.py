@@ -11,7 +11,7 @@ import numpy as np
 from perrin._arrays import choice_fault, refuse, to_plain
 from perrin._text import frames_text, number_text
 from perrin.diffusion.anomalous import AnomalousEstimate, fit_anomalous
-from perrin.diffusion.brownian_tests import (
+from perrin.diffusion.goodness_of_fit import (
     BrownianTests,
     Score,
     axis_model,
