@@ -248,51 +248,73 @@ class AxisModel:
         return AxisFit(y, D, D * tau * np.expm1(v) / 2 - noise)
 
     def _fit_tridiagonal(self, y: Floats, near: AxisFit | None) -> AxisFit:
-        """Fit any steps by scoring, with the information of even steps of the mean duration."""
-        from scipy.linalg.lapack import dpttrf, dpttrs
+        """Fit any steps by Newton steps on the score in ln D and v.
 
+        The curvature is that of even steps of the mean duration (scoring); the fit of one data set
+        takes its own curvature from differences of the score, where it has a maximum.
+        """
         tau, shape = self.tau.mean(), y.shape[:2]
+        single = near is None
         if near is None:
-            start = self.with_equal_noise()
-            modes = replace(
-                start, tau=np.full(self.n_steps, tau), linked=np.ones(self.n_steps, bool)
-            )
+            even = np.ones(self.n_steps, dtype=np.bool_)
+            modes = replace(self.with_equal_noise(), tau=np.full(self.n_steps, tau), linked=even)
             near = modes._fit_modes(y, None)
-        D = np.array(np.broadcast_to(near.D, shape))
-        v = np.array(self.ratio(D, np.broadcast_to(near.offset, shape)))
-        starts = np.arange(0, y.size, self.n_steps)
-        for _ in range(60 if near.y is y else 4):
-            offset = D * tau * np.expm1(v) / 2 if self.free else np.zeros_like(D)
-            a, b = self.bands(D, offset)
-            d, lower, _ = dpttrf(a, b)
-            up = dpttrf(a[::-1], b[::-1])[0]
-            z = dpttrs(d, lower, y.reshape(-1, 1))[0][:, 0]
-            inverse = 1 / (d + up[::-1] - a)
-            corner = -lower * inverse[1:]
-            linked = np.tile(np.append(self.linked[:-1], False), len(starts))
-            excess, cross = z * z - inverse, np.append((z[:-1] * z[1:] - corner), 0.0) * linked
-            # Slopes of the log-likelihood in D and in the offset.
-            taus = np.tile(self.tau, len(starts))
-            in_D = np.add.reduceat((taus - self.blur) * excess + self.blur * cross, starts)
-            in_o = np.add.reduceat(excess - cross, starts)
-            in_D, in_o = in_D.reshape(shape), in_o.reshape(shape)
+        t = np.stack([np.log(near.D), self.ratio(near.D, near.offset)], axis=-1)
+        t = np.array(np.broadcast_to(t, (*shape, 2)))[..., : 1 + self.free]
+
+        def parameters(t: Floats) -> tuple[Floats, Floats]:
+            D = np.exp(t[..., 0])
+            return D, D * tau * np.expm1(t[..., 1]) / 2 if self.free else np.zeros_like(D)
+
+        for _ in range(40 if single else 4):
+            D, offset = parameters(t)
+            score = self._score(y, D, offset)
             by_D, by_offset = self.slopes(D, offset)
+            g = by_D[..., None, :]
             if self.free:
-                share = tau * np.expm1(v) / 2
-                dv = tau * np.exp(v) / 2
-                g = np.stack([by_D + share[..., None] * by_offset, dv[..., None] * by_offset], -2)
-                score = np.stack([D * in_D + share * D * in_o, D * dv * in_o], axis=-1)
-                matrix = 0.5 * np.einsum("...ik,...jk->...ij", g, g)
-                move = np.linalg.solve(matrix, score[..., None])[..., 0]
-                move = np.clip(move, -1.0, 1.0)
-                v = np.clip(v + move[..., 1], _LEAST_V, _MOST_V)
-            else:
-                move = np.clip(D * in_D / (0.5 * np.sum(by_D**2, axis=-1)), -1, 1)[..., None]
-            D = D * np.exp(move[..., 0])
+                ratio = np.exp(t[..., 1])[..., None]
+                by_v = tau / 2 * ratio * by_offset
+                g = np.stack([by_D + tau / 2 * (ratio - 1) * by_offset, by_v], axis=-2)
+            matrix = 0.5 * np.einsum("...ik,...jk->...ij", g, g)
+            if single:
+                own = np.empty_like(matrix)
+                for k in range(t.shape[-1]):
+                    ahead = t.copy()
+                    ahead[..., k] += 1e-5
+                    own[..., k] = (score - self._score(y, *parameters(ahead))) / 1e-5
+                own = 0.5 * (own + np.swapaxes(own, -1, -2))
+                peaked = np.linalg.eigvalsh(own)[..., 0] > 0
+                matrix = np.where(peaked[..., None, None], own, matrix)
+            move = np.clip(np.linalg.solve(matrix, score[..., None])[..., 0], -0.5, 0.5)
+            t = t + move
+            if self.free:
+                t[..., 1] = np.clip(t[..., 1], _LEAST_V, _MOST_V)
             if np.all(np.abs(move) < 1e-9):
                 break
-        offset = D * tau * np.expm1(v) / 2 if self.free else np.zeros_like(D)
-        return AxisFit(y, D, offset)
+        return AxisFit(y, *parameters(t))
+
+    def _score(self, y: Floats, D: Floats, offset: Floats) -> Floats:
+        """Return the slopes of the log-likelihood in ln D and, where it is free, in v, (B, A, f)."""
+        from scipy.linalg.lapack import dpttrf, dpttrs
+
+        shape = y.shape[:2]
+        a, b = self.bands(D, offset)
+        d, lower, _ = dpttrf(a, b)
+        up = dpttrf(a[::-1], b[::-1])[0]
+        z = dpttrs(d, lower, y.reshape(-1, 1))[0][:, 0]
+        inverse = 1 / (d + up[::-1] - a)
+        starts = np.arange(0, y.size, self.n_steps)
+        linked = np.tile(np.append(self.linked[:-1], False), len(starts))
+        excess = z * z - inverse
+        cross = np.append(z[:-1] * z[1:] + lower * inverse[1:], 0.0) * linked
+        taus = np.tile(self.tau, len(starts))
+        in_D = np.add.reduceat((taus - self.blur) * excess + self.blur * cross, starts)
+        in_o = np.add.reduceat(excess - cross, starts)
+        in_D, in_o = D * in_D.reshape(shape), in_o.reshape(shape)
+        if not self.free:
+            return np.asarray(in_D[..., None])
+        half = D * self.tau.mean() / 2
+        return np.stack([in_D + offset * in_o, (half + offset) * in_o], axis=-1)
 
     def draws(self, fit: AxisFit, *, count: int, rng: np.random.Generator) -> Floats:
         """Return steps of Brownian motion with the D and the offset of one fit, (count, A, N)."""

@@ -450,7 +450,10 @@ def _period(tested: Sequence[BrownianTests]) -> float:
     peaks = []
     for one in tested:
         modes = np.sum(one.model.mode_ratios(one.fit), axis=1)[0]
-        k = int(np.argmax(modes)) + 1
+        # A vibration of any phase spreads over neighbouring sine modes: their centre of power.
+        largest = int(np.argmax(modes))
+        around = np.arange(max(0, largest - 2), min(len(modes), largest + 3))
+        k = 1 + float(np.average(around, weights=modes[around]))
         period = 2 * (one.model.n_steps + 1) * float(one.model.tau.mean()) / k
         peaks.append((float(largest_share(modes, one.fit.D.shape[1])), period))
     return max(peaks)[1]
