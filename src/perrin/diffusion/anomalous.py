@@ -18,7 +18,6 @@ if TYPE_CHECKING:
 
     from perrin._arrays import Floats
     from perrin.diffusion.noise_model import Noise
-    from perrin.diffusion.spectral_likelihood import MeanSquare
     from perrin.motion.rigid_motion import RigidMotion
 
 # Trial exponents; their distance is below the width of a maximum.
@@ -172,11 +171,8 @@ def fit_anomalous(
     """
     motions, settings = motions_and_noise(motion, quantity, noise, exposure)
 
-    def fractional(open_fraction: float) -> MeanSquare:
-        def mean_square(lag: Floats, alpha: float) -> Floats:
-            return fractional_mean_square(lag, alpha, exposure=open_fraction)
-
-        return mean_square
+    def mean_square(lag: Floats, shape: float) -> Floats:
+        return fractional_mean_square(lag, shape, exposure=settings.exposure or 0.0)
 
     frames: list[Literal["body", "lab"]] = ["lab" if quantity == "translation" else "body"]
     tracks = [[principal_steps(m, quantity) for m in motions]]
@@ -184,7 +180,7 @@ def fit_anomalous(
     if quantity == "rotation" and motions[0].dimension == 3 and turns > _SMALL_TURN:
         frames.append("lab")
         tracks.append([principal_steps(m, quantity, frame="lab") for m in motions])
-    choices = [ShapeLikelihood.of(steps, settings, fractional) for steps in tracks]
+    choices = [ShapeLikelihood.of(steps, settings, mean_square) for steps in tracks]
     found = [likelihood.best(_EXPONENTS) for likelihood in choices]
     brownian = max(likelihood.at(1.0).value for likelihood in choices)
     i = max(range(len(found)), key=lambda i: found[i][0].value)

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from perrin._arrays import Floats
     from perrin.diffusion.noise_model import Noise
-    from perrin.diffusion.spectral_likelihood import MeanSquare, ShapePoint
+    from perrin.diffusion.spectral_likelihood import ShapePoint
     from perrin.motion.rigid_motion import RigidMotion
 
 # Trial rates: from this share of one over the length of the track to this rate per frame, in about
@@ -187,11 +187,8 @@ def fit_confined(
     """
     motions, settings = motions_and_noise(motion, quantity, noise, exposure)
 
-    def confined(open_fraction: float) -> MeanSquare:
-        def mean_square(lag: Floats, log_rate: float) -> Floats:
-            return confined_mean_square(lag, np.exp(log_rate), exposure=open_fraction)
-
-        return mean_square
+    def mean_square(lag: Floats, shape: float) -> Floats:
+        return confined_mean_square(lag, np.exp(shape), exposure=settings.exposure or 0.0)
 
     frame: Literal["mean", "body", "lab"] = "lab"
     if quantity == "rotation":
@@ -202,30 +199,29 @@ def fit_confined(
     tracks = [
         principal_steps(m, quantity, frame="body" if frame == "lab" else frame) for m in motions
     ]
-    likelihood = ShapeLikelihood.of(tracks, settings, confined)
-    ends = np.log([_LEAST_LENGTHS / likelihood.longest, _MOST_RATE])
-    count = 1 + int(np.ceil(np.ptp(ends) / _LOG_DISTANCE))
-    best, points = likelihood.best(np.linspace(*ends, count))
+    likelihood = ShapeLikelihood.of(tracks, settings, mean_square)
+    slowest, fastest = np.log(_LEAST_LENGTHS / likelihood.longest), np.log(_MOST_RATE)
+    count = 1 + int(np.ceil((fastest - slowest) / _LOG_DISTANCE))
+    best, points = likelihood.best(np.linspace(slowest, fastest, count))
     free = likelihood.at(-np.inf)
     gain = max(best.value - free.value, 0.0)
     best = best if best.value > free.value else free
-    points = [free, *points]
     dt = float(np.mean([m.dt for m in motions]))
     rate = float(np.exp(best.shape))
     seen = likelihood.n_steps * rate >= _LEAST_RELAXATIONS
     times, cages, coefficients = {}, {}, {}
     for level, (low, high) in likelihood.intervals(best, points).items():
-        low = low or free if seen else free
+        low = low if seen and low else free
         times[level] = (
             dt * float(np.exp(-high.shape)) if high else 0.0,
             dt * float(np.exp(-low.shape)),
         )
         half = NORMAL[level] * np.sqrt(best.variance)
-        fastest = high or points[-1]
+        last = high or points[-1]
         cages[level] = _joined(
-            (cage_size(fastest) if high else 0.0, cage_size(best), cage_size(low)), 0.5 * half
+            (cage_size(last) if high else 0.0, cage_size(best), cage_size(low)), 0.5 * half
         )
-        along = sorted(point.D for point in (low, best, fastest))
+        along = sorted(point.D for point in (low, best, last))
         coefficients[level] = _joined((along[0] / dt, best.D / dt, along[2] / dt), half)
     limits = []
     if rate >= 1:
