@@ -108,7 +108,9 @@ class Table:
 
 def fractional_rows(table, tracks, rng):
     """Print the table of exponents."""
-    print("| alpha | N | SNR | exposure | bias | sd | bound | efficiency | 95 % | 68 % | MSD 68 % |")
+    print(
+        "| alpha | N | SNR | exposure | bias | sd | bound | efficiency | 95 % | 68 % | MSD 68 % |"
+    )
     print("|---|---|---|---|---|---|---|---|---|---|---|")
     for alpha, n, snr, exposure in FRACTIONAL:
         open_fraction = exposure or 0.0

@@ -11,7 +11,7 @@ from perrin._arrays import to_plain
 from perrin._text import with_error
 from perrin.diffusion.spectral_likelihood import ShapeLikelihood, motions_and_noise
 from perrin.diffusion.step_spectra import fractional_mean_square
-from perrin.diffusion.steps import Quantity, principal_steps
+from perrin.diffusion.steps import Quantity, pooled_steps, principal_steps
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -175,7 +175,7 @@ def fit_anomalous(
         return fractional_mean_square(lag, shape, exposure=settings.exposure or 0.0)
 
     frames: list[Literal["body", "lab"]] = ["lab" if quantity == "translation" else "body"]
-    tracks = [[principal_steps(m, quantity) for m in motions]]
+    tracks = [pooled_steps(motions, quantity, along=principal_steps)]
     turns = max(float(np.sqrt(np.mean(s.vectors**2))) for s in tracks[0])
     if quantity == "rotation" and motions[0].dimension == 3 and turns > _SMALL_TURN:
         frames.append("lab")

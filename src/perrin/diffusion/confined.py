@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -12,7 +13,12 @@ from perrin._text import interval_text, with_error
 from perrin.diffusion.estimate import NORMAL, UNITS
 from perrin.diffusion.spectral_likelihood import ShapeLikelihood, motions_and_noise
 from perrin.diffusion.step_spectra import confined_mean_square
-from perrin.diffusion.steps import Quantity, orientation_about_mean, principal_steps
+from perrin.diffusion.steps import (
+    Quantity,
+    orientation_about_mean,
+    pooled_steps,
+    principal_steps,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -196,9 +202,8 @@ def fit_confined(
         if motions[0].dimension == 3:
             rms = [np.sqrt(np.nanmean(orientation_about_mean(m) ** 2)) for m in motions]
             frame = "mean" if max(rms) <= _SMALL_CAGE else "body"
-    tracks = [
-        principal_steps(m, quantity, frame="body" if frame == "lab" else frame) for m in motions
-    ]
+    about: Literal["body", "mean"] = "mean" if frame == "mean" else "body"
+    tracks = pooled_steps(motions, quantity, along=partial(principal_steps, frame=about))
     likelihood = ShapeLikelihood.of(tracks, settings, mean_square)
     slowest, fastest = np.log(_LEAST_LENGTHS / likelihood.longest), np.log(_MOST_RATE)
     count = 1 + int(np.ceil((fastest - slowest) / _LOG_DISTANCE))

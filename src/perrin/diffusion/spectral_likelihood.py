@@ -21,7 +21,7 @@ from perrin.diffusion.likelihood import newton_crossing
 from perrin.diffusion.noise_model import Noise, noise_faults
 from perrin.diffusion.step_kernels import difference_eigenvalues
 from perrin.diffusion.step_spectra import sine_spectrum, step_autocovariance, step_covariance
-from perrin.diffusion.steps import Quantity, pooled_steps
+from perrin.diffusion.steps import Quantity
 from perrin.motion.rigid_motion import RigidMotion
 
 if TYPE_CHECKING:
@@ -214,14 +214,16 @@ class ShapeLikelihood:
         value = slope = D = offset = variance = 0.0
         for blocks, known in zip(self.motions, self.known, strict=True):
             modes = [step_modes(block, self.mean_square, shape) for block in blocks]
-            parts = [np.concatenate(x, axis=-1) for x in list(zip(*modes, strict=True))[:3]]
+            values = np.concatenate([m.values for m in modes], axis=1)
+            spectrum, noise = (np.concatenate([m[i] for m in modes]) for i in (1, 2))
             if known is None:
-                fit = fit_scales(*parts, least_offset=0.0 if self.blurred else None)
+                least = 0.0 if self.blurred else None
+                fit = fit_scales(values, spectrum, noise, least_offset=least)
             else:
-                fit = fit_scales_known_noise(*parts, known)
+                fit = fit_scales_known_noise(values, spectrum, noise, known)
             value += float(fit.value.sum())
             slope += sum(shape_slope(one, fit) for one in modes)
-            weight = parts[0].shape[1] / self.n_steps / self.n_axes
+            weight = len(spectrum) / self.n_steps / self.n_axes
             D += weight * float(fit.D.sum())
             offset += weight * float(fit.offset.sum())
             variance += weight**2 * float(np.sum(fit.D**2 * fit.variance))
@@ -467,7 +469,7 @@ def highest_maxima(
         # The error of the next Newton step is of the order of the square of this.
         if moved < 1e-6:
             break
-    return x
+    return np.asarray(x)
 
 
 def fit_scales_known_noise(
@@ -534,8 +536,6 @@ def motions_and_noise(
 
     Raises
     ------
-    TooFewFramesError
-        If a motion has fewer than two steps.
     ValueError
         For unknown or inconsistent choices, or motions of 2 and 3 dimensions together.
 
@@ -557,5 +557,4 @@ def motions_and_noise(
     if len({m.dimension for m in motions}) != 1:
         faults.append("motion: expected one or more motions, all in 2 or all in 3 dimensions")
     refuse(faults)
-    pooled_steps(motions, quantity)
     return motions, Noise.of(noise, exposure=exposure)
