@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from perrin.motion.rigid_motion import RigidMotion
 
 # Trial exponents; their distance is below the width of a maximum.
-_EXPONENTS = np.linspace(0.02, 1.98, 16)
+_EXPONENTS = np.linspace(0.02, 1.98, 9)
 
 # Above this rms turn of one axis per frame, rad, memory in the lab and in the body are different.
 _SMALL_TURN = 0.1

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 # Trial rates: from this share of one over the length of the track to this rate per frame, in about
 # this distance of their logarithms.
-_LEAST_LENGTHS, _MOST_RATE, _LOG_DISTANCE = 0.05, 10.0, 0.7
+_LEAST_LENGTHS, _MOST_RATE, _LOG_DISTANCE = 0.05, 10.0, 1.2
 
 # Relaxation times that a track must last for a closed interval of the cage.
 _LEAST_RELAXATIONS = 6.0

@@ -17,7 +17,6 @@ import numpy as np
 
 from perrin._arrays import choice_fault, refuse
 from perrin.diffusion.estimate import CHI2
-from perrin.diffusion.likelihood import newton_crossing
 from perrin.diffusion.noise_model import Noise, noise_faults
 from perrin.diffusion.step_kernels import difference_eigenvalues
 from perrin.diffusion.step_spectra import sine_spectrum, step_autocovariance, step_covariance
@@ -55,6 +54,9 @@ _SHAPE_STEP = 1e-4
 
 # The maximum is found to this difference of the shape parameter.
 _SHAPE_TOLERANCE = 1e-9
+
+# The ends of an interval are found to this share of a standard error.
+_ROOT_TOLERANCE = 1e-8
 
 
 class StepBlock(NamedTuple):
@@ -285,16 +287,19 @@ class ShapeLikelihood:
                 continue
             inside, outside = outward[last], outward[last + 1]
 
-            def height(
-                x: float, origin: float = inside.shape, side: int = side
-            ) -> tuple[float, float]:
-                point = self.at(origin + side * (x - 1))
-                return bound - root(point), side * point.slope / root(point)
-
-            reach = abs(outside.shape - inside.shape)
+            low, high = inside.shape, outside.shape
             share = (bound - root(inside)) / (root(outside) - root(inside))
-            x = newton_crossing(height, inside=1.0, start=1 + share * reach, outside=1 + reach)
-            ends.append(self.at(inside.shape + side * (x - 1)))
+            point = self.at(low + share * (high - low))
+            for _ in range(60):
+                rest = bound - root(point)
+                if abs(rest) <= _ROOT_TOLERANCE:
+                    break
+                low, high = (point.shape, high) if rest > 0 else (low, point.shape)
+                # The slope of the root is minus that of the value over the root.
+                step = -rest * root(point) / point.slope if point.slope else np.inf
+                within = min(low, high) < point.shape + step < max(low, high)
+                point = self.at(point.shape + step if within else 0.5 * (low + high))
+            ends.append(point)
         return ends[0], ends[1]
 
     def intervals(
