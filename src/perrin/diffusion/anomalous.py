@@ -112,10 +112,13 @@ class AnomalousEstimate:
 
     def __str__(self) -> str:
         length = self.unit.partition("/")[0]
+        tail = f"[{self.n_frames} frames]"
+        if self.ci95 == (0.0, 2.0):
+            return f"alpha: not bounded {tail}"
         msd = with_error(self.msd_at_best_lag, self.msd_at_best_lag_stderr)
         return (
             f"alpha = {with_error(self.alpha, self.stderr)}, MSD({self.best_lag:.3g} s) = {msd} "
-            f"{length} [{self.n_frames} frames]"
+            f"{length} {tail}"
         )
 
 

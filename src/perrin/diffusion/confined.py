@@ -32,11 +32,15 @@ if TYPE_CHECKING:
 # this distance of their logarithms.
 _LEAST_LENGTHS, _MOST_RATE, _LOG_DISTANCE = 0.05, 10.0, 1.2
 
+# A rate of this over the length of the track is free diffusion.
+_NO_RATE = 1e-9
+
 # Relaxation times that a track must last for a closed interval of the cage.
 _LEAST_RELAXATIONS = 6.0
 
-# Up to this rms angle about the mean orientation, rad, rotation vectors are taken from it.
-_SMALL_CAGE = 0.5
+# Up to this rms angle about the mean orientation, rad, rotation vectors are taken from it: cages
+# come back within 5 %, with added body steps 43 % too large at 0.5 rad and 86 % at 0.7 rad.
+_SMALL_CAGE = 0.7
 
 
 @dataclass(frozen=True)
@@ -182,7 +186,7 @@ def fit_confined(
     displacement 2 D (1 - exp(-k t))/k (Uhlenbeck and Ornstein 1930). The likelihood of the sine
     modes of the steps is maximised over k, and over D and the noise of each axis. A cage is found
     where the track lasts about six relaxation times or more. A rotation is taken as the vector from
-    the mean orientation while its rms is under 0.5 rad along each axis.
+    the mean orientation while its rms is under 0.7 rad along each axis.
 
     Examples
     --------
@@ -208,14 +212,17 @@ def fit_confined(
     slowest, fastest = np.log(_LEAST_LENGTHS / likelihood.longest), np.log(_MOST_RATE)
     count = 1 + int(np.ceil((fastest - slowest) / _LOG_DISTANCE))
     best, points = likelihood.best(np.linspace(slowest, fastest, count))
-    free = likelihood.at(-np.inf)
+    free = likelihood.at(float(np.log(_NO_RATE / likelihood.longest)))
     gain = max(best.value - free.value, 0.0)
-    best = best if best.value > free.value else free
+    best = best if gain > 0 else free
+    intervals = likelihood.intervals(best, points)
+    free = free._replace(shape=-np.inf)
+    best = best if gain > 0 else free
     dt = float(np.mean([m.dt for m in motions]))
     rate = float(np.exp(best.shape))
     seen = likelihood.n_steps * rate >= _LEAST_RELAXATIONS
     times, cages, coefficients = {}, {}, {}
-    for level, (low, high) in likelihood.intervals(best, points).items():
+    for level, (low, high) in intervals.items():
         low = low if seen and low else free
         times[level] = (
             dt * float(np.exp(-high.shape)) if high else 0.0,
@@ -279,7 +286,8 @@ def _joined(ends: tuple[float, float, float], half_width: float) -> tuple[float,
     low, value, high = ends
     below = np.hypot(np.log(value / low), half_width) if 0 < low < value < np.inf else half_width
     above = np.hypot(np.log(high / value), half_width) if value < high < np.inf else half_width
-    return (
-        float((value if np.isfinite(value) else low) * np.exp(-below)) if low > 0 else 0.0,
-        float(value * np.exp(above)) if np.isfinite(high) else np.inf,
-    )
+    with np.errstate(over="ignore"):
+        return (
+            float((value if np.isfinite(value) else low) * np.exp(-below)) if low > 0 else 0.0,
+            float(value * np.exp(above)) if np.isfinite(high) else np.inf,
+        )
