@@ -15,7 +15,7 @@ from perrin.geometry.rotations import exp_map, log_map, successive_product
 from perrin.geometry.wahba import svd_rotation
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from perrin._arrays import Bools, Floats, Ints
     from perrin.diffusion.noise_model import Noise
@@ -280,8 +280,20 @@ def steps_of(motion: RigidMotion, quantity: Quantity) -> Steps:
     )
 
 
-def pooled_steps(motions: Sequence[RigidMotion], quantity: Quantity) -> list[Steps]:
+def pooled_steps(
+    motions: Sequence[RigidMotion],
+    quantity: Quantity,
+    *,
+    along: Callable[[RigidMotion, Quantity], Steps] = steps_of,
+) -> list[Steps]:
     """Return the steps of every motion; an error names the motion where there are several.
+
+    Parameters
+    ----------
+    motions : sequence of RigidMotion
+    quantity : {"rotation", "translation"}
+    along : callable
+        Function that returns the steps of one motion, which chooses their axes.
 
     Examples
     --------
@@ -293,7 +305,7 @@ def pooled_steps(motions: Sequence[RigidMotion], quantity: Quantity) -> list[Ste
     steps = []
     for number, motion in enumerate(motions):
         try:
-            steps.append(steps_of(motion, quantity))
+            steps.append(along(motion, quantity))
         except TooFewFramesError as error:
             if len(motions) == 1:
                 raise
