@@ -203,14 +203,18 @@ class SwitchingEstimate:
 class SwitchingSteps:
     """The steps of one motion for a model of two states, in the order of time.
 
-    Given the states, step j of state i has variance 2 D_i tau + 2 o per axis and covariance -o with
-    the next, which shares the noise o = weight theta + known - b D_slow of the frame between them.
-    With a stated exposure blur also takes 2 b (D_fast - D_slow) from the variance of a fast step.
+    Given the states, a step is y = w + n_after - n_before: the displacement w of the body, of
+    variance 2 D tau per axis, and the errors n of its two frames, which it shares with its
+    neighbours. An error is localisation of variance s, and the distance from the body to the mean
+    place of the body during the exposure, f dt, that ends at the frame: the error has the variance
+    s + 2 b D with b = f dt/3, w + n_after the variance 2 D tau - 4 b D + s, and their covariance is
+    s - b D (Berglund 2010, for each D). Where the exposure is unknown, s - b D is one number o.
 
     Attributes
     ----------
     track : NoisySteps
-        Steps with what is known of their noise.
+        Steps with what is known of their noise: s or o is weight theta + known, less blur D_slow
+        where the exposure is unknown.
     elapsed : ndarray, shape (S,)
         Time from the beginning of the step before to that of each step, s; 0 for the first.
     follows : ndarray of bool, shape (S,)
@@ -272,14 +276,16 @@ class SwitchingSteps:
         firsts, first_axes = np.cumsum([0, *sizes[:-1]]), [axes[0] for axes in groups]
         group_of = np.repeat(np.arange(len(groups)), sizes) if len(groups) > 1 else slice(None)
         count = sizes[:, None, None].astype(np.float64)
+        common_blur = track.blur - self.exposed
         # Axes: steps, groups of axes, state before, state, points.
         D, rate = np.exp(points[:, :2].T), np.exp(points[:, 2:4].T)
         theta = np.exp(points[:, 4]) if self.free else np.full(len(points), track.theta)
         before, after = (
-            theta * weight[:, first_axes, None] + known[:, first_axes, None] - track.blur * D[0]
+            theta * weight[:, first_axes, None] + known[:, first_axes, None] - common_blur * D[0]
             for weight, known in zip(track.weight, track.known, strict=True)
         )
-        spread = 2 * D * s.duration[:, None, None] - 2 * self.exposed * (D - D[0])
+        blur = self.exposed * D
+        spread = 2 * D * s.duration[:, None, None] - 4 * blur
         leaving = rate / rate.sum(axis=0)
         leaving = leaving * -np.expm1(-rate.sum(axis=0) * self.elapsed[:, None, None])
         (to_fast, to_slow), (slow, fast) = leaving.swapaxes(0, 1), (1 - leaving).swapaxes(0, 1)
@@ -289,7 +295,7 @@ class SwitchingSteps:
         tops, totals, pairs = np.empty((len(s.vectors), len(points))), [], transition
         for j, y in enumerate(s.vectors[:, order, None, None]):
             if not self.follows[j]:
-                mean, variance = still, np.repeat(before[j][:, None], 2, axis=1)
+                mean, variance = still, before[j][:, None] + 2 * blur
             noise = after[j][:, None, None]
             surprise = y + mean
             square = np.add.reduceat(surprise * surprise, firsts, axis=0)
@@ -302,12 +308,14 @@ class SwitchingSteps:
             both = joint[0] + joint[1]
             totals.append(both[0] + both[1])
             probability = both / totals[-1]
-            gain = noise / total
+            shared = noise - blur
+            gain = shared / total
             share = joint / both * gain
             mean = np.add.reduce(share[group_of] * surprise[:, :, None], axis=1)
             second = np.add.reduce(share * gain * square[:, :, None], axis=1)
             second -= np.add.reduceat(mean * mean, firsts, axis=0)
-            variance = noise[:, 0] * (1 - np.add.reduce(share, axis=1)) + second / count
+            variance = noise[:, 0] + 2 * blur - shared[:, 0] * np.add.reduce(share, axis=1)
+            variance += second / count
         value = np.sum(tops, axis=0) + np.sum(np.log(totals), axis=0)
         if self.free and track.freedom:
             value -= 0.5 * track.freedom * (np.log(theta) + track.theta / theta)
@@ -364,8 +372,9 @@ def fit_switching(
     noise : {"joint", "residual"}, float or Noise
         As in `estimate_diffusion`; a `Noise` with drift is refused.
     exposure : float, optional
-        Open fraction of dt, 0 to 1. Where it is unknown (None) the joint noise may be negative, but
-        is the same in both states, although motion blur is larger in the fast one.
+        Open fraction f of dt, 0 to 1. Where it is unknown (None) the joint noise may be negative,
+        but is the same in both states. Motion blur is larger in the fast one: D_fast then is low by
+        the fraction f/3 (1 - D_slow/D_fast), so state the exposure of a long one.
 
     Returns
     -------
