@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
@@ -176,7 +176,7 @@ class SwitchingEstimate:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the estimate for JSON."""
-        plain: dict[str, Any] = to_plain({name: getattr(self, name) for name in self.__dict__})
+        plain: dict[str, Any] = to_plain({f.name: getattr(self, f.name) for f in fields(self)})
         return plain
 
     @classmethod
