@@ -42,6 +42,12 @@ from perrin.diffusion.step_kernels import (
     difference_eigenvalues,
     equal_columns,
 )
+from perrin.diffusion.step_spectra import (
+    confined_autocovariance,
+    fractional_autocovariance,
+    fractional_slope,
+    sine_spectrum,
+)
 from perrin.diffusion.step_tests import (
     JUMP_LEVEL,
     Jumps,
@@ -62,6 +68,7 @@ from perrin.diffusion.steps import (
     center_steps,
     direction_steps,
     pooled_steps,
+    principal_steps,
     residual_freedom,
     steps_of,
     unit_center_variance,
@@ -144,6 +151,7 @@ __all__ = [
     "body_steps",
     "by_likelihood",
     "center_steps",
+    "confined_autocovariance",
     "coupled_tensor",
     "covariance_bands",
     "covariance_estimate",
@@ -161,6 +169,8 @@ __all__ = [
     "fit_gls",
     "fit_line",
     "fit_switching",
+    "fractional_autocovariance",
+    "fractional_slope",
     "gls_weights",
     "identity_limits",
     "imposed_symmetry",
@@ -179,8 +189,10 @@ __all__ = [
     "plan_sampling",
     "pooled_steps",
     "precision_limits",
+    "principal_steps",
     "residual_freedom",
     "secant_trial",
+    "sine_spectrum",
     "slope_interval",
     "spread",
     "squares",

@@ -299,6 +299,45 @@ def pooled_steps(motions: Sequence[RigidMotion], quantity: Quantity) -> list[Ste
     return steps
 
 
+def principal_steps(motion: RigidMotion, quantity: Quantity) -> Steps:
+    """Return the steps along axes in which the diffusion is diagonal, with the noise along them.
+
+    The steps of a rotation are turned into the eigenvectors of the noise-corrected tensor
+    <w_j w_j^T>/2 + sym<w_j w_{j+1}^T> of body-frame rotation vectors w; those of a translation, and
+    of a rotation in the plane, keep their axes. Every axis then has its own D and noise, and the
+    noise of a frame along each axis follows the turning body.
+
+    Raises
+    ------
+    TooFewFramesError
+        If there are fewer than two steps.
+
+    Examples
+    --------
+    >>> from perrin import Cluster, simulate_motion
+    >>> D_R = [[4e-3, 2e-3, 0], [2e-3, 4e-3, 0], [0, 0, 1e-3]]
+    >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=D_R, dt=0.7, n_frames=3000, rng=3)
+    >>> square = np.mean(principal_steps(truth, "rotation").vectors ** 2, axis=0)
+    >>> (square / 1.4).round(3)
+    array([0.001, 0.002, 0.006])
+    """
+    steps = steps_of(motion, quantity)
+    if quantity == "translation" or motion.dimension == 2:
+        return steps
+    w = motion.step_vectors()[steps.stop - 1]
+    linked = steps.linked[:-1]
+    tensor = 0.5 * w.T @ w + w[:-1][linked].T @ w[1:][linked]
+    axes = np.linalg.eigh((tensor + tensor.T) / 2)[1]
+    turned = motion.rotation[steps.start] @ axes
+    noise = np.einsum("ia,tij,ja->ta", axes, unit_covariance(motion), axes)
+    return replace(
+        steps,
+        vectors=w @ axes,
+        noise=(noise[..., None] * np.eye(3))[None],
+        steady=np.swapaxes(turned, -1, -2) * steps.duration[:, None, None],
+    )
+
+
 def body_steps(motion: RigidMotion, quantity: Quantity | Literal["both"], turn: Floats) -> Steps:
     """Return the steps of a motion in three dimensions in body axes, with their full covariances.
 
