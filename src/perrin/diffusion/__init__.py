@@ -83,6 +83,9 @@ from perrin.diffusion.step_spectra import (
     sine_spectrum,
     step_autocovariance,
     step_covariance,
+    fractional_autocovariance,
+    fractional_slope,
+    sine_spectrum,
 )
 from perrin.diffusion.step_tests import (
     JUMP_LEVEL,
@@ -204,6 +207,7 @@ __all__ = [
     "combined_p",
     "confined_autocovariance",
     "confined_mean_square",
+    "confined_autocovariance",
     "coupled_tensor",
     "covariance_bands",
     "covariance_estimate",
