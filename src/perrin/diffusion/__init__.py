@@ -24,6 +24,14 @@ from perrin.diffusion.likelihood import (
 )
 from perrin.diffusion.moments import Moments, covariance_estimate, step_cosines, trace_estimate
 from perrin.diffusion.noise_model import Noise, noise_faults
+from perrin.diffusion.relaxation import (
+    Decay,
+    RelaxationEstimate,
+    fit_decay,
+    fit_relaxation,
+    log_interval,
+    relaxation_faults,
+)
 from perrin.diffusion.rods import estimate_rod
 from perrin.diffusion.sampling import (
     SamplingBudget,
@@ -64,8 +72,6 @@ from perrin.diffusion.steps import (
     pooled_steps,
     residual_freedom,
     steps_of,
-    unit_center_variance,
-    unit_covariance,
 )
 from perrin.diffusion.tensor_likelihood import (
     ArrowHessian,
@@ -100,6 +106,7 @@ __all__ = [
     "JUMP_LEVEL",
     "ArrowHessian",
     "CoupledTensor",
+    "Decay",
     "DiffusionEstimate",
     "DiffusionTensor",
     "Found",
@@ -114,6 +121,7 @@ __all__ = [
     "NoisyVectors",
     "PooledLikelihood",
     "ProfilePoint",
+    "RelaxationEstimate",
     "SamplingBudget",
     "SamplingPlan",
     "SamplingVerdict",
@@ -149,8 +157,10 @@ __all__ = [
     "estimate_rod",
     "excess_scatter",
     "find_jumps",
+    "fit_decay",
     "fit_gls",
     "fit_line",
+    "fit_relaxation",
     "gls_weights",
     "identity_limits",
     "imposed_symmetry",
@@ -158,6 +168,7 @@ __all__ = [
     "judge_sampling",
     "leave_one_out_residuals",
     "line_weights",
+    "log_interval",
     "log_slope_ratio",
     "maximise",
     "msd_covariance",
@@ -169,6 +180,7 @@ __all__ = [
     "plan_sampling",
     "pooled_steps",
     "precision_limits",
+    "relaxation_faults",
     "residual_freedom",
     "secant_trial",
     "slope_interval",
@@ -181,8 +193,6 @@ __all__ = [
     "symmetric_inverses",
     "template_alignments",
     "trace_estimate",
-    "unit_center_variance",
-    "unit_covariance",
     "value_text",
     "weighted_variance",
     "without_spin",
