@@ -238,7 +238,8 @@ def van_hove(
     raw = float(np.mean(x**4) * axes / ((axes + 2) * (axes * square) ** 2) - 1 + 2 * powers[1])
     alpha2, law, gain = np.nan, np.nan, np.inf
     if heat > offset:
-        alpha2, law = map(float, without_noise(raw, heat, offset=offset, curved=angles))
+        corrected, law = without_noise(raw, heat, offset=offset, curved=angles)
+        alpha2 = float(corrected)
         gain = (heat / (heat - offset)) ** 2
     return VanHove(
         lagtime=float(np.mean(motion.time[last] - motion.time[first])),

@@ -164,8 +164,9 @@ def non_gaussian(
     -------
     LagCurve
         Dimensionless. ``stderr`` comes from leaving out one block of the track after the other
-        (jackknife): it holds for motion that is not Gaussian, if its mobility changes many times
-        within a twelfth of the track, and is NaN for lags over a ninth of it. ``brownian`` is 0
+        (jackknife), or is that of Gaussian motion where this is larger: it holds for motion that is
+        not Gaussian, if its mobility changes many times within a twelfth of the track, and is NaN
+        for lags over a ninth of it. ``brownian`` is 0
         for translation and in the plane, and `brownian_alpha2` for rotation: the value of a
         Brownian rotor that turns as much. ``noise`` is the variance of one axis that was corrected
         for.
@@ -173,7 +174,8 @@ def non_gaussian(
     Raises
     ------
     ValueError
-        For an unknown quantity or noise, or lags that are not whole numbers of steps.
+        For an unknown quantity or noise, lags that are not whole numbers of steps, or a body that
+        does not move.
     TooFewFramesError
         If no two frames are one of these lags apart.
 
@@ -222,12 +224,14 @@ def non_gaussian(
             square = np.sum((b - a) ** 2, axis=-1)
         pairs[i] = first.size
         lagtime[i] = np.mean(frames.time[last] - frames.time[first])
-        if square.any():
+        if square.any():  # a body at rest has none
             value[i], stderr[i], law[i] = corrected_excess(
                 square, lag=int(lag), axes=axes, offset=offset, curved=rotates and axes == 3
             )
     if not pairs.any():
         raise TooFewFramesError("no two frames of one piece are one of these lags apart", 0)
+    if np.isnan(law).all() and not offset > 0:
+        raise ValueError("the body does not move: its displacements have no non-Gaussian parameter")
     lagtime = np.where(pairs > 0, lagtime, steps * frames.step)
     return LagCurve(
         lagtime=lagtime,
@@ -399,4 +403,11 @@ def corrected_excess(
         return float(excess[0]), np.nan, law
     others = excess[1:]
     value = number * excess[0] - (number - 1) * others.mean()
-    return float(value), float(np.sqrt((number - 1) * others.var())), law
+    # Overlapping pairs of Gaussian motion have the correlation of the time that they share.
+    shared = np.arange(1, lag) / lag
+    powers = (
+        (1 - offset / heat) ** 4 * shared**4 @ np.maximum(1 - (lag - lag * shared) / len(square), 0)
+    )
+    gaussian = 8 / (axes * (axes + 2)) * (1 + 2 * powers) / len(square)
+    gaussian *= (heat / (heat - offset)) ** 4
+    return float(value), float(np.sqrt(max(gaussian, (number - 1) * others.var()))), law

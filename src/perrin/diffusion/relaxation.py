@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from perrin._arrays import Floats
 
 # The fit ends where the correlation has fallen to this part of its first value, or at this part of
-# the longest stretch of frames. Longer fits have larger errors (Brownian rotation over 6 and 20 tau).
+# the longest stretch of frames: fits of Brownian rotation to longer lags have larger errors.
 _LAST_VALUE, _LAST_LAG = 0.4, 0.25
 
 _FIT_LAGS = 12  # evenly spaced lags of the fit: those between them vary with them
@@ -158,8 +158,8 @@ def fit_relaxation(curve: LagCurve, second: LagCurve | None = None) -> Relaxatio
     """Fit an exponential and a stretched exponential to an orientation correlation.
 
     Least squares over evenly spaced lags, up to the lag where the correlation has fallen to 40 % of
-    its first value, or to a quarter of the track. The amplitude is always free: noise multiplies the
-    correlation, and motion faster than a frame (rattling in a cage) does so as well, so that a
+    its first value, or to a quarter of the track. The amplitude is always free: noise multiplies
+    the correlation, and motion faster than a frame (rattling in a cage) does so as well, so that a
     curve forced through 1 has a tau that is too short.
 
     Parameters
@@ -180,7 +180,7 @@ def fit_relaxation(curve: LagCurve, second: LagCurve | None = None) -> Relaxatio
         If a curve is no orientation correlation, or the second has the same degree, other lags or
         other directions.
     TooFewFramesError
-        If fewer than four lags are left for the fit.
+        If fewer than four lags are left for the fit, or the correlation does not fall.
 
     Notes
     -----
@@ -292,7 +292,7 @@ def relaxation_faults(curves: list[LagCurve]) -> list[str]:
         faults.append(f"second: expected the other degree, got {_degree(second)} twice")
     if not np.array_equal(first.lagtime, second.lagtime):
         faults.append("second: expected a curve of the same motion, got other lags")
-    if first.directions is not None and not np.array_equal(first.directions, second.directions):
+    if not np.array_equal(np.asarray(first.directions), np.asarray(second.directions)):
         faults.append("second: expected the same directions as in the first curve")
     return faults
 
@@ -319,7 +319,7 @@ def fit_decay(curve: LagCurve, *, stretched: bool) -> Decay:
     Raises
     ------
     TooFewFramesError
-        If fewer than four lags are left.
+        If fewer than four lags are left, or the correlation does not fall.
 
     Examples
     --------
@@ -351,8 +351,13 @@ def fit_decay(curve: LagCurve, *, stretched: bool) -> Decay:
         return np.asarray(values[0] * np.exp(-((x / np.exp(values[1])) ** beta)))
 
     start = [max(float(y[0]), 0.1), np.log(x[-1] / 2)] + [1.0] * stretched
-    bounds = ([0.0, np.log(1e-2)], [2.0, np.log(1e4 * lag[-1])])
+    longest = np.log(1e4 * lag[-1])
+    bounds = ([0.0, np.log(1e-2)], [2.0, longest])
     if stretched:
         bounds = ([*bounds[0], 0.05], [*bounds[1], 5.0])
     fit = least_squares(lambda v: model(v) - y, start, bounds=bounds, x_scale="jac", xtol=1e-12)
+    if not stretched and fit.x[1] > longest - 1:
+        raise TooFewFramesError(
+            f"the correlation does not fall within {step * x[-1]:.3g} s: record longer", len(use)
+        )
     return Decay(x, present[use], blocks, fit.x, np.linalg.pinv(fit.jac))
