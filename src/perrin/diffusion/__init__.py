@@ -43,6 +43,14 @@ from perrin.diffusion.likelihood import (
 )
 from perrin.diffusion.moments import Moments, covariance_estimate, step_cosines, trace_estimate
 from perrin.diffusion.noise_model import Noise, noise_faults
+from perrin.diffusion.relaxation import (
+    Decay,
+    RelaxationEstimate,
+    fit_decay,
+    fit_relaxation,
+    log_interval,
+    relaxation_faults,
+)
 from perrin.diffusion.rods import estimate_rod
 from perrin.diffusion.sampling import (
     SamplingBudget,
@@ -111,8 +119,6 @@ from perrin.diffusion.steps import (
     principal_steps,
     residual_freedom,
     steps_of,
-    unit_center_variance,
-    unit_covariance,
 )
 from perrin.diffusion.switching import Parameter, SwitchingEstimate, SwitchingSteps, fit_switching
 from perrin.diffusion.tensor_likelihood import (
@@ -154,6 +160,7 @@ __all__ = [
     "BrownianTests",
     "ConfinedEstimate",
     "CoupledTensor",
+    "Decay",
     "DiffusionEstimate",
     "DiffusionTensor",
     "Found",
@@ -170,6 +177,7 @@ __all__ = [
     "Parameter",
     "PooledLikelihood",
     "ProfilePoint",
+    "RelaxationEstimate",
     "SamplingBudget",
     "SamplingPlan",
     "SamplingVerdict",
@@ -233,6 +241,10 @@ __all__ = [
     "fractional_autocovariance",
     "fractional_mean_square",
     "fractional_slope",
+    "fit_decay",
+    "fit_gls",
+    "fit_line",
+    "fit_relaxation",
     "gls_weights",
     "holm",
     "identity_limits",
@@ -243,6 +255,7 @@ __all__ = [
     "largest_share",
     "leave_one_out_residuals",
     "line_weights",
+    "log_interval",
     "log_slope_ratio",
     "maximise",
     "motions_and_noise",
@@ -257,6 +270,7 @@ __all__ = [
     "pooled_steps",
     "precision_limits",
     "principal_steps",
+    "relaxation_faults",
     "residual_freedom",
     "score_p",
     "secant_trial",
@@ -280,8 +294,6 @@ __all__ = [
     "tabulated_statistics",
     "template_alignments",
     "trace_estimate",
-    "unit_center_variance",
-    "unit_covariance",
     "value_text",
     "weighted_variance",
     "without_spin",
