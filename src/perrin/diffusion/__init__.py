@@ -12,6 +12,15 @@ from perrin.diffusion.curve_fits import (
     slope_interval,
     weighted_variance,
 )
+from perrin.diffusion.decoupling import (
+    CoefficientCorrelation,
+    DecouplingRatio,
+    MobilityCorrelation,
+    decoupling_ratio,
+    diffusion_correlation,
+    prediction_errors,
+    translation_rotation_correlation,
+)
 from perrin.diffusion.estimate import DiffusionEstimate, Found, bare_text, value_text
 from perrin.diffusion.estimators import by_likelihood, estimate_diffusion, precision_limits
 from perrin.diffusion.likelihood import (
@@ -22,6 +31,7 @@ from perrin.diffusion.likelihood import (
     newton_crossing,
     secant_trial,
 )
+from perrin.diffusion.long_time import LongTimeEstimate, long_time_diffusion
 from perrin.diffusion.moments import Moments, covariance_estimate, step_cosines, trace_estimate
 from perrin.diffusion.noise_model import Noise, noise_faults
 from perrin.diffusion.rods import estimate_rod
@@ -95,11 +105,14 @@ from perrin.diffusion.tensors import (
     symmetric_basis,
     template_alignments,
 )
+from perrin.diffusion.viscoelasticity import Moduli, curve_covariance, viscoelastic_moduli
 
 __all__ = [
     "JUMP_LEVEL",
     "ArrowHessian",
+    "CoefficientCorrelation",
     "CoupledTensor",
+    "DecouplingRatio",
     "DiffusionEstimate",
     "DiffusionTensor",
     "Found",
@@ -107,7 +120,10 @@ __all__ = [
     "GroupSlopes",
     "Jumps",
     "Likelihood",
+    "LongTimeEstimate",
     "Maximum",
+    "MobilityCorrelation",
+    "Moduli",
     "Moments",
     "Noise",
     "NoisySteps",
@@ -139,8 +155,11 @@ __all__ = [
     "covariance_bands",
     "covariance_estimate",
     "cramer_rao",
+    "curve_covariance",
     "cut_at",
+    "decoupling_ratio",
     "difference_eigenvalues",
+    "diffusion_correlation",
     "diffusion_tensor",
     "direction_steps",
     "element_variance",
@@ -159,6 +178,7 @@ __all__ = [
     "leave_one_out_residuals",
     "line_weights",
     "log_slope_ratio",
+    "long_time_diffusion",
     "maximise",
     "msd_covariance",
     "neighbour_products",
@@ -169,6 +189,7 @@ __all__ = [
     "plan_sampling",
     "pooled_steps",
     "precision_limits",
+    "prediction_errors",
     "residual_freedom",
     "secant_trial",
     "slope_interval",
@@ -181,9 +202,11 @@ __all__ = [
     "symmetric_inverses",
     "template_alignments",
     "trace_estimate",
+    "translation_rotation_correlation",
     "unit_center_variance",
     "unit_covariance",
     "value_text",
+    "viscoelastic_moduli",
     "weighted_variance",
     "without_spin",
 ]

@@ -445,7 +445,8 @@ def diffusion_correlation(
         stderr = float(np.hypot(measured_stderr / attenuation, value * of_spread))
         wider = stderr * attenuation / max(measured_stderr, 1e-300)
         low, high = (
-            value + wider * (np.tanh(np.arctanh(measured) + z / np.sqrt(n - 3)) / attenuation - value)
+            value
+            + wider * (np.tanh(np.arctanh(measured) + z / np.sqrt(n - 3)) / attenuation - value)
             for z in (-NORMAL[0.95], NORMAL[0.95])
         )
         known = value, stderr, (float(low), float(high)), attenuation

@@ -97,7 +97,9 @@ class LongTimeEstimate:
         over = f"over lag times of {low:.3g} to {high:.3g} s"
         tail = f"[{self.method}{how}, {self.n_frames} frames]"
         if self.resolved:
-            return f"{name} = {number_text(self.value, self.stderr)} {unit_text(unit)} {over} {tail}"
+            return (
+                f"{name} = {number_text(self.value, self.stderr)} {unit_text(unit)} {over} {tail}"
+            )
         limit = number_text(self.ci95[1], digits=2)
         return f"{name} < {limit} {unit_text(unit)} (95 % limit) {over} {tail}"
 
@@ -198,7 +200,9 @@ def long_time_diffusion(
     if threshold is not None:
         faults += number_fault("threshold", threshold, least=0, most=np.pi, unit="rad")
         if quantity == "translation" and threshold:
-            faults.append("threshold: for rotation only; displacements add up exactly, leave it out")
+            faults.append(
+                "threshold: for rotation only; displacements add up exactly, leave it out"
+            )
     refuse(faults)
     if quantity == "translation":
         angle, method = 0.0, "displacements"
@@ -269,7 +273,13 @@ class _PooledWalk:
         if quantity == "rotation" and dof == 3:
             n_walks = float(np.mean([independent_walks(m, np.eye(3)) for m in motions]))
         curve = mean_square_curve(
-            walk[:, None], time, piece, dt=motions[0].dt, quantity=quantity, dof=dof, n_walks=n_walks
+            walk[:, None],
+            time,
+            piece,
+            dt=motions[0].dt,
+            quantity=quantity,
+            dof=dof,
+            n_walks=n_walks,
         )
         return cls(walk, time, piece, curve, GridLags.of(curve))
 
@@ -383,7 +393,5 @@ def _long_line(walk: _PooledWalk, window: GridLags) -> _LongLine:
     b, c = b * memory, c * memory**2
     parts = (a, a + b + c, c)
     stderr = float(np.sqrt(a * D * D + b * D * max(s, 0.0) + c * s * s))
-    ci68, ci95 = (
-        slope_interval(value, parts, D=D, s=s, z=NORMAL[level]) for level in (0.68, 0.95)
-    )
+    ci68, ci95 = (slope_interval(value, parts, D=D, s=s, z=NORMAL[level]) for level in (0.68, 0.95))
     return _LongLine(value, stderr, ci68, ci95, offset)
