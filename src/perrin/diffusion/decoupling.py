@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from typing import Self
 
     from perrin._arrays import Floats
+    from perrin.diffusion.long_time import LongTimeEstimate
     from perrin.hydrodynamics.mobility import Mobility
 
 # Slow changes of mobility correlate neighbouring ranks over this many steps.
@@ -86,7 +87,8 @@ class MobilityCorrelation:
         ----------
         entry : mapping
         """
-        return _from_entry(cls, entry)
+        read: Self = _from_entry(cls, entry)
+        return read
 
 
 @dataclass(frozen=True)
@@ -159,7 +161,8 @@ class CoefficientCorrelation:
         ----------
         entry : mapping
         """
-        return _from_entry(cls, entry)
+        read: Self = _from_entry(cls, entry)
+        return read
 
 
 @dataclass(frozen=True)
@@ -216,7 +219,8 @@ class DecouplingRatio:
         ----------
         entry : mapping
         """
-        return _from_entry(cls, entry)
+        read: Self = _from_entry(cls, entry)
+        return read
 
 
 def _from_entry(kind: type[Any], entry: Mapping[str, Any]) -> Any:  # noqa: ANN401 (any result)
@@ -426,10 +430,11 @@ def diffusion_correlation(
     logs = np.empty((2, n))
     for row, estimates in enumerate((D_T, D_R)):
         logs[row] = np.log([one.value for one in estimates])
-        error[row] = np.mean([(one.stderr / one.value) ** 2 for one in estimates])
+        error[row] = sum((one.stderr / one.value) ** 2 for one in estimates) / n
         total[row] = logs[row].var(ddof=1)
     spread = total - error
-    measured = float(np.corrcoef(logs)[0, 1])
+    apart = logs - logs.mean(axis=1, keepdims=True)
+    measured = float(apart[0] @ apart[1] / np.sqrt(np.prod(total)) / (n - 1))
     measured_stderr = float((1 - measured**2) / np.sqrt(n - 1))
     t = measured * np.sqrt((n - 2) / max(1 - measured**2, 1e-300))
     known: tuple[float | None, float | None, tuple[float, float] | None, float | None]
@@ -443,10 +448,10 @@ def diffusion_correlation(
         # The variances of ln D have the relative error (2/(n - 1))^(1/2).
         of_spread = 0.5 * np.sqrt(2 / (n - 1)) * float(np.linalg.norm(error / spread))
         stderr = float(np.hypot(measured_stderr / attenuation, value * of_spread))
+        inside = np.clip(measured, -1 + 1e-12, 1 - 1e-12)
         wider = stderr * attenuation / max(measured_stderr, 1e-300)
         low, high = (
-            value
-            + wider * (np.tanh(np.arctanh(measured) + z / np.sqrt(n - 3)) / attenuation - value)
+            value + wider * (np.tanh(np.arctanh(inside) + z / np.sqrt(n - 3)) / attenuation - value)
             for z in (-NORMAL[0.95], NORMAL[0.95])
         )
         known = value, stderr, (float(low), float(high)), attenuation
@@ -469,7 +474,10 @@ def diffusion_correlation(
 
 
 def decoupling_ratio(
-    D_T: DiffusionEstimate, D_R: DiffusionEstimate, *, mobility: Mobility
+    D_T: DiffusionEstimate | LongTimeEstimate,
+    D_R: DiffusionEstimate | LongTimeEstimate,
+    *,
+    mobility: Mobility,
 ) -> DecouplingRatio:
     """Return D_T/D_R over that of the same body in a dilute simple fluid.
 
@@ -478,9 +486,8 @@ def decoupling_ratio(
 
     Parameters
     ----------
-    D_T, D_R : DiffusionEstimate
-        Measured coefficients of one cluster or of pooled clusters, means over the axes; long-time
-        values in a dense suspension (`LongTimeEstimate`) serve as well.
+    D_T, D_R : DiffusionEstimate or LongTimeEstimate
+        Measured coefficients of one cluster or of pooled clusters, means over the axes.
     mobility : Mobility
         Prediction of `cluster_mobility` for the body, at any viscosity and temperature.
 
@@ -505,7 +512,7 @@ def decoupling_ratio(
     >>> body = cluster_mobility(
     ...     Cluster.touching(4, 2.45), radius=1.225, viscosity=2.18e-3, temperature=295
     ... )
-    >>> motion = simulate_motion(body, dt=0.7, n_frames=900, rng=3)
+    >>> motion = simulate_motion(body, dt=0.7, n_frames=900, rng=1)
     >>> D_T, D_R = (estimate_diffusion(motion, quantity=q) for q in ("translation", "rotation"))
     >>> ratio = decoupling_ratio(D_T, D_R, mobility=body)
     >>> ratio.ci95[0] < 1 < ratio.ci95[1]

@@ -88,7 +88,7 @@ class LongTimeEstimate:
 
     @property
     def text(self) -> str:
-        """One sentence: the value or its upper limit, over which lag times, and how it was found."""
+        """One sentence: the value or its upper limit, the lag times, and how it was found."""
         name, unit = ("D_T", UNITS["translation"])
         if self.unit == UNITS["rotation"]:
             name, unit = ("D_R", UNITS["rotation"])
@@ -213,18 +213,25 @@ def long_time_diffusion(
         method = "threshold" if angle else "added steps"
     walk = _PooledWalk.of(motions, quantity, threshold=angle)
     window = _straight_window(walk.lags)
-    line = _long_line(walk, window)
+    weights = line_weights(window.steps)
+    value, offset = window.line(weights)
+    D, s = window.brownian_line(weights)
+    a, b, c = _slope_variance(walk, window, D=D, s=s)
     dt = window.step
+    (low68, high68), (low95, high95) = (
+        slope_interval(value, (a, a + b + c, c), D=D, s=s, z=NORMAL[level])
+        for level in (0.68, 0.95)
+    )
     return LongTimeEstimate(
-        value=line.value / dt,
-        stderr=line.stderr / dt,
-        ci68=(line.ci68[0] / dt, line.ci68[1] / dt),
-        ci95=(line.ci95[0] / dt, line.ci95[1] / dt),
-        resolved=line.ci95[0] > 0,
+        value=value / dt,
+        stderr=float(np.sqrt(a * D * D + b * D * max(s, 0.0) + c * s * s)) / dt,
+        ci68=(low68 / dt, high68 / dt),
+        ci95=(low95 / dt, high95 / dt),
+        resolved=low95 > 0,
         unit=UNITS[quantity],
         lag_range=(float(window.steps[0]) * dt, float(window.steps[-1]) * dt),
         threshold=angle,
-        offset=line.offset,
+        offset=offset,
         n_frames=sum(m.fitted.size for m in motions),
         method=method,
     )
@@ -318,7 +325,7 @@ def _cage_threshold(curve: LagCurve) -> float:
 
 
 def _straight_window(lags: GridLags) -> GridLags:
-    """Return the lags n to 4 n of the smallest n from which on the mean square is a straight line."""
+    """Return the lags n to 4 n of the smallest n beyond which the mean square is straight."""
     length = int(lags.stretches[-1][0])
     most = length // _LONGEST_START
     if most < 1:
@@ -367,31 +374,21 @@ def _cage_memory(lags: GridLags, window: GridLags, *, D: float, s: float) -> flo
     return 1 + 2 * float(np.sum(np.maximum(kept, 0.0)))
 
 
-@dataclass(frozen=True)
-class _LongLine:
-    """The slope of a line at long lags per step, its error and intervals, and the intercept."""
-
-    value: float
-    stderr: float
-    ci68: tuple[float, float]
-    ci95: tuple[float, float]
-    offset: float
-
-
-def _long_line(walk: _PooledWalk, window: GridLags) -> _LongLine:
-    """Return the line through a window of lags with the error of caged and hopping motion."""
-    weights = line_weights(window.steps)
-    value, offset = window.line(weights)
-    D, s = window.brownian_line(weights)
-    a, both, c = (window.variance(weights[0], D=d, s=e) for d, e in ((1, 0), (1, 1), (0, 1)))
-    b = both - a - c
+def _slope_variance(
+    walk: _PooledWalk, window: GridLags, *, D: float, s: float
+) -> tuple[float, float, float]:
+    """Return a, b, c of the variance a D^2 + b D s + c s^2 of the slope, cage and hops included."""
+    weights = line_weights(window.steps)[0]
+    a, both, c = (window.variance(weights, D=d, s=e) for d, e in ((1, 0), (1, 1), (0, 1)))
+    memory = _cage_memory(walk.lags, window, D=D, s=s)
+    b, c = (both - a - c) * memory, c * memory**2
     first = float(window.steps[0])
     excess, pairs = walk.fourth_cumulant(first * window.step)
-    if D > 0:
-        a += max(excess, 0.0) / (first * pairs * (2 * window.dof * D) ** 2)
-    memory = _cage_memory(walk.lags, window, D=D, s=s)
-    b, c = b * memory, c * memory**2
-    parts = (a, a + b + c, c)
-    stderr = float(np.sqrt(a * D * D + b * D * max(s, 0.0) + c * s * s))
-    ci68, ci95 = (slope_interval(value, parts, D=D, s=s, z=NORMAL[level]) for level in (0.68, 0.95))
-    return _LongLine(value, stderr, ci68, ci95, offset)
+    hops = max(excess, 0.0) / (first * pairs * (2 * window.dof) ** 2)
+    # More hops of the same size: in proportion to D, which is unknown below its other errors.
+    known = max(D, np.sqrt(a * D * D + b * D * max(s, 0.0) + c * s * s))
+    if hops > 0 and s > 0:
+        b += hops / (known * s)
+    elif hops > 0:
+        a += hops / known**2
+    return a, b, c

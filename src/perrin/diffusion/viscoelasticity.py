@@ -15,7 +15,6 @@ from perrin.diffusion.steps import Quantity
 from perrin.geometry.shapes import Cluster
 from perrin.hydrodynamics.mobility import BOLTZMANN, Mobility, condition_faults
 from perrin.hydrodynamics.sizes import shape_mobility
-from perrin.motion.rigid_motion import RigidMotion
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -25,6 +24,7 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from perrin._arrays import Bools, Floats
+    from perrin.motion.rigid_motion import RigidMotion
 
 # Longer lags have errors above 20 % of a modulus.
 _LONGEST_LAG = 10
@@ -48,7 +48,8 @@ _RELIABLE_FACTOR = 1.5
 # Points of each of two normal variables whose joint quantiles give the bands.
 _QUANTILE_POINTS = 41
 
-_MOST_ROUNDS = 20
+# The covariance is that of the fit before, until its parameters change by less than this.
+_CONVERGED, _MOST_ROUNDS = 1e-4, 20
 
 _ARRAYS = (
     "frequency", "modulus", "exponent", "storage", "loss", "modulus_ci68", "exponent_ci68",
@@ -219,7 +220,7 @@ def viscoelastic_moduli(
     >>> bool(abs(viscosity / 2.18e-3 - 1) < 0.1)
     True
     """
-    from scipy.special import gamma
+    from scipy.special import gamma, ndtri
 
     faults = condition_faults(temperature=temperature)
     faults += choice_fault("quantity", quantity, (None, *get_args(Quantity)))
@@ -238,7 +239,10 @@ def viscoelastic_moduli(
         curve = msad_vector(motion_or_curve) if turning else msd(motion_or_curve)
     if noise == "residual" and not np.isfinite(curve.noise):
         raise ValueError('noise: "residual" needs a curve of a motion; this one has no residuals')
-    lags = _spaced_lags(GridLags.of(curve))
+    lags = GridLags.of(curve)
+    longest = max(2 * int(lags.stretches[-1][0]) // _LONGEST_LAG, 1)
+    spaced = np.rint(np.geomspace(1, longest, 1 + int(np.log(longest) / np.log(_LAG_RATIO))))
+    lags = lags.take(np.flatnonzero(np.isin(np.rint(lags.steps), spaced)))
     fit = _offset_fit(lags, known=curve.noise if noise == "residual" else None)
     logs, error = _local_power_laws(lags, fit)
     body = shape_mobility(cluster)
@@ -247,7 +251,8 @@ def viscoelastic_moduli(
         friction = np.pi * body.diameter_R**3
     # kT over um^3 is 1e18 Pa.
     unit = BOLTZMANN * temperature * 1e18 / friction
-    grid = _normal_grid()
+    quantiles = ndtri((np.arange(_QUANTILE_POINTS) + 0.5) / _QUANTILE_POINTS)
+    grid = np.stack(np.meshgrid(quantiles, quantiles), axis=-1).reshape(-1, 2)
     draws = logs[:, None] + np.einsum("jab,gb->jga", error, grid)
     bands, values = {}, {}
     for drawn in (False, True):
@@ -301,14 +306,6 @@ class _OffsetFit(NamedTuple):
     chi2: float
 
 
-def _spaced_lags(lags: GridLags) -> GridLags:
-    """Return lags in a ratio of about 1.25 up to a fifth of the longest stretch."""
-    longest = 2 * int(lags.stretches[-1][0]) // _LONGEST_LAG
-    count = 1 + int(np.log(max(longest, 1)) / np.log(_LAG_RATIO))
-    wanted = np.unique(np.rint(np.geomspace(1, max(longest, 1), count)))
-    return lags.take(np.flatnonzero(np.isin(np.rint(lags.steps), wanted)))
-
-
 def _structure(fit: _OffsetFit, length: int) -> Floats:
     """Return the half MSD of a noisy power law at 0, 1, ... length steps."""
     half = fit.D * np.arange(length + 1.0) ** fit.alpha + fit.offset
@@ -317,7 +314,7 @@ def _structure(fit: _OffsetFit, length: int) -> Floats:
 
 
 def _offset_fit(lags: GridLags, *, known: float | None) -> _OffsetFit:
-    """Fit a power law with an offset to the longest range of lags from the first that follows one."""
+    """Fit a power law with an offset to the longest range of short lags that follows one."""
     from scipy.special import chdtrc
 
     count = int(np.searchsorted(lags.steps, lags.stretches[-1][0] / _LONGEST_LAG + 0.5))
@@ -346,37 +343,42 @@ def _power_law(lags: GridLags, *, known: float | None) -> _OffsetFit:
     for _ in range(_MOST_ROUNDS):
         before = fit
         covariance = curve_covariance(lags, _structure(fit, length))
-        root = np.linalg.inv(np.linalg.cholesky(covariance))
+        full = np.linalg.inv(np.linalg.cholesky(covariance))
+        # The offset is linear: its best value at any exponent is projected out.
+        level = full @ np.ones_like(n)
+        level *= (known is None) / np.linalg.norm(level)
+        root = full - np.outer(level, level @ full)
+        target = root @ (y - (known or 0.0))
 
-        def linear(alpha: float, root: Floats = root) -> tuple[float, Floats]:
-            """Return the squared distance and (D, o) of the best line in n^alpha."""
-            columns = [n**alpha] if known is not None else [n**alpha, np.ones_like(n)]
-            design = root @ np.stack(columns, axis=1)
-            target = root @ (y - (known or 0.0))
-            solved: Floats = np.linalg.lstsq(design, target, rcond=None)[0]
-            far = np.inf if solved[0] <= 0 else float(np.sum((target - design @ solved) ** 2))
-            return far, solved
+        def amplitude(alpha: Floats, root: Floats = root, target: Floats = target) -> Floats:
+            """Return the squared distance and D of the best power law of every exponent."""
+            power = root @ n[:, None] ** alpha
+            square = np.sum(power**2, axis=0)
+            D = target @ power / square
+            distance = np.where(D > 0, target @ target - D**2 * square, np.inf)
+            return np.stack([distance, D])
 
-        best = int(np.argmin([linear(alpha)[0] for alpha in exponents]))
+        best = int(np.argmin(amplitude(exponents)[0]))
         ends = exponents[max(best - 1, 0)], exponents[min(best + 1, len(exponents) - 1)]
         found = minimize_scalar(
-            lambda a: linear(a)[0], bounds=ends, method="bounded", options={"xatol": 1e-9}
+            lambda a, f=amplitude: f(np.array([a]))[0, 0],
+            bounds=ends,
+            method="bounded",
+            options={"xatol": 1e-9},
         )
         alpha = float(found.x)
-        chi2, solved = linear(alpha)
-        D = float(solved[0])
+        chi2, D = (float(x) for x in amplitude(np.array([alpha]))[:, 0])
         columns = [n**alpha, D * np.log(n) * n**alpha]
-        if known is None:
+        weights, stderr, offset = np.zeros(n.size), 0.0, known
+        if offset is None:
+            ones = full @ np.ones_like(n)
+            offset = float(ones @ (full @ (y - D * n**alpha)) / (ones @ ones))
             columns.append(np.ones_like(n))
-        design = root @ np.stack(columns, axis=1)
-        inverse = np.linalg.pinv(design)
-        weights, stderr = np.zeros(n.size), 0.0
-        if known is None:
-            weights = inverse[-1] @ root
+            inverse = np.linalg.pinv(full @ np.stack(columns, axis=1))
+            weights = inverse[-1] @ full
             stderr = float(np.linalg.norm(inverse[-1]))
-        offset = float(solved[1]) if known is None else known
         fit = _OffsetFit(D, alpha, offset, stderr, weights, chi2)
-        if abs(alpha - before.alpha) < 1e-6 and abs(D - before.D) < 1e-6 * D:
+        if abs(alpha - before.alpha) < _CONVERGED and abs(D - before.D) < _CONVERGED * D:
             break
     return fit
 
@@ -411,14 +413,6 @@ def _local_power_laws(lags: GridLags, fit: _OffsetFit) -> tuple[Floats, Floats]:
         logs[j] = line @ log_y
         root[j] = np.linalg.cholesky(line @ relative @ line.T)
     return logs, root
-
-
-def _normal_grid() -> Floats:
-    """Return pairs of normal quantiles (G, 2) that represent two independent normal variables."""
-    from scipy.special import ndtri
-
-    quantiles = ndtri((np.arange(_QUANTILE_POINTS) + 0.5) / _QUANTILE_POINTS)
-    return np.stack(np.meshgrid(quantiles, quantiles), axis=-1).reshape(-1, 2)
 
 
 def curve_covariance(lags: GridLags, structure: Floats) -> Floats:
@@ -465,11 +459,10 @@ def curve_covariance(lags: GridLags, structure: Floats) -> Floats:
                 c = around[at + n] + around[at - m] - around[at] - around[at + n - m]
                 starts = np.minimum(np.minimum(pairs_n - k, pairs_m + k), min(pairs_n, pairs_m))
                 q = np.sqrt(lags.present[i] * lags.present[j])
-                shared = np.ones(len(k))
                 if q < 1:
                     for common in (k == 0, k == m - n, k == m, k == -n):
-                        shared = np.where(common, shared / q, shared)
-                value = 0.5 * np.sum(starts * shared * c * c) * times
+                        starts = np.where(common, starts / q, starts)
+                value = 0.5 * times * float(starts @ (c * c))
                 total[i, j] += value / (lags.complete[i] * lags.complete[j])
     total += np.tril(total, -1).T
     return total / lags.n_walks
