@@ -79,10 +79,8 @@ def in_time(rng, *, quick):
         ("common x10", True, 10, 0.5),
         ("common x2", True, 2, 5.0),
     ]
-    print("\nTranslation and rotation in time, dwell 20 steps")
-    print(
-        "| motion | SNR | steps | runs | mean rho | sd | stated | found at 5 %, % | uncorrected |"
-    )
+    print("\nTranslation and rotation in time, dwell 20 steps, tests at 5 %")
+    print("| motion | SNR | steps | runs | mean rho | sd | stated | found, % | uncorrected, % |")
     print("|---|---|---|---|---|---|---|---|---|")
     for steps, runs in ((300, 60 if quick else 1000), (1000, 30 if quick else 400)):
         for name, common, ratio, snr in cases:
@@ -90,14 +88,15 @@ def in_time(rng, *, quick):
             for _ in range(runs):
                 one = switching_speed(steps, rng, ratio=ratio, dwell=20)
                 two = one if common else switching_speed(steps, rng, ratio=ratio, dwell=20)
-                found.append(
-                    perrin.translation_rotation_correlation(moving(one, two, rng, snr=snr))
-                )
+                motion = moving(one, two, rng, snr=snr)
+                found.append(perrin.translation_rotation_correlation(motion))
             rho = np.array([f.value for f in found])
+            stated = np.mean([f.stderr for f in found])
+            plain = np.abs(rho) * np.sqrt(steps - 1) > 1.96
             print(
-                f"| {name} | {snr:g} | {steps} | {runs} | {mean_text(rho)} | {rho.std(ddof=1):.3f} | "
-                f"{np.mean([f.stderr for f in found]):.3f} | {share_text([f.p < 0.05 for f in found])}"
-                f" | {share_text(np.abs(rho) * np.sqrt(steps - 1) > 1.96)} |",
+                f"| {name} | {snr:g} | {steps} | {runs} | {mean_text(rho)} | "
+                f"{rho.std(ddof=1):.3f} | {stated:.3f} | "
+                f"{share_text([f.p < 0.05 for f in found])} | {share_text(plain)} |",
                 flush=True,
             )
 
@@ -116,25 +115,30 @@ def over_clusters(rng, *, quick):
         ]  # fmt: skip
 
     runs = 200 if quick else 2000
-    print(f"\nD_T against D_R over 40 clusters, true correlation 1, {runs} runs")
-    print("| spread | error | measured | predicted | corrected | 95 % covers, % | no value, % |")
-    print("|---|---|---|---|---|---|---|")
-    for spread, error in ((0.3, 0.087), (0.3, 0.15), (0.1, 0.087), (0.0, 0.087)):
+    print(f"\nD_T against D_R over 40 clusters, {runs} runs")
+    print("| true | spread | error | measured | predicted | corrected | 95 % covers, % | none, % |")
+    print("|---|---|---|---|---|---|---|---|")
+    cells = ((1, 0.3, 0.087), (1, 0.3, 0.15), (1, 0.1, 0.087), (0.5, 0.3, 0.15), (0, 0.0, 0.087))
+    for truth, spread, error in cells:
         found = []
         for _ in range(runs):
-            common = np.exp(spread * rng.normal(size=40))
-            D_T, D_R = common * np.exp(error * rng.normal(size=(2, 40)))
+            own = rng.normal(size=(2, 40))
+            own[1] = truth * own[0] + np.sqrt(1 - truth**2) * own[1]
+            D_T, D_R = np.exp(spread * own + error * rng.normal(size=(2, 40)))
             found.append(
                 perrin.diffusion_correlation(
                     estimates(D_T, error, "translation"), estimates(D_R, error, "rotation")
                 )
             )
         known = [f for f in found if f.value is not None]
-        predicted = spread**2 / (spread**2 + error**2)
+        corrected = covers = "-"
+        if len(known) > 9:
+            corrected = mean_text([f.value for f in known])
+            covers = share_text([f.ci95[0] <= truth <= f.ci95[1] for f in known])
+        predicted = truth * spread**2 / (spread**2 + error**2)
         print(
-            f"| {spread} | {error} | {mean_text([f.measured for f in found])} | {predicted:.3f} | "
-            f"{mean_text([f.value for f in known]) if len(known) > 9 else '-'} | "
-            f"{share_text([f.ci95[0] <= 1 <= f.ci95[1] for f in known]) if len(known) > 9 else '-'} | "
+            f"| {truth} | {spread} | {error} | {mean_text([f.measured for f in found])} | "
+            f"{predicted:.3f} | {corrected} | {covers} | "
             f"{share_text([f.value is None for f in found])} |",
             flush=True,
         )
@@ -146,7 +150,8 @@ def moduli(rng, *, quick):
     sphere = perrin.Cluster(np.zeros((1, 3)), diameter=2.0)
     print(f"\nModuli from the MSD of a sphere, {runs} runs: median |G*|/true (sd), alpha (sd)")
     print(
-        "| frames | alpha | SNR | lag | raw |G*|, alpha | noise | |G*| | alpha | 68 % covers |G*|, alpha, G', G'', % |"
+        "| frames | alpha | SNR | lag | raw |G*|, alpha | noise | |G*| | alpha "
+        "| 68 % covers |G*|, alpha, G', G'', % |"
     )
     print("|---|---|---|---|---|---|---|---|---|")
     cells = [(300, 0.5, 5.0), (300, 0.5, 0.5), (300, 1.0, 5.0), (1000, 0.5, 5.0)]
