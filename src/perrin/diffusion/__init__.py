@@ -14,6 +14,15 @@ from perrin.diffusion.curve_fits import (
     slope_interval,
     weighted_variance,
 )
+from perrin.diffusion.decoupling import (
+    CoefficientCorrelation,
+    DecouplingRatio,
+    MobilityCorrelation,
+    decoupling_ratio,
+    diffusion_correlation,
+    prediction_errors,
+    translation_rotation_correlation,
+)
 from perrin.diffusion.estimate import DiffusionEstimate, Found, bare_text, value_text
 from perrin.diffusion.estimators import by_likelihood, estimate_diffusion, precision_limits
 from perrin.diffusion.goodness_of_fit import (
@@ -41,6 +50,7 @@ from perrin.diffusion.likelihood import (
     newton_crossing,
     secant_trial,
 )
+from perrin.diffusion.long_time import LongTimeEstimate, long_time_diffusion
 from perrin.diffusion.moments import Moments, covariance_estimate, step_cosines, trace_estimate
 from perrin.diffusion.noise_model import Noise, noise_faults
 from perrin.diffusion.relaxation import (
@@ -150,6 +160,7 @@ from perrin.diffusion.tensors import (
     template_alignments,
 )
 from perrin.diffusion.verdict import MotionVerdict, combined_p, detectable_by, judge_motion
+from perrin.diffusion.viscoelasticity import Moduli, curve_covariance, viscoelastic_moduli
 
 __all__ = [
     "JUMP_LEVEL",
@@ -161,6 +172,9 @@ __all__ = [
     "ConfinedEstimate",
     "CoupledTensor",
     "Decay",
+    "CoefficientCorrelation",
+    "CoupledTensor",
+    "DecouplingRatio",
     "DiffusionEstimate",
     "DiffusionTensor",
     "Found",
@@ -168,7 +182,10 @@ __all__ = [
     "GroupSlopes",
     "Jumps",
     "Likelihood",
+    "LongTimeEstimate",
     "Maximum",
+    "MobilityCorrelation",
+    "Moduli",
     "Moments",
     "MotionVerdict",
     "Noise",
@@ -220,9 +237,12 @@ __all__ = [
     "covariance_bands",
     "covariance_estimate",
     "cramer_rao",
+    "curve_covariance",
     "cut_at",
     "detectable_by",
+    "decoupling_ratio",
     "difference_eigenvalues",
+    "diffusion_correlation",
     "diffusion_tensor",
     "direction_steps",
     "element_variance",
@@ -257,6 +277,7 @@ __all__ = [
     "line_weights",
     "log_interval",
     "log_slope_ratio",
+    "long_time_diffusion",
     "maximise",
     "motions_and_noise",
     "msd_covariance",
@@ -271,6 +292,7 @@ __all__ = [
     "precision_limits",
     "principal_steps",
     "relaxation_faults",
+    "prediction_errors",
     "residual_freedom",
     "score_p",
     "secant_trial",
@@ -294,7 +316,11 @@ __all__ = [
     "tabulated_statistics",
     "template_alignments",
     "trace_estimate",
+    "translation_rotation_correlation",
+    "unit_center_variance",
+    "unit_covariance",
     "value_text",
+    "viscoelastic_moduli",
     "weighted_variance",
     "without_spin",
 ]
