@@ -29,7 +29,8 @@ def quantiles(axes: int, n_steps: int, rng: np.random.Generator) -> dict[str, np
     for start in range(0, draws, batch):
         e = rng.standard_normal((min(batch, draws - start), axes, n_steps))
         e /= np.sqrt(np.mean(e * e, axis=-1, keepdims=True))
-        for name, values in goodness_of_fit.tabulated_statistics(np.sum(e * e, axis=1), axes).items():
+        statistics = goodness_of_fit.tabulated_statistics(np.sum(e * e, axis=1), axes)
+        for name, values in statistics.items():
             found.setdefault(name, []).append(values)
     return {name: np.quantile(np.concatenate(v), 1 - np.array(UPPER)) for name, v in found.items()}
 

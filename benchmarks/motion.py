@@ -261,7 +261,7 @@ def body_row(task):
     return f"| {name}, {quantity} | {tracks} | {cells} | {percent(family, tracks)} |", bad
 
 
-# Kinds of rotation: what is planted, the word for it, and the share that must get it at N = 1000, %.
+# Kinds of rotation: what is planted, the word for it, and the least share of it at N = 1000, %.
 STEP = 0.05  # rms turn of a frame and axis, rad
 WORDS = {
     "diffusion": (None, "diffusion", 90),

@@ -255,5 +255,5 @@ def test_what_cannot_be_judged_is_refused():
     still = perrin.simulate_motion(TETRAHEDRON, D_R=D_R, dt=DT, n_frames=50, rng=1)
     with pytest.raises(ValueError, match="does not move"):
         judge_motion(still, quantity="translation")
-    with pytest.raises(ValueError, match="quantity.*; noise"):
+    with pytest.raises(ValueError, match=r"quantity.*; noise"):
         judge_motion(still, quantity="speed", noise="loud")

@@ -294,7 +294,7 @@ class AxisModel:
         return AxisFit(y, *parameters(t))
 
     def _score(self, y: Floats, D: Floats, offset: Floats) -> Floats:
-        """Return the slopes of the log-likelihood in ln D and, where it is free, in v, (B, A, f)."""
+        """Return the slopes of the log-likelihood in ln D and in a free v, (B, A, f)."""
         from scipy.linalg.lapack import dpttrf, dpttrs
 
         shape = y.shape[:2]

@@ -11,6 +11,9 @@ import numpy as np
 from perrin._arrays import choice_fault, refuse, to_plain
 from perrin._text import frames_text, number_text
 from perrin.diffusion.anomalous import AnomalousEstimate, fit_anomalous
+from perrin.diffusion.confined import ConfinedEstimate, fit_confined
+from perrin.diffusion.estimate import DiffusionEstimate
+from perrin.diffusion.estimators import estimate_diffusion
 from perrin.diffusion.goodness_of_fit import (
     BrownianTests,
     Score,
@@ -22,9 +25,6 @@ from perrin.diffusion.goodness_of_fit import (
     tabulated_p,
     tabulated_statistics,
 )
-from perrin.diffusion.confined import ConfinedEstimate, fit_confined
-from perrin.diffusion.estimate import DiffusionEstimate
-from perrin.diffusion.estimators import estimate_diffusion
 from perrin.diffusion.noise_model import Noise, noise_faults
 from perrin.diffusion.steps import Quantity
 from perrin.diffusion.switching import SwitchingEstimate, fit_switching
