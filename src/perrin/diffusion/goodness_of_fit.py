@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from importlib.resources import files
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -696,6 +695,8 @@ def tabulated_statistics(u: Floats, axes: int) -> dict[str, Floats]:
 @lru_cache(maxsize=1)
 def _quantile_table() -> dict[tuple[str, int], tuple[Floats, Floats]]:
     """Return the lengths and the quantiles (lengths, probabilities) by statistic and axes."""
+    from importlib.resources import files
+
     text = files("perrin.diffusion").joinpath("brownian_quantiles.csv").read_text("utf-8")
     head, *lines = text.splitlines()
     table: dict[tuple[str, int], list[list[float]]] = {}
