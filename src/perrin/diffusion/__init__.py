@@ -78,6 +78,7 @@ from perrin.diffusion.switching import (
     Parameter,
     SwitchingEstimate,
     SwitchingSteps,
+    equalised_steps,
     fit_switching,
 )
 from perrin.diffusion.tensor_likelihood import (
@@ -162,6 +163,7 @@ __all__ = [
     "direction_steps",
     "element_variance",
     "equal_columns",
+    "equalised_steps",
     "estimate_diffusion",
     "estimate_rod",
     "excess_scatter",
