@@ -36,6 +36,10 @@ _DIFFERENCE = 3e-3
 # Axes are scaled to equal D where the least is above this part of the mean.
 _LEAST_RATIO = 0.2
 
+# Beyond this T^2 the axes of D are unequal: chi-squared at 1 %, for the five numbers by which a
+# tensor differs from a multiple of unity, because the axes are chosen by the data.
+_UNEQUAL_AXES = 15.09
+
 _NEWTON_ROUNDS = 60
 
 # The search ends where the next step would raise the log-likelihood by less than this.
@@ -362,7 +366,8 @@ def equalised_steps(motion: RigidMotion, quantity: Quantity) -> Steps:
 
     The noise is scaled alike. Unequal axes would widen the law of the lengths of the steps, as two
     states do. Translation, and rotation in the plane, are left as they are, and so is a rotation
-    whose noise-corrected D along one axis is below a fifth of the mean: noise hides its ratio.
+    whose axes are not significantly unequal (p > 1 % by their scatter), or whose noise-corrected D
+    along one axis is below a fifth of the mean: the ratio is then not known.
 
     Examples
     --------
@@ -377,8 +382,14 @@ def equalised_steps(motion: RigidMotion, quantity: Quantity) -> Steps:
     if quantity == "translation" or motion.dimension == 2:
         return steps
     y, linked = steps.vectors, steps.linked[:-1]
-    D = 0.5 * np.sum(y**2, axis=0) + np.sum((y[:-1] * y[1:])[linked], axis=0)
+    squares = 0.5 * y**2
+    squares[:-1][linked] += (y[:-1] * y[1:])[linked]
+    D = squares.mean(axis=0)
     if not D.min() > _LEAST_RATIO * D.mean():
+        return steps
+    apart = (squares - squares.mean(axis=1, keepdims=True))[:, 1:]
+    mean = apart.mean(axis=0)
+    if len(y) * mean @ np.linalg.solve(np.cov(apart.T), mean) < _UNEQUAL_AXES:
         return steps
     ratio = D / D.mean()
     noise = steps.noise / ratio[:, None]
