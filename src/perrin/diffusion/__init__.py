@@ -127,6 +127,15 @@ from perrin.diffusion.steps import (
     principal_steps,
     residual_freedom,
     steps_of,
+    unit_center_variance,
+    unit_covariance,
+)
+from perrin.diffusion.switching import (
+    Parameter,
+    SwitchingEstimate,
+    SwitchingSteps,
+    equalised_steps,
+    fit_switching,
 )
 from perrin.diffusion.switching import Parameter, SwitchingEstimate, SwitchingSteps, fit_switching
 from perrin.diffusion.tensor_likelihood import (
@@ -243,6 +252,7 @@ __all__ = [
     "direction_steps",
     "element_variance",
     "equal_columns",
+    "equalised_steps",
     "estimate_diffusion",
     "estimate_rod",
     "excess_scatter",
