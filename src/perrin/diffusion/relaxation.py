@@ -202,8 +202,7 @@ def fit_relaxation(curve: LagCurve, second: LagCurve | None = None) -> Relaxatio
     refuse(relaxation_faults(curves))
     plain = [fit_decay(c, stretched=False) for c in curves]
     stretched = fit_decay(curve, stretched=True)
-    weights = curve.directions
-    assert weights is not None
+    directions = np.asarray(curve.directions)
     degrees = [_degree(c) for c in curves]
 
     def covariance(a: int, b: int, fits: list[Decay], *, rotor: int) -> Floats:
@@ -213,7 +212,7 @@ def fit_relaxation(curve: LagCurve, second: LagCurve | None = None) -> Relaxatio
         amplitude, log_tau = plain[rotor].values
         rate = 2 * curves[rotor].dof
         sampling = correlation_covariance(
-            (one.lag, other.lag), degrees=both, weights=product_weights(weights, degrees=both),
+            (one.lag, other.lag), degrees=both, weights=product_weights(directions, degrees=both),
             blocks=one.blocks, present=(one.present, other.present),
             D=float(np.exp(-log_tau)) / rate, s=-float(np.log(min(amplitude, 1.0))) / rate,
         )  # fmt: skip
