@@ -202,24 +202,24 @@ def fit_relaxation(curve: LagCurve, second: LagCurve | None = None) -> Relaxatio
     refuse(relaxation_faults(curves))
     plain = [fit_decay(c, stretched=False) for c in curves]
     stretched = fit_decay(curve, stretched=True)
-    weights = curve.directions
-    assert weights is not None
+    directions = np.asarray(curve.directions)
     degrees = [_degree(c) for c in curves]
-    s = max(-float(np.log(min(plain[0].values[0], 1.0))) / (2 * curve.dof), 0.0)
-    D = float(np.exp(-plain[0].values[1])) / (2 * curve.dof)
 
-    def covariance(a: int, b: int, fits: list[Decay]) -> Floats:
-        """Return the covariance of the values of two fits."""
+    def covariance(a: int, b: int, fits: list[Decay], *, rotor: int) -> Floats:
+        """Return the covariance of the values of two fits, for the rotor that one curve shows."""
         one, other = fits[a], fits[b]
         both = (degrees[a], degrees[b])
+        amplitude, log_tau = plain[rotor].values
+        rate = 2 * curves[rotor].dof
         sampling = correlation_covariance(
-            (one.lag, other.lag), degrees=both, weights=product_weights(weights, degrees=both),
-            blocks=one.blocks, present=(one.present, other.present), D=D, s=s,
+            (one.lag, other.lag), degrees=both, weights=product_weights(directions, degrees=both),
+            blocks=one.blocks, present=(one.present, other.present),
+            D=float(np.exp(-log_tau)) / rate, s=-float(np.log(min(amplitude, 1.0))) / rate,
         )  # fmt: skip
         return np.asarray(one.response @ sampling @ other.response.T)
 
-    own = covariance(0, 0, plain)
-    exponent = covariance(0, 0, [stretched])
+    own = covariance(0, 0, plain, rotor=0)
+    exponent = covariance(0, 0, [stretched], rotor=0)
     step = float(curve.step or curve.lagtime[0])
     tau, relative = step * float(np.exp(plain[0].values[1])), float(np.sqrt(own[1, 1]))
     beta, error = float(stretched.values[2]), float(np.sqrt(exponent[2, 2]))
@@ -227,7 +227,11 @@ def fit_relaxation(curve: LagCurve, second: LagCurve | None = None) -> Relaxatio
     if second is not None:
         sign = 1 if degrees[0] == 1 else -1
         ratio = float(np.exp(sign * (plain[0].values[1] - plain[1].values[1])))
-        variance = own[1, 1] + covariance(1, 1, plain)[1, 1] - 2 * covariance(0, 1, plain)[1, 1]
+        better = degrees.index(2)  # its tau has the smaller error
+        one, both, two = (
+            float(covariance(*pair, plain, rotor=better)[1, 1]) for pair in ((0, 0), (0, 1), (1, 1))
+        )
+        variance = one + two - 2 * both
         spread = float(np.sqrt(max(variance, 0.0)))
     return RelaxationEstimate(
         tau=tau,
