@@ -127,8 +127,6 @@ from perrin.diffusion.steps import (
     principal_steps,
     residual_freedom,
     steps_of,
-    unit_center_variance,
-    unit_covariance,
 )
 from perrin.diffusion.switching import (
     Parameter,
@@ -137,7 +135,6 @@ from perrin.diffusion.switching import (
     equalised_steps,
     fit_switching,
 )
-from perrin.diffusion.switching import Parameter, SwitchingEstimate, SwitchingSteps, fit_switching
 from perrin.diffusion.tensor_likelihood import (
     ArrowHessian,
     Maximum,
