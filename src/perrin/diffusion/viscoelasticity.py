@@ -312,8 +312,12 @@ class _OffsetFit(NamedTuple):
 
 
 def _structure(fit: _OffsetFit, length: int) -> Floats:
-    """Return the half MSD of a noisy power law at 0, 1, ... length steps."""
-    half = fit.D * np.arange(length + 1.0) ** fit.alpha + fit.offset
+    """Return the half MSD of a noisy power law at 0, 1, ... length steps.
+
+    A negative offset is taken as 0: with it no motion may have this MSD, and its covariance would
+    not be positive definite.
+    """
+    half = fit.D * np.arange(length + 1.0) ** fit.alpha + max(fit.offset, 0.0)
     half[0] = 0.0
     return half
 
