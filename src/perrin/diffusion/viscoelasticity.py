@@ -314,10 +314,11 @@ class _OffsetFit(NamedTuple):
 def _structure(fit: _OffsetFit, length: int) -> Floats:
     """Return the half MSD of a noisy power law at 0, 1, ... length steps.
 
-    A negative offset is taken as 0: with it no motion may have this MSD, and its covariance would
-    not be positive definite.
+    An offset below about -(1 - alpha/2) D has no motion: the spectrum of its steps would be
+    negative at the highest frequency. It is limited to nine tenths of that.
     """
-    half = fit.D * np.arange(length + 1.0) ** fit.alpha + max(fit.offset, 0.0)
+    least = -0.9 * (1 - fit.alpha / 2) * fit.D
+    half = fit.D * np.arange(length + 1.0) ** fit.alpha + max(fit.offset, least)
     half[0] = 0.0
     return half
 
