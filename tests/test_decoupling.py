@@ -46,7 +46,7 @@ def test_common_changes_of_mobility_are_found(repeats):
     """A common tenfold change of D, SNR 5, N = 300: rho is 0.45 on average, and always found."""
     rng = np.random.default_rng(2)
     rho = []
-    for _ in range(repeats(5, 100)):
+    for _ in range(repeats(3, 100)):
         speed = switching_speed(299, rng, ratio=10, dwell=20)
         found = translation_rotation_correlation(moving(speed, speed, rng))
         assert found.p < 0.01
@@ -59,7 +59,7 @@ def test_common_changes_of_mobility_are_found(repeats):
 def test_intermittent_but_independent_motions_are_not_called_correlated(repeats):
     """The variance corrected for intermittency: 5 % false alarms, where the plain one has 22 %."""
     rng = np.random.default_rng(3)
-    count = repeats(20, 400)
+    count = repeats(10, 400)
     z = []
     for _ in range(count):
         one, other = (switching_speed(299, rng, ratio=10, dwell=20) for _ in range(2))
@@ -111,7 +111,7 @@ def test_attenuation_of_the_correlation_over_clusters(repeats):
     """Spread 0.3 and errors of 0.15 lower a correlation of 1 to 0.80; the corrected one is 1."""
     rng = np.random.default_rng(6)
     measured, corrected, inside = [], [], []
-    for _ in range(repeats(60, 1000)):
+    for _ in range(repeats(30, 1000)):
         log = 0.3 * rng.normal(size=40)
         errors = np.exp(0.15 * rng.normal(size=(2, 40)))
         D_T = [estimate(0.04 * x, 0.15, "translation") for x in np.exp(log) * errors[0]]

@@ -18,7 +18,7 @@ def free(seed=1, n_frames=600, dt=1.0):
 def test_a_cage_without_hops_has_an_upper_limit(repeats):
     """The threshold rule finds no diffusion where added steps show about 0.09 L^4 a frame."""
     rng = np.random.default_rng(5)
-    motions = [caged(2000, rng) for _ in range(repeats(4, 40))]
+    motions = [caged(2000, rng) for _ in range(repeats(3, 40))]
     found = [long_time_diffusion(m) for m in motions]
     assert not any(f.resolved for f in found)
     assert all(0.5 < f.threshold < 0.7 for f in found)

@@ -40,7 +40,7 @@ def true_modulus(lag, *, alpha=0.5, D=1e-3):
 @pytest.mark.parametrize("make", [msad, msad_vector, msd])
 def test_a_newtonian_fluid_has_its_viscosity(make):
     """Rotation and translation of any body: G'' = viscosity times frequency, G' = 0."""
-    motion = simulate_motion(BODY, dt=0.5, n_frames=3000, rng=4)
+    motion = simulate_motion(BODY, dt=0.5, n_frames=1500, rng=4)
     found = viscoelastic_moduli(make(motion), cluster=BODY, temperature=300)
     fast = found.frequency > 0.1
     loss = 5e-3 * found.frequency
