@@ -18,12 +18,12 @@ def free(seed=1, n_frames=600, dt=1.0):
 def test_a_cage_without_hops_has_an_upper_limit(repeats):
     """The threshold rule finds no diffusion where added steps show about 0.09 L^4 a frame."""
     rng = np.random.default_rng(5)
-    motions = [caged(2000, rng) for _ in range(repeats(4, 40))]
+    motions = [caged(2000, rng) for _ in range(repeats(3, 40))]
     found = [long_time_diffusion(m) for m in motions]
     assert not any(f.resolved for f in found)
     assert all(0.5 < f.threshold < 0.7 for f in found)
     # The short-time D of the cage is L^2/5 = 2e-3 a frame.
-    assert all(0 <= f.ci95[1] < 1e-4 for f in found)
+    assert all(0 <= f.ci95[1] < 2e-4 for f in found)
     assert "< " in str(found[0])
     assert "95 % limit" in str(found[0])
     added = long_time_diffusion(motions, threshold=0)
@@ -99,5 +99,7 @@ def test_faults_are_named_together():
         long_time_diffusion([])
     with pytest.raises(ValueError, match="at least 24 steps, the longest has 19"):
         long_time_diffusion(free(n_frames=20))
+    with pytest.raises(ValueError, match="no translation at all"):
+        long_time_diffusion(caged(100, np.random.default_rng(1)), quantity="translation")
     with pytest.raises(TooFewFramesError):
         long_time_diffusion(free(n_frames=1))

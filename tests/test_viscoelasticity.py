@@ -40,7 +40,7 @@ def true_modulus(lag, *, alpha=0.5, D=1e-3):
 @pytest.mark.parametrize("make", [msad, msad_vector, msd])
 def test_a_newtonian_fluid_has_its_viscosity(make):
     """Rotation and translation of any body: G'' = viscosity times frequency, G' = 0."""
-    motion = simulate_motion(BODY, dt=0.5, n_frames=3000, rng=4)
+    motion = simulate_motion(BODY, dt=0.5, n_frames=1500, rng=4)
     found = viscoelastic_moduli(make(motion), cluster=BODY, temperature=300)
     fast = found.frequency > 0.1
     loss = 5e-3 * found.frequency
@@ -137,6 +137,15 @@ def test_results_go_to_tables_and_json():
     assert "known within a factor of 1.5 from" in found.text
 
 
+def test_a_steady_drift_has_no_positive_storage_modulus():
+    """Ballistic motion: the exponent is 2, far beyond that of a fluid, and nothing fails."""
+    time = np.arange(300.0)[:, None, None]
+    walk = 0.01 * time + np.random.default_rng(2).normal(size=(300, 1, 3)).cumsum(axis=0) * 1e-3
+    found = viscoelastic_moduli(msd(walk, dt=1.0), cluster=SPHERE, temperature=300)
+    np.testing.assert_allclose(found.exponent, 2, atol=0.05)
+    assert np.all(found.storage < 0)
+
+
 def test_faults_are_named():
     """All faults of one call in one message; a curve too short; a noise that is not known."""
     curve = msd(np.random.default_rng(1).normal(size=(300, 1, 3)).cumsum(axis=0), dt=1.0)
@@ -149,6 +158,8 @@ def test_faults_are_named():
         )
     with pytest.raises(ValueError, match="has no residuals"):
         viscoelastic_moduli(curve, cluster=SPHERE, temperature=300, noise="residual")
+    with pytest.raises(ValueError, match="does not move"):
+        viscoelastic_moduli(msd(np.zeros((300, 1, 3)), dt=1.0), cluster=SPHERE, temperature=300)
     short = simulate_motion(BODY, dt=0.5, n_frames=30, rng=4)
     with pytest.raises(ValueError, match="3 lags with data up to a tenth"):
         viscoelastic_moduli(short, cluster=BODY, temperature=300)

@@ -92,7 +92,7 @@ class LongTimeEstimate:
         name, unit = ("D_T", UNITS["translation"])
         if self.unit == UNITS["rotation"]:
             name, unit = ("D_R", UNITS["rotation"])
-        how = "" if not self.threshold else f", threshold {self.threshold:.2g} rad"
+        how = f" {self.threshold:.2g} rad" if self.method == "threshold" else ""
         low, high = self.lag_range
         over = f"over lag times of {low:.3g} to {high:.3g} s"
         tail = f"[{self.method}{how}, {self.n_frames} frames]"
@@ -164,7 +164,7 @@ def long_time_diffusion(
         If no two frames of one piece are present.
     ValueError
         For an unknown quantity, a threshold out of range or for translation, motions of different
-        dimensions or times between frames, or tracks under 24 steps.
+        dimensions or times between frames, motions at rest, or tracks under 24 steps.
 
     Notes
     -----
@@ -212,6 +212,8 @@ def long_time_diffusion(
         angle = float(threshold)
         method = "threshold" if angle else "added steps"
     walk = _PooledWalk.of(motions, quantity, threshold=angle)
+    if not np.nanmax(walk.curve.value) > 0:
+        raise ValueError(f"motion: no {quantity} at all, so that there is no D")
     window = _straight_window(walk.lags)
     weights = line_weights(window.steps)
     value, offset = window.line(weights)

@@ -51,6 +51,9 @@ _QUANTILE_POINTS = 41
 # The covariance is that of the fit before, until its parameters change by less than this.
 _CONVERGED, _MOST_ROUNDS = 1e-4, 20
 
+# Added to variances, relative: covariances of a mean square near exponent 2 are almost singular.
+_RIDGE = 1e-9
+
 _ARRAYS = (
     "frequency", "modulus", "exponent", "storage", "loss", "modulus_ci68", "exponent_ci68",
     "storage_ci68", "loss_ci68",
@@ -188,8 +191,8 @@ def viscoelastic_moduli(
     ------
     ValueError
         For an unknown choice or one that contradicts the curve, a temperature that is not in
-        kelvin, a single sphere without a diameter, residual noise that is not known, or a curve
-        with fewer than 5 lags of data up to a tenth of its length.
+        kelvin, a single sphere without a diameter, residual noise that is not known, a body that
+        does not move, or a curve with fewer than 5 lags of data up to a tenth of its length.
 
     Notes
     -----
@@ -239,6 +242,8 @@ def viscoelastic_moduli(
         curve = msad_vector(motion_or_curve) if turning else msd(motion_or_curve)
     if noise == "residual" and not np.isfinite(curve.noise):
         raise ValueError('noise: "residual" needs a curve of a motion; this one has no residuals')
+    if not np.nanmax(curve.value) > 0:
+        raise ValueError("motion_or_curve: the body does not move, so that there is no modulus")
     lags = GridLags.of(curve)
     longest = max(2 * int(lags.stretches[-1][0]) // _LONGEST_LAG, 1)
     spaced = np.rint(np.geomspace(1, longest, 1 + int(np.log(longest) / np.log(_LAG_RATIO))))
@@ -307,8 +312,13 @@ class _OffsetFit(NamedTuple):
 
 
 def _structure(fit: _OffsetFit, length: int) -> Floats:
-    """Return the half MSD of a noisy power law at 0, 1, ... length steps."""
-    half = fit.D * np.arange(length + 1.0) ** fit.alpha + fit.offset
+    """Return the half MSD of a noisy power law at 0, 1, ... length steps.
+
+    An offset below about -(1 - alpha/2) D has no motion: the spectrum of its steps would be
+    negative at the highest frequency. It is limited to nine tenths of that.
+    """
+    least = -0.9 * (1 - fit.alpha / 2) * fit.D
+    half = fit.D * np.arange(length + 1.0) ** fit.alpha + max(fit.offset, least)
     half[0] = 0.0
     return half
 
@@ -343,7 +353,7 @@ def _power_law(lags: GridLags, *, known: float | None) -> _OffsetFit:
     for _ in range(_MOST_ROUNDS):
         before = fit
         covariance = curve_covariance(lags, _structure(fit, length))
-        full = np.linalg.inv(np.linalg.cholesky(covariance))
+        full = np.linalg.inv(np.linalg.cholesky(covariance + _RIDGE * np.diag(np.diag(covariance))))
         # The offset is linear: its best value at any exponent is projected out.
         level = full @ np.ones_like(n)
         level *= (known is None) / np.linalg.norm(level)
@@ -411,7 +421,8 @@ def _local_power_laws(lags: GridLags, fit: _OffsetFit) -> tuple[Floats, Floats]:
         design = np.stack([np.ones_like(apart), apart], axis=1)
         line = np.linalg.solve((design.T * weight) @ design, design.T * weight)
         logs[j] = line @ log_y
-        root[j] = np.linalg.cholesky(line @ relative @ line.T)
+        errors = line @ relative @ line.T
+        root[j] = np.linalg.cholesky(errors + _RIDGE * np.diag(np.diag(errors)))
     return logs, root
 
 
