@@ -2,7 +2,7 @@
 
 from perrin.diffusion.anomalous import AnomalousEstimate, fit_anomalous
 from perrin.diffusion.bounds import cramer_rao
-from perrin.diffusion.confined import ConfinedEstimate, cage_size, fit_confined
+from perrin.diffusion.confined import ConfinedEstimate, cage_size, fit_confined, fit_confined_steps
 from perrin.diffusion.curve_fits import (
     GridLags,
     best_window,
@@ -43,6 +43,7 @@ from perrin.diffusion.spectral_likelihood import (
     StepModes,
     fit_scales,
     fit_scales_known_noise,
+    highest_maxima,
     motions_and_noise,
     shape_slope,
     step_blocks,
@@ -188,6 +189,7 @@ __all__ = [
     "find_jumps",
     "fit_anomalous",
     "fit_confined",
+    "fit_confined_steps",
     "fit_gls",
     "fit_line",
     "fit_scales",
@@ -196,6 +198,7 @@ __all__ = [
     "fractional_mean_square",
     "fractional_slope",
     "gls_weights",
+    "highest_maxima",
     "identity_limits",
     "imposed_symmetry",
     "invariant_basis",
