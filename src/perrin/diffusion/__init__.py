@@ -2,7 +2,7 @@
 
 from perrin.diffusion.anomalous import AnomalousEstimate, fit_anomalous
 from perrin.diffusion.bounds import cramer_rao
-from perrin.diffusion.confined import ConfinedEstimate, cage_size, fit_confined
+from perrin.diffusion.confined import ConfinedEstimate, cage_size, fit_confined, fit_confined_steps
 from perrin.diffusion.curve_fits import (
     GridLags,
     best_window,
@@ -257,6 +257,7 @@ __all__ = [
     "fit_anomalous",
     "fit_confined",
     "fit_decay",
+    "fit_confined_steps",
     "fit_gls",
     "fit_line",
     "fit_relaxation",

@@ -76,8 +76,8 @@ class ConfinedEstimate:
         Time between frames, s.
     quantity : {"rotation", "translation"}
     frame : {"mean", "body", "lab"}
-        Rotation: vectors from the mean orientation ("mean"), or body steps added up where the body
-        turns too far from it ("body"). Translation: "lab".
+        Rotation: vectors from the mean orientation ("mean") where they show a cage, else body steps
+        ("body"). Translation: "lab".
     noise : "joint", "residual" or float
         Model of the noise: fitted, from the residuals of the rigid fits, or the known localisation
         error, um.
@@ -186,7 +186,7 @@ def fit_confined(
     displacement 2 D (1 - exp(-k t))/k (Uhlenbeck and Ornstein 1930). The likelihood of the sine
     modes of the steps is maximised over k, and over D and the noise of each axis. A cage is found
     where the track lasts about six relaxation times or more. A rotation is taken as the vector from
-    the mean orientation while its rms is under 0.7 rad along each axis.
+    the mean orientation where its rms is under 0.7 rad along each axis and a cage is found.
 
     Examples
     --------
@@ -197,15 +197,49 @@ def fit_confined(
     """
     motions, settings = motions_and_noise(motion, quantity, noise, exposure)
 
+    if quantity == "translation":
+        return fit_confined_steps(motions, quantity, settings, frame="lab")
+    if motions[0].dimension == 3:
+        rms = [np.sqrt(np.nanmean(orientation_about_mean(m) ** 2)) for m in motions]
+        if max(rms) <= _SMALL_CAGE:
+            caged = fit_confined_steps(motions, quantity, settings, frame="mean")
+            if caged.resolved:
+                return caged
+    return fit_confined_steps(motions, quantity, settings, frame="body")
+
+
+def fit_confined_steps(
+    motions: Sequence[RigidMotion],
+    quantity: Quantity,
+    settings: Noise,
+    *,
+    frame: Literal["mean", "body", "lab"],
+) -> ConfinedEstimate:
+    """Fit motion in a harmonic well to steps in one frame.
+
+    Parameters
+    ----------
+    motions : sequence of RigidMotion
+    quantity : {"rotation", "translation"}
+    settings : Noise
+    frame : {"mean", "body", "lab"}
+        Attribute `frame` of the estimate.
+
+    Returns
+    -------
+    ConfinedEstimate
+
+    Examples
+    --------
+    >>> from perrin import Cluster, Noise, simulate_motion
+    >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=99, rng=3)
+    >>> fit_confined_steps([truth], "rotation", Noise(), frame="mean").frame
+    'mean'
+    """
+
     def mean_square(lag: Floats, shape: float) -> Floats:
         return confined_mean_square(lag, np.exp(shape), exposure=settings.exposure or 0.0)
 
-    frame: Literal["mean", "body", "lab"] = "lab"
-    if quantity == "rotation":
-        frame = "body"
-        if motions[0].dimension == 3:
-            rms = [np.sqrt(np.nanmean(orientation_about_mean(m) ** 2)) for m in motions]
-            frame = "mean" if max(rms) <= _SMALL_CAGE else "body"
     about: Literal["body", "mean"] = "mean" if frame == "mean" else "body"
     tracks = pooled_steps(motions, quantity, along=partial(principal_steps, frame=about))
     likelihood = ShapeLikelihood.of(tracks, settings, mean_square)

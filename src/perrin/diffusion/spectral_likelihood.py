@@ -10,7 +10,6 @@ in generalised eigenvectors of uneven ones. D and o of every axis are maximised 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
 from typing import TYPE_CHECKING, NamedTuple, Protocol, get_args
 
 import numpy as np
@@ -229,7 +228,7 @@ class ShapeLikelihood:
             D += weight * float(fit.D.sum())
             offset += weight * float(fit.offset.sum())
             variance += weight**2 * float(np.sum(fit.D**2 * fit.variance))
-        return ShapePoint(shape, value, slope, D, variance / D**2 if D else np.inf, offset)
+        return ShapePoint(float(shape), value, slope, D, variance / D**2 if D else np.inf, offset)
 
     def best(self, shapes: Floats) -> tuple[ShapePoint, list[ShapePoint]]:
         """Return the highest maximum over a range of shapes, and the points at `shapes`.
@@ -270,7 +269,7 @@ class ShapeLikelihood:
             Quantile of chi-squared with one degree of freedom.
         """
         # The root of twice the fall of the value is nearly straight in the shape parameter.
-        bound = np.sqrt(drop)
+        bound = float(np.sqrt(drop))
 
         def root(point: ShapePoint) -> float:
             return float(np.sqrt(max(2 * (best.value - point.value), np.finfo(float).tiny)))
@@ -372,9 +371,11 @@ def step_modes(block: StepBlock, mean_square: MeanSquare, shape: float) -> StepM
         slope = (more - less) / (2 * _SHAPE_STEP)
         noise = 2 * difference_eigenvalues(count)
         return StepModes(values, spectrum, noise, slope, lambda x: x**2 @ slope)
-    middle, less, more = (
-        step_covariance(block.time, partial(mean_square, shape=x)) for x in shapes
-    )
+
+    def covariance(shape: float) -> Floats:
+        return step_covariance(block.time, lambda lag: mean_square(lag, shape))
+
+    middle, less, more = map(covariance, shapes)
     difference = 2 * np.eye(count) - np.eye(count, k=1) - np.eye(count, k=-1)
     spectrum, axes = eigh(middle, difference)
     turned = (more - less) / (2 * _SHAPE_STEP) @ axes

@@ -209,9 +209,9 @@ def step_covariance(time: Floats, mean_square: Callable[[Floats], Floats]) -> Fl
 
     Examples
     --------
-    >>> step_covariance(np.array([0.0, 1, 4]), lambda lag: 2 * lag)
-    array([[2., 0.],
-           [0., 6.]])
+    >>> step_covariance(np.array([0.0, 1, 4]), lambda lag: 2.0 * (lag > 0))  # independent places
+    array([[ 2., -1.],
+           [-1.,  2.]])
     """
     square = mean_square(np.abs(time[:, None] - time))
     return np.asarray(-0.5 * np.diff(np.diff(square, axis=0), axis=1))
