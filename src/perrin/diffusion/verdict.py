@@ -92,7 +92,7 @@ class MotionVerdict:
         "drift" (um/s).
     model : AnomalousEstimate, ConfinedEstimate, DiffusionEstimate, SwitchingEstimate or None
         Fitted alternative; a `DiffusionEstimate` with its drift where the motion is steady; None
-        for diffusion, jumps and vibration.
+        for diffusion, jumps and vibration, and for several motions whose D changes.
     frames : tuple of int
         Rows of the motion at which jumps end.
     text : str
@@ -416,8 +416,11 @@ def _variance(
             "along the track"
         )
         return replace(verdict, text=_with_p(text, verdict.p_family))
-    motion = list(motions) if len(motions) > 1 else motions[0]
-    model = fit_switching(motion, quantity=quantity, noise=settings)
+    if len(motions) > 1:
+        # Every body has states of its own: the verdicts on each hold the fits.
+        text = f"The diffusion coefficient of the {quantity} changes in time"
+        return replace(verdict, kind="changing D", text=_with_p(text, verdict.p_family))
+    model = fit_switching(motions[0], quantity=quantity, noise=settings)
     text = _model_text("changing D", model, quantity)
     return replace(verdict, kind="changing D", model=model, text=_with_p(text, verdict.p_family))
 
