@@ -20,6 +20,7 @@ from perrin.plot.imaging import (
     tracks_figure,
 )
 from perrin.plot.motion import (
+    MOTION_CAPTION,
     alternative_spectrum,
     motion_figure,
     plot_error_distribution,
@@ -49,6 +50,7 @@ from perrin.plot.style import PALETTE, legend_above, new_figure, save_figure, wr
 
 __all__ = [
     "MAX_CLUSTERS",
+    "MOTION_CAPTION",
     "PALETTE",
     "ModelLine",
     "alternative_spectrum",

@@ -61,7 +61,7 @@ _SMALLEST_SQUARE, _SMALLEST_QUANTILE = 0.01, 0.01
 _VECTOR_POINTS = 1000  # more points are an image inside a PDF
 _NUMBERED_JUMPS = 5  # jumps whose row is written
 _LARGEST_ERROR = 8.0  # errors beyond this are counted in the legend
-_FEW_DECADES = 150.0  # ratio of the ends of an axis with more ticks than powers of ten
+_FEW_DECADES = 300.0  # ratio of the ends of an axis with more ticks than powers of ten
 _TITLE_LETTERS = 120  # letters in one line of the title
 
 # Shares of Brownian data inside the dark and the light band, and the opacity of both.
