@@ -182,7 +182,7 @@ class AxisModel:
             full(D[..., None]),
             full(offset[..., None]),
             full(self.tau),
-            full(linked),
+            full(linked.astype(np.float64)),
             blur=self.blur,
             weight=(one, one),
             known=(full(self.known[0]), full(self.known[1])),
@@ -215,7 +215,8 @@ class AxisModel:
 
         def cost(v: Floats) -> Floats:
             shape = relative(v)
-            return np.log(np.mean(power / shape, axis=-1)) + np.mean(np.log(shape), axis=-1)
+            mean = np.mean(power / shape, axis=-1)
+            return np.asarray(np.log(mean) + np.mean(np.log(shape), axis=-1))
 
         if not self.free:
             # One parameter: the root of the score in ln D, from the variance of the steps.
@@ -325,7 +326,7 @@ class AxisModel:
         # C = L diag(d) L^T with a bidiagonal L: each step takes up a part of the one before.
         z = np.sqrt(d) * rng.standard_normal((count, axes, self.n_steps))
         z[..., 1:] += lower[:, :-1] * z[..., :-1].copy()
-        return z
+        return np.asarray(z)
 
     def log_likelihood(self, fit: AxisFit) -> float:
         """Return the log-likelihood of the first data set at its fit, less a constant."""
@@ -380,7 +381,7 @@ class AxisModel:
         """
         if not self.even:
             ratio = sine_powers(self.prediction_errors(fit))
-            return ratio / ratio.mean(axis=-1, keepdims=True)
+            return np.asarray(ratio / ratio.mean(axis=-1, keepdims=True))
         ratio = sine_powers(fit.y) / self.eigenvalues(fit.D, fit.offset)
         ratio /= ratio.mean(axis=-1, keepdims=True)
         # A large mode draws the fit to itself, by its leverage h beyond that of the mean: without
@@ -462,7 +463,7 @@ class AxisModel:
                     self.tau[rows],
                     self.linked[rows],
                     blur=self.blur,
-                    weight=(1.0, 1.0),
+                    weight=(np.ones(1), np.ones(1)),
                     known=noise,
                 )
                 d, lower, _ = dpttrf(a, b)
@@ -628,7 +629,7 @@ def clustering(u: Floats) -> Floats:
     for lag in range(1, lags + 1):
         weight = 1 - lag / (lags + 1)
         total += weight * np.einsum("...n,...n->...", x[..., lag:], x[..., :-lag])
-    return total / variance
+    return np.asarray(total / variance)
 
 
 def slow_change(u: Floats, axes: int) -> Floats:
@@ -835,7 +836,8 @@ def brownian_tests(model: AxisModel, y: Floats) -> BrownianTests:
     """
     fit = model.fit(y)
     scores = model.scores(fit) if model.even else model.dense_scores(fit, y)
-    p = approximate_p(model, fit, scores)
+    values = approximate_p(model, fit, scores)
+    p = {name: float(value[0]) for name, value in values.items()}
     n = model.n_steps
     snr = float(
         np.mean(fit.D) * model.tau.mean() / max(np.mean(fit.offset + model.mean_known), 1e-300)
@@ -847,11 +849,9 @@ def brownian_tests(model: AxisModel, y: Floats) -> BrownianTests:
         near = model.fit(drawn, near=fit)
         again = model.scores(near) if model.even else model.dense_scores(fit, drawn)
         null = approximate_p(model, near, again)
-        p = {name: _rank(p[name][0], null[name]) for name in p}
+        p = {name: _rank(p[name], null[name]) for name in p}
     u = np.sum(model.prediction_errors(fit) ** 2, axis=1)[0]
-    return BrownianTests(
-        {k: float(np.ravel(v)[0]) for k, v in p.items()}, model, fit, scores, u, ranked
-    )
+    return BrownianTests(p, model, fit, scores, u, ranked)
 
 
 def approximate_p(model: AxisModel, fit: AxisFit, scores: tuple[Score, Score]) -> dict[str, Floats]:
@@ -884,7 +884,7 @@ def approximate_p(model: AxisModel, fit: AxisFit, scores: tuple[Score, Score]) -
     }
 
 
-def _rank(p: Floats, null: Floats) -> float:
+def _rank(p: float, null: Floats) -> float:
     """Return the rank of a p-value among those of draws, continued below the smallest of these."""
     order = np.sort(null)
     below = int(np.searchsorted(order, p, side="right"))

@@ -12,9 +12,9 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from perrin._arrays import refuse
 from perrin._text import number_text, unit_text
 from perrin.diffusion.anomalous import AnomalousEstimate
-from perrin.diffusion.brownian_tests import axis_model, sine_powers
 from perrin.diffusion.confined import ConfinedEstimate
 from perrin.diffusion.estimate import UNITS
+from perrin.diffusion.goodness_of_fit import axis_model, sine_powers
 from perrin.diffusion.noise_model import Noise
 from perrin.diffusion.step_spectra import (
     confined_autocovariance,
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure as Figure
 
     from perrin._arrays import Floats, Ints
-    from perrin.diffusion.brownian_tests import AxisFit, AxisModel
+    from perrin.diffusion.goodness_of_fit import AxisFit, AxisModel
     from perrin.diffusion.steps import Quantity
     from perrin.diffusion.verdict import MotionVerdict
     from perrin.motion.rigid_motion import RigidMotion
