@@ -1,4 +1,4 @@
-"""The examples of the conventions, tutorials and theory pages run, and print what the pages show."""
+"""The examples of the conventions, tutorial and theory pages run, and print what is shown."""
 
 import doctest
 import re
