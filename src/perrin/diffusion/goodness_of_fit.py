@@ -520,7 +520,7 @@ class AxisModel:
         Their shapes are (B, p), (B, p, p) and (B,). The motion is found by generalised least
         squares on `steady`, with D and the offset fitted
         once more to what is left. F has (p, nu) degrees of freedom, nu being twice the inverse
-        relative variance of D, summed over the axes.
+        relative variance of D, mean over the axes.
         """
         from scipy.linalg.lapack import dpttrf, dpttrs
         from scipy.special import fdtrc
