@@ -293,7 +293,7 @@ def combined_p(tested: Sequence[BrownianTests]) -> dict[str, float]:
         p[name] = float(gammaincc(len(tested), sum(logs)))
     if sum(one.model.n_steps for one in tested) >= 200:
         for i, name in enumerate(("fractional", "cage")):
-            total = Score(*np.sum([one.scores[i] for one in tested], axis=0))
+            total = Score.total([one.scores[i] for one in tested])
             p[name] = float(score_p(total, one_sided=name == "cage")[0])
     return p
 
@@ -375,7 +375,7 @@ def _steady_gain(tested: Sequence[BrownianTests]) -> tuple[float, float, float]:
         gain += model.log_likelihood(rest) - model.log_likelihood(fit)
         logs -= np.log(max(float(p[0]), 1e-300))
         scores.append((model.scores(rest) if model.even else model.dense_scores(rest, rest.y))[0])
-    p_rest = score_p(Score(*np.sum(scores, axis=0)), one_sided=False)
+    p_rest = score_p(Score.total(scores), one_sided=False)
     return gain, float(gammaincc(len(tested), logs)), float(p_rest[0])
 
 
