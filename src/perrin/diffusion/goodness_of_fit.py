@@ -83,7 +83,7 @@ class Score(NamedTuple):
 
     @classmethod
     def of(cls, value: Floats, g: Floats, *, information: Floats) -> Score:
-        """Return a score with the cumulants of modes g (B, A, N), scaled to the information (B,)."""
+        """Return a score with the cumulants of modes g (B, A, N), scaled to its information."""
         large = np.abs(g) > 0.5 * np.abs(g).max(axis=(-2, -1), keepdims=True)
         groups = np.stack([(g > 0) & large, (g > 0) & ~large, (g < 0) & large, (g < 0) & ~large])
         variance = 0.5 * np.sum(np.where(groups, g**2, 0.0), axis=(-2, -1))
@@ -447,7 +447,7 @@ class AxisModel:
         known = np.stack([by_D, by_offset] if self.free else [by_D], axis=-2)
         gram = np.einsum("...ik,...jk->...ij", known, known)
         right = np.einsum("...ik,x...k->x...i", known, g)
-        weight = np.linalg.solve(np.broadcast_to(gram, (2, *gram.shape)), right[..., None])[..., 0]
+        weight = np.linalg.solve(gram[None], right[..., None])[..., 0]
         return np.asarray(g - np.einsum("x...i,...ik->x...k", weight, known))
 
     def scores(self, fit: AxisFit) -> tuple[Score, Score]:
@@ -509,10 +509,9 @@ class AxisModel:
                     products.append(product)
                 U = np.stack(scores)
                 matrix = 0.5 * np.array([[np.sum(p * q.T) for q in products] for p in products])
-                known = slice(2, None)
-                weight = np.linalg.solve(matrix[known, known], matrix[known, :2])
-                value += U[:2] - weight.T @ U[known]
-                information += np.diag(matrix[:2, :2] - matrix[:2, known] @ weight)
+                weight = np.linalg.solve(matrix[2:, 2:], matrix[2:, :2])
+                value += U[:2] - weight.T @ U[2:]
+                information += np.diag(matrix[:2, :2] - matrix[:2, 2:] @ weight)
         g = np.broadcast_to(self.score_shapes(fit), (2, len(y), *fit.y.shape[1:]))
         known = np.broadcast_to(information[:, None], (2, len(y)))
         return (
