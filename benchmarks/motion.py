@@ -3,7 +3,8 @@
 Usage: python benchmarks/motion.py [--quick] [--jobs N] [TABLE ...]
 
 The tables are those of docs/validation.md: "levels" (share of Brownian tracks that each test
-rejects at 5 % and at 1 %, and the family of tests), "bodies" (the same for tracks of bodies with
+rejects at 5 % and at 1 %, and the family of tests), "pools" (the same for one verdict on several
+tracks), "bodies" (the same for tracks of bodies with
 unequal axes, through particles and rigid fits), "power" (share of other motions that each test
 rejects at 5 %) and "words" (what they are called). Steps of three axes are drawn directly for
 levels and power; bodies and words go through `judge_motion`. The exit status is the number of
@@ -22,6 +23,7 @@ from perrin.diffusion import (
     AxisModel,
     approximate_p,
     brownian_tests,
+    combined_p,
     confined_autocovariance,
     fractional_autocovariance,
     holm,
@@ -178,6 +180,25 @@ def level_cells(quick):
     return cells
 
 
+def pool_row(task):
+    """Return the line of one verdict on several tracks, and how many figures are beyond."""
+    n_steps, tracks, pools, seed = task
+    rng = np.random.default_rng([seed, n_steps, tracks])
+    model, p = even_model(n_steps), []
+    for _ in range(pools):
+        y = with_noise(steps_of_kind("brownian", n_steps, tracks, rng), 5.0, rng)
+        p.append(list(combined_p([brownian_tests(model, one[None]) for one in y]).values()))
+    p, cells, bad = np.array(p), [], 0
+    for one in p.T:
+        at_5, at_1 = np.mean(one < 0.05), np.mean(one < 0.01)
+        bad += beyond(at_5, pools, LEVEL) + beyond(at_1, pools, LEVEL_1)
+        cells.append(f"{100 * at_5:.1f}/{100 * at_1:.1f}")
+    family = np.mean([holm(one) < 0.05 for one in p])
+    bad += beyond(family, pools, FAMILY)
+    text = f"| {tracks} tracks, N = {n_steps}, SNR 5 | {pools} | "
+    return text + " | ".join(cells) + f" | {percent(family, pools)} |", bad
+
+
 POWER = {
     "alpha 0.5": ("fractional", 95),
     "alpha 0.8": ("fractional", 45),
@@ -321,6 +342,11 @@ def tables(quick, seed):
             level_row,
             [(cell, seed) for cell in level_cells(quick)],
         ),
+        "pools": (
+            f"| tracks of Brownian steps | pools | {tests} | family at 5 % |",
+            pool_row,
+            [(300, 5, 40, seed)] if quick else [(60, 20, 300, seed), (300, 5, 1000, seed)],
+        ),
         "bodies": (
             f"| body | tracks | {tests} | family at 5 % |",
             body_row,
@@ -346,7 +372,9 @@ def tables(quick, seed):
 def main():
     """Print the tables; the exit status is the number of figures beyond their limits."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("table", nargs="*", help="levels, bodies, power, words; all by default")
+    parser.add_argument(
+        "table", nargs="*", help="levels, pools, bodies, power, words; all by default"
+    )
     parser.add_argument("--quick", action="store_true")
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--seed", type=int, default=1)
