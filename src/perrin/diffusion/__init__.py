@@ -19,6 +19,7 @@ from perrin.diffusion.brownian_tests import (
     tabulated_p,
     tabulated_statistics,
 )
+from perrin.diffusion.changing import with_changing_interval
 from perrin.diffusion.confined import ConfinedEstimate, cage_size, fit_confined
 from perrin.diffusion.curve_fits import (
     GridLags,
@@ -280,5 +281,6 @@ __all__ = [
     "unit_covariance",
     "value_text",
     "weighted_variance",
+    "with_changing_interval",
     "without_spin",
 ]

@@ -523,7 +523,7 @@ def model_line(
     if estimate is None:
         return None
     symbol = _CURVE_NAMES[curve.quantity][1]
-    method = _METHODS.get(estimate.method, estimate.method)
+    method = _METHODS.get(estimate.method.partition(",")[0], estimate.method)
     text = f"{method} {symbol} {'= ' if estimate.resolved else ''}{value_text(estimate)}"
     return ModelLine(estimate.value, estimate.offset, 0.0, estimate.resolved, symbol, text)
 
