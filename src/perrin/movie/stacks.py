@@ -21,7 +21,7 @@ from perrin.images.stack import digest
 from perrin.movie.bodies import Bodies, find_bodies, stated_errors, tracks_of
 from perrin.movie.stages import Located, fit_poses, locate_frames
 from perrin.movie.workers import Work, check_workers
-from perrin.run.experiment import Experiment, Recording, merged_experiment
+from perrin.run.experiment import Experiment, MotionModel, Recording, merged_experiment
 from perrin.run.measure import library_version, measure_table
 from perrin.tracks.clock import Clock, evenly_spaced
 
@@ -124,7 +124,8 @@ def analyze_stack(
     **settings
         The fields of these objects as keywords of their own: ``dark``, ``minmass``, ``percentile``,
         ``border``; ``noise``, ``exposure``, ``drift``, ``keep_jumps``, ``model``,
-        ``viscosity``, ``temperature``; ``keep``, ``anew``, ``workers``, ``scheduler``, ``progress``.
+        ``viscosity``, ``temperature``; ``keep``, ``anew``, ``workers``, ``scheduler``,
+        ``progress``.
 
     Returns
     -------

@@ -95,7 +95,7 @@ _STEADY_LEVEL = 1e-3
 
 # A motion that is not diffusion is a warning below this p-value, shared by both quantities, and
 # half of it by all clusters where several are also judged together.
-_VERDICT_LEVEL = 0.01
+_VERDICT_LEVEL = 0.005
 
 # Noise floor and alike steps are tested at this number of standard errors (0.05 % of clean
 # tracks), the noise floor for any ratio sigma_z/sigma_xy up to this one.
@@ -691,6 +691,9 @@ def judge_bodies(
         for before, after in ((one.rotation, turn), (one.translation, path)):
             warnings += after.remarks.warnings[len(before.remarks.warnings) :]
             notes += after.remarks.notes[len(before.remarks.notes) :]
+        if any(words.is_not_diffusion(text) for text in turn.remarks.warnings):
+            # The offset of steps that contain another motion is no noise.
+            warnings = [text for text in warnings if not words.is_noise_floor(text)]
         result = replace(
             one.result,
             D_R=turn.estimate,

@@ -45,6 +45,20 @@ _ANGLES_SHOWN, _JUMPS_SHOWN = 5, 5
 
 _NOT_DIFFUSION = "not diffusion:"
 
+NOT_JUDGED = "fewer than 20 steps, or no motion"
+
+# What a motion shows, by its kind.
+_SHOWN_KINDS = {
+    "subdiffusion": "subdiffusion",
+    "superdiffusion": "superdiffusion",
+    "confined": "confinement",
+    "drift": "a drift",
+    "spin": "a spin",
+    "changing D": "a diffusion coefficient that changes in time",
+    "jumps": "jumps",
+    "vibration": "a vibration",
+}
+
 # At least one of this number of frame numbers occurs; numbers that are times in ms are sparser.
 SPARSE = 100
 
@@ -620,10 +634,9 @@ def jumps_verdict_text(
         where = f", in cluster{'s' if len(clusters) > 1 else ''} {listed(clusters)}"
     elif len(frames):
         where = f", at {frames_text(frames)}"
-    chance = f"p = {p:.2g}" if p >= JUMP_LEVEL else f"p < {JUMP_LEVEL:g}"
     return (
-        f"The {quantity} has steps too long for diffusion{where} ({chance}): a motion of the stage, "
-        "exchanged labels, hops or heavy tails."
+        f"The {quantity} has steps too long for diffusion{where} ({_p_text(p)}): a motion of the "
+        "stage, exchanged labels, hops or heavy tails."
     )
 
 
@@ -680,12 +693,19 @@ def not_diffusion_warning(verdict: MotionVerdict, estimate: DiffusionEstimate) -
     Parameters
     ----------
     verdict : MotionVerdict
+        Its text, with the parameters of the motion, is a result and not repeated.
     estimate : DiffusionEstimate
         Estimate of the same quantity, with the kind of its motion.
     """
     name = "D_R" if estimate.quantity == "rotation" else "D_T"
-    scale = f"; {name} holds {estimate.time_scale}" if estimate.time_scale else ""
-    return f"{_NOT_DIFFUSION} {verdict.text.rstrip('.')}{scale}"
+    return (
+        f"{_NOT_DIFFUSION} the {estimate.quantity} shows {_SHOWN_KINDS[verdict.kind]} "
+        f"({_p_text(verdict.p_family)}, all tests together); {name} holds {estimate.time_scale}"
+    )
+
+
+def _p_text(p: float) -> str:
+    return f"p = {p:.2g}" if p >= 1e-6 else "p < 1e-6"
 
 
 def no_model_notes(failures: Iterable[tuple[str, Exception | None]], model: str) -> list[str]:
@@ -703,7 +723,7 @@ def no_model_notes(failures: Iterable[tuple[str, Exception | None]], model: str)
     ['no fit of the confined model to the rotation: fewer than 20 steps, or no motion']
     """
     return [
-        f"no fit of the {model} model to the {quantity}: {error or 'fewer than 20 steps, or no motion'}"
+        f"no fit of the {model} model to the {quantity}: {error or NOT_JUDGED}"
         for quantity, error in failures
     ]
 
@@ -787,6 +807,17 @@ def noise_floor_warning(measured: float, stderr: float, *, predicted: float, gai
         f"{predicted:.3g} (likelihood ratio, {np.sqrt(gain):.1f} standard errors); motion blur "
         "lowers it, particles recorded one after another or noise that is smooth in time change it"
     )
+
+
+def is_noise_floor(text: str) -> bool:
+    """Return whether a warning is one of `noise_floor_warning`.
+
+    Examples
+    --------
+    >>> is_noise_floor("noise floor: the steps show"), is_noise_floor("jump: 3 um")
+    (True, False)
+    """
+    return text.startswith("noise floor:")
 
 
 # Sizes, predictions and pooled values.

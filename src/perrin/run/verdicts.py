@@ -17,20 +17,21 @@ from perrin.diffusion.step_tests import without_spin
 from perrin.diffusion.switching import SwitchingEstimate, fit_switching
 from perrin.diffusion.verdict import MotionVerdict, judge_motion
 from perrin.errors import PrecisionWarning
+from perrin.run.remarks import NOT_JUDGED
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     from perrin.diffusion.noise_model import Noise
     from perrin.diffusion.steps import Quantity
     from perrin.diffusion.verdict import Model
     from perrin.motion.rigid_motion import RigidMotion
     from perrin.run.experiment import MotionModel
-    from perrin.run.results import Report
+    from perrin.run.results import ClusterResult, Pooled, Report
 
 
 # The class of a fitted model, by a key that only its dictionary has.
-_MODEL_KEYS = {
+_MODEL_KEYS: dict[str, Any] = {
     "alpha": AnomalousEstimate,
     "cage": ConfinedEstimate,
     "D_slow": SwitchingEstimate,
@@ -150,12 +151,15 @@ def fit_model(
         else:
             path = np.outer(motion.time, estimate.drift[0])
             diffusing.append(replace(motion, center=motion.center - path))
-    fit = {"anomalous": fit_anomalous, "confined": fit_confined, "switching": fit_switching}[model]
+    fits: dict[str, Callable[..., Model]] = {
+        "anomalous": fit_anomalous,
+        "confined": fit_confined,
+        "switching": fit_switching,
+    }
     some = diffusing if len(diffusing) > 1 else diffusing[0]
     with python_warnings.catch_warnings():
         python_warnings.simplefilter("ignore", PrecisionWarning)
-        found: Model = fit(some, quantity=quantity, noise=replace(noise, drift=False))
-    return found
+        return fits[model](some, quantity=quantity, noise=replace(noise, drift=False))
 
 
 def verdicts_to_dict(verdicts: Mapping[str, MotionVerdict | None]) -> dict[str, Any]:
@@ -216,39 +220,42 @@ def verdict_lines(report: Report) -> dict[str, list[str]]:
     'The rotation is consistent with diffusion (p'
     """
     lines: dict[str, list[str]] = {}
-    several = len(report.clusters) > 1
+    several, pooled = len(report.clusters) > 1, report.pooled
     for name in ("rotation", "translation") if report.clusters else ():
-        verdict = None if report.pooled is None else report.pooled.verdicts.get(name)
-        if not several:
-            verdict = report.clusters[0].verdicts.get(name)
-        lines[name] = [] if verdict is None else sentences(verdict)
-        if several and report.pooled is not None and lines[name]:
-            count = len(report.pooled.clusters)
-            together = f"All {count} pooled clusters together: " if count > 1 else ""
-            lines[name][0] = together + lines[name][0]
+        source = pooled if several else report.clusters[0]
+        texts = [] if source is None else motion_sentences(source, name)
         if several:
-            lines[name].append(kinds_text(report, name))
-        elif verdict is None:
-            lines[name] = [f"The {name} was not judged: fewer than 20 steps, or no motion."]
+            if texts and pooled is not None and len(pooled.clusters) > 1:
+                texts[0] = f"All {len(pooled.clusters)} pooled clusters together: {texts[0]}"
+            texts.append(kinds_text(report, name))
+        lines[name] = texts or [f"The {name} was not judged: {NOT_JUDGED}."]
     return lines
 
 
-def sentences(verdict: MotionVerdict) -> list[str]:
-    """Return the verdict, what it could not have seen, and the fit that was asked for.
+def motion_sentences(result: ClusterResult | Pooled, quantity: str) -> list[str]:
+    """Return what kind of motion a result shows, with the fit, and over which time its D holds.
 
     Parameters
     ----------
-    verdict : MotionVerdict
+    result : ClusterResult or Pooled
+    quantity : {"rotation", "translation"}
 
     Returns
     -------
     list of str
-        The text of a verdict of diffusion contains what could have been seen, and that of another
-        kind its own fit.
+        Empty where the motion was not judged. A verdict of diffusion contains what could have been
+        seen, and one of another kind its parameters; a further fit is one that was asked for, or D
+        without the steady motion.
     """
+    verdict = result.verdicts.get(quantity)
+    if verdict is None:
+        return []
     texts = [verdict.text]
     if verdict.model is not None and str(verdict.model) not in verdict.text:
         texts.append(f"Fitted: {verdict.model}.")
+    name, estimate = ("D_R", result.D_R) if quantity == "rotation" else ("D_T", result.D_T)
+    if verdict.kind != "diffusion" and estimate.time_scale:
+        texts.append(f"{name} holds {estimate.time_scale}.")
     return texts
 
 
