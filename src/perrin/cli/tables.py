@@ -61,7 +61,7 @@ def show_report(report: Report, output: Path, command: Callable[..., None]) -> N
     from rich.markup import escape
 
     from perrin.run.results import perp_text
-    from perrin.run.verdicts import verdict_lines
+    from perrin.run.statements import verdict_lines
 
     console = Console(highlight=False)
     for result in report.clusters[:_CLUSTERS_SHOWN]:

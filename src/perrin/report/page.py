@@ -23,7 +23,7 @@ from perrin.plot.results import MAX_CLUSTERS
 from perrin.report.html import byline, captioned, inline_pictures, render_page
 from perrin.run.remarks import condensed, grouped
 from perrin.run.results import floor_factor
-from perrin.run.verdicts import motion_sentences, verdict_lines
+from perrin.run.statements import motion_sentences, verdict_lines
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -72,7 +72,7 @@ _RESULT_CAPTIONS = {
     ),
     "motion": (
         "Steps against Brownian motion.",
-        "The steps of the rotation and of the translation, compared with those of diffusion with one "
+        "The steps of rotation and translation, compared with those of diffusion with one "
         "D and one noise.",
         "The tests behind the verdict see what these pictures show.",
     ),

@@ -100,16 +100,9 @@ from perrin.run.results import (
     predicted_noise,
     write_data,
 )
+from perrin.run.statements import kinds_text, motion_sentences, verdict_lines
 from perrin.run.tables import analyze, read_table
-from perrin.run.verdicts import (
-    fit_model,
-    judge_each_and_all,
-    kinds_text,
-    motion_sentences,
-    verdict_lines,
-    verdicts_from_dict,
-    verdicts_to_dict,
-)
+from perrin.run.verdicts import fit_model, judge_each_and_all, verdicts_from_dict, verdicts_to_dict
 
 __all__ = [
     "ClusterResult",
