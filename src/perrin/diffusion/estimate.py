@@ -20,7 +20,7 @@ NORMAL = {0.68: 0.9945, 0.95: 1.9600}  # half widths of intervals in standard er
 # Over which times a value holds, by the kind of the motion.
 _TIME_SCALES = {
     "diffusion": "{frame} and at longer times",
-    "jumps": "{frame} and at longer times, jumps aside",
+    "jumps": "{frame}; it does not describe the jumps",
     "drift": "{frame}; the steady motion dominates at long times",
     "spin": "{frame}; the steady motion dominates at long times",
     "changing D": "{frame}, as a mean over the track",
