@@ -38,7 +38,6 @@ from zlib import crc32
 
 import numpy as np
 import pandas as pd
-from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 from scipy.stats import binom
 
@@ -170,6 +169,8 @@ def brownian(body, times, *, D_R, D_T, rng):
 
 def smooth(shape, *, size, memory, rng):
     """Return stationary noise (T, ...) of standard deviation `size`, correlated over frames."""
+    from scipy.signal import lfilter
+
     a = np.exp(-1 / memory)
     warm = int(8 * memory)
     white = rng.normal(size=(shape[0] + warm, *shape[1:])) * size * np.sqrt(1 - a * a)

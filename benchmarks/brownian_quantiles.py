@@ -1,7 +1,7 @@
 """Write the null laws of the tests of Brownian motion that have no closed form.
 
 Independent normal prediction errors, each axis scaled to a mean square of 1, give the quantiles of
-four statistics of perrin.diffusion.brownian_tests for 1 to 3 axes and 20 to 10000 steps. They are
+four statistics of perrin.diffusion.goodness_of_fit for 1 to 3 axes and 20 to 10000 steps. They are
 kept in the package; run this again after a change of a statistic (about five minutes):
 
     python benchmarks/brownian_quantiles.py
@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from perrin.diffusion import brownian_tests
+from perrin.diffusion import goodness_of_fit
 
 LENGTHS = (20, 30, 50, 75, 100, 150, 200, 300, 500, 1000, 3000, 10000)
 UPPER = (0.9, 0.7, 0.5, 0.3, 0.2, 0.1, 0.05, 0.02, 0.01, 0.005, 0.002, 0.001)
@@ -29,7 +29,8 @@ def quantiles(axes: int, n_steps: int, rng: np.random.Generator) -> dict[str, np
     for start in range(0, draws, batch):
         e = rng.standard_normal((min(batch, draws - start), axes, n_steps))
         e /= np.sqrt(np.mean(e * e, axis=-1, keepdims=True))
-        for name, values in brownian_tests.tabulated_statistics(np.sum(e * e, axis=1), axes).items():
+        statistics = goodness_of_fit.tabulated_statistics(np.sum(e * e, axis=1), axes)
+        for name, values in statistics.items():
             found.setdefault(name, []).append(values)
     return {name: np.quantile(np.concatenate(v), 1 - np.array(UPPER)) for name, v in found.items()}
 
@@ -43,7 +44,7 @@ def main() -> None:
             for name, values in quantiles(axes, n_steps, rng).items():
                 rows.append(f"{name},{axes},{n_steps}," + ",".join(f"{v:.5g}" for v in values))
             print(rows[-1], flush=True)
-    path = Path(brownian_tests.__file__).with_name("brownian_quantiles.csv")
+    path = Path(goodness_of_fit.__file__).with_name("brownian_quantiles.csv")
     path.write_text("\n".join(rows) + "\n", encoding="utf-8")
 
 

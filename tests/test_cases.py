@@ -9,7 +9,6 @@ import re
 import numpy as np
 import pandas as pd
 import pytest
-from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 import perrin
@@ -18,6 +17,13 @@ DT = 0.73
 D_R = 5e-3
 TETRA = 1.5 * np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / np.sqrt(3)
 EVEN = np.arange(300) * DT
+
+
+def remembered(white, share):
+    """Return noise of which each frame keeps this share of the one before."""
+    from scipy.signal import lfilter
+
+    return lfilter([np.sqrt(1 - share**2)], [1, -share], white, axis=0)
 
 
 def triangle(a, b, c):
@@ -160,7 +166,7 @@ def test_a_body_at_rest_is_one_body():
     Its 250 frames are worth about 3 independent ones per coordinate of 3 degrees of freedom.
     """
     e = np.random.default_rng(5).normal(size=(250, 3, 3))
-    smooth = lfilter([np.sqrt(1 - 0.98**2)], [1, -0.98], e, axis=0)
+    smooth = remembered(e, 0.98)
     cluster = only(perrin.analyze(table(triangle(2.45, 2.45, 2.45) + 0.002 * smooth), dt=DT))
     assert len(cluster.motion.template) == 3
     assert cluster.motion.sigma == pytest.approx(0.0016, rel=0.05)
@@ -294,7 +300,7 @@ def test_nothing_is_pooled_where_no_cluster_is_rigid(repeats):
     bodies = []
     for seed in (3, 4):
         x, rng = tetrahedra(seed, 0.02, times=times)
-        soft = lfilter([np.sqrt(1 - 0.9**2)], [1, -0.9], rng.normal(size=x.shape), axis=0)
+        soft = remembered(rng.normal(size=x.shape), 0.9)
         bodies.append(table(x + 0.3 * soft).assign(cluster=seed))
     rows = pd.concat(bodies, ignore_index=True)
     rows["particle"] += 10 * rows["cluster"]

@@ -157,7 +157,7 @@ def test_a_cage_has_its_plateau_and_its_relaxation(cluster):
     D_R, D_T, dt, tau = 2e-4, 0.04, 0.5, 4.0
     lags = np.array([1, 8, 100])
     turned, moved = [], []
-    for seed in range(60):
+    for seed in range(30):
         motion = simulate(Confined(tau), cluster, D_R=D_R, D_T=D_T, dt=dt, n_frames=301, rng=seed)
         turn = np.swapaxes(motion.rotation[:1], -1, -2) @ motion.rotation
         for found, x in ((turned, log_map(turn)), (moved, motion.center)):
@@ -171,12 +171,12 @@ def test_a_cage_takes_a_tensor_in_body_axes():
     """Short steps have the covariance 2 D dt of the tensor, and the steps of g_0 and g_1."""
     D = np.array([[3.0, 0.5, 0.2], [0.5, 2.0, -0.3], [0.2, -0.3, 1.0]]) * 1e-4
     kappa = 0.1
-    motion = simulate(Confined(1 / kappa), D_R=D, n_frames=40_001)
+    motion = simulate(Confined(1 / kappa), D_R=D, n_frames=20_001)
     y = body_steps(motion)
     g = 2 * -np.expm1(-kappa) / kappa, -(np.expm1(-kappa) ** 2) / kappa
-    np.testing.assert_allclose(y.T @ y / len(y), g[0] * D, atol=0.03 * g[0] * D.max())
+    np.testing.assert_allclose(y.T @ y / len(y), g[0] * D, atol=0.04 * g[0] * D.max())
     lagged = y[1:].T @ y[:-1] / (len(y) - 1)
-    np.testing.assert_allclose(lagged, g[1] * D, atol=0.03 * g[0] * D.max())
+    np.testing.assert_allclose(lagged, g[1] * D, atol=0.04 * g[0] * D.max())
 
 
 def test_a_relaxing_coordinate_does_not_depend_on_the_sampling():
@@ -283,7 +283,7 @@ def test_a_caged_body_diffuses_by_its_hops_alone():
     """
     angle, interval, tau, D_R = 0.8, 100.0, 5.0, 2e-3
     kept = []
-    for seed in range(60):
+    for seed in range(30):
         motion = simulate(
             Hopping(angle, interval, relaxation_time=tau), D_R=D_R, n_frames=1001, rng=seed
         )

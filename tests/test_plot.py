@@ -435,3 +435,7 @@ def test_van_hove_shows_the_bins_and_the_gaussian(space):
     np.testing.assert_allclose(line(ax, "Gaussian").get_ydata(), result.gaussian)
     assert "α₂" in points.get_label()
     assert ax.get_xlabel() == "rotation in 1 s (rad)"
+    angles = perrin.van_hove(space.motion, lag=1.0, quantity="angle", bins=9)
+    ax = drawn(plot.plot_van_hove(angles, ax=axes()))
+    np.testing.assert_allclose(line(ax, "Brownian rotation").get_ydata(), angles.brownian)
+    assert ax.get_xlabel() == "rotation angle in 1 s (rad)"

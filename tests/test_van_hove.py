@@ -70,7 +70,8 @@ def test_the_density_is_a_density():
     width = np.diff(found.edges)
     assert found.density @ width == pytest.approx(1, rel=1e-12)
     assert found.gaussian @ width == pytest.approx(1, rel=0.01)
-    assert list(found.to_frame()) == ["low", "high", "density", "stderr", "gaussian"]
+    names = ["low", "high", "density", "stderr", "gaussian", "brownian"]
+    assert list(found.to_frame()) == names
     cut = van_hove(brownian_center(1), lag=3.0, quantity="translation", bins=[0.0, 1.0])
     inside = found.n_pairs * 3 * cut.density[0]
     assert inside == pytest.approx(round(inside), abs=1e-6)

@@ -5,6 +5,13 @@ from perrin.curves.correlation import (
     orientation_correlation,
     quaternion_covariance,
 )
+from perrin.curves.correlation_errors import (
+    brownian_decay,
+    correlation_covariance,
+    correlation_stderr,
+    frames_present,
+    product_weights,
+)
 from perrin.curves.displacement import (
     LagCurve,
     angle_curve,
@@ -21,8 +28,31 @@ from perrin.curves.displacement import (
     msad_vector,
     msd,
 )
-from perrin.curves.distributions import VanHove, gaussian_bins, mean_correlation_powers, van_hove
+from perrin.curves.distributions import (
+    VanHove,
+    bins_fault,
+    gaussian_bins,
+    mean_correlation_powers,
+    radial_bins,
+    van_hove,
+)
+from perrin.curves.gaussianity import (
+    brownian_alpha2,
+    brownian_angle_time,
+    corrected_excess,
+    heat_kernel_moments,
+    non_gaussian,
+    turned_angles,
+    whole_lags,
+    without_noise,
+)
 from perrin.curves.grids import GRID_TOLERANCE, Frames, grid_step, place_frames
+from perrin.curves.noise_offsets import (
+    center_offset,
+    correction_fault,
+    neighbour_covariance,
+    orientation_offsets,
+)
 from perrin.curves.pairs import (
     Kernel,
     ListedPairs,
@@ -32,6 +62,7 @@ from perrin.curves.pairs import (
     fft_size,
     lag_bins,
     pair_sums,
+    pairs_apart,
 )
 from perrin.curves.standard_errors import (
     covariance_polynomials,
@@ -55,14 +86,25 @@ __all__ = [
     "angle_curve",
     "axes_weighted_equally",
     "axis_ratio",
+    "bins_fault",
     "body_directions",
+    "brownian_alpha2",
+    "brownian_angle_time",
+    "brownian_decay",
+    "center_offset",
+    "corrected_excess",
+    "correction_fault",
+    "correlation_covariance",
+    "correlation_stderr",
     "covariance_polynomials",
     "direction_weights",
     "displacement_counts",
     "drift_corrected",
     "fft_size",
+    "frames_present",
     "gaussian_bins",
     "grid_step",
+    "heat_kernel_moments",
     "independent_walks",
     "lag_bins",
     "mean_correlation_powers",
@@ -72,12 +114,21 @@ __all__ = [
     "msad_axes",
     "msad_vector",
     "msd",
+    "neighbour_covariance",
+    "non_gaussian",
     "orientation_correlation",
+    "orientation_offsets",
     "pair_sums",
+    "pairs_apart",
     "place_frames",
+    "product_weights",
     "quaternion_covariance",
+    "radial_bins",
     "relative_error",
     "squared_shared_times",
+    "turned_angles",
     "two_lag_fit",
     "van_hove",
+    "whole_lags",
+    "without_noise",
 ]

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from perrin._arrays import choice_fault, from_plain, number_fault, refuse, to_plain
-from perrin.curves.displacement import LagCurve, body_directions
+from perrin.curves.correlation_errors import correlation_stderr
+from perrin.curves.displacement import LagCurve, body_directions, direction_weights
 from perrin.curves.grids import place_frames
+from perrin.curves.noise_offsets import correction_fault, orientation_offsets
 from perrin.curves.pairs import Products, pair_sums
 
 if TYPE_CHECKING:
@@ -134,7 +136,11 @@ def quaternion_covariance(
 
 
 def orientation_correlation(
-    motion: RigidMotion, *, degree: int = 1, directions: ArrayLike | None = None
+    motion: RigidMotion,
+    *,
+    degree: int = 1,
+    directions: ArrayLike | None = None,
+    noise: Literal["residual", "joint"] | float | None = None,
 ) -> LagCurve:
     """Return the orientational correlation <P_l(p(t) . p(t + dt))> over all lag times.
 
@@ -146,23 +152,40 @@ def orientation_correlation(
         l = 1 or 2 of the Legendre polynomial.
     directions : array_like, shape (3,) or (K, 3), optional
         Body-fixed directions, averaged; default those of the particles.
+    noise : None, "residual", "joint" or float
+        Noise of the orientations that the curve is corrected for. None: no correction, the curve of
+        the orientations as they were measured. "residual": the noise that the residuals of the
+        rigid fits predict, frame by frame; right where all particles of a frame are recorded at the
+        same instant. A number is the known localisation error of one coordinate, um. "joint": the
+        offset of the steps, which includes motion blur, and holds where the motion is diffusion
+        from one frame to the next; a body that rattles in a cage has such an offset without noise.
 
     Returns
     -------
     LagCurve
-        Dimensionless curve that decays as exp(-l (l + 1) D_R t). ``stderr`` is NaN: the curve is
-        for display, the steps give D_R with a far smaller error. ``dof`` is l (l + 1) / 2, half the
-        rate over D_R.
+        Dimensionless curve that decays as exp(-l (l + 1) D_R t). ``stderr`` is the error of an
+        isotropic Brownian rotor with the decay of the curve, noise and missing frames included.
+        ``dof`` is l (l + 1) / 2, half the rate over D_R. ``noise`` is the variance of one
+        orientation (rad^2) that the residuals predict, corrected for or not.
 
     Raises
     ------
     ValueError
-        If the degree is not 1 or 2, or the motion is planar.
+        If the degree is not 1 or 2, the motion is planar, or the noise is none of those offered.
 
     Warns
     -----
     PrecisionWarning
         As `msd`.
+
+    Notes
+    -----
+    Noise of covariance S (rad^2) in every frame multiplies the correlation of a direction p by
+    exp(-l(l + 1) (tr S - p.S p)/2), which is exp(-l(l + 1) s) for isotropic noise s. It follows
+    from the mean of P_l of small angles, <angle^2> = tr S - p.S p for the noise of one frame, and
+    is exact to first order in S where p is a principal axis of the noise, or the body rotates
+    isotropically. The factor is taken out of every frame and direction before the average. Even a
+    corrected curve does not pass through 1 exactly: fit an amplitude (`fit_relaxation`).
 
     Examples
     --------
@@ -172,33 +195,57 @@ def orientation_correlation(
     >>> round(float(curve.value[49]), 1)  # exp(-2 x 0.01 x 50)
     0.4
     """
-    if degree not in (1, 2):
-        refuse(choice_fault("degree", degree, (1, 2)))
+    faults = [] if degree in (1, 2) else choice_fault("degree", degree, (1, 2))
+    refuse(faults + correction_fault(noise))
     if motion.dimension != 3:
         raise ValueError("orientation_correlation is for motions in three dimensions")
-    features = p = motion.orientation(body_directions(motion, directions))
+    body = body_directions(motion, directions)
+    features = p = motion.orientation(body)
     if degree == 2:
         # The five components of the quadrupole p p^T - 1/3, scaled so that their product is P_2.
         x, y, z = np.moveaxis(p, -1, 0)
         root = np.sqrt(3.0)
         squares = [root / 2 * (x * x - y * y), 1.5 * z * z - 0.5]
         features = np.stack([root * x * y, root * y * z, root * z * x, *squares], axis=-1)
+    unit = body / np.linalg.norm(body, axis=1, keepdims=True)
+    rate = degree * (degree + 1)
+    offset = 0.0
+    if noise is not None:
+        # Each frame contributes the root of the factor; across p, half of the trace.
+        covariance = orientation_offsets(motion, noise)
+        across = 0.5 * np.einsum("tij,ij->t", covariance, np.eye(3))[:, None]
+        across = across - 0.5 * np.einsum("ki,tij,kj->tk", unit, covariance, unit)
+        features = features * np.exp(0.5 * rate * across)[..., None]
+        offset = float(across[motion.fitted].mean())
     here = np.isfinite(motion.center[:, 0])
     frames = place_frames(motion.time, motion.piece, here, dt=motion.dt)
     columns = features.reshape(len(p), -1)
     sums = pair_sums(Products(columns, [[(i, i) for i in range(columns.shape[1])]]), frames)
-    # A mean of cosines that rounds above one is one.
-    value = np.minimum(sums.mean[:, 0] / p.shape[1], 1.0)
+    value = sums.mean[:, 0] / p.shape[1]
+    if noise is None:
+        value = np.minimum(value, 1.0)  # a mean of cosines that rounds above one is one
+    blocks = tuple(int(n) for n in frames.lengths)
+    damping = np.exp(-rate * offset)
+    stderr = correlation_stderr(
+        sums.lagtime / frames.step,
+        value * damping,
+        pairs=sums.pairs,
+        degree=degree,
+        directions=unit,
+        blocks=blocks,
+    )
     return LagCurve(
         lagtime=sums.lagtime,
         value=value,
         components=value[:, None].copy(),
-        stderr=np.full_like(value, np.nan),
+        stderr=stderr / damping,
         n_pairs=sums.pairs,
-        dof=degree * (degree + 1) // 2,
+        dof=rate // 2,
         quantity="orientation",
         unit="1",
         n_walks=1.0,
+        noise=float(np.trace(motion.orientation_noise @ direction_weights(unit))) / 2,
         step=frames.step,
-        blocks=tuple(int(n) for n in frames.lengths),
+        blocks=blocks,
+        directions=unit,
     )

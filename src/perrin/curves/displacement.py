@@ -55,8 +55,8 @@ class LagCurve:
     dof : int
         Number of angles or coordinates that diffuse: 3 for an MSD in space, 2 for an MSAD (1 in the
         plane).
-    quantity : {"rotation", "translation", "orientation"}
-        Kind of curve: an MSAD, an MSD, or a correlation of orientations.
+    quantity : {"rotation", "translation", "orientation", "non-Gaussian"}
+        Kind of curve: an MSAD, an MSD, a correlation of orientations, or a non-Gaussian parameter.
     unit : str
         Unit of the value: "rad^2", "um^2" or "1".
     n_walks : float
@@ -82,6 +82,11 @@ class LagCurve:
     ratio : tuple of float or None
         tr(D W)/dof over the mean of D about all axes, estimated from the motion's steps, and its
         standard error; None where all axes have the same weight.
+    directions : ndarray, shape (K, 3), or None
+        Body-fixed unit vectors whose correlations were averaged; None for other curves.
+    brownian : ndarray, shape (L,), or None
+        Value that Brownian motion with the same mean square would have; only for a non-Gaussian
+        parameter.
     """
 
     lagtime: Floats
@@ -100,15 +105,17 @@ class LagCurve:
     blocks: tuple[int, ...] = ()
     weights: Floats | None = None
     ratio: tuple[float, float] | None = None
+    directions: Floats | None = None
+    brownian: Floats | None = None
 
     def __post_init__(self) -> None:
         frozen(self.lagtime, self.value, self.components, self.stderr, self.n_pairs)
-        if self.weights is not None:
-            frozen(self.weights)
+        optional = (self.weights, self.directions, self.brownian)
+        frozen(*(array for array in optional if array is not None))
 
     def __repr__(self) -> str:
         names = {"rotation": "MSAD", "translation": "MSD", "orientation": "correlation"}
-        name = names[self.quantity]
+        name = names.get(self.quantity, "non-Gaussian parameter")
         return f"LagCurve({name}, {len(self.lagtime)} lags, dof={self.dof}, {self.unit})"
 
     def to_frame(self) -> pd.DataFrame:
@@ -120,6 +127,8 @@ class LagCurve:
         if self.components.shape[1] > 1:
             columns |= {f"value_{a}": self.components[:, i] for i, a in enumerate(axes)}
         columns |= {"stderr": self.stderr, "n_pairs": self.n_pairs}
+        if self.brownian is not None:
+            columns["brownian"] = self.brownian
         return pd.DataFrame(columns)
 
     def to_dict(self) -> dict[str, Any]:
@@ -164,8 +173,9 @@ class LagCurve:
         read["blocks"] = tuple(entry["blocks"])
         if entry["drift"] is not None:
             read["drift"] = tuple(entry["drift"])
-        if entry["weights"] is not None:
-            read["weights"] = from_plain(entry["weights"])
+        for name in ("weights", "directions", "brownian"):
+            if entry.get(name) is not None:
+                read[name] = from_plain(entry[name])
         if entry["ratio"] is not None:
             ratio, error = entry["ratio"]
             read["ratio"] = (ratio, np.inf if error is None else error)  # an unknown error is inf

@@ -11,9 +11,14 @@ from numpy.typing import ArrayLike
 
 from perrin._arrays import Floats, choice_fault, from_plain, frozen, refuse, to_plain
 from perrin.curves.displacement import angle_curve
+from perrin.curves.gaussianity import brownian_angle_time, without_noise
 from perrin.curves.grids import GRID_TOLERANCE
+from perrin.curves.noise_offsets import center_offset, correction_fault, orientation_offsets
+from perrin.curves.pairs import pairs_apart
 from perrin.curves.standard_errors import two_lag_fit
 from perrin.errors import TooFewFramesError
+from perrin.geometry.rotations import log_map
+from perrin.motion.simulate import heat_kernel_angles
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -38,17 +43,29 @@ class VanHove:
     stderr : ndarray, shape (B,)
         Standard error of the density for Gaussian motion; it accounts for overlapping pairs.
     gaussian : ndarray, shape (B,)
-        Gaussian of the same mean square, averaged over each bin.
+        Gaussian of the same mean square, averaged over each bin; for the angle that of the length
+        of a Gaussian vector (Maxwell).
     alpha2 : float
-        Non-Gaussian parameter <x^4>/(3 <x^2>^2) - 1, corrected for its bias in short tracks.
+        Non-Gaussian parameter <x^4>/(3 <x^2>^2) - 1, for the angle 3 <x^4>/(5 <x^2>^2) - 1,
+        corrected for its bias in short tracks and for noise.
     alpha2_stderr : float
-        Standard error of the non-Gaussian parameter about 0 for Gaussian motion.
+        Standard error of the non-Gaussian parameter about its Brownian value, for Brownian motion.
     n_pairs : int
         Number of pairs of frames.
-    quantity : {"rotation", "translation"}
-        Whether rotations or displacements were measured.
+    quantity : {"rotation", "translation", "angle"}
+        Whether rotations, displacements or angles of rotations were measured.
     unit : str
         Unit of the edges: "rad" or "um".
+    brownian : ndarray, shape (B,)
+        Law of Brownian motion of the same mean square, noise included, averaged over each bin: the
+        heat kernel on SO(3) for the angle, else the Gaussian.
+    alpha2_brownian : float
+        Non-Gaussian parameter of Brownian motion without noise: `brownian_alpha2` for the angle,
+        else 0.
+    alpha2_measured : float
+        Non-Gaussian parameter of the noisy motion.
+    noise : float
+        Noise variance of one axis of one frame that alpha2 is corrected for, rad^2 or um^2.
     """
 
     lagtime: float
@@ -61,9 +78,13 @@ class VanHove:
     n_pairs: int
     quantity: str
     unit: str
+    brownian: Floats
+    alpha2_brownian: float
+    alpha2_measured: float
+    noise: float
 
     def __post_init__(self) -> None:
-        frozen(self.edges, self.density, self.stderr, self.gaussian)
+        frozen(self.edges, self.density, self.stderr, self.gaussian, self.brownian)
 
     def to_frame(self) -> pd.DataFrame:
         """Return a table with a row per bin."""
@@ -76,6 +97,7 @@ class VanHove:
                 "density": self.density,
                 "stderr": self.stderr,
                 "gaussian": self.gaussian,
+                "brownian": self.brownian,
             }
         )
 
@@ -116,16 +138,20 @@ class VanHove:
         >>> VanHove.from_dict(van_hove(truth, lag=10.0).to_dict()).n_pairs
         40
         """
-        arrays = ("edges", "density", "stderr", "gaussian")
-        return cls(**(entry | {name: from_plain(entry[name]) for name in arrays}))
+        arrays = ("edges", "density", "stderr", "gaussian", "brownian")
+        read = entry | {name: from_plain(entry[name]) for name in arrays}
+        read["alpha2"] = np.nan if entry["alpha2"] is None else entry["alpha2"]
+        read["alpha2_stderr"] = np.inf if entry["alpha2_stderr"] is None else entry["alpha2_stderr"]
+        return cls(**read)
 
 
 def van_hove(
     motion: RigidMotion,
     *,
     lag: float,
-    quantity: Literal["rotation", "translation"] = "rotation",
+    quantity: Literal["rotation", "translation", "angle"] = "rotation",
     bins: int | ArrayLike = 31,
+    noise: Literal["residual", "joint"] | float | None = "residual",
 ) -> VanHove:
     """Return the distribution of rotations or displacements over one lag time (van Hove).
 
@@ -135,13 +161,19 @@ def van_hove(
         Positions and orientations against time.
     lag : float
         Lag time, s, a whole number of frames; pairs within a tenth of dt of it are used.
-    quantity : {"rotation", "translation"}
+    quantity : {"rotation", "translation", "angle"}
         Rotations are differences of the unbounded `RigidMotion.accumulated_rotation`, not the
-        rotation vectors between both frames, which end at pi. Components along all lab axes are
+        rotation vectors between both frames, which end at pi; their law is Gaussian for Brownian
+        motion. The angle is that of the rotation between both frames, 0 to pi, whose law is the
+        heat kernel on SO(3); in the plane it is the rotation. Components along all lab axes are
         taken together.
     bins : int or array_like, shape (B + 1,)
         Number of equal bins from the lowest to the highest value, symmetric about 0, or their edges
-        (rad or um); values beyond given edges lower the density's integral.
+        (rad or um); values beyond given edges lower the density's integral. The bins of the angle
+        begin at 0.
+    noise : "residual", "joint", float or None
+        Noise that alpha2 is corrected for, as in `non_gaussian`: Gaussian noise makes every
+        distribution more Gaussian. The densities are those that were measured.
 
     Returns
     -------
@@ -150,7 +182,7 @@ def van_hove(
     Raises
     ------
     ValueError
-        For a lag off the grid of frames, bad bins or quantity, or a body that does not move.
+        For a lag off the grid of frames, bad bins, quantity or noise, or a body that does not move.
     TooFewFramesError
         If no two frames are that lag apart.
 
@@ -162,54 +194,85 @@ def van_hove(
     >>> abs(result.alpha2) < 3 * result.alpha2_stderr
     True
     """
-    faults = choice_fault("quantity", quantity, ("rotation", "translation"))
+    faults = choice_fault("quantity", quantity, ("rotation", "translation", "angle"))
+    faults += correction_fault(noise)
     dt, span = motion.dt, motion.time[-1] - motion.time[0]
     steps = round(lag / dt)
     if abs(steps * dt - lag) > 1e-3 * dt or not 1 <= steps <= span / dt + GRID_TOLERANCE:
         faults.append(f"lag: expected a multiple of dt = {dt:g} s up to {span:g} s, got {lag!r}")
     edges = None if np.ndim(bins) == 0 else np.array(bins, dtype=np.float64)
-    if edges is None and int(np.asarray(bins)) < 1:
-        faults.append(f"bins: expected at least 1, got {bins!r}")
-    if edges is not None and (edges.ndim != 1 or edges.size < 2 or not np.all(np.diff(edges) > 0)):
-        faults.append("bins: expected a number, or rising edges, at least two of them")
-    refuse(faults)
+    refuse(faults + bins_fault(bins))
 
     rows = motion.fitted
-    time = motion.time[rows]
-    low, high = (time + lag + sign * GRID_TOLERANCE * dt for sign in (-1, 1))
-    partner = np.searchsorted(time, low)
-    there = np.flatnonzero(partner < np.searchsorted(time, high, side="right"))
-    first, last = rows[there], rows[partner[there]]
-    same = motion.piece[first] == motion.piece[last]
-    first, last = first[same], last[same]
+    first, last = pairs_apart(motion.time[rows] / dt, motion.piece[rows], lag / dt)
+    first, last = rows[first], rows[last]
     if not len(first):
         raise TooFewFramesError(f"no two frames of one piece are {lag:g} s apart", 0)
-
-    walk = motion.accumulated_rotation() if quantity == "rotation" else motion.center
+    if quantity == "translation":
+        walk, offset = motion.center, center_offset(motion, noise)
+    else:
+        walk = motion.accumulated_rotation()
+        covariance = orientation_offsets(motion, noise)[rows].mean(axis=0)
+        offset = float(np.trace(covariance)) / len(covariance)
+    angles = quantity == "angle" and motion.dimension == 3
     x = walk[last] - walk[first]
-    square = float(np.mean(x * x))
+    if angles:
+        turned = np.swapaxes(motion.rotation[first], -1, -2) @ motion.rotation[last]
+        x = np.linalg.norm(log_map(turned), axis=-1, keepdims=True)
+    axes = walk.shape[1] if angles else 1
+    square = float(np.mean(x * x)) / axes
     if square == 0:
         raise ValueError(
             "the body does not move: the distribution of its displacements has no width"
         )
     if edges is None:
         reach = float(np.abs(x).max())
-        edges = np.linspace(-reach, reach, int(np.asarray(bins)) + 1)
-    powers = mean_correlation_powers(motion, walk, lag, pairs=len(x)) / x.shape[1]
-    expected, spread = gaussian_bins(edges / np.sqrt(square), powers)
-    width = np.diff(edges)
+        edges = np.linspace(0.0 if angles else -reach, reach, int(np.asarray(bins)) + 1)
+    powers = mean_correlation_powers(motion, walk, lag, pairs=len(x)) / walk.shape[1]
+    heat = float(brownian_angle_time(3 * square)) if angles else 0.5 * square
+    expected, spread = (radial_bins if angles else gaussian_bins)(edges / np.sqrt(square), powers)
+    width, brownian = np.diff(edges), expected
+    if angles:
+        brownian = np.diff(np.interp(edges, *heat_kernel_angles(heat), left=0.0, right=1.0))
+    # The mean of r^4 over that of a Gaussian vector of `axes` components.
+    raw = float(np.mean(x**4) * axes / ((axes + 2) * (axes * square) ** 2) - 1 + 2 * powers[1])
+    alpha2, law, gain = np.nan, np.nan, np.inf
+    if heat > offset:
+        corrected, law = without_noise(raw, heat, offset=offset, curved=angles)
+        alpha2 = float(corrected)
+        gain = (heat / (heat - offset)) ** 2
     return VanHove(
         lagtime=float(np.mean(motion.time[last] - motion.time[first])),
         edges=edges,
         density=np.histogram(x, edges)[0] / (x.size * width),
         stderr=spread / width,
         gaussian=expected / width,
-        alpha2=float(np.mean(x**4) / (3 * square**2) - 1 + 2 * powers[1]),
-        alpha2_stderr=float(np.sqrt(8 / 3 * powers[3])),
+        alpha2=alpha2,
+        alpha2_stderr=float(np.sqrt(8 / (axes + 2) * powers[3])) * gain,
         n_pairs=len(x),
-        quantity=quantity,
-        unit="rad" if quantity == "rotation" else "um",
+        quantity="angle" if angles else quantity.replace("angle", "rotation"),
+        unit="um" if quantity == "translation" else "rad",
+        brownian=brownian / width,
+        alpha2_brownian=law,
+        alpha2_measured=raw,
+        noise=offset,
     )
+
+
+def bins_fault(bins: int | ArrayLike) -> list[str]:
+    """Return one line where bins are neither a number of them nor rising edges, or no line.
+
+    Examples
+    --------
+    >>> bins_fault(31), bins_fault([0.0, 0.5, 0.2])
+    ([], ['bins: expected a number, or rising edges, at least two of them'])
+    """
+    if np.ndim(bins) == 0:
+        return [] if int(np.asarray(bins)) >= 1 else [f"bins: expected at least 1, got {bins!r}"]
+    edges = np.asarray(bins, dtype=np.float64)
+    if edges.ndim == 1 and edges.size > 1 and np.all(np.diff(edges) > 0):
+        return []
+    return ["bins: expected a number, or rising edges, at least two of them"]
 
 
 def mean_correlation_powers(motion: RigidMotion, walk: Floats, lag: float, *, pairs: int) -> Floats:
@@ -288,3 +351,44 @@ def gaussian_bins(z: Floats, powers: Floats) -> tuple[Floats, Floats]:
         variance, rest = variance + coefficient * power, rest - coefficient
         last, this = this, (z * this - np.sqrt(k - 1) * last) / np.sqrt(k)
     return part, np.sqrt(variance + np.maximum(rest, 0.0) * powers[-1])
+
+
+def radial_bins(r: Floats, powers: Floats) -> tuple[Floats, Floats]:
+    """Return the part of the lengths of unit Gaussian vectors in each bin, and its error.
+
+    As `gaussian_bins`, with Laguerre polynomials of r^2/2: two vectors whose components have the
+    correlation c contribute c^(2k) to the k-th.
+
+    Parameters
+    ----------
+    r : ndarray, shape (B + 1,)
+        Edges of the bins in standard deviations of one of the three components; negative ones are
+        taken as 0.
+    powers : ndarray, shape (K,)
+        Third parts of the means of the powers of the correlation.
+
+    Returns
+    -------
+    part, stderr : ndarray, shape (B,)
+
+    Examples
+    --------
+    >>> part, stderr = radial_bins(np.array([0.0, 1.0]), np.full(100, 1 / 1500))
+    >>> float(part[0].round(4)), float(stderr[0].round(4))  # the root of p (1 - p)/500
+    (0.1987, 0.0178)
+    """
+    edge = np.maximum(r, 0.0)
+    below = np.array([erf(x / np.sqrt(2)) for x in edge])
+    part = np.diff(below - np.sqrt(2 / np.pi) * edge * np.exp(-edge * edge / 2))
+    # The integral of L_k^(1/2) over its weight is that weight times L_(k-1)^(3/2) x/k.
+    x = edge * edge / 2
+    weight = x**1.5 * np.exp(-x) * 2 / np.sqrt(np.pi)
+    last, this = np.zeros_like(x), np.ones_like(x)
+    variance, rest, norm = np.zeros_like(part), part * (1 - part), 1.0
+    orders = len(powers) // 2
+    for k in range(1, orders + 1):
+        norm *= (k + 0.5) / k  # the mean square of L_k^(1/2)
+        coefficient = np.diff(weight * this / k) ** 2 / norm
+        variance, rest = variance + coefficient * 3 * powers[2 * k - 1], rest - coefficient
+        last, this = this, ((2 * k + 0.5 - x) * this - (k + 0.5) * last) / k
+    return part, np.sqrt(variance + np.maximum(rest, 0.0) * 3 * powers[-1])

@@ -243,6 +243,36 @@ def _with_listed_pairs(
     return PairSums(mean, sums, count + within.astype(np.int64), within, listed)
 
 
+def pairs_apart(time: Floats, piece: Ints, lag: float) -> tuple[Ints, Ints]:
+    """Return the first and last element of all pairs of one piece that are one lag apart.
+
+    Parameters
+    ----------
+    time : ndarray, shape (N,)
+        Times in steps, rising within a piece.
+    piece : ndarray of int, shape (N,)
+        Piece of each time, sorted.
+    lag : float
+        Lag in steps; pairs within a tenth of a step of it are used.
+
+    Returns
+    -------
+    first, last : ndarray of int, shape (P,)
+
+    Examples
+    --------
+    >>> pairs_apart(np.array([0.0, 1.0, 3.0, 4.0]), np.zeros(4, dtype=int), 1.0)
+    (array([0, 2]), array([1, 3]))
+    """
+    # Pieces are moved apart, so that the times of all of them rise.
+    apart = np.ptp(time) + 2 * lag + 2
+    _, number = np.unique(piece, return_inverse=True)
+    t = time - time.min() + apart * number
+    partner = np.searchsorted(t, t + lag - GRID_TOLERANCE)
+    first = np.flatnonzero(partner < np.searchsorted(t, t + lag + GRID_TOLERANCE, side="right"))
+    return first, partner[first]
+
+
 def lag_bins(lag: Floats, *, longest: int, most: int) -> Ints:
     """Return the bin of every lag: 2n within a tenth of n steps, 2n + 1 from there to n + 1.
 

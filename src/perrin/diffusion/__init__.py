@@ -2,7 +2,30 @@
 
 from perrin.diffusion.anomalous import AnomalousEstimate, fit_anomalous
 from perrin.diffusion.bounds import cramer_rao
-from perrin.diffusion.brownian_tests import (
+from perrin.diffusion.confined import ConfinedEstimate, cage_size, fit_confined, fit_confined_steps
+from perrin.diffusion.curve_fits import (
+    GridLags,
+    best_window,
+    fit_gls,
+    fit_line,
+    gls_weights,
+    line_weights,
+    msd_covariance,
+    slope_interval,
+    weighted_variance,
+)
+from perrin.diffusion.decoupling import (
+    CoefficientCorrelation,
+    DecouplingRatio,
+    MobilityCorrelation,
+    decoupling_ratio,
+    diffusion_correlation,
+    prediction_errors,
+    translation_rotation_correlation,
+)
+from perrin.diffusion.estimate import DiffusionEstimate, Found, bare_text, value_text
+from perrin.diffusion.estimators import by_likelihood, estimate_diffusion, precision_limits
+from perrin.diffusion.goodness_of_fit import (
     AxisFit,
     AxisModel,
     BrownianTests,
@@ -42,8 +65,17 @@ from perrin.diffusion.likelihood import (
     newton_crossing,
     secant_trial,
 )
+from perrin.diffusion.long_time import LongTimeEstimate, long_time_diffusion
 from perrin.diffusion.moments import Moments, covariance_estimate, step_cosines, trace_estimate
 from perrin.diffusion.noise_model import Noise, noise_faults
+from perrin.diffusion.relaxation import (
+    Decay,
+    RelaxationEstimate,
+    fit_decay,
+    fit_relaxation,
+    log_interval,
+    relaxation_faults,
+)
 from perrin.diffusion.rods import estimate_rod
 from perrin.diffusion.sampling import (
     SamplingBudget,
@@ -61,6 +93,7 @@ from perrin.diffusion.spectral_likelihood import (
     StepModes,
     fit_scales,
     fit_scales_known_noise,
+    highest_maxima,
     motions_and_noise,
     shape_slope,
     step_blocks,
@@ -109,10 +142,14 @@ from perrin.diffusion.steps import (
     principal_steps,
     residual_freedom,
     steps_of,
-    unit_center_variance,
-    unit_covariance,
 )
-from perrin.diffusion.switching import Parameter, SwitchingEstimate, SwitchingSteps, fit_switching
+from perrin.diffusion.switching import (
+    Parameter,
+    SwitchingEstimate,
+    SwitchingSteps,
+    equalised_steps,
+    fit_switching,
+)
 from perrin.diffusion.tensor_likelihood import (
     ArrowHessian,
     Maximum,
@@ -142,6 +179,7 @@ from perrin.diffusion.tensors import (
     template_alignments,
 )
 from perrin.diffusion.verdict import MotionVerdict, combined_p, detectable_by, judge_motion
+from perrin.diffusion.viscoelasticity import Moduli, curve_covariance, viscoelastic_moduli
 
 __all__ = [
     "JUMP_LEVEL",
@@ -150,8 +188,11 @@ __all__ = [
     "AxisFit",
     "AxisModel",
     "BrownianTests",
+    "CoefficientCorrelation",
     "ConfinedEstimate",
     "CoupledTensor",
+    "Decay",
+    "DecouplingRatio",
     "DiffusionEstimate",
     "DiffusionTensor",
     "Found",
@@ -159,7 +200,10 @@ __all__ = [
     "GroupSlopes",
     "Jumps",
     "Likelihood",
+    "LongTimeEstimate",
     "Maximum",
+    "MobilityCorrelation",
+    "Moduli",
     "Moments",
     "MotionVerdict",
     "Noise",
@@ -168,6 +212,7 @@ __all__ = [
     "Parameter",
     "PooledLikelihood",
     "ProfilePoint",
+    "RelaxationEstimate",
     "SamplingBudget",
     "SamplingPlan",
     "SamplingVerdict",
@@ -209,21 +254,28 @@ __all__ = [
     "covariance_bands",
     "covariance_estimate",
     "cramer_rao",
+    "curve_covariance",
     "cut_at",
+    "decoupling_ratio",
     "detectable_by",
     "difference_eigenvalues",
+    "diffusion_correlation",
     "diffusion_tensor",
     "direction_steps",
     "element_variance",
     "equal_columns",
+    "equalised_steps",
     "estimate_diffusion",
     "estimate_rod",
     "excess_scatter",
     "find_jumps",
     "fit_anomalous",
     "fit_confined",
+    "fit_confined_steps",
+    "fit_decay",
     "fit_gls",
     "fit_line",
+    "fit_relaxation",
     "fit_scales",
     "fit_scales_known_noise",
     "fit_switching",
@@ -231,6 +283,7 @@ __all__ = [
     "fractional_mean_square",
     "fractional_slope",
     "gls_weights",
+    "highest_maxima",
     "holm",
     "identity_limits",
     "imposed_symmetry",
@@ -240,7 +293,9 @@ __all__ = [
     "largest_share",
     "leave_one_out_residuals",
     "line_weights",
+    "log_interval",
     "log_slope_ratio",
+    "long_time_diffusion",
     "maximise",
     "motions_and_noise",
     "msd_covariance",
@@ -253,7 +308,9 @@ __all__ = [
     "plan_sampling",
     "pooled_steps",
     "precision_limits",
+    "prediction_errors",
     "principal_steps",
+    "relaxation_faults",
     "residual_freedom",
     "score_p",
     "secant_trial",
@@ -277,9 +334,9 @@ __all__ = [
     "tabulated_statistics",
     "template_alignments",
     "trace_estimate",
-    "unit_center_variance",
-    "unit_covariance",
+    "translation_rotation_correlation",
     "value_text",
+    "viscoelastic_moduli",
     "weighted_variance",
     "with_changing_interval",
     "without_spin",

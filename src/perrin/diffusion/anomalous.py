@@ -11,18 +11,17 @@ from perrin._arrays import to_plain
 from perrin._text import with_error
 from perrin.diffusion.spectral_likelihood import ShapeLikelihood, motions_and_noise
 from perrin.diffusion.step_spectra import fractional_mean_square
-from perrin.diffusion.steps import Quantity, principal_steps
+from perrin.diffusion.steps import Quantity, pooled_steps, principal_steps
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from perrin._arrays import Floats
     from perrin.diffusion.noise_model import Noise
-    from perrin.diffusion.spectral_likelihood import MeanSquare
     from perrin.motion.rigid_motion import RigidMotion
 
 # Trial exponents; their distance is below the width of a maximum.
-_EXPONENTS = np.linspace(0.02, 1.98, 16)
+_EXPONENTS = np.linspace(0.02, 1.98, 9)
 
 # Above this rms turn of one axis per frame, rad, memory in the lab and in the body are different.
 _SMALL_TURN = 0.1
@@ -113,10 +112,13 @@ class AnomalousEstimate:
 
     def __str__(self) -> str:
         length = self.unit.partition("/")[0]
+        tail = f"[{self.n_frames} frames]"
+        if self.ci95 == (0.0, 2.0):
+            return f"alpha: not bounded {tail}"
         msd = with_error(self.msd_at_best_lag, self.msd_at_best_lag_stderr)
         return (
             f"alpha = {with_error(self.alpha, self.stderr)}, MSD({self.best_lag:.3g} s) = {msd} "
-            f"{length} [{self.n_frames} frames]"
+            f"{length} {tail}"
         )
 
 
@@ -172,19 +174,16 @@ def fit_anomalous(
     """
     motions, settings = motions_and_noise(motion, quantity, noise, exposure)
 
-    def fractional(open_fraction: float) -> MeanSquare:
-        def mean_square(lag: Floats, alpha: float) -> Floats:
-            return fractional_mean_square(lag, alpha, exposure=open_fraction)
-
-        return mean_square
+    def mean_square(lag: Floats, shape: float) -> Floats:
+        return fractional_mean_square(lag, shape, exposure=settings.exposure or 0.0)
 
     frames: list[Literal["body", "lab"]] = ["lab" if quantity == "translation" else "body"]
-    tracks = [[principal_steps(m, quantity) for m in motions]]
+    tracks = [pooled_steps(motions, quantity, along=principal_steps)]
     turns = max(float(np.sqrt(np.mean(s.vectors**2))) for s in tracks[0])
     if quantity == "rotation" and motions[0].dimension == 3 and turns > _SMALL_TURN:
         frames.append("lab")
         tracks.append([principal_steps(m, quantity, frame="lab") for m in motions])
-    choices = [ShapeLikelihood.of(steps, settings, fractional) for steps in tracks]
+    choices = [ShapeLikelihood.of(steps, settings, mean_square) for steps in tracks]
     found = [likelihood.best(_EXPONENTS) for likelihood in choices]
     brownian = max(likelihood.at(1.0).value for likelihood in choices)
     i = max(range(len(found)), key=lambda i: found[i][0].value)

@@ -161,9 +161,11 @@ class Likelihood:
         nearly straight. Towards theta = 0 the root may not exist; the edge is then the answer.
         """
         square, fixed = self.mean_square, self.fixed
+        some_fixed = bool(fixed.any())
 
         def theta_at(t: Floats) -> Floats:
-            return np.where(fixed, self.prior[1], square * np.exp(t))
+            free = square * np.exp(t)
+            return np.where(fixed, self.prior[1], free) if some_fixed else free
 
         def point(sums: GroupSlopes, theta: Floats, curvature: Floats) -> ProfilePoint:
             rise, fall = self.by_unit(sums.rise_D), self.by_unit(sums.fall_D)
@@ -189,10 +191,12 @@ class Likelihood:
             theta = theta_at(t)
             sums = self.sums(D, theta)
             ratio = log_slope_ratio(sums.rise, sums.fall)
-            low, high = np.where(ratio > 0, t, low), np.where(ratio > 0, high, t)
-            np.divide(ratio - old_ratio, t - old, out=curvature, where=np.abs(t - old) > 1e-9)
+            up, run = ratio > 0, t - old
+            low, high = np.where(up, t, low), np.where(up, high, t)
+            moved = np.abs(run)
+            np.divide(ratio - old_ratio, run, out=curvature, where=moved > 1e-9)
             target = secant_trial(t, ratio, old, old_ratio, low, high)
-            moves = np.minimum(np.abs(target - t), np.abs(t - old))
+            moves = np.minimum(np.abs(target - t), moved)
             done = (moves <= tolerance) | (high <= _LEAST_LOG_OFFSET) | fixed
             if done.all():
                 break
@@ -342,9 +346,12 @@ def secant_trial(
     array([2.])
     """
     rise, run = slope - old_slope, t - old
-    step = np.divide(slope * run, rise, out=np.full_like(t, np.nan), where=rise != 0)
-    target = np.where(rise * run < 0, t - step, np.nan)
+    step = np.full(t.shape, np.nan)
+    np.divide(slope * run, rise, out=step, where=rise * run < 0)
+    target = t - step
     inside = (target > low) & (target < high)
+    if inside.all():
+        return np.asarray(target)
     # Where a falling slope does not cross zero, the maximum is at the edge.
     edge = _LEAST_LOG_OFFSET
     target = np.where((target <= low) & (low <= edge), edge, target)

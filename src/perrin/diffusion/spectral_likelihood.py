@@ -10,17 +10,16 @@ in generalised eigenvectors of uneven ones. D and o of every axis are maximised 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple, get_args
+from typing import TYPE_CHECKING, NamedTuple, Protocol, get_args
 
 import numpy as np
 
 from perrin._arrays import choice_fault, refuse
 from perrin.diffusion.estimate import CHI2
-from perrin.diffusion.likelihood import newton_crossing
 from perrin.diffusion.noise_model import Noise, noise_faults
 from perrin.diffusion.step_kernels import difference_eigenvalues
 from perrin.diffusion.step_spectra import sine_spectrum, step_autocovariance, step_covariance
-from perrin.diffusion.steps import Quantity, pooled_steps
+from perrin.diffusion.steps import Quantity
 from perrin.motion.rigid_motion import RigidMotion
 
 if TYPE_CHECKING:
@@ -29,7 +28,12 @@ if TYPE_CHECKING:
     from perrin._arrays import Bools, Floats
     from perrin.diffusion.steps import Steps
 
-    MeanSquare = Callable[[Floats, float], Floats]
+    class MeanSquare(Protocol):
+        """Mean square displacement along one axis for D = 1 and a frame time of 1."""
+
+        def __call__(self, lag: Floats, shape: float) -> Floats:
+            """Return it at lags in frames for one shape of its curve."""
+
 
 # Uneven steps are diagonalised in blocks of this many, whose correlation is left out.
 _LONGEST_BLOCK = 500
@@ -47,6 +51,12 @@ _LEAST_STEP_RATIO = 1e-24
 # Change of the shape parameter for the derivative of the spectrum.
 _SHAPE_STEP = 1e-4
 
+# The maximum is found to this difference of the shape parameter.
+_SHAPE_TOLERANCE = 1e-9
+
+# The ends of an interval are found to this share of a standard error.
+_ROOT_TOLERANCE = 1e-8
+
 
 class StepBlock(NamedTuple):
     """Steps that follow each other without a break.
@@ -55,15 +65,14 @@ class StepBlock(NamedTuple):
     ----------
     vectors : ndarray, shape (S, A)
         Components of the steps along the axes.
-    start, stop : ndarray, shape (S,)
-        Times of the first and the last frame of each step, in frames.
+    time : ndarray, shape (S + 1,)
+        Times of the frames, in frame times.
     even : bool
         Whether all steps are equally long.
     """
 
     vectors: Floats
-    start: Floats
-    stop: Floats
+    time: Floats
     even: bool
 
 
@@ -76,14 +85,17 @@ class StepModes(NamedTuple):
         Coordinates of each axis; their squares have the mean D spectrum + o noise.
     spectrum, noise : ndarray, shape (K,)
         Diagonals of V and of E.
-    slope : ndarray, shape (K,) or (K, K)
-        Derivative of V in the shape parameter, as a diagonal or in full.
+    slope : ndarray, shape (K,)
+        Diagonal of the derivative V' of V in the shape parameter.
+    slope_form : callable
+        Quadratic form of V' for coordinates (A, K), by axis.
     """
 
     values: Floats
     spectrum: Floats
     noise: Floats
     slope: Floats
+    slope_form: Callable[[Floats], Floats]
 
 
 class ScaleFit(NamedTuple):
@@ -153,9 +165,7 @@ class ShapeLikelihood:
     blurred: bool = False
 
     @classmethod
-    def of(
-        cls, tracks: Sequence[Steps], noise: Noise, mean_square: Callable[[float], MeanSquare]
-    ) -> ShapeLikelihood:
+    def of(cls, tracks: Sequence[Steps], noise: Noise, mean_square: MeanSquare) -> ShapeLikelihood:
         """Return the likelihood of the steps of some motions along their own axes.
 
         Noise that differs between frames enters as its mean, which leaves the mean square of every
@@ -166,7 +176,7 @@ class ShapeLikelihood:
         tracks : sequence of Steps
         noise : Noise
         mean_square : callable
-            Mean square displacement as a function of the open fraction of the frame time.
+            Mean square displacement, with the blur of the stated exposure.
         """
         known: list[Floats | None] = []
         blocks = []
@@ -184,7 +194,7 @@ class ShapeLikelihood:
             known.append(sigma**2 * mean[moving])
         return cls(
             tuple(blocks),
-            mean_square(noise.exposure or 0.0),
+            mean_square,
             tuple(known),
             n_axes=tracks[0].vectors.shape[1],
             blurred=noise.exposure is not None,
@@ -193,7 +203,7 @@ class ShapeLikelihood:
     @property
     def longest(self) -> int:
         """Frames of the longest block."""
-        return max(int(b.stop[-1] - b.start[0]) for blocks in self.motions for b in blocks)
+        return max(int(b.time[-1] - b.time[0]) for blocks in self.motions for b in blocks)
 
     @property
     def n_steps(self) -> int:
@@ -205,18 +215,20 @@ class ShapeLikelihood:
         value = slope = D = offset = variance = 0.0
         for blocks, known in zip(self.motions, self.known, strict=True):
             modes = [step_modes(block, self.mean_square, shape) for block in blocks]
-            parts = [np.concatenate(x, axis=-1) for x in list(zip(*modes, strict=True))[:3]]
+            values = np.concatenate([m.values for m in modes], axis=1)
+            spectrum, noise = (np.concatenate([m[i] for m in modes]) for i in (1, 2))
             if known is None:
-                fit = fit_scales(*parts, least_offset=0.0 if self.blurred else None)
+                least = 0.0 if self.blurred else None
+                fit = fit_scales(values, spectrum, noise, least_offset=least)
             else:
-                fit = fit_scales_known_noise(*parts, known)
+                fit = fit_scales_known_noise(values, spectrum, noise, known)
             value += float(fit.value.sum())
             slope += sum(shape_slope(one, fit) for one in modes)
-            weight = parts[0].shape[1] / self.n_steps / self.n_axes
+            weight = len(spectrum) / self.n_steps / self.n_axes
             D += weight * float(fit.D.sum())
             offset += weight * float(fit.offset.sum())
             variance += weight**2 * float(np.sum(fit.D**2 * fit.variance))
-        return ShapePoint(shape, value, slope, D, variance / D**2 if D else np.inf, offset)
+        return ShapePoint(float(shape), value, slope, D, variance / D**2 if D else np.inf, offset)
 
     def best(self, shapes: Floats) -> tuple[ShapePoint, list[ShapePoint]]:
         """Return the highest maximum over a range of shapes, and the points at `shapes`.
@@ -226,15 +238,21 @@ class ShapeLikelihood:
         shapes : ndarray
             Trial values in rising order, nearer to each other than the width of a maximum.
         """
-        from scipy.optimize import brentq
-
         points = [self.at(float(shape)) for shape in shapes]
         top = max(range(len(points)), key=lambda i: points[i].value)
         best = points[top]
         side = top + (1 if best.slope > 0 else -1)
         if 0 <= side < len(points) and points[side].slope * best.slope < 0:
-            ends = (best.shape, points[side].shape)
-            peak = self.at(float(brentq(lambda x: self.at(x).slope, *ends, xtol=1e-10)))
+            old, peak = points[side], best
+            low, high = sorted((old.shape, peak.shape))
+            for _ in range(60):
+                low, high = (peak.shape, high) if peak.slope > 0 else (low, peak.shape)
+                run, rise = peak.shape - old.shape, peak.slope - old.slope
+                shape = peak.shape - peak.slope * run / rise if rise else np.inf
+                shape = shape if low < shape < high else 0.5 * (low + high)
+                if abs(shape - peak.shape) < _SHAPE_TOLERANCE:
+                    break
+                old, peak = peak, self.at(shape)
             best = max(best, peak, key=lambda point: point.value)
         return best, points
 
@@ -250,32 +268,37 @@ class ShapeLikelihood:
         drop : float
             Quantile of chi-squared with one degree of freedom.
         """
-        least = best.value - drop / 2
+        # The root of twice the fall of the value is nearly straight in the shape parameter.
+        bound = float(np.sqrt(drop))
+
+        def root(point: ShapePoint) -> float:
+            return float(np.sqrt(max(2 * (best.value - point.value), np.finfo(float).tiny)))
+
         ends: list[ShapePoint | None] = []
         for side in (-1, 1):
             outward = sorted(
                 [best, *(p for p in points if side * (p.shape - best.shape) > 0)],
                 key=lambda p: side * p.shape,
             )
-            last = max(i for i, p in enumerate(outward) if p.value >= least)
+            last = max(i for i, p in enumerate(outward) if root(p) <= bound)
             if last == len(outward) - 1:
                 ends.append(None)
                 continue
             inside, outside = outward[last], outward[last + 1]
 
-            def height(shape: float) -> tuple[float, float]:
-                point = self.at(shape)
-                return point.value - least, point.slope
-
-            share = (inside.value - least) / (inside.value - outside.value)
-            start = inside.shape + np.sqrt(max(share, 0.01)) * (outside.shape - inside.shape)
-            ends.append(
-                self.at(
-                    newton_crossing(
-                        height, inside=inside.shape, start=float(start), outside=outside.shape
-                    )
-                )
-            )
+            low, high = inside.shape, outside.shape
+            share = (bound - root(inside)) / (root(outside) - root(inside))
+            point = self.at(low + share * (high - low))
+            for _ in range(60):
+                rest = bound - root(point)
+                if abs(rest) <= _ROOT_TOLERANCE:
+                    break
+                low, high = (point.shape, high) if rest > 0 else (low, point.shape)
+                # The slope of the root is minus that of the value over the root.
+                step = -rest * root(point) / point.slope if point.slope else np.inf
+                within = min(low, high) < point.shape + step < max(low, high)
+                point = self.at(point.shape + step if within else 0.5 * (low + high))
+            ends.append(point)
         return ends[0], ends[1]
 
     def intervals(
@@ -316,10 +339,8 @@ def step_blocks(steps: Steps, moving: Bools) -> tuple[StepBlock, ...]:
         even = bool(np.all(np.abs(length[rows] - 1) <= _EVEN_FRAMES))
         parts = 1 if even else -(-len(rows) // _LONGEST_BLOCK)
         for part in np.array_split(rows, parts):
-            stop = np.cumsum(length[part])
-            blocks.append(
-                StepBlock(steps.vectors[part][:, moving], stop - length[part], stop, even)
-            )
+            time = np.append(0.0, np.cumsum(length[part]))
+            blocks.append(StepBlock(steps.vectors[part][:, moving], time, even))
     return tuple(blocks)
 
 
@@ -332,8 +353,7 @@ def step_modes(block: StepBlock, mean_square: MeanSquare, shape: float) -> StepM
     Examples
     --------
     >>> from perrin.diffusion import fractional_mean_square
-    >>> time = np.arange(5.0)
-    >>> block = StepBlock(np.ones((4, 1)), time[:-1], time[1:], even=False)
+    >>> block = StepBlock(np.ones((4, 1)), np.arange(5.0), even=False)
     >>> exact = step_modes(block, fractional_mean_square, 1.0)
     >>> sine = step_modes(block._replace(even=True), fractional_mean_square, 1.0)
     >>> bool(np.allclose(np.sort(sine.spectrum / sine.noise), exact.spectrum))
@@ -342,23 +362,30 @@ def step_modes(block: StepBlock, mean_square: MeanSquare, shape: float) -> StepM
     from scipy.fft import dst
     from scipy.linalg import eigh
 
-    near = (shape - _SHAPE_STEP, shape + _SHAPE_STEP)
+    shapes = (shape, shape - _SHAPE_STEP, shape + _SHAPE_STEP)
     count = len(block.vectors)
     if block.even:
-        lag = np.arange(count + 1.0)
-        square = np.stack([mean_square(lag, x) for x in (shape, *near)])
+        square = np.stack([mean_square(block.time, x) for x in shapes])
         spectrum, less, more = sine_spectrum(step_autocovariance(square))
         values = dst(block.vectors.T, type=1, norm="ortho", axis=1)
         slope = (more - less) / (2 * _SHAPE_STEP)
-        return StepModes(values, spectrum, 2 * difference_eigenvalues(count), slope)
-    middle, less, more = (
-        step_covariance(block.start, block.stop, lambda lag, x=x: mean_square(lag, x))
-        for x in (shape, *near)
-    )
+        noise = 2 * difference_eigenvalues(count)
+        return StepModes(values, spectrum, noise, slope, lambda x: x**2 @ slope)
+
+    def covariance(shape: float) -> Floats:
+        return step_covariance(block.time, lambda lag: mean_square(lag, shape))
+
+    middle, less, more = map(covariance, shapes)
     difference = 2 * np.eye(count) - np.eye(count, k=1) - np.eye(count, k=-1)
     spectrum, axes = eigh(middle, difference)
-    slope = axes.T @ ((more - less) / (2 * _SHAPE_STEP)) @ axes
-    return StepModes((axes.T @ block.vectors).T, spectrum, np.ones(count), slope)
+    turned = (more - less) / (2 * _SHAPE_STEP) @ axes
+    return StepModes(
+        values=(axes.T @ block.vectors).T,
+        spectrum=spectrum,
+        noise=np.ones(count),
+        slope=np.einsum("ik,ik->k", axes, turned),
+        slope_form=lambda x: np.einsum("ai,ai->a", x @ axes.T, x @ turned.T),
+    )
 
 
 def fit_scales(
@@ -393,26 +420,19 @@ def fit_scales(
     variance = rest + np.exp(trial)[:, None] * noise
     mean = power @ (1 / variance).T / count
     height = -0.5 * (np.log(variance).sum(axis=1) + count * np.log(mean))
-    top = np.argmax(height, axis=1)
-    low, high = (trial[np.clip(top + side, 0, len(trial) - 1)] for side in (-1, 1))
-    u = trial[top]
-    for _ in range(40):
+
+    def score(u: Floats) -> tuple[Floats, Floats]:
         scaled = np.exp(u)[:, None] * noise
         variance = rest + scaled
         share, weight = scaled / variance, power / variance
-        t0, t1, t2 = (np.sum(weight * share**k, axis=1) for k in range(3))
-        slope = -0.5 * (share.sum(axis=1) - count * t1 / t0)
-        bend = -0.5 * (
-            np.sum(share * (1 - share), axis=1) - count * ((t1 - 2 * t2) / t0 + (t1 / t0) ** 2)
-        )
-        low, high = np.where(slope > 0, u, low), np.where(slope > 0, high, u)
-        newton = u - np.divide(slope, bend, out=np.full_like(u, np.inf), where=bend < 0)
-        inside = (newton >= low) & (newton <= high)
-        target = np.where(inside, newton, 0.5 * (low + high))
-        moved = np.abs(target - u).max()
-        u = target
-        if moved < 1e-11:
-            break
+        shared = weight * share
+        t0, t1 = weight.sum(axis=1), shared.sum(axis=1)
+        t2 = np.einsum("ak,ak->a", shared, share)
+        s1, s2 = share.sum(axis=1), np.einsum("ak,ak->a", share, share)
+        bend = s1 - s2 - count * ((t1 - 2 * t2) / t0 + (t1 / t0) ** 2)
+        return -0.5 * (s1 - count * t1 / t0), -0.5 * bend
+
+    u = highest_maxima(score, np.broadcast_to(trial[:, None], height.T.shape), height.T)
     variance = rest + np.exp(u)[:, None] * noise
     D = np.mean(power / variance, axis=1)
     value = -0.5 * (np.log(variance).sum(axis=1) + count * np.log(D) + count)
@@ -421,6 +441,41 @@ def fit_scales(
     with np.errstate(divide="ignore"):
         spread = 2 / np.maximum(np.sum(by_D**2, axis=1) - shared, 0.0)
     return ScaleFit(value, D, D * (np.exp(u) + least), spread)
+
+
+def highest_maxima(
+    score: Callable[[Floats], tuple[Floats, Floats]], trial: Floats, height: Floats
+) -> Floats:
+    """Return where some functions of one variable each have their highest maximum, (A,).
+
+    Parameters
+    ----------
+    score : callable
+        First and second derivative of every function, (A,) each, at the arguments (A,).
+    trial, height : ndarray, shape (M, A)
+        Arguments in rising order, nearer to each other than the width of a maximum, and values.
+
+    Examples
+    --------
+    >>> trial = np.linspace(-3.0, 3.0, 7)[:, None]
+    >>> highest_maxima(lambda x: (0.3 - x, -np.ones(1)), trial, -((trial - 0.3) ** 2))
+    array([0.3])
+    """
+    top, column = np.argmax(height, axis=0), np.arange(height.shape[1])
+    low, high = (trial[np.clip(top + side, 0, len(trial) - 1), column] for side in (-1, 1))
+    x = trial[top, column]
+    for _ in range(40):
+        slope, bend = score(x)
+        rising = slope > 0
+        low, high = np.where(rising, x, low), np.where(rising, high, x)
+        newton = x - np.divide(slope, bend, out=np.full_like(x, np.inf), where=bend < 0)
+        target = np.where((newton >= low) & (newton <= high), newton, 0.5 * (low + high))
+        moved = np.abs(target - x).max()
+        x = target
+        # The error of the next Newton step is of the order of the square of this.
+        if moved < 1e-6:
+            break
+    return np.asarray(x)
 
 
 def fit_scales_known_noise(
@@ -446,25 +501,16 @@ def fit_scales_known_noise(
     trial = v + np.arange(_LEAST_LOG_RATIO, 1.5, _LOG_STEP)[:, None]
     variance = np.exp(trial)[..., None] * spectrum + known
     height = -0.5 * np.sum(np.log(variance) + power / variance, axis=-1)
-    top = np.argmax(height, axis=0)
-    axis = np.arange(len(v))
-    low, high = (trial[np.clip(top + side, 0, len(trial) - 1), axis] for side in (-1, 1))
-    v = trial[top, axis]
-    for _ in range(40):
+
+    def score(v: Floats) -> tuple[Floats, Floats]:
         scaled = np.exp(v)[:, None] * spectrum
         variance = scaled + known
         share, weight = scaled / variance, power / variance
-        slope = -0.5 * np.sum(share * (1 - weight), axis=1)
-        bend = -0.5 * np.sum(share * (1 - share) * (1 - weight) + share**2 * weight, axis=1)
-        low, high = np.where(slope > 0, v, low), np.where(slope > 0, high, v)
-        newton = v - np.divide(slope, bend, out=np.full_like(v, np.inf), where=bend < 0)
-        inside = (newton >= low) & (newton <= high)
-        target = np.where(inside, newton, 0.5 * (low + high))
-        moved = np.abs(target - v).max()
-        v = target
-        if moved < 1e-11:
-            break
-    D = np.exp(v)
+        slope, turn = share * (1 - weight), share**2 * weight
+        bend = np.sum((1 - share) * slope + turn, axis=1)
+        return -0.5 * slope.sum(axis=1), -0.5 * bend
+
+    D = np.exp(highest_maxima(score, trial, height))
     variance = D[:, None] * spectrum + known
     value = -0.5 * np.sum(np.log(variance) + power / variance, axis=1)
     return ScaleFit(value, D, offset, 2 / np.sum((D[:, None] * spectrum / variance) ** 2, axis=1))
@@ -475,17 +521,15 @@ def shape_slope(modes: StepModes, fit: ScaleFit) -> float:
 
     Examples
     --------
-    >>> modes = StepModes(np.ones((1, 3)), np.full(3, 2.0), np.ones(3), np.ones(3))
+    >>> modes = StepModes(np.ones((1, 3)), np.full(3, 2.0), np.ones(3), np.ones(3), np.sum)
     >>> fit = ScaleFit(np.zeros(1), np.full(1, 0.5), np.zeros(1), np.ones(1))
     >>> shape_slope(modes, fit)
     0.0
     """
     variance = fit.D[:, None] * modes.spectrum + fit.offset[:, None] * modes.noise
     scaled = modes.values / variance
-    if modes.slope.ndim == 1:
-        return float(0.5 * np.sum(fit.D[:, None] * modes.slope * (scaled**2 - 1 / variance)))
-    square = np.einsum("ak,kl,al->a", scaled, modes.slope, scaled, optimize=True)
-    return float(0.5 * np.sum(fit.D * (square - (1 / variance) @ np.diagonal(modes.slope))))
+    mean = (1 / variance) @ modes.slope
+    return float(0.5 * np.sum(fit.D * (modes.slope_form(scaled) - mean)))
 
 
 def motions_and_noise(
@@ -498,8 +542,6 @@ def motions_and_noise(
 
     Raises
     ------
-    TooFewFramesError
-        If a motion has fewer than two steps.
     ValueError
         For unknown or inconsistent choices, or motions of 2 and 3 dimensions together.
 
@@ -521,5 +563,4 @@ def motions_and_noise(
     if len({m.dimension for m in motions}) != 1:
         faults.append("motion: expected one or more motions, all in 2 or all in 3 dimensions")
     refuse(faults)
-    pooled_steps(motions, quantity)
     return motions, Noise.of(noise, exposure=exposure)

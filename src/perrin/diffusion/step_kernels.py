@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
@@ -143,6 +144,11 @@ class SineModes:
         which = np.repeat(np.arange(len(groups)), sizes)
         return cls(np.array(groups), starts, which, power, count, by_D, by_theta, given)
 
+    @cached_property
+    def half_slopes(self) -> tuple[Floats, Floats]:
+        """Half the slopes of the eigenvalue in D and in theta."""
+        return 0.5 * self.by_D, 0.5 * self.by_theta
+
     def sums(self, D: Floats, theta: Floats) -> GroupSlopes:
         """Evaluate all motions at the D and the theta of each."""
         if len(self.groups) == 1:
@@ -154,7 +160,7 @@ class SineModes:
         ratio = self.power / eigen
         rise = ratio / eigen
         value = -0.5 * (self.count * np.log(eigen) + ratio)
-        by_D, by_theta = 0.5 * self.by_D, 0.5 * self.by_theta
+        by_D, by_theta = self.half_slopes
         rows = (value, by_D * rise, by_D * fall, by_theta * rise, by_theta * fall)
         return GroupSlopes(*[np.add.reduceat(row, self.starts) for row in rows])
 

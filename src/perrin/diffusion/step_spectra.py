@@ -190,18 +190,18 @@ def step_autocovariance(square: Floats) -> Floats:
     return np.asarray(0.5 * (square[..., 1:] + before) - square[..., :-1])
 
 
-def step_covariance(start: Floats, stop: Floats, mean_square: Callable[[Floats], Floats]) -> Floats:
-    """Return the covariance of steps between any times, from the mean square displacement M.
+def step_covariance(time: Floats, mean_square: Callable[[Floats], Floats]) -> Floats:
+    """Return the covariance of the steps between any times, from the mean square displacement M.
 
     Steps from a to b and from c to d have covariance
     (M(|a - d|) + M(|b - c|) - M(|a - c|) - M(|b - d|))/2.
 
     Parameters
     ----------
-    start, stop : ndarray, shape (S,)
-        Times of the first and the last frame of each step, in frames.
+    time : ndarray, shape (S + 1,)
+        Times of the frames, in frame times.
     mean_square : callable
-        M as a function of the lag in frames.
+        M as a function of the lag in frame times.
 
     Returns
     -------
@@ -209,14 +209,12 @@ def step_covariance(start: Floats, stop: Floats, mean_square: Callable[[Floats],
 
     Examples
     --------
-    >>> step_covariance(np.array([0.0, 1]), np.array([1.0, 4]), lambda lag: 2 * lag)
-    array([[2., 0.],
-           [0., 6.]])
+    >>> step_covariance(np.array([0.0, 1, 4]), lambda lag: 2.0 * (lag > 0))  # independent places
+    array([[ 2., -1.],
+           [-1.,  2.]])
     """
-    ends = np.concatenate([start, stop])
-    m = mean_square(np.abs(ends[:, None] - ends))
-    n = len(start)
-    return np.asarray(0.5 * (m[:n, n:] + m[n:, :n] - m[:n, :n] - m[n:, n:]))
+    square = mean_square(np.abs(time[:, None] - time))
+    return np.asarray(-0.5 * np.diff(np.diff(square, axis=0), axis=1))
 
 
 def sine_spectrum(autocovariance: Floats) -> Floats:

@@ -310,8 +310,12 @@ def offset_gain(motion: RigidMotion, estimate: DiffusionEstimate, *, sigma: floa
     """
     steps = steps_of(motion, estimate.quantity)
     settings = estimate.settings
+    free = NoisySteps.of(steps, settings)
     known = NoisySteps.of(steps, replace(settings, model=float(sigma)))
-    return _likelihood_gain(NoisySteps.of(steps, settings), known)
+    # The estimate is the maximum of the likelihood with the noise left free.
+    at_estimate = np.array([estimate.value]), np.array([_theta(free, estimate)])
+    best = Likelihood.of([free]).sums(*at_estimate).value[0]
+    return max(2 * float(best - Likelihood.of([known]).best().value[0]), 0.0)
 
 
 def persistence_gain(
@@ -356,12 +360,7 @@ def persistence_gain(
         NoisySteps.free(steps, blur=float(steps.duration.min()) * share, drift=taken)
         for share in (1 / 2, 1 / 3)
     )
-    return _likelihood_gain(free, blurred)
-
-
-def _likelihood_gain(free: NoisySteps, restricted: NoisySteps) -> float:
-    """Return twice the log-likelihood that the best fit of one model gains over another's."""
-    values = [float(Likelihood.of([track]).best().value[0]) for track in (free, restricted)]
+    values = [float(Likelihood.of([track]).best().value[0]) for track in (free, blurred)]
     return max(2 * (values[0] - values[1]), 0.0)
 
 

@@ -10,12 +10,13 @@ import numpy as np
 
 from perrin._arrays import frozen
 from perrin.errors import TooFewFramesError
-from perrin.geometry.rigid import degrees_of_freedom, orientation_covariance
+from perrin.geometry.rigid import degrees_of_freedom
 from perrin.geometry.rotations import exp_map, log_map, successive_product
 from perrin.geometry.wahba import svd_rotation
+from perrin.motion.residuals import unit_center_variance, unit_covariance
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from perrin._arrays import Bools, Floats, Ints
     from perrin.diffusion.noise_model import Noise
@@ -280,8 +281,20 @@ def steps_of(motion: RigidMotion, quantity: Quantity) -> Steps:
     )
 
 
-def pooled_steps(motions: Sequence[RigidMotion], quantity: Quantity) -> list[Steps]:
+def pooled_steps(
+    motions: Sequence[RigidMotion],
+    quantity: Quantity,
+    *,
+    along: Callable[[RigidMotion, Quantity], Steps] = steps_of,
+) -> list[Steps]:
     """Return the steps of every motion; an error names the motion where there are several.
+
+    Parameters
+    ----------
+    motions : sequence of RigidMotion
+    quantity : {"rotation", "translation"}
+    along : callable
+        Function that returns the steps of one motion, which chooses their axes.
 
     Examples
     --------
@@ -293,7 +306,7 @@ def pooled_steps(motions: Sequence[RigidMotion], quantity: Quantity) -> list[Ste
     steps = []
     for number, motion in enumerate(motions):
         try:
-            steps.append(steps_of(motion, quantity))
+            steps.append(along(motion, quantity))
         except TooFewFramesError as error:
             if len(motions) == 1:
                 raise
@@ -520,36 +533,3 @@ def residual_freedom(motion: RigidMotion) -> int:
     n, d = motion.template.shape
     freedom = degrees_of_freedom(motion.n_present[motion.fitted], d).sum()
     return int(freedom - degrees_of_freedom(np.array(n), d))
-
-
-def unit_covariance(motion: RigidMotion) -> Floats:
-    """Return the covariance of every orientation for a localisation error of 1 um, (T, a, a).
-
-    Examples
-    --------
-    >>> from perrin import Cluster, simulate_motion
-    >>> truth = simulate_motion(Cluster.tetrahedron(1.0), D_R=5e-3, dt=0.7, n_frames=9, rng=3)
-    >>> unit_covariance(truth)[0].diagonal().round(9)
-    array([0.375, 0.375, 0.375])
-    """
-    square = float(np.mean(motion.noise**2))
-    if square > 0:
-        return np.asarray(motion.covariance / square)
-    unit = orientation_covariance(motion.template, np.eye(motion.template.shape[1]))
-    return np.broadcast_to(unit, motion.covariance.shape)
-
-
-def unit_center_variance(motion: RigidMotion) -> Floats:
-    """Return the variance of every centre for a localisation error of 1 um, (T,).
-
-    Examples
-    --------
-    >>> from perrin import Cluster, simulate_motion
-    >>> truth = simulate_motion(Cluster.tetrahedron(1.0), D_R=5e-3, dt=0.7, n_frames=2, rng=3)
-    >>> unit_center_variance(truth)
-    array([0.25, 0.25])
-    """
-    square = float(np.mean(motion.noise**2))
-    if square > 0:
-        return np.asarray(motion.center_variance / square)
-    return np.full(len(motion.time), 1 / len(motion.template))

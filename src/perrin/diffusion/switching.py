@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
@@ -13,7 +13,8 @@ from perrin._text import with_error
 from perrin.diffusion.estimate import NORMAL, UNITS
 from perrin.diffusion.likelihood import Likelihood
 from perrin.diffusion.noise_model import Noise, noise_faults
-from perrin.diffusion.steps import NoisySteps, Quantity, pooled_steps
+from perrin.diffusion.step_kernels import equal_columns
+from perrin.diffusion.steps import NoisySteps, Quantity, Steps, pooled_steps, principal_steps
 from perrin.errors import TooFewFramesError
 from perrin.motion.rigid_motion import RigidMotion
 
@@ -32,7 +33,17 @@ _MORE_PARAMETERS = 3
 # curvatures: the error of a slope is of the order of its square.
 _DIFFERENCE = 3e-3
 
+# Axes are scaled to equal D where the least is above this part of the mean.
+_LEAST_RATIO = 0.2
+
+# Beyond this T^2 the axes of D are unequal: chi-squared at 1 %, for the five numbers by which a
+# tensor differs from a multiple of unity, because the axes are chosen by the data.
+_UNEQUAL_AXES = 15.09
+
 _NEWTON_ROUNDS = 60
+
+# The search ends where the next step would raise the log-likelihood by less than this.
+_CONVERGED = 1e-10
 
 # The best of these is the start: D_slow and D_fast over the mean D, dwell time over the time
 # between frames, and the noise over that of one D.
@@ -172,7 +183,7 @@ class SwitchingEstimate:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the estimate for JSON."""
-        plain: dict[str, Any] = to_plain({name: getattr(self, name) for name in self.__dict__})
+        plain: dict[str, Any] = to_plain({f.name: getattr(self, f.name) for f in fields(self)})
         return plain
 
     @classmethod
@@ -187,10 +198,11 @@ class SwitchingEstimate:
 
     def __str__(self) -> str:
         name = "D_R" if self.unit == UNITS["rotation"] else "D_T"
-        number = "two states" if self.two_states else "one D suffices"
+        if not self.two_states:
+            return f"{name}: two states are no better than one [{self.n_frames} frames]"
         return (
             f"{name} switches between {self.D_slow} and {self.D_fast}, mean dwell "
-            f"{self.dwell_slow} and {self.dwell_fast} [{number}, {self.n_frames} frames]"
+            f"{self.dwell_slow} and {self.dwell_fast} [{self.n_frames} frames]"
         )
 
 
@@ -198,14 +210,18 @@ class SwitchingEstimate:
 class SwitchingSteps:
     """The steps of one motion for a model of two states, in the order of time.
 
-    Given the states, step j of state i has variance 2 D_i tau + 2 o per axis and covariance -o with
-    the next: the noise o of a frame is shared by its two steps, o = weight theta + known - b D_slow.
-    With a stated exposure blur also takes 2 b (D_fast - D_slow) from the variance of a fast step.
+    Given the states, a step is y = w + n_after - n_before: the displacement w of the body, of
+    variance 2 D tau per axis, and the errors n of its two frames, which it shares with its
+    neighbours. An error is localisation of variance s, and the distance from the body to the mean
+    place of the body during the exposure, f dt, that ends at the frame: the error has the variance
+    s + 2 b D with b = f dt/3, w + n_after the variance 2 D tau - 4 b D + s, and their covariance is
+    s - b D (Berglund 2010, for each D). Where the exposure is unknown, s - b D is one number o.
 
     Attributes
     ----------
     track : NoisySteps
-        Steps with what is known of their noise.
+        Steps with what is known of their noise: s or o is weight theta + known, less blur D_slow
+        where the exposure is unknown.
     elapsed : ndarray, shape (S,)
         Time from the beginning of the step before to that of each step, s; 0 for the first.
     follows : ndarray of bool, shape (S,)
@@ -231,6 +247,11 @@ class SwitchingSteps:
         """Whether the noise parameter theta is fitted."""
         return not np.isinf(self.track.freedom)
 
+    @cached_property
+    def equal_axes(self) -> list[Ints]:
+        """Axes in groups that have the same noise in every frame."""
+        return equal_columns(np.concatenate([*self.track.weight, *self.track.known]))
+
     def filtered(self, points: Floats) -> tuple[Floats, Floats]:
         """Return the log-likelihood at several points, and the weights of all pairs of states.
 
@@ -243,9 +264,9 @@ class SwitchingSteps:
         Returns
         -------
         value : ndarray, shape (P,)
-        pairs : ndarray, shape (S, P, 2, 2)
-            For every step, the probability of its state (last axis) and its density, given the
-            state before, relative to the largest of the four.
+        pairs : ndarray, shape (S, 2, 2, P)
+            For every step, by the states before and after it, the probability of the change times
+            the density of the step, relative to the largest of the four densities.
 
         Notes
         -----
@@ -256,52 +277,53 @@ class SwitchingSteps:
         Li, Estimation and Tracking, section 11.6). Without noise this is the exact hidden Markov
         model; with equal D it is the exact Brownian likelihood.
         """
-        s, track = self.track.steps, self.track
-        D, rate = np.exp(points[:, :2]), np.exp(points[:, 2:4])
+        s, track, groups = self.track.steps, self.track, self.equal_axes
+        order = np.concatenate(groups)
+        sizes = np.array([len(axes) for axes in groups])
+        firsts, first_axes = np.cumsum([0, *sizes[:-1]]), [axes[0] for axes in groups]
+        group_of = np.repeat(np.arange(len(groups)), sizes) if len(groups) > 1 else slice(None)
+        count = sizes[:, None, None].astype(np.float64)
+        common_blur = track.blur - self.exposed
+        # Axes: steps, groups of axes, state before, state, points.
+        D, rate = np.exp(points[:, :2].T), np.exp(points[:, 2:4].T)
         theta = np.exp(points[:, 4]) if self.free else np.full(len(points), track.theta)
-        weight, known = track.weight, track.known
-        blurred = track.blur * D[:, :1]
         before, after = (
-            np.maximum(theta[:, None] * weight[k][:, None] + known[k][:, None], 0.0) - blurred
-            for k in (0, 1)
+            theta * weight[:, first_axes, None] + known[:, first_axes, None] - common_blur * D[0]
+            for weight, known in zip(track.weight, track.known, strict=True)
         )
-        spread = 2 * D * s.duration[:, None, None] - 2 * self.exposed * (D - D[:, :1])
-        change = rate / rate.sum(axis=1, keepdims=True)
-        change = change * -np.expm1(-rate.sum(axis=1)[:, None] * self.elapsed[:, None, None])
-        stay = 1 - change
-        transition = np.stack(
-            [
-                np.stack([stay[..., 0], change[..., 0]], axis=-1),
-                np.stack([change[..., 1], stay[..., 1]], axis=-1),
-            ],
-            axis=-2,
-        )
-        # Last and present state are the second and third axis of what follows.
-        spread, after = spread[:, :, None, :, None], after[:, :, None, None, :]
-        probability = rate[:, ::-1] / rate.sum(axis=1, keepdims=True)
-        mean = np.zeros((len(points), 2, 1, s.vectors.shape[1]))
-        variance = np.broadcast_to(before[0][:, None, None], mean.shape)
-        value, pairs = np.zeros(len(points)), np.empty_like(transition)
-        for j, y in enumerate(s.vectors):
+        blur = self.exposed * D
+        spread = 2 * D * s.duration[:, None, None] - 4 * blur
+        leaving = rate / rate.sum(axis=0)
+        leaving = leaving * -np.expm1(-rate.sum(axis=0) * self.elapsed[:, None, None])
+        (to_fast, to_slow), (slow, fast) = leaving.swapaxes(0, 1), (1 - leaving).swapaxes(0, 1)
+        transition = np.stack([np.stack([slow, to_fast], 1), np.stack([to_slow, fast], 1)], 1)
+        probability = rate[::-1] / rate.sum(axis=0)
+        still = np.zeros((len(order), 2, len(points)))
+        tops, totals, pairs = np.empty((len(s.vectors), len(points))), [], transition
+        for j, y in enumerate(s.vectors[:, order, None, None]):
             if not self.follows[j]:
-                mean = np.zeros_like(mean)
-                variance = np.broadcast_to(before[j][:, None, None], mean.shape)
+                mean, variance = still, before[j][:, None] + 2 * blur
+            noise = after[j][:, None, None]
             surprise = y + mean
-            total = np.maximum(spread[j] + variance + after[j], 1e-100)
-            gain = after[j] / total
-            log_density = -0.5 * np.sum(np.log(total) + surprise**2 / total, axis=-1)
-            top = log_density.max(axis=(1, 2), keepdims=True)
-            pairs[j] = transition[j] * np.exp(log_density - top)
-            joint = probability[:, :, None] * pairs[j] + 1e-300
-            both = joint.sum(axis=1)
-            sum_of_all = both.sum(axis=1)
-            value += top[:, 0, 0] + np.log(sum_of_all)
-            probability = both / sum_of_all[:, None]
-            share = (joint / both[:, None])[..., None]
-            means = gain * surprise
-            mean = np.sum(share * means, axis=1)
-            variances = after[j] * (1 - gain) + (means - mean[:, None]) ** 2
-            mean, variance = mean[:, :, None], np.sum(share * variances, axis=1)[:, :, None]
+            square = np.add.reduceat(surprise * surprise, firsts, axis=0)
+            total = np.maximum(variance[:, :, None] + (spread[j] + noise), 1e-100)
+            deviance = count[..., None] * np.log(total) + square[:, :, None] / total
+            log_density = -0.5 * np.add.reduce(deviance, axis=0)
+            tops[j] = np.maximum.reduce(log_density, axis=(0, 1))
+            pairs[j] *= np.exp(log_density - tops[j])
+            joint = probability[:, None] * pairs[j] + 1e-300
+            both = joint[0] + joint[1]
+            totals.append(both[0] + both[1])
+            probability = both / totals[-1]
+            shared = noise - blur
+            gain = shared / total
+            share = joint / both * gain
+            mean = np.add.reduce(share[group_of] * surprise[:, :, None], axis=1)
+            second = np.add.reduce(share * gain * square[:, :, None], axis=1)
+            second -= np.add.reduceat(mean * mean, firsts, axis=0)
+            variance = noise[:, 0] + 2 * blur - shared[:, 0] * np.add.reduce(share, axis=1)
+            variance += second / count
+        value = np.sum(tops, axis=0) + np.sum(np.log(totals), axis=0)
         if self.free and track.freedom:
             value -= 0.5 * track.freedom * (np.log(theta) + track.theta / theta)
         return value, pairs
@@ -324,7 +346,7 @@ class SwitchingSteps:
         """Return the probability of the fast state of every step, given all steps, (S,)."""
         rate = np.exp(point[2:4])
         forward, backward = rate[::-1] / rate.sum(), np.ones(2)
-        pairs = self.filtered(point[None])[1][:, 0]
+        pairs = self.filtered(point[None])[1][..., 0]
         seen = []
         for pair in pairs:
             forward = forward @ pair
@@ -337,6 +359,42 @@ class SwitchingSteps:
             backward = pairs[j] @ backward
             backward = backward / backward.sum()
         return fast
+
+
+def equalised_steps(motion: RigidMotion, quantity: Quantity) -> Steps:
+    """Return steps along the axes of D, scaled so that every axis has the mean D of all.
+
+    The noise is scaled alike. Unequal axes would widen the law of the lengths of the steps, as two
+    states do. Translation, and rotation in the plane, are left as they are, and so is a rotation
+    whose axes are not significantly unequal (p > 1 % by their scatter), or whose noise-corrected D
+    along one axis is below a fifth of the mean: the ratio is then not known.
+
+    Examples
+    --------
+    >>> from perrin import Cluster, simulate_motion
+    >>> body = Cluster.pentahedron(1.5)
+    >>> truth = simulate_motion(body, D_R=[1e-3, 1e-3, 4e-3], dt=0.5, n_frames=3000, rng=3)
+    >>> square = np.mean(equalised_steps(truth, "rotation").vectors ** 2, axis=0)
+    >>> bool(np.ptp(square) < 0.1 * square.mean())
+    True
+    """
+    steps = principal_steps(motion, quantity)
+    if quantity == "translation" or motion.dimension == 2:
+        return steps
+    y, linked = steps.vectors, steps.linked[:-1]
+    squares = 0.5 * y**2
+    squares[:-1][linked] += (y[:-1] * y[1:])[linked]
+    D = squares.mean(axis=0)
+    if not D.min() > _LEAST_RATIO * D.mean():
+        return steps
+    apart = (squares - squares.mean(axis=1, keepdims=True))[:, 1:]
+    mean = apart.mean(axis=0)
+    if len(y) * mean @ np.linalg.solve(np.cov(apart.T), mean) < _UNEQUAL_AXES:
+        return steps
+    ratio = D / D.mean()
+    noise = steps.noise / ratio[:, None]
+    complete = steps.complete * float(np.mean(1 / ratio))
+    return replace(steps, vectors=y / np.sqrt(ratio), noise=noise, complete=complete)
 
 
 def fit_switching(
@@ -357,8 +415,9 @@ def fit_switching(
     noise : {"joint", "residual"}, float or Noise
         As in `estimate_diffusion`; a `Noise` with drift is refused.
     exposure : float, optional
-        Open fraction of dt, 0 to 1. Where it is unknown (None) the joint noise may be negative, but
-        is the same in both states, although motion blur is larger in the fast one.
+        Open fraction f of dt, 0 to 1. Where it is unknown (None) the joint noise may be negative,
+        but is the same in both states. Motion blur is larger in the fast one: D_fast then is low by
+        the fraction f/3 (1 - D_slow/D_fast), so state the exposure of a long one.
 
     Returns
     -------
@@ -378,8 +437,9 @@ def fit_switching(
     continuous time, so that a gap, or a cut, is a longer time in which it may change. The
     likelihood contains the noise that neighbouring steps share, and is maximised by Newton's method
     from the best point of a grid. Intervals come from its curvature in the logarithms of all
-    parameters, noise included. D is one number in each state: for an anisotropic body a mean over
-    axes.
+    parameters, noise included. D is the mean over axes in each state: the rotation of an
+    anisotropic body is scaled to equal axes first, so that the ratio of the axes is the same in
+    both states.
 
     Examples
     --------
@@ -390,7 +450,7 @@ def fit_switching(
     ...     dt=1.0,
     ...     n_frames=200,
     ...     dynamics=Switching(10, dwell=20.0),
-    ...     rng=1,
+    ...     rng=3,
     ... )
     >>> found = fit_switching(truth)
     >>> found.two_states, found.D_slow.ci95[0] < 1e-3 * 2 / 11 < found.D_slow.ci95[1]
@@ -407,7 +467,8 @@ def fit_switching(
         faults.append("motion: expected one or more motions, all in 2 or all in 3 dimensions")
     refuse(faults)
     settings = Noise.of(noise, exposure=exposure)
-    tracks = [NoisySteps.of(s, settings) for s in pooled_steps(motions, quantity)]
+    pooled_steps(motions, quantity)  # names the motion that has too few steps
+    tracks = [NoisySteps.of(equalised_steps(m, quantity), settings) for m in motions]
     count = sum(len(t.steps.duration) for t in tracks)
     if count < _FEWEST_SWITCHING_STEPS:
         raise TooFewFramesError(
@@ -415,9 +476,9 @@ def fit_switching(
             sum(m.fitted.size for m in motions),
         )
     likelihood = Likelihood.of(tracks)
-    one = likelihood.best()
-    if not one.D[0] > 0:
-        raise ValueError("motion: the steps are all noise, D = 0; two states cannot be told apart")
+    one = likelihood.best() if likelihood.scale[0] > 0 else None
+    if one is None or not one.D[0] > 0:
+        raise ValueError("motion: the steps are all noise, D = 0; they show no two states")
     steps = [
         SwitchingSteps.of(t, m.time, exposed=(settings.exposure or 0.0) * t.steps.dt / 3)
         for t, m in zip(tracks, motions, strict=True)
@@ -508,18 +569,15 @@ def _most_likely(
         step = np.zeros(len(x))
         step[free] = axes @ ((axes.T @ slope[free]) / np.maximum(np.abs(values), 1e-3))
         step *= min(1.0, 1.0 / max(float(np.abs(step).max()), 1e-300))
+        if slope @ step < _CONVERGED:
+            break
         trial = x + step
         trial[2:4] = np.clip(trial[2:4], slowest, quickest)
         there = expanded(trial) if trial[0] <= trial[1] else (-np.inf, slope, curvature)
         if there[0] >= value:
-            gained = there[0] - value
             x, here, damping = trial, there, damping / 10
-            if gained < 1e-8 and np.abs(step).max() < 1e-4:
-                break
         else:
             damping *= 10
-            if damping > 1e8:
-                break
     information = -here[2][np.ix_(~fixed, ~fixed)]
     covariance = np.zeros((len(x), len(x)))
     try:

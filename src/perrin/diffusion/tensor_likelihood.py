@@ -36,12 +36,31 @@ _DIFFERENCE_STEP = 1e-5
 
 
 class TensorSlopes(NamedTuple):
-    """A log-likelihood and its derivatives by D (b, b), by the noise amplitudes (r,) and by B."""
+    """Log-likelihoods at P points, and their derivatives.
 
-    value: float
+    Attributes
+    ----------
+    value : ndarray, shape (P,)
+        Log-likelihood; -inf, without slopes, where a covariance is not positive definite.
+    D : ndarray, shape (P, b, b)
+        Slopes in D.
+    theta : ndarray, shape (P, r)
+        Slopes in the noise amplitudes.
+    B : ndarray, shape (P,)
+        Slope in B.
+    """
+
+    value: Floats
     D: Floats
     theta: Floats
-    B: float
+    B: Floats
+
+    @classmethod
+    def undefined(cls, D: Floats, theta: Floats) -> TensorSlopes:
+        """Return -inf without slopes at all of these points."""
+        none = np.full(len(D), np.nan)
+        least = np.full(len(D), -np.inf)
+        return cls(least, np.full_like(D, np.nan), np.full_like(theta, np.nan), none)
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,27 +93,30 @@ class NoisyVectors:
         amplitudes = np.sqrt(self.theta) if np.isfinite(self.freedom) else np.empty(0)
         return np.append(amplitudes, [0.6] if self.B is None else [])
 
-    def slopes(self, D: Floats, own: Floats) -> tuple[float, Floats, Floats]:
-        """Return log-likelihood, its slopes by D, and by the free parameters of the noise.
+    def slopes(self, D: Floats, own: Floats) -> tuple[Floats, Floats, Floats]:
+        """Return log-likelihoods, their slopes by D, and by the free parameters of the noise.
 
-        Amplitudes are squares and B = sin^2 / 4, so that the search has no edges.
+        D (P, b, b) and own (P, c) are those of P points. Amplitudes are squares and B = sin^2 / 4,
+        so that the search has no edges.
         """
         free = np.isfinite(self.freedom)
-        roots, angle = (own[: len(self.theta)] if free else np.empty(0)), own[-1:]
-        theta = roots**2 if free else self.theta
-        B = _MOST_BLUR * float(np.sin(angle[0])) ** 2 if self.B is None else self.B
+        roots, angle = (own[:, : len(self.theta)] if free else np.empty((len(D), 0))), own[:, -1:]
+        theta = roots**2 if free else np.tile(self.theta, (len(D), 1))
+        B = np.full(len(D), self.B or 0.0)
+        if self.B is None:
+            B = np.array([_MOST_BLUR * float(one) ** 2 for one in np.sin(angle[:, 0])])
         value, by_D, by_theta, by_B = self.by_tensor(D, theta, B)
-        out = []
+        out = [np.empty((len(D), 0))]
         if free:
             if self.freedom:
                 ratio = self.theta / theta
-                value -= 0.5 * self.freedom * float(np.sum(ratio - np.log(ratio)))
+                value = value - 0.5 * self.freedom * np.sum(ratio - np.log(ratio), axis=1)
                 by_theta = by_theta - 0.5 * self.freedom * (1 - ratio) / theta
             out.append(2 * roots * by_theta)
         if self.B is None:
-            value -= _LEAST_BLUR * B
-            out.append((by_B - _LEAST_BLUR) * _MOST_BLUR * np.sin(2 * angle))
-        return value, by_D, np.concatenate([np.empty(0), *out])
+            value = value - _LEAST_BLUR * B
+            out.append((by_B - _LEAST_BLUR)[:, None] * _MOST_BLUR * np.sin(2 * angle))
+        return value, by_D, np.concatenate(out, axis=1)
 
     def noise(self, D: Floats, own: Floats) -> Floats:
         """Return the mean noise O of a frame, less its blur, (b, b)."""
@@ -113,42 +135,60 @@ class NoisyVectors:
         y = self.steps.vectors
         return dst(y, type=1, norm="ortho", axis=0), 2 * difference_eigenvalues(len(y))
 
-    def by_tensor(self, D: Floats, theta: Floats, B: float) -> TensorSlopes:
-        """Return the log-likelihood and its derivatives; -inf where it is not defined."""
-        return self.by_sines(D, theta, B) if self.steps.even else self.by_bands(D, theta, B)
+    def by_tensor(self, D: Floats, theta: Floats, B: Floats) -> TensorSlopes:
+        """Return the log-likelihood and its derivatives at P points; -inf where not defined."""
+        if self.steps.even:
+            try:
+                return self.by_sines(D, theta, B)
+            except np.linalg.LinAlgError:
+                if len(D) == 1:
+                    return TensorSlopes.undefined(D, theta)
+        if len(D) == 1:
+            return self.by_bands(D[0], theta[0], float(B[0]))
+        points = [
+            self.by_tensor(D[p : p + 1], theta[p : p + 1], B[p : p + 1]) for p in range(len(D))
+        ]
+        return TensorSlopes(*(np.concatenate(rows) for rows in zip(*points, strict=True)))
 
-    def by_sines(self, D: Floats, theta: Floats, B: float) -> TensorSlopes:
+    def by_sines(self, D: Floats, theta: Floats, B: Floats) -> TensorSlopes:
         """Evaluate even steps: mode k of the sine transform has covariance 2 D tau + w_k O.
 
-        All modes are diagonal in the axes that diagonalise D against 2 D tau + 2 O.
+        All modes are diagonal in the axes that diagonalise D against 2 D tau + 2 O. A LinAlgError
+        is raised if that sum is not positive definite at one of the points.
         """
         z, w = self.spectrum
         s = self.steps
         shapes, tau = s.before[:, 0], float(s.duration[0])
-        noise = np.tensordot(theta, shapes, 1) - 2 * B * s.dt * D
-        middle = 2 * tau * D + 2 * noise
-        try:
-            root = np.linalg.inv(np.linalg.cholesky(middle))
-        except np.linalg.LinAlgError:
-            return _undefined(D, theta)
-        share, turn = np.linalg.eigh(root @ (2 * tau * D) @ root.T)
-        axes = root.T @ turn
-        power = share + 0.5 * w[:, None] * (1 - share)
-        if not power.min() > 0:
-            return _undefined(D, theta)
+        blur = (B * s.dt)[:, None, None]
+        noise = np.tensordot(theta, shapes, 1) - 2 * blur * D
+        root = np.linalg.inv(np.linalg.cholesky(2 * tau * D + 2 * noise))
+        across = np.swapaxes(root, 1, 2)
+        share, turn = np.linalg.eigh(root @ (2 * tau * D) @ across)
+        axes = across @ turn
+        power = share[:, None] + 0.5 * w[:, None] * (1 - share[:, None])
+        inverse = 1 / power
         u = z @ axes
         q = u / power
-        inverse = 1 / power
-        plain = axes @ (q.T @ q - np.diag(inverse.sum(0))) @ axes.T
-        weighted = axes @ (q.T @ (w[:, None] * q) - np.diag(w @ inverse)) @ axes.T
-        log_det = np.log(power).sum() - 2 * len(z) * np.log(np.diag(root)).sum()
-        value = -0.5 * (log_det + np.sum(u * q))
-        by_theta = 0.5 * np.einsum("jab,ab->j", shapes, weighted)
-        by_B = -s.dt * float(np.sum(weighted * D))
-        return TensorSlopes(float(value), tau * plain - B * s.dt * weighted, by_theta, by_B)
+        columns, back = np.swapaxes(q, 1, 2), np.swapaxes(axes, 1, 2)
+        same, next_one = columns @ q, columns @ (w[:, None] * q)
+        kept = np.arange(D.shape[1])
+        same[:, kept, kept] -= inverse.sum(axis=1)
+        next_one[:, kept, kept] -= w @ inverse
+        plain, weighted = axes @ same @ back, axes @ next_one @ back
+        log_det = np.log(power).sum(axis=(1, 2))
+        log_det -= 2 * len(z) * np.log(root[:, kept, kept]).sum(axis=1)
+        value = -0.5 * (log_det + (u * q).sum(axis=(1, 2)))
+        by_theta = 0.5 * np.einsum("jab,pab->pj", shapes, weighted)
+        by_B = -s.dt * (weighted * D).reshape(len(D), -1).sum(axis=1)
+        found = TensorSlopes(value, tau * plain - blur * weighted, by_theta, by_B)
+        bad = ~(power.min(axis=(1, 2)) > 0)
+        if bad.any():
+            for values, undefined in zip(found, TensorSlopes.undefined(D, theta), strict=True):
+                values[bad] = undefined[bad]
+        return found
 
     def by_bands(self, D: Floats, theta: Floats, B: float) -> TensorSlopes:
-        """Evaluate any steps by banded Cholesky factors of their covariance.
+        """Evaluate any steps at one point by banded Cholesky factors of their covariance.
 
         With P and Q the pivot blocks of the elimination from above and from below and A the
         diagonal blocks, the diagonal blocks of the inverse are (P + Q - A)^-1; those next to them
@@ -165,7 +205,7 @@ class NoisyVectors:
         down, pivots, log_det = band_factor(diagonal, off_diagonal)
         _, up_pivots, log_up = band_factor(diagonal[::-1], off_diagonal[::-1])
         if not np.isfinite(log_det + log_up):
-            return _undefined(D, theta)
+            return TensorSlopes.undefined(D[None], theta[None])
         solved, _ = dpbtrs(down, s.vectors.reshape(-1), lower=1)
         z = solved.reshape(s.vectors.shape)
         inverse = symmetric_inverses(pivots + up_pivots[::-1] - diagonal)
@@ -178,12 +218,7 @@ class NoisyVectors:
         by_theta -= np.einsum("jsab,sab->j", s.after[:, :-1], next_one)
         by_B = -s.dt * float(np.sum(weighted * D))
         by_D = np.tensordot(s.duration, same, 1) - B * s.dt * weighted
-        return TensorSlopes(float(value), by_D, by_theta, by_B)
-
-
-def _undefined(D: Floats, theta: Floats) -> TensorSlopes:
-    """Return the value where a covariance is not positive definite: -inf, without slopes."""
-    return TensorSlopes(-np.inf, np.full_like(D, np.nan), np.full_like(theta, np.nan), np.nan)
+        return TensorSlopes(np.array([value]), by_D[None], by_theta[None], np.array([by_B]))
 
 
 def band_factor(diagonal: Floats, off_diagonal: Floats) -> tuple[Floats, Floats, float]:
@@ -396,11 +431,19 @@ class PooledLikelihood:
 
     def slopes(self, p: Floats) -> tuple[float, Floats]:
         """Return the log-likelihood and its slopes."""
-        D, jacobian = self.family(p[: self.m])
-        own = p[self.m :].reshape(self.shape)
-        found = [s.slopes(D, o) for s, o in zip(self.tracks, own, strict=True)]
-        by_q = np.einsum("ab,kab->k", np.sum([part[1] for part in found], axis=0), jacobian)
-        return sum(part[0] for part in found), np.concatenate([by_q, *(f[2] for f in found)])
+        values, slopes = self.slopes_at(p[None])
+        return float(values[0]), slopes[0]
+
+    def slopes_at(self, points: Floats) -> tuple[Floats, Floats]:
+        """Return the log-likelihoods (P,) and their slopes (P, m + Gc) at P points."""
+        pairs = [self.family(p[: self.m]) for p in points]
+        D, jacobian = (np.array(part) for part in zip(*pairs, strict=True))
+        own = points[:, self.m :].reshape(len(points), *self.shape)
+        found = [s.slopes(D, own[:, g]) for g, s in enumerate(self.tracks)]
+        by_D = np.sum([part[1] for part in found], axis=0)
+        by_q = [np.einsum("ab,kab->k", *one) for one in zip(by_D, jacobian, strict=True)]
+        value = np.sum([part[0] for part in found], axis=0)
+        return value, np.concatenate([by_q, *(part[2] for part in found)], axis=1)
 
     def line_search(
         self, p: Floats, value: float, step: Floats, gain: float
@@ -419,22 +462,15 @@ class PooledLikelihood:
         The noise of one motion does not enter the slopes of the others, so all change at once.
         """
         count, c = self.shape
-        shared, mixed = np.empty((self.m, self.m)), np.empty((count, self.m, c))
-        for k in range(self.m):
-            change = self.derivative_along(p, np.eye(len(p))[k])
-            shared[k], mixed[:, k] = change[: self.m], change[self.m :].reshape(self.shape)
-        own = np.empty((count, c, c))
-        for k in range(c):
-            toward = np.append(np.zeros(self.m), np.tile(np.eye(c)[k], count))
-            own[:, k] = self.derivative_along(p, toward)[self.m :].reshape(self.shape)
+        one, other = np.eye(self.m, len(p)), np.zeros((c, len(p)))
+        other[:, self.m :] = np.tile(np.eye(c), count)
+        steps = _DIFFERENCE_STEP * np.concatenate([one, other])
+        ahead, behind = np.split(self.slopes_at(np.concatenate([p + steps, p - steps]))[1], 2)
+        change = (behind - ahead) / (2 * _DIFFERENCE_STEP)
+        shared = change[: self.m, : self.m]
+        by_noise = change[:, self.m :].reshape(self.m + c, count, c).swapaxes(0, 1)
+        mixed, own = by_noise[:, : self.m], by_noise[:, self.m :]
         return ArrowHessian(0.5 * (shared + shared.T), mixed, 0.5 * (own + np.swapaxes(own, 1, 2)))
-
-    def derivative_along(self, p: Floats, toward: Floats) -> Floats:
-        """Return minus the derivative of the slopes along a direction."""
-        step = _DIFFERENCE_STEP * toward
-        ahead, behind = self.slopes(p + step)[1], self.slopes(p - step)[1]
-        change: Floats = (behind - ahead) / (2 * _DIFFERENCE_STEP)
-        return change
 
 
 @dataclass(frozen=True, eq=False)

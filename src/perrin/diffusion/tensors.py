@@ -323,8 +323,8 @@ def imposed_symmetry(motion: RigidMotion, wanted: str | None) -> tuple[str, Floa
     if wanted == "C_1":
         return "C_1", symmetric_basis(3)
     tolerance = motion.template_error
-    if wanted is None:
-        elements = symmetry_elements(motion.template, tolerance)
+    elements = motion.symmetry_elements
+    if wanted is None and elements is not None:
         return schoenflies(elements), invariant_basis(elements)
     seen = []
     gap = pair_distances(motion.template).min()

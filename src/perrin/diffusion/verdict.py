@@ -9,9 +9,12 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 import numpy as np
 
 from perrin._arrays import choice_fault, refuse, to_plain
-from perrin._text import frames_text, number_text
+from perrin._text import listed, number_text
 from perrin.diffusion.anomalous import AnomalousEstimate, fit_anomalous
-from perrin.diffusion.brownian_tests import (
+from perrin.diffusion.confined import ConfinedEstimate, fit_confined
+from perrin.diffusion.estimate import DiffusionEstimate
+from perrin.diffusion.estimators import estimate_diffusion
+from perrin.diffusion.goodness_of_fit import (
     BrownianTests,
     Score,
     axis_model,
@@ -22,9 +25,6 @@ from perrin.diffusion.brownian_tests import (
     tabulated_p,
     tabulated_statistics,
 )
-from perrin.diffusion.confined import ConfinedEstimate, fit_confined
-from perrin.diffusion.estimate import DiffusionEstimate
-from perrin.diffusion.estimators import estimate_diffusion
 from perrin.diffusion.noise_model import Noise, noise_faults
 from perrin.diffusion.steps import Quantity
 from perrin.diffusion.switching import SwitchingEstimate, fit_switching
@@ -59,7 +59,9 @@ _SCATTER_DRAWS = 199  # draws that give the scatter of the two scores of a slow 
 
 _SHAPE_TESTS = ("fractional", "cage", "steady")
 
-_MODELS = {
+Model = AnomalousEstimate | ConfinedEstimate | DiffusionEstimate | SwitchingEstimate
+
+_MODELS: dict[str, type[Model]] = {
     "subdiffusion": AnomalousEstimate,
     "superdiffusion": AnomalousEstimate,
     "confined": ConfinedEstimate,
@@ -67,8 +69,6 @@ _MODELS = {
     "spin": DiffusionEstimate,
     "changing D": SwitchingEstimate,
 }
-
-Model = AnomalousEstimate | ConfinedEstimate | DiffusionEstimate | SwitchingEstimate
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +92,7 @@ class MotionVerdict:
         "drift" (um/s).
     model : AnomalousEstimate, ConfinedEstimate, DiffusionEstimate, SwitchingEstimate or None
         Fitted alternative; a `DiffusionEstimate` with its drift where the motion is steady; None
-        for diffusion, jumps and vibration.
+        for diffusion, jumps and vibration, and for several motions whose D changes.
     frames : tuple of int
         Rows of the motion at which jumps end.
     text : str
@@ -391,8 +391,9 @@ def _variance(
     """
     from scipy.special import chdtri, gammaincc
 
-    quantity, logs, rows = verdict.quantity, np.zeros(2), []
-    for number, (m, one) in enumerate(zip(motions, tested, strict=True)):
+    quantity, logs = verdict.quantity, np.zeros(2)
+    rows: list[int] = []
+    for m, one in zip(motions, tested, strict=True):
         axes, n = one.fit.D.shape[1], one.model.n_steps
         limit = np.median(one.u) / chdtri(axes, 0.5) * chdtri(axes, 1 / n)
         u = np.minimum(one.u, limit)
@@ -400,26 +401,38 @@ def _variance(
         for i, name in enumerate(("clustering", "slow change")):
             p = tabulated_p(name, statistics[name], axes=axes, n_steps=n)
             logs[i] -= np.log(max(float(p), 1e-300))
-        rows += [(number, int(row)) for row in m.steps()[1][one.u > limit]]
+        beyond = np.median(one.u) / chdtri(axes, 0.5) * chdtri(axes, LEVEL / n)
+        rows += m.steps()[1][one.u > beyond].tolist()
     clustering, slow_change = gammaincc(len(tested), logs)
     if min(clustering, slow_change) > LEVEL:
-        frames = tuple(row for _, row in rows) if len(motions) == 1 else ()
-        where = f" (rows {frames_text(frames)} of the motion)" if frames else ""
-        text = (
-            f"A few steps of the {quantity} are too long for diffusion{where}: exchanged labels, "
-            "hops or heavy tails"
-        )
-        return replace(verdict, kind="jumps", frames=frames, text=_with_p(text, verdict.p_family))
+        return _jumps(verdict, rows if len(motions) == 1 else [])
     if slow_change < clustering and _noise_changes(motions, tested):
         text = (
             f"{_SUBJECT[quantity]} is consistent with diffusion whose measurement noise changes "
             "along the track"
         )
         return replace(verdict, text=_with_p(text, verdict.p_family))
-    motion = list(motions) if len(motions) > 1 else motions[0]
-    model = fit_switching(motion, quantity=quantity, noise=settings)
+    if len(motions) > 1:
+        # Every body has states of its own: the verdicts on each hold the fits.
+        text = f"The diffusion coefficient of the {quantity} changes in time"
+        return replace(verdict, kind="changing D", text=_with_p(text, verdict.p_family))
+    model = fit_switching(motions[0], quantity=quantity, noise=settings)
+    if model.dwell_fast.value < motions[0].usual_interval:
+        # A state that lasts less than a frame is single long steps.
+        return _jumps(verdict, np.flatnonzero(model.states[0] == 1).tolist())
     text = _model_text("changing D", model, quantity)
     return replace(verdict, kind="changing D", model=model, text=_with_p(text, verdict.p_family))
+
+
+def _jumps(verdict: MotionVerdict, rows: Sequence[int]) -> MotionVerdict:
+    """Return the verdict that a few steps are too long, which end at these rows of the motion."""
+    where = f" (rows {listed(rows)} of the motion)" if rows else ""
+    text = (
+        f"A few steps of the {verdict.quantity} are too long for diffusion{where}: exchanged "
+        "labels, hops or heavy tails"
+    )
+    text = _with_p(text, verdict.p_family)
+    return replace(verdict, kind="jumps", frames=tuple(rows), text=text)
 
 
 def _noise_changes(motions: Sequence[RigidMotion], tested: Sequence[BrownianTests]) -> bool:
@@ -450,7 +463,10 @@ def _period(tested: Sequence[BrownianTests]) -> float:
     peaks = []
     for one in tested:
         modes = np.sum(one.model.mode_ratios(one.fit), axis=1)[0]
-        k = int(np.argmax(modes)) + 1
+        # A vibration of any phase spreads over neighbouring sine modes: their centre of power.
+        largest = int(np.argmax(modes))
+        around = np.arange(max(0, largest - 2), min(len(modes), largest + 3))
+        k = 1 + float(np.average(around, weights=modes[around]))
         period = 2 * (one.model.n_steps + 1) * float(one.model.tau.mean()) / k
         peaks.append((float(largest_share(modes, one.fit.D.shape[1])), period))
     return max(peaks)[1]
@@ -462,9 +478,10 @@ def _diffusion_text(
     """Return the sentence on a track that no test rejects, with what it could have shown."""
     unit = "rad" if quantity == "rotation" else "um"
     steady = "spin" if quantity == "rotation" else "drift"
+    low, high = detectable["alpha_below"] or 0.0, detectable["alpha_above"] or 2.0
+    ends = [f"below {low:.2f}"] * (low > 0) + [f"above {high:.2f}"] * (high < 2)
     shown = [
-        f"an exponent below {detectable['alpha_below']:.2f} or above "
-        f"{detectable['alpha_above']:.2f}",
+        f"an exponent {' or '.join(ends)}" if ends else "no exponent between 0 and 2",
         f"a cage under {number_text(detectable['cage'] or 0.0, digits=2)} {unit}",
         f"a {steady} over {number_text(detectable[steady] or 0.0, digits=2)} {unit}/s",
     ]

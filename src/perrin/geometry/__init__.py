@@ -26,6 +26,7 @@ from perrin.geometry.shapes import Cluster, is_tetrahedron, pair_distances
 from perrin.geometry.symmetry import (
     matching_rotation,
     point_group,
+    projected_on_line,
     rotation_group,
     schoenflies,
     symmetry_elements,
@@ -62,6 +63,7 @@ __all__ = [
     "planar_rotation",
     "point_group",
     "pose_slopes",
+    "projected_on_line",
     "rotation_group",
     "schoenflies",
     "shifted",

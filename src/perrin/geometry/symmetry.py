@@ -57,7 +57,7 @@ def rotation_group(positions: ArrayLike, *, tolerance: float) -> Floats:
     """
     x = _centred_positions(positions, tolerance)
     d = x.shape[1]
-    line = _projected_on_line(x, tolerance)
+    line = projected_on_line(x, tolerance)
     if line is not None:
         return _line_rotations(line, d, tolerance)
     spatial = np.pad(x, ((0, 0), (0, 3 - d)))
@@ -100,7 +100,7 @@ def point_group(positions: ArrayLike, *, tolerance: float | None = None) -> str:
     x = _centred_positions(positions, 0.0 if tolerance is None else tolerance)
     x = np.pad(x, ((0, 0), (0, 3 - x.shape[1])))
     allowed = 1e-6 * float(np.linalg.norm(x, axis=1).mean()) if tolerance is None else tolerance
-    line = _projected_on_line(x, allowed)
+    line = projected_on_line(x, allowed)
     if line is not None:
         if np.abs(line).max() <= allowed:
             return "K_h"
@@ -143,8 +143,21 @@ def _centred_positions(positions: ArrayLike, tolerance: float) -> Floats:
     return Cluster.from_positions(positions).positions
 
 
-def _projected_on_line(x: Floats, tolerance: float) -> Floats | None:
-    """Return the projections on the line of a collinear body, None for any other body."""
+def projected_on_line(x: Floats, tolerance: float) -> Floats | None:
+    """Return the projections on the line of a collinear body, None for any other body.
+
+    Parameters
+    ----------
+    x : ndarray, shape (n, d)
+        Centred positions.
+    tolerance : float
+        Largest distance (um) of a particle from the line.
+
+    Examples
+    --------
+    >>> projected_on_line(np.eye(3) - 1 / 3, 0.1) is None
+    True
+    """
     axis = np.linalg.svd(x)[2][0]
     along = x @ axis
     off = np.linalg.norm(x - along[:, None] * axis, axis=1).max()
@@ -183,11 +196,13 @@ def _congruences(x: Floats, onto: Floats, tolerance: float) -> tuple[Ints, Float
     rotation, unique = fit_rotations(
         np.stack([origin, onto[k], onto[m]], axis=1), np.stack([np.zeros(3), x[i], x[j]])
     )
-    rotation = rotation[unique]
+    rotation, order = rotation[unique], np.empty((0, len(x)), dtype=np.int64)
     for _ in range(3):
-        rotated = x @ np.swapaxes(rotation, 1, 2)
+        rotated, before = x @ np.swapaxes(rotation, 1, 2), order
         order = np.argmin(np.linalg.norm(rotated[:, :, None] - onto, axis=3), axis=2)
         order = order[(np.sort(order, axis=1) == np.arange(len(x))).all(axis=1)]
+        if np.array_equal(order, before):
+            break
         rotation, unique = fit_rotations(onto[order], x)
         order, rotation = order[unique], rotation[unique]
     misfit = np.linalg.norm(x @ np.swapaxes(rotation, 1, 2) - onto[order], axis=2).max(axis=1)

@@ -284,7 +284,7 @@ def size_and_viscosity(
     """
     (d_t, e_t), (d_r, e_r), (kelvin, e_k) = _pair(D_T), _pair(D_R), _pair(temperature)
     refuse(_pair_faults(D_T=(d_t, e_t), D_R=(d_r, e_r), temperature=(kelvin, e_k)))
-    body = _unit_mobility(cluster)
+    body = shape_mobility(cluster)
     c_t, c_r = body.diameter_factor_T, body.diameter_factor_R
     sphere = float(np.sqrt(3 * c_t * d_t / (c_r**3 * d_r)))
     viscosity = BOLTZMANN * kelvin / (3 * np.pi * c_t * sphere * d_t) * 1e18
@@ -334,7 +334,7 @@ def _stokes_einstein(
     else:
         diameter, order = float(np.cbrt(thermal / (np.pi * eta * value))) * 1e6, 3
     if factor == "exact":
-        body = _unit_mobility(cluster)
+        body = shape_mobility(cluster)
         ratio = body.diameter_factor_T if mode == "translation" else body.diameter_factor_R
     elif is_tetrahedron(_centers_of(cluster)):
         ratio = _HOFFMANN
@@ -379,16 +379,6 @@ def _centers_of(cluster: Cluster | Mobility | ArrayLike) -> Floats:
     return (cluster if isinstance(cluster, Cluster) else Cluster.from_positions(cluster)).positions
 
 
-def _unit_mobility(cluster: Cluster | Mobility | ArrayLike) -> Mobility:
-    """Return a mobility of the cluster's shape; its scale and conditions cancel in ratios."""
-    if isinstance(cluster, Mobility):
-        return cluster
-    known = cluster.diameter if isinstance(cluster, Cluster) else None
-    positions = _centers_of(cluster)
-    diameter = neighbour_distance(positions) if known is None else known
-    return cluster_mobility(positions, radius=diameter / 2, viscosity=1e-3, temperature=300.0)
-
-
 def neighbour_distance(positions: Floats) -> float:
     """Return the mean distance of touching spheres; 1 for a single sphere.
 
@@ -405,3 +395,29 @@ def neighbour_distance(positions: Floats) -> float:
     if not len(distance) or distance.min() == 0:
         return 1.0  # coincident spheres are refused by `cluster_mobility`
     return float(distance[distance < _NEIGHBOUR_RATIO * distance.min()].mean())
+
+
+def shape_mobility(cluster: Cluster | Mobility | ArrayLike) -> Mobility:
+    """Return a mobility of the cluster, at any viscosity and temperature: they cancel in ratios.
+
+    Parameters
+    ----------
+    cluster : Cluster, Mobility or array_like, shape (n, 3)
+        As in `size_from_translation`.
+
+    Returns
+    -------
+    Mobility
+        The same object for a `Mobility`.
+
+    Examples
+    --------
+    >>> round(shape_mobility(Cluster.touching(4, 2.45)).diameter_T, 2)
+    4.37
+    """
+    if isinstance(cluster, Mobility):
+        return cluster
+    known = cluster.diameter if isinstance(cluster, Cluster) else None
+    positions = _centers_of(cluster)
+    diameter = neighbour_distance(positions) if known is None else known
+    return cluster_mobility(positions, radius=diameter / 2, viscosity=1e-3, temperature=300.0)

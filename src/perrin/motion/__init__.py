@@ -44,6 +44,8 @@ from perrin.motion.residuals import (
     median_chi2,
     regress,
     sample_residuals,
+    unit_center_variance,
+    unit_covariance,
 )
 from perrin.motion.rigid_motion import RigidMotion, threshold_displacement, threshold_references
 from perrin.motion.rigidity import (
@@ -116,4 +118,6 @@ __all__ = [
     "threshold_references",
     "track_direction",
     "track_rotation",
+    "unit_center_variance",
+    "unit_covariance",
 ]

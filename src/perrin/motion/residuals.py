@@ -9,7 +9,12 @@ import numpy as np
 
 from perrin._arrays import Floats, frozen
 from perrin.errors import DegenerateClusterError, TooFewFramesError
-from perrin.geometry.rigid import degrees_of_freedom, inertia_tensor, pose_slopes
+from perrin.geometry.rigid import (
+    degrees_of_freedom,
+    inertia_tensor,
+    orientation_covariance,
+    pose_slopes,
+)
 from perrin.geometry.rotations import skew
 from perrin.motion.tracking import template_motion
 
@@ -630,3 +635,36 @@ def body_residuals(motion: RigidMotion, positions: Floats) -> Floats:
     """
     out: Floats = np.einsum("tij,tni->tnj", motion.rotation, positions - motion.center[:, None])
     return out - motion.template
+
+
+def unit_covariance(motion: RigidMotion) -> Floats:
+    """Return the covariance of every orientation for a localisation error of 1 um, (T, a, a).
+
+    Examples
+    --------
+    >>> from perrin import Cluster, simulate_motion
+    >>> truth = simulate_motion(Cluster.tetrahedron(1.0), D_R=5e-3, dt=0.7, n_frames=9, rng=3)
+    >>> unit_covariance(truth)[0].diagonal().round(9)
+    array([0.375, 0.375, 0.375])
+    """
+    square = float(np.mean(motion.noise**2))
+    if square > 0:
+        return np.asarray(motion.covariance / square)
+    unit = orientation_covariance(motion.template, np.eye(motion.template.shape[1]))
+    return np.broadcast_to(unit, motion.covariance.shape)
+
+
+def unit_center_variance(motion: RigidMotion) -> Floats:
+    """Return the variance of every centre for a localisation error of 1 um, (T,).
+
+    Examples
+    --------
+    >>> from perrin import Cluster, simulate_motion
+    >>> truth = simulate_motion(Cluster.tetrahedron(1.0), D_R=5e-3, dt=0.7, n_frames=2, rng=3)
+    >>> unit_center_variance(truth)
+    array([0.25, 0.25])
+    """
+    square = float(np.mean(motion.noise**2))
+    if square > 0:
+        return np.asarray(motion.center_variance / square)
+    return np.full(len(motion.time), 1 / len(motion.template))

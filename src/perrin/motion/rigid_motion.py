@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -10,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from perrin._arrays import Floats, Ints, from_plain, frozen, to_plain
 from perrin.geometry.rotations import log_map
+from perrin.geometry.symmetry import projected_on_line, symmetry_elements
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -106,6 +108,17 @@ class RigidMotion:
         """
         first_order = 6 * self.sigma / np.sqrt(self.fitted.size)
         return float(first_order + 2 * self.sigma**2 / self.R + 1e-6 * self.R)
+
+    @cached_property
+    def symmetry_elements(self) -> Floats | None:
+        """The point group of the template within its error, as orthogonal matrices (g, 3, 3).
+
+        None in the plane and for particles on one line.
+        """
+        error = self.template_error
+        if self.dimension == 2 or projected_on_line(self.template, error) is not None:
+            return None
+        return symmetry_elements(self.template, error)
 
     @property
     def usual_interval(self) -> float:

@@ -9,7 +9,7 @@ import numpy as np
 
 from perrin._arrays import Bools, Floats, as_positions, as_sigma, finite_or_none, present, to_plain
 from perrin.geometry.shapes import pair_distances
-from perrin.geometry.symmetry import point_group
+from perrin.geometry.symmetry import point_group, schoenflies
 from perrin.motion.residuals import (
     SIGNIFICANCE,
     UNKNOWN_SLOPE,
@@ -270,6 +270,7 @@ def judge_quality(
             f"{body.time[misfit_rows[0]]:g} s): a particle is over {_MISPLACED_MULTIPLE:g} times "
             f"as far from its place as {_USUAL_SHARE:.0%} of all detections are",
         )
+    elements = motion.symmetry_elements
     return Quality(
         rigid=not soft,
         reasons=tuple(soft),
@@ -285,7 +286,9 @@ def judge_quality(
         swaps=swaps,
         cuts=cuts,
         extra=extra,
-        symmetry=point_group(motion.template, tolerance=motion.template_error),
+        symmetry=point_group(motion.template, tolerance=motion.template_error)
+        if elements is None
+        else schoenflies(elements),
         fraction=motion.fitted.size / len(motion.time),
         warnings=(*soft, *warnings),
         notes=tuple(notes),
@@ -528,7 +531,7 @@ def bond_drift(x: Floats) -> BondDrift:
         (low, n_low), (high, n_high) = min(medians), max(medians)
         # Error of a median, from the median absolute deviations inside the blocks, widened by
         # their autocorrelation.
-        off = [k - np.median(k) for k in kept]
+        off = [k - median for k, (median, _) in zip(kept, medians, strict=True)]
         scatter = 1.4826 * float(np.median(np.abs(np.concatenate(off))))
         power = sum(float(e @ e) for e in off)
         rho = sum(float(e[:-1] @ e[1:]) for e in off) / power if power > 0 else 0.0

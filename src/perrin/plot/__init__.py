@@ -19,6 +19,14 @@ from perrin.plot.imaging import (
     step_angle_density,
     tracks_figure,
 )
+from perrin.plot.motion import (
+    MOTION_CAPTION,
+    alternative_spectrum,
+    motion_figure,
+    plot_error_distribution,
+    plot_prediction_errors,
+    plot_step_spectrum,
+)
 from perrin.plot.results import (
     MAX_CLUSTERS,
     ModelLine,
@@ -42,8 +50,10 @@ from perrin.plot.style import PALETTE, legend_above, new_figure, save_figure, wr
 
 __all__ = [
     "MAX_CLUSTERS",
+    "MOTION_CAPTION",
     "PALETTE",
     "ModelLine",
+    "alternative_spectrum",
     "curve_figure",
     "forest_figure",
     "found_figure",
@@ -54,10 +64,12 @@ __all__ = [
     "legend_above",
     "misfit_figure",
     "model_line",
+    "motion_figure",
     "new_figure",
     "orientation_figure",
     "plot_angle",
     "plot_cluster",
+    "plot_error_distribution",
     "plot_forest",
     "plot_found",
     "plot_health",
@@ -66,10 +78,12 @@ __all__ = [
     "plot_misfit",
     "plot_orientations",
     "plot_plan",
+    "plot_prediction_errors",
     "plot_presence",
     "plot_residual",
     "plot_rigidity",
     "plot_step_angles",
+    "plot_step_spectrum",
     "plot_tracks",
     "plot_van_hove",
     "residual_figure",

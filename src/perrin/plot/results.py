@@ -117,7 +117,7 @@ def plot_lag_curve(
 
 
 def plot_van_hove(result: VanHove, *, ax: Axes) -> Axes:
-    """Draw a distribution of rotations or displacements, and the Gaussian of the same width.
+    """Draw a distribution of rotations or displacements, the Gaussian and the Brownian law.
 
     Parameters
     ----------
@@ -127,8 +127,9 @@ def plot_van_hove(result: VanHove, *, ax: Axes) -> Axes:
     Returns
     -------
     matplotlib.axes.Axes
-        Logarithmic; empty bins are left out. The legend has alpha_2 and its standard error for a
-        Gaussian.
+        Logarithmic; empty bins are left out. The legend has alpha_2, corrected for noise, and its
+        standard error for Brownian motion. The law of the angle on SO(3) is drawn where it is not
+        the Gaussian.
     """
     middle = (result.edges[1:] + result.edges[:-1]) / 2
     full = result.density > 0
@@ -144,7 +145,10 @@ def plot_van_hove(result: VanHove, *, ax: Axes) -> Axes:
         label=label,
     )
     ax.plot(middle, result.gaussian, "-", color=RED, lw=1.2, label="Gaussian of the same width")
-    name = "rotation" if result.quantity == "rotation" else "displacement"
+    if result.quantity == "angle":
+        ax.plot(middle, result.brownian, "--", color="k", lw=1.2, label="Brownian rotation")
+    names = {"translation": "displacement", "angle": "rotation angle"}
+    name = names.get(result.quantity, "rotation")
     unit = unit_text(result.unit)
     ax.set_yscale("log", nonpositive="clip")
     ax.set_ylim(0.3 * float(result.density[full].min()), 2 * float(result.density.max()))

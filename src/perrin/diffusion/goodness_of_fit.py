@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from importlib.resources import files
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -183,7 +182,7 @@ class AxisModel:
             full(D[..., None]),
             full(offset[..., None]),
             full(self.tau),
-            full(linked),
+            full(linked.astype(np.float64)),
             blur=self.blur,
             weight=(one, one),
             known=(full(self.known[0]), full(self.known[1])),
@@ -216,7 +215,8 @@ class AxisModel:
 
         def cost(v: Floats) -> Floats:
             shape = relative(v)
-            return np.log(np.mean(power / shape, axis=-1)) + np.mean(np.log(shape), axis=-1)
+            mean = np.mean(power / shape, axis=-1)
+            return np.asarray(np.log(mean) + np.mean(np.log(shape), axis=-1))
 
         if not self.free:
             # One parameter: the root of the score in ln D, from the variance of the steps.
@@ -248,51 +248,73 @@ class AxisModel:
         return AxisFit(y, D, D * tau * np.expm1(v) / 2 - noise)
 
     def _fit_tridiagonal(self, y: Floats, near: AxisFit | None) -> AxisFit:
-        """Fit any steps by scoring, with the information of even steps of the mean duration."""
-        from scipy.linalg.lapack import dpttrf, dpttrs
+        """Fit any steps by Newton steps on the score in ln D and v.
 
+        The curvature is that of even steps of the mean duration (scoring); the fit of one data set
+        takes its own curvature from differences of the score, where it has a maximum.
+        """
         tau, shape = self.tau.mean(), y.shape[:2]
+        single = near is None
         if near is None:
-            start = self.with_equal_noise()
-            modes = replace(
-                start, tau=np.full(self.n_steps, tau), linked=np.ones(self.n_steps, bool)
-            )
+            even = np.ones(self.n_steps, dtype=np.bool_)
+            modes = replace(self.with_equal_noise(), tau=np.full(self.n_steps, tau), linked=even)
             near = modes._fit_modes(y, None)
-        D = np.array(np.broadcast_to(near.D, shape))
-        v = np.array(self.ratio(D, np.broadcast_to(near.offset, shape)))
-        starts = np.arange(0, y.size, self.n_steps)
-        for _ in range(60 if near.y is y else 4):
-            offset = D * tau * np.expm1(v) / 2 if self.free else np.zeros_like(D)
-            a, b = self.bands(D, offset)
-            d, lower, _ = dpttrf(a, b)
-            up = dpttrf(a[::-1], b[::-1])[0]
-            z = dpttrs(d, lower, y.reshape(-1, 1))[0][:, 0]
-            inverse = 1 / (d + up[::-1] - a)
-            corner = -lower * inverse[1:]
-            linked = np.tile(np.append(self.linked[:-1], False), len(starts))
-            excess, cross = z * z - inverse, np.append((z[:-1] * z[1:] - corner), 0.0) * linked
-            # Slopes of the log-likelihood in D and in the offset.
-            taus = np.tile(self.tau, len(starts))
-            in_D = np.add.reduceat((taus - self.blur) * excess + self.blur * cross, starts)
-            in_o = np.add.reduceat(excess - cross, starts)
-            in_D, in_o = in_D.reshape(shape), in_o.reshape(shape)
+        t = np.stack([np.log(near.D), self.ratio(near.D, near.offset)], axis=-1)
+        t = np.array(np.broadcast_to(t, (*shape, 2)))[..., : 1 + self.free]
+
+        def parameters(t: Floats) -> tuple[Floats, Floats]:
+            D = np.exp(t[..., 0])
+            return D, D * tau * np.expm1(t[..., 1]) / 2 if self.free else np.zeros_like(D)
+
+        for _ in range(40 if single else 4):
+            D, offset = parameters(t)
+            score = self._score(y, D, offset)
             by_D, by_offset = self.slopes(D, offset)
+            g = by_D[..., None, :]
             if self.free:
-                share = tau * np.expm1(v) / 2
-                dv = tau * np.exp(v) / 2
-                g = np.stack([by_D + share[..., None] * by_offset, dv[..., None] * by_offset], -2)
-                score = np.stack([D * in_D + share * D * in_o, D * dv * in_o], axis=-1)
-                matrix = 0.5 * np.einsum("...ik,...jk->...ij", g, g)
-                move = np.linalg.solve(matrix, score[..., None])[..., 0]
-                move = np.clip(move, -1.0, 1.0)
-                v = np.clip(v + move[..., 1], _LEAST_V, _MOST_V)
-            else:
-                move = np.clip(D * in_D / (0.5 * np.sum(by_D**2, axis=-1)), -1, 1)[..., None]
-            D = D * np.exp(move[..., 0])
+                ratio = np.exp(t[..., 1])[..., None]
+                by_v = tau / 2 * ratio * by_offset
+                g = np.stack([by_D + tau / 2 * (ratio - 1) * by_offset, by_v], axis=-2)
+            matrix = 0.5 * np.einsum("...ik,...jk->...ij", g, g)
+            if single:
+                own = np.empty_like(matrix)
+                for k in range(t.shape[-1]):
+                    ahead = t.copy()
+                    ahead[..., k] += 1e-5
+                    own[..., k] = (score - self._score(y, *parameters(ahead))) / 1e-5
+                own = 0.5 * (own + np.swapaxes(own, -1, -2))
+                peaked = np.linalg.eigvalsh(own)[..., 0] > 0
+                matrix = np.where(peaked[..., None, None], own, matrix)
+            move = np.clip(np.linalg.solve(matrix, score[..., None])[..., 0], -0.5, 0.5)
+            t = t + move
+            if self.free:
+                t[..., 1] = np.clip(t[..., 1], _LEAST_V, _MOST_V)
             if np.all(np.abs(move) < 1e-9):
                 break
-        offset = D * tau * np.expm1(v) / 2 if self.free else np.zeros_like(D)
-        return AxisFit(y, D, offset)
+        return AxisFit(y, *parameters(t))
+
+    def _score(self, y: Floats, D: Floats, offset: Floats) -> Floats:
+        """Return the slopes of the log-likelihood in ln D and in a free v, (B, A, f)."""
+        from scipy.linalg.lapack import dpttrf, dpttrs
+
+        shape = y.shape[:2]
+        a, b = self.bands(D, offset)
+        d, lower, _ = dpttrf(a, b)
+        up = dpttrf(a[::-1], b[::-1])[0]
+        z = dpttrs(d, lower, y.reshape(-1, 1))[0][:, 0]
+        inverse = 1 / (d + up[::-1] - a)
+        starts = np.arange(0, y.size, self.n_steps)
+        linked = np.tile(np.append(self.linked[:-1], False), len(starts))
+        excess = z * z - inverse
+        cross = np.append(z[:-1] * z[1:] + lower * inverse[1:], 0.0) * linked
+        taus = np.tile(self.tau, len(starts))
+        in_D = np.add.reduceat((taus - self.blur) * excess + self.blur * cross, starts)
+        in_o = np.add.reduceat(excess - cross, starts)
+        in_D, in_o = D * in_D.reshape(shape), in_o.reshape(shape)
+        if not self.free:
+            return np.asarray(in_D[..., None])
+        half = D * self.tau.mean() / 2
+        return np.stack([in_D + offset * in_o, (half + offset) * in_o], axis=-1)
 
     def draws(self, fit: AxisFit, *, count: int, rng: np.random.Generator) -> Floats:
         """Return steps of Brownian motion with the D and the offset of one fit, (count, A, N)."""
@@ -304,7 +326,7 @@ class AxisModel:
         # C = L diag(d) L^T with a bidiagonal L: each step takes up a part of the one before.
         z = np.sqrt(d) * rng.standard_normal((count, axes, self.n_steps))
         z[..., 1:] += lower[:, :-1] * z[..., :-1].copy()
-        return z
+        return np.asarray(z)
 
     def log_likelihood(self, fit: AxisFit) -> float:
         """Return the log-likelihood of the first data set at its fit, less a constant."""
@@ -359,7 +381,7 @@ class AxisModel:
         """
         if not self.even:
             ratio = sine_powers(self.prediction_errors(fit))
-            return ratio / ratio.mean(axis=-1, keepdims=True)
+            return np.asarray(ratio / ratio.mean(axis=-1, keepdims=True))
         ratio = sine_powers(fit.y) / self.eigenvalues(fit.D, fit.offset)
         ratio /= ratio.mean(axis=-1, keepdims=True)
         # A large mode draws the fit to itself, by its leverage h beyond that of the mean: without
@@ -441,7 +463,7 @@ class AxisModel:
                     self.tau[rows],
                     self.linked[rows],
                     blur=self.blur,
-                    weight=(1.0, 1.0),
+                    weight=(np.ones(1), np.ones(1)),
                     known=noise,
                 )
                 d, lower, _ = dpttrf(a, b)
@@ -607,7 +629,7 @@ def clustering(u: Floats) -> Floats:
     for lag in range(1, lags + 1):
         weight = 1 - lag / (lags + 1)
         total += weight * np.einsum("...n,...n->...", x[..., lag:], x[..., :-lag])
-    return total / variance
+    return np.asarray(total / variance)
 
 
 def slow_change(u: Floats, axes: int) -> Floats:
@@ -674,6 +696,8 @@ def tabulated_statistics(u: Floats, axes: int) -> dict[str, Floats]:
 @lru_cache(maxsize=1)
 def _quantile_table() -> dict[tuple[str, int], tuple[Floats, Floats]]:
     """Return the lengths and the quantiles (lengths, probabilities) by statistic and axes."""
+    from importlib.resources import files
+
     text = files("perrin.diffusion").joinpath("brownian_quantiles.csv").read_text("utf-8")
     head, *lines = text.splitlines()
     table: dict[tuple[str, int], list[list[float]]] = {}
@@ -812,7 +836,8 @@ def brownian_tests(model: AxisModel, y: Floats) -> BrownianTests:
     """
     fit = model.fit(y)
     scores = model.scores(fit) if model.even else model.dense_scores(fit, y)
-    p = approximate_p(model, fit, scores)
+    values = approximate_p(model, fit, scores)
+    p = {name: float(value[0]) for name, value in values.items()}
     n = model.n_steps
     snr = float(
         np.mean(fit.D) * model.tau.mean() / max(np.mean(fit.offset + model.mean_known), 1e-300)
@@ -824,11 +849,9 @@ def brownian_tests(model: AxisModel, y: Floats) -> BrownianTests:
         near = model.fit(drawn, near=fit)
         again = model.scores(near) if model.even else model.dense_scores(fit, drawn)
         null = approximate_p(model, near, again)
-        p = {name: _rank(p[name][0], null[name]) for name in p}
+        p = {name: _rank(p[name], null[name]) for name in p}
     u = np.sum(model.prediction_errors(fit) ** 2, axis=1)[0]
-    return BrownianTests(
-        {k: float(np.ravel(v)[0]) for k, v in p.items()}, model, fit, scores, u, ranked
-    )
+    return BrownianTests(p, model, fit, scores, u, ranked)
 
 
 def approximate_p(model: AxisModel, fit: AxisFit, scores: tuple[Score, Score]) -> dict[str, Floats]:
@@ -861,7 +884,7 @@ def approximate_p(model: AxisModel, fit: AxisFit, scores: tuple[Score, Score]) -
     }
 
 
-def _rank(p: Floats, null: Floats) -> float:
+def _rank(p: float, null: Floats) -> float:
     """Return the rank of a p-value among those of draws, continued below the smallest of these."""
     order = np.sort(null)
     below = int(np.searchsorted(order, p, side="right"))
