@@ -75,7 +75,7 @@ _DEMO_FOLDER = "perrin-demo"
 
 _DEMO_FILES = re.compile(
     r"summary\.json|run\.json|report\.html|curves\.csv|(?:tracks|motion)\.parquet"
-    r"|figures|figures/(?:motion|cluster-0-\w+)\.(?:png|pdf|svg)"
+    r"|figures|figures/cluster-0-\w+\.(?:png|pdf)"
 )
 
 

@@ -2,6 +2,7 @@
 
 from perrin.diffusion.anomalous import AnomalousEstimate, fit_anomalous
 from perrin.diffusion.bounds import cramer_rao
+from perrin.diffusion.changing import with_changing_interval
 from perrin.diffusion.confined import ConfinedEstimate, cage_size, fit_confined, fit_confined_steps
 from perrin.diffusion.curve_fits import (
     GridLags,
@@ -42,21 +43,6 @@ from perrin.diffusion.goodness_of_fit import (
     tabulated_p,
     tabulated_statistics,
 )
-from perrin.diffusion.changing import with_changing_interval
-from perrin.diffusion.confined import ConfinedEstimate, cage_size, fit_confined
-from perrin.diffusion.curve_fits import (
-    GridLags,
-    best_window,
-    fit_gls,
-    fit_line,
-    gls_weights,
-    line_weights,
-    msd_covariance,
-    slope_interval,
-    weighted_variance,
-)
-from perrin.diffusion.estimate import DiffusionEstimate, Found, bare_text, value_text
-from perrin.diffusion.estimators import by_likelihood, estimate_diffusion, precision_limits
 from perrin.diffusion.likelihood import (
     Likelihood,
     ProfilePoint,

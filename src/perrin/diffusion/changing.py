@@ -26,7 +26,7 @@ _BLOCKS, _FEWEST_STEPS_OF_BLOCK = (4, 8, 16), 5
 def with_changing_interval(
     estimate: DiffusionEstimate,
     motion: RigidMotion | Sequence[RigidMotion],
-    states: SwitchingEstimate,
+    states: SwitchingEstimate | None = None,
 ) -> DiffusionEstimate:
     """Return an estimate whose interval holds where D changes in time.
 
@@ -36,8 +36,8 @@ def with_changing_interval(
         D of the motion by the likelihood of one constant D, whose interval is too narrow here.
     motion : RigidMotion or sequence of RigidMotion
         The motion, or motions, of the estimate.
-    states : SwitchingEstimate
-        Two states fitted to it.
+    states : SwitchingEstimate, optional
+        Two states fitted to it; None for several motions, which have states of their own.
 
     Returns
     -------
@@ -68,7 +68,7 @@ def with_changing_interval(
     """
     if not estimate.resolved:
         return estimate
-    low, high = states.D_mean.ci68
+    low, high = (0.0, np.inf) if states is None else states.D_mean.ci68
     error, source = np.inf, "states"
     if 0 < low < high < np.inf:
         error = float(np.log(high / low)) / (2 * NORMAL[0.68])

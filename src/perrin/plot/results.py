@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
@@ -12,6 +13,7 @@ from perrin._text import number_text, shortened, unit_text
 from perrin.curves.displacement import axes_weighted_equally
 from perrin.diffusion.estimate import value_text
 from perrin.geometry.rigid import degrees_of_freedom
+from perrin.plot.motion import motion_figure
 from perrin.plot.style import (
     BLUE,
     GREY,
@@ -417,9 +419,11 @@ def save_figures(report: Report, folder: str | os.PathLike[str]) -> list[Path]:
     -------
     list of Path
         ``clusters.*`` if there are several clusters, and for each cluster
-        ``cluster-<n>-curves.*``, ``-residuals.*`` and ``-orientations.*``.
+        ``cluster-<n>-curves.*``, ``-residuals.*`` and ``-orientations.*``, and, where its motion
+        was judged, ``-rotation.*`` and ``-translation.*``.
     """
     place = Path(folder)
+    first = report.tracks.dropna(subset=["x", "y"]).groupby("cluster")["frame"].min()
     files: list[Path] = []
     if report.pooled is not None and len(report.clusters) > 1:
         files += save_figure(forest_figure(report.clusters, report.pooled), place / "clusters")
@@ -431,6 +435,21 @@ def save_figures(report: Report, folder: str | os.PathLike[str]) -> list[Path]:
     for result in report.clusters[:MAX_CLUSTERS]:
         for kind, draw in kinds.items():
             files += save_figure(draw(result), place / f"cluster-{result.cluster}-{kind}")
+        for quantity, verdict in result.verdicts.items():
+            if verdict is None:
+                continue
+            motion = result.motion
+            if verdict.quantity == "translation":  # the centre's path crosses doubt about labels
+                motion = replace(motion, piece=np.zeros_like(motion.piece))
+            # In a report frames count from the table's first, in a motion from its own.
+            rows = tuple(frame - int(first[result.cluster]) for frame in verdict.frames)
+            figure = motion_figure(
+                motion,
+                quantity=verdict.quantity,
+                noise=result.D_R.settings,
+                verdict=replace(verdict, frames=rows),
+            )
+            files += save_figure(figure, place / f"cluster-{result.cluster}-{quantity}")
     return files
 
 

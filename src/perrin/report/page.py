@@ -19,6 +19,7 @@ from perrin._text import (
 )
 from perrin.diffusion.estimate import bare_text, value_text
 from perrin.diffusion.sampling import judge_sampling
+from perrin.plot.motion import MOTION_CAPTION
 from perrin.plot.results import MAX_CLUSTERS
 from perrin.report.html import byline, captioned, inline_pictures, render_page
 from perrin.run.remarks import condensed, grouped
@@ -70,12 +71,7 @@ _RESULT_CAPTIONS = {
         "A freely diffusing body has no trend. A steady slope is driven rotation; jumps are "
         "exchanges of labels.",
     ),
-    "motion": (
-        "Steps against Brownian motion.",
-        "The steps of rotation and translation, compared with those of diffusion with one "
-        "D and one noise.",
-        "The tests behind the verdict see what these pictures show.",
-    ),
+    "motion": MOTION_CAPTION,
     "clusters": (
         "All clusters.",
         "Diffusion coefficients of all clusters with 68 % (thick) and 95 % (thin) intervals; the "
@@ -134,7 +130,6 @@ def render_html(report: Report, figures: Iterable[Path]) -> str:
         label=None if several else report.results[0].label,
         headline=[] if pooled is None else _both_coefficients(pooled.D_R, pooled.D_T),
         verdict=[" ".join(texts) for texts in verdict_lines(report).values()],
-        motion_figure=captioned(pictures, "motion", "motion", _RESULT_CAPTIONS["motion"]),
         overview=[
             {
                 "anchor": result.cluster,
@@ -250,7 +245,8 @@ def _cluster_section(
     """Return everything that the page shows about one cluster."""
     motion, sizes = result.motion, result.sizes or {}
     d = motion.dimension
-    kinds = {"motion": "motion", "curves": "curves", "residuals": "residuals"}
+    kinds = {"rotation": "motion", "translation": "motion"}
+    kinds |= {"curves": "curves", "residuals": "residuals"}
     kinds |= {"orientations": "angle" if d == 2 else "sphere"}
     drawn = [
         captioned(pictures, f"cluster-{result.cluster}-{name}", kind, _RESULT_CAPTIONS[kind])

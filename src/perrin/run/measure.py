@@ -1016,8 +1016,8 @@ def pool_coefficients(
     if verdict is None:
         return estimate, None, []
     estimate, warnings = replace(estimate, motion=verdict.kind), []
-    if isinstance(verdict.model, SwitchingEstimate):
-        estimate = with_changing_interval(estimate, motions, verdict.model)
+    if verdict.kind == "changing D":
+        estimate = with_changing_interval(estimate, motions)
     removed = noise.drift and verdict.kind in ("drift", "spin")
     warned = any(
         not one.brownian or any(words.is_not_diffusion(text) for text in one.remarks.warnings)
