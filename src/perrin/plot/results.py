@@ -419,8 +419,9 @@ def save_figures(report: Report, folder: str | os.PathLike[str]) -> list[Path]:
     -------
     list of Path
         ``clusters.*`` if there are several clusters, and for each cluster
-        ``cluster-<n>-curves.*``, ``-residuals.*`` and ``-orientations.*``, and, where its motion
-        was judged, ``-rotation.*`` and ``-translation.*``.
+        ``cluster-<n>-curves.*``, ``-residuals.*`` and ``-orientations.*``; ``-rotation.*`` and
+        ``-translation.*``, against diffusion, for the first cluster and where the motion is not
+        diffusion.
     """
     place = Path(folder)
     first = report.tracks.dropna(subset=["x", "y"]).groupby("cluster")["frame"].min()
@@ -436,7 +437,10 @@ def save_figures(report: Report, folder: str | os.PathLike[str]) -> list[Path]:
         for kind, draw in kinds.items():
             files += save_figure(draw(result), place / f"cluster-{result.cluster}-{kind}")
         for quantity, verdict in result.verdicts.items():
-            if verdict is None:
+            # Drawing takes a second: of the others the first cluster is the example.
+            if verdict is None or (
+                verdict.kind == "diffusion" and result is not report.clusters[0]
+            ):
                 continue
             motion = result.motion
             if verdict.quantity == "translation":  # the centre's path crosses doubt about labels
