@@ -87,9 +87,10 @@ class MotionVerdict:
     p_family : float
         Probability, in Brownian motion, of a smallest p-value as small as this (Holm).
     detectable : dict of str to float or None
-        What this track would have shown in 80 % of cases: exponents "alpha_below" and
-        "alpha_above", a "cage" of smaller rms radius (rad or um), and a faster "spin" (rad/s) or
-        "drift" (um/s).
+        What this track could have shown: exponents "alpha_below" and "alpha_above", a "cage" of
+        smaller rms radius (rad or um), and a faster "spin" (rad/s) or "drift" (um/s). The test for
+        an exponent or a steady motion at its limit rejects in about 80 % of cases at 5 %, that for
+        a cage in half of them; the family of tests rejects nearly always at twice the distance.
     model : AnomalousEstimate, ConfinedEstimate, DiffusionEstimate, SwitchingEstimate or None
         Fitted alternative; a `DiffusionEstimate` with its drift where the motion is steady; None
         for diffusion, jumps and vibration, and for several motions whose D changes.
@@ -292,13 +293,13 @@ def combined_p(tested: Sequence[BrownianTests]) -> dict[str, float]:
         p[name] = float(gammaincc(len(tested), sum(logs)))
     if sum(one.model.n_steps for one in tested) >= 200:
         for i, name in enumerate(("fractional", "cage")):
-            total = Score(*np.sum([one.scores[i] for one in tested], axis=0))
+            total = Score.total([one.scores[i] for one in tested])
             p[name] = float(score_p(total, one_sided=name == "cage")[0])
     return p
 
 
 def detectable_by(tested: Sequence[BrownianTests], quantity: Quantity) -> dict[str, float | None]:
-    """Return what these tracks together would have shown in 80 % of cases.
+    """Return what these tracks together could have shown.
 
     An exponent that differs from 1 by 2.8 standard errors; a cage of rms radius r with 12
     (r/step)^2 steps in the longest track; a spin (rad/s) or drift (um/s) of 3.3 standard errors of
@@ -374,7 +375,7 @@ def _steady_gain(tested: Sequence[BrownianTests]) -> tuple[float, float, float]:
         gain += model.log_likelihood(rest) - model.log_likelihood(fit)
         logs -= np.log(max(float(p[0]), 1e-300))
         scores.append((model.scores(rest) if model.even else model.dense_scores(rest, rest.y))[0])
-    p_rest = score_p(Score(*np.sum(scores, axis=0)), one_sided=False)
+    p_rest = score_p(Score.total(scores), one_sided=False)
     return gain, float(gammaincc(len(tested), logs)), float(p_rest[0])
 
 
@@ -487,7 +488,7 @@ def _diffusion_text(
     ]
     return (
         f"{_SUBJECT[quantity]} is consistent with diffusion (p = {p_family:.2g} over {tests} "
-        f"tests); this track would have shown {shown[0]}, {shown[1]}, or {shown[2]}."
+        f"tests); this track could have shown {shown[0]}, {shown[1]}, or {shown[2]}."
     )
 
 
