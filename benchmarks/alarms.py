@@ -46,6 +46,7 @@ import perrin
 # What a warning is about, by its words. A text belongs to the first kind that it matches; a fault
 # is named when a text matches one of the kinds that it expects, whatever else the text matches.
 KINDS = {
+    "not diffusion": r"^not diffusion:",
     "velocity": r"mean velocity|\bflow\b|centre moves steadily",
     "spin": r"\bspin|mean turn|turns? steadily|steady (turn|rotation)|rad/s\b",
     "hopping": r"another kind of motion|no Brownian motion|not Brownian",
@@ -269,6 +270,22 @@ def at_rest(rng, *, count=1, body=TRIMER, size=0.002, memory=50):
         body + smooth((250, *body.shape), size=size, memory=memory, rng=rng) + [20.0 + 9 * k, 0, 0]
         for k in range(count)
     ]
+
+
+def caged(rng, *, memory=3, angle=0.1, radius=0.3):
+    """Return a tetrahedron that relaxes about one place and one orientation within `memory`."""
+    turn = smooth((300, 3), size=angle, memory=memory, rng=rng)
+    centre = smooth((300, 3), size=radius, memory=memory, rng=rng)
+    x = TETRAHEDRON @ np.swapaxes(Rotation.from_rotvec(turn).as_matrix(), -1, -2)
+    return [x + centre[:, None] + 20 + rng.normal(size=x.shape) * SIGMA]
+
+
+def switching(rng, *, ratio=10.0, dwell=30):
+    """Return a tetrahedron whose D is `ratio` times larger in every second block of frames."""
+    fast = np.arange(299) // dwell % 2 == 1
+    times = np.append(0, np.where(fast, DT, DT / ratio).cumsum())
+    x = brownian(TETRAHEDRON, times, D_R=SPEEDS["usual"][0], D_T=SPEEDS["usual"][1], rng=rng)
+    return [x + 20 + rng.normal(size=x.shape) * SIGMA]
 
 
 def sliced(rng, *, count=2):
@@ -649,6 +666,8 @@ FAULTS = [
           changes=(partial(wrapped, box=10.0, whole=False),)),
     fault("many jumps", "hopping", changes=(partial(hopping, share=0.1, size=2.0),),
           allowed=(*TRACES, "jump")),
+    fault("caged", "not diffusion", tracks=caged),
+    fault("D switches tenfold", ("not diffusion", "hopping"), tracks=switching),
     fault("time contradicts dt", "time", edits=(partial(with_times, step=0.5),)),
     fault("frames in steps of 5", "stride", edits=(every_fifth,), where="notes"),
     fault("5 % repeat the last place", "repeat", changes=(partial(last_places, share=0.05),),

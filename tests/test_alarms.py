@@ -239,7 +239,7 @@ def test_a_name_of_no_case_is_refused(capsys):
 # Quick cases that together raise every kind of warning that a fault must have; that clusters
 # disagree is a law of `test_analysis`.
 ONE_CASE_PER_KIND = (
-    "flow 0.15 um/s", "steady turn 0.2 rad/s", "stage jump 3 um, plane", "many jumps",
+    "flow 0.15 um/s", "steady turn 0.2 rad/s", "stage jump 3 um, plane", "many jumps", "caged",
     "time contradicts dt", "5 % repeat the last place", "5 % at (0, 0), plane", "centred before",
     "soft arm, 0.2 rad", "slices of tumbling bodies", "z +10 %, 100 frames", "sequential scan",
     "labels exchanged 15 times", "line through an anisotropic MSAD", "undersampled",

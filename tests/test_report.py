@@ -240,8 +240,8 @@ def test_the_run_folder_is_complete(single, tmp_path, monkeypatch, repeats):
         "summary.json", "tracks.parquet", "motion.parquet", "curves.csv", "run.json", "figures",
         "report.html",
     }  # fmt: skip
-    assert len(list((place / "figures").iterdir())) == 6
-    assert Page((place / "report.html").read_text(encoding="utf-8")).tags.count("img") == 3
+    assert len(list((place / "figures").iterdir())) == 10
+    assert Page((place / "report.html").read_text(encoding="utf-8")).tags.count("img") == 5
     assert [p.name for p in tmp_path.iterdir()] == ["run"]
     # The page made from what was read back is the same page.
     again = report.render_html(perrin.load_run(place), [])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
+from typing import TYPE_CHECKING, Annotated, Any, Literal, cast, get_args
 
 import typer
 from typer.core import TyperCommand
@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from perrin.geometry.shapes import Cluster
     from perrin.images.optics.optics import Optics
     from perrin.motion.dynamics import Dynamics as PlantedDynamics
+    from perrin.run.experiment import MotionModel
 
 
 SHAPES = ("tetrahedron", "pentahedron", "trimer")
@@ -136,6 +137,15 @@ KeepJumps = Annotated[
     ),
 ]
 
+Model = Annotated[
+    str | None,
+    typer.Option(
+        help="Fit this motion to every cluster, whatever it shows: anomalous (exponent), confined "
+        "(cage), switching (two D). By default the motion that the tests find is fitted.",
+        rich_help_panel=ESTIMATES,
+    ),
+]
+
 Viscosity = Annotated[
     float | None,
     typer.Option(
@@ -249,6 +259,16 @@ def read_noise(text: str) -> Literal["joint", "residual"] | float:
         raise ValueError(
             f"--noise: expected joint, residual or sigma in um, got {text!r}"
         ) from None
+
+
+def read_model(text: str | None) -> MotionModel | None:
+    """Read anomalous, confined or switching."""
+    from perrin.run.experiment import MotionModel
+
+    if text is not None and text not in get_args(MotionModel):
+        offered = ", ".join(get_args(MotionModel))
+        raise ValueError(f"--model: expected {offered}, got {text!r}")
+    return cast("MotionModel | None", text)
 
 
 def read_whole_numbers(option: str, text: str | None) -> list[int]:

@@ -61,6 +61,7 @@ def show_report(report: Report, output: Path, command: Callable[..., None]) -> N
     from rich.markup import escape
 
     from perrin.run.results import perp_text
+    from perrin.run.statements import verdict_lines
 
     console = Console(highlight=False)
     for result in report.clusters[:_CLUSTERS_SHOWN]:
@@ -78,6 +79,8 @@ def show_report(report: Report, output: Path, command: Callable[..., None]) -> N
         console.print(escape(perp_text(rod)))
         if rod.prediction is not None:
             console.print(escape(f"  {rod.prediction}"), soft_wrap=True)
+    for texts in verdict_lines(report).values():
+        console.print(escape(" ".join(texts)), soft_wrap=True)
     show_remarks(report, command, console)
     pages = "report.html" if report.imaging is None else "report.html, quality.html"
     console.print(f"Written to {escape(str(output))}: {pages}, figures, summary.json, tables.")

@@ -2,6 +2,7 @@
 
 from perrin.diffusion.anomalous import AnomalousEstimate, fit_anomalous
 from perrin.diffusion.bounds import cramer_rao
+from perrin.diffusion.changing import with_changing_interval
 from perrin.diffusion.confined import ConfinedEstimate, cage_size, fit_confined, fit_confined_steps
 from perrin.diffusion.curve_fits import (
     GridLags,
@@ -323,5 +324,6 @@ __all__ = [
     "value_text",
     "viscoelastic_moduli",
     "weighted_variance",
+    "with_changing_interval",
     "without_spin",
 ]

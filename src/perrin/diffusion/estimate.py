@@ -17,6 +17,19 @@ CHI2 = {0.68: 0.9889, 0.95: 3.8415}  # quantiles of chi-squared with one degree 
 
 NORMAL = {0.68: 0.9945, 0.95: 1.9600}  # half widths of intervals in standard errors
 
+# Over which times a value holds, by the kind of the motion.
+_TIME_SCALES = {
+    "diffusion": "{frame} and at longer times",
+    "jumps": "{frame}; it does not describe the jumps",
+    "drift": "{frame}; the steady motion dominates at long times",
+    "spin": "{frame}; the steady motion dominates at long times",
+    "changing D": "{frame}, as a mean over the track",
+    "confined": "{frame} only; it is 0 at long times",
+    "subdiffusion": "{frame} only; it is smaller at longer times",
+    "superdiffusion": "{frame} only; it is larger at longer times",
+    "vibration": "{frame} only; it contains the vibration",
+}
+
 # Below ten times its resolution floor a D_R is not resolved.
 _RESOLVED_FLOORS = 10.0
 
@@ -75,7 +88,7 @@ class DiffusionEstimate:
         Unit of the value: "rad^2/s" or "um^2/s".
     method : str
         Estimator: "mle", "cve" or "trace"; "line" or "gls" for a fit to a curve; "none" where the
-        data show no value.
+        data show no value. "mle, error from states" (or "from blocks") where D changes in time.
     n_frames : int
         Frames with a pose, of all motions.
     snr : float
@@ -98,6 +111,9 @@ class DiffusionEstimate:
         do (likelihood ratio); None for one motion and for other methods than "mle".
     warnings : tuple of str
         Conditions of the estimate that are not fulfilled; for an absent value the reason.
+    motion : str or None
+        Kind of the motion that `judge_motion` found ("diffusion", "confined", ...), set by
+        `analyze`; None where the motion was not judged.
     """
 
     value: float
@@ -119,6 +135,7 @@ class DiffusionEstimate:
     drift_stderr: tuple[tuple[float, ...], ...] | None = None
     p_same: float | None = None
     warnings: tuple[str, ...] = ()
+    motion: str | None = None
 
     @classmethod
     def judged(
@@ -202,6 +219,14 @@ class DiffusionEstimate:
     def quantity(self) -> Literal["rotation", "translation"]:
         """Motion that diffuses: "rotation" or "translation"."""
         return "rotation" if self.unit == UNITS["rotation"] else "translation"
+
+    @property
+    def time_scale(self) -> str:
+        """Over which times the value holds; empty where the motion was not judged."""
+        if self.motion is None or self.absent_because is not None:
+            return ""
+        frame = f"at one frame ({self.dt:.3g} s)"
+        return _TIME_SCALES[self.motion].format(frame=frame)
 
     @property
     def settings(self) -> Noise:

@@ -21,7 +21,7 @@ from perrin.images.stack import digest
 from perrin.movie.bodies import Bodies, find_bodies, stated_errors, tracks_of
 from perrin.movie.stages import Located, fit_poses, locate_frames
 from perrin.movie.workers import Work, check_workers
-from perrin.run.experiment import Experiment, Recording, merged_experiment
+from perrin.run.experiment import Experiment, MotionModel, Recording, merged_experiment
 from perrin.run.measure import library_version, measure_table
 from perrin.tracks.clock import Clock, evenly_spaced
 
@@ -57,6 +57,7 @@ class Settings(TypedDict, total=False):
     exposure: float | None
     drift: bool
     keep_jumps: bool
+    model: MotionModel | None
     viscosity: float | None
     temperature: float | None
     keep: str | os.PathLike[str] | None
@@ -67,7 +68,9 @@ class Settings(TypedDict, total=False):
 
 
 # Keywords of `analyze_stack` that are values of an `Experiment`.
-_EXPERIMENT_KEYWORDS = ("noise", "exposure", "drift", "keep_jumps", "viscosity", "temperature")
+_EXPERIMENT_KEYWORDS = (
+    "noise", "exposure", "drift", "keep_jumps", "model", "viscosity", "temperature",
+)  # fmt: skip
 
 
 def analyze_stack(
@@ -111,7 +114,8 @@ def analyze_stack(
     spots : Spots, optional
         How spheres are distinguished from noise.
     experiment : Experiment, optional
-        Viscosity, temperature, noise, and how jumps are treated, as in `analyze`. With viscosity
+        Viscosity, temperature, noise, how jumps are treated, and a model of the motion, as in
+        `analyze`. With viscosity
         and temperature, the report compares every cluster with the prediction for spheres of
         diameter `contact`. The time between frames and the localisation error are those of the
         images.
@@ -119,8 +123,9 @@ def analyze_stack(
         Where finished frames are kept, and which processes do the work.
     **settings
         The fields of these objects as keywords of their own: ``dark``, ``minmass``, ``percentile``,
-        ``border``; ``noise``, ``exposure``, ``drift``, ``keep_jumps``, ``viscosity``,
-        ``temperature``; ``keep``, ``anew``, ``workers``, ``scheduler``, ``progress``.
+        ``border``; ``noise``, ``exposure``, ``drift``, ``keep_jumps``, ``model``,
+        ``viscosity``, ``temperature``; ``keep``, ``anew``, ``workers``, ``scheduler``,
+        ``progress``.
 
     Returns
     -------

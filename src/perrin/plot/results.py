@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
@@ -12,6 +13,7 @@ from perrin._text import number_text, shortened, unit_text
 from perrin.curves.displacement import axes_weighted_equally
 from perrin.diffusion.estimate import value_text
 from perrin.geometry.rigid import degrees_of_freedom
+from perrin.plot.motion import motion_figure
 from perrin.plot.style import (
     BLUE,
     GREY,
@@ -417,9 +419,12 @@ def save_figures(report: Report, folder: str | os.PathLike[str]) -> list[Path]:
     -------
     list of Path
         ``clusters.*`` if there are several clusters, and for each cluster
-        ``cluster-<n>-curves.*``, ``-residuals.*`` and ``-orientations.*``.
+        ``cluster-<n>-curves.*``, ``-residuals.*`` and ``-orientations.*``; ``-rotation.*`` and
+        ``-translation.*``, against diffusion, for the first cluster and where the motion is not
+        diffusion.
     """
     place = Path(folder)
+    first = report.tracks.dropna(subset=["x", "y"]).groupby("cluster")["frame"].min()
     files: list[Path] = []
     if report.pooled is not None and len(report.clusters) > 1:
         files += save_figure(forest_figure(report.clusters, report.pooled), place / "clusters")
@@ -431,6 +436,24 @@ def save_figures(report: Report, folder: str | os.PathLike[str]) -> list[Path]:
     for result in report.clusters[:MAX_CLUSTERS]:
         for kind, draw in kinds.items():
             files += save_figure(draw(result), place / f"cluster-{result.cluster}-{kind}")
+        for quantity, verdict in result.verdicts.items():
+            # Drawing takes a second: of the others the first cluster is the example.
+            if verdict is None or (
+                verdict.kind == "diffusion" and result is not report.clusters[0]
+            ):
+                continue
+            motion = result.motion
+            if verdict.quantity == "translation":  # the centre's path crosses doubt about labels
+                motion = replace(motion, piece=np.zeros_like(motion.piece))
+            # In a report frames count from the table's first, in a motion from its own.
+            rows = tuple(frame - int(first[result.cluster]) for frame in verdict.frames)
+            figure = motion_figure(
+                motion,
+                quantity=verdict.quantity,
+                noise=result.D_R.settings,
+                verdict=replace(verdict, frames=rows),
+            )
+            files += save_figure(figure, place / f"cluster-{result.cluster}-{quantity}")
     return files
 
 
@@ -527,7 +550,7 @@ def model_line(
     if estimate is None:
         return None
     symbol = _CURVE_NAMES[curve.quantity][1]
-    method = _METHODS.get(estimate.method, estimate.method)
+    method = _METHODS.get(estimate.method.partition(",")[0], estimate.method)
     text = f"{method} {symbol} {'= ' if estimate.resolved else ''}{value_text(estimate)}"
     return ModelLine(estimate.value, estimate.offset, 0.0, estimate.resolved, symbol, text)
 

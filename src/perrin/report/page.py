@@ -19,10 +19,12 @@ from perrin._text import (
 )
 from perrin.diffusion.estimate import bare_text, value_text
 from perrin.diffusion.sampling import judge_sampling
+from perrin.plot.motion import MOTION_CAPTION
 from perrin.plot.results import MAX_CLUSTERS
 from perrin.report.html import byline, captioned, inline_pictures, render_page
 from perrin.run.remarks import condensed, grouped
 from perrin.run.results import floor_factor
+from perrin.run.statements import motion_sentences, verdict_lines
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -69,6 +71,7 @@ _RESULT_CAPTIONS = {
         "A freely diffusing body has no trend. A steady slope is driven rotation; jumps are "
         "exchanges of labels.",
     ),
+    "motion": MOTION_CAPTION,
     "clusters": (
         "All clusters.",
         "Diffusion coefficients of all clusters with 68 % (thick) and 95 % (thin) intervals; the "
@@ -126,6 +129,7 @@ def render_html(report: Report, figures: Iterable[Path]) -> str:
         several=several,
         label=None if several else report.results[0].label,
         headline=[] if pooled is None else _both_coefficients(pooled.D_R, pooled.D_T),
+        verdict=[" ".join(texts) for texts in verdict_lines(report).values()],
         overview=[
             {
                 "anchor": result.cluster,
@@ -214,6 +218,7 @@ def _estimate_text(estimate: DiffusionEstimate) -> dict[str, Any]:
     unit = unit_text(estimate.unit)
     if estimate.absent_because is not None:
         absent = {"value": "none", "bare": "none", "stderr": "–", "ci68": "–", "ci95": "–"}
+        absent |= {"time_scale": "", "error_from": ""}
         return {"resolved": False, "unit": unit, "absent": estimate.absent_because} | absent
     high = estimate.ci95[1]
     power = power_of(estimate.value if estimate.resolved or not np.isfinite(high) else high)
@@ -229,6 +234,8 @@ def _estimate_text(estimate: DiffusionEstimate) -> dict[str, Any]:
         "ci95": interval_text(estimate.ci95, power=power),
         "unit": unit,
         "absent": None,
+        "time_scale": estimate.time_scale,
+        "error_from": estimate.method.partition("error from ")[2],
     }
 
 
@@ -238,7 +245,8 @@ def _cluster_section(
     """Return everything that the page shows about one cluster."""
     motion, sizes = result.motion, result.sizes or {}
     d = motion.dimension
-    kinds = {"curves": "curves", "residuals": "residuals"}
+    kinds = {"rotation": "motion", "translation": "motion"}
+    kinds |= {"curves": "curves", "residuals": "residuals"}
     kinds |= {"orientations": "angle" if d == 2 else "sphere"}
     drawn = [
         captioned(pictures, f"cluster-{result.cluster}-{name}", kind, _RESULT_CAPTIONS[kind])
@@ -260,6 +268,11 @@ def _cluster_section(
         "anchor": result.cluster,
         "name": result.name,
         "estimates": _both_coefficients(result.D_R, result.D_T),
+        "motion": [
+            " ".join(texts)
+            for quantity in ("rotation", "translation")
+            if (texts := motion_sentences(result, quantity))
+        ],
         "facts": [
             *noise_facts(result),
             ("frames used", frames, f"one every {motion.dt:g} s"),

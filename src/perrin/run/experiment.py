@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import MISSING, dataclass, field, fields
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 
-from perrin._arrays import flag_fault, numpy_to_python, refuse, stated_twice
+from perrin._arrays import choice_fault, flag_fault, numpy_to_python, refuse, stated_twice
 from perrin.diffusion.noise_model import Noise
 from perrin.hydrodynamics.mobility import condition_faults
 
@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
     from perrin._arrays import Bools, Floats, Ints
     from perrin.tracks.clock import Clock
+
+MotionModel = Literal["anomalous", "confined", "switching"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,6 +44,9 @@ class Experiment:
         What the estimates assume of the measurement noise, the exposure and a drift.
     keep_jumps : bool
         Whether steps that Brownian motion cannot make stay in the estimates.
+    model : {"anomalous", "confined", "switching"}, optional
+        Other motion that is fitted to every cluster, whatever kind of motion it shows: by
+        `fit_anomalous`, `fit_confined` or `fit_switching`.
 
     Raises
     ------
@@ -63,6 +68,7 @@ class Experiment:
     diameter: float | None = None
     noise: Noise = field(default_factory=Noise)
     keep_jumps: bool = False
+    model: MotionModel | None = None
 
     def __post_init__(self) -> None:
         faults = argument_faults(
@@ -74,6 +80,8 @@ class Experiment:
         if not isinstance(self.noise, Noise):
             faults.append(f"noise: expected Noise(...), got {self.noise!r}")
         faults += flag_fault("keep_jumps", self.keep_jumps)
+        if self.model is not None:
+            faults += choice_fault("model", self.model, get_args(MotionModel))
         if self.sigma is not None:
             try:
                 plain = np.asarray(self.sigma)
@@ -114,12 +122,15 @@ class Experiment:
             "exposure": self.noise.exposure,
             "drift": self.noise.drift,
             "keep_jumps": self.keep_jumps,
+            "model": self.model,
         }
 
     @classmethod
     def from_dict(cls, entry: Mapping[str, Any]) -> Experiment:
         """Read back what `to_dict` wrote; further keys of ``run.json`` are ignored."""
-        own = {one.name: entry[one.name] for one in fields(cls) if one.name != "noise"}
+        # Runs of earlier versions have no model.
+        read = {"model": None} | dict(entry)
+        own = {one.name: read[one.name] for one in fields(cls) if one.name != "noise"}
         noise = Noise(entry["noise"], exposure=entry["exposure"], drift=entry["drift"])
         return cls(**own, noise=noise)
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from perrin.diffusion.changing import with_changing_interval
 from perrin.diffusion.estimate import DiffusionEstimate
 from perrin.diffusion.estimators import estimate_diffusion
 from perrin.diffusion.rods import estimate_rod
@@ -24,6 +25,7 @@ from perrin.diffusion.step_tests import (
     without_spin,
 )
 from perrin.diffusion.steps import residual_freedom
+from perrin.diffusion.switching import SwitchingEstimate
 from perrin.diffusion.tensors import diffusion_tensor
 from perrin.errors import (
     DegenerateClusterError,
@@ -59,6 +61,7 @@ from perrin.run.results import (
     floor_factor,
     predicted_noise,
 )
+from perrin.run.verdicts import fit_model, judge_each_and_all
 from perrin.tracks.clock import frame_stride, read_clock
 from perrin.tracks.clusters import each_cluster
 from perrin.tracks.identity import Identity, settle_identity
@@ -74,6 +77,7 @@ if TYPE_CHECKING:
     from perrin.diffusion.noise_model import Noise
     from perrin.diffusion.steps import Quantity
     from perrin.diffusion.tensor_results import DiffusionTensor
+    from perrin.diffusion.verdict import MotionVerdict
     from perrin.motion.floor import NoiseFloor
     from perrin.motion.rigid_motion import RigidMotion
 
@@ -88,6 +92,10 @@ _DISAGREEMENT = 0.003
 
 # A steady velocity or spin is reported below this p-value, shared by all clusters of a table.
 _STEADY_LEVEL = 1e-3
+
+# A motion that is not diffusion is a warning below this p-value, shared by both quantities, and
+# half of it by all clusters where several are also judged together.
+_VERDICT_LEVEL = 0.005
 
 # Noise floor and alike steps are tested at this number of standard errors (0.05 % of clean
 # tracks), the noise floor for any ratio sigma_z/sigma_xy up to this one.
@@ -154,6 +162,8 @@ class Coefficient:
         Estimate from the steps that Brownian motion can make.
     motion : RigidMotion
         Motion that it was estimated from, cut at the steps that were left out.
+    whole : RigidMotion
+        The motion before that; for translation, also without the cuts where labels are in doubt.
     jumps : Jumps
         Steps that Brownian motion cannot make.
     left_out : ndarray of int
@@ -162,14 +172,18 @@ class Coefficient:
         Whether the tests found no jumps, no steady motion and no alike steps.
     remarks : Remarks
         Warnings and notes on this coefficient.
+    verdict : MotionVerdict or None
+        What kind of motion it is; None until it is judged, and where it cannot be.
     """
 
     estimate: DiffusionEstimate
     motion: RigidMotion
+    whole: RigidMotion
     jumps: Jumps
     left_out: Ints
     brownian: bool
     remarks: Remarks
+    verdict: MotionVerdict | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -256,7 +270,8 @@ def measure_table(
             failures.append((body.tracks.label or str(body.tracks.cluster), error))
     if failures and not (measured or rods):
         raise failures[-1][1]
-    pooled, unpooled = pool_clusters(measured, experiment.noise)
+    measured, together = judge_bodies(measured, experiment, first_frame=first)
+    pooled, unpooled = pool_clusters(measured, experiment, together)
     results, rods = add_predictions([one.result for one in measured], rods, experiment)
     return Report(
         clusters=tuple(results),
@@ -565,7 +580,7 @@ def measure_coefficient(
             quantity=quantity, n_frames=int(motion.fitted.size), reason=CENTRE_REMOVED
         )
         none = Jumps(nothing, np.empty((0, 3)), np.empty(0), 0)
-        return Coefficient(estimate, motion, none, nothing, True, Remarks())
+        return Coefficient(estimate, motion, motion, none, nothing, True, Remarks())
     estimate = _estimated_quietly(motion, quantity, noise)
     # Doubt about the labels cuts the track, but the centre's path crosses it.
     path = motion if quantity == "rotation" else replace(motion, piece=np.zeros_like(motion.piece))
@@ -600,7 +615,7 @@ def measure_coefficient(
     if alike:
         remarks.warnings.append(words.persistence_warning(persistence, quantity))
     brownian = not (steady or alike or jumps.rows.size)
-    return Coefficient(estimate, motion, jumps, left_out, brownian, remarks)
+    return Coefficient(estimate, motion, path, jumps, left_out, brownian, remarks)
 
 
 def _estimated_quietly(
@@ -616,6 +631,141 @@ def _estimated_quietly(
             exposure=noise.exposure,
             drift=noise.drift,
         )
+
+
+def judge_bodies(
+    measured: Sequence[MeasuredBody], experiment: Experiment, *, first_frame: int
+) -> tuple[list[MeasuredBody], dict[str, MotionVerdict | None]]:
+    """Judge what kind of motion every body shows, and all rigid ones together.
+
+    Parameters
+    ----------
+    measured : sequence of MeasuredBody
+    experiment : Experiment
+    first_frame : int
+        The table's own number of its first frame.
+
+    Returns
+    -------
+    measured : list of MeasuredBody
+        The same with verdicts, with intervals that hold for a changing D, and with remarks.
+    together : dict of MotionVerdict or None
+        Verdict on the rotation and on the translation of all rigid bodies.
+    """
+    together: dict[str, MotionVerdict | None] = {}
+    judged: dict[str, list[Coefficient]] = {}
+    for quantity, coefficients in (
+        ("rotation", [one.rotation for one in measured]),
+        ("translation", [one.translation for one in measured]),
+    ):
+        shown = [i for i, c in enumerate(coefficients) if c.estimate.absent_because is None]
+        each, common = judge_each_and_all(
+            [coefficients[i].whole for i in shown],
+            quantity=coefficients[0].estimate.quantity if coefficients else "rotation",
+            noise=experiment.noise,
+            pooled=[measured[i].body.quality.rigid for i in shown],
+        )
+        judged[quantity] = list(coefficients)
+        for i, verdict in zip(shown, each, strict=True):
+            judged[quantity][i] = judge_coefficient(
+                coefficients[i],
+                verdict,
+                measured[i].body,
+                experiment,
+                first_frame=first_frame,
+                tested=len(measured),
+            )
+        used = [i for i in shown if measured[i].body.quality.rigid]
+        if common is not None and len(used) > 1:
+            jumped = [i for i in used if judged[quantity][i].left_out.size]
+            if jumped:
+                p = min(float(judged[quantity][i].jumps.p.min()) for i in jumped)
+                names = [measured[i].result.name for i in jumped]
+                common = words.with_jumps(common, np.empty(0, np.int64), p=p, clusters=names)
+            together[quantity] = common
+        else:
+            together[quantity] = next((judged[quantity][i].verdict for i in used), None)
+    bodies = []
+    for one, turn, path in zip(measured, judged["rotation"], judged["translation"], strict=True):
+        warnings, notes = [*one.result.warnings], [*one.result.notes]
+        for before, after in ((one.rotation, turn), (one.translation, path)):
+            warnings += after.remarks.warnings[len(before.remarks.warnings) :]
+            notes += after.remarks.notes[len(before.remarks.notes) :]
+        if any(words.is_not_diffusion(text) for text in turn.remarks.warnings):
+            # The offset of steps that contain another motion is no noise.
+            warnings = [text for text in warnings if not words.is_noise_floor(text)]
+        result = replace(
+            one.result,
+            D_R=turn.estimate,
+            D_T=path.estimate,
+            warnings=tuple(warnings),
+            notes=tuple(notes),
+            verdicts={"rotation": turn.verdict, "translation": path.verdict},
+        )
+        bodies.append(MeasuredBody(one.body, turn, path, result))
+    return bodies, together
+
+
+def judge_coefficient(
+    coefficient: Coefficient,
+    verdict: MotionVerdict | None,
+    body: FittedBody,
+    experiment: Experiment,
+    *,
+    first_frame: int,
+    tested: int,
+) -> Coefficient:
+    """Add the verdict on a motion to its coefficient, with what follows for its D.
+
+    Parameters
+    ----------
+    coefficient : Coefficient
+    verdict : MotionVerdict or None
+        Verdict of `judge_motion` on the whole motion.
+    body : FittedBody
+    experiment : Experiment
+    first_frame : int
+        The table's own number of its first frame.
+    tested : int
+        Number of clusters that share the level of a warning.
+
+    Returns
+    -------
+    Coefficient
+        Steps that were cut out, or would have been, are the verdict "jumps". Frames count from 0
+        at the table's first. Where D changes in time its interval is that of the states.
+    """
+    estimate, jumps, frames = coefficient.estimate, coefficient.jumps, body.tracks.frames
+    quantity, remarks = estimate.quantity, coefficient.remarks + Remarks()
+    if verdict is None:
+        if experiment.model is not None:
+            remarks.notes.extend(words.no_model_notes([(quantity, None)], experiment.model))
+        return replace(coefficient, remarks=remarks)
+    if jumps.rows.size and not jumps.many:
+        verdict = words.with_jumps(
+            verdict, frames[jumps.rows], p=float(jumps.p.min()), first_frame=first_frame
+        )
+    elif verdict.kind == "jumps":
+        rows = np.array(verdict.frames, dtype=np.int64)
+        verdict = words.with_jumps(verdict, frames[rows], p=1.0, first_frame=first_frame)
+    estimate = replace(estimate, motion=verdict.kind)
+    if isinstance(verdict.model, SwitchingEstimate):
+        estimate = with_changing_interval(estimate, coefficient.motion, verdict.model)
+    removed = experiment.noise.drift and verdict.kind in ("drift", "spin")
+    level = _VERDICT_LEVEL / 2 / (tested if tested == 1 else 2 * tested)
+    # A more specific warning on the same steps, or on the body, is enough.
+    unnamed = coefficient.brownian and body.quality.rigid and estimate.resolved and not removed
+    if verdict.kind != "diffusion" and unnamed and verdict.p_family < level:
+        remarks.warnings.append(words.not_diffusion_warning(verdict, estimate))
+    if experiment.model is not None:
+        try:
+            model = fit_model(
+                [coefficient.motion], [estimate], noise=experiment.noise, model=experiment.model
+            )
+            verdict = replace(verdict, model=model)
+        except ValueError as error:
+            remarks.notes.extend(words.no_model_notes([(quantity, error)], experiment.model))
+    return replace(coefficient, estimate=estimate, verdict=verdict, remarks=remarks)
 
 
 def measure_tensor(
@@ -786,20 +936,25 @@ def with_sizes(
 
 
 def pool_clusters(
-    measured: Sequence[MeasuredBody], noise: Noise
+    measured: Sequence[MeasuredBody],
+    experiment: Experiment,
+    verdicts: Mapping[str, MotionVerdict | None],
 ) -> tuple[Pooled | None, list[str]]:
     """Pool all clusters that passed as rigid; without any nothing is pooled.
 
     Parameters
     ----------
     measured : sequence of MeasuredBody
-    noise : Noise
+    experiment : Experiment
+    verdicts : mapping
+        Verdict on the "rotation" and on the "translation" of all rigid clusters together.
 
     Returns
     -------
     pooled : Pooled or None
     warnings : list of str
-        Clusters that are not pooled, and coefficients on which the others do not agree.
+        Clusters that are not pooled, coefficients on which the others do not agree, and motions
+        that are not diffusion where no single cluster shows it.
     """
     used = [one for one in measured if one.body.quality.rigid]
     soft = [one.result.name for one in measured if not one.body.quality.rigid]
@@ -809,17 +964,77 @@ def pool_clusters(
     clusters = tuple(one.result.cluster for one in used)
     D_R, D_T = used[0].result.D_R, used[0].result.D_T
     if len(used) == 1:
-        return Pooled(D_R, D_T, clusters), warnings
-    D_R = _estimated_quietly([one.rotation.motion for one in used], "rotation", noise)
-    paths = [one.translation.motion for one in used if np.isfinite(one.result.D_T.value)]
-    if paths:
-        D_T = _estimated_quietly(paths, "translation", noise)
+        return Pooled(D_R, D_T, clusters, dict(verdicts)), warnings
+    pooled, judged = {"rotation": D_R, "translation": D_T}, dict(verdicts)
+    for quantity, parts in (
+        ("rotation", [one.rotation for one in used]),
+        (
+            "translation",
+            [one.translation for one in used if np.isfinite(one.result.D_T.value)],
+        ),
+    ):
+        if not parts:
+            continue
+        pooled[quantity], judged[quantity], more = pool_coefficients(
+            parts, verdicts[quantity], experiment
+        )
+        warnings += more
+    D_R, D_T = pooled["rotation"], pooled["translation"]
     warnings += [
         words.disagreement_warning(name, estimate.p_same)
         for name, estimate in (("D_R", D_R), ("D_T", D_T))
         if estimate.p_same is not None and estimate.p_same < _DISAGREEMENT
     ]
-    return Pooled(D_R, D_T, clusters), warnings
+    return Pooled(D_R, D_T, clusters, judged), warnings
+
+
+def pool_coefficients(
+    parts: Sequence[Coefficient], verdict: MotionVerdict | None, experiment: Experiment
+) -> tuple[DiffusionEstimate, MotionVerdict | None, list[str]]:
+    """Estimate one D for several motions, with the verdict on all of them.
+
+    Parameters
+    ----------
+    parts : sequence of Coefficient
+        Coefficients of one quantity.
+    verdict : MotionVerdict or None
+        Verdict on the motions together.
+    experiment : Experiment
+
+    Returns
+    -------
+    estimate : DiffusionEstimate
+        Pooled D; where D changes in time, with the interval of the states.
+    verdict : MotionVerdict or None
+        The verdict, with the fit of the model that the experiment asks for.
+    warnings : list of str
+        That the motion is not diffusion, where no single motion has such a warning.
+    """
+    motions, noise = [one.motion for one in parts], experiment.noise
+    quantity = parts[0].estimate.quantity
+    estimate = _estimated_quietly(motions, quantity, noise)
+    if verdict is None:
+        return estimate, None, []
+    estimate, warnings = replace(estimate, motion=verdict.kind), []
+    if verdict.kind == "changing D":
+        estimate = with_changing_interval(estimate, motions)
+    removed = noise.drift and verdict.kind in ("drift", "spin")
+    warned = any(
+        not one.brownian or any(words.is_not_diffusion(text) for text in one.remarks.warnings)
+        for one in parts
+    )
+    unnamed = estimate.resolved and not (removed or warned)
+    if verdict.kind != "diffusion" and unnamed and verdict.p_family < _VERDICT_LEVEL / 4:
+        warnings.append(words.not_diffusion_warning(verdict, estimate))
+    if experiment.model is not None:
+        try:
+            model = fit_model(
+                motions, [one.estimate for one in parts], noise=noise, model=experiment.model
+            )
+            verdict = replace(verdict, model=model)
+        except ValueError:  # the notes of the clusters state it
+            verdict = replace(verdict, model=None)
+    return estimate, verdict, warnings
 
 
 @cache

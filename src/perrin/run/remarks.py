@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from perrin.diffusion.noise_model import Noise
     from perrin.diffusion.step_tests import Jumps, SteadyMotion
     from perrin.diffusion.steps import Quantity
+    from perrin.diffusion.verdict import MotionVerdict
 
 
 CONSTANT_Z = "z never changes: leave the column out to analyse motion in the plane"
@@ -41,6 +42,22 @@ _ONE_LENGTH = 0.3
 _SHARE_OF_CUTS = 0.02
 
 _ANGLES_SHOWN, _JUMPS_SHOWN = 5, 5
+
+_NOT_DIFFUSION = "not diffusion:"
+
+NOT_JUDGED = "fewer than 20 steps, or no motion"
+
+# What a motion shows, by its kind.
+_SHOWN_KINDS = {
+    "subdiffusion": "subdiffusion",
+    "superdiffusion": "superdiffusion",
+    "confined": "confinement",
+    "drift": "a drift",
+    "spin": "a spin",
+    "changing D": "a diffusion coefficient that changes in time",
+    "jumps": "jumps",
+    "vibration": "a vibration",
+}
 
 # At least one of this number of frame numbers occurs; numbers that are times in ms are sparser.
 SPARSE = 100
@@ -592,6 +609,125 @@ def common_jump_warnings(jumps: Iterable[tuple[str, Ints, Floats]]) -> list[str]
     return warnings
 
 
+def jumps_verdict_text(
+    frames: Ints, quantity: Quantity, *, p: float, clusters: Sequence[str] = ()
+) -> str:
+    """Return the verdict on a motion with steps that Brownian motion does not make.
+
+    Parameters
+    ----------
+    frames : ndarray of int
+        The table's own frame numbers; empty for several clusters.
+    quantity : {"rotation", "translation"}
+    p : float
+        Probability of such steps in Brownian motion.
+    clusters : sequence of str
+        Names of the clusters with such steps, where the verdict is one on several.
+
+    Examples
+    --------
+    >>> jumps_verdict_text(np.array([150]), "translation", p=1e-9)
+    'The translation has steps too long for diffusion, at frame 150 (p < 1e-6): a motion of the stage, exchanged labels, hops or heavy tails.'
+    """  # noqa: E501
+    where = ""
+    if clusters:
+        where = f", in cluster{'s' if len(clusters) > 1 else ''} {listed(clusters)}"
+    elif len(frames):
+        where = f", at {frames_text(frames)}"
+    return (
+        f"The {quantity} has steps too long for diffusion{where} ({_p_text(p)}): a motion of the "
+        "stage, exchanged labels, hops or heavy tails."
+    )
+
+
+def with_jumps(
+    verdict: MotionVerdict,
+    frames: Ints,
+    *,
+    p: float,
+    first_frame: int = 0,
+    clusters: Sequence[str] = (),
+) -> MotionVerdict:
+    """Return the verdict "jumps" with its frames, in the words of `jumps_verdict_text`.
+
+    Parameters
+    ----------
+    verdict : MotionVerdict
+        Verdict of `judge_motion`, of whatever kind.
+    frames : ndarray of int
+        Frames of the jumps, counted from the table's first; empty for several clusters.
+    p : float
+        Probability of the jumps in Brownian motion; that of the verdict holds where it is smaller.
+    first_frame : int
+        The table's own number of its first frame.
+    clusters : sequence of str
+        Names of the clusters that jump, where the verdict is one on several.
+    """
+    p_family = min(p, verdict.p_family)
+    return replace(
+        verdict,
+        kind="jumps",
+        model=None,
+        p_family=p_family,
+        frames=tuple(int(frame) for frame in frames),
+        text=jumps_verdict_text(
+            frames + first_frame, verdict.quantity, p=p_family, clusters=clusters
+        ),
+    )
+
+
+def is_not_diffusion(text: str) -> bool:
+    """Return whether a warning is one of `not_diffusion_warning`.
+
+    Examples
+    --------
+    >>> is_not_diffusion("not diffusion: the rotation is confined"), is_not_diffusion("jump: 3 um")
+    (True, False)
+    """
+    return text.startswith(_NOT_DIFFUSION)
+
+
+def not_diffusion_warning(verdict: MotionVerdict, estimate: DiffusionEstimate) -> str:
+    """Warn of a motion that is not diffusion, and state over which time its D holds.
+
+    Parameters
+    ----------
+    verdict : MotionVerdict
+        Its text, with the parameters of the motion, is a result and not repeated.
+    estimate : DiffusionEstimate
+        Estimate of the same quantity, with the kind of its motion.
+    """
+    name = "D_R" if estimate.quantity == "rotation" else "D_T"
+    return (
+        f"{_NOT_DIFFUSION} the {estimate.quantity} shows {_SHOWN_KINDS[verdict.kind]} "
+        f"({_p_text(verdict.p_family)}, all tests together); {name} holds {estimate.time_scale}"
+    )
+
+
+def _p_text(p: float) -> str:
+    return f"p = {p:.2g}" if p >= 1e-6 else "p < 1e-6"
+
+
+def no_model_notes(failures: Iterable[tuple[str, Exception | None]], model: str) -> list[str]:
+    """State for which quantities a model that was asked for has no fit.
+
+    Parameters
+    ----------
+    failures : iterable of tuple
+        Quantity, and the error of the fit; None where the motion was not judged.
+    model : str
+
+    Examples
+    --------
+    >>> no_model_notes([("rotation", None)], "confined")
+    ['no fit of the confined model to the rotation: fewer than 20 steps, or no motion']
+    """
+    return [
+        f"no fit of the {model} model to the {quantity}: {error or NOT_JUDGED}"
+        for quantity, error in failures
+    ]
+
+
 def persistence_warning(gain: float, quantity: Quantity) -> str:
     """Warn of successive steps that are more alike than motion blur can make them.
 
@@ -671,6 +807,17 @@ def noise_floor_warning(measured: float, stderr: float, *, predicted: float, gai
         f"{predicted:.3g} (likelihood ratio, {np.sqrt(gain):.1f} standard errors); motion blur "
         "lowers it, particles recorded one after another or noise that is smooth in time change it"
     )
+
+
+def is_noise_floor(text: str) -> bool:
+    """Return whether a warning is one of `noise_floor_warning`.
+
+    Examples
+    --------
+    >>> is_noise_floor("noise floor: the steps show"), is_noise_floor("jump: 3 um")
+    (True, False)
+    """
+    return text.startswith("noise floor:")
 
 
 # Sizes, predictions and pooled values.

@@ -24,6 +24,7 @@ from perrin.motion.rigidity import Quality
 from perrin.motion.rods import RodMotion
 from perrin.run.folders import staged_folder
 from perrin.run.predictions import Prediction
+from perrin.run.verdicts import verdicts_from_dict, verdicts_to_dict
 from perrin.tracks.writing import write_json
 
 if TYPE_CHECKING:
@@ -31,6 +32,8 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     import pandas as pd
+
+    from perrin.diffusion.verdict import MotionVerdict
 
 
 # The coefficients that a size follows from, and the ends of its keys in ``summary.json``.
@@ -70,6 +73,10 @@ class ClusterResult:
     jumps : dict of tuple of int
         Frames (from 0) at which a step was left out of the estimate of "rotation" or
         "translation" because Brownian motion cannot make it.
+    verdicts : dict of MotionVerdict or None
+        What kind of motion the "rotation" and the "translation" are, judged before jumps are cut
+        and before a steady motion is subtracted; None for fewer than 20 steps or without motion.
+        Their `frames` count from 0, as those of `jumps`; their texts state the table's own numbers.
     """
 
     cluster: int
@@ -85,6 +92,7 @@ class ClusterResult:
     prediction: Prediction | None = None
     notes: tuple[str, ...] = ()
     jumps: dict[str, tuple[int, ...]] = field(default_factory=dict)
+    verdicts: dict[str, MotionVerdict | None] = field(default_factory=dict)
 
     @cached_property
     def msad(self) -> LagCurve:
@@ -148,6 +156,7 @@ class ClusterResult:
             "prediction": None if self.prediction is None else self.prediction.to_dict(),
             "quality": None if self.quality is None else self.quality.to_dict(),
             "jumps": {name: list(frames) for name, frames in self.jumps.items()},
+            "motion": verdicts_to_dict(self.verdicts),
             "warnings": list(self.warnings),
             "notes": list(self.notes),
         }
@@ -182,9 +191,10 @@ class ClusterResult:
             label=entry["label"],
             quality=None if entry["quality"] is None else Quality.from_dict(entry["quality"]),
             prediction=None if prediction is None else Prediction.from_dict(prediction),
-            # Runs of earlier versions have no notes and no jumps.
+            # Runs of earlier versions have no notes, no jumps and no verdicts.
             notes=tuple(entry.get("notes", ())),
             jumps={name: tuple(frames) for name, frames in entry.get("jumps", {}).items()},
+            verdicts=verdicts_from_dict(entry.get("motion", {})),
         )
 
 
@@ -271,11 +281,14 @@ class Pooled:
         Rotational and translational diffusion coefficient of all these clusters.
     clusters : tuple of int
         Numbers of the clusters that are pooled.
+    verdicts : dict of MotionVerdict or None
+        What kind of motion the "rotation" and the "translation" of these clusters together are.
     """
 
     D_R: DiffusionEstimate
     D_T: DiffusionEstimate
     clusters: tuple[int, ...]
+    verdicts: dict[str, MotionVerdict | None] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the entry "pooled" of ``summary.json``."""
@@ -284,6 +297,7 @@ class Pooled:
             "D_T": self.D_T.to_dict(),
             "p_same": self.D_R.p_same,
             "clusters": list(self.clusters),
+            "motion": verdicts_to_dict(self.verdicts),
         }
 
     @classmethod
@@ -293,7 +307,8 @@ class Pooled:
             DiffusionEstimate.from_dict(entry["D_R"]),
             DiffusionEstimate.from_dict(entry["D_T"]),
         )
-        return cls(D_R, D_T, tuple(entry["clusters"]))
+        verdicts = verdicts_from_dict(entry.get("motion", {}))
+        return cls(D_R, D_T, tuple(entry["clusters"]), verdicts)
 
 
 @dataclass(frozen=True, eq=False)
@@ -348,6 +363,7 @@ class Report:
         """Return ``summary.json`` as a dictionary: plain numbers, null for what is unknown."""
         entries = [result.to_dict() for result in self.results]
         nothing: dict[str, Any] = {"D_R": None, "D_T": None, "p_same": None, "clusters": []}
+        nothing["motion"] = verdicts_to_dict({})
         return {
             "clusters": sorted(entries, key=lambda entry: int(entry["cluster"])),
             "pooled": nothing if self.pooled is None else self.pooled.to_dict(),

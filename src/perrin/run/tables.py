@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     import pandas as pd
     from numpy.typing import ArrayLike
 
-    from perrin.run.experiment import Experiment
+    from perrin.run.experiment import Experiment, MotionModel
     from perrin.run.results import Report
 
 
@@ -37,6 +37,7 @@ def analyze(
     exposure: float | None = None,
     drift: bool = False,
     keep_jumps: bool = False,
+    model: MotionModel | None = None,
     viscosity: float | None = None,
     temperature: float | None = None,
     diameter: float | None = None,
@@ -73,6 +74,10 @@ def analyze(
     keep_jumps : bool
         Leave steps in the estimates that Brownian motion cannot make (a jump of the stage, an
         exchange of labels). By default they are reported and the estimates of D leave them out.
+    model : {"anomalous", "confined", "switching"}, optional
+        Other motion that is fitted to every cluster, whatever `judge_motion` finds; the fit is
+        then `MotionVerdict.model`, in ``summary.json`` "parameters". By default the motion that
+        was found is fitted, if it is not diffusion.
     viscosity, temperature : float, optional
         Pa s and K: with both, sizes follow from D_T and from D_R for equal spheres of the measured
         shape, in three dimensions. The temperature alone gives the size and the viscosity that D_T
@@ -83,8 +88,8 @@ def analyze(
     frames : tuple of int or None, optional
         First frame and first frame that is not used, as in a slice.
     experiment : Experiment, optional
-        dt, sigma, noise, exposure, drift, keep_jumps, viscosity, temperature and diameter in one
-        object; a value is stated here or as its own argument, not both.
+        dt, sigma, noise, exposure, drift, keep_jumps, model, viscosity, temperature and diameter in
+        one object; a value is stated here or as its own argument, not both.
 
     Returns
     -------
@@ -115,6 +120,7 @@ def analyze(
         exposure=exposure,
         drift=drift,
         keep_jumps=keep_jumps,
+        model=model,
         viscosity=viscosity,
         temperature=temperature,
         diameter=diameter,

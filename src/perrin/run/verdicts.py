@@ -1,0 +1,194 @@
+"""What kind of motion every cluster shows, and all rigid ones together."""
+
+from __future__ import annotations
+
+import warnings as python_warnings
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from perrin.diffusion.anomalous import AnomalousEstimate, fit_anomalous
+from perrin.diffusion.confined import ConfinedEstimate, fit_confined
+from perrin.diffusion.estimate import DiffusionEstimate
+from perrin.diffusion.step_tests import without_spin
+from perrin.diffusion.switching import SwitchingEstimate, fit_switching
+from perrin.diffusion.verdict import MotionVerdict, judge_motion
+from perrin.errors import PrecisionWarning
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
+    from perrin.diffusion.noise_model import Noise
+    from perrin.diffusion.steps import Quantity
+    from perrin.diffusion.verdict import Model
+    from perrin.motion.rigid_motion import RigidMotion
+    from perrin.run.experiment import MotionModel
+
+
+# The class of a fitted model, by a key that only its dictionary has.
+_MODEL_KEYS: dict[str, Any] = {
+    "alpha": AnomalousEstimate,
+    "cage": ConfinedEstimate,
+    "D_slow": SwitchingEstimate,
+    "drift": DiffusionEstimate,
+}
+
+
+def judge_each_and_all(
+    motions: Sequence[RigidMotion],
+    *,
+    quantity: Quantity,
+    noise: Noise,
+    pooled: Sequence[bool],
+) -> tuple[list[MotionVerdict | None], MotionVerdict | None]:
+    """Judge every motion, and several of them together, testing each motion once.
+
+    Parameters
+    ----------
+    motions : sequence of RigidMotion
+        Motions before any jump is cut and before a steady motion is subtracted.
+    quantity : {"rotation", "translation"}
+    noise : Noise
+        What the estimates assume of the noise.
+    pooled : sequence of bool
+        Which motions are judged together.
+
+    Returns
+    -------
+    each : list of MotionVerdict or None
+        None for a motion of fewer than 20 steps, and for a body that does not move.
+    together : MotionVerdict or None
+        Verdict on the pooled motions that can be judged; None if there are none.
+
+    Examples
+    --------
+    >>> from perrin import Cluster, Noise, simulate_motion
+    >>> long, short = (
+    ...     simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=n, rng=3)
+    ...     for n in (300, 10)
+    ... )
+    >>> each, together = judge_each_and_all(
+    ...     [long, short], quantity="rotation", noise=Noise(), pooled=[True, True]
+    ... )
+    >>> each[0].kind, each[1], together is each[0]
+    ('diffusion', None, True)
+    """
+    settings = replace(noise, drift=False)
+
+    def judged(some: RigidMotion | list[RigidMotion]) -> MotionVerdict | None:
+        with python_warnings.catch_warnings():
+            python_warnings.simplefilter("ignore", PrecisionWarning)
+            try:
+                return judge_motion(some, quantity=quantity, noise=settings)
+            except ValueError:
+                return None
+
+    each: list[MotionVerdict | None] = [None] * len(motions)
+    used = [i for i, one in enumerate(pooled) if one]
+    together = judged([motions[i] for i in used]) if len(used) > 1 else None
+    if together is not None:
+        for i, one in zip(used, together.each, strict=True):
+            each[i] = one
+        together = replace(together, each=())
+    each = [judged(m) if one is None else one for m, one in zip(motions, each, strict=True)]
+    if together is not None:
+        return each, together
+    known = [i for i in used if each[i] is not None]
+    if len(known) == 1:
+        together = each[known[0]]
+    elif 1 < len(known) < len(used):
+        together = judged([motions[i] for i in known])
+        together = together and replace(together, each=())
+    return each, together
+
+
+def fit_model(
+    motions: Sequence[RigidMotion],
+    estimates: Sequence[DiffusionEstimate],
+    *,
+    noise: Noise,
+    model: MotionModel,
+) -> Model:
+    """Fit one model to motions, without the steady motion that their estimates leave out.
+
+    Parameters
+    ----------
+    motions : sequence of RigidMotion
+        Motions that the estimates were made from, cut at jumps.
+    estimates : sequence of DiffusionEstimate
+        Estimate of every motion.
+    noise : Noise
+    model : {"anomalous", "confined", "switching"}
+
+    Returns
+    -------
+    AnomalousEstimate, ConfinedEstimate or SwitchingEstimate
+
+    Raises
+    ------
+    TooFewFramesError, ValueError
+        As in `fit_anomalous`, `fit_confined` and `fit_switching`.
+
+    Examples
+    --------
+    >>> from perrin import Cluster, Noise, estimate_diffusion, simulate_motion
+    >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=300, rng=3)
+    >>> found = fit_model([truth], [estimate_diffusion(truth)], noise=Noise(), model="anomalous")
+    >>> found.ci95[0] < 1 < found.ci95[1]
+    True
+    """
+    quantity, diffusing = estimates[0].quantity, []
+    for motion, estimate in zip(motions, estimates, strict=True):
+        if estimate.drift is None:
+            diffusing.append(motion)
+        elif quantity == "rotation":
+            diffusing.append(without_spin(motion, estimate.drift[0]))
+        else:
+            path = np.outer(motion.time, estimate.drift[0])
+            diffusing.append(replace(motion, center=motion.center - path))
+    fits: dict[str, Callable[..., Model]] = {
+        "anomalous": fit_anomalous,
+        "confined": fit_confined,
+        "switching": fit_switching,
+    }
+    some = diffusing if len(diffusing) > 1 else diffusing[0]
+    with python_warnings.catch_warnings():
+        python_warnings.simplefilter("ignore", PrecisionWarning)
+        return fits[model](some, quantity=quantity, noise=replace(noise, drift=False))
+
+
+def verdicts_to_dict(verdicts: Mapping[str, MotionVerdict | None]) -> dict[str, Any]:
+    """Return the entry "motion" of ``summary.json``; null where a motion was not judged.
+
+    Examples
+    --------
+    >>> verdicts_to_dict({"rotation": None})
+    {'rotation': None, 'translation': None}
+    """
+    found = {name: verdicts.get(name) for name in ("rotation", "translation")}
+    return {name: None if one is None else one.to_dict() for name, one in found.items()}
+
+
+def verdicts_from_dict(entry: Mapping[str, Any]) -> dict[str, MotionVerdict | None]:
+    """Return the verdicts that `verdicts_to_dict` wrote.
+
+    The fitted model need not be that of the kind: it may be one that the user asked for.
+
+    Examples
+    --------
+    >>> verdicts_from_dict({"rotation": None, "translation": None})
+    {'rotation': None, 'translation': None}
+    """
+    verdicts: dict[str, MotionVerdict | None] = {}
+    for name, one in entry.items():
+        if one is None:
+            verdicts[name] = None
+            continue
+        parameters = one["parameters"]
+        verdict = MotionVerdict.from_dict({**one, "parameters": None})
+        if parameters is not None:
+            kind = next(cls for key, cls in _MODEL_KEYS.items() if key in parameters)
+            verdict = replace(verdict, model=kind.from_dict(parameters))
+        verdicts[name] = verdict
+    return verdicts
