@@ -288,6 +288,8 @@ class AxisModel:
         takes its own curvature from differences of the score, where it has a maximum.
         """
         tau, shape = self.tau.mean(), y.shape[:2]
+        # The covariance is positive definite where the offset is above -D/2 times the shortest step.
+        least = max(_LEAST_V, float(np.log1p(-(1 - 1e-4) * self.tau.min() / tau)))
         single = near is None
         if near is None:
             even = np.ones(self.n_steps, dtype=np.bool_)
@@ -295,6 +297,7 @@ class AxisModel:
             near = modes._fit_modes(y, None)
         t = np.stack([np.log(near.D), self.ratio(near.D, near.offset)], axis=-1)
         t = np.array(np.broadcast_to(t, (*shape, 2)))[..., : 1 + self.free]
+        t[..., 1:] = np.maximum(t[..., 1:], least)
 
         def parameters(t: Floats) -> tuple[Floats, Floats]:
             D = np.exp(t[..., 0])
@@ -322,7 +325,7 @@ class AxisModel:
             move = np.clip(np.linalg.solve(matrix, score[..., None])[..., 0], -0.5, 0.5)
             t = t + move
             if self.free:
-                t[..., 1] = np.clip(t[..., 1], _LEAST_V, _MOST_V)
+                t[..., 1] = np.clip(t[..., 1], least, _MOST_V)
             if np.all(np.abs(move) < 1e-9):
                 break
         return AxisFit(y, *parameters(t))
@@ -418,11 +421,13 @@ class AxisModel:
             return np.asarray(ratio / ratio.mean(axis=-1, keepdims=True))
         ratio = sine_powers(fit.y) / self.eigenvalues(fit.D, fit.offset)
         ratio /= ratio.mean(axis=-1, keepdims=True)
-        # A large mode draws the fit to itself, by its leverage h beyond that of the mean: without
-        # its own part in its variance the ratio r is r (1 - h)/(1 - h r).
+        # A large mode draws the fit to itself, by its leverage beyond that of the mean: without its
+        # own part in its variance the ratio r is r (1 - h)/(1 - h r). With half the leverage as h
+        # the largest of all modes has the law of independent ones most nearly.
         g = np.stack(self.slopes(fit.D, fit.offset)[: 1 + self.free], axis=-2)
         solved = np.linalg.solve(np.einsum("...ik,...jk->...ij", g, g), g)
         h = np.maximum(np.einsum("...ik,...ik->...k", g, solved) - 1 / self.n_steps, 0.0)
+        h /= 2
         return np.asarray(ratio * (1 - h) / np.maximum(1 - h * ratio, 0.1))
 
     def alternatives(self) -> Floats:

@@ -39,7 +39,7 @@ from perrin.movie.checks import (
     unsettled_poses,
 )
 from perrin.movie.parts import PartWriter, open_parts, read_parts
-from perrin.movie.stacks import analyze_stack
+from perrin.movie.stacks import Settings, analyze_stack
 from perrin.movie.stages import Located, fit_poses, learn_method, locate_frames, run_frames
 from perrin.movie.workers import Work, check_workers, work_through
 
@@ -49,6 +49,7 @@ __all__ = [
     "Findings",
     "Located",
     "PartWriter",
+    "Settings",
     "Verdict",
     "Work",
     "analyze_stack",
