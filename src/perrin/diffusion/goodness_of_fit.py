@@ -50,7 +50,7 @@ _CONFINED_RATE = 6.0  # relaxations per track of the cage that the cage test loo
 _CLUSTERING_LAGS = 20
 
 # A track of which the dense score would need more than this is divided, and the scores are added.
-_DENSE_BLOCK = 1000
+_DENSE_BLOCK = 400
 
 # Below these the p-values are replaced by ranks among draws from the fit.
 _FEWEST_ASYMPTOTIC_STEPS, _LEAST_INFORMATION = 200, 10.0
@@ -288,7 +288,7 @@ class AxisModel:
         takes its own curvature from differences of the score, where it has a maximum.
         """
         tau, shape = self.tau.mean(), y.shape[:2]
-        # The covariance is positive definite where the offset is above -D/2 times the shortest step.
+        # An offset above -D/2 times the shortest step makes the covariance positive definite.
         least = max(_LEAST_V, float(np.log1p(-(1 - 1e-4) * self.tau.min() / tau)))
         single = near is None
         if near is None:
@@ -485,12 +485,15 @@ class AxisModel:
         With z = C^-1 y and a derivative C' of the covariance, U = 1/2 (z^T C' z - tr C^-1 C') and
         I = 1/2 tr C^-1 C'_a C^-1 C'_b. What D and the offset can do is removed by regression of
         the scores, which also corrects for a fit that is not that of y. A long track is divided
-        into blocks, whose scores are added; the cumulants are scaled from those of even steps.
+        into blocks, whose scores and informations are added; the cumulants are scaled from those of
+        even steps.
         """
         from scipy.linalg.lapack import dpttrf, dpttrs
 
         blocks = np.array_split(np.arange(self.n_steps), -(-self.n_steps // _DENSE_BLOCK))
-        value, information = np.zeros((2, len(y))), np.zeros(2)
+        axes, parameters = y.shape[1], 3 + self.free
+        U = np.zeros((axes, parameters, len(y)))
+        matrix = np.zeros((axes, parameters, parameters))
         for rows in blocks:
             changes = self._covariance_changes(rows)
             for axis, (D, offset) in enumerate(zip(fit.D[0], fit.offset[0], strict=True)):
@@ -506,17 +509,17 @@ class AxisModel:
                 )
                 d, lower, _ = dpttrf(a, b)
                 z = dpttrs(d, lower, y[:, axis, rows].T)[0]
-                scores, products = [], []
-                for change in changes:
-                    product = dpttrs(d, lower, D * change)[0]
+                products = [dpttrs(d, lower, D * change)[0] for change in changes]
+                for i, change in enumerate(changes):
                     square = D * np.einsum("nb,nb->b", z, change @ z)
-                    scores.append(0.5 * (square - np.trace(product)))
-                    products.append(product)
-                U = np.stack(scores)
-                matrix = 0.5 * np.array([[np.sum(p * q.T) for q in products] for p in products])
-                weight = np.linalg.solve(matrix[2:, 2:], matrix[2:, :2])
-                value += U[:2] - weight.T @ U[2:]
-                information += np.diag(matrix[:2, :2] - matrix[:2, 2:] @ weight)
+                    U[axis, i] += 0.5 * (square - np.trace(products[i]))
+                flat = np.stack([product.ravel() for product in products])
+                turned = np.stack([product.T.ravel() for product in products])
+                matrix[axis] += 0.5 * flat @ turned.T
+        weight = np.linalg.solve(matrix[:, 2:, 2:], matrix[:, 2:, :2])
+        value = np.sum(U[:, :2] - np.swapaxes(weight, 1, 2) @ U[:, 2:], axis=0)
+        left = matrix[:, :2, :2] - matrix[:, :2, 2:] @ weight
+        information = np.einsum("aii->i", left)
         g = np.broadcast_to(self.score_shapes(fit), (2, len(y), *fit.y.shape[1:]))
         known = np.broadcast_to(information[:, None], (2, len(y)))
         return (

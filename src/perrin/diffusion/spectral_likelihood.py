@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 
 # Uneven steps are diagonalised in blocks of this many, whose correlation is left out.
-_LONGEST_BLOCK = 500
+_LONGEST_BLOCK = 250
 
 # Lowest logarithm of the ratio of noise to D, and of D to the mean square step; distance of the
 # trial values, less than the width of any maximum.
