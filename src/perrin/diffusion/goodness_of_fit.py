@@ -6,6 +6,7 @@ modes over their fitted variances, and the errors of predicting each step from t
 
 from __future__ import annotations
 
+import zlib
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, NamedTuple
@@ -905,7 +906,10 @@ def brownian_tests(model: AxisModel, y: Floats) -> BrownianTests:
     ranked = n < _FEWEST_ASYMPTOTIC_STEPS or 0 < n * snr < _LEAST_INFORMATION
     if ranked:
         count = int(np.clip(_DRAWN_NUMBERS // y.size, _FEWEST_DRAWS, _MOST_DRAWS))
-        drawn = model.draws(fit, count=count, rng=np.random.default_rng(n))
+        # The draws differ from track to track, so that their errors do not add up over tracks, and
+        # are the same when a track is judged again.
+        seed = zlib.crc32(np.round(y / np.abs(y).max(), 9).tobytes())
+        drawn = model.draws(fit, count=count, rng=np.random.default_rng(seed))
         near = model.fit(drawn, near=fit)
         again = model.scores(near) if model.even else model.dense_scores(fit, drawn)
         null = approximate_p(model, near, again)
