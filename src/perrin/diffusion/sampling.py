@@ -783,7 +783,9 @@ def _verdict_text(
         f"{percent(verdict.bound)}."
     )
     efficiency = (verdict.bound / verdict.error) ** 2
-    if efficiency < 0.6:
+    if estimate.motion == "changing D":
+        text += " The error contains the scatter of a D that changes; the bound does not."
+    elif efficiency < 0.6:
         text += (
             f" The efficiency of the estimate [{estimate.method}] is {percent(efficiency)}: check "
             "gaps, missing particles and the method."

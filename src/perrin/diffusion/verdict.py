@@ -61,13 +61,12 @@ _SHAPE_TESTS = ("fractional", "cage", "steady")
 
 Model = AnomalousEstimate | ConfinedEstimate | DiffusionEstimate | SwitchingEstimate
 
+# The class of a fitted alternative, by a key that only its dictionary has.
 _MODELS: dict[str, type[Model]] = {
-    "subdiffusion": AnomalousEstimate,
-    "superdiffusion": AnomalousEstimate,
-    "confined": ConfinedEstimate,
+    "alpha": AnomalousEstimate,
+    "cage": ConfinedEstimate,
+    "D_slow": SwitchingEstimate,
     "drift": DiffusionEstimate,
-    "spin": DiffusionEstimate,
-    "changing D": SwitchingEstimate,
 }
 
 
@@ -138,12 +137,17 @@ class MotionVerdict:
     def from_dict(cls, entry: dict[str, Any]) -> MotionVerdict:
         """Return the verdict that `to_dict` wrote."""
         parameters = entry["parameters"]
+        model = None
+        if parameters is not None:
+            model = next(kind for key, kind in _MODELS.items() if key in parameters).from_dict(
+                parameters
+            )
         return cls(
             kind=entry["kind"],
             p={name: np.nan if p is None else p for name, p in entry["p"].items()},
             p_family=entry["p_family"],
             detectable=dict(entry["detectable"]),
-            model=None if parameters is None else _MODELS[entry["kind"]].from_dict(parameters),
+            model=model,
             frames=tuple(entry["frames"]),
             text=entry["text"],
             quantity=entry["quantity"],

@@ -8,31 +8,22 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from perrin.diffusion.anomalous import AnomalousEstimate, fit_anomalous
-from perrin.diffusion.confined import ConfinedEstimate, fit_confined
-from perrin.diffusion.estimate import DiffusionEstimate
+from perrin.diffusion.anomalous import fit_anomalous
+from perrin.diffusion.confined import fit_confined
 from perrin.diffusion.step_tests import without_spin
-from perrin.diffusion.switching import SwitchingEstimate, fit_switching
+from perrin.diffusion.switching import fit_switching
 from perrin.diffusion.verdict import MotionVerdict, judge_motion
 from perrin.errors import PrecisionWarning
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
+    from perrin.diffusion.estimate import DiffusionEstimate
     from perrin.diffusion.noise_model import Noise
     from perrin.diffusion.steps import Quantity
     from perrin.diffusion.verdict import Model
     from perrin.motion.rigid_motion import RigidMotion
     from perrin.run.experiment import MotionModel
-
-
-# The class of a fitted model, by a key that only its dictionary has.
-_MODEL_KEYS: dict[str, Any] = {
-    "alpha": AnomalousEstimate,
-    "cage": ConfinedEstimate,
-    "D_slow": SwitchingEstimate,
-    "drift": DiffusionEstimate,
-}
 
 
 def judge_each_and_all(
@@ -173,22 +164,11 @@ def verdicts_to_dict(verdicts: Mapping[str, MotionVerdict | None]) -> dict[str, 
 def verdicts_from_dict(entry: Mapping[str, Any]) -> dict[str, MotionVerdict | None]:
     """Return the verdicts that `verdicts_to_dict` wrote.
 
-    The fitted model need not be that of the kind: it may be one that the user asked for.
-
     Examples
     --------
     >>> verdicts_from_dict({"rotation": None, "translation": None})
     {'rotation': None, 'translation': None}
     """
-    verdicts: dict[str, MotionVerdict | None] = {}
-    for name, one in entry.items():
-        if one is None:
-            verdicts[name] = None
-            continue
-        parameters = one["parameters"]
-        verdict = MotionVerdict.from_dict({**one, "parameters": None})
-        if parameters is not None:
-            kind = next(cls for key, cls in _MODEL_KEYS.items() if key in parameters)
-            verdict = replace(verdict, model=kind.from_dict(parameters))
-        verdicts[name] = verdict
-    return verdicts
+    return {
+        name: None if one is None else MotionVerdict.from_dict(one) for name, one in entry.items()
+    }
