@@ -23,7 +23,7 @@ _SERIES_FROM = 1e-3  # D t from which the series of characters is used, and the 
 _SERIES_TERMS = 220
 
 _LAGS_PER_DECADE = 10
-_MOST_BLOCKS, _LEAST_BLOCKS = 12, 4  # blocks of a track whose scatter is the error
+_MOST_JACKKNIFE_BLOCKS, _LEAST_BLOCKS = 12, 4  # blocks of a track whose scatter is the error
 _SHORTEST_BLOCK = 2  # lags that a block is long, so that blocks are nearly independent
 
 
@@ -386,7 +386,7 @@ def corrected_excess(
     heat = float(brownian_angle_time(mean)) if curved else mean / (2 * axes)
     if heat <= offset:
         return np.nan, np.nan, np.nan
-    number = min(_MOST_BLOCKS, len(square) // (_SHORTEST_BLOCK * lag))
+    number = min(_MOST_JACKKNIFE_BLOCKS, len(square) // (_SHORTEST_BLOCK * lag))
     edges = np.linspace(0, len(square), max(number, 1) + 1).astype(int)[:-1]
     sums = np.add.reduceat(np.stack([np.ones_like(square), square, square**2], axis=1), edges)
     # All pairs first, then all but those of each block.

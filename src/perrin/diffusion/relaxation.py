@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 # the longest stretch of frames: fits of Brownian rotation to longer lags have larger errors.
 _LAST_VALUE, _LAST_LAG = 0.4, 0.25
 
-_FIT_LAGS = 12  # evenly spaced lags of the fit: those between them vary with them
+_RELAXATION_LAGS = 12  # evenly spaced lags of the fit: those between them vary with them
 
 
 @dataclass(frozen=True)
@@ -341,7 +341,7 @@ def fit_decay(curve: LagCurve, *, stretched: bool) -> Decay:
     end = int(np.searchsorted(lag, _LAST_LAG * max(blocks), side="right"))
     below = np.flatnonzero(value <= _LAST_VALUE * max(value[0], 0.0))
     end = min(end, int(below[0])) if below.size else end
-    use = np.unique(np.linspace(0, max(end - 1, 0), _FIT_LAGS).astype(int))
+    use = np.unique(np.linspace(0, max(end - 1, 0), _RELAXATION_LAGS).astype(int))
     if len(use) < 4:
         raise TooFewFramesError(
             f"the correlation has {len(use)} lags before it has decayed; 4 are needed: record "

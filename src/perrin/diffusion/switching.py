@@ -38,7 +38,7 @@ _LEAST_RATIO = 0.2
 
 # Beyond this T^2 the axes of D are unequal: chi-squared at 1 %, for the five numbers by which a
 # tensor differs from a multiple of unity, because the axes are chosen by the data.
-_UNEQUAL_AXES = 15.09
+_UNEQUAL_AXES_TEST = 15.09
 
 _NEWTON_ROUNDS = 60
 
@@ -389,7 +389,7 @@ def equalised_steps(motion: RigidMotion, quantity: Quantity) -> Steps:
         return steps
     apart = (squares - squares.mean(axis=1, keepdims=True))[:, 1:]
     mean = apart.mean(axis=0)
-    if len(y) * mean @ np.linalg.solve(np.cov(apart.T), mean) < _UNEQUAL_AXES:
+    if len(y) * mean @ np.linalg.solve(np.cov(apart.T), mean) < _UNEQUAL_AXES_TEST:
         return steps
     ratio = D / D.mean()
     noise = steps.noise / ratio[:, None]

@@ -49,10 +49,10 @@ _RELIABLE_FACTOR = 1.5
 _QUANTILE_POINTS = 41
 
 # The covariance is that of the fit before, until its parameters change by less than this.
-_CONVERGED, _MOST_ROUNDS = 1e-4, 20
+_POWER_LAW_CONVERGED, _MOST_ROUNDS = 1e-4, 20
 
 # Added to variances, relative: covariances of a mean square near exponent 2 are almost singular.
-_RIDGE = 1e-9
+_CURVE_RIDGE = 1e-9
 
 _ARRAYS = (
     "frequency", "modulus", "exponent", "storage", "loss", "modulus_ci68", "exponent_ci68",
@@ -353,7 +353,9 @@ def _power_law(lags: GridLags, *, known: float | None) -> _OffsetFit:
     for _ in range(_MOST_ROUNDS):
         before = fit
         covariance = curve_covariance(lags, _structure(fit, length))
-        full = np.linalg.inv(np.linalg.cholesky(covariance + _RIDGE * np.diag(np.diag(covariance))))
+        full = np.linalg.inv(
+            np.linalg.cholesky(covariance + _CURVE_RIDGE * np.diag(np.diag(covariance)))
+        )
         # The offset is linear: its best value at any exponent is projected out.
         level = full @ np.ones_like(n)
         level *= (known is None) / np.linalg.norm(level)
@@ -388,7 +390,10 @@ def _power_law(lags: GridLags, *, known: float | None) -> _OffsetFit:
             weights = inverse[-1] @ full
             stderr = float(np.linalg.norm(inverse[-1]))
         fit = _OffsetFit(D, alpha, offset, stderr, weights, chi2)
-        if abs(alpha - before.alpha) < _CONVERGED and abs(D - before.D) < _CONVERGED * D:
+        if (
+            abs(alpha - before.alpha) < _POWER_LAW_CONVERGED
+            and abs(D - before.D) < _POWER_LAW_CONVERGED * D
+        ):
             break
     return fit
 
@@ -422,7 +427,7 @@ def _local_power_laws(lags: GridLags, fit: _OffsetFit) -> tuple[Floats, Floats]:
         line = np.linalg.solve((design.T * weight) @ design, design.T * weight)
         logs[j] = line @ log_y
         errors = line @ relative @ line.T
-        root[j] = np.linalg.cholesky(errors + _RIDGE * np.diag(np.diag(errors)))
+        root[j] = np.linalg.cholesky(errors + _CURVE_RIDGE * np.diag(np.diag(errors)))
     return logs, root
 
 

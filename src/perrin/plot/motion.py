@@ -58,9 +58,9 @@ _MOST_MEANS, _FEWEST_AVERAGED = 30, 5  # means of squared errors along a track; 
 _SHOWN_STEPS = 5000  # largest number of single squared errors shown, without the largest ones
 # Squared errors under this, or under this quantile of Brownian motion, are drawn at the bottom.
 _SMALLEST_SQUARE, _SMALLEST_QUANTILE = 0.01, 0.01
-_VECTOR_POINTS = 1000  # more points are an image inside a PDF
+_MOST_VECTOR_POINTS = 1000  # more points are an image inside a PDF
 _NUMBERED_JUMPS = 5  # jumps whose row is written
-_LARGEST_ERROR = 8.0  # errors beyond this are counted in the legend
+_WIDEST_ERROR = 8.0  # errors beyond this are counted in the legend
 _FEW_DECADES = 300.0  # ratio of the ends of an axis with more ticks than powers of ten
 _TITLE_LETTERS = 120  # letters in one line of the title
 
@@ -266,7 +266,7 @@ def plot_prediction_errors(
     large = np.flatnonzero(square > chdtri(axes, 1 / n) / axes)
     shown = np.union1d(np.arange(0, n, stride), large)
     label = "steps" if stride == 1 else f"one step in {stride}, and the largest"
-    few = n < _VECTOR_POINTS
+    few = n < _MOST_VECTOR_POINTS
     points: dict[str, Any] = {"color": GREY, "ms": 2.6 if few else 2.0, "mew": 0}
     points |= {"rasterized": not few, "alpha": 0.9 if few else 0.5, "zorder": 2.5}
     bottom = max(_SMALLEST_SQUARE, float(chdtri(axes, 1 - _SMALLEST_QUANTILE)) / axes)
@@ -320,7 +320,7 @@ def plot_error_distribution(model: AxisModel, fit: AxisFit, *, ax: Axes) -> Axes
 
     error = model.prediction_errors(fit).ravel()
     total = error.size
-    widest = min(_LARGEST_ERROR, max(4.0, float(np.abs(error).max())))
+    widest = min(_WIDEST_ERROR, max(4.0, float(np.abs(error).max())))
     width = float(np.clip(3.5 * total ** (-1 / 3), 0.1, 0.5))
     half = int(np.ceil(widest / width))
     edges = width * np.arange(-half, half + 1)
