@@ -23,7 +23,8 @@ from perrin.diffusion import (
     DiffusionEstimate,
     Found,
     Noise,
-    axis_model,
+    NoisySteps,
+    prediction_errors,
     steps_of,
 )
 from perrin.geometry.rotations import exp_map
@@ -99,8 +100,7 @@ def test_prediction_errors_are_independent_normal_numbers():
     missing = 1 + np.flatnonzero(rng.random(1998) < 0.2)
     center[missing], rotation[missing] = np.nan, np.nan
     steps = steps_of(replace(motion, center=center, rotation=rotation), "translation")
-    model, y = axis_model(replace(motion, center=center, rotation=rotation), "translation", Noise())
-    errors = model.prediction_errors(model.fit(y))[0].T
+    errors = prediction_errors(NoisySteps.of(steps, Noise()))
     sd = 1 / np.sqrt(errors.size)
     assert abs(np.mean(errors**2) - 1) < 4 * np.sqrt(2) * sd
     assert abs(np.mean(errors[1:] * errors[:-1])) < 4 * sd

@@ -21,6 +21,7 @@ from perrin.diffusion.decoupling import (
     MobilityCorrelation,
     decoupling_ratio,
     diffusion_correlation,
+    prediction_errors,
     translation_rotation_correlation,
 )
 from perrin.diffusion.estimate import DiffusionEstimate, Found, bare_text, value_text
@@ -293,6 +294,7 @@ __all__ = [
     "plan_sampling",
     "pooled_steps",
     "precision_limits",
+    "prediction_errors",
     "principal_steps",
     "relaxation_faults",
     "residual_freedom",

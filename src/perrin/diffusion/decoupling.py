@@ -10,9 +10,10 @@ import numpy as np
 from perrin._arrays import refuse, to_plain
 from perrin._text import number_text, with_error
 from perrin.diffusion.estimate import NORMAL, UNITS, DiffusionEstimate
-from perrin.diffusion.goodness_of_fit import axis_model
+from perrin.diffusion.likelihood import Likelihood
 from perrin.diffusion.noise_model import Noise
-from perrin.diffusion.steps import Quantity, pooled_steps
+from perrin.diffusion.step_kernels import covariance_bands
+from perrin.diffusion.steps import NoisySteps, pooled_steps
 from perrin.errors import TooFewFramesError
 from perrin.motion.rigid_motion import RigidMotion
 
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
     from typing import Self
 
+    from perrin._arrays import Floats
     from perrin.diffusion.long_time import LongTimeEstimate
     from perrin.hydrodynamics.mobility import Mobility
 
@@ -28,7 +30,7 @@ _MOST_RANK_LAGS = 60
 
 # Fewer steps have no rank correlation with a known error, and fewer clusters no corrected one
 # whose error is small against 1.
-_FEWEST_RANKED_STEPS, _FEW_CLUSTERS = 20, 30
+_LEAST_RANKED, _FEW_CLUSTERS = 20, 30
 
 
 @dataclass(frozen=True)
@@ -272,23 +274,22 @@ def translation_rotation_correlation(
     from scipy.special import erfc
 
     motions = [motion] if isinstance(motion, RigidMotion) else list(motion)
-    quantities: tuple[Quantity, Quantity] = ("translation", "rotation")
-    pairs = zip(*(pooled_steps(motions, quantity) for quantity in quantities), strict=True)
+    pairs = zip(
+        *(pooled_steps(motions, quantity) for quantity in ("translation", "rotation")), strict=True
+    )
     rho, variance, count = [], [], []
     for number, both in enumerate(pairs):
         n = len(both[0].duration)
-        if n < _FEWEST_RANKED_STEPS:
+        if n < _LEAST_RANKED:
             raise TooFewFramesError(
-                f"motion {number}: {n} steps; a rank correlation needs {_FEWEST_RANKED_STEPS}",
-                n + 1,
+                f"motion {number}: {n} steps; a rank correlation needs {_LEAST_RANKED}", n + 1
             )
         ranks = []
-        for steps, name in zip(both, quantities, strict=True):
+        for steps, name in zip(both, ("translation", "rotation"), strict=True):
             if not steps.vectors.any():
                 raise ValueError(f"motion {number}: no {name}, so that there is no correlation")
-            model, y = axis_model(motions[number], name, Noise())
-            errors = model.prediction_errors(model.fit(y))[0]
-            rank = np.argsort(np.argsort(np.sum(errors**2, axis=0), kind="stable"))
+            errors = prediction_errors(NoisySteps.of(steps, Noise()))
+            rank = np.argsort(np.argsort(np.sum(errors**2, axis=1), kind="stable"))
             centred = rank - rank.mean()
             ranks.append(centred / np.sqrt(centred @ centred))
         a, b = ranks
@@ -308,6 +309,59 @@ def translation_rotation_correlation(
     )
     p = float(erfc(abs(value) / stderr / np.sqrt(2)))
     return MobilityCorrelation(value, stderr, ci68, ci95, p, sum(count), (stderr / plain) ** 2)
+
+
+def prediction_errors(track: NoisySteps) -> Floats:
+    """Return each step less its prediction from the steps before it, in standard deviations.
+
+    D and the noise are those of greatest likelihood. Under the model the errors are independent
+    standard normal numbers, however the frames are spaced.
+
+    Parameters
+    ----------
+    track : NoisySteps
+
+    Returns
+    -------
+    ndarray, shape (S, c)
+
+    Notes
+    -----
+    With the covariance C = L V L^T of the steps y of one axis, V diagonal, they are
+    V^(-1/2) L^-1 y.
+
+    Examples
+    --------
+    >>> from perrin import Cluster, simulate_motion
+    >>> from perrin.diffusion import steps_of
+    >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=300, rng=3)
+    >>> errors = prediction_errors(NoisySteps.of(steps_of(truth, "rotation"), Noise()))
+    >>> bool(abs(errors.std() - 1) < 0.05)
+    True
+    """
+    from scipy.linalg import solve_banded
+    from scipy.linalg.lapack import dpttrf
+
+    best = Likelihood.of([track]).best()
+    steps = track.steps
+    diagonal, off_diagonal = covariance_bands(
+        float(best.D[0]),
+        float(best.theta[0]),
+        steps.duration[:, None],
+        steps.linked[:, None],
+        blur=track.blur,
+        weight=track.weight,
+        known=track.known,
+    )
+    errors = np.empty_like(steps.vectors)
+    for axis, y in enumerate(steps.vectors.T):
+        pivots, lower, singular = dpttrf(diagonal[:, axis], off_diagonal[:, axis])
+        if singular:  # only where the noise estimate lies on the edge of its range
+            errors[:, axis] = y / np.sqrt(diagonal[:, axis])
+            continue
+        bands = np.stack([np.ones_like(pivots), np.append(lower, 0.0)])
+        errors[:, axis] = solve_banded((1, 0), bands, y) / np.sqrt(pivots)
+    return errors
 
 
 def diffusion_correlation(

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 # Names of the tests, in the order in which they are reported.
 TESTS = ("fractional", "cage", "steady", "clustering", "slow change", "tails", "largest", "line")
 
-_FEWEST_TESTED_STEPS = 20  # eight tests of fewer steps say nothing
+_LEAST_STEPS = 20  # eight tests of fewer steps say nothing
 
 # An axis whose mean square is this much smaller than another one's does not move.
 _SMALLEST_AXIS = 1e-20
@@ -608,9 +608,9 @@ def axis_model(motion: RigidMotion, quantity: Quantity, noise: Noise) -> tuple[A
     """
     steps = principal_steps(motion, quantity)
     count = len(steps.duration)
-    if count < _FEWEST_TESTED_STEPS:
+    if count < _LEAST_STEPS:
         raise TooFewFramesError(
-            f"{count} steps: at least {_FEWEST_TESTED_STEPS} are needed to tell what kind of motion they "
+            f"{count} steps: at least {_LEAST_STEPS} are needed to tell what kind of motion they "
             "belong to",
             count + 1,
         )

@@ -49,10 +49,10 @@ _RELIABLE_FACTOR = 1.5
 _QUANTILE_POINTS = 41
 
 # The covariance is that of the fit before, until its parameters change by less than this.
-_POWER_LAW_CONVERGED, _MOST_ROUNDS = 1e-4, 20
+_STEADY_FIT, _MOST_ROUNDS = 1e-4, 20
 
 # Added to variances, relative: covariances of a mean square near exponent 2 are almost singular.
-_CURVE_RIDGE = 1e-9
+_LAG_RIDGE = 1e-9
 
 _ARRAYS = (
     "frequency", "modulus", "exponent", "storage", "loss", "modulus_ci68", "exponent_ci68",
@@ -354,7 +354,7 @@ def _power_law(lags: GridLags, *, known: float | None) -> _OffsetFit:
         before = fit
         covariance = curve_covariance(lags, _structure(fit, length))
         full = np.linalg.inv(
-            np.linalg.cholesky(covariance + _CURVE_RIDGE * np.diag(np.diag(covariance)))
+            np.linalg.cholesky(covariance + _LAG_RIDGE * np.diag(np.diag(covariance)))
         )
         # The offset is linear: its best value at any exponent is projected out.
         level = full @ np.ones_like(n)
@@ -390,10 +390,7 @@ def _power_law(lags: GridLags, *, known: float | None) -> _OffsetFit:
             weights = inverse[-1] @ full
             stderr = float(np.linalg.norm(inverse[-1]))
         fit = _OffsetFit(D, alpha, offset, stderr, weights, chi2)
-        if (
-            abs(alpha - before.alpha) < _POWER_LAW_CONVERGED
-            and abs(D - before.D) < _POWER_LAW_CONVERGED * D
-        ):
+        if abs(alpha - before.alpha) < _STEADY_FIT and abs(D - before.D) < _STEADY_FIT * D:
             break
     return fit
 
@@ -427,7 +424,7 @@ def _local_power_laws(lags: GridLags, fit: _OffsetFit) -> tuple[Floats, Floats]:
         line = np.linalg.solve((design.T * weight) @ design, design.T * weight)
         logs[j] = line @ log_y
         errors = line @ relative @ line.T
-        root[j] = np.linalg.cholesky(errors + _CURVE_RIDGE * np.diag(np.diag(errors)))
+        root[j] = np.linalg.cholesky(errors + _LAG_RIDGE * np.diag(np.diag(errors)))
     return logs, root
 
 
