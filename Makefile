@@ -52,7 +52,7 @@ test-lowest:  ## the suite on the oldest dependencies allowed (Python 3.11)
 benchmarks: .venv/.test  ## the quick benchmarks: coverage of intervals, warnings, the paper's claims
 	$(BIN)/python benchmarks/intervals.py --quick
 	$(BIN)/python benchmarks/alarms.py --quick --jobs 2
-	$(BIN)/python benchmarks/motion_models.py --quick
+	$(BIN)/python benchmarks/motion.py --quick --jobs 2
 	$(BIN)/python benchmarks/paper.py
 	$(BIN)/python benchmarks/structure.py
 
@@ -60,7 +60,11 @@ long: .venv/.test  ## the Monte-Carlo tests with all repeats, and 40 tables of e
 	OMP_NUM_THREADS=1 $(RUN) pytest -q --long -n auto --dist loadfile
 	$(BIN)/python benchmarks/intervals.py
 	$(BIN)/python benchmarks/alarms.py --repeats 40 --jobs 2
+	$(BIN)/python benchmarks/motion.py --jobs 2
 	$(BIN)/python benchmarks/motion_models.py
+	$(BIN)/python benchmarks/motion_switching.py
+	$(BIN)/python benchmarks/motion_correlation.py
+	$(BIN)/python benchmarks/motion_dense.py
 
 lint: .venv/.test  ## ruff: rules and format
 	$(RUN) ruff check .

@@ -167,7 +167,7 @@ def p_values(cell, seed):
 
 def level_cells(quick):
     """Return the cells of the table of levels."""
-    many, some, few = (400, 40, 0) if quick else (4000, 1000, 400)
+    many, some, few = (200, 20, 0) if quick else (4000, 1000, 400)
     cells = [
         Cell("brownian", n, snr, many, open_shutter=shutter)
         for n in (300, 1000)
@@ -334,7 +334,7 @@ def word_row(task):
 def tables(quick, seed):
     """Return every table: its title, its head, its function and its tasks."""
     tests = " | ".join(TESTS)
-    few, some, words = (0, 100, 5) if quick else (400, 600, 150)
+    few, some, words = (0, 60, 3) if quick else (400, 600, 100)
     lengths = (1001,) if quick else (301, 1001)
     return {
         "levels": (
@@ -345,13 +345,13 @@ def tables(quick, seed):
         "pools": (
             f"| tracks of Brownian steps | pools | {tests} | family at 5 % |",
             pool_row,
-            [(300, 5, 40, seed)] if quick else [(60, 20, 300, seed), (300, 5, 1000, seed)],
+            [(300, 5, 20, seed)] if quick else [(60, 20, 300, seed), (300, 5, 1000, seed)],
         ),
         "bodies": (
             f"| body | tracks | {tests} | family at 5 % |",
             body_row,
             [
-                (name, quantity, few or 30, seed)
+                (name, quantity, few or 10, seed)
                 for name in ("tetrahedron, sigma_z 2", "irregular, D 1:1.5:3, sigma_z 2")
                 for quantity in ("rotation", "translation")
             ],

@@ -89,7 +89,7 @@ def test_brownian_steps_are_rejected_at_the_stated_levels(repeats):
 
 
 def test_ranks_of_a_short_noisy_track_are_uniform(repeats):
-    tracks = repeats(40, 400)
+    tracks = repeats(24, 400)
     model = even_model(50)
     y = noisy_steps(50, tracks, 0.5, np.random.default_rng(6))
     p = np.array([list(brownian_tests(model, one[None]).p.values()) for one in y])
