@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -129,8 +129,19 @@ class NoisyVectors:
         """
         theta, B = self.amplitudes(own)
         found = self.by_tensor(D, theta, B)
-        value, by_own = self.by_parameters(found, theta, own)
-        return value - (_LEAST_BLUR * B if self.B is None else 0.0), found.D, by_own
+        value, by_theta = found.value, found.theta
+        out = [np.empty((len(D), 0))]
+        if np.isfinite(self.freedom):
+            if self.freedom:
+                ratio = self.theta / theta
+                value = value - 0.5 * self.freedom * np.sum(ratio - np.log(ratio), axis=1)
+                by_theta = by_theta - 0.5 * self.freedom * (1 - ratio) / theta
+            out.append(2 * own[:, : len(self.theta)] * by_theta)
+        if self.B is None:
+            value = value - _LEAST_BLUR * B
+            slope = _MOST_BLUR * np.sin(2 * own[:, -1:])
+            out.append((found.B - _LEAST_BLUR)[:, None] * slope)
+        return value, found.D, np.concatenate(out, axis=1)
 
     def amplitudes(self, own: Floats) -> tuple[Floats, Floats]:
         """Return the noise amplitudes (P, r) and B (P,) of the free parameters (P, c)."""
@@ -140,23 +151,6 @@ class NoisyVectors:
         if self.B is None:
             B = np.array([_MOST_BLUR * float(one) ** 2 for one in np.sin(own[:, -1])])
         return theta, B
-
-    def by_parameters(
-        self, found: TensorSlopes, theta: Floats, own: Floats
-    ) -> tuple[Floats, Floats]:
-        """Return the log-likelihoods with that of a measured theta, and slopes in the noise."""
-        value, by_theta = found.value, found.theta
-        out = [np.empty((len(own), 0))]
-        if np.isfinite(self.freedom):
-            if self.freedom:
-                ratio = self.theta / theta
-                value = value - 0.5 * self.freedom * np.sum(ratio - np.log(ratio), axis=1)
-                by_theta = by_theta - 0.5 * self.freedom * (1 - ratio) / theta
-            out.append(2 * own[:, : len(self.theta)] * by_theta)
-        if self.B is None:
-            slope = _MOST_BLUR * np.sin(2 * own[:, -1:])
-            out.append((found.B - _LEAST_BLUR)[:, None] * slope)
-        return value, np.concatenate(out, axis=1)
 
     def noise(self, D: Floats, own: Floats) -> Floats:
         """Return the mean noise O of a frame, less its blur, (b, b)."""
@@ -308,10 +302,8 @@ class NoisyVectors:
         columns = np.stack([x.reshape(-1) for x in products], axis=1)
         return np.asarray(0.5 * columns.T @ dpbtrs(factor, columns, lower=1)[0])
 
-    def expansion(
-        self, D: Floats, slopes: Floats, bends: Floats, own: Floats
-    ) -> tuple[float, Floats, Floats]:
-        """Return the log-likelihood, its slopes (m + c,) and minus its Hessian (m + c, m + c).
+    def curvatures(self, D: Floats, slopes: Floats, bends: Floats, own: Floats) -> Floats:
+        """Return minus the Hessian by the parameters of D and of the noise, (m + c, m + c).
 
         `slopes` (m, b, b) and `bends` (m, m, b, b) are the derivatives of D by its parameters, and
         `own` (c,) the free parameters of the noise. For steps that are not even the second
@@ -320,19 +312,13 @@ class NoisyVectors:
         theta, B = self.amplitudes(own[None])
         m, r = len(slopes), len(self.theta)
         if self.steps.even:
-            try:
-                modes = self.modes(D[None], theta, B)
-            except np.linalg.LinAlgError:
-                size = m + len(own)
-                return -np.inf, np.full(size, np.nan), np.full((size, size), np.nan)
+            modes = self.modes(D[None], theta, B)
             found = self.by_sines(D[None], theta, B, modes)
             full = self.sine_curvatures(slopes, D, float(B[0]), modes)
         else:
             found = self.by_tensor(D[None], theta, B)
             full = self.band_curvatures(slopes, D, theta[0], float(B[0]))
-        value, by_own = self.by_parameters(found, theta, own[None])
-        by_D = found.D[0]
-        full[:m, :m] -= np.tensordot(bends, by_D, 2)
+        full[:m, :m] -= np.tensordot(bends, found.D[0], 2)
         # The noise less its blur contains -2 B dt D, which is not linear.
         mixed = 2 * self.steps.dt * np.tensordot(slopes, found.noise[0], 2)
         full[:m, -1] += mixed
@@ -358,9 +344,7 @@ class NoisyVectors:
         if self.B is None:
             bend = 2 * _MOST_BLUR * np.cos(2 * own[-1])
             full[-1, -1] -= (found.B[0] - _LEAST_BLUR) * bend
-            value = value - _LEAST_BLUR * B
-        slope = np.append(slopes.reshape(m, -1) @ by_D.ravel(), by_own[0])
-        return float(value[0]), slope, np.asarray(full[np.ix_(kept, kept)])
+        return np.asarray(full[np.ix_(kept, kept)])
 
     def by_bands(self, D: Floats, theta: Floats, B: float) -> TensorSlopes:
         """Evaluate any steps at one point by banded Cholesky factors of their covariance.
@@ -532,9 +516,9 @@ class Maximum(NamedTuple):
 def maximise(tracks: Sequence[NoisyVectors], family: Family, q: Floats, own: Floats) -> Maximum:
     """Return the maximum over a family of D, common to all, and over the noise of each motion.
 
-    Newton steps where all steps are even. Otherwise the search is quasi-Newton (BFGS) and begins
-    with the average information, which is computed again where no step increases the likelihood,
-    and after every 30 steps. It ends at a root of the slopes.
+    The search is quasi-Newton (BFGS) and begins with the Hessian, with the average information in
+    it where steps are not even; it is computed again where no step increases the likelihood, and
+    after every 30 steps. The search ends at a root of the slopes.
 
     Examples
     --------
@@ -549,25 +533,20 @@ def maximise(tracks: Sequence[NoisyVectors], family: Family, q: Floats, own: Flo
     """
     problem = PooledLikelihood(tracks, family, len(q), own.shape)
     p = np.concatenate([q, own.ravel()])
-    exact = all(t.steps.even for t in tracks)
-    evaluate = problem.expansion if exact else problem.slopes
-    value, slope, *curvatures = evaluate(p)
-    for _ in range(200 if exact else 20):
-        inverse = (curvatures[0] if exact else problem.expansion(p)[2]).inverse()
-        for _ in range(1 if exact else 30):
+    value, slope = problem.slopes(p)
+    for _ in range(20):
+        inverse = problem.curvatures(p).inverse()
+        for _ in range(30):
             step = inverse @ slope
             gain = 0.5 * float(slope @ step)
             if gain <= _CONVERGED_GAIN:
                 return Maximum(value, *problem.tensor_and_noise(p))
-            trial = line_search(evaluate, p, value, step, gain)
+            trial = problem.line_search(p, value, step, gain)
             if trial is None:
                 break
-            new, new_value, new_slope, *curvatures = trial
-            if not exact:
-                inverse = bfgs_update(inverse, new - p, slope - new_slope)
+            new, new_value, new_slope = trial
+            inverse = bfgs_update(inverse, new - p, slope - new_slope)
             p, value, slope = new, new_value, new_slope
-        if exact and trial is None:
-            break
     if gain <= _ROUNDING_GAIN:
         return Maximum(value, *problem.tensor_and_noise(p))
     raise ValueError(
@@ -575,32 +554,6 @@ def maximise(tracks: Sequence[NoisyVectors], family: Family, q: Floats, own: Flo
         "at which a search converges: they hold too little information about diffusion and noise; "
         "take longer tracks"
     )
-
-
-def line_search(
-    evaluate: Callable[[Floats], tuple[Any, ...]],
-    p: Floats,
-    value: float,
-    step: Floats,
-    gain: float,
-) -> tuple[Any, ...] | None:
-    """Return the point along a step, shortened until the likelihood rises, and what is known of it.
-
-    `evaluate` returns the log-likelihood and its slopes, and perhaps more. None if the likelihood
-    never rises.
-
-    Examples
-    --------
-    >>> line_search(lambda x: (-float(x @ x), -2 * x), np.ones(1), -1.0, -3 * np.ones(1), 3.0)
-    (array([-0.2]), -0.04000000000000003, array([0.4]))
-    """
-    for part in 0.4 ** np.arange(16):
-        new = p + part * step
-        found = evaluate(new)
-        rises = found[0] > value + 1e-3 * part * gain
-        if rises or (gain <= _ROUNDING_GAIN and np.isfinite(found[0])):
-            return new, *found
-    return None
 
 
 def spread(tracks: Sequence[NoisyVectors], best: Maximum, basis: Floats) -> tuple[Floats, Floats]:
@@ -678,19 +631,25 @@ class PooledLikelihood:
         value = np.sum([part[0] for part in found], axis=0)
         return value, np.concatenate([by_q, *(part[2] for part in found)], axis=1)
 
-    def expansion(self, p: Floats) -> tuple[float, Floats, ArrowHessian]:
-        """Return the log-likelihood, its slopes and minus its Hessian.
+    def line_search(
+        self, p: Floats, value: float, step: Floats, gain: float
+    ) -> tuple[Floats, float, Floats] | None:
+        """Return the point along a step, shortened until the likelihood rises; None if never."""
+        for part in 0.4 ** np.arange(16):
+            new_value, slope = self.slopes(p + part * step)
+            rises = new_value > value + 1e-3 * part * gain
+            if rises or (gain <= _ROUNDING_GAIN and np.isfinite(new_value)):
+                return p + part * step, new_value, slope
+        return None
 
-        The Hessian contains the average information of steps that are not even.
-        """
-        tensors = self.family(p[: self.m])
-        own = p[self.m :].reshape(self.shape)
-        found = [t.expansion(*tensors, o) for t, o in zip(self.tracks, own, strict=True)]
-        slopes, bends = (np.array([one[k] for one in found]) for k in (1, 2))
-        m = self.m
-        slope = np.concatenate([slopes[:, :m].sum(axis=0), slopes[:, m:].ravel()])
-        hessian = ArrowHessian(bends[:, :m, :m].sum(axis=0), bends[:, :m, m:], bends[:, m:, m:])
-        return sum(one[0] for one in found), slope, hessian
+    def curvatures(self, p: Floats) -> ArrowHessian:
+        """Return minus the Hessian, with the average information of steps that are not even."""
+        tensors, m = self.family(p[: self.m]), self.m
+        own = p[m:].reshape(self.shape)
+        found = np.array(
+            [t.curvatures(*tensors, o) for t, o in zip(self.tracks, own, strict=True)]
+        )
+        return ArrowHessian(found[:, :m, :m].sum(axis=0), found[:, :m, m:], found[:, m:, m:])
 
     def hessian(self, p: Floats) -> ArrowHessian:
         """Return minus the Hessian, by central differences where the steps are not even.
@@ -698,7 +657,7 @@ class PooledLikelihood:
         The noise of one motion does not enter the slopes of the others, so all change at once.
         """
         if all(t.steps.even for t in self.tracks):
-            return self.expansion(p)[2]
+            return self.curvatures(p)
         count, c = self.shape
         one, other = np.eye(self.m, len(p)), np.zeros((c, len(p)))
         other[:, self.m :] = np.tile(np.eye(c), count)
