@@ -824,7 +824,7 @@ def test_a_long_track_is_solved_from_any_guess():
     start = likelihood.profile(np.zeros(1))
     assert start.theta > 100 * np.mean(steps.vectors**2)
     D = np.array([4.5e-3])
-    found, fresh = likelihood.profile(D, start).theta, likelihood.profile(D).theta
+    found, fresh = likelihood.profile(D, start.theta).theta, likelihood.profile(D).theta
     assert found == pytest.approx(fresh, rel=1e-8)
     assert found == pytest.approx(0.015**2, abs=4 * 0.002 * 4.5e-3)
 
