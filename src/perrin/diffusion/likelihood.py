@@ -37,7 +37,7 @@ _LEAST_LOG_OFFSET, _MOST_LOG_OFFSET = -30.0, 60.0
 _SMALLEST_STEP_RATIO = 1e-24
 
 # Steps in log theta that are short enough where only the sign of a slope is used.
-_COARSE_STEP = 0.01
+_COARSE_STEP = 0.03
 
 # About this many step components are evaluated at once; more do not stay in the processor's cache.
 _MOST_AT_ONCE = 100_000
@@ -72,8 +72,13 @@ class ProfilePoint(NamedTuple):
     theta_slope: Floats
 
     def theta_at(self, D: Floats) -> Floats:
-        """Return the theta that these points predict for other D nearby, (..., G)."""
-        return np.maximum(self.theta + self.theta_slope * (D - self.D), 0.01 * self.theta)
+        """Return the theta that these points predict for other D, (..., G): a power of D."""
+        known = (self.theta > 0) & (self.D > 0)
+        ratio = np.where(known & (D > 0), D / np.where(self.D > 0, self.D, 1.0), 1.0)
+        power = np.divide(
+            self.theta_slope * self.D, self.theta, out=np.zeros_like(self.theta), where=known
+        )
+        return np.asarray(self.theta * ratio**power)
 
 
 @dataclass(frozen=True, eq=False)
@@ -276,12 +281,15 @@ class Likelihood:
             rising = peak.log_ratio > 0
             low, high = np.where(rising, peak.D, low), np.where(rising, high, peak.D)
             trial = newton_trial(peak.D, peak.log_ratio, peak.bend, low, high)
-            done = (np.abs(trial - peak.D) <= 1e-13 * np.abs(peak.D)) | (high <= low)
+            # The error of the next Newton step is of the order of the square of this one.
+            nearest = np.where(peak.bend < 0, 1e-7, 1e-13) * np.abs(peak.D)
+            done = (np.abs(trial - peak.D) <= nearest) | (high <= low)
             if done.all():
                 break
             trial = np.where(done, peak.D, trial)
             peak = self.profile(trial, peak.theta_at(trial))
-        return peak
+        D = np.where(high > low, trial, peak.D)
+        return peak._replace(D=D, theta=peak.theta_at(D))
 
     def intervals(self, best: ProfilePoint, drops: Sequence[float]) -> list[tuple[float, float]]:
         """Return where twice the profile log-likelihood has fallen by each drop; 0 if it never has.

@@ -297,7 +297,7 @@ class TridiagonalCovariance:
             starts=numbered(self.starts, rows),
             which=numbered(self.which, groups),
             count=again(self.count),
-            y=again(self.y),
+            y=np.concatenate([self.y.T] * count, axis=1).T,
             tau=again(self.tau),
             linked=again(self.linked),
             blur=again(self.blur),
@@ -383,7 +383,8 @@ class TridiagonalCovariance:
 
         products = self.slope_products(z)
         columns = z.shape[1]
-        solved, _ = dpttrs(d, lower, np.concatenate(products, axis=1))
+        # Columns are contiguous, as LAPACK needs them.
+        solved, _ = dpttrs(d, lower, np.concatenate([x.T for x in products]).T)
         found = []
         for i, j in ((0, 0), (0, 1), (1, 1)):
             row = np.einsum("rc,rc->r", products[i], solved[:, j * columns : (j + 1) * columns])
@@ -409,12 +410,11 @@ class TridiagonalCovariance:
         """
         from scipy.linalg.lapack import dpttrs, dtbtrs
 
-        band = np.ones((2, len(d)))
+        band = np.ones((2, len(d)), order="F")
         band[1, :-1] = -(lower**2)
 
         def recurrence(columns: Sequence[Floats]) -> Floats:
-            right = np.stack(columns, axis=1)
-            return np.asarray(dtbtrs(band, right, uplo="L", diag="U")[0])
+            return np.asarray(dtbtrs(band, np.array(columns).T, uplo="L", diag="U")[0])
 
         first = []
         for on, off in self.band_slopes:
