@@ -138,6 +138,7 @@ from perrin.diffusion.switching import (
 )
 from perrin.diffusion.tensor_likelihood import (
     ArrowHessian,
+    DiagonalModes,
     Maximum,
     NoisyVectors,
     PooledLikelihood,
@@ -179,6 +180,7 @@ __all__ = [
     "CoupledTensor",
     "Decay",
     "DecouplingRatio",
+    "DiagonalModes",
     "DiffusionEstimate",
     "DiffusionTensor",
     "Found",

@@ -144,7 +144,8 @@ class Likelihood:
 
     def by_unit(self, x: Floats) -> Floats:
         """Sum over the motions that share a D, (..., units)."""
-        return x if self.own else np.asarray(x.sum(axis=-1, keepdims=True))
+        alone = self.own or len(self.tracks) == 1
+        return x if alone else np.asarray(x.sum(axis=-1, keepdims=True))
 
     def sums(self, D: Floats, theta: Floats) -> GroupSlopes:
         """Evaluate all motions at the D (..., units) and the theta (..., G)."""
@@ -186,8 +187,10 @@ class Likelihood:
             start = np.maximum(0.5 * square - D * spent, 0.01 * square)
         t = np.log(np.maximum(np.broadcast_to(start, shape) / square, 1e-6))
         low, high = np.full(shape, _LEAST_LOG_OFFSET), np.full(shape, _MOST_LOG_OFFSET)
+        some_fixed = bool(fixed.any())
         for _ in range(100):
-            theta = np.where(fixed, self.prior[1], square * np.exp(t))
+            theta = square * np.exp(t)
+            theta = np.where(fixed, self.prior[1], theta) if some_fixed else theta
             sums = self.sums(D, theta)
             ratio = log_slope_ratio(sums.rise, sums.fall)
             bend = theta * ratio_bend(sums.rise, sums.fall, sums.rise_oo, sums.fall_oo)
@@ -230,15 +233,16 @@ class Likelihood:
         # no more of them gets a bracket of length 0.
         falls = (seen.log_ratio[:-1] > 0) & (seen.log_ratio[1:] <= 0)
         order, unit = np.argsort(~falls, axis=0, kind="stable"), np.arange(len(best))
-        motion = np.arange(seen.theta.shape[1]) if self.own else np.zeros(1, dtype=np.int64)
         for row in order[: int(falls.sum(axis=0).max(initial=0))]:
             rows = np.stack([row, np.where(falls[row, unit], row + 1, row)])
-            of_motion = rows[:, motion] if self.own else np.broadcast_to(rows, (2, 1))
-            ends = [x[rows, unit] for x in (seen.D, seen.log_ratio)]
+            low, high = seen.D[rows, unit]
+            by_motion = np.broadcast_to(rows, (2, len(theta)))
             peak = self.maximum_between(
-                *ends, np.take_along_axis(seen.theta, np.broadcast_to(of_motion, (2, seen.theta.shape[1])), axis=0)
+                (low, high),
+                log_ratio=seen.log_ratio[rows, unit],
+                theta=np.take_along_axis(seen.theta, by_motion, axis=0),
             )
-            higher = (peak.value > height) & (ends[0][1] > ends[0][0])
+            higher = (peak.value > height) & (high > low)
             best, height = np.where(higher, peak.D, best), np.where(higher, peak.value, height)
             theta = np.where(higher, peak.theta, theta)
         return self.profile(best, theta)
@@ -262,13 +266,15 @@ class Likelihood:
                 break
         return ProfilePoint(*[np.concatenate(rows) for rows in zip(*parts, strict=True)])
 
-    def maximum_between(self, D: Floats, log_ratio: Floats, theta: Floats) -> ProfilePoint:
+    def maximum_between(
+        self, ends: tuple[Floats, Floats], *, log_ratio: Floats, theta: Floats
+    ) -> ProfilePoint:
         """Return the maximum of the profile between two D of every unit, by bracketed Newton steps.
 
-        D and the log ratio (2, units) and theta (2, G) are those at both ends. A unit whose ends
-        agree keeps that D.
+        The log ratio (2, units) and theta (2, G) are those at both ends. A unit whose ends agree
+        keeps that D.
         """
-        low, high = D
+        low, high = ends
         share = np.divide(
             log_ratio[0], log_ratio[0] - log_ratio[1], out=np.zeros_like(low), where=high > low
         )
@@ -301,7 +307,9 @@ class Likelihood:
         zero = self.profile(np.zeros(1))
         fall_to_zero = 2 * (top - float(zero.value[0]))
         has_low = [value > 0 and fall_to_zero > drop for drop in drops]
-        root = np.sqrt(np.array([*drops, *(d for d, has in zip(drops, has_low, strict=True) if has)]))
+        root = np.sqrt(
+            np.array([*drops, *(d for d, has in zip(drops, has_low, strict=True) if has)])
+        )
         side = np.where(np.arange(len(root)) < len(drops), 1.0, -1.0)
         count = sum(t.steps.vectors.size for t in self.tracks)
         if value > 0 and best.curvature[0] < 0:
@@ -319,9 +327,7 @@ class Likelihood:
             within = fall < root**2
             inside, outside = np.where(within, x, inside), np.where(within, outside, x)
             depth = np.sqrt(np.maximum(fall, 0.0))
-            slope = -np.divide(
-                point.slope[:, 0], depth, out=np.zeros_like(x), where=depth > 0
-            )
+            slope = -np.divide(point.slope[:, 0], depth, out=np.zeros_like(x), where=depth > 0)
             step = np.divide(root - depth, slope, out=np.full_like(x, np.inf), where=slope != 0)
             bounded = np.isfinite(outside)
             middle = np.where(bounded, 0.5 * (inside + np.where(bounded, outside, 0.0)), 2 * x)

@@ -185,8 +185,8 @@ class SineModes:
         return GroupSlopes(
             -0.5 * value,
             *(rises[..., 0], falls[..., 0], rises[..., 1], falls[..., 1]),
-            *np.moveaxis(-rise_bends, -1, 0),
-            *np.moveaxis(-0.5 * fall_bends, -1, 0),
+            *(-rise_bends[..., k] for k in range(3)),
+            *(-0.5 * fall_bends[..., k] for k in range(3)),
         )
 
     def by_motion(self, x: Floats, columns: Floats) -> Floats:

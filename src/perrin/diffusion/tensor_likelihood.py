@@ -132,11 +132,9 @@ class NoisyVectors:
         value, by_theta = found.value, found.theta
         out = [np.empty((len(D), 0))]
         if np.isfinite(self.freedom):
-            if self.freedom:
-                ratio = self.theta / theta
-                value = value - 0.5 * self.freedom * np.sum(ratio - np.log(ratio), axis=1)
-                by_theta = by_theta - 0.5 * self.freedom * (1 - ratio) / theta
-            out.append(2 * own[:, : len(self.theta)] * by_theta)
+            measured, slope, _ = self.measurement(theta)
+            value = value + measured.sum(axis=1)
+            out.append(2 * own[:, : len(self.theta)] * (by_theta + slope))
         if self.B is None:
             value = value - _LEAST_BLUR * B
             slope = _MOST_BLUR * np.sin(2 * own[:, -1:])
@@ -151,6 +149,17 @@ class NoisyVectors:
         if self.B is None:
             B = np.array([_MOST_BLUR * float(one) ** 2 for one in np.sin(own[:, -1])])
         return theta, B
+
+    def measurement(self, theta: Floats) -> tuple[Floats, Floats, Floats]:
+        """Return the log-likelihood of the measured amplitudes and two derivatives, (..., r) each.
+
+        They are chi-squared with their degrees of freedom; 0 where they were not measured.
+        """
+        if not self.freedom:
+            return np.zeros_like(theta), np.zeros_like(theta), np.zeros_like(theta)
+        ratio, half = self.theta / theta, 0.5 * self.freedom
+        value = half * (np.log(ratio) - ratio)
+        return value, half * (ratio - 1) / theta, half * (1 - 2 * ratio) / theta**2
 
     def noise(self, D: Floats, own: Floats) -> Floats:
         """Return the mean noise O of a frame, less its blur, (b, b)."""
@@ -228,15 +237,12 @@ class NoisyVectors:
         return DiagonalModes(axes, power, inverse, values, values * inverse, log_det)
 
     def covariance_slopes(self, E: Floats, D: Floats, B: float) -> tuple[Floats, Floats]:
-        """Return the slopes of 2 D tau, for tau = 1, and of the noise O of a frame.
+        """Return the slopes of 2 D (m, b, b) and of the noise less blur (m + 1, b, b).
 
-        The slopes are those along directions E (m, b, b) of D, and in B; those in the amplitudes
-        are the noise shapes.
+        They are those along directions E (m, b, b) of D; the last one of the noise is that in B.
         """
-        dt = self.steps.dt
-        return np.concatenate([2 * E, np.zeros((1, *D.shape))]), np.concatenate(
-            [-2 * B * dt * E, -2 * dt * D[None]]
-        )
+        blur = -2 * self.steps.dt * np.concatenate([B * E, D[None]])
+        return 2 * E, blur
 
     def sine_curvatures(self, E: Floats, D: Floats, B: float, modes: DiagonalModes) -> Floats:
         """Return minus the second derivatives along E, in theta and in B, of even steps.
@@ -249,15 +255,16 @@ class NoisyVectors:
         axes, inverse, q = modes.axes[0], modes.inverse[0], modes.scaled[0]
         of_D, of_noise = self.covariance_slopes(E, D, B)
         shapes = self.steps.before[:, 0]
-        none = np.zeros_like(shapes)
-        same = np.concatenate([float(self.steps.duration[0]) * of_D[:-1], none, 0 * of_D[-1:]])
+        count, b = len(E) + len(shapes) + 1, len(D)
+        same = np.zeros((count, b, b))
+        same[: len(E)] = float(self.steps.duration[0]) * of_D
         next_one = np.concatenate([of_noise[:-1], shapes, of_noise[-1:]])
         same, next_one = (axes.T @ x @ axes for x in (same, next_one))
-        count, b = len(same), len(D)
-        weights = (inverse[:, None, :] * (w[:, None] ** np.arange(3))[:, :, None]).reshape(-1, 3 * b)
-        squares = (q[:, :, None] * q[:, None, :]).reshape(-1, b * b)
-        power = (squares.T @ weights).reshape(b, b, 3, b)
-        trace = (inverse.T @ weights).reshape(b, 3, b)
+        # Sums over the modes of q_a q_b V_c and of V_a V_c, times 1, w and w^2.
+        powers = w[:, None, None] ** np.arange(3)[:, None]
+        weights = (inverse[:, None] * powers).reshape(-1, 3 * b)
+        power = (q[:, :, None] * q[:, None]).reshape(-1, b * b).T @ weights
+        power, trace = power.reshape(b, b, 3, b), (inverse.T @ weights).reshape(b, 3, b)
 
         def form(k: int, left: Floats, right: Floats) -> Floats:
             turned = np.tensordot(right, power[:, :, k], axes=([2], [1]))  # (j, c, a, c')
@@ -265,7 +272,8 @@ class NoisyVectors:
             return np.asarray(left.reshape(count, -1) @ turned.reshape(count, -1).T)
 
         mixed = form(1, same, next_one)
-        return form(0, same, same) + mixed + mixed.T + form(2, next_one, next_one)
+        total: Floats = form(0, same, same) + mixed + mixed.T + form(2, next_one, next_one)
+        return total
 
     def band_curvatures(self, E: Floats, D: Floats, theta: Floats, B: float) -> Floats:
         """Return the average of observed and expected information along E, in theta and in B.
@@ -282,23 +290,20 @@ class NoisyVectors:
             return np.full((len(E) + len(theta) + 1,) * 2, np.nan)
         z = dpbtrs(factor, s.vectors.reshape(-1), lower=1)[0].reshape(s.vectors.shape)
         of_D, of_noise = self.covariance_slopes(E, D, B)
+        linked, none = s.linked[:-1, None], np.zeros_like(D)
 
-        linked = s.linked[:-1, None]
-
-        def product(tau: Floats, before: Floats, after: Floats) -> Floats:
-            """Return X z for slopes of 2 D and of the noise before and after each step."""
-            around = np.broadcast_to(before, s.before.shape[1:]), np.broadcast_to(after, s.after.shape[1:])
-            out = s.duration[:, None] * (z @ tau) + blocks(around[0] + around[1], z)
-            out[:-1] -= linked * blocks(around[1][:-1], z[1:])
-            out[1:] -= linked * blocks(around[1][:-1], z[:-1])
+        def product(of_D: Floats, before: Floats, after: Floats) -> Floats:
+            """Return X z for the slopes of 2 D and of the noise before and after each step."""
+            out: Floats = s.duration[:, None] * (z @ of_D)
+            out += np.einsum("sab,sb->sa", before + after, z)
+            out[:-1] -= linked * np.einsum("sab,sb->sa", after[:-1], z[1:])
+            out[1:] -= linked * np.einsum("sab,sb->sa", after[:-1], z[:-1])
             return out
 
-        def blocks(a: Floats, x: Floats) -> Floats:
-            return np.einsum("sab,sb->sa", a, x)
-
-        products = [product(d, n, n) for d, n in zip(of_D[:-1], of_noise[:-1], strict=True)]
-        products += [product(0 * D, *x) for x in zip(s.before, s.after, strict=True)]
-        products.append(product(0 * D, of_noise[-1], of_noise[-1]))
+        blur = [np.broadcast_to(one, s.before.shape[1:]) for one in of_noise]
+        products = [product(d, n, n) for d, n in zip(of_D, blur[:-1], strict=True)]
+        products += [product(none, *x) for x in zip(s.before, s.after, strict=True)]
+        products.append(product(none, blur[-1], blur[-1]))
         columns = np.stack([x.reshape(-1) for x in products], axis=1)
         return np.asarray(0.5 * columns.T @ dpbtrs(factor, columns, lower=1)[0])
 
@@ -324,15 +329,11 @@ class NoisyVectors:
         full[:m, -1] += mixed
         full[-1, :m] += mixed
         kept, turn = list(range(m)), np.ones(m + r + 1)
-        amplitudes = np.arange(m, m + r)
+        amplitudes, by_theta = np.arange(m, m + r), found.theta[0]
         if np.isfinite(self.freedom):
-            by_theta = found.theta[0]
-            if self.freedom:
-                ratio = self.theta / theta[0]
-                by_theta = by_theta - 0.5 * self.freedom * (1 - ratio) / theta[0]
-                full[amplitudes, amplitudes] -= (
-                    0.5 * self.freedom * (1 - 2 * ratio) / theta[0] ** 2
-                )
+            _, slope, bend = self.measurement(theta[0])
+            by_theta = by_theta + slope
+            full[amplitudes, amplitudes] -= bend
             kept += amplitudes.tolist()
             turn[m : m + r] = 2 * own[:r]
         if self.B is None:
@@ -342,8 +343,8 @@ class NoisyVectors:
         if np.isfinite(self.freedom):
             full[amplitudes, amplitudes] -= 2 * by_theta
         if self.B is None:
-            bend = 2 * _MOST_BLUR * np.cos(2 * own[-1])
-            full[-1, -1] -= (found.B[0] - _LEAST_BLUR) * bend
+            twice = 2 * _MOST_BLUR * np.cos(2 * own[-1])
+            full[-1, -1] -= (found.B[0] - _LEAST_BLUR) * twice
         return np.asarray(full[np.ix_(kept, kept)])
 
     def by_bands(self, D: Floats, theta: Floats, B: float) -> TensorSlopes:
@@ -442,12 +443,11 @@ def squares(basis: Floats) -> Family:
     >>> D.diagonal(), slopes[0].diagonal()
     (array([4., 4., 4.]), array([4., 4., 4.]))
     """
-
     products = basis[:, None] @ basis
     bends = products + np.swapaxes(products, 0, 1)
 
     def family(q: Floats) -> tuple[Floats, Floats, Floats]:
-        root = np.tensordot(q, basis, 1)
+        root: Floats = np.tensordot(q, basis, 1)
         slope = basis @ root
         return root @ root, slope + np.swapaxes(slope, 1, 2), bends
 
@@ -482,9 +482,7 @@ def axial(axis: Floats) -> Family:
         second = -(second + (tilt @ across.T)[..., None] * u) / length  # second derivatives of u
         twice = np.einsum("kla,b->klab", second, u) + np.einsum("ka,lb->klab", tilt, tilt)
         span = q[1] ** 2 - q[0] ** 2
-        slopes = np.concatenate(
-            [[2 * q[0] * (eye - along), 2 * q[1] * along], span * turned]
-        )
+        slopes = np.concatenate([[2 * q[0] * (eye - along), 2 * q[1] * along], span * turned])
         bends = np.zeros((4, 4, 3, 3))
         bends[0, 0], bends[1, 1] = 2 * (eye - along), 2 * along
         bends[0, 2:], bends[1, 2:] = -2 * q[0] * turned, 2 * q[1] * turned
@@ -646,9 +644,7 @@ class PooledLikelihood:
         """Return minus the Hessian, with the average information of steps that are not even."""
         tensors, m = self.family(p[: self.m]), self.m
         own = p[m:].reshape(self.shape)
-        found = np.array(
-            [t.curvatures(*tensors, o) for t, o in zip(self.tracks, own, strict=True)]
-        )
+        found = np.array([t.curvatures(*tensors, o) for t, o in zip(self.tracks, own, strict=True)])
         return ArrowHessian(found[:, :m, :m].sum(axis=0), found[:, :m, m:], found[:, m:, m:])
 
     def hessian(self, p: Floats) -> ArrowHessian:

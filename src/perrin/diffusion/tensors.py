@@ -130,10 +130,8 @@ def diffusion_tensor(
     free = data.fit(symmetric_basis(3))
     isotropic = data.fit(np.eye(3)[None] / 3**0.5, near=free)
     p_isotropic, p_axial = data.p_values(free, isotropic)
-    if len(basis) == 1:
-        best = isotropic
-    else:
-        best = free if len(basis) == 6 else data.fit(basis, near=free)
+    known = {6: free, 1: isotropic}  # by the number of tensors that span what the symmetry allows
+    best = known[len(basis)] if len(basis) in known else data.fit(basis, near=free)
     tensor = data.in_units(best.D)
     covariance = data.covariance(best, basis, SYMMETRIC_ELEMENTS)
     if np.isnan(covariance).any():
