@@ -165,8 +165,8 @@ class SineModes:
     @cached_property
     def slope_columns(self) -> tuple[Floats, Floats]:
         """Half the slopes of the eigenvalue in D and in theta, (M, 2), and their products."""
-        halves = 0.5 * np.stack([self.by_D, self.by_theta], axis=1)
-        return halves, 4 * halves[:, [0, 0, 1]] * halves[:, [0, 1, 1]]
+        halves = 0.5 * np.stack([self.by_D, self.by_theta])
+        return halves.T, 4 * (halves[[0, 0, 1]] * halves[[0, 1, 1]]).T
 
     def sums(self, D: Floats, theta: Floats) -> GroupSlopes:
         """Evaluate all motions at the D and the theta of each, (..., G)."""
@@ -193,7 +193,8 @@ class SineModes:
         """Return the sums of x (..., M) times columns (M, c) over the modes of each motion."""
         if len(self.groups) == 1:
             return np.asarray((x @ columns)[..., None, :])
-        return np.asarray(np.add.reduceat(x[..., None] * columns, self.starts, axis=-2))
+        sums = [np.add.reduceat(x * column, self.starts, axis=-1) for column in columns.T]
+        return np.stack(sums, axis=-1)
 
 
 @dataclass(frozen=True, eq=False)
