@@ -72,13 +72,16 @@ class ProfilePoint(NamedTuple):
     theta_slope: Floats
 
     def theta_at(self, D: Floats) -> Floats:
-        """Return the theta that these points predict for other D, (..., G): a power of D."""
+        """Return the theta that these points predict for other D, (..., G): a power of D.
+
+        Near the edge theta = 0 the power would be without bound; there it is a first guess only.
+        """
         known = (self.theta > 0) & (self.D > 0)
         ratio = np.where(known & (D > 0), D / np.where(self.D > 0, self.D, 1.0), 1.0)
         power = np.divide(
             self.theta_slope * self.D, self.theta, out=np.zeros_like(self.theta), where=known
         )
-        return np.asarray(self.theta * ratio**power)
+        return np.asarray(self.theta * ratio ** np.clip(power, -3.0, 3.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,8 +188,9 @@ class Likelihood:
         if start is None:
             spent = np.array([np.mean(t.steps.duration) for t in self.tracks])
             start = np.maximum(0.5 * square - D * spent, 0.01 * square)
-        t = np.log(np.maximum(np.broadcast_to(start, shape) / square, 1e-6))
         low, high = np.full(shape, _LEAST_LOG_OFFSET), np.full(shape, _MOST_LOG_OFFSET)
+        t = np.log(np.maximum(np.broadcast_to(start, shape) / square, 1e-6))
+        t = np.minimum(t, _MOST_LOG_OFFSET)
         some_fixed = bool(fixed.any())
         for _ in range(100):
             theta = square * np.exp(t)
