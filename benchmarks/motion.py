@@ -307,7 +307,7 @@ def rotation_of_kind(name, frames, rng):
     D = STEP**2 / 2
     if isinstance(planted, str):
         y = steps_of_kind(planted, frames - 1, 1, rng)[0].T * np.sqrt(D)
-        turns = perrin.geometry.successive_product(perrin.geometry.exp_map(y))
+        turns = perrin.geometry.cumulative_product(perrin.geometry.exp_map(y))
         truth = perrin.simulate_motion(TETRAHEDRON, D_R=0.0, dt=1.0, n_frames=frames, rng=rng)
         truth = replace(truth, rotation=turns)
     else:
