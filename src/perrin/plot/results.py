@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
-from matplotlib.ticker import LogLocator, NullFormatter
+from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
 from perrin._text import number_text, shortened, unit_text
 from perrin.curves.displacement import axes_weighted_equally
@@ -338,6 +338,7 @@ def plot_forest(
         ax.axvline(pooled.value, color=RED, lw=1, zorder=1, label=f"pooled, {value_text(pooled)}")
         ax.legend(loc="lower center", bbox_to_anchor=(0.5, 1), frameon=False, fontsize="small")
     ax.set(xlabel=f"{_CURVE_NAMES[quantity][1]} ({unit_text(estimates[0].unit)})")
+    ax.xaxis.set_major_locator(MaxNLocator(4))  # small values have long labels
     ax.set_ylim(len(rows) - 0.4, -0.6)
     if many:
         ax.set(ylabel="clusters, ordered by value")
