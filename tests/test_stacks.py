@@ -493,10 +493,12 @@ def test_imaris(tmp_path, movie):
         assert_same(stack, movie[0][:, None], dt=0.15)
 
 
-def test_zeiss(tmp_path, movie):
+@pytest.mark.parametrize("compression", ["uncompressed:", "zstd0:", "zstd1:"])
+def test_zeiss(tmp_path, movie, compression):
     """A .czi file written by Zeiss's own library, two channels."""
     czi = pytest.importorskip("pylibCZIrw.czi")
-    with czi.create_czi(str(tmp_path / "a.czi")) as file:
+    pytest.importorskip("czifile")
+    with czi.create_czi(str(tmp_path / "a.czi"), compression_options=compression) as file:
         for t, z, c in np.ndindex(5, 4, 2):
             plane = {"T": t, "Z": z, "C": c}
             file.write(movie[t, z, :, :, None] // (c + 1), plane=plane)
@@ -506,6 +508,8 @@ def test_zeiss(tmp_path, movie):
         open_stack(tmp_path / "a.czi", channel=0)
     with open_stack(tmp_path / "a.czi", channel=1, dt=DT) as stack:
         assert_same(stack, movie // 2)
+    with pytest.raises(ValueError, match="no image 1 among its only image"):
+        open_stack(tmp_path / "a.czi", channel=1, dt=DT, image=1)
 
 
 class NikonFile:

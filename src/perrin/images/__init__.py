@@ -1,5 +1,6 @@
 """Image stacks of a microscope, and the spheres in them."""
 
+from perrin.images.formats.arrays import ArrayFrames, array_contents, hdf5, numpy_file
 from perrin.images.formats.contents import (
     Contents,
     Layout,
@@ -8,28 +9,44 @@ from perrin.images.formats.contents import (
     chosen,
     even_times,
     frames_of_planes,
+    grid,
     in_seconds,
     in_um,
     layout,
     needed,
 )
+from perrin.images.formats.deltavision import deltavision
+from perrin.images.formats.folders import name_counters, sequence, sequence_files
+from perrin.images.formats.headers import (
+    HeaderScale,
+    clock_scale,
+    header_scale,
+    image_header,
+    imagej_scale,
+    lsm_scale,
+    metaseries_scale,
+    ome_images,
+    ome_pixels,
+    ome_scale,
+    stk_scale,
+    tiff_kind,
+)
+from perrin.images.formats.olympus import olympus, olympus_scale
 from perrin.images.formats.tiff import (
     DeclaredSeries,
-    HeaderScale,
     axes_without_colours,
     axis_roles,
     declared_imagej_series,
-    imagej_scale,
     is_cut_short,
     named_axes,
-    ome_scale,
+    ndtiff,
+    opened,
     read_plane,
-    sequence,
-    sequence_files,
+    require_decoder,
     tiff,
 )
 from perrin.images.formats.vendors import (
-    czi,
+    imaris_size,
     imaris_times,
     ims,
     lif,
@@ -38,6 +55,7 @@ from perrin.images.formats.vendors import (
     ome_zarr,
     vendor,
 )
+from perrin.images.formats.zeiss import czi, czi_times
 from perrin.images.imaging import Imaging, View, read_imaging, write_imaging
 from perrin.images.optics.ball_image import SphereImage, SphereSpot, sphere_image
 from perrin.images.optics.crowd_equations import (
@@ -73,7 +91,7 @@ from perrin.images.optics.learn import (
     photon_transfer,
     saturated_share,
 )
-from perrin.images.optics.microscope import Camera, Light, Scan
+from perrin.images.optics.microscope import Camera, Light, RenderSettings, Scan
 from perrin.images.optics.optics import CameraNoise, Optics
 from perrin.images.optics.render import (
     RenderedFrames,
@@ -116,23 +134,18 @@ from perrin.images.spheres.localisation import (
 from perrin.images.spheres.poses import Pose, fit_pose, pose_in, start_of, with_poses
 from perrin.images.spheres.spots import (
     Spots,
+    SpotSettings,
     at_contact,
     groups_and_crowds,
     mass_cut,
     touching_together,
 )
-from perrin.images.stack import (
-    Stack,
-    array_contents,
-    digest,
-    file_contents,
-    open_stack,
-    write_stack,
-)
+from perrin.images.stack import Stack, digest, file_contents, open_stack, write_stack
 
 __all__ = [
     "NO_FLAT_MODEL",
     "Arrangement",
+    "ArrayFrames",
     "Camera",
     "CameraNoise",
     "Contents",
@@ -155,6 +168,7 @@ __all__ = [
     "Optics",
     "Pick",
     "Pose",
+    "RenderSettings",
     "RenderedFrames",
     "RigidCenters",
     "SampleFit",
@@ -163,6 +177,7 @@ __all__ = [
     "Search",
     "SphereImage",
     "SphereSpot",
+    "SpotSettings",
     "Spots",
     "Stack",
     "StackLike",
@@ -179,12 +194,15 @@ __all__ = [
     "check_search",
     "choose_method",
     "chosen",
+    "clock_scale",
     "crowd_intensity",
     "crowd_piece",
     "cut_crowd_window",
     "cut_window",
     "czi",
+    "czi_times",
     "declared_imagej_series",
+    "deltavision",
     "detection_chi2",
     "digest",
     "drawing_faults",
@@ -200,9 +218,14 @@ __all__ = [
     "found_table",
     "frame_digest",
     "frames_of_planes",
+    "grid",
     "group_columns",
     "groups_and_crowds",
+    "hdf5",
+    "header_scale",
+    "image_header",
     "imagej_scale",
+    "imaris_size",
     "imaris_times",
     "ims",
     "in_seconds",
@@ -212,16 +235,26 @@ __all__ = [
     "layout",
     "lif",
     "locate",
+    "lsm_scale",
     "mass_cut",
+    "metaseries_scale",
     "missing_spheres",
+    "name_counters",
     "named_axes",
     "nd2",
+    "ndtiff",
     "needed",
     "ngff_scale",
     "normal_equations",
+    "numpy_file",
+    "olympus",
+    "olympus_scale",
+    "ome_images",
+    "ome_pixels",
     "ome_scale",
     "ome_zarr",
     "open_stack",
+    "opened",
     "photon_transfer",
     "plausible_spheres",
     "pose_in",
@@ -231,6 +264,7 @@ __all__ = [
     "read_plane",
     "refine_by_trackpy",
     "render_stack",
+    "require_decoder",
     "residual_maps",
     "sample_frames",
     "saturated_share",
@@ -242,8 +276,10 @@ __all__ = [
     "sphere_paths",
     "standard_errors",
     "start_of",
+    "stk_scale",
     "sum_of_spheres",
     "tiff",
+    "tiff_kind",
     "touching_together",
     "vendor",
     "visible_fraction",

@@ -15,8 +15,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from perrin._arrays import Floats, frozen, number_fault
 from perrin.errors import FrameError, PrecisionWarning
-from perrin.images.formats.contents import Contents, Pick, even_times, needed
-from perrin.images.formats.tiff import sequence, sequence_files, tiff
+from perrin.images.formats.arrays import array_contents
+from perrin.images.formats.contents import Contents, Pick, needed
+from perrin.images.formats.folders import sequence, sequence_files
+from perrin.images.formats.tiff import tiff
 from perrin.images.formats.vendors import vendor
 from perrin.tracks.writing import written_whole
 
@@ -180,20 +182,6 @@ class _FileFrames:
             self._contents = None
 
 
-@dataclass(frozen=True, eq=False)
-class _ArrayFrames:
-    """Frames of an array (t, z, y, x) of any library."""
-
-    array: Any
-    shape: tuple[int, int, int, int]
-    n_axes: int
-    movie: bool
-
-    def __call__(self, i: int) -> NDArray[Any]:
-        whole = self.n_axes == 3 and not self.movie
-        return np.asarray(self.array[:] if whole else self.array[i]).reshape(self.shape[1:])
-
-
 def open_stack(
     path: _PathLike | ArrayLike,
     *,
@@ -286,6 +274,7 @@ def open_stack(
             plane_time = contents.plane_time
         else:
             faults += number_fault("plane_time", plane_time, least=0, unit="s")
+        faults += contents.doubts(settled, times, plane_time, given=size is not None)
         if faults:
             raise ValueError(f"{source}: " + "; ".join(faults))
         unequal = contents.differences(settled, times, plane_time, tolerance=_HEADER_TOLERANCE)
@@ -331,62 +320,6 @@ def file_contents(source: str, pick: Pick) -> Contents:
     if Path(source).is_dir() or (not Path(source).exists() and sequence_files(source)):
         return sequence(source, pick)
     return tiff(source, pick)
-
-
-def array_contents(given: Any, pick: Pick) -> tuple[Contents, _ArrayFrames]:  # noqa: ANN401
-    """Interpret an array as a movie (t, z, y, x), or (t, y, x) with planes=1, or one frame.
-
-    Parameters
-    ----------
-    given : array_like
-        An array of numpy or another library.
-    pick : Pick
-        The user's choices.
-
-    Returns
-    -------
-    contents : Contents
-    read : callable
-        ``read(i)`` returns frame i.
-
-    Raises
-    ------
-    ValueError
-        For another number of axes, or choices that are for files.
-
-    Examples
-    --------
-    >>> contents, read = array_contents(np.zeros((5, 12, 16)), Pick(planes=1))
-    >>> contents.shape, read(4).shape
-    ((5, 1, 12, 16), (1, 12, 16))
-    """
-    array = given if hasattr(given, "shape") else np.asarray(given)
-    if pick.channel is not None or pick.image is not None:
-        raise ValueError("array: channel and image are for files; pass the part of the array")
-    n_axes = len(array.shape)
-    movie = n_axes == 3 and pick.planes == 1
-    if n_axes == 4:
-        shape = tuple(array.shape)
-    elif n_axes == 3:
-        a, y, x = array.shape
-        shape = (a, 1, y, x) if movie else (1, a, y, x)
-    else:
-        raise ValueError(
-            f"array: expected (t, z, y, x), (z, y, x), or (t, y, x) with planes=1, got "
-            f"{array.shape}"
-        )
-    if pick.planes not in (None, shape[1]) or 0 in shape:
-        raise ValueError(f"array: {array.shape} has no frames of planes={pick.planes}")
-    read = _ArrayFrames(array, shape, n_axes, movie)
-    contents = Contents(
-        shape=shape,
-        dtype=np.dtype(array.dtype),
-        plane=lambda t, z: read(t)[z],
-        close=lambda: None,
-        voxel=np.full(3, np.nan),
-        times=even_times(shape[0], np.nan),
-    )
-    return contents, read
 
 
 def digest(stack: Stack) -> str:

@@ -1,0 +1,285 @@
+"""Headers that microscope programs write are read as they mean, or refused with the reason."""
+
+from __future__ import annotations
+
+import json
+import re
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from perrin import PrecisionWarning, open_stack
+
+tifffile = pytest.importorskip("tifffile")
+
+VOXEL, DT = (0.25, 0.2, 0.1), 0.73
+GIVEN = {"voxel": VOXEL, "dt": DT}
+REAL = Path(__file__).resolve().parents[2] / "shared" / "data" / "microscopes"
+CASES = json.loads((REAL / "expected.json").read_text()) if REAL.is_dir() else []
+
+
+@pytest.fixture
+def movie():
+    return np.random.default_rng(1).integers(0, 60000, (5, 4, 12, 16), dtype=np.uint16)
+
+
+def assert_frames(stack, movie, *, times=None, voxel=VOXEL):
+    """Compare voxels bit by bit, the voxel size, and times from the first frame."""
+    assert stack.shape == movie.shape
+    for i in range(len(movie)):
+        np.testing.assert_array_equal(stack.frame(i), movie[i])
+    np.testing.assert_allclose(stack.voxel, voxel, rtol=1e-5)
+    if times is not None:
+        np.testing.assert_allclose(stack.times - stack.times[0], times, rtol=1e-5, atol=1e-9)
+
+
+def imagej(path, movie, **header):
+    """Write an ImageJ hyperstack with pixels of 0.2 and 0.1 units."""
+    resolution = (1 / VOXEL[2], 1 / VOXEL[1])
+    metadata = {"axes": "TZYX", "spacing": VOXEL[0], "unit": "micron", **header}
+    tifffile.imwrite(path, movie, imagej=True, resolution=resolution, metadata=metadata)
+
+
+@pytest.mark.parametrize(
+    ("header", "dt"),
+    [
+        ({"finterval": 500, "tunit": "ms"}, 0.5),
+        ({"finterval": 2, "tunit": "min"}, 120),
+        ({"finterval": 0.5, "fps": 7.0}, 0.5),
+        ({"finterval": 0.5, "tunit": "sec"}, 0.5),
+    ],
+)
+def test_imagej_interval_has_its_own_unit(tmp_path, movie, header, dt):
+    """`tunit` is the unit of the interval; the speed of the player does not change it."""
+    imagej(tmp_path / "a.tif", movie, **header)
+    with open_stack(tmp_path / "a.tif") as stack:
+        assert_frames(stack, movie, times=np.arange(5) * dt)
+
+
+def test_imagej_player_speed_is_no_interval(tmp_path, movie):
+    imagej(tmp_path / "a.tif", movie, fps=7.0)
+    with pytest.raises(ValueError, match=r"fps=7.* is the speed of ImageJ's player.*pass dt="):
+        open_stack(tmp_path / "a.tif")
+
+
+@pytest.mark.parametrize(
+    ("units", "factors"),
+    [
+        ({"unit": "nm", "zunit": "micron"}, (1, 1e-3 * 50, 1e-3 * 50)),
+        ({"yunit": "mm"}, (1, 1e3 / 500, 1)),
+        ({"unit": "Angstrom", "zunit": "micron", "yunit": "micron"}, (1, 1, 1e-4 * 100)),
+    ],
+)
+def test_imagej_axes_have_units_of_their_own(tmp_path, movie, units, factors):
+    """`zunit` and `yunit` replace `unit` along their axes; pixels are scaled to be plausible."""
+    scale = {"unit": (50, 50), "yunit": (1, 1 / 500)}
+    x, y = scale["unit"] if units.get("unit") == "nm" else (1, 1)
+    x, y = (100, 1) if units.get("unit") == "Angstrom" else (x, y)
+    y = 1 / 500 if units.get("yunit") == "mm" else y
+    metadata = {"axes": "TZYX", "spacing": VOXEL[0], "unit": "micron", "finterval": DT, **units}
+    tifffile.imwrite(
+        tmp_path / "a.tif",
+        movie,
+        imagej=True,
+        resolution=(1 / (VOXEL[2] * x), 1 / (VOXEL[1] * y)),
+        metadata=metadata,
+    )
+    with open_stack(tmp_path / "a.tif") as stack:
+        assert_frames(stack, movie, voxel=np.multiply(VOXEL, factors))
+
+
+def test_pixels_that_no_microscope_has_are_doubted(tmp_path, movie):
+    """A size that is wrong by its unit is asked for; the user's own is not doubted."""
+    tifffile.imwrite(
+        tmp_path / "a.tif",
+        movie,
+        imagej=True,
+        resolution=(10.0, 5.0),
+        metadata={"axes": "TZYX", "spacing": 0.25, "unit": "mm", "finterval": DT},
+    )
+    with pytest.raises(ValueError, match=r"x = 100 um, is not between 1 nm and 20 um: pass voxel="):
+        open_stack(tmp_path / "a.tif")
+    with pytest.warns(PrecisionWarning, match="in the file"):
+        open_stack(tmp_path / "a.tif", voxel=VOXEL).close()
+
+
+def ome_header(path):
+    with tifffile.TiffFile(path) as file:
+        return file.ome_metadata
+
+
+def ome(path, movie, clock, **pixels):
+    """Write an OME file whose planes have the times of `clock`; NaN are left out."""
+    header = {"axes": "TZYX", **pixels}
+    header |= {f"PhysicalSize{axis}": v for axis, v in zip("ZYX", VOXEL, strict=True)}
+    header["Plane"] = {"DeltaT": np.nan_to_num(clock, nan=-1).ravel().tolist()}
+    tifffile.imwrite(path, movie, ome=True, metadata=header)
+    xml = ome_header(path)
+    cut = re.sub(r'DeltaT="-1.0"', "", xml)
+    tifffile.tiffcomment(path, cut.encode())
+
+
+CLOCK = np.arange(5)[:, None] * 1.2 + np.arange(4) * 0.1
+
+
+def test_one_lost_plane_time_does_not_change_the_interval(tmp_path, movie):
+    """The frame's other planes give its time; the 1 ms that was asked for is not used."""
+    clock = CLOCK.copy()
+    clock[2, 0] = np.nan
+    ome(tmp_path / "a.ome.tif", movie, clock, TimeIncrement=1.0, TimeIncrementUnit="ms")
+    with open_stack(tmp_path / "a.ome.tif") as stack:
+        assert_frames(stack, movie, times=CLOCK[:, 0])
+        assert stack.plane_time == pytest.approx(0.1)
+        assert stack.notes == ("the times of frames 2 come from planes other than the first",)
+
+
+def test_a_frame_without_any_time_is_asked_for(tmp_path, movie):
+    clock = CLOCK.copy()
+    clock[3] = np.nan
+    ome(tmp_path / "a.ome.tif", movie, clock, TimeIncrement=1.0, TimeIncrementUnit="ms")
+    with pytest.raises(ValueError, match=r"lacks those of 1 frames, the first of them 3.*pass dt="):
+        open_stack(tmp_path / "a.ome.tif")
+    with open_stack(tmp_path / "a.ome.tif", dt=1.2) as stack:
+        assert_frames(stack, movie, times=CLOCK[:, 0])
+
+
+def test_planes_that_take_longer_than_their_frame_are_refused(tmp_path, movie):
+    ome(tmp_path / "a.ome.tif", movie, np.arange(5)[:, None] * 0.2 + np.arange(4) * 0.1)
+    with pytest.raises(ValueError, match=r"4 planes of 0.1 s each take longer .* 0.2 s: pass dt="):
+        open_stack(tmp_path / "a.ome.tif")
+    with open_stack(tmp_path / "a.ome.tif", plane_time=0.05) as stack:
+        assert stack.dt == pytest.approx(0.2)
+
+
+def test_a_position_of_a_set_has_the_header_of_its_own(tmp_path, movie):
+    """The header of a set lists all positions; the file of the second has the second's times."""
+    for name, step in (("first", 1.0), ("second", 2.0)):
+        ome(tmp_path / f"{name}.ome.tif", movie, CLOCK * step)
+    headers = [ome_header(tmp_path / f"{name}.ome.tif") for name in ("first", "second")]
+    images = [re.search(r"<Image .*</Image>", xml, re.S)[0] for xml in headers]
+    named = [
+        re.sub(r'Name="[^"]*"', f'Name="{name}"', image, count=1)
+        for name, image in zip(("first", "second"), images, strict=True)
+    ]
+    # The images of the first position are in a file that is not there.
+    named[0] = re.sub(
+        r"<TiffData([^>]*)/>",
+        r'<TiffData\1><UUID FileName="gone.ome.tif">urn:uuid:1</UUID></TiffData>',
+        named[0],
+    )
+    whole = headers[1].replace(images[1], "".join(named))
+    tifffile.tiffcomment(tmp_path / "second.ome.tif", whole.encode())
+    with open_stack(tmp_path / "second.ome.tif", image="second") as stack:
+        assert_frames(stack, movie, times=2 * CLOCK[:, 0])
+
+
+NAMES = {
+    "LAS X": "a_Series014_t{t:02d}_z{z:03d}_ch{c:02d}",
+    "Micro-Manager 1.4": "img_{t:09d}_{colour}_{z:03d}",
+    "Micro-Manager 2": "img_channel{c:03d}_position000_time{t:09d}_z{z:03d}",
+    "FluoView": "s_C{c:03d}Z{z:03d}T{t:03d}",
+    "MetaMorph": "s_w{c}{colour}_z{z}_t{t}",
+}
+
+
+@pytest.mark.parametrize("program", NAMES)
+def test_names_count_times_planes_and_channels(tmp_path, movie, program):
+    """Files of one plane each come back in their places, whatever the order of the counters."""
+    for t, z, c in np.ndindex(5, 4, 2):
+        # Numbers from 8 on: 10 comes after 9.
+        name = NAMES[program].format(t=t + 8, z=z, c=c, colour=("Blue", "Green")[c])
+        tifffile.imwrite(tmp_path / f"{name}.tif", movie[t, z] // (c + 1))
+    with pytest.raises(ValueError, match="2 channels: pass channel=0 to 1"):
+        open_stack(tmp_path, **GIVEN)
+    with pytest.raises(ValueError, match="4 planes a frame, not planes=3"):
+        open_stack(tmp_path, channel=0, planes=3, **GIVEN)
+    for c in (0, 1):
+        with open_stack(tmp_path, channel=c, planes=4, **GIVEN) as stack:
+            assert_frames(stack, movie // (c + 1))
+
+
+def test_names_of_volumes_count_channels(tmp_path, movie):
+    """A file of several planes is one frame of one channel, as BigDataProcessor writes them."""
+    for t, c in np.ndindex(5, 2):
+        name = f"vol--C{c:02d}--T{t:05d}.tif"
+        tifffile.imwrite(tmp_path / name, movie[t] // (c + 1), photometric="minisblack")
+    with open_stack(tmp_path, channel=1, **GIVEN) as stack:
+        assert_frames(stack, movie // 2)
+
+
+@pytest.mark.parametrize(
+    ("names", "message"),
+    [
+        (["a1_b1", "a1_b2", "a2_b1", "a2_b2"], "2 numbers vary.*meaning is not clear"),
+        (["red1", "red2", "green1", "green2"], "differ in more than numbers"),
+        (["t1_z1", "t1_z2", "t2_z1"], r"lacks the image \{'T': 2, 'Z': 2\}"),
+        (["s_t1_xy1", "s_t1_xy2", "s_t2_xy1", "s_t2_xy2"], "2 images .*pass image="),
+    ],
+)
+def test_names_that_do_not_state_their_order_are_refused(tmp_path, movie, names, message):
+    for name in names:
+        tifffile.imwrite(tmp_path / f"{name}.tif", movie[0, 0])
+    with pytest.raises(ValueError, match=message):
+        open_stack(tmp_path, planes=1, **GIVEN)
+
+
+def test_an_image_that_is_not_there_is_refused(tmp_path, movie):
+    imagej(tmp_path / "a.tif", movie, finterval=DT)
+    with pytest.raises(ValueError, match="no image 7 among its only image"):
+        open_stack(tmp_path / "a.tif", image=7)
+
+
+def test_a_header_in_another_file(tmp_path, movie):
+    """The companion is asked for by name, and read where it is there."""
+    path = tmp_path / "a.ome.tif"
+    ome(path, movie, CLOCK)
+    whole = ome_header(path)
+    tifffile.tiffcomment(
+        path,
+        b'<OME xmlns="http://www.openmicroscopy.org/Schemas/OME/2016-06">'
+        b'<BinaryOnly MetadataFile="a.companion.ome" UUID="urn:uuid:1"/></OME>',
+    )
+    with pytest.raises(ValueError, match=r"another file, a\.companion\.ome; put that file"):
+        open_stack(path)
+    (tmp_path / "a.companion.ome").write_text(whole, encoding="utf-8")
+    with open_stack(path) as stack:
+        assert_frames(stack, movie, times=CLOCK[:, 0])
+
+
+def real_faults(case):
+    """Return how a real file was read otherwise than expected; skip where its reader is missing."""
+    try:
+        stack = open_stack(REAL / case["path"], **case["kw"])
+    except ImportError as missing:
+        pytest.skip(str(missing))
+    except ValueError as fault:
+        said = str(fault).split(case["path"], 1)[-1]
+        right = case["ok"] is not True and re.search(case.get("say", ""), said, re.I | re.S)
+        return [] if right else [said]
+    with stack:
+        if case["ok"] is False:
+            return [f"opened: {stack}"]
+        sums = [int(frame.astype(np.int64).sum()) for frame in stack]
+        wanted = [np.nan if v is None else v for v in case.get("voxel", stack.voxel)]
+        times = np.array(case.get("times", stack.times - stack.times[0]))
+        checks = {
+            "shape": list(stack.shape) == case.get("shape", list(stack.shape)),
+            "frames": sums == case.get("frame_sums", sums),
+            "voxel": np.all(np.isnan(wanted) | np.isclose(stack.voxel, wanted, rtol=1e-4)),
+            "times": np.allclose(stack.times - stack.times[0], times, rtol=1e-3, atol=2e-4),
+            "dt": not np.isclose(stack.dt, case.get("not_dt", np.nan)),
+        }
+        if "plane_time" in case:
+            checks["plane_time"] = stack.plane_time == pytest.approx(case["plane_time"], rel=0.05)
+        return [name for name, right in checks.items() if not right]
+
+
+@pytest.mark.skipif(not CASES, reason="the real files of microscopes are not here")
+@pytest.mark.parametrize("case", CASES, ids=lambda case: f"{case['path']} {case['kw']}")
+def test_real_files_of_microscopes(case):
+    """Values as other readers and the files' own metadata state them (expected.json)."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        assert not real_faults(case)
