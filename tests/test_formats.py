@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import json
+import pickle
 import re
+import struct
 import warnings
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from perrin import PrecisionWarning, open_stack
+from perrin import FrameError, PrecisionWarning, open_stack
 
 tifffile = pytest.importorskip("tifffile")
 
@@ -246,6 +248,180 @@ def test_a_header_in_another_file(tmp_path, movie):
     (tmp_path / "a.companion.ome").write_text(whole, encoding="utf-8")
     with open_stack(path) as stack:
         assert_frames(stack, movie, times=CLOCK[:, 0])
+
+
+def test_channels_are_summed(tmp_path, movie):
+    """Clusters of two colours: grey levels add up in a wider type, also in another process."""
+    both = np.stack([movie, movie[::-1]], axis=2)
+    path = tmp_path / "a.tif"
+    tifffile.imwrite(path, both, imagej=True, metadata={"axes": "TZCYX"})
+    with open_stack(path, channel=(0, 1), **GIVEN) as stack:
+        assert stack.dtype == np.uint32
+        assert_frames(pickle.loads(pickle.dumps(stack)), movie.astype(np.uint32) + movie[::-1])
+        assert stack.choice["channel"] == [0, 1]
+    with pytest.raises(ValueError, match="channel: expected different numbers from 0"):
+        open_stack(path, channel=(0, 0), **GIVEN)
+    with pytest.raises(ValueError, match="no channel 2"):
+        open_stack(path, channel=(0, 2), **GIVEN)
+
+
+def test_saved_arrays(tmp_path, movie):
+    """Arrays of numpy and HDF5 files are read as arrays in memory are."""
+    np.save(tmp_path / "a.npy", movie)
+    np.savez(tmp_path / "a.npz", first=movie, second=movie[::-1])
+    with open_stack(tmp_path / "a.npy", **GIVEN) as stack:
+        assert_frames(stack, movie)
+    with open_stack(tmp_path / "a.npz", image="second", **GIVEN) as stack:
+        assert_frames(stack, movie[::-1])
+    with pytest.raises(ValueError, match=r"no voxel size along z, y, x.*no times of its 5 frames"):
+        open_stack(tmp_path / "a.npy")
+    with pytest.raises(ValueError, match=r"2 images .*'first', 'second'"):
+        open_stack(tmp_path / "a.npz", **GIVEN)
+    (tmp_path / "b.npy").write_bytes(b"no array")
+    with pytest.raises(ValueError, match="no array of numbers"):
+        open_stack(tmp_path / "b.npy", **GIVEN)
+    h5py = pytest.importorskip("h5py")
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["images/raw"], file["drift"] = movie[:, 0], np.zeros(5)
+    with open_stack(tmp_path / "a.h5", voxel=VOXEL[1:], dt=DT) as stack:
+        assert_frames(stack, movie[:, :1], voxel=(np.nan, *VOXEL[1:]))
+
+
+def deltavision(movie, sequence, clock, order="<"):
+    """Return a DeltaVision file of two channels; `clock` (t, z) is the time of their planes."""
+    t, z, y, x = movie.shape
+    axes = {0: "CTZ", 1: "TZC", 2: "TCZ"}[sequence]
+    head = bytearray(1024)
+    put = struct.pack_into
+    put(f"{order}4i", head, 0, x, y, 2 * t * z, 6)
+    put(f"{order}3f", head, 40, *VOXEL[::-1])
+    put(f"{order}ih", head, 92, 40 * 2 * t * z, -16224)
+    put(f"{order}2h", head, 128, 8, 2)
+    put(f"{order}2h", head, 180, t, sequence)
+    put(f"{order}h", head, 196, 2)
+    about, planes = b"", b""
+    sizes = {"T": t, "Z": z, "C": 2}
+    for place in np.ndindex(*(sizes[axis] for axis in axes)):
+        at = dict(zip(axes, place, strict=True))
+        about += struct.pack(f"{order}8i2f", *[0] * 9, clock[at["T"], at["Z"]] + 0.01 * at["C"])
+        plane = movie[at["T"], at["Z"]] // (at["C"] + 1)
+        planes += plane.astype(f"{order}u2").tobytes()
+    return bytes(head) + about + planes
+
+
+@pytest.mark.parametrize("order", "<>")
+@pytest.mark.parametrize("sequence", [0, 1, 2])
+def test_deltavision(tmp_path, movie, sequence, order):
+    """Planes in the order of the header, their times, and the frames before a file's end."""
+    data = deltavision(movie, sequence, CLOCK, order)
+    (tmp_path / "a.dv").write_bytes(data)
+    with open_stack(tmp_path / "a.dv", channel=1) as stack:
+        assert_frames(stack, movie // 2, times=CLOCK[:, 0])
+        assert stack.plane_time == pytest.approx(0.1, rel=1e-4)
+    (tmp_path / "b.dv").write_bytes(data[:-10])
+    with open_stack(tmp_path / "b.dv", channel=1) as stack, pytest.raises(FrameError):
+        stack.frame(4)
+    (tmp_path / "c.dv").write_bytes(bytes(2000))
+    with pytest.raises(ValueError, match=r"DeltaVision: is not a DeltaVision file"):
+        open_stack(tmp_path / "c.dv")
+
+
+@pytest.mark.parametrize("lost", [None, 3])
+def test_ndtiff(tmp_path, movie, lost):
+    """Every image of Micro-Manager's NDTiff states its axes, height and time."""
+    path = tmp_path / "a_NDTiffStack.tif"
+    with tifffile.TiffWriter(path) as file:
+        places = list(np.ndindex(5, 4, 2))
+        for i, (t, z, c) in enumerate(places):
+            if i == lost:
+                continue
+            about = {
+                "Axes": {"time": t, "z": z, "channel": "red" if c else "green"},
+                "ElapsedTime-ms": 1e3 * CLOCK[t, z] + 10 * c,
+                "PixelSizeUm": 0.2,
+                "ZPosition_um_Intended": 7 - 0.25 * z,
+            }
+            tag = (51123, 2, 0, json.dumps(about), True)
+            file.write(movie[t, z] // (c + 1), extratags=[tag], contiguous=False, metadata=None)
+    if lost is not None:
+        with pytest.raises(ValueError, match=r"NDTiff.*lacks the image .*'channel|'C': 'red'"):
+            open_stack(path, channel=1)
+        return
+    with pytest.raises(ValueError, match=r"Micro-Manager TIFF \(NDTiff\): has 2 channels"):
+        open_stack(path)
+    with open_stack(path, channel=1) as stack:
+        assert_frames(stack, movie // 2, times=CLOCK[:, 0], voxel=(0.25, 0.2, 0.2))
+        assert stack.plane_time == pytest.approx(0.1)
+
+
+def test_the_root_of_bioformats2raw(tmp_path, movie):
+    """Images of a set are chosen by number, the set's list or the names of its folders."""
+    zarr = pytest.importorskip("zarr", minversion="3")
+    root = zarr.open_group(tmp_path / "a.zarr", mode="w", zarr_format=2)
+    root.attrs["bioformats2raw.layout"] = 3
+    for name, data in (("0", movie), ("1", movie[::-1])):
+        group = root.create_group(name)
+        group.create_array("0", data=data)
+        scale = {"type": "scale", "scale": [DT, *VOXEL]}
+        group.attrs["multiscales"] = [
+            {
+                "axes": [{"name": "t", "unit": "second"}]
+                + [{"name": a, "unit": "micrometer"} for a in "zyx"],
+                "datasets": [{"path": "0", "coordinateTransformations": [scale]}],
+            }
+        ]
+    with pytest.raises(ValueError, match=r"OME-Zarr: has 2 images \['0', '1'\]: pass image="):
+        open_stack(tmp_path / "a.zarr")
+    with open_stack(tmp_path / "a.zarr", image=1) as stack:
+        assert_frames(stack, movie[::-1], times=np.arange(5) * DT)
+
+
+def test_a_minimal_imaris_file(tmp_path, movie):
+    """The size of the image is an attribute of its channels; texts end with a zero."""
+    h5py = pytest.importorskip("h5py")
+    with h5py.File(tmp_path / "a.ims", "w") as file:
+        channel = file.create_group("DataSet/ResolutionLevel 0/TimePoint 0/Channel 0")
+        channel["Data"] = np.pad(movie[0], ((0, 0), (0, 4), (0, 0)))
+        image = file.create_group("DataSetInfo/Image").attrs
+        for i, axis in enumerate("XYZ"):
+            n = movie.shape[3 - i]
+            channel.attrs[f"ImageSize{axis}"] = np.array(list(str(n)), dtype="S1")
+            image[f"ExtMin{i}"] = np.bytes_(b"0.0")
+            image[f"ExtMax{i}"] = np.array([*f"{n * VOXEL[2 - i]:.6f}", "\0"], dtype="S1")
+    with open_stack(tmp_path / "a.ims") as stack:
+        assert_frames(stack, movie[:1])
+
+
+def test_scenes_and_colours_of_a_zeiss_file(tmp_path, movie):
+    """A scene is an image; an image in colours is refused before any frame is read."""
+    czi = pytest.importorskip("pylibCZIrw.czi")
+    pytest.importorskip("czifile")
+    with czi.create_czi(str(tmp_path / "a.czi")) as file:
+        for t, z, scene in np.ndindex(5, 4, 2):
+            data = movie[t, z, :, :, None] // (scene + 1)
+            file.write(data, plane={"T": t, "Z": z}, scene=scene, location=(40 * scene, 7))
+    with pytest.raises(ValueError, match=r"Zeiss CZI: has 2 images .*pass image="):
+        open_stack(tmp_path / "a.czi", **GIVEN)
+    with open_stack(tmp_path / "a.czi", image=1, **GIVEN) as stack:
+        assert_frames(stack, movie // 2)
+    with czi.create_czi(str(tmp_path / "b.czi")) as file:
+        file.write(np.zeros((12, 16, 3), np.uint8), plane={"T": 0, "Z": 0})
+    with pytest.raises(ValueError, match="has colours: save one channel"):
+        open_stack(tmp_path / "b.czi", **GIVEN)
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("a.vsi", "an Olympus cellSens file, which is not read: export it as OME-TIFF, or save"),
+        ("a.mp4", "a video, which is not read: export it"),
+        ("a.xyz", r"cannot be read \(TiffFileError.*\): export it as OME-TIFF, or save the array"),
+    ],
+)
+def test_a_refusal_states_what_to_do(tmp_path, name, message):
+    (tmp_path / name).write_bytes(b"no image" * 200)
+    with pytest.raises(ValueError, match=message):
+        open_stack(tmp_path / name, **GIVEN)
 
 
 def real_faults(case):

@@ -548,17 +548,23 @@ def test_nikon(tmp_path, movie, monkeypatch):
         assert stack.plane_time == pytest.approx(0.01)
 
 
-def lif_bytes(movie, voxel, dt):
-    """Return a small Leica file: an XML header in UTF-16, then one block of memory."""
+def lif_bytes(movie, voxel, dt, scan="xyzt"):
+    """Return a small Leica file: an XML header in UTF-16, then one block of memory.
+
+    The letters of `scan` are the axes, fastest first; those left out have one element.
+    """
     t, z, y, x = movie.shape
+    about = {
+        "x": (1, x, voxel[2] * 1e-6, "m"),
+        "y": (2, y, voxel[1] * 1e-6, "m"),
+        "z": (3, z, voxel[0] * 1e-6, "m"),
+        "t": (4, t, dt, "s"),
+    }
+    single = set("tzyx") - set(scan)
+    memory = movie.transpose(["tzyx".index(axis) for axis in (*single, *scan[::-1])])
     step = movie.itemsize
     dimensions = ""
-    for number, n, length, unit in (
-        (1, x, voxel[2] * 1e-6, "m"),
-        (2, y, voxel[1] * 1e-6, "m"),
-        (3, z, voxel[0] * 1e-6, "m"),
-        (4, t, dt, "s"),
-    ):
+    for number, n, length, unit in (about[axis] for axis in scan):
         dimensions += (
             f'<DimensionDescription DimID="{number}" NumberOfElements="{n}" Origin="0" '
             f'Length="{(n - 1) * length!r}" Unit="{unit}" BitInc="0" BytesInc="{step}"/>'
@@ -586,7 +592,7 @@ def lif_bytes(movie, voxel, dt):
         return number(0x70) + number(len(head)) + head + data
 
     start = number(0x70) + number(len(xml) + 5) + b"\x2a" + number(len(xml) // 2) + xml
-    return start + block("MemBlock_0", b"") + block("MemBlock_1", movie.tobytes())
+    return start + block("MemBlock_0", b"") + block("MemBlock_1", memory.tobytes())
 
 
 def test_leica(tmp_path, movie):
@@ -601,6 +607,21 @@ def test_leica(tmp_path, movie):
         np.testing.assert_array_equal(stack.frame(3), movie[3])
         with pytest.raises(FrameError, match="frame 4 of 5"):
             stack.frame(4)
+
+
+@pytest.mark.parametrize("scan", ["xzyt", "xyzt", "xzy", "xzt", "xz"])
+def test_leica_scans_across_the_planes(tmp_path, movie, scan):
+    """A scan of x and z at many y is a volume; at one y its z is the y of a movie of a plane."""
+    pytest.importorskip("liffile")
+    movie = movie if "t" in scan else movie[:1]
+    movie = movie if "y" in scan else movie[:, :, :1]
+    (tmp_path / "a.lif").write_bytes(lif_bytes(movie, VOXEL, DT, scan))
+    with open_stack(tmp_path / "a.lif") as stack:
+        if "y" in scan:
+            assert_same(stack, movie)
+        else:
+            assert_same(stack, movie.swapaxes(1, 2), voxel=(np.nan, VOXEL[0], VOXEL[2]))
+            assert stack.notes == ("the images are sections (z, x): their z is read as y",)
 
 
 def test_zarr_folder_without_scales(tmp_path):

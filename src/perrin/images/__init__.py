@@ -14,6 +14,7 @@ from perrin.images.formats.contents import (
     in_um,
     layout,
     needed,
+    summed,
 )
 from perrin.images.formats.deltavision import deltavision
 from perrin.images.formats.folders import name_counters, sequence, sequence_files
@@ -46,6 +47,7 @@ from perrin.images.formats.tiff import (
     tiff,
 )
 from perrin.images.formats.vendors import (
+    Format,
     imaris_size,
     imaris_times,
     ims,
@@ -155,6 +157,7 @@ __all__ = [
     "CrowdWindow",
     "DeclaredSeries",
     "Features",
+    "Format",
     "FreeCenters",
     "GroupSample",
     "HeaderScale",
@@ -278,6 +281,7 @@ __all__ = [
     "start_of",
     "stk_scale",
     "sum_of_spheres",
+    "summed",
     "tiff",
     "tiff_kind",
     "touching_together",

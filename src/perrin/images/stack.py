@@ -16,14 +16,14 @@ from numpy.typing import ArrayLike, NDArray
 from perrin._arrays import Floats, frozen, number_fault
 from perrin.errors import FrameError, PrecisionWarning
 from perrin.images.formats.arrays import array_contents
-from perrin.images.formats.contents import Contents, Pick, needed
+from perrin.images.formats.contents import Contents, Pick, needed, summed
 from perrin.images.formats.folders import sequence, sequence_files
 from perrin.images.formats.tiff import tiff
-from perrin.images.formats.vendors import vendor
+from perrin.images.formats.vendors import WAY_OUT, vendor
 from perrin.tracks.writing import written_whole
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterator, Sequence
     from typing import Self
 
 
@@ -105,9 +105,12 @@ class Stack:
         return Path(self.read.path) if isinstance(self.read, _FileFrames) else None
 
     @property
-    def choice(self) -> dict[str, int | str | None]:
+    def choice(self) -> dict[str, int | str | list[int] | None]:
         """The user's choices: channel, planes, image; empty for a stack in memory."""
-        return self.read.pick._asdict() if isinstance(self.read, _FileFrames) else {}
+        if not isinstance(self.read, _FileFrames):
+            return {}
+        several = {"channel": list(self.read.several)} if self.read.several else {}
+        return self.read.pick._asdict() | several
 
     @property
     def dt(self) -> float:
@@ -158,22 +161,28 @@ class _UnopenedError(OSError):
 class _FileFrames:
     """Frames of an open file: one reader at a time; the file is opened again after unpickling."""
 
-    def __init__(self, path: str, pick: Pick, contents: Contents | None = None) -> None:
-        self.path, self.pick, self._contents = path, pick, contents
+    def __init__(
+        self,
+        path: str,
+        pick: Pick,
+        contents: Contents | None = None,
+        several: tuple[int, ...] | None = None,
+    ) -> None:
+        self.path, self.pick, self.several, self._contents = path, pick, several, contents
         self._lock = threading.Lock()
 
     def __call__(self, i: int) -> NDArray[Any]:
         with self._lock:
             if self._contents is None:
                 try:
-                    self._contents = file_contents(self.path, self.pick)
+                    self._contents = file_contents(self.path, self.pick, self.several)
                 # The decoders of damaged files raise errors of any class.
                 except Exception as fault:
                     raise _UnopenedError(f"{self.path} cannot be opened here: {fault}") from fault
             return self._contents.frame(i)
 
-    def __reduce__(self) -> tuple[type[_FileFrames], tuple[str, Pick]]:
-        return _FileFrames, (self.path, self.pick)
+    def __reduce__(self) -> tuple[type[_FileFrames], tuple[Any, ...]]:
+        return _FileFrames, (self.path, self.pick, None, self.several)
 
     def close(self) -> None:
         with self._lock:
@@ -189,7 +198,7 @@ def open_stack(
     dt: float | None = None,
     plane_time: float | None = None,
     planes: int | None = None,
-    channel: int | None = None,
+    channel: int | Sequence[int] | None = None,
     image: int | str | None = None,
 ) -> Stack:
     """Open a movie of image stacks of any format; only its header is read.
@@ -200,8 +209,9 @@ def open_stack(
     ----------
     path : str, path or array_like
         TIFF, OME-TIFF, ImageJ hyperstack, a folder or glob of TIFF files (in the order of the
-        numbers in their names); Leica ``.lif``, Nikon ``.nd2``, Zeiss ``.czi``, Imaris ``.ims``,
-        OME-Zarr; or an array (t, z, y, x) or (z, y, x), also of dask, zarr or a memory map.
+        numbers in their names); Leica ``.lif``, Nikon ``.nd2``, Zeiss ``.czi`` and ``.lsm``,
+        Olympus ``.oib``, DeltaVision ``.dv``, Imaris ``.ims``, OME-Zarr, ``.npy``, ``.h5``; or an
+        array (t, z, y, x) or (z, y, x), also of dask, zarr or a memory map.
     voxel : array_like, shape (3,) or (2,), optional
         Voxel size (z, y, x), um; (y, x) for a 2-D movie. Required where the file does not state
         it, and used where the file states another one.
@@ -213,8 +223,10 @@ def open_stack(
     planes : int, optional
         Number of planes of one frame, where the file does not distinguish times from planes; 1 for
         a 2-D movie.
-    channel : int, optional
-        Number of the channel, from 0; required where there are several.
+    channel : int or sequence of int, optional
+        Number of the channel, from 0; required where there are several. The grey levels of
+        several channels are summed, as for clusters whose spheres differ in colour; their times
+        are those of the first.
     image : int or str, optional
         Number or name of the image in a file that holds several.
 
@@ -250,21 +262,18 @@ def open_stack(
     size = None if voxel is None else np.atleast_1d(np.asarray(voxel, dtype=np.float64))
     if size is not None and size.shape == (2,) and planes is None:
         planes = 1
-    pick = Pick(channel=channel, planes=planes, image=image)
+    one, several = _channels(channel)
+    pick = Pick(channel=one, planes=planes, image=image)
     if isinstance(path, (str, os.PathLike)):
         source = os.fspath(path)
-        try:
-            contents = file_contents(source, pick)
-        except (FileNotFoundError, PermissionError, IsADirectoryError):
-            raise
-        except ImportError as missing:
-            raise ImportError(f"{source}: {missing}") from missing
-        # The decoders of damaged files raise errors of any class.
-        except Exception as fault:
-            raise ValueError(f"{source}: {fault}") from fault
-        read: Callable[[int], NDArray[Any]] = _FileFrames(os.path.abspath(source), pick, contents)
+        contents = _described(source, pick, several)
+        read: Callable[[int], NDArray[Any]] = _FileFrames(
+            os.path.abspath(source), pick, contents, several
+        )
     else:
         source = "array"
+        if several:
+            raise ValueError("array: channel is for files; pass the sum of the channels")
         contents, read = array_contents(path, pick)
     try:
         settled, faults = contents.settled_voxel(size)
@@ -299,7 +308,34 @@ def open_stack(
     )
 
 
-def file_contents(source: str, pick: Pick) -> Contents:
+def _described(source: str, pick: Pick, several: tuple[int, ...] | None) -> Contents:
+    """Return the contents of a file; every fault names the file and what to do."""
+    try:
+        return file_contents(source, pick, several)
+    except (FileNotFoundError, PermissionError, IsADirectoryError):
+        raise
+    except ImportError as missing:
+        raise ImportError(f"{source}: {missing}") from missing
+    # The decoders of damaged files raise errors of any class.
+    except Exception as fault:
+        reason = str(fault)
+        if type(fault) is not ValueError:
+            reason = f"cannot be read ({type(fault).__name__}: {fault}): {WAY_OUT}"
+        raise ValueError(f"{source}: {reason}") from fault
+
+
+def _channels(given: Any) -> tuple[int | None, tuple[int, ...] | None]:  # noqa: ANN401
+    """Return the one channel that was chosen, or the several that are summed."""
+    if given is None or np.ndim(given) == 0:
+        return given, None
+    numbers = tuple(given)
+    whole = all(isinstance(n, (int, np.integer)) and not isinstance(n, bool) for n in numbers)
+    if not numbers or not whole or len(set(numbers)) < len(numbers):
+        raise ValueError(f"channel: expected different numbers from 0, got {given!r}")
+    return None, tuple(map(int, numbers))
+
+
+def file_contents(source: str, pick: Pick, several: tuple[int, ...] | None = None) -> Contents:
     """Return the contents of a file or folder, read by the reader of its format.
 
     Parameters
@@ -309,14 +345,37 @@ def file_contents(source: str, pick: Pick) -> Contents:
         other files are read as TIFF.
     pick : Pick
         The user's choices.
+    several : tuple of int, optional
+        Channels that are summed, instead of the channel of `pick`.
 
     Returns
     -------
     Contents
+
+    Raises
+    ------
+    ValueError
+        If the file is of a format that is not read, or does not have what was chosen.
     """
-    reader = vendor(source)
-    if reader is not None:
-        return reader(source, pick)
+    if several:
+        parts: list[Contents] = []
+        try:
+            for number in several:
+                parts.append(file_contents(source, pick._replace(channel=number)))
+            return summed(parts)
+        except Exception:
+            for part in parts:
+                part.close()
+            raise
+    found = vendor(source)
+    if found is not None:
+        try:
+            return found.read(source, pick)
+        except ValueError as fault:
+            # A library's own error keeps its class, so that the caller adds what to do.
+            if type(fault) is not ValueError:
+                raise
+            raise ValueError(f"{found.name}: {fault}") from fault
     if Path(source).is_dir() or (not Path(source).exists() and sequence_files(source)):
         return sequence(source, pick)
     return tiff(source, pick)

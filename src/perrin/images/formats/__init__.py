@@ -14,6 +14,7 @@ from perrin.images.formats.contents import (
     in_um,
     layout,
     needed,
+    summed,
 )
 from perrin.images.formats.deltavision import deltavision
 from perrin.images.formats.folders import name_counters, sequence, sequence_files
@@ -46,6 +47,7 @@ from perrin.images.formats.tiff import (
     tiff,
 )
 from perrin.images.formats.vendors import (
+    Format,
     imaris_size,
     imaris_times,
     ims,
@@ -61,6 +63,7 @@ __all__ = [
     "ArrayFrames",
     "Contents",
     "DeclaredSeries",
+    "Format",
     "HeaderScale",
     "Layout",
     "Pick",
@@ -110,6 +113,7 @@ __all__ = [
     "sequence",
     "sequence_files",
     "stk_scale",
+    "summed",
     "tiff",
     "tiff_kind",
     "vendor",

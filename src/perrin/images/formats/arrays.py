@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zipfile
 from dataclasses import dataclass
 from typing import Any
 
@@ -118,10 +119,13 @@ def numpy_file(path: str, pick: Pick) -> Contents:
     -------
     Contents
     """
+    with open(path, "rb") as file:
+        if file.read(6) != b"\x93NUMPY" and not zipfile.is_zipfile(path):
+            raise ValueError("has no array of numbers: write it again with np.save or np.savez")
     if path.lower().endswith(".npz"):
-        with np.load(path) as file:
-            number = chosen(list(file.files), pick.image)
-            return array_contents(file[file.files[number]], pick._replace(image=None))[0]
+        with np.load(path) as arrays:
+            number = chosen(list(arrays.files), pick.image)
+            return array_contents(arrays[arrays.files[number]], pick._replace(image=None))[0]
     chosen(["array"], pick.image)
     return array_contents(np.load(path, mmap_mode="r"), pick._replace(image=None))[0]
 

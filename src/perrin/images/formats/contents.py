@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import import_module
 from math import prod
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
@@ -53,7 +53,7 @@ class Pick(NamedTuple):
     Attributes
     ----------
     channel : int or None
-        Number of the channel, from 0.
+        Number of the channel, from 0; `open_stack` sums several one by one.
     planes : int or None
         Number of planes of a frame, where the file does not distinguish times from planes.
     image : int or str or None
@@ -477,6 +477,54 @@ def grid(
             missing = {axis: values[axis][i] for axis, i in zip(axes, place, strict=True)}
             raise ValueError(f"lacks the image {missing} of its {sizes}")
     return sizes, places
+
+
+def summed(parts: Sequence[Contents]) -> Contents:
+    """Return the sum of several channels, in a type of number that holds it.
+
+    Parameters
+    ----------
+    parts : sequence of Contents
+        The channels, of equal shape; sizes and times are those of the first.
+
+    Returns
+    -------
+    Contents
+
+    Raises
+    ------
+    ValueError
+        If the channels have different shapes.
+
+    Examples
+    --------
+    >>> one = Contents(
+    ...     (1, 1, 1, 2), np.dtype("u1"), lambda t, z: np.full((1, 2), 200, "u1"), lambda: 0,
+    ...     np.ones(3),
+    ... )
+    >>> both = summed([one, one])
+    >>> both.plane(0, 0), both.dtype
+    (array([[400, 400]], dtype=uint16), dtype('uint16'))
+    """
+    first = parts[0]
+    shapes = sorted({part.shape for part in parts})
+    if len(shapes) > 1:
+        raise ValueError(f"has channels of different shapes: {shapes}")
+    dtype = first.dtype.newbyteorder("=")
+    if dtype.kind in "ui":
+        dtype = np.dtype(f"{dtype.kind}{min(2 * dtype.itemsize, 8)}")
+
+    def plane(t: int, z: int) -> NDArray[Any]:
+        total = parts[0].plane(t, z).astype(dtype)
+        for part in parts[1:]:
+            total += part.plane(t, z).astype(dtype)
+        return total
+
+    def close() -> None:
+        for part in parts:
+            part.close()
+
+    return replace(first, dtype=dtype, plane=plane, close=close)
 
 
 def needed(module: str, extra: str) -> Any:  # noqa: ANN401 (any module)

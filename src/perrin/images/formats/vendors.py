@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -262,6 +262,8 @@ def ome_zarr(path: str, pick: Pick) -> Contents:
     ValueError
         If the folder has no image.
     """
+    if (Path(path) / ".zarray").exists():
+        raise ValueError("is one zarr array without a header: pass the array itself")
     group = needed("zarr", "zarr").open_group(path, mode="r")
     header = group.attrs.get("ome", group.attrs)
     if "bioformats2raw.layout" in header:
@@ -273,10 +275,7 @@ def ome_zarr(path: str, pick: Pick) -> Contents:
     if "plate" in header:
         raise ValueError("is a plate of OME-Zarr: pass the folder of one image in it, as A/1/0")
     if "multiscales" not in header:
-        raise ValueError(
-            "is a zarr folder without OME-Zarr `multiscales`: pass the array itself, "
-            "open_stack(zarr.open(...), voxel=, dt=)"
-        )
+        raise ValueError("is a zarr folder without OME-Zarr `multiscales`: pass the array itself")
     scales = header["multiscales"][0]
     axes = {a["name"].upper(): a.get("unit") for a in scales["axes"]}
     array = group[scales["datasets"][0]["path"]]
@@ -352,26 +351,73 @@ def ngff_scale(scales: Any, n: int) -> Floats:  # noqa: ANN401 (a JSON header)
     return total
 
 
-_READERS: dict[str, Callable[[str, Pick], Contents]] = {
-    **dict.fromkeys((".lif", ".lof", ".xlef", ".xlif"), lif),
-    ".nd2": nd2,
-    ".czi": czi,
-    ".ims": ims,
-    **dict.fromkeys((".oib", ".oif"), olympus),
-    ".dv": deltavision,
-    **dict.fromkeys((".npy", ".npz"), numpy_file),
-    **dict.fromkeys((".h5", ".hdf5"), hdf5),
-}
+class Format(NamedTuple):
+    """A format of image files that is read.
 
-
-def vendor(path: str) -> Callable[[str, Pick], Contents] | None:
-    """Return the reader of a file by its suffix; None for all other files.
+    Attributes
+    ----------
+    name : str
+        What a file of this format is, for messages.
+    read : callable
+        ``read(path, pick)`` describes the contents of a file.
 
     Examples
     --------
-    >>> vendor("movie.lif").__name__, vendor("movie.tif")
-    ('lif', None)
+    >>> Format("Nikon ND2", nd2).name
+    'Nikon ND2'
     """
-    if (Path(path) / ".zgroup").exists() or (Path(path) / "zarr.json").exists():
-        return ome_zarr
-    return _READERS.get(Path(path).suffix.lower())
+
+    name: str
+    read: Callable[[str, Pick], Contents]
+
+
+_FORMATS = {
+    **dict.fromkeys((".lif", ".lof", ".xlef", ".xlif"), Format("Leica LAS X", lif)),
+    ".nd2": Format("Nikon ND2", nd2),
+    ".czi": Format("Zeiss CZI", czi),
+    ".ims": Format("Imaris", ims),
+    **dict.fromkeys((".oib", ".oif"), Format("Olympus FluoView", olympus)),
+    **dict.fromkeys((".dv", ".r3d"), Format("DeltaVision", deltavision)),
+    **dict.fromkeys((".npy", ".npz"), Format("numpy array", numpy_file)),
+    **dict.fromkeys((".h5", ".hdf5"), Format("HDF5", hdf5)),
+}
+
+# Formats of microscopes without a free reader under a permissive licence, and files of pictures.
+_UNREAD = {
+    ".oir": "an Olympus FluoView OIR file",
+    ".vsi": "an Olympus cellSens file",
+    ".sld": "a SlideBook file",
+    ".sldy": "a SlideBook file",
+    ".zvi": "a Zeiss AxioVision file",
+    ".mvd2": "a Volocity file",
+    ".ids": "an ICS file",
+    ".ics": "an ICS file",
+    ".mrc": "an MRC file",
+    **dict.fromkeys((".avi", ".mp4", ".mov", ".mkv", ".wmv"), "a video"),
+    **dict.fromkeys((".png", ".jpg", ".jpeg", ".bmp", ".gif"), "a picture"),
+}
+
+WAY_OUT = (
+    "export it as OME-TIFF, or save the array (t, z, y, x) with np.save and open the .npy file"
+)
+
+
+def vendor(path: str) -> Format | None:
+    """Return the format of a file by its suffix; None for TIFF files and folders of them.
+
+    Raises
+    ------
+    ValueError
+        For a format that is known and not read, with what it is and what to do.
+
+    Examples
+    --------
+    >>> vendor("movie.lif").name, vendor("movie.tif")
+    ('Leica LAS X', None)
+    """
+    if any((Path(path) / name).exists() for name in (".zgroup", ".zarray", "zarr.json")):
+        return Format("OME-Zarr", ome_zarr)
+    suffix = Path(path).suffix.lower()
+    if suffix in _UNREAD:
+        raise ValueError(f"is {_UNREAD[suffix]}, which is not read: {WAY_OUT}")
+    return _FORMATS.get(suffix)
