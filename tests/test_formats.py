@@ -8,11 +8,13 @@ import re
 import struct
 import warnings
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 
 from perrin import FrameError, PrecisionWarning, open_stack
+from perrin.images.formats import Pick, czi_times, layout, stk_scale
 
 tifffile = pytest.importorskip("tifffile")
 
@@ -422,6 +424,78 @@ def test_a_refusal_states_what_to_do(tmp_path, name, message):
     (tmp_path / name).write_bytes(b"no image" * 200)
     with pytest.raises(ValueError, match=message):
         open_stack(tmp_path / name, **GIVEN)
+
+
+@pytest.mark.parametrize("stamped", [False, True])
+def test_lsm(tmp_path, movie, stamped):
+    """A LSM file: thumbnails are left out, three channels share a page, times are stamps."""
+    channels = np.stack([movie, movie // 2, movie // 3], axis=2)
+    about = bytearray(380)
+    struct.pack_into(
+        "<10i3d", about, 0, 0x0400494C, 380, 16, 12, 4, 3, 5, 2, 8, 6, 1e-7, 2e-7, 25e-8
+    )
+    struct.pack_into("<H", about, 88, 6)  # x, y, channel, z, time
+    struct.pack_into("<d", about, 112, DT)
+    path = tmp_path / "a.lsm"
+    how = {"planarconfig": "separate", "photometric": "minisblack", "contiguous": False}
+    with tifffile.TiffWriter(path, byteorder="<") as file:
+        for t, z in np.ndindex(5, 4):
+            tags = [(34412, 1, 380, bytes(about), True)] if t == z == 0 else []
+            file.write(channels[t, z], extratags=tags, metadata=None, **how)
+            file.write(channels[t, z, :, ::2, ::2], subfiletype=1, metadata=None, **how)
+    times = np.arange(5) * DT
+    if stamped:
+        times = np.array([0, 0.7, 1.5, 2.2, 3.0])
+        data = bytearray(path.read_bytes())
+        struct.pack_into("<i", data, data.index(bytes(about[:40])) + 132, len(data))
+        path.write_bytes(bytes(data) + struct.pack("<2i5d", 48, 5, *times))
+    with pytest.raises(ValueError, match="Zeiss LSM: has 3 channels"):
+        open_stack(path)
+    for c in range(3):
+        with open_stack(path, channel=c) as stack:
+            assert_frames(stack, movie // (c + 1), times=times)
+
+
+def test_metamorph_headers(tmp_path, movie):
+    """The calibration of a MetaMorph image, and distances and dates of a series."""
+    properties = {
+        "spatial-calibration-state": ("bool", "on"),
+        "spatial-calibration-x": ("float", "0.1"),
+        "spatial-calibration-y": ("float", "0.2"),
+        "spatial-calibration-units": ("string", "um"),
+    }
+    text = "".join(
+        f'<prop id="{name}" type="{kind}" value="{value}"/>'
+        for name, (kind, value) in properties.items()
+    )
+    xml = f"<MetaData><PlaneInfo>{text}</PlaneInfo></MetaData>"
+    written = {"description": xml, "software": "MetaSeries", "metadata": None}
+    tifffile.imwrite(tmp_path / "a.tif", movie[0, 0], **written)
+    with open_stack(tmp_path / "a.tif") as stack:
+        assert_frames(stack, movie[:1, :1], voxel=(np.nan, 0.2, 0.1))
+    start = np.datetime64("2024-03-01T23:59:59")
+    header = {
+        "SpatialCalibration": 1,
+        "XCalibration": 100.0,
+        "YCalibration": 200.0,
+        "CalibrationUnits": "nm",
+        "ZDistance": np.full(5, -0.25),
+        "DatetimeCreated": start + np.arange(5) * np.timedelta64(730, "ms"),
+    }
+    scale = stk_scale(header, layout({"T": 5}, Pick()))
+    np.testing.assert_allclose(scale.voxel, VOXEL)
+    np.testing.assert_allclose(scale.times, np.arange(5) * DT)
+
+
+def test_measured_times_of_a_zeiss_file_come_first():
+    """Stamps, then offsets, then the times of planes, then the interval that was asked for."""
+    header = ElementTree.fromstring(
+        "<T><T><Positions><Interval><Increment>9</Increment></Interval></Positions></T></T>"
+    )
+    unknown = [np.nan] * 3
+    np.testing.assert_array_equal(czi_times(header, [5, 6, 8], unknown), [5, 6, 8])
+    np.testing.assert_array_equal(czi_times(header, [5], [10.0, 11.0, 13.0]), [0, 1, 3])
+    np.testing.assert_array_equal(czi_times(header, [], unknown), [0, 9, 18])
 
 
 def real_faults(case):

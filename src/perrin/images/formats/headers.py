@@ -412,7 +412,7 @@ def stk_scale(header: Any, where: Layout) -> HeaderScale:  # noqa: ANN401
 
 
 def metaseries_scale(file: Any, where: Layout) -> HeaderScale:  # noqa: ANN401
-    """Read the header of a MetaMorph or MetaXpress TIFF: calibration, and heights of its planes.
+    """Read the pixel size in the header of a MetaMorph or MetaXpress TIFF.
 
     Parameters
     ----------
