@@ -328,15 +328,53 @@ def test_deltavision(tmp_path, movie, sequence, order):
         open_stack(tmp_path / "c.dv")
 
 
-@pytest.mark.parametrize("lost", [None, 3])
+def test_a_folder_of_an_ome_set_is_read_once(tmp_path, movie):
+    """Files that each have the header of all planes are one stack, not copies of it."""
+    whole = tmp_path / "whole.ome.tif"
+    tifffile.imwrite(whole, movie[0], ome=True, metadata={"axes": "ZYX"})
+    data = "".join(
+        f'<TiffData FirstZ="{z}" IFD="0" PlaneCount="1">'
+        f'<UUID FileName="run{z}.ome.tif">urn:uuid:{z}</UUID></TiffData>'
+        for z in range(4)
+    )
+    xml = re.sub(r"<TiffData.*?/>", data, ome_header(whole), count=1)
+    whole.unlink()
+    for z in range(4):
+        own = xml.replace("<OME ", f'<OME UUID="urn:uuid:{z}" ', 1)
+        own = re.sub(r' UUID="urn:uuid:[0-9a-f]{8}-[^"]*"', "", own)
+        path = tmp_path / f"run{z}.ome.tif"
+        tifffile.imwrite(path, movie[0, z], description=own, metadata=None)
+    with open_stack(tmp_path, **GIVEN) as stack:
+        assert_frames(stack, movie[:1])
+
+
+@pytest.mark.parametrize("lost", [None, 3, "two files"])
 def test_ndtiff(tmp_path, movie, lost):
     """Every image of Micro-Manager's NDTiff states its axes, height and time."""
+    places = list(np.ndindex(5, 4, 2))
+    if lost == "two files":
+        ndtiff(tmp_path / "a_NDTiffStack.tif", movie, places[:17])
+        ndtiff(tmp_path / "a_NDTiffStack_1.tif", movie, places[17:])
+        with open_stack(tmp_path, channel=1) as stack:
+            assert_frames(stack, movie // 2, times=CLOCK[:, 0], voxel=(0.25, 0.2, 0.2))
+        return
     path = tmp_path / "a_NDTiffStack.tif"
+    ndtiff(path, movie, [place for i, place in enumerate(places) if i != lost])
+    if lost is not None:
+        with pytest.raises(ValueError, match=r"NDTiff.*lacks the image .*'C': 'red'"):
+            open_stack(path, channel=1)
+        return
+    with pytest.raises(ValueError, match=r"Micro-Manager TIFF \(NDTiff\): has 2 channels"):
+        open_stack(path)
+    with open_stack(path, channel=1) as stack:
+        assert_frames(stack, movie // 2, times=CLOCK[:, 0], voxel=(0.25, 0.2, 0.2))
+        assert stack.plane_time == pytest.approx(0.1)
+
+
+def ndtiff(path, movie, places):
+    """Write the images at some (t, z, channel) as Micro-Manager does."""
     with tifffile.TiffWriter(path) as file:
-        places = list(np.ndindex(5, 4, 2))
-        for i, (t, z, c) in enumerate(places):
-            if i == lost:
-                continue
+        for t, z, c in places:
             about = {
                 "Axes": {"time": t, "z": z, "channel": "red" if c else "green"},
                 "ElapsedTime-ms": 1e3 * CLOCK[t, z] + 10 * c,
@@ -345,15 +383,6 @@ def test_ndtiff(tmp_path, movie, lost):
             }
             tag = (51123, 2, 0, json.dumps(about), True)
             file.write(movie[t, z] // (c + 1), extratags=[tag], contiguous=False, metadata=None)
-    if lost is not None:
-        with pytest.raises(ValueError, match=r"NDTiff.*lacks the image .*'channel|'C': 'red'"):
-            open_stack(path, channel=1)
-        return
-    with pytest.raises(ValueError, match=r"Micro-Manager TIFF \(NDTiff\): has 2 channels"):
-        open_stack(path)
-    with open_stack(path, channel=1) as stack:
-        assert_frames(stack, movie // 2, times=CLOCK[:, 0], voxel=(0.25, 0.2, 0.2))
-        assert stack.plane_time == pytest.approx(0.1)
 
 
 def test_the_root_of_bioformats2raw(tmp_path, movie):

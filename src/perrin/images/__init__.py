@@ -14,6 +14,7 @@ from perrin.images.formats.contents import (
     in_um,
     layout,
     needed,
+    strange_lengths,
     summed,
 )
 from perrin.images.formats.deltavision import deltavision
@@ -39,6 +40,7 @@ from perrin.images.formats.tiff import (
     axis_roles,
     declared_imagej_series,
     is_cut_short,
+    is_set,
     named_axes,
     ndtiff,
     opened,
@@ -235,6 +237,7 @@ __all__ = [
     "in_um",
     "is_cut_short",
     "is_flat",
+    "is_set",
     "layout",
     "lif",
     "locate",
@@ -280,6 +283,7 @@ __all__ = [
     "standard_errors",
     "start_of",
     "stk_scale",
+    "strange_lengths",
     "sum_of_spheres",
     "summed",
     "tiff",

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from perrin._arrays import Floats, frozen, number_fault
 from perrin.errors import FrameError, PrecisionWarning
 from perrin.images.formats.arrays import array_contents
-from perrin.images.formats.contents import Contents, Pick, needed, summed
+from perrin.images.formats.contents import Contents, Pick, needed, strange_lengths, summed
 from perrin.images.formats.folders import sequence, sequence_files
 from perrin.images.formats.tiff import tiff
 from perrin.images.formats.vendors import WAY_OUT, vendor
@@ -249,7 +249,8 @@ def open_stack(
     Warns
     -----
     PrecisionWarning
-        Where a value given differs from the file's by more than 0.1 %.
+        Where a value given differs from the file's by more than 0.1 %, or a voxel is not between
+        1 nm and 20 um long.
 
     Examples
     --------
@@ -287,6 +288,8 @@ def open_stack(
         if faults:
             raise ValueError(f"{source}: " + "; ".join(faults))
         unequal = contents.differences(settled, times, plane_time, tolerance=_HEADER_TOLERANCE)
+        if strange := strange_lengths(settled):
+            unequal.append(f"the voxel size, {strange}; it is in um")
         if unequal:
             warnings.warn(
                 f"{source}: the values given are used: " + "; ".join(unequal),

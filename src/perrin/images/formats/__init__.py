@@ -14,6 +14,7 @@ from perrin.images.formats.contents import (
     in_um,
     layout,
     needed,
+    strange_lengths,
     summed,
 )
 from perrin.images.formats.deltavision import deltavision
@@ -39,6 +40,7 @@ from perrin.images.formats.tiff import (
     axis_roles,
     declared_imagej_series,
     is_cut_short,
+    is_set,
     named_axes,
     ndtiff,
     opened,
@@ -90,6 +92,7 @@ __all__ = [
     "in_seconds",
     "in_um",
     "is_cut_short",
+    "is_set",
     "layout",
     "lif",
     "lsm_scale",
@@ -113,6 +116,7 @@ __all__ = [
     "sequence",
     "sequence_files",
     "stk_scale",
+    "strange_lengths",
     "summed",
     "tiff",
     "tiff_kind",

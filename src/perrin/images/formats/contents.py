@@ -202,18 +202,9 @@ class Contents:
         >>> still.doubts(np.ones(3), np.array([0.0, 0.7]), 0.2, given=True)
         ['5 planes of 0.2 s each take longer than a frame of 0.7 s: pass dt= or plane_time= in s']
         """
-        low, high = _VOXEL_LIMITS
-        strange = [
-            f"{axis} = {length:.3g} um"
-            for axis, length in zip("zyx", voxel, strict=True)
-            if np.isfinite(length) and not low <= length <= high
-        ]
         faults = []
-        if strange and not given:
-            faults.append(
-                f"the voxel size in the file, {', '.join(strange)}, is not between 1 nm and 20 um: "
-                "pass voxel= in um"
-            )
+        if not given and (strange := strange_lengths(voxel)):
+            faults.append(f"the voxel size in the file, {strange}: pass voxel= in um")
         planes = self.shape[1]
         if len(times) > 1 and plane_time is not None:
             interval = float(np.median(np.diff(times)))
@@ -477,6 +468,32 @@ def grid(
             missing = {axis: values[axis][i] for axis, i in zip(axes, place, strict=True)}
             raise ValueError(f"lacks the image {missing} of its {sizes}")
     return sizes, places
+
+
+def strange_lengths(voxel: Floats) -> str:
+    """Return which lengths of a voxel no light microscope has; empty if there are none.
+
+    Parameters
+    ----------
+    voxel : ndarray, shape (3,)
+        Voxel size (z, y, x), um.
+
+    Returns
+    -------
+    str
+
+    Examples
+    --------
+    >>> strange_lengths(np.array([250.0, 0.2, 0.2]))
+    'z = 250 um, is not between 1 nm and 20 um'
+    """
+    low, high = _VOXEL_LIMITS
+    strange = [
+        f"{axis} = {length:.3g} um"
+        for axis, length in zip("zyx", voxel, strict=True)
+        if np.isfinite(length) and not low <= length <= high
+    ]
+    return f"{', '.join(strange)}, is not between 1 nm and 20 um" if strange else ""
 
 
 def summed(parts: Sequence[Contents]) -> Contents:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perrin.images.formats.contents import Contents, Layout, Pick, chosen, even_times, grid, layout
-from perrin.images.formats.tiff import tiff
+from perrin.images.formats.tiff import is_set, ndtiff, opened, tiff
 
 # Words before a number in the names that microscope programs write.
 _COUNTERS = {
@@ -103,8 +103,11 @@ def sequence(path: str, pick: Pick) -> Contents:
     files = sequence_files(path)
     if not files:
         raise ValueError("is a folder without a .tif or .tiff file: no other images are read in it")
-    if len(files) == 1:
+    # The files of a set have the header of the whole.
+    if len(files) == 1 or is_set(files[0]):
         return tiff(files[0], pick)
+    if all("NDTiffStack" in Path(file).name for file in files):
+        return ndtiff([opened(file) for file in files], pick)
     sizes, places = grid(name_counters([Path(file).stem for file in files]))
     axes = list(sizes)
     position = {}

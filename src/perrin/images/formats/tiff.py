@@ -5,7 +5,7 @@ from __future__ import annotations
 import struct
 from math import prod
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +28,9 @@ from perrin.images.formats.headers import (
     ome_images,
     tiff_kind,
 )
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
 
 
 class DeclaredSeries(NamedTuple):
@@ -55,8 +58,9 @@ def tiff(path: str, pick: Pick, *, one_frame: bool = False) -> Contents:
     """Describe one TIFF file; with `one_frame` all its images are the planes of a single frame."""
     file = opened(path)
     try:
-        if file.is_micromanager and "Axes" in image_header(file.pages.first):
-            return ndtiff(file, pick)
+        plain = not (file.is_ome or file.is_imagej)
+        if plain and "Axes" in image_header(file.pages.first):
+            return ndtiff([file], pick)
         # A LSM file has a thumbnail of every image.
         images = [s for s in file.series if not (file.is_lsm and s.keyframe.is_reduced)]
         titles = [str(s.name) for s in images]
@@ -145,12 +149,28 @@ def require_decoder(file: Any) -> None:  # noqa: ANN401
     needed("imagecodecs", "images")
 
 
-def ndtiff(file: Any, pick: Pick) -> Contents:  # noqa: ANN401
-    """Describe an NDTiff file of Micro-Manager, each of whose images states its place and time.
+def is_set(path: str) -> bool:
+    """Return whether the image of an OME file is spread over several files.
 
     Parameters
     ----------
-    file : tifffile.TiffFile
+    path : str
+
+    Returns
+    -------
+    bool
+    """
+    with opened(path) as file:
+        return file.is_ome and any(series.is_multifile for series in file.series)
+
+
+def ndtiff(files: Sequence[Any], pick: Pick) -> Contents:
+    """Describe NDTiff files of Micro-Manager, whose images state their places and times.
+
+    Parameters
+    ----------
+    files : sequence of tifffile.TiffFile
+        The files of one recording.
     pick : Pick
         The user's choices; the image is one of several positions.
 
@@ -160,7 +180,8 @@ def ndtiff(file: Any, pick: Pick) -> Contents:  # noqa: ANN401
     """
     from datetime import UTC, datetime
 
-    about = [image_header(page) for page in file.pages]
+    pages = [page for file in files for page in file.pages]
+    about = [image_header(page) for page in pages]
     letters = {"time": "T", "z": "Z", "channel": "C", "position": "P"}
     sizes, places = grid(
         [{letters.get(k, k): v for k, v in a.get("Axes", {}).items()} for a in about]
@@ -196,14 +217,18 @@ def ndtiff(file: Any, pick: Pick) -> Contents:  # noqa: ANN401
     scale = clock_scale(np.array([in_um(depth, "um"), pixel, pixel]), clock - np.nanmin(clock))
 
     def plane(t: int, z: int) -> NDArray[Any]:
-        return np.asarray(file.pages[number(t, z)].asarray())
+        return np.asarray(pages[number(t, z)].asarray())
 
-    page = file.pages.first
+    def close() -> None:
+        for file in files:
+            file.close()
+
+    page = pages[0]
     return Contents(
         shape=(where.t, where.z, *page.shape),
         dtype=np.dtype(page.dtype),
         plane=plane,
-        close=file.close,
+        close=close,
         voxel=scale.voxel,
         times=scale.times,
         plane_time=scale.plane_time,
@@ -413,7 +438,17 @@ def read_plane(
         page = series.pages[at_page] if at_page < len(series.pages) else None
         if page is None:
             raise ValueError(f"image {number} is not in the file")
-        image = np.asarray(page.asarray().reshape(together, *block)[number % together])
+        # Other files of a set are closed between their images.
+        handle = page.parent.filehandle
+        was_closed = handle.closed
+        if was_closed:
+            handle.open()
+        try:
+            whole = page.asarray()
+        finally:
+            if was_closed:
+                handle.close()
+        image = np.asarray(whole.reshape(together, *block)[number % together])
     else:
         # The header of a contiguous file may list the first page only: the bytes are counted.
         dtype = np.dtype(series.dtype).newbyteorder(file.byteorder)
