@@ -548,10 +548,11 @@ def test_nikon(tmp_path, movie, monkeypatch):
         assert stack.plane_time == pytest.approx(0.01)
 
 
-def lif_bytes(movie, voxel, dt, scan="xyzt"):
+def lif_bytes(movie, voxel, dt, scan="xyzt", stamps=()):
     """Return a small Leica file: an XML header in UTF-16, then one block of memory.
 
-    The letters of `scan` are the axes, fastest first; those left out have one element.
+    The letters of `scan` are the axes, fastest first; those left out have one element. `stamps`
+    are times of its images, s.
     """
     t, z, y, x = movie.shape
     about = {
@@ -570,11 +571,14 @@ def lif_bytes(movie, voxel, dt, scan="xyzt"):
             f'Length="{(n - 1) * length!r}" Unit="{unit}" BitInc="0" BytesInc="{step}"/>'
         )
         step *= n
+    # Stamps count 100 ns since 1601.
+    ticks = [f"{int(133e15) + round(stamp * 1e7):x}" for stamp in stamps]
+    listed = f'<TimeStampList NumberOfTimeStamps="{len(ticks)}">{" ".join(ticks)}</TimeStampList>'
     image = (
         '<Data><Image><ImageDescription><Channels><ChannelDescription DataType="0" ChannelTag="0" '
         'Resolution="16" NameOfMeasuredQuantity="" Min="0" Max="65535" Unit="" LUTName="Gray" '
         'IsLUTInverted="0" BytesInc="0" BitInc="0"/></Channels>'
-        f"<Dimensions>{dimensions}</Dimensions></ImageDescription></Image></Data>"
+        f"<Dimensions>{dimensions}</Dimensions></ImageDescription>{listed}</Image></Data>"
         f'<Memory Size="{movie.nbytes}" MemoryBlockID="MemBlock_1"/>'
     )
     xml = (
@@ -602,6 +606,12 @@ def test_leica(tmp_path, movie):
     (tmp_path / "a.lif").write_bytes(data)
     with open_stack(tmp_path / "a.lif") as stack:
         assert_same(stack, movie)
+        assert stack.plane_time is None
+    clock = np.arange(5)[:, None] * DT + np.arange(4) * 0.15
+    (tmp_path / "c.lif").write_bytes(lif_bytes(movie, VOXEL, DT, stamps=clock.ravel()))
+    with open_stack(tmp_path / "c.lif") as stack:
+        assert_same(stack, movie)
+        assert stack.plane_time == pytest.approx(0.15)
     (tmp_path / "b.lif").write_bytes(data[: -movie[0].nbytes])
     with open_stack(tmp_path / "b.lif") as stack:
         np.testing.assert_array_equal(stack.frame(3), movie[3])

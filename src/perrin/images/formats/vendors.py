@@ -63,6 +63,8 @@ def lif(path: str, pick: Pick) -> Contents:
         where = layout(sizes, pick)
         steps = {axis: np.diff(values[:2]) for axis, values in image.coords.items()}
         spacing = {seen.get(axis, axis): float(s[0]) for axis, s in steps.items() if s.size}
+        stamps = image.timestamps if "Z" not in inner else None
+        plane_time = leica_plane_time(stamps, where.t, where.z)
     except Exception:
         file.close()
         raise
@@ -91,8 +93,37 @@ def lif(path: str, pick: Pick) -> Contents:
         close=file.close,
         voxel=np.array([in_um(spacing.get(axis), "m") for axis in "ZYX"]),
         times=even_times(where.t, in_seconds(spacing.get("T"), "s")),
+        plane_time=plane_time,
         notes=("the images are sections (z, x): their z is read as y",) if section else (),
     )
+
+
+def leica_plane_time(stamps: NDArray[np.datetime64] | None, t: int, z: int) -> float | None:
+    """Return the time from one plane to the next, where a Leica file has a stamp of every plane.
+
+    Parameters
+    ----------
+    stamps : ndarray or None
+        Time stamps of the images, planes before frames.
+    t, z : int
+        Number of frames, and of planes of a frame.
+
+    Returns
+    -------
+    float or None
+        Mean time over the planes of a frame, s, because the stamps are in whole milliseconds; its
+        median over the frames. None where there is not one stamp of each plane.
+
+    Examples
+    --------
+    >>> leica_plane_time(np.array([0, 20, 700, 720], dtype="datetime64[ms]"), 2, 2)
+    0.02
+    """
+    if stamps is None or z == 1 or len(stamps) != t * z:
+        return None
+    clock = stamps.reshape(t, z)
+    step = float(np.median((clock[:, -1] - clock[:, 0]) / np.timedelta64(1, "s"))) / (z - 1)
+    return step if step > 0 else None
 
 
 def nd2(path: str, pick: Pick) -> Contents:
