@@ -219,6 +219,8 @@ def test_names_of_volumes_count_channels(tmp_path, movie):
         (["a1_b1", "a1_b2", "a2_b1", "a2_b2"], "2 numbers vary.*meaning is not clear"),
         (["red1", "red2", "green1", "green2"], "differ in more than numbers"),
         (["t1_z1", "t1_z2", "t2_z1"], r"lacks the image \{'T': 2, 'Z': 2\}"),
+        (["t1", "t2", "t4"], "times are numbered unevenly, with none between 2 and 4"),
+        (["t1_z0", "t1_z1", "t1_z3"], "planes are numbered unevenly, with none between 1 and 3"),
         (["s_t1_xy1", "s_t1_xy2", "s_t2_xy1", "s_t2_xy2"], "2 images .*pass image="),
     ],
 )
