@@ -152,6 +152,33 @@ def test_the_slopes_are_finite_differences(case, mode, quantity):
         assert slopes == pytest.approx((more - less) / (2 * step), rel=1e-5, abs=1e-4)
 
 
+@pytest.mark.parametrize("drift", [False, True])
+@pytest.mark.parametrize("case", ["even", "gapped", "partial", "pooled"])
+def test_the_curvatures_are_finite_differences(case, drift):
+    """Rises and falls change in D and in theta as their own slopes say, to 1e-5, drift or not.
+
+    Many D and theta at once give what each gives alone.
+    """
+    steps = [steps_of(m, "rotation") for m in CASES[case]]
+    likelihood = Likelihood.of([NoisySteps.free(s, blur=0.2, drift=drift) for s in steps])
+    for D, theta in points(likelihood):
+        sums, h = likelihood.sums(D, theta), 1e-5
+        D_ends = np.stack([D * (1 + h), D * (1 - h)])
+        by_D = likelihood.sums(D_ends, np.stack([theta, theta]))
+        by_theta = likelihood.sums(np.stack([D, D]), np.stack([theta * (1 + h), theta * (1 - h)]))
+        for batch, single in zip(by_D, likelihood.sums(D_ends[1], theta), strict=True):
+            assert batch[1] == pytest.approx(single, rel=1e-12)
+        for name in ("rise", "fall"):
+            first, second = f"{name}_D", name
+            found = [getattr(sums, f"{name}_{which}") for which in ("DD", "Do", "Do", "oo")]
+            pairs = ((by_D, first, D), (by_D, second, D), (by_theta, first, theta))
+            for bend, (ends, part, x) in zip(
+                found, (*pairs, (by_theta, second, theta)), strict=True
+            ):
+                more, less = getattr(ends, part)
+                assert bend == pytest.approx((more - less) / (2 * h * x), rel=1e-5)
+
+
 @pytest.mark.parametrize("quantity", QUANTITIES)
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("case", ["even", "trimer", "plane"])
@@ -238,7 +265,7 @@ def test_maximum_and_intervals_are_those_of_a_brute_force_profile(mode, seed, n_
     grid = likelihood.scale[0] * np.geomspace(1e-4, 10, repeats(15, 40))
     assert max(brute(many, D) for D in grid) <= top + 1e-6
     for drop in (0.98894, 3.84146):
-        low, high = likelihood.interval(best, drop)
+        ((low, high),) = likelihood.intervals(best, [drop])
         assert brute(many, high) == pytest.approx(top - drop / 2, abs=1e-4)
         if low > 0:
             assert brute(many, low) == pytest.approx(top - drop / 2, abs=1e-4)

@@ -140,7 +140,7 @@ def orientation_correlation(
     *,
     degree: int = 1,
     directions: ArrayLike | None = None,
-    noise: Literal["residual", "joint"] | float | None = None,
+    noise: Literal["residual", "joint"] | float | None = "residual",
 ) -> LagCurve:
     """Return the orientational correlation <P_l(p(t) . p(t + dt))> over all lag times.
 
@@ -153,10 +153,10 @@ def orientation_correlation(
     directions : array_like, shape (3,) or (K, 3), optional
         Body-fixed directions, averaged; default those of the particles.
     noise : None, "residual", "joint" or float
-        Noise of the orientations that the curve is corrected for. None: no correction, the curve of
-        the orientations as they were measured. "residual": the noise that the residuals of the
-        rigid fits predict, frame by frame; right where all particles of a frame are recorded at the
-        same instant. A number is the known localisation error of one coordinate, um. "joint": the
+        Noise of the orientations that the curve is corrected for. "residual": the noise that the
+        residuals of the rigid fits predict, frame by frame; right where all particles of a frame
+        are recorded at the same instant. None: no correction, the curve of the orientations as they
+        were measured. A number is the known localisation error of one coordinate, um. "joint": the
         offset of the steps, which includes motion blur, and holds where the motion is diffusion
         from one frame to the next; a body that rattles in a cage has such an offset without noise.
 
@@ -222,7 +222,7 @@ def orientation_correlation(
     columns = features.reshape(len(p), -1)
     sums = pair_sums(Products(columns, [[(i, i) for i in range(columns.shape[1])]]), frames)
     value = sums.mean[:, 0] / p.shape[1]
-    if noise is None:
+    if offset == 0:
         value = np.minimum(value, 1.0)  # a mean of cosines that rounds above one is one
     blocks = tuple(int(n) for n in frames.lengths)
     damping = np.exp(-rate * offset)

@@ -49,7 +49,8 @@ from perrin.diffusion.likelihood import (
     excess_scatter,
     log_slope_ratio,
     newton_crossing,
-    secant_trial,
+    newton_trial,
+    ratio_bend,
 )
 from perrin.diffusion.long_time import LongTimeEstimate, long_time_diffusion
 from perrin.diffusion.moments import Moments, covariance_estimate, step_cosines, trace_estimate
@@ -138,6 +139,7 @@ from perrin.diffusion.switching import (
 )
 from perrin.diffusion.tensor_likelihood import (
     ArrowHessian,
+    DiagonalModes,
     Maximum,
     NoisyVectors,
     PooledLikelihood,
@@ -179,6 +181,7 @@ __all__ = [
     "CoupledTensor",
     "Decay",
     "DecouplingRatio",
+    "DiagonalModes",
     "DiffusionEstimate",
     "DiffusionTensor",
     "Found",
@@ -287,6 +290,7 @@ __all__ = [
     "msd_covariance",
     "neighbour_products",
     "newton_crossing",
+    "newton_trial",
     "noise_faults",
     "offset_gain",
     "orientation_about_mean",
@@ -296,10 +300,10 @@ __all__ = [
     "precision_limits",
     "prediction_errors",
     "principal_steps",
+    "ratio_bend",
     "relaxation_faults",
     "residual_freedom",
     "score_p",
-    "secant_trial",
     "shape_slope",
     "sine_powers",
     "sine_spectrum",

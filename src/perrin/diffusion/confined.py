@@ -275,6 +275,12 @@ def fit_confined_steps(
             f"relaxation time {dt / rate:.2g} s under the frame time: the cage cannot be "
             'distinguished from noise; state the noise (noise="residual" or a number)'
         )
+    turning = quantity == "rotation" and motions[0].dimension == 3
+    if turning and seen and cage_size(best) > _SMALL_CAGE:
+        limits.append(
+            f"cage wider than {_SMALL_CAGE} rad: rotation vectors do not add up in it, and the "
+            "relaxation time and the cage are not those of the body"
+        )
     return ConfinedEstimate(
         relaxation_time=dt / rate if rate else np.inf,
         relaxation_time_ci68=times[0.68],

@@ -17,17 +17,20 @@ CHI2 = {0.68: 0.9889, 0.95: 3.8415}  # quantiles of chi-squared with one degree 
 
 NORMAL = {0.68: 0.9945, 0.95: 1.9600}  # half widths of intervals in standard errors
 
-# Over which times a value holds, by the kind of the motion.
+# Over which times a value holds, by the kind of the motion. Where the motion has a memory a fit of
+# diffusion takes a part of it for noise, so that its value holds at no time.
 _TIME_SCALES = {
-    "diffusion": "{frame} and at longer times",
-    "jumps": "{frame}; it does not describe the jumps",
-    "drift": "{frame}; the steady motion dominates at long times",
-    "spin": "{frame}; the steady motion dominates at long times",
-    "changing D": "{frame}, as a mean over the track",
-    "confined": "{frame} only; it is 0 at long times",
-    "subdiffusion": "{frame} only; it is smaller at longer times",
-    "superdiffusion": "{frame} only; it is larger at longer times",
-    "vibration": "{frame} only; it contains the vibration",
+    "diffusion": "holds {frame} and at longer times",
+    "jumps": "holds {frame}; it does not describe the jumps",
+    "drift": "holds {frame}; the steady motion dominates at long times",
+    "spin": "holds {frame}; the steady motion dominates at long times",
+    "changing D": "holds {frame}, as a mean over the track",
+    "confined": "is below that {frame}, which the fit of a cage gives, and is 0 at long times",
+    "subdiffusion": "is below that {frame}, which the fit of the exponent gives, and decreases "
+    "with time",
+    "superdiffusion": "is above that {frame}, which the fit of the exponent gives, and increases "
+    "with time",
+    "vibration": "holds {frame} only; it contains the vibration",
 }
 
 # Below ten times its resolution floor a D_R is not resolved.
@@ -222,7 +225,7 @@ class DiffusionEstimate:
 
     @property
     def time_scale(self) -> str:
-        """Over which times the value holds; empty where the motion was not judged."""
+        """Over which times the value holds, with its verb; empty where it was not judged."""
         if self.motion is None or self.absent_because is not None:
             return ""
         frame = f"at one frame ({self.dt:.3g} s)"

@@ -189,7 +189,7 @@ def by_likelihood(tracks: Sequence[NoisySteps]) -> Found:
     best = likelihood.best()
     value = float(best.D[0])
     wider = excess_scatter(tracks, value, best.theta)
-    ci68, ci95 = (likelihood.interval(best, wider * CHI2[level]) for level in (0.68, 0.95))
+    ci68, ci95 = likelihood.intervals(best, [wider * CHI2[level] for level in (0.68, 0.95)])
     offsets, offset_stderr = likelihood.offsets(best)
     found = Found(value, ci68, ci95, float(offsets.mean()), offset_stderr)
     if tracks[0].drift:

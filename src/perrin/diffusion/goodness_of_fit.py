@@ -50,6 +50,8 @@ _CONFINED_RATE = 6.0  # relaxations per track of the cage that the cage test loo
 
 _CLUSTERING_LAGS = 20
 
+FEWEST_HALF_PERIODS = 6  # of a vibration in the track
+
 # A track of which the dense score would need more than this is divided, and the scores are added.
 _DENSE_BLOCK = 400
 
@@ -944,7 +946,7 @@ def approximate_p(model: AxisModel, fit: AxisFit, scores: tuple[Score, Score]) -
         "steady": model.steady_motion(fit)[2],
         **by_table,
         "largest": np.exp(-largest_share(u, axes)),
-        "line": np.exp(-largest_share(modes, axes)),
+        "line": np.exp(-largest_share(modes[:, FEWEST_HALF_PERIODS - 1 :], axes)),
     }
 
 

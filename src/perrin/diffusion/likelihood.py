@@ -36,34 +36,52 @@ _LEAST_LOG_OFFSET, _MOST_LOG_OFFSET = -30.0, 60.0
 # The steps of a body whose mean square is this much smaller than another one's are rounding.
 _SMALLEST_STEP_RATIO = 1e-24
 
+# Steps in log theta that are short enough where only the sign of a slope is used.
+_COARSE_STEP = 0.03
+
+# About this many step components are evaluated at once; more do not stay in the processor's cache.
+_MOST_AT_ONCE = 100_000
+
 _LEAST_SLOPE_RATIO = float(np.exp(-_MOST_LOG_OFFSET))
 
 
 class ProfilePoint(NamedTuple):
-    """A point of the profile likelihood: the likelihood maximised over theta at given D.
+    """Points of the profile likelihood: the likelihood maximised over theta at given D.
 
     Attributes
     ----------
-    D : ndarray, shape (units,)
+    D : ndarray, shape (..., units)
         D of each unit: one for every motion, or one for all.
-    value : ndarray, shape (units,)
+    value : ndarray, shape (..., units)
         Profile log-likelihood.
-    slope : ndarray, shape (units,)
-        Slope of the value in D.
-    log_ratio : ndarray, shape (units,)
-        Logarithm of the rise over the fall of that slope.
-    theta : ndarray, shape (G,)
-        Noise parameter of each motion at the maximum.
-    curvature : ndarray, shape (G,)
-        Slope of the log ratio of theta in log theta, with which the next search begins.
+    slope, curvature : ndarray, shape (..., units)
+        First and second derivative of the value in D.
+    log_ratio, bend : ndarray, shape (..., units)
+        Logarithm of the rise over the fall of that slope, and its derivative in D.
+    theta, theta_slope : ndarray, shape (..., G)
+        Noise parameter of each motion at the maximum, and its derivative in D.
     """
 
     D: Floats
     value: Floats
     slope: Floats
-    log_ratio: Floats
-    theta: Floats
     curvature: Floats
+    log_ratio: Floats
+    bend: Floats
+    theta: Floats
+    theta_slope: Floats
+
+    def theta_at(self, D: Floats) -> Floats:
+        """Return the theta that these points predict for other D, (..., G): a power of D.
+
+        Near the edge theta = 0 the power would be without bound; there it is a first guess only.
+        """
+        known = (self.theta > 0) & (self.D > 0)
+        ratio = np.where(known & (D > 0), D / np.where(self.D > 0, self.D, 1.0), 1.0)
+        power = np.divide(
+            self.theta_slope * self.D, self.theta, out=np.zeros_like(self.theta), where=known
+        )
+        return np.asarray(self.theta * ratio ** np.clip(power, -3.0, 3.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,20 +146,21 @@ class Likelihood:
         return np.where(self.fixed, 0.0, freedom), np.array([t.theta for t in self.tracks])
 
     def by_unit(self, x: Floats) -> Floats:
-        """Sum over the motions that share a D."""
-        return x if self.own else np.atleast_1d(x.sum())
+        """Sum over the motions that share a D, (..., units)."""
+        alone = self.own or len(self.tracks) == 1
+        return x if alone else np.asarray(x.sum(axis=-1, keepdims=True))
 
     def sums(self, D: Floats, theta: Floats) -> GroupSlopes:
-        """Evaluate all motions at the D of each unit and the theta of each motion."""
-        D = D if len(D) == len(theta) else np.full(len(theta), D[0])
+        """Evaluate all motions at the D (..., units) and the theta (..., G)."""
+        D = np.broadcast_to(D, theta.shape)
         if len(self.kernels) == 1:
             total = self.kernels[0].sums(D, theta)
         else:
-            total = GroupSlopes(*np.empty((5, len(theta))))
+            total = GroupSlopes(*[np.empty(theta.shape) for _ in GroupSlopes._fields])
             for kernel in self.kernels:
-                part = kernel.sums(D[kernel.groups], theta[kernel.groups])
+                part = kernel.sums(D[..., kernel.groups], theta[..., kernel.groups])
                 for of_all, of_some in zip(total, part, strict=True):
-                    of_all[kernel.groups] = of_some
+                    of_all[..., kernel.groups] = of_some
         freedom, value = self.prior
         if freedom.any():
             # The residuals of the rigid fits: chi-squared with their degrees of freedom in theta.
@@ -149,140 +168,186 @@ class Likelihood:
             total.value[:] -= 0.5 * freedom * (np.log(safe) + value / safe)
             total.rise[:] += 0.5 * freedom * (value / safe) / safe
             total.fall[:] += 0.5 * freedom / safe
+            total.rise_oo[:] -= freedom * (value / safe) / safe / safe
+            total.fall_oo[:] -= 0.5 * freedom / safe / safe
         return total
 
     def profile(
-        self, D: Floats, near: ProfilePoint | None = None, tolerance: float = 1e-12
+        self, D: Floats, start: Floats | None = None, *, tolerance: float = 1e-6
     ) -> ProfilePoint:
-        """Maximise over theta at given D, starting from the theta and the curvature of `near`.
+        """Maximise over theta at given D (..., units), starting from a theta (..., G).
 
-        Each theta is the root of its own rise less fall, all motions at once, by secant steps
-        inside a shrinking bracket in log theta; the logarithm of rise over fall makes the secant
-        nearly straight. Towards theta = 0 the root may not exist; the edge is then the answer.
+        Each theta is the root of its own rise less fall, all at once, by Newton steps inside a
+        shrinking bracket in log theta; the logarithm of rise over fall is nearly straight there.
+        Towards theta = 0 the root may not exist; the edge is then the answer. The last step is
+        shorter than the tolerance; it enters the result to first order, which leaves an error of
+        the order of its square.
         """
         square, fixed = self.mean_square, self.fixed
+        shape = (*D.shape[:-1], len(square))
+        if start is None:
+            spent = np.array([np.mean(t.steps.duration) for t in self.tracks])
+            start = np.maximum(0.5 * square - D * spent, 0.01 * square)
+        low, high = np.full(shape, _LEAST_LOG_OFFSET), np.full(shape, _MOST_LOG_OFFSET)
+        t = np.log(np.maximum(np.broadcast_to(start, shape) / square, 1e-6))
+        t = np.minimum(t, _MOST_LOG_OFFSET)
         some_fixed = bool(fixed.any())
-
-        def theta_at(t: Floats) -> Floats:
-            free = square * np.exp(t)
-            return np.where(fixed, self.prior[1], free) if some_fixed else free
-
-        def point(sums: GroupSlopes, theta: Floats, curvature: Floats) -> ProfilePoint:
-            rise, fall = self.by_unit(sums.rise_D), self.by_unit(sums.fall_D)
-            value, ratio = self.by_unit(sums.value), log_slope_ratio(rise, fall)
-            return ProfilePoint(D, value, rise - fall, ratio, theta, curvature)
-
-        if fixed.all():
-            theta = self.prior[1]
-            return point(self.sums(D, theta), theta, np.zeros_like(theta))
-        low = np.full(len(square), _LEAST_LOG_OFFSET)
-        high = np.full(len(square), _MOST_LOG_OFFSET)
-        start = 0.5 * square if near is None else near.theta
-        old = np.log(np.maximum(start / square, 1e-6))
-        old_ratio = log_slope_ratio(*self.sums(D, theta_at(old))[3:])
-        move = np.copysign(1e-3, old_ratio)
-        if near is not None:
-            steep = near.curvature < -0.01
-            newton = np.divide(-old_ratio, near.curvature, out=move.copy(), where=steep)
-            move = np.where(newton == 0, move, np.clip(newton, -1.0, 1.0))
-        t = np.clip(old + move, low, high)
-        curvature = np.full(len(square), np.nan)
         for _ in range(100):
-            theta = theta_at(t)
+            theta = square * np.exp(t)
+            theta = np.where(fixed, self.prior[1], theta) if some_fixed else theta
             sums = self.sums(D, theta)
             ratio = log_slope_ratio(sums.rise, sums.fall)
-            up, run = ratio > 0, t - old
+            bend = theta * ratio_bend(sums.rise, sums.fall, sums.rise_oo, sums.fall_oo)
+            up = ratio > 0
             low, high = np.where(up, t, low), np.where(up, high, t)
-            moved = np.abs(run)
-            np.divide(ratio - old_ratio, run, out=curvature, where=moved > 1e-9)
-            target = secant_trial(t, ratio, old, old_ratio, low, high)
-            moves = np.minimum(np.abs(target - t), moved)
-            done = (moves <= tolerance) | (high <= _LEAST_LOG_OFFSET) | fixed
-            if done.all():
+            target = newton_trial(t, ratio, bend, low, high)
+            at_edge = fixed | (high <= _LEAST_LOG_OFFSET)
+            move = np.where(at_edge, 0.0, target - t)
+            settled = np.abs(move) <= tolerance
+            if settled.all():
                 break
-            old, old_ratio, t = t, ratio, np.where(done, t, target)
-        return point(sums, theta, curvature)
-
-    def continued_profile(self, tolerance: float) -> Callable[[Floats], ProfilePoint]:
-        """Return `profile` as a function of D that starts where its last two calls ended."""
-        trail: list[ProfilePoint] = []
-
-        def follow(D: Floats) -> ProfilePoint:
-            near = trail[-1] if trail else None
-            if len(trail) > 1 and not self.own and trail[-1].D[0] != trail[-2].D[0]:
-                one, two = trail[-2:]
-                ahead = (two.theta - one.theta) * (D - two.D) / (two.D - one.D)
-                near = two._replace(theta=two.theta + ahead)
-            trail.append(self.profile(D, near, tolerance))
-            return trail[-1]
-
-        return follow
+            t = np.where(settled, t, target)
+        more = theta * np.expm1(move)
+        slopes = sums.rise_Do - sums.fall_Do, sums.rise_oo - sums.fall_oo
+        turn = np.divide(-slopes[0], slopes[1], out=np.zeros(shape), where=~at_edge & (bend < 0))
+        rise = self.by_unit(sums.rise_D + sums.rise_Do * more)
+        fall = self.by_unit(sums.fall_D + sums.fall_Do * more)
+        rise_bend = self.by_unit(sums.rise_DD + sums.rise_Do * turn)
+        fall_bend = self.by_unit(sums.fall_DD + sums.fall_Do * turn)
+        return ProfilePoint(
+            D,
+            self.by_unit(sums.value + 0.5 * (sums.rise - sums.fall) * more),
+            rise - fall,
+            rise_bend - fall_bend,
+            log_slope_ratio(rise, fall),
+            ratio_bend(rise, fall, rise_bend, fall_bend),
+            theta + more,
+            turn,
+        )
 
     def best(self) -> ProfilePoint:
         """Return the D of greatest likelihood of every unit: the highest maximum, or 0.
 
         Short tracks can have several maxima, so the whole range is searched.
         """
-        coarse, fine = self.continued_profile(1e-3), self.continued_profile(1e-12)
-        best = np.zeros_like(self.scale)
-        seen = [coarse(best)]
-        for power in range(-7, 60):
-            if power > 0 and np.all(seen[-1].slope <= 0):
-                break
-            seen.append(coarse(self.scale * 4.0**power))
-        height = np.where(seen[0].slope <= 0, seen[0].value, -np.inf)
+        seen = self.searched_range()
+        best, theta = np.zeros_like(self.scale), seen.theta[0]
+        height = np.where(seen.slope[0] <= 0, seen.value[0], -np.inf)
         # Brackets in which a unit's slope falls through zero, in the order of D; a unit that has
         # no more of them gets a bracket of length 0.
-        D = np.array([p.D for p in seen])
-        slope = np.array([p.log_ratio for p in seen])
-        falls = (slope[:-1] > 0) & (slope[1:] <= 0)
-        order, unit = np.argsort(~falls, axis=0, kind="stable"), np.arange(D.shape[1])
+        falls = (seen.log_ratio[:-1] > 0) & (seen.log_ratio[1:] <= 0)
+        order, unit = np.argsort(~falls, axis=0, kind="stable"), np.arange(len(best))
         for row in order[: int(falls.sum(axis=0).max(initial=0))]:
-            low = D[row, unit]
-            high = np.where(falls[row, unit], D[row + 1, unit], low)
-            peak = self.maximum_between(low, high, fine)
+            rows = np.stack([row, np.where(falls[row, unit], row + 1, row)])
+            low, high = seen.D[rows, unit]
+            by_motion = np.broadcast_to(rows, (2, len(theta)))
+            peak = self.maximum_between(
+                (low, high),
+                log_ratio=seen.log_ratio[rows, unit],
+                theta=np.take_along_axis(seen.theta, by_motion, axis=0),
+            )
             higher = (peak.value > height) & (high > low)
             best, height = np.where(higher, peak.D, best), np.where(higher, peak.value, height)
-        return fine(best)
+            theta = np.where(higher, peak.theta, theta)
+        return self.profile(best, theta)
+
+    def searched_range(self) -> ProfilePoint:
+        """Return the profile at D = 0 and at all powers of 4 of its scale that may be likely.
+
+        Only the signs of the slopes, and the value at 0, are used of it.
+        """
+        size = sum(t.steps.vectors.size for t in self.tracks)
+        powers = np.concatenate([[0.0], 4.0 ** np.arange(-7, 3)])
+        at_once = int(np.clip(_MOST_AT_ONCE / size, 1, len(powers)))
+        parts: list[ProfilePoint] = []
+        for k in range(0, 60, at_once):
+            if k >= len(powers):
+                powers = np.append(powers, 4.0 ** (len(powers) - 8 + np.arange(at_once)))
+            D = powers[k : k + at_once, None] * self.scale
+            start = parts[-1].theta_at(D)[-1:] if parts and at_once == 1 else None
+            parts.append(self.profile(D, start, tolerance=_COARSE_STEP))
+            if powers[min(k + at_once, len(powers)) - 1] > 1 and np.all(parts[-1].slope[-1] <= 0):
+                break
+        return ProfilePoint(*[np.concatenate(rows) for rows in zip(*parts, strict=True)])
 
     def maximum_between(
-        self, low: Floats, high: Floats, follow: Callable[[Floats], ProfilePoint]
+        self, ends: tuple[Floats, Floats], *, log_ratio: Floats, theta: Floats
     ) -> ProfilePoint:
-        """Return the maximum of the profile between `low` and `high`, by bracketed secant steps.
+        """Return the maximum of the profile between two D of every unit, by bracketed Newton steps.
 
-        A unit whose `low` and `high` agree keeps that D.
+        The log ratio (2, units) and theta (2, G) are those at both ends. A unit whose ends agree
+        keeps that D.
         """
-        first, last = follow(low), follow(high)
-        old, peak = first, last
+        low, high = ends
+        share = np.divide(
+            log_ratio[0], log_ratio[0] - log_ratio[1], out=np.zeros_like(low), where=high > low
+        )
+        share = np.clip(share, 0.05, 0.95) * (high > low)
+        # The ends differ by a factor of 4 or begin at 0.
+        part = np.where(low > 0, np.expm1(share * np.log(4.0)) / 3, share)
+        trial = low + part * (high - low)
+        peak = self.profile(trial, theta[0] + part * (theta[1] - theta[0]))
         for _ in range(200):
-            D = peak.D
-            low, high = np.where(peak.log_ratio > 0, D, low), np.where(peak.log_ratio > 0, high, D)
-            target = secant_trial(D, peak.log_ratio, old.D, old.log_ratio, low, high)
-            moves = np.minimum(np.abs(target - D), np.abs(D - old.D))
-            done = (moves <= 1e-13 * np.abs(D)) | (high <= low)
+            rising = peak.log_ratio > 0
+            low, high = np.where(rising, peak.D, low), np.where(rising, high, peak.D)
+            trial = newton_trial(peak.D, peak.log_ratio, peak.bend, low, high)
+            # The error of the next Newton step is of the order of the square of this one.
+            nearest = np.where(peak.bend < 0, 1e-7, 1e-13) * np.abs(peak.D)
+            done = (np.abs(trial - peak.D) <= nearest) | (high <= low)
             if done.all():
                 break
-            old, peak = peak, follow(np.where(done, D, target))
-        return peak
+            trial = np.where(done, peak.D, trial)
+            peak = self.profile(trial, peak.theta_at(trial))
+        D = np.where(high > low, trial, peak.D)
+        return peak._replace(D=D, theta=peak.theta_at(D))
 
-    def interval(self, best: ProfilePoint, drop: float) -> tuple[float, float]:
-        """Return where twice the profile log-likelihood has fallen by `drop`; 0 if it never has."""
-        # At the maximum over theta the value is flat: half the digits of theta give all of its own.
-        follow = self.continued_profile(1e-6)
+    def intervals(self, best: ProfilePoint, drops: Sequence[float]) -> list[tuple[float, float]]:
+        """Return where twice the profile log-likelihood has fallen by each drop; 0 if it never has.
+
+        All ends are found at once, by Newton steps in the root of twice the fall, which is nearly
+        straight, halved into brackets; or doubled, while there is no bracket.
+        """
         value, top = float(best.D[0]), float(best.value[0])
-
-        def height(D: float) -> tuple[float, float]:
-            peak = follow(np.array([D]))
-            return float(peak.value[0]) - top + drop / 2, float(peak.slope[0])
-
+        zero = self.profile(np.zeros(1))
+        fall_to_zero = 2 * (top - float(zero.value[0]))
+        has_low = [value > 0 and fall_to_zero > drop for drop in drops]
+        root = np.sqrt(
+            np.array([*drops, *(d for d, has in zip(drops, has_low, strict=True) if has)])
+        )
+        side = np.where(np.arange(len(root)) < len(drops), 1.0, -1.0)
         count = sum(t.steps.vectors.size for t in self.tracks)
-        near = 0.02 * value if value else float(self.scale[0]) / count
-        curvature = -height(value + near)[1] / near
-        reach = np.sqrt(drop / curvature) if curvature > 0 else near
-        high = newton_crossing(height, inside=value, start=value + reach, outside=np.inf)
-        if value == 0 or height(0.0)[0] > 0:
-            return 0.0, high
-        return newton_crossing(height, inside=value, start=value - reach, outside=0.0), high
+        if value > 0 and best.curvature[0] < 0:
+            reach = root / np.sqrt(-best.curvature[0])
+        else:
+            reach = np.full(len(root), float(self.scale[0]) / count)
+        inside, outside = np.full(len(root), value), np.where(side > 0, np.inf, 0.0)
+        x = value + side * reach
+        x = np.where(x > 0, x, 0.5 * value)
+        point = ProfilePoint(*[np.broadcast_to(row, (len(root), row.shape[-1])) for row in best])
+        for _ in range(200):
+            D = x[:, None]
+            point = self.profile(D, point.theta_at(D))
+            fall = 2 * (top - point.value[:, 0])
+            within = fall < root**2
+            inside, outside = np.where(within, x, inside), np.where(within, outside, x)
+            depth = np.sqrt(np.maximum(fall, 0.0))
+            slope = -np.divide(point.slope[:, 0], depth, out=np.zeros_like(x), where=depth > 0)
+            step = np.divide(root - depth, slope, out=np.full_like(x, np.inf), where=slope != 0)
+            bounded = np.isfinite(outside)
+            middle = np.where(bounded, 0.5 * (inside + np.where(bounded, outside, 0.0)), 2 * x)
+            between = (np.minimum(inside, outside) < x + step) & (
+                x + step < np.maximum(inside, outside)
+            )
+            moved = np.where(between, step, middle - x)
+            x = x + moved
+            # The error of the next Newton step is of the order of the square of this one.
+            if np.all(np.abs(moved) <= np.where(between, 1e-7, 1e-11) * np.abs(x)):
+                break
+        high, low = x[: len(drops)], iter(x[len(drops) :])
+        return [
+            (float(next(low)) if has else 0.0, float(end))
+            for has, end in zip(has_low, high, strict=True)
+        ]
 
     def steady_motion(self, D: float, theta: Floats) -> tuple[Floats, Floats]:
         """Return the steady velocity or spin of every motion (G, p), lab axes, and its information.
@@ -296,8 +361,8 @@ class Likelihood:
     def offsets(self, best: ProfilePoint) -> tuple[Floats, float]:
         """Return the noise offset of each motion, and the standard error of their mean.
 
-        The observed information is arrow-shaped (one D, a theta for each motion); it comes from
-        central differences of the slopes. NaN where a theta lies on its edge.
+        The observed information is arrow-shaped: one D, a theta for each motion. NaN where a theta
+        lies on its edge.
         """
         blur = np.array([t.blur for t in self.tracks])
         level = np.array([t.level for t in self.tracks])
@@ -306,12 +371,9 @@ class Likelihood:
         D, theta, free = best.D, best.theta, ~self.fixed
         if D[0] == 0 or np.any(free & (theta <= 1e-3 * self.mean_square)):
             return offset, np.nan
-        more, less = (self.sums(D, theta + k * 1e-4 * self.mean_square * free) for k in (1, -1))
-        h_oo = (less.rise - less.fall - more.rise + more.fall) / (2e-4 * self.mean_square)
-        more, less = (self.sums(D * (1 + k * 1e-4), theta) for k in (1, -1))
-        slope_D = less.rise_D - less.fall_D - more.rise_D + more.fall_D
-        slope_o = less.rise - less.fall - more.rise + more.fall
-        h_DD, h_Do = (float(slope_D.sum()) / (2e-4 * D[0]), slope_o / (2e-4 * D[0]))
+        sums = self.sums(D, theta)
+        h_DD = float((sums.fall_DD - sums.rise_DD).sum())
+        h_Do, h_oo = sums.fall_Do - sums.rise_Do, sums.fall_oo - sums.rise_oo
         turn = np.divide(h_Do, h_oo, out=np.zeros_like(h_Do), where=free)
         left = h_DD - float(np.sum(turn * h_Do))
         if left <= 0 or np.any(h_oo[free] <= 0):
@@ -334,22 +396,31 @@ def log_slope_ratio(rise: Floats, fall: Floats) -> Floats:
     )
 
 
-def secant_trial(
-    t: Floats, slope: Floats, old: Floats, old_slope: Floats, low: Floats, high: Floats
-) -> Floats:
-    """Return the next trial: the secant step, or the middle of the bracket where that leaves it.
+def ratio_bend(rise: Floats, fall: Floats, rise_bend: Floats, fall_bend: Floats) -> Floats:
+    """Return the slope of the logarithm of rise over fall; 0 where one of them is zero.
 
     Examples
     --------
-    >>> t, slope, old, old_slope, low, high = np.array([[1.0], [2.0], [0.0], [4.0], [1.0], [9.0]])
-    >>> secant_trial(t, slope, old, old_slope, low, high)
+    >>> two = np.array([2.0, 0.0])
+    >>> ratio_bend(two, two, -two, two)
+    array([-2.,  0.])
+    """
+    known = (rise > LEAST_EIGENVALUE) & (fall > LEAST_EIGENVALUE)
+    up = np.divide(rise_bend, rise, out=np.zeros_like(rise), where=known)
+    return np.asarray(up - np.divide(fall_bend, fall, out=np.zeros_like(fall), where=known))
+
+
+def newton_trial(t: Floats, slope: Floats, bend: Floats, low: Floats, high: Floats) -> Floats:
+    """Return the next trial: the Newton step, or the middle of the bracket where that leaves it.
+
+    Examples
+    --------
+    >>> t, slope, bend, low, high = np.array([[1.0], [2.0], [-2.0], [1.0], [9.0]])
+    >>> newton_trial(t, slope, bend, low, high)
     array([2.])
     """
-    rise, run = slope - old_slope, t - old
-    step = np.full(t.shape, np.nan)
-    np.divide(slope * run, rise, out=step, where=rise * run < 0)
-    target = t - step
-    inside = (target > low) & (target < high)
+    target = t - np.divide(slope, bend, out=np.full(t.shape, np.nan), where=bend < 0)
+    inside = (target >= low) & (target <= high)
     if inside.all():
         return np.asarray(target)
     # Where a falling slope does not cross zero, the maximum is at the edge.

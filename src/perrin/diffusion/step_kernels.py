@@ -36,14 +36,20 @@ def difference_eigenvalues(n_steps: int) -> Floats:
 class GroupSlopes(NamedTuple):
     """The log-likelihood of every motion and its slopes, each slope as a rise less a fall.
 
+    All arrays have the shape (..., G) of the theta at which they were evaluated.
+
     Attributes
     ----------
-    value : ndarray, shape (G,)
+    value : ndarray
         Log-likelihood of each motion.
-    rise_D, fall_D : ndarray, shape (G,)
+    rise_D, fall_D : ndarray
         Positive and negative part of the slope in D.
-    rise, fall : ndarray, shape (G,)
+    rise, fall : ndarray
         Positive and negative part of the slope in theta.
+    rise_DD, rise_Do, rise_oo : ndarray
+        Slopes of `rise_D` in D and in theta, and of `rise` in theta.
+    fall_DD, fall_Do, fall_oo : ndarray
+        The same of the negative parts.
     """
 
     value: Floats
@@ -51,6 +57,18 @@ class GroupSlopes(NamedTuple):
     fall_D: Floats
     rise: Floats
     fall: Floats
+    rise_DD: Floats
+    rise_Do: Floats
+    rise_oo: Floats
+    fall_DD: Floats
+    fall_Do: Floats
+    fall_oo: Floats
+
+    @classmethod
+    def impossible(cls, shape: tuple[int, ...]) -> GroupSlopes:
+        """Return the likelihood 0 of steps with a covariance that is not positive definite."""
+        zero = np.zeros(shape)
+        return cls(zero - np.inf, zero + 1, zero, zero + 1, *[zero] * 7)
 
 
 class StepKernel(Protocol):
@@ -61,7 +79,7 @@ class StepKernel(Protocol):
         """Numbers of the motions."""
 
     def sums(self, D: Floats, theta: Floats) -> GroupSlopes:
-        """Evaluate all motions at the D and the theta of each."""
+        """Evaluate all motions at the D and the theta of each, (..., G)."""
 
 
 def equal_columns(noise: Floats) -> list[Ints]:
@@ -145,24 +163,38 @@ class SineModes:
         return cls(np.array(groups), starts, which, power, count, by_D, by_theta, given)
 
     @cached_property
-    def half_slopes(self) -> tuple[Floats, Floats]:
-        """Half the slopes of the eigenvalue in D and in theta."""
-        return 0.5 * self.by_D, 0.5 * self.by_theta
+    def slope_columns(self) -> tuple[Floats, Floats]:
+        """Half the slopes of the eigenvalue in D and in theta, (M, 2), and their products."""
+        halves = 0.5 * np.stack([self.by_D, self.by_theta])
+        return halves.T, 4 * (halves[[0, 0, 1]] * halves[[0, 1, 1]]).T
 
     def sums(self, D: Floats, theta: Floats) -> GroupSlopes:
-        """Evaluate all motions at the D and the theta of each."""
-        if len(self.groups) == 1:
-            eigen = D * self.by_D + theta * self.by_theta + self.given
-        else:
-            eigen = D[self.which] * self.by_D + theta[self.which] * self.by_theta + self.given
+        """Evaluate all motions at the D and the theta of each, (..., G)."""
+        if len(self.groups) > 1:
+            D, theta = D[..., self.which], theta[..., self.which]
+        eigen = D * self.by_D + theta * self.by_theta + self.given
         np.maximum(eigen, LEAST_EIGENVALUE, out=eigen)
-        fall = self.count / eigen
-        ratio = self.power / eigen
-        rise = ratio / eigen
-        value = -0.5 * (self.count * np.log(eigen) + ratio)
-        by_D, by_theta = self.half_slopes
-        rows = (value, by_D * rise, by_D * fall, by_theta * rise, by_theta * fall)
-        return GroupSlopes(*[np.add.reduceat(row, self.starts) for row in rows])
+        inverse = 1 / eigen
+        fall = self.count * inverse
+        ratio = self.power * inverse
+        rise = ratio * inverse
+        halves, products = self.slope_columns
+        value = np.add.reduceat(self.count * np.log(eigen) + ratio, self.starts, axis=-1)
+        rises, falls = (self.by_motion(x, halves) for x in (rise, fall))
+        rise_bends, fall_bends = (self.by_motion(x * inverse, products) for x in (rise, fall))
+        return GroupSlopes(
+            -0.5 * value,
+            *(rises[..., 0], falls[..., 0], rises[..., 1], falls[..., 1]),
+            *(-rise_bends[..., k] for k in range(3)),
+            *(-0.5 * fall_bends[..., k] for k in range(3)),
+        )
+
+    def by_motion(self, x: Floats, columns: Floats) -> Floats:
+        """Return the sums of x (..., M) times columns (M, c) over the modes of each motion."""
+        if len(self.groups) == 1:
+            return np.asarray((x @ columns)[..., None, :])
+        sums = [np.add.reduceat(x * column, self.starts, axis=-1) for column in columns.T]
+        return np.stack(sums, axis=-1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -251,27 +283,61 @@ class TridiagonalCovariance:
             steady=steady,
         )
 
+    def repeated(self, count: int) -> TridiagonalCovariance:
+        """Return the same motions `count` times over, to evaluate as many D and theta at once."""
+        groups, rows = len(self.groups), len(self.tau)
+
+        def again(x: Floats) -> Floats:
+            return np.concatenate([x] * count)
+
+        def numbered(x: Ints, step: int) -> Ints:
+            return np.asarray((x + step * np.arange(count)[:, None]).ravel())
+
+        return TridiagonalCovariance(
+            groups=numbered(self.groups, groups),
+            starts=numbered(self.starts, rows),
+            which=numbered(self.which, groups),
+            count=again(self.count),
+            y=np.concatenate([self.y.T] * count, axis=1).T,
+            tau=again(self.tau),
+            linked=again(self.linked),
+            blur=again(self.blur),
+            weight=(again(self.weight[0]), again(self.weight[1])),
+            known=(again(self.known[0]), again(self.known[1])),
+            steady=None if self.steady is None else again(self.steady),
+        )
+
     def sums(self, D: Floats, theta: Floats) -> GroupSlopes:
-        """Evaluate all motions at the D and the theta of each.
+        """Evaluate all motions at the D and the theta of each, (..., G).
 
         The slopes need z z^T and C^-1, z = C^-1 y, on both diagonals, summed over the
-        columns of a block.
+        columns of a block. With A the slope of C in D or theta, the slopes of the rises are
+        -(A z)^T C^-1 (A z); those of the falls are half the second derivatives of ln det C.
         """
         from scipy.linalg.lapack import dpttrf, dpttrs
 
-        a, b = self.bands(D, theta)
+        shape = theta.shape
+        if theta.size > len(self.groups):
+            flat = D.reshape(-1), theta.reshape(-1)
+            found = self.repeated(theta.size // len(self.groups)).sums(*flat)
+            if np.isfinite(found.value).all():
+                return GroupSlopes(*[x.reshape(shape) for x in found])
+            rows = zip(D.reshape(-1, shape[-1]), theta.reshape(-1, shape[-1]), strict=True)
+            each = zip(*[self.sums(*row) for row in rows], strict=True)
+            return GroupSlopes(*[np.reshape(x, shape) for x in each])
+        a, b = self.bands(D.reshape(-1), theta.reshape(-1))
         d, lower, bad = dpttrf(a, b)
         up, _, bad_up = dpttrf(a[::-1], b[::-1])
         if bad or bad_up:
-            zero = np.zeros(len(self.groups))
-            return GroupSlopes(zero - np.inf, zero + 1.0, zero, zero + 1.0, zero)
+            return GroupSlopes.impossible(shape)
         z, _ = dpttrs(d, lower, self.y)
         inverse = 1 / (d + up[::-1] - a)
         corner = self.linked * np.append(-lower * inverse[1:], 0.0)
         value = -0.5 * self.count * np.log(d)
         inverse, corner = self.count * inverse, self.count * corner
+        steady = None
         if self.steady is not None:
-            unit, gram, mean = self.steady_normal_equations(d, lower)
+            steady = unit, gram, mean = self.steady_normal_equations(d, lower)
             z = z - np.einsum("rcp,rp->rc", unit, mean[self.which])
             value[self.starts] -= 0.5 * np.linalg.slogdet(gram)[1]
             shared = unit @ np.linalg.inv(gram)[self.which]
@@ -281,17 +347,109 @@ class TridiagonalCovariance:
         value -= 0.5 * np.einsum("rc,rc->r", self.y, z)
         square = np.einsum("rc,rc->r", z, z)
         cross = self.linked * np.append(np.einsum("rc,rc->r", z[:-1], z[1:]), 0.0)
-        blur = self.by_row(self.blur)
-        through, half = self.tau - blur, 0.5 * (self.weight[0] + self.weight[1])
-        by_frame = self.linked * self.weight[1]
-        rows = (
-            value,
-            through * square + blur * cross,
-            through * inverse + blur * corner,
-            half * square - by_frame * cross,
-            half * inverse - by_frame * corner,
+        slopes = [
+            0.5 * on * by_diagonal + off * by_corner
+            for on, off in self.band_slopes
+            for by_diagonal, by_corner in ((square, cross), (inverse, corner))
+        ]
+        sums = [np.add.reduceat(row, self.starts) for row in (value, *slopes)]
+        bends = self.rise_bends(z, d, lower, steady) + self.fall_bends(d, lower, steady)
+        return GroupSlopes(*[x.reshape(shape) for x in sums + bends])
+
+    @cached_property
+    def band_slopes(self) -> tuple[tuple[Floats, Floats], tuple[Floats, Floats]]:
+        """Slopes of the covariance in D and in theta: diagonal and next to it, (rows,) each."""
+        blur, (before, after) = self.by_row(self.blur), self.weight
+        return (
+            (2 * (self.tau - blur), blur * self.linked),
+            (before + after, -after * self.linked),
         )
-        return GroupSlopes(*[np.add.reduceat(row, self.starts) for row in rows])
+
+    def slope_products(self, x: Floats) -> list[Floats]:
+        """Return A x for the slopes A of the covariance in D and in theta, x (rows, ...)."""
+        found = []
+        for on, off in self.band_slopes:
+            on, off = (column.reshape(-1, *[1] * (x.ndim - 1)) for column in (on, off))
+            product = on * x
+            product[:-1] += off[:-1] * x[1:]
+            product[1:] += off[:-1] * x[:-1]
+            found.append(product)
+        return found
+
+    def rise_bends(
+        self, z: Floats, d: Floats, lower: Floats, steady: tuple[Floats, Floats, Floats] | None
+    ) -> list[Floats]:
+        """Return the slopes of both rises, (G,) each: -(A z)^T C^-1 (A z)."""
+        from scipy.linalg.lapack import dpttrs
+
+        products = self.slope_products(z)
+        columns = z.shape[1]
+        # Columns are contiguous, as LAPACK needs them.
+        solved, _ = dpttrs(d, lower, np.concatenate([x.T for x in products]).T)
+        found = []
+        for i, j in ((0, 0), (0, 1), (1, 1)):
+            row = np.einsum("rc,rc->r", products[i], solved[:, j * columns : (j + 1) * columns])
+            found.append(-np.add.reduceat(row, self.starts))
+        if steady is not None:
+            unit, gram, _ = steady
+            shares = [
+                np.add.reduceat(np.einsum("rcp,rc->rp", unit, x), self.starts) for x in products
+            ]
+            inverse = np.linalg.inv(gram)
+            for bend, (i, j) in zip(found, ((0, 0), (0, 1), (1, 1)), strict=True):
+                bend += np.einsum("gp,gpq,gq->g", shares[i], inverse, shares[j])
+        return found
+
+    def fall_bends(
+        self, d: Floats, lower: Floats, steady: tuple[Floats, Floats, Floats] | None
+    ) -> list[Floats]:
+        """Return the slopes of both falls, (G,) each: half the second derivatives of ln det C.
+
+        The pivots follow d_k+1 = a_k+1 - b_k^2/d_k, so that their derivatives obey linear
+        recurrences: with l = b/d, d'_k+1 = a'_k+1 - 2 l_k b'_k + l_k^2 d'_k, and the second ones
+        d''_k+1 = -2 (b'_k - l_k d'_k)^2/d_k + l_k^2 d''_k.
+        """
+        from scipy.linalg.lapack import dpttrs, dtbtrs
+
+        band = np.ones((2, len(d)), order="F")
+        band[1, :-1] = -(lower**2)
+
+        def recurrence(columns: Sequence[Floats]) -> Floats:
+            return np.asarray(dtbtrs(band, np.array(columns).T, uplo="L", diag="U")[0])
+
+        first = []
+        for on, off in self.band_slopes:
+            column = on.copy()
+            column[1:] -= 2 * lower * off[:-1]
+            first.append(column)
+        slopes = recurrence(first).T
+        turned = [
+            off[:-1] - lower * slope[:-1]
+            for (_, off), slope in zip(self.band_slopes, slopes, strict=True)
+        ]
+        pairs = ((0, 0), (0, 1), (1, 1))
+        second = [np.append(0.0, -2 * turned[i] * turned[j] / d[:-1]) for i, j in pairs]
+        bends = recurrence(second).T
+        found = []
+        for bend, (i, j) in zip(bends, pairs, strict=True):
+            row = 0.5 * self.count * (bend - slopes[i] * slopes[j] / d) / d
+            found.append(np.add.reduceat(row, self.starts))
+        if steady is not None:
+            unit, gram, _ = steady
+            inverse, size = np.linalg.inv(gram), unit[0].size
+            products = self.slope_products(unit)
+            flat = np.concatenate([x.reshape(len(d), -1) for x in products], axis=1)
+            solved, _ = dpttrs(d, lower, flat)
+            through = [
+                inverse @ np.add.reduceat(np.swapaxes(unit, -1, -2) @ x, self.starts)
+                for x in products
+            ]
+            for bend, (i, j) in zip(found, pairs, strict=True):
+                after = solved[:, j * size : (j + 1) * size].reshape(unit.shape)
+                twice = np.add.reduceat(np.swapaxes(products[i], -1, -2) @ after, self.starts)
+                bend += np.einsum("gpq,gqp->g", inverse, twice)
+                bend -= 0.5 * np.einsum("gpq,gqp->g", through[i], through[j])
+        return found
 
     def steady_normal_equations(self, d: Floats, lower: Floats) -> tuple[Floats, Floats, Floats]:
         """Return U = C^-1 X (rows, c, p), G = X^T U (G, p, p) and G^-1 U^T y (G, p).

@@ -106,7 +106,9 @@ class Steps:
     @cached_property
     def even(self) -> bool:
         """Whether all steps are linked, equally long and equally noisy."""
-        noise = self.noise[:, np.union1d(self.start, self.stop)]
+        ends = np.zeros(self.noise.shape[1], dtype=np.bool_)
+        ends[self.start] = ends[self.stop] = True
+        noise = self.noise[:, ends]
         same_noise = np.ptp(noise, axis=1).max() <= _EVEN_STEPS * np.abs(noise).max()
         same_time = np.ptp(self.duration) <= _EVEN_STEPS * self.duration[0]
         return bool(same_time and same_noise and self.linked[:-1].all())

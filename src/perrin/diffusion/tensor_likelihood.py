@@ -17,8 +17,9 @@ if TYPE_CHECKING:
     from perrin._arrays import Floats
     from perrin.diffusion.steps import Steps
 
-    # D (b, b) and its slopes (m, b, b) by the m parameters of a family of tensors.
-    Family: TypeAlias = Callable[[Floats], tuple[Floats, Floats]]
+    # D (b, b), its slopes (m, b, b) by the m parameters of a family of tensors, and second
+    # derivatives (m, m, b, b).
+    Family: TypeAlias = Callable[[Floats], tuple[Floats, Floats, Floats]]
 
 # The largest blur: all motion seen in the first and last instant of a frame (1/6: open shutter).
 _MOST_BLUR = 0.25
@@ -48,19 +49,46 @@ class TensorSlopes(NamedTuple):
         Slopes in the noise amplitudes.
     B : ndarray, shape (P,)
         Slope in B.
+    noise : ndarray, shape (P, b, b)
+        Slopes in a noise O that is added to that of every frame.
     """
 
     value: Floats
     D: Floats
     theta: Floats
     B: Floats
+    noise: Floats
 
     @classmethod
     def undefined(cls, D: Floats, theta: Floats) -> TensorSlopes:
         """Return -inf without slopes at all of these points."""
         none = np.full(len(D), np.nan)
         least = np.full(len(D), -np.inf)
-        return cls(least, np.full_like(D, np.nan), np.full_like(theta, np.nan), none)
+        lost = np.full_like(D, np.nan)
+        return cls(least, lost, np.full_like(theta, np.nan), none, lost)
+
+
+class DiagonalModes(NamedTuple):
+    """The sine modes of even steps at P points, in the axes that diagonalise their covariances.
+
+    Attributes
+    ----------
+    axes : ndarray, shape (P, b, b)
+        Those axes as columns, not of unit length.
+    power, inverse : ndarray, shape (P, K, b)
+        Variances of the K modes along them, and one over these.
+    values, scaled : ndarray, shape (P, K, b)
+        Modes along them, and the same over their variances.
+    log_det : ndarray, shape (P,)
+        Logarithm of the determinant of a covariance less that of its variances.
+    """
+
+    axes: Floats
+    power: Floats
+    inverse: Floats
+    values: Floats
+    scaled: Floats
+    log_det: Floats
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,32 +127,45 @@ class NoisyVectors:
         D (P, b, b) and own (P, c) are those of P points. Amplitudes are squares and B = sin^2 / 4,
         so that the search has no edges.
         """
-        free = np.isfinite(self.freedom)
-        roots, angle = (own[:, : len(self.theta)] if free else np.empty((len(D), 0))), own[:, -1:]
-        theta = roots**2 if free else np.tile(self.theta, (len(D), 1))
-        B = np.full(len(D), self.B or 0.0)
-        if self.B is None:
-            B = np.array([_MOST_BLUR * float(one) ** 2 for one in np.sin(angle[:, 0])])
-        value, by_D, by_theta, by_B = self.by_tensor(D, theta, B)
+        theta, B = self.amplitudes(own)
+        found = self.by_tensor(D, theta, B)
+        value, by_theta = found.value, found.theta
         out = [np.empty((len(D), 0))]
-        if free:
-            if self.freedom:
-                ratio = self.theta / theta
-                value = value - 0.5 * self.freedom * np.sum(ratio - np.log(ratio), axis=1)
-                by_theta = by_theta - 0.5 * self.freedom * (1 - ratio) / theta
-            out.append(2 * roots * by_theta)
+        if np.isfinite(self.freedom):
+            measured, slope, _ = self.measurement(theta)
+            value = value + measured.sum(axis=1)
+            out.append(2 * own[:, : len(self.theta)] * (by_theta + slope))
         if self.B is None:
             value = value - _LEAST_BLUR * B
-            out.append((by_B - _LEAST_BLUR)[:, None] * _MOST_BLUR * np.sin(2 * angle))
-        return value, by_D, np.concatenate(out, axis=1)
+            slope = _MOST_BLUR * np.sin(2 * own[:, -1:])
+            out.append((found.B - _LEAST_BLUR)[:, None] * slope)
+        return value, found.D, np.concatenate(out, axis=1)
+
+    def amplitudes(self, own: Floats) -> tuple[Floats, Floats]:
+        """Return the noise amplitudes (P, r) and B (P,) of the free parameters (P, c)."""
+        free = np.isfinite(self.freedom)
+        theta = own[:, : len(self.theta)] ** 2 if free else np.tile(self.theta, (len(own), 1))
+        B = np.full(len(own), self.B or 0.0)
+        if self.B is None:
+            B = np.array([_MOST_BLUR * float(one) ** 2 for one in np.sin(own[:, -1])])
+        return theta, B
+
+    def measurement(self, theta: Floats) -> tuple[Floats, Floats, Floats]:
+        """Return the log-likelihood of the measured amplitudes and two derivatives, (..., r) each.
+
+        They are chi-squared with their degrees of freedom; 0 where they were not measured.
+        """
+        if not self.freedom:
+            return np.zeros_like(theta), np.zeros_like(theta), np.zeros_like(theta)
+        ratio, half = self.theta / theta, 0.5 * self.freedom
+        value = half * (np.log(ratio) - ratio)
+        return value, half * (ratio - 1) / theta, half * (1 - 2 * ratio) / theta**2
 
     def noise(self, D: Floats, own: Floats) -> Floats:
         """Return the mean noise O of a frame, less its blur, (b, b)."""
-        free = np.isfinite(self.freedom)
-        theta = own[: len(self.theta)] ** 2 if free else self.theta
-        B = _MOST_BLUR * float(np.sin(own[-1])) ** 2 if self.B is None else self.B
+        theta, B = self.amplitudes(own[None])
         shape = 0.5 * (self.steps.before + self.steps.after).mean(axis=1)
-        offset: Floats = np.tensordot(theta, shape, 1) - 2 * B * self.steps.dt * D
+        offset: Floats = np.tensordot(theta[0], shape, 1) - 2 * B[0] * self.steps.dt * D
         return offset
 
     @cached_property
@@ -150,42 +191,161 @@ class NoisyVectors:
         ]
         return TensorSlopes(*(np.concatenate(rows) for rows in zip(*points, strict=True)))
 
-    def by_sines(self, D: Floats, theta: Floats, B: Floats) -> TensorSlopes:
+    def by_sines(
+        self, D: Floats, theta: Floats, B: Floats, modes: DiagonalModes | None = None
+    ) -> TensorSlopes:
         """Evaluate even steps: mode k of the sine transform has covariance 2 D tau + w_k O.
 
         All modes are diagonal in the axes that diagonalise D against 2 D tau + 2 O. A LinAlgError
-        is raised if that sum is not positive definite at one of the points.
+        is raised if that sum is not positive definite at one of the points. `modes` are those of
+        these points where they are known.
         """
-        z, w = self.spectrum
-        s = self.steps
-        shapes, tau = s.before[:, 0], float(s.duration[0])
-        blur = (B * s.dt)[:, None, None]
-        noise = np.tensordot(theta, shapes, 1) - 2 * blur * D
-        root = np.linalg.inv(np.linalg.cholesky(2 * tau * D + 2 * noise))
-        across = np.swapaxes(root, 1, 2)
-        share, turn = np.linalg.eigh(root @ (2 * tau * D) @ across)
-        axes = across @ turn
-        power = share[:, None] + 0.5 * w[:, None] * (1 - share[:, None])
-        inverse = 1 / power
-        u = z @ axes
-        q = u / power
+        s, tau, (z, w) = self.steps, float(self.steps.duration[0]), self.spectrum
+        modes = self.modes(D, theta, B) if modes is None else modes
+        axes, power, inverse, q = modes.axes, modes.power, modes.inverse, modes.scaled
         columns, back = np.swapaxes(q, 1, 2), np.swapaxes(axes, 1, 2)
         same, next_one = columns @ q, columns @ (w[:, None] * q)
         kept = np.arange(D.shape[1])
         same[:, kept, kept] -= inverse.sum(axis=1)
         next_one[:, kept, kept] -= w @ inverse
         plain, weighted = axes @ same @ back, axes @ next_one @ back
-        log_det = np.log(power).sum(axis=(1, 2))
-        log_det -= 2 * len(z) * np.log(root[:, kept, kept]).sum(axis=1)
-        value = -0.5 * (log_det + (u * q).sum(axis=(1, 2)))
-        by_theta = 0.5 * np.einsum("jab,pab->pj", shapes, weighted)
+        log_det = np.log(power).sum(axis=(1, 2)) + len(z) * modes.log_det
+        value = -0.5 * (log_det + (modes.values * q).sum(axis=(1, 2)))
+        by_theta = 0.5 * np.einsum("jab,pab->pj", s.before[:, 0], weighted)
         by_B = -s.dt * (weighted * D).reshape(len(D), -1).sum(axis=1)
-        found = TensorSlopes(value, tau * plain - blur * weighted, by_theta, by_B)
+        by_D = tau * plain - (B * s.dt)[:, None, None] * weighted
+        found = TensorSlopes(value, by_D, by_theta, by_B, 0.5 * weighted)
         bad = ~(power.min(axis=(1, 2)) > 0)
         if bad.any():
             for values, undefined in zip(found, TensorSlopes.undefined(D, theta), strict=True):
                 values[bad] = undefined[bad]
         return found
+
+    def modes(self, D: Floats, theta: Floats, B: Floats) -> DiagonalModes:
+        """Return the sine modes of even steps in the axes that diagonalise all of them."""
+        z, w = self.spectrum
+        s, tau = self.steps, float(self.steps.duration[0])
+        noise = np.tensordot(theta, s.before[:, 0], 1) - 2 * (B * s.dt)[:, None, None] * D
+        root = np.linalg.inv(np.linalg.cholesky(2 * tau * D + 2 * noise))
+        across = np.swapaxes(root, 1, 2)
+        share, turn = np.linalg.eigh(root @ (2 * tau * D) @ across)
+        axes = across @ turn
+        power = share[:, None] + 0.5 * w[:, None] * (1 - share[:, None])
+        inverse, values = 1 / power, z @ axes
+        kept = np.arange(D.shape[1])
+        log_det = -2 * np.log(root[:, kept, kept]).sum(axis=1)
+        return DiagonalModes(axes, power, inverse, values, values * inverse, log_det)
+
+    def covariance_slopes(self, E: Floats, D: Floats, B: float) -> tuple[Floats, Floats]:
+        """Return the slopes of 2 D (m, b, b) and of the noise less blur (m + 1, b, b).
+
+        They are those along directions E (m, b, b) of D; the last one of the noise is that in B.
+        """
+        blur = -2 * self.steps.dt * np.concatenate([B * E, D[None]])
+        return 2 * E, blur
+
+    def sine_curvatures(self, E: Floats, D: Floats, B: float, modes: DiagonalModes) -> Floats:
+        """Return minus the second derivatives along E, in theta and in B, of even steps.
+
+        They are those of the covariances alone, as if these were linear. With the slopes
+        X_i = A_i + w_k N_i of mode k and its inverse covariance V, they are
+        y^T V X_i V X_j V y - tr(V X_i V X_j)/2 summed over the modes.
+        """
+        _, w = self.spectrum
+        axes, inverse, q = modes.axes[0], modes.inverse[0], modes.scaled[0]
+        of_D, of_noise = self.covariance_slopes(E, D, B)
+        shapes = self.steps.before[:, 0]
+        count, b = len(E) + len(shapes) + 1, len(D)
+        same = np.zeros((count, b, b))
+        same[: len(E)] = float(self.steps.duration[0]) * of_D
+        next_one = np.concatenate([of_noise[:-1], shapes, of_noise[-1:]])
+        same, next_one = (axes.T @ x @ axes for x in (same, next_one))
+        # Sums over the modes of q_a q_b V_c and of V_a V_c, times 1, w and w^2.
+        powers = w[:, None, None] ** np.arange(3)[:, None]
+        weights = (inverse[:, None] * powers).reshape(-1, 3 * b)
+        power = (q[:, :, None] * q[:, None]).reshape(-1, b * b).T @ weights
+        power, trace = power.reshape(b, b, 3, b), (inverse.T @ weights).reshape(b, 3, b)
+
+        def form(k: int, left: Floats, right: Floats) -> Floats:
+            turned = np.tensordot(right, power[:, :, k], axes=([2], [1]))  # (j, c, a, c')
+            turned = np.einsum("jcac->jac", turned) - 0.5 * trace[:, k] * np.swapaxes(right, 1, 2)
+            return np.asarray(left.reshape(count, -1) @ turned.reshape(count, -1).T)
+
+        mixed = form(1, same, next_one)
+        total: Floats = form(0, same, same) + mixed + mixed.T + form(2, next_one, next_one)
+        return total
+
+    def band_curvatures(self, E: Floats, D: Floats, theta: Floats, B: float) -> Floats:
+        """Return the average of observed and expected information along E, in theta and in B.
+
+        With z = C^-1 y and the slopes X_i of C it is z^T X_i C^-1 X_j z/2 (Gilmour, Thompson and
+        Cullis 1995), which needs no trace.
+        """
+        from scipy.linalg.lapack import dpbtrs
+
+        s = self.steps
+        diagonal, off_diagonal = self.bands(D, theta, B)
+        factor, _, log_det = band_factor(diagonal, off_diagonal)
+        if not np.isfinite(log_det):
+            return np.full((len(E) + len(theta) + 1,) * 2, np.nan)
+        z = dpbtrs(factor, s.vectors.reshape(-1), lower=1)[0].reshape(s.vectors.shape)
+        of_D, of_noise = self.covariance_slopes(E, D, B)
+        linked, none = s.linked[:-1, None], np.zeros_like(D)
+
+        def product(of_D: Floats, before: Floats, after: Floats) -> Floats:
+            """Return X z for the slopes of 2 D and of the noise before and after each step."""
+            out: Floats = s.duration[:, None] * (z @ of_D)
+            out += np.einsum("sab,sb->sa", before + after, z)
+            out[:-1] -= linked * np.einsum("sab,sb->sa", after[:-1], z[1:])
+            out[1:] -= linked * np.einsum("sab,sb->sa", after[:-1], z[:-1])
+            return out
+
+        blur = [np.broadcast_to(one, s.before.shape[1:]) for one in of_noise]
+        products = [product(d, n, n) for d, n in zip(of_D, blur[:-1], strict=True)]
+        products += [product(none, *x) for x in zip(s.before, s.after, strict=True)]
+        products.append(product(none, blur[-1], blur[-1]))
+        columns = np.stack([x.reshape(-1) for x in products], axis=1)
+        return np.asarray(0.5 * columns.T @ dpbtrs(factor, columns, lower=1)[0])
+
+    def curvatures(self, D: Floats, slopes: Floats, bends: Floats, own: Floats) -> Floats:
+        """Return minus the Hessian by the parameters of D and of the noise, (m + c, m + c).
+
+        `slopes` (m, b, b) and `bends` (m, m, b, b) are the derivatives of D by its parameters, and
+        `own` (c,) the free parameters of the noise. For steps that are not even the second
+        derivatives by the covariance are the average of observed and expected information.
+        """
+        theta, B = self.amplitudes(own[None])
+        m, r = len(slopes), len(self.theta)
+        if self.steps.even:
+            modes = self.modes(D[None], theta, B)
+            found = self.by_sines(D[None], theta, B, modes)
+            full = self.sine_curvatures(slopes, D, float(B[0]), modes)
+        else:
+            found = self.by_tensor(D[None], theta, B)
+            full = self.band_curvatures(slopes, D, theta[0], float(B[0]))
+        full[:m, :m] -= np.tensordot(bends, found.D[0], 2)
+        # The noise less its blur contains -2 B dt D, which is not linear.
+        mixed = 2 * self.steps.dt * np.tensordot(slopes, found.noise[0], 2)
+        full[:m, -1] += mixed
+        full[-1, :m] += mixed
+        kept, turn = list(range(m)), np.ones(m + r + 1)
+        amplitudes, by_theta = np.arange(m, m + r), found.theta[0]
+        if np.isfinite(self.freedom):
+            _, slope, bend = self.measurement(theta[0])
+            by_theta = by_theta + slope
+            full[amplitudes, amplitudes] -= bend
+            kept += amplitudes.tolist()
+            turn[m : m + r] = 2 * own[:r]
+        if self.B is None:
+            kept.append(m + r)
+            turn[-1] = _MOST_BLUR * np.sin(2 * own[-1])
+        full *= turn[:, None] * turn
+        if np.isfinite(self.freedom):
+            full[amplitudes, amplitudes] -= 2 * by_theta
+        if self.B is None:
+            twice = 2 * _MOST_BLUR * np.cos(2 * own[-1])
+            full[-1, -1] -= (found.B[0] - _LEAST_BLUR) * twice
+        return np.asarray(full[np.ix_(kept, kept)])
 
     def by_bands(self, D: Floats, theta: Floats, B: float) -> TensorSlopes:
         """Evaluate any steps at one point by banded Cholesky factors of their covariance.
@@ -197,11 +357,7 @@ class NoisyVectors:
         from scipy.linalg.lapack import dpbtrs
 
         s = self.steps
-        blur = 2 * B * s.dt * D
-        first = np.tensordot(theta, s.before, 1) - blur
-        last = np.tensordot(theta, s.after, 1) - blur
-        diagonal = 2 * D * s.duration[:, None, None] + first + last
-        off_diagonal = -last[:-1] * s.linked[:-1, None, None]
+        diagonal, off_diagonal = self.bands(D, theta, B)
         down, pivots, log_det = band_factor(diagonal, off_diagonal)
         _, up_pivots, log_up = band_factor(diagonal[::-1], off_diagonal[::-1])
         if not np.isfinite(log_det + log_up):
@@ -218,7 +374,18 @@ class NoisyVectors:
         by_theta -= np.einsum("jsab,sab->j", s.after[:, :-1], next_one)
         by_B = -s.dt * float(np.sum(weighted * D))
         by_D = np.tensordot(s.duration, same, 1) - B * s.dt * weighted
-        return TensorSlopes(np.array([value]), by_D[None], by_theta[None], np.array([by_B]))
+        return TensorSlopes(
+            np.array([value]), by_D[None], by_theta[None], np.array([by_B]), 0.5 * weighted[None]
+        )
+
+    def bands(self, D: Floats, theta: Floats, B: float) -> tuple[Floats, Floats]:
+        """Return the blocks of the covariance of the steps on the diagonal and next to it."""
+        s = self.steps
+        blur = 2 * B * s.dt * D
+        first = np.tensordot(theta, s.before, 1) - blur
+        last = np.tensordot(theta, s.after, 1) - blur
+        diagonal = 2 * D * s.duration[:, None, None] + first + last
+        return diagonal, -last[:-1] * s.linked[:-1, None, None]
 
 
 def band_factor(diagonal: Floats, off_diagonal: Floats) -> tuple[Floats, Floats, float]:
@@ -272,15 +439,17 @@ def squares(basis: Floats) -> Family:
 
     Examples
     --------
-    >>> D, slopes = squares(np.eye(3)[None])(np.array([2.0]))
+    >>> D, slopes, _ = squares(np.eye(3)[None])(np.array([2.0]))
     >>> D.diagonal(), slopes[0].diagonal()
     (array([4., 4., 4.]), array([4., 4., 4.]))
     """
+    products = basis[:, None] @ basis
+    bends = products + np.swapaxes(products, 0, 1)
 
-    def family(q: Floats) -> tuple[Floats, Floats]:
-        root = np.tensordot(q, basis, 1)
+    def family(q: Floats) -> tuple[Floats, Floats, Floats]:
+        root: Floats = np.tensordot(q, basis, 1)
         slope = basis @ root
-        return root @ root, slope + np.swapaxes(slope, 1, 2)
+        return root @ root, slope + np.swapaxes(slope, 1, 2), bends
 
     return family
 
@@ -292,22 +461,34 @@ def axial(axis: Floats) -> Family:
 
     Examples
     --------
-    >>> D, slopes = axial(np.array([0.0, 0.0, 1.0]))(np.array([1.0, 2.0, 0.0, 0.0]))
+    >>> D, slopes, _ = axial(np.array([0.0, 0.0, 1.0]))(np.array([1.0, 2.0, 0.0, 0.0]))
     >>> D.diagonal(), slopes.shape
     (array([1., 1., 4.]), (4, 3, 3))
     """
     across = np.linalg.svd(axis[None])[2][1:]
 
-    def family(q: Floats) -> tuple[Floats, Floats]:
+    eye = np.eye(3)
+
+    def family(q: Floats) -> tuple[Floats, Floats, Floats]:
         v = axis + q[2:] @ across
-        u = v / np.linalg.norm(v)
+        length = float(np.linalg.norm(v))
+        u = v / length
         along = np.outer(u, u)
-        tilt = (across - np.outer(across @ u, u)) / np.linalg.norm(v)
+        share = across @ u
+        tilt = (across - np.outer(share, u)) / length  # slopes of u
         turned = np.einsum("ka,b->kab", tilt, u)
+        turned += np.swapaxes(turned, 1, 2)  # slopes of u u^T
+        second = np.einsum("l,ka->kla", share, tilt) + np.einsum("k,la->kla", share, tilt)
+        second = -(second + (tilt @ across.T)[..., None] * u) / length  # second derivatives of u
+        twice = np.einsum("kla,b->klab", second, u) + np.einsum("ka,lb->klab", tilt, tilt)
         span = q[1] ** 2 - q[0] ** 2
-        slopes = [2 * q[0] * (np.eye(3) - along), 2 * q[1] * along]
-        slopes += list(span * (turned + np.swapaxes(turned, 1, 2)))
-        return q[0] ** 2 * (np.eye(3) - along) + q[1] ** 2 * along, np.array(slopes)
+        slopes = np.concatenate([[2 * q[0] * (eye - along), 2 * q[1] * along], span * turned])
+        bends = np.zeros((4, 4, 3, 3))
+        bends[0, 0], bends[1, 1] = 2 * (eye - along), 2 * along
+        bends[0, 2:], bends[1, 2:] = -2 * q[0] * turned, 2 * q[1] * turned
+        bends[2:, 0], bends[2:, 1] = bends[0, 2:], bends[1, 2:]
+        bends[2:, 2:] = span * (twice + np.swapaxes(twice, 2, 3))
+        return q[0] ** 2 * eye + span * along, slopes, bends
 
     return family
 
@@ -333,8 +514,9 @@ class Maximum(NamedTuple):
 def maximise(tracks: Sequence[NoisyVectors], family: Family, q: Floats, own: Floats) -> Maximum:
     """Return the maximum over a family of D, common to all, and over the noise of each motion.
 
-    The search is quasi-Newton (BFGS) and begins with a true Hessian, which is computed again where
-    no step increases the likelihood, and after every 30 steps. It ends at a root of the slopes.
+    The search is quasi-Newton (BFGS) and begins with the Hessian, with the average information in
+    it where steps are not even; it is computed again where no step increases the likelihood, and
+    after every 30 steps. The search ends at a root of the slopes.
 
     Examples
     --------
@@ -351,7 +533,7 @@ def maximise(tracks: Sequence[NoisyVectors], family: Family, q: Floats, own: Flo
     p = np.concatenate([q, own.ravel()])
     value, slope = problem.slopes(p)
     for _ in range(20):
-        inverse = problem.hessian(p).inverse()
+        inverse = problem.curvatures(p).inverse()
         for _ in range(30):
             step = inverse @ slope
             gain = 0.5 * float(slope @ step)
@@ -394,8 +576,10 @@ def spread(tracks: Sequence[NoisyVectors], best: Maximum, basis: Floats) -> tupl
     root = (axes * np.sqrt(np.maximum(values, 1e-4 * values[-1]))) @ axes.T
     directions = root @ basis @ root
 
-    def family(q: Floats) -> tuple[Floats, Floats]:
-        return best.D + np.tensordot(q, directions, 1), directions
+    straight = np.zeros((len(basis), len(basis), *best.D.shape))
+
+    def family(q: Floats) -> tuple[Floats, Floats, Floats]:
+        return best.D + np.tensordot(q, directions, 1), directions, straight
 
     problem = PooledLikelihood(tracks, family, len(basis), best.own.shape)
     known = problem.hessian(np.append(np.zeros(len(basis)), best.own)).information()
@@ -436,8 +620,8 @@ class PooledLikelihood:
 
     def slopes_at(self, points: Floats) -> tuple[Floats, Floats]:
         """Return the log-likelihoods (P,) and their slopes (P, m + Gc) at P points."""
-        pairs = [self.family(p[: self.m]) for p in points]
-        D, jacobian = (np.array(part) for part in zip(*pairs, strict=True))
+        tensors = [self.family(p[: self.m])[:2] for p in points]
+        D, jacobian = (np.array(part) for part in zip(*tensors, strict=True))
         own = points[:, self.m :].reshape(len(points), *self.shape)
         found = [s.slopes(D, own[:, g]) for g, s in enumerate(self.tracks)]
         by_D = np.sum([part[1] for part in found], axis=0)
@@ -456,11 +640,20 @@ class PooledLikelihood:
                 return p + part * step, new_value, slope
         return None
 
+    def curvatures(self, p: Floats) -> ArrowHessian:
+        """Return minus the Hessian, with the average information of steps that are not even."""
+        tensors, m = self.family(p[: self.m]), self.m
+        own = p[m:].reshape(self.shape)
+        found = np.array([t.curvatures(*tensors, o) for t, o in zip(self.tracks, own, strict=True)])
+        return ArrowHessian(found[:, :m, :m].sum(axis=0), found[:, :m, m:], found[:, m:, m:])
+
     def hessian(self, p: Floats) -> ArrowHessian:
-        """Return minus the Hessian by central differences.
+        """Return minus the Hessian, by central differences where the steps are not even.
 
         The noise of one motion does not enter the slopes of the others, so all change at once.
         """
+        if all(t.steps.even for t in self.tracks):
+            return self.curvatures(p)
         count, c = self.shape
         one, other = np.eye(self.m, len(p)), np.zeros((c, len(p)))
         other[:, self.m :] = np.tile(np.eye(c), count)

@@ -128,8 +128,10 @@ def diffusion_tensor(
     steps = [body_steps(m, quantity, turn) for m, turn in zip(motions, turns, strict=True)]
     data = ScaledTracks.of(steps, Noise.of(noise, exposure=exposure))
     free = data.fit(symmetric_basis(3))
-    p_isotropic, p_axial = data.p_values(free)
-    best = free if len(basis) == 6 else data.fit(basis, near=free)
+    isotropic = data.fit(np.eye(3)[None] / 3**0.5, near=free)
+    p_isotropic, p_axial = data.p_values(free, isotropic)
+    known = {6: free, 1: isotropic}  # by the number of tensors that span what the symmetry allows
+    best = known[len(basis)] if len(basis) in known else data.fit(basis, near=free)
     tensor = data.in_units(best.D)
     covariance = data.covariance(best, basis, SYMMETRIC_ELEMENTS)
     if np.isnan(covariance).any():
@@ -469,11 +471,10 @@ class ScaledTracks:
             found.append(maximise(self.tracks, axial(axes[:, k]), q, near.own))
         return max(found, key=lambda m: m.value)
 
-    def p_values(self, free: Maximum) -> tuple[float, float]:
+    def p_values(self, free: Maximum, isotropic: Maximum) -> tuple[float, float]:
         """Return the p-values of isotropy and of axial symmetry from likelihood ratios."""
         from scipy.special import chdtrc
 
-        isotropic = self.fit(np.eye(3)[None] / 3**0.5, near=free)
         p_isotropic, p_axial = (
             float(chdtrc(freedom, max(2 * (free.value - restricted.value), 0.0)))
             for freedom, restricted in ((5, isotropic), (2, self.fit_axial(free)))

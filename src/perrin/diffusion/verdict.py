@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings as python_warnings
+from collections import Counter
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
@@ -15,6 +16,7 @@ from perrin.diffusion.confined import ConfinedEstimate, fit_confined
 from perrin.diffusion.estimate import DiffusionEstimate
 from perrin.diffusion.estimators import estimate_diffusion
 from perrin.diffusion.goodness_of_fit import (
+    FEWEST_HALF_PERIODS,
     BrownianTests,
     Score,
     axis_model,
@@ -55,6 +57,8 @@ _DETECTED, _DETECTED_MEAN = 2.8, 3.3
 
 _RELAXATIONS_SEEN = 12.0  # steps per squared cage radius (in steps) that show a cage
 
+_COARSE_TURN = 0.2  # 4 D_R dt beyond which rotation vectors lose the turns between frames
+
 _SCATTER_DRAWS = 199  # draws that give the scatter of the two scores of a slow change
 
 _SHAPE_TESTS = ("fractional", "cage", "steady")
@@ -89,7 +93,8 @@ class MotionVerdict:
         What this track could have shown: exponents "alpha_below" and "alpha_above", a "cage" of
         smaller rms radius (rad or um), and a faster "spin" (rad/s) or "drift" (um/s). The test for
         an exponent or a steady motion at its limit rejects in about 80 % of cases at 5 %, that for
-        a cage in half of them; the family of tests rejects nearly always at twice the distance.
+        a cage in half of them; the family of tests rejects nearly always at twice the distance. All
+        None where the body turns too far between frames.
     model : AnomalousEstimate, ConfinedEstimate, DiffusionEstimate, SwitchingEstimate or None
         Fitted alternative; a `DiffusionEstimate` with its drift where the motion is steady; None
         for diffusion, jumps and vibration, and for several motions whose D changes.
@@ -216,12 +221,20 @@ def judge_motion(
     'spin'
     """
     motions = [motion] if isinstance(motion, RigidMotion) else list(motion)
+    strange = [type(m).__name__ for m in motions if not isinstance(m, RigidMotion)]
+    if strange or not motions:
+        raise TypeError(
+            "motion: expected a RigidMotion or several (track_rotation makes one from positions), "
+            f"got {listed(sorted(set(strange))) or 'none'}"
+        )
     faults = [
         *choice_fault("quantity", quantity, get_args(Quantity)),
         *noise_faults(noise, exposure),
     ]
     if len({m.dimension for m in motions}) != 1:
         faults.append("motion: expected one or more motions, all in 2 or all in 3 dimensions")
+    if isinstance(noise, Noise) and noise.drift:
+        faults.append("noise: expected no drift; the verdict tests for a steady motion itself")
     refuse(faults)
     settings = Noise.of(noise, exposure=exposure)
     tested = [brownian_tests(*axis_model(m, quantity, settings)) for m in motions]
@@ -230,7 +243,10 @@ def judge_motion(
     )
     if len(motions) == 1:
         return each[0]
-    return replace(_verdict(motions, tested, quantity, settings), each=each)
+    together = _verdict(motions, tested, quantity, settings)
+    counts = Counter(one.kind for one in each).most_common()
+    singly = ", ".join(f"{count} {kind}" for kind, count in counts)
+    return replace(together, text=f"{together.text} Singly: {singly}.", each=each)
 
 
 def _verdict(
@@ -243,6 +259,15 @@ def _verdict(
     p = combined_p(tested)
     p_family = holm(np.array(list(p.values())))
     detectable = detectable_by(tested, quantity)
+    text = _diffusion_text(p_family, len(p), detectable, quantity)
+    turn = max(4 * float(np.mean(one.fit.D) * one.model.tau.mean()) for one in tested)
+    if quantity == "rotation" and motions[0].dimension == 3 and turn > _COARSE_TURN:
+        detectable = dict.fromkeys(detectable)
+        text = (
+            f"No test rejects diffusion of the rotation (p = {p_family:.2g}), but the body turns "
+            f"too far between frames for most of them (4 D_R dt = {turn:.2g}, over "
+            f"{_COARSE_TURN}): sample faster."
+        )
     verdict = MotionVerdict(
         kind="diffusion",
         p=p,
@@ -250,7 +275,7 @@ def _verdict(
         detectable=detectable,
         model=None,
         frames=(),
-        text=_diffusion_text(p_family, len(p), detectable, quantity),
+        text=text,
         quantity=quantity,
         n_frames=sum(m.fitted.size for m in motions),
     )
@@ -412,21 +437,30 @@ def _variance(
     if min(clustering, slow_change) > LEVEL:
         return _jumps(verdict, rows if len(motions) == 1 else [])
     if slow_change < clustering and _noise_changes(motions, tested):
-        text = (
-            f"{_SUBJECT[quantity]} is consistent with diffusion whose measurement noise changes "
-            "along the track"
-        )
-        return replace(verdict, text=_with_p(text, verdict.p_family))
+        return _changing_noise(verdict)
     if len(motions) > 1:
         # Every body has states of its own: the verdicts on each hold the fits.
         text = f"The diffusion coefficient of the {quantity} changes in time"
         return replace(verdict, kind="changing D", text=_with_p(text, verdict.p_family))
-    model = fit_switching(motions[0], quantity=quantity, noise=settings)
+    try:
+        model = fit_switching(motions[0], quantity=quantity, noise=settings)
+    except ValueError:
+        # The steps are all noise: with D = 0 it is the noise that changes.
+        return _changing_noise(verdict)
     if model.dwell_fast.value < motions[0].usual_interval:
         # A state that lasts less than a frame is single long steps.
         return _jumps(verdict, np.flatnonzero(model.states[0] == 1).tolist())
     text = _model_text("changing D", model, quantity)
     return replace(verdict, kind="changing D", model=model, text=_with_p(text, verdict.p_family))
+
+
+def _changing_noise(verdict: MotionVerdict) -> MotionVerdict:
+    """Return the verdict of diffusion, with a text that its noise changes."""
+    text = (
+        f"{_SUBJECT[verdict.quantity]} is consistent with diffusion whose measurement noise "
+        "changes along the track"
+    )
+    return replace(verdict, text=_with_p(text, verdict.p_family))
 
 
 def _jumps(verdict: MotionVerdict, rows: Sequence[int]) -> MotionVerdict:
@@ -469,8 +503,9 @@ def _period(tested: Sequence[BrownianTests]) -> float:
     for one in tested:
         modes = np.sum(one.model.mode_ratios(one.fit), axis=1)[0]
         # A vibration of any phase spreads over neighbouring sine modes: their centre of power.
-        largest = int(np.argmax(modes))
-        around = np.arange(max(0, largest - 2), min(len(modes), largest + 3))
+        slowest = FEWEST_HALF_PERIODS - 1
+        largest = slowest + int(np.argmax(modes[slowest:]))
+        around = np.arange(largest - 2, min(len(modes), largest + 3))
         k = 1 + float(np.average(around, weights=modes[around]))
         period = 2 * (one.model.n_steps + 1) * float(one.model.tau.mean()) / k
         peaks.append((float(largest_share(modes, one.fit.D.shape[1])), period))
@@ -486,7 +521,7 @@ def _diffusion_text(
     low, high = detectable["alpha_below"] or 0.0, detectable["alpha_above"] or 2.0
     ends = [f"below {low:.2f}"] * (low > 0) + [f"above {high:.2f}"] * (high < 2)
     shown = [
-        f"an exponent {' or '.join(ends)}" if ends else "no exponent between 0 and 2",
+        f"an exponent {' or '.join(ends)}" if ends else "an exponent of 0 or 2 at most",
         f"a cage under {number_text(detectable['cage'] or 0.0, digits=2)} {unit}",
         f"a {steady} over {number_text(detectable[steady] or 0.0, digits=2)} {unit}/s",
     ]
@@ -499,13 +534,19 @@ def _diffusion_text(
 def _model_text(kind: Kind, model: Model, quantity: Quantity) -> str:
     """Return the sentence on a fitted alternative, without its end."""
     if isinstance(model, DiffusionEstimate):
-        steady = model.drift[0] if model.drift else ()
-        errors = model.drift_stderr[0] if model.drift_stderr else ()
-        speed = float(np.linalg.norm(steady))
-        error = float(np.linalg.norm(np.multiply(steady, errors))) / speed if speed else np.nan
-        verb = "turns" if quantity == "rotation" else "moves"
+        speeds = []
+        for steady, errors in zip(model.drift or (), model.drift_stderr or (), strict=True):
+            speed = float(np.linalg.norm(steady))
+            error = float(np.linalg.norm(np.multiply(steady, errors))) / speed if speed else np.nan
+            speeds.append((speed, error))
+        verb = "turn" if quantity == "rotation" else "move"
         unit = "rad/s" if quantity == "rotation" else "um/s"
-        return f"The body {verb} steadily at {number_text(speed, error)} {unit} while it diffuses"
+        if len(speeds) == 1:
+            return (
+                f"The body {verb}s steadily at {number_text(*speeds[0])} {unit} while it diffuses"
+            )
+        low, high = number_text(*min(speeds)), number_text(*max(speeds))
+        return f"The bodies {verb} steadily, at {low} to {high} {unit}, while they diffuse"
     subject = _SUBJECT[quantity]
     words = {
         "subdiffusion": f"{subject} is subdiffusive",
@@ -513,6 +554,8 @@ def _model_text(kind: Kind, model: Model, quantity: Quantity) -> str:
         "confined": f"{subject} is confined",
         "changing D": f"The diffusion coefficient of the {quantity} changes in time",
     }
+    if isinstance(model, SwitchingEstimate) and not model.two_states:
+        return f"{words[kind]}, not between two values but slowly or in another way"
     return f"{words[kind]}: {model}"
 
 

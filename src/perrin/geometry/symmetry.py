@@ -192,6 +192,8 @@ def _congruences(x: Floats, onto: Floats, tolerance: float) -> tuple[Ints, Float
         & (np.abs(np.linalg.norm(onto[:, None] - onto, axis=2) - gap) <= 4 * tolerance)
     )
     k, m = np.nonzero(alike)
+    if not k.size:
+        return np.empty((0, len(x)), dtype=np.int64), np.empty(0)
     origin = np.zeros((len(k), 3))
     rotation, unique = fit_rotations(
         np.stack([origin, onto[k], onto[m]], axis=1), np.stack([np.zeros(3), x[i], x[j]])
@@ -201,6 +203,8 @@ def _congruences(x: Floats, onto: Floats, tolerance: float) -> tuple[Ints, Float
         rotated, before = x @ np.swapaxes(rotation, 1, 2), order
         order = np.argmin(np.linalg.norm(rotated[:, :, None] - onto, axis=3), axis=2)
         order = order[(np.sort(order, axis=1) == np.arange(len(x))).all(axis=1)]
+        if not order.size:
+            return order, np.empty(0)
         if np.array_equal(order, before):
             break
         rotation, unique = fit_rotations(onto[order], x)

@@ -113,14 +113,15 @@ class Residuals:
 
     def left_of(self, displacement: Floats) -> Floats:
         """Return what a rigid fit leaves of displacements (K, n, d), less their mean shape."""
-        left = np.einsum("nmij,tmj->tni", self.keeps, displacement)
+        n, d = self.template.shape
+        keeps = self.keeps.transpose(0, 2, 1, 3).reshape(n * d, n * d)
+        left = (displacement.reshape(-1, n * d) @ keeps.T).reshape(-1, n, d)
         from_mean: Floats = left - left.mean(axis=0)
         return from_mean
 
     def in_lab(self, vectors: Floats) -> Floats:
         """Return vectors (K, n, d) given in body axes along the axes of the lab."""
-        turned: Floats = np.einsum("tij,tnj->tni", self.rotation, vectors)
-        return turned
+        return np.asarray(vectors @ np.swapaxes(self.rotation, 1, 2))
 
 
 class Slope(NamedTuple):
@@ -432,11 +433,10 @@ def axis_noise(sample: Residuals) -> AxisNoise | None:
     d = turn.shape[-1]
     if count < 3 or not (sample.vector**2).sum() > 0:
         return None
-    back = np.swapaxes(turn, -1, -2)
-    mix = np.zeros((count, d, d))
-    for row in sample.keeps:
-        for block in row:
-            mix += (turn @ block @ back) ** 2
+    # The squares of the elements of turn K turn^T, summed over the blocks K of the projector.
+    blocks = sample.keeps.reshape(-1, d * d)
+    pairs = (turn[:, :, None, :, None] * turn[:, None, :, None, :]).reshape(count, d, d, d * d)
+    mix = ((pairs @ (blocks.T @ blocks)) * pairs).sum(axis=-1)
     lab = sample.in_lab(sample.vector)
     square = (lab**2).sum(axis=1) * count / (count - 1)
     total = mix.sum(axis=0)
@@ -561,21 +561,25 @@ def _noise_products(sample: Residuals, left: Floats) -> tuple[Floats, Floats]:
     arm = np.linalg.pinv(inertia_tensor(r)) @ skew(r)
     # The derivative of u (u . r) with u -> u - delta x u; its last index is that of delta.
     up = turn[:, 2]
+    count, (n, d) = len(turn), r.shape
     turned = np.einsum("abd,td->tab", _LEVI_CIVITA, up)
-    height = up @ r.T
-    slope = -np.einsum("tab,tn->tnab", turned, height)
-    slope = slope - np.einsum("ta,tcb,nc->tnab", up, turned, r)
-    slope = np.einsum("nmij,tmjb->tnib", sample.keeps, slope)
-    shared = np.einsum("lbp,liqc->ibpqc", arm, sample.keeps)
+    slope = -turned[:, None] * (up @ r.T)[:, :, None, None]
+    slope = slope - up[:, None, :, None] * (r @ turned)[:, :, None, :]
+    keeps = sample.keeps.transpose(0, 2, 1, 3).reshape(n * d, n * d)
+    slope = keeps @ slope.reshape(count, n * d, 3)
+    shared = np.einsum("lbp,liqc->ibcpq", arm, sample.keeps).reshape(-1, 9)
     products, squares = np.empty(3), np.empty(3)
     for axis in range(3):
-        noise = turn[:, axis, :, None] * turn[:, axis, None, :]
-        c = np.einsum("nab,tbc,ndc->tad", arm, noise, arm)
-        shift = 0.5 * (np.einsum("tab,nb->tna", c, r) - np.einsum("tbb,na->tna", c, r))
-        shift -= np.einsum("abc,nbp,tpc->tna", _LEVI_CIVITA, arm, noise)
-        crossed = np.einsum("ibpqc,tpq->tibc", shared, noise)
-        products[axis] = (left * shift).sum() + np.einsum("tncb,tnbc->", slope, crossed)
-        squares[axis] = np.einsum("tnia,tab,tnib->", slope, c, slope)
+        u = turn[:, axis]
+        turns = np.einsum("nab,tb->tna", arm, u)  # what unit noise along this axis turns the fit by
+        c = np.swapaxes(turns, 1, 2) @ turns
+        shift = 0.5 * (r @ c - np.trace(c, axis1=1, axis2=2)[:, None, None] * r)
+        shift -= np.cross(turns, u[:, None])
+        noise = (u[:, :, None] * u[:, None, :]).reshape(count, 9)
+        crossed = (noise @ shared.T).reshape(count, n, 3, d)
+        of_slope = slope.reshape(count, n, d, 3)
+        products[axis] = (left * shift).sum() + (of_slope * np.swapaxes(crossed, 2, 3)).sum()
+        squares[axis] = ((slope @ c) * slope).sum()
     return products, squares
 
 

@@ -188,7 +188,10 @@ def correlation(study: Study) -> Item:
     for degree in (1, 2):
         rate = degree * (degree + 1)
         values = np.stack(
-            [orientation_correlation(track, degree=degree).value[:100] for track in tracks]
+            [
+                orientation_correlation(track, degree=degree, noise=None).value[:100]
+                for track in tracks
+            ]
         )
         table[f"degree_{degree}"] = values.mean(axis=0)
         table[f"expected_{degree}"] = np.exp(-rate * D * table["lag_ts"])

@@ -282,7 +282,10 @@ def _cluster_section(
         "sampling": [
             (letter, str(judge_sampling(estimate, axes=axes)))
             for letter, estimate, axes in (("R", result.D_R, 2 * d - 3), ("T", result.D_T, d))
-            if estimate.dt > 0 and 0 < estimate.ci95[1] < np.inf
+            if estimate.dt > 0
+            and 0 < estimate.ci95[1] < np.inf
+            # Advice on sampling is that for diffusion.
+            and estimate.motion in (None, "diffusion", "jumps")
         ],
         "prediction": _prediction_text(result.prediction),
         "sizes": [

@@ -700,7 +700,7 @@ def not_diffusion_warning(verdict: MotionVerdict, estimate: DiffusionEstimate) -
     name = "D_R" if estimate.quantity == "rotation" else "D_T"
     return (
         f"{_NOT_DIFFUSION} the {estimate.quantity} shows {_SHOWN_KINDS[verdict.kind]} "
-        f"({_p_text(verdict.p_family)}, all tests together); {name} holds {estimate.time_scale}"
+        f"({_p_text(verdict.p_family)}, all tests together); {name} {estimate.time_scale}"
     )
 
 

@@ -69,7 +69,7 @@ def motion_sentences(result: ClusterResult | Pooled, quantity: str) -> list[str]
         texts.append(f"Fitted: {verdict.model}.")
     name, estimate = ("D_R", result.D_R) if quantity == "rotation" else ("D_T", result.D_T)
     if verdict.kind != "diffusion" and estimate.time_scale:
-        texts.append(f"{name} holds {estimate.time_scale}.")
+        texts.append(f"{name} {estimate.time_scale}.")
     return texts
 
 
