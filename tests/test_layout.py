@@ -45,7 +45,7 @@ OLD_PATHS = {
     "grouping": "tracks.clusters",
 }
 LAZY = ("pandas", "scipy", "matplotlib", "pyarrow", "jinja2", "typer", "rich", "trackpy", "numba")
-LAZY += ("tifffile", "liffile", "nd2", "pylibCZIrw", "h5py", "zarr")
+LAZY += ("tifffile", "liffile", "nd2", "czifile", "oiffile", "h5py", "zarr", "imagecodecs")
 
 
 def loaded_after(statement: str) -> set[str]:

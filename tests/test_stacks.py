@@ -493,10 +493,12 @@ def test_imaris(tmp_path, movie):
         assert_same(stack, movie[0][:, None], dt=0.15)
 
 
-def test_zeiss(tmp_path, movie):
+@pytest.mark.parametrize("compression", ["uncompressed:", "zstd0:", "zstd1:"])
+def test_zeiss(tmp_path, movie, compression):
     """A .czi file written by Zeiss's own library, two channels."""
     czi = pytest.importorskip("pylibCZIrw.czi")
-    with czi.create_czi(str(tmp_path / "a.czi")) as file:
+    pytest.importorskip("czifile")
+    with czi.create_czi(str(tmp_path / "a.czi"), compression_options=compression) as file:
         for t, z, c in np.ndindex(5, 4, 2):
             plane = {"T": t, "Z": z, "C": c}
             file.write(movie[t, z, :, :, None] // (c + 1), plane=plane)
@@ -506,6 +508,8 @@ def test_zeiss(tmp_path, movie):
         open_stack(tmp_path / "a.czi", channel=0)
     with open_stack(tmp_path / "a.czi", channel=1, dt=DT) as stack:
         assert_same(stack, movie // 2)
+    with pytest.raises(ValueError, match="no image 1 among its only image"):
+        open_stack(tmp_path / "a.czi", channel=1, dt=DT, image=1)
 
 
 class NikonFile:
@@ -544,27 +548,37 @@ def test_nikon(tmp_path, movie, monkeypatch):
         assert stack.plane_time == pytest.approx(0.01)
 
 
-def lif_bytes(movie, voxel, dt):
-    """Return a small Leica file: an XML header in UTF-16, then one block of memory."""
+def lif_bytes(movie, voxel, dt, scan="xyzt", stamps=()):
+    """Return a small Leica file: an XML header in UTF-16, then one block of memory.
+
+    The letters of `scan` are the axes, fastest first; those left out have one element. `stamps`
+    are times of its images, s.
+    """
     t, z, y, x = movie.shape
+    about = {
+        "x": (1, x, voxel[2] * 1e-6, "m"),
+        "y": (2, y, voxel[1] * 1e-6, "m"),
+        "z": (3, z, voxel[0] * 1e-6, "m"),
+        "t": (4, t, dt, "s"),
+    }
+    single = set("tzyx") - set(scan)
+    memory = movie.transpose(["tzyx".index(axis) for axis in (*single, *scan[::-1])])
     step = movie.itemsize
     dimensions = ""
-    for number, n, length, unit in (
-        (1, x, voxel[2] * 1e-6, "m"),
-        (2, y, voxel[1] * 1e-6, "m"),
-        (3, z, voxel[0] * 1e-6, "m"),
-        (4, t, dt, "s"),
-    ):
+    for number, n, length, unit in (about[axis] for axis in scan):
         dimensions += (
             f'<DimensionDescription DimID="{number}" NumberOfElements="{n}" Origin="0" '
             f'Length="{(n - 1) * length!r}" Unit="{unit}" BitInc="0" BytesInc="{step}"/>'
         )
         step *= n
+    # Stamps count 100 ns since 1601.
+    ticks = [f"{int(133e15) + round(stamp * 1e7):x}" for stamp in stamps]
+    listed = f'<TimeStampList NumberOfTimeStamps="{len(ticks)}">{" ".join(ticks)}</TimeStampList>'
     image = (
         '<Data><Image><ImageDescription><Channels><ChannelDescription DataType="0" ChannelTag="0" '
         'Resolution="16" NameOfMeasuredQuantity="" Min="0" Max="65535" Unit="" LUTName="Gray" '
         'IsLUTInverted="0" BytesInc="0" BitInc="0"/></Channels>'
-        f"<Dimensions>{dimensions}</Dimensions></ImageDescription></Image></Data>"
+        f"<Dimensions>{dimensions}</Dimensions></ImageDescription>{listed}</Image></Data>"
         f'<Memory Size="{movie.nbytes}" MemoryBlockID="MemBlock_1"/>'
     )
     xml = (
@@ -582,7 +596,7 @@ def lif_bytes(movie, voxel, dt):
         return number(0x70) + number(len(head)) + head + data
 
     start = number(0x70) + number(len(xml) + 5) + b"\x2a" + number(len(xml) // 2) + xml
-    return start + block("MemBlock_0", b"") + block("MemBlock_1", movie.tobytes())
+    return start + block("MemBlock_0", b"") + block("MemBlock_1", memory.tobytes())
 
 
 def test_leica(tmp_path, movie):
@@ -592,11 +606,32 @@ def test_leica(tmp_path, movie):
     (tmp_path / "a.lif").write_bytes(data)
     with open_stack(tmp_path / "a.lif") as stack:
         assert_same(stack, movie)
+        assert stack.plane_time is None
+    clock = np.arange(5)[:, None] * DT + np.arange(4) * 0.15
+    (tmp_path / "c.lif").write_bytes(lif_bytes(movie, VOXEL, DT, stamps=clock.ravel()))
+    with open_stack(tmp_path / "c.lif") as stack:
+        assert_same(stack, movie)
+        assert stack.plane_time == pytest.approx(0.15)
     (tmp_path / "b.lif").write_bytes(data[: -movie[0].nbytes])
     with open_stack(tmp_path / "b.lif") as stack:
         np.testing.assert_array_equal(stack.frame(3), movie[3])
         with pytest.raises(FrameError, match="frame 4 of 5"):
             stack.frame(4)
+
+
+@pytest.mark.parametrize("scan", ["xzyt", "xyzt", "xzy", "xzt", "xz"])
+def test_leica_scans_across_the_planes(tmp_path, movie, scan):
+    """A scan of x and z at many y is a volume; at one y its z is the y of a movie of a plane."""
+    pytest.importorskip("liffile")
+    movie = movie if "t" in scan else movie[:1]
+    movie = movie if "y" in scan else movie[:, :, :1]
+    (tmp_path / "a.lif").write_bytes(lif_bytes(movie, VOXEL, DT, scan))
+    with open_stack(tmp_path / "a.lif") as stack:
+        if "y" in scan:
+            assert_same(stack, movie)
+        else:
+            assert_same(stack, movie.swapaxes(1, 2), voxel=(np.nan, VOXEL[0], VOXEL[2]))
+            assert stack.notes == ("the images are sections (z, x): their z is read as y",)
 
 
 def test_zarr_folder_without_scales(tmp_path):

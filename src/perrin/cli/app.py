@@ -241,7 +241,10 @@ def run(
         ),
     ] = None,
     channel: Annotated[
-        int | None, typer.Option(help="Number of the channel, from 0.", rich_help_panel=INPUT)
+        str | None,
+        typer.Option(
+            help="Number of the channel, from 0; several are summed: 0,1.", rich_help_panel=INPUT
+        ),
     ] = None,
     image: Annotated[
         str | None,
@@ -333,13 +336,14 @@ def run(
 
     with messages_of(run), state_kept_frames(output):
         check_resumable(output, parts="located", overwrite=overwrite)
+        channels = read_whole_numbers("--channel", channel)
         movie = perrin.open_stack(
             stack,
             voxel=None if voxel is None else read_numbers("--voxel", voxel),
             dt=dt,
             plane_time=plane_time,
             planes=planes,
-            channel=channel,
+            channel=channels[0] if len(channels) == 1 else channels or None,
             image=int(image) if image is not None and image.isdecimal() else image,
         )
         with movie, progress_bar() as progress:

@@ -15,13 +15,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from perrin._arrays import Floats, frozen, number_fault
 from perrin.errors import FrameError, PrecisionWarning
-from perrin.images.formats.contents import Contents, Pick, even_times, needed
-from perrin.images.formats.tiff import sequence, sequence_files, tiff
-from perrin.images.formats.vendors import vendor
+from perrin.images.formats.arrays import array_contents
+from perrin.images.formats.contents import Contents, Pick, needed, strange_lengths, summed
+from perrin.images.formats.folders import sequence, sequence_files
+from perrin.images.formats.tiff import tiff
+from perrin.images.formats.vendors import WAY_OUT, vendor
 from perrin.tracks.writing import written_whole
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterator, Sequence
     from typing import Self
 
 
@@ -103,9 +105,12 @@ class Stack:
         return Path(self.read.path) if isinstance(self.read, _FileFrames) else None
 
     @property
-    def choice(self) -> dict[str, int | str | None]:
+    def choice(self) -> dict[str, int | str | list[int] | None]:
         """The user's choices: channel, planes, image; empty for a stack in memory."""
-        return self.read.pick._asdict() if isinstance(self.read, _FileFrames) else {}
+        if not isinstance(self.read, _FileFrames):
+            return {}
+        several = {"channel": list(self.read.several)} if self.read.several else {}
+        return self.read.pick._asdict() | several
 
     @property
     def dt(self) -> float:
@@ -156,42 +161,34 @@ class _UnopenedError(OSError):
 class _FileFrames:
     """Frames of an open file: one reader at a time; the file is opened again after unpickling."""
 
-    def __init__(self, path: str, pick: Pick, contents: Contents | None = None) -> None:
-        self.path, self.pick, self._contents = path, pick, contents
+    def __init__(
+        self,
+        path: str,
+        pick: Pick,
+        contents: Contents | None = None,
+        several: tuple[int, ...] | None = None,
+    ) -> None:
+        self.path, self.pick, self.several, self._contents = path, pick, several, contents
         self._lock = threading.Lock()
 
     def __call__(self, i: int) -> NDArray[Any]:
         with self._lock:
             if self._contents is None:
                 try:
-                    self._contents = file_contents(self.path, self.pick)
+                    self._contents = file_contents(self.path, self.pick, self.several)
                 # The decoders of damaged files raise errors of any class.
                 except Exception as fault:
                     raise _UnopenedError(f"{self.path} cannot be opened here: {fault}") from fault
             return self._contents.frame(i)
 
-    def __reduce__(self) -> tuple[type[_FileFrames], tuple[str, Pick]]:
-        return _FileFrames, (self.path, self.pick)
+    def __reduce__(self) -> tuple[type[_FileFrames], tuple[Any, ...]]:
+        return _FileFrames, (self.path, self.pick, None, self.several)
 
     def close(self) -> None:
         with self._lock:
             if self._contents is not None:
                 self._contents.close()
             self._contents = None
-
-
-@dataclass(frozen=True, eq=False)
-class _ArrayFrames:
-    """Frames of an array (t, z, y, x) of any library."""
-
-    array: Any
-    shape: tuple[int, int, int, int]
-    n_axes: int
-    movie: bool
-
-    def __call__(self, i: int) -> NDArray[Any]:
-        whole = self.n_axes == 3 and not self.movie
-        return np.asarray(self.array[:] if whole else self.array[i]).reshape(self.shape[1:])
 
 
 def open_stack(
@@ -201,7 +198,7 @@ def open_stack(
     dt: float | None = None,
     plane_time: float | None = None,
     planes: int | None = None,
-    channel: int | None = None,
+    channel: int | Sequence[int] | None = None,
     image: int | str | None = None,
 ) -> Stack:
     """Open a movie of image stacks of any format; only its header is read.
@@ -212,8 +209,9 @@ def open_stack(
     ----------
     path : str, path or array_like
         TIFF, OME-TIFF, ImageJ hyperstack, a folder or glob of TIFF files (in the order of the
-        numbers in their names); Leica ``.lif``, Nikon ``.nd2``, Zeiss ``.czi``, Imaris ``.ims``,
-        OME-Zarr; or an array (t, z, y, x) or (z, y, x), also of dask, zarr or a memory map.
+        numbers in their names); Leica ``.lif``, Nikon ``.nd2``, Zeiss ``.czi`` and ``.lsm``,
+        Olympus ``.oib``, DeltaVision ``.dv``, Imaris ``.ims``, OME-Zarr, ``.npy``, ``.h5``; or an
+        array (t, z, y, x) or (z, y, x), also of dask, zarr or a memory map.
     voxel : array_like, shape (3,) or (2,), optional
         Voxel size (z, y, x), um; (y, x) for a 2-D movie. Required where the file does not state
         it, and used where the file states another one.
@@ -225,8 +223,10 @@ def open_stack(
     planes : int, optional
         Number of planes of one frame, where the file does not distinguish times from planes; 1 for
         a 2-D movie.
-    channel : int, optional
-        Number of the channel, from 0; required where there are several.
+    channel : int or sequence of int, optional
+        Number of the channel, from 0; required where there are several. The grey levels of
+        several channels are summed, as for clusters whose spheres differ in colour; their times
+        are those of the first.
     image : int or str, optional
         Number or name of the image in a file that holds several.
 
@@ -249,7 +249,8 @@ def open_stack(
     Warns
     -----
     PrecisionWarning
-        Where a value given differs from the file's by more than 0.1 %.
+        Where a value given differs from the file's by more than 0.1 %, or a voxel is not between
+        1 nm and 20 um long.
 
     Examples
     --------
@@ -262,21 +263,18 @@ def open_stack(
     size = None if voxel is None else np.atleast_1d(np.asarray(voxel, dtype=np.float64))
     if size is not None and size.shape == (2,) and planes is None:
         planes = 1
-    pick = Pick(channel=channel, planes=planes, image=image)
+    one, several = _channels(channel)
+    pick = Pick(channel=one, planes=planes, image=image)
     if isinstance(path, (str, os.PathLike)):
         source = os.fspath(path)
-        try:
-            contents = file_contents(source, pick)
-        except (FileNotFoundError, PermissionError, IsADirectoryError):
-            raise
-        except ImportError as missing:
-            raise ImportError(f"{source}: {missing}") from missing
-        # The decoders of damaged files raise errors of any class.
-        except Exception as fault:
-            raise ValueError(f"{source}: {fault}") from fault
-        read: Callable[[int], NDArray[Any]] = _FileFrames(os.path.abspath(source), pick, contents)
+        contents = _described(source, pick, several)
+        read: Callable[[int], NDArray[Any]] = _FileFrames(
+            os.path.abspath(source), pick, contents, several
+        )
     else:
         source = "array"
+        if several:
+            raise ValueError("array: channel is for files; pass the sum of the channels")
         contents, read = array_contents(path, pick)
     try:
         settled, faults = contents.settled_voxel(size)
@@ -286,9 +284,12 @@ def open_stack(
             plane_time = contents.plane_time
         else:
             faults += number_fault("plane_time", plane_time, least=0, unit="s")
+        faults += contents.doubts(settled, times, plane_time, given=size is not None)
         if faults:
             raise ValueError(f"{source}: " + "; ".join(faults))
         unequal = contents.differences(settled, times, plane_time, tolerance=_HEADER_TOLERANCE)
+        if strange := strange_lengths(settled):
+            unequal.append(f"the voxel size, {strange}; it is in um")
         if unequal:
             warnings.warn(
                 f"{source}: the values given are used: " + "; ".join(unequal),
@@ -310,7 +311,34 @@ def open_stack(
     )
 
 
-def file_contents(source: str, pick: Pick) -> Contents:
+def _described(source: str, pick: Pick, several: tuple[int, ...] | None) -> Contents:
+    """Return the contents of a file; every fault names the file and what to do."""
+    try:
+        return file_contents(source, pick, several)
+    except (FileNotFoundError, PermissionError, IsADirectoryError):
+        raise
+    except ImportError as missing:
+        raise ImportError(f"{source}: {missing}") from missing
+    # The decoders of damaged files raise errors of any class.
+    except Exception as fault:
+        reason = str(fault)
+        if type(fault) is not ValueError:
+            reason = f"cannot be read ({type(fault).__name__}: {fault}): {WAY_OUT}"
+        raise ValueError(f"{source}: {reason}") from fault
+
+
+def _channels(given: Any) -> tuple[int | None, tuple[int, ...] | None]:  # noqa: ANN401
+    """Return the one channel that was chosen, or the several that are summed."""
+    if given is None or np.ndim(given) == 0:
+        return given, None
+    numbers = tuple(given)
+    whole = all(isinstance(n, (int, np.integer)) and not isinstance(n, bool) for n in numbers)
+    if not numbers or not whole or len(set(numbers)) < len(numbers):
+        raise ValueError(f"channel: expected different numbers from 0, got {given!r}")
+    return None, tuple(map(int, numbers))
+
+
+def file_contents(source: str, pick: Pick, several: tuple[int, ...] | None = None) -> Contents:
     """Return the contents of a file or folder, read by the reader of its format.
 
     Parameters
@@ -320,73 +348,40 @@ def file_contents(source: str, pick: Pick) -> Contents:
         other files are read as TIFF.
     pick : Pick
         The user's choices.
+    several : tuple of int, optional
+        Channels that are summed, instead of the channel of `pick`.
 
     Returns
     -------
     Contents
-    """
-    reader = vendor(source)
-    if reader is not None:
-        return reader(source, pick)
-    if Path(source).is_dir() or (not Path(source).exists() and sequence_files(source)):
-        return sequence(source, pick)
-    return tiff(source, pick)
-
-
-def array_contents(given: Any, pick: Pick) -> tuple[Contents, _ArrayFrames]:  # noqa: ANN401
-    """Interpret an array as a movie (t, z, y, x), or (t, y, x) with planes=1, or one frame.
-
-    Parameters
-    ----------
-    given : array_like
-        An array of numpy or another library.
-    pick : Pick
-        The user's choices.
-
-    Returns
-    -------
-    contents : Contents
-    read : callable
-        ``read(i)`` returns frame i.
 
     Raises
     ------
     ValueError
-        For another number of axes, or choices that are for files.
-
-    Examples
-    --------
-    >>> contents, read = array_contents(np.zeros((5, 12, 16)), Pick(planes=1))
-    >>> contents.shape, read(4).shape
-    ((5, 1, 12, 16), (1, 12, 16))
+        If the file is of a format that is not read, or does not have what was chosen.
     """
-    array = given if hasattr(given, "shape") else np.asarray(given)
-    if pick.channel is not None or pick.image is not None:
-        raise ValueError("array: channel and image are for files; pass the part of the array")
-    n_axes = len(array.shape)
-    movie = n_axes == 3 and pick.planes == 1
-    if n_axes == 4:
-        shape = tuple(array.shape)
-    elif n_axes == 3:
-        a, y, x = array.shape
-        shape = (a, 1, y, x) if movie else (1, a, y, x)
-    else:
-        raise ValueError(
-            f"array: expected (t, z, y, x), (z, y, x), or (t, y, x) with planes=1, got "
-            f"{array.shape}"
-        )
-    if pick.planes not in (None, shape[1]) or 0 in shape:
-        raise ValueError(f"array: {array.shape} has no frames of planes={pick.planes}")
-    read = _ArrayFrames(array, shape, n_axes, movie)
-    contents = Contents(
-        shape=shape,
-        dtype=np.dtype(array.dtype),
-        plane=lambda t, z: read(t)[z],
-        close=lambda: None,
-        voxel=np.full(3, np.nan),
-        times=even_times(shape[0], np.nan),
-    )
-    return contents, read
+    if several:
+        parts: list[Contents] = []
+        try:
+            for number in several:
+                parts.append(file_contents(source, pick._replace(channel=number)))
+            return summed(parts)
+        except Exception:
+            for part in parts:
+                part.close()
+            raise
+    found = vendor(source)
+    if found is not None:
+        try:
+            return found.read(source, pick)
+        except ValueError as fault:
+            # A library's own error keeps its class, so that the caller adds what to do.
+            if type(fault) is not ValueError:
+                raise
+            raise ValueError(f"{found.name}: {fault}") from fault
+    if Path(source).is_dir() or (not Path(source).exists() and sequence_files(source)):
+        return sequence(source, pick)
+    return tiff(source, pick)
 
 
 def digest(stack: Stack) -> str:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from importlib import import_module
 from math import prod
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
@@ -29,17 +29,22 @@ _UM_PER_UNIT = {
     **dict.fromkeys(("um", "\u00b5m", "\u03bcm", "\\u00b5m", "micron", "microns"), 1.0),
     **dict.fromkeys(("micrometer", "micrometre"), 1.0),
     **dict.fromkeys(("nm", "nanometer", "nanometre"), 1e-3),
+    **dict.fromkeys(("\u00e5", "\u212b", "\u00c5", "angstrom"), 1e-4),
     "inch": 25400.0,
 }
 
 _SECONDS_PER_UNIT = {
-    **dict.fromkeys(("h", "hour"), 3600.0),
-    **dict.fromkeys(("min", "minute"), 60.0),
-    **dict.fromkeys(("s", "sec", "second"), 1.0),
-    **dict.fromkeys(("ms", "millisecond"), 1e-3),
-    **dict.fromkeys(("us", "\u00b5s", "\u03bcs", "microsecond"), 1e-6),
+    **dict.fromkeys(("h", "hr", "hour", "hours"), 3600.0),
+    **dict.fromkeys(("min", "minute", "minutes"), 60.0),
+    **dict.fromkeys(("s", "sec", "secs", "second", "seconds"), 1.0),
+    **dict.fromkeys(("ms", "msec", "millisecond", "milliseconds"), 1e-3),
+    **dict.fromkeys(("us", "\u00b5s", "\u03bcs", "\\u00b5s", "usec", "microsecond"), 1e-6),
     **dict.fromkeys(("ns", "nanosecond"), 1e-9),
 }
+
+
+# Shortest and longest voxel of a light microscope, um.
+_VOXEL_LIMITS = (1e-3, 20.0)
 
 
 class Pick(NamedTuple):
@@ -48,7 +53,7 @@ class Pick(NamedTuple):
     Attributes
     ----------
     channel : int or None
-        Number of the channel, from 0.
+        Number of the channel, from 0; `open_stack` sums several one by one.
     planes : int or None
         Number of planes of a frame, where the file does not distinguish times from planes.
     image : int or str or None
@@ -87,6 +92,8 @@ class Contents:
         Time from one plane to the next, s; None where the file does not state it.
     notes : tuple of str
         How the file was interpreted where it does not name its axes.
+    without_times : str
+        Why the times in the file cannot be used; empty where they can, or there are none.
     """
 
     shape: tuple[int, int, int, int]
@@ -97,6 +104,7 @@ class Contents:
     times: Floats | None = None
     plane_time: float | None = None
     notes: tuple[str, ...] = ()
+    without_times: str = ""
 
     def frame(self, t: int) -> NDArray[Any]:
         """Return one frame (z, y, x), read plane by plane so that no second copy is made."""
@@ -163,11 +171,49 @@ class Contents:
                 return np.zeros(n), faults
             return np.arange(n, dtype=np.float64) * float(dt), []
         if self.times is None:
-            return np.zeros(n), [f"no times of its {n} frames: pass dt= in s"]
+            reason = f" ({self.without_times})" if self.without_times else ""
+            return np.zeros(n), [f"no times of its {n} frames{reason}: pass dt= in s"]
         if np.any(np.diff(self.times) <= 0):
             late = int(np.flatnonzero(np.diff(self.times) <= 0)[0]) + 1
             return np.zeros(n), [f"the times do not grow at frame {late}: pass dt= in s"]
         return self.times, []
+
+    def doubts(
+        self, voxel: Floats, times: Floats, plane_time: float | None, *, given: bool
+    ) -> list[str]:
+        """Return a line for each value that cannot be right.
+
+        Parameters
+        ----------
+        voxel, times, plane_time
+            The values in use.
+        given : bool
+            The user gave the voxel size, which is not doubted then.
+
+        Returns
+        -------
+        list of str
+            Voxels of the file that are not between 1 nm and 20 um long, and planes that together
+            take longer than the frame of which they are parts.
+
+        Examples
+        --------
+        >>> still = Contents((2, 5, 8, 8), np.dtype("u1"), lambda t, z: 0, lambda: 0, np.ones(3))
+        >>> still.doubts(np.ones(3), np.array([0.0, 0.7]), 0.2, given=True)
+        ['5 planes of 0.2 s each take longer than a frame of 0.7 s: pass dt= or plane_time= in s']
+        """
+        faults = []
+        if not given and (strange := strange_lengths(voxel)):
+            faults.append(f"the voxel size in the file, {strange}: pass voxel= in um")
+        planes = self.shape[1]
+        if len(times) > 1 and plane_time is not None:
+            interval = float(np.median(np.diff(times)))
+            if (planes - 1) * plane_time > interval > 0:
+                faults.append(
+                    f"{planes} planes of {plane_time:.4g} s each take longer than a frame of "
+                    f"{interval:.4g} s: pass dt= or plane_time= in s"
+                )
+        return faults
 
     def differences(
         self, voxel: Floats, times: Floats, plane_time: float | None, *, tolerance: float
@@ -372,7 +418,130 @@ def chosen(names: list[str], image: int | str | None) -> int:
         return image
     if isinstance(image, str) and names.count(image) == 1:
         return names.index(image)
-    raise ValueError(f"has {len(names)} images {names}: pass image= (a name or a number from 0)")
+    missing = "" if image is None else f"no image {image!r} among "
+    if len(names) == 1:
+        raise ValueError(f"has {missing}its only image {names[0]!r}: leave image= out")
+    raise ValueError(
+        f"has {missing}{len(names)} images {names}: pass image= (a name or a number from 0)"
+    )
+
+
+def grid(
+    labels: Sequence[Mapping[str, Any]],
+) -> tuple[dict[str, int], dict[tuple[int, ...], int]]:
+    """Arrange images by the labels that each of them has, as time 3, plane 0, channel "red".
+
+    Parameters
+    ----------
+    labels : sequence of mapping of str to object
+        Label of each image along every axis; the same axes for all images.
+
+    Returns
+    -------
+    sizes : dict of str to int
+        Number of different labels along each axis.
+    places : dict of tuple of int to int
+        Number of the image at each place of the grid, in the order of the sorted labels.
+
+    Raises
+    ------
+    ValueError
+        If images have the same labels, or places of the grid have no image.
+
+    Examples
+    --------
+    >>> grid([{"T": 1, "Z": 5}, {"T": 1, "Z": 4}])
+    ({'T': 1, 'Z': 2}, {(0, 1): 0, (0, 0): 1})
+    """
+    axes = list(labels[0])
+    values = {axis: sorted({label[axis] for label in labels}) for axis in axes}
+    sizes = {axis: len(values[axis]) for axis in axes}
+    rank = {axis: {v: i for i, v in enumerate(values[axis])} for axis in axes}
+    places: dict[tuple[int, ...], int] = {}
+    for number, label in enumerate(labels):
+        place = tuple(rank[axis][label[axis]] for axis in axes)
+        if place in places:
+            raise ValueError(f"has several images of the same {dict(label)}")
+        places[place] = number
+    for place in np.ndindex(*sizes.values()):
+        if place not in places:
+            missing = {axis: values[axis][i] for axis, i in zip(axes, place, strict=True)}
+            raise ValueError(f"lacks the image {missing} of its {sizes}")
+    return sizes, places
+
+
+def strange_lengths(voxel: Floats) -> str:
+    """Return which lengths of a voxel no light microscope has; empty if there are none.
+
+    Parameters
+    ----------
+    voxel : ndarray, shape (3,)
+        Voxel size (z, y, x), um.
+
+    Returns
+    -------
+    str
+
+    Examples
+    --------
+    >>> strange_lengths(np.array([250.0, 0.2, 0.2]))
+    'z = 250 um, is not between 1 nm and 20 um'
+    """
+    low, high = _VOXEL_LIMITS
+    strange = [
+        f"{axis} = {length:.3g} um"
+        for axis, length in zip("zyx", voxel, strict=True)
+        if np.isfinite(length) and not low <= length <= high
+    ]
+    return f"{', '.join(strange)}, is not between 1 nm and 20 um" if strange else ""
+
+
+def summed(parts: Sequence[Contents]) -> Contents:
+    """Return the sum of several channels, in a type of number that holds it.
+
+    Parameters
+    ----------
+    parts : sequence of Contents
+        The channels, of equal shape; sizes and times are those of the first.
+
+    Returns
+    -------
+    Contents
+
+    Raises
+    ------
+    ValueError
+        If the channels have different shapes.
+
+    Examples
+    --------
+    >>> one = Contents(
+    ...     (1, 1, 1, 2), np.dtype("u1"), lambda t, z: np.full((1, 2), 200, "u1"), lambda: 0,
+    ...     np.ones(3),
+    ... )
+    >>> both = summed([one, one])
+    >>> both.plane(0, 0), both.dtype
+    (array([[400, 400]], dtype=uint16), dtype('uint16'))
+    """
+    first = parts[0]
+    shapes = sorted({part.shape for part in parts})
+    if len(shapes) > 1:
+        raise ValueError(f"has channels of different shapes: {shapes}")
+    dtype = first.dtype.newbyteorder("=")
+    if dtype.kind in "ui":
+        dtype = np.dtype(f"{dtype.kind}{min(2 * dtype.itemsize, 8)}")
+
+    def plane(t: int, z: int) -> NDArray[Any]:
+        total = parts[0].plane(t, z).astype(dtype)
+        for part in parts[1:]:
+            total += part.plane(t, z).astype(dtype)
+        return total
+
+    def close() -> None:
+        for part in parts:
+            part.close()
+
+    return replace(first, dtype=dtype, plane=plane, close=close)
 
 
 def needed(module: str, extra: str) -> Any:  # noqa: ANN401 (any module)

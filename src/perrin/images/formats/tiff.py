@@ -1,10 +1,8 @@
-"""TIFF files: plain, OME, ImageJ, and sequences of files."""
+"""TIFF files: plain, OME, ImageJ, LSM, MetaMorph and NDTiff."""
 
 from __future__ import annotations
 
-import re
 import struct
-from contextlib import closing
 from math import prod
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -15,36 +13,24 @@ from numpy.typing import NDArray
 from perrin.images.formats.contents import (
     UNNAMED,
     Contents,
-    Layout,
     Pick,
     chosen,
     even_times,
-    in_seconds,
+    grid,
     in_um,
     layout,
     needed,
 )
+from perrin.images.formats.headers import (
+    clock_scale,
+    header_scale,
+    image_header,
+    ome_images,
+    tiff_kind,
+)
 
 if TYPE_CHECKING:
-    from perrin._arrays import Floats
-
-
-class HeaderScale(NamedTuple):
-    """Lengths and times that the header of a file states.
-
-    Attributes
-    ----------
-    voxel : ndarray, shape (3,)
-        Voxel size (z, y, x), um; NaN where it is not stated.
-    times : ndarray, shape (t,), or None
-        Times of the frames, s.
-    plane_time : float or None
-        Time from one plane to the next, s.
-    """
-
-    voxel: Floats
-    times: Floats | None = None
-    plane_time: float | None = None
+    from collections.abc import Sequence
 
 
 class DeclaredSeries(NamedTuple):
@@ -70,10 +56,17 @@ class DeclaredSeries(NamedTuple):
 
 def tiff(path: str, pick: Pick, *, one_frame: bool = False) -> Contents:
     """Describe one TIFF file; with `one_frame` all its images are the planes of a single frame."""
-    file = needed("tifffile", "images").TiffFile(path)
+    file = opened(path)
     try:
-        number = chosen([str(series.name) for series in file.series], pick.image)
-        series = declared_imagej_series(file) or file.series[number]
+        plain = not (file.is_ome or file.is_imagej)
+        if plain and "Axes" in image_header(file.pages.first):
+            return ndtiff([file], pick)
+        # A LSM file has a thumbnail of every image.
+        images = [s for s in file.series if not (file.is_lsm and s.keyframe.is_reduced)]
+        titles = [str(s.name) for s in images]
+        number = chosen(titles, pick.image)
+        series = declared_imagej_series(file) or images[number]
+        require_decoder(file)
         names, notes = named_axes(series, pick)
         sizes = dict(zip(names, series.shape, strict=True))
         if one_frame:
@@ -83,14 +76,13 @@ def tiff(path: str, pick: Pick, *, one_frame: bool = False) -> Contents:
             where = layout(sizes, pick._replace(planes=planes), cut=is_cut_short(file))
         else:
             where = layout(sizes, pick, cut=is_cut_short(file))
-        scale = HeaderScale(np.full(3, np.nan))
-        if file.is_ome:
-            scale = ome_scale(file.ome_metadata, number, where, pick.channel or 0)
-        elif file.is_imagej:
-            scale = imagej_scale(file, where)
+        scale = header_scale(file, where, number=number, names=titles, channel=pick.channel or 0)
     except struct.error as fault:
         file.close()
         raise ValueError("is cut short, within the header of an image: copy it again") from fault
+    except ValueError as fault:
+        file.close()
+        raise ValueError(f"{tiff_kind(file)}: {fault}") from fault
     except Exception:
         file.close()
         raise
@@ -106,7 +98,142 @@ def tiff(path: str, pick: Pick, *, one_frame: bool = False) -> Contents:
         voxel=scale.voxel,
         times=scale.times if scale.times is not None else even_times(where.t, np.nan),
         plane_time=scale.plane_time,
-        notes=notes,
+        notes=notes + scale.notes,
+        without_times=scale.without_times,
+    )
+
+
+def opened(path: str) -> Any:  # noqa: ANN401
+    """Open a TIFF file, with the header of a set of files where that is a file of its own.
+
+    Parameters
+    ----------
+    path : str
+
+    Returns
+    -------
+    tifffile.TiffFile
+
+    Raises
+    ------
+    ValueError
+        If the header is in another file, which is missing.
+    """
+    import re
+
+    tifffile = needed("tifffile", "images")
+    file = tifffile.TiffFile(path)
+    header = file.ome_metadata if file.is_ome else None
+    if not header or "BinaryOnly" not in header:
+        return file
+    file.close()
+    named = re.search(r'MetadataFile="([^"]+)"', header)
+    companion = Path(path).parent / (named[1] if named else "")
+    if not companion.is_file():
+        ome_images(header)
+    return tifffile.TiffFile(path, omexml=companion.read_text(encoding="utf-8"))
+
+
+def require_decoder(file: Any) -> None:  # noqa: ANN401
+    """Refuse a file whose compression needs a library that is not installed.
+
+    Raises
+    ------
+    ImportError
+        With the command that installs it.
+    """
+    page = file.pages.first
+    decoders = needed("tifffile", "images").TIFF
+    if page.compression in decoders.DECOMPRESSORS and page.predictor in decoders.UNPREDICTORS:
+        return
+    needed("imagecodecs", "images")
+
+
+def is_set(path: str) -> bool:
+    """Return whether the image of an OME file is spread over several files.
+
+    Parameters
+    ----------
+    path : str
+
+    Returns
+    -------
+    bool
+    """
+    with opened(path) as file:
+        return file.is_ome and any(series.is_multifile for series in file.series)
+
+
+def ndtiff(files: Sequence[Any], pick: Pick) -> Contents:
+    """Describe NDTiff files of Micro-Manager, whose images state their places and times.
+
+    Parameters
+    ----------
+    files : sequence of tifffile.TiffFile
+        The files of one recording.
+    pick : Pick
+        The user's choices; the image is one of several positions.
+
+    Returns
+    -------
+    Contents
+    """
+    from datetime import UTC, datetime
+
+    pages = [page for file in files for page in file.pages]
+    about = [image_header(page) for page in pages]
+    letters = {"time": "T", "z": "Z", "channel": "C", "position": "P"}
+    sizes, places = grid(
+        [{letters.get(k, k): v for k, v in a.get("Axes", {}).items()} for a in about]
+    )
+    axes = list(sizes)
+    position = {}
+    if "P" in sizes:
+        labels = [str(i) for i in range(sizes.pop("P"))]
+        position = {"P": chosen(labels, pick.image)}
+    elif pick.image is not None:
+        chosen(["0"], pick.image)
+    where = layout(sizes, pick)
+
+    def number(t: int, z: int) -> int:
+        at = where.at(t, z) | position
+        return places[tuple(at.get(axis, 0) for axis in axes)]
+
+    def received(t: int, z: int) -> float:
+        header = about[number(t, z)]
+        stamp = header.get("TimeReceivedByCore")
+        if stamp:
+            return datetime.fromisoformat(stamp).replace(tzinfo=UTC).timestamp()
+        return float(header.get("ElapsedTime-ms", np.nan)) / 1e3
+
+    first = about[number(0, 0)]
+    pixel = in_um(first.get("PixelSizeUm"), "um")
+    heights = [
+        float(about[number(0, z)].get("ZPosition_um_Intended", np.nan))
+        for z in range(min(2, where.z))
+    ]
+    depth = heights[-1] - heights[0]
+    clock = np.array([[received(t, z) for z in range(where.z)] for t in range(where.t)])
+    scale = clock_scale(np.array([in_um(depth, "um"), pixel, pixel]), clock - np.nanmin(clock))
+
+    def plane(t: int, z: int) -> NDArray[Any]:
+        return np.asarray(pages[number(t, z)].asarray())
+
+    def close() -> None:
+        for file in files:
+            file.close()
+
+    page = pages[0]
+    return Contents(
+        shape=(where.t, where.z, *page.shape),
+        dtype=np.dtype(page.dtype),
+        plane=plane,
+        close=close,
+        voxel=scale.voxel,
+        times=scale.times,
+        plane_time=scale.plane_time,
+        notes=scale.notes,
+        without_times=scale.without_times,
     )
 
 
@@ -304,10 +431,24 @@ def read_plane(
     number = int(np.ravel_multi_index(index[:lead], series.shape[:lead])) if lead else 0
     block = series.shape[lead:]
     if series.dataoffset is None:
-        page = series.pages[number] if number < len(series.pages) else None
+        # A page of a LSM file has all channels.
+        n_pages = prod(series.shape[:lead])
+        together = n_pages // len(series.pages) if file.is_lsm else 1
+        at_page = number // together
+        page = series.pages[at_page] if at_page < len(series.pages) else None
         if page is None:
             raise ValueError(f"image {number} is not in the file")
-        image = np.asarray(page.asarray().reshape(block))
+        # Other files of a set are closed between their images.
+        handle = page.parent.filehandle
+        was_closed = handle.closed
+        if was_closed:
+            handle.open()
+        try:
+            whole = page.asarray()
+        finally:
+            if was_closed:
+                handle.close()
+        image = np.asarray(whole.reshape(together, *block)[number % together])
     else:
         # The header of a contiguous file may list the first page only: the bytes are counted.
         dtype = np.dtype(series.dtype).newbyteorder(file.byteorder)
@@ -322,146 +463,3 @@ def read_plane(
         for axis, i in zip(series.axes[lead:], index[lead:], strict=True)
     )
     return np.asarray(image[tuple(inside)])
-
-
-def ome_scale(xml: str, number: int, where: Layout, channel: int) -> HeaderScale:
-    """Read an OME header: pixel sizes, and the measured times of planes or an interval.
-
-    Parameters
-    ----------
-    xml : str
-        The header.
-    number : int
-        Number of the image.
-    where : Layout
-        Times and planes of the image.
-    channel : int
-        Number of the channel, whose times are read.
-
-    Returns
-    -------
-    HeaderScale
-        The measured times where every frame has one, else even ones.
-
-    Examples
-    --------
-    >>> xml = (
-    ...     '<OME xmlns="a"><Image><Pixels PhysicalSizeZ="0.25" PhysicalSizeY="200" '
-    ...     'PhysicalSizeYUnit="nm" TimeIncrement="0.5"/></Image></OME>'
-    ... )
-    >>> scale = ome_scale(xml, 0, layout({"T": 3, "Z": 4}, Pick()), 0)
-    >>> scale.voxel, scale.times
-    (array([0.25, 0.2 ,  nan]), array([0. , 0.5, 1. ]))
-    """
-    from xml.etree import ElementTree
-
-    pixels = [e for e in ElementTree.fromstring(xml).iter() if e.tag.endswith("}Pixels")][number]
-    voxel = np.array(
-        [
-            in_um(
-                pixels.get(f"PhysicalSize{axis}"), pixels.get(f"PhysicalSize{axis}Unit", "\u00b5m")
-            )
-            for axis in "ZYX"
-        ]
-    )
-    interval = in_seconds(pixels.get("TimeIncrement"), pixels.get("TimeIncrementUnit", "s"))
-    clock = np.full((where.t, where.z), np.nan)
-    for e in pixels:
-        if e.tag.endswith("}Plane") and e.get("DeltaT") and int(e.get("TheC", 0)) == channel:
-            t, z = int(e.get("TheT", 0)), int(e.get("TheZ", 0))
-            if t < where.t and z < where.z:
-                unit = in_seconds(1.0, e.get("DeltaTUnit", "s"))
-                clock[t, z] = float(e.get("DeltaT", "nan")) * unit
-    start = clock[:, 0]
-    steps = np.diff(clock, axis=1)
-    steps = steps[np.isfinite(steps)]
-    plane_time = float(np.median(steps)) if steps.size else 0.0
-    measured = bool(np.all(np.isfinite(start)) and np.all(np.diff(start) > 0))
-    times = start if measured else even_times(where.t, interval)
-    return HeaderScale(voxel, times, plane_time if plane_time > 0 else None)
-
-
-def imagej_scale(file: Any, where: Layout) -> HeaderScale:  # noqa: ANN401
-    """Read an ImageJ header: unit, spacing, interval, and the resolution tags in that unit.
-
-    Parameters
-    ----------
-    file : tifffile.TiffFile
-    where : Layout
-        Times and planes of the file.
-
-    Returns
-    -------
-    HeaderScale
-    """
-    header = file.imagej_metadata or {}
-    unit = header.get("unit")
-    tags = file.pages[0].tags
-
-    def pixel_size(tag: str) -> float:
-        if tag not in tags or not all(tags[tag].value):
-            return float("nan")
-        count, length = tags[tag].value
-        return in_um(length / count, unit)
-
-    spacing = in_um(header.get("spacing"), unit)
-    voxel = np.array([spacing, pixel_size("YResolution"), pixel_size("XResolution")])
-    rate = float(header.get("fps") or 0)
-    interval = in_seconds(header.get("finterval") or (1 / rate if rate > 0 else None), "s")
-    return HeaderScale(voxel, even_times(where.t, interval))
-
-
-def sequence_files(path: str) -> list[str]:
-    """Return the TIFF files of a folder or a glob, in the order of the numbers in their names."""
-    from glob import glob
-
-    inside = Path(path).iterdir() if Path(path).is_dir() else map(Path, glob(path))
-    # Names that begin with a dot belong to the operating system or to files being written.
-    files = [
-        str(f)
-        for f in inside
-        if f.suffix.lower() in (".tif", ".tiff") and f.is_file() and not f.name.startswith(".")
-    ]
-
-    def numbered(path: str) -> list[int | str]:
-        return [int(part) if part.isdigit() else part for part in re.split(r"([0-9]+)", path)]
-
-    return sorted(files, key=numbered)
-
-
-def sequence(path: str, pick: Pick) -> Contents:
-    """Describe a folder or glob of TIFF files.
-
-    A file of several images is one frame; of files of one image each, `pick.planes` are a frame.
-    """
-    files = sequence_files(path)
-    if not files:
-        raise ValueError("has no .tif or .tiff file")
-    if len(files) == 1:
-        return tiff(files[0], pick)
-    first = tiff(files[0], pick, one_frame=True)
-    first.close()
-    _, inner, y, x = first.shape
-    outer = Pick(planes=pick.planes if inner == 1 else 1)
-    if inner > 1 and pick.planes not in (None, inner):
-        raise ValueError(f"has files of {inner} images each, not planes={pick.planes}")
-    where = layout({"I": len(files)}, outer)
-
-    def plane(t: int, z: int) -> NDArray[Any]:
-        number, k = (t, z) if inner > 1 else (t * where.z + z, 0)
-        with closing(tiff(files[number], pick, one_frame=True)) as file:
-            if file.shape != first.shape or file.dtype != first.dtype:
-                raise ValueError(
-                    f"{files[number]} is {file.shape[1:]} {file.dtype}, the first file "
-                    f"{first.shape[1:]} {first.dtype}"
-                )
-            return file.plane(0, k)
-
-    return Contents(
-        shape=(where.t, inner if inner > 1 else where.z, y, x),
-        dtype=first.dtype,
-        plane=plane,
-        close=lambda: None,
-        voxel=first.voxel,
-        times=even_times(where.t, np.nan),
-    )

@@ -1,14 +1,15 @@
-"""Leica, Nikon, Zeiss, Imaris and OME-Zarr files, each read by the library of its format."""
+"""Leica, Nikon, Imaris and OME-Zarr files, each read by the library of its format."""
 
 from __future__ import annotations
 
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from perrin.images.formats.arrays import hdf5, numpy_file
 from perrin.images.formats.contents import (
     Contents,
     Pick,
@@ -19,6 +20,9 @@ from perrin.images.formats.contents import (
     layout,
     needed,
 )
+from perrin.images.formats.deltavision import deltavision
+from perrin.images.formats.olympus import olympus
+from perrin.images.formats.zeiss import czi
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -31,32 +35,95 @@ _IMARIS_CACHE = 2**25
 
 
 def lif(path: str, pick: Pick) -> Contents:
-    """Describe an image of a Leica .lif file (liffile); times are those of its time axis."""
+    """Describe an image of a Leica .lif, .lof or .xlef file (liffile).
+
+    Times are those of its time axis. A scan of x and z at many y is a volume like any other; one at
+    a single y is a movie of a plane, whose y is the z of the microscope.
+
+    Parameters
+    ----------
+    path : str
+    pick : Pick
+        The user's choices.
+
+    Returns
+    -------
+    Contents
+    """
     file = needed("liffile", "lif").LifFile(path)
     try:
         names = [image.path for image in file.images]
         image = file.images[chosen(names, pick.image)]
-        where = layout(image.sizes, pick)
+        section = "Y" not in image.sizes and "Z" in image.sizes
+        seen = {"Z": "Y"} if section else {}
+        sizes = {seen.get(axis, axis): n for axis, n in image.sizes.items()}
+        if not {"X", "Y"} <= set(sizes):
+            raise ValueError(f"has an image without an area, of {dict(image.sizes)}")
+        inner = tuple(image.frames.frame_dims)
+        where = layout(sizes, pick)
         steps = {axis: np.diff(values[:2]) for axis, values in image.coords.items()}
-        spacing = {axis: float(step[0]) for axis, step in steps.items() if step.size}
+        spacing = {seen.get(axis, axis): float(s[0]) for axis, s in steps.items() if s.size}
+        stamps = image.timestamps if "Z" not in inner else None
+        plane_time = leica_plane_time(stamps, where.t, where.z)
     except Exception:
         file.close()
         raise
 
+    def stored(at: dict[str, int]) -> NDArray[Any]:
+        others = {axis: i for axis, i in at.items() if axis in image.sizes and axis not in inner}
+        data = np.asarray(image.frame(**others))
+        return data[..., at["S"]] if "S" in inner else data
+
+    # The images of such a scan lie across the planes: one frame is kept.
+    @lru_cache(maxsize=1)
+    def volume(others: tuple[tuple[str, int], ...]) -> NDArray[Any]:
+        rows = [stored({**dict(others), "Y": y}) for y in range(image.sizes["Y"])]
+        return np.stack(rows, axis=1)
+
     def plane(t: int, z: int) -> NDArray[Any]:
-        at = {axis: i for axis, i in where.at(t, z).items() if axis in image.sizes}
-        colour = at.pop("S", None)
-        data = np.asarray(image.frame(**at))
-        return data if colour is None else data[..., colour]
+        at = where.at(t, z)
+        if section or "Z" not in inner:
+            return stored(at)
+        return np.asarray(volume(tuple((a, i) for a, i in at.items() if a != "Z"))[at["Z"]])
 
     return Contents(
-        shape=(where.t, where.z, image.sizes["Y"], image.sizes["X"]),
+        shape=(where.t, where.z, sizes["Y"], sizes["X"]),
         dtype=np.dtype(image.dtype),
         plane=plane,
         close=file.close,
         voxel=np.array([in_um(spacing.get(axis), "m") for axis in "ZYX"]),
         times=even_times(where.t, in_seconds(spacing.get("T"), "s")),
+        plane_time=plane_time,
+        notes=("the images are sections (z, x): their z is read as y",) if section else (),
     )
+
+
+def leica_plane_time(stamps: NDArray[np.datetime64] | None, t: int, z: int) -> float | None:
+    """Return the time from one plane to the next, where a Leica file has a stamp of every plane.
+
+    Parameters
+    ----------
+    stamps : ndarray or None
+        Time stamps of the images, planes before frames.
+    t, z : int
+        Number of frames, and of planes of a frame.
+
+    Returns
+    -------
+    float or None
+        Mean time over the planes of a frame, s, because the stamps are in whole milliseconds; its
+        median over the frames. None where there is not one stamp of each plane.
+
+    Examples
+    --------
+    >>> leica_plane_time(np.array([0, 20, 700, 720], dtype="datetime64[ms]"), 2, 2)
+    0.02
+    """
+    if stamps is None or z == 1 or len(stamps) != t * z:
+        return None
+    clock = stamps.reshape(t, z)
+    step = float(np.median((clock[:, -1] - clock[:, 0]) / np.timedelta64(1, "s"))) / (z - 1)
+    return step if step > 0 else None
 
 
 def nd2(path: str, pick: Pick) -> Contents:
@@ -64,14 +131,16 @@ def nd2(path: str, pick: Pick) -> Contents:
     file = needed("nd2", "nd2").ND2File(path)
     try:
         sizes = dict(file.sizes)
-        where = layout(sizes, pick)
         loops = [axis for axis in sizes if axis not in "CSYX"]
+        # Positions of the stage are images of their own.
+        position = {"P": chosen([f"position {i}" for i in range(sizes.get("P", 1))], pick.image)}
+        where = layout({axis: n for axis, n in sizes.items() if axis != "P"}, pick)
         volume = file.metadata.channels[pick.channel or 0].volume
         known = zip(volume.axesCalibration, volume.axesCalibrated, strict=True)
         x, y, z = (length if yes else None for length, yes in known)
 
         def number(t: int, k: int) -> int:
-            at = where.at(t, k)
+            at = where.at(t, k) | position
             index = [at.get(axis, 0) for axis in loops]
             return int(np.ravel_multi_index(index, [sizes[a] for a in loops])) if loops else 0
 
@@ -103,48 +172,6 @@ def nd2(path: str, pick: Pick) -> Contents:
     )
 
 
-def czi(path: str, pick: Pick) -> Contents:
-    """Describe a Zeiss .czi file (pylibCZIrw)."""
-    context = needed("pylibCZIrw.czi", "czi").open_czi(path)
-    file = context.__enter__()
-
-    def close() -> None:
-        context.__exit__(None, None, None)
-
-    try:
-        if len(file.scenes_bounding_rectangle) > 1:
-            raise ValueError("has several scenes: save the one wanted as a file of its own")
-        box = {axis: stop - start for axis, (start, stop) in file.total_bounding_box.items()}
-        where = layout(box, pick)
-        scale = file.metadata["ImageDocument"]["Metadata"]
-        lengths = {
-            e["@Id"]: e.get("Value") for e in _header_items(scale, "Scaling", "Items", "Distance")
-        }
-        step = _header_items(
-            scale, "Information", "Image", "Dimensions", "T", "Positions", "Interval", "Increment"
-        )
-        dtype = np.asarray(file.read(plane={"T": 0, "Z": 0, "C": pick.channel or 0})).dtype
-    except Exception:
-        close()
-        raise
-
-    def plane(t: int, z: int) -> NDArray[Any]:
-        at = {axis: i for axis, i in where.at(t, z).items() if axis in box}
-        data = np.asarray(file.read(plane=at))
-        if data.shape[2] > 1:
-            raise ValueError("has colours: save one channel as grey values")
-        return data[..., 0]
-
-    return Contents(
-        shape=(where.t, where.z, box["Y"], box["X"]),
-        dtype=dtype,
-        plane=plane,
-        close=close,
-        voxel=np.array([in_um(lengths.get(axis), "m") for axis in "ZYX"]),
-        times=even_times(where.t, in_seconds(step[0] if step else None, "s")),
-    )
-
-
 def ims(path: str, pick: Pick) -> Contents:
     """Describe an Imaris .ims file: HDF5, finest resolution, padded blocks cut to the image."""
     file = needed("h5py", "ims").File(path, "r", rdcc_nbytes=_IMARIS_CACHE)
@@ -152,7 +179,8 @@ def ims(path: str, pick: Pick) -> Contents:
         finest = file["DataSet"]["ResolutionLevel 0"]
         about = file["DataSetInfo"]
         image = {key: _imaris_text(value) for key, value in about["Image"].attrs.items()}
-        size = {axis: int(image[axis]) for axis in "ZYX"}
+        chosen(["image"], pick.image)
+        size = imaris_size(image, finest["TimePoint 0"]["Channel 0"])
         n_channels = len(finest["TimePoint 0"])
         where = layout({"T": len(finest), "C": n_channels, **size}, pick)
         dtype = finest["TimePoint 0"]["Channel 0"]["Data"].dtype
@@ -185,6 +213,29 @@ def ims(path: str, pick: Pick) -> Contents:
     )
 
 
+def imaris_size(image: dict[str, str], channel: Any) -> dict[str, int]:  # noqa: ANN401
+    """Return the size of the image in an Imaris file, whose blocks may extend beyond it.
+
+    Parameters
+    ----------
+    image : dict
+        Attributes of the whole image, which a minimal file has not all.
+    channel : h5py.Group
+        The first channel, which has attributes of its own.
+
+    Returns
+    -------
+    dict of str to int
+        Number of voxels along Z, Y, X.
+    """
+    size = {}
+    for axis, n in zip("ZYX", channel["Data"].shape, strict=True):
+        own = channel.attrs.get(f"ImageSize{axis}")
+        stated = image.get(axis) or (None if own is None else _imaris_text(own))
+        size[axis] = int(n if stated is None else stated)
+    return size
+
+
 def imaris_times(about: Any, n: int) -> Floats | None:  # noqa: ANN401 (an HDF5 group)
     """Read the times of the frames from their dates in an Imaris file.
 
@@ -215,14 +266,45 @@ def imaris_times(about: Any, n: int) -> Floats | None:  # noqa: ANN401 (an HDF5 
 def _imaris_text(value: Any) -> str:  # noqa: ANN401 (Imaris writes arrays of single characters)
     """Return an attribute of an Imaris file as text."""
     if isinstance(value, np.ndarray):
-        return b"".join(np.atleast_1d(value).astype("S1")).decode()
-    return value.decode() if isinstance(value, bytes) else str(value)
+        text = b"".join(np.atleast_1d(value).astype("S1")).decode()
+    else:
+        text = value.decode() if isinstance(value, bytes) else str(value)
+    # The library of Imaris ends texts with a zero.
+    return text.rstrip("\x00 ")
 
 
 def ome_zarr(path: str, pick: Pick) -> Contents:
-    """Describe an OME-Zarr folder (NGFF 0.4 and 0.5), its finest resolution."""
+    """Describe an image of an OME-Zarr folder (NGFF 0.4 and 0.5), its finest resolution.
+
+    The folder is that of an image, or the root that bioformats2raw writes above several.
+
+    Parameters
+    ----------
+    path : str
+    pick : Pick
+        The user's choices.
+
+    Returns
+    -------
+    Contents
+
+    Raises
+    ------
+    ValueError
+        If the folder has no image.
+    """
+    if (Path(path) / ".zarray").exists():
+        raise ValueError("is one zarr array without a header: pass the array itself")
     group = needed("zarr", "zarr").open_group(path, mode="r")
     header = group.attrs.get("ome", group.attrs)
+    if "bioformats2raw.layout" in header:
+        series = _image_folders(group)
+        group = group[series[chosen(series, pick.image)]]
+        header = group.attrs.get("ome", group.attrs)
+    else:
+        chosen(["image"], pick.image)
+    if "plate" in header:
+        raise ValueError("is a plate of OME-Zarr: pass the folder of one image in it, as A/1/0")
     if "multiscales" not in header:
         raise ValueError("is a zarr folder without OME-Zarr `multiscales`: pass the array itself")
     scales = header["multiscales"][0]
@@ -261,6 +343,16 @@ def ome_zarr(path: str, pick: Pick) -> Contents:
     )
 
 
+def _image_folders(root: Any) -> list[str]:  # noqa: ANN401 (a zarr group)
+    """Return the names of the images under the root that bioformats2raw writes."""
+    if "OME" in root:
+        attributes = root["OME"].attrs
+        listed = attributes.get("ome", attributes).get("series")
+        if listed:
+            return [str(name) for name in listed]
+    return sorted((name for name in root.group_keys() if name.isdigit()), key=int)
+
+
 def ngff_scale(scales: Any, n: int) -> Floats:  # noqa: ANN401 (a JSON header)
     """Return the product of the scale of the finest level and that of the whole image.
 
@@ -290,31 +382,73 @@ def ngff_scale(scales: Any, n: int) -> Floats:  # noqa: ANN401 (a JSON header)
     return total
 
 
-def _header_items(tree: Any, *keys: str) -> list[Any]:  # noqa: ANN401 (a parsed XML header)
-    """Return the items under a path of keys of a header; empty where a key is missing."""
-    for key in keys:
-        if not isinstance(tree, dict) or key not in tree:
-            return []
-        tree = tree[key]
-    return tree if isinstance(tree, list) else [tree]
+class Format(NamedTuple):
+    """A format of image files that is read.
 
-
-_READERS: dict[str, Callable[[str, Pick], Contents]] = {
-    ".lif": lif,
-    ".nd2": nd2,
-    ".czi": czi,
-    ".ims": ims,
-}
-
-
-def vendor(path: str) -> Callable[[str, Pick], Contents] | None:
-    """Return the reader of a file by its suffix; None for all other files.
+    Attributes
+    ----------
+    name : str
+        What a file of this format is, for messages.
+    read : callable
+        ``read(path, pick)`` describes the contents of a file.
 
     Examples
     --------
-    >>> vendor("movie.lif").__name__, vendor("movie.tif")
-    ('lif', None)
+    >>> Format("Nikon ND2", nd2).name
+    'Nikon ND2'
     """
-    if (Path(path) / ".zgroup").exists() or (Path(path) / "zarr.json").exists():
-        return ome_zarr
-    return _READERS.get(Path(path).suffix.lower())
+
+    name: str
+    read: Callable[[str, Pick], Contents]
+
+
+_FORMATS = {
+    **dict.fromkeys((".lif", ".lof", ".xlef", ".xlif"), Format("Leica LAS X", lif)),
+    ".nd2": Format("Nikon ND2", nd2),
+    ".czi": Format("Zeiss CZI", czi),
+    ".ims": Format("Imaris", ims),
+    **dict.fromkeys((".oib", ".oif"), Format("Olympus FluoView", olympus)),
+    **dict.fromkeys((".dv", ".r3d"), Format("DeltaVision", deltavision)),
+    **dict.fromkeys((".npy", ".npz"), Format("numpy array", numpy_file)),
+    **dict.fromkeys((".h5", ".hdf5"), Format("HDF5", hdf5)),
+}
+
+# Formats of microscopes without a free reader under a permissive licence, and files of pictures.
+_UNREAD = {
+    ".oir": "an Olympus FluoView OIR file",
+    ".vsi": "an Olympus cellSens file",
+    ".sld": "a SlideBook file",
+    ".sldy": "a SlideBook file",
+    ".zvi": "a Zeiss AxioVision file",
+    ".mvd2": "a Volocity file",
+    ".ids": "an ICS file",
+    ".ics": "an ICS file",
+    ".mrc": "an MRC file",
+    **dict.fromkeys((".avi", ".mp4", ".mov", ".mkv", ".wmv"), "a video"),
+    **dict.fromkeys((".png", ".jpg", ".jpeg", ".bmp", ".gif"), "a picture"),
+}
+
+WAY_OUT = (
+    "export it as OME-TIFF, or save the array (t, z, y, x) with np.save and open the .npy file"
+)
+
+
+def vendor(path: str) -> Format | None:
+    """Return the format of a file by its suffix; None for TIFF files and folders of them.
+
+    Raises
+    ------
+    ValueError
+        For a format that is known and not read, with what it is and what to do.
+
+    Examples
+    --------
+    >>> vendor("movie.lif").name, vendor("movie.tif")
+    ('Leica LAS X', None)
+    """
+    if any((Path(path) / name).exists() for name in (".zgroup", ".zarray", "zarr.json")):
+        return Format("OME-Zarr", ome_zarr)
+    suffix = Path(path).suffix.lower()
+    if suffix in _UNREAD:
+        raise ValueError(f"is {_UNREAD[suffix]}, which is not read: {WAY_OUT}")
+    return _FORMATS.get(suffix)
