@@ -261,7 +261,8 @@ def test_channels_are_summed(tmp_path, movie):
     tifffile.imwrite(path, both, imagej=True, metadata={"axes": "TZCYX"})
     with open_stack(path, channel=(0, 1), **GIVEN) as stack:
         assert stack.dtype == np.uint32
-        assert_frames(pickle.loads(pickle.dumps(stack)), movie.astype(np.uint32) + movie[::-1])
+        with pickle.loads(pickle.dumps(stack)) as elsewhere:
+            assert_frames(elsewhere, movie.astype(np.uint32) + movie[::-1])
         assert stack.choice["channel"] == [0, 1]
     with pytest.raises(ValueError, match="channel: expected different numbers from 0"):
         open_stack(path, channel=(0, 0), **GIVEN)
