@@ -12,12 +12,14 @@ from perrin import Cluster, Confined, Fractional, MotionVerdict, Spin, Switching
 from perrin.diffusion import (
     AxisModel,
     Noise,
+    Score,
     approximate_p,
     axis_model,
     brownian_tests,
     confined_autocovariance,
     fractional_autocovariance,
     holm,
+    score_p,
     sine_spectrum,
 )
 from perrin.diffusion.goodness_of_fit import TESTS
@@ -257,3 +259,20 @@ def test_what_cannot_be_judged_is_refused():
         judge_motion(still, quantity="translation")
     with pytest.raises(ValueError, match=r"quantity.*; noise"):
         judge_motion(still, quantity="speed", noise="loud")
+
+
+def test_the_law_of_a_score_is_that_of_its_modes(repeats):
+    """Half the sum of g (chi-squared - 1), few large and many small modes: p is uniform."""
+    rng, g = np.random.default_rng(3), np.concatenate([[-0.8, -0.6, -0.4], np.full(200, 0.05)])
+    draws = repeats(20_000, 200_000)
+    value = 0.5 * (rng.chisquare(1, (draws, len(g))) - 1) @ g
+    one = Score.of(value[:1], g[None, None], information=np.array([0.5 * g @ g]))
+    score = Score(value, np.tile(one.variance, draws), np.tile(one.third, draws))
+    for one_sided in (True, False):
+        p = score_p(score, one_sided=one_sided)
+        for level in (0.01, 0.05, 0.5, 0.95):
+            error = np.sqrt(level * (1 - level) / draws)
+            assert np.mean(p < level) == pytest.approx(level, abs=4 * error + 0.05 * level)
+    near = np.linspace(-0.01, 0.01, 21)  # through 0, where the saddle point is at 0
+    tail = score_p(Score(near, *(np.tile(x, 21) for x in one[1:])), one_sided=True)
+    assert np.abs(np.diff(tail, 2)).max() < 0.01 * np.abs(np.diff(tail)).max()

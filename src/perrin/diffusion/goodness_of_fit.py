@@ -48,6 +48,10 @@ _LEAST_V, _MOST_V = -9.0, 14.0
 
 _CONFINED_RATE = 6.0  # relaxations per track of the cage that the cage test looks for
 
+# Above this p-value, at the D that contains the steady motion, no fit without it is made: it would
+# change D, and with it p, by a few parts in N.
+_NO_STEADY_MOTION = 0.2
+
 _CLUSTERING_LAGS = 20
 
 FEWEST_HALF_PERIODS = 6  # of a vibration in the track
@@ -267,7 +271,7 @@ class AxisModel:
                     break
             return AxisFit(y, D, np.zeros_like(D))
         if near is None:
-            trials = np.linspace(-5.0, 9.0, 29)
+            trials = np.linspace(-5.0, 9.0, 15)
             v = trials[np.argmin([cost(np.full(y.shape[:2], t)) for t in trials], axis=0)]
         else:
             v = np.broadcast_to(self.ratio(near.D, near.offset + noise), y.shape[:2])
@@ -561,9 +565,9 @@ class AxisModel:
         """Return a steady velocity or spin, its information, and p of the F test.
 
         Their shapes are (B, p), (B, p, p) and (B,). The motion is found by generalised least
-        squares on `steady`, with D and the offset fitted
-        once more to what is left. F has (p, nu) degrees of freedom, nu being twice the inverse
-        relative variance of D, mean over the axes.
+        squares on `steady`, with D and the offset fitted again to what is left where p is below
+        0.2. F has (p, nu) degrees of freedom, nu being twice the inverse relative variance of D,
+        mean over the axes.
         """
         from scipy.linalg.lapack import dpttrf, dpttrs
         from scipy.special import fdtrc
@@ -571,21 +575,23 @@ class AxisModel:
         shape, p = fit.y.shape, self.steady.shape[2]
         x = np.moveaxis(self.steady, 0, 1)
         rows = np.broadcast_to(x, (shape[0], *x.shape)).reshape(-1, p)
-        rest = fit
-        for _ in range(2):
+        rest, n = fit, self.n_steps
+        for refits in range(3):
             d, lower, _ = dpttrf(*self.bands(rest.D, rest.offset))
             unit = dpttrs(d, lower, rows)[0].reshape(*shape, p)
             information = np.einsum("anp,banq->bpq", x, unit)
             right = np.einsum("banp,ban->bp", unit, fit.y)
             mean = np.linalg.solve(information, right[..., None])[..., 0]
+            by_D, by_offset = self.slopes(rest.D, rest.offset)
+            g = np.stack([by_D, by_offset] if self.free else [by_D], axis=-2)
+            matrix = 0.5 * np.einsum("...ik,...jk->...ij", g, g)
+            nu = np.mean(2 / np.linalg.inv(matrix)[..., 0, 0], axis=1)
+            square = np.einsum("bp,bpq,bq->b", mean, information, mean) * (n - 1) / (n * p)
+            p_value = np.asarray(fdtrc(p, nu, square))
+            if refits == 2 or p_value.min() > _NO_STEADY_MOTION:
+                break
             rest = self.fit(fit.y - np.einsum("anp,bp->ban", x, mean), near=rest)
-        by_D, by_offset = self.slopes(rest.D, rest.offset)
-        g = np.stack([by_D, by_offset] if self.free else [by_D], axis=-2)
-        matrix = 0.5 * np.einsum("...ik,...jk->...ij", g, g)
-        nu = np.mean(2 / np.linalg.inv(matrix)[..., 0, 0], axis=1)
-        n = self.n_steps
-        square = np.einsum("bp,bpq,bq->b", mean, information, mean) * (n - 1) / (n * p)
-        return mean, information, np.asarray(fdtrc(p, nu, square))
+        return mean, information, p_value
 
 
 def axis_model(motion: RigidMotion, quantity: Quantity, noise: Noise) -> tuple[AxisModel, Floats]:
@@ -810,11 +816,17 @@ def score_p(score: Score, *, one_sided: bool) -> Floats:
     high = np.min(np.where(s > 0, 1 / s, np.inf), axis=0)
     low = np.max(np.where(s < 0, 1 / s, -np.inf), axis=0)
     high, low = np.minimum(high, 1e3 / unit), np.maximum(low, -1e3 / unit)
+    t = np.zeros_like(score.value)
     for _ in range(80):
-        t = 0.5 * (low + high)
-        slope = np.sum(a * s * s * t / (1 - s * t), axis=0)
-        low, high = np.where(slope < score.value, t, low), np.where(slope < score.value, high, t)
-    t = 0.5 * (low + high)
+        # Newton steps towards the saddle point, halved into the bracket.
+        left = 1 / (1 - s * t)
+        excess = np.sum(variance * t * left, axis=0) - score.value
+        low, high = np.where(excess < 0, t, low), np.where(excess < 0, high, t)
+        move = excess / np.sum(variance * left * left, axis=0)
+        newton = t - move
+        t = np.where((newton >= low) & (newton <= high), newton, 0.5 * (low + high))
+        if np.all(np.abs(move) * unit <= 1e-12):
+            break
     generating = -np.sum(a * (np.log1p(-s * t) + s * t), axis=0)
     curvature = np.sum(variance / (1 - s * t) ** 2, axis=0)
     w = np.sign(t) * np.sqrt(np.maximum(2 * (t * score.value - generating), 0.0))
