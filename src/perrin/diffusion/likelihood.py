@@ -37,7 +37,7 @@ _LEAST_LOG_OFFSET, _MOST_LOG_OFFSET = -30.0, 60.0
 _SMALLEST_STEP_RATIO = 1e-24
 
 # Steps in log theta that are short enough where only the sign of a slope is used.
-_COARSE_STEP = 0.03
+_COARSE_LOG_STEP = 0.03
 
 # About this many step components are evaluated at once; more do not stay in the processor's cache.
 _MOST_AT_ONCE = 100_000
@@ -265,7 +265,7 @@ class Likelihood:
                 powers = np.append(powers, 4.0 ** (len(powers) - 8 + np.arange(at_once)))
             D = powers[k : k + at_once, None] * self.scale
             start = parts[-1].theta_at(D)[-1:] if parts and at_once == 1 else None
-            parts.append(self.profile(D, start, tolerance=_COARSE_STEP))
+            parts.append(self.profile(D, start, tolerance=_COARSE_LOG_STEP))
             if powers[min(k + at_once, len(powers)) - 1] > 1 and np.all(parts[-1].slope[-1] <= 0):
                 break
         return ProfilePoint(*[np.concatenate(rows) for rows in zip(*parts, strict=True)])
