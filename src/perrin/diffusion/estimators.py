@@ -26,6 +26,9 @@ Method = Literal["mle", "cve", "trace"]
 # the plane angles add up exactly; only whole turns within a step (4 D_R dt = 2) are lost.
 _COARSE_STEP, _COARSE_STEP_IN_PLANE, _LOW_SNR, _FEW_STEPS = 0.2, 2.0, 0.2, 30
 
+# Beyond this the mean of the square of rotation vectors, which end at pi, says little of D_R.
+_LOST_TURNS = 1.0
+
 
 def estimate_diffusion(
     motion: RigidMotion | Sequence[RigidMotion],
@@ -236,6 +239,11 @@ def precision_limits(estimate: DiffusionEstimate, steps: Sequence[Steps]) -> tup
     if planar and 4 * step > _COARSE_STEP_IN_PLANE:
         limits.append(
             f"4 D_R dt = {4 * step:.2g} over {_COARSE_STEP_IN_PLANE}: whole turns between frames"
+        )
+    elif not planar and 4 * step > _LOST_TURNS:
+        limits.append(
+            f"4 D_R dt = {4 * step:.2g} over {_COARSE_STEP}: rotation vectors between frames do not "
+            "follow turns as large as these, and D_R is a lower limit; sample faster"
         )
     elif not planar and 4 * step > _COARSE_STEP:
         limits.append(
