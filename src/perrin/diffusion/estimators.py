@@ -242,8 +242,8 @@ def precision_limits(estimate: DiffusionEstimate, steps: Sequence[Steps]) -> tup
         )
     elif not planar and 4 * step > _LOST_TURNS:
         limits.append(
-            f"4 D_R dt = {4 * step:.2g} over {_COARSE_STEP}: rotation vectors between frames do not "
-            "follow turns as large as these, and D_R is a lower limit; sample faster"
+            f"4 D_R dt = {4 * step:.2g} over {_COARSE_STEP}: rotation vectors between frames do "
+            "not follow turns as large as these, and D_R is a lower limit; sample faster"
         )
     elif not planar and 4 * step > _COARSE_STEP:
         limits.append(
