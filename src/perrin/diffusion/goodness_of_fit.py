@@ -852,6 +852,20 @@ def holm(p: Floats) -> float:
     return float(min(1.0, known.size * known.min()))
 
 
+def fisher(p: Sequence[float]) -> float:
+    """Return the combined p-value of independent tests of one hypothesis (Fisher 1925).
+
+    Examples
+    --------
+    >>> round(fisher([0.05, 0.05]), 4)
+    0.0175
+    """
+    from scipy.special import gammaincc
+
+    logs = -np.log(np.maximum(np.asarray(p, dtype=np.float64), 1e-300))
+    return float(gammaincc(logs.size, logs.sum()))
+
+
 @dataclass(frozen=True, eq=False)
 class BrownianTests:
     """The tests of one motion against Brownian motion with constant noise.
@@ -882,11 +896,6 @@ class BrownianTests:
 
     def __post_init__(self) -> None:
         frozen(self.u)
-
-    @property
-    def alpha_error(self) -> float:
-        """Standard error that an estimate of the exponent has at 1."""
-        return float(1 / np.sqrt(self.scores[0].information[0]))
 
 
 def brownian_tests(model: AxisModel, y: Floats) -> BrownianTests:

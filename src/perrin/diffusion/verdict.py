@@ -21,6 +21,7 @@ from perrin.diffusion.goodness_of_fit import (
     Score,
     axis_model,
     brownian_tests,
+    fisher,
     holm,
     largest_share,
     score_p,
@@ -312,14 +313,9 @@ def combined_p(tested: Sequence[BrownianTests]) -> dict[str, float]:
     >>> 0 < combined_p(tested)["cage"] < 1
     True
     """
-    from scipy.special import gammaincc
-
     if len(tested) == 1:
         return dict(tested[0].p)
-    p = {}
-    for name in tested[0].p:
-        logs = [-np.log(max(one.p[name], 1e-300)) for one in tested]
-        p[name] = float(gammaincc(len(tested), sum(logs)))
+    p = {name: fisher([one.p[name] for one in tested]) for name in tested[0].p}
     if sum(one.model.n_steps for one in tested) >= 200:
         for i, name in enumerate(("fractional", "cage")):
             total = Score.total([one.scores[i] for one in tested])
@@ -394,18 +390,16 @@ def _shape(
 
 def _steady_gain(tested: Sequence[BrownianTests]) -> tuple[float, float, float]:
     """Return the log-likelihood gained by a steady motion, its p, and p of the exponent then."""
-    from scipy.special import gammaincc
-
-    gain, logs, scores = 0.0, 0.0, []
+    gain, p_steady, scores = 0.0, [], []
     for one in tested:
         model, fit = one.model, one.fit
         mean, _, p = model.steady_motion(fit)
         rest = model.fit(fit.y - np.einsum("nap,bp->ban", model.steady, mean), near=fit)
         gain += model.log_likelihood(rest) - model.log_likelihood(fit)
-        logs -= np.log(max(float(p[0]), 1e-300))
+        p_steady.append(float(p[0]))
         scores.append((model.scores(rest) if model.even else model.dense_scores(rest, rest.y))[0])
     p_rest = score_p(Score.total(scores), one_sided=False)
-    return gain, float(gammaincc(len(tested), logs)), float(p_rest[0])
+    return gain, fisher(p_steady), float(p_rest[0])
 
 
 def _variance(
@@ -419,21 +413,19 @@ def _variance(
     A test of clustering and of slow change with the longest steps shortened to what one Brownian
     track of this length has decides.
     """
-    from scipy.special import chdtri, gammaincc
+    from scipy.special import chdtri
 
-    quantity, logs = verdict.quantity, np.zeros(2)
-    rows: list[int] = []
+    quantity, rows = verdict.quantity, []
+    shortened: dict[str, list[float]] = {"clustering": [], "slow change": []}
     for m, one in zip(motions, tested, strict=True):
         axes, n = one.fit.D.shape[1], one.model.n_steps
-        limit = np.median(one.u) / chdtri(axes, 0.5) * chdtri(axes, 1 / n)
-        u = np.minimum(one.u, limit)
+        scale = np.median(one.u) / chdtri(axes, 0.5)
+        u = np.minimum(one.u, scale * chdtri(axes, 1 / n))
         statistics = tabulated_statistics(u * axes / u.mean(), axes)
-        for i, name in enumerate(("clustering", "slow change")):
-            p = tabulated_p(name, statistics[name], axes=axes, n_steps=n)
-            logs[i] -= np.log(max(float(p), 1e-300))
-        beyond = np.median(one.u) / chdtri(axes, 0.5) * chdtri(axes, LEVEL / n)
-        rows += m.steps()[1][one.u > beyond].tolist()
-    clustering, slow_change = gammaincc(len(tested), logs)
+        for name, p in shortened.items():
+            p.append(float(tabulated_p(name, statistics[name], axes=axes, n_steps=n)))
+        rows += m.steps()[1][one.u > scale * chdtri(axes, LEVEL / n)].tolist()
+    clustering, slow_change = map(fisher, shortened.values())
     if min(clustering, slow_change) > LEVEL:
         return _jumps(verdict, rows if len(motions) == 1 else [])
     if slow_change < clustering and _noise_changes(motions, tested):
