@@ -1,0 +1,475 @@
+"""Movies of an independent renderer through the pipeline: one property of a microscope at a time.
+
+The renderer shares no code with perrin. A ball is its own Fourier transform, multiplied by that of
+the point spread (Gaussian, or the product of two focal fields of a confocal microscope), sampled on
+a fine grid and interpolated at every voxel; each plane is drawn at its own time. Bodies move in a
+box with hard walls, by rejection of steps that would make spheres overlap, so that encounters
+happen. The base case: four touching tetrahedra of balls 2.45 um, 40 x 128 x 128 voxels of 0.25 x
+0.2 x 0.2 um, 20 frames 0.73 s apart, D_R 0.0049 rad^2/s, D_T 0.0385 um^2/s, 40 photons over a
+background of 3, gain 3.
+
+Printed for every case: spheres missed and false, the standard deviation of positions and the
+stated error (nm), planted clusters that were found, false ones, orientation errors over the stated
+ones, and D minus that of the true positions at one instant, in its standard errors, with the ratio
+of the standard errors.
+
+Usage: python benchmarks/microscopes.py [--only NAME] [--movies 1] [--seed 0] [--warnings]
+"""
+
+import argparse
+import time
+import warnings
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy.ndimage import map_coordinates, spline_filter
+from scipy.spatial.distance import cdist
+from scipy.spatial.transform import Rotation
+
+DIAMETER, DT, D_R, D_T = 2.45, 0.73, 0.0049, 0.0385
+SHAPES = {
+    1: np.zeros((1, 3)),
+    2: np.array([[-0.5, 0, 0], [0.5, 0, 0]]),
+    3: np.array([[0, 1, 0], [-np.sqrt(3) / 2, -0.5, 0], [np.sqrt(3) / 2, -0.5, 0]]) / np.sqrt(3),
+    4: np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / np.sqrt(8),
+    6: np.concatenate([np.eye(3), -np.eye(3)]) / np.sqrt(2),
+}
+
+
+@dataclass(frozen=True)
+class Microscope:
+    """What is between the spheres and the file."""
+
+    shape: tuple[int, int, int] = (40, 128, 128)
+    voxel: tuple[float, float, float] = (0.25, 0.2, 0.2)
+    psf: str = "gaussian"
+    blur: tuple[float, float] = (0.4, 0.15)  # z and xy, um; of the Gaussian
+    photons: float = 40.0
+    background: float = 3.0
+    gain: float = 3.0
+    read_noise: float = 1.0  # grey levels
+    pixel_spread: float = 0.0  # of the gain from pixel to pixel (sCMOS)
+    bits: int = 8
+    bleached: float = 0.0  # share of the light lost at the last frame
+    depth_loss: float = 0.0  # share of the light lost at the last plane
+    plane_time: float = 0.0
+    shell: bool = False
+
+    @property
+    def box(self):
+        """Return lengths of the field along x, y, z, um."""
+        return (np.array(self.shape) * self.voxel)[::-1]
+
+
+@dataclass
+class Body:
+    """Spheres that move together."""
+
+    shape: np.ndarray  # (n, 3), um
+    place: np.ndarray
+    turn: Rotation
+    bright: np.ndarray  # (n,)
+    path: list = field(default_factory=list)
+
+    def spheres(self):
+        """Return the positions (n, 3) of the spheres."""
+        return self.place + self.turn.apply(self.shape)
+
+
+def scene(kinds, box, *, rng, bright=None, walls=DIAMETER, tries=20000):
+    """Place bodies at random without overlap.
+
+    `kinds` lists numbers of spheres, in order; `bright` has factors of the light of the spheres of
+    each body; centres of all spheres keep `walls` from the sides (negative: they may leave).
+    """
+    bodies = []
+    for i, kind in enumerate(kinds):
+        shape = DIAMETER * SHAPES[kind]
+        light = np.ones(kind) if bright is None else np.asarray(bright[i], dtype=float)
+        for _ in range(tries):
+            body = Body(shape, rng.uniform(walls, box - walls), Rotation.random(rng=rng), light)
+            if allowed(body.spheres(), bodies, None, box, walls):
+                bodies.append(body)
+                break
+        else:
+            raise RuntimeError("no space is left for another body")
+    return bodies
+
+
+def allowed(x, bodies, me, box, walls):
+    """Return whether spheres are inside the walls and overlap no sphere of another body."""
+    if np.any(x < walls) or np.any(x > box - walls):
+        return False
+    others = [b.spheres() for b in bodies if b is not me]
+    return not others or cdist(x, np.concatenate(others)).min() >= 1.001 * DIAMETER
+
+
+def diffuse(bodies, times, box, *, rng, walls=DIAMETER, longest=0.1):
+    """Move all bodies through the times; each body's `path` becomes (len(times), n, 3).
+
+    D_T and D_R of a body of n spheres are those of a tetrahedron times 4 / n and (4 / n)^2 up to
+    the sizes of the shapes; a single sphere has 1.8 D_T.
+    """
+    now = times[0]
+    sizes = [len(b.shape) for b in bodies]
+    first = np.cumsum([0, *sizes])
+    x = np.concatenate([b.spheres() for b in bodies])
+    owner = np.repeat(np.arange(len(bodies)), sizes)
+    for t in times:
+        steps = max(1, int(np.ceil((t - now) / longest - 1e-9))) if t > now else 0
+        for _ in range(steps):
+            h = (t - now) / steps
+            for i, b in enumerate(bodies):
+                slow = (sizes[i] / 4) ** (1 / 3)
+                move = rng.normal(0, np.sqrt(2 * h * D_T / slow), 3)
+                spin = rng.normal(0, np.sqrt(2 * h * D_R / slow**3), 3)
+                place, turn = b.place + move, Rotation.from_rotvec(spin) * b.turn
+                new = place + turn.apply(b.shape)
+                if np.any(new < walls) or np.any(new > box - walls):
+                    continue
+                other = x[owner != i]
+                near = other[np.abs(other - place).max(axis=1) < 3 * DIAMETER]
+                if len(near) and cdist(new, near).min() < DIAMETER:
+                    continue
+                b.place, b.turn = place, turn
+                x[first[i] : first[i + 1]] = new
+        now = t
+        for b in bodies:
+            b.path.append(b.spheres())
+    for b in bodies:
+        b.path = np.array(b.path)
+
+
+def focal_field(rho, z, *, wave, aperture=1.3, index=1.4):
+    """Return the intensity of a focused wave near the focus (scalar Debye integral)."""
+    from scipy.special import j0
+
+    k = 2 * np.pi * index / wave
+    nodes, weights = np.polynomial.legendre.leggauss(60)
+    high = np.arcsin(aperture / index)
+    theta = high * (nodes + 1) / 2
+    ring = np.sqrt(np.cos(theta)) * np.sin(theta) * weights
+    phase = np.exp(1j * k * z[:, None] * np.cos(theta))
+    return np.abs(np.einsum("zt,rt,t->zr", phase, j0(k * np.outer(rho, np.sin(theta))), ring)) ** 2
+
+
+def blurred_ball(light, *, grid=0.05, half=(3.4, 2.3)):
+    """Return spline coefficients of the image of one ball on a fine grid, and its spacing, um.
+
+    The image is scaled to 1 at its middle.
+    """
+    n = [2 * round(half[0] / grid), 2 * round(half[1] / grid), 2 * round(half[1] / grid)]
+    k = [2 * np.pi * np.fft.fftfreq(m, grid) for m in n]
+    kz, ky, kx = np.meshgrid(*k, indexing="ij", sparse=True)
+    kr = np.sqrt(kz**2 + ky**2 + kx**2) * DIAMETER / 2
+    kr[0, 0, 0] = 1e-6
+    ball = np.sin(kr) / kr if light.shell else 3 * (np.sin(kr) - kr * np.cos(kr)) / kr**3
+    if light.psf == "gaussian":
+        otf = np.exp(-((kz * light.blur[0]) ** 2 + (ky**2 + kx**2) * light.blur[1] ** 2) / 2)
+    else:
+        z, y, x = ((np.arange(m) - m // 2) * grid for m in n)
+        fine = np.linspace(0, 1.5 * half[1], 400)
+        point = focal_field(fine, z, wave=0.488) * focal_field(fine, z, wave=0.52)
+        r = np.hypot(*np.meshgrid(y, x, indexing="ij"))
+        psf = np.stack([np.interp(r, fine, line) for line in point])
+        otf = np.fft.fftn(np.fft.ifftshift(psf))
+    image = np.fft.fftshift(np.fft.ifftn(ball * otf).real)
+    return spline_filter(image / image[tuple(m // 2 for m in n)], order=3), grid
+
+
+def exposed(bodies, light, *, frame, table, dust=()):
+    """Return the mean number of photons of every voxel of one frame."""
+    coefficients, grid = table
+    planes, ny, nx = light.shape
+    voxel = np.array(light.voxel)
+    size = np.array(coefficients.shape)
+    out = np.zeros(light.shape)
+    reach = size / 2 * grid - 2 * grid
+    # Paths have one position per plane where planes are drawn at their own times.
+    per = planes if light.plane_time else 1
+    for b in (*bodies, *dust):
+        for j, bright in enumerate(b.bright):
+            x = b.path[frame * per : frame * per + per, j]
+            x = np.broadcast_to(x, (planes, 3))
+            z = np.arange(planes) * voxel[0] - x[:, 2]
+            seen = np.flatnonzero(np.abs(z) < reach[0])
+            if not seen.size or bright == 0:
+                continue
+            ys, xs = x[seen, 1], x[seen, 0]
+            y0 = max(0, int(np.ceil((ys.min() - reach[1]) / voxel[1])))
+            y1 = min(ny, int((ys.max() + reach[1]) / voxel[1]) + 1)
+            x0 = max(0, int(np.ceil((xs.min() - reach[2]) / voxel[2])))
+            x1 = min(nx, int((xs.max() + reach[2]) / voxel[2]) + 1)
+            if y0 >= y1 or x0 >= x1:
+                continue
+            dy = np.arange(y0, y1) * voxel[1] - ys[:, None]
+            dx = np.arange(x0, x1) * voxel[2] - xs[:, None]
+            where = np.broadcast_arrays(
+                z[seen][:, None, None] / grid + size[0] // 2,
+                dy[:, :, None] / grid + size[1] // 2,
+                dx[:, None, :] / grid + size[2] // 2,
+            )
+            part = map_coordinates(coefficients, where, order=3, prefilter=False)
+            out[seen, y0:y1, x0:x1] += bright * np.maximum(part, 0)
+    return out
+
+
+def recorded(bodies, light, *, n_frames, rng, dust=()):
+    """Return the movie (T, z, y, x) as the camera writes it."""
+    table = blurred_ball(light)
+    gain = light.gain * (1 + light.pixel_spread * rng.normal(size=light.shape[1:]))
+    depth = 1 - light.depth_loss * np.arange(light.shape[0]) / max(light.shape[0] - 1, 1)
+    movie = np.empty((n_frames, *light.shape), dtype="uint8" if light.bits == 8 else "uint16")
+    for i in range(n_frames):
+        left = (1 - light.bleached) ** (i / max(n_frames - 1, 1))
+        mean = light.photons * left * exposed(bodies, light, frame=i, table=table, dust=dust)
+        mean = mean * depth[:, None, None] + light.background
+        grey = gain * rng.poisson(mean) + rng.normal(0, light.read_noise, light.shape)
+        movie[i] = np.clip(np.round(grey), 0, 2**light.bits - 1)
+    return movie
+
+
+def plane_times(light, n_frames):
+    """Return the times at which bodies are needed: of each frame, or of each of its planes."""
+    frames = np.arange(n_frames) * DT
+    if light.plane_time == 0:
+        return frames
+    return (frames[:, None] + np.arange(light.shape[0]) * light.plane_time).ravel()
+
+
+@dataclass(frozen=True)
+class Case:
+    """A movie: what is in it, through which microscope, and how it is analysed."""
+
+    kinds: tuple = (4, 4, 4, 4)
+    light: Microscope = Microscope()
+    bright: tuple | None = None
+    walls: float = DIAMETER
+    jump: float = 0.0  # um, of everything, before frame 10
+    dust: int = 0
+    n_frames: int = 20
+    options: dict = field(default_factory=dict)
+
+
+def monomers(share, light):
+    """Return how many single spheres fill a share of the volume of the field."""
+    return round(share * np.prod(light.box) / (np.pi / 6 * DIAMETER**3))
+
+
+BASE = Microscope()
+CASES = {
+    "base": Case(),
+    "planes 18 ms": Case(light=replace(BASE, plane_time=0.018)),
+    "planes 5 ms": Case(light=replace(BASE, plane_time=0.005)),
+    "bleaching 95 %": Case(light=replace(BASE, bleached=0.95)),
+    "monomers 10 %": Case((4, 4, 4) + (1,) * monomers(0.10, BASE), walls=DIAMETER / 2),
+    "monomers 25 %": Case((4, 4, 4) + (1,) * monomers(0.25, BASE), walls=DIAMETER / 2),
+    "monomers alone": Case((1,) * 60, walls=DIAMETER / 2),
+    "dust": Case(dust=14),
+    "monomers, dimers": Case((4, 4, 4, 4, 2, 2, 2, 1, 1, 1, 1, 1)),
+    "mixture": Case((2, 2, 3, 3, 4, 4, 6, 6)),
+    "dimers": Case((2, 2, 2, 2, 2)),
+    "one undyed": Case(bright=((0, 1, 1, 1), (1, 1, 1, 1), (1, 1, 1, 1), (1, 1, 1, 1))),
+    "one at 12 %": Case(bright=((0.12, 1, 1, 1), (1, 1, 1, 1), (1, 1, 1, 1), (1, 1, 1, 1))),
+    "entering": Case((4,) * 5, walls=-0.4 * DIAMETER),
+    "stage jump 1.2 um": Case(jump=1.2),
+    "stage jump 2 um": Case(jump=2.0),
+    "confocal": Case(light=replace(BASE, psf="confocal")),
+    "realistic": Case(
+        light=replace(
+            BASE, psf="confocal", bleached=0.28, plane_time=0.008, pixel_spread=0.03,
+            depth_loss=0.1, read_noise=2.0,
+        )
+    ),
+}  # fmt: skip
+
+
+def drawn(case, seed):
+    """Return the movie of a case, its bodies, and times (T,) of the middle plane of the frames."""
+    rng = np.random.default_rng(seed)
+    light = case.light
+    bodies = scene(case.kinds, light.box, rng=rng, bright=case.bright, walls=case.walls)
+    diffuse(bodies, plane_times(light, case.n_frames), light.box, rng=rng, walls=case.walls)
+    specks = specks_of(case, rng)
+    per = light.shape[0] if light.plane_time else 1
+    for b in (*bodies, *specks):
+        b.path[10 * per :, :, 0] += case.jump
+    movie = recorded(bodies, light, n_frames=case.n_frames, rng=rng, dust=specks)
+    return movie, bodies
+
+
+def specks_of(case, rng):
+    """Return dust: lumps of several balls that overlap, and are brighter than spheres."""
+    specks = []
+    for _ in range(case.dust):
+        n = int(rng.integers(1, 5))
+        spread = rng.uniform(0.1, 0.7) * DIAMETER
+        shape = rng.normal(0, spread / 2, (n, 3)) * rng.uniform(0.3, 1.5, 3)
+        place = rng.uniform(0, case.light.box)
+        speck = Body(shape, place, Rotation.identity(), rng.uniform(0.3, 2.5, n))
+        count = len(plane_times(case.light, case.n_frames))
+        specks.append(replace(speck, path=np.repeat((place + shape)[None], count, axis=0)))
+    return specks
+
+
+def instants(body, case, plane=None):
+    """Return positions (T, n, 3) of a body at the instant of one plane; default: the middle."""
+    planes = case.light.shape[0]
+    if not case.light.plane_time:
+        return body.path
+    return body.path[(planes // 2 if plane is None else plane) :: planes]
+
+
+def true_report(bodies, case):
+    """Return the report of the same estimators for the true positions at one instant."""
+    import pandas as pd
+
+    import perrin
+
+    tables, first = [], 0
+    for c, body in enumerate(bodies):
+        table = perrin.positions_table(instants(body, case)).assign(cluster=c)
+        table["particle"] += first
+        first += len(body.shape)
+        tables.append(table)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return perrin.analyze(pd.concat(tables, ignore_index=True), dt=DT)
+
+
+def analysed(movie, case):
+    """Return perrin's report of a movie."""
+    import perrin
+
+    light = case.light
+    stack = perrin.open_stack(movie, voxel=light.voxel, dt=DT, plane_time=light.plane_time or None)
+    options = {"contact": DIAMETER} | case.options
+    return perrin.analyze_stack(stack, diameter=DIAMETER, **options)
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--only", default="", help="cases whose name contains this")
+    parser.add_argument("--movies", type=int, default=1)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--warnings", action="store_true", help="print the warnings of each run")
+    args = parser.parse_args()
+    for name, case in CASES.items():
+        if args.only in name:
+            for seed in range(args.seed, args.seed + args.movies):
+                begun = time.process_time()
+                movie, bodies = drawn(case, seed)
+                print(name, seed, f"drawn in {time.process_time() - begun:.1f} s", flush=True)
+                begun = time.process_time()
+                try:
+                    report = analysed(movie, case)
+                except Exception as error:  # a refusal is a result here
+                    print(f"  refused: {error}")
+                    continue
+                print_case(report, bodies, case, seconds=time.process_time() - begun)
+                if args.warnings:
+                    for text in report.warnings:
+                        print("   !", text[:300])
+
+
+def print_case(report, bodies, case, *, seconds):
+    """Print how a report compares with the truth."""
+    rigid = [b for b in bodies if len(b.shape) >= 3]
+    x, stated, missed, false, n = [], [], 0, 0, 0
+    per = case.light.shape[0]
+    for i, part in report.imaging.features.groupby("frame"):
+        places, light = [], []
+        found = part[["x", "y", "z"]].to_numpy()
+        for b in bodies:
+            for j in range(len(b.shape)):
+                if case.light.plane_time:
+                    # The instant at which the scan reaches the sphere.
+                    own = b.path[i * per : (i + 1) * per, j]
+                    heights = np.arange(per) * case.light.voxel[0]
+                    places.append(own[np.abs(own[:, 2] - heights).argmin()])
+                else:
+                    places.append(b.path[i, j])
+                light.append(b.bright[j])
+        places, light = np.array(places), np.array(light)
+        inside = np.all((places > 0) & (places < case.light.box), axis=1) & (light > 0)
+        away = cdist(found, places)
+        good = away.min(axis=1) < DIAMETER / 4
+        false += int((~good).sum())
+        missed += int((away.min(axis=0)[inside] > DIAMETER / 4).sum())
+        n += int(inside.sum())
+        x.append((found - places[away.argmin(axis=1)])[good])
+        stated.append(part.loc[good, ["sigma_x", "sigma_y", "sigma_z"]].to_numpy())
+    error = np.concatenate(x)
+    sd = 1e3 * np.sqrt(np.mean((error - np.median(error, axis=0)) ** 2, axis=0))
+    said = 1e3 * np.sqrt(np.nanmedian(np.concatenate(stated) ** 2, axis=0))
+    print(f"  {n} spheres: {missed} missed, {false} false; sd {sd.round(1)}, stated", end=" ")
+    print(f"{said.round(1)} nm; {seconds:.1f} s")
+    if not rigid:
+        print(f"  no body was planted; {len(report.clusters)} clusters, {len(report.rods)} rods")
+        return
+    true = true_report(rigid, case)
+    pairs, others = matched(report, rigid, case)
+    sizes = [len(rigid[c].shape) for c in pairs]
+    print(f"  clusters: {len(pairs)} of {len(rigid)} found (sizes {sizes}),", end=" ")
+    print(f"{len(others)} false, {len(report.rods)} rods")
+    turns = [turn_errors(result, rigid[c], case) for c, result in pairs.items()]
+    if turns:
+        print(f"  turn errors {np.sqrt(np.mean(np.concatenate(turns) ** 2, axis=0)).round(1)} mrad")
+    known = {r.cluster: r for r in true.clusters}
+    for c, result in pairs.items():
+        if c in known:
+            print(f"  body {c}:", compared(result, known[c]))
+    if report.pooled is not None and true.pooled is not None:
+        print("  pooled:", compared(report.pooled, true.pooled))
+
+
+def compared(found, true):
+    """Return D_R and D_T against the truth in its standard errors, and the ratio of errors."""
+    texts = []
+    for name in ("D_R", "D_T"):
+        one, other = getattr(found, name), getattr(true, name)
+        off, ratio = (one.value - other.value) / other.stderr, one.stderr / other.stderr
+        texts.append(f"{name} {one.value:.5f} ({off:+.2f} errors, error x {ratio:.2f})")
+    return "; ".join(texts)
+
+
+def rows_of(result):
+    """Return the frame of each row of a result's motion."""
+    return np.rint(result.motion.time / DT).astype(int)
+
+
+def matched(report, bodies, case):
+    """Return {planted body: result} and the results that are no planted body."""
+    pairs, others = {}, []
+    for result in report.clusters:
+        rows = rows_of(result)
+        away = [
+            np.nanmedian(
+                np.linalg.norm(instants(b, case).mean(axis=1)[rows] - result.motion.center, axis=1)
+            )
+            for b in bodies
+        ]
+        best = int(np.argmin(away))
+        if away[best] < DIAMETER / 4 and best not in pairs:
+            pairs[best] = result
+        else:
+            others.append(result)
+    return pairs, others
+
+
+def turn_errors(result, body, case):
+    """Return errors (T, 3) of the orientation against the true one at the middle plane, mrad."""
+    rows = rows_of(result)
+    x = instants(body, case)
+    shape = body.shape - body.shape.mean(axis=0)
+    true = Rotation.concatenate(
+        [Rotation.align_vectors(x[i] - x[i].mean(axis=0), shape)[0] for i in rows]
+    )
+    fitted = np.isfinite(result.motion.rotation).all(axis=(1, 2))
+    apart = true[fitted].inv() * Rotation.from_matrix(result.motion.rotation[fitted])
+    mean = apart.mean()
+    return 1e3 * (apart * mean.inv()).as_rotvec()
+
+
+if __name__ == "__main__":
+    main()
