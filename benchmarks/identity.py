@@ -273,7 +273,7 @@ def scale(rng, clusters):
         found = perrin.find_clusters(table, contact=contact)
         times.append(time.perf_counter())
         spent = np.zeros(2)
-        for _, x, frames, _ in each_cluster(found):
+        for _, x, frames, *_ in each_cluster(found):
             start = time.perf_counter()
             identity = perrin.settle_identity(x, times=frames)
             middle = time.perf_counter()

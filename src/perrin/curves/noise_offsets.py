@@ -78,7 +78,7 @@ def orientation_offsets(motion: RigidMotion, noise: str | float | None) -> Float
         product = neighbour_covariance(motion.step_vectors()[stop - 1], start[1:] == stop[:-1])
         return np.broadcast_to(-product, motion.covariance.shape)
     if noise == "residual":
-        covariance = motion.covariance
+        covariance = motion.step_covariance
     else:
         covariance = unit_covariance(motion) * float(noise) ** 2
     covariance = np.where(np.isfinite(covariance), covariance, 0.0)

@@ -283,7 +283,7 @@ def open_stack(
         if plane_time is None:
             plane_time = contents.plane_time
         else:
-            faults += number_fault("plane_time", plane_time, least=0, unit="s")
+            faults += number_fault("plane_time", plane_time, unit="s")
         faults += contents.doubts(settled, times, plane_time, given=size is not None)
         if faults:
             raise ValueError(f"{source}: " + "; ".join(faults))

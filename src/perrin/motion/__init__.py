@@ -56,8 +56,9 @@ from perrin.motion.rigidity import (
     misplaced_detections,
 )
 from perrin.motion.rods import LEAP_UNLABELLED, SETTLED_LOG_ODDS, RodMotion, track_direction
+from perrin.motion.scanning import ScannedFit, fit_scanned, scan_share
 from perrin.motion.simulate import add_noise, heat_kernel_angles, simulate_motion
-from perrin.motion.tracking import remove_rotation, template_motion, track_rotation
+from perrin.motion.tracking import remove_rotation, template_motion, track_rotation, track_scanned
 
 __all__ = [
     "LEAP_UNLABELLED",
@@ -73,6 +74,7 @@ __all__ = [
     "Residuals",
     "RigidMotion",
     "RodMotion",
+    "ScannedFit",
     "Slope",
     "Spin",
     "Stretch",
@@ -87,6 +89,7 @@ __all__ = [
     "fast_states",
     "fit_chain",
     "fit_projector",
+    "fit_scanned",
     "fit_template",
     "fit_weighted",
     "floor_of",
@@ -111,6 +114,7 @@ __all__ = [
     "remove_rotation",
     "require_points",
     "sample_residuals",
+    "scan_share",
     "simulate_motion",
     "step_residuals",
     "template_motion",
@@ -118,6 +122,7 @@ __all__ = [
     "threshold_references",
     "track_direction",
     "track_rotation",
+    "track_scanned",
     "unit_center_variance",
     "unit_covariance",
 ]

@@ -642,7 +642,7 @@ def body_residuals(motion: RigidMotion, positions: Floats) -> Floats:
 
 
 def unit_covariance(motion: RigidMotion) -> Floats:
-    """Return the covariance of every orientation for a localisation error of 1 um, (T, a, a).
+    """Return the step noise of every orientation for a localisation error of 1 um, (T, a, a).
 
     Examples
     --------
@@ -653,13 +653,13 @@ def unit_covariance(motion: RigidMotion) -> Floats:
     """
     square = float(np.mean(motion.noise**2))
     if square > 0:
-        return np.asarray(motion.covariance / square)
+        return np.asarray(motion.step_covariance / square)
     unit = orientation_covariance(motion.template, np.eye(motion.template.shape[1]))
     return np.broadcast_to(unit, motion.covariance.shape)
 
 
 def unit_center_variance(motion: RigidMotion) -> Floats:
-    """Return the variance of every centre for a localisation error of 1 um, (T,).
+    """Return the step noise variance of every centre for a localisation error of 1 um, (T,).
 
     Examples
     --------
@@ -670,5 +670,5 @@ def unit_center_variance(motion: RigidMotion) -> Floats:
     """
     square = float(np.mean(motion.noise**2))
     if square > 0:
-        return np.asarray(motion.center_variance / square)
+        return np.asarray(motion.step_center_variance / square)
     return np.full(len(motion.time), 1 / len(motion.template))

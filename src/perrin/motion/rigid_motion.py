@@ -58,6 +58,12 @@ class RigidMotion:
         known one where it was given, else sigma.
     dt : float
         Time between frames, s.
+    turn_noise : ndarray, shape (T, 3, 3) or (T, 1, 1), or None
+        Covariance that the orientations' errors add to steps, rad^2, where particles were recorded
+        at different times (`track_rotation` with `delays`); None where it is `covariance`.
+    shift_noise : ndarray, shape (T,), or None
+        The same for the centre, um^2; None where it is `center_variance`. Negative where averaging
+        over the scan makes steps shorter.
     """
 
     time: Floats
@@ -73,9 +79,12 @@ class RigidMotion:
     sigma: float
     noise: Floats
     dt: float
+    turn_noise: Floats | None = None
+    shift_noise: Floats | None = None
 
     def __post_init__(self) -> None:
         frozen(self.time, self.center, self.rotation, self.residual, self.n_present)
+        frozen(*(x for x in (self.turn_noise, self.shift_noise) if x is not None))
         frozen(self.covariance, self.center_variance, self.piece, self.template, self.noise)
 
     def __repr__(self) -> str:
@@ -127,17 +136,27 @@ class RigidMotion:
         return float(np.median(self.time[stop] - self.time[start])) if start.size else self.dt
 
     @property
+    def step_covariance(self) -> Floats:
+        """What the error of every orientation adds to the covariance of steps, rad^2, (T, a, a)."""
+        return self.covariance if self.turn_noise is None else self.turn_noise
+
+    @property
+    def step_center_variance(self) -> Floats:
+        """What the error of every centre adds to the variance of steps, um^2, (T,)."""
+        return self.center_variance if self.shift_noise is None else self.shift_noise
+
+    @property
     def orientation_noise(self) -> Floats:
-        """The covariance of one orientation, mean over the ends of all steps, rad^2, (3, 3)."""
+        """The noise of one orientation, mean over the ends of all steps, rad^2, (3, 3)."""
         rows = np.concatenate(self.steps())
         rows = rows if rows.size else self.fitted
-        return np.asarray(self.covariance[rows].mean(axis=0))
+        return np.asarray(self.step_covariance[rows].mean(axis=0))
 
     @property
     def center_noise(self) -> float:
-        """The variance of one centre coordinate, mean over the ends of all steps, um^2."""
+        """The noise variance of one centre coordinate, mean over the ends of all steps, um^2."""
         rows = np.concatenate(self.steps())
-        return float(self.center_variance[rows if rows.size else self.fitted].mean())
+        return float(self.step_center_variance[rows if rows.size else self.fitted].mean())
 
     @property
     def resolution_floor(self) -> float:
@@ -296,6 +315,15 @@ class RigidMotion:
             if j >= i
         }
         columns |= {"center_variance": self.center_variance, "piece": self.piece}
+        if self.turn_noise is not None:
+            columns |= {
+                f"step_cov_{a}{b}": self.turn_noise[:, i, j]
+                for i, a in enumerate(angles)
+                for j, b in enumerate(angles)
+                if j >= i
+            }
+        if self.shift_noise is not None:
+            columns["step_center_variance"] = self.shift_noise
         columns |= {"reason": list(self.reason)}
         table = pd.DataFrame(columns)
         table.attrs = {"template": self.template.tolist(), "sigma": self.sigma, "dt": self.dt}
@@ -323,6 +351,7 @@ class RigidMotion:
         angles = "xyz" if len(axes) == 3 else "z"
         rotation = [[f"r_{a}{b}" for b in axes] for a in axes]
         covariance = [[f"cov_{min(a, b)}{max(a, b)}" for b in angles] for a in angles]
+        step_noise = [[f"step_{name}" for name in row] for row in covariance]
         plain = ("time", *axes, "residual", "n_present", "center_variance", "piece", "reason")
         matrix = {name for row in (*rotation, *covariance) for name in row}
         missing = sorted({*plain, *matrix} - set(table))
@@ -347,6 +376,10 @@ class RigidMotion:
             sigma=float(table.attrs["sigma"]),
             noise=np.array(table.attrs["noise"], dtype=np.float64),
             dt=float(table.attrs["dt"]),
+            turn_noise=matrices(step_noise) if step_noise[0][0] in table else None,
+            shift_noise=np.array(table["step_center_variance"], dtype=np.float64)
+            if "step_center_variance" in table
+            else None,
         )
 
     def to_dict(self) -> dict[str, Any]:
@@ -371,7 +404,7 @@ class RigidMotion:
         arrays = {
             name: from_plain(value, dtype=np.int64 if name in _WHOLE_NUMBERS else np.float64)
             for name, value in entry.items()
-            if name not in ("reason", "sigma", "dt")
+            if name not in ("reason", "sigma", "dt") and value is not None
         }
         sigma, dt = (float(from_plain(entry[name])) for name in ("sigma", "dt"))
         return cls(reason=tuple(entry["reason"]), sigma=sigma, dt=dt, **arrays)

@@ -248,7 +248,8 @@ def judge_quality(
     noise = noise if noise is not None and noise.known else None
     per_unit = unit / ratio if ratio is not None and (ratio > 0).all() else unit
     blur = UNKNOWN_SLOPE if noise is None or d == 2 else noise.z_ratio(per_unit)
-    delay = measure_scan(stretch.sample)
+    # Positions of particles with their own times were moved to one instant.
+    delay = measure_scan(stretch.sample) if motion.turn_noise is None else UNKNOWN_SLOPE
 
     sample = stretch.sample if stretched else sample_residuals(motion, x)
     soft = [

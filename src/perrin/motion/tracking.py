@@ -11,9 +11,11 @@ from numpy.typing import ArrayLike
 from perrin._arrays import (
     Bools,
     Floats,
+    Ints,
     as_positions,
     as_sigma,
     choice_fault,
+    number_fault,
     present,
     refuse,
     require_positive,
@@ -30,6 +32,7 @@ from perrin.motion.procrustes import (
     step_residuals,
 )
 from perrin.motion.rigid_motion import RigidMotion
+from perrin.motion.scanning import fit_scanned
 
 Reference = Literal["template", "previous"]
 
@@ -50,6 +53,8 @@ def track_rotation(
     sigma: ArrayLike | None = None,
     weights: Weights = "equal",
     piece: ArrayLike | None = None,
+    delays: ArrayLike | None = None,
+    crossing: float = 0.0,
 ) -> RigidMotion:
     """Fit a rigid body to a cluster's particles in every frame and return its motion.
 
@@ -78,6 +83,13 @@ def track_rotation(
     piece : array_like of int, shape (T,), optional
         Pieces of the track within which identity is certain, as `settle_identity` finds them; no
         pair of frames is formed across two of them. Default: one piece.
+    delays : array_like, shape (T, n), optional
+        Time of each particle after that of its frame, s, where particles are recorded one after
+        another, as by planes of a scan; NaN where a particle is missing. The body moves between
+        them: poses are those at the mean time of the particles of each frame, fitted by
+        generalised least squares, with the errors that this motion leaves.
+    crossing : float
+        Time in which the planes through one particle are recorded, s, where there are `delays`.
 
     Returns
     -------
@@ -111,6 +123,7 @@ def track_rotation(
         [
             *choice_fault("reference", reference, ("template", "previous")),
             *choice_fault("weights", weights, ("equal", "sigma")),
+            *number_fault("crossing", crossing, least=0, unit="s"),
         ]
     )
     time = _row_times(len(x), dt=dt, frames=frames, times=times)
@@ -121,7 +134,16 @@ def track_rotation(
             f"{pieces.shape}"
         )
     seen = present(x)
-    if weights == "equal":
+    if delays is not None:
+        if reference != "template" or weights != "equal":
+            raise ValueError(
+                'delays weigh particles by their times: they need reference="template" and '
+                'weights="equal"'
+            )
+        motion, _ = track_scanned(
+            x, delays, time=time, dt=dt, sigma=sigma, piece=pieces, crossing=crossing
+        )
+    elif weights == "equal":
         known = None if sigma is None else as_sigma(sigma, x.shape[2])
         require_points(seen, x.shape[2])
         fit = fit_chain(x, seen) if reference == "previous" else fit_template(x, seen)
@@ -135,6 +157,98 @@ def track_rotation(
         mean = known.mean(axis=0)
         motion = _motion_of(fit, x, seen, time=time, dt=dt, sigma=mean, errors=errors)
     return replace(motion, piece=np.array(pieces, dtype=np.int64))
+
+
+def _particle_delays(delays: ArrayLike, seen: Bools) -> Floats:
+    """Return the times of the particles after their frames (T, n), finite where one is present."""
+    t = np.asarray(delays, dtype=np.float64)
+    if t.shape != seen.shape:
+        raise ValueError(
+            f"delays: expected an array {seen.shape}, a time (s) for each particle in each frame, "
+            f"got shape {t.shape}"
+        )
+    unknown = seen & ~np.isfinite(t)
+    if unknown.any():
+        row, particle = (int(k[0]) for k in np.nonzero(unknown))
+        raise ValueError(
+            f"delays: {int(unknown.sum())} particles have coordinates but no time, the first is "
+            f"particle {particle} in row {row}: state all times, or leave these particles out (NaN)"
+        )
+    return t
+
+
+def track_scanned(
+    x: Floats,
+    delays: ArrayLike,
+    *,
+    time: Floats,
+    dt: float,
+    piece: Ints,
+    sigma: ArrayLike | None = None,
+    crossing: float = 0.0,
+    least: Floats | None = None,
+) -> tuple[RigidMotion, Floats]:
+    """Fit a body whose particles are recorded at their own times, for positions already checked.
+
+    Parameters
+    ----------
+    x : ndarray, shape (T, n, d)
+        Positions, um, NaN where missing.
+    delays : array_like, shape (T, n)
+        Time of each particle after that of its frame, s.
+    time : ndarray, shape (T,)
+        Time of each frame, s.
+    dt : float
+        Time between frames, s.
+    piece : ndarray of int, shape (T,)
+        Pieces of the track.
+    sigma : float or array_like, shape (d,), optional
+        Known localisation error, um; default: from the residuals.
+    crossing : float
+        Time in which the planes through one particle are recorded, s.
+    least : ndarray, shape (d,), optional
+        Smallest localisation error of each axis that is possible, um.
+
+    Returns
+    -------
+    motion : RigidMotion
+        Poses at the mean time of the particles of each frame.
+    instant : ndarray, shape (T, n, d)
+        Positions at that time, as far as the particles determine them, um.
+
+    Raises
+    ------
+    DegenerateClusterError, TooFewFramesError, ValueError
+        As in `track_rotation`.
+
+    Examples
+    --------
+    >>> from perrin import Cluster, simulate_motion
+    >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=50, rng=1)
+    >>> x = truth.positions()
+    >>> _, instant = track_scanned(
+    ...     x, np.zeros((50, 4)), time=truth.time, dt=0.7, piece=truth.piece
+    ... )
+    >>> bool(np.allclose(instant, x))
+    True
+    """
+    seen = present(x)
+    known = None if sigma is None else as_sigma(sigma, x.shape[2])
+    require_points(seen, x.shape[2])
+    own_times = _particle_delays(delays, seen)
+    scanned = fit_scanned(
+        x, seen, own_times, time=time, piece=piece, sigma=known, crossing=crossing, least=least
+    )
+    errors = scanned.covariance, scanned.center_variance
+    motion = _motion_of(scanned.fit, x, seen, time=time, dt=dt, sigma=scanned.noise, errors=errors)
+    lost = np.isnan(motion.center[:, 0])
+    motion = replace(
+        motion,
+        piece=np.array(piece, dtype=np.int64),
+        turn_noise=np.where(lost[:, None, None], np.nan, scanned.turn_noise),
+        shift_noise=np.where(lost, np.nan, scanned.center_noise),
+    )
+    return motion, scanned.instant
 
 
 def template_motion(x: Floats, *, time: Floats, dt: float) -> RigidMotion:

@@ -39,7 +39,7 @@ from perrin.movie.checks import (
     unsettled_poses,
 )
 from perrin.movie.parts import PartWriter, open_parts, read_parts
-from perrin.movie.stacks import Settings, analyze_stack
+from perrin.movie.stacks import Settings, analyze_stack, with_own_times
 from perrin.movie.stages import Located, fit_poses, learn_method, locate_frames, run_frames
 from perrin.movie.workers import Work, check_workers, work_through
 
@@ -90,5 +90,6 @@ __all__ = [
     "unreadable_frames",
     "unrefined_spheres",
     "unsettled_poses",
+    "with_own_times",
     "work_through",
 ]

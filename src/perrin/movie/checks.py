@@ -14,6 +14,7 @@ import numpy as np
 
 from perrin._text import listed
 from perrin.geometry.shapes import pair_distances
+from perrin.motion.scanning import scan_share
 from perrin.tracks.groups import TOUCHING_REACH
 
 if TYPE_CHECKING:
@@ -632,10 +633,12 @@ def scan_blur(
     diameter : float
         Sphere diameter, um.
     """
-    if plane_time is None or motion.template.shape[1] != 3 or not D_T.value > 0:
+    if not plane_time or motion.template.shape[1] != 3 or not D_T.value > 0:
+        return None
+    if motion.turn_noise is not None:  # every sphere has its own time
         return None
     planes = (2 * motion.R + diameter) / height
-    scan = planes * plane_time
+    scan = planes * abs(plane_time)
     blur, sigma = float(np.sqrt(2 * D_T.value * scan)), float(motion.sigma)
     # The errors of a square root and of a standard deviation are half the relative one.
     blur_error = blur * D_T.stderr / (2 * D_T.value)
@@ -644,12 +647,31 @@ def scan_blur(
     if not blur - sigma > _NORMAL_QUANTILE * np.hypot(blur_error, sigma_error):
         return None
     text = (
-        f"cluster scanned in {scan:.2g} s ({planes:.0f} planes of {plane_time:.2g} s): motion blur "
+        f"cluster scanned in {scan:.2g} s ({planes:.0f} planes of {abs(plane_time):.2g} s): motion blur "
         f"about {1e3 * blur:.0f} +- {1e3 * blur_error:.1g} nm > sigma {1e3 * sigma:.0f} +- "
         f"{1e3 * sigma_error:.1g} nm; positions are those of different times; scan faster or take "
         "fewer planes"
     )
     return Verdict(text, blur / sigma if sigma > 0 else np.inf)
+
+
+def scanned_poses(motion: RigidMotion) -> Verdict | None:
+    """Note that poses are those of spheres with their own times, and what the scan leaves in them.
+
+    Parameters
+    ----------
+    motion : RigidMotion
+    """
+    if motion.turn_noise is None:
+        return None
+    turn = motion.covariance[motion.fitted]
+    error = float(np.sqrt(np.trace(turn, axis1=1, axis2=2).mean() / turn.shape[1]))
+    text = (
+        f"every sphere has the time of its own planes; orientation error {1e3 * error:.2g} mrad, "
+        f"{scan_share(motion):.0%} of its variance from the motion during the scan; the pose is "
+        "that of the spheres, not of the image"
+    )
+    return Verdict(text, error)
 
 
 def step_length(motion: RigidMotion, *, contact: float) -> float:
@@ -836,6 +858,9 @@ def check_clusters(
                 found += Findings((text,))
     fast = {r.name: fast_sampling(r.motion, phi2=r.noise.phi2) for r in results}
     for name, text in combined_verdicts(fast).items():
+        found += Findings(notes=(f"cluster {name}: {text}" if name else text,))
+    scanned = {r.name: scanned_poses(r.motion) for r in results}
+    for name, text in combined_verdicts(scanned).items():
         found += Findings(notes=(f"cluster {name}: {text}" if name else text,))
     return tuple(replace(r, warnings=own[r.name]) for r in results), found
 

@@ -18,6 +18,7 @@ from perrin.images.imaging import Imaging, View
 from perrin.images.spheres.localisation import NO_FLAT_MODEL, Search, check_search, is_flat
 from perrin.images.spheres.spots import Spots
 from perrin.images.stack import digest
+from perrin.motion.scanning import scan_share
 from perrin.movie.bodies import Bodies, find_bodies, stated_errors, tracks_of
 from perrin.movie.stages import Located, fit_poses, locate_frames
 from perrin.movie.workers import Work, check_workers
@@ -30,6 +31,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
     from typing import Unpack
 
+    import pandas as pd
+
     from perrin._arrays import Ints
     from perrin.images.optics.optics import Optics
     from perrin.images.spheres.localisation import Refine
@@ -38,6 +41,10 @@ if TYPE_CHECKING:
     from perrin.movie.workers import Progress
     from perrin.run.results import Report
 
+
+# Poses are fitted to the images where less than this share of the variance of the orientation is
+# motion during the scan.
+_SCANNED = 0.05
 
 _VIEWS = 8  # frames that are kept as pictures
 _LIBRARIES = ("perrin", "numpy", "scipy", "trackpy")
@@ -204,9 +211,15 @@ def analyze_stack(
         bodies = find_bodies(located.features, stack, search, optics=method.optics, size=size)
         poses = _PoseFits(stack, method.optics, bodies, contact, folder / _POSED, work)
         report = measure_table(
-            tracks_of(bodies, exclude=excluded),
+            with_own_times(tracks_of(bodies, exclude=excluded), stack),
             experiment,
-            recording=Recording(stack.dt, _uneven_clock(stack), stated_errors(bodies)),
+            recording=Recording(
+                stack.dt,
+                _uneven_clock(stack),
+                stated_errors(bodies),
+                crossing=abs(stack.plane_time or 0.0) * diameter / float(stack.voxel[0]),
+                least_sigma=stated_errors(bodies),
+            ),
             source={"path": stack.source if stack.path else None, "sha256": depends["sha256"]},
             arguments=experiment.to_dict()
             | {k: v for k, v in depends.items() if k not in ("sha256", "versions")}
@@ -215,6 +228,21 @@ def analyze_stack(
         )
     findings = poses.findings + checks.Findings(notes=(NO_FLAT_MODEL,) if flat else ())
     return _with_checks(report, stack, located, bodies, search, findings)
+
+
+def with_own_times(table: pd.DataFrame, stack: Stack) -> pd.DataFrame:
+    """Add the time of every sphere after that of its frame, s: that of the planes through it.
+
+    Parameters
+    ----------
+    table : pandas.DataFrame
+        Tracks with the coordinate ``z``, um.
+    stack : Stack
+        With the time from plane to plane; without it the table is returned as it is.
+    """
+    if not stack.plane_time or "z" not in table:
+        return table
+    return table.assign(delay=table["z"] / stack.voxel[0] * stack.plane_time)
 
 
 def _stack_experiment(
@@ -363,18 +391,21 @@ class _PoseFits:
         self.findings += checks.Findings((*refused[:_LISTED_REFUSALS], *rest))
         if motions and not kept:
             raise IdentityError(next(iter(reasons.values())))
-        if self.optics is None or not kept:
+        # The image of a body that moves during the scan shows no single pose.
+        scanned = {c: m for c, (m, _) in kept.items() if scan_share(m) > _SCANNED}
+        still = {c: pair for c, pair in kept.items() if c not in scanned}
+        if self.optics is None or not still:
             return {c: motion for c, (motion, _) in kept.items()}
         fitted, findings = fit_poses(
             self.stack,
-            kept,
+            still,
             optics=self.optics,
             features=self.bodies.features,
             folder=self.folder,
             work=self.work,
         )
         self.findings += findings
-        return fitted
+        return {**fitted, **scanned}
 
 
 def _with_checks(

@@ -211,6 +211,10 @@ class Recording:
         The table's own number of its first frame.
     recorded : ndarray of int or None
         Frames, counted from the first, that any row of the table has.
+    crossing : float
+        Time in which the planes through one particle are recorded, s.
+    least_sigma : ndarray, shape (d,), or None
+        Localisation error of each axis that the light alone allows, um.
     """
 
     dt: float
@@ -218,6 +222,8 @@ class Recording:
     sigma_ratio: ArrayLike | None = None
     first_frame: int = 0
     recorded: Ints | None = None
+    crossing: float = 0.0
+    least_sigma: Floats | None = None
 
     def clock(self, frames: Ints) -> Floats:
         """Return the times of frames, s."""

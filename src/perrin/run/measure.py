@@ -38,7 +38,7 @@ from perrin.hydrodynamics.units import viscosity_remarks
 from perrin.motion.floor import floor_range
 from perrin.motion.rigidity import Quality, judge_quality
 from perrin.motion.rods import RodMotion, track_direction
-from perrin.motion.tracking import track_rotation
+from perrin.motion.tracking import track_rotation, track_scanned
 from perrin.run import remarks as words
 from perrin.run.experiment import Experiment, Recording
 from perrin.run.grouping import assign_clusters
@@ -62,7 +62,7 @@ from perrin.run.results import (
     predicted_noise,
 )
 from perrin.run.verdicts import fit_model, judge_each_and_all
-from perrin.tracks.clock import frame_stride, read_clock
+from perrin.tracks.clock import frame_stride, own_times, read_clock
 from perrin.tracks.clusters import each_cluster
 from perrin.tracks.identity import Identity, settle_identity
 from perrin.tracks.screening import CENTRE_REMOVED, centre_removed, far_points
@@ -120,6 +120,8 @@ class ClusterTracks:
         Number of the piece of each row: within a piece no label is in doubt.
     far : ndarray of bool, shape (T, n)
         Points that were left out because they lie far from the body.
+    delay : ndarray, shape (T, n), or None
+        Time of each particle after that of its frame, s; None where all are recorded at once.
     """
 
     cluster: int
@@ -128,6 +130,7 @@ class ClusterTracks:
     frames: Ints
     piece: Ints
     far: Bools
+    delay: Floats | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -327,6 +330,10 @@ def complete_recording(
         clock, notes = read_clock(table, dt=recording.dt)
         clock = None if clock is None else clock.from_frame(0)
         remarks.notes.extend(notes)
+        delays, notes = own_times(table, dt=recording.dt)
+        remarks.notes.extend(notes)
+        if delays is not None:
+            table["delay"] = delays
     recorded = np.unique(table["frame"].to_numpy(dtype=np.int64))
     remarks.notes.extend(
         words.absent_frames_notes(recorded, frame_stride(table), first_frame=first_frame)
@@ -351,12 +358,12 @@ def fit_clusters(
     bodies: list[FittedBody] = []
     rods: list[RodResult] = []
     failures: list[tuple[str, ValueError]] = []
-    for cluster, positions, frames, piece in each_cluster(table):
+    for cluster, positions, frames, piece, delay in each_cluster(table):
         label = labels.get(cluster)
         try:
             far = far_points(positions)
             near = np.where(far[..., None], np.nan, positions)
-            tracks = ClusterTracks(cluster, label, near, frames, piece, far)
+            tracks = ClusterTracks(cluster, label, near, frames, piece, far, delay)
             if positions.shape[1:] == (2, 3):
                 rods.append(measure_rod(tracks, experiment, recording))
                 continue
@@ -383,20 +390,29 @@ def fit_body(tracks: ClusterTracks, experiment: Experiment, recording: Recording
     positions = identity.arranged(tracks.positions)
     changed = (np.diff(tracks.piece) != 0) | (np.diff(identity.piece) != 0)
     piece = np.append(0, np.cumsum(changed)).astype(np.int64)
-    motion = track_rotation(
-        positions,
-        dt=recording.dt,
-        times=recording.clock(frames),
-        sigma=experiment.sigma,
-        piece=piece,
-    )
+    fitted: dict[str, Any] = {"dt": recording.dt, "sigma": experiment.sigma, "piece": piece}
+    times = recording.clock(frames)
+    if tracks.delay is None or positions.shape[2] != 3:
+        motion = track_rotation(positions, times=times, **fitted)
+    else:
+        # Rigidity and errors are those of the positions at one instant.
+        delays = identity.arranged(tracks.delay[..., None])[..., 0]
+        motion, positions = track_scanned(
+            positions,
+            delays,
+            time=times,
+            crossing=recording.crossing,
+            least=recording.least_sigma,
+            **fitted,
+        )
     swaps, cuts, extra = frames[identity.swaps], frames[1:][changed], frames[identity.extra]
     quality = judge_quality(
         motion,
         positions,
         sigma=experiment.sigma,
         sigma_ratio=recording.sigma_ratio,
-        detections=tracks.positions,
+        # Detections that were left out have no position at the instant.
+        detections=tracks.positions if tracks.delay is None else None,
         unsettled=tuple(identity.unsettled.tolist()),
         swaps=tuple(swaps.tolist()),
         cuts=tuple(cuts.tolist()),

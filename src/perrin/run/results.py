@@ -518,7 +518,7 @@ def perp_text(rod: RodResult) -> str:
 
 def predicted_noise(motion: RigidMotion) -> NoiseFloor:
     """Return the noise floor that sigma and the shape predict, averaged over the poses."""
-    covariance = np.mean(motion.covariance[motion.fitted], axis=0)
+    covariance = np.mean(motion.step_covariance[motion.fitted], axis=0)
     return NoiseFloor(float(floor_of(covariance)), covariance)
 
 

@@ -9,7 +9,7 @@ from perrin.tracks.bonds import (
     noise_along,
     rigid_groups,
 )
-from perrin.tracks.clock import Clock, evenly_spaced, frame_stride, read_clock
+from perrin.tracks.clock import Clock, evenly_spaced, frame_stride, own_times, read_clock
 from perrin.tracks.clusters import (
     cluster_positions,
     each_cluster,
@@ -112,6 +112,7 @@ __all__ = [
     "most_likely_path",
     "neighbour_pairs",
     "noise_along",
+    "own_times",
     "parse_csv",
     "parse_gdf",
     "parse_table",

@@ -155,6 +155,11 @@ def read_clock(table: pd.DataFrame, *, dt: float) -> tuple[Clock | None, tuple[s
         )
     if evenly_spaced(time, frame, dt=dt):
         return None, ()
+    if spread > _GRID_TOLERANCE * dt:
+        # Frames are even where their means vary only as the rows of one frame do.
+        off = time - dt * frame
+        if np.ptp(off) <= spread:
+            return None, ()
     gaps = np.diff(time) / np.diff(frame)
     notes = [
         f"the column time is used: intervals between frames run from {gaps.min():.4g} to "
@@ -165,6 +170,49 @@ def read_clock(table: pd.DataFrame, *, dt: float) -> tuple[Clock | None, tuple[s
     if spread > _GRID_TOLERANCE * dt:
         notes.append(f"the times of one frame differ by up to {spread:.3g} s; their mean is used")
     return Clock(frame, time, dt), tuple(notes)
+
+
+def own_times(table: pd.DataFrame, *, dt: float) -> tuple[Floats | None, tuple[str, ...]]:
+    """Return the time of every row after the mean of its frame, where rows have their own times.
+
+    Parameters
+    ----------
+    table : pandas.DataFrame
+        A clean track table, perhaps with the column ``time``, s.
+    dt : float
+        Time between frames, s.
+
+    Returns
+    -------
+    delays : ndarray, shape (N,), or None
+        Seconds; None where all rows of a frame have one time, or some rows have none.
+    notes : tuple of str
+        A sentence on how the times are used.
+
+    Examples
+    --------
+    >>> import pandas as pd
+    >>> table = pd.DataFrame({"frame": [0, 0, 1, 1], "time": [0.0, 0.1, 1.0, 1.1]})
+    >>> own_times(table, dt=1.0)[0].round(3)
+    array([-0.05,  0.05, -0.05,  0.05])
+    """
+    if "time" not in table or not table["time"].notna().any():
+        return None, ()
+    mean = table.groupby("frame")["time"].transform("mean")
+    delay = (table["time"] - mean).to_numpy(dtype=np.float64)
+    longest = float(np.nanmax(np.abs(delay)))
+    if not longest > _GRID_TOLERANCE * dt:
+        return None, ()
+    lacking = int(np.isnan(delay).sum())
+    if lacking:
+        return None, (
+            f"the rows of a frame have different times, but {lacking} rows have none: all are "
+            "taken as recorded at the mean time of their frame",
+        )
+    return delay, (
+        f"the rows of a frame have their own times, up to {longest:.3g} s from its mean: bodies "
+        "are fitted with the motion between them",
+    )
 
 
 def evenly_spaced(times: Floats, frames: Ints, *, dt: float) -> bool:

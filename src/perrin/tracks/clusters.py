@@ -104,13 +104,14 @@ def cluster_positions(
     return _as_array(columns.frame[rows], columns.code[rows], columns.x[rows])
 
 
-def each_cluster(table: pd.DataFrame) -> Iterator[tuple[int, Floats, Ints, Ints]]:
+def each_cluster(table: pd.DataFrame) -> Iterator[tuple[int, Floats, Ints, Ints, Floats | None]]:
     """Yield the positions of each cluster, checking the table only once.
 
     Parameters
     ----------
     table : pandas.DataFrame
-        Tracks with the column ``cluster`` (whole numbers, -1 for none) and perhaps ``piece``.
+        Tracks with the column ``cluster`` (whole numbers, -1 for none) and perhaps ``piece`` and
+        ``delay`` (time of a particle after that of its frame, s).
 
     Yields
     ------
@@ -120,6 +121,8 @@ def each_cluster(table: pd.DataFrame) -> Iterator[tuple[int, Floats, Ints, Ints]
     frames : ndarray of int64, shape (T,)
     piece : ndarray of int64, shape (T,)
         The column ``piece`` of each frame; where it is missing, that of the frame before.
+    delay : ndarray, shape (T, n), or None
+        The column ``delay``, NaN where a particle is missing; None without it.
 
     Raises
     ------
@@ -129,13 +132,14 @@ def each_cluster(table: pd.DataFrame) -> Iterator[tuple[int, Floats, Ints, Ints]
     Examples
     --------
     >>> table = positions_table([[[0.0, 1.0], [2.0, 3.0]]], frames=[7])
-    >>> [(cluster, x.shape, frames) for cluster, x, frames, _ in each_cluster(table)]
+    >>> [(cluster, x.shape, frames) for cluster, x, frames, *_ in each_cluster(table)]
     [(0, (1, 2, 2), array([7]))]
     """
     # Ids need to be unique within a cluster only.
     unique = ["frame", "particle", "cluster"]
     tracks = _columns_of(table, unique=unique)
     label = table["cluster"].to_numpy(dtype=np.int64)
+    late = table["delay"].to_numpy(dtype=np.float64)[:, None] if "delay" in table else None
     stretch = table["piece"].to_numpy(dtype=np.int64) if "piece" in table else None
     for inside in _rows_by_label(label):
         rows = inside[tracks.seen[inside]]
@@ -147,7 +151,10 @@ def each_cluster(table: pd.DataFrame) -> Iterator[tuple[int, Floats, Ints, Ints]
             last = np.zeros(len(frames), dtype=np.int64)
             last[position] = position
             piece = piece[np.maximum.accumulate(last)]
-        yield int(label[inside[0]]), positions, frames, piece
+        delay = None
+        if late is not None:
+            delay = _as_array(tracks.frame[rows], tracks.code[rows], late[rows])[0][..., 0]
+        yield int(label[inside[0]]), positions, frames, piece, delay
 
 
 def _as_array(frame: Ints, code: Ints, x: Floats) -> tuple[Floats, Ints]:

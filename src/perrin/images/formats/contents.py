@@ -208,9 +208,9 @@ class Contents:
         planes = self.shape[1]
         if len(times) > 1 and plane_time is not None:
             interval = float(np.median(np.diff(times)))
-            if (planes - 1) * plane_time > interval > 0:
+            if (planes - 1) * abs(plane_time) > interval > 0:
                 faults.append(
-                    f"{planes} planes of {plane_time:.4g} s each take longer than a frame of "
+                    f"{planes} planes of {abs(plane_time):.4g} s each take longer than a frame of "
                     f"{interval:.4g} s: pass dt= or plane_time= in s"
                 )
         return faults

@@ -294,7 +294,7 @@ def clock_scale(voxel: Floats, clock: Floats) -> HeaderScale:
             f"the times of frames {', '.join(map(str, recovered))} come from planes other than "
             "the first",
         )
-    step = plane_time if plane_time > 0 else None
+    step = plane_time if plane_time != 0 else None
     if len(start) == 1:
         return HeaderScale(voxel, np.nan_to_num(start), step, notes)
     lost = np.flatnonzero(np.isnan(start))

@@ -185,4 +185,6 @@ def with_poses(
         center_variance=variance,
         template=motion.template @ gauge.T,
         reason=tuple(reason),
+        turn_noise=None,
+        shift_noise=None,
     )
