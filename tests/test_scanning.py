@@ -20,9 +20,7 @@ def recorded(n_frames, *, rng, rate=0.05, steps=73, body=BODY, crossing=0):
     `crossing` fine steps about that: x and y with the weights of a semicircle, z at both ends.
     """
     h = DT / steps
-    truth = perrin.simulate_motion(
-        body, D_R=D_R, D_T=D_T, dt=h, n_frames=n_frames * steps, rng=rng
-    )
+    truth = perrin.simulate_motion(body, D_R=D_R, D_T=D_T, dt=h, n_frames=n_frames * steps, rng=rng)
     fine = truth.positions().reshape(n_frames, steps, len(body.positions), 3)
     fine = fine + np.array([0, 0, 6.0 - fine[..., 2].mean()])
     met = np.abs(fine[..., 2] * rate - (np.arange(steps) * h)[:, None]).argmin(axis=1)

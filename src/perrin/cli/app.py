@@ -232,7 +232,11 @@ def run(
     ] = None,
     plane_time: Annotated[
         float | None,
-        typer.Option(help="Time from one plane to the next, s.", rich_help_panel=INPUT),
+        typer.Option(
+            help="Time from one plane to the next, s; negative where the last plane is recorded "
+            "first.",
+            rich_help_panel=INPUT,
+        ),
     ] = None,
     planes: Annotated[
         int | None,

@@ -52,7 +52,8 @@ class Stack:
     times : ndarray, shape (t,)
         Time at which the first plane of each frame was recorded, s.
     plane_time : float or None
-        Time from one plane to the next, s; None where it is unknown.
+        Time from one plane to the next, s, negative where the last plane is recorded first; None
+        where it is unknown.
     source : str
         Name of the file, folder or other source of the frames.
     read : callable
@@ -219,7 +220,7 @@ def open_stack(
         Time between frames, s. Required where the file does not state it and there are several
         frames.
     plane_time : float, optional
-        Time from one plane to the next, s.
+        Time from one plane to the next, s; negative where the last plane is recorded first.
     planes : int, optional
         Number of planes of one frame, where the file does not distinguish times from planes; 1 for
         a 2-D movie.

@@ -282,9 +282,7 @@ def _restricted_variance(
     groups = [[0, 1], [2]] if d == 3 else [[0, 1]]
     selected = [np.isin(np.arange(e.shape[1]) % d, g) & ~absent for g in groups]
     turned = np.einsum("tij,tj->ti", M, e)
-    score = np.array(
-        [np.sum(turned[s] ** 2) - np.einsum("tii->ti", M)[s].sum() for s in selected]
-    )
+    score = np.array([np.sum(turned[s] ** 2) - np.einsum("tii->ti", M)[s].sum() for s in selected])
     information = np.array(
         [[np.einsum("tij,ti,tj->", M**2, a, b) for b in selected] for a in selected]
     )
