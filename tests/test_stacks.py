@@ -265,7 +265,7 @@ def test_given_values_replace_those_of_the_file_with_a_warning(tmp_path, movie):
         ({"voxel": (0.2, 0.2), "dt": 1}, "has no frames of planes=1"),
         ({"voxel": 0.2, "dt": 1}, r"voxel: expected \(z, y, x\)"),
         ({"voxel": VOXEL, "dt": -1}, r"dt: expected a finite number > 0 \(s\), got -1"),
-        ({"voxel": VOXEL, "dt": 1, "plane_time": -1}, "plane_time: expected"),
+        ({"voxel": VOXEL, "dt": 1, "plane_time": np.nan}, "plane_time: expected"),
         ({}, "pass voxel=.*pass dt="),
     ],
 )

@@ -173,8 +173,8 @@ class NoisySteps:
     def of(cls, steps: Steps, noise: Noise) -> NoisySteps:
         """Return the steps with the noise that the options state; blur takes b D from it."""
         if noise.model == "joint":
-            # An unknown exposure may blur up to the limit at which steps stop being possible; so may
-            # a scan, which averages the pose over the times of the particles.
+            # An unknown exposure may blur up to the limit at which steps stop being possible; so
+            # may a scan, which averages the pose over the times of the particles.
             unknown = noise.exposure is None or min(float(n.min()) for n in steps.variances) < 0
             blur = steps.duration.min() / 2 if unknown else (noise.exposure or 0.0) * steps.dt / 3
             return cls.free(steps, blur=float(blur), drift=noise.drift)

@@ -315,8 +315,8 @@ def _imaging_texts(
             "scan: the particles of a frame are recorded one after another along z: their "
             "residuals follow the velocity of the body times their height, "
             f"{abs(delay.value):.2g} +- {delay.stderr:.2g} s/um; sigma then includes motion, and D "
-            "with noise from the residuals is too low; the times of the rows (column time) or of the "
-            "planes (plane_time=) remove this"
+            "with noise from the residuals is too low; the times of the rows (column time) or of "
+            "the planes (plane_time=) remove this"
         )
     # Tested on the logarithm, whose error does not grow with the ratio.
     unequal = Slope(np.log(blur.value), blur.stderr / blur.value, np.inf).differs_from(0.0)

@@ -177,7 +177,7 @@ def fit_scanned(
     # Body axes are those of the lab at the first pose.
     rotation, template = rotation @ rotation[0].T, template @ rotation[0].T
     turn = rotation if angles == 3 else np.ones((len(rows), 1, 1))
-    every = _Frames(len(x), rows)
+    every = _Rows(len(x), rows)
     poses = every.filled(rotation)
     body = np.einsum("tij,tni->tnj", poses, instant - every.filled(center)[:, None])
     in_body = [np.swapaxes(turn, 1, 2) @ c[:, :angles, :angles] @ turn for c in (P, noise)]
@@ -196,15 +196,15 @@ def fit_scanned(
     )
 
 
-class _Frames(NamedTuple):
+class _Rows(NamedTuple):
     """The rows of all frames that have a pose."""
 
-    count: int
+    total: int
     rows: Ints
 
     def filled(self, values: Floats) -> Floats:
         """Return the values of the rows in an array of all frames, NaN elsewhere."""
-        out = np.full((self.count, *values.shape[1:]), np.nan)
+        out = np.full((self.total, *values.shape[1:]), np.nan)
         out[self.rows] = values
         return out
 
@@ -262,8 +262,8 @@ def _generalised_inverses(
     size = moved.shape[1]
     noise = np.tile(variance, size // len(variance))
     full = moved + np.eye(size) * np.where(absent, 1.0, noise)[:, None, :]
-    inverse = np.linalg.inv(full)
-    P = np.linalg.inv(np.swapaxes(slope, 1, 2) @ inverse @ slope)
+    inverse = np.asarray(np.linalg.inv(full), dtype=np.float64)
+    P = np.asarray(np.linalg.inv(np.swapaxes(slope, 1, 2) @ inverse @ slope), dtype=np.float64)
     return inverse, 0.5 * (P + np.swapaxes(P, 1, 2))
 
 

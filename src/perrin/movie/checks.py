@@ -647,8 +647,8 @@ def scan_blur(
     if not blur - sigma > _NORMAL_QUANTILE * np.hypot(blur_error, sigma_error):
         return None
     text = (
-        f"cluster scanned in {scan:.2g} s ({planes:.0f} planes of {abs(plane_time):.2g} s): motion blur "
-        f"about {1e3 * blur:.0f} +- {1e3 * blur_error:.1g} nm > sigma {1e3 * sigma:.0f} +- "
+        f"cluster scanned in {scan:.2g} s ({planes:.0f} planes of {abs(plane_time):.2g} s): motion "
+        f"blur about {1e3 * blur:.0f} +- {1e3 * blur_error:.1g} nm > sigma {1e3 * sigma:.0f} +- "
         f"{1e3 * sigma_error:.1g} nm; positions are those of different times; scan faster or take "
         "fewer planes"
     )

@@ -153,13 +153,9 @@ def read_clock(table: pd.DataFrame, *, dt: float) -> tuple[Clock | None, tuple[s
             f"the column time: {'; '.join(faults)}. Correct it or dt, or leave the column out",
             tuple(faults),
         )
-    if evenly_spaced(time, frame, dt=dt):
+    # Frames are even where their means vary only as the rows of one frame do.
+    if evenly_spaced(time, frame, dt=dt) or np.ptp(time - dt * frame) <= spread:
         return None, ()
-    if spread > _GRID_TOLERANCE * dt:
-        # Frames are even where their means vary only as the rows of one frame do.
-        off = time - dt * frame
-        if np.ptp(off) <= spread:
-            return None, ()
     gaps = np.diff(time) / np.diff(frame)
     notes = [
         f"the column time is used: intervals between frames run from {gaps.min():.4g} to "
@@ -167,8 +163,6 @@ def read_clock(table: pd.DataFrame, *, dt: float) -> tuple[Clock | None, tuple[s
     ]
     if not known.all():
         notes.append(f"{(~known).sum()} frames have no time; theirs is interpolated")
-    if spread > _GRID_TOLERANCE * dt:
-        notes.append(f"the times of one frame differ by up to {spread:.3g} s; their mean is used")
     return Clock(frame, time, dt), tuple(notes)
 
 
