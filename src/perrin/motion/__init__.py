@@ -18,6 +18,7 @@ from perrin.motion.dynamics import (
     hops,
     relaxing_coordinates,
 )
+from perrin.motion.error_ratio import ErrorRatio, error_ratio, with_error_ratio
 from perrin.motion.floor import NoiseFloor, floor_of, floor_range, noise_floor
 from perrin.motion.procrustes import (
     PoseFit,
@@ -66,6 +67,7 @@ __all__ = [
     "AxisNoise",
     "BondDrift",
     "Confined",
+    "ErrorRatio",
     "Fractional",
     "Hopping",
     "NoiseFloor",
@@ -86,6 +88,7 @@ __all__ = [
     "bond_drift",
     "chain_steps",
     "distance_change",
+    "error_ratio",
     "fast_states",
     "fit_chain",
     "fit_projector",
@@ -125,4 +128,5 @@ __all__ = [
     "track_scanned",
     "unit_center_variance",
     "unit_covariance",
+    "with_error_ratio",
 ]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,7 +13,7 @@ from perrin.tracks.files import check_tracks
 from perrin.tracks.groups import TOUCHING_REACH, touching_groups
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     import pandas as pd
 
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from perrin.images.optics.optics import Optics
     from perrin.images.spheres.localisation import Search
     from perrin.images.stack import Stack
+    from perrin.motion.error_ratio import ErrorRatio
 
 
 _CLEAR_MAJORITY = 0.95  # share of the groups with the most common size that needs no note
@@ -254,6 +255,51 @@ def stated_errors(bodies: Bodies) -> Floats | None:
         return None
     median = bodies.features[names].median().to_numpy(dtype=np.float64)
     return median if np.isfinite(median).all() else None
+
+
+def stated_variances(bodies: Bodies, frames: Mapping[int, Ints]) -> dict[int, Floats]:
+    """Return the stated variance of the spheres of clusters along each axis, mean over spheres.
+
+    Parameters
+    ----------
+    bodies : Bodies
+    frames : mapping
+        Frames of the rows of each cluster.
+
+    Returns
+    -------
+    dict of ndarray, shape (T, d)
+        um^2; NaN in frames in which no sphere of the cluster was refined by the model.
+    """
+    names = [f"sigma_{axis}" for axis in bodies.axes]
+    tracked = bodies.features[bodies.features["cluster"].isin(list(frames))]
+    square = (tracked[names] ** 2).assign(cluster=tracked["cluster"], frame=tracked["frame"])
+    mean = square.groupby(["cluster", "frame"])[names].mean()
+    return {
+        c: mean.loc[c].reindex(numbers).to_numpy(dtype=np.float64) for c, numbers in frames.items()
+    }
+
+
+def with_true_errors(bodies: Bodies, ratio: ErrorRatio, *, times: Floats) -> Bodies:
+    """Return the spheres with the errors that rigid bodies show in place of the stated ones.
+
+    Parameters
+    ----------
+    bodies : Bodies
+    ratio : ErrorRatio
+        Ratio of the variances, with times counted from the first frame of a cluster.
+    times : ndarray, shape (T,)
+        Time of each frame of the stack, s.
+    """
+    features = bodies.features
+    frame = features["frame"].to_numpy(dtype=np.int64)
+    first = int(frame[features["cluster"] >= 0].min())
+    height = features[bodies.axes[-1]].to_numpy(dtype=np.float64)
+    scale = np.sqrt(ratio.at(times[frame] - times[first], height))
+    names = [f"sigma_{axis}" for axis in bodies.axes]
+    return replace(bodies, features=features.assign(**{
+        name: features[name] * scale[:, i] for i, name in enumerate(names)
+    }))
 
 
 def tracks_of(bodies: Bodies, *, exclude: Sequence[int]) -> pd.DataFrame:

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
     from perrin._arrays import Floats, Ints
     from perrin.diffusion.estimate import DiffusionEstimate
+    from perrin.motion.error_ratio import ErrorRatio
     from perrin.motion.rigid_motion import RigidMotion
     from perrin.run.results import ClusterResult
 
@@ -35,6 +36,7 @@ _PAIR_BIAS = 0.03  # relative error of the mean pair distance
 _BLEACHED = 0.1  # relative loss of brightness over the movie
 _DEPTH_CHANGE = 0.1  # relative change of brightness over the depth of the spheres
 _MISSING_SHARE = 0.1  # missing share of the spheres of the clusters
+_NOTED_ERROR_RATIO, _LARGE_ERROR_RATIO = 1.15, 2.0  # errors of positions over the stated ones
 _FAILED_SHARE = 0.01  # share of fits that did not converge
 _UNSAFE_STEP, _REFUSED_STEP = 0.25, 0.5  # rms step over the contact distance
 _FAST_RATIO, _SLOW_ROTATION = 2.0, 0.5  # MSAD at the first lag over Phi^2; rms rotation, rad
@@ -416,6 +418,47 @@ def unrefined_spheres(features: pd.DataFrame) -> Findings:
         "column reason of features.parquet lists them; those of tried fits are not used"
     )
     return _fit_failures(text, failed.sum() / len(features))
+
+
+def error_ratio_shown(ratio: ErrorRatio, *, axes: list[str]) -> Findings:
+    """State by how much rigid bodies show larger errors than the light alone leaves.
+
+    A warning where the errors of an axis are over twice the stated ones, a note above 1.15 or where
+    they change with time or depth.
+
+    Parameters
+    ----------
+    ratio : ErrorRatio
+    axes : list of str
+        Columns of the coordinates.
+    """
+    if ratio.is_one:
+        return _NOTHING
+    factor = np.sqrt(ratio.value)
+    error = ratio.stderr / (2 * factor)
+    listed_axes = ", ".join(
+        f"{axis} {f:.2f} +- {e:.2g}" for axis, f, e in zip(axes, factor, error, strict=True)
+    )
+    trend = [
+        f"{100 * (np.exp(rate / 2) - 1):+.2g} % a {unit}"
+        for rate, unit in ((ratio.by_time, "second"), (ratio.by_depth, "um of height"))
+        if rate
+    ]
+    changing = f", changing by {' and '.join(trend)}" if trend else ""
+    text = (
+        f"errors of the positions over those that the photons leave, from the residuals of rigid "
+        f"bodies: {listed_axes}{changing}; the stated errors of spheres and poses contain this"
+    )
+    if factor.max() > _LARGE_ERROR_RATIO:
+        return Findings(
+            (
+                text + "; smoothing, compression or flicker of the movie, or an image of the "
+                "spheres that the model does not describe",
+            )
+        )
+    if trend or factor.max() > _NOTED_ERROR_RATIO:
+        return Findings(notes=(text,))
+    return _NOTHING
 
 
 def unsettled_poses(count: int, of: int) -> Findings:

@@ -18,8 +18,16 @@ from perrin.images.imaging import Imaging, View
 from perrin.images.spheres.localisation import NO_FLAT_MODEL, Search, check_search, is_flat
 from perrin.images.spheres.spots import Spots
 from perrin.images.stack import digest
+from perrin.motion.error_ratio import ErrorRatio, error_ratio, with_error_ratio
 from perrin.motion.scanning import scan_share
-from perrin.movie.bodies import Bodies, find_bodies, stated_errors, tracks_of
+from perrin.movie.bodies import (
+    Bodies,
+    find_bodies,
+    stated_errors,
+    stated_variances,
+    tracks_of,
+    with_true_errors,
+)
 from perrin.movie.stages import Located, fit_poses, locate_frames
 from perrin.movie.workers import Work, check_workers
 from perrin.run.experiment import Experiment, MotionModel, Recording, merged_experiment
@@ -39,6 +47,7 @@ if TYPE_CHECKING:
     from perrin.images.stack import Stack
     from perrin.motion.rigid_motion import RigidMotion
     from perrin.movie.workers import Progress
+    from perrin.run.measure import FittedBody
     from perrin.run.results import Report
 
 
@@ -227,6 +236,9 @@ def analyze_stack(
             improved=poses.improved,
         )
     findings = poses.findings + checks.Findings(notes=(NO_FLAT_MODEL,) if flat else ())
+    if poses.ratio is not None:
+        findings += checks.error_ratio_shown(poses.ratio, axes=bodies.axes)
+        bodies = with_true_errors(bodies, poses.ratio, times=stack.times)
     return _with_checks(report, stack, located, bodies, search, findings)
 
 
@@ -378,25 +390,30 @@ class _PoseFits:
     folder: Path
     work: Work
     findings: checks.Findings = field(default_factory=checks.Findings)
+    ratio: ErrorRatio | None = None
 
-    def improved(
-        self, motions: Mapping[int, tuple[RigidMotion, Ints]]
-    ) -> Mapping[int, RigidMotion]:
-        """Refuse clusters with too long steps, and fit the poses of the others."""
-        reasons = {c: checks.refusal(m, contact=self.contact) for c, (m, _) in motions.items()}
-        kept = {c: pair for c, pair in motions.items() if not reasons[c]}
+    def improved(self, fitted: Sequence[FittedBody], first_frame: int) -> dict[int, RigidMotion]:
+        """Refuse clusters with too long steps, fit the poses of the others, and scale errors."""
+        reasons = {
+            b.tracks.cluster: checks.refusal(b.motion, contact=self.contact) for b in fitted
+        }
+        kept = {b.tracks.cluster: b for b in fitted if not reasons[b.tracks.cluster]}
         refused = [f"cluster {c} was refused: {why}" for c, why in reasons.items() if why]
         more = len(refused) - _LISTED_REFUSALS
         rest = (f"{more} more clusters were refused",) if more > 0 else ()
         self.findings += checks.Findings((*refused[:_LISTED_REFUSALS], *rest))
-        if motions and not kept:
+        if fitted and not kept:
             raise IdentityError(next(iter(reasons.values())))
+        motions = {c: body.motion for c, body in kept.items()}
         # The image of a body that moves during the scan shows no single pose.
-        scanned = {c: m for c, (m, _) in kept.items() if scan_share(m) > _SCANNED}
-        still = {c: pair for c, pair in kept.items() if c not in scanned}
+        still = {
+            c: (body.motion, body.tracks.frames + first_frame)
+            for c, body in kept.items()
+            if scan_share(body.motion) <= _SCANNED
+        }
         if self.optics is None or not still:
-            return {c: motion for c, (motion, _) in kept.items()}
-        fitted, findings = fit_poses(
+            return motions
+        posed, findings = fit_poses(
             self.stack,
             still,
             optics=self.optics,
@@ -405,7 +422,15 @@ class _PoseFits:
             work=self.work,
         )
         self.findings += findings
-        return {**fitted, **scanned}
+        stated = stated_variances(self.bodies, {c: frames for c, (_, frames) in still.items()})
+        self.ratio = error_ratio(
+            (kept[c].motion, kept[c].positions, variance) for c, variance in stated.items()
+        )
+        for c, motion in posed.items():
+            mean = np.nanmean(stated[c], axis=0)
+            scale = self.ratio.at(motion.time, motion.center[:, -1])
+            posed[c] = with_error_ratio(motion, scale, mean)
+        return motions | posed
 
 
 def _with_checks(

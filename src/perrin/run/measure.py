@@ -81,10 +81,8 @@ if TYPE_CHECKING:
     from perrin.motion.floor import NoiseFloor
     from perrin.motion.rigid_motion import RigidMotion
 
-    # A better motion for every cluster, from its motion and the frame numbers of its rows.
-    Improve: TypeAlias = Callable[
-        [Mapping[int, tuple[RigidMotion, Ints]]], Mapping[int, RigidMotion]
-    ]
+    # Better motions by cluster number, from the fitted bodies and the number of the first frame.
+    Improve: TypeAlias = Callable[[Sequence["FittedBody"], int], Mapping[int, RigidMotion]]
 
 
 # Clusters have no common D if they agree less well than this by chance.
@@ -143,6 +141,8 @@ class FittedBody:
         Positions that were fitted.
     motion : RigidMotion
         Fitted positions and orientations.
+    positions : ndarray, shape (T, n, d)
+        Positions that the motion was fitted to, um, each column one particle.
     quality : Quality
         Rigidity, errors per axis, and what was corrected.
     remarks : Remarks
@@ -151,6 +151,7 @@ class FittedBody:
 
     tracks: ClusterTracks
     motion: RigidMotion
+    positions: Floats
     quality: Quality
     remarks: Remarks
 
@@ -259,7 +260,7 @@ def measure_table(
     remarks += more
     bodies, rods, failures = fit_clusters(table, labels, experiment, recording)
     if improved is not None:
-        motions = improved({b.tracks.cluster: (b.motion, b.tracks.frames + first) for b in bodies})
+        motions = improved(bodies, first)
         bodies = [
             replace(b, motion=motions[b.tracks.cluster])
             for b in bodies
@@ -438,7 +439,7 @@ def fit_body(tracks: ClusterTracks, experiment: Experiment, recording: Recording
     remarks.notes.extend(words.unsettled_notes(frames[identity.unsettled] + first, of=count))
     remarks.warnings.extend(words.fast_turning_warnings(cuts=cuts.size, of=count))
     return FittedBody(
-        tracks, motion, quality, remarks + Remarks([*quality.warnings], [*quality.notes])
+        tracks, motion, positions, quality, remarks + Remarks([*quality.warnings], [*quality.notes])
     )
 
 
