@@ -47,6 +47,7 @@ import perrin
 # is named when a text matches one of the kinds that it expects, whatever else the text matches.
 KINDS = {
     "not diffusion": r"^not diffusion:",
+    "common motion": r"^common motion:",
     "velocity": r"mean velocity|\bflow\b|centre moves steadily",
     "spin": r"\bspin|mean turn|turns? steadily|steady (turn|rotation)|rad/s\b",
     "hopping": r"another kind of motion|no Brownian motion|not Brownian",

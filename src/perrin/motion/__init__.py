@@ -1,5 +1,6 @@
 """Motion of a body: its position and orientation in every frame, their errors, its rigidity."""
 
+from perrin.motion.common_motion import CommonMotion, common_motion
 from perrin.motion.degenerate import (
     distance_change,
     mean_present,
@@ -66,6 +67,7 @@ __all__ = [
     "SETTLED_LOG_ODDS",
     "AxisNoise",
     "BondDrift",
+    "CommonMotion",
     "Confined",
     "ErrorRatio",
     "Fractional",
@@ -87,6 +89,7 @@ __all__ = [
     "body_residuals",
     "bond_drift",
     "chain_steps",
+    "common_motion",
     "distance_change",
     "error_ratio",
     "fast_states",

@@ -297,9 +297,12 @@ def with_true_errors(bodies: Bodies, ratio: ErrorRatio, *, times: Floats) -> Bod
     height = features[bodies.axes[-1]].to_numpy(dtype=np.float64)
     scale = np.sqrt(ratio.at(times[frame] - times[first], height))
     names = [f"sigma_{axis}" for axis in bodies.axes]
-    return replace(bodies, features=features.assign(**{
-        name: features[name] * scale[:, i] for i, name in enumerate(names)
-    }))
+    return replace(
+        bodies,
+        features=features.assign(
+            **{name: features[name] * scale[:, i] for i, name in enumerate(names)}
+        ),
+    )
 
 
 def tracks_of(bodies: Bodies, *, exclude: Sequence[int]) -> pd.DataFrame:

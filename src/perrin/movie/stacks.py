@@ -41,7 +41,6 @@ if TYPE_CHECKING:
 
     import pandas as pd
 
-    from perrin._arrays import Ints
     from perrin.images.optics.optics import Optics
     from perrin.images.spheres.localisation import Refine
     from perrin.images.stack import Stack
@@ -394,9 +393,7 @@ class _PoseFits:
 
     def improved(self, fitted: Sequence[FittedBody], first_frame: int) -> dict[int, RigidMotion]:
         """Refuse clusters with too long steps, fit the poses of the others, and scale errors."""
-        reasons = {
-            b.tracks.cluster: checks.refusal(b.motion, contact=self.contact) for b in fitted
-        }
+        reasons = {b.tracks.cluster: checks.refusal(b.motion, contact=self.contact) for b in fitted}
         kept = {b.tracks.cluster: b for b in fitted if not reasons[b.tracks.cluster]}
         refused = [f"cluster {c} was refused: {why}" for c, why in reasons.items() if why]
         more = len(refused) - _LISTED_REFUSALS

@@ -35,6 +35,7 @@ from perrin.errors import (
 )
 from perrin.geometry.rotations import fit_rotations, log_map
 from perrin.hydrodynamics.units import viscosity_remarks
+from perrin.motion.common_motion import common_motion
 from perrin.motion.floor import floor_range
 from perrin.motion.rigidity import Quality, judge_quality
 from perrin.motion.rods import RodMotion, track_direction
@@ -274,6 +275,9 @@ def measure_table(
             failures.append((body.tracks.label or str(body.tracks.cluster), error))
     if failures and not (measured or rods):
         raise failures[-1][1]
+    remarks += words.common_motion_remarks(
+        common_motion([(m.translation.motion, m.body.tracks.frames) for m in measured])
+    )
     measured, together = judge_bodies(measured, experiment, first_frame=first)
     pooled, unpooled = pool_clusters(measured, experiment, together)
     results, rods = add_predictions([one.result for one in measured], rods, experiment)

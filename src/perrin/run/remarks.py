@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from perrin.diffusion.step_tests import Jumps, SteadyMotion
     from perrin.diffusion.steps import Quantity
     from perrin.diffusion.verdict import MotionVerdict
+    from perrin.motion.common_motion import CommonMotion
 
 
 CONSTANT_Z = "z never changes: leave the column out to analyse motion in the plane"
@@ -37,6 +38,11 @@ _SHARE_FOR_NOTE = 0.01
 
 # Jumps whose lengths differ by less than this share are all of one length.
 _ONE_LENGTH = 0.3
+
+# A motion that all bodies share is named below this chance and above this share of the mean square
+# step: two spheres in a fluid, three radii apart, share a third.
+_COMMON_LEVEL, _COMMON_SHARE = 1e-4, 0.35
+_AXIS_ERRORS = 3.0  # of the covariance along an axis that is named
 
 # A track is cut too often beyond this share of the frames.
 _SHARE_OF_CUTS = 0.02
@@ -607,6 +613,52 @@ def common_jump_warnings(jumps: Iterable[tuple[str, Ints, Floats]]) -> list[str]
         names = listed(name for name, _ in found)
         warnings.append(f"jump: clusters {names} jump at the same frame {frame}: {cause}")
     return warnings
+
+
+def common_motion_remarks(found: CommonMotion | None) -> Remarks:
+    """Name a motion that all bodies share: a note where it is random from frame to frame.
+
+    Random common positions are noise of the steps, which the joint fit separates from diffusion; a
+    common motion that lasts is in D_T.
+
+    Parameters
+    ----------
+    found : CommonMotion or None
+
+    Examples
+    --------
+    >>> from perrin.motion.common_motion import CommonMotion
+    >>> one = np.ones(3)
+    >>> found = CommonMotion(0.01 * one, 1e-4 * one, 0.02 * one, -0.005 * one, 4, 1e-9)
+    >>> common_motion_remarks(found).notes[0][:40]
+    'common motion: the 4 bodies move togethe'
+    """
+    if found is None or found.p > _COMMON_LEVEL or found.share.max() < _COMMON_SHARE:
+        return Remarks()
+    along = np.flatnonzero(
+        (found.share > _COMMON_SHARE / 2) & (found.covariance > _AXIS_ERRORS * found.stderr)
+    )
+    axes = listed("xyz"[k] for k in along)
+    k = int(found.share.argmax())
+    share = with_error(100 * found.share[k], 100 * found.stderr[k] / found.variance[k])
+    size = 1e3 * float(np.sqrt(found.covariance[k]))
+    text = (
+        f"common motion: the {found.bodies} bodies move together along {axes}: {share} % of the "
+        f"mean square step, {size:.3g} nm a frame"
+    )
+    if found.following[k] < -found.covariance[k] / 4:
+        return Remarks(
+            notes=[
+                f"{text}, at random from frame to frame, as a stage or a focus that does not "
+                "return to its place; joint noise (noise='joint') contains it, D is not affected"
+            ]
+        )
+    return Remarks(
+        [
+            f"{text}: a drifting stage, a flow, or one fluid around bodies near each other; D_T "
+            "contains this motion, D_R does not"
+        ]
+    )
 
 
 def jumps_verdict_text(
