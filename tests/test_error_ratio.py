@@ -102,7 +102,7 @@ def moving_together(common, *, count=3, n_frames=60, seed=1):
             BODY, D_R=5e-3, D_T=0.04, dt=0.7, n_frames=n_frames, rng=100 * seed + k
         )
         x = perrin.add_noise(truth.positions(), sigma=0.005, rng=k) + common[:, None]
-        table = perrin.positions_table(x + [40.0 * k, 0, 0]).assign(cluster=k)
+        table = perrin.positions_table(x + np.array([40.0 * k, 0, 0])).assign(cluster=k)
         tables.append(table.assign(particle=table["particle"] + 4 * k))
     return pd.concat(tables, ignore_index=True)
 
