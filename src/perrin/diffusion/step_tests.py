@@ -45,6 +45,9 @@ _CLEARLY_STILL = 0.05
 # residual explains; beyond it the body itself was elsewhere for one frame.
 _BADLY_MEASURED = 100.0
 
+# A jump of the stage is a common step that has this probability, at most, in the whole movie.
+STAGE_LEVEL = 1e-4
+
 # More jumps of the stage than one in this number of steps (and more than one) are another motion.
 _STAGE_STEPS_PER_JUMP = 10
 
@@ -275,7 +278,7 @@ def find_stage_jumps(motions: Sequence[RigidMotion], frames: Sequence[Ints]) -> 
     Returns
     -------
     StageJumps
-        Common displacements of family-wise p < 1e-6. More than a tenth of the steps of a movie are
+        Common displacements of family-wise p < 1e-4. More than a tenth of the steps of a movie are
         no jumps but another common motion, and none is returned.
 
     Notes
@@ -343,7 +346,7 @@ def find_stage_jumps(motions: Sequence[RigidMotion], frames: Sequence[Ints]) -> 
     scatter = apart[usual & several].sum() / freedom[usual & several].sum()
     p = fdtrc(d, d * max(int((usual & several).sum()) - 1, 1), common / d / level)
     p = np.minimum(p * len(ends), 1.0)
-    found &= (p < JUMP_LEVEL) & (chdtrc(freedom, apart / scatter) > _MOVE_ALIKE)
+    found &= (p < STAGE_LEVEL) & (chdtrc(freedom, apart / scatter) > _MOVE_ALIKE)
     if np.count_nonzero(found) > most:
         return none
     root = np.sqrt(gap)[:, None]

@@ -15,6 +15,7 @@ from perrin.images.optics.optics import Optics
 from perrin.images.optics.window_fit import RigidCenters
 from perrin.images.spheres.localisation import Method, choose_method, found_table, sample_frames
 from perrin.images.spheres.poses import Pose, pose_in, with_poses
+from perrin.images.spheres.spots import Fading
 from perrin.movie.checks import Findings, unsettled_poses
 from perrin.movie.parts import PartWriter, open_parts, read_parts
 from perrin.movie.workers import work_through
@@ -165,6 +166,7 @@ def locate_frames(
         replace(search, minmass=learned["minmass"]),
         refine,
         None if found is None else Optics.from_dict(found),
+        None if learned["fading"] is None else Fading.from_dict(learned["fading"]),
     )
     rows, entries, notes = run_frames(
         _LocateTask(_without_times(stack), method),
@@ -210,7 +212,7 @@ def learn_method(
     Returns
     -------
     dict
-        Values that JSON can hold: ``minmass``, ``optics``, the ``spots`` of the sampled frames as
+        Values that JSON can hold: ``minmass``, ``optics``, ``fading``, the ``spots`` of the sampled frames as
         (frame, mass), and the warnings under ``told``.
 
     Raises
@@ -242,6 +244,7 @@ def learn_method(
     return {
         "minmass": method.search.minmass,
         "optics": None if method.optics is None else method.optics.to_dict(),
+        "fading": None if method.fading is None else method.fading.to_dict(),
         "spots": [[seen.number, mass] for seen in sample for mass in seen.spots.mass.tolist()],
         "told": [str(warning.message) for warning in caught],
     }

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from perrin._text import frames_text, listed, with_error
-from perrin.diffusion.step_tests import JUMP_LEVEL
+from perrin.diffusion.step_tests import JUMP_LEVEL, STAGE_LEVEL
 from perrin.tracks.screening import far_sentence
 
 if TYPE_CHECKING:
@@ -591,7 +591,7 @@ def stage_jump_warnings(stage: StageJumps, *, first_frame: int, kept: bool) -> l
         texts.append(
             f"stage jump: {stage.bodies[k]} clusters move together by ({size}) +- {error:.2g} um "
             f"at frame {stage.frames[k] + first_frame}: the stage or the camera moved; diffusion "
-            f"does so with a probability below {JUMP_LEVEL:g}; {done}; D_R is not affected"
+            f"does so with a probability below {STAGE_LEVEL:g}; {done}; D_R is not affected"
         )
     more = len(stage.frames) - _JUMPS_SHOWN
     return [*texts, f"stage jump: {more} more"] if more > 0 else texts

@@ -25,9 +25,11 @@ from perrin.images.optics.window_fit import FreeCenters, fit_window
 from perrin.images.spheres.by_trackpy import Features, find_features, refine_by_trackpy
 from perrin.images.spheres.spots import (
     SPOT_KEYWORDS,
+    Fading,
     Spots,
     SpotSettings,
     at_contact,
+    find_fading,
     groups_and_crowds,
     mass_cut,
 )
@@ -133,9 +135,9 @@ class Search:
             border=self.border,
         )
 
-    def spheres(self, spots: Features) -> Features:
-        """Return the spots of at least the least mass."""
-        keep = spots.mass >= (self.minmass or 0.0)
+    def spheres(self, spots: Features, light: Floats | float = 1.0) -> Features:
+        """Return the spots of at least the least mass, times the relative brightness at each."""
+        keep = spots.mass >= (self.minmass or 0.0) * light
         return Features(spots.centers[keep], spots.mass[keep])
 
 
@@ -193,11 +195,20 @@ class Method:
         How positions are refined.
     optics : Optics or None
         The optics for refinement by the model.
+    fading : Fading or None
+        Brightness that the mass cut follows; None is the same cut in all frames.
     """
 
     search: Search
     refine: Refine = "model"
     optics: Optics | None = None
+    fading: Fading | None = None
+
+    def spheres(self, spots: Features, frame: int) -> Features:
+        """Return the spots of a frame that pass the mass cut."""
+        if self.fading is None:
+            return self.search.spheres(spots)
+        return self.search.spheres(spots, self.fading.at(frame, spots.centers))
 
     def locate_in(self, stack: StackLike, i: int) -> LocatedFrame:
         """Find and refine the spheres of frame i.
@@ -220,7 +231,7 @@ class Method:
         data, voxel = np.asarray(stack.frame(i)), _voxel_size(stack)
         frame = _finite_frame(data, i)
         spots = self.search.spots(frame, voxel)
-        found = self.search.spheres(spots)
+        found = self.spheres(spots, i)
         if self.refine == "model":
             columns = group_columns(frame, found, self.search.contact, self.optics, voxel)
             if self.optics is not None and self.search.crowds:
@@ -306,22 +317,27 @@ def choose_method(
     PrecisionWarning
         As in `mass_cut`.
     """
+    fading = None
     if search.minmass is None:
-        masses = [sampled.spots.mass for sampled in sample]
+        fading = find_fading([seen.number for seen in sample], [seen.spots for seen in sample])
+        masses = [seen.spots.mass for seen in sample]
+        if fading is not None:
+            masses = [m.spots.mass / fading.at(m.number, m.spots.centers) for m in sample]
         search = replace(search, minmass=mass_cut(np.concatenate([np.empty(0), *masses])))
     if refine != "model":
-        return Method(search, refine, None)
+        return Method(search, refine, None, fading)
+    method = Method(search, refine, optics, fading)
     if optics is None:
         in_crowds = in_groups = 0
         for sampled in sample:
-            found = search.spheres(sampled.spots).centers
+            found = method.spheres(sampled.spots, sampled.number).centers
             groups, crowds = groups_and_crowds(found, contact=search.contact)
             in_crowds += sum(map(len, crowds))
             in_groups += sum(map(len, groups))
         # Where most spheres are in crowds that are not to be refined, no optics are needed.
         if search.crowds or in_crowds <= in_groups:
-            optics = fit_optics(sample, search, voxel=_voxel_size(stack))
-    return Method(search, refine, optics)
+            optics = fit_optics(sample, method, voxel=_voxel_size(stack))
+    return replace(method, optics=optics)
 
 
 def locate(
@@ -461,14 +477,14 @@ def locate(
     return table
 
 
-def fit_optics(sample: Sequence[SampledFrame], search: Search, *, voxel: _Voxel) -> Optics:
+def fit_optics(sample: Sequence[SampledFrame], method: Method, *, voxel: _Voxel) -> Optics:
     """Learn the diameter of the fluorescent sphere, the point spread and the noise.
 
     Parameters
     ----------
     sample : sequence of SampledFrame
         A few frames all over the movie.
-    search : Search
+    method : Method
         Options of the search, with the mass cut.
     voxel : tuple of float
         Voxel size (z, y, x), um.
@@ -482,10 +498,11 @@ def fit_optics(sample: Sequence[SampledFrame], search: Search, *, voxel: _Voxel)
     ValueError
         Where no sphere is found, or the search does not converge.
     """
+    search = method.search
     samples: list[GroupSample | CrowdSample] = []
     pieces: list[GroupSample | CrowdSample] = []
     for sampled in sample:
-        found = search.spheres(sampled.spots)
+        found = method.spheres(sampled.spots, sampled.number)
         groups, crowds = groups_and_crowds(found.centers, contact=search.contact)
         samples += [_group_sample(sampled.frame, found, group, search.contact) for group in groups]
         for crowd in crowds if search.crowds else []:
