@@ -20,10 +20,18 @@ from perrin._arrays import (
 from perrin._text import listed
 from perrin.errors import FrameError, PrecisionWarning
 from perrin.images.optics.crowd_fit import crowd_piece, fit_crowd
-from perrin.images.optics.learn import CrowdSample, GroupSample, fit_samples, saturated_share
+from perrin.images.optics.learn import (
+    CrowdSample,
+    GroupSample,
+    LearnedOptics,
+    UsualImage,
+    fit_samples,
+    saturated_share,
+)
 from perrin.images.optics.window_fit import FreeCenters, fit_window
 from perrin.images.spheres.by_trackpy import Features, find_features, refine_by_trackpy
 from perrin.images.spheres.spots import (
+    MAX_CHAIN,
     SPOT_KEYWORDS,
     Fading,
     Spots,
@@ -32,6 +40,7 @@ from perrin.images.spheres.spots import (
     find_fading,
     groups_and_crowds,
     mass_cut,
+    touching_together,
 )
 
 if TYPE_CHECKING:
@@ -42,7 +51,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from perrin._arrays import Ints
+    from perrin.images.optics.ball_image import SphereImage
     from perrin.images.optics.optics import Optics
+    from perrin.images.optics.window_fit import ImageFit, Window
 
     Columns: TypeAlias = dict[str, NDArray[Any]]
 
@@ -58,6 +69,9 @@ _LEARNING_GROUPS, _LEARNING_CROWDS = 15, 2
 
 # Number of spheres in a piece of a crowd.
 _PIECE_SPHERES = 30
+
+# Reason of spots whose image is not that of one sphere, by its shape or its brightness.
+NO_SPHERE = "not the image of a sphere"
 
 # Reasons for which a sphere is not refined.
 _IN_A_CROWD, _NO_OWN_VOXELS = "in a crowd", "no voxels of its own"
@@ -197,12 +211,15 @@ class Method:
         The optics for refinement by the model.
     fading : Fading or None
         Brightness that the mass cut follows; None is the same cut in all frames.
+    usual : UsualImage or None
+        What the images of the spheres have in common; None accepts every image.
     """
 
     search: Search
     refine: Refine = "model"
     optics: Optics | None = None
     fading: Fading | None = None
+    usual: UsualImage | None = None
 
     def spheres(self, spots: Features, frame: int) -> Features:
         """Return the spots of a frame that pass the mass cut."""
@@ -233,9 +250,15 @@ class Method:
         spots = self.search.spots(frame, voxel)
         found = self.spheres(spots, i)
         if self.refine == "model":
-            columns = group_columns(frame, found, self.search.contact, self.optics, voxel)
+            light = 1.0 if self.fading is None else self.fading.at(i, found.centers)
+            columns, crowds = group_columns(
+                frame, found, self.search, self.optics, voxel, usual=self.usual, light=light
+            )
             if self.optics is not None and self.search.crowds:
-                columns = with_crowds(columns, frame, found, self.search, self.optics, voxel)
+                columns = with_crowds(
+                    columns, frame, found, self.search, self.optics, voxel,
+                    crowds=crowds, usual=self.usual,
+                )  # fmt: skip
         else:
             centers = found.centers
             if self.refine == "trackpy":
@@ -336,8 +359,9 @@ def choose_method(
             in_groups += sum(map(len, groups))
         # Where most spheres are in crowds that are not to be refined, no optics are needed.
         if search.crowds or in_crowds <= in_groups:
-            optics = fit_optics(sample, method, voxel=_voxel_size(stack))
-    return replace(method, optics=optics)
+            learned = fit_optics(sample, method, voxel=_voxel_size(stack))
+            return replace(method, optics=learned.optics, usual=learned.usual)
+    return method
 
 
 def locate(
@@ -477,7 +501,7 @@ def locate(
     return table
 
 
-def fit_optics(sample: Sequence[SampledFrame], method: Method, *, voxel: _Voxel) -> Optics:
+def fit_optics(sample: Sequence[SampledFrame], method: Method, *, voxel: _Voxel) -> LearnedOptics:
     """Learn the diameter of the fluorescent sphere, the point spread and the noise.
 
     Parameters
@@ -491,7 +515,7 @@ def fit_optics(sample: Sequence[SampledFrame], method: Method, *, voxel: _Voxel)
 
     Returns
     -------
-    Optics
+    LearnedOptics
 
     Raises
     ------
@@ -516,8 +540,15 @@ def fit_optics(sample: Sequence[SampledFrame], method: Method, *, voxel: _Voxel)
 
 
 def group_columns(
-    frame: Floats, found: Features, contact: float, optics: Optics | None, voxel: _Voxel
-) -> Columns:
+    frame: Floats,
+    found: Features,
+    search: Search,
+    optics: Optics | None,
+    voxel: _Voxel,
+    *,
+    usual: UsualImage | None = None,
+    light: Floats | float = 1.0,
+) -> tuple[Columns, list[Ints]]:
     """Fit every group of touching spheres by the model of its image.
 
     Parameters
@@ -526,25 +557,48 @@ def group_columns(
         Grey levels.
     found : Features
         The spheres of the frame as they were found first.
-    contact : float
-        Centre distance of touching spheres, um.
+    search : Search
+        Options of the search.
     optics : Optics or None
         None: no group is fitted.
     voxel : tuple of float
         Voxel size (z, y, x), um.
+    usual : UsualImage, optional
+        What the images of spheres have in common. Spots with another image are not refined, and
+        their voxels are not used for the others.
+    light : ndarray, shape (n,), or float
+        Relative brightness of spheres in this frame, at each of the spots.
 
     Returns
     -------
-    dict of ndarray
+    columns : dict of ndarray
         The columns of the table of `locate`.
+    cut : list of ndarray of int
+        Groups that are not fitted here: crowds, and groups at the border whose images show spheres
+        beyond it.
     """
+    contact = search.contact
     centers, sigma = found.centers.copy(), np.full_like(found.centers, np.nan)
     chi2 = np.full(len(centers), np.nan)
     reason = np.full(len(centers), _IN_A_CROWD, dtype=object)
-    groups = [] if optics is None else groups_and_crowds(found.centers, contact=contact)[0]
+    groups, crowds = [], []
     if optics is not None:
+        groups, crowds = groups_and_crowds(found.centers, contact=contact)
         image, noise, furthest = optics.image(voxel), optics.noise, optics.diameter / 4
-    for group in groups:
+        light = np.broadcast_to(light, len(centers))
+    cut: list[Ints] = []
+    if usual is not None and usual.left_out:
+        # Dust makes crowds of small groups: these are fitted group by group.
+        for crowd in crowds:
+            parts = touching_together(found.centers[crowd], contact=contact)
+            if max(map(len, parts)) <= MAX_CHAIN:
+                groups += [crowd[part] for part in parts]
+            else:
+                cut.append(crowd)
+    else:
+        cut += crowds
+    while groups:
+        group = groups.pop()
         sample = _group_sample(frame, found, group, contact)
         window = sample.window(image)
         if not window.has_enough_voxels(len(group)):
@@ -554,13 +608,44 @@ def group_columns(
         moved = np.linalg.norm(fit.centers - sample.centers, axis=1) >= furthest
         dark = ~(fit.brightness / np.median(fit.brightness) > 0.1)
         faults = np.where(dark, _DARK, np.where(moved, _MOVED, "")).astype(object)
+        if usual is not None:
+            excess = _excess(window, fit, usual, light[group])
+            if excess.max() > 1 and search.crowds and _reaches_border(sample, image):
+                cut.append(group)
+                continue
+            if excess.max() > 1:
+                # Without the worst one, whose voxels are left out, the others may be spheres.
+                worst = int(excess.argmax())
+                reason[group[worst]], chi2[group[worst]] = NO_SPHERE, fit.chi2
+                groups += [np.delete(group, worst)] if len(group) > 1 else []
+                continue
         reason[group] = faults if fit.converged else _NOT_CONVERGED
         chi2[group] = fit.chi2
         good = reason[group] == ""
         centers[group[good]] = fit.centers[good]
         sigma[group[good]] = np.sqrt(np.diag(fit.covariance)).reshape(-1, 3)[good]
     columns = _axis_columns(centers) | {"mass": found.mass} | _axis_columns(sigma, "sigma_")
-    return columns | {"chi2": chi2, "refined": reason == "", "reason": reason}
+    return columns | {"chi2": chi2, "refined": reason == "", "reason": reason}, cut
+
+
+def _excess(window: Window, fit: ImageFit, usual: UsualImage, light: Floats) -> Floats:
+    """Return the excess of `UsualImage` of every sphere of a fit with independent positions."""
+    n = len(fit.brightness)
+    own = fit.jacobian[3 * n : 4 * n]  # the unit image of each sphere
+    square = fit.weight * (window.data - fit.expected) ** 2
+    voxels = own.sum(axis=1)
+    return usual.excess(
+        own @ square / np.maximum(voxels, 1e-300),
+        fit.brightness / (usual.brightness * light),
+        voxels=voxels,
+    )
+
+
+def _reaches_border(sample: GroupSample, image: SphereImage) -> bool:
+    """Return whether the image of a sphere of a group reaches the border of the frame."""
+    last = (np.array(sample.frame.shape) - 1) * np.array(image.voxel)
+    depth = np.minimum(sample.centers, last - sample.centers)
+    return bool(np.any(depth < image.extent))
 
 
 def with_crowds(
@@ -570,6 +655,9 @@ def with_crowds(
     search: Search,
     optics: Optics,
     voxel: _Voxel,
+    *,
+    crowds: Sequence[Ints],
+    usual: UsualImage | None = None,
 ) -> Columns:
     """Return the columns with the rows of every crowd replaced by those of its fit.
 
@@ -590,12 +678,15 @@ def with_crowds(
         Size, point spread and noise of the image of a sphere.
     voxel : tuple of float
         Voxel size (z, y, x), um.
+    crowds : sequence of ndarray of int
+        The spheres of each crowd.
+    usual : UsualImage, optional
+        What the images of spheres have in common; other spots are not refined.
 
     Returns
     -------
     dict of ndarray
     """
-    _, crowds = groups_and_crowds(found.centers, contact=search.contact)
     last = (np.array(frame.shape) - 1) * np.array(voxel)
     margin = 0.0 if search.border else search.diameter / 2
     for group in crowds:
@@ -616,6 +707,10 @@ def with_crowds(
         own = _axis_columns(centers) | {"mass": mass} | _axis_columns(sigma, "sigma_")
         own |= {"chi2": crowd.chi2, "refined": good}
         own["reason"] = np.where(good, "", _NOT_CONVERGED).astype(object)
+        if usual is not None:
+            none = crowd.chi2 > usual.worst_chi2
+            own["refined"] = good & ~none
+            own["reason"] = np.where(good & none, NO_SPHERE, own["reason"]).astype(object)
         columns = {k: np.concatenate([columns[k], own[k][kept]]) for k in columns}
     stays = np.ones(len(columns["mass"]), dtype=np.bool_)
     stays[np.concatenate([np.empty(0, dtype=np.int64), *crowds])] = False
