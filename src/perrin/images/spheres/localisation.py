@@ -19,7 +19,7 @@ from perrin._arrays import (
 )
 from perrin._text import listed
 from perrin.errors import FrameError, PrecisionWarning
-from perrin.images.optics.crowd_fit import crowd_piece, fit_crowd
+from perrin.images.optics.crowd_fit import CrowdFit, crowd_piece, fit_crowd
 from perrin.images.optics.learn import (
     CrowdSample,
     GroupSample,
@@ -31,7 +31,6 @@ from perrin.images.optics.learn import (
 from perrin.images.optics.window_fit import FreeCenters, fit_window
 from perrin.images.spheres.by_trackpy import Features, find_features, refine_by_trackpy
 from perrin.images.spheres.spots import (
-    MAX_CHAIN,
     SPOT_KEYWORDS,
     Fading,
     Spots,
@@ -52,7 +51,7 @@ if TYPE_CHECKING:
 
     from perrin._arrays import Ints
     from perrin.images.optics.ball_image import SphereImage
-    from perrin.images.optics.optics import Optics
+    from perrin.images.optics.optics import CameraNoise, Optics
     from perrin.images.optics.window_fit import ImageFit, Window
 
     Columns: TypeAlias = dict[str, NDArray[Any]]
@@ -66,6 +65,12 @@ _LEARNING_FRAMES = 5
 
 # Number of groups of spheres, or of pieces of crowds, from which the optics are learned.
 _LEARNING_GROUPS, _LEARNING_CROWDS = 15, 2
+
+# Largest number of spots that are fitted as one group where there is dust among them.
+_LARGEST_GROUP = 40
+
+# Largest number of spots of a group at the border that is fitted with spheres beyond it.
+_LARGEST_CUT_GROUP = 8
 
 # Number of spheres in a piece of a crowd.
 _PIECE_SPHERES = 30
@@ -254,11 +259,9 @@ class Method:
             columns, crowds = group_columns(
                 frame, found, self.search, self.optics, voxel, usual=self.usual, light=light
             )
-            if self.optics is not None and self.search.crowds:
-                columns = with_crowds(
-                    columns, frame, found, self.search, self.optics, voxel,
-                    crowds=crowds, usual=self.usual,
-                )  # fmt: skip
+            columns = with_crowds(
+                columns, frame, found, self.search, voxel, crowds=crowds, usual=self.usual
+            )
         else:
             centers = found.centers
             if self.refine == "trackpy":
@@ -548,7 +551,7 @@ def group_columns(
     *,
     usual: UsualImage | None = None,
     light: Floats | float = 1.0,
-) -> tuple[Columns, list[Ints]]:
+) -> tuple[Columns, list[tuple[Ints, CrowdFit]]]:
     """Fit every group of touching spheres by the model of its image.
 
     Parameters
@@ -573,30 +576,27 @@ def group_columns(
     -------
     columns : dict of ndarray
         The columns of the table of `locate`.
-    cut : list of ndarray of int
-        Groups that are not fitted here: crowds, and groups at the border whose images show spheres
-        beyond it.
+    crowds : list of tuple
+        Spheres that are fitted as a crowd, and the fit: with `Search.crowds` those of crowds, and
+        of groups at the border whose images show spheres beyond it.
     """
     contact = search.contact
     centers, sigma = found.centers.copy(), np.full_like(found.centers, np.nan)
     chi2 = np.full(len(centers), np.nan)
     reason = np.full(len(centers), _IN_A_CROWD, dtype=object)
-    groups, crowds = [], []
+    groups: list[Ints] = []
+    crowds: list[tuple[Ints, CrowdFit]] = []
     if optics is not None:
-        groups, crowds = groups_and_crowds(found.centers, contact=contact)
+        groups, chains = groups_and_crowds(found.centers, contact=contact)
         image, noise, furthest = optics.image(voxel), optics.noise, optics.diameter / 4
         light = np.broadcast_to(light, len(centers))
-    cut: list[Ints] = []
-    if usual is not None and usual.left_out:
-        # Dust makes crowds of small groups: these are fitted group by group.
-        for crowd in crowds:
-            parts = touching_together(found.centers[crowd], contact=contact)
-            if max(map(len, parts)) <= MAX_CHAIN:
-                groups += [crowd[part] for part in parts]
-            else:
-                cut.append(crowd)
-    else:
-        cut += crowds
+        for chain in chains:
+            parts = touching_together(found.centers[chain], contact=contact)
+            # Dust makes crowds of small groups: these are fitted group by group.
+            if usual is not None and usual.left_out and max(map(len, parts)) <= _LARGEST_GROUP:
+                groups += [chain[part] for part in parts]
+            elif search.crowds:
+                crowds.append((chain, _crowd_of(frame, found, chain, search, image, noise)))
     while groups:
         group = groups.pop()
         sample = _group_sample(frame, found, group, contact)
@@ -610,12 +610,17 @@ def group_columns(
         faults = np.where(dark, _DARK, np.where(moved, _MOVED, "")).astype(object)
         if usual is not None:
             excess = _excess(window, fit, usual, light[group])
-            if excess.max() > 1 and search.crowds and _reaches_border(sample, image):
-                cut.append(group)
-                continue
-            if excess.max() > 1:
+            worst = int(excess.argmax())
+            cut = _reaches_border(frame, fit.centers[worst], image)
+            if excess[worst] > 1 and search.crowds and cut and len(group) <= _LARGEST_CUT_GROUP:
+                beyond = _crowd_of(frame, found, group, search, image, noise)
+                if np.all(beyond.chi2 <= usual.worst_chi2) and set(beyond.origin) >= set(
+                    range(len(group))
+                ):
+                    crowds.append((group, beyond))
+                    continue
+            if excess[worst] > 1:
                 # Without the worst one, whose voxels are left out, the others may be spheres.
-                worst = int(excess.argmax())
                 reason[group[worst]], chi2[group[worst]] = NO_SPHERE, fit.chi2
                 groups += [np.delete(group, worst)] if len(group) > 1 else []
                 continue
@@ -625,7 +630,22 @@ def group_columns(
         centers[group[good]] = fit.centers[good]
         sigma[group[good]] = np.sqrt(np.diag(fit.covariance)).reshape(-1, 3)[good]
     columns = _axis_columns(centers) | {"mass": found.mass} | _axis_columns(sigma, "sigma_")
-    return columns | {"chi2": chi2, "refined": reason == "", "reason": reason}, cut
+    return columns | {"chi2": chi2, "refined": reason == "", "reason": reason}, crowds
+
+
+def _crowd_of(
+    frame: Floats,
+    found: Features,
+    group: Ints,
+    search: Search,
+    image: SphereImage,
+    noise: CameraNoise,
+) -> CrowdFit:
+    """Fit a group of the spheres of a frame together with those that were not found."""
+    others = np.delete(found.centers, group, axis=0)
+    return fit_crowd(
+        frame, found.centers[group], others=others, contact=search.contact, image=image, noise=noise
+    )
 
 
 def _excess(window: Window, fit: ImageFit, usual: UsualImage, light: Floats) -> Floats:
@@ -641,11 +661,10 @@ def _excess(window: Window, fit: ImageFit, usual: UsualImage, light: Floats) -> 
     )
 
 
-def _reaches_border(sample: GroupSample, image: SphereImage) -> bool:
-    """Return whether the image of a sphere of a group reaches the border of the frame."""
-    last = (np.array(sample.frame.shape) - 1) * np.array(image.voxel)
-    depth = np.minimum(sample.centers, last - sample.centers)
-    return bool(np.any(depth < image.extent))
+def _reaches_border(frame: Floats, center: Floats, image: SphereImage) -> bool:
+    """Return whether the image of a sphere at `center` (3,) reaches the border of the frame."""
+    last = (np.array(frame.shape) - 1) * np.array(image.voxel)
+    return bool(np.any(np.minimum(center, last - center) < image.extent))
 
 
 def with_crowds(
@@ -653,10 +672,9 @@ def with_crowds(
     frame: Floats,
     found: Features,
     search: Search,
-    optics: Optics,
     voxel: _Voxel,
     *,
-    crowds: Sequence[Ints],
+    crowds: Sequence[tuple[Ints, CrowdFit]],
     usual: UsualImage | None = None,
 ) -> Columns:
     """Return the columns with the rows of every crowd replaced by those of its fit.
@@ -666,20 +684,16 @@ def with_crowds(
 
     Parameters
     ----------
-    columns : dict of ndarray
-        The columns of `group_columns`.
+    columns, crowds : dict of ndarray, list of tuple
+        What `group_columns` returns.
     frame : ndarray, shape (nz, ny, nx)
         Grey levels.
     found : Features
         The spheres of the frame as they were found first.
     search : Search
         Options of the search.
-    optics : Optics
-        Size, point spread and noise of the image of a sphere.
     voxel : tuple of float
         Voxel size (z, y, x), um.
-    crowds : sequence of ndarray of int
-        The spheres of each crowd.
     usual : UsualImage, optional
         What the images of spheres have in common; other spots are not refined.
 
@@ -689,31 +703,21 @@ def with_crowds(
     """
     last = (np.array(frame.shape) - 1) * np.array(voxel)
     margin = 0.0 if search.border else search.diameter / 2
-    for group in crowds:
-        crowd = fit_crowd(
-            frame,
-            found.centers[group],
-            others=np.delete(found.centers, group, axis=0),
-            contact=search.contact,
-            image=optics.image(voxel),
-            noise=optics.noise,
-        )
+    for group, crowd in crowds:
         first = crowd.origin >= 0
         good = crowd.converged & np.isfinite(crowd.sigma).all(axis=1)
         centers = np.where(good[:, None], crowd.centers, found.centers[group][crowd.origin])
         sigma = np.where(good[:, None], crowd.sigma, np.nan)
+        reason = np.where(good, "", _NOT_CONVERGED).astype(object)
+        if usual is not None:
+            reason[good & (crowd.chi2 > usual.worst_chi2)] = NO_SPHERE
         kept = np.all((centers >= margin) & (centers <= last - margin), axis=1) & (good | first)
         mass = np.where(first, found.mass[group][crowd.origin], np.nan)
         own = _axis_columns(centers) | {"mass": mass} | _axis_columns(sigma, "sigma_")
-        own |= {"chi2": crowd.chi2, "refined": good}
-        own["reason"] = np.where(good, "", _NOT_CONVERGED).astype(object)
-        if usual is not None:
-            none = crowd.chi2 > usual.worst_chi2
-            own["refined"] = good & ~none
-            own["reason"] = np.where(good & none, NO_SPHERE, own["reason"]).astype(object)
+        own |= {"chi2": crowd.chi2, "refined": reason == "", "reason": reason}
         columns = {k: np.concatenate([columns[k], own[k][kept]]) for k in columns}
     stays = np.ones(len(columns["mass"]), dtype=np.bool_)
-    stays[np.concatenate([np.empty(0, dtype=np.int64), *crowds])] = False
+    stays[np.concatenate([np.empty(0, dtype=np.int64), *(group for group, _ in crowds)])] = False
     return {k: column[stays] for k, column in columns.items()}
 
 

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 _IMAGE_OVERLAP = 1.6
 
 # Largest number of spheres in a chain of overlapping images that is fitted group by group.
-MAX_CHAIN = 16
+_MAX_CHAIN = 16
 
 # Least ratio of neighbouring masses that separates spheres from noise.
 _CLEAR_GAP = 2.0
@@ -314,7 +314,7 @@ def groups_and_crowds(centers: Floats, *, contact: float) -> tuple[list[Ints], l
     ([0, 1], 20)
     """
     chains = touching_together(centers, contact=contact, reach=_IMAGE_OVERLAP)
-    crowds = [chain for chain in chains if len(chain) > MAX_CHAIN]
+    crowds = [chain for chain in chains if len(chain) > _MAX_CHAIN]
     crowded = np.zeros(len(centers), dtype=np.bool_)
     crowded[np.concatenate([np.empty(0, dtype=np.int64), *crowds])] = True
     together = touching_together(centers, contact=contact)
