@@ -232,6 +232,35 @@ def recorded(bodies, light, *, n_frames, rng, dust=()):
     return movie
 
 
+def ring_movie(*, n_frames, rng, rim=0.75):
+    """Return a movie (T, 1, y, x) of four planar trimers in bright field, and their paths.
+
+    A sphere is a dark rim, at a share of its radius, with a bright middle on a bright background.
+    """
+    shape = SHAPES[3][:, :2] * DIAMETER
+    field, pixel, size = 40.0, 0.2, 200
+    place = np.array([[10.0, 10.0], [30.0, 10.0], [10.0, 30.0], [30.0, 30.0]])
+    place += rng.uniform(-2, 2, place.shape)
+    turn = rng.uniform(0, 2 * np.pi, 4)
+    paths, movie = [], np.empty((n_frames, 1, size, size), dtype=np.uint8)
+    y, x = np.mgrid[:size, :size] * pixel
+    for i in range(n_frames):
+        cos, sin = np.cos(turn), np.sin(turn)
+        spin = np.stack([np.stack([cos, -sin], -1), np.stack([sin, cos], -1)], -2)
+        spheres = place[:, None] + np.einsum("bij,nj->bni", spin, shape)
+        paths.append(spheres)
+        mean = np.full((size, size), 40.0)
+        for a, b in spheres.reshape(-1, 2):
+            r = np.hypot(x - a, y - b)
+            mean -= 22.0 * np.exp(-(((r - rim * DIAMETER / 2) / 0.25) ** 2) / 2)
+            mean += 8.0 * np.exp(-((r / 0.5) ** 2) / 2)
+        movie[i, 0] = np.clip(3.0 * rng.poisson(np.maximum(mean, 2.0)) + 10.0, 0, 255)
+        place = place + rng.normal(0, np.sqrt(2 * D_T * DT), place.shape)
+        place = np.clip(place, 4.0, field - 4.0)
+        turn = turn + rng.normal(0, np.sqrt(2 * 3 * D_R * DT), 4)
+    return movie, np.array(paths).swapaxes(0, 1)
+
+
 def plane_times(light, n_frames):
     """Return the times at which bodies are needed: of each frame, or of each of its planes."""
     frames = np.arange(n_frames) * DT
