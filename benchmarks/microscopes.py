@@ -76,8 +76,8 @@ class Body:
         return self.place + self.turn.apply(self.shape)
 
 
-def scene(kinds, box, *, rng, bright=None, walls=DIAMETER, tries=20000):
-    """Place bodies at random without overlap.
+def scene(kinds, box, *, rng, bright=None, walls=DIAMETER, fixed=(), tries=20000):
+    """Place bodies at random without overlap with each other and with `fixed` bodies.
 
     `kinds` lists numbers of spheres, in order; `bright` has factors of the light of the spheres of
     each body; centres of all spheres keep `walls` from the sides (negative: they may leave).
@@ -88,7 +88,7 @@ def scene(kinds, box, *, rng, bright=None, walls=DIAMETER, tries=20000):
         light = np.ones(kind) if bright is None else np.asarray(bright[i], dtype=float)
         for _ in range(tries):
             body = Body(shape, rng.uniform(walls, box - walls), Rotation.random(rng=rng), light)
-            if allowed(body.spheres(), bodies, None, box, walls):
+            if allowed(body.spheres(), [*bodies, *fixed], box, walls):
                 bodies.append(body)
                 break
         else:
@@ -96,16 +96,18 @@ def scene(kinds, box, *, rng, bright=None, walls=DIAMETER, tries=20000):
     return bodies
 
 
-def allowed(x, bodies, me, box, walls):
-    """Return whether spheres are inside the walls and overlap no sphere of another body."""
+def allowed(x, bodies, box, walls):
+    """Return whether spheres are inside the walls and overlap no sphere of other bodies."""
     if np.any(x < walls) or np.any(x > box - walls):
         return False
-    others = [b.spheres() for b in bodies if b is not me]
+    others = [b.spheres() for b in bodies]
     return not others or cdist(x, np.concatenate(others)).min() >= 1.001 * DIAMETER
 
 
-def diffuse(bodies, times, box, *, rng, walls=DIAMETER, longest=0.1):
+def diffuse(bodies, times, box, *, rng, walls=DIAMETER, fixed=(), longest=0.1):
     """Move all bodies through the times; each body's `path` becomes (len(times), n, 3).
+
+    They do not overlap with each other nor with `fixed` bodies.
 
     D_T and D_R of a body of n spheres are those of a tetrahedron times 4 / n and (4 / n)^2 up to
     the sizes of the shapes; a single sphere has 1.8 D_T.
@@ -113,8 +115,9 @@ def diffuse(bodies, times, box, *, rng, walls=DIAMETER, longest=0.1):
     now = times[0]
     sizes = [len(b.shape) for b in bodies]
     first = np.cumsum([0, *sizes])
-    x = np.concatenate([b.spheres() for b in bodies])
+    x = np.concatenate([b.spheres() for b in (*bodies, *fixed)])
     owner = np.repeat(np.arange(len(bodies)), sizes)
+    owner = np.append(owner, np.full(len(x) - len(owner), -1))
     for t in times:
         steps = max(1, int(np.ceil((t - now) / longest - 1e-9))) if t > now else 0
         for _ in range(steps):
@@ -229,6 +232,35 @@ def recorded(bodies, light, *, n_frames, rng, dust=()):
     return movie
 
 
+def ring_movie(*, n_frames, rng, rim=0.75):
+    """Return a movie (T, 1, y, x) of four planar trimers in bright field, and their paths.
+
+    A sphere is a dark rim, at a share of its radius, with a bright middle on a bright background.
+    """
+    shape = SHAPES[3][:, :2] * DIAMETER
+    field, pixel, size = 40.0, 0.2, 200
+    place = np.array([[10.0, 10.0], [30.0, 10.0], [10.0, 30.0], [30.0, 30.0]])
+    place += rng.uniform(-2, 2, place.shape)
+    turn = rng.uniform(0, 2 * np.pi, 4)
+    paths, movie = [], np.empty((n_frames, 1, size, size), dtype=np.uint8)
+    y, x = np.mgrid[:size, :size] * pixel
+    for i in range(n_frames):
+        cos, sin = np.cos(turn), np.sin(turn)
+        spin = np.stack([np.stack([cos, -sin], -1), np.stack([sin, cos], -1)], -2)
+        spheres = place[:, None] + np.einsum("bij,nj->bni", spin, shape)
+        paths.append(spheres)
+        mean = np.full((size, size), 40.0)
+        for a, b in spheres.reshape(-1, 2):
+            r = np.hypot(x - a, y - b)
+            mean -= 22.0 * np.exp(-(((r - rim * DIAMETER / 2) / 0.25) ** 2) / 2)
+            mean += 8.0 * np.exp(-((r / 0.5) ** 2) / 2)
+        movie[i, 0] = np.clip(3.0 * rng.poisson(np.maximum(mean, 2.0)) + 10.0, 0, 255)
+        place = place + rng.normal(0, np.sqrt(2 * D_T * DT), place.shape)
+        place = np.clip(place, 4.0, field - 4.0)
+        turn = turn + rng.normal(0, np.sqrt(2 * 3 * D_R * DT), 4)
+    return movie, np.array(paths).swapaxes(0, 1)
+
+
 def plane_times(light, n_frames):
     """Return the times at which bodies are needed: of each frame, or of each of its planes."""
     frames = np.arange(n_frames) * DT
@@ -285,12 +317,13 @@ CASES = {
 
 
 def drawn(case, seed):
-    """Return the movie of a case, its bodies, and times (T,) of the middle plane of the frames."""
+    """Return the movie of a case, and its bodies with their paths."""
     rng = np.random.default_rng(seed)
     light = case.light
-    bodies = scene(case.kinds, light.box, rng=rng, bright=case.bright, walls=case.walls)
-    diffuse(bodies, plane_times(light, case.n_frames), light.box, rng=rng, walls=case.walls)
     specks = specks_of(case, rng)
+    where = {"rng": rng, "walls": case.walls, "fixed": specks}
+    bodies = scene(case.kinds, light.box, bright=case.bright, **where)
+    diffuse(bodies, plane_times(light, case.n_frames), light.box, **where)
     per = light.shape[0] if light.plane_time else 1
     for b in (*bodies, *specks):
         b.path[10 * per :, :, 0] += case.jump
@@ -299,16 +332,17 @@ def drawn(case, seed):
 
 
 def specks_of(case, rng):
-    """Return dust: lumps of several balls that overlap, and are brighter than spheres."""
+    """Return dust: lumps of balls that overlap, brighter than spheres, and stuck where they are."""
     specks = []
     for _ in range(case.dust):
         n = int(rng.integers(1, 5))
         spread = rng.uniform(0.1, 0.7) * DIAMETER
         shape = rng.normal(0, spread / 2, (n, 3)) * rng.uniform(0.3, 1.5, 3)
         place = rng.uniform(0, case.light.box)
-        speck = Body(shape, place, Rotation.identity(), rng.uniform(0.3, 2.5, n))
         count = len(plane_times(case.light, case.n_frames))
-        specks.append(replace(speck, path=np.repeat((place + shape)[None], count, axis=0)))
+        path = np.repeat((place + shape)[None], count, axis=0)
+        bright = rng.uniform(0.3, 2.5, n)
+        specks.append(Body(shape, place, Rotation.identity(), bright, path))
     return specks
 
 
@@ -379,6 +413,8 @@ def print_case(report, bodies, case, *, seconds):
     per = case.light.shape[0]
     for i, part in report.imaging.features.groupby("frame"):
         places, light = [], []
+        if "refined" in part:  # what the fits found to be no sphere is not used
+            part = part[part["refined"] | part["chi2"].isna()]
         found = part[["x", "y", "z"]].to_numpy()
         for b in bodies:
             for j in range(len(b.shape)):

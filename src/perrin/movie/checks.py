@@ -39,6 +39,12 @@ _MISSING_SHARE = 0.1  # missing share of the spheres of the clusters
 _NOTED_ERROR_RATIO, _LARGE_ERROR_RATIO = 1.15, 2.0  # errors of positions over the stated ones
 _FAILED_SHARE = 0.01  # share of fits that did not converge
 _UNSAFE_STEP, _REFUSED_STEP = 0.25, 0.5  # rms step over the contact distance
+_RING_ERRORS = 5.0  # standard errors of the contrasts of a 2-D image
+_RING_CONTRAST, _OPPOSITE_CONTRAST = 1.2, 0.3  # contrast at the rim over that in the middle
+_MIDDLE, _RIM = 0.15, (0.25, 0.5)  # radii of middle and rim of a sphere over its diameter
+_BACKGROUND_DISTANCE, _LEAST_BACKGROUND = 1.5, 0.02  # in diameters; least share of the pixels
+_OVERLAP, _OVERLAP_SHARE = 0.85, 0.1  # distance over the contact; share of the places
+_FEWEST_PLACES = 8  # from which the contrasts are known
 _FAST_RATIO, _SLOW_ROTATION = 2.0, 0.5  # MSAD at the first lag over Phi^2; rms rotation, rad
 
 
@@ -519,6 +525,129 @@ def pair_distance_bias(
     text = (
         f"mean pair distance {mean:.4g} +- {error:.1g} um, expected {contact:.4g} "
         f"({100 * off:+.1f} +- {100 * error / contact:.1g} %): {why}"
+    )
+    return Findings((text,))
+
+
+def ring_images(
+    images: Sequence[Floats],
+    places: Sequence[Floats],
+    *,
+    pixel: tuple[float, float],
+    diameter: float,
+    dark: bool,
+) -> Findings:
+    """Warn if the places found in a 2-D movie are no discs: rings, or gaps between dark spheres.
+
+    The contrast of a disc with the background is strongest in its middle, and has the same sign at
+    its rim. The background is the median of the pixels that are over 1.5 diameters from all places.
+
+    Parameters
+    ----------
+    images : sequence of ndarray, shape (ny, nx)
+        Some frames.
+    places : sequence of ndarray, shape (n, 2)
+        Places (x, y) found in each of them, um.
+    pixel : tuple of float
+        Size of a pixel (y, x), um.
+    diameter : float
+        Sphere diameter, um.
+    dark : bool
+        Whether spheres are searched for as darker than their surroundings.
+
+    Examples
+    --------
+    >>> y, x = np.mgrid[:60, :60] * 0.2
+    >>> away = np.hypot(x - 6.0, y - 6.0)
+    >>> ring = 100.0 - 50.0 * np.exp(-(((away - 1.0) / 0.2) ** 2))
+    >>> found = ring_images(
+    ...     [ring] * 9, [np.array([[6.0, 6.0]])] * 9, pixel=(0.2, 0.2), diameter=2.0, dark=True
+    ... )
+    >>> found.warnings[0][:40]
+    'ring images: the contrast of the places '
+    """
+    from scipy.spatial import cKDTree
+
+    middles, rims = [], []
+    for image, found in zip(images, places, strict=True):
+        if not len(found):
+            continue
+        y, x = np.meshgrid(*(h * np.arange(n) for h, n in zip(pixel, image.shape)), indexing="ij")
+        grid = np.stack([x.ravel(), y.ravel()], axis=1)
+        grey = image.ravel().astype(np.float64) * (-1.0 if dark else 1.0)
+        away, _ = cKDTree(found).query(grid)
+        far = away > _BACKGROUND_DISTANCE * diameter
+        if far.mean() < _LEAST_BACKGROUND:
+            continue
+        tree, level = cKDTree(grid), float(np.median(grey[far]))
+        for place in found:
+            near = np.array(tree.query_ball_point(place, _RIM[1] * diameter))
+            radius = np.linalg.norm(grid[near] - place, axis=1) / diameter
+            middle, rim = grey[near[radius < _MIDDLE]], grey[near[radius > _RIM[0]]]
+            if middle.size and rim.size:
+                middles.append(middle.mean() - level)
+                rims.append(rim.mean() - level)
+    if len(middles) < _FEWEST_PLACES:
+        return _NOTHING
+    middle, rim = np.array(middles), np.array(rims)
+    excess = rim - _RING_CONTRAST * np.maximum(middle, 0.0)
+    opposite = -rim - _OPPOSITE_CONTRAST * np.abs(middle)
+    for value, text in (
+        (
+            excess,
+            "ring images: the contrast of the places found is stronger at the rim than in the "
+            "middle ({rim:.3g} and {middle:.3g} grey levels): the spheres are rings, as in bright "
+            "field; between touching rims there are false places, and centroids are biased: focus "
+            "so that spheres are discs, or pass the clusters to leave out (exclude)",
+        ),
+        (
+            opposite,
+            "contrast: around the places found the image is {other} than the background (middle "
+            "{middle:+.3g}, rim {rim:+.3g} grey levels): they may be gaps between spheres that are "
+            "{other} than the background, as in bright field: pass dark={dark}, and look at the "
+            "places found",
+        ),
+    ):
+        if value.mean() > _RING_ERRORS * value.std() / np.sqrt(len(value)):
+            sign = -1.0 if dark else 1.0
+            words = {"other": "brighter" if dark else "darker", "dark": not dark}
+            numbers = {"rim": sign * rim.mean(), "middle": sign * middle.mean()}
+            return Findings((text.format(**words, **numbers),))
+    return _NOTHING
+
+
+def overlapping_places(places: Sequence[Floats], *, contact: float) -> Findings:
+    """Warn if many places of a 2-D movie are nearer to each other than spheres can be.
+
+    Parameters
+    ----------
+    places : sequence of ndarray, shape (n, 2)
+        Places found in some frames, um.
+    contact : float
+        Centre distance of touching spheres, um.
+
+    Examples
+    --------
+    >>> rims = np.array([[0.0, 0.0], [1.5, 0.0], [9.0, 0.0], [10.5, 0.0]])
+    >>> overlapping_places([rims, rims], contact=2.0).warnings[0][:52]
+    'overlap: 8 of 8 places (100 %) are nearer than 0.85 '
+    """
+    from scipy.special import bdtrc
+    from scipy.spatial import cKDTree
+
+    near = total = 0
+    for found in places:
+        if len(found) > 1:
+            distance = cKDTree(found).query(found, k=2)[0][:, 1]
+            near += int((distance < _OVERLAP * contact).sum())
+        total += len(found)
+    if not near or bdtrc(near - 1, total, _OVERLAP_SHARE) > _TEST_LEVEL:
+        return _NOTHING
+    text = (
+        f"overlap: {near} of {total} places ({100 * near / total:.2g} %) are nearer than "
+        f"{_OVERLAP:g} contact distances to another, where spheres in a plane cannot be: some are "
+        "no spheres but parts of them or gaps between them (rings, as in bright field), spheres "
+        "lie above each other, or contact is too large"
     )
     return Findings((text,))
 

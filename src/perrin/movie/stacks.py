@@ -463,6 +463,7 @@ def _with_checks(
             features, contact=contact, refine=method.refine, axes=bodies.axes
         )
         + checks.Findings(tuple(bodies.warnings), tuple(bodies.notes))
+        + _contrast(imaging, features, flat=is_flat(stack))
         + checks.missing_spheres(features, size=bodies.size, contact=contact, frames=read)
         + checks.Findings(notes=tuple(uneven))
         + checks.clusters_near_border(features, margin=bodies.margin, dropped=bodies.dropped)
@@ -483,6 +484,23 @@ def _with_checks(
         notes=(*found.notes, *report.notes),
         imaging=imaging,
     )
+
+
+def _contrast(imaging: Imaging, features: pd.DataFrame, *, flat: bool) -> checks.Findings:
+    """Return the findings on the contrast of a 2-D movie."""
+    if not flat:
+        return checks.Findings()
+    shown = [
+        features.loc[features["frame"] == v.frame, ["x", "y"]].to_numpy(dtype=np.float64)
+        for v in imaging.views
+    ]
+    return checks.ring_images(
+        [np.asarray(v.xy, dtype=np.float64) for v in imaging.views],
+        shown,
+        pixel=imaging.voxel[1:],
+        diameter=imaging.diameter,
+        dark=imaging.dark,
+    ) + checks.overlapping_places(shown, contact=imaging.contact)
 
 
 def _imaging(stack: Stack, located: Located, bodies: Bodies, search: Search) -> Imaging:
