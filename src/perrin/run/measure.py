@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import platform
 import warnings as python_warnings
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import cache
 from typing import TYPE_CHECKING, Any
@@ -19,6 +19,7 @@ from perrin.diffusion.step_tests import (
     Jumps,
     cut_at,
     find_jumps,
+    find_stage_jumps,
     offset_gain,
     persistence_gain,
     steady_motion,
@@ -144,12 +145,15 @@ class FittedBody:
         Rigidity, errors per axis, and what was corrected.
     remarks : Remarks
         Warnings and notes on identity and fit.
+    stage : ndarray of int
+        Rows at which a step ends that contains a jump of the stage and is left out of D_T.
     """
 
     tracks: ClusterTracks
     motion: RigidMotion
     quality: Quality
     remarks: Remarks
+    stage: Ints = field(default_factory=lambda: np.empty(0, dtype=np.int64))
 
 
 @dataclass(frozen=True, eq=False)
@@ -262,6 +266,13 @@ def measure_table(
             for b in bodies
             if b.tracks.cluster in motions
         ]
+    placed = [b for b in bodies if not centre_removed(b.tracks.positions)]
+    stage = find_stage_jumps([b.motion for b in placed], [b.tracks.frames for b in placed])
+    remarks.warnings.extend(
+        words.stage_jump_warnings(stage, first_frame=first, kept=experiment.keep_jumps)
+    )
+    if not experiment.keep_jumps:
+        bodies = [replace(b, stage=stage.rows(b.tracks.frames)) for b in bodies]
     measured: list[MeasuredBody] = []
     for body in bodies:
         try:
@@ -542,9 +553,12 @@ def measure_body(
             *no_tensor,
         ),
         jumps={
-            name: tuple(tracks.frames[found.left_out].tolist())
-            for name, found in (("rotation", turn), ("translation", path))
-            if found.left_out.size
+            name: tuple(tracks.frames[rows].tolist())
+            for name, rows in (
+                ("rotation", turn.left_out),
+                ("translation", np.union1d(path.left_out, body.stage)),
+            )
+            if rows.size
         },
     )
     return MeasuredBody(body, turn, path, result)
@@ -581,9 +595,12 @@ def measure_coefficient(
         )
         none = Jumps(nothing, np.empty((0, 3)), np.empty(0), 0)
         return Coefficient(estimate, motion, motion, none, nothing, True, Remarks())
+    path = motion
+    if quantity == "translation":
+        # Doubt about the labels cuts the track, but the centre's path crosses it.
+        path = cut_at(replace(motion, piece=np.zeros_like(motion.piece)), body.stage)
+        motion = cut_at(motion, body.stage)
     estimate = _estimated_quietly(motion, quantity, noise)
-    # Doubt about the labels cuts the track, but the centre's path crosses it.
-    path = motion if quantity == "rotation" else replace(motion, piece=np.zeros_like(motion.piece))
     jumps = find_jumps(path, estimate)
     left_out = jumps.rows[:0]
     remarks = Remarks()
