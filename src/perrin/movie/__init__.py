@@ -1,13 +1,6 @@
 """From an image stack to a Report."""
 
-from perrin.movie.bodies import (
-    Bodies,
-    find_bodies,
-    group_sizes,
-    most_common_size,
-    stated_errors,
-    tracks_of,
-)
+from perrin.movie.bodies import Bodies, find_bodies, group_sizes, median_errors, tracks_of
 from perrin.movie.checks import (
     Change,
     Findings,
@@ -73,8 +66,8 @@ __all__ = [
     "locate_frames",
     "long_steps",
     "mean_pair_distance",
+    "median_errors",
     "missing_spheres",
-    "most_common_size",
     "open_parts",
     "pair_distance_bias",
     "read_parts",
@@ -84,7 +77,6 @@ __all__ = [
     "saturated_frames",
     "scan_blur",
     "slow_sampling",
-    "stated_errors",
     "step_length",
     "tracks_of",
     "unreadable_frames",

@@ -514,7 +514,9 @@ def mean_pair_distance(
     return mean, scatter / np.sqrt(spheres / 2)
 
 
-def missing_spheres(features: pd.DataFrame, *, size: int, contact: float, frames: Ints) -> Findings:
+def missing_spheres(
+    features: pd.DataFrame, *, sizes: Mapping[int, int], contact: float, frames: Ints
+) -> Findings:
     """Report the frames in which clusters have missing or additional spheres, or are missing.
 
     It is a warning if over 10 % of the spheres of the clusters are missing between their first and
@@ -524,8 +526,8 @@ def missing_spheres(features: pd.DataFrame, *, size: int, contact: float, frames
     ----------
     features : pandas.DataFrame
         As in `Bodies`.
-    size : int
-        Number of spheres of a cluster.
+    sizes : mapping
+        Number of spheres of each cluster.
     contact : float
         Centre distance of touching spheres, um.
     frames : ndarray of int
@@ -537,10 +539,11 @@ def missing_spheres(features: pd.DataFrame, *, size: int, contact: float, frames
     for cluster, rows in tracked.groupby("cluster"):
         present = rows.groupby("frame").size()
         first, last = int(present.index.min()), int(present.index.max())
-        due = int(((frames >= first) & (frames <= last)).sum())
+        due, size = int(((frames >= first) & (frames <= last)).sum()), sizes[int(cluster)]
         absent = due - len(present)
         few = present[present < size]
-        crowd = rows.groupby("frame")["together"].max().loc[lambda n: n > size]
+        near = rows.groupby("frame")["together"].max()
+        crowd = near[near > size]
         missing += size * absent + int((size - few).sum())
         expected += size * due
         parts = [
@@ -549,8 +552,7 @@ def missing_spheres(features: pd.DataFrame, *, size: int, contact: float, frames
         if absent:
             parts.append(f"none placed in {_frame_count(absent)}")
         parts += [
-            f"{n} found in {_frame_count(k)} "
-            f"(two clusters within {TOUCHING_REACH * contact:.2g} um)"
+            f"{n} found in {_frame_count(k)} (two clusters within {TOUCHING_REACH * contact:.2g} um)"
             for n, k in crowd.value_counts().sort_index().items()
         ]
         if first > frames.min():
@@ -564,7 +566,8 @@ def missing_spheres(features: pd.DataFrame, *, size: int, contact: float, frames
     shown = "; ".join(f"cluster {c}: {text}" for c, text in list(texts.items())[:_LISTED_ITEMS])
     more = f"; and {len(texts) - _LISTED_ITEMS} more" if len(texts) > _LISTED_ITEMS else ""
     text = (
-        f"{100 * missing / expected:.2g} % of the spheres are missing, {size} expected in each of "
+        f"{100 * missing / expected:.2g} % of the spheres are missing, "
+        f"{listed(sorted(set(sizes.values())))} expected in each of "
         f"{tracked['cluster'].nunique()} clusters; {shown}{more}"
     )
     return Findings((text,)) if missing > _MISSING_SHARE * expected else Findings(notes=(text,))

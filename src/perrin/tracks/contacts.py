@@ -10,7 +10,7 @@ from perrin.tracks.bonds import shared_rows
 from perrin.tracks.groups import frames_of
 
 if TYPE_CHECKING:
-    from perrin._arrays import Bools, Floats, Ints
+    from perrin._arrays import Floats, Ints
 
 # A pair that is in contact in fewer frames is not followed.
 _FEWEST_NEAR = 3
@@ -91,14 +91,14 @@ def lasting_contacts(
     -----
     A likelihood-ratio test in time (Page's sequential test). A pair in contact has a constant
     distance, measured with up to eight times the stated error, and grossly wrong in 2 % of the
-    frames (of either kind of pair). The distance of a free pair takes steps with the variance of two spheres, or up to
-    twenty-five times less where near spheres hinder each other. For free pairs the expected likelihood
-    ratio is 1 in every frame, so that it exceeds the threshold N/0.0001 anywhere among N distances
-    in 0.01 % of all movies (Ville's inequality). The contact ends where the ratio has fallen by as
-    much as it had to rise. A pair that stays within reach in all of its frames, over half of the
-    movie, is in contact unless diffusion is more likely, if most contacts of the movie are of this
-    kind: in a few frames, or where spheres move less than the error of their places, nothing else
-    is known.
+    frames (of either kind of pair). The distance of a free pair takes steps with the variance of
+    two spheres, or up to twenty-five times less where near spheres hinder each other. For free
+    pairs the expected likelihood ratio is 1 in every frame, so that it exceeds the threshold
+    N/0.0001 anywhere among N distances in 0.01 % of all movies (Ville's inequality). The contact
+    ends where the ratio has fallen by as much as it had to rise. A pair that stays within reach in
+    all of its frames, over half of the movie, is in contact unless diffusion is more likely, if
+    most contacts of the movie are of this kind: in a few frames, or where spheres move less than
+    the error of their places, nothing else is known.
 
     Examples
     --------
@@ -189,9 +189,11 @@ def _sequential_test(
         level[..., on] += log
         before[on] = now
         constant, free = level[:, :1, on], level[:, 1:, on]
-        score[on] = np.logaddexp.reduce(constant, axis=(0, 1)) - np.logaddexp.reduce(
-            free, axis=(0, 1)
-        ) + np.log(len(_HINDERED))
+        score[on] = (
+            np.logaddexp.reduce(constant, axis=(0, 1))
+            - np.logaddexp.reduce(free, axis=(0, 1))
+            + np.log(len(_HINDERED))
+        )
         best[on] = np.maximum(best[on], score[on])
         holds = on[score[on] >= best[on] - _INSIGNIFICANT]
         last[holds] = time[begin[holds] + k]

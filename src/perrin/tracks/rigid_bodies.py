@@ -11,6 +11,7 @@ from perrin.motion.tracking import track_rotation
 from perrin.tracks.clusters import particles_and_pieces
 from perrin.tracks.contacts import Contacts, lasting_contacts
 from perrin.tracks.groups import TOUCHING_REACH, connected_groups
+from perrin.tracks.linking import Centers, stage_path, step_variance
 from perrin.tracks.sphere_tracks import link_spheres
 
 if TYPE_CHECKING:
@@ -202,7 +203,8 @@ def rigid_bodies(
     the most certain first, if bonds between them hold in 80 % of the frames that show both and the
     distances between them stay constant: two bodies that stick together for a while remain two,
     and a sphere that rolls on a body is none of its spheres. A body that ends, and one of
-    as many spheres that begins near its last place within ten frames, are one.
+    as many spheres that begins near its last place within ten frames, are one. Jumps of the stage
+    are subtracted before (`stage_path`).
 
     Examples
     --------
@@ -212,7 +214,9 @@ def rigid_bodies(
     >>> found.body[[0, 40, 80]].tolist(), found.size.tolist()
     ([0, 0, -1], [2])
     """
-    track, variance = link_spheres(frame, x)
+    variance = step_variance(Centers(frame, x, np.zeros(len(x))))
+    x = x - stage_path(Centers(frame, x, np.zeros(len(x))), variance)
+    track = link_spheres(frame, x, variance=variance)
     reach = TOUCHING_REACH * contact
     contacts = lasting_contacts(frame, track, x, reach=reach, variance=variance, error=error)
     body = np.full(len(x), -1, dtype=np.int64)

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from perrin.tracks.groups import connected_groups, frames_of
-from perrin.tracks.linking import Centers, step_variance
 
 if TYPE_CHECKING:
     from perrin._arrays import Floats, Ints
@@ -17,7 +16,7 @@ if TYPE_CHECKING:
 _SPHERE_GATE, _FRAMES_BRIDGED = 36.0, 5
 
 
-def link_spheres(frame: Ints, x: Floats) -> tuple[Ints, float]:
+def link_spheres(frame: Ints, x: Floats, *, variance: float) -> Ints:
     """Follow single spheres through time by least squares.
 
     Parameters
@@ -26,14 +25,13 @@ def link_spheres(frame: Ints, x: Floats) -> tuple[Ints, float]:
         Frame number of each detection.
     x : ndarray, shape (N, d)
         Coordinates of each detection, um; no NaN.
+    variance : float
+        Variance of one coordinate of a sphere's step over one frame, um^2 (`step_variance`).
 
     Returns
     -------
-    track : ndarray of int64, shape (N,)
+    ndarray of int64, shape (N,)
         Track of each detection, numbered from 0.
-    variance : float
-        Variance of one coordinate of a sphere's step over one frame, um^2, noise included; inf
-        where no two frames hold a sphere.
 
     Notes
     -----
@@ -45,10 +43,9 @@ def link_spheres(frame: Ints, x: Floats) -> tuple[Ints, float]:
     Examples
     --------
     >>> x = np.array([[0.0], [5.0], [5.1], [0.1], [0.2]])
-    >>> link_spheres(np.array([0, 0, 1, 1, 3]), x)[0]
+    >>> link_spheres(np.array([0, 0, 1, 1, 3]), x, variance=0.01)
     array([0, 1, 1, 0, 0])
     """
-    variance = step_variance(Centers(frame, x, np.zeros(len(x))))
     track = np.full(len(x), -1, dtype=np.int64)
     active = np.empty(0, dtype=np.int64)
     count = 0
@@ -61,7 +58,7 @@ def link_spheres(frame: Ints, x: Floats) -> tuple[Ints, float]:
         track[fresh] = count + np.arange(fresh.size)
         count += fresh.size
         active = np.concatenate([np.setdiff1d(active, old), rows])
-    return track, variance
+    return track
 
 
 def _least_square_links(
