@@ -14,6 +14,7 @@ import numpy as np
 
 from perrin._text import listed
 from perrin.geometry.shapes import pair_distances
+from perrin.run.kinds import part_of
 from perrin.tracks.groups import TOUCHING_REACH
 
 if TYPE_CHECKING:
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
     from perrin._arrays import Floats, Ints
     from perrin.diffusion.estimate import DiffusionEstimate
     from perrin.motion.rigid_motion import RigidMotion
-    from perrin.run.results import ClusterResult
+    from perrin.run.results import BodyKind, ClusterResult
 
 
 _LISTED_ITEMS = 10  # largest number of frames or clusters that a message lists
@@ -552,7 +553,8 @@ def missing_spheres(
         if absent:
             parts.append(f"none placed in {_frame_count(absent)}")
         parts += [
-            f"{n} found in {_frame_count(k)} (two clusters within {TOUCHING_REACH * contact:.2g} um)"
+            f"{n} found in {_frame_count(k)} "
+            f"(two clusters within {TOUCHING_REACH * contact:.2g} um)"
             for n, k in crowd.value_counts().sort_index().items()
         ]
         if first > frames.min():
@@ -609,6 +611,38 @@ def clusters_near_border(
             f"centre within d/2 + 2 sigma ({margin:.2g} um) of the border, "
             f"{f'cluster {name} ' if name else ''}{text}"
             for name, text in combined_verdicts(verdicts).items()
+        )
+    )
+
+
+def partial_bodies(results: Sequence[ClusterResult], kinds: Sequence[BodyKind]) -> Findings:
+    """Note the kinds of clusters that have the shape of a part of a larger kind.
+
+    Parameters
+    ----------
+    results : sequence of ClusterResult
+    kinds : sequence of BodyKind
+        Kinds of the results.
+    """
+    templates = {r.cluster: r.motion.template for r in results}
+    known = [kind for kind in kinds if kind.clusters[0] in templates]
+    texts = []
+    for kind in known:
+        shape = templates[kind.clusters[0]]
+        larger = [one for one in known if part_of(shape, templates[one.clusters[0]])]
+        if larger:
+            many = "s" if len(kind.clusters) > 1 else ""
+            texts.append(
+                f"cluster{many} {listed(kind.clusters)} ({kind.name}) in those of "
+                f"{' or '.join(one.name for one in larger)}"
+            )
+    if not texts:
+        return _NOTHING
+    return Findings(
+        notes=(
+            f"clusters with the shape of a part of larger ones: {'; '.join(texts)}; a sphere of "
+            "them may be undyed, dim or out of view, or they are smaller clusters: they are "
+            "measured with the spheres that are seen, and not pooled with the others",
         )
     )
 

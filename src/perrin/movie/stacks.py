@@ -450,7 +450,7 @@ def _with_checks(
         height=imaging.voxel[0],
         diameter=imaging.diameter,
     )
-    found += of_several
+    found += of_several + checks.partial_bodies(report.clusters, report.kinds)
     return replace(
         report,
         clusters=clusters,

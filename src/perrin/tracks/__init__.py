@@ -64,7 +64,7 @@ from perrin.tracks.screening import (
     rounding_chances,
     screen_rows,
 )
-from perrin.tracks.sphere_tracks import link_spheres
+from perrin.tracks.sphere_tracks import link_spheres, track_variances
 from perrin.tracks.writing import write_json, written_whole
 
 __all__ = [
@@ -149,6 +149,7 @@ __all__ = [
     "table_bytes",
     "table_suffix",
     "touching_groups",
+    "track_variances",
     "unit_faults",
     "write_json",
     "write_tracks",

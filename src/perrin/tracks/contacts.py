@@ -65,7 +65,7 @@ def lasting_contacts(
     x: Floats,
     *,
     reach: float,
-    variance: float,
+    variance: Floats,
     error: float | None = None,
 ) -> Contacts:
     """Find the contacts of spheres that last longer than diffusion allows.
@@ -78,8 +78,8 @@ def lasting_contacts(
         Coordinates of each detection, um; no NaN.
     reach : float
         Spheres nearer than this are in contact, um.
-    variance : float
-        Variance of one coordinate of a sphere's step over one frame, um^2.
+    variance : ndarray
+        Variance of one coordinate of the step over one frame of each track, um^2, by its number.
     error : float, optional
         Stated standard error of one coordinate, um.
 
@@ -92,7 +92,7 @@ def lasting_contacts(
     A likelihood-ratio test in time (Page's sequential test). A pair in contact has a constant
     distance, measured with up to eight times the stated error, and grossly wrong in 2 % of the
     frames (of either kind of pair). The distance of a free pair takes steps with the variance of
-    two spheres, or up to twenty-five times less where near spheres hinder each other. For free
+    the two spheres, or up to twenty-five times less where near spheres hinder each other. For free
     pairs the expected likelihood ratio is 1 in every frame, so that it exceeds the threshold
     N/0.0001 anywhere among N distances in 0.01 % of all movies (Ville's inequality). The contact
     ends where the ratio has fallen by as much as it had to rise. A pair that stays within reach in
@@ -105,7 +105,7 @@ def lasting_contacts(
     >>> steps = 0.3 * np.random.default_rng(1).normal(size=(40, 1))
     >>> one = np.concatenate([steps.cumsum(axis=0), steps.cumsum(axis=0) + 1.0])
     >>> frame, track = np.tile(np.arange(40), 2), np.repeat([0, 1], 40)
-    >>> found = lasting_contacts(frame, track, one, reach=1.3, variance=0.09)
+    >>> found = lasting_contacts(frame, track, one, reach=1.3, variance=np.full(2, 0.09))
     >>> found.first.tolist(), found.last.tolist()
     ([0], [39])
     """
@@ -120,11 +120,16 @@ def lasting_contacts(
     distance = np.linalg.norm(x[one] - x[two], axis=1)
     if error:
         errors = np.sqrt(2) * error * np.array(_ERROR_FACTORS)
-        variance = max(variance - 2 * error**2, _LEAST_STEP_SHARE * variance)
+        variance = np.maximum(variance - 2 * error**2, _LEAST_STEP_SHARE * variance)
     else:
         errors = reach * np.array(_ERROR_SHARES)
     index, start, stop, score = _sequential_test(
-        pair, time[one], distance, errors, steps=2 * variance, reach=reach
+        pair,
+        time[one],
+        distance,
+        errors,
+        steps=variance[first] + variance[second],
+        reach=reach,
     )
     begin = frame.min()
     return Contacts(first[index], second[index], begin + start, begin + stop, score)
@@ -146,7 +151,7 @@ def _near_pairs(number: Ints, code: Ints, x: Floats, *, reach: float) -> tuple[I
 
 
 def _sequential_test(
-    pair: Ints, time: Ints, distance: Floats, errors: Floats, *, steps: float, reach: float
+    pair: Ints, time: Ints, distance: Floats, errors: Floats, *, steps: Floats, reach: float
 ) -> tuple[Ints, Ints, Ints, Floats]:
     """Return pair, first and last time, and score of every stretch of constant distance.
 
@@ -175,7 +180,7 @@ def _sequential_test(
     for k in range(1, int(length.max())):
         on = np.flatnonzero(length > k)
         now, value = time[begin[on] + k], distance[begin[on] + k]
-        predicted = spread[..., on] + step * (now - before[on])
+        predicted = spread[..., on] + step[..., on] * (now - before[on])
         total = predicted + noise
         off = value - mean[..., on]
         log = -0.5 * (np.log(2 * np.pi * total) + off**2 / total)

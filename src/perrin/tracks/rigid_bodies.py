@@ -12,7 +12,7 @@ from perrin.tracks.clusters import particles_and_pieces
 from perrin.tracks.contacts import Contacts, lasting_contacts
 from perrin.tracks.groups import TOUCHING_REACH, connected_groups
 from perrin.tracks.linking import Centers, stage_path, step_variance
-from perrin.tracks.sphere_tracks import link_spheres
+from perrin.tracks.sphere_tracks import link_spheres, track_variances
 
 if TYPE_CHECKING:
     from perrin._arrays import Bools, Floats, Ints
@@ -32,6 +32,9 @@ _FOUND_AGAIN = 0.25
 
 # A body has the number of spheres that this share of its frames reach.
 _FULL_SHARE = 0.05
+
+# A step of up to half of the contact distance is unmistakable: no other sphere is as near.
+_SURE_STEP = 0.5
 
 # A body that ends is the one that begins within six standard deviations of a sphere's step
 # (squared), within this number of frames.
@@ -216,9 +219,11 @@ def rigid_bodies(
     """
     variance = step_variance(Centers(frame, x, np.zeros(len(x))))
     x = x - stage_path(Centers(frame, x, np.zeros(len(x))), variance)
+    # Beside spheres at rest, which may be the most, the others move far.
+    variance = max(variance, (_SURE_STEP * contact) ** 2 / _BODY_GATE)
     track = link_spheres(frame, x, variance=variance)
-    reach = TOUCHING_REACH * contact
-    contacts = lasting_contacts(frame, track, x, reach=reach, variance=variance, error=error)
+    reach, own = TOUCHING_REACH * contact, track_variances(frame, track, x)
+    contacts = lasting_contacts(frame, track, x, reach=reach, variance=own, error=error)
     body = np.full(len(x), -1, dtype=np.int64)
     if not contacts.one.size:
         return RigidBodies(body, np.empty(0, dtype=np.int64), track)

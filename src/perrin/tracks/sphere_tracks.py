@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from perrin.motion.residuals import median_chi2
 from perrin.tracks.groups import connected_groups, frames_of
 
 if TYPE_CHECKING:
@@ -14,6 +15,10 @@ if TYPE_CHECKING:
 # A sphere is searched for within six standard deviations (squared: the gate), for this number of
 # frames after it was last seen.
 _SPHERE_GATE, _FRAMES_BRIDGED = 36.0, 5
+
+# A track of fewer steps has no variance of its own. Spheres at rest among others in motion are taken
+# to make steps of at least this share of the usual variance: those that touch are a body.
+_FEWEST_STEPS, _LEAST_SHARE = 5, 0.05
 
 
 def link_spheres(frame: Ints, x: Floats, *, variance: float) -> Ints:
@@ -59,6 +64,44 @@ def link_spheres(frame: Ints, x: Floats, *, variance: float) -> Ints:
         count += fresh.size
         active = np.concatenate([np.setdiff1d(active, old), rows])
     return track
+
+
+def track_variances(frame: Ints, track: Ints, x: Floats) -> Floats:
+    """Return the variance of one coordinate of the steps of each track, from the median step.
+
+    Parameters
+    ----------
+    frame, track : ndarray of int, shape (N,)
+        Frame and track of each detection.
+    x : ndarray, shape (N, d)
+        Coordinates of each detection, um.
+
+    Returns
+    -------
+    ndarray
+        Variance for a step of one frame, um^2, by the number of the track; a track of few steps
+        has the median of all steps, and no variance is under a twentieth of that.
+
+    Examples
+    --------
+    >>> x = np.random.default_rng(0).normal(size=(4000, 3)).cumsum(axis=0)
+    >>> track_variances(np.arange(4000), np.zeros(4000, int), x).round(1)
+    array([1.])
+    """
+    order = np.lexsort((frame, track))
+    same = np.diff(track[order]) == 0
+    gap = np.diff(frame[order])[same]
+    square = (np.diff(x[order], axis=0)[same] ** 2).sum(axis=1) / gap
+    owner = track[order][1:][same]
+    steps = np.bincount(owner, minlength=int(track.max(initial=-1)) + 1)
+    if not square.size:
+        return np.zeros(len(steps))
+    ranked = np.lexsort((square, owner))
+    middle = np.cumsum(steps) - steps + steps // 2
+    own = square[ranked[np.minimum(middle, len(ranked) - 1)]]
+    usual = float(np.median(square))
+    own = np.where(steps < _FEWEST_STEPS, usual, np.maximum(own, _LEAST_SHARE * usual))
+    return own / median_chi2(x.shape[1])
 
 
 def _least_square_links(
