@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 _SAME_SHAPE = 0.15
 
 
-def shape_numbers(templates: Sequence[Floats]) -> Ints:
+def shape_numbers(templates: Sequence[Floats], *, rigid: Sequence[bool] | None = None) -> Ints:
     """Return the number of the shape of each body: by particles, then by the first of each shape.
 
     Mirror images, which diffuse alike, have one number.
@@ -28,6 +28,9 @@ def shape_numbers(templates: Sequence[Floats]) -> Ints:
     ----------
     templates : sequence of ndarray, shape (n, d)
         Positions of the particles of each body, um.
+    rigid : sequence of bool, optional
+        Which bodies are rigid; default all. The others count to the most similar shape of as many
+        particles, whatever the difference.
 
     Returns
     -------
@@ -41,19 +44,20 @@ def shape_numbers(templates: Sequence[Floats]) -> Ints:
     array([1, 0, 1])
     """
     distances = [np.sort(pair_distances(template)) for template in templates]
+    firm = [True] * len(templates) if rigid is None else list(rigid)
     kinds: list[int] = []  # the first body of each shape
     kind_of = np.zeros(len(templates), dtype=np.int64)
-    for b, distance in enumerate(distances):
+    for b in sorted(range(len(templates)), key=lambda b: not firm[b]):
+        distance, best = distances[b], (np.inf, -1)
         for number, first in enumerate(kinds):
             other = distances[first]
             if len(other) == len(distance):
-                off = np.abs(distance - other).max()
-                if off < _SAME_SHAPE * min(distance[0], other[0]):
-                    kind_of[b] = number
-                    break
-        else:
-            kind_of[b] = len(kinds)
+                off = float(np.abs(distance - other).max() / min(distance[0], other[0]))
+                best = min(best, (off, number))
+        if best[1] < 0 or (firm[b] and best[0] >= _SAME_SHAPE):
+            best = 0.0, len(kinds)
             kinds.append(b)
+        kind_of[b] = best[1]
     order = np.argsort([len(templates[first]) for first in kinds], kind="stable")
     rank = np.empty(len(kinds), dtype=np.int64)
     rank[order] = np.arange(len(kinds))

@@ -691,7 +691,10 @@ def measure_kinds(
     warnings : list of str
         As in `pool_clusters`; where there are several kinds, with the kind.
     """
-    shapes = shape_numbers([one.body.motion.template for one in measured])
+    shapes = shape_numbers(
+        [one.body.motion.template for one in measured],
+        rigid=[one.body.quality.rigid for one in measured],
+    )
     lines = shape_numbers([np.outer(rod.motion.places, [0.0, 0.0, 1.0]) for rod in rods])
     judged: list[MeasuredBody] = []
     kinds: list[BodyKind] = []
