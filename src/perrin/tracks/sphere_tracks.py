@@ -16,9 +16,7 @@ if TYPE_CHECKING:
 # frames after it was last seen.
 _SPHERE_GATE, _FRAMES_BRIDGED = 36.0, 5
 
-# A track of fewer steps has no variance of its own. Spheres at rest among others in motion are taken
-# to make steps of at least this share of the usual variance: those that touch are a body.
-_FEWEST_STEPS, _LEAST_SHARE = 5, 0.05
+_FEWEST_STEPS = 5  # of a track with a variance of its own
 
 
 def link_spheres(frame: Ints, x: Floats, *, variance: float) -> Ints:
@@ -67,7 +65,7 @@ def link_spheres(frame: Ints, x: Floats, *, variance: float) -> Ints:
 
 
 def track_variances(frame: Ints, track: Ints, x: Floats) -> Floats:
-    """Return the variance of one coordinate of the steps of each track, from the median step.
+    """Return the variance of one coordinate of the free steps of each track, from median steps.
 
     Parameters
     ----------
@@ -79,8 +77,9 @@ def track_variances(frame: Ints, track: Ints, x: Floats) -> Floats:
     Returns
     -------
     ndarray
-        Variance for a step of one frame, um^2, by the number of the track; a track of few steps
-        has the median of all steps, and no variance is under a twentieth of that.
+        Variance for a step of one frame, um^2, by the number of the track. It is at least that of
+        the median step of all tracks: spheres that stay at rest together among others in motion
+        are a body.
 
     Examples
     --------
@@ -100,7 +99,7 @@ def track_variances(frame: Ints, track: Ints, x: Floats) -> Floats:
     middle = np.cumsum(steps) - steps + steps // 2
     own = square[ranked[np.minimum(middle, len(ranked) - 1)]]
     usual = float(np.median(square))
-    own = np.where(steps < _FEWEST_STEPS, usual, np.maximum(own, _LEAST_SHARE * usual))
+    own = np.where(steps < _FEWEST_STEPS, usual, np.maximum(own, usual))
     return own / median_chi2(x.shape[1])
 
 
