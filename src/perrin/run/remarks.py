@@ -910,6 +910,12 @@ def is_noise_floor(text: str) -> bool:
 
 # Sizes, predictions and pooled values.
 
+NO_BODY = (
+    "no spheres keep together longer than diffusion over a contact allows (if there are clusters: "
+    "correct contact, the voxel size or the diameter, or take frames faster)"
+)
+FREE_SPHERES = "these are free spheres, of which only D_T is reported"
+
 
 def no_prediction_warning(wanted: str, reason: str) -> str:
     """State why sizes or a prediction cannot be computed for a shape."""
