@@ -140,11 +140,9 @@ from perrin.diffusion.switching import (
 )
 from perrin.diffusion.tensor_likelihood import (
     ArrowHessian,
-    DiagonalModes,
     Maximum,
     NoisyVectors,
     PooledLikelihood,
-    TensorSlopes,
     axial,
     band_factor,
     bfgs_update,
@@ -153,6 +151,7 @@ from perrin.diffusion.tensor_likelihood import (
     squares,
     symmetric_inverses,
 )
+from perrin.diffusion.tensor_modes import DiagonalModes, EvenTracks, TensorSlopes, covariance_slopes
 from perrin.diffusion.tensor_results import CoupledTensor, DiffusionTensor
 from perrin.diffusion.tensors import (
     ScaledTracks,
@@ -185,6 +184,7 @@ __all__ = [
     "DiagonalModes",
     "DiffusionEstimate",
     "DiffusionTensor",
+    "EvenTracks",
     "Found",
     "GridLags",
     "GroupSlopes",
@@ -243,6 +243,7 @@ __all__ = [
     "coupled_tensor",
     "covariance_bands",
     "covariance_estimate",
+    "covariance_slopes",
     "cramer_rao",
     "curve_covariance",
     "cut_at",

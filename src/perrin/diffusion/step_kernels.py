@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
+
+from perrin._arrays import frozen
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -18,6 +20,7 @@ if TYPE_CHECKING:
 LEAST_EIGENVALUE = 1e-100
 
 
+@lru_cache(maxsize=8)
 def difference_eigenvalues(n_steps: int) -> Floats:
     """Return 1 - cos(k pi/(N + 1)) for k = 1..N, the noise of N even steps by sine mode.
 
@@ -30,7 +33,9 @@ def difference_eigenvalues(n_steps: int) -> Floats:
     >>> difference_eigenvalues(2)
     array([0.5, 1.5])
     """
-    return np.asarray(1 - np.cos(np.pi * np.arange(1, n_steps + 1) / (n_steps + 1)))
+    values = np.asarray(1 - np.cos(np.pi * np.arange(1, n_steps + 1) / (n_steps + 1)))
+    frozen(values)
+    return values
 
 
 class GroupSlopes(NamedTuple):

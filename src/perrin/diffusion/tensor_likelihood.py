@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from perrin.diffusion.step_kernels import difference_eigenvalues
+from perrin.diffusion.tensor_modes import EvenTracks, TensorSlopes, covariance_slopes
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -34,61 +34,6 @@ _CONVERGED_GAIN, _ROUNDING_GAIN = 1e-17, 1e-9
 
 # Step of numerical derivatives, in scaled units where all parameters are of order 1.
 _DIFFERENCE_STEP = 1e-5
-
-
-class TensorSlopes(NamedTuple):
-    """Log-likelihoods at P points, and their derivatives.
-
-    Attributes
-    ----------
-    value : ndarray, shape (P,)
-        Log-likelihood; -inf, without slopes, where a covariance is not positive definite.
-    D : ndarray, shape (P, b, b)
-        Slopes in D.
-    theta : ndarray, shape (P, r)
-        Slopes in the noise amplitudes.
-    B : ndarray, shape (P,)
-        Slope in B.
-    noise : ndarray, shape (P, b, b)
-        Slopes in a noise O that is added to that of every frame.
-    """
-
-    value: Floats
-    D: Floats
-    theta: Floats
-    B: Floats
-    noise: Floats
-
-    @classmethod
-    def undefined(cls, D: Floats, theta: Floats) -> TensorSlopes:
-        """Return -inf without slopes at all of these points."""
-        none = np.full(len(D), np.nan)
-        least = np.full(len(D), -np.inf)
-        lost = np.full_like(D, np.nan)
-        return cls(least, lost, np.full_like(theta, np.nan), none, lost)
-
-
-class DiagonalModes(NamedTuple):
-    """The sine modes of even steps at P points, in the axes that diagonalise their covariances.
-
-    Attributes
-    ----------
-    axes : ndarray, shape (P, b, b)
-        Those axes as columns, not of unit length.
-    power, inverse : ndarray, shape (P, K, b)
-        Variances of the K modes along them, and one over these.
-    values, scaled : ndarray, shape (P, K, b)
-        Modes along them, and the same over their variances.
-    log_det : ndarray, shape (P,)
-        Logarithm of the determinant of a covariance less that of its variances.
-    """
-
-    axes: Floats
-    power: Floats
-    inverse: Floats
-    values: Floats
-    scaled: Floats
-    log_det: Floats
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,21 +114,14 @@ class NoisyVectors:
         return offset
 
     @cached_property
-    def spectrum(self) -> tuple[Floats, Floats]:
-        """Sine transform of the steps, and the weight 2 (1 - cos) of the noise in every mode."""
-        from scipy.fft import dst
-
-        y = self.steps.vectors
-        return dst(y, type=1, norm="ortho", axis=0), 2 * difference_eigenvalues(len(y))
+    def even_track(self) -> EvenTracks:
+        """The steps in their sine modes, where they are even."""
+        return EvenTracks.of([self.steps])
 
     def by_tensor(self, D: Floats, theta: Floats, B: Floats) -> TensorSlopes:
         """Return the log-likelihood and its derivatives at P points; -inf where not defined."""
         if self.steps.even:
-            try:
-                return self.by_sines(D, theta, B)
-            except np.linalg.LinAlgError:
-                if len(D) == 1:
-                    return TensorSlopes.undefined(D, theta)
+            return self.by_sines(D, theta, B)
         if len(D) == 1:
             return self.by_bands(D[0], theta[0], float(B[0]))
         points = [
@@ -191,89 +129,10 @@ class NoisyVectors:
         ]
         return TensorSlopes(*(np.concatenate(rows) for rows in zip(*points, strict=True)))
 
-    def by_sines(
-        self, D: Floats, theta: Floats, B: Floats, modes: DiagonalModes | None = None
-    ) -> TensorSlopes:
-        """Evaluate even steps: mode k of the sine transform has covariance 2 D tau + w_k O.
-
-        All modes are diagonal in the axes that diagonalise D against 2 D tau + 2 O. A LinAlgError
-        is raised if that sum is not positive definite at one of the points. `modes` are those of
-        these points where they are known.
-        """
-        s, tau, (z, w) = self.steps, float(self.steps.duration[0]), self.spectrum
-        modes = self.modes(D, theta, B) if modes is None else modes
-        axes, power, inverse, q = modes.axes, modes.power, modes.inverse, modes.scaled
-        columns, back = np.swapaxes(q, 1, 2), np.swapaxes(axes, 1, 2)
-        same, next_one = columns @ q, columns @ (w[:, None] * q)
-        kept = np.arange(D.shape[1])
-        same[:, kept, kept] -= inverse.sum(axis=1)
-        next_one[:, kept, kept] -= w @ inverse
-        plain, weighted = axes @ same @ back, axes @ next_one @ back
-        log_det = np.log(power).sum(axis=(1, 2)) + len(z) * modes.log_det
-        value = -0.5 * (log_det + (modes.values * q).sum(axis=(1, 2)))
-        by_theta = 0.5 * np.einsum("jab,pab->pj", s.before[:, 0], weighted)
-        by_B = -s.dt * (weighted * D).reshape(len(D), -1).sum(axis=1)
-        by_D = tau * plain - (B * s.dt)[:, None, None] * weighted
-        found = TensorSlopes(value, by_D, by_theta, by_B, 0.5 * weighted)
-        bad = ~(power.min(axis=(1, 2)) > 0)
-        if bad.any():
-            for values, undefined in zip(found, TensorSlopes.undefined(D, theta), strict=True):
-                values[bad] = undefined[bad]
-        return found
-
-    def modes(self, D: Floats, theta: Floats, B: Floats) -> DiagonalModes:
-        """Return the sine modes of even steps in the axes that diagonalise all of them."""
-        z, w = self.spectrum
-        s, tau = self.steps, float(self.steps.duration[0])
-        noise = np.tensordot(theta, s.before[:, 0], 1) - 2 * (B * s.dt)[:, None, None] * D
-        root = np.linalg.inv(np.linalg.cholesky(2 * tau * D + 2 * noise))
-        across = np.swapaxes(root, 1, 2)
-        share, turn = np.linalg.eigh(root @ (2 * tau * D) @ across)
-        axes = across @ turn
-        power = share[:, None] + 0.5 * w[:, None] * (1 - share[:, None])
-        inverse, values = 1 / power, z @ axes
-        kept = np.arange(D.shape[1])
-        log_det = -2 * np.log(root[:, kept, kept]).sum(axis=1)
-        return DiagonalModes(axes, power, inverse, values, values * inverse, log_det)
-
-    def covariance_slopes(self, E: Floats, D: Floats, B: float) -> tuple[Floats, Floats]:
-        """Return the slopes of 2 D (m, b, b) and of the noise less blur (m + 1, b, b).
-
-        They are those along directions E (m, b, b) of D; the last one of the noise is that in B.
-        """
-        blur = -2 * self.steps.dt * np.concatenate([B * E, D[None]])
-        return 2 * E, blur
-
-    def sine_curvatures(self, E: Floats, D: Floats, B: float, modes: DiagonalModes) -> Floats:
-        """Return minus the second derivatives along E, in theta and in B, of even steps.
-
-        They are those of the covariances alone, as if these were linear. With the slopes
-        X_i = A_i + w_k N_i of mode k and its inverse covariance V, they are
-        y^T V X_i V X_j V y - tr(V X_i V X_j)/2 summed over the modes.
-        """
-        _, w = self.spectrum
-        axes, inverse, q = modes.axes[0], modes.inverse[0], modes.scaled[0]
-        of_D, of_noise = self.covariance_slopes(E, D, B)
-        shapes = self.steps.before[:, 0]
-        count, b = len(E) + len(shapes) + 1, len(D)
-        same = np.zeros((count, b, b))
-        same[: len(E)] = float(self.steps.duration[0]) * of_D
-        next_one = np.concatenate([of_noise[:-1], shapes, of_noise[-1:]])
-        same, next_one = (axes.T @ x @ axes for x in (same, next_one))
-        # Sums over the modes of q_a q_b V_c and of V_a V_c, times 1, w and w^2.
-        powers = w[:, None, None] ** np.arange(3)[:, None]
-        weights = (inverse[:, None] * powers).reshape(-1, 3 * b)
-        power = (q[:, :, None] * q[:, None]).reshape(-1, b * b).T @ weights
-        power, trace = power.reshape(b, b, 3, b), (inverse.T @ weights).reshape(b, 3, b)
-
-        def form(k: int, left: Floats, right: Floats) -> Floats:
-            turned = np.tensordot(right, power[:, :, k], axes=([2], [1]))  # (j, c, a, c')
-            turned = np.einsum("jcac->jac", turned) - 0.5 * trace[:, k] * np.swapaxes(right, 1, 2)
-            return np.asarray(left.reshape(count, -1) @ turned.reshape(count, -1).T)
-
-        mixed = form(1, same, next_one)
-        total: Floats = form(0, same, same) + mixed + mixed.T + form(2, next_one, next_one)
-        return total
+    def by_sines(self, D: Floats, theta: Floats, B: Floats) -> TensorSlopes:
+        """Evaluate even steps in their sine modes."""
+        track = self.even_track
+        return track.slopes(D, theta, B, track.diagonal(D, theta, B))
 
     def band_curvatures(self, E: Floats, D: Floats, theta: Floats, B: float) -> Floats:
         """Return the average of observed and expected information along E, in theta and in B.
@@ -289,7 +148,9 @@ class NoisyVectors:
         if not np.isfinite(log_det):
             return np.full((len(E) + len(theta) + 1,) * 2, np.nan)
         z = dpbtrs(factor, s.vectors.reshape(-1), lower=1)[0].reshape(s.vectors.shape)
-        of_D, of_noise = self.covariance_slopes(E, D, B)
+        of_D, of_noise = (
+            x[0] for x in covariance_slopes(E[None], D[None], np.array([B]), np.array([s.dt]))
+        )
         linked, none = s.linked[:-1, None], np.zeros_like(D)
 
         def product(of_D: Floats, before: Floats, after: Floats) -> Floats:
@@ -317,9 +178,10 @@ class NoisyVectors:
         theta, B = self.amplitudes(own[None])
         m, r = len(slopes), len(self.theta)
         if self.steps.even:
-            modes = self.modes(D[None], theta, B)
-            found = self.by_sines(D[None], theta, B, modes)
-            full = self.sine_curvatures(slopes, D, float(B[0]), modes)
+            track = self.even_track
+            modes = track.diagonal(D[None], theta, B)
+            found = track.slopes(D[None], theta, B, modes)
+            full = track.curvatures(slopes[None], D[None], B, modes)[0]
         else:
             found = self.by_tensor(D[None], theta, B)
             full = self.band_curvatures(slopes, D, theta[0], float(B[0]))
