@@ -14,23 +14,23 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from typing import TypeAlias
 
-    from perrin._arrays import Floats
+    from perrin._arrays import Floats, Ints
     from perrin.diffusion.steps import Steps
 
-    # D (b, b), its slopes (m, b, b) by the m parameters of a family of tensors, and second
-    # derivatives (m, m, b, b).
-    Family: TypeAlias = Callable[[Floats], tuple[Floats, Floats, Floats]]
+    # D (..., b, b), slopes (..., m, b, b) by the m parameters of a family of tensors, and second
+    # derivatives (..., m, m, b, b), of the parameters (..., m) of those motions.
+    Family: TypeAlias = Callable[..., tuple[Floats, Floats, Floats]]
 
 # The largest blur: all motion seen in the first and last instant of a frame (1/6: open shutter).
-_MOST_BLUR = 0.25
+MOST_BLUR = 0.25
 
 # Where D and noise have the same shape only noise less blur is determined; then this slope of the
 # log-likelihood selects the least blur. It changes the log-likelihood by 0.025 at most.
-_LEAST_BLUR = 0.1
+LEAST_BLUR = 0.1
 
 # A search has converged where another step would gain this much: 5e-9 standard errors. A gain below
 # the second number is hidden by rounding, and steps are accepted without it.
-_CONVERGED_GAIN, _ROUNDING_GAIN = 1e-17, 1e-9
+CONVERGED_GAIN, ROUNDING_GAIN = 1e-17, 1e-9
 
 # Step of numerical derivatives, in scaled units where all parameters are of order 1.
 _DIFFERENCE_STEP = 1e-5
@@ -81,9 +81,9 @@ class NoisyVectors:
             value = value + measured.sum(axis=1)
             out.append(2 * own[:, : len(self.theta)] * (by_theta + slope))
         if self.B is None:
-            value = value - _LEAST_BLUR * B
-            slope = _MOST_BLUR * np.sin(2 * own[:, -1:])
-            out.append((found.B - _LEAST_BLUR)[:, None] * slope)
+            value = value - LEAST_BLUR * B
+            slope = MOST_BLUR * np.sin(2 * own[:, -1:])
+            out.append((found.B - LEAST_BLUR)[:, None] * slope)
         return value, found.D, np.concatenate(out, axis=1)
 
     def amplitudes(self, own: Floats) -> tuple[Floats, Floats]:
@@ -92,7 +92,7 @@ class NoisyVectors:
         theta = own[:, : len(self.theta)] ** 2 if free else np.tile(self.theta, (len(own), 1))
         B = np.full(len(own), self.B or 0.0)
         if self.B is None:
-            B = np.array([_MOST_BLUR * float(one) ** 2 for one in np.sin(own[:, -1])])
+            B = np.array([MOST_BLUR * float(one) ** 2 for one in np.sin(own[:, -1])])
         return theta, B
 
     def measurement(self, theta: Floats) -> tuple[Floats, Floats, Floats]:
@@ -132,7 +132,7 @@ class NoisyVectors:
     def by_sines(self, D: Floats, theta: Floats, B: Floats) -> TensorSlopes:
         """Evaluate even steps in their sine modes."""
         track = self.even_track
-        return track.slopes(D, theta, B, track.diagonal(D, theta, B))
+        return track.slopes(D, B, track.diagonal(D, theta, B))
 
     def band_curvatures(self, E: Floats, D: Floats, theta: Floats, B: float) -> Floats:
         """Return the average of observed and expected information along E, in theta and in B.
@@ -180,7 +180,7 @@ class NoisyVectors:
         if self.steps.even:
             track = self.even_track
             modes = track.diagonal(D[None], theta, B)
-            found = track.slopes(D[None], theta, B, modes)
+            found = track.slopes(D[None], B, modes)
             full = track.curvatures(slopes[None], D[None], B, modes)[0]
         else:
             found = self.by_tensor(D[None], theta, B)
@@ -200,13 +200,13 @@ class NoisyVectors:
             turn[m : m + r] = 2 * own[:r]
         if self.B is None:
             kept.append(m + r)
-            turn[-1] = _MOST_BLUR * np.sin(2 * own[-1])
+            turn[-1] = MOST_BLUR * np.sin(2 * own[-1])
         full *= turn[:, None] * turn
         if np.isfinite(self.freedom):
             full[amplitudes, amplitudes] -= 2 * by_theta
         if self.B is None:
-            twice = 2 * _MOST_BLUR * np.cos(2 * own[-1])
-            full[-1, -1] -= (found.B[0] - _LEAST_BLUR) * twice
+            twice = 2 * MOST_BLUR * np.cos(2 * own[-1])
+            full[-1, -1] -= (found.B[0] - LEAST_BLUR) * twice
         return np.asarray(full[np.ix_(kept, kept)])
 
     def by_bands(self, D: Floats, theta: Floats, B: float) -> TensorSlopes:
@@ -297,7 +297,7 @@ def squares(basis: Floats) -> Family:
     """Return the family D = L^2 with L = sum q_j E_j: all tensors >= 0 that share a symmetry.
 
     The basis (m, b, b) spans the symmetric matrices that are invariant under the symmetry; with L
-    also L^2 is invariant.
+    also L^2 is invariant. A basis (P, m, b, b) has one for each of P motions.
 
     Examples
     --------
@@ -305,13 +305,15 @@ def squares(basis: Floats) -> Family:
     >>> D.diagonal(), slopes[0].diagonal()
     (array([4., 4., 4.]), array([4., 4., 4.]))
     """
-    products = basis[:, None] @ basis
-    bends = products + np.swapaxes(products, 0, 1)
+    products = basis[..., :, None, :, :] @ basis[..., None, :, :, :]
+    bends = products + np.swapaxes(products, -4, -3)
 
-    def family(q: Floats) -> tuple[Floats, Floats, Floats]:
-        root: Floats = np.tensordot(q, basis, 1)
-        slope = basis @ root
-        return root @ root, slope + np.swapaxes(slope, 1, 2), bends
+    def family(q: Floats, rows: Ints | None = None) -> tuple[Floats, Floats, Floats]:
+        some, bent = (x[rows] if x.ndim > k else x for x, k in ((basis, 3), (bends, 4)))
+        root = np.sum(q[..., None, None] * some, axis=-3)
+        slope = some @ root[..., None, :, :]
+        bent = np.broadcast_to(bent, (*q.shape[:-1], *bent.shape[-4:]))
+        return root @ root, slope + np.swapaxes(slope, -1, -2), bent
 
     return family
 
@@ -319,7 +321,8 @@ def squares(basis: Floats) -> Family:
 def axial(axis: Floats) -> Family:
     """Return the tensors a^2 across and c^2 along an axis that may tilt away from this one.
 
-    The parameters are a, c and the tilt along the two directions across.
+    The parameters are a, c and the tilt along the two directions across. Axes (P, 3) are those of P
+    motions.
 
     Examples
     --------
@@ -327,30 +330,38 @@ def axial(axis: Floats) -> Family:
     >>> D.diagonal(), slopes.shape
     (array([1., 1., 4.]), (4, 3, 3))
     """
-    across = np.linalg.svd(axis[None])[2][1:]
-
+    sideways = np.linalg.svd(axis[..., None, :])[2][..., 1:, :]
     eye = np.eye(3)
 
-    def family(q: Floats) -> tuple[Floats, Floats, Floats]:
-        v = axis + q[2:] @ across
-        length = float(np.linalg.norm(v))
-        u = v / length
-        along = np.outer(u, u)
-        share = across @ u
-        tilt = (across - np.outer(share, u)) / length  # slopes of u
-        turned = np.einsum("ka,b->kab", tilt, u)
-        turned += np.swapaxes(turned, 1, 2)  # slopes of u u^T
-        second = np.einsum("l,ka->kla", share, tilt) + np.einsum("k,la->kla", share, tilt)
-        second = -(second + (tilt @ across.T)[..., None] * u) / length  # second derivatives of u
-        twice = np.einsum("kla,b->klab", second, u) + np.einsum("ka,lb->klab", tilt, tilt)
-        span = q[1] ** 2 - q[0] ** 2
-        slopes = np.concatenate([[2 * q[0] * (eye - along), 2 * q[1] * along], span * turned])
-        bends = np.zeros((4, 4, 3, 3))
-        bends[0, 0], bends[1, 1] = 2 * (eye - along), 2 * along
-        bends[0, 2:], bends[1, 2:] = -2 * q[0] * turned, 2 * q[1] * turned
-        bends[2:, 0], bends[2:, 1] = bends[0, 2:], bends[1, 2:]
-        bends[2:, 2:] = span * (twice + np.swapaxes(twice, 2, 3))
-        return q[0] ** 2 * eye + span * along, slopes, bends
+    def family(q: Floats, rows: Ints | None = None) -> tuple[Floats, Floats, Floats]:
+        first, across = (x[rows] if axis.ndim > 1 else x for x in (axis, sideways))
+        v = first + np.sum(q[..., 2:, None] * across, axis=-2)
+        length = np.linalg.norm(v, axis=-1)[..., None, None]
+        u = v / length[..., 0]
+        along = u[..., :, None] * u[..., None, :]
+        share = np.sum(across * u[..., None, :], axis=-1)
+        tilt = (across - share[..., None] * u[..., None, :]) / length  # slopes of u
+        turned = tilt[..., None] * u[..., None, None, :]
+        turned = turned + np.swapaxes(turned, -1, -2)  # slopes of u u^T
+        # Second derivatives of u, and of u u^T.
+        second = share[..., None, :, None] * tilt[..., :, None, :]
+        second = second + np.swapaxes(second, -3, -2)
+        second += (tilt @ np.swapaxes(across, -1, -2))[..., None] * u[..., None, None, :]
+        second /= -length[..., None]
+        twice = second[..., None] * u[..., None, None, None, :]
+        twice = twice + tilt[..., :, None, :, None] * tilt[..., None, :, None, :]
+        a, c = (q[..., k, None, None] for k in (0, 1))
+        span = (c**2 - a**2)[..., None, :, :]
+        slopes = np.empty((*q.shape, 3, 3))
+        slopes[..., 0, :, :], slopes[..., 1, :, :] = 2 * a * (eye - along), 2 * c * along
+        slopes[..., 2:, :, :] = span * turned
+        bends = np.zeros((*q.shape, 4, 3, 3))
+        bends[..., 0, 0, :, :], bends[..., 1, 1, :, :] = 2 * (eye - along), 2 * along
+        mixed = -2 * a[..., None, :, :] * turned, 2 * c[..., None, :, :] * turned
+        for k, one in enumerate(mixed):
+            bends[..., k, 2:, :, :] = bends[..., 2:, k, :, :] = one
+        bends[..., 2:, 2:, :, :] = span[..., None] * (twice + np.swapaxes(twice, -1, -2))
+        return a**2 * eye + span[..., 0, :, :] * along, slopes, bends
 
     return family
 
@@ -399,7 +410,7 @@ def maximise(tracks: Sequence[NoisyVectors], family: Family, q: Floats, own: Flo
         for _ in range(30):
             step = inverse @ slope
             gain = 0.5 * float(slope @ step)
-            if gain <= _CONVERGED_GAIN:
+            if gain <= CONVERGED_GAIN:
                 return Maximum(value, *problem.tensor_and_noise(p))
             trial = problem.line_search(p, value, step, gain)
             if trial is None:
@@ -407,7 +418,7 @@ def maximise(tracks: Sequence[NoisyVectors], family: Family, q: Floats, own: Flo
             new, new_value, new_slope = trial
             inverse = bfgs_update(inverse, new - p, slope - new_slope)
             p, value, slope = new, new_value, new_slope
-    if gain <= _ROUNDING_GAIN:
+    if gain <= ROUNDING_GAIN:
         return Maximum(value, *problem.tensor_and_noise(p))
     raise ValueError(
         f"the likelihood of these {sum(len(t.steps.vectors) for t in tracks)} steps has no maximum "
@@ -498,7 +509,7 @@ class PooledLikelihood:
         for part in 0.4 ** np.arange(16):
             new_value, slope = self.slopes(p + part * step)
             rises = new_value > value + 1e-3 * part * gain
-            if rises or (gain <= _ROUNDING_GAIN and np.isfinite(new_value)):
+            if rises or (gain <= ROUNDING_GAIN and np.isfinite(new_value)):
                 return p + part * step, new_value, slope
         return None
 
@@ -549,9 +560,9 @@ class ArrowHessian:
     def inverse(self) -> Floats:
         """Return the inverse (m + Gc, m + Gc), its negative curvatures turned positive."""
         count, m, c = self.mixed.shape
-        own = _positive_inverse(self.own)
+        own = positive_inverse(self.own)
         lever = self.mixed @ own
-        shared = _positive_inverse(self.shared - np.einsum("gmc,gnc->mn", lever, self.mixed))
+        shared = positive_inverse(self.shared - np.einsum("gmc,gnc->mn", lever, self.mixed))
         tail = -np.swapaxes(lever, 1, 2).reshape(count * c, m)
         inverse = np.empty((m + count * c,) * 2)
         inverse[:m, :m] = shared
@@ -570,7 +581,7 @@ class ArrowHessian:
         return information
 
 
-def _positive_inverse(a: Floats) -> Floats:
+def positive_inverse(a: Floats) -> Floats:
     """Return the inverse of symmetric matrices (..., c, c) with the sizes of their eigenvalues."""
     values, vectors = np.linalg.eigh(a)
     size = np.abs(values)
@@ -580,9 +591,9 @@ def _positive_inverse(a: Floats) -> Floats:
 
 
 def bfgs_update(inverse: Floats, step: Floats, fall: Floats) -> Floats:
-    """Return the BFGS update of an inverse Hessian; unchanged where the curvature is not positive.
+    """Return the BFGS update of inverse Hessians; unchanged where the curvature is not positive.
 
-    `fall` is the fall of the slopes along the step.
+    `fall` (..., n) is the fall of the slopes along the step (..., n).
 
     Examples
     --------
@@ -590,10 +601,13 @@ def bfgs_update(inverse: Floats, step: Floats, fall: Floats) -> Floats:
     array([[0.25, 0.  ],
            [0.  , 1.  ]])
     """
-    along = float(step @ fall)
-    if not along > 1e-14 * float(np.linalg.norm(step) * np.linalg.norm(fall)):
-        return inverse
-    pull = inverse @ fall
-    cross = np.outer(pull, step)
-    new: Floats = inverse - (cross + cross.T) / along
-    return new + np.outer(step, step) * ((1 + fall @ pull / along) / along)
+    along = np.sum(step * fall, axis=-1)
+    size = np.sqrt(np.sum(step**2, axis=-1) * np.sum(fall**2, axis=-1))
+    curved = along > 1e-14 * size
+    along = np.where(curved, along, 1.0)[..., None, None]
+    pull = (inverse @ fall[..., None])[..., 0]
+    cross = pull[..., :, None] * step[..., None, :]
+    new = inverse - (cross + np.swapaxes(cross, -1, -2)) / along
+    rise = np.sum(fall * pull, axis=-1)[..., None, None]
+    new += step[..., :, None] * step[..., None, :] * ((1 + rise / along) / along)
+    return np.asarray(np.where(curved[..., None, None], new, inverse))

@@ -146,7 +146,7 @@ class EvenTracks:
         undefined |= ~(power.min(axis=(1, 2)) > 0)
         return DiagonalModes(axes, power, inverse, along, along * inverse, log_det, undefined)
 
-    def slopes(self, D: Floats, theta: Floats, B: Floats, modes: DiagonalModes) -> TensorSlopes:
+    def slopes(self, D: Floats, B: Floats, modes: DiagonalModes) -> TensorSlopes:
         """Return the log-likelihoods and their derivatives at the points of these modes."""
         w, (axes, power, inverse, values, q, log_det, undefined) = self.weight, modes
         columns, back = np.swapaxes(q, 1, 2), np.swapaxes(axes, 1, 2)

@@ -7,7 +7,7 @@ import warnings as python_warnings
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import cache
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 
@@ -24,9 +24,9 @@ from perrin.diffusion.step_tests import (
     steady_motion,
     without_spin,
 )
-from perrin.diffusion.steps import residual_freedom
+from perrin.diffusion.steps import Quantity, residual_freedom
 from perrin.diffusion.switching import SwitchingEstimate
-from perrin.diffusion.tensors import diffusion_tensor
+from perrin.diffusion.tensors import tensor_of_each
 from perrin.errors import (
     DegenerateClusterError,
     IdentityWarning,
@@ -75,7 +75,6 @@ if TYPE_CHECKING:
 
     from perrin._arrays import Bools, Floats, Ints
     from perrin.diffusion.noise_model import Noise
-    from perrin.diffusion.steps import Quantity
     from perrin.diffusion.tensor_results import DiffusionTensor
     from perrin.diffusion.verdict import MotionVerdict
     from perrin.motion.floor import NoiseFloor
@@ -262,12 +261,8 @@ def measure_table(
             for b in bodies
             if b.tracks.cluster in motions
         ]
-    measured: list[MeasuredBody] = []
-    for body in bodies:
-        try:
-            measured.append(measure_body(body, experiment, recording, tested=len(bodies)))
-        except (DegenerateClusterError, TooFewFramesError) as error:
-            failures.append((body.tracks.label or str(body.tracks.cluster), error))
+    measured, failed = measure_bodies(bodies, experiment, recording)
+    failures += failed
     if failures and not (measured or rods):
         raise failures[-1][1]
     measured, together = judge_bodies(measured, experiment, first_frame=first)
@@ -482,37 +477,71 @@ def measure_rod(tracks: ClusterTracks, experiment: Experiment, recording: Record
     )
 
 
-def measure_body(
-    body: FittedBody, experiment: Experiment, recording: Recording, *, tested: int
+def measure_bodies(
+    bodies: Sequence[FittedBody], experiment: Experiment, recording: Recording
+) -> tuple[list[MeasuredBody], list[tuple[str, ValueError]]]:
+    """Estimate the coefficients and the tensors of all bodies, and collect the remarks on them.
+
+    Returns
+    -------
+    measured : list of MeasuredBody
+    failures : list of tuple
+        Names of the bodies whose steps give no estimate, with the error.
+    """
+    found, failures = [], []
+    for body in bodies:
+        try:
+            turn, path = (
+                measure_coefficient(body, quantity, experiment, recording, tested=len(bodies))
+                for quantity in get_args(Quantity)
+            )
+            found.append((body, turn, path))
+        except (DegenerateClusterError, TooFewFramesError) as error:
+            failures.append((body.tracks.label or str(body.tracks.cluster), error))
+    turning = [
+        turn.motion
+        if turn.estimate.drift is None
+        else without_spin(turn.motion, turn.estimate.drift[0])
+        for _, turn, _ in found
+    ]
+    tensors = measure_tensors(turning, "rotation", experiment.noise)
+    measured = [
+        measured_body(*one, *tensor, experiment=experiment, recording=recording)
+        for one, tensor in zip(found, tensors, strict=True)
+    ]
+    return measured, failures
+
+
+def measured_body(
+    body: FittedBody,
+    turn: Coefficient,
+    path: Coefficient,
+    tensor: DiffusionTensor | None,
+    no_tensor: Sequence[str],
+    *,
+    experiment: Experiment,
+    recording: Recording,
 ) -> MeasuredBody:
-    """Estimate the coefficients and the tensor of a body, and collect the remarks on them.
+    """Collect what was measured of a body, and the remarks on it.
 
     Parameters
     ----------
     body : FittedBody
+    turn, path : Coefficient
+        Rotational and translational coefficient.
+    tensor : DiffusionTensor or None
+    no_tensor : sequence of str
+        Why there is no tensor.
     experiment : Experiment
     recording : Recording
-    tested : int
-        Number of clusters that share the level of the test for a steady motion.
 
     Returns
     -------
     MeasuredBody
-
-    Raises
-    ------
-    DegenerateClusterError, TooFewFramesError
-        If the steps of the body give no estimate.
     """
     tracks, motion = body.tracks, body.motion
-    turn = measure_coefficient(body, "rotation", experiment, recording, tested=tested)
-    path = measure_coefficient(body, "translation", experiment, recording, tested=tested)
     D_R, D_T = turn.estimate, path.estimate
     noise = predicted_noise(motion)
-    turning = turn.motion
-    if D_R.drift is not None:
-        turning = without_spin(turning, D_R.drift[0])
-    tensor, no_tensor = measure_tensor(turning, "rotation", experiment.noise)
     # The offset of steps that contain another motion, or of a body that bends, is no noise.
     floor: list[str] = []
     if body.quality.rigid and turn.brownian:
@@ -768,21 +797,23 @@ def judge_coefficient(
     return replace(coefficient, estimate=estimate, verdict=verdict, remarks=remarks)
 
 
-def measure_tensor(
-    motion: RigidMotion, quantity: Quantity, noise: Noise
-) -> tuple[DiffusionTensor | None, list[str]]:
-    """Return the tensor in body axes, or None and the reason; in the plane there is none."""
-    if motion.template.shape[1] != 3:
-        return None, []
-    try:
-        with python_warnings.catch_warnings():
-            python_warnings.simplefilter("ignore", PrecisionWarning)
-            tensor = diffusion_tensor(
-                motion, quantity=quantity, noise=noise.model, exposure=noise.exposure
-            )
-    except ValueError as error:
-        return None, [f"no diffusion tensor: {error}"]
-    return tensor, []
+def measure_tensors(
+    motions: Sequence[RigidMotion], quantity: Quantity, noise: Noise
+) -> list[tuple[DiffusionTensor | None, list[str]]]:
+    """Return the tensor of each motion in body axes, or None and the reason.
+
+    In the plane there is none, and no reason is needed.
+    """
+    solid = [motion for motion in motions if motion.dimension == 3]
+    found = iter(tensor_of_each(solid, quantity=quantity, noise=replace(noise, drift=False)))
+    tensors: list[tuple[DiffusionTensor | None, list[str]]] = []
+    for motion in motions:
+        tensor = next(found) if motion.dimension == 3 else None
+        if isinstance(tensor, ValueError):
+            tensors.append((None, [f"no diffusion tensor: {tensor}"]))
+        else:
+            tensors.append((tensor, []))
+    return tensors
 
 
 def noise_floor_test(
@@ -921,7 +952,9 @@ def with_sizes(
         tensor_T = None
         # A drift would mix with the translation along the axes of the body.
         if not experiment.noise.drift and are_unequal(mobility.principal_D_T.values):
-            tensor_T, no_tensor = measure_tensor(result.motion, "translation", experiment.noise)
+            tensor_T, no_tensor = measure_tensors([result.motion], "translation", experiment.noise)[
+                0
+            ]
             notes += no_tensor
         prediction = compare_body(
             mobility, D_T=D_T, D_R=D_R, tensor_T=tensor_T, tensor_R=result.tensor
