@@ -25,7 +25,13 @@ from perrin.diffusion.decoupling import (
     translation_rotation_correlation,
 )
 from perrin.diffusion.estimate import DiffusionEstimate, Found, bare_text, value_text
-from perrin.diffusion.estimators import by_likelihood, estimate_diffusion, precision_limits
+from perrin.diffusion.estimators import (
+    by_likelihood,
+    estimate_diffusion,
+    estimate_each,
+    likelihood_of_each,
+    precision_limits,
+)
 from perrin.diffusion.goodness_of_fit import (
     AxisFit,
     AxisModel,
@@ -268,6 +274,7 @@ __all__ = [
     "equal_columns",
     "equalised_steps",
     "estimate_diffusion",
+    "estimate_each",
     "estimate_rod",
     "excess_scatter",
     "find_jumps",
@@ -295,6 +302,7 @@ __all__ = [
     "judge_sampling",
     "largest_share",
     "leave_one_out_residuals",
+    "likelihood_of_each",
     "line_weights",
     "log_interval",
     "log_slope_ratio",

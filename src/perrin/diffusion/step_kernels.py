@@ -168,37 +168,57 @@ class SineModes:
         return cls(np.array(groups), starts, which, power, count, by_D, by_theta, given)
 
     @cached_property
-    def slope_columns(self) -> tuple[Floats, Floats]:
-        """Half the slopes of the eigenvalue in D and in theta, (M, 2), and their products."""
+    def slope_columns(self) -> Floats:
+        """Half the slopes of the eigenvalue in D and in theta, and their three products, (5, M)."""
         halves = 0.5 * np.stack([self.by_D, self.by_theta])
-        return halves.T, 4 * (halves[[0, 0, 1]] * halves[[0, 1, 1]]).T
+        return np.concatenate([halves, 4 * (halves[[0, 0, 1]] * halves[[0, 1, 1]])])
+
+    @cached_property
+    def length(self) -> int:
+        """Number of modes of every motion; 0 where they differ."""
+        lengths = np.diff(self.starts, append=len(self.power))
+        return int(lengths[0]) if np.all(lengths == lengths[0]) else 0
 
     def sums(self, D: Floats, theta: Floats) -> GroupSlopes:
         """Evaluate all motions at the D and the theta of each, (..., G)."""
-        if len(self.groups) > 1:
+        halves, products = self.slope_columns[:2], self.slope_columns[2:]
+        if self.length:
+            # One row a motion: a sum over modes is then a product of matrices.
+            shape = (len(self.groups), self.length)
+            D, theta = D[..., None], theta[..., None]
+        else:
+            shape = self.power.shape
             D, theta = D[..., self.which], theta[..., self.which]
-        eigen = D * self.by_D + theta * self.by_theta + self.given
+        power, count, by_D, by_theta, given = (
+            x.reshape(shape) for x in (self.power, self.count, self.by_D, self.by_theta, self.given)
+        )
+        eigen = D * by_D + theta * by_theta + given
         np.maximum(eigen, LEAST_EIGENVALUE, out=eigen)
         inverse = 1 / eigen
-        fall = self.count * inverse
-        ratio = self.power * inverse
+        fall = count * inverse
+        ratio = power * inverse
         rise = ratio * inverse
-        halves, products = self.slope_columns
-        value = np.add.reduceat(self.count * np.log(eigen) + ratio, self.starts, axis=-1)
+        value = count * np.log(eigen) + ratio
+        each = value.sum(axis=-1) if self.length else np.add.reduceat(value, self.starts, axis=-1)
         rises, falls = (self.by_motion(x, halves) for x in (rise, fall))
         rise_bends, fall_bends = (self.by_motion(x * inverse, products) for x in (rise, fall))
         return GroupSlopes(
-            -0.5 * value,
+            -0.5 * each,
             *(rises[..., 0], falls[..., 0], rises[..., 1], falls[..., 1]),
             *(-rise_bends[..., k] for k in range(3)),
             *(-0.5 * fall_bends[..., k] for k in range(3)),
         )
 
     def by_motion(self, x: Floats, columns: Floats) -> Floats:
-        """Return the sums of x (..., M) times columns (M, c) over the modes of each motion."""
-        if len(self.groups) == 1:
-            return np.asarray((x @ columns)[..., None, :])
-        sums = [np.add.reduceat(x * column, self.starts, axis=-1) for column in columns.T]
+        """Return the sums over the modes of each motion of x times columns (c, M), (..., G, c)."""
+        if self.length:
+            by_row = columns.reshape(len(columns), *x.shape[-2:])
+            if len(self.groups) == 1:
+                return np.asarray(x @ by_row[:, 0].T)
+            # (G, P, K) times (G, K, c)
+            stacked = np.moveaxis(x.reshape(-1, *x.shape[-2:]), 0, 1) @ np.moveaxis(by_row, 0, 2)
+            return np.moveaxis(stacked, 1, 0).reshape(*x.shape[:-1], len(columns))
+        sums = [np.add.reduceat(x * column, self.starts, axis=-1) for column in columns]
         return np.stack(sums, axis=-1)
 
 

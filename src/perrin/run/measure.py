@@ -13,7 +13,7 @@ import numpy as np
 
 from perrin.diffusion.changing import with_changing_interval
 from perrin.diffusion.estimate import DiffusionEstimate
-from perrin.diffusion.estimators import estimate_diffusion
+from perrin.diffusion.estimators import estimate_diffusion, estimate_each
 from perrin.diffusion.rods import estimate_rod
 from perrin.diffusion.step_tests import (
     Jumps,
@@ -489,12 +489,23 @@ def measure_bodies(
         Names of the bodies whose steps give no estimate, with the error.
     """
     found, failures = [], []
-    for body in bodies:
+    motions = [body.motion for body in bodies]
+    turns, paths = (
+        estimate_each(motions, quantity=quantity, noise=experiment.noise)
+        for quantity in get_args(Quantity)
+    )
+    for body, first, second in zip(bodies, turns, paths, strict=True):
         try:
-            turn, path = (
-                measure_coefficient(body, quantity, experiment, recording, tested=len(bodies))
-                for quantity in get_args(Quantity)
-            )
+            measured = []
+            for quantity, estimate in zip(get_args(Quantity), (first, second), strict=True):
+                if isinstance(estimate, TooFewFramesError):
+                    raise estimate
+                measured.append(
+                    measure_coefficient(
+                        body, quantity, estimate, experiment, recording, tested=len(bodies)
+                    )
+                )
+            turn, path = measured
             found.append((body, turn, path))
         except (DegenerateClusterError, TooFewFramesError) as error:
             failures.append((body.tracks.label or str(body.tracks.cluster), error))
@@ -505,11 +516,11 @@ def measure_bodies(
         for _, turn, _ in found
     ]
     tensors = measure_tensors(turning, "rotation", experiment.noise)
-    measured = [
+    results = [
         measured_body(*one, *tensor, experiment=experiment, recording=recording)
         for one, tensor in zip(found, tensors, strict=True)
     ]
-    return measured, failures
+    return results, failures
 
 
 def measured_body(
@@ -582,6 +593,7 @@ def measured_body(
 def measure_coefficient(
     body: FittedBody,
     quantity: Quantity,
+    estimate: DiffusionEstimate,
     experiment: Experiment,
     recording: Recording,
     *,
@@ -593,6 +605,8 @@ def measure_coefficient(
     ----------
     body : FittedBody
     quantity : {"rotation", "translation"}
+    estimate : DiffusionEstimate
+        Estimate from all steps.
     experiment : Experiment
     recording : Recording
     tested : int
@@ -610,7 +624,6 @@ def measure_coefficient(
         )
         none = Jumps(nothing, np.empty((0, 3)), np.empty(0), 0)
         return Coefficient(estimate, motion, motion, none, nothing, True, Remarks())
-    estimate = _estimated_quietly(motion, quantity, noise)
     # Doubt about the labels cuts the track, but the centre's path crosses it.
     path = motion if quantity == "rotation" else replace(motion, piece=np.zeros_like(motion.piece))
     jumps = find_jumps(path, estimate)
