@@ -107,7 +107,7 @@ class Likelihood:
     @classmethod
     def of(cls, tracks: Sequence[NoisySteps]) -> Likelihood:
         """Return the likelihood with the sine transform for even steps, else elimination."""
-        even = [i for i, t in enumerate(tracks) if t.steps.even and not t.drift]
+        even = [i for i, t in enumerate(tracks) if t.steps.even]
         rest = sorted(set(range(len(tracks))) - set(even))
         found: list[StepKernel] = []
         if even:
@@ -352,8 +352,12 @@ class Likelihood:
 
         The information (G, p, p) is the inverse of the covariance at this D and theta.
         """
-        kernel = next(k for k in self.kernels if isinstance(k, TridiagonalCovariance))
-        mean, information = kernel.steady_motion(np.full(len(theta), D), theta)
+        p = self.tracks[0].steady.size
+        mean, information = np.empty((len(theta), p)), np.empty((len(theta), p, p))
+        for kernel in self.kernels:
+            rows = kernel.groups
+            some = kernel.steady_motion(np.full(len(rows), D), theta[rows])
+            mean[rows], information[rows] = some
         return mean + np.array([t.steady for t in self.tracks]), information
 
     def offsets(self, best: ProfilePoint) -> tuple[Floats, Floats]:
