@@ -160,7 +160,14 @@ from perrin.diffusion.tensor_likelihood import (
     squares,
     symmetric_inverses,
 )
-from perrin.diffusion.tensor_modes import DiagonalModes, EvenTracks, TensorSlopes, covariance_slopes
+from perrin.diffusion.tensor_modes import (
+    Chains,
+    ChainTrack,
+    DiagonalModes,
+    EvenTracks,
+    TensorSlopes,
+    covariance_slopes,
+)
 from perrin.diffusion.tensor_results import CoupledTensor, DiffusionTensor
 from perrin.diffusion.tensors import (
     ScaledTracks,
@@ -190,6 +197,8 @@ __all__ = [
     "AxisFit",
     "AxisModel",
     "BrownianTests",
+    "ChainTrack",
+    "Chains",
     "CoefficientCorrelation",
     "ConfinedEstimate",
     "CoupledTensor",

@@ -8,7 +8,12 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from perrin.diffusion.tensor_modes import EvenTracks, TensorSlopes, covariance_slopes
+from perrin.diffusion.tensor_modes import (
+    ChainTrack,
+    EvenTracks,
+    TensorSlopes,
+    covariance_slopes,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -31,6 +36,9 @@ LEAST_BLUR = 0.1
 # A search has converged where another step would gain this much: 5e-9 standard errors. A gain below
 # the second number is hidden by rounding, and steps are accepted without it.
 CONVERGED_GAIN, ROUNDING_GAIN = 1e-17, 1e-9
+
+# Frames are equally noisy if the elements of their noise agree to this.
+_EQUAL_NOISE = 1e-9
 
 # Step of numerical derivatives, in scaled units where all parameters are of order 1.
 _DIFFERENCE_STEP = 1e-5
@@ -118,12 +126,28 @@ class NoisyVectors:
         """The steps in their sine modes, where they are even."""
         return EvenTracks.of([self.steps])
 
+    @cached_property
+    def chain_track(self) -> ChainTrack | None:
+        """The steps as chains along common axes; None where frames are not equally noisy."""
+        s = self.steps
+        ends = np.zeros(s.noise.shape[1], dtype=np.bool_)
+        ends[s.start] = ends[s.stop] = True
+        noise = s.noise[:, ends]
+        if not np.ptp(noise, axis=1).max() <= _EQUAL_NOISE * np.abs(noise).max():
+            return None
+        return ChainTrack(s, noise[:, 0])
+
     def by_tensor(self, D: Floats, theta: Floats, B: Floats) -> TensorSlopes:
         """Return the log-likelihood and its derivatives at P points; -inf where not defined."""
         if self.steps.even:
             return self.by_sines(D, theta, B)
         if len(D) == 1:
-            return self.by_bands(D[0], theta[0], float(B[0]))
+            if self.chain_track is None:
+                return self.by_bands(D[0], theta[0], float(B[0]))
+            chains = self.chain_track.at(D[0], theta[0], float(B[0]))
+            if chains is None:
+                return TensorSlopes.undefined(D, theta)
+            return self.chain_track.slopes(D[0], float(B[0]), chains)
         points = [
             self.by_tensor(D[p : p + 1], theta[p : p + 1], B[p : p + 1]) for p in range(len(D))
         ]
@@ -168,6 +192,15 @@ class NoisyVectors:
         columns = np.stack([x.reshape(-1) for x in products], axis=1)
         return np.asarray(0.5 * columns.T @ dpbtrs(factor, columns, lower=1)[0])
 
+    def uneven_curvatures(self, E: Floats, D: Floats, theta: Floats, B: float) -> Floats:
+        """Return the average information of steps that are not even, as `band_curvatures`."""
+        if self.chain_track is None:
+            return self.band_curvatures(E, D, theta, B)
+        chains = self.chain_track.at(D, theta, B)
+        if chains is None:
+            return np.full((len(E) + len(theta) + 1,) * 2, np.nan)
+        return self.chain_track.curvatures(E, D, B, chains)
+
     def curvatures(self, D: Floats, slopes: Floats, bends: Floats, own: Floats) -> Floats:
         """Return minus the Hessian by the parameters of D and of the noise, (m + c, m + c).
 
@@ -184,7 +217,7 @@ class NoisyVectors:
             full = track.curvatures(slopes[None], D[None], B, modes)[0]
         else:
             found = self.by_tensor(D[None], theta, B)
-            full = self.band_curvatures(slopes, D, theta[0], float(B[0]))
+            full = self.uneven_curvatures(slopes, D, theta[0], float(B[0]))
         full[:m, :m] -= np.tensordot(bends, found.D[0], 2)
         # The noise less its blur contains -2 B dt D, which is not linear.
         mixed = 2 * self.steps.dt * np.tensordot(slopes, found.noise[0], 2)

@@ -1,4 +1,6 @@
-"""Likelihoods of even steps with tensors D in their sine modes, of many motions at once.
+"""Likelihoods of steps with tensors D whose frames are equally noisy, in axes that diagonalise D.
+
+Even steps are taken to their sine modes, those of many motions at once; other steps are a chain.
 
 Mode k of the sine transform of even steps has covariance 2 D tau + w_k O, w_k = 2 (1 - cos w), and
 all modes are diagonal in the axes that diagonalise D against 2 D tau + 2 O.
@@ -217,3 +219,115 @@ def covariance_slopes(E: Floats, D: Floats, B: Floats, dt: Floats) -> tuple[Floa
     """
     blur = np.concatenate([B[:, None, None, None] * E, D[:, None]], axis=1)
     return 2 * E, -2 * dt[:, None, None, None] * blur
+
+
+class Chains(NamedTuple):
+    """Uneven steps at one point, in the axes that diagonalise D against 2 D tau + 2 O.
+
+    Attributes
+    ----------
+    axes : ndarray, shape (b, b)
+        Those axes as columns, not of unit length.
+    pivots, lower : ndarray, shapes (b S,) and (b S - 1,)
+        Elimination of the tridiagonal covariances along them, one after the other.
+    inverse, corner : ndarray, shape (b, S)
+        Diagonals of their inverses, and the elements next to these; 0 where steps are not linked.
+    solved : ndarray, shape (b, S)
+        Inverse covariances times steps.
+    value : float
+        Log-likelihood; -inf where a covariance is not positive definite.
+    """
+
+    axes: Floats
+    pivots: Floats
+    lower: Floats
+    inverse: Floats
+    corner: Floats
+    solved: Floats
+    value: float
+
+
+@dataclass(frozen=True, eq=False)
+class ChainTrack:
+    """Steps of any durations and links whose frames are equally noisy.
+
+    D and the noise O of a frame are two matrices, which are diagonal in common axes: along each of
+    them the steps are a chain of their own, whose covariance is tridiagonal.
+
+    Attributes
+    ----------
+    steps : Steps
+    shapes : ndarray, shape (r, b, b)
+        Noise covariances of a frame for an amplitude of 1.
+    """
+
+    steps: Steps
+    shapes: Floats
+
+    def at(self, D: Floats, theta: Floats, B: float) -> Chains | None:
+        """Return the chains at one point; None where the covariance is not positive definite."""
+        from scipy.linalg.lapack import dpttrf, dpttrs
+
+        s, b = self.steps, len(D)
+        count, tau = len(s.duration), float(s.duration.mean())
+        motion = 2 * tau * D
+        values, turn = np.linalg.eigh(
+            motion + 2 * np.tensordot(theta, self.shapes, 1) - 4 * B * s.dt * D
+        )
+        if not values[0] > 0:
+            return None
+        root = turn / np.sqrt(values)
+        share, turn = np.linalg.eigh(root.T @ motion @ root)
+        axes = root @ turn
+        a = (share[:, None] * (s.duration / tau) + (1 - share)[:, None]).ravel()
+        off = (-0.5 * (1 - share)[:, None] * s.linked).ravel()[:-1]
+        d, lower, bad = dpttrf(a, off)
+        up, _, bad_up = dpttrf(a[::-1], off[::-1])
+        if bad or bad_up:
+            return None
+        y = axes.T @ s.vectors.T
+        z = dpttrs(d, lower, y.reshape(-1, 1))[0].reshape(b, count)
+        inverse = 1 / (d + up[::-1] - a)
+        corner = np.append(-lower * inverse[1:], 0.0).reshape(b, count) * s.linked
+        log_det = np.log(d).sum() + count * np.log(values).sum()
+        value = -0.5 * float(log_det + np.sum(y * z))
+        return Chains(axes, d, lower, inverse.reshape(b, count), corner, z, value)
+
+    def slopes(self, D: Floats, B: float, chains: Chains) -> TensorSlopes:
+        """Return the log-likelihood and its derivatives, at one point."""
+        s, z = self.steps, chains.solved
+        linked = z[:, :-1] * s.linked[:-1]
+        plain = (z * s.duration) @ z.T - np.diag(chains.inverse @ s.duration)
+        cross = linked @ z[:, 1:].T
+        weighted = 2 * z @ z.T - cross - cross.T
+        weighted -= 2 * np.diag(chains.inverse.sum(axis=1) - chains.corner.sum(axis=1))
+        plain, weighted = (chains.axes @ x @ chains.axes.T for x in (plain, weighted))
+        return TensorSlopes(
+            np.array([chains.value]),
+            (plain - B * s.dt * weighted)[None],
+            0.5 * np.einsum("jab,ab->j", self.shapes, weighted)[None],
+            np.array([-s.dt * float(np.sum(weighted * D))]),
+            0.5 * weighted[None],
+        )
+
+    def curvatures(self, E: Floats, D: Floats, B: float, chains: Chains) -> Floats:
+        """Return the average of observed and expected information along E, in theta and in B.
+
+        It is z^T X_i C^-1 X_j z/2 for the slopes X_i of C, as in `NoisyVectors.band_curvatures`.
+        """
+        from scipy.linalg.lapack import dpttrs
+
+        s, z = self.steps, chains.solved
+        of_D, of_noise = (
+            x[0] for x in covariance_slopes(E[None], D[None], np.array([B]), np.array([s.dt]))
+        )
+        none = np.zeros((len(self.shapes) + 1, *D.shape))
+        on = chains.axes.T @ np.concatenate([of_D, none]) @ chains.axes
+        noise = np.concatenate([of_noise[:-1], self.shapes, of_noise[-1:]])
+        noise = chains.axes.T @ noise @ chains.axes
+        differences = 2 * z
+        differences[:, :-1] -= s.linked[:-1] * z[:, 1:]
+        differences[:, 1:] -= s.linked[:-1] * z[:, :-1]
+        products = (on @ (z * s.duration) + noise @ differences).reshape(len(on), -1)
+        solved = dpttrs(chains.pivots, chains.lower, products.T)[0]
+        return np.asarray(0.5 * products @ solved)
