@@ -987,7 +987,10 @@ def brownian_tests_of_each(
                 found[i] = _ranked_if_short(
                     model,
                     AxisFit(fit.y[one], fit.D[one], fit.offset[one]),
-                    tuple(Score(*(x[..., one] for x in score)) for score in scores),
+                    (
+                        Score(*(x[..., one] for x in scores[0])),
+                        Score(*(x[..., one] for x in scores[1])),
+                    ),
                     {name: float(value[j]) for name, value in p.items()},
                 )
     return [found[i] for i in range(len(each))]

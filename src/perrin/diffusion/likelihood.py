@@ -371,13 +371,14 @@ class Likelihood:
         free, theta = ~self.fixed, best.theta
         count = self.by_unit(np.ones(len(blur)))
         offset = self.by_unit(np.where(free, theta, 0.0) + level - blur * best.D) / count
-        known = self.by_unit(1.0 * (free & (theta <= 1e-3 * self.mean_square))) == 0
+        known = self.by_unit((free & (theta <= 1e-3 * self.mean_square)).astype(np.float64)) == 0
         sums = self.sums(best.D, theta)
         h_DD = self.by_unit(sums.fall_DD - sums.rise_DD)
         h_Do, h_oo = sums.fall_Do - sums.rise_Do, sums.fall_oo - sums.rise_oo
-        known &= (best.D > 0) & (self.by_unit(1.0 * (free & (h_oo <= 0))) == 0)
-        inverse = np.divide(1.0, h_oo, out=np.zeros_like(h_oo), where=free & (h_oo > 0))
-        turn = h_Do * inverse
+        known &= (best.D > 0) & (self.by_unit((free & (h_oo <= 0)).astype(np.float64)) == 0)
+        inverse: Floats = np.zeros_like(h_oo)
+        np.divide(1.0, h_oo, out=inverse, where=free & (h_oo > 0))
+        turn: Floats = np.asarray(h_Do * inverse, dtype=np.float64)
         left = h_DD - self.by_unit(turn * h_Do)
         known &= left > 0
         left = np.where(known, left, np.nan)

@@ -86,6 +86,9 @@ class StepKernel(Protocol):
     def sums(self, D: Floats, theta: Floats) -> GroupSlopes:
         """Evaluate all motions at the D and the theta of each, (..., G)."""
 
+    def steady_motion(self, D: Floats, theta: Floats) -> tuple[Floats, Floats]:
+        """Return the steady motion (G, p) of every track and its inverse covariance (G, p, p)."""
+
 
 def equal_columns(noise: Floats) -> list[Ints]:
     """Return the columns of (M, A) in groups that are equal to rounding.
@@ -267,7 +270,7 @@ class SineModes:
             self.steady_sums(inverse**2, 1),
         )
         squares, products = self.steady_sums(inverse**3, 2)
-        left = np.linalg.inv(gram)  # (..., G, 1, p, p)
+        left = np.asarray(np.linalg.inv(gram), dtype=np.float64)  # (..., G, 1, p, p)
         mean = (left @ right[..., None])[..., 0]
 
         def change(square: Floats, product: Floats) -> Floats:
@@ -310,7 +313,7 @@ class SineModes:
     def steady_motion(self, D: Floats, theta: Floats) -> tuple[Floats, Floats]:
         """Return the steady motion (G, p) of every track and its inverse covariance (G, p, p)."""
         gram, right = self.steady_sums(1 / self.eigenvalues(D, theta), 0)
-        mean = np.linalg.solve(gram, right[..., None])[..., 0]
+        mean = np.asarray(np.linalg.solve(gram, right[..., None])[..., 0], dtype=np.float64)
         return mean[..., 0, :], gram[..., 0, :, :]
 
     def by_motion(self, x: Floats, columns: Floats) -> Floats:

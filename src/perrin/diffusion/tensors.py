@@ -618,7 +618,7 @@ def tensor_fits(
     >>> tensor_fits([data], [np.eye(3)[None] / 3**0.5])[0].p_isotropic > 0.05
     True
     """
-    found: list[TensorFit | ValueError | None] = [None] * len(data)
+    found: list[TensorFit | None] = [None] * len(data)
     together: dict[tuple[object, ...], list[int]] = {}
     for i, one in enumerate(data):
         if len(one.tracks) == 1 and one.tracks[0].steps.even:
@@ -629,8 +629,8 @@ def tensor_fits(
         for k in range(0, len(group), at_once):
             some = group[k : k + at_once]
             fits = _even_fits([data[i] for i in some], [bases[i] for i in some])
-            for i, fit in zip(some, fits, strict=True):
-                found[i] = fit
+            for i, even_fit in zip(some, fits, strict=True):
+                found[i] = even_fit
     fits_of_all: list[TensorFit | ValueError] = []
     for one, basis, fit in zip(data, bases, found, strict=True):
         try:

@@ -67,10 +67,10 @@ def save_figure(figure: Figure, stem: Path) -> list[Path]:
     engine = figure.get_layout_engine()
     # With a layout of its own every file would be drawn twice, first for the layout alone.
     with rc_context({"figure.autolayout": False, "figure.constrained_layout.use": False}):
-        if engine is not None:
+        if engine is not None and figure.axes:
             figure.set_dpi(DPI)
             engine.execute(figure)
-            figure.set_layout_engine(None)
+        figure.set_layout_engine(None)
         for file in files:
             figure.savefig(file, dpi=DPI)
     return files

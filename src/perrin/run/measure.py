@@ -488,7 +488,8 @@ def measure_bodies(
     failures : list of tuple
         Names of the bodies whose steps give no estimate, with the error.
     """
-    found, failures = [], []
+    found = []
+    failures: list[tuple[str, ValueError]] = []
     motions = [body.motion for body in bodies]
     turns, paths = (
         estimate_each(motions, quantity=quantity, noise=experiment.noise)
