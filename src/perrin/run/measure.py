@@ -7,13 +7,13 @@ import warnings as python_warnings
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import cache
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 
 from perrin.diffusion.changing import with_changing_interval
 from perrin.diffusion.estimate import DiffusionEstimate
-from perrin.diffusion.estimators import estimate_diffusion
+from perrin.diffusion.estimators import estimate_diffusion, estimate_each
 from perrin.diffusion.rods import estimate_rod
 from perrin.diffusion.step_tests import (
     Jumps,
@@ -25,9 +25,9 @@ from perrin.diffusion.step_tests import (
     steady_motion,
     without_spin,
 )
-from perrin.diffusion.steps import residual_freedom
+from perrin.diffusion.steps import Quantity, residual_freedom
 from perrin.diffusion.switching import SwitchingEstimate
-from perrin.diffusion.tensors import diffusion_tensor
+from perrin.diffusion.tensors import tensor_of_each
 from perrin.errors import (
     DegenerateClusterError,
     IdentityWarning,
@@ -81,7 +81,6 @@ if TYPE_CHECKING:
 
     from perrin._arrays import Bools, Floats, Ints
     from perrin.diffusion.noise_model import Noise
-    from perrin.diffusion.steps import Quantity
     from perrin.diffusion.tensor_results import DiffusionTensor
     from perrin.diffusion.verdict import MotionVerdict
     from perrin.motion.floor import NoiseFloor
@@ -166,6 +165,11 @@ class FittedBody:
     quality: Quality
     remarks: Remarks
     stage: Ints = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+
+    @property
+    def path(self) -> RigidMotion:
+        """The motion without the steps that contain a jump of the stage."""
+        return cut_at(self.motion, self.stage) if self.stage.size else self.motion
 
 
 @dataclass(frozen=True, eq=False)
@@ -288,12 +292,8 @@ def measure_table(
     )
     if not experiment.keep_jumps:
         bodies = [replace(b, stage=stage.rows(b.tracks.frames)) for b in bodies]
-    measured: list[MeasuredBody] = []
-    for body in bodies:
-        try:
-            measured.append(measure_body(body, experiment, recording, tested=len(bodies)))
-        except (DegenerateClusterError, TooFewFramesError) as error:
-            failures.append((body.tracks.label or str(body.tracks.cluster), error))
+    measured, failed = measure_bodies(bodies, experiment, recording)
+    failures += failed
     if failures and not (measured or rods):
         raise failures[-1][1]
     remarks += words.common_motion_remarks(
@@ -530,37 +530,81 @@ def measure_rod(tracks: ClusterTracks, experiment: Experiment, recording: Record
     )
 
 
-def measure_body(
-    body: FittedBody, experiment: Experiment, recording: Recording, *, tested: int
+def measure_bodies(
+    bodies: Sequence[FittedBody], experiment: Experiment, recording: Recording
+) -> tuple[list[MeasuredBody], list[tuple[str, ValueError]]]:
+    """Estimate the coefficients and the tensors of all bodies, and collect the remarks on them.
+
+    Returns
+    -------
+    measured : list of MeasuredBody
+    failures : list of tuple
+        Names of the bodies whose steps give no estimate, with the error.
+    """
+    found = []
+    failures: list[tuple[str, ValueError]] = []
+    noise = experiment.noise
+    turns = estimate_each([b.motion for b in bodies], quantity="rotation", noise=noise)
+    paths = estimate_each([b.path for b in bodies], quantity="translation", noise=noise)
+    for body, first, second in zip(bodies, turns, paths, strict=True):
+        try:
+            measured = []
+            for quantity, estimate in zip(get_args(Quantity), (first, second), strict=True):
+                if isinstance(estimate, TooFewFramesError):
+                    raise estimate
+                measured.append(
+                    measure_coefficient(
+                        body, quantity, estimate, experiment, recording, tested=len(bodies)
+                    )
+                )
+            turn, path = measured
+            found.append((body, turn, path))
+        except (DegenerateClusterError, TooFewFramesError) as error:
+            failures.append((body.tracks.label or str(body.tracks.cluster), error))
+    turning = [
+        turn.motion
+        if turn.estimate.drift is None
+        else without_spin(turn.motion, turn.estimate.drift[0])
+        for _, turn, _ in found
+    ]
+    tensors = measure_tensors(turning, "rotation", experiment.noise)
+    results = [
+        measured_body(*one, *tensor, experiment=experiment, recording=recording)
+        for one, tensor in zip(found, tensors, strict=True)
+    ]
+    return results, failures
+
+
+def measured_body(
+    body: FittedBody,
+    turn: Coefficient,
+    path: Coefficient,
+    tensor: DiffusionTensor | None,
+    no_tensor: Sequence[str],
+    *,
+    experiment: Experiment,
+    recording: Recording,
 ) -> MeasuredBody:
-    """Estimate the coefficients and the tensor of a body, and collect the remarks on them.
+    """Collect what was measured of a body, and the remarks on it.
 
     Parameters
     ----------
     body : FittedBody
+    turn, path : Coefficient
+        Rotational and translational coefficient.
+    tensor : DiffusionTensor or None
+    no_tensor : sequence of str
+        Why there is no tensor.
     experiment : Experiment
     recording : Recording
-    tested : int
-        Number of clusters that share the level of the test for a steady motion.
 
     Returns
     -------
     MeasuredBody
-
-    Raises
-    ------
-    DegenerateClusterError, TooFewFramesError
-        If the steps of the body give no estimate.
     """
     tracks, motion = body.tracks, body.motion
-    turn = measure_coefficient(body, "rotation", experiment, recording, tested=tested)
-    path = measure_coefficient(body, "translation", experiment, recording, tested=tested)
     D_R, D_T = turn.estimate, path.estimate
     noise = predicted_noise(motion)
-    turning = turn.motion
-    if D_R.drift is not None:
-        turning = without_spin(turning, D_R.drift[0])
-    tensor, no_tensor = measure_tensor(turning, "rotation", experiment.noise)
     # The offset of steps that contain another motion, or of a body that bends, is no noise.
     floor: list[str] = []
     if body.quality.rigid and turn.brownian:
@@ -604,6 +648,7 @@ def measure_body(
 def measure_coefficient(
     body: FittedBody,
     quantity: Quantity,
+    estimate: DiffusionEstimate,
     experiment: Experiment,
     recording: Recording,
     *,
@@ -615,6 +660,8 @@ def measure_coefficient(
     ----------
     body : FittedBody
     quantity : {"rotation", "translation"}
+    estimate : DiffusionEstimate
+        Estimate from all steps.
     experiment : Experiment
     recording : Recording
     tested : int
@@ -636,8 +683,7 @@ def measure_coefficient(
     if quantity == "translation":
         # Doubt about the labels cuts the track, but the centre's path crosses it.
         path = cut_at(replace(motion, piece=np.zeros_like(motion.piece)), body.stage)
-        motion = cut_at(motion, body.stage)
-    estimate = _estimated_quietly(motion, quantity, noise)
+        motion = body.path
     jumps = find_jumps(path, estimate)
     left_out = jumps.rows[:0]
     remarks = Remarks()
@@ -890,21 +936,23 @@ def judge_coefficient(
     return replace(coefficient, estimate=estimate, verdict=verdict, remarks=remarks)
 
 
-def measure_tensor(
-    motion: RigidMotion, quantity: Quantity, noise: Noise
-) -> tuple[DiffusionTensor | None, list[str]]:
-    """Return the tensor in body axes, or None and the reason; in the plane there is none."""
-    if motion.template.shape[1] != 3:
-        return None, []
-    try:
-        with python_warnings.catch_warnings():
-            python_warnings.simplefilter("ignore", PrecisionWarning)
-            tensor = diffusion_tensor(
-                motion, quantity=quantity, noise=noise.model, exposure=noise.exposure
-            )
-    except ValueError as error:
-        return None, [f"no diffusion tensor: {error}"]
-    return tensor, []
+def measure_tensors(
+    motions: Sequence[RigidMotion], quantity: Quantity, noise: Noise
+) -> list[tuple[DiffusionTensor | None, list[str]]]:
+    """Return the tensor of each motion in body axes, or None and the reason.
+
+    In the plane there is none, and no reason is needed.
+    """
+    solid = [motion for motion in motions if motion.dimension == 3]
+    found = iter(tensor_of_each(solid, quantity=quantity, noise=replace(noise, drift=False)))
+    tensors: list[tuple[DiffusionTensor | None, list[str]]] = []
+    for motion in motions:
+        tensor = next(found) if motion.dimension == 3 else None
+        if isinstance(tensor, ValueError):
+            tensors.append((None, [f"no diffusion tensor: {tensor}"]))
+        else:
+            tensors.append((tensor, []))
+    return tensors
 
 
 def noise_floor_test(
@@ -1043,7 +1091,9 @@ def with_sizes(
         tensor_T = None
         # A drift would mix with the translation along the axes of the body.
         if not experiment.noise.drift and are_unequal(mobility.principal_D_T.values):
-            tensor_T, no_tensor = measure_tensor(result.motion, "translation", experiment.noise)
+            tensor_T, no_tensor = measure_tensors([result.motion], "translation", experiment.noise)[
+                0
+            ]
             notes += no_tensor
         prediction = compare_body(
             mobility, D_T=D_T, D_R=D_R, tensor_T=tensor_T, tensor_R=result.tensor
