@@ -285,8 +285,8 @@ def find_stage_jumps(motions: Sequence[RigidMotion], frames: Sequence[Ints]) -> 
     -----
     The mean displacement m of the bodies between two frames, weighted with the inverse variances of
     their steps along every axis, is compared with those of all other frames by an F test of d and
-    d (G - 1) degrees of freedom, with the mean of the others subtracted, so that a steady drift is
-    no jump. The deviations of the bodies from m must be those of their other steps (p > 1e-4):
+    d (G - 1) / 2 degrees of freedom, with the median steps of the bodies subtracted, so that a steady
+    drift is no jump. The deviations of the bodies from m must be those of their other steps (p > 1e-4):
     otherwise one of them moved, and not the stage.
 
     Examples
@@ -306,7 +306,11 @@ def find_stage_jumps(motions: Sequence[RigidMotion], frames: Sequence[Ints]) -> 
 
     d = motions[0].center.shape[1] if motions else 3
     none = StageJumps(
-        np.empty(0, np.int64), np.empty((0, d)), np.empty((0, d)), np.empty(0), np.empty(0, np.int64)
+        np.empty(0, np.int64),
+        np.empty((0, d)),
+        np.empty((0, d)),
+        np.empty(0),
+        np.empty(0, np.int64),
     )
     table = _steps_between_frames(motions, frames)
     if table is None:
@@ -344,13 +348,14 @@ def find_stage_jumps(motions: Sequence[RigidMotion], frames: Sequence[Ints]) -> 
     apart = np.nansum(weight * (scaled - center - mean) ** 2, axis=(0, 2))
     freedom = d * (known.sum(axis=0) - 1)
     scatter = apart[usual & several].sum() / freedom[usual & several].sum()
-    p = fdtrc(d, d * max(int((usual & several).sum()) - 1, 1), common / d / level)
+    # Half of the degrees of freedom, because candidates were selected from these steps.
+    p = fdtrc(d, d * max(int((usual & several).sum()) - 1, 1) / 2, common / d / max(level, 1.0))
     p = np.minimum(p * len(ends), 1.0)
     found &= (p < STAGE_LEVEL) & (chdtrc(freedom, apart / scatter) > _MOVE_ALIKE)
     if np.count_nonzero(found) > most:
         return none
     root = np.sqrt(gap)[:, None]
-    error = np.sqrt(level / np.maximum(total, 1e-300)) * root
+    error = np.sqrt(max(level, 1.0) / np.maximum(total, 1e-300)) * root
     return StageJumps(
         ends[found], (mean * root)[found], error[found], p[found], known.sum(axis=0)[found]
     )

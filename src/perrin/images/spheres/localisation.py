@@ -49,7 +49,7 @@ if TYPE_CHECKING:
     import pandas as pd
     from numpy.typing import NDArray
 
-    from perrin._arrays import Ints
+    from perrin._arrays import Bools, Ints
     from perrin.images.optics.ball_image import SphereImage
     from perrin.images.optics.optics import CameraNoise, Optics
     from perrin.images.optics.window_fit import ImageFit, Window
@@ -609,14 +609,14 @@ def group_columns(
         dark = ~(fit.brightness / np.median(fit.brightness) > 0.1)
         faults = np.where(dark, _DARK, np.where(moved, _MOVED, "")).astype(object)
         if usual is not None:
-            excess = _excess(window, fit, usual, light[group])
+            square, voxels = _own_chi2(window, fit)
+            level = usual.brightness * light[group]
+            excess = usual.excess(square, fit.brightness / level, voxels=voxels)
             worst = int(excess.argmax())
-            cut = _reaches_border(frame, fit.centers[worst], image)
-            if excess[worst] > 1 and search.crowds and cut and len(group) <= _LARGEST_CUT_GROUP:
+            cut = usual.disturbed(square, voxels=voxels) & _reach_border(frame, fit.centers, image)
+            if search.crowds and cut.any() and len(group) <= _LARGEST_CUT_GROUP:
                 beyond = _crowd_of(frame, found, group, search, image, noise)
-                if np.all(beyond.chi2 <= usual.worst_chi2) and set(beyond.origin) >= set(
-                    range(len(group))
-                ):
+                if _are_spheres(beyond, usual, float(np.median(level)), count=len(group)):
                     crowds.append((group, beyond))
                     continue
             if excess[worst] > 1:
@@ -648,23 +648,33 @@ def _crowd_of(
     )
 
 
-def _excess(window: Window, fit: ImageFit, usual: UsualImage, light: Floats) -> Floats:
-    """Return the excess of `UsualImage` of every sphere of a fit with independent positions."""
+def _own_chi2(window: Window, fit: ImageFit) -> tuple[Floats, Floats]:
+    """Return chi-squared per voxel of the voxels of every sphere of a fit, and their number."""
     n = len(fit.brightness)
     own = fit.jacobian[3 * n : 4 * n]  # the unit image of each sphere
-    square = fit.weight * (window.data - fit.expected) ** 2
     voxels = own.sum(axis=1)
-    return usual.excess(
-        own @ square / np.maximum(voxels, 1e-300),
-        fit.brightness / (usual.brightness * light),
-        voxels=voxels,
+    square = own @ (fit.weight * (window.data - fit.expected) ** 2)
+    return square / np.maximum(voxels, 1e-300), voxels
+
+
+def _are_spheres(crowd: CrowdFit, usual: UsualImage, level: float, *, count: int) -> bool:
+    """Return whether all places of a fit show spheres of the usual brightness `level`.
+
+    All `count` spots of its start must be among them.
+    """
+    inside = crowd.window.holds(crowd.intensity.centers)
+    bright = crowd.intensity.brightness[inside] / level
+    return bool(
+        set(range(count)) <= set(crowd.origin.tolist())
+        and np.all(crowd.chi2 <= usual.worst_chi2)
+        and np.all((bright < usual.brightest) & (bright > 1 / usual.brightest))
     )
 
 
-def _reaches_border(frame: Floats, center: Floats, image: SphereImage) -> bool:
-    """Return whether the image of a sphere at `center` (3,) reaches the border of the frame."""
+def _reach_border(frame: Floats, centers: Floats, image: SphereImage) -> Bools:
+    """Return which images of spheres at `centers` (n, 3) reach the border of the frame."""
     last = (np.array(frame.shape) - 1) * np.array(image.voxel)
-    return bool(np.any(np.minimum(center, last - center) < image.extent))
+    return np.asarray(np.any(np.minimum(centers, last - centers) < image.extent, axis=1))
 
 
 def with_crowds(
