@@ -14,9 +14,9 @@ from scipy.spatial.distance import cdist
 import perrin
 from perrin.geometry.rotations import exp_map, log_map
 from perrin.images.optics.ball_image import sphere_image
+from perrin.images.optics.learn import UsualImage
 from perrin.images.optics.optics import CameraNoise
 from perrin.images.optics.window_fit import FreeCenters, RigidCenters, cut_window, fit_window
-from perrin.images.optics.learn import UsualImage
 from perrin.images.spheres.by_trackpy import Features
 from perrin.images.spheres.localisation import (
     NO_SPHERE,
@@ -393,12 +393,13 @@ def test_a_method_learns_from_spheres_and_not_from_dust():
     rng = np.random.default_rng(3)
     spheres = np.array([[5.0, y, x] for y in (3.0, 9.5) for x in (3.0, 9.5)])
     lumps = np.array([[5.0, 3.0, 16.0]])
-    centers = np.concatenate([spheres, lumps, lumps + [0.8, 1.1, 0.5]])
+    centers = np.concatenate([spheres, lumps, [*lumps, 0.8, 1.1, 0.5]])
     frame = drawn(centers, [1] * 4 + [0.9] * 2, rng, shape=(44, 64, 96))
     movie = Movie([frame])
     search = Search(DIAMETER, DIAMETER)
     method = choose_method(movie, search, sample_frames(movie, search, [0]))
-    assert isinstance(method, Method) and method.usual.left_out == 1
+    assert isinstance(method, Method)
+    assert method.usual.left_out == 1
     assert method.optics.diameter == pytest.approx(DIAMETER, abs=0.02)
     assert method.optics.noise.gain == pytest.approx(GAIN, rel=0.1)
     assert method.usual.brightness == pytest.approx(120.0, rel=0.03)

@@ -114,7 +114,7 @@ def test_stuck_beads_are_a_body_at_rest():
 
 
 def test_discs_are_no_rings_and_rings_are_named():
-    """A false alarm for no movie of discs, of either contrast; rings of either contrast are found."""
+    """No false alarm for discs of either contrast; rings of either contrast are named."""
     rng = np.random.default_rng(5)
     y, x = np.mgrid[:100, :100] * PIXEL
     for shape in ("disc", "ring"):
@@ -132,5 +132,6 @@ def test_discs_are_no_rings_and_rings_are_named():
             named = ring_images(signed, places, dark=dark, **given).warnings
             assert bool(named) == (shape == "ring")
             other = ring_images(signed, places, dark=not dark, **given).warnings
-            assert other and other[0].startswith("contrast:")
+            assert other
+            assert other[0].startswith("contrast:")
         assert not overlapping_places(places, contact=1.0).warnings

@@ -271,7 +271,8 @@ def test_a_jump_of_the_stage_is_found_and_measured():
     jump = np.array([1.0, -0.7, 0.2])
     motions, frames = together(jump)
     found = find_stage_jumps(motions, frames)
-    assert found.frames.tolist() == [10] and found.bodies.tolist() == [4]
+    assert found.frames.tolist() == [10]
+    assert found.bodies.tolist() == [4]
     assert np.all(np.abs(found.size[0] - jump) < 4 * found.stderr[0])
     # The mean of four steps of variance 2 D dt, known to the error of that D.
     assert found.stderr[0] == pytest.approx(np.sqrt(2 * 0.0385 * DT / 4), rel=0.3)

@@ -284,19 +284,17 @@ def find_stage_jumps(motions: Sequence[RigidMotion], frames: Sequence[Ints]) -> 
     Notes
     -----
     The mean displacement m of the bodies between two frames, weighted with the inverse variances of
-    their steps along every axis, is compared with those of all other frames by an F test of d and
-    d (G - 1) / 2 degrees of freedom, with the median steps of the bodies subtracted, so that a steady
-    drift is no jump. The deviations of the bodies from m must be those of their other steps (p > 1e-4):
-    otherwise one of them moved, and not the stage.
+    their steps along every axis, is compared with those of all G other frames by an F test of d and
+    d (G - 1) / 2 degrees of freedom. The median step of every body is subtracted, so that a steady
+    drift is no jump. The deviations of the bodies from m must be those of their other steps
+    (p > 1e-4): otherwise one of them moved, and not the stage.
 
     Examples
     --------
     >>> from dataclasses import replace
     >>> from perrin import Cluster, simulate_motion
-    >>> motions = [
-    ...     simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, D_T=0.02, dt=0.7, n_frames=30, rng=k)
-    ...     for k in range(4)
-    ... ]
+    >>> body, given = Cluster.tetrahedron(1.5), {"D_R": 5e-3, "D_T": 0.02, "dt": 0.7}
+    >>> motions = [simulate_motion(body, n_frames=30, rng=k, **given) for k in range(4)]
     >>> jump = np.where(np.arange(30) < 12, 0.0, 1.2)[:, None] * [1.0, 0.0, 0.0]
     >>> moved = [replace(m, center=m.center + jump) for m in motions]
     >>> find_stage_jumps(moved, [np.arange(30)] * 4).frames.tolist()

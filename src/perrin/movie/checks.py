@@ -518,7 +518,8 @@ def ring_images(
     for image, found in zip(images, places, strict=True):
         if not len(found):
             continue
-        y, x = np.meshgrid(*(h * np.arange(n) for h, n in zip(pixel, image.shape)), indexing="ij")
+        y, x = (h * np.arange(n) for h, n in zip(pixel, image.shape, strict=True))
+        y, x = np.meshgrid(y, x, indexing="ij")
         grid = np.stack([x.ravel(), y.ravel()], axis=1)
         grey = image.ravel().astype(np.float64) * (-1.0 if dark else 1.0)
         away, _ = cKDTree(found).query(grid)
@@ -578,8 +579,8 @@ def overlapping_places(places: Sequence[Floats], *, contact: float) -> Findings:
     >>> overlapping_places([rims, rims], contact=2.0).warnings[0][:52]
     'overlap: 8 of 8 places (100 %) are nearer than 0.85 '
     """
-    from scipy.special import bdtrc
     from scipy.spatial import cKDTree
+    from scipy.special import bdtrc
 
     near = total = 0
     for found in places:

@@ -595,11 +595,7 @@ def measure_coefficient(
         )
         none = Jumps(nothing, np.empty((0, 3)), np.empty(0), 0)
         return Coefficient(estimate, motion, motion, none, nothing, True, Remarks())
-    path = motion
-    if quantity == "translation":
-        # Doubt about the labels cuts the track, but the centre's path crosses it.
-        path = cut_at(replace(motion, piece=np.zeros_like(motion.piece)), body.stage)
-        motion = cut_at(motion, body.stage)
+    motion, path = motion_and_path(body, quantity)
     estimate = _estimated_quietly(motion, quantity, noise)
     jumps = find_jumps(path, estimate)
     left_out = jumps.rows[:0]
@@ -633,6 +629,18 @@ def measure_coefficient(
         remarks.warnings.append(words.persistence_warning(persistence, quantity))
     brownian = not (steady or alike or jumps.rows.size)
     return Coefficient(estimate, motion, path, jumps, left_out, brownian, remarks)
+
+
+def motion_and_path(body: FittedBody, quantity: Quantity) -> tuple[RigidMotion, RigidMotion]:
+    """Return the motion that a coefficient is estimated from, and the one to search for jumps.
+
+    Doubt about the labels cuts a track, but the path of the centre crosses it. A jump of the stage
+    cuts that path, and leaves the rotation as it is.
+    """
+    if quantity == "rotation":
+        return body.motion, body.motion
+    whole = replace(body.motion, piece=np.zeros_like(body.motion.piece))
+    return cut_at(body.motion, body.stage), cut_at(whole, body.stage)
 
 
 def _estimated_quietly(

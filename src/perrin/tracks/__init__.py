@@ -45,7 +45,7 @@ from perrin.tracks.identity import (
     shape_symmetry,
     squared_angle,
 )
-from perrin.tracks.linking import Centers, link_clusters, linked_tracks, step_variance
+from perrin.tracks.linking import Centers, link_clusters, linked_tracks, stage_path, step_variance
 from perrin.tracks.screening import (
     CENTRE_REMOVED,
     Screened,
@@ -130,6 +130,7 @@ __all__ = [
     "settle_identity",
     "shape_symmetry",
     "squared_angle",
+    "stage_path",
     "step_variance",
     "table_bytes",
     "table_suffix",

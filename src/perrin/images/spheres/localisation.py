@@ -587,16 +587,11 @@ def group_columns(
     groups: list[Ints] = []
     crowds: list[tuple[Ints, CrowdFit]] = []
     if optics is not None:
-        groups, chains = groups_and_crowds(found.centers, contact=contact)
         image, noise, furthest = optics.image(voxel), optics.noise, optics.diameter / 4
         light = np.broadcast_to(light, len(centers))
-        for chain in chains:
-            parts = touching_together(found.centers[chain], contact=contact)
-            # Dust makes crowds of small groups: these are fitted group by group.
-            if usual is not None and usual.left_out and max(map(len, parts)) <= _LARGEST_GROUP:
-                groups += [chain[part] for part in parts]
-            elif search.crowds:
-                crowds.append((chain, _crowd_of(frame, found, chain, search, image, noise)))
+        groups, chains = groups_to_fit(centers, contact, dusty=bool(usual and usual.left_out))
+        for chain in chains if search.crowds else []:
+            crowds.append((chain, _crowd_of(frame, found, chain, search, image, noise)))
     while groups:
         group = groups.pop()
         sample = _group_sample(frame, found, group, contact)
@@ -631,6 +626,29 @@ def group_columns(
         sigma[group[good]] = np.sqrt(np.diag(fit.covariance)).reshape(-1, 3)[good]
     columns = _axis_columns(centers) | {"mass": found.mass} | _axis_columns(sigma, "sigma_")
     return columns | {"chi2": chi2, "refined": reason == "", "reason": reason}, crowds
+
+
+def groups_to_fit(centers: Floats, contact: float, *, dusty: bool) -> tuple[list[Ints], list[Ints]]:
+    """Return the spheres of a frame as groups and crowds; see `groups_and_crowds`.
+
+    Dust makes crowds of small groups. Where there is dust, a crowd whose spheres touch in chains of
+    at most 40 is divided into these.
+
+    Examples
+    --------
+    >>> x = np.array([[0.0, 0.0, 1.5 * k] for k in range(20)])
+    >>> [len(found) for found in groups_to_fit(x, 1.0, dusty=True)]
+    [20, 0]
+    """
+    groups, crowds = groups_and_crowds(centers, contact=contact)
+    whole = []
+    for crowd in crowds:
+        parts = touching_together(centers[crowd], contact=contact)
+        if dusty and max(map(len, parts)) <= _LARGEST_GROUP:
+            groups += [crowd[part] for part in parts]
+        else:
+            whole.append(crowd)
+    return groups, whole
 
 
 def _crowd_of(
