@@ -367,6 +367,7 @@ def true_report(bodies, case):
     for c, body in enumerate(bodies):
         x = instants(body, case)
         inside = np.all((x > 0) & (x < case.light.box), axis=2).sum(axis=1)
+        x = x - np.where(np.arange(len(x)) < 10, 0.0, case.jump)[:, None, None] * [1.0, 0.0, 0.0]
         seen = np.flatnonzero(inside >= min(3, x.shape[1]))
         if len(seen):
             table = perrin.positions_table(x[seen], frames=seen).assign(cluster=c)

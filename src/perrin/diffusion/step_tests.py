@@ -316,8 +316,8 @@ def find_stage_jumps(motions: Sequence[RigidMotion], frames: Sequence[Ints]) -> 
     ends, steps, gap = table  # steps (B, G, d), NaN where a body has none
     scaled = steps / np.sqrt(gap)[:, None]
     known = np.isfinite(scaled).all(axis=2)
-    several = known.sum(axis=0) >= 2
-    usual = np.ones(len(ends), dtype=np.bool_)
+    several: Bools = np.asarray(known.sum(axis=0) >= 2)
+    usual: Bools = np.ones(len(ends), dtype=np.bool_)
     most = max(1, len(ends) // _STAGE_STEPS_PER_JUMP)
     while True:
         others = scaled[:, usual]

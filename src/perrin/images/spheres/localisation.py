@@ -588,7 +588,7 @@ def group_columns(
     crowds: list[tuple[Ints, CrowdFit]] = []
     if optics is not None:
         image, noise, furthest = optics.image(voxel), optics.noise, optics.diameter / 4
-        light = np.broadcast_to(light, len(centers))
+        dimmed = np.broadcast_to(light, len(centers))
         groups, chains = groups_to_fit(centers, contact, dusty=bool(usual and usual.left_out))
         for chain in chains if search.crowds else []:
             crowds.append((chain, _crowd_of(frame, found, chain, search, image, noise)))
@@ -605,7 +605,7 @@ def group_columns(
         faults = np.where(dark, _DARK, np.where(moved, _MOVED, "")).astype(object)
         if usual is not None:
             square, voxels = _own_chi2(window, fit)
-            level = usual.brightness * light[group]
+            level = usual.brightness * dimmed[group]
             excess = usual.excess(square, fit.brightness / level, voxels=voxels)
             worst = int(excess.argmax())
             cut = usual.disturbed(square, voxels=voxels) & _reach_border(frame, fit.centers, image)
