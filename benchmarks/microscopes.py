@@ -410,7 +410,7 @@ def main():
 
 
 def run_movie(name, case, seed, *, told):
-    """Print the results of one movie, and return them as a list of one dictionary; [] if refused."""
+    """Print the results of one movie, and return a list of its numbers; [] if it is refused."""
     begun = time.process_time()
     movie, bodies = drawn(case, seed)
     print(name, seed, f"drawn in {time.process_time() - begun:.1f} s", flush=True)

@@ -393,7 +393,7 @@ def test_a_method_learns_from_spheres_and_not_from_dust():
     rng = np.random.default_rng(3)
     spheres = np.array([[5.0, y, x] for y in (3.0, 9.5) for x in (3.0, 9.5)])
     lumps = np.array([[5.0, 3.0, 16.0]])
-    centers = np.concatenate([spheres, lumps, [*lumps, 0.8, 1.1, 0.5]])
+    centers = np.concatenate([spheres, lumps, lumps + np.array([0.8, 1.1, 0.5])])
     frame = drawn(centers, [1] * 4 + [0.9] * 2, rng, shape=(44, 64, 96))
     movie = Movie([frame])
     search = Search(DIAMETER, DIAMETER)

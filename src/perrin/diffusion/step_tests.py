@@ -315,7 +315,7 @@ def find_stage_jumps(motions: Sequence[RigidMotion], frames: Sequence[Ints]) -> 
         return none
     ends, steps, gap = table  # steps (B, G, d), NaN where a body has none
     scaled = steps / np.sqrt(gap)[:, None]
-    known = np.isfinite(scaled).all(axis=2)
+    known: Bools = np.asarray(np.isfinite(scaled).all(axis=2))
     several: Bools = np.asarray(known.sum(axis=0) >= 2)
     usual: Bools = np.ones(len(ends), dtype=np.bool_)
     most = max(1, len(ends) // _STAGE_STEPS_PER_JUMP)
