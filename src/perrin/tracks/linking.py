@@ -27,10 +27,10 @@ _FEWEST_FRAMES = 3  # of a track that is kept
 
 _NO_LINK = 1e6  # the cost of a link that is excluded
 
-# A displacement of all centres is searched for where the mean squared step over its variance exceeds
-# this multiple of its expectation, from the differences of this number of centres to all of the next
-# frame. It is accepted if it lowers chi-squared by more than `_STAGE_GAIN`: with three degrees of
-# freedom, by chance in 1e-9 of the frames.
+# A displacement of all centres is searched for where the mean squared step over its variance
+# exceeds this multiple of its expectation, from the differences of this number of centres to all
+# of the next frame. It is accepted if it lowers chi-squared by more than `_STAGE_GAIN`: with three
+# degrees of freedom, by chance in 1e-9 of the frames.
 _STAGE_SUSPECTED, _STAGE_TRIALS, _STAGE_GAIN = 2.5, 8, 45.0
 
 
@@ -284,9 +284,9 @@ def _link_costs(
 ) -> Iterator[tuple[Ints, Ints, Floats]]:
     """Yield independent sets of last groups and new groups within each other's gates, with costs.
 
-    A cost is half the squared distance over its variance, and the logarithm of the volume over which
-    a track may have moved: one that was lost for some frames is no rival of one seen just before.
-    Out of the gate it is above all others.
+    A cost is half the squared distance over its variance, and the logarithm of the volume over
+    which a track may have moved: one that was lost for some frames is no rival of one seen just
+    before. Out of the gate it is above all others.
     """
     from scipy.spatial import cKDTree
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from perrin._arrays import Floats
+    from perrin._arrays import Bools, Floats
     from perrin.images.optics.window_fit import Window
 
 
@@ -34,7 +34,7 @@ _MAX_LEARNING_ROUNDS = 15
 # What is no sphere has over this multiple of the usual chi-squared, beyond this number of standard
 # errors of it, or over this multiple of the usual brightness, beyond this number of standard
 # deviations.
-_WORST_CHI2, _CHI2_DEVIATIONS, _BRIGHTEST, _BRIGHT_DEVIATIONS = 1.6, 6.0, 1.7, 6.0
+_WORST_CHI2, _CHI2_DEVIATIONS, _BRIGHTEST, _BRIGHT_DEVIATIONS = 1.6, 6.0, 1.4, 8.0
 
 # Searches for the optics, each without the samples that the one before found to be no spheres.
 _MAX_SEARCHES, _FEWEST_SAMPLES = 4, 2
@@ -147,7 +147,7 @@ class UsualImage:
     --------
     >>> usual = UsualImage(1.0, 100.0, 0.1)
     >>> usual.brightest, UsualImage(1.0, 100.0, 0.3).brightest > 2 * usual.brightest
-    (1.7, True)
+    (2.225540928492468, True)
     """
 
     chi2: float
@@ -205,9 +205,23 @@ class UsualImage:
         voxels : ndarray, shape (n,)
             Number of voxels in each sphere.
         """
-        chance = 1 + _CHI2_DEVIATIONS * np.sqrt(2 / np.maximum(voxels, 1.0))
-        bound = self.chi2 * np.maximum(_WORST_CHI2, chance)
+        bound = self.chi2 * np.maximum(_WORST_CHI2, _chance(voxels))
         return np.maximum(chi2 / bound, brightness / self.brightest)
+
+    def disturbed(self, chi2: Floats, *, voxels: Floats) -> Bools:
+        """Return which images of spheres have more residual than chance leaves.
+
+        Parameters
+        ----------
+        chi2, voxels : ndarray, shape (n,)
+            As in `excess`.
+        """
+        return np.asarray(chi2 > self.chi2 * _chance(voxels))
+
+
+def _chance(voxels: Floats) -> Floats:
+    """Return the largest ratio of a chi-squared per voxel to the usual one by chance."""
+    return 1 + _CHI2_DEVIATIONS * np.sqrt(2 / np.maximum(voxels, 1.0))
 
 
 class LearnedOptics(NamedTuple):
@@ -303,9 +317,7 @@ class GroupSample(NamedTuple):
         residual = window.data - fit.expected
         information = weighted @ slope.T - shared.T @ taken
         score = weighted @ residual - taken.T @ (nuisance @ residual)
-        return SampleFit(
-            fit.centers, information, score, fit.expected, residual**2, fit.brightness
-        )
+        return SampleFit(fit.centers, information, score, fit.expected, residual**2, fit.brightness)
 
 
 class CrowdSample(NamedTuple):

@@ -49,7 +49,7 @@ if TYPE_CHECKING:
     import pandas as pd
     from numpy.typing import NDArray
 
-    from perrin._arrays import Ints
+    from perrin._arrays import Bools, Ints
     from perrin.images.optics.ball_image import SphereImage
     from perrin.images.optics.optics import CameraNoise, Optics
     from perrin.images.optics.window_fit import ImageFit, Window
@@ -587,16 +587,11 @@ def group_columns(
     groups: list[Ints] = []
     crowds: list[tuple[Ints, CrowdFit]] = []
     if optics is not None:
-        groups, chains = groups_and_crowds(found.centers, contact=contact)
         image, noise, furthest = optics.image(voxel), optics.noise, optics.diameter / 4
-        light = np.broadcast_to(light, len(centers))
-        for chain in chains:
-            parts = touching_together(found.centers[chain], contact=contact)
-            # Dust makes crowds of small groups: these are fitted group by group.
-            if usual is not None and usual.left_out and max(map(len, parts)) <= _LARGEST_GROUP:
-                groups += [chain[part] for part in parts]
-            elif search.crowds:
-                crowds.append((chain, _crowd_of(frame, found, chain, search, image, noise)))
+        dimmed = np.broadcast_to(light, len(centers))
+        groups, chains = groups_to_fit(centers, contact, dusty=bool(usual and usual.left_out))
+        for chain in chains if search.crowds else []:
+            crowds.append((chain, _crowd_of(frame, found, chain, search, image, noise)))
     while groups:
         group = groups.pop()
         sample = _group_sample(frame, found, group, contact)
@@ -609,14 +604,14 @@ def group_columns(
         dark = ~(fit.brightness / np.median(fit.brightness) > 0.1)
         faults = np.where(dark, _DARK, np.where(moved, _MOVED, "")).astype(object)
         if usual is not None:
-            excess = _excess(window, fit, usual, light[group])
+            square, voxels = _own_chi2(window, fit)
+            level = usual.brightness * dimmed[group]
+            excess = usual.excess(square, fit.brightness / level, voxels=voxels)
             worst = int(excess.argmax())
-            cut = _reaches_border(frame, fit.centers[worst], image)
-            if excess[worst] > 1 and search.crowds and cut and len(group) <= _LARGEST_CUT_GROUP:
+            cut = usual.disturbed(square, voxels=voxels) & _reach_border(frame, fit.centers, image)
+            if search.crowds and cut.any() and len(group) <= _LARGEST_CUT_GROUP:
                 beyond = _crowd_of(frame, found, group, search, image, noise)
-                if np.all(beyond.chi2 <= usual.worst_chi2) and set(beyond.origin) >= set(
-                    range(len(group))
-                ):
+                if _are_spheres(beyond, usual, float(np.median(level)), count=len(group)):
                     crowds.append((group, beyond))
                     continue
             if excess[worst] > 1:
@@ -631,6 +626,29 @@ def group_columns(
         sigma[group[good]] = np.sqrt(np.diag(fit.covariance)).reshape(-1, 3)[good]
     columns = _axis_columns(centers) | {"mass": found.mass} | _axis_columns(sigma, "sigma_")
     return columns | {"chi2": chi2, "refined": reason == "", "reason": reason}, crowds
+
+
+def groups_to_fit(centers: Floats, contact: float, *, dusty: bool) -> tuple[list[Ints], list[Ints]]:
+    """Return the spheres of a frame as groups and crowds; see `groups_and_crowds`.
+
+    Dust makes crowds of small groups. Where there is dust, a crowd whose spheres touch in chains of
+    at most 40 is divided into these.
+
+    Examples
+    --------
+    >>> x = np.array([[0.0, 0.0, 1.5 * k] for k in range(20)])
+    >>> [len(found) for found in groups_to_fit(x, 1.0, dusty=True)]
+    [20, 0]
+    """
+    groups, crowds = groups_and_crowds(centers, contact=contact)
+    whole = []
+    for crowd in crowds:
+        parts = touching_together(centers[crowd], contact=contact)
+        if dusty and max(map(len, parts)) <= _LARGEST_GROUP:
+            groups += [crowd[part] for part in parts]
+        else:
+            whole.append(crowd)
+    return groups, whole
 
 
 def _crowd_of(
@@ -648,23 +666,33 @@ def _crowd_of(
     )
 
 
-def _excess(window: Window, fit: ImageFit, usual: UsualImage, light: Floats) -> Floats:
-    """Return the excess of `UsualImage` of every sphere of a fit with independent positions."""
+def _own_chi2(window: Window, fit: ImageFit) -> tuple[Floats, Floats]:
+    """Return chi-squared per voxel of the voxels of every sphere of a fit, and their number."""
     n = len(fit.brightness)
     own = fit.jacobian[3 * n : 4 * n]  # the unit image of each sphere
-    square = fit.weight * (window.data - fit.expected) ** 2
     voxels = own.sum(axis=1)
-    return usual.excess(
-        own @ square / np.maximum(voxels, 1e-300),
-        fit.brightness / (usual.brightness * light),
-        voxels=voxels,
+    square = own @ (fit.weight * (window.data - fit.expected) ** 2)
+    return square / np.maximum(voxels, 1e-300), voxels
+
+
+def _are_spheres(crowd: CrowdFit, usual: UsualImage, level: float, *, count: int) -> bool:
+    """Return whether all places of a fit show spheres of the usual brightness `level`.
+
+    All `count` spots of its start must be among them.
+    """
+    inside = crowd.window.holds(crowd.intensity.centers)
+    bright = crowd.intensity.brightness[inside] / level
+    return bool(
+        set(range(count)) <= set(crowd.origin.tolist())
+        and np.all(crowd.chi2 <= usual.worst_chi2)
+        and np.all((bright < usual.brightest) & (bright > 1 / usual.brightest))
     )
 
 
-def _reaches_border(frame: Floats, center: Floats, image: SphereImage) -> bool:
-    """Return whether the image of a sphere at `center` (3,) reaches the border of the frame."""
+def _reach_border(frame: Floats, centers: Floats, image: SphereImage) -> Bools:
+    """Return which images of spheres at `centers` (n, 3) reach the border of the frame."""
     last = (np.array(frame.shape) - 1) * np.array(image.voxel)
-    return bool(np.any(np.minimum(center, last - center) < image.extent))
+    return np.asarray(np.any(np.minimum(centers, last - centers) < image.extent, axis=1))
 
 
 def with_crowds(

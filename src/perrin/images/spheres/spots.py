@@ -204,7 +204,8 @@ class Fading:
     @classmethod
     def from_dict(cls, entry: dict[str, Any]) -> Fading:
         """Return the brightness that `to_dict` wrote."""
-        return cls(**{k: tuple(v) if isinstance(v, list) else v for k, v in entry.items()})
+        frames, light = tuple(entry["frames"]), tuple(entry["light"])
+        return cls(frames, light, entry["per_depth"], entry["depth"])
 
 
 def find_fading(frames: Sequence[int], spots: Sequence[Features]) -> Fading | None:
