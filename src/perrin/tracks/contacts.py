@@ -23,9 +23,9 @@ _FALSE_CONTACTS = 1e-4
 _HINDERED = (0.2, 0.5, 1.0)
 
 # The distance of a pair in contact is measured with up to eight times the stated error; without a
-# stated error, with an error from a thousandth to a thirtieth of the reach.
+# stated error, with an error from a thousandth to a sixteenth of the reach.
 _ERROR_FACTORS = (1.0, 2.0, 4.0, 8.0)
-_ERROR_SHARES = tuple(2.0**k for k in range(-10, -4))
+_ERROR_SHARES = tuple(2.0**k for k in range(-10, -3))
 
 # A step has at least this share of the variance that is left when that of the errors is subtracted.
 _LEAST_STEP_SHARE = 0.01
