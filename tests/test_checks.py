@@ -15,6 +15,7 @@ from perrin.images.optics.learn import saturated_share
 from perrin.images.spheres.spots import mass_cut
 from perrin.movie import checks
 from perrin.movie.bodies import group_sizes
+from perrin.run.results import BodyKind
 
 CONTACT, DT = 2.45, 0.73
 
@@ -289,6 +290,23 @@ def test_clusters_with_other_numbers_of_spheres_are_reported():
     many = pd.concat([x.drop(index=8).assign(cluster=k) for k in range(40)])
     text = noted(checks.missing_spheres(many, sizes=four, contact=CONTACT, frames=np.arange(20)))
     assert text.endswith("cluster 9: 3 found in 1 frame; and 30 more")
+
+
+def test_the_shape_of_a_part_of_a_larger_cluster_is_noted():
+    """A trimer beside tetrahedra may be one with an undyed sphere; tetrahedra alone are none."""
+    shapes = {0: 4, 1: 4, 2: 3}
+    results = [
+        SimpleNamespace(
+            cluster=c,
+            motion=SimpleNamespace(template=perrin.Cluster.touching(n, CONTACT).positions),
+        )
+        for c, n in shapes.items()
+    ]
+    whole = BodyKind(4, "T_d", (0, 1))
+    part = BodyKind(3, "D_3h", (2,))
+    assert checks.partial_bodies(results[:2], [whole]) == NOTHING
+    text = noted(checks.partial_bodies(results, [part, whole]))
+    assert "cluster 2 (3 particles, D_3h) in those of 4 particles, T_d" in text
 
 
 def test_groups_of_touching_spheres_are_counted():

@@ -23,15 +23,18 @@ _FALSE_CONTACTS = 1e-4
 _HINDERED = (0.2, 0.5, 1.0)
 
 # The distance of a pair in contact is measured with up to eight times the stated error; without a
-# stated error, with an error from a thousandth to a thirtieth of the reach.
+# stated error, with an error from a thousandth to a sixteenth of the reach.
 _ERROR_FACTORS = (1.0, 2.0, 4.0, 8.0)
-_ERROR_SHARES = tuple(2.0**k for k in range(-10, -4))
+_ERROR_SHARES = tuple(2.0**k for k in range(-10, -3))
 
 # A step has at least this share of the variance that is left when that of the errors is subtracted.
 _LEAST_STEP_SHARE = 0.01
 
 # A likelihood ratio that is e^3 lower says nothing: one gross error costs more than that.
 _INSIGNIFICANT = 3.0
+
+# Where no contact is found, stated errors are taken to be this many times larger.
+_FAR_ABOVE = 4.0
 
 # Distances off by over five standard errors are measured wrongly, in this share of the frames.
 _GROSS_ERRORS, _GROSS_SHARE = 5.0, 0.02
@@ -123,16 +126,25 @@ def lasting_contacts(
         variance = np.maximum(variance - 2 * error**2, _LEAST_STEP_SHARE * variance)
     else:
         errors = reach * np.array(_ERROR_SHARES)
-    index, start, stop, score = _sequential_test(
-        pair,
-        time[one],
-        distance,
-        errors,
-        steps=variance[first] + variance[second],
-        reach=reach,
+    steps = variance[first] + variance[second]
+    threshold = float(np.log((distance <= reach).sum() / _FALSE_CONTACTS))
+    found = _sequential_test(
+        pair, time[one], distance, errors, steps=steps, reach=reach, threshold=threshold
     )
+    if error and not found.one.size:
+        # With errors far above the stated ones nothing can be decided, only assumed.
+        errors = errors * _FAR_ABOVE
+        found = _sequential_test(
+            pair, time[one], distance, errors, steps=steps, reach=reach, threshold=np.inf
+        )
     begin = frame.min()
-    return Contacts(first[index], second[index], begin + start, begin + stop, score)
+    return Contacts(
+        first[found.one],
+        second[found.one],
+        begin + found.first,
+        begin + found.last,
+        found.score,
+    )
 
 
 def _near_pairs(number: Ints, code: Ints, x: Floats, *, reach: float) -> tuple[Ints, Ints]:
@@ -151,9 +163,16 @@ def _near_pairs(number: Ints, code: Ints, x: Floats, *, reach: float) -> tuple[I
 
 
 def _sequential_test(
-    pair: Ints, time: Ints, distance: Floats, errors: Floats, *, steps: Floats, reach: float
-) -> tuple[Ints, Ints, Ints, Floats]:
-    """Return pair, first and last time, and score of every stretch of constant distance.
+    pair: Ints,
+    time: Ints,
+    distance: Floats,
+    errors: Floats,
+    *,
+    steps: Floats,
+    reach: float,
+    threshold: float,
+) -> Contacts:
+    """Return the stretches of constant distance, with the number of the pair for both tracks.
 
     Rows are sorted by pair and time. Every hypothesis is a Kalman filter of one number.
     """
@@ -167,7 +186,6 @@ def _sequential_test(
     mean, spread, level = np.zeros(shape), np.zeros(shape), np.zeros(shape)
     start, last, before = (np.zeros(count, dtype=np.int64) for _ in range(3))
     best, score = np.zeros(count), np.zeros(count)
-    threshold = float(np.log((distance <= reach).sum() / _FALSE_CONTACTS))
     out: list[tuple[Ints, Ints, Ints, Floats]] = []
 
     def restart(chosen: Ints, values: Floats, now: Ints) -> None:
@@ -214,4 +232,4 @@ def _sequential_test(
     kept = np.flatnonzero(decided | (open_still & usual))
     out.append((kept, start[kept], last[kept], best[kept]))
     index, first, final, value = (np.concatenate(column) for column in zip(*out, strict=True))
-    return index, first, final, value
+    return Contacts(index, index, first, final, value)

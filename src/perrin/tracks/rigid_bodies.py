@@ -20,9 +20,10 @@ if TYPE_CHECKING:
 # Two groups are one body if they are in contact in this share of the frames that show both.
 _LASTING_SHARE_OF_FRAMES = 0.8
 
-# The distances between two groups of one body scatter by under this share of the contact distance
-# (from their median absolute deviation, of at most this number of pairs).
-_RIGID_SHARE, _PAIRS_COMPARED = 0.05, 30
+# The distances between two groups of one body scatter by under this share of the contact distance,
+# or this multiple of the scatter of the bonds (from their median absolute deviation, of at most
+# this number of pairs).
+_RIGID_SHARE, _RIGID_RATIO, _PAIRS_COMPARED = 0.05, 3.0, 30
 
 # The median absolute deviation of a normal distribution in standard deviations.
 _NORMAL_MAD = 0.6745
@@ -278,6 +279,9 @@ def _joined_members(
     alive: dict[int, Bools] = dict(enumerate(seen))
     bonded: dict[int, dict[int, Bools]] = {m: {} for m in range(len(seen))}
     group = np.arange(len(seen))
+    bonds = list(zip(one.tolist(), other.tolist(), strict=True))
+    usual = float(np.median(_scatter(members.row, bonds, x)))
+    bound = max(_RIGID_SHARE * contact, _RIGID_RATIO * usual)
     for i, j, start, end in zip(one, other, contacts.first, contacts.last, strict=True):
         held = seen[i] & seen[j] & (number >= start) & (number <= end)
         both = held | bonded[int(i)].get(int(j), np.zeros_like(held))
@@ -289,7 +293,8 @@ def _joined_members(
         together = (alive[a] & alive[b]).sum()
         if bonded[a][b].sum() < _LASTING_SHARE_OF_FRAMES * together:
             continue
-        if not _keeps_its_shape(members.row, inside[a], inside[b], x, contact=contact):
+        pairs = [(i, j) for i in inside[a] for j in inside[b]]
+        if not np.all(_scatter(members.row, pairs, x) <= bound):
             continue
         group[inside[b]] = a
         inside[a] += inside.pop(b)
@@ -302,21 +307,15 @@ def _joined_members(
     return np.unique(group, return_inverse=True)[1].astype(np.int64)
 
 
-def _keeps_its_shape(
-    row: Ints, one: list[int], other: list[int], x: Floats, *, contact: float
-) -> bool:
-    """Return whether the distances between two groups of members are constant."""
-    pairs = [(i, j) for i in one for j in other]
-    pairs = pairs[:: max(1, len(pairs) // _PAIRS_COMPARED)]
-    for i, j in pairs:
+def _scatter(row: Ints, pairs: list[tuple[int, int]], x: Floats) -> Floats:
+    """Return the scatter of the distance of some pairs of members, 0 for pairs of few frames."""
+    scatter = []
+    for i, j in pairs[:: max(1, len(pairs) // _PAIRS_COMPARED)]:
         both = np.flatnonzero((row[i] >= 0) & (row[j] >= 0))
-        if both.size < 3:
-            continue
         distance = np.linalg.norm(x[row[i, both]] - x[row[j, both]], axis=1)
-        spread = np.median(np.abs(distance - np.median(distance))) / _NORMAL_MAD
-        if spread > _RIGID_SHARE * contact:
-            return False
-    return True
+        off = np.abs(distance - np.median(distance)) if both.size > 2 else np.zeros(1)
+        scatter.append(np.median(off) / _NORMAL_MAD)
+    return np.array(scatter)
 
 
 def _joined_in_time(frame: Ints, x: Floats, body: Ints, *, variance: float) -> Ints:
