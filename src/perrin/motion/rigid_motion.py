@@ -115,9 +115,14 @@ class RigidMotion:
     def template_error(self) -> float:
         """Bound of the error of the template's positions, um.
 
-        Six standard errors, the second-order inflation of the shape by noise, and rounding.
+        Six standard errors, the second-order inflation of the shape by noise, and rounding. Where
+        particles are recorded at different times, the errors of the poses are in the shape too.
         """
-        first_order = 6 * self.sigma / np.sqrt(self.fitted.size)
+        square = self.sigma**2
+        if self.turn_noise is not None:
+            turn = np.trace(self.covariance[self.fitted], axis1=1, axis2=2).mean()
+            square += self.R**2 * turn / 3 + self.center_variance[self.fitted].mean()
+        first_order = 6 * np.sqrt(square / self.fitted.size)
         return float(first_order + 2 * self.sigma**2 / self.R + 1e-6 * self.R)
 
     @cached_property
