@@ -15,7 +15,7 @@ import perrin.movie.checks as checks
 from perrin._arrays import finite_or_none, number_fault, options_from, refuse, refuse_unknown
 from perrin.errors import IdentityError, PartsError, TooFewFramesError
 from perrin.images.imaging import Imaging, View
-from perrin.images.spheres.localisation import NO_FLAT_MODEL, Search, check_search, is_flat
+from perrin.images.spheres.localisation import Search, check_search, is_flat
 from perrin.images.spheres.spots import Spots
 from perrin.images.stack import digest
 from perrin.motion.scanning import scan_share
@@ -185,6 +185,7 @@ def analyze_stack(
         minmass=spots.minmass,
         border=spots.border,
         crowds=True,  # clusters that meet may be a crowd for some frames
+        circles=refine == "model" and is_flat(stack),
     )
     faults += _faults_of(check_search, stack, search, refine, optics=optics)
     if size is not None:
@@ -195,8 +196,6 @@ def analyze_stack(
     refuse(faults)
     check_workers(work)
 
-    flat = refine == "model" and is_flat(stack)
-    refine = None if flat else refine
     numbers, excluded = _selected_frames(len(stack), frames), sorted({int(c) for c in exclude})
     work.report(0, 0, "taking the file's SHA-256")
     depends = _dependencies(stack, search, refine, optics, numbers)
@@ -226,8 +225,7 @@ def analyze_stack(
             | {"size": bodies.size, "exclude": excluded},
             improved=poses.improved,
         )
-    findings = poses.findings + checks.Findings(notes=(NO_FLAT_MODEL,) if flat else ())
-    return _with_checks(report, stack, located, bodies, search, findings)
+    return _with_checks(report, stack, located, bodies, search, poses.findings)
 
 
 def with_own_times(table: pd.DataFrame, stack: Stack) -> pd.DataFrame:
@@ -479,6 +477,7 @@ def _imaging(stack: Stack, located: Located, bodies: Bodies, search: Search) -> 
         spots=located.spots,
         views=tuple(views),
         optics=located.method.optics,
+        radial=located.method.radial,
         minmass=float(located.method.search.minmass or 0.0),
         voxel=(z, y, x),
         diameter=search.diameter,

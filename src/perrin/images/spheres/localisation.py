@@ -23,6 +23,8 @@ from perrin.images.optics.crowd_fit import crowd_piece, fit_crowd
 from perrin.images.optics.learn import CrowdSample, GroupSample, fit_samples, saturated_share
 from perrin.images.optics.window_fit import FreeCenters, fit_window
 from perrin.images.spheres.by_trackpy import Features, find_features, refine_by_trackpy
+from perrin.images.spheres.circles import circle_cut, find_circles
+from perrin.images.spheres.planar import learn_plane, plane_columns
 from perrin.images.spheres.spots import (
     SPOT_KEYWORDS,
     Spots,
@@ -41,6 +43,7 @@ if TYPE_CHECKING:
 
     from perrin._arrays import Ints
     from perrin.images.optics.optics import Optics
+    from perrin.images.optics.radial_image import RadialImage
 
     Columns: TypeAlias = dict[str, NDArray[Any]]
 
@@ -64,12 +67,6 @@ _NOT_CONVERGED, _MOVED, _DARK = (
     "moved over half a radius",
     "no light of its own",
 )
-
-NO_FLAT_MODEL = (
-    "the model of the image is that of a volume; in this 2-D movie places are filtered centroids: "
-    "pass refine=None, or refine='trackpy' where spheres touch"
-)
-
 
 class StackLike(Protocol):
     """A movie from which spheres can be located: sizes, and one frame at a time."""
@@ -106,6 +103,8 @@ class Search:
         Spheres that the border of the stack cuts are located too.
     crowds : bool
         Spheres in chains of over 16 are refined too.
+    circles : bool
+        Spots are centres of circular symmetry, bright or dark: in a 2-D movie for the model.
 
     Examples
     --------
@@ -120,9 +119,13 @@ class Search:
     minmass: float | None = None
     border: bool = True
     crowds: bool = False
+    circles: bool = False
 
     def spots(self, frame: Floats, voxel: _Voxel) -> Features:
         """Return the spots of a frame, noise among them."""
+        if self.circles:
+            margin = 0.0 if self.border else self.diameter / 2
+            return find_circles(frame[0], contact=self.contact, pixel=voxel[1:], margin=margin)
         return find_features(
             frame,
             diameter=self.diameter,
@@ -193,11 +196,14 @@ class Method:
         How positions are refined.
     optics : Optics or None
         The optics for refinement by the model.
+    radial : RadialImage or None
+        The image of a sphere of a 2-D movie for refinement by the model.
     """
 
     search: Search
     refine: Refine = "model"
     optics: Optics | None = None
+    radial: RadialImage | None = None
 
     def locate_in(self, stack: StackLike, i: int) -> LocatedFrame:
         """Find and refine the spheres of frame i.
@@ -221,7 +227,11 @@ class Method:
         frame = _finite_frame(data, i)
         spots = self.search.spots(frame, voxel)
         found = self.search.spheres(spots)
-        if self.refine == "model":
+        if self.radial is not None:
+            columns = plane_columns(
+                frame[0], found, contact=self.search.contact, image=self.radial, pixel=voxel[1:]
+            )
+        elif self.refine == "model":
             columns = group_columns(frame, found, self.search.contact, self.optics, voxel)
             if self.optics is not None and self.search.crowds:
                 columns = with_crowds(columns, frame, found, self.search, self.optics, voxel)
@@ -306,6 +316,17 @@ def choose_method(
     PrecisionWarning
         As in `mass_cut`.
     """
+    if search.circles:
+        if search.minmass is None:
+            masses = [sampled.spots.mass for sampled in sample]
+            search = replace(search, minmass=circle_cut(np.concatenate([np.empty(0), *masses])))
+        radial = learn_plane(
+            [np.asarray(sampled.frame[0], dtype=np.float64) for sampled in sample],
+            [search.spheres(sampled.spots).centers[:, 1:] for sampled in sample],
+            contact=search.contact,
+            pixel=_voxel_size(stack)[1:],
+        )
+        return Method(search, refine, None, radial)
     if search.minmass is None:
         masses = [sampled.spots.mass for sampled in sample]
         search = replace(search, minmass=mass_cut(np.concatenate([np.empty(0), *masses])))
@@ -418,12 +439,16 @@ def locate(
     faults: list[str] = []
     spots = options_from(Spots, spots, settings, name="spots", faults=faults)
     search = Search(
-        diameter, contact, spots.dark, spots.percentile, spots.minmass, spots.border, crowds
+        diameter=diameter,
+        contact=contact,
+        dark=spots.dark,
+        percentile=spots.percentile,
+        minmass=spots.minmass,
+        border=spots.border,
+        crowds=crowds,
+        circles=refine == "model" and is_flat(stack),
     )
     check_search(stack, search, refine, optics=optics, faults=faults)
-    if refine == "model" and is_flat(stack):
-        refine = None
-        warnings.warn(NO_FLAT_MODEL, PrecisionWarning, stacklevel=2)
     n_frames = stack.shape[0]
     numbers = list(range(n_frames)) if frames is None else [int(i) for i in frames]
     outside = [i for i in numbers if not 0 <= i < n_frames]
@@ -712,6 +737,11 @@ def check_search(
             "overlap; are the two exchanged?"
         )
     faults += number_fault("percentile", search.percentile, least=0, below=100)
+    if search.circles and optics is not None:
+        faults.append(
+            "optics: those of a volume do not describe a 2-D movie, whose image of a sphere is "
+            "learned: leave optics out"
+        )
     if not lengths and len(stack.shape) == 4:
         faults += size_faults(stack, search, optics)
     refuse(faults)
