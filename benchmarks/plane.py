@@ -363,9 +363,7 @@ def matched(results, bodies):
     for result in results:
         rows = np.rint(result.motion.time / DT).astype(int)
         center = result.motion.center[:, :2]
-        away = [
-            np.nanmedian(np.linalg.norm(b.mean(axis=1)[rows] - center, axis=1)) for b in bodies
-        ]
+        away = [np.nanmedian(np.linalg.norm(b.mean(axis=1)[rows] - center, axis=1)) for b in bodies]
         best = int(np.argmin(away))
         if away[best] < DIAMETER / 4 and best not in pairs:
             pairs[best] = result

@@ -212,8 +212,8 @@ def learn_method(
     Returns
     -------
     dict
-        Values that JSON can hold: ``minmass``, ``optics``, ``radial``, the ``spots`` of the sampled frames as
-        (frame, mass), and the warnings under ``told``.
+        Values that JSON can hold: ``minmass``, ``optics``, ``radial``, the ``spots`` of the sampled
+        frames as (frame, mass), and the warnings under ``told``.
 
     Raises
     ------

@@ -26,9 +26,18 @@ if TYPE_CHECKING:
 
 
 # Distances of the knots and ends of the image that are tried, in contact distances.
-_SPACINGS, _REACHES = (0.05, 0.03, 0.08), (0.8, 0.65, 1.1)
+_SPACINGS, _REACHES = (0.05, 0.03, 0.08, 0.12), (0.8, 0.65, 1.1)
+
+# Number of samples with which knots and ends are compared.
+_COMPARED = 20
+
+# Standard errors by which chi-squared of other spheres must be lower with more coefficients.
+_CLEARLY_BETTER = 1.0
 
 _MAX_ROUNDS = 20
+
+# Median brightness of spheres in its standard errors, and the round from which it is required.
+_LEAST_SIGNIFICANCE, _JUDGED = 4.0, 2
 
 # The search ends where a step is this far in squared standard errors, for each coefficient.
 _SETTLED = 0.01
@@ -58,9 +67,9 @@ class RadialSample(NamedTuple):
     centers: Floats
     others: Floats
 
-    def patch(self, reach: float, pixel: tuple[float, float]) -> Patch:
-        """Return the pixels within `reach` of the spheres and of no other ones."""
-        patch = cut_patch(self.frame, self.centers, reach=reach, pixel=pixel)
+    def patch(self, surroundings: float, reach: float, pixel: tuple[float, float]) -> Patch:
+        """Return the pixels of the surroundings that no other sphere reaches."""
+        patch = cut_patch(self.frame, self.centers, reach=surroundings, pixel=pixel)
         if not len(self.others):
             return patch
         free = (patch.offsets(self.others)[1] > reach).all(axis=0)
@@ -87,6 +96,12 @@ def _equations(patch: Patch, fit: PatchFit, image: RadialImage) -> _Equations:
     residual = patch.data - fit.expected
     score = weighted @ residual - taken.T @ ((fit.jacobian * fit.weight) @ residual)
     return _Equations(weighted @ design.T - shared.T @ taken, score)
+
+
+def _brightness_error(fit: PatchFit) -> Floats:
+    """Return the standard errors (n,) of the brightness of the spheres of a fit."""
+    n = len(fit.centers)
+    return np.asarray(np.sqrt(np.maximum(np.diag(fit.covariance)[2 * n : 3 * n], 1e-300)))
 
 
 def noise_of_neighbours(patches: Sequence[Patch], fits: Sequence[PatchFit]) -> CameraNoise:
@@ -133,7 +148,7 @@ def first_image(
     k = max(round(reach / spacing) - 1, 3)
     information, score, square, count = np.zeros((k, k)), np.zeros(k), 0.0, 0
     for sample in samples:
-        patch = sample.patch(spacing * (k + 1), pixel)
+        patch = sample.patch(spacing * (k + 1), spacing * (k + 1), pixel)
         distance = patch.offsets(sample.centers)[1]
         design = spline_design(distance, spacing=spacing, k=k).sum(axis=0)
         # Without the part that the background explains.
@@ -178,8 +193,10 @@ def settled_image(
     """
     samples, step = list(samples), np.inf
     for k in range(_MAX_ROUNDS):
-        patches = [s.patch(image.reach, pixel) for s in samples]
-        enough = [p.has_enough_pixels(len(s.centers)) for p, s in zip(patches, samples, strict=True)]
+        patches = [s.patch(image.surroundings, image.reach, pixel) for s in samples]
+        enough = [
+            p.has_enough_pixels(len(s.centers)) for p, s in zip(patches, samples, strict=True)
+        ]
         samples = [s for s, good in zip(samples, enough, strict=True) if good]
         patches = [p for p, good in zip(patches, enough, strict=True) if good]
         if sum(len(p.data) for p in patches) < _PIXELS_PER_COEFFICIENT * len(image.coefficients):
@@ -191,10 +208,12 @@ def settled_image(
         score = np.sum([e.score for e in parts], axis=0)
         change = np.linalg.lstsq(information, score, rcond=1e-10)[0]
         step = float(change @ score) / len(score)
-        typical = float(np.median(np.concatenate([f.brightness for f in fits])))
-        image = replace(
-            image, coefficients=(image.coefficients + change) * typical, noise=noise
-        )
+        brightness = np.concatenate([f.brightness for f in fits])
+        typical = float(np.median(brightness))
+        error = np.concatenate([_brightness_error(f) for f in fits])
+        if k >= _JUDGED and not np.median(brightness / error) > _LEAST_SIGNIFICANCE:
+            return image, samples, np.inf
+        image = replace(image, coefficients=(image.coefficients + change) * typical, noise=noise)
         kept = [f.brightness > LEAST_BRIGHTNESS * typical for f in fits]
         samples = [
             s._replace(centers=f.centers[good])
@@ -213,8 +232,8 @@ def held_out_misfit(
     reach: float,
     pixel: tuple[float, float],
     noise: CameraNoise,
-) -> float:
-    """Return chi-squared of samples that an image was not learned from, within a given reach.
+) -> Floats:
+    """Return chi-squared of each sample that an image was not learned from, within a reach.
 
     Parameters
     ----------
@@ -229,14 +248,29 @@ def held_out_misfit(
 
     Returns
     -------
-    float
+    ndarray, shape (n,)
     """
-    total = 0.0
+    out = []
     for sample in samples:
-        patch = sample.patch(reach, pixel)
+        patch = sample.patch(reach, reach, pixel)
         fit = fit_patch(patch, replace(image, noise=noise), sample.centers)
-        total += float(fit.weight @ (patch.data - fit.expected) ** 2)
-    return total
+        out.append(fit.weight @ (patch.data - fit.expected) ** 2)
+    return np.array(out)
+
+
+def _simplest_of_best(tried: dict[tuple[float, float], Floats]) -> tuple[float, float]:
+    """Return the spacing and reach of fewest coefficients that are not clearly worse than the best.
+
+    The samples are the same for all, so that the error of a difference is that of its own spread.
+    """
+    best = min(tried.values(), key=lambda chi2: float(chi2.sum()))
+    good = []
+    for pair, chi2 in tried.items():
+        worse = chi2 - best
+        error = float(np.std(worse)) * np.sqrt(len(worse))
+        if worse.sum() <= _CLEARLY_BETTER * error:
+            good.append(pair)
+    return min(good, key=lambda pair: pair[1] / pair[0])
 
 
 def learn_image(
@@ -262,40 +296,48 @@ def learn_image(
     Raises
     ------
     NoSpheresError
-        Where there are too few spheres, the search does not converge, or they do not exceed the
-        noise.
+        Where there are too few spheres, the search does not converge, or their brightness is less
+        than four of its standard errors.
     """
     widest = max(_REACHES) * contact
-    samples = [s for s in samples if s.patch(widest, pixel).has_enough_pixels(len(s.centers))]
-    chosen, best, noise = (_SPACINGS[0], _REACHES[0]), np.inf, None
-    tried: dict[tuple[float, float], float] = {}
-    halves = samples[::2], samples[1::2]
+    samples = [
+        s for s in samples if s.patch(widest, widest, pixel).has_enough_pixels(len(s.centers))
+    ]
+    chosen, noise = (_SPACINGS[0], _REACHES[0]), None
+    tried: dict[tuple[float, float], Floats] = {}
+    failed: set[tuple[float, float]] = set()
+    apart = max(len(samples) // _COMPARED, 1)
+    halves = [samples[:: 2 * apart], samples[apart :: 2 * apart]]
     for turn in range(4 if halves[1] else 0):
         # By turns another distance of the knots and another end.
         options = _SPACINGS if turn % 2 else _REACHES
         for option in options:
             pair = (option, chosen[1]) if turn % 2 else (chosen[0], option)
-            if pair in tried:
+            if pair in tried or pair in failed:
                 continue
             spacing, reach = pair[0] * contact, pair[1] * contact
             image = first_image(halves[0], spacing=spacing, reach=reach, pixel=pixel)
-            image, _, step = settled_image(halves[0], image, pixel=pixel)
-            tried[pair] = np.inf
+            image, fitted, step = settled_image(halves[0], image, pixel=pixel)
+            failed.add(pair)
             if step < _UNSETTLED:
-                noise = noise or image.noise
-                tried[pair] = held_out_misfit(halves[1], image, reach=widest, pixel=pixel, noise=noise)
-        best = min(tried.values())
-        chosen = min(tried, key=lambda pair: tried[pair])
+                if noise is None:
+                    # Later searches begin at the positions of the first.
+                    noise, halves[0] = image.noise, fitted
+                    halves[1] = settled_image(halves[1], image, pixel=pixel)[1]
+                tried[pair] = held_out_misfit(
+                    halves[1], image, reach=widest, pixel=pixel, noise=noise
+                )
+        chosen = _simplest_of_best(tried) if tried else chosen
     spacing, reach = chosen[0] * contact, chosen[1] * contact
     step = np.inf
-    if samples and (np.isfinite(best) or not halves[1]):
+    if samples and (tried or not halves[1]):
         image = first_image(samples, spacing=spacing, reach=reach, pixel=pixel)
         image, samples, step = settled_image(samples, image, pixel=pixel)
     if not step < _UNSETTLED:
         raise NoSpheresError(
             f"the image of a sphere cannot be learned from {sum(len(s.centers) for s in samples)} "
-            "spots of this 2-D movie: have spheres one circular image of one size, and is contact "
-            "right? refine=None keeps the positions found first"
+            "spots of this 2-D movie: do the spheres exceed the noise, have they one circular "
+            "image of one size, and is contact right? refine=None finds filtered centroids"
         )
     return image, samples
 
@@ -324,7 +366,7 @@ def size_spread(
     """
     sizes, variances = [], []
     for sample in samples:
-        patch = sample.patch(image.reach, pixel)
+        patch = sample.patch(image.surroundings, image.reach, pixel)
         if not patch.has_enough_pixels(2 * len(sample.centers)):
             continue
         fit = fit_patch(patch, image, sample.centers)

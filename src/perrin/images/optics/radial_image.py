@@ -27,8 +27,14 @@ _CUBIC = np.array([[1, 4, 1, 0], [-3, 0, 3, 0], [3, -6, 3, 0], [-1, 3, -3, 1]]) 
 # Step of a sphere over the distance of the knots at which a fit ends, and its most steps.
 _STEP_CONVERGED, _MAX_STEPS = 1e-3, 25
 
-# Damping at which no step lowers chi-squared.
-_MOST_DAMPING = 1e8
+# Last step that is accepted, in standard errors of a coordinate with all others known.
+_SETTLED_STEP = 0.1
+
+# Radius of the pixels of a fit over that of the image.
+_SURROUNDINGS = 1.25
+
+# Damping below which a step is a full one, and that at which no step lowers chi-squared.
+_SMALL_DAMPING, _MOST_DAMPING = 0.1, 1e8
 
 # Least number of pixels for each fitted parameter.
 _PIXELS_PER_PARAMETER = 4
@@ -72,6 +78,11 @@ class RadialImage:
     def reach(self) -> float:
         """Distance from the centre at which the image ends, um."""
         return (len(self.coefficients) + 1) * self.spacing
+
+    @property
+    def surroundings(self) -> float:
+        """Distance from the centre of the pixels of a fit, which show the background too, um."""
+        return _SURROUNDINGS * self.reach
 
     def value(self, distance: Floats) -> Floats:
         """Return the image at distances from the centre, um."""
@@ -162,7 +173,7 @@ def spline_design(distance: Floats, *, spacing: float, k: int) -> Floats:
 
 
 class Patch(NamedTuple):
-    """The pixels of one fit: those within the reach of any of its spheres.
+    """The pixels of one fit: those near any of its spheres.
 
     Attributes
     ----------
@@ -296,10 +307,12 @@ def _patch_state(
     rows = np.concatenate([value, patch.background])
     if linear is None:
         weight = image.noise.weight(np.full(m, (patch.data + known).mean()))
+        linear = np.zeros(len(rows))
         for _ in range(2):
             weighted = rows * weight
-            linear = np.linalg.lstsq(weighted @ rows.T, weighted @ patch.data, rcond=None)[0]
-            weight = image.noise.weight(linear @ rows + known)
+            solved = np.linalg.lstsq(weighted @ rows.T, weighted @ patch.data, rcond=None)[0]
+            linear = np.asarray(solved, dtype=np.float64)
+            weight = image.noise.weight(np.asarray(linear @ rows + known))
     expected = linear @ rows
     gradient = -(linear[:n, None] * slope / np.maximum(distance, 1e-12))[:, None] * offset
     return _PatchState(
@@ -334,7 +347,8 @@ def fit_patch(
 
     Notes
     -----
-    Fisher scoring with Levenberg-Marquardt damping, as in `fit_window`.
+    Fisher scoring with Levenberg-Marquardt damping, as in `fit_window`. A steep rim between pixels
+    makes it slow: a last step of under a tenth of a standard error is accepted.
 
     Examples
     --------
@@ -349,7 +363,7 @@ def fit_patch(
     others = np.broadcast_to(np.asarray(known, dtype=np.float64), patch.data.shape)
     n = len(start)
     state = _patch_state(patch, image, start, others, None)
-    damping, converged = 1e-3, False
+    damping, converged, settled = 1e-3, False, False
     for _ in range(_MAX_STEPS):
         weighted = state.jacobian * state.weight
         information = weighted @ state.jacobian.T
@@ -371,8 +385,10 @@ def fit_patch(
                 break
             continue
         change = np.abs(step[: 2 * n]).max()
+        full = damping < _SMALL_DAMPING
+        settled = full and bool((np.abs(step) * np.sqrt(scale) < _SETTLED_STEP)[: 2 * n].all())
         state, damping = trial, damping / 10.0
-        if change < _STEP_CONVERGED * image.spacing:
+        if change < _STEP_CONVERGED * image.spacing and full:
             converged = True
             break
     freedom = max(len(patch.data) - len(state.jacobian), 1)
@@ -384,5 +400,5 @@ def fit_patch(
         state.jacobian,
         state.weight,
         state.chi2(patch, state.expected) / freedom,
-        converged,
+        converged or settled,
     )

@@ -51,8 +51,8 @@ if TYPE_CHECKING:
 Refine = Literal["model", "trackpy"] | None
 _Voxel = tuple[float, float, float]
 
-# Number of frames from which the mass cut and the optics are learned.
-_LEARNING_FRAMES = 5
+# Number of frames from which the mass cut and the optics are learned, and of those of a plane.
+_LEARNING_FRAMES, _LEARNING_PLANES = 5, 15
 
 # Number of groups of spheres, or of pieces of crowds, from which the optics are learned.
 _LEARNING_GROUPS, _LEARNING_CROWDS = 15, 2
@@ -67,6 +67,7 @@ _NOT_CONVERGED, _MOVED, _DARK = (
     "moved over half a radius",
     "no light of its own",
 )
+
 
 class StackLike(Protocol):
     """A movie from which spheres can be located: sizes, and one frame at a time."""
@@ -271,7 +272,8 @@ def sample_frames(stack: StackLike, search: Search, frames: Sequence[int]) -> li
     """
     sample = []
     fault: FrameError | None = None
-    for k in _evenly_spaced(len(frames), _LEARNING_FRAMES):
+    most = _LEARNING_PLANES if search.circles else _LEARNING_FRAMES
+    for k in _evenly_spaced(len(frames), most):
         try:
             data = np.asarray(stack.frame(frames[k]))
             spots = search.spots(_finite_frame(data, frames[k]), _voxel_size(stack))

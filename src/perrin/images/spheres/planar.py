@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from perrin._arrays import Bools, Floats, Ints
+    from perrin._arrays import Floats, Ints
     from perrin.images.optics.radial_image import RadialImage
     from perrin.images.spheres.by_trackpy import Features
 
@@ -31,11 +31,11 @@ if TYPE_CHECKING:
 _MOST_TOGETHER = 12
 
 # Number of groups of spheres from which the image is learned.
-_LEARNING_GROUPS = 24
+_LEARNING_GROUPS = 40
 
 # Most fits of a group, between which those of its neighbours change, and the change of a position
 # over the distance of the knots at which they end.
-_MAX_SWEEPS, _SWEEP_CONVERGED = 12, 0.01
+_MAX_SWEEPS, _SWEEP_CONVERGED = 12, 0.001
 
 # Distance from the place found first, and distance of two spheres, in contact distances, from which
 # a fit is that of another sphere.
@@ -220,9 +220,11 @@ def fit_plane(
         np.full(n, "", dtype=object),
     )
     for _ in range(n + 1):
+        before = fit.reason.copy()
         _sweep(frame, centers, fit, contact, image, pixel)
-        wrong = _wrong_spots(centers, fit, contact)
-        if not wrong.any():
+        _mark_wrong_spots(centers, fit, contact)
+        # Without the spots that were marked now, the others may be spheres.
+        if not np.isin(fit.reason[before != fit.reason], (_NO_IMAGE, _AWAY)).any():
             break
     failed = fit.reason != ""
     fit.centers[failed], fit.sigma[failed] = centers[failed], np.nan
@@ -240,7 +242,7 @@ def _sweep(
     """Fit every group of the spheres in turn, until positions stay."""
     there = np.flatnonzero((fit.reason == "") | (fit.reason == _UNSETTLED))
     groups = [there[g] for g in fitted_together(first[there], contact=contact)]
-    overlap = 2 * image.reach + 0.1 * contact
+    overlap = image.reach + image.surroundings + 0.1 * contact
     away = np.linalg.norm(first[there][:, None] - first[there], axis=2)
     beside = []
     for group in groups:
@@ -268,7 +270,7 @@ def _fit_group(
     pixel: tuple[float, float],
 ) -> None:
     """Fit one group of spheres, with the images of the others subtracted."""
-    patch = cut_patch(frame, fit.centers[group], reach=image.reach, pixel=pixel)
+    patch = cut_patch(frame, fit.centers[group], reach=image.surroundings, pixel=pixel)
     if not patch.has_enough_pixels(len(group)):
         fit.reason[group] = _NO_PIXELS
         return
@@ -280,7 +282,8 @@ def _fit_group(
     n = len(group)
     fit.chi2[group] = found.chi2
     if not (found.converged and np.isfinite(found.centers).all()):
-        fit.reason[group] = _UNSETTLED
+        dim = ~(found.brightness > LEAST_BRIGHTNESS * np.median(found.brightness))
+        fit.reason[group] = np.where(dim, _NO_IMAGE, _UNSETTLED)
         return
     fit.reason[group] = ""
     fit.centers[group], fit.brightness[group] = found.centers, found.brightness
@@ -288,11 +291,11 @@ def _fit_group(
     fit.sigma[group] = np.sqrt(np.maximum(variance, 0.0)).reshape(n, 2)
 
 
-def _wrong_spots(first: Floats, fit: PlaneFit, contact: float) -> Bools:
-    """Mark the spots that are no spheres, and return those marked now."""
+def _mark_wrong_spots(first: Floats, fit: PlaneFit, contact: float) -> None:
+    """Mark the spots whose fits show no sphere, or that of another spot."""
     good = fit.reason == ""
     if not good.any():
-        return good
+        return
     typical = float(np.median(fit.brightness[good]))
     dim = good & ~(fit.brightness > LEAST_BRIGHTNESS * typical)
     away = good & (np.linalg.norm(fit.centers - first, axis=1) > _MOVED * contact)
@@ -302,7 +305,6 @@ def _wrong_spots(first: Floats, fit: PlaneFit, contact: float) -> Bools:
         if good[i] and good[j]:
             away[i if moved[i] > moved[j] else j] = True
     fit.reason[dim], fit.reason[away & ~dim] = _NO_IMAGE, _AWAY
-    return dim | away
 
 
 def plane_columns(
