@@ -2,33 +2,49 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from perrin.errors import NoSpheresError
-from perrin.images.optics.ball_image import SphereImage, sphere_image
-from perrin.images.optics.crowd_equations import profile_information, sum_of_spheres
+from perrin.images.optics.ball_image import BallBlur, PsfTail, SphereImage, sphere_image
+from perrin.images.optics.crowd_equations import profile_information, slopes_of_spheres
 from perrin.images.optics.crowd_fit import fit_crowd
 from perrin.images.optics.optics import CameraNoise, Optics
 from perrin.images.optics.window_fit import FreeCenters, cut_window, fit_window
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Sequence
 
     from numpy.typing import NDArray
 
-    from perrin._arrays import Floats
+    from perrin._arrays import Bools, Floats
     from perrin.images.optics.window_fit import Window
 
 
-# Change of a logarithm for the central differences.
-_LOG_DIFFERENCE = 0.01
+# Change of a parameter for the central differences.
+_PARAMETER_DIFFERENCE = 0.01
 
-# Largest step of a logarithm, and the step at which the search ends.
-_MAX_LOG_STEP, _LOG_STEP_CONVERGED = 0.25, 1e-3
+# Largest step of a parameter; the search ends at steps below this, or below this fraction of their
+# standard errors: voxels that enter and leave the windows change the maximum by up to a fifth.
+_MAX_STEP, _STEP_CONVERGED, _STEP_IN_ERRORS = 0.25, 1e-3, 0.3
 
 _MAX_LEARNING_ROUNDS = 15
+
+# Least ratios of the blur along z to that in the plane (both are varied), of the blur to that of
+# the voxel alone, and of the tail's blur to that of the narrower Gaussian.
+_LEAST_ELONGATION, _LEAST_OVER_VOXEL, _LEAST_TAIL = 1.025, 1.02, 1.2
+
+# Blurs and share of the tail at the start of its search, over the Gaussian point spread found.
+_NARROWED, _WIDENED, _TAIL_SHARE, _MAX_TAIL_SHARE = 0.85, 3.0, 0.15, 0.6
+
+# A tail is searched for if its share is this many standard errors above 0 to first order, and it is
+# kept if it increases the logarithm of the likelihood of other groups by at least this.
+_LEAST_SHARE_ERRORS, _LEAST_HELD_OUT_GAIN = 3.0, 3.0
+
+# Order of the differences between neighbouring voxels, and their factors: a variance of 20.
+_NEIGHBOURS = np.array([-1.0, 3.0, -3.0, 1.0])
 
 # Searches of a crowd's residuals for missing spheres, in every round.
 _LEARNING_SEARCHES = 2
@@ -86,6 +102,143 @@ def saturated_share(data: NDArray[Any]) -> float:
     return share if bdtrc(count - 2, count - 1 + most, 0.5) < _SATURATION_LEVEL else 0.0
 
 
+@dataclass(frozen=True, eq=False)
+class ImageParameters:
+    """The parameters of a sphere's image in the search for the optics.
+
+    Attributes
+    ----------
+    values : ndarray, shape (3,) or (6,)
+        Logarithms of the diameter and of the blurs along z and in the plane, um; with a tail its
+        share, and the logarithms of its blurs. Blurs include the voxel.
+    voxel : tuple of float
+        Voxel size (z, y, x), um.
+
+    Examples
+    --------
+    >>> plain = ImageParameters(np.log([2.45, 0.4, 0.15]), (0.25, 0.2, 0.2))
+    >>> plain.image().psf[0].__round__(3), len(plain.with_tail().values)
+    (0.393, 6)
+    """
+
+    values: Floats
+    voxel: tuple[float, float, float]
+
+    @property
+    def voxel_blur(self) -> Floats:
+        """Standard deviations (z, plane) of a voxel, um."""
+        return np.sqrt(np.array([self.voxel[0] ** 2, self.voxel[1] * self.voxel[2]]) / 12)
+
+    def ball(self, values: Floats) -> BallBlur:
+        """Return the blurred ball at other values of the parameters."""
+        diameter, blur_z, blur = np.exp(values[:3]).tolist()
+        if len(values) == 3:
+            return BallBlur(diameter, ((1.0, (blur_z, blur)),))
+        share, (tail_z, tail) = float(values[3]), np.exp(values[4:]).tolist()
+        return BallBlur(diameter, ((1.0 - share, (blur_z, blur)), (share, (tail_z, tail))))
+
+    def image(self) -> SphereImage:
+        """Return the sphere's image."""
+        ball = self.ball(self.values)
+        (psf_z, psf), *wider = (
+            np.sqrt(np.square(blur) - self.voxel_blur**2).tolist() for _, blur in ball.components
+        )
+        tail = None
+        if wider:
+            tail = PsfTail(ball.components[1][0], (wider[0][0], wider[0][1]))
+        return sphere_image(
+            diameter=ball.diameter, psf=(psf_z, psf), voxel=self.voxel, tail=tail
+        )
+
+    def with_tail(self) -> ImageParameters:
+        """Return parameters with a tail at the start of its search."""
+        blurs = self.values[1:]
+        start = [self.values[:1], blurs + np.log(_NARROWED), [_TAIL_SHARE], blurs + np.log(_WIDENED)]
+        return ImageParameters(np.concatenate(start), self.voxel).within_bounds()
+
+    def bounds(self) -> tuple[Floats, Floats]:
+        """Return the least and the largest values of the parameters.
+
+        A blur is at least that of the voxel, and a microscope's point spread is elongated along z;
+        the tail is wider than the other Gaussian, and narrower than the sphere.
+        """
+        n = len(self.values)
+        low, high = np.full(n, -np.inf), np.full(n, np.inf)
+        least = np.log(_LEAST_OVER_VOXEL * self.voxel_blur)
+        low[2] = least[1]
+        low[1] = max(least[0], max(self.values[2], low[2]) + np.log(_LEAST_ELONGATION))
+        if n > 3:
+            low[3], high[3] = 0.0, _MAX_TAIL_SHARE
+            low[4:] = np.maximum(self.values[1:3], low[1:3]) + np.log(_LEAST_TAIL)
+            low[4] = max(low[4], max(self.values[5], low[5]) + np.log(_LEAST_ELONGATION))
+            high[4:] = np.maximum(self.values[0], low[4:])
+        return low, high
+
+    def within_bounds(self) -> ImageParameters:
+        """Return the nearest parameters within the bounds."""
+        return ImageParameters(np.clip(self.values, *self.bounds()), self.voxel)
+
+    def moved(self, information: Floats, score: Floats) -> ImageParameters:
+        """Return the parameters after a Gauss-Newton step that stays within the bounds.
+
+        A parameter that would leave its bound is set to it, and the step of the others is computed
+        again.
+        """
+        low, high = self.bounds()
+        step, free = np.zeros_like(score), np.ones(len(score), dtype=np.bool_)
+        while free.any():
+            pull = score[free] - information[free][:, ~free] @ step[~free]
+            step[free] = np.linalg.solve(information[free][:, free], pull)
+            moved = self.values + step
+            left = free & ((moved < low) | (moved > high))
+            if not left.any():
+                break
+            step[left] = np.clip(moved, low, high)[left] - self.values[left]
+            free &= ~left
+        step *= min(1.0, _MAX_STEP / max(np.abs(step).max(), _MAX_STEP))
+        return ImageParameters(self.values + step, self.voxel).within_bounds()
+
+    def optics(self, noise: CameraNoise, information: Floats) -> Optics:
+        """Return the optics, with standard errors from the information on the parameters."""
+        image = self.image()
+        error = np.sqrt(np.diag(np.linalg.inv(information)))[:3]
+        # The blur is the root of the sum of squares of point spread and voxel.
+        factor = np.array([image.diameter, *(np.square(image.blur) / np.array(image.psf))])
+        a, b, c = (float(value) for value in factor * error)
+        return Optics(image.diameter, image.psf, noise, (a, b, c), image.tail)
+
+
+class ImageVariations(NamedTuple):
+    """The sphere's image and its derivatives by the parameters.
+
+    Attributes
+    ----------
+    image : SphereImage
+        The image at the present values.
+    slopes : ndarray, shape (k, ...)
+        Tables of the derivatives (`SphereImage.slopes`); without a tail the last one is that by the
+        share of a tail, at a share of 0.
+    """
+
+    image: SphereImage
+    slopes: Floats
+
+    @classmethod
+    def about(cls, parameters: ImageParameters) -> ImageVariations:
+        """Return image and derivatives at the values of parameters."""
+        values, d = parameters.values, _PARAMETER_DIFFERENCE
+        pairs = [
+            (parameters.ball(values + shift), parameters.ball(values - shift))
+            for shift in d * np.eye(len(values))
+        ]
+        if len(values) == 3:
+            plain = parameters.ball(values)
+            wide = np.concatenate([values, [2 * d], values[1:] + np.log(_WIDENED)])
+            pairs.append((parameters.ball(wide), plain))
+        image = parameters.image()
+        return cls(image, image.slopes(pairs, 2 * d))
+
+
 class SampleFit(NamedTuple):
     """A fit to one sample of a frame, and its information on the optics.
 
@@ -93,55 +246,21 @@ class SampleFit(NamedTuple):
     ----------
     centers : ndarray, shape (n, 3)
         Fitted positions (z, y, x), um.
-    information : ndarray, shape (3, 3)
-        Information on the logarithms of diameter, psf z and psf plane, the parameters of the
-        spheres eliminated.
-    score : ndarray, shape (3,)
-        Score of these logarithms.
+    information : ndarray, shape (k, k)
+        Information on the k parameters of the image, the parameters of the spheres eliminated.
+    score : ndarray, shape (k,)
+        Score of these parameters.
     expected : ndarray, shape (m,)
-        Expected grey levels of the voxels of the fit.
-    squared_residual : ndarray, shape (m,)
-        Squared differences of grey levels and expected grey levels.
+        Expected grey levels of groups of neighbouring voxels.
+    variance : ndarray, shape (m,)
+        Estimates of the variance of these voxels from their differences (`neighbour_variance`).
     """
 
     centers: Floats
     information: Floats
     score: Floats
     expected: Floats
-    squared_residual: Floats
-
-
-class ImageVariations(NamedTuple):
-    """The sphere's image, and the images with each logarithm slightly larger and smaller.
-
-    The logarithms are those of diameter, psf z and psf plane.
-
-    Attributes
-    ----------
-    image : SphereImage
-        The image at the present values.
-    pairs : list of tuple of SphereImage
-        The image with one logarithm larger, and with it smaller, for each of the three.
-    """
-
-    image: SphereImage
-    pairs: list[tuple[SphereImage, ...]]
-
-    @classmethod
-    def about(cls, log: Floats, voxel: tuple[float, float, float]) -> ImageVariations:
-        """Return the variations about logarithms (3,), for voxels (z, y, x), um."""
-        steps = _LOG_DIFFERENCE * np.eye(3)
-        pairs = [tuple(_image_at(log + s * d, voxel) for s in (1, -1)) for d in steps]
-        return cls(_image_at(log, voxel), pairs)
-
-    def derivatives(self, intensity: Callable[[SphereImage], Floats]) -> Floats:
-        """Return the derivatives (3, ...) of an intensity by the logarithms."""
-        return np.stack(
-            [
-                (intensity(larger) - intensity(smaller)) / (2 * _LOG_DIFFERENCE)
-                for larger, smaller in self.pairs
-            ]
-        )
+    variance: Floats
 
 
 class GroupSample(NamedTuple):
@@ -178,9 +297,7 @@ class GroupSample(NamedTuple):
         image = variations.image
         window = self.window(image)
         fit = fit_window(window, image, noise, FreeCenters(self.centers))
-        slope = variations.derivatives(
-            lambda varied: fit.brightness @ window.spots(varied, fit.centers)[0]
-        )
+        slope = window.slopes(image, variations.slopes, fit.centers, fit.brightness)
         # The Schur complement of the information, with the fit's own parameters eliminated.
         weighted = slope * fit.weight
         nuisance = fit.jacobian * fit.weight
@@ -189,7 +306,32 @@ class GroupSample(NamedTuple):
         residual = window.data - fit.expected
         information = weighted @ slope.T - shared.T @ taken
         score = weighted @ residual - taken.T @ (nuisance @ residual)
-        return SampleFit(fit.centers, information, score, fit.expected, residual**2)
+        whole = np.zeros((2, *window.mask.shape))
+        whole[:, window.mask] = residual, fit.expected
+        expected, variance = neighbour_variance(*whole, window.mask, image=image)
+        return SampleFit(fit.centers, information, score, expected, variance)
+
+    def log_likelihood(
+        self, image: SphereImage, noise: CameraNoise, *, within: SphereImage
+    ) -> float:
+        """Return the logarithm of the likelihood of the group's voxels, up to a constant.
+
+        Parameters
+        ----------
+        image : SphereImage
+            The image with which the group is fitted.
+        noise : CameraNoise
+        within : SphereImage
+            The image that sets the voxels.
+
+        Returns
+        -------
+        float
+        """
+        window = self.window(within)
+        fit = fit_window(window, image, noise, FreeCenters(self.centers))
+        square = fit.weight * (window.data - fit.expected) ** 2
+        return -0.5 * float(np.sum(square - np.log(fit.weight)))
 
 
 class CrowdSample(NamedTuple):
@@ -232,21 +374,78 @@ class CrowdSample(NamedTuple):
             searches=_LEARNING_SEARCHES,
         )
         window, state = found.window, found.intensity
-        slope = variations.derivatives(
-            lambda varied: sum_of_spheres(
-                window, window.spots(varied, state.centers), state.brightness
-            )
-        )
+        slope = slopes_of_spheres(window, variations.slopes, state.centers, state.brightness)
         information, score = profile_information(window, state, slope)
-        used = window.mask
-        residual = (window.data - state.expected)[used]
-        return SampleFit(state.centers, information, score, state.expected[used], residual**2)
+        residual = window.data - state.expected
+        expected, variance = neighbour_variance(
+            residual, state.expected, window.mask, image=variations.image
+        )
+        return SampleFit(state.centers, information, score, expected, variance)
 
 
-def _image_at(log: Floats, voxel: tuple[float, float, float]) -> SphereImage:
-    """Return the image for the logarithms of diameter, psf z and psf plane."""
-    size, psf_z, psf = np.exp(log)
-    return sphere_image(diameter=float(size), psf=(float(psf_z), float(psf)), voxel=voxel)
+def neighbour_variance(
+    residual: Floats, expected: Floats, used: Bools, *, image: SphereImage
+) -> tuple[Floats, Floats]:
+    """Estimate the variance of voxels from the differences of neighbours.
+
+    Parameters
+    ----------
+    residual, expected : ndarray, shape (nz, ny, nx)
+        Grey levels minus expected grey levels, and expected grey levels.
+    used : ndarray of bool, shape (nz, ny, nx)
+        The voxels that are used.
+    image : SphereImage
+        The image of a sphere, whose blur chooses the axis.
+
+    Returns
+    -------
+    expected : ndarray, shape (m,)
+        Expected grey level of every four neighbours along one axis.
+    variance : ndarray, shape (m,)
+        Their squared third differences over 20, the sum of squares of the factors 1, 3, 3, 1.
+
+    Notes
+    -----
+    The axis is the one along which the blur covers most voxels. An error of the model of the image
+    is blurred too, so that its third differences are small: with a blur of b voxels they have
+    15 / (2 b^2)^3 / 20 of the error's variance (the sixth moment of its Gaussian spectrum), 1 % for
+    b = 1.5. Noise that is constant along the axis does not contribute.
+
+    Examples
+    --------
+    >>> from perrin.images import sphere_image
+    >>> image = sphere_image(diameter=2.0, psf=(0.4, 0.15), voxel=(0.25, 0.2, 0.2))
+    >>> noise = np.random.default_rng(1).normal(0.0, 3.0, (20, 30, 30))
+    >>> misfit = 5 * np.cos(np.arange(20) / 3)[:, None, None]
+    >>> used, level = np.ones(noise.shape, dtype=bool), np.full(noise.shape, 7.0)
+    >>> expected, variance = neighbour_variance(noise + misfit, level, used, image=image)
+    >>> expected.mean().round(), variance.mean().round(1), (noise + misfit).var().round(1)
+    (np.float64(7.0), np.float64(9.0), np.float64(21.9))
+    """
+    blur = np.array([image.blur[0], image.blur[1], image.blur[1]]) / image.voxel
+    long_enough = np.array(used.shape) >= len(_NEIGHBOURS)
+    axis = int(np.argmax(np.where(long_enough, blur, -1.0)))
+    if not long_enough[axis]:
+        return np.empty(0), np.empty(0)
+    quads = (
+        np.lib.stride_tricks.sliding_window_view(field, len(_NEIGHBOURS), axis=axis)
+        for field in (residual, expected, used)
+    )
+    difference, level, together = quads
+    kept = together.all(axis=-1)
+    share = _NEIGHBOURS**2 / np.sum(_NEIGHBOURS**2)
+    square = (difference @ _NEIGHBOURS)[kept] ** 2 / np.sum(_NEIGHBOURS**2)
+    return (level @ share)[kept], square
+
+
+class _Settled(NamedTuple):
+    """Parameters at the maximum of the likelihood of some samples."""
+
+    parameters: ImageParameters
+    noise: CameraNoise
+    samples: list[GroupSample | CrowdSample]
+    information: Floats
+    score: Floats
 
 
 def fit_samples(
@@ -277,71 +476,111 @@ def fit_samples(
 
     Notes
     -----
-    Gauss-Newton steps in the logarithms of the three lengths, with every sphere's position and
-    brightness and every background eliminated exactly (the Schur complement of the information).
+    Gauss-Newton steps in the logarithms of the lengths, with every sphere's position and brightness
+    and every background eliminated exactly (the Schur complement of the information). The noise is
+    that of the differences between neighbouring voxels.
+
+    The point spread is a Gaussian. Where the derivative of the likelihood by the share of a wider
+    second Gaussian is significant, the sum of two Gaussians is fitted to every other group, and it
+    is used if the likelihood of the groups between them is the larger one. Crowds have one Gaussian.
     """
-    log = np.log([diameter, max(voxel[0], 0.15 * diameter), max(voxel[1] / 2, 0.06 * diameter)])
-    log[1] = max(log[1], _least_log_psf_z(log[2], voxel))
-    image = _image_at(log, voxel)
-    samples = [
+    psf = np.array([max(voxel[0], 0.15 * diameter), max(voxel[1] / 2, 0.06 * diameter)])
+    start = ImageParameters(np.log([diameter, 1.0, 1.0]), voxel)
+    start.values[1:] = np.log(np.hypot(psf, start.voxel_blur))
+    start = start.within_bounds()
+    image = start.image()
+    usable = [
         s
         for s in samples
         if isinstance(s, CrowdSample) or s.window(image).has_enough_voxels(len(s.centers))
     ]
-    if not samples:
+    if not usable:
         raise NoSpheresError(
             "no spheres to learn the optics from: none was found, or none has voxels to itself; "
             "check diameter, contact and minmass, and whether spheres are dark (dark=True), state "
             "the optics (optics=), or keep the positions found first (refine=None)"
         )
-    mean = float(np.mean([s.frame.mean() for s in samples]))
-    noise = CameraNoise(1.0, 0.05 * abs(mean))
-    for _ in range(_MAX_LEARNING_ROUNDS):
-        variations = ImageVariations.about(log, voxel)
+    mean = float(np.mean([s.frame.mean() for s in usable]))
+    found = _settled(usable, start, CameraNoise(1.0, 0.05 * abs(mean)))
+    if _shows_tail(found):
+        found = _with_tail(found)
+    return found.parameters.optics(found.noise, found.information)
+
+
+def _settled(
+    samples: list[GroupSample | CrowdSample], parameters: ImageParameters, noise: CameraNoise
+) -> _Settled:
+    """Return the parameters of greatest likelihood, from a start."""
+    n = len(parameters.values)
+    for number in range(_MAX_LEARNING_ROUNDS):
+        variations = ImageVariations.about(parameters)
         fits = [s.fit(variations, noise) for s in samples]
         samples = [s._replace(centers=fit.centers) for s, fit in zip(samples, fits, strict=True)]
         information = np.sum([fit.information for fit in fits], axis=0)
-        step = np.linalg.solve(information, np.sum([fit.score for fit in fits], axis=0))
+        score = np.sum([fit.score for fit in fits], axis=0)
         noise = photon_transfer(
             np.concatenate([fit.expected for fit in fits]),
-            np.concatenate([fit.squared_residual for fit in fits]),
+            np.concatenate([fit.variance for fit in fits]),
         )
-        log = log + step * min(1.0, _MAX_LOG_STEP / np.abs(step).max())
-        log[1] = max(log[1], _least_log_psf_z(log[2], voxel))
-        if np.abs(step).max() < _LOG_STEP_CONVERGED:
-            break
-    else:
-        raise NoSpheresError(
-            f"sphere size and point spread do not converge: diameter {np.exp(log[0]):.3g}, psf "
-            f"({np.exp(log[1]):.3g}, {np.exp(log[2]):.3g}) um after {_MAX_LEARNING_ROUNDS} rounds "
-            f"on {len(samples)} groups: are these spheres, bright enough, or dark (dark=True), and "
-            "is the voxel size right? State the optics (optics=), or keep the positions found "
-            "first (refine=None)"
+        moved = parameters.moved(information[:n, :n], score[:n])
+        step = moved.values - parameters.values
+        parameters = moved
+        in_errors = float(np.sqrt(step @ information[:n, :n] @ step))
+        # The information of the first round is that of a guessed noise.
+        if np.abs(step).max() < _STEP_CONVERGED or (number > 0 and in_errors < _STEP_IN_ERRORS):
+            return _Settled(parameters, noise, samples, information, score)
+    size, psf_z, psf = np.exp(parameters.values[:3])
+    raise NoSpheresError(
+        f"sphere size and point spread do not converge: diameter {size:.3g}, blur "
+        f"({psf_z:.3g}, {psf:.3g}) um after {_MAX_LEARNING_ROUNDS} rounds "
+        f"on {len(samples)} groups: are these spheres, bright enough, or dark (dark=True), and "
+        "is the voxel size right? State the optics (optics=), or keep the positions found "
+        "first (refine=None)"
+    )
+
+
+def _shows_tail(found: _Settled) -> bool:
+    """Return whether the first step of a tail's share is significantly positive."""
+    variance = np.linalg.inv(found.information)
+    share = float(variance[-1] @ found.score)
+    return share > _LEAST_SHARE_ERRORS * float(np.sqrt(variance[-1, -1]))
+
+
+def _with_tail(plain: _Settled) -> _Settled:
+    """Return the parameters with a tail if groups that were not fitted are more likely with it."""
+    groups = [s for s in plain.samples if isinstance(s, GroupSample)]
+    if len(groups) < max(2, len(plain.samples)):
+        return plain
+    start = plain.parameters.with_tail()
+    widest = start.image()
+    groups = [s for s in groups if s.window(widest).has_enough_voxels(len(s.centers))]
+    if len(groups) < 2:
+        return plain
+    try:
+        half = _settled(list(groups[::2]), start, plain.noise)
+        tailed, image = half.parameters.image(), plain.parameters.image()
+        gain = sum(
+            s.log_likelihood(tailed, half.noise, within=tailed)
+            - s.log_likelihood(image, half.noise, within=tailed)
+            for s in groups[1::2]
         )
-    size, psf_z, psf = (float(v) for v in np.exp(log))
-    error = np.exp(log) * np.sqrt(np.diag(np.linalg.inv(information)))
-    return Optics(size, (psf_z, psf), noise, (float(error[0]), float(error[1]), float(error[2])))
+        if gain < _LEAST_HELD_OUT_GAIN:
+            return plain
+        return _settled(list(groups), half.parameters, half.noise)
+    except NoSpheresError:
+        # The Gaussian has settled, and the sum of two Gaussians has not: the first one is used.
+        return plain
 
 
-def _least_log_psf_z(log_psf: float, voxel: tuple[float, float, float]) -> float:
-    """Return the logarithm of the least point spread along z: that of a microscope is elongated.
-
-    With the widths of the voxels the blur along z stays the larger one, in all variations too.
-    """
-    plane = np.exp(2 * (log_psf + _LOG_DIFFERENCE)) + (voxel[1] * voxel[2] - voxel[0] ** 2) / 12
-    narrowest = np.exp(2 * log_psf)
-    return 0.5 * float(np.log(max(plane, narrowest))) + _LOG_DIFFERENCE + 1e-3
-
-
-def photon_transfer(expected: Floats, squared_residual: Floats) -> CameraNoise:
+def photon_transfer(expected: Floats, variance: Floats) -> CameraNoise:
     """Return gain and floor of the camera from the growth of the variance with the mean.
 
     Parameters
     ----------
     expected : ndarray, shape (m,)
         Expected grey levels.
-    squared_residual : ndarray, shape (m,)
-        Squared differences of grey levels and expected grey levels.
+    variance : ndarray, shape (m,)
+        Estimates of their variance.
 
     Returns
     -------
@@ -355,11 +594,11 @@ def photon_transfer(expected: Floats, squared_residual: Floats) -> CameraNoise:
     (3.0, 4.0)
     """
     design = np.stack([expected, np.ones_like(expected)])
-    noise = CameraNoise(0.0, float(squared_residual.mean()))
+    noise = CameraNoise(0.0, float(variance.mean()))
     for _ in range(4):
         weighted = design * noise.weight(expected) ** 2
-        gain, floor = np.linalg.solve(weighted @ design.T, weighted @ squared_residual)
+        gain, floor = np.linalg.solve(weighted @ design.T, weighted @ variance)
         if gain <= 0:
-            return CameraNoise(0.0, float(squared_residual.mean()))
+            return CameraNoise(0.0, float(variance.mean()))
         noise = CameraNoise(float(gain), float(floor))
     return noise

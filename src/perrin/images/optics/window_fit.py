@@ -69,6 +69,26 @@ class Window(NamedTuple):
         kept = kept.reshape(len(centers), 4, -1)
         return kept[:, 0], kept[:, 1:]
 
+    def slopes(
+        self, image: SphereImage, slopes: Floats, centers: Floats, brightness: Floats
+    ) -> Floats:
+        """Return derivatives (k, m) of the intensity by parameters of the sphere's image.
+
+        Parameters
+        ----------
+        image : SphereImage
+        slopes : ndarray, shape (k, ...)
+            The tables of `SphereImage.slopes`.
+        centers, brightness : ndarray, shape (n, 3), (n,)
+            The spheres.
+        """
+        origin = np.array([s.start for s in self.box]) * np.array(image.voxel)
+        whole = np.zeros((len(slopes), *self.mask.shape))
+        for center, bright in zip(centers - origin, brightness, strict=True):
+            box, value = image.slope_spot(slopes, center, self.mask.shape)
+            whole[(slice(None), *box)] += bright * value
+        return whole[:, self.mask]
+
 
 class Arrangement(Protocol):
     """Spheres whose positions follow from a few parameters."""
@@ -145,7 +165,8 @@ class ImageFit(NamedTuple):
     brightness : ndarray, shape (n,)
         Intensity inside each sphere, grey levels.
     covariance : ndarray, shape (k, k)
-        Covariance of the arrangement's parameters.
+        Covariance of the arrangement's parameters: the inverse Fisher information, times `chi2`
+        where this is above 1.
     converged : bool
         Whether the last step was far below the blur.
     chi2 : float
@@ -256,7 +277,9 @@ def fit_window(
     -----
     Fisher scoring with Levenberg-Marquardt damping. The weights follow the expected intensity, so
     that the fixed point is the root of the score of the Poisson likelihood shifted by the camera's
-    floor; the covariance is the inverse Fisher information there.
+    floor; the covariance is the inverse Fisher information there. Where the residuals exceed the
+    noise (chi-squared per degree of freedom above 1), the model misses something of the image, and
+    the covariance is multiplied by chi-squared.
 
     Examples
     --------
@@ -293,13 +316,14 @@ def fit_window(
             break
     information, _ = state.normal_equations(window)
     k = state.n_arrangement
-    freedom = max(len(window.data) - len(state.jacobian), 1)
+    chi2 = state.chi2(window, state.expected) / max(len(window.data) - len(state.jacobian), 1)
+    covariance = np.linalg.pinv(information, hermitian=True)[:k, :k] * max(chi2, 1.0)
     return ImageFit(
         state.arrangement,
         state.linear[: len(state.linear) - _N_BACKGROUND],
-        np.asarray(np.linalg.pinv(information, hermitian=True)[:k, :k], dtype=np.float64),
+        np.asarray(covariance, dtype=np.float64),
         converged,
-        state.chi2(window, state.expected) / freedom,
+        chi2,
         state.expected,
         state.weight,
         state.jacobian,
