@@ -13,7 +13,13 @@ from scipy.spatial.distance import cdist
 
 import perrin
 from perrin.geometry.rotations import exp_map, log_map
-from perrin.images.optics.ball_image import sphere_image
+from perrin.images.optics.ball_image import PsfTail, sphere_image
+from perrin.images.optics.learn import (
+    GroupSample,
+    ImageParameters,
+    ImageVariations,
+    fit_samples,
+)
 from perrin.images.optics.optics import CameraNoise
 from perrin.images.optics.window_fit import FreeCenters, RigidCenters, cut_window, fit_window
 from perrin.images.spheres.localisation import Search, choose_method, sample_frames
@@ -128,6 +134,80 @@ def test_the_image_has_the_volume_of_the_ball_and_the_gradient():
         assert np.allclose(gradient[axis], (up - down) / (2 * step), atol=1e-6)
 
 
+def test_the_image_with_a_tail_is_the_sum_of_two_images():
+    """The shares add up, and derivatives by the parameters are those of finite differences."""
+    tail = PsfTail(0.2, (0.7, 0.3))
+    image = sphere_image(diameter=DIAMETER, psf=PSF, voxel=VOXEL, tail=tail)
+    narrow, wide = (sphere_image(diameter=DIAMETER, psf=p, voxel=VOXEL) for p in (PSF, tail.psf))
+    grid = [np.linspace(-1.5, 1.6, 12)] * 3
+    one, other, both = (i.at(*grid)[0] for i in (narrow, wide, image))
+    assert np.allclose(0.8 * one + 0.2 * other, both, atol=2e-4)
+    parameters = ImageParameters(np.log([DIAMETER, 0.41, 0.16, np.e, 0.7, 0.3]), VOXEL)
+    parameters.values[3] = 0.2
+    variations, center = ImageVariations.about(parameters), np.array([3.0, 3.1, 3.2])
+    box, slopes = variations.image.slope_spot(variations.slopes, center, (24, 32, 32))
+    for step, slope in zip(1e-3 * np.eye(6), slopes, strict=True):
+        up, down = (
+            replace(parameters, values=parameters.values + sign * step).image() for sign in (1, -1)
+        )
+        offsets = [
+            h * np.arange(s.start, s.stop) - c for h, s, c in zip(VOXEL, box, center, strict=True)
+        ]
+        change = (up.at(*offsets)[0] - down.at(*offsets)[0]) / 2e-3
+        # The steps of 0.01 and 0.001 differ by a third derivative, and the image by its knots.
+        assert np.allclose(slope, change, atol=0.01 * np.abs(change).max())
+
+
+def pairs_of_balls(diameters, tail, rng):
+    """Return groups of two touching balls drawn with a point spread, in 12 frames."""
+    groups = []
+    for first, second in np.reshape(diameters, (-1, 2)):
+        arm = rng.normal(size=3)
+        arm *= DIAMETER / 2 / np.linalg.norm(arm)
+        centers = np.array([4.2, 3.7, 3.7]) + rng.uniform(-0.1, 0.1, 3) + [[*arm], [*-arm]]
+        unit = np.zeros((34, 37, 37))
+        for center, diameter in zip(centers, (first, second), strict=True):
+            spot = sphere_image(diameter=diameter, psf=PSF, voxel=VOXEL, tail=tail).spot(
+                center, unit.shape
+            )
+            unit[spot.box] += spot.value
+        groups.append(GroupSample(recorded(unit, rng), centers, NO_OTHERS))
+    return groups
+
+
+def distances(groups, optics):
+    """Return the distances of the two balls of every group, fitted with these optics."""
+    image, found = optics.image(VOXEL), []
+    for group in groups:
+        window = group.window(image)
+        fit = fit_window(window, image, optics.noise, FreeCenters(group.centers))
+        found.append(np.linalg.norm(np.diff(fit.centers, axis=0)))
+    return np.array(found)
+
+
+def test_a_point_spread_with_tails_is_learned_and_distances_are_right():
+    """The tail is recognised by held-out groups; with one Gaussian distances are too short."""
+    rng, tail = np.random.default_rng(5), PsfTail(0.25, (0.9, 0.4))
+    groups = pairs_of_balls(np.full(12, DIAMETER), tail, rng)
+    optics = fit_samples(groups, diameter=2.5, voxel=VOXEL)
+    assert optics.tail is not None
+    assert optics.tail.share == pytest.approx(0.25, abs=0.06)
+    assert optics.diameter == pytest.approx(DIAMETER, abs=4 * optics.stderr[0])
+    # A distance has an error of 6 nm from its photons: the mean of six 0.1 %.
+    assert distances(groups, optics).mean() == pytest.approx(DIAMETER, rel=4e-3)
+
+
+def test_misfit_appears_in_chi2_and_not_in_the_gain():
+    """With radii that differ by 10 % the gain is that of the camera, and chi2 is above 1."""
+    rng = np.random.default_rng(6)
+    groups = pairs_of_balls(DIAMETER * np.tile([0.9, 1.1], 4), None, rng)
+    optics = fit_samples(groups, diameter=DIAMETER, voxel=VOXEL)
+    assert optics.noise.gain == pytest.approx(GAIN, rel=0.08)
+    image, group = optics.image(VOXEL), groups[0]
+    fit = fit_window(group.window(image), image, optics.noise, FreeCenters(group.centers))
+    assert fit.chi2 > 1.2
+
+
 def test_a_sphere_far_outside_the_frame_has_an_empty_image():
     """Its box is empty, and so are the image and its gradient."""
     spot = sphere_image(diameter=DIAMETER, psf=PSF, voxel=VOXEL).spot(
@@ -190,6 +270,7 @@ def test_optics_are_learned_from_the_movie(learned):
     assert np.all(np.abs(got - [DIAMETER, *PSF]) < 4 * np.array(learned.stderr))
     assert np.all(np.array(learned.stderr) < 0.005)
     assert learned.noise.gain == pytest.approx(GAIN, rel=0.05)
+    assert learned.tail is None
 
 
 def test_touching_spheres_are_located_within_the_stated_errors(tetrahedra, learned):
@@ -303,8 +384,11 @@ def test_spots_are_stated_in_an_object_or_as_keywords(tetrahedra):
 
 def test_optics_noise_and_spots_survive_json(learned):
     """What `from_dict` reads from the JSON of `to_dict` equals the original."""
-    for original in (learned, learned.noise, Spots(dark=True), Spots(minmass=2.5, border=False)):
+    tailed = replace(learned, tail=PsfTail(0.1, (0.9, 0.4)))
+    for original in (learned, tailed, learned.noise, Spots(dark=True), Spots(minmass=2.5, border=False)):
         entry = json.loads(json.dumps(original.to_dict()))
         assert type(original).from_dict(entry) == original
     # The keys and the nesting are those of earlier run folders.
-    assert json.loads(json.dumps(asdict(learned))) == learned.to_dict()
+    assert json.loads(json.dumps(asdict(tailed))) == tailed.to_dict()
+    earlier = {k: v for k, v in learned.to_dict().items() if k != "tail"}
+    assert perrin.Optics.from_dict(earlier) == learned

@@ -85,8 +85,9 @@ class BallBlur(NamedTuple):
         radius = self.diameter / 2
         total = np.zeros((len(z), len(rho)))
         for share, (blur_z, blur) in self.components:
-            nodes, weights = _gaussian_nodes(float(np.sqrt(max(blur_z**2 - blur**2, 0.0))), blur)
-            r = np.hypot((z[:, None] - nodes)[..., None], rho)
+            excess = float(np.sqrt(max(blur_z**2 - blur**2, 0.0)))
+            nodes, weights = _gaussian_quadrature(z, excess, blur)
+            r = np.hypot(nodes[:, None], rho)
             a, b = (radius - r) / blur, (radius + r) / blur
             # Near the centre the difference of exponentials over r is its limit, the derivative.
             small = r < 1e-4 * blur
@@ -94,7 +95,7 @@ class BallBlur(NamedTuple):
             edge = blur / safe * (np.exp(-0.5 * a**2) - np.exp(-0.5 * b**2))
             edge = np.where(small, 2 * radius / blur * np.exp(-0.5 * (radius / blur) ** 2), edge)
             ball = 0.5 * (erf(b / np.sqrt(2)) + erf(a / np.sqrt(2))) - edge / np.sqrt(2 * np.pi)
-            total += share * np.einsum("k,zkr->zr", weights, ball)
+            total += share * (weights @ ball)
         return total
 
 
@@ -336,15 +337,21 @@ def _spline_knots(table: Floats) -> Floats:
     return np.pad(table, 1, mode="reflect")
 
 
-def _gaussian_nodes(width: float, blur: float) -> tuple[Floats, Floats]:
-    """Return nodes and weights that convolve with a Gaussian; the sum converges exponentially."""
-    if width < 1e-6 * blur:
-        return np.zeros(1), np.ones(1)
+def _gaussian_quadrature(z: Floats, width: float, blur: float) -> tuple[Floats, Floats]:
+    """Return nodes (k,) and weights (len(z), k) that convolve a function with a Gaussian at z.
+
+    The function is even, and smooth over `blur`. The sum over even spaces converges exponentially;
+    for a Gaussian far narrower than `blur` three Hermite nodes have an error below 1e-8.
+    """
+    if width < 0.05 * blur:
+        nodes = np.concatenate([z, z - np.sqrt(3) * width, z + np.sqrt(3) * width])
+        return nodes, np.hstack([np.eye(len(z)) * share for share in (2 / 3, 1 / 6, 1 / 6)])
     step = min(width, blur) / 2
-    count = int(np.ceil(6 * width / step))
-    nodes = np.asarray(step * np.arange(-count, count + 1), dtype=np.float64)
-    weights = np.exp(-0.5 * (nodes / width) ** 2)
-    return nodes, weights / weights.sum()
+    nodes = step * np.arange(int(np.ceil((z.max() + 6 * width) / step)) + 1)
+    weights = np.exp(-0.5 * ((z[:, None] - nodes) / width) ** 2)
+    weights += np.exp(-0.5 * ((z[:, None] + nodes) / width) ** 2)
+    weights[:, 0] /= 2
+    return nodes, weights * (step / (width * np.sqrt(2 * np.pi)))
 
 
 def _cubic_splines(t: Floats, count: int) -> tuple[Floats, Floats]:

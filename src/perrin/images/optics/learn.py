@@ -32,6 +32,9 @@ _MAX_STEP, _STEP_CONVERGED, _STEP_IN_ERRORS = 0.25, 1e-3, 0.3
 
 _MAX_LEARNING_ROUNDS = 15
 
+# The same two for the tail of half of the groups, which only has to be good enough to be chosen.
+_MAX_TRIAL_ROUNDS, _TRIAL_STEP_IN_ERRORS = 6, 2.0
+
 # Least ratios of the blur along z to that in the plane (both are varied), of the blur to that of
 # the voxel alone, and of the tail's blur to that of the narrower Gaussian.
 _LEAST_ELONGATION, _LEAST_OVER_VOXEL, _LEAST_TAIL = 1.025, 1.02, 1.2
@@ -188,7 +191,8 @@ class ImageParameters:
         step, free = np.zeros_like(score), np.ones(len(score), dtype=np.bool_)
         while free.any():
             pull = score[free] - information[free][:, ~free] @ step[~free]
-            step[free] = np.linalg.solve(information[free][:, free], pull)
+            # Without a share there is no information on the widths of the tail.
+            step[free] = np.linalg.lstsq(information[free][:, free], pull, rcond=None)[0]
             moved = self.values + step
             left = free & ((moved < low) | (moved > high))
             if not left.any():
@@ -201,7 +205,7 @@ class ImageParameters:
     def optics(self, noise: CameraNoise, information: Floats) -> Optics:
         """Return the optics, with standard errors from the information on the parameters."""
         image = self.image()
-        error = np.sqrt(np.diag(np.linalg.inv(information)))[:3]
+        error = np.sqrt(np.diag(np.linalg.pinv(information, hermitian=True)))[:3]
         # The blur is the root of the sum of squares of point spread and voxel.
         factor = np.array([image.diameter, *(np.square(image.blur) / np.array(image.psf))])
         a, b, c = (float(value) for value in factor * error)
@@ -508,11 +512,16 @@ def fit_samples(
 
 
 def _settled(
-    samples: list[GroupSample | CrowdSample], parameters: ImageParameters, noise: CameraNoise
+    samples: list[GroupSample | CrowdSample],
+    parameters: ImageParameters,
+    noise: CameraNoise,
+    *,
+    rounds: int = _MAX_LEARNING_ROUNDS,
+    tolerance: float = _STEP_IN_ERRORS,
 ) -> _Settled:
-    """Return the parameters of greatest likelihood, from a start."""
+    """Return the parameters of greatest likelihood, from a start; steps in standard errors."""
     n = len(parameters.values)
-    for number in range(_MAX_LEARNING_ROUNDS):
+    for number in range(rounds):
         variations = ImageVariations.about(parameters)
         fits = [s.fit(variations, noise) for s in samples]
         samples = [s._replace(centers=fit.centers) for s, fit in zip(samples, fits, strict=True)]
@@ -527,12 +536,12 @@ def _settled(
         parameters = moved
         in_errors = float(np.sqrt(step @ information[:n, :n] @ step))
         # The information of the first round is that of a guessed noise.
-        if np.abs(step).max() < _STEP_CONVERGED or (number > 0 and in_errors < _STEP_IN_ERRORS):
+        if np.abs(step).max() < _STEP_CONVERGED or (number > 0 and in_errors < tolerance):
             return _Settled(parameters, noise, samples, information, score)
     size, psf_z, psf = np.exp(parameters.values[:3])
     raise NoSpheresError(
         f"sphere size and point spread do not converge: diameter {size:.3g}, blur "
-        f"({psf_z:.3g}, {psf:.3g}) um after {_MAX_LEARNING_ROUNDS} rounds "
+        f"({psf_z:.3g}, {psf:.3g}) um after {rounds} rounds "
         f"on {len(samples)} groups: are these spheres, bright enough, or dark (dark=True), and "
         "is the voxel size right? State the optics (optics=), or keep the positions found "
         "first (refine=None)"
@@ -541,7 +550,7 @@ def _settled(
 
 def _shows_tail(found: _Settled) -> bool:
     """Return whether the first step of a tail's share is significantly positive."""
-    variance = np.linalg.inv(found.information)
+    variance = np.linalg.pinv(found.information, hermitian=True)
     share = float(variance[-1] @ found.score)
     return share > _LEAST_SHARE_ERRORS * float(np.sqrt(variance[-1, -1]))
 
@@ -557,7 +566,13 @@ def _with_tail(plain: _Settled) -> _Settled:
     if len(groups) < 2:
         return plain
     try:
-        half = _settled(list(groups[::2]), start, plain.noise)
+        half = _settled(
+            list(groups[::2]),
+            start,
+            plain.noise,
+            rounds=_MAX_TRIAL_ROUNDS,
+            tolerance=_TRIAL_STEP_IN_ERRORS,
+        )
         tailed, image = half.parameters.image(), plain.parameters.image()
         gain = sum(
             s.log_likelihood(tailed, half.noise, within=tailed)

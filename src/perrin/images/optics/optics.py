@@ -99,14 +99,14 @@ class Optics:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the optics as values that JSON holds: `noise` as [gain, floor], `tail` as
-        [share, z, plane].
+        [share, [z, plane]].
         """
         return {
             "diameter": to_plain(self.diameter),
             "psf": to_plain(self.psf),
             "noise": [to_plain(value) for value in self.noise],
             "stderr": to_plain(self.stderr),
-            "tail": None if self.tail is None else to_plain([self.tail.share, *self.tail.psf]),
+            "tail": None if self.tail is None else [to_plain(part) for part in self.tail],
         }
 
     @classmethod
@@ -125,7 +125,7 @@ class Optics:
         (psf_z, psf), (a, b, c) = entry["psf"], entry["stderr"]
         tail = None
         if entry.get("tail") is not None:
-            share, tail_z, tail_plane = entry["tail"]
+            share, (tail_z, tail_plane) = entry["tail"]
             tail = PsfTail(share, (tail_z, tail_plane))
         noise = CameraNoise(*entry["noise"])
         return cls(entry["diameter"], (psf_z, psf), noise, (a, b, c), tail)
