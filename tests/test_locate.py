@@ -385,7 +385,13 @@ def test_spots_are_stated_in_an_object_or_as_keywords(tetrahedra):
 def test_optics_noise_and_spots_survive_json(learned):
     """What `from_dict` reads from the JSON of `to_dict` equals the original."""
     tailed = replace(learned, tail=PsfTail(0.1, (0.9, 0.4)))
-    for original in (learned, tailed, learned.noise, Spots(dark=True), Spots(minmass=2.5, border=False)):
+    for original in (
+        learned,
+        tailed,
+        learned.noise,
+        Spots(dark=True),
+        Spots(minmass=2.5, border=False),
+    ):
         entry = json.loads(json.dumps(original.to_dict()))
         assert type(original).from_dict(entry) == original
     # The keys and the nesting are those of earlier run folders.

@@ -62,7 +62,7 @@ from perrin.images.formats.vendors import (
 )
 from perrin.images.formats.zeiss import czi, czi_times
 from perrin.images.imaging import Imaging, View, read_imaging, write_imaging
-from perrin.images.optics.ball_image import SphereImage, SphereSpot, sphere_image
+from perrin.images.optics.ball_image import BallBlur, PsfTail, SphereImage, SphereSpot, sphere_image
 from perrin.images.optics.crowd_equations import (
     CrowdIntensity,
     CrowdWindow,
@@ -75,6 +75,7 @@ from perrin.images.optics.crowd_equations import (
     profile_information,
     project,
     residual_maps,
+    slopes_of_spheres,
     sphere_chi2,
     standard_errors,
     sum_of_spheres,
@@ -90,9 +91,11 @@ from perrin.images.optics.crowd_fit import (
 from perrin.images.optics.learn import (
     CrowdSample,
     GroupSample,
+    ImageParameters,
     ImageVariations,
     SampleFit,
     fit_samples,
+    neighbour_variance,
     photon_transfer,
     saturated_share,
 )
@@ -151,6 +154,7 @@ __all__ = [
     "NO_FLAT_MODEL",
     "Arrangement",
     "ArrayFrames",
+    "BallBlur",
     "Camera",
     "CameraNoise",
     "Contents",
@@ -165,6 +169,7 @@ __all__ = [
     "GroupSample",
     "HeaderScale",
     "ImageFit",
+    "ImageParameters",
     "ImageVariations",
     "Imaging",
     "Layout",
@@ -174,6 +179,7 @@ __all__ = [
     "Optics",
     "Pick",
     "Pose",
+    "PsfTail",
     "RenderSettings",
     "RenderedFrames",
     "RigidCenters",
@@ -252,6 +258,7 @@ __all__ = [
     "nd2",
     "ndtiff",
     "needed",
+    "neighbour_variance",
     "ngff_scale",
     "normal_equations",
     "numpy_file",
@@ -279,6 +286,7 @@ __all__ = [
     "sequence",
     "sequence_files",
     "size_faults",
+    "slopes_of_spheres",
     "sphere_chi2",
     "sphere_image",
     "sphere_paths",

@@ -202,7 +202,9 @@ class SphereImage:
         difference : float
             The change of the parameter between the two.
         """
-        z, rho = (h * np.arange(n - 2) for h, n in zip(self._spacing, self._knots.shape, strict=True))
+        z, rho = (
+            h * np.arange(n - 2) for h, n in zip(self._spacing, self._knots.shape, strict=True)
+        )
         tables = [larger.intensity(z, rho) - smaller.intensity(z, rho) for larger, smaller in pairs]
         return np.stack([_spline_knots(table / difference) for table in tables])
 
@@ -319,7 +321,7 @@ def sphere_image(
     blur_z, blur = components[0][1]
     spacing = _KNOT_SPACING * blur_z, _KNOT_SPACING * blur
     z, rho = (
-        h * np.arange(int(np.ceil((diameter / 2 + end) / h)) + 2)
+        np.asarray(h * np.arange(int(np.ceil((diameter / 2 + end) / h)) + 2), dtype=np.float64)
         for h, end in zip(spacing, ball.ranges(_TABLE_RANGE, _TAIL_TABLE_RANGE), strict=True)
     )
     knots = _spline_knots(ball.intensity(z, rho))
@@ -351,7 +353,7 @@ def _gaussian_quadrature(z: Floats, width: float, blur: float) -> tuple[Floats, 
     weights = np.exp(-0.5 * ((z[:, None] - nodes) / width) ** 2)
     weights += np.exp(-0.5 * ((z[:, None] + nodes) / width) ** 2)
     weights[:, 0] /= 2
-    return nodes, weights * (step / (width * np.sqrt(2 * np.pi)))
+    return np.asarray(nodes, dtype=np.float64), weights * (step / (width * np.sqrt(2 * np.pi)))
 
 
 def _cubic_splines(t: Floats, count: int) -> tuple[Floats, Floats]:

@@ -149,14 +149,17 @@ class ImageParameters:
         tail = None
         if wider:
             tail = PsfTail(ball.components[1][0], (wider[0][0], wider[0][1]))
-        return sphere_image(
-            diameter=ball.diameter, psf=(psf_z, psf), voxel=self.voxel, tail=tail
-        )
+        return sphere_image(diameter=ball.diameter, psf=(psf_z, psf), voxel=self.voxel, tail=tail)
 
     def with_tail(self) -> ImageParameters:
         """Return parameters with a tail at the start of its search."""
         blurs = self.values[1:]
-        start = [self.values[:1], blurs + np.log(_NARROWED), [_TAIL_SHARE], blurs + np.log(_WIDENED)]
+        start = [
+            self.values[:1],
+            blurs + np.log(_NARROWED),
+            [_TAIL_SHARE],
+            blurs + np.log(_WIDENED),
+        ]
         return ImageParameters(np.concatenate(start), self.voxel).within_bounds()
 
     def bounds(self) -> tuple[Floats, Floats]:
@@ -310,9 +313,9 @@ class GroupSample(NamedTuple):
         residual = window.data - fit.expected
         information = weighted @ slope.T - shared.T @ taken
         score = weighted @ residual - taken.T @ (nuisance @ residual)
-        whole = np.zeros((2, *window.mask.shape))
-        whole[:, window.mask] = residual, fit.expected
-        expected, variance = neighbour_variance(*whole, window.mask, image=image)
+        left, level = np.zeros((2, *window.mask.shape))
+        left[window.mask], level[window.mask] = residual, fit.expected
+        expected, variance = neighbour_variance(left, level, window.mask, image=image)
         return SampleFit(fit.centers, information, score, expected, variance)
 
     def log_likelihood(
@@ -486,7 +489,8 @@ def fit_samples(
 
     The point spread is a Gaussian. Where the derivative of the likelihood by the share of a wider
     second Gaussian is significant, the sum of two Gaussians is fitted to every other group, and it
-    is used if the likelihood of the groups between them is the larger one. Crowds have one Gaussian.
+    is used if the likelihood of the groups between them is the larger one. Crowds have one
+    Gaussian.
     """
     psf = np.array([max(voxel[0], 0.15 * diameter), max(voxel[1] / 2, 0.06 * diameter)])
     start = ImageParameters(np.log([diameter, 1.0, 1.0]), voxel)

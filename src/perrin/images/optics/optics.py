@@ -98,9 +98,7 @@ class Optics:
     tail: PsfTail | None = None
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the optics as values that JSON holds: `noise` as [gain, floor], `tail` as
-        [share, [z, plane]].
-        """
+        """Return values that JSON holds: `noise` as [gain, floor], `tail` as [share, psf]."""
         return {
             "diameter": to_plain(self.diameter),
             "psf": to_plain(self.psf),
