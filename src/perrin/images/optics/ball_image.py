@@ -5,7 +5,7 @@ In `perrin.images` the axes of arrays, centres and point spreads are (z, y, x).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -24,6 +24,10 @@ _FIT_RANGE, _TAIL_FIT_RANGE = 3.5, 1.5
 
 # The table ends this many blurs outside the sphere, where less than 1e-5 is left.
 _TABLE_RANGE, _TAIL_TABLE_RANGE = 4.5, 3.5
+
+# Where diameters differ: largest deviation of a sphere's from the mean, in standard deviations and
+# in its logarithm, and the spacing of the tables in units of the blur; the cubic error is 1e-3.
+_SIZE_RANGE, _MAX_SIZE_RANGE, _SIZE_SPACING = 4.0, 0.3, 0.4
 
 
 class PsfTail(NamedTuple):
@@ -133,6 +137,8 @@ class SphereImage:
         Standard deviations of point spread and voxel together, (z, plane), um.
     tail : PsfTail or None
         The second, wider Gaussian of the point spread; `psf` and `blur` are of the first.
+    spread : float
+        Relative standard deviation of the diameters; 0 where all spheres are equal.
 
     Examples
     --------
@@ -147,21 +153,57 @@ class SphereImage:
     voxel: tuple[float, float, float]
     blur: tuple[float, float]
     tail: PsfTail | None
+    spread: float
     _ball: BallBlur
     _knots: Floats
     _spacing: tuple[float, float]
+    _sizes: Floats
+    _tables: Floats
 
     @property
     def reach(self) -> tuple[float, float, float]:
         """Distances from the centre along z, y and x at which the image ends, um."""
         z, plane = self._ball.ranges(_TABLE_RANGE, _TAIL_TABLE_RANGE)
-        return self.diameter / 2 + z, self.diameter / 2 + plane, self.diameter / 2 + plane
+        radius = self.diameter / 2 * float(np.exp(_size_range(self.spread)))
+        return radius + z, radius + plane, radius + plane
 
     @property
     def extent(self) -> Floats:
         """Half axes (z, y, x) of the ellipsoid of voxels that a fit uses, um."""
         z, plane = self._ball.ranges(_FIT_RANGE, _TAIL_FIT_RANGE)
-        return self.diameter / 2 + np.array([z, plane, plane])
+        return self.diameter / 2 * (1 + self.spread) + np.array([z, plane, plane])
+
+    @property
+    def size_range(self) -> float:
+        """Largest deviation of the logarithm of a diameter from the mean."""
+        return _size_range(self.spread)
+
+    def sized(self, deviation: float) -> SphereImage:
+        """Return the image of a sphere whose logarithm of the diameter deviates from the mean."""
+        if self.spread == 0:
+            return self
+        value, _ = self._between_sizes(deviation)
+        return replace(self, _knots=np.tensordot(value, self._tables, 1))
+
+    def size_slope(self, deviation: float) -> Floats:
+        """Return the table (1, ...) of the derivative by this deviation, for `slope_spot`."""
+        _, slope = self._between_sizes(deviation)
+        return np.asarray(np.tensordot(slope, self._tables, 1)[None])
+
+    def _between_sizes(self, deviation: float) -> tuple[Floats, Floats]:
+        """Return the factors of the tables at a deviation, and their derivatives."""
+        step = self._sizes[1] - self._sizes[0]
+        t = (deviation - self._sizes[0]) / step
+        first = int(np.clip(np.floor(t) - 1, 0, len(self._sizes) - 4))
+        u = t - first
+        value, slope = np.zeros((2, len(self._sizes)))
+        for k in range(4):
+            other = np.array([j for j in range(4) if j != k])
+            scale = float(np.prod(k - other))
+            a, b, c = u - other
+            value[first + k] = a * b * c / scale
+            slope[first + k] = (a * b + b * c + a * c) / (scale * step)
+        return value, slope
 
     def spot(self, center: Floats, shape: tuple[int, ...]) -> SphereSpot:
         """Return the image of a sphere at `center` (z, y, x), um, inside an array of `shape`.
@@ -173,7 +215,7 @@ class SphereImage:
         return SphereSpot(box, value, gradient)
 
     def slope_spot(
-        self, slopes: Floats, center: Floats, shape: tuple[int, ...]
+        self, slopes: Floats, center: Floats, shape: tuple[int, ...], *, deviation: float = 0.0
     ) -> tuple[tuple[slice, slice, slice], Floats]:
         """Return the voxels that the image covers, and its derivatives (k, nz, ny, nx).
 
@@ -185,8 +227,12 @@ class SphereImage:
             Position (z, y, x), um.
         shape : tuple of int
             Shape of the array.
+        deviation : float
+            Deviation of the logarithm of the diameter at which tables of the mean diameter are
+            evaluated, by their scale.
         """
-        box, (z, y, x) = self._covered(center, shape)
+        box, offsets = self._covered(center, shape)
+        z, y, x = (offset * float(np.exp(-deviation)) for offset in offsets)
         rho = np.hypot(y[:, None], x)
         along, _ = _cubic_splines(np.abs(z) / self._spacing[0], slopes.shape[1])
         across, _ = _cubic_splines(rho.ravel() / self._spacing[1], slopes.shape[2])
@@ -261,6 +307,7 @@ def sphere_image(
     psf: tuple[float, float],
     voxel: tuple[float, float, float],
     tail: PsfTail | None = None,
+    spread: float = 0.0,
 ) -> SphereImage:
     """Tabulate a ball convolved with an anisotropic point spread and with the voxels.
 
@@ -274,6 +321,8 @@ def sphere_image(
         Voxel size (z, y, x), um.
     tail : PsfTail, optional
         A second, wider Gaussian of the point spread.
+    spread : float
+        Relative standard deviation of the diameters of different spheres.
 
     Returns
     -------
@@ -320,13 +369,27 @@ def sphere_image(
     ball = BallBlur(diameter, tuple(components))
     blur_z, blur = components[0][1]
     spacing = _KNOT_SPACING * blur_z, _KNOT_SPACING * blur
+    radius = diameter / 2 * float(np.exp(_size_range(spread)))
     z, rho = (
-        np.asarray(h * np.arange(int(np.ceil((diameter / 2 + end) / h)) + 2), dtype=np.float64)
+        np.asarray(h * np.arange(int(np.ceil((radius + end) / h)) + 2), dtype=np.float64)
         for h, end in zip(spacing, ball.ranges(_TABLE_RANGE, _TAIL_TABLE_RANGE), strict=True)
     )
     knots = _spline_knots(ball.intensity(z, rho))
-    frozen(knots)
-    return SphereImage(diameter, psf, voxel, (blur_z, blur), tail, ball, knots, spacing)
+    sizes, tables = np.zeros(1), knots[None]
+    if spread > 0:
+        half = int(np.ceil(_size_range(spread) * diameter / 2 / (_SIZE_SPACING * blur))) + 1
+        sizes = np.linspace(-1.0, 1.0, 2 * half + 1) * _size_range(spread)
+        balls = [ball._replace(diameter=diameter * float(np.exp(size))) for size in sizes]
+        tables = np.stack([_spline_knots(sphere.intensity(z, rho)) for sphere in balls])
+    frozen(knots, sizes, tables)
+    return SphereImage(
+        diameter, psf, voxel, (blur_z, blur), tail, spread, ball, knots, spacing, sizes, tables
+    )
+
+
+def _size_range(spread: float) -> float:
+    """Return the largest deviation of the logarithm of a diameter from the mean."""
+    return min(_SIZE_RANGE * spread, _MAX_SIZE_RANGE)
 
 
 def _spline_knots(table: Floats) -> Floats:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -45,6 +45,13 @@ _NARROWED, _WIDENED, _TAIL_SHARE, _MAX_TAIL_SHARE = 0.85, 3.0, 0.15, 0.6
 # A tail is searched for if its share is this many standard errors above 0 to first order, and it is
 # kept if it increases the logarithm of the likelihood of other groups by at least this.
 _LEAST_SHARE_ERRORS, _LEAST_HELD_OUT_GAIN = 3.0, 3.0
+
+# Spread of the diameters with which they are fitted first; a spread is used if it is at least this,
+# and increases the logarithm of the likelihood of the diameters by at least this.
+_FIRST_SPREAD, _LEAST_SPREAD, _LEAST_SPREAD_GAIN = 0.06, 0.007, 5.0
+
+# Change of the spread, relative to it, at which its search ends.
+_SPREAD_CONVERGED = 0.05
 
 # Order of the differences between neighbouring voxels, and their factors: a variance of 20.
 _NEIGHBOURS = np.array([-1.0, 3.0, -3.0, 1.0])
@@ -116,6 +123,8 @@ class ImageParameters:
         share, and the logarithms of its blurs. Blurs include the voxel.
     voxel : tuple of float
         Voxel size (z, y, x), um.
+    spread : float
+        Relative standard deviation of the diameters of different spheres.
 
     Examples
     --------
@@ -126,6 +135,7 @@ class ImageParameters:
 
     values: Floats
     voxel: tuple[float, float, float]
+    spread: float = 0.0
 
     @property
     def voxel_blur(self) -> Floats:
@@ -149,7 +159,13 @@ class ImageParameters:
         tail = None
         if wider:
             tail = PsfTail(ball.components[1][0], (wider[0][0], wider[0][1]))
-        return sphere_image(diameter=ball.diameter, psf=(psf_z, psf), voxel=self.voxel, tail=tail)
+        return sphere_image(
+            diameter=ball.diameter,
+            psf=(psf_z, psf),
+            voxel=self.voxel,
+            tail=tail,
+            spread=self.spread,
+        )
 
     def with_tail(self) -> ImageParameters:
         """Return parameters with a tail at the start of its search."""
@@ -160,7 +176,7 @@ class ImageParameters:
             [_TAIL_SHARE],
             blurs + np.log(_WIDENED),
         ]
-        return ImageParameters(np.concatenate(start), self.voxel).within_bounds()
+        return replace(self, values=np.concatenate(start)).within_bounds()
 
     def bounds(self) -> tuple[Floats, Floats]:
         """Return the least and the largest values of the parameters.
@@ -182,16 +198,20 @@ class ImageParameters:
 
     def within_bounds(self) -> ImageParameters:
         """Return the nearest parameters within the bounds."""
-        return ImageParameters(np.clip(self.values, *self.bounds()), self.voxel)
+        return replace(self, values=np.clip(self.values, *self.bounds()))
 
-    def moved(self, information: Floats, score: Floats) -> ImageParameters:
+    def moved(
+        self, information: Floats, score: Floats, *, larger: float | None = None
+    ) -> ImageParameters:
         """Return the parameters after a Gauss-Newton step that stays within the bounds.
 
         A parameter that would leave its bound is set to it, and the step of the others is computed
-        again.
+        again. The step of the diameter may be given as `larger`.
         """
         low, high = self.bounds()
         step, free = np.zeros_like(score), np.ones(len(score), dtype=np.bool_)
+        if larger is not None:
+            step[0], free[0] = larger, False
         while free.any():
             pull = score[free] - information[free][:, ~free] @ step[~free]
             # Without a share there is no information on the widths of the tail.
@@ -203,7 +223,7 @@ class ImageParameters:
             step[left] = np.clip(moved, low, high)[left] - self.values[left]
             free &= ~left
         step *= min(1.0, _MAX_STEP / max(np.abs(step).max(), _MAX_STEP))
-        return ImageParameters(self.values + step, self.voxel).within_bounds()
+        return replace(self, values=self.values + step).within_bounds()
 
     def optics(self, noise: CameraNoise, information: Floats) -> Optics:
         """Return the optics, with standard errors from the information on the parameters."""
@@ -212,7 +232,7 @@ class ImageParameters:
         # The blur is the root of the sum of squares of point spread and voxel.
         factor = np.array([image.diameter, *(np.square(image.blur) / np.array(image.psf))])
         a, b, c = (float(value) for value in factor * error)
-        return Optics(image.diameter, image.psf, noise, (a, b, c), image.tail)
+        return Optics(image.diameter, image.psf, noise, (a, b, c), image.tail, self.spread)
 
 
 class ImageVariations(NamedTuple):
@@ -261,6 +281,8 @@ class SampleFit(NamedTuple):
         Expected grey levels of groups of neighbouring voxels.
     variance : ndarray, shape (m,)
         Estimates of the variance of these voxels from their differences (`neighbour_variance`).
+    sizes, size_variance : ndarray, shape (n,)
+        Deviations of the logarithms of the diameters and their variances, where they are fitted.
     """
 
     centers: Floats
@@ -268,6 +290,8 @@ class SampleFit(NamedTuple):
     score: Floats
     expected: Floats
     variance: Floats
+    sizes: Floats
+    size_variance: Floats
 
 
 class GroupSample(NamedTuple):
@@ -304,19 +328,25 @@ class GroupSample(NamedTuple):
         image = variations.image
         window = self.window(image)
         fit = fit_window(window, image, noise, FreeCenters(self.centers))
-        slope = window.slopes(image, variations.slopes, fit.centers, fit.brightness)
+        slope = window.slopes(image, variations.slopes, fit.centers, fit.brightness, fit.sizes)
         # The Schur complement of the information, with the fit's own parameters eliminated.
         weighted = slope * fit.weight
         nuisance = fit.jacobian * fit.weight
         shared = nuisance @ slope.T
-        taken = np.linalg.lstsq(nuisance @ fit.jacobian.T, shared, rcond=None)[0]
+        own = nuisance @ fit.jacobian.T + np.diag(fit.prior)
+        taken = np.linalg.lstsq(own, shared, rcond=None)[0]
         residual = window.data - fit.expected
         information = weighted @ slope.T - shared.T @ taken
-        score = weighted @ residual - taken.T @ (nuisance @ residual)
+        left_over = nuisance @ residual
+        if image.spread > 0:
+            left_over[fit.prior > 0] -= fit.sizes / image.spread**2
+        score = weighted @ residual - taken.T @ left_over
         left, level = np.zeros((2, *window.mask.shape))
         left[window.mask], level[window.mask] = residual, fit.expected
         expected, variance = neighbour_variance(left, level, window.mask, image=image)
-        return SampleFit(fit.centers, information, score, expected, variance)
+        return SampleFit(
+            fit.centers, information, score, expected, variance, fit.sizes, fit.size_variance
+        )
 
     def log_likelihood(
         self, image: SphereImage, noise: CameraNoise, *, within: SphereImage
@@ -387,7 +417,8 @@ class CrowdSample(NamedTuple):
         expected, variance = neighbour_variance(
             residual, state.expected, window.mask, image=variations.image
         )
-        return SampleFit(state.centers, information, score, expected, variance)
+        equal = np.zeros(len(state.centers))
+        return SampleFit(state.centers, information, score, expected, variance, equal, equal)
 
 
 def neighbour_variance(
@@ -489,8 +520,10 @@ def fit_samples(
 
     The point spread is a Gaussian. Where the derivative of the likelihood by the share of a wider
     second Gaussian is significant, the sum of two Gaussians is fitted to every other group, and it
-    is used if the likelihood of the groups between them is the larger one. Crowds have one
-    Gaussian.
+    is used if the likelihood of the groups between them is the larger one. Where the diameters of
+    single spheres, fitted with a wide distribution, differ by more than their errors, their spread
+    is learned too: that of greatest likelihood, and the mean diameter is the mean of the spheres.
+    Crowds have one Gaussian and one diameter.
     """
     psf = np.array([max(voxel[0], 0.15 * diameter), max(voxel[1] / 2, 0.06 * diameter)])
     start = ImageParameters(np.log([diameter, 1.0, 1.0]), voxel)
@@ -510,6 +543,8 @@ def fit_samples(
         )
     mean = float(np.mean([s.frame.mean() for s in usable]))
     found = _settled(usable, start, CameraNoise(1.0, 0.05 * abs(mean)))
+    if not any(isinstance(s, CrowdSample) for s in usable):
+        found = _with_spread(found)
     if _shows_tail(found):
         found = _with_tail(found)
     return found.parameters.optics(found.noise, found.information)
@@ -535,12 +570,20 @@ def _settled(
             np.concatenate([fit.expected for fit in fits]),
             np.concatenate([fit.variance for fit in fits]),
         )
-        moved = parameters.moved(information[:n, :n], score[:n])
+        spread, larger = parameters.spread, None
+        if spread > 0:
+            sizes = np.concatenate([fit.sizes for fit in fits])
+            variance = np.concatenate([fit.size_variance for fit in fits])
+            larger = float(sizes.mean())
+            spread = float(np.sqrt(np.mean((sizes - larger) ** 2 + variance)))
+        moved = parameters.moved(information[:n, :n], score[:n], larger=larger)
         step = moved.values - parameters.values
-        parameters = moved
+        same = abs(spread - parameters.spread) <= _SPREAD_CONVERGED * spread
+        parameters = replace(moved, spread=spread)
         in_errors = float(np.sqrt(step @ information[:n, :n] @ step))
         # The information of the first round is that of a guessed noise.
-        if np.abs(step).max() < _STEP_CONVERGED or (number > 0 and in_errors < tolerance):
+        settled = np.abs(step).max() < _STEP_CONVERGED or (number > 0 and in_errors < tolerance)
+        if settled and same:
             return _Settled(parameters, noise, samples, information, score)
     size, psf_z, psf = np.exp(parameters.values[:3])
     raise NoSpheresError(
@@ -550,6 +593,33 @@ def _settled(
         "is the voxel size right? State the optics (optics=), or keep the positions found "
         "first (refine=None)"
     )
+
+
+def _with_spread(equal: _Settled) -> _Settled:
+    """Return the parameters with a spread of the diameters if their likelihood shows one."""
+    trial = replace(equal.parameters, spread=_FIRST_SPREAD)
+    variations = ImageVariations.about(trial)
+    fits = [s.fit(variations, equal.noise) for s in equal.samples]
+    sizes = np.concatenate([fit.sizes for fit in fits])
+    posterior = np.concatenate([fit.size_variance for fit in fits])
+    # Deviations and variances from the images alone, without the distribution.
+    variance = 1.0 / np.maximum(1.0 / posterior - _FIRST_SPREAD**-2, 1e-3 / posterior)
+    deviation = sizes * variance / posterior
+    deviation -= np.average(deviation, weights=1.0 / variance)
+    spreads = np.geomspace(_LEAST_SPREAD, 0.2, 30)
+    total = variance + spreads[:, None] ** 2
+    gain = 0.5 * np.sum(
+        deviation**2 * (1.0 / variance - 1.0 / total) - np.log(total / variance), axis=1
+    )
+    best = int(np.argmax(gain))
+    if gain[best] < _LEAST_SPREAD_GAIN:
+        return equal
+    try:
+        start = replace(equal.parameters, spread=float(spreads[best]))
+        return _settled(equal.samples, start, equal.noise)
+    except NoSpheresError:
+        # Equal diameters have settled, and different ones have not: the first are used.
+        return equal
 
 
 def _shows_tail(found: _Settled) -> bool:

@@ -83,6 +83,8 @@ class Optics:
     tail : PsfTail or None
         The second, wider Gaussian of the point spread: its share of the intensity and its standard
         deviations (z, plane), um; None for a Gaussian point spread.
+    spread : float
+        Relative standard deviation of the diameters of different spheres; 0 where they are equal.
 
     Examples
     --------
@@ -96,6 +98,7 @@ class Optics:
     noise: CameraNoise
     stderr: tuple[float, float, float] = (0.0, 0.0, 0.0)
     tail: PsfTail | None = None
+    spread: float = 0.0
 
     def to_dict(self) -> dict[str, Any]:
         """Return values that JSON holds: `noise` as [gain, floor], `tail` as [share, psf]."""
@@ -105,6 +108,7 @@ class Optics:
             "noise": [to_plain(value) for value in self.noise],
             "stderr": to_plain(self.stderr),
             "tail": None if self.tail is None else [to_plain(part) for part in self.tail],
+            "spread": to_plain(self.spread),
         }
 
     @classmethod
@@ -114,7 +118,8 @@ class Optics:
         Parameters
         ----------
         entry : mapping
-            The dictionary of `to_dict`; one without `tail` has a Gaussian point spread.
+            The dictionary of `to_dict`; one without `tail` has a Gaussian point spread,
+            and one without `spread` equal spheres.
 
         Returns
         -------
@@ -126,8 +131,16 @@ class Optics:
             share, (tail_z, tail_plane) = entry["tail"]
             tail = PsfTail(share, (tail_z, tail_plane))
         noise = CameraNoise(*entry["noise"])
-        return cls(entry["diameter"], (psf_z, psf), noise, (a, b, c), tail)
+        return cls(
+            entry["diameter"], (psf_z, psf), noise, (a, b, c), tail, entry.get("spread", 0.0)
+        )
 
     def image(self, voxel: tuple[float, float, float]) -> SphereImage:
         """Return the table of the sphere's image for voxels (z, y, x), um."""
-        return sphere_image(diameter=self.diameter, psf=self.psf, voxel=voxel, tail=self.tail)
+        return sphere_image(
+            diameter=self.diameter,
+            psf=self.psf,
+            voxel=voxel,
+            tail=self.tail,
+            spread=self.spread,
+        )
