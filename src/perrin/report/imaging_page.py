@@ -280,6 +280,8 @@ def optics_facts(imaging: Imaging) -> list[Fact]:
         wide_z, wide = (number_text(width) for width in optics.tail.psf)
         share = f"{100 * optics.tail.share:.0f} % of the intensity, {wide_z} µm along z"
         tail = [("tail of the point spread", f"{wide} µm", share)]
+    if optics.spread:
+        expected += f"; spheres differ by {100 * optics.spread:.1f} % (standard deviation)"
     return [
         ("apparent diameter", f"{size} µm", expected),
         ("point spread", f"{psf} µm", f"standard deviation in the plane; {psf_z} µm along z"),
