@@ -159,7 +159,7 @@ def focal_field(rho, z, *, wave, aperture=1.3, index=1.4):
     return np.abs(np.einsum("zt,rt,t->zr", phase, j0(k * np.outer(rho, np.sin(theta))), ring)) ** 2
 
 
-def blurred_ball(light, *, grid=0.05, half=(3.4, 2.3)):
+def blurred_ball(light, *, grid=0.05, half=(3.4, 2.3), diameter=DIAMETER):
     """Return spline coefficients of the image of one ball on a fine grid, and its spacing, um.
 
     The image is scaled to 1 at its middle.
@@ -167,7 +167,7 @@ def blurred_ball(light, *, grid=0.05, half=(3.4, 2.3)):
     n = [2 * round(half[0] / grid), 2 * round(half[1] / grid), 2 * round(half[1] / grid)]
     k = [2 * np.pi * np.fft.fftfreq(m, grid) for m in n]
     kz, ky, kx = np.meshgrid(*k, indexing="ij", sparse=True)
-    kr = np.sqrt(kz**2 + ky**2 + kx**2) * DIAMETER / 2
+    kr = np.sqrt(kz**2 + ky**2 + kx**2) * diameter / 2
     kr[0, 0, 0] = 1e-6
     ball = np.sin(kr) / kr if light.shell else 3 * (np.sin(kr) - kr * np.cos(kr)) / kr**3
     if light.psf == "gaussian":
@@ -183,9 +183,13 @@ def blurred_ball(light, *, grid=0.05, half=(3.4, 2.3)):
     return spline_filter(image / image[tuple(m // 2 for m in n)], order=3), grid
 
 
-def exposed(bodies, light, *, frame, table, dust=()):
-    """Return the mean number of photons of every voxel of one frame."""
+def exposed(bodies, light, *, frame, table, dust=(), tables=None):
+    """Return the mean number of photons of every voxel of one frame.
+
+    `tables` are those of the spheres of `bodies` in their order, where they differ.
+    """
     coefficients, grid = table
+    tables = iter(tables or ())
     planes, ny, nx = light.shape
     voxel = np.array(light.voxel)
     size = np.array(coefficients.shape)
@@ -195,6 +199,7 @@ def exposed(bodies, light, *, frame, table, dust=()):
     per = planes if light.plane_time else 1
     for b in (*bodies, *dust):
         for j, bright in enumerate(b.bright):
+            coefficients, _ = next(tables, table)
             x = b.path[frame * per : frame * per + per, j]
             x = np.broadcast_to(x, (planes, 3))
             z = np.arange(planes) * voxel[0] - x[:, 2]
@@ -220,15 +225,23 @@ def exposed(bodies, light, *, frame, table, dust=()):
     return out
 
 
-def recorded(bodies, light, *, n_frames, rng, dust=()):
+def recorded(bodies, light, *, n_frames, rng, dust=(), radius_spread=0.0):
     """Return the movie (T, z, y, x) as the camera writes it."""
-    table = blurred_ball(light)
+    table, tables = blurred_ball(light), None
+    if radius_spread:
+        n = sum(len(b.bright) for b in bodies)
+        sizes = DIAMETER * (1 + radius_spread * rng.normal(size=n))
+        tables = [blurred_ball(light, diameter=size) for size in sizes]
     gain = light.gain * (1 + light.pixel_spread * rng.normal(size=light.shape[1:]))
     depth = 1 - light.depth_loss * np.arange(light.shape[0]) / max(light.shape[0] - 1, 1)
     movie = np.empty((n_frames, *light.shape), dtype="uint8" if light.bits == 8 else "uint16")
     for i in range(n_frames):
         left = (1 - light.bleached) ** (i / max(n_frames - 1, 1))
-        mean = light.photons * left * exposed(bodies, light, frame=i, table=table, dust=dust)
+        mean = (
+            light.photons
+            * left
+            * exposed(bodies, light, frame=i, table=table, dust=dust, tables=tables)
+        )
         mean = mean * depth[:, None, None] + light.background
         grey = gain * rng.poisson(mean) + rng.normal(0, light.read_noise, light.shape)
         movie[i] = np.clip(np.round(grey), 0, 2**light.bits - 1)
@@ -282,6 +295,7 @@ class Case:
     walls: float = DIAMETER
     jump: float = 0.0  # um, of everything, before frame 10
     dust: int = 0
+    radius_spread: float = 0.0  # relative, from sphere to sphere; contacts stay those of equal ones
     n_frames: int = 20
     options: dict = field(default_factory=dict)
 
@@ -310,6 +324,11 @@ CASES = {
     "stage jump 1.2 um": Case(jump=1.2),
     "stage jump 2 um": Case(jump=2.0),
     "confocal": Case(light=replace(BASE, psf="confocal")),
+    "confocal, 200 photons": Case(light=replace(BASE, psf="confocal", photons=200, bits=16)),
+    "radii spread by 5 %": Case(radius_spread=0.05),
+    "radii spread by 8 %": Case(radius_spread=0.08),
+    "shells": Case(light=replace(BASE, shell=True)),
+    "5 photons": Case(light=replace(BASE, photons=5)),
     "realistic": Case(
         light=replace(
             BASE, psf="confocal", bleached=0.28, plane_time=0.008, pixel_spread=0.03,
@@ -330,7 +349,14 @@ def drawn(case, seed):
     per = light.shape[0] if light.plane_time else 1
     for b in (*bodies, *specks):
         b.path[10 * per :, :, 0] += case.jump
-    movie = recorded(bodies, light, n_frames=case.n_frames, rng=rng, dust=specks)
+    movie = recorded(
+        bodies,
+        light,
+        n_frames=case.n_frames,
+        rng=rng,
+        dust=specks,
+        radius_spread=case.radius_spread,
+    )
     return movie, bodies
 
 

@@ -301,8 +301,9 @@ def run(
     optics: Annotated[
         str | None,
         typer.Option(
-            help="Image of a sphere, learned if left out: diameter,psf_z,psf (um), and gain,floor "
-            "of the noise (variance of a voxel: gain times its intensity plus floor).",
+            help="Image of a sphere, learned if left out: diameter,psf_z,psf (um), gain,floor "
+            "of the noise (variance of a voxel: gain times its intensity plus floor), and "
+            "share,tail_z,tail (um) of the second Gaussian of a point spread with a tail.",
             rich_help_panel=SPHERES,
         ),
     ] = None,

@@ -175,16 +175,25 @@ Shape = Annotated[str, typer.Argument(help=f"{', '.join(SHAPES)}.")]
 
 
 def read_optics(text: str | None) -> Optics | None:
-    """Read diameter, point spread along z and in the plane, gain and floor of the noise."""
+    """Read diameter, point spread along z and in the plane, gain and floor, and the tail.
+
+    The tail of the point spread, which may be absent, is its share and its widths along z and in
+    the plane.
+    """
+    from perrin.images.optics.ball_image import PsfTail
     from perrin.images.optics.optics import CameraNoise, Optics
 
     if text is None:
         return None
     values = read_numbers("--optics", text)
-    if not isinstance(values, list) or len(values) != 5:
-        raise ValueError(f"--optics: expected diameter,psf_z,psf,gain,floor, got {text!r}")
-    diameter, psf_z, psf, gain, floor = values
-    return Optics(diameter, (psf_z, psf), CameraNoise(gain, floor))
+    if not isinstance(values, list) or len(values) not in (5, 8):
+        raise ValueError(
+            f"--optics: expected diameter,psf_z,psf,gain,floor, and for a point spread with a tail "
+            f"also share,tail_z,tail, got {text!r}"
+        )
+    diameter, psf_z, psf, gain, floor, *wide = values
+    tail = PsfTail(wide[0], (wide[1], wide[2])) if wide else None
+    return Optics(diameter, (psf_z, psf), CameraNoise(gain, floor), tail=tail)
 
 
 def spheres_of(

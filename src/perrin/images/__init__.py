@@ -62,7 +62,7 @@ from perrin.images.formats.vendors import (
 )
 from perrin.images.formats.zeiss import czi, czi_times
 from perrin.images.imaging import Imaging, View, read_imaging, write_imaging
-from perrin.images.optics.ball_image import SphereImage, SphereSpot, sphere_image
+from perrin.images.optics.ball_image import BallBlur, PsfTail, SphereImage, SphereSpot, sphere_image
 from perrin.images.optics.crowd_equations import (
     CrowdIntensity,
     CrowdWindow,
@@ -75,6 +75,7 @@ from perrin.images.optics.crowd_equations import (
     profile_information,
     project,
     residual_maps,
+    slopes_of_spheres,
     sphere_chi2,
     standard_errors,
     sum_of_spheres,
@@ -90,11 +91,13 @@ from perrin.images.optics.crowd_fit import (
 from perrin.images.optics.learn import (
     CrowdSample,
     GroupSample,
+    ImageParameters,
     ImageVariations,
     LearnedOptics,
     SampleFit,
     UsualImage,
     fit_samples,
+    neighbour_variance,
     photon_transfer,
     saturated_share,
 )
@@ -180,6 +183,7 @@ from perrin.images.stack import Stack, digest, file_contents, open_stack, write_
 __all__ = [
     "Arrangement",
     "ArrayFrames",
+    "BallBlur",
     "Camera",
     "CameraNoise",
     "Contents",
@@ -195,6 +199,7 @@ __all__ = [
     "GroupSample",
     "HeaderScale",
     "ImageFit",
+    "ImageParameters",
     "ImageVariations",
     "Imaging",
     "Layout",
@@ -208,6 +213,7 @@ __all__ = [
     "Pick",
     "PlaneFit",
     "Pose",
+    "PsfTail",
     "RadialImage",
     "RadialSample",
     "RenderSettings",
@@ -302,6 +308,7 @@ __all__ = [
     "nd2",
     "ndtiff",
     "needed",
+    "neighbour_variance",
     "ngff_scale",
     "noise_of_neighbours",
     "normal_equations",
@@ -333,6 +340,7 @@ __all__ = [
     "settled_image",
     "size_faults",
     "size_spread",
+    "slopes_of_spheres",
     "sphere_chi2",
     "sphere_image",
     "sphere_paths",

@@ -275,9 +275,17 @@ def optics_facts(imaging: Imaging) -> list[Fact]:
     floor = number_text(abs(optics.noise.floor))
     noise = f"the variance of a voxel is {gain} times its signal {sign} {floor}, in grey levels"
     expected = f"{learned}; the expected diameter is {number_text(imaging.diameter)} µm"
+    tail = []
+    if optics.tail is not None:
+        wide_z, wide = (number_text(width) for width in optics.tail.psf)
+        share = f"{100 * optics.tail.share:.0f} % of the intensity, {wide_z} µm along z"
+        tail = [("tail of the point spread", f"{wide} µm", share)]
+    if optics.spread:
+        expected += f"; spheres differ by {100 * optics.spread:.1f} % (standard deviation)"
     return [
         ("apparent diameter", f"{size} µm", expected),
         ("point spread", f"{psf} µm", f"standard deviation in the plane; {psf_z} µm along z"),
+        *tail,
         ("gain", gain, noise),
     ]
 

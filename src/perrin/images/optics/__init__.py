@@ -1,6 +1,6 @@
 """The image of a sphere: optics, noise, fits to images, and rendered movies."""
 
-from perrin.images.optics.ball_image import SphereImage, SphereSpot, sphere_image
+from perrin.images.optics.ball_image import BallBlur, PsfTail, SphereImage, SphereSpot, sphere_image
 from perrin.images.optics.crowd_equations import (
     CrowdIntensity,
     CrowdWindow,
@@ -13,6 +13,7 @@ from perrin.images.optics.crowd_equations import (
     profile_information,
     project,
     residual_maps,
+    slopes_of_spheres,
     sphere_chi2,
     standard_errors,
     sum_of_spheres,
@@ -28,9 +29,13 @@ from perrin.images.optics.crowd_fit import (
 from perrin.images.optics.learn import (
     CrowdSample,
     GroupSample,
+    ImageParameters,
     ImageVariations,
+    LearnedOptics,
     SampleFit,
+    UsualImage,
     fit_samples,
+    neighbour_variance,
     photon_transfer,
     saturated_share,
 )
@@ -74,6 +79,7 @@ from perrin.images.optics.window_fit import (
 
 __all__ = [
     "Arrangement",
+    "BallBlur",
     "Camera",
     "CameraNoise",
     "CrowdFit",
@@ -83,11 +89,14 @@ __all__ = [
     "FreeCenters",
     "GroupSample",
     "ImageFit",
+    "ImageParameters",
     "ImageVariations",
+    "LearnedOptics",
     "Light",
     "Optics",
     "Patch",
     "PatchFit",
+    "PsfTail",
     "RadialImage",
     "RadialSample",
     "RenderSettings",
@@ -97,6 +106,7 @@ __all__ = [
     "Scan",
     "SphereImage",
     "SphereSpot",
+    "UsualImage",
     "Window",
     "blurred_ball",
     "box_around",
@@ -117,6 +127,7 @@ __all__ = [
     "held_out_misfit",
     "learn_image",
     "missing_spheres",
+    "neighbour_variance",
     "noise_of_neighbours",
     "normal_equations",
     "photon_transfer",
@@ -128,6 +139,7 @@ __all__ = [
     "saturated_share",
     "settled_image",
     "size_spread",
+    "slopes_of_spheres",
     "sphere_chi2",
     "sphere_image",
     "sphere_paths",

@@ -5,21 +5,102 @@ In `perrin.images` the axes of arrays, centres and point spreads are (z, y, x).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from perrin._arrays import Floats, frozen, require_positive
 
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
 # Spacing of the table's knots in units of the blur along each axis; the cubic error is below 1e-4.
 _KNOT_SPACING = 0.25
 
-# A fit uses the voxels up to this many blurs outside a sphere's surface.
-_FIT_RANGE = 3.5
+# A fit uses the voxels up to this many blurs outside a sphere's surface. The tail of the point
+# spread, with a share of the intensity of some tenths, is as weak at a smaller multiple of its own.
+_FIT_RANGE, _TAIL_FIT_RANGE = 3.5, 1.5
 
 # The table ends this many blurs outside the sphere, where less than 1e-5 is left.
-_TABLE_RANGE = 4.5
+_TABLE_RANGE, _TAIL_TABLE_RANGE = 4.5, 3.5
+
+# Where diameters differ: largest deviation of a sphere's from the mean, in standard deviations and
+# in its logarithm, and the spacing of the tables in units of the blur; the cubic error is 1e-3.
+_SIZE_RANGE, _MAX_SIZE_RANGE, _SIZE_SPACING = 4.0, 0.3, 0.4
+
+
+class PsfTail(NamedTuple):
+    """The wider one of the two Gaussians of a point spread with tails.
+
+    Attributes
+    ----------
+    share : float
+        Share of the intensity, between 0 and 1; the narrower Gaussian has the rest.
+    psf : tuple of float
+        Standard deviations (z, plane), um.
+
+    Examples
+    --------
+    >>> PsfTail(0.15, (0.66, 0.27)).share
+    0.15
+    """
+
+    share: float
+    psf: tuple[float, float]
+
+
+class BallBlur(NamedTuple):
+    """A ball, and the Gaussian components by which its image is blurred.
+
+    Attributes
+    ----------
+    diameter : float
+        Diameter of the ball, um.
+    components : tuple
+        ``(share, (z, plane))`` of each component: its share of the intensity and its standard
+        deviations with the voxels included, um; the narrowest component is the first.
+    """
+
+    diameter: float
+    components: tuple[tuple[float, tuple[float, float]], ...]
+
+    def ranges(self, narrow: float, wide: float) -> tuple[float, float]:
+        """Return distances (z, plane), um, in blurs of the narrowest component or of the others."""
+        factors = [narrow, *([wide] * (len(self.components) - 1))]
+        z, plane = (
+            max(f * blur[axis] for f, (_, blur) in zip(factors, self.components, strict=True))
+            for axis in (0, 1)
+        )
+        return z, plane
+
+    def intensity(self, z: Floats, rho: Floats) -> Floats:
+        """Return the intensity (len(z), len(rho)) at heights z and distances rho from the axis.
+
+        The ball blurred evenly by s has a closed form, with a = R - r and b = R + r::
+
+            (erf(b/s√2) + erf(a/s√2))/2 - s/(r√2π) (exp(-a²/2s²) - exp(-b²/2s²))
+
+        (the integral of a Gaussian over a ball); the blur along z in excess of s is added by one
+        numerical convolution.
+        """
+        from scipy.special import erf
+
+        radius = self.diameter / 2
+        total = np.zeros((len(z), len(rho)))
+        for share, (blur_z, blur) in self.components:
+            excess = float(np.sqrt(max(blur_z**2 - blur**2, 0.0)))
+            nodes, weights = _gaussian_quadrature(z, excess, blur)
+            r = np.hypot(nodes[:, None], rho)
+            a, b = (radius - r) / blur, (radius + r) / blur
+            # Near the centre the difference of exponentials over r is its limit, the derivative.
+            small = r < 1e-4 * blur
+            safe = np.where(small, blur, r)
+            edge = blur / safe * (np.exp(-0.5 * a**2) - np.exp(-0.5 * b**2))
+            edge = np.where(small, 2 * radius / blur * np.exp(-0.5 * (radius / blur) ** 2), edge)
+            ball = 0.5 * (erf(b / np.sqrt(2)) + erf(a / np.sqrt(2))) - edge / np.sqrt(2 * np.pi)
+            total += share * (weights @ ball)
+        return total
 
 
 class SphereSpot(NamedTuple):
@@ -54,6 +135,10 @@ class SphereImage:
         Voxel size (z, y, x), um.
     blur : tuple of float
         Standard deviations of point spread and voxel together, (z, plane), um.
+    tail : PsfTail or None
+        The second, wider Gaussian of the point spread; `psf` and `blur` are of the first.
+    spread : float
+        Relative standard deviation of the diameters; 0 where all spheres are equal.
 
     Examples
     --------
@@ -67,39 +152,125 @@ class SphereImage:
     psf: tuple[float, float]
     voxel: tuple[float, float, float]
     blur: tuple[float, float]
+    tail: PsfTail | None
+    spread: float
+    _ball: BallBlur
     _knots: Floats
     _spacing: tuple[float, float]
+    _sizes: Floats
+    _tables: Floats
 
     @property
     def reach(self) -> tuple[float, float, float]:
         """Distances from the centre along z, y and x at which the image ends, um."""
-        z, plane = (self.diameter / 2 + _TABLE_RANGE * blur for blur in self.blur)
-        return z, plane, plane
+        z, plane = self._ball.ranges(_TABLE_RANGE, _TAIL_TABLE_RANGE)
+        radius = self.diameter / 2 * float(np.exp(_size_range(self.spread)))
+        return radius + z, radius + plane, radius + plane
 
     @property
     def extent(self) -> Floats:
         """Half axes (z, y, x) of the ellipsoid of voxels that a fit uses, um."""
-        return self.diameter / 2 + _FIT_RANGE * np.array([self.blur[0], self.blur[1], self.blur[1]])
+        z, plane = self._ball.ranges(_FIT_RANGE, _TAIL_FIT_RANGE)
+        return self.diameter / 2 * (1 + self.spread) + np.array([z, plane, plane])
+
+    @property
+    def size_range(self) -> float:
+        """Largest deviation of the logarithm of a diameter from the mean."""
+        return _size_range(self.spread)
+
+    def sized(self, deviation: float) -> SphereImage:
+        """Return the image of a sphere whose logarithm of the diameter deviates from the mean."""
+        if self.spread == 0:
+            return self
+        value, _ = self._between_sizes(deviation)
+        return replace(self, _knots=np.tensordot(value, self._tables, 1))
+
+    def size_slope(self, deviation: float) -> Floats:
+        """Return the table (1, ...) of the derivative by this deviation, for `slope_spot`."""
+        _, slope = self._between_sizes(deviation)
+        return np.asarray(np.tensordot(slope, self._tables, 1)[None])
+
+    def _between_sizes(self, deviation: float) -> tuple[Floats, Floats]:
+        """Return the factors of the tables at a deviation, and their derivatives."""
+        step = self._sizes[1] - self._sizes[0]
+        t = (deviation - self._sizes[0]) / step
+        first = int(np.clip(np.floor(t) - 1, 0, len(self._sizes) - 4))
+        u = t - first
+        value, slope = np.zeros((2, len(self._sizes)))
+        for k in range(4):
+            other = np.array([j for j in range(4) if j != k])
+            scale = float(np.prod(k - other))
+            a, b, c = u - other
+            value[first + k] = a * b * c / scale
+            slope[first + k] = (a * b + b * c + a * c) / (scale * step)
+        return value, slope
 
     def spot(self, center: Floats, shape: tuple[int, ...]) -> SphereSpot:
         """Return the image of a sphere at `center` (z, y, x), um, inside an array of `shape`.
 
         The origin is the centre of voxel (0, 0, 0); the box is cut at the array's borders.
         """
+        box, (z, y, x) = self._covered(center, shape)
+        value, gradient = self.at(z, y, x)
+        return SphereSpot(box, value, gradient)
+
+    def slope_spot(
+        self, slopes: Floats, center: Floats, shape: tuple[int, ...], *, deviation: float = 0.0
+    ) -> tuple[tuple[slice, slice, slice], Floats]:
+        """Return the voxels that the image covers, and its derivatives (k, nz, ny, nx).
+
+        Parameters
+        ----------
+        slopes : ndarray, shape (k, ...)
+            The tables of `slopes`.
+        center : ndarray, shape (3,)
+            Position (z, y, x), um.
+        shape : tuple of int
+            Shape of the array.
+        deviation : float
+            Deviation of the logarithm of the diameter at which tables of the mean diameter are
+            evaluated, by their scale.
+        """
+        box, offsets = self._covered(center, shape)
+        z, y, x = (offset * float(np.exp(-deviation)) for offset in offsets)
+        rho = np.hypot(y[:, None], x)
+        along, _ = _cubic_splines(np.abs(z) / self._spacing[0], slopes.shape[1])
+        across, _ = _cubic_splines(rho.ravel() / self._spacing[1], slopes.shape[2])
+        return box, (along @ slopes @ across.T).reshape(len(slopes), len(z), *rho.shape)
+
+    def slopes(self, pairs: Sequence[tuple[BallBlur, BallBlur]], difference: float) -> Floats:
+        """Return the tables of derivatives (k, ...) by k parameters, for `slope_spot`.
+
+        Parameters
+        ----------
+        pairs : sequence of tuple of BallBlur
+            The ball with each parameter larger, and with it smaller.
+        difference : float
+            The change of the parameter between the two.
+        """
+        z, rho = (
+            h * np.arange(n - 2) for h, n in zip(self._spacing, self._knots.shape, strict=True)
+        )
+        tables = [larger.intensity(z, rho) - smaller.intensity(z, rho) for larger, smaller in pairs]
+        return np.stack([_spline_knots(table / difference) for table in tables])
+
+    def _covered(
+        self, center: Floats, shape: tuple[int, ...]
+    ) -> tuple[tuple[slice, slice, slice], list[Floats]]:
+        """Return the voxels that the image covers, and their offsets from the centre, um."""
         limits = zip(center, self.reach, self.voxel, shape, strict=True)
-        box = tuple(
+        z, y, x = (
             slice(
                 min(max(int(np.ceil((c - reach) / h)), 0), n),
                 max(min(int(np.floor((c + reach) / h)) + 1, n), 0),
             )
             for c, reach, h, n in limits
         )
-        z, y, x = (
+        offsets = [
             h * np.arange(s.start, s.stop) - c
-            for s, h, c in zip(box, self.voxel, center, strict=True)
-        )
-        value, gradient = self.at(z, y, x)
-        return SphereSpot((box[0], box[1], box[2]), value, gradient)
+            for s, h, c in zip((z, y, x), self.voxel, center, strict=True)
+        ]
+        return (z, y, x), offsets
 
     def at(self, z: Floats, y: Floats, x: Floats) -> tuple[Floats, Floats]:
         """Return image and gradient on the grid of offsets z, y, x from the centre, um.
@@ -135,8 +306,10 @@ def sphere_image(
     diameter: float,
     psf: tuple[float, float],
     voxel: tuple[float, float, float],
+    tail: PsfTail | None = None,
+    spread: float = 0.0,
 ) -> SphereImage:
-    """Tabulate a ball convolved with an anisotropic Gaussian point spread and with the voxels.
+    """Tabulate a ball convolved with an anisotropic point spread and with the voxels.
 
     Parameters
     ----------
@@ -146,6 +319,10 @@ def sphere_image(
         Standard deviations of the point spread, (z, plane), um.
     voxel : tuple of float
         Voxel size (z, y, x), um.
+    tail : PsfTail, optional
+        A second, wider Gaussian of the point spread.
+    spread : float
+        Relative standard deviation of the diameters of different spheres.
 
     Returns
     -------
@@ -154,17 +331,13 @@ def sphere_image(
     Raises
     ------
     ValueError
-        For a length that is not positive, or where the blur along z is less than within the plane.
+        For a length that is not positive, a share of the tail outside 0 to 1, or where the blur
+        along z is less than within the plane.
 
     Notes
     -----
-    A voxel of side h enters as a Gaussian of variance h^2/12, exact to the third moment. The ball
-    blurred evenly by s has a closed form, with a = R - r and b = R + r::
-
-        (erf(b/s√2) + erf(a/s√2))/2 - s/(r√2π) (exp(-a²/2s²) - exp(-b²/2s²))
-
-    (the integral of a Gaussian over a ball); the blur along z in excess of s is added by one
-    numerical convolution.
+    A voxel of side h enters as a Gaussian of variance h^2/12, exact to the third moment. The image
+    of a point spread of two Gaussians is the sum of the two images.
 
     Examples
     --------
@@ -174,52 +347,76 @@ def sphere_image(
     >>> value.round(2).tolist()
     [[[1.0, 0.34, 0.0]]]
     """
-    from scipy.ndimage import spline_filter1d
-    from scipy.special import erf
-
     require_positive(diameter=diameter, **{"psf[z]": psf[0], "psf[plane]": psf[1]})
     require_positive(**{f"voxel[{axis}]": h for axis, h in zip("zyx", voxel, strict=True)})
-    blur_z = float(np.sqrt(psf[0] ** 2 + voxel[0] ** 2 / 12))
-    blur = float(np.sqrt(psf[1] ** 2 + voxel[1] * voxel[2] / 12))
-    if blur_z < blur:
-        raise ValueError(
-            f"psf: expected (z, plane) with the larger blur along z, as in every microscope, got "
-            f"{psf} um, with the voxel {blur_z:.3g} and {blur:.3g}; are the two exchanged?"
-        )
-    # The ball blurred by `blur` along all axes, over abs(z) and the distance rho from the axis.
-    radius = diameter / 2
+    spreads = [(1.0 if tail is None else 1.0 - tail.share, psf)]
+    if tail is not None:
+        require_positive(**{"tail psf[z]": tail.psf[0], "tail psf[plane]": tail.psf[1]})
+        if not 0 <= tail.share <= 1:
+            raise ValueError(f"tail: expected a share between 0 and 1, got {tail.share}")
+        spreads.append((tail.share, tail.psf))
+    components = []
+    for share, (psf_z, psf_plane) in spreads:
+        blur_z = float(np.sqrt(psf_z**2 + voxel[0] ** 2 / 12))
+        blur = float(np.sqrt(psf_plane**2 + voxel[1] * voxel[2] / 12))
+        if blur_z < blur:
+            raise ValueError(
+                f"psf: expected (z, plane) with the larger blur along z, as in every microscope, "
+                f"got {(psf_z, psf_plane)} um, with the voxel {blur_z:.3g} and {blur:.3g}; are the "
+                "two exchanged?"
+            )
+        components.append((share, (blur_z, blur)))
+    ball = BallBlur(diameter, tuple(components))
+    blur_z, blur = components[0][1]
     spacing = _KNOT_SPACING * blur_z, _KNOT_SPACING * blur
+    radius = diameter / 2 * float(np.exp(_size_range(spread)))
     z, rho = (
-        h * np.arange(int(np.ceil((radius + _TABLE_RANGE * s) / h)) + 2)
-        for h, s in zip(spacing, (blur_z, blur), strict=True)
+        np.asarray(h * np.arange(int(np.ceil((radius + end) / h)) + 2), dtype=np.float64)
+        for h, end in zip(spacing, ball.ranges(_TABLE_RANGE, _TAIL_TABLE_RANGE), strict=True)
     )
-    nodes, weights = _gaussian_nodes(float(np.sqrt(blur_z**2 - blur**2)), blur)
-    r = np.hypot((z[:, None] - nodes)[..., None], rho)
-    a, b = (radius - r) / blur, (radius + r) / blur
-    # Near the centre the difference of exponentials over r is its limit, the derivative.
-    small = r < 1e-4 * blur
-    safe = np.where(small, blur, r)
-    edge = blur / safe * (np.exp(-0.5 * a**2) - np.exp(-0.5 * b**2))
-    edge = np.where(small, 2 * radius / blur * np.exp(-0.5 * (radius / blur) ** 2), edge)
-    ball = 0.5 * (erf(b / np.sqrt(2)) + erf(a / np.sqrt(2))) - edge / np.sqrt(2 * np.pi)
-    table = np.einsum("k,zkr->zr", weights, ball)
+    knots = _spline_knots(ball.intensity(z, rho))
+    sizes, tables = np.zeros(1), knots[None]
+    if spread > 0:
+        half = int(np.ceil(_size_range(spread) * diameter / 2 / (_SIZE_SPACING * blur))) + 1
+        sizes = np.linspace(-1.0, 1.0, 2 * half + 1) * _size_range(spread)
+        balls = [ball._replace(diameter=diameter * float(np.exp(size))) for size in sizes]
+        tables = np.stack([_spline_knots(sphere.intensity(z, rho)) for sphere in balls])
+    frozen(knots, sizes, tables)
+    return SphereImage(
+        diameter, psf, voxel, (blur_z, blur), tail, spread, ball, knots, spacing, sizes, tables
+    )
+
+
+def _size_range(spread: float) -> float:
+    """Return the largest deviation of the logarithm of a diameter from the mean."""
+    return min(_SIZE_RANGE * spread, _MAX_SIZE_RANGE)
+
+
+def _spline_knots(table: Floats) -> Floats:
+    """Return the knots of the cubic spline through a table that is even along both axes."""
+    from scipy.ndimage import spline_filter1d
+
     for axis in (0, 1):
         table = spline_filter1d(table, axis=axis, mode="mirror")
     # The image is even in z and in rho: the knot before the first equals the one after it.
-    knots = np.pad(table, 1, mode="reflect")
-    frozen(knots)
-    return SphereImage(diameter, psf, voxel, (blur_z, blur), knots, spacing)
+    return np.pad(table, 1, mode="reflect")
 
 
-def _gaussian_nodes(width: float, blur: float) -> tuple[Floats, Floats]:
-    """Return nodes and weights that convolve with a Gaussian; the sum converges exponentially."""
-    if width < 1e-6 * blur:
-        return np.zeros(1), np.ones(1)
+def _gaussian_quadrature(z: Floats, width: float, blur: float) -> tuple[Floats, Floats]:
+    """Return nodes (k,) and weights (len(z), k) that convolve a function with a Gaussian at z.
+
+    The function is even, and smooth over `blur`. The sum over even spaces converges exponentially;
+    for a Gaussian far narrower than `blur` three Hermite nodes have an error below 1e-8.
+    """
+    if width < 0.05 * blur:
+        nodes = np.concatenate([z, z - np.sqrt(3) * width, z + np.sqrt(3) * width])
+        return nodes, np.hstack([np.eye(len(z)) * share for share in (2 / 3, 1 / 6, 1 / 6)])
     step = min(width, blur) / 2
-    count = int(np.ceil(6 * width / step))
-    nodes = np.asarray(step * np.arange(-count, count + 1), dtype=np.float64)
-    weights = np.exp(-0.5 * (nodes / width) ** 2)
-    return nodes, weights / weights.sum()
+    nodes = step * np.arange(int(np.ceil((z.max() + 6 * width) / step)) + 1)
+    weights = np.exp(-0.5 * ((z[:, None] - nodes) / width) ** 2)
+    weights += np.exp(-0.5 * ((z[:, None] + nodes) / width) ** 2)
+    weights[:, 0] /= 2
+    return np.asarray(nodes, dtype=np.float64), weights * (step / (width * np.sqrt(2 * np.pi)))
 
 
 def _cubic_splines(t: Floats, count: int) -> tuple[Floats, Floats]:

@@ -193,6 +193,30 @@ def sum_of_spheres(window: CrowdWindow, spots: list[SphereSpot], brightness: Flo
     return intensity
 
 
+def slopes_of_spheres(
+    window: CrowdWindow, slopes: Floats, centers: Floats, brightness: Floats
+) -> Floats:
+    """Return derivatives (k, nz, ny, nx) of the intensity by parameters of the sphere's image.
+
+    Parameters
+    ----------
+    window : CrowdWindow
+    slopes : ndarray, shape (k, ...)
+        The tables of `SphereImage.slopes`.
+    centers, brightness : ndarray, shape (n, 3), (n,)
+        The spheres.
+
+    Returns
+    -------
+    ndarray, shape (k, nz, ny, nx)
+    """
+    intensity = np.zeros((len(slopes), *window.data.shape))
+    for center, bright in zip(centers - window.origin, brightness, strict=True):
+        box, value = window.image.slope_spot(slopes, center, window.data.shape)
+        intensity[(slice(None), *box)] += bright * value
+    return intensity
+
+
 def fit_brightness(window: CrowdWindow, centers: Floats) -> CrowdIntensity:
     """Fit brightness and background by least squares, with the spheres at given positions.
 

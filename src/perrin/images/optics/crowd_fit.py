@@ -67,7 +67,8 @@ class CrowdFit(NamedTuple):
     Attributes
     ----------
     centers, sigma : ndarray, shape (n, 3)
-        Positions (z, y, x), um, and their standard errors from the Fisher information.
+        Positions (z, y, x), um, and their standard errors: from the Fisher information, times the
+        root of `chi2` where this is above 1.
     chi2 : ndarray, shape (n,)
         Chi-squared per voxel, averaged over the voxels of each sphere.
     converged : ndarray of bool, shape (n,)
@@ -168,10 +169,12 @@ def fit_crowd(
     last = (np.array(frame.shape) - 1) * image.voxel
     inside = np.all((state.centers >= 0) & (state.centers <= last), axis=1)
     inside &= plausible_spheres(window, state, contact)
+    chi2 = sphere_chi2(window, state)
+    sigma = standard_errors(information, state) * np.sqrt(np.fmax(chi2, 1.0))[:, None]
     return CrowdFit(
         state.centers[inside],
-        standard_errors(information, state)[inside],
-        sphere_chi2(window, state)[inside],
+        sigma[inside],
+        chi2[inside],
         converged[inside],
         origin[inside],
         window,

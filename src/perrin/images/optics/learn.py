@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from perrin.errors import NoSpheresError
-from perrin.images.optics.ball_image import SphereImage, sphere_image
-from perrin.images.optics.crowd_equations import profile_information, sum_of_spheres
+from perrin.images.optics.ball_image import BallBlur, PsfTail, SphereImage, sphere_image
+from perrin.images.optics.crowd_equations import profile_information, slopes_of_spheres
 from perrin.images.optics.crowd_fit import fit_crowd
 from perrin.images.optics.optics import CameraNoise, Optics
 from perrin.images.optics.window_fit import FreeCenters, cut_window, fit_window
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Sequence
 
     from numpy.typing import NDArray
 
@@ -23,13 +23,38 @@ if TYPE_CHECKING:
     from perrin.images.optics.window_fit import Window
 
 
-# Change of a logarithm for the central differences.
-_LOG_DIFFERENCE = 0.01
+# Change of a parameter for the central differences.
+_PARAMETER_DIFFERENCE = 0.01
 
-# Largest step of a logarithm, and the step at which the search ends.
-_MAX_LOG_STEP, _LOG_STEP_CONVERGED = 0.25, 1e-3
+# Largest step of a parameter; the search ends at steps below this, or below this fraction of their
+# standard errors: voxels that enter and leave the windows change the maximum by up to a fifth.
+_MAX_STEP, _STEP_CONVERGED, _STEP_IN_ERRORS = 0.25, 1e-3, 0.3
 
 _MAX_LEARNING_ROUNDS = 15
+
+# The same two for the tail of half of the groups, which only has to be good enough to be chosen.
+_MAX_TRIAL_ROUNDS, _TRIAL_STEP_IN_ERRORS = 6, 2.0
+
+# Least ratios of the blur along z to that in the plane (both are varied), of the blur to that of
+# the voxel alone, and of the tail's blur to that of the narrower Gaussian.
+_LEAST_ELONGATION, _LEAST_OVER_VOXEL, _LEAST_TAIL = 1.025, 1.02, 1.2
+
+# Blurs and share of the tail at the start of its search, over the Gaussian point spread found.
+_NARROWED, _WIDENED, _TAIL_SHARE, _MAX_TAIL_SHARE = 0.85, 3.0, 0.15, 0.6
+
+# A tail is searched for if its share is this many standard errors above 0 to first order, and it is
+# kept if it increases the logarithm of the likelihood of other groups by at least this.
+_LEAST_SHARE_ERRORS, _LEAST_HELD_OUT_GAIN = 3.0, 3.0
+
+# Spread of the diameters with which they are fitted first; a spread is used if it is at least this,
+# and increases the logarithm of the likelihood of the diameters by at least this.
+_FIRST_SPREAD, _LEAST_SPREAD, _LEAST_SPREAD_GAIN = 0.06, 0.007, 5.0
+
+# Change of the spread, relative to it, at which its search ends.
+_SPREAD_CONVERGED = 0.05
+
+# Order of the differences between neighbouring voxels, and their factors: a variance of 20.
+_NEIGHBOURS = np.array([-1.0, 3.0, -3.0, 1.0])
 
 # What is no sphere has over this multiple of the usual chi-squared, beyond this number of standard
 # errors of it, or over this multiple of the usual brightness, beyond this number of standard
@@ -95,6 +120,160 @@ def saturated_share(data: NDArray[Any]) -> float:
     return share if bdtrc(count - 2, count - 1 + most, 0.5) < _SATURATION_LEVEL else 0.0
 
 
+@dataclass(frozen=True, eq=False)
+class ImageParameters:
+    """The parameters of a sphere's image in the search for the optics.
+
+    Attributes
+    ----------
+    values : ndarray, shape (3,) or (6,)
+        Logarithms of the diameter and of the blurs along z and in the plane, um; with a tail its
+        share, and the logarithms of its blurs. Blurs include the voxel.
+    voxel : tuple of float
+        Voxel size (z, y, x), um.
+    spread : float
+        Relative standard deviation of the diameters of different spheres.
+
+    Examples
+    --------
+    >>> plain = ImageParameters(np.log([2.45, 0.4, 0.15]), (0.25, 0.2, 0.2))
+    >>> plain.image().psf[0].__round__(3), len(plain.with_tail().values)
+    (0.393, 6)
+    """
+
+    values: Floats
+    voxel: tuple[float, float, float]
+    spread: float = 0.0
+
+    @property
+    def voxel_blur(self) -> Floats:
+        """Standard deviations (z, plane) of a voxel, um."""
+        return np.sqrt(np.array([self.voxel[0] ** 2, self.voxel[1] * self.voxel[2]]) / 12)
+
+    def ball(self, values: Floats) -> BallBlur:
+        """Return the blurred ball at other values of the parameters."""
+        diameter, blur_z, blur = np.exp(values[:3]).tolist()
+        if len(values) == 3:
+            return BallBlur(diameter, ((1.0, (blur_z, blur)),))
+        share, (tail_z, tail) = float(values[3]), np.exp(values[4:]).tolist()
+        return BallBlur(diameter, ((1.0 - share, (blur_z, blur)), (share, (tail_z, tail))))
+
+    def image(self) -> SphereImage:
+        """Return the sphere's image."""
+        ball = self.ball(self.values)
+        (psf_z, psf), *wider = (
+            np.sqrt(np.square(blur) - self.voxel_blur**2).tolist() for _, blur in ball.components
+        )
+        tail = None
+        if wider:
+            tail = PsfTail(ball.components[1][0], (wider[0][0], wider[0][1]))
+        return sphere_image(
+            diameter=ball.diameter,
+            psf=(psf_z, psf),
+            voxel=self.voxel,
+            tail=tail,
+            spread=self.spread,
+        )
+
+    def with_tail(self) -> ImageParameters:
+        """Return parameters with a tail at the start of its search."""
+        blurs = self.values[1:]
+        start = [
+            self.values[:1],
+            blurs + np.log(_NARROWED),
+            [_TAIL_SHARE],
+            blurs + np.log(_WIDENED),
+        ]
+        return replace(self, values=np.concatenate(start)).within_bounds()
+
+    def bounds(self) -> tuple[Floats, Floats]:
+        """Return the least and the largest values of the parameters.
+
+        A blur is at least that of the voxel, and a microscope's point spread is elongated along z;
+        the tail is wider than the other Gaussian, and narrower than the sphere.
+        """
+        n = len(self.values)
+        low, high = np.full(n, -np.inf), np.full(n, np.inf)
+        least = np.log(_LEAST_OVER_VOXEL * self.voxel_blur)
+        low[2] = least[1]
+        low[1] = max(least[0], max(self.values[2], low[2]) + np.log(_LEAST_ELONGATION))
+        if n > 3:
+            low[3], high[3] = 0.0, _MAX_TAIL_SHARE
+            low[4:] = np.maximum(self.values[1:3], low[1:3]) + np.log(_LEAST_TAIL)
+            low[4] = max(low[4], max(self.values[5], low[5]) + np.log(_LEAST_ELONGATION))
+            high[4:] = np.maximum(self.values[0], low[4:])
+        return low, high
+
+    def within_bounds(self) -> ImageParameters:
+        """Return the nearest parameters within the bounds."""
+        return replace(self, values=np.clip(self.values, *self.bounds()))
+
+    def moved(
+        self, information: Floats, score: Floats, *, larger: float | None = None
+    ) -> ImageParameters:
+        """Return the parameters after a Gauss-Newton step that stays within the bounds.
+
+        A parameter that would leave its bound is set to it, and the step of the others is computed
+        again. The step of the diameter may be given as `larger`.
+        """
+        low, high = self.bounds()
+        step, free = np.zeros_like(score), np.ones(len(score), dtype=np.bool_)
+        if larger is not None:
+            step[0], free[0] = larger, False
+        while free.any():
+            pull = score[free] - information[free][:, ~free] @ step[~free]
+            # Without a share there is no information on the widths of the tail.
+            step[free] = np.linalg.lstsq(information[free][:, free], pull, rcond=None)[0]
+            moved = self.values + step
+            left = free & ((moved < low) | (moved > high))
+            if not left.any():
+                break
+            step[left] = np.clip(moved, low, high)[left] - self.values[left]
+            free &= ~left
+        step *= min(1.0, _MAX_STEP / max(np.abs(step).max(), _MAX_STEP))
+        return replace(self, values=self.values + step).within_bounds()
+
+    def optics(self, noise: CameraNoise, information: Floats) -> Optics:
+        """Return the optics, with standard errors from the information on the parameters."""
+        image = self.image()
+        error = np.sqrt(np.diag(np.linalg.pinv(information, hermitian=True)))[:3]
+        # The blur is the root of the sum of squares of point spread and voxel.
+        factor = np.array([image.diameter, *(np.square(image.blur) / np.array(image.psf))])
+        a, b, c = (float(value) for value in factor * error)
+        return Optics(image.diameter, image.psf, noise, (a, b, c), image.tail, self.spread)
+
+
+class ImageVariations(NamedTuple):
+    """The sphere's image and its derivatives by the parameters.
+
+    Attributes
+    ----------
+    image : SphereImage
+        The image at the present values.
+    slopes : ndarray, shape (k, ...)
+        Tables of the derivatives (`SphereImage.slopes`); without a tail the last one is that by the
+        share of a tail, at a share of 0.
+    """
+
+    image: SphereImage
+    slopes: Floats
+
+    @classmethod
+    def about(cls, parameters: ImageParameters) -> ImageVariations:
+        """Return image and derivatives at the values of parameters."""
+        values, d = parameters.values, _PARAMETER_DIFFERENCE
+        pairs = [
+            (parameters.ball(values + shift), parameters.ball(values - shift))
+            for shift in d * np.eye(len(values))
+        ]
+        if len(values) == 3:
+            plain = parameters.ball(values)
+            wide = np.concatenate([values, [2 * d], values[1:] + np.log(_WIDENED)])
+            pairs.append((parameters.ball(wide), plain))
+        image = parameters.image()
+        return cls(image, image.slopes(pairs, 2 * d))
+
+
 class SampleFit(NamedTuple):
     """A fit to one sample of a frame, and its information on the optics.
 
@@ -102,17 +281,20 @@ class SampleFit(NamedTuple):
     ----------
     centers : ndarray, shape (n, 3)
         Fitted positions (z, y, x), um.
-    information : ndarray, shape (3, 3)
-        Information on the logarithms of diameter, psf z and psf plane, the parameters of the
-        spheres eliminated.
-    score : ndarray, shape (3,)
-        Score of these logarithms.
-    expected : ndarray, shape (m,)
-        Expected grey levels of the voxels of the fit.
-    squared_residual : ndarray, shape (m,)
-        Squared differences of grey levels and expected grey levels.
+    information : ndarray, shape (k, k)
+        Information on the k parameters of the image, the parameters of the spheres eliminated.
+    score : ndarray, shape (k,)
+        Score of these parameters.
+    expected, squared_residual : ndarray, shape (m,)
+        Expected grey levels of the voxels of the fit, and squared differences of their grey levels
+        from these.
     brightness : ndarray, shape (n,)
         Fitted intensity inside each sphere, grey levels.
+    level, variance : ndarray, shape (q,)
+        Expected grey levels of groups of neighbouring voxels, and estimates of the variance of
+        these voxels from their differences (`neighbour_variance`).
+    sizes, size_variance : ndarray, shape (n,)
+        Deviations of the logarithms of the diameters and their variances, where they are fitted.
     """
 
     centers: Floats
@@ -121,6 +303,10 @@ class SampleFit(NamedTuple):
     expected: Floats
     squared_residual: Floats
     brightness: Floats
+    level: Floats
+    variance: Floats
+    sizes: Floats
+    size_variance: Floats
 
     def chi2(self, noise: CameraNoise) -> float:
         """Return the mean squared residual over the variance that a camera noise predicts."""
@@ -239,39 +425,6 @@ class LearnedOptics(NamedTuple):
     usual: UsualImage
 
 
-class ImageVariations(NamedTuple):
-    """The sphere's image, and the images with each logarithm slightly larger and smaller.
-
-    The logarithms are those of diameter, psf z and psf plane.
-
-    Attributes
-    ----------
-    image : SphereImage
-        The image at the present values.
-    pairs : list of tuple of SphereImage
-        The image with one logarithm larger, and with it smaller, for each of the three.
-    """
-
-    image: SphereImage
-    pairs: list[tuple[SphereImage, ...]]
-
-    @classmethod
-    def about(cls, log: Floats, voxel: tuple[float, float, float]) -> ImageVariations:
-        """Return the variations about logarithms (3,), for voxels (z, y, x), um."""
-        steps = _LOG_DIFFERENCE * np.eye(3)
-        pairs = [tuple(_image_at(log + s * d, voxel) for s in (1, -1)) for d in steps]
-        return cls(_image_at(log, voxel), pairs)
-
-    def derivatives(self, intensity: Callable[[SphereImage], Floats]) -> Floats:
-        """Return the derivatives (3, ...) of an intensity by the logarithms."""
-        return np.stack(
-            [
-                (intensity(larger) - intensity(smaller)) / (2 * _LOG_DIFFERENCE)
-                for larger, smaller in self.pairs
-            ]
-        )
-
-
 class GroupSample(NamedTuple):
     """One group of spheres in one frame, from which the optics are learned.
 
@@ -306,18 +459,56 @@ class GroupSample(NamedTuple):
         image = variations.image
         window = self.window(image)
         fit = fit_window(window, image, noise, FreeCenters(self.centers))
-        slope = variations.derivatives(
-            lambda varied: fit.brightness @ window.spots(varied, fit.centers)[0]
-        )
+        slope = window.slopes(image, variations.slopes, fit.centers, fit.brightness, fit.sizes)
         # The Schur complement of the information, with the fit's own parameters eliminated.
         weighted = slope * fit.weight
         nuisance = fit.jacobian * fit.weight
         shared = nuisance @ slope.T
-        taken = np.linalg.lstsq(nuisance @ fit.jacobian.T, shared, rcond=None)[0]
+        own = nuisance @ fit.jacobian.T + np.diag(fit.prior)
+        taken = np.linalg.lstsq(own, shared, rcond=None)[0]
         residual = window.data - fit.expected
         information = weighted @ slope.T - shared.T @ taken
-        score = weighted @ residual - taken.T @ (nuisance @ residual)
-        return SampleFit(fit.centers, information, score, fit.expected, residual**2, fit.brightness)
+        left_over = nuisance @ residual
+        if image.spread > 0:
+            left_over[fit.prior > 0] -= fit.sizes / image.spread**2
+        score = weighted @ residual - taken.T @ left_over
+        left, expected = np.zeros((2, *window.mask.shape))
+        left[window.mask], expected[window.mask] = residual, fit.expected
+        level, variance = neighbour_variance(left, expected, window.mask, image=image)
+        return SampleFit(
+            fit.centers,
+            information,
+            score,
+            fit.expected,
+            residual**2,
+            fit.brightness,
+            level,
+            variance,
+            fit.sizes,
+            fit.size_variance,
+        )
+
+    def log_likelihood(
+        self, image: SphereImage, noise: CameraNoise, *, within: SphereImage
+    ) -> float:
+        """Return the logarithm of the likelihood of the group's voxels, up to a constant.
+
+        Parameters
+        ----------
+        image : SphereImage
+            The image with which the group is fitted.
+        noise : CameraNoise
+        within : SphereImage
+            The image that sets the voxels.
+
+        Returns
+        -------
+        float
+        """
+        window = self.window(within)
+        fit = fit_window(window, image, noise, FreeCenters(self.centers))
+        square = fit.weight * (window.data - fit.expected) ** 2
+        return -0.5 * float(np.sum(square - np.log(fit.weight)))
 
 
 class CrowdSample(NamedTuple):
@@ -360,23 +551,90 @@ class CrowdSample(NamedTuple):
             searches=_LEARNING_SEARCHES,
         )
         window, state = found.window, found.intensity
-        slope = variations.derivatives(
-            lambda varied: sum_of_spheres(
-                window, window.spots(varied, state.centers), state.brightness
-            )
-        )
+        slope = slopes_of_spheres(window, variations.slopes, state.centers, state.brightness)
         information, score = profile_information(window, state, slope)
+        residual = window.data - state.expected
         used = window.mask
-        residual = (window.data - state.expected)[used]
+        level, variance = neighbour_variance(residual, state.expected, used, image=variations.image)
+        equal = np.zeros(len(state.centers))
         return SampleFit(
-            state.centers, information, score, state.expected[used], residual**2, state.brightness
+            state.centers,
+            information,
+            score,
+            state.expected[used],
+            residual[used] ** 2,
+            state.brightness,
+            level,
+            variance,
+            equal,
+            equal,
         )
 
 
-def _image_at(log: Floats, voxel: tuple[float, float, float]) -> SphereImage:
-    """Return the image for the logarithms of diameter, psf z and psf plane."""
-    size, psf_z, psf = np.exp(log)
-    return sphere_image(diameter=float(size), psf=(float(psf_z), float(psf)), voxel=voxel)
+def neighbour_variance(
+    residual: Floats, expected: Floats, used: Bools, *, image: SphereImage
+) -> tuple[Floats, Floats]:
+    """Estimate the variance of voxels from the differences of neighbours.
+
+    Parameters
+    ----------
+    residual, expected : ndarray, shape (nz, ny, nx)
+        Grey levels minus expected grey levels, and expected grey levels.
+    used : ndarray of bool, shape (nz, ny, nx)
+        The voxels that are used.
+    image : SphereImage
+        The image of a sphere, whose blur chooses the axis.
+
+    Returns
+    -------
+    expected : ndarray, shape (m,)
+        Expected grey level of every four neighbours along one axis.
+    variance : ndarray, shape (m,)
+        Their squared third differences over 20, the sum of squares of the factors 1, 3, 3, 1.
+
+    Notes
+    -----
+    The axis is the one along which the blur covers most voxels. An error of the model of the image
+    is blurred too, so that its third differences are small: with a blur of b voxels they have
+    15 / (2 b^2)^3 / 20 of the error's variance (the sixth moment of its Gaussian spectrum), 1 % for
+    b = 1.5. Noise that is constant along the axis does not contribute.
+
+    Examples
+    --------
+    >>> from perrin.images import sphere_image
+    >>> image = sphere_image(diameter=2.0, psf=(0.4, 0.15), voxel=(0.25, 0.2, 0.2))
+    >>> noise = np.random.default_rng(1).normal(0.0, 3.0, (20, 30, 30))
+    >>> misfit = 5 * np.cos(np.arange(20) / 3)[:, None, None]
+    >>> used, level = np.ones(noise.shape, dtype=bool), np.full(noise.shape, 7.0)
+    >>> expected, variance = neighbour_variance(noise + misfit, level, used, image=image)
+    >>> expected.mean().round(), variance.mean().round(1), (noise + misfit).var().round(1)
+    (np.float64(7.0), np.float64(9.0), np.float64(21.9))
+    """
+    blur = np.array([image.blur[0], image.blur[1], image.blur[1]]) / image.voxel
+    long_enough = np.array(used.shape) >= len(_NEIGHBOURS)
+    axis = int(np.argmax(np.where(long_enough, blur, -1.0)))
+    if not long_enough[axis]:
+        return np.empty(0), np.empty(0)
+    quads = (
+        np.lib.stride_tricks.sliding_window_view(field, len(_NEIGHBOURS), axis=axis)
+        for field in (residual, expected, used)
+    )
+    difference, level, together = quads
+    kept = together.all(axis=-1)
+    share = _NEIGHBOURS**2 / np.sum(_NEIGHBOURS**2)
+    square = (difference @ _NEIGHBOURS)[kept] ** 2 / np.sum(_NEIGHBOURS**2)
+    return (level @ share)[kept], square
+
+
+class _Settled(NamedTuple):
+    """Parameters at the maximum of the likelihood of some samples."""
+
+    parameters: ImageParameters
+    noise: CameraNoise
+    samples: list[GroupSample | CrowdSample]
+    fits: list[SampleFit]
+    information: Floats
+    score: Floats
 
 
 def fit_samples(
@@ -409,101 +667,227 @@ def fit_samples(
 
     Notes
     -----
-    Gauss-Newton steps in the logarithms of the three lengths, with every sphere's position and
-    brightness and every background eliminated exactly (the Schur complement of the information).
+    Gauss-Newton steps in the logarithms of the lengths, with every sphere's position and brightness
+    and every background eliminated exactly (the Schur complement of the information). The noise is
+    that of the differences between neighbouring voxels.
+
+    The point spread is a Gaussian. Where the derivative of the likelihood by the share of a wider
+    second Gaussian is significant, the sum of two Gaussians is fitted to every other group, and it
+    is used if the likelihood of the groups between them is the larger one. Where the diameters of
+    single spheres, fitted with a wide distribution, differ by more than their errors, their spread
+    is learned too: that of greatest likelihood, and the mean diameter is the mean of the spheres.
+    Crowds have one Gaussian and one diameter. Samples are left out first, because dust among them
+    would appear as a tail or as a spread, and all are judged again by the image that is found.
     """
-    left_out = 0
-    for _ in range(_MAX_SEARCHES):
-        optics, samples, fits = _search_optics(samples, diameter=diameter, voxel=voxel)
-        chi2 = [fit.chi2(optics.noise) for fit in fits]
-        usual = UsualImage.of(chi2, [fit.brightness for fit in fits])
-        kept = [
-            s
-            for s, fit, square in zip(samples, fits, chi2, strict=True)
-            if usual.excess(
-                np.full(len(fit.brightness), square),
-                fit.brightness / usual.brightness,
-                voxels=np.full(len(fit.brightness), len(fit.expected) / len(fit.brightness)),
-            ).max(initial=0.0)
-            <= 1
-        ]
-        if len(kept) == len(samples) or len(kept) < _FEWEST_SAMPLES:
-            break
-        left_out += len(samples) - len(kept)
-        samples = kept
-    return LearnedOptics(optics, replace(usual, left_out=left_out))
-
-
-def _search_optics(
-    samples: Sequence[GroupSample | CrowdSample],
-    *,
-    diameter: float,
-    voxel: tuple[float, float, float],
-) -> tuple[Optics, list[GroupSample | CrowdSample], list[SampleFit]]:
-    """Return the optics of greatest likelihood, the samples with enough voxels, and their fits."""
-    log = np.log([diameter, max(voxel[0], 0.15 * diameter), max(voxel[1] / 2, 0.06 * diameter)])
-    log[1] = max(log[1], _least_log_psf_z(log[2], voxel))
-    image = _image_at(log, voxel)
-    samples = [
-        s
-        for s in samples
-        if isinstance(s, CrowdSample) or s.window(image).has_enough_voxels(len(s.centers))
-    ]
-    if not samples:
+    psf = np.array([max(voxel[0], 0.15 * diameter), max(voxel[1] / 2, 0.06 * diameter)])
+    start = ImageParameters(np.log([diameter, 1.0, 1.0]), voxel)
+    start.values[1:] = np.log(np.hypot(psf, start.voxel_blur))
+    start = start.within_bounds()
+    usable = _with_enough_voxels(samples, start.image())
+    if not usable:
         raise NoSpheresError(
             "no spheres to learn the optics from: none was found, or none has voxels to itself; "
             "check diameter, contact and minmass, and whether spheres are dark (dark=True), state "
             "the optics (optics=), or keep the positions found first (refine=None)"
         )
-    mean = float(np.mean([s.frame.mean() for s in samples]))
-    noise = CameraNoise(1.0, 0.05 * abs(mean))
-    for _ in range(_MAX_LEARNING_ROUNDS):
-        variations = ImageVariations.about(log, voxel)
+    mean = float(np.mean([s.frame.mean() for s in usable]))
+    plain = _settled(usable, start, CameraNoise(1.0, 0.05 * abs(mean)))
+    plain, left_out = _without_dust(plain)
+    found = plain
+    if not any(isinstance(s, CrowdSample) for s in found.samples):
+        found = _with_spread(found)
+    if _shows_tail(found):
+        found = _with_tail(found)
+    if found is not plain and left_out:
+        found, left_out = _judged_again(found, usable)
+    elif found is not plain:
+        found, left_out = _without_dust(found)
+    optics = found.parameters.optics(found.noise, found.information)
+    return LearnedOptics(optics, replace(_usual_of(found), left_out=left_out))
+
+
+def _with_enough_voxels(
+    samples: Sequence[GroupSample | CrowdSample], image: SphereImage
+) -> list[GroupSample | CrowdSample]:
+    """Return the samples that have enough voxels to fit their spheres with an image."""
+    return [
+        s
+        for s in samples
+        if isinstance(s, CrowdSample) or s.window(image).has_enough_voxels(len(s.centers))
+    ]
+
+
+def _usual_of(found: _Settled) -> UsualImage:
+    """Return what most spheres of the samples have in common."""
+    chi2 = [fit.chi2(found.noise) for fit in found.fits]
+    return UsualImage.of(chi2, [fit.brightness for fit in found.fits])
+
+
+def _spheres_among(
+    samples: Sequence[GroupSample | CrowdSample],
+    fits: Sequence[SampleFit],
+    *,
+    noise: CameraNoise,
+    usual: UsualImage,
+) -> list[GroupSample | CrowdSample]:
+    """Return the samples whose images are those of spheres."""
+    return [
+        s
+        for s, fit in zip(samples, fits, strict=True)
+        if usual.excess(
+            np.full(len(fit.brightness), fit.chi2(noise)),
+            fit.brightness / usual.brightness,
+            voxels=np.full(len(fit.brightness), len(fit.expected) / len(fit.brightness)),
+        ).max(initial=0.0)
+        <= 1
+    ]
+
+
+def _without_dust(found: _Settled) -> tuple[_Settled, int]:
+    """Return the parameters without samples that are no spheres, and the number of these."""
+    left_out = 0
+    for _ in range(_MAX_SEARCHES - 1):
+        kept = _spheres_among(found.samples, found.fits, noise=found.noise, usual=_usual_of(found))
+        if len(kept) == len(found.samples) or len(kept) < _FEWEST_SAMPLES:
+            break
+        left_out += len(found.samples) - len(kept)
+        found = _settled(kept, found.parameters, found.noise)
+    return found, left_out
+
+
+def _judged_again(
+    found: _Settled, samples: Sequence[GroupSample | CrowdSample]
+) -> tuple[_Settled, int]:
+    """Return the parameters with all samples that are spheres by the image that was found."""
+    variations = ImageVariations.about(found.parameters)
+    samples = _with_enough_voxels(samples, variations.image)
+    fits = [s.fit(variations, found.noise) for s in samples]
+    kept = _spheres_among(samples, fits, noise=found.noise, usual=_usual_of(found))
+    if len(kept) < _FEWEST_SAMPLES:
+        return found, len(samples) - len(kept)
+    return _settled(kept, found.parameters, found.noise), len(samples) - len(kept)
+
+
+def _settled(
+    samples: list[GroupSample | CrowdSample],
+    parameters: ImageParameters,
+    noise: CameraNoise,
+    *,
+    rounds: int = _MAX_LEARNING_ROUNDS,
+    tolerance: float = _STEP_IN_ERRORS,
+) -> _Settled:
+    """Return the parameters of greatest likelihood, from a start; steps in standard errors."""
+    n = len(parameters.values)
+    for number in range(rounds):
+        variations = ImageVariations.about(parameters)
         fits = [s.fit(variations, noise) for s in samples]
         samples = [s._replace(centers=fit.centers) for s, fit in zip(samples, fits, strict=True)]
         information = np.sum([fit.information for fit in fits], axis=0)
-        step = np.linalg.solve(information, np.sum([fit.score for fit in fits], axis=0))
+        score = np.sum([fit.score for fit in fits], axis=0)
         noise = photon_transfer(
-            np.concatenate([fit.expected for fit in fits]),
-            np.concatenate([fit.squared_residual for fit in fits]),
+            np.concatenate([fit.level for fit in fits]),
+            np.concatenate([fit.variance for fit in fits]),
         )
-        log = log + step * min(1.0, _MAX_LOG_STEP / np.abs(step).max())
-        log[1] = max(log[1], _least_log_psf_z(log[2], voxel))
-        if np.abs(step).max() < _LOG_STEP_CONVERGED:
-            break
-    else:
-        raise NoSpheresError(
-            f"sphere size and point spread do not converge: diameter {np.exp(log[0]):.3g}, psf "
-            f"({np.exp(log[1]):.3g}, {np.exp(log[2]):.3g}) um after {_MAX_LEARNING_ROUNDS} rounds "
-            f"on {len(samples)} groups: are these spheres, bright enough, or dark (dark=True), and "
-            "is the voxel size right? State the optics (optics=), or keep the positions found "
-            "first (refine=None)"
+        spread, larger = parameters.spread, None
+        if spread > 0:
+            sizes = np.concatenate([fit.sizes for fit in fits])
+            variance = np.concatenate([fit.size_variance for fit in fits])
+            larger = float(sizes.mean())
+            spread = float(np.sqrt(np.mean((sizes - larger) ** 2 + variance)))
+        moved = parameters.moved(information[:n, :n], score[:n], larger=larger)
+        step = moved.values - parameters.values
+        same = abs(spread - parameters.spread) <= _SPREAD_CONVERGED * spread
+        parameters = replace(moved, spread=spread)
+        in_errors = float(np.sqrt(step @ information[:n, :n] @ step))
+        # The information of the first round is that of a guessed noise.
+        settled = np.abs(step).max() < _STEP_CONVERGED or (number > 0 and in_errors < tolerance)
+        if settled and same:
+            return _Settled(parameters, noise, samples, fits, information, score)
+    size, psf_z, psf = np.exp(parameters.values[:3])
+    raise NoSpheresError(
+        f"sphere size and point spread do not converge: diameter {size:.3g}, blur "
+        f"({psf_z:.3g}, {psf:.3g}) um after {rounds} rounds "
+        f"on {len(samples)} groups: are these spheres, bright enough, or dark (dark=True), and "
+        "is the voxel size right? State the optics (optics=), or keep the positions found "
+        "first (refine=None)"
+    )
+
+
+def _with_spread(equal: _Settled) -> _Settled:
+    """Return the parameters with a spread of the diameters if their likelihood shows one."""
+    trial = replace(equal.parameters, spread=_FIRST_SPREAD)
+    variations = ImageVariations.about(trial)
+    fits = [s.fit(variations, equal.noise) for s in equal.samples]
+    sizes = np.concatenate([fit.sizes for fit in fits])
+    posterior = np.concatenate([fit.size_variance for fit in fits])
+    # Deviations and variances from the images alone, without the distribution.
+    variance = 1.0 / np.maximum(1.0 / posterior - _FIRST_SPREAD**-2, 1e-3 / posterior)
+    deviation = sizes * variance / posterior
+    deviation -= np.average(deviation, weights=1.0 / variance)
+    spreads = np.geomspace(_LEAST_SPREAD, 0.2, 30)
+    total = variance + spreads[:, None] ** 2
+    gain = 0.5 * np.sum(
+        deviation**2 * (1.0 / variance - 1.0 / total) - np.log(total / variance), axis=1
+    )
+    best = int(np.argmax(gain))
+    if gain[best] < _LEAST_SPREAD_GAIN:
+        return equal
+    try:
+        start = replace(equal.parameters, spread=float(spreads[best]))
+        return _settled(equal.samples, start, equal.noise)
+    except NoSpheresError:
+        # Equal diameters have settled, and different ones have not: the first are used.
+        return equal
+
+
+def _shows_tail(found: _Settled) -> bool:
+    """Return whether the first step of a tail's share is significantly positive."""
+    variance = np.linalg.pinv(found.information, hermitian=True)
+    share = float(variance[-1] @ found.score)
+    return share > _LEAST_SHARE_ERRORS * float(np.sqrt(variance[-1, -1]))
+
+
+def _with_tail(plain: _Settled) -> _Settled:
+    """Return the parameters with a tail if groups that were not fitted are more likely with it."""
+    groups = [s for s in plain.samples if isinstance(s, GroupSample)]
+    if len(groups) < max(2, len(plain.samples)):
+        return plain
+    start = plain.parameters.with_tail()
+    widest = start.image()
+    groups = [s for s in groups if s.window(widest).has_enough_voxels(len(s.centers))]
+    if len(groups) < 2:
+        return plain
+    try:
+        half = _settled(
+            list(groups[::2]),
+            start,
+            plain.noise,
+            rounds=_MAX_TRIAL_ROUNDS,
+            tolerance=_TRIAL_STEP_IN_ERRORS,
         )
-    size, psf_z, psf = (float(v) for v in np.exp(log))
-    error = np.exp(log) * np.sqrt(np.diag(np.linalg.inv(information)))
-    stderr = (float(error[0]), float(error[1]), float(error[2]))
-    return Optics(size, (psf_z, psf), noise, stderr), samples, fits
+        tailed, image = half.parameters.image(), plain.parameters.image()
+        gain = sum(
+            s.log_likelihood(tailed, half.noise, within=tailed)
+            - s.log_likelihood(image, half.noise, within=tailed)
+            for s in groups[1::2]
+        )
+        if gain < _LEAST_HELD_OUT_GAIN:
+            return plain
+        return _settled(list(groups), half.parameters, half.noise)
+    except NoSpheresError:
+        # The Gaussian has settled, and the sum of two Gaussians has not: the first one is used.
+        return plain
 
 
-def _least_log_psf_z(log_psf: float, voxel: tuple[float, float, float]) -> float:
-    """Return the logarithm of the least point spread along z: that of a microscope is elongated.
-
-    With the widths of the voxels the blur along z stays the larger one, in all variations too.
-    """
-    plane = np.exp(2 * (log_psf + _LOG_DIFFERENCE)) + (voxel[1] * voxel[2] - voxel[0] ** 2) / 12
-    narrowest = np.exp(2 * log_psf)
-    return 0.5 * float(np.log(max(plane, narrowest))) + _LOG_DIFFERENCE + 1e-3
-
-
-def photon_transfer(expected: Floats, squared_residual: Floats) -> CameraNoise:
+def photon_transfer(expected: Floats, variance: Floats) -> CameraNoise:
     """Return gain and floor of the camera from the growth of the variance with the mean.
 
     Parameters
     ----------
     expected : ndarray, shape (m,)
         Expected grey levels.
-    squared_residual : ndarray, shape (m,)
-        Squared differences of grey levels and expected grey levels.
+    variance : ndarray, shape (m,)
+        Estimates of their variance.
 
     Returns
     -------
@@ -517,11 +901,11 @@ def photon_transfer(expected: Floats, squared_residual: Floats) -> CameraNoise:
     (3.0, 4.0)
     """
     design = np.stack([expected, np.ones_like(expected)])
-    noise = CameraNoise(0.0, float(squared_residual.mean()))
+    noise = CameraNoise(0.0, float(variance.mean()))
     for _ in range(4):
         weighted = design * noise.weight(expected) ** 2
-        gain, floor = np.linalg.solve(weighted @ design.T, weighted @ squared_residual)
+        gain, floor = np.linalg.solve(weighted @ design.T, weighted @ variance)
         if gain <= 0:
-            return CameraNoise(0.0, float(squared_residual.mean()))
+            return CameraNoise(0.0, float(variance.mean()))
         noise = CameraNoise(float(gain), float(floor))
     return noise

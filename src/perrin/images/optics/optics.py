@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from perrin._arrays import to_plain
-from perrin.images.optics.ball_image import SphereImage, sphere_image
+from perrin.images.optics.ball_image import PsfTail, SphereImage, sphere_image
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -73,12 +73,18 @@ class Optics:
     diameter : float
         Diameter of the fluorescent sphere, um.
     psf : tuple of float
-        Standard deviations of the Gaussian point spread, (z, plane), um.
+        Standard deviations of the Gaussian point spread, (z, plane), um; with a tail those of its
+        narrower Gaussian.
     noise : CameraNoise
         ``(gain, floor)``: the variance of a voxel is gain times its expected value plus floor, in
         squared grey levels; the floor includes read noise and the camera's offset.
     stderr : tuple of float
         Standard errors of diameter, psf z and psf plane, um; 0 where the user stated the values.
+    tail : PsfTail or None
+        The second, wider Gaussian of the point spread: its share of the intensity and its standard
+        deviations (z, plane), um; None for a Gaussian point spread.
+    spread : float
+        Relative standard deviation of the diameters of different spheres; 0 where they are equal.
 
     Examples
     --------
@@ -91,14 +97,18 @@ class Optics:
     psf: tuple[float, float]
     noise: CameraNoise
     stderr: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    tail: PsfTail | None = None
+    spread: float = 0.0
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the optics as values that JSON holds; `noise` is the list [gain, floor]."""
+        """Return values that JSON holds: `noise` as [gain, floor], `tail` as [share, psf]."""
         return {
             "diameter": to_plain(self.diameter),
             "psf": to_plain(self.psf),
             "noise": [to_plain(value) for value in self.noise],
             "stderr": to_plain(self.stderr),
+            "tail": None if self.tail is None else [to_plain(part) for part in self.tail],
+            "spread": to_plain(self.spread),
         }
 
     @classmethod
@@ -108,15 +118,29 @@ class Optics:
         Parameters
         ----------
         entry : mapping
-            The dictionary of `to_dict`.
+            The dictionary of `to_dict`; one without `tail` has a Gaussian point spread,
+            and one without `spread` equal spheres.
 
         Returns
         -------
         Optics
         """
         (psf_z, psf), (a, b, c) = entry["psf"], entry["stderr"]
-        return cls(entry["diameter"], (psf_z, psf), CameraNoise(*entry["noise"]), (a, b, c))
+        tail = None
+        if entry.get("tail") is not None:
+            share, (tail_z, tail_plane) = entry["tail"]
+            tail = PsfTail(share, (tail_z, tail_plane))
+        noise = CameraNoise(*entry["noise"])
+        return cls(
+            entry["diameter"], (psf_z, psf), noise, (a, b, c), tail, entry.get("spread", 0.0)
+        )
 
     def image(self, voxel: tuple[float, float, float]) -> SphereImage:
         """Return the table of the sphere's image for voxels (z, y, x), um."""
-        return sphere_image(diameter=self.diameter, psf=self.psf, voxel=voxel)
+        return sphere_image(
+            diameter=self.diameter,
+            psf=self.psf,
+            voxel=voxel,
+            tail=self.tail,
+            spread=self.spread,
+        )

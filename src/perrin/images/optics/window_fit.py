@@ -56,18 +56,55 @@ class Window(NamedTuple):
         """Return whether there are enough voxels to fit `count` spheres."""
         return len(self.data) >= _VOXELS_PER_PARAMETER * (4 * count + _N_BACKGROUND)
 
-    def spots(self, image: SphereImage, centers: Floats) -> tuple[Floats, Floats]:
-        """Return unit images (n, m) of spheres on these voxels and their gradients (n, 3, m)."""
+    def spots(self, image: SphereImage, centers: Floats, sizes: Floats) -> tuple[Floats, Floats]:
+        """Return unit images (n, m) of spheres on these voxels and their gradients (n, 3, m).
+
+        `sizes` (n,) are deviations of the logarithms of the diameters.
+        """
         shape = self.mask.shape
         origin = np.array([s.start for s in self.box]) * np.array(image.voxel)
         whole = np.zeros((len(centers), 4, *shape))
-        for layer, center in zip(whole, centers - origin, strict=True):
-            spot = image.spot(center, shape)
+        for layer, center, size in zip(whole, centers - origin, sizes, strict=True):
+            spot = image.sized(size).spot(center, shape)
             layer[(0, *spot.box)] = spot.value
             layer[(slice(1, None), *spot.box)] = spot.gradient
         kept = whole.reshape(4 * len(centers), -1).take(np.flatnonzero(self.mask), axis=1)
         kept = kept.reshape(len(centers), 4, -1)
         return kept[:, 0], kept[:, 1:]
+
+    def size_slopes(self, image: SphereImage, centers: Floats, sizes: Floats) -> Floats:
+        """Return the derivatives (n, m) of unit images by the logarithms of the diameters."""
+        origin = np.array([s.start for s in self.box]) * np.array(image.voxel)
+        whole = np.zeros((len(centers), *self.mask.shape))
+        for layer, center, size in zip(whole, centers - origin, sizes, strict=True):
+            box, value = image.slope_spot(image.size_slope(size), center, self.mask.shape)
+            layer[box] = value[0]
+        return whole[:, self.mask]
+
+    def slopes(
+        self,
+        image: SphereImage,
+        slopes: Floats,
+        centers: Floats,
+        brightness: Floats,
+        sizes: Floats,
+    ) -> Floats:
+        """Return derivatives (k, m) of the intensity by parameters of the sphere's image.
+
+        Parameters
+        ----------
+        image : SphereImage
+        slopes : ndarray, shape (k, ...)
+            The tables of `SphereImage.slopes`.
+        centers, brightness, sizes : ndarray, shape (n, 3), (n,), (n,)
+            The spheres; `sizes` are deviations of the logarithms of their diameters.
+        """
+        origin = np.array([s.start for s in self.box]) * np.array(image.voxel)
+        whole = np.zeros((len(slopes), *self.mask.shape))
+        for center, bright, size in zip(centers - origin, brightness, sizes, strict=True):
+            box, value = image.slope_spot(slopes, center, self.mask.shape, deviation=size)
+            whole[(slice(None), *box)] += bright * value
+        return whole[:, self.mask]
 
 
 class Arrangement(Protocol):
@@ -145,7 +182,8 @@ class ImageFit(NamedTuple):
     brightness : ndarray, shape (n,)
         Intensity inside each sphere, grey levels.
     covariance : ndarray, shape (k, k)
-        Covariance of the arrangement's parameters.
+        Covariance of the arrangement's parameters: the inverse Fisher information, times `chi2`
+        where this is above 1.
     converged : bool
         Whether the last step was far below the blur.
     chi2 : float
@@ -156,6 +194,11 @@ class ImageFit(NamedTuple):
         Inverse variances of the voxels.
     jacobian : ndarray, shape (p, m)
         Derivatives of the expected grey levels by all parameters.
+    sizes, size_variance : ndarray, shape (n,)
+        Deviations of the logarithms of the diameters from the mean, and their variances; 0 where
+        all spheres are equal.
+    prior : ndarray, shape (p,)
+        Information on the parameters by the distribution of the diameters.
     """
 
     arrangement: Arrangement
@@ -166,6 +209,14 @@ class ImageFit(NamedTuple):
     expected: Floats
     weight: Floats
     jacobian: Floats
+    sizes: Floats
+    size_variance: Floats
+    prior: Floats
+
+    @property
+    def unit_images(self) -> Floats:
+        """Images (n, m) of the spheres at a brightness of 1."""
+        return self.jacobian[-_N_BACKGROUND - len(self.brightness) : -_N_BACKGROUND]
 
     @property
     def centers(self) -> Floats:
@@ -256,7 +307,10 @@ def fit_window(
     -----
     Fisher scoring with Levenberg-Marquardt damping. The weights follow the expected intensity, so
     that the fixed point is the root of the score of the Poisson likelihood shifted by the camera's
-    floor; the covariance is the inverse Fisher information there.
+    floor; the covariance is the inverse Fisher information there. Where the residuals exceed the
+    noise (chi-squared per degree of freedom above 1), the model misses something of the image, and
+    the covariance is multiplied by chi-squared. Where diameters differ (`SphereImage.spread`), that
+    of every sphere is fitted too, with a Gaussian distribution of its logarithm about the mean.
 
     Examples
     --------
@@ -280,10 +334,16 @@ def fit_window(
             break
         damped = information + np.diag((damping + 1e-12) * scale)
         step = np.asarray(np.linalg.solve(damped, score), dtype=np.float64)
-        k = state.n_arrangement
+        k, free = state.n_arrangement, state.n_sizes
         moved = state.arrangement.moved(step[:k])
-        trial = _fit_state(window, image, noise, moved, linear=state.linear + step[k:])
-        if state.chi2(window, trial.expected) > state.chi2(window, state.expected) * (1 + 1e-12):
+        sizes = state.sizes.copy()
+        sizes[:free] = np.clip(
+            sizes[:free] + step[k : k + free], -image.size_range, image.size_range
+        )
+        trial = _fit_state(
+            window, image, noise, moved, linear=state.linear + step[k + free :], sizes=sizes
+        )
+        if state.deviance(window, trial) > state.deviance(window, state) * (1 + 1e-12):
             damping *= 10.0
             continue
         change = np.abs(trial.arrangement.centers - state.arrangement.centers).max()
@@ -292,17 +352,24 @@ def fit_window(
             converged = True
             break
     information, _ = state.normal_equations(window)
-    k = state.n_arrangement
-    freedom = max(len(window.data) - len(state.jacobian), 1)
+    k, free = state.n_arrangement, state.n_sizes
+    variance = np.linalg.pinv(information, hermitian=True)
+    size_variance = np.zeros(len(state.sizes))
+    size_variance[:free] = np.diag(variance)[k : k + free]
+    chi2 = state.chi2(window, state.expected) / max(len(window.data) - len(state.jacobian), 1)
+    covariance = variance[:k, :k] * max(chi2, 1.0)
     return ImageFit(
         state.arrangement,
         state.linear[: len(state.linear) - _N_BACKGROUND],
-        np.asarray(np.linalg.pinv(information, hermitian=True)[:k, :k], dtype=np.float64),
+        np.asarray(covariance, dtype=np.float64),
         converged,
-        state.chi2(window, state.expected) / freedom,
+        chi2,
         state.expected,
         state.weight,
         state.jacobian,
+        state.sizes,
+        size_variance,
+        state.prior,
     )
 
 
@@ -314,11 +381,23 @@ class _FitState(NamedTuple):
     expected: Floats
     weight: Floats
     jacobian: Floats
+    sizes: Floats
+    prior: Floats
+
+    @property
+    def n_sizes(self) -> int:
+        """Number of diameters that are fitted."""
+        return int(np.count_nonzero(self.prior))
 
     @property
     def n_arrangement(self) -> int:
         """Number of parameters of the arrangement."""
-        return len(self.jacobian) - len(self.linear)
+        return len(self.jacobian) - len(self.linear) - self.n_sizes
+
+    def deviance(self, window: Window, trial: _FitState) -> float:
+        """Return chi-squared of a trial with the weights of this state, and that of its sizes."""
+        precision = float(self.prior.max())
+        return self.chi2(window, trial.expected) + precision * float(np.sum(trial.sizes**2))
 
     def chi2(self, window: Window, expected: Floats) -> float:
         """Return chi-squared of an expected intensity, with the weights of this state."""
@@ -327,7 +406,12 @@ class _FitState(NamedTuple):
     def normal_equations(self, window: Window) -> tuple[Floats, Floats]:
         """Return the Fisher information and the score."""
         weighted = self.jacobian * self.weight
-        return weighted @ self.jacobian.T, weighted @ (window.data - self.expected)
+        information = weighted @ self.jacobian.T
+        score = weighted @ (window.data - self.expected)
+        if self.n_sizes:
+            information += np.diag(self.prior)
+            score[self.prior > 0] -= self.prior.max() * self.sizes
+        return information, score
 
 
 def _least_squares(data: Floats, design: Floats, noise: CameraNoise, expected: Floats) -> Floats:
@@ -346,9 +430,12 @@ def _fit_state(
     arrangement: Arrangement,
     *,
     linear: Floats | None = None,
+    sizes: Floats | None = None,
 ) -> _FitState:
     """Return the state of an arrangement; `linear` None is fitted by least squares."""
-    value, gradient = window.spots(image, arrangement.centers)
+    if sizes is None:
+        sizes = np.zeros(len(arrangement.centers))
+    value, gradient = window.spots(image, arrangement.centers, sizes)
     if linear is None:
         design = np.concatenate([value, window.background])
         flat = np.full_like(window.data, window.data.mean())
@@ -356,12 +443,20 @@ def _fit_state(
         linear = _least_squares(window.data, design, noise, np.asarray(linear @ design))
     slope, n = arrangement.slope, len(value)
     k = 3 * n if slope is None else len(slope)
-    jacobian = np.empty((k + len(linear), len(window.data)))
+    free = n if image.spread > 0 else 0
+    jacobian = np.empty((k + free + len(linear), len(window.data)))
     brightness = linear[:n, None, None]
     if slope is None:
         np.multiply(brightness, gradient, out=jacobian[:k].reshape(gradient.shape))
     else:
         np.matmul(slope, (brightness * gradient).reshape(3 * n, -1), out=jacobian[:k])
+    if free:
+        slopes = window.size_slopes(image, arrangement.centers, sizes)
+        np.multiply(linear[:n, None], slopes, out=jacobian[k : k + n])
+    k += free
     jacobian[k : k + n], jacobian[k + n :] = value, window.background
     expected = linear @ jacobian[k:]
-    return _FitState(arrangement, linear, expected, noise.weight(expected), jacobian)
+    prior = np.zeros(len(jacobian))
+    if free:
+        prior[k - n : k] = image.spread**-2
+    return _FitState(arrangement, linear, expected, noise.weight(expected), jacobian, sizes, prior)

@@ -695,8 +695,7 @@ def _crowd_of(
 
 def _own_chi2(window: Window, fit: ImageFit) -> tuple[Floats, Floats]:
     """Return chi-squared per voxel of the voxels of every sphere of a fit, and their number."""
-    n = len(fit.brightness)
-    own = fit.jacobian[3 * n : 4 * n]  # the unit image of each sphere
+    own = fit.unit_images
     voxels = own.sum(axis=1)
     square = own @ (fit.weight * (window.data - fit.expected) ** 2)
     return square / np.maximum(voxels, 1e-300), voxels
