@@ -428,7 +428,7 @@ def unrefined_spheres(features: pd.DataFrame) -> Findings:
 
 
 def error_ratio_shown(ratio: ErrorRatio, *, axes: list[str]) -> Findings:
-    """State by how much rigid bodies show larger errors than the light alone leaves.
+    """State by how much rigid bodies show larger errors than the fits of their images state.
 
     A warning where the errors of an axis are over twice the stated ones, a note above 1.15 or where
     they change with time or depth.
@@ -453,8 +453,8 @@ def error_ratio_shown(ratio: ErrorRatio, *, axes: list[str]) -> Findings:
     ]
     changing = f", changing by {' and '.join(trend)}" if trend else ""
     text = (
-        f"errors of the positions over those that the photons leave, from the residuals of rigid "
-        f"bodies: {listed_axes}{changing}; the stated errors of spheres and poses contain this"
+        f"errors of the positions over those of the fits of their images, from the residuals of "
+        f"rigid bodies: {listed_axes}{changing}; the stated errors of spheres and poses contain this"
     )
     if factor.max() > _LARGE_ERROR_RATIO:
         return Findings(
