@@ -170,8 +170,9 @@ def fit_crowd(
     inside = np.all((state.centers >= 0) & (state.centers <= last), axis=1)
     inside &= plausible_spheres(window, state, contact)
     chi2 = sphere_chi2(window, state)
-    known = np.append(chi2[np.isfinite(chi2)], [] if np.isfinite(chi2).any() else 1.0)
-    sigma = standard_errors(information, state) * np.sqrt(max(float(np.median(known)), 1.0))
+    finite = chi2[np.isfinite(chi2)]
+    excess = max(float(np.median(finite)), 1.0) if finite.size else 1.0
+    sigma = standard_errors(information, state) * np.sqrt(excess)
     return CrowdFit(
         state.centers[inside],
         sigma[inside],
