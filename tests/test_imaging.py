@@ -84,7 +84,7 @@ def test_the_results_survive_json():
 
 
 def test_imaging_json_keeps_its_keys(tmp_path):
-    """The file of earlier versions has the same text."""
+    """The file has the keys of earlier versions; a tail and a spread have been added."""
     written = imaging()
     write_imaging(written, tmp_path)
     entry = json.loads((tmp_path / "imaging.json").read_text())
@@ -93,6 +93,7 @@ def test_imaging_json_keeps_its_keys(tmp_path):
     ]  # fmt: skip
     assert entry["optics"] == {
         "diameter": 2.4, "psf": [0.41, 0.152], "noise": [3.1, -2.0], "stderr": [0.1, 0.2, 0.3],
+        "tail": None, "spread": 0.0,
     }  # fmt: skip
 
 

@@ -68,7 +68,7 @@ class CrowdFit(NamedTuple):
     ----------
     centers, sigma : ndarray, shape (n, 3)
         Positions (z, y, x), um, and their standard errors: from the Fisher information, times the
-        root of `chi2` where this is above 1.
+        root of the median `chi2` where this is above 1.
     chi2 : ndarray, shape (n,)
         Chi-squared per voxel, averaged over the voxels of each sphere.
     converged : ndarray of bool, shape (n,)
@@ -170,7 +170,9 @@ def fit_crowd(
     inside = np.all((state.centers >= 0) & (state.centers <= last), axis=1)
     inside &= plausible_spheres(window, state, contact)
     chi2 = sphere_chi2(window, state)
-    sigma = standard_errors(information, state) * np.sqrt(np.fmax(chi2, 1.0))[:, None]
+    finite = chi2[np.isfinite(chi2)]
+    excess = max(float(np.median(finite)), 1.0) if finite.size else 1.0
+    sigma = standard_errors(information, state) * np.sqrt(excess)
     return CrowdFit(
         state.centers[inside],
         sigma[inside],

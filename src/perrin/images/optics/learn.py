@@ -608,7 +608,7 @@ def neighbour_variance(
     >>> used, level = np.ones(noise.shape, dtype=bool), np.full(noise.shape, 7.0)
     >>> expected, variance = neighbour_variance(noise + misfit, level, used, image=image)
     >>> expected.mean().round(), variance.mean().round(1), (noise + misfit).var().round(1)
-    (np.float64(7.0), np.float64(9.0), np.float64(21.9))
+    (np.float64(7.0), np.float64(8.9), np.float64(22.1))
     """
     blur = np.array([image.blur[0], image.blur[1], image.blur[1]]) / image.voxel
     long_enough = np.array(used.shape) >= len(_NEIGHBOURS)
