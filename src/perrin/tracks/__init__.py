@@ -9,7 +9,14 @@ from perrin.tracks.bonds import (
     noise_along,
     rigid_groups,
 )
-from perrin.tracks.clock import Clock, evenly_spaced, frame_stride, own_times, read_clock
+from perrin.tracks.clock import (
+    Clock,
+    evenly_spaced,
+    frame_stride,
+    frames_from_times,
+    own_times,
+    read_clock,
+)
 from perrin.tracks.clusters import (
     cluster_positions,
     each_cluster,
@@ -17,9 +24,24 @@ from perrin.tracks.clusters import (
     identify,
     positions_table,
 )
-from perrin.tracks.column_names import Spelling, recognise_columns, seconds, unit_faults
+from perrin.tracks.column_names import (
+    Spelling,
+    ours_of,
+    recognise_columns,
+    seconds,
+    stated_units,
+    unit_faults,
+)
+from perrin.tracks.delimited import Layout, decoded, delimited_table, layout_of, parse_text
 from perrin.tracks.files import RowNumbers, check_tracks, read_spheres, read_tracks, write_tracks
-from perrin.tracks.formats import SUFFIXES, parse_csv, parse_table, table_bytes, table_suffix
+from perrin.tracks.formats import (
+    SUFFIXES,
+    parse_table,
+    sheet_text,
+    table_bytes,
+    table_suffix,
+    text_table,
+)
 from perrin.tracks.gdf import gdf_bytes, parse_gdf
 from perrin.tracks.groups import TOUCHING_REACH, connected_groups, frames_of, touching_groups
 from perrin.tracks.identity import (
@@ -45,7 +67,10 @@ from perrin.tracks.identity import (
     shape_symmetry,
     squared_angle,
 )
+from perrin.tracks.imaris import imaris_table, is_imaris
 from perrin.tracks.linking import Centers, link_clusters, linked_tracks, step_variance
+from perrin.tracks.motion_capture import is_motive, motive_table, parse_c3d
+from perrin.tracks.raw_tables import RawTable, tracked_rows, without_flat_z
 from perrin.tracks.screening import (
     CENTRE_REMOVED,
     Screened,
@@ -60,7 +85,11 @@ from perrin.tracks.screening import (
     rounding_chances,
     screen_rows,
 )
+from perrin.tracks.simulations import is_selection, parse_gsd, selection_table
+from perrin.tracks.track_arrays import gdf_table, napari_columns, napari_text
+from perrin.tracks.trackmate import is_trackmate, parse_trackmate_xml, trackmate_table
 from perrin.tracks.writing import write_json, written_whole
+from perrin.tracks.xyz import parse_xyz, xyz_text
 
 __all__ = [
     "CENTRE_REMOVED",
@@ -72,8 +101,10 @@ __all__ = [
     "Clock",
     "Detections",
     "Identity",
+    "Layout",
     "Pairs",
     "Pose",
+    "RawTable",
     "RowNumbers",
     "Screened",
     "Spelling",
@@ -88,6 +119,8 @@ __all__ = [
     "cluster_positions",
     "connected_groups",
     "covering_rotations",
+    "decoded",
+    "delimited_table",
     "distance_notes",
     "each_cluster",
     "evenly_spaced",
@@ -96,26 +129,42 @@ __all__ = [
     "find_clusters",
     "followed_pairs",
     "frame_stride",
+    "frames_from_times",
     "frames_of",
     "gdf_bytes",
+    "gdf_table",
     "has_trackpy_columns",
     "icp_fit",
     "icp_search",
     "identify",
+    "imaris_table",
+    "is_imaris",
+    "is_motive",
+    "is_selection",
+    "is_trackmate",
     "joined_pairs",
     "labels_are_certain",
     "labels_in_time",
     "lattice_step",
+    "layout_of",
     "link_clusters",
     "linked_tracks",
     "most_likely_identity",
     "most_likely_path",
+    "motive_table",
+    "napari_columns",
+    "napari_text",
     "neighbour_pairs",
     "noise_along",
+    "ours_of",
     "own_times",
-    "parse_csv",
+    "parse_c3d",
     "parse_gdf",
+    "parse_gsd",
     "parse_table",
+    "parse_text",
+    "parse_trackmate_xml",
+    "parse_xyz",
     "placeholder_rows",
     "positions_table",
     "read_clock",
@@ -128,15 +177,23 @@ __all__ = [
     "rounding_chances",
     "screen_rows",
     "seconds",
+    "selection_table",
     "settle_identity",
     "shape_symmetry",
+    "sheet_text",
     "squared_angle",
+    "stated_units",
     "step_variance",
     "table_bytes",
     "table_suffix",
+    "text_table",
     "touching_groups",
+    "tracked_rows",
+    "trackmate_table",
     "unit_faults",
+    "without_flat_z",
     "write_json",
     "write_tracks",
     "written_whole",
+    "xyz_text",
 ]
