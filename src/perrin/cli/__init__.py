@@ -7,14 +7,17 @@ from perrin.cli.app import (
     common_options,
     convert,
     demo,
+    doctor,
     main,
     paper,
     plan,
     predict,
-    progress_bar,
     run,
+    show_run,
     simulate,
 )
+from perrin.cli.config import config_text, take_config, write_config
+from perrin.cli.diagnosis import Check, figure_font, installed, optional_readers, self_test
 from perrin.cli.messages import (
     in_options,
     messages_of,
@@ -36,9 +39,12 @@ from perrin.cli.options import (
     read_whole_numbers,
     spheres_of,
 )
+from perrin.cli.progress import progress_lines, shown_progress
 from perrin.cli.tables import (
     cluster_table,
     pooled_table,
+    show_diagnosis,
+    show_json,
     show_plan,
     show_prediction,
     show_remarks,
@@ -46,6 +52,7 @@ from perrin.cli.tables import (
 )
 
 __all__ = [
+    "Check",
     "GroupedCommand",
     "analyze",
     "body_of",
@@ -53,17 +60,22 @@ __all__ = [
     "check_new_file",
     "cluster_table",
     "common_options",
+    "config_text",
     "convert",
     "demo",
+    "doctor",
+    "figure_font",
     "in_options",
+    "installed",
     "main",
     "messages_of",
+    "optional_readers",
     "options_of",
     "paper",
     "plan",
     "pooled_table",
     "predict",
-    "progress_bar",
+    "progress_lines",
     "read_columns",
     "read_dynamics",
     "read_model",
@@ -74,12 +86,19 @@ __all__ = [
     "read_slice",
     "read_whole_numbers",
     "run",
+    "self_test",
+    "show_diagnosis",
+    "show_json",
     "show_plan",
     "show_prediction",
     "show_remarks",
     "show_report",
+    "show_run",
+    "shown_progress",
     "simulate",
     "spheres_of",
     "state_kept_frames",
+    "take_config",
     "warnings_in_one_line",
+    "write_config",
 ]

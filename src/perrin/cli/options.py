@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, cast, get_args
 import typer
 from typer.core import TyperCommand
 
+from perrin.cli.config import take_config
+
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
@@ -27,10 +29,13 @@ PICTURE_SUFFIXES = (".png", ".pdf", ".svg")
 
 # Headings of the options in the help of commands with many of them, in this order.
 INPUT, SPHERES = "Input", "Spheres and clusters"
+BODY, RECORDING = "Body and motion", "Recording"
 ESTIMATES, SIZES, WORK, OUTPUT = (
     "Noise and estimates", "Sizes and predictions", "Work", "Output",
 )  # fmt: skip
-_GROUPS = (INPUT, SPHERES, ESTIMATES, SIZES, WORK, OUTPUT, "Other options")
+_GROUPS = (
+    INPUT, SPHERES, BODY, RECORDING, ESTIMATES, SIZES, WORK, OUTPUT, "Other options",
+)  # fmt: skip
 
 
 class GroupedCommand(TyperCommand):
@@ -52,8 +57,21 @@ class GroupedCommand(TyperCommand):
                 with formatter.section(heading):
                     formatter.write_dl(records)
 
+    def format_epilog(self, ctx: Any, formatter: Any) -> None:  # noqa: ANN401, ARG002
+        """Write the examples, a line each, as they are."""
+        if self.epilog:
+            with formatter.section("Examples"):
+                for line in self.epilog.splitlines():
+                    formatter.write(f"  {line.strip()}\n")
 
-Tracks = Annotated[Path, typer.Argument(help="Track table: .csv, .csv.gz, .parquet or .gdf.")]
+
+Tracks = Annotated[
+    Path,
+    typer.Argument(
+        help="Track table: .csv, .tsv, .txt, .xlsx, .parquet, .gdf, .xyz, TrackMate, Imaris, ... "
+        "(docs/tables.md)."
+    ),
+]
 
 Interval = Annotated[
     float, typer.Option("--dt", help="Time between frames, s.", rich_help_panel=INPUT)
@@ -74,7 +92,8 @@ Scale = Annotated[
 Columns = Annotated[
     str | None,
     typer.Option(
-        help="Names or numbers of the file's columns: x=0,y=1,z=2,frame=-2,particle=-1.",
+        help="Names or numbers of the file's columns: x=0,y=1,z=2,frame=-2,particle=-1, or time=t "
+        "(s) in place of frame.",
         rich_help_panel=INPUT,
     ),
 ]
@@ -91,7 +110,50 @@ Overwrite = Annotated[
     typer.Option("--overwrite", help="Replace an existing run folder.", rich_help_panel=OUTPUT),
 ]
 
-OverwriteFile = Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")]
+OverwriteFile = Annotated[
+    bool, typer.Option("--overwrite", help="Replace an existing file.", rich_help_panel=OUTPUT)
+]
+
+Json = Annotated[
+    bool,
+    typer.Option("--json", help="Print the results as JSON, no tables.", rich_help_panel=OUTPUT),
+]
+
+Quiet = Annotated[
+    bool,
+    typer.Option(
+        "--quiet", help="Print warnings and errors only, no progress.", rich_help_panel=OUTPUT
+    ),
+]
+
+Config = Annotated[
+    Path | None,
+    typer.Option(
+        "--config",
+        help="TOML file with options by their names, as run.toml of a run folder; those of the "
+        "command line outrank it.",
+        is_eager=True,
+        callback=take_config,
+        rich_help_panel=INPUT,
+    ),
+]
+
+Contact = Annotated[
+    float | None,
+    typer.Option(
+        help="Centre distance of touching particles, um: finds the clusters.",
+        rich_help_panel=INPUT,
+    ),
+]
+
+ClusterSize = Annotated[
+    int | None,
+    typer.Option(
+        help="Number of particles of a cluster: with --contact, finds the particles of a table "
+        "without ids.",
+        rich_help_panel=INPUT,
+    ),
+]
 
 Sigma = Annotated[
     str | None,
@@ -166,11 +228,12 @@ Dynamics = Annotated[
     typer.Option(
         help="Another motion than Brownian: fractional:ALPHA, confined:RELAXATION_TIME, spin:RATE "
         "or spin:X,Y,Z, switching:RATIO,DWELL, hopping:ANGLE,INTERVAL or "
-        "hopping:ANGLE,INTERVAL,RELAXATION_TIME (rad, rad/s, s)."
+        "hopping:ANGLE,INTERVAL,RELAXATION_TIME (rad, rad/s, s).",
+        rich_help_panel=BODY,
     ),
 ]
 
-Seed = Annotated[int, typer.Option(help="Seed of the random numbers.")]
+Seed = Annotated[int, typer.Option(help="Seed of the random numbers.", rich_help_panel=RECORDING)]
 Shape = Annotated[str, typer.Argument(help=f"{', '.join(SHAPES)}.")]
 
 

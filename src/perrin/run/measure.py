@@ -81,6 +81,8 @@ if TYPE_CHECKING:
     from perrin.motion.floor import NoiseFloor
     from perrin.motion.rigid_motion import RigidMotion
 
+    Progress: TypeAlias = Callable[[int, int, str], None]
+
     # A better motion for every cluster, from its motion and the frame numbers of its rows.
     Improve: TypeAlias = Callable[
         [Mapping[int, tuple[RigidMotion, Ints]]], Mapping[int, RigidMotion]
@@ -219,6 +221,7 @@ def measure_table(
     recording: Recording | None = None,
     improved: Improve | None = None,
     remarks: Remarks | None = None,
+    progress: Progress | None = None,
 ) -> Report:
     """Measure every cluster of a clean table: `analyze` without reading and checking.
 
@@ -238,6 +241,8 @@ def measure_table(
         be left out.
     remarks : Remarks, optional
         Remarks from reading and screening the table.
+    progress : callable, optional
+        Called with the number of finished clusters, their total, and what is done.
 
     Returns
     -------
@@ -257,7 +262,7 @@ def measure_table(
     recording = recording or Recording(dt=experiment.dt or np.nan)
     recording, more = complete_recording(recording, table, first_frame=first)
     remarks += more
-    bodies, rods, failures = fit_clusters(table, labels, experiment, recording)
+    bodies, rods, failures = fit_clusters(table, labels, experiment, recording, progress=progress)
     if improved is not None:
         motions = improved({b.tracks.cluster: (b.motion, b.tracks.frames + first) for b in bodies})
         bodies = [
@@ -266,13 +271,17 @@ def measure_table(
             if b.tracks.cluster in motions
         ]
     measured: list[MeasuredBody] = []
-    for body in bodies:
+    for number, body in enumerate(bodies):
+        if progress is not None:
+            progress(number, len(bodies), "measuring clusters")
         try:
             measured.append(measure_body(body, experiment, recording, tested=len(bodies)))
         except (DegenerateClusterError, TooFewFramesError) as error:
             failures.append((body.tracks.label or str(body.tracks.cluster), error))
     if failures and not (measured or rods):
         raise failures[-1][1]
+    if progress is not None:
+        progress(0, 0, "judging the motion")
     measured, together = judge_bodies(measured, experiment, first_frame=first)
     pooled, unpooled = pool_clusters(measured, experiment, together)
     results, rods = add_predictions([one.result for one in measured], rods, experiment)
@@ -344,7 +353,12 @@ def complete_recording(
 
 
 def fit_clusters(
-    table: pd.DataFrame, labels: Mapping[int, str], experiment: Experiment, recording: Recording
+    table: pd.DataFrame,
+    labels: Mapping[int, str],
+    experiment: Experiment,
+    recording: Recording,
+    *,
+    progress: Progress | None = None,
 ) -> tuple[list[FittedBody], list[RodResult], list[tuple[str, ValueError]]]:
     """Fit every cluster of a table; particles on one line are measured as rods.
 
@@ -358,7 +372,10 @@ def fit_clusters(
     bodies: list[FittedBody] = []
     rods: list[RodResult] = []
     failures: list[tuple[str, ValueError]] = []
-    for cluster, positions, frames, piece, delay in each_cluster(table):
+    count = table["cluster"][table["cluster"] >= 0].nunique()
+    for number, (cluster, positions, frames, piece, delay) in enumerate(each_cluster(table)):
+        if progress is not None:
+            progress(number, count, "fitting clusters")
         label = labels.get(cluster)
         try:
             far = far_points(positions)

@@ -475,7 +475,7 @@ def _column_faults(
             f"columns={{'{missing[0]}': ...}} with the file's name or number of the column"
         )
         if missing == ["particle"]:
-            faults[-1] += "; where the rows have no ids, state contact and size to find them"
+            faults[-1] += "; where the rows have no ids, state contact= and size= to find them"
     twice = [name for name in COLUMNS if found.count(name) > 1]
     if twice:
         faults.append(f"more than one column is called {', '.join(twice)}; keep one of each")
