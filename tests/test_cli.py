@@ -751,7 +751,7 @@ def test_json_and_quiet_print_nothing_else(csv, tmp_path, no_figures):
     body = ("tetrahedron", "--diameter", 2.45)
     fluid = ("--viscosity", 1e-3, "--temperature", 298)
     found = json.loads(run("predict", *body, *fluid, "--json", cwd=tmp_path).stdout)
-    assert len(found["radius"]) == 4
+    assert found["temperature_K"] == 298
     noise = ("--d-r", 0.005, "--sigma", 0.03, "--frames", 300)
     assert json.loads(run("plan", *body, *noise, "--json", cwd=tmp_path).stdout)["n_frames"] == 300
 

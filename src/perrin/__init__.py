@@ -140,6 +140,7 @@ if TYPE_CHECKING:
         RodResult,
         analyze,
         load_run,
+        napari_layers,
     )
     from perrin.tracks import (
         Identity,
@@ -247,6 +248,7 @@ __all__ = [
     "msad_axes",
     "msad_vector",
     "msd",
+    "napari_layers",
     "noise_floor",
     "non_gaussian",
     "open_stack",
@@ -419,6 +421,7 @@ _FACES = {
         "RodResult",
         "analyze",
         "load_run",
+        "napari_layers",
     ),
     "movie": (
         "Work",

@@ -3,6 +3,7 @@
 from perrin.run.experiment import Experiment, Recording, argument_faults, merged_experiment
 from perrin.run.folders import check_place, check_resumable, filled_folder, staged_folder
 from perrin.run.grouping import assign_clusters
+from perrin.run.layers import napari_layers, napari_reader, table_layers
 from perrin.run.measure import (
     ClusterTracks,
     Coefficient,
@@ -180,6 +181,8 @@ __all__ = [
     "misfit_as_labelled",
     "motion_sentences",
     "motion_table",
+    "napari_layers",
+    "napari_reader",
     "no_cluster_text",
     "no_model_notes",
     "no_pose_notes",
@@ -202,6 +205,7 @@ __all__ = [
     "sparse_frames_warnings",
     "staged_folder",
     "steady_motion_warning",
+    "table_layers",
     "unfit_diameter_text",
     "unresolved_size_notes",
     "unsettled_notes",
