@@ -305,6 +305,15 @@ def test_a_repeated_column_counts_once_only_where_it_is_equal(tmp_path):
     assert "more than one column is called frame" in fault(path)
 
 
+def test_quoted_names_and_text_may_hold_the_mark(tmp_path):
+    """A comma in a quoted name or label divides no columns."""
+    text = 'frame,particle,"x",y,"remark, free"\n0,"a, b",1,2,"1,5"\n1,"a, b",1,2,\n'
+    read = read_tracks(written(tmp_path, "t.csv", text))
+    assert read["particle"].tolist() == ["a, b", "a, b"]
+    assert read.attrs["columns"][-1] == "remark, free"
+    assert read["y"].tolist() == [2, 2]
+
+
 # ---- DataFrames ---------------------------------------------------------------------------------
 
 

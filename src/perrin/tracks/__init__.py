@@ -32,7 +32,14 @@ from perrin.tracks.column_names import (
     stated_units,
     unit_faults,
 )
-from perrin.tracks.delimited import Layout, decoded, delimited_table, layout_of, parse_text
+from perrin.tracks.delimited import (
+    Layout,
+    delimited_table,
+    first_lines,
+    layout_of,
+    parse_text,
+    utf8_text,
+)
 from perrin.tracks.files import RowNumbers, check_tracks, read_spheres, read_tracks, write_tracks
 from perrin.tracks.formats import (
     SUFFIXES,
@@ -119,7 +126,6 @@ __all__ = [
     "cluster_positions",
     "connected_groups",
     "covering_rotations",
-    "decoded",
     "delimited_table",
     "distance_notes",
     "each_cluster",
@@ -127,6 +133,7 @@ __all__ = [
     "far_points",
     "far_sentence",
     "find_clusters",
+    "first_lines",
     "followed_pairs",
     "frame_stride",
     "frames_from_times",
@@ -191,6 +198,7 @@ __all__ = [
     "tracked_rows",
     "trackmate_table",
     "unit_faults",
+    "utf8_text",
     "without_flat_z",
     "write_json",
     "write_tracks",

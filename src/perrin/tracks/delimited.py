@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import codecs
+import csv
 import io
 import re
 from typing import TYPE_CHECKING, NamedTuple
@@ -55,22 +56,25 @@ class Layout(NamedTuple):
 
     def fields(self, line: str) -> list[str]:
         """Return the fields of a line, without quotation marks and blanks around them."""
-        parts = line.split() if self.mark == r"\s+" else line.split(self.mark)
-        return [part.strip().strip('"').strip() for part in parts]
+        if self.mark == r"\s+":
+            return [part.strip('"') for part in line.split()]
+        parts = next(csv.reader([line], delimiter=self.mark, skipinitialspace=True), [])
+        return [part.strip() for part in parts]
 
 
-def decoded(data: bytes, source: str) -> str:
-    r"""Return the text of a file, in UTF-8 or, with a byte order mark, in UTF-16.
+def utf8_text(data: bytes, source: str) -> bytes:
+    r"""Return the text of a file in UTF-8 without a byte order mark.
 
     Parameters
     ----------
     data : bytes
+        UTF-8 or, with a byte order mark, UTF-16.
     source : str
         The file's name, for messages.
 
     Returns
     -------
-    str
+    bytes
 
     Raises
     ------
@@ -79,34 +83,49 @@ def decoded(data: bytes, source: str) -> str:
 
     Examples
     --------
-    >>> decoded("x (µm)".encode("utf-16"), "t.txt")
+    >>> utf8_text("x (µm)".encode("utf-16"), "t.txt").decode()
     'x (µm)'
     """
+    if data[:2] in _UTF16:
+        try:
+            data = data.decode("utf-16").encode()
+        except UnicodeDecodeError:
+            raise table_error(source, "not a text file in UTF-16; save it in UTF-8") from None
+    data = data.removeprefix(codecs.BOM_UTF8)
     if not data.strip():
         raise table_error(source, "the file is empty")
-    encoding = "utf-16" if data[:2] in _UTF16 else "utf-8-sig"
     try:
-        text = data.decode(encoding)
+        data.decode()
     except UnicodeDecodeError as error:
         line = data.count(b"\n", 0, error.start) + 1
         raise table_error(
             source, f"not a text file in UTF-8 (line {line}); save it as csv in UTF-8"
         ) from None
-    if "\0" in text:
+    if b"\0" in data:
         raise table_error(source, "a binary file, not a csv; give it the suffix of its kind")
-    if not text.strip():
-        raise table_error(source, "the file is empty")
-    return text
+    return data
 
 
-def parse_text(text: str, source: str) -> RawTable:
+def first_lines(text: bytes) -> list[str]:
+    r"""Return the first lines of a text in UTF-8, as many as its layout is found from.
+
+    Examples
+    --------
+    >>> first_lines(b"x,y\r\n1,2\r\n")
+    ['x,y', '1,2']
+    """
+    parts = text.split(b"\n", _LINES_OF_NUMBERS)[:_LINES_OF_NUMBERS]
+    return b"\n".join(parts).decode().splitlines()
+
+
+def parse_text(text: bytes, source: str) -> RawTable:
     r"""Return the table of a text with one header line, which may begin with #.
 
     Parameters
     ----------
-    text : str
-        Columns separated by commas, semicolons, tabs or blanks; with the last three, numbers may
-        have decimal commas.
+    text : bytes
+        UTF-8; columns separated by commas, semicolons, tabs or blanks; with the last three, numbers
+        may have decimal commas.
     source : str
         The file's name, for messages.
 
@@ -122,41 +141,43 @@ def parse_text(text: str, source: str) -> RawTable:
 
     Examples
     --------
-    >>> raw = parse_text("x;y\n1,5;2\n\n3,25;4\n", "t.csv")
+    >>> raw = parse_text(b"x;y\n1,5;2\n\n3,25;4\n", "t.csv")
     >>> raw.table.index.tolist(), raw.table["x"].tolist()
     ([0, 2], [1.5, 3.25])
     >>> raw.notes
     ('read with semicolons between the columns and decimal commas',)
     """
-    lines = text.splitlines()
-    header = next(i for i, line in enumerate(lines) if line.strip())
+    lines = first_lines(text)
+    header = next((i for i, line in enumerate(lines) if line.strip()), 0)
     comments = header
     while comments < len(lines) and lines[comments].lstrip().startswith("#"):
         comments += 1
-    first = next((i for i in range(comments, len(lines)) if lines[i].strip()), len(lines))
     notes: tuple[str, ...] = ()
     if comments > header:
+        first = next((i for i in range(comments, len(lines)) if lines[i].strip()), comments)
         following = lines[first : first + _LINES_COMPARED]
         layout = layout_of(following, source)
-        named = lines[comments - 1].lstrip("#\t ")
-        is_header = bool(following) and all(map(_is_number, layout.fields(following[0])))
         # numpy.savetxt writes the names of the columns into a comment.
-        header = comments - 1 if is_header else first
-        if is_header:
-            lines[header] = named
+        in_comment = bool(following) and all(map(_is_number, layout.fields(following[0])))
+        header = comments - 1 if in_comment else first
+        lines[header:header] = [lines.pop(header).lstrip("#\t ")] if in_comment else []
         if header > 0:
             notes = (f"line {header + 1} has the names of the columns; those before are comments",)
-    layout = layout_of(lines[header : header + _LINES_OF_NUMBERS], source)
-    if all(map(_is_number, layout.fields(lines[header]))):
+    layout = layout_of(lines[header:], source)
+    names = layout.fields(lines[header])
+    if all(map(_is_number, names)):
         shown = lines[header].strip()[:60]
         unnamed = (
             f"line {header + 1} holds numbers ({shown}) where the names of the columns are "
             "expected; add a header line such as frame,particle,x,y,z, or state the numbers of the "
             "columns, for example columns={'frame': 0, 'particle': 1, 'x': 2, 'y': 3}"
         )
-        table = delimited_table(lines, layout, source, header=header, named=False)
+        table = delimited_table(text, layout, source, header=header - 1, names=None)
         return RawTable(table, notes=layout.notes, unnamed=unnamed, word="line", first=2)
-    table = delimited_table(lines, layout, source, header=header)
+    named = lines[header] if comments else None
+    table = delimited_table(
+        text, layout, source, header=header, names=layout.fields(named) if named else names
+    )
     return RawTable(table, notes=(*layout.notes, *notes), word="line", first=2)
 
 
@@ -215,29 +236,29 @@ def layout_of(lines: Sequence[str], source: str) -> Layout:
 
 
 def delimited_table(
-    lines: Sequence[str],
+    text: bytes,
     layout: Layout,
     source: str,
     *,
     header: int,
     skipped: int = 0,
-    named: bool = True,
+    names: Sequence[str] | None,
 ) -> pd.DataFrame:
-    r"""Return the table that begins at a line.
+    r"""Return the table that begins after a line.
 
     Parameters
     ----------
-    lines : sequence of str
-        All lines of the file.
+    text : bytes
+        UTF-8.
     layout : Layout
     source : str
         The file's name, for messages.
     header : int
-        Index of the header line.
+        Index of the header line; that before the first row where there is none.
     skipped : int
         Number of lines after the header that are no rows.
-    named : bool
-        Whether the header has names; if not, it is a row and the columns have numbers.
+    names : sequence of str, optional
+        Names of the columns in the header; None: the columns have numbers.
 
     Returns
     -------
@@ -251,7 +272,7 @@ def delimited_table(
 
     Examples
     --------
-    >>> delimited_table(["a title", "x,y", "1,2"], Layout(), "t.csv", header=1)
+    >>> delimited_table(b"a title\nx,y\n1,2\n", Layout(), "t.csv", header=1, names=["x", "y"])
        x  y
     1  1  2
     """
@@ -260,13 +281,15 @@ def delimited_table(
     major, minor = (int(part) for part in pd.__version__.split(".")[:2])
     # From pandas 3.1 on floats always read back bit-identical, and the option is deprecated.
     exact = {} if (major, minor) >= (3, 1) else {"float_precision": "round_trip"}
-    body = lines[header + 1 + skipped :] if named else lines[header:]
     try:
         table = pd.read_csv(
-            io.StringIO("\n".join([lines[header], *body] if named else body)),
+            io.BytesIO(text),
             sep=layout.mark,
             decimal=layout.decimal,
-            header=0 if named else None,
+            header=None,
+            names=None if names is None else range(len(names)),
+            skiprows=header + 1 + skipped,
+            encoding="utf-8",
             **exact,
             low_memory=False,
             skip_blank_lines=False,
@@ -274,8 +297,6 @@ def delimited_table(
         )
     except (pd.errors.ParserError, pd.errors.EmptyDataError) as error:
         reason = str(error).strip().removeprefix("Error tokenizing data. C error: ")
-        shift = header + skipped
-        reason = re.sub(r"(?<=\bline )\d+", lambda at: str(int(at[0]) + shift), reason)
         raise table_error(
             source,
             f"not a table with one header line and {_MARKS[layout.mark]} between the columns: "
@@ -286,25 +307,25 @@ def delimited_table(
             source, f"rows have more fields than the header (line {header + 1}) has names"
         )
     empty = np.flatnonzero(table.isna().all(axis=1)).tolist()
-    table = table.drop(index=[i for i in empty if not body[i].strip(" \t,;")])
-    table.index += header + skipped - (0 if named else 1)
-    if named:
-        table.columns = table.columns.astype(str).str.strip()
-        table = _without_equal_columns(table, layout.fields(lines[header]))
-    return table
+    lines = text.decode().splitlines()[header + 1 + skipped :] if empty else []
+    table = table.drop(index=[i for i in empty if not lines[i].strip(" \t,;")])
+    table.index += header + skipped
+    return table if names is None else _with_names(table, names)
 
 
-def _without_equal_columns(table: pd.DataFrame, names: list[str]) -> pd.DataFrame:
-    """Return the table without repeated columns of equal content; others keep their name.
+def _with_names(table: pd.DataFrame, names: Sequence[str]) -> pd.DataFrame:
+    """Return the table with names, but without repeated columns of equal content.
 
     A DataFrame whose index has the name of a column is written with both.
     """
-    repeated = {name for name in names if name and names.count(name) > 1}
-    again = {f"{name}.{k}": name for name in repeated for k in range(1, names.count(name))}
-    again = {column: name for column, name in again.items() if {column, name} <= set(table.columns)}
-    equal = [column for column, name in again.items() if table[column].equals(table[name])]
-    kept = table.drop(columns=equal)
-    return kept.rename(columns={k: name for k, name in again.items() if k not in equal})
+    first: dict[str, int] = {}
+    kept = []
+    for column, name in enumerate(names):
+        again = name and name in first and table[column].equals(table[first[name]])
+        first.setdefault(name, column)
+        if not again:
+            kept.append(column)
+    return table[kept].set_axis([names[column] for column in kept], axis=1)
 
 
 def _is_number(text: str) -> bool:

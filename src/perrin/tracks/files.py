@@ -20,7 +20,7 @@ from perrin.tracks.column_names import (
     stated_units,
     unit_faults,
 )
-from perrin.tracks.delimited import decoded, parse_text
+from perrin.tracks.delimited import parse_text, utf8_text
 from perrin.tracks.formats import LARGEST_EXACT, parse_table, table_bytes, table_suffix
 from perrin.tracks.simulations import is_selection, selection_table
 from perrin.tracks.writing import written_whole
@@ -266,7 +266,7 @@ def read_spheres(path: _PathLike) -> tuple[Floats, Floats | None]:
     array([1. , 1.5])
     """
     source = os.fspath(path)
-    table = parse_text(decoded(Path(path).read_bytes(), source), source).table
+    table = parse_text(utf8_text(Path(path).read_bytes(), source), source).table
     faults = [f"column {name!r} is missing" for name in _AXES if name not in table]
     unknown = [name for name in table if name not in (*_AXES, "radius")]
     if unknown:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from perrin.errors import table_error
-from perrin.tracks.delimited import decoded, parse_text
+from perrin.tracks.delimited import first_lines, parse_text, utf8_text
 from perrin.tracks.gdf import gdf_bytes, parse_gdf
 from perrin.tracks.imaris import imaris_table, is_imaris
 from perrin.tracks.motion_capture import is_motive, motive_table, parse_c3d
@@ -115,10 +115,10 @@ def parse_table(data: bytes, suffix: str, source: str) -> RawTable:
             ) from None
         suffix = suffix.removesuffix(".gz")
     if suffix in (".xyz", ".extxyz"):
-        return parse_xyz(decoded(data, source), source)
+        return parse_xyz(utf8_text(data, source).decode(), source)
     if suffix in _SHEET_SUFFIXES:
         text, note = sheet_text(data, source)
-        raw = text_table(text, source)
+        raw = text_table(text.encode(), source)
         return RawTable(
             raw.table, raw.kind, raw.columns, raw.units, (note, *raw.notes), raw.unnamed, "row", 2
         )
@@ -131,15 +131,16 @@ def parse_table(data: bytes, suffix: str, source: str) -> RawTable:
     }
     if suffix in parsers:
         return parsers[suffix](data, source)
-    return text_table(decoded(data, source), source)
+    return text_table(utf8_text(data, source), source)
 
 
-def text_table(text: str, source: str) -> RawTable:
+def text_table(text: bytes, source: str) -> RawTable:
     r"""Return the table of a text, recognised by its first lines.
 
     Parameters
     ----------
-    text : str
+    text : bytes
+        UTF-8.
     source : str
         The file's name, for messages.
 
@@ -154,17 +155,17 @@ def text_table(text: str, source: str) -> RawTable:
 
     Examples
     --------
-    >>> text_table("track_id,t,z,y,x\n7,0,1,2,3\n", "t.csv").kind
+    >>> text_table(b"track_id,t,z,y,x\n7,0,1,2,3\n", "t.csv").kind
     'a table of tracks as napari takes them'
     """
-    lines = text.splitlines()
+    lines = first_lines(text)
     for recognised, parse in (
         (is_motive, motive_table),
         (is_imaris, imaris_table),
         (is_trackmate, trackmate_table),
     ):
         if recognised(lines):
-            return parse(lines, source)
+            return parse(text, source)
     raw = parse_text(text, source)
     columns = napari_columns(raw.table.columns)
     if not columns:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from perrin.errors import table_error
-from perrin.tracks.delimited import Layout, delimited_table
+from perrin.tracks.delimited import Layout, delimited_table, first_lines
 from perrin.tracks.raw_tables import RawTable, tracked_rows
 
 if TYPE_CHECKING:
@@ -27,13 +27,13 @@ def is_imaris(lines: Sequence[str]) -> bool:
     return _underline(lines) is not None
 
 
-def imaris_table(lines: Sequence[str], source: str) -> RawTable:
-    """Return the positions in a file of statistics.
+def imaris_table(text: bytes, source: str) -> RawTable:
+    r"""Return the positions in a file of statistics.
 
     Parameters
     ----------
-    lines : sequence of str
-        Lines of the file.
+    text : bytes
+        UTF-8.
     source : str
         The file's name, for messages.
 
@@ -50,12 +50,12 @@ def imaris_table(lines: Sequence[str], source: str) -> RawTable:
 
     Examples
     --------
-    >>> lines = ["", "Position", "====================",
-    ...          "Position X,Position Y,Position Z,Unit,Time,TrackID,ID,", "1,2,3,um,1,7,0,"]
-    >>> raw = imaris_table(lines, "Position.csv")
+    >>> text = b"\nPosition\n====\nPosition X,Position Y,Position Z,Unit,Time,TrackID,ID,\n"
+    >>> raw = imaris_table(text + b"1,2,3,um,1,7,0,\n", "Position.csv")
     >>> raw.columns["particle"], raw.units["x"], raw.table.index.tolist()
     ('TrackID', 'um', [3])
     """
+    lines = first_lines(text)
     underline = _underline(lines) or 0
     header = underline + 1
     title = lines[underline - 1].strip(' ",') if underline else ""
@@ -66,7 +66,7 @@ def imaris_table(lines: Sequence[str], source: str) -> RawTable:
             f"the statistic {title or names[:1]} of Imaris; export the statistic Position, which "
             "has the columns Position X, Position Y, Position Z, Time and TrackID",
         )
-    table = delimited_table(lines, Layout(), source, header=header)
+    table = delimited_table(text, Layout(), source, header=header, names=names)
     found = {ours: name for ours, name in _NAMES.items() if name in table}
     particle = next((name for name in ("TrackID", "Parent") if name in table), None)
     notes: tuple[str, ...] = ()

@@ -29,13 +29,13 @@ def is_motive(lines: Sequence[str]) -> bool:
     return lines[0].lstrip('"').startswith("Format Version")
 
 
-def motive_table(lines: Sequence[str], source: str) -> RawTable:
-    """Return the positions of markers in a csv file of Motive, a row per marker and frame.
+def motive_table(text: bytes, source: str) -> RawTable:
+    r"""Return the positions of markers in a csv file of Motive, a row per marker and frame.
 
     Parameters
     ----------
-    lines : sequence of str
-        Lines of the file.
+    text : bytes
+        UTF-8.
     source : str
         The file's name, for messages.
 
@@ -52,10 +52,9 @@ def motive_table(lines: Sequence[str], source: str) -> RawTable:
 
     Examples
     --------
-    >>> lines = ["Format Version,1.23,Length Units,Millimeters", "", ",,Marker,Marker,Marker",
-    ...          ",,a:1,a:1,a:1", ",,Position,Position,Position", "Frame,Time (Seconds),X,Y,Z",
-    ...          "0,0.0,1,2,3"]
-    >>> motive_table(lines, "take.csv").table
+    >>> text = b"Format Version,1.23,Length Units,Millimeters\n\n,,Marker,Marker,Marker\n"
+    >>> text += b",,a:1,a:1,a:1\n,,Position,Position,Position\nFrame,Time (Seconds),X,Y,Z\n"
+    >>> motive_table(text + b"0,0.0,1,2,3\n", "take.csv").table
        Frame  Time (Seconds) Marker  X  Y  Z Body
     4      0             0.0    a:1  1  2  3    a
     """
@@ -63,6 +62,7 @@ def motive_table(lines: Sequence[str], source: str) -> RawTable:
 
     import pandas as pd
 
+    lines = text.decode().splitlines()
     head = next((i for i, line in enumerate(lines) if line.lower().startswith("frame,time")), None)
     if head is None:
         raise table_error(source, "a file of Motive without the line Frame,Time (Seconds),X,Y,Z")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from perrin.errors import table_error
-from perrin.tracks.delimited import Layout, delimited_table
+from perrin.tracks.delimited import Layout, delimited_table, first_lines
 from perrin.tracks.raw_tables import RawTable, tracked_rows, without_flat_z
 
 if TYPE_CHECKING:
@@ -35,13 +35,13 @@ def is_trackmate(lines: Sequence[str]) -> bool:
     return {"POSITION_X", "POSITION_Y", "FRAME"} <= set(Layout().fields(lines[0]))
 
 
-def trackmate_table(lines: Sequence[str], source: str) -> RawTable:
-    """Return a table of spots, without the lines that repeat the header and state units.
+def trackmate_table(text: bytes, source: str) -> RawTable:
+    r"""Return a table of spots, without the lines that repeat the header and state units.
 
     Parameters
     ----------
-    lines : sequence of str
-        Lines of the file.
+    text : bytes
+        UTF-8.
     source : str
         The file's name, for messages.
 
@@ -57,12 +57,12 @@ def trackmate_table(lines: Sequence[str], source: str) -> RawTable:
 
     Examples
     --------
-    >>> lines = ["TRACK_ID,POSITION_X,POSITION_Y,FRAME", "Track ID,X,Y,Frame", "Track ID,X,Y,Frame",
-    ...          ",(micron),(micron),", "3,1.5,2.5,0"]
-    >>> raw = trackmate_table(lines, "spots.csv")
+    >>> text = b"TRACK_ID,POSITION_X,POSITION_Y,FRAME\nTrack ID,X,Y,Frame\nTrack ID,X,Y,Frame\n"
+    >>> raw = trackmate_table(text + b",(micron),(micron),\n3,1.5,2.5,0\n", "spots.csv")
     >>> len(raw.table), raw.units["x"], raw.columns["particle"]
     (1, 'micron', 'TRACK_ID')
     """
+    lines = first_lines(text)
     names = Layout().fields(lines[0])
     extra = 0
     while extra < _MOST_EXTRA_LINES and not _has_numbers(lines, extra + 1, names):
@@ -75,7 +75,7 @@ def trackmate_table(lines: Sequence[str], source: str) -> RawTable:
             for ours, name in _NAMES.items()
             if stated.get(name, "").startswith("(")
         }
-    table = delimited_table(lines, Layout(), source, header=0, skipped=extra)
+    table = delimited_table(text, Layout(), source, header=0, skipped=extra, names=names)
     found = {ours: name for ours, name in _NAMES.items() if name in table}
     if "particle" in found:
         table, notes = tracked_rows(table, found["particle"])
