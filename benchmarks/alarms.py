@@ -47,9 +47,13 @@ import perrin
 # is named when a text matches one of the kinds that it expects, whatever else the text matches.
 KINDS = {
     "not diffusion": r"^not diffusion:",
+    "common motion": r"^common motion:",
     "velocity": r"mean velocity|\bflow\b|centre moves steadily",
     "spin": r"\bspin|mean turn|turns? steadily|steady (turn|rotation)|rad/s\b",
     "hopping": r"another kind of motion|no Brownian motion|not Brownian",
+    "stage": r"^stage jump:",
+    "rings": r"^(ring images|contrast|overlap):",
+    "no sphere": r"not the image of a sphere",
     "jump": r"\bjumps?\b(?! (of|by) the )|Brownian motion cannot",
     "time": r"column '?time|time column|\btimes?\b.*contradict",
     "stride": r"multiples? of \d|every \d+(th|rd|nd)",
@@ -72,6 +76,8 @@ KINDS = {
     "symmetry": r"too far between frames|sample faster",
     "units": r"\bunits?\b|trackpy|outside [\d.]+ (to|-)|per (pixel|unit)|in nm\b|lengths in um",
     "viscosity": r"viscosity.*(water|Pa s)|viscosity .* (is|over|above)",
+    "no cluster": r"^no clusters:|free spheres",
+    "aggregate": r"are no cluster: bodies of over",
     "disagreement": r"do not agree|not agree on one",
     "coarse": r"4 D_R dt",
     "noisy": r"signal-to-noise",

@@ -8,10 +8,13 @@ happen. The base case: four touching tetrahedra of balls 2.45 um, 40 x 128 x 128
 0.2 x 0.2 um, 20 frames 0.73 s apart, D_R 0.0049 rad^2/s, D_T 0.0385 um^2/s, 40 photons over a
 background of 3, gain 3.
 
-Printed for every case: spheres missed and false, the standard deviation of positions and the
-stated error (nm), planted clusters that were found, false ones, orientation errors over the stated
-ones, and D minus that of the true positions at one instant, in its standard errors, with the ratio
-of the standard errors.
+Printed for every movie: spheres missed and false, false ones in clusters, the standard deviation of
+positions and the stated error (nm), their mean squared ratio, planted clusters that were found,
+false ones, orientation errors with their mean squared ratio to the stated ones, and D minus that of
+the true positions at one instant, in its standard errors, with the ratio of the standard errors.
+The true positions are those of frames in which most of a body is in the field. With several movies
+a case ends with means and their Monte-Carlo errors. "bright field" is a 2-D movie of dark-rim
+rings, with and without dark=True: printed are clusters and warnings.
 
 Usage: python benchmarks/microscopes.py [--only NAME] [--movies 1] [--seed 0] [--warnings]
 """
@@ -76,8 +79,8 @@ class Body:
         return self.place + self.turn.apply(self.shape)
 
 
-def scene(kinds, box, *, rng, bright=None, walls=DIAMETER, tries=20000):
-    """Place bodies at random without overlap.
+def scene(kinds, box, *, rng, bright=None, walls=DIAMETER, fixed=(), tries=20000):
+    """Place bodies at random without overlap with each other and with `fixed` bodies.
 
     `kinds` lists numbers of spheres, in order; `bright` has factors of the light of the spheres of
     each body; centres of all spheres keep `walls` from the sides (negative: they may leave).
@@ -88,7 +91,7 @@ def scene(kinds, box, *, rng, bright=None, walls=DIAMETER, tries=20000):
         light = np.ones(kind) if bright is None else np.asarray(bright[i], dtype=float)
         for _ in range(tries):
             body = Body(shape, rng.uniform(walls, box - walls), Rotation.random(rng=rng), light)
-            if allowed(body.spheres(), bodies, None, box, walls):
+            if allowed(body.spheres(), [*bodies, *fixed], box, walls):
                 bodies.append(body)
                 break
         else:
@@ -96,16 +99,18 @@ def scene(kinds, box, *, rng, bright=None, walls=DIAMETER, tries=20000):
     return bodies
 
 
-def allowed(x, bodies, me, box, walls):
-    """Return whether spheres are inside the walls and overlap no sphere of another body."""
+def allowed(x, bodies, box, walls):
+    """Return whether spheres are inside the walls and overlap no sphere of other bodies."""
     if np.any(x < walls) or np.any(x > box - walls):
         return False
-    others = [b.spheres() for b in bodies if b is not me]
+    others = [b.spheres() for b in bodies]
     return not others or cdist(x, np.concatenate(others)).min() >= 1.001 * DIAMETER
 
 
-def diffuse(bodies, times, box, *, rng, walls=DIAMETER, longest=0.1):
+def diffuse(bodies, times, box, *, rng, walls=DIAMETER, fixed=(), longest=0.1):
     """Move all bodies through the times; each body's `path` becomes (len(times), n, 3).
+
+    They do not overlap with each other nor with `fixed` bodies.
 
     D_T and D_R of a body of n spheres are those of a tetrahedron times 4 / n and (4 / n)^2 up to
     the sizes of the shapes; a single sphere has 1.8 D_T.
@@ -113,8 +118,9 @@ def diffuse(bodies, times, box, *, rng, walls=DIAMETER, longest=0.1):
     now = times[0]
     sizes = [len(b.shape) for b in bodies]
     first = np.cumsum([0, *sizes])
-    x = np.concatenate([b.spheres() for b in bodies])
+    x = np.concatenate([b.spheres() for b in (*bodies, *fixed)])
     owner = np.repeat(np.arange(len(bodies)), sizes)
+    owner = np.append(owner, np.full(len(x) - len(owner), -1))
     for t in times:
         steps = max(1, int(np.ceil((t - now) / longest - 1e-9))) if t > now else 0
         for _ in range(steps):
@@ -229,6 +235,35 @@ def recorded(bodies, light, *, n_frames, rng, dust=()):
     return movie
 
 
+def ring_movie(*, n_frames, rng, rim=0.75):
+    """Return a movie (T, 1, y, x) of four planar trimers in bright field, and their paths.
+
+    A sphere is a dark rim, at a share of its radius, with a bright middle on a bright background.
+    """
+    shape = SHAPES[3][:, :2] * DIAMETER
+    field, pixel, size = 40.0, 0.2, 200
+    place = np.array([[10.0, 10.0], [30.0, 10.0], [10.0, 30.0], [30.0, 30.0]])
+    place += rng.uniform(-2, 2, place.shape)
+    turn = rng.uniform(0, 2 * np.pi, 4)
+    paths, movie = [], np.empty((n_frames, 1, size, size), dtype=np.uint8)
+    y, x = np.mgrid[:size, :size] * pixel
+    for i in range(n_frames):
+        cos, sin = np.cos(turn), np.sin(turn)
+        spin = np.stack([np.stack([cos, -sin], -1), np.stack([sin, cos], -1)], -2)
+        spheres = place[:, None] + np.einsum("bij,nj->bni", spin, shape)
+        paths.append(spheres)
+        mean = np.full((size, size), 40.0)
+        for a, b in spheres.reshape(-1, 2):
+            r = np.hypot(x - a, y - b)
+            mean -= 22.0 * np.exp(-(((r - rim * DIAMETER / 2) / 0.25) ** 2) / 2)
+            mean += 8.0 * np.exp(-((r / 0.5) ** 2) / 2)
+        movie[i, 0] = np.clip(3.0 * rng.poisson(np.maximum(mean, 2.0)) + 10.0, 0, 255)
+        place = place + rng.normal(0, np.sqrt(2 * D_T * DT), place.shape)
+        place = np.clip(place, 4.0, field - 4.0)
+        turn = turn + rng.normal(0, np.sqrt(2 * 3 * D_R * DT), 4)
+    return movie, np.array(paths).swapaxes(0, 1)
+
+
 def plane_times(light, n_frames):
     """Return the times at which bodies are needed: of each frame, or of each of its planes."""
     frames = np.arange(n_frames) * DT
@@ -285,12 +320,13 @@ CASES = {
 
 
 def drawn(case, seed):
-    """Return the movie of a case, its bodies, and times (T,) of the middle plane of the frames."""
+    """Return the movie of a case, and its bodies with their paths."""
     rng = np.random.default_rng(seed)
     light = case.light
-    bodies = scene(case.kinds, light.box, rng=rng, bright=case.bright, walls=case.walls)
-    diffuse(bodies, plane_times(light, case.n_frames), light.box, rng=rng, walls=case.walls)
     specks = specks_of(case, rng)
+    where = {"rng": rng, "walls": case.walls, "fixed": specks}
+    bodies = scene(case.kinds, light.box, bright=case.bright, **where)
+    diffuse(bodies, plane_times(light, case.n_frames), light.box, **where)
     per = light.shape[0] if light.plane_time else 1
     for b in (*bodies, *specks):
         b.path[10 * per :, :, 0] += case.jump
@@ -299,16 +335,17 @@ def drawn(case, seed):
 
 
 def specks_of(case, rng):
-    """Return dust: lumps of several balls that overlap, and are brighter than spheres."""
+    """Return dust: lumps of balls that overlap, brighter than spheres, and stuck where they are."""
     specks = []
     for _ in range(case.dust):
         n = int(rng.integers(1, 5))
         spread = rng.uniform(0.1, 0.7) * DIAMETER
         shape = rng.normal(0, spread / 2, (n, 3)) * rng.uniform(0.3, 1.5, 3)
         place = rng.uniform(0, case.light.box)
-        speck = Body(shape, place, Rotation.identity(), rng.uniform(0.3, 2.5, n))
         count = len(plane_times(case.light, case.n_frames))
-        specks.append(replace(speck, path=np.repeat((place + shape)[None], count, axis=0)))
+        path = np.repeat((place + shape)[None], count, axis=0)
+        bright = rng.uniform(0.3, 2.5, n)
+        specks.append(Body(shape, place, Rotation.identity(), bright, path))
     return specks
 
 
@@ -328,10 +365,15 @@ def true_report(bodies, case):
 
     tables, first = [], 0
     for c, body in enumerate(bodies):
-        table = perrin.positions_table(instants(body, case)).assign(cluster=c)
-        table["particle"] += first
+        x = instants(body, case)
+        inside = np.all((x > 0) & (x < case.light.box), axis=2).sum(axis=1)
+        x = x - np.where(np.arange(len(x)) < 10, 0.0, case.jump)[:, None, None] * [1.0, 0.0, 0.0]
+        seen = np.flatnonzero(inside >= min(3, x.shape[1]))
+        if len(seen):
+            table = perrin.positions_table(x[seen], frames=seen).assign(cluster=c)
+            table["particle"] += first
+            tables.append(table)
         first += len(body.shape)
-        tables.append(table)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         return perrin.analyze(pd.concat(tables, ignore_index=True), dt=DT)
@@ -356,81 +398,183 @@ def main():
     args = parser.parse_args()
     for name, case in CASES.items():
         if args.only in name:
+            rows = []
             for seed in range(args.seed, args.seed + args.movies):
-                begun = time.process_time()
-                movie, bodies = drawn(case, seed)
-                print(name, seed, f"drawn in {time.process_time() - begun:.1f} s", flush=True)
-                begun = time.process_time()
-                try:
-                    report = analysed(movie, case)
-                except Exception as error:  # a refusal is a result here
-                    print(f"  refused: {error}")
-                    continue
-                print_case(report, bodies, case, seconds=time.process_time() - begun)
-                if args.warnings:
-                    for text in report.warnings:
-                        print("   !", text[:300])
+                rows += run_movie(name, case, seed, told=args.warnings)
+            if args.movies > 1:
+                print_summary(name, rows, args.movies)
+    if args.only in "bright field":
+        for seed in range(args.seed, args.seed + args.movies):
+            for dark in (True, False):
+                run_rings(seed, dark=dark)
+
+
+def run_movie(name, case, seed, *, told):
+    """Print the results of one movie, and return a list of its numbers; [] if it is refused."""
+    begun = time.process_time()
+    movie, bodies = drawn(case, seed)
+    print(name, seed, f"drawn in {time.process_time() - begun:.1f} s", flush=True)
+    begun = time.process_time()
+    try:
+        report = analysed(movie, case)
+    except Exception as error:  # a refusal is a result here
+        print(f"  refused: {error}")
+        return []
+    row = print_case(report, bodies, case, seconds=time.process_time() - begun)
+    for text in report.warnings if told else []:
+        print("   !", text[:300])
+    return [row]
+
+
+def run_rings(seed, *, dark):
+    """Print clusters and warnings of a bright-field movie of rings."""
+    import perrin
+
+    movie, _ = ring_movie(n_frames=40, rng=np.random.default_rng(seed))
+    stack = perrin.open_stack(movie, voxel=(0.2, 0.2), dt=DT)
+    print("bright field", seed, "with dark=True" if dark else "without dark", flush=True)
+    try:
+        report = perrin.analyze_stack(stack, diameter=DIAMETER, contact=DIAMETER, dark=dark)
+    except Exception as error:  # a refusal is a result here
+        print(f"  refused: {error}")
+        return
+    print(f"  {len(report.imaging.features)} of 480 spheres, {len(report.clusters)} of 4 clusters")
+    for text in report.warnings:
+        print("   !", text[:120])
+
+
+def print_summary(name, rows, count):
+    """Print means over movies, with their Monte-Carlo errors."""
+    print(f"{name}: means of {len(rows)} of {count} movies")
+    for key in dict.fromkeys(k for row in rows for k in row):
+        values = np.array([row[key] for row in rows if key in row and np.isfinite(row[key])])
+        if len(values) > 1:
+            print(f"  {key} {values.mean():.3f} +- {values.std(ddof=1) / len(values) ** 0.5:.3f}")
+
+
+def places_in(bodies, case, frame):
+    """Return the true positions (n, 3) of all spheres when they are recorded, and their light."""
+    places, light, per = [], [], case.light.shape[0]
+    for b in bodies:
+        for j in range(len(b.shape)):
+            if case.light.plane_time:
+                # The instant at which the scan reaches the sphere.
+                own = b.path[frame * per : (frame + 1) * per, j]
+                heights = np.arange(per) * case.light.voxel[0]
+                places.append(own[np.abs(own[:, 2] - heights).argmin()])
+            else:
+                places.append(b.path[frame, j])
+            light.append(b.bright[j])
+    return np.array(places), np.array(light)
+
+
+def place_errors(report, bodies, case):
+    """Return the errors (k, 3) of places, the stated ones, and counts.
+
+    The counts are those of the spheres in the field, of missed and of false ones, and of false ones
+    in clusters. What the fits found to be no sphere is not used.
+    """
+    x, stated, counts = [np.empty((0, 3))], [np.empty((0, 3))], np.zeros(4, dtype=int)
+    table = report.imaging.features
+    if "refined" in table:
+        table = table[table["refined"] | table["chi2"].isna()]
+    for i in range(case.n_frames):
+        part = table[table["frame"] == i]
+        places, light = places_in(bodies, case, i)
+        inside = np.all((places > 0) & (places < case.light.box), axis=1) & (light > 0)
+        away = cdist(part[["x", "y", "z"]].to_numpy(), places)
+        good = away.min(axis=1) < DIAMETER / 4
+        met = away.min(axis=0, initial=np.inf) <= DIAMETER / 4
+        owned = (part["cluster"] >= 0).to_numpy()
+        counts += [inside.sum(), (inside & ~met).sum(), (~good).sum(), (owned & ~good).sum()]
+        x.append((part[["x", "y", "z"]].to_numpy() - places[away.argmin(axis=1)])[good])
+        stated.append(part.loc[good, ["sigma_x", "sigma_y", "sigma_z"]].to_numpy())
+    return np.concatenate(x), np.concatenate(stated), counts.tolist()
 
 
 def print_case(report, bodies, case, *, seconds):
-    """Print how a report compares with the truth."""
-    rigid = [b for b in bodies if len(b.shape) >= 3]
-    x, stated, missed, false, n = [], [], 0, 0, 0
-    per = case.light.shape[0]
-    for i, part in report.imaging.features.groupby("frame"):
-        places, light = [], []
-        found = part[["x", "y", "z"]].to_numpy()
-        for b in bodies:
-            for j in range(len(b.shape)):
-                if case.light.plane_time:
-                    # The instant at which the scan reaches the sphere.
-                    own = b.path[i * per : (i + 1) * per, j]
-                    heights = np.arange(per) * case.light.voxel[0]
-                    places.append(own[np.abs(own[:, 2] - heights).argmin()])
-                else:
-                    places.append(b.path[i, j])
-                light.append(b.bright[j])
-        places, light = np.array(places), np.array(light)
-        inside = np.all((places > 0) & (places < case.light.box), axis=1) & (light > 0)
-        away = cdist(found, places)
-        good = away.min(axis=1) < DIAMETER / 4
-        false += int((~good).sum())
-        missed += int((away.min(axis=0)[inside] > DIAMETER / 4).sum())
-        n += int(inside.sum())
-        x.append((found - places[away.argmin(axis=1)])[good])
-        stated.append(part.loc[good, ["sigma_x", "sigma_y", "sigma_z"]].to_numpy())
-    error = np.concatenate(x)
-    sd = 1e3 * np.sqrt(np.mean((error - np.median(error, axis=0)) ** 2, axis=0))
-    said = 1e3 * np.sqrt(np.nanmedian(np.concatenate(stated) ** 2, axis=0))
-    print(f"  {n} spheres: {missed} missed, {false} false; sd {sd.round(1)}, stated", end=" ")
-    print(f"{said.round(1)} nm; {seconds:.1f} s")
+    """Print how a report compares with the truth, and return the numbers of the summary."""
+    rigid = [b for b in bodies if len(b.shape) >= 2]
+    error, stated, (n, missed, false, owned) = place_errors(report, bodies, case)
+    off = error - np.median(error, axis=0)
+    sd, said = (
+        1e3 * np.sqrt(np.mean(off**2, axis=0)),
+        1e3 * np.sqrt(np.nanmedian(stated**2, axis=0)),
+    )
+    row = {"missed": missed / n, "false": false / n, "false in clusters": owned / n}
+    row |= {"place (error/stated)^2": float(np.nanmean((off / stated) ** 2)), "seconds": seconds}
+    print(f"  {n} spheres: {missed} missed, {false} false ({owned} in clusters);", end=" ")
+    print(f"sd {sd.round(1)}, stated {said.round(1)} nm; {seconds:.1f} s")
+    print_singles(report, [b for b in bodies if len(b.shape) == 1], case)
     if not rigid:
         print(f"  no body was planted; {len(report.clusters)} clusters, {len(report.rods)} rods")
-        return
+        return row | {"false clusters": len(report.clusters)}
     true = true_report(rigid, case)
     pairs, others = matched(report, rigid, case)
     sizes = [len(rigid[c].shape) for c in pairs]
+    row |= {"clusters found": len(pairs) / len(rigid), "false clusters": len(others)}
     print(f"  clusters: {len(pairs)} of {len(rigid)} found (sizes {sizes}),", end=" ")
     print(f"{len(others)} false, {len(report.rods)} rods")
-    turns = [turn_errors(result, rigid[c], case) for c, result in pairs.items()]
+    turns = [
+        turn_errors(result, rigid[c], case)
+        for c, result in pairs.items()
+        if len(rigid[c].shape) > 2
+    ]
     if turns:
-        print(f"  turn errors {np.sqrt(np.mean(np.concatenate(turns) ** 2, axis=0)).round(1)} mrad")
-    known = {r.cluster: r for r in true.clusters}
+        turn, square = (np.concatenate(part) for part in zip(*turns, strict=True))
+        row["turn (error/stated)^2"] = float(np.mean(square))
+        print(f"  turn errors {np.sqrt(np.mean(turn**2, axis=0)).round(1)} mrad,", end=" ")
+        print(f"(error/stated)^2 {np.mean(square):.2f}, median {np.median(square):.2f}")
+    known = {r.cluster: r for r in true.results}
     for c, result in pairs.items():
         if c in known:
-            print(f"  body {c}:", compared(result, known[c]))
+            print(f"  body {c}:", compared(result, known[c])[0])
     if report.pooled is not None and true.pooled is not None:
-        print("  pooled:", compared(report.pooled, true.pooled))
+        text, numbers = compared(report.pooled, true.pooled)
+        print("  pooled:", text)
+        row |= numbers
+    for kind in report.kinds:
+        for other in true.kinds:
+            if (kind.size, kind.point_group) == (other.size, other.point_group):
+                print(f"  {kind.name} ({len(kind.clusters)}):", end=" ")
+                print(compared_values(dict(kind.coefficients), dict(other.coefficients))[0])
+    return row
+
+
+def print_singles(report, singles, case):
+    """Print D_T of single spheres against that of their true positions."""
+    import pandas as pd
+
+    from perrin import Noise
+    from perrin.run.experiment import Recording
+    from perrin.run.singles import measure_singles
+
+    if not singles or report.singles is None:
+        return
+    x = np.concatenate([instants(b, case)[:, 0] for b in singles])
+    table = pd.DataFrame(x, columns=["x", "y", "z"])
+    frame, particle = np.indices((case.n_frames, len(singles)))
+    table = table.assign(frame=frame.T.ravel(), particle=particle.T.ravel())
+    true = measure_singles(table, Noise(), Recording(dt=DT))
+    one = compared_values({"D_T": report.singles.D_T}, {"D_T": true.D_T})
+    print(f"  single spheres ({report.singles.n_tracks} tracks of {len(singles)}):", one[0])
 
 
 def compared(found, true):
     """Return D_R and D_T against the truth in its standard errors, and the ratio of errors."""
-    texts = []
-    for name in ("D_R", "D_T"):
-        one, other = getattr(found, name), getattr(true, name)
+    names = [name for name in ("D_R", "D_perp", "D_T") if getattr(found, name, None) is not None]
+    return compared_values(*({name: getattr(one, name) for name in names} for one in (found, true)))
+
+
+def compared_values(found, true):
+    """Return the comparison of each coefficient, by name, with the true one, and its numbers."""
+    texts, numbers = [], {}
+    for name in found:
+        one, other = found[name], true[name]
         off, ratio = (one.value - other.value) / other.stderr, one.stderr / other.stderr
         texts.append(f"{name} {one.value:.5f} ({off:+.2f} errors, error x {ratio:.2f})")
-    return "; ".join(texts)
+        numbers |= {f"{name} off (errors)": off, f"{name} error ratio": ratio}
+    return "; ".join(texts), numbers
 
 
 def rows_of(result):
@@ -441,7 +585,7 @@ def rows_of(result):
 def matched(report, bodies, case):
     """Return {planted body: result} and the results that are no planted body."""
     pairs, others = {}, []
-    for result in report.clusters:
+    for result in report.results:
         rows = rows_of(result)
         away = [
             np.nanmedian(
@@ -458,7 +602,10 @@ def matched(report, bodies, case):
 
 
 def turn_errors(result, body, case):
-    """Return errors (T, 3) of the orientation against the true one at the middle plane, mrad."""
+    """Return errors (T, 3) of the orientation against the true one at the middle plane, mrad.
+
+    Also the mean squared ratios (T,) of these errors to the stated ones, of three components.
+    """
     rows = rows_of(result)
     x = instants(body, case)
     shape = body.shape - body.shape.mean(axis=0)
@@ -468,7 +615,11 @@ def turn_errors(result, body, case):
     fitted = np.isfinite(result.motion.rotation).all(axis=(1, 2))
     apart = true[fitted].inv() * Rotation.from_matrix(result.motion.rotation[fitted])
     mean = apart.mean()
-    return 1e3 * (apart * mean.inv()).as_rotvec()
+    error = (apart * mean.inv()).as_rotvec()
+    axes = mean.as_matrix()
+    stated = axes @ result.motion.covariance[fitted] @ axes.T
+    square = np.einsum("ti,tij,tj->t", error, np.linalg.pinv(stated), error) / 3
+    return 1e3 * error, square
 
 
 if __name__ == "__main__":

@@ -120,7 +120,7 @@ def test_demo_prints_a_short_table(demo):
         "viscosity (mPa s)", "0.00672", "0.0453", "pull -", "Planted in the simulation",
     ):  # fmt: skip
         assert words in demo[1]
-    assert len(demo[1].splitlines()) < 28
+    assert len(demo[1].splitlines()) < 29
 
 
 def test_demo_writes_a_whole_run_folder(demo):
@@ -140,7 +140,7 @@ def test_summary_has_the_promised_form(demo):
     assert "NaN" not in text
     assert "Infinity" not in text
     summary = json.loads(text)
-    assert set(summary) == {"clusters", "pooled", "warnings", "notes"}
+    assert set(summary) == {"clusters", "pooled", "kinds", "singles", "warnings", "notes"}
     assert {"D_R", "D_T", "p_same"} <= set(summary["pooled"])
     (cluster,) = summary["clusters"]
     assert {

@@ -8,6 +8,7 @@ from scipy.stats import multivariate_normal
 
 from perrin import Cluster, add_noise, simulate_motion, track_rotation
 from perrin.diffusion.likelihood import Likelihood
+from perrin.diffusion.noise_model import Noise
 from perrin.diffusion.step_kernels import SineModes, TridiagonalCovariance
 from perrin.diffusion.steps import NoisySteps, steps_of
 
@@ -265,7 +266,7 @@ def test_maximum_and_intervals_are_those_of_a_brute_force_profile(mode, seed, n_
     grid = likelihood.scale[0] * np.geomspace(1e-4, 10, repeats(15, 40))
     assert max(brute(many, D) for D in grid) <= top + 1e-6
     for drop in (0.98894, 3.84146):
-        ((low, high),) = likelihood.intervals(best, [drop])
+        low, high = (float(end[0, 0]) for end in likelihood.intervals(best, np.array([[drop]])))
         assert brute(many, high) == pytest.approx(top - drop / 2, abs=1e-4)
         if low > 0:
             assert brute(many, low) == pytest.approx(top - drop / 2, abs=1e-4)
@@ -284,3 +285,22 @@ def test_apart_finds_the_maximum_of_every_motion():
         alone = Likelihood.of([track]).best()
         assert together.D[i] == pytest.approx(alone.D[0], rel=1e-9)
         assert together.value[i] == pytest.approx(alone.value[0], rel=1e-9)
+
+
+@pytest.mark.parametrize("quantity", ["rotation", "translation"])
+def test_the_restricted_likelihood_is_the_same_in_sine_modes_and_in_bands(quantity):
+    """With a free steady motion both kernels agree in value and in all slopes."""
+    truth = simulate_motion(
+        Cluster.tetrahedron(1.5), D_R=5e-3, D_T=0.02, dt=0.7, n_frames=40, rng=3
+    )
+    track = NoisySteps.of(steps_of(truth, quantity), Noise(drift=True))
+    D, theta = np.array([2e-3, 6e-3])[:, None], np.array([1e-3, 4e-4])[:, None]
+    modes, bands = (kernel.of([track], [0]) for kernel in (SineModes, TridiagonalCovariance))
+    found, expected = modes.sums(D, theta), bands.sums(D, theta)
+    np.testing.assert_allclose(np.diff(found.value[:, 0]), np.diff(expected.value[:, 0]), rtol=1e-9)
+    for one, other in zip(found[1:], expected[1:], strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-8)
+    for one, other in zip(
+        modes.steady_motion(D[0], theta[0]), bands.steady_motion(D[0], theta[0]), strict=True
+    ):
+        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-15)

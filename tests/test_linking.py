@@ -151,3 +151,26 @@ def test_groups_stop_growing_at_their_size():
     x = np.array([[0.0, 0], [1.0, 0], [2.2, 0], [3.2, 0], [9.0, 0]])
     assert touching_groups(x, reach=1.3, size=2, smallest=2).tolist() == [0, 0, 1, 1, -1]
     assert touching_groups(x, reach=1.3, size=4, smallest=2).tolist() == [0, 0, 0, 0, -1]
+
+
+@pytest.mark.parametrize("jump", [1.2, 2.0, 5.0])
+def test_a_jump_of_the_stage_ends_no_track(jump):
+    """All clusters displaced at once keep their tracks, forwards and backwards in time."""
+    rng = np.random.default_rng(3)
+    places = [track(rng, 20) + np.array([9.0 * k, 0, 0]) for k in range(4)]
+    for x in places:
+        x[10:] += jump * np.array([0.6, 0.8, 0.0])
+    for order in (1, -1):
+        found = perrin.identify(raw([x[::order] for x in places], rng), contact=DIAMETER, size=4)
+        assert wrong(found) == 0
+        assert (found["cluster"] >= 0).all()
+        assert found.groupby("body")["cluster"].nunique().eq(1).all()
+
+
+def test_one_cluster_that_jumps_is_no_stage():
+    """The others keep their tracks, and it gets a new one."""
+    rng = np.random.default_rng(3)
+    places = [track(rng, 20) + np.array([12.0 * k, 0, 0]) for k in range(4)]
+    places[0][10:] -= [0.0, 5.0, 0.0]
+    found = perrin.identify(raw(places, rng), contact=DIAMETER, size=4)
+    assert found.groupby("body")["cluster"].nunique().tolist() == [2, 1, 1, 1]

@@ -14,10 +14,20 @@ from scipy.spatial.distance import cdist
 import perrin
 from perrin.geometry.rotations import exp_map, log_map
 from perrin.images.optics.ball_image import sphere_image
+from perrin.images.optics.learn import UsualImage
 from perrin.images.optics.optics import CameraNoise
 from perrin.images.optics.window_fit import FreeCenters, RigidCenters, cut_window, fit_window
-from perrin.images.spheres.localisation import Search, choose_method, sample_frames
-from perrin.images.spheres.spots import Spots, mass_cut
+from perrin.images.spheres.by_trackpy import Features
+from perrin.images.spheres.localisation import (
+    NO_SPHERE,
+    Method,
+    Search,
+    choose_method,
+    group_columns,
+    sample_frames,
+    with_crowds,
+)
+from perrin.images.spheres.spots import Fading, Spots, find_fading, mass_cut
 
 pytest.importorskip("trackpy")
 
@@ -308,3 +318,88 @@ def test_optics_noise_and_spots_survive_json(learned):
         assert type(original).from_dict(entry) == original
     # The keys and the nesting are those of earlier run folders.
     assert json.loads(json.dumps(asdict(learned))) == learned.to_dict()
+
+
+def test_the_mass_cut_follows_bleaching_and_depth():
+    """Brightness that falls exponentially in time and depth comes back, in any unit of it."""
+    rng = np.random.default_rng(0)
+    frames, spots = [0, 5, 10, 15, 19], []
+    for i in frames:
+        z = rng.uniform(0, 10, 16)
+        spheres = 3e4 * 0.05 ** (i / 19) * np.exp(-0.08 * z) * rng.uniform(0.95, 1.05, 16)
+        centers = np.zeros((56, 3))
+        centers[:16, 0] = z
+        spots.append(Features(centers, np.append(spheres, rng.uniform(10, 300, 40))))
+    found = find_fading(frames, spots)
+    assert found.at(19, np.array([[found.depth, 0, 0]]))[0] == pytest.approx(0.05, rel=0.1)
+    assert found.per_depth == pytest.approx(-0.08, abs=0.02)
+    louder = find_fading(frames, [Features(s.centers, 7.0 * s.mass) for s in spots])
+    assert louder.light == pytest.approx(found.light)
+    assert Fading.from_dict(json.loads(json.dumps(found.to_dict()))) == found
+    same = [Features(s.centers, np.where(s.mass > 300, 2e4, s.mass)) for s in spots]
+    assert find_fading(frames, same) is None
+
+
+def drawn(centers, brightness, rng, shape=(44, 64, 64)):
+    """Return a frame of balls by the model of the image, with the noise of a camera."""
+    image, unit = sphere_image(diameter=DIAMETER, psf=PSF, voxel=VOXEL), np.zeros(shape)
+    for center, bright in zip(centers, brightness, strict=True):
+        spot = image.spot(np.asarray(center), shape)
+        unit[spot.box] += bright * spot.value
+    return recorded(unit, rng)
+
+
+USUAL = UsualImage(1.0, 120.0, 0.0)
+OPTICS = perrin.Optics(DIAMETER, PSF, CameraNoise(GAIN, READ**2 + 1 / 12))
+
+
+def test_spheres_that_touch_dust_keep_their_errors_and_the_dust_is_named():
+    """A bright lump and a rod at a dimer are no spheres; the dimer is found as without them."""
+    rng = np.random.default_rng(1)
+    dimer = np.array([[5.0, 6.0, 5.0], [5.0, 6.0, 7.45]])
+    dust = np.array([[5.0, 6.0, 9.9], [5.0, 6.6, 10.7], [5.0, 8.6, 4.0], [5.0, 9.7, 4.6]])
+    frame = drawn(np.concatenate([dimer, dust]), [1, 1, 0.9, 0.9, 0.8, 0.8], rng)
+    spots = Features(np.concatenate([dimer, dust[[0, 2]]]) + 0.05, np.full(4, 3e4))
+    columns, _ = group_columns(frame, spots, Search(DIAMETER, DIAMETER), OPTICS, VOXEL, usual=USUAL)
+    assert columns["reason"].tolist() == ["", "", NO_SPHERE, NO_SPHERE]
+    x = np.stack([columns[a][:2] for a in "zyx"], axis=1)
+    sigma = np.stack([columns[f"sigma_{a}"][:2] for a in "zyx"], axis=1)
+    assert np.all(np.abs(x - dimer) < 4 * sigma)
+
+
+def test_a_sphere_beyond_the_border_does_not_bias_its_neighbour():
+    """Its image is fitted too: errors are those stated, not several times as large."""
+    rng = np.random.default_rng(2)
+    pair = np.array([[1.4, 6.0, 6.0], [-0.8, 6.0, 7.08]])
+    frame = drawn(pair, [1, 1], rng)
+    spots, search = Features(pair[:1] + 0.05, np.array([3e4])), Search(DIAMETER, DIAMETER)
+    search = replace(search, crowds=True)
+    plain, none = group_columns(frame, spots, search, OPTICS, VOXEL)
+    assert not none
+    columns, crowds = group_columns(frame, spots, search, OPTICS, VOXEL, usual=USUAL)
+    columns = with_crowds(columns, frame, spots, search, VOXEL, crowds=crowds, usual=USUAL)
+    assert columns["refined"].tolist() == [True]
+    off, biased = (
+        max(
+            abs(c[a][0] - true) / c[f"sigma_{a}"][0] for a, true in zip("zyx", pair[0], strict=True)
+        )
+        for c in (columns, plain)
+    )
+    assert off < 4 < biased
+
+
+def test_a_method_learns_from_spheres_and_not_from_dust():
+    """A lump among the groups leaves diameter, blur and gain as they are."""
+    rng = np.random.default_rng(3)
+    spheres = np.array([[5.0, y, x] for y in (3.0, 9.5) for x in (3.0, 9.5)])
+    lumps = np.array([[5.0, 3.0, 16.0]])
+    centers = np.concatenate([spheres, lumps, lumps + np.array([0.8, 1.1, 0.5])])
+    frame = drawn(centers, [1] * 4 + [0.9] * 2, rng, shape=(44, 64, 96))
+    movie = Movie([frame])
+    search = Search(DIAMETER, DIAMETER)
+    method = choose_method(movie, search, sample_frames(movie, search, [0]))
+    assert isinstance(method, Method)
+    assert method.usual.left_out == 1
+    assert method.optics.diameter == pytest.approx(DIAMETER, abs=0.02)
+    assert method.optics.noise.gain == pytest.approx(GAIN, rel=0.1)
+    assert method.usual.brightness == pytest.approx(120.0, rel=0.03)

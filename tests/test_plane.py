@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import perrin
+from perrin.movie.checks import overlapping_places, ring_images
 
 pytest.importorskip("trackpy")
 
@@ -110,3 +111,27 @@ def test_stuck_beads_are_a_body_at_rest():
     allowed = motion.sigma / np.linalg.norm(motion.template)
     assert np.std(angle, ddof=1) < allowed * (1 + 3 / np.sqrt(8))
     assert np.std(angle, ddof=1) > allowed * (1 - 2.5 / np.sqrt(8))
+
+
+def test_discs_are_no_rings_and_rings_are_named():
+    """No false alarm for discs of either contrast; rings of either contrast are named."""
+    rng = np.random.default_rng(5)
+    y, x = np.mgrid[:100, :100] * PIXEL
+    for shape in ("disc", "ring"):
+        images, places = [], []
+        for _ in range(6):
+            at = np.array([[2.5, 2.5], [3.5, 2.5], [7.0, 7.0]]) + rng.uniform(-0.5, 0.5, 2)
+            r = np.hypot(x[..., None] - at[:, 0], y[..., None] - at[:, 1])
+            part = 1 / (1 + np.exp((r - 0.5) / 0.05))
+            part = part if shape == "disc" else np.exp(-(((r - 0.38) / 0.1) ** 2))
+            images.append(100 + 40 * part.sum(axis=2) + rng.normal(0, 3, x.shape))
+            places.append(at)
+        for dark in (False, True):
+            signed = [200 - image if dark else image for image in images]
+            given = {"pixel": (PIXEL, PIXEL), "diameter": 1.0}
+            named = ring_images(signed, places, dark=dark, **given).warnings
+            assert bool(named) == (shape == "ring")
+            other = ring_images(signed, places, dark=not dark, **given).warnings
+            assert other
+            assert other[0].startswith("contrast:")
+        assert not overlapping_places(places, contact=1.0).warnings

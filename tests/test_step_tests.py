@@ -4,11 +4,18 @@ import json
 from dataclasses import fields, replace
 
 import numpy as np
+import pandas as pd
 import pytest
 from scipy.spatial.transform import Rotation
 
 import perrin
-from perrin.diffusion.step_tests import cut_at, find_jumps, steady_motion
+from perrin.diffusion.step_tests import (
+    StageJumps,
+    cut_at,
+    find_jumps,
+    find_stage_jumps,
+    steady_motion,
+)
 from perrin.motion.tracking import track_rotation
 
 DT = 0.73
@@ -247,3 +254,68 @@ def test_jumps_and_steady_motions_come_back_from_json():
             assert np.size(expected) == 0 or np.shape(value) == np.shape(expected)
             np.testing.assert_equal(np.ravel(value), np.ravel(expected))
     assert jumps.rows.tolist() == [30]
+
+
+def together(jump, *, frames=24, bodies=4, seed=0):
+    """Return the motions of bodies, of which all are displaced by `jump` from row 10 on."""
+    motions = []
+    for k in range(bodies):
+        x = brownian(100 * seed + k, frames=frames, D_T=0.0385) + 9.0 * k
+        x[10:] += jump
+        motions.append(track_rotation(x, dt=DT))
+    return motions, [np.arange(frames)] * bodies
+
+
+def test_a_jump_of_the_stage_is_found_and_measured():
+    """A common step of 5 standard deviations of one body; reversed time gives the opposite one."""
+    jump = np.array([1.0, -0.7, 0.2])
+    motions, frames = together(jump)
+    found = find_stage_jumps(motions, frames)
+    assert found.frames.tolist() == [10]
+    assert found.bodies.tolist() == [4]
+    assert np.all(np.abs(found.size[0] - jump) < 4 * found.stderr[0])
+    # The mean of four steps of variance 2 D dt, known to the error of that D.
+    assert found.stderr[0] == pytest.approx(np.sqrt(2 * 0.0385 * DT / 4), rel=0.3)
+    back = [replace(m, center=m.center[::-1]) for m in motions]
+    turned_back = find_stage_jumps(back, frames)
+    assert turned_back.frames.tolist() == [14]
+    assert turned_back.size == pytest.approx(-found.size)
+    again = StageJumps.from_dict(json.loads(json.dumps(found.to_dict())))
+    assert all(
+        np.array_equal(getattr(again, f.name), getattr(found, f.name)) for f in fields(found)
+    )
+
+
+def test_diffusion_drift_and_one_body_are_no_jumps_of_the_stage(repeats):
+    """No false alarm where nothing jumps, all drift, or one of the bodies jumps alone."""
+    for seed in range(repeats(3, 30)):
+        motions, frames = together(0.0, seed=seed + 1)
+        assert not find_stage_jumps(motions, frames).frames.size
+        flow = np.outer(np.arange(24), [0.1, 0.0, 0.0])
+        drifting = [replace(m, center=m.center + flow) for m in motions]
+        assert not find_stage_jumps(drifting, frames).frames.size
+        alone = motions[0].center + np.where(np.arange(24) < 10, 0.0, 4.0)[:, None]
+        one = [replace(motions[0], center=alone), *motions[1:]]
+        assert not find_stage_jumps(one, frames).frames.size
+    assert not find_stage_jumps(motions[:1], frames[:1]).frames.size
+
+
+def test_a_table_leaves_the_jump_of_the_stage_out_of_the_translation():
+    """D_T is that without the step, D_R keeps all frames, and the report names the jump."""
+    still, moved = (
+        perrin.analyze(
+            pd.concat(
+                perrin.positions_table(x, frames=np.arange(5, 29)).assign(cluster=k)
+                for k, x in enumerate(m.positions() for m in together(jump, bodies=2)[0])
+            ),
+            dt=DT,
+        )
+        for jump in (0.0, 1.6)
+    )
+    assert [w for w in still.warnings if "stage" in w] == []
+    (named,) = [w for w in moved.warnings if w.startswith("stage jump:")]
+    assert "at frame 15" in named
+    for one, other in zip(moved.clusters, still.clusters, strict=True):
+        assert one.D_R.value == pytest.approx(other.D_R.value, rel=1e-9)
+        assert one.jumps["translation"] == (10,)
+    assert abs(moved.pooled.D_T.value / still.pooled.D_T.value - 1) < 0.2

@@ -129,6 +129,27 @@ def test_the_likelihood_is_the_normal_density(b, r, how):
             np.testing.assert_allclose(one, other, rtol=1e-11, atol=1e-11)
 
 
+@pytest.mark.parametrize("r", [1, 2])
+def test_chains_along_common_axes_are_the_blocks(r):
+    """Where frames are equally noisy both kernels agree in value, slopes and information."""
+    steps = steps_of(1, 3, r, pieces=True)
+    same = np.broadcast_to(steps.noise[:, :1], steps.noise.shape).copy()
+    source = noisy(dataclasses.replace(steps, noise=same))
+    rng = np.random.default_rng(2)
+    D, theta, B = spd(rng, 3), rng.uniform(0.2, 0.5, r), 0.1
+    blocks, chains = source.by_bands(D, theta, B), source.chain_track.at(D, theta, B)
+    for one, other in zip(source.chain_track.slopes(D, B, chains), blocks, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-10, atol=1e-10)
+    E = np.stack([spd(rng, 3), spd(rng, 3)])
+    np.testing.assert_allclose(
+        source.chain_track.curvatures(E, D, B, chains),
+        source.band_curvatures(E, D, theta, B),
+        rtol=1e-10,
+        atol=1e-10,
+    )
+    assert noisy(steps).chain_track is None
+
+
 @pytest.mark.parametrize("how", [{"even": True}, {"pieces": True}])
 def test_the_slopes_are_those_of_the_likelihood(how):
     """Derivatives by D, by the noise and by the blur equal central differences."""

@@ -132,12 +132,14 @@ if TYPE_CHECKING:
     from perrin.movie import Work, analyze_stack
     from perrin.report import write_run
     from perrin.run import (
+        BodyKind,
         ClusterResult,
         Compared,
         Experiment,
         Prediction,
         Report,
         RodResult,
+        SingleSpheres,
         analyze,
         load_run,
         napari_layers,
@@ -157,6 +159,7 @@ __version__ = "0.1.0"
 
 __all__ = [
     "AnomalousEstimate",
+    "BodyKind",
     "Camera",
     "Cluster",
     "ClusterResult",
@@ -200,6 +203,7 @@ __all__ = [
     "SamplingVerdict",
     "Scan",
     "Similarity",
+    "SingleSpheres",
     "Size",
     "Spin",
     "Spots",
@@ -413,12 +417,14 @@ _FACES = {
         "write_stack",
     ),
     "run": (
+        "BodyKind",
         "ClusterResult",
         "Compared",
         "Experiment",
         "Prediction",
         "Report",
         "RodResult",
+        "SingleSpheres",
         "analyze",
         "load_run",
         "napari_layers",

@@ -42,6 +42,7 @@ from perrin.cli.options import (
 from perrin.cli.progress import progress_lines, shown_progress
 from perrin.cli.tables import (
     cluster_table,
+    kinds_table,
     pooled_table,
     show_diagnosis,
     show_json,
@@ -49,6 +50,7 @@ from perrin.cli.tables import (
     show_prediction,
     show_remarks,
     show_report,
+    terms_of,
 )
 
 __all__ = [
@@ -67,6 +69,7 @@ __all__ = [
     "figure_font",
     "in_options",
     "installed",
+    "kinds_table",
     "main",
     "messages_of",
     "optional_readers",
@@ -99,6 +102,7 @@ __all__ = [
     "spheres_of",
     "state_kept_frames",
     "take_config",
+    "terms_of",
     "warnings_in_one_line",
     "write_config",
 ]

@@ -13,12 +13,15 @@ from perrin.diffusion.estimate import CHI2, DiffusionEstimate, Found
 from perrin.diffusion.likelihood import Likelihood, excess_scatter
 from perrin.diffusion.moments import covariance_estimate, trace_estimate
 from perrin.diffusion.noise_model import Noise, noise_faults
-from perrin.diffusion.steps import NoisySteps, Quantity, Steps, pooled_steps
-from perrin.errors import PrecisionWarning
+from perrin.diffusion.steps import NoisySteps, Quantity, Steps, pooled_steps, steps_of
+from perrin.errors import PrecisionWarning, TooFewFramesError
 from perrin.motion.rigid_motion import RigidMotion
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+
+    from perrin._arrays import Floats
+    from perrin.diffusion.likelihood import ProfilePoint
 
 Method = Literal["mle", "cve", "trace"]
 
@@ -28,6 +31,10 @@ _COARSE_STEP, _COARSE_STEP_IN_PLANE, _LOW_SNR, _FEW_STEPS = 0.2, 2.0, 0.2, 30
 
 # Beyond this the mean of the square of rotation vectors, which end at pi, says little of D_R.
 _LOST_TURNS = 1.0
+
+_TOGETHER = 32  # motions that are evaluated at once; more do not stay in the processor's cache
+
+_NO_MOTION = Found(0.0, (0.0, 0.0), (0.0, 0.0), 0.0, np.nan)
 
 
 def estimate_diffusion(
@@ -117,8 +124,64 @@ def estimate_diffusion(
     refuse(faults)
     settings = Noise.of(noise, exposure=exposure, drift=drift)
     steps = pooled_steps(motions, quantity)
+    found = _found(motions, steps, method, settings)
+    estimate = _judged(motions, steps, found, quantity=quantity, method=method, settings=settings)
+    for text in estimate.warnings:
+        python_warnings.warn(text, PrecisionWarning, stacklevel=2)
+    return estimate
+
+
+def estimate_each(
+    motions: Sequence[RigidMotion], *, quantity: Quantity, noise: Noise
+) -> list[DiffusionEstimate | TooFewFramesError]:
+    """Estimate a D of its own for each motion, as `estimate_diffusion`, all of them together.
+
+    Parameters
+    ----------
+    motions : sequence of RigidMotion
+    quantity : {"rotation", "translation"}
+    noise : Noise
+
+    Returns
+    -------
+    list of DiffusionEstimate or TooFewFramesError
+        The error that `estimate_diffusion` raises, where there is no estimate.
+
+    Examples
+    --------
+    >>> from perrin import Cluster, simulate_motion
+    >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=300, rng=3)
+    >>> print(*estimate_each([truth, truth], quantity="rotation", noise=Noise()), sep="; ")
+    D_R = 0.0050(4) rad^2/s [mle, 300 frames]; D_R = 0.0050(4) rad^2/s [mle, 300 frames]
+    """
+    steps: list[Steps | TooFewFramesError] = []
+    for motion in motions:
+        try:
+            steps.append(steps_of(motion, quantity))
+        except TooFewFramesError as error:
+            steps.append(error)
+    tracks = [NoisySteps.of(s, noise) for s in steps if isinstance(s, Steps)]
+    found = iter(likelihood_of_each(tracks))
+    return [
+        s
+        if isinstance(s, TooFewFramesError)
+        else _judged([m], [s], next(found), quantity=quantity, method="mle", settings=noise)
+        for m, s in zip(motions, steps, strict=True)
+    ]
+
+
+def _judged(
+    motions: Sequence[RigidMotion],
+    steps: Sequence[Steps],
+    found: Found,
+    *,
+    quantity: Quantity,
+    method: Method,
+    settings: Noise,
+) -> DiffusionEstimate:
+    """Return the estimate of some motions, with what limits its precision."""
     estimate = DiffusionEstimate.judged(
-        _found(motions, steps, method, settings),
+        found,
         quantity=quantity,
         method=method,
         n_frames=sum(m.fitted.size for m in motions),
@@ -129,10 +192,7 @@ def estimate_diffusion(
         else None,
         noise=settings,
     )
-    limits = precision_limits(estimate, steps)
-    for text in limits:
-        python_warnings.warn(text, PrecisionWarning, stacklevel=2)
-    return replace(estimate, warnings=limits)
+    return replace(estimate, warnings=precision_limits(estimate, steps))
 
 
 def _found(
@@ -188,15 +248,12 @@ def by_likelihood(tracks: Sequence[NoisySteps]) -> Found:
 
     likelihood = Likelihood.of(tracks)
     if not likelihood.scale[0] > 0:
-        return Found(0.0, (0.0, 0.0), (0.0, 0.0), 0.0, np.nan)
+        return _NO_MOTION
     best = likelihood.best()
-    value = float(best.D[0])
-    wider = excess_scatter(tracks, value, best.theta)
-    ci68, ci95 = likelihood.intervals(best, [wider * CHI2[level] for level in (0.68, 0.95)])
-    offsets, offset_stderr = likelihood.offsets(best)
-    found = Found(value, ci68, ci95, float(offsets.mean()), offset_stderr)
+    wider = np.array([excess_scatter(tracks, float(best.D[0]), best.theta)])
+    found = _found_of_units(likelihood, best, wider)[0]
     if tracks[0].drift:
-        mean, information = likelihood.steady_motion(value, best.theta)
+        mean, information = likelihood.steady_motion(found.value, best.theta)
         errors = np.sqrt(np.diagonal(np.linalg.inv(information), axis1=1, axis2=2))
         drift, drift_stderr = (tuple(map(tuple, x.tolist())) for x in (mean, errors))
         found = replace(found, drift=drift, drift_stderr=drift_stderr)
@@ -204,6 +261,57 @@ def by_likelihood(tracks: Sequence[NoisySteps]) -> Found:
         gain = float(likelihood.apart().best().value.sum() - best.value[0])
         found = replace(found, p_same=float(chdtrc(len(tracks) - 1, max(2 * gain, 0.0))))
     return found
+
+
+def likelihood_of_each(tracks: Sequence[NoisySteps]) -> list[Found]:
+    """Return the maximum of the likelihood of each motion alone, as `by_likelihood`, all at once.
+
+    Parameters
+    ----------
+    tracks : sequence of NoisySteps
+
+    Examples
+    --------
+    >>> from perrin import Cluster, simulate_motion
+    >>> from perrin.diffusion import Noise, NoisySteps, steps_of
+    >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=300, rng=3)
+    >>> track = NoisySteps.of(steps_of(truth, "rotation"), Noise())
+    >>> [one.ci95[0] < 5e-3 < one.ci95[1] for one in likelihood_of_each([track, track])]
+    [True, True]
+    """
+    found: list[Found | None] = [None] * len(tracks)
+    # Uneven steps are one tridiagonal system each, which has no gain from others.
+    even = [
+        i for i, t in enumerate(tracks) if t.steps.even and not t.drift and np.any(t.steps.vectors)
+    ]
+    for k in range(0, len(even), _TOGETHER):
+        rows = even[k : k + _TOGETHER]
+        some = [tracks[i] for i in rows]
+        likelihood = Likelihood.of(some).apart()
+        best = likelihood.best()
+        pairs = zip(some, best.D, best.theta, strict=True)
+        wider = np.array([excess_scatter([t], float(D), theta[None]) for t, D, theta in pairs])
+        for i, one in zip(rows, _found_of_units(likelihood, best, wider), strict=True):
+            found[i] = one
+    return [by_likelihood([t]) if f is None else f for t, f in zip(tracks, found, strict=True)]
+
+
+def _found_of_units(likelihood: Likelihood, best: ProfilePoint, wider: Floats) -> list[Found]:
+    """Return the D of every unit with its intervals, `wider` in square, and its offset."""
+    levels = np.array([CHI2[level] for level in (0.68, 0.95)])
+    low, high = likelihood.intervals(best, levels[:, None] * wider)
+    offset, offset_stderr = likelihood.offsets(best)
+    return [
+        Found(float(D), tuple(ci68), tuple(ci95), float(mean), float(error))
+        for D, ci68, ci95, mean, error in zip(
+            best.D,
+            np.transpose([low[0], high[0]]).tolist(),
+            np.transpose([low[1], high[1]]).tolist(),
+            offset,
+            offset_stderr,
+            strict=True,
+        )
+    ]
 
 
 def precision_limits(estimate: DiffusionEstimate, steps: Sequence[Steps]) -> tuple[str, ...]:

@@ -54,6 +54,9 @@ _NO_STEADY_MOTION = 0.2
 
 _CLUSTERING_LAGS = 20
 
+# About this many step components are tested at once; more do not stay in the processor's cache.
+_MOST_AT_ONCE = 30_000
+
 FEWEST_HALF_PERIODS = 6  # of a vibration in the track
 
 # A track of which the dense score would need more than this is divided, and the scores are added.
@@ -135,6 +138,9 @@ class AxisFit:
 class AxisModel:
     """Brownian steps along A axes, each with a D and an offset of its own.
 
+    Several motions with the same frames are one model, whose `known` and `steady` have a first axis
+    of B motions.
+
     Attributes
     ----------
     start : ndarray, shape (N,)
@@ -143,13 +149,13 @@ class AxisModel:
         Duration of each step, s.
     linked : ndarray of bool, shape (N,)
         Whether the next step begins with the frame that this one ends with.
-    known : tuple of ndarray, shape (A, N)
+    known : tuple of ndarray, shape (A, N) or (B, A, N)
         Known part of the noise variances of the frames before and after each step.
     blur : float
         Motion blur takes this (s) times D from the known noise; 0 where the offset is free.
     free : bool
         Whether the offset is free; else the noise is known and the offset is 0.
-    steady : ndarray, shape (N, A, p)
+    steady : ndarray, shape (N, A, p) or (B, N, A, p)
         What a steady velocity or spin along the lab axes adds to each step, per unit of it.
     """
 
@@ -181,12 +187,12 @@ class AxisModel:
 
     @cached_property
     def mean_known(self) -> Floats:
-        """Mean known noise variance of each axis, (A,)."""
-        return np.asarray(0.5 * (self.known[0] + self.known[1]).mean(axis=1))
+        """Mean known noise variance of each axis, (A,) or (B, A)."""
+        return np.asarray(0.5 * (self.known[0] + self.known[1]).mean(axis=-1))
 
     def with_equal_noise(self) -> AxisModel:
         """Return the model with the mean noise in all frames."""
-        level = np.broadcast_to(self.mean_known[:, None], self.known[0].shape)
+        level = np.broadcast_to(self.mean_known[..., None], self.known[0].shape)
         return replace(self, known=(level, level))
 
     def ratio(self, D: Floats, offset: Floats) -> Floats:
@@ -242,7 +248,7 @@ class AxisModel:
         near : AxisFit, optional
             A fit of one data set from which to start; then three iterations suffice.
         """
-        if self.even and np.all(np.ptp(self.known[0], axis=1) == 0):
+        if self.even and np.all(np.ptp(self.known[0], axis=-1) == 0):
             return self._fit_modes(y, near)
         return self._fit_tridiagonal(y, near)
 
@@ -572,25 +578,32 @@ class AxisModel:
         from scipy.linalg.lapack import dpttrf, dpttrs
         from scipy.special import fdtrc
 
-        shape, p = fit.y.shape, self.steady.shape[2]
-        x = np.moveaxis(self.steady, 0, 1)
-        rows = np.broadcast_to(x, (shape[0], *x.shape)).reshape(-1, p)
+        shape, p = fit.y.shape, self.steady.shape[-1]
+        x = np.broadcast_to(np.swapaxes(self.steady, -3, -2), (*shape, p))
+        rows = x.reshape(-1, p)
         rest, n = fit, self.n_steps
+        separate = self.steady.ndim == 4  # several motions, each tested as if it were alone
+        mean, information = np.zeros((shape[0], p)), np.zeros((shape[0], p, p))
+        p_value, done = np.zeros(shape[0]), np.zeros(shape[0], dtype=np.bool_)
         for refits in range(3):
             d, lower, _ = dpttrf(*self.bands(rest.D, rest.offset))
             unit = dpttrs(d, lower, rows)[0].reshape(*shape, p)
-            information = np.einsum("anp,banq->bpq", x, unit)
+            gram = np.einsum("banp,banq->bpq", x, unit)
             right = np.einsum("banp,ban->bp", unit, fit.y)
-            mean = np.linalg.solve(information, right[..., None])[..., 0]
+            found = np.linalg.solve(gram, right[..., None])[..., 0]
             by_D, by_offset = self.slopes(rest.D, rest.offset)
             g = np.stack([by_D, by_offset] if self.free else [by_D], axis=-2)
             matrix = 0.5 * np.einsum("...ik,...jk->...ij", g, g)
             nu = np.mean(2 / np.linalg.inv(matrix)[..., 0, 0], axis=1)
-            square = np.einsum("bp,bpq,bq->b", mean, information, mean) * (n - 1) / (n * p)
-            p_value = np.asarray(fdtrc(p, nu, square))
-            if refits == 2 or p_value.min() > _NO_STEADY_MOTION:
+            square = np.einsum("bp,bpq,bq->b", found, gram, found) * (n - 1) / (n * p)
+            mean = np.where(done[:, None], mean, found)
+            information = np.where(done[:, None, None], information, gram)
+            p_value = np.where(done, p_value, fdtrc(p, nu, square))
+            done = p_value > _NO_STEADY_MOTION
+            done = done if separate else np.full_like(done, done.all())
+            if refits == 2 or done.all():
                 break
-            rest = self.fit(fit.y - np.einsum("anp,bp->ban", x, mean), near=rest)
+            rest = self.fit(fit.y - np.einsum("banp,bp->ban", x, mean), near=rest)
         return mean, information, p_value
 
 
@@ -920,9 +933,74 @@ def brownian_tests(model: AxisModel, y: Floats) -> BrownianTests:
     """
     fit = model.fit(y)
     scores = model.scores(fit) if model.even else model.dense_scores(fit, y)
-    values = approximate_p(model, fit, scores)
-    p = {name: float(value[0]) for name, value in values.items()}
-    n = model.n_steps
+    p = {name: float(value[0]) for name, value in approximate_p(model, fit, scores).items()}
+    return _ranked_if_short(model, fit, scores, p)
+
+
+def brownian_tests_of_each(
+    each: Sequence[tuple[AxisModel, Floats]],
+) -> list[BrownianTests]:
+    """Test the steps of several motions, each alone, as `brownian_tests`; alike ones together.
+
+    Parameters
+    ----------
+    each : sequence of tuple
+        Model and steps (1, A, N) of every motion.
+
+    Examples
+    --------
+    >>> from perrin import Cluster, Noise, simulate_motion
+    >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=300, rng=3)
+    >>> one = axis_model(truth, "rotation", Noise())
+    >>> first, second = brownian_tests_of_each([one, one])
+    >>> first.p["cage"] == second.p["cage"]
+    True
+    """
+    alike: dict[tuple[object, ...], list[int]] = {}
+    for i, (model, y) in enumerate(each):
+        equal_noise = np.all(np.ptp(model.known[0], axis=-1) == 0)
+        key: tuple[object, ...] = (i,)
+        if model.even and equal_noise:
+            duration = float(model.tau[0])
+            key = (y.shape[1:], model.steady.shape[-1], duration, model.blur, model.free)
+        alike.setdefault(key, []).append(i)
+    found: dict[int, BrownianTests] = {}
+    for group in alike.values():
+        at_once = max(1, _MOST_AT_ONCE // each[group[0]][1].size)
+        for k in range(0, len(group), at_once):
+            rows = group[k : k + at_once]
+            if len(rows) == 1:
+                found[rows[0]] = brownian_tests(*each[rows[0]])
+                continue
+            some = [each[i] for i in rows]
+            before, after = (np.stack([model.known[e] for model, _ in some]) for e in (0, 1))
+            together = replace(
+                some[0][0],
+                known=(before, after),
+                steady=np.stack([model.steady for model, _ in some]),
+            )
+            fit = together.fit(np.concatenate([y for _, y in some]))
+            scores = together.scores(fit)
+            p = approximate_p(together, fit, scores)
+            for j, (i, (model, _)) in enumerate(zip(rows, some, strict=True)):
+                one = slice(j, j + 1)
+                found[i] = _ranked_if_short(
+                    model,
+                    AxisFit(fit.y[one], fit.D[one], fit.offset[one]),
+                    (
+                        Score(*(x[..., one] for x in scores[0])),
+                        Score(*(x[..., one] for x in scores[1])),
+                    ),
+                    {name: float(value[j]) for name, value in p.items()},
+                )
+    return [found[i] for i in range(len(each))]
+
+
+def _ranked_if_short(
+    model: AxisModel, fit: AxisFit, scores: tuple[Score, Score], p: dict[str, float]
+) -> BrownianTests:
+    """Return the tests of one motion, ranked among draws where the laws of p do not hold."""
+    n, y = model.n_steps, fit.y
     snr = float(
         np.mean(fit.D) * model.tau.mean() / max(np.mean(fit.offset + model.mean_known), 1e-300)
     )

@@ -107,7 +107,7 @@ class Likelihood:
     @classmethod
     def of(cls, tracks: Sequence[NoisySteps]) -> Likelihood:
         """Return the likelihood with the sine transform for even steps, else elimination."""
-        even = [i for i, t in enumerate(tracks) if t.steps.even and not t.drift]
+        even = [i for i, t in enumerate(tracks) if t.steps.even]
         rest = sorted(set(range(len(tracks))) - set(even))
         found: list[StepKernel] = []
         if even:
@@ -301,85 +301,89 @@ class Likelihood:
         D = np.where(high > low, trial, peak.D)
         return peak._replace(D=D, theta=peak.theta_at(D))
 
-    def intervals(self, best: ProfilePoint, drops: Sequence[float]) -> list[tuple[float, float]]:
-        """Return where twice the profile log-likelihood has fallen by each drop; 0 if it never has.
+    def intervals(self, best: ProfilePoint, drops: Floats) -> tuple[Floats, Floats]:
+        """Return where twice the profile log-likelihood has fallen by drops (K, units), both ends.
 
-        All ends are found at once, by Newton steps in the root of twice the fall, which is nearly
-        straight, halved into brackets; or doubled, while there is no bracket.
+        The low end is 0 if it never has. All ends are found at once, by Newton steps in the root of
+        twice the fall, which is nearly straight, halved into brackets; or doubled, while there is
+        no bracket.
         """
-        value, top = float(best.D[0]), float(best.value[0])
-        zero = self.profile(np.zeros(1))
-        fall_to_zero = 2 * (top - float(zero.value[0]))
-        has_low = [value > 0 and fall_to_zero > drop for drop in drops]
-        root = np.sqrt(
-            np.array([*drops, *(d for d, has in zip(drops, has_low, strict=True) if has)])
+        value, top = best.D, best.value
+        count = len(drops)
+        fall_to_zero = 2 * (top - self.profile(np.zeros_like(value)).value)
+        has_low = (value > 0) & (fall_to_zero > drops)
+        root = np.sqrt(np.concatenate([drops, drops]))
+        side = np.where(np.arange(2 * count) < count, 1.0, -1.0)[:, None]
+        sizes = self.by_unit(np.array([t.steps.vectors.size for t in self.tracks]))
+        bent = (value > 0) & (best.curvature < 0)
+        reach = np.where(
+            bent, root / np.sqrt(np.where(bent, -best.curvature, 1.0)), self.scale / sizes
         )
-        side = np.where(np.arange(len(root)) < len(drops), 1.0, -1.0)
-        count = sum(t.steps.vectors.size for t in self.tracks)
-        if value > 0 and best.curvature[0] < 0:
-            reach = root / np.sqrt(-best.curvature[0])
-        else:
-            reach = np.full(len(root), float(self.scale[0]) / count)
-        inside, outside = np.full(len(root), value), np.where(side > 0, np.inf, 0.0)
+        inside = np.broadcast_to(value, root.shape)
+        outside = np.broadcast_to(np.where(side > 0, np.inf, 0.0), root.shape)
         x = value + side * reach
         x = np.where(x > 0, x, 0.5 * value)
-        point = ProfilePoint(*[np.broadcast_to(row, (len(root), row.shape[-1])) for row in best])
+        settled = np.concatenate([np.zeros_like(has_low), ~has_low])
+        x = np.where(settled, value, x)
+        point = ProfilePoint(*[np.broadcast_to(row, (2 * count, row.shape[-1])) for row in best])
         for _ in range(200):
-            D = x[:, None]
-            point = self.profile(D, point.theta_at(D))
-            fall = 2 * (top - point.value[:, 0])
+            point = self.profile(x, point.theta_at(x))
+            fall = 2 * (top - point.value)
             within = fall < root**2
             inside, outside = np.where(within, x, inside), np.where(within, outside, x)
             depth = np.sqrt(np.maximum(fall, 0.0))
-            slope = -np.divide(point.slope[:, 0], depth, out=np.zeros_like(x), where=depth > 0)
+            slope = -np.divide(point.slope, depth, out=np.zeros_like(x), where=depth > 0)
             step = np.divide(root - depth, slope, out=np.full_like(x, np.inf), where=slope != 0)
             bounded = np.isfinite(outside)
             middle = np.where(bounded, 0.5 * (inside + np.where(bounded, outside, 0.0)), 2 * x)
             between = (np.minimum(inside, outside) < x + step) & (
                 x + step < np.maximum(inside, outside)
             )
-            moved = np.where(between, step, middle - x)
+            moved = np.where(settled, 0.0, np.where(between, step, middle - x))
             x = x + moved
             # The error of the next Newton step is of the order of the square of this one.
-            if np.all(np.abs(moved) <= np.where(between, 1e-7, 1e-11) * np.abs(x)):
+            settled |= np.abs(moved) <= np.where(between, 1e-7, 1e-11) * np.abs(x)
+            if settled.all():
                 break
-        high, low = x[: len(drops)], iter(x[len(drops) :])
-        return [
-            (float(next(low)) if has else 0.0, float(end))
-            for has, end in zip(has_low, high, strict=True)
-        ]
+        return np.where(has_low, x[count:], 0.0), x[:count]
 
     def steady_motion(self, D: float, theta: Floats) -> tuple[Floats, Floats]:
         """Return the steady velocity or spin of every motion (G, p), lab axes, and its information.
 
         The information (G, p, p) is the inverse of the covariance at this D and theta.
         """
-        kernel = next(k for k in self.kernels if isinstance(k, TridiagonalCovariance))
-        mean, information = kernel.steady_motion(np.full(len(theta), D), theta)
+        p = self.tracks[0].steady.size
+        mean, information = np.empty((len(theta), p)), np.empty((len(theta), p, p))
+        for kernel in self.kernels:
+            rows = kernel.groups
+            some = kernel.steady_motion(np.full(len(rows), D), theta[rows])
+            mean[rows], information[rows] = some
         return mean + np.array([t.steady for t in self.tracks]), information
 
-    def offsets(self, best: ProfilePoint) -> tuple[Floats, float]:
-        """Return the noise offset of each motion, and the standard error of their mean.
+    def offsets(self, best: ProfilePoint) -> tuple[Floats, Floats]:
+        """Return the mean noise offset of the motions of each unit, and its standard error.
 
         The observed information is arrow-shaped: one D, a theta for each motion. NaN where a theta
         lies on its edge.
         """
         blur = np.array([t.blur for t in self.tracks])
         level = np.array([t.level for t in self.tracks])
-        free = np.where(self.fixed, 0.0, best.theta)
-        offset = free + level - blur * best.D
-        D, theta, free = best.D, best.theta, ~self.fixed
-        if D[0] == 0 or np.any(free & (theta <= 1e-3 * self.mean_square)):
-            return offset, np.nan
-        sums = self.sums(D, theta)
-        h_DD = float((sums.fall_DD - sums.rise_DD).sum())
+        free, theta = ~self.fixed, best.theta
+        count = self.by_unit(np.ones(len(blur)))
+        offset = self.by_unit(np.where(free, theta, 0.0) + level - blur * best.D) / count
+        known = self.by_unit((free & (theta <= 1e-3 * self.mean_square)).astype(np.float64)) == 0
+        sums = self.sums(best.D, theta)
+        h_DD = self.by_unit(sums.fall_DD - sums.rise_DD)
         h_Do, h_oo = sums.fall_Do - sums.rise_Do, sums.fall_oo - sums.rise_oo
-        turn = np.divide(h_Do, h_oo, out=np.zeros_like(h_Do), where=free)
-        left = h_DD - float(np.sum(turn * h_Do))
-        if left <= 0 or np.any(h_oo[free] <= 0):
-            return offset, np.nan
-        own = np.sum(1 / h_oo[free]) / len(offset) ** 2
-        return offset, float(np.sqrt(own + np.mean(turn + blur) ** 2 / left))
+        known &= (best.D > 0) & (self.by_unit((free & (h_oo <= 0)).astype(np.float64)) == 0)
+        inverse: Floats = np.zeros_like(h_oo)
+        np.divide(1.0, h_oo, out=inverse, where=free & (h_oo > 0))
+        turn: Floats = np.asarray(h_Do * inverse, dtype=np.float64)
+        left = h_DD - self.by_unit(turn * h_Do)
+        known &= left > 0
+        left = np.where(known, left, np.nan)
+        own = self.by_unit(inverse) / count**2
+        return offset, np.sqrt(own + (self.by_unit(turn + blur) / count) ** 2 / left)
 
 
 def log_slope_ratio(rise: Floats, fall: Floats) -> Floats:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
+
+from perrin._arrays import frozen
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -18,6 +20,7 @@ if TYPE_CHECKING:
 LEAST_EIGENVALUE = 1e-100
 
 
+@lru_cache(maxsize=8)
 def difference_eigenvalues(n_steps: int) -> Floats:
     """Return 1 - cos(k pi/(N + 1)) for k = 1..N, the noise of N even steps by sine mode.
 
@@ -30,7 +33,9 @@ def difference_eigenvalues(n_steps: int) -> Floats:
     >>> difference_eigenvalues(2)
     array([0.5, 1.5])
     """
-    return np.asarray(1 - np.cos(np.pi * np.arange(1, n_steps + 1) / (n_steps + 1)))
+    values = np.asarray(1 - np.cos(np.pi * np.arange(1, n_steps + 1) / (n_steps + 1)))
+    frozen(values)
+    return values
 
 
 class GroupSlopes(NamedTuple):
@@ -81,6 +86,9 @@ class StepKernel(Protocol):
     def sums(self, D: Floats, theta: Floats) -> GroupSlopes:
         """Evaluate all motions at the D and the theta of each, (..., G)."""
 
+    def steady_motion(self, D: Floats, theta: Floats) -> tuple[Floats, Floats]:
+        """Return the steady motion (G, p) of every track and its inverse covariance (G, p, p)."""
+
 
 def equal_columns(noise: Floats) -> list[Ints]:
     """Return the columns of (M, A) in groups that are equal to rounding.
@@ -105,7 +113,9 @@ class SineModes:
 
     Eigenvalue k is 2 D (tau - b c_k) + 2 (weight theta + known) c_k, c_k = 1 - cos(k pi/(N + 1))
     for N steps; the powers of axes with the same noise are added. All modes of all motions follow
-    one another, (M,).
+    one another, (M,). A free steady motion makes the likelihood the restricted one (REML), as in
+    `TridiagonalCovariance`: its effect on mode k is X_k, and sums over the modes of X_k^T X_k and
+    X_k^T y_k, with the weights of the other sums, are all that it needs.
 
     Attributes
     ----------
@@ -121,6 +131,8 @@ class SineModes:
         Number of those axes.
     by_D, by_theta, given : ndarray, shape (M,)
         Slopes of the eigenvalue in D and in theta, and its known part.
+    steady : tuple of ndarray, shapes (p, p, M) and (p, M), or None
+        X_k^T X_k and X_k^T y_k of a free steady motion, summed over axes.
     """
 
     groups: Ints
@@ -131,6 +143,7 @@ class SineModes:
     by_D: Floats
     by_theta: Floats
     given: Floats
+    steady: tuple[Floats, Floats] | None = None
 
     @classmethod
     def of(cls, tracks: Sequence[NoisySteps], groups: Sequence[int]) -> SineModes:
@@ -138,11 +151,20 @@ class SineModes:
         from scipy.fft import dst
 
         rows = []
+        squares, products = [], []
         for track in tracks:
             s = track.steps
             c = difference_eigenvalues(len(s.vectors))
-            power = dst(s.vectors, type=1, norm="ortho", axis=0) ** 2
+            modes = dst(s.vectors, type=1, norm="ortho", axis=0)
+            power = modes**2
             weight, known = track.weight[0][0], track.known[0][0]
+            alike = equal_columns(np.stack([weight, known]))
+            if track.drift:
+                effect = dst(s.steady, type=1, norm="ortho", axis=0)
+                for axes in alike:
+                    some = effect[:, axes]
+                    squares.append(np.einsum("kap,kaq->pqk", some, some))
+                    products.append(np.einsum("kap,ka->pk", some, modes[:, axes]))
             columns = [
                 np.stack(
                     [
@@ -153,47 +175,157 @@ class SineModes:
                         2 * known[axes[0]] * c,
                     ]
                 )
-                for axes in equal_columns(np.stack([weight, known]))
+                for axes in alike
             ]
             rows.append(np.concatenate(columns, axis=1))
         sizes = [row.shape[1] for row in rows]
         power, count, by_D, by_theta, given = np.concatenate(rows, axis=1)
         starts = np.cumsum([0, *sizes[:-1]])
         which = np.repeat(np.arange(len(groups)), sizes)
-        return cls(np.array(groups), starts, which, power, count, by_D, by_theta, given)
+        steady = None
+        if squares:
+            steady = np.concatenate(squares, axis=-1), np.concatenate(products, axis=-1)
+        return cls(np.array(groups), starts, which, power, count, by_D, by_theta, given, steady)
 
     @cached_property
-    def slope_columns(self) -> tuple[Floats, Floats]:
-        """Half the slopes of the eigenvalue in D and in theta, (M, 2), and their products."""
+    def slope_columns(self) -> Floats:
+        """Half the slopes of the eigenvalue in D and in theta, and their three products, (5, M)."""
         halves = 0.5 * np.stack([self.by_D, self.by_theta])
-        return halves.T, 4 * (halves[[0, 0, 1]] * halves[[0, 1, 1]]).T
+        return np.concatenate([halves, 4 * (halves[[0, 0, 1]] * halves[[0, 1, 1]])])
+
+    @cached_property
+    def length(self) -> int:
+        """Number of modes of every motion; 0 where they differ."""
+        lengths = np.diff(self.starts, append=len(self.power))
+        return int(lengths[0]) if np.all(lengths == lengths[0]) else 0
 
     def sums(self, D: Floats, theta: Floats) -> GroupSlopes:
         """Evaluate all motions at the D and the theta of each, (..., G)."""
-        if len(self.groups) > 1:
-            D, theta = D[..., self.which], theta[..., self.which]
-        eigen = D * self.by_D + theta * self.by_theta + self.given
-        np.maximum(eigen, LEAST_EIGENVALUE, out=eigen)
+        halves, products = self.slope_columns[:2], self.slope_columns[2:]
+        eigen = self.eigenvalues(D, theta)
+        power, count = (
+            x.reshape(eigen.shape[-1 - bool(self.length) :]) for x in (self.power, self.count)
+        )
         inverse = 1 / eigen
-        fall = self.count * inverse
-        ratio = self.power * inverse
+        fall = count * inverse
+        ratio = power * inverse
         rise = ratio * inverse
-        halves, products = self.slope_columns
-        value = np.add.reduceat(self.count * np.log(eigen) + ratio, self.starts, axis=-1)
+        value = count * np.log(eigen) + ratio
+        each = value.sum(axis=-1) if self.length else np.add.reduceat(value, self.starts, axis=-1)
         rises, falls = (self.by_motion(x, halves) for x in (rise, fall))
         rise_bends, fall_bends = (self.by_motion(x * inverse, products) for x in (rise, fall))
-        return GroupSlopes(
-            -0.5 * value,
+        found = GroupSlopes(
+            -0.5 * each,
             *(rises[..., 0], falls[..., 0], rises[..., 1], falls[..., 1]),
             *(-rise_bends[..., k] for k in range(3)),
             *(-0.5 * fall_bends[..., k] for k in range(3)),
         )
+        return found if self.steady is None else self.without_steady_motion(found, inverse)
+
+    def eigenvalues(self, D: Floats, theta: Floats) -> Floats:
+        """Return the variances of the modes, (..., G, K) where motions are of one length K."""
+        if self.length:
+            # One row a motion: a sum over modes is then a product of matrices.
+            shape: tuple[int, ...] = (len(self.groups), self.length)
+            D, theta = D[..., None], theta[..., None]
+        else:
+            shape = self.power.shape
+            D, theta = D[..., self.which], theta[..., self.which]
+        by_D, by_theta, given = (x.reshape(shape) for x in (self.by_D, self.by_theta, self.given))
+        eigen = D * by_D + theta * by_theta + given
+        return np.asarray(np.maximum(eigen, LEAST_EIGENVALUE, out=eigen))
+
+    @cached_property
+    def steady_columns(self) -> tuple[Floats, Floats, Floats]:
+        """X^T X and X^T y of every mode, (p^2 + p, M), and times slopes, and products of slopes."""
+        if self.steady is None:
+            raise ValueError("these steps have no free steady motion")
+        squares, products = self.steady
+        plain = np.concatenate([squares.reshape(-1, squares.shape[-1]), products])
+        slopes = np.stack([self.by_D, self.by_theta])
+        pairs = slopes[[0, 0, 1]] * slopes[[0, 1, 1]]
+        once, twice = ((x[:, None] * plain).reshape(-1, plain.shape[1]) for x in (slopes, pairs))
+        return plain, once, twice
+
+    def steady_sums(self, weight: Floats, order: int) -> tuple[Floats, Floats]:
+        """Return sums of weight times X^T X (..., G, s, p, p) and X^T y (..., G, s, p).
+
+        The weights are multiplied by `order` slopes: none, D and theta, or their products DD, Do
+        and oo.
+        """
+        columns = self.steady_columns[order]
+        count, total = order + 1, self.by_motion(weight, columns)
+        p = int(np.sqrt(len(columns) / count))  # p^2 + p columns each
+        total = total.reshape(*total.shape[:-1], count, p * p + p)
+        square = total[..., : p * p].reshape(*total.shape[:-1], p, p)
+        return square, total[..., p * p :]
+
+    def without_steady_motion(self, plain: GroupSlopes, inverse: Floats) -> GroupSlopes:
+        """Return the restricted likelihood from that without a steady motion.
+
+        With the steady motion m = G^-1 X^T V y all squares of y become those of y - X m.
+        """
+        (gram, right), (square, product) = (
+            self.steady_sums(inverse, 0),
+            self.steady_sums(inverse**2, 1),
+        )
+        squares, products = self.steady_sums(inverse**3, 2)
+        left = np.asarray(np.linalg.inv(gram), dtype=np.float64)  # (..., G, 1, p, p)
+        mean = (left @ right[..., None])[..., 0]
+
+        def change(square: Floats, product: Floats) -> Floats:
+            turned = (square @ mean[..., None])[..., 0]
+            return np.asarray(np.sum(mean * (turned - 2 * product), axis=-1))
+
+        def trace(a: Floats, b: Floats) -> Floats:
+            return np.asarray(np.sum(a * np.swapaxes(b, -1, -2), axis=(-2, -1)))
+
+        value = plain.value + 0.5 * np.sum(right * mean, axis=-1)[..., 0]
+        value = value - 0.5 * np.linalg.slogdet(gram)[1][..., 0]
+        rise, fall = 0.5 * change(square, product), -0.5 * trace(left, square)
+        rest = product - (square @ mean[..., None])[..., 0]
+        through = left @ square
+        pairs = ((0, 0), (0, 1), (1, 1))
+        lever = np.stack(
+            [
+                np.einsum(
+                    "...p,...pq,...q->...", rest[..., i, :], left[..., 0, :, :], rest[..., j, :]
+                )
+                for i, j in pairs
+            ],
+            axis=-1,
+        )
+        rise_bends = lever - change(squares, products)
+        both = np.stack(
+            [trace(through[..., i, :, :], through[..., j, :, :]) for i, j in pairs], axis=-1
+        )
+        fall_bends = trace(left, squares) - 0.5 * both
+        return GroupSlopes(
+            value,
+            plain.rise_D + rise[..., 0],
+            plain.fall_D + fall[..., 0],
+            plain.rise + rise[..., 1],
+            plain.fall + fall[..., 1],
+            *(plain[5 + k] + rise_bends[..., k] for k in range(3)),
+            *(plain[8 + k] + fall_bends[..., k] for k in range(3)),
+        )
+
+    def steady_motion(self, D: Floats, theta: Floats) -> tuple[Floats, Floats]:
+        """Return the steady motion (G, p) of every track and its inverse covariance (G, p, p)."""
+        gram, right = self.steady_sums(1 / self.eigenvalues(D, theta), 0)
+        mean = np.asarray(np.linalg.solve(gram, right[..., None])[..., 0], dtype=np.float64)
+        return mean[..., 0, :], gram[..., 0, :, :]
 
     def by_motion(self, x: Floats, columns: Floats) -> Floats:
-        """Return the sums of x (..., M) times columns (M, c) over the modes of each motion."""
-        if len(self.groups) == 1:
-            return np.asarray((x @ columns)[..., None, :])
-        sums = [np.add.reduceat(x * column, self.starts, axis=-1) for column in columns.T]
+        """Return the sums over the modes of each motion of x times columns (c, M), (..., G, c)."""
+        if self.length:
+            by_row = columns.reshape(len(columns), *x.shape[-2:])
+            if len(self.groups) == 1:
+                return np.asarray(x @ by_row[:, 0].T)
+            # (G, P, K) times (G, K, c)
+            stacked = np.moveaxis(x.reshape(-1, *x.shape[-2:]), 0, 1) @ np.moveaxis(by_row, 0, 2)
+            return np.moveaxis(stacked, 1, 0).reshape(*x.shape[:-1], len(columns))
+        sums = [np.add.reduceat(x * column, self.starts, axis=-1) for column in columns]
         return np.stack(sums, axis=-1)
 
 

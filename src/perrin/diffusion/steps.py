@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Literal
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -32,6 +33,10 @@ _EQUALLY_NOISY_AXES = 0.02
 
 # Steps are even, and a sine transform is used, if times and noise agree to this.
 _EVEN_STEPS = 1e-9
+
+# Steps of motions that are in use: a motion does not change, and neither do its steps, which
+# estimates and tests of one motion share.
+_STEPS_OF_MOTIONS: WeakKeyDictionary[RigidMotion, dict[Quantity, Steps]] = WeakKeyDictionary()
 
 
 @dataclass(frozen=True, eq=False)
@@ -244,6 +249,14 @@ def steps_of(motion: RigidMotion, quantity: Quantity) -> Steps:
     >>> steps.vectors.shape, steps.even
     ((99, 3), True)
     """
+    known = _STEPS_OF_MOTIONS.setdefault(motion, {})
+    if quantity not in known:
+        known[quantity] = _computed_steps(motion, quantity)
+    return known[quantity]
+
+
+def _computed_steps(motion: RigidMotion, quantity: Quantity) -> Steps:
+    """Compute what `steps_of` returns."""
     start, stop = motion.steps()
     if len(start) < 2:
         raise TooFewFramesError(

@@ -8,87 +8,40 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from perrin.diffusion.step_kernels import difference_eigenvalues
+from perrin.diffusion.tensor_modes import (
+    ChainTrack,
+    EvenTracks,
+    TensorSlopes,
+    covariance_slopes,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from typing import TypeAlias
 
-    from perrin._arrays import Floats
+    from perrin._arrays import Floats, Ints
     from perrin.diffusion.steps import Steps
 
-    # D (b, b), its slopes (m, b, b) by the m parameters of a family of tensors, and second
-    # derivatives (m, m, b, b).
-    Family: TypeAlias = Callable[[Floats], tuple[Floats, Floats, Floats]]
+    # D (..., b, b), slopes (..., m, b, b) by the m parameters of a family of tensors, and second
+    # derivatives (..., m, m, b, b), of the parameters (..., m) of those motions.
+    Family: TypeAlias = Callable[..., tuple[Floats, Floats, Floats]]
 
 # The largest blur: all motion seen in the first and last instant of a frame (1/6: open shutter).
-_MOST_BLUR = 0.25
+MOST_BLUR = 0.25
 
 # Where D and noise have the same shape only noise less blur is determined; then this slope of the
 # log-likelihood selects the least blur. It changes the log-likelihood by 0.025 at most.
-_LEAST_BLUR = 0.1
+LEAST_BLUR = 0.1
 
 # A search has converged where another step would gain this much: 5e-9 standard errors. A gain below
 # the second number is hidden by rounding, and steps are accepted without it.
-_CONVERGED_GAIN, _ROUNDING_GAIN = 1e-17, 1e-9
+CONVERGED_GAIN, ROUNDING_GAIN = 1e-17, 1e-9
+
+# Frames are equally noisy if the elements of their noise agree to this.
+_EQUAL_NOISE = 1e-9
 
 # Step of numerical derivatives, in scaled units where all parameters are of order 1.
 _DIFFERENCE_STEP = 1e-5
-
-
-class TensorSlopes(NamedTuple):
-    """Log-likelihoods at P points, and their derivatives.
-
-    Attributes
-    ----------
-    value : ndarray, shape (P,)
-        Log-likelihood; -inf, without slopes, where a covariance is not positive definite.
-    D : ndarray, shape (P, b, b)
-        Slopes in D.
-    theta : ndarray, shape (P, r)
-        Slopes in the noise amplitudes.
-    B : ndarray, shape (P,)
-        Slope in B.
-    noise : ndarray, shape (P, b, b)
-        Slopes in a noise O that is added to that of every frame.
-    """
-
-    value: Floats
-    D: Floats
-    theta: Floats
-    B: Floats
-    noise: Floats
-
-    @classmethod
-    def undefined(cls, D: Floats, theta: Floats) -> TensorSlopes:
-        """Return -inf without slopes at all of these points."""
-        none = np.full(len(D), np.nan)
-        least = np.full(len(D), -np.inf)
-        lost = np.full_like(D, np.nan)
-        return cls(least, lost, np.full_like(theta, np.nan), none, lost)
-
-
-class DiagonalModes(NamedTuple):
-    """The sine modes of even steps at P points, in the axes that diagonalise their covariances.
-
-    Attributes
-    ----------
-    axes : ndarray, shape (P, b, b)
-        Those axes as columns, not of unit length.
-    power, inverse : ndarray, shape (P, K, b)
-        Variances of the K modes along them, and one over these.
-    values, scaled : ndarray, shape (P, K, b)
-        Modes along them, and the same over their variances.
-    log_det : ndarray, shape (P,)
-        Logarithm of the determinant of a covariance less that of its variances.
-    """
-
-    axes: Floats
-    power: Floats
-    inverse: Floats
-    values: Floats
-    scaled: Floats
-    log_det: Floats
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,9 +89,9 @@ class NoisyVectors:
             value = value + measured.sum(axis=1)
             out.append(2 * own[:, : len(self.theta)] * (by_theta + slope))
         if self.B is None:
-            value = value - _LEAST_BLUR * B
-            slope = _MOST_BLUR * np.sin(2 * own[:, -1:])
-            out.append((found.B - _LEAST_BLUR)[:, None] * slope)
+            value = value - LEAST_BLUR * B
+            slope = MOST_BLUR * np.sin(2 * own[:, -1:])
+            out.append((found.B - LEAST_BLUR)[:, None] * slope)
         return value, found.D, np.concatenate(out, axis=1)
 
     def amplitudes(self, own: Floats) -> tuple[Floats, Floats]:
@@ -147,7 +100,7 @@ class NoisyVectors:
         theta = own[:, : len(self.theta)] ** 2 if free else np.tile(self.theta, (len(own), 1))
         B = np.full(len(own), self.B or 0.0)
         if self.B is None:
-            B = np.array([_MOST_BLUR * float(one) ** 2 for one in np.sin(own[:, -1])])
+            B = np.array([MOST_BLUR * float(one) ** 2 for one in np.sin(own[:, -1])])
         return theta, B
 
     def measurement(self, theta: Floats) -> tuple[Floats, Floats, Floats]:
@@ -169,111 +122,41 @@ class NoisyVectors:
         return offset
 
     @cached_property
-    def spectrum(self) -> tuple[Floats, Floats]:
-        """Sine transform of the steps, and the weight 2 (1 - cos) of the noise in every mode."""
-        from scipy.fft import dst
+    def even_track(self) -> EvenTracks:
+        """The steps in their sine modes, where they are even."""
+        return EvenTracks.of([self.steps])
 
-        y = self.steps.vectors
-        return dst(y, type=1, norm="ortho", axis=0), 2 * difference_eigenvalues(len(y))
+    @cached_property
+    def chain_track(self) -> ChainTrack | None:
+        """The steps as chains along common axes; None where frames are not equally noisy."""
+        s = self.steps
+        ends = np.zeros(s.noise.shape[1], dtype=np.bool_)
+        ends[s.start] = ends[s.stop] = True
+        noise = s.noise[:, ends]
+        if not np.ptp(noise, axis=1).max() <= _EQUAL_NOISE * np.abs(noise).max():
+            return None
+        return ChainTrack(s, noise[:, 0])
 
     def by_tensor(self, D: Floats, theta: Floats, B: Floats) -> TensorSlopes:
         """Return the log-likelihood and its derivatives at P points; -inf where not defined."""
         if self.steps.even:
-            try:
-                return self.by_sines(D, theta, B)
-            except np.linalg.LinAlgError:
-                if len(D) == 1:
-                    return TensorSlopes.undefined(D, theta)
+            return self.by_sines(D, theta, B)
         if len(D) == 1:
-            return self.by_bands(D[0], theta[0], float(B[0]))
+            if self.chain_track is None:
+                return self.by_bands(D[0], theta[0], float(B[0]))
+            chains = self.chain_track.at(D[0], theta[0], float(B[0]))
+            if chains is None:
+                return TensorSlopes.undefined(D, theta)
+            return self.chain_track.slopes(D[0], float(B[0]), chains)
         points = [
             self.by_tensor(D[p : p + 1], theta[p : p + 1], B[p : p + 1]) for p in range(len(D))
         ]
         return TensorSlopes(*(np.concatenate(rows) for rows in zip(*points, strict=True)))
 
-    def by_sines(
-        self, D: Floats, theta: Floats, B: Floats, modes: DiagonalModes | None = None
-    ) -> TensorSlopes:
-        """Evaluate even steps: mode k of the sine transform has covariance 2 D tau + w_k O.
-
-        All modes are diagonal in the axes that diagonalise D against 2 D tau + 2 O. A LinAlgError
-        is raised if that sum is not positive definite at one of the points. `modes` are those of
-        these points where they are known.
-        """
-        s, tau, (z, w) = self.steps, float(self.steps.duration[0]), self.spectrum
-        modes = self.modes(D, theta, B) if modes is None else modes
-        axes, power, inverse, q = modes.axes, modes.power, modes.inverse, modes.scaled
-        columns, back = np.swapaxes(q, 1, 2), np.swapaxes(axes, 1, 2)
-        same, next_one = columns @ q, columns @ (w[:, None] * q)
-        kept = np.arange(D.shape[1])
-        same[:, kept, kept] -= inverse.sum(axis=1)
-        next_one[:, kept, kept] -= w @ inverse
-        plain, weighted = axes @ same @ back, axes @ next_one @ back
-        log_det = np.log(power).sum(axis=(1, 2)) + len(z) * modes.log_det
-        value = -0.5 * (log_det + (modes.values * q).sum(axis=(1, 2)))
-        by_theta = 0.5 * np.einsum("jab,pab->pj", s.before[:, 0], weighted)
-        by_B = -s.dt * (weighted * D).reshape(len(D), -1).sum(axis=1)
-        by_D = tau * plain - (B * s.dt)[:, None, None] * weighted
-        found = TensorSlopes(value, by_D, by_theta, by_B, 0.5 * weighted)
-        bad = ~(power.min(axis=(1, 2)) > 0)
-        if bad.any():
-            for values, undefined in zip(found, TensorSlopes.undefined(D, theta), strict=True):
-                values[bad] = undefined[bad]
-        return found
-
-    def modes(self, D: Floats, theta: Floats, B: Floats) -> DiagonalModes:
-        """Return the sine modes of even steps in the axes that diagonalise all of them."""
-        z, w = self.spectrum
-        s, tau = self.steps, float(self.steps.duration[0])
-        noise = np.tensordot(theta, s.before[:, 0], 1) - 2 * (B * s.dt)[:, None, None] * D
-        root = np.linalg.inv(np.linalg.cholesky(2 * tau * D + 2 * noise))
-        across = np.swapaxes(root, 1, 2)
-        share, turn = np.linalg.eigh(root @ (2 * tau * D) @ across)
-        axes = across @ turn
-        power = share[:, None] + 0.5 * w[:, None] * (1 - share[:, None])
-        inverse, values = 1 / power, z @ axes
-        kept = np.arange(D.shape[1])
-        log_det = -2 * np.log(root[:, kept, kept]).sum(axis=1)
-        return DiagonalModes(axes, power, inverse, values, values * inverse, log_det)
-
-    def covariance_slopes(self, E: Floats, D: Floats, B: float) -> tuple[Floats, Floats]:
-        """Return the slopes of 2 D (m, b, b) and of the noise less blur (m + 1, b, b).
-
-        They are those along directions E (m, b, b) of D; the last one of the noise is that in B.
-        """
-        blur = -2 * self.steps.dt * np.concatenate([B * E, D[None]])
-        return 2 * E, blur
-
-    def sine_curvatures(self, E: Floats, D: Floats, B: float, modes: DiagonalModes) -> Floats:
-        """Return minus the second derivatives along E, in theta and in B, of even steps.
-
-        They are those of the covariances alone, as if these were linear. With the slopes
-        X_i = A_i + w_k N_i of mode k and its inverse covariance V, they are
-        y^T V X_i V X_j V y - tr(V X_i V X_j)/2 summed over the modes.
-        """
-        _, w = self.spectrum
-        axes, inverse, q = modes.axes[0], modes.inverse[0], modes.scaled[0]
-        of_D, of_noise = self.covariance_slopes(E, D, B)
-        shapes = self.steps.before[:, 0]
-        count, b = len(E) + len(shapes) + 1, len(D)
-        same = np.zeros((count, b, b))
-        same[: len(E)] = float(self.steps.duration[0]) * of_D
-        next_one = np.concatenate([of_noise[:-1], shapes, of_noise[-1:]])
-        same, next_one = (axes.T @ x @ axes for x in (same, next_one))
-        # Sums over the modes of q_a q_b V_c and of V_a V_c, times 1, w and w^2.
-        powers = w[:, None, None] ** np.arange(3)[:, None]
-        weights = (inverse[:, None] * powers).reshape(-1, 3 * b)
-        power = (q[:, :, None] * q[:, None]).reshape(-1, b * b).T @ weights
-        power, trace = power.reshape(b, b, 3, b), (inverse.T @ weights).reshape(b, 3, b)
-
-        def form(k: int, left: Floats, right: Floats) -> Floats:
-            turned = np.tensordot(right, power[:, :, k], axes=([2], [1]))  # (j, c, a, c')
-            turned = np.einsum("jcac->jac", turned) - 0.5 * trace[:, k] * np.swapaxes(right, 1, 2)
-            return np.asarray(left.reshape(count, -1) @ turned.reshape(count, -1).T)
-
-        mixed = form(1, same, next_one)
-        total: Floats = form(0, same, same) + mixed + mixed.T + form(2, next_one, next_one)
-        return total
+    def by_sines(self, D: Floats, theta: Floats, B: Floats) -> TensorSlopes:
+        """Evaluate even steps in their sine modes."""
+        track = self.even_track
+        return track.slopes(D, B, track.diagonal(D, theta, B))
 
     def band_curvatures(self, E: Floats, D: Floats, theta: Floats, B: float) -> Floats:
         """Return the average of observed and expected information along E, in theta and in B.
@@ -289,7 +172,9 @@ class NoisyVectors:
         if not np.isfinite(log_det):
             return np.full((len(E) + len(theta) + 1,) * 2, np.nan)
         z = dpbtrs(factor, s.vectors.reshape(-1), lower=1)[0].reshape(s.vectors.shape)
-        of_D, of_noise = self.covariance_slopes(E, D, B)
+        of_D, of_noise = (
+            x[0] for x in covariance_slopes(E[None], D[None], np.array([B]), np.array([s.dt]))
+        )
         linked, none = s.linked[:-1, None], np.zeros_like(D)
 
         def product(of_D: Floats, before: Floats, after: Floats) -> Floats:
@@ -307,6 +192,15 @@ class NoisyVectors:
         columns = np.stack([x.reshape(-1) for x in products], axis=1)
         return np.asarray(0.5 * columns.T @ dpbtrs(factor, columns, lower=1)[0])
 
+    def uneven_curvatures(self, E: Floats, D: Floats, theta: Floats, B: float) -> Floats:
+        """Return the average information of steps that are not even, as `band_curvatures`."""
+        if self.chain_track is None:
+            return self.band_curvatures(E, D, theta, B)
+        chains = self.chain_track.at(D, theta, B)
+        if chains is None:
+            return np.full((len(E) + len(theta) + 1,) * 2, np.nan)
+        return self.chain_track.curvatures(E, D, B, chains)
+
     def curvatures(self, D: Floats, slopes: Floats, bends: Floats, own: Floats) -> Floats:
         """Return minus the Hessian by the parameters of D and of the noise, (m + c, m + c).
 
@@ -317,12 +211,13 @@ class NoisyVectors:
         theta, B = self.amplitudes(own[None])
         m, r = len(slopes), len(self.theta)
         if self.steps.even:
-            modes = self.modes(D[None], theta, B)
-            found = self.by_sines(D[None], theta, B, modes)
-            full = self.sine_curvatures(slopes, D, float(B[0]), modes)
+            track = self.even_track
+            modes = track.diagonal(D[None], theta, B)
+            found = track.slopes(D[None], B, modes)
+            full = track.curvatures(slopes[None], D[None], B, modes)[0]
         else:
             found = self.by_tensor(D[None], theta, B)
-            full = self.band_curvatures(slopes, D, theta[0], float(B[0]))
+            full = self.uneven_curvatures(slopes, D, theta[0], float(B[0]))
         full[:m, :m] -= np.tensordot(bends, found.D[0], 2)
         # The noise less its blur contains -2 B dt D, which is not linear.
         mixed = 2 * self.steps.dt * np.tensordot(slopes, found.noise[0], 2)
@@ -338,13 +233,13 @@ class NoisyVectors:
             turn[m : m + r] = 2 * own[:r]
         if self.B is None:
             kept.append(m + r)
-            turn[-1] = _MOST_BLUR * np.sin(2 * own[-1])
+            turn[-1] = MOST_BLUR * np.sin(2 * own[-1])
         full *= turn[:, None] * turn
         if np.isfinite(self.freedom):
             full[amplitudes, amplitudes] -= 2 * by_theta
         if self.B is None:
-            twice = 2 * _MOST_BLUR * np.cos(2 * own[-1])
-            full[-1, -1] -= (found.B[0] - _LEAST_BLUR) * twice
+            twice = 2 * MOST_BLUR * np.cos(2 * own[-1])
+            full[-1, -1] -= (found.B[0] - LEAST_BLUR) * twice
         return np.asarray(full[np.ix_(kept, kept)])
 
     def by_bands(self, D: Floats, theta: Floats, B: float) -> TensorSlopes:
@@ -435,7 +330,7 @@ def squares(basis: Floats) -> Family:
     """Return the family D = L^2 with L = sum q_j E_j: all tensors >= 0 that share a symmetry.
 
     The basis (m, b, b) spans the symmetric matrices that are invariant under the symmetry; with L
-    also L^2 is invariant.
+    also L^2 is invariant. A basis (P, m, b, b) has one for each of P motions.
 
     Examples
     --------
@@ -443,13 +338,15 @@ def squares(basis: Floats) -> Family:
     >>> D.diagonal(), slopes[0].diagonal()
     (array([4., 4., 4.]), array([4., 4., 4.]))
     """
-    products = basis[:, None] @ basis
-    bends = products + np.swapaxes(products, 0, 1)
+    products = basis[..., :, None, :, :] @ basis[..., None, :, :, :]
+    bends = products + np.swapaxes(products, -4, -3)
 
-    def family(q: Floats) -> tuple[Floats, Floats, Floats]:
-        root: Floats = np.tensordot(q, basis, 1)
-        slope = basis @ root
-        return root @ root, slope + np.swapaxes(slope, 1, 2), bends
+    def family(q: Floats, rows: Ints | None = None) -> tuple[Floats, Floats, Floats]:
+        some, bent = (x[rows] if x.ndim > k else x for x, k in ((basis, 3), (bends, 4)))
+        root = np.sum(q[..., None, None] * some, axis=-3)
+        slope = some @ root[..., None, :, :]
+        bent = np.broadcast_to(bent, (*q.shape[:-1], *bent.shape[-4:]))
+        return root @ root, slope + np.swapaxes(slope, -1, -2), bent
 
     return family
 
@@ -457,7 +354,8 @@ def squares(basis: Floats) -> Family:
 def axial(axis: Floats) -> Family:
     """Return the tensors a^2 across and c^2 along an axis that may tilt away from this one.
 
-    The parameters are a, c and the tilt along the two directions across.
+    The parameters are a, c and the tilt along the two directions across. Axes (P, 3) are those of P
+    motions.
 
     Examples
     --------
@@ -465,30 +363,38 @@ def axial(axis: Floats) -> Family:
     >>> D.diagonal(), slopes.shape
     (array([1., 1., 4.]), (4, 3, 3))
     """
-    across = np.linalg.svd(axis[None])[2][1:]
-
+    sideways = np.linalg.svd(axis[..., None, :])[2][..., 1:, :]
     eye = np.eye(3)
 
-    def family(q: Floats) -> tuple[Floats, Floats, Floats]:
-        v = axis + q[2:] @ across
-        length = float(np.linalg.norm(v))
-        u = v / length
-        along = np.outer(u, u)
-        share = across @ u
-        tilt = (across - np.outer(share, u)) / length  # slopes of u
-        turned = np.einsum("ka,b->kab", tilt, u)
-        turned += np.swapaxes(turned, 1, 2)  # slopes of u u^T
-        second = np.einsum("l,ka->kla", share, tilt) + np.einsum("k,la->kla", share, tilt)
-        second = -(second + (tilt @ across.T)[..., None] * u) / length  # second derivatives of u
-        twice = np.einsum("kla,b->klab", second, u) + np.einsum("ka,lb->klab", tilt, tilt)
-        span = q[1] ** 2 - q[0] ** 2
-        slopes = np.concatenate([[2 * q[0] * (eye - along), 2 * q[1] * along], span * turned])
-        bends = np.zeros((4, 4, 3, 3))
-        bends[0, 0], bends[1, 1] = 2 * (eye - along), 2 * along
-        bends[0, 2:], bends[1, 2:] = -2 * q[0] * turned, 2 * q[1] * turned
-        bends[2:, 0], bends[2:, 1] = bends[0, 2:], bends[1, 2:]
-        bends[2:, 2:] = span * (twice + np.swapaxes(twice, 2, 3))
-        return q[0] ** 2 * eye + span * along, slopes, bends
+    def family(q: Floats, rows: Ints | None = None) -> tuple[Floats, Floats, Floats]:
+        first, across = (x[rows] if axis.ndim > 1 else x for x in (axis, sideways))
+        v = first + np.sum(q[..., 2:, None] * across, axis=-2)
+        length = np.linalg.norm(v, axis=-1)[..., None, None]
+        u = v / length[..., 0]
+        along = u[..., :, None] * u[..., None, :]
+        share = np.sum(across * u[..., None, :], axis=-1)
+        tilt = (across - share[..., None] * u[..., None, :]) / length  # slopes of u
+        turned = tilt[..., None] * u[..., None, None, :]
+        turned = turned + np.swapaxes(turned, -1, -2)  # slopes of u u^T
+        # Second derivatives of u, and of u u^T.
+        second = share[..., None, :, None] * tilt[..., :, None, :]
+        second = second + np.swapaxes(second, -3, -2)
+        second += (tilt @ np.swapaxes(across, -1, -2))[..., None] * u[..., None, None, :]
+        second /= -length[..., None]
+        twice = second[..., None] * u[..., None, None, None, :]
+        twice = twice + tilt[..., :, None, :, None] * tilt[..., None, :, None, :]
+        a, c = (q[..., k, None, None] for k in (0, 1))
+        span = (c**2 - a**2)[..., None, :, :]
+        slopes = np.empty((*q.shape, 3, 3))
+        slopes[..., 0, :, :], slopes[..., 1, :, :] = 2 * a * (eye - along), 2 * c * along
+        slopes[..., 2:, :, :] = span * turned
+        bends = np.zeros((*q.shape, 4, 3, 3))
+        bends[..., 0, 0, :, :], bends[..., 1, 1, :, :] = 2 * (eye - along), 2 * along
+        mixed = -2 * a[..., None, :, :] * turned, 2 * c[..., None, :, :] * turned
+        for k, one in enumerate(mixed):
+            bends[..., k, 2:, :, :] = bends[..., 2:, k, :, :] = one
+        bends[..., 2:, 2:, :, :] = span[..., None] * (twice + np.swapaxes(twice, -1, -2))
+        return a**2 * eye + span[..., 0, :, :] * along, slopes, bends
 
     return family
 
@@ -537,7 +443,7 @@ def maximise(tracks: Sequence[NoisyVectors], family: Family, q: Floats, own: Flo
         for _ in range(30):
             step = inverse @ slope
             gain = 0.5 * float(slope @ step)
-            if gain <= _CONVERGED_GAIN:
+            if gain <= CONVERGED_GAIN:
                 return Maximum(value, *problem.tensor_and_noise(p))
             trial = problem.line_search(p, value, step, gain)
             if trial is None:
@@ -545,7 +451,7 @@ def maximise(tracks: Sequence[NoisyVectors], family: Family, q: Floats, own: Flo
             new, new_value, new_slope = trial
             inverse = bfgs_update(inverse, new - p, slope - new_slope)
             p, value, slope = new, new_value, new_slope
-    if gain <= _ROUNDING_GAIN:
+    if gain <= ROUNDING_GAIN:
         return Maximum(value, *problem.tensor_and_noise(p))
     raise ValueError(
         f"the likelihood of these {sum(len(t.steps.vectors) for t in tracks)} steps has no maximum "
@@ -636,7 +542,7 @@ class PooledLikelihood:
         for part in 0.4 ** np.arange(16):
             new_value, slope = self.slopes(p + part * step)
             rises = new_value > value + 1e-3 * part * gain
-            if rises or (gain <= _ROUNDING_GAIN and np.isfinite(new_value)):
+            if rises or (gain <= ROUNDING_GAIN and np.isfinite(new_value)):
                 return p + part * step, new_value, slope
         return None
 
@@ -687,9 +593,9 @@ class ArrowHessian:
     def inverse(self) -> Floats:
         """Return the inverse (m + Gc, m + Gc), its negative curvatures turned positive."""
         count, m, c = self.mixed.shape
-        own = _positive_inverse(self.own)
+        own = positive_inverse(self.own)
         lever = self.mixed @ own
-        shared = _positive_inverse(self.shared - np.einsum("gmc,gnc->mn", lever, self.mixed))
+        shared = positive_inverse(self.shared - np.einsum("gmc,gnc->mn", lever, self.mixed))
         tail = -np.swapaxes(lever, 1, 2).reshape(count * c, m)
         inverse = np.empty((m + count * c,) * 2)
         inverse[:m, :m] = shared
@@ -708,7 +614,7 @@ class ArrowHessian:
         return information
 
 
-def _positive_inverse(a: Floats) -> Floats:
+def positive_inverse(a: Floats) -> Floats:
     """Return the inverse of symmetric matrices (..., c, c) with the sizes of their eigenvalues."""
     values, vectors = np.linalg.eigh(a)
     size = np.abs(values)
@@ -718,9 +624,9 @@ def _positive_inverse(a: Floats) -> Floats:
 
 
 def bfgs_update(inverse: Floats, step: Floats, fall: Floats) -> Floats:
-    """Return the BFGS update of an inverse Hessian; unchanged where the curvature is not positive.
+    """Return the BFGS update of inverse Hessians; unchanged where the curvature is not positive.
 
-    `fall` is the fall of the slopes along the step.
+    `fall` (..., n) is the fall of the slopes along the step (..., n).
 
     Examples
     --------
@@ -728,10 +634,13 @@ def bfgs_update(inverse: Floats, step: Floats, fall: Floats) -> Floats:
     array([[0.25, 0.  ],
            [0.  , 1.  ]])
     """
-    along = float(step @ fall)
-    if not along > 1e-14 * float(np.linalg.norm(step) * np.linalg.norm(fall)):
-        return inverse
-    pull = inverse @ fall
-    cross = np.outer(pull, step)
-    new: Floats = inverse - (cross + cross.T) / along
-    return new + np.outer(step, step) * ((1 + fall @ pull / along) / along)
+    along = np.sum(step * fall, axis=-1)
+    size = np.sqrt(np.sum(step**2, axis=-1) * np.sum(fall**2, axis=-1))
+    curved = along > 1e-14 * size
+    along = np.where(curved, along, 1.0)[..., None, None]
+    pull = (inverse @ fall[..., None])[..., 0]
+    cross = pull[..., :, None] * step[..., None, :]
+    new = inverse - (cross + np.swapaxes(cross, -1, -2)) / along
+    rise = np.sum(fall * pull, axis=-1)[..., None, None]
+    new += step[..., :, None] * step[..., None, :] * ((1 + rise / along) / along)
+    return np.asarray(np.where(curved[..., None, None], new, inverse))

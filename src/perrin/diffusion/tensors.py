@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from dataclasses import dataclass, replace
 from itertools import permutations
-from typing import TYPE_CHECKING, Literal, get_args
+from typing import TYPE_CHECKING, Literal, NamedTuple, get_args
 
 import numpy as np
 
@@ -13,6 +13,12 @@ from perrin._arrays import choice_fault, refuse
 from perrin.diffusion.estimate import UNITS
 from perrin.diffusion.noise_model import Noise, noise_faults
 from perrin.diffusion.steps import Quantity, body_steps
+from perrin.diffusion.tensor_batches import (
+    SeparateTensors,
+    batch_key,
+    maximise_each,
+    spread_each,
+)
 from perrin.diffusion.tensor_likelihood import (
     Maximum,
     NoisyVectors,
@@ -45,6 +51,11 @@ if TYPE_CHECKING:
 
 # Noise below this variance, relative to a step's, is rounding: that of simulated truth.
 _NOISELESS = 1e-8
+
+# About this many step components are evaluated at once; more do not stay in the processor's cache.
+_MOST_AT_ONCE = 30_000
+
+_ISOTROPIC = np.eye(3)[None] / 3**0.5
 
 
 def diffusion_tensor(
@@ -123,19 +134,80 @@ def diffusion_tensor(
     if isinstance(noise, Noise) and noise.drift:
         faults.append("noise: a drift is not subtracted from a tensor; leave drift out of it")
     _refuse_motions(motions, faults, needed=12)
+    settings = Noise.of(noise, exposure=exposure)
+    data, symbol, basis = _prepared(motions, quantity, settings, symmetry)
+    fit = tensor_fits([data], [basis])[0]
+    if isinstance(fit, ValueError):
+        raise fit
+    tensor = _described(fit, data, motions, quantity, symbol)
+    if np.isnan(tensor.covariance).any():
+        warnings.warn(f"diffusion_tensor: {NO_ERRORS}", PrecisionWarning, stacklevel=2)
+    return tensor
+
+
+def tensor_of_each(
+    motions: Sequence[RigidMotion], *, quantity: Quantity = "rotation", noise: Noise
+) -> list[DiffusionTensor | ValueError]:
+    """Estimate a tensor of its own for each motion, as `diffusion_tensor`, all of them together.
+
+    Parameters
+    ----------
+    motions : sequence of RigidMotion
+    quantity : {"rotation", "translation"}
+    noise : Noise
+
+    Returns
+    -------
+    list of DiffusionTensor or ValueError
+        The error that `diffusion_tensor` raises, where there is no tensor.
+
+    Examples
+    --------
+    >>> from perrin import Cluster, Noise, simulate_motion
+    >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=300, rng=3)
+    >>> [str(one)[:10] for one in tensor_of_each([truth, truth], noise=Noise())]
+    ['D_R = 0.00', 'D_R = 0.00']
+    """
+    found: list[DiffusionTensor | ValueError] = []
+    prepared = []
+    for one in motions:
+        try:
+            _refuse_motions([one], [], needed=12)
+            prepared.append((len(found), *_prepared([one], quantity, noise, None)))
+            found.append(ValueError("no tensor"))
+        except ValueError as error:
+            found.append(error)
+    fits = tensor_fits([data for _, data, _, _ in prepared], [basis for *_, basis in prepared])
+    for (i, data, symbol, _), fit in zip(prepared, fits, strict=True):
+        if isinstance(fit, ValueError):
+            found[i] = fit
+        else:
+            found[i] = _described(fit, data, [motions[i]], quantity, symbol)
+    return found
+
+
+def _prepared(
+    motions: Sequence[RigidMotion], quantity: Quantity, noise: Noise, symmetry: str | None
+) -> tuple[ScaledTracks, str, Floats]:
+    """Return the scaled steps, the point group to impose and a basis of the tensors that have it.
+
+    The motions share one tensor.
+    """
     turns = template_alignments(motions)
     symbol, basis = imposed_symmetry(motions[0], symmetry)
     steps = [body_steps(m, quantity, turn) for m, turn in zip(motions, turns, strict=True)]
-    data = ScaledTracks.of(steps, Noise.of(noise, exposure=exposure))
-    free = data.fit(symmetric_basis(3))
-    isotropic = data.fit(np.eye(3)[None] / 3**0.5, near=free)
-    p_isotropic, p_axial = data.p_values(free, isotropic)
-    known = {6: free, 1: isotropic}  # by the number of tensors that span what the symmetry allows
-    best = known[len(basis)] if len(basis) in known else data.fit(basis, near=free)
-    tensor = data.in_units(best.D)
-    covariance = data.covariance(best, basis, SYMMETRIC_ELEMENTS)
-    if np.isnan(covariance).any():
-        warnings.warn(f"diffusion_tensor: {NO_ERRORS}", PrecisionWarning, stacklevel=2)
+    return ScaledTracks.of(steps, noise), symbol, basis
+
+
+def _described(
+    fit: TensorFit,
+    data: ScaledTracks,
+    motions: Sequence[RigidMotion],
+    quantity: Quantity,
+    symbol: str,
+) -> DiffusionTensor:
+    """Return the tensor of some motions in um, rad and s, with its axes and errors."""
+    tensor = data.in_units(fit.best.D)
     values, axes = np.linalg.eigh(tensor)
     values = np.maximum(values, 0.0)  # the tensor is a square: below 0 is rounding
     axes = axes * np.sign(np.linalg.det(axes))
@@ -143,13 +215,13 @@ def diffusion_tensor(
         tensor=tensor,
         principal_values=values,
         axes=axes,
-        stderr=np.sqrt([element_variance(covariance, a, a) for a in axes.T]),
-        p_isotropic=p_isotropic,
-        p_axial=p_axial,
-        covariance=covariance,
-        axis_errors=axis_errors(values, axes, covariance),
+        stderr=np.sqrt([element_variance(fit.covariance, a, a) for a in axes.T]),
+        p_isotropic=fit.p_isotropic,
+        p_axial=fit.p_axial,
+        covariance=fit.covariance,
+        axis_errors=axis_errors(values, axes, fit.covariance),
         symmetry=symbol,
-        offset=data.mean_noise(best),
+        offset=data.mean_noise(fit.best),
         quantity=quantity,
         unit=UNITS[quantity],
         n_frames=sum(m.fitted.size for m in motions),
@@ -217,7 +289,8 @@ def coupled_tensor(
     basis = symmetric_basis(6)
     best = data.fit(basis)
     elements = [(i, j) for i in range(6) for j in range(i + 1)]
-    tensor, covariance = data.in_units(best.D), data.covariance(best, basis, elements)
+    tensor = data.in_units(best.D)
+    covariance = data.covariance(spread(data.tracks, best, basis), elements)
     if np.isnan(covariance).any():
         warnings.warn(f"coupled_tensor: {NO_ERRORS}", PrecisionWarning, stacklevel=2)
 
@@ -438,48 +511,27 @@ class ScaledTracks:
             )
         return cls(tracks, scale, time)
 
-    def fit(self, basis: Floats, near: Maximum | None = None) -> Maximum:
-        """Return the best tensor >= 0 in the span of a basis.
+    def start(self) -> tuple[Floats, Floats]:
+        """Return a D > 0 from the covariance of steps and of neighbours, and the noise (G, c)."""
+        duration = sum(float(t.steps.duration.sum()) for t in self.tracks)
+        products = [t.steps.vectors.T @ t.steps.vectors for t in self.tracks]
+        now = np.sum(products, axis=0) / duration
+        neighbour = np.sum([neighbour_products(t.steps) for t in self.tracks], axis=0) / duration
+        values, axes = np.linalg.eigh(0.5 * now + neighbour)
+        D = (axes * np.maximum(values, 0.05 * np.trace(now) / len(now))) @ axes.T
+        return D, np.array([t.start() for t in self.tracks])
 
-        Without a maximum to start from, D comes from the covariance of steps and of neighbours,
-        kept positive.
-        """
-        if near is None:
-            duration = sum(float(t.steps.duration.sum()) for t in self.tracks)
-            products = [t.steps.vectors.T @ t.steps.vectors for t in self.tracks]
-            now = np.sum(products, axis=0) / duration
-            neighbour = (
-                np.sum([neighbour_products(t.steps) for t in self.tracks], axis=0) / duration
-            )
-            values, axes = np.linalg.eigh(0.5 * now + neighbour)
-            D = (axes * np.maximum(values, 0.05 * np.trace(now) / len(now))) @ axes.T
-            own = np.array([t.start() for t in self.tracks])
-        else:
-            D, own = near.D, near.own
-        values, axes = np.linalg.eigh(D)
-        root = (axes * np.sqrt(np.maximum(values, 1e-3 * values[-1]))) @ axes.T
-        q = np.einsum("mij,ij->m", basis, root)
-        return maximise(self.tracks, squares(basis), q, own)
+    def fit(self, basis: Floats, near: Maximum | None = None) -> Maximum:
+        """Return the best tensor >= 0 in the span of a basis, near another maximum if given."""
+        D, own = self.start() if near is None else (near.D, near.own)
+        return maximise(self.tracks, squares(basis), root_parameters(D, basis), own)
 
     def fit_axial(self, near: Maximum) -> Maximum:
         """Return the best tensor with two values equal, about any axis."""
-        values, axes = np.linalg.eigh(near.D)
-        values = np.maximum(values, 1e-3 * values[-1])
-        found = []
-        for k, others in ((0, [1, 2]), (2, [0, 1])):
-            q = np.array([values[others].mean(), values[k], 0.0, 0.0]) ** [0.5, 0.5, 1, 1]
-            found.append(maximise(self.tracks, axial(axes[:, k]), q, near.own))
+        found = [
+            maximise(self.tracks, axial(axis), q, near.own) for axis, q in axial_starts(near.D)
+        ]
         return max(found, key=lambda m: m.value)
-
-    def p_values(self, free: Maximum, isotropic: Maximum) -> tuple[float, float]:
-        """Return the p-values of isotropy and of axial symmetry from likelihood ratios."""
-        from scipy.special import chdtrc
-
-        p_isotropic, p_axial = (
-            float(chdtrc(freedom, max(2 * (free.value - restricted.value), 0.0)))
-            for freedom, restricted in ((5, isotropic), (2, self.fit_axial(free)))
-        )
-        return p_isotropic, p_axial
 
     def in_units(self, D: Floats) -> Floats:
         """Return a tensor in um, rad and s."""
@@ -487,13 +539,13 @@ class ScaledTracks:
         return out
 
     def covariance(
-        self, best: Maximum, basis: Floats, elements: Sequence[tuple[int, int]]
+        self, spread: tuple[Floats, Floats], elements: Sequence[tuple[int, int]]
     ) -> Floats:
-        """Return the covariance of elements of D in um, rad and s; NaN where it is not known."""
-        directions, errors = spread(self.tracks, best, basis)
-        slopes = np.array([[self.in_units(e)[i, j] for e in directions] for i, j in elements])
-        covariance: Floats = slopes @ errors @ slopes.T
-        return covariance
+        """Return the covariance of elements of D in um, rad and s, from that along directions."""
+        directions, errors = spread
+        rows, columns = np.transpose(elements)
+        slopes = self.in_units(directions)[:, rows, columns].T
+        return np.asarray(slopes @ errors @ slopes.T)
 
     def mean_noise(self, best: Maximum) -> Floats:
         """Return the noise of one frame less blur in um and rad, mean over motions."""
@@ -501,6 +553,188 @@ class ScaledTracks:
         noise = np.mean([t.noise(best.D, own) for t, own in pairs], axis=0)
         out: Floats = noise * np.outer(self.scale, self.scale)
         return out
+
+
+class TensorFit(NamedTuple):
+    """The tensor of some motions in scaled units, with its error and two tests.
+
+    Attributes
+    ----------
+    best : Maximum
+        Most likely tensor of the symmetry that is imposed.
+    covariance : ndarray, shape (6, 6)
+        Covariance of its elements in um, rad and s.
+    p_isotropic, p_axial : float
+        p-values of isotropy and of axial symmetry, from likelihood ratios.
+    """
+
+    best: Maximum
+    covariance: Floats
+    p_isotropic: float
+    p_axial: float
+
+    @classmethod
+    def tested(
+        cls,
+        data: ScaledTracks,
+        best: Maximum,
+        spread: tuple[Floats, Floats],
+        *,
+        free: Maximum,
+        isotropic: Maximum,
+        axial: Maximum,
+    ) -> TensorFit:
+        """Return a fit with the p-values of likelihood ratios."""
+        from scipy.special import chdtrc
+
+        p_isotropic, p_axial = (
+            float(chdtrc(freedom, max(2 * (free.value - restricted.value), 0.0)))
+            for freedom, restricted in ((5, isotropic), (2, axial))
+        )
+        return cls(best, data.covariance(spread, SYMMETRIC_ELEMENTS), p_isotropic, p_axial)
+
+
+def tensor_fits(
+    data: Sequence[ScaledTracks], bases: Sequence[Floats]
+) -> list[TensorFit | ValueError]:
+    """Fit a tensor to each of some sets of tracks: those of one track with even steps together.
+
+    Parameters
+    ----------
+    data : sequence of ScaledTracks
+    bases : sequence of ndarray, shape (m, 3, 3)
+        Bases of the tensors of the symmetry that is imposed on each.
+
+    Returns
+    -------
+    list of TensorFit or ValueError
+        The error where no search converges.
+
+    Examples
+    --------
+    >>> from perrin import Cluster, Noise, simulate_motion
+    >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=300, rng=3)
+    >>> data = ScaledTracks.of([body_steps(truth, "rotation", np.eye(3))], Noise())
+    >>> tensor_fits([data], [np.eye(3)[None] / 3**0.5])[0].p_isotropic > 0.05
+    True
+    """
+    found: list[TensorFit | None] = [None] * len(data)
+    together: dict[tuple[object, ...], list[int]] = {}
+    for i, one in enumerate(data):
+        if len(one.tracks) == 1 and one.tracks[0].steps.even:
+            together.setdefault(batch_key(one.tracks[0]), []).append(i)
+    for group in together.values():
+        size = data[group[0]].tracks[0].steps.vectors.size
+        at_once = max(1, _MOST_AT_ONCE // size)
+        for k in range(0, len(group), at_once):
+            some = group[k : k + at_once]
+            fits = _even_fits([data[i] for i in some], [bases[i] for i in some])
+            for i, even_fit in zip(some, fits, strict=True):
+                found[i] = even_fit
+    fits_of_all: list[TensorFit | ValueError] = []
+    for one, basis, fit in zip(data, bases, found, strict=True):
+        try:
+            fits_of_all.append(_one_fit(one, basis) if fit is None else fit)
+        except ValueError as error:
+            fits_of_all.append(error)
+    return fits_of_all
+
+
+def _one_fit(data: ScaledTracks, basis: Floats) -> TensorFit:
+    """Fit a tensor to one set of tracks."""
+    free = data.fit(symmetric_basis(3))
+    isotropic = data.fit(_ISOTROPIC, near=free)
+    known = {6: free, 1: isotropic}  # by the number of tensors that span what the symmetry allows
+    best = known[len(basis)] if len(basis) in known else data.fit(basis, near=free)
+    spreads = spread(data.tracks, best, basis)
+    axially = data.fit_axial(free)
+    return TensorFit.tested(data, best, spreads, free=free, isotropic=isotropic, axial=axially)
+
+
+def _even_fits(data: Sequence[ScaledTracks], bases: Sequence[Floats]) -> list[TensorFit | None]:
+    """Fit tensors to single tracks with even steps; None where a search does not converge."""
+    each = SeparateTensors.of([one.tracks[0] for one in data])
+    every = np.arange(len(data))
+
+    def fitted(rows: Ints, basis: Floats, D: Floats, own: Floats) -> list[Maximum | None]:
+        q = root_parameters(D, basis)
+        return maximise_each(each.rows(rows), squares(basis), q, own)
+
+    starts = [one.start() for one in data]
+    D, own = np.stack([D for D, _ in starts]), np.concatenate([own for _, own in starts])
+    free = fitted(every, symmetric_basis(3), D, own)
+    # Where that did not converge the others are not needed.
+    kept = np.array([i for i in every if free[i] is not None], dtype=np.int64)
+    peaks = [one for one in free if one is not None]
+    found: list[TensorFit | None] = [None] * len(data)
+    if not peaks:
+        return found
+    D, own = np.stack([one.D for one in peaks]), np.concatenate([one.own for one in peaks])
+    isotropic = fitted(kept, _ISOTROPIC, D, own)
+    pairs = [pair for one in D for pair in axial_starts(one)]
+    about = axial(np.stack([axis for axis, _ in pairs]))
+    q = np.stack([q for _, q in pairs])
+    tilted = maximise_each(each.rows(np.repeat(kept, 2)), about, q, np.repeat(own, 2, axis=0))
+    sizes = np.array([len(bases[i]) for i in kept])
+    for size in np.unique(sizes):
+        where = np.flatnonzero(sizes == size)
+        basis = np.stack([bases[i] for i in kept[where]])
+        if size in (1, 6):
+            best = [(isotropic if size == 1 else peaks)[k] for k in where]
+        else:
+            best = fitted(kept[where], basis, D[where], own[where])
+        where = where[[one is not None for one in best]]
+        if not where.size:
+            continue
+        known = [one for one in best if one is not None]
+        basis = np.stack([bases[i] for i in kept[where]])
+        spreads = spread_each(each.rows(kept[where]), known, basis)
+        for k, one, directions, errors in zip(where, known, *spreads, strict=True):
+            sphere, first, last = isotropic[k], *tilted[2 * k : 2 * k + 2]
+            if sphere is None or first is None or last is None:
+                continue
+            found[kept[k]] = TensorFit.tested(
+                data[kept[k]],
+                one,
+                (directions, errors),
+                free=peaks[k],
+                isotropic=sphere,
+                axial=max(first, last, key=lambda m: m.value),
+            )
+    return found
+
+
+def root_parameters(D: Floats, basis: Floats) -> Floats:
+    """Return the parameters q (..., m) of a basis for which (sum q_j E_j)^2 is near D (..., b, b).
+
+    Examples
+    --------
+    >>> root_parameters(4 * np.eye(3), np.eye(3)[None] / 3).round(9)
+    array([2.])
+    """
+    values, axes = np.linalg.eigh(D)
+    roots = np.sqrt(np.maximum(values, 1e-3 * values[..., -1:]))
+    root = (axes * roots[..., None, :]) @ np.swapaxes(axes, -1, -2)
+    return np.asarray(np.einsum("...mij,...ij->...m", basis, root))
+
+
+def axial_starts(D: Floats) -> list[tuple[Floats, Floats]]:
+    """Return two axes and the parameters of `axial` from which to search for the best tensor.
+
+    Examples
+    --------
+    >>> [q.round(9).tolist() for _, q in axial_starts(np.diag([1.0, 4.0, 4.0]))]
+    [[2.0, 1.0, 0.0, 0.0], [1.58113883, 2.0, 0.0, 0.0]]
+    """
+    values, axes = np.linalg.eigh(D)
+    values = np.maximum(values, 1e-3 * values[-1])
+    return [
+        (
+            axes[:, k],
+            np.array([values[others].mean(), values[k], 0.0, 0.0]) ** [0.5, 0.5, 1, 1],
+        )
+        for k, others in ((0, [1, 2]), (2, [0, 1]))
+    ]
 
 
 def neighbour_products(steps: Steps) -> Floats:

@@ -20,7 +20,7 @@ from perrin.diffusion.goodness_of_fit import (
     BrownianTests,
     Score,
     axis_model,
-    brownian_tests,
+    brownian_tests_of_each,
     fisher,
     holm,
     largest_share,
@@ -238,7 +238,7 @@ def judge_motion(
         faults.append("noise: expected no drift; the verdict tests for a steady motion itself")
     refuse(faults)
     settings = Noise.of(noise, exposure=exposure)
-    tested = [brownian_tests(*axis_model(m, quantity, settings)) for m in motions]
+    tested = brownian_tests_of_each([axis_model(m, quantity, settings) for m in motions])
     each = tuple(
         _verdict([m], [one], quantity, settings) for m, one in zip(motions, tested, strict=True)
     )

@@ -1,5 +1,6 @@
 """Motion of a body: its position and orientation in every frame, their errors, its rigidity."""
 
+from perrin.motion.common_motion import CommonMotion, common_motion
 from perrin.motion.degenerate import (
     distance_change,
     mean_present,
@@ -18,6 +19,7 @@ from perrin.motion.dynamics import (
     hops,
     relaxing_coordinates,
 )
+from perrin.motion.error_ratio import ErrorRatio, error_ratio, with_error_ratio
 from perrin.motion.floor import NoiseFloor, floor_of, floor_range, noise_floor
 from perrin.motion.procrustes import (
     PoseFit,
@@ -65,7 +67,9 @@ __all__ = [
     "SETTLED_LOG_ODDS",
     "AxisNoise",
     "BondDrift",
+    "CommonMotion",
     "Confined",
+    "ErrorRatio",
     "Fractional",
     "Hopping",
     "NoiseFloor",
@@ -85,7 +89,9 @@ __all__ = [
     "body_residuals",
     "bond_drift",
     "chain_steps",
+    "common_motion",
     "distance_change",
+    "error_ratio",
     "fast_states",
     "fit_chain",
     "fit_projector",
@@ -125,4 +131,5 @@ __all__ = [
     "track_scanned",
     "unit_center_variance",
     "unit_covariance",
+    "with_error_ratio",
 ]

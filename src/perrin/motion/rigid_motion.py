@@ -99,10 +99,12 @@ class RigidMotion:
         """Number of coordinates of a point: 2 or 3."""
         return int(self.template.shape[1])
 
-    @property
+    @cached_property
     def fitted(self) -> Ints:
         """Indices of the frames that have a pose."""
-        return np.flatnonzero(np.isfinite(self.center[:, 0]))
+        rows = np.flatnonzero(np.isfinite(self.center[:, 0]))
+        frozen(rows)
+        return rows
 
     @property
     def R(self) -> float:
@@ -129,7 +131,7 @@ class RigidMotion:
             return None
         return symmetry_elements(self.template, error)
 
-    @property
+    @cached_property
     def usual_interval(self) -> float:
         """The median time between neighbouring poses of one piece, s; dt where there is no step."""
         start, stop = self.steps()
@@ -172,10 +174,16 @@ class RigidMotion:
 
         A gap is one longer step; no step joins two pieces.
         """
+        return self._step_ends
+
+    @cached_property
+    def _step_ends(self) -> tuple[Ints, Ints]:
         rows = self.fitted
         start, stop = rows[:-1], rows[1:]
         same = self.piece[start] == self.piece[stop]
-        return start[same], stop[same]
+        ends = start[same], stop[same]
+        frozen(*ends)
+        return ends
 
     def step_vectors(self) -> Floats:
         """Return the body-frame rotation vector of every step, log(R_k^T R_{k+1}).
@@ -186,9 +194,14 @@ class RigidMotion:
             Row k is the rotation (rad) that ends at frame k + 1, from the last pose before it; NaN
             where frame k + 1 has no pose or begins a piece.
         """
+        return self._step_vectors
+
+    @cached_property
+    def _step_vectors(self) -> Floats:
         start, stop = self.steps()
         vector = np.full((len(self.time) - 1, self.covariance.shape[-1]), np.nan)
         vector[stop - 1] = log_map(np.swapaxes(self.rotation[start], -1, -2) @ self.rotation[stop])
+        frozen(vector)
         return vector
 
     def orientation(self, p0: ArrayLike) -> Floats:

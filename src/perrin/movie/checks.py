@@ -15,6 +15,7 @@ import numpy as np
 from perrin._text import listed
 from perrin.geometry.shapes import pair_distances
 from perrin.motion.scanning import scan_share
+from perrin.run.kinds import part_of
 from perrin.tracks.groups import TOUCHING_REACH
 
 if TYPE_CHECKING:
@@ -24,19 +25,27 @@ if TYPE_CHECKING:
 
     from perrin._arrays import Floats, Ints
     from perrin.diffusion.estimate import DiffusionEstimate
+    from perrin.motion.error_ratio import ErrorRatio
     from perrin.motion.rigid_motion import RigidMotion
-    from perrin.run.results import ClusterResult
+    from perrin.run.results import BodyKind, ClusterResult
 
 
 _LISTED_ITEMS = 10  # largest number of frames or clusters that a message lists
 _TEST_LEVEL = 0.01  # one-sided level of the tests
 _NORMAL_QUANTILE = 2.326  # quantile of the normal distribution at that level
-_PAIR_BIAS = 0.03  # relative error of the mean pair distance
+_PAIR_BIAS, _NOTED_PAIR_BIAS = 0.03, 0.003  # relative error of the mean pair distance
 _BLEACHED = 0.1  # relative loss of brightness over the movie
 _DEPTH_CHANGE = 0.1  # relative change of brightness over the depth of the spheres
 _MISSING_SHARE = 0.1  # missing share of the spheres of the clusters
+_NOTED_ERROR_RATIO, _LARGE_ERROR_RATIO = 1.15, 2.0  # errors of positions over the stated ones
 _FAILED_SHARE = 0.01  # share of fits that did not converge
 _UNSAFE_STEP, _REFUSED_STEP = 0.25, 0.5  # rms step over the contact distance
+_RING_ERRORS = 5.0  # standard errors of the contrasts of a 2-D image
+_RING_CONTRAST, _OPPOSITE_CONTRAST = 1.2, 0.3  # contrast at the rim over that in the middle
+_MIDDLE, _RIM = 0.15, (0.25, 0.5)  # radii of middle and rim of a sphere over its diameter
+_BACKGROUND_DISTANCE, _LEAST_BACKGROUND = 1.5, 0.02  # in diameters; least share of the pixels
+_OVERLAP, _OVERLAP_SHARE = 0.85, 0.1  # distance over the contact; share of the places
+_FEWEST_PLACES = 8  # from which the contrasts are known
 _FAST_RATIO, _SLOW_ROTATION = 2.0, 0.5  # MSAD at the first lag over Phi^2; rms rotation, rad
 
 
@@ -418,6 +427,47 @@ def unrefined_spheres(features: pd.DataFrame) -> Findings:
     return _fit_failures(text, failed.sum() / len(features))
 
 
+def error_ratio_shown(ratio: ErrorRatio, *, axes: list[str]) -> Findings:
+    """State by how much rigid bodies show larger errors than the light alone leaves.
+
+    A warning where the errors of an axis are over twice the stated ones, a note above 1.15 or where
+    they change with time or depth.
+
+    Parameters
+    ----------
+    ratio : ErrorRatio
+    axes : list of str
+        Columns of the coordinates.
+    """
+    if ratio.is_one:
+        return _NOTHING
+    factor = np.sqrt(ratio.value)
+    error = ratio.stderr / (2 * factor)
+    listed_axes = ", ".join(
+        f"{axis} {f:.2f} +- {e:.2g}" for axis, f, e in zip(axes, factor, error, strict=True)
+    )
+    trend = [
+        f"{100 * (np.exp(rate / 2) - 1):+.2g} % a {unit}"
+        for rate, unit in ((ratio.by_time, "second"), (ratio.by_depth, "um of height"))
+        if rate
+    ]
+    changing = f", changing by {' and '.join(trend)}" if trend else ""
+    text = (
+        f"errors of the positions over those that the photons leave, from the residuals of rigid "
+        f"bodies: {listed_axes}{changing}; the stated errors of spheres and poses contain this"
+    )
+    if factor.max() > _LARGE_ERROR_RATIO:
+        return Findings(
+            (
+                text + "; smoothing, compression or flicker of the movie, or an image of the "
+                "spheres that the model does not describe",
+            )
+        )
+    if trend or factor.max() > _NOTED_ERROR_RATIO:
+        return Findings(notes=(text,))
+    return _NOTHING
+
+
 def unsettled_poses(count: int, of: int) -> Findings:
     """Count the fits of poses that failed; a warning above 1 %, else a note.
 
@@ -443,6 +493,8 @@ def pair_distance_bias(
 ) -> Findings:
     """Warn if the mean distance of touching spheres differs from the contact distance.
 
+    Above 0.3 % it is a note: an error that is constant in the body changes its shape, not D.
+
     Parameters
     ----------
     features : pandas.DataFrame
@@ -456,8 +508,16 @@ def pair_distance_bias(
     """
     mean, error = mean_pair_distance(features, contact=contact, axes=axes)
     off = mean / contact - 1
-    if not abs(off) > _PAIR_BIAS + _NORMAL_QUANTILE * error / contact:
+    if not abs(off) > _NOTED_PAIR_BIAS + _NORMAL_QUANTILE * error / contact:
         return _NOTHING
+    if not abs(off) > _PAIR_BIAS + _NORMAL_QUANTILE * error / contact:
+        text = (
+            f"distances of touching spheres read {100 * abs(off):.2g} +- "
+            f"{100 * error / contact:.1g} % {'short' if off < 0 else 'long'} of the contact "
+            f"distance {contact:.4g} um: a point spread that the model does not describe, unequal "
+            "spheres, or the contact itself; the shape and its R have this error, D is not affected"
+        )
+        return Findings(notes=(text,))
     why = (
         "centroid bias of touching spheres; run refinement (refine='model')"
         if refine is None
@@ -466,6 +526,130 @@ def pair_distance_bias(
     text = (
         f"mean pair distance {mean:.4g} +- {error:.1g} um, expected {contact:.4g} "
         f"({100 * off:+.1f} +- {100 * error / contact:.1g} %): {why}"
+    )
+    return Findings((text,))
+
+
+def ring_images(
+    images: Sequence[Floats],
+    places: Sequence[Floats],
+    *,
+    pixel: tuple[float, float],
+    diameter: float,
+    dark: bool,
+) -> Findings:
+    """Warn if the places found in a 2-D movie are no discs: rings, or gaps between dark spheres.
+
+    The contrast of a disc with the background is strongest in its middle, and has the same sign at
+    its rim. The background is the median of the pixels that are over 1.5 diameters from all places.
+
+    Parameters
+    ----------
+    images : sequence of ndarray, shape (ny, nx)
+        Some frames.
+    places : sequence of ndarray, shape (n, 2)
+        Places (x, y) found in each of them, um.
+    pixel : tuple of float
+        Size of a pixel (y, x), um.
+    diameter : float
+        Sphere diameter, um.
+    dark : bool
+        Whether spheres are searched for as darker than their surroundings.
+
+    Examples
+    --------
+    >>> y, x = np.mgrid[:60, :60] * 0.2
+    >>> away = np.hypot(x - 6.0, y - 6.0)
+    >>> ring = 100.0 - 50.0 * np.exp(-(((away - 1.0) / 0.2) ** 2))
+    >>> found = ring_images(
+    ...     [ring] * 9, [np.array([[6.0, 6.0]])] * 9, pixel=(0.2, 0.2), diameter=2.0, dark=True
+    ... )
+    >>> found.warnings[0][:40]
+    'ring images: the contrast of the places '
+    """
+    from scipy.spatial import cKDTree
+
+    middles, rims = [], []
+    for image, found in zip(images, places, strict=True):
+        if not len(found):
+            continue
+        y, x = (h * np.arange(n) for h, n in zip(pixel, image.shape, strict=True))
+        y, x = np.meshgrid(y, x, indexing="ij")
+        grid = np.stack([x.ravel(), y.ravel()], axis=1)
+        grey = image.ravel().astype(np.float64) * (-1.0 if dark else 1.0)
+        away, _ = cKDTree(found).query(grid)
+        far = away > _BACKGROUND_DISTANCE * diameter
+        if far.mean() < _LEAST_BACKGROUND:
+            continue
+        tree, level = cKDTree(grid), float(np.median(grey[far]))
+        for place in found:
+            near = np.array(tree.query_ball_point(place, _RIM[1] * diameter))
+            radius = np.linalg.norm(grid[near] - place, axis=1) / diameter
+            middle, rim = grey[near[radius < _MIDDLE]], grey[near[radius > _RIM[0]]]
+            if middle.size and rim.size:
+                middles.append(middle.mean() - level)
+                rims.append(rim.mean() - level)
+    if len(middles) < _FEWEST_PLACES:
+        return _NOTHING
+    middle, rim = np.array(middles), np.array(rims)
+    excess = rim - _RING_CONTRAST * np.maximum(middle, 0.0)
+    opposite = -rim - _OPPOSITE_CONTRAST * np.abs(middle)
+    for value, text in (
+        (
+            excess,
+            "ring images: the contrast of the places found is stronger at the rim than in the "
+            "middle ({rim:.3g} and {middle:.3g} grey levels): the spheres are rings, as in bright "
+            "field; between touching rims there are false places, and centroids are biased: focus "
+            "so that spheres are discs, or pass the clusters to leave out (exclude)",
+        ),
+        (
+            opposite,
+            "contrast: around the places found the image is {other} than the background (middle "
+            "{middle:+.3g}, rim {rim:+.3g} grey levels): they may be gaps between spheres that are "
+            "{other} than the background, as in bright field: pass dark={dark}, and look at the "
+            "places found",
+        ),
+    ):
+        if value.mean() > _RING_ERRORS * value.std() / np.sqrt(len(value)):
+            sign = -1.0 if dark else 1.0
+            words = {"other": "brighter" if dark else "darker", "dark": not dark}
+            numbers = {"rim": sign * rim.mean(), "middle": sign * middle.mean()}
+            return Findings((text.format(**words, **numbers),))
+    return _NOTHING
+
+
+def overlapping_places(places: Sequence[Floats], *, contact: float) -> Findings:
+    """Warn if many places of a 2-D movie are nearer to each other than spheres can be.
+
+    Parameters
+    ----------
+    places : sequence of ndarray, shape (n, 2)
+        Places found in some frames, um.
+    contact : float
+        Centre distance of touching spheres, um.
+
+    Examples
+    --------
+    >>> rims = np.array([[0.0, 0.0], [1.5, 0.0], [9.0, 0.0], [10.5, 0.0]])
+    >>> overlapping_places([rims, rims], contact=2.0).warnings[0][:43]
+    'overlap: 8 of 8 places (100 %) are nearer t'
+    """
+    from scipy.spatial import cKDTree
+    from scipy.special import bdtrc
+
+    near = total = 0
+    for found in places:
+        if len(found) > 1:
+            distance = cKDTree(found).query(found, k=2)[0][:, 1]
+            near += int((distance < _OVERLAP * contact).sum())
+        total += len(found)
+    if not near or bdtrc(near - 1, total, _OVERLAP_SHARE) > _TEST_LEVEL:
+        return _NOTHING
+    text = (
+        f"overlap: {near} of {total} places ({100 * near / total:.0f} %) are nearer than "
+        f"{_OVERLAP:g} contact distances to another, where spheres in a plane cannot be: some are "
+        "no spheres but parts of them or gaps between them (rings, as in bright field), spheres "
+        "lie above each other, or contact is too large"
     )
     return Findings((text,))
 
@@ -515,7 +699,9 @@ def mean_pair_distance(
     return mean, scatter / np.sqrt(spheres / 2)
 
 
-def missing_spheres(features: pd.DataFrame, *, size: int, contact: float, frames: Ints) -> Findings:
+def missing_spheres(
+    features: pd.DataFrame, *, sizes: Mapping[int, int], contact: float, frames: Ints
+) -> Findings:
     """Report the frames in which clusters have missing or additional spheres, or are missing.
 
     It is a warning if over 10 % of the spheres of the clusters are missing between their first and
@@ -525,8 +711,8 @@ def missing_spheres(features: pd.DataFrame, *, size: int, contact: float, frames
     ----------
     features : pandas.DataFrame
         As in `Bodies`.
-    size : int
-        Number of spheres of a cluster.
+    sizes : mapping
+        Number of spheres of each cluster.
     contact : float
         Centre distance of touching spheres, um.
     frames : ndarray of int
@@ -538,10 +724,11 @@ def missing_spheres(features: pd.DataFrame, *, size: int, contact: float, frames
     for cluster, rows in tracked.groupby("cluster"):
         present = rows.groupby("frame").size()
         first, last = int(present.index.min()), int(present.index.max())
-        due = int(((frames >= first) & (frames <= last)).sum())
+        due, size = int(((frames >= first) & (frames <= last)).sum()), sizes[int(cluster)]
         absent = due - len(present)
         few = present[present < size]
-        crowd = rows.groupby("frame")["together"].max().loc[lambda n: n > size]
+        near = rows.groupby("frame")["together"].max()
+        crowd = near[near > size]
         missing += size * absent + int((size - few).sum())
         expected += size * due
         parts = [
@@ -565,7 +752,8 @@ def missing_spheres(features: pd.DataFrame, *, size: int, contact: float, frames
     shown = "; ".join(f"cluster {c}: {text}" for c, text in list(texts.items())[:_LISTED_ITEMS])
     more = f"; and {len(texts) - _LISTED_ITEMS} more" if len(texts) > _LISTED_ITEMS else ""
     text = (
-        f"{100 * missing / expected:.2g} % of the spheres are missing, {size} expected in each of "
+        f"{100 * missing / expected:.2g} % of the spheres are missing, "
+        f"{listed(sorted(set(sizes.values())))} expected in each of "
         f"{tracked['cluster'].nunique()} clusters; {shown}{more}"
     )
     return Findings((text,)) if missing > _MISSING_SHARE * expected else Findings(notes=(text,))
@@ -607,6 +795,38 @@ def clusters_near_border(
             f"centre within d/2 + 2 sigma ({margin:.2g} um) of the border, "
             f"{f'cluster {name} ' if name else ''}{text}"
             for name, text in combined_verdicts(verdicts).items()
+        )
+    )
+
+
+def partial_bodies(results: Sequence[ClusterResult], kinds: Sequence[BodyKind]) -> Findings:
+    """Note the kinds of clusters that have the shape of a part of a larger kind.
+
+    Parameters
+    ----------
+    results : sequence of ClusterResult
+    kinds : sequence of BodyKind
+        Kinds of the results.
+    """
+    templates = {r.cluster: r.motion.template for r in results}
+    known = [kind for kind in kinds if kind.clusters[0] in templates]
+    texts = []
+    for kind in known:
+        shape = templates[kind.clusters[0]]
+        larger = [one for one in known if part_of(shape, templates[one.clusters[0]])]
+        if larger:
+            many = "s" if len(kind.clusters) > 1 else ""
+            texts.append(
+                f"cluster{many} {listed(kind.clusters)} ({kind.name}) in those of "
+                f"{' or '.join(one.name for one in larger)}"
+            )
+    if not texts:
+        return _NOTHING
+    return Findings(
+        notes=(
+            f"clusters with the shape of a part of larger ones: {'; '.join(texts)}; a sphere of "
+            "them may be undyed, dim or out of view, or they are smaller clusters: they are "
+            "measured with the spheres that are seen, and not pooled with the others",
         )
     )
 

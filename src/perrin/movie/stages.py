@@ -11,10 +11,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 import numpy as np
 
 from perrin.errors import FrameError, PrecisionWarning, TooFewFramesError
+from perrin.images.optics.learn import UsualImage
 from perrin.images.optics.optics import Optics
 from perrin.images.optics.window_fit import RigidCenters
 from perrin.images.spheres.localisation import Method, choose_method, found_table, sample_frames
 from perrin.images.spheres.poses import Pose, pose_in, with_poses
+from perrin.images.spheres.spots import Fading
 from perrin.movie.checks import Findings, unsettled_poses
 from perrin.movie.parts import PartWriter, open_parts, read_parts
 from perrin.movie.workers import work_through
@@ -165,6 +167,8 @@ def locate_frames(
         replace(search, minmass=learned["minmass"]),
         refine,
         None if found is None else Optics.from_dict(found),
+        None if learned["fading"] is None else Fading.from_dict(learned["fading"]),
+        None if learned["usual"] is None else UsualImage.from_dict(learned["usual"]),
     )
     rows, entries, notes = run_frames(
         _LocateTask(_without_times(stack), method),
@@ -210,8 +214,8 @@ def learn_method(
     Returns
     -------
     dict
-        Values that JSON can hold: ``minmass``, ``optics``, the ``spots`` of the sampled frames as
-        (frame, mass), and the warnings under ``told``.
+        Values that JSON can hold: ``minmass``, ``optics``, ``fading``, ``usual``, the ``spots`` of
+        the sampled frames as (frame, mass), and the warnings under ``told``.
 
     Raises
     ------
@@ -242,6 +246,8 @@ def learn_method(
     return {
         "minmass": method.search.minmass,
         "optics": None if method.optics is None else method.optics.to_dict(),
+        "fading": None if method.fading is None else method.fading.to_dict(),
+        "usual": None if method.usual is None else method.usual.to_dict(),
         "spots": [[seen.number, mass] for seen in sample for mass in seen.spots.mass.tolist()],
         "told": [str(warning.message) for warning in caught],
     }

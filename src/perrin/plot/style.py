@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from matplotlib import rc_context
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure as Figure
 
@@ -63,10 +64,15 @@ def save_figure(figure: Figure, stem: Path) -> list[Path]:
     """
     FigureCanvasAgg(figure)
     files = [stem.with_name(stem.name + suffix) for suffix in (".png", ".pdf")]
-    for file in files:
-        figure.savefig(file, dpi=DPI)
-        # The layout of the first file is used for the second one.
-        figure.set_layout_engine("none")
+    engine = figure.get_layout_engine()
+    # With a layout of its own every file would be drawn twice, first for the layout alone.
+    with rc_context({"figure.autolayout": False, "figure.constrained_layout.use": False}):
+        if engine is not None and figure.axes:
+            figure.set_dpi(DPI)
+            engine.execute(figure)
+        figure.set_layout_engine(None)
+        for file in files:
+            figure.savefig(file, dpi=DPI)
     return files
 
 

@@ -3,6 +3,7 @@
 from perrin.run.experiment import Experiment, Recording, argument_faults, merged_experiment
 from perrin.run.folders import check_place, check_resumable, filled_folder, staged_folder
 from perrin.run.grouping import assign_clusters
+from perrin.run.kinds import part_of, shape_numbers, usual_symmetry
 from perrin.run.layers import napari_layers, napari_reader, table_layers
 from perrin.run.measure import (
     ClusterTracks,
@@ -16,13 +17,17 @@ from perrin.run.measure import (
     judge_bodies,
     judge_coefficient,
     library_version,
-    measure_body,
+    measure_bodies,
     measure_coefficient,
+    measure_free_spheres,
+    measure_kinds,
     measure_rod,
     measure_table,
-    measure_tensor,
+    measure_tensors,
+    measured_body,
     measured_shape,
     misfit_as_labelled,
+    motion_and_path,
     noise_floor_test,
     pool_clusters,
     pool_coefficients,
@@ -50,6 +55,7 @@ from perrin.run.remarks import (
     absent_frames_notes,
     assumed_exposure_notes,
     common_jump_warnings,
+    common_motion_remarks,
     condensed,
     corrected_labels_text,
     cut_text,
@@ -81,6 +87,7 @@ from perrin.run.remarks import (
     removed_drift_notes,
     soft_clusters_warning,
     sparse_frames_warnings,
+    stage_jump_warnings,
     steady_motion_warning,
     unfit_diameter_text,
     unresolved_size_notes,
@@ -89,6 +96,7 @@ from perrin.run.remarks import (
     wrapped_box_text,
 )
 from perrin.run.results import (
+    BodyKind,
     ClusterResult,
     Pooled,
     Report,
@@ -101,11 +109,13 @@ from perrin.run.results import (
     predicted_noise,
     write_data,
 )
+from perrin.run.singles import SingleSpheres, measure_singles, track_steps
 from perrin.run.statements import kinds_text, motion_sentences, verdict_lines
 from perrin.run.tables import analyze, read_table
 from perrin.run.verdicts import fit_model, judge_each_and_all, verdicts_from_dict, verdicts_to_dict
 
 __all__ = [
+    "BodyKind",
     "ClusterResult",
     "ClusterTracks",
     "Coefficient",
@@ -122,6 +132,7 @@ __all__ = [
     "RodResult",
     "Shape",
     "ShapeMobility",
+    "SingleSpheres",
     "absent_frames_notes",
     "add_predictions",
     "analyze",
@@ -132,6 +143,7 @@ __all__ = [
     "check_place",
     "check_resumable",
     "common_jump_warnings",
+    "common_motion_remarks",
     "compare_axes",
     "compare_body",
     "compare_rod",
@@ -170,15 +182,20 @@ __all__ = [
     "limit_warnings",
     "load_run",
     "loose_particles_note",
-    "measure_body",
+    "measure_bodies",
     "measure_coefficient",
+    "measure_free_spheres",
+    "measure_kinds",
     "measure_rod",
+    "measure_singles",
     "measure_table",
-    "measure_tensor",
+    "measure_tensors",
+    "measured_body",
     "measured_shape",
     "merged",
     "merged_experiment",
     "misfit_as_labelled",
+    "motion_and_path",
     "motion_sentences",
     "motion_table",
     "napari_layers",
@@ -191,6 +208,7 @@ __all__ = [
     "noise_floor_test",
     "noise_floor_warning",
     "not_diffusion_warning",
+    "part_of",
     "perp_text",
     "persistence_warning",
     "pool_clusters",
@@ -199,16 +217,20 @@ __all__ = [
     "read_table",
     "removed_drift_notes",
     "run_settings",
+    "shape_numbers",
     "soft_clusters_warning",
     "solve_bodies",
     "solve_shape",
     "sparse_frames_warnings",
+    "stage_jump_warnings",
     "staged_folder",
     "steady_motion_warning",
     "table_layers",
+    "track_steps",
     "unfit_diameter_text",
     "unresolved_size_notes",
     "unsettled_notes",
+    "usual_symmetry",
     "verdict_lines",
     "verdicts_from_dict",
     "verdicts_to_dict",

@@ -4,29 +4,30 @@ from __future__ import annotations
 
 import platform
 import warnings as python_warnings
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import cache
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 
 from perrin.diffusion.changing import with_changing_interval
 from perrin.diffusion.estimate import DiffusionEstimate
-from perrin.diffusion.estimators import estimate_diffusion
+from perrin.diffusion.estimators import estimate_diffusion, estimate_each
 from perrin.diffusion.rods import estimate_rod
 from perrin.diffusion.step_tests import (
     Jumps,
     cut_at,
     find_jumps,
+    find_stage_jumps,
     offset_gain,
     persistence_gain,
     steady_motion,
     without_spin,
 )
-from perrin.diffusion.steps import residual_freedom
+from perrin.diffusion.steps import Quantity, residual_freedom
 from perrin.diffusion.switching import SwitchingEstimate
-from perrin.diffusion.tensors import diffusion_tensor
+from perrin.diffusion.tensors import tensor_of_each
 from perrin.errors import (
     DegenerateClusterError,
     IdentityWarning,
@@ -34,7 +35,9 @@ from perrin.errors import (
     TooFewFramesError,
 )
 from perrin.geometry.rotations import fit_rotations, log_map
+from perrin.geometry.symmetry import point_group
 from perrin.hydrodynamics.units import viscosity_remarks
+from perrin.motion.common_motion import common_motion
 from perrin.motion.floor import floor_range
 from perrin.motion.rigidity import Quality, judge_quality
 from perrin.motion.rods import RodMotion, track_direction
@@ -42,6 +45,7 @@ from perrin.motion.tracking import track_rotation, track_scanned
 from perrin.run import remarks as words
 from perrin.run.experiment import Experiment, Recording
 from perrin.run.grouping import assign_clusters
+from perrin.run.kinds import shape_numbers, usual_symmetry
 from perrin.run.predictions import (
     Shape,
     ShapeMobility,
@@ -54,6 +58,7 @@ from perrin.run.predictions import (
 )
 from perrin.run.remarks import Remarks
 from perrin.run.results import (
+    BodyKind,
     ClusterResult,
     Pooled,
     Report,
@@ -61,6 +66,7 @@ from perrin.run.results import (
     floor_factor,
     predicted_noise,
 )
+from perrin.run.singles import measure_singles
 from perrin.run.verdicts import fit_model, judge_each_and_all
 from perrin.tracks.clock import frame_stride, own_times, read_clock
 from perrin.tracks.clusters import each_cluster
@@ -75,7 +81,6 @@ if TYPE_CHECKING:
 
     from perrin._arrays import Bools, Floats, Ints
     from perrin.diffusion.noise_model import Noise
-    from perrin.diffusion.steps import Quantity
     from perrin.diffusion.tensor_results import DiffusionTensor
     from perrin.diffusion.verdict import MotionVerdict
     from perrin.motion.floor import NoiseFloor
@@ -83,10 +88,8 @@ if TYPE_CHECKING:
 
     Progress: TypeAlias = Callable[[int, int, str], None]
 
-    # A better motion for every cluster, from its motion and the frame numbers of its rows.
-    Improve: TypeAlias = Callable[
-        [Mapping[int, tuple[RigidMotion, Ints]]], Mapping[int, RigidMotion]
-    ]
+    # Better motions by cluster number, from the fitted bodies and the number of the first frame.
+    Improve: TypeAlias = Callable[[Sequence["FittedBody"], int], Mapping[int, RigidMotion]]
 
 
 # Clusters have no common D if they agree less well than this by chance.
@@ -98,6 +101,9 @@ _STEADY_LEVEL = 1e-3
 # A motion that is not diffusion is a warning below this p-value, shared by both quantities, and
 # half of it by all clusters where several are also judged together.
 _VERDICT_LEVEL = 0.005
+
+# The symmetry of a straight chain is that of places equal within this share of its length.
+_SAME_PLACE = 0.03
 
 # Noise floor and alike steps are tested at this number of standard errors (0.05 % of clean
 # tracks), the noise floor for any ratio sigma_z/sigma_xy up to this one.
@@ -145,16 +151,22 @@ class FittedBody:
         Positions that were fitted.
     motion : RigidMotion
         Fitted positions and orientations.
+    positions : ndarray, shape (T, n, d)
+        Positions that the motion was fitted to, um, each column one particle.
     quality : Quality
         Rigidity, errors per axis, and what was corrected.
     remarks : Remarks
         Warnings and notes on identity and fit.
+    stage : ndarray of int
+        Rows at which a step ends that contains a jump of the stage and is left out of D_T.
     """
 
     tracks: ClusterTracks
     motion: RigidMotion
+    positions: Floats
     quality: Quality
     remarks: Remarks
+    stage: Ints = field(default_factory=lambda: np.empty(0, dtype=np.int64))
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,6 +233,7 @@ def measure_table(
     recording: Recording | None = None,
     improved: Improve | None = None,
     remarks: Remarks | None = None,
+    singles: pd.DataFrame | None = None,
     progress: Progress | None = None,
 ) -> Report:
     """Measure every cluster of a clean table: `analyze` without reading and checking.
@@ -241,6 +254,8 @@ def measure_table(
         be left out.
     remarks : Remarks, optional
         Remarks from reading and screening the table.
+    singles : pandas.DataFrame, optional
+        Tracks of single particles, as in `measure_singles`, with frames as in the table.
     progress : callable, optional
         Called with the number of finished clusters, their total, and what is done.
 
@@ -264,30 +279,38 @@ def measure_table(
     remarks += more
     bodies, rods, failures = fit_clusters(table, labels, experiment, recording, progress=progress)
     if improved is not None:
-        motions = improved({b.tracks.cluster: (b.motion, b.tracks.frames + first) for b in bodies})
+        motions = improved(bodies, first)
         bodies = [
             replace(b, motion=motions[b.tracks.cluster])
             for b in bodies
             if b.tracks.cluster in motions
         ]
-    measured: list[MeasuredBody] = []
-    for number, body in enumerate(bodies):
-        if progress is not None:
-            progress(number, len(bodies), "measuring clusters")
-        try:
-            measured.append(measure_body(body, experiment, recording, tested=len(bodies)))
-        except (DegenerateClusterError, TooFewFramesError) as error:
-            failures.append((body.tracks.label or str(body.tracks.cluster), error))
+    placed = [b for b in bodies if not centre_removed(b.tracks.positions)]
+    stage = find_stage_jumps([b.motion for b in placed], [b.tracks.frames for b in placed])
+    remarks.warnings.extend(
+        words.stage_jump_warnings(stage, first_frame=first, kept=experiment.keep_jumps)
+    )
+    if not experiment.keep_jumps:
+        bodies = [replace(b, stage=stage.rows(b.tracks.frames)) for b in bodies]
+    if progress is not None:
+        progress(0, 0, "estimating D_R and D_T")
+    measured, failed = measure_bodies(bodies, experiment, recording)
+    failures += failed
     if failures and not (measured or rods):
         raise failures[-1][1]
-    if progress is not None:
-        progress(0, 0, "judging the motion")
-    measured, together = judge_bodies(measured, experiment, first_frame=first)
-    pooled, unpooled = pool_clusters(measured, experiment, together)
+    remarks += words.common_motion_remarks(
+        common_motion([(m.translation.motion, m.body.tracks.frames) for m in measured])
+    )
+    measured, kinds, unpooled = measure_kinds(measured, rods, experiment, first_frame=first)
+    pooled = [kind.pooled for kind in kinds if kind.pooled is not None]
+    loose = None
+    if singles is not None:
+        shifted = singles.assign(frame=singles["frame"] - first)
+        loose = measure_singles(shifted, experiment.noise, recording)
     results, rods = add_predictions([one.result for one in measured], rods, experiment)
     return Report(
         clusters=tuple(results),
-        pooled=pooled,
+        pooled=pooled[0] if len(pooled) == 1 else None,
         warnings=(
             *unpooled,
             *remarks.warnings,
@@ -306,6 +329,8 @@ def measure_table(
         settings=run_settings(source, arguments=arguments, first_frame=first),
         rods=tuple(rods),
         notes=(*remarks.notes, *words.assumed_exposure_notes(experiment.noise)),
+        kinds=tuple(kinds),
+        singles=loose,
     )
 
 
@@ -455,7 +480,7 @@ def fit_body(tracks: ClusterTracks, experiment: Experiment, recording: Recording
     remarks.notes.extend(words.unsettled_notes(frames[identity.unsettled] + first, of=count))
     remarks.warnings.extend(words.fast_turning_warnings(cuts=cuts.size, of=count))
     return FittedBody(
-        tracks, motion, quality, remarks + Remarks([*quality.warnings], [*quality.notes])
+        tracks, motion, positions, quality, remarks + Remarks([*quality.warnings], [*quality.notes])
     )
 
 
@@ -515,37 +540,82 @@ def measure_rod(tracks: ClusterTracks, experiment: Experiment, recording: Record
     )
 
 
-def measure_body(
-    body: FittedBody, experiment: Experiment, recording: Recording, *, tested: int
+def measure_bodies(
+    bodies: Sequence[FittedBody], experiment: Experiment, recording: Recording
+) -> tuple[list[MeasuredBody], list[tuple[str, ValueError]]]:
+    """Estimate the coefficients and the tensors of all bodies, and collect the remarks on them.
+
+    Returns
+    -------
+    measured : list of MeasuredBody
+    failures : list of tuple
+        Names of the bodies whose steps give no estimate, with the error.
+    """
+    found = []
+    failures: list[tuple[str, ValueError]] = []
+    noise = experiment.noise
+    turns = estimate_each([b.motion for b in bodies], quantity="rotation", noise=noise)
+    without_stage = [motion_and_path(b, "translation")[0] for b in bodies]
+    paths = estimate_each(without_stage, quantity="translation", noise=noise)
+    for body, first, second in zip(bodies, turns, paths, strict=True):
+        try:
+            measured = []
+            for quantity, estimate in zip(get_args(Quantity), (first, second), strict=True):
+                if isinstance(estimate, TooFewFramesError):
+                    raise estimate
+                measured.append(
+                    measure_coefficient(
+                        body, quantity, estimate, experiment, recording, tested=len(bodies)
+                    )
+                )
+            turn, path = measured
+            found.append((body, turn, path))
+        except (DegenerateClusterError, TooFewFramesError) as error:
+            failures.append((body.tracks.label or str(body.tracks.cluster), error))
+    turning = [
+        turn.motion
+        if turn.estimate.drift is None
+        else without_spin(turn.motion, turn.estimate.drift[0])
+        for _, turn, _ in found
+    ]
+    tensors = measure_tensors(turning, "rotation", experiment.noise)
+    results = [
+        measured_body(*one, *tensor, experiment=experiment, recording=recording)
+        for one, tensor in zip(found, tensors, strict=True)
+    ]
+    return results, failures
+
+
+def measured_body(
+    body: FittedBody,
+    turn: Coefficient,
+    path: Coefficient,
+    tensor: DiffusionTensor | None,
+    no_tensor: Sequence[str],
+    *,
+    experiment: Experiment,
+    recording: Recording,
 ) -> MeasuredBody:
-    """Estimate the coefficients and the tensor of a body, and collect the remarks on them.
+    """Collect what was measured of a body, and the remarks on it.
 
     Parameters
     ----------
     body : FittedBody
+    turn, path : Coefficient
+        Rotational and translational coefficient.
+    tensor : DiffusionTensor or None
+    no_tensor : sequence of str
+        Why there is no tensor.
     experiment : Experiment
     recording : Recording
-    tested : int
-        Number of clusters that share the level of the test for a steady motion.
 
     Returns
     -------
     MeasuredBody
-
-    Raises
-    ------
-    DegenerateClusterError, TooFewFramesError
-        If the steps of the body give no estimate.
     """
     tracks, motion = body.tracks, body.motion
-    turn = measure_coefficient(body, "rotation", experiment, recording, tested=tested)
-    path = measure_coefficient(body, "translation", experiment, recording, tested=tested)
     D_R, D_T = turn.estimate, path.estimate
     noise = predicted_noise(motion)
-    turning = turn.motion
-    if D_R.drift is not None:
-        turning = without_spin(turning, D_R.drift[0])
-    tensor, no_tensor = measure_tensor(turning, "rotation", experiment.noise)
     # The offset of steps that contain another motion, or of a body that bends, is no noise.
     floor: list[str] = []
     if body.quality.rigid and turn.brownian:
@@ -575,9 +645,12 @@ def measure_body(
             *no_tensor,
         ),
         jumps={
-            name: tuple(tracks.frames[found.left_out].tolist())
-            for name, found in (("rotation", turn), ("translation", path))
-            if found.left_out.size
+            name: tuple(tracks.frames[rows].tolist())
+            for name, rows in (
+                ("rotation", turn.left_out),
+                ("translation", np.union1d(path.left_out, body.stage)),
+            )
+            if rows.size
         },
     )
     return MeasuredBody(body, turn, path, result)
@@ -586,6 +659,7 @@ def measure_body(
 def measure_coefficient(
     body: FittedBody,
     quantity: Quantity,
+    estimate: DiffusionEstimate,
     experiment: Experiment,
     recording: Recording,
     *,
@@ -597,6 +671,8 @@ def measure_coefficient(
     ----------
     body : FittedBody
     quantity : {"rotation", "translation"}
+    estimate : DiffusionEstimate
+        Estimate from all steps.
     experiment : Experiment
     recording : Recording
     tested : int
@@ -614,9 +690,7 @@ def measure_coefficient(
         )
         none = Jumps(nothing, np.empty((0, 3)), np.empty(0), 0)
         return Coefficient(estimate, motion, motion, none, nothing, True, Remarks())
-    estimate = _estimated_quietly(motion, quantity, noise)
-    # Doubt about the labels cuts the track, but the centre's path crosses it.
-    path = motion if quantity == "rotation" else replace(motion, piece=np.zeros_like(motion.piece))
+    motion, path = motion_and_path(body, quantity)
     jumps = find_jumps(path, estimate)
     left_out = jumps.rows[:0]
     remarks = Remarks()
@@ -651,6 +725,18 @@ def measure_coefficient(
     return Coefficient(estimate, motion, path, jumps, left_out, brownian, remarks)
 
 
+def motion_and_path(body: FittedBody, quantity: Quantity) -> tuple[RigidMotion, RigidMotion]:
+    """Return the motion that a coefficient is estimated from, and the one to search for jumps.
+
+    Doubt about the labels cuts a track, but the path of the centre crosses it. A jump of the stage
+    cuts that path, and leaves the rotation as it is.
+    """
+    if quantity == "rotation":
+        return body.motion, body.motion
+    whole = replace(body.motion, piece=np.zeros_like(body.motion.piece))
+    return cut_at(body.motion, body.stage), cut_at(whole, body.stage)
+
+
 def _estimated_quietly(
     motion: RigidMotion | list[RigidMotion], quantity: Quantity, noise: Noise
 ) -> DiffusionEstimate:
@@ -666,8 +752,74 @@ def _estimated_quietly(
         )
 
 
+def measure_kinds(
+    measured: Sequence[MeasuredBody],
+    rods: Sequence[RodResult],
+    experiment: Experiment,
+    *,
+    first_frame: int,
+) -> tuple[list[MeasuredBody], list[BodyKind], list[str]]:
+    """Judge and pool the bodies of each number of particles and shape; those of others never.
+
+    Parameters
+    ----------
+    measured : sequence of MeasuredBody
+    rods : sequence of RodResult
+    experiment : Experiment
+    first_frame : int
+        The table's own number of its first frame.
+
+    Returns
+    -------
+    measured : list of MeasuredBody
+        Bodies with verdicts, sorted by number of particles and shape.
+    kinds : list of BodyKind
+    warnings : list of str
+        As in `pool_clusters`; where there are several kinds, with the kind.
+    """
+    shapes = shape_numbers(
+        [one.body.motion.template for one in measured],
+        rigid=[one.body.quality.rigid for one in measured],
+    )
+    lines = shape_numbers([np.outer(rod.motion.places, [0.0, 0.0, 1.0]) for rod in rods])
+    judged: list[MeasuredBody] = []
+    kinds: list[BodyKind] = []
+    found: list[tuple[str, str]] = []
+    for number in np.unique(shapes).tolist():
+        members = [one for one, shape in zip(measured, shapes, strict=True) if shape == number]
+        part, together = judge_bodies(
+            members, experiment, first_frame=first_frame, tested=len(measured)
+        )
+        pooled, texts = pool_clusters(part, experiment, together)
+        judged += part
+        kind = BodyKind(
+            size=len(part[0].body.motion.template),
+            point_group=usual_symmetry([one.body.quality.symmetry for one in part]),
+            clusters=tuple(one.result.cluster for one in part),
+            pooled=pooled,
+        )
+        kinds.append(kind)
+        found += [(kind.name, text) for text in texts]
+    for number in np.unique(lines).tolist():
+        same = [rod for rod, line in zip(rods, lines, strict=True) if line == number]
+        places = same[0].motion.places
+        centred = np.outer(places, [0.0, 0.0, 1.0])
+        kinds.append(
+            BodyKind(
+                size=len(places),
+                point_group=point_group(centred, tolerance=_SAME_PLACE * float(np.ptp(places))),
+                clusters=tuple(rod.cluster for rod in same),
+                D_perp=estimate_rod([rod.motion for rod in same]),
+                D_T=estimate_rod([rod.motion for rod in same], quantity="translation"),
+            )
+        )
+    kinds.sort(key=lambda kind: kind.size)
+    warnings = [f"{name}: {text}" if len(kinds) > 1 else text for name, text in found]
+    return judged, kinds, warnings
+
+
 def judge_bodies(
-    measured: Sequence[MeasuredBody], experiment: Experiment, *, first_frame: int
+    measured: Sequence[MeasuredBody], experiment: Experiment, *, first_frame: int, tested: int
 ) -> tuple[list[MeasuredBody], dict[str, MotionVerdict | None]]:
     """Judge what kind of motion every body shows, and all rigid ones together.
 
@@ -677,6 +829,8 @@ def judge_bodies(
     experiment : Experiment
     first_frame : int
         The table's own number of its first frame.
+    tested : int
+        Number of clusters that share the level of a warning.
 
     Returns
     -------
@@ -706,7 +860,7 @@ def judge_bodies(
                 measured[i].body,
                 experiment,
                 first_frame=first_frame,
-                tested=len(measured),
+                tested=tested,
             )
         used = [i for i in shown if measured[i].body.quality.rigid]
         if common is not None and len(used) > 1:
@@ -801,21 +955,23 @@ def judge_coefficient(
     return replace(coefficient, estimate=estimate, verdict=verdict, remarks=remarks)
 
 
-def measure_tensor(
-    motion: RigidMotion, quantity: Quantity, noise: Noise
-) -> tuple[DiffusionTensor | None, list[str]]:
-    """Return the tensor in body axes, or None and the reason; in the plane there is none."""
-    if motion.template.shape[1] != 3:
-        return None, []
-    try:
-        with python_warnings.catch_warnings():
-            python_warnings.simplefilter("ignore", PrecisionWarning)
-            tensor = diffusion_tensor(
-                motion, quantity=quantity, noise=noise.model, exposure=noise.exposure
-            )
-    except ValueError as error:
-        return None, [f"no diffusion tensor: {error}"]
-    return tensor, []
+def measure_tensors(
+    motions: Sequence[RigidMotion], quantity: Quantity, noise: Noise
+) -> list[tuple[DiffusionTensor | None, list[str]]]:
+    """Return the tensor of each motion in body axes, or None and the reason.
+
+    In the plane there is none, and no reason is needed.
+    """
+    solid = [motion for motion in motions if motion.dimension == 3]
+    found = iter(tensor_of_each(solid, quantity=quantity, noise=replace(noise, drift=False)))
+    tensors: list[tuple[DiffusionTensor | None, list[str]]] = []
+    for motion in motions:
+        tensor = next(found) if motion.dimension == 3 else None
+        if isinstance(tensor, ValueError):
+            tensors.append((None, [f"no diffusion tensor: {tensor}"]))
+        else:
+            tensors.append((tensor, []))
+    return tensors
 
 
 def noise_floor_test(
@@ -954,7 +1110,9 @@ def with_sizes(
         tensor_T = None
         # A drift would mix with the translation along the axes of the body.
         if not experiment.noise.drift and are_unequal(mobility.principal_D_T.values):
-            tensor_T, no_tensor = measure_tensor(result.motion, "translation", experiment.noise)
+            tensor_T, no_tensor = measure_tensors([result.motion], "translation", experiment.noise)[
+                0
+            ]
             notes += no_tensor
         prediction = compare_body(
             mobility, D_T=D_T, D_R=D_R, tensor_T=tensor_T, tensor_R=result.tensor
@@ -1068,6 +1226,58 @@ def pool_coefficients(
         except ValueError:  # the notes of the clusters state it
             verdict = replace(verdict, model=None)
     return estimate, verdict, warnings
+
+
+def measure_free_spheres(
+    table: pd.DataFrame,
+    experiment: Experiment,
+    recording: Recording,
+    *,
+    source: Mapping[str, str | None],
+    arguments: Mapping[str, Any],
+) -> Report:
+    """Return the report of a movie in which no spheres form a cluster.
+
+    Parameters
+    ----------
+    table : pandas.DataFrame
+        Tracks of the single spheres, as in `measure_singles`.
+    experiment : Experiment
+    recording : Recording
+        Times of the frames.
+    source, arguments : mapping
+        Input and arguments for ``run.json``.
+
+    Returns
+    -------
+    Report
+        Without clusters; `Report.singles` has the D_T of the spheres.
+
+    Raises
+    ------
+    DegenerateClusterError
+        If the tracks are too few or too short for a D_T either.
+    """
+    first = int(table["frame"].min())
+    table = table.assign(frame=table["frame"] - first, cluster=-1).reset_index(drop=True)
+    clock = None if recording.times is None else recording.times.from_frame(first)
+    recorded = np.unique(table["frame"].to_numpy(dtype=np.int64))
+    whole = replace(recording, times=clock, first_frame=first, recorded=recorded)
+    singles = measure_singles(table, experiment.noise, whole)
+    if singles is None:
+        raise DegenerateClusterError(
+            f"no cluster: {words.NO_BODY}; single spheres are followed over too few frames for a "
+            "D_T"
+        )
+    return Report(
+        clusters=(),
+        pooled=None,
+        warnings=(f"no clusters: {words.NO_BODY}; {words.FREE_SPHERES}",),
+        tracks=table,
+        settings=run_settings(source, arguments=arguments, first_frame=first),
+        notes=tuple(words.assumed_exposure_notes(experiment.noise)),
+        singles=singles,
+    )
 
 
 @cache

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from perrin._text import frames_text, listed, with_error
-from perrin.diffusion.step_tests import JUMP_LEVEL
+from perrin.diffusion.step_tests import JUMP_LEVEL, STAGE_LEVEL
 from perrin.tracks.screening import far_sentence
 
 if TYPE_CHECKING:
@@ -18,9 +18,10 @@ if TYPE_CHECKING:
     from perrin._arrays import Bools, Floats, Ints
     from perrin.diffusion.estimate import DiffusionEstimate
     from perrin.diffusion.noise_model import Noise
-    from perrin.diffusion.step_tests import Jumps, SteadyMotion
+    from perrin.diffusion.step_tests import Jumps, StageJumps, SteadyMotion
     from perrin.diffusion.steps import Quantity
     from perrin.diffusion.verdict import MotionVerdict
+    from perrin.motion.common_motion import CommonMotion
 
 
 CONSTANT_Z = "z never changes: leave the column out to analyse motion in the plane"
@@ -37,6 +38,11 @@ _SHARE_FOR_NOTE = 0.01
 
 # Jumps whose lengths differ by less than this share are all of one length.
 _ONE_LENGTH = 0.3
+
+# A motion that all bodies share is named below this chance and above this share of the mean square
+# step: two spheres in a fluid, three radii apart, share a third.
+_COMMON_LEVEL, _COMMON_SHARE = 1e-4, 0.35
+_AXIS_ERRORS = 3.0  # of the covariance along an axis that is named
 
 # A track is cut too often beyond this share of the frames.
 _SHARE_OF_CUTS = 0.02
@@ -561,6 +567,42 @@ def jump_warning(jumps: Jumps, frames: Ints, quantity: Quantity, *, kept: bool) 
     )
 
 
+def stage_jump_warnings(stage: StageJumps, *, first_frame: int, kept: bool) -> list[str]:
+    """Name the jumps of the stage, with frame and displacement.
+
+    Parameters
+    ----------
+    stage : StageJumps
+        Common displacements of all bodies, with frames counted from the table's first.
+    first_frame : int
+        The table's own number of its first frame.
+    kept : bool
+        Whether the estimates contain the jumps.
+
+    Examples
+    --------
+    >>> from perrin.diffusion.step_tests import StageJumps
+    >>> one = StageJumps(
+    ...     np.array([9]), np.array([[1.2, 0.0, 0.1]]), np.full((1, 3), 0.12), np.zeros(1),
+    ...     np.array([4]),
+    ... )
+    >>> stage_jump_warnings(one, first_frame=1, kept=False)[0][:76]
+    'stage jump: 4 clusters move together by (1.2, 0, 0.1) +- 0.12 um at frame 10'
+    """
+    texts = []
+    done = "D_T contains it" if kept else "D_T leaves this step out (keep_jumps keeps it)"
+    for k in range(min(len(stage.frames), _JUMPS_SHOWN)):
+        size = ", ".join(f"{x:.2g}" for x in stage.size[k])
+        error = float(np.sqrt(np.mean(stage.stderr[k] ** 2)))
+        texts.append(
+            f"stage jump: {stage.bodies[k]} clusters move together by ({size}) +- {error:.2g} um "
+            f"at frame {stage.frames[k] + first_frame}: the stage or the camera moved; diffusion "
+            f"does so with a probability below {STAGE_LEVEL:g}; {done}; D_R is not affected"
+        )
+    more = len(stage.frames) - _JUMPS_SHOWN
+    return [*texts, f"stage jump: {more} more"] if more > 0 else texts
+
+
 def wrapped_box_text(size: Floats) -> str:
     """Return what jumps (K, d) of one length along one axis each suggest: a periodic box."""
     if len(size) < 2:
@@ -607,6 +649,52 @@ def common_jump_warnings(jumps: Iterable[tuple[str, Ints, Floats]]) -> list[str]
         names = listed(name for name, _ in found)
         warnings.append(f"jump: clusters {names} jump at the same frame {frame}: {cause}")
     return warnings
+
+
+def common_motion_remarks(found: CommonMotion | None) -> Remarks:
+    """Name a motion that all bodies share: a note where it is random from frame to frame.
+
+    Random common positions are noise of the steps, which the joint fit separates from diffusion; a
+    common motion that lasts is in D_T.
+
+    Parameters
+    ----------
+    found : CommonMotion or None
+
+    Examples
+    --------
+    >>> from perrin.motion.common_motion import CommonMotion
+    >>> one = np.ones(3)
+    >>> found = CommonMotion(0.01 * one, 1e-4 * one, 0.02 * one, -0.005 * one, 4, 1e-9)
+    >>> common_motion_remarks(found).notes[0][:40]
+    'common motion: the 4 bodies move togethe'
+    """
+    if found is None or found.p > _COMMON_LEVEL or found.share.max() < _COMMON_SHARE:
+        return Remarks()
+    along = np.flatnonzero(
+        (found.share > _COMMON_SHARE / 2) & (found.covariance > _AXIS_ERRORS * found.stderr)
+    )
+    axes = listed("xyz"[k] for k in along)
+    k = int(found.share.argmax())
+    share = with_error(100 * found.share[k], 100 * found.stderr[k] / found.variance[k])
+    size = 1e3 * float(np.sqrt(found.covariance[k]))
+    text = (
+        f"common motion: the {found.bodies} bodies move together along {axes}: {share} % of the "
+        f"mean square step, {size:.3g} nm a frame"
+    )
+    if found.following[k] < -found.covariance[k] / 4:
+        return Remarks(
+            notes=[
+                f"{text}, at random from frame to frame, as a stage or a focus that does not "
+                "return to its place; joint noise (noise='joint') contains it, D is not affected"
+            ]
+        )
+    return Remarks(
+        [
+            f"{text}: a drifting stage, a flow, or one fluid around bodies near each other; D_T "
+            "contains this motion, D_R does not"
+        ]
+    )
 
 
 def jumps_verdict_text(
@@ -821,6 +909,12 @@ def is_noise_floor(text: str) -> bool:
 
 
 # Sizes, predictions and pooled values.
+
+NO_BODY = (
+    "no spheres keep together longer than diffusion over a contact allows (if there are clusters: "
+    "correct contact, the voxel size or the diameter, or take frames faster)"
+)
+FREE_SPHERES = "these are free spheres, of which only D_T is reported"
 
 
 def no_prediction_warning(wanted: str, reason: str) -> str:

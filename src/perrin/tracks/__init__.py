@@ -8,6 +8,7 @@ from perrin.tracks.bonds import (
     neighbour_pairs,
     noise_along,
     rigid_groups,
+    shared_rows,
 )
 from perrin.tracks.clock import (
     Clock,
@@ -22,6 +23,7 @@ from perrin.tracks.clusters import (
     each_cluster,
     find_clusters,
     identify,
+    particles_and_pieces,
     positions_table,
 )
 from perrin.tracks.column_names import (
@@ -32,6 +34,7 @@ from perrin.tracks.column_names import (
     stated_units,
     unit_faults,
 )
+from perrin.tracks.contacts import Contacts, lasting_contacts
 from perrin.tracks.delimited import (
     Layout,
     delimited_table,
@@ -75,9 +78,10 @@ from perrin.tracks.identity import (
     squared_angle,
 )
 from perrin.tracks.imaris import imaris_table, is_imaris
-from perrin.tracks.linking import Centers, link_clusters, linked_tracks, step_variance
+from perrin.tracks.linking import Centers, link_clusters, linked_tracks, stage_path, step_variance
 from perrin.tracks.motion_capture import is_motive, motive_table, parse_c3d
 from perrin.tracks.raw_tables import RawTable, tracked_rows, without_flat_z
+from perrin.tracks.rigid_bodies import IdentifiedBodies, RigidBodies, identify_bodies, rigid_bodies
 from perrin.tracks.screening import (
     CENTRE_REMOVED,
     Screened,
@@ -93,6 +97,7 @@ from perrin.tracks.screening import (
     screen_rows,
 )
 from perrin.tracks.simulations import is_selection, parse_gsd, selection_table
+from perrin.tracks.sphere_tracks import link_spheres, track_variances
 from perrin.tracks.track_arrays import gdf_table, napari_columns, napari_text
 from perrin.tracks.trackmate import is_trackmate, parse_trackmate_xml, trackmate_table
 from perrin.tracks.writing import write_json, written_whole
@@ -106,12 +111,15 @@ __all__ = [
     "Candidates",
     "Centers",
     "Clock",
+    "Contacts",
     "Detections",
+    "IdentifiedBodies",
     "Identity",
     "Layout",
     "Pairs",
     "Pose",
     "RawTable",
+    "RigidBodies",
     "RowNumbers",
     "Screened",
     "Spelling",
@@ -144,6 +152,7 @@ __all__ = [
     "icp_fit",
     "icp_search",
     "identify",
+    "identify_bodies",
     "imaris_table",
     "is_imaris",
     "is_motive",
@@ -152,9 +161,11 @@ __all__ = [
     "joined_pairs",
     "labels_are_certain",
     "labels_in_time",
+    "lasting_contacts",
     "lattice_step",
     "layout_of",
     "link_clusters",
+    "link_spheres",
     "linked_tracks",
     "most_likely_identity",
     "most_likely_path",
@@ -172,6 +183,7 @@ __all__ = [
     "parse_text",
     "parse_trackmate_xml",
     "parse_xyz",
+    "particles_and_pieces",
     "placeholder_rows",
     "positions_table",
     "read_clock",
@@ -179,6 +191,7 @@ __all__ = [
     "read_tracks",
     "recognise_columns",
     "repeated_rows",
+    "rigid_bodies",
     "rigid_fits",
     "rigid_groups",
     "rounding_chances",
@@ -187,14 +200,17 @@ __all__ = [
     "selection_table",
     "settle_identity",
     "shape_symmetry",
+    "shared_rows",
     "sheet_text",
     "squared_angle",
+    "stage_path",
     "stated_units",
     "step_variance",
     "table_bytes",
     "table_suffix",
     "text_table",
     "touching_groups",
+    "track_variances",
     "tracked_rows",
     "trackmate_table",
     "unit_faults",

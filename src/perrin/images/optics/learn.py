@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from perrin._arrays import Floats
+    from perrin._arrays import Bools, Floats
     from perrin.images.optics.window_fit import Window
 
 
@@ -29,6 +30,14 @@ _LOG_DIFFERENCE = 0.01
 _MAX_LOG_STEP, _LOG_STEP_CONVERGED = 0.25, 1e-3
 
 _MAX_LEARNING_ROUNDS = 15
+
+# What is no sphere has over this multiple of the usual chi-squared, beyond this number of standard
+# errors of it, or over this multiple of the usual brightness, beyond this number of standard
+# deviations.
+_WORST_CHI2, _CHI2_DEVIATIONS, _BRIGHTEST, _BRIGHT_DEVIATIONS = 1.6, 6.0, 1.4, 8.0
+
+# Searches for the optics, each without the samples that the one before found to be no spheres.
+_MAX_SEARCHES, _FEWEST_SAMPLES = 4, 2
 
 # Searches of a crowd's residuals for missing spheres, in every round.
 _LEARNING_SEARCHES = 2
@@ -102,6 +111,8 @@ class SampleFit(NamedTuple):
         Expected grey levels of the voxels of the fit.
     squared_residual : ndarray, shape (m,)
         Squared differences of grey levels and expected grey levels.
+    brightness : ndarray, shape (n,)
+        Fitted intensity inside each sphere, grey levels.
     """
 
     centers: Floats
@@ -109,6 +120,123 @@ class SampleFit(NamedTuple):
     score: Floats
     expected: Floats
     squared_residual: Floats
+    brightness: Floats
+
+    def chi2(self, noise: CameraNoise) -> float:
+        """Return the mean squared residual over the variance that a camera noise predicts."""
+        return float(np.mean(self.squared_residual * noise.weight(self.expected)))
+
+
+@dataclass(frozen=True)
+class UsualImage:
+    """What the images of the spheres of a movie have in common.
+
+    Attributes
+    ----------
+    chi2 : float
+        Chi-squared per degree of freedom of the fits to spheres: over 1 where the model of the
+        image is not exact.
+    brightness : float
+        Median intensity inside a sphere, grey levels; negative for dark spheres.
+    spread : float
+        Standard deviation of its logarithm over the spheres, from the median deviation.
+    left_out : int
+        Number of groups that were left out in learning it, because they are no spheres.
+
+    Examples
+    --------
+    >>> usual = UsualImage(1.0, 100.0, 0.1)
+    >>> usual.brightest, UsualImage(1.0, 100.0, 0.3).brightest > 2 * usual.brightest
+    (2.225540928492468, True)
+    """
+
+    chi2: float
+    brightness: float
+    spread: float
+    left_out: int = 0
+
+    @classmethod
+    def of(cls, chi2: Sequence[float], brightness: Sequence[Floats]) -> UsualImage:
+        """Return what most spheres of some groups have in common.
+
+        Parameters
+        ----------
+        chi2 : sequence of float
+            Chi-squared per degree of freedom of the fit to each group.
+        brightness : sequence of ndarray
+            Intensity inside each sphere of each group.
+        """
+        count = [len(b) for b in brightness]
+        every = np.concatenate(brightness)
+        median = float(np.median(every))
+        relative = every[every * median > 0] / median
+        deviation = np.median(np.abs(np.log(relative))) if relative.size else 0.0
+        # A low quantile, because what is no sphere has a larger chi-squared.
+        return cls(float(np.quantile(np.repeat(chi2, count), 0.25)), median, 1.4826 * deviation)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the values for JSON."""
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, entry: dict[str, Any]) -> UsualImage:
+        """Return the values that `to_dict` wrote."""
+        return cls(**entry)
+
+    @property
+    def worst_chi2(self) -> float:
+        """Return the largest chi-squared per degree of freedom of a sphere."""
+        return _WORST_CHI2 * self.chi2
+
+    @property
+    def brightest(self) -> float:
+        """Return the largest brightness of a sphere over the median."""
+        return max(_BRIGHTEST, float(np.exp(_BRIGHT_DEVIATIONS * self.spread)))
+
+    def excess(self, chi2: Floats, brightness: Floats, *, voxels: Floats) -> Floats:
+        """Return how far images are from those of spheres: over 1 for what is no single sphere.
+
+        Parameters
+        ----------
+        chi2 : ndarray, shape (n,)
+            Chi-squared per voxel, averaged over the voxels of each sphere.
+        brightness : ndarray, shape (n,)
+            Intensity inside each sphere over the usual one in this frame and depth.
+        voxels : ndarray, shape (n,)
+            Number of voxels in each sphere.
+        """
+        bound = self.chi2 * np.maximum(_WORST_CHI2, _chance(voxels))
+        return np.maximum(chi2 / bound, brightness / self.brightest)
+
+    def disturbed(self, chi2: Floats, *, voxels: Floats) -> Bools:
+        """Return which images of spheres have more residual than chance leaves.
+
+        Parameters
+        ----------
+        chi2, voxels : ndarray, shape (n,)
+            As in `excess`.
+        """
+        return np.asarray(chi2 > self.chi2 * _chance(voxels))
+
+
+def _chance(voxels: Floats) -> Floats:
+    """Return the largest ratio of a chi-squared per voxel to the usual one by chance."""
+    return 1 + _CHI2_DEVIATIONS * np.sqrt(2 / np.maximum(voxels, 1.0))
+
+
+class LearnedOptics(NamedTuple):
+    """Optics that were learned from samples of frames.
+
+    Attributes
+    ----------
+    optics : Optics
+        Sphere diameter, point spread and noise.
+    usual : UsualImage
+        What the images of the spheres have in common.
+    """
+
+    optics: Optics
+    usual: UsualImage
 
 
 class ImageVariations(NamedTuple):
@@ -189,7 +317,7 @@ class GroupSample(NamedTuple):
         residual = window.data - fit.expected
         information = weighted @ slope.T - shared.T @ taken
         score = weighted @ residual - taken.T @ (nuisance @ residual)
-        return SampleFit(fit.centers, information, score, fit.expected, residual**2)
+        return SampleFit(fit.centers, information, score, fit.expected, residual**2, fit.brightness)
 
 
 class CrowdSample(NamedTuple):
@@ -240,7 +368,9 @@ class CrowdSample(NamedTuple):
         information, score = profile_information(window, state, slope)
         used = window.mask
         residual = (window.data - state.expected)[used]
-        return SampleFit(state.centers, information, score, state.expected[used], residual**2)
+        return SampleFit(
+            state.centers, information, score, state.expected[used], residual**2, state.brightness
+        )
 
 
 def _image_at(log: Floats, voxel: tuple[float, float, float]) -> SphereImage:
@@ -254,8 +384,10 @@ def fit_samples(
     *,
     diameter: float,
     voxel: tuple[float, float, float],
-) -> Optics:
-    """Find the sphere diameter, point spread and noise of greatest likelihood for all samples.
+) -> LearnedOptics:
+    """Find the sphere diameter, point spread and noise of greatest likelihood for most samples.
+
+    Samples whose images are not those of spheres (dust, spheres that the border cuts) are left out.
 
     Parameters
     ----------
@@ -268,7 +400,7 @@ def fit_samples(
 
     Returns
     -------
-    Optics
+    LearnedOptics
 
     Raises
     ------
@@ -280,6 +412,35 @@ def fit_samples(
     Gauss-Newton steps in the logarithms of the three lengths, with every sphere's position and
     brightness and every background eliminated exactly (the Schur complement of the information).
     """
+    left_out = 0
+    for _ in range(_MAX_SEARCHES):
+        optics, samples, fits = _search_optics(samples, diameter=diameter, voxel=voxel)
+        chi2 = [fit.chi2(optics.noise) for fit in fits]
+        usual = UsualImage.of(chi2, [fit.brightness for fit in fits])
+        kept = [
+            s
+            for s, fit, square in zip(samples, fits, chi2, strict=True)
+            if usual.excess(
+                np.full(len(fit.brightness), square),
+                fit.brightness / usual.brightness,
+                voxels=np.full(len(fit.brightness), len(fit.expected) / len(fit.brightness)),
+            ).max(initial=0.0)
+            <= 1
+        ]
+        if len(kept) == len(samples) or len(kept) < _FEWEST_SAMPLES:
+            break
+        left_out += len(samples) - len(kept)
+        samples = kept
+    return LearnedOptics(optics, replace(usual, left_out=left_out))
+
+
+def _search_optics(
+    samples: Sequence[GroupSample | CrowdSample],
+    *,
+    diameter: float,
+    voxel: tuple[float, float, float],
+) -> tuple[Optics, list[GroupSample | CrowdSample], list[SampleFit]]:
+    """Return the optics of greatest likelihood, the samples with enough voxels, and their fits."""
     log = np.log([diameter, max(voxel[0], 0.15 * diameter), max(voxel[1] / 2, 0.06 * diameter)])
     log[1] = max(log[1], _least_log_psf_z(log[2], voxel))
     image = _image_at(log, voxel)
@@ -320,7 +481,8 @@ def fit_samples(
         )
     size, psf_z, psf = (float(v) for v in np.exp(log))
     error = np.exp(log) * np.sqrt(np.diag(np.linalg.inv(information)))
-    return Optics(size, (psf_z, psf), noise, (float(error[0]), float(error[1]), float(error[2])))
+    stderr = (float(error[0]), float(error[1]), float(error[2]))
+    return Optics(size, (psf_z, psf), noise, stderr), samples, fits
 
 
 def _least_log_psf_z(log_psf: float, voxel: tuple[float, float, float]) -> float:

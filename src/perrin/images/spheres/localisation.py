@@ -19,17 +19,27 @@ from perrin._arrays import (
 )
 from perrin._text import listed
 from perrin.errors import FrameError, PrecisionWarning
-from perrin.images.optics.crowd_fit import crowd_piece, fit_crowd
-from perrin.images.optics.learn import CrowdSample, GroupSample, fit_samples, saturated_share
+from perrin.images.optics.crowd_fit import CrowdFit, crowd_piece, fit_crowd
+from perrin.images.optics.learn import (
+    CrowdSample,
+    GroupSample,
+    LearnedOptics,
+    UsualImage,
+    fit_samples,
+    saturated_share,
+)
 from perrin.images.optics.window_fit import FreeCenters, fit_window
 from perrin.images.spheres.by_trackpy import Features, find_features, refine_by_trackpy
 from perrin.images.spheres.spots import (
     SPOT_KEYWORDS,
+    Fading,
     Spots,
     SpotSettings,
     at_contact,
+    find_fading,
     groups_and_crowds,
     mass_cut,
+    touching_together,
 )
 
 if TYPE_CHECKING:
@@ -39,8 +49,10 @@ if TYPE_CHECKING:
     import pandas as pd
     from numpy.typing import NDArray
 
-    from perrin._arrays import Ints
-    from perrin.images.optics.optics import Optics
+    from perrin._arrays import Bools, Ints
+    from perrin.images.optics.ball_image import SphereImage
+    from perrin.images.optics.optics import CameraNoise, Optics
+    from perrin.images.optics.window_fit import ImageFit, Window
 
     Columns: TypeAlias = dict[str, NDArray[Any]]
 
@@ -54,8 +66,17 @@ _LEARNING_FRAMES = 5
 # Number of groups of spheres, or of pieces of crowds, from which the optics are learned.
 _LEARNING_GROUPS, _LEARNING_CROWDS = 15, 2
 
+# Largest number of spots that are fitted as one group where there is dust among them.
+_LARGEST_GROUP = 40
+
+# Largest number of spots of a group at the border that is fitted with spheres beyond it.
+_LARGEST_CUT_GROUP = 8
+
 # Number of spheres in a piece of a crowd.
 _PIECE_SPHERES = 30
+
+# Reason of spots whose image is not that of one sphere, by its shape or its brightness.
+NO_SPHERE = "not the image of a sphere"
 
 # Reasons for which a sphere is not refined.
 _IN_A_CROWD, _NO_OWN_VOXELS = "in a crowd", "no voxels of its own"
@@ -133,9 +154,9 @@ class Search:
             border=self.border,
         )
 
-    def spheres(self, spots: Features) -> Features:
-        """Return the spots of at least the least mass."""
-        keep = spots.mass >= (self.minmass or 0.0)
+    def spheres(self, spots: Features, light: Floats | float = 1.0) -> Features:
+        """Return the spots of at least the least mass, times the relative brightness at each."""
+        keep = spots.mass >= (self.minmass or 0.0) * light
         return Features(spots.centers[keep], spots.mass[keep])
 
 
@@ -193,11 +214,23 @@ class Method:
         How positions are refined.
     optics : Optics or None
         The optics for refinement by the model.
+    fading : Fading or None
+        Brightness that the mass cut follows; None is the same cut in all frames.
+    usual : UsualImage or None
+        What the images of the spheres have in common; None accepts every image.
     """
 
     search: Search
     refine: Refine = "model"
     optics: Optics | None = None
+    fading: Fading | None = None
+    usual: UsualImage | None = None
+
+    def spheres(self, spots: Features, frame: int) -> Features:
+        """Return the spots of a frame that pass the mass cut."""
+        if self.fading is None:
+            return self.search.spheres(spots)
+        return self.search.spheres(spots, self.fading.at(frame, spots.centers))
 
     def locate_in(self, stack: StackLike, i: int) -> LocatedFrame:
         """Find and refine the spheres of frame i.
@@ -220,11 +253,15 @@ class Method:
         data, voxel = np.asarray(stack.frame(i)), _voxel_size(stack)
         frame = _finite_frame(data, i)
         spots = self.search.spots(frame, voxel)
-        found = self.search.spheres(spots)
+        found = self.spheres(spots, i)
         if self.refine == "model":
-            columns = group_columns(frame, found, self.search.contact, self.optics, voxel)
-            if self.optics is not None and self.search.crowds:
-                columns = with_crowds(columns, frame, found, self.search, self.optics, voxel)
+            light = 1.0 if self.fading is None else self.fading.at(i, found.centers)
+            columns, crowds = group_columns(
+                frame, found, self.search, self.optics, voxel, usual=self.usual, light=light
+            )
+            columns = with_crowds(
+                columns, frame, found, self.search, voxel, crowds=crowds, usual=self.usual
+            )
         else:
             centers = found.centers
             if self.refine == "trackpy":
@@ -306,22 +343,28 @@ def choose_method(
     PrecisionWarning
         As in `mass_cut`.
     """
+    fading = None
     if search.minmass is None:
-        masses = [sampled.spots.mass for sampled in sample]
+        fading = find_fading([seen.number for seen in sample], [seen.spots for seen in sample])
+        masses = [seen.spots.mass for seen in sample]
+        if fading is not None:
+            masses = [m.spots.mass / fading.at(m.number, m.spots.centers) for m in sample]
         search = replace(search, minmass=mass_cut(np.concatenate([np.empty(0), *masses])))
     if refine != "model":
-        return Method(search, refine, None)
+        return Method(search, refine, None, fading)
+    method = Method(search, refine, optics, fading)
     if optics is None:
         in_crowds = in_groups = 0
         for sampled in sample:
-            found = search.spheres(sampled.spots).centers
+            found = method.spheres(sampled.spots, sampled.number).centers
             groups, crowds = groups_and_crowds(found, contact=search.contact)
             in_crowds += sum(map(len, crowds))
             in_groups += sum(map(len, groups))
         # Where most spheres are in crowds that are not to be refined, no optics are needed.
         if search.crowds or in_crowds <= in_groups:
-            optics = fit_optics(sample, search, voxel=_voxel_size(stack))
-    return Method(search, refine, optics)
+            learned = fit_optics(sample, method, voxel=_voxel_size(stack))
+            return replace(method, optics=learned.optics, usual=learned.usual)
+    return method
 
 
 def locate(
@@ -461,31 +504,32 @@ def locate(
     return table
 
 
-def fit_optics(sample: Sequence[SampledFrame], search: Search, *, voxel: _Voxel) -> Optics:
+def fit_optics(sample: Sequence[SampledFrame], method: Method, *, voxel: _Voxel) -> LearnedOptics:
     """Learn the diameter of the fluorescent sphere, the point spread and the noise.
 
     Parameters
     ----------
     sample : sequence of SampledFrame
         A few frames all over the movie.
-    search : Search
+    method : Method
         Options of the search, with the mass cut.
     voxel : tuple of float
         Voxel size (z, y, x), um.
 
     Returns
     -------
-    Optics
+    LearnedOptics
 
     Raises
     ------
     ValueError
         Where no sphere is found, or the search does not converge.
     """
+    search = method.search
     samples: list[GroupSample | CrowdSample] = []
     pieces: list[GroupSample | CrowdSample] = []
     for sampled in sample:
-        found = search.spheres(sampled.spots)
+        found = method.spheres(sampled.spots, sampled.number)
         groups, crowds = groups_and_crowds(found.centers, contact=search.contact)
         samples += [_group_sample(sampled.frame, found, group, search.contact) for group in groups]
         for crowd in crowds if search.crowds else []:
@@ -499,8 +543,15 @@ def fit_optics(sample: Sequence[SampledFrame], search: Search, *, voxel: _Voxel)
 
 
 def group_columns(
-    frame: Floats, found: Features, contact: float, optics: Optics | None, voxel: _Voxel
-) -> Columns:
+    frame: Floats,
+    found: Features,
+    search: Search,
+    optics: Optics | None,
+    voxel: _Voxel,
+    *,
+    usual: UsualImage | None = None,
+    light: Floats | float = 1.0,
+) -> tuple[Columns, list[tuple[Ints, CrowdFit]]]:
     """Fit every group of touching spheres by the model of its image.
 
     Parameters
@@ -509,25 +560,40 @@ def group_columns(
         Grey levels.
     found : Features
         The spheres of the frame as they were found first.
-    contact : float
-        Centre distance of touching spheres, um.
+    search : Search
+        Options of the search.
     optics : Optics or None
         None: no group is fitted.
     voxel : tuple of float
         Voxel size (z, y, x), um.
+    usual : UsualImage, optional
+        What the images of spheres have in common. Spots with another image are not refined, and
+        their voxels are not used for the others.
+    light : ndarray, shape (n,), or float
+        Relative brightness of spheres in this frame, at each of the spots.
 
     Returns
     -------
-    dict of ndarray
+    columns : dict of ndarray
         The columns of the table of `locate`.
+    crowds : list of tuple
+        Spheres that are fitted as a crowd, and the fit: with `Search.crowds` those of crowds, and
+        of groups at the border whose images show spheres beyond it.
     """
+    contact = search.contact
     centers, sigma = found.centers.copy(), np.full_like(found.centers, np.nan)
     chi2 = np.full(len(centers), np.nan)
     reason = np.full(len(centers), _IN_A_CROWD, dtype=object)
-    groups = [] if optics is None else groups_and_crowds(found.centers, contact=contact)[0]
+    groups: list[Ints] = []
+    crowds: list[tuple[Ints, CrowdFit]] = []
     if optics is not None:
         image, noise, furthest = optics.image(voxel), optics.noise, optics.diameter / 4
-    for group in groups:
+        dimmed = np.broadcast_to(light, len(centers))
+        groups, chains = groups_to_fit(centers, contact, dusty=bool(usual and usual.left_out))
+        for chain in chains if search.crowds else []:
+            crowds.append((chain, _crowd_of(frame, found, chain, search, image, noise)))
+    while groups:
+        group = groups.pop()
         sample = _group_sample(frame, found, group, contact)
         window = sample.window(image)
         if not window.has_enough_voxels(len(group)):
@@ -537,13 +603,96 @@ def group_columns(
         moved = np.linalg.norm(fit.centers - sample.centers, axis=1) >= furthest
         dark = ~(fit.brightness / np.median(fit.brightness) > 0.1)
         faults = np.where(dark, _DARK, np.where(moved, _MOVED, "")).astype(object)
+        if usual is not None:
+            square, voxels = _own_chi2(window, fit)
+            level = usual.brightness * dimmed[group]
+            excess = usual.excess(square, fit.brightness / level, voxels=voxels)
+            worst = int(excess.argmax())
+            cut = usual.disturbed(square, voxels=voxels) & _reach_border(frame, fit.centers, image)
+            if search.crowds and cut.any() and len(group) <= _LARGEST_CUT_GROUP:
+                beyond = _crowd_of(frame, found, group, search, image, noise)
+                if _are_spheres(beyond, usual, float(np.median(level)), count=len(group)):
+                    crowds.append((group, beyond))
+                    continue
+            if excess[worst] > 1:
+                # Without the worst one, whose voxels are left out, the others may be spheres.
+                reason[group[worst]], chi2[group[worst]] = NO_SPHERE, fit.chi2
+                groups += [np.delete(group, worst)] if len(group) > 1 else []
+                continue
         reason[group] = faults if fit.converged else _NOT_CONVERGED
         chi2[group] = fit.chi2
         good = reason[group] == ""
         centers[group[good]] = fit.centers[good]
         sigma[group[good]] = np.sqrt(np.diag(fit.covariance)).reshape(-1, 3)[good]
     columns = _axis_columns(centers) | {"mass": found.mass} | _axis_columns(sigma, "sigma_")
-    return columns | {"chi2": chi2, "refined": reason == "", "reason": reason}
+    return columns | {"chi2": chi2, "refined": reason == "", "reason": reason}, crowds
+
+
+def groups_to_fit(centers: Floats, contact: float, *, dusty: bool) -> tuple[list[Ints], list[Ints]]:
+    """Return the spheres of a frame as groups and crowds; see `groups_and_crowds`.
+
+    Dust makes crowds of small groups. Where there is dust, a crowd whose spheres touch in chains of
+    at most 40 is divided into these.
+
+    Examples
+    --------
+    >>> x = np.array([[0.0, 0.0, 1.5 * k] for k in range(20)])
+    >>> [len(found) for found in groups_to_fit(x, 1.0, dusty=True)]
+    [20, 0]
+    """
+    groups, crowds = groups_and_crowds(centers, contact=contact)
+    whole = []
+    for crowd in crowds:
+        parts = touching_together(centers[crowd], contact=contact)
+        if dusty and max(map(len, parts)) <= _LARGEST_GROUP:
+            groups += [crowd[part] for part in parts]
+        else:
+            whole.append(crowd)
+    return groups, whole
+
+
+def _crowd_of(
+    frame: Floats,
+    found: Features,
+    group: Ints,
+    search: Search,
+    image: SphereImage,
+    noise: CameraNoise,
+) -> CrowdFit:
+    """Fit a group of the spheres of a frame together with those that were not found."""
+    others = np.delete(found.centers, group, axis=0)
+    return fit_crowd(
+        frame, found.centers[group], others=others, contact=search.contact, image=image, noise=noise
+    )
+
+
+def _own_chi2(window: Window, fit: ImageFit) -> tuple[Floats, Floats]:
+    """Return chi-squared per voxel of the voxels of every sphere of a fit, and their number."""
+    n = len(fit.brightness)
+    own = fit.jacobian[3 * n : 4 * n]  # the unit image of each sphere
+    voxels = own.sum(axis=1)
+    square = own @ (fit.weight * (window.data - fit.expected) ** 2)
+    return square / np.maximum(voxels, 1e-300), voxels
+
+
+def _are_spheres(crowd: CrowdFit, usual: UsualImage, level: float, *, count: int) -> bool:
+    """Return whether all places of a fit show spheres of the usual brightness `level`.
+
+    All `count` spots of its start must be among them.
+    """
+    inside = crowd.window.holds(crowd.intensity.centers)
+    bright = crowd.intensity.brightness[inside] / level
+    return bool(
+        set(range(count)) <= set(crowd.origin.tolist())
+        and np.all(crowd.chi2 <= usual.worst_chi2)
+        and np.all((bright < usual.brightest) & (bright > 1 / usual.brightest))
+    )
+
+
+def _reach_border(frame: Floats, centers: Floats, image: SphereImage) -> Bools:
+    """Return which images of spheres at `centers` (n, 3) reach the border of the frame."""
+    last = (np.array(frame.shape) - 1) * np.array(image.voxel)
+    return np.asarray(np.any(np.minimum(centers, last - centers) < image.extent, axis=1))
 
 
 def with_crowds(
@@ -551,8 +700,10 @@ def with_crowds(
     frame: Floats,
     found: Features,
     search: Search,
-    optics: Optics,
     voxel: _Voxel,
+    *,
+    crowds: Sequence[tuple[Ints, CrowdFit]],
+    usual: UsualImage | None = None,
 ) -> Columns:
     """Return the columns with the rows of every crowd replaced by those of its fit.
 
@@ -561,47 +712,40 @@ def with_crowds(
 
     Parameters
     ----------
-    columns : dict of ndarray
-        The columns of `group_columns`.
+    columns, crowds : dict of ndarray, list of tuple
+        What `group_columns` returns.
     frame : ndarray, shape (nz, ny, nx)
         Grey levels.
     found : Features
         The spheres of the frame as they were found first.
     search : Search
         Options of the search.
-    optics : Optics
-        Size, point spread and noise of the image of a sphere.
     voxel : tuple of float
         Voxel size (z, y, x), um.
+    usual : UsualImage, optional
+        What the images of spheres have in common; other spots are not refined.
 
     Returns
     -------
     dict of ndarray
     """
-    _, crowds = groups_and_crowds(found.centers, contact=search.contact)
     last = (np.array(frame.shape) - 1) * np.array(voxel)
     margin = 0.0 if search.border else search.diameter / 2
-    for group in crowds:
-        crowd = fit_crowd(
-            frame,
-            found.centers[group],
-            others=np.delete(found.centers, group, axis=0),
-            contact=search.contact,
-            image=optics.image(voxel),
-            noise=optics.noise,
-        )
+    for group, crowd in crowds:
         first = crowd.origin >= 0
         good = crowd.converged & np.isfinite(crowd.sigma).all(axis=1)
         centers = np.where(good[:, None], crowd.centers, found.centers[group][crowd.origin])
         sigma = np.where(good[:, None], crowd.sigma, np.nan)
+        reason = np.where(good, "", _NOT_CONVERGED).astype(object)
+        if usual is not None:
+            reason[good & (crowd.chi2 > usual.worst_chi2)] = NO_SPHERE
         kept = np.all((centers >= margin) & (centers <= last - margin), axis=1) & (good | first)
         mass = np.where(first, found.mass[group][crowd.origin], np.nan)
         own = _axis_columns(centers) | {"mass": mass} | _axis_columns(sigma, "sigma_")
-        own |= {"chi2": crowd.chi2, "refined": good}
-        own["reason"] = np.where(good, "", _NOT_CONVERGED).astype(object)
+        own |= {"chi2": crowd.chi2, "refined": reason == "", "reason": reason}
         columns = {k: np.concatenate([columns[k], own[k][kept]]) for k in columns}
     stays = np.ones(len(columns["mass"]), dtype=np.bool_)
-    stays[np.concatenate([np.empty(0, dtype=np.int64), *crowds])] = False
+    stays[np.concatenate([np.empty(0, dtype=np.int64), *(group for group, _ in crowds)])] = False
     return {k: column[stays] for k, column in columns.items()}
 
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, TypedDict
+from dataclasses import asdict, dataclass, fields
+from typing import TYPE_CHECKING, Any, TypedDict
 
 import numpy as np
 
@@ -14,7 +14,10 @@ from perrin.geometry.shapes import pair_distances
 from perrin.tracks.groups import TOUCHING_REACH, touching_groups
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from perrin._arrays import Floats, Ints
+    from perrin.images.spheres.by_trackpy import Features
 
 
 # Distance in contacts below which the images of two spheres overlap, with their blur.
@@ -28,6 +31,9 @@ _CLEAR_GAP = 2.0
 
 # Masses that are all within this ratio are all of spheres.
 _SAME_MASS_RATIO = 4.0
+
+# The mass cut follows the brightness of the spheres where it changes by more than this factor.
+_FADED = 2.0
 
 # Ratio to the largest mass below which a gap separates noise from noise.
 _FAINT_RATIO = 20.0
@@ -119,13 +125,8 @@ def mass_cut(mass: Floats) -> float:
     >>> round(mass_cut(np.array([100.0, 200.0, 300.0, 2.0e4, 2.5e4, 3.0e4])))
     2449
     """
-    ordered = np.sort(mass[mass > 0])
-    if not ordered.size:
-        return 0.0
-    if ordered[-1] < _SAME_MASS_RATIO * ordered[0]:
-        return float(ordered[0] / _SAME_MASS_RATIO)
-    ratio = np.where(ordered[1:] > ordered[-1] / _FAINT_RATIO, ordered[1:] / ordered[:-1], 1.0)
-    if ratio.max() < _CLEAR_GAP:
+    cut = clear_mass_cut(mass)
+    if cut is None:
         warnings.warn(
             f"the masses of the {mass.size} spots found have no clear gap between spheres and "
             "noise: all are kept; inspect their histogram and set minmass",
@@ -133,8 +134,126 @@ def mass_cut(mass: Floats) -> float:
             stacklevel=4,
         )
         return 0.0
+    return cut
+
+
+def clear_mass_cut(mass: Floats) -> float | None:
+    """Return the mass cut of `mass_cut`, or None where there is no clear gap.
+
+    Parameters
+    ----------
+    mass : ndarray
+        Integrated brightness of spots.
+
+    Examples
+    --------
+    >>> clear_mass_cut(np.array([1.0, 1.9, 3.5, 6.0])) is None
+    True
+    """
+    ordered = np.sort(mass[mass > 0])
+    if not ordered.size:
+        return 0.0
+    if ordered[-1] < _SAME_MASS_RATIO * ordered[0]:
+        return float(ordered[0] / _SAME_MASS_RATIO)
+    ratio = np.where(ordered[1:] > ordered[-1] / _FAINT_RATIO, ordered[1:] / ordered[:-1], 1.0)
+    if ratio.max() < _CLEAR_GAP:
+        return None
     k = int(ratio.argmax())
     return float(np.sqrt(ordered[k] * ordered[k + 1]))
+
+
+@dataclass(frozen=True)
+class Fading:
+    """Brightness of the spheres in time and over the depth: bleaching, and light lost on the way.
+
+    Attributes
+    ----------
+    frames : tuple of int
+        Frames in which the brightness is known, in their order.
+    light : tuple of float
+        Brightness in these frames over that in the first of them.
+    per_depth : float
+        Logarithmic change of the brightness with z, 1/um.
+    depth : float
+        The z of the brightness above, um.
+
+    Examples
+    --------
+    >>> bleached = Fading((0, 10), (1.0, 0.25))
+    >>> bleached.at(5, np.zeros((1, 3)))
+    array([0.5])
+    """
+
+    frames: tuple[int, ...]
+    light: tuple[float, ...]
+    per_depth: float = 0.0
+    depth: float = 0.0
+
+    def at(self, frame: int, centers: Floats) -> Floats:
+        """Return the relative brightness (n,) of spheres at `centers` (n, 3) as (z, y, x), um.
+
+        Between the known frames its logarithm is interpolated.
+        """
+        light = float(np.exp(np.interp(frame, self.frames, np.log(self.light))))
+        return light * np.exp(self.per_depth * (centers[:, 0] - self.depth))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the brightness for JSON."""
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, entry: dict[str, Any]) -> Fading:
+        """Return the brightness that `to_dict` wrote."""
+        frames, light = tuple(entry["frames"]), tuple(entry["light"])
+        return cls(frames, light, entry["per_depth"], entry["depth"])
+
+
+def find_fading(frames: Sequence[int], spots: Sequence[Features]) -> Fading | None:
+    """Return how the brightness of the spheres changes in time and over the depth.
+
+    Parameters
+    ----------
+    frames : sequence of int
+        Frames from which it is learned.
+    spots : sequence of Features
+        The spots of each, noise among them.
+
+    Returns
+    -------
+    Fading or None
+        None where it changes by less than a factor of 2, which one mass cut for all frames serves,
+        and where the masses of a frame have no clear gap between spheres and noise.
+
+    Examples
+    --------
+    >>> from perrin.images.spheres.by_trackpy import Features
+    >>> masses = [np.array([900.0, 1000.0, 1100.0]), np.array([1.0, 90.0, 100.0, 110.0])]
+    >>> find_fading([0, 5], [Features(np.zeros((len(m), 3)), m) for m in masses]).light
+    (1.0, 0.1)
+    """
+    number, light, depth, relative = [], [], [np.empty(0)], [np.empty(0)]
+    for frame, found in zip(frames, spots, strict=True):
+        cut = clear_mass_cut(found.mass)
+        if cut is None:
+            return None
+        sphere = (found.mass >= cut) & (found.mass > 0)
+        if sphere.any():
+            number.append(frame)
+            light.append(float(np.median(found.mass[sphere])))
+            depth.append(found.centers[sphere, 0])
+            relative.append(np.log(found.mass[sphere] / light[-1]))
+    if not light:
+        return None
+    z, y = np.concatenate(depth), np.concatenate(relative)
+    height = z - z.mean()
+    slope = float(height @ y) / max(float(height @ height), 1e-300)
+    if abs(slope) * float(np.ptp(z)) < np.log(_FADED):
+        slope = 0.0
+    if max(light) < _FADED * min(light) and slope == 0:
+        return None
+    return Fading(
+        tuple(int(i) for i in number), tuple(m / light[0] for m in light), slope, float(z.mean())
+    )
 
 
 def touching_together(

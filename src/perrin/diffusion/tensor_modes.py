@@ -1,0 +1,333 @@
+"""Likelihoods of steps with tensors D whose frames are equally noisy, in axes that diagonalise D.
+
+Even steps are taken to their sine modes, those of many motions at once; other steps are a chain.
+
+Mode k of the sine transform of even steps has covariance 2 D tau + w_k O, w_k = 2 (1 - cos w), and
+all modes are diagonal in the axes that diagonalise D against 2 D tau + 2 O.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from perrin.diffusion.step_kernels import difference_eigenvalues
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from perrin._arrays import Bools, Floats, Ints
+    from perrin.diffusion.steps import Steps
+
+
+class TensorSlopes(NamedTuple):
+    """Log-likelihoods at P points, and their derivatives.
+
+    Attributes
+    ----------
+    value : ndarray, shape (P,)
+        Log-likelihood; -inf, without slopes, where a covariance is not positive definite.
+    D : ndarray, shape (P, b, b)
+        Slopes in D.
+    theta : ndarray, shape (P, r)
+        Slopes in the noise amplitudes.
+    B : ndarray, shape (P,)
+        Slope in B.
+    noise : ndarray, shape (P, b, b)
+        Slopes in a noise O that is added to that of every frame.
+    """
+
+    value: Floats
+    D: Floats
+    theta: Floats
+    B: Floats
+    noise: Floats
+
+    @classmethod
+    def undefined(cls, D: Floats, theta: Floats) -> TensorSlopes:
+        """Return -inf without slopes at all of these points."""
+        none = np.full(len(D), np.nan)
+        least = np.full(len(D), -np.inf)
+        lost = np.full_like(D, np.nan)
+        return cls(least, lost, np.full_like(theta, np.nan), none, lost)
+
+    def lose(self, bad: Bools) -> None:
+        """Make the likelihoods of some points undefined, in place."""
+        if bad.any():
+            self.value[bad] = -np.inf
+            for slopes in self[1:]:
+                slopes[bad] = np.nan
+
+
+class DiagonalModes(NamedTuple):
+    """The sine modes of even steps at P points, in the axes that diagonalise their covariances.
+
+    Attributes
+    ----------
+    axes : ndarray, shape (P, b, b)
+        Those axes as columns, not of unit length.
+    power, inverse : ndarray, shape (P, K, b)
+        Variances of the K modes along them, and one over these.
+    values, scaled : ndarray, shape (P, K, b)
+        Modes along them, and the same over their variances.
+    log_det : ndarray, shape (P,)
+        Logarithm of the determinant of a covariance less that of its variances.
+    undefined : ndarray of bool, shape (P,)
+        Whether the covariance is not positive definite.
+    """
+
+    axes: Floats
+    power: Floats
+    inverse: Floats
+    values: Floats
+    scaled: Floats
+    log_det: Floats
+    undefined: Bools
+
+
+@dataclass(frozen=True, eq=False)
+class EvenTracks:
+    """Even steps of P motions of one length in their sine modes; all points of one motion if P = 1.
+
+    Attributes
+    ----------
+    modes : ndarray, shape (P, K, b)
+        Sine transforms of the steps.
+    tau, dt : ndarray, shape (P,)
+        Duration of the steps, and time between frames.
+    shapes : ndarray, shape (P, r, b, b)
+        Noise covariances of a frame for an amplitude of 1.
+    """
+
+    modes: Floats
+    tau: Floats
+    dt: Floats
+    shapes: Floats
+
+    @classmethod
+    def of(cls, steps: Sequence[Steps]) -> EvenTracks:
+        """Transform the even steps of some motions, of which each has as many."""
+        from scipy.fft import dst
+
+        return cls(
+            dst(np.stack([s.vectors for s in steps]), type=1, norm="ortho", axis=1),
+            np.array([s.duration[0] for s in steps]),
+            np.array([s.dt for s in steps]),
+            np.stack([s.noise[:, s.start[0]] for s in steps]),
+        )
+
+    def rows(self, rows: Ints) -> EvenTracks:
+        """Return some of the motions."""
+        return EvenTracks(self.modes[rows], self.tau[rows], self.dt[rows], self.shapes[rows])
+
+    @property
+    def weight(self) -> Floats:
+        """Weight w of the noise in every mode, (K,)."""
+        return np.asarray(2 * difference_eigenvalues(self.modes.shape[1]))
+
+    def noise(self, D: Floats, theta: Floats, B: Floats) -> Floats:
+        """Return the noise O of a frame, less its blur, (P, b, b)."""
+        blur = (2 * B * self.dt)[:, None, None] * D
+        return np.asarray(np.einsum("pr,prab->pab", theta, self.shapes) - blur)
+
+    def diagonal(self, D: Floats, theta: Floats, B: Floats) -> DiagonalModes:
+        """Return the modes in the axes that diagonalise all of them, at P points."""
+        w, motion = self.weight, (2 * self.tau)[:, None, None] * D
+        values, turn = np.linalg.eigh(motion + 2 * self.noise(D, theta, B))
+        undefined = ~(values[:, 0] > 0)
+        if undefined.any():
+            values = np.where(undefined[:, None], 1.0, values)
+        root = turn / np.sqrt(values)[:, None]
+        share, turn = np.linalg.eigh(np.swapaxes(root, 1, 2) @ motion @ root)
+        axes = root @ turn
+        power = share[:, None] + 0.5 * w[:, None] * (1 - share[:, None])
+        inverse, along = 1 / power, self.modes @ axes
+        log_det = np.log(values).sum(axis=1)
+        undefined |= ~(power.min(axis=(1, 2)) > 0)
+        return DiagonalModes(axes, power, inverse, along, along * inverse, log_det, undefined)
+
+    def slopes(self, D: Floats, B: Floats, modes: DiagonalModes) -> TensorSlopes:
+        """Return the log-likelihoods and their derivatives at the points of these modes."""
+        w, (axes, power, inverse, values, q, log_det, undefined) = self.weight, modes
+        columns, back = np.swapaxes(q, 1, 2), np.swapaxes(axes, 1, 2)
+        same, next_one = columns @ q, columns @ (w[:, None] * q)
+        kept = np.arange(D.shape[1])
+        same[:, kept, kept] -= inverse.sum(axis=1)
+        next_one[:, kept, kept] -= w @ inverse
+        plain, weighted = axes @ same @ back, axes @ next_one @ back
+        with np.errstate(divide="ignore", invalid="ignore"):
+            log_det = np.log(power).sum(axis=(1, 2)) + len(w) * log_det
+        value = -0.5 * (log_det + (values * q).sum(axis=(1, 2)))
+        by_theta = 0.5 * np.einsum("pjab,pab->pj", self.shapes, weighted)
+        by_B = -self.dt * (weighted * D).sum(axis=(1, 2))
+        by_D = self.tau[:, None, None] * plain - (B * self.dt)[:, None, None] * weighted
+        found = TensorSlopes(value, by_D, by_theta, by_B, 0.5 * weighted)
+        found.lose(undefined)
+        return found
+
+    def curvatures(self, E: Floats, D: Floats, B: Floats, modes: DiagonalModes) -> Floats:
+        """Return minus the second derivatives along E (P, m, b, b), in theta and in B.
+
+        They are those of the covariances alone, as if these were linear. With the slopes
+        X_i = A_i + w_k N_i of mode k and its inverse covariance V, they are
+        y^T V X_i V X_j V y - tr(V X_i V X_j)/2 summed over the modes.
+        """
+        w, inverse, q = self.weight, modes.inverse, modes.scaled
+        of_D, of_noise = covariance_slopes(E, D, B, self.dt)
+        points, m, b = E.shape[:3]
+        none = np.zeros((points, self.shapes.shape[1] + 1, b, b))
+        same = np.concatenate([self.tau[:, None, None, None] * of_D, none], axis=1)
+        shapes = np.broadcast_to(self.shapes, (points, *self.shapes.shape[1:]))
+        next_one = np.concatenate([of_noise[:, :m], shapes, of_noise[:, m:]], axis=1)
+        axes = modes.axes[:, None]
+        same, next_one = (np.swapaxes(axes, 2, 3) @ x @ axes for x in (same, next_one))
+        # Sums over the modes of q_a q_b V_c and of V_a V_c, times 1, w and w^2.
+        powers = w[:, None, None] ** np.arange(3)[:, None]
+        weights = (inverse[:, :, None] * powers).reshape(points, -1, 3 * b)
+        pairs = (q[..., None] * q[:, :, None]).reshape(points, -1, b * b)
+        power = (np.swapaxes(pairs, 1, 2) @ weights).reshape(points, b, b, 3, b)
+        trace = (np.swapaxes(inverse, 1, 2) @ weights).reshape(points, b, 3, b)
+
+        def form(k: int, left: Floats, right: Floats) -> Floats:
+            # (c, a, b) times (c, b, j): sum over b of q_a q_b V_c X_j[c, b]
+            turned = np.moveaxis(power[:, :, :, k], 3, 1) @ np.moveaxis(right, 1, 3)
+            turned = np.moveaxis(turned, 3, 1)  # (j, c, a)
+            turned = np.swapaxes(turned, 2, 3) - 0.5 * trace[:, None, :, k] * np.swapaxes(
+                right, 2, 3
+            )
+            count = left.shape[1]
+            flat = turned.reshape(points, count, -1)
+            return np.asarray(left.reshape(points, count, -1) @ np.swapaxes(flat, 1, 2))
+
+        mixed = form(1, same, next_one)
+        total = form(0, same, same) + mixed + np.swapaxes(mixed, 1, 2)
+        return np.asarray(total + form(2, next_one, next_one))
+
+
+def covariance_slopes(E: Floats, D: Floats, B: Floats, dt: Floats) -> tuple[Floats, Floats]:
+    """Return the slopes of 2 D (P, m, b, b) and of the noise less blur (P, m + 1, b, b).
+
+    They are those along directions E (P, m, b, b) of D; the last one of the noise is that in B.
+
+    Examples
+    --------
+    >>> one = np.ones((1, 1, 1))
+    >>> covariance_slopes(one[None], one, np.array([0.1]), np.array([2.0]))[1].ravel()
+    array([-0.4, -4. ])
+    """
+    blur = np.concatenate([B[:, None, None, None] * E, D[:, None]], axis=1)
+    return 2 * E, -2 * dt[:, None, None, None] * blur
+
+
+class Chains(NamedTuple):
+    """Uneven steps at one point, in the axes that diagonalise D against 2 D tau + 2 O.
+
+    Attributes
+    ----------
+    axes : ndarray, shape (b, b)
+        Those axes as columns, not of unit length.
+    pivots, lower : ndarray, shapes (b S,) and (b S - 1,)
+        Elimination of the tridiagonal covariances along them, one after the other.
+    inverse, corner : ndarray, shape (b, S)
+        Diagonals of their inverses, and the elements next to these; 0 where steps are not linked.
+    solved : ndarray, shape (b, S)
+        Inverse covariances times steps.
+    value : float
+        Log-likelihood; -inf where a covariance is not positive definite.
+    """
+
+    axes: Floats
+    pivots: Floats
+    lower: Floats
+    inverse: Floats
+    corner: Floats
+    solved: Floats
+    value: float
+
+
+@dataclass(frozen=True, eq=False)
+class ChainTrack:
+    """Steps of any durations and links whose frames are equally noisy.
+
+    D and the noise O of a frame are two matrices, which are diagonal in common axes: along each of
+    them the steps are a chain of their own, whose covariance is tridiagonal.
+
+    Attributes
+    ----------
+    steps : Steps
+    shapes : ndarray, shape (r, b, b)
+        Noise covariances of a frame for an amplitude of 1.
+    """
+
+    steps: Steps
+    shapes: Floats
+
+    def at(self, D: Floats, theta: Floats, B: float) -> Chains | None:
+        """Return the chains at one point; None where the covariance is not positive definite."""
+        from scipy.linalg.lapack import dpttrf, dpttrs
+
+        s, b = self.steps, len(D)
+        count, tau = len(s.duration), float(s.duration.mean())
+        motion = 2 * tau * D
+        values, turn = np.linalg.eigh(
+            motion + 2 * np.tensordot(theta, self.shapes, 1) - 4 * B * s.dt * D
+        )
+        if not values[0] > 0:
+            return None
+        root = turn / np.sqrt(values)
+        share, turn = np.linalg.eigh(root.T @ motion @ root)
+        axes = root @ turn
+        a = (share[:, None] * (s.duration / tau) + (1 - share)[:, None]).ravel()
+        off = (-0.5 * (1 - share)[:, None] * s.linked).ravel()[:-1]
+        d, lower, bad = dpttrf(a, off)
+        up, _, bad_up = dpttrf(a[::-1], off[::-1])
+        if bad or bad_up:
+            return None
+        y = axes.T @ s.vectors.T
+        z = dpttrs(d, lower, y.reshape(-1, 1))[0].reshape(b, count)
+        inverse = 1 / (d + up[::-1] - a)
+        corner = np.append(-lower * inverse[1:], 0.0).reshape(b, count) * s.linked
+        log_det = np.log(d).sum() + count * np.log(values).sum()
+        value = -0.5 * float(log_det + np.sum(y * z))
+        return Chains(axes, d, lower, inverse.reshape(b, count), corner, z, value)
+
+    def slopes(self, D: Floats, B: float, chains: Chains) -> TensorSlopes:
+        """Return the log-likelihood and its derivatives, at one point."""
+        s, z = self.steps, chains.solved
+        linked = z[:, :-1] * s.linked[:-1]
+        plain = (z * s.duration) @ z.T - np.diag(chains.inverse @ s.duration)
+        cross = linked @ z[:, 1:].T
+        weighted = 2 * z @ z.T - cross - cross.T
+        weighted -= 2 * np.diag(chains.inverse.sum(axis=1) - chains.corner.sum(axis=1))
+        plain, weighted = (chains.axes @ x @ chains.axes.T for x in (plain, weighted))
+        return TensorSlopes(
+            np.array([chains.value]),
+            (plain - B * s.dt * weighted)[None],
+            0.5 * np.einsum("jab,ab->j", self.shapes, weighted)[None],
+            np.array([-s.dt * float(np.sum(weighted * D))]),
+            0.5 * weighted[None],
+        )
+
+    def curvatures(self, E: Floats, D: Floats, B: float, chains: Chains) -> Floats:
+        """Return the average of observed and expected information along E, in theta and in B.
+
+        It is z^T X_i C^-1 X_j z/2 for the slopes X_i of C, as in `NoisyVectors.band_curvatures`.
+        """
+        from scipy.linalg.lapack import dpttrs
+
+        s, z = self.steps, chains.solved
+        of_D, of_noise = (
+            x[0] for x in covariance_slopes(E[None], D[None], np.array([B]), np.array([s.dt]))
+        )
+        none = np.zeros((len(self.shapes) + 1, *D.shape))
+        on = chains.axes.T @ np.concatenate([of_D, none]) @ chains.axes
+        noise = np.concatenate([of_noise[:-1], self.shapes, of_noise[-1:]])
+        noise = chains.axes.T @ noise @ chains.axes
+        differences = 2 * z
+        differences[:, :-1] -= s.linked[:-1] * z[:, 1:]
+        differences[:, 1:] -= s.linked[:-1] * z[:, :-1]
+        products = (on @ (z * s.duration) + noise @ differences).reshape(len(on), -1)
+        solved = dpttrs(chains.pivots, chains.lower, products.T)[0]
+        return np.asarray(0.5 * products @ solved)
