@@ -695,13 +695,42 @@ def test_names_with_square_brackets_are_printed_as_they_are(csv, tmp_path):
 # ---- formats, configuration, machine-readable output --------------------------------------------
 
 
-def test_the_demo_leaves_a_table_that_the_next_command_takes(demo, tmp_path, no_figures):
-    """The command of the README, as it stands, gives the demo's own answer from demo-tracks.csv."""
-    words = ("analyze", "perrin-demo/demo-tracks.csv", "--dt", "0.73", "-o", "my-run")
-    assert run(*words, cwd=demo[0].parent).returncode == 0
-    shutil.move(demo[0].parent / "my-run", tmp_path / "my-run")
-    both = [json.loads((f / "summary.json").read_text()) for f in (demo[0], tmp_path / "my-run")]
-    assert both[0]["clusters"][0]["D_R"] == both[1]["clusters"][0]["D_R"]
+def test_the_demo_leaves_a_table_that_the_next_command_takes(demo):
+    """The README's command reads demo-tracks.csv, which holds all digits of the demo's input."""
+    readme = (Path(__file__).resolve().parents[1] / "README.md").read_text(encoding="utf-8")
+    assert "perrin analyze perrin-demo/demo-tracks.csv --dt 0.73 -o my-run" in readme
+    read = perrin.read_tracks(demo[0] / "demo-tracks.csv")
+    used = pd.read_parquet(demo[0] / "tracks.parquet")
+    pd.testing.assert_frame_equal(read[list(used)], used, check_exact=True)
+    assert "dt = 0.73\n" in (demo[0] / "run.toml").read_text()
+
+
+def test_bodies_have_the_same_names_everywhere(tmp_path):
+    """Every name, and a file of positions, is a body of plan, predict and simulate."""
+    from perrin.cli.options import SHAPES, body_of
+
+    for shape, count in SHAPES.items():
+        for size in ({"radius": 1.5, "diameter": None}, {"radius": None, "diameter": 2.0}):
+            body = body_of(shape, positions=None, **size)
+            assert len(body.positions) == count
+            if size["radius"] is not None:
+                np.testing.assert_allclose(body.R, 1.5)
+    positions = perrin.Cluster.tetrahedron(1.5).positions
+    pd.DataFrame(positions, columns=["x", "y", "z"]).to_csv(tmp_path / "body.csv", index=False)
+    options = ("--d-r", 0.005, "--sigma", 0.03)
+    named = ("tetrahedron", "--radius", 1.5)
+    plans, tables = [], []
+    for k, body in enumerate((("--positions", "body.csv"), named)):
+        result = run("plan", *body, *options, "--frames", 300, "--json", cwd=tmp_path)
+        plans.append(json.loads(result.stdout))
+        movie = ("--dt", 0.7, "--frames", 5, "-o", f"{k}.csv")
+        assert run("simulate", *body, *options, *movie, cwd=tmp_path).returncode == 0
+        tables.append(perrin.read_tracks(tmp_path / f"{k}.csv"))
+    assert plans[0]["dt_best"] == pytest.approx(plans[1]["dt_best"])
+    assert plans[0]["dt_rigid"] == pytest.approx(plans[1]["dt_rigid"])
+    pd.testing.assert_frame_equal(*tables)
+    both = run("plan", "trimer", "--positions", "body.csv", *options, cwd=tmp_path)
+    refused(both, 2, "--positions: states the body")
 
 
 def test_a_configuration_repeats_a_run(csv, tmp_path, no_figures):

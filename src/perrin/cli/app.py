@@ -17,15 +17,14 @@ from perrin.cli.options import (
     OUTPUT,
     PICTURE_SUFFIXES,
     RECORDING,
-    SHAPES,
     SIZES,
     SPHERES,
-    TOUCHING_SHAPES,
     WORK,
     ClusterSize,
     Columns,
     Config,
     Contact,
+    Diameter,
     Drift,
     Dynamics,
     Exposure,
@@ -39,7 +38,9 @@ from perrin.cli.options import (
     Output,
     Overwrite,
     OverwriteFile,
+    Positions,
     Quiet,
+    Radius,
     Scale,
     Seed,
     Shape,
@@ -448,11 +449,6 @@ def show_run(
     perrin analyze t.csv --dt 0.73 -o my-run""",
 )
 def simulate(
-    shape: Shape,
-    radius: Annotated[
-        float,
-        typer.Option(help="Mean distance of particles to the centre, um.", rich_help_panel=BODY),
-    ],
     d_r: Annotated[float, typer.Option("--d-r", help="D_R, rad^2/s.", rich_help_panel=BODY)],
     dt: Annotated[
         float, typer.Option("--dt", help="Time between frames, s.", rich_help_panel=RECORDING)
@@ -466,6 +462,10 @@ def simulate(
             rich_help_panel=OUTPUT,
         ),
     ],
+    shape: Shape = None,
+    radius: Radius = None,
+    diameter: Diameter = None,
+    positions: Positions = None,
     d_t: Annotated[float, typer.Option("--d-t", help="D_T, um^2/s.", rich_help_panel=BODY)] = 0.0,
     sigma: Annotated[
         str,
@@ -486,11 +486,10 @@ def simulate(
 
     with messages_of(simulate):
         check_new_file(output, SUFFIXES, overwrite=overwrite)
-        if shape not in SHAPES:
-            raise ValueError(f"shape: expected {', '.join(SHAPES)}, got {shape!r}")
+        body = body_of(shape, radius=radius, diameter=diameter, positions=positions)
         rng = np.random.default_rng(seed)
         truth = perrin.simulate_motion(
-            getattr(perrin.Cluster, shape)(radius),
+            body,
             D_R=d_r,
             D_T=d_t,
             dt=dt,
@@ -498,15 +497,13 @@ def simulate(
             dynamics=read_dynamics(dynamics),
             rng=rng,
         )
-        positions = perrin.add_noise(
-            truth.positions(), sigma=read_numbers("--sigma", sigma), rng=rng
-        )
-        table = perrin.positions_table(positions)
+        x = perrin.add_noise(truth.positions(), sigma=read_numbers("--sigma", sigma), rng=rng)
+        table = perrin.positions_table(x)
         # Formats without a cluster column.
         if output.name.lower().endswith((".gdf", ".napari.csv")):
             table = table.drop(columns="cluster")
         perrin.write_tracks(table, output)
-        print(f"{frames} frames of one {shape} written to {output}")
+        print(f"{frames} frames of one {shape or positions} written to {output}")
 
 
 @app.command(
@@ -517,20 +514,11 @@ def simulate(
 def predict(
     viscosity: Annotated[float, typer.Option(help="Viscosity, Pa s.", rich_help_panel=SIZES)],
     temperature: Annotated[float, typer.Option(help="Temperature, K.", rich_help_panel=SIZES)],
-    shape: Annotated[
-        str | None, typer.Argument(help=f"Touching spheres: {', '.join(TOUCHING_SHAPES)}.")
-    ] = None,
+    shape: Shape = None,
     diameter: Annotated[
         float | None, typer.Option(help="Sphere diameter, um.", rich_help_panel=BODY)
     ] = None,
-    positions: Annotated[
-        Path | None,
-        typer.Option(
-            help="Sphere centres of another body: csv with the columns x,y,z (um) and, if the "
-            "radii differ, radius (um).",
-            rich_help_panel=BODY,
-        ),
-    ] = None,
+    positions: Positions = None,
     accuracy: Annotated[
         float, typer.Option(help="Largest relative numerical error.", rich_help_panel=SIZES)
     ] = 1e-4,
@@ -579,7 +567,6 @@ def predict(
     perrin plan tetrahedron --diameter 2.45 --d-r 0.005 --sigma 0.03 --time 600 -o plan.png""",
 )
 def plan(
-    shape: Shape,
     d_r: Annotated[
         float, typer.Option("--d-r", help="Expected D_R, rad^2/s.", rich_help_panel=BODY)
     ],
@@ -589,16 +576,10 @@ def plan(
             help="Localisation error, um, one number or x,y,z.", rich_help_panel=RECORDING
         ),
     ],
-    radius: Annotated[
-        float | None,
-        typer.Option(help="Mean distance of particles to the centre, um.", rich_help_panel=BODY),
-    ] = None,
-    diameter: Annotated[
-        float | None,
-        typer.Option(
-            help="Diameter of touching spheres, um, instead of --radius.", rich_help_panel=BODY
-        ),
-    ] = None,
+    shape: Shape = None,
+    radius: Radius = None,
+    diameter: Diameter = None,
+    positions: Positions = None,
     d_t: Annotated[
         float | None,
         typer.Option(
@@ -642,7 +623,7 @@ def plan(
         if output is not None:
             check_new_file(output, PICTURE_SUFFIXES, overwrite=overwrite)
         found = perrin.plan_sampling(
-            body_of(shape, radius=radius, diameter=diameter),
+            body_of(shape, radius=radius, diameter=diameter, positions=positions),
             D_R=d_r,
             sigma=read_numbers("--sigma", sigma),
             D_T=d_t,

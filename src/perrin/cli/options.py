@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, cast, get_args
 import typer
 from typer.core import TyperCommand
 
+from perrin._arrays import require_positive
 from perrin.cli.config import take_config
 
 if TYPE_CHECKING:
@@ -19,11 +20,12 @@ if TYPE_CHECKING:
     from perrin.run.experiment import MotionModel
 
 
-SHAPES = ("tetrahedron", "pentahedron", "trimer")
-
-TOUCHING_SHAPES = (
-    "dimer", "trimer", "tetrahedron", "bipyramid", "octahedron", "pentagonal-bipyramid",
-)  # fmt: skip
+# Number of spheres of the named bodies; the paper's pentahedron is the bipyramid with all five at
+# one distance from the centre, where a radius is given.
+SHAPES = {
+    "dimer": 2, "trimer": 3, "tetrahedron": 4, "pentahedron": 5, "bipyramid": 5, "octahedron": 6,
+    "pentagonal-bipyramid": 7,
+}  # fmt: skip
 
 PICTURE_SUFFIXES = (".png", ".pdf", ".svg")
 
@@ -234,7 +236,28 @@ Dynamics = Annotated[
 ]
 
 Seed = Annotated[int, typer.Option(help="Seed of the random numbers.", rich_help_panel=RECORDING)]
-Shape = Annotated[str, typer.Argument(help=f"{', '.join(SHAPES)}.")]
+Shape = Annotated[str | None, typer.Argument(help=f"{', '.join(SHAPES)}; or --positions.")]
+
+Radius = Annotated[
+    float | None,
+    typer.Option(help="Mean distance of particles to the centre, um.", rich_help_panel=BODY),
+]
+
+Diameter = Annotated[
+    float | None,
+    typer.Option(
+        help="Diameter of touching spheres, um, instead of --radius.", rich_help_panel=BODY
+    ),
+]
+
+Positions = Annotated[
+    Path | None,
+    typer.Option(
+        help="Sphere centres of another body: csv with the columns x,y,z (um) and, if the radii "
+        "differ, radius (um).",
+        rich_help_panel=BODY,
+    ),
+]
 
 
 def read_optics(text: str | None) -> Optics | None:
@@ -255,20 +278,17 @@ def spheres_of(
 ) -> tuple[ArrayLike, ArrayLike]:
     """Return centres and radius of a named body of touching spheres, or those of a file."""
     import perrin
-    from perrin._arrays import require_positive
     from perrin.tracks.files import read_spheres
 
     if diameter is not None:
         require_positive(diameter=diameter)
-    if positions is None and shape in TOUCHING_SHAPES:
+    if positions is None and shape in SHAPES:
         if diameter is None:
             raise ValueError("--diameter: the sphere diameter (um) is needed")
-        return perrin.Cluster.touching(
-            TOUCHING_SHAPES.index(shape) + 2, diameter
-        ).positions, diameter / 2
+        return perrin.Cluster.touching(SHAPES[shape], diameter).positions, diameter / 2
     if positions is None or shape is not None:
         raise ValueError(
-            f"expected one of {', '.join(TOUCHING_SHAPES)}, or --positions FILE, got {shape!r}"
+            f"expected one of {', '.join(SHAPES)}, or --positions FILE, got {shape!r}"
             + ("" if positions is None else f" and {positions}")
         )
     centers, radius = read_spheres(positions)
@@ -363,21 +383,34 @@ def read_columns(text: str | None) -> dict[str, str | int] | None:
     return {name.strip(): place(column.strip()) for name, _, column in pairs}
 
 
-def body_of(shape: str, *, radius: float | None, diameter: float | None) -> Cluster:
-    """Return the named body of that radius, or of touching spheres of that diameter."""
+def body_of(
+    shape: str | None, *, radius: float | None, diameter: float | None, positions: Path | None
+) -> Cluster:
+    """Return the named body of that radius, or of touching spheres, or that of a file."""
     from perrin import Cluster
+    from perrin.geometry.symmetry import point_group
+    from perrin.tracks.files import read_spheres
 
+    if positions is not None:
+        if shape is not None or radius is not None or diameter is not None:
+            raise ValueError("--positions: states the body; expected no name, radius or diameter")
+        places = read_spheres(positions)[0]
+        return Cluster(places, point_group(places))
     faults = []
     if shape not in SHAPES:
-        faults.append(f"shape: expected {', '.join(SHAPES)}, got {shape!r}")
+        faults.append(f"expected one of {', '.join(SHAPES)}, or --positions FILE, got {shape!r}")
     if (radius is None) == (diameter is None):
         faults.append("expected either --radius or --diameter (touching spheres)")
-    if faults:
+    if faults or shape is None:
         raise ValueError("; ".join(faults))
     if diameter is not None:
-        return Cluster.touching({"trimer": 3, "tetrahedron": 4, "pentahedron": 5}[shape], diameter)
-    body: Cluster = getattr(Cluster, shape)(radius)
-    return body
+        return Cluster.touching(SHAPES[shape], diameter)
+    if shape in ("trimer", "tetrahedron", "pentahedron"):
+        body: Cluster = getattr(Cluster, shape)(radius)
+        return body
+    require_positive(radius=radius or 0.0)
+    unit = Cluster.touching(SHAPES[shape], 1.0)
+    return Cluster(unit.positions * ((radius or 0.0) / unit.R), unit.symmetry)
 
 
 def read_slice(text: str | None) -> tuple[int | None, int | None] | None:
