@@ -11,7 +11,7 @@ from perrin.tracks.raw_tables import RawTable, tracked_rows
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-_NAMES = {"x": "Position X", "y": "Position Y", "z": "Position Z", "frame": "Time"}
+_IMARIS_NAMES = {"x": "Position X", "y": "Position Y", "z": "Position Z", "frame": "Time"}
 
 _LINES_BEFORE_HEADER = 4
 
@@ -67,7 +67,7 @@ def imaris_table(text: bytes, source: str) -> RawTable:
             "has the columns Position X, Position Y, Position Z, Time and TrackID",
         )
     table = delimited_table(text, Layout(), source, header=header, names=names)
-    found = {ours: name for ours, name in _NAMES.items() if name in table}
+    found = {ours: name for ours, name in _IMARIS_NAMES.items() if name in table}
     particle = next((name for name in ("TrackID", "Parent") if name in table), None)
     notes: tuple[str, ...] = ()
     if particle and table[particle].notna().any():

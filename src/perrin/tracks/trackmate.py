@@ -11,7 +11,7 @@ from perrin.tracks.raw_tables import RawTable, tracked_rows, without_flat_z
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-_NAMES = {
+_TRACKMATE_NAMES = {
     "frame": "FRAME",
     "particle": "TRACK_ID",
     "x": "POSITION_X",
@@ -72,11 +72,11 @@ def trackmate_table(text: bytes, source: str) -> RawTable:
         stated = dict(zip(names, Layout().fields(lines[extra]), strict=False))
         units = {
             ours: stated[name].strip("()")
-            for ours, name in _NAMES.items()
+            for ours, name in _TRACKMATE_NAMES.items()
             if stated.get(name, "").startswith("(")
         }
     table = delimited_table(text, Layout(), source, header=0, skipped=extra, names=names)
-    found = {ours: name for ours, name in _NAMES.items() if name in table}
+    found = {ours: name for ours, name in _TRACKMATE_NAMES.items() if name in table}
     if "particle" in found:
         table, notes = tracked_rows(table, found["particle"])
     else:
@@ -117,7 +117,7 @@ def parse_trackmate_xml(data: bytes, source: str) -> RawTable:
 
     import pandas as pd
 
-    contents = _Contents()
+    contents = _SpotsInFile()
     parser = expat.ParserCreate()
 
     def refuse_entities(*_: object) -> None:
@@ -151,7 +151,7 @@ def parse_trackmate_xml(data: bytes, source: str) -> RawTable:
     wanted = ("TRACK_ID", "FRAME", "POSITION_X", "POSITION_Y", "POSITION_Z", "POSITION_T")
     table = pd.DataFrame([{name: spot.get(name) for name in wanted} for spot in spots])
     table = table.apply(pd.to_numeric, errors="coerce").dropna(axis="columns", how="all")
-    found = {ours: name for ours, name in _NAMES.items() if name in table}
+    found = {ours: name for ours, name in _TRACKMATE_NAMES.items() if name in table}
     units = {axis: contents.length_unit for axis in "xyz" if contents.length_unit}
     if contents.time_unit:
         units["time"] = contents.time_unit
@@ -159,7 +159,7 @@ def parse_trackmate_xml(data: bytes, source: str) -> RawTable:
     return _spots(RawTable(table, kind, found, units, notes))
 
 
-class _Contents:
+class _SpotsInFile:
     """Spots and tracks of a file of TrackMate, collected while it is read."""
 
     def __init__(self) -> None:

@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 
 _PROPERTIES = re.compile(r'\bProperties="?([^"\s]+)"?', re.IGNORECASE)
 
-_FRAME = re.compile(r"\bframe\s*[=:]?\s*(-?\d+)\b", re.IGNORECASE)
+_FRAME_STATED = re.compile(r"\bframe\s*[=:]?\s*(-?\d+)\b", re.IGNORECASE)
 
-_TIME = re.compile(r"\btime\s*[=:]?\s*\"?([-+.\deE]+)", re.IGNORECASE)
+_TIME_STATED = re.compile(r"\btime\s*[=:]?\s*\"?([-+.\deE]+)", re.IGNORECASE)
 
 # Names of properties that other programs give to our columns.
 _OURS = {
@@ -59,18 +59,18 @@ def parse_xyz(text: str, source: str) -> RawTable:
     [[0, 0, 0], [0, 1, 1], [1, 0, 0], [1, 1, 1]]
     """
     lines = text.splitlines()
-    starts, counts = _frames(lines, source)
+    starts, counts = _frame_starts(lines, source)
     comments = [lines[start + 1] for start in starts]
     body = [
         line
         for start, count in zip(starts, counts, strict=True)
         for line in lines[start + 2 : start + 2 + count]
     ]
-    table, found = _columns(body, comments[0], source)
-    table["frame"] = np.repeat(_numbers(comments), counts)
+    table, found = _particle_columns(body, comments[0], source)
+    table["frame"] = np.repeat(_frame_numbers(comments), counts)
     at = np.concatenate([np.arange(n) + start + 2 for start, n in zip(starts, counts, strict=True)])
     table.index = at - 1
-    times = [_TIME.search(comment) for comment in comments]
+    times = [_TIME_STATED.search(comment) for comment in comments]
     if "time" not in table and all(times):
         table["time"] = np.repeat([float(time[1]) for time in times if time], counts)
     notes = []
@@ -130,7 +130,7 @@ def xyz_text(table: pd.DataFrame) -> str:
     return "\n".join(parts) + "\n"
 
 
-def _frames(lines: Sequence[str], source: str) -> tuple[list[int], list[int]]:
+def _frame_starts(lines: Sequence[str], source: str) -> tuple[list[int], list[int]]:
     """Return the first line of each frame and its number of particles."""
     starts, counts = [], []
     at = 0
@@ -155,7 +155,7 @@ def _frames(lines: Sequence[str], source: str) -> tuple[list[int], list[int]]:
     return starts, counts
 
 
-def _columns(body: list[str], comment: str, source: str) -> tuple[pd.DataFrame, set[str]]:
+def _particle_columns(body: list[str], comment: str, source: str) -> tuple[pd.DataFrame, set[str]]:
     """Return the columns that the properties of an extended file, or their number, name."""
     import pandas as pd
 
@@ -189,9 +189,9 @@ def _columns(body: list[str], comment: str, source: str) -> tuple[pd.DataFrame, 
     return table, set(names.values())
 
 
-def _numbers(comments: list[str]) -> list[int]:
+def _frame_numbers(comments: list[str]) -> list[int]:
     """Return the numbers of the frames: those in the comments where all rise, or their order."""
-    found = [_FRAME.search(comment) for comment in comments]
+    found = [_FRAME_STATED.search(comment) for comment in comments]
     stated = [int(match[1]) for match in found if match]
     if len(stated) == len(comments) and all(a < b for a, b in pairwise(stated)):
         return stated
