@@ -46,7 +46,14 @@ from perrin.plot.results import (
     residual_figure,
     save_figures,
 )
-from perrin.plot.style import PALETTE, legend_above, new_figure, save_figure, write_reason
+from perrin.plot.style import (
+    PALETTE,
+    font_in_use,
+    legend_above,
+    new_figure,
+    save_figure,
+    write_reason,
+)
 
 __all__ = [
     "MAX_CLUSTERS",
@@ -55,6 +62,7 @@ __all__ = [
     "ModelLine",
     "alternative_spectrum",
     "curve_figure",
+    "font_in_use",
     "forest_figure",
     "found_figure",
     "health_figure",

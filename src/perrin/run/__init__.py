@@ -4,6 +4,7 @@ from perrin.run.experiment import Experiment, Recording, argument_faults, merged
 from perrin.run.folders import check_place, check_resumable, filled_folder, staged_folder
 from perrin.run.grouping import assign_clusters
 from perrin.run.kinds import part_of, shape_numbers, usual_symmetry
+from perrin.run.layers import napari_layers, napari_reader, table_layers
 from perrin.run.measure import (
     ClusterTracks,
     Coefficient,
@@ -197,6 +198,8 @@ __all__ = [
     "motion_and_path",
     "motion_sentences",
     "motion_table",
+    "napari_layers",
+    "napari_reader",
     "no_cluster_text",
     "no_model_notes",
     "no_pose_notes",
@@ -222,6 +225,7 @@ __all__ = [
     "stage_jump_warnings",
     "staged_folder",
     "steady_motion_warning",
+    "table_layers",
     "track_steps",
     "unfit_diameter_text",
     "unresolved_size_notes",
