@@ -72,6 +72,8 @@ KINDS = {
     "symmetry": r"too far between frames|sample faster",
     "units": r"\bunits?\b|trackpy|outside [\d.]+ (to|-)|per (pixel|unit)|in nm\b|lengths in um",
     "viscosity": r"viscosity.*(water|Pa s)|viscosity .* (is|over|above)",
+    "no cluster": r"^no clusters:|free spheres",
+    "aggregate": r"are no cluster: bodies of over",
     "disagreement": r"do not agree|not agree on one",
     "coarse": r"4 D_R dt",
     "noisy": r"signal-to-noise",

@@ -374,7 +374,7 @@ def main():
 
 def print_case(report, bodies, case, *, seconds):
     """Print how a report compares with the truth."""
-    rigid = [b for b in bodies if len(b.shape) >= 3]
+    rigid = [b for b in bodies if len(b.shape) >= 2]
     x, stated, missed, false, n = [], [], 0, 0, 0
     per = case.light.shape[0]
     for i, part in report.imaging.features.groupby("frame"):
@@ -404,6 +404,7 @@ def print_case(report, bodies, case, *, seconds):
     said = 1e3 * np.sqrt(np.nanmedian(np.concatenate(stated) ** 2, axis=0))
     print(f"  {n} spheres: {missed} missed, {false} false; sd {sd.round(1)}, stated", end=" ")
     print(f"{said.round(1)} nm; {seconds:.1f} s")
+    print_singles(report, [b for b in bodies if len(b.shape) == 1], case)
     if not rigid:
         print(f"  no body was planted; {len(report.clusters)} clusters, {len(report.rods)} rods")
         return
@@ -412,25 +413,60 @@ def print_case(report, bodies, case, *, seconds):
     sizes = [len(rigid[c].shape) for c in pairs]
     print(f"  clusters: {len(pairs)} of {len(rigid)} found (sizes {sizes}),", end=" ")
     print(f"{len(others)} false, {len(report.rods)} rods")
-    turns = [turn_errors(result, rigid[c], case) for c, result in pairs.items()]
+    turns = [
+        turn_errors(result, rigid[c], case)
+        for c, result in pairs.items()
+        if len(rigid[c].shape) > 2
+    ]
     if turns:
         print(f"  turn errors {np.sqrt(np.mean(np.concatenate(turns) ** 2, axis=0)).round(1)} mrad")
-    known = {r.cluster: r for r in true.clusters}
+    known = {r.cluster: r for r in true.results}
     for c, result in pairs.items():
         if c in known:
             print(f"  body {c}:", compared(result, known[c]))
     if report.pooled is not None and true.pooled is not None:
         print("  pooled:", compared(report.pooled, true.pooled))
+    for kind in report.kinds:
+        for other in true.kinds:
+            if (kind.size, kind.point_group) == (other.size, other.point_group):
+                print(f"  {kind.name} ({len(kind.clusters)}):", end=" ")
+                print("; ".join(compared_values(dict(kind.coefficients), dict(other.coefficients))))
+
+
+def print_singles(report, singles, case):
+    """Print D_T of single spheres against that of their true positions."""
+    import pandas as pd
+
+    from perrin import Noise
+    from perrin.run.experiment import Recording
+    from perrin.run.singles import measure_singles
+
+    if not singles or report.singles is None:
+        return
+    x = np.concatenate([instants(b, case)[:, 0] for b in singles])
+    table = pd.DataFrame(x, columns=["x", "y", "z"])
+    frame, particle = np.indices((case.n_frames, len(singles)))
+    table = table.assign(frame=frame.T.ravel(), particle=particle.T.ravel())
+    true = measure_singles(table, Noise(), Recording(dt=DT))
+    one = compared_values({"D_T": report.singles.D_T}, {"D_T": true.D_T})
+    print(f"  single spheres ({report.singles.n_tracks} tracks of {len(singles)}):", *one)
 
 
 def compared(found, true):
     """Return D_R and D_T against the truth in its standard errors, and the ratio of errors."""
+    names = [name for name in ("D_R", "D_perp", "D_T") if getattr(found, name, None) is not None]
+    both = ({name: getattr(one, name) for name in names} for one in (found, true))
+    return "; ".join(compared_values(*both))
+
+
+def compared_values(found, true):
+    """Return the comparison of each coefficient, by name, with the true one."""
     texts = []
-    for name in ("D_R", "D_T"):
-        one, other = getattr(found, name), getattr(true, name)
+    for name in found:
+        one, other = found[name], true[name]
         off, ratio = (one.value - other.value) / other.stderr, one.stderr / other.stderr
         texts.append(f"{name} {one.value:.5f} ({off:+.2f} errors, error x {ratio:.2f})")
-    return "; ".join(texts)
+    return texts
 
 
 def rows_of(result):
@@ -441,7 +477,7 @@ def rows_of(result):
 def matched(report, bodies, case):
     """Return {planted body: result} and the results that are no planted body."""
     pairs, others = {}, []
-    for result in report.clusters:
+    for result in report.results:
         rows = rows_of(result)
         away = [
             np.nanmedian(

@@ -304,7 +304,7 @@ def test_like_clusters_share_one_solution(monkeypatch):
 
     monkeypatch.setattr("perrin.run.predictions.cluster_mobility", counted)
     report = perrin.analyze(pd.concat(tables), dt=0.73, diameter=2.45, **KNOWN)
-    assert solved == [4, 3]
+    assert solved == [3, 4]  # by number of particles
     values = [c.prediction.D_R.predicted for c in report.clusters]
     np.testing.assert_allclose(values[:3], values[0], rtol=1e-12)
     assert values[3] > 1.1 * values[0]
@@ -540,7 +540,7 @@ def test_rods_are_measured_and_full_rotation_refused(tmp_path):
         report.save(tmp_path / name)
         again = perrin.load_run(tmp_path / name)
         assert again.to_dict() == report.to_dict()
-        entry = report.to_dict()["clusters"][-1]
+        (entry,) = (e for e in report.to_dict()["clusters"] if e["cluster"] == 5)
         assert entry["D_R"] is None
         assert any("no D_R" in w for w in entry["notes"])
         assert entry["D_perp"]["value"] == rod.D_perp.value

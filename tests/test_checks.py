@@ -270,12 +270,13 @@ def test_the_mean_pair_distance_knows_its_error(repeats):
 def test_clusters_with_other_numbers_of_spheres_are_reported():
     """Fewer, none, and more, as where two clusters meet."""
     x = table(20)
-    assert checks.missing_spheres(x, size=4, contact=CONTACT, frames=np.arange(20)) == NOTHING
+    four = dict.fromkeys(range(40), 4)
+    assert checks.missing_spheres(x, sizes=four, contact=CONTACT, frames=np.arange(20)) == NOTHING
     lost = x.drop(index=[4 * k for k in range(3, 15)])  # one sphere in 12 frames
     lost = lost[~lost["frame"].isin([1, 5])]  # frame 5 could not be read
     meeting = lost.assign(together=np.where(lost["frame"] >= 18, 8, lost["together"]))
     found = checks.missing_spheres(
-        meeting, size=4, contact=CONTACT, frames=np.delete(np.arange(26), 5)
+        meeting, sizes=four, contact=CONTACT, frames=np.delete(np.arange(26), 5)
     )
     # Of 19 frames of 4 spheres one lacks 4, and 11 lack one.
     assert warned(found) == (
@@ -283,10 +284,10 @@ def test_clusters_with_other_numbers_of_spheres_are_reported():
         "11 frames, none placed in 1 frame, 8 found in 2 frames (two clusters within 3.2 um), lost "
         "after frame 19"
     )
-    one = checks.missing_spheres(x.drop(index=8), size=4, contact=CONTACT, frames=np.arange(20))
+    one = checks.missing_spheres(x.drop(index=8), sizes=four, contact=CONTACT, frames=np.arange(20))
     assert noted(one).startswith("1.2 % of the spheres are missing")
     many = pd.concat([x.drop(index=8).assign(cluster=k) for k in range(40)])
-    text = noted(checks.missing_spheres(many, size=4, contact=CONTACT, frames=np.arange(20)))
+    text = noted(checks.missing_spheres(many, sizes=four, contact=CONTACT, frames=np.arange(20)))
     assert text.endswith("cluster 9: 3 found in 1 frame; and 30 more")
 
 

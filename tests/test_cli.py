@@ -134,7 +134,7 @@ def test_summary_has_the_promised_form(demo):
     assert "NaN" not in text
     assert "Infinity" not in text
     summary = json.loads(text)
-    assert set(summary) == {"clusters", "pooled", "warnings", "notes"}
+    assert set(summary) == {"clusters", "pooled", "kinds", "singles", "warnings", "notes"}
     assert {"D_R", "D_T", "p_same"} <= set(summary["pooled"])
     (cluster,) = summary["clusters"]
     assert {

@@ -481,8 +481,8 @@ def test_a_movie_without_a_fault_has_no_warning_of_its_images(whole):
     assert found == []
 
 
-def test_spheres_of_a_larger_body_are_no_cluster():
-    """A bipyramid in a movie of trimers is no cluster, and no warning is about its spheres."""
+def test_clusters_of_all_sizes_are_measured_each_kind_by_itself():
+    """A trimer and a bipyramid have templates and pooled values of their own; size= selects."""
     bodies = [perrin.Cluster.touching(3, DIAMETER), perrin.Cluster.touching(5, DIAMETER)]
     truth = [
         perrin.simulate_motion(b, D_R=5e-3, D_T=0.01, dt=DT, n_frames=3, rng=k)
@@ -498,15 +498,20 @@ def test_spheres_of_a_larger_body_are_no_cluster():
     frames = np.stack(list(movie))
     movie = perrin.open_stack(frames, voxel=VOXEL, dt=DT)
     by_default = perrin.analyze_stack(movie, **SEARCH, refine=None)
-    assert [len(c.motion.template) for c in by_default.clusters] == [5]  # the larger of equals
+    assert [len(c.motion.template) for c in by_default.clusters] == [3, 5]
+    assert [(kind.size, kind.clusters) for kind in by_default.kinds] == [(3, (1,)), (5, (0,))]
+    assert by_default.pooled is None
     report = perrin.analyze_stack(movie, **SEARCH, refine=None, size=3)
     (only,) = report.clusters
     assert len(only.motion.template) == 3
     assert np.linalg.norm(only.motion.center[0] - CENTERS[0]) < 0.5
+    assert report.pooled is not None
+    assert "clusters of other sizes are left out: 1 of 5" in " ".join(report.notes)
     message = " ".join(report.warnings)
-    assert "larger bodies are left out (touching spheres: 5 in 3 frames)" in message
     assert "two clusters within" not in message
     assert "refused" not in message
+    with pytest.raises(perrin.DegenerateClusterError, match="no cluster of 4 spheres; found: 1 of"):
+        perrin.analyze_stack(movie, **SEARCH, refine=None, size=4)
 
 
 def test_voxels_without_a_number_make_a_frame_unreadable(movie_file, learned):

@@ -258,9 +258,9 @@ def run(
     ] = None,
     frames: Frames = None,
     size: Annotated[
-        int | None,
+        str | None,
         typer.Option(
-            help="Number of spheres of a cluster; the most common one if left out.",
+            help="Number of spheres of the clusters to measure: 4, or 3,4; all if left out.",
             rich_help_panel=SPHERES,
         ),
     ] = None,
@@ -355,7 +355,7 @@ def run(
                 movie,
                 diameter=diameter,
                 contact=contact,
-                size=size,
+                size=read_whole_numbers("--size", size) or None,
                 frames=read_slice(frames),
                 exclude=read_whole_numbers("--exclude", exclude),
                 refine=read_refine(refine),

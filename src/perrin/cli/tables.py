@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from perrin.diffusion.sampling import SamplingPlan
     from perrin.hydrodynamics.mobility import Mobility
     from perrin.run.predictions import Compared
-    from perrin.run.results import ClusterResult, Pooled, Report
+    from perrin.run.results import BodyKind, ClusterResult, Pooled, Report
 
 
 _CLUSTERS_SHOWN, _WARNINGS_SHOWN, _NOTES_SHOWN = 5, 20, 10
@@ -65,7 +65,8 @@ def show_report(report: Report, output: Path, command: Callable[..., None]) -> N
 
     console = Console(highlight=False)
     for result in report.clusters[:_CLUSTERS_SHOWN]:
-        console.print(cluster_table(result))
+        kind = report.kind_of(result.cluster) if len(report.kinds) > 1 else None
+        console.print(cluster_table(result, kind=kind))
         if result.tensor is not None and result.tensor.p_isotropic < _EQUAL_AXES:
             axes = f"rotation about the body's axes: {result.tensor.summary}\n"
             console.print(escape(axes), soft_wrap=True)
@@ -75,6 +76,8 @@ def show_report(report: Report, output: Path, command: Callable[..., None]) -> N
         )
     if report.pooled is not None and len(report.clusters) > 1:
         console.print(pooled_table(report.pooled))
+    if report.pooled_by_kind:
+        console.print(kinds_table(report))
     for rod in report.rods[:_CLUSTERS_SHOWN]:
         console.print(escape(perp_text(rod)))
         if rod.prediction is not None:
@@ -113,8 +116,15 @@ def show_remarks(report: Report, command: Callable[..., None], console: Console)
         console.print(f"[dim]and {len(notes) - _NOTES_SHOWN} more notes in summary.json[/]")
 
 
-def cluster_table(result: ClusterResult) -> Table:
-    """Return the short table of one cluster: coefficients, noise, sizes."""
+def cluster_table(result: ClusterResult, *, kind: BodyKind | None = None) -> Table:
+    """Return the short table of one cluster: coefficients, noise, sizes.
+
+    Parameters
+    ----------
+    result : ClusterResult
+    kind : BodyKind, optional
+        Number of particles and shape for the title, where there are several kinds.
+    """
     from rich.box import SIMPLE_HEAD
     from rich.markup import escape
     from rich.table import Table
@@ -122,7 +132,8 @@ def cluster_table(result: ClusterResult) -> Table:
     from perrin._text import with_error
 
     # A name is the user's text: square brackets in it are no markup.
-    title = f"cluster {escape(result.name)}: {result.motion.fitted.size} frames"
+    shape = "" if kind is None else f"{kind.name}, "
+    title = f"cluster {escape(result.name)}: {shape}{result.motion.fitted.size} frames"
     table = Table("", "value", "68 %", "95 %", title=title, title_justify="left", box=SIMPLE_HEAD)
     table.columns[0].no_wrap = True
     for name, estimate in (("D_R", result.D_R), ("D_T", result.D_T)):
@@ -213,6 +224,33 @@ def pooled_table(pooled: Pooled) -> Table:
     if same:
         table.caption = f"chance of such a scatter about one value: {', '.join(same)}"
         table.caption_justify = "left"
+    return table
+
+
+def kinds_table(report: Report) -> Table:
+    """Return the table of the pooled values of every kind of clusters, and of single spheres."""
+    from rich.box import SIMPLE_HEAD
+    from rich.table import Table
+
+    title = "kinds of bodies, each pooled by itself"
+    head = ("spheres", "bodies", "", "value", "95 %")
+    table = Table(*head, title=title, title_justify="left", box=SIMPLE_HEAD)
+    for column in table.columns:
+        column.no_wrap = True
+    rows = [
+        ((f"{kind.size} {kind.point_group}", str(len(kind.clusters))), kind.coefficients)
+        for kind in report.kinds
+    ]
+    if report.singles is not None:
+        rows.append((("1", f"{report.singles.n_tracks} tracks"), [("D_T", report.singles.D_T)]))
+    for names, coefficients in rows:
+        shown = names
+        for name, estimate in coefficients:
+            value, _, interval = _estimate_cells(estimate)
+            table.add_row(*shown, f"{name} ({estimate.unit})", value, interval)
+            shown = ("", "")
+        if not coefficients:
+            table.add_row(*names, "", "not rigid: not pooled")
     return table
 
 

@@ -12,19 +12,23 @@ from perrin.diffusion.estimators import by_likelihood
 from perrin.diffusion.noise_model import Noise
 from perrin.diffusion.steps import NoisySteps, center_steps, direction_steps
 from perrin.errors import TooFewFramesError
+from perrin.motion.rods import RodMotion
 
 if TYPE_CHECKING:
-    from perrin.motion.rods import RodMotion
+    from collections.abc import Sequence
 
 
 def estimate_rod(
-    motion: RodMotion, *, quantity: Literal["direction", "translation"] = "direction"
+    motion: RodMotion | Sequence[RodMotion],
+    *,
+    quantity: Literal["direction", "translation"] = "direction",
 ) -> DiffusionEstimate:
     """Estimate D_perp of a rod's direction, or D_T of its centre, by maximum likelihood.
 
     Parameters
     ----------
-    motion : RodMotion
+    motion : RodMotion or sequence of RodMotion
+        Motion; several motions are pooled: they share one D, and each has its own noise.
     quantity : {"direction", "translation"}
         D_perp (rad^2/s), with ``<|du|^2>`` = 4 D_perp dt for short times, or the mean D_T (um^2/s).
 
@@ -49,18 +53,21 @@ def estimate_rod(
     True
     """
     refuse(choice_fault("quantity", quantity, ("direction", "translation")))
-    steps = direction_steps(motion) if quantity == "direction" else center_steps(motion)
-    if len(steps.duration) < 2:
-        raise TooFewFramesError(
-            f"{motion.fitted.size} frames contain the rod in too few steps: at least 3 in a row "
-            "(gaps allowed) are needed to separate diffusion from noise",
-            int(motion.fitted.size),
-        )
+    motions = [motion] if isinstance(motion, RodMotion) else list(motion)
+    steps_of_rod = direction_steps if quantity == "direction" else center_steps
+    steps = [steps_of_rod(one) for one in motions]
+    for one, found in zip(motions, steps, strict=True):
+        if len(found.duration) < 2:
+            raise TooFewFramesError(
+                f"{one.fitted.size} frames contain the rod in too few steps: at least 3 in a row "
+                "(gaps allowed) are needed to separate diffusion from noise",
+                int(one.fitted.size),
+            )
     return DiffusionEstimate.judged(
-        by_likelihood([NoisySteps.of(steps, Noise())]),
+        by_likelihood([NoisySteps.of(found, Noise()) for found in steps]),
         quantity="rotation" if quantity == "direction" else "translation",
         method="mle",
-        n_frames=int(motion.fitted.size),
-        dt=float(np.median(steps.duration)),
-        noise_variance=steps.complete,
+        n_frames=sum(int(one.fitted.size) for one in motions),
+        dt=float(np.mean([np.median(found.duration) for found in steps])),
+        noise_variance=float(np.mean([found.complete for found in steps])),
     )

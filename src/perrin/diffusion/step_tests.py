@@ -45,6 +45,14 @@ _CLEARLY_STILL = 0.05
 # residual explains; beyond it the body itself was elsewhere for one frame.
 _BADLY_MEASURED = 100.0
 
+# More jumps of the stage than one in this number of steps (and more than one) are another motion.
+_STAGE_STEPS_PER_JUMP = 10
+
+_MEDIAN_SQUARE = 0.4549  # median of chi-squared with one degree of freedom
+
+# Bodies move alike unless their displacements differ by more than at this level.
+_MOVE_ALIKE = 1e-4
+
 # A variance multiplied by this takes a step out of the prediction of the others.
 _LEFT_OUT = 1e6
 
@@ -205,6 +213,174 @@ def find_jumps(motion: RigidMotion, estimate: DiffusionEstimate) -> Jumps:
     p = np.minimum(len(residuals) * p, 1.0)
     found = np.flatnonzero(likely)[p < JUMP_LEVEL]
     return Jumps(stop[found], size[found], p[p < JUMP_LEVEL], len(stop))
+
+
+@dataclass(frozen=True, eq=False)
+class StageJumps:
+    """Steps that all bodies make together: the stage or the camera moved.
+
+    Attributes
+    ----------
+    frames : ndarray of int, shape (K,)
+        Frames in which these steps end.
+    size, stderr : ndarray, shape (K, d)
+        Common displacements along the lab axes, um, and their standard errors, which the diffusion
+        of the bodies causes.
+    p : ndarray, shape (K,)
+        Probability of at least this common displacement anywhere in the movie.
+    bodies : ndarray of int, shape (K,)
+        Number of bodies that moved together.
+    """
+
+    frames: Ints
+    size: Floats
+    stderr: Floats
+    p: Floats
+    bodies: Ints
+
+    def __post_init__(self) -> None:
+        frozen(self.frames, self.size, self.stderr, self.p, self.bodies)
+
+    def rows(self, frames: Ints) -> Ints:
+        """Return the rows of a motion, by its frames (T,), at which the step with a jump ends."""
+        row = np.unique(np.searchsorted(frames, self.frames))
+        return np.asarray(row[(row > 0) & (row < len(frames))])
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the jumps for JSON."""
+        plain: dict[str, Any] = to_plain({f.name: getattr(self, f.name) for f in fields(self)})
+        return plain
+
+    @classmethod
+    def from_dict(cls, entry: dict[str, Any]) -> StageJumps:
+        """Return the jumps that `to_dict` wrote."""
+        frames, bodies = (from_plain(entry[k], dtype=np.int64) for k in ("frames", "bodies"))
+        size, error = (
+            from_plain(entry[name]).reshape(len(frames), -1 if len(frames) else 0)
+            for name in ("size", "stderr")
+        )
+        return cls(frames, size, error, from_plain(entry["p"]), bodies)
+
+
+def find_stage_jumps(motions: Sequence[RigidMotion], frames: Sequence[Ints]) -> StageJumps:
+    """Find the steps that all bodies of a movie make together.
+
+    Parameters
+    ----------
+    motions : sequence of RigidMotion
+        Motions of two or more bodies.
+    frames : sequence of ndarray of int
+        Frame of each row of each motion.
+
+    Returns
+    -------
+    StageJumps
+        Common displacements of family-wise p < 1e-6. More than a tenth of the steps of a movie are
+        no jumps but another common motion, and none is returned.
+
+    Notes
+    -----
+    The mean displacement m of the bodies between two frames, weighted with the inverse variances of
+    their steps along every axis, is compared with those of all other frames by an F test of d and
+    d (G - 1) degrees of freedom, with the mean of the others subtracted, so that a steady drift is
+    no jump. The deviations of the bodies from m must be those of their other steps (p > 1e-4):
+    otherwise one of them moved, and not the stage.
+
+    Examples
+    --------
+    >>> from dataclasses import replace
+    >>> from perrin import Cluster, simulate_motion
+    >>> motions = [
+    ...     simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, D_T=0.02, dt=0.7, n_frames=30, rng=k)
+    ...     for k in range(4)
+    ... ]
+    >>> jump = np.where(np.arange(30) < 12, 0.0, 1.2)[:, None] * [1.0, 0.0, 0.0]
+    >>> moved = [replace(m, center=m.center + jump) for m in motions]
+    >>> find_stage_jumps(moved, [np.arange(30)] * 4).frames.tolist()
+    [12]
+    """
+    from scipy.special import chdtrc, fdtrc
+
+    d = motions[0].center.shape[1] if motions else 3
+    none = StageJumps(
+        np.empty(0, np.int64), np.empty((0, d)), np.empty((0, d)), np.empty(0), np.empty(0, np.int64)
+    )
+    table = _steps_between_frames(motions, frames)
+    if table is None:
+        return none
+    ends, steps, gap = table  # steps (B, G, d), NaN where a body has none
+    scaled = steps / np.sqrt(gap)[:, None]
+    known = np.isfinite(scaled).all(axis=2)
+    several = known.sum(axis=0) >= 2
+    usual = np.ones(len(ends), dtype=np.bool_)
+    most = max(1, len(ends) // _STAGE_STEPS_PER_JUMP)
+    while True:
+        others = scaled[:, usual]
+        if usual.sum() < _FEWEST_STEPS or np.isfinite(others[..., 0]).sum(axis=1).min() < 3:
+            return none
+        center = np.nanmedian(others, axis=1, keepdims=True)
+        # A first scale that half of the steps cannot change; then that of all usual steps.
+        if usual.all():
+            square = np.nanmedian((others - center) ** 2, axis=1) / _MEDIAN_SQUARE
+        else:
+            square = np.nanmean((others - center) ** 2, axis=1)
+        weight = np.where(known[..., None], 1 / np.maximum(square, 1e-300)[:, None], 0.0)
+        total = weight.sum(axis=0)
+        mean = np.nansum(weight * (scaled - center), axis=0) / np.maximum(total, 1e-300)
+        common = (mean**2 * total).sum(axis=1)
+        level = 1.0 if usual.all() else float(common[usual & several].mean()) / d
+        largest = int(np.argmax(np.where(several & usual, common, 0.0)))
+        if not chdtrc(d, common[largest] / max(level, 1.0)) < _CANDIDATE_LEVEL:
+            break
+        usual[largest] = False
+        if np.count_nonzero(~usual) > 2 * most + 1:
+            return none
+    found = several & ~usual
+    if not found.any():
+        return none
+    apart = np.nansum(weight * (scaled - center - mean) ** 2, axis=(0, 2))
+    freedom = d * (known.sum(axis=0) - 1)
+    scatter = apart[usual & several].sum() / freedom[usual & several].sum()
+    p = fdtrc(d, d * max(int((usual & several).sum()) - 1, 1), common / d / level)
+    p = np.minimum(p * len(ends), 1.0)
+    found &= (p < JUMP_LEVEL) & (chdtrc(freedom, apart / scatter) > _MOVE_ALIKE)
+    if np.count_nonzero(found) > most:
+        return none
+    root = np.sqrt(gap)[:, None]
+    error = np.sqrt(level / np.maximum(total, 1e-300)) * root
+    return StageJumps(
+        ends[found], (mean * root)[found], error[found], p[found], known.sum(axis=0)[found]
+    )
+
+
+def _steps_between_frames(
+    motions: Sequence[RigidMotion], frames: Sequence[Ints]
+) -> tuple[Ints, Floats, Floats] | None:
+    """Return the steps of several bodies between successive frames.
+
+    Returns
+    -------
+    ends : ndarray of int, shape (G,)
+        Frames in which the steps end.
+    steps : ndarray, shape (B, G, d)
+        Displacements, um; NaN where a body has no such step.
+    duration : ndarray, shape (G,)
+        Durations of the steps over the shortest one.
+
+    None is returned for fewer than two bodies.
+    """
+    if len(motions) < 2:
+        return None
+    seen = np.unique(np.concatenate([f[m.fitted] for m, f in zip(motions, frames, strict=True)]))
+    if len(seen) < 2:
+        return None
+    x = np.full((len(motions), len(seen), motions[0].center.shape[1]), np.nan)
+    time = np.full(len(seen), np.nan)
+    for k, (motion, frame) in enumerate(zip(motions, frames, strict=True)):
+        place = np.searchsorted(seen, frame[motion.fitted])
+        x[k, place], time[place] = motion.center[motion.fitted], motion.time[motion.fitted]
+    duration = np.diff(time)
+    return seen[1:], np.diff(x, axis=1), duration / duration.min()
 
 
 def cut_at(motion: RigidMotion, rows: Ints) -> RigidMotion:

@@ -1,13 +1,6 @@
 """From an image stack to a Report."""
 
-from perrin.movie.bodies import (
-    Bodies,
-    find_bodies,
-    group_sizes,
-    most_common_size,
-    stated_errors,
-    tracks_of,
-)
+from perrin.movie.bodies import Bodies, find_bodies, group_sizes, median_errors, tracks_of
 from perrin.movie.checks import (
     Change,
     Findings,
@@ -28,6 +21,7 @@ from perrin.movie.checks import (
     mean_pair_distance,
     missing_spheres,
     pair_distance_bias,
+    partial_bodies,
     refusal,
     repeated_frames,
     saturated_frames,
@@ -74,10 +68,11 @@ __all__ = [
     "locate_frames",
     "long_steps",
     "mean_pair_distance",
+    "median_errors",
     "missing_spheres",
-    "most_common_size",
     "open_parts",
     "pair_distance_bias",
+    "partial_bodies",
     "read_parts",
     "refusal",
     "repeated_frames",
@@ -86,7 +81,6 @@ __all__ = [
     "scan_blur",
     "scanned_poses",
     "slow_sampling",
-    "stated_errors",
     "step_length",
     "tracks_of",
     "unreadable_frames",

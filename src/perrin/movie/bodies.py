@@ -7,13 +7,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from perrin._text import listed
 from perrin.errors import DegenerateClusterError, NoSpheresError
-from perrin.tracks.clusters import identify
 from perrin.tracks.files import check_tracks
 from perrin.tracks.groups import TOUCHING_REACH, touching_groups
+from perrin.tracks.rigid_bodies import identify_bodies
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     import pandas as pd
 
@@ -21,9 +22,15 @@ if TYPE_CHECKING:
     from perrin.images.optics.optics import Optics
     from perrin.images.spheres.localisation import Search
     from perrin.images.stack import Stack
+    from perrin.tracks.rigid_bodies import IdentifiedBodies
 
 
-_CLEAR_MAJORITY = 0.95  # share of the groups with the most common size that needs no note
+# Groups that keep together in fewer frames are left out, in short movies those of under half of the
+# frames; below three frames nothing can be measured.
+_FEWEST_FRAMES_TOGETHER, _FEWEST_FRAMES_MEASURED = 8, 3
+
+# A group of more spheres is a gel, a crystal or a glass.
+_MOST_SPHERES = 100
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,12 +40,12 @@ class Bodies:
     Attributes
     ----------
     features : DataFrame
-        Table of the spheres as in `Imaging`, with ``together`` (number of spheres in the chain of
-        touching ones) and ``border`` (distance of the centre to the border, um).
+        Table of the spheres as in `Imaging`, with ``together`` (number of spheres of clusters in
+        the chain of touching ones) and ``border`` (distance of the centre to the border, um).
     axes : list of str
         Columns of the coordinates.
-    size : int
-        Number of spheres of a cluster.
+    sizes : dict of int
+        Number of spheres of each cluster.
     margin : float
         Largest distance to the border of the centre of a sphere that the border cuts, um.
     dropped : dict of ndarray
@@ -46,16 +53,19 @@ class Bodies:
     warnings : list of str
         Warnings about bodies that are left out.
     notes : list of str
-        Notes about the choice of the size.
+        Notes about bodies that are left out.
+    singles : DataFrame
+        Tracks of the spheres that belong to no body: frame, particle and the coordinates, um.
     """
 
     features: pd.DataFrame
     axes: list[str]
-    size: int
+    sizes: dict[int, int]
     margin: float
     dropped: dict[int, Ints]
     warnings: list[str]
     notes: list[str]
+    singles: pd.DataFrame
 
 
 def find_bodies(
@@ -64,9 +74,9 @@ def find_bodies(
     search: Search,
     *,
     optics: Optics | None,
-    size: int | None = None,
+    sizes: Sequence[int] | None = None,
 ) -> Bodies:
-    """Assign the spheres of a movie to its clusters.
+    """Assign the spheres of a movie to its clusters: groups that move as rigid bodies.
 
     Parameters
     ----------
@@ -75,8 +85,8 @@ def find_bodies(
     stack : Stack
     search : Search
     optics : Optics or None
-    size : int, optional
-        Number of spheres of a cluster; default: the most common number of touching spheres.
+    sizes : sequence of int, optional
+        Numbers of spheres of the clusters that are wanted; default: all that are found.
 
     Returns
     -------
@@ -84,8 +94,10 @@ def find_bodies(
 
     Raises
     ------
-    NoSpheresError, DegenerateClusterError
-        If nothing was found, or no spheres touch.
+    NoSpheresError
+        If nothing was found.
+    DegenerateClusterError
+        If there are bodies, but none of a size that is wanted.
     """
     usable = np.ones(len(features), dtype=np.bool_)
     if "refined" in features:
@@ -97,17 +109,24 @@ def find_bodies(
             "check diameter and minmass, and whether the spheres are dark (dark=True)"
         )
     axes = [axis for axis in "xyz" if axis in features]
-    together = np.ones(len(features), dtype=np.int64)
-    together[usable] = group_sizes(features[usable], contact=search.contact, axes=axes)
-    notes: list[str] = []
-    if size is None:
-        size, notes = most_common_size(together[usable], dimension=len(axes))
-    found = identify(features.loc[usable, ["frame", *axes]], contact=search.contact, size=size)
-    columns = {"cluster": -1, "particle": -1, "piece": 0}
-    features = features.assign(together=together, **columns)
-    features.loc[usable, list(columns)] = found[list(columns)]
-    features, warnings = _without_larger_bodies(features, size=size)
-    features.loc[features["cluster"] < 0, ["particle", "piece"]] = (-1, 0)
+    rows = np.flatnonzero(usable)
+    frame = features["frame"].to_numpy(dtype=np.int64)[rows]
+    x = features[axes].to_numpy(dtype=np.float64)[rows]
+    errors = median_errors(features[usable], axes=axes)
+    error = None if errors is None else float(np.sqrt(np.mean(errors**2)))
+    found = identify_bodies(frame, x, contact=search.contact, error=error)
+    number, notes, warnings = _chosen_bodies(found, frame, sizes)
+    label = np.append(number, -1)[found.body]
+    size = {int(c): int(n) for c, n in zip(number, found.size, strict=True) if c >= 0}
+    offset = np.cumsum([0, *(size[c] for c in sorted(size))])
+    own = label >= 0
+    columns = np.tile([[1], [-1], [-1], [0]], len(features))
+    columns[0, rows[own]] = group_sizes(features.iloc[rows[own]], contact=search.contact, axes=axes)
+    columns[1, rows] = label
+    columns[2, rows] = np.where(own, offset[label] + found.particle, -1)
+    columns[3, rows] = np.where(own, found.piece, 0)
+    names = ("together", "cluster", "particle", "piece")
+    features = features.assign(**dict(zip(names, columns, strict=True)))
     length = dict(zip("zyx", np.array(stack.shape[1:]) * stack.voxel, strict=True))
     half = dict(zip("zyx", stack.voxel / 2, strict=True))
     sides = [
@@ -117,79 +136,58 @@ def find_bodies(
     features["border"] = np.min(sides, axis=0)
     blur = 0.0 if optics is None else optics.psf[0]
     margin = search.diameter / 2 + 2 * blur
-    features, dropped = _without_cut_bodies(features, size=size, margin=margin)
-    return Bodies(features, axes, size, margin, dropped, warnings, notes)
+    features, dropped = _without_cut_bodies(features, sizes=size, margin=margin)
+    single = rows[found.track >= 0]
+    singles = features.iloc[single][["frame", *axes]].assign(particle=found.track[found.track >= 0])
+    return Bodies(features, axes, size, margin, dropped, warnings, notes, singles)
 
 
-def _without_larger_bodies(features: pd.DataFrame, *, size: int) -> tuple[pd.DataFrame, list[str]]:
-    """Assign no cluster to spheres that are in a larger group in most of their frames."""
-    tracked = features[features["cluster"] >= 0]
-    usual = tracked.groupby(["cluster", "frame"])["together"].max().groupby("cluster").median()
-    larger = usual[usual > size]
-    if not len(larger):
-        return features, []
-    parts = features["cluster"].isin(larger.index)
-    kinds = features[features["together"].isin(larger)].groupby("together")["frame"].nunique()
-    listed = ", ".join(f"{n} in {count} frames" for n, count in kinds.items())
-    features = features.copy()
-    features.loc[parts, "cluster"] = -1
-    return features, [
-        f"larger bodies are left out (touching spheres: {listed}): they are no clusters of {size}; "
-        "size= measures them"
-    ]
-
-
-def most_common_size(together: Ints, *, dimension: int) -> tuple[int, list[str]]:
-    """Return the most common number of touching spheres, and a note if there are other numbers.
-
-    Parameters
-    ----------
-    together : ndarray of int
-        Number of spheres in the group of each sphere, in all frames.
-    dimension : int
-        2 or 3. Groups of fewer spheres, which have no orientation, are chosen only if there are no
-        larger ones.
-
-    Returns
-    -------
-    size : int
-        The largest of several that are equally common.
-    notes : list of str
-
-    Raises
-    ------
-    DegenerateClusterError
-        If no spheres touch.
-
-    Examples
-    --------
-    >>> most_common_size(np.repeat([4, 8], [400, 8]), dimension=3)
-    (4, [])
-    """
-    counted = np.bincount(together)
-    groups = np.round(counted / np.maximum(np.arange(len(counted)), 1)).astype(int)
-    groups[:2] = 0
-    if not groups.any():
-        raise DegenerateClusterError(
-            f"no spheres touch: all {len(together)} found are over {TOUCHING_REACH} contact "
-            "distances apart; correct contact or the voxel size"
+def _chosen_bodies(
+    found: IdentifiedBodies, frame: Ints, sizes: Sequence[int] | None
+) -> tuple[Ints, list[str], list[str]]:
+    """Return the number of the cluster that each body is, -1 if it is left out; notes; warnings."""
+    frames = len(np.unique(frame))
+    fewest = min(_FEWEST_FRAMES_TOGETHER, max(_FEWEST_FRAMES_MEASURED, int(np.ceil(frames / 2))))
+    own = found.body >= 0
+    pairs = np.unique(np.stack([found.body[own], frame[own]]), axis=1)
+    lives = np.bincount(pairs[0].astype(np.int64), minlength=len(found.size))
+    brief = (lives < fewest) & (lives > 0)
+    huge = found.size > _MOST_SPHERES
+    whole = ~brief & ~huge & (lives > 0)
+    wanted = whole if sizes is None else whole & np.isin(found.size, sizes)
+    notes, warnings = [], []
+    if brief.any():
+        notes.append(
+            f"{brief.sum()} groups of spheres that kept together in fewer than {fewest} of "
+            f"{frames} frames are no clusters and are left out"
         )
-    bodies = groups.copy()
-    bodies[:dimension] = 0
-    counts = bodies if bodies.any() else groups
-    size = int(np.flatnonzero(counts == counts.max())[-1])
-    share = groups[size] / groups.sum()
-    if share >= _CLEAR_MAJORITY:
-        return size, []
-    listed = ", ".join(f"{count} of {n}" for n, count in enumerate(groups) if count)
-    return size, [
-        f"clusters are taken to be of {size} spheres, the most common number (the largest of "
-        f"equals); groups of touching spheres in all frames: {listed}; size= measures others"
-    ]
+    if huge.any():
+        warnings.append(
+            f"{found.size[huge].max()} spheres that touch and keep their distances are no cluster: "
+            f"bodies of over {_MOST_SPHERES} spheres (gels, crystals, glasses) are left out"
+        )
+    if whole.any() and not wanted.any():
+        raise DegenerateClusterError(
+            f"no cluster of {' or '.join(map(str, sizes or ()))} spheres; found: "
+            f"{_counted_sizes(found.size[whole])}; without size= all are measured"
+        )
+    if (whole & ~wanted).any():
+        notes.append(
+            f"clusters of other sizes are left out: {_counted_sizes(found.size[whole & ~wanted])}; "
+            "size= selects several, without it all are measured"
+        )
+    number = np.where(wanted, np.cumsum(wanted) - 1, -1)
+    return number.astype(np.int64), notes, warnings
+
+
+def _counted_sizes(sizes: Ints) -> str:
+    """Return how many clusters there are of each size, in words."""
+    kinds, counts = np.unique(sizes, return_counts=True)
+    return listed(f"{count} of {n}" for n, count in zip(kinds, counts, strict=True))
 
 
 def _without_cut_bodies(
-    features: pd.DataFrame, *, size: int, margin: float
+    features: pd.DataFrame, *, sizes: Mapping[int, int], margin: float
 ) -> tuple[pd.DataFrame, dict[int, Ints]]:
     """Assign no cluster to bodies with spheres outside the border, in the frames concerned.
 
@@ -197,6 +195,7 @@ def _without_cut_bodies(
     """
     tracked = features[features["cluster"] >= 0]
     bodies = tracked.groupby(["cluster", "frame"]).agg(n=("x", "size"), border=("border", "min"))
+    size = bodies.index.get_level_values("cluster").map(sizes).to_numpy(dtype=np.int64)
     cut = bodies[(bodies["n"] < size) & (bodies["border"] < margin)].reset_index()
     in_cut_body = features.set_index(["cluster", "frame"]).index.isin(
         cut.set_index(["cluster", "frame"]).index
@@ -237,22 +236,31 @@ def group_sizes(features: pd.DataFrame, *, contact: float, axes: list[str]) -> I
     return out
 
 
-def stated_errors(bodies: Bodies) -> Floats | None:
+def median_errors(features: pd.DataFrame, *, axes: list[str]) -> Floats | None:
     """Return the median standard errors of the positions along each axis, um.
 
     Parameters
     ----------
-    bodies : Bodies
+    features : pandas.DataFrame
+        Table of the spheres, as `locate` returns it.
+    axes : list of str
+        Columns of the coordinates.
 
     Returns
     -------
     ndarray, shape (d,), or None
         None if the positions were not refined by the model.
+
+    Examples
+    --------
+    >>> import pandas as pd
+    >>> median_errors(pd.DataFrame({"x": [1.0], "sigma_x": [0.01]}), axes=["x"])
+    array([0.01])
     """
-    names = [f"sigma_{axis}" for axis in bodies.axes]
-    if not set(names) <= set(bodies.features):
+    names = [f"sigma_{axis}" for axis in axes]
+    if not set(names) <= set(features):
         return None
-    median = bodies.features[names].median().to_numpy(dtype=np.float64)
+    median = features[names].median().to_numpy(dtype=np.float64)
     return median if np.isfinite(median).all() else None
 
 
@@ -281,7 +289,7 @@ def tracks_of(bodies: Bodies, *, exclude: Sequence[int]) -> pd.DataFrame:
     found = set(features.loc[features["cluster"] >= 0, "cluster"].unique().tolist())
     if not found:
         raise DegenerateClusterError(
-            f"no cluster of {bodies.size} touching spheres is seen in three frames or more"
+            "no cluster: no spheres keep together longer than diffusion over a contact allows"
         )
     unknown = sorted(set(exclude) - found)
     if unknown:

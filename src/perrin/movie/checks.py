@@ -15,6 +15,7 @@ import numpy as np
 from perrin._text import listed
 from perrin.geometry.shapes import pair_distances
 from perrin.motion.scanning import scan_share
+from perrin.run.kinds import part_of
 from perrin.tracks.groups import TOUCHING_REACH
 
 if TYPE_CHECKING:
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
     from perrin._arrays import Floats, Ints
     from perrin.diffusion.estimate import DiffusionEstimate
     from perrin.motion.rigid_motion import RigidMotion
-    from perrin.run.results import ClusterResult
+    from perrin.run.results import BodyKind, ClusterResult
 
 
 _LISTED_ITEMS = 10  # largest number of frames or clusters that a message lists
@@ -515,7 +516,9 @@ def mean_pair_distance(
     return mean, scatter / np.sqrt(spheres / 2)
 
 
-def missing_spheres(features: pd.DataFrame, *, size: int, contact: float, frames: Ints) -> Findings:
+def missing_spheres(
+    features: pd.DataFrame, *, sizes: Mapping[int, int], contact: float, frames: Ints
+) -> Findings:
     """Report the frames in which clusters have missing or additional spheres, or are missing.
 
     It is a warning if over 10 % of the spheres of the clusters are missing between their first and
@@ -525,8 +528,8 @@ def missing_spheres(features: pd.DataFrame, *, size: int, contact: float, frames
     ----------
     features : pandas.DataFrame
         As in `Bodies`.
-    size : int
-        Number of spheres of a cluster.
+    sizes : mapping
+        Number of spheres of each cluster.
     contact : float
         Centre distance of touching spheres, um.
     frames : ndarray of int
@@ -538,10 +541,11 @@ def missing_spheres(features: pd.DataFrame, *, size: int, contact: float, frames
     for cluster, rows in tracked.groupby("cluster"):
         present = rows.groupby("frame").size()
         first, last = int(present.index.min()), int(present.index.max())
-        due = int(((frames >= first) & (frames <= last)).sum())
+        due, size = int(((frames >= first) & (frames <= last)).sum()), sizes[int(cluster)]
         absent = due - len(present)
         few = present[present < size]
-        crowd = rows.groupby("frame")["together"].max().loc[lambda n: n > size]
+        near = rows.groupby("frame")["together"].max()
+        crowd = near[near > size]
         missing += size * absent + int((size - few).sum())
         expected += size * due
         parts = [
@@ -565,7 +569,8 @@ def missing_spheres(features: pd.DataFrame, *, size: int, contact: float, frames
     shown = "; ".join(f"cluster {c}: {text}" for c, text in list(texts.items())[:_LISTED_ITEMS])
     more = f"; and {len(texts) - _LISTED_ITEMS} more" if len(texts) > _LISTED_ITEMS else ""
     text = (
-        f"{100 * missing / expected:.2g} % of the spheres are missing, {size} expected in each of "
+        f"{100 * missing / expected:.2g} % of the spheres are missing, "
+        f"{listed(sorted(set(sizes.values())))} expected in each of "
         f"{tracked['cluster'].nunique()} clusters; {shown}{more}"
     )
     return Findings((text,)) if missing > _MISSING_SHARE * expected else Findings(notes=(text,))
@@ -607,6 +612,38 @@ def clusters_near_border(
             f"centre within d/2 + 2 sigma ({margin:.2g} um) of the border, "
             f"{f'cluster {name} ' if name else ''}{text}"
             for name, text in combined_verdicts(verdicts).items()
+        )
+    )
+
+
+def partial_bodies(results: Sequence[ClusterResult], kinds: Sequence[BodyKind]) -> Findings:
+    """Note the kinds of clusters that have the shape of a part of a larger kind.
+
+    Parameters
+    ----------
+    results : sequence of ClusterResult
+    kinds : sequence of BodyKind
+        Kinds of the results.
+    """
+    templates = {r.cluster: r.motion.template for r in results}
+    known = [kind for kind in kinds if kind.clusters[0] in templates]
+    texts = []
+    for kind in known:
+        shape = templates[kind.clusters[0]]
+        larger = [one for one in known if part_of(shape, templates[one.clusters[0]])]
+        if larger:
+            many = "s" if len(kind.clusters) > 1 else ""
+            texts.append(
+                f"cluster{many} {listed(kind.clusters)} ({kind.name}) in those of "
+                f"{' or '.join(one.name for one in larger)}"
+            )
+    if not texts:
+        return _NOTHING
+    return Findings(
+        notes=(
+            f"clusters with the shape of a part of larger ones: {'; '.join(texts)}; a sphere of "
+            "them may be undyed, dim or out of view, or they are smaller clusters: they are "
+            "measured with the spheres that are seen, and not pooled with the others",
         )
     )
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import shutil
+from collections.abc import Iterable
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -19,16 +20,16 @@ from perrin.images.spheres.localisation import NO_FLAT_MODEL, Search, check_sear
 from perrin.images.spheres.spots import Spots
 from perrin.images.stack import digest
 from perrin.motion.scanning import scan_share
-from perrin.movie.bodies import Bodies, find_bodies, stated_errors, tracks_of
+from perrin.movie.bodies import Bodies, find_bodies, median_errors, tracks_of
 from perrin.movie.stages import Located, fit_poses, locate_frames
 from perrin.movie.workers import Work, check_workers
 from perrin.run.experiment import Experiment, MotionModel, Recording, merged_experiment
-from perrin.run.measure import library_version, measure_table
+from perrin.run.measure import library_version, measure_free_spheres, measure_table
 from perrin.tracks.clock import Clock, evenly_spaced
 
 if TYPE_CHECKING:
     import os
-    from collections.abc import Callable, Iterable, Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
     from typing import Unpack
 
     import pandas as pd
@@ -51,6 +52,13 @@ _LIBRARIES = ("perrin", "numpy", "scipy", "trackpy")
 _FEWEST_IMAGES = 3  # different images that a movie must have
 _LISTED_REFUSALS = 10  # refused clusters that are listed one by one
 _LOCATED, _POSED = "located", "posed"  # folders of finished frames
+
+
+class _Run(TypedDict):
+    """Input and arguments for ``run.json``."""
+
+    source: dict[str, str | None]
+    arguments: dict[str, Any]
 
 
 class Settings(TypedDict, total=False):
@@ -85,7 +93,7 @@ def analyze_stack(
     *,
     diameter: float,
     contact: float,
-    size: int | None = None,
+    size: int | Iterable[int] | None = None,
     frames: tuple[int | None, int | None] | None = None,
     exclude: Iterable[int] = (),
     refine: Refine = "model",
@@ -97,9 +105,10 @@ def analyze_stack(
 ) -> Report:
     """Measure D_R and D_T of every cluster in a movie of image stacks.
 
-    Spheres are located and refined (`locate`) and assigned to clusters (`identify`), the poses of
-    the clusters are fitted to the images (`fit_pose`), and the motions are analysed as in
-    `analyze`.
+    Spheres are located and refined (`locate`) and assigned to clusters, which are those that move
+    as rigid bodies (`rigid_bodies`), the poses of the clusters are fitted to the images
+    (`fit_pose`), and the motions are analysed as in `analyze`. Clusters of different numbers of
+    spheres or of different shapes have pooled values of their own (`Report.kinds`).
 
     Parameters
     ----------
@@ -109,9 +118,8 @@ def analyze_stack(
         Diameter of the fluorescent sphere, um.
     contact : float
         Centre distance of touching spheres, um.
-    size : int, optional
-        Number of spheres of a cluster; default: the most common number of touching spheres (three
-        or more, in the plane two or more, if there are any).
+    size : int or iterable of int, optional
+        Number of spheres of the clusters that are measured, or several; default: all clusters.
     frames : tuple of int or None, optional
         First frame, and first frame that is not used, as in a slice.
     exclude : iterable of int
@@ -137,7 +145,9 @@ def analyze_stack(
     Returns
     -------
     Report
-        With `Report.imaging`. Results do not depend on the number of workers, nor on interruptions.
+        With `Report.imaging`; without clusters where all spheres are free, of which
+        `Report.singles` has the D_T. Results do not depend on the number of workers, nor on
+        interruptions.
 
     Raises
     ------
@@ -147,7 +157,7 @@ def analyze_stack(
         For arguments out of range, or stated both in an object and as a keyword; if the folder of
         finished frames holds parts of another input or of other settings.
     NoSpheresError, DegenerateClusterError, TooFewFramesError
-        If there are no spheres, none touch, or no cluster can be measured.
+        If there are no spheres, none of the sizes that are wanted, or no cluster can be measured.
     IdentityError
         If particles move over half a contact distance between frames.
     OSError
@@ -187,11 +197,7 @@ def analyze_stack(
         crowds=True,  # clusters that meet may be a crowd for some frames
     )
     faults += _faults_of(check_search, stack, search, refine, optics=optics)
-    if size is not None:
-        number: Any = size
-        if isinstance(number, float) and number.is_integer():
-            number = int(number)
-        faults += number_fault("size", number, least=2, whole=True)
+    sizes = _wanted_sizes(size, faults)
     refuse(faults)
     check_workers(work)
 
@@ -208,24 +214,33 @@ def analyze_stack(
         folder = Path(kept)
         located = _located(stack, search, refine, optics, numbers, depends, folder, work)
         method = located.method
-        bodies = find_bodies(located.features, stack, search, optics=method.optics, size=size)
+        bodies = find_bodies(located.features, stack, search, optics=method.optics, sizes=sizes)
         poses = _PoseFits(stack, method.optics, bodies, contact, folder / _POSED, work)
-        report = measure_table(
-            with_own_times(tracks_of(bodies, exclude=excluded), stack),
-            experiment,
-            recording=Recording(
-                stack.dt,
-                _uneven_clock(stack),
-                stated_errors(bodies),
-                crossing=abs(stack.plane_time or 0.0) * diameter / float(stack.voxel[0]),
-                least_sigma=stated_errors(bodies),
-            ),
-            source={"path": stack.source if stack.path else None, "sha256": depends["sha256"]},
-            arguments=experiment.to_dict()
+        errors = median_errors(bodies.features, axes=bodies.axes)
+        run: _Run = {
+            "source": {"path": stack.source if stack.path else None, "sha256": depends["sha256"]},
+            "arguments": experiment.to_dict()
             | {k: v for k, v in depends.items() if k not in ("sha256", "versions")}
-            | {"size": bodies.size, "exclude": excluded},
-            improved=poses.improved,
+            | {"size": sizes, "exclude": excluded},
+        }
+        recording = Recording(
+            stack.dt,
+            _uneven_clock(stack),
+            errors,
+            crossing=abs(stack.plane_time or 0.0) * diameter / float(stack.voxel[0]),
+            least_sigma=errors,
         )
+        if bodies.sizes or excluded:
+            report = measure_table(
+                with_own_times(tracks_of(bodies, exclude=excluded), stack),
+                experiment,
+                recording=recording,
+                improved=poses.improved,
+                singles=bodies.singles,
+                **run,
+            )
+        else:
+            report = measure_free_spheres(bodies.singles, experiment, recording, **run)
     findings = poses.findings + checks.Findings(notes=(NO_FLAT_MODEL,) if flat else ())
     return _with_checks(report, stack, located, bodies, search, findings)
 
@@ -283,6 +298,19 @@ def _faults_of(check: Callable[..., object], *arguments: object, **named: object
     except ValueError as fault:
         return [str(fault)]
     return []
+
+
+def _wanted_sizes(size: int | Iterable[int] | None, faults: list[str]) -> list[int] | None:
+    """Return the numbers of spheres that are wanted, sorted; collect what is wrong with them."""
+    if size is None:
+        return None
+    numbers: list[Any] = list(size) if isinstance(size, Iterable) else [size]
+    numbers = [int(n) if isinstance(n, float) and n.is_integer() else n for n in numbers]
+    wrong = [line for n in numbers for line in number_fault("size", n, least=2, whole=True)]
+    if not numbers:
+        wrong = ["size: expected one number of spheres or several, got none"]
+    faults += wrong
+    return None if wrong else sorted({int(n) for n in numbers})
 
 
 def _selected_frames(count: int, frames: tuple[int | None, int | None] | None) -> list[int]:
@@ -441,7 +469,7 @@ def _with_checks(
             features, contact=contact, refine=method.refine, axes=bodies.axes
         )
         + checks.Findings(tuple(bodies.warnings), tuple(bodies.notes))
-        + checks.missing_spheres(features, size=bodies.size, contact=contact, frames=read)
+        + checks.missing_spheres(features, sizes=bodies.sizes, contact=contact, frames=read)
         + checks.Findings(notes=tuple(uneven))
         + checks.clusters_near_border(features, margin=bodies.margin, dropped=bodies.dropped)
         + findings
@@ -453,7 +481,7 @@ def _with_checks(
         height=imaging.voxel[0],
         diameter=imaging.diameter,
     )
-    found += of_several
+    found += of_several + checks.partial_bodies(report.clusters, report.kinds)
     return replace(
         report,
         clusters=clusters,

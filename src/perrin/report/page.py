@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
     from perrin.diffusion.estimate import DiffusionEstimate
     from perrin.run.predictions import Prediction
-    from perrin.run.results import ClusterResult, Report
+    from perrin.run.results import BodyKind, ClusterResult, Report
 
 
 # Caption of each figure: its title, what it shows, and what to check.
@@ -127,13 +127,16 @@ def render_html(report: Report, figures: Iterable[Path]) -> str:
         ],
         versions=list(settings.get("versions", {}).items()),
         several=several,
-        label=None if several else report.results[0].label,
+        label=None if several or not report.results else report.results[0].label,
+        subject=_subject(report),
+        kinds=_kind_rows(report) if report.pooled_by_kind else [],
         headline=[] if pooled is None else _both_coefficients(pooled.D_R, pooled.D_T),
         verdict=[" ".join(texts) for texts in verdict_lines(report).values()],
         overview=[
             {
                 "anchor": result.cluster,
                 "name": result.name,
+                "kind": _kind_text(report.kind_of(result.cluster)),
                 "D_R": _estimate_text(result.D_R),
                 "D_T": _estimate_text(result.D_T),
                 "sigma": length_text(result.motion.sigma),
@@ -147,6 +150,7 @@ def render_html(report: Report, figures: Iterable[Path]) -> str:
             {
                 "anchor": rod.cluster,
                 "name": rod.name,
+                "kind": _kind_text(report.kind_of(rod.cluster)),
                 "D_perp": _estimate_text(rod.D_perp),
                 "D_T": _estimate_text(rod.D_T),
                 "length": length_text(rod.motion.length),
@@ -170,6 +174,44 @@ def render_html(report: Report, figures: Iterable[Path]) -> str:
         exposure=None if method is None else method.D_R.exposure,
         drift=method is not None and method.D_T.drift is not None,
     )
+
+
+def _subject(report: Report) -> str:
+    """Return what a report is about, for its heading."""
+    if not report.results:
+        return "Translational diffusion of single spheres"
+    many = len(report.results) > 1
+    return f"Rotational diffusion of {'clusters' if many else 'a cluster'}"
+
+
+def _kind_text(kind: BodyKind | None) -> str:
+    """Return the number of particles and the point group of a kind of clusters."""
+    return "–" if kind is None else f"{kind.size}, {kind.point_group.replace('inf', '∞')}"
+
+
+def _kind_rows(report: Report) -> list[dict[str, Any]]:
+    """Return a row for every kind of clusters, and one for the single spheres."""
+    rows = []
+    for kind in report.kinds:
+        D = {name: _estimate_text(one) for name, one in kind.coefficients}
+        turn = D.get("D_R", D.get("D_perp"))
+        used = kind.clusters if kind.pooled is None else kind.pooled.clusters
+        rows.append(
+            {
+                "name": _kind_text(kind),
+                "count": len(kind.clusters),
+                "used": len(used) if D else 0,
+                "letter": "⊥" if "D_perp" in D else "R",
+                "turn": turn,
+                "path": D.get("D_T"),
+            }
+        )
+    if report.singles is not None:
+        path = _estimate_text(report.singles.D_T)
+        count = report.singles.n_tracks
+        single = {"name": "1 (single spheres)", "count": count, "used": count}
+        rows.append(single | {"letter": "", "turn": None, "path": path})
+    return rows
 
 
 def _remarks(report: Report, texts: Mapping[str, Sequence[str]]) -> list[dict[str, Any]]:

@@ -3,6 +3,7 @@
 from perrin.run.experiment import Experiment, Recording, argument_faults, merged_experiment
 from perrin.run.folders import check_place, check_resumable, filled_folder, staged_folder
 from perrin.run.grouping import assign_clusters
+from perrin.run.kinds import part_of, shape_numbers, usual_symmetry
 from perrin.run.measure import (
     ClusterTracks,
     Coefficient,
@@ -17,6 +18,8 @@ from perrin.run.measure import (
     library_version,
     measure_body,
     measure_coefficient,
+    measure_free_spheres,
+    measure_kinds,
     measure_rod,
     measure_table,
     measure_tensor,
@@ -80,6 +83,7 @@ from perrin.run.remarks import (
     removed_drift_notes,
     soft_clusters_warning,
     sparse_frames_warnings,
+    stage_jump_warnings,
     steady_motion_warning,
     unfit_diameter_text,
     unresolved_size_notes,
@@ -88,6 +92,7 @@ from perrin.run.remarks import (
     wrapped_box_text,
 )
 from perrin.run.results import (
+    BodyKind,
     ClusterResult,
     Pooled,
     Report,
@@ -100,11 +105,13 @@ from perrin.run.results import (
     predicted_noise,
     write_data,
 )
+from perrin.run.singles import SingleSpheres, measure_singles, track_steps
 from perrin.run.statements import kinds_text, motion_sentences, verdict_lines
 from perrin.run.tables import analyze, read_table
 from perrin.run.verdicts import fit_model, judge_each_and_all, verdicts_from_dict, verdicts_to_dict
 
 __all__ = [
+    "BodyKind",
     "ClusterResult",
     "ClusterTracks",
     "Coefficient",
@@ -121,6 +128,7 @@ __all__ = [
     "RodResult",
     "Shape",
     "ShapeMobility",
+    "SingleSpheres",
     "absent_frames_notes",
     "add_predictions",
     "analyze",
@@ -171,7 +179,10 @@ __all__ = [
     "loose_particles_note",
     "measure_body",
     "measure_coefficient",
+    "measure_free_spheres",
+    "measure_kinds",
     "measure_rod",
+    "measure_singles",
     "measure_table",
     "measure_tensor",
     "measured_shape",
@@ -188,6 +199,7 @@ __all__ = [
     "noise_floor_test",
     "noise_floor_warning",
     "not_diffusion_warning",
+    "part_of",
     "perp_text",
     "persistence_warning",
     "pool_clusters",
@@ -196,15 +208,19 @@ __all__ = [
     "read_table",
     "removed_drift_notes",
     "run_settings",
+    "shape_numbers",
     "soft_clusters_warning",
     "solve_bodies",
     "solve_shape",
     "sparse_frames_warnings",
+    "stage_jump_warnings",
     "staged_folder",
     "steady_motion_warning",
+    "track_steps",
     "unfit_diameter_text",
     "unresolved_size_notes",
     "unsettled_notes",
+    "usual_symmetry",
     "verdict_lines",
     "verdicts_from_dict",
     "verdicts_to_dict",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import platform
 import warnings as python_warnings
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import cache
 from typing import TYPE_CHECKING, Any
@@ -19,6 +19,7 @@ from perrin.diffusion.step_tests import (
     Jumps,
     cut_at,
     find_jumps,
+    find_stage_jumps,
     offset_gain,
     persistence_gain,
     steady_motion,
@@ -34,6 +35,7 @@ from perrin.errors import (
     TooFewFramesError,
 )
 from perrin.geometry.rotations import fit_rotations, log_map
+from perrin.geometry.symmetry import point_group
 from perrin.hydrodynamics.units import viscosity_remarks
 from perrin.motion.floor import floor_range
 from perrin.motion.rigidity import Quality, judge_quality
@@ -42,6 +44,7 @@ from perrin.motion.tracking import track_rotation, track_scanned
 from perrin.run import remarks as words
 from perrin.run.experiment import Experiment, Recording
 from perrin.run.grouping import assign_clusters
+from perrin.run.kinds import shape_numbers, usual_symmetry
 from perrin.run.predictions import (
     Shape,
     ShapeMobility,
@@ -54,6 +57,7 @@ from perrin.run.predictions import (
 )
 from perrin.run.remarks import Remarks
 from perrin.run.results import (
+    BodyKind,
     ClusterResult,
     Pooled,
     Report,
@@ -61,6 +65,7 @@ from perrin.run.results import (
     floor_factor,
     predicted_noise,
 )
+from perrin.run.singles import measure_singles
 from perrin.run.verdicts import fit_model, judge_each_and_all
 from perrin.tracks.clock import frame_stride, own_times, read_clock
 from perrin.tracks.clusters import each_cluster
@@ -96,6 +101,9 @@ _STEADY_LEVEL = 1e-3
 # A motion that is not diffusion is a warning below this p-value, shared by both quantities, and
 # half of it by all clusters where several are also judged together.
 _VERDICT_LEVEL = 0.005
+
+# The symmetry of a straight chain is that of places equal within this share of its length.
+_SAME_PLACE = 0.03
 
 # Noise floor and alike steps are tested at this number of standard errors (0.05 % of clean
 # tracks), the noise floor for any ratio sigma_z/sigma_xy up to this one.
@@ -147,12 +155,15 @@ class FittedBody:
         Rigidity, errors per axis, and what was corrected.
     remarks : Remarks
         Warnings and notes on identity and fit.
+    stage : ndarray of int
+        Rows at which a step ends that contains a jump of the stage and is left out of D_T.
     """
 
     tracks: ClusterTracks
     motion: RigidMotion
     quality: Quality
     remarks: Remarks
+    stage: Ints = field(default_factory=lambda: np.empty(0, dtype=np.int64))
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,6 +230,7 @@ def measure_table(
     recording: Recording | None = None,
     improved: Improve | None = None,
     remarks: Remarks | None = None,
+    singles: pd.DataFrame | None = None,
 ) -> Report:
     """Measure every cluster of a clean table: `analyze` without reading and checking.
 
@@ -238,6 +250,8 @@ def measure_table(
         be left out.
     remarks : Remarks, optional
         Remarks from reading and screening the table.
+    singles : pandas.DataFrame, optional
+        Tracks of single particles, as in `measure_singles`, with frames as in the table.
 
     Returns
     -------
@@ -265,6 +279,13 @@ def measure_table(
             for b in bodies
             if b.tracks.cluster in motions
         ]
+    placed = [b for b in bodies if not centre_removed(b.tracks.positions)]
+    stage = find_stage_jumps([b.motion for b in placed], [b.tracks.frames for b in placed])
+    remarks.warnings.extend(
+        words.stage_jump_warnings(stage, first_frame=first, kept=experiment.keep_jumps)
+    )
+    if not experiment.keep_jumps:
+        bodies = [replace(b, stage=stage.rows(b.tracks.frames)) for b in bodies]
     measured: list[MeasuredBody] = []
     for body in bodies:
         try:
@@ -273,12 +294,16 @@ def measure_table(
             failures.append((body.tracks.label or str(body.tracks.cluster), error))
     if failures and not (measured or rods):
         raise failures[-1][1]
-    measured, together = judge_bodies(measured, experiment, first_frame=first)
-    pooled, unpooled = pool_clusters(measured, experiment, together)
+    measured, kinds, unpooled = measure_kinds(measured, rods, experiment, first_frame=first)
+    pooled = [kind.pooled for kind in kinds if kind.pooled is not None]
+    loose = None
+    if singles is not None:
+        shifted = singles.assign(frame=singles["frame"] - first)
+        loose = measure_singles(shifted, experiment.noise, recording)
     results, rods = add_predictions([one.result for one in measured], rods, experiment)
     return Report(
         clusters=tuple(results),
-        pooled=pooled,
+        pooled=pooled[0] if len(pooled) == 1 else None,
         warnings=(
             *unpooled,
             *remarks.warnings,
@@ -297,6 +322,8 @@ def measure_table(
         settings=run_settings(source, arguments=arguments, first_frame=first),
         rods=tuple(rods),
         notes=(*remarks.notes, *words.assumed_exposure_notes(experiment.noise)),
+        kinds=tuple(kinds),
+        singles=loose,
     )
 
 
@@ -558,9 +585,12 @@ def measure_body(
             *no_tensor,
         ),
         jumps={
-            name: tuple(tracks.frames[found.left_out].tolist())
-            for name, found in (("rotation", turn), ("translation", path))
-            if found.left_out.size
+            name: tuple(tracks.frames[rows].tolist())
+            for name, rows in (
+                ("rotation", turn.left_out),
+                ("translation", np.union1d(path.left_out, body.stage)),
+            )
+            if rows.size
         },
     )
     return MeasuredBody(body, turn, path, result)
@@ -597,9 +627,12 @@ def measure_coefficient(
         )
         none = Jumps(nothing, np.empty((0, 3)), np.empty(0), 0)
         return Coefficient(estimate, motion, motion, none, nothing, True, Remarks())
+    path = motion
+    if quantity == "translation":
+        # Doubt about the labels cuts the track, but the centre's path crosses it.
+        path = cut_at(replace(motion, piece=np.zeros_like(motion.piece)), body.stage)
+        motion = cut_at(motion, body.stage)
     estimate = _estimated_quietly(motion, quantity, noise)
-    # Doubt about the labels cuts the track, but the centre's path crosses it.
-    path = motion if quantity == "rotation" else replace(motion, piece=np.zeros_like(motion.piece))
     jumps = find_jumps(path, estimate)
     left_out = jumps.rows[:0]
     remarks = Remarks()
@@ -649,8 +682,74 @@ def _estimated_quietly(
         )
 
 
+def measure_kinds(
+    measured: Sequence[MeasuredBody],
+    rods: Sequence[RodResult],
+    experiment: Experiment,
+    *,
+    first_frame: int,
+) -> tuple[list[MeasuredBody], list[BodyKind], list[str]]:
+    """Judge and pool the bodies of each number of particles and shape; those of others never.
+
+    Parameters
+    ----------
+    measured : sequence of MeasuredBody
+    rods : sequence of RodResult
+    experiment : Experiment
+    first_frame : int
+        The table's own number of its first frame.
+
+    Returns
+    -------
+    measured : list of MeasuredBody
+        Bodies with verdicts, sorted by number of particles and shape.
+    kinds : list of BodyKind
+    warnings : list of str
+        As in `pool_clusters`; where there are several kinds, with the kind.
+    """
+    shapes = shape_numbers(
+        [one.body.motion.template for one in measured],
+        rigid=[one.body.quality.rigid for one in measured],
+    )
+    lines = shape_numbers([np.outer(rod.motion.places, [0.0, 0.0, 1.0]) for rod in rods])
+    judged: list[MeasuredBody] = []
+    kinds: list[BodyKind] = []
+    found: list[tuple[str, str]] = []
+    for number in np.unique(shapes).tolist():
+        members = [one for one, shape in zip(measured, shapes, strict=True) if shape == number]
+        part, together = judge_bodies(
+            members, experiment, first_frame=first_frame, tested=len(measured)
+        )
+        pooled, texts = pool_clusters(part, experiment, together)
+        judged += part
+        kind = BodyKind(
+            size=len(part[0].body.motion.template),
+            point_group=usual_symmetry([one.body.quality.symmetry for one in part]),
+            clusters=tuple(one.result.cluster for one in part),
+            pooled=pooled,
+        )
+        kinds.append(kind)
+        found += [(kind.name, text) for text in texts]
+    for number in np.unique(lines).tolist():
+        same = [rod for rod, line in zip(rods, lines, strict=True) if line == number]
+        places = same[0].motion.places
+        centred = np.outer(places, [0.0, 0.0, 1.0])
+        kinds.append(
+            BodyKind(
+                size=len(places),
+                point_group=point_group(centred, tolerance=_SAME_PLACE * float(np.ptp(places))),
+                clusters=tuple(rod.cluster for rod in same),
+                D_perp=estimate_rod([rod.motion for rod in same]),
+                D_T=estimate_rod([rod.motion for rod in same], quantity="translation"),
+            )
+        )
+    kinds.sort(key=lambda kind: kind.size)
+    warnings = [f"{name}: {text}" if len(kinds) > 1 else text for name, text in found]
+    return judged, kinds, warnings
+
+
 def judge_bodies(
-    measured: Sequence[MeasuredBody], experiment: Experiment, *, first_frame: int
+    measured: Sequence[MeasuredBody], experiment: Experiment, *, first_frame: int, tested: int
 ) -> tuple[list[MeasuredBody], dict[str, MotionVerdict | None]]:
     """Judge what kind of motion every body shows, and all rigid ones together.
 
@@ -660,6 +759,8 @@ def judge_bodies(
     experiment : Experiment
     first_frame : int
         The table's own number of its first frame.
+    tested : int
+        Number of clusters that share the level of a warning.
 
     Returns
     -------
@@ -689,7 +790,7 @@ def judge_bodies(
                 measured[i].body,
                 experiment,
                 first_frame=first_frame,
-                tested=len(measured),
+                tested=tested,
             )
         used = [i for i in shown if measured[i].body.quality.rigid]
         if common is not None and len(used) > 1:
@@ -1051,6 +1152,58 @@ def pool_coefficients(
         except ValueError:  # the notes of the clusters state it
             verdict = replace(verdict, model=None)
     return estimate, verdict, warnings
+
+
+def measure_free_spheres(
+    table: pd.DataFrame,
+    experiment: Experiment,
+    recording: Recording,
+    *,
+    source: Mapping[str, str | None],
+    arguments: Mapping[str, Any],
+) -> Report:
+    """Return the report of a movie in which no spheres form a cluster.
+
+    Parameters
+    ----------
+    table : pandas.DataFrame
+        Tracks of the single spheres, as in `measure_singles`.
+    experiment : Experiment
+    recording : Recording
+        Times of the frames.
+    source, arguments : mapping
+        Input and arguments for ``run.json``.
+
+    Returns
+    -------
+    Report
+        Without clusters; `Report.singles` has the D_T of the spheres.
+
+    Raises
+    ------
+    DegenerateClusterError
+        If the tracks are too few or too short for a D_T either.
+    """
+    first = int(table["frame"].min())
+    table = table.assign(frame=table["frame"] - first, cluster=-1).reset_index(drop=True)
+    clock = None if recording.times is None else recording.times.from_frame(first)
+    recorded = np.unique(table["frame"].to_numpy(dtype=np.int64))
+    whole = replace(recording, times=clock, first_frame=first, recorded=recorded)
+    singles = measure_singles(table, experiment.noise, whole)
+    if singles is None:
+        raise DegenerateClusterError(
+            f"no cluster: {words.NO_BODY}; single spheres are followed over too few frames for a "
+            "D_T"
+        )
+    return Report(
+        clusters=(),
+        pooled=None,
+        warnings=(f"no clusters: {words.NO_BODY}; {words.FREE_SPHERES}",),
+        tracks=table,
+        settings=run_settings(source, arguments=arguments, first_frame=first),
+        notes=tuple(words.assumed_exposure_notes(experiment.noise)),
+        singles=singles,
+    )
 
 
 @cache

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from perrin._arrays import Bools, Floats, Ints
     from perrin.diffusion.estimate import DiffusionEstimate
     from perrin.diffusion.noise_model import Noise
-    from perrin.diffusion.step_tests import Jumps, SteadyMotion
+    from perrin.diffusion.step_tests import Jumps, StageJumps, SteadyMotion
     from perrin.diffusion.steps import Quantity
     from perrin.diffusion.verdict import MotionVerdict
 
@@ -561,6 +561,42 @@ def jump_warning(jumps: Jumps, frames: Ints, quantity: Quantity, *, kept: bool) 
     )
 
 
+def stage_jump_warnings(stage: StageJumps, *, first_frame: int, kept: bool) -> list[str]:
+    """Name the jumps of the stage, with frame and displacement.
+
+    Parameters
+    ----------
+    stage : StageJumps
+        Common displacements of all bodies, with frames counted from the table's first.
+    first_frame : int
+        The table's own number of its first frame.
+    kept : bool
+        Whether the estimates contain the jumps.
+
+    Examples
+    --------
+    >>> from perrin.diffusion.step_tests import StageJumps
+    >>> one = StageJumps(
+    ...     np.array([9]), np.array([[1.2, 0.0, 0.1]]), np.full((1, 3), 0.12), np.zeros(1),
+    ...     np.array([4]),
+    ... )
+    >>> stage_jump_warnings(one, first_frame=1, kept=False)[0][:76]
+    'stage jump: 4 clusters move together by (1.2, 0, 0.1) +- 0.12 um at frame 10'
+    """
+    texts = []
+    done = "D_T contains it" if kept else "D_T leaves this step out (keep_jumps keeps it)"
+    for k in range(min(len(stage.frames), _JUMPS_SHOWN)):
+        size = ", ".join(f"{x:.2g}" for x in stage.size[k])
+        error = float(np.sqrt(np.mean(stage.stderr[k] ** 2)))
+        texts.append(
+            f"stage jump: {stage.bodies[k]} clusters move together by ({size}) +- {error:.2g} um "
+            f"at frame {stage.frames[k] + first_frame}: the stage or the camera moved; diffusion "
+            f"does so with a probability below {JUMP_LEVEL:g}; {done}; D_R is not affected"
+        )
+    more = len(stage.frames) - _JUMPS_SHOWN
+    return [*texts, f"stage jump: {more} more"] if more > 0 else texts
+
+
 def wrapped_box_text(size: Floats) -> str:
     """Return what jumps (K, d) of one length along one axis each suggest: a periodic box."""
     if len(size) < 2:
@@ -821,6 +857,12 @@ def is_noise_floor(text: str) -> bool:
 
 
 # Sizes, predictions and pooled values.
+
+NO_BODY = (
+    "no spheres keep together longer than diffusion over a contact allows (if there are clusters: "
+    "correct contact, the voxel size or the diameter, or take frames faster)"
+)
+FREE_SPHERES = "these are free spheres, of which only D_T is reported"
 
 
 def no_prediction_warning(wanted: str, reason: str) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -24,6 +24,7 @@ from perrin.motion.rigidity import Quality
 from perrin.motion.rods import RodMotion
 from perrin.run.folders import staged_folder
 from perrin.run.predictions import Prediction
+from perrin.run.singles import SingleSpheres
 from perrin.run.verdicts import verdicts_from_dict, verdicts_to_dict
 from perrin.tracks.writing import write_json
 
@@ -35,6 +36,9 @@ if TYPE_CHECKING:
 
     from perrin.diffusion.verdict import MotionVerdict
 
+
+# Coefficients of a kind of bodies.
+_COEFFICIENTS = ("D_R", "D_perp", "D_T")
 
 # The coefficients that a size follows from, and the ends of its keys in ``summary.json``.
 _SIZE_ENDINGS = {"translation": "T", "rotation": "R", "both": "TR"}
@@ -312,15 +316,82 @@ class Pooled:
 
 
 @dataclass(frozen=True, eq=False)
+class BodyKind:
+    """The clusters of one number of particles and one shape, and their pooled coefficients.
+
+    Attributes
+    ----------
+    size : int
+        Number of particles.
+    point_group : str
+        Schoenflies symbol that most of the clusters have.
+    clusters : tuple of int
+        Numbers of all clusters of this kind.
+    pooled : Pooled or None
+        Values of the rigid ones among them together; None for rods, and without a rigid cluster.
+    D_perp, D_T : DiffusionEstimate or None
+        Values of all rods of this kind together; None for other clusters, whose values are in
+        `pooled`.
+    """
+
+    size: int
+    point_group: str
+    clusters: tuple[int, ...]
+    pooled: Pooled | None = None
+    D_perp: DiffusionEstimate | None = None
+    D_T: DiffusionEstimate | None = None
+
+    @property
+    def name(self) -> str:
+        """Number of particles and point group."""
+        return f"{self.size} particles, {self.point_group}"
+
+    @property
+    def coefficients(self) -> list[tuple[str, DiffusionEstimate]]:
+        """Names and values of the pooled coefficients: D_R and D_T, or D_perp and D_T of rods."""
+        if self.pooled is not None:
+            return [("D_R", self.pooled.D_R), ("D_T", self.pooled.D_T)]
+        both = (("D_perp", self.D_perp), ("D_T", self.D_T))
+        return [(name, one) for name, one in both if one is not None]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return an entry of "kinds" of ``summary.json``."""
+        pooled, known = self.pooled, dict(self.coefficients)
+        return {
+            "size": self.size,
+            "point_group": self.point_group,
+            "clusters": list(self.clusters),
+            **{name: known[name].to_dict() if name in known else None for name in _COEFFICIENTS},
+            "pooled": None if pooled is None else list(pooled.clusters),
+            "motion": verdicts_to_dict({} if pooled is None else pooled.verdicts),
+        }
+
+    @classmethod
+    def from_dict(cls, entry: Mapping[str, Any]) -> BodyKind:
+        """Read back what `to_dict` wrote."""
+        D = {
+            name: None if entry[name] is None else DiffusionEstimate.from_dict(entry[name])
+            for name in _COEFFICIENTS
+        }
+        kind = cls(entry["size"], entry["point_group"], tuple(entry["clusters"]))
+        if D["D_R"] is None or D["D_T"] is None:
+            return replace(kind, D_perp=D["D_perp"], D_T=D["D_T"])
+        verdicts = verdicts_from_dict(entry["motion"])
+        pooled = Pooled(D["D_R"], D["D_T"], tuple(entry["pooled"]), verdicts)
+        return replace(kind, pooled=pooled)
+
+
+@dataclass(frozen=True, eq=False)
 class Report:
     """The result of a run: a result per cluster, pooled values, warnings, notes and settings.
 
     Attributes
     ----------
     clusters : tuple of ClusterResult
-        Results of the clusters.
+        Results of the clusters, by number of particles and shape.
     pooled : Pooled or None
-        Values of all rigid clusters together; None where there is no rigid cluster.
+        Values of all rigid clusters together; None where there is no rigid cluster, and where they
+        are of several kinds: `kinds` has the values of each.
     warnings : tuple of str
         Reasons to doubt the results of the whole table; those of one cluster are in its result.
     tracks : pandas.DataFrame
@@ -333,6 +404,10 @@ class Report:
         Features, images and optics, where the run began with images.
     notes : tuple of str
         How the whole table was read, what was left out, and what was corrected.
+    kinds : tuple of BodyKind
+        Numbers of particles and shapes of the clusters, with the pooled values of each.
+    singles : SingleSpheres or None
+        Diffusion of the spheres of a movie that belong to no cluster; None where there are few.
     """
 
     clusters: tuple[ClusterResult, ...]
@@ -343,6 +418,18 @@ class Report:
     rods: tuple[RodResult, ...] = ()
     imaging: Imaging | None = None
     notes: tuple[str, ...] = ()
+    kinds: tuple[BodyKind, ...] = ()
+    singles: SingleSpheres | None = None
+
+    @property
+    def pooled_by_kind(self) -> bool:
+        """Whether there are pooled values that `pooled` does not hold."""
+        rods = any(kind.D_perp is not None and len(kind.clusters) > 1 for kind in self.kinds)
+        return len(self.kinds) > 1 or rods or self.singles is not None
+
+    def kind_of(self, cluster: int) -> BodyKind | None:
+        """Return the kind of a cluster by its number; None in runs of earlier versions."""
+        return next((kind for kind in self.kinds if cluster in kind.clusters), None)
 
     @property
     def results(self) -> tuple[ClusterResult | RodResult, ...]:
@@ -357,16 +444,31 @@ class Report:
         lines += [f"  {perp_text(rod)}" for rod in self.rods[:10]]
         if self.pooled is not None and len(self.clusters) > 1:
             lines.append(f"  pooled: {self.pooled.D_R}; {self.pooled.D_T}")
+        for kind in self.kinds if self.pooled_by_kind else ():
+            shown = "; ".join(
+                f"{name} = {with_error(one.value, one.stderr)} {one.unit}"
+                for name, one in kind.coefficients
+            )
+            lines.append(f"  {kind.name}, pooled: {shown or 'nothing'}")
+        if self.singles is not None:
+            lines.append(f"  {self.singles.text}")
         return "\n".join(lines)
 
     def to_dict(self) -> dict[str, Any]:
         """Return ``summary.json`` as a dictionary: plain numbers, null for what is unknown."""
-        entries = [result.to_dict() for result in self.results]
+        order = {c: k for k, kind in enumerate(self.kinds) for c in kind.clusters}
+        entries = []
+        for result in self.results:
+            kind = self.kind_of(result.cluster)
+            shape = None if kind is None else {"size": kind.size, "point_group": kind.point_group}
+            entries.append(result.to_dict() | {"kind": shape})
         nothing: dict[str, Any] = {"D_R": None, "D_T": None, "p_same": None, "clusters": []}
         nothing["motion"] = verdicts_to_dict({})
         return {
-            "clusters": sorted(entries, key=lambda entry: int(entry["cluster"])),
+            "clusters": sorted(entries, key=lambda e: (order.get(e["cluster"], 0), e["cluster"])),
             "pooled": nothing if self.pooled is None else self.pooled.to_dict(),
+            "kinds": [kind.to_dict() for kind in self.kinds],
+            "singles": None if self.singles is None else self.singles.to_dict(),
             "warnings": list(self.warnings),
             "notes": list(self.notes),
         }
@@ -407,7 +509,7 @@ class Report:
                 rods.append(RodResult.from_dict(one, motion))
             else:
                 clusters.append(ClusterResult.from_dict(one, motion))
-        pooled = entry["pooled"]
+        pooled, singles = entry["pooled"], entry.get("singles")
         return cls(
             clusters=tuple(clusters),
             rods=tuple(rods),
@@ -417,6 +519,9 @@ class Report:
             settings={} if settings is None else settings,
             imaging=imaging,
             notes=tuple(entry.get("notes", ())),
+            # Runs of earlier versions have no kinds.
+            kinds=tuple(map(BodyKind.from_dict, entry.get("kinds", ()))),
+            singles=None if singles is None else SingleSpheres.from_dict(singles),
         )
 
     def save(self, folder: str | os.PathLike[str], *, overwrite: bool = False) -> None:
@@ -489,7 +594,8 @@ def motion_table(report: Report) -> pd.DataFrame:
         part.insert(0, "cluster", result.cluster)
         part.insert(1, "frame", first[result.cluster] + np.arange(len(part), dtype=np.int64))
         parts.append(part)
-    table = pd.concat(parts, ignore_index=True)
+    empty = pd.DataFrame({"cluster": np.empty(0, np.int64), "frame": np.empty(0, np.int64)})
+    table = pd.concat(parts, ignore_index=True) if parts else empty
     table.attrs = {"clusters": attributes}
     return table
 

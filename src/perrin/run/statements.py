@@ -38,8 +38,12 @@ def verdict_lines(report: Report) -> dict[str, list[str]]:
     for name in ("rotation", "translation") if report.clusters else ():
         source = pooled if several else report.clusters[0]
         texts = [] if source is None else motion_sentences(source, name)
+        if several and pooled is None:
+            for kind in report.kinds:
+                found = [] if kind.pooled is None else motion_sentences(kind.pooled, name)
+                texts += [f"Clusters of {kind.name}: {text}" for text in found]
         if several:
-            if texts and pooled is not None and len(pooled.clusters) > 1:
+            if source is not None and texts and pooled is not None and len(pooled.clusters) > 1:
                 texts[0] = f"All {len(pooled.clusters)} pooled clusters together: {texts[0]}"
             texts.append(kinds_text(report, name))
         lines[name] = texts or [f"The {name} was not judged: {NOT_JUDGED}."]

@@ -8,6 +8,7 @@ from perrin.tracks.bonds import (
     neighbour_pairs,
     noise_along,
     rigid_groups,
+    shared_rows,
 )
 from perrin.tracks.clock import Clock, evenly_spaced, frame_stride, own_times, read_clock
 from perrin.tracks.clusters import (
@@ -15,9 +16,11 @@ from perrin.tracks.clusters import (
     each_cluster,
     find_clusters,
     identify,
+    particles_and_pieces,
     positions_table,
 )
 from perrin.tracks.column_names import Spelling, recognise_columns, seconds, unit_faults
+from perrin.tracks.contacts import Contacts, lasting_contacts
 from perrin.tracks.files import RowNumbers, check_tracks, read_spheres, read_tracks, write_tracks
 from perrin.tracks.formats import SUFFIXES, parse_csv, parse_table, table_bytes, table_suffix
 from perrin.tracks.gdf import gdf_bytes, parse_gdf
@@ -45,7 +48,8 @@ from perrin.tracks.identity import (
     shape_symmetry,
     squared_angle,
 )
-from perrin.tracks.linking import Centers, link_clusters, linked_tracks, step_variance
+from perrin.tracks.linking import Centers, link_clusters, linked_tracks, stage_path, step_variance
+from perrin.tracks.rigid_bodies import IdentifiedBodies, RigidBodies, identify_bodies, rigid_bodies
 from perrin.tracks.screening import (
     CENTRE_REMOVED,
     Screened,
@@ -60,6 +64,7 @@ from perrin.tracks.screening import (
     rounding_chances,
     screen_rows,
 )
+from perrin.tracks.sphere_tracks import link_spheres, track_variances
 from perrin.tracks.writing import write_json, written_whole
 
 __all__ = [
@@ -70,10 +75,13 @@ __all__ = [
     "Candidates",
     "Centers",
     "Clock",
+    "Contacts",
     "Detections",
+    "IdentifiedBodies",
     "Identity",
     "Pairs",
     "Pose",
+    "RigidBodies",
     "RowNumbers",
     "Screened",
     "Spelling",
@@ -102,11 +110,14 @@ __all__ = [
     "icp_fit",
     "icp_search",
     "identify",
+    "identify_bodies",
     "joined_pairs",
     "labels_are_certain",
     "labels_in_time",
+    "lasting_contacts",
     "lattice_step",
     "link_clusters",
+    "link_spheres",
     "linked_tracks",
     "most_likely_identity",
     "most_likely_path",
@@ -116,6 +127,7 @@ __all__ = [
     "parse_csv",
     "parse_gdf",
     "parse_table",
+    "particles_and_pieces",
     "placeholder_rows",
     "positions_table",
     "read_clock",
@@ -123,6 +135,7 @@ __all__ = [
     "read_tracks",
     "recognise_columns",
     "repeated_rows",
+    "rigid_bodies",
     "rigid_fits",
     "rigid_groups",
     "rounding_chances",
@@ -130,11 +143,14 @@ __all__ = [
     "seconds",
     "settle_identity",
     "shape_symmetry",
+    "shared_rows",
     "squared_angle",
+    "stage_path",
     "step_variance",
     "table_bytes",
     "table_suffix",
     "touching_groups",
+    "track_variances",
     "unit_faults",
     "write_json",
     "write_tracks",

@@ -305,7 +305,7 @@ def followed_pairs(frame: Ints, code: Ints, x: Floats, *, count: int) -> Pairs:
     parts = []
     # Every part holds about the same number of rows, which bounds the memory.
     for part in np.split(np.arange(len(brief)), np.flatnonzero(np.diff(ends // _CHUNK_ROWS)) + 1):
-        pair, one, two = _shared_rows(number, code, brief[part], other[part])
+        pair, one, two = shared_rows(number, code, brief[part], other[part])
         parts.append(Pairs.of(first[part], second[part], pair, x[one] - x[two]))
     pairs = Pairs._make(np.concatenate(column) for column in zip(*parts, strict=True))
     seen = pairs.shared > 0
@@ -317,7 +317,7 @@ def followed_pairs(frame: Ints, code: Ints, x: Floats, *, count: int) -> Pairs:
     return pairs._replace(nearest=np.minimum(nearest[pairs.first], nearest[pairs.second]))
 
 
-def _shared_rows(number: Ints, code: Ints, brief: Ints, other: Ints) -> tuple[Ints, Ints, Ints]:
+def shared_rows(number: Ints, code: Ints, brief: Ints, other: Ints) -> tuple[Ints, Ints, Ints]:
     """Return pair, row of the one and row of the other, for each frame that holds both.
 
     Rows are sorted by particle, then frame.

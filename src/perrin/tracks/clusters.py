@@ -337,7 +337,7 @@ def identify(table: pd.DataFrame, *, contact: float, size: int) -> pd.DataFrame:
     cluster = link_clusters(frame, x, reach=reach, contact=contact, size=size)
     own, piece = np.full(len(rows), -1, dtype=np.int64), np.zeros(len(rows), dtype=np.int64)
     for inside in _rows_by_label(cluster):
-        own[inside], piece[inside] = _particles_and_pieces(frame[inside], x[inside], size)
+        own[inside], piece[inside] = particles_and_pieces(frame[inside], x[inside], size)
     known = own >= 0
     particle = np.full(len(table), -1, dtype=np.int64)
     particle[rows[known]] = cluster[known] * size + own[known]
@@ -371,19 +371,44 @@ def _rows_by_label(label: Ints) -> Iterator[Ints]:
         yield from np.split(order, np.flatnonzero(np.diff(label[order])) + 1)
 
 
-def _particles_and_pieces(frame: Ints, x: Floats, size: int) -> tuple[Ints, Ints]:
-    """Return the particle (0 to size - 1, or -1) and the piece of each detection of one cluster."""
+def particles_and_pieces(frame: Ints, x: Floats, size: int) -> tuple[Ints, Ints]:
+    """Distinguish the particles of one body by the rigid fit and least rotation.
+
+    Parameters
+    ----------
+    frame : ndarray of int, shape (N,)
+        Frame number of each detection.
+    x : ndarray, shape (N, d)
+        Coordinates of each detection, um; no NaN. Of a pair no frame holds a third detection.
+    size : int
+        Number of particles of the body.
+
+    Returns
+    -------
+    particle : ndarray of int, shape (N,)
+        0 to size - 1, or -1 where it is unknown.
+    piece : ndarray of int, shape (N,)
+        A new piece begins where the particles may have been mistaken.
+
+    Examples
+    --------
+    >>> x = np.array([[0.0, 0.0], [2.0, 0.0], [0.0, 3.0]])
+    >>> frame = np.repeat(np.arange(3), 3)
+    >>> particles_and_pieces(frame, np.concatenate([x, x[::-1], x]), 3)[0].tolist()
+    [0, 1, 2, 2, 1, 0, 0, 1, 2]
+    """
     order = np.argsort(frame, kind="stable")
     times, row, counts = np.unique(frame[order], return_inverse=True, return_counts=True)
     column = np.arange(len(frame)) - np.repeat(np.cumsum(counts) - counts, counts)
-    positions = np.full((len(times), size, x.shape[1]), np.nan)
+    width = max(size, int(counts.max()))
+    positions = np.full((len(times), width, x.shape[1]), np.nan)
     positions[row, column] = x[order]
     if size == 2 and x.shape[1] == 3:
         taken, piece = _rod_ends(positions, times)
     else:
         found = settle_identity(positions, times=times, size=size, labelled=False)
         taken, piece = found.order, found.piece
-    particle = np.full((len(times), size), -1, dtype=np.int64)
+    particle = np.full((len(times), width), -1, dtype=np.int64)
     filled, number = np.nonzero(taken >= 0)
     particle[filled, taken[filled, number]] = number
     out = np.empty((2, len(frame)), dtype=np.int64)

@@ -27,6 +27,12 @@ _FEWEST_FRAMES = 3  # of a track that is kept
 
 _NO_LINK = 1e6  # the cost of a link that is excluded
 
+# A displacement of all centres is searched for where the mean squared step over its variance exceeds
+# this multiple of its expectation, from the differences of this number of centres to all of the next
+# frame. It is accepted if it lowers chi-squared by more than `_STAGE_GAIN`: with three degrees of
+# freedom, by chance in 1e-9 of the frames.
+_STAGE_SUSPECTED, _STAGE_TRIALS, _STAGE_GAIN = 2.5, 8, 45.0
+
 
 def link_clusters(frame: Ints, x: Floats, *, reach: float, contact: float, size: int) -> Ints:
     """Group the detections of every frame into clusters and follow them through time.
@@ -55,6 +61,7 @@ def link_clusters(frame: Ints, x: Floats, *, reach: float, contact: float, size:
     that pass each other stay apart as long as their spheres are nearer to their own than to the
     other's. Centres are linked by least squared distance over the variance of a step (from the
     median step, growing with time). Where another link is nearly as likely all tracks involved end.
+    Displacements of all centres at once (a jump of the stage) are subtracted before.
 
     Examples
     --------
@@ -120,6 +127,7 @@ def linked_tracks(centers: Centers) -> Ints:
     array([0, 1, 1, 0])
     """
     variance = step_variance(centers)
+    centers = centers._replace(position=centers.position - stage_path(centers, variance))
     track = np.full(len(centers.frame), -1, dtype=np.int64)
     active = np.empty(0, dtype=np.int64)
     count = 0
@@ -177,6 +185,71 @@ def step_variance(centers: Centers) -> float:
     return float(np.median(np.concatenate(squares))) / median_chi2(centers.position.shape[1])
 
 
+def stage_path(centers: Centers, variance: float) -> Floats:
+    """Return the displacement of the stage at each group: the sum of all jumps up to its frame.
+
+    Parameters
+    ----------
+    centers : Centers
+    variance : float
+        Variance of one coordinate of a step of one frame, um^2.
+
+    Returns
+    -------
+    ndarray, shape (G, d)
+        um; 0 where the stage does not jump. Drift in small steps is not found.
+
+    Examples
+    --------
+    >>> x = np.array([[0.0, 0.0], [5.0, 1.0], [3.0, 0.1], [8.0, 1.1]])
+    >>> stage_path(Centers(np.array([0, 0, 1, 1]), x, np.zeros(4)), 0.01).round(6).tolist()
+    [[0.0, 0.0], [0.0, 0.0], [3.0, 0.1], [3.0, 0.1]]
+    """
+    path = np.zeros_like(centers.position)
+    if not 0 < variance < np.inf:
+        return path
+    total = np.zeros(centers.position.shape[1])
+    before: Ints | None = None
+    for groups in frames_of(centers.frame):
+        if before is not None:
+            gap = int(centers.frame[groups[0]] - centers.frame[before[0]])
+            total = total + _common_step(
+                centers.position[before], centers.position[groups], variance * gap
+            )
+        path[groups] = total
+        before = groups
+    return path
+
+
+def _common_step(old: Floats, new: Floats, variance: float) -> Floats:
+    """Return the displacement (d,) that most centres of two successive frames have in common.
+
+    It is 0 unless it makes their steps far likelier: chi-squared is summed over the old centres and
+    limited to the gate for those that meet none of the new ones.
+    """
+    from scipy.spatial import cKDTree
+
+    tree, d = cKDTree(new), old.shape[1]
+
+    def squares(shift: Floats) -> Floats:
+        return np.asarray(np.minimum(tree.query(old + shift)[0] ** 2 / variance, _GATE))
+
+    still = np.zeros(d)
+    unmoved = float(squares(still).sum())
+    fewest = max(2, len(old) / 2)
+    if unmoved < _STAGE_SUSPECTED * d * len(old) or min(len(old), len(new)) < fewest:
+        return still
+    tried = old[np.unique(np.linspace(0, len(old) - 1, _STAGE_TRIALS).astype(int))]
+    trials = (new[None] - tried[:, None]).reshape(-1, d)
+    best = min(trials, key=lambda shift: float(squares(shift).sum()))
+    for _ in range(3):
+        met = squares(best) < _GATE
+        best = (new[tree.query(old[met] + best)[1]] - old[met]).mean(axis=0)
+    met = squares(best) < _GATE
+    gain = unmoved - float(squares(best).sum())
+    return best if met.sum() >= fewest and gain > _STAGE_GAIN else still
+
+
 def _links(
     centers: Centers, old: Ints, new: Ints, variance: float
 ) -> Iterator[tuple[int, int, bool]]:
@@ -211,7 +284,9 @@ def _link_costs(
 ) -> Iterator[tuple[Ints, Ints, Floats]]:
     """Yield independent sets of last groups and new groups within each other's gates, with costs.
 
-    A cost is half the squared distance over its variance; out of the gate it is above all others.
+    A cost is half the squared distance over its variance, and the logarithm of the volume over which
+    a track may have moved: one that was lost for some frames is no rival of one seen just before.
+    Out of the gate it is above all others.
     """
     from scipy.spatial import cKDTree
 
@@ -227,7 +302,8 @@ def _link_costs(
     total = step + centers.extra[old[near.row]] + centers.extra[new[near.col]]
     half = 0.5 * near.data**2 / np.maximum(total, 1e-300)
     kept = half <= _GATE / 2
-    i, j, half = near.row[kept], near.col[kept], half[kept]
+    spread = 0.5 * centers.position.shape[1] * np.log(np.maximum(total / variance, 1.0))
+    i, j, half = near.row[kept], near.col[kept], (half + spread)[kept]
     part = connected_groups(i, old.size + j, count=old.size + new.size)
     order = np.argsort(part[i], kind="stable")
     for edges in np.split(order, np.flatnonzero(np.diff(part[i[order]])) + 1):
