@@ -702,19 +702,34 @@ def curve_figure(result: ClusterResult) -> Figure:
     """
     figure = new_figure(10, 4.6)
     left, right = figure.subplots(1, 2)
-    weights, floor = result.msad.weights, result.noise.phi2
-    if weights is not None:
-        # Both ends of a rotation have the error of the orientation, perpendicular to a direction.
-        floor = 2 * float(np.einsum("ij,ij->", weights, result.noise.covariance))
-    plot_lag_curve(result.msad, ax=left, estimate=result.D_R, floor=floor, tensor=result.tensor)
+    turn, shift = curve_floors(result)
+    plot_lag_curve(result.msad, ax=left, estimate=result.D_R, floor=turn, tensor=result.tensor)
     if result.D_T.absent_because is not None:
         write_reason(right, f"no {_CURVE_NAMES['translation'][1]}: {result.D_T.absent_because}")
         return figure
+    plot_lag_curve(result.msd, ax=right, estimate=result.D_T, floor=shift)
+    return figure
+
+
+def curve_floors(result: ClusterResult) -> tuple[float, float]:
+    """Return the noise floors that the localisation error predicts for MSAD and MSD.
+
+    Parameters
+    ----------
+    result : ClusterResult
+
+    Returns
+    -------
+    tuple of float
+        rad^2 and um^2.
+    """
+    weights, turn = result.msad.weights, result.noise.phi2
+    if weights is not None:
+        # Both ends of a rotation have the error of the orientation, perpendicular to a direction.
+        turn = 2 * float(np.einsum("ij,ij->", weights, result.noise.covariance))
     motion = result.motion
     # Both ends of a displacement have the error of the centre, along each axis.
-    floor = 2 * motion.dimension * float(np.mean(motion.center_variance[motion.fitted]))
-    plot_lag_curve(result.msd, ax=right, estimate=result.D_T, floor=floor)
-    return figure
+    return turn, 2 * motion.dimension * float(np.mean(motion.center_variance[motion.fitted]))
 
 
 def residual_figure(result: ClusterResult) -> Figure:
