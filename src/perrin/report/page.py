@@ -29,8 +29,8 @@ from perrin.report.citations import (
     python_lines,
     software_bibtex,
 )
-from perrin.report.cluster_data import body_picture, cluster_data, grouped_tracks
 from perrin.report.embedding import packed, page_script, plotly_script, source_hash
+from perrin.report.figure_data import body_picture, cluster_data, grouped_tracks
 from perrin.report.html import byline, captioned, inline_pictures, render_page, render_part
 from perrin.run.remarks import condensed, grouped
 from perrin.run.results import RodResult, floor_factor

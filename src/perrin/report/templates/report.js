@@ -59,11 +59,13 @@
   const narrow = () => window.innerWidth < 640;
   const SETTINGS = { displaylogo: false, responsive: true, displayModeBar: matchMedia("(hover: hover)").matches ? "hover" : false,
     modeBarButtonsToRemove: ["select2d", "lasso2d", "autoScale2d"], toImageButtonOptions: { format: "svg", filename: "perrin" } };
+  // Labels are text of users: plotly would read tags in them.
+  const literal = (text) => text.replace(/&/g, "&amp;").replace(/</g, "&lt;");
   const layout = (x, y, more = {}) => {
     const axis = (title, given = {}) => ({ title: { text: title, standoff: 6 }, color: color("ink"), gridcolor: color("line"),
       zerolinecolor: color("line"), linecolor: color("soft"), automargin: true, exponentformat: "power", ...given });
     return { paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)", font: { family: "system-ui, sans-serif", size: 13, color: color("ink") },
-      margin: { l: 60, r: 12, t: 8, b: 44 }, legend: { orientation: "h", x: 0, y: 1.02, yanchor: "bottom", font: { size: 12 } },
+      margin: { l: 60, r: 12, t: 8, b: 44 }, legend: { orientation: "h", x: 0, y: 1.02, yanchor: "bottom", font: { size: narrow() ? 11 : 12 } },
       hoverlabel: { bgcolor: color("raised"), font: { color: color("ink") } },
       modebar: { bgcolor: "rgba(0,0,0,0)", color: color("soft"), activecolor: color("ink") },
       ...more, xaxis: axis(x, more.xaxis), yaxis: axis(y, more.yaxis) };
@@ -173,19 +175,33 @@
   };
 
   // ---- the body in three dimensions -----------------------------------------------------------
-  const BALL = (() => {
-    const across = 18, down = 11, points = [], faces = [];
-    for (let i = 0; i <= down; i += 1) for (let j = 0; j < across; j += 1) {
-      const a = (Math.PI * i) / down, b = (2 * Math.PI * j) / across;
-      points.push([Math.sin(a) * Math.cos(b), Math.sin(a) * Math.sin(b), Math.cos(a)]);
+  // An icosahedron whose edges are halved a number of times, on the unit sphere.
+  const ball = (times) => {
+    const g = (1 + Math.sqrt(5)) / 2, points = [];
+    for (const a of [-1, 1]) for (const b of [-g, g]) points.push([0, a, b], [a, b, 0], [b, 0, a]);
+    const gap = (i, j) => Math.hypot(...points[i].map((v, k) => v - points[j][k]));
+    let faces = [];
+    for (let i = 0; i < 12; i += 1) for (let j = i + 1; j < 12; j += 1) for (let k = j + 1; k < 12; k += 1) {
+      if (Math.max(gap(i, j), gap(j, k), gap(i, k)) > 2.01) continue;
+      const [u, v, w] = [points[i], points[j], points[k]];
+      const volume = u[0] * (v[1] * w[2] - v[2] * w[1]) + u[1] * (v[2] * w[0] - v[0] * w[2]) + u[2] * (v[0] * w[1] - v[1] * w[0]);
+      faces.push(volume > 0 ? [i, j, k] : [i, k, j]);
     }
-    for (let i = 0; i < down; i += 1) for (let j = 0; j < across; j += 1) {
-      const a = i * across + j, b = i * across + ((j + 1) % across);
-      faces.push([a, a + across, b], [b, a + across, b + across]);
+    for (let n = 0; n < times; n += 1) {
+      const middle = new Map();
+      const half = (i, j) => {
+        const key = i < j ? `${i},${j}` : `${j},${i}`;
+        if (!middle.has(key)) { middle.set(key, points.length); points.push(points[i].map((v, k) => v + points[j][k])); }
+        return middle.get(key);
+      };
+      faces = faces.flatMap(([i, j, k]) => { const [a, b, c] = [half(i, j), half(j, k), half(k, i)]; return [[i, a, c], [j, b, a], [k, c, b], [a, b, c]]; });
+      for (const [i, p] of points.entries()) { const r = Math.hypot(...p); points[i] = p.map((v) => v / r); }
     }
     return { points, faces };
-  })();
-  const SHADES = ["#4ba3d9", "#e58a4e", "#3fb892", "#d99bc2", "#e9bb4a", "#8fc9ee", "#b5b5b5", "#9a8ad0"];
+  };
+  const BALLS = [ball(1), ball(2), ball(3)];
+  const ballOf = (data) => BALLS[data.template.length <= 8 ? 2 : data.template.length <= 40 ? 1 : 0];
+  const SHADES = ["#56b4e9", "#f0904f", "#35c79a", "#e5a5cc", "#f2c14e", "#9ed4f7", "#c4c4c4", "#a99ae0"];
   const body = { row: 0, timer: null, view: "centred", data: null };
   const turned = (q, v) => {
     const [w, x, y, z] = q;
@@ -208,10 +224,10 @@
     const pose = poseAt(data, row), inverse = [pose.q[0], -pose.q[1], -pose.q[2], -pose.q[3]];
     const shift = body.view === "lab" ? pose.center : [0, 0, 0];
     const move = (v) => (body.view === "body" ? v : turned(pose.q, v)).map((u, k) => u + shift[k]);
-    const radius = data.diameter / 2, mesh = [[], [], []];
+    const radius = data.diameter / 2, mesh = [[], [], []], { points } = ballOf(data);
     for (const center of data.template) {
       const c = move(solid(center));
-      for (const p of BALL.points) for (let k = 0; k < 3; k += 1) mesh[k].push(c[k] + radius * p[k]);
+      for (const p of points) for (let k = 0; k < 3; k += 1) mesh[k].push(c[k] + radius * p[k]);
     }
     const d = data.dimension, n = data.template.length, places = [[], [], []];
     if (data.column.places) for (let i = 0; i < n; i += 1) {
@@ -227,12 +243,12 @@
     return { mesh, places, axes };
   };
   const bodyTraces = (data, row) => {
-    const { mesh, places, axes } = bodyAt(data, row), size = BALL.points.length;
-    const faces = data.template.flatMap((_, k) => BALL.faces.map((f) => f.map((v) => v + k * size)));
+    const { mesh, places, axes } = bodyAt(data, row), { points, faces: own } = ballOf(data), size = points.length;
+    const faces = data.template.flatMap((_, k) => own.map((f) => f.map((v) => v + k * size)));
     const covered = find("#show-places").checked && data.column.places;
     const traces = [{ type: "mesh3d", x: mesh[0], y: mesh[1], z: mesh[2], i: faces.map((f) => f[0]), j: faces.map((f) => f[1]), k: faces.map((f) => f[2]),
-      vertexcolor: data.template.flatMap((_, k) => BALL.points.map(() => SHADES[k % SHADES.length])), opacity: covered ? 0.4 : 1, flatshading: false,
-      lighting: { ambient: 0.72, diffuse: 0.55, specular: 0.18, roughness: 0.6, fresnel: 0.1 }, lightposition: { x: 1e4, y: -1e4, z: 2e4 }, hoverinfo: "skip", showlegend: false, name: "spheres" }];
+      vertexcolor: data.template.flatMap((_, k) => points.map(() => SHADES[k % SHADES.length])), opacity: covered ? 0.4 : 1, flatshading: false,
+      lighting: { ambient: 0.55, diffuse: 0.75, specular: 0.25, roughness: 0.4, fresnel: 0.1 }, lightposition: { x: 100, y: 200, z: 120 }, hoverinfo: "skip", showlegend: false, name: "spheres" }];
     traces.push({ type: "scatter3d", mode: "markers", x: places[0], y: places[1], z: places[2], marker: { size: 5, symbol: "diamond", color: color("ink") },
       name: "measured places", visible: Boolean(covered), hovertemplate: "%{x:.3f}, %{y:.3f}, %{z:.3f} µm<extra>measured</extra>" });
     [0, 1, 2].forEach((k) => {
@@ -258,8 +274,8 @@
     const axis = (k) => ({ range: [middle[k] - half, middle[k] + half], title: { text: `${"xyz"[k]} (µm)` }, color: color("ink"), gridcolor: color("line"), showbackground: false, zeroline: false, nticks: 5 });
     return { paper_bgcolor: "rgba(0,0,0,0)", font: { family: "system-ui, sans-serif", size: 12, color: color("ink") }, margin: { l: 0, r: 0, t: 0, b: 0 },
       legend: { x: 0, y: 1, bgcolor: "rgba(0,0,0,0)", visible: true }, uirevision: `${body.view}`,
-      scene: { aspectmode: "cube", xaxis: axis(0), yaxis: axis(1), zaxis: axis(2), camera: data.dimension === 2 ? { eye: { x: 0, y: 0, z: 1.2 }, up: { x: 0, y: 1, z: 0 }, projection: { type: "orthographic" } }
-        : { eye: { x: 0.85, y: -0.85, z: 0.45 }, projection: { type: "orthographic" } } } };
+      scene: { aspectmode: "cube", xaxis: axis(0), yaxis: axis(1), zaxis: axis(2), camera: data.dimension === 2 ? { eye: { x: 0, y: 0, z: 1.2 }, up: { x: 0, y: 1, z: 0 } }
+        : { eye: { x: 1.1, y: -1.1, z: 0.6 } } } };
   };
   const drawBody = async () => {
     const data = body.data;
@@ -459,12 +475,12 @@
         { ...bars(c("low95"), c("high95")), mode: "lines", line: { width: many ? 0.7 : 1.2, color: many ? faint("soft", 0.7) : color("blue") }, hoverinfo: "skip", name: "95 %" },
         { ...bars(c("low68"), c("high68")), mode: "lines", line: { width: many ? 1.6 : 4, color: color("blue") }, hoverinfo: "skip", name: "68 %" },
         { x: kept.map((k) => value[k]), y, mode: "markers", marker: { size: many ? 3 : 6, color: color("ink") }, name: "value",
-          text: kept.map((k) => overview.names[rows[k]]), customdata: kept.map((k) => names[k]), hovertemplate: "%{text}: %{x:.4g}<extra></extra>" },
+          text: kept.map((k) => literal(overview.names[rows[k]])), customdata: kept.map((k) => names[k]), hovertemplate: "%{text}: %{x:.4g}<extra></extra>" },
       ];
       const pooled = overview.pooled[kind], shapes = pooled ? [
         { type: "rect", xref: "x", yref: "paper", x0: pooled[1], x1: pooled[2], y0: 0, y1: 1, fillcolor: faint("red", 0.18), line: { width: 0 }, layer: "below" },
         { type: "line", xref: "x", yref: "paper", x0: pooled[0], x1: pooled[0], y0: 0, y1: 1, line: { color: color("red"), width: 1.5 } }] : [];
-      const ticks = rows.length <= 40 ? { tickvals: rows.map((_, k) => k), ticktext: rows.map((k) => overview.names[k].slice(0, 16)) } : { showticklabels: false };
+      const ticks = rows.length <= 40 ? { tickvals: rows.map((_, k) => k), ticktext: rows.map((k) => literal(overview.names[k].slice(0, 16))) } : { showticklabels: false };
       const bounds = kept.flatMap((k) => [c("low95")[k], c("high95")[k]]).filter((v) => Number.isFinite(v) && v >= 0).sort((a, b) => a - b);
       const far = kept.map((k) => value[k]).reduce((a, b) => Math.max(a, b), 0) * 3;
       const top = Math.min(bounds[bounds.length - 1] ?? 1, far || Infinity);
