@@ -85,6 +85,12 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     return folder / "perrin-demo", result.stdout
 
 
+@pytest.fixture(autouse=True)
+def no_progress(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Write no lines on progress, which depend on how busy the machine is."""
+    monkeypatch.setattr("perrin.cli.progress._SHORT", math.inf)
+
+
 @pytest.fixture
 def no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Write run folders without pictures, which take most of the time of a run."""
@@ -114,7 +120,7 @@ def test_demo_prints_a_short_table(demo):
         "viscosity (mPa s)", "0.00672", "0.0453", "pull -", "Planted in the simulation",
     ):  # fmt: skip
         assert words in demo[1]
-    assert len(demo[1].splitlines()) < 25
+    assert len(demo[1].splitlines()) < 29
 
 
 def test_demo_writes_a_whole_run_folder(demo):
@@ -122,7 +128,7 @@ def test_demo_writes_a_whole_run_folder(demo):
     names = {p.name for p in demo[0].iterdir()}
     assert names == {
         "summary.json", "tracks.parquet", "motion.parquet", "curves.csv", "figures",
-        "report.html", "run.json",
+        "report.html", "run.json", "run.toml", "demo-tracks.csv",
     }  # fmt: skip
     assert list((demo[0] / "figures").glob("*.png"))
     assert [p.name for p in demo[0].parent.iterdir()] == ["perrin-demo"]
@@ -684,3 +690,184 @@ def test_names_with_square_brackets_are_printed_as_they_are(csv, tmp_path):
     result = run("analyze", "named.csv", "--dt", "0.73", "-o", "run", cwd=tmp_path)
     assert result.returncode == 0, result.stderr
     assert "cluster a[/]b [bold]:" in result.stdout
+
+
+# ---- formats, configuration, machine-readable output --------------------------------------------
+
+
+def test_the_demo_leaves_a_table_that_the_next_command_takes(demo):
+    """The README's command reads demo-tracks.csv, which holds all digits of the demo's input."""
+    readme = (Path(__file__).resolve().parents[1] / "README.md").read_text(encoding="utf-8")
+    assert "perrin analyze perrin-demo/demo-tracks.csv --dt 0.73 -o my-run" in readme
+    read = perrin.read_tracks(demo[0] / "demo-tracks.csv")
+    used = pd.read_parquet(demo[0] / "tracks.parquet")
+    pd.testing.assert_frame_equal(read[list(used)], used, check_exact=True)
+    assert "dt = 0.73\n" in (demo[0] / "run.toml").read_text()
+
+
+def test_bodies_have_the_same_names_everywhere(tmp_path):
+    """Every name, and a file of positions, is a body of plan, predict and simulate."""
+    from perrin.cli.options import SHAPES, body_of
+
+    for shape, count in SHAPES.items():
+        for size in ({"radius": 1.5, "diameter": None}, {"radius": None, "diameter": 2.0}):
+            body = body_of(shape, positions=None, **size)
+            assert len(body.positions) == count
+            if size["radius"] is not None:
+                np.testing.assert_allclose(body.R, 1.5)
+    positions = perrin.Cluster.tetrahedron(1.5).positions
+    pd.DataFrame(positions, columns=["x", "y", "z"]).to_csv(tmp_path / "body.csv", index=False)
+    options = ("--d-r", 0.005, "--sigma", 0.03)
+    named = ("tetrahedron", "--radius", 1.5)
+    plans, tables = [], []
+    for k, body in enumerate((("--positions", "body.csv"), named)):
+        result = run("plan", *body, *options, "--frames", 300, "--json", cwd=tmp_path)
+        plans.append(json.loads(result.stdout))
+        movie = ("--dt", 0.7, "--frames", 5, "-o", f"{k}.csv")
+        assert run("simulate", *body, *options, *movie, cwd=tmp_path).returncode == 0
+        tables.append(perrin.read_tracks(tmp_path / f"{k}.csv"))
+    assert plans[0]["dt_best"] == pytest.approx(plans[1]["dt_best"])
+    assert plans[0]["dt_rigid"] == pytest.approx(plans[1]["dt_rigid"])
+    pd.testing.assert_frame_equal(*tables)
+    both = run("plan", "trimer", "--positions", "body.csv", *options, cwd=tmp_path)
+    refused(both, 2, "--positions: states the body")
+
+
+def test_a_configuration_repeats_a_run(csv, tmp_path, no_figures):
+    """run.toml holds the options that were stated; the command line outranks it."""
+    stated = ("--scale", "0.5,0.5,0.5", "--frames", "0:50", "--drift", "--sigma", "0.03")
+    first = run("analyze", csv, "--dt", 0.73, *stated, "-o", "one", "--json", cwd=tmp_path)
+    assert first.returncode == 0, first.stderr
+    assert 'command = "analyze"\n' in (tmp_path / "one" / "run.toml").read_text()
+    again = run("analyze", "--config", "one/run.toml", "--json", cwd=tmp_path)
+    assert again.returncode == 0, again.stderr
+    assert json.loads(again.stdout) == json.loads(first.stdout)
+    assert (tmp_path / "one-2" / "run.toml").read_bytes() == (
+        tmp_path / "one" / "run.toml"
+    ).read_bytes()
+    half = run("analyze", "--config", "one/run.toml", "--frames", "0:40", "-o", "half", "--json",
+               cwd=tmp_path)  # fmt: skip
+    assert json.loads(half.stdout)["clusters"][0]["n_frames"] == 40
+
+
+def test_a_configuration_takes_lists_and_refuses_what_is_no_option(csv, tmp_path, no_figures):
+    """Lists and tables of TOML are what one types; a misspelt name is a fault, not ignored."""
+    text = (
+        'tracks = "tracks.csv"\ndt = 0.73\nscale = [1, 1.0, 1]\nkeep_jumps = true\n'
+        'columns = {x = "x", particle = 1}\n'
+    )
+    (tmp_path / "a.toml").write_text(text)
+    result = run("analyze", "--config", "a.toml", "-o", "r", "--quiet", cwd=tmp_path)
+    assert (result.returncode, result.stdout, result.stderr) == (0, "", "")
+    arguments = json.loads((tmp_path / "r" / "run.json").read_text())["arguments"]
+    assert arguments["keep_jumps"] is True
+    assert arguments["columns"] == {"x": "x", "particle": 1}
+    for content, words in (
+        ("dt = 0.73\nsgima = 1\n", "unknown: sgima"),
+        ('command = "run"\n', "is of the command run"),
+        ("dt = \n", "Invalid value"),
+    ):
+        (tmp_path / "b.toml").write_text(content)
+        result = run("analyze", "--config", "b.toml", cwd=tmp_path)
+        assert result.returncode == 2
+        assert words in " ".join(result.stderr.split())
+
+
+def test_json_and_quiet_print_nothing_else(csv, tmp_path, no_figures):
+    """--json prints summary.json to the byte, --quiet nothing, plan and predict their results."""
+    result = run("analyze", csv, "--dt", 0.73, "-o", "r", "--json", cwd=tmp_path)
+    assert result.stdout == (tmp_path / "r" / "summary.json").read_text()
+    body = ("tetrahedron", "--diameter", 2.45)
+    fluid = ("--viscosity", 1e-3, "--temperature", 298)
+    found = json.loads(run("predict", *body, *fluid, "--json", cwd=tmp_path).stdout)
+    assert found["temperature_K"] == 298
+    noise = ("--d-r", 0.005, "--sigma", 0.03, "--frames", 300)
+    assert json.loads(run("plan", *body, *noise, "--json", cwd=tmp_path).stdout)["n_frames"] == 300
+
+
+def test_a_table_without_ids_is_identified(table, tmp_path, no_figures):
+    """--contact and --size find the particles: the answer is that of the labelled table."""
+    raw = table[["frame", "x", "y", "z"]].sample(frac=1, random_state=1)
+    raw.to_csv(tmp_path / "raw.csv", index=False)
+    known = run("analyze", "raw.csv", "--dt", 0.73, "--contact", 2.45, "--size", 4, "-o", "r",
+                "--json", cwd=tmp_path)  # fmt: skip
+    assert known.returncode == 0, known.stderr
+    (cluster,) = json.loads(known.stdout)["clusters"]
+    labelled = perrin.analyze(table, dt=0.73).clusters[0]
+    assert cluster["D_R"]["value"] == pytest.approx(labelled.D_R.value, rel=1e-6)
+    alone = run("analyze", "raw.csv", "--dt", 0.73, "-o", "s", cwd=tmp_path)
+    refused(alone, 2, "missing column particle", "--contact", "--size")
+    perrin.write_tracks(table, tmp_path / "t.csv")
+    both = run("analyze", "t.csv", "--dt", 0.73, "--contact", 2.45, "--size", 4, "-o", "s",
+               cwd=tmp_path)  # fmt: skip
+    refused(both, 2, "--size: finds the particles of a table without ids")
+
+
+def test_times_in_place_of_frames_are_checked_against_dt(table, tmp_path, no_figures):
+    """--columns time=t numbers the frames; a dt that contradicts the times is refused."""
+    late = table.assign(t=(0.73 * table["frame"]).round(3)).drop(columns="frame")
+    late.to_csv(tmp_path / "t.csv", index=False)
+    words = ("analyze", "t.csv", "--columns", "time=t")
+    right = run(*words, "--dt", 0.73, "-o", "r", "--json", cwd=tmp_path)
+    assert right.returncode == 0, right.stderr
+    value = json.loads(right.stdout)["clusters"][0]["D_R"]["value"]
+    assert value == pytest.approx(perrin.analyze(table, dt=0.73).clusters[0].D_R.value, rel=1e-3)
+    refused(run(*words, "--dt", 0.5, "-o", "s", cwd=tmp_path), 2, "contradicts dt = 0.5")
+
+
+@pytest.mark.parametrize("suffix", [".csv.gz", ".parquet", ".gdf", ".xyz", ".napari.csv"])
+def test_convert_and_back_is_the_same_table(table, tmp_path, suffix):
+    """Each format that is written gives the table back; what it cannot hold is named."""
+    perrin.write_tracks(table, tmp_path / "t.csv")
+    drop = () if suffix in (".csv.gz", ".parquet", ".xyz") else ("--drop", "cluster")
+    if drop:
+        refused(run("convert", "t.csv", f"u{suffix}", cwd=tmp_path), 2, "cannot hold", "cluster")
+    assert run("convert", "t.csv", f"u{suffix}", *drop, cwd=tmp_path).returncode == 0
+    assert run("convert", f"u{suffix}", "v.csv", cwd=tmp_path).returncode == 0
+    back = perrin.read_tracks(tmp_path / "v.csv")
+    expected = table.drop(columns="cluster") if drop else table
+    keys = ["frame", "particle"]
+    pd.testing.assert_frame_equal(
+        back.sort_values(keys, ignore_index=True), expected.sort_values(keys, ignore_index=True)
+    )
+
+
+def test_an_interruption_says_what_is_kept(csv, tmp_path, monkeypatch):
+    """Ctrl-C ends with status 130 and a sentence; no folder appears."""
+
+    def stop(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("perrin.analyze", stop)
+    result = run("analyze", csv, "--dt", 0.73, "-o", "r", cwd=tmp_path)
+    assert result.returncode == 130
+    assert result.stderr == "Stopped: nothing is written, and what was there is kept.\n"
+    assert not (tmp_path / "r").exists()
+
+
+def test_the_doctor_measures_a_simulated_cluster(tmp_path):
+    """Versions, readers, font and self-test are listed; a missing required package is a failure."""
+    result = run("doctor", cwd=tmp_path)
+    assert result.returncode == 0, result.stdout
+    for words in ("ok  numpy: ", "font of figures", "self-test, planted 0.005: D_R = ", "(.gsd)"):
+        assert words in result.stdout
+    assert "BAD" not in result.stdout
+
+
+def test_progress_in_a_log_is_a_line_for_each_tenth():
+    """Of 40 clusters in 10 s a log gets at most ten lines of each task, none in the first 2 s."""
+    from perrin.cli.progress import progress_lines
+
+    stream, now = io.StringIO(), iter(np.arange(0, 100, 0.25))
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr("perrin.cli.progress._SHORT", 2.0)
+        show = progress_lines(stream, clock=lambda: float(next(now)))
+        for done in range(41):
+            show(done, 40, "fitting clusters")
+        show(0, 0, "writing the report")
+    lines = stream.getvalue().splitlines()
+    assert lines[0] == "fitting clusters: 10 % (7 of 40), 2 s"
+    assert [line.split(":")[1].split("%")[0] for line in lines[1:-1]] == [
+        f" {10 * k} " for k in range(2, 11)
+    ]
+    assert lines[-1].startswith("writing the report, ")

@@ -315,11 +315,12 @@ def test_a_gdf_holds_no_text_no_cluster_no_time(tmp_path):
 # ---- files that are none ------------------------------------------------------------------------
 
 
-def test_an_unknown_suffix_names_the_four(tmp_path):
-    """The message lists what can be read and written."""
-    for act in (lambda p: read_tracks(p), lambda p: write_tracks(tracks(), p)):
-        with pytest.raises(TrackTableError, match=r"t.xlsx.*\.csv, \.csv\.gz, \.parquet, \.gdf"):
-            act(tmp_path / "t.xlsx")
+def test_an_unknown_suffix_names_what_can_be_read_and_written(tmp_path):
+    """The message lists the formats; a spreadsheet is read, but not written."""
+    with pytest.raises(TrackTableError, match=r"t.doc.*\.csv, \.tsv, .*\.parquet, .*\.xlsx"):
+        read_tracks(tmp_path / "t.doc")
+    with pytest.raises(TrackTableError, match=r"t.xlsx.*\.csv, \.csv\.gz, \.parquet, \.gdf"):
+        write_tracks(tracks(), tmp_path / "t.xlsx")
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".csv.gz", ".parquet", ".gdf"])
@@ -341,11 +342,8 @@ GOOD = "frame,particle,x,y\n0,1,2,3\n1,1,2,3\n"
         (b"frame,particle,x,y\n", "t.csv", ["no rows"]),
         (b"\x89PNG\r\n\x1a\n" + bytes(50), "t.csv", ["not a text file in UTF-8", "line 1"]),
         (b"abc\0\0\0,def", "t.csv", ["binary file"]),
-        (GOOD.encode("utf-16"), "t.csv", ["not a text file in UTF-8"]),
         (b"frame,particle,x,y\n0,1,2,3\n0,1,2,\xb5m\n", "t.csv", ["UTF-8", "line 3"]),
         (b"0,1,2.5,3\n1,1,2,3\n", "t.csv", ["line 1 holds numbers (0,1,2.5,3)", "header line"]),
-        (GOOD.replace(",", ";").encode(), "t.csv", ["separated by ';'", "commas"]),
-        (GOOD.replace(",", "\t").encode(), "t.csv", [r"separated by '\t'", "commas"]),
         (GOOD.encode() + b"1,2,3,4,5\n", "t.csv", ["Expected 4 fields in line 4, saw 5"]),
         (b"frame,particle,x,y\n0,1,2,3,9\n", "t.csv", ["more fields than the header"]),
         (b'frame,particle,x,y\n0,1,2,"3\n', "t.csv", ["not a table", "EOF inside string"]),

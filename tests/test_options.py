@@ -26,7 +26,7 @@ COMMANDS = {
 # Arguments that the command line sets by itself, or takes as words without an option.
 WITHOUT_OPTION = {
     "border", "cluster", "degree", "experiment", "keep", "path", "positions", "progress", "radius",
-    "rng", "scheme", "settings", "spots", "stack", "tracks", "work",
+    "rng", "scheme", "settings", "spots", "stack", "tracks", "work", "detections",
 }  # fmt: skip
 
 
@@ -172,7 +172,10 @@ def test_no_message_of_the_library_names_an_option():
             ["Arguments", "Input", "Spheres and clusters", "Noise and estimates",
              "Sizes and predictions", "Work", "Output"],
         ),
-        (cli.predict, ["Arguments", "Options"]),
+        (cli.predict, ["Arguments", "Body and motion", "Sizes and predictions", "Output"]),
+        (cli.simulate, ["Arguments", "Body and motion", "Recording", "Output"]),
+        (cli.plan, ["Arguments", "Body and motion", "Recording", "Output"]),
+        (cli.convert, ["Arguments", "Input", "Output"]),
     ],
 )  # fmt: skip
 def test_many_options_are_shown_in_groups(command, headings):
@@ -181,6 +184,8 @@ def test_many_options_are_shown_in_groups(command, headings):
 
     text = CliRunner().invoke(cli.app, [command.__name__, "--help"]).output
     shown = re.findall(r"^(\w[\w ]*):$", text, re.MULTILINE)
-    assert [heading for heading in shown if heading != "Other options"] == headings
+    other = ("Other options", "Examples")
+    assert [heading for heading in shown if heading not in other] == headings
+    assert f"Examples:\n  perrin {command.__name__} " in text
     options = re.findall(r"^  (?:-o, )?(--[a-z][a-z-]*)", text, re.MULTILINE)
     assert sorted(options) == sorted({*options_of(command).values(), "--help"})

@@ -142,6 +142,7 @@ if TYPE_CHECKING:
         SingleSpheres,
         analyze,
         load_run,
+        napari_layers,
     )
     from perrin.tracks import (
         Identity,
@@ -251,6 +252,7 @@ __all__ = [
     "msad_axes",
     "msad_vector",
     "msd",
+    "napari_layers",
     "noise_floor",
     "non_gaussian",
     "open_stack",
@@ -425,6 +427,7 @@ _FACES = {
         "SingleSpheres",
         "analyze",
         "load_run",
+        "napari_layers",
     ),
     "movie": (
         "Work",

@@ -4,35 +4,43 @@ from __future__ import annotations
 
 import os
 import re
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from perrin.cli.config import config_text, write_config
 from perrin.cli.messages import messages_of, state_kept_frames
 from perrin.cli.options import (
+    BODY,
     INPUT,
     OUTPUT,
     PICTURE_SUFFIXES,
-    SHAPES,
+    RECORDING,
     SIZES,
     SPHERES,
-    TOUCHING_SHAPES,
     WORK,
+    ClusterSize,
     Columns,
+    Config,
+    Contact,
+    Diameter,
     Drift,
     Dynamics,
     Exposure,
     Frames,
     GroupedCommand,
     Interval,
+    Json,
     KeepJumps,
     Model,
     Noise,
     Output,
     Overwrite,
     OverwriteFile,
+    Positions,
+    Quiet,
+    Radius,
     Scale,
     Seed,
     Shape,
@@ -52,19 +60,18 @@ from perrin.cli.options import (
     read_whole_numbers,
     spheres_of,
 )
-from perrin.cli.tables import show_plan, show_prediction, show_report
+from perrin.cli.progress import shown_progress
+from perrin.cli.tables import show_diagnosis, show_json, show_plan, show_prediction, show_report
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable
 
-    from rich.progress import TaskID
-
+    from perrin.run.results import Report
 
 app = typer.Typer(
     name="perrin",
     help="Measure how rigid clusters of colloidal particles diffuse and turn.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     # Plain help: the formatted one imports a Markdown parser, a third of the time of `--help`.
     rich_markup_mode=None,
@@ -74,7 +81,8 @@ app = typer.Typer(
 _DEMO_FOLDER = "perrin-demo"
 
 _DEMO_FILES = re.compile(
-    r"summary\.json|run\.json|report\.html|curves\.csv|(?:tracks|motion)\.parquet"
+    r"summary\.json|run\.json|run\.toml|report\.html|(?:curves|results|demo-tracks)\.csv"
+    r"|(?:tracks|motion)\.parquet"
     r"|figures|figures/cluster-0-\w+\.(?:png|pdf)"
 )
 
@@ -104,7 +112,7 @@ def common_options(
     """Measure how rigid clusters of colloidal particles diffuse and turn."""
 
 
-@app.command()
+@app.command(cls=GroupedCommand, epilog="perrin demo")
 def demo(
     output: Annotated[
         Path | None,
@@ -112,8 +120,11 @@ def demo(
             "-o",
             "--output",
             help=f"Folder for the run; {_DEMO_FOLDER} if left out, replaced if a demo's.",
+            rich_help_panel=OUTPUT,
         ),
     ] = None,
+    as_json: Json = False,
+    quiet: Quiet = False,
     overwrite: Overwrite = False,
 ) -> None:
     """Analyse an embedded table: one simulated tetrahedron under the paper's conditions."""
@@ -121,6 +132,7 @@ def demo(
     from importlib.resources import as_file, files
 
     import perrin
+    from perrin.run.experiment import Experiment
     from perrin.run.folders import check_place
 
     with messages_of(demo), as_file(files("perrin") / "data" / "demo_tracks.csv.gz") as path:
@@ -129,28 +141,40 @@ def demo(
             check_demo_folder(place)
             overwrite = True
         check_place(place, overwrite=overwrite)
-        report = perrin.analyze(path, dt=0.73, viscosity=2.18e-3, temperature=295.0, diameter=2.45)
+        known = Experiment(dt=0.73, viscosity=2.18e-3, temperature=295.0, diameter=2.45)
+        report = perrin.analyze(path, experiment=known)
         report = replace(report, settings=report.settings | {"made": "demo"})
         perrin.write_run(report, place, overwrite=overwrite)
-        show_report(report, place, demo)
-        print("Planted in the simulation: D_R = 0.00493 rad^2/s, D_T = 0.0385 um^2/s.")
+        table = perrin.read_tracks(path)
+        perrin.write_tracks(table, place / "demo-tracks.csv")
+        stated = {"tracks": place / "demo-tracks.csv", **known.to_dict()}
+        text = config_text("analyze", stated, {"keep_jumps": "keep-jumps"})
+        (place / "run.toml").write_text(text, encoding="utf-8")
+        show_run(report, place, demo, as_json=as_json, quiet=quiet)
+        if not (as_json or quiet):
+            print("Planted in the simulation: D_R = 0.00493 rad^2/s, D_T = 0.0385 um^2/s.")
+            print(f"The input, as an example of a table: {place / 'demo-tracks.csv'}")
 
 
-@app.command(cls=GroupedCommand)
+@app.command(
+    cls=GroupedCommand,
+    epilog="""perrin analyze tracks.csv --dt 0.73 -o my-run
+    perrin analyze spots.csv --dt 0.5 --scale 0.11 -o my-run          # pixels of 0.11 um
+    perrin analyze tracks.gdf --dt 0.5 --columns x=0,y=1,frame=-2,particle=-1 -o my-run
+    perrin analyze points.txt --dt 0.5 --contact 2.45 --size 4 -o my-run   # no ids
+    perrin analyze --config my-run/run.toml                           # once more""",
+)
 def analyze(
+    ctx: typer.Context,
     tracks: Tracks,
     dt: Interval,
     output: Output,
+    config: Config = None,  # noqa: ARG001 (its callback has taken it)
     scale: Scale = "1",
     columns: Columns = None,
     frames: Frames = None,
-    contact: Annotated[
-        float | None,
-        typer.Option(
-            help="Centre distance of touching particles, um: finds the clusters.",
-            rich_help_panel=INPUT,
-        ),
-    ] = None,
+    contact: Contact = None,
+    size: ClusterSize = None,
     sigma: Sigma = None,
     noise: Noise = "joint",
     exposure: Exposure = None,
@@ -166,20 +190,24 @@ def analyze(
             rich_help_panel=SIZES,
         ),
     ] = None,
+    as_json: Json = False,
+    quiet: Quiet = False,
     overwrite: Overwrite = False,
 ) -> None:
     """Measure D_R and D_T of every cluster in a track table."""
     import perrin
     from perrin.run.folders import check_place
 
-    with messages_of(analyze):
+    with messages_of(analyze), shown_progress(quiet=quiet) as progress:
         check_place(output, overwrite=overwrite)
+        progress(0, 0, "reading the table")
         report = perrin.analyze(
             tracks,
             dt=dt,
             scale=read_numbers("--scale", scale),
             columns=read_columns(columns),
             contact=contact,
+            size=size,
             sigma=None if sigma is None else read_numbers("--sigma", sigma),
             noise=read_noise(noise),
             exposure=exposure,
@@ -190,13 +218,23 @@ def analyze(
             temperature=temperature,
             diameter=diameter,
             frames=read_slice(frames),
+            progress=progress,
         )
+        progress(0, 0, "writing the report")
         perrin.write_run(report, output, overwrite=overwrite)
-        show_report(report, output, analyze)
+        write_config(output, ctx)
+    with messages_of(analyze):
+        show_run(report, output, analyze, as_json=as_json, quiet=quiet)
 
 
-@app.command(cls=GroupedCommand)
+@app.command(
+    cls=GroupedCommand,
+    epilog="""perrin run movie.ome.tif --diameter 2.45 --contact 2.45 -o my-run
+    perrin run movie.tif --voxel 0.2,0.1,0.1 --dt 0.73 --diameter 2.45 --contact 2.45 -o my-run
+    perrin run movie.lif --image 3 --diameter 1.8 --contact 2.0 --workers 8 -o my-run""",
+)
 def run(
+    ctx: typer.Context,
     stack: Annotated[
         Path, typer.Argument(help="Movie of stacks: TIFF, OME-TIFF, .lif, .nd2, .czi, .ims, .zarr.")
     ],
@@ -217,6 +255,7 @@ def run(
             rich_help_panel=OUTPUT,
         ),
     ],
+    config: Config = None,  # noqa: ARG001 (its callback has taken it)
     voxel: Annotated[
         str | None,
         typer.Option(
@@ -329,6 +368,8 @@ def run(
             rich_help_panel=WORK,
         ),
     ] = None,
+    as_json: Json = False,
+    quiet: Quiet = False,
     overwrite: Overwrite = False,
 ) -> None:
     """Measure D_R and D_T of every cluster in a movie of image stacks.
@@ -351,7 +392,7 @@ def run(
             channel=channels[0] if len(channels) == 1 else channels or None,
             image=int(image) if image is not None and image.isdecimal() else image,
         )
-        with movie, progress_bar() as progress:
+        with movie, shown_progress(quiet=quiet, unit="frames") as progress:
             report = perrin.analyze_stack(
                 movie,
                 diameter=diameter,
@@ -379,52 +420,61 @@ def run(
             )
             progress(0, 0, "writing the report")
             complete_run(report, output)
-        show_report(report, output, run)
+            write_config(output, ctx)
+        show_run(report, output, run, as_json=as_json, quiet=quiet)
 
 
-@contextmanager
-def progress_bar() -> Iterator[Callable[[int, int, str], None]]:
-    """Give a function that shows progress, rate and remaining time of the work."""
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+def show_run(
+    report: Report, output: Path, command: Callable[..., None], *, as_json: bool, quiet: bool
+) -> None:
+    """Print the tables of a run, its summary.json, or nothing.
 
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TextColumn("{task.fields[count]}"),
-        TextColumn("{task.fields[rate]}"),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=Console(stderr=True, highlight=False)) as bar:
-        tasks: dict[str, TaskID] = {}
-
-        def show(done: int, total: int, title: str) -> None:
-            if title not in tasks:
-                for task in bar.tasks:  # earlier tasks are done
-                    bar.update(task.id, total=task.total or 1, completed=task.total or 1)
-                tasks[title] = bar.add_task(
-                    title, total=total or None, completed=done, count="", rate=""
-                )
-            task = bar.tasks[tasks[title]]
-            rate = f"{task.speed:.2g} frames/s" if task.speed else ""
-            count = f"{done}/{total}" if total else ""
-            bar.update(task.id, completed=done, total=total or None, count=count, rate=rate)
-
-        yield show
+    Parameters
+    ----------
+    report : Report
+    output : Path
+        Its run folder.
+    command : callable
+        The command that made it.
+    as_json, quiet : bool
+    """
+    if as_json:
+        print((output / "summary.json").read_text(encoding="utf-8"), end="")
+    elif not quiet:
+        show_report(report, output, command)
 
 
-@app.command()
+@app.command(
+    cls=GroupedCommand,
+    epilog="""perrin simulate tetrahedron --radius 1.5 --d-r 5e-3 --sigma 0.03 --dt 0.73 -o t.csv
+    perrin analyze t.csv --dt 0.73 -o my-run""",
+)
 def simulate(
-    shape: Shape,
-    radius: Annotated[float, typer.Option(help="Mean distance of particles to the centre, um.")],
-    d_r: Annotated[float, typer.Option("--d-r", help="D_R, rad^2/s.")],
-    dt: Interval,
-    output: Annotated[
-        Path, typer.Option("-o", "--output", help="Track table: .csv, .csv.gz, .parquet or .gdf.")
+    d_r: Annotated[float, typer.Option("--d-r", help="D_R, rad^2/s.", rich_help_panel=BODY)],
+    dt: Annotated[
+        float, typer.Option("--dt", help="Time between frames, s.", rich_help_panel=RECORDING)
     ],
-    d_t: Annotated[float, typer.Option("--d-t", help="D_T, um^2/s.")] = 0.0,
-    sigma: Annotated[str, typer.Option(help="Localisation error, um, one number or x,y,z.")] = "0",
-    frames: Annotated[int, typer.Option(help="Number of frames.")] = 300,
+    output: Annotated[
+        Path,
+        typer.Option(
+            "-o",
+            "--output",
+            help="Track table: .csv, .csv.gz, .parquet, .gdf, .xyz or .napari.csv.",
+            rich_help_panel=OUTPUT,
+        ),
+    ],
+    shape: Shape = None,
+    radius: Radius = None,
+    diameter: Diameter = None,
+    positions: Positions = None,
+    d_t: Annotated[float, typer.Option("--d-t", help="D_T, um^2/s.", rich_help_panel=BODY)] = 0.0,
+    sigma: Annotated[
+        str,
+        typer.Option(
+            help="Localisation error, um, one number or x,y,z.", rich_help_panel=RECORDING
+        ),
+    ] = "0",
+    frames: Annotated[int, typer.Option(help="Number of frames.", rich_help_panel=RECORDING)] = 300,
     dynamics: Dynamics = None,
     seed: Seed = 0,
     overwrite: OverwriteFile = False,
@@ -437,11 +487,10 @@ def simulate(
 
     with messages_of(simulate):
         check_new_file(output, SUFFIXES, overwrite=overwrite)
-        if shape not in SHAPES:
-            raise ValueError(f"shape: expected {', '.join(SHAPES)}, got {shape!r}")
+        body = body_of(shape, radius=radius, diameter=diameter, positions=positions)
         rng = np.random.default_rng(seed)
         truth = perrin.simulate_motion(
-            getattr(perrin.Cluster, shape)(radius),
+            body,
             D_R=d_r,
             D_T=d_t,
             dt=dt,
@@ -449,35 +498,36 @@ def simulate(
             dynamics=read_dynamics(dynamics),
             rng=rng,
         )
-        positions = perrin.add_noise(
-            truth.positions(), sigma=read_numbers("--sigma", sigma), rng=rng
-        )
-        table = perrin.positions_table(positions)
-        if output.suffix.lower() == ".gdf":  # a format without a cluster column
+        x = perrin.add_noise(truth.positions(), sigma=read_numbers("--sigma", sigma), rng=rng)
+        table = perrin.positions_table(x)
+        # Formats without a cluster column.
+        if output.name.lower().endswith((".gdf", ".napari.csv")):
             table = table.drop(columns="cluster")
         perrin.write_tracks(table, output)
-        print(f"{frames} frames of one {shape} written to {output}")
+        print(f"{frames} frames of one {shape or positions} written to {output}")
 
 
-@app.command()
+@app.command(
+    cls=GroupedCommand,
+    epilog="""perrin predict tetrahedron --diameter 2.45 --viscosity 2.18e-3 --temperature 295
+    perrin predict --positions spheres.csv --diameter 2.45 --viscosity 1e-3 --temperature 298""",
+)
 def predict(
-    viscosity: Annotated[float, typer.Option(help="Viscosity, Pa s.")],
-    temperature: Annotated[float, typer.Option(help="Temperature, K.")],
-    shape: Annotated[
-        str | None, typer.Argument(help=f"Touching spheres: {', '.join(TOUCHING_SHAPES)}.")
+    viscosity: Annotated[float, typer.Option(help="Viscosity, Pa s.", rich_help_panel=SIZES)],
+    temperature: Annotated[float, typer.Option(help="Temperature, K.", rich_help_panel=SIZES)],
+    shape: Shape = None,
+    diameter: Annotated[
+        float | None, typer.Option(help="Sphere diameter, um.", rich_help_panel=BODY)
     ] = None,
-    diameter: Annotated[float | None, typer.Option(help="Sphere diameter, um.")] = None,
-    positions: Annotated[
-        Path | None,
-        typer.Option(
-            help="Sphere centres of another body: csv with the columns x,y,z (um) and, if the "
-            "radii differ, radius (um)."
-        ),
-    ] = None,
-    accuracy: Annotated[float, typer.Option(help="Largest relative numerical error.")] = 1e-4,
+    positions: Positions = None,
+    accuracy: Annotated[
+        float, typer.Option(help="Largest relative numerical error.", rich_help_panel=SIZES)
+    ] = 1e-4,
     output: Annotated[
-        Path | None, typer.Option("-o", "--output", help="JSON file of the results.")
+        Path | None,
+        typer.Option("-o", "--output", help="JSON file of the results.", rich_help_panel=OUTPUT),
     ] = None,
+    as_json: Json = False,
     overwrite: OverwriteFile = False,
 ) -> None:
     """Predict D_T, D_R and hydrodynamic diameters of a rigid cluster of spheres."""
@@ -504,42 +554,67 @@ def predict(
         )
         if output is not None:
             write_json(output, body.to_dict())
+        if as_json:
+            show_json(body.to_dict())
+            return
         show_prediction(body, name=shape or str(positions))
         if output is not None:
             print(f"Written to {output}")
 
 
-@app.command()
+@app.command(
+    cls=GroupedCommand,
+    epilog="""perrin plan tetrahedron --diameter 2.45 --d-r 0.005 --sigma 0.03 --frames 300
+    perrin plan tetrahedron --diameter 2.45 --d-r 0.005 --sigma 0.03 --time 600 -o plan.png""",
+)
 def plan(
-    shape: Shape,
-    d_r: Annotated[float, typer.Option("--d-r", help="Expected D_R, rad^2/s.")],
-    sigma: Annotated[str, typer.Option(help="Localisation error, um, one number or x,y,z.")],
-    radius: Annotated[
-        float | None, typer.Option(help="Mean distance of particles to the centre, um.")
-    ] = None,
-    diameter: Annotated[
-        float | None, typer.Option(help="Diameter of touching spheres, um, instead of --radius.")
-    ] = None,
+    d_r: Annotated[
+        float, typer.Option("--d-r", help="Expected D_R, rad^2/s.", rich_help_panel=BODY)
+    ],
+    sigma: Annotated[
+        str,
+        typer.Option(
+            help="Localisation error, um, one number or x,y,z.", rich_help_panel=RECORDING
+        ),
+    ],
+    shape: Shape = None,
+    radius: Radius = None,
+    diameter: Diameter = None,
+    positions: Positions = None,
     d_t: Annotated[
         float | None,
         typer.Option(
-            "--d-t", help="Expected D_T, um^2/s; displacements between frames then limit dt too."
+            "--d-t",
+            help="Expected D_T, um^2/s; displacements between frames then limit dt too.",
+            rich_help_panel=BODY,
         ),
     ] = None,
-    frames: Annotated[int | None, typer.Option(help="Largest number of frames.")] = None,
-    time: Annotated[float | None, typer.Option(help="Longest duration of the movie, s.")] = None,
+    frames: Annotated[
+        int | None, typer.Option(help="Largest number of frames.", rich_help_panel=RECORDING)
+    ] = None,
+    time: Annotated[
+        float | None,
+        typer.Option(help="Longest duration of the movie, s.", rich_help_panel=RECORDING),
+    ] = None,
     photons: Annotated[
         bool,
         typer.Option(
             "--photons",
             help="The number of photons is fixed: that of --frames frames in --time s with "
             "--sigma. The plan divides them among any number of frames.",
+            rich_help_panel=RECORDING,
         ),
     ] = False,
     output: Annotated[
         Path | None,
-        typer.Option("-o", "--output", help="Figure of the error against dt: .png, .pdf or .svg."),
+        typer.Option(
+            "-o",
+            "--output",
+            help="Figure of the error against dt: .png, .pdf or .svg.",
+            rich_help_panel=OUTPUT,
+        ),
     ] = None,
+    as_json: Json = False,
     overwrite: OverwriteFile = False,
 ) -> None:
     """Recommend the time between frames and their number, and predict the error of D_R."""
@@ -549,7 +624,7 @@ def plan(
         if output is not None:
             check_new_file(output, PICTURE_SUFFIXES, overwrite=overwrite)
         found = perrin.plan_sampling(
-            body_of(shape, radius=radius, diameter=diameter),
+            body_of(shape, radius=radius, diameter=diameter, positions=positions),
             D_R=d_r,
             sigma=read_numbers("--sigma", sigma),
             D_T=d_t,
@@ -557,7 +632,10 @@ def plan(
             total_time=time,
             photons=photons,
         )
-        show_plan(found)
+        if as_json:
+            show_json(found.to_dict())
+        else:
+            show_plan(found)
         if output is not None:
             from perrin.plot.results import plot_plan
             from perrin.plot.style import new_figure
@@ -565,37 +643,37 @@ def plan(
             figure = new_figure(7, 4.6)
             plot_plan(found, ax=figure.add_subplot())
             figure.savefig(output, dpi=150)
-            print(f"Written to {output}")
+            if not as_json:
+                print(f"Written to {output}")
 
 
-@app.command()
+@app.command(cls=GroupedCommand, epilog="perrin paper -o paper")
 def paper(
-    output: Annotated[Path, typer.Option("-o", "--output", help="Folder for figures and claims.")],
+    output: Annotated[
+        Path,
+        typer.Option(
+            "-o", "--output", help="Folder for figures and claims.", rich_help_panel=OUTPUT
+        ),
+    ],
     seed: Seed = 2011,
     overwrite: Overwrite = False,
 ) -> None:
     """Reproduce all figures, tables and claims of the paper (Hunter 2011)."""
     from rich.console import Console
     from rich.markup import escape
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
     from perrin.paper.remake import reproduce
     from perrin.run.folders import check_place
 
     console = Console(highlight=False)
-    columns = BarColumn(), TextColumn("{task.completed}/{task.total}"), TimeElapsedColumn()
-    bar = Progress(*columns, TextColumn("{task.description}"), console=console)
     with messages_of(paper):
         check_place(output, overwrite=overwrite)
-        with bar:
-            task = bar.add_task("starting", total=None)
+        with shown_progress() as progress:
             claims = reproduce(
                 output,
                 seed=seed,
                 overwrite=overwrite,
-                progress=lambda done, total, title: bar.update(
-                    task, completed=done, total=total, description=escape(title)
-                ),
+                progress=lambda done, total, _: progress(done, total, "figures and claims"),
             )
         failing = [claim for claim in claims if not claim.holds]
         console.print(f"{len(claims)} claims, {len(failing)} of them do not hold:")
@@ -605,29 +683,69 @@ def paper(
         console.print(f"Written to {escape(str(output))}: claims.md, figures, tables.")
 
 
-@app.command()
+@app.command(
+    cls=GroupedCommand,
+    epilog="""perrin convert tracks.gdf tracks.csv
+    perrin convert spots.xml tracks.parquet --scale 0.11
+    perrin convert tracks.csv tracks.gdf --drop cluster
+    perrin convert points.xyz tracks.csv --contact 2.45 --size 4      # finds the ids""",
+)
 def convert(
     source: Annotated[Path, typer.Argument(help="Track table to read.")],
     target: Annotated[
-        Path, typer.Argument(help="Track table to write; its suffix states the format.")
+        Path,
+        typer.Argument(
+            help="Track table to write; its suffix states the format: .csv, .csv.gz, .parquet, "
+            ".gdf, .xyz or .napari.csv."
+        ),
     ],
     scale: Scale = "1",
     columns: Columns = None,
+    contact: Contact = None,
+    size: ClusterSize = None,
+    drop: Annotated[
+        str | None,
+        typer.Option(help="Columns that are not written: cluster,time.", rich_help_panel=OUTPUT),
+    ] = None,
     overwrite: OverwriteFile = False,
 ) -> None:
-    """Convert a track table between .csv, .csv.gz, .parquet and .gdf."""
+    """Convert a track table from any format that is read to one that is written."""
     import perrin
     from perrin.tracks.formats import SUFFIXES
 
     with messages_of(convert):
         check_new_file(target, SUFFIXES, overwrite=overwrite)
+        if (contact is None) != (size is None):
+            raise ValueError("contact, size: both are needed to find the particles of a table")
+        dropped = [name.strip() for name in (drop or "").split(",") if name.strip()]
+        unknown = [name for name in dropped if name not in ("cluster", "time", "z")]
+        if unknown:
+            raise ValueError(f"--drop: expected cluster, time or z, got {', '.join(unknown)}")
         table = perrin.read_tracks(
-            source, scale=read_numbers("--scale", scale), columns=read_columns(columns)
+            source,
+            scale=read_numbers("--scale", scale),
+            columns=read_columns(columns),
+            detections=size is not None,
         )
+        notes = table.attrs.get("notes", ())
+        if contact is not None and size is not None:
+            table = perrin.identify(table, contact=contact, size=size).drop(columns="piece")
+        table = table.drop(columns=dropped, errors="ignore")
         perrin.write_tracks(table, target)
-        for note in table.attrs.get("notes", ()):
+        for note in notes:
             print(f"note: {note}")
         print(f"{len(table)} rows written to {target}")
+
+
+@app.command(cls=GroupedCommand, epilog="perrin doctor")
+def doctor() -> None:
+    """Show versions, optional readers and the font, and measure a simulated cluster as a test."""
+    from perrin.cli.diagnosis import figure_font, installed, optional_readers, self_test
+
+    checks = [*installed(), *optional_readers(), figure_font(), *self_test()]
+    show_diagnosis(checks)
+    if any(check.good is False for check in checks):
+        raise typer.Exit(1)
 
 
 def check_new_file(path: Path, endings: tuple[str, ...] = (), *, overwrite: bool) -> None:

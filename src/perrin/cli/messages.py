@@ -6,7 +6,7 @@ import os
 import re
 import sys
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, get_type_hints
+from typing import TYPE_CHECKING, TypeGuard, get_type_hints
 
 import typer
 
@@ -65,13 +65,18 @@ def options_of(command: Callable[..., object]) -> dict[str, str]:
     for name, hint in get_type_hints(command, include_extras=True).items():
         for about in getattr(hint, "__metadata__", ()):
             if isinstance(about, OptionInfo):
-                default = f"--{name.replace('_', '-')}"
-                options[name] = max(about.param_decls or (default,), key=len)
+                # typer takes the first name of an option for its default.
+                stated = [d for d in (about.default, *(about.param_decls or ())) if _is_option(d)]
+                options[name] = max(stated, key=len, default=f"--{name.replace('_', '-')}")
     return options | {
         argument: option
         for argument, option in _RENAMED_ARGUMENTS.items()
         if option in options.values()
     }
+
+
+def _is_option(declaration: object) -> TypeGuard[str]:
+    return isinstance(declaration, str) and declaration.startswith("--")
 
 
 def in_options(text: str, options: Mapping[str, str]) -> str:
@@ -139,7 +144,7 @@ def messages_of(command: Callable[..., object]) -> Iterator[None]:
     ------
     typer.Exit
         With status 1 where the data cannot answer, 2 where the input or the place of the output is
-        wrong.
+        wrong, 130 after an interruption from the keyboard.
     """
     import perrin
 
@@ -153,6 +158,9 @@ def messages_of(command: Callable[..., object]) -> Iterator[None]:
     try:
         with warnings_in_one_line(options):
             yield
+    except KeyboardInterrupt:
+        print("Stopped: nothing is written, and what was there is kept.", file=sys.stderr)
+        raise typer.Exit(130) from None
     except BrokenPipeError:
         # The reader has stopped (a pipe into head); the run itself is written. Python's own flush
         # at the end would complain again.
@@ -223,12 +231,12 @@ def state_kept_frames(output: Path) -> Iterator[None]:
     try:
         yield
     except (OSError, KeyboardInterrupt) as stop:
-        kept = any((output / "located").glob("part-*"))
-        if kept and not (output / "run.json").exists():
+        kept = any((output / "located").glob("part-*")) and not (output / "run.json").exists()
+        if kept:
             print(
                 f"Finished frames are kept in {output}: the same command resumes the run.",
                 file=sys.stderr,
             )
-        if isinstance(stop, OSError):
+        if isinstance(stop, OSError) or not kept:
             raise
         raise typer.Exit(130) from None

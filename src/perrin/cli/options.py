@@ -8,6 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, cast, get_args
 import typer
 from typer.core import TyperCommand
 
+from perrin._arrays import require_positive
+from perrin.cli.config import take_config
+
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
@@ -17,20 +20,24 @@ if TYPE_CHECKING:
     from perrin.run.experiment import MotionModel
 
 
-SHAPES = ("tetrahedron", "pentahedron", "trimer")
-
-TOUCHING_SHAPES = (
-    "dimer", "trimer", "tetrahedron", "bipyramid", "octahedron", "pentagonal-bipyramid",
-)  # fmt: skip
+# Number of spheres of the named bodies; the paper's pentahedron is the bipyramid with all five at
+# one distance from the centre, where a radius is given.
+SHAPES = {
+    "dimer": 2, "trimer": 3, "tetrahedron": 4, "pentahedron": 5, "bipyramid": 5, "octahedron": 6,
+    "pentagonal-bipyramid": 7,
+}  # fmt: skip
 
 PICTURE_SUFFIXES = (".png", ".pdf", ".svg")
 
 # Headings of the options in the help of commands with many of them, in this order.
 INPUT, SPHERES = "Input", "Spheres and clusters"
+BODY, RECORDING = "Body and motion", "Recording"
 ESTIMATES, SIZES, WORK, OUTPUT = (
     "Noise and estimates", "Sizes and predictions", "Work", "Output",
 )  # fmt: skip
-_GROUPS = (INPUT, SPHERES, ESTIMATES, SIZES, WORK, OUTPUT, "Other options")
+_GROUPS = (
+    INPUT, SPHERES, BODY, RECORDING, ESTIMATES, SIZES, WORK, OUTPUT, "Other options",
+)  # fmt: skip
 
 
 class GroupedCommand(TyperCommand):
@@ -52,8 +59,21 @@ class GroupedCommand(TyperCommand):
                 with formatter.section(heading):
                     formatter.write_dl(records)
 
+    def format_epilog(self, ctx: Any, formatter: Any) -> None:  # noqa: ANN401, ARG002
+        """Write the examples, a line each, as they are."""
+        if self.epilog:
+            with formatter.section("Examples"):
+                for line in self.epilog.splitlines():
+                    formatter.write(f"  {line.strip()}\n")
 
-Tracks = Annotated[Path, typer.Argument(help="Track table: .csv, .csv.gz, .parquet or .gdf.")]
+
+Tracks = Annotated[
+    Path,
+    typer.Argument(
+        help="Track table: .csv, .tsv, .txt, .xlsx, .parquet, .gdf, .xyz, TrackMate, Imaris, ... "
+        "(docs/tables.md)."
+    ),
+]
 
 Interval = Annotated[
     float, typer.Option("--dt", help="Time between frames, s.", rich_help_panel=INPUT)
@@ -74,7 +94,8 @@ Scale = Annotated[
 Columns = Annotated[
     str | None,
     typer.Option(
-        help="Names or numbers of the file's columns: x=0,y=1,z=2,frame=-2,particle=-1.",
+        help="Names or numbers of the file's columns: x=0,y=1,z=2,frame=-2,particle=-1, or time=t "
+        "(s) in place of frame.",
         rich_help_panel=INPUT,
     ),
 ]
@@ -91,7 +112,50 @@ Overwrite = Annotated[
     typer.Option("--overwrite", help="Replace an existing run folder.", rich_help_panel=OUTPUT),
 ]
 
-OverwriteFile = Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")]
+OverwriteFile = Annotated[
+    bool, typer.Option("--overwrite", help="Replace an existing file.", rich_help_panel=OUTPUT)
+]
+
+Json = Annotated[
+    bool,
+    typer.Option("--json", help="Print the results as JSON, no tables.", rich_help_panel=OUTPUT),
+]
+
+Quiet = Annotated[
+    bool,
+    typer.Option(
+        "--quiet", help="Print warnings and errors only, no progress.", rich_help_panel=OUTPUT
+    ),
+]
+
+Config = Annotated[
+    Path | None,
+    typer.Option(
+        "--config",
+        help="TOML file with options by their names, as run.toml of a run folder; those of the "
+        "command line outrank it.",
+        is_eager=True,
+        callback=take_config,
+        rich_help_panel=INPUT,
+    ),
+]
+
+Contact = Annotated[
+    float | None,
+    typer.Option(
+        help="Centre distance of touching particles, um: finds the clusters.",
+        rich_help_panel=INPUT,
+    ),
+]
+
+ClusterSize = Annotated[
+    int | None,
+    typer.Option(
+        help="Number of particles of a cluster: with --contact, finds the particles of a table "
+        "without ids.",
+        rich_help_panel=INPUT,
+    ),
+]
 
 Sigma = Annotated[
     str | None,
@@ -166,12 +230,34 @@ Dynamics = Annotated[
     typer.Option(
         help="Another motion than Brownian: fractional:ALPHA, confined:RELAXATION_TIME, spin:RATE "
         "or spin:X,Y,Z, switching:RATIO,DWELL, hopping:ANGLE,INTERVAL or "
-        "hopping:ANGLE,INTERVAL,RELAXATION_TIME (rad, rad/s, s)."
+        "hopping:ANGLE,INTERVAL,RELAXATION_TIME (rad, rad/s, s).",
+        rich_help_panel=BODY,
     ),
 ]
 
-Seed = Annotated[int, typer.Option(help="Seed of the random numbers.")]
-Shape = Annotated[str, typer.Argument(help=f"{', '.join(SHAPES)}.")]
+Seed = Annotated[int, typer.Option(help="Seed of the random numbers.", rich_help_panel=RECORDING)]
+Shape = Annotated[str | None, typer.Argument(help=f"{', '.join(SHAPES)}; or --positions.")]
+
+Radius = Annotated[
+    float | None,
+    typer.Option(help="Mean distance of particles to the centre, um.", rich_help_panel=BODY),
+]
+
+Diameter = Annotated[
+    float | None,
+    typer.Option(
+        help="Diameter of touching spheres, um, instead of --radius.", rich_help_panel=BODY
+    ),
+]
+
+Positions = Annotated[
+    Path | None,
+    typer.Option(
+        help="Sphere centres of another body: csv with the columns x,y,z (um) and, if the radii "
+        "differ, radius (um).",
+        rich_help_panel=BODY,
+    ),
+]
 
 
 def read_optics(text: str | None) -> Optics | None:
@@ -201,20 +287,17 @@ def spheres_of(
 ) -> tuple[ArrayLike, ArrayLike]:
     """Return centres and radius of a named body of touching spheres, or those of a file."""
     import perrin
-    from perrin._arrays import require_positive
     from perrin.tracks.files import read_spheres
 
     if diameter is not None:
         require_positive(diameter=diameter)
-    if positions is None and shape in TOUCHING_SHAPES:
+    if positions is None and shape in SHAPES:
         if diameter is None:
             raise ValueError("--diameter: the sphere diameter (um) is needed")
-        return perrin.Cluster.touching(
-            TOUCHING_SHAPES.index(shape) + 2, diameter
-        ).positions, diameter / 2
+        return perrin.Cluster.touching(SHAPES[shape], diameter).positions, diameter / 2
     if positions is None or shape is not None:
         raise ValueError(
-            f"expected one of {', '.join(TOUCHING_SHAPES)}, or --positions FILE, got {shape!r}"
+            f"expected one of {', '.join(SHAPES)}, or --positions FILE, got {shape!r}"
             + ("" if positions is None else f" and {positions}")
         )
     centers, radius = read_spheres(positions)
@@ -309,21 +392,34 @@ def read_columns(text: str | None) -> dict[str, str | int] | None:
     return {name.strip(): place(column.strip()) for name, _, column in pairs}
 
 
-def body_of(shape: str, *, radius: float | None, diameter: float | None) -> Cluster:
-    """Return the named body of that radius, or of touching spheres of that diameter."""
+def body_of(
+    shape: str | None, *, radius: float | None, diameter: float | None, positions: Path | None
+) -> Cluster:
+    """Return the named body of that radius, or of touching spheres, or that of a file."""
     from perrin import Cluster
+    from perrin.geometry.symmetry import point_group
+    from perrin.tracks.files import read_spheres
 
+    if positions is not None:
+        if shape is not None or radius is not None or diameter is not None:
+            raise ValueError("--positions: states the body; expected no name, radius or diameter")
+        places = read_spheres(positions)[0]
+        return Cluster(places, point_group(places))
     faults = []
     if shape not in SHAPES:
-        faults.append(f"shape: expected {', '.join(SHAPES)}, got {shape!r}")
+        faults.append(f"expected one of {', '.join(SHAPES)}, or --positions FILE, got {shape!r}")
     if (radius is None) == (diameter is None):
         faults.append("expected either --radius or --diameter (touching spheres)")
-    if faults:
+    if faults or shape is None:
         raise ValueError("; ".join(faults))
     if diameter is not None:
-        return Cluster.touching({"trimer": 3, "tetrahedron": 4, "pentahedron": 5}[shape], diameter)
-    body: Cluster = getattr(Cluster, shape)(radius)
-    return body
+        return Cluster.touching(SHAPES[shape], diameter)
+    if shape in ("trimer", "tetrahedron", "pentahedron"):
+        body: Cluster = getattr(Cluster, shape)(radius)
+        return body
+    require_positive(radius=radius or 0.0)
+    unit = Cluster.touching(SHAPES[shape], 1.0)
+    return Cluster(unit.positions * ((radius or 0.0) / unit.R), unit.symmetry)
 
 
 def read_slice(text: str | None) -> tuple[int | None, int | None] | None:

@@ -6,12 +6,13 @@ from math import isfinite
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
     from pathlib import Path
 
     from rich.console import Console
     from rich.table import Table
 
+    from perrin.cli.diagnosis import Check
     from perrin.diffusion.estimate import DiffusionEstimate
     from perrin.diffusion.sampling import SamplingPlan
     from perrin.hydrodynamics.mobility import Mobility
@@ -47,12 +48,44 @@ def show_plan(plan: SamplingPlan) -> None:
     window = f"{plan.dt_min:.3g} to {plan.dt_max:.3g} s"
     table.add_row("window of dt", "empty" if plan.dt_min > plan.dt_max else window)
     table.add_row("the paper's rules", f"{plan.paper_dt_min:.3g} to {plan.paper_dt_max:.3g} s")
-    table.add_row("SNR at the best dt", f"{plan.snr:.3g}")
-    table.add_row("noise floor Phi^2", f"{plan.phi2:.3g} rad^2")
+    table.add_row("signal to noise (SNR)", f"{plan.snr:.3g} at the best dt")
+    table.add_row("noise floor (Phi^2)", f"{plan.phi2:.3g} rad^2")
     console = Console(highlight=False)
     console.print(table)
     for reason in plan.reasons:
         console.print(f"- {escape(reason)}", soft_wrap=True)
+
+
+def show_json(content: object) -> None:
+    """Print a result as JSON, indented.
+
+    Examples
+    --------
+    >>> show_json({"D_R": 0.005})
+    {
+      "D_R": 0.005
+    }
+    """
+    import json
+
+    from perrin._arrays import to_plain
+
+    print(json.dumps(content, indent=2, allow_nan=False, default=to_plain, ensure_ascii=False))
+
+
+def show_diagnosis(checks: Sequence[Check]) -> None:
+    """Print the lines of a diagnosis, with a mark for each.
+
+    Examples
+    --------
+    >>> from perrin.cli.diagnosis import Check
+    >>> show_diagnosis([Check("numpy", "2.4"), Check("gsd", "not installed", None)])
+    ok  numpy: 2.4
+    -   gsd: not installed
+    """
+    marks = {True: "ok ", False: "BAD", None: "-  "}
+    for check in checks:
+        print(f"{marks[check.good]} {check.subject}: {check.state}")
 
 
 def show_report(report: Report, output: Path, command: Callable[..., None]) -> None:
@@ -74,6 +107,8 @@ def show_report(report: Report, output: Path, command: Callable[..., None]) -> N
         console.print(
             f"and {len(report.clusters) - _CLUSTERS_SHOWN} more clusters in report.html\n"
         )
+    for term in terms_of(report):
+        console.print(f"[dim]{escape(term)}[/]", soft_wrap=True)
     if report.pooled is not None and len(report.clusters) > 1:
         console.print(pooled_table(report.pooled))
     if report.pooled_by_kind:
@@ -87,6 +122,28 @@ def show_report(report: Report, output: Path, command: Callable[..., None]) -> N
     show_remarks(report, command, console)
     pages = "report.html" if report.imaging is None else "report.html, quality.html"
     console.print(f"Written to {escape(str(output))}: {pages}, figures, summary.json, tables.")
+
+
+def terms_of(report: Report) -> list[str]:
+    """Return what the terms in the tables of a report mean, one sentence each.
+
+    Examples
+    --------
+    >>> from types import SimpleNamespace
+    >>> cluster = SimpleNamespace(prediction=None)
+    >>> terms_of(SimpleNamespace(clusters=(cluster,), kinds=()))[0][:43]
+    'Phi^2, the noise floor: the mean square tur'
+    """
+    terms = []
+    if report.clusters:
+        terms.append(
+            "Phi^2, the noise floor: the mean square turn that noise alone shows between two frames"
+        )
+    if any(result.prediction is not None for result in report.clusters):
+        terms.append("pull: measured minus predicted, in standard errors")
+    if len(report.kinds) > 1:
+        terms.append("T_d, D_3h, ...: the symmetry of the shape (its point group)")
+    return terms
 
 
 def show_remarks(report: Report, command: Callable[..., None], console: Console) -> None:

@@ -454,7 +454,8 @@ def error_ratio_shown(ratio: ErrorRatio, *, axes: list[str]) -> Findings:
     changing = f", changing by {' and '.join(trend)}" if trend else ""
     text = (
         f"errors of the positions over those of the fits of their images, from the residuals of "
-        f"rigid bodies: {listed_axes}{changing}; the stated errors of spheres and poses contain this"
+        f"rigid bodies: {listed_axes}{changing}; the stated errors of spheres and poses contain "
+        "this"
     )
     if factor.max() > _LARGE_ERROR_RATIO:
         return Findings(

@@ -28,9 +28,9 @@ from perrin.plot.motion import (
     plot_step_spectrum,
 )
 from perrin.plot.results import (
-    MAX_CLUSTERS,
     ModelLine,
     curve_figure,
+    curve_floors,
     forest_figure,
     model_line,
     orientation_figure,
@@ -46,15 +46,23 @@ from perrin.plot.results import (
     residual_figure,
     save_figures,
 )
-from perrin.plot.style import PALETTE, legend_above, new_figure, save_figure, write_reason
+from perrin.plot.style import (
+    PALETTE,
+    font_in_use,
+    legend_above,
+    new_figure,
+    save_figure,
+    write_reason,
+)
 
 __all__ = [
-    "MAX_CLUSTERS",
     "MOTION_CAPTION",
     "PALETTE",
     "ModelLine",
     "alternative_spectrum",
     "curve_figure",
+    "curve_floors",
+    "font_in_use",
     "forest_figure",
     "found_figure",
     "health_figure",

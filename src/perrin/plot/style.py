@@ -123,3 +123,20 @@ def write_reason(ax: Axes, reason: str, *, framed: bool = False) -> Axes:
     else:
         ax.set_axis_off()
     return ax
+
+
+def font_in_use() -> str | None:
+    """Return the name and the file of the font that figures get, None where no font is found.
+
+    Examples
+    --------
+    >>> font_in_use() is not None
+    True
+    """
+    from matplotlib.font_manager import FontProperties, findfont
+
+    try:
+        file = findfont(FontProperties())
+    except ValueError:
+        return None
+    return f"{FontProperties(fname=file).get_name()}, {file}"

@@ -4,6 +4,7 @@ from perrin.run.experiment import Experiment, Recording, argument_faults, merged
 from perrin.run.folders import check_place, check_resumable, filled_folder, staged_folder
 from perrin.run.grouping import assign_clusters
 from perrin.run.kinds import part_of, shape_numbers, usual_symmetry
+from perrin.run.layers import napari_layers, napari_reader, table_layers
 from perrin.run.measure import (
     ClusterTracks,
     Coefficient,
@@ -94,6 +95,7 @@ from perrin.run.remarks import (
     with_jumps,
     wrapped_box_text,
 )
+from perrin.run.result_table import result_rows_html, result_table
 from perrin.run.results import (
     BodyKind,
     ClusterResult,
@@ -109,7 +111,7 @@ from perrin.run.results import (
     write_data,
 )
 from perrin.run.singles import SingleSpheres, measure_singles, track_steps
-from perrin.run.statements import kinds_text, motion_sentences, verdict_lines
+from perrin.run.statements import answer_lines, kinds_text, motion_sentences, verdict_lines
 from perrin.run.tables import analyze, read_table
 from perrin.run.verdicts import fit_model, judge_each_and_all, verdicts_from_dict, verdicts_to_dict
 
@@ -135,6 +137,7 @@ __all__ = [
     "absent_frames_notes",
     "add_predictions",
     "analyze",
+    "answer_lines",
     "are_unequal",
     "argument_faults",
     "assign_clusters",
@@ -197,6 +200,8 @@ __all__ = [
     "motion_and_path",
     "motion_sentences",
     "motion_table",
+    "napari_layers",
+    "napari_reader",
     "no_cluster_text",
     "no_model_notes",
     "no_pose_notes",
@@ -213,6 +218,8 @@ __all__ = [
     "predicted_noise",
     "read_table",
     "removed_drift_notes",
+    "result_rows_html",
+    "result_table",
     "run_settings",
     "shape_numbers",
     "soft_clusters_warning",
@@ -222,6 +229,7 @@ __all__ = [
     "stage_jump_warnings",
     "staged_folder",
     "steady_motion_warning",
+    "table_layers",
     "track_steps",
     "unfit_diameter_text",
     "unresolved_size_notes",

@@ -86,6 +86,8 @@ if TYPE_CHECKING:
     from perrin.motion.floor import NoiseFloor
     from perrin.motion.rigid_motion import RigidMotion
 
+    Progress: TypeAlias = Callable[[int, int, str], None]
+
     # Better motions by cluster number, from the fitted bodies and the number of the first frame.
     Improve: TypeAlias = Callable[[Sequence["FittedBody"], int], Mapping[int, RigidMotion]]
 
@@ -232,6 +234,7 @@ def measure_table(
     improved: Improve | None = None,
     remarks: Remarks | None = None,
     singles: pd.DataFrame | None = None,
+    progress: Progress | None = None,
 ) -> Report:
     """Measure every cluster of a clean table: `analyze` without reading and checking.
 
@@ -253,6 +256,8 @@ def measure_table(
         Remarks from reading and screening the table.
     singles : pandas.DataFrame, optional
         Tracks of single particles, as in `measure_singles`, with frames as in the table.
+    progress : callable, optional
+        Called with the number of finished clusters, their total, and what is done.
 
     Returns
     -------
@@ -272,7 +277,7 @@ def measure_table(
     recording = recording or Recording(dt=experiment.dt or np.nan)
     recording, more = complete_recording(recording, table, first_frame=first)
     remarks += more
-    bodies, rods, failures = fit_clusters(table, labels, experiment, recording)
+    bodies, rods, failures = fit_clusters(table, labels, experiment, recording, progress=progress)
     if improved is not None:
         motions = improved(bodies, first)
         bodies = [
@@ -287,6 +292,8 @@ def measure_table(
     )
     if not experiment.keep_jumps:
         bodies = [replace(b, stage=stage.rows(b.tracks.frames)) for b in bodies]
+    if progress is not None:
+        progress(0, 0, "estimating D_R and D_T")
     measured, failed = measure_bodies(bodies, experiment, recording)
     failures += failed
     if failures and not (measured or rods):
@@ -371,7 +378,12 @@ def complete_recording(
 
 
 def fit_clusters(
-    table: pd.DataFrame, labels: Mapping[int, str], experiment: Experiment, recording: Recording
+    table: pd.DataFrame,
+    labels: Mapping[int, str],
+    experiment: Experiment,
+    recording: Recording,
+    *,
+    progress: Progress | None = None,
 ) -> tuple[list[FittedBody], list[RodResult], list[tuple[str, ValueError]]]:
     """Fit every cluster of a table; particles on one line are measured as rods.
 
@@ -385,7 +397,10 @@ def fit_clusters(
     bodies: list[FittedBody] = []
     rods: list[RodResult] = []
     failures: list[tuple[str, ValueError]] = []
-    for cluster, positions, frames, piece, delay in each_cluster(table):
+    count = table["cluster"][table["cluster"] >= 0].nunique()
+    for number, (cluster, positions, frames, piece, delay) in enumerate(each_cluster(table)):
+        if progress is not None:
+            progress(number, count, "fitting clusters")
         label = labels.get(cluster)
         try:
             far = far_points(positions)

@@ -12,6 +12,7 @@ import numpy as np
 from perrin.run.experiment import Recording, merged_experiment
 from perrin.run.measure import measure_table
 from perrin.run.remarks import Remarks
+from perrin.tracks.clusters import identify
 from perrin.tracks.files import check_tracks, read_tracks
 from perrin.tracks.screening import distance_notes, has_trackpy_columns, screen_rows
 
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from perrin.run.experiment import Experiment, MotionModel
+    from perrin.run.measure import Progress
     from perrin.run.results import Report
 
 
@@ -32,6 +34,7 @@ def analyze(
     scale: ArrayLike = 1.0,
     columns: Mapping[str, str | int] | None = None,
     contact: float | None = None,
+    size: int | None = None,
     sigma: ArrayLike | None = None,
     noise: Literal["joint", "residual"] | float = "joint",
     exposure: float | None = None,
@@ -43,14 +46,15 @@ def analyze(
     diameter: float | None = None,
     frames: tuple[int | None, int | None] | None = None,
     experiment: Experiment | None = None,
+    progress: Progress | None = None,
 ) -> Report:
     """Measure D_R and D_T of every cluster in a track table.
 
     Parameters
     ----------
-    tracks : path or pandas.DataFrame
-        A .csv, .csv.gz, .parquet or .gdf file, or a table with the columns frame, particle, x,
-        y[, z] and perhaps cluster and time (s), which may be uneven.
+    tracks : path, pandas.DataFrame or MDAnalysis selection
+        A file that `read_tracks` reads, or a table with the columns frame, particle, x, y[, z] and
+        perhaps cluster and time (s), which may be uneven.
     dt : float
         Time between successive frame numbers, s; the column time must agree with it.
     scale : float or array_like
@@ -60,6 +64,9 @@ def analyze(
     contact : float, optional
         Centre distance of touching particles, um: finds the clusters in a table without a
         cluster column. Without it they are found by the distances that stay the same.
+    size : int, optional
+        Number of particles of a cluster, for a table without the column particle: with `contact`,
+        `identify` finds particles and clusters.
     sigma : float or array_like, optional
         Known localisation error, um, one number or one per axis: sets the predicted noise floor and
         the test of rigidity, not the estimates.
@@ -90,6 +97,8 @@ def analyze(
     experiment : Experiment, optional
         dt, sigma, noise, exposure, drift, keep_jumps, model, viscosity, temperature and diameter in
         one object; a value is stated here or as its own argument, not both.
+    progress : callable, optional
+        Called with the number of finished clusters, their total, and what is done.
 
     Returns
     -------
@@ -128,17 +137,21 @@ def analyze(
     )
     if experiment.dt is None:
         raise ValueError("dt: needed, the time between successive frame numbers, s")
-    table, source, remarks = read_table(tracks, scale=scale, columns=columns, frames=frames)
+    table, source, remarks = read_table(
+        tracks, scale=scale, columns=columns, frames=frames, contact=contact, size=size
+    )
     plain_scale = np.asarray(scale, dtype=np.float64).tolist()
     return measure_table(
         table,
         experiment,
         source=source,
         arguments=experiment.to_dict()
-        | {"contact": contact, "frames": frames, "columns": columns, "scale": plain_scale},
+        | {"contact": contact, "frames": frames, "columns": columns, "scale": plain_scale}
+        | ({} if size is None else {"size": size}),
         contact=contact,
         recording=Recording(dt=experiment.dt),
         remarks=remarks,
+        progress=progress,
     )
 
 
@@ -148,12 +161,14 @@ def read_table(
     scale: ArrayLike = 1.0,
     columns: Mapping[str, str | int] | None = None,
     frames: tuple[int | None, int | None] | None = None,
+    contact: float | None = None,
+    size: int | None = None,
 ) -> tuple[pd.DataFrame, dict[str, str | None], Remarks]:
     """Read or check a track table, and mark the rows that are no measurements.
 
     Parameters
     ----------
-    tracks, scale, columns, frames
+    tracks, scale, columns, frames, contact, size
         As in `analyze`.
 
     Returns
@@ -170,17 +185,20 @@ def read_table(
         As in `analyze`.
     """
     if isinstance(tracks, str | os.PathLike):
-        table = read_tracks(tracks, scale=scale, columns=columns)
+        table = read_tracks(tracks, scale=scale, columns=columns, detections=size is not None)
         digest = hashlib.sha256(Path(tracks).read_bytes()).hexdigest()
         source: dict[str, str | None] = {"path": os.fspath(tracks), "sha256": digest}
-        names: Iterable[str] = table.attrs.get("columns", table.columns)
     else:
         if columns is not None:
             raise ValueError("columns: only for files; rename the columns of a table")
-        table = check_tracks(tracks, source="the table", scale=scale)
-        source, names = {"path": None, "sha256": None}, map(str, tracks.columns)
-        if "piece" in tracks:  # where `identify` was in doubt
+        table = check_tracks(tracks, source="the table", scale=scale, detections=size is not None)
+        source = {"path": None, "sha256": None}
+        if "piece" in getattr(tracks, "columns", ()):  # where `identify` was in doubt
             table["piece"] = tracks["piece"].to_numpy()
+    if size is not None and (contact is None or "particle" in table):
+        wrong = "contact is needed too" if contact is None else "the table has a column particle"
+        raise ValueError(f"size: finds the particles of a table without ids; {wrong}")
+    names: Iterable[str] = table.attrs["columns"]
     read_notes = list(table.attrs.get("notes", ()))
     first, stop = frames or (None, None)
     keep = np.ones(len(table), dtype=np.bool_)
@@ -191,7 +209,15 @@ def read_table(
     if not keep.any():
         low, high = int(table["frame"].min()), int(table["frame"].max())
         raise ValueError(f"frames {first}:{stop} hold no rows; the table runs from {low} to {high}")
-    screened = screen_rows(table[keep].reset_index(drop=True))
+    table = table[keep].reset_index(drop=True)
+    if size is not None and contact is not None:
+        table = identify(table, contact=contact, size=size)
+        known = table["cluster"] >= 0
+        read_notes.append(
+            f"particles are identified in {table['cluster'][known].nunique()} clusters of {size}; "
+            f"{(~known).sum()} of {len(known)} rows belong to none"
+        )
+    screened = screen_rows(table)
     notes, warnings = distance_notes(
         screened.table,
         scale_given=bool(np.any(np.asarray(scale) != 1)),

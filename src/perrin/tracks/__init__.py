@@ -10,7 +10,14 @@ from perrin.tracks.bonds import (
     rigid_groups,
     shared_rows,
 )
-from perrin.tracks.clock import Clock, evenly_spaced, frame_stride, own_times, read_clock
+from perrin.tracks.clock import (
+    Clock,
+    evenly_spaced,
+    frame_stride,
+    frames_from_times,
+    own_times,
+    read_clock,
+)
 from perrin.tracks.clusters import (
     cluster_positions,
     each_cluster,
@@ -19,10 +26,32 @@ from perrin.tracks.clusters import (
     particles_and_pieces,
     positions_table,
 )
-from perrin.tracks.column_names import Spelling, recognise_columns, seconds, unit_faults
+from perrin.tracks.column_names import (
+    Spelling,
+    ours_of,
+    recognise_columns,
+    seconds,
+    stated_units,
+    unit_faults,
+)
 from perrin.tracks.contacts import Contacts, lasting_contacts
+from perrin.tracks.delimited import (
+    Layout,
+    delimited_table,
+    first_lines,
+    layout_of,
+    parse_text,
+    utf8_text,
+)
 from perrin.tracks.files import RowNumbers, check_tracks, read_spheres, read_tracks, write_tracks
-from perrin.tracks.formats import SUFFIXES, parse_csv, parse_table, table_bytes, table_suffix
+from perrin.tracks.formats import (
+    SUFFIXES,
+    parse_table,
+    sheet_text,
+    table_bytes,
+    table_suffix,
+    text_table,
+)
 from perrin.tracks.gdf import gdf_bytes, parse_gdf
 from perrin.tracks.groups import TOUCHING_REACH, connected_groups, frames_of, touching_groups
 from perrin.tracks.identity import (
@@ -48,7 +77,10 @@ from perrin.tracks.identity import (
     shape_symmetry,
     squared_angle,
 )
+from perrin.tracks.imaris import imaris_table, is_imaris
 from perrin.tracks.linking import Centers, link_clusters, linked_tracks, stage_path, step_variance
+from perrin.tracks.motion_capture import is_motive, motive_table, parse_c3d
+from perrin.tracks.raw_tables import RawTable, tracked_rows, without_flat_z
 from perrin.tracks.rigid_bodies import IdentifiedBodies, RigidBodies, identify_bodies, rigid_bodies
 from perrin.tracks.screening import (
     CENTRE_REMOVED,
@@ -64,8 +96,12 @@ from perrin.tracks.screening import (
     rounding_chances,
     screen_rows,
 )
+from perrin.tracks.simulations import is_selection, parse_gsd, selection_table
 from perrin.tracks.sphere_tracks import link_spheres, track_variances
+from perrin.tracks.track_arrays import gdf_table, napari_columns, napari_text
+from perrin.tracks.trackmate import is_trackmate, parse_trackmate_xml, trackmate_table
 from perrin.tracks.writing import write_json, written_whole
+from perrin.tracks.xyz import parse_xyz, xyz_text
 
 __all__ = [
     "CENTRE_REMOVED",
@@ -79,8 +115,10 @@ __all__ = [
     "Detections",
     "IdentifiedBodies",
     "Identity",
+    "Layout",
     "Pairs",
     "Pose",
+    "RawTable",
     "RigidBodies",
     "RowNumbers",
     "Screened",
@@ -96,37 +134,55 @@ __all__ = [
     "cluster_positions",
     "connected_groups",
     "covering_rotations",
+    "delimited_table",
     "distance_notes",
     "each_cluster",
     "evenly_spaced",
     "far_points",
     "far_sentence",
     "find_clusters",
+    "first_lines",
     "followed_pairs",
     "frame_stride",
+    "frames_from_times",
     "frames_of",
     "gdf_bytes",
+    "gdf_table",
     "has_trackpy_columns",
     "icp_fit",
     "icp_search",
     "identify",
     "identify_bodies",
+    "imaris_table",
+    "is_imaris",
+    "is_motive",
+    "is_selection",
+    "is_trackmate",
     "joined_pairs",
     "labels_are_certain",
     "labels_in_time",
     "lasting_contacts",
     "lattice_step",
+    "layout_of",
     "link_clusters",
     "link_spheres",
     "linked_tracks",
     "most_likely_identity",
     "most_likely_path",
+    "motive_table",
+    "napari_columns",
+    "napari_text",
     "neighbour_pairs",
     "noise_along",
+    "ours_of",
     "own_times",
-    "parse_csv",
+    "parse_c3d",
     "parse_gdf",
+    "parse_gsd",
     "parse_table",
+    "parse_text",
+    "parse_trackmate_xml",
+    "parse_xyz",
     "particles_and_pieces",
     "placeholder_rows",
     "positions_table",
@@ -141,18 +197,27 @@ __all__ = [
     "rounding_chances",
     "screen_rows",
     "seconds",
+    "selection_table",
     "settle_identity",
     "shape_symmetry",
     "shared_rows",
+    "sheet_text",
     "squared_angle",
     "stage_path",
+    "stated_units",
     "step_variance",
     "table_bytes",
     "table_suffix",
+    "text_table",
     "touching_groups",
     "track_variances",
+    "tracked_rows",
+    "trackmate_table",
     "unit_faults",
+    "utf8_text",
+    "without_flat_z",
     "write_json",
     "write_tracks",
     "written_whole",
+    "xyz_text",
 ]

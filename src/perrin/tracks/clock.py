@@ -21,6 +21,10 @@ if TYPE_CHECKING:
 # Times that differ from an even grid by less than this share of dt are even.
 _GRID_TOLERANCE = 5e-4
 
+# Times are on a grid if the intervals between them are multiples of one interval to this share of
+# it; times that differ by less than the second share are those of one frame.
+_INTERVAL_TOLERANCE, _SAME_TIME = 0.1, 1e-3
+
 # The median interval of the column may differ from dt by this share: clocks are not exact.
 _DT_TOLERANCE = 0.01
 
@@ -207,6 +211,49 @@ def own_times(table: pd.DataFrame, *, dt: float) -> tuple[Floats | None, tuple[s
         f"the rows of a frame have their own times, up to {longest:.3g} s from its mean: bodies "
         "are fitted with the motion between them",
     )
+
+
+def frames_from_times(times: Floats) -> tuple[Ints, list[str], list[str]]:
+    """Return the frames of rows, numbered by the times at which they were recorded.
+
+    Parameters
+    ----------
+    times : ndarray, shape (N,)
+        Time of each row, s.
+
+    Returns
+    -------
+    frames : ndarray of int64, shape (N,)
+        From 0 at the first time. Where all intervals are multiples of the usual one, a longer one
+        leaves out frames; otherwise times are numbered in their order.
+    notes, faults : list of str
+
+    Examples
+    --------
+    >>> frames, notes, faults = frames_from_times(np.array([5.0, 5.5, 5.5, 6.5]))
+    >>> frames.tolist(), notes
+    ([0, 1, 1, 3], ['frames are numbered by the column time: 3 times, 0.5 s apart'])
+    """
+    known = np.isfinite(times)
+    if not known.all():
+        text = f"time: {(~known).sum()} entries are missing, which are needed to number the frames"
+        return np.zeros(len(times), dtype=np.int64), [], [text]
+    distinct = np.unique(times)
+    gaps = np.diff(distinct)
+    if gaps.size:
+        # Rounding may have made two times of one.
+        new = np.concatenate([[True], gaps > _SAME_TIME * np.median(gaps)])
+        distinct = distinct[new]
+        gaps = np.diff(distinct)
+    usual = float(np.quantile(gaps, 0.5, method="lower")) if gaps.size else np.nan
+    multiples = np.round(gaps / usual)
+    even = bool(np.all(np.abs(gaps / usual - multiples) <= _INTERVAL_TOLERANCE))
+    steps = multiples if even and np.all(multiples >= 1) else np.ones(len(gaps))
+    numbers = np.concatenate([[0], np.cumsum(steps)]).astype(np.int64)
+    row = np.searchsorted(distinct, times, side="right") - 1
+    apart = f", {usual:.4g} s apart" if even else f", unevenly spaced (median {usual:.4g} s)"
+    note = f"frames are numbered by the column time: {len(distinct)} times{apart}"
+    return numbers[row], [note], []
 
 
 def evenly_spaced(times: Floats, frames: Ints, *, dt: float) -> bool:

@@ -18,24 +18,28 @@ _OURS_BY_SPELLING = {
     **{name: name for name in COLUMNS},
     "framenumber": "frame",
     "particleid": "particle",
+    "trackid": "particle",
     "clusterid": "cluster",
 }
 
 _UNIT_UM: dict[str, float | None] = {
-    **dict.fromkeys(("um", "\u03bcm", "micron", "microns", "micrometer", "micrometre"), 1.0),
-    **dict.fromkeys(("nm", "nanometer", "nanometre"), 1e-3),
-    **dict.fromkeys(("mm", "millimeter", "millimetre"), 1e3),
-    "cm": 1e4,
-    "m": 1e6,
+    **dict.fromkeys(("um", "\u03bcm", "micron", "microns"), 1.0),
+    **dict.fromkeys((f"micromet{end}" for end in ("er", "re", "ers", "res")), 1.0),
+    **dict.fromkeys(("nm", "nanometer", "nanometre", "nanometers", "nanometres"), 1e-3),
+    **dict.fromkeys(("mm", "millimeter", "millimetre", "millimeters", "millimetres"), 1e3),
+    **dict.fromkeys(("cm", "centimeter", "centimetre", "centimeters", "centimetres"), 1e4),
+    **dict.fromkeys(("m", "meter", "metre", "meters", "metres"), 1e6),
+    **dict.fromkeys(("a", "\u00e5", "angstrom", "angstroms"), 1e-4),
     # The size of a pixel is not in its name.
     **dict.fromkeys(("px", "pix", "pixel", "pixels", "voxel", "voxels"), None),
 }
 
 _UNIT_SECONDS = {
     **dict.fromkeys(("s", "sec", "second", "seconds"), 1.0),
-    **dict.fromkeys(("ms", "msec"), 1e-3),
+    **dict.fromkeys(("ms", "msec", "millisecond", "milliseconds"), 1e-3),
+    **dict.fromkeys(("us", "\u03bcs"), 1e-6),
     **dict.fromkeys(("min", "minute", "minutes"), 60.0),
-    "h": 3600.0,
+    **dict.fromkeys(("h", "hour", "hours"), 3600.0),
 }
 
 _UNITS_OF: dict[str, Mapping[str, float | None]] = {
@@ -129,6 +133,56 @@ def recognise_columns(
         name, unit = units["time"]
         notes.append(f"column {name!r} is converted from {unit} to s")
     return Spelling(renamed, units, tuple(notes), tuple(faults))
+
+
+def ours_of(names: Iterable[object]) -> dict[str, str]:
+    """Return our name for each of the names that is ours in any spelling.
+
+    Examples
+    --------
+    >>> ours_of(["Frame", "x", "mass"])
+    {'Frame': 'frame', 'x': 'x'}
+    """
+    found = {}
+    for name in names:
+        if isinstance(name, str):
+            base, unit = _base_and_unit(name)
+            ours = _OURS_BY_SPELLING.get(base)
+            if ours is not None and (not unit or unit in _UNITS_OF.get(ours, {})):
+                found[name] = ours
+    return found
+
+
+def stated_units(
+    units: Mapping[str, tuple[str, str]],
+) -> tuple[dict[str, tuple[str, str]], list[str]]:
+    """Return the units that a format states, spelled as in the names of columns, and faults.
+
+    Parameters
+    ----------
+    units : mapping
+        For each of our names the file's name of the column and the unit.
+
+    Returns
+    -------
+    units : dict
+        As in `Spelling`.
+    faults : list of str
+        Units that are unknown.
+
+    Examples
+    --------
+    >>> stated_units({"x": ("POSITION_X", "Micron")})[0]
+    {'x': ('POSITION_X (micron)', 'micron')}
+    """
+    known, faults = {}, []
+    for ours, (name, unit) in units.items():
+        simple = unit.strip().casefold()
+        if simple in _UNITS_OF.get(ours, {}):
+            known[ours] = f"{name} ({simple})", simple
+        elif simple and ours in _UNITS_OF:
+            faults.append(f"{ours}: the unit {unit!r} of the file is unknown")
+    return known, faults
 
 
 def unit_faults(units: Mapping[str, tuple[str, str]], scale: Mapping[str, float]) -> list[str]:

@@ -10,8 +10,19 @@ import numpy as np
 
 from perrin._text import listed
 from perrin.errors import table_error
-from perrin.tracks.column_names import COLUMNS, Spelling, recognise_columns, seconds, unit_faults
-from perrin.tracks.formats import LARGEST_EXACT, parse_csv, parse_table, table_bytes, table_suffix
+from perrin.tracks.clock import frames_from_times
+from perrin.tracks.column_names import (
+    COLUMNS,
+    Spelling,
+    ours_of,
+    recognise_columns,
+    seconds,
+    stated_units,
+    unit_faults,
+)
+from perrin.tracks.delimited import parse_text, utf8_text
+from perrin.tracks.formats import LARGEST_EXACT, parse_table, table_bytes, table_suffix
+from perrin.tracks.simulations import is_selection, selection_table
 from perrin.tracks.writing import written_whole
 
 if TYPE_CHECKING:
@@ -21,15 +32,9 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
     from perrin._arrays import Bools, Floats, Ints
+    from perrin.tracks.raw_tables import RawTable
 
 _AXES = ("x", "y", "z")
-
-_GDF_NAMES = {
-    4: ("x", "y", "frame", "particle"),
-    5: ("x", "y", "z", "frame", "particle"),
-}
-
-_GDF_EXAMPLE = 'columns={"x": 0, "y": 1, "z": 2, "frame": -2, "particle": -1}'
 
 _PathLike: TypeAlias = str | os.PathLike[str]
 
@@ -39,15 +44,18 @@ def read_tracks(
     *,
     scale: ArrayLike = 1.0,
     columns: Mapping[str, str | int] | None = None,
+    detections: bool = False,
 ) -> pd.DataFrame:
     r"""Read particle tracks from a file into one checked table in micrometres.
 
     Parameters
     ----------
     path : str or path
-        A file ending in ``.csv``, ``.csv.gz``, ``.parquet`` or ``.gdf`` (IDL, either byte order).
-        A ``.gdf`` of 4 columns holds x, y, frame, particle, one of 5 columns x, y, z, frame,
-        particle; any other needs `columns`.
+        A table of text (``.csv``, ``.tsv``, ``.txt``, ``.dat``, packed as ``.gz`` or not), with
+        commas, semicolons, tabs or blanks between the columns, among them tables of trackpy,
+        TrackMate, Imaris and Motive; ``.parquet``; ``.gdf`` (IDL); ``.xml`` (TrackMate); ``.xyz``;
+        and, with ``perrin[tables]``, ``.xlsx``, ``.xls``, ``.ods``, ``.c3d`` and ``.gsd``. The page
+        docs/tables.md describes what is recognised in each.
     scale : float or one float per axis
         Micrometres per unit of the file: the pixel size, or (x, y, z) voxel sizes.
     columns : mapping, optional
@@ -56,6 +64,8 @@ def read_tracks(
         negative): ``{"x": "POS_X"}`` or ``{"x": 0, "y": 1, "frame": -2, "particle": -1}``.
         Columns that already have our names need no entry, nor do those that differ in case, blanks
         or a unit only (``Frame``, ``Particle ID``, ``x (um)``, ``Y_um``); see the notes.
+    detections : bool
+        Accept a table without the column ``particle``, for `identify`.
 
     Returns
     -------
@@ -64,7 +74,7 @@ def read_tracks(
         (float64, um), ``cluster`` and ``time`` (s) as in `check_tracks`. Other columns of the
         file are left out. ``attrs["columns"]`` holds all of the file's column
         names; ``attrs["notes"]``, where there are any, is a list of texts that state
-        which columns were recognised under another spelling.
+        as what the file was read, and which columns were recognised under another spelling.
 
     Raises
     ------
@@ -72,6 +82,8 @@ def read_tracks(
         If the file cannot be read as a track table; the message lists every fault found.
     ValueError
         If `scale` is not one positive number, or one per axis.
+    ImportError
+        If the format needs a package that is not installed.
     OSError
         If the file is missing or may not be read.
 
@@ -79,11 +91,12 @@ def read_tracks(
     -----
     A column with exactly our name is always taken. Otherwise a column is taken that has our name
     but for case, blanks, underscores and a unit at its end; where two columns could be the same one
-    of ours, the table is refused. A unit of length in the name of a column must agree with `scale`:
-    nm needs 0.001, px needs the size of a pixel, and um needs 1; the table is refused where they
-    contradict each other, since one of the two is wrong. Columns that `columns` gives by number are
-    taken without regard to their names. A unit of time in the name of the column ``time`` converts
-    it to s, as no argument can contradict it.
+    of ours, the table is refused. A unit of length in the name of a column, or stated elsewhere in
+    the file, must agree with `scale`: nm needs 0.001, px needs the size of a pixel, and um needs 1;
+    the table is refused where they contradict each other, since one of the two is wrong. Columns
+    that `columns` gives by number are taken without regard to their names. A unit of time in the
+    name of the column ``time`` converts it to s, as no argument can contradict it. Where a table
+    has a column ``time``, but no ``frame``, frames are numbered by their times.
 
     Examples
     --------
@@ -100,27 +113,18 @@ def read_tracks(
     source = os.fspath(path)
     suffix = table_suffix(source)
     raw = parse_table(Path(path).read_bytes(), suffix, source)
-    if suffix == ".gdf" and columns is None:
-        if raw.shape[1] not in _GDF_NAMES:
-            raise table_error(
-                source,
-                f"the meaning of the columns of a .gdf of {raw.shape[1]} columns is unknown (4 are "
-                "x, y, frame, particle; 5 are x, y, z, frame, particle); name them, for example "
-                f"{_GDF_EXAMPLE}",
-            )
-        columns = {name: i for i, name in enumerate(_GDF_NAMES[raw.shape[1]])}
+    if raw.unnamed and not columns:
+        raise table_error(source, raw.unnamed)
     columns = columns or {}
-    names = list(raw.columns)
-    found = _mapped_columns(names, columns, source)
-    rest = [i for i, name in enumerate(names) if i not in found.values() and name not in found]
-    table = raw.iloc[:, [*found.values(), *rest]]
-    table.columns = [*found, *(names[i] for i in rest)]
-    taken = {ours: theirs if isinstance(theirs, str) else None for ours, theirs in columns.items()}
-    spelling = recognise_columns([names[i] for i in rest], taken=taken)
-    return _clean_table(table, spelling, source, RowNumbers.of(raw, suffix), scale)
+    found = _mapped_columns(list(raw.table.columns), columns, source)
+    table, spelling = _named_columns(raw, found, columns)
+    rows = RowNumbers(raw.word, raw.table.index.to_numpy() + raw.first)
+    return _clean_table(table, spelling, source, rows, scale, detections=detections)
 
 
-def check_tracks(table: pd.DataFrame, *, source: str, scale: ArrayLike = 1.0) -> pd.DataFrame:
+def check_tracks(
+    table: pd.DataFrame, *, source: str, scale: ArrayLike = 1.0, detections: bool = False
+) -> pd.DataFrame:
     """Check a table of tracks and return a clean copy.
 
     A NaN coordinate is not a fault: it is a missing point, and is kept.
@@ -129,12 +133,17 @@ def check_tracks(table: pd.DataFrame, *, source: str, scale: ArrayLike = 1.0) ->
     ----------
     table : pandas.DataFrame
         One row per particle and frame, with the columns ``frame``, ``particle``, ``x``, ``y`` and,
-        where given, ``z``, ``cluster``, ``time``. The index is ignored.
+        where given, ``z``, ``cluster``, ``time``. A level of the index with one of these names that
+        is no column counts as one; the rest of the index is ignored. Columns of two levels, such as
+        those of a pivot table (axis, particle), become rows. A Universe or a group of atoms of
+        MDAnalysis is taken as well.
     source : str
         Name of the table in messages: the name of its file, or "the table". For a source ending in
         ``.csv`` or ``.csv.gz`` they count lines (the header is line 1), else rows from 0.
     scale : float or one float per axis
         Micrometres per unit of the coordinates.
+    detections : bool
+        Accept a table without the column ``particle``, for `identify`.
 
     Returns
     -------
@@ -163,12 +172,23 @@ def check_tracks(table: pd.DataFrame, *, source: str, scale: ArrayLike = 1.0) ->
     """
     import pandas as pd
 
+    if is_selection(table):
+        table = selection_table(table)
     if not isinstance(table, pd.DataFrame):
         raise TypeError(f"{source}: expected a pandas DataFrame, got {type(table).__name__}")
-    table = table.reset_index(drop=True)
+    if table.columns.nlevels == 2:
+        table = _long_rows(table, source)
+    else:
+        present = set(ours_of(table.columns).values())
+        levels = [name for name in table.index.names if isinstance(name, str)]
+        wanted = {name: ours for name, ours in ours_of(levels).items() if ours not in present}
+        added = {name: table.index.get_level_values(name) for name in wanted}
+        table = table.reset_index(drop=True)
+        table = table.assign(**{name: np.asarray(level) for name, level in added.items()})
     is_csv = source.lower().endswith((".csv", ".csv.gz"))
-    rows = RowNumbers.of(table, ".csv" if is_csv else "")
-    return _clean_table(table, recognise_columns(table.columns), source, rows, scale)
+    rows = RowNumbers("line" if is_csv else "row", table.index.to_numpy() + 2 * is_csv)
+    spelling = recognise_columns(table.columns)
+    return _clean_table(table, spelling, source, rows, scale, detections=detections)
 
 
 def write_tracks(table: pd.DataFrame, path: _PathLike) -> None:
@@ -182,15 +202,16 @@ def write_tracks(table: pd.DataFrame, path: _PathLike) -> None:
     table : pandas.DataFrame
         Tracks, coordinates in um.
     path : str or path
-        Name of the file, ending in ``.csv``, ``.csv.gz``, ``.parquet`` or ``.gdf`` (little endian,
-        float64, columns x, y[, z], frame, particle). Text ids of digits in
-        a csv are read back as numbers; parquet keeps them.
+        Name of the file, ending in ``.csv``, ``.csv.gz``, ``.parquet``, ``.gdf`` (little endian,
+        float64, columns x, y[, z], frame, particle), ``.xyz`` (extended) or ``.napari.csv``
+        (track_id, t[, z], y, x). Text ids of digits in a csv are read back as numbers; parquet
+        keeps them.
 
     Raises
     ------
     TrackTableError
-        If the table has a fault, or the kind of file cannot hold it: a ``.gdf`` holds neither text
-        ids nor a ``cluster`` or ``time`` column.
+        If the table has a fault, or the kind of file cannot hold it: ``.gdf`` and ``.napari.csv``
+        hold neither text ids nor a ``cluster`` or ``time`` column.
     OSError
         If the file cannot be written.
 
@@ -206,7 +227,7 @@ def write_tracks(table: pd.DataFrame, path: _PathLike) -> None:
     True
     """
     target = Path(path)
-    suffix = table_suffix(target.name)
+    suffix = table_suffix(target.name, written=True)
     data = table_bytes(check_tracks(table, source="the table"), suffix, os.fspath(path))
     with written_whole(target) as part:
         part.write_bytes(data)
@@ -245,7 +266,7 @@ def read_spheres(path: _PathLike) -> tuple[Floats, Floats | None]:
     array([1. , 1.5])
     """
     source = os.fspath(path)
-    table = parse_csv(Path(path).read_bytes(), source)
+    table = parse_text(utf8_text(Path(path).read_bytes(), source), source).table
     faults = [f"column {name!r} is missing" for name in _AXES if name not in table]
     unknown = [name for name in table if name not in (*_AXES, "radius")]
     if unknown:
@@ -277,13 +298,6 @@ class RowNumbers(NamedTuple):
     word: str
     numbers: Ints
 
-    @classmethod
-    def of(cls, table: pd.DataFrame, suffix: str) -> RowNumbers:
-        """Return the numbers of the rows of a raw table, whose index counts data rows from 0."""
-        if suffix.startswith(".csv"):
-            return cls("line", table.index.to_numpy() + 2)
-        return cls("row", table.index.to_numpy())
-
     def where(self, bad: Bools) -> str:
         """Return "line 3" or "lines 3, 7, 9, 12, 20 and 4 more"."""
         numbers = self.numbers[bad]
@@ -314,25 +328,90 @@ def _mapped_columns(
     return found
 
 
+def _named_columns(
+    raw: RawTable, found: Mapping[str, int], columns: Mapping[str, str | int]
+) -> tuple[pd.DataFrame, Spelling]:
+    """Return a table with our names where the caller or the format states them, and the others.
+
+    What the caller states outranks the format.
+    """
+    names = list(raw.table.columns)
+    taken: dict[str, str | None] = {
+        ours: theirs if isinstance(theirs, str) else None for ours, theirs in columns.items()
+    }
+    by_format = {
+        ours: theirs
+        for ours, theirs in raw.columns.items()
+        if ours not in columns and names.index(theirs) not in found.values()
+    }
+    place = {**found, **{ours: names.index(theirs) for ours, theirs in by_format.items()}}
+    taken |= {o: theirs if isinstance(theirs, str) else None for o, theirs in by_format.items()}
+    rest = [i for i, name in enumerate(names) if i not in place.values() and name not in place]
+    table = raw.table.iloc[:, [*place.values(), *rest]]
+    table.columns = [*place, *(names[i] for i in rest)]
+    table.attrs["names"] = [str(name) for name in names]
+    spelling = recognise_columns([names[i] for i in rest], taken=taken)
+    units, faults = stated_units(
+        {
+            ours: (str(theirs), raw.units[ours])
+            for ours, theirs in by_format.items()
+            if ours in raw.units
+        }
+    )
+    notes = [*raw.notes]
+    if raw.kind:
+        pairs = listed(
+            f"{theirs if isinstance(theirs, int) else repr(theirs)} as {ours}"
+            for ours, theirs in by_format.items()
+            if theirs != ours
+        )
+        notes.insert(0, f"read as {raw.kind}" + (f": {pairs}" if pairs else ""))
+    return table, Spelling(
+        spelling.renamed,
+        {**spelling.units, **units},
+        (*notes, *spelling.notes),
+        (*spelling.faults, *faults),
+    )
+
+
+def _long_rows(table: pd.DataFrame, source: str) -> pd.DataFrame:
+    """Return a table with columns of two levels, one of them the axes, as one row per particle."""
+    levels = [{str(name) for name in table.columns.get_level_values(k)} for k in (0, 1)]
+    axis = next((k for k in (0, 1) if {"x", "y"} <= levels[k] <= {*_AXES}), None)
+    if axis is None:
+        raise table_error(
+            source,
+            "columns of two levels, of which none holds just x, y and perhaps z; expected one of "
+            "axes and one of particles",
+        )
+    ours = ours_of([name for name in table.index.names if isinstance(name, str)])
+    if not {"frame", "time"} & set(ours.values()):
+        table = table.rename_axis(index="frame")
+    long = table.set_axis(table.columns.set_names([None, None]), axis=1)
+    long = long.stack(level=1 - axis, future_stack=True)
+    return long.rename_axis([*table.index.names, "particle"]).reset_index()
+
+
 def _clean_table(
-    raw: pd.DataFrame, spelling: Spelling, source: str, rows: RowNumbers, scale: ArrayLike
+    raw: pd.DataFrame,
+    spelling: Spelling,
+    source: str,
+    rows: RowNumbers,
+    scale: ArrayLike,
+    *,
+    detections: bool,
 ) -> pd.DataFrame:
     """Check a table, convert its units to um and s, and attach its notes; list all faults."""
     import pandas as pd
 
+    names = raw.attrs.get("names", [str(name) for name in raw.columns])
     table = raw.rename(columns=dict(spelling.renamed))
     axes = [axis for axis in _AXES if axis in table]
-    faults = [*spelling.faults, *_column_faults(table, raw.columns, spelling)]
-    if {"x", "y"} <= set(axes):
-        factor = np.asarray(scale, dtype=np.float64)
-        one_or_each = factor.shape in ((), (len(axes),))
-        if not one_or_each or not (np.isfinite(factor) & (factor > 0)).all():
-            raise ValueError(
-                f"scale: expected one positive number, or {len(axes)} of them (one per axis), in "
-                f"um per unit of the file, got {scale!r}"
-            )
-        factors = dict(zip(axes, np.broadcast_to(factor, len(axes)).tolist(), strict=True))
-        faults += unit_faults(spelling.units, factors)
+    table, note, faults = _with_frames(table, spelling)
+    notes = [*spelling.notes, *note]
+    faults += [*spelling.faults, *_column_faults(table, names, spelling, detections=detections)]
+    factors = _um_per_unit(scale, axes) if {"x", "y"} <= set(axes) else {}
+    faults += unit_faults(spelling.units, factors)
     clean: dict[str, NDArray[Any]] = {}
     for name in COLUMNS:
         if list(table.columns).count(name) == 1:
@@ -347,18 +426,47 @@ def _clean_table(
         tracks[axis] *= factors[axis]
     if "time" in tracks:
         tracks["time"] *= seconds(spelling.units)
-    if spelling.notes:
-        tracks.attrs["notes"] = list(spelling.notes)
-    tracks.attrs["columns"] = [str(name) for name in raw.columns]
+    if notes:
+        tracks.attrs["notes"] = notes
+    tracks.attrs["columns"] = list(names)
     return tracks
 
 
-def _column_faults(table: pd.DataFrame, names: pd.Index, spelling: Spelling) -> list[str]:
+def _um_per_unit(scale: ArrayLike, axes: list[str]) -> dict[str, float]:
+    """Return the scale of each axis; refuse one that is not positive."""
+    factor = np.asarray(scale, dtype=np.float64)
+    one_or_each = factor.shape in ((), (len(axes),))
+    if not one_or_each or not (np.isfinite(factor) & (factor > 0)).all():
+        raise ValueError(
+            f"scale: expected one positive number, or {len(axes)} of them (one per axis), in "
+            f"um per unit of the file, got {scale!r}"
+        )
+    return dict(zip(axes, np.broadcast_to(factor, len(axes)).tolist(), strict=True))
+
+
+def _with_frames(
+    table: pd.DataFrame, spelling: Spelling
+) -> tuple[pd.DataFrame, list[str], list[str]]:
+    """Return a table with frames numbered by the times where it has only these; notes, faults."""
+    if "frame" in table or list(table.columns).count("time") != 1 or not len(table):
+        return table, [], []
+    times, text = _as_numbers(table["time"])
+    if text.any():
+        return table, [], []
+    factor = seconds(spelling.units)
+    frames, notes, faults = frames_from_times(np.asarray(times, dtype=np.float64) * factor)
+    return table.assign(frame=frames), notes, faults
+
+
+def _column_faults(
+    table: pd.DataFrame, names: list[str], spelling: Spelling, *, detections: bool
+) -> list[str]:
     """Return the faults of the table as a whole: its columns, named as in the file, and length."""
     found = list(table.columns)
     faults = []
     ambiguous = {fault.partition(":")[0] for fault in spelling.faults}
-    required = [name for name in ("frame", "particle", "x", "y") if name not in ambiguous]
+    needed = ("frame", "x", "y") if detections else ("frame", "particle", "x", "y")
+    required = [name for name in needed if name not in ambiguous]
     missing = [name for name in required if name not in found]
     if missing:
         faults.append(
@@ -366,6 +474,8 @@ def _column_faults(table: pd.DataFrame, names: pd.Index, spelling: Spelling) -> 
             f"{listed(names) or 'none'}; rename them, or state "
             f"columns={{'{missing[0]}': ...}} with the file's name or number of the column"
         )
+        if missing == ["particle"]:
+            faults[-1] += "; where the rows have no ids, state contact= and size= to find them"
     twice = [name for name in COLUMNS if found.count(name) > 1]
     if twice:
         faults.append(f"more than one column is called {', '.join(twice)}; keep one of each")

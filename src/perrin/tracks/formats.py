@@ -1,4 +1,4 @@
-"""Track tables as bytes: csv, csv.gz, parquet and gdf, read and written without a check."""
+"""Track tables as bytes: which format a file has, how it is read, and how tables are written."""
 
 from __future__ import annotations
 
@@ -9,174 +9,240 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from perrin.errors import table_error
+from perrin.tracks.delimited import first_lines, parse_text, utf8_text
 from perrin.tracks.gdf import gdf_bytes, parse_gdf
+from perrin.tracks.imaris import imaris_table, is_imaris
+from perrin.tracks.motion_capture import is_motive, motive_table, parse_c3d
+from perrin.tracks.raw_tables import RawTable
+from perrin.tracks.simulations import parse_gsd
+from perrin.tracks.track_arrays import gdf_table, napari_columns, napari_text
+from perrin.tracks.trackmate import is_trackmate, parse_trackmate_xml, trackmate_table
+from perrin.tracks.xyz import parse_xyz, xyz_text
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     import pandas as pd
 
-SUFFIXES = (".csv", ".csv.gz", ".parquet", ".gdf")
+# Endings of names of files that can be written; ".napari.csv" before ".csv".
+SUFFIXES = (".napari.csv", ".csv", ".csv.gz", ".parquet", ".gdf", ".xyz")
+
+_TEXT_SUFFIXES = (".csv", ".tsv", ".txt", ".dat")
+
+_SHEET_SUFFIXES = (".xlsx", ".xls", ".ods")
+
+# Endings of names of files that can be read; a text file may be packed as .gz.
+READABLE_SUFFIXES = (
+    *_TEXT_SUFFIXES, ".csv.gz", ".parquet", ".gdf", ".xml", ".xyz", ".extxyz", *_SHEET_SUFFIXES,
+    ".c3d", ".gsd",
+)  # fmt: skip
 
 LARGEST_EXACT = 2**53  # whole numbers up to this are exact as float64
 
 
-def table_suffix(name: str) -> str:
+def table_suffix(name: str, *, written: bool = False) -> str:
     """Return the suffix of a file's name, which determines the format.
+
+    Parameters
+    ----------
+    name : str
+    written : bool
+        Whether the file is to be written; not all formats can be.
+
+    Returns
+    -------
+    str
+        In small letters, with ".gz" where the name has it.
 
     Raises
     ------
     TrackTableError
-        For a name with another ending; the four formats are listed.
+        For a name with another ending; the formats are listed.
 
     Examples
     --------
-    >>> table_suffix("Tracks.CSV.GZ")
-    '.csv.gz'
+    >>> table_suffix("Tracks.CSV.GZ"), table_suffix("tracks.xyz", written=True)
+    ('.csv.gz', '.xyz')
     """
-    for suffix in SUFFIXES:
+    offered = SUFFIXES if written else READABLE_SUFFIXES
+    packed = () if written else tuple(f"{s}.gz" for s in (*_TEXT_SUFFIXES, ".xml", ".xyz"))
+    suffixes: tuple[str, ...] = (*packed, *offered)
+    for suffix in suffixes:
         if name.lower().endswith(suffix):
             return suffix
-    raise table_error(
-        name, f"unknown kind of file; expected a name ending in {', '.join(SUFFIXES)}"
-    )
+    raise table_error(name, f"unknown kind of file; expected a name ending in {', '.join(offered)}")
 
 
-def parse_table(data: bytes, suffix: str, source: str) -> pd.DataFrame:
-    r"""Return the table in the bytes of a file as it is; the columns of a .gdf are numbered.
+def parse_table(data: bytes, suffix: str, source: str) -> RawTable:
+    r"""Return the table in the bytes of a file as it is, and what its format states about it.
 
     Parameters
     ----------
     data : bytes
     suffix : str
-        One of `SUFFIXES`.
+        As `table_suffix` returns it. A text file is recognised by its content: a csv may be a table
+        of TrackMate, Imaris or Motive.
     source : str
         The file's name, for messages.
 
     Returns
     -------
-    pandas.DataFrame
-        The index counts data rows from 0; blank lines of a csv have no row, but are counted.
+    RawTable
 
     Raises
     ------
     TrackTableError
         If the bytes are no table of that format.
+    ImportError
+        If the format needs a package that is not installed.
 
     Examples
     --------
-    >>> parse_table(b"x,y\n1,2\n", ".csv", "t.csv")
+    >>> parse_table(b"x,y\n1,2\n", ".csv", "t.csv").table
        x  y
     0  1  2
     """
-    import pandas as pd
-
-    if suffix == ".gdf":
-        return pd.DataFrame(parse_gdf(data, source))
-    if suffix == ".parquet":
-        import pyarrow as pa
-        import pyarrow.parquet as pq
-
-        try:
-            # Metadata of pandas could hide the frame column in the index.
-            return pq.read_table(io.BytesIO(data)).to_pandas(ignore_metadata=True)
-        except (pa.ArrowException, OSError) as error:
-            reason = str(error).strip().splitlines()[0]
-            raise table_error(source, f"not a parquet file that can be read ({reason})") from None
-    if suffix == ".csv.gz":
+    if suffix.endswith(".gz"):
         import gzip
 
+        if not data:
+            raise table_error(source, "the file is empty")
         try:
             data = gzip.decompress(data)
         except (gzip.BadGzipFile, EOFError, zlib.error) as error:
             raise table_error(
                 source, f"not a whole gzip file ({error}); fetch or write it again"
             ) from None
-    return parse_csv(data, source)
+        suffix = suffix.removesuffix(".gz")
+    if suffix in (".xyz", ".extxyz"):
+        return parse_xyz(utf8_text(data, source).decode(), source)
+    if suffix in _SHEET_SUFFIXES:
+        text, note = sheet_text(data, source)
+        raw = text_table(text.encode(), source)
+        return RawTable(
+            raw.table, raw.kind, raw.columns, raw.units, (note, *raw.notes), raw.unnamed, "row", 2
+        )
+    parsers: dict[str, Callable[[bytes, str], RawTable]] = {
+        ".gdf": lambda data, source: gdf_table(parse_gdf(data, source)),
+        ".parquet": _parse_parquet,
+        ".xml": parse_trackmate_xml,
+        ".c3d": parse_c3d,
+        ".gsd": parse_gsd,
+    }
+    if suffix in parsers:
+        return parsers[suffix](data, source)
+    return text_table(utf8_text(data, source), source)
 
 
-def parse_csv(data: bytes, source: str) -> pd.DataFrame:
-    r"""Return the table in the bytes of a csv file with one header line.
+def text_table(text: bytes, source: str) -> RawTable:
+    r"""Return the table of a text, recognised by its first lines.
 
     Parameters
     ----------
-    data : bytes
-        Text in UTF-8, commas between the columns.
+    text : bytes
+        UTF-8.
     source : str
         The file's name, for messages.
 
     Returns
     -------
-    pandas.DataFrame
-        The index counts data rows from 0; blank lines have no row, but are counted.
+    RawTable
 
     Raises
     ------
     TrackTableError
-        If these are not the bytes of such a file.
+        If the text is no table.
 
     Examples
     --------
-    >>> parse_csv(b"x,y\n1,2\n\n3,4\n", "t.csv").index.tolist()
-    [0, 2]
+    >>> text_table(b"track_id,t,z,y,x\n7,0,1,2,3\n", "t.csv").kind
+    'a table of tracks as napari takes them'
     """
-    import pandas as pd
+    lines = first_lines(text)
+    for recognised, parse in (
+        (is_motive, motive_table),
+        (is_imaris, imaris_table),
+        (is_trackmate, trackmate_table),
+    ):
+        if recognised(lines):
+            return parse(text, source)
+    raw = parse_text(text, source)
+    columns = napari_columns(raw.table.columns)
+    if not columns:
+        return raw
+    kind = "a table of tracks as napari takes them"
+    return RawTable(raw.table, kind, columns, notes=raw.notes, word=raw.word, first=raw.first)
 
-    _refuse_other_text(data, source)
-    major, minor = (int(part) for part in pd.__version__.split(".")[:2])
-    # From pandas 3.1 on floats always read back bit-identical, and the option is deprecated.
-    exact = {} if (major, minor) >= (3, 1) else {"float_precision": "round_trip"}
+
+def sheet_text(data: bytes, source: str) -> tuple[str, str]:
+    """Return a sheet of a spreadsheet as csv, and a sentence on which; needs python-calamine.
+
+    Parameters
+    ----------
+    data : bytes
+        File of .xlsx, .xls or .ods.
+    source : str
+        The file's name, for messages.
+
+    Returns
+    -------
+    text : str
+        The sheet Position, which Imaris writes, or the first one that is not empty.
+    note : str
+
+    Raises
+    ------
+    TrackTableError
+        If this is no spreadsheet, or an empty one.
+    ImportError
+        If the package is not installed.
+    """
+    import csv
+
     try:
-        table = pd.read_csv(
-            io.BytesIO(data),
-            encoding="utf-8",
-            **exact,
-            low_memory=False,
-            skip_blank_lines=False,
-            skipinitialspace=True,
-        )
-    except (pd.errors.ParserError, pd.errors.EmptyDataError) as error:
-        reason = str(error).strip().removeprefix("Error tokenizing data. C error: ")
-        raise table_error(
-            source, f"not a table with one header line and commas between the columns: {reason}"
+        from python_calamine import CalamineError, CalamineWorkbook
+    except ImportError:
+        raise ImportError(
+            f"{source}: spreadsheets need python-calamine: pip install 'perrin[tables]'; or save "
+            "the sheet as csv"
         ) from None
-    if not isinstance(table.index, pd.RangeIndex):
-        raise table_error(source, "rows have more fields than the header (line 1) has names")
-    table.columns = table.columns.astype(str).str.strip()
-    empty = np.flatnonzero(table.isna().all(axis=1))
-    lines = data.splitlines() if len(empty) else []
-    return table.drop(index=[i for i in empty if not lines[i + 1].strip(b" \t,")])
 
-
-def _refuse_other_text(data: bytes, source: str) -> None:
-    """Raise for bytes that are no text in UTF-8, or whose first line is no header with commas."""
-    if not data.strip():
+    try:
+        book = CalamineWorkbook.from_filelike(io.BytesIO(data))
+        sheets = {
+            name: book.get_sheet_by_name(name).to_python(skip_empty_area=False)
+            for name in book.sheet_names
+        }
+    except CalamineError as error:
+        raise table_error(source, f"not a spreadsheet that can be read ({error})") from None
+    full = [name for name, rows in sheets.items() if any(any(c != "" for c in r) for r in rows)]
+    if not full:
         raise table_error(source, "the file is empty")
-    try:
-        data.decode("utf-8")
-    except UnicodeDecodeError as error:
-        line = data.count(b"\n", 0, error.start) + 1
-        raise table_error(
-            source, f"not a text file in UTF-8 (line {line}); save it as csv in UTF-8"
-        ) from None
-    if b"\0" in data:
-        raise table_error(source, "a binary file, not a csv; give it the suffix of its kind")
-    header = data[:65536].decode("utf-8-sig", errors="replace").splitlines()[0]
-    if header.strip() and all(_is_number(name) for name in header.split(",")):
-        raise table_error(
-            source,
-            f"line 1 holds numbers ({header[:60]}) where the names of the columns are expected; "
-            "add a header line such as frame,particle,x,y,z",
-        )
-    other = next((mark for mark in (";", "\t") if mark in header and "," not in header), None)
-    if other:
-        raise table_error(source, f"columns are separated by {other!r}; save it with commas")
+    chosen = "Position" if "Position" in full else full[0]
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(
+        [" ".join(cell.split()) if isinstance(cell, str) else cell for cell in row]
+        for row in sheets[chosen]
+    )
+    others = [name for name in full if name != chosen]
+    note = f"read from the sheet {chosen!r}"
+    if others:
+        note += f", not from {', '.join(map(repr, others))}"
+    return text.getvalue(), note
 
 
-def _is_number(text: str) -> bool:
+def _parse_parquet(data: bytes, source: str) -> RawTable:
+    """Return the table of a Parquet file."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
     try:
-        float(text)
-    except ValueError:
-        return False
-    return True
+        # Metadata of pandas could hide the frame column in the index.
+        table = pq.read_table(io.BytesIO(data)).to_pandas(ignore_metadata=True)
+    except (pa.ArrowException, OSError) as error:
+        reason = str(error).strip().splitlines()[0]
+        raise table_error(source, f"not a parquet file that can be read ({reason})") from None
+    return RawTable(table)
 
 
 def table_bytes(table: pd.DataFrame, suffix: str, target: str) -> bytes:
@@ -211,20 +277,16 @@ def table_bytes(table: pd.DataFrame, suffix: str, target: str) -> bytes:
     if suffix == ".parquet":
         table.to_parquet(buffer, engine="pyarrow", index=False)
         return buffer.getvalue()
+    faults = _faults_of_writing(table, suffix)
+    if faults:
+        raise table_error(target, *(f"{fault}, or write .csv or .parquet" for fault in faults))
     if suffix == ".gdf":
-        faults = [
-            f"a .gdf cannot hold the column {name}; drop it"
-            for name in ("cluster", "time")
-            if name in table
-        ]
-        if table["particle"].dtype.kind != "i":
-            faults.append("a .gdf cannot hold text in particle; number the particles")
-        elif max(table["particle"].abs().max(), table["frame"].abs().max()) > LARGEST_EXACT:
-            faults.append("a .gdf of float64 cannot hold frames or ids beyond 2**53; renumber them")
-        if faults:
-            raise table_error(target, *(f"{fault}, or write .csv or .parquet" for fault in faults))
         names = [name for name in ("x", "y", "z", "frame", "particle") if name in table]
         return gdf_bytes(table[names].to_numpy(dtype=np.float64))
+    if suffix == ".xyz":
+        return xyz_text(table).encode("utf-8")
+    if suffix == ".napari.csv":
+        return napari_text(table).encode("utf-8")
     text: str = table.to_csv(index=False, lineterminator="\n")
     if suffix == ".csv":
         return text.encode("utf-8")
@@ -234,3 +296,28 @@ def table_bytes(table: pd.DataFrame, suffix: str, target: str) -> bytes:
     with gzip.GzipFile("", "wb", compresslevel=6, fileobj=buffer, mtime=0) as packed:
         packed.write(text.encode("utf-8"))
     return buffer.getvalue()
+
+
+def _faults_of_writing(table: pd.DataFrame, suffix: str) -> list[str]:
+    """Return what a format cannot hold of a table."""
+    faults = []
+    if suffix in (".gdf", ".napari.csv"):
+        faults += [
+            f"a {suffix} cannot hold the column {name}; drop it"
+            for name in ("cluster", "time")
+            if name in table
+        ]
+        if table["particle"].dtype.kind != "i":
+            faults.append(f"a {suffix} cannot hold text in particle; number the particles")
+    if suffix == ".gdf" and table["particle"].dtype.kind == "i":
+        largest = max(table["particle"].abs().max(), table["frame"].abs().max())
+        if largest > LARGEST_EXACT:
+            faults.append("a .gdf of float64 cannot hold frames or ids beyond 2**53; renumber them")
+    if suffix == ".xyz":
+        faults += [
+            f"a .xyz cannot hold blanks in {name} ({label!r}); replace them"
+            for name in ("particle", "cluster")
+            if name in table and table[name].dtype.kind not in "i"
+            for label in [str(v) for v in table[name].unique() if len(str(v).split()) != 1][:1]
+        ]
+    return faults

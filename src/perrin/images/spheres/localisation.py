@@ -434,7 +434,8 @@ def locate(
     DataFrame
         ``frame, x, y, z`` (no z for a 2-D movie) in um, with the origin at the centre of voxel
         (0, 0, 0), and ``mass``; with "model" also ``sigma_x, sigma_y, sigma_z`` in um (from the
-        Fisher information), ``chi2`` of the group's image per degree of freedom, and ``refined``.
+        Fisher information, times the root of ``chi2`` where this is above 1), ``chi2`` of the
+        group's image per degree of freedom, and ``refined``.
         `refined` is False where the fit did not converge, moved the sphere by over half a radius,
         found no intensity, or was not attempted: the position found first is kept, without errors,
         and `reason` names the cause. For crowds see the notes.
