@@ -58,7 +58,7 @@ _IMAGING_CAPTIONS = {
         "Misfit of the model image to the voxels around the spheres (top, if images were fitted), "
         "and rms distance of the spheres to the fitted rigid body (bottom).",
         "The misfit should be near 1. A larger value in all frames means that the model does not "
-        "describe the spheres; the stated errors are then too small by its square root. In the "
+        "describe the spheres; its square root is contained in the stated errors. In the "
         "residuals a single spike is a bad frame, a lasting step an exchange of spheres; a slow "
         "rise means that the body is not rigid or that the dye bleaches.",
     ),
