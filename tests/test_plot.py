@@ -347,13 +347,14 @@ def test_save_figures_names_its_files_and_changes_no_setting(
     assert dict(rcParams) == before
 
 
-def test_save_figures_draws_the_first_clusters_and_all_in_one(three, tmp_path, monkeypatch):
-    monkeypatch.setattr(plot, "MAX_CLUSTERS", 1)
+def test_save_figures_draws_the_first_cluster_and_all_in_one(three, tmp_path, monkeypatch):
     monkeypatch.setattr(plot, "save_figure", lambda _, stem: [stem])
     files = plot.save_figures(three, tmp_path)
     stems = {f.name for f in files}
     assert "clusters" in stems
     assert {s.split("-")[1] for s in stems if "-" in s} == {"0"}
+    wanted = plot.save_figures(three, tmp_path, clusters=(1, 2))
+    assert {f.name.split("-")[1] for f in wanted if "-" in f.name} == {"1", "2"}
 
 
 PAPER = {"D_R": 4.93e-3, "sigma": (0.03, 0.03, 0.04)}

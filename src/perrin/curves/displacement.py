@@ -18,6 +18,7 @@ from perrin._arrays import (
     require_positive,
     to_plain,
 )
+from perrin._display import Shown
 from perrin.curves.grids import place_frames
 from perrin.curves.pairs import Squares, pair_sums
 from perrin.curves.standard_errors import relative_error
@@ -32,7 +33,7 @@ _EVEN_WEIGHTS = 0.01
 
 
 @dataclass(frozen=True, eq=False)
-class LagCurve:
+class LagCurve(Shown):
     """A mean square displacement, or angle, against lag time: value = 2 dof D t + offset.
 
     The lags are multiples of the step between frames. Where frames lie on no compact grid of times

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from perrin._arrays import Floats, choice_fault, from_plain, frozen, refuse, to_plain
+from perrin._display import Shown
 from perrin.curves.displacement import angle_curve
 from perrin.curves.gaussianity import brownian_angle_time, without_noise
 from perrin.curves.grids import GRID_TOLERANCE
@@ -28,8 +29,8 @@ if TYPE_CHECKING:
 _HERMITE_ORDERS = 100  # beyond which the error of a bin is bounded from above
 
 
-@dataclass(frozen=True, eq=False)
-class VanHove:
+@dataclass(frozen=True, eq=False, repr=False)
+class VanHove(Shown):
     """Distribution of displacements or rotations over one lag time, compared with a Gaussian.
 
     Attributes

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from perrin._arrays import to_plain
+from perrin._display import Shown
 from perrin._text import with_error
 from perrin.diffusion.spectral_likelihood import ShapeLikelihood, motions_and_noise
 from perrin.diffusion.step_spectra import fractional_mean_square
@@ -27,8 +28,8 @@ _EXPONENTS = np.linspace(0.02, 1.98, 9)
 _SMALL_TURN = 0.1
 
 
-@dataclass(frozen=True)
-class AnomalousEstimate:
+@dataclass(frozen=True, repr=False)
+class AnomalousEstimate(Shown):
     """Fractional Brownian motion fitted to steps: mean square displacement 2 d D_alpha t^alpha.
 
     Attributes

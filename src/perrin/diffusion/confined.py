@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from perrin._arrays import to_plain
+from perrin._display import Shown
 from perrin._text import interval_text, with_error
 from perrin.diffusion.estimate import NORMAL, UNITS
 from perrin.diffusion.spectral_likelihood import ShapeLikelihood, motions_and_noise
@@ -43,8 +44,8 @@ _LEAST_RELAXATIONS = 6.0
 _SMALL_CAGE = 0.7
 
 
-@dataclass(frozen=True)
-class ConfinedEstimate:
+@dataclass(frozen=True, repr=False)
+class ConfinedEstimate(Shown):
     """Motion in a harmonic well (Ornstein-Uhlenbeck process) fitted to steps.
 
     A cage that relaxes within about one frame (relaxation time under dt) adds white noise to the

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from perrin._arrays import refuse, to_plain
+from perrin._display import Shown
 from perrin._text import number_text, with_error
 from perrin.diffusion.estimate import NORMAL, UNITS, DiffusionEstimate
 from perrin.diffusion.likelihood import Likelihood
@@ -33,8 +34,8 @@ _MOST_RANK_LAGS = 60
 _LEAST_RANKED, _FEW_CLUSTERS = 20, 30
 
 
-@dataclass(frozen=True)
-class MobilityCorrelation:
+@dataclass(frozen=True, repr=False)
+class MobilityCorrelation(Shown):
     """Rank correlation of the squared steps of translation and rotation.
 
     Attributes
@@ -91,8 +92,8 @@ class MobilityCorrelation:
         return read
 
 
-@dataclass(frozen=True)
-class CoefficientCorrelation:
+@dataclass(frozen=True, repr=False)
+class CoefficientCorrelation(Shown):
     """Correlation of ln D_T and ln D_R over clusters.
 
     Attributes
@@ -165,8 +166,8 @@ class CoefficientCorrelation:
         return read
 
 
-@dataclass(frozen=True)
-class DecouplingRatio:
+@dataclass(frozen=True, repr=False)
+class DecouplingRatio(Shown):
     """D_T/D_R of a cluster over that of the same body in a dilute simple fluid.
 
     Attributes

@@ -8,6 +8,7 @@ from typing import Any, Literal
 import numpy as np
 
 from perrin._arrays import to_plain
+from perrin._display import Shown
 from perrin._text import number_text, unit_text, with_error
 from perrin.diffusion.noise_model import Noise
 
@@ -65,8 +66,8 @@ class Found:
         return cls(float(value), ci68, ci95, offset, offset_stderr)
 
 
-@dataclass(frozen=True)
-class DiffusionEstimate:
+@dataclass(frozen=True, repr=False)
+class DiffusionEstimate(Shown):
     """A diffusion coefficient with its intervals, and the data and noise that they are based on.
 
     Attributes

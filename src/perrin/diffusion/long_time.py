@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, get_args
 import numpy as np
 
 from perrin._arrays import choice_fault, number_fault, refuse, to_plain
+from perrin._display import Shown
 from perrin._text import number_text, unit_text
 from perrin.curves.displacement import independent_walks, mean_square_curve
 from perrin.diffusion.curve_fits import GridLags, line_weights, slope_interval
@@ -42,8 +43,8 @@ _WINDOW, _SHORTEST_START, _LONGEST_START = 4, 60, 24
 _STRAIGHT = 1.0
 
 
-@dataclass(frozen=True)
-class LongTimeEstimate:
+@dataclass(frozen=True, repr=False)
+class LongTimeEstimate(Shown):
     """A diffusion coefficient at long times, with the range of lag times over which it holds.
 
     Attributes

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from perrin._arrays import refuse, to_plain
+from perrin._display import Shown
 from perrin._text import with_error
 from perrin.curves.correlation_errors import (
     correlation_covariance,
@@ -28,8 +29,8 @@ _LAST_VALUE, _LAST_LAG = 0.4, 0.25
 _RELAXATION_LAGS = 12  # evenly spaced lags of the fit: those between them vary with them
 
 
-@dataclass(frozen=True)
-class RelaxationEstimate:
+@dataclass(frozen=True, repr=False)
+class RelaxationEstimate(Shown):
     """Relaxation time of an orientation correlation, its stretched exponent, and their errors.
 
     Attributes

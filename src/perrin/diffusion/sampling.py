@@ -19,6 +19,7 @@ from perrin._arrays import (
     sigma_fault,
     to_plain,
 )
+from perrin._display import Shown
 from perrin._text import ordinal, percent, short
 from perrin.diffusion.bounds import NoiseKnowledge, cramer_rao
 from perrin.diffusion.estimate import UNITS
@@ -57,8 +58,8 @@ _DEFAULT_FRAMES = 300  # where neither frames nor time are given
 _CURVE_POINTS = 121  # of the errors against the time between frames
 
 
-@dataclass(frozen=True, eq=False)
-class SamplingPlan:
+@dataclass(frozen=True, eq=False, repr=False)
+class SamplingPlan(Shown):
     """Recommended time between frames, and the expected error of D_R.
 
     Times are between frames, in s; errors are standard errors over D_R: the least that any
@@ -236,8 +237,8 @@ class SamplingPlan:
         return cls(**(entry | arrays | {"reasons": tuple(entry["reasons"])}))
 
 
-@dataclass(frozen=True)
-class SamplingBudget:
+@dataclass(frozen=True, repr=False)
+class SamplingBudget(Shown):
     """What limits a measurement of D_R: the noise, and the number of frames, time or photons.
 
     Attributes
@@ -602,8 +603,8 @@ def _budget_reason(plan: SamplingPlan, budget: SamplingBudget) -> str:
     )
 
 
-@dataclass(frozen=True)
-class SamplingVerdict:
+@dataclass(frozen=True, repr=False)
+class SamplingVerdict(Shown):
     """How the time between frames of a measurement compares with the best one.
 
     Attributes

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 import numpy as np
 
 from perrin._arrays import choice_fault, finite_or_none, from_plain, frozen, refuse, to_plain
+from perrin._display import Shown
 from perrin._text import with_error
 from perrin.diffusion.estimate import NORMAL, UNITS
 from perrin.diffusion.likelihood import Likelihood
@@ -127,8 +128,8 @@ class Parameter:
         return self.value
 
 
-@dataclass(frozen=True, eq=False)
-class SwitchingEstimate:
+@dataclass(frozen=True, eq=False, repr=False)
+class SwitchingEstimate(Shown):
     """Two diffusion coefficients between which a motion switches, and the state of every step.
 
     Attributes

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from perrin._arrays import Bools, Floats, from_plain, frozen, to_plain
+from perrin._display import Shown
 from perrin._text import with_error
 
 if TYPE_CHECKING:
@@ -30,8 +31,8 @@ NO_ERRORS = "no errors are known: a value lies on its edge, 0; take longer track
 _ISOTROPY_LEVEL = 0.05
 
 
-@dataclass(frozen=True, eq=False)
-class DiffusionTensor:
+@dataclass(frozen=True, eq=False, repr=False)
+class DiffusionTensor(Shown):
     """A diffusion tensor in body axes: those of the (first) motion's template.
 
     Attributes
@@ -206,8 +207,8 @@ class DiffusionTensor:
         return cls(**read)
 
 
-@dataclass(frozen=True, eq=False)
-class CoupledTensor:
+@dataclass(frozen=True, eq=False, repr=False)
+class CoupledTensor(Shown):
     """The 6 x 6 tensor of translation, rotation and their coupling, in body axes.
 
     Attributes

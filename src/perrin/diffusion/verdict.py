@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 import numpy as np
 
 from perrin._arrays import choice_fault, refuse, to_plain
+from perrin._display import Shown
 from perrin._text import listed, number_text
 from perrin.diffusion.anomalous import AnomalousEstimate, fit_anomalous
 from perrin.diffusion.confined import ConfinedEstimate, fit_confined
@@ -75,8 +76,8 @@ _MODELS: dict[str, type[Model]] = {
 }
 
 
-@dataclass(frozen=True, eq=False)
-class MotionVerdict:
+@dataclass(frozen=True, eq=False, repr=False)
+class MotionVerdict(Shown):
     """What kind of motion a track shows, by tests against Brownian motion.
 
     Attributes

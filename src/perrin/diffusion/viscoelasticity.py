@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 import numpy as np
 
 from perrin._arrays import choice_fault, from_plain, frozen, refuse, to_plain
+from perrin._display import Shown
 from perrin._text import number_text
 from perrin.curves.displacement import LagCurve, msad_vector, msd
 from perrin.diffusion.curve_fits import GridLags
@@ -61,7 +62,7 @@ _ARRAYS = (
 
 
 @dataclass(frozen=True, eq=False)
-class Moduli:
+class Moduli(Shown):
     """Complex shear modulus against frequency, with its bands.
 
     Attributes

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from perrin._arrays import Floats, from_plain, frozen, require_positive
+from perrin._display import Shown
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -16,7 +17,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False)
-class Cluster:
+class Cluster(Shown):
     """A rigid arrangement of particle centres, its own centre at the origin.
 
     Attributes

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from perrin._arrays import Floats, from_plain, frozen, number_fault, refuse
+from perrin._display import Shown
 from perrin.errors import UnitWarning
 from perrin.geometry.rigid import diffusion_center, shifted
 from perrin.geometry.shapes import Cluster, pair_distances
@@ -49,7 +50,7 @@ class Principal(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Mobility:
+class Mobility(Shown):
     """The predicted diffusion tensor of a rigid body of spheres.
 
     Attributes

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeAlias, get_args, r
 import numpy as np
 
 from perrin._arrays import choice_fault, refuse
+from perrin._display import Shown
 from perrin.errors import UnitWarning
 from perrin.geometry.shapes import Cluster, is_tetrahedron, pair_distances
 from perrin.hydrodynamics.mobility import BOLTZMANN, Mobility, cluster_mobility, condition_faults
@@ -62,8 +63,8 @@ _NEIGHBOUR_RATIO = 1.2
 _HALF_INTERVAL = 0.01
 
 
-@dataclass(frozen=True)
-class Size:
+@dataclass(frozen=True, repr=False)
+class Size(Shown):
     """Hydrodynamic diameters that follow from diffusion coefficients.
 
     Attributes

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from perrin._arrays import choice_fault, number_fault, refuse
+from perrin._display import Shown
 from perrin.hydrodynamics.mobility import BOLTZMANN, Mobility, condition_faults
 
 if TYPE_CHECKING:
@@ -29,8 +30,8 @@ _WATER_TERMS = ((280.68, -1.9), (511.45, -7.7), (61.131, -19.6), (0.45903, -40.0
 _WATER_RANGE = (253.15, 383.15)
 
 
-@dataclass(frozen=True)
-class WallFactor:
+@dataclass(frozen=True, repr=False)
+class WallFactor(Shown):
     """D near one flat wall over D far from it.
 
     Attributes

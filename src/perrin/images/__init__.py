@@ -98,8 +98,25 @@ from perrin.images.optics.learn import (
     photon_transfer,
     saturated_share,
 )
+from perrin.images.optics.learn_radial import (
+    RadialSample,
+    first_image,
+    held_out_misfit,
+    learn_image,
+    noise_of_neighbours,
+    settled_image,
+    size_spread,
+)
 from perrin.images.optics.microscope import Camera, Light, RenderSettings, Scan
 from perrin.images.optics.optics import CameraNoise, Optics
+from perrin.images.optics.radial_image import (
+    Patch,
+    PatchFit,
+    RadialImage,
+    cut_patch,
+    fit_patch,
+    spline_design,
+)
 from perrin.images.optics.render import (
     RenderedFrames,
     blurred_ball,
@@ -119,8 +136,8 @@ from perrin.images.optics.window_fit import (
     within,
 )
 from perrin.images.spheres.by_trackpy import Features, find_features, refine_by_trackpy
+from perrin.images.spheres.circles import circle_cut, find_circles
 from perrin.images.spheres.localisation import (
-    NO_FLAT_MODEL,
     LocatedFrame,
     Method,
     SampledFrame,
@@ -139,6 +156,13 @@ from perrin.images.spheres.localisation import (
     size_faults,
     with_crowds,
 )
+from perrin.images.spheres.planar import (
+    PlaneFit,
+    fit_plane,
+    fitted_together,
+    learn_plane,
+    plane_columns,
+)
 from perrin.images.spheres.poses import Pose, fit_pose, pose_in, start_of, with_poses
 from perrin.images.spheres.spots import (
     Fading,
@@ -154,7 +178,6 @@ from perrin.images.spheres.spots import (
 from perrin.images.stack import Stack, digest, file_contents, open_stack, write_stack
 
 __all__ = [
-    "NO_FLAT_MODEL",
     "Arrangement",
     "ArrayFrames",
     "Camera",
@@ -180,8 +203,13 @@ __all__ = [
     "LocatedFrame",
     "Method",
     "Optics",
+    "Patch",
+    "PatchFit",
     "Pick",
+    "PlaneFit",
     "Pose",
+    "RadialImage",
+    "RadialSample",
     "RenderSettings",
     "RenderedFrames",
     "RigidCenters",
@@ -209,11 +237,13 @@ __all__ = [
     "check_search",
     "choose_method",
     "chosen",
+    "circle_cut",
     "clear_mass_cut",
     "clock_scale",
     "crowd_intensity",
     "crowd_piece",
     "cut_crowd_window",
+    "cut_patch",
     "cut_window",
     "czi",
     "czi_times",
@@ -224,14 +254,19 @@ __all__ = [
     "drawing_faults",
     "even_times",
     "file_contents",
+    "find_circles",
     "find_fading",
     "find_features",
+    "first_image",
     "fit_brightness",
     "fit_crowd",
     "fit_optics",
+    "fit_patch",
+    "fit_plane",
     "fit_pose",
     "fit_samples",
     "fit_window",
+    "fitted_together",
     "found_table",
     "frame_digest",
     "frames_of_planes",
@@ -241,6 +276,7 @@ __all__ = [
     "groups_to_fit",
     "hdf5",
     "header_scale",
+    "held_out_misfit",
     "image_header",
     "imagej_scale",
     "imaris_size",
@@ -252,6 +288,8 @@ __all__ = [
     "is_flat",
     "is_set",
     "layout",
+    "learn_image",
+    "learn_plane",
     "leica_plane_time",
     "lif",
     "locate",
@@ -265,6 +303,7 @@ __all__ = [
     "ndtiff",
     "needed",
     "ngff_scale",
+    "noise_of_neighbours",
     "normal_equations",
     "numpy_file",
     "olympus",
@@ -276,6 +315,7 @@ __all__ = [
     "open_stack",
     "opened",
     "photon_transfer",
+    "plane_columns",
     "plausible_spheres",
     "pose_in",
     "profile_information",
@@ -290,10 +330,13 @@ __all__ = [
     "saturated_share",
     "sequence",
     "sequence_files",
+    "settled_image",
     "size_faults",
+    "size_spread",
     "sphere_chi2",
     "sphere_image",
     "sphere_paths",
+    "spline_design",
     "standard_errors",
     "start_of",
     "stk_scale",

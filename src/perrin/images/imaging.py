@@ -10,6 +10,7 @@ import numpy as np
 
 from perrin._arrays import from_plain, to_plain
 from perrin.images.optics.optics import Optics
+from perrin.images.optics.radial_image import RadialImage
 from perrin.tracks.writing import write_json
 
 if TYPE_CHECKING:
@@ -101,6 +102,8 @@ class Imaging:
         Spheres are darker than their surroundings.
     refine : str or None
         How positions were refined, as in `locate`.
+    radial : RadialImage or None
+        The image of a sphere of a 2-D movie; None without refinement by the model.
     """
 
     features: pd.DataFrame
@@ -114,6 +117,7 @@ class Imaging:
     contact: float
     dark: bool
     refine: str | None
+    radial: RadialImage | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """Return everything as values that JSON holds: tables as lists by column."""
@@ -160,10 +164,11 @@ _IMAGING_SETTINGS = tuple(
 
 def _settings_from(entry: Mapping[str, Any]) -> dict[str, Any]:
     """Return the fields that `Imaging.settings` wrote."""
-    optics, voxel = entry["optics"], entry["voxel"]
+    optics, radial, voxel = entry["optics"], entry.get("radial"), entry["voxel"]
     z, y, x = (np.nan if size is None else float(size) for size in voxel)
-    return {name: entry[name] for name in _IMAGING_SETTINGS} | {
+    return {name: entry.get(name) for name in _IMAGING_SETTINGS} | {
         "optics": None if optics is None else Optics.from_dict(optics),
+        "radial": None if radial is None else RadialImage.from_dict(radial),
         "voxel": (z, y, x),
     }
 

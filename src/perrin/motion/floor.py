@@ -9,13 +9,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from perrin._arrays import Floats, as_sigma, from_plain, frozen, to_plain
+from perrin._display import Shown
 from perrin.errors import DegenerateClusterError
 from perrin.geometry.rigid import inertia_tensor, orientation_covariance
 from perrin.geometry.shapes import Cluster
 
 
-@dataclass(frozen=True, eq=False)
-class NoiseFloor:
+@dataclass(frozen=True, eq=False, repr=False)
+class NoiseFloor(Shown):
     """Mean square angle by which a motionless cluster appears to turn, from localisation error.
 
     Attributes

@@ -9,8 +9,20 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from perrin._arrays import Floats, Ints, from_plain, frozen, to_plain
-from perrin.geometry.rotations import log_map
+from perrin._arrays import (
+    Floats,
+    Ints,
+    choice_fault,
+    from_plain,
+    frozen,
+    number_fault,
+    refuse,
+    require_positive,
+    to_plain,
+)
+from perrin._display import Shown
+from perrin.errors import TooFewFramesError
+from perrin.geometry.rotations import log_map, skew
 from perrin.geometry.symmetry import projected_on_line, symmetry_elements
 
 if TYPE_CHECKING:
@@ -20,11 +32,16 @@ if TYPE_CHECKING:
 # Apparent D_R dt of a tetrahedron at rest, over (sigma/R)^4.
 _RESTING_DIFFUSION = 0.04
 
+# Nodes of the nominal template of a body whose particles are not known.
+_UNEVEN_POINTS = (0.0, 1.0, 2.0, 4.0, 7.0)
+
+_ROTATION_ERROR = 1e-5  # largest departure of R^T R from the identity
+
 _WHOLE_NUMBERS = ("n_present", "piece")
 
 
 @dataclass(frozen=True, eq=False)
-class RigidMotion:
+class RigidMotion(Shown):
     """Position and orientation of one rigid cluster in every frame; missing frames are NaN.
 
     Attributes
@@ -115,9 +132,14 @@ class RigidMotion:
     def template_error(self) -> float:
         """Bound of the error of the template's positions, um.
 
-        Six standard errors, the second-order inflation of the shape by noise, and rounding.
+        Six standard errors, the second-order inflation of the shape by noise, and rounding. Where
+        particles are recorded at different times, the errors of the poses are in the shape too.
         """
-        first_order = 6 * self.sigma / np.sqrt(self.fitted.size)
+        square = self.sigma**2
+        if self.turn_noise is not None:
+            turn = np.trace(self.covariance[self.fitted], axis1=1, axis2=2).mean()
+            square += self.R**2 * turn / 3 + self.center_variance[self.fitted].mean()
+        first_order = 6 * np.sqrt(square / self.fitted.size)
         return float(first_order + 2 * self.sigma**2 / self.R + 1e-6 * self.R)
 
     @cached_property
@@ -395,6 +417,99 @@ class RigidMotion:
             else None,
         )
 
+    @classmethod
+    def from_rotations(
+        cls,
+        rotations: ArrayLike | Rotation,
+        centers: ArrayLike | None = None,
+        *,
+        dt: float,
+        sigma: float = 0.0,
+        center_sigma: float = 0.0,
+        order: Literal["xyzw", "wxyz"] | None = None,
+    ) -> RigidMotion:
+        """Return the motion of a body whose orientations are known, without its particles.
+
+        Parameters
+        ----------
+        rotations : array_like, shape (T, d, d) or (T, 4), or scipy Rotation
+            Lab from body, in every frame: matrices, d = 2 or 3, or quaternions of any length but
+            zero. A frame with a NaN has no pose.
+        centers : array_like, shape (T, d), optional
+            Centre in every frame, um. Without it the body turns on the spot.
+        dt : float
+            Time between frames, s.
+        sigma : float
+            Standard error of one orientation about each axis, rad.
+        center_sigma : float
+            Standard error of one coordinate of the centre, um.
+        order : {"xyzw", "wxyz"}, optional
+            Order of the components of quaternions, with the scalar w last (scipy) or first. It must
+            be stated for quaternions.
+
+        Returns
+        -------
+        RigidMotion
+            Its body axes are those of the lab at the first frame with a pose. Its template is five
+            nominal points without symmetry at a mean distance of 1 um, whose localisation error
+            `RigidMotion.sigma` makes orientations as uncertain as stated, so that no symmetry of
+            the body is assumed. It has no residuals.
+
+        Raises
+        ------
+        ValueError
+            If shapes do not fit, a matrix is no proper rotation, the order of quaternions is
+            missing, fewer than two frames have a pose, or a number is out of range.
+
+        Examples
+        --------
+        >>> from perrin import RigidMotion
+        >>> quarter = [[0, 0, 0, 1], [0, 0, 1, 1], [0, 0, 1, 0]]
+        >>> RigidMotion.from_rotations(quarter, dt=0.5, order="xyzw").rotation[1].round(3)
+        array([[ 0., -1.,  0.],
+               [ 1.,  0.,  0.],
+               [ 0.,  0.,  1.]])
+        """
+        require_positive(dt=dt)
+        named = {"sigma": sigma, "center_sigma": center_sigma}
+        refuse(f for k, x in named.items() for f in number_fault(k, x, least=0.0))
+        given = _rotation_matrices(rotations, order)
+        count, d = given.shape[:2]
+        center = np.zeros((count, d)) if centers is None else np.array(centers, dtype=np.float64)
+        if center.shape != (count, d):
+            raise ValueError(
+                f"centers: expected the shape ({count}, {d}) of the rotations, got {center.shape}"
+            )
+        lost = ~(np.isfinite(given).all(axis=(1, 2)) & np.isfinite(center).all(axis=1))
+        rows = np.flatnonzero(~lost)
+        if rows.size < 2:
+            raise TooFewFramesError(
+                f"{rows.size} of {count} frames have a rotation: two or more are needed", rows.size
+            )
+        rotation = given @ given[rows[0]].T
+        rotation[lost], center[lost] = np.nan, np.nan
+        # Orthogonal polynomials over uneven points: equal moments along all axes, no symmetry.
+        basis = np.linalg.qr(np.vander(_UNEVEN_POINTS, d + 1, increasing=True))[0][:, 1:]
+        size = 1 / np.linalg.norm(basis, axis=1).mean()
+        # Both in the plane and in space the moment of inertia is 2 size^2 about every axis.
+        error = float(np.sqrt(2) * size * sigma)
+        angles = 1 if d == 2 else 3
+        return cls(
+            time=np.arange(count) * float(dt),
+            center=center,
+            rotation=rotation,
+            residual=np.where(lost, np.nan, 0.0),
+            n_present=np.where(lost, 0, len(basis)).astype(np.int64),
+            covariance=np.where(lost[:, None, None], np.nan, sigma**2 * np.eye(angles)),
+            center_variance=np.where(lost, np.nan, center_sigma**2),
+            piece=np.zeros(count, dtype=np.int64),
+            reason=tuple("no rotation was given" if gone else "" for gone in lost.tolist()),
+            template=size * basis,
+            sigma=error,
+            noise=np.full(d, error),
+            dt=float(dt),
+        )
+
     def to_dict(self) -> dict[str, Any]:
         """Return the motion for JSON: lists for arrays, None for NaN."""
         return {field.name: to_plain(getattr(self, field.name)) for field in fields(self)}
@@ -421,6 +536,41 @@ class RigidMotion:
         }
         sigma, dt = (float(from_plain(entry[name])) for name in ("sigma", "dt"))
         return cls(reason=tuple(entry["reason"]), sigma=sigma, dt=dt, **arrays)
+
+
+def _rotation_matrices(
+    rotations: ArrayLike | Rotation, order: Literal["xyzw", "wxyz"] | None
+) -> Floats:
+    """Return matrices (T, d, d) from matrices, quaternions or a scipy rotation, each checked."""
+    if hasattr(rotations, "as_matrix"):
+        return np.array(np.atleast_3d(rotations.as_matrix()), dtype=np.float64)
+    given = np.array(rotations, dtype=np.float64)
+    if given.ndim == 2 and given.shape[1] == 4:
+        refuse(choice_fault("order of the quaternions", order, ("xyzw", "wxyz")))
+        length = np.linalg.norm(given, axis=1, keepdims=True)
+        if np.any(length == 0):
+            raise ValueError(f"rotations: the quaternion of row {np.argmin(length)} is zero")
+        given = given / length
+        w, vector = (given[:, 3], given[:, :3]) if order == "xyzw" else (given[:, 0], given[:, 1:])
+        cross = skew(vector)
+        turned = np.eye(3) + 2 * w[:, None, None] * cross + 2 * cross @ cross
+        return np.asarray(turned)
+    if given.ndim != 3 or given.shape[1:] not in ((2, 2), (3, 3)):
+        raise ValueError(
+            "rotations: expected matrices (T, 3, 3) or (T, 2, 2), quaternions (T, 4) or a scipy "
+            f"Rotation, got the shape {given.shape}"
+        )
+    known = np.isfinite(given).all(axis=(1, 2))
+    rows = np.flatnonzero(known)
+    unit = np.swapaxes(given[rows], 1, 2) @ given[rows]
+    wrong = np.abs(unit - np.eye(given.shape[1])).max(axis=(1, 2)) > _ROTATION_ERROR
+    wrong |= np.linalg.det(given[rows]) < 0
+    if wrong.any():
+        raise ValueError(
+            f"rotations: {int(wrong.sum())} of {len(given)} matrices are no proper rotations "
+            f"(the first is row {rows[wrong][0]}): R^T R must be the identity and det R = +1"
+        )
+    return given
 
 
 def threshold_displacement(motion: RigidMotion, *, threshold: float) -> Floats:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from perrin._arrays import Bools, Floats, as_positions, as_sigma, finite_or_none, present, to_plain
+from perrin._display import Shown
 from perrin.geometry.shapes import pair_distances
 from perrin.geometry.symmetry import point_group, schoenflies
 from perrin.motion.residuals import (
@@ -77,8 +78,8 @@ _SCALE_ERROR = 0.01
 _RATIO_EXCESS = 1.25
 
 
-@dataclass(frozen=True)
-class Quality:
+@dataclass(frozen=True, repr=False)
+class Quality(Shown):
     """How rigid a fitted cluster is, and how large its errors are.
 
     Attributes

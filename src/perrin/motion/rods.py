@@ -19,6 +19,7 @@ from perrin._arrays import (
     require_positive,
     to_plain,
 )
+from perrin._display import Shown
 from perrin.errors import DegenerateClusterError, TooFewFramesError
 
 if TYPE_CHECKING:
@@ -51,7 +52,7 @@ _INTEGER_FIELDS = ("n_present", "piece", "swaps")
 
 
 @dataclass(frozen=True, eq=False)
-class RodMotion:
+class RodMotion(Shown):
     """Centre and direction of a rod or straight chain in every frame; missing frames are NaN.
 
     Rotation about the rod's own axis is not measured: a rod has a direction, no full orientation.

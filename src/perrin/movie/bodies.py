@@ -115,7 +115,10 @@ def find_bodies(
     x = features[axes].to_numpy(dtype=np.float64)[rows]
     errors = median_errors(features[usable], axes=axes)
     error = None if errors is None else float(np.sqrt(np.mean(errors**2)))
-    found = identify_bodies(frame, x, contact=search.contact, error=error)
+    # The spheres of a pair are a contact distance apart in height at most, a third in its square.
+    between = abs(stack.plane_time or 0.0) * search.contact / float(stack.voxel[0]) / np.sqrt(3)
+    scan = between / stack.dt if between > 0 else 0.0
+    found = identify_bodies(frame, x, contact=search.contact, error=error, scan=scan)
     number, notes, warnings = _chosen_bodies(found, frame, sizes)
     label = np.append(number, -1)[found.body]
     size = {int(c): int(n) for c, n in zip(number, found.size, strict=True) if c >= 0}

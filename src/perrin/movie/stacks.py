@@ -16,7 +16,7 @@ import perrin.movie.checks as checks
 from perrin._arrays import finite_or_none, number_fault, options_from, refuse, refuse_unknown
 from perrin.errors import IdentityError, PartsError, TooFewFramesError
 from perrin.images.imaging import Imaging, View
-from perrin.images.spheres.localisation import NO_FLAT_MODEL, Search, check_search, is_flat
+from perrin.images.spheres.localisation import Search, check_search, is_flat
 from perrin.images.spheres.spots import Spots
 from perrin.images.stack import digest
 from perrin.motion.error_ratio import ErrorRatio, error_ratio, with_error_ratio
@@ -203,14 +203,13 @@ def analyze_stack(
         minmass=spots.minmass,
         border=spots.border,
         crowds=True,  # clusters that meet may be a crowd for some frames
+        circles=refine == "model" and is_flat(stack),
     )
     faults += _faults_of(check_search, stack, search, refine, optics=optics)
     sizes = _wanted_sizes(size, faults)
     refuse(faults)
     check_workers(work)
 
-    flat = refine == "model" and is_flat(stack)
-    refine = None if flat else refine
     numbers, excluded = _selected_frames(len(stack), frames), sorted({int(c) for c in exclude})
     work.report(0, 0, "taking the file's SHA-256")
     depends = _dependencies(stack, search, refine, optics, numbers)
@@ -249,7 +248,7 @@ def analyze_stack(
             )
         else:
             report = measure_free_spheres(bodies.singles, experiment, recording, **run)
-    findings = poses.findings + checks.Findings(notes=(NO_FLAT_MODEL,) if flat else ())
+    findings = poses.findings
     if poses.ratio is not None:
         findings += checks.error_ratio_shown(poses.ratio, axes=bodies.axes)
         bodies = with_true_errors(bodies, poses.ratio, times=stack.times)
@@ -491,7 +490,7 @@ def _with_checks(
             features, contact=contact, refine=method.refine, axes=bodies.axes
         )
         + checks.Findings(tuple(bodies.warnings), tuple(bodies.notes))
-        + _contrast(imaging, features, flat=is_flat(stack))
+        + _contrast(imaging, features, flat=is_flat(stack) and method.radial is None)
         + checks.missing_spheres(features, sizes=bodies.sizes, contact=contact, frames=read)
         + checks.Findings(notes=tuple(uneven))
         + checks.clusters_near_border(features, margin=bodies.margin, dropped=bodies.dropped)
@@ -547,6 +546,7 @@ def _imaging(stack: Stack, located: Located, bodies: Bodies, search: Search) -> 
         spots=located.spots,
         views=tuple(views),
         optics=located.method.optics,
+        radial=located.method.radial,
         minmass=float(located.method.search.minmass or 0.0),
         voxel=(z, y, x),
         diameter=search.diameter,

@@ -13,6 +13,7 @@ import numpy as np
 from perrin.errors import FrameError, PrecisionWarning, TooFewFramesError
 from perrin.images.optics.learn import UsualImage
 from perrin.images.optics.optics import Optics
+from perrin.images.optics.radial_image import RadialImage
 from perrin.images.optics.window_fit import RigidCenters
 from perrin.images.spheres.localisation import Method, choose_method, found_table, sample_frames
 from perrin.images.spheres.poses import Pose, pose_in, with_poses
@@ -162,13 +163,14 @@ def locate_frames(
         open_parts(folder, settings)
         with written_whole(known) as unfinished:
             write_json(unfinished, learned)
-    found = learned["optics"]
+    found, radial = learned["optics"], learned["radial"]
     method = Method(
         replace(search, minmass=learned["minmass"]),
         refine,
         None if found is None else Optics.from_dict(found),
         None if learned["fading"] is None else Fading.from_dict(learned["fading"]),
         None if learned["usual"] is None else UsualImage.from_dict(learned["usual"]),
+        None if radial is None else RadialImage.from_dict(radial),
     )
     rows, entries, notes = run_frames(
         _LocateTask(_without_times(stack), method),
@@ -214,8 +216,8 @@ def learn_method(
     Returns
     -------
     dict
-        Values that JSON can hold: ``minmass``, ``optics``, ``fading``, ``usual``, the ``spots`` of
-        the sampled frames as (frame, mass), and the warnings under ``told``.
+        Values that JSON can hold: ``minmass``, ``optics``, ``fading``, ``usual``, ``radial``, the
+        ``spots`` of the sampled frames as (frame, mass), and the warnings under ``told``.
 
     Raises
     ------
@@ -248,6 +250,7 @@ def learn_method(
         "optics": None if method.optics is None else method.optics.to_dict(),
         "fading": None if method.fading is None else method.fading.to_dict(),
         "usual": None if method.usual is None else method.usual.to_dict(),
+        "radial": None if method.radial is None else method.radial.to_dict(),
         "spots": [[seen.number, mass] for seen in sample for mass in seen.spots.mass.tolist()],
         "told": [str(warning.message) for warning in caught],
     }

@@ -28,9 +28,9 @@ from perrin.plot.motion import (
     plot_step_spectrum,
 )
 from perrin.plot.results import (
-    MAX_CLUSTERS,
     ModelLine,
     curve_figure,
+    curve_floors,
     forest_figure,
     model_line,
     orientation_figure,
@@ -56,12 +56,12 @@ from perrin.plot.style import (
 )
 
 __all__ = [
-    "MAX_CLUSTERS",
     "MOTION_CAPTION",
     "PALETTE",
     "ModelLine",
     "alternative_spectrum",
     "curve_figure",
+    "curve_floors",
     "font_in_use",
     "forest_figure",
     "found_figure",

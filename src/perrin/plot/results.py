@@ -28,7 +28,7 @@ from perrin.plot.style import (
 
 if TYPE_CHECKING:
     import os
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Iterable, Sequence
 
     from matplotlib.axes import Axes as Axes
     from matplotlib.figure import Figure as Figure
@@ -62,7 +62,6 @@ _CURVE_NAMES = {"rotation": ("MSAD", "$D_R$"), "translation": ("MSD", "$D_T$")}
 # Names of methods in the legend.
 _METHODS = {"mle": "ML fit", "line": "line"}
 
-MAX_CLUSTERS = 12  # clusters that `save_figures` draws one by one
 _NAMED_CLUSTERS = 60  # largest number of clusters whose names a forest plot shows
 _SHOWN_LAGS = 200  # largest number of lag times shown
 _SHOWN_FRAMES = 5000  # largest number of frames of an orientation path shown
@@ -407,24 +406,28 @@ def plot_plan(plan: SamplingPlan, *, ax: Axes) -> Axes:
     return ax
 
 
-def save_figures(report: Report, folder: str | os.PathLike[str]) -> list[Path]:
-    """Write the figures of a report into an existing folder, each as PNG and PDF.
+def save_figures(
+    report: Report, folder: str | os.PathLike[str], *, clusters: Iterable[int] | None = None
+) -> list[Path]:
+    """Write figures of a report into an existing folder, each as PNG and PDF.
 
     Parameters
     ----------
     report : Report
-        Of more than 12 clusters the first 12 get figures of their own.
     folder : path
+    clusters : iterable of int, optional
+        Numbers of the clusters that are drawn; by default the first one. The report page draws all
+        of them itself.
 
     Returns
     -------
     list of Path
-        ``clusters.*`` if there are several clusters, and for each cluster
-        ``cluster-<n>-curves.*``, ``-residuals.*`` and ``-orientations.*``; ``-rotation.*`` and
-        ``-translation.*``, against diffusion, for the first cluster and where the motion is not
-        diffusion.
+        ``clusters.*`` if there are several clusters, and for each drawn cluster
+        ``cluster-<n>-curves.*``, ``-residuals.*`` and ``-orientations.*``, with ``-rotation.*`` and
+        ``-translation.*``, against diffusion, where the motion is not diffusion.
     """
     place = Path(folder)
+    drawn = {c.cluster for c in report.clusters[:1]} if clusters is None else set(clusters)
     first = report.tracks.dropna(subset=["x", "y"]).groupby("cluster")["frame"].min()
     files: list[Path] = []
     if report.pooled is not None and len(report.clusters) > 1:
@@ -434,14 +437,13 @@ def save_figures(report: Report, folder: str | os.PathLike[str]) -> list[Path]:
         "residuals": residual_figure,
         "orientations": orientation_figure,
     }
-    for result in report.clusters[:MAX_CLUSTERS]:
+    for result in report.clusters:
+        if result.cluster not in drawn:
+            continue
         for kind, draw in kinds.items():
             files += save_figure(draw(result), place / f"cluster-{result.cluster}-{kind}")
         for quantity, verdict in result.verdicts.items():
-            # Drawing takes a second: of the others the first cluster is the example.
-            if verdict is None or (
-                verdict.kind == "diffusion" and result is not report.clusters[0]
-            ):
+            if verdict is None or verdict.kind == "diffusion":
                 continue
             motion = result.motion
             if verdict.quantity == "translation":  # the centre's path crosses doubt about labels
@@ -702,19 +704,34 @@ def curve_figure(result: ClusterResult) -> Figure:
     """
     figure = new_figure(10, 4.6)
     left, right = figure.subplots(1, 2)
-    weights, floor = result.msad.weights, result.noise.phi2
-    if weights is not None:
-        # Both ends of a rotation have the error of the orientation, perpendicular to a direction.
-        floor = 2 * float(np.einsum("ij,ij->", weights, result.noise.covariance))
-    plot_lag_curve(result.msad, ax=left, estimate=result.D_R, floor=floor, tensor=result.tensor)
+    turn, shift = curve_floors(result)
+    plot_lag_curve(result.msad, ax=left, estimate=result.D_R, floor=turn, tensor=result.tensor)
     if result.D_T.absent_because is not None:
         write_reason(right, f"no {_CURVE_NAMES['translation'][1]}: {result.D_T.absent_because}")
         return figure
+    plot_lag_curve(result.msd, ax=right, estimate=result.D_T, floor=shift)
+    return figure
+
+
+def curve_floors(result: ClusterResult) -> tuple[float, float]:
+    """Return the noise floors that the localisation error predicts for MSAD and MSD.
+
+    Parameters
+    ----------
+    result : ClusterResult
+
+    Returns
+    -------
+    tuple of float
+        rad^2 and um^2.
+    """
+    weights, turn = result.msad.weights, result.noise.phi2
+    if weights is not None:
+        # Both ends of a rotation have the error of the orientation, perpendicular to a direction.
+        turn = 2 * float(np.einsum("ij,ij->", weights, result.noise.covariance))
     motion = result.motion
     # Both ends of a displacement have the error of the centre, along each axis.
-    floor = 2 * motion.dimension * float(np.mean(motion.center_variance[motion.fitted]))
-    plot_lag_curve(result.msd, ax=right, estimate=result.D_T, floor=floor)
-    return figure
+    return turn, 2 * motion.dimension * float(np.mean(motion.center_variance[motion.fitted]))
 
 
 def residual_figure(result: ClusterResult) -> Figure:

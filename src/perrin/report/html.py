@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import base64
+import re
 from datetime import datetime
+from functools import lru_cache
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from jinja2 import Environment, FunctionLoader, StrictUndefined
+from markupsafe import Markup, escape
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -20,7 +23,7 @@ def render_page(template: str, **values: Any) -> str:  # noqa: ANN401 (values of
     Parameters
     ----------
     template : str
-        "report" or "imaging".
+        Name without suffix.
     **values
         Values of the template's variables. The template escapes them, because labels and paths
         are text of users.
@@ -29,6 +32,28 @@ def render_page(template: str, **values: Any) -> str:  # noqa: ANN401 (values of
     -------
     str
     """
+    return _environment().get_template(template).render(**values)
+
+
+def render_part(template: str, macro: str, *values: Any) -> str:  # noqa: ANN401 (values of any type)
+    """Fill one macro of a template of the package.
+
+    Parameters
+    ----------
+    template, macro : str
+    *values
+        Arguments of the macro, escaped by it.
+
+    Returns
+    -------
+    str
+    """
+    return str(getattr(_environment().get_template(template).module, macro)(*values))
+
+
+@lru_cache(maxsize=1)
+def _environment() -> Environment:
+    """Return the package's templates, compiled once."""
     folder = files("perrin.report") / "templates"
     environment = Environment(
         loader=FunctionLoader(
@@ -39,7 +64,16 @@ def render_page(template: str, **values: Any) -> str:  # noqa: ANN401 (values of
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    return environment.get_template(template).render(**values)
+    environment.filters["symbols"] = _symbols
+    return environment
+
+
+def _symbols(text: str) -> Markup:
+    """Escape a text, and set the indices and units of its coefficients."""
+    marked = re.sub(r"\bum\b", "µm", str(escape(text))).replace("^2", "²")
+    for letter, index in (("R", "R"), ("T", "T"), ("perp", "⊥")):
+        marked = re.sub(rf"\bD_{letter}\b", f"<i>D</i><sub>{index}</sub>", marked)
+    return Markup(marked)
 
 
 def inline_pictures(figures: Iterable[Path]) -> dict[str, str]:

@@ -19,20 +19,32 @@ from perrin._text import (
 )
 from perrin.diffusion.estimate import bare_text, value_text
 from perrin.diffusion.sampling import judge_sampling
+from perrin.geometry.shapes import pair_distances
 from perrin.plot.motion import MOTION_CAPTION
-from perrin.plot.results import MAX_CLUSTERS
-from perrin.report.html import byline, captioned, inline_pictures, render_page
+from perrin.report.citations import (
+    PAPER_BIBTEX,
+    command_line,
+    folder_links,
+    methods_paragraph,
+    python_lines,
+    software_bibtex,
+)
+from perrin.report.embedding import packed, page_script, plotly_script, source_hash
+from perrin.report.figure_data import body_picture, cluster_data, grouped_tracks
+from perrin.report.html import byline, captioned, inline_pictures, render_page, render_part
 from perrin.run.remarks import condensed, grouped
-from perrin.run.results import floor_factor
-from perrin.run.statements import motion_sentences, verdict_lines
+from perrin.run.results import RodResult, floor_factor
+from perrin.run.statements import answer_lines, motion_sentences, verdict_lines
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
     from pathlib import Path
 
     from perrin.diffusion.estimate import DiffusionEstimate
+    from perrin.motion.rigid_motion import RigidMotion
+    from perrin.motion.rods import RodMotion
     from perrin.run.predictions import Prediction
-    from perrin.run.results import BodyKind, ClusterResult, Report
+    from perrin.run.results import BodyKind, ClusterResult, Pooled, Report
 
 
 # Caption of each figure: its title, what it shows, and what to check.
@@ -112,9 +124,19 @@ def render_html(report: Report, figures: Iterable[Path]) -> str:
     """
     pictures, pooled = inline_pictures(figures), report.pooled
     settings, source = report.settings, report.settings.get("input", {})
-    several = len(report.clusters) > 1
+    several = len(report.results) > 1
     # Noise, exposure and drift are the same for all clusters.
     method = pooled or next(iter(report.clusters), None)
+    headline = [] if pooled is None else _coefficients(pooled)
+    if pooled is None and report.rods and not several:
+        headline = _coefficients(report.rods[0])
+    version = settings.get("versions", {}).get("perrin", "")
+    script = page_script("report")
+    plotly, plotly_hash = plotly_script()
+    sections = [_section(one, report) for one in report.results]
+    chosen = None
+    if sections:
+        chosen = sections[0] | {"figures": _figures(report.results[0], pictures)}
     return render_page(
         "report",
         **byline(settings),
@@ -127,53 +149,124 @@ def render_html(report: Report, figures: Iterable[Path]) -> str:
         ],
         versions=list(settings.get("versions", {}).items()),
         several=several,
+        results=len(report.results),
+        clusters=len(report.clusters),
+        rods=len(report.rods),
         label=None if several or not report.results else report.results[0].label,
         subject=_subject(report),
+        answer=answer_lines(report),
         kinds=_kind_rows(report) if report.pooled_by_kind else [],
-        headline=[] if pooled is None else _both_coefficients(pooled.D_R, pooled.D_T),
+        headline=headline,
         verdict=[" ".join(texts) for texts in verdict_lines(report).values()],
-        overview=[
-            {
-                "anchor": result.cluster,
-                "name": result.name,
-                "kind": _kind_text(report.kind_of(result.cluster)),
-                "D_R": _estimate_text(result.D_R),
-                "D_T": _estimate_text(result.D_T),
-                "sigma": length_text(result.motion.sigma),
-                "frames": result.motion.fitted.size,
-                "warnings": len(result.warnings),
-            }
-            for result in (report.clusters if several else ())
-        ],
+        overview=[_overview_row(one, report) for one in (report.results if several else ())],
         pooled=_pooled_text(report) if several and pooled is not None else None,
-        rods=[
-            {
-                "anchor": rod.cluster,
-                "name": rod.name,
-                "kind": _kind_text(report.kind_of(rod.cluster)),
-                "D_perp": _estimate_text(rod.D_perp),
-                "D_T": _estimate_text(rod.D_T),
-                "length": length_text(rod.motion.length),
-                "frames": rod.motion.fitted.size,
-                "warnings": rod.warnings,
-                "notes": rod.notes,
-                "prediction": _prediction_text(rod.prediction),
-            }
-            for rod in report.rods
-        ],
         has_images=report.imaging is not None,
         warnings=condensed(report.warnings),
         warned=_remarks(report, {c.name: c.warnings for c in report.results}),
         notes=condensed(report.notes),
         noted=_remarks(report, {c.name: c.notes for c in report.results}),
         overview_figure=captioned(pictures, "clusters", "clusters", _RESULT_CAPTIONS["clusters"]),
-        clusters=[_cluster_section(c, pictures, settings) for c in report.clusters],
-        hidden=max(len(report.clusters) - MAX_CLUSTERS, 0),
+        chosen=chosen,
+        payloads=_payloads(report, sections),
+        overview_data=_overview_data(report),
+        copies=[
+            ("Methods paragraph", methods_paragraph(report)),
+            ("Command", command_line(report)),
+            ("Python", python_lines(report)),
+            ("BibTeX", f"{PAPER_BIBTEX}\n\n{software_bibtex(version)}"),
+        ],
+        links=folder_links(report),
         planar=any(c.motion.dimension == 2 for c in report.clusters),
         noise="joint" if method is None else method.D_R.settings.text,
         exposure=None if method is None else method.D_R.exposure,
         drift=method is not None and method.D_T.drift is not None,
+        script=script,
+        plotly=plotly,
+        script_sources=f"{source_hash(script)} {plotly_hash}",
     )
+
+
+def _overview_row(result: ClusterResult | RodResult, report: Report) -> dict[str, Any]:
+    """Return the row of a cluster or rod in the table of all, with numbers to sort by."""
+    (_, turn), (_, path) = _named_coefficients(result)
+    kinds = {v.kind for v in getattr(result, "verdicts", {}).values() if v is not None}
+    return {
+        "anchor": result.cluster,
+        "name": result.name,
+        "kind": _kind_text(report.kind_of(result.cluster)),
+        "D_R": _estimate_text(turn),
+        "D_T": _estimate_text(path),
+        "turn_sort": (turn.value, turn.ci95[1]),
+        "path_sort": (path.value, path.ci95[1]),
+        "motion": ", ".join(sorted(kinds)) or "not judged",
+        "sigma": length_text(result.motion.sigma),
+        "sigma_sort": result.motion.sigma,
+        "frames": result.motion.fitted.size,
+        "warnings": len(result.warnings),
+    }
+
+
+def _overview_data(report: Report) -> str:
+    """Return values and intervals of all clusters for the forest plot, compressed."""
+    columns: dict[str, Any] = {}
+    both = [_named_coefficients(one) for one in report.results]
+    for k, kind in enumerate(("turn", "shift")):
+        estimates = [one[k][1] for one in both]
+        columns |= {
+            f"{kind}_value": [e.value if e.resolved else np.nan for e in estimates],
+            f"{kind}_low68": [e.ci68[0] for e in estimates],
+            f"{kind}_high68": [e.ci68[1] for e in estimates],
+            f"{kind}_low95": [e.ci95[0] for e in estimates],
+            f"{kind}_high95": [e.ci95[1] for e in estimates],
+        }
+    pooled: dict[str, Any] = {"turn": None, "shift": None}
+    if report.pooled is not None:
+        for kind, one in (("turn", report.pooled.D_R), ("shift", report.pooled.D_T)):
+            numbers = (one.value, *one.ci95)
+            pooled[kind] = list(numbers) if np.isfinite(numbers).all() else None
+    header = {
+        "keys": [one.cluster for one in report.results],
+        "names": [one.name for one in report.results],
+        "pooled": pooled,
+    }
+    return packed(header, columns, exact=columns.keys())
+
+
+def _payloads(report: Report, sections: Sequence[Mapping[str, Any]]) -> list[tuple[int, str]]:
+    """Return what the page draws and writes of every cluster, compressed, by its number."""
+    several = len(report.results) > 1
+    tracks = grouped_tracks(report.tracks)
+    diameter = report.settings.get("arguments", {}).get("diameter")
+    return [
+        (
+            result.cluster,
+            cluster_data(
+                result,
+                tracks.get(result.cluster, np.empty((0, 5))),
+                clusters=len(sections),
+                diameter=diameter,
+                title=section["title"],
+                numbers=render_part("cluster", "numbers", section, several),
+                details=render_part("cluster", "details", section),
+            ),
+        )
+        for result, section in zip(report.results, sections, strict=True)
+    ]
+
+
+def _figures(
+    result: ClusterResult | RodResult, pictures: Mapping[str, str]
+) -> list[dict[str, str]]:
+    """Return the pictures of a cluster with their captions."""
+    planar = result.motion.center.shape[1] == 2
+    kinds = {"rotation": "motion", "translation": "motion"}
+    kinds |= {"curves": "curves", "residuals": "residuals"}
+    kinds |= {"orientations": "angle" if planar else "sphere"}
+    drawn = [
+        captioned(pictures, f"cluster-{result.cluster}-{name}", kind, _RESULT_CAPTIONS[kind])
+        for name, kind in kinds.items()
+    ]
+    return [one for one in drawn if one]
 
 
 def _subject(report: Report) -> str:
@@ -250,9 +343,18 @@ def _pooled_text(report: Report) -> dict[str, Any]:
     }
 
 
-def _both_coefficients(D_R: DiffusionEstimate, D_T: DiffusionEstimate) -> list[dict[str, Any]]:
-    """Return D_R and D_T as text, each with the letter of its index."""
-    return [{"letter": k} | _estimate_text(e) for k, e in zip("RT", (D_R, D_T), strict=True)]
+def _named_coefficients(
+    result: ClusterResult | RodResult | Pooled,
+) -> tuple[tuple[str, DiffusionEstimate], tuple[str, DiffusionEstimate]]:
+    """Return the rotational and the translational coefficient, each with its index."""
+    if isinstance(result, RodResult):
+        return ("⊥", result.D_perp), ("T", result.D_T)
+    return ("R", result.D_R), ("T", result.D_T)
+
+
+def _coefficients(result: ClusterResult | RodResult | Pooled) -> list[dict[str, Any]]:
+    """Return both coefficients as text, each with its index."""
+    return [{"letter": k} | _estimate_text(e) for k, e in _named_coefficients(result)]
 
 
 def _estimate_text(estimate: DiffusionEstimate) -> dict[str, Any]:
@@ -281,19 +383,62 @@ def _estimate_text(estimate: DiffusionEstimate) -> dict[str, Any]:
     }
 
 
-def _cluster_section(
-    result: ClusterResult, pictures: Mapping[str, str], settings: Mapping[str, Any]
-) -> dict[str, Any]:
-    """Return everything that the page shows about one cluster."""
+def _section(result: ClusterResult | RodResult, report: Report) -> dict[str, Any]:
+    """Return everything that the page writes about one cluster or rod."""
+    alone = len(report.results) == 1
+    # The remarks on a table of one cluster are remarks on it.
+    warnings = (*(condensed(report.warnings) if alone else ()), *result.warnings)
+    notes = (*(condensed(report.notes) if alone else ()), *result.notes)
+    rod = isinstance(result, RodResult)
+    common: dict[str, Any] = {
+        "anchor": result.cluster,
+        "title": f"{'Rod' if rod else 'Cluster'} {result.name}",
+        "name": result.name,
+        "estimates": _coefficients(result),
+        "warnings": warnings,
+        "notes": notes,
+        "prediction": _prediction_text(result.prediction),
+    }
+    parts = _rod_parts(result) if isinstance(result, RodResult) else _body_parts(result, report)
+    return common | parts
+
+
+def _frames_fact(motion: RigidMotion | RodMotion) -> tuple[str, str, str]:
+    """Return the number of frames that were used."""
+    return (
+        "frames used",
+        f"{motion.fitted.size} of {len(motion.time)}",
+        f"one every {motion.dt:g} s",
+    )
+
+
+def _rod_parts(rod: RodResult) -> dict[str, Any]:
+    """Return what the page writes about a rod alone."""
+    motion = rod.motion
+    places = np.outer(motion.places, [1.0, 0.0, 0.0])
+    nearest = float(np.diff(np.sort(motion.places)).min())
+    return {
+        "motion": [],
+        "facts": [
+            ("length", length_text(motion.length), "distance of the outermost particles"),
+            ("σ", length_text(motion.sigma), "localisation error of one coordinate"),
+            _frames_fact(motion),
+            ("particles", str(len(motion.places)), "on one line"),
+        ],
+        "tensor": None,
+        "sampling": [],
+        "sizes": [],
+        "viscosity": "",
+        "no_sizes": "",
+        "still": body_picture(places, nearest, label=f"Rod of {len(places)} spheres"),
+    }
+
+
+def _body_parts(result: ClusterResult, report: Report) -> dict[str, Any]:
+    """Return what the page writes about a cluster that is no rod."""
     motion, sizes = result.motion, result.sizes or {}
+    arguments = report.settings.get("arguments", {})
     d = motion.dimension
-    kinds = {"rotation": "motion", "translation": "motion"}
-    kinds |= {"curves": "curves", "residuals": "residuals"}
-    kinds |= {"orientations": "angle" if d == 2 else "sphere"}
-    drawn = [
-        captioned(pictures, f"cluster-{result.cluster}-{name}", kind, _RESULT_CAPTIONS[kind])
-        for name, kind in kinds.items()
-    ]
     both, viscosity = sizes.get("both"), ""
     if both is not None and both.viscosity is not None and both.viscosity_stderr is not None:
         value = number_text(1e3 * both.viscosity, 1e3 * both.viscosity_stderr)
@@ -302,14 +447,12 @@ def _cluster_section(
     no_sizes = "not computed"
     if stated:
         no_sizes = stated[0].partition(": ")[2]
-    elif settings.get("arguments", {}).get("temperature") is None:
+    elif arguments.get("temperature") is None:
         no_sizes = "viscosity and temperature were not given"
     body = f"in {d} dimensions, mean distance to the centre {number_text(motion.R)} µm"
-    frames = f"{motion.fitted.size} of {len(motion.time)}"
+    count = len(motion.template)
+    diameter = arguments.get("diameter") or float(pair_distances(motion.template).min())
     return {
-        "anchor": result.cluster,
-        "name": result.name,
-        "estimates": _both_coefficients(result.D_R, result.D_T),
         "motion": [
             " ".join(texts)
             for quantity in ("rotation", "translation")
@@ -317,8 +460,8 @@ def _cluster_section(
         ],
         "facts": [
             *noise_facts(result),
-            ("frames used", frames, f"one every {motion.dt:g} s"),
-            ("particles", str(len(motion.template)), body),
+            _frames_fact(motion),
+            ("particles", str(count), body),
         ],
         "tensor": _tensor_text(result),
         "sampling": [
@@ -329,7 +472,6 @@ def _cluster_section(
             # Advice on sampling is that for diffusion.
             and estimate.motion in (None, "diffusion", "jumps")
         ],
-        "prediction": _prediction_text(result.prediction),
         "sizes": [
             (
                 letters,
@@ -341,9 +483,7 @@ def _cluster_section(
         ],
         "viscosity": viscosity,
         "no_sizes": no_sizes,
-        "warnings": result.warnings,
-        "notes": result.notes,
-        "figures": [f for f in drawn if f],
+        "still": body_picture(motion.template, diameter, label=f"Cluster of {count} spheres"),
     }
 
 

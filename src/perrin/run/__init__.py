@@ -95,6 +95,7 @@ from perrin.run.remarks import (
     with_jumps,
     wrapped_box_text,
 )
+from perrin.run.result_table import result_rows_html, result_table
 from perrin.run.results import (
     BodyKind,
     ClusterResult,
@@ -110,7 +111,7 @@ from perrin.run.results import (
     write_data,
 )
 from perrin.run.singles import SingleSpheres, measure_singles, track_steps
-from perrin.run.statements import kinds_text, motion_sentences, verdict_lines
+from perrin.run.statements import answer_lines, kinds_text, motion_sentences, verdict_lines
 from perrin.run.tables import analyze, read_table
 from perrin.run.verdicts import fit_model, judge_each_and_all, verdicts_from_dict, verdicts_to_dict
 
@@ -136,6 +137,7 @@ __all__ = [
     "absent_frames_notes",
     "add_predictions",
     "analyze",
+    "answer_lines",
     "are_unequal",
     "argument_faults",
     "assign_clusters",
@@ -216,6 +218,8 @@ __all__ = [
     "predicted_noise",
     "read_table",
     "removed_drift_notes",
+    "result_rows_html",
+    "result_table",
     "run_settings",
     "shape_numbers",
     "soft_clusters_warning",

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from perrin._arrays import finite_or_none
+from perrin._display import Shown
 from perrin.diffusion.tensors import axes_like
 from perrin.errors import PrecisionWarning, UnitWarning
 from perrin.geometry.shapes import pair_distances
@@ -49,8 +50,8 @@ _OVERLAPPING, _SEPARATE = 1.1, 1.5
 _IMPOSSIBLE = 2.0
 
 
-@dataclass(frozen=True)
-class Compared:
+@dataclass(frozen=True, repr=False)
+class Compared(Shown):
     """A predicted coefficient and the measured one.
 
     Attributes
@@ -89,8 +90,8 @@ class Compared:
         return cls(*(np.nan if x is None else x for x in known))
 
 
-@dataclass(frozen=True)
-class Prediction:
+@dataclass(frozen=True, repr=False)
+class Prediction(Shown):
     """How equal spheres of a stated diameter would diffuse at the places measured.
 
     Attributes

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from perrin._arrays import finite_or_none
+from perrin._arrays import finite_or_none, to_plain
+from perrin._display import Shown
 from perrin._text import with_error
 from perrin.curves.displacement import LagCurve, msad, msd
 from perrin.diffusion.estimate import DiffusionEstimate
@@ -24,6 +25,7 @@ from perrin.motion.rigidity import Quality
 from perrin.motion.rods import RodMotion
 from perrin.run.folders import staged_folder
 from perrin.run.predictions import Prediction
+from perrin.run.result_table import result_rows_html, result_table
 from perrin.run.singles import SingleSpheres
 from perrin.run.verdicts import verdicts_from_dict, verdicts_to_dict
 from perrin.tracks.writing import write_json
@@ -44,8 +46,8 @@ _COEFFICIENTS = ("D_R", "D_perp", "D_T")
 _SIZE_ENDINGS = {"translation": "T", "rotation": "R", "both": "TR"}
 
 
-@dataclass(frozen=True, eq=False)
-class ClusterResult:
+@dataclass(frozen=True, eq=False, repr=False)
+class ClusterResult(Shown):
     """What was measured on one cluster.
 
     Attributes
@@ -125,6 +127,9 @@ class ClusterResult:
         """Cluster label, or the number where there is none."""
         return self.label or str(self.cluster)
 
+    def __str__(self) -> str:
+        return f"cluster {self.name}: {self.D_R}; {self.D_T}"
+
     def to_dict(self) -> dict[str, Any]:
         """Return the cluster's entry of ``summary.json``."""
         xyz = None if self.quality is None else self.quality.sigma_xyz
@@ -202,8 +207,8 @@ class ClusterResult:
         )
 
 
-@dataclass(frozen=True, eq=False)
-class RodResult:
+@dataclass(frozen=True, eq=False, repr=False)
+class RodResult(Shown):
     """What was measured on one rod or straight chain: it has a direction, no full orientation.
 
     Attributes
@@ -237,6 +242,9 @@ class RodResult:
     def name(self) -> str:
         """Rod label, or the number where there is none."""
         return self.label or str(self.cluster)
+
+    def __str__(self) -> str:
+        return perp_text(self)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the rod's entry of ``summary.json``."""
@@ -275,8 +283,8 @@ class RodResult:
         )
 
 
-@dataclass(frozen=True, eq=False)
-class Pooled:
+@dataclass(frozen=True, eq=False, repr=False)
+class Pooled(Shown):
     """One D_R and D_T for all rigid clusters together, each with its own noise.
 
     Attributes
@@ -293,6 +301,9 @@ class Pooled:
     D_T: DiffusionEstimate
     clusters: tuple[int, ...]
     verdicts: dict[str, MotionVerdict | None] = field(default_factory=dict)
+
+    def __str__(self) -> str:
+        return f"{len(self.clusters)} clusters: {self.D_R}; {self.D_T}"
 
     def to_dict(self) -> dict[str, Any]:
         """Return the entry "pooled" of ``summary.json``."""
@@ -315,8 +326,8 @@ class Pooled:
         return cls(D_R, D_T, tuple(entry["clusters"]), verdicts)
 
 
-@dataclass(frozen=True, eq=False)
-class BodyKind:
+@dataclass(frozen=True, eq=False, repr=False)
+class BodyKind(Shown):
     """The clusters of one number of particles and one shape, and their pooled coefficients.
 
     Attributes
@@ -437,10 +448,47 @@ class Report:
         both: list[ClusterResult | RodResult] = [*self.clusters, *self.rods]
         return tuple(both)
 
+    def __eq__(self, other: object) -> bool:
+        """Whether all numbers, texts, settings, positions and motions are equal."""
+        if not isinstance(other, Report):
+            return NotImplemented
+        pairs = zip(self.results, other.results, strict=False)
+        return (
+            self.to_dict() == other.to_dict()
+            and to_plain(self.settings) == to_plain(other.settings)
+            and self.tracks.equals(other.tracks)
+            and all(a.motion.to_dict() == b.motion.to_dict() for a, b in pairs)
+        )
+
+    __hash__ = object.__hash__
+
     def __repr__(self) -> str:
         count = len(self.warnings) + sum(len(c.warnings) for c in self.results)
+        many = len(self.results)
+        parts = [f"{many} cluster{'s' * (many != 1)}"]
+        if self.pooled is not None:
+            for name, one in (("D_R", self.pooled.D_R), ("D_T", self.pooled.D_T)):
+                if one.absent_because is None:
+                    parts.append(f"{name} = {with_error(one.value, one.stderr)} {one.unit}")
+        if self.pooled_by_kind:
+            parts.append(f"{len(self.kinds)} kind{'s' * (len(self.kinds) != 1)}")
+        return f"Report({', '.join(parts)}, {count} warning{'s' * (count != 1)})"
+
+    def _repr_html_(self) -> str:
+        """Return a table of the coefficients for a notebook."""
+        return result_rows_html(self)
+
+    def to_frame(self) -> pd.DataFrame:
+        """Return all numbers as a tidy table, a row for every cluster and quantity.
+
+        It is the content of ``results.csv``; `perrin.run.result_table` describes the columns.
+        """
+        return result_table(self)
+
+    def __str__(self) -> str:
+        count = len(self.warnings) + sum(len(c.warnings) for c in self.results)
         lines = [f"Report({len(self.results)} clusters, {count} warnings)"]
-        lines += [f"  cluster {c.name}: {c.D_R}; {c.D_T}" for c in self.clusters[:10]]
+        lines += [f"  {c}" for c in self.clusters[:10]]
         lines += [f"  {perp_text(rod)}" for rod in self.rods[:10]]
         if self.pooled is not None and len(self.clusters) > 1:
             lines.append(f"  pooled: {self.pooled.D_R}; {self.pooled.D_T}")
@@ -569,12 +617,13 @@ def load_run(folder: str | os.PathLike[str]) -> Report:
 
 
 def write_data(report: Report, folder: Path) -> None:
-    """Write summary.json, tracks.parquet, motion.parquet, curves.csv and run.json to a folder."""
+    """Write summary.json, results.csv, curves.csv, run.json and the tables to a folder."""
     write_json(folder / "summary.json", report.to_dict())
     write_json(folder / "run.json", report.settings)
     report.tracks.to_parquet(folder / "tracks.parquet", index=False)
     motion_table(report).to_parquet(folder / "motion.parquet", index=False)
     curve_table(report).to_csv(folder / "curves.csv", index=False)
+    result_table(report).to_csv(folder / "results.csv", index=False)
     if report.imaging is not None:
         write_imaging(report.imaging, folder)
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from perrin._display import Shown
 from perrin._text import with_error
 from perrin.diffusion.estimate import DiffusionEstimate
 from perrin.diffusion.estimators import by_likelihood, precision_limits
@@ -25,8 +26,8 @@ if TYPE_CHECKING:
 _FEWEST_FRAMES_OF_A_TRACK, _FEWEST_STEPS_OF_ALL = 3, 30
 
 
-@dataclass(frozen=True, eq=False)
-class SingleSpheres:
+@dataclass(frozen=True, eq=False, repr=False)
+class SingleSpheres(Shown):
     """The diffusion of the single spheres of a movie, pooled.
 
     Attributes
@@ -48,6 +49,9 @@ class SingleSpheres:
         """The coefficient in one line."""
         value = with_error(self.D_T.value, self.D_T.stderr)
         return f"single spheres: D_T = {value} {self.D_T.unit} ({self.n_tracks} tracks)"
+
+    def __str__(self) -> str:
+        return self.text
 
     def to_dict(self) -> dict[str, Any]:
         """Return the entry "singles" of ``summary.json``."""

@@ -5,11 +5,117 @@ from __future__ import annotations
 from collections import Counter
 from typing import TYPE_CHECKING
 
-from perrin._text import listed
+import numpy as np
+
+from perrin._text import interval_text, listed, number_text, unit_text
+from perrin.diffusion.estimate import value_text
 from perrin.run.remarks import NOT_JUDGED
 
 if TYPE_CHECKING:
-    from perrin.run.results import ClusterResult, Pooled, Report
+    from perrin.diffusion.estimate import DiffusionEstimate
+    from perrin.run.predictions import Compared
+    from perrin.run.results import ClusterResult, Pooled, Report, RodResult
+
+_DIFFERENT = 0.05  # p-value below which coefficients are called different
+_FAR_PULL = 2.0  # standard errors beyond which a value is called different from a prediction
+
+
+def answer_lines(report: Report) -> list[str]:
+    """Return the result of a report in sentences: values, times, agreement, prediction.
+
+    Parameters
+    ----------
+    report : Report
+
+    Returns
+    -------
+    list of str
+        Empty where there is no pooled value and not just one cluster.
+
+    Examples
+    --------
+    >>> from importlib.resources import files
+    >>> import perrin
+    >>> report = perrin.analyze(str(files("perrin") / "data" / "demo_tracks.csv.gz"), dt=0.73)
+    >>> answer_lines(report)[0][:61]
+    'The cluster of 4 particles rotates with D_R = 0.0051(4) rad²/'
+    """
+    several = len(report.results) > 1
+    source: ClusterResult | RodResult | Pooled | None = report.pooled
+    if not several and report.results:
+        source = report.results[0]
+    lines = []
+    if source is not None:
+        count = len(report.pooled.clusters) if several and report.pooled is not None else 1
+        many = f"The {count} clusters {{}} with a common {{}}"
+        one = f"The cluster of {_particles(report)} particles {{}} with {{}}"
+        turn = "D_perp" if hasattr(source, "D_perp") else "D_R"
+        for name, verbs in ((turn, ("rotate", "rotates")), ("D_T", ("move", "moves"))):
+            text = _value_sentence(name, getattr(source, name))
+            if text:
+                lines.append(many.format(verbs[0], text) if several else one.format(verbs[1], text))
+    if several and report.pooled is not None:
+        lines += _agreement(report.pooled)
+    return lines + _predictions(report)
+
+
+def _particles(report: Report) -> int:
+    """Return the number of particles of the first cluster."""
+    return int(report.results[0].to_dict()["n_particles"])
+
+
+def _value_sentence(name: str, estimate: DiffusionEstimate) -> str:
+    """Return the value with its interval and the times at which it holds; empty without one."""
+    if estimate.absent_because is not None:
+        return ""
+    sign = "= " if estimate.resolved else ""
+    interval = f"95 % interval {interval_text(estimate.ci95)} {unit_text(estimate.unit)}"
+    limit = "" if estimate.resolved else "an upper limit, "
+    when = f", which {estimate.time_scale}" if estimate.time_scale else ""
+    return f"{name} {sign}{value_text(estimate)} ({limit}{interval}){when}."
+
+
+def _agreement(pooled: Pooled) -> list[str]:
+    """Return whether the clusters have the same coefficients."""
+    lines = []
+    for name, estimate in (("D_R", pooled.D_R), ("D_T", pooled.D_T)):
+        p = estimate.p_same
+        if p is None:
+            continue
+        chance = f"equal values would scatter as much as these with probability {number_text(p)}"
+        if p < _DIFFERENT:
+            lines.append(f"The clusters differ in {name}: {chance}. No cluster need have the mean.")
+        else:
+            lines.append(f"The clusters agree in {name}: {chance}.")
+    return lines
+
+
+def _predictions(report: Report) -> list[str]:
+    """Return how the measured coefficients compare with the predicted ones."""
+    compared: dict[str, list[Compared]] = {}
+    for result in report.results:
+        for name in ("D_R", "D_perp", "D_T") if result.prediction is not None else ():
+            one = getattr(result.prediction, name)
+            if one is not None and np.isfinite(one.pull):
+                compared.setdefault(name, []).append(one)
+    lines = []
+    for name, found in compared.items():
+        if len(found) == 1:
+            (one,) = found
+            unit = "µm²/s" if name == "D_T" else "rad²/s"
+            side = "above" if one.pull > 0 else "below"
+            agrees = "agrees with" if abs(one.pull) < _FAR_PULL else "differs from"
+            lines.append(
+                f"The measured {name} {agrees} the prediction {number_text(one.predicted)} {unit}: "
+                f"it is {abs(one.pull):.1f} standard errors {side}."
+            )
+            continue
+        far = sum(abs(one.pull) > _FAR_PULL for one in found)
+        lines.append(
+            f"{name} of {far} of {len(found)} clusters is over two standard errors from its "
+            f"prediction; {0.0455 * len(found):.2g} are expected by chance."
+        )
+    return lines
 
 
 def verdict_lines(report: Report) -> dict[str, list[str]]:

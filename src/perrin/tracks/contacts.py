@@ -70,6 +70,7 @@ def lasting_contacts(
     reach: float,
     variance: Floats,
     error: float | None = None,
+    scan: float = 0.0,
 ) -> Contacts:
     """Find the contacts of spheres that last longer than diffusion allows.
 
@@ -85,6 +86,9 @@ def lasting_contacts(
         Variance of one coordinate of the step over one frame of each track, um^2, by its number.
     error : float, optional
         Stated standard error of one coordinate, um.
+    scan : float
+        Share of the time between frames that passes between the recordings of two touching spheres:
+        the body moves meanwhile, and their distance has the variance of that part of a step.
 
     Returns
     -------
@@ -122,7 +126,8 @@ def lasting_contacts(
     pair, one, two = shared_rows(time, code, first, second)
     distance = np.linalg.norm(x[one] - x[two], axis=1)
     if error:
-        errors = np.sqrt(2) * error * np.array(_ERROR_FACTORS)
+        moved = scan * float(np.median(variance))
+        errors = np.sqrt(2 * (error * np.array(_ERROR_FACTORS)) ** 2 + moved)
         variance = np.maximum(variance - 2 * error**2, _LEAST_STEP_SHARE * variance)
     else:
         errors = reach * np.array(_ERROR_SHARES)

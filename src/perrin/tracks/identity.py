@@ -38,6 +38,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from perrin._arrays import Bools, Floats, Ints, as_positions, from_plain, frozen, present, to_plain
+from perrin._display import Shown
 from perrin._text import frames_text
 from perrin.errors import IdentityWarning
 from perrin.geometry.rigid import degrees_of_freedom
@@ -79,8 +80,8 @@ _ROUNDING_ANGLE = 1e-6  # rotations by less than this, rad, are rounding errors
 _CLOSE_FIT, _ROTATION_STRIDE = 0.1, 5
 
 
-@dataclass(frozen=True, eq=False)
-class Identity:
+@dataclass(frozen=True, eq=False, repr=False)
+class Identity(Shown):
     """Which column of an array of detections holds which particle, row by row.
 
     Attributes

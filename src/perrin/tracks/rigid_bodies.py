@@ -83,13 +83,13 @@ class IdentifiedBodies(NamedTuple):
 
 
 def identify_bodies(
-    frame: Ints, x: Floats, *, contact: float, error: float | None = None
+    frame: Ints, x: Floats, *, contact: float, error: float | None = None, scan: float = 0.0
 ) -> IdentifiedBodies:
     """Find rigid bodies of all sizes, and which detection is which sphere of each.
 
     Parameters
     ----------
-    frame, x, contact, error
+    frame, x, contact, error, scan
         As in `rigid_bodies`.
 
     Returns
@@ -113,7 +113,7 @@ def identify_bodies(
     >>> found.size.tolist(), np.bincount(found.particle).tolist()
     ([3], [30, 30, 30])
     """
-    found = rigid_bodies(frame, x, contact=contact, error=error)
+    found = rigid_bodies(frame, x, contact=contact, error=error, scan=scan)
     body = found.body.copy()
     particle, piece = np.full(len(x), -1, dtype=np.int64), np.zeros(len(x), dtype=np.int64)
     for b, size in enumerate(found.size.tolist()):
@@ -180,7 +180,7 @@ class _Members(NamedTuple):
 
 
 def rigid_bodies(
-    frame: Ints, x: Floats, *, contact: float, error: float | None = None
+    frame: Ints, x: Floats, *, contact: float, error: float | None = None, scan: float = 0.0
 ) -> RigidBodies:
     """Find the groups of touching spheres that move as rigid bodies.
 
@@ -194,6 +194,8 @@ def rigid_bodies(
         Centre distance of touching spheres, um.
     error : float, optional
         Stated standard error of one coordinate, um.
+    scan : float
+        Share of the time between frames that passes between the recordings of two touching spheres.
 
     Returns
     -------
@@ -224,7 +226,7 @@ def rigid_bodies(
     variance = max(variance, (_SURE_STEP * contact) ** 2 / _BODY_GATE)
     track = link_spheres(frame, x, variance=variance)
     reach, own = TOUCHING_REACH * contact, track_variances(frame, track, x)
-    contacts = lasting_contacts(frame, track, x, reach=reach, variance=own, error=error)
+    contacts = lasting_contacts(frame, track, x, reach=reach, variance=own, error=error, scan=scan)
     body = np.full(len(x), -1, dtype=np.int64)
     if not contacts.one.size:
         return RigidBodies(body, np.empty(0, dtype=np.int64), track)

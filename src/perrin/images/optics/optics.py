@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from perrin._arrays import to_plain
+from perrin._display import Shown
 from perrin.images.optics.ball_image import SphereImage, sphere_image
 
 if TYPE_CHECKING:
@@ -64,8 +65,8 @@ class CameraNoise(NamedTuple):
         return cls(entry["gain"], entry["floor"])
 
 
-@dataclass(frozen=True)
-class Optics:
+@dataclass(frozen=True, repr=False)
+class Optics(Shown):
     """The image of a sphere: its size, the point spread, and the noise.
 
     Attributes

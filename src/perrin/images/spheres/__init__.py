@@ -1,8 +1,8 @@
 """Positions of the spheres and poses of the clusters of a stack."""
 
 from perrin.images.spheres.by_trackpy import Features, find_features, refine_by_trackpy
+from perrin.images.spheres.circles import circle_cut, find_circles
 from perrin.images.spheres.localisation import (
-    NO_FLAT_MODEL,
     LocatedFrame,
     Method,
     SampledFrame,
@@ -20,9 +20,17 @@ from perrin.images.spheres.localisation import (
     size_faults,
     with_crowds,
 )
+from perrin.images.spheres.planar import (
+    PlaneFit,
+    fit_plane,
+    fitted_together,
+    learn_plane,
+    plane_columns,
+)
 from perrin.images.spheres.poses import Pose, fit_pose, pose_in, start_of, with_poses
 from perrin.images.spheres.spots import (
     Spots,
+    SpotSettings,
     at_contact,
     groups_and_crowds,
     mass_cut,
@@ -30,28 +38,35 @@ from perrin.images.spheres.spots import (
 )
 
 __all__ = [
-    "NO_FLAT_MODEL",
     "Features",
     "LocatedFrame",
     "Method",
+    "PlaneFit",
     "Pose",
     "SampledFrame",
     "Search",
+    "SpotSettings",
     "Spots",
     "StackLike",
     "at_contact",
     "check_search",
     "choose_method",
+    "circle_cut",
+    "find_circles",
     "find_features",
     "fit_optics",
+    "fit_plane",
     "fit_pose",
+    "fitted_together",
     "found_table",
     "frame_digest",
     "group_columns",
     "groups_and_crowds",
     "is_flat",
+    "learn_plane",
     "locate",
     "mass_cut",
+    "plane_columns",
     "pose_in",
     "refine_by_trackpy",
     "sample_frames",

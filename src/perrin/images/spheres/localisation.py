@@ -30,6 +30,8 @@ from perrin.images.optics.learn import (
 )
 from perrin.images.optics.window_fit import FreeCenters, fit_window
 from perrin.images.spheres.by_trackpy import Features, find_features, refine_by_trackpy
+from perrin.images.spheres.circles import circle_cut, find_circles
+from perrin.images.spheres.planar import learn_plane, plane_columns
 from perrin.images.spheres.spots import (
     SPOT_KEYWORDS,
     Fading,
@@ -52,6 +54,7 @@ if TYPE_CHECKING:
     from perrin._arrays import Bools, Ints
     from perrin.images.optics.ball_image import SphereImage
     from perrin.images.optics.optics import CameraNoise, Optics
+    from perrin.images.optics.radial_image import RadialImage
     from perrin.images.optics.window_fit import ImageFit, Window
 
     Columns: TypeAlias = dict[str, NDArray[Any]]
@@ -60,8 +63,8 @@ if TYPE_CHECKING:
 Refine = Literal["model", "trackpy"] | None
 _Voxel = tuple[float, float, float]
 
-# Number of frames from which the mass cut and the optics are learned.
-_LEARNING_FRAMES = 5
+# Number of frames from which the mass cut and the optics are learned, and of those of a plane.
+_LEARNING_FRAMES, _LEARNING_PLANES = 5, 15
 
 # Number of groups of spheres, or of pieces of crowds, from which the optics are learned.
 _LEARNING_GROUPS, _LEARNING_CROWDS = 15, 2
@@ -84,11 +87,6 @@ _NOT_CONVERGED, _MOVED, _DARK = (
     "fit did not settle",
     "moved over half a radius",
     "no light of its own",
-)
-
-NO_FLAT_MODEL = (
-    "the model of the image is that of a volume; in this 2-D movie places are filtered centroids: "
-    "pass refine=None, or refine='trackpy' where spheres touch"
 )
 
 
@@ -127,6 +125,8 @@ class Search:
         Spheres that the border of the stack cuts are located too.
     crowds : bool
         Spheres in chains of over 16 are refined too.
+    circles : bool
+        Spots are centres of circular symmetry, bright or dark: in a 2-D movie for the model.
 
     Examples
     --------
@@ -141,9 +141,13 @@ class Search:
     minmass: float | None = None
     border: bool = True
     crowds: bool = False
+    circles: bool = False
 
     def spots(self, frame: Floats, voxel: _Voxel) -> Features:
         """Return the spots of a frame, noise among them."""
+        if self.circles:
+            margin = 0.0 if self.border else self.diameter / 2
+            return find_circles(frame[0], contact=self.contact, pixel=voxel[1:], margin=margin)
         return find_features(
             frame,
             diameter=self.diameter,
@@ -218,6 +222,8 @@ class Method:
         Brightness that the mass cut follows; None is the same cut in all frames.
     usual : UsualImage or None
         What the images of the spheres have in common; None accepts every image.
+    radial : RadialImage or None
+        The image of a sphere of a 2-D movie for refinement by the model.
     """
 
     search: Search
@@ -225,6 +231,7 @@ class Method:
     optics: Optics | None = None
     fading: Fading | None = None
     usual: UsualImage | None = None
+    radial: RadialImage | None = None
 
     def spheres(self, spots: Features, frame: int) -> Features:
         """Return the spots of a frame that pass the mass cut."""
@@ -254,7 +261,11 @@ class Method:
         frame = _finite_frame(data, i)
         spots = self.search.spots(frame, voxel)
         found = self.spheres(spots, i)
-        if self.refine == "model":
+        if self.radial is not None:
+            columns = plane_columns(
+                frame[0], found, contact=self.search.contact, image=self.radial, pixel=voxel[1:]
+            )
+        elif self.refine == "model":
             light = 1.0 if self.fading is None else self.fading.at(i, found.centers)
             columns, crowds = group_columns(
                 frame, found, self.search, self.optics, voxel, usual=self.usual, light=light
@@ -298,7 +309,8 @@ def sample_frames(stack: StackLike, search: Search, frames: Sequence[int]) -> li
     """
     sample = []
     fault: FrameError | None = None
-    for k in _evenly_spaced(len(frames), _LEARNING_FRAMES):
+    most = _LEARNING_PLANES if search.circles else _LEARNING_FRAMES
+    for k in _evenly_spaced(len(frames), most):
         try:
             data = np.asarray(stack.frame(frames[k]))
             spots = search.spots(_finite_frame(data, frames[k]), _voxel_size(stack))
@@ -343,6 +355,17 @@ def choose_method(
     PrecisionWarning
         As in `mass_cut`.
     """
+    if search.circles:
+        if search.minmass is None:
+            masses = [sampled.spots.mass for sampled in sample]
+            search = replace(search, minmass=circle_cut(np.concatenate([np.empty(0), *masses])))
+        radial = learn_plane(
+            [np.asarray(sampled.frame[0], dtype=np.float64) for sampled in sample],
+            [search.spheres(sampled.spots).centers[:, 1:] for sampled in sample],
+            contact=search.contact,
+            pixel=_voxel_size(stack)[1:],
+        )
+        return Method(search, refine, radial=radial)
     fading = None
     if search.minmass is None:
         fading = find_fading([seen.number for seen in sample], [seen.spots for seen in sample])
@@ -461,12 +484,16 @@ def locate(
     faults: list[str] = []
     spots = options_from(Spots, spots, settings, name="spots", faults=faults)
     search = Search(
-        diameter, contact, spots.dark, spots.percentile, spots.minmass, spots.border, crowds
+        diameter=diameter,
+        contact=contact,
+        dark=spots.dark,
+        percentile=spots.percentile,
+        minmass=spots.minmass,
+        border=spots.border,
+        crowds=crowds,
+        circles=refine == "model" and is_flat(stack),
     )
     check_search(stack, search, refine, optics=optics, faults=faults)
-    if refine == "model" and is_flat(stack):
-        refine = None
-        warnings.warn(NO_FLAT_MODEL, PrecisionWarning, stacklevel=2)
     n_frames = stack.shape[0]
     numbers = list(range(n_frames)) if frames is None else [int(i) for i in frames]
     outside = [i for i in numbers if not 0 <= i < n_frames]
@@ -856,6 +883,11 @@ def check_search(
             "overlap; are the two exchanged?"
         )
     faults += number_fault("percentile", search.percentile, least=0, below=100)
+    if search.circles and optics is not None:
+        faults.append(
+            "optics: those of a volume do not describe a 2-D movie, whose image of a sphere is "
+            "learned: leave optics out"
+        )
     if not lengths and len(stack.shape) == 4:
         faults += size_faults(stack, search, optics)
     refuse(faults)

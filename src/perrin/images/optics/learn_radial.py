@@ -1,0 +1,387 @@
+"""The radial image of a sphere and the camera's noise, learned from the frames of a plane."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from perrin.errors import NoSpheresError
+from perrin.images.optics.learn import photon_transfer
+from perrin.images.optics.optics import CameraNoise
+from perrin.images.optics.radial_image import (
+    Patch,
+    PatchFit,
+    RadialImage,
+    cut_patch,
+    fit_patch,
+    spline_design,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from perrin._arrays import Floats
+
+
+# Distances of the knots and ends of the image that are tried, in contact distances.
+_SPACINGS, _REACHES = (0.05, 0.03, 0.08, 0.12), (0.8, 0.65, 1.1)
+
+# Number of samples with which knots and ends are compared.
+_COMPARED = 20
+
+# Standard errors by which chi-squared of other spheres must be lower with more coefficients.
+_CLEARLY_BETTER = 1.0
+
+_MAX_ROUNDS = 20
+
+# Median brightness of spheres in its standard errors, and the round from which it is required.
+_LEAST_SIGNIFICANCE, _JUDGED = 4.0, 2
+
+# The search ends where a step is this far in squared standard errors, for each coefficient.
+_SETTLED = 0.01
+
+# Largest such step after the last round that is a failure.
+_UNSETTLED = 1.0
+
+# Brightness below which a spot is no sphere, over the median of the spheres.
+LEAST_BRIGHTNESS = 0.3
+
+# Least number of pixels for each coefficient of the image.
+_PIXELS_PER_COEFFICIENT = 10
+
+
+class RadialSample(NamedTuple):
+    """Spheres of one frame from which the image is learned, all those near them included.
+
+    Attributes
+    ----------
+    frame : ndarray, shape (ny, nx)
+        Grey levels.
+    centers, others : ndarray, shape (n, 2), (m, 2)
+        Positions (y, x) of these spheres, and of spheres whose pixels are not used, um.
+    """
+
+    frame: Floats
+    centers: Floats
+    others: Floats
+
+    def patch(self, surroundings: float, reach: float, pixel: tuple[float, float]) -> Patch:
+        """Return the pixels of the surroundings that no other sphere reaches."""
+        patch = cut_patch(self.frame, self.centers, reach=surroundings, pixel=pixel)
+        if not len(self.others):
+            return patch
+        free = (patch.offsets(self.others)[1] > reach).all(axis=0)
+        return Patch(
+            patch.place[:, free], patch.data[free], patch.background[:, free], patch.pixel[:, free]
+        )
+
+
+class _Equations(NamedTuple):
+    """Information on the coefficients of the image and its score, from one fit."""
+
+    information: Floats
+    score: Floats
+
+
+def _equations(patch: Patch, fit: PatchFit, image: RadialImage) -> _Equations:
+    """Return what a fit says on the coefficients, its own parameters eliminated (Schur)."""
+    distance = patch.offsets(fit.centers)[1]
+    k = len(image.coefficients)
+    design = np.tensordot(fit.brightness, spline_design(distance, spacing=image.spacing, k=k), 1)
+    weighted = design * fit.weight
+    shared = (fit.jacobian * fit.weight) @ design.T
+    taken = np.linalg.lstsq(fit.information, shared, rcond=1e-12)[0]
+    residual = patch.data - fit.expected
+    score = weighted @ residual - taken.T @ ((fit.jacobian * fit.weight) @ residual)
+    return _Equations(weighted @ design.T - shared.T @ taken, score)
+
+
+def _brightness_error(fit: PatchFit) -> Floats:
+    """Return the standard errors (n,) of the brightness of the spheres of a fit."""
+    n = len(fit.centers)
+    return np.asarray(np.sqrt(np.maximum(np.diag(fit.covariance)[2 * n : 3 * n], 1e-300)))
+
+
+def noise_of_neighbours(patches: Sequence[Patch], fits: Sequence[PatchFit]) -> CameraNoise:
+    """Return the camera's noise from the differences of neighbouring pixels.
+
+    The residuals of a wrong image vary slowly, so that their differences show the noise alone, and
+    chi-squared shows the wrong image.
+
+    Parameters
+    ----------
+    patches : sequence of Patch
+    fits : sequence of PatchFit
+
+    Returns
+    -------
+    CameraNoise
+    """
+    means, squares = [], []
+    for patch, fit in zip(patches, fits, strict=True):
+        residual = patch.data - fit.expected
+        beside = (np.diff(patch.pixel[0]) == 0) & (np.diff(patch.pixel[1]) == 1)
+        means.append(((fit.expected[1:] + fit.expected[:-1]) / 2)[beside])
+        squares.append((np.diff(residual) ** 2 / 2)[beside])
+    return photon_transfer(np.concatenate(means), np.concatenate(squares))
+
+
+def first_image(
+    samples: Sequence[RadialSample], *, spacing: float, reach: float, pixel: tuple[float, float]
+) -> RadialImage:
+    """Return the image of least squares for spheres of equal brightness at their first positions.
+
+    Parameters
+    ----------
+    samples : sequence of RadialSample
+    spacing, reach : float
+        Distance of the knots, and about the end of the image, um.
+    pixel : tuple of float
+        Pixel size (y, x), um.
+
+    Returns
+    -------
+    RadialImage
+    """
+    k = max(round(reach / spacing) - 1, 3)
+    information, score, square, count = np.zeros((k, k)), np.zeros(k), 0.0, 0
+    for sample in samples:
+        patch = sample.patch(spacing * (k + 1), spacing * (k + 1), pixel)
+        distance = patch.offsets(sample.centers)[1]
+        design = spline_design(distance, spacing=spacing, k=k).sum(axis=0)
+        # Without the part that the background explains.
+        basis = np.linalg.qr(patch.background.T)[0]
+        design, data = (a - (a @ basis) @ basis.T for a in (design, patch.data))
+        information += design @ design.T
+        score += design @ data
+        square, count = square + float(data @ data), count + len(data)
+    bend = np.diff(np.eye(k + 2), 2, axis=0)[:, :k]
+    ridge = 1e-4 * np.trace(information) / k * bend.T @ bend
+    coefficients = np.linalg.solve(information + ridge, score)
+    mean = square / max(count, 1)
+    return RadialImage(spacing, coefficients, CameraNoise(0.0, mean))
+
+
+def settled_image(
+    samples: Sequence[RadialSample], image: RadialImage, *, pixel: tuple[float, float]
+) -> tuple[RadialImage, list[RadialSample], float]:
+    """Return the image of greatest likelihood and the samples with fitted positions.
+
+    Parameters
+    ----------
+    samples : sequence of RadialSample
+    image : RadialImage
+        The image at the start.
+    pixel : tuple of float
+        Pixel size (y, x), um.
+
+    Returns
+    -------
+    image : RadialImage
+        For spheres of mean brightness.
+    samples : list of RadialSample
+        Without spots that have less than 0.3 of the median brightness.
+    step : float
+        The last step in squared standard errors, for each coefficient.
+
+    Notes
+    -----
+    Gauss-Newton steps in the coefficients, with every sphere's position and brightness and every
+    background eliminated exactly (the Schur complement of the information).
+    """
+    samples, step = list(samples), np.inf
+    for k in range(_MAX_ROUNDS):
+        patches = [s.patch(image.surroundings, image.reach, pixel) for s in samples]
+        enough = [
+            p.has_enough_pixels(len(s.centers)) for p, s in zip(patches, samples, strict=True)
+        ]
+        samples = [s for s, good in zip(samples, enough, strict=True) if good]
+        patches = [p for p, good in zip(patches, enough, strict=True) if good]
+        if sum(len(p.data) for p in patches) < _PIXELS_PER_COEFFICIENT * len(image.coefficients):
+            return image, samples, np.inf
+        fits = [fit_patch(p, image, s.centers) for p, s in zip(patches, samples, strict=True)]
+        noise = noise_of_neighbours(patches, fits)
+        parts = [_equations(p, f, image) for p, f in zip(patches, fits, strict=True)]
+        information = np.sum([e.information for e in parts], axis=0)
+        score = np.sum([e.score for e in parts], axis=0)
+        change = np.linalg.lstsq(information, score, rcond=1e-10)[0]
+        step = float(change @ score) / len(score)
+        brightness = np.concatenate([f.brightness for f in fits])
+        typical = float(np.median(brightness))
+        error = np.concatenate([_brightness_error(f) for f in fits])
+        if k >= _JUDGED and not np.median(brightness / error) > _LEAST_SIGNIFICANCE:
+            return image, samples, np.inf
+        image = replace(image, coefficients=(image.coefficients + change) * typical, noise=noise)
+        kept = [f.brightness > LEAST_BRIGHTNESS * typical for f in fits]
+        samples = [
+            s._replace(centers=f.centers[good])
+            for s, f, good in zip(samples, fits, kept, strict=True)
+            if good.any()
+        ]
+        if step < _SETTLED and k > 0:
+            break
+    return image, samples, step
+
+
+def held_out_misfit(
+    samples: Sequence[RadialSample],
+    image: RadialImage,
+    *,
+    reach: float,
+    pixel: tuple[float, float],
+    noise: CameraNoise,
+) -> Floats:
+    """Return chi-squared of each sample that an image was not learned from, within a reach.
+
+    Parameters
+    ----------
+    samples : sequence of RadialSample
+    image : RadialImage
+    reach : float
+        Distance from the spheres of the pixels that are compared, um.
+    pixel : tuple of float
+        Pixel size (y, x), um.
+    noise : CameraNoise
+        The noise, the same for all images that are compared.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+    """
+    out = []
+    for sample in samples:
+        patch = sample.patch(reach, reach, pixel)
+        fit = fit_patch(patch, replace(image, noise=noise), sample.centers)
+        out.append(fit.weight @ (patch.data - fit.expected) ** 2)
+    return np.array(out)
+
+
+def _simplest_of_best(tried: dict[tuple[float, float], Floats]) -> tuple[float, float]:
+    """Return the spacing and reach of fewest coefficients that are not clearly worse than the best.
+
+    The samples are the same for all, so that the error of a difference is that of its own spread.
+    """
+    best = min(tried.values(), key=lambda chi2: float(chi2.sum()))
+    good = []
+    for pair, chi2 in tried.items():
+        worse = chi2 - best
+        error = float(np.std(worse)) * np.sqrt(len(worse))
+        if worse.sum() <= _CLEARLY_BETTER * error:
+            good.append(pair)
+    return min(good, key=lambda pair: pair[1] / pair[0])
+
+
+def learn_image(
+    samples: Sequence[RadialSample], *, contact: float, pixel: tuple[float, float]
+) -> tuple[RadialImage, list[RadialSample]]:
+    """Learn the image of a sphere; knots and end are those that predict other spheres best.
+
+    Parameters
+    ----------
+    samples : sequence of RadialSample
+        Spheres at the positions found first.
+    contact : float
+        Centre distance of touching spheres, um.
+    pixel : tuple of float
+        Pixel size (y, x), um.
+
+    Returns
+    -------
+    image : RadialImage
+    samples : list of RadialSample
+        With fitted positions.
+
+    Raises
+    ------
+    NoSpheresError
+        Where there are too few spheres, the search does not converge, or their brightness is less
+        than four of its standard errors.
+    """
+    widest = max(_REACHES) * contact
+    samples = [
+        s for s in samples if s.patch(widest, widest, pixel).has_enough_pixels(len(s.centers))
+    ]
+    chosen, noise = (_SPACINGS[0], _REACHES[0]), None
+    tried: dict[tuple[float, float], Floats] = {}
+    failed: set[tuple[float, float]] = set()
+    apart = max(len(samples) // _COMPARED, 1)
+    halves = [samples[:: 2 * apart], samples[apart :: 2 * apart]]
+    for turn in range(4 if halves[1] else 0):
+        # By turns another distance of the knots and another end.
+        options = _SPACINGS if turn % 2 else _REACHES
+        for option in options:
+            pair = (option, chosen[1]) if turn % 2 else (chosen[0], option)
+            if pair in tried or pair in failed:
+                continue
+            spacing, reach = pair[0] * contact, pair[1] * contact
+            image = first_image(halves[0], spacing=spacing, reach=reach, pixel=pixel)
+            image, fitted, step = settled_image(halves[0], image, pixel=pixel)
+            failed.add(pair)
+            if step < _UNSETTLED:
+                if noise is None:
+                    # Later searches begin at the positions of the first.
+                    noise, halves[0] = image.noise, fitted
+                    halves[1] = settled_image(halves[1], image, pixel=pixel)[1]
+                tried[pair] = held_out_misfit(
+                    halves[1], image, reach=widest, pixel=pixel, noise=noise
+                )
+        chosen = _simplest_of_best(tried) if tried else chosen
+    spacing, reach = chosen[0] * contact, chosen[1] * contact
+    step = np.inf
+    if samples and (tried or not halves[1]):
+        image = first_image(samples, spacing=spacing, reach=reach, pixel=pixel)
+        image, samples, step = settled_image(samples, image, pixel=pixel)
+    if not step < _UNSETTLED:
+        raise NoSpheresError(
+            f"the image of a sphere cannot be learned from {sum(len(s.centers) for s in samples)} "
+            "spots of this 2-D movie: do the spheres exceed the noise, have they one circular "
+            "image of one size, and is contact right? refine=None finds filtered centroids"
+        )
+    return image, samples
+
+
+def size_spread(
+    samples: Sequence[RadialSample], image: RadialImage, *, pixel: tuple[float, float]
+) -> tuple[float, float]:
+    """Return the spread of the sizes of the images of spheres, relative, and its standard error.
+
+    Parameters
+    ----------
+    samples : sequence of RadialSample
+    image : RadialImage
+    pixel : tuple of float
+        Pixel size (y, x), um.
+
+    Returns
+    -------
+    spread, stderr : float
+        Root of the variance of the logarithm of the size, less that of the noise.
+
+    Notes
+    -----
+    One step of Gauss-Newton in a size of its own for every sphere, together with all parameters
+    of its fit.
+    """
+    sizes, variances = [], []
+    for sample in samples:
+        patch = sample.patch(image.surroundings, image.reach, pixel)
+        if not patch.has_enough_pixels(2 * len(sample.centers)):
+            continue
+        fit = fit_patch(patch, image, sample.centers)
+        distance = patch.offsets(fit.centers)[1]
+        slope = image.value_and_slope(distance)[1]
+        design = np.concatenate([-fit.brightness[:, None] * slope * distance, fit.jacobian])
+        weighted = design * fit.weight
+        covariance = np.linalg.pinv(weighted @ design.T, hermitian=True)
+        n = len(fit.centers)
+        sizes.append((covariance @ (weighted @ (patch.data - fit.expected)))[:n])
+        variances.append(np.diag(covariance)[:n])
+    if not sizes:
+        return 0.0, np.inf
+    size, variance = np.concatenate(sizes), np.concatenate(variances)
+    excess = float(np.mean(size**2 - variance))
+    error = float(np.std(size**2 - variance)) / np.sqrt(len(size))
+    spread = np.sqrt(max(excess, 0.0))
+    return spread, error / max(2 * spread, np.sqrt(error), 1e-12)
