@@ -381,7 +381,7 @@ def size_spread(
     if not sizes:
         return 0.0, np.inf
     size, variance = np.concatenate(sizes), np.concatenate(variances)
-    excess = float(np.mean(size**2 - variance))
-    error = float(np.std(size**2 - variance)) / np.sqrt(len(size))
+    square = (size - size.mean()) ** 2 - variance
+    excess, error = float(square.mean()), float(square.std()) / np.sqrt(len(size))
     spread = np.sqrt(max(excess, 0.0))
     return spread, error / max(2 * spread, np.sqrt(error), 1e-12)
