@@ -28,8 +28,11 @@ if TYPE_CHECKING:
 # Distances of the knots and ends of the image that are tried, in contact distances.
 _SPACINGS, _REACHES = (0.05, 0.03, 0.08, 0.12), (0.8, 0.65, 1.1)
 
+# Least distance of the knots, pixels.
+_LEAST_SPACING = 0.4
+
 # Number of samples with which knots and ends are compared.
-_COMPARED = 20
+_COMPARED = 40
 
 # Standard errors by which chi-squared of other spheres must be lower with more coefficients.
 _CLEARLY_BETTER = 1.0
@@ -299,7 +302,7 @@ def learn_image(
         Where there are too few spheres, the search does not converge, or their brightness is less
         than four of its standard errors.
     """
-    widest = max(_REACHES) * contact
+    widest, least = max(_REACHES) * contact, _LEAST_SPACING * min(pixel)
     samples = [
         s for s in samples if s.patch(widest, widest, pixel).has_enough_pixels(len(s.centers))
     ]
@@ -315,7 +318,7 @@ def learn_image(
             pair = (option, chosen[1]) if turn % 2 else (chosen[0], option)
             if pair in tried or pair in failed:
                 continue
-            spacing, reach = pair[0] * contact, pair[1] * contact
+            spacing, reach = max(pair[0] * contact, least), pair[1] * contact
             image = first_image(halves[0], spacing=spacing, reach=reach, pixel=pixel)
             image, fitted, step = settled_image(halves[0], image, pixel=pixel)
             failed.add(pair)
@@ -328,7 +331,7 @@ def learn_image(
                     halves[1], image, reach=widest, pixel=pixel, noise=noise
                 )
         chosen = _simplest_of_best(tried) if tried else chosen
-    spacing, reach = chosen[0] * contact, chosen[1] * contact
+    spacing, reach = max(chosen[0] * contact, least), chosen[1] * contact
     step = np.inf
     if samples and (tried or not halves[1]):
         image = first_image(samples, spacing=spacing, reach=reach, pixel=pixel)

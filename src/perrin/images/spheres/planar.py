@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 _MOST_TOGETHER = 12
 
 # Number of groups of spheres from which the image is learned.
-_LEARNING_GROUPS = 40
+_LEARNING_GROUPS = 80
 
 # Most fits of a group, between which those of its neighbours change, and the change of a position
 # over the distance of the knots at which they end.
