@@ -31,8 +31,8 @@ _SPACINGS, _REACHES = (0.05, 0.03, 0.08, 0.12), (0.8, 0.65, 1.1)
 # Least distance of the knots, pixels.
 _LEAST_SPACING = 0.4
 
-# Number of samples with which knots and ends are compared.
-_COMPARED = 40
+# Number of samples above which knots and ends are compared with half of them.
+_COMPARED = 20
 
 # Standard errors by which chi-squared of other spheres must be lower with more coefficients.
 _CLEARLY_BETTER = 1.0
@@ -309,7 +309,7 @@ def learn_image(
     chosen, noise = (_SPACINGS[0], _REACHES[0]), None
     tried: dict[tuple[float, float], Floats] = {}
     failed: set[tuple[float, float]] = set()
-    apart = max(len(samples) // _COMPARED, 1)
+    apart = 2 if len(samples) > _COMPARED else 1
     halves = [samples[:: 2 * apart], samples[apart :: 2 * apart]]
     for turn in range(4 if halves[1] else 0):
         # By turns another distance of the knots and another end.

@@ -33,7 +33,10 @@ if TYPE_CHECKING:
 _MOST_TOGETHER = 12
 
 # Number of groups of spheres from which the image is learned.
-_LEARNING_GROUPS = 80
+_LEARNING_GROUPS = 40
+
+# Contact distance in pixels below which twice as many are used, as each shows less.
+_SMALL_SPHERES = 8
 
 # Most fits of a group, between which those of its neighbours change, and the change of a position
 # over the distance of the knots at which they end.
@@ -129,7 +132,8 @@ def learn_plane(
         for frame, centers in zip(frames, places, strict=True)
         for group in fitted_together(centers, contact=contact)
     ]
-    chosen = np.unique(np.linspace(0, len(samples) - 1, _LEARNING_GROUPS).round().astype(int))
+    most = _LEARNING_GROUPS * (2 if contact < _SMALL_SPHERES * min(pixel) else 1)
+    chosen = np.unique(np.linspace(0, len(samples) - 1, most).round().astype(int))
     samples = [samples[k] for k in chosen] if samples else []
     image, samples = learn_image(samples, contact=contact, pixel=pixel)
     # Fine knots can follow steps of several sizes, so that no size alone would fit better.
