@@ -128,7 +128,7 @@ def test_demo_writes_a_whole_run_folder(demo):
     names = {p.name for p in demo[0].iterdir()}
     assert names == {
         "summary.json", "tracks.parquet", "motion.parquet", "curves.csv", "figures",
-        "report.html", "run.json", "run.toml", "demo-tracks.csv",
+        "report.html", "run.json", "run.toml", "demo-tracks.csv", "results.csv",
     }  # fmt: skip
     assert list((demo[0] / "figures").glob("*.png"))
     assert [p.name for p in demo[0].parent.iterdir()] == ["perrin-demo"]
@@ -866,8 +866,8 @@ def test_progress_in_a_log_is_a_line_for_each_tenth():
             show(done, 40, "fitting clusters")
         show(0, 0, "writing the report")
     lines = stream.getvalue().splitlines()
-    assert lines[0] == "fitting clusters: 10 % (7 of 40), 2 s"
+    assert lines[0] == "fitting clusters: 20 % (8 of 40), 2 s"
     assert [line.split(":")[1].split("%")[0] for line in lines[1:-1]] == [
-        f" {10 * k} " for k in range(2, 11)
+        f" {10 * k} " for k in range(3, 11)
     ]
     assert lines[-1].startswith("writing the report, ")

@@ -216,8 +216,7 @@ def learned(rings):
     return image, places
 
 
-@pytest.mark.parametrize("image", [disc, ring])
-def test_touching_spheres_of_a_plane_come_back_within_their_errors(image):
+def test_touching_discs_come_back_within_their_errors():
     """All found, no others; squared errors are those stated, and distances are those of contact.
 
     Of 60 coordinates the mean square has a standard error of sqrt(2/60) = 18 %, of 24 distances
@@ -225,7 +224,7 @@ def test_touching_spheres_of_a_plane_come_back_within_their_errors(image):
     """
     rng = np.random.default_rng(5)
     places = chains(6, rng)
-    table = located(drawn(places, image, rng))
+    table = located(drawn(places, disc, rng))
     assert table["refined"].all()
     error = off(table, places)
     square = np.mean((error / table[["sigma_x", "sigma_y"]].to_numpy()) ** 2)
@@ -238,6 +237,20 @@ def test_touching_spheres_of_a_plane_come_back_within_their_errors(image):
         lengths += away[away < 1.3 * CONTACT].tolist()
     assert len(lengths) == 4 * len(places)
     assert np.mean(lengths) == pytest.approx(CONTACT, rel=0.004)
+
+
+def test_touching_rings_come_back_within_their_errors(rings, learned):
+    """Bright-field rings: squared errors are those stated, within 4 of sqrt(2/60) = 18 %."""
+    places, movie = rings
+    image, starts = learned
+    square = []
+    for truth, frame, start in zip(places, movie[:, 0], starts, strict=True):
+        fit = fit_plane(frame, start, contact=CONTACT, image=image, pixel=(STEP, STEP))
+        assert (fit.reason == "").all()
+        away = np.linalg.norm(fit.centers[:, ::-1][:, None] - truth, axis=2).argmin(axis=1)
+        assert sorted(away) == list(range(len(truth)))
+        square.append(((fit.centers[:, ::-1] - truth[away]) / fit.sigma[:, ::-1]) ** 2)
+    assert abs(np.mean(square) - 1) < 4 * np.sqrt(2 / np.size(square))
 
 
 def test_places_in_a_plane_follow_its_shift_rotation_and_contrast(rings, learned):
@@ -309,9 +322,9 @@ def test_a_crowd_in_a_plane_is_fitted_in_parts(learned):
 def test_images_of_unequal_sizes_are_named():
     """Circles that spread by 17 %, as in a slice of a volume, are no images of equal spheres."""
     rng = np.random.default_rng(3)
-    places = chains(6, rng, sizes=(2, 2))
+    places = chains(4, rng, sizes=(2, 2))
     movie = drawn(places, disc, rng, sizes=np.array([0.8, 1.2, 0.85, 1.1]))
-    with pytest.warns(perrin.PrecisionWarning, match=r"differ in size by 1\d %"):
+    with pytest.warns(perrin.PrecisionWarning, match=r"differ in size by [12]\d %"):
         located(movie)
 
 
@@ -330,7 +343,7 @@ def test_a_planar_movie_ends_in_a_report():
     rng = np.random.default_rng(8)
     body = perrin.Cluster.touching(3, CONTACT).positions[:, :2]
     truth = perrin.simulate_motion(
-        perrin.Cluster(body), D_R=0.02, D_T=0.01, dt=1.0, n_frames=25, rng=4
+        perrin.Cluster(body), D_R=0.02, D_T=0.01, dt=1.0, n_frames=15, rng=4
     )
     places = truth.positions() + 4.5
     movie = drawn(places, ring, rng, shape=(46, 46))
@@ -342,8 +355,8 @@ def test_a_planar_movie_ends_in_a_report():
         found, true = getattr(cluster, name), getattr(known, name)
         assert abs(found.value - true.value) < 0.5 * true.stderr
     features = report.imaging.features
-    # Of the 3 internal coordinates in 25 frames: 1/sqrt(2 * 75), 8 %.
-    assert cluster.motion.sigma == pytest.approx(features["sigma_x"].median(), rel=0.25)
+    # Of the 3 internal coordinates in 15 frames: 1/sqrt(2 * 45), 11 %.
+    assert cluster.motion.sigma == pytest.approx(features["sigma_x"].median(), rel=0.35)
     again = type(report.imaging).from_dict(report.imaging.to_dict())
     r = np.linspace(0, 3, 20)
     np.testing.assert_array_equal(again.radial.value(r), report.imaging.radial.value(r))

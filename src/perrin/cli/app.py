@@ -195,10 +195,10 @@ def analyze(
     overwrite: Overwrite = False,
 ) -> None:
     """Measure D_R and D_T of every cluster in a track table."""
-    import perrin
-    from perrin.run.folders import check_place
-
     with messages_of(analyze), shown_progress(quiet=quiet) as progress:
+        import perrin
+        from perrin.run.folders import check_place
+
         check_place(output, overwrite=overwrite)
         progress(0, 0, "reading the table")
         report = perrin.analyze(

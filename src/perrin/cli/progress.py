@@ -61,11 +61,11 @@ def progress_lines(stream: TextIO, *, clock: Callable[[], float] = time.monotoni
     Returns
     -------
     callable
-        As in `shown_progress`. Nothing is written in the first two seconds.
+        As in `shown_progress`. Nothing is written in the two seconds after its first call.
 
     Examples
     --------
-    >>> seconds = iter([0.0, 1.0, 3.0, 4.0, 5.0])
+    >>> seconds = iter([0.0, 3.0, 4.0, 5.0])
     >>> show = progress_lines(sys.stdout, clock=lambda: next(seconds))
     >>> for done in (0, 4, 5, 8):
     ...     show(done, 8, "fitting clusters")
@@ -73,11 +73,12 @@ def progress_lines(stream: TextIO, *, clock: Callable[[], float] = time.monotoni
     fitting clusters: 60 % (5 of 8), 4 s
     fitting clusters: 100 % (8 of 8), 5 s
     """
-    start = clock()
+    calls: list[float] = []
     written: dict[str, int] = {}
 
     def show(done: int, total: int, title: str) -> None:
-        passed = clock() - start
+        calls[1:] = [clock()]
+        passed = calls[-1] - calls[0]
         tenth = 10 * done // total if total else 0
         if passed < _SHORT or written.get(title, -1) >= tenth:
             return

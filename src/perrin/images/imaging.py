@@ -152,7 +152,10 @@ class Imaging:
 
     def settings(self) -> dict[str, Any]:
         """Return all but tables and views as values that JSON holds: the file imaging.json."""
-        return {name: to_plain(getattr(self, name)) for name in _IMAGING_SETTINGS}
+        entry = {name: to_plain(getattr(self, name)) for name in _IMAGING_SETTINGS}
+        if self.radial is None:  # only that of a 2-D movie is written
+            del entry["radial"]
+        return entry
 
 
 _TABLES = ("features", "frames", "spots")

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from perrin.images.imaging import Imaging
+    from perrin.images.optics.optics import CameraNoise
     from perrin.run.results import Report
 
 
@@ -58,7 +59,8 @@ _IMAGING_CAPTIONS = {
         "Misfit of the model image to the voxels around the spheres (top, if images were fitted), "
         "and rms distance of the spheres to the fitted rigid body (bottom).",
         "The misfit should be near 1. A larger value in all frames means that the model does not "
-        "describe the spheres; its square root is contained in the stated errors. In the "
+        "describe the spheres; its square root is contained in the errors stated in a volume, and "
+        "those stated in a plane are too small by it. In the "
         "residuals a single spike is a bad frame, a lasting step an exchange of spheres; a slow "
         "rise means that the body is not rigid or that the dye bleaches.",
     ),
@@ -254,7 +256,7 @@ def fit_facts(imaging: Imaging) -> list[Fact]:
 
 
 def optics_facts(imaging: Imaging) -> list[Fact]:
-    """Return apparent diameter, point spread and camera noise.
+    """Return apparent diameter, point spread or radial image, and camera noise.
 
     Parameters
     ----------
@@ -265,15 +267,18 @@ def optics_facts(imaging: Imaging) -> list[Fact]:
     list of tuple of str
         Name, value and remark of each quantity.
     """
-    optics = imaging.optics
+    optics, radial = imaging.optics, imaging.radial
+    if radial is not None:
+        shape = (
+            f"learned from the images: a spline with knots {number_text(radial.spacing)} µm apart"
+        )
+        reach = f"radial, ends {number_text(radial.reach)} µm from the centre"
+        return [("image of a sphere", reach, shape), _gain_fact(radial.noise)]
     if optics is None:
         return []
     values = (optics.diameter, *optics.psf)
     size, psf_z, psf = (number_text(v, e) for v, e in zip(values, optics.stderr, strict=True))
     learned = "learned from the images" if any(optics.stderr) else "as stated"
-    gain, sign = number_text(optics.noise.gain), "−" if optics.noise.floor < 0 else "+"
-    floor = number_text(abs(optics.noise.floor))
-    noise = f"the variance of a voxel is {gain} times its signal {sign} {floor}, in grey levels"
     expected = f"{learned}; the expected diameter is {number_text(imaging.diameter)} µm"
     tail = []
     if optics.tail is not None:
@@ -286,8 +291,19 @@ def optics_facts(imaging: Imaging) -> list[Fact]:
         ("apparent diameter", f"{size} µm", expected),
         ("point spread", f"{psf} µm", f"standard deviation in the plane; {psf_z} µm along z"),
         *tail,
-        ("gain", gain, noise),
+        _gain_fact(optics.noise),
     ]
+
+
+def _gain_fact(noise: CameraNoise) -> Fact:
+    """Return the gain of the camera and the variance of a voxel."""
+    gain, sign = number_text(noise.gain), "−" if noise.floor < 0 else "+"
+    floor = number_text(abs(noise.floor))
+    return (
+        "gain",
+        gain,
+        f"the variance of a voxel is {gain} times its signal {sign} {floor}, in grey levels",
+    )
 
 
 def rigid_body_facts(report: Report) -> list[Fact]:

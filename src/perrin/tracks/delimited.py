@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import codecs
-import csv
 import io
 import re
 from typing import TYPE_CHECKING, NamedTuple
@@ -56,6 +55,8 @@ class Layout(NamedTuple):
 
     def fields(self, line: str) -> list[str]:
         """Return the fields of a line, without quotation marks and blanks around them."""
+        import csv
+
         if self.mark == r"\s+":
             return [part.strip('"') for part in line.split()]
         parts = next(csv.reader([line], delimiter=self.mark, skipinitialspace=True), [])

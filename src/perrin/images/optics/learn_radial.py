@@ -28,7 +28,10 @@ if TYPE_CHECKING:
 # Distances of the knots and ends of the image that are tried, in contact distances.
 _SPACINGS, _REACHES = (0.05, 0.03, 0.08, 0.12), (0.8, 0.65, 1.1)
 
-# Number of samples with which knots and ends are compared.
+# Least distance of the knots, pixels.
+_LEAST_SPACING = 0.4
+
+# Number of samples above which knots and ends are compared with half of them.
 _COMPARED = 20
 
 # Standard errors by which chi-squared of other spheres must be lower with more coefficients.
@@ -299,14 +302,14 @@ def learn_image(
         Where there are too few spheres, the search does not converge, or their brightness is less
         than four of its standard errors.
     """
-    widest = max(_REACHES) * contact
+    widest, least = max(_REACHES) * contact, _LEAST_SPACING * min(pixel)
     samples = [
         s for s in samples if s.patch(widest, widest, pixel).has_enough_pixels(len(s.centers))
     ]
     chosen, noise = (_SPACINGS[0], _REACHES[0]), None
     tried: dict[tuple[float, float], Floats] = {}
     failed: set[tuple[float, float]] = set()
-    apart = max(len(samples) // _COMPARED, 1)
+    apart = 2 if len(samples) > _COMPARED else 1
     halves = [samples[:: 2 * apart], samples[apart :: 2 * apart]]
     for turn in range(4 if halves[1] else 0):
         # By turns another distance of the knots and another end.
@@ -315,7 +318,7 @@ def learn_image(
             pair = (option, chosen[1]) if turn % 2 else (chosen[0], option)
             if pair in tried or pair in failed:
                 continue
-            spacing, reach = pair[0] * contact, pair[1] * contact
+            spacing, reach = max(pair[0] * contact, least), pair[1] * contact
             image = first_image(halves[0], spacing=spacing, reach=reach, pixel=pixel)
             image, fitted, step = settled_image(halves[0], image, pixel=pixel)
             failed.add(pair)
@@ -328,7 +331,7 @@ def learn_image(
                     halves[1], image, reach=widest, pixel=pixel, noise=noise
                 )
         chosen = _simplest_of_best(tried) if tried else chosen
-    spacing, reach = chosen[0] * contact, chosen[1] * contact
+    spacing, reach = max(chosen[0] * contact, least), chosen[1] * contact
     step = np.inf
     if samples and (tried or not halves[1]):
         image = first_image(samples, spacing=spacing, reach=reach, pixel=pixel)
@@ -381,7 +384,7 @@ def size_spread(
     if not sizes:
         return 0.0, np.inf
     size, variance = np.concatenate(sizes), np.concatenate(variances)
-    excess = float(np.mean(size**2 - variance))
-    error = float(np.std(size**2 - variance)) / np.sqrt(len(size))
+    square = (size - size.mean()) ** 2 - variance
+    excess, error = float(square.mean()), float(square.std()) / np.sqrt(len(size))
     spread = np.sqrt(max(excess, 0.0))
     return spread, error / max(2 * spread, np.sqrt(error), 1e-12)

@@ -413,7 +413,8 @@ def locate(
     contact : float
         Centre distance of touching spheres, um. Spheres within 1.3 times that are fitted together.
     refine : {"model", "trackpy", None}
-        "model" fits the ball blurred by the optics; "trackpy" uses its least-squares fit of discs;
+        "model" fits the ball blurred by the optics, in a 2-D movie the radial image that is learned
+        from it (see the notes); "trackpy" uses its least-squares fit of discs;
         None keeps the filtered centroid, whose error is a tenth of the contact distance where
         spheres touch.
     optics : Optics, optional
@@ -434,8 +435,8 @@ def locate(
     DataFrame
         ``frame, x, y, z`` (no z for a 2-D movie) in um, with the origin at the centre of voxel
         (0, 0, 0), and ``mass``; with "model" also ``sigma_x, sigma_y, sigma_z`` in um (from the
-        Fisher information, times the root of ``chi2`` where this is above 1), ``chi2`` of the
-        group's image per degree of freedom, and ``refined``.
+        Fisher information, in a volume times the root of ``chi2`` where this is above 1),
+        ``chi2`` of the group's image per degree of freedom, and ``refined``.
         `refined` is False where the fit did not converge, moved the sphere by over half a radius,
         found no intensity, or was not attempted: the position found first is kept, without errors,
         and `reason` names the cause. For crowds see the notes.
@@ -455,7 +456,7 @@ def locate(
     PrecisionWarning
         Where a frame cannot be read and is left out. Where the masses show no gap between spheres
         and noise. Where spheres keep the positions found first: those in crowds, and those that
-        have no voxels of their own. Where the model is requested for a 2-D movie.
+        have no voxels of their own. Where the images of the spheres of a 2-D movie differ in size.
 
     Notes
     -----
@@ -464,6 +465,11 @@ def locate(
     removed, and missing spheres are added, with a `mass` of NaN. Its `chi2` is that of each
     sphere's own voxels. Its background has a level of its own in every plane; any other bright
     structure is taken for a sphere if it is bright enough.
+
+    In a 2-D movie the model is one radial function for the images of all spheres, bright or dark,
+    learned from a few frames, and images of neighbours add. Spots are centres of circular symmetry,
+    whose `mass` grows in proportion to the contrast (`find_circles`); `dark` and `percentile` have
+    no effect, crowds are always refined.
 
     Examples
     --------

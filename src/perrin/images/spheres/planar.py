@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -11,6 +12,7 @@ from perrin.errors import PrecisionWarning
 from perrin.images.optics.learn_radial import (
     LEAST_BRIGHTNESS,
     RadialSample,
+    first_image,
     learn_image,
     size_spread,
 )
@@ -33,6 +35,9 @@ _MOST_TOGETHER = 12
 # Number of groups of spheres from which the image is learned.
 _LEARNING_GROUPS = 40
 
+# Contact distance in pixels below which twice as many are used, as each shows less.
+_SMALL_SPHERES = 8
+
 # Most fits of a group, between which those of its neighbours change, and the change of a position
 # over the distance of the knots at which they end.
 _MAX_SWEEPS, _SWEEP_CONVERGED = 12, 0.001
@@ -41,8 +46,9 @@ _MAX_SWEEPS, _SWEEP_CONVERGED = 12, 0.001
 # a fit is that of another sphere.
 _MOVED, _SAME = 0.3, 0.6
 
-# Spread of the sizes of the images, from which they are not those of equal spheres in a plane.
-_SIZE_SPREAD = 0.06
+# Spread of the sizes of the images, from which they are not those of equal spheres in a plane, and
+# distance of the knots for its measurement, in contact distances.
+_SIZE_SPREAD, _SIZE_KNOTS = 0.06, 0.12
 
 # Reasons for which a sphere is not refined.
 _NO_IMAGE, _AWAY, _UNSETTLED, _NO_PIXELS = (
@@ -126,10 +132,18 @@ def learn_plane(
         for frame, centers in zip(frames, places, strict=True)
         for group in fitted_together(centers, contact=contact)
     ]
-    chosen = np.unique(np.linspace(0, len(samples) - 1, _LEARNING_GROUPS).round().astype(int))
+    most = _LEARNING_GROUPS * (2 if contact < _SMALL_SPHERES * min(pixel) else 1)
+    chosen = np.unique(np.linspace(0, len(samples) - 1, most).round().astype(int))
     samples = [samples[k] for k in chosen] if samples else []
     image, samples = learn_image(samples, contact=contact, pixel=pixel)
-    spread, error = size_spread(samples, image, pixel=pixel)
+    # Fine knots can follow steps of several sizes, so that no size alone would fit better.
+    coarse = first_image(
+        samples,
+        spacing=max(image.spacing, _SIZE_KNOTS * contact),
+        reach=image.reach,
+        pixel=pixel,
+    )
+    spread, error = size_spread(samples, replace(coarse, noise=image.noise), pixel=pixel)
     if spread - 2.5 * error > _SIZE_SPREAD:
         warnings.warn(
             f"the images of the spheres differ in size by {100 * spread:.0f} % (rms), so that no "

@@ -52,6 +52,9 @@ class SpotSettings(TypedDict, total=False):
 class Spots(PlainOptions):
     """Which spots of a frame are taken for spheres.
 
+    `dark` and `percentile` have no effect on 2-D movies that are refined by the model, where
+    spots are centres of circular symmetry.
+
     Parameters
     ----------
     dark : bool
