@@ -218,7 +218,8 @@ def unequal():
 def test_different_diameters_are_learned_and_fitted(unequal):
     """Spread, gain and every diameter come back, and the errors of positions are as stated."""
     groups, diameters = unequal
-    optics = fit_samples(groups, diameter=2.5, voxel=VOXEL).optics
+    optics, usual = fit_samples(groups, diameter=2.5, voxel=VOXEL)
+    assert usual.left_out == 0
     assert optics.spread == pytest.approx(np.std(diameters) / DIAMETER, rel=0.1)
     assert optics.diameter == pytest.approx(diameters.mean(), rel=0.005)
     assert optics.noise.gain == pytest.approx(GAIN, rel=0.08)
@@ -228,6 +229,8 @@ def test_different_diameters_are_learned_and_fitted(unequal):
         fit = fit_window(group.window(image), image, optics.noise, FreeCenters(group.centers))
         sizes += (optics.diameter * np.exp(fit.sizes)).tolist()
         assert fit.chi2 == pytest.approx(1.0, abs=0.1)
+        volumes = np.pi * (optics.diameter * np.exp(fit.sizes)) ** 3 / 6
+        assert np.allclose(fit.unit_images.sum(axis=1) * np.prod(VOXEL), volumes, rtol=0.01)
         normal.append((fit.centers - group.centers).ravel() / np.sqrt(np.diag(fit.covariance)))
     # One diameter has an error of 0.3 %; four standard errors of a mean square of 36 are 0.9.
     assert np.allclose(sizes, diameters, rtol=0.015)
@@ -520,6 +523,9 @@ def test_a_method_learns_from_spheres_and_not_from_dust():
     method = choose_method(movie, search, sample_frames(movie, search, [0]))
     assert isinstance(method, Method)
     assert method.usual.left_out == 1
+    # It would appear as a tail of the point spread, or as a different diameter.
+    assert method.optics.tail is None
+    assert method.optics.spread == 0
     assert method.optics.diameter == pytest.approx(DIAMETER, abs=0.02)
     assert method.optics.noise.gain == pytest.approx(GAIN, rel=0.1)
     assert method.usual.brightness == pytest.approx(120.0, rel=0.03)
