@@ -309,7 +309,7 @@ def test_the_data_of_the_figures_are_those_of_the_result(single, planar):
     assert np.allclose(
         10 ** column["msad_y"], result.msad.value[: len(column["msad_y"])], rtol=1e-3
     )
-    assert header["steps"]["turn"]["count"] == column["turn_steps"].sum()
+    assert header["steps"]["turn"]["count"] == np.rint(column["turn_steps"]).sum()
     if not planar:
         q = np.stack([column[f"q{k}"] for k in range(4)], axis=1)
         trace = 4 * q[:, 0] ** 2 - 1

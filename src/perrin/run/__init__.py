@@ -91,7 +91,7 @@ from perrin.run.remarks import (
     with_jumps,
     wrapped_box_text,
 )
-from perrin.run.result_table import result_rows_html, result_table
+from perrin.run.result_table import coefficients_html, estimate_row, prediction_columns, tidy_table
 from perrin.run.results import (
     BodyKind,
     ClusterResult,
@@ -140,6 +140,7 @@ __all__ = [
     "assumed_exposure_notes",
     "check_place",
     "check_resumable",
+    "coefficients_html",
     "common_jump_warnings",
     "compare_axes",
     "compare_body",
@@ -152,6 +153,7 @@ __all__ = [
     "cut_text",
     "disagreement_warning",
     "doubtful_ends_warning",
+    "estimate_row",
     "exchanged_ends_text",
     "extra_detection_text",
     "far_points_notes",
@@ -207,10 +209,9 @@ __all__ = [
     "pool_clusters",
     "pool_coefficients",
     "predicted_noise",
+    "prediction_columns",
     "read_table",
     "removed_drift_notes",
-    "result_rows_html",
-    "result_table",
     "run_settings",
     "shape_numbers",
     "soft_clusters_warning",
@@ -220,6 +221,7 @@ __all__ = [
     "stage_jump_warnings",
     "staged_folder",
     "steady_motion_warning",
+    "tidy_table",
     "track_steps",
     "unfit_diameter_text",
     "unresolved_size_notes",
