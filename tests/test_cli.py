@@ -121,7 +121,8 @@ def test_demo_writes_a_whole_run_folder(demo):
     """Every file that a run folder promises is there, and no unfinished file."""
     names = {p.name for p in demo[0].iterdir()}
     assert names == {
-        "summary.json", "tracks.parquet", "motion.parquet", "curves.csv", "figures",
+        "summary.json", "tracks.parquet", "motion.parquet", "curves.csv", "results.csv",
+        "demo-tracks.csv", "figures",
         "report.html", "run.json",
     }  # fmt: skip
     assert list((demo[0] / "figures").glob("*.png"))

@@ -73,8 +73,14 @@ app = typer.Typer(
 # Default folder of the demo, and the files that it writes there, by which it is recognised.
 _DEMO_FOLDER = "perrin-demo"
 
+_DEMO_NOTE = (
+    "the planted D_R and D_T are those that Hunter et al. measured; they are below the prediction "
+    "for spheres of 2.45 um, as the sizes that follow from them, 2.9(4) and 2.72(9) um, are above it"
+)
+
 _DEMO_FILES = re.compile(
-    r"summary\.json|run\.json|report\.html|curves\.csv|(?:tracks|motion)\.parquet"
+    r"summary\.json|run\.json|report\.html|(?:curves|results|demo-tracks)\.csv"
+    r"|(?:tracks|motion)\.parquet"
     r"|figures|figures/cluster-0-\w+\.(?:png|pdf)"
 )
 
@@ -117,6 +123,7 @@ def demo(
     overwrite: Overwrite = False,
 ) -> None:
     """Analyse an embedded table: one simulated tetrahedron under the paper's conditions."""
+    import gzip
     from dataclasses import replace
     from importlib.resources import as_file, files
 
@@ -130,8 +137,13 @@ def demo(
             overwrite = True
         check_place(place, overwrite=overwrite)
         report = perrin.analyze(path, dt=0.73, viscosity=2.18e-3, temperature=295.0, diameter=2.45)
-        report = replace(report, settings=report.settings | {"made": "demo"})
+        report = replace(
+            report,
+            settings=report.settings | {"made": "demo"},
+            notes=(*report.notes, _DEMO_NOTE),
+        )
         perrin.write_run(report, place, overwrite=overwrite)
+        (place / "demo-tracks.csv").write_bytes(gzip.decompress(path.read_bytes()))
         show_report(report, place, demo)
         print("Planted in the simulation: D_R = 0.00493 rad^2/s, D_T = 0.0385 um^2/s.")
 
