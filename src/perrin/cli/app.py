@@ -82,7 +82,7 @@ _DEMO_FOLDER = "perrin-demo"
 
 _DEMO_NOTE = (
     "the planted D_R and D_T are those that Hunter et al. measured; they are below the prediction "
-    "for spheres of 2.45 um, as the sizes that follow from them, 2.9(4) and 2.72(9) um, are above it"
+    "for spheres of 2.45 um, as the sizes that follow from them are above it"
 )
 
 _DEMO_FILES = re.compile(
