@@ -36,7 +36,7 @@ SUBPACKAGES = [
     {"paper"},
     {"cli"},
 ]
-FLAT = {"_arrays", "_text", "errors"}
+FLAT = {"_arrays", "_display", "_text", "errors"}
 OLD_PATHS = {
     "rotations": "geometry.rotations",
     "shapes": "geometry.shapes",

@@ -208,8 +208,8 @@ def test_a_run_folder_is_whole_and_reads_back(tmp_path, movie_file, known, state
     again = perrin.load_run(tmp_path / "run")
     assert_identical(again, known)
     names = {p.name for p in (tmp_path / "run").iterdir()}
-    wanted = {"summary.json", "tracks.parquet", "motion.parquet", "curves.csv", "figures"}
-    assert wanted | {"report.html", "run.json", "features.parquet"} <= names
+    wanted = {"summary.json", "results.csv", "tracks.parquet", "motion.parquet", "curves.csv"}
+    assert wanted | {"figures", "report.html", "run.json", "features.parquet"} <= names
     assert not [n for n in names if n.startswith(".")]
     motion = pd.read_parquet(tmp_path / "run" / "motion.parquet")
     assert motion["frame"].tolist() == 2 * list(range(FEW))

@@ -80,6 +80,11 @@ app = typer.Typer(
 # Default folder of the demo, and the files that it writes there, by which it is recognised.
 _DEMO_FOLDER = "perrin-demo"
 
+_DEMO_NOTE = (
+    "the planted D_R and D_T are those that Hunter et al. measured; they are below the prediction "
+    "for spheres of 2.45 um, as the sizes that follow from them are above it"
+)
+
 _DEMO_FILES = re.compile(
     r"summary\.json|run\.json|run\.toml|report\.html|(?:curves|results|demo-tracks)\.csv"
     r"|(?:tracks|motion)\.parquet"
@@ -143,7 +148,11 @@ def demo(
         check_place(place, overwrite=overwrite)
         known = Experiment(dt=0.73, viscosity=2.18e-3, temperature=295.0, diameter=2.45)
         report = perrin.analyze(path, experiment=known)
-        report = replace(report, settings=report.settings | {"made": "demo"})
+        report = replace(
+            report,
+            settings=report.settings | {"made": "demo"},
+            notes=(*report.notes, _DEMO_NOTE),
+        )
         perrin.write_run(report, place, overwrite=overwrite)
         table = perrin.read_tracks(path)
         perrin.write_tracks(table, place / "demo-tracks.csv")

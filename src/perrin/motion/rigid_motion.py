@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from perrin._arrays import (
+    Bools,
     Floats,
     Ints,
     choice_fault,
@@ -480,7 +481,8 @@ class RigidMotion(Shown):
             raise ValueError(
                 f"centers: expected the shape ({count}, {d}) of the rotations, got {center.shape}"
             )
-        lost = ~(np.isfinite(given).all(axis=(1, 2)) & np.isfinite(center).all(axis=1))
+        known = np.isfinite(given).all(axis=(1, 2)) & np.isfinite(center).all(axis=1)
+        lost: Bools = np.asarray(~known, dtype=np.bool_)
         rows = np.flatnonzero(~lost)
         if rows.size < 2:
             raise TooFewFramesError(
@@ -495,7 +497,7 @@ class RigidMotion(Shown):
         error = float(np.sqrt(2) * size * sigma)
         angles = 1 if d == 2 else 3
         return cls(
-            time=np.arange(count) * float(dt),
+            time=float(dt) * np.arange(count, dtype=np.float64),
             center=center,
             rotation=rotation,
             residual=np.where(lost, np.nan, 0.0),

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from perrin._arrays import Floats, finite_or_none
+from perrin._arrays import Floats, Ints, finite_or_none
 from perrin._text import unit_text
 from perrin.geometry.rigid import degrees_of_freedom
 from perrin.geometry.rotations import unit_quaternion
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 _LAGS = 80  # lag times of a curve, evenly over its logarithm
 _FEWEST_FRAMES, _MOST_FRAMES = 100, 2000  # frames of a path that are drawn
-_MOST_BYTES = 4_500_000  # of the paths of all clusters together, before compression
+_MOST_BYTES = 4_000_000  # of the paths of all clusters together, before compression
 _BINS = 31  # of a distribution of steps
 
 
@@ -130,7 +130,7 @@ def _measured_places(rows: Floats, *, count: int, template: Floats) -> Floats | 
     return places
 
 
-def _orientations(motion: Any, shown: Floats, *, rod: bool) -> dict[str, Floats]:  # noqa: ANN401
+def _orientations(motion: Any, shown: Ints, *, rod: bool) -> dict[str, Floats]:  # noqa: ANN401
     """Return quaternions, or directions of a rod, and the rotation from the first frame."""
     if rod:
         return {f"u{k}": motion.direction[shown, k] for k in range(3)}

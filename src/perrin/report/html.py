@@ -71,6 +71,7 @@ def _environment() -> Environment:
 def _symbols(text: str) -> Markup:
     """Escape a text, and set the indices and units of its coefficients."""
     marked = re.sub(r"\bum\b", "µm", str(escape(text))).replace("^2", "²")
+    marked = marked.replace("_inf", "_∞")
     for letter, index in (("R", "R"), ("T", "T"), ("perp", "⊥")):
         marked = re.sub(rf"\bD_{letter}\b", f"<i>D</i><sub>{index}</sub>", marked)
     return Markup(marked)

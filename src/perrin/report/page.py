@@ -248,6 +248,7 @@ def _payloads(report: Report, sections: Sequence[Mapping[str, Any]]) -> list[tup
                 title=section["title"],
                 numbers=render_part("cluster", "numbers", section, several),
                 details=render_part("cluster", "details", section),
+                still=section["still"],
             ),
         )
         for result, section in zip(report.results, sections, strict=True)

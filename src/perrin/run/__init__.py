@@ -95,7 +95,7 @@ from perrin.run.remarks import (
     with_jumps,
     wrapped_box_text,
 )
-from perrin.run.result_table import result_rows_html, result_table
+from perrin.run.result_table import coefficients_html, estimate_row, prediction_columns, tidy_table
 from perrin.run.results import (
     BodyKind,
     ClusterResult,
@@ -144,6 +144,7 @@ __all__ = [
     "assumed_exposure_notes",
     "check_place",
     "check_resumable",
+    "coefficients_html",
     "common_jump_warnings",
     "common_motion_remarks",
     "compare_axes",
@@ -157,6 +158,7 @@ __all__ = [
     "cut_text",
     "disagreement_warning",
     "doubtful_ends_warning",
+    "estimate_row",
     "exchanged_ends_text",
     "extra_detection_text",
     "far_points_notes",
@@ -216,10 +218,9 @@ __all__ = [
     "pool_clusters",
     "pool_coefficients",
     "predicted_noise",
+    "prediction_columns",
     "read_table",
     "removed_drift_notes",
-    "result_rows_html",
-    "result_table",
     "run_settings",
     "shape_numbers",
     "soft_clusters_warning",
@@ -230,6 +231,7 @@ __all__ = [
     "staged_folder",
     "steady_motion_warning",
     "table_layers",
+    "tidy_table",
     "track_steps",
     "unfit_diameter_text",
     "unresolved_size_notes",

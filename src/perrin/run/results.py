@@ -25,7 +25,12 @@ from perrin.motion.rigidity import Quality
 from perrin.motion.rods import RodMotion
 from perrin.run.folders import staged_folder
 from perrin.run.predictions import Prediction
-from perrin.run.result_table import result_rows_html, result_table
+from perrin.run.result_table import (
+    coefficients_html,
+    estimate_row,
+    prediction_columns,
+    tidy_table,
+)
 from perrin.run.singles import SingleSpheres
 from perrin.run.verdicts import verdicts_from_dict, verdicts_to_dict
 from perrin.tracks.writing import write_json
@@ -41,6 +46,8 @@ if TYPE_CHECKING:
 
 # Coefficients of a kind of bodies.
 _COEFFICIENTS = ("D_R", "D_perp", "D_T")
+
+_NOTEBOOK_ROWS = 20  # largest number of clusters that a notebook shows
 
 # The coefficients that a size follows from, and the ends of its keys in ``summary.json``.
 _SIZE_ENDINGS = {"translation": "T", "rotation": "R", "both": "TR"}
@@ -129,6 +136,37 @@ class ClusterResult(Shown):
 
     def __str__(self) -> str:
         return f"cluster {self.name}: {self.D_R}; {self.D_T}"
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Return a row of ``results.csv`` for every quantity."""
+        known = self.prediction
+        rotation, translation = (self.verdicts.get(q) for q in ("rotation", "translation"))
+        rows: list[dict[str, Any]] = [
+            estimate_row("D_R", self.D_R, rotation, None if known is None else known.D_R),
+            estimate_row("D_T", self.D_T, translation, None if known is None else known.D_T),
+            {"quantity": "sigma", "value": self.motion.sigma, "unit": "um"},
+            {"quantity": "phi2", "value": self.phi2_measured, "unit": "rad^2"}
+            | {"stderr": self.phi2_stderr},
+            {"quantity": "phi2_predicted", "value": self.noise.phi2, "unit": "rad^2"},
+            {"quantity": "snr", "value": self.D_R.snr, "unit": "1"},
+        ]
+        compared = () if known is None else known.principal_D_R
+        for k in range(0 if self.tensor is None else 3):
+            assert self.tensor is not None
+            value, stderr = self.tensor.principal_values[k], self.tensor.stderr[k]
+            row = {"quantity": f"D_R{k + 1}", "value": float(value), "stderr": float(stderr)}
+            row |= {"unit": self.tensor.unit, "frames": self.tensor.n_frames}
+            rows.append(row | prediction_columns(compared[k] if len(compared) == 3 else None))
+        for mode, ending in _SIZE_ENDINGS.items():
+            size = (self.sizes or {}).get(mode)
+            for what in ("sphere", "cluster") if size is not None else ():
+                value, stderr = getattr(size, what), getattr(size, f"{what}_stderr")
+                row = {"quantity": f"{what}_diameter_{ending}", "value": value, "stderr": stderr}
+                rows.append(row | {"unit": "um"})
+            if mode == "both" and size is not None and size.viscosity is not None:
+                row = {"quantity": "viscosity_TR", "value": size.viscosity, "unit": "Pa s"}
+                rows.append(row | {"stderr": size.viscosity_stderr})
+        return rows
 
     def to_dict(self) -> dict[str, Any]:
         """Return the cluster's entry of ``summary.json``."""
@@ -245,6 +283,16 @@ class RodResult(Shown):
 
     def __str__(self) -> str:
         return perp_text(self)
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Return a row of ``results.csv`` for every quantity."""
+        known = self.prediction
+        return [
+            estimate_row("D_perp", self.D_perp, None, None if known is None else known.D_perp),
+            estimate_row("D_T", self.D_T, None, None if known is None else known.D_T),
+            {"quantity": "sigma", "value": self.motion.sigma, "unit": "um"},
+            {"quantity": "length", "value": self.motion.length, "unit": "um"},
+        ]
 
     def to_dict(self) -> dict[str, Any]:
         """Return the rod's entry of ``summary.json``."""
@@ -475,15 +523,62 @@ class Report:
         return f"Report({', '.join(parts)}, {count} warning{'s' * (count != 1)})"
 
     def _repr_html_(self) -> str:
-        """Return a table of the coefficients for a notebook."""
-        return result_rows_html(self)
+        """Return a table of the coefficients of the first clusters for a notebook."""
+        rows = [(c.name, c.D_R, c.D_T, len(c.warnings)) for c in self.clusters]
+        rows += [(rod.name, rod.D_perp, rod.D_T, len(rod.warnings)) for rod in self.rods]
+        table = coefficients_html(rows[:_NOTEBOOK_ROWS], caption=repr(self))
+        rest = len(rows) - _NOTEBOOK_ROWS
+        return table + (f"<p>and {rest} more: to_frame() has all.</p>" if rest > 0 else "")
 
     def to_frame(self) -> pd.DataFrame:
-        """Return all numbers as a tidy table, a row for every cluster and quantity.
+        """Return all numbers as a tidy table, the content of ``results.csv``.
 
-        It is the content of ``results.csv``; `perrin.run.result_table` describes the columns.
+        Returns
+        -------
+        pandas.DataFrame
+            A row for every cluster (or pooled value) and quantity. Columns: of ("cluster", "rod",
+            "pooled", "kind" or "single spheres"), cluster, label, particles, point_group, quantity
+            ("D_R", "D_T", "D_perp", "D_R1" to "D_R3", "sigma", "length", "phi2",
+            "phi2_predicted", "snr", "sphere_diameter_T", ..., "viscosity_TR"), value, stderr,
+            ci68_low, ci68_high, ci95_low, ci95_high, unit, resolved (False for an upper limit,
+            which is ci95_high), verdict (kind of motion), predicted, pull, frames, warnings (their
+            number). A number that is not known is missing; an interval without bound ends at inf.
+
+        Examples
+        --------
+        >>> import perrin
+        >>> from importlib.resources import files
+        >>> report = perrin.analyze(str(files("perrin") / "data" / "demo_tracks.csv.gz"), dt=0.73)
+        >>> report.to_frame().loc[0, ["of", "quantity", "unit", "verdict"]].tolist()
+        ['cluster', 'D_R', 'rad^2/s', 'diffusion']
         """
-        return result_table(self)
+        rows: list[dict[str, Any]] = []
+        for result in self.results:
+            kind = self.kind_of(result.cluster)
+            motion = result.motion
+            shape = motion.places if isinstance(motion, RodMotion) else motion.template
+            about: dict[str, Any] = {
+                "of": "rod" if isinstance(result, RodResult) else "cluster",
+                "cluster": result.cluster,
+                "label": result.label,
+                "particles": len(shape),
+                "point_group": None if kind is None else kind.point_group,
+                "frames": int(motion.fitted.size),
+                "warnings": len(result.warnings),
+            }
+            rows += [about | row for row in result.rows()]
+        pooled = self.pooled
+        if pooled is not None and len(self.clusters) > 1:
+            for name, quantity in (("D_R", "rotation"), ("D_T", "translation")):
+                row = estimate_row(name, getattr(pooled, name), pooled.verdicts.get(quantity))
+                rows.append({"of": "pooled"} | row)
+        for kind in self.kinds if self.pooled_by_kind else ():
+            about = {"of": "kind", "particles": kind.size, "point_group": kind.point_group}
+            rows += [about | estimate_row(name, one) for name, one in kind.coefficients]
+        if self.singles is not None:
+            about = {"of": "single spheres", "particles": 1}
+            rows.append(about | estimate_row("D_T", self.singles.D_T))
+        return tidy_table(rows)
 
     def __str__(self) -> str:
         count = len(self.warnings) + sum(len(c.warnings) for c in self.results)
@@ -623,7 +718,7 @@ def write_data(report: Report, folder: Path) -> None:
     report.tracks.to_parquet(folder / "tracks.parquet", index=False)
     motion_table(report).to_parquet(folder / "motion.parquet", index=False)
     curve_table(report).to_csv(folder / "curves.csv", index=False)
-    result_table(report).to_csv(folder / "results.csv", index=False)
+    report.to_frame().to_csv(folder / "results.csv", index=False)
     if report.imaging is not None:
         write_imaging(report.imaging, folder)
 

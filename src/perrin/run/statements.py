@@ -30,7 +30,7 @@ def answer_lines(report: Report) -> list[str]:
     Returns
     -------
     list of str
-        Empty where there is no pooled value and not just one cluster.
+        Without a pooled value those of every kind of clusters.
 
     Examples
     --------
@@ -54,6 +54,10 @@ def answer_lines(report: Report) -> list[str]:
             text = _value_sentence(name, getattr(source, name))
             if text:
                 lines.append(many.format(verbs[0], text) if several else one.format(verbs[1], text))
+    for kind in report.kinds if several and report.pooled is None else ():
+        for name, estimate in kind.coefficients:
+            text = _value_sentence(name, estimate)
+            lines += [f"Clusters of {kind.name}: {text}"] if text else []
     if several and report.pooled is not None:
         lines += _agreement(report.pooled)
     return lines + _predictions(report)

@@ -150,7 +150,7 @@
     const about = data.steps && data.steps[name], id = `plot-${name}-steps`;
     find(`#${id}`).closest("figure").hidden = !about;
     if (!about) return null;
-    const counts = data.column[`${name}_steps`], width = (2 * about.half) / counts.length, unit = 1 / (about.count * width);
+    const counts = data.column[`${name}_steps`].map(Math.round), width = (2 * about.half) / counts.length, unit = 1 / (about.count * width);
     const p = counts.map((v) => v * unit), e = counts.map((v) => Math.sqrt(v) * unit), kept = counts.map((v, k) => k).filter((k) => counts[k] > 0);
     const x = counts.map((_, k) => -about.half + (k + 0.5) * width), fine = Array.from({ length: 161 }, (_, k) => about.half * (k / 80 - 1));
     const wide = about.variance.filter((v) => v > 0);
@@ -202,6 +202,7 @@
   const BALLS = [ball(1), ball(2), ball(3)];
   const ballOf = (data) => BALLS[data.template.length <= 8 ? 2 : data.template.length <= 40 ? 1 : 0];
   const SHADES = ["#56b4e9", "#f0904f", "#35c79a", "#e5a5cc", "#f2c14e", "#9ed4f7", "#c4c4c4", "#a99ae0"];
+  const SPACE = ["webgl2", "webgl"].some((kind) => document.createElement("canvas").getContext(kind));
   const body = { row: 0, timer: null, view: "centred", data: null };
   const turned = (q, v) => {
     const [w, x, y, z] = q;
@@ -327,17 +328,20 @@
       slider.max = data.column.time.length - 1;
       find("#plots").hidden = false;
       find("#curves-caption").hidden = data.rod;
+      find("#show-axes").closest("label").hidden = !data.axes;
+      find("#show-places").closest("label").hidden = !data.column.places;
       const thinned = data.stride > 1 ? ` One of ${data.stride} frames is shown.` : "";
-      find("#body-caption").textContent = `Spheres of ${data.diameter.toPrecision(3)} µm, to scale; diamonds: the places measured in this frame; `
-        + `lines: axes of the rotational diffusion tensor, as long as its values. Drag to turn, scroll to zoom.${thinned}`;
+      find("#body-caption").textContent = `Spheres of ${data.diameter.toPrecision(3)} µm, to scale; diamonds: the places measured in this frame. `
+        + `${data.axes ? "Lines: axes of the rotational diffusion tensor, as long as its values. " : ""}Drag to turn, scroll to zoom.${thinned}`;
       if (!library) state.textContent = "Drawing …";
       const rest = [() => drawCurve("msad", data.rod ? { lines: {} } : data), () => drawCurve("msd", data.rod ? { lines: {} } : data),
         () => drawSeries("plot-turn", data, ["turn0", "turn1", "turn2"], data.dimension === 2 ? ["φ"] : ["about x", "about y", "about z"], "rotation (rad)"),
         () => drawSeries("plot-center", data, ["center0", "center1", "center2"], ["x", "y", "z"], "from the first frame (µm)"),
         () => drawSteps("turn", data), () => drawSteps("shift", data), () => drawResidual(data)];
-      await drawBody().then(() => document.documentElement.classList.add("drawn"), () => {
-        find("#plot-body").textContent = "This browser draws no three-dimensional view (WebGL is off).";
-      });
+      if (SPACE) {
+        await drawBody();
+        document.documentElement.classList.add("drawn");
+      } else find("#body-figure").hidden = true;  // the still picture is shown instead
       for (const one of rest) {
         await new Promise((done) => setTimeout(done, 0));
         if (ticket !== turn) return;
@@ -485,7 +489,7 @@
       const far = kept.map((k) => value[k]).reduce((a, b) => Math.max(a, b), 0) * 3;
       const top = Math.min(bounds[bounds.length - 1] ?? 1, far || Infinity);
       const plot = find(`#plot-forest-${kind}`);
-      plot.style.height = `${Math.min(Math.max(9, 4 + 0.9 * rows.length), 40)}rem`;
+      plot.style.height = `${Math.min(Math.max(150, 64 + 15 * rows.length), 640)}px`;
       await Plotly.react(plot, traces, layout(title, "", { shapes, showlegend: false, hovermode: "closest", xaxis: { range: [(bounds[0] ?? 0) * 0.9, top * 1.05], nticks: 5 },
         yaxis: { range: [rows.length - 0.4, -0.6], zeroline: false, showgrid: false, ...ticks } }), SETTINGS);
       if (!plot.dataset.linked) {
@@ -538,6 +542,9 @@
     if (key !== shown) await show(key);
     find("#one").scrollIntoView();
   });
+  const resized = () => { for (const plot of all(".js-plotly-plot")) window.Plotly.Plots.resize(plot); };
+  window.addEventListener("beforeprint", resized);
+  window.addEventListener("afterprint", resized);
   const redraw = () => { drawAll(); drawForest(); };
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", redraw);
   const asked = fromHash();
