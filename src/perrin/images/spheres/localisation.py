@@ -608,8 +608,12 @@ def group_columns(
             level = usual.brightness * dimmed[group]
             excess = usual.excess(square, fit.brightness / level, voxels=voxels)
             worst = int(excess.argmax())
-            cut = usual.disturbed(square, voxels=voxels) & _reach_border(frame, fit.centers, image)
-            if search.crowds and cut.any() and len(group) <= _LARGEST_CUT_GROUP:
+            if (
+                search.crowds
+                and len(group) <= _LARGEST_CUT_GROUP
+                and _touch_border(frame, fit.centers, voxel, reach=contact)
+                and _is_disturbed(usual, square, voxels, window, fit)
+            ):
                 beyond = _crowd_of(frame, found, group, search, image, noise)
                 if _are_spheres(beyond, usual, float(np.median(level)), count=len(group)):
                     crowds.append((group, beyond))
@@ -689,10 +693,24 @@ def _are_spheres(crowd: CrowdFit, usual: UsualImage, level: float, *, count: int
     )
 
 
-def _reach_border(frame: Floats, centers: Floats, image: SphereImage) -> Bools:
-    """Return which images of spheres at `centers` (n, 3) reach the border of the frame."""
-    last = (np.array(frame.shape) - 1) * np.array(image.voxel)
-    return np.asarray(np.any(np.minimum(centers, last - centers) < image.extent, axis=1))
+def _touch_border(frame: Floats, centers: Floats, voxel: _Voxel, *, reach: float) -> bool:
+    """Return whether one of the centres (n, 3) is nearer to the border than a sphere that it cuts.
+
+    Spheres at the border, which are often not found, touch those within one contact distance.
+    """
+    last = (np.array(frame.shape) - 1) * np.array(voxel)
+    return bool(np.any(np.minimum(centers, last - centers) < reach))
+
+
+def _is_disturbed(
+    usual: UsualImage, square: Floats, voxels: Floats, window: Window, fit: ImageFit
+) -> bool:
+    """Return whether an image has more residual than chance leaves, in its spheres or beside them.
+
+    The light of a sphere that was not found lies beside those of its group.
+    """
+    beside = usual.disturbed(np.array([fit.chi2]), voxels=np.array([window.data.size]))
+    return bool(usual.disturbed(square, voxels=voxels).any() or beside[0])
 
 
 def with_crowds(
@@ -730,7 +748,8 @@ def with_crowds(
     dict of ndarray
     """
     last = (np.array(frame.shape) - 1) * np.array(voxel)
-    margin = 0.0 if search.border else search.diameter / 2
+    # The field ends half a voxel beyond the centres of the outer voxels.
+    margin = -np.array(voxel) / 2 if search.border else search.diameter / 2
     for group, crowd in crowds:
         first = crowd.origin >= 0
         good = crowd.converged & np.isfinite(crowd.sigma).all(axis=1)
