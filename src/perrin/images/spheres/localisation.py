@@ -41,6 +41,7 @@ from perrin.images.spheres.spots import (
     mass_cut,
     touching_together,
 )
+from perrin.tracks.groups import TOUCHING_REACH
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -49,7 +50,7 @@ if TYPE_CHECKING:
     import pandas as pd
     from numpy.typing import NDArray
 
-    from perrin._arrays import Bools, Ints
+    from perrin._arrays import Ints
     from perrin.images.optics.ball_image import SphereImage
     from perrin.images.optics.optics import CameraNoise, Optics
     from perrin.images.optics.window_fit import ImageFit, Window
@@ -608,15 +609,26 @@ def group_columns(
             level = usual.brightness * dimmed[group]
             excess = usual.excess(square, fit.brightness / level, voxels=voxels)
             worst = int(excess.argmax())
+            bright = fit.brightness / level >= usual.brightest
             if (
                 search.crowds
                 and len(group) <= _LARGEST_CUT_GROUP
-                and _touch_border(frame, fit.centers, voxel, reach=contact)
-                and _is_disturbed(usual, square, voxels, window, fit)
+                and not bright.any()
+                and (
+                    excess[worst] > 1
+                    or fit.chi2 > usual.worst_chi2
+                    or (
+                        _touch_border(frame, fit.centers, voxel, reach=contact)
+                        and _is_disturbed(usual, square, voxels, window, fit)
+                    )
+                )
             ):
                 beyond = _crowd_of(frame, found, group, search, image, noise)
-                if _are_spheres(beyond, usual, float(np.median(level)), count=len(group)):
-                    crowds.append((group, beyond))
+                whole = _usual_spheres(
+                    beyond, usual, float(np.median(level)), count=len(group), contact=contact
+                )
+                if whole is not None:
+                    crowds.append((group, whole))
                     continue
             if excess[worst] > 1:
                 # Without the worst one, whose voxels are left out, the others may be spheres.
@@ -679,17 +691,29 @@ def _own_chi2(window: Window, fit: ImageFit) -> tuple[Floats, Floats]:
     return square / np.maximum(voxels, 1e-300), voxels
 
 
-def _are_spheres(crowd: CrowdFit, usual: UsualImage, level: float, *, count: int) -> bool:
-    """Return whether all places of a fit show spheres of the usual brightness `level`.
+def _usual_spheres(
+    crowd: CrowdFit, usual: UsualImage, level: float, *, count: int, contact: float
+) -> CrowdFit | None:
+    """Return the fit with the spheres of the usual image and brightness `level` that are a group.
 
-    All `count` spots of its start must be among them.
+    These are the `count` spots of its start, and spheres that touch one of them. None if a spot of
+    the start is no such sphere.
     """
-    inside = crowd.window.holds(crowd.intensity.centers)
-    bright = crowd.intensity.brightness[inside] / level
-    return bool(
-        set(range(count)) <= set(crowd.origin.tolist())
-        and np.all(crowd.chi2 <= usual.worst_chi2)
-        and np.all((bright < usual.brightest) & (bright > 1 / usual.brightest))
+    same = (crowd.centers[:, None] == crowd.intensity.centers).all(axis=2)
+    bright = crowd.intensity.brightness[same.argmax(axis=1)] / level
+    good = (crowd.chi2 <= usual.worst_chi2) & (bright < usual.brightest)
+    good &= bright > 1 / usual.brightest
+    start = crowd.origin >= 0
+    if not set(range(count)) <= set(crowd.origin[good].tolist()):
+        return None
+    away = np.linalg.norm(crowd.centers[:, None] - crowd.centers[start], axis=2).min(axis=1)
+    good &= start | (away < TOUCHING_REACH * contact)
+    return crowd._replace(
+        centers=crowd.centers[good],
+        sigma=crowd.sigma[good],
+        chi2=crowd.chi2[good],
+        converged=crowd.converged[good],
+        origin=crowd.origin[good],
     )
 
 
