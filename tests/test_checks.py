@@ -303,7 +303,7 @@ def test_groups_of_touching_spheres_are_counted():
 
 
 def test_clusters_at_the_border_are_noted():
-    four = {k: 4 for k in range(40)}
+    four = dict.fromkeys(range(40), 4)
     assert checks.clusters_near_border(table(), margin=1.5, sizes=four) == NOTHING
     near = table(border=np.where(np.arange(40) // 4 >= 7, 1.0, 5.0))
     text = noted(checks.clusters_near_border(near.drop(index=[30, 34]), margin=1.5, sizes=four))

@@ -1198,7 +1198,7 @@ def most_likely_path(
     choice, certain = _path_from(detections, body, candidates, rows, variance, labelled=labelled)
     if labelled:
         return choice, certain
-    complete = (candidates.assignment[rows, choice] >= 0).all(axis=1)
+    complete: Bools = np.all(candidates.assignment[rows, choice] >= 0, axis=1)
     end = 0
     for begin in np.flatnonzero(~complete & np.append(True, ~certain[1:])).tolist():
         if begin < end or not complete[begin:].any():

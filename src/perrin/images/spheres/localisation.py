@@ -70,7 +70,7 @@ _LEARNING_GROUPS, _LEARNING_CROWDS = 15, 2
 # Largest number of spots that are fitted as one group where there is dust among them.
 _LARGEST_GROUP = 40
 
-# Largest number of spots of a group at the border that is fitted with spheres beyond it.
+# Largest number of spots of a group that is fitted with spheres that were not found.
 _LARGEST_CUT_GROUP = 8
 
 # Number of spheres in a piece of a crowd.
@@ -579,7 +579,7 @@ def group_columns(
         The columns of the table of `locate`.
     crowds : list of tuple
         Spheres that are fitted as a crowd, and the fit: with `Search.crowds` those of crowds, and
-        of groups at the border whose images show spheres beyond it.
+        of groups whose images show spheres that were not found or are beyond the border.
     """
     contact = search.contact
     centers, sigma = found.centers.copy(), np.full_like(found.centers, np.nan)
@@ -610,6 +610,7 @@ def group_columns(
             excess = usual.excess(square, fit.brightness / level, voxels=voxels)
             worst = int(excess.argmax())
             bright = fit.brightness / level >= usual.brightest
+            # Light beside spheres of usual brightness may be that of a sphere that was not found.
             if (
                 search.crowds
                 and len(group) <= _LARGEST_CUT_GROUP
