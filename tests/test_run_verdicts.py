@@ -77,9 +77,9 @@ def test_clusters_are_judged_together_as_each_alone(report):
     alone, together = judge_motion(motions[2]), judge_motion(motions)
     found = report.clusters[2].verdicts["rotation"], report.pooled.verdicts["rotation"]
     for verdict, expected in zip(found, (alone, together), strict=True):
-        assert (verdict.kind, verdict.p, verdict.text) == (
-            expected.kind, expected.p, expected.text,
-        )  # fmt: skip
+        assert (verdict.kind, verdict.text) == (expected.kind, expected.text)
+        # Motions are estimated together, with other roundings than alone.
+        assert verdict.p == pytest.approx(expected.p, rel=1e-8)
     assert report.pooled.D_R.motion == together.kind
     assert report.pooled.verdicts["translation"].kind == "jumps"
     assert "in cluster 0 " in report.pooled.verdicts["translation"].text
