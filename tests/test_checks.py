@@ -321,15 +321,16 @@ def test_groups_of_touching_spheres_are_counted():
 
 
 def test_clusters_at_the_border_are_noted():
-    assert checks.clusters_near_border(table(), margin=1.5, dropped={}) == NOTHING
+    four = dict.fromkeys(range(40), 4)
+    assert checks.clusters_near_border(table(), margin=1.5, sizes=four) == NOTHING
     near = table(border=np.where(np.arange(40) // 4 >= 7, 1.0, 5.0))
-    text = noted(checks.clusters_near_border(near, margin=1.5, dropped={0: np.array([12, 13])}))
+    text = noted(checks.clusters_near_border(near.drop(index=[30, 34]), margin=1.5, sizes=four))
     assert text == (
-        "centre within d/2 + 2 sigma (1.5 um) of the border, cluster 0 in frames 7 to 9, 12 to 13; "
-        "dropped, as spheres are out of view: frames 12 to 13"
+        "centre within d/2 + 2 sigma (1.5 um) of the border, cluster 0 in frames 7 to 9; in part, "
+        "with spheres out of view, in frames 7 to 8"
     )
     many = pd.concat([near.assign(cluster=k) for k in range(40)])
-    text = noted(checks.clusters_near_border(many, margin=1.5, dropped={}))
+    text = noted(checks.clusters_near_border(many, margin=1.5, sizes=four))
     assert "40 of 40 clusters (0, 1, 2, 3, 4, 5, 6, 7, 8, 9 and 30 more)" in text
 
 

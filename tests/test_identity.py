@@ -53,6 +53,22 @@ def test_labels_shuffled_in_every_frame_are_sorted_out(body, repeats):
         assert np.isfinite(found.arranged(mixed)).all()
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_incomplete_rows_before_the_first_complete_one_are_no_mirror_image(seed):
+    """Three of four particles fit both hands; the body that enters the field decides it later."""
+    x, rng = track(seed, n_frames=30, sigma=(0.005,) * 3)
+    mixed, particle = shuffled(x, rng)
+    mixed[:5, 0] = np.nan
+    found = settle_identity(mixed, labelled=False)
+    assert wrong_steps(found, particle) == 0
+    assert not found.cuts.size
+    motion = perrin.track_rotation(found.arranged(mixed), dt=1.0)
+    right = perrin.track_rotation(x, dt=1.0)
+    np.testing.assert_allclose(
+        motion.center - motion.center[-1], right.center - right.center[-1], atol=0.03
+    )
+
+
 def test_seven_particles_are_assigned_without_trying_all_orders():
     """Beyond six, linear assignment and rigid fit in turn do the same."""
     x, rng = track(1, 7, n_frames=5)

@@ -511,6 +511,21 @@ def test_a_sphere_beyond_the_border_does_not_bias_its_neighbour():
     assert off < 4 < biased
 
 
+@pytest.mark.parametrize("beside", [[5.0, 6.0, 9.9], [5.0, 6.0, 12.0]])
+def test_a_sphere_that_was_not_found_is_fitted_with_its_group(beside):
+    """Dust hides one of three from the search; its places and errors are right, dust is none."""
+    rng = np.random.default_rng(5)
+    three = np.array([[5.0, 5.0, 5.0], [5.0, 5.0, 7.45], [5.0, 7.12, 6.225]])
+    frame = drawn(np.concatenate([three, [beside]]), [1, 1, 1, 2.5], rng)
+    spots = Features(three[:2] + 0.05, np.full(2, 3e4))
+    search = Search(DIAMETER, DIAMETER, crowds=True)
+    columns, crowds = group_columns(frame, spots, search, OPTICS, VOXEL, usual=USUAL)
+    columns = with_crowds(columns, frame, spots, search, VOXEL, crowds=crowds, usual=USUAL)
+    assert columns["refined"].tolist() == [True] * 3
+    x, sigma = (np.stack([columns[s + a] for a in "zyx"], axis=1) for s in ("", "sigma_"))
+    assert np.all(np.abs(x - three[cdist(x, three).argmin(axis=1)]) < 4 * sigma)
+
+
 def test_a_method_learns_from_spheres_and_not_from_dust():
     """A lump among the groups leaves diameter, blur and gain as they are."""
     rng = np.random.default_rng(3)

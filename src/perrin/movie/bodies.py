@@ -49,8 +49,6 @@ class Bodies:
         Number of spheres of each cluster.
     margin : float
         Largest distance to the border of the centre of a sphere that the border cuts, um.
-    dropped : dict of ndarray
-        Frames of each cluster that are dropped because spheres are missing at the border.
     warnings : list of str
         Warnings about bodies that are left out.
     notes : list of str
@@ -63,7 +61,6 @@ class Bodies:
     axes: list[str]
     sizes: dict[int, int]
     margin: float
-    dropped: dict[int, Ints]
     warnings: list[str]
     notes: list[str]
     singles: pd.DataFrame
@@ -140,10 +137,9 @@ def find_bodies(
     features["border"] = np.min(sides, axis=0)
     blur = 0.0 if optics is None else optics.psf[0]
     margin = search.diameter / 2 + 2 * blur
-    features, dropped = _without_cut_bodies(features, sizes=size, margin=margin)
     single = rows[found.track >= 0]
     singles = features.iloc[single][["frame", *axes]].assign(particle=found.track[found.track >= 0])
-    return Bodies(features, axes, size, margin, dropped, warnings, notes, singles)
+    return Bodies(features, axes, size, margin, warnings, notes, singles)
 
 
 def _chosen_bodies(
@@ -188,25 +184,6 @@ def _counted_sizes(sizes: Ints) -> str:
     """Return how many clusters there are of each size, in words."""
     kinds, counts = np.unique(sizes, return_counts=True)
     return listed(f"{count} of {n}" for n, count in zip(kinds, counts, strict=True))
-
-
-def _without_cut_bodies(
-    features: pd.DataFrame, *, sizes: Mapping[int, int], margin: float
-) -> tuple[pd.DataFrame, dict[int, Ints]]:
-    """Assign no cluster to bodies with spheres outside the border, in the frames concerned.
-
-    The intensity of spheres outside the stack biases the fits of the others.
-    """
-    tracked = features[features["cluster"] >= 0]
-    bodies = tracked.groupby(["cluster", "frame"]).agg(n=("x", "size"), border=("border", "min"))
-    size = bodies.index.get_level_values("cluster").map(sizes).to_numpy(dtype=np.int64)
-    cut = bodies[(bodies["n"] < size) & (bodies["border"] < margin)].reset_index()
-    in_cut_body = features.set_index(["cluster", "frame"]).index.isin(
-        cut.set_index(["cluster", "frame"]).index
-    )
-    features = features.copy()
-    features.loc[in_cut_body, ["cluster", "particle", "piece"]] = (-1, -1, 0)
-    return features, {int(c): part.to_numpy() for c, part in cut.groupby("cluster")["frame"]}
 
 
 def group_sizes(features: pd.DataFrame, *, contact: float, axes: list[str]) -> Ints:

@@ -765,9 +765,9 @@ def _frame_count(count: int) -> str:
 
 
 def clusters_near_border(
-    features: pd.DataFrame, *, margin: float, dropped: Mapping[int, Ints]
+    features: pd.DataFrame, *, margin: float, sizes: Mapping[int, int]
 ) -> Findings:
-    """Note the clusters near the border, and those of their frames that are dropped.
+    """Note the clusters near the border, and the frames in which spheres of them are missing.
 
     Parameters
     ----------
@@ -775,21 +775,21 @@ def clusters_near_border(
         As in `Bodies`.
     margin : float
         Largest distance to the border of a centre whose sphere may be cut, um.
-    dropped : mapping
-        Dropped frames of each cluster.
+    sizes : mapping
+        Number of spheres of each cluster.
     """
     tracked = features[features["cluster"] >= 0]
     near = tracked[tracked["border"] < margin].groupby("cluster")["frame"]
-    touched = {int(cluster): frames.unique() for cluster, frames in near}
+    touched = {int(cluster): np.unique(frames) for cluster, frames in near}
     verdicts: dict[str, Verdict | None] = {
-        str(c): None for c in sorted({*tracked["cluster"].unique().tolist(), *dropped})
+        str(c): None for c in sorted(tracked["cluster"].unique().tolist())
     }
-    for cluster in sorted({*touched, *dropped}):
-        cut = dropped.get(cluster, np.empty(0, dtype=np.int64))
-        frames = np.union1d(touched.get(cluster, np.empty(0, dtype=np.int64)), cut)
+    for cluster, frames in touched.items():
+        shown = tracked[tracked["cluster"] == cluster].groupby("frame")["x"].size()[frames]
+        partial = frames[shown.to_numpy() < sizes[cluster]]
         text = f"in {frame_runs_text(frames)}"
-        if len(cut):
-            text += f"; dropped, as spheres are out of view: {frame_runs_text(cut)}"
+        if len(partial):
+            text += f"; in part, with spheres out of view, in {frame_runs_text(partial)}"
         verdicts[str(cluster)] = Verdict(text, float(len(frames)))
     return Findings(
         notes=tuple(

@@ -493,7 +493,7 @@ def _with_checks(
         + _contrast(imaging, features, flat=is_flat(stack) and method.radial is None)
         + checks.missing_spheres(features, sizes=bodies.sizes, contact=contact, frames=read)
         + checks.Findings(notes=tuple(uneven))
-        + checks.clusters_near_border(features, margin=bodies.margin, dropped=bodies.dropped)
+        + checks.clusters_near_border(features, margin=bodies.margin, sizes=bodies.sizes)
         + findings
     )
     clusters, of_several = checks.check_clusters(

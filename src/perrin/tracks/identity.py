@@ -1178,6 +1178,11 @@ def most_likely_path(
     certain : ndarray of bool, shape (K,)
         False where a candidate in conflict with the chosen one is nearly as likely.
 
+    Notes
+    -----
+    Three of four particles fit the body and its mirror image. Without labels the incomplete rows
+    at the beginning of a piece therefore follow, backward in time, from its first complete row.
+
     Examples
     --------
     >>> import perrin
@@ -1191,6 +1196,38 @@ def most_likely_path(
     if not rows.size:
         return [], np.empty(0, dtype=np.bool_)
     variance = candidates.step_variance(detections, time[rows], rows, labelled=labelled)
+    choice, certain = _path_from(detections, body, candidates, rows, variance, labelled=labelled)
+    if labelled:
+        return choice, certain
+    complete: Bools = np.all(candidates.assignment[rows, choice] >= 0, axis=1)
+    end = 0
+    for begin in np.flatnonzero(~complete & np.append(True, ~certain[1:])).tolist():
+        if begin < end or not complete[begin:].any():
+            continue
+        end = begin + int(np.argmax(complete[begin:]))
+        back, passed = rows[begin : end + 1][::-1], variance[begin:end][::-1]
+        path, sure = _path_from(
+            detections, body, candidates, back, passed, labelled=False, first=choice[end]
+        )
+        choice[begin:end], certain[begin + 1 : end + 1] = path[:0:-1], sure[:0:-1]
+    return choice, certain
+
+
+def _path_from(
+    detections: Detections,
+    body: BodyModel,
+    candidates: Candidates,
+    rows: Ints,
+    variance: Floats,
+    *,
+    labelled: bool,
+    first: int | None = None,
+) -> tuple[list[int], Bools]:
+    """Choose the most likely candidate of each row after the one before it.
+
+    `variance` (K - 1,) is that of the steps between the rows; the candidate of the first row may be
+    known.
+    """
     order = candidates.order(detections, rows[:1])[0]
     cost = candidates.cost[rows[0]]
     if labelled:
@@ -1199,7 +1236,7 @@ def most_likely_path(
         wrong = ((particle != np.arange(detections.n)) & (order >= 0)).sum(axis=1)
         against = _contradict(body.label, order, detections.column[rows[0]])
         cost = cost + LABEL_LOG_ODDS * against + wrong
-    choice, certain = [int(np.argmin(cost))], [True]
+    choice, certain = [int(np.argmin(cost)) if first is None else first], [True]
     label = _passed_on(body.label, order[choice[0]])
     # A step between rows with the labels as given is obvious where it is likelier than all others,
     # whatever their angles: every other candidate contradicts the labels.

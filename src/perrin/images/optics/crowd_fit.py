@@ -166,8 +166,9 @@ def fit_crowd(
         origin = np.append(origin[keep], np.full(len(new), -1))
     state, converged = _scored(window, state, _MAX_CROWD_ROUNDS, _CROWD_STEP_CONVERGED)
     information, _ = normal_equations(window, state)
-    last = (np.array(frame.shape) - 1) * image.voxel
-    inside = np.all((state.centers >= 0) & (state.centers <= last), axis=1)
+    voxel = np.array(image.voxel)
+    end = (np.array(frame.shape) - 0.5) * voxel
+    inside = np.all((state.centers >= -voxel / 2) & (state.centers <= end), axis=1)
     inside &= plausible_spheres(window, state, contact)
     chi2 = sphere_chi2(window, state)
     finite = chi2[np.isfinite(chi2)]

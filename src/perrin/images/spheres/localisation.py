@@ -43,6 +43,7 @@ from perrin.images.spheres.spots import (
     mass_cut,
     touching_together,
 )
+from perrin.tracks.groups import TOUCHING_REACH
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -51,7 +52,7 @@ if TYPE_CHECKING:
     import pandas as pd
     from numpy.typing import NDArray
 
-    from perrin._arrays import Bools, Ints
+    from perrin._arrays import Ints
     from perrin.images.optics.ball_image import SphereImage
     from perrin.images.optics.optics import CameraNoise, Optics
     from perrin.images.optics.radial_image import RadialImage
@@ -72,7 +73,7 @@ _LEARNING_GROUPS, _LEARNING_CROWDS = 15, 2
 # Largest number of spots that are fitted as one group where there is dust among them.
 _LARGEST_GROUP = 40
 
-# Largest number of spots of a group at the border that is fitted with spheres beyond it.
+# Largest number of spots of a group that is fitted with spheres that were not found.
 _LARGEST_CUT_GROUP = 8
 
 # Number of spheres in a piece of a crowd.
@@ -612,7 +613,7 @@ def group_columns(
         The columns of the table of `locate`.
     crowds : list of tuple
         Spheres that are fitted as a crowd, and the fit: with `Search.crowds` those of crowds, and
-        of groups at the border whose images show spheres beyond it.
+        of groups whose images show spheres that were not found or are beyond the border.
     """
     contact = search.contact
     centers, sigma = found.centers.copy(), np.full_like(found.centers, np.nan)
@@ -642,11 +643,27 @@ def group_columns(
             level = usual.brightness * dimmed[group]
             excess = usual.excess(square, fit.brightness / level, voxels=voxels)
             worst = int(excess.argmax())
-            cut = usual.disturbed(square, voxels=voxels) & _reach_border(frame, fit.centers, image)
-            if search.crowds and cut.any() and len(group) <= _LARGEST_CUT_GROUP:
+            bright = fit.brightness / level >= usual.brightest
+            # Light beside spheres of usual brightness may be that of a sphere that was not found.
+            if (
+                search.crowds
+                and len(group) <= _LARGEST_CUT_GROUP
+                and not bright.any()
+                and (
+                    excess[worst] > 1
+                    or fit.chi2 > usual.worst_chi2
+                    or (
+                        _touch_border(frame, fit.centers, voxel, reach=contact)
+                        and _is_disturbed(usual, square, voxels, window, fit)
+                    )
+                )
+            ):
                 beyond = _crowd_of(frame, found, group, search, image, noise)
-                if _are_spheres(beyond, usual, float(np.median(level)), count=len(group)):
-                    crowds.append((group, beyond))
+                whole = _usual_spheres(
+                    beyond, usual, float(np.median(level)), count=len(group), contact=contact
+                )
+                if whole is not None:
+                    crowds.append((group, whole))
                     continue
             if excess[worst] > 1:
                 # Without the worst one, whose voxels are left out, the others may be spheres.
@@ -708,24 +725,50 @@ def _own_chi2(window: Window, fit: ImageFit) -> tuple[Floats, Floats]:
     return square / np.maximum(voxels, 1e-300), voxels
 
 
-def _are_spheres(crowd: CrowdFit, usual: UsualImage, level: float, *, count: int) -> bool:
-    """Return whether all places of a fit show spheres of the usual brightness `level`.
+def _usual_spheres(
+    crowd: CrowdFit, usual: UsualImage, level: float, *, count: int, contact: float
+) -> CrowdFit | None:
+    """Return the fit with the spheres of the usual image and brightness `level` that are a group.
 
-    All `count` spots of its start must be among them.
+    These are the `count` spots of its start, and spheres that touch one of them. None if a spot of
+    the start is no such sphere.
     """
-    inside = crowd.window.holds(crowd.intensity.centers)
-    bright = crowd.intensity.brightness[inside] / level
-    return bool(
-        set(range(count)) <= set(crowd.origin.tolist())
-        and np.all(crowd.chi2 <= usual.worst_chi2)
-        and np.all((bright < usual.brightest) & (bright > 1 / usual.brightest))
+    same = (crowd.centers[:, None] == crowd.intensity.centers).all(axis=2)
+    bright = crowd.intensity.brightness[same.argmax(axis=1)] / level
+    good = (crowd.chi2 <= usual.worst_chi2) & (bright < usual.brightest)
+    good &= bright > 1 / usual.brightest
+    start = crowd.origin >= 0
+    if not set(range(count)) <= set(crowd.origin[good].tolist()):
+        return None
+    away = np.linalg.norm(crowd.centers[:, None] - crowd.centers[start], axis=2).min(axis=1)
+    good &= start | (away < TOUCHING_REACH * contact)
+    return crowd._replace(
+        centers=crowd.centers[good],
+        sigma=crowd.sigma[good],
+        chi2=crowd.chi2[good],
+        converged=crowd.converged[good],
+        origin=crowd.origin[good],
     )
 
 
-def _reach_border(frame: Floats, centers: Floats, image: SphereImage) -> Bools:
-    """Return which images of spheres at `centers` (n, 3) reach the border of the frame."""
-    last = (np.array(frame.shape) - 1) * np.array(image.voxel)
-    return np.asarray(np.any(np.minimum(centers, last - centers) < image.extent, axis=1))
+def _touch_border(frame: Floats, centers: Floats, voxel: _Voxel, *, reach: float) -> bool:
+    """Return whether one of the centres (n, 3) is nearer to the border than a sphere that it cuts.
+
+    Spheres at the border, which are often not found, touch those within one contact distance.
+    """
+    last = (np.array(frame.shape) - 1) * np.array(voxel)
+    return bool(np.any(np.minimum(centers, last - centers) < reach))
+
+
+def _is_disturbed(
+    usual: UsualImage, square: Floats, voxels: Floats, window: Window, fit: ImageFit
+) -> bool:
+    """Return whether an image has more residual than chance leaves, in its spheres or beside them.
+
+    The light of a sphere that was not found lies beside those of its group.
+    """
+    beside = usual.disturbed(np.array([fit.chi2]), voxels=np.array([window.data.size]))
+    return bool(usual.disturbed(square, voxels=voxels).any() or beside[0])
 
 
 def with_crowds(
@@ -763,7 +806,8 @@ def with_crowds(
     dict of ndarray
     """
     last = (np.array(frame.shape) - 1) * np.array(voxel)
-    margin = 0.0 if search.border else search.diameter / 2
+    # The field ends half a voxel beyond the centres of the outer voxels.
+    margin = -np.array(voxel) / 2 if search.border else search.diameter / 2
     for group, crowd in crowds:
         first = crowd.origin >= 0
         good = crowd.converged & np.isfinite(crowd.sigma).all(axis=1)
