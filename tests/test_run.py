@@ -544,7 +544,7 @@ def test_a_movie_of_pairs_gives_rods(learned):
 
 
 def test_a_movie_in_the_plane_is_measured(tmp_path):
-    """Triangles of bright discs: the angle is measured with the image of a sphere that is learned."""
+    """Triangles of bright discs are measured with the image of a sphere that the movie shows."""
     body = perrin.Cluster([[0.0, 0.0], [1.2, 0.0], [0.3, 1.1]])
     truth = perrin.simulate_motion(body, D_R=0.01, D_T=0.005, dt=1.0, n_frames=12, rng=4)
     places = truth.positions() + 5.0
