@@ -211,3 +211,12 @@ def test_planes_may_be_recorded_from_the_last(tmp_path):
         np.testing.assert_allclose(again.times, [0, 1, 2], atol=1e-9)
     with pytest.raises(ValueError, match=r"4 planes of 0\.5 s"):
         perrin.open_stack(frames, voxel=(0.3, 0.2, 0.2), dt=1.0, plane_time=-0.5)
+
+
+def test_a_body_at_rest_without_noise_has_no_errors():
+    """Positions that are exact and do not move give the same pose in all frames."""
+    x = np.repeat(BODY.positions[None], 20, axis=0)
+    delays = np.random.default_rng(1).uniform(0, 0.3, (20, 4))
+    motion = perrin.track_rotation(x, dt=DT, delays=delays, crossing=0.1)
+    np.testing.assert_allclose(motion.rotation, np.broadcast_to(np.eye(3), (20, 3, 3)), atol=1e-9)
+    assert motion.sigma < 1e-8

@@ -25,6 +25,9 @@ _NODES = 6
 # mean square step would give without noise.
 _LEAST_SHARE = 0.2
 
+# Positions without noise are exact to this share of the body's size.
+_ROUNDING = 1e-9
+
 # The error of an axis is at least a third of the largest one: few frames can give zero.
 _LEAST_AXIS = 0.1
 
@@ -144,7 +147,8 @@ def fit_scanned(
     shared, away = _averaged_brownian(t, d, crossing=crossing)
     points = np.where(here[..., None], x[rows], 0.0)
     rotation, center, template = fit.rotation[rows], fit.center[rows], fit.template
-    variance = np.full(d, fit.sigma2) if sigma is None else sigma**2
+    rounding = (_ROUNDING * np.abs(fit.template).max()) ** 2
+    variance = np.full(d, max(fit.sigma2, rounding)) if sigma is None else sigma**2
     instant = x.copy()
     for _ in range(_ROUNDS):
         D_R, D_T = _step_moments(rotation, center, time[rows], piece[rows])
@@ -157,7 +161,7 @@ def fit_scanned(
         e = ((points - center[:, None] - arm) * here[..., None]).reshape(len(rows), n * d)
         if sigma is None:
             variance = _restricted_variance(moved, slope, e, variance, absent)
-            variance = np.maximum(variance, _LEAST_AXIS * variance.max())
+            variance = np.maximum(variance, max(_LEAST_AXIS * variance.max(), rounding))
             if least is not None:
                 variance = np.maximum(variance, least**2)
         inverse, P = _generalised_inverses(moved, slope, variance, absent)
