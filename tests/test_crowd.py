@@ -13,7 +13,12 @@ import perrin
 from perrin.images.optics.crowd_equations import normal_equations
 from perrin.images.optics.crowd_fit import fit_crowd
 from perrin.images.optics.optics import CameraNoise
-from perrin.images.spheres.localisation import Search, choose_method, sample_frames
+from perrin.images.spheres.localisation import (
+    Search,
+    choose_method,
+    sample_frames,
+    without_doubles,
+)
 
 pytest.importorskip("trackpy")
 
@@ -199,6 +204,29 @@ def test_the_normal_equations_are_those_of_finite_differences(pack, begun):
 
 
 @pytest.mark.skipif(not REAL.exists(), reason="the real confocal stack is not available")
+def test_no_two_refined_spheres_overlap():
+    """Of spheres within 0.8 contacts the worse fit is marked; the order of rows does not matter."""
+    rng = np.random.default_rng(7)
+    x = rng.uniform(0, 8, (60, 3))
+    columns = dict(zip("xyz", x.T, strict=True)) | {
+        "chi2": rng.uniform(0.8, 2.0, 60),
+        "refined": rng.random(60) < 0.9,
+        "reason": np.full(60, "", dtype=object),
+    }
+    found = without_doubles(columns, contact=2.0)
+    kept = found["refined"]
+    assert not (kept & ~columns["refined"]).any()
+    away = cdist(x, x) + np.diag(np.full(60, np.inf))
+    assert away[np.ix_(kept, kept)].min() >= 1.6
+    for k in np.flatnonzero(columns["refined"] & ~kept):
+        near = columns["refined"] & (away[k] < 1.6)
+        assert (columns["chi2"][near] < columns["chi2"][k]).any()
+        assert "0.8 contact" in found["reason"][k]
+    order = rng.permutation(60)
+    turned = without_doubles({name: v[order] for name, v in columns.items()}, contact=2.0)
+    np.testing.assert_array_equal(turned["refined"], kept[order])
+
+
 def test_a_real_stack_of_dark_spheres(repeats):
     """Spheres that do not overlap are found at almost all positions listed for another program.
 

@@ -158,6 +158,7 @@ from perrin.images.spheres.localisation import (
     sample_frames,
     size_faults,
     with_crowds,
+    without_doubles,
 )
 from perrin.images.spheres.planar import (
     PlaneFit,
@@ -359,6 +360,7 @@ __all__ = [
     "with_crowds",
     "with_poses",
     "within",
+    "without_doubles",
     "write_imaging",
     "write_stack",
 ]

@@ -81,6 +81,10 @@ _PIECE_SPHERES = 30
 
 # Reason of spots whose image is not that of one sphere, by its shape or its brightness.
 NO_SPHERE = "not the image of a sphere"
+_DOUBLE = "nearer than 0.8 contact distances to a sphere that fits better"
+
+# Hard spheres do not overlap; the distribution of their sizes and errors are far below a fifth.
+_LEAST_DISTANCE = 0.8
 
 # Reasons for which a sphere is not refined.
 _IN_A_CROWD, _NO_OWN_VOXELS = "in a crowd", "no voxels of its own"
@@ -274,6 +278,7 @@ class Method:
             columns = with_crowds(
                 columns, frame, found, self.search, voxel, crowds=crowds, usual=self.usual
             )
+            columns = without_doubles(columns, contact=self.search.contact)
         else:
             centers = found.centers
             if self.refine == "trackpy":
@@ -575,6 +580,46 @@ def fit_optics(sample: Sequence[SampledFrame], method: Method, *, voxel: _Voxel)
         samples, most = pieces, _LEARNING_CROWDS
     chosen = [samples[k] for k in _evenly_spaced(len(samples), most)]
     return fit_samples(chosen, diameter=search.diameter, voxel=voxel)
+
+
+def without_doubles(columns: Columns, *, contact: float) -> Columns:
+    """Return the spheres of a frame of which no two refined ones are within 0.8 contacts.
+
+    Parameters
+    ----------
+    columns : dict of ndarray
+        As `group_columns` returns them.
+    contact : float
+        Centre distance of touching spheres, um.
+
+    Returns
+    -------
+    dict of ndarray
+        Of two spheres that overlap by more, the one with the larger chi-squared is marked as not
+        refined, the worst of a frame first.
+
+    Examples
+    --------
+    >>> two = {axis: np.zeros(2) for axis in "yz"} | {"x": np.array([0.0, 1.0])}
+    >>> two |= {"chi2": np.array([1.0, 3.0]), "refined": np.ones(2, dtype=bool)}
+    >>> without_doubles(two | {"reason": np.array(["", ""], dtype=object)}, contact=2.0)["refined"]
+    array([ True, False])
+    """
+    from scipy.spatial import cKDTree
+
+    refined, reason = columns["refined"].copy(), columns["reason"].copy()
+    x = np.stack([columns[axis] for axis in "xyz"], axis=1)
+    rows = np.flatnonzero(refined)
+    if rows.size < 2:
+        return columns
+    pairs = rows[cKDTree(x[rows]).query_pairs(_LEAST_DISTANCE * contact, output_type="ndarray")]
+    worse = np.where(
+        columns["chi2"][pairs[:, 0]] > columns["chi2"][pairs[:, 1]], pairs[:, 0], pairs[:, 1]
+    )
+    for k in np.argsort(-columns["chi2"][worse], kind="stable"):
+        if refined[pairs[k]].all():
+            refined[worse[k]], reason[worse[k]] = False, _DOUBLE
+    return columns | {"refined": refined, "reason": reason}
 
 
 def group_columns(
