@@ -14,11 +14,13 @@ from perrin.images.spheres.localisation import (
     found_table,
     frame_digest,
     group_columns,
+    groups_to_fit,
     is_flat,
     locate,
     sample_frames,
     size_faults,
     with_crowds,
+    without_doubles,
 )
 from perrin.images.spheres.planar import (
     PlaneFit,
@@ -29,15 +31,19 @@ from perrin.images.spheres.planar import (
 )
 from perrin.images.spheres.poses import Pose, fit_pose, pose_in, start_of, with_poses
 from perrin.images.spheres.spots import (
+    Fading,
     Spots,
     SpotSettings,
     at_contact,
+    clear_mass_cut,
+    find_fading,
     groups_and_crowds,
     mass_cut,
     touching_together,
 )
 
 __all__ = [
+    "Fading",
     "Features",
     "LocatedFrame",
     "Method",
@@ -52,7 +58,9 @@ __all__ = [
     "check_search",
     "choose_method",
     "circle_cut",
+    "clear_mass_cut",
     "find_circles",
+    "find_fading",
     "find_features",
     "fit_optics",
     "fit_plane",
@@ -62,6 +70,7 @@ __all__ = [
     "frame_digest",
     "group_columns",
     "groups_and_crowds",
+    "groups_to_fit",
     "is_flat",
     "learn_plane",
     "locate",
@@ -75,4 +84,5 @@ __all__ = [
     "touching_together",
     "with_crowds",
     "with_poses",
+    "without_doubles",
 ]
