@@ -100,8 +100,8 @@ def error_ratio(bodies: Iterable[tuple[RigidMotion, Floats, Floats]]) -> ErrorRa
     >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=0.02, dt=0.7, n_frames=400, rng=1)
     >>> x = add_noise(truth.positions(), sigma=(0.03, 0.03, 0.06), rng=2)
     >>> stated = np.full((400, 3), 0.03**2)
-    >>> error_ratio([(track_rotation(x, dt=0.7), x, stated)]).value.round(1)
-    array([1. , 1. , 4. ])
+    >>> error_ratio([(track_rotation(x, dt=0.7), x, stated)]).measured.round()
+    array([1., 1., 4.])
     """
     total: Floats | None = None
     mixes, squares, times, depths = [], [], [], []
