@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-_LISTED_ITEMS = 4  # longer sequences are shown by their length
+_SHOWN_ITEMS = 4  # longer sequences are shown by their length
 _LONGEST_LINE = 240  # letters of a representation
 
 
@@ -60,16 +60,16 @@ class Shown:
 def _short_text(value: Any) -> str:  # noqa: ANN401 (values of any type)
     """Write a number in four digits, an array as its shape, a long sequence as its length."""
     if isinstance(value, np.ndarray):
-        short = value.size <= _LISTED_ITEMS and value.ndim == 1
+        short = value.size <= _SHOWN_ITEMS and value.ndim == 1
         return _short_text(value.tolist()) if short else f"array of shape {value.shape}"
     if isinstance(value, float | np.floating):
         return f"{float(value):.4g}"
     if isinstance(value, dict):
-        if len(value) > 2 * _LISTED_ITEMS:
+        if len(value) > 2 * _SHOWN_ITEMS:
             return f"{len(value)} entries"
         return "{" + ", ".join(f"{k}: {_short_text(x)}" for k, x in value.items()) + "}"
     if isinstance(value, tuple | list):
-        if len(value) > _LISTED_ITEMS:
+        if len(value) > _SHOWN_ITEMS:
             return f"{len(value)} items"
         return f"({', '.join(map(_short_text, value))})"
     return str(value)

@@ -40,7 +40,7 @@ _SMALLEST_STEP_RATIO = 1e-24
 _COARSE_LOG_STEP = 0.03
 
 # About this many step components are evaluated at once; more do not stay in the processor's cache.
-_MOST_AT_ONCE = 100_000
+_MOST_MOTIONS_AT_ONCE = 100_000
 
 _LEAST_SLOPE_RATIO = float(np.exp(-_MOST_LOG_OFFSET))
 
@@ -258,7 +258,7 @@ class Likelihood:
         """
         size = sum(t.steps.vectors.size for t in self.tracks)
         powers = np.concatenate([[0.0], 4.0 ** np.arange(-7, 3)])
-        at_once = int(np.clip(_MOST_AT_ONCE / size, 1, len(powers)))
+        at_once = int(np.clip(_MOST_MOTIONS_AT_ONCE / size, 1, len(powers)))
         parts: list[ProfilePoint] = []
         for k in range(0, 60, at_once):
             if k >= len(powers):

@@ -38,7 +38,7 @@ LEAST_BLUR = 0.1
 CONVERGED_GAIN, ROUNDING_GAIN = 1e-17, 1e-9
 
 # Frames are equally noisy if the elements of their noise agree to this.
-_EQUAL_NOISE = 1e-9
+_EQUALLY_NOISY_FRAMES = 1e-9
 
 # Step of numerical derivatives, in scaled units where all parameters are of order 1.
 _DIFFERENCE_STEP = 1e-5
@@ -133,7 +133,7 @@ class NoisyVectors:
         ends = np.zeros(s.noise.shape[1], dtype=np.bool_)
         ends[s.start] = ends[s.stop] = True
         noise = s.noise[:, ends]
-        if not np.ptp(noise, axis=1).max() <= _EQUAL_NOISE * np.abs(noise).max():
+        if not np.ptp(noise, axis=1).max() <= _EQUALLY_NOISY_FRAMES * np.abs(noise).max():
             return None
         return ChainTrack(s, noise[:, 0])
 

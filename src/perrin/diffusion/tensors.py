@@ -53,7 +53,7 @@ if TYPE_CHECKING:
 _NOISELESS = 1e-8
 
 # About this many step components are evaluated at once; more do not stay in the processor's cache.
-_MOST_AT_ONCE = 30_000
+_MOST_TENSORS_AT_ONCE = 30_000
 
 _ISOTROPIC = np.eye(3)[None] / 3**0.5
 
@@ -139,7 +139,7 @@ def diffusion_tensor(
     fit = tensor_fits([data], [basis])[0]
     if isinstance(fit, ValueError):
         raise fit
-    tensor = _described(fit, data, motions, quantity, symbol)
+    tensor = _tensor_of(fit, data, motions, quantity, symbol)
     if np.isnan(tensor.covariance).any():
         warnings.warn(f"diffusion_tensor: {NO_ERRORS}", PrecisionWarning, stacklevel=2)
     return tensor
@@ -182,7 +182,7 @@ def tensor_of_each(
         if isinstance(fit, ValueError):
             found[i] = fit
         else:
-            found[i] = _described(fit, data, [motions[i]], quantity, symbol)
+            found[i] = _tensor_of(fit, data, [motions[i]], quantity, symbol)
     return found
 
 
@@ -199,7 +199,7 @@ def _prepared(
     return ScaledTracks.of(steps, noise), symbol, basis
 
 
-def _described(
+def _tensor_of(
     fit: TensorFit,
     data: ScaledTracks,
     motions: Sequence[RigidMotion],
@@ -625,7 +625,7 @@ def tensor_fits(
             together.setdefault(batch_key(one.tracks[0]), []).append(i)
     for group in together.values():
         size = data[group[0]].tracks[0].steps.vectors.size
-        at_once = max(1, _MOST_AT_ONCE // size)
+        at_once = max(1, _MOST_TENSORS_AT_ONCE // size)
         for k in range(0, len(group), at_once):
             some = group[k : k + at_once]
             fits = _even_fits([data[i] for i in some], [bases[i] for i in some])

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from perrin._arrays import Floats, Ints
     from perrin.motion.rigid_motion import RigidMotion
 
-_FEWEST_STEPS = 10  # that two bodies share
+_FEWEST_SHARED_STEPS = 10  # that two bodies share
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +106,7 @@ def common_motion(bodies: Sequence[tuple[RigidMotion, Ints]]) -> CommonMotion | 
     filled = np.where(seen[..., None], steps, 0.0)
     own = (filled**2).sum(axis=1) / np.maximum(seen.sum(axis=1), 1)[:, None]
     pairs = float((seen.sum(axis=0) * (seen.sum(axis=0) - 1) / 2).sum())
-    if pairs < _FEWEST_STEPS or not (own[seen.any(axis=1)] > 0).all():
+    if pairs < _FEWEST_SHARED_STEPS or not (own[seen.any(axis=1)] > 0).all():
         return None
     squares = np.where(seen[..., None], own[:, None], 0.0)
     products = 0.5 * (filled.sum(axis=0) ** 2 - (filled**2).sum(axis=0))

@@ -21,9 +21,9 @@ if TYPE_CHECKING:
 _TREND_ERRORS = 3.3
 
 # A measured ratio is at least this one; few frames can give a negative variance.
-_LEAST_RATIO = 0.1
+_LEAST_ERROR_RATIO = 0.1
 
-_ROUNDS = 8  # of the weights
+_WEIGHTING_ROUNDS = 8  # of the weights
 
 # The logarithm of the ratio changes by at most this over the movie or the depth.
 _LARGEST_TREND = 3.0
@@ -130,13 +130,13 @@ def error_ratio(bodies: Iterable[tuple[RigidMotion, Floats, Floats]]) -> ErrorRa
         return ErrorRatio(np.ones(len(unknown)), unknown, unknown, 0.0, 0.0, 0.0, 0.0)
     mix, square = np.concatenate(mixes), np.concatenate(squares)
     time, depth = np.concatenate(times), np.concatenate(depths)
-    measured = np.maximum(np.linalg.solve(total, square.sum(axis=0)), _LEAST_RATIO)
-    for _ in range(_ROUNDS):
+    measured = np.maximum(np.linalg.solve(total, square.sum(axis=0)), _LEAST_ERROR_RATIO)
+    for _ in range(_WEIGHTING_ROUNDS):
         # Squares scatter in proportion to their expectation.
         weighted = np.swapaxes(mix, 1, 2) / ((mix @ measured) ** 2)[:, None, :]
         inverse = np.linalg.inv((weighted @ mix).sum(axis=0))
         scores = np.einsum("tab,tb->ta", weighted, square - mix @ measured)
-        measured = np.maximum(measured + inverse @ scores.sum(axis=0), _LEAST_RATIO)
+        measured = np.maximum(measured + inverse @ scores.sum(axis=0), _LEAST_ERROR_RATIO)
     stderr = np.sqrt(np.diag(inverse @ scores.T @ scores @ inverse.T))
     off = measured - 1
     held = np.divide(stderr, off, out=np.full(len(off), np.inf), where=off != 0)

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from perrin.motion.rigid_motion import RigidMotion
 
 # Rounds of diffusion, localisation error, poses and shape: each depends on the others.
-_ROUNDS = 6
+_SCAN_ROUNDS = 6
 
 # Nodes of the average over the planes through one particle.
 _NODES = 6
@@ -150,7 +150,7 @@ def fit_scanned(
     rounding = (_ROUNDING * np.abs(fit.template).max()) ** 2
     variance = np.full(d, max(fit.sigma2, rounding)) if sigma is None else sigma**2
     instant = x.copy()
-    for _ in range(_ROUNDS):
+    for _ in range(_SCAN_ROUNDS):
         D_R, D_T = _step_moments(rotation, center, time[rows], piece[rows])
         Q = np.diag([2 * D_R] * angles + [2 * D_T] * d)
         arm = np.einsum("tij,nj->tni", rotation, template)

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 # frames after it was last seen.
 _SPHERE_GATE, _FRAMES_BRIDGED = 36.0, 5
 
-_FEWEST_STEPS = 5  # of a track with a variance of its own
+_FEWEST_OWN_STEPS = 5  # of a track with a variance of its own
 
 
 def link_spheres(frame: Ints, x: Floats, *, variance: float) -> Ints:
@@ -99,7 +99,7 @@ def track_variances(frame: Ints, track: Ints, x: Floats) -> Floats:
     middle = np.cumsum(steps) - steps + steps // 2
     own = square[ranked[np.minimum(middle, len(ranked) - 1)]]
     usual = float(np.median(square))
-    own = np.where(steps < _FEWEST_STEPS, usual, np.maximum(own, usual))
+    own = np.where(steps < _FEWEST_OWN_STEPS, usual, np.maximum(own, usual))
     return own / median_chi2(x.shape[1])
 
 

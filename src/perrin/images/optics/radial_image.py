@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 _CUBIC = np.array([[1, 4, 1, 0], [-3, 0, 3, 0], [3, -6, 3, 0], [-1, 3, -3, 1]]) / 6.0
 
 # Step of a sphere over the distance of the knots at which a fit ends, and its most steps.
-_STEP_CONVERGED, _MAX_STEPS = 1e-3, 25
+_RADIAL_STEP_CONVERGED, _MAX_STEPS = 1e-3, 25
 
 # Last step that is accepted, in standard errors of a coordinate with all others known.
 _SETTLED_STEP = 0.1
@@ -40,7 +40,7 @@ _SMALL_DAMPING, _MOST_DAMPING = 0.1, 1e8
 _PIXELS_PER_PARAMETER = 4
 
 # Parameters of the background: a level and its slope along y and x.
-_N_BACKGROUND = 3
+_N_LOCAL_BACKGROUND = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,7 +199,7 @@ class Patch(NamedTuple):
 
     def has_enough_pixels(self, count: int) -> bool:
         """Return whether there are enough pixels to fit `count` spheres."""
-        return len(self.data) >= _PIXELS_PER_PARAMETER * (3 * count + _N_BACKGROUND)
+        return len(self.data) >= _PIXELS_PER_PARAMETER * (3 * count + _N_LOCAL_BACKGROUND)
 
 
 def cut_patch(frame: Floats, centers: Floats, *, reach: float, pixel: tuple[float, float]) -> Patch:
@@ -388,7 +388,7 @@ def fit_patch(
         full = damping < _SMALL_DAMPING
         settled = full and bool((np.abs(step) * np.sqrt(scale) < _SETTLED_STEP)[: 2 * n].all())
         state, damping = trial, damping / 10.0
-        if change < _STEP_CONVERGED * image.spacing and full:
+        if change < _RADIAL_STEP_CONVERGED * image.spacing and full:
             converged = True
             break
     freedom = max(len(patch.data) - len(state.jacobian), 1)

@@ -84,7 +84,7 @@ NO_SPHERE = "not the image of a sphere"
 _DOUBLE = "nearer than 0.8 contact distances to a sphere that fits better"
 
 # Hard spheres do not overlap; the distribution of their sizes and errors are far below a fifth.
-_LEAST_DISTANCE = 0.8
+_LEAST_APART = 0.8
 
 # Reasons for which a sphere is not refined.
 _IN_A_CROWD, _NO_OWN_VOXELS = "in a crowd", "no voxels of its own"
@@ -612,7 +612,7 @@ def without_doubles(columns: Columns, *, contact: float) -> Columns:
     rows = np.flatnonzero(refined)
     if rows.size < 2:
         return columns
-    pairs = rows[cKDTree(x[rows]).query_pairs(_LEAST_DISTANCE * contact, output_type="ndarray")]
+    pairs = rows[cKDTree(x[rows]).query_pairs(_LEAST_APART * contact, output_type="ndarray")]
     worse = np.where(
         columns["chi2"][pairs[:, 0]] > columns["chi2"][pairs[:, 1]], pairs[:, 0], pairs[:, 1]
     )

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 _MOST_TOGETHER = 12
 
 # Number of groups of spheres from which the image is learned.
-_LEARNING_GROUPS = 40
+_LEARNING_PLANAR_GROUPS = 40
 
 # Contact distance in pixels below which twice as many are used, as each shows less.
 _SMALL_SPHERES = 8
@@ -44,14 +44,14 @@ _MAX_SWEEPS, _SWEEP_CONVERGED = 12, 0.001
 
 # Distance from the place found first, and distance of two spheres, in contact distances, from which
 # a fit is that of another sphere.
-_MOVED, _SAME = 0.3, 0.6
+_LEFT_PLACE, _SAME = 0.3, 0.6
 
 # Spread of the sizes of the images, from which they are not those of equal spheres in a plane, and
 # distance of the knots for its measurement, in contact distances.
 _SIZE_SPREAD, _SIZE_KNOTS = 0.06, 0.12
 
 # Reasons for which a sphere is not refined.
-_NO_IMAGE, _AWAY, _UNSETTLED, _NO_PIXELS = (
+_NO_IMAGE, _AWAY, _UNSETTLED_PLACE, _NO_PIXELS = (
     "no image of a sphere",
     "moved to another sphere",
     "fit did not settle",
@@ -132,7 +132,7 @@ def learn_plane(
         for frame, centers in zip(frames, places, strict=True)
         for group in fitted_together(centers, contact=contact)
     ]
-    most = _LEARNING_GROUPS * (2 if contact < _SMALL_SPHERES * min(pixel) else 1)
+    most = _LEARNING_PLANAR_GROUPS * (2 if contact < _SMALL_SPHERES * min(pixel) else 1)
     chosen = np.unique(np.linspace(0, len(samples) - 1, most).round().astype(int))
     samples = [samples[k] for k in chosen] if samples else []
     image, samples = learn_image(samples, contact=contact, pixel=pixel)
@@ -254,7 +254,7 @@ def _sweep(
     pixel: tuple[float, float],
 ) -> None:
     """Fit every group of the spheres in turn, until positions stay."""
-    there = np.flatnonzero((fit.reason == "") | (fit.reason == _UNSETTLED))
+    there = np.flatnonzero((fit.reason == "") | (fit.reason == _UNSETTLED_PLACE))
     groups = [there[g] for g in fitted_together(first[there], contact=contact)]
     overlap = image.reach + image.surroundings + 0.1 * contact
     away = np.linalg.norm(first[there][:, None] - first[there], axis=2)
@@ -297,7 +297,7 @@ def _fit_group(
     fit.chi2[group] = found.chi2
     if not (found.converged and np.isfinite(found.centers).all()):
         dim = ~(found.brightness > LEAST_BRIGHTNESS * np.median(found.brightness))
-        fit.reason[group] = np.where(dim, _NO_IMAGE, _UNSETTLED)
+        fit.reason[group] = np.where(dim, _NO_IMAGE, _UNSETTLED_PLACE)
         return
     fit.reason[group] = ""
     fit.centers[group], fit.brightness[group] = found.centers, found.brightness
@@ -312,7 +312,7 @@ def _mark_wrong_spots(first: Floats, fit: PlaneFit, contact: float) -> None:
         return
     typical = float(np.median(fit.brightness[good]))
     dim = good & ~(fit.brightness > LEAST_BRIGHTNESS * typical)
-    away = good & (np.linalg.norm(fit.centers - first, axis=1) > _MOVED * contact)
+    away = good & (np.linalg.norm(fit.centers - first, axis=1) > _LEFT_PLACE * contact)
     close = np.linalg.norm(fit.centers[:, None] - fit.centers, axis=2) < _SAME * contact
     moved = np.linalg.norm(fit.centers - first, axis=1)
     for i, j in zip(*np.nonzero(np.triu(close, 1)), strict=True):
