@@ -181,7 +181,7 @@ def viscoelastic_moduli(
     noise : {"joint", "residual"}
         "joint": the offset of the mean square is fitted together with a power law. "residual": it
         is that which the rigid-fit residuals predict, which is right where all particles of a
-        frame are recorded at the same instant and the exposure is short; the error of |G*| at
+        frame are recorded at the same instant and the exposure is short; the error of ``|G*|`` at
         short lags is then five times smaller.
 
     Returns
@@ -198,8 +198,8 @@ def viscoelastic_moduli(
     Notes
     -----
     With the local power law MSD ~ t^alpha after Mason, Rheol. Acta 39, 371 (2000):
-    |G*|(1/t) = 2 d kT/(f MSD(t) Gamma(1 + alpha)), G' = |G*| cos(pi alpha/2) and
-    G'' = |G*| sin(pi alpha/2), with the mean square over d axes and the friction per viscosity f
+    ``|G*|``(1/t) = 2 d kT/(f MSD(t) Gamma(1 + alpha)), G' = ``|G*|`` cos(pi alpha/2) and
+    G'' = ``|G*|`` sin(pi alpha/2), with the mean square over d axes and the friction per viscosity f
     of that motion: 6 pi a for the translation of a sphere, 8 pi a^3 for its rotation.
 
     The offset 2 d o is subtracted first; without that, noise reads as elasticity at short lags. It
