@@ -197,10 +197,10 @@ def viscoelastic_moduli(
 
     Notes
     -----
-    With the local power law MSD ~ t^alpha after Mason, Rheol. Acta 39, 371 (2000):
-    ``|G*|``(1/t) = 2 d kT/(f MSD(t) Gamma(1 + alpha)), G' = ``|G*|`` cos(pi alpha/2) and
-    G'' = ``|G*|`` sin(pi alpha/2), with the mean square over d axes and the friction per viscosity f
-    of that motion: 6 pi a for the translation of a sphere, 8 pi a^3 for its rotation.
+    With the local power law MSD ~ t^alpha after Mason, Rheol. Acta 39, 371 (2000), at 1/t:
+    ``|G*|`` = 2 d kT/(f MSD(t) Gamma(1 + alpha)), G' = ``|G*|`` cos(pi alpha/2) and G'' =
+    ``|G*|`` sin(pi alpha/2), with the mean square over d axes and the friction per viscosity f of
+    that motion: 6 pi a for the translation of a sphere, 8 pi a^3 for its rotation.
 
     The offset 2 d o is subtracted first; without that, noise reads as elasticity at short lags. It
     is fitted by generalised least squares with the exact covariance of a noisy power law, over
