@@ -203,7 +203,6 @@ def test_the_normal_equations_are_those_of_finite_differences(pack, begun):
     assert np.allclose(found.sigma, exact[:n].reshape(-1, 4)[:, :3], rtol=0.01)
 
 
-@pytest.mark.skipif(not REAL.exists(), reason="the real confocal stack is not available")
 def test_no_two_refined_spheres_overlap():
     """Of spheres within 0.8 contacts the worse fit is marked; the order of rows does not matter."""
     rng = np.random.default_rng(7)
@@ -227,6 +226,7 @@ def test_no_two_refined_spheres_overlap():
     np.testing.assert_array_equal(turned["refined"], kept[order])
 
 
+@pytest.mark.skipif(not REAL.exists(), reason="the real confocal stack is not available")
 def test_a_real_stack_of_dark_spheres(repeats):
     """Spheres that do not overlap are found at almost all positions listed for another program.
 

@@ -325,7 +325,7 @@ def test_the_data_of_the_figures_are_those_of_the_result(single, planar):
 
 def test_paths_of_many_clusters_are_thinned(single, monkeypatch):
     """A cluster among very many is drawn in the fewest frames, so that the page stays small."""
-    monkeypatch.setattr(figure_data, "_FEWEST_FRAMES", 20)
+    monkeypatch.setattr(figure_data, "_FEWEST_DRAWN_FRAMES", 20)
     (result,) = single.clusters
     rows = figure_data.grouped_tracks(single.tracks)[result.cluster]
     header, column = unpacked(figure_data.cluster_data(result, rows, clusters=10**6))
