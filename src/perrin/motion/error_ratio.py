@@ -40,7 +40,8 @@ class ErrorRatio:
     ----------
     value : ndarray, shape (d,)
         Ratio of each lab axis, drawn to 1 by its own error: 1 + (1 - s^2/(r - 1)^2) (r - 1) for the
-        measured ratio r of standard error s, and 1 where r differs from 1 by less than s.
+        measured ratio r of standard error s, and 1 where r - 1 is less than s: positions are not
+        better than their light allows.
     measured, stderr : ndarray, shape (d,)
         Measured ratios and their standard errors; NaN where no frame determines them.
     by_time : float
@@ -140,7 +141,7 @@ def error_ratio(bodies: Iterable[tuple[RigidMotion, Floats, Floats]]) -> ErrorRa
     stderr = np.sqrt(np.diag(inverse @ scores.T @ scores @ inverse.T))
     off = measured - 1
     held = np.divide(stderr, off, out=np.full(len(off), np.inf), where=off != 0)
-    value = 1 + np.maximum(1 - held**2, 0.0) * off
+    value = 1 + np.maximum(1 - held**2, 0.0) * np.maximum(off, 0.0)
     by_time, by_depth = _trends(square, mix @ measured, time, depth)
     return ErrorRatio(
         value, measured, stderr, by_time, by_depth, float(time.mean()), float(depth.mean())
