@@ -9,7 +9,7 @@ import numpy as np
 
 from perrin._arrays import frozen
 from perrin.geometry.rigid import orientation_covariance
-from perrin.motion.residuals import body_residuals, fit_projector
+from perrin.motion.residuals import body_residuals, expected_squares, fit_projector
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -110,14 +110,12 @@ def error_ratio(bodies: Iterable[tuple[RigidMotion, Floats, Floats]]) -> ErrorRa
         vector = body_residuals(motion, positions)
         good = np.isfinite(vector).all(axis=(1, 2)) & np.isfinite(stated).all(axis=1)
         good &= (stated > 0).all(axis=1)
-        count, d = int(good.sum()), vector.shape[2]
+        count = int(good.sum())
         if count < 3:
             continue
         turn = motion.rotation[good]
-        blocks = fit_projector(motion.template).reshape(-1, d * d)
-        pairs = (turn[:, :, None, :, None] * turn[:, None, :, None, :]).reshape(count, d, d, d * d)
-        mix = ((pairs @ (blocks.T @ blocks)) * pairs).sum(axis=-1)
         mean = stated[good].mean(axis=1, keepdims=True)
+        mix = expected_squares(turn, fit_projector(motion.template))
         mix = mix * (stated[good] / mean)[:, None, :]
         lab = np.einsum("tij,tnj->tni", turn, vector[good])
         # The mean shape was fitted to the same frames.

@@ -405,6 +405,35 @@ class AxisNoise(NamedTuple):
         return Slope(ratio, error, np.inf)
 
 
+def expected_squares(rotation: Floats, keeps: Floats) -> Floats:
+    """Return what variances along the lab axes add to the squares of the residuals of each frame.
+
+    Parameters
+    ----------
+    rotation : ndarray, shape (K, d, d)
+        Orientations of the body, lab from body.
+    keeps : ndarray, shape (n, n, d, d)
+        Projector on the residuals, as `fit_projector` returns it.
+
+    Returns
+    -------
+    ndarray, shape (K, d, d)
+        Sum over the particles of the squares along axis a for a variance of 1 along axis b: the
+        squares of the elements of R K R^T, summed over the blocks K of the projector.
+
+    Examples
+    --------
+    >>> triangle = np.array([[1.0, 0.0], [-0.5, 0.75**0.5], [-0.5, -(0.75**0.5)]])
+    >>> float(expected_squares(np.eye(2)[None], fit_projector(triangle)).sum().round(9))  # 2 n - 3
+    3.0
+    """
+    count, d = rotation.shape[:2]
+    blocks = keeps.reshape(-1, d * d)
+    pairs = rotation[:, :, None, :, None] * rotation[:, None, :, None, :]
+    pairs = pairs.reshape(count, d, d, d * d)
+    return np.asarray(((pairs @ (blocks.T @ blocks)) * pairs).sum(axis=-1))
+
+
 def axis_noise(sample: Residuals) -> AxisNoise | None:
     """Measure the localisation error of each lab axis; None where it is not determined.
 
@@ -430,13 +459,9 @@ def axis_noise(sample: Residuals) -> AxisNoise | None:
     array([0.031, 0.032, 0.059])
     """
     turn, count = sample.rotation, len(sample.rotation)
-    d = turn.shape[-1]
     if count < 3 or not (sample.vector**2).sum() > 0:
         return None
-    # The squares of the elements of turn K turn^T, summed over the blocks K of the projector.
-    blocks = sample.keeps.reshape(-1, d * d)
-    pairs = (turn[:, :, None, :, None] * turn[:, None, :, None, :]).reshape(count, d, d, d * d)
-    mix = ((pairs @ (blocks.T @ blocks)) * pairs).sum(axis=-1)
+    mix = expected_squares(turn, sample.keeps)
     lab = sample.in_lab(sample.vector)
     square = (lab**2).sum(axis=1) * count / (count - 1)
     total = mix.sum(axis=0)
