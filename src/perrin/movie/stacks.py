@@ -195,15 +195,13 @@ def analyze_stack(
     spots = options_from(Spots, spots, settings, name="spots", faults=faults)
     work = options_from(Work, work, settings, name="work", faults=faults)
     experiment = _stack_experiment(stack, experiment, settings, contact, faults)
-    search = Search(
+    search = Search.of(
+        stack,
+        spots,
         diameter=diameter,
         contact=contact,
-        dark=spots.dark,
-        percentile=spots.percentile,
-        minmass=spots.minmass,
-        border=spots.border,
+        refine=refine,
         crowds=True,  # clusters that meet may be a crowd for some frames
-        circles=refine == "model" and is_flat(stack),
     )
     faults += _faults_of(check_search, stack, search, refine, optics=optics)
     sizes = _wanted_sizes(size, faults)

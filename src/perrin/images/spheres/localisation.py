@@ -148,6 +148,29 @@ class Search:
     crowds: bool = False
     circles: bool = False
 
+    @classmethod
+    def of(
+        cls,
+        stack: StackLike,
+        spots: Spots,
+        *,
+        diameter: float,
+        contact: float,
+        refine: Refine,
+        crowds: bool,
+    ) -> Search:
+        """Return the search that options of spots state; in a 2-D movie it is for circles."""
+        return cls(
+            diameter=diameter,
+            contact=contact,
+            dark=spots.dark,
+            percentile=spots.percentile,
+            minmass=spots.minmass,
+            border=spots.border,
+            crowds=crowds,
+            circles=refine == "model" and is_flat(stack),
+        )
+
     def spots(self, frame: Floats, voxel: _Voxel) -> Features:
         """Return the spots of a frame, noise among them."""
         if self.circles:
@@ -496,15 +519,8 @@ def locate(
     refuse_unknown("locate", settings, SPOT_KEYWORDS)
     faults: list[str] = []
     spots = options_from(Spots, spots, settings, name="spots", faults=faults)
-    search = Search(
-        diameter=diameter,
-        contact=contact,
-        dark=spots.dark,
-        percentile=spots.percentile,
-        minmass=spots.minmass,
-        border=spots.border,
-        crowds=crowds,
-        circles=refine == "model" and is_flat(stack),
+    search = Search.of(
+        stack, spots, diameter=diameter, contact=contact, refine=refine, crowds=crowds
     )
     check_search(stack, search, refine, optics=optics, faults=faults)
     n_frames = stack.shape[0]
