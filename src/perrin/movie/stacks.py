@@ -233,7 +233,6 @@ def analyze_stack(
             _uneven_clock(stack),
             errors,
             crossing=abs(stack.plane_time or 0.0) * diameter / float(stack.voxel[0]),
-            least_sigma=errors,
         )
         if bodies.sizes or excluded:
             report = measure_table(

@@ -14,8 +14,6 @@ from perrin.hydrodynamics.mobility import condition_faults
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from numpy.typing import ArrayLike
-
     from perrin._arrays import Bools, Floats, Ints
     from perrin.tracks.clock import Clock
 
@@ -205,25 +203,23 @@ class Recording:
         Time between successive frame numbers, s.
     times : Clock or None
         Times of the frames where they are not `dt` apart.
-    sigma_ratio : array_like or None
-        Localisation errors of the axes over each other, where only their ratio is known.
+    stated_sigma : ndarray, shape (d,), or None
+        Localisation error of each axis that the fits to the images state, um: at least that of the
+        light, and in the right ratio.
     first_frame : int
         The table's own number of its first frame.
     recorded : ndarray of int or None
         Frames, counted from the first, that any row of the table has.
     crossing : float
         Time in which the planes through one particle are recorded, s.
-    least_sigma : ndarray, shape (d,), or None
-        Localisation error of each axis that the light alone allows, um.
     """
 
     dt: float
     times: Clock | None = None
-    sigma_ratio: ArrayLike | None = None
+    stated_sigma: Floats | None = None
     first_frame: int = 0
     recorded: Ints | None = None
     crossing: float = 0.0
-    least_sigma: Floats | None = None
 
     def clock(self, frames: Ints) -> Floats:
         """Return the times of frames, s."""

@@ -444,7 +444,7 @@ def fit_body(tracks: ClusterTracks, experiment: Experiment, recording: Recording
             delays,
             time=times,
             crossing=recording.crossing,
-            least=recording.least_sigma,
+            least=recording.stated_sigma,
             **fitted,
         )
     swaps, cuts, extra = frames[identity.swaps], frames[1:][changed], frames[identity.extra]
@@ -452,7 +452,7 @@ def fit_body(tracks: ClusterTracks, experiment: Experiment, recording: Recording
         motion,
         positions,
         sigma=experiment.sigma,
-        sigma_ratio=recording.sigma_ratio,
+        sigma_ratio=recording.stated_sigma,
         # Detections that were left out have no position at the instant.
         detections=tracks.positions if tracks.delay is None else None,
         unsettled=tuple(identity.unsettled.tolist()),
