@@ -24,6 +24,14 @@ from perrin.diffusion.decoupling import (
     prediction_errors,
     translation_rotation_correlation,
 )
+from perrin.diffusion.effective_modes import (
+    EffectiveModes,
+    FewModes,
+    NoiseProfile,
+    compress_steps,
+    moments_of_steps,
+    ratio_node,
+)
 from perrin.diffusion.estimate import DiffusionEstimate, Found, bare_text, value_text
 from perrin.diffusion.estimators import (
     by_likelihood,
@@ -209,7 +217,9 @@ __all__ = [
     "DiagonalModes",
     "DiffusionEstimate",
     "DiffusionTensor",
+    "EffectiveModes",
     "EvenTracks",
+    "FewModes",
     "Found",
     "GridLags",
     "GroupSlopes",
@@ -222,6 +232,7 @@ __all__ = [
     "Moments",
     "MotionVerdict",
     "Noise",
+    "NoiseProfile",
     "NoisySteps",
     "NoisyVectors",
     "Parameter",
@@ -269,6 +280,7 @@ __all__ = [
     "center_steps",
     "clustering",
     "combined_p",
+    "compress_steps",
     "confined_autocovariance",
     "confined_mean_square",
     "coupled_tensor",
@@ -324,6 +336,7 @@ __all__ = [
     "long_time_diffusion",
     "maximise",
     "maximise_each",
+    "moments_of_steps",
     "motions_and_noise",
     "msd_covariance",
     "neighbour_products",
@@ -340,6 +353,7 @@ __all__ = [
     "prediction_errors",
     "principal_steps",
     "ratio_bend",
+    "ratio_node",
     "relaxation_faults",
     "residual_freedom",
     "root_parameters",
