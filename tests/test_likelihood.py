@@ -325,7 +325,7 @@ def test_few_modes_are_the_likelihood_of_a_long_track_with_gaps(body, quantity, 
     D, theta = np.array([2e-3, 3e-3, 4e-3])[:, None], np.array([2e-4, 3e-4, 4e-4])[:, None]
     for one, other in zip(few.sums(D, theta), few.bands.sums(D, theta), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-12 * np.abs(other).max())
-    monkeypatch.setattr(effective_modes, "_LEAST_STEPS", 10**9)
+    monkeypatch.setattr(effective_modes, "LEAST_STEPS", 10**9)
     expected = by_likelihood([track])
     monkeypatch.undo()
     monkeypatch.setattr(TridiagonalCovariance, "sums", None)
@@ -367,7 +367,7 @@ def test_few_modes_serve_any_signal_to_noise_ratio(D, sigma, noise, monkeypatch)
     x[1:-1][rng.random(1498) < 0.2] = np.nan
     steps = steps_of(track_rotation(x, dt=1.0), "rotation")
     found = by_likelihood([NoisySteps.of(steps, Noise(noise))])
-    monkeypatch.setattr(effective_modes, "_LEAST_STEPS", 10**9)
+    monkeypatch.setattr(effective_modes, "LEAST_STEPS", 10**9)
     expected = by_likelihood([NoisySteps.of(steps, Noise(noise))])
     for one, other in ((found.value, expected.value), (found.offset, expected.offset)):
         assert one == pytest.approx(other, rel=1e-9, abs=1e-14)

@@ -29,7 +29,7 @@ from perrin.diffusion.effective_modes import (
     FewModes,
     NoiseProfile,
     compress_steps,
-    moments_of_steps,
+    moment_estimate,
     ratio_node,
 )
 from perrin.diffusion.estimate import DiffusionEstimate, Found, bare_text, value_text
@@ -175,8 +175,11 @@ from perrin.diffusion.tensor_modes import (
     ChainTrack,
     DiagonalModes,
     EvenTracks,
+    FewDiagonalModes,
+    FewModesTrack,
     TensorSlopes,
     covariance_slopes,
+    information,
 )
 from perrin.diffusion.tensor_results import CoupledTensor, DiffusionTensor
 from perrin.diffusion.tensors import (
@@ -219,7 +222,9 @@ __all__ = [
     "DiffusionTensor",
     "EffectiveModes",
     "EvenTracks",
+    "FewDiagonalModes",
     "FewModes",
+    "FewModesTrack",
     "Found",
     "GridLags",
     "GroupSlopes",
@@ -324,6 +329,7 @@ __all__ = [
     "holm",
     "identity_limits",
     "imposed_symmetry",
+    "information",
     "invariant_basis",
     "judge_motion",
     "judge_sampling",
@@ -336,7 +342,7 @@ __all__ = [
     "long_time_diffusion",
     "maximise",
     "maximise_each",
-    "moments_of_steps",
+    "moment_estimate",
     "motions_and_noise",
     "msd_covariance",
     "neighbour_products",

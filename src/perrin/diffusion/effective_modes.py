@@ -43,13 +43,13 @@ _NODES, _NODES_BY_WIDTH = 9, 5.5
 _SPARSE_NODES = np.array([0.8, 2.0, 4.5, 10.0])
 
 # Fewer steps than these are eliminated at every D and noise instead.
-_LEAST_STEPS = 1000
+LEAST_STEPS = 1000
 
 # Noise is proportional in all frames if its ratio agrees to this.
 _PROPORTIONAL = 1e-9
 
 # Half-width of the window about the estimate from moments, in log(o/(a s)).
-_WINDOW = 1.0
+WINDOW = 1.0
 
 # Displacements over this many steps, more than most noise hides.
 _FAR_STEPS = 50
@@ -249,7 +249,7 @@ class NoiseProfile(NamedTuple):
     @classmethod
     def of(cls, track: NoisySteps) -> NoiseProfile | None:
         """Return the profile of a long track; None for a short one, or without such a profile."""
-        if len(track.steps.vectors) < _LEAST_STEPS or track.drift:
+        if len(track.steps.vectors) < LEAST_STEPS or track.drift:
             return None
         free = not np.isinf(track.freedom)
         first, last = (noise[:, 0] for noise in (track.weight if free else track.known))
@@ -271,23 +271,33 @@ class NoiseProfile(NamedTuple):
         return cls(*profile, *by_axis)
 
 
-def moments_of_steps(steps: Steps) -> tuple[Floats, Floats]:
-    """Return the sums of y y^T over the time, and of products of neighbours that share a frame.
+def moment_estimate(steps: Steps) -> tuple[Floats, Floats]:
+    """Return D and the noise of a frame less its blur from moments of the steps, (A, A) each.
 
-    Both are (A, A) and divided by the sum of the times; the second is symmetric.
+    D is <y y^T> tau/2 plus the covariance of neighbours, and the noise minus that covariance; where
+    noise prevails D comes from displacements over 50 steps. Both are symmetric; D may have
+    negative eigenvalues.
 
     Examples
     --------
     >>> from perrin import Cluster, simulate_motion
     >>> from perrin.diffusion import steps_of
     >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=300, rng=3)
-    >>> square, neighbours = moments_of_steps(steps_of(truth, "rotation"))
-    >>> bool(abs(np.trace(square / 2 + neighbours) / 3 - 5e-3) < 1e-3)
+    >>> D, noise = moment_estimate(steps_of(truth, "rotation"))
+    >>> bool(abs(np.trace(D) / 3 - 5e-3) < 1e-3)
     True
     """
     y, time = steps.vectors, steps.duration.sum()
     product = (y[:-1] * steps.linked[:-1, None]).T @ y[1:]
-    return y.T @ y / time, 0.5 * (product + product.T) / time
+    product = 0.5 * (product + product.T)
+    square = y.T @ y
+    D = (0.5 * square + product) / time
+    if np.trace(D) < 0.2 * np.trace(square) / time and len(y) > 2 * _FAR_STEPS:
+        place, when = np.cumsum(y, axis=0), np.cumsum(steps.duration)
+        far = place[_FAR_STEPS:] - place[:-_FAR_STEPS]
+        longer = np.mean(when[_FAR_STEPS:] - when[:-_FAR_STEPS]) - time / len(y)
+        D = 0.5 * (far.T @ far / len(far) - square / len(y)) / longer
+    return D, -product / max(int(steps.linked.sum()), 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -397,24 +407,15 @@ def _modes_of_track(track: NoisySteps, profile: NoiseProfile) -> EffectiveModes:
     motion = 2 * (steps.duration - blur), blur * linked
     noise = profile.before + profile.after, -profile.after[:-1] * linked
     scale = float(steps.duration.mean())
-    square, neighbours = (np.trace(x) / len(x) for x in moments_of_steps(steps))
-    D = 0.5 * square + neighbours
-    if 0.2 * square > D:
-        # Where noise prevails displacements over many steps tell D better than neighbours do.
-        place = np.cumsum(steps.vectors, axis=0)
-        time = np.cumsum(steps.duration)
-        far, near = (
-            (np.mean((place[m:] - place[:-m]) ** 2), np.mean(time[m:] - time[:-m]))
-            for m in (_FAR_STEPS, 1)
-        )
-        D = 0.5 * float((far[0] - near[0]) / (far[1] - near[1]))
-    D = max(D, 1e-5 * square)
+    matrices = moment_estimate(steps)
+    D, offset = (float(np.trace(x)) / len(x) for x in matrices)
+    D = max(D, 1e-5 * float(np.mean(steps.vectors**2)) / scale)
     if track.freedom:
         offset = float(np.mean(profile.by_theta)) * track.theta + float(profile.known.mean())
     else:
-        # The noise less its blur is minus the covariance of neighbours.
-        offset = max(-neighbours * steps.duration.sum() / max(linked.sum(), 1), 0.0) + blur * D
+        # The covariance of neighbours contains the blur.
+        offset = max(offset, 0.0) + blur * D
     excess = profile.known - profile.known.mean()
     places = np.log(np.maximum(offset + excess, 1e-6 * D * scale) / (D * scale))
-    window = float(places.min()) - _WINDOW, float(places.max()) + _WINDOW
+    window = float(places.min()) - WINDOW, float(places.max()) + WINDOW
     return compress_steps(steps.vectors, motion, noise, scale=scale, window=window)
