@@ -7,10 +7,12 @@ import warnings as python_warnings
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import cache
+from itertools import islice
 from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 
+from perrin._arrays import as_sigma
 from perrin.diffusion.changing import with_changing_interval
 from perrin.diffusion.estimate import DiffusionEstimate
 from perrin.diffusion.estimators import estimate_diffusion, estimate_each
@@ -39,9 +41,10 @@ from perrin.geometry.symmetry import point_group
 from perrin.hydrodynamics.units import viscosity_remarks
 from perrin.motion.common_motion import common_motion
 from perrin.motion.floor import floor_range
-from perrin.motion.rigidity import Quality, judge_quality
+from perrin.motion.rigid_motion import RigidMotion
+from perrin.motion.rigidity import Corrections, Quality, judge_each
 from perrin.motion.rods import RodMotion, track_direction
-from perrin.motion.tracking import track_rotation, track_scanned
+from perrin.motion.tracking import track_each, track_scanned
 from perrin.run import remarks as words
 from perrin.run.experiment import Experiment, Recording
 from perrin.run.grouping import assign_clusters
@@ -70,8 +73,13 @@ from perrin.run.singles import measure_singles
 from perrin.run.verdicts import fit_model, judge_each_and_all
 from perrin.tracks.clock import frame_stride, own_times, read_clock
 from perrin.tracks.clusters import each_cluster
-from perrin.tracks.identity import Identity, settle_identity
-from perrin.tracks.screening import CENTRE_REMOVED, centre_removed, far_points
+from perrin.tracks.identity import Identity, settle_each
+from perrin.tracks.screening import (
+    CENTRE_REMOVED,
+    centres_removed,
+    far_points_of_each,
+    of_equal_shape,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -84,7 +92,6 @@ if TYPE_CHECKING:
     from perrin.diffusion.tensor_results import DiffusionTensor
     from perrin.diffusion.verdict import MotionVerdict
     from perrin.motion.floor import NoiseFloor
-    from perrin.motion.rigid_motion import RigidMotion
 
     Progress: TypeAlias = Callable[[int, int, str], None]
 
@@ -101,6 +108,8 @@ _STEADY_LEVEL = 1e-3
 # A motion that is not diffusion is a warning below this p-value, shared by both quantities, and
 # half of it by all clusters where several are also judged together.
 _VERDICT_LEVEL = 0.005
+
+_TOGETHER = 256  # clusters that are fitted at a time: bounds the memory
 
 # The symmetry of a straight chain is that of places equal within this share of its length.
 _SAME_PLACE = 0.03
@@ -159,6 +168,8 @@ class FittedBody:
         Warnings and notes on identity and fit.
     stage : ndarray of int
         Rows at which a step ends that contains a jump of the stage and is left out of D_T.
+    centre_removed : bool
+        Whether the mean of the particles was subtracted, so that there is no D_T.
     """
 
     tracks: ClusterTracks
@@ -167,6 +178,7 @@ class FittedBody:
     quality: Quality
     remarks: Remarks
     stage: Ints = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    centre_removed: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -285,7 +297,7 @@ def measure_table(
             for b in bodies
             if b.tracks.cluster in motions
         ]
-    placed = [b for b in bodies if not centre_removed(b.tracks.positions)]
+    placed = [b for b in bodies if not b.centre_removed]
     stage = find_stage_jumps([b.motion for b in placed], [b.tracks.frames for b in placed])
     remarks.warnings.extend(
         words.stage_jump_warnings(stage, first_frame=first, kept=experiment.keep_jumps)
@@ -398,67 +410,199 @@ def fit_clusters(
     rods: list[RodResult] = []
     failures: list[tuple[str, ValueError]] = []
     count = table["cluster"][table["cluster"] >= 0].nunique()
-    for number, (cluster, positions, frames, piece, delay) in enumerate(each_cluster(table)):
+    clusters, done = each_cluster(table), 0
+    while some := list(islice(clusters, _TOGETHER)):
         if progress is not None:
-            progress(number, count, "fitting clusters")
-        label = labels.get(cluster)
-        try:
-            far = far_points(positions)
-            near = np.where(far[..., None], np.nan, positions)
-            tracks = ClusterTracks(cluster, label, near, frames, piece, far, delay)
-            if positions.shape[1:] == (2, 3):
-                rods.append(measure_rod(tracks, experiment, recording))
+            progress(done, count, "fitting clusters")
+        done += len(some)
+        far = far_points_of_each([positions for _, positions, *_ in some])
+        tracks = [
+            ClusterTracks(
+                cluster,
+                labels.get(cluster),
+                np.where(away[..., None], np.nan, x) if away.any() else x,
+                frames,
+                piece,
+                away,
+                delay,
+            )
+            for (cluster, x, frames, piece, delay), away in zip(some, far, strict=True)
+        ]
+        solid = [one for one in tracks if one.positions.shape[1:] != (2, 3)]
+        fitted = iter(fit_bodies(solid, experiment, recording))
+        for one in tracks:
+            name = one.label or str(one.cluster)
+            pair = one.positions.shape[1:] == (2, 3)
+            body = None if pair else next(fitted)
+            if isinstance(body, FittedBody):
+                bodies.append(body)
+                continue
+            if body is not None and not getattr(body, "collinear", False):
+                failures.append((name, body))
                 continue
             try:
-                bodies.append(fit_body(tracks, experiment, recording))
-            except DegenerateClusterError as error:
-                if not error.collinear:
+                rods.append(measure_rod(one, experiment, recording))
+            except (DegenerateClusterError, TooFewFramesError) as error:
+                failures.append((name, error if body is None else body))
+            except ValueError:
+                if body is None:
                     raise
-                try:
-                    rods.append(measure_rod(tracks, experiment, recording))
-                except (DegenerateClusterError, ValueError):
-                    raise error from None
-        except (DegenerateClusterError, TooFewFramesError) as error:
-            failures.append((label or str(cluster), error))
+                failures.append((name, body))
     return bodies, rods, failures
 
 
-def fit_body(tracks: ClusterTracks, experiment: Experiment, recording: Recording) -> FittedBody:
-    """Settle which label belongs to which particle, fit the common shape, and judge the fits."""
-    frames, first = tracks.frames, recording.first_frame
+def fit_bodies(
+    tracks: Sequence[ClusterTracks], experiment: Experiment, recording: Recording
+) -> list[FittedBody | DegenerateClusterError | TooFewFramesError]:
+    """Settle which label belongs to which particle, fit the common shapes, and judge the fits.
+
+    Parameters
+    ----------
+    tracks : sequence of ClusterTracks
+    experiment : Experiment
+    recording : Recording
+
+    Returns
+    -------
+    list of FittedBody, DegenerateClusterError or TooFewFramesError
+        The error of a cluster that cannot be fitted.
+    """
+    times = [recording.clock(one.frames) for one in tracks]
     # The remarks on identity state what this warning states.
     with python_warnings.catch_warnings(action="ignore", category=IdentityWarning):
-        identity = settle_identity(tracks.positions, times=recording.clock(frames))
-    positions = identity.arranged(tracks.positions)
-    changed = (np.diff(tracks.piece) != 0) | (np.diff(identity.piece) != 0)
-    piece = np.append(0, np.cumsum(changed)).astype(np.int64)
-    fitted: dict[str, Any] = {"dt": recording.dt, "sigma": experiment.sigma, "piece": piece}
-    times = recording.clock(frames)
-    if tracks.delay is None or positions.shape[2] != 3:
-        motion = track_rotation(positions, times=times, **fitted)
-    else:
-        # Rigidity and errors are those of the positions at one instant.
-        delays = identity.arranged(tracks.delay[..., None])[..., 0]
-        motion, positions = track_scanned(
-            positions,
-            delays,
-            time=times,
-            crossing=recording.crossing,
-            least=recording.stated_sigma,
-            **fitted,
+        identities = settle_each([one.positions for one in tracks], times=times)
+    positions = [
+        identity.arranged(one.positions) for identity, one in zip(identities, tracks, strict=True)
+    ]
+    pieces = []
+    for identity, one in zip(identities, tracks, strict=True):
+        changed = (np.diff(one.piece) != 0) | (np.diff(identity.piece) != 0)
+        pieces.append(np.append(0, np.cumsum(changed)).astype(np.int64))
+    motions = _tracked_bodies(
+        tracks, identities, positions, pieces, times, experiment=experiment, recording=recording
+    )
+    fitted = [k for k, motion in enumerate(motions) if isinstance(motion, RigidMotion)]
+    moving = [motion for motion in motions if isinstance(motion, RigidMotion)]
+    corrections = [
+        Corrections(
+            *(
+                tuple(tracks[k].frames[rows].tolist())
+                for rows in (
+                    identities[k].swaps,
+                    1 + np.flatnonzero(np.diff(pieces[k])),
+                    identities[k].extra,
+                )
+            )
         )
-    swaps, cuts, extra = frames[identity.swaps], frames[1:][changed], frames[identity.extra]
-    quality = judge_quality(
-        motion,
-        positions,
+        for k in fitted
+    ]
+    qualities = judge_each(
+        moving,
+        [positions[k] for k in fitted],
         sigma=experiment.sigma,
         sigma_ratio=recording.stated_sigma,
+        corrections=corrections,
         # Detections that were left out have no position at the instant.
-        detections=tracks.positions if tracks.delay is None else None,
-        unsettled=tuple(identity.unsettled.tolist()),
-        swaps=tuple(swaps.tolist()),
-        cuts=tuple(cuts.tolist()),
-        extra=tuple(extra.tolist()),
+        detections=[tracks[k].positions if tracks[k].delay is None else None for k in fitted],
+        unsettled=[identities[k].unsettled for k in fitted],
+    )
+    centred = centres_removed([tracks[k].positions for k in fitted])
+    bodies = [
+        FittedBody(
+            tracks[k],
+            motion,
+            positions[k],
+            quality,
+            identity_remarks(tracks[k], identities[k], motion, quality, recording)
+            + Remarks([*quality.warnings], [*quality.notes]),
+            centre_removed=still,
+        )
+        for k, motion, quality, still in zip(fitted, moving, qualities, centred, strict=True)
+    ]
+    fits = iter(bodies)
+    return [next(fits) if isinstance(one, RigidMotion) else one for one in motions]
+
+
+def _tracked_bodies(
+    tracks: Sequence[ClusterTracks],
+    identities: Sequence[Identity],
+    positions: list[Floats],
+    pieces: Sequence[Ints],
+    times: Sequence[Floats],
+    *,
+    experiment: Experiment,
+    recording: Recording,
+) -> list[RigidMotion | DegenerateClusterError | TooFewFramesError]:
+    """Fit the common shape of every body; positions of scanned ones become those at one instant."""
+    found: dict[int, RigidMotion | DegenerateClusterError | TooFewFramesError] = {}
+    scanned = [
+        k
+        for k, (one, x) in enumerate(zip(tracks, positions, strict=True))
+        if one.delay is not None and x.shape[2] == 3
+    ]
+    for k in scanned:
+        # Rigidity and errors are those of the positions at one instant.
+        delays = identities[k].arranged(tracks[k].delay[..., None])[..., 0]
+        try:
+            found[k], positions[k] = track_scanned(
+                positions[k],
+                delays,
+                time=times[k],
+                dt=recording.dt,
+                piece=pieces[k],
+                sigma=experiment.sigma,
+                crossing=recording.crossing,
+                least=recording.stated_sigma,
+            )
+        except (DegenerateClusterError, TooFewFramesError) as error:
+            found[k] = error
+    rest = [k for k in range(len(tracks)) if k not in found]
+    d = positions[rest[0]].shape[2] if rest else 3
+    sigma = None if experiment.sigma is None else as_sigma(experiment.sigma, d)
+    # Bodies without gaps need no weights.
+    for complete in (True, False):
+        some = [k for k in rest if bool(np.isfinite(positions[k]).all()) is complete]
+        for rows in of_equal_shape([positions[k] for k in some]):
+            numbers = [some[i] for i in rows]
+            fits = track_each(
+                np.stack([positions[k] for k in numbers]),
+                time=np.stack([times[k] for k in numbers]),
+                dt=recording.dt,
+                sigma=sigma,
+            )
+            for k, fit in zip(numbers, fits, strict=True):
+                if not isinstance(fit, RigidMotion | DegenerateClusterError | TooFewFramesError):
+                    raise fit
+                piece = pieces[k]
+                found[k] = replace(fit, piece=piece) if isinstance(fit, RigidMotion) else fit
+    return [found[k] for k in range(len(tracks))]
+
+
+def identity_remarks(
+    tracks: ClusterTracks,
+    identity: Identity,
+    motion: RigidMotion,
+    quality: Quality,
+    recording: Recording,
+) -> Remarks:
+    """State where labels were corrected or are in doubt, and which points were left out.
+
+    Parameters
+    ----------
+    tracks : ClusterTracks
+    identity : Identity
+    motion : RigidMotion
+    quality : Quality
+        With the frames of the corrections.
+    recording : Recording
+
+    Returns
+    -------
+    Remarks
+    """
+    frames, first = tracks.frames, recording.first_frame
+    swaps, cuts, extra = (
+        np.array(some, dtype=np.int64) for some in (quality.swaps, quality.cuts, quality.extra)
     )
     remarks, count = Remarks(notes=words.far_points_notes(tracks.far, frames + first)), len(frames)
     if swaps.size:
@@ -479,9 +623,7 @@ def fit_body(tracks: ClusterTracks, experiment: Experiment, recording: Recording
     # The number of bad frames that a rigid body may have is part of its quality.
     remarks.notes.extend(words.unsettled_notes(frames[identity.unsettled] + first, of=count))
     remarks.warnings.extend(words.fast_turning_warnings(cuts=cuts.size, of=count))
-    return FittedBody(
-        tracks, motion, positions, quality, remarks + Remarks([*quality.warnings], [*quality.notes])
-    )
+    return remarks
 
 
 def misfit_as_labelled(identity: Identity, positions: Floats, motion: RigidMotion) -> float:
@@ -683,7 +825,7 @@ def measure_coefficient(
     Coefficient
     """
     motion, noise = body.motion, experiment.noise
-    if quantity == "translation" and centre_removed(body.tracks.positions):
+    if quantity == "translation" and body.centre_removed:
         nothing = np.empty(0, dtype=np.int64)
         estimate = DiffusionEstimate.absent(
             quantity=quantity, n_frames=int(motion.fitted.size), reason=CENTRE_REMOVED
