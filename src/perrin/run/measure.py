@@ -19,12 +19,13 @@ from perrin.diffusion.estimators import estimate_diffusion, estimate_each
 from perrin.diffusion.rods import estimate_rod
 from perrin.diffusion.step_tests import (
     Jumps,
+    SteadyMotion,
     cut_at,
-    find_jumps,
+    find_jumps_of_each,
     find_stage_jumps,
-    offset_gain,
+    offset_gain_of_each,
     persistence_gain,
-    steady_motion,
+    steady_motion_of_each,
     without_spin,
 )
 from perrin.diffusion.steps import Quantity, residual_freedom
@@ -693,27 +694,18 @@ def measure_bodies(
     failures : list of tuple
         Names of the bodies whose steps give no estimate, with the error.
     """
-    found = []
     failures: list[tuple[str, ValueError]] = []
-    noise = experiment.noise
-    turns = estimate_each([b.motion for b in bodies], quantity="rotation", noise=noise)
-    without_stage = [motion_and_path(b, "translation")[0] for b in bodies]
-    paths = estimate_each(without_stage, quantity="translation", noise=noise)
-    for body, first, second in zip(bodies, turns, paths, strict=True):
-        try:
-            measured = []
-            for quantity, estimate in zip(get_args(Quantity), (first, second), strict=True):
-                if isinstance(estimate, TooFewFramesError):
-                    raise estimate
-                measured.append(
-                    measure_coefficient(
-                        body, quantity, estimate, experiment, recording, tested=len(bodies)
-                    )
-                )
-            turn, path = measured
+    coefficients = [
+        measure_coefficients(bodies, quantity, experiment, recording)
+        for quantity in get_args(Quantity)
+    ]
+    found: list[tuple[FittedBody, Coefficient, Coefficient]] = []
+    for body, turn, path in zip(bodies, *coefficients, strict=True):
+        if isinstance(turn, Coefficient) and isinstance(path, Coefficient):
             found.append((body, turn, path))
-        except (DegenerateClusterError, TooFewFramesError) as error:
-            failures.append((body.tracks.label or str(body.tracks.cluster), error))
+            continue
+        error = path if isinstance(turn, Coefficient) else turn
+        failures.append((body.tracks.label or str(body.tracks.cluster), error))
     turning = [
         turn.motion
         if turn.estimate.drift is None
@@ -721,9 +713,19 @@ def measure_bodies(
         for _, turn, _ in found
     ]
     tensors = measure_tensors(turning, "rotation", experiment.noise)
+    predicted = [predicted_noise(body.motion) for body, *_ in found]
+    # The offset of steps that contain another motion, or of a body that bends, is no noise.
+    tested = [k for k, (body, turn, _) in enumerate(found) if body.quality.rigid and turn.brownian]
+    floors = noise_floor_tests(
+        [(found[k][0].motion, found[k][1].estimate, predicted[k]) for k in tested],
+        stated=experiment.sigma is not None,
+    )
+    floor = dict(zip(tested, floors, strict=True))
     results = [
-        measured_body(*one, *tensor, experiment=experiment, recording=recording)
-        for one, tensor in zip(found, tensors, strict=True)
+        measured_body(
+            *one, *tensors[k], noise=predicted[k], floor=floor.get(k, []), recording=recording
+        )
+        for k, one in enumerate(found)
     ]
     return results, failures
 
@@ -735,7 +737,8 @@ def measured_body(
     tensor: DiffusionTensor | None,
     no_tensor: Sequence[str],
     *,
-    experiment: Experiment,
+    noise: NoiseFloor,
+    floor: Sequence[str],
     recording: Recording,
 ) -> MeasuredBody:
     """Collect what was measured of a body, and the remarks on it.
@@ -748,7 +751,10 @@ def measured_body(
     tensor : DiffusionTensor or None
     no_tensor : sequence of str
         Why there is no tensor.
-    experiment : Experiment
+    noise : NoiseFloor
+        Noise floor that residuals or sigma predict.
+    floor : sequence of str
+        Warning that the offset of the steps is not that noise.
     recording : Recording
 
     Returns
@@ -757,11 +763,6 @@ def measured_body(
     """
     tracks, motion = body.tracks, body.motion
     D_R, D_T = turn.estimate, path.estimate
-    noise = predicted_noise(motion)
-    # The offset of steps that contain another motion, or of a body that bends, is no noise.
-    floor: list[str] = []
-    if body.quality.rigid and turn.brownian:
-        floor = noise_floor_test(motion, D_R, noise, stated=experiment.sigma is not None)
     result = ClusterResult(
         cluster=tracks.cluster,
         motion=motion,
@@ -798,44 +799,100 @@ def measured_body(
     return MeasuredBody(body, turn, path, result)
 
 
-def measure_coefficient(
-    body: FittedBody,
+def measure_coefficients(
+    bodies: Sequence[FittedBody],
     quantity: Quantity,
-    estimate: DiffusionEstimate,
     experiment: Experiment,
     recording: Recording,
-    *,
-    tested: int,
+) -> list[Coefficient | DegenerateClusterError | TooFewFramesError]:
+    """Estimate one coefficient of every body from the steps that Brownian motion can make.
+
+    Parameters
+    ----------
+    bodies : sequence of FittedBody
+        They share the level of the test for a steady motion.
+    quantity : {"rotation", "translation"}
+    experiment : Experiment
+    recording : Recording
+
+    Returns
+    -------
+    list of Coefficient, DegenerateClusterError or TooFewFramesError
+        The error of a body whose steps give no estimate.
+    """
+    noise = experiment.noise
+    motions, paths = [], []
+    for body in bodies:
+        motion, path = motion_and_path(body, quantity)
+        motions.append(motion)
+        paths.append(path)
+    found: list[Coefficient | DegenerateClusterError | TooFewFramesError | None]
+    estimates = estimate_each(motions, quantity=quantity, noise=noise)
+    found = [one if isinstance(one, TooFewFramesError) else None for one in estimates]
+    if quantity == "translation":
+        for k, body in enumerate(bodies):
+            if body.centre_removed and found[k] is None:
+                found[k] = no_translation(body)
+    rest = [k for k, one in enumerate(found) if one is None]
+    given = [one for k, one in enumerate(estimates) if k in set(rest)]
+    some = [one for one in given if not isinstance(one, TooFewFramesError)]
+    jumps = find_jumps_of_each([paths[k] for k in rest], some)
+    tested: list[Coefficient] = []
+    numbers: list[int] = []
+    for k, estimate, own in zip(rest, some, jumps, strict=True):
+        try:
+            coefficient = without_jumps(
+                bodies[k], motions[k], paths[k], estimate, own, experiment, recording
+            )
+        except (DegenerateClusterError, TooFewFramesError) as error:
+            found[k] = error
+            continue
+        tested.append(coefficient)
+        numbers.append(k)
+    level = _STEADY_LEVEL / len(bodies) if bodies else 0.0
+    for k, one in zip(numbers, with_step_tests(tested, noise, level=level), strict=True):
+        found[k] = one
+    return [one for one in found if one is not None]
+
+
+def no_translation(body: FittedBody) -> Coefficient:
+    """Return the missing D_T of a body whose centre was subtracted from its particles."""
+    motion, nothing = body.motion, np.empty(0, dtype=np.int64)
+    estimate = DiffusionEstimate.absent(
+        quantity="translation", n_frames=int(motion.fitted.size), reason=CENTRE_REMOVED
+    )
+    none = Jumps(nothing, np.empty((0, 3)), np.empty(0), 0)
+    return Coefficient(estimate, motion, motion, none, nothing, True, Remarks())
+
+
+def without_jumps(
+    body: FittedBody,
+    motion: RigidMotion,
+    path: RigidMotion,
+    estimate: DiffusionEstimate,
+    jumps: Jumps,
+    experiment: Experiment,
+    recording: Recording,
 ) -> Coefficient:
-    """Estimate one coefficient from the steps that Brownian motion can make.
+    """Leave jumps out of an estimate, and state them.
 
     Parameters
     ----------
     body : FittedBody
-    quantity : {"rotation", "translation"}
+    motion, path : RigidMotion
+        Motion that D is estimated from, and the one that was searched for jumps.
     estimate : DiffusionEstimate
         Estimate from all steps.
+    jumps : Jumps
     experiment : Experiment
     recording : Recording
-    tested : int
-        Number of clusters that share the level of the test for a steady motion.
 
     Returns
     -------
     Coefficient
+        Before its steps are tested any further.
     """
-    motion, noise = body.motion, experiment.noise
-    if quantity == "translation" and body.centre_removed:
-        nothing = np.empty(0, dtype=np.int64)
-        estimate = DiffusionEstimate.absent(
-            quantity=quantity, n_frames=int(motion.fitted.size), reason=CENTRE_REMOVED
-        )
-        none = Jumps(nothing, np.empty((0, 3)), np.empty(0), 0)
-        return Coefficient(estimate, motion, motion, none, nothing, True, Remarks())
-    motion, path = motion_and_path(body, quantity)
-    jumps = find_jumps(path, estimate)
-    left_out = jumps.rows[:0]
-    remarks = Remarks()
+    quantity, left_out, remarks = estimate.quantity, jumps.rows[:0], Remarks()
     if jumps.rows.size:
         frames = body.tracks.frames[jumps.rows] + recording.first_frame
         remarks.warnings.append(
@@ -844,27 +901,53 @@ def measure_coefficient(
         if not (jumps.many or experiment.keep_jumps):
             left_out = jumps.rows
             motion = cut_at(motion, left_out)
-            estimate = _estimated_quietly(motion, quantity, noise)
+            estimate = _estimated_quietly(motion, quantity, experiment.noise)
     remarks.notes.extend(words.removed_drift_notes(estimate, quantity))
     if not estimate.resolved:
         remarks.notes.append(f"not resolved: {estimate}")
-    steady, persistence = False, 0.0
-    if not jumps.many:
-        persistence = persistence_gain(motion, estimate)
-        if not noise.drift:
-            found = steady_motion(motion, estimate)
-            steady = found.p < _STEADY_LEVEL / tested
-            if steady and persistence > _TEST_ERRORS**2:
-                # A steady motion makes steps alike as well; what is left without it decides.
-                persistence = persistence_gain(motion, estimate, drift=True)
-                steady = persistence < _TEST_ERRORS**2
-            if steady:
-                remarks.warnings.append(words.steady_motion_warning(found, quantity))
-    alike = persistence > _TEST_ERRORS**2 and not steady
-    if alike:
-        remarks.warnings.append(words.persistence_warning(persistence, quantity))
-    brownian = not (steady or alike or jumps.rows.size)
+    brownian = not jumps.rows.size
     return Coefficient(estimate, motion, path, jumps, left_out, brownian, remarks)
+
+
+def with_step_tests(
+    coefficients: Sequence[Coefficient], noise: Noise, *, level: float
+) -> list[Coefficient]:
+    """Test the steps of coefficients of one quantity for a steady motion and for likeness.
+
+    Parameters
+    ----------
+    coefficients : sequence of Coefficient
+    noise : Noise
+    level : float
+        p-value below which a motion is steady.
+
+    Returns
+    -------
+    list of Coefficient
+        The same with remarks.
+    """
+    few = [k for k, one in enumerate(coefficients) if not one.jumps.many]
+    motions = [coefficients[k].motion for k in few]
+    estimates = [coefficients[k].estimate for k in few]
+    moving: dict[int, SteadyMotion] = {}
+    if not noise.drift:
+        moving = dict(zip(few, steady_motion_of_each(motions, estimates), strict=True))
+    tested = list(coefficients)
+    for k, motion, estimate in zip(few, motions, estimates, strict=True):
+        one, remarks = coefficients[k], coefficients[k].remarks
+        persistence = persistence_gain(motion, estimate)
+        steady = k in moving and moving[k].p < level
+        if steady and persistence > _TEST_ERRORS**2:
+            # A steady motion makes steps alike as well; what is left without it decides.
+            persistence = persistence_gain(motion, estimate, drift=True)
+            steady = persistence < _TEST_ERRORS**2
+        if steady:
+            remarks.warnings.append(words.steady_motion_warning(moving[k], estimate.quantity))
+        alike = persistence > _TEST_ERRORS**2 and not steady
+        if alike:
+            remarks.warnings.append(words.persistence_warning(persistence, estimate.quantity))
+        tested[k] = replace(one, brownian=one.brownian and not (steady or alike))
+    return tested
 
 
 def motion_and_path(body: FittedBody, quantity: Quantity) -> tuple[RigidMotion, RigidMotion]:
@@ -873,10 +956,13 @@ def motion_and_path(body: FittedBody, quantity: Quantity) -> tuple[RigidMotion, 
     Doubt about the labels cuts a track, but the path of the centre crosses it. A jump of the stage
     cuts that path, and leaves the rotation as it is.
     """
+    motion = body.motion
     if quantity == "rotation":
-        return body.motion, body.motion
-    whole = replace(body.motion, piece=np.zeros_like(body.motion.piece))
-    return cut_at(body.motion, body.stage), cut_at(whole, body.stage)
+        return motion, motion
+    whole = motion
+    if motion.piece.any():
+        whole = replace(motion, piece=np.zeros_like(motion.piece))
+    return cut_at(motion, body.stage), cut_at(whole, body.stage)
 
 
 def _estimated_quietly(
@@ -1116,9 +1202,9 @@ def measure_tensors(
     return tensors
 
 
-def noise_floor_test(
-    motion: RigidMotion, D_R: DiffusionEstimate, predicted: NoiseFloor, *, stated: bool
-) -> list[str]:
+def noise_floor_tests(
+    bodies: Sequence[tuple[RigidMotion, DiffusionEstimate, NoiseFloor]], *, stated: bool
+) -> list[list[str]]:
     """Test whether the offset of the steps is the noise that residuals or sigma predict.
 
     A likelihood-ratio test with one degree of freedom. Where sigma is not stated, any
@@ -1127,41 +1213,47 @@ def noise_floor_test(
 
     Parameters
     ----------
-    motion : RigidMotion
-    D_R : DiffusionEstimate
-        D_R of this motion.
-    predicted : NoiseFloor
-        Noise floor that the residuals or sigma predict.
+    bodies : sequence of tuple
+        Motion, its D_R, and the noise floor that the residuals or sigma predict.
     stated : bool
         Whether the user stated sigma.
 
     Returns
     -------
-    list of str
-        A warning, or nothing.
+    list of list of str
+        For every body a warning, or nothing.
     """
-    # Over a scan the offset is mostly motion, and no multiple of sigma^2.
-    if D_R.noise != "joint" or not D_R.value > 0 or motion.turn_noise is not None:
-        return []
-    low = high = 1.0
-    if not stated:
-        if motion.template.shape[1] == 3:
-            rotation = motion.rotation[motion.fitted]
-            low, high = floor_range(motion.template, rotation, ratio=_NOISE_RATIO)
-        unsure = _TEST_ERRORS * np.sqrt(2 / max(residual_freedom(motion), 1))
-        low, high = low * max(1 - unsure, 0.0), high * (1 + unsure)
-    # A stated exposure takes b D, b = exposure dt/3, from the noise of every frame.
-    blur = (D_R.exposure or 0.0) * motion.dt / 3 * D_R.value
-    measured = floor_factor(motion) * (D_R.offset + blur)
-    if low * predicted.phi2 <= measured <= high * predicted.phi2:
-        return []
-    nearest = high if measured > high * predicted.phi2 else low
-    sigma = float(np.sqrt(nearest * np.mean(motion.noise**2)))
-    gain = offset_gain(motion, D_R, sigma=sigma)
-    if gain < _TEST_ERRORS**2:
-        return []
-    error = floor_factor(motion) * D_R.offset_stderr
-    return [words.noise_floor_warning(measured, error, predicted=predicted.phi2, gain=gain)]
+    outside: dict[int, tuple[float, float]] = {}
+    for k, (motion, D_R, predicted) in enumerate(bodies):
+        # Over a scan the offset is mostly motion, and no multiple of sigma^2.
+        if D_R.noise != "joint" or not D_R.value > 0 or motion.turn_noise is not None:
+            continue
+        low = high = 1.0
+        if not stated:
+            if motion.template.shape[1] == 3:
+                rotation = motion.rotation[motion.fitted]
+                low, high = floor_range(motion.template, rotation, ratio=_NOISE_RATIO)
+            unsure = _TEST_ERRORS * np.sqrt(2 / max(residual_freedom(motion), 1))
+            low, high = low * max(1 - unsure, 0.0), high * (1 + unsure)
+        # A stated exposure takes b D, b = exposure dt/3, from the noise of every frame.
+        blur = (D_R.exposure or 0.0) * motion.dt / 3 * D_R.value
+        measured = floor_factor(motion) * (D_R.offset + blur)
+        if not low * predicted.phi2 <= measured <= high * predicted.phi2:
+            nearest = high if measured > high * predicted.phi2 else low
+            outside[k] = measured, float(np.sqrt(nearest * np.mean(motion.noise**2)))
+    gains = offset_gain_of_each(
+        [bodies[k][0] for k in outside],
+        [bodies[k][1] for k in outside],
+        sigma=[sigma for _, sigma in outside.values()],
+    )
+    warnings: list[list[str]] = [[] for _ in bodies]
+    for (k, (measured, _)), gain in zip(outside.items(), gains, strict=True):
+        if gain >= _TEST_ERRORS**2:
+            motion, D_R, predicted = bodies[k]
+            error = floor_factor(motion) * D_R.offset_stderr
+            text = words.noise_floor_warning(measured, error, predicted=predicted.phi2, gain=gain)
+            warnings[k].append(text)
+    return warnings
 
 
 def add_predictions(
