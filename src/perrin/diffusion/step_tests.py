@@ -830,8 +830,9 @@ def leave_one_out_residuals(
 
 
 def _jump_candidates(residuals: StepResiduals, known: Bools) -> Bools:
-    from scipy.special import chdtri
     """Return further steps (B, S) unlike the bulk that are not due to one displaced frame."""
+    from scipy.special import chdtri
+
     count = known.shape[1]
     displaced = np.where(
         residuals.linked & residuals.measured_badly,

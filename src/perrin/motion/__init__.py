@@ -54,7 +54,12 @@ from perrin.motion.residuals import (
     unit_center_variance,
     unit_covariance,
 )
-from perrin.motion.rigid_motion import RigidMotion, threshold_displacement, threshold_references
+from perrin.motion.rigid_motion import (
+    RigidMotion,
+    find_symmetries,
+    threshold_displacement,
+    threshold_references,
+)
 from perrin.motion.rigidity import (
     BondDrift,
     Corrections,
@@ -103,6 +108,7 @@ __all__ = [
     "error_ratio",
     "expected_squares",
     "fast_states",
+    "find_symmetries",
     "fit_chain",
     "fit_projector",
     "fit_scanned",

@@ -34,6 +34,7 @@ from perrin.motion.residuals import (
     residuals_of_each,
     sample_residuals,
 )
+from perrin.motion.rigid_motion import find_symmetries
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -453,12 +454,21 @@ def symmetries_of_each(motions: Sequence[RigidMotion]) -> list[str]:
     >>> symmetries_of_each([truth])
     ['T_d']
     """
-    return [
-        point_group(motion.template, tolerance=motion.template_error)
-        if motion.symmetry_elements is None
-        else schoenflies(motion.symmetry_elements)
-        for motion in motions
-    ]
+    find_symmetries(motions)
+    symbols, known = [], dict[tuple[int, bytes], str]()
+    for motion in motions:
+        elements = motion.symmetry_elements
+        if elements is None:
+            symbols.append(point_group(motion.template, tolerance=motion.template_error))
+            continue
+        # Groups with the same angles between all their elements are turned against each other.
+        flat = elements.reshape(len(elements), -1)
+        angles = np.rint(1e4 * (flat @ flat.T)).astype(np.int64)
+        key = len(elements), angles.tobytes()
+        if key not in known:
+            known[key] = schoenflies(elements)
+        symbols.append(known[key])
+    return symbols
 
 
 def _imaging_texts(
