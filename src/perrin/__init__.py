@@ -288,6 +288,7 @@ __all__ = [
 
 # The public names of every subpackage.
 _FACES = {
+    "compiled": (),
     "errors": (
         "DegenerateClusterError",
         "FrameError",
