@@ -88,7 +88,7 @@ _DEMO_NOTE = (
 )
 
 _DEMO_FILES = re.compile(
-    r"summary\.json|run\.json|run\.toml|report\.html|(?:curves|results|demo-tracks)\.csv"
+    r"summary\.json|run\.json|checksums\.json|run\.toml|report\.html|(?:curves|results|demo-tracks)\.csv"
     r"|(?:tracks|motion)\.parquet"
     r"|figures|figures/cluster-0-\w+\.(?:png|pdf)"
 )
