@@ -10,6 +10,14 @@ from perrin.tracks.bonds import (
     rigid_groups,
     shared_rows,
 )
+from perrin.tracks.checksums import (
+    CheckedFiles,
+    checksum,
+    read_sealed,
+    refusing_damage,
+    write_checksums,
+    write_sealed,
+)
 from perrin.tracks.clock import (
     Clock,
     evenly_spaced,
@@ -104,7 +112,7 @@ from perrin.tracks.simulations import is_selection, parse_gsd, selection_table
 from perrin.tracks.sphere_tracks import link_spheres, track_variances
 from perrin.tracks.track_arrays import gdf_table, napari_columns, napari_text
 from perrin.tracks.trackmate import is_trackmate, parse_trackmate_xml, trackmate_table
-from perrin.tracks.writing import write_json, written_whole
+from perrin.tracks.writing import hidden_beside, write_json, written_whole
 from perrin.tracks.xyz import parse_xyz, xyz_text
 
 __all__ = [
@@ -114,6 +122,7 @@ __all__ = [
     "BodyModel",
     "Candidates",
     "Centers",
+    "CheckedFiles",
     "Clock",
     "Contacts",
     "Detections",
@@ -137,6 +146,7 @@ __all__ = [
     "centres_removed",
     "certain_labels",
     "check_tracks",
+    "checksum",
     "cluster_positions",
     "connected_groups",
     "covering_rotations",
@@ -156,6 +166,7 @@ __all__ = [
     "gdf_bytes",
     "gdf_table",
     "has_trackpy_columns",
+    "hidden_beside",
     "icp_fit",
     "icp_search",
     "identify",
@@ -194,9 +205,11 @@ __all__ = [
     "placeholder_rows",
     "positions_table",
     "read_clock",
+    "read_sealed",
     "read_spheres",
     "read_tracks",
     "recognise_columns",
+    "refusing_damage",
     "repeated_rows",
     "rigid_bodies",
     "rigid_fits",
@@ -224,7 +237,9 @@ __all__ = [
     "unit_faults",
     "utf8_text",
     "without_flat_z",
+    "write_checksums",
     "write_json",
+    "write_sealed",
     "write_tracks",
     "written_whole",
     "xyz_text",
