@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.polynomial.polynomial import polyval
 
 import perrin.curves.pairs as pairs_module
 from brownian_motions import (
@@ -32,6 +33,7 @@ from perrin import (
     track_rotation,
     van_hove,
 )
+from perrin.curves import Correlations, covariance_polynomials, squared_covariances
 
 SMALL = settings(max_examples=8, deadline=None, derandomize=True)
 
@@ -377,3 +379,62 @@ def test_rotation_at_uneven_times_gives_D_R(repeats):
     mean, error = np.mean(found, axis=0), np.std(found, axis=0, ddof=1) / np.sqrt(n)
     assert np.all(np.abs(mean - D) < 4 * error + 0.02 * D)
     assert error.max() < 0.08 * D
+
+
+@pytest.mark.parametrize("gaps", [False, True])
+@pytest.mark.parametrize("walkers", [1, 3])
+def test_a_steady_motion_keeps_its_digits(gaps, walkers):
+    """A straight line far from the origin, with a small walk: 1e-12 of the direct sums (O(T^2))."""
+    rng = np.random.default_rng(8)
+    n = 4000
+    x = np.arange(n)[:, None, None] * np.array([1.0, 0.3, -0.2]) + 1e4
+    x = x + 0.1 * np.cumsum(rng.normal(size=(n, walkers, 3)), axis=0)
+    if gaps:
+        x[1:-1][rng.random((n - 2, walkers)) < 0.1] = np.nan
+    curve = msd(x, dt=0.5)
+    for lag in (1, 2, 7, 400, n // 2, n - 2):
+        square = np.sum((x[lag:] - x[:-lag]) ** 2, axis=-1)
+        if np.isfinite(square).any():
+            assert curve.value[lag - 1] == pytest.approx(np.nanmean(square), rel=1e-12)
+            assert curve.n_pairs[lag - 1] == np.isfinite(square).sum()
+
+
+@pytest.mark.parametrize("count", [1, 5, 30, 39])
+def test_half_frequencies_give_all_correlations(count):
+    """Even and odd parts of correlations equal direct sums, also where the period is shorter."""
+    rng = np.random.default_rng(3)
+    x, y = rng.normal(size=(2, 40))
+    transform = Correlations.of(40 + count)
+    f, g = (transform.spectrum(one[None]) for one in (x, y))
+    forward = [x[: 40 - lag] @ y[lag:] for lag in range(count + 1)]
+    back = [y[: 40 - lag] @ x[lag:] for lag in range(count + 1)]
+    product = (np.conj(f) * g)[0]
+    even, odd = transform.even(product.real)[: count + 1], transform.odd(product.imag)[: count + 1]
+    np.testing.assert_allclose(2 * even, np.add(forward, back), atol=1e-12)
+    np.testing.assert_allclose(-2 * odd, np.subtract(forward, back), atol=1e-12)
+
+
+@pytest.mark.parametrize("present", [1.0, 0.7])
+def test_squared_covariances_are_the_polynomials_at_equal_lags(present):
+    """One lag with itself: the closed form equals `covariance_polynomials`, to rounding."""
+    lag = np.arange(1.0, 38.0)
+    fraction = np.full(37, present)
+    near, far, same = covariance_polynomials(lag, 37, present=fraction, D=0.7, s=0.3)
+    expected = [polyval(lag, c, tensor=False) + same for c in (near, far)]
+    for shorter, value in zip((True, False), expected, strict=True):
+        use = (lag <= 38 - lag) == shorter
+        found = squared_covariances(
+            lag[use], 37, gap=1 / present - 1, D=0.7, s=0.3, shorter=shorter
+        )
+        np.testing.assert_allclose(found, value[use], rtol=1e-12)
+
+
+def test_all_lags_of_a_track_need_little_memory():
+    """The MSD of a track without gaps, all lags: under six times its bytes (results are four)."""
+    x = np.cumsum(np.random.default_rng(1).normal(size=(100_000, 1, 3)), axis=0)
+    msd(x[:100], dt=1.0)
+    tracemalloc.start()
+    msd(x, dt=1.0)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 6 * x.nbytes

@@ -29,7 +29,7 @@ def as_positions(positions: ArrayLike, *, name: str = "positions") -> Floats:
             f"{name}: expected shape (T, n, d) with d = 2 or 3 (frames, particles, "
             f"coordinates), got {x.shape}"
         )
-    if np.isinf(x).any():
+    if not np.isfinite(x.sum()) and np.isinf(x).any():
         t, i, _ = np.argwhere(np.isinf(x))[0]
         raise ValueError(
             f"{name}: infinite coordinate at row {t}, particle {i}; use NaN for a missing point"
@@ -39,7 +39,12 @@ def as_positions(positions: ArrayLike, *, name: str = "positions") -> Floats:
 
 def present(points: Floats) -> Bools:
     """Return which points (..., d) are present, those without a NaN: shape (...)."""
-    return np.asarray(~np.isnan(points).any(axis=-1), dtype=np.bool_)
+    if not np.isnan(points.sum()):  # a NaN anywhere makes the sum one
+        return np.ones(points.shape[:-1], dtype=np.bool_)
+    missing = np.isnan(points[..., 0])
+    for axis in range(1, points.shape[-1]):
+        missing |= np.isnan(points[..., axis])
+    return np.asarray(~missing, dtype=np.bool_)
 
 
 def as_sigma(sigma: ArrayLike, dimensions: int) -> Floats:

@@ -54,6 +54,7 @@ from perrin.curves.noise_offsets import (
     orientation_offsets,
 )
 from perrin.curves.pairs import (
+    Correlations,
     Kernel,
     ListedPairs,
     PairSums,
@@ -63,17 +64,20 @@ from perrin.curves.pairs import (
     lag_bins,
     pair_sums,
     pairs_apart,
+    squared_size,
 )
 from perrin.curves.standard_errors import (
     covariance_polynomials,
     displacement_counts,
     relative_error,
+    squared_covariances,
     squared_shared_times,
     two_lag_fit,
 )
 
 __all__ = [
     "GRID_TOLERANCE",
+    "Correlations",
     "Frames",
     "Kernel",
     "LagCurve",
@@ -125,7 +129,9 @@ __all__ = [
     "quaternion_covariance",
     "radial_bins",
     "relative_error",
+    "squared_covariances",
     "squared_shared_times",
+    "squared_size",
     "turned_angles",
     "two_lag_fit",
     "van_hove",

@@ -483,6 +483,7 @@ def mean_square_curve(
     frames = place_frames(time, piece, here, dt=dt)
     sums = pair_sums(Squares(walks), frames)
     components = sums.mean
+    sums = sums._replace(sums=components)  # the sums are not needed any more, and as large
     value = components.sum(axis=1)
     pairs = sums.pairs / walks.shape[1]
     relative = relative_error(sums, frames, value / (2 * dof), pairs)

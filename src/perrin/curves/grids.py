@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
@@ -58,13 +59,15 @@ class Frames:
     def __post_init__(self) -> None:
         frozen(self.row, self.time, self.piece, self.block, self.slot)
 
-    @property
+    @cached_property
     def blocks(self) -> list[slice]:
         """Slice of the frames that belong to each block."""
+        if self.block[-1] == 0:
+            return [slice(0, len(self.block))]
         edges = np.flatnonzero(np.diff(self.block, prepend=-1, append=self.block[-1] + 1))
         return [slice(int(a), int(b)) for a, b in pairwise(edges)]
 
-    @property
+    @cached_property
     def lengths(self) -> Ints:
         """Steps from the first to the last frame of each block, shape (B,)."""
         return np.array([int(self.slot[b.stop - 1]) for b in self.blocks], dtype=np.int64)
@@ -72,6 +75,8 @@ class Frames:
     @property
     def separate(self) -> bool:
         """Whether every piece is one block, so that no pair joins two blocks."""
+        if self.block[-1] == 0:
+            return True
         joined = (np.diff(self.block) > 0) & (np.diff(self.piece) == 0)
         return not joined.any()
 
@@ -117,9 +122,18 @@ def place_frames(time: Floats, piece: Ints, here: Bools, *, dt: float) -> Frames
     rows = np.flatnonzero(here)
     if rows.size < 2:
         raise TooFewFramesError("no two frames in one piece: a pair needs two", rows.size)
-    rows = rows[np.lexsort((time[rows], piece[rows]))]
+    if rows.size == len(time):
+        slot = _one_after_another(time, piece, dt)
+        if slot is not None:
+            # Views: the arrays of the caller stay writable, and long tracks are not copied.
+            block = np.broadcast_to(np.zeros((), dtype=np.int64), slot.shape)
+            return Frames(slot[:], time[:], piece[:], block, slot, dt, exact=True)
     t, label = time[rows], piece[rows]
     same = label[1:] == label[:-1]
+    if np.any(label[1:] < label[:-1]) or np.any((t[1:] < t[:-1]) & same):
+        rows = rows[np.lexsort((t, label))]
+        t, label = time[rows], piece[rows]
+        same = label[1:] == label[:-1]
     first = np.flatnonzero(np.append(True, ~same))
     origin = np.repeat(t[first], np.diff(np.append(first, len(t))))
     place = (t - origin) / dt
@@ -147,6 +161,17 @@ def place_frames(time: Floats, piece: Ints, here: Bools, *, dt: float) -> Frames
     begins |= np.append(False, np.diff(slot) > _PLACES_PER_FRAME) & sparse
     block = np.cumsum(begins) - 1
     return Frames(rows, t, label, block, slot - slot[begins][block], step, exact)
+
+
+def _one_after_another(time: Floats, piece: Ints, dt: float) -> Ints | None:
+    """Return the frame numbers of one piece without a gap, times exact; None for other frames."""
+    slot = np.arange(len(time))
+    if piece[0] != piece[-1]:
+        return None
+    off = (time - time[0]) / dt
+    off -= slot
+    np.abs(off, out=off)
+    return slot if off.max() < _EXACT_GRID and np.all(piece == piece[0]) else None
 
 
 def grid_step(durations: Floats, dt: float) -> float:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import warnings
-from typing import TYPE_CHECKING, NamedTuple, Protocol
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 
@@ -12,14 +13,28 @@ from perrin.curves.grids import GRID_TOLERANCE
 from perrin.errors import PrecisionWarning, TooFewFramesError
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from perrin._arrays import Floats, Ints
     from perrin.curves.grids import Frames
+
+    Complexes: TypeAlias = NDArray[np.complex128]
 
 # Largest number of pairs formed one by one where frames lie on no common compact grid: all pairs
 # of 1400 frames, which take a second and 200 MB.
 _MOST_LISTED_PAIRS = 1_000_000
 
 _PAIRS_IN_MEMORY = 1 << 16  # pairs whose displacements are in memory at once
+
+
+# Whether transforms can be written to given memory (NumPy 2): new memory costs as much as they do.
+_IN_PLACE = int(np.__version__.split(".")[0]) >= 2
+
+# Components are transformed together up to so many numbers; more do not stay in the cache.
+_NUMBERS_AT_ONCE = 40_000
+
+# A straight line is subtracted first where it is this part of the mean square of a walk.
+_STEADY_SHARE = 0.9
 
 
 class Kernel(Protocol):
@@ -76,9 +91,7 @@ class PairSums(NamedTuple):
     @property
     def mean(self) -> Floats:
         """Mean over the pairs, shape (L, q); NaN at a lag without a pair."""
-        average = np.full_like(self.sums, np.nan)
-        pairs = self.pairs[:, None]
-        np.divide(self.sums, pairs, out=average, where=pairs > 0)
+        average: Floats = self.sums / np.where(self.pairs > 0, self.pairs, np.nan)[:, None]
         return average
 
 
@@ -128,28 +141,37 @@ def pair_sums(kernel: Kernel, frames: Frames, *, most: int | None = None) -> Pai
         span = round(float(np.ptp(frames.time)) / frames.step)
         longest = span if span <= frames.most_lags else longest
     longest = longest if most is None else min(longest, most)
-    sums = None
-    count, grid = np.zeros(longest, np.int64), np.arange(1.0, longest + 1) * frames.step
-    lagtime = grid.copy()
+    sums: Floats | None = None
+    count: Ints | None = None
+    before: Ints | int = 0
+    grid = np.arange(1.0, longest + 1) * frames.step
+    lagtime = grid if frames.exact else grid.copy()
     for elements in [] if complete else frames.blocks:
         slot = frames.slot[elements]
         lags = min(int(slot[-1]), longest)
         if lags < 1:
             continue
         added, number = kernel.within(frames.row[elements], slot, lags)
-        sums = np.zeros((longest, added.shape[1])) if sums is None else sums
-        sums[:lags] += added
+        if sums is None or count is None:
+            if lags == longest and len(frames.blocks) == 1:
+                sums, count = added, number
+            else:
+                sums, count = np.zeros((longest, added.shape[1])), np.zeros(longest, np.int64)
+                sums[:lags], count[:lags] = added, number
+        else:
+            before = count[:lags].copy()
+            sums[:lags] += added
+            count[:lags] += number
         if not frames.exact:
-            total = count[:lags] + number
             excess = number * _mean_excess(frames.time[elements], slot, frames.step, lags)
             lagtime[:lags] += np.divide(
                 excess - number * (lagtime[:lags] - grid[:lags]),
-                total,
+                before + number,
                 out=np.zeros(lags),
-                where=total > 0,
+                where=before + number > 0,
             )
-        count[:lags] += number
-    sums = np.zeros((longest, 1)) if sums is None else sums
+    if sums is None or count is None:
+        sums, count = np.zeros((longest, 1)), np.zeros(longest, np.int64)
     found = PairSums(lagtime, sums, count, count.astype(np.float64), None)
     if pairs is not None and pairs[0].size:
         found = _with_listed_pairs(found, kernel, frames, pairs, most)
@@ -321,31 +343,205 @@ class Squares:
         self.walks = walks
 
     def within(self, rows: Ints, slots: Ints, count: int) -> tuple[Floats, Ints]:
-        """Return the sums by FFT.
+        """Return the sums by FFT, of one component after the other.
 
-        With m the presence, the sum is corr(m x^2, m) + corr(m, m x^2) - 2 corr(m x, m x). The
-        mean is subtracted first: the squares of coordinates far from the origin would lose digits
-        of the displacements.
+        Without gaps the sum over the pairs of lag n is the sum of x^2 over the frames that begin
+        one, plus that over the frames that end one, less twice the autocorrelation of x; with m
+        the presence it is 2 corr(m, x^2) - 2 corr(x, x). The mean is subtracted first: the squares
+        of coordinates far from the origin would lose digits of the displacements. So is a straight
+        line v t where it is most of the motion; its share v^2 n^2 of every pair, and 2 v n times
+        the sum of the other displacements, are added back.
         """
         walks = _on_grid(self.walks, rows, slots)
         here = present(walks)
-        mask = here.astype(np.float64)
-        mean = np.where(here[..., None], walks, 0.0).sum(0) / np.maximum(mask.sum(0), 1)[:, None]
-        x = np.where(here[..., None], walks - mean, 0.0)
-        size = fft_size(len(walks) + count)
-        m = np.fft.rfft(mask, size, axis=0)[..., None]
-        f, g = np.fft.rfft(x, size, axis=0), np.fft.rfft(x * x, size, axis=0)
-        spectrum = 2 * np.real(np.conj(m) * g) - 2 * np.abs(f) ** 2
-        sums = np.fft.irfft(spectrum.sum(1), size, axis=0)[1 : count + 1]
-        counts = np.fft.irfft((np.abs(m) ** 2).sum((1, 2)), size)[1 : count + 1]
-        # A sum of squares that rounds below zero is zero.
-        return np.maximum(sums, 0.0), np.rint(counts).astype(np.int64)
+        n, walkers, components = walks.shape
+        transform = Correlations.of(n + count)
+        sums = np.empty((components, count))
+        at_once = int(np.clip(_NUMBERS_AT_ONCE // (n * walkers), 1, components))
+        parts = [slice(k, k + at_once) for k in range(0, components, at_once)]
+        if here.all():
+            x, time = np.empty((at_once, walkers, n)), np.arange(0.5 * (1 - n), 0.5 * n)
+            memory = np.empty((at_once * walkers, len(transform.turn)), dtype=np.complex128)
+            for part in parts:
+                some = x[: len(sums[part])]
+                some[:] = walks[..., part].T
+                _complete_squares(some, transform, time=time, memory=memory, out=sums[part])
+            return sums.T, walkers * (n - np.arange(1, count + 1))
+        mask = np.ascontiguousarray(here.T, dtype=np.float64)
+        spectrum = transform.spectrum(mask)
+        pairs = np.rint(transform.even(squared_size(spectrum))[1 : count + 1])
+        for part in parts:
+            some = np.where(here.T, walks[..., part].T, 0.0)
+            _gapped_squares(some, mask, transform, spectrum=spectrum, pairs=pairs, out=sums[part])
+        return sums.T, pairs.astype(np.int64)
 
     def between(self, first: Ints, last: Ints) -> tuple[Floats, Ints]:
         """Return the squared differences of pairs."""
         square = (self.walks[last] - self.walks[first]) ** 2
         here = present(square)
         return np.where(here[..., None], square, 0.0).sum(1), here.sum(1)
+
+
+def _complete_squares(
+    x: Floats, transform: Correlations, *, time: Floats, memory: Complexes, out: Floats
+) -> None:
+    """Write sums of squared differences at lags 1, 2, ... of complete walks (q, K, n) to `out`.
+
+    `time` is that from the middle, in steps, and `memory` (q K, H) that of a transform. The walks
+    are overwritten.
+    """
+    count, (components, walkers, n) = out.shape[1], x.shape
+    x -= x.sum(axis=2, keepdims=True) / n
+    slope = _steady_slopes(x, time, walkers * float(time @ time))
+    rest = None
+    if slope.any():
+        x -= slope[:, None, None] * time
+        total = x.sum(axis=1)
+        rest = np.cumsum(total[:, : -count - 1 : -1] - total[:, :count], axis=1)
+    power = transform.spectrum(x.reshape(-1, n), out=memory[: components * walkers])
+    power = power.reshape(components, walkers, -1)
+    correlation = transform.even(squared_size(power, overwrite=True))
+    np.multiply(x, x, out=x)
+    square = x[:, 0] if walkers == 1 else x.sum(axis=1)
+    np.add(square[:, :count], square[:, : -count - 1 : -1], out=out)
+    np.cumsum(out, axis=1, out=out)
+    np.subtract(2 * square.sum(axis=1, keepdims=True), out, out=out)
+    correlation *= 2
+    out -= correlation[:, 1 : count + 1]
+    if rest is not None:
+        lag = np.arange(1.0, count + 1)
+        far = slope[:, None] * lag
+        out += far * (far * (walkers * (n - lag)) + 2 * rest)
+    # A sum of squares that rounds below zero is zero.
+    np.maximum(out, 0.0, out=out)
+
+
+def _gapped_squares(
+    x: Floats,
+    mask: Floats,
+    transform: Correlations,
+    *,
+    spectrum: Complexes,
+    pairs: Floats,
+    out: Floats,
+) -> None:
+    """Write sums of squared differences at lags 1, 2, ... of walks (q, K, n) with gaps to `out`.
+
+    The walks are 0 where they are missing; `spectrum` is that of the presence (K, n), `mask`, and
+    `pairs` their number at every lag.
+    """
+    count, (components, walkers, n) = out.shape[1], x.shape
+    time = np.arange(float(n))
+    number = np.maximum(mask.sum(axis=1, keepdims=True), 1.0)
+    x -= mask * (x.sum(axis=2, keepdims=True) / number)
+    middle = mask * (time - (mask @ time)[:, None] / number)
+    slope = _steady_slopes(x, time, float(np.vdot(middle, middle)))
+    steady = bool(slope.any())
+    if steady:
+        x -= slope[:, None, None] * middle
+    both = transform.spectrum(np.concatenate([x, x * x]).reshape(-1, n))
+    moved, squared = both.reshape(2, components, walkers, -1)
+    power = (np.conj(spectrum) * squared).real.sum(axis=1) - squared_size(moved)
+    np.multiply(transform.even(power)[:, 1 : count + 1], 2.0, out=out)
+    if steady:
+        lag = np.arange(1.0, count + 1)
+        far = slope[:, None] * lag
+        rest = transform.odd((spectrum * np.conj(moved)).imag.sum(axis=1))[:, 1 : count + 1]
+        out += far * (far * pairs + 4 * rest)
+    # A sum of squares that rounds below zero is zero.
+    np.maximum(out, 0.0, out=out)
+
+
+def _steady_slopes(x: Floats, time: Floats, spread: float) -> Floats:
+    """Return the common slope of the walks (q, K, n) of mean 0 along each component, (q,).
+
+    It is 0 where a straight line is not most of the motion. `spread` is the sum over the frames of
+    all walks of the squared time from the walk's mean time.
+    """
+    slope = (x @ time).sum(axis=1) / max(spread, 1.0)
+    square = np.array([float(np.vdot(one, one)) for one in x])
+    return np.where(slope**2 * spread > _STEADY_SHARE * square, slope, 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Correlations:
+    """Fourier transforms of real sequences at the odd multiples of half a frequency step.
+
+    A zero-padded sequence of N numbers in a period of M = 2 H >= N + count places has correlations
+    free of overlap up to lag `count`. At the frequencies (2k + 1/2)/M the transforms are complex
+    ones of length H, and those at the other half frequencies their complex conjugates; sums over
+    all of them are real transforms of length H: together less than half of the usual work.
+
+    Attributes
+    ----------
+    turn : ndarray, shape (H,)
+        exp(-i pi j/M).
+
+    Examples
+    --------
+    >>> transform = Correlations.of(6)
+    >>> spectrum = transform.spectrum(np.array([[1.0, 2.0, 3.0]]))
+    >>> transform.even(np.abs(spectrum[0]) ** 2).round(9)  # 1 + 4 + 9, 2 + 6 and 3
+    array([14.,  8.,  3.])
+    """
+
+    turn: Complexes
+
+    @classmethod
+    def of(cls, places: int) -> Correlations:
+        """Return the transforms of a period of at least this many places."""
+        half = fft_size(-(-places // 2))
+        # Products of two short lists: a trigonometric function for every place takes longer.
+        width = int(np.sqrt(half)) + 1
+        step = -0.5j * np.pi / half
+        rows, columns = np.exp(step * width * np.arange(width)), np.exp(step * np.arange(width))
+        return cls(np.multiply.outer(rows, columns).ravel()[:half])
+
+    def spectrum(self, x: Floats, *, out: Complexes | None = None) -> Complexes:
+        """Return the transform of sequences (K, N) at the frequencies (2k + 1/2)/M, (K, H)."""
+        half = len(self.turn)
+        out = np.empty((len(x), half), dtype=np.complex128) if out is None else out
+        size = min(half, x.shape[1])
+        np.multiply(x[:, :half], self.turn[:size], out=out[:, :size])
+        out[:, size:] = 0.0
+        rest = x[:, half:]
+        if rest.shape[1]:
+            out[:, : rest.shape[1]] -= 1j * rest * self.turn[: rest.shape[1]]
+        return np.fft.fft(out, axis=1, out=out) if _IN_PLACE else np.fft.fft(out, axis=1)
+
+    def even(self, power: Floats) -> Floats:
+        """Return sum_k p_k cos(2 pi (2k + 1/2) j/M)/H of p (..., H) at j = 0 to H - 1."""
+        turned = self._summed(power)
+        back = slice(len(self.turn) - turned.shape[-1], 0, -1)
+        return np.concatenate([turned.real, -turned.imag[..., back]], axis=-1)
+
+    def odd(self, power: Floats) -> Floats:
+        """Return sum_k p_k sin(2 pi (2k + 1/2) j/M)/H of p (..., H) at j = 0 to H - 1."""
+        turned = self._summed(power)
+        back = slice(len(self.turn) - turned.shape[-1], 0, -1)
+        return np.concatenate([-turned.imag, turned.real[..., back]], axis=-1)
+
+    def _summed(self, power: Floats) -> Complexes:
+        """Return sum_k p_k exp(-2 pi i (2k + 1/2) j/M)/H at j = 0 to H/2."""
+        summed = np.fft.rfft(power, norm="forward")
+        summed *= self.turn[: summed.shape[-1]]
+        return summed
+
+
+def squared_size(spectrum: Complexes, *, overwrite: bool = False) -> Floats:
+    """Return the squared absolute values of spectra (..., K, H), summed over K.
+
+    The spectra may be overwritten to save memory.
+
+    Examples
+    --------
+    >>> squared_size(np.array([[3.0 + 4.0j], [1.0j]]))
+    array([26.])
+    """
+    parts = spectrum.view(np.float64)
+    squares = np.multiply(parts, parts, out=parts if overwrite else None)
+    total = squares[..., 0, :] if squares.shape[-2] == 1 else squares.sum(axis=-2)
+    return np.asarray(total[..., ::2] + total[..., 1::2])
 
 
 class Products:
@@ -391,6 +587,8 @@ class Products:
 def _on_grid(values: Floats, rows: Ints, slots: Ints) -> Floats:
     """Return rows of an array at their places on a grid, NaN between them."""
     if len(slots) == slots[-1] + 1:
+        if rows[-1] - rows[0] == len(rows) - 1 and np.all(np.diff(rows) == 1):
+            return values[rows[0] : rows[-1] + 1]
         return values[rows]
     grid = np.full((int(slots[-1]) + 1, *values.shape[1:]), np.nan)
     grid[slots] = values[rows]

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.polynomial.polynomial import polyval
 
 if TYPE_CHECKING:
     from perrin._arrays import Floats, Ints
@@ -14,6 +14,10 @@ if TYPE_CHECKING:
 
 # Starts of displacements are compared as whole numbers below this: exact sums of their squares.
 _INTEGER_RANGE = 1 << 22
+
+
+# Lags whose errors are computed at once; more do not stay in the processor's cache.
+_LAGS_AT_ONCE = 8192
 
 
 def relative_error(sums: PairSums, frames: Frames, half: Floats, pairs: Floats) -> Floats:
@@ -50,29 +54,103 @@ def relative_error(sums: PairSums, frames: Frames, half: Floats, pairs: Floats) 
     True
     """
     lag = sums.lagtime / frames.step
+    steps, on_grid = lag, np.asarray(pairs, dtype=np.float64)
+    if frames.exact and sums.listed is None:
+        np.rint(lag, out=lag)
+    else:
+        steps = np.maximum(np.rint(lag), 1.0)
     d, s = two_lag_fit(lag, half, pairs)
-    share = np.divide(sums.on_grid, sums.pairs, out=np.zeros_like(half), where=sums.pairs > 0)
-    on_grid = share * pairs
-    steps = np.maximum(np.rint(lag), 1.0)
-    complete = displacement_counts(frames.lengths, steps)
-    present = np.sqrt(
-        np.where((on_grid > 0) & (complete > 0), on_grid / np.maximum(complete, 1), 1.0)
-    )
+    if sums.listed is not None:
+        share = np.divide(sums.on_grid, sums.pairs, out=np.zeros_like(half), where=sums.pairs > 0)
+        on_grid = share * pairs
     total = np.zeros_like(lag)
+    complete = displacement_counts(frames.lengths, steps)
+    gap: Floats | float = 0.0
+    whole = np.array_equal(on_grid, complete)
+    if not whole:
+        share = np.divide(on_grid, complete, out=np.zeros_like(half), where=complete > 0)
+        gap = 1 / np.sqrt(np.where(share > 0, share, 1.0)) - 1
     for length, times in zip(*np.unique(frames.lengths, return_counts=True), strict=True):
-        use = np.flatnonzero((steps <= length) & (on_grid > 0))
-        b, p = steps[use], length + 1 - steps[use]
-        near, far, same = covariance_polynomials(b, int(length), present=present[use], D=d, s=s)
-        own = np.where(b <= p, *(polyval(b, c, tensor=False) for c in (near, far))) + same
-        total[use] += times * own
-    total = np.asarray(total * present**4)
+        # Steps rise: the lags up to half the track, and the longer ones, in parts that stay in the
+        # processor's cache.
+        middle, end = np.searchsorted(steps, [0.5 * (length + 1) + 0.25, length + 0.5]).tolist()
+        edges = [*range(0, middle, _LAGS_AT_ONCE), *range(middle, end, _LAGS_AT_ONCE), end]
+        for first, last in pairwise(edges):
+            own = squared_covariances(
+                steps[first:last],
+                int(length),
+                gap=gap if isinstance(gap, float) else gap[first:last],
+                D=d,
+                s=s,
+                shorter=first < middle,
+            )
+            total[first:last] += times * own
+    if not whole:
+        total *= share**2
     if sums.listed is not None:
         total += _listed_covariances(sums.listed, frames, lag, d=d, s=s)
-    mean = 2 * (d * lag + s)
-    relative = np.full_like(half, np.nan)
-    good = (pairs > 0) & (mean > 0)
-    np.divide(np.sqrt(2 * total), pairs * mean, out=relative, where=good)
+    # The relative error is the root of 2 total over the number of pairs and the mean square.
+    total *= 2
+    relative = np.sqrt(total, out=total)
+    mean = np.multiply(lag, 2 * d)
+    mean += 2 * s
+    with np.errstate(divide="ignore", invalid="ignore"):
+        relative /= pairs
+        relative /= mean
+    if not (mean[0] > 0 and np.all(pairs)):
+        relative[(pairs == 0) | (mean <= 0)] = np.nan
     return relative
+
+
+def squared_covariances(
+    lag: Floats, steps: int, *, gap: Floats | float, D: float, s: float, shorter: bool
+) -> Floats:
+    """Return the sum of the squared covariances of all pairs of displacements of one lag.
+
+    It is the polynomial of `covariance_polynomials` where both lags are the same.
+
+    Parameters
+    ----------
+    lag : ndarray, shape (L,)
+        Lags b, frames.
+    steps : int
+        Steps of the track.
+    gap : ndarray, shape (L,), or float
+        One over the fraction of the frames that is present, less 1.
+    D, s : float
+        Diffusion coefficient times dt, and variance of one coordinate from noise.
+    shorter : bool
+        Whether these lags are at most half the track, steps + 1 >= 2 b; else they are longer.
+
+    Examples
+    --------
+    >>> squared_covariances(np.array([1.0]), 10, gap=0.0, D=0.5, s=0.0, shorter=True)
+    array([10.])
+    """
+    b, p = lag, steps + 1 - lag
+    squares, noise = 4 * D * D, 2 * s * s
+    square = b * b
+    if shorter:
+        total = (2 / 3 * squares) * p
+        total -= (squares / 6) * b
+        total *= b
+        total += squares / 6
+        total *= b
+        total += (squares / 3 + 8 * D * s) * p - noise
+        total *= b
+        total += (3 * noise) * p
+        extra = 2 * squares * square * p + 2 * noise * p + 8 * D * s * p * b - noise * b
+    else:
+        twice = p * p - 1
+        total = p * ((squares / 6) * p - (2 / 3 * squares) * b)
+        total *= twice
+        total += squares * p * p * square
+        total += (2 * noise + 8 * D * s * b) * p
+        extra = 2 * squares * square * p + noise * p + 8 * D * s * p * b
+    if isinstance(gap, float) and gap == 0:
+        return np.asarray(total)
+    same = (gap * gap + 2 * gap) * (2 * D * b + 2 * s) ** 2 - 2 * gap * (2 * D * b + s) ** 2
+    return np.asarray(total + gap * extra + p * same)
 
 
 def two_lag_fit(lag: Floats, half: Floats, pairs: Floats | Ints) -> tuple[float, float]:
@@ -96,7 +174,9 @@ def two_lag_fit(lag: Floats, half: Floats, pairs: Floats | Ints) -> tuple[float,
     >>> two_lag_fit(np.array([1.0, 2.0]), np.array([0.75, 1.25]), np.array([9, 8]))
     (0.5, 0.25)
     """
-    good = np.flatnonzero(pairs > 0)
+    good = np.flatnonzero(pairs[:16] > 0)
+    if good.size < 2:
+        good = np.flatnonzero(pairs > 0)
     first, second = (good[0], good[1]) if good.size > 1 else (good[0], good[0])
     rise = (half[second] - half[first]) / max(lag[second] - lag[first], 1e-9)
     d = min(max(rise, 0.0), half[first] / lag[first])
@@ -122,6 +202,8 @@ def displacement_counts(lengths: Ints, lag: Floats) -> Floats:
     >>> displacement_counts(np.array([3, 5]), np.array([1.0, 4.0]))
     array([8., 2.])
     """
+    if len(lengths) == 1:
+        return np.asarray(np.maximum(lengths[0] + 1 - lag, 0.0))
     rising = np.sort(lengths)
     left = np.append(np.cumsum(rising[::-1])[::-1], 0)
     shorter = np.searchsorted(rising, lag - 0.5)
