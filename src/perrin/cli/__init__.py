@@ -21,6 +21,7 @@ from perrin.cli.app import (
 from perrin.cli.config import config_text, take_config, write_config
 from perrin.cli.diagnosis import Check, figure_font, installed, optional_readers, self_test
 from perrin.cli.messages import (
+    claimed_output,
     in_options,
     messages_of,
     options_of,
@@ -30,6 +31,7 @@ from perrin.cli.messages import (
 from perrin.cli.options import (
     GroupedCommand,
     body_of,
+    read_channels,
     read_columns,
     read_dynamics,
     read_model,
@@ -62,6 +64,7 @@ __all__ = [
     "body_of",
     "check_demo_folder",
     "check_new_file",
+    "claimed_output",
     "cluster_table",
     "common_options",
     "config_text",
@@ -83,6 +86,7 @@ __all__ = [
     "pooled_table",
     "predict",
     "progress_lines",
+    "read_channels",
     "read_columns",
     "read_dynamics",
     "read_model",
