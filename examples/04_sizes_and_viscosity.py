@@ -40,12 +40,8 @@ print(D_T)
 known = {"cluster": motion.template, "viscosity": viscosity, "temperature": temperature}
 from_translation = perrin.size_from_translation(D_T, **known)
 from_rotation = perrin.size_from_rotation(D_R, **known)
-print(
-    f"sphere diameter from D_T: {from_translation.sphere:.2f} +- {from_translation.sphere_stderr:.2f} um"
-)
-print(
-    f"sphere diameter from D_R: {from_rotation.sphere:.2f} +- {from_rotation.sphere_stderr:.2f} um"
-)
+for name, size in (("D_T", from_translation), ("D_R", from_rotation)):
+    print(f"sphere diameter from {name}: {size.sphere:.2f} +- {size.sphere_stderr:.2f} um")
 
 # %%
 # ``Size.cluster`` is the hydrodynamic diameter of the whole cluster, that of a sphere with the
