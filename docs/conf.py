@@ -28,6 +28,7 @@ extensions = [
     "local_mathjax",
 ]
 exclude_patterns = ["_build", "gallery_scripts", "_extensions", "tutorials/examples/index.rst"]
+highlight_language = "none"  # a block without a language is output
 suppress_warnings = ["config.cache"]  # the settings of the gallery hold a class
 
 myst_enable_extensions = ["colon_fence", "deflist", "dollarmath"]
