@@ -1,10 +1,17 @@
 """From a track table to a Report, and the folder that holds it."""
 
 from perrin.run.experiment import Experiment, Recording, argument_faults, merged_experiment
-from perrin.run.folders import check_place, check_resumable, filled_folder, staged_folder
+from perrin.run.folders import (
+    check_place,
+    check_resumable,
+    claimed_folder,
+    filled_folder,
+    staged_folder,
+)
 from perrin.run.grouping import assign_clusters
 from perrin.run.kinds import part_of, shape_numbers, usual_symmetry
 from perrin.run.layers import napari_layers, napari_reader, table_layers
+from perrin.run.lock import locked
 from perrin.run.measure import (
     ClusterTracks,
     Coefficient,
@@ -12,13 +19,14 @@ from perrin.run.measure import (
     MeasuredBody,
     add_predictions,
     complete_recording,
-    fit_body,
+    fit_bodies,
     fit_clusters,
+    identity_remarks,
     judge_bodies,
     judge_coefficient,
     library_version,
     measure_bodies,
-    measure_coefficient,
+    measure_coefficients,
     measure_free_spheres,
     measure_kinds,
     measure_rod,
@@ -28,11 +36,14 @@ from perrin.run.measure import (
     measured_shape,
     misfit_as_labelled,
     motion_and_path,
-    noise_floor_test,
+    no_translation,
+    noise_floor_tests,
     pool_clusters,
     pool_coefficients,
     run_settings,
     with_sizes,
+    with_step_tests,
+    without_jumps,
 )
 from perrin.run.predictions import (
     Compared,
@@ -144,6 +155,7 @@ __all__ = [
     "assumed_exposure_notes",
     "check_place",
     "check_resumable",
+    "claimed_folder",
     "coefficients_html",
     "common_jump_warnings",
     "common_motion_remarks",
@@ -165,13 +177,14 @@ __all__ = [
     "fast_turning_warnings",
     "filled_folder",
     "find_sizes",
-    "fit_body",
+    "fit_bodies",
     "fit_clusters",
     "fit_model",
     "floor_factor",
     "flow_warnings",
     "grouped",
     "grouping_note",
+    "identity_remarks",
     "is_known",
     "is_noise_floor",
     "is_not_diffusion",
@@ -185,9 +198,10 @@ __all__ = [
     "library_version",
     "limit_warnings",
     "load_run",
+    "locked",
     "loose_particles_note",
     "measure_bodies",
-    "measure_coefficient",
+    "measure_coefficients",
     "measure_free_spheres",
     "measure_kinds",
     "measure_rod",
@@ -209,7 +223,8 @@ __all__ = [
     "no_pose_notes",
     "no_prediction_warning",
     "no_rotation_note",
-    "noise_floor_test",
+    "no_translation",
+    "noise_floor_tests",
     "noise_floor_warning",
     "not_diffusion_warning",
     "part_of",
@@ -242,6 +257,8 @@ __all__ = [
     "verdicts_to_dict",
     "with_jumps",
     "with_sizes",
+    "with_step_tests",
+    "without_jumps",
     "wrapped_box_text",
     "write_data",
 ]
