@@ -60,7 +60,7 @@ def test_fft_equals_direct_sums_far_from_the_origin(gaps, repeats):
 def test_a_steady_motion_keeps_the_digits_of_its_displacements(gaps, repeats):
     """A velocity of 1000 root-mean-square steps: errors under 1e-8 at the shortest lags too."""
     n, rng = repeats(20_000, 1_000_000), np.random.default_rng(9)
-    steps = rng.normal(scale=1e-3, size=(n, 3)) + [1.0, -2.0, 0.5]
+    steps = np.array([1.0, -2.0, 0.5]) + rng.normal(scale=1e-3, size=(n, 3))
     walk = 1e4 + np.cumsum(steps, axis=0)
     walk[1:-1][rng.random(n - 2) < gaps] = np.nan
     curve = msd(walk[:, None], dt=1.0)
