@@ -3,7 +3,7 @@
 from perrin.run.experiment import Experiment, Recording, argument_faults, merged_experiment
 from perrin.run.folders import check_place, check_resumable, filled_folder, staged_folder
 from perrin.run.grouping import assign_clusters
-from perrin.run.kinds import part_of, shape_numbers, usual_symmetry
+from perrin.run.kinds import matched_particles, part_of, shape_numbers, usual_symmetry
 from perrin.run.layers import napari_layers, napari_reader, table_layers
 from perrin.run.measure import (
     ClusterTracks,
@@ -186,6 +186,7 @@ __all__ = [
     "limit_warnings",
     "load_run",
     "loose_particles_note",
+    "matched_particles",
     "measure_bodies",
     "measure_coefficient",
     "measure_free_spheres",
