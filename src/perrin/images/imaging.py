@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +10,7 @@ import numpy as np
 from perrin._arrays import from_plain, to_plain
 from perrin.images.optics.optics import Optics
 from perrin.images.optics.radial_image import RadialImage
+from perrin.tracks.checksums import CheckedFiles, refusing_damage
 from perrin.tracks.writing import write_json
 
 if TYPE_CHECKING:
@@ -224,12 +224,13 @@ def read_imaging(folder: Path) -> Imaging:
     ------
     FileNotFoundError
         If a file is missing.
+    DamagedFileError
+        If one of them is damaged.
     """
-    import pandas as pd
-
-    entry = json.loads((folder / "imaging.json").read_text(encoding="utf-8"))
-    with np.load(folder / "views.npz") as stored:
+    files = CheckedFiles.of(folder)
+    entry, stored = files.json("imaging.json"), files.arrays("views.npz")
+    tables = {name: files.table(f"{name}.parquet") for name in _TABLES}
+    with refusing_damage(folder):
         frames = sorted({int(name.partition("-")[0]) for name in stored})
         views = tuple(View(k, *(stored[f"{k}-{side}"] for side in _SIDES)) for k in frames)
-    tables = {name: pd.read_parquet(folder / f"{name}.parquet") for name in _TABLES}
-    return Imaging(**tables, views=views, **_settings_from(entry))
+        return Imaging(**tables, views=views, **_settings_from(entry))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import inspect
 import shutil
 from collections.abc import Iterable
-from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypedDict
@@ -41,6 +40,7 @@ from perrin.movie.hidden import complete_bodies
 from perrin.movie.stages import Located, fit_poses, locate_frames
 from perrin.movie.workers import Work, check_workers
 from perrin.run.experiment import Experiment, MotionModel, Recording, merged_experiment
+from perrin.run.folders import claimed_folder
 from perrin.run.measure import library_version, measure_free_spheres, measure_table
 from perrin.tracks.clock import Clock, evenly_spaced
 
@@ -237,7 +237,7 @@ def analyze_stack(
     work.report(0, 0, "taking the file's SHA-256")
     depends = [_dependencies(one, search, refine, optics, numbers) for one in stacks]
     with (
-        nullcontext(work.keep)
+        claimed_folder(work.keep)
         if work.keep is not None
         else tempfile.TemporaryDirectory(prefix="perrin-")
     ) as kept:
