@@ -307,7 +307,7 @@ class _Trial:
 
     def depth(self, x: Floats) -> Floats:
         """Return how far places (..., 3) are beyond the border, um; negative inside."""
-        return np.maximum(self.low - x, x - self.high).max(axis=-1)
+        return np.asarray(np.maximum(self.low - x, x - self.high).max(axis=-1))
 
     def best_of(
         self,
@@ -328,8 +328,8 @@ class _Trial:
                 sets += [(places, _BRIGHT_KNOWN) for places in missing_places(start, whole)]
         size = float(pair_distances(start).min())
         size = contact if size > _TOUCHING * contact else size
-        near = touching_places(start, contact=size) if len(start) <= _LARGEST_BODY else []
-        for place in near:
+        small = len(start) <= _LARGEST_BODY
+        for place in touching_places(start, contact=size) if small else np.empty((0, 3)):
             away = self.depth(motion.center[rows] + motion.rotation[rows] @ place)
             if np.mean(away > -_INSIDE * self.diameter) > 0.5:
                 sets.append((place[None], _BRIGHT_TOUCHING))

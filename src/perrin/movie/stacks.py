@@ -570,13 +570,7 @@ def _with_checks(
         + checks.clusters_near_border(features, margin=bodies.margin, sizes=bodies.sizes)
         + findings
     )
-    clusters, of_several = checks.check_clusters(
-        report.clusters,
-        contact=contact,
-        plane_time=stack.plane_time,
-        height=imaging.voxel[0],
-        diameter=imaging.diameter,
-    )
+    clusters, of_several = checks.check_clusters(report.clusters, contact=contact)
     found += of_several + checks.partial_bodies(report.clusters, report.kinds)
     return replace(
         report,
