@@ -756,6 +756,53 @@ def convert(
         print(f"{len(table)} rows written to {target}")
 
 
+@app.command(cls=GroupedCommand, epilog="perrin examples my-examples")
+def examples(
+    folder: Annotated[Path, typer.Argument(help="Folder for the copies.")] = Path(
+        "perrin-examples"
+    ),
+    overwrite: Annotated[
+        bool,
+        typer.Option("--overwrite", help="Replace files of these names.", rich_help_panel=OUTPUT),
+    ] = False,
+) -> None:
+    """Copy the scripts and notebooks of the tutorials into a folder."""
+    import shutil
+
+    with messages_of(examples):
+        found = example_files()
+        folder.mkdir(parents=True, exist_ok=True)
+        present = [path.name for path in found if (folder / path.name).exists()]
+        if present and not overwrite:
+            raise FileExistsError(
+                f"{folder} has {', '.join(present)}: choose another folder, or overwrite=True"
+            )
+        for path in found:
+            shutil.copyfile(path, folder / path.name)
+        print(f"{len(found)} examples copied to {folder}: {found[0].name} is the first")
+
+
+def example_files() -> list[Path]:
+    """Return the examples: in the package, or in the repository where this is not installed.
+
+    Raises
+    ------
+    FileNotFoundError
+        If the installation has none.
+
+    Examples
+    --------
+    >>> example_files()[0].name
+    '01_own_table.py'
+    """
+    package = Path(__file__).parents[1]
+    for folder in (package / "data" / "examples", package.parents[1] / "examples"):
+        found = sorted(path for path in folder.glob("[0-9]*") if path.suffix in (".py", ".ipynb"))
+        if found:
+            return found
+    raise FileNotFoundError("this installation has no examples: install perrin from a wheel")
+
+
 @app.command(cls=GroupedCommand, epilog="perrin doctor")
 def doctor() -> None:
     """Show versions, optional readers and the font, and measure a simulated cluster as a test."""
