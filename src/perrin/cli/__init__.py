@@ -19,6 +19,7 @@ from perrin.cli.app import (
 from perrin.cli.config import config_text, take_config, write_config
 from perrin.cli.diagnosis import Check, figure_font, installed, optional_readers, self_test
 from perrin.cli.messages import (
+    claimed_output,
     in_options,
     messages_of,
     options_of,
@@ -60,6 +61,7 @@ __all__ = [
     "body_of",
     "check_demo_folder",
     "check_new_file",
+    "claimed_output",
     "cluster_table",
     "common_options",
     "config_text",

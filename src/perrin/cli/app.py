@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from perrin.cli.config import config_text, write_config
-from perrin.cli.messages import messages_of, state_kept_frames
+from perrin.cli.messages import claimed_output, messages_of, state_kept_frames
 from perrin.cli.options import (
     BODY,
     INPUT,
@@ -140,8 +140,9 @@ def demo(
     from perrin.run.experiment import Experiment
     from perrin.run.folders import check_place
 
-    with messages_of(demo), as_file(files("perrin") / "data" / "demo_tracks.csv.gz") as path:
-        place = output or Path(_DEMO_FOLDER)
+    source = files("perrin") / "data" / "demo_tracks.csv.gz"
+    place = output or Path(_DEMO_FOLDER)
+    with claimed_output(demo, place), as_file(source) as path:
         if output is None and place.exists() and not overwrite:
             check_demo_folder(place)
             overwrite = True
@@ -204,7 +205,7 @@ def analyze(
     overwrite: Overwrite = False,
 ) -> None:
     """Measure D_R and D_T of every cluster in a track table."""
-    with messages_of(analyze), shown_progress(quiet=quiet) as progress:
+    with claimed_output(analyze, output), shown_progress(quiet=quiet) as progress:
         import perrin
         from perrin.run.folders import check_place
 
@@ -389,7 +390,7 @@ def run(
     from perrin.report.write import complete_run
     from perrin.run.folders import check_resumable
 
-    with messages_of(run), state_kept_frames(output):
+    with claimed_output(run, output), state_kept_frames(output):
         check_resumable(output, parts="located", overwrite=overwrite)
         channels = read_whole_numbers("--channel", channel)
         movie = perrin.open_stack(
@@ -675,7 +676,7 @@ def paper(
     from perrin.run.folders import check_place
 
     console = Console(highlight=False)
-    with messages_of(paper):
+    with claimed_output(paper, output):
         check_place(output, overwrite=overwrite)
         with shown_progress() as progress:
             claims = reproduce(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import inspect
 import shutil
 from collections.abc import Iterable
-from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypedDict
@@ -32,6 +31,7 @@ from perrin.movie.bodies import (
 from perrin.movie.stages import Located, fit_poses, locate_frames
 from perrin.movie.workers import Work, check_workers
 from perrin.run.experiment import Experiment, MotionModel, Recording, merged_experiment
+from perrin.run.folders import claimed_folder
 from perrin.run.measure import library_version, measure_free_spheres, measure_table
 from perrin.tracks.clock import Clock, evenly_spaced
 
@@ -212,7 +212,7 @@ def analyze_stack(
     work.report(0, 0, "taking the file's SHA-256")
     depends = _dependencies(stack, search, refine, optics, numbers)
     with (
-        nullcontext(work.keep)
+        claimed_folder(work.keep)
         if work.keep is not None
         else tempfile.TemporaryDirectory(prefix="perrin-")
     ) as kept:
