@@ -16,7 +16,7 @@ import numpy as np
 
 import perrin
 from perrin.diffusion.estimate import NORMAL
-from perrin.study import Coefficient, population_mean
+from perrin.study import Coefficient, PopulationMean, population_mean
 
 ROOTS = np.array([-NORMAL[0.95], -NORMAL[0.68], 0.0, NORMAL[0.68], NORMAL[0.95]])
 SPREADS = ((0.0, 0.0), (0.2, 0.0), (0.0, 0.3), (0.2, 0.2), (0.5, 0.5))
@@ -78,13 +78,25 @@ def covered(
         if mean.spread_movies_ci95 is not None:
             separated += 1
             hits[3] += mean.spread_movies_ci95[0] <= between_movies <= mean.spread_movies_ci95[1]
-        # What a normal interval with the estimated spreads would cover.
-        half = 1.96 * mean.log_stderr / np.sqrt(mean.dispersion)
-        hits[4] += abs(np.log(planted / mean.value)) <= half
+        hits[4] += normal_covers(found, movie, mean, planted)
     hits[3] = hits[3] / separated if separated else np.nan
     hits[[0, 1, 2, 4]] /= repeats
     names = ("ci95", "ci68", "spread_clusters", "spread_movies", "normal")
     return dict(zip(names, map(float, hits), strict=True))
+
+
+def normal_covers(
+    found: list[Coefficient], movie: np.ndarray, mean: PopulationMean, planted: float
+) -> bool:
+    """Return whether the usual interval, 1.96 standard errors with these spreads, covers."""
+    centre = np.log([one.value for one in found])
+    error = np.array([np.log(one.ci95[1] / one.ci95[0]) / 2 / 1.96 for one in found])
+    inner = 1 / (error**2 + mean.spread_clusters**2)
+    weight = np.bincount(movie, inner)
+    each, variance = np.bincount(movie, inner * centre) / weight, 1 / weight
+    outer = 1 / (variance + (mean.spread_movies or 0.0) ** 2)
+    middle = float(outer @ each / outer.sum())
+    return bool(abs(np.log(planted) - middle) <= 1.96 / np.sqrt(outer.sum()))
 
 
 def main() -> int:

@@ -34,6 +34,7 @@ SUBPACKAGES = [
     {"plot"},
     {"report"},
     {"paper"},
+    {"study"},
     {"cli"},
 ]
 FLAT = {"_arrays", "_display", "_text", "errors"}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from functools import partial
+from functools import lru_cache, partial
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
@@ -28,7 +28,7 @@ LawName = Literal["constant", "proportional", "inverse", "power", "exponential"]
 
 # The parameters of each law, D = law(x, *parameters), and whether x must be above 0. All laws are
 # linear in ln D: ln D = ln A + exponent ln x, or ln D = ln A + rate x.
-_LAWS: dict[str, tuple[tuple[str, ...], bool]] = {
+LAWS: dict[str, tuple[tuple[str, ...], bool]] = {
     "constant": (("A",), False),
     "proportional": (("A",), True),
     "inverse": (("A",), True),
@@ -221,10 +221,12 @@ def fit_trend(
     else:
         first = _line_start(law, condition, np.array([one.centre for one in rows]))
 
+    @lru_cache(maxsize=1)
+    def lines(spread: float) -> list[tuple[Floats, Floats]]:
+        return [one.widened(spread).line() for one in rows]
+
     def fit(spread: float, fixed: tuple[int, float] | None, at_first: Floats) -> _Fit:
-        return _least_deviance(
-            [one.widened(spread) for one in rows], condition, logarithm, at_first, fixed
-        )
+        return _least_deviance(lines(spread), condition, logarithm, at_first, fixed)
 
     without = fit(0.0, None, first)
     spread = _spread_about(lambda s: fit(s, None, without.parameters).deviance - dof)
@@ -443,17 +445,17 @@ def _checked(
         if np.any(own(x, *(start or {}).values()) == -1e3):
             refuse([f"start: expected parameters at which the law is above 0, got {start}"])
         return names, own
-    faults += choice_fault("law", law, _LAWS)
-    if law in _LAWS and _LAWS[law][1] and not np.all(x > 0):
+    faults += choice_fault("law", law, LAWS)
+    if law in LAWS and LAWS[law][1] and not np.all(x > 0):
         faults.append(f"x: expected numbers > 0 for the law {law!r}, got {x}")
     refuse(faults)
 
     def linear(at: Floats, log_A: float, second: float = 0.0) -> Floats:
         power = {"proportional": 1.0, "inverse": -1.0, "power": second}.get(law, 0.0)
         grown = second * at if law == "exponential" else 0.0
-        return np.asarray(log_A + grown + (power * np.log(at) if _LAWS[law][1] else 0.0 * at))
+        return np.asarray(log_A + grown + (power * np.log(at) if LAWS[law][1] else 0.0 * at))
 
-    return _LAWS[law][0], linear
+    return LAWS[law][0], linear
 
 
 def _movie_rows(means: Sequence[PopulationMean]) -> tuple[list[_MovieRoot], list[int]]:
@@ -481,7 +483,7 @@ def _line_start(law: str, x: Floats, y: Floats) -> Floats:
 
 
 def _least_deviance(
-    movies: Sequence[_MovieRoot],
+    lines: Sequence[tuple[Floats, Floats]],
     x: Floats,
     logarithm: Callable[..., Floats],
     first: Floats,
@@ -489,8 +491,6 @@ def _least_deviance(
 ) -> _Fit:
     """Return the parameters of least deviance, one of them perhaps fixed."""
     from scipy.optimize import least_squares
-
-    lines = [one.line() for one in movies]
 
     def whole(free: Floats) -> Floats:
         return free if fixed is None else np.insert(free, fixed[0], fixed[1])
@@ -530,20 +530,13 @@ def _likelihood_ends(
     t = float(stdtrit(dof, 0.975))
 
     def end(sign: float, level: float) -> float:
-        step = 1e-3 * max(abs(value), 0.1)
+        inner, step = 0.0, 0.02 * max(abs(value), 0.1)
         while rise(value + sign * step) < level:
-            step *= 2
-            if step > 1e9:
+            inner, step = step, 2 * step
+            if step > 1e6:
                 return sign * np.inf
-        return (
-            float(
-                brentq(lambda s: rise(value + sign * s) - level, step / 2, step, xtol=1e-9 * step)
-                if rise(value + sign * step / 2) < level
-                else step / 2
-            )
-            * sign
-            + value
-        )
+        found = brentq(lambda s: rise(value + sign * s) - level, inner, step, xtol=1e-5 * step)
+        return value + sign * float(found)
 
     low, high = (end(sign, t * t * dispersion) for sign in (-1.0, 1.0))
     one = [end(sign, NORMAL[0.68] ** 2 * dispersion) for sign in (-1.0, 1.0)]
