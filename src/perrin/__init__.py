@@ -445,6 +445,7 @@ _FACES = {
     "plot": (),
     "report": ("write_run",),
     "paper": (),
+    "study": ("Study",),
     "cli": (),
 }
 

@@ -65,7 +65,7 @@ def study_table(
                 "unit": UNITS[one.quantity],
                 "verdict": one.verdict,
                 "averaged": not one.apart_because,
-                "apart_because": one.apart_because,
+                "apart_because": one.apart_because or None,
                 "predicted": one.predicted,
                 "frames": one.frames,
                 "warnings": one.warnings,

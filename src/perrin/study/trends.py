@@ -11,7 +11,6 @@ import numpy as np
 from perrin._arrays import choice_fault, from_plain, frozen, refuse, to_plain
 from perrin._display import Shown
 from perrin._text import number_text
-from perrin.diffusion.estimate import NORMAL
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -36,6 +35,10 @@ LAWS: dict[str, tuple[tuple[str, ...], bool]] = {
     "exponential": (("A", "rate"), False),
 }
 _LEAST_SPREAD, _MOST_SPREAD = 1e-3, 3.0  # of ln D between movies
+
+# Signed roots at which the likelihood of a movie is known, and how far they are continued.
+_EDGE, _FAR = 5.0, 40.0
+_ROOTS = np.concatenate([[-_FAR], np.linspace(-_EDGE, _EDGE, 81), [_FAR]])
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -222,8 +225,8 @@ def fit_trend(
         first = _line_start(law, condition, np.array([one.centre for one in rows]))
 
     @lru_cache(maxsize=1)
-    def lines(spread: float) -> list[tuple[Floats, Floats]]:
-        return [one.widened(spread).line() for one in rows]
+    def lines(spread: float) -> Floats:
+        return np.array([one.widened(spread).places() for one in rows])
 
     def fit(spread: float, fixed: tuple[int, float] | None, at_first: Floats) -> _Fit:
         return _least_deviance(lines(spread), condition, logarithm, at_first, fixed)
@@ -236,14 +239,11 @@ def fit_trend(
     def rise(k: int, value: float) -> float:
         return fit(spread, (k, value), best.parameters).deviance - best.deviance
 
+    dispersion = max(best.deviance / dof, 1e-12)
     for k in range(len(names)):
-        low, high, error = _likelihood_ends(
-            partial(rise, k),
-            float(best.parameters[k]),
-            dispersion=max(best.deviance / dof, 1e-12),
-            dof=dof,
-        )
-        ends.append((low, high))
+        error = float(np.sqrt(best.covariance[k, k] * dispersion))
+        value = float(best.parameters[k])
+        ends.append(_likelihood_ends(partial(rise, k), value, error, dispersion, dof=dof))
         errors.append(error)
     predicted = logarithm(condition, *best.parameters)
     convert = np.exp if not callable(law) else None
@@ -344,20 +344,17 @@ def fit_power_law(D_R: Sequence[PopulationMean], D_T: Sequence[PopulationMean]) 
 
     best = least_squares(roots, slope, xtol=1e-12)
     deviance = 2 * float(best.cost)
+    dispersion = max(deviance / dof, 1e-12)
+    errors = np.sqrt(np.diag(np.linalg.pinv(best.jac.T @ best.jac)) * dispersion)
     found = [
-        _likelihood_ends(
-            partial(rise, k),
-            float(best.x[k]),
-            dispersion=max(deviance / dof, 1e-12),
-            dof=dof,
-        )
+        _likelihood_ends(partial(rise, k), float(best.x[k]), float(errors[k]), dispersion, dof=dof)
         for k in (0, 1)
     ]
     A = float(np.exp(best.x[0]))
     return Trend(
         law="power",
         parameters={"A": A, "exponent": float(best.x[1])},
-        stderr={"A": A * found[0][2], "exponent": found[1][2]},
+        stderr={"A": A * float(errors[0]), "exponent": float(errors[1])},
         ci95={
             "A": (float(np.exp(found[0][0])), float(np.exp(found[0][1]))),
             "exponent": (found[1][0], found[1][1]),
@@ -389,8 +386,8 @@ class _MovieRoot:
         step = float(self.log_D[1] - self.log_D[0])
         return _MovieRoot(self.log_D, smoothed(self.log_likelihood[None], spread, step=step)[0])
 
-    def line(self) -> tuple[Floats, Floats]:
-        """Return ln D and signed roots, to be continued as straight lines."""
+    def places(self) -> Floats:
+        """Return ln D at the signed roots `_ROOTS`; straight lines beyond the tabulated ones."""
         row = self.log_likelihood
         i = min(max(int(np.argmax(row)), 1), row.size - 2)
         bend, slope = row[i - 1] - 2 * row[i] + row[i + 1], (row[i + 1] - row[i - 1]) / 2
@@ -398,12 +395,21 @@ class _MovieRoot:
         step = float(self.log_D[1] - self.log_D[0])
         centre, top = self.log_D[i] + offset * step, row[i] + offset * slope / 2
         root = np.sign(self.log_D - centre) * np.sqrt(np.maximum(2 * (top - row), 0.0))
-        keep = np.abs(root) < 5
+        keep = np.abs(root) < _EDGE
         x, r = self.log_D[keep], np.maximum.accumulate(root[keep])
-        far = 40.0
-        low = x[0] - far * (centre - x[0]) / max(-r[0], 0.2)
-        high = x[-1] + far * (x[-1] - centre) / max(r[-1], 0.2)
-        return np.concatenate([[low], x, [high]]), np.concatenate([[r[0] - far], r, [r[-1] + far]])
+        low = x[0] - _FAR * (centre - x[0]) / max(-r[0], 0.2)
+        high = x[-1] + _FAR * (x[-1] - centre) / max(r[-1], 0.2)
+        roots = np.concatenate([[r[0] - _FAR], r, [r[-1] + _FAR]])
+        return np.interp(_ROOTS, roots, np.concatenate([[low], x, [high]]))
+
+
+def _roots_at(places: Floats, log_D: Floats) -> Floats:
+    """Return the signed root of each movie at its own ln D, from the places of `_ROOTS`."""
+    row = np.arange(len(places))
+    k = np.clip(np.sum(places < log_D[:, None], axis=1), 1, _ROOTS.size - 1)
+    left, right = places[row, k - 1], places[row, k]
+    share = (log_D - left) / np.maximum(right - left, 1e-12)
+    return np.asarray(_ROOTS[k - 1] + share * (_ROOTS[k] - _ROOTS[k - 1]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -413,6 +419,7 @@ class _Fit:
     parameters: Floats
     deviance: float
     roots: Floats
+    covariance: Floats
 
 
 def _checked(
@@ -483,7 +490,7 @@ def _line_start(law: str, x: Floats, y: Floats) -> Floats:
 
 
 def _least_deviance(
-    lines: Sequence[tuple[Floats, Floats]],
+    places: Floats,
     x: Floats,
     logarithm: Callable[..., Floats],
     first: Floats,
@@ -496,15 +503,15 @@ def _least_deviance(
         return free if fixed is None else np.insert(free, fixed[0], fixed[1])
 
     def roots(free: Floats) -> Floats:
-        at = logarithm(x, *whole(free))
-        return np.array([np.interp(a, *line) for a, line in zip(at, lines, strict=True)])
+        return _roots_at(places, logarithm(x, *whole(free)))
 
     free = first if fixed is None else np.delete(first, fixed[0])
     if free.size == 0:
         values = roots(free)
-        return _Fit(whole(free), float(values @ values), -values)
+        return _Fit(whole(free), float(values @ values), -values, np.empty((0, 0)))
     found = least_squares(roots, free, x_scale=np.maximum(np.abs(free), 0.1), xtol=1e-10)
-    return _Fit(whole(found.x), 2 * float(found.cost), -found.fun)
+    covariance = np.linalg.pinv(found.jac.T @ found.jac)
+    return _Fit(whole(found.x), 2 * float(found.cost), -found.fun, covariance)
 
 
 def _spread_about(excess: Callable[[float], float]) -> float:
@@ -521,23 +528,23 @@ def _spread_about(excess: Callable[[float], float]) -> float:
 
 
 def _likelihood_ends(
-    rise: Callable[[float], float], value: float, *, dispersion: float, dof: int
-) -> tuple[float, float, float]:
-    """Return the ends of the 95 % interval and the standard error of a parameter."""
+    rise: Callable[[float], float], value: float, error: float, dispersion: float, *, dof: int
+) -> tuple[float, float]:
+    """Return the ends of the 95 % interval of a parameter."""
     from scipy.optimize import brentq
     from scipy.special import stdtrit
 
     t = float(stdtrit(dof, 0.975))
+    level = t * t * dispersion
 
-    def end(sign: float, level: float) -> float:
-        inner, step = 0.0, 0.02 * max(abs(value), 0.1)
+    def end(sign: float) -> float:
+        inner, step = 0.0, max(1.1 * t * error, 1e-9 * max(abs(value), 1e-3))
+        first = step
         while rise(value + sign * step) < level:
             inner, step = step, 2 * step
-            if step > 1e6:
+            if step > 1e6 * first:
                 return sign * np.inf
-        found = brentq(lambda s: rise(value + sign * s) - level, inner, step, xtol=1e-5 * step)
+        found = brentq(lambda s: rise(value + sign * s) - level, inner, step, xtol=1e-4 * step)
         return value + sign * float(found)
 
-    low, high = (end(sign, t * t * dispersion) for sign in (-1.0, 1.0))
-    one = [end(sign, NORMAL[0.68] ** 2 * dispersion) for sign in (-1.0, 1.0)]
-    return low, high, (one[1] - one[0]) / 2 / NORMAL[0.68]
+    return end(-1.0), end(1.0)
