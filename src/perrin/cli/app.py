@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -49,6 +50,7 @@ from perrin.cli.options import (
     Tracks,
     Viscosity,
     body_of,
+    read_channels,
     read_columns,
     read_dynamics,
     read_model,
@@ -89,7 +91,7 @@ _DEMO_NOTE = (
 )
 
 _DEMO_FILES = re.compile(
-    r"summary\.json|run\.json|run\.toml|report\.html|(?:curves|results|demo-tracks)\.csv"
+    r"summary\.json|run\.json|checksums\.json|run\.toml|report\.html|(?:curves|results|demo-tracks)\.csv"
     r"|(?:tracks|motion)\.parquet"
     r"|figures|figures/cluster-0-\w+\.(?:png|pdf)"
 )
@@ -299,7 +301,9 @@ def run(
     channel: Annotated[
         str | None,
         typer.Option(
-            help="Number of the channel, from 0; several are summed: 0,1.", rich_help_panel=INPUT
+            help="Number of the channel, from 0. Several are summed: 0,1. With 0:1 each channel "
+            "shows spheres of one kind.",
+            rich_help_panel=INPUT,
         ),
     ] = None,
     image: Annotated[
@@ -395,19 +399,24 @@ def run(
 
     with claimed_output(run, output), state_kept_frames(output):
         check_resumable(output, parts="located", overwrite=overwrite)
-        channels = read_whole_numbers("--channel", channel)
-        movie = perrin.open_stack(
-            stack,
-            voxel=None if voxel is None else read_numbers("--voxel", voxel),
-            dt=dt,
-            plane_time=plane_time,
-            planes=planes,
-            channel=channels[0] if len(channels) == 1 else channels or None,
-            image=int(image) if image is not None and image.isdecimal() else image,
-        )
-        with movie, shown_progress(quiet=quiet, unit="frames") as progress:
+        with ExitStack() as files:
+            movies = [
+                files.enter_context(
+                    perrin.open_stack(
+                        stack,
+                        voxel=None if voxel is None else read_numbers("--voxel", voxel),
+                        dt=dt,
+                        plane_time=plane_time,
+                        planes=planes,
+                        channel=one,
+                        image=int(image) if image is not None and image.isdecimal() else image,
+                    )
+                )
+                for one in read_channels(channel)
+            ]
+            progress = files.enter_context(shown_progress(quiet=quiet, unit="frames"))
             report = perrin.analyze_stack(
-                movie,
+                movies,
                 diameter=diameter,
                 contact=contact,
                 size=read_whole_numbers("--size", size) or None,
