@@ -29,6 +29,7 @@ from perrin.cli.messages import (
 from perrin.cli.options import (
     GroupedCommand,
     body_of,
+    read_channels,
     read_columns,
     read_dynamics,
     read_model,
@@ -83,6 +84,7 @@ __all__ = [
     "pooled_table",
     "predict",
     "progress_lines",
+    "read_channels",
     "read_columns",
     "read_dynamics",
     "read_model",

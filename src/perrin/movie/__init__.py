@@ -57,7 +57,7 @@ from perrin.movie.colours import (
 from perrin.movie.parts import PartWriter, open_parts, read_parts
 from perrin.movie.stacks import Settings, analyze_stack, with_own_times
 from perrin.movie.stages import Located, fit_poses, learn_method, locate_frames, run_frames
-from perrin.movie.workers import Work, check_workers, work_through
+from perrin.movie.workers import Work, check_workers, dask_client, work_through
 
 __all__ = [
     "Bodies",
@@ -79,6 +79,7 @@ __all__ = [
     "check_workers",
     "clusters_near_border",
     "combined_verdicts",
+    "dask_client",
     "depth_change",
     "depth_dimming",
     "empty_frames",

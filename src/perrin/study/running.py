@@ -36,6 +36,9 @@ if TYPE_CHECKING:
 # Movies that are given to the scheduler for each worker: one that it measures, and the next one.
 _MOVIES_PER_WORKER = 2
 
+# Workers that the frames of one movie keep busy.
+_MOST_SHARED = 32
+
 # Failures of the machine, after which the next call tries again; other errors lie in the data.
 _OF_THE_MACHINE = (OSError, MemoryError, ImportError)
 
@@ -166,8 +169,8 @@ def measure_all(
     Notes
     -----
     Tables, and movies in full rounds of the workers, are tasks of their own: nothing is exchanged
-    while they are measured. The movies of the last round, fewer than the workers, are measured
-    one after another with their frames divided among all workers. At most two movies for
+    while they are measured. Where the last round would leave half of the workers idle, its movies
+    are measured one after another, with their frames divided among all. At most two movies for
     each worker are with the scheduler at a time, and what returns is an entry: memory depends on
     the workers and not on the movies.
     """
@@ -180,7 +183,8 @@ def measure_all(
     with dask_client(workers, scheduler) as client:
         count = max(len(client.scheduler_info(n_workers=-1)["workers"]), 1)
         stacks = [task for task in tasks if task.movie.source == "movie"]
-        divided = stacks[len(stacks) - len(stacks) % count :] if count > 1 else []
+        left = len(stacks) % count
+        divided = stacks[len(stacks) - left :] if 2 * left <= min(count, _MOST_SHARED) else []
         whole = [task for task in tasks if task not in divided]
         yield from _distributed(whole, client)
         address = client.scheduler.address

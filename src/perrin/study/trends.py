@@ -400,7 +400,8 @@ class _MovieRoot:
         low = x[0] - _FAR * (centre - x[0]) / max(-r[0], 0.2)
         high = x[-1] + _FAR * (x[-1] - centre) / max(r[-1], 0.2)
         roots = np.concatenate([[r[0] - _FAR], r, [r[-1] + _FAR]])
-        return np.interp(_ROOTS, roots, np.concatenate([[low], x, [high]]))
+        places = np.interp(_ROOTS, roots, np.concatenate([[low], x, [high]]))
+        return np.asarray(places, dtype=np.float64)
 
 
 def _roots_at(places: Floats, log_D: Floats) -> Floats:
