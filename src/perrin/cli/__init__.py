@@ -44,6 +44,7 @@ from perrin.cli.options import (
     spheres_of,
 )
 from perrin.cli.progress import progress_lines, shown_progress
+from perrin.cli.study_commands import new_study, report_study, run_study
 from perrin.cli.tables import (
     cluster_table,
     kinds_table,
@@ -79,6 +80,7 @@ __all__ = [
     "kinds_table",
     "main",
     "messages_of",
+    "new_study",
     "optional_readers",
     "options_of",
     "paper",
@@ -96,7 +98,9 @@ __all__ = [
     "read_refine",
     "read_slice",
     "read_whole_numbers",
+    "report_study",
     "run",
+    "run_study",
     "self_test",
     "show_diagnosis",
     "show_json",

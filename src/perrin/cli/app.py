@@ -63,6 +63,7 @@ from perrin.cli.options import (
     spheres_of,
 )
 from perrin.cli.progress import shown_progress
+from perrin.cli.study_commands import study_app
 from perrin.cli.tables import show_diagnosis, show_json, show_plan, show_prediction, show_report
 
 if TYPE_CHECKING:
@@ -78,6 +79,8 @@ app = typer.Typer(
     # Plain help: the formatted one imports a Markdown parser, a third of the time of `--help`.
     rich_markup_mode=None,
 )
+
+app.add_typer(study_app, name="study")
 
 # Default folder of the demo, and the files that it writes there, by which it is recognised.
 _DEMO_FOLDER = "perrin-demo"
