@@ -19,16 +19,21 @@ from perrin.cli.app import (
 from perrin.cli.config import config_text, take_config, write_config
 from perrin.cli.diagnosis import Check, figure_font, installed, optional_readers, self_test
 from perrin.cli.messages import (
+    StoppedError,
     claimed_output,
+    escape,
     in_options,
     messages_of,
     options_of,
     state_kept_frames,
+    status_of,
+    stop_in_order,
     warnings_in_one_line,
 )
 from perrin.cli.options import (
     GroupedCommand,
     body_of,
+    read_channels,
     read_columns,
     read_dynamics,
     read_model,
@@ -57,6 +62,7 @@ from perrin.cli.tables import (
 __all__ = [
     "Check",
     "GroupedCommand",
+    "StoppedError",
     "analyze",
     "body_of",
     "check_demo_folder",
@@ -68,6 +74,7 @@ __all__ = [
     "convert",
     "demo",
     "doctor",
+    "escape",
     "figure_font",
     "in_options",
     "installed",
@@ -81,6 +88,7 @@ __all__ = [
     "pooled_table",
     "predict",
     "progress_lines",
+    "read_channels",
     "read_columns",
     "read_dynamics",
     "read_model",
@@ -103,6 +111,8 @@ __all__ = [
     "simulate",
     "spheres_of",
     "state_kept_frames",
+    "status_of",
+    "stop_in_order",
     "take_config",
     "terms_of",
     "warnings_in_one_line",

@@ -10,6 +10,7 @@ from perrin.tracks.bonds import (
     rigid_groups,
     shared_rows,
 )
+from perrin.tracks.cells import guarded_cell, guarded_table, unguarded_cell
 from perrin.tracks.checksums import (
     CheckedFiles,
     checksum,
@@ -158,6 +159,8 @@ __all__ = [
     "frames_of",
     "gdf_bytes",
     "gdf_table",
+    "guarded_cell",
+    "guarded_table",
     "has_trackpy_columns",
     "hidden_beside",
     "icp_fit",
@@ -226,6 +229,7 @@ __all__ = [
     "track_variances",
     "tracked_rows",
     "trackmate_table",
+    "unguarded_cell",
     "unit_faults",
     "utf8_text",
     "without_flat_z",

@@ -10,6 +10,7 @@ import numpy as np
 
 from perrin._text import listed
 from perrin.errors import table_error
+from perrin.tracks.cells import unguarded_cell
 from perrin.tracks.clock import frames_from_times
 from perrin.tracks.column_names import (
     COLUMNS,
@@ -542,6 +543,11 @@ def _checked_ids(column: pd.Series, name: str, rows: RowNumbers) -> tuple[NDArra
     all_text = pd.api.types.infer_dtype(raw, skipna=True) == "string"
     if text.any() or all_text:
         labels = raw.where(column.notna(), np.nan).to_numpy()
+        if rows.word == "line":
+            plain = np.array([unguarded_cell(label) for label in labels], dtype=object)
+            # Two labels of a file stay two.
+            if len(set(plain[~missing])) == len(set(labels[~missing])):
+                labels = plain
         numeric = ~text & ~missing
         faults = []
         if text.any() and (numeric.any() or not all_text):

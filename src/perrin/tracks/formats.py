@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from perrin.errors import table_error
+from perrin.tracks.cells import guarded_table
 from perrin.tracks.delimited import first_lines, parse_text, utf8_text
 from perrin.tracks.gdf import gdf_bytes, parse_gdf
 from perrin.tracks.imaris import imaris_table, is_imaris
@@ -287,7 +288,7 @@ def table_bytes(table: pd.DataFrame, suffix: str, target: str) -> bytes:
         return xyz_text(table).encode("utf-8")
     if suffix == ".napari.csv":
         return napari_text(table).encode("utf-8")
-    text: str = table.to_csv(index=False, lineterminator="\n")
+    text: str = guarded_table(table).to_csv(index=False, lineterminator="\n")
     if suffix == ".csv":
         return text.encode("utf-8")
     import gzip
