@@ -294,6 +294,7 @@ __all__ = [
 
 # The public names of every subpackage.
 _FACES = {
+    "compiled": (),
     "errors": (
         "DamagedFileError",
         "DegenerateClusterError",
