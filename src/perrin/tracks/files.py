@@ -22,6 +22,7 @@ from perrin.tracks.column_names import (
     unit_faults,
 )
 from perrin.tracks.delimited import parse_text, utf8_text
+from perrin.tracks.file_limits import refusing_foreign_errors
 from perrin.tracks.formats import LARGEST_EXACT, parse_table, table_bytes, table_suffix
 from perrin.tracks.simulations import is_selection, selection_table
 from perrin.tracks.writing import written_whole
@@ -113,14 +114,17 @@ def read_tracks(
     """
     source = os.fspath(path)
     suffix = table_suffix(source)
-    raw = parse_table(Path(path).read_bytes(), suffix, source)
+    data = Path(path).read_bytes()
+    with refusing_foreign_errors(source):
+        raw = parse_table(data, suffix, source)
     if raw.unnamed and not columns:
         raise table_error(source, raw.unnamed)
     columns = columns or {}
     found = _mapped_columns(list(raw.table.columns), columns, source)
-    table, spelling = _named_columns(raw, found, columns)
-    rows = RowNumbers(raw.word, raw.table.index.to_numpy() + raw.first)
-    return _clean_table(table, spelling, source, rows, scale, detections=detections)
+    with refusing_foreign_errors(source):
+        table, spelling = _named_columns(raw, found, columns)
+        rows = RowNumbers(raw.word, raw.table.index.to_numpy() + raw.first)
+        return _clean_table(table, spelling, source, rows, scale, detections=detections)
 
 
 def check_tracks(
@@ -267,7 +271,8 @@ def read_spheres(path: _PathLike) -> tuple[Floats, Floats | None]:
     array([1. , 1.5])
     """
     source = os.fspath(path)
-    table = parse_text(utf8_text(Path(path).read_bytes(), source), source).table
+    with refusing_foreign_errors(source):
+        table = parse_text(utf8_text(Path(path).read_bytes(), source), source).table
     faults = [f"column {name!r} is missing" for name in _AXES if name not in table]
     unknown = [name for name in table if name not in (*_AXES, "radius")]
     if unknown:
