@@ -21,11 +21,15 @@ from perrin.cli.app import (
 from perrin.cli.config import config_text, take_config, write_config
 from perrin.cli.diagnosis import Check, figure_font, installed, optional_readers, self_test
 from perrin.cli.messages import (
+    StoppedError,
     claimed_output,
+    escape,
     in_options,
     messages_of,
     options_of,
     state_kept_frames,
+    status_of,
+    stop_in_order,
     warnings_in_one_line,
 )
 from perrin.cli.options import (
@@ -61,6 +65,7 @@ from perrin.cli.tables import (
 __all__ = [
     "Check",
     "GroupedCommand",
+    "StoppedError",
     "analyze",
     "body_of",
     "check_demo_folder",
@@ -72,6 +77,7 @@ __all__ = [
     "convert",
     "demo",
     "doctor",
+    "escape",
     "example_files",
     "examples",
     "figure_font",
@@ -113,6 +119,8 @@ __all__ = [
     "simulate",
     "spheres_of",
     "state_kept_frames",
+    "status_of",
+    "stop_in_order",
     "take_config",
     "terms_of",
     "warnings_in_one_line",

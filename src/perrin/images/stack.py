@@ -18,8 +18,10 @@ from perrin.errors import FrameError, PrecisionWarning
 from perrin.images.formats.arrays import array_contents
 from perrin.images.formats.contents import Contents, Pick, needed, strange_lengths, summed
 from perrin.images.formats.folders import sequence, sequence_files
+from perrin.images.formats.isolation import SWITCH, guarded
 from perrin.images.formats.tiff import tiff
 from perrin.images.formats.vendors import WAY_OUT, vendor
+from perrin.tracks.file_limits import refuse_oversize
 from perrin.tracks.writing import written_whole
 
 if TYPE_CHECKING:
@@ -373,10 +375,23 @@ def file_contents(source: str, pick: Pick, several: tuple[int, ...] | None = Non
             for part in parts:
                 part.close()
             raise
+    contents = _read_alone(source, pick)
+    try:
+        refuse_oversize(source, contents.shape[1:], contents.dtype.itemsize, what="a frame")
+        refuse_oversize(source, contents.shape[:1], 8, what="a series of frames")
+    except ValueError:
+        contents.close()
+        raise
+    return contents
+
+
+def _read_alone(source: str, pick: Pick) -> Contents:
+    """Return the contents of a file or folder of one channel, by the reader of its format."""
     found = vendor(source)
     if found is not None:
+        apart = found.apart and os.environ.get(SWITCH) != "off"
         try:
-            return found.read(source, pick)
+            return (guarded if apart else found.read)(source, pick)
         except ValueError as fault:
             # A library's own error keeps its class, so that the caller adds what to do.
             if type(fault) is not ValueError:
