@@ -33,7 +33,7 @@ venv_works = $(shell $(1)/bin/python -c 'import sys, pip; sys.exit(sys.version_i
 make_venv = $(if $(call venv_works,$(1)),:,$(call new_venv,$(1),$(find_python)))
 new_venv = $(call check_python,$(2))rm -rf $(1); $(2) -m venv $(1) || { echo '$(call no_venv,$(2))' >&2; exit 1; }
 
-.PHONY: help demo test test-numpy test-lowest benchmarks long lint types doctests docs release lock clean
+.PHONY: help demo faults fuzz fuzz-short test test-numpy test-lowest benchmarks long lint types doctests docs release lock clean
 
 help:  ## list these targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1 - \2/p' Makefile | awk -F ' - ' '{printf "%-18s %s\n", $$1, $$2}'
@@ -46,6 +46,16 @@ test: .venv/.test  ## the whole suite, on all cores
 
 test-numpy: .venv/.test  ## the numeric tests again, without the compiled kernels
 	PERRIN_COMPILED=0 OMP_NUM_THREADS=1 $(RUN) pytest -q -n auto --dist loadfile $(NUMERIC)
+
+faults: .venv/.test  ## stopped and broken runs: kills, signals, full disks, two at a time (3 minutes)
+	OMP_NUM_THREADS=1 $(RUN) pytest -q -m faults
+
+SECONDS ?= 3600
+fuzz: .venv/.test  ## damaged files of all formats, an hour (SECONDS=...); faults become seeds
+	OMP_NUM_THREADS=1 $(BIN)/python tests/fuzz/run.py --seconds $(SECONDS) --jobs 2
+
+fuzz-short: .venv/.test  ## the same for a minute
+	OMP_NUM_THREADS=1 $(RUN) pytest -q -m fuzz tests/fuzz
 
 test-lowest:  ## the suite on the oldest dependencies allowed (Python 3.11)
 	@$(call make_venv,.venv-lowest)

@@ -7,10 +7,8 @@ from pathlib import Path
 
 import perrin
 
-SUBPACKAGES = (
-    "tracks", "images", "run", "movie", "motion", "curves", "diffusion", "hydrodynamics",
-    "geometry", "plot", "report", "errors",
-)  # fmt: skip
+# Those of the command line and of the paper's figures are no interface.
+SUBPACKAGES = tuple(name for name in perrin._FACES if name not in ("cli", "paper", "compiled"))
 # Subpackages without names in `perrin` itself whose functions users call.
 CALLED_BY_PATH = ("plot",)
 
