@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
-PAGES = [DOCS / "conventions.md", DOCS / "tables.md", DOCS / "dense.md"]
+PAGES = [DOCS / "conventions.md", DOCS / "tables.md", DOCS / "dense.md", DOCS / "figures.md"]
 PAGES += sorted((DOCS / "theory").glob("*.md"))
 BOX = re.compile(r"```python\n(.*?)```\n(?:\n?```(?:text)?\n(.*?)```\n)?", re.DOTALL)
 

@@ -80,11 +80,6 @@ app = typer.Typer(
 # Default folder of the demo, and the files that it writes there, by which it is recognised.
 _DEMO_FOLDER = "perrin-demo"
 
-_DEMO_NOTE = (
-    "the planted D_R and D_T are those that Hunter et al. measured; they are below the prediction "
-    "for spheres of 2.45 um, as the sizes that follow from them are above it"
-)
-
 _DEMO_FILES = re.compile(
     r"summary\.json|run\.json|run\.toml|report\.html|(?:curves|results|demo-tracks)\.csv"
     r"|(?:tracks|motion)\.parquet"
@@ -132,7 +127,7 @@ def demo(
     quiet: Quiet = False,
     overwrite: Overwrite = False,
 ) -> None:
-    """Analyse an embedded table: one simulated tetrahedron under the paper's conditions."""
+    """Analyse an embedded table: a simulated tetrahedron that diffuses as predicted."""
     from dataclasses import replace
     from importlib.resources import as_file, files
 
@@ -148,11 +143,7 @@ def demo(
         check_place(place, overwrite=overwrite)
         known = Experiment(dt=0.73, viscosity=2.18e-3, temperature=295.0, diameter=2.45)
         report = perrin.analyze(path, experiment=known)
-        report = replace(
-            report,
-            settings=report.settings | {"made": "demo"},
-            notes=(*report.notes, _DEMO_NOTE),
-        )
+        report = replace(report, settings=report.settings | {"made": "demo"})
         perrin.write_run(report, place, overwrite=overwrite)
         table = perrin.read_tracks(path)
         perrin.write_tracks(table, place / "demo-tracks.csv")
@@ -161,7 +152,8 @@ def demo(
         (place / "run.toml").write_text(text, encoding="utf-8")
         show_run(report, place, demo, as_json=as_json, quiet=quiet)
         if not (as_json or quiet):
-            print("Planted in the simulation: D_R = 0.00493 rad^2/s, D_T = 0.0385 um^2/s.")
+            planted = "D_R = 0.006727 rad^2/s, D_T = 0.04535 um^2/s"
+            print(f"Planted in the simulation, as predicted: {planted}.")
             print(f"The input, as an example of a table: {place / 'demo-tracks.csv'}")
 
 
@@ -646,12 +638,13 @@ def plan(
         else:
             show_plan(found)
         if output is not None:
+            from perrin.plot.figure_style import column_figure, style
             from perrin.plot.results import plot_plan
-            from perrin.plot.style import new_figure
 
-            figure = new_figure(7, 4.6)
-            plot_plan(found, ax=figure.add_subplot())
-            figure.savefig(output, dpi=150)
+            with style():
+                figure = column_figure(0.55)
+                plot_plan(found, ax=figure.add_subplot())
+                figure.savefig(output)
             if not as_json:
                 print(f"Written to {output}")
 

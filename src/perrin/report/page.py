@@ -116,7 +116,7 @@ def render_html(report: Report, figures: Iterable[Path]) -> str:
     ----------
     report : Report
     figures : iterable of Path
-        Files of `perrin.plot.results.save_figures`; the page contains the PNGs among them.
+        Files of `perrin.plot.report_figures.save_figures`; the page contains the PNGs among them.
 
     Returns
     -------

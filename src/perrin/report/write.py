@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from perrin.plot.imaging import save_image_figures
-from perrin.plot.results import save_figures
+from perrin.plot.report_figures import save_figures
 from perrin.report.imaging_page import render_imaging_quality
 from perrin.report.page import render_html
 from perrin.run.folders import filled_folder, staged_folder

@@ -38,7 +38,7 @@ def answer_lines(report: Report) -> list[str]:
     >>> import perrin
     >>> report = perrin.analyze(str(files("perrin") / "data" / "demo_tracks.csv.gz"), dt=0.73)
     >>> answer_lines(report)[0][:61]
-    'The cluster of 4 particles rotates with D_R = 0.0051(4) rad²/'
+    'The cluster of 4 particles rotates with D_R = 0.0069(6) rad²/'
     """
     several = len(report.results) > 1
     source: ClusterResult | RodResult | Pooled | None = report.pooled

@@ -119,7 +119,7 @@ def analyze(
     >>> from importlib.resources import files
     >>> report = perrin.analyze(str(files("perrin") / "data" / "demo_tracks.csv.gz"), dt=0.73)
     >>> print(report.clusters[0].D_R)
-    D_R = 0.0051(4) rad^2/s [mle, 300 frames]
+    D_R = 0.0069(6) rad^2/s [mle, 300 frames]
     """
     experiment = merged_experiment(
         experiment,
