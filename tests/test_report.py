@@ -18,6 +18,7 @@ from perrin.diffusion.estimate import bare_text
 from perrin.plot import report_figures
 from perrin.report import citations, embedding, figure_data, write
 from perrin.report import page as report
+from perrin.run import repetition
 from perrin.run.results import write_data
 from test_plot import estimate, measured
 
@@ -337,10 +338,10 @@ def test_what_is_copied_repeats_the_run(single, tmp_path):
     """The Python lines and the command have the arguments that are not the defaults."""
     settings = single.settings | {"arguments": {"dt": 0.5, "scale": 1.0, "frames": (2, None)}}
     found = replace(single, settings=settings)
-    assert citations.python_lines(found).splitlines()[2] == (
+    assert repetition.python_lines(found).splitlines()[2] == (
         "report = perrin.analyze('/data/<my> & \"tracks\".csv', dt=0.5, frames=(2, None))"
     )
-    assert citations.command_line(found) == (
+    assert repetition.command_line(found) == (
         "perrin analyze '/data/<my> & \"tracks\".csv' --dt 0.5 --frames 2: -o my-run"
     )
     text = citations.methods_paragraph(found)
@@ -356,6 +357,7 @@ def test_the_run_folder_is_complete(single, tmp_path, monkeypatch, repeats):
     names = {f.name for f in place.iterdir()}
     assert names == {
         "summary.json", "results.csv", "tracks.parquet", "motion.parquet", "curves.csv", "run.json",
+        "run.toml",
         "figures", "report.html",
     }  # fmt: skip
     assert len(list((place / "figures").iterdir())) == 6

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from perrin.cli.config import config_text, write_config
 from perrin.cli.messages import messages_of, state_kept_frames
 from perrin.cli.options import (
     BODY,
@@ -128,10 +127,13 @@ def demo(
     overwrite: Overwrite = False,
 ) -> None:
     """Analyse an embedded table: a simulated tetrahedron that diffuses as predicted."""
+    import shutil
+    import tempfile
     from dataclasses import replace
     from importlib.resources import as_file, files
 
     import perrin
+    from perrin.report.write import run_folder
     from perrin.run.experiment import Experiment
     from perrin.run.folders import check_place
 
@@ -141,15 +143,15 @@ def demo(
             check_demo_folder(place)
             overwrite = True
         check_place(place, overwrite=overwrite)
-        known = Experiment(dt=0.73, viscosity=2.18e-3, temperature=295.0, diameter=2.45)
-        report = perrin.analyze(path, experiment=known)
-        report = replace(report, settings=report.settings | {"made": "demo"})
-        perrin.write_run(report, place, overwrite=overwrite)
-        table = perrin.read_tracks(path)
-        perrin.write_tracks(table, place / "demo-tracks.csv")
-        stated = {"tracks": place / "demo-tracks.csv", **known.to_dict()}
-        text = config_text("analyze", stated, {"keep_jumps": "keep-jumps"})
-        (place / "run.toml").write_text(text, encoding="utf-8")
+        with tempfile.TemporaryDirectory(prefix="perrin-") as folder:
+            input_table = Path(folder) / "demo-tracks.csv"
+            perrin.write_tracks(perrin.read_tracks(path), input_table)
+            known = Experiment(dt=0.73, viscosity=2.18e-3, temperature=295.0, diameter=2.45)
+            report = perrin.analyze(input_table, experiment=known)
+            source = report.settings["input"] | {"path": str(place / input_table.name)}
+            report = replace(report, settings=report.settings | {"made": "demo", "input": source})
+            with run_folder(report, place, overwrite=overwrite) as stage:
+                shutil.copy(input_table, stage)
         show_run(report, place, demo, as_json=as_json, quiet=quiet)
         if not (as_json or quiet):
             planted = "D_R = 0.006727 rad^2/s, D_T = 0.04535 um^2/s"
@@ -166,7 +168,6 @@ def demo(
     perrin analyze --config my-run/run.toml                           # once more""",
 )
 def analyze(
-    ctx: typer.Context,
     tracks: Tracks,
     dt: Interval,
     output: Output,
@@ -223,7 +224,6 @@ def analyze(
         )
         progress(0, 0, "writing the report")
         perrin.write_run(report, output, overwrite=overwrite)
-        write_config(output, ctx)
     with messages_of(analyze):
         show_run(report, output, analyze, as_json=as_json, quiet=quiet)
 
@@ -235,7 +235,6 @@ def analyze(
     perrin run movie.lif --image 3 --diameter 1.8 --contact 2.0 --workers 8 -o my-run""",
 )
 def run(
-    ctx: typer.Context,
     stack: Annotated[
         Path, typer.Argument(help="Movie of stacks: TIFF, OME-TIFF, .lif, .nd2, .czi, .ims, .zarr.")
     ],
@@ -323,6 +322,12 @@ def run(
             rich_help_panel=SPHERES,
         ),
     ] = False,
+    border: Annotated[
+        bool,
+        typer.Option(
+            help="Whether spheres that the border cuts are located too.", rich_help_panel=SPHERES
+        ),
+    ] = True,
     minmass: Annotated[
         float | None,
         typer.Option(
@@ -342,8 +347,9 @@ def run(
         str | None,
         typer.Option(
             help="Image of a sphere, learned if left out: diameter,psf_z,psf (um), gain,floor "
-            "of the noise (variance of a voxel: gain times its intensity plus floor), and "
-            "share,tail_z,tail (um) of the second Gaussian of a point spread with a tail.",
+            "of the noise (variance of a voxel: gain times its intensity plus floor), "
+            "share,tail_z,tail (um) of the second Gaussian of a point spread with a tail, and the "
+            "relative spread of the diameters.",
             rich_help_panel=SPHERES,
         ),
     ] = None,
@@ -404,6 +410,7 @@ def run(
                 refine=read_refine(refine),
                 optics=read_optics(optics),
                 dark=dark,
+                border=border,
                 minmass=minmass,
                 percentile=percentile,
                 noise=read_noise(noise),
@@ -421,7 +428,6 @@ def run(
             )
             progress(0, 0, "writing the report")
             complete_run(report, output)
-            write_config(output, ctx)
         show_run(report, output, run, as_json=as_json, quiet=quiet)
 
 

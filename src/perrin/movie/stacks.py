@@ -226,7 +226,8 @@ def analyze_stack(
             "source": {"path": stack.source if stack.path else None, "sha256": depends["sha256"]},
             "arguments": experiment.to_dict()
             | {k: v for k, v in depends.items() if k not in ("sha256", "versions")}
-            | {"size": sizes, "exclude": excluded},
+            | {"size": sizes, "exclude": excluded}
+            | {f"stated_{name}": value for name, value in stack.stated.items()},
         }
         recording = Recording(
             stack.dt,

@@ -1,12 +1,6 @@
 """Run folders with figures, and HTML pages that need no other file."""
 
-from perrin.report.citations import (
-    command_line,
-    folder_links,
-    methods_paragraph,
-    python_lines,
-    software_bibtex,
-)
+from perrin.report.citations import folder_links, methods_paragraph, software_bibtex
 from perrin.report.embedding import packed, page_script, plotly_script, source_hash
 from perrin.report.figure_data import body_picture, cluster_data, grouped_tracks
 from perrin.report.html import byline, captioned, inline_pictures, render_page, render_part
@@ -18,7 +12,7 @@ from perrin.report.imaging_page import (
     rigid_body_facts,
 )
 from perrin.report.page import noise_facts, render_html
-from perrin.report.write import complete_run, write_run
+from perrin.report.write import complete_run, run_folder, write_run
 
 __all__ = [
     "body_picture",
@@ -26,7 +20,6 @@ __all__ = [
     "byline",
     "captioned",
     "cluster_data",
-    "command_line",
     "complete_run",
     "fit_facts",
     "folder_links",
@@ -38,12 +31,12 @@ __all__ = [
     "packed",
     "page_script",
     "plotly_script",
-    "python_lines",
     "render_html",
     "render_imaging_quality",
     "render_page",
     "render_part",
     "rigid_body_facts",
+    "run_folder",
     "software_bibtex",
     "source_hash",
     "write_run",

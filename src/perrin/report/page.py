@@ -23,16 +23,15 @@ from perrin.geometry.shapes import pair_distances
 from perrin.plot.motion import MOTION_CAPTION
 from perrin.report.citations import (
     PAPER_BIBTEX,
-    command_line,
     folder_links,
     methods_paragraph,
-    python_lines,
     software_bibtex,
 )
 from perrin.report.embedding import packed, page_script, plotly_script, source_hash
 from perrin.report.figure_data import body_picture, cluster_data, grouped_tracks
 from perrin.report.html import byline, captioned, inline_pictures, render_page, render_part
 from perrin.run.remarks import condensed, grouped
+from perrin.run.repetition import command_line, python_lines
 from perrin.run.results import RodResult, floor_factor
 from perrin.run.statements import answer_lines, motion_sentences, verdict_lines
 

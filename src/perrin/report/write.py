@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from perrin.plot.imaging import save_image_figures
@@ -13,9 +14,36 @@ from perrin.run.results import write_data
 
 if TYPE_CHECKING:
     import os
+    from collections.abc import Iterator
     from pathlib import Path
 
     from perrin.run.results import Report
+
+
+@contextmanager
+def run_folder(
+    report: Report, folder: str | os.PathLike[str], *, overwrite: bool = False
+) -> Iterator[Path]:
+    """Write a run folder as `write_run` does, and give it to add further files before it appears.
+
+    Parameters
+    ----------
+    report, folder, overwrite
+        As in `write_run`.
+
+    Yields
+    ------
+    Path
+        The folder that is renamed to `folder` at the end.
+
+    Raises
+    ------
+    FileExistsError
+        As `write_run`.
+    """
+    with staged_folder(folder, overwrite=overwrite) as stage:
+        _write_files(report, stage)
+        yield stage
 
 
 def write_run(report: Report, folder: str | os.PathLike[str], *, overwrite: bool = False) -> None:
@@ -35,8 +63,8 @@ def write_run(report: Report, folder: str | os.PathLike[str], *, overwrite: bool
     FileExistsError
         If the folder exists and `overwrite` is not set, or is not a run folder.
     """
-    with staged_folder(folder, overwrite=overwrite) as stage:
-        _write_files(report, stage)
+    with run_folder(report, folder, overwrite=overwrite):
+        pass
 
 
 def complete_run(report: Report, folder: str | os.PathLike[str]) -> None:

@@ -95,6 +95,13 @@ from perrin.run.remarks import (
     with_jumps,
     wrapped_box_text,
 )
+from perrin.run.repetition import (
+    Repetition,
+    command_line,
+    config_text,
+    python_lines,
+    stated_arguments,
+)
 from perrin.run.result_table import coefficients_html, estimate_row, prediction_columns, tidy_table
 from perrin.run.results import (
     BodyKind,
@@ -129,6 +136,7 @@ __all__ = [
     "Recording",
     "Remark",
     "Remarks",
+    "Repetition",
     "Report",
     "RodResult",
     "Shape",
@@ -145,6 +153,7 @@ __all__ = [
     "check_place",
     "check_resumable",
     "coefficients_html",
+    "command_line",
     "common_jump_warnings",
     "common_motion_remarks",
     "compare_axes",
@@ -153,6 +162,7 @@ __all__ = [
     "compare_value",
     "complete_recording",
     "condensed",
+    "config_text",
     "corrected_labels_text",
     "curve_table",
     "cut_text",
@@ -219,6 +229,7 @@ __all__ = [
     "pool_coefficients",
     "predicted_noise",
     "prediction_columns",
+    "python_lines",
     "read_table",
     "removed_drift_notes",
     "run_settings",
@@ -229,6 +240,7 @@ __all__ = [
     "sparse_frames_warnings",
     "stage_jump_warnings",
     "staged_folder",
+    "stated_arguments",
     "steady_motion_warning",
     "table_layers",
     "tidy_table",
