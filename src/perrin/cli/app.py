@@ -719,6 +719,7 @@ def convert(
 ) -> None:
     """Convert a track table from any format that is read to one that is written."""
     import perrin
+    from perrin._text import counted
     from perrin.tracks.formats import SUFFIXES
 
     with messages_of(convert):
@@ -742,7 +743,7 @@ def convert(
         perrin.write_tracks(table, target)
         for note in notes:
             print(f"note: {note}")
-        print(f"{len(table)} rows written to {target}")
+        print(f"{counted(len(table), 'row')} written to {target}")
 
 
 @app.command(cls=GroupedCommand, epilog="perrin doctor")

@@ -52,7 +52,7 @@ from perrin.tracks.formats import (
     table_suffix,
     text_table,
 )
-from perrin.tracks.gdf import gdf_bytes, parse_gdf
+from perrin.tracks.gdf import gdf_bytes, parse_ascii_gdf, parse_gdf
 from perrin.tracks.groups import TOUCHING_REACH, connected_groups, frames_of, touching_groups
 from perrin.tracks.identity import (
     BodyModel,
@@ -176,6 +176,7 @@ __all__ = [
     "noise_along",
     "ours_of",
     "own_times",
+    "parse_ascii_gdf",
     "parse_c3d",
     "parse_gdf",
     "parse_gsd",
