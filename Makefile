@@ -5,6 +5,8 @@ SHELL := /bin/sh
 .DEFAULT_GOAL := help
 PYTHON ?=
 BIN := .venv/bin
+# Tests of numbers that compiled kernels make.
+NUMERIC := $(addprefix tests/test_,rotations.py laws.py motion.py scanning.py rigidity.py identity.py)
 RUN := $(BIN)/python -m
 PIP := $(RUN) pip --disable-pip-version-check
 
@@ -31,7 +33,7 @@ venv_works = $(shell $(1)/bin/python -c 'import sys, pip; sys.exit(sys.version_i
 make_venv = $(if $(call venv_works,$(1)),:,$(call new_venv,$(1),$(find_python)))
 new_venv = $(call check_python,$(2))rm -rf $(1); $(2) -m venv $(1) || { echo '$(call no_venv,$(2))' >&2; exit 1; }
 
-.PHONY: help demo test test-lowest benchmarks long lint types doctests docs lock clean
+.PHONY: help demo test test-numpy test-lowest benchmarks long lint types doctests docs lock clean
 
 help:  ## list these targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1 - \2/p' Makefile | awk -F ' - ' '{printf "%-18s %s\n", $$1, $$2}'
@@ -41,6 +43,9 @@ demo: .venv/.demo  ## the main job on an embedded table, into perrin-demo/
 
 test: .venv/.test  ## the whole suite, on all cores
 	PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(RUN) pytest -q -n auto --dist loadfile
+
+test-numpy: .venv/.test  ## the numeric tests again, without the compiled kernels
+	PERRIN_COMPILED=0 OMP_NUM_THREADS=1 $(RUN) pytest -q -n auto --dist loadfile $(NUMERIC)
 
 test-lowest:  ## the suite on the oldest dependencies allowed (Python 3.11)
 	@$(call make_venv,.venv-lowest)
@@ -55,6 +60,7 @@ benchmarks: .venv/.test  ## the quick benchmarks: coverage of intervals, warning
 	$(BIN)/python benchmarks/motion.py --quick --jobs 2
 	$(BIN)/python benchmarks/paper.py
 	$(BIN)/python benchmarks/structure.py
+	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/peers.py --quick
 
 long: .venv/.test  ## the Monte-Carlo tests with all repeats, and 40 tables of every warning (hours)
 	OMP_NUM_THREADS=1 $(RUN) pytest -q --long -n auto --dist loadfile
@@ -90,12 +96,13 @@ clean:  ## remove what was installed and built, demo output included
 	find src tests -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # The locks are complete, so pip resolves nothing; `pip check` would show a gap.
-.venv/.demo: requirements/demo.lock pyproject.toml
+.venv/.demo: requirements/demo.lock pyproject.toml hatch_build.py src/perrin/compiled/kernels.c
 	@$(call make_venv,.venv)
 	@echo 'Installing locked versions into .venv (once; a minute or two)'
 	@$(PIP) install --quiet --no-deps -r requirements/demo.lock
 	@$(PIP) install --quiet --no-deps --no-build-isolation -e .
 	@$(PIP) --quiet check
+	@$(BIN)/python -c 'from perrin.compiled import kernels_in_use; print("Compiled kernels:", kernels_in_use())'
 	@printf '%s' "$(CURDIR)" > .venv/.tree
 	@touch $@
 

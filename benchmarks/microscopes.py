@@ -297,6 +297,7 @@ class Case:
     dust: int = 0
     radius_spread: float = 0.0  # relative, from sphere to sphere; contacts stay those of equal ones
     n_frames: int = 20
+    shift: tuple = ()  # x, y, z, um: every other sphere is in a second channel, with this offset
     options: dict = field(default_factory=dict)
 
 
@@ -328,6 +329,7 @@ CASES = {
     "radii spread by 5 %": Case(radius_spread=0.05),
     "radii spread by 8 %": Case(radius_spread=0.08),
     "shells": Case(light=replace(BASE, shell=True)),
+    "two colours": Case((4, 4, 4, 3, 3), shift=(0.12, -0.09, 0.2)),
     "5 photons": Case(light=replace(BASE, photons=5)),
     "realistic": Case(
         light=replace(
@@ -349,15 +351,18 @@ def drawn(case, seed):
     per = light.shape[0] if light.plane_time else 1
     for b in (*bodies, *specks):
         b.path[10 * per :, :, 0] += case.jump
-    movie = recorded(
-        bodies,
-        light,
-        n_frames=case.n_frames,
-        rng=rng,
-        dust=specks,
-        radius_spread=case.radius_spread,
-    )
-    return movie, bodies
+    settings = {"n_frames": case.n_frames, "rng": rng, "dust": specks}
+    settings["radius_spread"] = case.radius_spread
+    if not case.shift:
+        return recorded(bodies, light, **settings), bodies
+    channels = [
+        [
+            replace(b, path=b.path + k * np.array(case.shift), bright=b.bright * (odd == k))
+            for b, odd in ((b, np.arange(len(b.bright)) % 2) for b in bodies)
+        ]
+        for k in (0, 1)
+    ]
+    return [recorded(channel, light, **settings) for channel in channels], bodies
 
 
 def specks_of(case, rng):
@@ -410,7 +415,9 @@ def analysed(movie, case):
     import perrin
 
     light = case.light
-    stack = perrin.open_stack(movie, voxel=light.voxel, dt=DT, plane_time=light.plane_time or None)
+    movies = movie if isinstance(movie, list) else [movie]
+    scale = {"voxel": light.voxel, "dt": DT, "plane_time": light.plane_time or None}
+    stack = [perrin.open_stack(one, **scale) for one in movies]
     options = {"contact": DIAMETER} | case.options
     return perrin.analyze_stack(stack, diameter=DIAMETER, **options)
 

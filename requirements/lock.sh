@@ -10,7 +10,7 @@ compile() { "$UV" pip compile --quiet --no-annotate --no-header --no-emit-index-
 everywhere() { compile --universal --fork-strategy fewest --python-version 3.11 "$@"; }
 note() { printf '# %s\n# Made from pyproject.toml by `make lock`; do not edit.\n' "$1"; }
 
-printf 'hatchling\neditables\n' | everywhere pyproject.toml - > "$new/demo"
+printf 'hatchling\neditables\nsetuptools\n' | everywhere pyproject.toml - > "$new/demo"
 { note "What perrin runs with, and its build backend."; cat "$new/demo"; } > "$new/demo.lock"
 cp "$new/demo" "$new/all"
 for extra in test docs; do

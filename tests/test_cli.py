@@ -135,7 +135,7 @@ def test_demo_writes_a_whole_run_folder(demo):
     names = {p.name for p in demo[0].iterdir()}
     assert names == {
         "summary.json", "tracks.parquet", "motion.parquet", "curves.csv", "figures",
-        "report.html", "run.json", "run.toml", "demo-tracks.csv", "results.csv",
+        "report.html", "run.json", "run.toml", "demo-tracks.csv", "results.csv", "checksums.json",
     }  # fmt: skip
     assert list((demo[0] / "figures").glob("*.png"))
     assert [p.name for p in demo[0].parent.iterdir()] == ["perrin-demo"]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import json
 import shlex
+from contextlib import nullcontext
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -84,9 +85,9 @@ def test_saving_and_writing_give_the_same_data(report, tmp_path, monkeypatch):
     names = {path.name for path in (tmp_path / "a").iterdir()}
     assert names == {
         "summary.json", "results.csv", "curves.csv", "run.json", "run.toml", "tracks.parquet",
-        "motion.parquet",
+        "motion.parquet", "checksums.json",
     }  # fmt: skip
-    for name in names:
+    for name in names - {"checksums.json"}:
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
     assert {path.name for path in (tmp_path / "b").iterdir()} - names == {"report.html", "figures"}
     assert perrin.load_run(tmp_path / "a") == report
@@ -116,12 +117,8 @@ def test_a_movie_is_opened_and_measured_with_the_same_arguments(movie, tmp_path,
     """run.toml, the command and the Python lines call both functions with what was stated."""
     calls: list[dict] = []
 
-    class Opened:
-        def __enter__(self):
-            return self
-
-        def __exit__(self, *_):
-            pass
+    class Opened(nullcontext):
+        pass
 
     def open_stack(path, **given):
         calls.append({"path": str(path)} | given)
@@ -133,12 +130,12 @@ def test_a_movie_is_opened_and_measured_with_the_same_arguments(movie, tmp_path,
 
     monkeypatch.setattr(perrin, "open_stack", open_stack, raising=False)
     monkeypatch.setattr(perrin, "analyze_stack", analyze_stack, raising=False)
-    (tmp_path / "run.toml").write_text(repetition.config_text(movie))
-    words = shlex.split(repetition.command_line(movie))
+    (tmp_path / "run.toml").write_text(repetition.config_text(movie.settings))
+    words = shlex.split(repetition.command_line(movie.settings))
     for arguments in (["run", "--config", "run.toml", "-o", "x"], words[1:]):
         assert "seen" in run(*arguments, cwd=tmp_path).stderr
     with pytest.raises(ValueError, match="seen"):
-        exec(repetition.python_lines(movie), {})
+        exec(repetition.python_lines(movie.settings), {})
     opening = {"voxel": [0.3, 0.1, 0.1], "dt": 0.73, "planes": 20, "channel": [0, 2]}
     opening |= {"image": "second, series", "path": movie.settings["input"]["path"]}
     for given in calls[::2]:
@@ -156,11 +153,19 @@ def test_a_movie_is_opened_and_measured_with_the_same_arguments(movie, tmp_path,
 def test_a_movie_in_memory_is_repeated_from_its_tracks(movie):
     """run.toml says that it measures the positions; it has no options of images."""
     settings = movie.settings | {"input": {"path": None}}
-    lines = repetition.config_text(replace(movie, settings=settings)).splitlines()
+    lines = repetition.config_text(settings).splitlines()
     assert lines[0].startswith("# The movie was in memory")
     assert lines[1:3] == ['command = "analyze"', 'tracks = "tracks.parquet"']
     keys = {line.split(" = ")[0] for line in lines[3:]}
     assert keys == {"dt", "viscosity", "temperature", "noise", "exposure", "drift", "model"}
+
+
+def test_channels_of_several_kinds_are_opened_one_by_one(movie):
+    """Each kind of sphere has its channel, or a sum of channels."""
+    arguments = MOVIE | {"other_channels": [{"path": "my movie.tif", "channel": 1}]}
+    found = replace(movie, settings=movie.settings | {"arguments": arguments})
+    assert 'channel = "0,2:1"' in repetition.config_text(found.settings)
+    assert "channel=kind) for kind in ([0, 2], 1)]" in repetition.python_lines(found.settings)
 
 
 @pytest.mark.parametrize("text", ["2.4,.5,.2,3,1,.05", "2.4,.5,.2,3,1,.1,1,.6,.05"])

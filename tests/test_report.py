@@ -338,10 +338,10 @@ def test_what_is_copied_repeats_the_run(single, tmp_path):
     """The Python lines and the command have the arguments that are not the defaults."""
     settings = single.settings | {"arguments": {"dt": 0.5, "scale": 1.0, "frames": (2, None)}}
     found = replace(single, settings=settings)
-    assert repetition.python_lines(found).splitlines()[2] == (
+    assert repetition.python_lines(found.settings).splitlines()[2] == (
         "report = perrin.analyze('/data/<my> & \"tracks\".csv', dt=0.5, frames=(2, None))"
     )
-    assert repetition.command_line(found) == (
+    assert repetition.command_line(found.settings) == (
         "perrin analyze '/data/<my> & \"tracks\".csv' --dt 0.5 --frames 2: -o my-run"
     )
     text = citations.methods_paragraph(found)
@@ -358,6 +358,7 @@ def test_the_run_folder_is_complete(single, tmp_path, monkeypatch, repeats):
     assert names == {
         "summary.json", "results.csv", "tracks.parquet", "motion.parquet", "curves.csv", "run.json",
         "run.toml",
+        "checksums.json",
         "figures", "report.html",
     }  # fmt: skip
     assert len(list((place / "figures").iterdir())) == 6
@@ -450,5 +451,6 @@ def test_notes_are_kept_and_older_runs_have_none(single, tmp_path):
     for entry in (summary, *summary["clusters"]):
         del entry["notes"]
     (tmp_path / "run" / "summary.json").write_text(json.dumps(summary))
+    (tmp_path / "run" / "checksums.json").unlink()  # which older runs do not have either
     again = perrin.load_run(tmp_path / "run")
     assert (again.notes, again.clusters[0].notes) == ((), ())

@@ -63,11 +63,14 @@ if TYPE_CHECKING:
         viscoelastic_moduli,
     )
     from perrin.errors import (
+        DamagedFileError,
         DegenerateClusterError,
+        FolderInUseError,
         FrameError,
         IdentityError,
         IdentityWarning,
         NoSpheresError,
+        PartsError,
         PrecisionWarning,
         TooFewFramesError,
         TrackTableError,
@@ -168,11 +171,13 @@ __all__ = [
     "Confined",
     "ConfinedEstimate",
     "CoupledTensor",
+    "DamagedFileError",
     "DecouplingRatio",
     "DegenerateClusterError",
     "DiffusionEstimate",
     "DiffusionTensor",
     "Experiment",
+    "FolderInUseError",
     "Fractional",
     "FrameError",
     "Hopping",
@@ -190,6 +195,7 @@ __all__ = [
     "Noise",
     "NoiseFloor",
     "Optics",
+    "PartsError",
     "PrecisionWarning",
     "Prediction",
     "Quality",
@@ -288,12 +294,16 @@ __all__ = [
 
 # The public names of every subpackage.
 _FACES = {
+    "compiled": (),
     "errors": (
+        "DamagedFileError",
         "DegenerateClusterError",
+        "FolderInUseError",
         "FrameError",
         "IdentityError",
         "IdentityWarning",
         "NoSpheresError",
+        "PartsError",
         "PrecisionWarning",
         "TooFewFramesError",
         "TrackTableError",

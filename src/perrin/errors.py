@@ -97,3 +97,21 @@ class IdentityWarning(UserWarning):
 
 class PartsError(ValueError):
     """The folder holds the unfinished parts of another run."""
+
+
+class FolderInUseError(OSError):
+    """Another process is writing into the folder."""
+
+
+class DamagedFileError(ValueError):
+    """A file of a run folder is not what was written there.
+
+    Attributes
+    ----------
+    file : str
+        Path of the file.
+    """
+
+    def __init__(self, message: str, file: str = "") -> None:
+        super().__init__(message)
+        self.file = file

@@ -19,6 +19,7 @@ from perrin.cli.app import (
 from perrin.cli.config import take_config
 from perrin.cli.diagnosis import Check, figure_font, installed, optional_readers, self_test
 from perrin.cli.messages import (
+    claimed_output,
     in_options,
     messages_of,
     options_of,
@@ -28,6 +29,7 @@ from perrin.cli.messages import (
 from perrin.cli.options import (
     GroupedCommand,
     body_of,
+    read_channels,
     read_columns,
     read_dynamics,
     read_model,
@@ -60,6 +62,7 @@ __all__ = [
     "body_of",
     "check_demo_folder",
     "check_new_file",
+    "claimed_output",
     "cluster_table",
     "common_options",
     "convert",
@@ -78,6 +81,7 @@ __all__ = [
     "pooled_table",
     "predict",
     "progress_lines",
+    "read_channels",
     "read_columns",
     "read_dynamics",
     "read_model",

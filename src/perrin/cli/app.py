@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import os
 import re
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from perrin.cli.messages import messages_of, state_kept_frames
+from perrin.cli.messages import claimed_output, messages_of, state_kept_frames
 from perrin.cli.options import (
     BODY,
     INPUT,
@@ -48,6 +49,7 @@ from perrin.cli.options import (
     Tracks,
     Viscosity,
     body_of,
+    read_channels,
     read_columns,
     read_dynamics,
     read_model,
@@ -80,7 +82,7 @@ app = typer.Typer(
 _DEMO_FOLDER = "perrin-demo"
 
 _DEMO_FILES = re.compile(
-    r"summary\.json|run\.json|run\.toml|report\.html|(?:curves|results|demo-tracks)\.csv"
+    r"summary\.json|run\.json|checksums\.json|run\.toml|report\.html|(?:curves|results|demo-tracks)\.csv"
     r"|(?:tracks|motion)\.parquet"
     r"|figures|figures/cluster-0-\w+\.(?:png|pdf)"
 )
@@ -137,8 +139,9 @@ def demo(
     from perrin.run.experiment import Experiment
     from perrin.run.folders import check_place
 
-    with messages_of(demo), as_file(files("perrin") / "data" / "demo_tracks.csv.gz") as path:
-        place = output or Path(_DEMO_FOLDER)
+    source = files("perrin") / "data" / "demo_tracks.csv.gz"
+    place = output or Path(_DEMO_FOLDER)
+    with claimed_output(demo, place), as_file(source) as path:
         if output is None and place.exists() and not overwrite:
             check_demo_folder(place)
             overwrite = True
@@ -197,7 +200,7 @@ def analyze(
     overwrite: Overwrite = False,
 ) -> None:
     """Measure D_R and D_T of every cluster in a track table."""
-    with messages_of(analyze), shown_progress(quiet=quiet) as progress:
+    with claimed_output(analyze, output), shown_progress(quiet=quiet) as progress:
         import perrin
         from perrin.run.folders import check_place
 
@@ -286,7 +289,9 @@ def run(
     channel: Annotated[
         str | None,
         typer.Option(
-            help="Number of the channel, from 0; several are summed: 0,1.", rich_help_panel=INPUT
+            help="Number of the channel, from 0. Several are summed: 0,1. With 0:1 each channel "
+            "shows spheres of one kind.",
+            rich_help_panel=INPUT,
         ),
     ] = None,
     image: Annotated[
@@ -387,21 +392,26 @@ def run(
     from perrin.report.write import complete_run
     from perrin.run.folders import check_resumable
 
-    with messages_of(run), state_kept_frames(output):
+    with claimed_output(run, output), state_kept_frames(output):
         check_resumable(output, parts="located", overwrite=overwrite)
-        channels = read_whole_numbers("--channel", channel)
-        movie = perrin.open_stack(
-            stack,
-            voxel=None if voxel is None else read_numbers("--voxel", voxel),
-            dt=dt,
-            plane_time=plane_time,
-            planes=planes,
-            channel=channels[0] if len(channels) == 1 else channels or None,
-            image=int(image) if image is not None and image.isdecimal() else image,
-        )
-        with movie, shown_progress(quiet=quiet, unit="frames") as progress:
+        with ExitStack() as files:
+            movies = [
+                files.enter_context(
+                    perrin.open_stack(
+                        stack,
+                        voxel=None if voxel is None else read_numbers("--voxel", voxel),
+                        dt=dt,
+                        plane_time=plane_time,
+                        planes=planes,
+                        channel=one,
+                        image=int(image) if image is not None and image.isdecimal() else image,
+                    )
+                )
+                for one in read_channels(channel)
+            ]
+            progress = files.enter_context(shown_progress(quiet=quiet, unit="frames"))
             report = perrin.analyze_stack(
-                movie,
+                movies,
                 diameter=diameter,
                 contact=contact,
                 size=read_whole_numbers("--size", size) or None,
@@ -674,7 +684,7 @@ def paper(
     from perrin.run.folders import check_place
 
     console = Console(highlight=False)
-    with messages_of(paper):
+    with claimed_output(paper, output):
         check_place(output, overwrite=overwrite)
         with shown_progress() as progress:
             claims = reproduce(

@@ -52,7 +52,7 @@ class Check(NamedTuple):
 
 
 def installed() -> list[Check]:
-    """Return the versions of Python, of perrin and of the packages that it needs.
+    """Return the versions of Python, perrin and the packages it needs, and what is compiled.
 
     Examples
     --------
@@ -60,6 +60,7 @@ def installed() -> list[Check]:
     ['python', 'perrin']
     """
     import perrin
+    from perrin.compiled import compiled_kernels, kernels_in_use
 
     system = f"{platform.python_version()}, {platform.system()} {platform.machine()}"
     cores = f"{os.cpu_count()} processors"
@@ -67,7 +68,8 @@ def installed() -> list[Check]:
     for name in _REQUIRED:
         version = _version(name)
         found.append(Check(name, version or "is missing", version is not None))
-    return found
+    good = None if compiled_kernels() is None else True
+    return [*found, Check("compiled kernels", kernels_in_use(), good)]
 
 
 def optional_readers() -> list[Check]:

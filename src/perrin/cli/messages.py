@@ -175,6 +175,33 @@ def messages_of(command: Callable[..., object]) -> Iterator[None]:
 
 
 @contextmanager
+def claimed_output(command: Callable[..., object], folder: Path) -> Iterator[Path]:
+    """Hold the folder of a command's output, with messages as in `messages_of`.
+
+    Parameters
+    ----------
+    command : callable
+        The command that runs inside.
+    folder : Path
+
+    Yields
+    ------
+    Path
+        The folder.
+
+    Raises
+    ------
+    typer.Exit
+        As in `messages_of`; with status 2 if another process is writing there.
+    """
+    with messages_of(command):
+        from perrin.run.folders import claimed_folder
+
+        with claimed_folder(folder) as place:
+            yield place
+
+
+@contextmanager
 def warnings_in_one_line(options: Mapping[str, str]) -> Iterator[None]:
     """Print the library's warnings when they are raised, each text once.
 

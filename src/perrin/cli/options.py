@@ -372,6 +372,23 @@ def read_whole_numbers(option: str, text: str | None) -> list[int]:
         raise ValueError(f"{option}: expected numbers like 3,7, got {text!r}") from None
 
 
+def read_channels(text: str | None) -> list[int | list[int] | None]:
+    """Read the channels of each kind of sphere: 0, or 0,1 for a sum, or 0:1 for two kinds.
+
+    Examples
+    --------
+    >>> read_channels(None), read_channels("2"), read_channels("0,1"), read_channels("0,1:2")
+    ([None], [2], [[0, 1]], [[0, 1], 2])
+    """
+    kinds = [read_whole_numbers("--channel", part) for part in (text or "").split(":")]
+    if len(kinds) > 1 and not all(kinds):
+        raise ValueError(f"--channel: expected a number on each side of a colon, got {text!r}")
+    used = [number for kind in kinds for number in kind]
+    if len(kinds) > 1 and len(set(used)) < len(used):
+        raise ValueError(f"--channel: expected different channels for each kind, got {text!r}")
+    return [kind[0] if len(kind) == 1 else kind or None for kind in kinds]
+
+
 def read_refine(text: str) -> Literal["model", "trackpy"] | None:
     """Read model, trackpy or none."""
     if text not in ("model", "trackpy", "none"):

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from perrin._arrays import Bools, Floats, from_plain, present, to_plain
+from perrin.compiled.loading import compiled_kernels
 from perrin.errors import DegenerateClusterError
 from perrin.geometry.wahba import planar_rotation, spatial_rotation
 
@@ -147,8 +148,8 @@ def similarity(points: ArrayLike, reference: ArrayLike) -> Similarity:
     (2.0, [1.0, 0.0, -1.0])
     """
     R = kabsch(points, reference)
-    y, x, w = _paired(points, reference, None)
-    weight = np.ones(y.shape[-2]) if w is None else w
+    y, x, w = _without_absent(*_checked(points, reference, None))
+    weight = np.ones(y.shape[-2]) if w is None else w[..., 0]
     total = weight.sum(-1)[..., None]
     y0 = (weight[..., None] * y).sum(-2) / total
     x0 = (weight[..., None] * x).sum(-2) / total
@@ -182,19 +183,26 @@ def fit_rotations(
     >>> fit_rotations(np.stack([square, line]), square)[1]
     array([ True, False])
     """
-    y, x, w = _paired(points, reference, weights)
+    y, x, w = _checked(points, reference, weights)
     batch = np.broadcast_shapes(y.shape[:-2], x.shape[:-2], () if w is None else w.shape[:-1])
     d, size = y.shape[-1], int(np.prod(batch))
-    rotation = np.empty((size, d, d))
-    unique = np.empty(size, dtype=np.bool_)
-    y_rows, x_rows = _rows(y, batch), _rows(x, batch)
-    w_rows = None if w is None else _rows(w[..., None], batch)
+    y, x = _rows(y, batch), _rows(x, batch)
+    w = None if w is None else _rows(w[..., None], batch)
+    rotation, unique = np.empty((size, d, d)), np.zeros(size, dtype=np.bool_)
+    kernels = compiled_kernels() if d == 3 else None
+    if kernels is not None:
+        kernels.wahba(y, x, rotation, unique, w)
+    rest = np.flatnonzero(~unique)
     solve = planar_rotation if d == 2 else spatial_rotation
-    for low in range(0, size, _CACHED_ROWS):
-        rows = slice(low, low + _CACHED_ROWS)
-        chunk_w = None if w_rows is None else _transposed(w_rows, rows)
-        sets = _transposed(y_rows, rows), _transposed(x_rows, rows), chunk_w
-        rotation[rows], unique[rows] = solve(*sets)
+    for low in range(0, rest.size, _CACHED_ROWS):
+        rows = rest[low : low + _CACHED_ROWS]
+        some_y, some_x, some_w = _without_absent(
+            y if len(y) == 1 else y[rows],
+            x if len(x) == 1 else x[rows],
+            w if w is None or len(w) == 1 else w[rows],
+        )
+        last_w = None if some_w is None else _batch_last(some_w)
+        rotation[rows], unique[rows] = solve(_batch_last(some_y), _batch_last(some_x), last_w)
     rotation[~unique] = np.nan
     return rotation.reshape(*batch, d, d), unique.reshape(batch)
 
@@ -415,10 +423,10 @@ def successive_product(steps: Floats) -> Floats:
     return np.swapaxes(cumulative_product(np.swapaxes(steps, -1, -2)), -1, -2)
 
 
-def _paired(
+def _checked(
     points: ArrayLike, reference: ArrayLike, weights: ArrayLike | None
 ) -> tuple[Floats, Floats, Floats | None]:
-    """Check the three inputs; absent particles get weight 0 and coordinate 0."""
+    """Check shapes and weights, and return arrays."""
     y, x = np.asarray(points, dtype=np.float64), np.asarray(reference, dtype=np.float64)
     if y.ndim < 2 or y.shape[-2:] != x.shape[-2:] or y.shape[-1] not in (2, 3) or not y.shape[-2]:
         raise ValueError(
@@ -431,23 +439,28 @@ def _paired(
             f"weights: expected finite numbers >= 0 of shape (..., {y.shape[-2]}), got shape "
             f"{w.shape}" + ("" if w.size == 0 else f" with minimum {np.min(w)}")
         )
+    return y, x, w
+
+
+def _without_absent(y: Floats, x: Floats, w: Floats | None) -> tuple[Floats, Floats, Floats | None]:
+    """Give absent particles the coordinate 0 and the weight 0; weights are (..., n, 1)."""
     if np.isfinite(y).all() and np.isfinite(x).all():
         return y, x, w
     if np.isinf(y).any() or np.isinf(x).any():
         raise ValueError("points and reference: infinite coordinate; use NaN for a missing point")
-    here_y, here_x = present(y), present(x)
+    here_y, here_x = present(y)[..., None], present(x)[..., None]
     w = np.where(here_y & here_x, 1.0 if w is None else w, 0.0)
-    return np.where(here_y[..., None], y, 0.0), np.where(here_x[..., None], x, 0.0), w
+    return np.where(here_y, y, 0.0), np.where(here_x, x, 0.0), w
 
 
 def _rows(a: Floats, batch: tuple[int, ...]) -> Floats:
     """Flatten the leading axes to one, or keep a single set as it is (it broadcasts)."""
     if int(np.prod(a.shape[:-2])) == 1:
-        return a.reshape(1, *a.shape[-2:])
-    return np.broadcast_to(a, (*batch, *a.shape[-2:])).reshape(-1, *a.shape[-2:])
+        return np.ascontiguousarray(a.reshape(1, *a.shape[-2:]))
+    rows = np.broadcast_to(a, (*batch, *a.shape[-2:])).reshape(-1, *a.shape[-2:])
+    return np.ascontiguousarray(rows)
 
 
-def _transposed(a: Floats, rows: slice) -> Floats:
+def _batch_last(a: Floats) -> Floats:
     """Return (n, d, B) with the batch last: every component one contiguous vector."""
-    part = a if a.shape[0] == 1 else a[rows]
-    return np.ascontiguousarray(part.transpose(1, 2, 0))
+    return np.ascontiguousarray(a.transpose(1, 2, 0))

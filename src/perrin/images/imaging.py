@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +10,7 @@ import numpy as np
 from perrin._arrays import from_plain, to_plain
 from perrin.images.optics.optics import Optics
 from perrin.images.optics.radial_image import RadialImage
+from perrin.tracks.checksums import CheckedFiles, refusing_damage
 from perrin.tracks.writing import write_json
 
 if TYPE_CHECKING:
@@ -78,14 +78,16 @@ class Imaging:
     ----------
     features : pandas.DataFrame
         One row per sphere: ``frame`` (of the stack), ``x, y, z`` (um), ``mass``, the other columns
-        of `locate`, and ``cluster, particle, piece`` (cluster -1: no cluster).
+        of `locate`, and ``cluster, particle, piece`` (cluster -1: no cluster); ``kind``, the number
+        of the channel, where each channel shows one kind of sphere.
     frames : pandas.DataFrame
         One row per frame used: ``frame``, ``time`` (s), ``spots`` (before the mass cut),
         ``spheres``, ``level`` (median grey level), ``saturated`` (fraction of voxels clipped at the
         highest grey level), ``fault`` (why it could not be read, or ""), ``copy_of`` (the earlier
         frame that it repeats exactly, or -1; such a frame has no features).
     spots : pandas.DataFrame
-        ``frame, mass`` of all spots, noise included, in a few frames all over the movie.
+        ``frame, mass`` of all spots, noise included, in a few frames all over the movie; masses
+        of other channels are scaled to the mass cut of the first.
     views : tuple of View
         Projections of a few frames all over the movie.
     optics : Optics or None
@@ -104,6 +106,11 @@ class Imaging:
         How positions were refined, as in `locate`.
     radial : RadialImage or None
         The image of a sphere of a 2-D movie; None without refinement by the model.
+    other_optics : tuple of Optics
+        `optics` of the other channels, where each channel shows one kind of sphere.
+    channel_offsets : tuple of tuple of float
+        Shift (x, y, z) of each of the other channels against the first, um, which is subtracted in
+        `features`; an empty tuple where it is not measured.
     """
 
     features: pd.DataFrame
@@ -118,6 +125,8 @@ class Imaging:
     dark: bool
     refine: str | None
     radial: RadialImage | None = None
+    other_optics: tuple[Optics, ...] = ()
+    channel_offsets: tuple[tuple[float, ...], ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """Return everything as values that JSON holds: tables as lists by column."""
@@ -153,8 +162,12 @@ class Imaging:
     def settings(self) -> dict[str, Any]:
         """Return all but tables and views as values that JSON holds: the file imaging.json."""
         entry = {name: to_plain(getattr(self, name)) for name in _IMAGING_SETTINGS}
-        if self.radial is None:  # only that of a 2-D movie is written
-            del entry["radial"]
+        entry["other_optics"] = [optics.to_dict() for optics in self.other_optics]
+        entry["channel_offsets"] = [list(offset) for offset in self.channel_offsets]
+        # What only 2-D movies and movies of several channels have is not written for others.
+        for name in ("radial", "other_optics", "channel_offsets"):
+            if not getattr(self, name):
+                del entry[name]
         return entry
 
 
@@ -172,6 +185,8 @@ def _settings_from(entry: Mapping[str, Any]) -> dict[str, Any]:
     return {name: entry.get(name) for name in _IMAGING_SETTINGS} | {
         "optics": None if optics is None else Optics.from_dict(optics),
         "radial": None if radial is None else RadialImage.from_dict(radial),
+        "other_optics": tuple(Optics.from_dict(one) for one in entry.get("other_optics", ())),
+        "channel_offsets": tuple(tuple(shift) for shift in entry.get("channel_offsets", ())),
         "voxel": (z, y, x),
     }
 
@@ -209,12 +224,13 @@ def read_imaging(folder: Path) -> Imaging:
     ------
     FileNotFoundError
         If a file is missing.
+    DamagedFileError
+        If one of them is damaged.
     """
-    import pandas as pd
-
-    entry = json.loads((folder / "imaging.json").read_text(encoding="utf-8"))
-    with np.load(folder / "views.npz") as stored:
+    files = CheckedFiles.of(folder)
+    entry, stored = files.json("imaging.json"), files.arrays("views.npz")
+    tables = {name: files.table(f"{name}.parquet") for name in _TABLES}
+    with refusing_damage(folder):
         frames = sorted({int(name.partition("-")[0]) for name in stored})
         views = tuple(View(k, *(stored[f"{k}-{side}"] for side in _SIDES)) for k in frames)
-    tables = {name: pd.read_parquet(folder / f"{name}.parquet") for name in _TABLES}
-    return Imaging(**tables, views=views, **_settings_from(entry))
+        return Imaging(**tables, views=views, **_settings_from(entry))

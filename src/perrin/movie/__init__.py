@@ -44,6 +44,16 @@ from perrin.movie.checks import (
     unrefined_spheres,
     unsettled_poses,
 )
+from perrin.movie.colours import (
+    ChannelOffset,
+    channel_offset,
+    check_channels,
+    joined_frames,
+    joined_kinds,
+    joined_spots,
+    kinds_of_clusters,
+    one_of_each,
+)
 from perrin.movie.parts import PartWriter, open_parts, read_parts
 from perrin.movie.stacks import Settings, analyze_stack, with_own_times
 from perrin.movie.stages import Located, fit_poses, learn_method, locate_frames, run_frames
@@ -52,6 +62,7 @@ from perrin.movie.workers import Work, check_workers, work_through
 __all__ = [
     "Bodies",
     "Change",
+    "ChannelOffset",
     "Findings",
     "Located",
     "PartWriter",
@@ -62,6 +73,8 @@ __all__ = [
     "bleached",
     "bleaching",
     "bleaching_text",
+    "channel_offset",
+    "check_channels",
     "check_clusters",
     "check_workers",
     "clusters_near_border",
@@ -76,12 +89,17 @@ __all__ = [
     "fit_poses",
     "frame_runs_text",
     "group_sizes",
+    "joined_frames",
+    "joined_kinds",
+    "joined_spots",
+    "kinds_of_clusters",
     "learn_method",
     "locate_frames",
     "long_steps",
     "mean_pair_distance",
     "median_errors",
     "missing_spheres",
+    "one_of_each",
     "open_parts",
     "overlapping_places",
     "pair_distance_bias",

@@ -305,7 +305,8 @@ def tracks_of(bodies: Bodies, *, exclude: Sequence[int]) -> pd.DataFrame:
     Returns
     -------
     pandas.DataFrame
-        As `check_tracks` returns it, with ``cluster`` and ``piece``.
+        As `check_tracks` returns it, with ``cluster``, ``piece`` and, where there are several
+        channels, ``kind``.
 
     Raises
     ------
@@ -329,4 +330,5 @@ def tracks_of(bodies: Bodies, *, exclude: Sequence[int]) -> pd.DataFrame:
     table = check_tracks(
         rows[["frame", "particle", "cluster", *bodies.axes]], source="the spheres found"
     )
-    return table.assign(piece=rows["piece"].to_numpy())
+    own = [name for name in ("piece", "kind") if name in rows]
+    return table.assign(**{name: rows[name].to_numpy() for name in own})

@@ -8,7 +8,8 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from perrin.errors import PartsError
-from perrin.tracks.writing import write_json, written_whole
+from perrin.tracks.checksums import checksum, read_sealed, write_sealed
+from perrin.tracks.writing import written_whole
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -40,12 +41,14 @@ def open_parts(folder: Path, settings: Mapping[str, Any]) -> set[str]:
     ------
     PartsError
         If its parts have other settings; the message names those that differ.
+    DamagedFileError
+        If the list of their settings is damaged, so that nothing is known about them.
     """
     folder.mkdir(parents=True, exist_ok=True)
     place = folder / _SETTINGS
     plain = json.loads(json.dumps(settings))
     if place.exists():
-        there = json.loads(place.read_text(encoding="utf-8"))
+        there = read_sealed(place)
         different = [
             f"{name} {there.get(name)!r} there, {plain.get(name)!r} now"
             for name in sorted({*there, *plain})
@@ -54,8 +57,7 @@ def open_parts(folder: Path, settings: Mapping[str, Any]) -> set[str]:
         if different:
             raise PartsError(f"{folder} holds the parts of another run: {'; '.join(different)}")
     else:
-        with written_whole(place) as unfinished:
-            write_json(unfinished, plain)
+        write_sealed(place, plain)
     return {p.name for p in folder.glob("part-*.parquet")}
 
 
@@ -73,21 +75,27 @@ def read_parts(folder: Path) -> tuple[pd.DataFrame, list[dict[str, Any]], list[s
     entries : list of dict
         The entry of each frame, as given to `PartWriter.add`.
     damaged : list of str
-        Names of parts that cannot be read; they were removed, so that their frames are processed
-        again.
+        Names of parts without the checksum in their name, or of another version; they were removed,
+        so that their frames are processed again.
+
+    Raises
+    ------
+    OSError
+        If a part cannot be read from the disk; it is kept.
     """
+    import io
+
     import pandas as pd
 
     tables, entries, damaged = [], [], []
     seen: set[int] = set()
     for path in sorted(folder.glob("part-*.parquet")):
-        try:
-            table = pd.read_parquet(path)
-        # The decoder of a damaged file may raise any exception.
-        except Exception:
+        data = path.read_bytes()
+        if path.stem.rpartition("-")[2] != checksum(data):
             path.unlink()
             damaged.append(path.name)
             continue
+        table = pd.read_parquet(io.BytesIO(data))
         added = [e for e in table.attrs["entries"] if e["frame"] not in seen]
         fresh = {int(e["frame"]) for e in added}
         seen |= fresh
@@ -140,14 +148,16 @@ class PartWriter:
             self.flush()
 
     def flush(self) -> None:
-        """Write the collected frames as one part; an incomplete part never appears.
+        """Write the collected frames as one part, with its checksum in its name.
+
+        An incomplete part never appears.
 
         Raises
         ------
         OSError
             If it cannot be written, as on a full disk; parts written before remain valid.
         """
-        import uuid
+        import io
 
         import pandas as pd
 
@@ -157,8 +167,11 @@ class PartWriter:
         part = pd.concat(tables, ignore_index=True)
         part.attrs = {"entries": self._entries}
         first = min(int(e["frame"]) for e in self._entries)
-        place = self.folder / f"part-{first:07d}-{uuid.uuid4().hex[:8]}.parquet"
+        buffer = io.BytesIO()
+        part.to_parquet(buffer, index=False)
+        data = buffer.getvalue()
+        place = self.folder / f"part-{first:07d}-{checksum(data)}.parquet"
         with written_whole(place) as unfinished:
-            part.to_parquet(unfinished, index=False)
+            unfinished.write_bytes(data)
         self._tables, self._entries = [], []
         self._written = time.monotonic()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import inspect
 import shutil
 from collections.abc import Iterable
-from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypedDict
@@ -29,9 +28,18 @@ from perrin.movie.bodies import (
     tracks_of,
     with_true_errors,
 )
+from perrin.movie.colours import (
+    ChannelOffset,
+    check_channels,
+    joined_frames,
+    joined_kinds,
+    joined_spots,
+    kinds_of_clusters,
+)
 from perrin.movie.stages import Located, fit_poses, locate_frames
 from perrin.movie.workers import Work, check_workers
 from perrin.run.experiment import Experiment, MotionModel, Recording, merged_experiment
+from perrin.run.folders import claimed_folder
 from perrin.run.measure import library_version, measure_free_spheres, measure_table
 from perrin.tracks.clock import Clock, evenly_spaced
 
@@ -54,6 +62,9 @@ if TYPE_CHECKING:
 # Poses are fitted to the images where less than this share of the variance of the orientation is
 # motion during the scan.
 _SCANNED = 0.05
+
+# Frames of two channels that begin less than this share of their interval apart are simultaneous.
+_SAME_TIME = 1e-6
 
 _VIEWS = 8  # frames that are kept as pictures
 _LIBRARIES = ("perrin", "numpy", "scipy", "trackpy")
@@ -97,7 +108,7 @@ _EXPERIMENT_KEYWORDS = (
 
 
 def analyze_stack(
-    stack: Stack,
+    stack: Stack | list[Stack] | tuple[Stack, ...],
     *,
     diameter: float,
     contact: float,
@@ -120,8 +131,9 @@ def analyze_stack(
 
     Parameters
     ----------
-    stack : Stack
-        Image stack from `open_stack` or `render_stack`.
+    stack : Stack, or list or tuple of Stack
+        Image stack from `open_stack` or `render_stack`; for clusters of spheres in several colours
+        one stack for each channel, of which each shows the spheres of one kind.
     diameter : float
         Diameter of the fluorescent sphere, um.
     contact : float
@@ -171,6 +183,15 @@ def analyze_stack(
     OSError
         If files cannot be read or written, or the scheduler does not answer.
 
+    Notes
+    -----
+    The spheres of each channel are located by themselves, with a mass cut and optics of their own,
+    and then put together in the coordinates of the first channel: a constant shift of the other
+    channels follows from the distances of touching spheres of different kinds, is subtracted and
+    reported. Where the channels begin their frames at different times, spheres have these times.
+    `Imaging.features` has the column ``kind``: the number of the channel. The motions are then
+    those of the fitted centres, as no one image shows a cluster whole.
+
     Examples
     --------
     >>> from perrin import Cluster, analyze_stack, render_stack, simulate_motion
@@ -187,11 +208,14 @@ def analyze_stack(
     """
     import tempfile
 
+    stacks = tuple(stack) if isinstance(stack, (list, tuple)) else (stack,)
+    refuse(["stack: expected a stack or several, got none"] if not stacks else [])
+    stack = stacks[0]
     if len(stack) < 2:
         raise TooFewFramesError("one frame shows no motion: two or more are needed", len(stack))
     known = [*inspect.signature(analyze_stack).parameters, *Settings.__annotations__]
     refuse_unknown("analyze_stack", settings, known)
-    faults: list[str] = []
+    faults = check_channels(stacks)
     spots = options_from(Spots, spots, settings, name="spots", faults=faults)
     work = options_from(Work, work, settings, name="work", faults=faults)
     experiment = _stack_experiment(stack, experiment, settings, contact, faults)
@@ -210,24 +234,37 @@ def analyze_stack(
 
     numbers, excluded = _selected_frames(len(stack), frames), sorted({int(c) for c in exclude})
     work.report(0, 0, "taking the file's SHA-256")
-    depends = _dependencies(stack, search, refine, optics, numbers)
+    depends = [_dependencies(one, search, refine, optics, numbers) for one in stacks]
     with (
-        nullcontext(work.keep)
+        claimed_folder(work.keep)
         if work.keep is not None
         else tempfile.TemporaryDirectory(prefix="perrin-")
     ) as kept:
         folder = Path(kept)
-        located = _located(stack, search, refine, optics, numbers, depends, folder, work)
-        method = located.method
-        bodies = find_bodies(located.features, stack, search, optics=method.optics, sizes=sizes)
-        poses = _PoseFits(stack, method.optics, bodies, contact, folder / _POSED, work)
+        located = [
+            _located(one, search, refine, optics, numbers, own, folder / name, work)
+            for one, own, name in zip(stacks, depends, _folders(len(stacks)), strict=True)
+        ]
+        learned, findings = located[0].method.optics, checks.Findings()
+        features = located[0].features
+        offsets: list[ChannelOffset | None] = []
+        if len(stacks) > 1:
+            tables = [one.features for one in located]
+            features, offsets, findings = joined_kinds(tables, contact=contact)
+        bodies = find_bodies(features, stack, search, optics=learned, sizes=sizes)
+        poses = _PoseFits(stacks, learned, bodies, contact, folder / _POSED, work)
         errors = median_errors(bodies.features, axes=bodies.axes)
+        sources = [
+            {"path": one.source if one.path else None, "sha256": own["sha256"]}
+            for one, own in zip(stacks, depends, strict=True)
+        ]
         run: _Run = {
-            "source": {"path": stack.source if stack.path else None, "sha256": depends["sha256"]},
+            "source": sources[0],
             "arguments": experiment.to_dict()
-            | {k: v for k, v in depends.items() if k not in ("sha256", "versions")}
+            | {k: v for k, v in depends[0].items() if k not in ("sha256", "versions")}
             | {"size": sizes, "exclude": excluded}
-            | {f"stated_{name}": value for name, value in stack.stated.items()},
+            | {f"stated_{name}": value for name, value in stack.stated.items()}
+            | _other_channels(stacks, sources),
         }
         recording = Recording(
             stack.dt,
@@ -237,7 +274,7 @@ def analyze_stack(
         )
         if bodies.sizes or excluded:
             report = measure_table(
-                with_own_times(tracks_of(bodies, exclude=excluded), stack),
+                with_own_times(tracks_of(bodies, exclude=excluded), *stacks),
                 experiment,
                 recording=recording,
                 improved=poses.improved,
@@ -246,26 +283,51 @@ def analyze_stack(
             )
         else:
             report = measure_free_spheres(bodies.singles, experiment, recording, **run)
-    findings = poses.findings
+    findings += poses.findings
     if poses.ratio is not None:
         findings += checks.error_ratio_shown(poses.ratio, axes=bodies.axes)
         bodies = with_true_errors(bodies, poses.ratio, times=stack.times)
-    return _with_checks(report, stack, located, bodies, search, findings)
+    return _with_checks(report, stacks, located, bodies, search, findings, offsets)
 
 
-def with_own_times(table: pd.DataFrame, stack: Stack) -> pd.DataFrame:
+def _folders(count: int) -> list[str]:
+    """Return the folders of the finished frames of all channels."""
+    return [_LOCATED, *(f"{_LOCATED}-{k}" for k in range(1, count))]
+
+
+def _other_channels(
+    stacks: Sequence[Stack], sources: Sequence[dict[str, str | None]]
+) -> dict[str, Any]:
+    """Return where the channels beside the first come from, for run.json."""
+    if len(stacks) == 1:
+        return {}
+    pairs = list(zip(stacks, sources, strict=True))
+    return {"other_channels": [{**source, **one.choice} for one, source in pairs[1:]]}
+
+
+def with_own_times(table: pd.DataFrame, stack: Stack, *channels: Stack) -> pd.DataFrame:
     """Add the time of every sphere after that of its frame, s: that of the planes through it.
 
     Parameters
     ----------
     table : pandas.DataFrame
-        Tracks with the coordinate ``z``, um.
+        Tracks with the coordinate ``z``, um, and ``kind`` where there are several channels.
     stack : Stack
-        With the time from plane to plane; without it the table is returned as it is.
+        With the time from plane to plane; without it the planes of a frame have the same time.
+    *channels : Stack
+        The other channels, whose frames may begin later. Where neither planes nor channels have
+        times of their own the table is returned as it is.
     """
-    if not stack.plane_time or "z" not in table:
+    late = np.array([one.times - stack.times for one in (stack, *channels)])
+    scanned = bool(stack.plane_time) and "z" in table
+    if not scanned and not np.any(np.abs(late) > _SAME_TIME * (stack.dt or 1.0)):
         return table
-    return table.assign(delay=table["z"] / stack.voxel[0] * stack.plane_time)
+    delay = np.zeros(len(table))
+    if channels:
+        delay += late[table["kind"], table["frame"]]
+    if scanned:
+        delay += table["z"].to_numpy() / stack.voxel[0] * stack.plane_time
+    return table.assign(delay=delay)
 
 
 def _stack_experiment(
@@ -384,14 +446,14 @@ def _located(
                 optics=optics,
                 frames=frames,
                 settings=depends,
-                folder=folder / _LOCATED,
+                folder=folder,
                 work=work,
             )
             break
         except PartsError as error:
             if last_attempt:
                 raise PartsError(f"{error}; choose another folder, or anew=True") from None
-            shutil.rmtree(folder / _LOCATED)
+            shutil.rmtree(folder)
     table = located.frames
     different = int(((table["copy_of"] < 0) & (table["fault"] == "")).sum())
     copies = checks.repeated_frames(table).warnings
@@ -405,9 +467,12 @@ def _located(
 
 @dataclass(eq=False)
 class _PoseFits:
-    """Replace the motions of free centres by those of poses fitted to the images."""
+    """Replace the motions of free centres by those of poses fitted to the images.
 
-    stack: Stack
+    Where each channel shows one kind of sphere, no image shows a body whole: motions stay.
+    """
+
+    stacks: tuple[Stack, ...]
     optics: Optics | None
     bodies: Bodies
     contact: float
@@ -435,15 +500,17 @@ class _PoseFits:
         }
         if self.optics is None or not still:
             return motions
-        posed, findings = fit_poses(
-            self.stack,
-            still,
-            optics=self.optics,
-            features=self.bodies.features,
-            folder=self.folder,
-            work=self.work,
-        )
-        self.findings += findings
+        posed: dict[int, RigidMotion] = {}
+        if len(self.stacks) == 1:
+            posed, findings = fit_poses(
+                self.stacks[0],
+                still,
+                optics=self.optics,
+                features=self.bodies.features,
+                folder=self.folder,
+                work=self.work,
+            )
+            self.findings += findings
         stated = stated_variances(self.bodies, {c: frames for c, (_, frames) in still.items()})
         self.ratio = error_ratio(
             (kept[c].motion, kept[c].positions, variance) for c, variance in stated.items()
@@ -457,17 +524,19 @@ class _PoseFits:
 
 def _with_checks(
     report: Report,
-    stack: Stack,
-    located: Located,
+    stacks: Sequence[Stack],
+    located: Sequence[Located],
     bodies: Bodies,
     search: Search,
     findings: checks.Findings,
+    offsets: Sequence[ChannelOffset | None],
 ) -> Report:
     """Return the report with the images, and with the warnings and notes of all checks."""
-    imaging = _imaging(stack, located, bodies, search)
-    features, contact, method = bodies.features, imaging.contact, located.method
-    good = (located.frames["fault"] == "") & (located.frames["copy_of"] < 0)
-    read = located.frames.loc[good, "frame"].to_numpy(dtype=np.int64)
+    stack = stacks[0]
+    imaging = _imaging(stacks, located, bodies, search, offsets)
+    features, contact, method = bodies.features, imaging.contact, located[0].method
+    good = np.all([(o.frames["fault"] == "") & (o.frames["copy_of"] < 0) for o in located], axis=0)
+    read = located[0].frames.loc[good, "frame"].to_numpy(dtype=np.int64)
     uneven: list[str] = []
     if _uneven_clock(stack) is not None:
         gaps = np.diff(stack.times)
@@ -475,18 +544,17 @@ def _with_checks(
             f"times between frames run from {gaps.min():.4g} to {gaps.max():.4g} s: these times "
             "are used"
         )
-    found = (
-        checks.Findings(tuple(located.warnings), (*stack.notes, *located.notes))
-        + checks.unreadable_frames(located.frames)
-        + checks.repeated_frames(located.frames)
-        + checks.empty_frames(located.frames, minmass=imaging.minmass)
-        + checks.saturated_frames(located.frames)
-        + checks.bleached(features)
-        + checks.depth_dimming(features)
-        + checks.unrefined_spheres(features)
-        + checks.pair_distance_bias(
-            features, contact=contact, refine=method.refine, axes=bodies.axes
-        )
+    if len(stacks) == 1:
+        found = _channel_checks(stack, located[0], features)
+    else:
+        found = checks.Findings()
+        for k, (one, own) in enumerate(zip(stacks, located, strict=True)):
+            shown = _channel_checks(one, own, features[features["kind"] == k])
+            texts = (tuple(f"channel {k}: {text}" for text in part) for part in shown)
+            found += checks.Findings(*texts)
+        found += kinds_of_clusters(features)
+    found += (
+        checks.pair_distance_bias(features, contact=contact, refine=method.refine, axes=bodies.axes)
         + checks.Findings(tuple(bodies.warnings), tuple(bodies.notes))
         + _contrast(imaging, features, flat=is_flat(stack) and method.radial is None)
         + checks.missing_spheres(features, sizes=bodies.sizes, contact=contact, frames=read)
@@ -511,6 +579,20 @@ def _with_checks(
     )
 
 
+def _channel_checks(stack: Stack, located: Located, features: pd.DataFrame) -> checks.Findings:
+    """Return the findings on the frames and the spheres of one channel."""
+    return (
+        checks.Findings(tuple(located.warnings), (*stack.notes, *located.notes))
+        + checks.unreadable_frames(located.frames)
+        + checks.repeated_frames(located.frames)
+        + checks.empty_frames(located.frames, minmass=float(located.method.search.minmass or 0.0))
+        + checks.saturated_frames(located.frames)
+        + checks.bleached(features)
+        + checks.depth_dimming(features)
+        + checks.unrefined_spheres(features)
+    )
+
+
 def _contrast(imaging: Imaging, features: pd.DataFrame, *, flat: bool) -> checks.Findings:
     """Return the findings on the contrast of a 2-D movie."""
     if not flat:
@@ -528,27 +610,42 @@ def _contrast(imaging: Imaging, features: pd.DataFrame, *, flat: bool) -> checks
     ) + checks.overlapping_places(shown, contact=imaging.contact)
 
 
-def _imaging(stack: Stack, located: Located, bodies: Bodies, search: Search) -> Imaging:
+def _imaging(
+    stacks: Sequence[Stack],
+    located: Sequence[Located],
+    bodies: Bodies,
+    search: Search,
+    offsets: Sequence[ChannelOffset | None],
+) -> Imaging:
     """Return the tables of the run, and projections of some frames along their three axes."""
-    z, y, x = (float(v) for v in stack.voxel)
-    read = located.frames.loc[located.frames["fault"] == "", "frame"].to_numpy()
+    first = located[0]
+    z, y, x = (float(v) for v in stacks[0].voxel)
+    frames = joined_frames([one.frames for one in located])
+    read = frames.loc[frames["fault"] == "", "frame"].to_numpy()
     shown = read[np.unique(np.linspace(0, len(read) - 1, min(_VIEWS, len(read))).astype(int))]
     views = []
     for i in map(int, shown):
-        frame = stack.frame(i)
+        frame = stacks[0].frame(i)
+        for one in stacks[1:]:
+            frame = frame + one.frame(i).astype(np.float64)
         sides = (frame.min(axis=k) if search.dark else frame.max(axis=k) for k in range(3))
         views.append(View(i, *sides))
+    cuts = [float(one.method.search.minmass or 0.0) for one in located]
     return Imaging(
         features=bodies.features.drop(columns=["together", "border"]),
-        frames=located.frames,
-        spots=located.spots,
+        frames=frames,
+        spots=joined_spots([one.spots for one in located], cuts),
         views=tuple(views),
-        optics=located.method.optics,
-        radial=located.method.radial,
-        minmass=float(located.method.search.minmass or 0.0),
+        optics=first.method.optics,
+        radial=first.method.radial,
+        minmass=cuts[0],
         voxel=(z, y, x),
         diameter=search.diameter,
         contact=search.contact,
         dark=search.dark,
-        refine=located.method.refine,
+        refine=first.method.refine,
+        other_optics=tuple(one.method.optics for one in located[1:] if one.method.optics),
+        channel_offsets=tuple(
+            () if offset is None else tuple(offset.value.tolist()) for offset in offsets
+        ),
     )

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import hashlib
-import json
+import shutil
 import warnings
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from perrin.errors import FrameError, PrecisionWarning, TooFewFramesError
+from perrin.errors import DamagedFileError, FrameError, PrecisionWarning, TooFewFramesError
 from perrin.images.optics.learn import UsualImage
 from perrin.images.optics.optics import Optics
 from perrin.images.optics.radial_image import RadialImage
@@ -21,7 +21,7 @@ from perrin.images.spheres.spots import Fading
 from perrin.movie.checks import Findings, unsettled_poses
 from perrin.movie.parts import PartWriter, open_parts, read_parts
 from perrin.movie.workers import work_through
-from perrin.tracks.writing import write_json, written_whole
+from perrin.tracks.checksums import read_sealed, write_sealed
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -154,15 +154,21 @@ def locate_frames(
     import pandas as pd
 
     known = folder / _METHOD_FILE
+    learned, repeated = None, []
     if known.exists():
-        open_parts(folder, settings)
-        learned = json.loads(known.read_text(encoding="utf-8"))
-    else:
+        try:
+            open_parts(folder, settings)
+            learned = read_sealed(known)
+        except DamagedFileError as damage:
+            # Without its settings a part may be of any run; a method is learned once more.
+            if damage.file != str(known):
+                shutil.rmtree(folder)
+            repeated.append(f"{damage.file} was damaged: what followed from it was computed again")
+    if learned is None:
         work.report(0, 0, "learning mass cut and optics")
         learned = learn_method(stack, search, refine=refine, optics=optics, frames=frames)
         open_parts(folder, settings)
-        with written_whole(known) as unfinished:
-            write_json(unfinished, learned)
+        write_sealed(known, learned)
     found, radial = learned["optics"], learned["radial"]
     method = Method(
         replace(search, minmass=learned["minmass"]),
@@ -192,7 +198,7 @@ def locate_frames(
         entries.drop(columns="digest"),
         spots,
         learned["told"],
-        notes,
+        repeated + notes,
     )
 
 
@@ -335,8 +341,6 @@ def fit_poses(
     try:
         open_parts(folder, settings)
     except ValueError:
-        import shutil
-
         # Poses follow from the located spheres; those of other bodies are useless.
         shutil.rmtree(folder)
         open_parts(folder, settings)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from contextlib import contextmanager
 from importlib.resources import as_file, files
+from os import fspath
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 from matplotlib import rc_context, rcParams
@@ -15,7 +17,7 @@ from perrin._arrays import choice_fault, refuse
 
 if TYPE_CHECKING:
     import os
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Iterator
     from pathlib import Path
 
     from matplotlib.axes import Axes as Axes
@@ -67,7 +69,9 @@ def style(*, sheet: Sheet | None = None) -> Iterator[None]:
     from matplotlib import style as styles
 
     with as_file(files("perrin.plot") / "perrin.mplstyle") as own, rc_context():
-        styles.use([own] if sheet is None else [own, sheet])
+        styles.use(own)
+        if sheet is not None:
+            styles.use(dict(sheet) if isinstance(sheet, Mapping) else fspath(sheet))
         yield
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import numpy as np
 
@@ -153,7 +153,7 @@ def trajectory(
             drawn.plot(motion.time, values, color=series_color(k), lw=line_width(0.6), label=name)
         drawn.set(xlabel="time (s)", ylabel=label)
         legend_above(drawn, ncols=3)
-    return drawn
+        return drawn
 
 
 def steps(
@@ -220,7 +220,7 @@ def steps(
             ylim=(0.3 / (total * width[0]), 2 * max(density.max(), law.max())),
         )
         legend_above(drawn, ncols=2)
-    return drawn
+        return drawn
 
 
 def residuals(
@@ -511,11 +511,12 @@ def _forest_height(count: int) -> float:
 
 
 @contextmanager
-def _given_or_new(ax: Axes | None, *, height: float = 0.37, space: bool = False) -> Iterator[Any]:
+def _given_or_new(ax: Axes | None, *, height: float = 0.37, space: bool = False) -> Iterator[Axes]:
     """Give axes to draw on: those given, or those of a new figure in perrin's style."""
     if ax is not None:
         yield ax
         return
     with style():
         figure = column_figure(height, columns=1)
-        yield figure.add_subplot(projection="3d" if space else None)
+        axes: Axes = figure.add_subplot(projection="3d" if space else None)
+        yield axes

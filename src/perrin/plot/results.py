@@ -308,7 +308,7 @@ def plot_orientations(motion: RigidMotion, *, ax: Axes) -> Axes:
     viewer = np.array([np.cos(up) * np.cos(turn), np.cos(up) * np.sin(turn), np.sin(up)])
     length = np.linalg.norm(motion.template, axis=1)
     which = np.flatnonzero(length > 1e-6 * length.max())[:_SHOWN_PARTICLES]
-    colors = [series_color(k) for k in range(len(which))]
+    colors = [series_color(k) for k in range(which.size)]
     shown = np.arange(0, len(motion.time), -(-len(motion.time) // _SHOWN_FRAMES))
     shown = np.union1d(shown, motion.fitted[-1:])
     paths = motion.orientation(motion.template[which])
@@ -529,7 +529,7 @@ def plot_cluster(cluster: Cluster, *, ax: Axes, diameter: float, view: ArrayLike
         height[front] = (center[2] + up * diameter / 2)[front]
         # Diffuse reflection of a lamp at the upper left, and ambient light.
         brightness = 0.35 + 0.65 * np.maximum((across @ [-0.4, 0.5] + up) / np.hypot(0.64, 1), 0)
-        own = np.array([int(color(i)[k : k + 2], 16) / 255 for k in (1, 3, 5)])
+        own = np.array([int(series_color(i)[k : k + 2], 16) / 255 for k in (1, 3, 5)])
         color[front] = (brightness[..., None] * own)[front]
     ax.imshow(color, origin="lower", extent=(-half, half, -half, half), interpolation="bilinear")
     ax.set(xlabel="x (µm)", ylabel="y (µm)")

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 
 from perrin._arrays import Floats, Ints, finite_or_none
 from perrin._text import unit_text
+from perrin.diffusion.steps import Quantity
 from perrin.geometry.rigid import degrees_of_freedom
 from perrin.geometry.rotations import unit_quaternion
 from perrin.geometry.shapes import pair_distances
@@ -162,7 +163,8 @@ def _rigid_parts(
         header["lines"][name] = _line_entry(curve, line, floors[name])
         columns |= _curve_columns(name, curve)
     d = motion.dimension
-    for name, quantity, unit in (("turn", "rotation", "rad"), ("shift", "translation", "µm")):
+    kinds = zip(("turn", "shift"), get_args(Quantity), ("rad", "µm"), strict=True)
+    for name, quantity, unit in kinds:
         found = step_distribution(result, quantity)
         if found is None:
             continue

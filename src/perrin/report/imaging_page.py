@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from perrin.images.imaging import Imaging
-    from perrin.images.optics.optics import CameraNoise
+    from perrin.images.optics.optics import CameraNoise, Optics
     from perrin.run.results import Report
 
 
@@ -267,15 +267,26 @@ def optics_facts(imaging: Imaging) -> list[Fact]:
     list of tuple of str
         Name, value and remark of each quantity.
     """
-    optics, radial = imaging.optics, imaging.radial
+    radial = imaging.radial
     if radial is not None:
         shape = (
             f"learned from the images: a spline with knots {number_text(radial.spacing)} µm apart"
         )
         reach = f"radial, ends {number_text(radial.reach)} µm from the centre"
         return [("image of a sphere", reach, shape), _gain_fact(radial.noise)]
-    if optics is None:
+    if imaging.optics is None:
         return []
+    if not imaging.other_optics:
+        return _channel_facts(imaging, imaging.optics)
+    return [
+        (f"{name}, channel {k}", value, remark)
+        for k, optics in enumerate((imaging.optics, *imaging.other_optics))
+        for name, value, remark in _channel_facts(imaging, optics)
+    ]
+
+
+def _channel_facts(imaging: Imaging, optics: Optics) -> list[Fact]:
+    """Return size and point spread of the image of a sphere, and the noise, of one channel."""
     values = (optics.diameter, *optics.psf)
     size, psf_z, psf = (number_text(v, e) for v, e in zip(values, optics.stderr, strict=True))
     learned = "learned from the images" if any(optics.stderr) else "as stated"

@@ -170,8 +170,8 @@ def render_html(report: Report, figures: Iterable[Path]) -> str:
         overview_data=_overview_data(report),
         copies=[
             ("Methods paragraph", methods_paragraph(report)),
-            ("Command", command_line(report)),
-            ("Python", python_lines(report)),
+            ("Command", command_line(settings)),
+            ("Python", python_lines(settings)),
             ("BibTeX", f"{PAPER_BIBTEX}\n\n{software_bibtex(version)}"),
         ],
         links=folder_links(report),

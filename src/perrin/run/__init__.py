@@ -1,10 +1,17 @@
 """From a track table to a Report, and the folder that holds it."""
 
 from perrin.run.experiment import Experiment, Recording, argument_faults, merged_experiment
-from perrin.run.folders import check_place, check_resumable, filled_folder, staged_folder
+from perrin.run.folders import (
+    check_place,
+    check_resumable,
+    claimed_folder,
+    filled_folder,
+    staged_folder,
+)
 from perrin.run.grouping import assign_clusters
 from perrin.run.kinds import part_of, shape_numbers, usual_symmetry
 from perrin.run.layers import napari_layers, napari_reader, table_layers
+from perrin.run.lock import locked
 from perrin.run.measure import (
     ClusterTracks,
     Coefficient,
@@ -152,6 +159,7 @@ __all__ = [
     "assumed_exposure_notes",
     "check_place",
     "check_resumable",
+    "claimed_folder",
     "coefficients_html",
     "command_line",
     "common_jump_warnings",
@@ -195,6 +203,7 @@ __all__ = [
     "library_version",
     "limit_warnings",
     "load_run",
+    "locked",
     "loose_particles_note",
     "measure_bodies",
     "measure_coefficient",

@@ -1,4 +1,4 @@
-"""Run folders: written whole, or resumed."""
+"""Run folders: written whole, or resumed, by one process at a time."""
 
 from __future__ import annotations
 
@@ -8,8 +8,58 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from perrin.run.lock import LOCK_INSIDE, locked
+from perrin.tracks.writing import hidden_beside
+
 if TYPE_CHECKING:
     from collections.abc import Iterator
+
+
+@contextmanager
+def claimed_folder(folder: str | os.PathLike[str]) -> Iterator[Path]:
+    """Hold a run folder, and put in order what a process that was stopped has left beside it.
+
+    A finished run that was about to be replaced is put back; unfinished files are removed.
+
+    Parameters
+    ----------
+    folder : path
+        Existing or new run folder.
+
+    Yields
+    ------
+    Path
+        The folder.
+
+    Raises
+    ------
+    FolderInUseError
+        If another process is writing there (`locked`).
+    OSError
+        If the folder above cannot be written.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as parent, claimed_folder(Path(parent, "run")) as place:
+    ...     place.name
+    'run'
+    """
+    place = Path(folder)
+    with locked(place) as first:
+        if first and place.parent.is_dir():
+            begin = hidden_beside(place, "").name
+            left = [p for p in place.parent.iterdir() if p.name.startswith(begin)]
+            for old in [p for p in left if p.name.endswith(_REPLACED) and not place.exists()]:
+                old.rename(place)
+            for part in [p for p in left if p.name.endswith((_UNFINISHED, _REPLACED))]:
+                shutil.rmtree(part, ignore_errors=True)
+        yield place
+
+
+# Ends of the names of folders that are being written, and of those that are being replaced.
+_UNFINISHED = ".part"
+_REPLACED = ".part.old"
 
 
 @contextmanager
@@ -32,6 +82,8 @@ def staged_folder(folder: str | os.PathLike[str], *, overwrite: bool = False) ->
     ------
     FileExistsError
         If the folder exists and `overwrite` is not set, or is no run folder.
+    FolderInUseError
+        If another process is writing there.
     OSError
         If the folder cannot be written.
 
@@ -44,22 +96,22 @@ def staged_folder(folder: str | os.PathLike[str], *, overwrite: bool = False) ->
     ...     [path.name for path in Path(parent, "run").iterdir()]
     ['run.json']
     """
-    place = Path(folder)
-    check_place(place, overwrite=overwrite)
-    place.parent.mkdir(parents=True, exist_ok=True)
-    stage = place.with_name(f".{place.name}.{os.getpid()}.part")
-    stage.mkdir()
-    try:
-        yield stage
-        if place.exists():
-            old = stage.with_name(stage.name + ".old")
-            place.rename(old)
-            stage.rename(place)
-            shutil.rmtree(old)
-        else:
-            stage.rename(place)
-    finally:
-        shutil.rmtree(stage, ignore_errors=True)
+    with claimed_folder(folder) as place:
+        check_place(place, overwrite=overwrite)
+        place.parent.mkdir(parents=True, exist_ok=True)
+        stage = hidden_beside(place, f"{os.getpid()}{_UNFINISHED}")
+        stage.mkdir()
+        try:
+            yield stage
+            if place.exists():
+                old = hidden_beside(place, f"{os.getpid()}{_REPLACED}")
+                place.rename(old)
+                stage.rename(place)
+                shutil.rmtree(old)
+            else:
+                stage.rename(place)
+        finally:
+            shutil.rmtree(stage, ignore_errors=True)
 
 
 @contextmanager
@@ -81,25 +133,27 @@ def filled_folder(folder: str | os.PathLike[str]) -> Iterator[Path]:
 
     Raises
     ------
+    FolderInUseError
+        If another process is writing there.
     OSError
         If the folder cannot be written.
     """
-    place = Path(folder)
-    place.mkdir(parents=True, exist_ok=True)
-    for left in place.glob(".*.part"):  # by a process that was stopped
-        shutil.rmtree(left)
-    stage = place / f".{os.getpid()}.part"
-    stage.mkdir()
-    try:
-        yield stage
-        (place / "run.json").unlink(missing_ok=True)
-        for new in sorted(stage.iterdir(), key=lambda path: path.name == "run.json"):
-            old = place / new.name
-            if old.is_dir():
-                shutil.rmtree(old)
-            new.replace(old)
-    finally:
-        shutil.rmtree(stage, ignore_errors=True)
+    with claimed_folder(folder) as place:
+        place.mkdir(parents=True, exist_ok=True)
+        for left in place.glob(f".*{_UNFINISHED}"):  # by a process that was stopped
+            shutil.rmtree(left)
+        stage = place / f".{os.getpid()}{_UNFINISHED}"
+        stage.mkdir()
+        try:
+            yield stage
+            (place / "run.json").unlink(missing_ok=True)
+            for new in sorted(stage.iterdir(), key=lambda path: path.name == "run.json"):
+                old = place / new.name
+                if old.is_dir():
+                    shutil.rmtree(old)
+                new.replace(old)
+        finally:
+            shutil.rmtree(stage, ignore_errors=True)
 
 
 def check_resumable(folder: str | os.PathLike[str], *, parts: str, overwrite: bool = False) -> None:
@@ -120,7 +174,7 @@ def check_resumable(folder: str | os.PathLike[str], *, parts: str, overwrite: bo
     """
     place = Path(folder)
     unfinished = (place / parts).is_dir() and not (place / "run.json").exists()
-    empty = place.is_dir() and not any(place.iterdir())
+    empty = place.is_dir() and not _contents(place)
     if not (unfinished or empty):
         check_place(place, overwrite=overwrite)
 
@@ -147,5 +201,10 @@ def check_place(folder: str | os.PathLike[str], *, overwrite: bool = False) -> N
         return
     if not overwrite:
         raise FileExistsError(f"{place} exists: choose another folder, or overwrite=True")
-    if not place.is_dir() or (any(place.iterdir()) and not (place / "run.json").is_file()):
+    if not place.is_dir() or (_contents(place) and not (place / "run.json").is_file()):
         raise FileExistsError(f"{place} is no run folder of perrin (no run.json): not overwritten")
+
+
+def _contents(folder: Path) -> set[str]:
+    """Return the names in a folder, but for that of a lock."""
+    return {path.name for path in folder.iterdir()} - {LOCK_INSIDE}

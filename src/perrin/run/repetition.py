@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 if TYPE_CHECKING:
-    from perrin.run.results import Report
+    from collections.abc import Mapping
 
 # Defaults of `analyze`, of `open_stack`, and of `analyze_stack`, where a command has the option.
 TABLE_DEFAULTS: dict[str, Any] = {
@@ -41,7 +41,8 @@ class Repetition(NamedTuple):
     source : str or None
         Path of the input; None for a table or a movie in memory.
     opening : dict
-        Keywords of `open_stack`; empty for a table.
+        Keywords of `open_stack`; empty for a table. A tuple of channels is one for each kind of
+        sphere, each opened by itself.
     options : dict
         Keywords of `analyze` or `analyze_stack`.
     """
@@ -52,12 +53,15 @@ class Repetition(NamedTuple):
     options: dict[str, Any]
 
 
-def stated_arguments(report: Report) -> Repetition:
+def stated_arguments(settings: Mapping[str, Any], *, dt: float | None = None) -> Repetition:
     """Return what repeats a run.
 
     Parameters
     ----------
-    report : Report
+    settings : mapping
+        `Report.settings`.
+    dt : float, optional
+        Time between frames, s, where the settings do not state it.
 
     Returns
     -------
@@ -68,14 +72,12 @@ def stated_arguments(report: Report) -> Repetition:
     >>> import perrin
     >>> from importlib.resources import files
     >>> report = perrin.analyze(str(files("perrin") / "data" / "demo_tracks.csv.gz"), dt=0.73)
-    >>> stated_arguments(report).options
+    >>> stated_arguments(report.settings).options
     {'dt': 0.73}
     """
-    given = dict(report.settings.get("arguments", {}))
-    path = report.settings.get("input", {}).get("path")
-    if report.imaging is None:
-        if "dt" not in given and report.results:
-            given["dt"] = report.results[0].motion.dt
+    given: dict[str, Any] = {"dt": dt} | dict(settings.get("arguments", {}))
+    path = settings.get("input", {}).get("path")
+    if "shape" not in given:  # that of a movie
         return Repetition("analyze", path, {}, _differing(given, TABLE_DEFAULTS))
     given |= {name: given.get(f"stated_{name}") for name in ("voxel", "dt", "plane_time")}
     first, last = given.get("first_frame", 0), given.get("last_frame")
@@ -83,18 +85,21 @@ def stated_arguments(report: Report) -> Repetition:
     if last is not None and (first, last) != (0, count and count - 1):
         given["frames"] = (first, last + 1)
     opening = _differing(given, dict.fromkeys(OPENING))
+    if others := given.get("other_channels"):  # spheres of another kind each
+        opening["channel"] = (given["channel"], *(one["channel"] for one in others))
     options = _differing(given, MOVIE_DEFAULTS)
     if "refine" in given and given["refine"] is None:
         options["refine"] = None
     return Repetition("run", path, opening, options)
 
 
-def command_line(report: Report) -> str:
+def command_line(settings: Mapping[str, Any]) -> str:
     """Return the command that repeats a run.
 
     Parameters
     ----------
-    report : Report
+    settings : mapping
+        `Report.settings`.
 
     Returns
     -------
@@ -106,10 +111,10 @@ def command_line(report: Report) -> str:
     >>> import perrin
     >>> from importlib.resources import files
     >>> report = perrin.analyze(str(files("perrin") / "data" / "demo_tracks.csv.gz"), dt=0.73)
-    >>> command_line(report).split()[-4:]
+    >>> command_line(report.settings).split()[-4:]
     ['--dt', '0.73', '-o', 'my-run']
     """
-    again = stated_arguments(report)
+    again = stated_arguments(settings)
     if not again.source:
         return ""
     words = ["perrin", again.command, shlex.quote(str(again.source))]
@@ -122,46 +127,53 @@ def command_line(report: Report) -> str:
     return " ".join([*words, "-o", "my-run"])
 
 
-def python_lines(report: Report) -> str:
+def python_lines(settings: Mapping[str, Any]) -> str:
     """Return the Python lines that repeat a run.
 
     Parameters
     ----------
-    report : Report
+    settings : mapping
+        `Report.settings`.
 
     Examples
     --------
     >>> import perrin
     >>> from importlib.resources import files
     >>> report = perrin.analyze(str(files("perrin") / "data" / "demo_tracks.csv.gz"), dt=0.73)
-    >>> print(python_lines(report).splitlines()[0])
+    >>> print(python_lines(report.settings).splitlines()[0])
     import perrin
     """
-    again = stated_arguments(report)
+    again = stated_arguments(settings)
     lines, options = ["import perrin", ""], dict(again.options)
     optics = options.pop("optics", None)
     given = "".join(f", {name}={value!r}" for name, value in options.items())
     if optics is not None:
         given += f", optics=perrin.Optics.from_dict({optics!r})"
     if again.command == "run":
-        opening = "".join(f", {name}={value!r}" for name, value in again.opening.items())
+        stated, kinds = dict(again.opening), again.opening.get("channel")
+        if isinstance(kinds, tuple):
+            stated.pop("channel")
+        opening = "".join(f", {name}={value!r}" for name, value in stated.items())
         source = "movie" if again.source is None else repr(str(again.source))
-        lines += [
-            f"with perrin.open_stack({source}{opening}) as stack:",
-            f"    report = perrin.analyze_stack(stack{given})",
-        ]
+        if isinstance(kinds, tuple):
+            each = f"perrin.open_stack({source}{opening}, channel=kind) for kind in {kinds!r}"
+            lines.append(f"stack = [{each}]")
+        else:
+            lines.append(f"stack = perrin.open_stack({source}{opening})")
+        lines.append(f"report = perrin.analyze_stack(stack{given})")
     else:
         source = "table" if again.source is None else repr(str(again.source))
         lines.append(f"report = perrin.analyze({source}{given})")
     return "\n".join([*lines, "print(report)", 'report.to_frame().to_csv("results.csv")'])
 
 
-def config_text(report: Report) -> str:
+def config_text(settings: Mapping[str, Any], *, dt: float | None = None) -> str:
     """Return the options of a run as TOML: ``run.toml``, which `--config` reads.
 
     Parameters
     ----------
-    report : Report
+    settings, dt
+        As in `stated_arguments`.
 
     Returns
     -------
@@ -174,13 +186,13 @@ def config_text(report: Report) -> str:
     >>> import perrin
     >>> from importlib.resources import files
     >>> table = perrin.read_tracks(files("perrin") / "data" / "demo_tracks.csv.gz")
-    >>> print(config_text(perrin.analyze(table, dt=0.73)))
+    >>> print(config_text(perrin.analyze(table, dt=0.73).settings))
     command = "analyze"
     tracks = "tracks.parquet"
     dt = 0.73
     <BLANKLINE>
     """
-    again = stated_arguments(report)
+    again = stated_arguments(settings, dt=dt)
     command, options = again.command, again.opening | again.options
     lines = []
     if again.source is not None:
@@ -193,7 +205,7 @@ def config_text(report: Report) -> str:
             command = "analyze"
             left_out = (*_READING, "diameter", *set(MOVIE_DEFAULTS) - set(TABLE_DEFAULTS))
             options = {k: value for k, value in again.options.items() if k not in left_out}
-            options = {"dt": report.settings["arguments"]["dt"]} | options
+            options = {"dt": settings["arguments"]["dt"]} | options
     values = {COMMAND_KEY: command, "stack" if command == "run" else "tracks": source}
     values |= {name.replace("_", "-"): _typed(name, value) for name, value in options.items()}
     # Text, numbers and truth values are written in TOML as in JSON.
@@ -216,6 +228,8 @@ def _typed(name: str, value: Any) -> Any:  # noqa: ANN401 (arguments of any type
         return ":".join("" if end is None else str(end) for end in value)
     if name == "refine" and value is None:
         return "none"
+    if name == "channel" and isinstance(value, tuple):
+        return ":".join(str(_typed(name, kind)) for kind in value)
     if name == "optics":
         tail = [] if value["tail"] is None else [value["tail"][0], *value["tail"][1]]
         spread = [value["spread"]] if value["spread"] else []

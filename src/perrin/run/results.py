@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -34,6 +33,7 @@ from perrin.run.result_table import (
 )
 from perrin.run.singles import SingleSpheres
 from perrin.run.verdicts import verdicts_from_dict, verdicts_to_dict
+from perrin.tracks.checksums import CheckedFiles, refusing_damage, write_checksums
 from perrin.tracks.writing import write_json
 
 if TYPE_CHECKING:
@@ -683,46 +683,57 @@ class Report:
 def load_run(folder: str | os.PathLike[str]) -> Report:
     """Read a run folder back.
 
+    Parameters
+    ----------
+    folder : path
+        Folder of a finished run.
+
+    Returns
+    -------
+    Report
+
     Raises
     ------
     FileNotFoundError
         If the folder or one of its files is missing.
+    DamagedFileError
+        If a file does not have its checksum in ``checksums.json``, or cannot be read; the message
+        names it. Folders of earlier versions have no checksums.
+    OSError
+        If a file cannot be read from the disk.
     """
-    import pandas as pd
-
     path = Path(folder)
     if not (path / "summary.json").is_file():
         raise FileNotFoundError(f"{path}: not a run folder: it holds no summary.json")
-    summary = json.loads((path / "summary.json").read_text(encoding="utf-8"))
-    settings = json.loads((path / "run.json").read_text(encoding="utf-8"))
-    table = pd.read_parquet(path / "motion.parquet")
-    attributes = table.attrs["clusters"]
-    motions: dict[int, RigidMotion | RodMotion] = {}
-    for entry in summary["clusters"]:
-        rows = table[table["cluster"] == entry["cluster"]].reset_index(drop=True)
-        rows.attrs = attributes[str(entry["cluster"])]
-        kind = RodMotion if "D_perp" in entry else RigidMotion
-        motions[entry["cluster"]] = kind.from_frame(rows)
-    return Report.from_dict(
-        summary,
-        motions=motions,
-        tracks=pd.read_parquet(path / "tracks.parquet"),
-        settings=settings,
-        imaging=read_imaging(path) if (path / "imaging.json").is_file() else None,
-    )
+    files = CheckedFiles.of(path)
+    summary, settings = files.json("summary.json"), files.json("run.json")
+    table, tracks = files.table("motion.parquet"), files.table("tracks.parquet")
+    imaging = read_imaging(path) if files.has("imaging.json") else None
+    with refusing_damage(path):
+        motions: dict[int, RigidMotion | RodMotion] = {}
+        for entry in summary["clusters"]:
+            rows = table[table["cluster"] == entry["cluster"]].reset_index(drop=True)
+            rows.attrs = table.attrs["clusters"][str(entry["cluster"])]
+            kind = RodMotion if "D_perp" in entry else RigidMotion
+            motions[entry["cluster"]] = kind.from_frame(rows)
+        return Report.from_dict(
+            summary, motions=motions, tracks=tracks, settings=settings, imaging=imaging
+        )
 
 
 def write_data(report: Report, folder: Path) -> None:
-    """Write numbers, tables and settings of a report to a folder."""
+    """Write numbers, tables and settings of a report to a folder, with checksums."""
     write_json(folder / "summary.json", report.to_dict())
     write_json(folder / "run.json", report.settings)
-    (folder / "run.toml").write_text(config_text(report), encoding="utf-8")
+    dt = report.results[0].motion.dt if report.results else None
+    (folder / "run.toml").write_text(config_text(report.settings, dt=dt), encoding="utf-8")
     report.tracks.to_parquet(folder / "tracks.parquet", index=False)
     motion_table(report).to_parquet(folder / "motion.parquet", index=False)
     curve_table(report).to_csv(folder / "curves.csv", index=False)
     report.to_frame().to_csv(folder / "results.csv", index=False)
     if report.imaging is not None:
         write_imaging(report.imaging, folder)
+    write_checksums(folder)
 
 
 def motion_table(report: Report) -> pd.DataFrame:

@@ -10,6 +10,14 @@ from perrin.tracks.bonds import (
     rigid_groups,
     shared_rows,
 )
+from perrin.tracks.checksums import (
+    CheckedFiles,
+    checksum,
+    read_sealed,
+    refusing_damage,
+    write_checksums,
+    write_sealed,
+)
 from perrin.tracks.clock import (
     Clock,
     evenly_spaced,
@@ -100,7 +108,7 @@ from perrin.tracks.simulations import is_selection, parse_gsd, selection_table
 from perrin.tracks.sphere_tracks import link_spheres, track_variances
 from perrin.tracks.track_arrays import gdf_table, napari_columns, napari_text
 from perrin.tracks.trackmate import is_trackmate, parse_trackmate_xml, trackmate_table
-from perrin.tracks.writing import write_json, written_whole
+from perrin.tracks.writing import hidden_beside, write_json, written_whole
 from perrin.tracks.xyz import parse_xyz, xyz_text
 
 __all__ = [
@@ -110,6 +118,7 @@ __all__ = [
     "BodyModel",
     "Candidates",
     "Centers",
+    "CheckedFiles",
     "Clock",
     "Contacts",
     "Detections",
@@ -131,6 +140,7 @@ __all__ = [
     "candidate_assignments",
     "centre_removed",
     "check_tracks",
+    "checksum",
     "cluster_positions",
     "connected_groups",
     "covering_rotations",
@@ -149,6 +159,7 @@ __all__ = [
     "gdf_bytes",
     "gdf_table",
     "has_trackpy_columns",
+    "hidden_beside",
     "icp_fit",
     "icp_search",
     "identify",
@@ -188,9 +199,11 @@ __all__ = [
     "placeholder_rows",
     "positions_table",
     "read_clock",
+    "read_sealed",
     "read_spheres",
     "read_tracks",
     "recognise_columns",
+    "refusing_damage",
     "repeated_rows",
     "rigid_bodies",
     "rigid_fits",
@@ -217,7 +230,9 @@ __all__ = [
     "unit_faults",
     "utf8_text",
     "without_flat_z",
+    "write_checksums",
     "write_json",
+    "write_sealed",
     "write_tracks",
     "written_whole",
     "xyz_text",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 from contextlib import contextmanager
@@ -12,6 +13,10 @@ from perrin._arrays import to_plain
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
+
+
+# File systems have names of up to 255 bytes; an ending must have its place.
+_LONGEST_NAME = 200
 
 
 @contextmanager
@@ -46,7 +51,7 @@ def written_whole(path: Path) -> Iterator[Path]:
     ...     [path.name for path in Path(folder).iterdir()]
     ['a.txt']
     """
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    part = hidden_beside(path, f"{os.getpid()}.part")
     try:
         yield part
         _flush(part)
@@ -60,6 +65,33 @@ def written_whole(path: Path) -> Iterator[Path]:
         raise type(fault)(fault.errno, fault.strerror, str(path)) from fault
     finally:
         part.unlink(missing_ok=True)
+
+
+def hidden_beside(path: Path, ending: str) -> Path:
+    """Return a hidden path in the folder of `path`, of a name that a file system can hold.
+
+    Parameters
+    ----------
+    path : Path
+    ending : str
+        End of the name, without its dot.
+
+    Returns
+    -------
+    Path
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> hidden_beside(Path("a/run"), "lock").as_posix()
+    'a/.run.lock'
+    >>> len(hidden_beside(Path("n" * 250), "lock").name)
+    38
+    """
+    name = path.name
+    if len(os.fsencode(name)) > _LONGEST_NAME:
+        name = hashlib.blake2b(os.fsencode(name), digest_size=16).hexdigest()
+    return path.with_name(f".{name}.{ending}")
 
 
 def write_json(path: Path, content: object) -> None:

@@ -1,0 +1,390 @@
+/* Compiled twins of functions of perrin that spend their time in arithmetic on small matrices.
+ *
+ * Only the stable ABI of Python 3.11 is used: one binary serves every later version, and arrays
+ * arrive as buffers. Compilers of the GNU family work on several rows at once in vectors; others
+ * work on one row at a time. Without contracted multiplications (-ffp-contract=off) both, and every
+ * instruction set, round alike.
+ */
+
+#define PY_SSIZE_T_CLEAN
+#define Py_LIMITED_API 0x030B0000
+#include <Python.h>
+
+#include <float.h>
+#include <math.h>
+#include <stdint.h>
+#include <stdlib.h>
+#include <string.h>
+
+#if defined(__GNUC__)
+#define WIDTH 4
+#define INLINE static inline __attribute__((always_inline))
+typedef double Lanes __attribute__((vector_size(8 * WIDTH)));
+typedef int64_t Mask __attribute__((vector_size(8 * WIDTH)));
+#define LANE(vector, i) ((vector)[i])
+INLINE Lanes choose(Mask mask, Lanes a, Lanes b)
+{
+    return (Lanes)((mask & (Mask)a) | (~mask & (Mask)b));
+}
+INLINE Lanes magnitude(Lanes a) { return (Lanes)((Mask)a & INT64_MAX); }
+INLINE Lanes square_root(Lanes a)
+{
+    for (int i = 0; i < WIDTH; i++)
+        a[i] = sqrt(a[i]);
+    return a;
+}
+INLINE int any(Mask mask)
+{
+    int64_t found = 0;
+    for (int i = 0; i < WIDTH; i++)
+        found |= mask[i];
+    return found != 0;
+}
+#else
+#define WIDTH 1
+#define INLINE static __inline
+typedef double Lanes;
+typedef int Mask;
+#define LANE(vector, i) (vector)
+INLINE Lanes choose(Mask mask, Lanes a, Lanes b) { return mask ? a : b; }
+INLINE Lanes magnitude(Lanes a) { return fabs(a); }
+INLINE Lanes square_root(Lanes a) { return sqrt(a); }
+INLINE int any(Mask mask) { return mask; }
+#endif
+
+/* The loader chooses among versions of a function for the vector registers of the machine. */
+#if defined(__x86_64__) && defined(__GLIBC__) && defined(__GNUC__)
+#define EVERY_MACHINE __attribute__((target_clones("avx2", "default")))
+#else
+#define EVERY_MACHINE
+#endif
+
+INLINE Lanes larger(Lanes a, Lanes b) { return choose(a > b, a, b); }
+INLINE Lanes all_equal(double value)
+{
+    Lanes same;
+    for (int i = 0; i < WIDTH; i++)
+        LANE(same, i) = value;
+    return same;
+}
+
+/* Up to this many steps of Newton's method towards the largest root of the quartic. */
+enum { MOST_STEPS = 30 };
+
+/* Point sets of `rows` rows of n points; a stride of 0 repeats one set for all rows. */
+typedef struct {
+    Py_ssize_t rows, n, stride_y, stride_x, stride_w;
+    const double *y, *x, *w;
+    double *rotation;
+    uint8_t *certain;
+} Sets;
+
+INLINE void cross(const Lanes a[3], const Lanes b[3], Lanes out[3])
+{
+    out[0] = a[1] * b[2] - a[2] * b[1];
+    out[1] = a[2] * b[0] - a[0] * b[2];
+    out[2] = a[0] * b[1] - a[1] * b[0];
+}
+
+/* out = a b, or a^T b. */
+INLINE void product(Lanes a[3][3], Lanes b[3][3], int transposed, Lanes out[3][3])
+{
+    for (int i = 0; i < 3; i++)
+        for (int j = 0; j < 3; j++)
+            out[i][j] = transposed ? a[0][i] * b[0][j] + a[1][i] * b[1][j] + a[2][i] * b[2][j]
+                                   : a[i][0] * b[0][j] + a[i][1] * b[1][j] + a[i][2] * b[2][j];
+}
+
+/* Copy WIDTH rows of n numbers to `out` (n), one row a lane; where rows end, the last is repeated. */
+INLINE void gather(const double *set, Py_ssize_t stride, Py_ssize_t n, Py_ssize_t count, Lanes *out)
+{
+    for (int lane = 0; lane < WIDTH; lane++) {
+        const double *row = set + (lane < count ? lane : count - 1) * stride;
+        for (Py_ssize_t i = 0; i < n; i++)
+            LANE(out[i], lane) = row[i];
+    }
+}
+
+INLINE void centre(Lanes *points, const Lanes *weight, Py_ssize_t n, Lanes total, Lanes mean[3])
+{
+    for (int k = 0; k < 3; k++)
+        mean[k] = all_equal(0.0);
+    for (Py_ssize_t i = 0; i < n; i++)
+        for (int k = 0; k < 3; k++)
+            mean[k] += weight ? points[3 * i + k] * weight[i] : points[3 * i + k];
+    for (int k = 0; k < 3; k++)
+        mean[k] = mean[k] / total;
+    for (Py_ssize_t i = 0; i < n; i++)
+        for (int k = 0; k < 3; k++)
+            points[3 * i + k] -= mean[k];
+}
+
+/* The cross-dispersion sum w y x^T of centred sets and a bound of its rounding error. */
+INLINE Lanes dispersion(Lanes *y, Lanes *x, const Lanes *w, Py_ssize_t n, Lanes c[3][3])
+{
+    Lanes total = all_equal((double)n), y0[3], x0[3], zero = all_equal(0.0);
+    if (w) {
+        total = zero;
+        for (Py_ssize_t i = 0; i < n; i++)
+            total += w[i];
+        total = larger(total, all_equal(1e-300));
+    }
+    centre(y, w, n, total, y0);
+    centre(x, w, n, total, x0);
+    for (int j = 0; j < 3; j++)
+        for (int k = 0; k < 3; k++)
+            c[j][k] = zero;
+    Lanes y_size = zero, x_size = zero, y_largest = zero, far_y = zero, far_x = zero;
+    for (Py_ssize_t i = 0; i < n; i++)
+        for (int k = 0; k < 3; k++) {
+            Lanes x_weighted = w ? x[3 * i + k] * w[i] : x[3 * i + k];
+            Lanes y_distance = magnitude(y[3 * i + k]);
+            for (int j = 0; j < 3; j++)
+                c[j][k] += y[3 * i + j] * x_weighted;
+            x_size += magnitude(x_weighted);
+            y_size += w ? y_distance * w[i] : y_distance;
+            y_largest = larger(y_distance, y_largest);
+        }
+    for (int k = 0; k < 3; k++) {
+        far_y = larger(magnitude(y0[k]), far_y);
+        far_x = larger(magnitude(x0[k]), far_x);
+    }
+    Lanes near = y_largest * x_size * (double)n;
+    return 8 * DBL_EPSILON * (near + (far_y * x_size + far_x * y_size));
+}
+
+/* The largest root of (l^2 - 1)^2 - 8 l det - 4 cofactor2, and the gap to the next one. */
+INLINE Lanes characteristic_root(Lanes det, Lanes cofactor2, Lanes *gap)
+{
+    Lanes root = all_equal(sqrt(3.0)), tiny = all_equal(1e-12);
+    for (int step = 0; step < MOST_STEPS; step++) {
+        Lanes square = root * root - 1.0;
+        Lanes slope = 0.5 * root * square - det;
+        Lanes value = 0.125 * square * square - root * det - 0.5 * cofactor2;
+        Lanes change = value / larger(slope, tiny);
+        root = root - change;
+        if (!any(magnitude(change) > 1e-9))
+            break;
+    }
+    *gap = 0.5 * root * (root * root - 1.0) - det;
+    return root;
+}
+
+/* Solve (tr S - sym S) w = axial(S - S^T) and return where that matrix is positive definite. */
+INLINE Mask newton_step(Lanes s[3][3], Lanes w[3])
+{
+    Lanes trace = s[0][0] + s[1][1] + s[2][2];
+    Lanes p = trace - s[0][0], q = trace - s[1][1], r = trace - s[2][2];
+    Lanes f = -0.5 * (s[0][1] + s[1][0]);
+    Lanes g = -0.5 * (s[0][2] + s[2][0]);
+    Lanes h = -0.5 * (s[1][2] + s[2][1]);
+    Lanes a[3] = {s[2][1] - s[1][2], s[0][2] - s[2][0], s[1][0] - s[0][1]};
+    Lanes m00 = q * r - h * h, m01 = g * h - f * r, m02 = f * h - g * q;
+    Lanes m11 = p * r - g * g, m12 = f * g - p * h, m22 = p * q - f * f;
+    Lanes zero = all_equal(0.0), det = p * m00 + f * m01 + g * m02;
+    Mask definite = (p > zero) & (m22 > zero) & (det > zero);
+    Lanes divisor = choose(definite, det, all_equal(1.0));
+    w[0] = (m00 * a[0] + m01 * a[1] + m02 * a[2]) / divisor;
+    w[1] = (m01 * a[0] + m11 * a[1] + m12 * a[2]) / divisor;
+    w[2] = (m02 * a[0] + m12 * a[1] + m22 * a[2]) / divisor;
+    return definite;
+}
+
+/* Markley's closed form, one orthonormalising and one Newton step; returns where it is certain. */
+INLINE Mask certified_rotation(Lanes b[3][3], Lanes error, Lanes r[3][3])
+{
+    Lanes zero = all_equal(0.0), one = all_equal(1.0), largest = zero, norm = zero;
+    for (int i = 0; i < 3; i++)
+        for (int j = 0; j < 3; j++)
+            largest = larger(magnitude(b[i][j]), largest);
+    Lanes scale = one / choose(largest > zero, largest, one);
+    for (int i = 0; i < 3; i++)
+        for (int j = 0; j < 3; j++) {
+            b[i][j] *= scale;
+            norm += b[i][j] * b[i][j];
+        }
+    norm = square_root(norm);
+    scale = one / choose(norm > zero, norm, one);
+    for (int i = 0; i < 3; i++)
+        for (int j = 0; j < 3; j++)
+            b[i][j] *= scale;
+    Lanes cofactor[3][3], cofactor2 = zero, gap;
+    for (int i = 0; i < 3; i++)
+        cross(b[(i + 1) % 3], b[(i + 2) % 3], cofactor[i]);
+    for (int i = 0; i < 3; i++)
+        for (int j = 0; j < 3; j++)
+            cofactor2 += cofactor[i][j] * cofactor[i][j];
+    Lanes det = b[0][0] * cofactor[0][0] + b[0][1] * cofactor[0][1] + b[0][2] * cofactor[0][2];
+    Lanes root = characteristic_root(det, cofactor2, &gap);
+    Lanes gram[3][3], cubic[3][3], inverse = one / larger(gap, all_equal(1e-12));
+    product(b, b, 1, gram);
+    product(b, gram, 0, cubic);
+    Lanes factor = 0.5 * (root * root + 1.0);
+    for (int i = 0; i < 3; i++)
+        for (int j = 0; j < 3; j++)
+            r[i][j] = (factor * b[i][j] + root * cofactor[i][j] - cubic[i][j]) * inverse;
+    product(r, r, 1, gram);
+    product(r, gram, 0, cubic);
+    Lanes schulz2 = zero;
+    for (int i = 0; i < 3; i++)
+        for (int j = 0; j < 3; j++) {
+            Lanes schulz = 0.5 * (r[i][j] - cubic[i][j]);
+            schulz2 += schulz * schulz;
+            r[i][j] += schulz;
+        }
+    Lanes s[3][3], step[3], turned[3];
+    product(r, b, 1, s);
+    Mask definite = newton_step(s, step);
+    Lanes step2 = step[0] * step[0] + step[1] * step[1] + step[2] * step[2];
+    for (int i = 0; i < 3; i++) {
+        cross(r[i], step, turned);
+        for (int j = 0; j < 3; j++)
+            r[i][j] += turned[j];
+    }
+    return definite & (schulz2 < all_equal(1e-16)) & (step2 < 1e-14 * gap) &
+           (gap > all_equal(1e-7)) & (0.5 * gap * norm * largest > error);
+}
+
+/* Give points of which a coordinate is NaN the weight 0, and that coordinate the value 0. */
+INLINE void leave_out_absent(Lanes *y, Lanes *x, Lanes *w, Py_ssize_t n)
+{
+    Lanes zero = all_equal(0.0);
+    for (Py_ssize_t i = 0; i < 3 * n; i++) {
+        Mask y_here = y[i] == y[i], x_here = x[i] == x[i];
+        w[i / 3] = choose(y_here & x_here, w[i / 3], zero);
+        y[i] = choose(y_here, y[i], zero);
+        x[i] = choose(x_here, x[i], zero);
+    }
+}
+
+/* Read WIDTH rows of both sets, and of the weights if they are given. */
+INLINE void read_rows(const Sets *sets, Py_ssize_t row, Lanes *y, Lanes *x, Lanes *w)
+{
+    Py_ssize_t n = sets->n, count = sets->rows - row < WIDTH ? sets->rows - row : WIDTH;
+    gather(sets->y + row * sets->stride_y, sets->stride_y, 3 * n, count, y);
+    gather(sets->x + row * sets->stride_x, sets->stride_x, 3 * n, count, x);
+    if (sets->w)
+        gather(sets->w + row * sets->stride_w, sets->stride_w, n, count, w);
+}
+
+EVERY_MACHINE
+static void solve(const Sets *sets, Lanes *y, Lanes *x, Lanes *w)
+{
+    Py_ssize_t n = sets->n;
+    for (Py_ssize_t row = 0; row < sets->rows; row += WIDTH) {
+        Py_ssize_t count = sets->rows - row < WIDTH ? sets->rows - row : WIDTH;
+        Lanes c[3][3], r[3][3];
+        read_rows(sets, row, y, x, w);
+        Lanes error = dispersion(y, x, sets->w ? w : NULL, n, c);
+        if (any(error - error != all_equal(0.0))) {
+            for (Py_ssize_t i = 0; i < n; i++)
+                w[i] = all_equal(1.0);
+            read_rows(sets, row, y, x, w);
+            leave_out_absent(y, x, w, n);
+            error = dispersion(y, x, w, n, c);
+        }
+        Mask certain = certified_rotation(c, error, r);
+        for (int lane = 0; lane < count; lane++) {
+            double *out = sets->rotation + 9 * (row + lane);
+            for (int i = 0; i < 9; i++)
+                out[i] = LANE(r[i / 3][i % 3], lane);
+            sets->certain[row + lane] = LANE(certain, lane) != 0;
+        }
+    }
+}
+
+/* Keep `view` as doubles, C-contiguous; returns 0 with an exception set where it is not. */
+static int doubles(PyObject *array, int flags, Py_buffer *view)
+{
+    if (PyObject_GetBuffer(array, view, PyBUF_C_CONTIGUOUS | PyBUF_FORMAT | flags) < 0)
+        return 0;
+    if (view->itemsize == sizeof(double) && view->format && strcmp(view->format, "d") == 0)
+        return 1;
+    PyBuffer_Release(view);
+    PyErr_SetString(PyExc_TypeError, "expected arrays of float64");
+    return 0;
+}
+
+/* Numbers from one row to the next: 0 where an array has one row for all; -1 if its size is wrong. */
+static Py_ssize_t stride_of(const Py_buffer *view, Py_ssize_t rows, Py_ssize_t numbers)
+{
+    Py_ssize_t size = view->len / view->itemsize;
+    if (size == rows * numbers)
+        return numbers;
+    return size == numbers ? 0 : -1;
+}
+
+static PyObject *solve_sets(Py_buffer views[4], const Py_buffer *weight)
+{
+    Sets sets = {.rows = views[3].len / views[3].itemsize, .n = 0};
+    if (views[0].ndim < 2)
+        return PyErr_Format(PyExc_ValueError, "expected points (rows, n, 3)");
+    sets.n = views[0].shape[views[0].ndim - 2];
+    sets.stride_y = stride_of(&views[0], sets.rows, 3 * sets.n);
+    sets.stride_x = stride_of(&views[1], sets.rows, 3 * sets.n);
+    sets.stride_w = weight ? stride_of(weight, sets.rows, sets.n) : 0;
+    if (sets.n < 1 || sets.stride_y < 0 || sets.stride_x < 0 || sets.stride_w < 0 ||
+        stride_of(&views[2], sets.rows, 9) < 0 || views[3].itemsize != 1)
+        return PyErr_Format(PyExc_ValueError, "expected points (rows, n, 3), reference (rows or 1, "
+                            "n, 3), rotation (rows, 3, 3), certain (rows,), weights (rows or 1, n)");
+    sets.y = views[0].buf;
+    sets.x = views[1].buf;
+    sets.rotation = views[2].buf;
+    sets.certain = views[3].buf;
+    sets.w = weight ? weight->buf : NULL;
+    /* Vectors need addresses that are multiples of their size. */
+    size_t bytes = (size_t)(7 * sets.n) * sizeof(Lanes);
+    char *memory = malloc(bytes + sizeof(Lanes));
+    if (!memory)
+        return PyErr_NoMemory();
+    Lanes *lanes = (Lanes *)(memory + sizeof(Lanes) - (uintptr_t)memory % sizeof(Lanes));
+    Py_BEGIN_ALLOW_THREADS
+    solve(&sets, lanes, lanes + 3 * sets.n, lanes + 6 * sets.n);
+    Py_END_ALLOW_THREADS
+    free(memory);
+    Py_RETURN_NONE;
+}
+
+static PyObject *wahba(PyObject *self, PyObject *args)
+{
+    (void)self;
+    PyObject *arrays[5];
+    if (!PyArg_ParseTuple(args, "OOOOO", arrays, arrays + 1, arrays + 2, arrays + 3, arrays + 4))
+        return NULL;
+    Py_buffer views[4], weight;
+    int weighted = arrays[4] != Py_None, held = 0;
+    PyObject *done = NULL;
+    while (held < 3 && doubles(arrays[held], held == 2 ? PyBUF_WRITABLE : 0, &views[held]))
+        held++;
+    if (held == 3 && PyObject_GetBuffer(arrays[3], &views[3], PyBUF_CONTIG) == 0)
+        held++;
+    if (held == 4 && (!weighted || doubles(arrays[4], 0, &weight))) {
+        done = solve_sets(views, weighted ? &weight : NULL);
+        if (weighted)
+            PyBuffer_Release(&weight);
+    }
+    while (held > 0)
+        PyBuffer_Release(&views[--held]);
+    return done;
+}
+
+PyDoc_STRVAR(wahba_doc,
+"wahba(points, reference, rotation, certain, weights)\n--\n\n"
+"Write the rotations that carry reference sets onto points, and which of them are certain.\n\n"
+"points (rows, n, 3), reference (rows or 1, n, 3) and weights (rows or 1, n) or None are read;\n"
+"a point with a NaN is absent. rotation (rows, 3, 3) and certain (rows,) of bytes are written:\n"
+"rows that are not certain have to be decided by a singular value decomposition.");
+
+static PyMethodDef functions[] = {
+    {"wahba", wahba, METH_VARARGS, wahba_doc},
+    {NULL, NULL, 0, NULL},
+};
+
+static PyModuleDef_Slot slots[] = {{0, NULL}};
+
+static struct PyModuleDef module = {
+    PyModuleDef_HEAD_INIT, "kernels", "Compiled twins of functions of perrin.", 0,
+    functions, slots, NULL, NULL, NULL,
+};
+
+PyMODINIT_FUNC PyInit_kernels(void) { return PyModuleDef_Init(&module); }
