@@ -280,20 +280,55 @@ def likelihood_of_each(tracks: Sequence[NoisySteps]) -> list[Found]:
     [True, True]
     """
     found: list[Found | None] = [None] * len(tracks)
-    # Uneven steps are one tridiagonal system each, which has no gain from others.
-    even = [
-        i for i, t in enumerate(tracks) if t.steps.even and not t.drift and np.any(t.steps.vectors)
-    ]
-    for k in range(0, len(even), _TOGETHER):
-        rows = even[k : k + _TOGETHER]
-        some = [tracks[i] for i in rows]
+    moving = [i for i, t in enumerate(tracks) if np.any(t.steps.vectors)]
+    for rows in together([tracks[i] for i in moving]):
+        numbers = [moving[k] for k in rows]
+        some = [tracks[i] for i in numbers]
         likelihood = Likelihood.of(some).apart()
         best = likelihood.best()
         pairs = zip(some, best.D, best.theta, strict=True)
         wider = np.array([excess_scatter([t], float(D), theta[None]) for t, D, theta in pairs])
-        for i, one in zip(rows, _found_of_units(likelihood, best, wider), strict=True):
+        units = _found_of_units(likelihood, best, wider)
+        if some[0].drift:
+            mean, information = likelihood.steady_motion(best.D, best.theta)
+            errors = np.sqrt(np.diagonal(np.linalg.inv(information), axis1=1, axis2=2))
+            units = [
+                replace(one, drift=(tuple(own),), drift_stderr=(tuple(error),))
+                for one, own, error in zip(units, mean.tolist(), errors.tolist(), strict=True)
+            ]
+        for i, one in zip(numbers, units, strict=True):
             found[i] = one
-    return [by_likelihood([t]) if f is None else f for t, f in zip(tracks, found, strict=True)]
+    return [_NO_MOTION if f is None else f for f in found]
+
+
+def together(tracks: Sequence[NoisySteps]) -> list[list[int]]:
+    """Return the numbers of tracks in groups whose likelihoods are evaluated at once.
+
+    Even steps are evaluated in their sine modes, which is fastest for equally many of them.
+
+    Parameters
+    ----------
+    tracks : sequence of NoisySteps
+
+    Examples
+    --------
+    >>> from perrin import Cluster, simulate_motion
+    >>> from perrin.diffusion import Noise, NoisySteps, steps_of
+    >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=300, rng=3)
+    >>> track = NoisySteps.of(steps_of(truth, "rotation"), Noise())
+    >>> together([track, track])
+    [[0, 1]]
+    """
+    alike: dict[tuple[bool, int, bool], list[int]] = {}
+    for i, track in enumerate(tracks):
+        even = track.steps.even
+        key = even, len(track.steps.duration) if even else 0, track.drift
+        alike.setdefault(key, []).append(i)
+    return [
+        rows[low : low + _TOGETHER]
+        for rows in alike.values()
+        for low in range(0, len(rows), _TOGETHER)
+    ]
 
 
 def _found_of_units(likelihood: Likelihood, best: ProfilePoint, wider: Floats) -> list[Found]:

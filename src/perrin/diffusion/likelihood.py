@@ -347,16 +347,17 @@ class Likelihood:
                 break
         return np.where(has_low, x[count:], 0.0), x[:count]
 
-    def steady_motion(self, D: float, theta: Floats) -> tuple[Floats, Floats]:
+    def steady_motion(self, D: Floats | float, theta: Floats) -> tuple[Floats, Floats]:
         """Return the steady velocity or spin of every motion (G, p), lab axes, and its information.
 
-        The information (G, p, p) is the inverse of the covariance at this D and theta.
+        The information (G, p, p) is the inverse of the covariance at this D, one for all or (G,),
+        and theta.
         """
         p = self.tracks[0].steady.size
         mean, information = np.empty((len(theta), p)), np.empty((len(theta), p, p))
         for kernel in self.kernels:
             rows = kernel.groups
-            some = kernel.steady_motion(np.full(len(rows), D), theta[rows])
+            some = kernel.steady_motion(np.broadcast_to(D, theta.shape)[rows], theta[rows])
             mean[rows], information[rows] = some
         return mean + np.array([t.steady for t in self.tracks]), information
 

@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from perrin._arrays import from_plain, frozen, to_plain
-from perrin.diffusion.estimators import estimate_diffusion
+from perrin.diffusion.estimators import estimate_diffusion, estimate_each, together
 from perrin.diffusion.likelihood import Likelihood
 from perrin.diffusion.step_kernels import covariance_bands
 from perrin.diffusion.steps import NoisySteps, steps_of
 from perrin.errors import PrecisionWarning, TooFewFramesError
 from perrin.geometry.rotations import exp_map
+from perrin.motion.residuals import median_present
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -55,6 +56,8 @@ _MEDIAN_SQUARE = 0.4549  # median of chi-squared with one degree of freedom
 
 # Bodies move alike unless their displacements differ by more than at this level.
 _MOVE_ALIKE = 1e-4
+
+_MOST_AT_ONCE = 20_000  # steps that are tested at once; more do not stay in the processor's cache
 
 # A variance multiplied by this takes a step out of the prediction of the others.
 _LEFT_OUT = 1e6
@@ -193,9 +196,8 @@ def find_jumps(motion: RigidMotion, estimate: DiffusionEstimate) -> Jumps:
     likely = np.zeros(len(stop), dtype=np.bool_)
     without_jumps = estimate
     for _ in range(_MOST_CANDIDATE_ROUNDS):
-        more = _jump_candidates(
-            leave_one_out_residuals(motion, without_jumps, without=likely), likely
-        )
+        residuals = leave_one_out_residuals([motion], [without_jumps], without=likely[None])
+        more = _jump_candidates(residuals, likely[None])[0]
         if not more.any() or 2 * np.count_nonzero(likely | more) > len(stop):
             break
         likely |= more
@@ -205,17 +207,75 @@ def find_jumps(motion: RigidMotion, estimate: DiffusionEstimate) -> Jumps:
             return none
     if not likely.any():
         return none
-    residuals = leave_one_out_residuals(motion, without_jumps, without=likely).step
-    z, others = residuals[likely], residuals[~likely]
+    step = leave_one_out_residuals([motion], [without_jumps], without=likely[None]).step[0]
+    z, others = step[likely], step[~likely]
     count, d = others.shape
     # The residuals of a body at rest are a slow wave, of which one track has few periods: M may
     # then be small by chance. It is not taken smaller than 1, its value where the fit is right.
     square = np.sum((z @ _inverse_root(others.T @ others / count, least=1.0)) ** 2, axis=1)
     freedom = count - d + 1  # of Hotelling's T^2
     p = fdtrc(d, freedom, square * freedom / (d * count))
-    p = np.minimum(len(residuals) * p, 1.0)
+    p = np.minimum(len(step) * p, 1.0)
     found = np.flatnonzero(likely)[p < JUMP_LEVEL]
     return Jumps(stop[found], size[found], p[p < JUMP_LEVEL], len(stop))
+
+
+def find_jumps_of_each(
+    motions: Sequence[RigidMotion], estimates: Sequence[DiffusionEstimate]
+) -> list[Jumps]:
+    """Find the steps of several motions that Brownian motion cannot make, as `find_jumps`.
+
+    Motions with equally many steps are searched for candidates together.
+
+    Parameters
+    ----------
+    motions : sequence of RigidMotion
+    estimates : sequence of DiffusionEstimate
+        D of every motion.
+
+    Returns
+    -------
+    list of Jumps
+
+    Examples
+    --------
+    >>> from perrin import Cluster, estimate_diffusion, simulate_motion
+    >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=100, rng=3)
+    >>> jumps = find_jumps_of_each([truth] * 2, [estimate_diffusion(truth)] * 2)
+    >>> [one.rows.size for one in jumps]
+    [0, 0]
+    """
+    suspected = np.zeros(len(motions), dtype=np.bool_)
+    for rows in _equally_many_steps(motions, estimates):
+        some, own = [motions[k] for k in rows], [estimates[k] for k in rows]
+        none = np.zeros((len(rows), len(some[0].steps()[0])), dtype=np.bool_)
+        residuals = leave_one_out_residuals(some, own, without=none)
+        suspected[rows] = _jump_candidates(residuals, none).any(axis=1)
+    found = []
+    for motion, estimate, likely in zip(motions, estimates, suspected, strict=True):
+        if likely:
+            found.append(find_jumps(motion, estimate))
+            continue
+        stop = motion.steps()[1]
+        axes = motion.covariance.shape[-1] if estimate.quantity == "rotation" else motion.dimension
+        found.append(Jumps(stop[:0], np.empty((0, axes)), np.empty(0), len(stop)))
+    return found
+
+
+def _equally_many_steps(
+    motions: Sequence[RigidMotion], estimates: Sequence[DiffusionEstimate]
+) -> list[list[int]]:
+    """Return the numbers of motions that can be tested, in groups of equally many steps."""
+    alike: dict[tuple[int, int], list[int]] = {}
+    for k, (motion, estimate) in enumerate(zip(motions, estimates, strict=True)):
+        count = len(motion.steps()[0])
+        if count >= _FEWEST_STEPS and estimate.value > 0:
+            alike.setdefault((count, motion.dimension), []).append(k)
+    groups = []
+    for (count, _), rows in alike.items():
+        at_once = max(1, _MOST_AT_ONCE // count)
+        groups += [rows[low : low + at_once] for low in range(0, len(rows), at_once)]
+    return groups
 
 
 @dataclass(frozen=True, eq=False)
@@ -399,6 +459,8 @@ def cut_at(motion: RigidMotion, rows: Ints) -> RigidMotion:
     >>> cut_at(truth, np.array([2])).steps()[1].tolist()
     [1, 3, 4]
     """
+    if not len(rows):
+        return motion
     begins = np.zeros(len(motion.time), dtype=np.int64)
     begins[rows] = 1
     return replace(motion, piece=motion.piece + np.cumsum(begins))
@@ -458,10 +520,50 @@ def steady_motion(motion: RigidMotion, estimate: DiffusionEstimate) -> SteadyMot
     >>> found.p < 1e-6, abs(found.value[0] - 1) < 4 * found.stderr[0]
     (True, True)
     """
-    found = _steady_motion_at(motion, estimate)
-    if found.p > _CLEARLY_STILL or not estimate.value > 0:
-        return found
-    return _steady_motion_at(motion, _estimated_alike(motion, estimate, drift=True))
+    return steady_motion_of_each([motion], [estimate])[0]
+
+
+def steady_motion_of_each(
+    motions: Sequence[RigidMotion], estimates: Sequence[DiffusionEstimate]
+) -> list[SteadyMotion]:
+    """Test several motions for a mean velocity or spin, as `steady_motion`, all of them together.
+
+    Parameters
+    ----------
+    motions : sequence of RigidMotion
+    estimates : sequence of DiffusionEstimate
+        D of every motion, all of one quantity and with the same settings.
+
+    Returns
+    -------
+    list of SteadyMotion
+
+    Examples
+    --------
+    >>> from perrin import Cluster, estimate_diffusion, simulate_motion
+    >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=100, rng=3)
+    >>> first, second = steady_motion_of_each([truth] * 2, [estimate_diffusion(truth)] * 2)
+    >>> first.p == second.p
+    True
+    """
+    found = _steady_motions_at(motions, estimates)
+    moving = [
+        k
+        for k, (one, estimate) in enumerate(zip(found, estimates, strict=True))
+        if not one.p > _CLEARLY_STILL and estimate.value > 0
+    ]
+    if moving:
+        some = [motions[k] for k in moving]
+        settings = replace(estimates[moving[0]].settings, drift=True)
+        again = estimate_each(some, quantity=estimates[moving[0]].quantity, noise=settings)
+        free = []
+        for one in again:
+            if isinstance(one, TooFewFramesError):
+                raise one
+            free.append(one)
+        for k, one in zip(moving, _steady_motions_at(some, free), strict=True):
+            found[k] = one
+    return found
 
 
 def offset_gain(motion: RigidMotion, estimate: DiffusionEstimate, *, sigma: float) -> float:
@@ -490,14 +592,54 @@ def offset_gain(motion: RigidMotion, estimate: DiffusionEstimate, *, sigma: floa
     >>> [round(offset_gain(motion, estimate, sigma=s)) for s in (0.03, 0.06)]
     [0, 23]
     """
-    steps = steps_of(motion, estimate.quantity)
-    settings = estimate.settings
-    free = NoisySteps.of(steps, settings)
-    known = NoisySteps.of(steps, replace(settings, model=float(sigma)))
-    # The estimate is the maximum of the likelihood with the noise left free.
-    at_estimate = np.array([estimate.value]), np.array([_theta(free, estimate)])
-    best = Likelihood.of([free]).sums(*at_estimate).value[0]
-    return max(2 * float(best - Likelihood.of([known]).best().value[0]), 0.0)
+    return offset_gain_of_each([motion], [estimate], sigma=[sigma])[0]
+
+
+def offset_gain_of_each(
+    motions: Sequence[RigidMotion],
+    estimates: Sequence[DiffusionEstimate],
+    *,
+    sigma: Sequence[float],
+) -> list[float]:
+    """Return the gains of a free noise offset for several motions, as `offset_gain`.
+
+    Parameters
+    ----------
+    motions : sequence of RigidMotion
+    estimates : sequence of DiffusionEstimate
+        D of every motion with noise "joint".
+    sigma : sequence of float
+        Localisation error of each, um (rms over axes).
+
+    Returns
+    -------
+    list of float
+
+    Examples
+    --------
+    >>> from perrin import Cluster, add_noise, estimate_diffusion, simulate_motion, track_rotation
+    >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=1e-3, dt=0.7, n_frames=100, rng=3)
+    >>> motion = track_rotation(add_noise(truth.positions(), sigma=0.03, rng=4), dt=0.7)
+    >>> found = estimate_diffusion(motion)
+    >>> [round(x) for x in offset_gain_of_each([motion] * 2, [found] * 2, sigma=[0.03, 0.06])]
+    [0, 23]
+    """
+    gains = np.zeros(len(motions))
+    steps = [steps_of(m, e.quantity) for m, e in zip(motions, estimates, strict=True)]
+    free = [NoisySteps.of(s, e.settings) for s, e in zip(steps, estimates, strict=True)]
+    known = [
+        NoisySteps.of(s, replace(e.settings, model=float(own)))
+        for s, e, own in zip(steps, estimates, sigma, strict=True)
+    ]
+    for rows in together(free):
+        own = [estimates[k] for k in rows]
+        theta = np.array([_theta(free[k], e) for k, e in zip(rows, own, strict=True)])
+        # The estimate is the maximum of the likelihood with the noise left free.
+        best = Likelihood.of([free[k] for k in rows]).apart()
+        highest = best.sums(np.array([e.value for e in own]), theta).value
+        fixed = Likelihood.of([known[k] for k in rows]).apart().best().value
+        gains[rows] = np.maximum(2 * (highest - fixed), 0.0)
+    return [float(gain) for gain in gains]
 
 
 def persistence_gain(
@@ -546,38 +688,50 @@ def persistence_gain(
     return max(2 * (values[0] - values[1]), 0.0)
 
 
-def _steady_motion_at(motion: RigidMotion, estimate: DiffusionEstimate) -> SteadyMotion:
-    """Return the generalised least-squares steady motion at the D and noise of an estimate."""
+def _steady_motions_at(
+    motions: Sequence[RigidMotion], estimates: Sequence[DiffusionEstimate]
+) -> list[SteadyMotion]:
+    """Return the generalised least-squares steady motion at the D and noise of each estimate."""
     from scipy.special import fdtrc
 
-    steps = steps_of(motion, estimate.quantity)
-    track = NoisySteps.of(steps, replace(estimate.settings, drift=True))
-    likelihood = Likelihood.of([track])
-    D = max(estimate.value, 1e-12 * float(likelihood.scale[0]))
-    means, informations = likelihood.steady_motion(D, np.array([_theta(track, estimate)]))
-    mean, information = means[0], informations[0]
-    count, d = len(steps.duration), len(mean)
-    square = float(mean @ information @ mean) * (count - 1) / count
-    freedom = 2 * (estimate.value / estimate.stderr) ** 2 if estimate.stderr > 0 else np.inf
-    p = float(fdtrc(d, min(max(freedom, 1.0), 1e9), square / d))
-    error = np.sqrt(np.diagonal(np.linalg.inv(information)))
-    return SteadyMotion(tuple(mean.tolist()), tuple(error.tolist()), p)
+    tracks = [
+        NoisySteps.of(steps_of(m, e.quantity), replace(e.settings, drift=True))
+        for m, e in zip(motions, estimates, strict=True)
+    ]
+    found: dict[int, SteadyMotion] = {}
+    for rows in together(tracks):
+        some, own = [tracks[k] for k in rows], [estimates[k] for k in rows]
+        likelihood = Likelihood.of(some).apart()
+        value = np.array([e.value for e in own])
+        theta = np.array([_theta(t, e) for t, e in zip(some, own, strict=True)])
+        D = np.maximum(value, 1e-12 * likelihood.scale)
+        means, informations = likelihood.steady_motion(D, theta)
+        counts, d = np.array([len(t.steps.duration) for t in some]), means.shape[1]
+        square = np.einsum("gp,gpq,gq->g", means, informations, means) * (counts - 1) / counts
+        stderr = np.array([e.stderr for e in own])
+        freedom = 2 * np.divide(value, stderr, out=np.full(len(own), np.inf), where=stderr > 0) ** 2
+        p = fdtrc(d, np.clip(freedom, 1.0, 1e9), square / d)
+        inverse = np.linalg.inv(informations)
+        errors = np.sqrt(np.diagonal(inverse, axis1=1, axis2=2))
+        parts = zip(rows, means.tolist(), errors.tolist(), p.tolist(), strict=True)
+        found |= {k: SteadyMotion(tuple(m), tuple(error), chance) for k, m, error, chance in parts}
+    return [found[k] for k in range(len(motions))]
 
 
 class StepResiduals(NamedTuple):
-    """Standardised residuals of steps, and of frames that two steps share.
+    """Standardised residuals of the S steps of B motions, and of frames that two steps share.
 
     Attributes
     ----------
-    step : ndarray, shape (S, A)
+    step : ndarray, shape (B, S, A)
         Standardised difference of each step from its prediction from all others.
-    length : ndarray, shape (S, A)
+    length : ndarray, shape (B, S, A)
         Each step over its standard deviation.
-    frame : ndarray, shape (S - 1, A)
+    frame : ndarray, shape (B, S - 1, A)
         Standardised displacement of the frame between two steps from its prediction.
-    linked : ndarray of bool, shape (S - 1,)
+    linked : ndarray of bool, shape (B, S - 1)
         Whether the two steps share that frame.
-    measured_badly : ndarray of bool, shape (S - 1,)
+    measured_badly : ndarray of bool, shape (B, S - 1)
         Whether localisation, by the frame's own rigid-fit residual, explains its displacement.
     """
 
@@ -589,107 +743,147 @@ class StepResiduals(NamedTuple):
 
 
 def leave_one_out_residuals(
-    motion: RigidMotion, estimate: DiffusionEstimate, *, without: Bools
+    motions: Sequence[RigidMotion], estimates: Sequence[DiffusionEstimate], *, without: Bools
 ) -> StepResiduals:
     """Return the residual of each step given all others but those `without`, standardised.
 
-    An estimate with drift was fitted without them as well.
+    The motions have equally many steps, S. An estimate with drift was fitted without the steps
+    `without` (B, S) as well.
 
     Examples
     --------
     >>> from perrin import Cluster, simulate_motion
     >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=300, rng=3)
     >>> from perrin import estimate_diffusion
-    >>> none = np.zeros(299, dtype=bool)
-    >>> residuals = leave_one_out_residuals(truth, estimate_diffusion(truth), without=none)
+    >>> none = np.zeros((1, 299), dtype=bool)
+    >>> residuals = leave_one_out_residuals([truth], [estimate_diffusion(truth)], without=none)
     >>> bool(abs(residuals.step.std() - 1) < 0.1)
     True
     """
     from scipy.linalg.lapack import dpttrf, dpttrs
 
-    track = NoisySteps.of(steps_of(motion, estimate.quantity), estimate.settings)
-    s = track.steps
-    y, linked = s.vectors, s.linked[:-1]
-    if estimate.drift is not None and without.any():
-        y = s.without_steady_motion(kept=~without)[0].vectors
-    diagonal, off_diagonal = covariance_bands(
-        estimate.value,
-        _theta(track, estimate),
-        s.duration[:, None],
-        s.linked[:, None],
-        blur=track.blur,
-        weight=track.weight,
-        known=track.known,
+    tracks = [
+        NoisySteps.of(steps_of(m, e.quantity), e.settings)
+        for m, e in zip(motions, estimates, strict=True)
+    ]
+    y = np.stack(
+        [
+            t.steps.without_steady_motion(kept=~omitted)[0].vectors
+            if e.drift is not None and omitted.any()
+            else t.steps.vectors
+            for t, e, omitted in zip(tracks, estimates, without, strict=True)
+        ]
     )
-    step, frame = np.empty_like(y), np.zeros((len(y) - 1, y.shape[1]))
-    for axis in range(y.shape[1]):
-        extra = _LEFT_OUT * diagonal[:, axis] * without
-        a, b = diagonal[:, axis] + extra, off_diagonal[:, axis]
-        d, lower, bad = dpttrf(a, b)
-        up, _, bad_up = dpttrf(a[::-1], b[::-1])
-        if bad or bad_up:
-            none = np.zeros_like(y)
-            return StepResiduals(none, none, frame, linked, linked)
-        z, _ = dpttrs(d, lower, y[:, axis])
-        inverse = 1 / (d + up[::-1] - a)
-        corner = -lower * inverse[1:]
-        step[:, axis] = z / inverse / np.sqrt(1 / inverse - extra)
-        variance = inverse[:-1] + inverse[1:] - 2 * corner
-        frame[:, axis] = (z[:-1] - z[1:]) / np.sqrt(variance)
-    displacement = 0.25 * np.sum((y[:-1] - y[1:]) ** 2, axis=1)
-    residual = motion.residual[s.stop[:-1]]
-    usual = float(np.nanmedian(motion.residual))
-    worse = np.maximum(residual / usual, 1.0) ** 2 if usual > 0 else np.ones_like(residual)
-    expected = motion.sigma**2 * s.variances[1][:-1].sum(axis=1) * worse
-    badly = np.asarray(displacement <= _BADLY_MEASURED * expected)
-    return StepResiduals(step, y / np.sqrt(diagonal), frame, linked, badly)
+    linked = np.stack([t.steps.linked for t in tracks])
+    shape = (len(tracks), y.shape[2], y.shape[1])
+
+    def along_rows(x: Floats | Bools) -> Floats:
+        """Return numbers of every step (B, S, A) as rows, one axis of one motion after another."""
+        rows = np.swapaxes(np.broadcast_to(x, y.shape), 1, 2)
+        return np.ascontiguousarray(rows, dtype=np.float64).ravel()
+
+    def of_motion(numbers: Sequence[float]) -> Floats:
+        return along_rows(np.array(numbers)[:, None, None])
+
+    def by_step(rows: Floats) -> Floats:
+        return np.ascontiguousarray(np.swapaxes(rows.reshape(shape), 1, 2))
+
+    diagonal, off_diagonal = covariance_bands(
+        of_motion([e.value for e in estimates]),
+        of_motion([_theta(t, e) for t, e in zip(tracks, estimates, strict=True)]),
+        along_rows(np.stack([t.steps.duration for t in tracks])[..., None]),
+        along_rows(linked[..., None]),
+        blur=of_motion([t.blur for t in tracks]),
+        weight=tuple(along_rows(np.stack([t.weight[k] for t in tracks])) for k in (0, 1)),
+        known=tuple(along_rows(np.stack([t.known[k] for t in tracks])) for k in (0, 1)),
+    )
+    extra = _LEFT_OUT * diagonal * along_rows(without[..., None])
+    a, b = diagonal + extra, off_diagonal
+    d, lower, bad = dpttrf(a, b)
+    up, _, bad_up = dpttrf(a[::-1], b[::-1])
+    if (bad or bad_up) and len(tracks) > 1:
+        # One of the motions has no positive definite covariance.
+        singly = [
+            leave_one_out_residuals([m], [e], without=omitted[None])
+            for m, e, omitted in zip(motions, estimates, without, strict=True)
+        ]
+        return StepResiduals(*(np.concatenate(parts) for parts in zip(*singly, strict=True)))
+    pairs = linked[:, :-1]
+    if bad or bad_up:
+        return StepResiduals(0 * y, 0 * y, 0 * y[:, 1:], pairs, pairs)
+    z, _ = dpttrs(d, lower, along_rows(y))
+    inverse = 1 / (d + up[::-1] - a)
+    corner = np.append(-lower * inverse[1:], 0.0)
+    step = by_step(z / inverse / np.sqrt(1 / inverse - extra))
+    z, inverse, corner = by_step(z), by_step(inverse), by_step(corner)
+    variance = inverse[:, :-1] + inverse[:, 1:] - 2 * corner[:, :-1]
+    frame = (z[:, :-1] - z[:, 1:]) / np.sqrt(variance)
+    displacement = 0.25 * np.sum((y[:, :-1] - y[:, 1:]) ** 2, axis=2)
+    pairs_of = list(zip(motions, tracks, strict=True))
+    residual = np.stack([m.residual[t.steps.stop[:-1]] for m, t in pairs_of])
+    usual = np.array([median_present(m.residual) for m in motions])[:, None]
+    worse = np.divide(residual, usual, out=np.ones_like(residual), where=usual > 0)
+    worse = np.where(usual > 0, np.maximum(worse, 1.0) ** 2, 1.0)
+    noise = [m.sigma**2 * t.steps.variances[1][:-1].sum(axis=1) for m, t in pairs_of]
+    badly = np.asarray(displacement <= _BADLY_MEASURED * np.stack(noise) * worse)
+    return StepResiduals(step, y / np.sqrt(by_step(diagonal)), frame, pairs, badly)
 
 
 def _jump_candidates(residuals: StepResiduals, known: Bools) -> Bools:
-    """Return further steps that differ from the bulk and are not due to one displaced frame."""
+    """Return further steps (B, S) unlike the bulk that are not due to one displaced frame."""
     from scipy.special import chdtri
 
-    count = len(known)
+    count = known.shape[1]
     displaced = np.where(
         residuals.linked & residuals.measured_badly,
         _robust_square(residuals.frame, residuals.step),
         0.0,
     )
-    around = np.maximum(np.append(displaced, 0.0), np.append(0.0, displaced))
+
+    def before(x: Floats | Bools) -> Floats | Bools:
+        return np.pad(x, ((0, 0), (1, 0)))
+
+    def after(x: Floats | Bools) -> Floats | Bools:
+        return np.pad(x, ((0, 0), (0, 1)))
+
+    around = np.maximum(after(displaced), before(displaced))
     # The first and the last frame of a piece belong to one step only: a jump there isolates one
     # frame, and a badly measured frame explains it as well.
-    inside = np.append(False, residuals.linked) & np.append(residuals.linked, False)
-    limit = chdtri(residuals.step.shape[1], _CANDIDATE_LEVEL / count)
+    inside = before(residuals.linked) & after(residuals.linked)
+    limit = chdtri(residuals.step.shape[2], _CANDIDATE_LEVEL / count)
     given_others = _robust_square(residuals.step, residuals.step)
     # Jumps back and forth resemble noise once the noise is fitted to them: the length alone.
     alone = np.where(around == 0, _robust_square(residuals.length, residuals.length), 0.0)
     # A jump distorts the prediction of its neighbours: the largest of them is taken first.
-    largest = np.maximum(np.append(given_others[1:], 0.0), np.append(0.0, given_others[:-1]))
+    largest = np.maximum(after(given_others[:, 1:]), before(given_others[:, :-1]))
     likely = (given_others > limit) & (given_others > around) & (given_others > largest)
     return np.asarray((likely | (alone > limit)) & inside & ~known)
 
 
 def _robust_square(z: Floats, bulk: Floats) -> Floats:
-    """Return z^T M^-1 z with M from the half of `bulk` that is shortest, scaled to chi-squared."""
+    """Return z^T M^-1 z (B, K) with M from the half of `bulk` that is shortest, as chi-squared."""
     from scipy.special import chdtri
 
-    power = np.sum(bulk**2 / np.maximum(np.median(bulk**2, axis=0), 1e-300), axis=1)
-    short = bulk[power <= np.median(power)]
-    root = _inverse_root(short.T @ short / len(short))
-    median = float(np.median(np.sum((bulk @ root) ** 2, axis=1)))
-    if not median > 0:
-        return np.zeros(len(z))
-    return np.asarray(np.sum((z @ root) ** 2, axis=1) * chdtri(z.shape[1], 0.5) / median)
+    typical = np.median(bulk**2, axis=1, keepdims=True)
+    power = np.sum(bulk**2 / np.maximum(typical, 1e-300), axis=2)
+    short = power <= np.median(power, axis=1, keepdims=True)
+    half = np.where(short[..., None], bulk, 0.0)
+    mean = np.swapaxes(half, 1, 2) @ half / short.sum(axis=1)[:, None, None]
+    root = _inverse_root(mean)
+    median = np.median(np.sum((bulk @ root) ** 2, axis=2), axis=1)
+    scale = np.divide(chdtri(z.shape[2], 0.5), median, out=np.zeros_like(median), where=median > 0)
+    return np.asarray(np.sum((z @ root) ** 2, axis=2) * scale[:, None])
 
 
 def _inverse_root(a: Floats, *, least: float = 0.0) -> Floats:
-    """Return A^(-1/2) of a covariance with eigenvalues of `least` or more.
+    """Return A^(-1/2) of covariances (..., A, A) with eigenvalues of `least` or more.
 
-    Axes without any motion are left out.
+    Axes without any motion are 0.
     """
     values, axes = np.linalg.eigh(a)
-    moves = values > 1e-12 * max(float(values[-1]), 1e-300)
-    return np.asarray(axes[:, moves] / np.sqrt(np.maximum(values[moves], least)))
+    moves = values > 1e-12 * np.maximum(values[..., -1:], 1e-300)
+    root = np.sqrt(np.maximum(np.where(moves, values, 1.0), least))
+    return np.asarray(axes * np.where(moves, 1 / root, 0.0)[..., None, :])
 
 
 def _theta(track: NoisySteps, estimate: DiffusionEstimate) -> float:

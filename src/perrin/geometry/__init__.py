@@ -30,6 +30,7 @@ from perrin.geometry.symmetry import (
     rotation_group,
     schoenflies,
     symmetry_elements,
+    symmetry_elements_of_each,
 )
 from perrin.geometry.wahba import (
     certified_rotation,
@@ -73,5 +74,6 @@ __all__ = [
     "successive_product",
     "svd_rotation",
     "symmetry_elements",
+    "symmetry_elements_of_each",
     "unit_quaternion",
 ]

@@ -71,15 +71,21 @@ def inertia_tensor(arm: Floats) -> Floats:
 
     Parameters
     ----------
-    arm : ndarray, shape (n, 3)
+    arm : ndarray, shape (..., n, 3)
         Positions relative to their centre, um.
+
+    Returns
+    -------
+    ndarray, shape (..., 3, 3)
 
     Examples
     --------
     >>> inertia_tensor(np.array([[0.0, 0, 1.0], [0, 0, -1.0]])).diagonal()
     array([2., 2., 0.])
     """
-    return np.sum(arm * arm) * np.eye(3) - arm.T @ arm
+    square = np.sum(arm * arm, axis=(-2, -1))[..., None, None]
+    tensor: Floats = square * np.eye(3) - np.swapaxes(arm, -1, -2) @ arm
+    return tensor
 
 
 def orientation_covariance(positions: Floats, noise: Floats) -> Floats:
@@ -87,7 +93,7 @@ def orientation_covariance(positions: Floats, noise: Floats) -> Floats:
 
     Parameters
     ----------
-    positions : ndarray, shape (n, d)
+    positions : ndarray, shape (..., n, d)
         Particles used for the fit, body axes; their mean need not be at the origin.
     noise : ndarray, shape (..., d, d)
         Covariance of the localisation error in body axes.
@@ -107,20 +113,21 @@ def orientation_covariance(positions: Floats, noise: Floats) -> Floats:
     >>> orientation_covariance(pair, 0.01 * np.eye(2))
     array([[0.005]])
     """
-    r = positions - positions.mean(0)
+    r = positions - positions.mean(axis=-2, keepdims=True)
     slopes = pose_slopes(r)
-    if r.shape[1] == 2:
+    if r.shape[-1] == 2:
         across = slopes[..., 0]
-        inertia = float((r * r).sum())
-        variance = np.einsum("ia,...ab,ib->...", across, noise, across) / inertia**2
+        inertia = (r * r).sum(axis=(-2, -1))
+        variance = np.einsum("...ia,...ab,...ib->...", across, noise, across) / inertia**2
         return np.asarray(variance)[..., None, None]
-    response = np.linalg.inv(inertia_tensor(r)) @ np.swapaxes(slopes[..., :3], -1, -2)
-    covariance: Floats = np.einsum("iab,...bc,idc->...ad", response, noise, response)
+    inverse = np.linalg.inv(inertia_tensor(r))[..., None, :, :]
+    response = inverse @ np.swapaxes(slopes[..., :3], -1, -2)
+    covariance: Floats = np.einsum("...iab,...bc,...idc->...ad", response, noise, response)
     # Symmetric to the last bit, as tables store one triangle of it.
     return 0.5 * (covariance + np.swapaxes(covariance, -1, -2))
 
 
-def center_variance(positions: Floats, present: Bools, sigma: float) -> float:
+def center_variance(positions: Floats, present: Bools, sigma: float | Floats) -> Floats:
     """Return the variance (um^2, mean over axes) of a cluster's centre fitted from some particles.
 
     With particles missing the centre is extrapolated along the body, so the error of the
@@ -128,12 +135,16 @@ def center_variance(positions: Floats, present: Bools, sigma: float) -> float:
 
     Parameters
     ----------
-    positions : ndarray, shape (n, d)
-        All particles of the body, um, their centre at the origin.
+    positions : ndarray, shape (..., n, d)
+        All particles of a body, um, their centre at the origin.
     present : ndarray of bool, shape (n,)
         Whether the pose is fitted to each particle.
-    sigma : float
+    sigma : float or ndarray, shape (...)
         Localisation error of one coordinate, um.
+
+    Returns
+    -------
+    ndarray, shape (...)
 
     Examples
     --------
@@ -143,16 +154,18 @@ def center_variance(positions: Floats, present: Bools, sigma: float) -> float:
     >>> bool(all_three < two)
     True
     """
-    seen = positions[present]
-    lever = seen.mean(0)
-    variance = sigma**2 / len(seen)
+    seen, d = positions[..., present, :], positions.shape[-1]
+    lever = seen.mean(axis=-2)
+    square = np.broadcast_to(np.asarray(sigma, dtype=np.float64) ** 2, lever.shape[:-1])
+    variance = square / seen.shape[-2]
     if present.all():
-        return variance
-    covariance = orientation_covariance(seen, sigma**2 * np.eye(positions.shape[1]))
-    if positions.shape[1] == 2:
-        return float(variance + lever @ lever * covariance[0, 0] / 2)
-    arm = pose_slopes(lever)[:, :3]
-    return float(variance + np.trace(arm @ covariance @ arm.T) / 3)
+        return np.asarray(variance)
+    covariance = orientation_covariance(seen, square[..., None, None] * np.eye(d))
+    if d == 2:
+        return np.asarray(variance + (lever * lever).sum(axis=-1) * covariance[..., 0, 0] / 2)
+    arm = pose_slopes(lever)[..., :3]
+    spread = np.einsum("...ia,...ab,...ib->...", arm, covariance, arm)
+    return np.asarray(variance + spread / 3)
 
 
 def shifted(tensor: Floats, point: ArrayLike) -> Floats:

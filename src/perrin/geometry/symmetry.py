@@ -130,7 +130,7 @@ def matching_rotation(x: Floats, onto: Floats, *, tolerance: float) -> Floats | 
     >>> np.allclose(np.sort((x @ R.T)[:, 0]), np.sort(x[:, 1]))
     True
     """
-    order, miss = _congruences(x, onto, tolerance)
+    _, order, miss = _congruences(x[None], onto[None], np.array([tolerance]))
     if not miss.size:
         return None
     rotation: Floats = fit_rotations(onto[order[np.argmin(miss)]][None], x)[0][0]
@@ -175,42 +175,57 @@ def _line_rotations(line: Floats, d: int, tolerance: float) -> Floats:
     return np.stack([np.eye(d), half])
 
 
-def _congruences(x: Floats, onto: Floats, tolerance: float) -> tuple[Ints, Floats]:
-    """Return the permutations p with R x_i = onto_p(i) for a rotation R, and their largest misfit.
+def _congruences(x: Floats, onto: Floats, tolerance: Floats) -> tuple[Ints, Ints, Floats]:
+    """Return the permutations p with R x_i = onto_p(i) for a rotation R, of each of B bodies.
 
     Two particles that are not on one line with the origin determine R. Each pair of `onto` at the
     same distances is tried as their image, and the permutation of all particles is refined.
+
+    Parameters
+    ----------
+    x, onto : ndarray, shape (B, n, 3)
+    tolerance : ndarray, shape (B,)
+
+    Returns
+    -------
+    body : ndarray of int, shape (K,)
+        Body that each of the permutations belongs to.
+    order : ndarray of int, shape (K, n)
+    misfit : ndarray, shape (K,)
+        Largest distance of a rotated particle from the one it is mapped to.
     """
+    bodies, n = np.arange(len(x)), x.shape[1]
     # The pair with the largest cross product determines R most precisely.
-    area = np.linalg.norm(np.cross(x[:, None], x[None]), axis=2)
-    i, j = map(int, np.unravel_index(np.argmax(area), area.shape))
-    gap, radius = np.linalg.norm(x[i] - x[j]), np.linalg.norm(x[[i, j]], axis=1)
-    onto_radius = np.linalg.norm(onto, axis=1)
-    alike = (
-        (np.abs(onto_radius[:, None] - radius[0]) <= 2 * tolerance)
-        & (np.abs(onto_radius - radius[1]) <= 2 * tolerance)
-        & (np.abs(np.linalg.norm(onto[:, None] - onto, axis=2) - gap) <= 4 * tolerance)
-    )
-    k, m = np.nonzero(alike)
-    if not k.size:
-        return np.empty((0, len(x)), dtype=np.int64), np.empty(0)
-    origin = np.zeros((len(k), 3))
-    rotation, unique = fit_rotations(
-        np.stack([origin, onto[k], onto[m]], axis=1), np.stack([np.zeros(3), x[i], x[j]])
-    )
-    rotation, order = rotation[unique], np.empty((0, len(x)), dtype=np.int64)
+    area = np.linalg.norm(np.cross(x[:, :, None], x[:, None]), axis=3)
+    i, j = np.unravel_index(np.argmax(area.reshape(len(x), -1), axis=1), (n, n))
+    first, second = x[bodies, i], x[bodies, j]
+    gap = np.linalg.norm(first - second, axis=1)[:, None, None]
+    radius = np.linalg.norm(np.stack([first, second]), axis=2)[..., None]
+    onto_radius = np.linalg.norm(onto, axis=2)
+    near = 2 * tolerance[:, None]
+    alike = (np.abs(onto_radius - radius[0]) <= near)[:, :, None]
+    alike = alike & (np.abs(onto_radius - radius[1]) <= near)[:, None]
+    apart = np.linalg.norm(onto[:, :, None] - onto[:, None], axis=3)
+    alike &= np.abs(apart - gap) <= 4 * tolerance[:, None, None]
+    body, k, m = np.nonzero(alike)
+    origin = np.zeros((len(body), 3))
+    images = np.stack([origin, onto[body, k], onto[body, m]], axis=1)
+    rotation, unique = fit_rotations(images, np.stack([origin, first[body], second[body]], axis=1))
+    rotation, body, order = rotation[unique], body[unique], np.empty((0, n), dtype=np.int64)
     for _ in range(3):
-        rotated, before = x @ np.swapaxes(rotation, 1, 2), order
-        order = np.argmin(np.linalg.norm(rotated[:, :, None] - onto, axis=3), axis=2)
-        order = order[(np.sort(order, axis=1) == np.arange(len(x))).all(axis=1)]
-        if not order.size:
-            return order, np.empty(0)
+        rotated, before = x[body] @ np.swapaxes(rotation, 1, 2), order
+        away = np.linalg.norm(rotated[:, :, None] - onto[body][:, None], axis=3)
+        order = np.argmin(away, axis=2)
+        permutes = (np.sort(order, axis=1) == np.arange(n)).all(axis=1)
+        order, body = order[permutes], body[permutes]
         if np.array_equal(order, before):
             break
-        rotation, unique = fit_rotations(onto[order], x)
-        order, rotation = order[unique], rotation[unique]
-    misfit = np.linalg.norm(x @ np.swapaxes(rotation, 1, 2) - onto[order], axis=2).max(axis=1)
-    return order[misfit <= tolerance], misfit[misfit <= tolerance]
+        rotation, unique = fit_rotations(onto[body[:, None], order], x[body])
+        order, rotation, body = order[unique], rotation[unique], body[unique]
+    away = x[body] @ np.swapaxes(rotation, 1, 2) - onto[body[:, None], order]
+    misfit = np.linalg.norm(away, axis=2).max(axis=1)
+    kept = misfit <= tolerance[body]
+    return body[kept], order[kept], misfit[kept]
 
 
 def symmetry_elements(x: Floats, tolerance: float) -> Floats:
@@ -233,28 +248,91 @@ def symmetry_elements(x: Floats, tolerance: float) -> Floats:
     >>> symmetry_elements(Cluster.tetrahedron(1.5).positions, 0.01).shape
     (24, 3, 3)
     """
-    tolerance = max(tolerance, 1e-12 * float(np.abs(x).max()))
-    misfit = {
-        (sign, *map(int, order)): largest
-        for sign in (1, -1)
-        for order, largest in zip(*_congruences(x, sign * x, 2 * tolerance), strict=True)
-    }
-    identity = (1, *range(len(x)))
-    group = {identity}
-    for element in sorted(misfit, key=lambda e: (misfit[e], e)):
-        if misfit[element] > tolerance:
-            break
-        if element not in group:
-            group = _generated_group(group | {element}, set(misfit)) or group
-    elements = np.array([identity, *sorted(group - {identity}, reverse=True)])
-    # Averaging the body over the group makes it symmetric, and the matrices exact, to rounding.
-    sign, order = elements[:, 0, None, None], elements[:, 1:]
+    return symmetry_elements_of_each(x[None], np.array([tolerance]))[0]
+
+
+def symmetry_elements_of_each(x: Floats, tolerance: Floats) -> list[Floats]:
+    """Return the point groups of several bodies, as `symmetry_elements`.
+
+    Bodies with the same permutations have the same group.
+
+    Parameters
+    ----------
+    x : ndarray, shape (B, n, 3)
+        Centred positions of the particles of each body, which are not on one line.
+    tolerance : ndarray, shape (B,)
+        Largest distance (um) of a mapped particle from the one it is mapped to.
+
+    Returns
+    -------
+    list of ndarray, shape (g, 3, 3)
+
+    Examples
+    --------
+    >>> x = np.stack([Cluster.tetrahedron(1.5).positions, Cluster.tetrahedron(2.0).positions])
+    >>> [len(elements) for elements in symmetry_elements_of_each(x, np.full(2, 0.01))]
+    [24, 24]
+    """
+    tolerance = np.maximum(tolerance, 1e-12 * np.abs(x).max(axis=(1, 2)))
+    misfits: list[dict[_Element, float]] = [{} for _ in x]
+    for sign in (1, -1):
+        found = _congruences(x, sign * x, 2 * tolerance)
+        for body, order, misfit in zip(*(part.tolist() for part in found), strict=True):
+            misfits[body][sign, *order] = misfit
+    groups: dict[tuple[_Element, ...], list[int]] = {}
+    generated: dict[tuple[frozenset[_Element], frozenset[_Element]], set[_Element] | None] = {}
+    for k, (misfit, own) in enumerate(zip(misfits, tolerance.tolist(), strict=True)):
+        group = _group_within(misfit, own, x.shape[1], generated)
+        groups.setdefault(group, []).append(k)
+    matrices: dict[int, Floats] = {}
+    for group, bodies in groups.items():
+        elements = np.array(group, dtype=np.int64)
+        exact = _exact_elements(x[bodies], elements[:, 0, None, None], elements[:, 1:])
+        matrices.update(zip(bodies, exact, strict=True))
+    return [matrices[k] for k in range(len(x))]
+
+
+def _group_within(
+    misfit: dict[_Element, float],
+    tolerance: float,
+    n: int,
+    generated: dict[tuple[frozenset[_Element], frozenset[_Element]], set[_Element] | None],
+) -> tuple[_Element, ...]:
+    """Return the group of the elements of n particles within a tolerance, the identity first.
+
+    Elements are accepted best first. All products are to be among the elements with a known misfit.
+    `generated` holds the groups that were generated for other bodies.
+    """
+    allowed = frozenset(misfit)
+    identity: _Element = (1, *range(n))
+    within = frozenset(e for e in misfit if misfit[e] <= tolerance) | {identity}
+    if (within, allowed) not in generated:
+        generated[within, allowed] = _generated_group(set(within), set(allowed))
+    # If all of them together generate a group of allowed elements, so do the best of them.
+    group = generated[within, allowed]
+    if group is None:
+        group = {identity}
+        for element in sorted(within, key=lambda e: (misfit.get(e, 0.0), e)):
+            if element not in group:
+                group = _generated_group(group | {element}, set(allowed)) or group
+    return (identity, *sorted(group - {identity}, reverse=True))
+
+
+def _exact_elements(x: Floats, sign: Ints, order: Ints) -> Floats:
+    """Return the matrices (B, g, 3, 3) of a group for several bodies.
+
+    Averaging a body over the group makes it symmetric, and the matrices exact, to rounding.
+    """
+    matrix = np.empty((len(x), len(order), 3, 3))
+    moving = np.arange(len(x))
     for _ in range(50):
-        matrix: Floats = sign * fit_rotations(sign * x[order], x)[0]
-        mean = np.einsum("gji,gnj->ni", matrix, x[order]) / len(elements)
-        change = np.abs(mean - x).max()
-        x = mean
-        if change <= 1e-15 * np.abs(x).max():
+        some = x[moving]
+        matrix[moving] = sign * fit_rotations(sign * some[:, order], some[:, None])[0]
+        mean = np.einsum("bgji,bgnj->bni", matrix[moving], some[:, order]) / len(order)
+        change = np.abs(mean - some).max(axis=(1, 2))
+        x[moving] = mean
+        moving = moving[~(change <= 1e-15 * np.abs(mean).max(axis=(1, 2)))]
+        if not moving.size:
             break
     return matrix
 

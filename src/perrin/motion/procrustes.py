@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from perrin.errors import TooFewFramesError
+from perrin.errors import DegenerateClusterError, TooFewFramesError
 from perrin.geometry.rigid import (
     center_variance,
     degrees_of_freedom,
@@ -17,8 +17,6 @@ from perrin.geometry.rotations import exp_map, fit_rotations, successive_product
 from perrin.motion.degenerate import mean_present, no_rotation, require_points
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from perrin._arrays import Bools, Floats, Ints
 
 # Largest rotation (rad) of a last Gauss-Newton step: rounding of a rotation matrix.
@@ -27,6 +25,8 @@ _LAST_TURN = 1e-13
 
 class PoseFit(NamedTuple):
     """Poses of all frames before their errors are known; frames without a pose are NaN.
+
+    The fits of B bodies together have a first axis of length B.
 
     Attributes
     ----------
@@ -38,7 +38,7 @@ class PoseFit(NamedTuple):
         Particles of the common shape, um, their centre at the origin.
     residual : ndarray, shape (T, n, d)
         Measured minus fitted positions, body axes, um.
-    sigma2 : float
+    sigma2 : float or ndarray, shape (B,)
         Variance of the localisation error of one coordinate, from the residuals, um^2.
     """
 
@@ -46,7 +46,7 @@ class PoseFit(NamedTuple):
     center: Floats
     template: Floats
     residual: Floats
-    sigma2: float
+    sigma2: float | Floats
 
 
 def fit_template(x: Floats, seen: Bools) -> PoseFit:
@@ -76,20 +76,71 @@ def fit_template(x: Floats, seen: Bools) -> PoseFit:
     array([[ 0., -1.],
            [ 1.,  0.]])
     """
+    fit, faults = fit_templates(x[None], seen[None])
+    if faults[0] is not None:
+        raise faults[0]
+    return PoseFit(*(part[0] for part in fit))
 
-    def refined(shape: Floats) -> Floats:
-        rotation, unique = fit_rotations(x, shape)
-        if not unique.any():
-            return shape
-        new = _centred_mean(_in_body(x, seen, rotation, shape))
-        turn, known = fit_rotations(shape, new)
-        return new @ turn.T if known else new
 
-    shape = _fixed_point(refined, x[np.argmax(seen.sum(axis=1))])
-    rotation, unique = fit_rotations(x, shape)
-    if not unique.any() or not np.isfinite(shape).all():
-        raise no_rotation(x)
-    return _fit_of(x, seen, rotation, shape)
+def fit_templates(
+    x: Floats, seen: Bools
+) -> tuple[PoseFit, list[DegenerateClusterError | TooFewFramesError | None]]:
+    """Fit the frames of each of several bodies to their common shape, as `fit_template`.
+
+    Parameters
+    ----------
+    x : ndarray, shape (B, T, n, d)
+        Positions, um, NaN where missing.
+    seen : ndarray of bool, shape (B, T, n)
+        Whether each particle is present.
+
+    Returns
+    -------
+    fit : PoseFit
+        Of all bodies; that of a body without a fit has no meaning.
+    faults : list of DegenerateClusterError, TooFewFramesError or None
+        The error that `fit_template` raises for each body.
+
+    Examples
+    --------
+    >>> triangle = np.array([[0.0, 0.0], [2.0, 0.0], [0.0, 1.0]])
+    >>> x = np.stack([triangle, triangle[:, ::-1] * [-1.0, 1.0]])  # turned by 90 degrees
+    >>> fit, faults = fit_templates(np.stack([x, x + 9.0]), np.ones((2, 2, 3), dtype=bool))
+    >>> fit.template.shape, faults
+    ((2, 3, 2), [None, None])
+    """
+    shape = x[np.arange(len(x)), np.argmax(seen.sum(axis=2), axis=1)]
+    rotation = np.empty((*x.shape[:2], x.shape[3], x.shape[3]))
+    unique = np.empty(x.shape[:2], dtype=np.bool_)
+    moving = np.arange(len(x))
+    for _ in range(100):
+        every = moving.size == len(x)
+        some, here = (x, seen) if every else (x[moving], seen[moving])
+        before = shape[moving]
+        turned, found = fit_rotations(some, before[:, None])
+        rotation[moving], unique[moving] = turned, found
+        new = _centred_mean(_in_body(some, here, turned, before))
+        back, known = fit_rotations(before, new)
+        new = np.where(known[:, None, None], new @ np.swapaxes(back, -1, -2), new)
+        new = np.where(found.any(axis=1)[:, None, None], new, before)
+        change = np.nan_to_num(np.abs(new - before)).max(axis=(1, 2))
+        arm = new - mean_present(new, axis=-2)[:, None]
+        size = np.nan_to_num(np.abs(arm)).max(axis=(1, 2))
+        grown = np.isfinite(new).sum(axis=(1, 2)) > np.isfinite(before).sum(axis=(1, 2))
+        shape[moving] = new
+        # The shape is final when it changes by rounding only and no particle is added to it.
+        moving = moving[grown | ~(change <= 1e-14 * size)]
+        if not moving.size:
+            break
+    else:
+        rotation[moving], unique[moving] = fit_rotations(x[moving], shape[moving][:, None])
+    faults: list[DegenerateClusterError | TooFewFramesError | None] = [None] * len(x)
+    for k in np.flatnonzero(~unique.any(axis=1) | ~np.isfinite(shape).all(axis=(1, 2))).tolist():
+        faults[k] = no_rotation(x[k])
+    poses = unique.sum(axis=1)
+    for k in np.flatnonzero(poses < 2).tolist():
+        faults[k] = faults[k] or _too_few_poses(int(poses[k]))
+    return _fit_of(x, seen, rotation, shape), faults
 
 
 def fit_chain(x: Floats, seen: Bools) -> PoseFit:
@@ -124,9 +175,19 @@ def fit_chain(x: Floats, seen: Bools) -> PoseFit:
     rows, step = chain_steps(x, seen)
     rotation = np.full((len(x), x.shape[2], x.shape[2]), np.nan)
     rotation[rows] = successive_product(step)
-    shape = _fixed_point(lambda s: _centred_mean(_in_body(x, seen, rotation, s)), x[rows[0]])
+    shape = x[rows[0]]
+    for _ in range(100):
+        new = _centred_mean(_in_body(x, seen, rotation, shape))
+        change = np.nanmax(np.abs(new - shape))
+        size = np.nanmax(np.abs(new - mean_present(new, axis=-2)))
+        grown = np.isfinite(new).sum() > np.isfinite(shape).sum()
+        shape = new
+        if not grown and change <= 1e-14 * size:
+            break
     _, residual, sigma2 = step_residuals(x, seen, rows, step)
-    return _fit_of(x, seen, rotation, shape)._replace(residual=residual, sigma2=sigma2)
+    chained = _fit_of(x[None], seen[None], rotation[None], shape[None])
+    rotation, center, template = chained.rotation[0], chained.center[0], chained.template[0]
+    return PoseFit(rotation, center, template, residual, sigma2)
 
 
 def chain_steps(x: Floats, seen: Bools) -> tuple[Ints, Floats]:
@@ -281,92 +342,100 @@ def pose_errors(fit: PoseFit, seen: Bools, noise: Floats) -> tuple[Floats, Float
     Parameters
     ----------
     fit : PoseFit
-        A fit with equal weights.
-    seen : ndarray of bool, shape (T, n)
+        Fits of B bodies with equal weights.
+    seen : ndarray of bool, shape (B, T, n)
         Whether each particle is present.
-    noise : ndarray, shape (d,)
+    noise : ndarray, shape (B, d)
         Variance of the localisation error along each lab axis, um^2.
 
     Returns
     -------
-    covariance : ndarray, shape (T, 3, 3) or (T, 1, 1)
+    covariance : ndarray, shape (B, T, 3, 3) or (B, T, 1, 1)
         Covariance of the orientation, rad^2, body axes.
-    variance : ndarray, shape (T,)
+    variance : ndarray, shape (B, T)
         Variance of one coordinate of the centre, um^2, mean over axes.
 
     Examples
     --------
     >>> triangle = np.array([[0.0, 0.0], [2.0, 0.0], [0.0, 1.0]])
-    >>> x, seen = np.stack([triangle, triangle + 1.0]), np.ones((2, 3), dtype=bool)
-    >>> covariance, variance = pose_errors(fit_template(x, seen), seen, np.ones(2))
-    >>> covariance[:, 0, 0].round(9), variance.round(9)
+    >>> x, seen = np.stack([triangle, triangle + 1.0])[None], np.ones((1, 2, 3), dtype=bool)
+    >>> covariance, variance = pose_errors(fit_templates(x, seen)[0], seen, np.ones((1, 2)))
+    >>> covariance[0, :, 0, 0].round(9), variance[0].round(9)
     (array([0.3, 0.3]), array([0.33333333, 0.33333333]))
     """
-    angles = 3 if len(noise) == 3 else 1
-    covariance = np.full((len(seen), angles, angles), np.nan)
-    variance = np.full(len(seen), np.nan)
-    fitted = np.flatnonzero(np.isfinite(fit.rotation[:, 0, 0]))
-    patterns, which = np.unique(seen[fitted], axis=0, return_inverse=True)
-    for i, pattern in enumerate(patterns):
-        rows = fitted[which.ravel() == i]
-        r = fit.rotation[rows]
-        body_noise = np.einsum("tij,i,tik->tjk", r, noise, r)
-        covariance[rows] = orientation_covariance(fit.template[pattern], body_noise)
-        variance[rows] = center_variance(fit.template, pattern, float(np.sqrt(noise.mean())))
+    bodies, frames, n = seen.shape
+    d = noise.shape[1]
+    angles = 3 if d == 3 else 1
+    covariance = np.full((bodies, frames, angles, angles), np.nan)
+    variance = np.full((bodies, frames), np.nan)
+    fitted = np.isfinite(fit.rotation[..., 0, 0])
+    sigma = np.sqrt(noise.mean(axis=1))
+    equal = np.ptp(noise, axis=1) == 0
+    code = np.packbits(seen, axis=2)
+    patterns, first, which = np.unique(
+        code.reshape(-1, code.shape[2]), axis=0, return_index=True, return_inverse=True
+    )
+    which = which.reshape(bodies, frames)
+    for i in range(len(patterns)):
+        pattern = seen.reshape(-1, n)[first[i]]
+        rows = fitted & (which == i)
+        some = np.flatnonzero(rows.any(axis=1))
+        if not some.size:
+            continue
+        template, place = fit.template[some], np.searchsorted(some, np.nonzero(rows)[0])
+        variance[rows] = center_variance(template, pattern, sigma[some])[place]
+        # Noise that is equal along all axes is the same in body axes.
+        of_body = noise[some, 0][:, None, None] * np.eye(d)
+        covariance[rows] = orientation_covariance(template[:, pattern], of_body)[place]
+        for k in some[~equal[some]].tolist():
+            r = fit.rotation[k, rows[k]]
+            body_noise = np.einsum("tij,i,tik->tjk", r, noise[k], r)
+            covariance[k, rows[k]] = orientation_covariance(fit.template[k, pattern], body_noise)
     return covariance, variance
 
 
-def _fixed_point(refined: Callable[[Floats], Floats], shape: Floats) -> Floats:
-    """Refine a shape until it changes by rounding only and no particle is added to it."""
-    for _ in range(100):
-        new = refined(shape)
-        change = np.nanmax(np.abs(new - shape))
-        size = np.nanmax(np.abs(new - mean_present(new, axis=-2)))
-        grown = np.isfinite(new).sum() > np.isfinite(shape).sum()
-        shape = new
-        if not grown and change <= 1e-14 * size:
-            break
-    return shape
-
-
 def _in_body(x: Floats, seen: Bools, rotation: Floats, shape: Floats) -> Floats:
-    """Return the particles in the axes of the body, (T, n, d)."""
+    """Return the particles in the axes of the body, (..., T, n, d)."""
     center = _shape_centers(x, rotation, shape)
-    turned: Floats = np.einsum("tij,tni->tnj", rotation, x - center[:, None])
+    turned: Floats = (x - center[..., None, :]) @ rotation
     body: Floats = np.where(seen[..., None], turned, np.nan)
     return body
 
 
 def _shape_centers(x: Floats, rotation: Floats, shape: Floats) -> Floats:
     """Return the lab position of the shape's origin, from the particles present in both."""
-    known = np.isfinite(x) & np.isfinite(shape)
-    arm = mean_present(np.where(known, shape, np.nan), axis=-2)
-    centroid = mean_present(np.where(known, x, np.nan), axis=-2)
-    center: Floats = centroid - np.einsum("tij,tj->ti", rotation, arm)
+    known = np.isfinite(x) & np.isfinite(shape[..., None, :, :])
+    if known.all():
+        arm = np.broadcast_to(shape.mean(axis=-2)[..., None, :], (*x.shape[:-2], x.shape[-1]))
+        centroid = x.mean(axis=-2)
+    else:
+        arm = mean_present(np.where(known, shape[..., None, :, :], np.nan), axis=-2)
+        centroid = mean_present(np.where(known, x, np.nan), axis=-2)
+    center: Floats = centroid - (rotation @ arm[..., None])[..., 0]
     return center
 
 
 def _centred_mean(body: Floats) -> Floats:
-    """Average the frames, and move the centre of the shape to the origin."""
-    shape = mean_present(body, axis=0)
-    centred: Floats = shape - mean_present(shape, axis=-2)
+    """Average the frames (..., T, n, d), and move the centre of the shape to the origin."""
+    shape = mean_present(body, axis=-3)
+    centred: Floats = shape - mean_present(shape, axis=-2)[..., None, :]
     return centred
 
 
 def _fit_of(x: Floats, seen: Bools, rotation: Floats, shape: Floats) -> PoseFit:
-    """Turn the template so that the first pose is the identity; return poses and residuals."""
-    fitted = np.flatnonzero(np.isfinite(rotation[:, 0, 0]))
-    if fitted.size < 2:
-        raise _too_few_poses(int(fitted.size))
-    gauge = rotation[fitted[0]]
-    shape, rotation = shape @ gauge.T, rotation @ gauge.T
-    rotation[fitted[0]] = np.eye(len(gauge))
-    residual = _in_body(x, seen, rotation, shape) - shape
-    d = x.shape[2]
+    """Turn the templates so that the first pose is the identity; return poses and residuals."""
+    bodies, d = np.arange(len(x)), x.shape[3]
+    fitted = np.isfinite(rotation[..., 0, 0])
+    first = np.argmax(fitted, axis=1)
+    gauge = np.swapaxes(rotation[bodies, first], 1, 2)
+    shape, rotation = shape @ gauge, rotation @ gauge[:, None]
+    rotation[bodies, first] = np.eye(d)
+    residual = _in_body(x, seen, rotation, shape) - shape[:, None]
     # The template was fitted too: it takes the degrees of freedom of one complete frame.
-    freedom = degrees_of_freedom(seen[fitted].sum(axis=1), d).sum()
-    freedom -= degrees_of_freedom(np.array(len(shape)), d)
-    sigma2 = float(np.nansum(residual**2) / freedom) if freedom > 0 else np.nan
+    freedom = (degrees_of_freedom(seen.sum(axis=2), d) * fitted).sum(axis=1)
+    freedom = freedom - degrees_of_freedom(np.array(shape.shape[1]), d)
+    square = np.nansum(residual**2, axis=(1, 2, 3))
+    sigma2 = np.divide(square, freedom, out=np.full(len(x), np.nan), where=freedom > 0)
     return PoseFit(rotation, _shape_centers(x, rotation, shape), shape, residual, sigma2)
 
 

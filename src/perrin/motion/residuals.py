@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from perrin._arrays import Floats, frozen
-from perrin.errors import DegenerateClusterError, TooFewFramesError
+from perrin._arrays import Bools, Floats, Ints, frozen
 from perrin.geometry.rigid import (
     degrees_of_freedom,
     inertia_tensor,
@@ -16,10 +16,11 @@ from perrin.geometry.rigid import (
     pose_slopes,
 )
 from perrin.geometry.rotations import skew
-from perrin.motion.tracking import template_motion
+from perrin.motion.rigid_motion import RigidMotion
+from perrin.motion.tracking import track_each
 
 if TYPE_CHECKING:
-    from perrin.motion.rigid_motion import RigidMotion
+    from collections.abc import Sequence
 
 # Most frames sampled: the standard error of every average here is then below 2 % of its scatter.
 _SAMPLED_FRAMES = 2000
@@ -46,8 +47,6 @@ _VARIANCE_ERROR = 0.3
 # sequential scan displaces particles by.
 _JUMP_SPEED = 6.0
 
-_LEVI_CIVITA = -skew(np.eye(3))
-
 
 def median_chi2(freedom: float) -> float:
     """Return the median of chi squared (Wilson and Hilferty, 1931; within 3 % from 1 on).
@@ -67,136 +66,230 @@ def median_chi2(freedom: float) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Residuals:
-    """Residual vectors of the complete frames of one body, in body axes.
+    """Residual vectors of the complete frames of B bodies of n particles, in body axes.
+
+    Bodies with fewer complete frames than others have rows of zeros after their last one.
 
     Attributes
     ----------
-    rotation : ndarray, shape (K, d, d)
-        Orientation of the body, lab from body.
-    vector : ndarray, shape (K, n, d)
+    rotation : ndarray, shape (B, K, d, d)
+        Orientation of each body, lab from body.
+    vector : ndarray, shape (B, K, n, d)
         Measured positions minus those of the template, um.
-    velocity : ndarray, shape (K, d)
+    velocity : ndarray, shape (B, K, d)
         Velocity of the centre from the neighbouring poses, about its mean, um/s, lab axes; 0 at
         the ends and at jumps.
-    template : ndarray, shape (n, d)
-        Particles of the common shape, um.
-    keeps : ndarray, shape (n, n, d, d)
+    count : ndarray of int, shape (B,)
+        Number of complete frames of each body.
+    template : ndarray, shape (B, n, d)
+        Particles of the common shapes, um.
+    keeps : ndarray, shape (B, n, n, d, d)
         Projector on the residuals of a rigid fit: what it leaves of displacements of the particles.
     """
 
     rotation: Floats
     vector: Floats
     velocity: Floats
+    count: Ints
     template: Floats
     keeps: Floats
 
     def __post_init__(self) -> None:
-        frozen(self.rotation, self.vector, self.velocity, self.template, self.keeps)
+        frozen(self.rotation, self.vector, self.velocity, self.count, self.template, self.keeps)
 
     @property
     def freedom(self) -> int:
         """Degrees of freedom of the residuals of one frame."""
-        n, d = self.template.shape
+        n, d = self.template.shape[1:]
         return int(degrees_of_freedom(np.array(n), d))
 
-    @property
-    def median_sigma(self) -> float:
-        """Localisation error of one coordinate (um) from the median frame; NaN where unknown.
+    @cached_property
+    def complete(self) -> Bools:
+        """Which rows are frames of each body, (B, K)."""
+        return np.asarray(np.arange(self.vector.shape[1]) < self.count[:, None])
+
+    @cached_property
+    def median_sigma(self) -> Floats:
+        """Localisation error of one coordinate (um) from the median frame, (B,); NaN where unknown.
 
         A few bad frames hardly change it.
         """
-        freedom, count = self.freedom, len(self.vector)
-        if count < 2 or freedom == 0:
-            return np.nan
-        square = float(np.median((self.vector**2).sum(axis=(1, 2)))) * count / (count - 1)
-        return float(np.sqrt(square / median_chi2(freedom)))
+        freedom, count = self.freedom, self.count
+        if freedom == 0:
+            return np.full(count.shape, np.nan)
+        square = np.where(self.complete, (self.vector**2).sum(axis=(2, 3)), np.nan)
+        square = median_present(square)
+        unbiased = np.divide(count, count - 1, out=np.full(count.shape, np.nan), where=count > 1)
+        return np.asarray(np.sqrt(square * unbiased / median_chi2(freedom)))
+
+    def of_bodies(self, bodies: Ints) -> Residuals:
+        """Return the residuals of some of the bodies."""
+        return Residuals(*(getattr(self, part.name)[bodies] for part in fields(self)))
+
+    def with_bodies(self, bodies: Ints, others: Residuals) -> Residuals:
+        """Return the residuals with other ones for some of the bodies."""
+        parts = {part.name: getattr(self, part.name).copy() for part in fields(self)}
+        for name, part in parts.items():
+            part[bodies] = getattr(others, name)
+        return Residuals(**parts)
 
     def left_of(self, displacement: Floats) -> Floats:
-        """Return what a rigid fit leaves of displacements (K, n, d), less their mean shape."""
-        n, d = self.template.shape
-        keeps = self.keeps.transpose(0, 2, 1, 3).reshape(n * d, n * d)
-        left = (displacement.reshape(-1, n * d) @ keeps.T).reshape(-1, n, d)
-        from_mean: Floats = left - left.mean(axis=0)
+        """Return what a rigid fit leaves of displacements (B, K, n, d), less their mean shape."""
+        bodies, rows, n, d = displacement.shape
+        keeps = self.keeps.transpose(0, 2, 4, 1, 3).reshape(bodies, n * d, n * d)
+        left = (displacement.reshape(bodies, rows, n * d) @ keeps).reshape(displacement.shape)
+        mean = left.sum(axis=1) / np.maximum(self.count, 1)[:, None, None]
+        from_mean: Floats = np.where(self.complete[..., None, None], left - mean[:, None], 0.0)
         return from_mean
 
     def in_lab(self, vectors: Floats) -> Floats:
-        """Return vectors (K, n, d) given in body axes along the axes of the lab."""
-        return np.asarray(vectors @ np.swapaxes(self.rotation, 1, 2))
+        """Return vectors (B, K, n, d) given in body axes along the axes of the lab."""
+        return np.asarray(vectors @ np.swapaxes(self.rotation, 2, 3))
 
 
 class Slope(NamedTuple):
-    """A regression coefficient of the residuals.
+    """A regression coefficient of the residuals, of one body or of several.
 
     Attributes
     ----------
-    value : float
+    value : float or ndarray, shape (B,)
         Coefficient; NaN where it is not determined.
-    stderr : float
+    stderr : float or ndarray, shape (B,)
         Standard error of the coefficient.
-    freedom : float
+    freedom : float or ndarray, shape (B,)
         Degrees of freedom of the standard error.
     """
 
-    value: float
-    stderr: float
-    freedom: float
+    value: Floats
+    stderr: Floats
+    freedom: Floats
+
+    @classmethod
+    def unknown(cls, shape: tuple[int, ...] = ()) -> Slope:
+        """Return coefficients that are not determined."""
+        return cls(np.full(shape, np.nan), np.full(shape, np.nan), np.zeros(shape))
 
     @property
-    def known(self) -> bool:
+    def known(self) -> Bools:
         """Whether the track determines the coefficient."""
-        return bool(np.isfinite(self.stderr))
+        return np.asarray(np.isfinite(self.stderr))
 
-    def differs_from(self, expected: float) -> bool:
+    def of_body(self, number: int) -> Slope:
+        """Return the coefficient of one body."""
+        return Slope(*(x[number] for x in self))
+
+    def where(self, some: Bools, other: Slope) -> Slope:
+        """Return these coefficients for some of the bodies, and the other ones elsewhere."""
+        pairs = zip(self, other, strict=True)
+        return Slope(*(np.where(some, mine, theirs) for mine, theirs in pairs))
+
+    def differs_from(self, expected: float) -> Bools:
         """Test at the level `SIGNIFICANCE` whether the coefficient differs (Student's t)."""
-        from scipy.stats import t
+        from scipy.special import ndtri, stdtrit
 
-        if not self.known:
-            return False
-        return bool(
-            abs(self.value - expected) > t.isf(SIGNIFICANCE / 2, self.freedom) * self.stderr
-        )
-
-
-UNKNOWN_SLOPE = Slope(np.nan, np.nan, 0.0)
+        known, exact = self.known, np.isinf(self.freedom)
+        freedom = np.where(known & ~exact, self.freedom, 1.0)
+        quantile = np.where(exact, ndtri(SIGNIFICANCE / 2), stdtrit(freedom, SIGNIFICANCE / 2))
+        off = np.abs(np.where(known, self.value - expected, 0.0))
+        return np.asarray(known & (off > -quantile * np.where(known, self.stderr, 0.0)))
 
 
-def sample_residuals(motion: RigidMotion, positions: Floats) -> Residuals:
-    """Collect the residuals of the complete frames, at most 2000 of them, evenly chosen.
+def sample_residuals(motions: Sequence[RigidMotion], positions: Floats) -> Residuals:
+    """Collect the residuals of the complete frames, at most 2000 a body, evenly chosen.
 
     Parameters
     ----------
-    motion : RigidMotion
-    positions : ndarray, shape (T, n, d)
-        The positions that the motion was fitted to, um.
+    motions : sequence of RigidMotion
+        Motions of B bodies.
+    positions : ndarray, shape (B, T, n, d)
+        The positions that the motions were fitted to, um.
 
     Examples
     --------
     >>> from perrin import Cluster, add_noise, simulate_motion, track_rotation
     >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=0.02, dt=0.7, n_frames=300, rng=1)
     >>> x = add_noise(truth.positions(), sigma=0.03, rng=2)
-    >>> sample_residuals(track_rotation(x, dt=0.7), x).vector.shape
-    (300, 4, 3)
+    >>> sample_residuals([track_rotation(x, dt=0.7)], x[None]).vector.shape
+    (1, 300, 4, 3)
     """
-    vector = body_residuals(motion, positions)
-    rows = np.flatnonzero(np.isfinite(vector).all(axis=(1, 2)))
-    even = np.linspace(0, max(rows.size - 1, 0), _SAMPLED_FRAMES).astype(int)
-    rows = rows[np.unique(even)[: rows.size]]
-    # Velocity of the centre between the poses before and after, about its mean.
-    velocity, fitted = np.zeros_like(motion.center), motion.fitted
-    if fitted.size >= 3:
-        step = motion.center[fitted[2:]] - motion.center[fitted[:-2]]
-        v = step / (motion.time[fitted[2:]] - motion.time[fitted[:-2]])[:, None]
-        v = v - np.median(v, axis=0)
-        speed = np.linalg.norm(v, axis=1)
-        usual = speed <= _JUMP_SPEED * np.median(speed)
-        velocity[fitted[1:-1][usual]] = v[usual] - v[usual].mean(axis=0)
+    vector = residuals_of_each(motions, positions)
+    whole = np.isfinite(vector).all(axis=(2, 3))
+    count = np.minimum(whole.sum(axis=1), _SAMPLED_FRAMES)
+    rows = np.argsort(~whole, axis=1, kind="stable")[:, :_SAMPLED_FRAMES]
+    for k in np.flatnonzero(whole.sum(axis=1) > _SAMPLED_FRAMES):
+        all_rows = np.flatnonzero(whole[k])
+        rows[k] = all_rows[np.linspace(0, all_rows.size - 1, _SAMPLED_FRAMES).astype(int)]
+    complete = np.arange(rows.shape[1]) < count[:, None]
+
+    def sampled(x: Floats) -> Floats:
+        index = rows.reshape(*rows.shape, *[1] * (x.ndim - 2))
+        here = complete.reshape(index.shape)
+        return np.where(here, np.take_along_axis(x, index, axis=1), 0.0)
+
+    template = np.stack([m.template for m in motions])
     return Residuals(
-        motion.rotation[rows],
-        vector[rows],
-        velocity[rows],
-        motion.template.copy(),
-        fit_projector(motion.template),
+        rotation=sampled(np.stack([m.rotation for m in motions])),
+        vector=sampled(vector),
+        velocity=sampled(_center_velocity(motions)),
+        count=count,
+        template=template,
+        keeps=fit_projector(template),
     )
+
+
+def _center_velocity(motions: Sequence[RigidMotion]) -> Floats:
+    """Return the velocity of the centre between the poses before and after, about its mean.
+
+    It is 0 at the first and at the last pose, and at jumps, (B, T, d).
+    """
+    center, time = np.stack([m.center for m in motions]), np.stack([m.time for m in motions])
+    velocity = np.zeros_like(center)
+    poses = np.array([m.fitted.size for m in motions])
+    for size in np.unique(poses[poses >= 3]).tolist():
+        bodies = np.flatnonzero(poses == size)
+        rows = np.stack([motions[k].fitted for k in bodies])
+        x, t = center[bodies[:, None], rows], time[bodies[:, None], rows]
+        v = (x[:, 2:] - x[:, :-2]) / (t[:, 2:] - t[:, :-2])[..., None]
+        v = v - np.median(v, axis=1, keepdims=True)
+        speed = np.sqrt((v * v).sum(axis=2))
+        usual = (speed <= _JUMP_SPEED * np.median(speed, axis=1, keepdims=True))[..., None]
+        mean = np.where(usual, v, 0.0).sum(axis=1, keepdims=True) / usual.sum(axis=1)[:, None]
+        velocity[bodies[:, None], rows[:, 1:-1]] = np.where(usual, v - mean, 0.0)
+    return velocity
+
+
+def median_present(values: Floats) -> Floats:
+    """Return the median over the last axis of the values that are not NaN; NaN of none.
+
+    Examples
+    --------
+    >>> median_present(np.array([[1.0, 5.0, 3.0], [7.0, np.nan, np.nan]]))
+    array([3., 7.])
+    """
+    return quantile_present(values, 0.5)
+
+
+def quantile_present(values: Floats, share: float) -> Floats:
+    """Return the quantile over the last axis of the values that are not NaN; NaN of none.
+
+    Parameters
+    ----------
+    values : ndarray, shape (..., K)
+    share : float
+        Share of the values below the quantile, which is interpolated linearly.
+
+    Examples
+    --------
+    >>> quantile_present(np.array([[1.0, 5.0, 3.0], [7.0, np.nan, np.nan]]), 0.75)
+    array([4., 7.])
+    """
+    last = np.maximum(np.isfinite(values).sum(axis=-1) - 1, 0)
+    ordered = np.sort(values, axis=-1)  # NaN last
+    place = share * last
+    below = np.floor(place).astype(np.int64)
+    low = np.take_along_axis(ordered, below[..., None], axis=-1)[..., 0]
+    high = np.take_along_axis(ordered, np.minimum(below + 1, last)[..., None], axis=-1)[..., 0]
+    return np.asarray(low + (place - below) * (high - low))
 
 
 def fit_projector(template: Floats) -> Floats:
@@ -204,11 +297,11 @@ def fit_projector(template: Floats) -> Floats:
 
     Parameters
     ----------
-    template : ndarray, shape (n, d)
+    template : ndarray, shape (..., n, d)
 
     Returns
     -------
-    ndarray, shape (n, n, d, d)
+    ndarray, shape (..., n, n, d, d)
 
     Examples
     --------
@@ -216,14 +309,15 @@ def fit_projector(template: Floats) -> Floats:
     >>> round(float(np.einsum("nnii->", fit_projector(triangle))), 9)  # 2 n - 3
     3.0
     """
-    n, d = template.shape
-    slopes = pose_slopes(template).reshape(n * d, -1)
+    n, d = template.shape[-2:]
+    slopes = pose_slopes(template)
+    slopes = slopes.reshape(*template.shape[:-2], n * d, -1)
     left = np.eye(n * d) - slopes @ np.linalg.pinv(slopes)
-    blocks: Floats = left.reshape(n, d, n, d).transpose(0, 2, 1, 3).copy()
-    return blocks
+    blocks = left.reshape(*template.shape[:-2], n, d, n, d)
+    return np.ascontiguousarray(np.swapaxes(blocks, -3, -2))
 
 
-def autocorrelation(sums: Floats, freedom: float) -> Floats:
+def autocorrelation(vectors: Floats, count: Ints, freedom: float) -> Floats:
     """Return the autocorrelation of residuals up to the lag where it falls below its error.
 
     Subtracting the mean of every component lowers it by about the variance of that mean, which is
@@ -231,33 +325,43 @@ def autocorrelation(sums: Floats, freedom: float) -> Floats:
 
     Parameters
     ----------
-    sums : ndarray, shape (K,)
-        Sums of products of K residuals at the lags 0, ..., K - 1 (`lagged_products`).
+    vectors : ndarray, shape (B, K, ...)
+        Residuals of B bodies, rows of zeros after the last frame of each.
+    count : ndarray of int, shape (B,)
+        Number of frames of each body.
     freedom : float
         Degrees of freedom of one frame.
 
     Returns
     -------
-    ndarray, shape (M,)
-        Autocorrelation at the lags 1, ..., M.
+    ndarray, shape (B, M)
+        Autocorrelation at the lags 1, ..., M; 0 from the first lag below its error.
 
     Examples
     --------
-    >>> white = np.random.default_rng(1).normal(size=(300, 4, 3))
-    >>> bool(np.abs(autocorrelation(lagged_products(white), 6)).sum() < 0.1)
+    >>> white = np.random.default_rng(1).normal(size=(1, 300, 4, 3))
+    >>> bool(np.abs(autocorrelation(white, np.array([300]), 6)).sum() < 0.1)
     True
     """
-    count = len(sums)
-    if not sums[0] > 0:
-        return np.zeros(0)
-    rho = sums[1 : max(2, count // 2)] / sums[0]
-    below = np.flatnonzero(rho < 2.0 / np.sqrt(max(count * freedom, 1.0)))
-    kept = rho[: int(below[0]) if below.size else rho.size]
-    lost = 0.0
-    for _ in range(20 if kept.size else 0):
-        corrected = (kept + lost) / (1.0 + lost)
-        lost = min((1.0 + 2.0 * float(corrected.sum())) / count, 1.0)
-    raised: Floats = (kept + lost) / (1.0 + lost)
+    flat = vectors.reshape(*vectors.shape[:2], -1)
+    power = np.einsum("bkc,bkc->b", flat, flat)
+    following = np.einsum("bkc,bkc->b", flat[:, 1:], flat[:, :-1])
+    least = 2.0 / np.sqrt(np.maximum(count * freedom, 1.0))
+    first = np.divide(following, power, out=np.zeros(len(flat)), where=power > 0)
+    smooth = np.flatnonzero((first >= least) & (count > 1) & (power > 0))
+    if not smooth.size:
+        return np.zeros((len(flat), 0))
+    rho = lagged_products(flat[smooth])[:, 1:] / power[smooth, None]
+    within = np.arange(1, rho.shape[1] + 1) < np.maximum(2, count[smooth] // 2)[:, None]
+    kept = np.logical_and.accumulate(within & (rho >= least[smooth, None]), axis=1)
+    lags = kept.sum(axis=1)
+    kept, rho = kept[:, : lags.max()], rho[:, : lags.max()]
+    total, lost = np.where(kept, rho, 0.0).sum(axis=1), np.zeros(len(smooth))
+    for _ in range(20):
+        raised_total = (total + lags * lost) / (1.0 + lost)
+        lost = np.minimum((1.0 + 2.0 * raised_total) / count[smooth], 1.0)
+    raised = np.zeros((len(flat), rho.shape[1]))
+    raised[smooth] = np.where(kept, (rho + lost[:, None]) / (1.0 + lost[:, None]), 0.0)
     return raised
 
 
@@ -266,7 +370,7 @@ def lag_one_autocorrelation(residuals: Floats) -> Slope:
 
     Parameters
     ----------
-    residuals : ndarray, shape (T, n, d)
+    residuals : ndarray, shape (..., T, n, d)
         Residuals in body axes, NaN where missing; gaps are not bridged.
 
     Examples
@@ -276,17 +380,18 @@ def lag_one_autocorrelation(residuals: Floats) -> Slope:
     >>> bool(abs(found.value) < 4 * found.stderr)
     True
     """
-    before, after = residuals[:-1], residuals[1:]
+    before, after = residuals[..., :-1, :, :], residuals[..., 1:, :, :]
     both = np.isfinite(before) & np.isfinite(after)
-    a, b = before[both], after[both]
-    power = 0.5 * float(a @ a + b @ b)
-    n, d = residuals.shape[1:]
-    freedom = a.size * float(degrees_of_freedom(np.array(n), d)) / (n * d)
-    if not power > 0:
-        return UNKNOWN_SLOPE
-    value = float(a @ b) / power
-    error = np.sqrt(max(1 - value**2, 0.0) / freedom) if freedom > 0 else np.inf
-    return Slope(value, float(error), freedom)
+    a, b = np.where(both, before, 0.0), np.where(both, after, 0.0)
+    power = 0.5 * (np.einsum("...tni,...tni->...", a, a) + np.einsum("...tni,...tni->...", b, b))
+    n, d = residuals.shape[-2:]
+    share = float(degrees_of_freedom(np.array(n), d)) / (n * d)
+    freedom = np.where(power > 0, both.sum(axis=(-3, -2, -1)) * share, 0.0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        value = np.where(power > 0, np.einsum("...tni,...tni->...", a, b) / power, np.nan)
+        error = np.sqrt(np.maximum(1 - value**2, 0.0) / freedom)
+    unknown_error = np.where(power > 0, np.inf, np.nan)
+    return Slope(value, np.where(freedom > 0, error, unknown_error), freedom)
 
 
 def lagged_products(vectors: Floats) -> Floats:
@@ -294,26 +399,32 @@ def lagged_products(vectors: Floats) -> Floats:
 
     Parameters
     ----------
-    vectors : ndarray, shape (K, ...)
+    vectors : ndarray, shape (B, K, ...)
 
     Returns
     -------
-    ndarray, shape (K,)
+    ndarray, shape (B, K)
 
     Examples
     --------
-    >>> lagged_products(np.array([[1.0], [2.0], [3.0]])).round(12)
-    array([14.,  8.,  3.])
+    >>> lagged_products(np.array([[[1.0], [2.0], [3.0]]])).round(12)
+    array([[14.,  8.,  3.]])
     """
-    flat = vectors.reshape(len(vectors), -1)
-    spectrum = np.fft.rfft(flat, n=2 * len(flat), axis=0)
+    count = vectors.shape[1]
+    series = np.ascontiguousarray(np.swapaxes(vectors.reshape(*vectors.shape[:2], -1), 1, 2))
+    spectrum = np.fft.rfft(series, n=2 * count)
     power = (spectrum.real**2 + spectrum.imag**2).sum(axis=1)
-    sums: Floats = np.fft.irfft(power, n=2 * len(flat))[: len(flat)]
+    sums: Floats = np.fft.irfft(power, n=2 * count)[:, :count]
     return sums
 
 
 def regress(
-    sample: Residuals, displacement: Floats, *, offset: float = 0.0, imitated: float = 0.0
+    sample: Residuals,
+    displacement: Floats,
+    *,
+    left: Floats | None = None,
+    offset: Floats | float = 0.0,
+    imitated: Floats | float = 0.0,
 ) -> Slope:
     """Regress the residuals on what a rigid fit leaves of a displacement; return slope and error.
 
@@ -325,60 +436,76 @@ def regress(
     Parameters
     ----------
     sample : Residuals
-    displacement : ndarray, shape (K, n, d)
+        Of B bodies.
+    displacement : ndarray, shape (B, K, n, d)
         Displacement of every particle for a slope of 1, body axes.
-    offset : float
+    left : ndarray, shape (B, K, n, d), optional
+        What a rigid fit leaves of it, where that is known already.
+    offset : float or ndarray, shape (B,)
         Expectation of the product of residuals and displacement for a slope of 0.
-    imitated : float
+    imitated : float or ndarray, shape (B,)
         Square of the displacement that noise of the fitted orientation alone contributes.
 
     Returns
     -------
     Slope
-        NaN where the displacement is too small to measure it.
+        Of every body; NaN where the displacement is too small to measure it.
 
     Examples
     --------
     >>> from perrin import Cluster, add_noise, simulate_motion, track_rotation
     >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=0.02, dt=0.7, n_frames=300, rng=1)
     >>> x = add_noise(truth.positions(), sigma=0.03, rng=2)
-    >>> sample = sample_residuals(track_rotation(x, dt=0.7), x)
+    >>> sample = sample_residuals([track_rotation(x, dt=0.7)], x[None])
     >>> moved = np.zeros(sample.vector.shape)
-    >>> moved[::2, 0] = 1.0  # the first particle, in every second frame
-    >>> bool(abs(regress(sample, moved).value) < 0.01)
+    >>> moved[:, ::2, 0] = 1.0  # the first particle, in every second frame
+    >>> bool(abs(regress(sample, moved).value[0]) < 0.01)
     True
     """
-    left = sample.left_of(displacement)
-    total = float((left**2).sum())
+    left = sample.left_of(displacement) if left is None else left
+    if sample.freedom == 0:
+        return Slope.unknown(sample.count.shape)
+    frames = np.einsum("bkni,bkni->bk", left, left)
+    total = frames.sum(axis=1)
     power = total - imitated
-    if len(left) < 3 or sample.freedom == 0:
-        return UNKNOWN_SLOPE
-    if not power > max(_LEAST_POWER * imitated, 1e-9 * float((displacement**2).sum())):
-        return UNKNOWN_SLOPE
-    slope = (float((left * sample.vector).sum()) - offset) / power
-    rest = sample.vector - slope * left
-    lab = sample.in_lab(rest)
-    rho = autocorrelation(lagged_products(lab), sample.freedom)
-    count = len(left)
-    share = (left**2).sum(axis=(1, 2)) / total  # leverage of every frame
-    scores = (left * rest).sum(axis=(1, 2)) / (1.0 - share)
-    mean_square = float((rest**2).sum()) / (sample.freedom * (count - 1))
-    variance = max(float(scores @ scores), mean_square * total)
-    shared = lagged_products(sample.in_lab(left))[1 : rho.size + 1]
-    inflation = max(1.0 + 2.0 * float(rho @ shared) / total, 1.0)
-    mean_lost = 1.0 + (1.0 + 2.0 * float(rho.sum())) / count
-    freedom = 1.0 / float(share @ share) / (1.0 + 2.0 * float(rho @ rho))
-    return Slope(slope, float(np.sqrt(variance * inflation * mean_lost)) / power, freedom)
+    moved = np.einsum("bkni,bkni->b", displacement, displacement)
+    least = np.maximum(_LEAST_POWER * np.asarray(imitated), 1e-9 * moved)
+    known = (sample.count >= 3) & (power > least)
+    if not known.any():
+        return Slope.unknown(sample.count.shape)
+    total, power = np.where(known, total, 1.0), np.where(known, power, 1.0)
+    along = np.einsum("bkni,bkni->bk", left, sample.vector)
+    slope = (along.sum(axis=1) - offset) / power
+    rest = sample.vector - slope[:, None, None, None] * left
+    rho = autocorrelation(sample.in_lab(rest), sample.count, sample.freedom)
+    share = np.where(known[:, None], frames / total[:, None], 0.0)  # leverage of every frame
+    scores = (along - slope[:, None] * frames) / (1.0 - share)
+    residual_square = np.einsum("bkni,bkni->b", rest, rest)
+    mean_square = residual_square / (sample.freedom * np.maximum(sample.count - 1, 1))
+    variance = np.maximum((scores * scores).sum(axis=1), mean_square * total)
+    shared = np.zeros(len(total))
+    smooth = np.flatnonzero(rho.any(axis=1))
+    if smooth.size:
+        together = lagged_products(sample.of_bodies(smooth).in_lab(left[smooth]))
+        shared[smooth] = (rho[smooth] * together[:, 1 : rho.shape[1] + 1]).sum(axis=1)
+    inflation = np.maximum(1.0 + 2.0 * shared / total, 1.0)
+    mean_lost = 1.0 + (1.0 + 2.0 * rho.sum(axis=1)) / np.maximum(sample.count, 1)
+    repeats = 1.0 + 2.0 * (rho * rho).sum(axis=1)
+    concentration = np.where(known, (share * share).sum(axis=1), 1.0)
+    found = Slope(
+        slope, np.sqrt(variance * inflation * mean_lost) / power, 1.0 / concentration / repeats
+    )
+    return found.where(known, Slope.unknown(known.shape))
 
 
 class AxisNoise(NamedTuple):
-    """Variance of the localisation error along each lab axis.
+    """Variance of the localisation error along each lab axis, of one body or of several.
 
     Attributes
     ----------
-    variance : ndarray, shape (d,)
-        Variance along each lab axis, um^2.
-    covariance : ndarray, shape (d, d)
+    variance : ndarray, shape (..., d)
+        Variance along each lab axis, um^2; NaN where it is not determined.
+    covariance : ndarray, shape (..., d, d)
         Covariance of these variances, um^4.
     """
 
@@ -386,23 +513,23 @@ class AxisNoise(NamedTuple):
     covariance: Floats
 
     @property
-    def known(self) -> bool:
+    def known(self) -> Bools:
         """Whether every variance is positive and its relative standard error at most 30 %."""
-        if not (self.variance > 0).all():
-            return False
-        error = np.sqrt(np.diag(self.covariance))
-        return bool((error <= _VARIANCE_ERROR * self.variance).all())
+        diagonal = np.diagonal(self.covariance, axis1=-2, axis2=-1)
+        positive = (self.variance > 0).all(axis=-1)
+        error = np.sqrt(np.where(positive[..., None], diagonal, np.inf))
+        return np.asarray((error <= _VARIANCE_ERROR * self.variance).all(axis=-1) & positive)
 
     def z_ratio(self, unit: Floats) -> Slope:
-        """Return sigma_z over sigma_xy, each times a unit (3,) of its axis, and its error."""
+        """Return sigma_z over sigma_xy, each times a unit (..., 3) of its axis, and its error."""
         square = unit**2
         v = self.variance * square
-        across = v[:2].sum()
-        ratio = float(np.sqrt(2 * v[2] / across))
+        across = v[..., :2].sum(axis=-1)
+        ratio = np.sqrt(2 * v[..., 2] / across)
         # Slope of the logarithm of the squared ratio.
-        slope = np.array([-1 / across, -1 / across, 1 / v[2]]) * square
-        error = 0.5 * ratio * float(np.sqrt(slope @ self.covariance @ slope))
-        return Slope(ratio, error, np.inf)
+        slope = np.stack([-1 / across, -1 / across, 1 / v[..., 2]], axis=-1) * square
+        variance = np.einsum("...a,...ab,...b->...", slope, self.covariance, slope)
+        return Slope(ratio, 0.5 * ratio * np.sqrt(variance), np.full_like(ratio, np.inf))
 
 
 def expected_squares(rotation: Floats, keeps: Floats) -> Floats:
@@ -410,14 +537,14 @@ def expected_squares(rotation: Floats, keeps: Floats) -> Floats:
 
     Parameters
     ----------
-    rotation : ndarray, shape (K, d, d)
+    rotation : ndarray, shape (..., K, d, d)
         Orientations of the body, lab from body.
-    keeps : ndarray, shape (n, n, d, d)
+    keeps : ndarray, shape (..., n, n, d, d)
         Projector on the residuals, as `fit_projector` returns it.
 
     Returns
     -------
-    ndarray, shape (K, d, d)
+    ndarray, shape (..., K, d, d)
         Sum over the particles of the squares along axis a for a variance of 1 along axis b: the
         squares of the elements of R K R^T, summed over the blocks K of the projector.
 
@@ -427,15 +554,17 @@ def expected_squares(rotation: Floats, keeps: Floats) -> Floats:
     >>> float(expected_squares(np.eye(2)[None], fit_projector(triangle)).sum().round(9))  # 2 n - 3
     3.0
     """
-    count, d = rotation.shape[:2]
-    blocks = keeps.reshape(-1, d * d)
-    pairs = rotation[:, :, None, :, None] * rotation[:, None, :, None, :]
-    pairs = pairs.reshape(count, d, d, d * d)
-    return np.asarray(((pairs @ (blocks.T @ blocks)) * pairs).sum(axis=-1))
+    d = rotation.shape[-1]
+    blocks = keeps.reshape(*keeps.shape[:-4], -1, d * d)
+    pairs = rotation[..., :, None, :, None] * rotation[..., None, :, None, :]
+    pairs = pairs.reshape(*rotation.shape[:-2], d * d, d * d)
+    products = np.swapaxes(blocks, -1, -2) @ blocks
+    sums = np.einsum("...x,...x->...", pairs @ products[..., None, :, :], pairs)
+    return sums.reshape(rotation.shape)
 
 
-def axis_noise(sample: Residuals) -> AxisNoise | None:
-    """Measure the localisation error of each lab axis; None where it is not determined.
+def axis_noise(sample: Residuals) -> AxisNoise:
+    """Measure the localisation error of each lab axis.
 
     The squares of a frame's residuals along the lab axes are a linear function of the variances
     through the projector of the fit. The covariance is that of the measured squares, widened by
@@ -444,56 +573,80 @@ def axis_noise(sample: Residuals) -> AxisNoise | None:
     Parameters
     ----------
     sample : Residuals
+        Of B bodies.
 
     Returns
     -------
-    AxisNoise or None
+    AxisNoise
+        Of every body; NaN where the residuals do not determine it.
 
     Examples
     --------
     >>> from perrin import Cluster, add_noise, simulate_motion, track_rotation
     >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=0.02, dt=0.7, n_frames=300, rng=1)
     >>> x = add_noise(truth.positions(), sigma=(0.03, 0.03, 0.06), rng=2)
-    >>> noise = axis_noise(sample_residuals(track_rotation(x, dt=0.7), x))
-    >>> (noise.variance**0.5).round(3)
+    >>> noise = axis_noise(sample_residuals([track_rotation(x, dt=0.7)], x[None]))
+    >>> (noise.variance[0] ** 0.5).round(3)
     array([0.031, 0.032, 0.059])
     """
-    turn, count = sample.rotation, len(sample.rotation)
-    if count < 3 or not (sample.vector**2).sum() > 0:
-        return None
-    mix = expected_squares(turn, sample.keeps)
+    count, d = sample.count, sample.template.shape[2]
+    mix = expected_squares(sample.rotation, sample.keeps)
     lab = sample.in_lab(sample.vector)
-    square = (lab**2).sum(axis=1) * count / (count - 1)
-    total = mix.sum(axis=0)
-    if np.linalg.cond(total) > 1e8:
-        return None
-    inverse = np.linalg.inv(total)
-    variance = inverse @ square.sum(axis=0)
-    scores = square - mix @ variance
-    rho = autocorrelation(lagged_products(lab), sample.freedom)
-    spread = inverse @ scores.T @ scores @ inverse.T * (1.0 + 2.0 * float(rho @ rho))
-    return AxisNoise(variance, spread)
+    unbiased = count / np.maximum(count - 1, 1)
+    square = np.einsum("bkni,bkni->bki", lab, lab) * unbiased[:, None, None]
+    sums, total = square.sum(axis=1), mix.sum(axis=1)
+    known = (count >= 3) & (sums.sum(axis=1) > 0)
+    singular = np.linalg.svd(np.where(known[:, None, None], total, np.eye(d)), compute_uv=False)
+    known &= singular[:, 0] <= 1e8 * singular[:, -1]
+    inverse = np.linalg.inv(np.where(known[:, None, None], total, np.eye(d)))
+    variance = np.einsum("bij,bj->bi", inverse, sums)
+    scores = square - np.einsum("bkij,bj->bki", mix, variance)
+    rho = autocorrelation(lab, count, sample.freedom)
+    spread = inverse @ (np.swapaxes(scores, 1, 2) @ scores) @ np.swapaxes(inverse, 1, 2)
+    spread = spread * (1.0 + 2.0 * (rho * rho).sum(axis=1))[:, None, None]
+    return AxisNoise(
+        np.where(known[:, None], variance, np.nan), np.where(known[:, None, None], spread, np.nan)
+    )
 
 
 class Stretch(NamedTuple):
-    """Scale of z against x and y, and the fit with z corrected.
+    """Scale of z against x and y of several bodies, and their fits with z corrected.
 
     Attributes
     ----------
     scale : Slope
-        Scale of z (1: not stretched).
+        Scale of z of every body (1: not stretched).
     sample : Residuals
-        Residuals of the body with z corrected.
-    motion : RigidMotion
-        Motion of the body with z corrected.
+        Residuals of the bodies with z corrected.
+    motions : list of RigidMotion
+        Motions of the bodies with z corrected.
     """
 
     scale: Slope
     sample: Residuals
-    motion: RigidMotion
+    motions: list[RigidMotion]
+
+    def with_bodies(self, bodies: Ints, others: Stretch) -> Stretch:
+        """Return the same with the scales of others for some bodies, where these are known."""
+        known = np.flatnonzero(others.scale.known)
+        scale = Slope(*(part.copy() for part in self.scale))
+        for part, other in zip(scale, others.scale, strict=True):
+            part[bodies[known]] = other[known]
+        motions = list(self.motions)
+        for k in known.tolist():
+            motions[bodies[k]] = others.motions[k]
+        sample = self.sample.with_bodies(bodies[known], others.sample.of_bodies(known))
+        return Stretch(scale, sample, motions)
 
 
-def measure_stretch(motion: RigidMotion, positions: Floats) -> Stretch:
+def measure_stretch(
+    motions: Sequence[RigidMotion],
+    positions: Floats,
+    sample: Residuals,
+    *,
+    scale: Floats | None = None,
+    trials: int = 10,
+) -> Stretch:
     """Measure the scale of z against x and y from the change of a body's shape as it turns.
 
     Least squares in scale, template and poses: Gauss-Newton steps in the scale alternate with
@@ -501,9 +654,16 @@ def measure_stretch(motion: RigidMotion, positions: Floats) -> Stretch:
 
     Parameters
     ----------
-    motion : RigidMotion
-    positions : ndarray, shape (T, n, d)
-        The positions that the motion was fitted to, um.
+    motions : sequence of RigidMotion
+        Motions of B bodies.
+    positions : ndarray, shape (B, T, n, d)
+        Positions of their particles, um.
+    sample : Residuals
+        Residuals of the motions.
+    scale : ndarray, shape (B,), optional
+        Scale of z that was taken off the positions before the motions were fitted; default 1.
+    trials : int
+        Largest number of steps.
 
     Returns
     -------
@@ -516,62 +676,87 @@ def measure_stretch(motion: RigidMotion, positions: Floats) -> Stretch:
     >>> from perrin import Cluster, add_noise, simulate_motion, track_rotation
     >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=0.02, dt=0.7, n_frames=300, rng=1)
     >>> x = add_noise(truth.positions(), sigma=0.03, rng=2) * [1.0, 1.0, 1.1]
-    >>> found = measure_stretch(track_rotation(x, dt=0.7), x).scale
-    >>> round(found.value, 2), found.differs_from(1.0)
-    (1.1, True)
+    >>> motions = [track_rotation(x, dt=0.7)]
+    >>> found = measure_stretch(motions, x[None], sample_residuals(motions, x[None])).scale
+    >>> found.value.round(2), found.differs_from(1.0)
+    (array([1.1]), array([ True]))
     """
-    sample = sample_residuals(motion, positions)
-    if motion.dimension == 2 or len(sample.vector) < 3:
-        return Stretch(UNKNOWN_SLOPE, sample, motion)
-    first, scale, step = (motion, sample), 1.0, UNKNOWN_SLOPE
-    for _ in range(10):
-        step, left = _stretch_step(sample)
-        if not step.known or step.stderr > _STRETCH_ERROR:
-            return Stretch(UNKNOWN_SLOPE, first[1], first[0])
-        # The step is linear in the stretch; its second order is then small against the error.
-        if step.value**2 <= 0.1 * step.stderr:
-            break
-        scale *= float(np.clip(1.0 + step.value, 0.5, 2.0))
-        try:
-            motion = template_motion(positions / [1.0, 1.0, scale], time=motion.time, dt=motion.dt)
-        except (DegenerateClusterError, TooFewFramesError):
-            return Stretch(UNKNOWN_SLOPE, first[1], first[0])
-        sample = sample_residuals(motion, positions / [1.0, 1.0, scale])
-    rest = replace(sample, vector=sample.vector - step.value * left)
+    unknown = Slope.unknown(sample.count.shape)
+    if sample.template.shape[2] == 2:
+        return Stretch(unknown, sample, list(motions))
+    scale = np.ones(len(motions)) if scale is None else scale
+    step, left = _stretch_step(sample)
+    usable = step.known & ~(step.stderr > _STRETCH_ERROR)
+    # The step is linear in the stretch; its second order is then small against the error.
+    settled = usable & ((step.value**2 <= 0.1 * step.stderr) | (trials == 1))
+    taken = np.where(settled, step.value, 0.0)[:, None, None, None]
+    rest = replace(sample, vector=sample.vector - taken * left)
     found = Slope(scale * (1.0 + step.value), scale * step.stderr, step.freedom)
-    return Stretch(found, rest, motion)
+    stretch = Stretch(found.where(settled, unknown), rest, list(motions))
+    bodies = np.flatnonzero(usable & ~settled)
+    if not bodies.size:
+        return stretch
+    scale = scale[bodies] * np.clip(1.0 + step.value[bodies], 0.5, 2.0)
+    x = positions[bodies].copy()
+    x[..., 2] /= scale[:, None, None]
+    time = np.stack([motions[k].time for k in bodies.tolist()])
+    fits = track_each(x, time=time, dt=motions[0].dt)
+    fitted = np.array([isinstance(fit, RigidMotion) for fit in fits])
+    closer = [fit for fit in fits if isinstance(fit, RigidMotion)]
+    if not closer:
+        return stretch
+    again = measure_stretch(
+        closer,
+        positions[bodies[fitted]],
+        sample_residuals(closer, x[fitted]),
+        scale=scale[fitted],
+        trials=trials - 1,
+    )
+    return stretch.with_bodies(bodies[fitted], again)
 
 
 def _stretch_step(sample: Residuals) -> tuple[Slope, Floats]:
     """Return the stretch of z from the residuals, and what a rigid fit leaves of a unit stretch."""
-    up = sample.rotation[:, 2]  # the lab's z axis in body axes
-    height = up @ sample.template.T
-    displacement = height[..., None] * up[:, None]
+    up = sample.rotation[:, :, 2]  # the lab's z axis in body axes
+    height = up @ np.swapaxes(sample.template, 1, 2)
+    displacement = height[..., None] * up[:, :, None]
     left = sample.left_of(displacement)
-    plain = regress(sample, displacement)
-    if not plain.known:
+    plain = regress(sample, displacement, left=left)
+    known = plain.known
+    if not known.any():
         return plain, left
-    rest = replace(sample, vector=sample.vector - plain.value * left)
+    vector = sample.vector - np.where(known, plain.value, 0.0)[:, None, None, None] * left
     # The noise of the axes is shrunk to equal noise, the more the larger its error. A body whose
     # residuals do not separate the axes (a trimer that hardly turns) is left with equal noise, and
     # with an error that allows standard deviations of 1 : 1 : 3.
-    mean = float((rest.vector**2).sum()) / (sample.freedom * max(len(rest.vector) - 1, 1))
-    variance, covariance = np.full(3, mean), (_VARIANCE_SPREAD * mean) ** 2 * np.eye(3)
-    noise = axis_noise(rest)
-    if noise is not None:
-        gain = np.linalg.solve(covariance + noise.covariance, covariance).T
-        variance = np.maximum(variance + gain @ (noise.variance - variance), 0.0)
-        covariance = covariance - gain @ covariance
+    square = np.einsum("bkni,bkni->b", vector, vector)
+    mean = square / (sample.freedom * np.maximum(sample.count - 1, 1))
+    variance = np.repeat(mean[:, None], 3, axis=1)
+    covariance = ((_VARIANCE_SPREAD * mean) ** 2)[:, None, None] * np.eye(3)
+    noise = axis_noise(replace(sample, vector=vector))
+    measured = np.isfinite(noise.variance).all(axis=1)
+    if measured.any():
+        some = covariance[measured]
+        total = some + noise.covariance[measured]
+        gain = np.swapaxes(np.linalg.solve(total, some), 1, 2)
+        off = (noise.variance - variance)[measured]
+        shrunk = variance[measured] + np.einsum("bij,bj->bi", gain, off)
+        variance[measured] = np.maximum(shrunk, 0.0)
+        covariance[measured] = some - gain @ some
     products, squares = _noise_products(sample, left)
+    imitated = (squares * variance).sum(axis=1)
     found = regress(
         sample,
         displacement,
-        offset=float(products @ variance),
-        imitated=float(squares @ variance),
+        left=left,
+        offset=(products * variance).sum(axis=1),
+        imitated=imitated,
     )
-    power = float((left**2).sum()) - float(squares @ variance)
-    noise_error = float(products @ covariance @ products) / power**2
-    return found._replace(stderr=float(np.sqrt(found.stderr**2 + noise_error))), left
+    power = np.einsum("bkni,bkni->b", left, left) - imitated
+    noise_error = np.einsum("ba,bac,bc->b", products, covariance, products)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        error = np.sqrt(found.stderr**2 + noise_error / power**2)
+    return found._replace(stderr=error).where(known, plain), left
 
 
 def _noise_products(sample: Residuals, left: Floats) -> tuple[Floats, Floats]:
@@ -583,28 +768,32 @@ def _noise_products(sample: Residuals, left: Floats) -> tuple[Floats, Floats]:
     correlated with the residual where the axes of the lab have unequal noise.
     """
     turn, r = sample.rotation, sample.template
-    arm = np.linalg.pinv(inertia_tensor(r)) @ skew(r)
+    arm = np.linalg.pinv(inertia_tensor(r))[:, None] @ skew(r)
     # The derivative of u (u . r) with u -> u - delta x u; its last index is that of delta.
-    up = turn[:, 2]
-    count, (n, d) = len(turn), r.shape
-    turned = np.einsum("abd,td->tab", _LEVI_CIVITA, up)
-    slope = -turned[:, None] * (up @ r.T)[:, :, None, None]
-    slope = slope - up[:, None, :, None] * (r @ turned)[:, :, None, :]
-    keeps = sample.keeps.transpose(0, 2, 1, 3).reshape(n * d, n * d)
-    slope = keeps @ slope.reshape(count, n * d, 3)
-    shared = np.einsum("lbp,liqc->ibcpq", arm, sample.keeps).reshape(-1, 9)
-    products, squares = np.empty(3), np.empty(3)
+    up = turn[:, :, 2]
+    bodies, count, n, d = left.shape
+    turned = skew(up)
+    slope = turned[:, :, None] * (up @ np.swapaxes(r, 1, 2))[..., None, None]
+    slope = slope + up[:, :, None, :, None] * (r[:, None] @ turned)[:, :, :, None, :]
+    keeps = sample.keeps.transpose(0, 1, 3, 2, 4).reshape(bodies, 1, n * d, n * d)
+    slope = keeps @ slope.reshape(bodies, count, n * d, 3)
+    shared = np.einsum("zlbp,zliqc->zibcpq", arm, sample.keeps).reshape(bodies, -1, 9)
+    products, squares = np.empty((2, bodies, 3))
+    of_slope = np.swapaxes(slope.reshape(bodies, count, n, d, 3), 3, 4).reshape(bodies, count, -1)
+    flat_arm = np.swapaxes(arm.reshape(bodies, n * 3, 3), 1, 2)
     for axis in range(3):
-        u = turn[:, axis]
-        turns = np.einsum("nab,tb->tna", arm, u)  # what unit noise along this axis turns the fit by
-        c = np.swapaxes(turns, 1, 2) @ turns
-        shift = 0.5 * (r @ c - np.trace(c, axis1=1, axis2=2)[:, None, None] * r)
-        shift -= np.cross(turns, u[:, None])
-        noise = (u[:, :, None] * u[:, None, :]).reshape(count, 9)
-        crossed = (noise @ shared.T).reshape(count, n, 3, d)
-        of_slope = slope.reshape(count, n, d, 3)
-        products[axis] = (left * shift).sum() + (of_slope * np.swapaxes(crossed, 2, 3)).sum()
-        squares[axis] = ((slope @ c) * slope).sum()
+        u = turn[:, :, axis]
+        # what unit noise along this axis turns the fit by
+        turns = (u @ flat_arm).reshape(bodies, count, n, 3)
+        c = np.swapaxes(turns, 2, 3) @ turns
+        trace = np.trace(c, axis1=2, axis2=3)[..., None, None]
+        shift = 0.5 * (r[:, None] @ c - trace * r[:, None])
+        shift -= turns @ skew(u)
+        noise = (u[..., :, None] * u[..., None, :]).reshape(bodies, count, 9)
+        crossed = noise @ np.swapaxes(shared, 1, 2)
+        products[:, axis] = np.einsum("bkni,bkni->b", left, shift)
+        products[:, axis] += np.einsum("bkx,bkx->b", of_slope, crossed)
+        squares[:, axis] = np.einsum("bkxi,bkxi->b", slope @ c, slope)
     return products, squares
 
 
@@ -618,6 +807,7 @@ def measure_scan(sample: Residuals) -> Slope:
     Parameters
     ----------
     sample : Residuals
+        Of B bodies.
 
     Returns
     -------
@@ -631,14 +821,14 @@ def measure_scan(sample: Residuals) -> Slope:
     ...     Cluster.tetrahedron(1.5), D_R=0.02, D_T=0.04, dt=0.7, n_frames=300, rng=1
     ... )
     >>> x = add_noise(truth.positions(), sigma=0.03, rng=2)  # all recorded at once
-    >>> measure_scan(sample_residuals(track_rotation(x, dt=0.7), x)).differs_from(0.0)
-    False
+    >>> measure_scan(sample_residuals([track_rotation(x, dt=0.7)], x[None])).differs_from(0.0)
+    array([False])
     """
-    if sample.rotation.shape[-1] != 3 or len(sample.vector) < 3:
-        return UNKNOWN_SLOPE
-    height = sample.rotation[:, 2] @ sample.template.T
-    velocity = np.einsum("tij,ti->tj", sample.rotation, sample.velocity)
-    return regress(sample, height[..., None] * velocity[:, None])
+    if sample.rotation.shape[-1] != 3:
+        return Slope.unknown(sample.count.shape)
+    height = sample.rotation[:, :, 2] @ np.swapaxes(sample.template, 1, 2)
+    velocity = (sample.velocity[:, :, None] @ sample.rotation)[:, :, 0]
+    return regress(sample, height[..., None] * velocity[:, :, None])
 
 
 def body_residuals(motion: RigidMotion, positions: Floats) -> Floats:
@@ -662,8 +852,36 @@ def body_residuals(motion: RigidMotion, positions: Floats) -> Floats:
     >>> bool(np.allclose(body_residuals(truth, truth.positions()), 0.0))
     True
     """
-    out: Floats = np.einsum("tij,tni->tnj", motion.rotation, positions - motion.center[:, None])
-    return out - motion.template
+    return residuals_of_each([motion], positions[None])[0]
+
+
+def residuals_of_each(motions: Sequence[RigidMotion], positions: Floats) -> Floats:
+    """Return the measured minus the fitted positions of several bodies in body axes, um.
+
+    Parameters
+    ----------
+    motions : sequence of RigidMotion
+        Motions of B bodies.
+    positions : ndarray, shape (B, T, n, d)
+        The positions that the motions were fitted to, um.
+
+    Returns
+    -------
+    ndarray, shape (B, T, n, d)
+        NaN where a particle or a pose is missing.
+
+    Examples
+    --------
+    >>> from perrin import Cluster, simulate_motion
+    >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=0.02, dt=0.7, n_frames=5, rng=1)
+    >>> residuals_of_each([truth, truth], np.stack([truth.positions()] * 2)).shape
+    (2, 5, 4, 3)
+    """
+    center = np.stack([m.center for m in motions])
+    rotation = np.stack([m.rotation for m in motions])
+    template = np.stack([m.template for m in motions])
+    out: Floats = (positions - center[:, :, None]) @ rotation
+    return out - template[:, None]
 
 
 def unit_covariance(motion: RigidMotion) -> Floats:

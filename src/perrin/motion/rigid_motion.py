@@ -24,9 +24,11 @@ from perrin._arrays import (
 from perrin._display import Shown
 from perrin.errors import TooFewFramesError
 from perrin.geometry.rotations import log_map, skew
-from perrin.geometry.symmetry import projected_on_line, symmetry_elements
+from perrin.geometry.symmetry import projected_on_line, symmetry_elements_of_each
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     import pandas as pd
     from scipy.spatial.transform import Rotation
 
@@ -149,10 +151,9 @@ class RigidMotion(Shown):
 
         None in the plane and for particles on one line.
         """
-        error = self.template_error
-        if self.dimension == 2 or projected_on_line(self.template, error) is not None:
-            return None
-        return symmetry_elements(self.template, error)
+        find_symmetries([self])
+        found: Floats | None = vars(self)["symmetry_elements"]
+        return found
 
     @cached_property
     def usual_interval(self) -> float:
@@ -538,6 +539,32 @@ class RigidMotion(Shown):
         }
         sigma, dt = (float(from_plain(entry[name])) for name in ("sigma", "dt"))
         return cls(reason=tuple(entry["reason"]), sigma=sigma, dt=dt, **arrays)
+
+
+def find_symmetries(motions: Iterable[RigidMotion]) -> None:
+    """Find the point groups of several bodies together, for `RigidMotion.symmetry_elements`.
+
+    Examples
+    --------
+    >>> from perrin import Cluster, simulate_motion
+    >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=9, rng=3)
+    >>> find_symmetries([truth])
+    >>> truth.symmetry_elements.shape
+    (24, 3, 3)
+    """
+    alike: dict[int, list[tuple[RigidMotion, float]]] = {}
+    for motion in motions:
+        error = motion.template_error
+        if motion.dimension == 2 or projected_on_line(motion.template, error) is not None:
+            vars(motion)["symmetry_elements"] = None
+        else:
+            alike.setdefault(len(motion.template), []).append((motion, error))
+    for bodies in alike.values():
+        templates = np.stack([motion.template for motion, _ in bodies])
+        errors = np.array([error for _, error in bodies])
+        found = symmetry_elements_of_each(templates, errors)
+        for (motion, _), elements in zip(bodies, found, strict=True):
+            vars(motion)["symmetry_elements"] = elements
 
 
 def _rotation_matrices(

@@ -7,27 +7,38 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from perrin._arrays import Bools, Floats, as_positions, as_sigma, finite_or_none, present, to_plain
+from perrin._arrays import (
+    Bools,
+    Floats,
+    Ints,
+    as_positions,
+    as_sigma,
+    finite_or_none,
+    present,
+    to_plain,
+)
 from perrin._display import Shown
 from perrin.geometry.shapes import pair_distances
 from perrin.geometry.symmetry import point_group, schoenflies
 from perrin.motion.residuals import (
     SIGNIFICANCE,
-    UNKNOWN_SLOPE,
-    Residuals,
     Slope,
     autocorrelation,
     axis_noise,
-    body_residuals,
     fit_projector,
     lag_one_autocorrelation,
-    lagged_products,
     measure_scan,
     measure_stretch,
+    median_present,
+    quantile_present,
+    residuals_of_each,
     sample_residuals,
 )
+from perrin.motion.rigid_motion import find_symmetries
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import ArrayLike
 
     from perrin.motion.rigid_motion import RigidMotion
@@ -68,6 +79,9 @@ _LARGEST_DRIFT = 0.2
 # Standard errors by which a change of a distance must exceed its noise: 28 pairs of blocks of up to
 # dozens of pairs of particles are compared.
 _DRIFT_ERRORS = 5.0
+
+# About this many coordinates are judged at once; more do not stay in the processor's cache.
+_MOST_AT_ONCE = 60_000
 
 # Smallest relative error of the scale of z that is reported, where it is significant: refractive
 # indices are not known better.
@@ -224,122 +238,285 @@ def judge_quality(
     >>> quality.rigid, [round(s, 3) for s in quality.sigma_xyz]
     (True, [0.031, 0.032, 0.059])
     """
-    x = as_positions(positions)
-    d = motion.dimension
+    return judge_each(
+        [motion],
+        [as_positions(positions)],
+        sigma=sigma,
+        sigma_ratio=sigma_ratio,
+        corrections=[Corrections(swaps, cuts, extra)],
+        detections=[None if detections is None else as_positions(detections, name="detections")],
+        unsettled=[np.asarray(unsettled, dtype=np.int64)],
+    )[0]
+
+
+class Corrections(NamedTuple):
+    """Corrections of the identity of the particles of one body (`Identity`), in rows.
+
+    Attributes
+    ----------
+    swaps, cuts, extra : tuple of int
+        Exchanges of labels, cuts, and detections left out.
+    """
+
+    swaps: tuple[int, ...] = ()
+    cuts: tuple[int, ...] = ()
+    extra: tuple[int, ...] = ()
+
+
+def judge_each(
+    motions: Sequence[RigidMotion],
+    positions: Sequence[Floats],
+    *,
+    sigma: ArrayLike | None = None,
+    sigma_ratio: ArrayLike | None = None,
+    corrections: Sequence[Corrections] | None = None,
+    detections: Sequence[Floats | None] | None = None,
+    unsettled: Sequence[Ints] | None = None,
+) -> list[Quality]:
+    """Judge several clusters, each alone, as `judge_quality`; those of one shape together.
+
+    Parameters
+    ----------
+    motions : sequence of RigidMotion
+    positions : sequence of ndarray, shape (T, n, d)
+        The positions that each motion was fitted to, um.
+    sigma, sigma_ratio
+        As in `judge_quality`.
+    corrections : sequence of Corrections, optional
+        Corrections of the identity of the particles of each cluster.
+    detections : sequence of ndarray, shape (T, m, d), or None, optional
+        The rows of each cluster before any detection was left out.
+    unsettled : sequence of ndarray of int, optional
+        Rows of each cluster that fit the common shape in no assignment.
+
+    Returns
+    -------
+    list of Quality
+
+    Examples
+    --------
+    >>> from perrin import Cluster, add_noise, simulate_motion, track_rotation
+    >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=0.02, dt=0.7, n_frames=300, rng=1)
+    >>> x = [add_noise(truth.positions(), sigma=0.03, rng=seed) for seed in (2, 3)]
+    >>> [one.rigid for one in judge_each([track_rotation(one, dt=0.7) for one in x], x)]
+    [True, True]
+    """
+    count = len(motions)
+    corrections = [Corrections()] * count if corrections is None else corrections
+    detections = [None] * count if detections is None else detections
+    unsettled = [np.empty(0, np.int64)] * count if unsettled is None else unsettled
+    alike: dict[tuple[object, ...], list[int]] = {}
+    for k, (motion, x) in enumerate(zip(motions, positions, strict=True)):
+        scanned = motion.turn_noise is not None
+        alike.setdefault((x.shape, motion.dt, scanned), []).append(k)
+    found: dict[int, Quality] = {}
+    for group in alike.values():
+        at_once = max(1, _MOST_AT_ONCE // positions[group[0]].size)
+        for low in range(0, len(group), at_once):
+            rows = group[low : low + at_once]
+            judged = _judge_alike(
+                [motions[k] for k in rows],
+                np.stack([positions[k] for k in rows]),
+                sigma=sigma,
+                sigma_ratio=sigma_ratio,
+                corrections=[
+                    Corrections() if corrections is None else corrections[k] for k in rows
+                ],
+                detections=[detections[k] for k in rows],
+                unsettled=[
+                    np.empty(0, np.int64) if unsettled is None else unsettled[k] for k in rows
+                ],
+            )
+            found.update(zip(rows, judged, strict=True))
+    return [found[k] for k in range(count)]
+
+
+def _judge_alike(
+    motions: Sequence[RigidMotion],
+    x: Floats,
+    *,
+    sigma: ArrayLike | None,
+    sigma_ratio: ArrayLike | None,
+    corrections: Sequence[Corrections],
+    detections: Sequence[Floats | None],
+    unsettled: Sequence[Ints],
+) -> list[Quality]:
+    """Judge bodies whose positions (B, T, n, d) have one shape."""
+    d = x.shape[3]
     stated = None if sigma is None else as_sigma(sigma, d)
     ratio = stated if sigma_ratio is None else as_sigma(sigma_ratio, d)
     stated_sigma = None if stated is None else float(np.sqrt(np.mean(stated**2)))
-    stretch = measure_stretch(motion, x)
+    plain = sample_residuals(motions, x)
+    stretch = measure_stretch(motions, x, plain)
     scale = stretch.scale
-    stretched = abs(scale.value - 1) > _SCALE_ERROR and scale.differs_from(1.0)
+    stretched = (np.abs(scale.value - 1) > _SCALE_ERROR) & scale.differs_from(1.0)
     # A stretched z changes the distances of a rigid body: it is corrected before the tests.
-    unit = np.array([1.0, 1.0, scale.value]) if stretched else np.ones(d)
-    body = stretch.motion if stretched else motion
-    corrected = x / unit
-    all_detections = corrected
-    if detections is not None:
-        found = as_positions(detections, name="detections") / unit
-        all_detections = _restored_detections(body, corrected, found)
-    misfit = misplaced_detections(body, all_detections)
-    misfit[np.asarray(unsettled, dtype=np.int64)] = True
-    misfit_rows = np.flatnonzero(misfit.any(axis=1))
-    smooth = lag_one_autocorrelation(body_residuals(body, corrected))
-    drift = bond_drift(corrected)
-    noise = axis_noise(stretch.sample)
-    noise = noise if noise is not None and noise.known else None
-    per_unit = unit / ratio if ratio is not None and (ratio > 0).all() else unit
-    blur = UNKNOWN_SLOPE if noise is None or d == 2 else noise.z_ratio(per_unit)
-    # Positions of particles with their own times were moved to one instant.
-    delay = measure_scan(stretch.sample) if motion.turn_noise is None else UNKNOWN_SLOPE
-
-    sample = stretch.sample if stretched else sample_residuals(motion, x)
-    soft = [
-        *_residual_test(body, sample, smooth, stated_sigma),
-        *_flexing_test(body, all_detections),
-        *_misfit_test(misfit, body.fitted.size),
+    unit = np.ones((len(x), d))
+    unit[stretched, -1] = scale.value[stretched]
+    bodies = [
+        s if yes else m for s, yes, m in zip(stretch.motions, stretched, motions, strict=True)
     ]
-    if drift.change > _LARGEST_DRIFT:
-        soft.append(
-            f"not rigid: the distance of particles {drift.pair[0]} and {drift.pair[1]} (counted "
-            f"from 0) changes in time between {drift.distances[0]:.3g} and "
-            f"{drift.distances[1]:.3g} um; a bond breaks, or a label moves to another particle"
+    corrected = x / unit[:, None, None] if stretched.any() else x
+    residuals = residuals_of_each(bodies, corrected)
+    all_detections, all_residuals = corrected, residuals
+    if any(found is not None for found in detections):
+        filled = [
+            one if found is None else _restored_detections(body, one, found / own)
+            for body, one, found, own in zip(bodies, corrected, detections, unit, strict=True)
+        ]
+        if any(more is not one for more, one in zip(filled, corrected, strict=True)):
+            all_detections = np.stack(filled)
+            all_residuals = residuals_of_each(bodies, all_detections)
+    radius = np.array([body.R for body in bodies])
+    misfit = misplaced_detections(all_residuals, radius)
+    for own, rows in zip(misfit, unsettled, strict=True):
+        own[rows] = True
+    smooth = lag_one_autocorrelation(residuals)
+    drifts = bond_drifts(corrected)
+    noise = axis_noise(stretch.sample)
+    per_unit = unit / ratio if ratio is not None and (ratio > 0).all() else unit
+    blur = Slope.unknown((len(x),))
+    if d == 3:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            blur = noise.z_ratio(per_unit).where(noise.known, blur)
+    # Positions of particles with their own times were moved to one instant.
+    delay = Slope.unknown((len(x),))
+    if motions[0].turn_noise is None:
+        delay = measure_scan(stretch.sample)
+    usual = plain.median_sigma
+    if stretched.any():
+        usual = np.where(stretched, stretch.sample.median_sigma, usual)
+    flexing = _flexing_tests(bodies, all_residuals)
+    imaging = _imaging_texts(scale, stretched, delay, blur, ratio is not None)
+    symmetries = symmetries_of_each(motions)
+    judged = []
+    for k, (motion, body) in enumerate(zip(motions, bodies, strict=True)):
+        misfit_rows = np.flatnonzero(misfit[k].any(axis=1))
+        drift = drifts[k]
+        soft = [
+            *_residual_test(body, float(usual[k]), smooth.of_body(k), stated_sigma),
+            *flexing[k],
+            *_misfit_test(misfit[k], body.fitted.size),
+        ]
+        if drift.change > _LARGEST_DRIFT:
+            soft.append(
+                f"not rigid: the distance of particles {drift.pair[0]} and {drift.pair[1]} "
+                f"(counted from 0) changes in time between {drift.distances[0]:.3g} and "
+                f"{drift.distances[1]:.3g} um; a bond breaks, or a label moves to another particle"
+            )
+        warnings, notes = imaging[k]
+        if misfit_rows.size and not soft:
+            notes.insert(
+                0,
+                f"{misfit_rows.size} of {body.fitted.size} frames fit the common shape badly "
+                f"(first at {body.time[misfit_rows[0]]:g} s): a particle is over "
+                f"{_MISPLACED_MULTIPLE:g} times as far from its place as {_USUAL_SHARE:.0%} of all "
+                "detections are",
+            )
+        error = np.sqrt(noise.variance[k]) * unit[k] if noise.known[k] else None
+        over = finite_or_none(motion.sigma / stated_sigma) if stated_sigma else None
+        judged.append(
+            Quality(
+                rigid=not soft,
+                reasons=tuple(soft),
+                residual_over_R=motion.sigma / motion.R,
+                residual_over_sigma=over,
+                autocorrelation=finite_or_none(smooth.value[k]),
+                bond_drift=drift.change,
+                drifting_pair=drift.pair,
+                sigma_xyz=None if error is None else tuple(error.tolist()),
+                z_scale=finite_or_none(scale.value[k]),
+                z_scale_stderr=finite_or_none(scale.stderr[k]),
+                scan_blur=finite_or_none(blur.value[k]),
+                swaps=corrections[k].swaps,
+                cuts=corrections[k].cuts,
+                extra=corrections[k].extra,
+                symmetry=symmetries[k],
+                fraction=motion.fitted.size / len(motion.time),
+                warnings=(*soft, *warnings),
+                notes=tuple(notes),
+                scan_blur_stderr=finite_or_none(blur.stderr[k]),
+                scan_delay=finite_or_none(delay.value[k]),
+                scan_delay_stderr=finite_or_none(delay.stderr[k]),
+                misfits=misfit_rows.size,
+            )
         )
-    warnings, notes = _imaging_texts(scale if stretched else None, delay, blur, ratio is not None)
-    if misfit_rows.size and not soft:
-        notes.insert(
-            0,
-            f"{misfit_rows.size} of {body.fitted.size} frames fit the common shape badly (first at "
-            f"{body.time[misfit_rows[0]]:g} s): a particle is over {_MISPLACED_MULTIPLE:g} times "
-            f"as far from its place as {_USUAL_SHARE:.0%} of all detections are",
-        )
-    elements = motion.symmetry_elements
-    return Quality(
-        rigid=not soft,
-        reasons=tuple(soft),
-        residual_over_R=motion.sigma / motion.R,
-        residual_over_sigma=finite_or_none(motion.sigma / stated_sigma) if stated_sigma else None,
-        autocorrelation=finite_or_none(smooth.value),
-        bond_drift=drift.change,
-        drifting_pair=drift.pair,
-        sigma_xyz=None if noise is None else tuple((np.sqrt(noise.variance) * unit).tolist()),
-        z_scale=finite_or_none(scale.value),
-        z_scale_stderr=finite_or_none(scale.stderr),
-        scan_blur=finite_or_none(blur.value),
-        swaps=swaps,
-        cuts=cuts,
-        extra=extra,
-        symmetry=point_group(motion.template, tolerance=motion.template_error)
-        if elements is None
-        else schoenflies(elements),
-        fraction=motion.fitted.size / len(motion.time),
-        warnings=(*soft, *warnings),
-        notes=tuple(notes),
-        scan_blur_stderr=finite_or_none(blur.stderr),
-        scan_delay=finite_or_none(delay.value),
-        scan_delay_stderr=finite_or_none(delay.stderr),
-        misfits=misfit_rows.size,
-    )
+    return judged
+
+
+def symmetries_of_each(motions: Sequence[RigidMotion]) -> list[str]:
+    """Return the point groups of bodies within the errors of their shapes (Schoenflies symbols).
+
+    Examples
+    --------
+    >>> from perrin import Cluster, simulate_motion
+    >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=0.02, dt=0.7, n_frames=9, rng=1)
+    >>> symmetries_of_each([truth])
+    ['T_d']
+    """
+    find_symmetries(motions)
+    symbols, known = [], dict[tuple[int, bytes], str]()
+    for motion in motions:
+        elements = motion.symmetry_elements
+        if elements is None:
+            symbols.append(point_group(motion.template, tolerance=motion.template_error))
+            continue
+        # Groups with the same angles between all their elements are turned against each other.
+        flat = elements.reshape(len(elements), -1)
+        angles = np.rint(1e4 * (flat @ flat.T)).astype(np.int64)
+        key = len(elements), angles.tobytes()
+        if key not in known:
+            known[key] = schoenflies(elements)
+        symbols.append(known[key])
+    return symbols
 
 
 def _imaging_texts(
-    scale: Slope | None, delay: Slope, blur: Slope, stated: bool
-) -> tuple[list[str], list[str]]:
+    scale: Slope, stretched: Bools, delay: Slope, blur: Slope, stated: bool
+) -> list[tuple[list[str], list[str]]]:
     """Return warnings and notes on the imaging: scale of z, sequential scan, noise along z."""
-    warnings, notes = [], []
-    if scale is not None:
-        warnings.append(
-            f"z scale: the shape changes with its orientation as if z were {scale.value:.3f} +- "
-            f"{scale.stderr:.2g} times too long; check the voxel size or the refractive index"
-        )
-    if delay.differs_from(0.0):
-        warnings.append(
-            "scan: the particles of a frame are recorded one after another along z: their "
-            "residuals follow the velocity of the body times their height, "
-            f"{abs(delay.value):.2g} +- {delay.stderr:.2g} s/um; sigma then includes motion, and D "
-            "with noise from the residuals is too low; the times of the rows (column time) or of "
-            "the planes (plane_time=) remove this"
-        )
+    late = delay.differs_from(0.0)
     # Tested on the logarithm, whose error does not grow with the ratio.
-    unequal = Slope(np.log(blur.value), blur.stderr / blur.value, np.inf).differs_from(0.0)
-    if unequal and not stated:
-        notes.append(
-            f"localisation error: sigma_z is {blur.value:.2f} +- {blur.stderr:.2g} times sigma_xy"
-        )
-    elif unequal and blur.value > _RATIO_EXCESS:
-        warnings.append(
-            f"noise along z: sigma_z over sigma_xy is {blur.value:.2f} +- {blur.stderr:.2g} times "
-            "the stated ratio; z is located worse than stated, or the particles of a frame are "
-            "recorded one after another (sequential scan): then sigma includes motion, and D with "
-            "noise from the residuals is too low"
-        )
-    return warnings, notes
+    with np.errstate(divide="ignore", invalid="ignore"):
+        logarithm = Slope(np.log(blur.value), blur.stderr / blur.value, blur.freedom)
+    unequal = logarithm.differs_from(0.0)
+    texts = []
+    for k in range(len(stretched)):
+        warnings, notes = [], []
+        if stretched[k]:
+            warnings.append(
+                "z scale: the shape changes with its orientation as if z were "
+                f"{scale.value[k]:.3f} +- {scale.stderr[k]:.2g} times too long; check the voxel "
+                "size or the refractive index"
+            )
+        if late[k]:
+            warnings.append(
+                "scan: the particles of a frame are recorded one after another along z: their "
+                "residuals follow the velocity of the body times their height, "
+                f"{abs(delay.value[k]):.2g} +- {delay.stderr[k]:.2g} s/um; sigma then includes "
+                "motion, and D with noise from the residuals is too low; the times of the rows "
+                "(column time) or of the planes (plane_time=) remove this"
+            )
+        if unequal[k] and not stated:
+            notes.append(
+                f"localisation error: sigma_z is {blur.value[k]:.2f} +- {blur.stderr[k]:.2g} times "
+                "sigma_xy"
+            )
+        elif unequal[k] and blur.value[k] > _RATIO_EXCESS:
+            warnings.append(
+                f"noise along z: sigma_z over sigma_xy is {blur.value[k]:.2f} +- "
+                f"{blur.stderr[k]:.2g} times the stated ratio; z is located worse than stated, or "
+                "the particles of a frame are recorded one after another (sequential scan): then "
+                "sigma includes motion, and D with noise from the residuals is too low"
+            )
+        texts.append((warnings, notes))
+    return texts
 
 
 def _residual_test(
-    motion: RigidMotion, sample: Residuals, smooth: Slope, stated: float | None
+    motion: RigidMotion, usual: float, smooth: Slope, stated: float | None
 ) -> list[str]:
     """Test the size of the residuals: over the stated sigma, or over R and smooth in time."""
-    usual = sample.median_sigma
     if stated is not None:
         if not usual > _LARGEST_OVER_SIGMA * stated:
             return []
@@ -368,9 +545,13 @@ def _restored_detections(motion: RigidMotion, x: Floats, found: Floats) -> Float
     """
     if len(found) != len(x):
         raise ValueError(f"detections: expected {len(x)} rows as in positions, got {len(found)}")
-    filled, seen, expected = x.copy(), present(x), motion.positions()
+    seen, detected = present(x), present(found)
+    # As many positions as detections: none was left out.
+    if (seen.sum(axis=1) == detected.sum(axis=1)).all():
+        return x
+    filled, expected = x.copy(), motion.positions()
     used = (found[:, :, None] == x[:, None]).all(axis=3).any(axis=2)
-    spare = present(found) & ~used
+    spare = detected & ~used
     for k in np.flatnonzero(spare.any(axis=1) & ~seen.all(axis=1) & np.isfinite(expected[:, 0, 0])):
         missing, points = np.flatnonzero(~seen[k]), found[k, spare[k]]
         distance = np.linalg.norm(points[:, None] - expected[k, missing], axis=2)
@@ -383,18 +564,19 @@ def _restored_detections(motion: RigidMotion, x: Floats, found: Floats) -> Float
     return filled
 
 
-def misplaced_detections(motion: RigidMotion, x: Floats) -> Bools:
+def misplaced_detections(residuals: Floats, radius: Floats) -> Bools:
     """Return which detections are far from their positions in the common shape.
 
     Parameters
     ----------
-    motion : RigidMotion
-    x : ndarray, shape (T, n, d)
-        The positions that the motion was fitted to, um.
+    residuals : ndarray, shape (B, T, n, d)
+        Measured minus fitted positions of B bodies, um.
+    radius : ndarray, shape (B,)
+        Mean distance of the particles of each body to its centre, um.
 
     Returns
     -------
-    ndarray of bool, shape (T, n)
+    ndarray of bool, shape (B, T, n)
 
     Examples
     --------
@@ -402,29 +584,30 @@ def misplaced_detections(motion: RigidMotion, x: Floats) -> Bools:
     >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=0.02, dt=0.7, n_frames=50, rng=1)
     >>> x = truth.positions()
     >>> x[7, 2] += 1.0
-    >>> np.argwhere(misplaced_detections(truth, x))
-    array([[7, 2]])
+    >>> np.argwhere(misplaced_detections(residuals_of_each([truth], x[None]), np.array([1.5])))
+    array([[0, 7, 2]])
     """
-    distance = np.linalg.norm(body_residuals(motion, x), axis=2)
+    distance = np.sqrt((residuals * residuals).sum(axis=3))
     seen = np.isfinite(distance)
-    usual = float(np.quantile(distance[seen], _USUAL_SHARE)) if seen.any() else np.inf
+    usual = quantile_present(distance.reshape(len(distance), -1), _USUAL_SHARE)
     # A difference of rounding is no misfit.
-    limit = max(_MISPLACED_MULTIPLE * usual, 1e-9 * motion.R)
-    return np.asarray(seen & (distance > limit))
+    limit = np.maximum(_MISPLACED_MULTIPLE * np.nan_to_num(usual, nan=np.inf), 1e-9 * radius)
+    return np.asarray(seen & (distance > limit[:, None, None]))
 
 
 def _misfit_test(misfit: Bools, count: int) -> list[str]:
     """Test the number of frames with a misplaced detection (binomial test)."""
-    from scipy.stats import binom
+    from scipy.special import bdtrc
 
     each, total = misfit.sum(axis=0), int(misfit.any(axis=1).sum())
     worst = int(each.argmax())
-    if total > binom.isf(SIGNIFICANCE, count, _MISPLACED_FRAMES):
+    if total and bdtrc(total - 1, count, _MISPLACED_FRAMES) <= SIGNIFICANCE:
         return [
             f"not rigid: in {total} of {count} frames a particle is not at its place in the common "
             f"shape (at most {_MISPLACED_FRAMES:.0%} are taken for bad frames)"
         ]
-    if each[worst] > binom.isf(SIGNIFICANCE / len(each), count, _MISPLACED_PARTICLE):
+    chance = SIGNIFICANCE / len(each)
+    if total and bdtrc(each[worst] - 1, count, _MISPLACED_PARTICLE) <= chance:
         return [
             f"not rigid: particle {worst} (counted from 0) is not at its place in the common shape "
             f"in {each[worst]} of {count} frames (at most {_MISPLACED_PARTICLE:.0%} are taken for "
@@ -433,53 +616,72 @@ def _misfit_test(misfit: Bools, count: int) -> list[str]:
     return []
 
 
-def _flexing_test(motion: RigidMotion, x: Floats) -> list[str]:
+def _flexing_tests(motions: Sequence[RigidMotion], residuals: Floats) -> list[list[str]]:
     """Test the particle that moves against the others more than noise of all of them explains.
 
     Noise that differs between particles has no memory, and noise that is smooth in time is as
     smooth for all of them. The statistic is the covariance of a particle's position in the body
     between neighbouring frames, less that of the median particle.
     """
-    from scipy.stats import t
+    from scipy.special import stdtrit
 
-    n, d = motion.template.shape
-    keeps = fit_projector(motion.template)
-    vector = np.einsum("nmij,tmj->tni", keeps, body_residuals(motion, x))
-    whole = np.isfinite(vector).all(axis=(1, 2))
+    bodies, frames, n, d = residuals.shape
+    keeps = fit_projector(np.stack([m.template for m in motions]))
     # Contribution of each particle's variance to the mean squares of all residuals.
-    share = np.einsum("nmij,nmij->nm", keeps, keeps)
-    first = (np.cumsum(whole) - 1)[:-1][whole[1:] & whole[:-1]]
-    if first.size < 10 or np.linalg.cond(share) > 1e6:
-        return []
-    vector = vector[whole] - np.median(vector[whole], axis=0)
+    share = np.einsum("bnmij,bnmij->bnm", keeps, keeps)
+    singular = np.linalg.svd(share, compute_uv=False)
+    whole = np.isfinite(residuals).all(axis=(2, 3))
+    following = whole[:, 1:] & whole[:, :-1]
+    pairs = following.sum(axis=1)
+    tested = np.flatnonzero((pairs >= 10) & ~(singular[:, 0] > 1e6 * singular[:, -1]))
+    texts: list[list[str]] = [[] for _ in range(bodies)]
+    if not tested.size:
+        return texts
+    # Complete frames first, each with the number of the frame after it.
+    order = np.argsort(~whole[tested], axis=1, kind="stable")
+    count, pairs = whole[tested].sum(axis=1), pairs[tested]
+    complete = np.arange(frames) < count[:, None]
+    linked = np.take_along_axis(np.pad(following[tested], ((0, 0), (0, 1))), order, axis=1)[:, :-1]
+    matrix = keeps[tested].transpose(0, 2, 4, 1, 3).reshape(len(tested), n * d, n * d)
+    rows = np.take_along_axis(residuals[tested], order[..., None, None], axis=1)
+    rows = np.where(complete[..., None, None], rows, np.nan)
+    vector = (rows.reshape(len(tested), frames, n * d) @ matrix).reshape(rows.shape)
+    vector = vector - median_present(np.moveaxis(vector, 1, -1))[:, None]
     # The longest vectors of every particle are shortened to the length of the next (winsorised).
-    length = np.linalg.norm(vector, axis=2, keepdims=True)
-    limit = np.quantile(length, 1 - _TRIMMED_SHARE, axis=0)
-    vector = vector * np.minimum(1.0, limit / np.maximum(length, 1e-300))
-    inverse = np.linalg.inv(share)
-    product = (vector[first] * vector[first + 1]).sum(axis=2) @ inverse
-    order = np.argsort(product.mean(axis=0))
-    worst, middle = int(order[-1]), int(order[(n - 1) // 2])
-    excess = float(np.mean(product[:, worst] - product[:, middle]))
-    size = float(np.sqrt(max(d * excess, 0.0)))
-    if not size > _LARGEST_FLEXING * motion.R:
-        return []
-    # Equal noise gives the products the covariance `inverse` times a number; the number is that of
-    # the median particle, and its autocorrelation that of the other particles, as the error of
-    # the worst would contain the tested motion itself.
-    unit = float(np.sort(product.var(axis=0) / np.diag(inverse))[(n - 1) // 2])
-    others = np.delete(vector, worst, axis=1)
-    rho = autocorrelation(lagged_products(others), d * (n - 1) / 2)
-    repeats = 1.0 + 2.0 * float(rho @ rho)
-    contrast = inverse[worst, worst] + inverse[middle, middle] - 2 * inverse[worst, middle]
-    error = float(np.sqrt(unit * contrast * repeats / first.size))
-    if not excess > t.isf(SIGNIFICANCE / n, max(first.size / repeats, 1.0)) * error:
-        return []
-    return [
-        f"not rigid: particle {worst} (counted from 0) moves against the others by {size:.3g} um "
-        f"smoothly in time ({size / motion.R:.3f} of R, over {_LARGEST_FLEXING}; "
-        f"{excess / error:.1f} standard errors)"
-    ]
+    length = np.sqrt((vector * vector).sum(axis=3))
+    limit = quantile_present(np.moveaxis(length, 1, -1), 1 - _TRIMMED_SHARE)
+    vector = vector * np.minimum(1.0, limit[:, None] / np.maximum(length, 1e-300))[..., None]
+    vector = np.where(complete[..., None, None], vector, 0.0)
+    inverse = np.linalg.inv(share[tested])
+    product = (vector[:, :-1] * vector[:, 1:]).sum(axis=3) @ inverse
+    product = np.where(linked[..., None], product, 0.0)
+    mean = product.sum(axis=1) / pairs[:, None]
+    ranks = np.argsort(mean, axis=1)
+    worst, usual = ranks[:, -1], ranks[:, (n - 1) // 2]
+    number = np.arange(len(tested))
+    excess = mean[number, worst] - mean[number, usual]
+    size = np.sqrt(np.maximum(d * excess, 0.0))
+    radius = np.array([motions[k].R for k in tested.tolist()])
+    for i in np.flatnonzero(size > _LARGEST_FLEXING * radius).tolist():
+        # Equal noise gives the products the covariance `inverse` times a number; the number is that
+        # of the median particle, and its autocorrelation that of the other particles, as the error
+        # of the worst would contain the tested motion itself.
+        w, m, own = worst[i], usual[i], inverse[i]
+        variance = product[i, linked[i]].var(axis=0) / np.diag(own)
+        unit = float(np.sort(variance)[(n - 1) // 2])
+        others = np.delete(vector[i : i + 1], w, axis=2)
+        rho = autocorrelation(others, count[i : i + 1], d * (n - 1) / 2)[0]
+        repeats = 1.0 + 2.0 * float(rho @ rho)
+        contrast = own[w, w] + own[m, m] - 2 * own[w, m]
+        error = float(np.sqrt(unit * contrast * repeats / pairs[i]))
+        quantile = -stdtrit(max(pairs[i] / repeats, 1.0), SIGNIFICANCE / n)
+        if excess[i] > quantile * error:
+            texts[tested[i]].append(
+                f"not rigid: particle {w} (counted from 0) moves against the others by "
+                f"{size[i]:.3g} um smoothly in time ({size[i] / radius[i]:.3f} of R, over "
+                f"{_LARGEST_FLEXING}; {excess[i] / error:.1f} standard errors)"
+            )
+    return texts
 
 
 class BondDrift(NamedTuple):
@@ -500,7 +702,7 @@ class BondDrift(NamedTuple):
     distances: tuple[float, float]
 
 
-def bond_drift(x: Floats) -> BondDrift:
+def bond_drifts(x: Floats) -> list[BondDrift]:
     """Return the largest relative change of a pair's distance between eighths of the time.
 
     Medians are compared with the scatter inside the eighths, which does not contain the drift
@@ -508,46 +710,63 @@ def bond_drift(x: Floats) -> BondDrift:
 
     Parameters
     ----------
-    x : ndarray, shape (T, n, d)
-        Positions, um, NaN where missing.
+    x : ndarray, shape (B, T, n, d)
+        Positions of B bodies, um, NaN where missing.
 
     Returns
     -------
-    BondDrift
+    list of BondDrift
 
     Examples
     --------
-    >>> x = np.zeros((80, 2, 2))
-    >>> x[:, 1, 0] = np.repeat([1.0, 1.5], 40)
-    >>> bond_drift(x)
-    BondDrift(change=0.5, pair=(0, 1), distances=(1.0, 1.5))
+    >>> x = np.zeros((1, 80, 2, 2))
+    >>> x[0, :, 1, 0] = np.repeat([1.0, 1.5], 40)
+    >>> bond_drifts(x)
+    [BondDrift(change=0.5, pair=(0, 1), distances=(1.0, 1.5))]
     """
-    worst = BondDrift(0.0, (0, 1), (0.0, 0.0))
-    distances = pair_distances(x)
-    blocks = np.array_split(np.arange(len(x)), min(_TIME_BLOCKS, max(1, len(x) // 5)))
-    pairs = zip(*np.triu_indices(x.shape[1], 1), strict=True)
-    for (i, j), distance in zip(pairs, distances.T, strict=True):
-        kept = [k for k in (distance[b][np.isfinite(distance[b])] for b in blocks) if k.size]
-        if len(kept) < 2:
+    bodies, frames, n, _ = x.shape
+    distances = np.moveaxis(pair_distances(x), 1, -1)  # (B, pairs, T)
+    blocks = np.array_split(np.arange(frames), min(_TIME_BLOCKS, max(1, frames // 5)))
+    width = max(len(rows) for rows in blocks)
+    # The values of every block without the missing ones, those to the right.
+    values = np.full((*distances.shape[:2], len(blocks), width), np.nan)
+    for k, rows in enumerate(blocks):
+        values[..., k, : len(rows)] = distances[..., rows]
+    if not np.isfinite(distances).all():
+        order = np.argsort(~np.isfinite(values), axis=-1, kind="stable")
+        values = np.take_along_axis(values, order, axis=-1)
+    here = np.isfinite(values)
+    count = here.sum(axis=-1)
+    medians = median_present(values)
+    known = count > 0
+    off = values - medians[..., None]
+    # Error of a median, from the median absolute deviations inside the blocks, widened by their
+    # autocorrelation.
+    scatter = 1.4826 * median_present(np.abs(off).reshape(*off.shape[:2], -1))
+    off = np.where(here, off, 0.0)
+    power = (off * off).sum(axis=(2, 3))
+    together = (off[..., 1:] * off[..., :-1]).sum(axis=(2, 3))
+    rho = np.divide(together, power, out=np.zeros_like(power), where=power > 0)
+    rho = np.clip(rho, 0.0, 0.9)  # a block of a dozen values does not determine more
+    noise = scatter * np.sqrt(np.pi / 2 * (1 + rho) / (1 - rho))
+    ends = [
+        np.argmin(np.where(known, medians, np.inf), axis=-1)[..., None],
+        np.argmax(np.where(known, medians, -np.inf), axis=-1)[..., None],
+    ]
+    (low, high), (n_low, n_high) = (
+        [np.take_along_axis(a, k, axis=-1)[..., 0] for k in ends] for a in (medians, count)
+    )
+    several = (known.sum(axis=-1) >= 2) & (low > 0)
+    error = noise * np.sqrt(1 / np.maximum(n_low, 1) + 1 / np.maximum(n_high, 1))
+    changed = several & (high - low > _DRIFT_ERRORS * error)
+    change = np.divide(high - low, low, out=np.zeros_like(low), where=changed)
+    first, second = np.triu_indices(n, 1)
+    found = []
+    for k, worst in enumerate(change.argmax(axis=1).tolist() if n > 1 else [0] * bodies):
+        if n < 2 or not change[k, worst] > 0:
+            found.append(BondDrift(0.0, (0, 1), (0.0, 0.0)))
             continue
-        medians = [(_median(k), k.size) for k in kept]
-        (low, n_low), (high, n_high) = min(medians), max(medians)
-        # Error of a median, from the median absolute deviations inside the blocks, widened by
-        # their autocorrelation.
-        off = [k - median for k, (median, _) in zip(kept, medians, strict=True)]
-        scatter = 1.4826 * _median(np.abs(np.concatenate(off)))
-        power = sum(float(e @ e) for e in off)
-        rho = sum(float(e[:-1] @ e[1:]) for e in off) / power if power > 0 else 0.0
-        rho = min(max(rho, 0.0), 0.9)  # a block of a dozen values does not determine more
-        noise = scatter * float(np.sqrt(np.pi / 2 * (1 + rho) / (1 - rho)))
-        error = noise * np.sqrt(1 / n_low + 1 / n_high)
-        change = (high - low) / low if high - low > _DRIFT_ERRORS * error and low > 0 else 0.0
-        if change > worst.change:
-            worst = BondDrift(float(change), (int(i), int(j)), (low, high))
-    return worst
-
-
-def _median(values: Floats) -> float:
-    """Return the median of finite values (K,); numpy's own takes ten times as long for few."""
-    ordered = np.sort(values)
-    return 0.5 * float(ordered[(len(values) - 1) // 2] + ordered[len(values) // 2])
+        pair = int(first[worst]), int(second[worst])
+        ends_um = float(low[k, worst]), float(high[k, worst])
+        found.append(BondDrift(float(change[k, worst]), pair, ends_um))
+    return found

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -28,12 +28,18 @@ from perrin.motion.procrustes import (
     chain_steps,
     fit_chain,
     fit_template,
+    fit_templates,
     fit_weighted,
     pose_errors,
     step_residuals,
 )
 from perrin.motion.rigid_motion import RigidMotion
 from perrin.motion.scanning import fit_scanned
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from perrin.errors import DegenerateClusterError, TooFewFramesError
 
 Reference = Literal["template", "previous"]
 
@@ -253,32 +259,52 @@ def track_scanned(
     return motion, scanned.instant
 
 
-def template_motion(x: Floats, *, time: Floats, dt: float) -> RigidMotion:
-    """Fit all frames to their common shape, as `track_rotation`, for positions already checked.
+def track_each(
+    positions: Floats, *, time: Floats, dt: float, sigma: Floats | None = None
+) -> list[RigidMotion | DegenerateClusterError | TooFewFramesError | ValueError]:
+    """Fit each of several bodies to its common shape, as `track_rotation`, all of them together.
 
     Parameters
     ----------
-    x : ndarray, shape (T, n, d)
-        Positions, um; every particle is present in some frame.
-    time : ndarray, shape (T,)
+    positions : ndarray, shape (B, T, n, d)
+        Positions of B bodies of n particles, um, NaN where missing.
+    time : ndarray, shape (B, T)
         Time of each frame, s.
     dt : float
         Time between frames, s.
+    sigma : ndarray, shape (d,), optional
+        Known localisation error, um; default: from the residuals.
 
     Returns
     -------
-    RigidMotion
+    list of RigidMotion, DegenerateClusterError, TooFewFramesError or ValueError
+        The error that `track_rotation` raises, where there is no motion.
 
     Examples
     --------
     >>> from perrin import Cluster, simulate_motion
     >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=50, rng=1)
-    >>> motion = template_motion(truth.positions(), time=truth.time, dt=0.7)
-    >>> bool(np.allclose(motion.rotation, truth.rotation))
+    >>> x = np.stack([truth.positions(), truth.positions() + 9.0])
+    >>> motions = track_each(x, time=np.stack([truth.time] * 2), dt=0.7)
+    >>> bool(np.allclose(motions[0].rotation, motions[1].rotation))
     True
     """
-    seen = present(x)
-    return _motion_of(fit_template(x, seen), x, seen, time=time, dt=dt)
+    found: list[RigidMotion | DegenerateClusterError | TooFewFramesError | ValueError | None]
+    found = [None] * len(positions)
+    seen = present(positions)
+    for k, here in enumerate(seen):
+        try:
+            require_points(here, positions.shape[3])
+        except ValueError as error:
+            found[k] = error
+    rows = np.array([k for k, one in enumerate(found) if one is None], dtype=np.int64)
+    if rows.size:
+        some, here = positions[rows], seen[rows]
+        fit, faults = fit_templates(some, here)
+        motions = _motions_of(fit, faults, some, here, time=time[rows], dt=dt, sigma=sigma)
+        for k, motion in zip(rows.tolist(), motions, strict=True):
+            found[k] = motion
+    return [one for one in found if one is not None]
 
 
 def remove_rotation(
@@ -390,37 +416,77 @@ def _motion_of(
     errors: tuple[Floats, Floats] | None = None,
 ) -> RigidMotion:
     """Return the motion of fitted poses with their errors, without the poses too uncertain."""
-    d = x.shape[2]
-    noise = np.full(d, fit.sigma2) if sigma is None else sigma**2
+    together = PoseFit(*(np.asarray(part)[None] for part in fit))
+    given = None if errors is None else (errors[0][None], errors[1][None])
+    motion = _motions_of(
+        together, [None], x[None], seen[None], time=time[None], dt=dt, sigma=sigma, errors=given
+    )[0]
+    if not isinstance(motion, RigidMotion):
+        raise motion
+    return motion
+
+
+def _motions_of(
+    fit: PoseFit,
+    faults: Sequence[DegenerateClusterError | TooFewFramesError | None],
+    x: Floats,
+    seen: Bools,
+    *,
+    time: Floats,
+    dt: float,
+    sigma: Floats | None = None,
+    errors: tuple[Floats, Floats] | None = None,
+) -> list[RigidMotion | DegenerateClusterError | TooFewFramesError]:
+    """Return the motions of the fitted poses of several bodies, or why there is none."""
+    d = x.shape[3]
+    square = np.asarray(fit.sigma2)
+    own = square[:, None] if sigma is None else sigma**2
+    noise = np.broadcast_to(own, (len(x), d))
     covariance, variance = pose_errors(fit, seen, noise) if errors is None else errors
-    worst = np.sqrt(np.linalg.eigvalsh(np.nan_to_num(covariance))[:, -1])
-    lost = worst > _LOST_AXIS
-    fitted = np.isfinite(fit.rotation[:, 0, 0]) & ~lost
-    if fitted.sum() < 2:
-        frames = tuple(np.flatnonzero(lost).tolist())
-        raise no_orientation(x, fit.template, float(np.sqrt(noise.mean())), frames)
-    square = np.where(seen[..., None], fit.residual, np.nan) ** 2
+    # The largest variance of an orientation about any axis is at most their sum.
+    lost = np.trace(covariance, axis1=2, axis2=3) > _LOST_AXIS**2
+    worst = np.sqrt(np.linalg.eigvalsh(covariance[lost])[:, -1])
+    lost[lost] = worst > _LOST_AXIS
+    fitted = np.isfinite(fit.rotation[..., 0, 0]) & ~lost
+    residual = np.where(seen[..., None], fit.residual, np.nan) ** 2
     nan = np.where(fitted, 0.0, np.nan)
-    return RigidMotion(
-        time=time,
-        center=fit.center + nan[:, None],
-        rotation=fit.rotation + nan[:, None, None],
-        residual=np.sqrt(mean_present(square.sum(axis=2), axis=1)) + nan,
-        n_present=seen.sum(axis=1),
-        covariance=covariance + nan[:, None, None],
-        center_variance=variance + nan,
-        piece=np.zeros(len(x), dtype=np.int64),
-        reason=_missing_reasons(seen, fitted, lost, d),
-        template=fit.template,
-        sigma=float(np.sqrt(fit.sigma2)),
-        noise=np.sqrt(noise),
-        dt=float(dt),
-    )
+    center, rotation = fit.center + nan[..., None], fit.rotation + nan[..., None, None]
+    distance = np.sqrt(mean_present(residual.sum(axis=3), axis=2)) + nan
+    count = seen.sum(axis=2)
+    covariance, variance = covariance + nan[..., None, None], variance + nan
+    motions: list[RigidMotion | DegenerateClusterError | TooFewFramesError] = []
+    for k, fault in enumerate(faults):
+        if fault is None and fitted[k].sum() < 2:
+            frames = tuple(np.flatnonzero(lost[k]).tolist())
+            fault = no_orientation(x[k], fit.template[k], float(np.sqrt(noise[k].mean())), frames)
+        if fault is not None:
+            motions.append(fault)
+            continue
+        motions.append(
+            RigidMotion(
+                time=time[k],
+                center=center[k],
+                rotation=rotation[k],
+                residual=distance[k],
+                n_present=count[k],
+                covariance=covariance[k],
+                center_variance=variance[k],
+                piece=np.zeros(x.shape[1], dtype=np.int64),
+                reason=_missing_reasons(seen[k], fitted[k], lost[k], d),
+                template=fit.template[k],
+                sigma=float(np.sqrt(square[k])),
+                noise=np.sqrt(noise[k]),
+                dt=float(dt),
+            )
+        )
+    return motions
 
 
 def _missing_reasons(seen: Bools, fitted: Bools, lost: Bools, d: int) -> tuple[str, ...]:
     """Return for every frame the reason why it has no pose; empty where it has one."""
     n = seen.shape[1]
+    if fitted.all():
+        return ("",) * len(seen)
 
     def reason(count: int, ok: bool, blurred: bool) -> str:
         if ok:

@@ -7,22 +7,25 @@ import warnings as python_warnings
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import cache
+from itertools import islice
 from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 
+from perrin._arrays import as_sigma
 from perrin.diffusion.changing import with_changing_interval
 from perrin.diffusion.estimate import DiffusionEstimate
 from perrin.diffusion.estimators import estimate_diffusion, estimate_each
 from perrin.diffusion.rods import estimate_rod
 from perrin.diffusion.step_tests import (
     Jumps,
+    SteadyMotion,
     cut_at,
-    find_jumps,
+    find_jumps_of_each,
     find_stage_jumps,
-    offset_gain,
+    offset_gain_of_each,
     persistence_gain,
-    steady_motion,
+    steady_motion_of_each,
     without_spin,
 )
 from perrin.diffusion.steps import Quantity, residual_freedom
@@ -39,9 +42,10 @@ from perrin.geometry.symmetry import point_group
 from perrin.hydrodynamics.units import viscosity_remarks
 from perrin.motion.common_motion import common_motion
 from perrin.motion.floor import floor_range
-from perrin.motion.rigidity import Quality, judge_quality
+from perrin.motion.rigid_motion import RigidMotion
+from perrin.motion.rigidity import Corrections, Quality, judge_each
 from perrin.motion.rods import RodMotion, track_direction
-from perrin.motion.tracking import track_rotation, track_scanned
+from perrin.motion.tracking import track_each, track_scanned
 from perrin.run import remarks as words
 from perrin.run.experiment import Experiment, Recording
 from perrin.run.grouping import assign_clusters
@@ -70,8 +74,13 @@ from perrin.run.singles import measure_singles
 from perrin.run.verdicts import fit_model, judge_each_and_all
 from perrin.tracks.clock import frame_stride, own_times, read_clock
 from perrin.tracks.clusters import each_cluster
-from perrin.tracks.identity import Identity, settle_identity
-from perrin.tracks.screening import CENTRE_REMOVED, centre_removed, far_points
+from perrin.tracks.identity import Identity, settle_each
+from perrin.tracks.screening import (
+    CENTRE_REMOVED,
+    centres_removed,
+    far_points_of_each,
+    of_equal_shape,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -84,7 +93,6 @@ if TYPE_CHECKING:
     from perrin.diffusion.tensor_results import DiffusionTensor
     from perrin.diffusion.verdict import MotionVerdict
     from perrin.motion.floor import NoiseFloor
-    from perrin.motion.rigid_motion import RigidMotion
 
     Progress: TypeAlias = Callable[[int, int, str], None]
 
@@ -101,6 +109,8 @@ _STEADY_LEVEL = 1e-3
 # A motion that is not diffusion is a warning below this p-value, shared by both quantities, and
 # half of it by all clusters where several are also judged together.
 _VERDICT_LEVEL = 0.005
+
+_TOGETHER = 256  # clusters that are fitted at a time: bounds the memory
 
 # The symmetry of a straight chain is that of places equal within this share of its length.
 _SAME_PLACE = 0.03
@@ -159,6 +169,8 @@ class FittedBody:
         Warnings and notes on identity and fit.
     stage : ndarray of int
         Rows at which a step ends that contains a jump of the stage and is left out of D_T.
+    centre_removed : bool
+        Whether the mean of the particles was subtracted, so that there is no D_T.
     """
 
     tracks: ClusterTracks
@@ -167,6 +179,7 @@ class FittedBody:
     quality: Quality
     remarks: Remarks
     stage: Ints = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    centre_removed: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -285,7 +298,7 @@ def measure_table(
             for b in bodies
             if b.tracks.cluster in motions
         ]
-    placed = [b for b in bodies if not centre_removed(b.tracks.positions)]
+    placed = [b for b in bodies if not b.centre_removed]
     stage = find_stage_jumps([b.motion for b in placed], [b.tracks.frames for b in placed])
     remarks.warnings.extend(
         words.stage_jump_warnings(stage, first_frame=first, kept=experiment.keep_jumps)
@@ -398,67 +411,199 @@ def fit_clusters(
     rods: list[RodResult] = []
     failures: list[tuple[str, ValueError]] = []
     count = table["cluster"][table["cluster"] >= 0].nunique()
-    for number, (cluster, positions, frames, piece, delay) in enumerate(each_cluster(table)):
+    clusters, done = each_cluster(table), 0
+    while some := list(islice(clusters, _TOGETHER)):
         if progress is not None:
-            progress(number, count, "fitting clusters")
-        label = labels.get(cluster)
-        try:
-            far = far_points(positions)
-            near = np.where(far[..., None], np.nan, positions)
-            tracks = ClusterTracks(cluster, label, near, frames, piece, far, delay)
-            if positions.shape[1:] == (2, 3):
-                rods.append(measure_rod(tracks, experiment, recording))
+            progress(done, count, "fitting clusters")
+        done += len(some)
+        far = far_points_of_each([positions for _, positions, *_ in some])
+        tracks = [
+            ClusterTracks(
+                cluster,
+                labels.get(cluster),
+                np.where(away[..., None], np.nan, x) if away.any() else x,
+                frames,
+                piece,
+                away,
+                delay,
+            )
+            for (cluster, x, frames, piece, delay), away in zip(some, far, strict=True)
+        ]
+        solid = [one for one in tracks if one.positions.shape[1:] != (2, 3)]
+        fitted = iter(fit_bodies(solid, experiment, recording))
+        for one in tracks:
+            name = one.label or str(one.cluster)
+            pair = one.positions.shape[1:] == (2, 3)
+            body = None if pair else next(fitted)
+            if isinstance(body, FittedBody):
+                bodies.append(body)
+                continue
+            if body is not None and not getattr(body, "collinear", False):
+                failures.append((name, body))
                 continue
             try:
-                bodies.append(fit_body(tracks, experiment, recording))
-            except DegenerateClusterError as error:
-                if not error.collinear:
+                rods.append(measure_rod(one, experiment, recording))
+            except (DegenerateClusterError, TooFewFramesError) as error:
+                failures.append((name, error if body is None else body))
+            except ValueError:
+                if body is None:
                     raise
-                try:
-                    rods.append(measure_rod(tracks, experiment, recording))
-                except (DegenerateClusterError, ValueError):
-                    raise error from None
-        except (DegenerateClusterError, TooFewFramesError) as error:
-            failures.append((label or str(cluster), error))
+                failures.append((name, body))
     return bodies, rods, failures
 
 
-def fit_body(tracks: ClusterTracks, experiment: Experiment, recording: Recording) -> FittedBody:
-    """Settle which label belongs to which particle, fit the common shape, and judge the fits."""
-    frames, first = tracks.frames, recording.first_frame
+def fit_bodies(
+    tracks: Sequence[ClusterTracks], experiment: Experiment, recording: Recording
+) -> list[FittedBody | DegenerateClusterError | TooFewFramesError]:
+    """Settle which label belongs to which particle, fit the common shapes, and judge the fits.
+
+    Parameters
+    ----------
+    tracks : sequence of ClusterTracks
+    experiment : Experiment
+    recording : Recording
+
+    Returns
+    -------
+    list of FittedBody, DegenerateClusterError or TooFewFramesError
+        The error of a cluster that cannot be fitted.
+    """
+    times = [recording.clock(one.frames) for one in tracks]
     # The remarks on identity state what this warning states.
     with python_warnings.catch_warnings(action="ignore", category=IdentityWarning):
-        identity = settle_identity(tracks.positions, times=recording.clock(frames))
-    positions = identity.arranged(tracks.positions)
-    changed = (np.diff(tracks.piece) != 0) | (np.diff(identity.piece) != 0)
-    piece = np.append(0, np.cumsum(changed)).astype(np.int64)
-    fitted: dict[str, Any] = {"dt": recording.dt, "sigma": experiment.sigma, "piece": piece}
-    times = recording.clock(frames)
-    if tracks.delay is None or positions.shape[2] != 3:
-        motion = track_rotation(positions, times=times, **fitted)
-    else:
-        # Rigidity and errors are those of the positions at one instant.
-        delays = identity.arranged(tracks.delay[..., None])[..., 0]
-        motion, positions = track_scanned(
-            positions,
-            delays,
-            time=times,
-            crossing=recording.crossing,
-            least=recording.stated_sigma,
-            **fitted,
+        identities = settle_each([one.positions for one in tracks], times=times)
+    positions = [
+        identity.arranged(one.positions) for identity, one in zip(identities, tracks, strict=True)
+    ]
+    pieces = []
+    for identity, one in zip(identities, tracks, strict=True):
+        changed = (np.diff(one.piece) != 0) | (np.diff(identity.piece) != 0)
+        pieces.append(np.append(0, np.cumsum(changed)).astype(np.int64))
+    motions = _tracked_bodies(
+        tracks, identities, positions, pieces, times, experiment=experiment, recording=recording
+    )
+    fitted = [k for k, motion in enumerate(motions) if isinstance(motion, RigidMotion)]
+    moving = [motion for motion in motions if isinstance(motion, RigidMotion)]
+    corrections = [
+        Corrections(
+            *(
+                tuple(tracks[k].frames[rows].tolist())
+                for rows in (
+                    identities[k].swaps,
+                    1 + np.flatnonzero(np.diff(pieces[k])),
+                    identities[k].extra,
+                )
+            )
         )
-    swaps, cuts, extra = frames[identity.swaps], frames[1:][changed], frames[identity.extra]
-    quality = judge_quality(
-        motion,
-        positions,
+        for k in fitted
+    ]
+    qualities = judge_each(
+        moving,
+        [positions[k] for k in fitted],
         sigma=experiment.sigma,
         sigma_ratio=recording.stated_sigma,
+        corrections=corrections,
         # Detections that were left out have no position at the instant.
-        detections=tracks.positions if tracks.delay is None else None,
-        unsettled=tuple(identity.unsettled.tolist()),
-        swaps=tuple(swaps.tolist()),
-        cuts=tuple(cuts.tolist()),
-        extra=tuple(extra.tolist()),
+        detections=[tracks[k].positions if tracks[k].delay is None else None for k in fitted],
+        unsettled=[identities[k].unsettled for k in fitted],
+    )
+    centred = centres_removed([tracks[k].positions for k in fitted])
+    bodies = [
+        FittedBody(
+            tracks[k],
+            motion,
+            positions[k],
+            quality,
+            identity_remarks(tracks[k], identities[k], motion, quality, recording)
+            + Remarks([*quality.warnings], [*quality.notes]),
+            centre_removed=still,
+        )
+        for k, motion, quality, still in zip(fitted, moving, qualities, centred, strict=True)
+    ]
+    fits = iter(bodies)
+    return [next(fits) if isinstance(one, RigidMotion) else one for one in motions]
+
+
+def _tracked_bodies(
+    tracks: Sequence[ClusterTracks],
+    identities: Sequence[Identity],
+    positions: list[Floats],
+    pieces: Sequence[Ints],
+    times: Sequence[Floats],
+    *,
+    experiment: Experiment,
+    recording: Recording,
+) -> list[RigidMotion | DegenerateClusterError | TooFewFramesError]:
+    """Fit the common shape of every body; positions of scanned ones become those at one instant."""
+    found: dict[int, RigidMotion | DegenerateClusterError | TooFewFramesError] = {}
+    scanned = [
+        k
+        for k, (one, x) in enumerate(zip(tracks, positions, strict=True))
+        if one.delay is not None and x.shape[2] == 3
+    ]
+    for k in scanned:
+        # Rigidity and errors are those of the positions at one instant.
+        delays = identities[k].arranged(tracks[k].delay[..., None])[..., 0]
+        try:
+            found[k], positions[k] = track_scanned(
+                positions[k],
+                delays,
+                time=times[k],
+                dt=recording.dt,
+                piece=pieces[k],
+                sigma=experiment.sigma,
+                crossing=recording.crossing,
+                least=recording.stated_sigma,
+            )
+        except (DegenerateClusterError, TooFewFramesError) as error:
+            found[k] = error
+    rest = [k for k in range(len(tracks)) if k not in found]
+    d = positions[rest[0]].shape[2] if rest else 3
+    sigma = None if experiment.sigma is None else as_sigma(experiment.sigma, d)
+    # Bodies without gaps need no weights.
+    for complete in (True, False):
+        some = [k for k in rest if bool(np.isfinite(positions[k]).all()) is complete]
+        for rows in of_equal_shape([positions[k] for k in some]):
+            numbers = [some[i] for i in rows]
+            fits = track_each(
+                np.stack([positions[k] for k in numbers]),
+                time=np.stack([times[k] for k in numbers]),
+                dt=recording.dt,
+                sigma=sigma,
+            )
+            for k, fit in zip(numbers, fits, strict=True):
+                if not isinstance(fit, RigidMotion | DegenerateClusterError | TooFewFramesError):
+                    raise fit
+                piece = pieces[k]
+                found[k] = replace(fit, piece=piece) if isinstance(fit, RigidMotion) else fit
+    return [found[k] for k in range(len(tracks))]
+
+
+def identity_remarks(
+    tracks: ClusterTracks,
+    identity: Identity,
+    motion: RigidMotion,
+    quality: Quality,
+    recording: Recording,
+) -> Remarks:
+    """State where labels were corrected or are in doubt, and which points were left out.
+
+    Parameters
+    ----------
+    tracks : ClusterTracks
+    identity : Identity
+    motion : RigidMotion
+    quality : Quality
+        With the frames of the corrections.
+    recording : Recording
+
+    Returns
+    -------
+    Remarks
+    """
+    frames, first = tracks.frames, recording.first_frame
+    swaps, cuts, extra = (
+        np.array(some, dtype=np.int64) for some in (quality.swaps, quality.cuts, quality.extra)
     )
     remarks, count = Remarks(notes=words.far_points_notes(tracks.far, frames + first)), len(frames)
     if swaps.size:
@@ -479,9 +624,7 @@ def fit_body(tracks: ClusterTracks, experiment: Experiment, recording: Recording
     # The number of bad frames that a rigid body may have is part of its quality.
     remarks.notes.extend(words.unsettled_notes(frames[identity.unsettled] + first, of=count))
     remarks.warnings.extend(words.fast_turning_warnings(cuts=cuts.size, of=count))
-    return FittedBody(
-        tracks, motion, positions, quality, remarks + Remarks([*quality.warnings], [*quality.notes])
-    )
+    return remarks
 
 
 def misfit_as_labelled(identity: Identity, positions: Floats, motion: RigidMotion) -> float:
@@ -551,27 +694,18 @@ def measure_bodies(
     failures : list of tuple
         Names of the bodies whose steps give no estimate, with the error.
     """
-    found = []
     failures: list[tuple[str, ValueError]] = []
-    noise = experiment.noise
-    turns = estimate_each([b.motion for b in bodies], quantity="rotation", noise=noise)
-    without_stage = [motion_and_path(b, "translation")[0] for b in bodies]
-    paths = estimate_each(without_stage, quantity="translation", noise=noise)
-    for body, first, second in zip(bodies, turns, paths, strict=True):
-        try:
-            measured = []
-            for quantity, estimate in zip(get_args(Quantity), (first, second), strict=True):
-                if isinstance(estimate, TooFewFramesError):
-                    raise estimate
-                measured.append(
-                    measure_coefficient(
-                        body, quantity, estimate, experiment, recording, tested=len(bodies)
-                    )
-                )
-            turn, path = measured
+    coefficients = [
+        measure_coefficients(bodies, quantity, experiment, recording)
+        for quantity in get_args(Quantity)
+    ]
+    found: list[tuple[FittedBody, Coefficient, Coefficient]] = []
+    for body, turn, path in zip(bodies, *coefficients, strict=True):
+        if isinstance(turn, Coefficient) and isinstance(path, Coefficient):
             found.append((body, turn, path))
-        except (DegenerateClusterError, TooFewFramesError) as error:
-            failures.append((body.tracks.label or str(body.tracks.cluster), error))
+            continue
+        error = path if isinstance(turn, Coefficient) else turn
+        failures.append((body.tracks.label or str(body.tracks.cluster), error))
     turning = [
         turn.motion
         if turn.estimate.drift is None
@@ -579,9 +713,19 @@ def measure_bodies(
         for _, turn, _ in found
     ]
     tensors = measure_tensors(turning, "rotation", experiment.noise)
+    predicted = [predicted_noise(body.motion) for body, *_ in found]
+    # The offset of steps that contain another motion, or of a body that bends, is no noise.
+    tested = [k for k, (body, turn, _) in enumerate(found) if body.quality.rigid and turn.brownian]
+    floors = noise_floor_tests(
+        [(found[k][0].motion, found[k][1].estimate, predicted[k]) for k in tested],
+        stated=experiment.sigma is not None,
+    )
+    floor = dict(zip(tested, floors, strict=True))
     results = [
-        measured_body(*one, *tensor, experiment=experiment, recording=recording)
-        for one, tensor in zip(found, tensors, strict=True)
+        measured_body(
+            *one, *tensors[k], noise=predicted[k], floor=floor.get(k, []), recording=recording
+        )
+        for k, one in enumerate(found)
     ]
     return results, failures
 
@@ -593,7 +737,8 @@ def measured_body(
     tensor: DiffusionTensor | None,
     no_tensor: Sequence[str],
     *,
-    experiment: Experiment,
+    noise: NoiseFloor,
+    floor: Sequence[str],
     recording: Recording,
 ) -> MeasuredBody:
     """Collect what was measured of a body, and the remarks on it.
@@ -606,7 +751,10 @@ def measured_body(
     tensor : DiffusionTensor or None
     no_tensor : sequence of str
         Why there is no tensor.
-    experiment : Experiment
+    noise : NoiseFloor
+        Noise floor that residuals or sigma predict.
+    floor : sequence of str
+        Warning that the offset of the steps is not that noise.
     recording : Recording
 
     Returns
@@ -615,11 +763,6 @@ def measured_body(
     """
     tracks, motion = body.tracks, body.motion
     D_R, D_T = turn.estimate, path.estimate
-    noise = predicted_noise(motion)
-    # The offset of steps that contain another motion, or of a body that bends, is no noise.
-    floor: list[str] = []
-    if body.quality.rigid and turn.brownian:
-        floor = noise_floor_test(motion, D_R, noise, stated=experiment.sigma is not None)
     result = ClusterResult(
         cluster=tracks.cluster,
         motion=motion,
@@ -656,44 +799,100 @@ def measured_body(
     return MeasuredBody(body, turn, path, result)
 
 
-def measure_coefficient(
-    body: FittedBody,
+def measure_coefficients(
+    bodies: Sequence[FittedBody],
     quantity: Quantity,
-    estimate: DiffusionEstimate,
     experiment: Experiment,
     recording: Recording,
-    *,
-    tested: int,
+) -> list[Coefficient | DegenerateClusterError | TooFewFramesError]:
+    """Estimate one coefficient of every body from the steps that Brownian motion can make.
+
+    Parameters
+    ----------
+    bodies : sequence of FittedBody
+        They share the level of the test for a steady motion.
+    quantity : {"rotation", "translation"}
+    experiment : Experiment
+    recording : Recording
+
+    Returns
+    -------
+    list of Coefficient, DegenerateClusterError or TooFewFramesError
+        The error of a body whose steps give no estimate.
+    """
+    noise = experiment.noise
+    motions, paths = [], []
+    for body in bodies:
+        motion, path = motion_and_path(body, quantity)
+        motions.append(motion)
+        paths.append(path)
+    found: list[Coefficient | DegenerateClusterError | TooFewFramesError | None]
+    estimates = estimate_each(motions, quantity=quantity, noise=noise)
+    found = [one if isinstance(one, TooFewFramesError) else None for one in estimates]
+    if quantity == "translation":
+        for k, body in enumerate(bodies):
+            if body.centre_removed and found[k] is None:
+                found[k] = no_translation(body)
+    rest = [k for k, one in enumerate(found) if one is None]
+    given = [one for k, one in enumerate(estimates) if k in set(rest)]
+    some = [one for one in given if not isinstance(one, TooFewFramesError)]
+    jumps = find_jumps_of_each([paths[k] for k in rest], some)
+    tested: list[Coefficient] = []
+    numbers: list[int] = []
+    for k, estimate, own in zip(rest, some, jumps, strict=True):
+        try:
+            coefficient = without_jumps(
+                bodies[k], motions[k], paths[k], estimate, own, experiment, recording
+            )
+        except (DegenerateClusterError, TooFewFramesError) as error:
+            found[k] = error
+            continue
+        tested.append(coefficient)
+        numbers.append(k)
+    level = _STEADY_LEVEL / len(bodies) if bodies else 0.0
+    for k, one in zip(numbers, with_step_tests(tested, noise, level=level), strict=True):
+        found[k] = one
+    return [one for one in found if one is not None]
+
+
+def no_translation(body: FittedBody) -> Coefficient:
+    """Return the missing D_T of a body whose centre was subtracted from its particles."""
+    motion, nothing = body.motion, np.empty(0, dtype=np.int64)
+    estimate = DiffusionEstimate.absent(
+        quantity="translation", n_frames=int(motion.fitted.size), reason=CENTRE_REMOVED
+    )
+    none = Jumps(nothing, np.empty((0, 3)), np.empty(0), 0)
+    return Coefficient(estimate, motion, motion, none, nothing, True, Remarks())
+
+
+def without_jumps(
+    body: FittedBody,
+    motion: RigidMotion,
+    path: RigidMotion,
+    estimate: DiffusionEstimate,
+    jumps: Jumps,
+    experiment: Experiment,
+    recording: Recording,
 ) -> Coefficient:
-    """Estimate one coefficient from the steps that Brownian motion can make.
+    """Leave jumps out of an estimate, and state them.
 
     Parameters
     ----------
     body : FittedBody
-    quantity : {"rotation", "translation"}
+    motion, path : RigidMotion
+        Motion that D is estimated from, and the one that was searched for jumps.
     estimate : DiffusionEstimate
         Estimate from all steps.
+    jumps : Jumps
     experiment : Experiment
     recording : Recording
-    tested : int
-        Number of clusters that share the level of the test for a steady motion.
 
     Returns
     -------
     Coefficient
+        Before its steps are tested any further.
     """
-    motion, noise = body.motion, experiment.noise
-    if quantity == "translation" and centre_removed(body.tracks.positions):
-        nothing = np.empty(0, dtype=np.int64)
-        estimate = DiffusionEstimate.absent(
-            quantity=quantity, n_frames=int(motion.fitted.size), reason=CENTRE_REMOVED
-        )
-        none = Jumps(nothing, np.empty((0, 3)), np.empty(0), 0)
-        return Coefficient(estimate, motion, motion, none, nothing, True, Remarks())
-    motion, path = motion_and_path(body, quantity)
-    jumps = find_jumps(path, estimate)
-    left_out = jumps.rows[:0]
-    remarks = Remarks()
+    quantity, left_out, remarks = estimate.quantity, jumps.rows[:0], Remarks()
     if jumps.rows.size:
         frames = body.tracks.frames[jumps.rows] + recording.first_frame
         remarks.warnings.append(
@@ -702,27 +901,53 @@ def measure_coefficient(
         if not (jumps.many or experiment.keep_jumps):
             left_out = jumps.rows
             motion = cut_at(motion, left_out)
-            estimate = _estimated_quietly(motion, quantity, noise)
+            estimate = _estimated_quietly(motion, quantity, experiment.noise)
     remarks.notes.extend(words.removed_drift_notes(estimate, quantity))
     if not estimate.resolved:
         remarks.notes.append(f"not resolved: {estimate}")
-    steady, persistence = False, 0.0
-    if not jumps.many:
-        persistence = persistence_gain(motion, estimate)
-        if not noise.drift:
-            found = steady_motion(motion, estimate)
-            steady = found.p < _STEADY_LEVEL / tested
-            if steady and persistence > _TEST_ERRORS**2:
-                # A steady motion makes steps alike as well; what is left without it decides.
-                persistence = persistence_gain(motion, estimate, drift=True)
-                steady = persistence < _TEST_ERRORS**2
-            if steady:
-                remarks.warnings.append(words.steady_motion_warning(found, quantity))
-    alike = persistence > _TEST_ERRORS**2 and not steady
-    if alike:
-        remarks.warnings.append(words.persistence_warning(persistence, quantity))
-    brownian = not (steady or alike or jumps.rows.size)
+    brownian = not jumps.rows.size
     return Coefficient(estimate, motion, path, jumps, left_out, brownian, remarks)
+
+
+def with_step_tests(
+    coefficients: Sequence[Coefficient], noise: Noise, *, level: float
+) -> list[Coefficient]:
+    """Test the steps of coefficients of one quantity for a steady motion and for likeness.
+
+    Parameters
+    ----------
+    coefficients : sequence of Coefficient
+    noise : Noise
+    level : float
+        p-value below which a motion is steady.
+
+    Returns
+    -------
+    list of Coefficient
+        The same with remarks.
+    """
+    few = [k for k, one in enumerate(coefficients) if not one.jumps.many]
+    motions = [coefficients[k].motion for k in few]
+    estimates = [coefficients[k].estimate for k in few]
+    moving: dict[int, SteadyMotion] = {}
+    if not noise.drift:
+        moving = dict(zip(few, steady_motion_of_each(motions, estimates), strict=True))
+    tested = list(coefficients)
+    for k, motion, estimate in zip(few, motions, estimates, strict=True):
+        one, remarks = coefficients[k], coefficients[k].remarks
+        persistence = persistence_gain(motion, estimate)
+        steady = k in moving and moving[k].p < level
+        if steady and persistence > _TEST_ERRORS**2:
+            # A steady motion makes steps alike as well; what is left without it decides.
+            persistence = persistence_gain(motion, estimate, drift=True)
+            steady = persistence < _TEST_ERRORS**2
+        if steady:
+            remarks.warnings.append(words.steady_motion_warning(moving[k], estimate.quantity))
+        alike = persistence > _TEST_ERRORS**2 and not steady
+        if alike:
+            remarks.warnings.append(words.persistence_warning(persistence, estimate.quantity))
+        tested[k] = replace(one, brownian=one.brownian and not (steady or alike))
+    return tested
 
 
 def motion_and_path(body: FittedBody, quantity: Quantity) -> tuple[RigidMotion, RigidMotion]:
@@ -731,10 +956,13 @@ def motion_and_path(body: FittedBody, quantity: Quantity) -> tuple[RigidMotion, 
     Doubt about the labels cuts a track, but the path of the centre crosses it. A jump of the stage
     cuts that path, and leaves the rotation as it is.
     """
+    motion = body.motion
     if quantity == "rotation":
-        return body.motion, body.motion
-    whole = replace(body.motion, piece=np.zeros_like(body.motion.piece))
-    return cut_at(body.motion, body.stage), cut_at(whole, body.stage)
+        return motion, motion
+    whole = motion
+    if motion.piece.any():
+        whole = replace(motion, piece=np.zeros_like(motion.piece))
+    return cut_at(motion, body.stage), cut_at(whole, body.stage)
 
 
 def _estimated_quietly(
@@ -974,9 +1202,9 @@ def measure_tensors(
     return tensors
 
 
-def noise_floor_test(
-    motion: RigidMotion, D_R: DiffusionEstimate, predicted: NoiseFloor, *, stated: bool
-) -> list[str]:
+def noise_floor_tests(
+    bodies: Sequence[tuple[RigidMotion, DiffusionEstimate, NoiseFloor]], *, stated: bool
+) -> list[list[str]]:
     """Test whether the offset of the steps is the noise that residuals or sigma predict.
 
     A likelihood-ratio test with one degree of freedom. Where sigma is not stated, any
@@ -985,41 +1213,47 @@ def noise_floor_test(
 
     Parameters
     ----------
-    motion : RigidMotion
-    D_R : DiffusionEstimate
-        D_R of this motion.
-    predicted : NoiseFloor
-        Noise floor that the residuals or sigma predict.
+    bodies : sequence of tuple
+        Motion, its D_R, and the noise floor that the residuals or sigma predict.
     stated : bool
         Whether the user stated sigma.
 
     Returns
     -------
-    list of str
-        A warning, or nothing.
+    list of list of str
+        For every body a warning, or nothing.
     """
-    # Over a scan the offset is mostly motion, and no multiple of sigma^2.
-    if D_R.noise != "joint" or not D_R.value > 0 or motion.turn_noise is not None:
-        return []
-    low = high = 1.0
-    if not stated:
-        if motion.template.shape[1] == 3:
-            rotation = motion.rotation[motion.fitted]
-            low, high = floor_range(motion.template, rotation, ratio=_NOISE_RATIO)
-        unsure = _TEST_ERRORS * np.sqrt(2 / max(residual_freedom(motion), 1))
-        low, high = low * max(1 - unsure, 0.0), high * (1 + unsure)
-    # A stated exposure takes b D, b = exposure dt/3, from the noise of every frame.
-    blur = (D_R.exposure or 0.0) * motion.dt / 3 * D_R.value
-    measured = floor_factor(motion) * (D_R.offset + blur)
-    if low * predicted.phi2 <= measured <= high * predicted.phi2:
-        return []
-    nearest = high if measured > high * predicted.phi2 else low
-    sigma = float(np.sqrt(nearest * np.mean(motion.noise**2)))
-    gain = offset_gain(motion, D_R, sigma=sigma)
-    if gain < _TEST_ERRORS**2:
-        return []
-    error = floor_factor(motion) * D_R.offset_stderr
-    return [words.noise_floor_warning(measured, error, predicted=predicted.phi2, gain=gain)]
+    outside: dict[int, tuple[float, float]] = {}
+    for k, (motion, D_R, predicted) in enumerate(bodies):
+        # Over a scan the offset is mostly motion, and no multiple of sigma^2.
+        if D_R.noise != "joint" or not D_R.value > 0 or motion.turn_noise is not None:
+            continue
+        low = high = 1.0
+        if not stated:
+            if motion.template.shape[1] == 3:
+                rotation = motion.rotation[motion.fitted]
+                low, high = floor_range(motion.template, rotation, ratio=_NOISE_RATIO)
+            unsure = _TEST_ERRORS * np.sqrt(2 / max(residual_freedom(motion), 1))
+            low, high = low * max(1 - unsure, 0.0), high * (1 + unsure)
+        # A stated exposure takes b D, b = exposure dt/3, from the noise of every frame.
+        blur = (D_R.exposure or 0.0) * motion.dt / 3 * D_R.value
+        measured = floor_factor(motion) * (D_R.offset + blur)
+        if not low * predicted.phi2 <= measured <= high * predicted.phi2:
+            nearest = high if measured > high * predicted.phi2 else low
+            outside[k] = measured, float(np.sqrt(nearest * np.mean(motion.noise**2)))
+    gains = offset_gain_of_each(
+        [bodies[k][0] for k in outside],
+        [bodies[k][1] for k in outside],
+        sigma=[sigma for _, sigma in outside.values()],
+    )
+    warnings: list[list[str]] = [[] for _ in bodies]
+    for (k, (measured, _)), gain in zip(outside.items(), gains, strict=True):
+        if gain >= _TEST_ERRORS**2:
+            motion, D_R, predicted = bodies[k]
+            error = floor_factor(motion) * D_R.offset_stderr
+            text = words.noise_floor_warning(measured, error, predicted=predicted.phi2, gain=gain)
+            warnings[k].append(text)
+    return warnings
 
 
 def add_predictions(

@@ -48,7 +48,7 @@ from perrin.motion.residuals import median_chi2
 from perrin.motion.rods import LABEL_LOG_ODDS, LEAP_LABELLED, LEAP_UNLABELLED, SETTLED_LOG_ODDS
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Iterator, Mapping, Sequence
 
     from numpy.typing import ArrayLike
 
@@ -224,10 +224,10 @@ def settle_identity(
     seen = present(x)
     time = np.arange(len(x), dtype=np.float64) if times is None else np.asarray(times, np.float64)
     n = body_size(seen) if size is None else size
-    detections = Detections.of(x, n)
-    given = BodyModel.of_labels(detections) if labelled else None
-    if given is not None and labels_are_certain(detections, given):
+    columns = seen.any(axis=0)
+    if labelled and columns.sum() == n and certain_labels(x[None, :, columns])[0]:
         return _without_assignment(seen, n, labelled=labelled)
+    detections = Detections.of(x, n)
     start = _medoid_row(x, seen, n)
     if start is None:
         return _without_assignment(seen, n, labelled=labelled)
@@ -255,6 +255,55 @@ def settle_identity(
             stacklevel=2,
         )
     return found
+
+
+def settle_each(positions: Sequence[Floats], *, times: Sequence[Floats | None]) -> list[Identity]:
+    """Decide which detection is which particle for several labelled bodies, as `settle_identity`.
+
+    Bodies of one shape whose labels are right are found together; the others are settled one by
+    one.
+
+    Parameters
+    ----------
+    positions : sequence of ndarray, shape (T, m, d)
+        Detections of each body, um; NaN where there is none.
+    times : sequence of ndarray, shape (T,), or None
+        Time of each row.
+
+    Returns
+    -------
+    list of Identity
+
+    Warns
+    -----
+    IdentityWarning
+        Where labels were corrected.
+
+    Examples
+    --------
+    >>> import perrin
+    >>> x = np.stack([perrin.Cluster.tetrahedron(1.5).positions] * 9)
+    >>> [one.order[8].tolist() for one in settle_each([x, x + 5.0], times=[None, None])]
+    [[0, 1, 2, 3], [0, 1, 2, 3]]
+    """
+    alike: dict[tuple[object, ...], list[int]] = {}
+    for k, x in enumerate(positions):
+        complete = bool(np.isfinite(x).all())
+        if complete or body_size(present(x)) == x.shape[1]:
+            alike.setdefault((x.shape, complete), []).append(k)
+    found: dict[int, Identity] = {}
+    for group in alike.values():
+        for part in _batches(len(group), len(positions[group[0]])):
+            rows = group[part]
+            some = np.stack([positions[k] for k in rows])
+            for k, certain in zip(rows, certain_labels(some), strict=True):
+                if certain:
+                    seen = present(positions[k])
+                    found[k] = _without_assignment(seen, seen.shape[1], labelled=True)
+    return [
+        found[k] if k in found else settle_identity(x, times=time)
+        for k, (x, time) in enumerate(zip(positions, times, strict=True))
+    ]
 
 
 def body_size(seen: Bools) -> int:
@@ -386,28 +435,6 @@ class BodyModel(NamedTuple):
         return cls(shape, sigma2, shape_symmetry(shape, sigma2), label)
 
     @classmethod
-    def of_labels(cls, detections: Detections) -> BodyModel | None:
-        """Return the shape that follows if all labels are right; None if they are not."""
-        n, d = detections.n, detections.x.shape[2]
-        rows = np.flatnonzero(detections.shown == n)
-        if n < d or rows.size < 2 or detections.x.shape[1] != n:
-            return None
-        rows = _evenly(rows)
-        order = detections.column[rows[0]]
-        if not (detections.column[rows] == order).all():
-            return None
-        points = detections.x[rows]
-        template = points[0] - points[0].mean(axis=0)
-        misfit = rigid_fits(points, template)[1]
-        # Of two labellings that share the time, neither is right for all: the lower tenth of the
-        # misfits belongs to one.
-        lowest = float(np.sort(misfit[1:])[(rows.size - 1) // 10])
-        usual = max(lowest, _ROUNDING_ANGLE**2 * float((template**2).sum()))
-        if not misfit.max() <= 2 * _NOISE_LIKE * usual:
-            return None
-        return cls.averaged(points, template, _label_of(order, detections))
-
-    @classmethod
     def of_row(cls, detections: Detections, start: int, *, labelled: bool) -> BodyModel:
         """Return the shape from the rows that can be assigned to one complete row."""
         n, d = detections.n, detections.x.shape[2]
@@ -464,21 +491,6 @@ class BodyModel(NamedTuple):
         cost: Floats = norm[used] + strays
         return cost + (_STUDENT_FREEDOM + freedom[used]) / 2 * np.log1p(misfit / scale)
 
-    def least_angle(self, particles: Ints) -> float:
-        """Return the least angle, rad, between two noise-like assignments of some particles."""
-        n = len(self.template)
-        if n > _MOST_PERMUTED:
-            particles = np.arange(n)
-        used = particles.size
-        tried = self.symmetry if used == n else all_assignments(used, n, used)
-        points = self.template if used == n else self.template[particles]
-        rotation, misfit = rigid_fits(assigned_points(points[None], tried)[0], self.template)
-        angle = np.sqrt(squared_angle(rotation, np.eye(len(rotation[0]))))
-        own = np.full(n, -1)
-        own[particles] = np.arange(used)
-        other = (tried != own).any(axis=1) & (misfit <= 2 * self.misfit_limit(np.array(used)))
-        return float(angle[other].min(initial=np.pi))
-
 
 def _evenly(rows: Ints) -> Ints:
     """Return evenly spaced rows of some, at most as many as the shape is averaged from."""
@@ -517,6 +529,11 @@ def rigid_fits(points: Floats, template: Floats) -> tuple[Floats, Floats]:
     """
     rotation, unique = fit_rotations(points, template)
     here = present(points) & present(template)
+    if here.all():
+        y = points - points.mean(axis=-2, keepdims=True)
+        t = template - template.mean(axis=-2, keepdims=True)
+        e = y - t @ np.swapaxes(rotation, -1, -2)
+        return rotation, np.where(unique, (e * e).sum(axis=(-2, -1)), np.inf)
     weight = here[..., None] / np.maximum(here.sum(axis=-1), 1)[..., None, None]
     y, t = np.where(here[..., None], points, 0.0), np.where(here[..., None], template, 0.0)
     y = y - (y * weight).sum(axis=-2, keepdims=True)
@@ -781,38 +798,142 @@ def squared_angle(one: Floats, other: Floats) -> Floats:
     return np.asarray((2 * np.arcsin(half)) ** 2)
 
 
-def labels_are_certain(detections: Detections, body: BodyModel) -> bool:
-    """Return whether the labels fit everywhere and no step is long enough to be mistaken.
+def certain_labels(x: Floats) -> Bools:
+    """Return for which bodies the labels fit in all frames and no step can be mistaken for another.
 
     Parameters
     ----------
-    detections : Detections
-    body : BodyModel
+    x : ndarray, shape (B, T, n, d)
+        Detections of B bodies of n particles, um; NaN where there is none.
 
     Returns
     -------
-    bool
+    ndarray of bool, shape (B,)
+
+    Notes
+    -----
+    A step can be mistaken if it turns the body by over 0.4 of the least angle between two
+    assignments that fit the shape as well as noise allows.
 
     Examples
     --------
     >>> import perrin
     >>> x = np.stack([perrin.Cluster.tetrahedron(1.5).positions] * 9)
-    >>> detections = Detections.of(x, 4)
-    >>> labels_are_certain(detections, BodyModel.of_labels(detections))
-    True
+    >>> swapped = x.copy()
+    >>> swapped[5, [0, 1]] = x[5, [1, 0]]
+    >>> certain_labels(np.stack([x, swapped]))
+    array([ True, False])
     """
-    assignment = detections.assignment(body.label)
-    if not ((assignment >= 0).sum(axis=1) == detections.shown).all():
-        return False
-    rows = np.flatnonzero(detections.shown >= body.template.shape[1])
-    points = assigned_points(detections.x[rows], assignment[rows, None])[:, 0]
-    rotation, misfit = rigid_fits(points, body.template)
-    if not (misfit <= body.misfit_limit(detections.shown[rows])).all():
-        return False
-    sets, which = np.unique(assignment[rows] >= 0, axis=0, return_inverse=True)
-    least = np.array([body.least_angle(np.flatnonzero(here)) for here in sets])[which.ravel()]
-    angle = np.sqrt(squared_angle(rotation[:-1], rotation[1:]))
-    return bool((angle < _SHORT_STEP * np.minimum(least[:-1], least[1:])).all())
+    _, _, n, d = x.shape
+    seen = present(x)
+    shown = seen.sum(axis=2)
+    certain = ((shown == n).sum(axis=1) >= 2) & seen.any(axis=1).all(axis=1) & (n >= d)
+    bodies = np.flatnonzero(certain)
+    if not bodies.size:
+        return np.asarray(certain)
+    x, seen, shown = x[bodies], seen[bodies], shown[bodies]
+    shape, usable, sampled = _labelled_shapes(x, shown == n)
+    rotation, misfit = rigid_fits(x, shape[:, None])
+    freedom = float(degrees_of_freedom(np.array(n), d))
+    chosen = np.take_along_axis(misfit, np.maximum(sampled, 0), axis=1)
+    sigma2 = np.array(
+        [np.median(m[k >= 0]) for m, k in zip(chosen, sampled, strict=True)]
+    ) / median_chi2(freedom)
+    # Where there is no noise, the rounding error is taken as noise.
+    sigma2 = np.maximum(sigma2, (1e-7 * np.abs(shape).max(axis=(1, 2))) ** 2)
+    posed = shown >= d
+    limit = _NOISE_LIKE * sigma2[:, None] * degrees_of_freedom(shown, d)
+    usable &= ((misfit <= limit) | ~posed).all(axis=1)
+    least = np.full(shown.shape, np.pi)
+    # Of large bodies the symmetries are compared, which all particles determine.
+    compared = seen if n <= _MOST_PERMUTED else np.ones_like(seen)
+    code = np.packbits(compared, axis=2).reshape(-1, -(-n // 8))
+    patterns, first, which = np.unique(code, axis=0, return_index=True, return_inverse=True)
+    which = which.reshape(shown.shape)
+    for i in range(len(patterns)):
+        particles = np.flatnonzero(compared.reshape(-1, n)[first[i]])
+        rows = (which == i) & usable[:, None]
+        some = np.flatnonzero(rows.any(axis=1))
+        if particles.size >= d and some.size:
+            angle = np.full(len(x), np.pi)
+            angle[some] = _least_angles(shape[some], sigma2[some], particles)
+            least = np.where(rows, angle[:, None], least)
+    # Rows with a pose first, so that a step over a gap is one step.
+    order = np.argsort(~posed, axis=1, kind="stable")
+    turned = np.take_along_axis(rotation, order[..., None, None], axis=1)
+    least = np.take_along_axis(least, order, axis=1)
+    angle = np.sqrt(squared_angle(turned[:, :-1], turned[:, 1:]))
+    step = np.arange(1, x.shape[1]) < posed.sum(axis=1)[:, None]
+    short = angle < _SHORT_STEP * np.minimum(least[:, :-1], least[:, 1:])
+    certain[bodies] = usable & (short | ~step).all(axis=1)
+    return np.asarray(certain)
+
+
+def _labelled_shapes(x: Floats, whole: Bools) -> tuple[Floats, Bools, Ints]:
+    """Return the shapes that follow if all labels are right, and where they are.
+
+    Parameters
+    ----------
+    x : ndarray, shape (B, T, n, d)
+    whole : ndarray of bool, shape (B, T)
+        Complete rows, two or more of each body.
+
+    Returns
+    -------
+    shape : ndarray, shape (B, n, d)
+        Mean of complete rows turned to the first of them.
+    usable : ndarray of bool, shape (B,)
+        Whether all these rows fit the first of them as well as noise allows.
+    sampled : ndarray of int, shape (B, K)
+        These rows; -1 after the last.
+    """
+    width = min(x.shape[1], _MOST_MODEL_ROWS)
+    sampled = np.full((len(x), width), -1, dtype=np.int64)
+    for own, complete in zip(sampled, whole, strict=True):
+        rows = _evenly(np.flatnonzero(complete))
+        own[: rows.size] = rows
+    used = sampled >= 0
+    points = x
+    if x.shape[1] > width or not whole.all():
+        points = np.take_along_axis(x, np.maximum(sampled, 0)[..., None, None], axis=1)
+        points = np.where(used[..., None, None], points, np.nan)
+    template = points[:, 0] - points[:, 0].mean(axis=1, keepdims=True)
+    rotation, misfit = rigid_fits(points, template[:, None])
+    # Of two labellings that share the time, neither is right for all: the lower tenth of the
+    # misfits belongs to one.
+    others = np.sort(misfit[:, 1:], axis=1)
+    tenth = (used.sum(axis=1) - 1) // 10
+    lowest = np.take_along_axis(others, tenth[:, None], axis=1)[:, 0]
+    usual = np.maximum(lowest, _ROUNDING_ANGLE**2 * (template**2).sum(axis=(1, 2)))
+    worst = np.where(used, misfit, 0.0).max(axis=1)
+    usable = np.asarray(worst <= 2 * _NOISE_LIKE * usual)
+    fits = np.isfinite(misfit) & used
+    centred = points - points.mean(axis=2, keepdims=True)
+    turned = np.where(fits[..., None, None], centred @ rotation, 0.0)
+    count = fits.sum(axis=1)[:, None, None]
+    shape = np.where(count > 0, turned.sum(axis=1) / np.maximum(count, 1), template)
+    return shape, usable, sampled
+
+
+def _least_angles(shapes: Floats, sigma2: Floats, particles: Ints) -> Floats:
+    """Return the least angle, rad, between two noise-like assignments of some particles, (B,)."""
+    n, d = shapes.shape[1:]
+    used = particles.size
+    if n > _MOST_PERMUTED and len(shapes) > 1:
+        rows = [slice(k, k + 1) for k in range(len(shapes))]
+        return np.concatenate([_least_angles(shapes[k], sigma2[k], particles) for k in rows])
+    if n > _MOST_PERMUTED:
+        tried = shape_symmetry(shapes[0], float(sigma2[0]))
+    else:
+        tried = all_assignments(used, n, used)
+    limit = 2 * _NOISE_LIKE * sigma2 * float(degrees_of_freedom(np.array(used), d))
+    own = np.full(n, -1)
+    own[particles] = np.arange(used)
+    points = assigned_points(shapes[:, particles], tried)
+    rotation, misfit = rigid_fits(points, shapes[:, None])
+    other = (tried != own).any(axis=1) & (misfit <= limit[:, None])
+    angle = np.sqrt(squared_angle(rotation, np.eye(d)))
+    return np.asarray(np.where(other, angle, np.pi).min(axis=1))
 
 
 class Candidates(NamedTuple):

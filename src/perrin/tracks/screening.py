@@ -9,10 +9,13 @@ import numpy as np
 
 from perrin._arrays import Bools, Floats, Ints, present
 from perrin._text import counted
+from perrin.geometry.shapes import pair_distances
+from perrin.motion.degenerate import mean_present
+from perrin.motion.residuals import median_present
 from perrin.tracks.groups import frames_of
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Sequence
 
     import pandas as pd
 
@@ -57,6 +60,9 @@ _MOVING_SPREAD, _STILL_SHARE = 10.0, 1e-6
 # Values lie on a lattice if their differences are multiples of one step to the first share of it; a
 # ratio of two steps is whole to the second.
 _LATTICE_TOLERANCE, _WHOLE_TOLERANCE = 1e-3, 0.02
+
+# About this many coordinates are compared at once; more do not stay in the processor's cache.
+_MOST_AT_ONCE = 100_000
 
 _POINTS_SHOWN = 3  # placeholders that a warning names
 
@@ -200,6 +206,55 @@ def far_points(x: Floats) -> Bools:
     return np.asarray(np.isfinite(nearest) & (nearest > _FAR_SIZES * size))
 
 
+def far_points_of_each(positions: Sequence[Floats]) -> list[Bools]:
+    """Find the points of several clusters that lie far from the rest, as `far_points`.
+
+    Parameters
+    ----------
+    positions : sequence of ndarray, shape (T, n, d)
+
+    Returns
+    -------
+    list of ndarray of bool, shape (T, n)
+
+    Examples
+    --------
+    >>> x = np.tile([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]], (9, 1, 1))
+    >>> far_points_of_each([x, x + 1.0])[1].any()
+    np.False_
+    """
+    found = [np.zeros(x.shape[:2], dtype=np.bool_) for x in positions]
+    for rows in of_equal_shape(positions):
+        x = np.stack([positions[k] for k in rows])
+        if x.shape[2] < 2:
+            continue
+        distance = pair_distances(x)
+        # A far point is farther from all others than many times any median distance.
+        limit = _FAR_SIZES * median_present(distance[..., 0])
+        largest = np.nan_to_num(distance).max(axis=(1, 2), initial=0.0)
+        for i in np.flatnonzero(~(largest <= limit)).tolist():
+            found[rows[i]] = far_points(positions[rows[i]])
+    return found
+
+
+def of_equal_shape(arrays: Sequence[Floats]) -> list[list[int]]:
+    """Return the numbers of arrays of the same shape, in groups that fit the processor's cache.
+
+    Examples
+    --------
+    >>> of_equal_shape([np.zeros((5, 4, 3)), np.zeros((6, 4, 3)), np.zeros((5, 4, 3))])
+    [[0, 2], [1]]
+    """
+    alike: dict[tuple[int, ...], list[int]] = {}
+    for k, one in enumerate(arrays):
+        alike.setdefault(one.shape, []).append(k)
+    groups = []
+    for shape, rows in alike.items():
+        at_once = max(1, _MOST_AT_ONCE // max(int(np.prod(shape)), 1))
+        groups += [rows[low : low + at_once] for low in range(0, len(rows), at_once)]
+    return groups
+
+
 def far_sentence(far: Bools, frames: Ints) -> str:
     """State which points of one cluster are left out because they are too far from the rest.
 
@@ -269,6 +324,55 @@ def centre_removed(x: Floats) -> bool:
         if still.all() and (spread > _MOVING_SPREAD * rounding).any():
             return True
     return False
+
+
+def centres_removed(positions: Sequence[Floats]) -> list[bool]:
+    """Return which of several clusters have a mean that stays the same, as `centre_removed`.
+
+    Parameters
+    ----------
+    positions : sequence of ndarray, shape (T, n, d)
+
+    Returns
+    -------
+    list of bool
+
+    Notes
+    -----
+    The resolution of a coordinate is at most the smallest of its steps, so that a mean that moves
+    by more is not constant; only the other clusters are tested in detail.
+
+    Examples
+    --------
+    >>> x = np.random.default_rng(1).normal(size=(50, 4, 3)).cumsum(axis=0)
+    >>> centres_removed([x, x - x.mean(axis=1, keepdims=True)])
+    [False, True]
+    """
+    removed = [False] * len(positions)
+    for rows in of_equal_shape(positions):
+        x = np.stack([positions[k] for k in rows])
+        seen = present(x)
+        several = seen.sum(axis=2) >= 2
+        largest = np.nan_to_num(np.abs(x)).max(axis=(1, 2), initial=0.0)
+        rounding = 8 * float(np.finfo(np.float64).eps) * largest
+        clear = np.ones(len(rows), dtype=np.bool_)
+        for whole in (seen.all(axis=2) & several, several):
+            some = np.where((whole[..., None] & seen)[..., None], x, np.nan)
+            step = np.nan_to_num(np.abs(np.diff(some, axis=1)))
+            step = np.where(step > rounding[:, None, None], step, np.inf)
+            finest = np.maximum(step.min(axis=(1, 2), initial=np.inf), rounding)
+            centre = mean_present(some, axis=2)
+            moved = np.where(whole[..., None], centre, -np.inf).max(axis=1)
+            moved = moved - np.where(whole[..., None], centre, np.inf).min(axis=1)
+            spread = mean_present((some - mean_present(some, axis=1)[:, None]) ** 2, axis=1)
+            spread = np.sqrt(median_present(np.swapaxes(spread, 1, 2)))
+            moves = (moved > np.maximum(finest, _STILL_SHARE * spread)).any(axis=1)
+            clear &= moves | (whole.sum(axis=1) <= 2)
+            if seen.all():
+                break
+        for i in np.flatnonzero(~clear).tolist():
+            removed[rows[i]] = centre_removed(positions[rows[i]])
+    return removed
 
 
 def distance_notes(
