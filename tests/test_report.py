@@ -391,7 +391,7 @@ def test_a_failure_leaves_no_files_and_keeps_an_existing_folder(
     place.mkdir()
     write_data(single, place)
 
-    def fail(*_):
+    def fail(*_, **__):
         raise RuntimeError("disk full")
 
     monkeypatch.setattr(write, "save_figures", lambda *_: [])

@@ -225,8 +225,7 @@ def analyze(
             frames=read_slice(frames),
             progress=progress,
         )
-        progress(0, 0, "writing the report")
-        perrin.write_run(report, output, overwrite=overwrite)
+        perrin.write_run(report, output, overwrite=overwrite, progress=progress)
     with messages_of(analyze):
         show_run(report, output, analyze, as_json=as_json, quiet=quiet)
 
@@ -436,8 +435,7 @@ def run(
                 scheduler=scheduler,
                 progress=progress,
             )
-            progress(0, 0, "writing the report")
-            complete_run(report, output)
+            complete_run(report, output, progress=progress)
         show_run(report, output, run, as_json=as_json, quiet=quiet)
 
 

@@ -17,18 +17,23 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
+    from perrin.report.page import Progress
     from perrin.run.results import Report
 
 
 @contextmanager
 def run_folder(
-    report: Report, folder: str | os.PathLike[str], *, overwrite: bool = False
+    report: Report,
+    folder: str | os.PathLike[str],
+    *,
+    overwrite: bool = False,
+    progress: Progress | None = None,
 ) -> Iterator[Path]:
     """Write a run folder as `write_run` does, and give it to add further files before it appears.
 
     Parameters
     ----------
-    report, folder, overwrite
+    report, folder, overwrite, progress
         As in `write_run`.
 
     Yields
@@ -42,11 +47,17 @@ def run_folder(
         As `write_run`.
     """
     with staged_folder(folder, overwrite=overwrite) as stage:
-        _write_files(report, stage)
+        _write_files(report, stage, progress)
         yield stage
 
 
-def write_run(report: Report, folder: str | os.PathLike[str], *, overwrite: bool = False) -> None:
+def write_run(
+    report: Report,
+    folder: str | os.PathLike[str],
+    *,
+    overwrite: bool = False,
+    progress: Progress | None = None,
+) -> None:
     """Write a run folder with data, figures and HTML pages, complete or not at all.
 
     Parameters
@@ -57,17 +68,21 @@ def write_run(report: Report, folder: str | os.PathLike[str], *, overwrite: bool
         run on images, the imaging quality as ``quality.html``.
     overwrite : bool
         Replace an existing run folder.
+    progress : callable, optional
+        Called with the number of finished clusters, their total, and what is done.
 
     Raises
     ------
     FileExistsError
         If the folder exists and `overwrite` is not set, or is not a run folder.
     """
-    with run_folder(report, folder, overwrite=overwrite):
+    with run_folder(report, folder, overwrite=overwrite, progress=progress):
         pass
 
 
-def complete_run(report: Report, folder: str | os.PathLike[str]) -> None:
+def complete_run(
+    report: Report, folder: str | os.PathLike[str], *, progress: Progress | None = None
+) -> None:
     """Write a run, as `write_run` does, into the folder that holds its finished frames.
 
     Parameters
@@ -75,6 +90,8 @@ def complete_run(report: Report, folder: str | os.PathLike[str]) -> None:
     report : Report
     folder : path
         Folder given to `analyze_stack` as `keep`.
+    progress : callable, optional
+        As in `write_run`.
 
     Raises
     ------
@@ -82,15 +99,17 @@ def complete_run(report: Report, folder: str | os.PathLike[str]) -> None:
         If the run cannot be written; the finished frames remain.
     """
     with filled_folder(folder) as stage:
-        _write_files(report, stage)
+        _write_files(report, stage, progress)
 
 
-def _write_files(report: Report, stage: Path) -> None:
+def _write_files(report: Report, stage: Path, progress: Progress | None) -> None:
     """Write data, figures and pages into an empty folder."""
+    if progress is not None:
+        progress(0, 0, "writing tables and figures")
     write_data(report, stage)
     place = stage / "figures"
     place.mkdir()
-    html = render_html(report, save_figures(report, place))
+    html = render_html(report, save_figures(report, place), progress=progress)
     (stage / "report.html").write_text(html, encoding="utf-8")
     if report.imaging is not None:
         html = render_imaging_quality(report, save_image_figures(report, place))
