@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from perrin._text import unit_text
-from perrin.plot.style import GREY, PALETTE, new_figure, save_figure
+from perrin.plot.figure_style import GREY, PALETTE, new_figure, save_figure
 from perrin.study.conditions import QUANTITIES, UNITS, condition_text
 from perrin.study.trends import law_values
 
