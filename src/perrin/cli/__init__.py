@@ -8,6 +8,8 @@ from perrin.cli.app import (
     convert,
     demo,
     doctor,
+    example_files,
+    examples,
     main,
     paper,
     plan,
@@ -16,14 +18,18 @@ from perrin.cli.app import (
     show_run,
     simulate,
 )
-from perrin.cli.config import config_text, take_config, write_config
+from perrin.cli.config import take_config
 from perrin.cli.diagnosis import Check, figure_font, installed, optional_readers, self_test
 from perrin.cli.messages import (
+    StoppedError,
     claimed_output,
+    escape,
     in_options,
     messages_of,
     options_of,
     state_kept_frames,
+    status_of,
+    stop_in_order,
     warnings_in_one_line,
 )
 from perrin.cli.options import (
@@ -59,6 +65,7 @@ from perrin.cli.tables import (
 __all__ = [
     "Check",
     "GroupedCommand",
+    "StoppedError",
     "analyze",
     "body_of",
     "check_demo_folder",
@@ -66,10 +73,12 @@ __all__ = [
     "claimed_output",
     "cluster_table",
     "common_options",
-    "config_text",
     "convert",
     "demo",
     "doctor",
+    "escape",
+    "example_files",
+    "examples",
     "figure_font",
     "in_options",
     "installed",
@@ -110,8 +119,9 @@ __all__ = [
     "simulate",
     "spheres_of",
     "state_kept_frames",
+    "status_of",
+    "stop_in_order",
     "take_config",
     "terms_of",
     "warnings_in_one_line",
-    "write_config",
 ]

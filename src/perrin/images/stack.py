@@ -6,7 +6,7 @@ import hashlib
 import os
 import threading
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -18,8 +18,10 @@ from perrin.errors import FrameError, PrecisionWarning
 from perrin.images.formats.arrays import array_contents
 from perrin.images.formats.contents import Contents, Pick, needed, strange_lengths, summed
 from perrin.images.formats.folders import sequence, sequence_files
+from perrin.images.formats.isolation import SWITCH, guarded
 from perrin.images.formats.tiff import tiff
 from perrin.images.formats.vendors import WAY_OUT, vendor
+from perrin.tracks.file_limits import refuse_oversize
 from perrin.tracks.writing import written_whole
 
 if TYPE_CHECKING:
@@ -60,6 +62,8 @@ class Stack:
         ``read(i)`` returns frame i without the checks of `frame`.
     notes : tuple of str
         How the file was interpreted where it does not name its axes.
+    stated : dict
+        Values of voxel, dt and plane_time that the user stated.
 
     Examples
     --------
@@ -77,6 +81,7 @@ class Stack:
     source: str
     read: Callable[[int], NDArray[Any]]
     notes: tuple[str, ...] = ()
+    stated: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         frozen(self.voxel, self.times)
@@ -265,6 +270,7 @@ def open_stack(
     ((5, 8, 32, 32), (8, 32, 32))
     """
     size = None if voxel is None else np.atleast_1d(np.asarray(voxel, dtype=np.float64))
+    given = {"voxel": None if size is None else size.tolist(), "dt": dt, "plane_time": plane_time}
     if size is not None and size.shape == (2,) and planes is None:
         planes = 1
     one, several = _channels(channel)
@@ -311,6 +317,7 @@ def open_stack(
         source=source,
         read=read,
         notes=contents.notes,
+        stated={name: value for name, value in given.items() if value is not None},
     )
 
 
@@ -373,10 +380,23 @@ def file_contents(source: str, pick: Pick, several: tuple[int, ...] | None = Non
             for part in parts:
                 part.close()
             raise
+    contents = _read_alone(source, pick)
+    try:
+        refuse_oversize(source, contents.shape[1:], contents.dtype.itemsize, what="a frame")
+        refuse_oversize(source, contents.shape[:1], 8, what="a series of frames")
+    except ValueError:
+        contents.close()
+        raise
+    return contents
+
+
+def _read_alone(source: str, pick: Pick) -> Contents:
+    """Return the contents of a file or folder of one channel, by the reader of its format."""
     found = vendor(source)
     if found is not None:
+        apart = found.apart and os.environ.get(SWITCH) != "off"
         try:
-            return found.read(source, pick)
+            return (guarded if apart else found.read)(source, pick)
         except ValueError as fault:
             # A library's own error keeps its class, so that the caller adds what to do.
             if type(fault) is not ValueError:
