@@ -163,7 +163,7 @@ class TestFromRotations:
 
 
 def test_progress_counts_the_clusters_of_every_long_step(tmp_path, monkeypatch):
-    """Each step begins at 0 of its total; 20 clusters are estimated in two parts, written singly."""
+    """Steps begin at 0 of their total; 20 clusters are estimated in two parts, written singly."""
     monkeypatch.setattr("perrin.report.write.save_figures", lambda report, place: [])
     calls: dict[str, list[tuple[int, int]]] = {}
 
