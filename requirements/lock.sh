@@ -9,7 +9,7 @@ compile() { "$UV" pip compile --quiet --no-annotate --no-header --no-emit-index-
 # One version of each for every Python and system that perrin serves, markers where they differ.
 everywhere() { compile --universal --fork-strategy fewest --python-version 3.11 "$@"; }
 # The pins of a lock with the hashes of all their files, without resolving anything anew.
-hashed() { compile --universal --python-version 3.11 --no-deps --generate-hashes "$1"; }
+hashed() { compile --universal --python-version 3.11.7 --no-deps --generate-hashes "$1"; }
 note() { printf '# %s\n# Made from pyproject.toml by `make lock`; do not edit.\n' "$1"; }
 
 printf 'hatchling\neditables\nsetuptools\n' | everywhere pyproject.toml - > "$new/demo"

@@ -8,6 +8,8 @@ from perrin.cli.app import (
     convert,
     demo,
     doctor,
+    example_files,
+    examples,
     main,
     paper,
     plan,
@@ -16,7 +18,7 @@ from perrin.cli.app import (
     show_run,
     simulate,
 )
-from perrin.cli.config import config_text, take_config, write_config
+from perrin.cli.config import take_config
 from perrin.cli.diagnosis import Check, figure_font, installed, optional_readers, self_test
 from perrin.cli.messages import (
     StoppedError,
@@ -46,6 +48,7 @@ from perrin.cli.options import (
     spheres_of,
 )
 from perrin.cli.progress import progress_lines, shown_progress
+from perrin.cli.study_commands import new_study, report_study, run_study
 from perrin.cli.tables import (
     cluster_table,
     kinds_table,
@@ -70,17 +73,19 @@ __all__ = [
     "claimed_output",
     "cluster_table",
     "common_options",
-    "config_text",
     "convert",
     "demo",
     "doctor",
     "escape",
+    "example_files",
+    "examples",
     "figure_font",
     "in_options",
     "installed",
     "kinds_table",
     "main",
     "messages_of",
+    "new_study",
     "optional_readers",
     "options_of",
     "paper",
@@ -98,7 +103,9 @@ __all__ = [
     "read_refine",
     "read_slice",
     "read_whole_numbers",
+    "report_study",
     "run",
+    "run_study",
     "self_test",
     "show_diagnosis",
     "show_json",
@@ -116,5 +123,4 @@ __all__ = [
     "take_config",
     "terms_of",
     "warnings_in_one_line",
-    "write_config",
 ]

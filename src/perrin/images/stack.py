@@ -6,7 +6,7 @@ import hashlib
 import os
 import threading
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -62,6 +62,8 @@ class Stack:
         ``read(i)`` returns frame i without the checks of `frame`.
     notes : tuple of str
         How the file was interpreted where it does not name its axes.
+    stated : dict
+        Values of voxel, dt and plane_time that the user stated.
 
     Examples
     --------
@@ -79,6 +81,7 @@ class Stack:
     source: str
     read: Callable[[int], NDArray[Any]]
     notes: tuple[str, ...] = ()
+    stated: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         frozen(self.voxel, self.times)
@@ -104,8 +107,10 @@ class Stack:
 
     @property
     def path(self) -> Path | None:
-        """The file, folder or glob that is read; None for a stack in memory."""
-        return Path(self.read.path) if isinstance(self.read, _FileFrames) else None
+        """The file, folder or glob that is read; None for an address and a stack in memory."""
+        if not isinstance(self.read, _FileFrames) or "://" in self.read.path:
+            return None
+        return Path(self.read.path)
 
     @property
     def choice(self) -> dict[str, int | str | list[int] | None]:
@@ -213,7 +218,8 @@ def open_stack(
     path : str, path or array_like
         TIFF, OME-TIFF, ImageJ hyperstack, a folder or glob of TIFF files (in the order of the
         numbers in their names); Leica ``.lif``, Nikon ``.nd2``, Zeiss ``.czi`` and ``.lsm``,
-        Olympus ``.oib``, DeltaVision ``.dv``, Imaris ``.ims``, OME-Zarr, ``.npy``, ``.h5``; or an
+        Olympus ``.oib``, DeltaVision ``.dv``, Imaris ``.ims``, OME-Zarr (also an address that
+        fsspec reads, such as ``s3://bucket/movie.zarr``), ``.npy``, ``.h5``; or an
         array (t, z, y, x) or (z, y, x), also of dask, zarr or a memory map.
     voxel : array_like, shape (3,) or (2,), optional
         Voxel size (z, y, x), um; (y, x) for a 2-D movie. Required where the file does not state
@@ -264,6 +270,7 @@ def open_stack(
     ((5, 8, 32, 32), (8, 32, 32))
     """
     size = None if voxel is None else np.atleast_1d(np.asarray(voxel, dtype=np.float64))
+    given = {"voxel": None if size is None else size.tolist(), "dt": dt, "plane_time": plane_time}
     if size is not None and size.shape == (2,) and planes is None:
         planes = 1
     one, several = _channels(channel)
@@ -271,9 +278,8 @@ def open_stack(
     if isinstance(path, (str, os.PathLike)):
         source = os.fspath(path)
         contents = _described(source, pick, several)
-        read: Callable[[int], NDArray[Any]] = _FileFrames(
-            os.path.abspath(source), pick, contents, several
-        )
+        place = source if "://" in source else os.path.abspath(source)
+        read: Callable[[int], NDArray[Any]] = _FileFrames(place, pick, contents, several)
     else:
         source = "array"
         if several:
@@ -311,6 +317,7 @@ def open_stack(
         source=source,
         read=read,
         notes=contents.notes,
+        stated={name: value for name, value in given.items() if value is not None},
     )
 
 
@@ -439,6 +446,9 @@ def _files_of(stack: Stack) -> list[Path]:
 def digest(stack: Stack) -> str:
     """Return the SHA-256 of a stack: of its files with their names, or of its frames in memory.
 
+    Of a movie in an object store it is that of the names, sizes and marks (ETag) of its objects,
+    which are not read.
+
     Parameters
     ----------
     stack : Stack
@@ -456,6 +466,14 @@ def digest(stack: Stack) -> str:
     '38723a2e5e8a'
     """
     total = hashlib.sha256()
+    if stack.path is None and "://" in stack.source:
+        from fsspec.core import url_to_fs
+
+        system, root = url_to_fs(stack.source)
+        for name, state in sorted(system.find(root, detail=True).items()):
+            mark = state.get("ETag", state.get("etag", state.get("mtime")))
+            total.update(f"{name.removeprefix(root)} {state['size']} {mark}\n".encode())
+        return total.hexdigest()
     if stack.path is None:
         for frame in stack:
             total.update(np.ascontiguousarray(frame).tobytes())

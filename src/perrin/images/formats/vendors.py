@@ -463,7 +463,10 @@ def vendor(path: str) -> Format | None:
     >>> vendor("movie.lif").name, vendor("movie.tif")
     ('Leica LAS X', None)
     """
-    if any((Path(path) / name).exists() for name in (".zgroup", ".zarray", "zarr.json")):
+    # Addresses of object stores hold OME-Zarr: the other formats are not read by range.
+    if "://" in path or any(
+        (Path(path) / name).exists() for name in (".zgroup", ".zarray", "zarr.json")
+    ):
         return Format("OME-Zarr", ome_zarr)
     suffix = Path(path).suffix.lower()
     if suffix in _UNREAD:
