@@ -8,7 +8,7 @@ import perrin.report.write as pages
 from perrin.cli.app import main
 
 
-def no_figures(_, folder):
+def no_figures(_, folder, **__):
     """Make the folder of the figures."""
     Path(folder).mkdir(exist_ok=True)
     return []
@@ -17,7 +17,7 @@ def no_figures(_, folder):
 def without_pictures():
     """Let runs write their data, and pages without content."""
     pages.save_figures = pages.save_image_figures = no_figures
-    pages.render_html = pages.render_imaging_quality = lambda *_: "<html></html>"
+    pages.render_html = pages.render_imaging_quality = lambda *_, **__: "<html></html>"
 
 
 if __name__ == "__main__":

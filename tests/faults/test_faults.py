@@ -106,7 +106,7 @@ def called(capsys, monkeypatch):
     from perrin.cli.app import app
 
     for name in ("save_figures", "save_image_figures", "render_html", "render_imaging_quality"):
-        monkeypatch.setattr(f"perrin.report.write.{name}", lambda *_: "")
+        monkeypatch.setattr(f"perrin.report.write.{name}", lambda *_, **__: "")
 
     def call(arguments):
         with pytest.raises(SystemExit) as end:
