@@ -33,7 +33,7 @@ venv_works = $(shell $(1)/bin/python -c 'import sys, pip; sys.exit(sys.version_i
 make_venv = $(if $(call venv_works,$(1)),:,$(call new_venv,$(1),$(find_python)))
 new_venv = $(call check_python,$(2))rm -rf $(1); $(2) -m venv $(1) || { echo '$(call no_venv,$(2))' >&2; exit 1; }
 
-.PHONY: help demo test test-numpy test-lowest benchmarks long lint types doctests docs lock clean
+.PHONY: help demo faults fuzz fuzz-short test test-numpy test-lowest benchmarks long lint types doctests docs release lock clean
 
 help:  ## list these targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1 - \2/p' Makefile | awk -F ' - ' '{printf "%-18s %s\n", $$1, $$2}'
@@ -47,10 +47,20 @@ test: .venv/.test  ## the whole suite, on all cores
 test-numpy: .venv/.test  ## the numeric tests again, without the compiled kernels
 	PERRIN_COMPILED=0 OMP_NUM_THREADS=1 $(RUN) pytest -q -n auto --dist loadfile $(NUMERIC)
 
+faults: .venv/.test  ## stopped and broken runs: kills, signals, full disks, two at a time (3 minutes)
+	OMP_NUM_THREADS=1 $(RUN) pytest -q -m faults -n 2 --dist load tests/faults
+
+SECONDS ?= 3600
+fuzz: .venv/.test  ## damaged files of all formats, an hour (SECONDS=...); faults become seeds
+	OMP_NUM_THREADS=1 $(BIN)/python tests/fuzz/run.py --seconds $(SECONDS) --jobs 2
+
+fuzz-short: .venv/.test  ## the same for a minute
+	OMP_NUM_THREADS=1 $(RUN) pytest -q -m fuzz tests/fuzz
+
 test-lowest:  ## the suite on the oldest dependencies allowed (Python 3.11)
 	@$(call make_venv,.venv-lowest)
 	.venv-lowest/bin/python -m pip install --quiet --disable-pip-version-check \
-	  -r requirements/lowest.txt $$(grep -E '^(pytest|hypothesis)==' requirements/test.lock)
+	  -r requirements/lowest.txt $$(sed -nE 's/^((pytest|hypothesis)==[^ ]+).*/\1/p' requirements/test.lock)
 	.venv-lowest/bin/python -m pip install --quiet --disable-pip-version-check --no-deps -e .
 	.venv-lowest/bin/python -m pytest -q
 
@@ -59,11 +69,13 @@ benchmarks: .venv/.test  ## the quick benchmarks: coverage of intervals, warning
 	$(BIN)/python benchmarks/alarms.py --quick --jobs 2
 	$(BIN)/python benchmarks/motion.py --quick --jobs 2
 	$(BIN)/python benchmarks/paper.py
+	$(BIN)/python benchmarks/study_coverage.py --quick
+	$(BIN)/python benchmarks/study.py --quick
 	$(BIN)/python benchmarks/structure.py
 	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/peers.py --quick
 
 long: .venv/.test  ## the Monte-Carlo tests with all repeats, and 40 tables of every warning (hours)
-	OMP_NUM_THREADS=1 $(RUN) pytest -q --long -n auto --dist loadfile
+	OMP_NUM_THREADS=1 $(RUN) pytest -q --long -n auto --dist loadfile tests docs/test_pages.py
 	$(BIN)/python benchmarks/intervals.py
 	$(BIN)/python benchmarks/alarms.py --repeats 40 --jobs 2
 	$(BIN)/python benchmarks/motion.py --jobs 2
@@ -71,6 +83,8 @@ long: .venv/.test  ## the Monte-Carlo tests with all repeats, and 40 tables of e
 	$(BIN)/python benchmarks/motion_switching.py
 	$(BIN)/python benchmarks/motion_correlation.py
 	$(BIN)/python benchmarks/motion_dense.py
+	$(BIN)/python benchmarks/study_coverage.py
+	$(BIN)/python benchmarks/study.py
 
 lint: .venv/.test  ## ruff: rules and format
 	$(RUN) ruff check .
@@ -79,11 +93,15 @@ lint: .venv/.test  ## ruff: rules and format
 types: .venv/.test  ## mypy --strict on src
 	$(RUN) mypy
 
-doctests: .venv/.test  ## the examples in the docstrings
-	$(RUN) pytest --doctest-modules src/perrin -q
+doctests: .venv/.test  ## the examples in the docstrings, and the code of all pages
+	$(RUN) pytest --doctest-modules src/perrin docs/test_pages.py -q -n auto
 
-docs: .venv/.docs  ## the documentation, into docs/_build/html
-	$(RUN) sphinx -q -b html docs docs/_build/html
+docs: .venv/.docs  ## the documentation with its gallery, into docs/_build/html
+	OMP_NUM_THREADS=1 $(RUN) sphinx -W --keep-going -q -j 2 -d docs/_build/doctrees -b html docs docs/_build/html
+	@echo 'The documentation is in file://$(CURDIR)/docs/_build/html/index.html'
+
+release: .venv/.demo  ## wheel and sdist, checked and installed into an empty environment
+	sh requirements/release.sh
 
 lock:  ## resolve the dependencies of pyproject.toml anew into requirements/
 	@$(call make_venv,.venv-lock)
@@ -92,6 +110,7 @@ lock:  ## resolve the dependencies of pyproject.toml anew into requirements/
 
 clean:  ## remove what was installed and built, demo output included
 	rm -rf .venv .venv-lowest .venv-lock dist docs/_build perrin-demo
+	rm -rf docs/gallery docs/tutorials/examples docs/reference/python docs/reference/backreferences
 	rm -rf .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	find src tests -name __pycache__ -type d -prune -exec rm -rf {} +
 
@@ -99,7 +118,7 @@ clean:  ## remove what was installed and built, demo output included
 .venv/.demo: requirements/demo.lock pyproject.toml hatch_build.py src/perrin/compiled/kernels.c
 	@$(call make_venv,.venv)
 	@echo 'Installing locked versions into .venv (once; a minute or two)'
-	@$(PIP) install --quiet --no-deps -r requirements/demo.lock
+	@$(PIP) install --quiet --no-deps --require-hashes -r requirements/demo.lock
 	@$(PIP) install --quiet --no-deps --no-build-isolation -e .
 	@$(PIP) --quiet check
 	@$(BIN)/python -c 'from perrin.compiled import kernels_in_use; print("Compiled kernels:", kernels_in_use())'
@@ -108,6 +127,6 @@ clean:  ## remove what was installed and built, demo output included
 
 .venv/.test .venv/.docs: .venv/.%: requirements/%.lock .venv/.demo
 	@echo 'Installing $< into .venv'
-	@$(PIP) install --quiet --no-deps -r $<
+	@$(PIP) install --quiet --no-deps --require-hashes -r $<
 	@$(PIP) --quiet check
 	@touch $@

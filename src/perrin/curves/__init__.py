@@ -69,8 +69,8 @@ from perrin.curves.pairs import (
 from perrin.curves.standard_errors import (
     covariance_polynomials,
     displacement_counts,
+    lag_covariance,
     relative_error,
-    squared_covariances,
     squared_shared_times,
     two_lag_fit,
 )
@@ -111,6 +111,7 @@ __all__ = [
     "heat_kernel_moments",
     "independent_walks",
     "lag_bins",
+    "lag_covariance",
     "mean_correlation_powers",
     "mean_square_curve",
     "mean_velocity",
@@ -129,7 +130,6 @@ __all__ = [
     "quaternion_covariance",
     "radial_bins",
     "relative_error",
-    "squared_covariances",
     "squared_shared_times",
     "squared_size",
     "turned_angles",

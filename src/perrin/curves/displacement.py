@@ -247,7 +247,7 @@ def msd(
         require_positive(dt=dt)
         walks = as_positions(motion_or_positions)
         time = dt * np.arange(len(walks), dtype=np.float64)
-        piece = np.zeros(len(walks), dtype=np.int64)
+        piece = np.broadcast_to(np.zeros((), dtype=np.int64), len(walks))
     dof = walks.shape[2]
     estimated = isinstance(drift, (bool, np.bool_)) and bool(drift)
     velocity = None

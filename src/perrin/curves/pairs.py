@@ -564,13 +564,17 @@ class Products:
         values = _on_grid(self.features, rows, slots)
         here = present(values)
         size = fft_size(len(values) + count)
-        f = np.fft.rfft(np.where(here[:, None], values, 0.0).T, size)
-        m = np.fft.rfft(here.astype(np.float64), size)
+        whole = bool(here.all())
+        columns = np.ascontiguousarray(values.T)
+        f = np.fft.rfft(columns if whole else np.where(here, columns, 0.0), size)
         sums = np.empty((count, len(self.groups)))
         for k, group in enumerate(self.groups):
             # The real part is the transform of the mean of a product and its reverse.
             power = sum(f[i].real * f[j].real + f[i].imag * f[j].imag for i, j in group)
             sums[:, k] = np.fft.irfft(power, size)[1 : count + 1]
+        if whole:
+            return sums, len(values) - np.arange(1, count + 1)
+        m = np.fft.rfft(here.astype(np.float64), size)
         pairs = np.fft.irfft(m.real**2 + m.imag**2, size)[1 : count + 1]
         return sums, np.rint(pairs).astype(np.int64)
 

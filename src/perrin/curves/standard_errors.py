@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,8 +15,7 @@ if TYPE_CHECKING:
 _INTEGER_RANGE = 1 << 22
 
 
-# Lags whose errors are computed at once; more do not stay in the processor's cache.
-_LAGS_AT_ONCE = 8192
+_CACHED_LAGS = 4096  # lags whose working arrays fit into the second-level cache
 
 
 def relative_error(sums: PairSums, frames: Frames, half: Floats, pairs: Floats) -> Floats:
@@ -54,103 +52,31 @@ def relative_error(sums: PairSums, frames: Frames, half: Floats, pairs: Floats) 
     True
     """
     lag = sums.lagtime / frames.step
-    steps, on_grid = lag, np.asarray(pairs, dtype=np.float64)
-    if frames.exact and sums.listed is None:
-        np.rint(lag, out=lag)
-    else:
-        steps = np.maximum(np.rint(lag), 1.0)
     d, s = two_lag_fit(lag, half, pairs)
-    if sums.listed is not None:
-        share = np.divide(sums.on_grid, sums.pairs, out=np.zeros_like(half), where=sums.pairs > 0)
-        on_grid = share * pairs
-    total = np.zeros_like(lag)
-    complete = displacement_counts(frames.lengths, steps)
-    gap: Floats | float = 0.0
-    whole = np.array_equal(on_grid, complete)
-    if not whole:
-        share = np.divide(on_grid, complete, out=np.zeros_like(half), where=complete > 0)
-        gap = 1 / np.sqrt(np.where(share > 0, share, 1.0)) - 1
-    for length, times in zip(*np.unique(frames.lengths, return_counts=True), strict=True):
-        # Steps rise: the lags up to half the track, and the longer ones, in parts that stay in the
-        # processor's cache.
-        middle, end = np.searchsorted(steps, [0.5 * (length + 1) + 0.25, length + 0.5]).tolist()
-        edges = [*range(0, middle, _LAGS_AT_ONCE), *range(middle, end, _LAGS_AT_ONCE), end]
-        for first, last in pairwise(edges):
-            own = squared_covariances(
-                steps[first:last],
-                int(length),
-                gap=gap if isinstance(gap, float) else gap[first:last],
-                D=d,
-                s=s,
-                shorter=first < middle,
-            )
-            total[first:last] += times * own
-    if not whole:
-        total *= share**2
+    total, lengths = np.zeros_like(lag), frames.lengths
+    blocks = [
+        (int(n), int(k)) for n, k in zip(*np.unique(lengths, return_counts=True), strict=True)
+    ]
+    for begin in range(0, len(lag), _CACHED_LAGS):
+        part = slice(begin, begin + _CACHED_LAGS)
+        steps, number = np.maximum(np.rint(lag[part]), 1.0), pairs[part]
+        share = np.zeros_like(steps)
+        np.divide(sums.on_grid[part], sums.pairs[part], out=share, where=sums.pairs[part] > 0)
+        on_grid = share * number
+        complete = displacement_counts(lengths, steps)
+        known = (on_grid > 0) & (complete > 0)
+        present = np.sqrt(np.where(known, on_grid / np.maximum(complete, 1), 1.0))
+        for length, times in blocks:
+            use = np.flatnonzero((steps <= length) & (on_grid > 0))
+            own = lag_covariance(steps[use], length, present=present[use], D=d, s=s)
+            total[part][use] += times * own * present[use] ** 4
     if sums.listed is not None:
         total += _listed_covariances(sums.listed, frames, lag, d=d, s=s)
-    # The relative error is the root of 2 total over the number of pairs and the mean square.
-    total *= 2
-    relative = np.sqrt(total, out=total)
-    mean = np.multiply(lag, 2 * d)
-    mean += 2 * s
-    with np.errstate(divide="ignore", invalid="ignore"):
-        relative /= pairs
-        relative /= mean
-    if not (mean[0] > 0 and np.all(pairs)):
-        relative[(pairs == 0) | (mean <= 0)] = np.nan
+    mean = 2 * (d * lag + s)
+    relative = np.full_like(half, np.nan)
+    good = (pairs > 0) & (mean > 0)
+    np.divide(np.sqrt(2 * total), pairs * mean, out=relative, where=good)
     return relative
-
-
-def squared_covariances(
-    lag: Floats, steps: int, *, gap: Floats | float, D: float, s: float, shorter: bool
-) -> Floats:
-    """Return the sum of the squared covariances of all pairs of displacements of one lag.
-
-    It is the polynomial of `covariance_polynomials` where both lags are the same.
-
-    Parameters
-    ----------
-    lag : ndarray, shape (L,)
-        Lags b, frames.
-    steps : int
-        Steps of the track.
-    gap : ndarray, shape (L,), or float
-        One over the fraction of the frames that is present, less 1.
-    D, s : float
-        Diffusion coefficient times dt, and variance of one coordinate from noise.
-    shorter : bool
-        Whether these lags are at most half the track, steps + 1 >= 2 b; else they are longer.
-
-    Examples
-    --------
-    >>> squared_covariances(np.array([1.0]), 10, gap=0.0, D=0.5, s=0.0, shorter=True)
-    array([10.])
-    """
-    b, p = lag, steps + 1 - lag
-    squares, noise = 4 * D * D, 2 * s * s
-    square = b * b
-    if shorter:
-        total = (2 / 3 * squares) * p
-        total -= (squares / 6) * b
-        total *= b
-        total += squares / 6
-        total *= b
-        total += (squares / 3 + 8 * D * s) * p - noise
-        total *= b
-        total += (3 * noise) * p
-        extra = 2 * squares * square * p + 2 * noise * p + 8 * D * s * p * b - noise * b
-    else:
-        twice = p * p - 1
-        total = p * ((squares / 6) * p - (2 / 3 * squares) * b)
-        total *= twice
-        total += squares * p * p * square
-        total += (2 * noise + 8 * D * s * b) * p
-        extra = 2 * squares * square * p + noise * p + 8 * D * s * p * b
-    if isinstance(gap, float) and gap == 0:
-        return np.asarray(total)
-    same = (gap * gap + 2 * gap) * (2 * D * b + 2 * s) ** 2 - 2 * gap * (2 * D * b + s) ** 2
-    return np.asarray(total + gap * extra + p * same)
 
 
 def two_lag_fit(lag: Floats, half: Floats, pairs: Floats | Ints) -> tuple[float, float]:
@@ -174,9 +100,7 @@ def two_lag_fit(lag: Floats, half: Floats, pairs: Floats | Ints) -> tuple[float,
     >>> two_lag_fit(np.array([1.0, 2.0]), np.array([0.75, 1.25]), np.array([9, 8]))
     (0.5, 0.25)
     """
-    good = np.flatnonzero(pairs[:16] > 0)
-    if good.size < 2:
-        good = np.flatnonzero(pairs > 0)
+    good = np.flatnonzero(pairs > 0)
     first, second = (good[0], good[1]) if good.size > 1 else (good[0], good[0])
     rise = (half[second] - half[first]) / max(lag[second] - lag[first], 1e-9)
     d = min(max(rise, 0.0), half[first] / lag[first])
@@ -202,8 +126,6 @@ def displacement_counts(lengths: Ints, lag: Floats) -> Floats:
     >>> displacement_counts(np.array([3, 5]), np.array([1.0, 4.0]))
     array([8., 2.])
     """
-    if len(lengths) == 1:
-        return np.asarray(np.maximum(lengths[0] + 1 - lag, 0.0))
     rising = np.sort(lengths)
     left = np.append(np.cumsum(rising[::-1])[::-1], 0)
     shorter = np.searchsorted(rising, lag - 0.5)
@@ -286,6 +208,43 @@ def squared_shared_times(pairs: ListedPairs, frames: Frames, lag: Floats) -> Flo
     shared += twice[here] - twice[begin]
     square = np.bincount(pairs.lag, shared.astype(np.float64), minlength=len(lag))
     return np.asarray(square / scale**2)
+
+
+def lag_covariance(lag: Floats, steps: int, *, present: Floats, D: float, s: float) -> Floats:
+    """Return S(b, b) of `covariance_polynomials` for rising lags b, without polynomials.
+
+    Parameters
+    ----------
+    lag, steps, present, D, s
+        As in `covariance_polynomials`.
+
+    Returns
+    -------
+    ndarray, shape (L,)
+
+    Examples
+    --------
+    >>> lag_covariance(np.array([1.0, 8.0]), 10, present=np.ones(2), D=0.5, s=0.0)
+    array([ 10., 460.])
+    """
+    gap = 1 / present - 1
+    b, p = lag, steps + 1 - lag
+    squares, noise = 4 * D * D, 2 * s * s
+    middle = int(np.searchsorted(2 * b, steps + 1, side="right"))
+    total = 8 * D * s * p * b + noise * np.maximum(2 * p - b, p)
+    total *= 1 + gap
+    total += 2 * squares * p * gap * b * b
+    near, far = slice(0, middle), slice(middle, None)
+    b, q = lag[near], p[near]
+    total[near] += squares * b * (q / 3 + b / 6 + b * b * (2 * q / 3 - b / 6))
+    b, q = lag[far], p[far]
+    total[far] += squares * q * ((q * q - 1) * (q / 6 - 2 * b / 3) + b * b * q)
+    total += p * noise
+    if gap.any():
+        b = lag
+        same = (gap * gap + 2 * gap) * (2 * D * b + 2 * s) ** 2 - 2 * gap * (2 * D * b + s) ** 2
+        total += p * same
+    return total
 
 
 def covariance_polynomials(

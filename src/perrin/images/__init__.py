@@ -18,6 +18,7 @@ from perrin.images.formats.contents import (
     summed,
 )
 from perrin.images.formats.deltavision import deltavision
+from perrin.images.formats.directories import check_directories
 from perrin.images.formats.folders import name_counters, sequence, sequence_files
 from perrin.images.formats.headers import (
     HeaderScale,
@@ -32,7 +33,9 @@ from perrin.images.formats.headers import (
     ome_scale,
     stk_scale,
     tiff_kind,
+    xml_root,
 )
+from perrin.images.formats.isolation import guarded, serve
 from perrin.images.formats.olympus import olympus, olympus_scale
 from perrin.images.formats.tiff import (
     DeclaredSeries,
@@ -106,6 +109,7 @@ from perrin.images.optics.learn_radial import (
     first_image,
     held_out_misfit,
     learn_image,
+    log_likelihood,
     noise_of_neighbours,
     settled_image,
     size_spread,
@@ -116,6 +120,7 @@ from perrin.images.optics.radial_image import (
     Patch,
     PatchFit,
     RadialImage,
+    TransmissionNoise,
     cut_patch,
     fit_patch,
     spline_design,
@@ -179,7 +184,7 @@ from perrin.images.spheres.spots import (
     mass_cut,
     touching_together,
 )
-from perrin.images.stack import Stack, digest, file_contents, open_stack, write_stack
+from perrin.images.stack import Stack, digest, file_contents, file_states, open_stack, write_stack
 
 __all__ = [
     "Arrangement",
@@ -230,6 +235,7 @@ __all__ = [
     "Spots",
     "Stack",
     "StackLike",
+    "TransmissionNoise",
     "UsualImage",
     "View",
     "Window",
@@ -241,6 +247,7 @@ __all__ = [
     "box_around",
     "brightness_parameters",
     "channel_index",
+    "check_directories",
     "check_search",
     "choose_method",
     "chosen",
@@ -261,6 +268,7 @@ __all__ = [
     "drawing_faults",
     "even_times",
     "file_contents",
+    "file_states",
     "find_circles",
     "find_fading",
     "find_features",
@@ -281,6 +289,7 @@ __all__ = [
     "group_columns",
     "groups_and_crowds",
     "groups_to_fit",
+    "guarded",
     "hdf5",
     "header_scale",
     "held_out_misfit",
@@ -300,6 +309,7 @@ __all__ = [
     "leica_plane_time",
     "lif",
     "locate",
+    "log_likelihood",
     "lsm_scale",
     "mass_cut",
     "metaseries_scale",
@@ -338,6 +348,7 @@ __all__ = [
     "saturated_share",
     "sequence",
     "sequence_files",
+    "serve",
     "settled_image",
     "size_faults",
     "size_spread",
@@ -363,4 +374,5 @@ __all__ = [
     "without_doubles",
     "write_imaging",
     "write_stack",
+    "xml_root",
 ]

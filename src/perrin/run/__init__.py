@@ -9,7 +9,7 @@ from perrin.run.folders import (
     staged_folder,
 )
 from perrin.run.grouping import assign_clusters
-from perrin.run.kinds import part_of, shape_numbers, usual_symmetry
+from perrin.run.kinds import matched_particles, part_of, shape_numbers, usual_symmetry
 from perrin.run.layers import napari_layers, napari_reader, table_layers
 from perrin.run.lock import locked
 from perrin.run.measure import (
@@ -32,6 +32,7 @@ from perrin.run.measure import (
     measure_rod,
     measure_table,
     measure_tensors,
+    measure_together,
     measured_body,
     measured_shape,
     misfit_as_labelled,
@@ -106,6 +107,13 @@ from perrin.run.remarks import (
     with_jumps,
     wrapped_box_text,
 )
+from perrin.run.repetition import (
+    Repetition,
+    command_line,
+    config_text,
+    python_lines,
+    stated_arguments,
+)
 from perrin.run.result_table import coefficients_html, estimate_row, prediction_columns, tidy_table
 from perrin.run.results import (
     BodyKind,
@@ -140,6 +148,7 @@ __all__ = [
     "Recording",
     "Remark",
     "Remarks",
+    "Repetition",
     "Report",
     "RodResult",
     "Shape",
@@ -157,6 +166,7 @@ __all__ = [
     "check_resumable",
     "claimed_folder",
     "coefficients_html",
+    "command_line",
     "common_jump_warnings",
     "common_motion_remarks",
     "compare_axes",
@@ -165,6 +175,7 @@ __all__ = [
     "compare_value",
     "complete_recording",
     "condensed",
+    "config_text",
     "corrected_labels_text",
     "curve_table",
     "cut_text",
@@ -200,6 +211,7 @@ __all__ = [
     "load_run",
     "locked",
     "loose_particles_note",
+    "matched_particles",
     "measure_bodies",
     "measure_coefficients",
     "measure_free_spheres",
@@ -208,6 +220,7 @@ __all__ = [
     "measure_singles",
     "measure_table",
     "measure_tensors",
+    "measure_together",
     "measured_body",
     "measured_shape",
     "merged",
@@ -234,6 +247,7 @@ __all__ = [
     "pool_coefficients",
     "predicted_noise",
     "prediction_columns",
+    "python_lines",
     "read_table",
     "removed_drift_notes",
     "run_settings",
@@ -244,6 +258,7 @@ __all__ = [
     "sparse_frames_warnings",
     "stage_jump_warnings",
     "staged_folder",
+    "stated_arguments",
     "steady_motion_warning",
     "table_layers",
     "tidy_table",

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from perrin._text import frames_text, listed, with_error
+from perrin._text import counted, frames_text, listed, with_error
 from perrin.diffusion.step_tests import JUMP_LEVEL, STAGE_LEVEL
 from perrin.tracks.screening import far_sentence
 
@@ -27,6 +27,11 @@ if TYPE_CHECKING:
 CONSTANT_Z = "z never changes: leave the column out to analyse motion in the plane"
 ROD_TESTS = "jumps and a steady motion of a rod are not tested for"
 ROD_DRIFT = "drift=True is not applied to rods: D_T and D_perp contain a mean motion"
+
+UNMOVED = (
+    "the body does not move at all, its frames are equal: one frame was copied, or its particles "
+    "are fixed"
+)
 
 TOO_FAST = (
     "identity: the body turns too far between frames for its symmetry; cutting the longest steps "
@@ -268,9 +273,9 @@ def loose_particles_note(count: int) -> str:
     Examples
     --------
     >>> loose_particles_note(3)
-    '3 particles belong to no cluster and are left out'
+    '3 particles belong to no cluster: left out'
     """
-    return f"{count} particles belong to no cluster and are left out"
+    return f"{counted(count, 'particle', 'belong')} to no cluster: left out"
 
 
 def no_cluster_text(contact: float | None, *, marked: bool) -> str:
@@ -508,7 +513,7 @@ def no_pose_notes(reasons: Iterable[str], recorded: Bools) -> list[str]:
         return []
     kinds = {r: refused.count(r) for r in sorted(set(refused))}
     by_kind = "; ".join(f"{count} x {reason}" for reason, count in kinds.items())
-    return [f"{len(refused)} of {np.count_nonzero(recorded)} frames have no pose ({by_kind})"]
+    return [f"frames without a pose: {len(refused)} of {np.count_nonzero(recorded)} ({by_kind})"]
 
 
 def no_rotation_note(particles: int) -> str:
@@ -874,7 +879,10 @@ def limit_warnings(D_R: DiffusionEstimate, D_T: DiffusionEstimate) -> list[str]:
         for text in estimate.warnings:
             if estimate.resolved or not text.startswith("signal-to-noise"):
                 named.setdefault(text, []).append(name)
-    return [f"{' and '.join(names)}: {text}" for text, names in named.items()]
+    texts = [f"{' and '.join(names)}: {text}" for text, names in named.items()]
+    if D_R.value == D_R.stderr == D_T.value == D_T.stderr == 0:
+        texts.insert(0, UNMOVED)
+    return texts
 
 
 def noise_floor_warning(measured: float, stderr: float, *, predicted: float, gain: float) -> str:

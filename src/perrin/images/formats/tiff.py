@@ -21,6 +21,7 @@ from perrin.images.formats.contents import (
     layout,
     needed,
 )
+from perrin.images.formats.directories import check_directories
 from perrin.images.formats.headers import (
     clock_scale,
     header_scale,
@@ -117,19 +118,23 @@ def opened(path: str) -> Any:  # noqa: ANN401
     Raises
     ------
     ValueError
-        If the header is in another file, which is missing.
+        If the header is in another file, which is missing; if the directories of the images loop
+        or state impossible sizes (`check_directories`).
     """
     import re
 
     tifffile = needed("tifffile", "images")
+    check_directories(path)
     file = tifffile.TiffFile(path)
     header = file.ome_metadata if file.is_ome else None
     if not header or "BinaryOnly" not in header:
         return file
     file.close()
     named = re.search(r'MetadataFile="([^"]+)"', header)
-    companion = Path(path).parent / (named[1] if named else "")
-    if not companion.is_file():
+    name = named[1] if named else ""
+    companion = Path(path).parent / name
+    # A name with a path would be of another folder.
+    if name != Path(name).name or not companion.is_file():
         ome_images(header)
     return tifffile.TiffFile(path, omexml=companion.read_text(encoding="utf-8"))
 

@@ -176,6 +176,7 @@ def ims(path: str, pick: Pick) -> Contents:
     """Describe an Imaris .ims file: HDF5, finest resolution, padded blocks cut to the image."""
     file = needed("h5py", "ims").File(path, "r", rdcc_nbytes=_IMARIS_CACHE)
     try:
+        _refuse_links(file)
         finest = file["DataSet"]["ResolutionLevel 0"]
         about = file["DataSetInfo"]
         image = {key: _imaris_text(value) for key, value in about["Image"].attrs.items()}
@@ -211,6 +212,18 @@ def ims(path: str, pick: Pick) -> Contents:
         voxel=voxel,
         times=times,
     )
+
+
+def _refuse_links(file: Any) -> None:  # noqa: ANN401 (h5py.File)
+    """Refuse an Imaris file whose images are in other files."""
+    group = file
+    for name in ("DataSet", "ResolutionLevel 0", "TimePoint 0", "Channel 0", "Data"):
+        link = type(group.get(name, getlink=True)).__name__ if hasattr(group, "get") else ""
+        if link == "ExternalLink":
+            raise ValueError(f"has its {name!r} in another file: save it as one file")
+        group = group[name]
+    if getattr(group, "external", None) or getattr(group, "is_virtual", False):
+        raise ValueError("has its images in other files: save it as one file")
 
 
 def imaris_size(image: dict[str, str], channel: Any) -> dict[str, int]:  # noqa: ANN401
@@ -391,6 +404,9 @@ class Format(NamedTuple):
         What a file of this format is, for messages.
     read : callable
         ``read(path, pick)`` describes the contents of a file.
+    apart : bool
+        Whether files are read in a process of their own (`guarded`), because a library decodes
+        them.
 
     Examples
     --------
@@ -400,6 +416,7 @@ class Format(NamedTuple):
 
     name: str
     read: Callable[[str, Pick], Contents]
+    apart: bool = True
 
 
 _FORMATS = {
@@ -408,8 +425,8 @@ _FORMATS = {
     ".czi": Format("Zeiss CZI", czi),
     ".ims": Format("Imaris", ims),
     **dict.fromkeys((".oib", ".oif"), Format("Olympus FluoView", olympus)),
-    **dict.fromkeys((".dv", ".r3d"), Format("DeltaVision", deltavision)),
-    **dict.fromkeys((".npy", ".npz"), Format("numpy array", numpy_file)),
+    **dict.fromkeys((".dv", ".r3d"), Format("DeltaVision", deltavision, apart=False)),
+    **dict.fromkeys((".npy", ".npz"), Format("numpy array", numpy_file, apart=False)),
     **dict.fromkeys((".h5", ".hdf5"), Format("HDF5", hdf5)),
 }
 
@@ -446,7 +463,10 @@ def vendor(path: str) -> Format | None:
     >>> vendor("movie.lif").name, vendor("movie.tif")
     ('Leica LAS X', None)
     """
-    if any((Path(path) / name).exists() for name in (".zgroup", ".zarray", "zarr.json")):
+    # Addresses of object stores hold OME-Zarr: the other formats are not read by range.
+    if "://" in path or any(
+        (Path(path) / name).exists() for name in (".zgroup", ".zarray", "zarr.json")
+    ):
         return Format("OME-Zarr", ome_zarr)
     suffix = Path(path).suffix.lower()
     if suffix in _UNREAD:
