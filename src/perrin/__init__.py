@@ -132,7 +132,7 @@ if TYPE_CHECKING:
         track_direction,
         track_rotation,
     )
-    from perrin.movie import Work, analyze_stack
+    from perrin.movie import analyze_stack
     from perrin.report import write_run
     from perrin.run import (
         BodyKind,
@@ -143,6 +143,7 @@ if TYPE_CHECKING:
         Report,
         RodResult,
         SingleSpheres,
+        Work,
         analyze,
         load_run,
         napari_layers,
@@ -294,7 +295,6 @@ __all__ = [
 
 # The public names of every subpackage.
 _FACES = {
-    "compiled": (),
     "errors": (
         "DamagedFileError",
         "DegenerateClusterError",
@@ -435,18 +435,17 @@ _FACES = {
         "Report",
         "RodResult",
         "SingleSpheres",
+        "Work",
         "analyze",
         "load_run",
         "napari_layers",
     ),
-    "movie": (
-        "Work",
-        "analyze_stack",
-    ),
+    "movie": ("analyze_stack",),
     "plot": (),
     "report": ("write_run",),
     "paper": (),
     "cli": (),
+    "compiled": (),
 }
 
 

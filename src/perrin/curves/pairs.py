@@ -387,10 +387,10 @@ class Squares:
 def _centred(x: Floats, mask: Floats | None) -> Floats:
     """Return walks (K, T) less their means, 0 where the mask is."""
     if mask is None:
-        return x - x.mean(1, keepdims=True)
+        return np.asarray(x - x.mean(1, keepdims=True))
     walk = np.where(mask > 0, x, 0.0)
     mean = walk.sum(1, keepdims=True) / np.maximum(mask.sum(1, keepdims=True), 1.0)
-    return (walk - mean) * mask
+    return np.asarray((walk - mean) * mask)
 
 
 def _dominant_velocity(x: Floats, mask: Floats | None) -> Floats:

@@ -57,7 +57,6 @@ from perrin.movie.colours import (
 from perrin.movie.parts import PartWriter, open_parts, read_parts
 from perrin.movie.stacks import Settings, analyze_stack, with_own_times
 from perrin.movie.stages import Located, fit_poses, learn_method, locate_frames, run_frames
-from perrin.movie.workers import Work, check_workers, work_through
 
 __all__ = [
     "Bodies",
@@ -68,7 +67,6 @@ __all__ = [
     "PartWriter",
     "Settings",
     "Verdict",
-    "Work",
     "analyze_stack",
     "bleached",
     "bleaching",
@@ -76,7 +74,6 @@ __all__ = [
     "channel_offset",
     "check_channels",
     "check_clusters",
-    "check_workers",
     "clusters_near_border",
     "combined_verdicts",
     "depth_change",
@@ -121,5 +118,4 @@ __all__ = [
     "unsettled_poses",
     "with_own_times",
     "with_true_errors",
-    "work_through",
 ]

@@ -6,8 +6,7 @@ import platform
 import warnings as python_warnings
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
-from functools import cache
-from itertools import islice
+from functools import cache, partial
 from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
@@ -47,6 +46,7 @@ from perrin.motion.rigidity import Corrections, Quality, judge_each
 from perrin.motion.rods import RodMotion, track_direction
 from perrin.motion.tracking import track_each, track_scanned
 from perrin.run import remarks as words
+from perrin.run.batches import batches_of, shared_work
 from perrin.run.experiment import Experiment, Recording
 from perrin.run.grouping import assign_clusters
 from perrin.run.kinds import shape_numbers, usual_symmetry
@@ -93,6 +93,8 @@ if TYPE_CHECKING:
     from perrin.diffusion.tensor_results import DiffusionTensor
     from perrin.diffusion.verdict import MotionVerdict
     from perrin.motion.floor import NoiseFloor
+    from perrin.run.batches import InOrder
+    from perrin.run.workers import Work
 
     Progress: TypeAlias = Callable[[int, int, str], None]
 
@@ -109,8 +111,6 @@ _STEADY_LEVEL = 1e-3
 # A motion that is not diffusion is a warning below this p-value, shared by both quantities, and
 # half of it by all clusters where several are also judged together.
 _VERDICT_LEVEL = 0.005
-
-_TOGETHER = 256  # clusters that are fitted at a time: bounds the memory
 
 # The symmetry of a straight chain is that of places equal within this share of its length.
 _SAME_PLACE = 0.03
@@ -248,6 +248,7 @@ def measure_table(
     remarks: Remarks | None = None,
     singles: pd.DataFrame | None = None,
     progress: Progress | None = None,
+    work: Work | None = None,
 ) -> Report:
     """Measure every cluster of a clean table: `analyze` without reading and checking.
 
@@ -271,6 +272,8 @@ def measure_table(
         Tracks of single particles, as in `measure_singles`, with frames as in the table.
     progress : callable, optional
         Called with the number of finished clusters, their total, and what is done.
+    work : Work, optional
+        The processes that share the clusters; by default this one.
 
     Returns
     -------
@@ -290,25 +293,33 @@ def measure_table(
     recording = recording or Recording(dt=experiment.dt or np.nan)
     recording, more = complete_recording(recording, table, first_frame=first)
     remarks += more
-    bodies, rods, failures = fit_clusters(table, labels, experiment, recording, progress=progress)
-    if improved is not None:
-        motions = improved(bodies, first)
-        bodies = [
-            replace(b, motion=motions[b.tracks.cluster])
-            for b in bodies
-            if b.tracks.cluster in motions
-        ]
-    placed = [b for b in bodies if not b.centre_removed]
-    stage = find_stage_jumps([b.motion for b in placed], [b.tracks.frames for b in placed])
-    remarks.warnings.extend(
-        words.stage_jump_warnings(stage, first_frame=first, kept=experiment.keep_jumps)
-    )
-    if not experiment.keep_jumps:
-        bodies = [replace(b, stage=stage.rows(b.tracks.frames)) for b in bodies]
-    if progress is not None:
-        progress(0, 0, "estimating D_R and D_T")
-    measured, failed = measure_bodies(bodies, experiment, recording)
-    failures += failed
+    with shared_work(work) as in_order:
+        bodies, rods, failures = fit_clusters(
+            table, labels, experiment, recording, in_order=in_order, progress=progress
+        )
+        if improved is not None:
+            motions = improved(bodies, first)
+            bodies = [
+                replace(b, motion=motions[b.tracks.cluster])
+                for b in bodies
+                if b.tracks.cluster in motions
+            ]
+        placed = [b for b in bodies if not b.centre_removed]
+        stage = find_stage_jumps([b.motion for b in placed], [b.tracks.frames for b in placed])
+        remarks.warnings.extend(
+            words.stage_jump_warnings(stage, first_frame=first, kept=experiment.keep_jumps)
+        )
+        if not experiment.keep_jumps:
+            bodies = [replace(b, stage=stage.rows(b.tracks.frames)) for b in bodies]
+        if progress is not None:
+            progress(0, 0, "estimating D_R and D_T")
+        measure = partial(
+            measure_bodies, experiment=experiment, recording=recording, tested=len(bodies)
+        )
+        measured: list[MeasuredBody] = []
+        for part, failed in in_order(measure, batches_of(bodies)):
+            measured += part
+            failures += failed
     if failures and not (measured or rods):
         raise failures[-1][1]
     remarks += words.common_motion_remarks(
@@ -396,9 +407,33 @@ def fit_clusters(
     experiment: Experiment,
     recording: Recording,
     *,
+    in_order: InOrder,
     progress: Progress | None = None,
 ) -> tuple[list[FittedBody], list[RodResult], list[tuple[str, ValueError]]]:
-    """Fit every cluster of a table; particles on one line are measured as rods.
+    """Fit every cluster of a table, batch by batch, as `fit_batch` does."""
+    bodies: list[FittedBody] = []
+    rods: list[RodResult] = []
+    failures: list[tuple[str, ValueError]] = []
+    count = table["cluster"][table["cluster"] >= 0].nunique()
+    fit = partial(fit_batch, labels=labels, experiment=experiment, recording=recording)
+    if progress is not None:
+        progress(0, count, "fitting clusters")
+    for more_bodies, more_rods, more_failures in in_order(fit, batches_of(each_cluster(table))):
+        bodies += more_bodies
+        rods += more_rods
+        failures += more_failures
+        if progress is not None:
+            progress(len(bodies) + len(rods) + len(failures), count, "fitting clusters")
+    return bodies, rods, failures
+
+
+def fit_batch(
+    clusters: Sequence[tuple[int, Floats, Ints, Ints, Floats | None]],
+    labels: Mapping[int, str],
+    experiment: Experiment,
+    recording: Recording,
+) -> tuple[list[FittedBody], list[RodResult], list[tuple[str, ValueError]]]:
+    """Fit some clusters, as `each_cluster` gives them; particles on one line are rods.
 
     Returns
     -------
@@ -410,45 +445,39 @@ def fit_clusters(
     bodies: list[FittedBody] = []
     rods: list[RodResult] = []
     failures: list[tuple[str, ValueError]] = []
-    count = table["cluster"][table["cluster"] >= 0].nunique()
-    clusters, done = each_cluster(table), 0
-    while some := list(islice(clusters, _TOGETHER)):
-        if progress is not None:
-            progress(done, count, "fitting clusters")
-        done += len(some)
-        far = far_points_of_each([positions for _, positions, *_ in some])
-        tracks = [
-            ClusterTracks(
-                cluster,
-                labels.get(cluster),
-                np.where(away[..., None], np.nan, x) if away.any() else x,
-                frames,
-                piece,
-                away,
-                delay,
-            )
-            for (cluster, x, frames, piece, delay), away in zip(some, far, strict=True)
-        ]
-        solid = [one for one in tracks if one.positions.shape[1:] != (2, 3)]
-        fitted = iter(fit_bodies(solid, experiment, recording))
-        for one in tracks:
-            name = one.label or str(one.cluster)
-            pair = one.positions.shape[1:] == (2, 3)
-            body = None if pair else next(fitted)
-            if isinstance(body, FittedBody):
-                bodies.append(body)
-                continue
-            if body is not None and not getattr(body, "collinear", False):
-                failures.append((name, body))
-                continue
-            try:
-                rods.append(measure_rod(one, experiment, recording))
-            except (DegenerateClusterError, TooFewFramesError) as error:
-                failures.append((name, error if body is None else body))
-            except ValueError:
-                if body is None:
-                    raise
-                failures.append((name, body))
+    far = far_points_of_each([positions for _, positions, *_ in clusters])
+    tracks = [
+        ClusterTracks(
+            cluster,
+            labels.get(cluster),
+            np.where(away[..., None], np.nan, x) if away.any() else x,
+            frames,
+            piece,
+            away,
+            delay,
+        )
+        for (cluster, x, frames, piece, delay), away in zip(clusters, far, strict=True)
+    ]
+    solid = [one for one in tracks if one.positions.shape[1:] != (2, 3)]
+    fitted = iter(fit_bodies(solid, experiment, recording))
+    for one in tracks:
+        name = one.label or str(one.cluster)
+        pair = one.positions.shape[1:] == (2, 3)
+        body = None if pair else next(fitted)
+        if isinstance(body, FittedBody):
+            bodies.append(body)
+            continue
+        if body is not None and not getattr(body, "collinear", False):
+            failures.append((name, body))
+            continue
+        try:
+            rods.append(measure_rod(one, experiment, recording))
+        except (DegenerateClusterError, TooFewFramesError) as error:
+            failures.append((name, error if body is None else body))
+        except ValueError:
+            if body is None:
+                raise
+            failures.append((name, body))
     return bodies, rods, failures
 
 
@@ -684,9 +713,18 @@ def measure_rod(tracks: ClusterTracks, experiment: Experiment, recording: Record
 
 
 def measure_bodies(
-    bodies: Sequence[FittedBody], experiment: Experiment, recording: Recording
+    bodies: Sequence[FittedBody], experiment: Experiment, recording: Recording, *, tested: int
 ) -> tuple[list[MeasuredBody], list[tuple[str, ValueError]]]:
-    """Estimate the coefficients and the tensors of all bodies, and collect the remarks on them.
+    """Estimate the coefficients and the tensors of bodies, and collect the remarks on them.
+
+    Parameters
+    ----------
+    bodies : sequence of FittedBody
+        Some of the bodies of a table, or all.
+    experiment : Experiment
+    recording : Recording
+    tested : int
+        Number of all bodies of the table, which share the levels of tests.
 
     Returns
     -------
@@ -696,7 +734,7 @@ def measure_bodies(
     """
     failures: list[tuple[str, ValueError]] = []
     coefficients = [
-        measure_coefficients(bodies, quantity, experiment, recording)
+        measure_coefficients(bodies, quantity, experiment, recording, tested=tested)
         for quantity in get_args(Quantity)
     ]
     found: list[tuple[FittedBody, Coefficient, Coefficient]] = []
@@ -715,12 +753,14 @@ def measure_bodies(
     tensors = measure_tensors(turning, "rotation", experiment.noise)
     predicted = [predicted_noise(body.motion) for body, *_ in found]
     # The offset of steps that contain another motion, or of a body that bends, is no noise.
-    tested = [k for k, (body, turn, _) in enumerate(found) if body.quality.rigid and turn.brownian]
+    brownian = [
+        k for k, (body, turn, _) in enumerate(found) if body.quality.rigid and turn.brownian
+    ]
     floors = noise_floor_tests(
-        [(found[k][0].motion, found[k][1].estimate, predicted[k]) for k in tested],
+        [(found[k][0].motion, found[k][1].estimate, predicted[k]) for k in brownian],
         stated=experiment.sigma is not None,
     )
-    floor = dict(zip(tested, floors, strict=True))
+    floor = dict(zip(brownian, floors, strict=True))
     results = [
         measured_body(
             *one, *tensors[k], noise=predicted[k], floor=floor.get(k, []), recording=recording
@@ -804,16 +844,19 @@ def measure_coefficients(
     quantity: Quantity,
     experiment: Experiment,
     recording: Recording,
+    *,
+    tested: int,
 ) -> list[Coefficient | DegenerateClusterError | TooFewFramesError]:
     """Estimate one coefficient of every body from the steps that Brownian motion can make.
 
     Parameters
     ----------
     bodies : sequence of FittedBody
-        They share the level of the test for a steady motion.
     quantity : {"rotation", "translation"}
     experiment : Experiment
     recording : Recording
+    tested : int
+        Number of bodies that share the level of the test for a steady motion.
 
     Returns
     -------
@@ -837,7 +880,7 @@ def measure_coefficients(
     given = [one for k, one in enumerate(estimates) if k in set(rest)]
     some = [one for one in given if not isinstance(one, TooFewFramesError)]
     jumps = find_jumps_of_each([paths[k] for k in rest], some)
-    tested: list[Coefficient] = []
+    moving: list[Coefficient] = []
     numbers: list[int] = []
     for k, estimate, own in zip(rest, some, jumps, strict=True):
         try:
@@ -847,10 +890,10 @@ def measure_coefficients(
         except (DegenerateClusterError, TooFewFramesError) as error:
             found[k] = error
             continue
-        tested.append(coefficient)
+        moving.append(coefficient)
         numbers.append(k)
-    level = _STEADY_LEVEL / len(bodies) if bodies else 0.0
-    for k, one in zip(numbers, with_step_tests(tested, noise, level=level), strict=True):
+    level = _STEADY_LEVEL / tested if tested else 0.0
+    for k, one in zip(numbers, with_step_tests(moving, noise, level=level), strict=True):
         found[k] = one
     return [one for one in found if one is not None]
 
