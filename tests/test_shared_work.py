@@ -1,7 +1,5 @@
 """Clusters of a table on several processes: the results of one, in the same order."""
 
-from functools import partial
-
 import numpy as np
 import pandas as pd
 import pytest
@@ -38,7 +36,7 @@ def tetrahedra(count, n_frames):
 
 def test_a_dask_cluster_gives_the_results_of_one_process(scheduler, monkeypatch):
     """Every number, remark and failure is the same to the last bit, in the same order."""
-    monkeypatch.setattr(measure, "batches_of", partial(batches_of, size=2))
+    monkeypatch.setattr(measure, "clusters_together", lambda count: 2)
     table = tetrahedra(6, 40)
     alone = perrin.analyze(table, dt=0.7)
     shared = perrin.analyze(table, dt=0.7, scheduler=scheduler)

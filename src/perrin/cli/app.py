@@ -4,14 +4,22 @@ from __future__ import annotations
 
 import os
 import re
+import sys
 from contextlib import ExitStack
+from io import TextIOWrapper
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from perrin.cli.config import config_text, write_config
-from perrin.cli.messages import claimed_output, messages_of, state_kept_frames
+from perrin._text import counted, printable
+from perrin.cli.messages import (
+    claimed_output,
+    escape,
+    messages_of,
+    state_kept_frames,
+    stop_in_order,
+)
 from perrin.cli.options import (
     BODY,
     INPUT,
@@ -64,6 +72,7 @@ from perrin.cli.options import (
     spheres_of,
 )
 from perrin.cli.progress import shown_progress
+from perrin.cli.study_commands import study_app
 from perrin.cli.tables import show_diagnosis, show_json, show_plan, show_prediction, show_report
 
 if TYPE_CHECKING:
@@ -80,13 +89,10 @@ app = typer.Typer(
     rich_markup_mode=None,
 )
 
+app.add_typer(study_app, name="study")
+
 # Default folder of the demo, and the files that it writes there, by which it is recognised.
 _DEMO_FOLDER = "perrin-demo"
-
-_DEMO_NOTE = (
-    "the planted D_R and D_T are those that Hunter et al. measured; they are below the prediction "
-    "for spheres of 2.45 um, as the sizes that follow from them are above it"
-)
 
 _DEMO_FILES = re.compile(
     r"summary\.json|run\.json|checksums\.json|run\.toml|report\.html|(?:curves|results|demo-tracks)\.csv"
@@ -97,6 +103,11 @@ _DEMO_FILES = re.compile(
 
 def main() -> None:
     """Run the command line; the entry point of ``perrin``."""
+    for stream in (sys.stdout, sys.stderr):
+        # A terminal without µ gets its code, not an error.
+        if isinstance(stream, TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
+    stop_in_order()
     app()
 
 
@@ -135,11 +146,14 @@ def demo(
     quiet: Quiet = False,
     overwrite: Overwrite = False,
 ) -> None:
-    """Analyse an embedded table: one simulated tetrahedron under the paper's conditions."""
+    """Analyse an embedded table: a simulated tetrahedron that diffuses as predicted."""
+    import shutil
+    import tempfile
     from dataclasses import replace
     from importlib.resources import as_file, files
 
     import perrin
+    from perrin.report.write import run_folder
     from perrin.run.experiment import Experiment
     from perrin.run.folders import check_place
 
@@ -150,23 +164,20 @@ def demo(
             check_demo_folder(place)
             overwrite = True
         check_place(place, overwrite=overwrite)
-        known = Experiment(dt=0.73, viscosity=2.18e-3, temperature=295.0, diameter=2.45)
-        report = perrin.analyze(path, experiment=known)
-        report = replace(
-            report,
-            settings=report.settings | {"made": "demo"},
-            notes=(*report.notes, _DEMO_NOTE),
-        )
-        perrin.write_run(report, place, overwrite=overwrite)
-        table = perrin.read_tracks(path)
-        perrin.write_tracks(table, place / "demo-tracks.csv")
-        stated = {"tracks": place / "demo-tracks.csv", **known.to_dict()}
-        text = config_text("analyze", stated, {"keep_jumps": "keep-jumps"})
-        (place / "run.toml").write_text(text, encoding="utf-8")
+        with tempfile.TemporaryDirectory(prefix="perrin-") as folder:
+            input_table = Path(folder) / "demo-tracks.csv"
+            perrin.write_tracks(perrin.read_tracks(path), input_table)
+            known = Experiment(dt=0.73, viscosity=2.18e-3, temperature=295.0, diameter=2.45)
+            report = perrin.analyze(input_table, experiment=known)
+            source = report.settings["input"] | {"path": str(place / input_table.name)}
+            report = replace(report, settings=report.settings | {"made": "demo", "input": source})
+            with run_folder(report, place, overwrite=overwrite) as stage:
+                shutil.copy(input_table, stage)
         show_run(report, place, demo, as_json=as_json, quiet=quiet)
         if not (as_json or quiet):
-            print("Planted in the simulation: D_R = 0.00493 rad^2/s, D_T = 0.0385 um^2/s.")
-            print(f"The input, as an example of a table: {place / 'demo-tracks.csv'}")
+            planted = "D_R = 0.006727 rad^2/s, D_T = 0.04535 um^2/s"
+            print(f"Planted in the simulation, as predicted: {planted}.")
+            print(printable(f"The input, as an example of a table: {place / 'demo-tracks.csv'}"))
 
 
 @app.command(
@@ -179,7 +190,6 @@ def demo(
     perrin analyze --config my-run/run.toml                           # once more""",
 )
 def analyze(
-    ctx: typer.Context,
     tracks: Tracks,
     dt: Interval,
     output: Output,
@@ -238,9 +248,7 @@ def analyze(
             scheduler=scheduler,
             progress=progress,
         )
-        progress(0, 0, "writing the report")
-        perrin.write_run(report, output, overwrite=overwrite)
-        write_config(output, ctx)
+        perrin.write_run(report, output, overwrite=overwrite, progress=progress)
     with messages_of(analyze):
         show_run(report, output, analyze, as_json=as_json, quiet=quiet)
 
@@ -252,7 +260,6 @@ def analyze(
     perrin run movie.lif --image 3 --diameter 1.8 --contact 2.0 --workers 8 -o my-run""",
 )
 def run(
-    ctx: typer.Context,
     stack: Annotated[
         Path, typer.Argument(help="Movie of stacks: TIFF, OME-TIFF, .lif, .nd2, .czi, .ims, .zarr.")
     ],
@@ -342,6 +349,12 @@ def run(
             rich_help_panel=SPHERES,
         ),
     ] = False,
+    border: Annotated[
+        bool,
+        typer.Option(
+            help="Whether spheres that the border cuts are located too.", rich_help_panel=SPHERES
+        ),
+    ] = True,
     minmass: Annotated[
         float | None,
         typer.Option(
@@ -361,8 +374,9 @@ def run(
         str | None,
         typer.Option(
             help="Image of a sphere, learned if left out: diameter,psf_z,psf (um), gain,floor "
-            "of the noise (variance of a voxel: gain times its intensity plus floor), and "
-            "share,tail_z,tail (um) of the second Gaussian of a point spread with a tail.",
+            "of the noise (variance of a voxel: gain times its intensity plus floor), "
+            "share,tail_z,tail (um) of the second Gaussian of a point spread with a tail, and the "
+            "relative spread of the diameters.",
             rich_help_panel=SPHERES,
         ),
     ] = None,
@@ -415,6 +429,7 @@ def run(
                 refine=read_refine(refine),
                 optics=read_optics(optics),
                 dark=dark,
+                border=border,
                 minmass=minmass,
                 percentile=percentile,
                 noise=read_noise(noise),
@@ -430,9 +445,7 @@ def run(
                 scheduler=scheduler,
                 progress=progress,
             )
-            progress(0, 0, "writing the report")
-            complete_run(report, output)
-            write_config(output, ctx)
+            complete_run(report, output, progress=progress)
         show_run(report, output, run, as_json=as_json, quiet=quiet)
 
 
@@ -516,7 +529,7 @@ def simulate(
         if output.name.lower().endswith((".gdf", ".napari.csv")):
             table = table.drop(columns="cluster")
         perrin.write_tracks(table, output)
-        print(f"{frames} frames of one {shape or positions} written to {output}")
+        print(printable(f"{frames} frames of one {shape or positions} written to {output}"))
 
 
 @app.command(
@@ -571,7 +584,7 @@ def predict(
             return
         show_prediction(body, name=shape or str(positions))
         if output is not None:
-            print(f"Written to {output}")
+            print(printable(f"Written to {output}"))
 
 
 @app.command(
@@ -649,14 +662,15 @@ def plan(
         else:
             show_plan(found)
         if output is not None:
+            from perrin.plot.figure_style import column_figure, style
             from perrin.plot.results import plot_plan
-            from perrin.plot.style import new_figure
 
-            figure = new_figure(7, 4.6)
-            plot_plan(found, ax=figure.add_subplot())
-            figure.savefig(output, dpi=150)
+            with style():
+                figure = column_figure(0.55)
+                plot_plan(found, ax=figure.add_subplot())
+                figure.savefig(output)
             if not as_json:
-                print(f"Written to {output}")
+                print(printable(f"Written to {output}"))
 
 
 @app.command(cls=GroupedCommand, epilog="perrin paper -o paper")
@@ -672,7 +686,6 @@ def paper(
 ) -> None:
     """Reproduce all figures, tables and claims of the paper (Hunter 2011)."""
     from rich.console import Console
-    from rich.markup import escape
 
     from perrin.paper.remake import reproduce
     from perrin.run.folders import check_place
@@ -745,8 +758,55 @@ def convert(
         table = table.drop(columns=dropped, errors="ignore")
         perrin.write_tracks(table, target)
         for note in notes:
-            print(f"note: {note}")
-        print(f"{len(table)} rows written to {target}")
+            print(printable(f"note: {note}"))
+        print(printable(f"{counted(len(table), 'row')} written to {target}"))
+
+
+@app.command(cls=GroupedCommand, epilog="perrin examples my-examples")
+def examples(
+    folder: Annotated[Path, typer.Argument(help="Folder for the copies.")] = Path(
+        "perrin-examples"
+    ),
+    overwrite: Annotated[
+        bool,
+        typer.Option("--overwrite", help="Replace files of these names.", rich_help_panel=OUTPUT),
+    ] = False,
+) -> None:
+    """Copy the scripts and notebooks of the tutorials into a folder."""
+    import shutil
+
+    with messages_of(examples):
+        found = example_files()
+        folder.mkdir(parents=True, exist_ok=True)
+        present = [path.name for path in found if (folder / path.name).exists()]
+        if present and not overwrite:
+            raise FileExistsError(
+                f"{folder} has {', '.join(present)}: choose another folder, or overwrite=True"
+            )
+        for path in found:
+            shutil.copyfile(path, folder / path.name)
+        print(f"{len(found)} examples copied to {folder}: {found[0].name} is the first")
+
+
+def example_files() -> list[Path]:
+    """Return the examples: in the package, or in the repository where this is not installed.
+
+    Raises
+    ------
+    FileNotFoundError
+        If the installation has none.
+
+    Examples
+    --------
+    >>> example_files()[0].name
+    '01_own_table.py'
+    """
+    package = Path(__file__).parents[1]
+    for folder in (package / "data" / "examples", package.parents[1] / "examples"):
+        found = sorted(path for path in folder.glob("[0-9]*") if path.suffix in (".py", ".ipynb"))
+        if found:
+            return found
+    raise FileNotFoundError("this installation has no examples: install perrin from a wheel")
 
 
 @app.command(cls=GroupedCommand, epilog="perrin doctor")

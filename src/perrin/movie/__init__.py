@@ -36,7 +36,6 @@ from perrin.movie.checks import (
     repeated_frames,
     ring_images,
     saturated_frames,
-    scan_blur,
     scanned_poses,
     slow_sampling,
     step_length,
@@ -54,6 +53,13 @@ from perrin.movie.colours import (
     kinds_of_clusters,
     one_of_each,
 )
+from perrin.movie.hidden import (
+    Hidden,
+    complete_bodies,
+    missing_places,
+    touching_places,
+    with_spheres,
+)
 from perrin.movie.parts import PartWriter, open_parts, read_parts
 from perrin.movie.stacks import Settings, analyze_stack, with_own_times
 from perrin.movie.stages import Located, fit_poses, learn_method, locate_frames, run_frames
@@ -63,6 +69,7 @@ __all__ = [
     "Change",
     "ChannelOffset",
     "Findings",
+    "Hidden",
     "Located",
     "PartWriter",
     "Settings",
@@ -76,6 +83,7 @@ __all__ = [
     "check_clusters",
     "clusters_near_border",
     "combined_verdicts",
+    "complete_bodies",
     "depth_change",
     "depth_dimming",
     "empty_frames",
@@ -95,6 +103,7 @@ __all__ = [
     "long_steps",
     "mean_pair_distance",
     "median_errors",
+    "missing_places",
     "missing_spheres",
     "one_of_each",
     "open_parts",
@@ -107,15 +116,16 @@ __all__ = [
     "ring_images",
     "run_frames",
     "saturated_frames",
-    "scan_blur",
     "scanned_poses",
     "slow_sampling",
     "stated_variances",
     "step_length",
+    "touching_places",
     "tracks_of",
     "unreadable_frames",
     "unrefined_spheres",
     "unsettled_poses",
     "with_own_times",
+    "with_spheres",
     "with_true_errors",
 ]

@@ -1,6 +1,6 @@
 """From a track table to a Report, and the folder that holds it."""
 
-from perrin.run.batches import InOrder, batches_of, shared_work
+from perrin.run.batches import InOrder, batches_of, clusters_together, shared_work
 from perrin.run.experiment import Experiment, Recording, argument_faults, merged_experiment
 from perrin.run.folders import (
     check_place,
@@ -10,7 +10,7 @@ from perrin.run.folders import (
     staged_folder,
 )
 from perrin.run.grouping import assign_clusters
-from perrin.run.kinds import part_of, shape_numbers, usual_symmetry
+from perrin.run.kinds import matched_particles, part_of, shape_numbers, usual_symmetry
 from perrin.run.layers import napari_layers, napari_reader, table_layers
 from perrin.run.lock import locked
 from perrin.run.measure import (
@@ -34,6 +34,7 @@ from perrin.run.measure import (
     measure_rod,
     measure_table,
     measure_tensors,
+    measure_together,
     measured_body,
     measured_shape,
     misfit_as_labelled,
@@ -108,6 +109,13 @@ from perrin.run.remarks import (
     with_jumps,
     wrapped_box_text,
 )
+from perrin.run.repetition import (
+    Repetition,
+    command_line,
+    config_text,
+    python_lines,
+    stated_arguments,
+)
 from perrin.run.result_table import coefficients_html, estimate_row, prediction_columns, tidy_table
 from perrin.run.results import (
     BodyKind,
@@ -144,6 +152,7 @@ __all__ = [
     "Recording",
     "Remark",
     "Remarks",
+    "Repetition",
     "Report",
     "RodResult",
     "Shape",
@@ -163,7 +172,9 @@ __all__ = [
     "check_resumable",
     "check_workers",
     "claimed_folder",
+    "clusters_together",
     "coefficients_html",
+    "command_line",
     "common_jump_warnings",
     "common_motion_remarks",
     "compare_axes",
@@ -172,6 +183,7 @@ __all__ = [
     "compare_value",
     "complete_recording",
     "condensed",
+    "config_text",
     "corrected_labels_text",
     "curve_table",
     "cut_text",
@@ -209,6 +221,7 @@ __all__ = [
     "load_run",
     "locked",
     "loose_particles_note",
+    "matched_particles",
     "measure_bodies",
     "measure_coefficients",
     "measure_free_spheres",
@@ -217,6 +230,7 @@ __all__ = [
     "measure_singles",
     "measure_table",
     "measure_tensors",
+    "measure_together",
     "measured_body",
     "measured_shape",
     "merged",
@@ -244,6 +258,7 @@ __all__ = [
     "pool_coefficients",
     "predicted_noise",
     "prediction_columns",
+    "python_lines",
     "read_table",
     "removed_drift_notes",
     "run_settings",
@@ -255,6 +270,7 @@ __all__ = [
     "sparse_frames_warnings",
     "stage_jump_warnings",
     "staged_folder",
+    "stated_arguments",
     "steady_motion_warning",
     "table_layers",
     "tidy_table",

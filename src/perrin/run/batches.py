@@ -18,10 +18,10 @@ if TYPE_CHECKING:
 S = TypeVar("S")
 T = TypeVar("T")
 
-# Clusters of a batch: enough that arrays of all of them cost less than the calls, few enough that
-# several processes share a small table. Results may depend on it in the last digits, and so it
-# does not depend on the number of processes.
-TOGETHER = 32
+# Clusters of a batch: a tenth of them, so that progress is seen and several processes share them,
+# not fewer than are efficient, nor more than bound the memory. Results may depend on it in the
+# last digits, and so it does not depend on the number of processes.
+_FEWEST_TOGETHER, _MOST_TOGETHER = 16, 256
 
 
 class InOrder(Protocol):
@@ -42,7 +42,18 @@ class _NumberedTask:
         return number, self.task(batch)
 
 
-def batches_of(items: Iterable[S], *, size: int = TOGETHER) -> Iterator[list[S]]:
+def clusters_together(count: int) -> int:
+    """Return how many of `count` clusters are a batch.
+
+    Examples
+    --------
+    >>> [clusters_together(count) for count in (5, 1000, 10_000)]
+    [16, 100, 256]
+    """
+    return min(max(-(-count // 10), _FEWEST_TOGETHER), _MOST_TOGETHER)
+
+
+def batches_of(items: Iterable[S], *, size: int) -> Iterator[list[S]]:
     """Yield the items in lists of one size, the last one perhaps shorter.
 
     Parameters

@@ -46,7 +46,7 @@ from perrin.motion.rigidity import Corrections, Quality, judge_each
 from perrin.motion.rods import RodMotion, track_direction
 from perrin.motion.tracking import track_each, track_scanned
 from perrin.run import remarks as words
-from perrin.run.batches import batches_of, shared_work
+from perrin.run.batches import batches_of, clusters_together, shared_work
 from perrin.run.experiment import Experiment, Recording
 from perrin.run.grouping import assign_clusters
 from perrin.run.kinds import shape_numbers, usual_symmetry
@@ -311,20 +311,17 @@ def measure_table(
         )
         if not experiment.keep_jumps:
             bodies = [replace(b, stage=stage.rows(b.tracks.frames)) for b in bodies]
-        if progress is not None:
-            progress(0, 0, "estimating D_R and D_T")
-        measure = partial(
-            measure_bodies, experiment=experiment, recording=recording, tested=len(bodies)
+        measured, failed = measure_bodies(
+            bodies, experiment, recording, in_order=in_order, progress=progress
         )
-        measured: list[MeasuredBody] = []
-        for part, failed in in_order(measure, batches_of(bodies)):
-            measured += part
-            failures += failed
+        failures += failed
     if failures and not (measured or rods):
         raise failures[-1][1]
     remarks += words.common_motion_remarks(
         common_motion([(m.translation.motion, m.body.tracks.frames) for m in measured])
     )
+    if progress is not None:
+        progress(0, 0, "judging the motion")
     measured, kinds, unpooled = measure_kinds(measured, rods, experiment, first_frame=first)
     pooled = [kind.pooled for kind in kinds if kind.pooled is not None]
     loose = None
@@ -410,15 +407,24 @@ def fit_clusters(
     in_order: InOrder,
     progress: Progress | None = None,
 ) -> tuple[list[FittedBody], list[RodResult], list[tuple[str, ValueError]]]:
-    """Fit every cluster of a table, batch by batch, as `fit_batch` does."""
+    """Fit every cluster of a table, batch by batch; particles on one line are measured as rods.
+
+    Returns
+    -------
+    bodies : list of FittedBody
+    rods : list of RodResult
+    failures : list of tuple
+        Names of the clusters that cannot be fitted, with the error.
+    """
     bodies: list[FittedBody] = []
     rods: list[RodResult] = []
     failures: list[tuple[str, ValueError]] = []
     count = table["cluster"][table["cluster"] >= 0].nunique()
     fit = partial(fit_batch, labels=labels, experiment=experiment, recording=recording)
+    batches = batches_of(each_cluster(table), size=clusters_together(count))
     if progress is not None:
         progress(0, count, "fitting clusters")
-    for more_bodies, more_rods, more_failures in in_order(fit, batches_of(each_cluster(table))):
+    for more_bodies, more_rods, more_failures in in_order(fit, batches):
         bodies += more_bodies
         rods += more_rods
         failures += more_failures
@@ -433,15 +439,7 @@ def fit_batch(
     experiment: Experiment,
     recording: Recording,
 ) -> tuple[list[FittedBody], list[RodResult], list[tuple[str, ValueError]]]:
-    """Fit some clusters, as `each_cluster` gives them; particles on one line are rods.
-
-    Returns
-    -------
-    bodies : list of FittedBody
-    rods : list of RodResult
-    failures : list of tuple
-        Names of the clusters that cannot be fitted, with the error.
-    """
+    """Fit some clusters, as `each_cluster` gives them, as `fit_clusters` does."""
     bodies: list[FittedBody] = []
     rods: list[RodResult] = []
     failures: list[tuple[str, ValueError]] = []
@@ -713,18 +711,58 @@ def measure_rod(tracks: ClusterTracks, experiment: Experiment, recording: Record
 
 
 def measure_bodies(
+    bodies: Sequence[FittedBody],
+    experiment: Experiment,
+    recording: Recording,
+    *,
+    in_order: InOrder,
+    progress: Progress | None = None,
+) -> tuple[list[MeasuredBody], list[tuple[str, ValueError]]]:
+    """Measure all bodies, batch by batch.
+
+    Parameters
+    ----------
+    bodies, experiment, recording
+        As in `measure_together`.
+    in_order : callable
+        As `shared_work` gives it.
+    progress : callable, optional
+        As in `measure_table`.
+
+    Returns
+    -------
+    measured : list of MeasuredBody
+    failures : list of tuple
+        As `measure_together`.
+    """
+    measured: list[MeasuredBody] = []
+    failures: list[tuple[str, ValueError]] = []
+    count = len(bodies)
+    measure = partial(measure_together, experiment=experiment, recording=recording, tested=count)
+    if progress is not None:
+        progress(0, count, "estimating D_R and D_T")
+    batches = batches_of(bodies, size=clusters_together(count))
+    for found, failed in in_order(measure, batches):
+        measured += found
+        failures += failed
+        if progress is not None:
+            done = len(measured) + len(failures)
+            progress(done, count, "estimating D_R and D_T")
+    return measured, failures
+
+
+def measure_together(
     bodies: Sequence[FittedBody], experiment: Experiment, recording: Recording, *, tested: int
 ) -> tuple[list[MeasuredBody], list[tuple[str, ValueError]]]:
-    """Estimate the coefficients and the tensors of bodies, and collect the remarks on them.
+    """Estimate the coefficients and the tensors of some bodies, and collect the remarks on them.
 
     Parameters
     ----------
     bodies : sequence of FittedBody
-        Some of the bodies of a table, or all.
     experiment : Experiment
     recording : Recording
     tested : int
-        Number of all bodies of the table, which share the levels of tests.
+        Number of bodies that share the level of the test for a steady motion.
 
     Returns
     -------
@@ -753,14 +791,12 @@ def measure_bodies(
     tensors = measure_tensors(turning, "rotation", experiment.noise)
     predicted = [predicted_noise(body.motion) for body, *_ in found]
     # The offset of steps that contain another motion, or of a body that bends, is no noise.
-    brownian = [
-        k for k, (body, turn, _) in enumerate(found) if body.quality.rigid and turn.brownian
-    ]
+    sound = [k for k, (body, turn, _) in enumerate(found) if body.quality.rigid and turn.brownian]
     floors = noise_floor_tests(
-        [(found[k][0].motion, found[k][1].estimate, predicted[k]) for k in brownian],
+        [(found[k][0].motion, found[k][1].estimate, predicted[k]) for k in sound],
         stated=experiment.sigma is not None,
     )
-    floor = dict(zip(brownian, floors, strict=True))
+    floor = dict(zip(sound, floors, strict=True))
     results = [
         measured_body(
             *one, *tensors[k], noise=predicted[k], floor=floor.get(k, []), recording=recording
@@ -880,7 +916,7 @@ def measure_coefficients(
     given = [one for k, one in enumerate(estimates) if k in set(rest)]
     some = [one for one in given if not isinstance(one, TooFewFramesError)]
     jumps = find_jumps_of_each([paths[k] for k in rest], some)
-    moving: list[Coefficient] = []
+    without_tests: list[Coefficient] = []
     numbers: list[int] = []
     for k, estimate, own in zip(rest, some, jumps, strict=True):
         try:
@@ -890,10 +926,10 @@ def measure_coefficients(
         except (DegenerateClusterError, TooFewFramesError) as error:
             found[k] = error
             continue
-        moving.append(coefficient)
+        without_tests.append(coefficient)
         numbers.append(k)
-    level = _STEADY_LEVEL / tested if tested else 0.0
-    for k, one in zip(numbers, with_step_tests(moving, noise, level=level), strict=True):
+    level = _STEADY_LEVEL / tested
+    for k, one in zip(numbers, with_step_tests(without_tests, noise, level=level), strict=True):
         found[k] = one
     return [one for one in found if one is not None]
 

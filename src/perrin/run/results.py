@@ -24,6 +24,7 @@ from perrin.motion.rigidity import Quality
 from perrin.motion.rods import RodMotion
 from perrin.run.folders import staged_folder
 from perrin.run.predictions import Prediction
+from perrin.run.repetition import config_text
 from perrin.run.result_table import (
     coefficients_html,
     estimate_row,
@@ -32,6 +33,7 @@ from perrin.run.result_table import (
 )
 from perrin.run.singles import SingleSpheres
 from perrin.run.verdicts import verdicts_from_dict, verdicts_to_dict
+from perrin.tracks.cells import guarded_table
 from perrin.tracks.checksums import CheckedFiles, refusing_damage, write_checksums
 from perrin.tracks.writing import write_json
 
@@ -721,13 +723,15 @@ def load_run(folder: str | os.PathLike[str]) -> Report:
 
 
 def write_data(report: Report, folder: Path) -> None:
-    """Write summary.json, results.csv, curves.csv, run.json and the tables, with checksums."""
+    """Write numbers, tables and settings of a report to a folder, with checksums."""
     write_json(folder / "summary.json", report.to_dict())
     write_json(folder / "run.json", report.settings)
+    dt = report.results[0].motion.dt if report.results else None
+    (folder / "run.toml").write_text(config_text(report.settings, dt=dt), encoding="utf-8")
     report.tracks.to_parquet(folder / "tracks.parquet", index=False)
     motion_table(report).to_parquet(folder / "motion.parquet", index=False)
     curve_table(report).to_csv(folder / "curves.csv", index=False)
-    report.to_frame().to_csv(folder / "results.csv", index=False)
+    guarded_table(report.to_frame()).to_csv(folder / "results.csv", index=False)
     if report.imaging is not None:
         write_imaging(report.imaging, folder)
     write_checksums(folder)
