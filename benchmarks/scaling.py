@@ -78,7 +78,7 @@ JOBS = {
     "frames: D_R, 5 % missing": (estimate_with_gaps, 2 ** np.arange(11, 17), 1.1),
     "frames: tensor, 5 % missing": (tensor_with_gaps, 2 ** np.arange(10, 15), 1.1),
     "particles: track_rotation": (rotation_fit_of_particles, 2 ** np.arange(4, 10), 1.1),
-    "clusters: analyze": (analysis_of_clusters, 2 ** np.arange(3, 7), 1.1),
+    "clusters: analyze": (analysis_of_clusters, 2 ** np.arange(3, 9), 1.1),
 }
 
 
