@@ -21,7 +21,7 @@ T = TypeVar("T")
 # Clusters of a batch: a tenth of them, so that progress is seen and several processes share them,
 # not fewer than are efficient, nor more than bound the memory. Results may depend on it in the
 # last digits, and so it does not depend on the number of processes.
-_FEWEST_TOGETHER, _MOST_TOGETHER = 16, 256
+_FEWEST_MEASURED, _MOST_MEASURED = 16, 256
 
 
 class InOrder(Protocol):
@@ -50,7 +50,7 @@ def clusters_together(count: int) -> int:
     >>> [clusters_together(count) for count in (5, 1000, 10_000)]
     [16, 100, 256]
     """
-    return min(max(-(-count // 10), _FEWEST_TOGETHER), _MOST_TOGETHER)
+    return min(max(-(-count // 10), _FEWEST_MEASURED), _MOST_MEASURED)
 
 
 def batches_of(items: Iterable[S], *, size: int) -> Iterator[list[S]]:

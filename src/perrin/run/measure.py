@@ -320,9 +320,9 @@ def measure_table(
     remarks += words.common_motion_remarks(
         common_motion([(m.translation.motion, m.body.tracks.frames) for m in measured])
     )
-    if progress is not None:
-        progress(0, 0, "judging the motion")
-    measured, kinds, unpooled = measure_kinds(measured, rods, experiment, first_frame=first)
+    measured, kinds, unpooled = measure_kinds(
+        measured, rods, experiment, first_frame=first, progress=progress
+    )
     pooled = [kind.pooled for kind in kinds if kind.pooled is not None]
     loose = None
     if singles is not None:
@@ -1065,6 +1065,7 @@ def measure_kinds(
     experiment: Experiment,
     *,
     first_frame: int,
+    progress: Progress | None = None,
 ) -> tuple[list[MeasuredBody], list[BodyKind], list[str]]:
     """Judge and pool the bodies of each number of particles and shape; those of others never.
 
@@ -1075,6 +1076,8 @@ def measure_kinds(
     experiment : Experiment
     first_frame : int
         The table's own number of its first frame.
+    progress : callable, optional
+        As in `measure_table`.
 
     Returns
     -------
@@ -1095,7 +1098,7 @@ def measure_kinds(
     for number in np.unique(shapes).tolist():
         members = [one for one, shape in zip(measured, shapes, strict=True) if shape == number]
         part, together = judge_bodies(
-            members, experiment, first_frame=first_frame, tested=len(measured)
+            members, experiment, first_frame=first_frame, tested=len(measured), progress=progress
         )
         pooled, texts = pool_clusters(part, experiment, together)
         judged += part
@@ -1126,7 +1129,12 @@ def measure_kinds(
 
 
 def judge_bodies(
-    measured: Sequence[MeasuredBody], experiment: Experiment, *, first_frame: int, tested: int
+    measured: Sequence[MeasuredBody],
+    experiment: Experiment,
+    *,
+    first_frame: int,
+    tested: int,
+    progress: Progress | None = None,
 ) -> tuple[list[MeasuredBody], dict[str, MotionVerdict | None]]:
     """Judge what kind of motion every body shows, and all rigid ones together.
 
@@ -1138,6 +1146,8 @@ def judge_bodies(
         The table's own number of its first frame.
     tested : int
         Number of clusters that share the level of a warning.
+    progress : callable, optional
+        As in `measure_table`.
 
     Returns
     -------
@@ -1152,6 +1162,8 @@ def judge_bodies(
         ("rotation", [one.rotation for one in measured]),
         ("translation", [one.translation for one in measured]),
     ):
+        if progress is not None:
+            progress(len(judged), 2, "judging the motion")
         shown = [i for i, c in enumerate(coefficients) if c.estimate.absent_because is None]
         each, common = judge_each_and_all(
             [coefficients[i].whole for i in shown],
