@@ -69,6 +69,8 @@ benchmarks: .venv/.test  ## the quick benchmarks: coverage of intervals, warning
 	$(BIN)/python benchmarks/alarms.py --quick --jobs 2
 	$(BIN)/python benchmarks/motion.py --quick --jobs 2
 	$(BIN)/python benchmarks/paper.py
+	$(BIN)/python benchmarks/study_coverage.py --quick
+	$(BIN)/python benchmarks/study.py --quick
 	$(BIN)/python benchmarks/structure.py
 	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/peers.py --quick
 
@@ -81,6 +83,8 @@ long: .venv/.test  ## the Monte-Carlo tests with all repeats, and 40 tables of e
 	$(BIN)/python benchmarks/motion_switching.py
 	$(BIN)/python benchmarks/motion_correlation.py
 	$(BIN)/python benchmarks/motion_dense.py
+	$(BIN)/python benchmarks/study_coverage.py
+	$(BIN)/python benchmarks/study.py
 
 lint: .venv/.test  ## ruff: rules and format
 	$(RUN) ruff check .
