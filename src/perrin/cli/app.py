@@ -14,10 +14,13 @@ import typer
 
 from perrin._text import counted, printable
 from perrin.cli.messages import (
+    STOPPED,
+    StoppedError,
     claimed_output,
     escape,
     messages_of,
     state_kept_frames,
+    status_of,
     stop_in_order,
 )
 from perrin.cli.options import (
@@ -108,7 +111,11 @@ def main() -> None:
         if isinstance(stream, TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
     stop_in_order()
-    app()
+    try:
+        app()
+    except StoppedError as stop:  # before the command itself began
+        print(STOPPED, file=sys.stderr)
+        sys.exit(status_of(stop))
 
 
 def _print_version(wanted: bool) -> None:
