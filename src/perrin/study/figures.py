@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from perrin._text import unit_text
-from perrin.plot.figure_style import GREY, new_figure, save_figure, series_color
+from perrin.plot.figure_style import GREY, new_figure, palette, save_figure, series_color
 from perrin.study.conditions import QUANTITIES, UNITS, condition_text
 from perrin.study.trends import law_values
 
@@ -38,6 +38,12 @@ def save_study_figures(result: StudyResult, folder: Path) -> list[Path]:
     """
     if not result.means:
         return []
+    with palette():
+        return _drawn(result, folder)
+
+
+def _drawn(result: StudyResult, folder: Path) -> list[Path]:
+    """Draw and write both figures."""
     figure = new_figure(4.2 * len(QUANTITIES), 3.8)
     axes = figure.subplots(1, len(QUANTITIES))
     for ax, quantity in zip(axes, QUANTITIES, strict=True):
