@@ -389,7 +389,7 @@ class _MovieRoot:
         return _MovieRoot(self.log_D, smoothed(self.log_likelihood[None], spread, step=step)[0])
 
     def places(self) -> Floats:
-        """Return ln D at the signed roots `_MOVIE_ROOTS`, by straight lines beyond the known ones."""
+        """Return ln D at the roots `_MOVIE_ROOTS`, by straight lines beyond the known ones."""
         row = self.log_likelihood
         i = min(max(int(np.argmax(row)), 1), row.size - 2)
         bend, slope = row[i - 1] - 2 * row[i] + row[i + 1], (row[i + 1] - row[i - 1]) / 2
