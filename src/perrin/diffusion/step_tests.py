@@ -633,7 +633,9 @@ def offset_gain_of_each(
     ]
     for rows in together(free):
         own = [estimates[k] for k in rows]
-        theta = np.array([_theta(free[k], e) for k, e in zip(rows, own, strict=True)])
+        theta = np.array(
+            [free[k].theta_at(e.value, e.offset) for k, e in zip(rows, own, strict=True)]
+        )
         # The estimate is the maximum of the likelihood with the noise left free.
         best = Likelihood.of([free[k] for k in rows]).apart()
         highest = best.sums(np.array([e.value for e in own]), theta).value
@@ -703,7 +705,7 @@ def _steady_motions_at(
         some, own = [tracks[k] for k in rows], [estimates[k] for k in rows]
         likelihood = Likelihood.of(some).apart()
         value = np.array([e.value for e in own])
-        theta = np.array([_theta(t, e) for t, e in zip(some, own, strict=True)])
+        theta = np.array([t.theta_at(e.value, e.offset) for t, e in zip(some, own, strict=True)])
         D = np.maximum(value, 1e-12 * likelihood.scale)
         means, informations = likelihood.steady_motion(D, theta)
         counts, d = np.array([len(t.steps.duration) for t in some]), means.shape[1]
@@ -790,7 +792,7 @@ def leave_one_out_residuals(
 
     diagonal, off_diagonal = covariance_bands(
         of_motion([e.value for e in estimates]),
-        of_motion([_theta(t, e) for t, e in zip(tracks, estimates, strict=True)]),
+        of_motion([t.theta_at(e.value, e.offset) for t, e in zip(tracks, estimates, strict=True)]),
         along_rows(np.stack([t.steps.duration for t in tracks])[..., None]),
         along_rows(linked[..., None]),
         blur=of_motion([t.blur for t in tracks]),
@@ -884,13 +886,6 @@ def _inverse_root(a: Floats, *, least: float = 0.0) -> Floats:
     moves = values > 1e-12 * np.maximum(values[..., -1:], 1e-300)
     root = np.sqrt(np.maximum(np.where(moves, values, 1.0), least))
     return np.asarray(axes * np.where(moves, 1 / root, 0.0)[..., None, :])
-
-
-def _theta(track: NoisySteps, estimate: DiffusionEstimate) -> float:
-    """Return the free part of the noise: the offset is theta + level - blur D."""
-    if np.isinf(track.freedom):
-        return 0.0
-    return max(estimate.offset - track.level + track.blur * estimate.value, 0.0)
 
 
 def _estimated_alike(

@@ -174,6 +174,10 @@ class NoisySteps:
     drift: bool = False
     steady: Floats = field(default_factory=lambda: np.zeros(0))
 
+    def theta_at(self, D: float, offset: float) -> float:
+        """Return the free part of the noise: the offset is theta + level - blur D."""
+        return 0.0 if np.isinf(self.freedom) else max(offset - self.level + self.blur * D, 0.0)
+
     @classmethod
     def of(cls, steps: Steps, noise: Noise) -> NoisySteps:
         """Return the steps with the noise that the options state; blur takes b D from it."""

@@ -53,7 +53,7 @@ if TYPE_CHECKING:
 _NOISELESS = 1e-8
 
 # About this many step components are evaluated at once; more do not stay in the processor's cache.
-_MOST_TENSORS_AT_ONCE = 30_000
+_MOST_TENSORS_AT_ONCE = 60_000
 
 _ISOTROPIC = np.eye(3)[None] / 3**0.5
 
