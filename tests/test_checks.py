@@ -334,28 +334,6 @@ def test_clusters_at_the_border_are_noted():
     assert "40 of 40 clusters (0, 1, 2, 3, 4, 5, 6, 7, 8, 9 and 30 more)" in text
 
 
-def coefficient(value, stderr=0.0):
-    """Return what a check asks of an estimate."""
-    return SimpleNamespace(value=value, stderr=stderr)
-
-
-def test_a_slow_scan_is_reported():
-    """Only where the time per plane is known and the cluster moves more than sigma meanwhile."""
-    still = motion(sigma=0.03)
-    ask = {"height": 0.25, "diameter": CONTACT}
-    text = checks.scan_blur(still, D_T=coefficient(0.04, 0.004), plane_time=0.73 / 64, **ask).text
-    planes = (2 * still.R + CONTACT) / 0.25
-    blur = np.sqrt(2 * 0.04 * planes * 0.73 / 64)
-    assert f"{planes:.0f} planes" in text
-    assert f"motion blur about {1e3 * blur:.0f} +- {50 * blur:.1g} nm > sigma" in text
-    assert checks.scan_blur(still, D_T=coefficient(0.04), plane_time=None, **ask) is None
-    assert checks.scan_blur(still, D_T=coefficient(0.04), plane_time=0.0, **ask) is None
-    assert checks.scan_blur(still, D_T=coefficient(0.04), plane_time=1e-5, **ask) is None
-    # A D_T that is hardly known shows no blur.
-    vague = coefficient(0.04, 0.04)
-    assert checks.scan_blur(still, D_T=vague, plane_time=0.73 / 64, **ask) is None
-
-
 def test_long_steps_are_reported_and_longer_ones_refused():
     """A quarter of the contact distance warns, a half refuses; both name a dt that is safe."""
     slow, quick, wild = motion(D_T=0.01), motion(D_T=0.15), motion(D_T=0.5)

@@ -24,6 +24,14 @@ from perrin.diffusion.decoupling import (
     prediction_errors,
     translation_rotation_correlation,
 )
+from perrin.diffusion.effective_modes import (
+    EffectiveModes,
+    FewModes,
+    NoiseProfile,
+    compress_steps,
+    moment_estimate,
+    ratio_node,
+)
 from perrin.diffusion.estimate import DiffusionEstimate, Found, bare_text, value_text
 from perrin.diffusion.estimators import (
     by_likelihood,
@@ -178,8 +186,11 @@ from perrin.diffusion.tensor_modes import (
     ChainTrack,
     DiagonalModes,
     EvenTracks,
+    FewDiagonalModes,
+    FewModesTrack,
     TensorSlopes,
     covariance_slopes,
+    information,
 )
 from perrin.diffusion.tensor_results import CoupledTensor, DiffusionTensor
 from perrin.diffusion.tensors import (
@@ -220,7 +231,11 @@ __all__ = [
     "DiagonalModes",
     "DiffusionEstimate",
     "DiffusionTensor",
+    "EffectiveModes",
     "EvenTracks",
+    "FewDiagonalModes",
+    "FewModes",
+    "FewModesTrack",
     "Found",
     "GridLags",
     "GroupSlopes",
@@ -233,6 +248,7 @@ __all__ = [
     "Moments",
     "MotionVerdict",
     "Noise",
+    "NoiseProfile",
     "NoisySteps",
     "NoisyVectors",
     "Parameter",
@@ -281,6 +297,7 @@ __all__ = [
     "center_steps",
     "clustering",
     "combined_p",
+    "compress_steps",
     "confined_autocovariance",
     "confined_mean_square",
     "coupled_tensor",
@@ -330,6 +347,7 @@ __all__ = [
     "holm",
     "identity_limits",
     "imposed_symmetry",
+    "information",
     "invariant_basis",
     "judge_motion",
     "judge_sampling",
@@ -342,6 +360,7 @@ __all__ = [
     "long_time_diffusion",
     "maximise",
     "maximise_each",
+    "moment_estimate",
     "motions_and_noise",
     "msd_covariance",
     "neighbour_products",
@@ -359,6 +378,7 @@ __all__ = [
     "prediction_errors",
     "principal_steps",
     "ratio_bend",
+    "ratio_node",
     "relaxation_faults",
     "residual_freedom",
     "root_parameters",

@@ -18,6 +18,7 @@ from perrin.images.formats.contents import (
     summed,
 )
 from perrin.images.formats.deltavision import deltavision
+from perrin.images.formats.directories import check_directories
 from perrin.images.formats.folders import name_counters, sequence, sequence_files
 from perrin.images.formats.headers import (
     HeaderScale,
@@ -33,6 +34,7 @@ from perrin.images.formats.headers import (
     stk_scale,
     tiff_kind,
 )
+from perrin.images.formats.isolation import guarded, serve
 from perrin.images.formats.olympus import olympus, olympus_scale
 from perrin.images.formats.tiff import (
     DeclaredSeries,
@@ -106,6 +108,7 @@ from perrin.images.optics.learn_radial import (
     first_image,
     held_out_misfit,
     learn_image,
+    log_likelihood,
     noise_of_neighbours,
     settled_image,
     size_spread,
@@ -116,6 +119,7 @@ from perrin.images.optics.radial_image import (
     Patch,
     PatchFit,
     RadialImage,
+    TransmissionNoise,
     cut_patch,
     fit_patch,
     spline_design,
@@ -230,6 +234,7 @@ __all__ = [
     "Spots",
     "Stack",
     "StackLike",
+    "TransmissionNoise",
     "UsualImage",
     "View",
     "Window",
@@ -241,6 +246,7 @@ __all__ = [
     "box_around",
     "brightness_parameters",
     "channel_index",
+    "check_directories",
     "check_search",
     "choose_method",
     "chosen",
@@ -281,6 +287,7 @@ __all__ = [
     "group_columns",
     "groups_and_crowds",
     "groups_to_fit",
+    "guarded",
     "hdf5",
     "header_scale",
     "held_out_misfit",
@@ -300,6 +307,7 @@ __all__ = [
     "leica_plane_time",
     "lif",
     "locate",
+    "log_likelihood",
     "lsm_scale",
     "mass_cut",
     "metaseries_scale",
@@ -338,6 +346,7 @@ __all__ = [
     "saturated_share",
     "sequence",
     "sequence_files",
+    "serve",
     "settled_image",
     "size_faults",
     "size_spread",

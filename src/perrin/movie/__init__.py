@@ -36,7 +36,6 @@ from perrin.movie.checks import (
     repeated_frames,
     ring_images,
     saturated_frames,
-    scan_blur,
     scanned_poses,
     slow_sampling,
     step_length,
@@ -54,16 +53,24 @@ from perrin.movie.colours import (
     kinds_of_clusters,
     one_of_each,
 )
+from perrin.movie.hidden import (
+    Hidden,
+    complete_bodies,
+    missing_places,
+    touching_places,
+    with_spheres,
+)
 from perrin.movie.parts import PartWriter, open_parts, read_parts
 from perrin.movie.stacks import Settings, analyze_stack, with_own_times
 from perrin.movie.stages import Located, fit_poses, learn_method, locate_frames, run_frames
-from perrin.movie.workers import Work, check_workers, work_through
+from perrin.movie.workers import Work, check_workers, dask_client, work_through
 
 __all__ = [
     "Bodies",
     "Change",
     "ChannelOffset",
     "Findings",
+    "Hidden",
     "Located",
     "PartWriter",
     "Settings",
@@ -79,6 +86,8 @@ __all__ = [
     "check_workers",
     "clusters_near_border",
     "combined_verdicts",
+    "complete_bodies",
+    "dask_client",
     "depth_change",
     "depth_dimming",
     "empty_frames",
@@ -98,6 +107,7 @@ __all__ = [
     "long_steps",
     "mean_pair_distance",
     "median_errors",
+    "missing_places",
     "missing_spheres",
     "one_of_each",
     "open_parts",
@@ -110,16 +120,17 @@ __all__ = [
     "ring_images",
     "run_frames",
     "saturated_frames",
-    "scan_blur",
     "scanned_poses",
     "slow_sampling",
     "stated_variances",
     "step_length",
+    "touching_places",
     "tracks_of",
     "unreadable_frames",
     "unrefined_spheres",
     "unsettled_poses",
     "with_own_times",
+    "with_spheres",
     "with_true_errors",
     "work_through",
 ]

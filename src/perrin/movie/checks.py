@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from perrin._arrays import Floats, Ints
-    from perrin.diffusion.estimate import DiffusionEstimate
     from perrin.motion.error_ratio import ErrorRatio
     from perrin.motion.rigid_motion import RigidMotion
     from perrin.run.results import BodyKind, ClusterResult
@@ -832,50 +831,6 @@ def partial_bodies(results: Sequence[ClusterResult], kinds: Sequence[BodyKind]) 
     )
 
 
-def scan_blur(
-    motion: RigidMotion,
-    *,
-    D_T: DiffusionEstimate,
-    plane_time: float | None,
-    height: float,
-    diameter: float,
-) -> Verdict | None:
-    """Warn if a cluster moves significantly while its planes are scanned.
-
-    Parameters
-    ----------
-    motion : RigidMotion
-    D_T : DiffusionEstimate
-        Translational diffusion coefficient, um^2/s.
-    plane_time : float or None
-        Time between planes, s.
-    height : float
-        Distance of planes, um.
-    diameter : float
-        Sphere diameter, um.
-    """
-    if not plane_time or motion.template.shape[1] != 3 or not D_T.value > 0:
-        return None
-    if motion.turn_noise is not None:  # every sphere has its own time
-        return None
-    planes = (2 * motion.R + diameter) / height
-    scan = planes * abs(plane_time)
-    blur, sigma = float(np.sqrt(2 * D_T.value * scan)), float(motion.sigma)
-    # The errors of a square root and of a standard deviation are half the relative one.
-    blur_error = blur * D_T.stderr / (2 * D_T.value)
-    n, freedom = len(motion.template), max(1, motion.fitted.size - 1)
-    sigma_error = sigma / np.sqrt(2 * max(1, 3 * n - 6) * freedom)
-    if not blur - sigma > _NORMAL_QUANTILE * np.hypot(blur_error, sigma_error):
-        return None
-    text = (
-        f"cluster scanned in {scan:.2g} s ({planes:.0f} planes of {abs(plane_time):.2g} s): motion "
-        f"blur about {1e3 * blur:.0f} +- {1e3 * blur_error:.1g} nm > sigma {1e3 * sigma:.0f} +- "
-        f"{1e3 * sigma_error:.1g} nm; positions are those of different times; scan faster or take "
-        "fewer planes"
-    )
-    return Verdict(text, blur / sigma if sigma > 0 else np.inf)
-
-
 def scanned_poses(motion: RigidMotion) -> Verdict | None:
     """Note that poses are those of spheres with their own times, and what the scan leaves in them.
 
@@ -1039,12 +994,7 @@ def fast_sampling(motion: RigidMotion, *, phi2: float) -> Verdict | None:
 
 
 def check_clusters(
-    results: Sequence[ClusterResult],
-    *,
-    contact: float,
-    plane_time: float | None,
-    height: float,
-    diameter: float,
+    results: Sequence[ClusterResult], *, contact: float
 ) -> tuple[tuple[ClusterResult, ...], Findings]:
     """Run the checks of steps, sampling and scan on every cluster.
 
@@ -1053,8 +1003,6 @@ def check_clusters(
     results : sequence of ClusterResult
     contact : float
         Centre distance of touching spheres, um.
-    plane_time, height, diameter
-        As in `scan_blur`.
 
     Returns
     -------
@@ -1067,9 +1015,6 @@ def check_clusters(
     alarms: tuple[Callable[[ClusterResult], Verdict | None], ...] = (
         lambda r: long_steps(r.motion, contact=contact),
         lambda r: slow_sampling(r.motion),
-        lambda r: scan_blur(
-            r.motion, D_T=r.D_T, plane_time=plane_time, height=height, diameter=diameter
-        ),
     )
     for check in alarms:
         for name, text in combined_verdicts({r.name: check(r) for r in results}).items():

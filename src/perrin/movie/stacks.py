@@ -36,6 +36,7 @@ from perrin.movie.colours import (
     joined_spots,
     kinds_of_clusters,
 )
+from perrin.movie.hidden import complete_bodies
 from perrin.movie.stages import Located, fit_poses, locate_frames
 from perrin.movie.workers import Work, check_workers
 from perrin.run.experiment import Experiment, MotionModel, Recording, merged_experiment
@@ -255,7 +256,10 @@ def analyze_stack(
         poses = _PoseFits(stacks, learned, bodies, contact, folder / _POSED, work)
         errors = median_errors(bodies.features, axes=bodies.axes)
         sources = [
-            {"path": one.source if one.path else None, "sha256": own["sha256"]}
+            {
+                "path": one.source if one.path or "://" in one.source else None,
+                "sha256": own["sha256"],
+            }
             for one, own in zip(stacks, depends, strict=True)
         ]
         run: _Run = {
@@ -501,9 +505,17 @@ class _PoseFits:
             return motions
         posed: dict[int, RigidMotion] = {}
         if len(self.stacks) == 1:
-            posed, findings = fit_poses(
+            whole, findings = complete_bodies(
                 self.stacks[0],
                 still,
+                optics=self.optics,
+                features=self.bodies.features,
+                contact=self.contact,
+            )
+            self.findings += findings
+            posed, findings = fit_poses(
+                self.stacks[0],
+                {c: (whole.get(c, motion), frames) for c, (motion, frames) in still.items()},
                 optics=self.optics,
                 features=self.bodies.features,
                 folder=self.folder,
@@ -561,13 +573,7 @@ def _with_checks(
         + checks.clusters_near_border(features, margin=bodies.margin, sizes=bodies.sizes)
         + findings
     )
-    clusters, of_several = checks.check_clusters(
-        report.clusters,
-        contact=contact,
-        plane_time=stack.plane_time,
-        height=imaging.voxel[0],
-        diameter=imaging.diameter,
-    )
+    clusters, of_several = checks.check_clusters(report.clusters, contact=contact)
     found += of_several + checks.partial_bodies(report.clusters, report.kinds)
     return replace(
         report,

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
     from perrin.images.imaging import Imaging
     from perrin.images.optics.optics import CameraNoise, Optics
+    from perrin.images.optics.radial_image import TransmissionNoise
     from perrin.run.results import Report
 
 
@@ -306,7 +307,7 @@ def _channel_facts(imaging: Imaging, optics: Optics) -> list[Fact]:
     ]
 
 
-def _gain_fact(noise: CameraNoise) -> Fact:
+def _gain_fact(noise: CameraNoise | TransmissionNoise) -> Fact:
     """Return the gain of the camera and the variance of a voxel."""
     gain, sign = number_text(noise.gain), "−" if noise.floor < 0 else "+"
     floor = number_text(abs(noise.floor))

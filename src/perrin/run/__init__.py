@@ -9,7 +9,7 @@ from perrin.run.folders import (
     staged_folder,
 )
 from perrin.run.grouping import assign_clusters
-from perrin.run.kinds import part_of, shape_numbers, usual_symmetry
+from perrin.run.kinds import matched_particles, part_of, shape_numbers, usual_symmetry
 from perrin.run.layers import napari_layers, napari_reader, table_layers
 from perrin.run.lock import locked
 from perrin.run.measure import (
@@ -200,6 +200,7 @@ __all__ = [
     "load_run",
     "locked",
     "loose_particles_note",
+    "matched_particles",
     "measure_bodies",
     "measure_coefficients",
     "measure_free_spheres",

@@ -96,17 +96,40 @@ def part_of(template: Floats, whole: Floats) -> bool:
     >>> part_of(triangle, tetrahedron), part_of(tetrahedron, triangle), part_of(2 * pair, triangle)
     (True, False, False)
     """
+    return bool(matched_particles(template, whole))
+
+
+def matched_particles(template: Floats, whole: Floats) -> list[tuple[int, ...]]:
+    """Return all ways in which the particles of a body have the distances of those of a larger one.
+
+    Parameters
+    ----------
+    template, whole
+        As in `part_of`.
+
+    Returns
+    -------
+    list of tuple of int
+        Particle of `whole` for each particle of `template`; empty for a body that is not smaller.
+
+    Examples
+    --------
+    >>> from perrin import Cluster
+    >>> triangle, tetrahedron = (Cluster.touching(n, 2.0).positions for n in (3, 4))
+    >>> len(matched_particles(triangle, tetrahedron)), matched_particles(tetrahedron, triangle)
+    (24, [])
+    """
     if len(template) >= len(whole):
-        return False
+        return []
     part, full = (np.linalg.norm(x[:, None] - x, axis=2) for x in (template, whole))
     bound = _SAME_SHAPE * float(pair_distances(template).min())
     # Particles are placed one by one where the distances to those before agree.
-    partial: list[list[int]] = [[]]
+    partial: list[tuple[int, ...]] = [()]
     for k in range(len(part)):
         partial = [
-            [*chosen, j]
+            (*chosen, j)
             for chosen in partial
             for j in range(len(full))
-            if j not in chosen and np.all(np.abs(full[j, chosen] - part[k, :k]) < bound)
+            if j not in chosen and np.all(np.abs(full[j, list(chosen)] - part[k, :k]) < bound)
         ]
-    return bool(partial)
+    return partial

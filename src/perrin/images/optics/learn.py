@@ -474,7 +474,8 @@ class GroupSample(NamedTuple):
         score = weighted @ residual - taken.T @ left_over
         left, expected = np.zeros((2, *window.mask.shape))
         left[window.mask], expected[window.mask] = residual, fit.expected
-        level, variance = neighbour_variance(left, expected, window.mask, image=image)
+        axis = _most_blurred_axis(image, left.shape)
+        level, variance = neighbour_variance(left, expected, window.mask, axis=axis)
         return SampleFit(
             fit.centers,
             information,
@@ -555,7 +556,8 @@ class CrowdSample(NamedTuple):
         information, score = profile_information(window, state, slope)
         residual = window.data - state.expected
         used = window.mask
-        level, variance = neighbour_variance(residual, state.expected, used, image=variations.image)
+        axis = _most_blurred_axis(variations.image, used.shape)
+        level, variance = neighbour_variance(residual, state.expected, used, axis=axis)
         equal = np.zeros(len(state.centers))
         return SampleFit(
             state.centers,
@@ -572,48 +574,43 @@ class CrowdSample(NamedTuple):
 
 
 def neighbour_variance(
-    residual: Floats, expected: Floats, used: Bools, *, image: SphereImage
+    residual: Floats, expected: Floats, used: Bools, *, axis: int
 ) -> tuple[Floats, Floats]:
-    """Estimate the variance of voxels from the differences of neighbours.
+    """Estimate the variance of voxels or pixels from the differences of neighbours.
 
     Parameters
     ----------
-    residual, expected : ndarray, shape (nz, ny, nx)
+    residual, expected : ndarray, shape (nz, ny, nx) or (ny, nx)
         Grey levels minus expected grey levels, and expected grey levels.
-    used : ndarray of bool, shape (nz, ny, nx)
+    used : ndarray of bool, shape (nz, ny, nx) or (ny, nx)
         The voxels that are used.
-    image : SphereImage
-        The image of a sphere, whose blur chooses the axis.
+    axis : int
+        The axis along which they are neighbours.
 
     Returns
     -------
     expected : ndarray, shape (m,)
-        Expected grey level of every four neighbours along one axis.
+        Expected grey level of every four neighbours along the axis.
     variance : ndarray, shape (m,)
         Their squared third differences over 20, the sum of squares of the factors 1, 3, 3, 1.
 
     Notes
     -----
-    The axis is the one along which the blur covers most voxels. An error of the model of the image
-    is blurred too, so that its third differences are small: with a blur of b voxels they have
-    15 / (2 b^2)^3 / 20 of the error's variance (the sixth moment of its Gaussian spectrum), 1 % for
-    b = 1.5. Noise that is constant along the axis does not contribute.
+    An error of the model of the image is blurred as the image is, so that its third differences
+    are small: with a blur of b voxels they have 15 / (2 b^2)^3 / 20 of the error's variance (the
+    sixth moment of its Gaussian spectrum), 1 % for b = 1.5. Noise that is constant along the axis
+    does not contribute.
 
     Examples
     --------
-    >>> from perrin.images import sphere_image
-    >>> image = sphere_image(diameter=2.0, psf=(0.4, 0.15), voxel=(0.25, 0.2, 0.2))
     >>> noise = np.random.default_rng(1).normal(0.0, 3.0, (20, 30, 30))
     >>> misfit = 5 * np.cos(np.arange(20) / 3)[:, None, None]
     >>> used, level = np.ones(noise.shape, dtype=bool), np.full(noise.shape, 7.0)
-    >>> expected, variance = neighbour_variance(noise + misfit, level, used, image=image)
+    >>> expected, variance = neighbour_variance(noise + misfit, level, used, axis=0)
     >>> expected.mean().round(), variance.mean().round(1), (noise + misfit).var().round(1)
     (np.float64(7.0), np.float64(8.9), np.float64(22.1))
     """
-    blur = np.array([image.blur[0], image.blur[1], image.blur[1]]) / image.voxel
-    long_enough = np.array(used.shape) >= len(_NEIGHBOURS)
-    axis = int(np.argmax(np.where(long_enough, blur, -1.0)))
-    if not long_enough[axis]:
+    if used.shape[axis] < len(_NEIGHBOURS):
         return np.empty(0), np.empty(0)
     quads = (
         np.lib.stride_tricks.sliding_window_view(field, len(_NEIGHBOURS), axis=axis)
@@ -624,6 +621,12 @@ def neighbour_variance(
     share = _NEIGHBOURS**2 / np.sum(_NEIGHBOURS**2)
     square = (difference @ _NEIGHBOURS)[kept] ** 2 / np.sum(_NEIGHBOURS**2)
     return (level @ share)[kept], square
+
+
+def _most_blurred_axis(image: SphereImage, shape: tuple[int, ...]) -> int:
+    """Return the axis along which the blur covers most voxels, of those with four neighbours."""
+    blur = np.array([image.blur[0], image.blur[1], image.blur[1]]) / image.voxel
+    return int(np.argmax(np.where(np.array(shape) >= len(_NEIGHBOURS), blur, -1.0)))
 
 
 class _Settled(NamedTuple):

@@ -8,12 +8,13 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from perrin.errors import NoSpheresError
-from perrin.images.optics.learn import photon_transfer
+from perrin.images.optics.learn import neighbour_variance, photon_transfer
 from perrin.images.optics.optics import CameraNoise
 from perrin.images.optics.radial_image import (
     Patch,
     PatchFit,
     RadialImage,
+    TransmissionNoise,
     cut_patch,
     fit_patch,
     spline_design,
@@ -21,8 +22,11 @@ from perrin.images.optics.radial_image import (
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+    from typing import TypeAlias
 
     from perrin._arrays import Floats
+
+    PixelNoise: TypeAlias = CameraNoise | TransmissionNoise
 
 
 # Distances of the knots and ends of the image that are tried, in contact distances.
@@ -107,8 +111,10 @@ def _brightness_error(fit: PatchFit) -> Floats:
     return np.asarray(np.sqrt(np.maximum(np.diag(fit.covariance)[2 * n : 3 * n], 1e-300)))
 
 
-def noise_of_neighbours(patches: Sequence[Patch], fits: Sequence[PatchFit]) -> CameraNoise:
-    """Return the camera's noise from the differences of neighbouring pixels.
+def noise_of_neighbours(
+    patches: Sequence[Patch], fits: Sequence[PatchFit], noise: PixelNoise
+) -> PixelNoise:
+    """Return the camera's noise from the differences of neighbouring pixels (`neighbour_variance`).
 
     The residuals of a wrong image vary slowly, so that their differences show the noise alone, and
     chi-squared shows the wrong image.
@@ -117,22 +123,43 @@ def noise_of_neighbours(patches: Sequence[Patch], fits: Sequence[PatchFit]) -> C
     ----------
     patches : sequence of Patch
     fits : sequence of PatchFit
+    noise : CameraNoise or TransmissionNoise
+        The noise of the fits.
 
     Returns
     -------
-    CameraNoise
+    CameraNoise or TransmissionNoise
+        Of the kind of `noise`.
     """
-    means, squares = [], []
+    levels, variances = [], []
     for patch, fit in zip(patches, fits, strict=True):
-        residual = patch.data - fit.expected
-        beside = (np.diff(patch.pixel[0]) == 0) & (np.diff(patch.pixel[1]) == 1)
-        means.append(((fit.expected[1:] + fit.expected[:-1]) / 2)[beside])
-        squares.append((np.diff(residual) ** 2 / 2)[beside])
-    return photon_transfer(np.concatenate(means), np.concatenate(squares))
+        place = tuple(patch.pixel - patch.pixel.min(axis=1, keepdims=True))
+        residual, expected = np.zeros((2, *(patch.pixel.max(axis=1) - patch.pixel.min(axis=1) + 1)))
+        used = np.zeros(residual.shape, dtype=np.bool_)
+        residual[place], expected[place], used[place] = (
+            patch.data - fit.expected,
+            fit.expected,
+            True,
+        )
+        level, variance = neighbour_variance(residual, expected, used, axis=1)
+        levels.append(level)
+        variances.append(variance)
+    mean, square = np.concatenate(levels), np.concatenate(variances)
+    if isinstance(noise, TransmissionNoise):
+        grey = noise.grey(mean)
+        return TransmissionNoise(
+            *photon_transfer(grey, square * (grey / noise.level) ** 2), noise.level
+        )
+    return photon_transfer(mean, square)
 
 
 def first_image(
-    samples: Sequence[RadialSample], *, spacing: float, reach: float, pixel: tuple[float, float]
+    samples: Sequence[RadialSample],
+    *,
+    spacing: float,
+    reach: float,
+    pixel: tuple[float, float],
+    level: float | None = None,
 ) -> RadialImage:
     """Return the image of least squares for spheres of equal brightness at their first positions.
 
@@ -143,6 +170,8 @@ def first_image(
         Distance of the knots, and about the end of the image, um.
     pixel : tuple of float
         Pixel size (y, x), um.
+    level : float, optional
+        Where the frames of the samples are logarithms, that of `TransmissionNoise`.
 
     Returns
     -------
@@ -164,6 +193,8 @@ def first_image(
     ridge = 1e-4 * np.trace(information) / k * bend.T @ bend
     coefficients = np.linalg.solve(information + ridge, score)
     mean = square / max(count, 1)
+    if level is not None:
+        return RadialImage(spacing, coefficients, TransmissionNoise(0.0, mean, level))
     return RadialImage(spacing, coefficients, CameraNoise(0.0, mean))
 
 
@@ -205,7 +236,7 @@ def settled_image(
         if sum(len(p.data) for p in patches) < _PIXELS_PER_COEFFICIENT * len(image.coefficients):
             return image, samples, np.inf
         fits = [fit_patch(p, image, s.centers) for p, s in zip(patches, samples, strict=True)]
-        noise = noise_of_neighbours(patches, fits)
+        noise = noise_of_neighbours(patches, fits, image.noise)
         parts = [_equations(p, f, image) for p, f in zip(patches, fits, strict=True)]
         information = np.sum([e.information for e in parts], axis=0)
         score = np.sum([e.score for e in parts], axis=0)
@@ -234,7 +265,7 @@ def held_out_misfit(
     *,
     reach: float,
     pixel: tuple[float, float],
-    noise: CameraNoise,
+    noise: PixelNoise,
 ) -> Floats:
     """Return chi-squared of each sample that an image was not learned from, within a reach.
 
@@ -246,7 +277,7 @@ def held_out_misfit(
         Distance from the spheres of the pixels that are compared, um.
     pixel : tuple of float
         Pixel size (y, x), um.
-    noise : CameraNoise
+    noise : CameraNoise or TransmissionNoise
         The noise, the same for all images that are compared.
 
     Returns
@@ -277,7 +308,11 @@ def _simplest_of_best(tried: dict[tuple[float, float], Floats]) -> tuple[float, 
 
 
 def learn_image(
-    samples: Sequence[RadialSample], *, contact: float, pixel: tuple[float, float]
+    samples: Sequence[RadialSample],
+    *,
+    contact: float,
+    pixel: tuple[float, float],
+    level: float | None = None,
 ) -> tuple[RadialImage, list[RadialSample]]:
     """Learn the image of a sphere; knots and end are those that predict other spheres best.
 
@@ -289,6 +324,8 @@ def learn_image(
         Centre distance of touching spheres, um.
     pixel : tuple of float
         Pixel size (y, x), um.
+    level : float, optional
+        As in `first_image`.
 
     Returns
     -------
@@ -319,7 +356,7 @@ def learn_image(
             if pair in tried or pair in failed:
                 continue
             spacing, reach = max(pair[0] * contact, least), pair[1] * contact
-            image = first_image(halves[0], spacing=spacing, reach=reach, pixel=pixel)
+            image = first_image(halves[0], spacing=spacing, reach=reach, pixel=pixel, level=level)
             image, fitted, step = settled_image(halves[0], image, pixel=pixel)
             failed.add(pair)
             if step < _UNSETTLED:
@@ -334,7 +371,7 @@ def learn_image(
     spacing, reach = max(chosen[0] * contact, least), chosen[1] * contact
     step = np.inf
     if samples and (tried or not halves[1]):
-        image = first_image(samples, spacing=spacing, reach=reach, pixel=pixel)
+        image = first_image(samples, spacing=spacing, reach=reach, pixel=pixel, level=level)
         image, samples, step = settled_image(samples, image, pixel=pixel)
     if not step < _UNSETTLED:
         raise NoSpheresError(
@@ -343,6 +380,42 @@ def learn_image(
             "image of one size, and is contact right? refine=None finds filtered centroids"
         )
     return image, samples
+
+
+def log_likelihood(
+    samples: Sequence[RadialSample],
+    image: RadialImage,
+    *,
+    reach: float,
+    pixel: tuple[float, float],
+) -> tuple[float, float]:
+    """Return the logarithm of the likelihood of grey levels, and chi-squared per degree of freedom.
+
+    Parameters
+    ----------
+    samples : sequence of RadialSample
+    image : RadialImage
+    reach : float
+        Distance from the spheres of the pixels that count, um.
+    pixel : tuple of float
+        Pixel size (y, x), um.
+
+    Returns
+    -------
+    likelihood, chi2 : float
+        Up to a constant that is the same for images of grey levels and of their logarithms.
+    """
+    total, square, freedom = 0.0, 0.0, 0
+    for sample in samples:
+        patch = sample.patch(reach, reach, pixel)
+        fit = fit_patch(patch, image, sample.centers)
+        own = fit.weight * (patch.data - fit.expected) ** 2
+        total += 0.5 * float(np.sum(np.log(fit.weight) - own))
+        if isinstance(image.noise, TransmissionNoise):
+            # A change of the grey level is that of its logarithm times level / grey.
+            total -= float(np.sum(patch.data)) / image.noise.level
+        square, freedom = square + float(own.sum()), freedom + max(len(own) - len(fit.jacobian), 1)
+    return total, square / max(freedom, 1)
 
 
 def size_spread(

@@ -39,8 +39,58 @@ _SMALL_DAMPING, _MOST_DAMPING = 0.1, 1e8
 # Least number of pixels for each fitted parameter.
 _PIXELS_PER_PARAMETER = 4
 
+# Least transmission that a logarithm is taken of.
+_LEAST_TRANSMISSION = 0.01
+
 # Parameters of the background: a level and its slope along y and x.
 _N_LOCAL_BACKGROUND = 3
+
+
+class TransmissionNoise(NamedTuple):
+    """Noise of the logarithm of grey levels: of images whose transmissions multiply.
+
+    A sphere lets a share of the light through, so that behind two spheres the shares multiply: in
+    the logarithm ``level * log(grey / level)`` their images add. A grey level g has the variance
+    gain g + floor, its logarithm (level / g)^2 of it.
+
+    Attributes
+    ----------
+    gain : float
+        Grey levels per photon.
+    floor : float
+        Variance of a pixel whose expected value is 0, squared grey levels.
+    level : float
+        Grey level at which the logarithm is 0 and has the slope 1.
+
+    Examples
+    --------
+    >>> noise = TransmissionNoise(3.0, 4.0, 100.0)
+    >>> logarithm = noise.logarithm(np.array([50.0, 100.0]))
+    >>> noise.grey(logarithm), noise.weight(logarithm).round(5)
+    (array([ 50., 100.]), array([0.00162, 0.00329]))
+    """
+
+    gain: float
+    floor: float
+    level: float
+
+    def logarithm(self, grey: Floats) -> Floats:
+        """Return level log(grey / level); grey levels below a hundredth of the level count as it.
+
+        The logarithm of a noisy grey level is on average below that of its mean by half its
+        relative variance, far below the noise unless there are only a few photons.
+        """
+        least = _LEAST_TRANSMISSION * self.level
+        return np.asarray(self.level * np.log(np.maximum(grey, least) / self.level))
+
+    def grey(self, logarithm: Floats) -> Floats:
+        """Return the grey levels of logarithms."""
+        return np.asarray(self.level * np.exp(logarithm / self.level))
+
+    def weight(self, expected: Floats) -> Floats:
+        """Return the inverse variance of pixels with these expected logarithms."""
+        grey = self.grey(expected)
+        return CameraNoise(self.gain, self.floor).weight(grey) * (grey / self.level) ** 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,8 +106,9 @@ class RadialImage:
     coefficients : ndarray, shape (k,)
         Coefficients of the B-splines that are centred at 0, 1, ... k - 1 times the spacing, grey
         levels.
-    noise : CameraNoise
-        Variance of a pixel.
+    noise : CameraNoise or TransmissionNoise
+        Variance of a pixel. With `TransmissionNoise` the image is that of the logarithm of the
+        grey levels: the transmissions of spheres multiply.
 
     Examples
     --------
@@ -68,7 +119,7 @@ class RadialImage:
 
     spacing: float
     coefficients: Floats
-    noise: CameraNoise
+    noise: CameraNoise | TransmissionNoise
 
     def __post_init__(self) -> None:
         """Make the array read-only."""
@@ -104,7 +155,7 @@ class RadialImage:
         return pieces[:, knot], part
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the image as values that JSON holds; `noise` is the list [gain, floor]."""
+        """Return values that JSON holds; `noise` is [gain, floor], or [gain, floor, level]."""
         return {
             "spacing": to_plain(self.spacing),
             "coefficients": to_plain(self.coefficients),
@@ -124,8 +175,15 @@ class RadialImage:
         -------
         RadialImage
         """
-        noise = CameraNoise(*entry["noise"])
+        values = entry["noise"]
+        noise = TransmissionNoise(*values) if len(values) == 3 else CameraNoise(*values)
         return cls(entry["spacing"], from_plain(entry["coefficients"]), noise)
+
+    def seen_in(self, frame: Floats) -> Floats:
+        """Return what the images of spheres add to: grey levels, or their logarithms."""
+        if isinstance(self.noise, TransmissionNoise):
+            return self.noise.logarithm(frame)
+        return frame
 
 
 def _in_knots(distance: Floats, spacing: float, k: int) -> tuple[Ints, Floats]:

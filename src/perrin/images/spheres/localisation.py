@@ -76,6 +76,9 @@ _LARGEST_GROUP = 40
 # Largest number of spots of a group that is fitted with spheres that were not found.
 _LARGEST_CUT_GROUP = 8
 
+# Largest number of touching spheres that trackpy's least squares fit at once, in seconds.
+_MOST_BY_TRACKPY = 16
+
 # Number of spheres in a piece of a crowd.
 _PIECE_SPHERES = 30
 
@@ -303,10 +306,11 @@ class Method:
             )
             columns = without_doubles(columns, contact=self.search.contact)
         else:
-            centers = found.centers
+            centers = found.centers.copy()
             if self.refine == "trackpy":
                 lengths = {"diameter": self.search.diameter, "contact": self.search.contact}
-                centers = refine_by_trackpy(frame, centers, voxel=voxel, **lengths)
+                few, _ = _trackpy_groups(centers, contact=self.search.contact)
+                centers[few] = refine_by_trackpy(frame, centers[few], voxel=voxel, **lengths)
             columns = _axis_columns(centers) | {"mass": found.mass}
             if np.isnan(voxel[0]):
                 del columns["z"]
@@ -402,9 +406,13 @@ def choose_method(
         if fading is not None:
             masses = [m.spots.mass / fading.at(m.number, m.spots.centers) for m in sample]
         search = replace(search, minmass=mass_cut(np.concatenate([np.empty(0), *masses])))
+    method = Method(search, refine, optics if refine == "model" else None, fading)
+    if refine == "trackpy":
+        _refuse_trackpy_in_crowds(
+            [method.spheres(s.spots, s.number).centers for s in sample], contact=search.contact
+        )
     if refine != "model":
-        return Method(search, refine, None, fading)
-    method = Method(search, refine, optics, fading)
+        return method
     if optics is None:
         in_crowds = in_groups = 0
         for sampled in sample:
@@ -417,6 +425,27 @@ def choose_method(
             learned = fit_optics(sample, method, voxel=_voxel_size(stack))
             return replace(method, optics=learned.optics, usual=learned.usual)
     return method
+
+
+def _trackpy_groups(centers: Floats, *, contact: float) -> tuple[Ints, int]:
+    """Return the spheres in chains that trackpy's fit can solve, and the longest chain of all."""
+    groups = touching_together(centers, contact=contact)
+    few = [group for group in groups if len(group) <= _MOST_BY_TRACKPY]
+    rows = np.sort(np.concatenate([np.empty(0, dtype=np.int64), *few]))
+    return rows, max(map(len, groups), default=0)
+
+
+def _refuse_trackpy_in_crowds(places: Sequence[Floats], *, contact: float) -> None:
+    """Raise an error if most spheres of some frames are in groups too large for trackpy."""
+    groups = [_trackpy_groups(x, contact=contact) for x in places]
+    most = sum(len(few) for few, _ in groups) > sum(map(len, places)) / 2
+    if not most and any(map(len, places)):
+        raise ValueError(
+            f'refine="trackpy" fits all spheres that touch at once: chains of up to '
+            f"{max(largest for _, largest in groups)} in this movie, over its limit of "
+            f'{_MOST_BY_TRACKPY}, as its time grows with their cube; refine="model" is '
+            "made for them, None keeps the positions found first"
+        )
 
 
 def locate(
@@ -443,7 +472,8 @@ def locate(
         Centre distance of touching spheres, um. Spheres within 1.3 times that are fitted together.
     refine : {"model", "trackpy", None}
         "model" fits the ball blurred by the optics, in a 2-D movie the radial image that is learned
-        from it (see the notes); "trackpy" uses its least-squares fit of discs;
+        from it (see the notes); "trackpy" uses its least-squares fit of discs (of up to 16
+        touching spheres; larger groups keep the positions found first, a crowd is refused);
         None keeps the filtered centroid, whose error is a tenth of the contact distance where
         spheres touch.
     optics : Optics, optional

@@ -8,15 +8,16 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from perrin.errors import PrecisionWarning
+from perrin.errors import NoSpheresError, PrecisionWarning
 from perrin.images.optics.learn_radial import (
     LEAST_BRIGHTNESS,
     RadialSample,
     first_image,
     learn_image,
+    log_likelihood,
     size_spread,
 )
-from perrin.images.optics.radial_image import Patch, cut_patch, fit_patch
+from perrin.images.optics.radial_image import Patch, TransmissionNoise, cut_patch, fit_patch
 from perrin.images.spheres.spots import touching_together
 
 if TYPE_CHECKING:
@@ -49,6 +50,10 @@ _LEFT_PLACE, _SAME = 0.3, 0.6
 # Spread of the sizes of the images, from which they are not those of equal spheres in a plane, and
 # distance of the knots for its measurement, in contact distances.
 _SIZE_SPREAD, _SIZE_KNOTS = 0.06, 0.12
+
+# Chi-squared per degree of freedom above which images that multiply are tried, and the distance
+# from the spheres of the pixels that are compared, in contact distances.
+_MISFIT, _COMPARED_REACH = 1.03, 1.0
 
 # Reasons for which a sphere is not refined.
 _NO_IMAGE, _AWAY, _UNSETTLED_PLACE, _NO_PIXELS = (
@@ -135,13 +140,14 @@ def learn_plane(
     most = _LEARNING_PLANAR_GROUPS * (2 if contact < _SMALL_SPHERES * min(pixel) else 1)
     chosen = np.unique(np.linspace(0, len(samples) - 1, most).round().astype(int))
     samples = [samples[k] for k in chosen] if samples else []
-    image, samples = learn_image(samples, contact=contact, pixel=pixel)
+    image, samples = _likelier_image(samples, contact=contact, pixel=pixel)
     # Fine knots can follow steps of several sizes, so that no size alone would fit better.
     coarse = first_image(
         samples,
         spacing=max(image.spacing, _SIZE_KNOTS * contact),
         reach=image.reach,
         pixel=pixel,
+        level=image.noise.level if isinstance(image.noise, TransmissionNoise) else None,
     )
     spread, error = size_spread(samples, replace(coarse, noise=image.noise), pixel=pixel)
     if spread - 2.5 * error > _SIZE_SPREAD:
@@ -154,6 +160,31 @@ def learn_plane(
             stacklevel=4,
         )
     return image
+
+
+def _likelier_image(
+    samples: Sequence[RadialSample], *, contact: float, pixel: tuple[float, float]
+) -> tuple[RadialImage, list[RadialSample]]:
+    """Return the image under which the samples are likelier: of grey levels, or of logarithms.
+
+    Images of fluorescent spheres add, their transmissions in bright field multiply. Logarithms are
+    tried where images that add leave residuals.
+    """
+    image, fitted = learn_image(samples, contact=contact, pixel=pixel)
+    reach = _COMPARED_REACH * contact
+    likelihood, chi2 = log_likelihood(fitted, image, reach=reach, pixel=pixel)
+    levels = np.array([np.median(s.frame) for s in samples])
+    if chi2 < _MISFIT or not levels.min() > 0:
+        return image, fitted
+    noise = TransmissionNoise(0.0, 1.0, float(np.median(levels)))
+    logarithms = [s._replace(frame=noise.logarithm(s.frame)) for s in fitted]
+    try:
+        other, moved = learn_image(logarithms, contact=contact, pixel=pixel, level=noise.level)
+    except NoSpheresError:
+        return image, fitted
+    if log_likelihood(moved, other, reach=reach, pixel=pixel)[0] > likelihood:
+        return other, moved
+    return image, fitted
 
 
 class PlaneFit(NamedTuple):
@@ -225,7 +256,7 @@ def fit_plane(
     >>> fit.centers.round(4).tolist() == truth.tolist()
     True
     """
-    n = len(centers)
+    n, frame = len(centers), image.seen_in(frame)
     fit = PlaneFit(
         centers.copy(),
         np.full((n, 2), np.nan),

@@ -21,6 +21,10 @@ if TYPE_CHECKING:
     from perrin.motion.rigid_motion import RigidMotion
 
 
+# Spheres whose centres are beyond the border by this share of the reach of their images are hidden.
+_SHOWN = 0.95
+
+
 class Pose(NamedTuple):
     """Pose of one body in one frame.
 
@@ -136,6 +140,11 @@ def pose_in(
     Pose or None
         None where the fit does not converge.
     """
+    last = (np.array(frame.shape) - 1) * np.array(image.voxel)
+    beyond = np.maximum(-start.centers, start.centers - last)
+    shown = np.all(beyond < _SHOWN * image.extent, axis=1)
+    if not shown.all():  # a sphere that is out of view has no brightness
+        start = RigidCenters(start.center, start.rotation, start.template[shown])
     window = cut_window(frame, image, start.centers, others=others[:, ::-1])
     if not window.has_enough_voxels(len(start.template)):
         return None
