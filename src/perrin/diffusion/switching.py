@@ -389,13 +389,21 @@ def _filtered_together(requests: Sequence[tuple[SwitchingSteps, Floats]]) -> tup
     tops, totals, pairs = np.empty((len(vectors), len(points))), [], transition
     mean = np.zeros((vectors.shape[1], 2, len(points)))
     variance = np.zeros((len(groups), 2, len(points)))
+
+    def by_group(x: Floats) -> Floats:
+        """Sum over the axes of each group."""
+        if len(groups) == 1:
+            return x.sum(axis=0, keepdims=True)
+        return np.asarray(np.add.reduceat(x, firsts, axis=0))
+
+    all_follow = follows.all(axis=1).tolist()
     for j, y in enumerate(vectors):
-        if not follows[j].all():
+        if not all_follow[j]:
             start = before[j][:, None] + 2 * blur
             mean, variance = np.where(follows[j], mean, 0.0), np.where(follows[j], variance, start)
         noise = after[j][:, None, None]
         surprise = y + mean
-        square = np.add.reduceat(surprise * surprise, firsts, axis=0)
+        square = by_group(surprise * surprise)
         total = np.maximum(variance[:, :, None] + (spread[j] + noise), 1e-100)
         deviance = count[..., None] * np.log(total) + square[:, :, None] / total
         log_density = -0.5 * np.add.reduce(deviance, axis=0)
@@ -410,7 +418,7 @@ def _filtered_together(requests: Sequence[tuple[SwitchingSteps, Floats]]) -> tup
         share = joint / both * gain
         mean = np.add.reduce(share[group_of] * surprise[:, :, None], axis=1)
         second = np.add.reduce(share * gain * square[:, :, None], axis=1)
-        second -= np.add.reduceat(mean * mean, firsts, axis=0)
+        second -= by_group(mean * mean)
         variance = noise[:, 0] + 2 * blur - shared[:, 0] * np.add.reduce(share, axis=1)
         variance += second / count
     value = np.sum(tops, axis=0) + np.sum(np.log(totals), axis=0)
