@@ -398,8 +398,7 @@ def _in_body(x: Floats, seen: Bools, rotation: Floats, shape: Floats) -> Floats:
     """Return the particles in the axes of the body, (..., T, n, d)."""
     center = _shape_centers(x, rotation, shape)
     turned: Floats = (x - center[..., None, :]) @ rotation
-    body: Floats = np.where(seen[..., None], turned, np.nan)
-    return body
+    return turned if seen.all() else np.where(seen[..., None], turned, np.nan)
 
 
 def _shape_centers(x: Floats, rotation: Floats, shape: Floats) -> Floats:
