@@ -557,12 +557,12 @@ def steady_motion_of_each(
         settings = replace(estimates[moving[0]].settings, drift=True)
         again = estimate_each(some, quantity=estimates[moving[0]].quantity, noise=settings)
         free = []
-        for one in again:
-            if isinstance(one, TooFewFramesError):
-                raise one
-            free.append(one)
-        for k, one in zip(moving, _steady_motions_at(some, free), strict=True):
-            found[k] = one
+        for taken in again:
+            if isinstance(taken, TooFewFramesError):
+                raise taken
+            free.append(taken)
+        for k, without in zip(moving, _steady_motions_at(some, free), strict=True):
+            found[k] = without
     return found
 
 
@@ -784,6 +784,10 @@ def leave_one_out_residuals(
         rows = np.swapaxes(np.broadcast_to(x, y.shape), 1, 2)
         return np.ascontiguousarray(rows, dtype=np.float64).ravel()
 
+    def of_ends(pairs: Sequence[tuple[Floats, Floats]]) -> tuple[Floats, Floats]:
+        before, after = (along_rows(np.stack(part)) for part in zip(*pairs, strict=True))
+        return before, after
+
     def of_motion(numbers: Sequence[float]) -> Floats:
         return along_rows(np.array(numbers)[:, None, None])
 
@@ -796,8 +800,8 @@ def leave_one_out_residuals(
         along_rows(np.stack([t.steps.duration for t in tracks])[..., None]),
         along_rows(linked[..., None]),
         blur=of_motion([t.blur for t in tracks]),
-        weight=tuple(along_rows(np.stack([t.weight[k] for t in tracks])) for k in (0, 1)),
-        known=tuple(along_rows(np.stack([t.known[k] for t in tracks])) for k in (0, 1)),
+        weight=of_ends([t.weight for t in tracks]),
+        known=of_ends([t.known for t in tracks]),
     )
     extra = _LEFT_OUT * diagonal * along_rows(without[..., None])
     a, b = diagonal + extra, off_diagonal
@@ -842,16 +846,17 @@ def _jump_candidates(residuals: StepResiduals, known: Bools) -> Bools:
         0.0,
     )
 
-    def before(x: Floats | Bools) -> Floats | Bools:
-        return np.pad(x, ((0, 0), (1, 0)))
+    def before(x: Floats) -> Floats:
+        return np.asarray(np.pad(x, ((0, 0), (1, 0))), dtype=np.float64)
 
-    def after(x: Floats | Bools) -> Floats | Bools:
-        return np.pad(x, ((0, 0), (0, 1)))
+    def after(x: Floats) -> Floats:
+        return np.asarray(np.pad(x, ((0, 0), (0, 1))), dtype=np.float64)
 
     around = np.maximum(after(displaced), before(displaced))
     # The first and the last frame of a piece belong to one step only: a jump there isolates one
     # frame, and a badly measured frame explains it as well.
-    inside = before(residuals.linked) & after(residuals.linked)
+    pairs = residuals.linked.astype(np.float64)
+    inside = (before(pairs) > 0) & (after(pairs) > 0)
     limit = chdtri(residuals.step.shape[2], _CANDIDATE_LEVEL / count)
     given_others = _robust_square(residuals.step, residuals.step)
     # Jumps back and forth resemble noise once the noise is fitted to them: the length alone.

@@ -385,7 +385,7 @@ def _filtered_together(requests: Sequence[tuple[SwitchingSteps, Floats]]) -> tup
     transition = np.stack([np.stack([slow, to_fast], 1), np.stack([to_slow, fast], 1)], 1)
     probability = rate[::-1] / rate.sum(axis=0)
     vectors = by_point(lambda s: s.track.steps.vectors[:, np.concatenate(s.equal_axes)])[:, :, None]
-    follows = by_point(lambda s: s.follows) > 0
+    follows = np.asarray(by_point(lambda s: s.follows) > 0)
     tops, totals, pairs = np.empty((len(vectors), len(points))), [], transition
     mean = np.zeros((vectors.shape[1], 2, len(points)))
     variance = np.zeros((len(groups), 2, len(points)))
@@ -393,10 +393,10 @@ def _filtered_together(requests: Sequence[tuple[SwitchingSteps, Floats]]) -> tup
     def by_group(x: Floats) -> Floats:
         """Sum over the axes of each group."""
         if len(groups) == 1:
-            return x.sum(axis=0, keepdims=True)
+            return np.asarray(x.sum(axis=0, keepdims=True))
         return np.asarray(np.add.reduceat(x, firsts, axis=0))
 
-    all_follow = follows.all(axis=1).tolist()
+    all_follow = np.asarray(follows.all(axis=1)).tolist()
     for j, y in enumerate(vectors):
         if not all_follow[j]:
             start = before[j][:, None] + 2 * blur
@@ -440,7 +440,8 @@ def around(point: Floats) -> Floats:
     unit = _DIFFERENCE * np.eye(5)
     first, second = np.triu_indices(5, k=1)
     across = unit[first] + unit[second]
-    return point + np.concatenate([np.zeros((1, 5)), unit, -unit, across, -across])
+    moves = np.concatenate([np.zeros((1, 5)), unit, -unit, across, -across])
+    return np.asarray(point + moves)
 
 
 def expanded_about(value: Floats) -> tuple[float, Floats, Floats]:

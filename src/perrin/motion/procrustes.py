@@ -79,7 +79,7 @@ def fit_template(x: Floats, seen: Bools) -> PoseFit:
     fit, faults = fit_templates(x[None], seen[None])
     if faults[0] is not None:
         raise faults[0]
-    return PoseFit(*(part[0] for part in fit))
+    return PoseFit(*(np.asarray(part)[0] for part in fit))
 
 
 def fit_templates(
@@ -122,7 +122,8 @@ def fit_templates(
         new = _centred_mean(_in_body(some, here, turned, before))
         back, known = fit_rotations(before, new)
         new = np.where(known[:, None, None], new @ np.swapaxes(back, -1, -2), new)
-        new = np.where(found.any(axis=1)[:, None, None], new, before)
+        usable = np.asarray(found.any(axis=1))
+        new = np.where(usable[:, None, None], new, before)
         change = np.nan_to_num(np.abs(new - before)).max(axis=(1, 2))
         arm = new - mean_present(new, axis=-2)[:, None]
         size = np.nan_to_num(np.abs(arm)).max(axis=(1, 2))

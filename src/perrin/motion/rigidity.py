@@ -602,7 +602,7 @@ def _flexing_tests(motions: Sequence[RigidMotion], residuals: Floats) -> list[li
     # Contribution of each particle's variance to the mean squares of all residuals.
     share = np.einsum("bnmij,bnmij->bnm", keeps, keeps)
     singular = np.linalg.svd(share, compute_uv=False)
-    whole = np.isfinite(residuals).all(axis=(2, 3))
+    whole = np.asarray(np.isfinite(residuals).all(axis=(2, 3)))
     following = whole[:, 1:] & whole[:, :-1]
     pairs = following.sum(axis=1)
     tested = np.flatnonzero((pairs >= 10) & ~(singular[:, 0] > 1e6 * singular[:, -1]))

@@ -546,7 +546,7 @@ def _tracked_bodies(
     ]
     for k in scanned:
         # Rigidity and errors are those of the positions at one instant.
-        delays = identities[k].arranged(tracks[k].delay[..., None])[..., 0]
+        delays = identities[k].arranged(np.asarray(tracks[k].delay)[..., None])[..., 0]
         try:
             found[k], positions[k] = track_scanned(
                 positions[k],

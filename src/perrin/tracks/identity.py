@@ -835,7 +835,8 @@ def certain_labels(x: Floats) -> Bools:
     _, _, n, d = x.shape
     seen = present(x)
     shown = seen.sum(axis=2)
-    certain = ((shown == n).sum(axis=1) >= 2) & seen.any(axis=1).all(axis=1) & (n >= d)
+    every = np.asarray(seen.any(axis=1)).all(axis=1)
+    certain = ((shown == n).sum(axis=1) >= 2) & every & (n >= d)
     bodies = np.flatnonzero(certain)
     if not bodies.size:
         return np.asarray(certain)
