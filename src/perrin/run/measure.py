@@ -14,7 +14,7 @@ import numpy as np
 from perrin._arrays import as_sigma
 from perrin.diffusion.changing import with_changing_interval
 from perrin.diffusion.estimate import DiffusionEstimate
-from perrin.diffusion.estimators import estimate_diffusion, estimate_each
+from perrin.diffusion.estimators import estimate_diffusion, estimate_each, estimate_pooled
 from perrin.diffusion.rods import estimate_rod
 from perrin.diffusion.step_tests import (
     Jumps,
@@ -570,7 +570,7 @@ def _tracked_bodies(
     ]
     for k in scanned:
         # Rigidity and errors are those of the positions at one instant.
-        delays = identities[k].arranged(tracks[k].delay[..., None])[..., 0]
+        delays = identities[k].arranged(np.asarray(tracks[k].delay)[..., None])[..., 0]
         try:
             found[k], positions[k] = track_scanned(
                 positions[k],
@@ -1044,9 +1044,7 @@ def motion_and_path(body: FittedBody, quantity: Quantity) -> tuple[RigidMotion, 
     return cut_at(motion, body.stage), cut_at(whole, body.stage)
 
 
-def _estimated_quietly(
-    motion: RigidMotion | list[RigidMotion], quantity: Quantity, noise: Noise
-) -> DiffusionEstimate:
+def _estimated_quietly(motion: RigidMotion, quantity: Quantity, noise: Noise) -> DiffusionEstimate:
     """Estimate D_R or D_T; the estimate's own warnings go into the report."""
     with python_warnings.catch_warnings():
         python_warnings.simplefilter("ignore", PrecisionWarning)
@@ -1529,7 +1527,8 @@ def pool_coefficients(
     """
     motions, noise = [one.motion for one in parts], experiment.noise
     quantity = parts[0].estimate.quantity
-    estimate = _estimated_quietly(motions, quantity, noise)
+    each = [one.estimate for one in parts]
+    estimate = estimate_pooled(motions, each, quantity=quantity, noise=noise)
     if verdict is None:
         return estimate, None, []
     estimate, warnings = replace(estimate, motion=verdict.kind), []
