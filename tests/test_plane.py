@@ -294,9 +294,7 @@ def test_trackpy_is_refused_in_a_crowd():
     x, y = np.meshgrid(np.arange(5.0), np.arange(5.0))
     grid = 2.0 + CONTACT * np.column_stack([x.ravel(), y.ravel()])
     movie = drawn([grid], disc, np.random.default_rng(3), shape=(80, 80))
-    with pytest.raises(
-        ValueError, match=r"fits all spheres that touch at once: chains of up to 2"
-    ):
+    with pytest.raises(ValueError, match=r"fits all spheres that touch at once: chains of up to 2"):
         located(movie, refine="trackpy")
 
 

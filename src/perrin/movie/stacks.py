@@ -646,6 +646,9 @@ def _imaging(
         contact=search.contact,
         dark=search.dark,
         refine=first.method.refine,
+        distance_error=checks.distance_error(
+            bodies.features, contact=search.contact, axes=bodies.axes
+        ),
         other_optics=tuple(one.method.optics for one in located[1:] if one.method.optics),
         channel_offsets=tuple(
             () if offset is None else tuple(offset.value.tolist()) for offset in offsets
