@@ -104,11 +104,13 @@ if TYPE_CHECKING:
         Camera,
         Light,
         Optics,
+        PointSpread,
         Scan,
         Spots,
         Stack,
         fit_pose,
         locate,
+        measure_point_spread,
         open_stack,
         render_stack,
         write_stack,
@@ -196,6 +198,7 @@ __all__ = [
     "NoiseFloor",
     "Optics",
     "PartsError",
+    "PointSpread",
     "PrecisionWarning",
     "Prediction",
     "Quality",
@@ -254,6 +257,7 @@ __all__ = [
     "load_run",
     "locate",
     "long_time_diffusion",
+    "measure_point_spread",
     "msad",
     "msad_axes",
     "msad_vector",
@@ -294,7 +298,6 @@ __all__ = [
 
 # The public names of every subpackage.
 _FACES = {
-    "compiled": (),
     "errors": (
         "DamagedFileError",
         "DegenerateClusterError",
@@ -417,11 +420,13 @@ _FACES = {
         "Camera",
         "Light",
         "Optics",
+        "PointSpread",
         "Scan",
         "Spots",
         "Stack",
         "fit_pose",
         "locate",
+        "measure_point_spread",
         "open_stack",
         "render_stack",
         "write_stack",
@@ -447,6 +452,7 @@ _FACES = {
     "report": ("write_run",),
     "paper": (),
     "cli": (),
+    "compiled": (),
 }
 
 

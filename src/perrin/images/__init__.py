@@ -100,6 +100,7 @@ from perrin.images.optics.learn import (
     neighbour_variance,
     photon_transfer,
     saturated_share,
+    without_clipped,
 )
 from perrin.images.optics.learn_radial import (
     RadialSample,
@@ -113,6 +114,7 @@ from perrin.images.optics.learn_radial import (
 )
 from perrin.images.optics.microscope import Camera, Light, RenderSettings, Scan
 from perrin.images.optics.optics import CameraNoise, Optics
+from perrin.images.optics.point_spread import BeadStack, PointSpread, measure_point_spread
 from perrin.images.optics.radial_image import (
     Patch,
     PatchFit,
@@ -187,6 +189,7 @@ __all__ = [
     "Arrangement",
     "ArrayFrames",
     "BallBlur",
+    "BeadStack",
     "Camera",
     "CameraNoise",
     "Contents",
@@ -215,6 +218,7 @@ __all__ = [
     "PatchFit",
     "Pick",
     "PlaneFit",
+    "PointSpread",
     "Pose",
     "PsfTail",
     "RadialImage",
@@ -306,6 +310,7 @@ __all__ = [
     "log_likelihood",
     "lsm_scale",
     "mass_cut",
+    "measure_point_spread",
     "metaseries_scale",
     "missing_spheres",
     "name_counters",
@@ -364,6 +369,7 @@ __all__ = [
     "with_crowds",
     "with_poses",
     "within",
+    "without_clipped",
     "without_doubles",
     "write_imaging",
     "write_stack",

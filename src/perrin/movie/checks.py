@@ -239,8 +239,8 @@ def saturated_frames(frames: pd.DataFrame) -> Findings:
     text = (
         f"saturated voxels: up to {100 * np.nanmax(share):.2g} % of a frame pile up at its highest "
         f"value, in {over.sum()} of {len(frames)} frames (chance of one such frame without "
-        "saturation under 1e-6); their intensity is lost and positions may be biased; reduce gain "
-        "or laser power"
+        "saturation under 1e-6); they and the voxels beside them are left out of the fits of a "
+        "volume, so that positions are less exact; reduce gain or laser power"
     )
     return Findings((text,))
 

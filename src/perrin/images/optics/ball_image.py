@@ -15,6 +15,8 @@ from perrin._arrays import Floats, frozen, require_positive
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from perrin.images.optics.point_spread import PointSpread
+
 # Spacing of the table's knots in units of the blur along each axis; the cubic error is below 1e-4.
 _KNOT_SPACING = 0.25
 
@@ -308,6 +310,7 @@ def sphere_image(
     voxel: tuple[float, float, float],
     tail: PsfTail | None = None,
     spread: float = 0.0,
+    measured: PointSpread | None = None,
 ) -> SphereImage:
     """Tabulate a ball convolved with an anisotropic point spread and with the voxels.
 
@@ -323,6 +326,8 @@ def sphere_image(
         A second, wider Gaussian of the point spread.
     spread : float
         Relative standard deviation of the diameters of different spheres.
+    measured : PointSpread, optional
+        A measured point spread, in place of `psf` and `tail`: `psf` is that of its first Gaussian.
 
     Returns
     -------
@@ -355,6 +360,8 @@ def sphere_image(
         if not 0 <= tail.share <= 1:
             raise ValueError(f"tail: expected a share between 0 and 1, got {tail.share}")
         spreads.append((tail.share, tail.psf))
+    if measured is not None:
+        spreads = list(measured.components)
     components = []
     for share, (psf_z, psf_plane) in spreads:
         blur_z = float(np.sqrt(psf_z**2 + voxel[0] ** 2 / 12))

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from perrin._arrays import Bools, Floats
+    from perrin.images.optics.point_spread import PointSpread
     from perrin.images.optics.window_fit import Window
 
 
@@ -120,19 +121,55 @@ def saturated_share(data: NDArray[Any]) -> float:
     return share if bdtrc(count - 2, count - 1 + most, 0.5) < _SATURATION_LEVEL else 0.0
 
 
+def without_clipped(data: NDArray[Any]) -> Floats:
+    """Return a frame as float64, with NaN in voxels that are clipped and in their neighbours.
+
+    A voxel that noise keeps just below the end of the range is no sample of its distribution, so
+    that all voxels beside clipped ones are left out too: their selection does not depend on their
+    own noise.
+
+    Parameters
+    ----------
+    data : ndarray
+        One frame, in the type in which it was recorded.
+
+    Returns
+    -------
+    ndarray
+        The frame itself where `saturated_share` finds no clipping.
+
+    Examples
+    --------
+    >>> frame = np.random.default_rng(1).poisson(9.0, size=(9, 40, 40)).astype(np.uint8)
+    >>> frame[3:6, 20:23, 20:23] = 255
+    >>> int(np.isnan(without_clipped(frame)).sum())
+    125
+    """
+    from scipy.ndimage import binary_dilation
+
+    frame = np.asarray(data, dtype=np.float64)
+    if saturated_share(data) == 0:
+        return frame
+    beside = np.ones((3,) * frame.ndim, dtype=np.bool_)
+    return np.where(binary_dilation(data == data.max(), beside), np.nan, frame)
+
+
 @dataclass(frozen=True, eq=False)
 class ImageParameters:
     """The parameters of a sphere's image in the search for the optics.
 
     Attributes
     ----------
-    values : ndarray, shape (3,) or (6,)
+    values : ndarray, shape (1,), (3,) or (6,)
         Logarithms of the diameter and of the blurs along z and in the plane, um; with a tail its
-        share, and the logarithms of its blurs. Blurs include the voxel.
+        share, and the logarithms of its blurs. Blurs include the voxel. With a measured point
+        spread the diameter alone.
     voxel : tuple of float
         Voxel size (z, y, x), um.
     spread : float
         Relative standard deviation of the diameters of different spheres.
+    measured : PointSpread or None
+        A point spread that was measured, and is not searched for.
 
     Examples
     --------
@@ -144,6 +181,7 @@ class ImageParameters:
     values: Floats
     voxel: tuple[float, float, float]
     spread: float = 0.0
+    measured: PointSpread | None = None
 
     @property
     def voxel_blur(self) -> Floats:
@@ -152,6 +190,12 @@ class ImageParameters:
 
     def ball(self, values: Floats) -> BallBlur:
         """Return the blurred ball at other values of the parameters."""
+        if self.measured is not None:
+            blurs = [
+                (share, tuple(np.hypot(widths, self.voxel_blur).tolist()))
+                for share, widths in self.measured.components
+            ]
+            return BallBlur(float(np.exp(values[0])), tuple(blurs))
         diameter, blur_z, blur = np.exp(values[:3]).tolist()
         if len(values) == 3:
             return BallBlur(diameter, ((1.0, (blur_z, blur)),))
@@ -161,6 +205,14 @@ class ImageParameters:
     def image(self) -> SphereImage:
         """Return the sphere's image."""
         ball = self.ball(self.values)
+        if self.measured is not None:
+            return sphere_image(
+                diameter=ball.diameter,
+                psf=self.measured.components[0][1],
+                voxel=self.voxel,
+                spread=self.spread,
+                measured=self.measured,
+            )
         (psf_z, psf), *wider = (
             np.sqrt(np.square(blur) - self.voxel_blur**2).tolist() for _, blur in ball.components
         )
@@ -194,6 +246,8 @@ class ImageParameters:
         """
         n = len(self.values)
         low, high = np.full(n, -np.inf), np.full(n, np.inf)
+        if n == 1:
+            return low, high
         least = np.log(_LEAST_OVER_VOXEL * self.voxel_blur)
         low[2] = least[1]
         low[1] = max(least[0], max(self.values[2], low[2]) + np.log(_LEAST_ELONGATION))
@@ -237,6 +291,11 @@ class ImageParameters:
         """Return the optics, with standard errors from the information on the parameters."""
         image = self.image()
         error = np.sqrt(np.diag(np.linalg.pinv(information, hermitian=True)))[:3]
+        if self.measured is not None:
+            stderr = (float(image.diameter * error[0]), 0.0, 0.0)
+            return Optics(
+                image.diameter, image.psf, noise, stderr, None, self.spread, self.measured
+            )
         # The blur is the root of the sum of squares of point spread and voxel.
         factor = np.array([image.diameter, *(np.square(image.blur) / np.array(image.psf))])
         a, b, c = (float(value) for value in factor * error)
@@ -251,8 +310,8 @@ class ImageVariations(NamedTuple):
     image : SphereImage
         The image at the present values.
     slopes : ndarray, shape (k, ...)
-        Tables of the derivatives (`SphereImage.slopes`); without a tail the last one is that by the
-        share of a tail, at a share of 0.
+        Tables of the derivatives (`SphereImage.slopes`); of a single Gaussian the last one is that
+        by the share of a tail, at a share of 0.
     """
 
     image: SphereImage
@@ -645,6 +704,7 @@ def fit_samples(
     *,
     diameter: float,
     voxel: tuple[float, float, float],
+    measured: PointSpread | None = None,
 ) -> LearnedOptics:
     """Find the sphere diameter, point spread and noise of greatest likelihood for most samples.
 
@@ -658,6 +718,8 @@ def fit_samples(
         Diameter at the start of the search, um; the diameter of the result is fitted.
     voxel : tuple of float
         Voxel size (z, y, x), um.
+    measured : PointSpread, optional
+        A point spread that was measured; diameter and noise are learned.
 
     Returns
     -------
@@ -685,6 +747,8 @@ def fit_samples(
     psf = np.array([max(voxel[0], 0.15 * diameter), max(voxel[1] / 2, 0.06 * diameter)])
     start = ImageParameters(np.log([diameter, 1.0, 1.0]), voxel)
     start.values[1:] = np.log(np.hypot(psf, start.voxel_blur))
+    if measured is not None:
+        start = ImageParameters(np.log([diameter]), voxel, measured=measured)
     start = start.within_bounds()
     usable = _with_enough_voxels(samples, start.image())
     if not usable:
@@ -693,7 +757,7 @@ def fit_samples(
             "check diameter, contact and minmass, and whether spheres are dark (dark=True), state "
             "the optics (optics=), or keep the positions found first (refine=None)"
         )
-    mean = float(np.mean([s.frame.mean() for s in usable]))
+    mean = float(np.mean([np.nanmean(s.frame) for s in usable]))
     plain = _settled(usable, start, CameraNoise(1.0, 0.05 * abs(mean)))
     plain, left_out = _without_dust(plain)
     found = plain
@@ -806,9 +870,10 @@ def _settled(
         settled = np.abs(step).max() < _STEP_CONVERGED or (number > 0 and in_errors < tolerance)
         if settled and same:
             return _Settled(parameters, noise, samples, fits, information, score)
-    size, psf_z, psf = np.exp(parameters.values[:3])
+    found = parameters.ball(parameters.values)
+    psf_z, psf = found.components[0][1]
     raise NoSpheresError(
-        f"sphere size and point spread do not converge: diameter {size:.3g}, blur "
+        f"sphere size and point spread do not converge: diameter {found.diameter:.3g}, blur "
         f"({psf_z:.3g}, {psf:.3g}) um after {rounds} rounds "
         f"on {len(samples)} groups: are these spheres, bright enough, or dark (dark=True), and "
         "is the voxel size right? State the optics (optics=), or keep the positions found "
@@ -845,6 +910,8 @@ def _with_spread(equal: _Settled) -> _Settled:
 
 def _shows_tail(found: _Settled) -> bool:
     """Return whether the first step of a tail's share is significantly positive."""
+    if found.parameters.measured is not None:
+        return False
     variance = np.linalg.pinv(found.information, hermitian=True)
     share = float(variance[-1] @ found.score)
     return share > _LEAST_SHARE_ERRORS * float(np.sqrt(variance[-1, -1]))

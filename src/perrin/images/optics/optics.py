@@ -10,6 +10,7 @@ import numpy as np
 from perrin._arrays import to_plain
 from perrin._display import Shown
 from perrin.images.optics.ball_image import PsfTail, SphereImage, sphere_image
+from perrin.images.optics.point_spread import PointSpread
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -86,6 +87,9 @@ class Optics(Shown):
         deviations (z, plane), um; None for a Gaussian point spread.
     spread : float
         Relative standard deviation of the diameters of different spheres; 0 where they are equal.
+    measured : PointSpread or None
+        A point spread that was measured on beads; `psf` is then that of its narrowest Gaussian, and
+        there is no `tail`.
 
     Examples
     --------
@@ -100,10 +104,11 @@ class Optics(Shown):
     stderr: tuple[float, float, float] = (0.0, 0.0, 0.0)
     tail: PsfTail | None = None
     spread: float = 0.0
+    measured: PointSpread | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """Return values that JSON holds: `noise` as [gain, floor], `tail` as [share, psf]."""
-        return {
+        entry = {
             "diameter": to_plain(self.diameter),
             "psf": to_plain(self.psf),
             "noise": [to_plain(value) for value in self.noise],
@@ -111,6 +116,7 @@ class Optics(Shown):
             "tail": None if self.tail is None else [to_plain(part) for part in self.tail],
             "spread": to_plain(self.spread),
         }
+        return entry if self.measured is None else entry | {"measured": self.measured.to_dict()}
 
     @classmethod
     def from_dict(cls, entry: Mapping[str, Any]) -> Optics:
@@ -119,8 +125,8 @@ class Optics(Shown):
         Parameters
         ----------
         entry : mapping
-            The dictionary of `to_dict`; one without `tail` has a Gaussian point spread,
-            and one without `spread` equal spheres.
+            The dictionary of `to_dict`; one without `tail` has a Gaussian point spread, one without
+            `spread` equal spheres, and one without `measured` a point spread that was learned.
 
         Returns
         -------
@@ -132,9 +138,11 @@ class Optics(Shown):
             share, (tail_z, tail_plane) = entry["tail"]
             tail = PsfTail(share, (tail_z, tail_plane))
         noise = CameraNoise(*entry["noise"])
-        return cls(
-            entry["diameter"], (psf_z, psf), noise, (a, b, c), tail, entry.get("spread", 0.0)
-        )
+        measured = None
+        if entry.get("measured") is not None:
+            measured = PointSpread.from_dict(entry["measured"])
+        size, spread = entry["diameter"], entry.get("spread", 0.0)
+        return cls(size, (psf_z, psf), noise, (a, b, c), tail, spread, measured)
 
     def image(self, voxel: tuple[float, float, float]) -> SphereImage:
         """Return the table of the sphere's image for voxels (z, y, x), um."""
@@ -144,4 +152,5 @@ class Optics(Shown):
             voxel=voxel,
             tail=self.tail,
             spread=self.spread,
+            measured=self.measured,
         )
