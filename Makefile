@@ -33,7 +33,7 @@ venv_works = $(shell $(1)/bin/python -c 'import sys, pip; sys.exit(sys.version_i
 make_venv = $(if $(call venv_works,$(1)),:,$(call new_venv,$(1),$(find_python)))
 new_venv = $(call check_python,$(2))rm -rf $(1); $(2) -m venv $(1) || { echo '$(call no_venv,$(2))' >&2; exit 1; }
 
-.PHONY: help demo test test-numpy test-lowest benchmarks long lint types doctests docs lock clean
+.PHONY: help demo faults fuzz fuzz-short test test-numpy test-lowest benchmarks long lint types doctests docs release lock clean
 
 help:  ## list these targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1 - \2/p' Makefile | awk -F ' - ' '{printf "%-18s %s\n", $$1, $$2}'
@@ -46,6 +46,16 @@ test: .venv/.test  ## the whole suite, on all cores
 
 test-numpy: .venv/.test  ## the numeric tests again, without the compiled kernels
 	PERRIN_COMPILED=0 OMP_NUM_THREADS=1 $(RUN) pytest -q -n auto --dist loadfile $(NUMERIC)
+
+faults: .venv/.test  ## stopped and broken runs: kills, signals, full disks, two at a time (3 minutes)
+	OMP_NUM_THREADS=1 $(RUN) pytest -q -m faults
+
+SECONDS ?= 3600
+fuzz: .venv/.test  ## damaged files of all formats, an hour (SECONDS=...); faults become seeds
+	OMP_NUM_THREADS=1 $(BIN)/python tests/fuzz/run.py --seconds $(SECONDS) --jobs 2
+
+fuzz-short: .venv/.test  ## the same for a minute
+	OMP_NUM_THREADS=1 $(RUN) pytest -q -m fuzz tests/fuzz
 
 test-lowest:  ## the suite on the oldest dependencies allowed (Python 3.11)
 	@$(call make_venv,.venv-lowest)
@@ -63,7 +73,7 @@ benchmarks: .venv/.test  ## the quick benchmarks: coverage of intervals, warning
 	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/peers.py --quick
 
 long: .venv/.test  ## the Monte-Carlo tests with all repeats, and 40 tables of every warning (hours)
-	OMP_NUM_THREADS=1 $(RUN) pytest -q --long -n auto --dist loadfile
+	OMP_NUM_THREADS=1 $(RUN) pytest -q --long -n auto --dist loadfile tests docs/test_pages.py
 	$(BIN)/python benchmarks/intervals.py
 	$(BIN)/python benchmarks/alarms.py --repeats 40 --jobs 2
 	$(BIN)/python benchmarks/motion.py --jobs 2
@@ -79,11 +89,15 @@ lint: .venv/.test  ## ruff: rules and format
 types: .venv/.test  ## mypy --strict on src
 	$(RUN) mypy
 
-doctests: .venv/.test  ## the examples in the docstrings
-	$(RUN) pytest --doctest-modules src/perrin -q
+doctests: .venv/.test  ## the examples in the docstrings, and the code of all pages
+	$(RUN) pytest --doctest-modules src/perrin docs/test_pages.py -q -n auto
 
-docs: .venv/.docs  ## the documentation, into docs/_build/html
-	$(RUN) sphinx -q -b html docs docs/_build/html
+docs: .venv/.docs  ## the documentation with its gallery, into docs/_build/html
+	OMP_NUM_THREADS=1 $(RUN) sphinx -W --keep-going -q -j 2 -d docs/_build/doctrees -b html docs docs/_build/html
+	@echo 'The documentation is in file://$(CURDIR)/docs/_build/html/index.html'
+
+release: .venv/.demo  ## wheel and sdist, checked and installed into an empty environment
+	sh requirements/release.sh
 
 lock:  ## resolve the dependencies of pyproject.toml anew into requirements/
 	@$(call make_venv,.venv-lock)
@@ -92,6 +106,7 @@ lock:  ## resolve the dependencies of pyproject.toml anew into requirements/
 
 clean:  ## remove what was installed and built, demo output included
 	rm -rf .venv .venv-lowest .venv-lock dist docs/_build perrin-demo
+	rm -rf docs/gallery docs/tutorials/examples docs/reference/python docs/reference/backreferences
 	rm -rf .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	find src tests -name __pycache__ -type d -prune -exec rm -rf {} +
 

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import os
 from typing import TYPE_CHECKING
 
 import pytest
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+
+
+# Files of microscopes are read in this process, where tests replace their readers;
+# tests/test_guarded.py reads them apart.
+os.environ.setdefault("PERRIN_GUARD", "off")
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

@@ -10,6 +10,7 @@ import pytest
 
 from perrin.compiled import compiled_kernels, kernels_in_use, loading
 from perrin.geometry import rotations
+from perrin.images.optics import ball_image, sphere_image
 from test_rotations import hard_cases
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -79,7 +80,24 @@ def test_rotations_of_lines_and_points_are_not_unique(both_ways):
 
 
 @compiled
-def test_the_kernel_refuses_arrays_that_do_not_fit():
+@pytest.mark.parametrize("spread", [0.0, 0.06])
+def test_images_of_spheres_equal_those_of_numpy(monkeypatch, spread):
+    """Inside the window, cut by its border and beyond it, for equal and for unequal diameters."""
+    image = sphere_image(diameter=2.0, psf=(0.4, 0.15), voxel=(0.25, 0.2, 0.2), spread=spread)
+    rng = np.random.default_rng(8)
+    mask = rng.random((19, 23, 29)) < 0.6
+    centers = rng.uniform(-1, 6, (12, 3))
+    centers[:2] = [[2.0, 2.0, 2.0], [40.0, -40.0, 2.0]]
+    sizes = rng.normal(scale=spread, size=12)
+    kernel = image.on_voxels(mask, centers, sizes)
+    monkeypatch.setattr(ball_image, "compiled_kernels", lambda: None)
+    twin = image.on_voxels(mask, centers, sizes)
+    assert np.abs(twin).max(axis=(1, 2))[1:].tolist().count(0.0) >= 1
+    np.testing.assert_allclose(kernel, twin, rtol=0, atol=1e-12)
+
+
+@compiled
+def test_the_kernels_refuse_arrays_that_do_not_fit():
     """A wrong number of rows or type is an error, not a read beyond the array."""
     kernels = compiled_kernels()
     points, rotation, certain = np.zeros((5, 4, 3)), np.empty((5, 3, 3)), np.empty(5, np.bool_)
@@ -92,6 +110,10 @@ def test_the_kernel_refuses_arrays_that_do_not_fit():
         kernels.wahba(points.astype(np.float32), points, rotation, certain, None)
     with pytest.raises((BufferError, ValueError)):
         kernels.wahba(points[:, ::2], points[:, ::2], rotation, certain, None)
+    mask, three, table = np.ones((3, 4, 5), np.bool_), np.ones(3), np.zeros((1, 9, 9))
+    for out in (np.empty((1, 4, 59)), np.empty((2, 4, 60)), np.empty((1, 3, 60))):
+        with pytest.raises(ValueError, match="expected mask"):
+            kernels.spots(mask, three[None], three, three, three[:2], table, out)
 
 
 def test_the_environment_chooses_numpy(monkeypatch):

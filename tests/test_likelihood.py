@@ -7,6 +7,9 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from perrin import Cluster, add_noise, simulate_motion, track_rotation
+from perrin.diffusion import effective_modes
+from perrin.diffusion.effective_modes import FewModes, NoiseProfile
+from perrin.diffusion.estimators import by_likelihood
 from perrin.diffusion.likelihood import Likelihood
 from perrin.diffusion.noise_model import Noise
 from perrin.diffusion.step_kernels import SineModes, TridiagonalCovariance
@@ -304,3 +307,68 @@ def test_the_restricted_likelihood_is_the_same_in_sine_modes_and_in_bands(quanti
         modes.steady_motion(D[0], theta[0]), bands.steady_motion(D[0], theta[0]), strict=True
     ):
         np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-15)
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize(
+    ("body", "quantity"),
+    [("tetrahedron", "rotation"), ("trimer", "rotation"), ("trimer", "translation")],
+)
+def test_few_modes_are_the_likelihood_of_a_long_track_with_gaps(body, quantity, mode, monkeypatch):
+    """Value, slopes and bends are those of an elimination: to 1e-9 near the estimate of moments.
+
+    So are D and its intervals, without one elimination of all steps beyond those of the nodes.
+    """
+    cluster = {"tetrahedron": TETRAHEDRON, "trimer": Cluster.trimer(1.5)}[body]
+    track = MODES[mode](steps_of(cloud(6, 1500, cluster, frames=0.2), quantity))
+    few = FewModes.of([track], [NoiseProfile.of(track)], [0])
+    D, theta = np.array([2e-3, 3e-3, 4e-3])[:, None], np.array([2e-4, 3e-4, 4e-4])[:, None]
+    for one, other in zip(few.sums(D, theta), few.bands.sums(D, theta), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-12 * np.abs(other).max())
+    monkeypatch.setattr(effective_modes, "LEAST_STEPS", 10**9)
+    expected = by_likelihood([track])
+    monkeypatch.undo()
+    monkeypatch.setattr(TridiagonalCovariance, "sums", None)
+    found = by_likelihood([track])
+    for one, other in ((found.value, expected.value), (found.offset, expected.offset)):
+        assert one == pytest.approx(other, rel=1e-9, abs=1e-14)
+    assert found.ci68 == pytest.approx(expected.ci68, rel=1e-9)
+    assert found.ci95 == pytest.approx(expected.ci95, rel=1e-9)
+
+
+def test_a_long_track_takes_few_eliminations(monkeypatch):
+    """Estimate and intervals of any long track take at most 30 eliminations of its steps."""
+    motion = cloud(6, 1500, frames=0.2)
+    nodes, node = [], effective_modes.ratio_node
+
+    def counted(*steps, **options):
+        nodes.append(1)
+        return node(*steps, **options)
+
+    monkeypatch.setattr(effective_modes, "ratio_node", counted)
+    by_likelihood([NoisySteps.of(steps_of(motion, "rotation"), Noise())])
+    assert 10 < len(nodes) <= 30
+
+
+def test_noise_that_differs_between_frames_has_no_profile():
+    """Frames with a particle missing are noisier: their steps are not made into few modes."""
+    motion = cloud(6, 1200, Cluster.touching(5, 2.45), particles=0.02)
+    track = NoisySteps.of(steps_of(motion, "translation"), Noise())
+    assert NoiseProfile.of(track) is None
+
+
+@pytest.mark.parametrize(("D", "sigma"), [(1e-6, 0.05), (1e-2, 0.003)])
+@pytest.mark.parametrize("noise", ["joint", "residual"])
+def test_few_modes_serve_any_signal_to_noise_ratio(D, sigma, noise, monkeypatch):
+    """From a body that hardly moves to noise far below a step, the result is that of bands."""
+    rng = np.random.default_rng(1)
+    truth = simulate_motion(TETRAHEDRON, D_R=D, D_T=D, dt=1.0, n_frames=1500, rng=rng)
+    x = add_noise(truth.positions(), sigma=sigma, rng=rng)
+    x[1:-1][rng.random(1498) < 0.2] = np.nan
+    steps = steps_of(track_rotation(x, dt=1.0), "rotation")
+    found = by_likelihood([NoisySteps.of(steps, Noise(noise))])
+    monkeypatch.setattr(effective_modes, "LEAST_STEPS", 10**9)
+    expected = by_likelihood([NoisySteps.of(steps, Noise(noise))])
+    for one, other in ((found.value, expected.value), (found.offset, expected.offset)):
+        assert one == pytest.approx(other, rel=1e-9, abs=1e-14)
+    assert found.ci95 == pytest.approx(expected.ci95, rel=1e-9)

@@ -21,6 +21,7 @@ from perrin import (
     simulate_motion,
     track_rotation,
 )
+from perrin.diffusion import effective_modes, tensor_likelihood
 from perrin.diffusion.noise_model import Noise
 from perrin.diffusion.steps import Steps
 from perrin.diffusion.tensor_likelihood import (
@@ -31,6 +32,7 @@ from perrin.diffusion.tensor_likelihood import (
     spread,
     squares,
 )
+from perrin.diffusion.tensor_modes import ChainTrack, FewModesTrack
 from perrin.diffusion.tensors import axes_like, symmetric_basis
 from perrin.geometry.rigid import diffusion_center, shifted
 from perrin.geometry.rotations import exp_map, skew
@@ -124,7 +126,7 @@ def test_the_likelihood_is_the_normal_density(b, r, how):
     assert found.value == pytest.approx(dense_value(steps, D, theta, B), abs=1e-10)
     assert steps.even == bool(how.get("even"))
     if steps.even:
-        quick = noisy(steps).by_sines(D[None], theta[None], np.array([B]))
+        quick = noisy(steps).by_modes(D[None], theta[None], np.array([B]))
         for one, other in zip(quick, found, strict=True):
             np.testing.assert_allclose(one, other, rtol=1e-11, atol=1e-11)
 
@@ -148,6 +150,72 @@ def test_chains_along_common_axes_are_the_blocks(r):
         atol=1e-10,
     )
     assert noisy(steps).chain_track is None
+
+
+@pytest.mark.parametrize(("b", "r"), [(3, 1), (6, 2)])
+def test_few_modes_are_the_chains_of_equally_noisy_frames(b, r):
+    """Values and slopes are those of chains, curvatures the differences of their slopes."""
+    steps = steps_of(1, b, r, count=40, pieces=True)
+    same = np.broadcast_to(steps.noise[:, :1], steps.noise.shape).copy()
+    source = noisy(dataclasses.replace(steps, noise=same))
+    rng = np.random.default_rng(2)
+    D, theta, B = spd(rng, b), rng.uniform(0.2, 0.5, r), np.array([0.1])
+    few = FewModesTrack.of(steps, same[:, 0], None, window=(-2.0, 3.0))
+    modes = few.diagonal(D[None], theta[None], B)
+    assert few.exact(modes.places)
+    chains = source.chain_track
+    expected = chains.slopes(D, 0.1, chains.at(D, theta, 0.1))
+    for one, other in zip(few.slopes(D[None], B, modes), expected, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9)
+    E, h = np.stack([spd(rng, b), spd(rng, b)]), 1e-5
+    found = few.curvatures(E[None], D[None], B, modes)[0]
+
+    def slopes(change, dtheta=0.0):
+        at = chains.slopes(D + change, 0.1, chains.at(D + change, theta + dtheta, 0.1))
+        return np.append(np.sum(at.D * E, axis=(1, 2)), at.theta)
+
+    for i, to in enumerate(E):
+        bend = (slopes(-h * to) - slopes(h * to)) / (2 * h)
+        np.testing.assert_allclose(found[i, : 2 + r], bend, rtol=1e-5, atol=1e-5)
+    bend = (slopes(0 * D, -h) - slopes(0 * D, h)) / (2 * h)
+    np.testing.assert_allclose(found[2 : 2 + r, : 2 + r].sum(axis=0), bend, rtol=1e-5, atol=1e-5)
+
+
+def test_a_long_track_with_gaps_takes_few_eliminations(monkeypatch):
+    """Tensor, errors and both tests of any body, isotropic ones too, take at most 40 passes."""
+    nodes, node = [], effective_modes.ratio_node
+
+    def counted(*steps, **options):
+        nodes.append(1)
+        return node(*steps, **options)
+
+    points, slopes = [], PooledLikelihood.slopes_at
+    monkeypatch.setattr(effective_modes, "ratio_node", counted)
+    monkeypatch.setattr(
+        PooledLikelihood, "slopes_at", lambda s, p: (points.extend(p), slopes(s, p))[1]
+    )
+    monkeypatch.setattr(NoisyVectors, "by_bands", None)
+    monkeypatch.setattr(ChainTrack, "at", None)
+    for ratio in ((1, 1, 1), (1, 1.5, 3)):
+        motion = tracked(3, n_frames=1500, ratio=ratio, missing=0.1)
+        nodes.clear()
+        points.clear()
+        diffusion_tensor(motion, symmetry="C_1")
+        assert len(nodes) <= 40
+        assert len(points) <= 150  # sums over a hundred modes
+
+
+@pytest.mark.parametrize("options", [{}, {"noise": "residual"}, {"noise": SIGMA, "exposure": 0.5}])
+def test_the_tensor_of_a_long_track_is_that_of_its_chains(options, monkeypatch):
+    """Values, errors and p-values of few modes and of eliminations at every point agree."""
+    motion = tracked(3, n_frames=1200, missing=0.1)
+    found = diffusion_tensor(motion, **options)
+    monkeypatch.setattr(tensor_likelihood, "LEAST_STEPS", 10**9)
+    expected = diffusion_tensor(motion, **options)
+    np.testing.assert_allclose(found.tensor, expected.tensor, rtol=1e-8, atol=1e-12)
+    np.testing.assert_allclose(found.stderr, expected.stderr, rtol=1e-6)
+    assert found.p_axial == pytest.approx(expected.p_axial, rel=1e-6)
+    np.testing.assert_allclose(found.offset, expected.offset, rtol=1e-6, atol=1e-12)
 
 
 @pytest.mark.parametrize("how", [{"even": True}, {"pieces": True}])

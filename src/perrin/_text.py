@@ -213,3 +213,28 @@ def signed_text(value: float) -> str:
     ('−4.1', '+0.3')
     """
     return f"{value:+.1f}".replace("-", "−")
+
+
+def printable(text: object) -> str:
+    r"""Return a text in which no character controls a terminal or reverses the reading direction.
+
+    Line ends stay. Others are written as in Python: an escape code of a terminal as ``\x1b``, a
+    byte of a file's name that is no UTF-8 as ``\udcff``.
+
+    Parameters
+    ----------
+    text : object
+
+    Returns
+    -------
+    str
+
+    Examples
+    --------
+    >>> printable("a\x1b[31m µm\n")
+    'a\\x1b[31m µm\n'
+    """
+    return "".join(
+        c if c == "\n" or c.isprintable() else c.encode("unicode_escape").decode()
+        for c in str(text)
+    )

@@ -99,6 +99,10 @@ class PartsError(ValueError):
     """The folder holds the unfinished parts of another run."""
 
 
+class ManifestError(ValueError):
+    """A manifest of a study with faults; the message lists all of them with their lines."""
+
+
 class FolderInUseError(OSError):
     """Another process is writing into the folder."""
 

@@ -8,6 +8,8 @@ from perrin.cli.app import (
     convert,
     demo,
     doctor,
+    example_files,
+    examples,
     main,
     paper,
     plan,
@@ -19,16 +21,21 @@ from perrin.cli.app import (
 from perrin.cli.config import config_text, take_config, write_config
 from perrin.cli.diagnosis import Check, figure_font, installed, optional_readers, self_test
 from perrin.cli.messages import (
+    StoppedError,
     claimed_output,
+    escape,
     in_options,
     messages_of,
     options_of,
     state_kept_frames,
+    status_of,
+    stop_in_order,
     warnings_in_one_line,
 )
 from perrin.cli.options import (
     GroupedCommand,
     body_of,
+    read_channels,
     read_columns,
     read_dynamics,
     read_model,
@@ -41,6 +48,7 @@ from perrin.cli.options import (
     spheres_of,
 )
 from perrin.cli.progress import progress_lines, shown_progress
+from perrin.cli.study_commands import new_study, report_study, run_study
 from perrin.cli.tables import (
     cluster_table,
     kinds_table,
@@ -57,6 +65,7 @@ from perrin.cli.tables import (
 __all__ = [
     "Check",
     "GroupedCommand",
+    "StoppedError",
     "analyze",
     "body_of",
     "check_demo_folder",
@@ -68,12 +77,16 @@ __all__ = [
     "convert",
     "demo",
     "doctor",
+    "escape",
+    "example_files",
+    "examples",
     "figure_font",
     "in_options",
     "installed",
     "kinds_table",
     "main",
     "messages_of",
+    "new_study",
     "optional_readers",
     "options_of",
     "paper",
@@ -81,6 +94,7 @@ __all__ = [
     "pooled_table",
     "predict",
     "progress_lines",
+    "read_channels",
     "read_columns",
     "read_dynamics",
     "read_model",
@@ -90,7 +104,9 @@ __all__ = [
     "read_refine",
     "read_slice",
     "read_whole_numbers",
+    "report_study",
     "run",
+    "run_study",
     "self_test",
     "show_diagnosis",
     "show_json",
@@ -103,6 +119,8 @@ __all__ = [
     "simulate",
     "spheres_of",
     "state_kept_frames",
+    "status_of",
+    "stop_in_order",
     "take_config",
     "terms_of",
     "warnings_in_one_line",

@@ -4,14 +4,23 @@ from __future__ import annotations
 
 import os
 import re
+import sys
 from contextlib import ExitStack
+from io import TextIOWrapper
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from perrin._text import printable
 from perrin.cli.config import config_text, write_config
-from perrin.cli.messages import claimed_output, messages_of, state_kept_frames
+from perrin.cli.messages import (
+    claimed_output,
+    escape,
+    messages_of,
+    state_kept_frames,
+    stop_in_order,
+)
 from perrin.cli.options import (
     BODY,
     INPUT,
@@ -63,6 +72,7 @@ from perrin.cli.options import (
     spheres_of,
 )
 from perrin.cli.progress import shown_progress
+from perrin.cli.study_commands import study_app
 from perrin.cli.tables import show_diagnosis, show_json, show_plan, show_prediction, show_report
 
 if TYPE_CHECKING:
@@ -79,6 +89,8 @@ app = typer.Typer(
     # Plain help: the formatted one imports a Markdown parser, a third of the time of `--help`.
     rich_markup_mode=None,
 )
+
+app.add_typer(study_app, name="study")
 
 # Default folder of the demo, and the files that it writes there, by which it is recognised.
 _DEMO_FOLDER = "perrin-demo"
@@ -97,6 +109,11 @@ _DEMO_FILES = re.compile(
 
 def main() -> None:
     """Run the command line; the entry point of ``perrin``."""
+    for stream in (sys.stdout, sys.stderr):
+        # A terminal without µ gets its code, not an error.
+        if isinstance(stream, TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
+    stop_in_order()
     app()
 
 
@@ -166,7 +183,7 @@ def demo(
         show_run(report, place, demo, as_json=as_json, quiet=quiet)
         if not (as_json or quiet):
             print("Planted in the simulation: D_R = 0.00493 rad^2/s, D_T = 0.0385 um^2/s.")
-            print(f"The input, as an example of a table: {place / 'demo-tracks.csv'}")
+            print(printable(f"The input, as an example of a table: {place / 'demo-tracks.csv'}"))
 
 
 @app.command(
@@ -553,7 +570,7 @@ def simulate(
         if output.name.lower().endswith((".gdf", ".napari.csv")):
             table = table.drop(columns="cluster")
         perrin.write_tracks(table, output)
-        print(f"{frames} frames of one {shape or positions} written to {output}")
+        print(printable(f"{frames} frames of one {shape or positions} written to {output}"))
 
 
 @app.command(
@@ -608,7 +625,7 @@ def predict(
             return
         show_prediction(body, name=shape or str(positions))
         if output is not None:
-            print(f"Written to {output}")
+            print(printable(f"Written to {output}"))
 
 
 @app.command(
@@ -693,7 +710,7 @@ def plan(
             plot_plan(found, ax=figure.add_subplot())
             figure.savefig(output, dpi=150)
             if not as_json:
-                print(f"Written to {output}")
+                print(printable(f"Written to {output}"))
 
 
 @app.command(cls=GroupedCommand, epilog="perrin paper -o paper")
@@ -709,7 +726,6 @@ def paper(
 ) -> None:
     """Reproduce all figures, tables and claims of the paper (Hunter 2011)."""
     from rich.console import Console
-    from rich.markup import escape
 
     from perrin.paper.remake import reproduce
     from perrin.run.folders import check_place
@@ -782,8 +798,55 @@ def convert(
         table = table.drop(columns=dropped, errors="ignore")
         perrin.write_tracks(table, target)
         for note in notes:
-            print(f"note: {note}")
-        print(f"{len(table)} rows written to {target}")
+            print(printable(f"note: {note}"))
+        print(printable(f"{len(table)} rows written to {target}"))
+
+
+@app.command(cls=GroupedCommand, epilog="perrin examples my-examples")
+def examples(
+    folder: Annotated[Path, typer.Argument(help="Folder for the copies.")] = Path(
+        "perrin-examples"
+    ),
+    overwrite: Annotated[
+        bool,
+        typer.Option("--overwrite", help="Replace files of these names.", rich_help_panel=OUTPUT),
+    ] = False,
+) -> None:
+    """Copy the scripts and notebooks of the tutorials into a folder."""
+    import shutil
+
+    with messages_of(examples):
+        found = example_files()
+        folder.mkdir(parents=True, exist_ok=True)
+        present = [path.name for path in found if (folder / path.name).exists()]
+        if present and not overwrite:
+            raise FileExistsError(
+                f"{folder} has {', '.join(present)}: choose another folder, or overwrite=True"
+            )
+        for path in found:
+            shutil.copyfile(path, folder / path.name)
+        print(f"{len(found)} examples copied to {folder}: {found[0].name} is the first")
+
+
+def example_files() -> list[Path]:
+    """Return the examples: in the package, or in the repository where this is not installed.
+
+    Raises
+    ------
+    FileNotFoundError
+        If the installation has none.
+
+    Examples
+    --------
+    >>> example_files()[0].name
+    '01_own_table.py'
+    """
+    package = Path(__file__).parents[1]
+    for folder in (package / "data" / "examples", package.parents[1] / "examples"):
+        found = sorted(path for path in folder.glob("[0-9]*") if path.suffix in (".py", ".ipynb"))
+        if found:
+            return found
+    raise FileNotFoundError("this installation has no examples: install perrin from a wheel")
 
 
 @app.command(cls=GroupedCommand, epilog="perrin doctor")

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, TypeGuard, get_type_hints
 
 import typer
 
+from perrin._text import printable
+
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
     from pathlib import Path
@@ -131,6 +133,74 @@ def in_options(text: str, options: Mapping[str, str]) -> str:
     return re.sub(rf"(?<![\w-])({alone})\b", option, text) if alone else text
 
 
+class StoppedError(KeyboardInterrupt):
+    """The operating system, or the keyboard, stops the process.
+
+    Attributes
+    ----------
+    number : int
+        Number of the signal.
+    """
+
+    def __init__(self, number: int) -> None:
+        super().__init__()
+        self.number = number
+
+
+def status_of(stop: BaseException) -> int:
+    """Return the exit status of a process that was stopped: 128 and the number of the signal.
+
+    Examples
+    --------
+    >>> status_of(KeyboardInterrupt()), status_of(StoppedError(15))
+    (130, 143)
+    """
+    return 128 + (stop.number if isinstance(stop, StoppedError) else 2)
+
+
+def stop_in_order() -> None:
+    """Let SIGINT and SIGTERM raise an error once, and end the process at once the second time.
+
+    The error lets finished work be written; what is written appears whole or not at all, so that
+    the second signal does no harm.
+    """
+    import signal
+
+    signals = (signal.SIGINT, signal.SIGTERM)
+
+    def stop(number: int, _: object) -> None:
+        for each in signals:
+            signal.signal(each, signal.SIG_DFL)
+        raise StoppedError(number)
+
+    for each in signals:
+        if signal.getsignal(each) is not signal.SIG_IGN:  # as under nohup
+            signal.signal(each, stop)
+
+
+def escape(text: object) -> str:
+    r"""Return a text for the tables of the terminal: no markup, and no codes of a terminal.
+
+    Parameters
+    ----------
+    text : object
+        With the names that users give to clusters and files.
+
+    Returns
+    -------
+    str
+
+    Examples
+    --------
+    >>> escape("[bold]a\x1b[0m")
+    '\\[bold]a\\x1b[0m'
+    """
+    from rich.markup import escape as without_markup
+
+    # At the end of its text rich doubles a backslash, which is right before a tag only.
+    return without_markup(f"{printable(text)} ")[:-1]
+
+
 @contextmanager
 def messages_of(command: Callable[..., object]) -> Iterator[None]:
     """Print warnings and an error in one line each, in the words of the command line.
@@ -144,7 +214,7 @@ def messages_of(command: Callable[..., object]) -> Iterator[None]:
     ------
     typer.Exit
         With status 1 where the data cannot answer, 2 where the input or the place of the output is
-        wrong, 130 after an interruption from the keyboard.
+        wrong, 130 after an interruption from the keyboard, 143 after SIGTERM.
     """
     import perrin
 
@@ -158,19 +228,21 @@ def messages_of(command: Callable[..., object]) -> Iterator[None]:
     try:
         with warnings_in_one_line(options):
             yield
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as stop:
         print("Stopped: nothing is written, and what was there is kept.", file=sys.stderr)
-        raise typer.Exit(130) from None
+        raise typer.Exit(status_of(stop)) from None
     except BrokenPipeError:
         # The reader has stopped (a pipe into head); the run itself is written. Python's own flush
         # at the end would complain again.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    except (ValueError, OSError, ImportError) as error:
-        if isinstance(error, OSError) and error.strerror and error.filename:
+    except (ValueError, OSError, ImportError, MemoryError) as error:
+        if isinstance(error, MemoryError):
+            text = f"not enough memory: {error}" if str(error) else "not enough memory"
+        elif isinstance(error, OSError) and error.strerror and error.filename:
             text = f"{error.filename}: {error.strerror}"
         else:
             text = "; ".join(line.strip().removeprefix("- ") for line in str(error).splitlines())
-        print(f"perrin: {in_options(text, options)}", file=sys.stderr)
+        print(f"perrin: {printable(in_options(text, options))}", file=sys.stderr)
         raise typer.Exit(1 if isinstance(error, no_answer) else 2) from None
 
 
@@ -230,7 +302,7 @@ def warnings_in_one_line(options: Mapping[str, str]) -> Iterator[None]:
             if not issubclass(category, ours):
                 usual(message, category, filename, lineno, file, line)
                 return
-            text = in_options(" ".join(str(message).split()), options)
+            text = printable(in_options(" ".join(str(message).split()), options))
             if text not in printed:
                 print(f"warning: {text}", file=sys.stderr)
                 printed.add(text)
@@ -253,7 +325,7 @@ def state_kept_frames(output: Path) -> Iterator[None]:
     Raises
     ------
     typer.Exit
-        With status 130 after an interruption from the keyboard.
+        With status 130 after an interruption from the keyboard, 143 after SIGTERM.
     """
     try:
         yield
@@ -261,9 +333,10 @@ def state_kept_frames(output: Path) -> Iterator[None]:
         kept = any((output / "located").glob("part-*")) and not (output / "run.json").exists()
         if kept:
             print(
-                f"Finished frames are kept in {output}: the same command resumes the run.",
+                f"Finished frames are kept in {printable(output)}: the same command resumes the "
+                "run.",
                 file=sys.stderr,
             )
         if isinstance(stop, OSError) or not kept:
             raise
-        raise typer.Exit(130) from None
+        raise typer.Exit(status_of(stop)) from None

@@ -5,6 +5,8 @@ from __future__ import annotations
 from math import isfinite
 from typing import TYPE_CHECKING
 
+from perrin.cli.messages import escape
+
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from pathlib import Path
@@ -30,7 +32,6 @@ def show_plan(plan: SamplingPlan) -> None:
     """Print the plan as a short table, and its reasons."""
     from rich.box import SIMPLE_HEAD
     from rich.console import Console
-    from rich.markup import escape
     from rich.table import Table
 
     from perrin._text import percent
@@ -91,7 +92,6 @@ def show_diagnosis(checks: Sequence[Check]) -> None:
 def show_report(report: Report, output: Path, command: Callable[..., None]) -> None:
     """Print the short tables, the warnings, the notes, and where the run is written."""
     from rich.console import Console
-    from rich.markup import escape
 
     from perrin.run.results import perp_text
     from perrin.run.statements import verdict_lines
@@ -108,7 +108,7 @@ def show_report(report: Report, output: Path, command: Callable[..., None]) -> N
             f"and {len(report.clusters) - _CLUSTERS_SHOWN} more clusters in report.html\n"
         )
     for term in terms_of(report):
-        console.print(f"[dim]{escape(term)}[/]", soft_wrap=True)
+        console.print(escape(term), style="dim", soft_wrap=True)
     if report.pooled is not None and len(report.clusters) > 1:
         console.print(pooled_table(report.pooled))
     if report.pooled_by_kind:
@@ -148,8 +148,6 @@ def terms_of(report: Report) -> list[str]:
 
 def show_remarks(report: Report, command: Callable[..., None], console: Console) -> None:
     """Print the warnings, then the notes, with those of several clusters in one line."""
-    from rich.markup import escape
-
     from perrin.cli.messages import in_options, options_of
     from perrin.run.remarks import condensed, merged
 
@@ -168,7 +166,7 @@ def show_remarks(report: Report, command: Callable[..., None], console: Console)
     if len(warnings) > _WARNINGS_SHOWN:
         console.print(f"and {len(warnings) - _WARNINGS_SHOWN} more warnings in summary.json")
     for text in notes[:_NOTES_SHOWN]:
-        console.print(f"[dim]note: {escape(in_options(text, options))}[/]", soft_wrap=True)
+        console.print(f"note: {escape(in_options(text, options))}", style="dim", soft_wrap=True)
     if len(notes) > _NOTES_SHOWN:
         console.print(f"[dim]and {len(notes) - _NOTES_SHOWN} more notes in summary.json[/]")
 
@@ -183,7 +181,6 @@ def cluster_table(result: ClusterResult, *, kind: BodyKind | None = None) -> Tab
         Number of particles and shape for the title, where there are several kinds.
     """
     from rich.box import SIMPLE_HEAD
-    from rich.markup import escape
     from rich.table import Table
 
     from perrin._text import with_error
@@ -232,7 +229,6 @@ def show_prediction(body: Mobility, *, name: str) -> None:
     """Print the short table of a prediction."""
     from rich.box import SIMPLE_HEAD
     from rich.console import Console
-    from rich.markup import escape
     from rich.table import Table
 
     from perrin.diffusion.tensors import axes_like

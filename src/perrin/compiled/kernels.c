@@ -293,6 +293,121 @@ static void solve(const Sets *sets, Lanes *y, Lanes *x, Lanes *w)
     }
 }
 
+/* A window of voxels, and the spheres whose images are wanted on the `count` voxels of its mask. */
+typedef struct {
+    Py_ssize_t spheres, shape[3], count, knots[2], table_stride;
+    const uint8_t *mask;
+    const double *center, *voxel, *reach, *spacing, *table;
+    double *out;
+} Window;
+
+/* The voxels of one axis that an image covers. */
+typedef struct {
+    Py_ssize_t first, stop;
+} Range;
+
+static Range covered(double center, double reach, double voxel, Py_ssize_t n)
+{
+    double first = ceil((center - reach) / voxel), stop = floor((center + reach) / voxel) + 1;
+    Range range = {first < 0 ? 0 : (Py_ssize_t)first, stop < 0 ? 0 : (Py_ssize_t)stop};
+    range.first = first > (double)n ? n : range.first;
+    range.stop = stop > (double)n ? n : range.stop;
+    return range;
+}
+
+/* The four cubic B-splines at t among `count` padded knots, and their slopes. */
+typedef struct {
+    Py_ssize_t first;
+    double value[4], slope[4];
+} Splines;
+
+static Splines splines_at(double t, Py_ssize_t count)
+{
+    Splines s = {.first = t < (double)(count - 4) ? (Py_ssize_t)t : count - 4};
+    double u = t - (double)s.first, v;
+    u = u < 1.0 ? u : 1.0;
+    v = 1.0 - u;
+    s.value[0] = v * v * v / 6;
+    s.value[1] = 2.0 / 3 - u * u + u * u * u / 2;
+    s.value[2] = 2.0 / 3 - v * v + v * v * v / 2;
+    s.value[3] = u * u * u / 6;
+    s.slope[0] = -v * v / 2;
+    s.slope[1] = -2 * u + 1.5 * u * u;
+    s.slope[2] = 2 * v - 1.5 * v * v;
+    s.slope[3] = u * u / 2;
+    return s;
+}
+
+/* A pixel of the window: splines in the distance from the sphere's axis, and its offsets. */
+typedef struct {
+    Splines across;
+    double y, x;
+} Pixel;
+
+/* Write image and gradient (4, count) of one sphere; `rows` holds two rows of the table. */
+static void write_spot(const Window *window, const double *center, const double *table,
+                       Pixel *pixels, double *rows, double *out)
+{
+    const Py_ssize_t *shape = window->shape, columns = window->knots[1], count = window->count;
+    double spacing_z = window->spacing[0], spacing_rho = window->spacing[1];
+    Range range[3];
+    for (int k = 0; k < 3; k++)
+        range[k] = covered(center[k], window->reach[k], window->voxel[k], shape[k]);
+    for (Py_ssize_t j = range[1].first; j < range[1].stop; j++)
+        for (Py_ssize_t i = range[2].first; i < range[2].stop; i++) {
+            Pixel *pixel = pixels + j * shape[2] + i;
+            pixel->y = window->voxel[1] * (double)j - center[1];
+            pixel->x = window->voxel[2] * (double)i - center[2];
+            double rho = sqrt(pixel->y * pixel->y + pixel->x * pixel->x);
+            pixel->across = splines_at(rho / spacing_rho, columns);
+            for (int k = 0; k < 4; k++)
+                pixel->across.slope[k] /= spacing_rho * (rho > 0 ? rho : 1.0);
+        }
+    double *value_row = rows, *slope_row = rows + columns;
+    const uint8_t *mask = window->mask;
+    Py_ssize_t number = 0;
+    for (Py_ssize_t l = 0; l < shape[0]; l++) {
+        int covers_plane = l >= range[0].first && l < range[0].stop;
+        if (covers_plane) {
+            double z = window->voxel[0] * (double)l - center[0];
+            double outward = z > 0 ? -1 / spacing_z : z < 0 ? 1 / spacing_z : 0.0;
+            Splines along = splines_at(fabs(z) / spacing_z, window->knots[0]);
+            const double *knots = table + along.first * columns;
+            for (Py_ssize_t c = 0; c < columns; c++) {
+                value_row[c] = slope_row[c] = 0.0;
+                for (int k = 0; k < 4; k++) {
+                    value_row[c] += along.value[k] * knots[k * columns + c];
+                    slope_row[c] += along.slope[k] * knots[k * columns + c] * outward;
+                }
+            }
+        }
+        for (Py_ssize_t j = 0; j < shape[1]; j++) {
+            int covers_line = covers_plane && j >= range[1].first && j < range[1].stop;
+            for (Py_ssize_t i = 0; i < shape[2]; i++) {
+                if (!*mask++)
+                    continue;
+                double value = 0.0, by_z = 0.0, by_rho = 0.0, y = 0.0, x = 0.0;
+                if (covers_line && i >= range[2].first && i < range[2].stop) {
+                    const Pixel *pixel = pixels + j * shape[2] + i;
+                    const Splines *across = &pixel->across;
+                    for (int k = 0; k < 4; k++) {
+                        value += value_row[across->first + k] * across->value[k];
+                        by_z += slope_row[across->first + k] * across->value[k];
+                        by_rho += value_row[across->first + k] * across->slope[k];
+                    }
+                    y = pixel->y;
+                    x = pixel->x;
+                }
+                out[number] = value;
+                out[count + number] = by_z;
+                out[2 * count + number] = -by_rho * y;
+                out[3 * count + number] = -by_rho * x;
+                number++;
+            }
+        }
+    }
+}
+
 /* Keep `view` as doubles, C-contiguous; returns 0 with an exception set where it is not. */
 static int doubles(PyObject *array, int flags, Py_buffer *view)
 {
@@ -375,8 +490,79 @@ PyDoc_STRVAR(wahba_doc,
 "a point with a NaN is absent. rotation (rows, 3, 3) and certain (rows,) of bytes are written:\n"
 "rows that are not certain have to be decided by a singular value decomposition.");
 
+/* Whether the mask has `count` voxels: the images are written there and nowhere else. */
+static int mask_fits(const Window *window)
+{
+    Py_ssize_t found = 0, size = window->shape[0] * window->shape[1] * window->shape[2];
+    for (Py_ssize_t i = 0; i < size; i++)
+        found += window->mask[i] != 0;
+    return found == window->count;
+}
+
+static PyObject *write_spots(Py_buffer views[7])
+{
+    Py_buffer *mask = &views[0], *table = &views[5], *out = &views[6];
+    Window window = {.mask = mask->buf, .center = views[1].buf, .voxel = views[2].buf,
+                     .reach = views[3].buf, .spacing = views[4].buf, .table = table->buf,
+                     .out = out->buf};
+    int fits = mask->ndim == 3 && mask->itemsize == 1 && table->ndim == 3 && out->ndim == 3 &&
+               out->shape[1] == 4 && table->shape[1] >= 4 && table->shape[2] >= 4;
+    if (fits) {
+        window.spheres = out->shape[0];
+        window.count = out->shape[2];
+        memcpy(window.shape, mask->shape, sizeof window.shape);
+        memcpy(window.knots, table->shape + 1, sizeof window.knots);
+        window.table_stride = table->shape[0] == 1 ? 0 : window.knots[0] * window.knots[1];
+        fits = (table->shape[0] == 1 || table->shape[0] == window.spheres) &&
+               views[1].len == window.spheres * 3 * (Py_ssize_t)sizeof(double) &&
+               views[2].len == 3 * sizeof(double) && views[3].len == 3 * sizeof(double) &&
+               views[4].len == 2 * sizeof(double) && mask_fits(&window);
+    }
+    if (!fits)
+        return PyErr_Format(PyExc_ValueError, "expected mask (nz, ny, nx), centers (n, 3), voxel "
+                            "(3,), reach (3,), spacing (2,), tables (n or 1, a, b), out (n, 4, "
+                            "voxels of the mask)");
+    size_t pixels = (size_t)(window.shape[1] * window.shape[2]) * sizeof(Pixel);
+    Pixel *memory = malloc(pixels + 2 * (size_t)window.knots[1] * sizeof(double));
+    if (!memory)
+        return PyErr_NoMemory();
+    double *rows = (double *)((char *)memory + pixels);
+    Py_BEGIN_ALLOW_THREADS
+    for (Py_ssize_t i = 0; i < window.spheres; i++)
+        write_spot(&window, window.center + 3 * i, window.table + i * window.table_stride, memory,
+                   rows, window.out + i * 4 * window.count);
+    Py_END_ALLOW_THREADS
+    free(memory);
+    Py_RETURN_NONE;
+}
+
+static PyObject *spots(PyObject *self, PyObject *args)
+{
+    (void)self;
+    PyObject *arrays[7];
+    if (!PyArg_ParseTuple(args, "OOOOOOO", arrays, arrays + 1, arrays + 2, arrays + 3, arrays + 4,
+                          arrays + 5, arrays + 6))
+        return NULL;
+    Py_buffer views[7];
+    int held = PyObject_GetBuffer(arrays[0], &views[0], PyBUF_C_CONTIGUOUS) == 0;
+    while (held > 0 && held < 7 &&
+           doubles(arrays[held], held == 6 ? PyBUF_WRITABLE : 0, &views[held]))
+        held++;
+    PyObject *done = held == 7 ? write_spots(views) : NULL;
+    while (held > 0)
+        PyBuffer_Release(&views[--held]);
+    return done;
+}
+
+PyDoc_STRVAR(spots_doc,
+"spots(mask, centers, voxel, reach, spacing, tables, out)\n--\n\n"
+"Write the images of spheres, and their derivatives by z, y and x, on the voxels of a mask.\n\n"
+"mask (nz, ny, nx) of bytes, centers (n, 3), voxel (3,) and reach (3,) in um, spacing (2,) of the\n"
+"knots of tables (n or 1, a, b) are read, out (n, 4, voxels of the mask) is written.");
+
 static PyMethodDef functions[] = {
     {"wahba", wahba, METH_VARARGS, wahba_doc},
+    {"spots", spots, METH_VARARGS, spots_doc},
     {NULL, NULL, 0, NULL},
 };
 

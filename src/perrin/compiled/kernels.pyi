@@ -8,3 +8,13 @@ def wahba(
     weights: Floats | None,
     /,
 ) -> None: ...
+def spots(
+    mask: Bools,
+    centers: Floats,
+    voxel: Floats,
+    reach: Floats,
+    spacing: Floats,
+    tables: Floats,
+    out: Floats,
+    /,
+) -> None: ...

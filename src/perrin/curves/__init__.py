@@ -67,6 +67,7 @@ from perrin.curves.pairs import (
 from perrin.curves.standard_errors import (
     covariance_polynomials,
     displacement_counts,
+    lag_covariance,
     relative_error,
     squared_shared_times,
     two_lag_fit,
@@ -107,6 +108,7 @@ __all__ = [
     "heat_kernel_moments",
     "independent_walks",
     "lag_bins",
+    "lag_covariance",
     "mean_correlation_powers",
     "mean_square_curve",
     "mean_velocity",

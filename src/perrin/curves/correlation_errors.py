@@ -67,6 +67,10 @@ def product_weights(directions: Floats, *, degrees: tuple[int, int]) -> Floats:
     return np.asarray(np.linalg.lstsq(character / (2 * order + 1), mean, rcond=None)[0])
 
 
+# Covariances below exp(-45) of the largest one are not summed.
+_NO_COVARIANCE = 45.0
+
+
 def correlation_covariance(
     lags: tuple[Floats, Floats],
     *,
@@ -120,9 +124,13 @@ def correlation_covariance(
     weights = np.where(np.abs(weights) > 1e-12, weights, 0.0)
     lengths, times = np.unique(np.asarray(blocks, dtype=np.int64), return_counts=True)
     covariance, b = np.zeros((len(lags[0]), len(lags[1]))), lags[1][:, None]
+    reach = _NO_COVARIANCE / max((first + second) * D, 1e-12)
     for i, a in enumerate(lags[0]):
-        # Start of the second pair less that of the first, wherever they share time or a frame.
-        shift = np.arange(np.floor(-b.max()), np.ceil(a) + 1)
+        # Start of the second pair less that of the first, wherever they share time or a frame, and
+        # the rotation during what they do not share has left a correlation.
+        earliest = max(np.floor(-b.max()), np.floor(min(a - b.max(), 0.0) - reach))
+        latest = min(np.ceil(a), np.ceil(max(a - b.min(), 0.0) + reach))
+        shift = np.arange(earliest, latest + 1)
         overlap = np.maximum(np.minimum(a, b + shift) - np.maximum(0.0, shift), 0.0)
         common = sum(
             (np.abs(shift - at) < 1e-9).astype(float) for at in (0 * b, a - b, a + 0 * b, -b)

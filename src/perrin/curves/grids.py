@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
@@ -58,13 +59,13 @@ class Frames:
     def __post_init__(self) -> None:
         frozen(self.row, self.time, self.piece, self.block, self.slot)
 
-    @property
+    @cached_property
     def blocks(self) -> list[slice]:
         """Slice of the frames that belong to each block."""
         edges = np.flatnonzero(np.diff(self.block, prepend=-1, append=self.block[-1] + 1))
         return [slice(int(a), int(b)) for a, b in pairwise(edges)]
 
-    @property
+    @cached_property
     def lengths(self) -> Ints:
         """Steps from the first to the last frame of each block, shape (B,)."""
         return np.array([int(self.slot[b.stop - 1]) for b in self.blocks], dtype=np.int64)
@@ -117,9 +118,12 @@ def place_frames(time: Floats, piece: Ints, here: Bools, *, dt: float) -> Frames
     rows = np.flatnonzero(here)
     if rows.size < 2:
         raise TooFewFramesError("no two frames in one piece: a pair needs two", rows.size)
-    rows = rows[np.lexsort((time[rows], piece[rows]))]
     t, label = time[rows], piece[rows]
     same = label[1:] == label[:-1]
+    if not (np.all(label[1:] >= label[:-1]) and np.all((t[1:] >= t[:-1]) | ~same)):
+        order = np.lexsort((t, label))
+        rows, t, label = rows[order], t[order], label[order]
+        same = label[1:] == label[:-1]
     first = np.flatnonzero(np.append(True, ~same))
     origin = np.repeat(t[first], np.diff(np.append(first, len(t))))
     place = (t - origin) / dt

@@ -19,6 +19,9 @@ if TYPE_CHECKING:
 # of 1400 frames, which take a second and 200 MB.
 _MOST_LISTED_PAIRS = 1_000_000
 
+# A mean velocity is subtracted from walks of which it makes all but this share of the squares.
+_REST_OF_STEADY_MOTION = 0.01
+
 _PAIRS_IN_MEMORY = 1 << 16  # pairs whose displacements are in memory at once
 
 
@@ -323,29 +326,82 @@ class Squares:
     def within(self, rows: Ints, slots: Ints, count: int) -> tuple[Floats, Ints]:
         """Return the sums by FFT.
 
-        With m the presence, the sum is corr(m x^2, m) + corr(m, m x^2) - 2 corr(m x, m x). The
-        mean is subtracted first: the squares of coordinates far from the origin would lose digits
-        of the displacements.
+        With m the presence, the sum is corr(m x^2, m) + corr(m, m x^2) - 2 corr(m x, m x); where
+        every frame is present, its first two terms are sums of squares up to a frame and from a
+        frame on. The mean is subtracted first: the squares of coordinates far from the origin
+        would lose digits of the displacements. So would those of a fast steady motion, whose mean
+        velocity v is subtracted too: over n steps (x + v n)^2 = x^2 + 2 v n x + v^2 n^2.
         """
         walks = _on_grid(self.walks, rows, slots)
-        here = present(walks)
-        mask = here.astype(np.float64)
-        mean = np.where(here[..., None], walks, 0.0).sum(0) / np.maximum(mask.sum(0), 1)[:, None]
-        x = np.where(here[..., None], walks - mean, 0.0)
+        here = np.ascontiguousarray(present(walks).T)
+        mask = None if here.all() else here.astype(np.float64)
+        lag = np.arange(1.0, count + 1)
         size = fft_size(len(walks) + count)
-        m = np.fft.rfft(mask, size, axis=0)[..., None]
-        f, g = np.fft.rfft(x, size, axis=0), np.fft.rfft(x * x, size, axis=0)
-        spectrum = 2 * np.real(np.conj(m) * g) - 2 * np.abs(f) ** 2
-        sums = np.fft.irfft(spectrum.sum(1), size, axis=0)[1 : count + 1]
-        counts = np.fft.irfft((np.abs(m) ** 2).sum((1, 2)), size)[1 : count + 1]
+        if mask is None:
+            pairs = len(here) * (len(walks) - lag)
+        else:
+            m = np.fft.rfft(mask, size)
+            pairs = np.rint(np.fft.irfft((m.real**2 + m.imag**2).sum(0), size)[1 : count + 1])
+        sums, last = np.empty((walks.shape[2], count)), slice(-2, -2 - count, -1)
+        for total, axis in zip(sums, range(walks.shape[2]), strict=True):
+            x = _centred(walks[..., axis].T, mask)
+            velocity = _dominant_velocity(x, mask)
+            if velocity.any():
+                x = _centred(x - velocity * np.arange(len(walks)), mask)
+            f = np.fft.rfft(x, size)
+            if velocity.any():
+                w = np.fft.rfft(velocity * here, size)
+                along = np.fft.irfft(2j * (np.conj(w) * f).imag.sum(0), size)[1 : count + 1]
+                squared = np.fft.irfft((w.real**2 + w.imag**2).sum(0), size)[1 : count + 1]
+            # In place: memory that is asked for anew costs as much time as the transforms.
+            np.multiply(x, x, out=x)
+            power = f.real**2
+            power += f.imag**2
+            if mask is None:
+                square = x.sum(0) if len(x) > 1 else x[0]
+                up_to = np.cumsum(square)
+                np.copyto(total, up_to[last])
+                total += np.cumsum(square[::-1], out=up_to)[last]
+                power *= -1.0
+            else:
+                g = np.fft.rfft(x, size)
+                np.subtract(m.real * g.real + m.imag * g.imag, power, out=power)
+                total[:] = 0.0
+            spectrum = power.sum(0) if len(x) > 1 else power[0]
+            correlation = np.fft.irfft(spectrum, size)[1 : count + 1]
+            correlation *= 2.0
+            total += correlation
+            if velocity.any():
+                total += 2 * lag * along + lag**2 * squared
+        sums = sums.T
         # A sum of squares that rounds below zero is zero.
-        return np.maximum(sums, 0.0), np.rint(counts).astype(np.int64)
+        return np.maximum(sums, 0.0, out=sums), pairs.astype(np.int64)
 
     def between(self, first: Ints, last: Ints) -> tuple[Floats, Ints]:
         """Return the squared differences of pairs."""
         square = (self.walks[last] - self.walks[first]) ** 2
         here = present(square)
         return np.where(here[..., None], square, 0.0).sum(1), here.sum(1)
+
+
+def _centred(x: Floats, mask: Floats | None) -> Floats:
+    """Return walks (K, T) less their means, 0 where the mask is."""
+    if mask is None:
+        return x - x.mean(1, keepdims=True)
+    walk = np.where(mask > 0, x, 0.0)
+    mean = walk.sum(1, keepdims=True) / np.maximum(mask.sum(1, keepdims=True), 1.0)
+    return (walk - mean) * mask
+
+
+def _dominant_velocity(x: Floats, mask: Floats | None) -> Floats:
+    """Return the slope (K, 1) of walks with mean 0 where it makes most of them, else 0."""
+    time = _centred(np.arange(float(x.shape[1]))[None], None)
+    time = time if mask is None else _centred(np.broadcast_to(time, x.shape), mask)
+    squares = np.maximum((time * time).sum(1), 1.0)
+    slope = np.einsum("kt,kt->k", x, np.broadcast_to(time, x.shape)) / squares
+    # By least squares, those of the walk are those of the slope and those of the rest.
+    dominant = slope**2 * squares > (1 - _REST_OF_STEADY_MOTION) * np.einsum("kt,kt->k", x, x)
+    return np.where(dominant, slope, 0.0)[:, None]
 
 
 class Products:
@@ -368,13 +424,17 @@ class Products:
         values = _on_grid(self.features, rows, slots)
         here = present(values)
         size = fft_size(len(values) + count)
-        f = np.fft.rfft(np.where(here[:, None], values, 0.0).T, size)
-        m = np.fft.rfft(here.astype(np.float64), size)
+        whole = bool(here.all())
+        columns = np.ascontiguousarray(values.T)
+        f = np.fft.rfft(columns if whole else np.where(here, columns, 0.0), size)
         sums = np.empty((count, len(self.groups)))
         for k, group in enumerate(self.groups):
             # The real part is the transform of the mean of a product and its reverse.
             power = sum(f[i].real * f[j].real + f[i].imag * f[j].imag for i, j in group)
             sums[:, k] = np.fft.irfft(power, size)[1 : count + 1]
+        if whole:
+            return sums, len(values) - np.arange(1, count + 1)
+        m = np.fft.rfft(here.astype(np.float64), size)
         pairs = np.fft.irfft(m.real**2 + m.imag**2, size)[1 : count + 1]
         return sums, np.rint(pairs).astype(np.int64)
 
@@ -391,7 +451,8 @@ class Products:
 def _on_grid(values: Floats, rows: Ints, slots: Ints) -> Floats:
     """Return rows of an array at their places on a grid, NaN between them."""
     if len(slots) == slots[-1] + 1:
-        return values[rows]
+        follow = rows[-1] - rows[0] + 1 == len(rows) and bool((np.diff(rows) == 1).all())
+        return values[rows[0] : rows[-1] + 1] if follow else values[rows]
     grid = np.full((int(slots[-1]) + 1, *values.shape[1:]), np.nan)
     grid[slots] = values[rows]
     return grid

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.polynomial.polynomial import polyval
 
 if TYPE_CHECKING:
     from perrin._arrays import Floats, Ints
@@ -14,6 +13,9 @@ if TYPE_CHECKING:
 
 # Starts of displacements are compared as whole numbers below this: exact sums of their squares.
 _INTEGER_RANGE = 1 << 22
+
+
+_CACHED_LAGS = 4096  # lags whose working arrays fit into the second-level cache
 
 
 def relative_error(sums: PairSums, frames: Frames, half: Floats, pairs: Floats) -> Floats:
@@ -51,21 +53,23 @@ def relative_error(sums: PairSums, frames: Frames, half: Floats, pairs: Floats) 
     """
     lag = sums.lagtime / frames.step
     d, s = two_lag_fit(lag, half, pairs)
-    share = np.divide(sums.on_grid, sums.pairs, out=np.zeros_like(half), where=sums.pairs > 0)
-    on_grid = share * pairs
-    steps = np.maximum(np.rint(lag), 1.0)
-    complete = displacement_counts(frames.lengths, steps)
-    present = np.sqrt(
-        np.where((on_grid > 0) & (complete > 0), on_grid / np.maximum(complete, 1), 1.0)
-    )
-    total = np.zeros_like(lag)
-    for length, times in zip(*np.unique(frames.lengths, return_counts=True), strict=True):
-        use = np.flatnonzero((steps <= length) & (on_grid > 0))
-        b, p = steps[use], length + 1 - steps[use]
-        near, far, same = covariance_polynomials(b, int(length), present=present[use], D=d, s=s)
-        own = np.where(b <= p, *(polyval(b, c, tensor=False) for c in (near, far))) + same
-        total[use] += times * own
-    total = np.asarray(total * present**4)
+    total, lengths = np.zeros_like(lag), frames.lengths
+    blocks = [
+        (int(n), int(k)) for n, k in zip(*np.unique(lengths, return_counts=True), strict=True)
+    ]
+    for begin in range(0, len(lag), _CACHED_LAGS):
+        part = slice(begin, begin + _CACHED_LAGS)
+        steps, number = np.maximum(np.rint(lag[part]), 1.0), pairs[part]
+        share = np.zeros_like(steps)
+        np.divide(sums.on_grid[part], sums.pairs[part], out=share, where=sums.pairs[part] > 0)
+        on_grid = share * number
+        complete = displacement_counts(lengths, steps)
+        known = (on_grid > 0) & (complete > 0)
+        present = np.sqrt(np.where(known, on_grid / np.maximum(complete, 1), 1.0))
+        for length, times in blocks:
+            use = np.flatnonzero((steps <= length) & (on_grid > 0))
+            own = lag_covariance(steps[use], length, present=present[use], D=d, s=s)
+            total[part][use] += times * own * present[use] ** 4
     if sums.listed is not None:
         total += _listed_covariances(sums.listed, frames, lag, d=d, s=s)
     mean = 2 * (d * lag + s)
@@ -204,6 +208,43 @@ def squared_shared_times(pairs: ListedPairs, frames: Frames, lag: Floats) -> Flo
     shared += twice[here] - twice[begin]
     square = np.bincount(pairs.lag, shared.astype(np.float64), minlength=len(lag))
     return np.asarray(square / scale**2)
+
+
+def lag_covariance(lag: Floats, steps: int, *, present: Floats, D: float, s: float) -> Floats:
+    """Return S(b, b) of `covariance_polynomials` for rising lags b, without polynomials.
+
+    Parameters
+    ----------
+    lag, steps, present, D, s
+        As in `covariance_polynomials`.
+
+    Returns
+    -------
+    ndarray, shape (L,)
+
+    Examples
+    --------
+    >>> lag_covariance(np.array([1.0, 8.0]), 10, present=np.ones(2), D=0.5, s=0.0)
+    array([ 10., 460.])
+    """
+    gap = 1 / present - 1
+    b, p = lag, steps + 1 - lag
+    squares, noise = 4 * D * D, 2 * s * s
+    middle = int(np.searchsorted(2 * b, steps + 1, side="right"))
+    total = 8 * D * s * p * b + noise * np.maximum(2 * p - b, p)
+    total *= 1 + gap
+    total += 2 * squares * p * gap * b * b
+    near, far = slice(0, middle), slice(middle, None)
+    b, q = lag[near], p[near]
+    total[near] += squares * b * (q / 3 + b / 6 + b * b * (2 * q / 3 - b / 6))
+    b, q = lag[far], p[far]
+    total[far] += squares * q * ((q * q - 1) * (q / 6 - 2 * b / 3) + b * b * q)
+    total += p * noise
+    if gap.any():
+        b = lag
+        same = (gap * gap + 2 * gap) * (2 * D * b + 2 * s) ** 2 - 2 * gap * (2 * D * b + s) ** 2
+        total += p * same
+    return total
 
 
 def covariance_polynomials(

@@ -24,6 +24,14 @@ from perrin.diffusion.decoupling import (
     prediction_errors,
     translation_rotation_correlation,
 )
+from perrin.diffusion.effective_modes import (
+    EffectiveModes,
+    FewModes,
+    NoiseProfile,
+    compress_steps,
+    moment_estimate,
+    ratio_node,
+)
 from perrin.diffusion.estimate import DiffusionEstimate, Found, bare_text, value_text
 from perrin.diffusion.estimators import (
     by_likelihood,
@@ -171,8 +179,11 @@ from perrin.diffusion.tensor_modes import (
     ChainTrack,
     DiagonalModes,
     EvenTracks,
+    FewDiagonalModes,
+    FewModesTrack,
     TensorSlopes,
     covariance_slopes,
+    information,
 )
 from perrin.diffusion.tensor_results import CoupledTensor, DiffusionTensor
 from perrin.diffusion.tensors import (
@@ -213,7 +224,11 @@ __all__ = [
     "DiagonalModes",
     "DiffusionEstimate",
     "DiffusionTensor",
+    "EffectiveModes",
     "EvenTracks",
+    "FewDiagonalModes",
+    "FewModes",
+    "FewModesTrack",
     "Found",
     "GridLags",
     "GroupSlopes",
@@ -226,6 +241,7 @@ __all__ = [
     "Moments",
     "MotionVerdict",
     "Noise",
+    "NoiseProfile",
     "NoisySteps",
     "NoisyVectors",
     "Parameter",
@@ -273,6 +289,7 @@ __all__ = [
     "center_steps",
     "clustering",
     "combined_p",
+    "compress_steps",
     "confined_autocovariance",
     "confined_mean_square",
     "coupled_tensor",
@@ -317,6 +334,7 @@ __all__ = [
     "holm",
     "identity_limits",
     "imposed_symmetry",
+    "information",
     "invariant_basis",
     "judge_motion",
     "judge_sampling",
@@ -329,6 +347,7 @@ __all__ = [
     "long_time_diffusion",
     "maximise",
     "maximise_each",
+    "moment_estimate",
     "motions_and_noise",
     "msd_covariance",
     "neighbour_products",
@@ -346,6 +365,7 @@ __all__ = [
     "prediction_errors",
     "principal_steps",
     "ratio_bend",
+    "ratio_node",
     "relaxation_faults",
     "residual_freedom",
     "root_parameters",

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from perrin.diffusion.effective_modes import FewModes, NoiseProfile
 from perrin.diffusion.step_kernels import (
     LEAST_EIGENVALUE,
     GroupSlopes,
@@ -106,12 +107,17 @@ class Likelihood:
 
     @classmethod
     def of(cls, tracks: Sequence[NoisySteps]) -> Likelihood:
-        """Return the likelihood with the sine transform for even steps, else elimination."""
+        """Return the likelihood: sine modes of even steps, few of long tracks, else elimination."""
         even = [i for i, t in enumerate(tracks) if t.steps.even]
         rest = sorted(set(range(len(tracks))) - set(even))
+        profiles = {i: NoiseProfile.of(tracks[i]) for i in rest}
+        long = {i: one for i, one in profiles.items() if one is not None}
+        rest = [i for i in rest if i not in long]
         found: list[StepKernel] = []
         if even:
             found.append(SineModes.of([tracks[i] for i in even], even))
+        if long:
+            found.append(FewModes.of([tracks[i] for i in long], [*long.values()], [*long]))
         if rest:
             found.append(TridiagonalCovariance.of([tracks[i] for i in rest], rest))
         return cls(tuple(tracks), tuple(found))
@@ -150,14 +156,18 @@ class Likelihood:
         alone = self.own or len(self.tracks) == 1
         return x if alone else np.asarray(x.sum(axis=-1, keepdims=True))
 
-    def sums(self, D: Floats, theta: Floats) -> GroupSlopes:
-        """Evaluate all motions at the D (..., units) and the theta (..., G)."""
+    def sums(self, D: Floats, theta: Floats, *, rough: bool = False) -> GroupSlopes:
+        """Evaluate all motions at the D (..., units) and the theta (..., G).
+
+        `rough` allows an error of 1 %, to find where to search.
+        """
         D = np.broadcast_to(D, theta.shape)
-        if len(self.kernels) == 1:
-            total = self.kernels[0].sums(D, theta)
+        kernels = [kernel.rough if rough else kernel for kernel in self.kernels]
+        if len(kernels) == 1:
+            total = kernels[0].sums(D, theta)
         else:
             total = GroupSlopes(*[np.empty(theta.shape) for _ in GroupSlopes._fields])
-            for kernel in self.kernels:
+            for kernel in kernels:
                 part = kernel.sums(D[..., kernel.groups], theta[..., kernel.groups])
                 for of_all, of_some in zip(total, part, strict=True):
                     of_all[..., kernel.groups] = of_some
@@ -191,11 +201,11 @@ class Likelihood:
         low, high = np.full(shape, _LEAST_LOG_OFFSET), np.full(shape, _MOST_LOG_OFFSET)
         t = np.log(np.maximum(np.broadcast_to(start, shape) / square, 1e-6))
         t = np.minimum(t, _MOST_LOG_OFFSET)
-        some_fixed = bool(fixed.any())
+        some_fixed, rough = bool(fixed.any()), tolerance >= _COARSE_LOG_STEP
         for _ in range(100):
             theta = square * np.exp(t)
             theta = np.where(fixed, self.prior[1], theta) if some_fixed else theta
-            sums = self.sums(D, theta)
+            sums = self.sums(D, theta, rough=rough)
             ratio = log_slope_ratio(sums.rise, sums.fall)
             bend = theta * ratio_bend(sums.rise, sums.fall, sums.rise_oo, sums.fall_oo)
             up = ratio > 0
@@ -256,7 +266,7 @@ class Likelihood:
 
         Only the signs of the slopes, and the value at 0, are used of it.
         """
-        size = sum(t.steps.vectors.size for t in self.tracks)
+        size = sum(kernel.size for kernel in self.kernels)
         powers = np.concatenate([[0.0], 4.0 ** np.arange(-7, 3)])
         at_once = int(np.clip(_MOST_MOTIONS_AT_ONCE / size, 1, len(powers)))
         parts: list[ProfilePoint] = []
@@ -515,14 +525,14 @@ def _squared_deviations(track: NoisySteps, D: float, theta: float) -> tuple[floa
     if not np.all(eigen > 0):
         return 0.0, 0.0
     modes = dst(track.steps.vectors, type=1, norm="ortho", axis=0)
-    powers = modes[:, :, None] * modes[:, None, :]
-    powers -= by_noise[:, None, None] * np.diag(noise - noise.mean())
-    powers -= np.trace(powers, axis1=1, axis2=2)[:, None, None] / axes * np.eye(axes)
     rows = np.stack([by_D, by_noise])
     fisher = np.linalg.inv((rows / eigen) @ (rows / eigen).T)
-    found = np.einsum("kab,pk->pab", powers, fisher @ (rows / eigen**2))
-    deviation = np.einsum("pab,pk->kab", found, rows)
-    chance = (axes - 1) * (axes + 2) * np.einsum("pk,pq,qk->k", rows, fisher, rows)
+    # The deviations of D and of the noise, less what the unequal noise of the axes makes of them.
+    weights = fisher @ (rows / eigen**2)
+    found = np.stack([modes.T @ (one[:, None] * modes) for one in weights])
+    found -= (weights @ by_noise)[:, None, None] * np.diag(noise - noise.mean())
+    found -= np.trace(found, axis1=1, axis2=2)[:, None, None] / axes * np.eye(axes)
+    squares = np.einsum("pab,qab->pq", found, found) - (axes - 1) * (axes + 2) * fisher
     # Weights of the modes in the score of D with theta profiled out.
     score = by_D / eigen**2
     if np.isfinite(track.freedom):
@@ -532,5 +542,6 @@ def _squared_deviations(track: NoisySteps, D: float, theta: float) -> tuple[floa
             np.sum((by_theta / eigen) ** 2) + known_theta
         )
         score = (by_D - shared * by_theta) / eigen**2
-    excess = np.sum(score**2 * (np.sum(deviation**2, axis=(1, 2)) - chance))
+    scored = score * rows
+    excess = np.sum(squares * (scored @ scored.T))
     return float(excess), float(axes * np.sum((score * eigen) ** 2))

@@ -83,6 +83,14 @@ class StepKernel(Protocol):
     def groups(self) -> Ints:
         """Numbers of the motions."""
 
+    @property
+    def size(self) -> int:
+        """Number of terms of one evaluation."""
+
+    @property
+    def rough(self) -> StepKernel:
+        """The same likelihood to 1 %, where that is faster."""
+
     def sums(self, D: Floats, theta: Floats) -> GroupSlopes:
         """Evaluate all motions at the D and the theta of each, (..., G)."""
 
@@ -186,6 +194,16 @@ class SineModes:
         if squares:
             steady = np.concatenate(squares, axis=-1), np.concatenate(products, axis=-1)
         return cls(np.array(groups), starts, which, power, count, by_D, by_theta, given, steady)
+
+    @property
+    def size(self) -> int:
+        """Number of modes of all axes."""
+        return round(float(self.count.sum()))
+
+    @property
+    def rough(self) -> StepKernel:
+        """The same object."""
+        return self
 
     @cached_property
     def slope_columns(self) -> Floats:
@@ -414,6 +432,16 @@ class TridiagonalCovariance:
             known=(noise(lambda t: t.known[0]), noise(lambda t: t.known[1])),
             steady=steady,
         )
+
+    @property
+    def size(self) -> int:
+        """Number of steps along all axes."""
+        return round(float(self.count.sum()))
+
+    @property
+    def rough(self) -> StepKernel:
+        """The same object."""
+        return self
 
     def repeated(self, count: int) -> TridiagonalCovariance:
         """Return the same motions `count` times over, to evaluate as many D and theta at once."""

@@ -111,12 +111,13 @@ class Steps:
     @cached_property
     def even(self) -> bool:
         """Whether all steps are linked, equally long and equally noisy."""
+        same_time = np.ptp(self.duration) <= _EVEN_STEPS * self.duration[0]
+        if not (same_time and self.linked[:-1].all()):
+            return False
         ends = np.zeros(self.noise.shape[1], dtype=np.bool_)
         ends[self.start] = ends[self.stop] = True
         noise = self.noise[:, ends]
-        same_noise = np.ptp(noise, axis=1).max() <= _EVEN_STEPS * np.abs(noise).max()
-        same_time = np.ptp(self.duration) <= _EVEN_STEPS * self.duration[0]
-        return bool(same_time and same_noise and self.linked[:-1].all())
+        return bool(np.ptp(noise, axis=1).max() <= _EVEN_STEPS * np.abs(noise).max())
 
     def without_steady_motion(self, *, kept: Bools | None = None) -> tuple[Steps, Floats]:
         """Return the steps less their least-squares steady motion, and that motion (p,).
@@ -270,13 +271,18 @@ def _computed_steps(motion: RigidMotion, quantity: Quantity) -> Steps:
     if quantity == "rotation":
         covariance = unit_covariance(motion)
         values, axes = np.linalg.eigh(np.mean(covariance[complete], axis=0))
-        noise = np.einsum("ji,tjk,ki->ti", axes, covariance, axes)
+        turned = (covariance.reshape(-1, len(axes)) @ axes).reshape(covariance.shape)
+        noise = np.einsum("ji,tji->ti", axes, turned)
         apart = np.diff(values) > _EQUALLY_NOISY_AXES * values[1:]
         for group in np.split(np.arange(len(values)), 1 + np.flatnonzero(apart)):
-            noise[np.ix_(complete, group)] = noise[np.ix_(complete, group)].mean(axis=1)[:, None]
+            alike = noise[:, group].mean(axis=1)
+            for axis in group if len(group) > 1 else ():
+                noise[complete, axis] = alike[complete]
         vectors = motion.step_vectors()[stop - 1] @ axes
         # A spin of the lab moves the body by R^T of it; in the plane both are one number.
-        turned = motion.rotation[start] @ axes if len(axes) == 3 else np.ones((len(start), 1, 1))
+        turned = np.ones((len(start), 1, 1))
+        if len(axes) == 3:
+            turned = (motion.rotation[start].reshape(-1, 3) @ axes).reshape(-1, 3, 3)
         steady = np.swapaxes(turned, -1, -2) * duration[:, None, None]
     else:
         vectors = motion.center[stop] - motion.center[start]

@@ -8,9 +8,11 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from perrin.diffusion.effective_modes import LEAST_STEPS
 from perrin.diffusion.tensor_modes import (
     ChainTrack,
     EvenTracks,
+    FewModesTrack,
     TensorSlopes,
     covariance_slopes,
 )
@@ -37,6 +39,9 @@ LEAST_BLUR = 0.1
 # the second number is hidden by rounding, and steps are accepted without it.
 CONVERGED_GAIN, ROUNDING_GAIN = 1e-17, 1e-9
 
+# Newton steps along a ridge: their number, the part of the way to an edge, and the least gain.
+_MOST_STRAIGHT_STEPS, _TOWARDS_EDGE, _STRAIGHT_GAIN = 50, 0.95, 1e-6
+
 # Frames are equally noisy if the elements of their noise agree to this.
 _EQUALLY_NOISY_FRAMES = 1e-9
 
@@ -62,12 +67,16 @@ class NoisyVectors:
         Degrees of freedom of that measurement; 0 for a guess, inf where they are known.
     B : float or None
         Blur coefficient, exposure/6; None where it is unknown.
+    window : tuple of float or None
+        Ratios of noise to motion at which the few modes of a long uneven track are exact; those
+        about an estimate from moments if None, and no such modes if empty.
     """
 
     steps: Steps
     theta: Floats
     freedom: float
     B: float | None
+    window: tuple[float, ...] | None = None
 
     def start(self) -> Floats:
         """Return the free parameters of the noise to start from: square roots, then an angle."""
@@ -122,11 +131,6 @@ class NoisyVectors:
         return offset
 
     @cached_property
-    def even_track(self) -> EvenTracks:
-        """The steps in their sine modes, where they are even."""
-        return EvenTracks.of([self.steps])
-
-    @cached_property
     def chain_track(self) -> ChainTrack | None:
         """The steps as chains along common axes; None where frames are not equally noisy."""
         s = self.steps
@@ -137,10 +141,31 @@ class NoisyVectors:
             return None
         return ChainTrack(s, noise[:, 0])
 
+    @cached_property
+    def mode_track(self) -> EvenTracks | FewModesTrack | None:
+        """The steps as modes: sine modes of even ones, few modes of a long track; else None."""
+        if self.steps.even:
+            return EvenTracks.of([self.steps])
+        few = self.window is None or len(self.window) == 2
+        if not few or len(self.steps.vectors) < LEAST_STEPS or self.chain_track is None:
+            return None
+        shapes = self.chain_track.shapes
+        noise = None if self.freedom == 0 else np.tensordot(self.theta, shapes, 1)
+        window = None if self.window is None else (self.window[0], self.window[1])
+        return FewModesTrack.of(self.steps, shapes, noise, window=window)
+
+    def places(self, D: Floats, own: Floats) -> Floats | None:
+        """Return the ratios of noise to motion along the axes (b,) where few modes are used."""
+        track = self.mode_track
+        if not isinstance(track, FewModesTrack):
+            return None
+        theta, B = self.amplitudes(own[None])
+        return np.asarray(track.diagonal(D[None], theta, B).places[0])
+
     def by_tensor(self, D: Floats, theta: Floats, B: Floats) -> TensorSlopes:
         """Return the log-likelihood and its derivatives at P points; -inf where not defined."""
-        if self.steps.even:
-            return self.by_sines(D, theta, B)
+        if self.mode_track is not None:
+            return self.by_modes(D, theta, B)
         if len(D) == 1:
             if self.chain_track is None:
                 return self.by_bands(D[0], theta[0], float(B[0]))
@@ -153,9 +178,13 @@ class NoisyVectors:
         ]
         return TensorSlopes(*(np.concatenate(rows) for rows in zip(*points, strict=True)))
 
-    def by_sines(self, D: Floats, theta: Floats, B: Floats) -> TensorSlopes:
-        """Evaluate even steps in their sine modes."""
-        track = self.even_track
+    def by_modes(self, D: Floats, theta: Floats, B: Floats) -> TensorSlopes:
+        """Evaluate steps as modes: even ones, or long tracks with equally noisy frames."""
+        track = self.mode_track
+        if isinstance(track, EvenTracks):
+            return track.slopes(D, B, track.diagonal(D, theta, B))
+        if track is None:
+            raise ValueError("these steps are neither even nor a long track with equal noise")
         return track.slopes(D, B, track.diagonal(D, theta, B))
 
     def band_curvatures(self, E: Floats, D: Floats, theta: Floats, B: float) -> Floats:
@@ -201,20 +230,47 @@ class NoisyVectors:
             return np.full((len(E) + len(theta) + 1,) * 2, np.nan)
         return self.chain_track.curvatures(E, D, B, chains)
 
+    def noise_turns(self, own: Floats) -> tuple[Floats, Floats]:
+        """Return the derivatives of the amplitudes and B by their parameters, first and second."""
+        first, second = 2 * own, np.full(len(own), 2.0)
+        if self.B is None:
+            first[-1] = MOST_BLUR * np.sin(2 * own[-1])
+            second[-1] = 2 * MOST_BLUR * np.cos(2 * own[-1])
+        return first, second
+
     def curvatures(self, D: Floats, slopes: Floats, bends: Floats, own: Floats) -> Floats:
         """Return minus the Hessian by the parameters of D and of the noise, (m + c, m + c).
 
         `slopes` (m, b, b) and `bends` (m, m, b, b) are the derivatives of D by its parameters, and
-        `own` (c,) the free parameters of the noise. For steps that are not even the second
+        `own` (c,) the free parameters of the noise. Where steps are not modes the second
         derivatives by the covariance are the average of observed and expected information.
+        """
+        full, by_noise = self.straight_curvatures(D, slopes, bends, own)
+        first, second = self.noise_turns(own)
+        turn = np.append(np.ones(len(slopes)), first)
+        full *= turn[:, None] * turn
+        noise = np.arange(len(slopes), len(turn))
+        full[noise, noise] -= second * by_noise
+        return full
+
+    def straight_curvatures(
+        self, D: Floats, slopes: Floats, bends: Floats, own: Floats
+    ) -> tuple[Floats, Floats]:
+        """Return what `curvatures` does by the noise amplitudes and B themselves, and their slopes.
+
+        The slopes are (c,).
         """
         theta, B = self.amplitudes(own[None])
         m, r = len(slopes), len(self.theta)
-        if self.steps.even:
-            track = self.even_track
-            modes = track.diagonal(D[None], theta, B)
-            found = track.slopes(D[None], B, modes)
-            full = track.curvatures(slopes[None], D[None], B, modes)[0]
+        track = self.mode_track
+        if isinstance(track, EvenTracks):
+            even = track.diagonal(D[None], theta, B)
+            found = track.slopes(D[None], B, even)
+            full = track.curvatures(slopes[None], D[None], B, even)[0]
+        elif track is not None:
+            few = track.diagonal(D[None], theta, B)
+            found = track.slopes(D[None], B, few)
+            full = track.curvatures(slopes[None], D[None], B, few)[0]
         else:
             found = self.by_tensor(D[None], theta, B)
             full = self.uneven_curvatures(slopes, D, theta[0], float(B[0]))
@@ -223,24 +279,17 @@ class NoisyVectors:
         mixed = 2 * self.steps.dt * np.tensordot(slopes, found.noise[0], 2)
         full[:m, -1] += mixed
         full[-1, :m] += mixed
-        kept, turn = list(range(m)), np.ones(m + r + 1)
-        amplitudes, by_theta = np.arange(m, m + r), found.theta[0]
+        kept, by_noise = list(range(m)), []
         if np.isfinite(self.freedom):
             _, slope, bend = self.measurement(theta[0])
-            by_theta = by_theta + slope
+            amplitudes = np.arange(m, m + r)
             full[amplitudes, amplitudes] -= bend
             kept += amplitudes.tolist()
-            turn[m : m + r] = 2 * own[:r]
+            by_noise += (found.theta[0] + slope).tolist()
         if self.B is None:
             kept.append(m + r)
-            turn[-1] = MOST_BLUR * np.sin(2 * own[-1])
-        full *= turn[:, None] * turn
-        if np.isfinite(self.freedom):
-            full[amplitudes, amplitudes] -= 2 * by_theta
-        if self.B is None:
-            twice = 2 * MOST_BLUR * np.cos(2 * own[-1])
-            full[-1, -1] -= (found.B[0] - LEAST_BLUR) * twice
-        return np.asarray(full[np.ix_(kept, kept)])
+            by_noise.append(float(found.B[0]) - LEAST_BLUR)
+        return np.asarray(full[np.ix_(kept, kept)]), np.array(by_noise)
 
     def by_bands(self, D: Floats, theta: Floats, B: float) -> TensorSlopes:
         """Evaluate any steps at one point by banded Cholesky factors of their covariance.
@@ -420,9 +469,12 @@ class Maximum(NamedTuple):
 def maximise(tracks: Sequence[NoisyVectors], family: Family, q: Floats, own: Floats) -> Maximum:
     """Return the maximum over a family of D, common to all, and over the noise of each motion.
 
-    The search is quasi-Newton (BFGS) and begins with the Hessian, with the average information in
-    it where steps are not even; it is computed again where no step increases the likelihood, and
-    after every 30 steps. The search ends at a root of the slopes.
+    Where the steps are modes the search begins with Newton steps by the noise amplitudes and the
+    blur themselves: noise and blur may have nearly the same effect, and the narrow ridge of the
+    likelihood is straight in these. Then it is quasi-Newton (BFGS), by their square roots and an
+    angle, and begins with the Hessian, with the average information in it where steps are not
+    modes; it is computed again where no step increases the likelihood, and after every 30 steps.
+    The search ends at a root of the slopes.
 
     Examples
     --------
@@ -438,6 +490,8 @@ def maximise(tracks: Sequence[NoisyVectors], family: Family, q: Floats, own: Flo
     problem = PooledLikelihood(tracks, family, len(q), own.shape)
     p = np.concatenate([q, own.ravel()])
     value, slope = problem.slopes(p)
+    if all(t.mode_track is not None for t in tracks):
+        p, value, slope = problem.climbed(p, value, slope)
     for _ in range(20):
         inverse = problem.curvatures(p).inverse()
         for _ in range(30):
@@ -546,19 +600,51 @@ class PooledLikelihood:
                 return p + part * step, new_value, slope
         return None
 
+    def climbed(self, p: Floats, value: float, slope: Floats) -> tuple[Floats, float, Floats]:
+        """Return a higher point with its value and slopes, by Newton steps while they gain.
+
+        Steps are by the parameters of D, the noise amplitudes and the blur; they go at most this
+        part of the way to the edges of the latter, which the search that follows reaches.
+        """
+        for _ in range(_MOST_STRAIGHT_STEPS):
+            tensors, m, own = self.family(p[: self.m]), self.m, p[self.m :].reshape(self.shape)
+            pairs = list(zip(self.tracks, own, strict=True))
+            parts = [t.straight_curvatures(*tensors, one) for t, one in pairs]
+            found = np.array([full for full, _ in parts])
+            hessian = ArrowHessian(found[:, :m, :m].sum(axis=0), found[:, :m, m:], found[:, m:, m:])
+            by_noise = np.array([one for _, one in parts])
+            step = hessian.inverse() @ np.append(slope[:m], by_noise)
+            change = step[m:].reshape(self.shape)
+            blurred = self.tracks[0].B is None
+            size, most = own**2, np.full(self.shape, np.inf)
+            if blurred:
+                size[:, -1], most[:, -1] = MOST_BLUR * np.sin(own[:, -1]) ** 2, MOST_BLUR
+            with np.errstate(divide="ignore", invalid="ignore"):
+                room = np.where(change < 0, -size / change, (most - size) / change)
+            part = min(1.0, _TOWARDS_EDGE * float(np.min(room, initial=np.inf, where=change != 0)))
+            size = np.sqrt(size + part * change)
+            if blurred:
+                size[:, -1] = np.arcsin(size[:, -1] / np.sqrt(MOST_BLUR))
+            trial = np.append(p[:m] + part * step[:m], size)
+            new, new_slope = self.slopes(trial)
+            if not new > value + _STRAIGHT_GAIN:
+                break
+            p, value, slope = trial, new, new_slope
+        return p, value, slope
+
     def curvatures(self, p: Floats) -> ArrowHessian:
-        """Return minus the Hessian, with the average information of steps that are not even."""
+        """Return minus the Hessian, with the average information of steps that are not modes."""
         tensors, m = self.family(p[: self.m]), self.m
         own = p[m:].reshape(self.shape)
         found = np.array([t.curvatures(*tensors, o) for t, o in zip(self.tracks, own, strict=True)])
         return ArrowHessian(found[:, :m, :m].sum(axis=0), found[:, :m, m:], found[:, m:, m:])
 
     def hessian(self, p: Floats) -> ArrowHessian:
-        """Return minus the Hessian, by central differences where the steps are not even.
+        """Return minus the Hessian, by central differences where the steps are not modes.
 
         The noise of one motion does not enter the slopes of the others, so all change at once.
         """
-        if all(t.steps.even for t in self.tracks):
+        if all(t.mode_track is not None for t in self.tracks):
             return self.curvatures(p)
         count, c = self.shape
         one, other = np.eye(self.m, len(p)), np.zeros((c, len(p)))

@@ -1,6 +1,7 @@
 """Likelihoods of steps with tensors D whose frames are equally noisy, in axes that diagonalise D.
 
-Even steps are taken to their sine modes, those of many motions at once; other steps are a chain.
+Even steps are taken to their sine modes, those of many motions at once; long uneven tracks to a few
+modes with the same likelihood; other steps are a chain.
 
 Mode k of the sine transform of even steps has covariance 2 D tau + w_k O, w_k = 2 (1 - cos w), and
 all modes are diagonal in the axes that diagonalise D against 2 D tau + 2 O.
@@ -13,12 +14,14 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from perrin.diffusion.effective_modes import WINDOW, compress_steps, moment_estimate
 from perrin.diffusion.step_kernels import difference_eigenvalues
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from perrin._arrays import Bools, Floats, Ints
+    from perrin.diffusion.effective_modes import EffectiveModes
     from perrin.diffusion.steps import Steps
 
 
@@ -189,21 +192,211 @@ class EvenTracks:
         pairs = (q[..., None] * q[:, :, None]).reshape(points, -1, b * b)
         power = (np.swapaxes(pairs, 1, 2) @ weights).reshape(points, b, b, 3, b)
         trace = (np.swapaxes(inverse, 1, 2) @ weights).reshape(points, b, 3, b)
+        return information(same, next_one, power, trace)
 
-        def form(k: int, left: Floats, right: Floats) -> Floats:
-            # (c, a, b) times (c, b, j): sum over b of q_a q_b V_c X_j[c, b]
-            turned = np.moveaxis(power[:, :, :, k], 3, 1) @ np.moveaxis(right, 1, 3)
-            turned = np.moveaxis(turned, 3, 1)  # (j, c, a)
-            turned = np.swapaxes(turned, 2, 3) - 0.5 * trace[:, None, :, k] * np.swapaxes(
-                right, 2, 3
-            )
-            count = left.shape[1]
-            flat = turned.reshape(points, count, -1)
-            return np.asarray(left.reshape(points, count, -1) @ np.swapaxes(flat, 1, 2))
 
-        mixed = form(1, same, next_one)
-        total = form(0, same, same) + mixed + np.swapaxes(mixed, 1, 2)
-        return np.asarray(total + form(2, next_one, next_one))
+class FewDiagonalModes(NamedTuple):
+    """The effective modes of a track at P points, in the axes that diagonalise all of them.
+
+    Attributes
+    ----------
+    axes : ndarray, shape (P, b, b)
+        Those axes as columns, not of unit length.
+    variance, inverse : ndarray, shape (P, K, b)
+        Variances of the K modes along them, and one over these.
+    scaled : ndarray, shape (P, K, b, b)
+        Products of amplitudes along them over both variances.
+    log_det : ndarray, shape (P,)
+        Logarithm of the determinant of a covariance.
+    undefined : ndarray of bool, shape (P,)
+        Whether the covariance is not positive definite.
+    places : ndarray, shape (P, b)
+        Ratio of noise to motion along the axes, as the window of the modes counts it.
+    """
+
+    axes: Floats
+    variance: Floats
+    inverse: Floats
+    scaled: Floats
+    log_det: Floats
+    undefined: Bools
+    places: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class FewModesTrack:
+    """A long track with equally noisy frames as effective modes of covariance d_k D + w_k O.
+
+    Attributes
+    ----------
+    modes : EffectiveModes
+        Modes of the pair A = 2 tau - lift W and W, the second difference: d_k = motion + lift w_k.
+    lift : float
+        Half the shortest step, in units of time: the noise less its blur is at least -lift D.
+    shapes : ndarray, shape (r, b, b)
+        Noise covariances of a frame for an amplitude of 1.
+    dt : float
+        Time between frames.
+    count : int
+        Number of steps.
+    """
+
+    modes: EffectiveModes
+    lift: float
+    shapes: Floats
+    dt: float
+    count: int
+
+    @classmethod
+    def of(
+        cls,
+        steps: Steps,
+        shapes: Floats,
+        noise: Floats | None,
+        *,
+        window: tuple[float, float] | None = None,
+    ) -> FewModesTrack:
+        """Compress the steps; the noise of a frame (b, b) is estimated from moments if not given.
+
+        The modes are exact about these estimates, or in the window of `places` that is given.
+        """
+        tau, linked = steps.duration, steps.linked[:-1].astype(np.float64)
+        lift, scale = 0.5 * float(tau.min()), float(tau.mean())
+        if window is None:
+            D, offset = moment_estimate(steps)
+            values, axes = np.linalg.eigh(D)
+            root = axes / np.sqrt(np.maximum(values, 0.02 * np.abs(values).max()))
+            ratio = np.linalg.eigvalsh(root.T @ (offset if noise is None else noise) @ root) + lift
+            places = np.log(np.maximum(ratio / scale, 1e-4))
+            window = float(places.min()) - WINDOW, float(places.max()) + WINDOW
+        return cls(
+            compress_steps(
+                steps.vectors,
+                (2 * (tau - lift), lift * linked),
+                (np.full(len(tau), 2.0), -linked),
+                scale=scale,
+                window=window,
+            ),
+            lift,
+            shapes,
+            steps.dt,
+            len(tau),
+        )
+
+    def exact(self, places: Floats) -> bool:
+        """Return whether the modes are exact at all of these log ratios of noise to motion."""
+        low, high = self.modes.window
+        return bool(np.all((places >= low) & (places <= high) | (places == np.inf)))
+
+    @property
+    def motion(self) -> Floats:
+        """Weight d of the motion in every mode, (K,)."""
+        return np.asarray(self.modes.motion + self.lift * self.modes.noise)
+
+    def diagonal(self, D: Floats, theta: Floats, B: Floats) -> FewDiagonalModes:
+        """Return the modes in the axes that diagonalise all of them, at P points."""
+        modes, scale = self.modes, self.modes.scale
+        lifted = (self.lift - 2 * B * self.dt)[:, None, None] * D
+        noise = np.einsum("pr,rab->pab", theta, self.shapes) + lifted
+        values, turn = np.linalg.eigh(scale * D + noise)
+        undefined = ~(values[:, 0] > 0)
+        if undefined.any():
+            values = np.where(undefined[:, None], 1.0, values)
+        root = turn / np.sqrt(values)[:, None]
+        share, turn = np.linalg.eigh(np.swapaxes(root, 1, 2) @ (scale * D) @ root)
+        axes = root @ turn
+        of_noise = 1 - share
+        variance = share[:, None] * (modes.motion / scale)[:, None]
+        variance = variance + of_noise[:, None] * modes.noise[:, None]
+        undefined |= ~(variance.min(axis=(1, 2)) > 0)
+        variance = np.where(undefined[:, None, None], 1.0, variance)
+        inverse, turned = 1 / variance, axes[:, None]
+        scaled = np.swapaxes(turned, 2, 3) @ modes.power @ turned
+        scaled = scaled * (inverse[..., None] * inverse[:, :, None])
+        log_det = self.count * np.log(values).sum(axis=1) + len(self.shapes[0]) * modes.log_det
+        log_det = log_det + np.log(variance).sum(axis=2) @ modes.count
+        with np.errstate(divide="ignore", invalid="ignore"):
+            places = np.log(of_noise / share)
+        return FewDiagonalModes(axes, variance, inverse, scaled, log_det, undefined, places)
+
+    def slopes(self, D: Floats, B: Floats, modes: FewDiagonalModes) -> TensorSlopes:
+        """Return the log-likelihoods and their derivatives at the points of these modes."""
+        axes, back = modes.axes, np.swapaxes(modes.axes, 1, 2)
+        weights = np.stack([self.motion, self.modes.noise])
+        points, K, b = modes.inverse.shape
+        sums = (weights @ modes.scaled.reshape(points, K, b * b)).reshape(points, 2, b, b)
+        kept = np.arange(b)
+        sums[:, :, kept, kept] -= (weights * self.modes.count) @ modes.inverse
+        moved, weighted = (axes @ sums[:, j] @ back for j in (0, 1))
+        form = np.einsum("pkaa,pka->p", modes.scaled, modes.variance)
+        found = TensorSlopes(
+            -0.5 * (modes.log_det + form),
+            0.5 * moved - (B * self.dt)[:, None, None] * weighted,
+            0.5 * np.einsum("jab,pab->pj", self.shapes, weighted),
+            -self.dt * (weighted * D).sum(axis=(1, 2)),
+            0.5 * weighted,
+        )
+        found.lose(modes.undefined)
+        return found
+
+    def curvatures(self, E: Floats, D: Floats, B: Floats, modes: FewDiagonalModes) -> Floats:
+        """Return minus the second derivatives along E (P, m, b, b), in theta and in B.
+
+        As `EvenTracks.curvatures`, with the slopes X_i = d_k A_i + w_k N_i of mode k.
+        """
+        points, m, b = E.shape[:3]
+        _, of_noise = covariance_slopes(E, D, B, np.full(points, self.dt))
+        none = np.zeros((points, len(self.shapes) + 1, b, b))
+        of_D = np.concatenate([E, none], axis=1)
+        shapes = np.broadcast_to(self.shapes, (points, *self.shapes.shape))
+        next_one = np.concatenate([of_noise[:, :m], shapes, of_noise[:, m:]], axis=1)
+        axes, inverse = modes.axes[:, None], modes.inverse
+        of_D, next_one = (np.swapaxes(axes, 2, 3) @ x @ axes for x in (of_D, next_one))
+        d, w = self.motion, self.modes.noise
+        powers = np.stack([d * d, d * w, w * w], axis=1)
+        weights = (inverse[:, :, None] * powers[:, :, None]).reshape(points, -1, 3 * b)
+        pairs = modes.scaled.reshape(points, -1, b * b)
+        counted = np.swapaxes(inverse * self.modes.count[:, None], 1, 2)
+        return information(
+            of_D,
+            next_one,
+            (np.swapaxes(pairs, 1, 2) @ weights).reshape(points, b, b, 3, b),
+            (counted @ weights).reshape(points, b, 3, b),
+        )
+
+
+def information(same: Floats, next_one: Floats, power: Floats, trace: Floats) -> Floats:
+    """Return minus the second derivatives of a log-likelihood from sums over its modes.
+
+    Parameters
+    ----------
+    same, next_one : ndarray, shape (P, m, b, b)
+        Slopes of the covariances of the modes: those of the motion and those of the noise.
+    power : ndarray, shape (P, b, b, 3, b)
+        Sums of q_a q_b V_c, weighted for two slopes of motion, one of each, and two of noise.
+    trace : ndarray, shape (P, b, 3, b)
+        The same sums of V_a V_c.
+
+    Examples
+    --------
+    >>> one = np.ones((1, 1, 1, 1))
+    >>> information(one, one, 2 * np.ones((1, 1, 1, 3, 1)), np.ones((1, 1, 3, 1)))
+    array([[[6.]]])
+    """
+    points = len(power)
+
+    def form(k: int, left: Floats, right: Floats) -> Floats:
+        # (c, a, b) times (c, b, j): sum over b of q_a q_b V_c X_j[c, b]
+        turned = np.moveaxis(power[:, :, :, k], 3, 1) @ np.moveaxis(right, 1, 3)
+        turned = np.moveaxis(turned, 3, 1)  # (j, c, a)
+        turned = np.swapaxes(turned, 2, 3) - 0.5 * trace[:, None, :, k] * np.swapaxes(right, 2, 3)
+        count = left.shape[1]
+        flat = turned.reshape(points, count, -1)
+        return np.asarray(left.reshape(points, count, -1) @ np.swapaxes(flat, 1, 2))
+
+    mixed = form(1, same, next_one)
+    total = form(0, same, same) + mixed + np.swapaxes(mixed, 1, 2)
+    return np.asarray(total + form(2, next_one, next_one))
 
 
 def covariance_slopes(E: Floats, D: Floats, B: Floats, dt: Floats) -> tuple[Floats, Floats]:

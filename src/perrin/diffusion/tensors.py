@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple, get_args
 import numpy as np
 
 from perrin._arrays import choice_fault, refuse
+from perrin.diffusion.effective_modes import WINDOW
 from perrin.diffusion.estimate import UNITS
 from perrin.diffusion.noise_model import Noise, noise_faults
 from perrin.diffusion.steps import Quantity, body_steps
@@ -27,6 +28,7 @@ from perrin.diffusion.tensor_likelihood import (
     spread,
     squares,
 )
+from perrin.diffusion.tensor_modes import FewModesTrack
 from perrin.diffusion.tensor_results import (
     EQUAL_AXES_ERROR,
     NO_ERRORS,
@@ -54,6 +56,9 @@ _NOISELESS = 1e-8
 
 # About this many step components are evaluated at once; more do not stay in the processor's cache.
 _MOST_TENSORS_AT_ONCE = 30_000
+
+# Beyond this log ratio of noise to motion one of the two is as good as none.
+_FARTHEST = 20.0
 
 _ISOTROPIC = np.eye(3)[None] / 3**0.5
 
@@ -288,6 +293,9 @@ def coupled_tensor(
     data = ScaledTracks.of([body_steps(motion, "both", np.eye(3))], Noise())
     basis = symmetric_basis(6)
     best = data.fit(basis)
+    while (closer := data.reaching([best])) is not None:
+        data = closer
+        best = data.fit(basis)
     elements = [(i, j) for i in range(6) for j in range(i + 1)]
     tensor = data.in_units(best.D)
     covariance = data.covariance(spread(data.tracks, best, basis), elements)
@@ -533,6 +541,25 @@ class ScaledTracks:
         ]
         return max(found, key=lambda m: m.value)
 
+    def reaching(self, maxima: Sequence[Maximum]) -> ScaledTracks | None:
+        """Return the tracks with few modes that are exact at these maxima; None if they all are."""
+        tracks, exact = [], True
+        for k, track in enumerate(self.tracks):
+            places = [track.places(m.D, m.own[k]) for m in maxima]
+            known = [one for one in places if one is not None]
+            if not known:
+                tracks.append(track)
+                continue
+            low, high = float(np.min(known)), float(np.max(known))
+            few = track.mode_track
+            if isinstance(few, FewModesTrack) and few.exact(np.stack(known)):
+                tracks.append(track)
+                continue
+            exact = False
+            window = (max(low, -_FARTHEST) - WINDOW, min(high, _FARTHEST) + WINDOW)
+            tracks.append(replace(track, window=() if track.window is not None else window))
+        return None if exact else replace(self, tracks=tracks)
+
     def in_units(self, D: Floats) -> Floats:
         """Return a tensor in um, rad and s."""
         out: Floats = D * np.outer(self.scale, self.scale) / self.time
@@ -646,8 +673,11 @@ def _one_fit(data: ScaledTracks, basis: Floats) -> TensorFit:
     isotropic = data.fit(_ISOTROPIC, near=free)
     known = {6: free, 1: isotropic}  # by the number of tensors that span what the symmetry allows
     best = known[len(basis)] if len(basis) in known else data.fit(basis, near=free)
-    spreads = spread(data.tracks, best, basis)
     axially = data.fit_axial(free)
+    closer = data.reaching([free, isotropic, best, axially])
+    if closer is not None:
+        return _one_fit(closer, basis)
+    spreads = spread(data.tracks, best, basis)
     return TensorFit.tested(data, best, spreads, free=free, isotropic=isotropic, axial=axially)
 
 

@@ -18,6 +18,7 @@ from perrin.images.formats.contents import (
     summed,
 )
 from perrin.images.formats.deltavision import deltavision
+from perrin.images.formats.directories import check_directories
 from perrin.images.formats.folders import name_counters, sequence, sequence_files
 from perrin.images.formats.headers import (
     HeaderScale,
@@ -33,6 +34,7 @@ from perrin.images.formats.headers import (
     stk_scale,
     tiff_kind,
 )
+from perrin.images.formats.isolation import guarded, serve
 from perrin.images.formats.olympus import olympus, olympus_scale
 from perrin.images.formats.tiff import (
     DeclaredSeries,
@@ -248,6 +250,7 @@ __all__ = [
     "box_around",
     "brightness_parameters",
     "channel_index",
+    "check_directories",
     "check_search",
     "choose_method",
     "chosen",
@@ -288,6 +291,7 @@ __all__ = [
     "group_columns",
     "groups_and_crowds",
     "groups_to_fit",
+    "guarded",
     "hdf5",
     "header_scale",
     "held_out_misfit",
@@ -347,6 +351,7 @@ __all__ = [
     "saturated_share",
     "sequence",
     "sequence_files",
+    "serve",
     "settled_image",
     "size_faults",
     "size_spread",

@@ -18,8 +18,10 @@ from perrin.errors import FrameError, PrecisionWarning
 from perrin.images.formats.arrays import array_contents
 from perrin.images.formats.contents import Contents, Pick, needed, strange_lengths, summed
 from perrin.images.formats.folders import sequence, sequence_files
+from perrin.images.formats.isolation import SWITCH, guarded
 from perrin.images.formats.tiff import tiff
 from perrin.images.formats.vendors import WAY_OUT, vendor
+from perrin.tracks.file_limits import refuse_oversize
 from perrin.tracks.writing import written_whole
 
 if TYPE_CHECKING:
@@ -102,8 +104,10 @@ class Stack:
 
     @property
     def path(self) -> Path | None:
-        """The file, folder or glob that is read; None for a stack in memory."""
-        return Path(self.read.path) if isinstance(self.read, _FileFrames) else None
+        """The file, folder or glob that is read; None for an address and a stack in memory."""
+        if not isinstance(self.read, _FileFrames) or "://" in self.read.path:
+            return None
+        return Path(self.read.path)
 
     @property
     def choice(self) -> dict[str, int | str | list[int] | None]:
@@ -211,7 +215,8 @@ def open_stack(
     path : str, path or array_like
         TIFF, OME-TIFF, ImageJ hyperstack, a folder or glob of TIFF files (in the order of the
         numbers in their names); Leica ``.lif``, Nikon ``.nd2``, Zeiss ``.czi`` and ``.lsm``,
-        Olympus ``.oib``, DeltaVision ``.dv``, Imaris ``.ims``, OME-Zarr, ``.npy``, ``.h5``; or an
+        Olympus ``.oib``, DeltaVision ``.dv``, Imaris ``.ims``, OME-Zarr (also an address that
+        fsspec reads, such as ``s3://bucket/movie.zarr``), ``.npy``, ``.h5``; or an
         array (t, z, y, x) or (z, y, x), also of dask, zarr or a memory map.
     voxel : array_like, shape (3,) or (2,), optional
         Voxel size (z, y, x), um; (y, x) for a 2-D movie. Required where the file does not state
@@ -269,9 +274,8 @@ def open_stack(
     if isinstance(path, (str, os.PathLike)):
         source = os.fspath(path)
         contents = _described(source, pick, several)
-        read: Callable[[int], NDArray[Any]] = _FileFrames(
-            os.path.abspath(source), pick, contents, several
-        )
+        place = source if "://" in source else os.path.abspath(source)
+        read: Callable[[int], NDArray[Any]] = _FileFrames(place, pick, contents, several)
     else:
         source = "array"
         if several:
@@ -371,10 +375,23 @@ def file_contents(source: str, pick: Pick, several: tuple[int, ...] | None = Non
             for part in parts:
                 part.close()
             raise
+    contents = _read_alone(source, pick)
+    try:
+        refuse_oversize(source, contents.shape[1:], contents.dtype.itemsize, what="a frame")
+        refuse_oversize(source, contents.shape[:1], 8, what="a series of frames")
+    except ValueError:
+        contents.close()
+        raise
+    return contents
+
+
+def _read_alone(source: str, pick: Pick) -> Contents:
+    """Return the contents of a file or folder of one channel, by the reader of its format."""
     found = vendor(source)
     if found is not None:
+        apart = found.apart and os.environ.get(SWITCH) != "off"
         try:
-            return found.read(source, pick)
+            return (guarded if apart else found.read)(source, pick)
         except ValueError as fault:
             # A library's own error keeps its class, so that the caller adds what to do.
             if type(fault) is not ValueError:
@@ -387,6 +404,9 @@ def file_contents(source: str, pick: Pick, several: tuple[int, ...] | None = Non
 
 def digest(stack: Stack) -> str:
     """Return the SHA-256 of a stack: of its files with their names, or of its frames in memory.
+
+    Of a movie in an object store it is that of the names, sizes and marks (ETag) of its objects,
+    which are not read.
 
     Parameters
     ----------
@@ -405,6 +425,14 @@ def digest(stack: Stack) -> str:
     '38723a2e5e8a'
     """
     total = hashlib.sha256()
+    if stack.path is None and "://" in stack.source:
+        from fsspec.core import url_to_fs
+
+        system, root = url_to_fs(stack.source)
+        for name, state in sorted(system.find(root, detail=True).items()):
+            mark = state.get("ETag", state.get("etag", state.get("mtime")))
+            total.update(f"{name.removeprefix(root)} {state['size']} {mark}\n".encode())
+        return total.hexdigest()
     if stack.path is None:
         for frame in stack:
             total.update(np.ascontiguousarray(frame).tobytes())

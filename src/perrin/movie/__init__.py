@@ -64,7 +64,7 @@ from perrin.movie.hidden import (
 from perrin.movie.parts import PartWriter, open_parts, read_parts
 from perrin.movie.stacks import Settings, analyze_stack, with_own_times
 from perrin.movie.stages import Located, fit_poses, learn_method, locate_frames, run_frames
-from perrin.movie.workers import Work, check_workers, work_through
+from perrin.movie.workers import Work, check_workers, dask_client, work_through
 
 __all__ = [
     "Bodies",
@@ -88,6 +88,7 @@ __all__ = [
     "clusters_near_border",
     "combined_verdicts",
     "complete_bodies",
+    "dask_client",
     "depth_change",
     "depth_dimming",
     "distance_error",

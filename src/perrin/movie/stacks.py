@@ -259,7 +259,10 @@ def analyze_stack(
         poses = _PoseFits(stacks, learned, bodies, contact, folder / _POSED, work)
         errors = median_errors(bodies.features, axes=bodies.axes)
         sources = [
-            {"path": one.source if one.path else None, "sha256": own["sha256"]}
+            {
+                "path": one.source if one.path or "://" in one.source else None,
+                "sha256": own["sha256"],
+            }
             for one, own in zip(stacks, depends, strict=True)
         ]
         run: _Run = {

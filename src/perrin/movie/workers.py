@@ -144,7 +144,7 @@ def work_through(
         return
     from concurrent.futures import CancelledError
 
-    with _client(workers, scheduler) as client:
+    with dask_client(workers, scheduler) as client:
         from distributed import KilledWorker, as_completed
 
         starts = range(0, len(items), _ITEMS_AT_ONCE)
@@ -183,7 +183,7 @@ def check_workers(work: Work) -> None:
     >>> check_workers(Work())
     """
     if work.scheduler is not None:
-        with _client(0, work.scheduler):
+        with dask_client(0, work.scheduler):
             pass
     elif work.workers:
         _dask()
@@ -218,8 +218,23 @@ def _several_items(task: Callable[[S], T], items: list[S]) -> list[T]:
 
 
 @contextmanager
-def _client(workers: int, scheduler: str | None) -> Iterator[Any]:
-    """Give a client of the cluster at an address, or of processes started on this machine."""
+def dask_client(workers: int, scheduler: str | None) -> Iterator[Any]:
+    """Give a client of the cluster at an address, or of processes started on this machine.
+
+    Parameters
+    ----------
+    workers, scheduler
+        As in `work_through`.
+
+    Yields
+    ------
+    distributed.Client
+
+    Raises
+    ------
+    ModuleNotFoundError, OSError
+        As in `work_through`.
+    """
     dask, Client, LocalCluster = _dask()
     if scheduler is not None:
         with Client(scheduler, timeout=_TIMEOUT, set_as_default=False) as client:

@@ -32,6 +32,7 @@ from perrin.run.result_table import (
 )
 from perrin.run.singles import SingleSpheres
 from perrin.run.verdicts import verdicts_from_dict, verdicts_to_dict
+from perrin.tracks.cells import guarded_table
 from perrin.tracks.checksums import CheckedFiles, refusing_damage, write_checksums
 from perrin.tracks.writing import write_json
 
@@ -727,7 +728,7 @@ def write_data(report: Report, folder: Path) -> None:
     report.tracks.to_parquet(folder / "tracks.parquet", index=False)
     motion_table(report).to_parquet(folder / "motion.parquet", index=False)
     curve_table(report).to_csv(folder / "curves.csv", index=False)
-    report.to_frame().to_csv(folder / "results.csv", index=False)
+    guarded_table(report.to_frame()).to_csv(folder / "results.csv", index=False)
     if report.imaging is not None:
         write_imaging(report.imaging, folder)
     write_checksums(folder)

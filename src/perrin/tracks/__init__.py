@@ -10,6 +10,7 @@ from perrin.tracks.bonds import (
     rigid_groups,
     shared_rows,
 )
+from perrin.tracks.cells import guarded_cell, guarded_table, unguarded_cell
 from perrin.tracks.checksums import (
     CheckedFiles,
     checksum,
@@ -51,6 +52,15 @@ from perrin.tracks.delimited import (
     parse_text,
     utf8_text,
 )
+from perrin.tracks.file_limits import (
+    allowed_memory,
+    length_of,
+    oversize_text,
+    refuse_large_archive,
+    refuse_oversize,
+    refusing_foreign_errors,
+    size_text,
+)
 from perrin.tracks.files import RowNumbers, check_tracks, read_spheres, read_tracks, write_tracks
 from perrin.tracks.formats import (
     SUFFIXES,
@@ -59,6 +69,7 @@ from perrin.tracks.formats import (
     table_bytes,
     table_suffix,
     text_table,
+    unpacked,
 )
 from perrin.tracks.gdf import gdf_bytes, parse_gdf
 from perrin.tracks.groups import TOUCHING_REACH, connected_groups, frames_of, touching_groups
@@ -137,6 +148,7 @@ __all__ = [
     "Screened",
     "Spelling",
     "all_assignments",
+    "allowed_memory",
     "are_one_body",
     "assigned_points",
     "best_assignments",
@@ -165,6 +177,8 @@ __all__ = [
     "frames_of",
     "gdf_bytes",
     "gdf_table",
+    "guarded_cell",
+    "guarded_table",
     "has_trackpy_columns",
     "hidden_beside",
     "icp_fit",
@@ -181,6 +195,7 @@ __all__ = [
     "lasting_contacts",
     "lattice_step",
     "layout_of",
+    "length_of",
     "link_clusters",
     "link_spheres",
     "linked_tracks",
@@ -193,6 +208,7 @@ __all__ = [
     "noise_along",
     "of_equal_shape",
     "ours_of",
+    "oversize_text",
     "own_times",
     "parse_c3d",
     "parse_gdf",
@@ -209,7 +225,10 @@ __all__ = [
     "read_spheres",
     "read_tracks",
     "recognise_columns",
+    "refuse_large_archive",
+    "refuse_oversize",
     "refusing_damage",
+    "refusing_foreign_errors",
     "repeated_rows",
     "rigid_bodies",
     "rigid_fits",
@@ -223,6 +242,7 @@ __all__ = [
     "shape_symmetry",
     "shared_rows",
     "sheet_text",
+    "size_text",
     "squared_angle",
     "stage_path",
     "stated_units",
@@ -234,7 +254,9 @@ __all__ = [
     "track_variances",
     "tracked_rows",
     "trackmate_table",
+    "unguarded_cell",
     "unit_faults",
+    "unpacked",
     "utf8_text",
     "without_flat_z",
     "write_checksums",

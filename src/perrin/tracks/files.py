@@ -10,6 +10,7 @@ import numpy as np
 
 from perrin._text import listed
 from perrin.errors import table_error
+from perrin.tracks.cells import unguarded_cell
 from perrin.tracks.clock import frames_from_times
 from perrin.tracks.column_names import (
     COLUMNS,
@@ -21,6 +22,7 @@ from perrin.tracks.column_names import (
     unit_faults,
 )
 from perrin.tracks.delimited import parse_text, utf8_text
+from perrin.tracks.file_limits import refusing_foreign_errors
 from perrin.tracks.formats import LARGEST_EXACT, parse_table, table_bytes, table_suffix
 from perrin.tracks.simulations import is_selection, selection_table
 from perrin.tracks.writing import written_whole
@@ -112,14 +114,17 @@ def read_tracks(
     """
     source = os.fspath(path)
     suffix = table_suffix(source)
-    raw = parse_table(Path(path).read_bytes(), suffix, source)
+    data = Path(path).read_bytes()
+    with refusing_foreign_errors(source):
+        raw = parse_table(data, suffix, source)
     if raw.unnamed and not columns:
         raise table_error(source, raw.unnamed)
     columns = columns or {}
     found = _mapped_columns(list(raw.table.columns), columns, source)
-    table, spelling = _named_columns(raw, found, columns)
-    rows = RowNumbers(raw.word, raw.table.index.to_numpy() + raw.first)
-    return _clean_table(table, spelling, source, rows, scale, detections=detections)
+    with refusing_foreign_errors(source):
+        table, spelling = _named_columns(raw, found, columns)
+        rows = RowNumbers(raw.word, raw.table.index.to_numpy() + raw.first)
+        return _clean_table(table, spelling, source, rows, scale, detections=detections)
 
 
 def check_tracks(
@@ -266,7 +271,8 @@ def read_spheres(path: _PathLike) -> tuple[Floats, Floats | None]:
     array([1. , 1.5])
     """
     source = os.fspath(path)
-    table = parse_text(utf8_text(Path(path).read_bytes(), source), source).table
+    with refusing_foreign_errors(source):
+        table = parse_text(utf8_text(Path(path).read_bytes(), source), source).table
     faults = [f"column {name!r} is missing" for name in _AXES if name not in table]
     unknown = [name for name in table if name not in (*_AXES, "radius")]
     if unknown:
@@ -542,6 +548,11 @@ def _checked_ids(column: pd.Series, name: str, rows: RowNumbers) -> tuple[NDArra
     all_text = pd.api.types.infer_dtype(raw, skipna=True) == "string"
     if text.any() or all_text:
         labels = raw.where(column.notna(), np.nan).to_numpy()
+        if rows.word == "line":
+            plain = np.array([unguarded_cell(label) for label in labels], dtype=object)
+            # Two labels of a file stay two.
+            if len(set(plain[~missing])) == len(set(labels[~missing])):
+                labels = plain
         numeric = ~text & ~missing
         faults = []
         if text.any() and (numeric.any() or not all_text):

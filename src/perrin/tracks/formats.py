@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from perrin.errors import table_error
+from perrin.tracks.cells import guarded_table
 from perrin.tracks.delimited import first_lines, parse_text, utf8_text
+from perrin.tracks.file_limits import allowed_memory, oversize_text, refuse_large_archive
 from perrin.tracks.gdf import gdf_bytes, parse_gdf
 from perrin.tracks.imaris import imaris_table, is_imaris
 from perrin.tracks.motion_capture import is_motive, motive_table, parse_c3d
@@ -103,16 +105,7 @@ def parse_table(data: bytes, suffix: str, source: str) -> RawTable:
     0  1  2
     """
     if suffix.endswith(".gz"):
-        import gzip
-
-        if not data:
-            raise table_error(source, "the file is empty")
-        try:
-            data = gzip.decompress(data)
-        except (gzip.BadGzipFile, EOFError, zlib.error) as error:
-            raise table_error(
-                source, f"not a whole gzip file ({error}); fetch or write it again"
-            ) from None
+        data = unpacked(data, source)
         suffix = suffix.removesuffix(".gz")
     if suffix in (".xyz", ".extxyz"):
         return parse_xyz(utf8_text(data, source).decode(), source)
@@ -132,6 +125,47 @@ def parse_table(data: bytes, suffix: str, source: str) -> RawTable:
     if suffix in parsers:
         return parsers[suffix](data, source)
     return text_table(utf8_text(data, source), source)
+
+
+def unpacked(data: bytes, source: str) -> bytes:
+    """Return the content of a gzip file, which must not be larger than its length warrants.
+
+    Parameters
+    ----------
+    data : bytes
+    source : str
+        The file's name, for messages.
+
+    Returns
+    -------
+    bytes
+
+    Raises
+    ------
+    TrackTableError
+        If this is no whole gzip file, or its content is too large (`allowed_memory`).
+
+    Examples
+    --------
+    >>> import gzip
+    >>> unpacked(gzip.compress(b"x,y"), "t.csv.gz")
+    b'x,y'
+    """
+    import gzip
+
+    if not data:
+        raise table_error(source, "the file is empty")
+    most = allowed_memory(len(data))
+    try:
+        with gzip.GzipFile(fileobj=io.BytesIO(data)) as file:
+            content = file.read(most + 1)
+    except (gzip.BadGzipFile, EOFError, zlib.error) as error:
+        raise table_error(
+            source, f"not a whole gzip file ({error}); fetch or write it again"
+        ) from None
+    if len(content) > most:
+        raise table_error(source, oversize_text("the unpacked table", len(content)))
+    return content
 
 
 def text_table(text: bytes, source: str) -> RawTable:
@@ -207,6 +241,7 @@ def sheet_text(data: bytes, source: str) -> tuple[str, str]:
             "the sheet as csv"
         ) from None
 
+    refuse_large_archive(data, source)
     try:
         book = CalamineWorkbook.from_filelike(io.BytesIO(data))
         sheets = {
@@ -237,8 +272,12 @@ def _parse_parquet(data: bytes, source: str) -> RawTable:
     import pyarrow.parquet as pq
 
     try:
+        file = pq.ParquetFile(io.BytesIO(data))
+        needed = 8 * file.metadata.num_rows * file.metadata.num_columns
+        if not 0 <= needed <= allowed_memory(len(data)):
+            raise table_error(source, oversize_text("its table", needed))
         # Metadata of pandas could hide the frame column in the index.
-        table = pq.read_table(io.BytesIO(data)).to_pandas(ignore_metadata=True)
+        table = file.read().to_pandas(ignore_metadata=True)
     except (pa.ArrowException, OSError) as error:
         reason = str(error).strip().splitlines()[0]
         raise table_error(source, f"not a parquet file that can be read ({reason})") from None
@@ -287,7 +326,7 @@ def table_bytes(table: pd.DataFrame, suffix: str, target: str) -> bytes:
         return xyz_text(table).encode("utf-8")
     if suffix == ".napari.csv":
         return napari_text(table).encode("utf-8")
-    text: str = table.to_csv(index=False, lineterminator="\n")
+    text: str = guarded_table(table).to_csv(index=False, lineterminator="\n")
     if suffix == ".csv":
         return text.encode("utf-8")
     import gzip

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from perrin.errors import table_error
+from perrin.errors import TrackTableError, table_error
 from perrin.tracks.raw_tables import RawTable
 
 if TYPE_CHECKING:
@@ -16,6 +16,9 @@ if TYPE_CHECKING:
     from perrin._arrays import Floats, Ints
 
 _NO_BODY = 2**32 - 1  # in files of HOOMD: particles of no rigid body
+
+
+_NUMBER = "particles/N"
 
 
 def parse_gsd(data: bytes, source: str) -> RawTable:
@@ -46,7 +49,18 @@ def parse_gsd(data: bytes, source: str) -> RawTable:
         raise ImportError(f"{source}: GSD needs gsd: pip install 'perrin[tables]'") from None
 
     try:
-        frames = list(gsd.hoomd.HOOMDTrajectory(gsd.pygsd.GSDFile(io.BytesIO(data))))
+        file = gsd.pygsd.GSDFile(io.BytesIO(data))
+        # Particles without positions of their own are at 0: the file need not hold them.
+        stated = [
+            int(file.read_chunk(frame=i, name=_NUMBER)[0])
+            for i in range(file.nframes)
+            if file.chunk_exists(frame=i, name=_NUMBER)
+        ]
+        if max(stated, default=0) > len(data):
+            raise table_error(source, f"not a GSD file: it states {max(stated)} particles")
+        frames = list(gsd.hoomd.HOOMDTrajectory(file))
+    except TrackTableError:
+        raise
     except (RuntimeError, OSError, ValueError) as error:
         raise table_error(source, f"not a GSD file that can be read ({error})") from None
     if not sum(frame.particles.N for frame in frames):

@@ -18,6 +18,7 @@ from perrin.images.formats.contents import (
     summed,
 )
 from perrin.images.formats.deltavision import deltavision
+from perrin.images.formats.directories import check_directories
 from perrin.images.formats.folders import name_counters, sequence, sequence_files
 from perrin.images.formats.headers import (
     HeaderScale,
@@ -33,6 +34,7 @@ from perrin.images.formats.headers import (
     stk_scale,
     tiff_kind,
 )
+from perrin.images.formats.isolation import guarded, serve
 from perrin.images.formats.olympus import olympus, olympus_scale
 from perrin.images.formats.tiff import (
     DeclaredSeries,
@@ -74,6 +76,7 @@ __all__ = [
     "axes_without_colours",
     "axis_roles",
     "channel_index",
+    "check_directories",
     "chosen",
     "clock_scale",
     "czi",
@@ -83,6 +86,7 @@ __all__ = [
     "even_times",
     "frames_of_planes",
     "grid",
+    "guarded",
     "hdf5",
     "header_scale",
     "image_header",
@@ -117,6 +121,7 @@ __all__ = [
     "require_decoder",
     "sequence",
     "sequence_files",
+    "serve",
     "stk_scale",
     "strange_lengths",
     "summed",

@@ -21,6 +21,7 @@ from perrin.images.formats.contents import (
     layout,
     needed,
 )
+from perrin.images.formats.directories import check_directories
 from perrin.images.formats.headers import (
     clock_scale,
     header_scale,
@@ -117,11 +118,13 @@ def opened(path: str) -> Any:  # noqa: ANN401
     Raises
     ------
     ValueError
-        If the header is in another file, which is missing.
+        If the header is in another file, which is missing; if the directories of the images loop
+        or state impossible sizes (`check_directories`).
     """
     import re
 
     tifffile = needed("tifffile", "images")
+    check_directories(path)
     file = tifffile.TiffFile(path)
     header = file.ome_metadata if file.is_ome else None
     if not header or "BinaryOnly" not in header:

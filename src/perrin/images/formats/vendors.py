@@ -391,6 +391,9 @@ class Format(NamedTuple):
         What a file of this format is, for messages.
     read : callable
         ``read(path, pick)`` describes the contents of a file.
+    apart : bool
+        Whether files are read in a process of their own (`guarded`), because a library decodes
+        them.
 
     Examples
     --------
@@ -400,6 +403,7 @@ class Format(NamedTuple):
 
     name: str
     read: Callable[[str, Pick], Contents]
+    apart: bool = True
 
 
 _FORMATS = {
@@ -408,8 +412,8 @@ _FORMATS = {
     ".czi": Format("Zeiss CZI", czi),
     ".ims": Format("Imaris", ims),
     **dict.fromkeys((".oib", ".oif"), Format("Olympus FluoView", olympus)),
-    **dict.fromkeys((".dv", ".r3d"), Format("DeltaVision", deltavision)),
-    **dict.fromkeys((".npy", ".npz"), Format("numpy array", numpy_file)),
+    **dict.fromkeys((".dv", ".r3d"), Format("DeltaVision", deltavision, apart=False)),
+    **dict.fromkeys((".npy", ".npz"), Format("numpy array", numpy_file, apart=False)),
     **dict.fromkeys((".h5", ".hdf5"), Format("HDF5", hdf5)),
 }
 
@@ -446,7 +450,10 @@ def vendor(path: str) -> Format | None:
     >>> vendor("movie.lif").name, vendor("movie.tif")
     ('Leica LAS X', None)
     """
-    if any((Path(path) / name).exists() for name in (".zgroup", ".zarray", "zarr.json")):
+    # Addresses of object stores hold OME-Zarr: the other formats are not read by range.
+    if "://" in path or any(
+        (Path(path) / name).exists() for name in (".zgroup", ".zarray", "zarr.json")
+    ):
         return Format("OME-Zarr", ome_zarr)
     suffix = Path(path).suffix.lower()
     if suffix in _UNREAD:

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from perrin._arrays import Floats, frozen, require_positive
+from perrin._arrays import Bools, Floats, frozen, require_positive
+from perrin.compiled.loading import compiled_kernels
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -215,6 +216,40 @@ class SphereImage:
         box, (z, y, x) = self._covered(center, shape)
         value, gradient = self.at(z, y, x)
         return SphereSpot(box, value, gradient)
+
+    def on_voxels(self, mask: Bools, centers: Floats, sizes: Floats) -> Floats:
+        """Return the images of spheres and their gradients on the voxels of a mask.
+
+        Parameters
+        ----------
+        mask : ndarray of bool, shape (nz, ny, nx)
+            The m voxels that are wanted.
+        centers : ndarray, shape (n, 3)
+            Positions (z, y, x) from the centre of voxel (0, 0, 0), um.
+        sizes : ndarray, shape (n,)
+            Deviations of the logarithms of the diameters from the mean.
+
+        Returns
+        -------
+        ndarray, shape (n, 4, m)
+            Intensity, and its derivatives by z, y and x, per um.
+        """
+        kernels = compiled_kernels()
+        if kernels is None:
+            whole = np.zeros((len(centers), 4, *mask.shape))
+            for layer, center, size in zip(whole, centers, sizes, strict=True):
+                spot = self.sized(size).spot(center, mask.shape)
+                layer[(0, *spot.box)] = spot.value
+                layer[(slice(1, None), *spot.box)] = spot.gradient
+            kept = whole.reshape(4 * len(centers), -1).take(np.flatnonzero(mask), axis=1)
+            return kept.reshape(len(centers), 4, -1)
+        tables = self._knots[None]
+        if self.spread > 0 and len(sizes):
+            tables = np.stack([self.sized(size)._knots for size in sizes])
+        out = np.empty((len(centers), 4, np.count_nonzero(mask)))
+        lengths = (np.array(length) for length in (self.voxel, self.reach, self._spacing))
+        kernels.spots(mask, np.ascontiguousarray(centers), *lengths, tables, out)
+        return out
 
     def slope_spot(
         self, slopes: Floats, center: Floats, shape: tuple[int, ...], *, deviation: float = 0.0

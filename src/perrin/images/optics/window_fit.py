@@ -61,16 +61,9 @@ class Window(NamedTuple):
 
         `sizes` (n,) are deviations of the logarithms of the diameters.
         """
-        shape = self.mask.shape
         origin = np.array([s.start for s in self.box]) * np.array(image.voxel)
-        whole = np.zeros((len(centers), 4, *shape))
-        for layer, center, size in zip(whole, centers - origin, sizes, strict=True):
-            spot = image.sized(size).spot(center, shape)
-            layer[(0, *spot.box)] = spot.value
-            layer[(slice(1, None), *spot.box)] = spot.gradient
-        kept = whole.reshape(4 * len(centers), -1).take(np.flatnonzero(self.mask), axis=1)
-        kept = kept.reshape(len(centers), 4, -1)
-        return kept[:, 0], kept[:, 1:]
+        layers = image.on_voxels(self.mask, centers - origin, sizes)
+        return layers[:, 0], layers[:, 1:]
 
     def size_slopes(self, image: SphereImage, centers: Floats, sizes: Floats) -> Floats:
         """Return the derivatives (n, m) of unit images by the logarithms of the diameters."""

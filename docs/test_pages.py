@@ -1,0 +1,105 @@
+"""The code of the README, of the pages and of the notebooks runs, and prints what is shown.
+
+`make doctests` runs it; it is no part of the suite in `tests`.
+"""
+
+import doctest
+import json
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+ROOT = Path(__file__).resolve().parents[1]
+DOCS = ROOT / "docs"
+PAGES = [ROOT / "README.md", DOCS / "conventions.md", DOCS / "tables.md", DOCS / "dense.md"]
+PAGES += [DOCS / "index.md", DOCS / "reference" / "files.md"]
+for folder in ("start", "howto", "theory", "tutorials", "coming-from"):
+    PAGES += sorted((DOCS / folder).glob("*.md"))
+PAGES = [page for page in PAGES if re.search(r"^```(python|sh)$", page.read_text("utf-8"), re.M)]
+NOTEBOOKS = sorted((ROOT / "examples").glob("*.ipynb"))
+BOX = re.compile(r"^```(python|sh)\n(.*?)^```\n(?:\n?```(?:text)?\n(.*?)^```\n)?", re.DOTALL | re.M)
+
+# Pages whose numbers are compared with --long only: each takes over 10 s.
+SLOW = ("dense", "estimators", "curves")
+# Beginnings of commands that install or start something, or need a network or a cluster.
+NOT_RUN = ("pip", "python", ".venv/bin/pip", "make", "git", "cd", "sleep", "kill", "napari")
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: f"{page.parent.name}-{page.stem}")
+def test_pages_print_what_they_show(page, capsys, request, tmp_path, monkeypatch):
+    """A page has doctests, or blocks of code whose output follows in a box or as comments.
+
+    Without --long a slow page has a tenth of its repeats, or fewer and shorter tracks, and is only
+    run.
+    """
+    monkeypatch.chdir(tmp_path)
+    text, names = page.read_text(encoding="utf-8"), {}
+    slow = page.stem in SLOW and not request.config.getoption("--long", default=False)
+    if slow:
+        text = re.sub(r"\brange\((\d+)0\)", r"range(\1)", text)
+        text = text.replace("n_frames = 1000\n", "n_frames = 200\n").replace("size=6", "size=4")
+    if ">>>" in text:
+        if slow:
+            for example in doctest.DocTestParser().get_examples(text):
+                exec(compile(example.source, page.name, "single"), names)
+            return
+        result = doctest.testfile(str(page), module_relative=False)
+        assert result.attempted > 0
+        assert result.failed == 0, capsys.readouterr().out
+        return
+    if "perrin-demo/" in text and "perrin demo" not in text and "make demo" not in text:
+        run_command("perrin demo --quiet")
+    for language, code, box in BOX.findall(text):
+        if language == "sh":
+            run_block(code)
+            capsys.readouterr()
+            continue
+        exec(compile(code, page.name, "exec"), names)
+        promised = box.splitlines() if box else re.findall(r"^# (.*)$", code, re.MULTILINE)
+        printed = capsys.readouterr().out.splitlines()
+        assert slow or printed == promised
+
+
+def run_block(code):
+    """Run the lines of a block for a shell that are commands of perrin and need nothing else."""
+    for line in code.replace("\\\n", " ").splitlines():
+        command = line.split("  #")[0].strip().removeprefix(".venv/bin/")
+        if not command or command.startswith(("#", *NOT_RUN)):
+            if command.startswith("make demo"):
+                run_command("perrin demo --quiet")
+            continue
+        assert command.startswith("perrin "), f"not a command that is known: {line}"
+        if "--scheduler" not in command and not missing_file(command):
+            run_command(command)
+
+
+def missing_file(command):
+    """Return whether a command takes a file of the reader, which is not here."""
+    words = shlex.split(command)
+    takes_file = words[1] in ("analyze", "run", "convert") and "--config" not in words
+    return takes_file and not Path(words[2]).exists()
+
+
+def run_command(command):
+    """Run a command of perrin in this process."""
+    from perrin.cli.app import app
+
+    result = CliRunner().invoke(app, shlex.split(command)[1:])
+    assert result.exit_code == 0, f"{command}\n{result.output}\n{result.exception!r}"
+
+
+@pytest.mark.parametrize("notebook", NOTEBOOKS, ids=lambda notebook: notebook.stem)
+def test_notebooks_run_from_top_to_bottom(notebook, tmp_path, monkeypatch):
+    """Every cell of code runs, in order, in an empty folder."""
+    import matplotlib as mpl
+
+    mpl.use("agg")
+    monkeypatch.chdir(tmp_path)
+    names = {}
+    for cell in json.loads(notebook.read_text(encoding="utf-8"))["cells"]:
+        if cell["cell_type"] == "code":
+            exec(compile("".join(cell["source"]), notebook.name, "exec"), names)
+    assert len(names) > 5

@@ -1,0 +1,155 @@
+"""The commands of a study: new, run and report."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from perrin.cli.messages import messages_of
+from perrin.cli.options import OUTPUT, WORK, GroupedCommand, Json, Quiet
+from perrin.cli.progress import shown_progress
+from perrin.cli.tables import show_json
+
+if TYPE_CHECKING:
+    from perrin.study.study_results import StudyResult
+
+study_app = typer.Typer(
+    help="Measure many movies under several conditions, and their means.",
+    no_args_is_help=True,
+    rich_markup_mode=None,
+)
+
+
+@study_app.command("new", cls=GroupedCommand, epilog="perrin study new data/*.csv -o study.toml")
+def new_study(
+    files: Annotated[list[str], typer.Argument(help="Movies and track tables.")],
+    output: Annotated[
+        Path,
+        typer.Option("-o", "--output", help="Manifest to write.", rich_help_panel=OUTPUT),
+    ] = Path("study.toml"),
+    overwrite: Annotated[
+        bool,
+        typer.Option("--overwrite", help="Replace an existing file.", rich_help_panel=OUTPUT),
+    ] = False,
+) -> None:
+    """Write a manifest that lists the files, to be edited."""
+    with messages_of(new_study):
+        from perrin.study import manifest_text
+        from perrin.tracks.writing import written_whole
+
+        if output.exists() and not overwrite:
+            raise FileExistsError(f"{output} exists: choose another name, or overwrite=True")
+        text = manifest_text(files, folder=output.absolute().parent)
+        with written_whole(output) as part:
+            part.write_text(text, encoding="utf-8")
+        print(f"{output} lists {len(files)} file{'s' * (len(files) != 1)}. State the conditions of")
+        print(f"every sample in it, then: perrin study run {output} -o STUDY")
+
+
+@study_app.command(
+    "run",
+    cls=GroupedCommand,
+    epilog="""perrin study run study.toml -o STUDY --workers 8
+    perrin study run study.toml -o STUDY --scheduler tcp://node7:8786""",
+)
+def run_study(
+    manifest: Annotated[Path, typer.Argument(help="Manifest of the study: study.toml.")],
+    output: Annotated[
+        Path,
+        typer.Option(
+            "-o",
+            "--output",
+            help="Folder of the study; what is finished there is kept.",
+            rich_help_panel=OUTPUT,
+        ),
+    ],
+    workers: Annotated[
+        int,
+        typer.Option(min=0, help="Number of processes of this machine.", rich_help_panel=WORK),
+    ] = 0,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(
+            help="Address of a Dask scheduler that does the work: tcp://host:8786.",
+            rich_help_panel=WORK,
+        ),
+    ] = None,
+    as_json: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """Measure every movie that is new or has changed, and write tables, figures and the page.
+
+    After an interruption, or with more movies in the manifest, the same command does the rest.
+    """
+    with messages_of(run_study):
+        from perrin.study import Study
+
+        study = Study.from_toml(manifest)
+        with shown_progress(quiet=quiet, unit="movies") as progress:
+            result = study.run(
+                output,
+                workers=workers,
+                scheduler=scheduler,
+                progress=progress,
+                command=shlex.join(["perrin", *sys.argv[1:]]),
+            )
+        _show(result, as_json=as_json, quiet=quiet)
+
+
+@study_app.command("report", cls=GroupedCommand, epilog="perrin study report STUDY")
+def report_study(
+    folder: Annotated[Path, typer.Argument(help="Folder of a study.")],
+    as_json: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """Write tables, figures and the page again from the finished movies, and print the means."""
+    with messages_of(report_study):
+        from perrin.run.lock import locked
+        from perrin.study import StudyResult, write_results
+
+        result = StudyResult.load(folder)
+        with locked(folder):
+            write_results(result, command=shlex.join(["perrin", *sys.argv[1:]]))
+        _show(result, as_json=as_json, quiet=quiet)
+
+
+def _show(result: StudyResult, *, as_json: bool, quiet: bool) -> None:
+    """Print the means of a study, its summary.json, or nothing."""
+    if as_json:
+        show_json(result.to_dict())
+        return
+    if quiet:
+        return
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    console = Console(highlight=False)
+    done = len(result.entries) - len(result.failed)
+    console.print(
+        f"{escape(result.manifest.title)}: {done} of {len(result.manifest.movies)} movies measured"
+    )
+    table = Table(box=None, pad_edge=False)
+    for name in ("bodies", "condition", "quantity", "mean", "95 %", "movies", "clusters"):
+        table.add_column(name)
+    for one in result.means:
+        low, high = one.mean.ci95
+        table.add_row(
+            escape(one.body),
+            escape(one.label),
+            f"{one.quantity} ({one.mean.unit})",
+            f"{one.mean.value:.3g}",
+            f"{low:.3g} to {high:.3g}",
+            f"{one.mean.n_movies}{' *' * (one.mean.scope != 'movies')}",
+            str(one.mean.n_clusters),
+        )
+    console.print(table)
+    if any(one.mean.scope != "movies" for one in result.means):
+        console.print("* one movie: the interval holds for this movie, not for others")
+    for entry in result.failed[:20]:
+        console.print(f"failed: {escape(entry.name)}: {escape(entry.reason)}", soft_wrap=True)
+    console.print(f"Written to {escape(str(result.folder))}: study.html, results.csv, runs/")
