@@ -47,6 +47,9 @@ _NARROWED, _WIDENED, _TAIL_SHARE, _MAX_TAIL_SHARE = 0.85, 3.0, 0.15, 0.6
 # kept if it increases the logarithm of the likelihood of other groups by at least this.
 _LEAST_SHARE_ERRORS, _LEAST_HELD_OUT_GAIN = 3.0, 3.0
 
+# Median chi-squared per voxel above which shells are tried in place of balls.
+_SHELL_MISFIT = 1.3
+
 # Spread of the diameters with which they are fitted first; a spread is used if it is at least this,
 # and increases the logarithm of the likelihood of the diameters by at least this.
 _FIRST_SPREAD, _LEAST_SPREAD, _LEAST_SPREAD_GAIN = 0.06, 0.007, 5.0
@@ -170,6 +173,8 @@ class ImageParameters:
         Relative standard deviation of the diameters of different spheres.
     measured : PointSpread or None
         A point spread that was measured, and is not searched for.
+    shell : bool
+        The surface of the spheres is fluorescent, in place of all of them.
 
     Examples
     --------
@@ -182,6 +187,7 @@ class ImageParameters:
     voxel: tuple[float, float, float]
     spread: float = 0.0
     measured: PointSpread | None = None
+    shell: bool = False
 
     @property
     def voxel_blur(self) -> Floats:
@@ -191,16 +197,18 @@ class ImageParameters:
     def ball(self, values: Floats) -> BallBlur:
         """Return the blurred ball at other values of the parameters."""
         if self.measured is not None:
-            blurs = [
-                (share, tuple(np.hypot(widths, self.voxel_blur).tolist()))
-                for share, widths in self.measured.components
-            ]
-            return BallBlur(float(np.exp(values[0])), tuple(blurs))
+            wide_z, wide = self.voxel_blur.tolist()
+            measured = tuple(
+                (share, (float(np.hypot(z, wide_z)), float(np.hypot(plane, wide))))
+                for share, (z, plane) in self.measured.components
+            )
+            return BallBlur(float(np.exp(values[0])), measured, self.shell)
         diameter, blur_z, blur = np.exp(values[:3]).tolist()
         if len(values) == 3:
-            return BallBlur(diameter, ((1.0, (blur_z, blur)),))
+            return BallBlur(diameter, ((1.0, (blur_z, blur)),), self.shell)
         share, (tail_z, tail) = float(values[3]), np.exp(values[4:]).tolist()
-        return BallBlur(diameter, ((1.0 - share, (blur_z, blur)), (share, (tail_z, tail))))
+        both = ((1.0 - share, (blur_z, blur)), (share, (tail_z, tail)))
+        return BallBlur(diameter, both, self.shell)
 
     def image(self) -> SphereImage:
         """Return the sphere's image."""
@@ -212,6 +220,7 @@ class ImageParameters:
                 voxel=self.voxel,
                 spread=self.spread,
                 measured=self.measured,
+                shell=self.shell,
             )
         (psf_z, psf), *wider = (
             np.sqrt(np.square(blur) - self.voxel_blur**2).tolist() for _, blur in ball.components
@@ -225,6 +234,7 @@ class ImageParameters:
             voxel=self.voxel,
             tail=tail,
             spread=self.spread,
+            shell=self.shell,
         )
 
     def with_tail(self) -> ImageParameters:
@@ -294,12 +304,16 @@ class ImageParameters:
         if self.measured is not None:
             stderr = (float(image.diameter * error[0]), 0.0, 0.0)
             return Optics(
-                image.diameter, image.psf, noise, stderr, None, self.spread, self.measured
+                *(image.diameter, image.psf, noise, stderr, None, self.spread, self.measured),
+                self.shell,
             )
         # The blur is the root of the sum of squares of point spread and voxel.
         factor = np.array([image.diameter, *(np.square(image.blur) / np.array(image.psf))])
         a, b, c = (float(value) for value in factor * error)
-        return Optics(image.diameter, image.psf, noise, (a, b, c), image.tail, self.spread)
+        return Optics(
+            *(image.diameter, image.psf, noise, (a, b, c), image.tail, self.spread),
+            shell=self.shell,
+        )
 
 
 class ImageVariations(NamedTuple):
@@ -758,7 +772,7 @@ def fit_samples(
             "the optics (optics=), or keep the positions found first (refine=None)"
         )
     mean = float(np.mean([np.nanmean(s.frame) for s in usable]))
-    plain = _settled(usable, start, CameraNoise(1.0, 0.05 * abs(mean)))
+    plain = _ball_or_shell(usable, start, CameraNoise(1.0, 0.05 * abs(mean)))
     plain, left_out = _without_dust(plain)
     found = plain
     if not any(isinstance(s, CrowdSample) for s in found.samples):
@@ -771,6 +785,34 @@ def fit_samples(
         found, left_out = _without_dust(found)
     optics = found.parameters.optics(found.noise, found.information)
     return LearnedOptics(optics, replace(_usual_of(found), left_out=left_out))
+
+
+def _ball_or_shell(
+    samples: list[GroupSample | CrowdSample], start: ImageParameters, noise: CameraNoise
+) -> _Settled:
+    """Return the parameters of balls, or of shells if the samples are likelier with them.
+
+    Shells are tried where the search for balls does not converge, or leaves large residuals.
+    """
+    ball: _Settled | None = None
+    try:
+        ball = _settled(samples, start, noise)
+        chi2 = np.median([fit.chi2(ball.noise) for fit in ball.fits])
+        if chi2 < _SHELL_MISFIT or not all(isinstance(s, GroupSample) for s in samples):
+            return ball
+        shell = _settled(ball.samples, replace(start, shell=True), noise)
+    except NoSpheresError:
+        if ball is not None:
+            return ball
+        return _settled(samples, replace(start, shell=True), noise)
+    images = [one.parameters.image() for one in (ball, shell)]
+    within = max(images, key=lambda image: float(image.extent.max()))
+    gain = 0.0
+    for one, image, sign in zip((ball, shell), images, (-1, 1), strict=True):
+        for s in one.samples:
+            if isinstance(s, GroupSample):
+                gain += sign * s.log_likelihood(image, shell.noise, within=within)
+    return shell if gain > _LEAST_HELD_OUT_GAIN else ball
 
 
 def _with_enough_voxels(

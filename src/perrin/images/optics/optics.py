@@ -90,6 +90,8 @@ class Optics(Shown):
     measured : PointSpread or None
         A point spread that was measured on beads; `psf` is then that of its narrowest Gaussian, and
         there is no `tail`.
+    shell : bool
+        The surface of the spheres is fluorescent, in place of all of them.
 
     Examples
     --------
@@ -105,6 +107,7 @@ class Optics(Shown):
     tail: PsfTail | None = None
     spread: float = 0.0
     measured: PointSpread | None = None
+    shell: bool = False
 
     def to_dict(self) -> dict[str, Any]:
         """Return values that JSON holds: `noise` as [gain, floor], `tail` as [share, psf]."""
@@ -116,7 +119,10 @@ class Optics(Shown):
             "tail": None if self.tail is None else [to_plain(part) for part in self.tail],
             "spread": to_plain(self.spread),
         }
-        return entry if self.measured is None else entry | {"measured": self.measured.to_dict()}
+        # What most movies do not have is not written.
+        shell = {"shell": True} if self.shell else {}
+        measured = {} if self.measured is None else {"measured": self.measured.to_dict()}
+        return entry | measured | shell
 
     @classmethod
     def from_dict(cls, entry: Mapping[str, Any]) -> Optics:
@@ -126,7 +132,8 @@ class Optics(Shown):
         ----------
         entry : mapping
             The dictionary of `to_dict`; one without `tail` has a Gaussian point spread, one without
-            `spread` equal spheres, and one without `measured` a point spread that was learned.
+            `spread` equal spheres, one without `measured` a point spread that was learned, and one
+            without `shell` balls.
 
         Returns
         -------
@@ -142,7 +149,8 @@ class Optics(Shown):
         if entry.get("measured") is not None:
             measured = PointSpread.from_dict(entry["measured"])
         size, spread = entry["diameter"], entry.get("spread", 0.0)
-        return cls(size, (psf_z, psf), noise, (a, b, c), tail, spread, measured)
+        shell = bool(entry.get("shell", False))
+        return cls(size, (psf_z, psf), noise, (a, b, c), tail, spread, measured, shell)
 
     def image(self, voxel: tuple[float, float, float]) -> SphereImage:
         """Return the table of the sphere's image for voxels (z, y, x), um."""
@@ -153,4 +161,5 @@ class Optics(Shown):
             tail=self.tail,
             spread=self.spread,
             measured=self.measured,
+            shell=self.shell,
         )
