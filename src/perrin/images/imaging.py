@@ -169,8 +169,8 @@ class Imaging:
         entry = {name: to_plain(getattr(self, name)) for name in _IMAGING_SETTINGS}
         entry["other_optics"] = [optics.to_dict() for optics in self.other_optics]
         entry["channel_offsets"] = [list(offset) for offset in self.channel_offsets]
-        # What only 2-D movies and movies of several channels have is not written for others.
-        for name in ("radial", "other_optics", "channel_offsets"):
+        # What only some movies have is not written for others.
+        for name in ("radial", "distance_error", "other_optics", "channel_offsets"):
             if not getattr(self, name):
                 del entry[name]
         return entry
