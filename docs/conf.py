@@ -5,6 +5,8 @@ import sys
 from importlib.metadata import version as installed_version
 from pathlib import Path
 
+import sphinx.ext.autosummary
+
 sys.path.insert(0, str(Path(__file__).parent / "_extensions"))
 for threads in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(threads, "1")  # scripts of the gallery are small: threads only wait
@@ -28,12 +30,16 @@ extensions = [
     "local_mathjax",
 ]
 exclude_patterns = ["_build", "gallery_scripts", "_extensions", "tutorials/examples/index.rst"]
+smartquotes = False  # options begin with two hyphens
+highlight_language = "none"  # a block without a language is output
 suppress_warnings = ["config.cache"]  # the settings of the gallery hold a class
 
 myst_enable_extensions = ["colon_fence", "deflist", "dollarmath"]
 myst_heading_anchors = 3
 
 autosummary_generate = True
+# A first sentence does not end after these.
+sphinx.ext.autosummary.WELL_KNOWN_ABBREVIATIONS += ("Eq.", "Eqs.", "Fig.", " .")
 autodoc_typehints = "none"  # the docstrings carry types with shapes
 autodoc_member_order = "groupwise"
 numpydoc_show_class_members = False

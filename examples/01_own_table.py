@@ -14,10 +14,12 @@ are (:doc:`/tables`).
 import tempfile
 from pathlib import Path
 
+import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 
 import perrin
+from perrin.plot import plot_lag_curve
 
 folder = Path(tempfile.mkdtemp())
 
@@ -91,10 +93,6 @@ print(f"p_same = {report.pooled.D_R.p_same:.2f}")
 # The mean square angular displacement (MSAD) of one cluster with the estimated line. The dashed
 # line is the noise floor that the localisation error predicts. Beyond a quarter of the track the
 # points are faint: few independent intervals remain.
-
-import matplotlib.pyplot as plt  # noqa: E402
-
-from perrin.plot import plot_lag_curve  # noqa: E402
 
 cluster = report.clusters[0]
 figure, ax = plt.subplots(figsize=(7, 4.6), layout="constrained")

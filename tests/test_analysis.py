@@ -106,7 +106,7 @@ def test_frames_and_particles_may_be_missing(base, whole):
     assert result.motion.n_present[7] == 3
     assert "2 of 4 particles" in result.motion.reason[9]
     assert abs(result.D_R.value - full.D_R.value) < full.D_R.stderr
-    assert any("1 of 135 frames have no pose" in w for w in result.notes)
+    assert any("frames without a pose: 1 of 135" in w for w in result.notes)
     assert any("15 frame numbers have no row (the first is 3)" in w for w in report.notes)
 
 

@@ -103,14 +103,21 @@ def answer(table: pd.DataFrame) -> perrin.Report:
 
 
 def test_demo_gives_the_planted_values_back(demo):
-    """The demo's 95 % intervals hold D_R = 4.93e-3 and D_T = 3.85e-2; sigma is 34 nm within 5 %."""
+    """The demo's 95 % intervals hold the planted D_R and D_T; sigma is 34 nm within 5 %.
+
+    Planted are the predicted values, so that the pulls are those of chance.
+    """
     (cluster,) = json.loads((demo[0] / "summary.json").read_text())["clusters"]
-    assert cluster["D_R"]["ci95"][0] < 4.93e-3 < cluster["D_R"]["ci95"][1]
-    assert cluster["D_T"]["ci95"][0] < 3.85e-2 < cluster["D_T"]["ci95"][1]
+    assert cluster["D_R"]["ci95"][0] < 6.727e-3 < cluster["D_R"]["ci95"][1]
+    assert cluster["D_T"]["ci95"][0] < 4.535e-2 < cluster["D_T"]["ci95"][1]
     assert cluster["sigma"] == pytest.approx(math.sqrt((2 * 0.03**2 + 0.04**2) / 3), rel=0.05)
     assert cluster["phi2"]["predicted"] == pytest.approx(7.55e-4, rel=0.1)
     assert cluster["n_frames"] == 300
     assert cluster["warnings"] == []
+    for name, planted in (("D_R", 6.727e-3), ("D_T", 4.535e-2)):
+        compared = cluster["prediction"][name]
+        assert compared["predicted"] == pytest.approx(planted, rel=1e-3)
+        assert abs(compared["pull"]) < 2
 
 
 def test_demo_prints_a_short_table(demo):
@@ -128,7 +135,7 @@ def test_demo_writes_a_whole_run_folder(demo):
     names = {p.name for p in demo[0].iterdir()}
     assert names == {
         "summary.json", "tracks.parquet", "motion.parquet", "curves.csv", "figures",
-        "report.html", "run.json", "run.toml", "demo-tracks.csv", "results.csv",
+        "report.html", "run.json", "run.toml", "demo-tracks.csv", "results.csv", "checksums.json",
     }  # fmt: skip
     assert list((demo[0] / "figures").glob("*.png"))
     assert [p.name for p in demo[0].parent.iterdir()] == ["perrin-demo"]

@@ -250,6 +250,19 @@ def test_gdf_of_one_row_has_one_dimension_in_idl(tmp_path):
     assert read_tracks(tmp_path / "t.gdf").to_numpy().tolist() == [[3, 8, 0.5, 1.5]]
 
 
+@pytest.mark.parametrize("count", [10, 0])
+def test_the_ascii_variant_holds_the_same_table(tmp_path, count):
+    """As `write_gdf, data, file, /ascii` prints it: header, sizes, elements in wrapped lines."""
+    text = (
+        f"GDF v. 1.0\n           2\n           5           2           4          {count}\n"
+        "     0.500000      1.50000      2.25000      3.00000      8.00000\n     0.250000"
+        "      2.50000  1.25000e-03\n      4.00000      8.00000\n"
+    )
+    (tmp_path / "t.gdf").write_text(text)
+    (tmp_path / "b.gdf").write_bytes(gdf([[0.5, 1.5, 2.25, 3, 8], [0.25, 2.5, 1.25e-3, 4, 8]]))
+    pd.testing.assert_frame_equal(read_tracks(tmp_path / "t.gdf"), read_tracks(tmp_path / "b.gdf"))
+
+
 def test_gdf_with_more_columns_asks_for_names(tmp_path):
     """7 columns cannot be guessed: the message shows how to name them, and naming works."""
     rows = np.arange(14.0).reshape(2, 7)
@@ -283,7 +296,10 @@ def test_a_gdf_cut_anywhere_is_refused(tmp_path, order, length):
     ("data", "words"),
     [
         (gdf(np.ones((2, 5)), magic=82992), ["not a .gdf", "82991", "30 44 01 00"]),
-        (b"GDF v. 1.0\n2 5 2\n", ["ASCII variant"]),
+        (b"GDF v. 1.0\n2\n5", ["cut short", "header"]),
+        (b"GDF v. 1.0\n3\n5 1 1 4 5\n1 2 3 4 5\n", ["2 dimensions"]),
+        (b"GDF v. 1.0\n2\n5 1 4 5\n1 2 3 4\n", ["1 rows of 5 columns", "4 numbers"]),
+        (b"GDF v. 1.0\n2\n4 1 4 4\n1 2 **** 4\n", ["column 2", "'****'", "without /ascii"]),
         (gdf(np.ones((2, 5)), code=7), ["unknown type code 7", "5 float64"]),
         (gdf(np.ones((2, 5)), code=6, count=9), ["type code 6", "5 columns x 2 rows, but 9"]),
         (gdf(np.ones((2, 5)), count=11), ["contradicts", "5 columns x 2 rows", "11 elements"]),
@@ -616,7 +632,7 @@ def test_all_faults_are_in_one_message():
     table.loc[4, "particle"] = np.nan
     table.loc[9, ["frame", "particle"]] = [0.0, 1.0]
     faults = faults_of(table.drop(columns="y"), source="data.parquet")
-    starts = ["missing column y", "frame: 1", "frame: 1", "particle: 1", "x: 1", "z: 1", "1 rows"]
+    starts = ["missing column y", "frame: 1", "frame: 1", "particle: 1", "x: 1", "z: 1", "1 row "]
     assert [fault.startswith(s) for fault, s in zip(faults, starts, strict=True)] == [True] * 7
 
 

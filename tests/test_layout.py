@@ -102,7 +102,7 @@ def test_public_names_are_the_ones_listed():
 def test_every_subpackage_is_an_attribute():
     """After `import perrin` alone, `perrin.plot` and the others are imported when first used."""
     code = "; ".join(f"perrin.{name}" for names in SUBPACKAGES for name in sorted(names))
-    assert "perrin.plot.style" in loaded_after(f"import perrin; {code}")
+    assert "perrin.plot.figure_style" in loaded_after(f"import perrin; {code}")
 
 
 def test_names_survive_the_import_of_every_module():

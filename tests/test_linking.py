@@ -140,8 +140,7 @@ def test_labels_that_pass_to_another_particle_are_a_warning():
         perrin.identify(table.assign(particle=exchanged), contact=DIAMETER, size=4)
     (warning,) = caught
     assert str(warning.message) == (
-        "identity: 2 labels of the column particle pass to another particle, in frame 12; they are "
-        "corrected"
+        "identity: 2 labels pass to another particle, in frame 12; they are corrected"
     )
     assert warning.filename == __file__
 

@@ -25,7 +25,7 @@ COMMANDS = {
 }
 # Arguments that the command line sets by itself, or takes as words without an option.
 WITHOUT_OPTION = {
-    "border", "cluster", "degree", "experiment", "keep", "path", "positions", "progress", "radius",
+    "cluster", "degree", "experiment", "keep", "path", "positions", "progress", "radius",
     "rng", "scheme", "settings", "spots", "stack", "tracks", "work", "detections",
 }  # fmt: skip
 

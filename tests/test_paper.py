@@ -20,7 +20,7 @@ from perrin.paper.experiment import conclusion, table_1
 from perrin.paper.method import challis, localisation, simulation
 from perrin.paper.noise import sampling
 from perrin.paper.orientations import appendix, axes, correlation, figure_2, figure_6
-from perrin.plot import style
+from perrin.plot import figure_style as style
 
 ROOT = Path(__file__).resolve().parents[1]
 QUICK_ITEMS = (localisation, table_1, appendix)

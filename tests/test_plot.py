@@ -8,14 +8,14 @@ import numpy as np
 import pandas as pd
 import pytest
 from matplotlib import rcParams
-from matplotlib.colors import to_rgba
+from matplotlib.colors import to_hex, to_rgba
 from matplotlib.figure import Figure
 
 import perrin
 from perrin._text import number_text
 from perrin.diffusion.estimate import DiffusionEstimate, bare_text, value_text
+from perrin.plot import figure_style, report_figures
 from perrin.plot import results as plot
-from perrin.plot import style
 
 
 def measured(*, clusters=1, frames=80, planar=False, labels=None, D_R=0.02, gaps=False):
@@ -153,7 +153,7 @@ def rod():
 
 def test_the_msad_of_an_anisotropic_body_is_compared_with_its_tensor(rod):
     """Line, circles and floor are those of the directions averaged: W = 1 - <p p^T>."""
-    left = plot.curve_figure(rod).axes[0]
+    left = report_figures.curve_figure(rod).axes[0]
     unit = rod.motion.template / np.linalg.norm(rod.motion.template, axis=1, keepdims=True)
     W = np.eye(3) - unit.T @ unit / len(unit)
     D, noise = np.trace(rod.tensor.tensor @ W), np.trace(rod.tensor.offset @ W)
@@ -332,13 +332,18 @@ def without_layout(figure):
 def test_save_figures_names_its_files_and_changes_no_setting(
     tmp_path, planar, monkeypatch, repeats
 ):
-    monkeypatch.setattr(style, "DPI", repeats(30, 150))
     if planar and repeats(True, False):
         # The layout of the figures takes most of the time.
-        figure = plot.new_figure
-        monkeypatch.setattr(plot, "new_figure", lambda *size: without_layout(figure(*size)))
+        figure = report_figures.column_figure
+        monkeypatch.setattr(
+            report_figures,
+            "column_figure",
+            lambda height, columns=2: without_layout(figure(height, columns=columns)),
+        )
     before = dict(rcParams)
-    files = plot.save_figures(measured(planar=planar, frames=20), tmp_path)
+    report = measured(planar=planar, frames=20)
+    sheet = {"savefig.dpi": 30} if repeats(True, False) else None
+    files = report_figures.save_figures(report, tmp_path, sheet=sheet)
     kinds = ("curves", "residuals", "orientations")
     names = [f"cluster-0-{kind}.{end}" for kind in kinds for end in ("png", "pdf")]
     assert [f.name for f in files] == names
@@ -348,14 +353,111 @@ def test_save_figures_names_its_files_and_changes_no_setting(
 
 
 def test_save_figures_draws_the_first_cluster_and_all_in_one(three, tmp_path, monkeypatch):
-    monkeypatch.setattr(plot, "save_figure", lambda _, stem: [stem])
-    files = plot.save_figures(three, tmp_path)
+    monkeypatch.setattr(report_figures, "save_figure", lambda _, stem: [stem])
+    files = report_figures.save_figures(three, tmp_path)
     stems = {f.name for f in files}
     assert "clusters" in stems
     assert {s.split("-")[1] for s in stems if "-" in s} == {"0"}
-    monkeypatch.setattr(plot, "orientation_figure", lambda _: None)
-    wanted = plot.save_figures(three, tmp_path, clusters=(2,))
+    monkeypatch.setattr(report_figures, "orientation_figure", lambda _, columns: None)
+    wanted = report_figures.save_figures(three, tmp_path, clusters=(2,))
     assert {f.name.split("-")[1] for f in wanted if "-" in f.name} == {"2"}
+
+
+@pytest.mark.parametrize("columns", [1, 2])
+def test_figures_of_runs_have_the_sizes_of_the_style_sheet(three, columns):
+    """Widths are 3.4 and 7.0 inches, or those of another sheet, whose text and colours count."""
+    result = three.clusters[0]
+    for sheet, widths in ((None, (3.4, 7.0)), ({"figure.figsize": (6.2, 3.0)}, (3.0, 6.2))):
+        with figure_style.style(sheet=sheet):
+            for draw in (report_figures.curve_figure, report_figures.residual_figure):
+                assert draw(result, columns=columns).get_figwidth() == widths[columns - 1]
+            figure = report_figures.forest_figure(three.clusters, three.pooled, columns=columns)
+            assert figure.get_figwidth() == widths[columns - 1]
+    sheet = {"font.size": 13, "lines.linewidth": 4, "axes.prop_cycle": "cycler('color', ['m'])"}
+    with figure_style.style(sheet=sheet):
+        ax = report_figures.curves(result, ax=axes())
+    fit = line(ax, "ML fit")
+    assert (fit.get_color(), fit.get_linewidth()) == (to_hex("m"), pytest.approx(0.95 * 4))
+    assert ax.xaxis.label.get_size() == 13
+    with pytest.raises(ValueError, match="columns: expected"):
+        figure_style.column_width(3)
+    with pytest.raises(OSError, match="nonsense"), figure_style.style(sheet="nonsense"):
+        pass
+
+
+def test_every_line_and_symbol_of_the_figures_follows_the_sheet(three):
+    """A sheet with doubled lines and symbols doubles all of them, in every figure of a run."""
+    result, drawn = three.clusters[0], []
+    for factor in (1, 2):
+        sheet = {"lines.linewidth": 1.0 * factor, "lines.markersize": 4.0 * factor}
+        with figure_style.style(sheet=sheet):
+            figures = [report_figures.forest_figure(three.clusters, three.pooled)]
+            figures += [report_figures.curve_figure(result), report_figures.residual_figure(result)]
+        drawn.append([x for f in figures for ax in f.axes for x in ax.lines])
+    for thin, thick in zip(*drawn, strict=True):
+        assert thick.get_linewidth() == pytest.approx(2 * thin.get_linewidth())
+        assert thick.get_markersize() == pytest.approx(2 * thin.get_markersize())
+
+
+def test_curves_and_forest_of_a_report_are_those_of_its_results(three):
+    """`curves(report, cluster=2)` draws the MSAD of cluster 2; the ratio divides it by 4 D_R t."""
+    result = three.clusters[2]
+    for quantity, curve, D in (("rotation", result.msad, result.D_R),
+                               ("translation", result.msd, result.D_T)):  # fmt: skip
+        ax = report_figures.curves(three, cluster=2, quantity=quantity)
+        points = np.concatenate([x.get_xydata() for x in ax.lines if x.get_marker() == "."])
+        assert np.array_equal(points, np.stack([curve.lagtime, curve.value], axis=1))
+        ax = report_figures.curves(three, cluster=2, quantity=quantity, ratio=True)
+        points = np.concatenate([x.get_xydata() for x in ax.lines if x.get_marker() == "."])
+        pure = 2 * curve.dof * D.value * curve.lagtime
+        np.testing.assert_allclose(points[:, 1], curve.value / pure, rtol=1e-12)
+        x, y = line(ax, "ML fit").get_data()
+        np.testing.assert_allclose(y, 1 + D.offset / (D.value * x), rtol=1e-12)
+        corners = ax.collections[0].get_paths()[0].vertices
+        first = corners[np.isclose(corners[:, 0], curve.lagtime[0]), 1]
+        assert np.ptp(first) == pytest.approx(2 * curve.stderr[0] / pure[0], rel=1e-9)
+    ax = report_figures.forest(three)
+    assert list(ax.lines[0].get_xdata()) == [c.D_R.value for c in three.clusters]
+    assert three.pooled.D_R.value in line(ax, "pooled").get_xdata()
+    given = axes()
+    assert report_figures.residuals(three, cluster=1, ax=given) is given
+
+
+def test_trajectories_and_steps_are_those_of_the_motion(three):
+    """Paths begin at 0 and end at the whole displacement; steps of all axes are counted once."""
+    result = three.clusters[1]
+    motion = result.motion
+    ax = report_figures.trajectory(three, cluster=1)
+    ends = [x.get_ydata()[-1] for x in ax.lines]
+    np.testing.assert_allclose(ends, motion.center[-1] - motion.center[0], rtol=1e-12)
+    ax = report_figures.trajectory(result, quantity="rotation")
+    drawn = np.stack([x.get_ydata() for x in ax.lines], axis=1)
+    assert np.array_equal(drawn, motion.accumulated_rotation())
+    for quantity, D in (("rotation", result.D_R), ("translation", result.D_T)):
+        found = perrin.plot.step_distribution(result, quantity)
+        assert found.number.sum() == 3 * (len(motion.time) - 1)
+        x = np.linspace(-1, 1, 20001) * 12 * np.sqrt(found.variance.max())
+        law = found.density(x)
+        assert np.trapezoid(law, x) == pytest.approx(1, abs=1e-6)
+        mean = 2 * (D.value * motion.dt + D.offset)
+        assert np.trapezoid(x**2 * law, x) == pytest.approx(mean, rel=0.02)
+        ax = report_figures.steps(three, cluster=1, quantity=quantity)
+        (points,) = ax.containers
+        width = found.edges[1] - found.edges[0]
+        assert points[0].get_ydata().sum() * width == pytest.approx(1, rel=1e-12)
+        np.testing.assert_allclose(
+            line(ax, "law").get_ydata(), found.density(line(ax, "law").get_xdata())
+        )
+
+
+def test_figures_of_a_report_ask_which_cluster(three):
+    """Several clusters need a number that exists; a result needs none."""
+    with pytest.raises(ValueError, match="cluster: expected one of 0, 1, 2, got none"):
+        report_figures.curves(three)
+    with pytest.raises(ValueError, match="got 7"):
+        report_figures.steps(three, cluster=7)
+    with pytest.raises(ValueError, match="quantity"):
+        report_figures.trajectory(three, cluster=0, quantity="msd")
 
 
 PAPER = {"D_R": 4.93e-3, "sigma": (0.03, 0.03, 0.04)}

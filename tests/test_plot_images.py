@@ -16,7 +16,7 @@ import perrin
 from perrin.images.imaging import Imaging, View
 from perrin.images.optics.optics import CameraNoise, Optics
 from perrin.plot import imaging as plot_images
-from perrin.plot import results as plot
+from perrin.plot.figure_style import series_color
 
 VOXEL, BALL = (0.25, 0.2, 0.2), 2.45
 
@@ -193,8 +193,8 @@ def test_clusters_have_colours_and_numbers_and_free_spheres_are_dashed(report):
     assert np.allclose(solid.get_offsets(), frame.loc[frame["cluster"] >= 0, ["x", "y"]])
     assert dashed.get_linestyles()[0][1] is not None
     assert solid.get_linestyles()[0][1] is None
-    assert [to_hex(c).upper() for c in solid.get_edgecolors()] == [
-        plot.PALETTE[k] for k in frame.loc[frame["cluster"] >= 0, "cluster"]
+    assert [to_hex(c) for c in solid.get_edgecolors()] == [
+        series_color(k) for k in frame.loc[frame["cluster"] >= 0, "cluster"]
     ]
     assert [t.get_text() for t in ax.texts] == ["0", "1"]
 
@@ -334,7 +334,7 @@ def test_paths_end_at_the_frame_of_the_view(report):
     for halo, path, cluster in zip(ax.lines[::2], ax.lines[1::2], report.clusters, strict=True):
         assert np.array_equal(path.get_xydata(), cluster.motion.center[:14, :2])
         assert np.array_equal(halo.get_xydata(), path.get_xydata())
-        assert path.get_color() == plot.PALETTE[cluster.cluster]
+        assert path.get_color() == series_color(cluster.cluster)
     here = report.imaging.features[report.imaging.features["frame"] == 20]
     assert np.allclose(circles(ax)[1].get_offsets(), here[["x", "y"]])
     assert ax.get_title() == "frame 20, 14.0 s"

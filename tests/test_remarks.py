@@ -11,9 +11,9 @@ from perrin.run.remarks import condensed, grouped, merged
 def poses(k: int) -> str:
     """Return the text about frames without a pose, as the analysis writes it."""
     if k % 3 == 0:
-        return f"{k + 2} of 300 frames have no pose ({k + 2} x 2 of 4 particles, 3 needed)"
+        return f"frames without a pose: {k + 2} of 300 ({k + 2} x 2 of 4 particles, 3 needed)"
     few, none = "1 x 1 of 4 particles, 3 needed", f"{k} x 2 of 4 particles, 3 needed"
-    return f"{k + 1} of 300 frames have no pose ({few}; {none})"
+    return f"frames without a pose: {k + 1} of 300 ({few}; {none})"
 
 
 def test_texts_that_differ_in_numbers_are_one_line():

@@ -15,9 +15,10 @@ import pytest
 import perrin
 from perrin._text import number_text
 from perrin.diffusion.estimate import bare_text
-from perrin.plot import results
+from perrin.plot import report_figures
 from perrin.report import citations, embedding, figure_data, write
 from perrin.report import page as report
+from perrin.run import repetition
 from perrin.run.results import write_data
 from test_plot import estimate, measured
 
@@ -337,10 +338,10 @@ def test_what_is_copied_repeats_the_run(single, tmp_path):
     """The Python lines and the command have the arguments that are not the defaults."""
     settings = single.settings | {"arguments": {"dt": 0.5, "scale": 1.0, "frames": (2, None)}}
     found = replace(single, settings=settings)
-    assert citations.python_lines(found).splitlines()[2] == (
+    assert repetition.python_lines(found.settings).splitlines()[2] == (
         "report = perrin.analyze('/data/<my> & \"tracks\".csv', dt=0.5, frames=(2, None))"
     )
-    assert citations.command_line(found) == (
+    assert repetition.command_line(found.settings) == (
         "perrin analyze '/data/<my> & \"tracks\".csv' --dt 0.5 --frames 2: -o my-run"
     )
     text = citations.methods_paragraph(found)
@@ -350,12 +351,14 @@ def test_what_is_copied_repeats_the_run(single, tmp_path):
 
 def test_the_run_folder_is_complete(single, tmp_path, monkeypatch, repeats):
     if repeats(True, False):
-        monkeypatch.setattr(results, "save_figure", save_blank)
+        monkeypatch.setattr(report_figures, "save_figure", save_blank)
     place = tmp_path / "run"
     write.write_run(single, place)
     names = {f.name for f in place.iterdir()}
     assert names == {
         "summary.json", "results.csv", "tracks.parquet", "motion.parquet", "curves.csv", "run.json",
+        "run.toml",
+        "checksums.json",
         "figures", "report.html",
     }  # fmt: skip
     assert len(list((place / "figures").iterdir())) == 6
@@ -388,7 +391,7 @@ def test_a_failure_leaves_no_files_and_keeps_an_existing_folder(
     place.mkdir()
     write_data(single, place)
 
-    def fail(*_):
+    def fail(*_, **__):
         raise RuntimeError("disk full")
 
     monkeypatch.setattr(write, "save_figures", lambda *_: [])
@@ -448,5 +451,6 @@ def test_notes_are_kept_and_older_runs_have_none(single, tmp_path):
     for entry in (summary, *summary["clusters"]):
         del entry["notes"]
     (tmp_path / "run" / "summary.json").write_text(json.dumps(summary))
+    (tmp_path / "run" / "checksums.json").unlink()  # which older runs do not have either
     again = perrin.load_run(tmp_path / "run")
     assert (again.notes, again.clusters[0].notes) == ((), ())

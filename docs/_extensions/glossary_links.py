@@ -9,6 +9,8 @@ from sphinx import addnodes
 from sphinx.transforms import SphinxTransform
 
 GLOSSARY = "reference/glossary"
+# Terms that are also common words: a link would often explain something else.
+COMMON = {"R", "cage", "interval", "note", "piece", "pooled", "rod", "sigma", "warning"}
 # No links inside these: titles, code, links, definitions of signatures, captions of figures.
 CLOSED = (
     nodes.title,
@@ -43,7 +45,7 @@ def terms(path):
 @cache
 def pattern(path):
     """Return the expression that finds any of the terms, the longest first."""
-    longest = sorted(terms(path), key=len, reverse=True)
+    longest = sorted(set(terms(path)) - COMMON, key=len, reverse=True)
     return re.compile(r"(?<![\w-])(" + "|".join(map(re.escape, longest)) + r")(?![\w-])")
 
 

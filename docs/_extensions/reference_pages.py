@@ -7,10 +7,8 @@ from pathlib import Path
 
 import perrin
 
-SUBPACKAGES = (
-    "tracks", "images", "run", "movie", "motion", "curves", "diffusion", "hydrodynamics",
-    "geometry", "plot", "report", "errors",
-)  # fmt: skip
+# Those of the command line and of the paper's figures are no interface.
+SUBPACKAGES = tuple(name for name in perrin._FACES if name not in ("cli", "paper", "compiled"))
 # Subpackages without names in `perrin` itself whose functions users call.
 CALLED_BY_PATH = ("plot",)
 
@@ -126,7 +124,7 @@ def command_line_page():
     return "\n".join(text)
 
 
-def write_pages(app):
+def write_pages(app, _):
     """Write all generated pages into docs/reference."""
     folder = Path(app.srcdir, "reference")
     write_if_changed(folder / "python" / "index.rst", reference_index())
@@ -136,6 +134,6 @@ def write_pages(app):
 
 
 def setup(app):
-    """Register the pages before autosummary looks for its tables."""
-    app.connect("builder-inited", write_pages, priority=100)
+    """Register the pages; they are written before Sphinx lists the files that it reads."""
+    app.connect("config-inited", write_pages)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

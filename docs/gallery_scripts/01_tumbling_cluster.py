@@ -23,7 +23,9 @@ left, right = figure.subfigures(1, 2, width_ratios=(1, 1.1))
 for ax, frame in zip(left.subplots(2, 3).ravel(), range(0, 300, 50), strict=False):
     turned = perrin.Cluster(body.positions @ motion.rotation[frame].T)
     plot_cluster(turned, ax=ax, diameter=2.45, view=np.eye(3))
-    ax.set_title(f"{motion.time[frame]:.0f} s", fontsize=10)
+    ax.set(xlim=(-2.8, 2.8), ylim=(-2.8, 2.8))
+    ax.axis("off")
+    ax.set_title(f"{motion.time[frame]:.0f} s", fontsize=10, y=0.93)
 
 plot_lag_curve(
     perrin.msad(motion),

@@ -55,6 +55,27 @@ def frames_text(frames: Iterable[int], *, most: int = 10) -> str:
     return f"frame{'s' if len(numbers) != 1 else ''} {listed(numbers, most=most)}"
 
 
+def counted(count: int, noun: str, verb: str = "") -> str:
+    """Write a number of things with the plural that it needs, and the verb of these things.
+
+    Parameters
+    ----------
+    count : int
+    noun : str
+        Singular whose plural ends in s.
+    verb : str
+        Of the plural: "have", "are", "belong".
+
+    Examples
+    --------
+    >>> counted(1, "row"), counted(0, "row"), counted(1, "row", "have"), counted(1, "row", "belong")
+    ('1 row', '0 rows', '1 row has', '1 row belongs')
+    """
+    one = count == 1
+    singular = {"have": "has", "are": "is", "pass": "passes"}.get(verb, f"{verb}s" if verb else "")
+    return f"{count} {noun}{'' if one else 's'} {singular if one else verb}".rstrip()
+
+
 def with_error(value: float, stderr: float) -> str:
     """Write a value with its standard error in the last digits: 0.0047(5).
 

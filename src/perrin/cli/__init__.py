@@ -18,7 +18,7 @@ from perrin.cli.app import (
     show_run,
     simulate,
 )
-from perrin.cli.config import config_text, take_config, write_config
+from perrin.cli.config import take_config
 from perrin.cli.diagnosis import Check, figure_font, installed, optional_readers, self_test
 from perrin.cli.messages import (
     StoppedError,
@@ -73,7 +73,6 @@ __all__ = [
     "claimed_output",
     "cluster_table",
     "common_options",
-    "config_text",
     "convert",
     "demo",
     "doctor",
@@ -124,5 +123,4 @@ __all__ = [
     "take_config",
     "terms_of",
     "warnings_in_one_line",
-    "write_config",
 ]

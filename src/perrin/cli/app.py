@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from perrin._text import printable
-from perrin.cli.config import config_text, write_config
+from perrin._text import counted, printable
 from perrin.cli.messages import (
     claimed_output,
     escape,
@@ -95,11 +94,6 @@ app.add_typer(study_app, name="study")
 # Default folder of the demo, and the files that it writes there, by which it is recognised.
 _DEMO_FOLDER = "perrin-demo"
 
-_DEMO_NOTE = (
-    "the planted D_R and D_T are those that Hunter et al. measured; they are below the prediction "
-    "for spheres of 2.45 um, as the sizes that follow from them are above it"
-)
-
 _DEMO_FILES = re.compile(
     r"summary\.json|run\.json|checksums\.json|run\.toml|report\.html|(?:curves|results|demo-tracks)\.csv"
     r"|(?:tracks|motion)\.parquet"
@@ -152,11 +146,14 @@ def demo(
     quiet: Quiet = False,
     overwrite: Overwrite = False,
 ) -> None:
-    """Analyse an embedded table: one simulated tetrahedron under the paper's conditions."""
+    """Analyse an embedded table: a simulated tetrahedron that diffuses as predicted."""
+    import shutil
+    import tempfile
     from dataclasses import replace
     from importlib.resources import as_file, files
 
     import perrin
+    from perrin.report.write import run_folder
     from perrin.run.experiment import Experiment
     from perrin.run.folders import check_place
 
@@ -167,22 +164,19 @@ def demo(
             check_demo_folder(place)
             overwrite = True
         check_place(place, overwrite=overwrite)
-        known = Experiment(dt=0.73, viscosity=2.18e-3, temperature=295.0, diameter=2.45)
-        report = perrin.analyze(path, experiment=known)
-        report = replace(
-            report,
-            settings=report.settings | {"made": "demo"},
-            notes=(*report.notes, _DEMO_NOTE),
-        )
-        perrin.write_run(report, place, overwrite=overwrite)
-        table = perrin.read_tracks(path)
-        perrin.write_tracks(table, place / "demo-tracks.csv")
-        stated = {"tracks": place / "demo-tracks.csv", **known.to_dict()}
-        text = config_text("analyze", stated, {"keep_jumps": "keep-jumps"})
-        (place / "run.toml").write_text(text, encoding="utf-8")
+        with tempfile.TemporaryDirectory(prefix="perrin-") as folder:
+            input_table = Path(folder) / "demo-tracks.csv"
+            perrin.write_tracks(perrin.read_tracks(path), input_table)
+            known = Experiment(dt=0.73, viscosity=2.18e-3, temperature=295.0, diameter=2.45)
+            report = perrin.analyze(input_table, experiment=known)
+            source = report.settings["input"] | {"path": str(place / input_table.name)}
+            report = replace(report, settings=report.settings | {"made": "demo", "input": source})
+            with run_folder(report, place, overwrite=overwrite) as stage:
+                shutil.copy(input_table, stage)
         show_run(report, place, demo, as_json=as_json, quiet=quiet)
         if not (as_json or quiet):
-            print("Planted in the simulation: D_R = 0.00493 rad^2/s, D_T = 0.0385 um^2/s.")
+            planted = "D_R = 0.006727 rad^2/s, D_T = 0.04535 um^2/s"
+            print(f"Planted in the simulation, as predicted: {planted}.")
             print(printable(f"The input, as an example of a table: {place / 'demo-tracks.csv'}"))
 
 
@@ -195,7 +189,6 @@ def demo(
     perrin analyze --config my-run/run.toml                           # once more""",
 )
 def analyze(
-    ctx: typer.Context,
     tracks: Tracks,
     dt: Interval,
     output: Output,
@@ -250,9 +243,7 @@ def analyze(
             frames=read_slice(frames),
             progress=progress,
         )
-        progress(0, 0, "writing the report")
-        perrin.write_run(report, output, overwrite=overwrite)
-        write_config(output, ctx)
+        perrin.write_run(report, output, overwrite=overwrite, progress=progress)
     with messages_of(analyze):
         show_run(report, output, analyze, as_json=as_json, quiet=quiet)
 
@@ -264,7 +255,6 @@ def analyze(
     perrin run movie.lif --image 3 --diameter 1.8 --contact 2.0 --workers 8 -o my-run""",
 )
 def run(
-    ctx: typer.Context,
     stack: Annotated[
         Path, typer.Argument(help="Movie of stacks: TIFF, OME-TIFF, .lif, .nd2, .czi, .ims, .zarr.")
     ],
@@ -354,6 +344,12 @@ def run(
             rich_help_panel=SPHERES,
         ),
     ] = False,
+    border: Annotated[
+        bool,
+        typer.Option(
+            help="Whether spheres that the border cuts are located too.", rich_help_panel=SPHERES
+        ),
+    ] = True,
     minmass: Annotated[
         float | None,
         typer.Option(
@@ -373,8 +369,9 @@ def run(
         str | None,
         typer.Option(
             help="Image of a sphere, learned if left out: diameter,psf_z,psf (um), gain,floor "
-            "of the noise (variance of a voxel: gain times its intensity plus floor), and "
-            "share,tail_z,tail (um) of the second Gaussian of a point spread with a tail.",
+            "of the noise (variance of a voxel: gain times its intensity plus floor), "
+            "share,tail_z,tail (um) of the second Gaussian of a point spread with a tail, and the "
+            "relative spread of the diameters.",
             rich_help_panel=SPHERES,
         ),
     ] = None,
@@ -452,6 +449,7 @@ def run(
                 optics=read_optics(optics),
                 psf=None if psf is None else measured_psf(psf, bead_diameter),
                 dark=dark,
+                border=border,
                 minmass=minmass,
                 percentile=percentile,
                 noise=read_noise(noise),
@@ -467,9 +465,7 @@ def run(
                 scheduler=scheduler,
                 progress=progress,
             )
-            progress(0, 0, "writing the report")
-            complete_run(report, output)
-            write_config(output, ctx)
+            complete_run(report, output, progress=progress)
         show_run(report, output, run, as_json=as_json, quiet=quiet)
 
 
@@ -703,12 +699,13 @@ def plan(
         else:
             show_plan(found)
         if output is not None:
+            from perrin.plot.figure_style import column_figure, style
             from perrin.plot.results import plot_plan
-            from perrin.plot.style import new_figure
 
-            figure = new_figure(7, 4.6)
-            plot_plan(found, ax=figure.add_subplot())
-            figure.savefig(output, dpi=150)
+            with style():
+                figure = column_figure(0.55)
+                plot_plan(found, ax=figure.add_subplot())
+                figure.savefig(output)
             if not as_json:
                 print(printable(f"Written to {output}"))
 
@@ -799,7 +796,7 @@ def convert(
         perrin.write_tracks(table, target)
         for note in notes:
             print(printable(f"note: {note}"))
-        print(printable(f"{len(table)} rows written to {target}"))
+        print(printable(f"{counted(len(table), 'row')} written to {target}"))
 
 
 @app.command(cls=GroupedCommand, epilog="perrin examples my-examples")

@@ -1,26 +1,21 @@
-"""Options of a command in a TOML file: read by --config, and written into every run folder."""
+"""Options of a command in a TOML file, which --config reads: that of a run folder, or one's own."""
 
 from __future__ import annotations
 
-import json
 import tomllib
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from pathlib import Path  # noqa: TC003 (typer reads the annotations of callbacks)
+from typing import Any
 
 import typer
 
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-# Names of a configuration that are no options: the command that it belongs to.
-_COMMAND = "command"
-
-# Options that a repeated run states anew.
-_NOT_KEPT = ("config", "output", "overwrite", "as_json", "quiet", "workers", "scheduler")
+# Arguments that are paths.
+_PATHS = ("tracks", "stack", "output")
 
 
 def take_config(ctx: typer.Context, path: Path | None) -> Path | None:
     """Take the options of a file as defaults; those of the command line outrank them.
+
+    Paths in the file are relative to its folder.
 
     Parameters
     ----------
@@ -45,7 +40,7 @@ def take_config(ctx: typer.Context, path: Path | None) -> Path | None:
     except (OSError, tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         raise typer.BadParameter(f"{path}: {reason}") from None
-    command = stated.pop(_COMMAND, ctx.info_name)
+    command = stated.pop("command", ctx.info_name)
     if command != ctx.info_name:
         raise typer.BadParameter(f"{path} is of the command {command}, not of {ctx.info_name}")
     names = _names_of(ctx)
@@ -54,65 +49,14 @@ def take_config(ctx: typer.Context, path: Path | None) -> Path | None:
         offered = ", ".join(sorted(names))
         raise typer.BadParameter(f"{path}: unknown: {', '.join(unknown)}; expected {offered}")
     values = {names[n.replace("_", "-")]: _as_option(value) for n, value in stated.items()}
+    for name in set(_PATHS) & set(values):
+        # A configuration means the same wherever it is read from.
+        values[name] = str(path.absolute().parent / values[name])
     if ctx.info_name in ("analyze", "run") and "output" not in values:
         beside = _beside(path)
         values |= {} if beside is None else {"output": beside}
     ctx.default_map = {**(ctx.default_map or {}), **values}
     return path
-
-
-def config_text(
-    command: str, values: Mapping[str, Any], names: Mapping[str, str] | None = None
-) -> str:
-    """Return the options of a command as TOML.
-
-    Parameters
-    ----------
-    command : str
-    values : mapping
-        Values by the names of the command's arguments; paths are made absolute, and values of
-        None or False are left out.
-    names : mapping of str to str, optional
-        Name of an argument on the command line, without dashes before it, where it differs.
-
-    Returns
-    -------
-    str
-
-    Examples
-    --------
-    >>> print(config_text("analyze", {"dt": 0.5, "d_r": None, "drift": True}, {"d_r": "d-r"}))
-    command = "analyze"
-    dt = 0.5
-    drift = true
-    <BLANKLINE>
-    """
-    lines = [f'{_COMMAND} = "{command}"']
-    for key, value in values.items():
-        if key in _NOT_KEPT or value is None or value is False:
-            continue
-        plain = str(value.absolute()) if isinstance(value, Path) else value
-        # Text, numbers and true are written in TOML as in JSON.
-        lines.append(f"{(names or {}).get(key, key)} = {json.dumps(plain, ensure_ascii=False)}")
-    return "\n".join(lines) + "\n"
-
-
-def write_config(folder: Path, ctx: typer.Context) -> None:
-    """Write the options of this call into a run folder, as run.toml.
-
-    Parameters
-    ----------
-    folder : Path
-        A finished run folder.
-    ctx : typer.Context
-    """
-    from perrin.tracks.writing import written_whole
-
-    names = {key: name for name, key in _names_of(ctx).items()}
-    values = {key: ctx.params[key] for key in names if key in ctx.params}
-    text = config_text(str(ctx.info_name), values, names)
-    with written_whole(folder / "run.toml") as part:
-        part.write_text(text, encoding="utf-8")
 
 
 def _names_of(ctx: typer.Context) -> dict[str, str]:

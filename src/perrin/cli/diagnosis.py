@@ -96,7 +96,7 @@ def figure_font() -> Check:
     >>> figure_font().subject
     'font of figures'
     """
-    from perrin.plot.style import font_in_use
+    from perrin.plot.figure_style import font_in_use
 
     font = font_in_use()
     return Check("font of figures", font or "none is found", font is not None)

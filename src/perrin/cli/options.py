@@ -261,10 +261,10 @@ Positions = Annotated[
 
 
 def read_optics(text: str | None) -> Optics | None:
-    """Read diameter, point spread along z and in the plane, gain and floor, and the tail.
+    """Read diameter, point spread along z and in the plane, gain, floor, tail and spread.
 
     The tail of the point spread, which may be absent, is its share and its widths along z and in
-    the plane.
+    the plane; the spread of the diameters, which may be absent too, is the last number.
     """
     from perrin.images.optics.ball_image import PsfTail
     from perrin.images.optics.optics import CameraNoise, Optics
@@ -272,14 +272,15 @@ def read_optics(text: str | None) -> Optics | None:
     if text is None:
         return None
     values = read_numbers("--optics", text)
-    if not isinstance(values, list) or len(values) not in (5, 8):
+    if not isinstance(values, list) or len(values) not in (5, 6, 8, 9):
         raise ValueError(
-            f"--optics: expected diameter,psf_z,psf,gain,floor, and for a point spread with a tail "
-            f"also share,tail_z,tail, got {text!r}"
+            f"--optics: expected diameter,psf_z,psf,gain,floor, for a point spread with a tail "
+            f"also share,tail_z,tail, and for unequal spheres also the spread, got {text!r}"
         )
+    spread = values.pop() if len(values) in (6, 9) else 0.0
     diameter, psf_z, psf, gain, floor, *wide = values
     tail = PsfTail(wide[0], (wide[1], wide[2])) if wide else None
-    return Optics(diameter, (psf_z, psf), CameraNoise(gain, floor), tail=tail)
+    return Optics(diameter, (psf_z, psf), CameraNoise(gain, floor), tail=tail, spread=spread)
 
 
 def spheres_of(

@@ -93,6 +93,7 @@ def show_report(report: Report, output: Path, command: Callable[..., None]) -> N
     """Print the short tables, the warnings, the notes, and where the run is written."""
     from rich.console import Console
 
+    from perrin._text import counted
     from perrin.run.results import perp_text
     from perrin.run.statements import verdict_lines
 
@@ -104,9 +105,8 @@ def show_report(report: Report, output: Path, command: Callable[..., None]) -> N
             axes = f"rotation about the body's axes: {result.tensor.summary}\n"
             console.print(escape(axes), soft_wrap=True)
     if len(report.clusters) > _CLUSTERS_SHOWN:
-        console.print(
-            f"and {len(report.clusters) - _CLUSTERS_SHOWN} more clusters in report.html\n"
-        )
+        rest = counted(len(report.clusters) - _CLUSTERS_SHOWN, "more cluster")
+        console.print(f"and {rest} in report.html\n")
     for term in terms_of(report):
         console.print(escape(term), style="dim", soft_wrap=True)
     if report.pooled is not None and len(report.clusters) > 1:
@@ -148,6 +148,7 @@ def terms_of(report: Report) -> list[str]:
 
 def show_remarks(report: Report, command: Callable[..., None], console: Console) -> None:
     """Print the warnings, then the notes, with those of several clusters in one line."""
+    from perrin._text import counted
     from perrin.cli.messages import in_options, options_of
     from perrin.run.remarks import condensed, merged
 
@@ -164,7 +165,8 @@ def show_remarks(report: Report, command: Callable[..., None], console: Console)
         shown = escape(in_options(text, options))
         console.print(f"[bold yellow]! warning:[/] {shown}", soft_wrap=True)
     if len(warnings) > _WARNINGS_SHOWN:
-        console.print(f"and {len(warnings) - _WARNINGS_SHOWN} more warnings in summary.json")
+        rest = counted(len(warnings) - _WARNINGS_SHOWN, "more warning")
+        console.print(f"and {rest} in summary.json")
     for text in notes[:_NOTES_SHOWN]:
         console.print(f"note: {escape(in_options(text, options))}", style="dim", soft_wrap=True)
     if len(notes) > _NOTES_SHOWN:
@@ -266,8 +268,10 @@ def pooled_table(pooled: Pooled) -> Table:
     from rich.box import SIMPLE_HEAD
     from rich.table import Table
 
+    from perrin._text import counted
+
     count = len(pooled.clusters)
-    title = f"{count} clusters pooled"
+    title = f"{counted(count, 'cluster')} pooled"
     table = Table("", "value", "68 %", "95 %", title=title, title_justify="left", box=SIMPLE_HEAD)
     table.columns[0].no_wrap = True
     same = []

@@ -6,7 +6,7 @@ import hashlib
 import os
 import threading
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -62,6 +62,8 @@ class Stack:
         ``read(i)`` returns frame i without the checks of `frame`.
     notes : tuple of str
         How the file was interpreted where it does not name its axes.
+    stated : dict
+        Values of voxel, dt and plane_time that the user stated.
 
     Examples
     --------
@@ -79,6 +81,7 @@ class Stack:
     source: str
     read: Callable[[int], NDArray[Any]]
     notes: tuple[str, ...] = ()
+    stated: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         frozen(self.voxel, self.times)
@@ -267,6 +270,7 @@ def open_stack(
     ((5, 8, 32, 32), (8, 32, 32))
     """
     size = None if voxel is None else np.atleast_1d(np.asarray(voxel, dtype=np.float64))
+    given = {"voxel": None if size is None else size.tolist(), "dt": dt, "plane_time": plane_time}
     if size is not None and size.shape == (2,) and planes is None:
         planes = 1
     one, several = _channels(channel)
@@ -313,6 +317,7 @@ def open_stack(
         source=source,
         read=read,
         notes=contents.notes,
+        stated={name: value for name, value in given.items() if value is not None},
     )
 
 

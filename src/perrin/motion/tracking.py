@@ -20,6 +20,7 @@ from perrin._arrays import (
     refuse,
     require_positive,
 )
+from perrin._text import counted
 from perrin.geometry.rotations import successive_product
 from perrin.motion.degenerate import mean_present, no_orientation, require_points
 from perrin.motion.procrustes import (
@@ -177,8 +178,9 @@ def _particle_delays(delays: ArrayLike, seen: Bools) -> Floats:
     if unknown.any():
         row, particle = (int(k[0]) for k in np.nonzero(unknown))
         raise ValueError(
-            f"delays: {int(unknown.sum())} particles have coordinates but no time, the first is "
-            f"particle {particle} in row {row}: state all times, or leave these particles out (NaN)"
+            f"delays: {counted(int(unknown.sum()), 'particle', 'have')} coordinates but no time, "
+            f"the first is particle {particle} in row {row}: state all times, or leave these "
+            "particles out (NaN)"
         )
     return t
 

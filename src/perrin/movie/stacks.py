@@ -270,6 +270,7 @@ def analyze_stack(
             "arguments": experiment.to_dict()
             | {k: v for k, v in depends[0].items() if k not in ("sha256", "versions")}
             | {"size": sizes, "exclude": excluded}
+            | {f"stated_{name}": value for name, value in stack.stated.items()}
             | _other_channels(stacks, sources),
         }
         recording = Recording(

@@ -8,7 +8,7 @@ from zlib import crc32
 
 import numpy as np
 
-from perrin.plot.style import new_figure, save_figure
+from perrin.plot.figure_style import new_figure, palette, save_figure
 from perrin.tracks.writing import write_json
 
 if TYPE_CHECKING:
@@ -196,9 +196,10 @@ def write_item(item: Item, folder: Path) -> None:
     folder : Path
         An existing folder.
     """
-    figure = new_figure(*item.size)
-    item.draw(figure)
-    save_figure(figure, folder / item.name)
+    with palette():
+        figure = new_figure(*item.size)
+        item.draw(figure)
+        save_figure(figure, folder / item.name)
     item.table.to_csv(folder / f"{item.name}.csv", index=False)
 
 

@@ -19,7 +19,7 @@ from perrin.motion.simulate import add_noise, simulate_motion
 from perrin.motion.tracking import remove_rotation, track_rotation
 from perrin.paper.claims import Claim, Item, Study, statistical
 from perrin.paper.method import log_lags
-from perrin.plot.style import PALETTE
+from perrin.plot.figure_style import PALETTE
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

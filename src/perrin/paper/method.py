@@ -14,8 +14,8 @@ from perrin.geometry.shapes import Cluster, pair_distances
 from perrin.motion.simulate import add_noise, simulate_motion
 from perrin.motion.tracking import track_rotation
 from perrin.paper.claims import Claim, Item, Study, statistical
+from perrin.plot.figure_style import PALETTE
 from perrin.plot.results import plot_cluster
-from perrin.plot.style import PALETTE
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

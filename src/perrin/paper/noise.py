@@ -18,7 +18,7 @@ from perrin.motion.simulate import add_noise, simulate_motion
 from perrin.motion.tracking import track_rotation
 from perrin.paper.claims import Claim, Item, Study, statistical
 from perrin.paper.method import NOISES, STEPS, R, log_lags
-from perrin.plot.style import PALETTE
+from perrin.plot.figure_style import PALETTE
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

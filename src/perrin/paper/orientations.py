@@ -17,8 +17,8 @@ from perrin.motion.simulate import add_noise, simulate_motion
 from perrin.motion.tracking import track_rotation
 from perrin.paper.claims import Claim, Item, Study, statistical
 from perrin.paper.method import STEPS, R, log_lags, random_rotations, unit
+from perrin.plot.figure_style import PALETTE
 from perrin.plot.results import plot_orientations
-from perrin.plot.style import PALETTE
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

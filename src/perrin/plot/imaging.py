@@ -11,15 +11,16 @@ from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator
 
 from perrin._text import number_text, shortened
-from perrin.plot.style import (
-    BLUE,
+from perrin.plot.figure_style import (
     GREY,
-    INK,
-    PALETTE,
-    RED,
+    column_figure,
+    ink,
     legend_above,
-    new_figure,
+    line_width,
+    marker_size,
     save_figure,
+    series_color,
+    style,
     write_reason,
 )
 
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
     from perrin.images.imaging import Imaging, View
     from perrin.motion.rigid_motion import RigidMotion
     from perrin.motion.rods import RodMotion
+    from perrin.plot.figure_style import Sheet
     from perrin.run.results import ClusterResult, Report, RodResult
 
 
@@ -90,14 +92,14 @@ def plot_found(imaging: Imaging, view: View, *, ax: Axes, side: Side = "xy") -> 
     across, down = _SIDE_AXES[side]
     _draw_image(imaging, view, ax=ax, side=side)
     here = _spheres_of(imaging, view.frame)
-    _draw_circles(here, imaging.diameter, ax=ax, across=across, down=down, lw=1.4)
+    _draw_circles(here, imaging.diameter, ax=ax, across=across, down=down, lw=line_width(0.95))
     named = here[here["cluster"] >= 0].groupby("cluster")[[across, down]].mean()
     if side == "xy" or len(named) <= _NUMBERED_CLUSTERS:
         size = "x-small" if len(named) > _NUMBERED_CLUSTERS else "medium"
         for cluster, place in zip(named.index, named.to_numpy(), strict=True):
             # The outline makes the number readable on dark and bright spheres.
-            outline = [withStroke(linewidth=2, foreground="white")]
-            text = ax.text(place[0], place[1], str(cluster), color=INK, ha="center", va="center")
+            outline = [withStroke(linewidth=line_width(1.35), foreground="white")]
+            text = ax.text(place[0], place[1], str(cluster), color=ink(), ha="center", va="center")
             text.set(size=size, weight="bold", path_effects=outline)
             text.set_clip_on(True)
     return ax
@@ -121,13 +123,13 @@ def plot_tracks(report: Report, view: View, *, ax: Axes) -> Axes:
     imaging = imaging_of(report)
     _draw_image(imaging, view, ax=ax, side="xy")
     here = _spheres_of(imaging, view.frame)
-    _draw_circles(here, imaging.diameter, ax=ax, across="x", down="y", lw=0.9)
+    _draw_circles(here, imaging.diameter, ax=ax, across="x", down="y", lw=line_width(0.6))
     for result in report.results:
         motion = result.motion
         frame = stack_frames(report, motion)
         path = motion.center[(frame <= view.frame) & (frame > view.frame - _PATH_FRAMES)]
-        ax.plot(path[:, 0], path[:, 1], color="white", lw=2.4, alpha=0.7)
-        ax.plot(path[:, 0], path[:, 1], color=_color(result.cluster), lw=1.2)
+        ax.plot(path[:, 0], path[:, 1], color="white", lw=line_width(1.6), alpha=0.7)
+        ax.plot(path[:, 0], path[:, 1], color=series_color(result.cluster), lw=line_width(0.8))
     ax.set_title(_frame_text(imaging, view.frame), size="medium")
     return ax
 
@@ -151,12 +153,14 @@ def plot_masses(imaging: Imaging, *, ax: Axes) -> Axes:
         return write_reason(ax, "no spots in the sampled frames", framed=True)
     edges = _mass_edges(mass, imaging.minmass)
     kept = mass >= imaging.minmass
-    for which, color, verdict in ((~kept, GREY, "rejected"), (kept, BLUE, "kept")):
+    for which, color, verdict in ((~kept, GREY, "rejected"), (kept, series_color(0), "kept")):
         if which.any():
             ax.hist(mass[which], edges.tolist(), color=color, label=f"{which.sum()} {verdict}")
     if imaging.minmass > 0:
         label = f"cut at {number_text(imaging.minmass)}"
-        ax.axvline(imaging.minmass, color=RED, lw=1.4, ls="--", label=label)
+        ax.axvline(
+            imaging.minmass, color=series_color(1), lw=line_width(0.95), ls="--", label=label
+        )
     ax.set(xscale="log", xlabel="mass (grey levels)", ylabel="spots")
     _count_axis(ax)
     legend_above(ax, ncols=3)
@@ -183,13 +187,26 @@ def plot_misfit(imaging: Imaging, *, ax: Axes) -> Axes:
         return write_reason(ax, "no image was fitted", framed=True)
     chi2 = known.groupby("frame")["chi2"].agg(["min", "median", "max"])
     time = _frame_times(imaging, chi2.index.to_numpy())
-    ax.fill_between(time, chi2["min"], chi2["max"], color=BLUE, alpha=0.25, lw=0, label="range")
+    ax.fill_between(
+        time, chi2["min"], chi2["max"], color=series_color(0), alpha=0.25, lw=0, label="range"
+    )
     raster = len(time) > _VECTOR_POINTS
-    ax.plot(time, chi2["median"], color=BLUE, lw=1.2, label="median", rasterized=raster)
+    ax.plot(
+        time,
+        chi2["median"],
+        color=series_color(0),
+        lw=line_width(0.8),
+        label="median",
+        rasterized=raster,
+    )
     if len(time) == 1:
         ends = np.abs(chi2[["min", "max"]].T.to_numpy() - chi2["median"].to_numpy())
-        ax.errorbar(time, chi2["median"], ends, fmt="o", color=BLUE, ms=4)
-    ax.axhline(1.0, color=RED, lw=1.1, ls="--", label="explained to the noise")
+        ax.errorbar(
+            time, chi2["median"], ends, fmt="o", color=series_color(0), ms=marker_size(0.65)
+        )
+    ax.axhline(
+        1.0, color=series_color(1), lw=line_width(0.75), ls="--", label="explained to the noise"
+    )
     ax.set(xlabel="time (s)", ylabel="image misfit\nχ² per degree of freedom")
     if chi2["max"].max() > 5 * chi2["median"].median():
         ax.set_yscale("log")
@@ -218,22 +235,28 @@ def plot_rigidity(report: Report, *, ax: Axes) -> Axes:
     few, start = len(results) <= _COLORED_CLUSTERS, _tracks_start(report)
     for result in results:
         motion = result.motion
-        style: dict[str, Any] = {"color": GREY, "alpha": 0.5, "lw": 0.6}
+        style: dict[str, Any] = {"color": GREY, "alpha": 0.5, "lw": line_width(0.4)}
         if few:
-            style = {"color": _color(result.cluster), "lw": 0.9, "label": _cluster_label(result)}
+            style = {
+                "color": series_color(result.cluster),
+                "lw": line_width(0.6),
+                "label": _cluster_label(result),
+            }
         raster = len(motion.time) * len(results) > _VECTOR_POINTS
         ax.plot(start + motion.time, 1e3 * motion.residual, rasterized=raster, **style)
     if not few:
         time, middle = _median_residual(report)
         label = f"median of {len(results)} clusters"
-        ax.plot(start + time, 1e3 * middle, color=INK, lw=1.2, label=label)
+        ax.plot(start + time, 1e3 * middle, color=ink(), lw=line_width(0.8), label=label)
     tops = [float(np.nanmax(r.motion.residual, initial=0.0)) for r in results]
     worst: ClusterResult | RodResult = results[int(np.argmax(tops))]
     k = int(np.nanargmax(worst.motion.residual))
     x, y = start + worst.motion.time[k], 1e3 * worst.motion.residual[k]
     frame = stack_frames(report, worst.motion)[k]
     label = f"largest: {number_text(y)} nm ({_cluster_label(worst)}, frame {frame})"
-    ax.plot(x, y, "o", ms=8, mfc="none", mec=INK, mew=1.0, label=label)
+    ax.plot(
+        x, y, "o", ms=marker_size(1.35), mfc="none", mec=ink(), mew=line_width(0.65), label=label
+    )
     ax.set(xlabel="time (s)", ylabel="distance to the\nrigid body (nm)")
     ax.set_ylim(bottom=0)
     # A legend that is wider than its axes makes the axes narrower.
@@ -264,22 +287,34 @@ def plot_step_angles(report: Report, *, ax: Axes) -> Axes:
     top = 1.08 * max(float(angle.max()), 1e-3)
     width = max(float(np.median(angle)) / 5, top / _MOST_ANGLE_BINS)
     edges = np.arange(0, top + width, width)
-    ax.hist(angle, edges.tolist(), color=BLUE, alpha=0.75, label=f"{angle.size} steps")
+    ax.hist(angle, edges.tolist(), color=series_color(0), alpha=0.75, label=f"{angle.size} steps")
     if report.pooled is not None:
         planar = any(c.motion.dimension == 2 for c in report.clusters)
         x = np.linspace(0, edges[-1], 20 * len(edges))
         density = step_angle_density(x, duration, report.pooled.D_R, planar=planar)
         label = "Brownian rotation with the pooled $D_R$ and noise"
-        ax.plot(x, duration.size * edges[1] * density, color=RED, lw=1.4, label=label)
+        ax.plot(
+            x,
+            duration.size * edges[1] * density,
+            color=series_color(1),
+            lw=line_width(0.95),
+            label=label,
+        )
     k = int(angle.argmax())
     largest = np.sort(angle)[-_MARKED_STEPS:]
     label = f"largest: {number_text(angle[k])}° ({end[k]})"
-    style: dict[str, Any] = {"color": INK, "ls": "none", "ms": 9, "clip_on": False, "zorder": 4}
+    style: dict[str, Any] = {
+        "color": ink(),
+        "ls": "none",
+        "ms": marker_size(1.5),
+        "clip_on": False,
+        "zorder": 4,
+    }
     bottom = ax.get_xaxis_transform()
     ax.plot(largest, np.zeros(len(largest)), "|", label=label, transform=bottom, **style)
     for turn in [t for t in least_turns(report) if t < top]:
         label = f"symmetry rotation, {number_text(turn)}°"
-        ax.axvline(turn, color=INK, lw=1.2, ls=":", label=label)
+        ax.axvline(turn, color=ink(), lw=line_width(0.8), ls=":", label=label)
     ax.set(xlabel="angle between successive poses (°)", ylabel="steps")
     ax.set_xlim(0, edges[-1])
     _count_axis(ax)
@@ -317,14 +352,27 @@ def plot_health(imaging: Imaging, *, ax: Axes, series: Series = "spheres") -> Ax
     value = np.where(unread, np.nan, value)
     raster = len(time) > _VECTOR_POINTS
     marker = "." if len(time) <= 200 else None
-    ax.plot(time, value, color=BLUE, lw=0.9, marker=marker, ms=4, rasterized=raster)
+    ax.plot(
+        time,
+        value,
+        color=series_color(0),
+        lw=line_width(0.6),
+        marker=marker,
+        ms=marker_size(0.65),
+        rasterized=raster,
+    )
     lost = time[unread]
     if lost.size:
-        style: dict[str, Any] = {"color": RED, "ls": "none", "ms": 5, "clip_on": False}
+        style: dict[str, Any] = {
+            "color": series_color(1),
+            "ls": "none",
+            "ms": marker_size(0.85),
+            "clip_on": False,
+        }
         ax.plot(lost, np.zeros(lost.size), "x", transform=ax.get_xaxis_transform(), **style)
         title += f"; ×: not read ({lost.size} of {len(time)} frames)" if series == "spheres" else ""
     ax.set(xlabel="time (s)", ylabel=label)
-    ax.set_title(title, loc="left", size="small", color=INK, pad=3)
+    ax.set_title(title, loc="left", size="small", color=ink(), pad=3)
     counted = series in ("spheres", "spots")
     ax.yaxis.set_major_locator(MaxNLocator(3, integer=counted))
     known = value[np.isfinite(value)]
@@ -336,7 +384,9 @@ def plot_health(imaging: Imaging, *, ax: Axes, series: Series = "spheres") -> Ax
     return ax
 
 
-def save_image_figures(report: Report, folder: str | os.PathLike[str]) -> list[Path]:
+def save_image_figures(
+    report: Report, folder: str | os.PathLike[str], *, sheet: Sheet | None = None
+) -> list[Path]:
     """Write the figures of imaging quality into an existing folder, each as PNG and PDF.
 
     Parameters
@@ -344,6 +394,8 @@ def save_image_figures(report: Report, folder: str | os.PathLike[str]) -> list[P
     report : Report
         Report of a movie, with `imaging`.
     folder : path
+    sheet : path, str or mapping, optional
+        Style sheet that outranks perrin's, as in `style`.
 
     Returns
     -------
@@ -354,16 +406,19 @@ def save_image_figures(report: Report, folder: str | os.PathLike[str]) -> list[P
     place = Path(folder)
     imaging = imaging_of(report)
     drawn: dict[str, Figure] = {}
-    if imaging.views:
-        drawn["found"] = found_figure(imaging)
-        drawn["tracks"] = tracks_figure(report)
-    drawn["masses"] = _single_figure()
-    plot_masses(imaging, ax=drawn["masses"].axes[0])
-    drawn["residuals"] = misfit_figure(report)
-    drawn["steps"] = _single_figure()
-    plot_step_angles(report, ax=drawn["steps"].axes[0])
-    drawn["health"] = health_figure(imaging)
-    return [f for name, one in drawn.items() for f in save_figure(one, place / f"images-{name}")]
+    with style(sheet=sheet):
+        if imaging.views:
+            drawn["found"] = found_figure(imaging)
+            drawn["tracks"] = tracks_figure(report)
+        drawn["masses"] = _single_figure()
+        plot_masses(imaging, ax=drawn["masses"].axes[0])
+        drawn["residuals"] = misfit_figure(report)
+        drawn["steps"] = _single_figure()
+        plot_step_angles(report, ax=drawn["steps"].axes[0])
+        drawn["health"] = health_figure(imaging)
+        return [
+            f for name, one in drawn.items() for f in save_figure(one, place / f"images-{name}")
+        ]
 
 
 def imaging_of(report: Report) -> Imaging:
@@ -385,10 +440,6 @@ def imaging_of(report: Report) -> Imaging:
     if report.imaging is None:
         raise ValueError("this report began with a table, not with images: report.imaging is None")
     return report.imaging
-
-
-def _color(cluster: int) -> str:
-    return PALETTE[cluster % len(PALETTE)]
 
 
 def _cluster_label(result: ClusterResult | RodResult) -> str:
@@ -476,10 +527,10 @@ def _draw_circles(
     lw *= min(1.0, max(0.4, 16 * diameter / abs(limits[1] - limits[0])))
     cluster = spheres["cluster"].to_numpy()
     centers = spheres[[across, down]].to_numpy(dtype=np.float64)
-    own = np.array([_color(k) for k in cluster[cluster >= 0]], dtype=object)
-    for which, colors, style in (
+    own = np.array([series_color(int(k)) for k in cluster[cluster >= 0]], dtype=object)
+    for which, colors, outline in (
         (cluster < 0, "white", {"linewidths": 2 * lw}),
-        (cluster < 0, INK, {"linewidths": lw, "linestyles": [(0, (2.5, 2))]}),
+        (cluster < 0, ink(), {"linewidths": lw, "linestyles": [(0, (2.5, 2))]}),
         (cluster >= 0, own, {"linewidths": lw}),
     ):
         size = np.full(which.sum(), diameter)
@@ -492,7 +543,7 @@ def _draw_circles(
             offset_transform=ax.transData,
             facecolors="none",
             edgecolors=colors,
-            **style,
+            **outline,
         )
         ax.add_collection(circles, autolim=False)
     ax.axis(limits)
@@ -619,7 +670,7 @@ def least_turns(report: Report) -> list[float]:
 
 
 def _single_figure() -> Figure:
-    figure = new_figure(10, 4.2)
+    figure = column_figure(0.42)
     figure.add_subplot()
     return figure
 
@@ -642,7 +693,8 @@ def found_figure(imaging: Imaging) -> Figure:
     depth, high, wide = np.array([view.xz.shape[0], rows, columns]) * imaging.voxel
     planar = not np.isfinite(depth)
     depth = 0.0 if planar else depth
-    figure = new_figure(10, float(np.clip(9 * (high + depth) / (wide + depth) + 0.7, 3, 14)))
+    height = 0.9 * (high + depth) / (wide + depth) + 0.07
+    figure = column_figure(float(np.clip(height, 0.3, 1.4)))
     figure.set_layout_engine("compressed")
     title = f"{_frame_text(imaging, view.frame)}: {len(_spheres_of(imaging, view.frame))} spheres"
     if planar:
@@ -685,7 +737,9 @@ def tracks_figure(report: Report) -> Figure:
     _, y, x = imaging_of(report).voxel
     rows, columns = views[0].xy.shape
     shape = rows * y / (columns * x)
-    figure = new_figure(10, float(np.clip(lines * (9.4 / across * shape + 0.35) + 0.4, 2.5, 14)))
+    figure = column_figure(
+        float(np.clip(lines * (0.94 / across * shape + 0.035) + 0.04, 0.25, 1.4))
+    )
     figure.set_layout_engine("compressed")
     panels = figure.subplots(lines, across, sharex=True, sharey=True, squeeze=False)
     for k, ax in enumerate(panels.flat):
@@ -719,7 +773,7 @@ def misfit_figure(report: Report) -> Figure:
         figure = _single_figure()
         plot_rigidity(report, ax=figure.axes[0])
         return figure
-    figure = new_figure(10, 5.6)
+    figure = column_figure(0.56)
     top, bottom = figure.subplots(2, 1, sharex=True)
     plot_misfit(imaging, ax=top)
     plot_rigidity(report, ax=bottom)
@@ -738,7 +792,7 @@ def health_figure(imaging: Imaging) -> Figure:
     -------
     matplotlib.figure.Figure
     """
-    figure = new_figure(10, 7)
+    figure = column_figure(0.7)
     panels = figure.subplots(len(_SERIES), 1, sharex=True)
     for ax, series in zip(panels, _SERIES, strict=True):
         plot_health(imaging, ax=ax, series=series)

@@ -23,7 +23,15 @@ from perrin.diffusion.step_spectra import (
 )
 from perrin.diffusion.switching import SwitchingEstimate
 from perrin.diffusion.verdict import judge_motion
-from perrin.plot.style import BLUE, GREY, INK, PALETTE, RED, legend_above, new_figure
+from perrin.plot.figure_style import (
+    GREY,
+    column_figure,
+    ink,
+    legend_above,
+    line_width,
+    marker_size,
+    series_color,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes as Axes
@@ -183,27 +191,52 @@ def plot_step_spectrum(
             ends.ravel(),
             low.ravel(),
             high.ravel(),
-            color=BLUE,
+            color=series_color(0),
             alpha=opacity,
             lw=0,
             label="68 % and 95 % of means" if share == 0.68 else None,
         )
-    ax.plot(frequency, law, color=BLUE, lw=1.4, label="diffusion and noise")
+    ax.plot(frequency, law, color=series_color(0), lw=line_width(0.95), label="diffusion and noise")
     found = None if verdict is None else alternative_spectrum(model, fit, verdict)
-    ax.plot(middle, average, "o", color=INK, ms=3.5, mew=0, label="steps, bin means", zorder=4)
+    ax.plot(
+        middle,
+        average,
+        "o",
+        color=ink(),
+        ms=marker_size(0.6),
+        mew=0,
+        label="steps, bin means",
+        zorder=4,
+    )
     # The range contains the dark band, which is the last one drawn.
     shown = np.concatenate([average, low.ravel(), high.ravel()])
     if found is not None:
         # The odd modes alone have the power of a constant velocity: bins are averaged.
         power = _bin_means(found[0], edges) / scale
-        ax.plot(middle, power, color=RED, lw=1.6, ls=(0, (4, 2)), label=found[1])
+        ax.plot(
+            middle,
+            power,
+            color=series_color(1),
+            lw=line_width(1.05),
+            ls=(0, (4, 2)),
+            label=found[1],
+        )
         shown = np.append(shown, power)
     if verdict is not None and verdict.kind == "vibration":
         k = int(np.argmax(np.sum(model.mode_ratios(fit), axis=1)[0]))
         height = ratio[k] * law[k]
         shown = np.append(shown, height)
         label = f"period {number_text(1 / float(frequency[k]))} s"
-        ax.plot(frequency[k], height, "D", mfc="none", mec=RED, ms=7, mew=1.6, label=label)
+        ax.plot(
+            frequency[k],
+            height,
+            "D",
+            mfc="none",
+            mec=series_color(1),
+            ms=marker_size(1.15),
+            mew=line_width(1.05),
+            label=label,
+        )
     bottom, top = shown[shown > 0].min(), shown.max()
     margin = max(top / bottom, 10.0) ** 0.05
     ax.set(
@@ -258,8 +291,8 @@ def plot_prediction_errors(
     for share, opacity in _BANDS:
         low, high = (gammaincinv(shape, 0.5 + s * share / 2) / shape for s in (-1, 1))
         label = "68 % and 95 % of the means" if share == 0.68 else None
-        ax.axhspan(low, high, color=BLUE, alpha=opacity, lw=0, label=label)
-    ax.axhline(1, color=BLUE, lw=1.2)
+        ax.axhspan(low, high, color=series_color(0), alpha=opacity, lw=0, label=label)
+    ax.axhline(1, color=series_color(0), lw=line_width(0.8))
 
     stride = -(-n // _SHOWN_STEPS)
     # Beyond this one track of Brownian motion has one square.
@@ -267,14 +300,20 @@ def plot_prediction_errors(
     shown = np.union1d(np.arange(0, n, stride), large)
     label = "steps" if stride == 1 else f"one step in {stride}, and the largest"
     few = n < _MOST_VECTOR_POINTS
-    points: dict[str, Any] = {"color": GREY, "ms": 2.6 if few else 2.0, "mew": 0}
+    points: dict[str, Any] = {"color": GREY, "ms": marker_size(0.45 if few else 0.35), "mew": 0}
     points |= {"rasterized": not few, "alpha": 0.9 if few else 0.5, "zorder": 2.5}
     bottom = max(_SMALLEST_SQUARE, float(chdtri(axes, 1 - _SMALLEST_QUANTILE)) / axes)
     ax.plot(time[shown], np.maximum(square[shown], bottom), "o", label=label, **points)
     ends = np.append(time[edges[:-1]], time[-1])
     label = f"mean of {averaged:.0f} steps"
     ax.stairs(
-        _bin_means(square, edges), ends, baseline=None, color=INK, lw=1.6, label=label, zorder=3
+        _bin_means(square, edges),
+        ends,
+        baseline=None,
+        color=ink(),
+        lw=line_width(1.05),
+        label=label,
+        zorder=3,
     )
 
     found = None if verdict is None else verdict.model
@@ -283,7 +322,12 @@ def plot_prediction_errors(
         ends = np.stack([motion.time[motion.steps()[0]], time], axis=1).ravel()
         fast = np.repeat(found.states[0][row] == 1, 2)
         # Single steps of a long track are thinner than a pixel and need the outline.
-        shade: dict[str, Any] = {"color": PALETTE[4], "alpha": 0.25, "lw": 0.6, "zorder": 0}
+        shade: dict[str, Any] = {
+            "color": series_color(4),
+            "alpha": 0.25,
+            "lw": line_width(0.4),
+            "zorder": 0,
+        }
         shade |= {"transform": ax.get_xaxis_transform(), "label": "fast state"}
         ax.fill_between(ends, 0, 1, where=fast, **shade)
     if verdict is not None and verdict.frames:
@@ -342,19 +386,34 @@ def plot_error_distribution(model: AxisModel, fit: AxisFit, *, ax: Axes) -> Axes
             np.repeat(edges, 2)[1:-1],
             np.repeat(np.maximum(low * unit, 0.1 * bottom), 2),
             np.repeat(high * unit, 2),
-            color=BLUE,
+            color=series_color(0),
             alpha=opacity,
             lw=0,
             label="68 % and 95 % of counts" if share == 0.68 else None,
         )
     x = np.linspace(edges[0], edges[-1], 400)
-    ax.plot(x, np.exp(-(x**2) / 2) / np.sqrt(2 * np.pi), color=BLUE, lw=1.4, label="normal law")
+    ax.plot(
+        x,
+        np.exp(-(x**2) / 2) / np.sqrt(2 * np.pi),
+        color=series_color(0),
+        lw=line_width(0.95),
+        label="normal law",
+    )
     full = number > 0
     middle = (edges[1:] + edges[:-1]) / 2
     label = f"{total} errors"
     if outside:
         label += f", {outside} beyond ±{edges[-1]:.0f}"
-    ax.plot(middle[full], number[full] * unit, "o", color=INK, ms=3.5, mew=0, label=label, zorder=4)
+    ax.plot(
+        middle[full],
+        number[full] * unit,
+        "o",
+        color=ink(),
+        ms=marker_size(0.6),
+        mew=0,
+        label=label,
+        zorder=4,
+    )
     ax.set(yscale="log", xlim=(edges[0], edges[-1]), ylabel="probability density")
     ax.set_ylim(bottom, 2 * max(float(number.max()) * unit, 0.4))
     ax.set_xlabel("prediction error / its standard deviation")
@@ -419,7 +478,7 @@ def motion_figure(
     refuse(faults)
     model, y = axis_model(motion, quantity, Noise.of(noise, exposure=exposure))
     fit = model.fit(y)
-    figure = new_figure(10, 7)
+    figure = column_figure(0.7)
     axes = figure.subplot_mosaic(
         [["spectrum", "distribution"], ["time", "time"]], height_ratios=[1.35, 1]
     )
@@ -448,7 +507,13 @@ def _set_log_ticks(axis: Axis) -> None:
 
 def _mark_jumps(time: Floats, square: Floats, row: Ints, jumps: Ints, *, ax: Axes) -> None:
     """Draw a ring about every jump, and the row of the largest ones that are apart."""
-    style: dict[str, Any] = {"mfc": "none", "mec": RED, "ms": 7, "mew": 1.4, "zorder": 4}
+    style: dict[str, Any] = {
+        "mfc": "none",
+        "mec": series_color(1),
+        "ms": marker_size(1.15),
+        "mew": line_width(0.95),
+        "zorder": 4,
+    }
     label = f"jumps ({jumps.size})" if jumps.size > 1 else "jump"
     ax.plot(time[jumps], square[jumps], "o", label=label, **style)
     place = (time - time[0]) / (time[-1] - time[0])
@@ -467,5 +532,5 @@ def _mark_jumps(time: Floats, square: Floats, row: Ints, jumps: Ints, *, ax: Axe
                 textcoords="offset points",
                 ha=side,
                 size="small",
-                color=RED,
+                color=series_color(1),
             )

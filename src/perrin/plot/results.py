@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
@@ -13,22 +11,18 @@ from perrin._text import number_text, shortened, unit_text
 from perrin.curves.displacement import axes_weighted_equally
 from perrin.diffusion.estimate import value_text
 from perrin.geometry.rigid import degrees_of_freedom
-from perrin.plot.motion import motion_figure
-from perrin.plot.style import (
-    BLUE,
+from perrin.plot.figure_style import (
     GREY,
-    INK,
-    PALETTE,
-    RED,
+    ink,
     legend_above,
-    new_figure,
-    save_figure,
+    line_width,
+    marker_size,
+    series_color,
     write_reason,
 )
 
 if TYPE_CHECKING:
-    import os
-    from collections.abc import Callable, Iterable, Sequence
+    from collections.abc import Sequence
 
     from matplotlib.axes import Axes as Axes
     from matplotlib.figure import Figure as Figure
@@ -42,19 +36,8 @@ if TYPE_CHECKING:
     from perrin.diffusion.tensor_results import DiffusionTensor
     from perrin.geometry.shapes import Cluster
     from perrin.motion.rigid_motion import RigidMotion
-    from perrin.run.results import ClusterResult, Pooled, Report
+    from perrin.run.results import ClusterResult
 
-
-# Style of the crosses that mark frames without a pose.
-_CROSS: dict[str, Any] = {
-    "marker": "x",
-    "ls": "none",
-    "color": INK,
-    "ms": 4,
-    "mew": 0.8,
-    "clip_on": False,
-    "zorder": 4,
-}
 
 # Symbols of a curve and of its coefficient.
 _CURVE_NAMES = {"rotation": ("MSAD", "$D_R$"), "translation": ("MSD", "$D_T$")}
@@ -62,7 +45,8 @@ _CURVE_NAMES = {"rotation": ("MSAD", "$D_R$"), "translation": ("MSD", "$D_T$")}
 # Names of methods in the legend.
 _METHODS = {"mle": "ML fit", "line": "line"}
 
-_NAMED_CLUSTERS = 60  # largest number of clusters whose names a forest plot shows
+NAMED_CLUSTERS = 60  # largest number of clusters whose names a forest plot shows
+_SHOWN_PARTICLES = 6  # particles whose paths are shown
 _SHOWN_LAGS = 200  # largest number of lag times shown
 _SHOWN_FRAMES = 5000  # largest number of frames of an orientation path shown
 _VECTOR_FRAMES = 5000  # longer lines are images inside a PDF
@@ -109,10 +93,58 @@ def plot_lag_curve(
     unit = unit_text(curve.unit)
     if floor is not None and floor > 0:
         name = f"noise floor {number_text(floor)} {unit}"
-        ax.axhline(floor, color=RED, lw=1.1, ls="--", label=name)
+        ax.axhline(floor, color=series_color(1), lw=line_width(0.75), ls="--", label=name)
     ax.set(xscale="log", yscale="log", xlabel="lag time (s)")
     ax.set_ylabel(f"{_CURVE_NAMES[curve.quantity][0]} ({unit})")
     _set_curve_range(ax, curve, line, floor)
+    legend_above(ax, ncols=2)
+    return ax
+
+
+def plot_curve_ratio(
+    curve: LagCurve,
+    *,
+    ax: Axes,
+    estimate: DiffusionEstimate | None = None,
+    tensor: DiffusionTensor | None = None,
+) -> Axes:
+    """Draw an MSD or MSAD over that of pure diffusion, 2 dof D t, against lag time.
+
+    Parameters
+    ----------
+    curve : LagCurve
+        Lags beyond a quarter of the track are faint; at most 200 are shown.
+    ax : matplotlib.axes.Axes
+    estimate, tensor : DiffusionEstimate, DiffusionTensor, optional
+        They state D and the noise, as in `plot_lag_curve`.
+
+    Returns
+    -------
+    matplotlib.axes.Axes
+        Lag time in s, logarithmic. The band is one standard error of the curve; the line is that
+        of the fit with its noise, 1 + offset/(D t). Without a resolved D there is no ratio.
+    """
+    line = model_line(curve, estimate, tensor)
+    if line is None or not line.resolved:
+        return write_reason(ax, "no ratio: the diffusion coefficient is not resolved")
+    pure = 2 * curve.dof * line.D * curve.lagtime
+    kept = _shown_lags(curve)
+    t, value = curve.lagtime[kept], (curve.value / pure)[kept]
+    error = (curve.stderr / pure)[kept]
+    sure = t <= 0.25 * curve.lagtime[-1]
+    points: dict[str, Any] = {"color": ink(), "ms": marker_size(0.65), "mew": 0}
+    name = _CURVE_NAMES[curve.quantity][0]
+    ax.plot(t[sure], value[sure], ".", label=name, **points)
+    ax.plot(t[~sure], value[~sure], ".", alpha=0.3, label="beyond ¼ of the track", **points)
+    label = "± 1 standard error"
+    ax.fill_between(t, value - error, value + error, color=GREY, alpha=0.25, lw=0, label=label)
+    x = np.geomspace(curve.lagtime[0], curve.lagtime[-1], _SHOWN_LAGS)
+    fit = 1 + line.offset / (line.D * x)
+    ax.plot(x, fit, color=series_color(0), lw=line_width(0.95), label=line.text)
+    ax.axhline(1, color=series_color(0), lw=line_width(0.55), ls=":", label="pure diffusion")
+    shown = np.concatenate([value[sure], fit, [0.0, 1.0]])
+    ax.set(xscale="log", xlabel="lag time (s)", ylim=(1.1 * shown.min(), 1.25 * shown.max()))
+    ax.set_ylabel(f"{name} / ({2 * curve.dof} {line.symbol} t)")
     legend_above(ax, ncols=2)
     return ax
 
@@ -140,14 +172,23 @@ def plot_van_hove(result: VanHove, *, ax: Axes) -> Axes:
         result.density[full],
         result.stderr[full],
         fmt="o",
-        color=BLUE,
-        ms=3.5,
-        elinewidth=0.8,
+        color=series_color(0),
+        ms=marker_size(0.6),
+        elinewidth=line_width(0.55),
         label=label,
     )
-    ax.plot(middle, result.gaussian, "-", color=RED, lw=1.2, label="Gaussian of the same width")
+    ax.plot(
+        middle,
+        result.gaussian,
+        "-",
+        color=series_color(1),
+        lw=line_width(0.8),
+        label="Gaussian of the same width",
+    )
     if result.quantity == "angle":
-        ax.plot(middle, result.brownian, "--", color="k", lw=1.2, label="Brownian rotation")
+        ax.plot(
+            middle, result.brownian, "--", color="k", lw=line_width(0.8), label="Brownian rotation"
+        )
     names = {"translation": "displacement", "angle": "rotation angle"}
     name = names.get(result.quantity, "rotation")
     unit = unit_text(result.unit)
@@ -180,20 +221,33 @@ def plot_residual(motion: RigidMotion, *, ax: Axes) -> Axes:
     middle = float(np.median(motion.residual[rows]))
     scale, unit = (1e3, "nm") if middle < 1 else (1.0, "µm")
     raster = len(motion.time) > _VECTOR_FRAMES
-    drawn = ax.plot(motion.time, scale * motion.residual, "-", color=BLUE, lw=0.7, marker=".")
-    drawn[0].set(ms=2, rasterized=raster, label="rms residual of the frame")
+    drawn = ax.plot(
+        motion.time,
+        scale * motion.residual,
+        "-",
+        color=series_color(0),
+        lw=line_width(0.45),
+        marker=".",
+    )
+    drawn[0].set(ms=marker_size(0.35), rasterized=raster, label="rms residual of the frame")
     # A pose has as many free coordinates as a rigid body, so n rms^2 = sigma^2 (d n - 6) in space.
     n_present, expected = motion.n_present[rows], np.full(len(motion.time), np.nan)
     free = degrees_of_freedom(n_present, motion.dimension)
     expected[rows] = motion.sigma * np.sqrt(free / n_present)
     label = f"expected from σ = {number_text(scale * motion.sigma)} {unit}"
-    style: dict[str, Any] = {"color": RED, "lw": 1.2, "drawstyle": "steps-mid"}
+    style: dict[str, Any] = {
+        "color": series_color(1),
+        "lw": line_width(0.8),
+        "drawstyle": "steps-mid",
+    }
     ax.plot(motion.time, scale * expected, label=label, rasterized=raster, **style)
     absent = _without_pose(motion)
     if absent.size:
         label = f"no pose ({absent.size} of {len(motion.time)} frames)"
         bottom = ax.get_xaxis_transform()
-        ax.plot(motion.time[absent], np.zeros(absent.size), **_CROSS, transform=bottom, label=label)
+        ax.plot(
+            motion.time[absent], np.zeros(absent.size), **_cross(), transform=bottom, label=label
+        )
     ax.set(xlabel="time (s)", ylabel=f"residual ({unit})")
     top = scale * float(np.max(motion.residual[rows]))
     ax.set_ylim(0, 1.08 * top if top > 0 else 1.0)
@@ -215,11 +269,17 @@ def plot_presence(motion: RigidMotion, *, ax: Axes) -> Axes:
         Time in s.
     """
     n = len(motion.template)
-    drawn = ax.plot(motion.time, motion.n_present, drawstyle="steps-mid", color=BLUE, lw=1)
+    drawn = ax.plot(
+        motion.time,
+        motion.n_present,
+        drawstyle="steps-mid",
+        color=series_color(0),
+        lw=line_width(0.65),
+    )
     drawn[0].set_rasterized(len(motion.time) > _VECTOR_FRAMES)
     absent = _without_pose(motion)
     if absent.size:
-        ax.plot(motion.time[absent], motion.n_present[absent], **_CROSS)
+        ax.plot(motion.time[absent], motion.n_present[absent], **_cross())
     ax.set(xlabel="time (s)", ylabel=f"present (of {n})", ylim=(-0.3, n + 0.5))
     ax.set_yticks(np.arange(0, n + 1, max(1, n // 4)))
     return ax
@@ -247,21 +307,24 @@ def plot_orientations(motion: RigidMotion, *, ax: Axes) -> Axes:
     up, turn = np.deg2rad([space.elev, space.azim])
     viewer = np.array([np.cos(up) * np.cos(turn), np.cos(up) * np.sin(turn), np.sin(up)])
     length = np.linalg.norm(motion.template, axis=1)
-    which = np.flatnonzero(length > 1e-6 * length.max())[: len(PALETTE)]
+    which = np.flatnonzero(length > 1e-6 * length.max())[:_SHOWN_PARTICLES]
+    colors = [series_color(k) for k in range(which.size)]
     shown = np.arange(0, len(motion.time), -(-len(motion.time) // _SHOWN_FRAMES))
     shown = np.union1d(shown, motion.fitted[-1:])
     paths = motion.orientation(motion.template[which])
-    for color, i, path in zip(PALETTE, which, np.swapaxes(paths, 0, 1), strict=False):
+    for color, i, path in zip(colors, which, np.swapaxes(paths, 0, 1), strict=False):
         path = path[shown]
         # A path is faint on the far side of the sphere and strong on the side of the viewer.
         near = path @ viewer > 0
         front = np.where(near[:, None], path, np.nan)
-        space.plot(*path.T, color=color, lw=0.5, alpha=0.35)
-        space.plot(*front.T, color=color, lw=1.0, label=f"particle {i}")
+        space.plot(*path.T, color=color, lw=line_width(0.35), alpha=0.35)
+        space.plot(*front.T, color=color, lw=line_width(0.65), label=f"particle {i}")
         last = np.flatnonzero(np.isfinite(path[:, 0]))[-1]
         end: dict[str, Any] = {"mec": color, "alpha": 1.0 if near[last] else 0.5}
-        space.plot(*path[[last]].T, "o", ms=8, mfc="white", mew=1.5, **end)
-    space.plot([], [], "o", ms=6, mfc="white", mec=INK, label="last frame")
+        space.plot(
+            *path[[last]].T, "o", ms=marker_size(1.35), mfc="white", mew=line_width(1), **end
+        )
+    space.plot([], [], "o", ms=marker_size(1), mfc="white", mec=ink(), label="last frame")
     space.legend(loc="upper left", frameon=False, fontsize="small", handlelength=1.2)
     parts = [f"particles 0 to {which[-1]} of {len(length)}"] if len(which) < len(length) else []
     parts += [f"{len(shown)} of {len(motion.time)} frames"] if len(shown) < len(motion.time) else []
@@ -284,10 +347,24 @@ def plot_angle(motion: RigidMotion, *, ax: Axes) -> Axes:
         rad against s; a circle marks the last frame with a pose.
     """
     angle = motion.rotational_displacement([1.0, 0.0])[:, 0]
-    ax.plot(motion.time, angle, color=BLUE, lw=0.9, rasterized=len(angle) > _VECTOR_FRAMES)
+    ax.plot(
+        motion.time,
+        angle,
+        color=series_color(0),
+        lw=line_width(0.6),
+        rasterized=len(angle) > _VECTOR_FRAMES,
+    )
     last = motion.fitted[-1]
-    ax.plot(motion.time[last], angle[last], "o", ms=7, mfc="white", mec=BLUE, mew=1.4)
-    ax.axhline(0, color=GREY, lw=0.6)
+    ax.plot(
+        motion.time[last],
+        angle[last],
+        "o",
+        ms=marker_size(1.15),
+        mfc="white",
+        mec=series_color(0),
+        mew=line_width(0.95),
+    )
+    ax.axhline(0, color=GREY, lw=line_width(0.4))
     ax.set(xlabel="time (s)", ylabel="angle φ (rad)")
     return ax
 
@@ -323,7 +400,7 @@ def plot_forest(
     clusters = [c for e, c in both if e.absent_because is None]
     if not estimates:
         return write_reason(ax, f"no {_CURVE_NAMES[quantity][1]}: {both[0][0].absent_because}")
-    many = len(clusters) > _NAMED_CLUSTERS
+    many = len(clusters) > NAMED_CLUSTERS
     rows = np.argsort([e.value for e in estimates]) if many else np.arange(len(estimates))
     ordered = [estimates[i] for i in rows]
     logarithmic, left, right = _forest_range([*ordered, *([pooled] if pooled else [])])
@@ -333,8 +410,14 @@ def plot_forest(
     if pooled is not None:
         for ends, alpha in ((pooled.ci95, 0.15), (pooled.ci68, 0.3)):
             low, high = np.clip(ends, left, right)
-            ax.axvspan(low, high, color=RED, alpha=alpha, lw=0, zorder=0)
-        ax.axvline(pooled.value, color=RED, lw=1, zorder=1, label=f"pooled, {value_text(pooled)}")
+            ax.axvspan(low, high, color=series_color(1), alpha=alpha, lw=0, zorder=0)
+        ax.axvline(
+            pooled.value,
+            color=series_color(1),
+            lw=line_width(0.65),
+            zorder=1,
+            label=f"pooled, {value_text(pooled)}",
+        )
         ax.legend(loc="lower center", bbox_to_anchor=(0.5, 1), frameon=False, fontsize="small")
     ax.set(xlabel=f"{_CURVE_NAMES[quantity][1]} ({unit_text(estimates[0].unit)})")
     ax.xaxis.set_major_locator(MaxNLocator(4))  # small values have long labels
@@ -371,27 +454,36 @@ def plot_plan(plan: SamplingPlan, *, ax: Axes) -> Axes:
     known = plan.dt <= plan.dt_rigid
     rest = plan.dt >= plan.dt[known][-1]
     for error, color, label in (
-        (plan.error, BLUE, "noise estimated along (default)"),
-        (plan.error_residual, RED, "noise from the residuals"),
+        (plan.error, series_color(0), "noise estimated along (default)"),
+        (plan.error_residual, series_color(1), "noise from the residuals"),
     ):
-        ax.plot(plan.dt[known], 100 * error[known], color=color, lw=1.8, label=label)
-        ax.plot(plan.dt[rest], 100 * error[rest], color=color, lw=1.4, ls=(0, (3, 2)))
+        ax.plot(plan.dt[known], 100 * error[known], color=color, lw=line_width(1.2), label=label)
+        ax.plot(plan.dt[rest], 100 * error[rest], color=color, lw=line_width(0.95), ls=(0, (3, 2)))
     best: dict[str, Any] = {
         "mfc": "white",
-        "mew": 1.6,
-        "ms": 7,
+        "mew": line_width(1.05),
+        "ms": marker_size(1.15),
         "ls": "none",
         "marker": "o",
         "zorder": 4,
     }
     label = f"best, {number_text(plan.dt_best)} s"
-    ax.plot(plan.dt_best, 100 * plan.expected_error, mec=BLUE, label=label, **best)
-    ax.plot(plan.dt_best, 100 * plan.expected_error_residual, mec=RED, **best)
-    lost: dict[str, Any] = {"color": GREY, "lw": 1.4, "ls": (0, (3, 2))}
+    ax.plot(plan.dt_best, 100 * plan.expected_error, mec=series_color(0), label=label, **best)
+    ax.plot(plan.dt_best, 100 * plan.expected_error_residual, mec=series_color(1), **best)
+    lost: dict[str, Any] = {"color": GREY, "lw": line_width(0.95), "ls": (0, (3, 2))}
     ax.plot([], [], label="particles cannot be distinguished", **lost)
     rules = [plan.paper_dt_min, plan.paper_dt_max]
     label = "rules of Hunter 2011, {} and {} s".format(*map(number_text, rules))
-    ax.vlines(rules, 0, 1, INK, lw=1.2, ls=":", label=label, transform=ax.get_xaxis_transform())
+    ax.vlines(
+        rules,
+        0,
+        1,
+        ink(),
+        lw=line_width(0.8),
+        ls=":",
+        label=label,
+        transform=ax.get_xaxis_transform(),
+    )
     ax.set(xscale="log", yscale="log", xlabel="time between frames (s)")
     ax.set_xlim(plan.dt[0], max(plan.dt[-1], 1.5 * plan.paper_dt_max))
     ax.set_ylabel("expected error of $D_R$ (%)")
@@ -404,60 +496,6 @@ def plot_plan(plan: SamplingPlan, *, ax: Axes) -> Axes:
     ax.xaxis.set_major_formatter(lambda value, _: number_text(value, digits=1))
     legend_above(ax, ncols=2)
     return ax
-
-
-def save_figures(
-    report: Report, folder: str | os.PathLike[str], *, clusters: Iterable[int] | None = None
-) -> list[Path]:
-    """Write figures of a report into an existing folder, each as PNG and PDF.
-
-    Parameters
-    ----------
-    report : Report
-    folder : path
-    clusters : iterable of int, optional
-        Numbers of the clusters that are drawn; by default the first one. The report page draws all
-        of them itself.
-
-    Returns
-    -------
-    list of Path
-        ``clusters.*`` if there are several clusters, and for each drawn cluster
-        ``cluster-<n>-curves.*``, ``-residuals.*`` and ``-orientations.*``, with ``-rotation.*`` and
-        ``-translation.*``, against diffusion, where the motion is not diffusion.
-    """
-    place = Path(folder)
-    drawn = {c.cluster for c in report.clusters[:1]} if clusters is None else set(clusters)
-    first = report.tracks.dropna(subset=["x", "y"]).groupby("cluster")["frame"].min()
-    files: list[Path] = []
-    if report.pooled is not None and len(report.clusters) > 1:
-        files += save_figure(forest_figure(report.clusters, report.pooled), place / "clusters")
-    kinds: dict[str, Callable[[ClusterResult], Figure]] = {
-        "curves": curve_figure,
-        "residuals": residual_figure,
-        "orientations": orientation_figure,
-    }
-    for result in report.clusters:
-        if result.cluster not in drawn:
-            continue
-        for kind, draw in kinds.items():
-            files += save_figure(draw(result), place / f"cluster-{result.cluster}-{kind}")
-        for quantity, verdict in result.verdicts.items():
-            if verdict is None or verdict.kind == "diffusion":
-                continue
-            motion = result.motion
-            if verdict.quantity == "translation":  # the centre's path crosses doubt about labels
-                motion = replace(motion, piece=np.zeros_like(motion.piece))
-            # In a report frames count from the table's first, in a motion from its own.
-            rows = tuple(frame - int(first[result.cluster]) for frame in verdict.frames)
-            figure = motion_figure(
-                motion,
-                quantity=verdict.quantity,
-                noise=result.D_R.settings,
-                verdict=replace(verdict, frames=rows),
-            )
-            files += save_figure(figure, place / f"cluster-{result.cluster}-{quantity}")
-    return files
 
 
 def plot_cluster(cluster: Cluster, *, ax: Axes, diameter: float, view: ArrayLike) -> Axes:
@@ -491,7 +529,7 @@ def plot_cluster(cluster: Cluster, *, ax: Axes, diameter: float, view: ArrayLike
         height[front] = (center[2] + up * diameter / 2)[front]
         # Diffuse reflection of a lamp at the upper left, and ambient light.
         brightness = 0.35 + 0.65 * np.maximum((across @ [-0.4, 0.5] + up) / np.hypot(0.64, 1), 0)
-        own = np.array([int(PALETTE[i % len(PALETTE)][k : k + 2], 16) / 255 for k in (1, 3, 5)])
+        own = np.array([int(series_color(i)[k : k + 2], 16) / 255 for k in (1, 3, 5)])
         color[front] = (brightness[..., None] * own)[front]
     ax.imshow(color, origin="lower", extent=(-half, half, -half, half), interpolation="bilinear")
     ax.set(xlabel="x (µm)", ylabel="y (µm)")
@@ -558,20 +596,52 @@ def model_line(
     return ModelLine(estimate.value, estimate.offset, 0.0, estimate.resolved, symbol, text)
 
 
+def curve_floors(result: ClusterResult) -> tuple[float, float]:
+    """Return the noise floors that the localisation error predicts for MSAD and MSD.
+
+    Parameters
+    ----------
+    result : ClusterResult
+
+    Returns
+    -------
+    tuple of float
+        rad^2 and um^2.
+    """
+    weights, turn = result.msad.weights, result.noise.phi2
+    if weights is not None:
+        # Both ends of a rotation have the error of the orientation, perpendicular to a direction.
+        turn = 2 * float(np.einsum("ij,ij->", weights, result.noise.covariance))
+    motion = result.motion
+    # Both ends of a displacement have the error of the centre, along each axis.
+    return turn, 2 * motion.dimension * float(np.mean(motion.center_variance[motion.fitted]))
+
+
+def _shown_lags(curve: LagCurve) -> Ints:
+    """Return at most 200 rows of a curve, even on the logarithm of the lag time."""
+    kept = np.arange(len(curve.lagtime))
+    if len(kept) <= _SHOWN_LAGS:
+        return kept
+    even = np.geomspace(curve.lagtime[0], curve.lagtime[-1], _SHOWN_LAGS)
+    return np.unique(np.rint(np.interp(even, curve.lagtime, kept)).astype(np.int64))
+
+
+def _cross() -> dict[str, Any]:
+    """Return the style of the crosses that mark frames without a pose."""
+    size = {"ms": marker_size(0.65), "mew": line_width(0.55)}
+    return {"marker": "x", "ls": "none", "color": ink(), "clip_on": False, "zorder": 4} | size
+
+
 def _draw_curve_points(curve: LagCurve, *, ax: Axes, label: str | None) -> None:
     """Draw the values and their band, faint beyond a quarter of the track."""
-    count = len(curve.lagtime)
-    kept = np.arange(count)
-    if count > _SHOWN_LAGS:
-        even = np.geomspace(curve.lagtime[0], curve.lagtime[-1], _SHOWN_LAGS)
-        kept = np.unique(np.rint(np.interp(even, curve.lagtime, kept)).astype(np.int64))
+    kept = _shown_lags(curve)
     kept = kept[curve.value[kept] > 0]
     t, value, error = curve.lagtime[kept], curve.value[kept], curve.stderr[kept]
     # Where the standard error is as large as the value, the band would reach zero.
     low, high = np.maximum(value - error, 1e-2 * value), value + error
     sure = t <= 0.25 * curve.lagtime[-1]
     rest = t >= t[sure].max(initial=0.0)
-    points: dict[str, Any] = {"color": INK, "ms": 4, "mew": 0}
+    points: dict[str, Any] = {"color": ink(), "ms": marker_size(0.65), "mew": 0}
     name = label or _CURVE_NAMES[curve.quantity][0]
     ax.plot(t[sure], value[sure], ".", label=name, **points)
     if not sure.all():
@@ -589,15 +659,30 @@ def _draw_model_line(curve: LagCurve, line: ModelLine, *, ax: Axes) -> None:
     t = np.geomspace(first, last, _SHOWN_LAGS)
     value = slope * (line.D * t + line.offset)
     # With motion blur the offset can be so negative that the line is negative at short lags.
-    ax.plot(t, np.where(value > 0, value, np.nan), color=BLUE, lw=1.4, label=line.text)
+    ax.plot(
+        t,
+        np.where(value > 0, value, np.nan),
+        color=series_color(0),
+        lw=line_width(0.95),
+        label=line.text,
+    )
     if line.stderr > 0:
         half = slope * line.stderr * t
         low = np.maximum(value - half, 1e-2 * np.abs(value))
-        ax.fill_between(t, low, value + half, color=BLUE, lw=0, alpha=0.25)
+        ax.fill_between(t, low, value + half, color=series_color(0), lw=0, alpha=0.25)
     if line.resolved:
         sparse = np.geomspace(first, last, 12)
         pure, name = slope * line.D * sparse, f"pure diffusion {slope} {line.symbol} t"
-        ax.plot(sparse, pure, "o", mfc="none", mec=BLUE, ms=5, mew=0.9, label=name)
+        ax.plot(
+            sparse,
+            pure,
+            "o",
+            mfc="none",
+            mec=series_color(0),
+            ms=marker_size(0.85),
+            mew=line_width(0.6),
+            label=name,
+        )
 
 
 def _set_curve_range(
@@ -628,7 +713,7 @@ def _without_pose(motion: RigidMotion) -> Ints:
 def _draw_unit_sphere(ax: Any) -> None:  # noqa: ANN401
     """Draw a grid on the unit sphere with lab axes, in parallel projection, without a box."""
     polar, around = np.linspace(0, np.pi, 37), np.linspace(0, 2 * np.pi, 73)
-    grid = {"color": "#cccccc", "lw": 0.4, "zorder": 0}
+    grid = {"color": "#cccccc", "lw": line_width(0.25), "zorder": 0}
     for z in np.cos(polar[6:-1:6]):
         r = np.sqrt(1 - z * z)
         ax.plot(r * np.cos(around), r * np.sin(around), np.full_like(around, z), **grid)
@@ -636,8 +721,8 @@ def _draw_unit_sphere(ax: Any) -> None:  # noqa: ANN401
         r = np.sin(polar)
         ax.plot(r * np.cos(azimuth), r * np.sin(azimuth), np.cos(polar), **grid)
     for axis, name in zip(np.eye(3), "xyz", strict=True):
-        ax.plot(*np.outer(axis, [1.0, 1.2]), color=GREY, lw=0.9)
-        ax.text(*(1.3 * axis), name, color=INK, ha="center", va="center")
+        ax.plot(*np.outer(axis, [1.0, 1.2]), color=GREY, lw=line_width(0.6))
+        ax.text(*(1.3 * axis), name, color=ink(), ha="center", va="center")
     ax.set(xlim=(-1, 1), ylim=(-1, 1), zlim=(-1, 1), xlabel="x", ylabel="y", zlabel="z")
     ax.set_proj_type("ortho")
     ax.set_box_aspect((1, 1, 1), zoom=1.4)
@@ -671,16 +756,29 @@ def _draw_intervals(
     value = np.array([e.value for e in estimates])
     resolved = np.array([e.resolved for e in estimates], dtype=np.bool_)
     ci68, ci95 = (np.array([getattr(e, c) for e in estimates]) for c in ("ci68", "ci95"))
-    for ends, width, color in ((ci95, 0.8, GREY if thin else BLUE), (ci68, 3.5, BLUE)):
+    for ends, width, color in (
+        (ci95, 0.55, GREY if thin else series_color(0)),
+        (ci68, 2.3, series_color(0)),
+    ):
         low, high = np.clip(ends, left, right).T
         seen = (low < right) & (high > left)
-        ax.hlines(rows[seen], low[seen], high[seen], color=color, lw=width / (1 + thin))
-    dots: dict[str, Any] = {"ms": 2, "color": "white"} if thin else {"ms": 5, "color": INK}
+        ax.hlines(rows[seen], low[seen], high[seen], color=color, lw=line_width(width / (1 + thin)))
+    dots: dict[str, Any] = (
+        {"ms": marker_size(0.35), "color": "white"}
+        if thin
+        else {"ms": marker_size(0.85), "color": ink()}
+    )
     ax.plot(value[resolved], rows[resolved], "o", mew=0, **dots)
     limits = np.minimum(ci95[:, 1], right)
     beyond, below = (ci95[:, 1] > right) & resolved, (ci95[:, 0] < left) & resolved
-    edge: dict[str, Any] = {"ls": "none", "clip_on": False, "mec": BLUE, "mfc": BLUE, "ms": 4}
-    limit = edge | {"mec": INK, "mfc": "white", "ms": 3 if thin else 7}
+    edge: dict[str, Any] = {
+        "ls": "none",
+        "clip_on": False,
+        "mec": series_color(0),
+        "mfc": series_color(0),
+        "ms": marker_size(0.65),
+    }
+    limit = edge | {"mec": ink(), "mfc": "white", "ms": marker_size(0.5 if thin else 1.15)}
     for which, x, marker, style in (
         (~resolved, limits, "<", limit),
         (beyond, np.full(len(rows), right), ">", edge),
@@ -689,106 +787,3 @@ def _draw_intervals(
         # The layout counts an empty unclipped line as a point in the corner of the figure.
         if which.any():
             ax.plot(x[which], rows[which], marker=marker, **style)
-
-
-def curve_figure(result: ClusterResult) -> Figure:
-    """Return a figure of the MSAD and the MSD of a cluster.
-
-    Parameters
-    ----------
-    result : ClusterResult
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-    """
-    figure = new_figure(10, 4.6)
-    left, right = figure.subplots(1, 2)
-    turn, shift = curve_floors(result)
-    plot_lag_curve(result.msad, ax=left, estimate=result.D_R, floor=turn, tensor=result.tensor)
-    if result.D_T.absent_because is not None:
-        write_reason(right, f"no {_CURVE_NAMES['translation'][1]}: {result.D_T.absent_because}")
-        return figure
-    plot_lag_curve(result.msd, ax=right, estimate=result.D_T, floor=shift)
-    return figure
-
-
-def curve_floors(result: ClusterResult) -> tuple[float, float]:
-    """Return the noise floors that the localisation error predicts for MSAD and MSD.
-
-    Parameters
-    ----------
-    result : ClusterResult
-
-    Returns
-    -------
-    tuple of float
-        rad^2 and um^2.
-    """
-    weights, turn = result.msad.weights, result.noise.phi2
-    if weights is not None:
-        # Both ends of a rotation have the error of the orientation, perpendicular to a direction.
-        turn = 2 * float(np.einsum("ij,ij->", weights, result.noise.covariance))
-    motion = result.motion
-    # Both ends of a displacement have the error of the centre, along each axis.
-    return turn, 2 * motion.dimension * float(np.mean(motion.center_variance[motion.fitted]))
-
-
-def residual_figure(result: ClusterResult) -> Figure:
-    """Return a figure of the residuals and of the number of detected particles against time.
-
-    Parameters
-    ----------
-    result : ClusterResult
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-    """
-    figure = new_figure(10, 4.2)
-    top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=[2.4, 1])
-    plot_residual(result.motion, ax=top)
-    plot_presence(result.motion, ax=bottom)
-    top.set_xlabel("")
-    return figure
-
-
-def orientation_figure(result: ClusterResult) -> Figure:
-    """Return a figure of the paths on the unit sphere, or of the angle in the plane.
-
-    Parameters
-    ----------
-    result : ClusterResult
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-    """
-    planar = result.motion.dimension == 2
-    figure = new_figure(10, 3.6) if planar else new_figure(6, 6)
-    ax = figure.add_subplot() if planar else figure.add_subplot(projection="3d")
-    plot_orientations(result.motion, ax=ax)
-    return figure
-
-
-def forest_figure(clusters: Sequence[ClusterResult], pooled: Pooled) -> Figure:
-    """Return a figure of D_R and D_T of all clusters, as high as the list is long.
-
-    Parameters
-    ----------
-    clusters : sequence of ClusterResult
-    pooled : Pooled
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-    """
-    rows = len(clusters) if len(clusters) <= _NAMED_CLUSTERS else 40
-    figure = new_figure(10, 1.6 + 0.2 * rows)
-    left, right = figure.subplots(1, 2)
-    plot_forest(clusters, ax=left, quantity="rotation", pooled=pooled.D_R)
-    plot_forest(clusters, ax=right, quantity="translation", pooled=pooled.D_T)
-    if len(clusters) <= _NAMED_CLUSTERS:
-        right.tick_params(labelleft=False)
-        right.set_ylabel("")
-    return figure

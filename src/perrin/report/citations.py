@@ -1,14 +1,11 @@
-"""Texts of a report to copy: methods paragraph, BibTeX entries, and what repeats the run."""
+"""Texts of a report to copy: methods paragraph, BibTeX entries; links to its files."""
 
 from __future__ import annotations
 
-import inspect
-import shlex
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from perrin._text import interval_text, length_text, number_text, unit_text
 from perrin.diffusion.estimate import value_text
-from perrin.run.tables import analyze
 
 if TYPE_CHECKING:
     from perrin.diffusion.estimate import DiffusionEstimate
@@ -24,10 +21,6 @@ PAPER_BIBTEX = """@article{Hunter2011,
   year    = {2011},
   doi     = {10.1364/OE.19.017189}
 }"""
-
-# Arguments of the command line that are flags, and those of a movie.
-_FLAGS = ("drift", "keep_jumps")
-_MOVIE_ARGUMENTS = ("diameter", "contact", "exposure", "viscosity", "temperature", "drift")
 
 
 def software_bibtex(version: str) -> str:
@@ -115,90 +108,6 @@ def _interval(estimate: DiffusionEstimate) -> str:
     return f"{interval_text(estimate.ci95)} {unit_text(estimate.unit)}"
 
 
-def command_line(report: Report) -> str:
-    """Return the command that repeats a run.
-
-    Parameters
-    ----------
-    report : Report
-
-    Returns
-    -------
-    str
-        A line for a shell; empty if the input was not a file.
-
-    Examples
-    --------
-    >>> import perrin
-    >>> from importlib.resources import files
-    >>> report = perrin.analyze(str(files("perrin") / "data" / "demo_tracks.csv.gz"), dt=0.73)
-    >>> command_line(report).split()[-4:]
-    ['--dt', '0.73', '-o', 'my-run']
-    """
-    path = report.settings.get("input", {}).get("path")
-    if not path:
-        return ""
-    movie = report.imaging is not None
-    words = ["perrin", "run" if movie else "analyze", shlex.quote(str(path))]
-    for name, value in _stated(report).items():
-        option = f"--{name.replace('_', '-')}"
-        if name in _FLAGS:
-            words.append(option)
-        elif name == "frames":
-            words += [option, ":".join("" if end is None else str(end) for end in value)]
-        elif name == "columns":
-            words += [option, shlex.quote(",".join(f"{k}={v}" for k, v in value.items()))]
-        elif isinstance(value, list | tuple):
-            words += [option, ",".join(map(str, value))]
-        else:
-            words += [option, str(value)]
-    return " ".join([*words, "-o", "my-run"])
-
-
-def python_lines(report: Report) -> str:
-    """Return the Python lines that repeat a run.
-
-    Parameters
-    ----------
-    report : Report
-
-    Examples
-    --------
-    >>> import perrin
-    >>> from importlib.resources import files
-    >>> report = perrin.analyze(str(files("perrin") / "data" / "demo_tracks.csv.gz"), dt=0.73)
-    >>> print(python_lines(report).splitlines()[0])
-    import perrin
-    """
-    path = report.settings.get("input", {}).get("path")
-    stated = _stated(report)
-    lines = ["import perrin", ""]
-    if report.imaging is not None:
-        lines.append(f"stack = perrin.open_stack({path!r})")
-        source, function = "stack", "analyze_stack"
-    else:
-        source = "table" if path is None else repr(str(path))
-        function = "analyze"
-    given = "".join(f", {name}={value!r}" for name, value in stated.items())
-    lines.append(f"report = perrin.{function}({source}{given})")
-    lines += ["print(report)", 'report.to_frame().to_csv("results.csv")']
-    return "\n".join(lines)
-
-
-def _stated(report: Report) -> dict[str, Any]:
-    """Return the arguments of a run that differ from the defaults."""
-    defaults = {
-        name: parameter.default for name, parameter in inspect.signature(analyze).parameters.items()
-    }
-    given = report.settings.get("arguments", {})
-    names = _MOVIE_ARGUMENTS if report.imaging is not None else tuple(defaults)
-    return {
-        name: given[name]
-        for name in names
-        if name in given and given[name] is not None and given[name] != defaults.get(name)
-    }
-
-
 def folder_links(report: Report) -> list[tuple[str, str]]:
     """Return the files of a run folder and what they contain.
 
@@ -226,6 +135,7 @@ def folder_links(report: Report) -> list[tuple[str, str]]:
         ("motion.parquet", "position and orientation of every cluster in every frame"),
         ("tracks.parquet", "the particle positions that were used"),
         ("run.json", "arguments, versions and the input's SHA-256"),
+        ("run.toml", "the options, a configuration that repeats the run"),
         ("figures/", "figures as PNG and PDF"),
     ]
     if report.imaging is not None:

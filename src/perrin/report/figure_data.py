@@ -2,24 +2,25 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 
 from perrin._arrays import Floats, Ints, finite_or_none
 from perrin._text import unit_text
+from perrin.diffusion.steps import Quantity
 from perrin.geometry.rigid import degrees_of_freedom
 from perrin.geometry.rotations import unit_quaternion
 from perrin.geometry.shapes import pair_distances
 from perrin.motion.rods import RodMotion
 from perrin.plot.results import curve_floors, model_line
+from perrin.plot.step_law import step_distribution
 from perrin.report.embedding import packed
 
 if TYPE_CHECKING:
     import pandas as pd
 
     from perrin.curves.displacement import LagCurve
-    from perrin.diffusion.estimate import DiffusionEstimate
     from perrin.motion.rigid_motion import RigidMotion
     from perrin.plot.results import ModelLine
     from perrin.run.results import ClusterResult, RodResult
@@ -27,7 +28,6 @@ if TYPE_CHECKING:
 _LAGS = 80  # lag times of a curve, evenly over its logarithm
 _FEWEST_DRAWN_FRAMES, _MOST_FRAMES = 100, 2000  # frames of a path that are drawn
 _MOST_BYTES = 4_000_000  # of the paths of all clusters together, before compression
-_BINS = 31  # of a distribution of steps
 
 
 def cluster_data(
@@ -163,24 +163,18 @@ def _rigid_parts(
         header["lines"][name] = _line_entry(curve, line, floors[name])
         columns |= _curve_columns(name, curve)
     d = motion.dimension
-    start, stop = motion.steps()
-    shift = (motion.center[stop] - motion.center[start]).T
-    turn = motion.step_vectors()[stop - 1].T
-    usual = np.abs(motion.time[stop] - motion.time[start] - motion.usual_interval)
-    regular = usual < 1e-3 * motion.usual_interval
-    for name, vectors, estimate in (("turn", turn, result.D_R), ("shift", shift, result.D_T)):
-        if estimate.absent_because is not None or not regular.any():
+    kinds = zip(("turn", "shift"), get_args(Quantity), ("rad", "µm"), strict=True)
+    for name, quantity, unit in kinds:
+        found = step_distribution(result, quantity)
+        if found is None:
             continue
-        values = [estimate.value] * len(vectors)
-        if name == "turn" and result.tensor is not None:
-            # Steps are in body axes: along the axes of the tensor they have its values.
-            vectors = result.tensor.axes.T @ vectors
-            values = result.tensor.principal_values.tolist()
-        steps = vectors[:, regular]
-        columns[f"{name}_steps"], law = _distribution(
-            steps, estimate, values, motion.usual_interval
-        )
-        header["steps"][name] = law | {"unit": "rad" if name == "turn" else "µm"}
+        columns[f"{name}_steps"] = found.number
+        header["steps"][name] = {
+            "count": int(found.number.sum()),
+            "half": float(found.edges[-1]),
+            "variance": found.variance.tolist(),
+            "unit": unit,
+        }
     if result.tensor is not None:
         header["axes"] = np.round(result.tensor.axes.T, 4).tolist()
         header["principal"] = result.tensor.principal_values.tolist()
@@ -214,21 +208,6 @@ def _curve_columns(name: str, curve: LagCurve) -> dict[str, Floats]:
         f"{name}_y": np.where(shown, np.log10(y), np.nan),
         f"{name}_e": np.where(shown, np.minimum(e / y, 10.0), np.nan),
     }
-
-
-def _distribution(
-    steps: Floats, estimate: DiffusionEstimate, values: list[float], dt: float
-) -> tuple[Floats, dict[str, Any]]:
-    """Return the counts of all components of steps in bins, and the law of the fit.
-
-    The law is the mean of the normal laws of the axes, each with its variance.
-    """
-    variance = np.maximum(2 * np.array(values) * dt + 2 * estimate.offset, 0.0)
-    width = float(np.sqrt(variance.mean())) or float(steps.std()) or 1.0
-    half = max(4.0 * width, float(np.abs(steps).max()))
-    number = np.histogram(steps, np.linspace(-half, half, _BINS + 1))[0]
-    law = {"count": int(steps.size), "half": half, "variance": variance.tolist()}
-    return number.astype(np.float64), law
 
 
 def body_picture(template: Floats, diameter: float, *, label: str) -> str:

@@ -71,7 +71,9 @@ def _environment() -> Environment:
 def _symbols(text: str) -> Markup:
     """Escape a text, and set the indices and units of its coefficients."""
     marked = re.sub(r"\bum\b", "µm", str(escape(text))).replace("^2", "²")
-    marked = marked.replace("_inf", "_∞")
+    marked = marked.replace("_inf", "_∞").replace("+-", "±").replace("Phi²", "Φ²")
+    marked = re.sub(r"\bsigma_(xy|[xyz])\b", r"σ<sub>\1</sub>", marked)
+    marked = re.sub(r"\bsigma\b", "σ", marked)
     for letter, index in (("R", "R"), ("T", "T"), ("perp", "⊥")):
         marked = re.sub(rf"\bD_{letter}\b", f"<i>D</i><sub>{index}</sub>", marked)
     return Markup(marked)

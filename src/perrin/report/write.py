@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from perrin.plot.imaging import save_image_figures
-from perrin.plot.results import save_figures
+from perrin.plot.report_figures import save_figures
 from perrin.report.imaging_page import render_imaging_quality
 from perrin.report.page import render_html
 from perrin.run.folders import filled_folder, staged_folder
@@ -13,12 +14,50 @@ from perrin.run.results import write_data
 
 if TYPE_CHECKING:
     import os
+    from collections.abc import Iterator
     from pathlib import Path
 
+    from perrin.report.page import Progress
     from perrin.run.results import Report
 
 
-def write_run(report: Report, folder: str | os.PathLike[str], *, overwrite: bool = False) -> None:
+@contextmanager
+def run_folder(
+    report: Report,
+    folder: str | os.PathLike[str],
+    *,
+    overwrite: bool = False,
+    progress: Progress | None = None,
+) -> Iterator[Path]:
+    """Write a run folder as `write_run` does, and give it to add further files before it appears.
+
+    Parameters
+    ----------
+    report, folder, overwrite, progress
+        As in `write_run`.
+
+    Yields
+    ------
+    Path
+        The folder that is renamed to `folder` at the end.
+
+    Raises
+    ------
+    FileExistsError
+        As `write_run`.
+    """
+    with staged_folder(folder, overwrite=overwrite) as stage:
+        _write_files(report, stage, progress)
+        yield stage
+
+
+def write_run(
+    report: Report,
+    folder: str | os.PathLike[str],
+    *,
+    overwrite: bool = False,
+    progress: Progress | None = None,
+) -> None:
     """Write a run folder with data, figures and HTML pages, complete or not at all.
 
     Parameters
@@ -29,17 +68,21 @@ def write_run(report: Report, folder: str | os.PathLike[str], *, overwrite: bool
         run on images, the imaging quality as ``quality.html``.
     overwrite : bool
         Replace an existing run folder.
+    progress : callable, optional
+        Called with the number of finished clusters, their total, and what is done.
 
     Raises
     ------
     FileExistsError
         If the folder exists and `overwrite` is not set, or is not a run folder.
     """
-    with staged_folder(folder, overwrite=overwrite) as stage:
-        _write_files(report, stage)
+    with run_folder(report, folder, overwrite=overwrite, progress=progress):
+        pass
 
 
-def complete_run(report: Report, folder: str | os.PathLike[str]) -> None:
+def complete_run(
+    report: Report, folder: str | os.PathLike[str], *, progress: Progress | None = None
+) -> None:
     """Write a run, as `write_run` does, into the folder that holds its finished frames.
 
     Parameters
@@ -47,6 +90,8 @@ def complete_run(report: Report, folder: str | os.PathLike[str]) -> None:
     report : Report
     folder : path
         Folder given to `analyze_stack` as `keep`.
+    progress : callable, optional
+        As in `write_run`.
 
     Raises
     ------
@@ -54,15 +99,17 @@ def complete_run(report: Report, folder: str | os.PathLike[str]) -> None:
         If the run cannot be written; the finished frames remain.
     """
     with filled_folder(folder) as stage:
-        _write_files(report, stage)
+        _write_files(report, stage, progress)
 
 
-def _write_files(report: Report, stage: Path) -> None:
+def _write_files(report: Report, stage: Path, progress: Progress | None) -> None:
     """Write data, figures and pages into an empty folder."""
+    if progress is not None:
+        progress(0, 0, "writing tables and figures")
     write_data(report, stage)
     place = stage / "figures"
     place.mkdir()
-    html = render_html(report, save_figures(report, place))
+    html = render_html(report, save_figures(report, place), progress=progress)
     (stage / "report.html").write_text(html, encoding="utf-8")
     if report.imaging is not None:
         html = render_imaging_quality(report, save_image_figures(report, place))

@@ -110,7 +110,9 @@ _STEADY_LEVEL = 1e-3
 # half of it by all clusters where several are also judged together.
 _VERDICT_LEVEL = 0.005
 
-_TOGETHER = 256  # clusters that are fitted at a time: bounds the memory
+# Clusters that are fitted and measured at a time: a tenth of them, so that progress is seen, not
+# fewer than are efficient, nor more than bound the memory.
+_FEWEST_TOGETHER, _MOST_TOGETHER = 16, 256
 
 # The symmetry of a straight chain is that of places equal within this share of its length.
 _SAME_PLACE = 0.03
@@ -305,15 +307,15 @@ def measure_table(
     )
     if not experiment.keep_jumps:
         bodies = [replace(b, stage=stage.rows(b.tracks.frames)) for b in bodies]
-    if progress is not None:
-        progress(0, 0, "estimating D_R and D_T")
-    measured, failed = measure_bodies(bodies, experiment, recording)
+    measured, failed = measure_bodies(bodies, experiment, recording, progress=progress)
     failures += failed
     if failures and not (measured or rods):
         raise failures[-1][1]
     remarks += words.common_motion_remarks(
         common_motion([(m.translation.motion, m.body.tracks.frames) for m in measured])
     )
+    if progress is not None:
+        progress(0, 0, "judging the motion")
     measured, kinds, unpooled = measure_kinds(measured, rods, experiment, first_frame=first)
     pooled = [kind.pooled for kind in kinds if kind.pooled is not None]
     loose = None
@@ -412,7 +414,8 @@ def fit_clusters(
     failures: list[tuple[str, ValueError]] = []
     count = table["cluster"][table["cluster"] >= 0].nunique()
     clusters, done = each_cluster(table), 0
-    while some := list(islice(clusters, _TOGETHER)):
+    together = _clusters_at_a_time(count)
+    while some := list(islice(clusters, together)):
         if progress is not None:
             progress(done, count, "fitting clusters")
         done += len(some)
@@ -683,10 +686,58 @@ def measure_rod(tracks: ClusterTracks, experiment: Experiment, recording: Record
     )
 
 
+def _clusters_at_a_time(count: int) -> int:
+    return int(np.clip(-(-count // 10), _FEWEST_TOGETHER, _MOST_TOGETHER))
+
+
 def measure_bodies(
-    bodies: Sequence[FittedBody], experiment: Experiment, recording: Recording
+    bodies: Sequence[FittedBody],
+    experiment: Experiment,
+    recording: Recording,
+    *,
+    progress: Progress | None = None,
 ) -> tuple[list[MeasuredBody], list[tuple[str, ValueError]]]:
-    """Estimate the coefficients and the tensors of all bodies, and collect the remarks on them.
+    """Measure all bodies, a tenth of them at a time.
+
+    Parameters
+    ----------
+    bodies, experiment, recording
+        As in `measure_together`.
+    progress : callable, optional
+        As in `measure_table`.
+
+    Returns
+    -------
+    measured : list of MeasuredBody
+    failures : list of tuple
+        As `measure_together`.
+    """
+    measured: list[MeasuredBody] = []
+    failures: list[tuple[str, ValueError]] = []
+    count = len(bodies)
+    together = _clusters_at_a_time(count)
+    for done in range(0, count, together):
+        if progress is not None:
+            progress(done, count, "estimating D_R and D_T")
+        part = bodies[done : done + together]
+        found, failed = measure_together(part, experiment, recording, tested=count)
+        measured += found
+        failures += failed
+    return measured, failures
+
+
+def measure_together(
+    bodies: Sequence[FittedBody], experiment: Experiment, recording: Recording, *, tested: int
+) -> tuple[list[MeasuredBody], list[tuple[str, ValueError]]]:
+    """Estimate the coefficients and the tensors of some bodies, and collect the remarks on them.
+
+    Parameters
+    ----------
+    bodies : sequence of FittedBody
+    experiment : Experiment
+    recording : Recording
+    tested : int
+        Number of bodies that share the level of the test for a steady motion.
 
     Returns
     -------
@@ -696,7 +747,7 @@ def measure_bodies(
     """
     failures: list[tuple[str, ValueError]] = []
     coefficients = [
-        measure_coefficients(bodies, quantity, experiment, recording)
+        measure_coefficients(bodies, quantity, experiment, recording, tested=tested)
         for quantity in get_args(Quantity)
     ]
     found: list[tuple[FittedBody, Coefficient, Coefficient]] = []
@@ -715,12 +766,12 @@ def measure_bodies(
     tensors = measure_tensors(turning, "rotation", experiment.noise)
     predicted = [predicted_noise(body.motion) for body, *_ in found]
     # The offset of steps that contain another motion, or of a body that bends, is no noise.
-    tested = [k for k, (body, turn, _) in enumerate(found) if body.quality.rigid and turn.brownian]
+    sound = [k for k, (body, turn, _) in enumerate(found) if body.quality.rigid and turn.brownian]
     floors = noise_floor_tests(
-        [(found[k][0].motion, found[k][1].estimate, predicted[k]) for k in tested],
+        [(found[k][0].motion, found[k][1].estimate, predicted[k]) for k in sound],
         stated=experiment.sigma is not None,
     )
-    floor = dict(zip(tested, floors, strict=True))
+    floor = dict(zip(sound, floors, strict=True))
     results = [
         measured_body(
             *one, *tensors[k], noise=predicted[k], floor=floor.get(k, []), recording=recording
@@ -804,16 +855,19 @@ def measure_coefficients(
     quantity: Quantity,
     experiment: Experiment,
     recording: Recording,
+    *,
+    tested: int,
 ) -> list[Coefficient | DegenerateClusterError | TooFewFramesError]:
     """Estimate one coefficient of every body from the steps that Brownian motion can make.
 
     Parameters
     ----------
     bodies : sequence of FittedBody
-        They share the level of the test for a steady motion.
     quantity : {"rotation", "translation"}
     experiment : Experiment
     recording : Recording
+    tested : int
+        Number of bodies that share the level of the test for a steady motion.
 
     Returns
     -------
@@ -837,7 +891,7 @@ def measure_coefficients(
     given = [one for k, one in enumerate(estimates) if k in set(rest)]
     some = [one for one in given if not isinstance(one, TooFewFramesError)]
     jumps = find_jumps_of_each([paths[k] for k in rest], some)
-    tested: list[Coefficient] = []
+    without_tests: list[Coefficient] = []
     numbers: list[int] = []
     for k, estimate, own in zip(rest, some, jumps, strict=True):
         try:
@@ -847,10 +901,10 @@ def measure_coefficients(
         except (DegenerateClusterError, TooFewFramesError) as error:
             found[k] = error
             continue
-        tested.append(coefficient)
+        without_tests.append(coefficient)
         numbers.append(k)
-    level = _STEADY_LEVEL / len(bodies) if bodies else 0.0
-    for k, one in zip(numbers, with_step_tests(tested, noise, level=level), strict=True):
+    level = _STEADY_LEVEL / tested
+    for k, one in zip(numbers, with_step_tests(without_tests, noise, level=level), strict=True):
         found[k] = one
     return [one for one in found if one is not None]
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from perrin._text import frames_text, listed, with_error
+from perrin._text import counted, frames_text, listed, with_error
 from perrin.diffusion.step_tests import JUMP_LEVEL, STAGE_LEVEL
 from perrin.tracks.screening import far_sentence
 
@@ -268,9 +268,9 @@ def loose_particles_note(count: int) -> str:
     Examples
     --------
     >>> loose_particles_note(3)
-    '3 particles belong to no cluster and are left out'
+    '3 particles belong to no cluster: left out'
     """
-    return f"{count} particles belong to no cluster and are left out"
+    return f"{counted(count, 'particle', 'belong')} to no cluster: left out"
 
 
 def no_cluster_text(contact: float | None, *, marked: bool) -> str:
@@ -508,7 +508,7 @@ def no_pose_notes(reasons: Iterable[str], recorded: Bools) -> list[str]:
         return []
     kinds = {r: refused.count(r) for r in sorted(set(refused))}
     by_kind = "; ".join(f"{count} x {reason}" for reason, count in kinds.items())
-    return [f"{len(refused)} of {np.count_nonzero(recorded)} frames have no pose ({by_kind})"]
+    return [f"frames without a pose: {len(refused)} of {np.count_nonzero(recorded)} ({by_kind})"]
 
 
 def no_rotation_note(particles: int) -> str:

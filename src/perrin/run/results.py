@@ -24,6 +24,7 @@ from perrin.motion.rigidity import Quality
 from perrin.motion.rods import RodMotion
 from perrin.run.folders import staged_folder
 from perrin.run.predictions import Prediction
+from perrin.run.repetition import config_text
 from perrin.run.result_table import (
     coefficients_html,
     estimate_row,
@@ -722,9 +723,11 @@ def load_run(folder: str | os.PathLike[str]) -> Report:
 
 
 def write_data(report: Report, folder: Path) -> None:
-    """Write summary.json, results.csv, curves.csv, run.json and the tables, with checksums."""
+    """Write numbers, tables and settings of a report to a folder, with checksums."""
     write_json(folder / "summary.json", report.to_dict())
     write_json(folder / "run.json", report.settings)
+    dt = report.results[0].motion.dt if report.results else None
+    (folder / "run.toml").write_text(config_text(report.settings, dt=dt), encoding="utf-8")
     report.tracks.to_parquet(folder / "tracks.parquet", index=False)
     motion_table(report).to_parquet(folder / "motion.parquet", index=False)
     curve_table(report).to_csv(folder / "curves.csv", index=False)

@@ -38,7 +38,7 @@ def answer_lines(report: Report) -> list[str]:
     >>> import perrin
     >>> report = perrin.analyze(str(files("perrin") / "data" / "demo_tracks.csv.gz"), dt=0.73)
     >>> answer_lines(report)[0][:61]
-    'The cluster of 4 particles rotates with D_R = 0.0051(4) rad²/'
+    'The cluster of 4 particles rotates with D_R = 0.0069(6) rad²/'
     """
     several = len(report.results) > 1
     source: ClusterResult | RodResult | Pooled | None = report.pooled
@@ -46,37 +46,55 @@ def answer_lines(report: Report) -> list[str]:
         source = report.results[0]
     lines = []
     if source is not None:
-        count = len(report.pooled.clusters) if several and report.pooled is not None else 1
-        many = f"The {count} clusters {{}} with a common {{}}"
-        one = f"The cluster of {_particles(report)} particles {{}} with {{}}"
         turn = "D_perp" if hasattr(source, "D_perp") else "D_R"
-        for name, verbs in ((turn, ("rotate", "rotates")), ("D_T", ("move", "moves"))):
-            text = _value_sentence(name, getattr(source, name))
-            if text:
-                lines.append(many.format(verbs[0], text) if several else one.format(verbs[1], text))
+        known = {name: getattr(source, name) for name in (turn, "D_T")}
+        known = {k: one for k, one in known.items() if one.absent_because is None}
+        if several and report.pooled is not None:
+            subject = f"The {len(report.pooled.clusters)} clusters"
+            verbs, common = {"D_T": "move"}, "a common "
+        else:
+            count = report.results[0].to_dict()["n_particles"]
+            subject, verbs, common = f"The cluster of {count} particles", {"D_T": "moves"}, ""
+        turns = "rotate" if several else "rotates"
+        # One sentence where both values hold over the same times, which are then stated once.
+        scales = {one.time_scale for one in known.values()}
+        if len(known) == 2 and len(scales) == 1:
+            both = " and ".join(
+                f"{verbs.get(name, turns)} with {common}{_value_text(name, one)}"
+                for name, one in known.items()
+            )
+            when = f". Both {_of_several(scales.pop())}" if scales != {""} else ""
+            lines.append(f"{subject} {both}{when}.")
+        else:
+            lines += [
+                f"{subject} {verbs.get(name, turns)} with {common}{_value_text(name, one)}"
+                + (f", which {one.time_scale}." if one.time_scale else ".")
+                for name, one in known.items()
+            ]
     for kind in report.kinds if several and report.pooled is None else ():
         for name, estimate in kind.coefficients:
-            text = _value_sentence(name, estimate)
-            lines += [f"Clusters of {kind.name}: {text}"] if text else []
+            if estimate.absent_because is None:
+                when = f", which {estimate.time_scale}" if estimate.time_scale else ""
+                lines.append(f"Clusters of {kind.name}: {_value_text(name, estimate)}{when}.")
     if several and report.pooled is not None:
         lines += _agreement(report.pooled)
     return lines + _predictions(report)
 
 
-def _particles(report: Report) -> int:
-    """Return the number of particles of the first cluster."""
-    return int(report.results[0].to_dict()["n_particles"])
-
-
-def _value_sentence(name: str, estimate: DiffusionEstimate) -> str:
-    """Return the value with its interval and the times at which it holds; empty without one."""
-    if estimate.absent_because is not None:
-        return ""
+def _value_text(name: str, estimate: DiffusionEstimate) -> str:
+    """Return a value with its interval."""
     sign = "= " if estimate.resolved else ""
     interval = f"95 % interval {interval_text(estimate.ci95)} {unit_text(estimate.unit)}"
     limit = "" if estimate.resolved else "an upper limit, "
-    when = f", which {estimate.time_scale}" if estimate.time_scale else ""
-    return f"{name} {sign}{value_text(estimate)} ({limit}{interval}){when}."
+    return f"{name} {sign}{value_text(estimate)} ({limit}{interval})"
+
+
+def _of_several(time_scale: str) -> str:
+    """Return the times at which one value holds as those at which several values hold."""
+    for one, several in (("holds ", "hold "), ("is ", "are ")):
+        if time_scale.startswith(one):
+            return several + time_scale.removeprefix(one)
+    return time_scale
 
 
 def _agreement(pooled: Pooled) -> list[str]:
@@ -115,6 +133,10 @@ def _predictions(report: Report) -> list[str]:
             )
             continue
         far = sum(abs(one.pull) > _FAR_PULL for one in found)
+        if not far:
+            all_of_them = f"{name} of all {len(found)} clusters"
+            lines.append(f"{all_of_them} is within two standard errors of its prediction.")
+            continue
         lines.append(
             f"{name} of {far} of {len(found)} clusters is over two standard errors from its "
             f"prediction; {0.0455 * len(found):.2g} are expected by chance."
@@ -154,7 +176,10 @@ def verdict_lines(report: Report) -> dict[str, list[str]]:
                 texts += [f"Clusters of {kind.name}: {text}" for text in found]
         if several:
             if source is not None and texts and pooled is not None and len(pooled.clusters) > 1:
-                texts[0] = f"All {len(pooled.clusters)} pooled clusters together: {texts[0]}"
+                # How many clusters show which motion is stated below, with their names.
+                text = texts[0].partition(" Singly: ")[0].replace("this track ", "these tracks ")
+                start = f"All {len(pooled.clusters)} pooled clusters together: "
+                texts[0] = start + text[:1].lower() + text[1:]
             texts.append(kinds_text(report, name))
         lines[name] = texts or [f"The {name} was not judged: {NOT_JUDGED}."]
     return lines

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from perrin._text import counted
 from perrin.run.experiment import Recording, merged_experiment
 from perrin.run.measure import measure_table
 from perrin.run.remarks import Remarks
@@ -119,7 +120,7 @@ def analyze(
     >>> from importlib.resources import files
     >>> report = perrin.analyze(str(files("perrin") / "data" / "demo_tracks.csv.gz"), dt=0.73)
     >>> print(report.clusters[0].D_R)
-    D_R = 0.0051(4) rad^2/s [mle, 300 frames]
+    D_R = 0.0069(6) rad^2/s [mle, 300 frames]
     """
     experiment = merged_experiment(
         experiment,
@@ -213,9 +214,10 @@ def read_table(
     if size is not None and contact is not None:
         table = identify(table, contact=contact, size=size)
         known = table["cluster"] >= 0
+        count = int(table["cluster"][known].nunique())
         read_notes.append(
-            f"particles are identified in {table['cluster'][known].nunique()} clusters of {size}; "
-            f"{(~known).sum()} of {len(known)} rows belong to none"
+            f"particles are identified in {counted(count, 'cluster')} of {size}; "
+            f"{counted(int((~known).sum()), 'row', 'belong')} to none, of {len(known)}"
         )
     screened = screen_rows(table)
     notes, warnings = distance_notes(

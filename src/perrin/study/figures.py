@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from perrin._text import unit_text
-from perrin.plot.style import GREY, PALETTE, new_figure, save_figure
+from perrin.plot.figure_style import GREY, PALETTE, column_figure, save_figure, style
 from perrin.study.conditions import QUANTITIES, UNITS, condition_text
 from perrin.study.trends import law_values
 
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 _SYMBOLS = {"D_R": "$D_R$", "D_T": "$D_T$", "D_T/D_R": "$D_T/D_R$"}
 
 
+@style()
 def save_study_figures(result: StudyResult, folder: Path) -> list[Path]:
     """Write the figure of all conditions, and that of the residuals of fitted laws.
 
@@ -38,16 +39,14 @@ def save_study_figures(result: StudyResult, folder: Path) -> list[Path]:
     """
     if not result.means:
         return []
-    figure = new_figure(4.2 * len(QUANTITIES), 3.8)
+    figure = column_figure(0.36)
     axes = figure.subplots(1, len(QUANTITIES))
     for ax, quantity in zip(axes, QUANTITIES, strict=True):
         plot_conditions(result, quantity, ax=ax)
     files = save_figure(figure, folder / "conditions")
     if result.trends:
-        figure = new_figure(
-            4.2 * min(len(result.trends), 3), 3.2 * (1 + (len(result.trends) - 1) // 3)
-        )
         shape = (1 + (len(result.trends) - 1) // 3, min(len(result.trends), 3))
+        figure = column_figure(0.32 * shape[0])
         for ax, (name, trend) in zip(
             np.ravel(figure.subplots(*shape, squeeze=False)), result.trends.items(), strict=False
         ):

@@ -71,7 +71,7 @@ from perrin.tracks.formats import (
     text_table,
     unpacked,
 )
-from perrin.tracks.gdf import gdf_bytes, parse_gdf
+from perrin.tracks.gdf import gdf_bytes, parse_ascii_gdf, parse_gdf
 from perrin.tracks.groups import TOUCHING_REACH, connected_groups, frames_of, touching_groups
 from perrin.tracks.identity import (
     BodyModel,
@@ -210,6 +210,7 @@ __all__ = [
     "ours_of",
     "oversize_text",
     "own_times",
+    "parse_ascii_gdf",
     "parse_c3d",
     "parse_gdf",
     "parse_gsd",

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from perrin._arrays import from_plain, to_plain
-from perrin._text import frames_text
+from perrin._text import counted, frames_text
 from perrin.errors import TrackTableError
 
 if TYPE_CHECKING:
@@ -139,7 +139,7 @@ def read_clock(table: pd.DataFrame, *, dt: float) -> tuple[Clock | None, tuple[s
     back = np.flatnonzero(step <= 0)
     faults = []
     if missing > len(time):
-        faults.append(f"{missing} of {missing + len(time)} frames have none")
+        faults.append(f"{counted(missing, 'frame', 'have')} none, of {missing + len(time)}")
     elif back.size:
         where = frames_text(frame[back + 1])
         faults.append(f"it does not rise from one frame to the next at {where}")
@@ -166,7 +166,8 @@ def read_clock(table: pd.DataFrame, *, dt: float) -> tuple[Clock | None, tuple[s
         f"{gaps.max():.4g} s (median {np.median(gaps):.4g} s)"
     ]
     if not known.all():
-        notes.append(f"{(~known).sum()} frames have no time; theirs is interpolated")
+        lacking = counted(int((~known).sum()), "frame", "have")
+        notes.append(f"{lacking} no time; it is interpolated")
     return Clock(frame, time, dt), tuple(notes)
 
 
@@ -204,7 +205,8 @@ def own_times(table: pd.DataFrame, *, dt: float) -> tuple[Floats | None, tuple[s
     lacking = int(np.isnan(delay).sum())
     if lacking:
         return None, (
-            f"the rows of a frame have different times, but {lacking} rows have none: all are "
+            "the rows of a frame have different times, but "
+            f"{counted(lacking, 'row', 'have')} none: all are "
             "taken as recorded at the mean time of their frame",
         )
     return delay, (

@@ -17,7 +17,7 @@ from perrin._arrays import (
     refuse,
     require_positive,
 )
-from perrin._text import frames_text, listed
+from perrin._text import counted, frames_text, listed
 from perrin.errors import (
     DegenerateClusterError,
     IdentityWarning,
@@ -349,8 +349,8 @@ def identify(table: pd.DataFrame, *, contact: float, size: int) -> pd.DataFrame:
         passed = order[1:][same & (given[order[1:]] != given[order[:-1]])]
         if passed.size:
             warnings.warn(
-                f"identity: {passed.size} labels of the column particle pass to another particle, "
-                f"in {frames_text(np.unique(frame[known][passed]))}; they are corrected",
+                f"identity: {counted(passed.size, 'label', 'pass')} to another particle, in "
+                f"{frames_text(np.unique(frame[known][passed]))}; they are corrected",
                 IdentityWarning,
                 stacklevel=2,
             )
@@ -447,7 +447,7 @@ def _columns_of(table: pd.DataFrame, *, unique: Sequence[str] = ("frame", "parti
     missing = [name for name in ("frame", "particle", "x", "y") if name not in table]
     faults = [f"missing columns {', '.join(missing)}"] if missing else []
     faults += [
-        f"{table[name].isna().sum()} rows without {name}"
+        f"{counted(int(table[name].isna().sum()), 'row')} without {name}"
         for name in ("frame", "particle")
         if name in table and table[name].isna().any()
     ]

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from perrin._text import listed
+from perrin._text import counted, listed
 from perrin.errors import table_error
 from perrin.tracks.cells import unguarded_cell
 from perrin.tracks.clock import frames_from_times
@@ -530,7 +530,7 @@ def _checked_numbers(
     infinite = np.isinf(values)
     if infinite.any():
         faults.append(
-            f"{name}: {infinite.sum()} infinite values, in {rows.where(infinite)}; "
+            f"{name}: {counted(int(infinite.sum()), 'infinite value')}, in {rows.where(infinite)}; "
             "use NaN for a missing point"
         )
     return values, faults
@@ -609,7 +609,8 @@ def _repeat_faults(clean: dict[str, NDArray[Any]], rows: RowNumbers) -> list[str
         return []
     first = ", ".join(f"{name} {keys[name].to_numpy()[repeated][0]}" for name in key)
     return [
-        f"{repeated.sum()} rows repeat the ({', '.join(key)}) of an earlier row, first {first}, in "
+        f"{counted(int(repeated.sum()), 'row', 'repeat')} the ({', '.join(key)}) of an earlier "
+        f"row, first {first}, in "
         f"{rows.where(repeated)}; a particle has at most one row per frame, so drop the repeats "
         "or, where ids start anew in every cluster, add a cluster column"
     ]

@@ -2,7 +2,8 @@
 
 int32 words: the magic number 82991, the number of dimensions, the dimensions, a type code, the
 number of elements; then the elements with the first dimension (columns) running fastest. The byte
-order of the magic number is that of the file.
+order of the magic number is that of the file. The ASCII variant has the line ``GDF v. 1.0`` in
+place of the magic number, and the same numbers as text.
 """
 
 from __future__ import annotations
@@ -18,6 +19,8 @@ if TYPE_CHECKING:
 
 _GDF_MAGIC = 82991
 
+_ASCII_HEADER = b"GDF v. 1.0"
+
 _GDF_TYPES = {1: "u1", 2: "i2", 3: "i4", 4: "f4", 5: "f8"}
 
 
@@ -27,17 +30,15 @@ def parse_gdf(data: bytes, source: str) -> Floats:
     Raises
     ------
     TrackTableError
-        If these are not the bytes of a whole binary .gdf file; `source` is its name.
+        If these are not the bytes of a whole .gdf file; `source` is its name.
 
     Examples
     --------
     >>> parse_gdf(gdf_bytes(np.array([[0.5, 1.5, 0.0, 7.0]])), "t.gdf")
     array([[0.5, 1.5, 0. , 7. ]])
     """
-    if data.startswith(b"GDF v. 1.0"):
-        raise table_error(
-            source, "the ASCII variant of GDF; write it again in binary, without /ascii"
-        )
+    if data.startswith(_ASCII_HEADER):
+        return parse_ascii_gdf(data, source)
     orders = {_GDF_MAGIC.to_bytes(4, "little"): "<", _GDF_MAGIC.to_bytes(4, "big"): ">"}
     if data[:4] not in orders:
         raise table_error(
@@ -81,6 +82,60 @@ def parse_gdf(data: bytes, source: str) -> Floats:
         )
     values = np.frombuffer(data, dtype=dtype, offset=offset).reshape((n_rows, n_columns))
     return values.astype(np.float64)
+
+
+def parse_ascii_gdf(data: bytes, source: str) -> Floats:
+    r"""Return the table in the bytes of an ASCII .gdf file, shape (rows, columns).
+
+    Raises
+    ------
+    TrackTableError
+        If a number cannot be read, or if there are more or fewer of them than the header states.
+
+    Examples
+    --------
+    >>> parse_ascii_gdf(b"GDF v. 1.0\n 2\n 4 1 4 4\n 0.5 1.5 0.0 7.0\n", "t.gdf")
+    array([[0.5, 1.5, 0. , 7. ]])
+    """
+    words = data[len(_ASCII_HEADER) :].split()
+    try:
+        n_dims = int(words[0])
+        *size, _, count = (int(word) for word in words[1 : n_dims + 3])
+    except (ValueError, IndexError):
+        raise table_error(source, "cut short or damaged within its header") from None
+    if n_dims not in (1, 2) or len(size) != n_dims or min(size) < 0:
+        raise table_error(
+            source, f"expected a .gdf with 2 dimensions (columns, rows), got {n_dims}"
+        )
+    n_columns, n_rows = (*size, 1)[:2]
+    # Programs other than IDL write 0 for the number of elements.
+    found, expected = words[n_dims + 3 :], n_columns * n_rows
+    if count not in (0, expected) or len(found) != expected:
+        raise table_error(
+            source,
+            f"the header states {n_rows} rows of {n_columns} columns and {count} elements, the "
+            f"file has {len(found)} numbers; copy or write it again",
+        )
+    try:
+        values = np.array(found, dtype=np.float64)
+    except ValueError:
+        # A number that is too long for its place is a row of asterisks.
+        wrong = next(i for i, word in enumerate(found) if not _is_number(word))
+        text = found[wrong].decode("ascii", "replace")
+        raise table_error(
+            source,
+            f"row {wrong // n_columns}, column {wrong % n_columns}: expected a number, got "
+            f"{text!r}; write it again in binary, without /ascii",
+        ) from None
+    return values.reshape((n_rows, n_columns))
+
+
+def _is_number(word: bytes) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
 
 
 def gdf_bytes(values: Floats) -> bytes:

@@ -39,7 +39,7 @@ import numpy as np
 
 from perrin._arrays import Bools, Floats, Ints, as_positions, from_plain, frozen, present, to_plain
 from perrin._display import Shown
-from perrin._text import frames_text
+from perrin._text import counted, frames_text
 from perrin.errors import IdentityWarning
 from perrin.geometry.rigid import degrees_of_freedom
 from perrin.geometry.rotations import fit_rotations
@@ -249,7 +249,7 @@ def settle_identity(
     if found.swaps.size:
         passed = np.diff(labels_in_time(found.order), axis=0)[found.swaps - 1] != 0
         warnings.warn(
-            f"identity: {passed.sum()} labels pass to another particle, in "
+            f"identity: {counted(int(passed.sum()), 'label', 'pass')} to another particle, in "
             f"{frames_text(found.swaps)} counted from 0; they are corrected",
             IdentityWarning,
             stacklevel=2,

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from perrin._arrays import Bools, Floats, Ints, present
+from perrin._text import counted
 from perrin.geometry.shapes import pair_distances
 from perrin.motion.degenerate import mean_present
 from perrin.motion.residuals import median_present
@@ -144,7 +145,7 @@ def screen_rows(table: pd.DataFrame) -> Screened:
     frequent = points[np.argsort(-times, kind="stable")[:_POINTS_SHOWN]]
     places = [f"({', '.join(f'{c:.6g}' for c in point)})" for point in frequent]
     if len(points) > _POINTS_SHOWN:
-        places[-1] += f" or {len(points) - _POINTS_SHOWN} more points"
+        places[-1] += f" or {counted(len(points) - _POINTS_SHOWN, 'more point')}"
     placeholders = _rows_sentence(
         filled,
         frame,

@@ -739,7 +739,9 @@ def group_columns(
             reason[group] = _NO_OWN_VOXELS
             continue
         fit = fit_window(window, image, noise, FreeCenters(sample.centers))
-        moved = np.linalg.norm(fit.centers - sample.centers, axis=1) >= furthest
+        # Spheres that only come near were found where they are, not where they would touch.
+        starts = np.stack([sample.centers, found.centers[group]])
+        moved = np.linalg.norm(fit.centers - starts, axis=2).min(axis=0) >= furthest
         dark = ~(fit.brightness / np.median(fit.brightness) > 0.1)
         faults = np.where(dark, _DARK, np.where(moved, _MOVED, "")).astype(object)
         if usual is not None:
