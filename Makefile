@@ -48,7 +48,7 @@ test-numpy: .venv/.test  ## the numeric tests again, without the compiled kernel
 	PERRIN_COMPILED=0 OMP_NUM_THREADS=1 $(RUN) pytest -q -n auto --dist loadfile $(NUMERIC)
 
 faults: .venv/.test  ## stopped and broken runs: kills, signals, full disks, two at a time (3 minutes)
-	OMP_NUM_THREADS=1 $(RUN) pytest -q -m faults
+	OMP_NUM_THREADS=1 $(RUN) pytest -q -m faults -n 2 --dist load tests/faults
 
 SECONDS ?= 3600
 fuzz: .venv/.test  ## damaged files of all formats, an hour (SECONDS=...); faults become seeds
@@ -60,7 +60,7 @@ fuzz-short: .venv/.test  ## the same for a minute
 test-lowest:  ## the suite on the oldest dependencies allowed (Python 3.11)
 	@$(call make_venv,.venv-lowest)
 	.venv-lowest/bin/python -m pip install --quiet --disable-pip-version-check \
-	  -r requirements/lowest.txt $$(grep -E '^(pytest|hypothesis)==' requirements/test.lock)
+	  -r requirements/lowest.txt $$(sed -nE 's/^((pytest|hypothesis)==[^ ]+).*/\1/p' requirements/test.lock)
 	.venv-lowest/bin/python -m pip install --quiet --disable-pip-version-check --no-deps -e .
 	.venv-lowest/bin/python -m pytest -q
 
@@ -69,6 +69,8 @@ benchmarks: .venv/.test  ## the quick benchmarks: coverage of intervals, warning
 	$(BIN)/python benchmarks/alarms.py --quick --jobs 2
 	$(BIN)/python benchmarks/motion.py --quick --jobs 2
 	$(BIN)/python benchmarks/paper.py
+	$(BIN)/python benchmarks/study_coverage.py --quick
+	$(BIN)/python benchmarks/study.py --quick
 	$(BIN)/python benchmarks/structure.py
 	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/peers.py --quick
 
@@ -81,6 +83,8 @@ long: .venv/.test  ## the Monte-Carlo tests with all repeats, and 40 tables of e
 	$(BIN)/python benchmarks/motion_switching.py
 	$(BIN)/python benchmarks/motion_correlation.py
 	$(BIN)/python benchmarks/motion_dense.py
+	$(BIN)/python benchmarks/study_coverage.py
+	$(BIN)/python benchmarks/study.py
 
 lint: .venv/.test  ## ruff: rules and format
 	$(RUN) ruff check .
@@ -114,7 +118,7 @@ clean:  ## remove what was installed and built, demo output included
 .venv/.demo: requirements/demo.lock pyproject.toml hatch_build.py src/perrin/compiled/kernels.c
 	@$(call make_venv,.venv)
 	@echo 'Installing locked versions into .venv (once; a minute or two)'
-	@$(PIP) install --quiet --no-deps -r requirements/demo.lock
+	@$(PIP) install --quiet --no-deps --require-hashes -r requirements/demo.lock
 	@$(PIP) install --quiet --no-deps --no-build-isolation -e .
 	@$(PIP) --quiet check
 	@$(BIN)/python -c 'from perrin.compiled import kernels_in_use; print("Compiled kernels:", kernels_in_use())'
@@ -123,6 +127,6 @@ clean:  ## remove what was installed and built, demo output included
 
 .venv/.test .venv/.docs: .venv/.%: requirements/%.lock .venv/.demo
 	@echo 'Installing $< into .venv'
-	@$(PIP) install --quiet --no-deps -r $<
+	@$(PIP) install --quiet --no-deps --require-hashes -r $<
 	@$(PIP) --quiet check
 	@touch $@

@@ -8,16 +8,19 @@ trap 'rm -rf "$new"' EXIT
 compile() { "$UV" pip compile --quiet --no-annotate --no-header --no-emit-index-url "$@"; }
 # One version of each for every Python and system that perrin serves, markers where they differ.
 everywhere() { compile --universal --fork-strategy fewest --python-version 3.11 "$@"; }
+# The pins of a lock with the hashes of all their files, without resolving anything anew.
+hashed() { compile --universal --python-version 3.11.7 --no-deps --generate-hashes "$1"; }
 note() { printf '# %s\n# Made from pyproject.toml by `make lock`; do not edit.\n' "$1"; }
 
 printf 'hatchling\neditables\nsetuptools\n' | everywhere pyproject.toml - > "$new/demo"
-{ note "What perrin runs with, and its build backend."; cat "$new/demo"; } > "$new/demo.lock"
+{ note "What perrin runs with, and its build backend."; hashed "$new/demo"; } > "$new/demo.lock"
 cp "$new/demo" "$new/all"
 for extra in test docs; do
     everywhere --extra "$extra" --constraint "$new/all" pyproject.toml > "$new/$extra"
     { note "The [$extra] extra on top of what perrin runs with."
       echo "-r demo.lock"
-      grep -vxFf "$new/demo" "$new/$extra"; } > "$new/$extra.lock"
+      grep -vxFf "$new/demo" "$new/$extra" > "$new/more"
+      hashed "$new/more"; } > "$new/$extra.lock"
     sort -u "$new/$extra" "$new/all" -o "$new/all"  # both extras go into one .venv
 done
 

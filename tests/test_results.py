@@ -160,3 +160,28 @@ class TestFromRotations:
     def test_what_is_no_rotation_is_refused(self, rotations, more, message):
         with pytest.raises(ValueError, match=message):
             perrin.RigidMotion.from_rotations(rotations, dt=1.0, **more)
+
+
+def test_progress_counts_the_clusters_of_every_long_step(tmp_path, monkeypatch):
+    """Steps begin at 0 of their total; 20 clusters are estimated in two parts, written singly."""
+    monkeypatch.setattr("perrin.report.write.save_figures", lambda report, place: [])
+    calls: dict[str, list[tuple[int, int]]] = {}
+
+    def progress(done, total, title):
+        calls.setdefault(title, []).append((done, total))
+
+    one = measured(frames=20).tracks
+    table = pd.concat(
+        [one.assign(cluster=k, particle=one["particle"] + 4 * k) for k in range(20)],
+        ignore_index=True,
+    )
+    report = perrin.analyze(table, dt=0.5, progress=progress)
+    perrin.write_run(report, tmp_path / "run", progress=progress)
+    assert list(calls) == [
+        "fitting clusters", "estimating D_R and D_T", "judging the motion", "writing the curves",
+        "drawing the figures", "writing the report",
+    ]  # fmt: skip
+    for title in ("fitting clusters", "estimating D_R and D_T"):
+        assert calls[title] == [(0, 20), (16, 20)]
+    for title in ("writing the curves", "writing the report"):
+        assert calls[title] == [(k, 20) for k in range(20)]

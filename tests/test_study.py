@@ -338,3 +338,32 @@ def test_the_commands_write_run_and_report(tmp_path, monkeypatch, quick):
     again = run(app, ["study", "report", "STUDY", "--json"])
     assert json.loads(again.output)["movies"] == 1
     assert run(app, ["study", "report", "a.csv"]).exit_code == 2
+    planned = run(
+        app,
+        ["study", "plan", "--half-width", "0.1", "--clusters", "10", "--spread-clusters", "0.2"],
+    )
+    assert "movies with 10 clusters" in planned.output
+
+
+def test_workers_of_a_scheduler_give_the_same_results(tmp_path, quick):
+    """Two workers measure five tables; the tables of both studies are equal to the last bit."""
+    distributed = pytest.importorskip("distributed")
+    names = [f"{number}.csv" for number in range(5)]
+    for number, name in enumerate(names):
+        write_table(tmp_path / name, seed=number, clusters=1, frames=3)
+    (tmp_path / "bad.csv").write_text("frame,particle\n1,1\n")
+    study = Study.from_toml(write_study(tmp_path, movies={0.1: [*names, "bad.csv"]}))
+    study.run(tmp_path / "here")
+    shown = []
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=False, protocol="tcp", dashboard_address=None
+    ) as cluster:
+        study.run(
+            tmp_path / "there",
+            scheduler=cluster.scheduler_address,
+            progress=lambda done, total, _: shown.append((done, total)),
+        )
+    first, second = ((tmp_path / p / "results.csv").read_bytes() for p in ("here", "there"))
+    assert first == second
+    assert shown[:7] == [(k, 6) for k in range(7)]
+    assert "6/6" in (tmp_path / "there" / "study.log").read_text()

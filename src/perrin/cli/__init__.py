@@ -48,7 +48,7 @@ from perrin.cli.options import (
     spheres_of,
 )
 from perrin.cli.progress import progress_lines, shown_progress
-from perrin.cli.study_commands import new_study, report_study, run_study
+from perrin.cli.study_commands import new_study, plan_of_study, report_study, run_study
 from perrin.cli.tables import (
     cluster_table,
     kinds_table,
@@ -90,6 +90,7 @@ __all__ = [
     "options_of",
     "paper",
     "plan",
+    "plan_of_study",
     "pooled_table",
     "predict",
     "progress_lines",

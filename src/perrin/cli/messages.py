@@ -6,7 +6,7 @@ import os
 import re
 import sys
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, TypeGuard, get_type_hints
+from typing import TYPE_CHECKING, get_type_hints
 
 import typer
 
@@ -68,17 +68,14 @@ def options_of(command: Callable[..., object]) -> dict[str, str]:
         for about in getattr(hint, "__metadata__", ()):
             if isinstance(about, OptionInfo):
                 # typer takes the first name of an option for its default.
-                stated = [d for d in (about.default, *(about.param_decls or ())) if _is_option(d)]
+                names = (about.default, *(about.param_decls or ()))
+                stated = [d for d in names if isinstance(d, str) and d.startswith("--")]
                 options[name] = max(stated, key=len, default=f"--{name.replace('_', '-')}")
     return options | {
         argument: option
         for argument, option in _RENAMED_ARGUMENTS.items()
         if option in options.values()
     }
-
-
-def _is_option(declaration: object) -> TypeGuard[str]:
-    return isinstance(declaration, str) and declaration.startswith("--")
 
 
 def in_options(text: str, options: Mapping[str, str]) -> str:

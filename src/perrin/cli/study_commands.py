@@ -1,4 +1,4 @@
-"""The commands of a study: new, run and report."""
+"""The commands of a study: new, run, report and plan."""
 
 from __future__ import annotations
 
@@ -115,6 +115,47 @@ def report_study(
         with locked(folder):
             write_results(result, command=shlex.join(["perrin", *sys.argv[1:]]))
         _show(result, as_json=as_json, quiet=quiet)
+
+
+@study_app.command(
+    "plan",
+    cls=GroupedCommand,
+    epilog="perrin study plan --half-width 0.1 --clusters 10 --spread-clusters 0.2",
+)
+def plan_of_study(
+    half_width: Annotated[
+        float, typer.Option(help="Wanted half width of the 95 % interval over the mean.")
+    ],
+    clusters: Annotated[int, typer.Option(help="Number of clusters in a movie.")],
+    spread_clusters: Annotated[
+        float, typer.Option(help="Standard deviation of ln D between clusters: 0.2 for 20 %.")
+    ],
+    spread_movies: Annotated[
+        float, typer.Option(help="Standard deviation of ln D between movies.")
+    ] = 0.0,
+    snr: Annotated[float, typer.Option(help="Signal-to-noise ratio of a step, D dt/s.")] = 20.0,
+    frames: Annotated[int | None, typer.Option(help="Largest number of frames.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Recommend the numbers of movies and frames for the mean of a condition."""
+    with messages_of(plan_of_study):
+        from perrin.study import plan_study
+
+        found = plan_study(
+            half_width,
+            n_clusters=clusters,
+            spread_clusters=spread_clusters,
+            spread_movies=spread_movies,
+            snr=snr,
+            most_frames=frames,
+        )
+        if as_json:
+            show_json(found.to_dict())
+            return
+        print(found)
+        print("movies, frames of each, half width:")
+        for movies, n_frames, width in found.choices:
+            print(f"{movies:6d} {n_frames:7d} {100 * width:7.2g} %")
 
 
 def _show(result: StudyResult, *, as_json: bool, quiet: bool) -> None:

@@ -1001,9 +1001,9 @@ def _ranked_if_short(
 ) -> BrownianTests:
     """Return the tests of one motion, ranked among draws where the laws of p do not hold."""
     n, y = model.n_steps, fit.y
-    snr = float(
-        np.mean(fit.D) * model.tau.mean() / max(np.mean(fit.offset + model.mean_known), 1e-300)
-    )
+    signal, noise = np.mean(fit.D) * model.tau.mean(), np.mean(fit.offset + model.mean_known)
+    # Without noise, in any unit of length, the ratio has no bound.
+    snr = float(signal / noise) if noise > 1e-30 * signal else (np.inf if signal > 0 else 0.0)
     ranked = n < _FEWEST_ASYMPTOTIC_STEPS or 0 < n * snr < _LEAST_INFORMATION
     if ranked:
         count = int(np.clip(_DRAWN_NUMBERS // y.size, _FEWEST_DRAWS, _MOST_DRAWS))

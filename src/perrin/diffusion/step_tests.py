@@ -712,7 +712,8 @@ def _steady_motions_at(
         freedom = 2 * np.divide(value, stderr, out=np.full(len(own), np.inf), where=stderr > 0) ** 2
         p = fdtrc(d, np.clip(freedom, 1.0, 1e9), square / d)
         inverse = np.linalg.inv(informations)
-        errors = np.sqrt(np.diagonal(inverse, axis1=1, axis2=2))
+        # A body at rest has variances of 0, within rounding.
+        errors = np.sqrt(np.maximum(np.diagonal(inverse, axis1=1, axis2=2), 0.0))
         parts = zip(rows, means.tolist(), errors.tolist(), p.tolist(), strict=True)
         found |= {k: SteadyMotion(tuple(m), tuple(error), chance) for k, m, error, chance in parts}
     return [found[k] for k in range(len(motions))]

@@ -421,6 +421,8 @@ def _variance(
     for m, one in zip(motions, tested, strict=True):
         axes, n = one.fit.D.shape[1], one.model.n_steps
         scale = np.median(one.u) / chdtri(axes, 0.5)
+        if not scale > 0:  # most steps are none at all
+            return verdict
         u = np.minimum(one.u, scale * chdtri(axes, 1 / n))
         statistics = tabulated_statistics(u * axes / u.mean(), axes)
         for name, p in shortened.items():

@@ -33,6 +33,7 @@ from perrin.images.formats.headers import (
     ome_scale,
     stk_scale,
     tiff_kind,
+    xml_root,
 )
 from perrin.images.formats.isolation import guarded, serve
 from perrin.images.formats.olympus import olympus, olympus_scale
@@ -185,7 +186,7 @@ from perrin.images.spheres.spots import (
     mass_cut,
     touching_together,
 )
-from perrin.images.stack import Stack, digest, file_contents, open_stack, write_stack
+from perrin.images.stack import Stack, digest, file_contents, file_states, open_stack, write_stack
 
 __all__ = [
     "Arrangement",
@@ -271,6 +272,7 @@ __all__ = [
     "drawing_faults",
     "even_times",
     "file_contents",
+    "file_states",
     "find_circles",
     "find_fading",
     "find_features",
@@ -378,4 +380,5 @@ __all__ = [
     "without_doubles",
     "write_imaging",
     "write_stack",
+    "xml_root",
 ]

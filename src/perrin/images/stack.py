@@ -407,6 +407,42 @@ def _read_alone(source: str, pick: Pick) -> Contents:
     return tiff(source, pick)
 
 
+def file_states(stack: Stack) -> list[tuple[str, int, int]]:
+    """Return name, length and time of the last change of all files of a stack.
+
+    Parameters
+    ----------
+    stack : Stack
+
+    Returns
+    -------
+    list of tuple
+        Empty for a stack in memory.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> file_states(open_stack(np.zeros((1, 2, 8, 8)), voxel=(1, 1, 1)))
+    []
+    """
+    states = []
+    for path in _files_of(stack):
+        about = path.stat()
+        states.append((str(path), about.st_size, about.st_mtime_ns))
+    return states
+
+
+def _files_of(stack: Stack) -> list[Path]:
+    """Return the files of a stack in the order of their names; none for a stack in memory."""
+    if stack.path is None:
+        return []
+    if stack.path.is_file():
+        return [stack.path]
+    folder = stack.path.is_dir()
+    inside = sorted(stack.path.rglob("*")) if folder else sequence_files(str(stack.path))
+    return list(filter(Path.is_file, map(Path, inside)))
+
+
 def digest(stack: Stack) -> str:
     """Return the SHA-256 of a stack: of its files with their names, or of its frames in memory.
 
@@ -446,8 +482,7 @@ def digest(stack: Stack) -> str:
         with open(stack.path, "rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
     folder = stack.path.is_dir()
-    inside = sorted(stack.path.rglob("*")) if folder else sequence_files(str(stack.path))
-    for part in filter(Path.is_file, map(Path, inside)):
+    for part in _files_of(stack):
         total.update(part.relative_to(stack.path).as_posix().encode() if folder else b"")
         with open(part, "rb") as file:
             total.update(hashlib.file_digest(file, "sha256").digest())

@@ -17,7 +17,7 @@ from perrin.errors import IdentityError, PartsError, TooFewFramesError
 from perrin.images.imaging import Imaging, View
 from perrin.images.spheres.localisation import Search, check_search, is_flat
 from perrin.images.spheres.spots import Spots
-from perrin.images.stack import digest
+from perrin.images.stack import digest, file_states
 from perrin.motion.error_ratio import ErrorRatio, error_ratio, with_error_ratio
 from perrin.motion.scanning import scan_share
 from perrin.movie.bodies import (
@@ -238,6 +238,7 @@ def analyze_stack(
 
     numbers, excluded = _selected_frames(len(stack), frames), sorted({int(c) for c in exclude})
     work.report(0, 0, "taking the file's SHA-256")
+    before = [file_states(one) for one in stacks]
     depends = [_dependencies(one, search, refine, optics, numbers) for one in stacks]
     with (
         claimed_folder(work.keep)
@@ -249,6 +250,11 @@ def analyze_stack(
             _located(one, search, refine, optics, numbers, own, folder / name, work)
             for one, own, name in zip(stacks, depends, _folders(len(stacks)), strict=True)
         ]
+        if [file_states(one) for one in stacks] != before:
+            raise OSError(
+                f"{stacks[0].source}: the file was written while it was read: run it again when it "
+                "is complete, into another folder"
+            )
         learned, findings = located[0].method.optics, checks.Findings()
         features = located[0].features
         offsets: list[ChannelOffset | None] = []

@@ -24,6 +24,7 @@ from perrin.plot.figure_style import (
 )
 from perrin.plot.motion import motion_figure
 from perrin.plot.results import (
+    CURVE_NAMES,
     NAMED_CLUSTERS,
     curve_floors,
     plot_curve_ratio,
@@ -47,8 +48,6 @@ if TYPE_CHECKING:
     from perrin.run.results import Pooled, Report
 
 Quantity: TypeAlias = Literal["rotation", "translation"]
-
-_SYMBOLS = {"rotation": "$D_R$", "translation": "$D_T$"}
 
 
 def curves(
@@ -98,7 +97,7 @@ def curves(
     estimate = result.D_R if rotation else result.D_T
     with _given_or_new(ax) as drawn:
         if estimate.absent_because is not None:
-            return write_reason(drawn, f"no {_SYMBOLS[quantity]}: {estimate.absent_because}")
+            return write_reason(drawn, f"no {CURVE_NAMES[quantity][1]}: {estimate.absent_because}")
         curve, tensor = (result.msad, result.tensor) if rotation else (result.msd, None)
         if ratio:
             return plot_curve_ratio(curve, ax=drawn, estimate=estimate, tensor=tensor)
@@ -195,7 +194,9 @@ def steps(
     found = step_distribution(result, quantity)
     with _given_or_new(ax) as drawn:
         if found is None:
-            return write_reason(drawn, f"no {_SYMBOLS[quantity]}, or no step of the usual duration")
+            return write_reason(
+                drawn, f"no {CURVE_NAMES[quantity][1]}, or no step of the usual duration"
+            )
         width, total = np.diff(found.edges), found.number.sum()
         middle, full = (found.edges[1:] + found.edges[:-1]) / 2, found.number > 0
         density = found.number / (total * width)

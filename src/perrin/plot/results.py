@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 
 # Symbols of a curve and of its coefficient.
-_CURVE_NAMES = {"rotation": ("MSAD", "$D_R$"), "translation": ("MSD", "$D_T$")}
+CURVE_NAMES = {"rotation": ("MSAD", "$D_R$"), "translation": ("MSD", "$D_T$")}
 
 # Names of methods in the legend.
 _METHODS = {"mle": "ML fit", "line": "line"}
@@ -95,7 +95,7 @@ def plot_lag_curve(
         name = f"noise floor {number_text(floor)} {unit}"
         ax.axhline(floor, color=series_color(1), lw=line_width(0.75), ls="--", label=name)
     ax.set(xscale="log", yscale="log", xlabel="lag time (s)")
-    ax.set_ylabel(f"{_CURVE_NAMES[curve.quantity][0]} ({unit})")
+    ax.set_ylabel(f"{CURVE_NAMES[curve.quantity][0]} ({unit})")
     _set_curve_range(ax, curve, line, floor)
     legend_above(ax, ncols=2)
     return ax
@@ -133,7 +133,7 @@ def plot_curve_ratio(
     error = (curve.stderr / pure)[kept]
     sure = t <= 0.25 * curve.lagtime[-1]
     points: dict[str, Any] = {"color": ink(), "ms": marker_size(0.65), "mew": 0}
-    name = _CURVE_NAMES[curve.quantity][0]
+    name = CURVE_NAMES[curve.quantity][0]
     ax.plot(t[sure], value[sure], ".", label=name, **points)
     ax.plot(t[~sure], value[~sure], ".", alpha=0.3, label="beyond ¼ of the track", **points)
     label = "± 1 standard error"
@@ -246,7 +246,11 @@ def plot_residual(motion: RigidMotion, *, ax: Axes) -> Axes:
         label = f"no pose ({absent.size} of {len(motion.time)} frames)"
         bottom = ax.get_xaxis_transform()
         ax.plot(
-            motion.time[absent], np.zeros(absent.size), **_cross(), transform=bottom, label=label
+            motion.time[absent],
+            np.zeros(absent.size),
+            **_no_pose_style(),
+            transform=bottom,
+            label=label,
         )
     ax.set(xlabel="time (s)", ylabel=f"residual ({unit})")
     top = scale * float(np.max(motion.residual[rows]))
@@ -279,7 +283,7 @@ def plot_presence(motion: RigidMotion, *, ax: Axes) -> Axes:
     drawn[0].set_rasterized(len(motion.time) > _VECTOR_FRAMES)
     absent = _without_pose(motion)
     if absent.size:
-        ax.plot(motion.time[absent], motion.n_present[absent], **_cross())
+        ax.plot(motion.time[absent], motion.n_present[absent], **_no_pose_style())
     ax.set(xlabel="time (s)", ylabel=f"present (of {n})", ylim=(-0.3, n + 0.5))
     ax.set_yticks(np.arange(0, n + 1, max(1, n // 4)))
     return ax
@@ -399,7 +403,7 @@ def plot_forest(
     estimates = [e for e, _ in both if e.absent_because is None]
     clusters = [c for e, c in both if e.absent_because is None]
     if not estimates:
-        return write_reason(ax, f"no {_CURVE_NAMES[quantity][1]}: {both[0][0].absent_because}")
+        return write_reason(ax, f"no {CURVE_NAMES[quantity][1]}: {both[0][0].absent_because}")
     many = len(clusters) > NAMED_CLUSTERS
     rows = np.argsort([e.value for e in estimates]) if many else np.arange(len(estimates))
     ordered = [estimates[i] for i in rows]
@@ -419,7 +423,7 @@ def plot_forest(
             label=f"pooled, {value_text(pooled)}",
         )
         ax.legend(loc="lower center", bbox_to_anchor=(0.5, 1), frameon=False, fontsize="small")
-    ax.set(xlabel=f"{_CURVE_NAMES[quantity][1]} ({unit_text(estimates[0].unit)})")
+    ax.set(xlabel=f"{CURVE_NAMES[quantity][1]} ({unit_text(estimates[0].unit)})")
     ax.xaxis.set_major_locator(MaxNLocator(4))  # small values have long labels
     ax.set_ylim(len(rows) - 0.4, -0.6)
     if many:
@@ -590,7 +594,7 @@ def model_line(
         return ModelLine(D, offset, stderr, True, symbol, text)
     if estimate is None:
         return None
-    symbol = _CURVE_NAMES[curve.quantity][1]
+    symbol = CURVE_NAMES[curve.quantity][1]
     method = _METHODS.get(estimate.method.partition(",")[0], estimate.method)
     text = f"{method} {symbol} {'= ' if estimate.resolved else ''}{value_text(estimate)}"
     return ModelLine(estimate.value, estimate.offset, 0.0, estimate.resolved, symbol, text)
@@ -626,7 +630,7 @@ def _shown_lags(curve: LagCurve) -> Ints:
     return np.unique(np.rint(np.interp(even, curve.lagtime, kept)).astype(np.int64))
 
 
-def _cross() -> dict[str, Any]:
+def _no_pose_style() -> dict[str, Any]:
     """Return the style of the crosses that mark frames without a pose."""
     size = {"ms": marker_size(0.65), "mew": line_width(0.55)}
     return {"marker": "x", "ls": "none", "color": ink(), "clip_on": False, "zorder": 4} | size
@@ -642,7 +646,7 @@ def _draw_curve_points(curve: LagCurve, *, ax: Axes, label: str | None) -> None:
     sure = t <= 0.25 * curve.lagtime[-1]
     rest = t >= t[sure].max(initial=0.0)
     points: dict[str, Any] = {"color": ink(), "ms": marker_size(0.65), "mew": 0}
-    name = label or _CURVE_NAMES[curve.quantity][0]
+    name = label or CURVE_NAMES[curve.quantity][0]
     ax.plot(t[sure], value[sure], ".", label=name, **points)
     if not sure.all():
         name = "beyond ¼ of the track"

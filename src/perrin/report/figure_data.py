@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from perrin.run.results import ClusterResult, RodResult
 
 _LAGS = 80  # lag times of a curve, evenly over its logarithm
-_FEWEST_DRAWN_FRAMES, _MOST_FRAMES = 100, 2000  # frames of a path that are drawn
+_FEWEST_DRAWN_FRAMES, _MOST_DRAWN_FRAMES = 100, 2000  # frames of a path that are drawn
 _MOST_BYTES = 4_000_000  # of the paths of all clusters together, before compression
 
 
@@ -63,7 +63,9 @@ def cluster_data(
     template = np.outer(motion.places, [1.0, 0.0, 0.0]) if rod else motion.template
     places = _measured_places(rows, count=len(motion.time), template=template)
     width = 8 + (0 if places is None else places.shape[1] * places.shape[2])
-    allowed = int(np.clip(_MOST_BYTES / clusters / (2 * width), _FEWEST_DRAWN_FRAMES, _MOST_FRAMES))
+    allowed = int(
+        np.clip(_MOST_BYTES / clusters / (2 * width), _FEWEST_DRAWN_FRAMES, _MOST_DRAWN_FRAMES)
+    )
     stride = -(-len(motion.time) // allowed)
     shown = np.arange(0, len(motion.time), stride)
     header: dict[str, Any] = {

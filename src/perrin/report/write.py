@@ -104,11 +104,11 @@ def complete_run(
 
 def _write_files(report: Report, stage: Path, progress: Progress | None) -> None:
     """Write data, figures and pages into an empty folder."""
-    if progress is not None:
-        progress(0, 0, "writing tables and figures")
-    write_data(report, stage)
+    write_data(report, stage, progress=progress)
     place = stage / "figures"
     place.mkdir()
+    if progress is not None:
+        progress(0, 0, "drawing the figures")
     html = render_html(report, save_figures(report, place), progress=progress)
     (stage / "report.html").write_text(html, encoding="utf-8")
     if report.imaging is not None:

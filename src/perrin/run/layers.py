@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -113,7 +114,7 @@ def table_layers(table: pd.DataFrame) -> list[Layer]:
         "features": features,
         "face_color": ids[0],
         "size": _drawn_diameter(frame, x),
-        "out_of_slice_display": True,
+        **_seen_beside_its_plane(),
     }
     paths = np.column_stack([number, points])[order]
     ordered = {
@@ -150,6 +151,17 @@ def napari_reader(path: str | list[str]) -> Callable[[str | list[str]], list[Lay
     if not is_run and not one.lower().endswith((*READABLE_SUFFIXES, ".gz")):
         return None
     return lambda _: napari_layers(load_run(one)) if is_run else table_layers(read_tracks(one))
+
+
+def _seen_beside_its_plane() -> dict[str, Any]:
+    """Return the option by which a sphere is drawn in the planes that it reaches."""
+    try:
+        parts = version("napari").split(".")
+    except PackageNotFoundError:
+        parts = []
+    if parts and (int(parts[0]), int(parts[1])) < (0, 9):
+        return {"out_of_slice_display": True}
+    return {"projection_mode": "rescale_spherical"}
 
 
 def _drawn_diameter(frame: Ints, x: Floats) -> float:

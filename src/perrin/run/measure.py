@@ -112,7 +112,7 @@ _VERDICT_LEVEL = 0.005
 
 # Clusters that are fitted and measured at a time: a tenth of them, so that progress is seen, not
 # fewer than are efficient, nor more than bound the memory.
-_FEWEST_TOGETHER, _MOST_TOGETHER = 16, 256
+_FEWEST_MEASURED, _MOST_MEASURED = 16, 256
 
 # The symmetry of a straight chain is that of places equal within this share of its length.
 _SAME_PLACE = 0.03
@@ -314,9 +314,9 @@ def measure_table(
     remarks += words.common_motion_remarks(
         common_motion([(m.translation.motion, m.body.tracks.frames) for m in measured])
     )
-    if progress is not None:
-        progress(0, 0, "judging the motion")
-    measured, kinds, unpooled = measure_kinds(measured, rods, experiment, first_frame=first)
+    measured, kinds, unpooled = measure_kinds(
+        measured, rods, experiment, first_frame=first, progress=progress
+    )
     pooled = [kind.pooled for kind in kinds if kind.pooled is not None]
     loose = None
     if singles is not None:
@@ -687,7 +687,7 @@ def measure_rod(tracks: ClusterTracks, experiment: Experiment, recording: Record
 
 
 def _clusters_at_a_time(count: int) -> int:
-    return int(np.clip(-(-count // 10), _FEWEST_TOGETHER, _MOST_TOGETHER))
+    return int(np.clip(-(-count // 10), _FEWEST_MEASURED, _MOST_MEASURED))
 
 
 def measure_bodies(
@@ -1040,6 +1040,7 @@ def measure_kinds(
     experiment: Experiment,
     *,
     first_frame: int,
+    progress: Progress | None = None,
 ) -> tuple[list[MeasuredBody], list[BodyKind], list[str]]:
     """Judge and pool the bodies of each number of particles and shape; those of others never.
 
@@ -1050,6 +1051,8 @@ def measure_kinds(
     experiment : Experiment
     first_frame : int
         The table's own number of its first frame.
+    progress : callable, optional
+        As in `measure_table`.
 
     Returns
     -------
@@ -1070,7 +1073,7 @@ def measure_kinds(
     for number in np.unique(shapes).tolist():
         members = [one for one, shape in zip(measured, shapes, strict=True) if shape == number]
         part, together = judge_bodies(
-            members, experiment, first_frame=first_frame, tested=len(measured)
+            members, experiment, first_frame=first_frame, tested=len(measured), progress=progress
         )
         pooled, texts = pool_clusters(part, experiment, together)
         judged += part
@@ -1101,7 +1104,12 @@ def measure_kinds(
 
 
 def judge_bodies(
-    measured: Sequence[MeasuredBody], experiment: Experiment, *, first_frame: int, tested: int
+    measured: Sequence[MeasuredBody],
+    experiment: Experiment,
+    *,
+    first_frame: int,
+    tested: int,
+    progress: Progress | None = None,
 ) -> tuple[list[MeasuredBody], dict[str, MotionVerdict | None]]:
     """Judge what kind of motion every body shows, and all rigid ones together.
 
@@ -1113,6 +1121,8 @@ def judge_bodies(
         The table's own number of its first frame.
     tested : int
         Number of clusters that share the level of a warning.
+    progress : callable, optional
+        As in `measure_table`.
 
     Returns
     -------
@@ -1127,6 +1137,8 @@ def judge_bodies(
         ("rotation", [one.rotation for one in measured]),
         ("translation", [one.translation for one in measured]),
     ):
+        if progress is not None:
+            progress(len(judged), 2, "judging the motion")
         shown = [i for i, c in enumerate(coefficients) if c.estimate.absent_because is None]
         each, common = judge_each_and_all(
             [coefficients[i].whole for i in shown],

@@ -28,6 +28,11 @@ CONSTANT_Z = "z never changes: leave the column out to analyse motion in the pla
 ROD_TESTS = "jumps and a steady motion of a rod are not tested for"
 ROD_DRIFT = "drift=True is not applied to rods: D_T and D_perp contain a mean motion"
 
+UNMOVED = (
+    "the body does not move at all, its frames are equal: one frame was copied, or its particles "
+    "are fixed"
+)
+
 TOO_FAST = (
     "identity: the body turns too far between frames for its symmetry; cutting the longest steps "
     "makes D_R too low: sample faster"
@@ -874,7 +879,10 @@ def limit_warnings(D_R: DiffusionEstimate, D_T: DiffusionEstimate) -> list[str]:
         for text in estimate.warnings:
             if estimate.resolved or not text.startswith("signal-to-noise"):
                 named.setdefault(text, []).append(name)
-    return [f"{' and '.join(names)}: {text}" for text, names in named.items()]
+    texts = [f"{' and '.join(names)}: {text}" for text, names in named.items()]
+    if D_R.value == D_R.stderr == D_T.value == D_T.stderr == 0:
+        texts.insert(0, UNMOVED)
+    return texts
 
 
 def noise_floor_warning(measured: float, stderr: float, *, predicted: float, gain: float) -> str:

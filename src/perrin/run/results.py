@@ -39,11 +39,14 @@ from perrin.tracks.writing import write_json
 
 if TYPE_CHECKING:
     import os
-    from collections.abc import Mapping
+    from collections.abc import Callable, Mapping
+    from typing import TypeAlias
 
     import pandas as pd
 
     from perrin.diffusion.verdict import MotionVerdict
+
+    Progress: TypeAlias = Callable[[int, int, str], None]
 
 
 # Coefficients of a kind of bodies.
@@ -722,7 +725,7 @@ def load_run(folder: str | os.PathLike[str]) -> Report:
         )
 
 
-def write_data(report: Report, folder: Path) -> None:
+def write_data(report: Report, folder: Path, *, progress: Progress | None = None) -> None:
     """Write numbers, tables and settings of a report to a folder, with checksums."""
     write_json(folder / "summary.json", report.to_dict())
     write_json(folder / "run.json", report.settings)
@@ -730,7 +733,7 @@ def write_data(report: Report, folder: Path) -> None:
     (folder / "run.toml").write_text(config_text(report.settings, dt=dt), encoding="utf-8")
     report.tracks.to_parquet(folder / "tracks.parquet", index=False)
     motion_table(report).to_parquet(folder / "motion.parquet", index=False)
-    curve_table(report).to_csv(folder / "curves.csv", index=False)
+    curve_table(report, progress=progress).to_csv(folder / "curves.csv", index=False)
     guarded_table(report.to_frame()).to_csv(folder / "results.csv", index=False)
     if report.imaging is not None:
         write_imaging(report.imaging, folder)
@@ -758,12 +761,14 @@ def motion_table(report: Report) -> pd.DataFrame:
     return table
 
 
-def curve_table(report: Report) -> pd.DataFrame:
+def curve_table(report: Report, *, progress: Progress | None = None) -> pd.DataFrame:
     """Return the MSD and MSAD of all clusters, a row per cluster, quantity and lag."""
     import pandas as pd
 
     parts = []
-    for result in report.clusters:
+    for done, result in enumerate(report.clusters):
+        if progress is not None:
+            progress(done, len(report.clusters), "writing the curves")
         for name, curve in (("msad", result.msad), ("msd", result.msd)):
             part = curve.to_frame()
             part.insert(0, "cluster", result.cluster)

@@ -26,6 +26,13 @@ if TYPE_CHECKING:
     from perrin.run.experiment import MotionModel
 
 
+def _is_at_rest(motion: RigidMotion) -> bool:
+    """Return whether a body does not move at all, within rounding: there is nothing to judge."""
+    center = motion.center[motion.fitted]
+    size = float(np.abs(center).max(initial=0.0) + np.abs(motion.template).max())
+    return bool(np.ptp(center, axis=0).max(initial=0.0) <= 1e-13 * size)
+
+
 def judge_each_and_all(
     motions: Sequence[RigidMotion],
     *,
@@ -68,6 +75,8 @@ def judge_each_and_all(
     settings = replace(noise, drift=False)
 
     def judged(some: RigidMotion | list[RigidMotion]) -> MotionVerdict | None:
+        if any(map(_is_at_rest, some if isinstance(some, list) else [some])):
+            return None
         with python_warnings.catch_warnings():
             python_warnings.simplefilter("ignore", PrecisionWarning)
             try:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from perrin._text import unit_text
-from perrin.plot.figure_style import GREY, PALETTE, column_figure, save_figure, style
+from perrin.plot.figure_style import GREY, column_figure, save_figure, series_color, style
 from perrin.study.conditions import QUANTITIES, UNITS, condition_text
 from perrin.study.trends import law_values
 
@@ -51,7 +51,7 @@ def save_study_figures(result: StudyResult, folder: Path) -> list[Path]:
             np.ravel(figure.subplots(*shape, squeeze=False)), result.trends.items(), strict=False
         ):
             ax.axhline(0, color=GREY, lw=0.8)
-            ax.plot(trend.x, trend.residuals, "o", color=PALETTE[0], ms=4)
+            ax.plot(trend.x, trend.residuals, "o", color=series_color(0), ms=4)
             ax.set_title(name, fontsize="small")
             ax.set(xlabel="condition", ylabel="residual (standard deviations)")
             if trend.law == "power" and np.all(trend.x > 0):
@@ -87,7 +87,7 @@ def plot_conditions(result: StudyResult, quantity: str, *, ax: Axes) -> Axes:
         )
 
     for k, (body, of_body) in enumerate(result.by_body().items()):
-        color = PALETTE[k % len(PALETTE)]
+        color = series_color(k)
         singles = [
             v
             for v in result.values

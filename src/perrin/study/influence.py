@@ -22,8 +22,10 @@ if TYPE_CHECKING:
     from perrin.study.profiles import Interval
     from perrin.study.random_effects import PopulationMean
 
-# Members whose deviation is computed with the spreads of the others: those that deviate most.
-_CANDIDATES = 5
+# Members whose deviation is computed with the spreads of the others: those that deviate most, by
+# more than this many standard deviations with the spreads of all. An outlier raises these spreads,
+# but among three members it still deviates by 1.1.
+_CANDIDATES, _SUSPECT = 3, 1.1
 
 _OUTLYING = 0.05  # probability that any member of a population without outliers is called outlying
 
@@ -112,7 +114,7 @@ def leave_one_out(
 
     Notes
     -----
-    Means without one member are weighted means of ln D with the spreads of all; for the five
+    Means without one member are weighted means of ln D with the spreads of all; for the three
     members that deviate most the spreads are estimated without them, as an outlier raises the
     spread that would hide it. Probabilities are those of Student's t, corrected for the
     number of members (Holm, Scand. J. Stat. 6, 65, 1979).
@@ -143,7 +145,8 @@ def leave_one_out(
     spread = np.sqrt(variance + 1 / (load - weight))
     deviation = (centre - others) / spread
     dof = np.full(len(groups), float(max(unit - 2, 1)))
-    for k in np.argsort(-np.abs(deviation))[:_CANDIDATES]:
+    far = np.argsort(-np.abs(deviation))[:_CANDIDATES]
+    for k in far[np.abs(deviation[far]) > _suspicious(len(groups))]:
         rest = [i for j, group in enumerate(groups) if j != k for i in group]
         without = population_mean([members[i] for i in rest], movies=[names[i] for i in rest])
         own = _own_variance([members[i] for i in groups[k]], without, by_movie=kind == "movie")
@@ -163,6 +166,13 @@ def leave_one_out(
         )
         for k in range(len(groups))
     ]
+
+
+def _suspicious(count: int) -> float:
+    """Return the deviation that half of the populations of that size have somewhere, at least."""
+    from scipy.special import ndtri
+
+    return max(_SUSPECT, float(-ndtri((1 - 0.5 ** (1 / count)) / 2)) - 0.5)
 
 
 def _moments(

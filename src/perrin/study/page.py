@@ -102,7 +102,7 @@ def study_methods(result: StudyResult) -> str:
         return ""
     clusters = sum(one.mean.n_clusters for one in result.means if one.quantity == "D_R")
     movies = len({v.movie.unit for v in result.values})
-    averaged = " or ".join(result.manifest.average)
+    averaged = ", ".join(result.manifest.average)
     text = (
         f"Diffusion coefficients of {clusters} clusters in {movies} movies were measured with "
         f"perrin {__version__} (Hunter et al. 2011), each with its profile likelihood. Means over "
@@ -112,8 +112,8 @@ def study_methods(result: StudyResult) -> str:
         "Intervals of the means are those of the likelihood ratio, scaled by the dispersion of "
         "the movies, with Student's t of one degree of freedom less than the movies (Hartung and "
         "Knapp 2001); where a condition has one movie they hold for this movie. Clusters whose "
-        f"motion is not {averaged}, clusters that are not rigid, and excluded ones are listed but "
-        "not averaged."
+        f"motion has another verdict than {averaged}, clusters that are not rigid, and excluded "
+        "ones are listed but not averaged."
     )
     values = [
         f"{one.quantity} = {_mean_text(one)} {UNITS[one.quantity]} ({one.body}, {one.label})"

@@ -13,7 +13,8 @@ import numpy as np
 from perrin.movie.stacks import analyze_stack
 from perrin.movie.workers import Work, dask_client
 from perrin.report.write import complete_run, write_run
-from perrin.run.results import RodResult
+from perrin.run.folders import filled_folder
+from perrin.run.results import RodResult, write_data
 from perrin.run.tables import analyze
 from perrin.study.ledger import (
     RUNS,
@@ -272,7 +273,11 @@ def _measured(task: Task) -> Report:
             **rest,
             work=Work(keep=place, anew=True, scheduler=task.scheduler),
         )
-        complete_run(report, place)
+        if task.reports:
+            complete_run(report, place)
+        else:
+            with filled_folder(place) as stage:
+                write_data(report, stage)
     return report
 
 

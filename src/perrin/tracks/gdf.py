@@ -120,7 +120,7 @@ def parse_ascii_gdf(data: bytes, source: str) -> Floats:
         values = np.array(found, dtype=np.float64)
     except ValueError:
         # A number that is too long for its place is a row of asterisks.
-        wrong = next(i for i, word in enumerate(found) if not _is_number(word))
+        wrong = next(i for i, word in enumerate(found) if not _reads_as_number(word))
         text = found[wrong].decode("ascii", "replace")
         raise table_error(
             source,
@@ -130,7 +130,7 @@ def parse_ascii_gdf(data: bytes, source: str) -> Floats:
     return values.reshape((n_rows, n_columns))
 
 
-def _is_number(word: bytes) -> bool:
+def _reads_as_number(word: bytes) -> bool:
     try:
         float(word)
     except ValueError:

@@ -33,6 +33,7 @@ from perrin.images.formats.headers import (
     ome_scale,
     stk_scale,
     tiff_kind,
+    xml_root,
 )
 from perrin.images.formats.isolation import guarded, serve
 from perrin.images.formats.olympus import olympus, olympus_scale
@@ -128,4 +129,5 @@ __all__ = [
     "tiff",
     "tiff_kind",
     "vendor",
+    "xml_root",
 ]

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perrin.images.formats.contents import Contents, Pick, chosen, even_times, needed
+from perrin.tracks.file_limits import refuse_oversize
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,11 +124,17 @@ def numpy_file(path: str, pick: Pick) -> Contents:
         if file.read(6) != b"\x93NUMPY" and not zipfile.is_zipfile(path):
             raise ValueError("has no array of numbers: write it again with np.save or np.savez")
     if path.lower().endswith(".npz"):
-        with np.load(path) as arrays:
+        with zipfile.ZipFile(path) as archive:
+            for entry in archive.infolist():
+                what = f"the array {entry.filename!r}"
+                refuse_oversize(path, (entry.file_size,), 1, what=what)
+        with np.load(path, allow_pickle=False) as arrays:
             number = chosen(list(arrays.files), pick.image)
             return array_contents(arrays[arrays.files[number]], pick._replace(image=None))[0]
     chosen(["array"], pick.image)
-    return array_contents(np.load(path, mmap_mode="r"), pick._replace(image=None))[0]
+    return array_contents(
+        np.load(path, mmap_mode="r", allow_pickle=False), pick._replace(image=None)
+    )[0]
 
 
 def hdf5(path: str, pick: Pick) -> Contents:
@@ -159,6 +166,8 @@ def hdf5(path: str, pick: Pick) -> Contents:
         if not names:
             raise ValueError("has no array (t, z, y, x) or (z, y, x)")
         array = file[names[chosen(names, pick.image)]]
+        if getattr(array, "external", None) or getattr(array, "is_virtual", False):
+            raise ValueError("has its array in other files: copy it into one, as with h5repack")
         contents, _ = array_contents(array, pick._replace(image=None))
     except Exception:
         file.close()

@@ -125,6 +125,33 @@ def image_header(page: Any) -> dict[str, Any]:  # noqa: ANN401
     return tag.value if tag is not None and isinstance(tag.value, dict) else {}
 
 
+def xml_root(text: str | bytes) -> Element:
+    """Return the root of a header in XML; one that defines entities of its own is refused.
+
+    Raises
+    ------
+    ValueError
+        If this is no XML, or has a document type.
+
+    Examples
+    --------
+    >>> xml_root("<OME><Image/></OME>").tag
+    'OME'
+    >>> xml_root('<!DOCTYPE a [<!ENTITY b "c">]><a>&b;</a>')
+    Traceback (most recent call last):
+        ...
+    ValueError: has a header with a document type (DOCTYPE), which no microscope writes
+    """
+    from xml.etree import ElementTree
+
+    if ("<!doctype" if isinstance(text, str) else b"<!doctype") in text.lower():
+        raise ValueError("has a header with a document type (DOCTYPE), which no microscope writes")
+    try:
+        return ElementTree.fromstring(text)
+    except ElementTree.ParseError as fault:
+        raise ValueError(f"has a damaged header: {fault}") from None
+
+
 def ome_images(xml: str) -> list[Element]:
     """Return the Image elements of an OME header.
 
@@ -138,9 +165,7 @@ def ome_images(xml: str) -> list[Element]:
     >>> [image.get("Name") for image in ome_images('<OME xmlns="a"><Image Name="b"/></OME>')]
     ['b']
     """
-    from xml.etree import ElementTree
-
-    root = ElementTree.fromstring(xml)
+    root = xml_root(xml)
     images = [e for e in root if e.tag.split("}")[-1] == "Image"]
     elsewhere = [e for e in root if e.tag.split("}")[-1] == "BinaryOnly"]
     if elsewhere and not images:

@@ -131,8 +131,10 @@ def opened(path: str) -> Any:  # noqa: ANN401
         return file
     file.close()
     named = re.search(r'MetadataFile="([^"]+)"', header)
-    companion = Path(path).parent / (named[1] if named else "")
-    if not companion.is_file():
+    name = named[1] if named else ""
+    companion = Path(path).parent / name
+    # A name with a path would be of another folder.
+    if name != Path(name).name or not companion.is_file():
         ome_images(header)
     return tifffile.TiffFile(path, omexml=companion.read_text(encoding="utf-8"))
 

@@ -176,6 +176,7 @@ def ims(path: str, pick: Pick) -> Contents:
     """Describe an Imaris .ims file: HDF5, finest resolution, padded blocks cut to the image."""
     file = needed("h5py", "ims").File(path, "r", rdcc_nbytes=_IMARIS_CACHE)
     try:
+        _refuse_links(file)
         finest = file["DataSet"]["ResolutionLevel 0"]
         about = file["DataSetInfo"]
         image = {key: _imaris_text(value) for key, value in about["Image"].attrs.items()}
@@ -211,6 +212,18 @@ def ims(path: str, pick: Pick) -> Contents:
         voxel=voxel,
         times=times,
     )
+
+
+def _refuse_links(file: Any) -> None:  # noqa: ANN401 (h5py.File)
+    """Refuse an Imaris file whose images are in other files."""
+    group = file
+    for name in ("DataSet", "ResolutionLevel 0", "TimePoint 0", "Channel 0", "Data"):
+        link = type(group.get(name, getlink=True)).__name__ if hasattr(group, "get") else ""
+        if link == "ExternalLink":
+            raise ValueError(f"has its {name!r} in another file: save it as one file")
+        group = group[name]
+    if getattr(group, "external", None) or getattr(group, "is_virtual", False):
+        raise ValueError("has its images in other files: save it as one file")
 
 
 def imaris_size(image: dict[str, str], channel: Any) -> dict[str, int]:  # noqa: ANN401

@@ -19,6 +19,7 @@ from perrin.images.formats.contents import (
     layout,
     needed,
 )
+from perrin.images.formats.headers import xml_root
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -32,8 +33,6 @@ _LZW, _ZSTD, _ZSTD_WITH_HEADER = 2, 5, 6
 
 def czi(path: str, pick: Pick) -> Contents:
     """Describe a scene of a Zeiss .czi file (czifile); a scene is an image of `pick`."""
-    from xml.etree import ElementTree
-
     file = needed("czifile", "czi").CziFile(path)
     try:
         # Smaller copies of the image are stored beside it.
@@ -62,7 +61,7 @@ def czi(path: str, pick: Pick) -> Contents:
         first = next(b for t in range(where.t) for b in blocks_of(t, 0))
         dtype = np.dtype(first.dtype)
         _decoder(first.compression)
-        header = ElementTree.fromstring(file.metadata())
+        header = xml_root(file.metadata())
         lengths = [header.findtext(f".//Scaling/Items/Distance[@Id='{a}']/Value") for a in "ZYX"]
         started = [_clock_time(blocks_of(t, 0)) for t in range(where.t)]
         times = czi_times(header, _stamps(file), started)
