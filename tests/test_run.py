@@ -31,11 +31,11 @@ from perrin.images.spheres.localisation import Method
 from perrin.images.spheres.spots import Spots
 from perrin.movie import stages, workers
 from perrin.movie.parts import PartWriter, open_parts, read_parts
-from perrin.movie.workers import Work, work_through
 from perrin.plot.imaging import stack_frames
 from perrin.run.experiment import Experiment
 from perrin.run.folders import check_resumable, filled_folder
 from perrin.run.results import motion_table
+from perrin.run.workers import Work, work_through
 
 pytest.importorskip("tifffile")
 pytest.importorskip("trackpy")

@@ -135,7 +135,7 @@ if TYPE_CHECKING:
         track_direction,
         track_rotation,
     )
-    from perrin.movie import Work, analyze_stack
+    from perrin.movie import analyze_stack
     from perrin.report import write_run
     from perrin.run import (
         BodyKind,
@@ -146,6 +146,7 @@ if TYPE_CHECKING:
         Report,
         RodResult,
         SingleSpheres,
+        Work,
         analyze,
         load_run,
         napari_layers,
@@ -471,14 +472,12 @@ _FACES = {
         "Report",
         "RodResult",
         "SingleSpheres",
+        "Work",
         "analyze",
         "load_run",
         "napari_layers",
     ),
-    "movie": (
-        "Work",
-        "analyze_stack",
-    ),
+    "movie": ("analyze_stack",),
     "plot": (),
     "report": ("write_run",),
     "paper": (),

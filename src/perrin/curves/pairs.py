@@ -133,15 +133,19 @@ def pair_sums(kernel: Kernel, frames: Frames, *, most: int | None = None) -> Pai
     longest = longest if most is None else min(longest, most)
     sums = None
     count, grid = np.zeros(longest, np.int64), np.arange(1.0, longest + 1) * frames.step
-    lagtime = grid.copy()
+    lagtime = grid if frames.exact else grid.copy()
     for elements in [] if complete else frames.blocks:
         slot = frames.slot[elements]
         lags = min(int(slot[-1]), longest)
         if lags < 1:
             continue
         added, number = kernel.within(frames.row[elements], slot, lags)
-        sums = np.zeros((longest, added.shape[1])) if sums is None else sums
-        sums[:lags] += added
+        if sums is None and lags == longest:
+            sums = added
+        else:
+            sums = np.zeros((longest, added.shape[1])) if sums is None else sums
+            sums[:lags] += added
+        del added
         if not frames.exact:
             total = count[:lags] + number
             excess = number * _mean_excess(frames.time[elements], slot, frames.step, lags)
@@ -335,13 +339,9 @@ class Squares:
         walks = _on_grid(self.walks, rows, slots)
         here = np.ascontiguousarray(present(walks).T)
         mask = None if here.all() else here.astype(np.float64)
-        lag = np.arange(1.0, count + 1)
         size = fft_size(len(walks) + count)
-        if mask is None:
-            pairs = len(here) * (len(walks) - lag)
-        else:
+        if mask is not None:
             m = np.fft.rfft(mask, size)
-            pairs = np.rint(np.fft.irfft((m.real**2 + m.imag**2).sum(0), size)[1 : count + 1])
         sums, last = np.empty((walks.shape[2], count)), slice(-2, -2 - count, -1)
         for total, axis in zip(sums, range(walks.shape[2]), strict=True):
             x = _centred(walks[..., axis].T, mask)
@@ -353,29 +353,39 @@ class Squares:
                 w = np.fft.rfft(velocity * here, size)
                 along = np.fft.irfft(2j * (np.conj(w) * f).imag.sum(0), size)[1 : count + 1]
                 squared = np.fft.irfft((w.real**2 + w.imag**2).sum(0), size)[1 : count + 1]
-            # In place: memory that is asked for anew costs as much time as the transforms.
+            # In place, and without what is not needed any more: memory that is asked for anew costs
+            # as much time as the transforms.
             np.multiply(x, x, out=x)
             power = f.real**2
             power += f.imag**2
+            del f
             if mask is None:
                 square = x.sum(0) if len(x) > 1 else x[0]
                 up_to = np.cumsum(square)
                 np.copyto(total, up_to[last])
                 total += np.cumsum(square[::-1], out=up_to)[last]
                 power *= -1.0
+                del square, up_to
             else:
                 g = np.fft.rfft(x, size)
                 np.subtract(m.real * g.real + m.imag * g.imag, power, out=power)
                 total[:] = 0.0
-            spectrum = power.sum(0) if len(x) > 1 else power[0]
-            correlation = np.fft.irfft(spectrum, size)[1 : count + 1]
+            del x
+            correlation = np.fft.irfft(power.sum(0) if len(power) > 1 else power[0], size)
             correlation *= 2.0
-            total += correlation
+            total += correlation[1 : count + 1]
+            del correlation, power
             if velocity.any():
+                lag = np.arange(1.0, count + 1)
                 total += 2 * lag * along + lag**2 * squared
+        if mask is None:
+            pairs = here.shape[0] * (len(walks) - np.arange(1, count + 1))
+        else:
+            present_pairs = np.fft.irfft((m.real**2 + m.imag**2).sum(0), size)[1 : count + 1]
+            pairs = np.rint(present_pairs).astype(np.int64)
         sums = sums.T
         # A sum of squares that rounds below zero is zero.
-        return np.maximum(sums, 0.0, out=sums), pairs.astype(np.int64)
+        return np.maximum(sums, 0.0, out=sums), pairs
 
     def between(self, first: Ints, last: Ints) -> tuple[Floats, Ints]:
         """Return the squared differences of pairs."""
@@ -387,10 +397,10 @@ class Squares:
 def _centred(x: Floats, mask: Floats | None) -> Floats:
     """Return walks (K, T) less their means, 0 where the mask is."""
     if mask is None:
-        return x - x.mean(1, keepdims=True)
+        return np.asarray(x - x.mean(1, keepdims=True))
     walk = np.where(mask > 0, x, 0.0)
     mean = walk.sum(1, keepdims=True) / np.maximum(mask.sum(1, keepdims=True), 1.0)
-    return (walk - mean) * mask
+    return np.asarray((walk - mean) * mask)
 
 
 def _dominant_velocity(x: Floats, mask: Floats | None) -> Floats:

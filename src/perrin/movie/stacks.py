@@ -38,10 +38,10 @@ from perrin.movie.colours import (
 )
 from perrin.movie.hidden import complete_bodies
 from perrin.movie.stages import Located, fit_poses, locate_frames
-from perrin.movie.workers import Work, check_workers
 from perrin.run.experiment import Experiment, MotionModel, Recording, merged_experiment
 from perrin.run.folders import claimed_folder
 from perrin.run.measure import library_version, measure_free_spheres, measure_table
+from perrin.run.workers import Work, check_workers
 from perrin.tracks.clock import Clock, evenly_spaced
 
 if TYPE_CHECKING:
@@ -56,9 +56,9 @@ if TYPE_CHECKING:
     from perrin.images.spheres.localisation import Refine
     from perrin.images.stack import Stack
     from perrin.motion.rigid_motion import RigidMotion
-    from perrin.movie.workers import Progress
     from perrin.run.measure import FittedBody
     from perrin.run.results import Report
+    from perrin.run.workers import Progress
 
 
 # Poses are fitted to the images where less than this share of the variance of the orientation is

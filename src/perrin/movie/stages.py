@@ -20,7 +20,7 @@ from perrin.images.spheres.poses import Pose, pose_in, with_poses
 from perrin.images.spheres.spots import Fading
 from perrin.movie.checks import Findings, unsettled_poses
 from perrin.movie.parts import PartWriter, open_parts, read_parts
-from perrin.movie.workers import work_through
+from perrin.run.workers import work_through
 from perrin.tracks.checksums import read_sealed, write_sealed
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from perrin.images.spheres.localisation import Refine, Search
     from perrin.images.stack import Stack
     from perrin.motion.rigid_motion import RigidMotion
-    from perrin.movie.workers import Work
+    from perrin.run.workers import Work
 
 S = TypeVar("S")
 _METHOD_FILE = "method.json"
