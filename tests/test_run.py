@@ -29,9 +29,10 @@ from perrin.diffusion.noise_model import Noise
 from perrin.images.optics.optics import CameraNoise
 from perrin.images.spheres.localisation import Method
 from perrin.images.spheres.spots import Spots
-from perrin.movie import stages, workers
+from perrin.movie import stages
 from perrin.movie.parts import PartWriter, open_parts, read_parts
 from perrin.plot.imaging import stack_frames
+from perrin.run import workers
 from perrin.run.experiment import Experiment
 from perrin.run.folders import check_resumable, filled_folder
 from perrin.run.results import motion_table
