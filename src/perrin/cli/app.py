@@ -81,6 +81,7 @@ from perrin.cli.tables import show_diagnosis, show_json, show_plan, show_predict
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from perrin.images.optics.point_spread import PointSpread
     from perrin.run.results import Report
 
 app = typer.Typer(
@@ -387,6 +388,17 @@ def run(
             rich_help_panel=SPHERES,
         ),
     ] = None,
+    psf: Annotated[
+        Path | None,
+        typer.Option(
+            help="Stack of beads that are smaller than the point spread, which is measured on them "
+            "and not learned: beads.tif.",
+            rich_help_panel=SPHERES,
+        ),
+    ] = None,
+    bead_diameter: Annotated[
+        float, typer.Option(help="Diameter of these beads, um.", rich_help_panel=SPHERES)
+    ] = 0.1,
     noise: Noise = "joint",
     exposure: Exposure = None,
     drift: Drift = False,
@@ -435,6 +447,7 @@ def run(
                 exclude=read_whole_numbers("--exclude", exclude),
                 refine=read_refine(refine),
                 optics=read_optics(optics),
+                psf=None if psf is None else measured_psf(psf, bead_diameter),
                 dark=dark,
                 border=border,
                 minmass=minmass,
@@ -454,6 +467,23 @@ def run(
             )
             complete_run(report, output, progress=progress)
         show_run(report, output, run, as_json=as_json, quiet=quiet)
+
+
+def measured_psf(path: Path, diameter: float) -> PointSpread:
+    """Return the point spread that a stack of beads shows.
+
+    Parameters
+    ----------
+    path : Path
+        With the voxel size in the file.
+    diameter : float
+        Diameter of the beads, um.
+    """
+    import perrin
+
+    # Frames are averaged, so that their interval does not matter.
+    with perrin.open_stack(path, dt=1.0) as beads:
+        return perrin.measure_point_spread(beads, diameter=diameter)
 
 
 def show_run(

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 import numpy as np
 
 from perrin.errors import DamagedFileError, FrameError, PrecisionWarning, TooFewFramesError
-from perrin.images.optics.learn import UsualImage
+from perrin.images.optics.learn import UsualImage, without_clipped
 from perrin.images.optics.optics import Optics
 from perrin.images.optics.radial_image import RadialImage
 from perrin.images.optics.window_fit import RigidCenters
@@ -406,7 +406,7 @@ class _PoseTask:
     def __call__(self, item: _FramePoses) -> tuple[pd.DataFrame, dict[str, Any]]:
         import pandas as pd
 
-        frame = np.asarray(self.stack.frame(item.frame), dtype=np.float64)
+        frame = without_clipped(np.asarray(self.stack.frame(item.frame)))
         z, y, x = (float(h) for h in self.stack.voxel)
         image = self.optics.image((z, y, x))
         lines = []
