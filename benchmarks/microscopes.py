@@ -297,6 +297,7 @@ class Case:
     dust: int = 0
     radius_spread: float = 0.0  # relative, from sphere to sphere; contacts stay those of equal ones
     n_frames: int = 20
+    beads: bool = False  # the point spread is measured on a stack of beads of 0.1 um
     shift: tuple = ()  # x, y, z, um: every other sphere is in a second channel, with this offset
     options: dict = field(default_factory=dict)
 
@@ -325,6 +326,7 @@ CASES = {
     "stage jump 1.2 um": Case(jump=1.2),
     "stage jump 2 um": Case(jump=2.0),
     "confocal": Case(light=replace(BASE, psf="confocal")),
+    "confocal, beads": Case(light=replace(BASE, psf="confocal"), beads=True),
     "confocal, 200 photons": Case(light=replace(BASE, psf="confocal", photons=200, bits=16)),
     "radii spread by 5 %": Case(radius_spread=0.05),
     "radii spread by 8 %": Case(radius_spread=0.08),
@@ -419,7 +421,27 @@ def analysed(movie, case):
     scale = {"voxel": light.voxel, "dt": DT, "plane_time": light.plane_time or None}
     stack = [perrin.open_stack(one, **scale) for one in movies]
     options = {"contact": DIAMETER} | case.options
+    if case.beads:
+        options["psf"] = measured_psf(light)
     return perrin.analyze_stack(stack, diameter=DIAMETER, **options)
+
+
+def measured_psf(light):
+    """Return the point spread that perrin measures on nine beads, with the voxels of the movie."""
+    import perrin
+
+    fine = replace(light, shape=(26, 50, 50), photons=1000.0, bits=16)
+    bead = blurred_ball(fine, grid=0.04, diameter=0.1)
+    places = [[x + 0.03 * y, y, 3.0 + 0.02 * x] for x in (1.9, 5.0, 8.1) for y in (1.9, 5.0, 8.1)]
+    bodies = [
+        Body(np.zeros((1, 3)), np.array(x), Rotation.identity(), np.ones(1), np.array([[x]]))
+        for x in places
+    ]
+    rng = np.random.default_rng(0)
+    mean = fine.photons * exposed(bodies, fine, frame=0, table=bead) + fine.background
+    grey = fine.gain * rng.poisson(mean) + rng.normal(0, fine.read_noise, fine.shape)
+    stack = perrin.open_stack(np.round(np.clip(grey, 0, None))[None], voxel=fine.voxel, dt=1.0)
+    return perrin.measure_point_spread(stack, diameter=0.1)
 
 
 def main():

@@ -81,10 +81,10 @@ def memory(pid: int | str = "self") -> float:
 def scheduling(folder: Path, *, tasks: int, seconds: float, workers: int) -> tuple[float, float]:
     """Return the efficiency of the workers, and the processor time of a task over its work.
 
-    The tasks sleep, so that all processor time is that of scheduling them and of writing their
-    entries.
+    For the second the tasks do nothing: all processor time is that of scheduling them and of
+    writing their entries.
     """
-    from perrin.movie.workers import dask_client
+    from perrin.run.workers import dask_client
 
     study = study_of(tasks, folder)
     running.measure_movie = stand_in(seconds)
@@ -92,11 +92,16 @@ def scheduling(folder: Path, *, tasks: int, seconds: float, workers: int) -> tup
         address = client.scheduler.address
         # The first task of a worker imports the package.
         list(running.measure_all(study.manifest.movies[:4], folder / "S", scheduler=address))
-        start, before = time.monotonic(), processor_time(client)
+        start = time.monotonic()
         count = len(
             list(running.measure_all(study.manifest.movies, folder / "S", scheduler=address))
         )
-        wall, spent = time.monotonic() - start, processor_time(client) - before
+        wall = time.monotonic() - start
+        running.measure_movie = stand_in(0.0)
+        before = processor_time(client)
+        for _ in running.measure_all(study.manifest.movies, folder / "S", scheduler=address):
+            pass
+        spent = processor_time(client) - before
     return count * seconds / (workers * wall), spent / count / seconds
 
 
@@ -119,7 +124,7 @@ def resumption(folder: Path, *, count: int) -> tuple[float, float, float]:
 
 def growth(folder: Path, *, counts: tuple[int, int]) -> list[float]:
     """Return the memory of the scheduling process after two numbers of movies, MB."""
-    from perrin.movie.workers import dask_client
+    from perrin.run.workers import dask_client
 
     running.measure_movie = stand_in(0.0)
     found = []
@@ -151,7 +156,7 @@ def real(folder: Path, *, count: int) -> float:
         movies.append(StudyMovie(f"r{number}", str(path), "table", "s", options={"dt": 0.7}))
     spent = []
     for workers in (1, 2):
-        from perrin.movie.workers import dask_client
+        from perrin.run.workers import dask_client
 
         with dask_client(workers, None) as client:
             address = client.scheduler.address

@@ -1,14 +1,18 @@
 """Many motions at once give what each of them gives alone."""
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from perrin import (
     Cluster,
     Noise,
+    Switching,
     add_noise,
+    analyze,
     diffusion_tensor,
     estimate_diffusion,
+    fit_switching,
     simulate_motion,
     track_rotation,
 )
@@ -17,6 +21,8 @@ from perrin.diffusion import (
     brownian_tests,
     brownian_tests_of_each,
     estimate_each,
+    estimate_pooled,
+    fit_switching_each,
     tensor_of_each,
 )
 from perrin.errors import TooFewFramesError
@@ -25,9 +31,11 @@ IRREGULAR = Cluster.from_positions([[0, 0, 0], [3, 0, 0], [0, 2, 0], [0, 0, 1]])
 TETRAHEDRON = Cluster.tetrahedron(1.5)
 
 
-def tracked(body, n_frames, seed, *, gaps=()):
+def tracked(body, n_frames, seed, *, gaps=(), dynamics=None):
     """Return the motion of a body that was tracked with noise."""
-    truth = simulate_motion(body, D_R=5e-3, D_T=0.02, dt=0.7, n_frames=n_frames, rng=seed)
+    truth = simulate_motion(
+        body, D_R=5e-3, D_T=0.02, dt=0.7, n_frames=n_frames, dynamics=dynamics, rng=seed
+    )
     x = add_noise(truth.positions(), sigma=0.03, rng=seed + 100)
     x[list(gaps)] = np.nan
     return track_rotation(x, dt=0.7)
@@ -95,3 +103,90 @@ def test_a_motion_without_an_estimate_does_not_stop_the_others(motions):
     error, tensor = tensor_of_each([short, motions[0]], noise=Noise())
     assert isinstance(error, TooFewFramesError)
     assert tensor.n_frames == 210
+
+
+def rows_of(cluster, body, n_frames, *, seed, first=0, gaps=0.0, swapped=None, stretch=1.0):
+    """Return the rows of one cluster, perhaps with gaps, exchanged labels or a stretched z."""
+    rng = np.random.default_rng(seed)
+    truth = simulate_motion(body, D_R=5e-3, D_T=0.02, dt=0.7, n_frames=n_frames, rng=rng)
+    x = add_noise(truth.positions(), sigma=0.03, rng=rng) * [1.0, 1.0, stretch] + 20.0 * cluster
+    if swapped is not None:
+        x[swapped:, [0, 1]] = x[swapped:, [1, 0]]
+    frame, particle = np.nonzero(rng.random(x.shape[:2]) >= gaps)
+    columns = {"frame": frame + first, "particle": particle + 10 * cluster, "cluster": cluster}
+    return pd.DataFrame(columns | dict(zip("xyz", x[frame, particle].T, strict=True)))
+
+
+@pytest.fixture(scope="module")
+def unlike_clusters():
+    """Tables of bodies of several shapes, with gaps, exchanged labels and other lengths."""
+    return [
+        rows_of(0, TETRAHEDRON, 210, seed=1),
+        rows_of(1, TETRAHEDRON, 210, seed=2, gaps=0.05),
+        rows_of(2, IRREGULAR, 210, seed=3, swapped=40),
+        rows_of(3, TETRAHEDRON, 210, seed=4, stretch=1.2),
+        rows_of(4, TETRAHEDRON, 204, seed=5, first=6, gaps=0.1),
+        rows_of(5, Cluster.touching(5, 2.0), 210, seed=6, gaps=0.03),
+    ]
+
+
+def numbers_of(result):
+    """Return all numbers of a cluster's fit and of its coefficients, by name."""
+    motion, quality = result.motion, result.quality.to_dict()
+    numbers = {
+        name: getattr(motion, name)
+        for name in ("rotation", "center", "covariance", "center_variance", "residual", "template")
+    }
+    numbers |= {name: value for name, value in quality.items() if isinstance(value, int | float)}
+    numbers |= {"sigma_xyz": quality["sigma_xyz"] or np.nan, "sigma": motion.sigma}
+    for name, D in (("D_R", result.D_R), ("D_T", result.D_T)):
+        numbers |= {f"{name} {key}": getattr(D, key) for key in ("value", "ci68", "ci95", "offset")}
+    for quantity, verdict in result.verdicts.items():
+        numbers |= {f"{quantity} {test}": p for test, p in (verdict.p if verdict else {}).items()}
+    return numbers
+
+
+def test_a_table_of_unlike_clusters_is_each_of_them_alone(unlike_clusters):
+    """Fits, quality, coefficients and p-values are those of tables of one cluster, to 1e-9."""
+    together = analyze(pd.concat(unlike_clusters, ignore_index=True), dt=0.7)
+    found = {one.cluster: one for one in together.clusters}
+    assert sorted(found) == list(range(6))
+    for number, table in enumerate(unlike_clusters):
+        alone = analyze(table, dt=0.7).clusters[0]
+        one = found[number]
+        assert one.quality.symmetry == alone.quality.symmetry
+        assert one.quality.reasons == alone.quality.reasons
+        assert one.quality.swaps == alone.quality.swaps
+        assert one.motion.reason == alone.motion.reason
+        expected = numbers_of(alone)
+        for name, value in numbers_of(one).items():
+            np.testing.assert_allclose(
+                value, expected[name], rtol=1e-9, atol=1e-12, err_msg=f"cluster {number}: {name}"
+            )
+    assert found[2].quality.swaps == (40,)
+    assert found[3].quality.z_scale == pytest.approx(1.2, abs=0.05)
+
+
+def test_two_states_of_several_motions_are_those_of_each_alone():
+    """Coefficients, rates and state probabilities are those of single fits, to 1e-9."""
+    motions = [
+        tracked(TETRAHEDRON, n_frames, seed, dynamics=Switching(10, dwell=20.0))
+        for n_frames, seed in ((90, 1), (90, 2), (70, 3))
+    ]
+    found = fit_switching_each([[m] for m in motions], quantity="rotation", noise=Noise())
+    for one, motion in zip(found, motions, strict=True):
+        alone = fit_switching(motion)
+        for name in ("D_slow", "D_fast", "dwell_slow", "dwell_fast"):
+            expected = getattr(alone, name)
+            assert getattr(one, name).value == pytest.approx(expected.value, rel=1e-9)
+        np.testing.assert_allclose(one.probability[0], alone.probability[0], rtol=1e-8, atol=1e-12)
+
+
+@pytest.mark.filterwarnings("ignore::perrin.errors.PrecisionWarning")
+def test_pooling_from_the_estimates_of_each_is_pooling(motions):
+    """The pooled D and the test of a common D are those of `estimate_diffusion`, to 1e-9."""
+    each = estimate_each(motions, quantity="rotation", noise=Noise())
+    one = estimate_pooled(motions, each, quantity="rotation", noise=Noise())
+    alone = estimate_diffusion(motions)
+    assert one.value == pytest.approx(alone.value, rel=1e-9)
+    assert one.p_same == pytest.approx(alone.p_same, rel=1e-8)

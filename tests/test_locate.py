@@ -544,3 +544,20 @@ def test_a_method_learns_from_spheres_and_not_from_dust():
     assert method.optics.diameter == pytest.approx(DIAMETER, abs=0.02)
     assert method.optics.noise.gain == pytest.approx(GAIN, rel=0.1)
     assert method.usual.brightness == pytest.approx(120.0, rel=0.03)
+
+
+def test_spheres_that_come_near_are_refined_as_those_that_touch():
+    """A row at 1.27 contacts is found where it is, though fits start drawn together to contact.
+
+    The fits of its ends move from there by over half a radius.
+    """
+    row = 1.27 * DIAMETER * np.arange(4)
+    places = np.column_stack([np.full(4, 5.1), np.full(4, 6.0), 2.0 + row])
+    rng = np.random.default_rng(4)
+    frame = drawn(places, np.ones(4), rng, shape=(44, 64, 80))
+    found = Features(places + rng.normal(0, 0.03, places.shape), np.full(4, 3e4))
+    columns, _ = group_columns(frame, found, Search(DIAMETER, DIAMETER), OPTICS, VOXEL)
+    assert columns["reason"].tolist() == [""] * 4
+    error = np.stack([columns[a] for a in "zyx"], axis=1) - places
+    sigma = np.stack([columns[f"sigma_{a}"] for a in "zyx"], axis=1)
+    assert np.abs(error / sigma).max() < 5

@@ -165,7 +165,8 @@ def test_no_message_of_the_library_names_an_option():
     [
         (
             cli.analyze,
-            ["Arguments", "Input", "Noise and estimates", "Sizes and predictions", "Output"],
+            ["Arguments", "Input", "Noise and estimates",
+             "Sizes and predictions", "Work", "Output"],
         ),
         (
             cli.run,

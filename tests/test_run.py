@@ -29,13 +29,14 @@ from perrin.diffusion.noise_model import Noise
 from perrin.images.optics.optics import CameraNoise
 from perrin.images.spheres.localisation import Method
 from perrin.images.spheres.spots import Spots
-from perrin.movie import stages, workers
+from perrin.movie import stages
 from perrin.movie.parts import PartWriter, open_parts, read_parts
-from perrin.movie.workers import Work, work_through
 from perrin.plot.imaging import stack_frames
+from perrin.run import workers
 from perrin.run.experiment import Experiment
 from perrin.run.folders import check_resumable, filled_folder
 from perrin.run.results import motion_table
+from perrin.run.workers import Work, work_through
 
 pytest.importorskip("tifffile")
 pytest.importorskip("trackpy")
@@ -177,6 +178,11 @@ def test_the_run_describes_the_images_of_the_spheres(whole):
     assert (imaging.features["cluster"] >= 0).all()
     assert imaging.optics.diameter == pytest.approx(DIAMETER, abs=0.02)
     assert len(imaging.spots) > 8  # noise among them
+    # The distances of touching spheres state the error of the shape that all frames share.
+    radius = perrin.Cluster.touching(4, DIAMETER).R
+    assert 0 < imaging.distance_error < 0.003
+    for cluster in whole.clusters:
+        assert abs(cluster.motion.R / radius - 1) < 4 * imaging.distance_error
     assert {v.frame for v in imaging.views} <= set(range(FRAMES))
     assert imaging.views[0].xy.shape == SHAPE[1:]
     assert imaging.views[0].xz.shape == (SHAPE[0], SHAPE[2])

@@ -166,7 +166,7 @@ def test_a_table_with_its_own_times_is_fitted_with_them():
     assert perrin.analyze(table, dt=DT).clusters[0].motion.turn_noise is None
     table.loc[7, "time"] = np.nan
     table.loc[8, "time"] += 0.1
-    assert any("have none" in note for note in perrin.analyze(table, dt=DT).notes)
+    assert any("has none" in note for note in perrin.analyze(table, dt=DT).notes)
 
 
 def test_a_scanned_motion_is_written_and_read():

@@ -153,11 +153,11 @@ def test_after_a_lost_scheduler_or_client_the_next_call_ends(movies, cluster, tm
 
 
 def test_after_a_full_disk_the_next_call_ends(movies, tmp_path):
-    """Files are limited to 20 kB, which no run folder keeps to, as on a disk that is full."""
+    """Files are limited to 3 kB, which no run folder keeps to, as on a disk that is full."""
     manifest, expected = movies
     place = tmp_path / "STUDY"
     limited = "import resource, signal; signal.signal(signal.SIGXFSZ, signal.SIG_IGN); "
-    limited += "resource.setrlimit(resource.RLIMIT_FSIZE, (20000, 20000)); " + SCRIPT
+    limited += "resource.setrlimit(resource.RLIMIT_FSIZE, (3000, 3000)); " + SCRIPT
     process = subprocess.run(
         [sys.executable, "-c", limited, str(manifest), str(place)],
         capture_output=True, text=True, check=False,

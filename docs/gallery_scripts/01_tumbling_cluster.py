@@ -12,6 +12,7 @@ import numpy as np
 import perrin
 from perrin.plot import plot_cluster, plot_lag_curve
 
+plt.style.use("perrin.plot.perrin")
 body = perrin.Cluster.touching(4, diameter=2.45)
 truth = perrin.simulate_motion(body, D_R=4.93e-3, D_T=3.85e-2, dt=0.73, n_frames=300, rng=1)
 motion = perrin.track_rotation(

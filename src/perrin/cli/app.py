@@ -14,10 +14,13 @@ import typer
 
 from perrin._text import counted, printable
 from perrin.cli.messages import (
+    STOPPED,
+    StoppedError,
     claimed_output,
     escape,
     messages_of,
     state_kept_frames,
+    status_of,
     stop_in_order,
 )
 from perrin.cli.options import (
@@ -28,7 +31,6 @@ from perrin.cli.options import (
     RECORDING,
     SIZES,
     SPHERES,
-    WORK,
     ClusterSize,
     Columns,
     Config,
@@ -51,12 +53,14 @@ from perrin.cli.options import (
     Quiet,
     Radius,
     Scale,
+    Scheduler,
     Seed,
     Shape,
     Sigma,
     Temperature,
     Tracks,
     Viscosity,
+    Workers,
     body_of,
     read_channels,
     read_columns,
@@ -77,6 +81,7 @@ from perrin.cli.tables import show_diagnosis, show_json, show_plan, show_predict
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from perrin.images.optics.point_spread import PointSpread
     from perrin.run.results import Report
 
 app = typer.Typer(
@@ -107,7 +112,11 @@ def main() -> None:
         if isinstance(stream, TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
     stop_in_order()
-    app()
+    try:
+        app()
+    except StoppedError as stop:  # before the command itself began
+        print(STOPPED, file=sys.stderr)
+        sys.exit(status_of(stop))
 
 
 def _print_version(wanted: bool) -> None:
@@ -185,6 +194,7 @@ def demo(
     perrin analyze spots.csv --dt 0.5 --scale 0.11 -o my-run          # pixels of 0.11 um
     perrin analyze tracks.gdf --dt 0.5 --columns x=0,y=1,frame=-2,particle=-1 -o my-run
     perrin analyze points.txt --dt 0.5 --contact 2.45 --size 4 -o my-run   # no ids
+    perrin analyze many.parquet --dt 0.5 --workers 4 -o my-run        # on four cores
     perrin analyze --config my-run/run.toml                           # once more""",
 )
 def analyze(
@@ -212,6 +222,8 @@ def analyze(
             rich_help_panel=SIZES,
         ),
     ] = None,
+    workers: Workers = 0,
+    scheduler: Scheduler = None,
     as_json: Json = False,
     quiet: Quiet = False,
     overwrite: Overwrite = False,
@@ -240,6 +252,8 @@ def analyze(
             temperature=temperature,
             diameter=diameter,
             frames=read_slice(frames),
+            workers=workers,
+            scheduler=scheduler,
             progress=progress,
         )
         perrin.write_run(report, output, overwrite=overwrite, progress=progress)
@@ -374,6 +388,17 @@ def run(
             rich_help_panel=SPHERES,
         ),
     ] = None,
+    psf: Annotated[
+        Path | None,
+        typer.Option(
+            help="Stack of beads that are smaller than the point spread, which is measured on them "
+            "and not learned: beads.tif.",
+            rich_help_panel=SPHERES,
+        ),
+    ] = None,
+    bead_diameter: Annotated[
+        float, typer.Option(help="Diameter of these beads, um.", rich_help_panel=SPHERES)
+    ] = 0.1,
     noise: Noise = "joint",
     exposure: Exposure = None,
     drift: Drift = False,
@@ -381,21 +406,8 @@ def run(
     model: Model = None,
     viscosity: Viscosity = None,
     temperature: Temperature = None,
-    workers: Annotated[
-        int,
-        typer.Option(
-            min=0,
-            help="Number of processes of this machine that share the work.",
-            rich_help_panel=WORK,
-        ),
-    ] = 0,
-    scheduler: Annotated[
-        str | None,
-        typer.Option(
-            help="Address of a Dask scheduler that does the work: tcp://host:8786.",
-            rich_help_panel=WORK,
-        ),
-    ] = None,
+    workers: Workers = 0,
+    scheduler: Scheduler = None,
     as_json: Json = False,
     quiet: Quiet = False,
     overwrite: Overwrite = False,
@@ -435,6 +447,7 @@ def run(
                 exclude=read_whole_numbers("--exclude", exclude),
                 refine=read_refine(refine),
                 optics=read_optics(optics),
+                psf=None if psf is None else measured_psf(psf, bead_diameter),
                 dark=dark,
                 border=border,
                 minmass=minmass,
@@ -454,6 +467,23 @@ def run(
             )
             complete_run(report, output, progress=progress)
         show_run(report, output, run, as_json=as_json, quiet=quiet)
+
+
+def measured_psf(path: Path, diameter: float) -> PointSpread:
+    """Return the point spread that a stack of beads shows.
+
+    Parameters
+    ----------
+    path : Path
+        With the voxel size in the file.
+    diameter : float
+        Diameter of the beads, um.
+    """
+    import perrin
+
+    # Frames are averaged, so that their interval does not matter.
+    with perrin.open_stack(path, dt=1.0) as beads:
+        return perrin.measure_point_spread(beads, diameter=diameter)
 
 
 def show_run(

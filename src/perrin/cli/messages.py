@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from typing import TextIO
 
 
+STOPPED = "Stopped: nothing is written, and what was there is kept."
+
 # Arguments of the library that have another name on the command line.
 _RENAMED_ARGUMENTS = {
     "n_frames": "--frames",
@@ -130,8 +132,8 @@ def in_options(text: str, options: Mapping[str, str]) -> str:
     return re.sub(rf"(?<![\w-])({alone})\b", option, text) if alone else text
 
 
-class StoppedError(KeyboardInterrupt):
-    """The operating system, or the keyboard, stops the process.
+class StoppedError(BaseException):
+    """The operating system, or the keyboard, stops the process; no library handles it on the way.
 
     Attributes
     ----------
@@ -225,8 +227,8 @@ def messages_of(command: Callable[..., object]) -> Iterator[None]:
     try:
         with warnings_in_one_line(options):
             yield
-    except KeyboardInterrupt as stop:
-        print("Stopped: nothing is written, and what was there is kept.", file=sys.stderr)
+    except (KeyboardInterrupt, StoppedError) as stop:
+        print(STOPPED, file=sys.stderr)
         raise typer.Exit(status_of(stop)) from None
     except BrokenPipeError:
         # The reader has stopped (a pipe into head); the run itself is written. Python's own flush
@@ -326,7 +328,7 @@ def state_kept_frames(output: Path) -> Iterator[None]:
     """
     try:
         yield
-    except (OSError, KeyboardInterrupt) as stop:
+    except (OSError, KeyboardInterrupt, StoppedError) as stop:
         kept = any((output / "located").glob("part-*")) and not (output / "run.json").exists()
         if kept:
             print(

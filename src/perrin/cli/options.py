@@ -116,6 +116,25 @@ OverwriteFile = Annotated[
     bool, typer.Option("--overwrite", help="Replace an existing file.", rich_help_panel=OUTPUT)
 ]
 
+Workers = Annotated[
+    int,
+    typer.Option(
+        "--workers",
+        min=0,
+        help="Number of processes of this machine that share the work.",
+        rich_help_panel=WORK,
+    ),
+]
+
+Scheduler = Annotated[
+    str | None,
+    typer.Option(
+        "--scheduler",
+        help="Address of a Dask scheduler that does the work: tcp://host:8786.",
+        rich_help_panel=WORK,
+    ),
+]
+
 Json = Annotated[
     bool,
     typer.Option("--json", help="Print the results as JSON, no tables.", rich_help_panel=OUTPUT),

@@ -10,7 +10,7 @@ import numpy as np
 
 from perrin._arrays import choice_fault, refuse
 from perrin.diffusion.estimate import CHI2, DiffusionEstimate, Found
-from perrin.diffusion.likelihood import Likelihood, excess_scatter
+from perrin.diffusion.likelihood import Likelihood, excess_scatter, excess_scatter_of_each
 from perrin.diffusion.moments import covariance_estimate, trace_estimate
 from perrin.diffusion.noise_model import Noise, noise_faults
 from perrin.diffusion.steps import NoisySteps, Quantity, Steps, pooled_steps, steps_of
@@ -170,6 +170,56 @@ def estimate_each(
     ]
 
 
+def estimate_pooled(
+    motions: Sequence[RigidMotion],
+    each: Sequence[DiffusionEstimate],
+    *,
+    quantity: Quantity,
+    noise: Noise,
+) -> DiffusionEstimate:
+    """Estimate one D for several motions, as `estimate_diffusion`, from the D of each of them.
+
+    Parameters
+    ----------
+    motions : sequence of RigidMotion
+    each : sequence of DiffusionEstimate
+        Estimate of every motion alone, with the same noise: the maxima that the test of a common D
+        compares.
+    quantity : {"rotation", "translation"}
+    noise : Noise
+
+    Returns
+    -------
+    DiffusionEstimate
+
+    Raises
+    ------
+    TooFewFramesError
+        As in `estimate_diffusion`.
+
+    Examples
+    --------
+    >>> from perrin import Cluster, simulate_motion
+    >>> motions = [
+    ...     simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=300, rng=seed)
+    ...     for seed in (3, 4)
+    ... ]
+    >>> each = estimate_each(motions, quantity="rotation", noise=Noise())
+    >>> print(estimate_pooled(motions, each, quantity="rotation", noise=Noise()))
+    D_R = 0.0054(3) rad^2/s [mle, 600 frames]
+    """
+    steps = pooled_steps(motions, quantity)
+    tracks = [NoisySteps.of(s, noise) for s in steps]
+    apart = 0.0
+    for rows in together(tracks):
+        some = [tracks[k] for k in rows]
+        D = np.array([each[k].value for k in rows])
+        theta = np.array([tracks[k].theta_at(each[k].value, each[k].offset) for k in rows])
+        apart += float(Likelihood.of(some).apart().sums(D, theta).value.sum())
+    found = by_likelihood(tracks, apart=apart)
+    return _judged(motions, steps, found, quantity=quantity, method="mle", settings=noise)
+
+
 def _judged(
     motions: Sequence[RigidMotion],
     steps: Sequence[Steps],
@@ -225,7 +275,7 @@ def _noise_variance(
     return float(np.mean(np.multiply(squares, means)))
 
 
-def by_likelihood(tracks: Sequence[NoisySteps]) -> Found:
+def by_likelihood(tracks: Sequence[NoisySteps], *, apart: float | None = None) -> Found:
     """Return the maximum of the likelihood, with intervals from its profile.
 
     Axes that diffuse unequally widen the intervals.
@@ -234,6 +284,9 @@ def by_likelihood(tracks: Sequence[NoisySteps]) -> Found:
     ----------
     tracks : sequence of NoisySteps
         Steps of every motion, all of one quantity.
+    apart : float, optional
+        Sum of the greatest log-likelihoods of the motions, each with a D of its own, where that is
+        known.
 
     Examples
     --------
@@ -258,7 +311,8 @@ def by_likelihood(tracks: Sequence[NoisySteps]) -> Found:
         drift, drift_stderr = (tuple(map(tuple, x.tolist())) for x in (mean, errors))
         found = replace(found, drift=drift, drift_stderr=drift_stderr)
     if len(tracks) > 1:
-        gain = float(likelihood.apart().best().value.sum() - best.value[0])
+        highest = likelihood.apart().best().value.sum() if apart is None else apart
+        gain = float(highest - best.value[0])
         found = replace(found, p_same=float(chdtrc(len(tracks) - 1, max(2 * gain, 0.0))))
     return found
 
@@ -286,8 +340,7 @@ def likelihood_of_each(tracks: Sequence[NoisySteps]) -> list[Found]:
         some = [tracks[i] for i in numbers]
         likelihood = Likelihood.of(some).apart()
         best = likelihood.best()
-        pairs = zip(some, best.D, best.theta, strict=True)
-        wider = np.array([excess_scatter([t], float(D), theta[None]) for t, D, theta in pairs])
+        wider = excess_scatter_of_each(some, best.D, best.theta)
         units = _found_of_units(likelihood, best, wider)
         if some[0].drift:
             mean, information = likelihood.steady_motion(best.D, best.theta)

@@ -501,47 +501,97 @@ def excess_scatter(tracks: Sequence[NoisySteps], D: float, theta: Floats) -> flo
     >>> excess_scatter([track], 4e-3, np.zeros(1)) > 1.4
     True
     """
-    parts = [_squared_deviations(t, D, float(own)) for t, own in zip(tracks, theta, strict=True)]
-    excess, scale = np.sum(parts, axis=0)
+    excess, scale = _squared_deviations(tracks, np.full(len(tracks), D), theta).sum(axis=1)
     return 1.0 + max(0.0, float(excess / scale)) if scale > 0 else 1.0
 
 
-def _squared_deviations(track: NoisySteps, D: float, theta: float) -> tuple[float, float]:
-    """Return sums over modes of the squared deviations, chance subtracted, and of their scale."""
+def excess_scatter_of_each(tracks: Sequence[NoisySteps], D: Floats, theta: Floats) -> Floats:
+    """Return the factor of `excess_scatter` for each of several motions alone, (G,).
+
+    Parameters
+    ----------
+    tracks : sequence of NoisySteps
+    D, theta : ndarray, shape (G,)
+        D and noise of each motion.
+
+    Examples
+    --------
+    >>> from perrin import Cluster, simulate_motion
+    >>> from perrin.diffusion import Noise, NoisySteps, steps_of
+    >>> D_R = [1e-3, 1e-3, 1e-2]
+    >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=D_R, dt=0.7, n_frames=300, rng=3)
+    >>> track = NoisySteps.of(steps_of(truth, "rotation"), Noise())
+    >>> excess_scatter_of_each([track, track], np.full(2, 4e-3), np.zeros(2)) > 1.4
+    array([ True,  True])
+    """
+    excess, scale = _squared_deviations(tracks, D, theta)
+    ratio = np.divide(excess, scale, out=np.zeros_like(excess), where=scale > 0)
+    return np.asarray(1.0 + np.maximum(ratio, 0.0))
+
+
+def _squared_deviations(tracks: Sequence[NoisySteps], D: Floats, theta: Floats) -> Floats:
+    """Return sums over modes of the squared deviations, chance subtracted, and of their scale.
+
+    They are those of each motion, (2, G).
+    """
+    found = np.zeros((2, len(tracks)))
+    alike: dict[tuple[int, ...], list[int]] = {}
+    for k, track in enumerate(tracks):
+        alike.setdefault(track.steps.vectors.shape, []).append(k)
+    for (count, axes), rows in alike.items():
+        if axes == 1 or count < 5:
+            continue
+        at_once = max(1, _MOST_MOTIONS_AT_ONCE // (count * axes))
+        for low in range(0, len(rows), at_once):
+            some = rows[low : low + at_once]
+            found[:, some] = _deviations_alike([tracks[k] for k in some], D[some], theta[some])
+    return found
+
+
+def _deviations_alike(tracks: Sequence[NoisySteps], D: Floats, theta: Floats) -> Floats:
+    """Return the sums of `_squared_deviations` for motions with equally many steps, (2, G)."""
     from scipy.fft import dst
 
-    count, axes = track.steps.vectors.shape
-    if axes == 1 or count < 5:
-        return 0.0, 0.0
+    count, axes = tracks[0].steps.vectors.shape
     c = difference_eigenvalues(count)
     weight, known = (
-        np.mean([pair[0].mean(axis=0), pair[1].mean(axis=0)], axis=0)
-        for pair in (track.weight, track.known)
+        np.stack([0.5 * (pair[0].mean(axis=0) + pair[1].mean(axis=0)) for pair in pairs])
+        for pairs in ([t.weight for t in tracks], [t.known for t in tracks])
     )
-    noise = theta * weight + known
+    noise = theta[:, None] * weight + known
+    level = noise.mean(axis=1)
     # Uneven steps are taken as even ones of their mean duration: only a width depends on it.
-    by_D, by_noise = 2 * (track.steps.duration.mean() - track.blur * c), 2 * c
-    eigen = by_D * D + by_noise * noise.mean()
-    if not np.all(eigen > 0):
-        return 0.0, 0.0
-    modes = dst(track.steps.vectors, type=1, norm="ortho", axis=0)
-    rows = np.stack([by_D, by_noise])
-    fisher = np.linalg.inv((rows / eigen) @ (rows / eigen).T)
+    duration = np.array([t.steps.duration.mean() for t in tracks])
+    blur = np.array([t.blur for t in tracks])
+    by_D, by_noise = 2 * (duration[:, None] - blur[:, None] * c), 2 * c
+    eigen = by_D * D[:, None] + by_noise * level[:, None]
+    defined = (eigen > 0).all(axis=1)
+    eigen = np.where(defined[:, None], eigen, 1.0)
+    modes = dst(np.stack([t.steps.vectors for t in tracks]), type=1, norm="ortho", axis=1)
+    rows = np.stack([by_D, np.broadcast_to(by_noise, by_D.shape)], axis=1)
+    relative = rows / eigen[:, None]
+    fisher = np.linalg.inv(relative @ np.swapaxes(relative, 1, 2))
     # The deviations of D and of the noise, less what the unequal noise of the axes makes of them.
-    weights = fisher @ (rows / eigen**2)
-    found = np.stack([modes.T @ (one[:, None] * modes) for one in weights])
-    found -= (weights @ by_noise)[:, None, None] * np.diag(noise - noise.mean())
-    found -= np.trace(found, axis1=1, axis2=2)[:, None, None] / axes * np.eye(axes)
-    squares = np.einsum("pab,qab->pq", found, found) - (axes - 1) * (axes + 2) * fisher
+    weights = fisher @ (relative / eigen[:, None])
+    columns = np.swapaxes(modes, 1, 2)[:, None]
+    deviation = columns @ (weights[..., None] * modes[:, None])
+    unequal = (noise - level[:, None])[:, None, None] * np.eye(axes)
+    deviation = deviation - (weights @ by_noise)[..., None, None] * unequal
+    mean = np.trace(deviation, axis1=2, axis2=3)[..., None, None] / axes
+    deviation = deviation - mean * np.eye(axes)
+    flat = deviation.reshape(len(tracks), 2, -1)
+    squares = flat @ np.swapaxes(flat, 1, 2) - (axes - 1) * (axes + 2) * fisher
     # Weights of the modes in the score of D with theta profiled out.
-    score = by_D / eigen**2
-    if np.isfinite(track.freedom):
-        by_theta = by_noise * weight.mean()
-        known_theta = track.freedom / (axes * theta**2) if theta > 0 else 0.0
-        shared = np.sum(by_D * by_theta / eigen**2) / (
-            np.sum((by_theta / eigen) ** 2) + known_theta
-        )
-        score = (by_D - shared * by_theta) / eigen**2
-    scored = score * rows
-    excess = np.sum(squares * (scored @ scored.T))
-    return float(excess), float(axes * np.sum((score * eigen) ** 2))
+    freedom = np.array([t.freedom for t in tracks])
+    free = np.isfinite(freedom)
+    by_theta = by_noise * np.where(free, weight.mean(axis=1), 0.0)[:, None]
+    known_theta = np.where(free, freedom, 0.0) / axes
+    known_theta = np.divide(known_theta, theta**2, out=np.zeros_like(theta), where=theta > 0)
+    power = ((by_theta / eigen) ** 2).sum(axis=1) + known_theta
+    crossed = (by_D * by_theta / eigen**2).sum(axis=1)
+    shared = np.divide(crossed, power, out=np.zeros_like(power), where=power > 0)
+    score = (by_D - shared[:, None] * by_theta) / eigen**2
+    scored = score[:, None] * rows
+    excess = (squares * (scored @ np.swapaxes(scored, 1, 2))).sum(axis=(1, 2))
+    scale = axes * ((score * eigen) ** 2).sum(axis=1)
+    return np.where(defined, np.stack([excess, scale]), 0.0)

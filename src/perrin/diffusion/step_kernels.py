@@ -158,6 +158,11 @@ class SineModes:
         """Transform the steps of these motions, which have these numbers."""
         from scipy.fft import dst
 
+        if len({(t.steps.vectors.shape, t.drift) for t in tracks}) == 1:
+            noise = np.stack([[t.weight[0][0], t.known[0][0]] for t in tracks])
+            scale = 1e-9 * np.abs(noise).max(axis=2, keepdims=True)
+            if (np.abs(noise - noise[..., :1]) <= scale).all():
+                return cls.of_equal_axes(tracks, groups)
         rows = []
         squares, products = [], []
         for track in tracks:
@@ -194,6 +199,35 @@ class SineModes:
         if squares:
             steady = np.concatenate(squares, axis=-1), np.concatenate(products, axis=-1)
         return cls(np.array(groups), starts, which, power, count, by_D, by_theta, given, steady)
+
+    @classmethod
+    def of_equal_axes(cls, tracks: Sequence[NoisySteps], groups: Sequence[int]) -> SineModes:
+        """Transform equally many steps of each motion, whose axes are equally noisy, as `of`."""
+        from scipy.fft import dst
+
+        count, axes = tracks[0].steps.vectors.shape
+        c = difference_eigenvalues(count)
+        modes = dst(np.stack([t.steps.vectors for t in tracks]), type=1, norm="ortho", axis=1)
+        duration, blur, weight, known = np.array(
+            [(t.steps.duration[0], t.blur, t.weight[0][0, 0], t.known[0][0, 0]) for t in tracks]
+        ).T[..., None]
+        steady = None
+        if tracks[0].drift:
+            effect = dst(np.stack([t.steps.steady for t in tracks]), type=1, norm="ortho", axis=1)
+            squares = np.einsum("gkap,gkaq->pqgk", effect, effect)
+            products = np.einsum("gkap,gka->pgk", effect, modes)
+            steady = squares.reshape(*squares.shape[:2], -1), products.reshape(len(products), -1)
+        return cls(
+            groups=np.array(groups),
+            starts=np.arange(len(tracks)) * count,
+            which=np.repeat(np.arange(len(tracks)), count),
+            power=(modes * modes).sum(axis=2).ravel(),
+            count=np.full(len(tracks) * count, float(axes)),
+            by_D=(2 * (duration - blur * c)).ravel(),
+            by_theta=(2 * weight * c).ravel(),
+            given=(2 * known * c).ravel(),
+            steady=steady,
+        )
 
     @property
     def size(self) -> int:

@@ -557,12 +557,12 @@ def steady_motion_of_each(
         settings = replace(estimates[moving[0]].settings, drift=True)
         again = estimate_each(some, quantity=estimates[moving[0]].quantity, noise=settings)
         free = []
-        for one in again:
-            if isinstance(one, TooFewFramesError):
-                raise one
-            free.append(one)
-        for k, one in zip(moving, _steady_motions_at(some, free), strict=True):
-            found[k] = one
+        for taken in again:
+            if isinstance(taken, TooFewFramesError):
+                raise taken
+            free.append(taken)
+        for k, without in zip(moving, _steady_motions_at(some, free), strict=True):
+            found[k] = without
     return found
 
 
@@ -633,7 +633,9 @@ def offset_gain_of_each(
     ]
     for rows in together(free):
         own = [estimates[k] for k in rows]
-        theta = np.array([_theta(free[k], e) for k, e in zip(rows, own, strict=True)])
+        theta = np.array(
+            [free[k].theta_at(e.value, e.offset) for k, e in zip(rows, own, strict=True)]
+        )
         # The estimate is the maximum of the likelihood with the noise left free.
         best = Likelihood.of([free[k] for k in rows]).apart()
         highest = best.sums(np.array([e.value for e in own]), theta).value
@@ -703,7 +705,7 @@ def _steady_motions_at(
         some, own = [tracks[k] for k in rows], [estimates[k] for k in rows]
         likelihood = Likelihood.of(some).apart()
         value = np.array([e.value for e in own])
-        theta = np.array([_theta(t, e) for t, e in zip(some, own, strict=True)])
+        theta = np.array([t.theta_at(e.value, e.offset) for t, e in zip(some, own, strict=True)])
         D = np.maximum(value, 1e-12 * likelihood.scale)
         means, informations = likelihood.steady_motion(D, theta)
         counts, d = np.array([len(t.steps.duration) for t in some]), means.shape[1]
@@ -783,6 +785,10 @@ def leave_one_out_residuals(
         rows = np.swapaxes(np.broadcast_to(x, y.shape), 1, 2)
         return np.ascontiguousarray(rows, dtype=np.float64).ravel()
 
+    def of_ends(pairs: Sequence[tuple[Floats, Floats]]) -> tuple[Floats, Floats]:
+        before, after = (along_rows(np.stack(part)) for part in zip(*pairs, strict=True))
+        return before, after
+
     def of_motion(numbers: Sequence[float]) -> Floats:
         return along_rows(np.array(numbers)[:, None, None])
 
@@ -791,12 +797,12 @@ def leave_one_out_residuals(
 
     diagonal, off_diagonal = covariance_bands(
         of_motion([e.value for e in estimates]),
-        of_motion([_theta(t, e) for t, e in zip(tracks, estimates, strict=True)]),
+        of_motion([t.theta_at(e.value, e.offset) for t, e in zip(tracks, estimates, strict=True)]),
         along_rows(np.stack([t.steps.duration for t in tracks])[..., None]),
         along_rows(linked[..., None]),
         blur=of_motion([t.blur for t in tracks]),
-        weight=tuple(along_rows(np.stack([t.weight[k] for t in tracks])) for k in (0, 1)),
-        known=tuple(along_rows(np.stack([t.known[k] for t in tracks])) for k in (0, 1)),
+        weight=of_ends([t.weight for t in tracks]),
+        known=of_ends([t.known for t in tracks]),
     )
     extra = _LEFT_OUT * diagonal * along_rows(without[..., None])
     a, b = diagonal + extra, off_diagonal
@@ -841,16 +847,17 @@ def _jump_candidates(residuals: StepResiduals, known: Bools) -> Bools:
         0.0,
     )
 
-    def before(x: Floats | Bools) -> Floats | Bools:
-        return np.pad(x, ((0, 0), (1, 0)))
+    def before(x: Floats) -> Floats:
+        return np.asarray(np.pad(x, ((0, 0), (1, 0))), dtype=np.float64)
 
-    def after(x: Floats | Bools) -> Floats | Bools:
-        return np.pad(x, ((0, 0), (0, 1)))
+    def after(x: Floats) -> Floats:
+        return np.asarray(np.pad(x, ((0, 0), (0, 1))), dtype=np.float64)
 
     around = np.maximum(after(displaced), before(displaced))
     # The first and the last frame of a piece belong to one step only: a jump there isolates one
     # frame, and a badly measured frame explains it as well.
-    inside = before(residuals.linked) & after(residuals.linked)
+    pairs = residuals.linked.astype(np.float64)
+    inside = (before(pairs) > 0) & (after(pairs) > 0)
     limit = chdtri(residuals.step.shape[2], _CANDIDATE_LEVEL / count)
     given_others = _robust_square(residuals.step, residuals.step)
     # Jumps back and forth resemble noise once the noise is fitted to them: the length alone.
@@ -885,13 +892,6 @@ def _inverse_root(a: Floats, *, least: float = 0.0) -> Floats:
     moves = values > 1e-12 * np.maximum(values[..., -1:], 1e-300)
     root = np.sqrt(np.maximum(np.where(moves, values, 1.0), least))
     return np.asarray(axes * np.where(moves, 1 / root, 0.0)[..., None, :])
-
-
-def _theta(track: NoisySteps, estimate: DiffusionEstimate) -> float:
-    """Return the free part of the noise: the offset is theta + level - blur D."""
-    if np.isinf(track.freedom):
-        return 0.0
-    return max(estimate.offset - track.level + track.blur * estimate.value, 0.0)
 
 
 def _estimated_alike(

@@ -131,7 +131,9 @@ class Steps:
         if kept is not None:
             steady, vectors = steady[kept], vectors[kept]
         rows = steady.reshape(vectors.size, -1)
-        mean: Floats = np.linalg.lstsq(rows, vectors.ravel(), rcond=None)[0].astype(np.float64)
+        # The columns are orthogonal, or nearly so: squaring them loses no digits.
+        normal = rows.T @ rows, rows.T @ vectors.ravel()
+        mean: Floats = np.linalg.lstsq(*normal, rcond=None)[0].astype(np.float64)
         return replace(self, vectors=self.vectors - self.steady @ mean), mean
 
 
@@ -174,6 +176,10 @@ class NoisySteps:
     level: float
     drift: bool = False
     steady: Floats = field(default_factory=lambda: np.zeros(0))
+
+    def theta_at(self, D: float, offset: float) -> float:
+        """Return the free part of the noise: the offset is theta + level - blur D."""
+        return 0.0 if np.isinf(self.freedom) else max(offset - self.level + self.blur * D, 0.0)
 
     @classmethod
     def of(cls, steps: Steps, noise: Noise) -> NoisySteps:

@@ -20,9 +20,16 @@ from perrin.errors import TooFewFramesError
 from perrin.motion.rigid_motion import RigidMotion
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Generator, Mapping, Sequence
+    from typing import TypeAlias
 
     from perrin._arrays import Bools, Floats, Ints
+    from perrin.diffusion.likelihood import ProfilePoint
+
+    # Points at which motions are to be filtered, and what filtering them gives.
+    _Requests: TypeAlias = list[tuple["SwitchingSteps", Floats]]
+    _Answers: TypeAlias = list[tuple[Floats, Floats]]
+    _Search: TypeAlias = Generator[_Requests, _Answers, "SwitchingEstimate"]
 
 # Fewer steps cannot show two states: an alternation of a few dwell times needs this many.
 _FEWEST_SWITCHING_STEPS = 20
@@ -42,6 +49,9 @@ _LEAST_RATIO = 0.2
 _UNEQUAL_AXES_TEST = 15.09
 
 _NEWTON_ROUNDS = 60
+
+# Points at which motions are filtered at once; more do not stay in the processor's cache.
+_MOST_POINTS = 700
 
 # The search ends where the next step would raise the log-likelihood by less than this.
 _CONVERGED = 1e-10
@@ -278,88 +288,213 @@ class SwitchingSteps:
         Li, Estimation and Tracking, section 11.6). Without noise this is the exact hidden Markov
         model; with equal D it is the exact Brownian likelihood.
         """
-        s, track, groups = self.track.steps, self.track, self.equal_axes
-        order = np.concatenate(groups)
-        sizes = np.array([len(axes) for axes in groups])
-        firsts, first_axes = np.cumsum([0, *sizes[:-1]]), [axes[0] for axes in groups]
-        group_of = np.repeat(np.arange(len(groups)), sizes) if len(groups) > 1 else slice(None)
-        count = sizes[:, None, None].astype(np.float64)
-        common_blur = track.blur - self.exposed
-        # Axes: steps, groups of axes, state before, state, points.
-        D, rate = np.exp(points[:, :2].T), np.exp(points[:, 2:4].T)
-        theta = np.exp(points[:, 4]) if self.free else np.full(len(points), track.theta)
-        before, after = (
-            theta * weight[:, first_axes, None] + known[:, first_axes, None] - common_blur * D[0]
-            for weight, known in zip(track.weight, track.known, strict=True)
-        )
-        blur = self.exposed * D
-        spread = 2 * D * s.duration[:, None, None] - 4 * blur
-        leaving = rate / rate.sum(axis=0)
-        leaving = leaving * -np.expm1(-rate.sum(axis=0) * self.elapsed[:, None, None])
-        (to_fast, to_slow), (slow, fast) = leaving.swapaxes(0, 1), (1 - leaving).swapaxes(0, 1)
-        transition = np.stack([np.stack([slow, to_fast], 1), np.stack([to_slow, fast], 1)], 1)
-        probability = rate[::-1] / rate.sum(axis=0)
-        still = np.zeros((len(order), 2, len(points)))
-        tops, totals, pairs = np.empty((len(s.vectors), len(points))), [], transition
-        for j, y in enumerate(s.vectors[:, order, None, None]):
-            if not self.follows[j]:
-                mean, variance = still, before[j][:, None] + 2 * blur
-            noise = after[j][:, None, None]
-            surprise = y + mean
-            square = np.add.reduceat(surprise * surprise, firsts, axis=0)
-            total = np.maximum(variance[:, :, None] + (spread[j] + noise), 1e-100)
-            deviance = count[..., None] * np.log(total) + square[:, :, None] / total
-            log_density = -0.5 * np.add.reduce(deviance, axis=0)
-            tops[j] = np.maximum.reduce(log_density, axis=(0, 1))
-            pairs[j] *= np.exp(log_density - tops[j])
-            joint = probability[:, None] * pairs[j] + 1e-300
-            both = joint[0] + joint[1]
-            totals.append(both[0] + both[1])
-            probability = both / totals[-1]
-            shared = noise - blur
-            gain = shared / total
-            share = joint / both * gain
-            mean = np.add.reduce(share[group_of] * surprise[:, :, None], axis=1)
-            second = np.add.reduce(share * gain * square[:, :, None], axis=1)
-            second -= np.add.reduceat(mean * mean, firsts, axis=0)
-            variance = noise[:, 0] + 2 * blur - shared[:, 0] * np.add.reduce(share, axis=1)
-            variance += second / count
-        value = np.sum(tops, axis=0) + np.sum(np.log(totals), axis=0)
-        if self.free and track.freedom:
-            value -= 0.5 * track.freedom * (np.log(theta) + track.theta / theta)
-        return value, pairs
+        return filtered_each([(self, points)])[0]
 
     def expansion(self, point: Floats) -> tuple[float, Floats, Floats]:
         """Return the log-likelihood at a point (5,) with its slopes (5,) and curvatures (5, 5)."""
-        unit = _DIFFERENCE * np.eye(5)
-        first, second = np.triu_indices(5, k=1)
-        across = unit[first] + unit[second]
-        offsets = np.concatenate([np.zeros((1, 5)), unit, -unit, across, -across])
-        value = self.filtered(point + offsets)[0]
-        center, up, down = value[0], value[1:6], value[6:11]
-        bent = up + down - 2 * center
-        curvature = np.diag(bent)
-        both = 0.5 * (value[11:21] + value[21:31] - 2 * center - bent[first] - bent[second])
-        curvature[first, second] = curvature[second, first] = both
-        return float(center), (up - down) / (2 * _DIFFERENCE), curvature / _DIFFERENCE**2
+        return expanded_about(self.filtered(around(point))[0])
 
     def fast_probability(self, point: Floats) -> Floats:
         """Return the probability of the fast state of every step, given all steps, (S,)."""
-        rate = np.exp(point[2:4])
-        forward, backward = rate[::-1] / rate.sum(), np.ones(2)
-        pairs = self.filtered(point[None])[1][..., 0]
-        seen = []
-        for pair in pairs:
-            forward = forward @ pair
-            forward = forward / forward.sum()
-            seen.append(forward)
-        fast = np.empty(len(pairs))
-        for j in range(len(pairs) - 1, -1, -1):
-            both = seen[j] * backward
-            fast[j] = both[1] / both.sum()
-            backward = pairs[j] @ backward
-            backward = backward / backward.sum()
-        return fast
+        return smoothed(self.filtered(point[None])[1], point[None, 2:4])[:, 0]
+
+
+def filtered_each(
+    requests: Sequence[tuple[SwitchingSteps, Floats]],
+) -> list[tuple[Floats, Floats]]:
+    """Filter several motions, each at points of its own, as `SwitchingSteps.filtered`.
+
+    Motions with equally many steps are filtered together.
+
+    Parameters
+    ----------
+    requests : sequence of tuple
+        Steps of each motion, and its points (P, 5).
+
+    Returns
+    -------
+    list of tuple
+        Log-likelihoods (P,) and weights (S, 2, 2, P) of each.
+
+    Examples
+    --------
+    >>> from perrin import Cluster, Noise, simulate_motion
+    >>> from perrin.diffusion import steps_of
+    >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=30, rng=3)
+    >>> track = NoisySteps.of(steps_of(truth, "rotation"), Noise())
+    >>> steps = SwitchingSteps.of(track, truth.time, exposed=0.0)
+    >>> point = np.log([[2e-3, 8e-3, 0.1, 0.1, 1e-9]])
+    >>> one, two = filtered_each([(steps, point), (steps, point)])
+    >>> one[0] == two[0]
+    array([ True])
+    """
+    alike: dict[tuple[int, ...], list[list[int]]] = {}
+    for k, (steps, points) in enumerate(requests):
+        sizes = [len(axes) for axes in steps.equal_axes]
+        groups = alike.setdefault((len(steps.elapsed), *sizes), [[]])
+        filled = sum(len(requests[i][1]) for i in groups[-1])
+        if groups[-1] and filled + len(points) > _MOST_POINTS:
+            groups.append([])
+        groups[-1].append(k)
+    found: dict[int, tuple[Floats, Floats]] = {}
+    for groups in alike.values():
+        for rows in groups:
+            value, pairs = _filtered_together([requests[k] for k in rows])
+            ends = np.cumsum([len(requests[k][1]) for k in rows])
+            for k, high in zip(rows, ends.tolist(), strict=True):
+                own = slice(high - len(requests[k][1]), high)
+                found[k] = value[own], pairs[..., own]
+    return [found[k] for k in range(len(requests))]
+
+
+def _filtered_together(requests: Sequence[tuple[SwitchingSteps, Floats]]) -> tuple[Floats, Floats]:
+    """Filter motions with equally many steps and axes at all points, one after the other."""
+    groups = requests[0][0].equal_axes
+    sizes = np.array([len(axes) for axes in groups])
+    firsts = np.cumsum([0, *sizes[:-1]])
+    group_of = np.repeat(np.arange(len(groups)), sizes) if len(groups) > 1 else slice(None)
+    count = sizes[:, None, None].astype(np.float64)
+    points = np.concatenate([own for _, own in requests])
+    counts = [len(own) for _, own in requests]
+
+    def by_point(part: Callable[[SwitchingSteps], Floats | Bools]) -> Floats:
+        """Return what belongs to each motion (...) for every point, (..., P)."""
+        each = np.stack([np.asarray(part(steps), np.float64) for steps, _ in requests], axis=-1)
+        return np.repeat(each, counts, axis=-1)
+
+    # Axes: steps, groups of axes, state before, state, points.
+    D, rate = np.exp(points[:, :2].T), np.exp(points[:, 2:4].T)
+    free = by_point(lambda s: np.array(s.free)) > 0
+    theta = np.where(free, np.exp(points[:, 4]), by_point(lambda s: np.array(s.track.theta)))
+    exposed = by_point(lambda s: np.array(s.exposed))
+    common_blur = by_point(lambda s: np.array(s.track.blur)) - exposed
+
+    def noise_of(end: int) -> Floats:
+        """Return the noise variance of the first or last frame of each step, by group of axes."""
+        weight = by_point(lambda s: s.track.weight[end][:, [own[0] for own in s.equal_axes]])
+        known = by_point(lambda s: s.track.known[end][:, [own[0] for own in s.equal_axes]])
+        return np.asarray(theta * weight + known - common_blur * D[0])
+
+    before, after = noise_of(0), noise_of(1)
+    blur = exposed * D
+    spread = 2 * D * by_point(lambda s: s.track.steps.duration)[:, None] - 4 * blur
+    leaving = rate / rate.sum(axis=0)
+    elapsed = by_point(lambda s: s.elapsed)[:, None]
+    leaving = leaving * -np.expm1(-rate.sum(axis=0) * elapsed)
+    (to_fast, to_slow), (slow, fast) = leaving.swapaxes(0, 1), (1 - leaving).swapaxes(0, 1)
+    transition = np.stack([np.stack([slow, to_fast], 1), np.stack([to_slow, fast], 1)], 1)
+    probability = rate[::-1] / rate.sum(axis=0)
+    vectors = by_point(lambda s: s.track.steps.vectors[:, np.concatenate(s.equal_axes)])[:, :, None]
+    follows = np.asarray(by_point(lambda s: s.follows) > 0)
+    tops, totals, pairs = np.empty((len(vectors), len(points))), [], transition
+    mean = np.zeros((vectors.shape[1], 2, len(points)))
+    variance = np.zeros((len(groups), 2, len(points)))
+
+    def by_group(x: Floats) -> Floats:
+        """Sum over the axes of each group."""
+        if len(groups) == 1:
+            return np.asarray(x.sum(axis=0, keepdims=True))
+        return np.asarray(np.add.reduceat(x, firsts, axis=0))
+
+    all_follow = np.asarray(follows.all(axis=1)).tolist()
+    for j, y in enumerate(vectors):
+        if not all_follow[j]:
+            start = before[j][:, None] + 2 * blur
+            mean, variance = np.where(follows[j], mean, 0.0), np.where(follows[j], variance, start)
+        noise = after[j][:, None, None]
+        surprise = y + mean
+        square = by_group(surprise * surprise)
+        total = np.maximum(variance[:, :, None] + (spread[j] + noise), 1e-100)
+        deviance = count[..., None] * np.log(total) + square[:, :, None] / total
+        log_density = -0.5 * np.add.reduce(deviance, axis=0)
+        tops[j] = np.maximum.reduce(log_density, axis=(0, 1))
+        pairs[j] *= np.exp(log_density - tops[j])
+        joint = probability[:, None] * pairs[j] + 1e-300
+        both = joint[0] + joint[1]
+        totals.append(both[0] + both[1])
+        probability = both / totals[-1]
+        shared = noise - blur
+        gain = shared / total
+        share = joint / both * gain
+        mean = np.add.reduce(share[group_of] * surprise[:, :, None], axis=1)
+        second = np.add.reduce(share * gain * square[:, :, None], axis=1)
+        second -= by_group(mean * mean)
+        variance = noise[:, 0] + 2 * blur - shared[:, 0] * np.add.reduce(share, axis=1)
+        variance += second / count
+    value = np.sum(tops, axis=0) + np.sum(np.log(totals), axis=0)
+    freedom = np.where(free, by_point(lambda s: np.array(s.track.freedom if s.free else 0.0)), 0.0)
+    if freedom.any():
+        prior = by_point(lambda s: np.array(s.track.theta)) / theta
+        value -= 0.5 * freedom * (np.log(theta) + prior)
+    return value, pairs
+
+
+def around(point: Floats) -> Floats:
+    """Return a point (5,) and those from which its slopes and curvatures follow, (31, 5).
+
+    Examples
+    --------
+    >>> around(np.zeros(5)).shape
+    (31, 5)
+    """
+    unit = _DIFFERENCE * np.eye(5)
+    first, second = np.triu_indices(5, k=1)
+    across = unit[first] + unit[second]
+    moves = np.concatenate([np.zeros((1, 5)), unit, -unit, across, -across])
+    return np.asarray(point + moves)
+
+
+def expanded_about(value: Floats) -> tuple[float, Floats, Floats]:
+    """Return value, slopes (5,) and curvatures (5, 5) from the values (31,) at `around`.
+
+    Examples
+    --------
+    >>> value, slope, _ = expanded_about(around(np.array([3.0, 0, 0, 0, 0])).sum(axis=1))
+    >>> value, slope.round(9).tolist()
+    (3.0, [1.0, 1.0, 1.0, 1.0, 1.0])
+    """
+    first, second = np.triu_indices(5, k=1)
+    center, up, down = value[0], value[1:6], value[6:11]
+    bent = up + down - 2 * center
+    curvature = np.diag(bent)
+    both = 0.5 * (value[11:21] + value[21:31] - 2 * center - bent[first] - bent[second])
+    curvature[first, second] = curvature[second, first] = both
+    return float(center), (up - down) / (2 * _DIFFERENCE), curvature / _DIFFERENCE**2
+
+
+def smoothed(pairs: Floats, log_rate: Floats) -> Floats:
+    """Return the probability of the fast state of every step, given all steps.
+
+    Parameters
+    ----------
+    pairs : ndarray, shape (S, 2, 2, P)
+        Weights of the pairs of states, as `SwitchingSteps.filtered` returns them.
+    log_rate : ndarray, shape (P, 2)
+        Logarithms of the rates of leaving the slow and the fast state, 1/s.
+
+    Returns
+    -------
+    ndarray, shape (S, P)
+
+    Examples
+    --------
+    >>> smoothed(np.ones((3, 2, 2, 1)), np.zeros((1, 2)))[:, 0]
+    array([0.5, 0.5, 0.5])
+    """
+    rate = np.exp(log_rate.T)
+    forward, backward = rate[::-1] / rate.sum(axis=0), np.ones_like(rate)
+    seen = np.empty((len(pairs), *forward.shape))
+    for j, pair in enumerate(pairs):
+        forward = (forward[:, None] * pair).sum(axis=0)
+        forward = forward / forward.sum(axis=0)
+        seen[j] = forward
+    fast = np.empty((len(pairs), forward.shape[1]))
+    for j in range(len(pairs) - 1, -1, -1):
+        both = seen[j] * backward
+        fast[j] = both[1] / both.sum(axis=0)
+        backward = (pairs[j] * backward).sum(axis=1)
+        backward = backward / backward.sum(axis=0)
+    return fast
 
 
 def equalised_steps(motion: RigidMotion, quantity: Quantity) -> Steps:
@@ -468,6 +603,67 @@ def fit_switching(
         faults.append("motion: expected one or more motions, all in 2 or all in 3 dimensions")
     refuse(faults)
     settings = Noise.of(noise, exposure=exposure)
+    found = fit_switching_each([motions], quantity=quantity, noise=settings)[0]
+    if isinstance(found, ValueError):
+        raise found
+    return found
+
+
+def fit_switching_each(
+    pools: Sequence[Sequence[RigidMotion]], *, quantity: Quantity, noise: Noise
+) -> list[SwitchingEstimate | ValueError]:
+    """Fit two states to several pools of motions, each alone, as `fit_switching`; all together.
+
+    Parameters
+    ----------
+    pools : sequence of sequence of RigidMotion
+        Motions that share their coefficients and rates.
+    quantity : {"rotation", "translation"}
+    noise : Noise
+
+    Returns
+    -------
+    list of SwitchingEstimate or ValueError
+        The error that `fit_switching` raises, where there is no fit.
+
+    Examples
+    --------
+    >>> from perrin import Cluster, Noise, Switching, simulate_motion
+    >>> truth = simulate_motion(
+    ...     Cluster.tetrahedron(1.5),
+    ...     D_R=1e-3,
+    ...     dt=1.0,
+    ...     n_frames=100,
+    ...     dynamics=Switching(10, dwell=20.0),
+    ...     rng=3,
+    ... )
+    >>> one, two = fit_switching_each([[truth], [truth]], quantity="rotation", noise=Noise())
+    >>> one.D_fast.value == two.D_fast.value
+    True
+    """
+    searches: dict[int, _Search] = {}
+    found: dict[int, SwitchingEstimate | ValueError] = {}
+    for k, motions in enumerate(pools):
+        try:
+            searches[k] = _two_states(motions, quantity, noise)
+        except ValueError as error:
+            found[k] = error
+    # All searches take their steps at the same time, so that the motions are filtered together.
+    asked = {k: next(search) for k, search in searches.items()}
+    while asked:
+        answers = iter(filtered_each([one for requests in asked.values() for one in requests]))
+        after = {}
+        for k, requests in asked.items():
+            try:
+                after[k] = searches[k].send([next(answers) for _ in requests])
+            except StopIteration as end:
+                found[k] = end.value
+        asked = after
+    return [found[k] for k in range(len(pools))]
+
+
+def _two_states(motions: Sequence[RigidMotion], quantity: Quantity, settings: Noise) -> _Search:
+    """Check the motions of one pool, and return the search for their two states."""
     pooled_steps(motions, quantity)  # names the motion that has too few steps
     tracks = [NoisySteps.of(equalised_steps(m, quantity), settings) for m in motions]
     count = sum(len(t.steps.duration) for t in tracks)
@@ -485,13 +681,26 @@ def fit_switching(
         for t, m in zip(tracks, motions, strict=True)
     ]
     least = 1e-6 * likelihood.mean_square
-    shared, noises, value, covariance = _most_likely(
-        steps, float(one.D[0]), np.log(np.maximum(one.theta, least))
-    )
+    log_theta = np.log(np.maximum(one.theta, least))
+    return _estimated(motions, steps, one, log_theta, quantity)
+
+
+def _estimated(
+    motions: Sequence[RigidMotion],
+    steps: Sequence[SwitchingSteps],
+    one: ProfilePoint,
+    log_theta: Floats,
+    quantity: Quantity,
+) -> _Search:
+    """Search for the two states of a pool; the estimate is what the search returns."""
+    shared, noises, value, covariance = yield from _most_likely(steps, float(one.D[0]), log_theta)
+    count = sum(len(s.elapsed) for s in steps)
+    points = [np.append(shared, own)[None] for own in noises]
+    filtered = yield list(zip(steps, points, strict=True))
     states, probability = [], []
-    for track, m, own in zip(steps, motions, noises, strict=True):
+    for track, m, point, (_, pairs) in zip(steps, motions, points, filtered, strict=True):
         fast = np.full(len(m.time), np.nan)
-        fast[track.track.steps.stop] = track.fast_probability(np.append(shared, own))
+        fast[track.track.steps.stop] = smoothed(pairs, point[:, 2:4])[:, 0]
         probability.append(fast)
         states.append(np.where(np.isnan(fast), -1, fast > 0.5).astype(np.int64))
     gain = value - float(one.value[0])
@@ -521,11 +730,12 @@ def fit_switching(
 
 def _most_likely(
     steps: Sequence[SwitchingSteps], D: float, log_theta: Floats
-) -> tuple[Floats, Floats, float, Floats]:
-    """Return the most likely parameters: shared (4,), noise (G,), value, covariance.
+) -> Generator[_Requests, _Answers, tuple[Floats, Floats, float, Floats]]:
+    """Search for the most likely parameters: shared (4,), noise (G,), value, covariance.
 
-    `D` and `log_theta` (G,) are those of one D; the parameters are logarithms, and the covariance
-    is that of all of them, NaN where the data do not bound a parameter.
+    The points at which the likelihood is needed are yielded. `D` and `log_theta` (G,) are those of
+    one D; the parameters are logarithms, and the covariance is that of all of them, NaN where the
+    data do not bound a parameter.
     """
     dt = float(np.median(np.concatenate([s.track.steps.duration for s in steps])))
     grid = np.array(
@@ -538,26 +748,29 @@ def _most_likely(
         ]
     )
     moved = np.log(grid)
-    height = np.zeros(len(grid))
-    for track, own in zip(steps, log_theta, strict=True):
-        height += track.filtered(moved + np.array([0, 0, 0, 0, own]))[0]
+    trials = [moved + np.array([0, 0, 0, 0, own]) for own in log_theta]
+    filtered = yield list(zip(steps, trials, strict=True))
+    height = np.sum([values for values, _ in filtered], axis=0)
     best = moved[np.argmax(height)]
     x = np.concatenate([best[:4], best[4] + log_theta])
     longest = max(float(s.elapsed.sum()) for s in steps) + dt
     slowest, quickest = np.log(0.1 / longest), np.log(3.0 / dt)
     fixed = np.array([False] * 4 + [not s.free for s in steps])
 
-    def expanded(x: Floats) -> tuple[float, Floats, Floats]:
+    def expanded(
+        x: Floats,
+    ) -> Generator[_Requests, _Answers, tuple[float, Floats, Floats]]:
         value, slope, curvature = 0.0, np.zeros(len(x)), np.zeros((len(x), len(x)))
-        for g, track in enumerate(steps):
-            rows = np.array([0, 1, 2, 3, 4 + g])
-            part = track.expansion(x[rows])
+        every = [np.array([0, 1, 2, 3, 4 + g]) for g in range(len(steps))]
+        filtered = yield [(s, around(x[rows])) for s, rows in zip(steps, every, strict=True)]
+        for rows, (values, _) in zip(every, filtered, strict=True):
+            part = expanded_about(values)
             value += part[0]
             slope[rows] += part[1]
             curvature[np.ix_(rows, rows)] += part[2]
         return value, np.where(fixed, 0.0, slope), curvature
 
-    here, damping = expanded(x), 1e-3
+    here, damping = (yield from expanded(x)), 1e-3
     for _ in range(_NEWTON_ROUNDS):
         value, slope, curvature = here
         free = ~fixed
@@ -574,7 +787,9 @@ def _most_likely(
             break
         trial = x + step
         trial[2:4] = np.clip(trial[2:4], slowest, quickest)
-        there = expanded(trial) if trial[0] <= trial[1] else (-np.inf, slope, curvature)
+        there = -np.inf, slope, curvature
+        if trial[0] <= trial[1]:
+            there = yield from expanded(trial)
         if there[0] >= value:
             x, here, damping = trial, there, damping / 10
         else:

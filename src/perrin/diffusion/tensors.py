@@ -40,7 +40,7 @@ from perrin.errors import PrecisionWarning, TooFewFramesError
 from perrin.geometry.rigid import diffusion_center, shifted
 from perrin.geometry.rotations import kabsch
 from perrin.geometry.shapes import pair_distances
-from perrin.geometry.symmetry import point_group, schoenflies, symmetry_elements
+from perrin.geometry.symmetry import point_group, symmetry_elements
 from perrin.motion.rigid_motion import RigidMotion
 
 if TYPE_CHECKING:
@@ -55,7 +55,7 @@ if TYPE_CHECKING:
 _NOISELESS = 1e-8
 
 # About this many step components are evaluated at once; more do not stay in the processor's cache.
-_MOST_TENSORS_AT_ONCE = 30_000
+_MOST_TENSORS_AT_ONCE = 60_000
 
 # Beyond this log ratio of noise to motion one of the two is as good as none.
 _FARTHEST = 20.0
@@ -408,7 +408,7 @@ def imposed_symmetry(motion: RigidMotion, wanted: str | None) -> tuple[str, Floa
     tolerance = motion.template_error
     elements = motion.symmetry_elements
     if wanted is None and elements is not None:
-        return schoenflies(elements), invariant_basis(elements)
+        return motion.point_group, invariant_basis(elements)
     seen = []
     gap = pair_distances(motion.template).min()
     while tolerance <= 0.3 * gap:

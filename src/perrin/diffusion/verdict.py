@@ -31,7 +31,7 @@ from perrin.diffusion.goodness_of_fit import (
 )
 from perrin.diffusion.noise_model import Noise, noise_faults
 from perrin.diffusion.steps import Quantity
-from perrin.diffusion.switching import SwitchingEstimate, fit_switching
+from perrin.diffusion.switching import SwitchingEstimate, fit_switching_each
 from perrin.errors import PrecisionWarning
 from perrin.motion.rigid_motion import RigidMotion
 
@@ -240,15 +240,16 @@ def judge_motion(
     refuse(faults)
     settings = Noise.of(noise, exposure=exposure)
     tested = brownian_tests_of_each([axis_model(m, quantity, settings) for m in motions])
-    each = tuple(
+    singly = [
         _verdict([m], [one], quantity, settings) for m, one in zip(motions, tested, strict=True)
-    )
+    ]
+    each = tuple(_with_states(motions, singly, settings))
     if len(motions) == 1:
         return each[0]
     together = _verdict(motions, tested, quantity, settings)
     counts = Counter(one.kind for one in each).most_common()
-    singly = ", ".join(f"{count} {kind}" for kind, count in counts)
-    return replace(together, text=f"{together.text} Singly: {singly}.", each=each)
+    kinds = ", ".join(f"{count} {kind}" for kind, count in counts)
+    return replace(together, text=f"{together.text} Singly: {kinds}.", each=each)
 
 
 def _verdict(
@@ -292,7 +293,7 @@ def _verdict(
         kind, model = _shape(motions, tested, quantity, settings)
         text = _model_text(kind, model, quantity)
         return replace(verdict, kind=kind, model=model, text=_with_p(text, p_family))
-    return _variance(verdict, motions, tested, settings)
+    return _variance(verdict, motions, tested)
 
 
 def combined_p(tested: Sequence[BrownianTests]) -> dict[str, float]:
@@ -407,7 +408,6 @@ def _variance(
     verdict: MotionVerdict,
     motions: Sequence[RigidMotion],
     tested: Sequence[BrownianTests],
-    settings: Noise,
 ) -> MotionVerdict:
     """Tell a few long steps from a D that changes, and a D that changes from noise that does.
 
@@ -433,20 +433,33 @@ def _variance(
         return _jumps(verdict, rows if len(motions) == 1 else [])
     if slow_change < clustering and _noise_changes(motions, tested):
         return _changing_noise(verdict)
-    if len(motions) > 1:
-        # Every body has states of its own: the verdicts on each hold the fits.
-        text = f"The diffusion coefficient of the {quantity} changes in time"
-        return replace(verdict, kind="changing D", text=_with_p(text, verdict.p_family))
-    try:
-        model = fit_switching(motions[0], quantity=quantity, noise=settings)
-    except ValueError:
-        # The steps are all noise: with D = 0 it is the noise that changes.
-        return _changing_noise(verdict)
-    if model.dwell_fast.value < motions[0].usual_interval:
-        # A state that lasts less than a frame is single long steps.
-        return _jumps(verdict, np.flatnonzero(model.states[0] == 1).tolist())
-    text = _model_text("changing D", model, quantity)
-    return replace(verdict, kind="changing D", model=model, text=_with_p(text, verdict.p_family))
+    # Every body has states of its own: the verdicts on each hold the fits.
+    text = f"The diffusion coefficient of the {quantity} changes in time"
+    return replace(verdict, kind="changing D", text=_with_p(text, verdict.p_family))
+
+
+def _with_states(
+    motions: Sequence[RigidMotion], verdicts: Sequence[MotionVerdict], settings: Noise
+) -> list[MotionVerdict]:
+    """Return the verdicts on single motions with the two states of each whose D changes."""
+    judged = list(verdicts)
+    changing = [k for k, one in enumerate(verdicts) if one.kind == "changing D"]
+    if not changing:
+        return judged
+    pools = [[motions[k]] for k in changing]
+    fits = fit_switching_each(pools, quantity=verdicts[changing[0]].quantity, noise=settings)
+    for k, model in zip(changing, fits, strict=True):
+        verdict = replace(verdicts[k], kind="diffusion")
+        if isinstance(model, ValueError):
+            # The steps are all noise: with D = 0 it is the noise that changes.
+            judged[k] = _changing_noise(verdict)
+        elif model.dwell_fast.value < motions[k].usual_interval:
+            # A state that lasts less than a frame is single long steps.
+            judged[k] = _jumps(verdict, np.flatnonzero(model.states[0] == 1).tolist())
+        else:
+            text = _with_p(_model_text("changing D", model, verdict.quantity), verdict.p_family)
+            judged[k] = replace(verdict, kind="changing D", model=model, text=text)
+    return judged
 
 
 def _changing_noise(verdict: MotionVerdict) -> MotionVerdict:

@@ -103,6 +103,7 @@ from perrin.images.optics.learn import (
     neighbour_variance,
     photon_transfer,
     saturated_share,
+    without_clipped,
 )
 from perrin.images.optics.learn_radial import (
     RadialSample,
@@ -116,6 +117,7 @@ from perrin.images.optics.learn_radial import (
 )
 from perrin.images.optics.microscope import Camera, Light, RenderSettings, Scan
 from perrin.images.optics.optics import CameraNoise, Optics
+from perrin.images.optics.point_spread import BeadStack, PointSpread, measure_point_spread
 from perrin.images.optics.radial_image import (
     Patch,
     PatchFit,
@@ -190,6 +192,7 @@ __all__ = [
     "Arrangement",
     "ArrayFrames",
     "BallBlur",
+    "BeadStack",
     "Camera",
     "CameraNoise",
     "Contents",
@@ -218,6 +221,7 @@ __all__ = [
     "PatchFit",
     "Pick",
     "PlaneFit",
+    "PointSpread",
     "Pose",
     "PsfTail",
     "RadialImage",
@@ -312,6 +316,7 @@ __all__ = [
     "log_likelihood",
     "lsm_scale",
     "mass_cut",
+    "measure_point_spread",
     "metaseries_scale",
     "missing_spheres",
     "name_counters",
@@ -371,6 +376,7 @@ __all__ = [
     "with_crowds",
     "with_poses",
     "within",
+    "without_clipped",
     "without_doubles",
     "write_imaging",
     "write_stack",

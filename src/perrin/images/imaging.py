@@ -106,6 +106,10 @@ class Imaging:
         How positions were refined, as in `locate`.
     radial : RadialImage or None
         The image of a sphere of a 2-D movie; None without refinement by the model.
+    distance_error : float or None
+        Relative error of the distances in a body that is the same in all frames: the deviation of
+        touching spheres from `contact`, or the error of their mean where that is larger; None where
+        no spheres of a cluster touch.
     other_optics : tuple of Optics
         `optics` of the other channels, where each channel shows one kind of sphere.
     channel_offsets : tuple of tuple of float
@@ -125,6 +129,7 @@ class Imaging:
     dark: bool
     refine: str | None
     radial: RadialImage | None = None
+    distance_error: float | None = None
     other_optics: tuple[Optics, ...] = ()
     channel_offsets: tuple[tuple[float, ...], ...] = ()
 
@@ -164,8 +169,8 @@ class Imaging:
         entry = {name: to_plain(getattr(self, name)) for name in _IMAGING_SETTINGS}
         entry["other_optics"] = [optics.to_dict() for optics in self.other_optics]
         entry["channel_offsets"] = [list(offset) for offset in self.channel_offsets]
-        # What only 2-D movies and movies of several channels have is not written for others.
-        for name in ("radial", "other_optics", "channel_offsets"):
+        # What only some movies have is not written for others.
+        for name in ("radial", "distance_error", "other_optics", "channel_offsets"):
             if not getattr(self, name):
                 del entry[name]
         return entry

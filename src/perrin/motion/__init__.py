@@ -68,7 +68,6 @@ from perrin.motion.rigidity import (
     judge_each,
     judge_quality,
     misplaced_detections,
-    symmetries_of_each,
 )
 from perrin.motion.rods import LEAP_UNLABELLED, SETTLED_LOG_ODDS, RodMotion, track_direction
 from perrin.motion.scanning import ScannedFit, fit_scanned, scan_share
@@ -144,7 +143,6 @@ __all__ = [
     "scan_share",
     "simulate_motion",
     "step_residuals",
-    "symmetries_of_each",
     "threshold_displacement",
     "threshold_references",
     "track_direction",

@@ -79,7 +79,7 @@ def fit_template(x: Floats, seen: Bools) -> PoseFit:
     fit, faults = fit_templates(x[None], seen[None])
     if faults[0] is not None:
         raise faults[0]
-    return PoseFit(*(part[0] for part in fit))
+    return PoseFit(*(np.asarray(part)[0] for part in fit))
 
 
 def fit_templates(
@@ -122,7 +122,8 @@ def fit_templates(
         new = _centred_mean(_in_body(some, here, turned, before))
         back, known = fit_rotations(before, new)
         new = np.where(known[:, None, None], new @ np.swapaxes(back, -1, -2), new)
-        new = np.where(found.any(axis=1)[:, None, None], new, before)
+        usable = np.asarray(found.any(axis=1))
+        new = np.where(usable[:, None, None], new, before)
         change = np.nan_to_num(np.abs(new - before)).max(axis=(1, 2))
         arm = new - mean_present(new, axis=-2)[:, None]
         size = np.nan_to_num(np.abs(arm)).max(axis=(1, 2))
@@ -398,8 +399,7 @@ def _in_body(x: Floats, seen: Bools, rotation: Floats, shape: Floats) -> Floats:
     """Return the particles in the axes of the body, (..., T, n, d)."""
     center = _shape_centers(x, rotation, shape)
     turned: Floats = (x - center[..., None, :]) @ rotation
-    body: Floats = np.where(seen[..., None], turned, np.nan)
-    return body
+    return turned if seen.all() else np.where(seen[..., None], turned, np.nan)
 
 
 def _shape_centers(x: Floats, rotation: Floats, shape: Floats) -> Floats:

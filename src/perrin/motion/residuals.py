@@ -213,7 +213,7 @@ def sample_residuals(motions: Sequence[RigidMotion], positions: Floats) -> Resid
     (1, 300, 4, 3)
     """
     vector = residuals_of_each(motions, positions)
-    whole = np.isfinite(vector).all(axis=(2, 3))
+    whole = np.asarray(np.isfinite(vector).all(axis=(2, 3)))
     count = np.minimum(whole.sum(axis=1), _SAMPLED_FRAMES)
     rows = np.argsort(~whole, axis=1, kind="stable")[:, :_SAMPLED_FRAMES]
     for k in np.flatnonzero(whole.sum(axis=1) > _SAMPLED_FRAMES):
@@ -247,7 +247,7 @@ def _center_velocity(motions: Sequence[RigidMotion]) -> Floats:
     poses = np.array([m.fitted.size for m in motions])
     for size in np.unique(poses[poses >= 3]).tolist():
         bodies = np.flatnonzero(poses == size)
-        rows = np.stack([motions[k].fitted for k in bodies])
+        rows = np.stack([motions[k].fitted for k in bodies.tolist()])
         x, t = center[bodies[:, None], rows], time[bodies[:, None], rows]
         v = (x[:, 2:] - x[:, :-2]) / (t[:, 2:] - t[:, :-2])[..., None]
         v = v - np.median(v, axis=1, keepdims=True)
@@ -516,7 +516,7 @@ class AxisNoise(NamedTuple):
     def known(self) -> Bools:
         """Whether every variance is positive and its relative standard error at most 30 %."""
         diagonal = np.diagonal(self.covariance, axis1=-2, axis2=-1)
-        positive = (self.variance > 0).all(axis=-1)
+        positive = np.asarray((self.variance > 0).all(axis=-1))
         error = np.sqrt(np.where(positive[..., None], diagonal, np.inf))
         return np.asarray((error <= _VARIANCE_ERROR * self.variance).all(axis=-1) & positive)
 
@@ -560,7 +560,7 @@ def expected_squares(rotation: Floats, keeps: Floats) -> Floats:
     pairs = pairs.reshape(*rotation.shape[:-2], d * d, d * d)
     products = np.swapaxes(blocks, -1, -2) @ blocks
     sums = np.einsum("...x,...x->...", pairs @ products[..., None, :, :], pairs)
-    return sums.reshape(rotation.shape)
+    return np.asarray(sums.reshape(rotation.shape))
 
 
 def axis_noise(sample: Residuals) -> AxisNoise:
@@ -852,7 +852,8 @@ def body_residuals(motion: RigidMotion, positions: Floats) -> Floats:
     >>> bool(np.allclose(body_residuals(truth, truth.positions()), 0.0))
     True
     """
-    return residuals_of_each([motion], positions[None])[0]
+    residuals: Floats = residuals_of_each([motion], positions[None])[0]
+    return residuals
 
 
 def residuals_of_each(motions: Sequence[RigidMotion], positions: Floats) -> Floats:

@@ -24,7 +24,12 @@ from perrin._arrays import (
 from perrin._display import Shown
 from perrin.errors import TooFewFramesError
 from perrin.geometry.rotations import log_map, skew
-from perrin.geometry.symmetry import projected_on_line, symmetry_elements_of_each
+from perrin.geometry.symmetry import (
+    point_group,
+    projected_on_line,
+    schoenflies,
+    symmetry_elements_of_each,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -153,6 +158,13 @@ class RigidMotion(Shown):
         """
         find_symmetries([self])
         found: Floats | None = vars(self)["symmetry_elements"]
+        return found
+
+    @cached_property
+    def point_group(self) -> str:
+        """The point group of the template within its error (Schoenflies symbol)."""
+        find_symmetries([self])
+        found: str = vars(self)["point_group"]
         return found
 
     @cached_property
@@ -542,29 +554,40 @@ class RigidMotion(Shown):
 
 
 def find_symmetries(motions: Iterable[RigidMotion]) -> None:
-    """Find the point groups of several bodies together, for `RigidMotion.symmetry_elements`.
+    """Find the point groups of several bodies together.
+
+    They become `RigidMotion.symmetry_elements` and `RigidMotion.point_group` of each.
 
     Examples
     --------
     >>> from perrin import Cluster, simulate_motion
     >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=9, rng=3)
     >>> find_symmetries([truth])
-    >>> truth.symmetry_elements.shape
-    (24, 3, 3)
+    >>> truth.symmetry_elements.shape, truth.point_group
+    ((24, 3, 3), 'T_d')
     """
     alike: dict[int, list[tuple[RigidMotion, float]]] = {}
     for motion in motions:
         error = motion.template_error
         if motion.dimension == 2 or projected_on_line(motion.template, error) is not None:
             vars(motion)["symmetry_elements"] = None
+            vars(motion)["point_group"] = point_group(motion.template, tolerance=error)
         else:
             alike.setdefault(len(motion.template), []).append((motion, error))
+    symbols: dict[tuple[int, bytes], str] = {}
     for bodies in alike.values():
         templates = np.stack([motion.template for motion, _ in bodies])
         errors = np.array([error for _, error in bodies])
         found = symmetry_elements_of_each(templates, errors)
         for (motion, _), elements in zip(bodies, found, strict=True):
+            # Groups with the same angles between all their elements have the same symbol.
+            flat = elements.reshape(len(elements), -1)
+            angles = np.rint(1e4 * (flat @ flat.T)).astype(np.int64)
+            key = len(elements), angles.tobytes()
+            if key not in symbols:
+                symbols[key] = schoenflies(elements)
             vars(motion)["symmetry_elements"] = elements
+            vars(motion)["point_group"] = symbols[key]
 
 
 def _rotation_matrices(

@@ -19,7 +19,6 @@ from perrin._arrays import (
 )
 from perrin._display import Shown
 from perrin.geometry.shapes import pair_distances
-from perrin.geometry.symmetry import point_group, schoenflies
 from perrin.motion.residuals import (
     SIGNIFICANCE,
     Slope,
@@ -388,7 +387,7 @@ def _judge_alike(
         usual = np.where(stretched, stretch.sample.median_sigma, usual)
     flexing = _flexing_tests(bodies, all_residuals)
     imaging = _imaging_texts(scale, stretched, delay, blur, ratio is not None)
-    symmetries = symmetries_of_each(motions)
+    find_symmetries(motions)
     judged = []
     for k, (motion, body) in enumerate(zip(motions, bodies, strict=True)):
         misfit_rows = np.flatnonzero(misfit[k].any(axis=1))
@@ -431,7 +430,7 @@ def _judge_alike(
                 swaps=corrections[k].swaps,
                 cuts=corrections[k].cuts,
                 extra=corrections[k].extra,
-                symmetry=symmetries[k],
+                symmetry=motion.point_group,
                 fraction=motion.fitted.size / len(motion.time),
                 warnings=(*soft, *warnings),
                 notes=tuple(notes),
@@ -442,33 +441,6 @@ def _judge_alike(
             )
         )
     return judged
-
-
-def symmetries_of_each(motions: Sequence[RigidMotion]) -> list[str]:
-    """Return the point groups of bodies within the errors of their shapes (Schoenflies symbols).
-
-    Examples
-    --------
-    >>> from perrin import Cluster, simulate_motion
-    >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=0.02, dt=0.7, n_frames=9, rng=1)
-    >>> symmetries_of_each([truth])
-    ['T_d']
-    """
-    find_symmetries(motions)
-    symbols, known = [], dict[tuple[int, bytes], str]()
-    for motion in motions:
-        elements = motion.symmetry_elements
-        if elements is None:
-            symbols.append(point_group(motion.template, tolerance=motion.template_error))
-            continue
-        # Groups with the same angles between all their elements are turned against each other.
-        flat = elements.reshape(len(elements), -1)
-        angles = np.rint(1e4 * (flat @ flat.T)).astype(np.int64)
-        key = len(elements), angles.tobytes()
-        if key not in known:
-            known[key] = schoenflies(elements)
-        symbols.append(known[key])
-    return symbols
 
 
 def _imaging_texts(
@@ -630,7 +602,7 @@ def _flexing_tests(motions: Sequence[RigidMotion], residuals: Floats) -> list[li
     # Contribution of each particle's variance to the mean squares of all residuals.
     share = np.einsum("bnmij,bnmij->bnm", keeps, keeps)
     singular = np.linalg.svd(share, compute_uv=False)
-    whole = np.isfinite(residuals).all(axis=(2, 3))
+    whole = np.asarray(np.isfinite(residuals).all(axis=(2, 3)))
     following = whole[:, 1:] & whole[:, :-1]
     pairs = following.sum(axis=1)
     tested = np.flatnonzero((pairs >= 10) & ~(singular[:, 0] > 1e6 * singular[:, -1]))

@@ -21,6 +21,7 @@ from perrin.movie.checks import (
     combined_verdicts,
     depth_change,
     depth_dimming,
+    distance_error,
     empty_frames,
     error_ratio_shown,
     exceeds_rms,
@@ -63,7 +64,6 @@ from perrin.movie.hidden import (
 from perrin.movie.parts import PartWriter, open_parts, read_parts
 from perrin.movie.stacks import Settings, analyze_stack, with_own_times
 from perrin.movie.stages import Located, fit_poses, learn_method, locate_frames, run_frames
-from perrin.movie.workers import Work, check_workers, dask_client, work_through
 
 __all__ = [
     "Bodies",
@@ -75,7 +75,6 @@ __all__ = [
     "PartWriter",
     "Settings",
     "Verdict",
-    "Work",
     "analyze_stack",
     "bleached",
     "bleaching",
@@ -83,13 +82,12 @@ __all__ = [
     "channel_offset",
     "check_channels",
     "check_clusters",
-    "check_workers",
     "clusters_near_border",
     "combined_verdicts",
     "complete_bodies",
-    "dask_client",
     "depth_change",
     "depth_dimming",
+    "distance_error",
     "empty_frames",
     "error_ratio_shown",
     "exceeds_rms",
@@ -132,5 +130,4 @@ __all__ = [
     "with_own_times",
     "with_spheres",
     "with_true_errors",
-    "work_through",
 ]

@@ -239,8 +239,8 @@ def saturated_frames(frames: pd.DataFrame) -> Findings:
     text = (
         f"saturated voxels: up to {100 * np.nanmax(share):.2g} % of a frame pile up at its highest "
         f"value, in {over.sum()} of {len(frames)} frames (chance of one such frame without "
-        "saturation under 1e-6); their intensity is lost and positions may be biased; reduce gain "
-        "or laser power"
+        "saturation under 1e-6); they and the voxels beside them are left out of the fits of a "
+        "volume, so that positions are less exact; reduce gain or laser power"
     )
     return Findings((text,))
 
@@ -515,7 +515,8 @@ def pair_distance_bias(
             f"distances of touching spheres read {100 * abs(off):.2g} +- "
             f"{100 * error / contact:.1g} % {'short' if off < 0 else 'long'} of the contact "
             f"distance {contact:.4g} um: a point spread that the model does not describe, unequal "
-            "spheres, or the contact itself; the shape and its R have this error, D is not affected"
+            "spheres, or the contact itself; the stated errors of the shape contain it, and D is "
+            "not affected"
         )
         return Findings(notes=(text,))
     why = (
@@ -697,6 +698,36 @@ def mean_pair_distance(
     spheres = len(tracked[["cluster", "particle"]].drop_duplicates())
     scatter = float(np.std(np.bincount(which, every) / count, ddof=1))
     return mean, scatter / np.sqrt(spheres / 2)
+
+
+def distance_error(features: pd.DataFrame, *, contact: float, axes: list[str]) -> float | None:
+    """Return the relative error of distances that is the same in all frames, from touching spheres.
+
+    Rigid residuals do not show it. It is the deviation of the mean distance of touching spheres
+    from the contact distance, or the error of this mean where that is larger.
+
+    Parameters
+    ----------
+    features, contact, axes
+        As in `mean_pair_distance`.
+
+    Returns
+    -------
+    float or None
+        None where no spheres of a cluster touch.
+
+    Examples
+    --------
+    >>> import pandas as pd
+    >>> pair = {"frame": [0, 0, 1, 1], "cluster": 0, "particle": [0, 1, 0, 1]}
+    >>> table = pd.DataFrame(pair | {"x": [0, 1.98, 0, 1.98], "y": 0.0})
+    >>> round(distance_error(table, contact=2.0, axes=["x", "y"]), 6)
+    0.01
+    """
+    mean, stderr = mean_pair_distance(features, contact=contact, axes=axes)
+    if not np.isfinite(mean):
+        return None
+    return max(abs(mean - contact), float(np.nan_to_num(stderr))) / contact
 
 
 def missing_spheres(

@@ -12,6 +12,7 @@ from perrin._arrays import frozen
 from perrin._text import listed
 from perrin.geometry.rotations import kabsch
 from perrin.geometry.shapes import pair_distances
+from perrin.images.optics.learn import without_clipped
 from perrin.images.optics.window_fit import RigidCenters, cut_window, fit_window
 from perrin.movie.checks import Findings
 from perrin.run.kinds import matched_particles, shape_numbers
@@ -365,7 +366,7 @@ class _Trial:
             beyond.append(away[len(start) :] > -_INSIDE * self.diameter)
             ratio = np.full(len(places), np.nan)
             if shown[len(start) :].any():
-                frame = np.asarray(self.stack.frame(int(frames[row])), dtype=np.float64)
+                frame = without_clipped(np.asarray(self.stack.frame(int(frames[row]))))
                 there = self.features[self.features["frame"] == frames[row]]
                 others = there.loc[there["cluster"] != cluster, ["x", "y", "z"]].to_numpy(float)
                 # What was taken for another sphere at one of the places is this one.

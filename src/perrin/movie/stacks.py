@@ -38,10 +38,10 @@ from perrin.movie.colours import (
 )
 from perrin.movie.hidden import complete_bodies
 from perrin.movie.stages import Located, fit_poses, locate_frames
-from perrin.movie.workers import Work, check_workers
 from perrin.run.experiment import Experiment, MotionModel, Recording, merged_experiment
 from perrin.run.folders import claimed_folder
 from perrin.run.measure import library_version, measure_free_spheres, measure_table
+from perrin.run.workers import Work, check_workers
 from perrin.tracks.clock import Clock, evenly_spaced
 
 if TYPE_CHECKING:
@@ -52,12 +52,13 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from perrin.images.optics.optics import Optics
+    from perrin.images.optics.point_spread import PointSpread
     from perrin.images.spheres.localisation import Refine
     from perrin.images.stack import Stack
     from perrin.motion.rigid_motion import RigidMotion
-    from perrin.movie.workers import Progress
     from perrin.run.measure import FittedBody
     from perrin.run.results import Report
+    from perrin.run.workers import Progress
 
 
 # Poses are fitted to the images where less than this share of the variance of the orientation is
@@ -118,6 +119,7 @@ def analyze_stack(
     exclude: Iterable[int] = (),
     refine: Refine = "model",
     optics: Optics | None = None,
+    psf: PointSpread | None = None,
     spots: Spots | None = None,
     experiment: Experiment | None = None,
     work: Work | None = None,
@@ -145,7 +147,7 @@ def analyze_stack(
         First frame, and first frame that is not used, as in a slice.
     exclude : iterable of int
         Numbers of clusters to leave out; the others keep theirs.
-    refine, optics
+    refine, optics, psf
         As in `locate`. With "model" poses are fitted to the images as well.
     spots : Spots, optional
         How spheres are distinguished from noise.
@@ -227,6 +229,7 @@ def analyze_stack(
         contact=contact,
         refine=refine,
         crowds=True,  # clusters that meet may be a crowd for some frames
+        psf=psf,
     )
     faults += _faults_of(check_search, stack, search, refine, optics=optics)
     sizes = _wanted_sizes(size, faults)
@@ -656,6 +659,9 @@ def _imaging(
         contact=search.contact,
         dark=search.dark,
         refine=first.method.refine,
+        distance_error=checks.distance_error(
+            bodies.features, contact=search.contact, axes=bodies.axes
+        ),
         other_optics=tuple(one.method.optics for one in located[1:] if one.method.optics),
         channel_offsets=tuple(
             () if offset is None else tuple(offset.value.tolist()) for offset in offsets

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 import numpy as np
 
 from perrin.errors import DamagedFileError, FrameError, PrecisionWarning, TooFewFramesError
-from perrin.images.optics.learn import UsualImage
+from perrin.images.optics.learn import UsualImage, without_clipped
 from perrin.images.optics.optics import Optics
 from perrin.images.optics.radial_image import RadialImage
 from perrin.images.optics.window_fit import RigidCenters
@@ -20,7 +20,7 @@ from perrin.images.spheres.poses import Pose, pose_in, with_poses
 from perrin.images.spheres.spots import Fading
 from perrin.movie.checks import Findings, unsettled_poses
 from perrin.movie.parts import PartWriter, open_parts, read_parts
-from perrin.movie.workers import work_through
+from perrin.run.workers import work_through
 from perrin.tracks.checksums import read_sealed, write_sealed
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from perrin.images.spheres.localisation import Refine, Search
     from perrin.images.stack import Stack
     from perrin.motion.rigid_motion import RigidMotion
-    from perrin.movie.workers import Work
+    from perrin.run.workers import Work
 
 S = TypeVar("S")
 _METHOD_FILE = "method.json"
@@ -406,7 +406,7 @@ class _PoseTask:
     def __call__(self, item: _FramePoses) -> tuple[pd.DataFrame, dict[str, Any]]:
         import pandas as pd
 
-        frame = np.asarray(self.stack.frame(item.frame), dtype=np.float64)
+        frame = without_clipped(np.asarray(self.stack.frame(item.frame)))
         z, y, x = (float(h) for h in self.stack.voxel)
         image = self.optics.image((z, y, x))
         lines = []

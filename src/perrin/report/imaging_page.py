@@ -292,6 +292,8 @@ def _channel_facts(imaging: Imaging, optics: Optics) -> list[Fact]:
     size, psf_z, psf = (number_text(v, e) for v, e in zip(values, optics.stderr, strict=True))
     learned = "learned from the images" if any(optics.stderr) else "as stated"
     expected = f"{learned}; the expected diameter is {number_text(imaging.diameter)} µm"
+    if optics.shell:
+        expected += "; the surface of the spheres is fluorescent"
     tail = []
     if optics.tail is not None:
         wide_z, wide = (number_text(width) for width in optics.tail.psf)

@@ -199,8 +199,15 @@ def body_texts(result: ClusterResult, report: Report) -> dict[str, Any]:
         no_sizes = stated[0].partition(": ")[2]
     elif arguments.get("temperature") is None:
         no_sizes = "viscosity and temperature were not given"
-    body = f"in {d} dimensions, mean distance to the centre {number_text(motion.R)} µm"
     count = len(motion.template)
+    constant = None if report.imaging is None else report.imaging.distance_error
+    # The template is a mean over frames; an error of all distances alike is the same in each.
+    error = np.hypot(
+        np.nan_to_num(motion.sigma) / np.sqrt(motion.fitted.size * count),
+        motion.R * (constant or 0.0),
+    )
+    radius = number_text(motion.R, float(error))
+    body = f"in {d} dimensions, mean distance to the centre {radius} µm"
     diameter = arguments.get("diameter") or float(pair_distances(motion.template).min())
     return {
         "motion": [

@@ -1,5 +1,6 @@
 """From a track table to a Report, and the folder that holds it."""
 
+from perrin.run.batches import InOrder, batches_of, clusters_together, shared_work
 from perrin.run.experiment import Experiment, Recording, argument_faults, merged_experiment
 from perrin.run.folders import (
     check_place,
@@ -19,6 +20,7 @@ from perrin.run.measure import (
     MeasuredBody,
     add_predictions,
     complete_recording,
+    fit_batch,
     fit_bodies,
     fit_clusters,
     identity_remarks,
@@ -133,6 +135,7 @@ from perrin.run.singles import SingleSpheres, measure_singles, track_steps
 from perrin.run.statements import answer_lines, kinds_text, motion_sentences, verdict_lines
 from perrin.run.tables import analyze, read_table
 from perrin.run.verdicts import fit_model, judge_each_and_all, verdicts_from_dict, verdicts_to_dict
+from perrin.run.workers import Work, check_workers, dask_client, one_thread, work_through
 
 __all__ = [
     "BodyKind",
@@ -142,6 +145,7 @@ __all__ = [
     "Compared",
     "Experiment",
     "FittedBody",
+    "InOrder",
     "MeasuredBody",
     "Pooled",
     "Prediction",
@@ -154,6 +158,7 @@ __all__ = [
     "Shape",
     "ShapeMobility",
     "SingleSpheres",
+    "Work",
     "absent_frames_notes",
     "add_predictions",
     "analyze",
@@ -162,9 +167,12 @@ __all__ = [
     "argument_faults",
     "assign_clusters",
     "assumed_exposure_notes",
+    "batches_of",
     "check_place",
     "check_resumable",
+    "check_workers",
     "claimed_folder",
+    "clusters_together",
     "coefficients_html",
     "command_line",
     "common_jump_warnings",
@@ -179,6 +187,7 @@ __all__ = [
     "corrected_labels_text",
     "curve_table",
     "cut_text",
+    "dask_client",
     "disagreement_warning",
     "doubtful_ends_warning",
     "estimate_row",
@@ -188,6 +197,7 @@ __all__ = [
     "fast_turning_warnings",
     "filled_folder",
     "find_sizes",
+    "fit_batch",
     "fit_bodies",
     "fit_clusters",
     "fit_model",
@@ -240,6 +250,7 @@ __all__ = [
     "noise_floor_tests",
     "noise_floor_warning",
     "not_diffusion_warning",
+    "one_thread",
     "part_of",
     "perp_text",
     "persistence_warning",
@@ -252,6 +263,7 @@ __all__ = [
     "removed_drift_notes",
     "run_settings",
     "shape_numbers",
+    "shared_work",
     "soft_clusters_warning",
     "solve_bodies",
     "solve_shape",
@@ -274,6 +286,7 @@ __all__ = [
     "with_sizes",
     "with_step_tests",
     "without_jumps",
+    "work_through",
     "wrapped_box_text",
     "write_data",
 ]

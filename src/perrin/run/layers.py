@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -155,6 +154,8 @@ def napari_reader(path: str | list[str]) -> Callable[[str | list[str]], list[Lay
 
 def _seen_beside_its_plane() -> dict[str, Any]:
     """Return the option by which a sphere is drawn in the planes that it reaches."""
+    from importlib.metadata import PackageNotFoundError, version
+
     try:
         parts = version("napari").split(".")
     except PackageNotFoundError:

@@ -111,10 +111,14 @@ def _lock_file(folder: str | os.PathLike[str], place: Path) -> Iterator[None]:
         finally:
             silence.set()
             beat.join()
-            # Removed while it is locked: who opens it meanwhile notices that it is gone.
+            # Removed while it is locked: who opens it meanwhile notices that it is gone. Windows
+            # removes closed files only.
+            if os.name == "nt":
+                os.close(handle)
             with suppress(OSError):
                 path.unlink()
-            os.close(handle)
+            if os.name != "nt":
+                os.close(handle)
     finally:
         for made in above:
             with suppress(OSError):
@@ -143,7 +147,8 @@ def _acquired(path: Path, folder: str | os.PathLike[str]) -> int:
                 handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
             record = {"pid": os.getpid(), "host": _host(), "system": _system()}
             os.ftruncate(handle, 0)
-            os.pwrite(handle, json.dumps(record | {"since": time.time()}).encode(), 0)
+            os.lseek(handle, 0, os.SEEK_SET)
+            os.write(handle, json.dumps(record | {"since": time.time()}).encode())
         except FileExistsError:
             continue
         except BaseException:
@@ -190,7 +195,8 @@ class _Holder:
     def of(cls, handle: int) -> _Holder:
         """Read an open lock file; nothing is known where it is empty or damaged."""
         try:
-            record = json.loads(os.pread(handle, 4096, 0))
+            os.lseek(handle, 0, os.SEEK_SET)
+            record = json.loads(os.read(handle, 4096))
         except ValueError:
             record = {}
         return cls(record if isinstance(record, dict) else {}, os.fstat(handle).st_mtime)

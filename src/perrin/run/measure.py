@@ -6,8 +6,7 @@ import platform
 import warnings as python_warnings
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
-from functools import cache
-from itertools import islice
+from functools import cache, partial
 from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
@@ -15,7 +14,7 @@ import numpy as np
 from perrin._arrays import as_sigma
 from perrin.diffusion.changing import with_changing_interval
 from perrin.diffusion.estimate import DiffusionEstimate
-from perrin.diffusion.estimators import estimate_diffusion, estimate_each
+from perrin.diffusion.estimators import estimate_diffusion, estimate_each, estimate_pooled
 from perrin.diffusion.rods import estimate_rod
 from perrin.diffusion.step_tests import (
     Jumps,
@@ -47,6 +46,7 @@ from perrin.motion.rigidity import Corrections, Quality, judge_each
 from perrin.motion.rods import RodMotion, track_direction
 from perrin.motion.tracking import track_each, track_scanned
 from perrin.run import remarks as words
+from perrin.run.batches import batches_of, clusters_together, shared_work
 from perrin.run.experiment import Experiment, Recording
 from perrin.run.grouping import assign_clusters
 from perrin.run.kinds import shape_numbers, usual_symmetry
@@ -93,6 +93,8 @@ if TYPE_CHECKING:
     from perrin.diffusion.tensor_results import DiffusionTensor
     from perrin.diffusion.verdict import MotionVerdict
     from perrin.motion.floor import NoiseFloor
+    from perrin.run.batches import InOrder
+    from perrin.run.workers import Work
 
     Progress: TypeAlias = Callable[[int, int, str], None]
 
@@ -109,10 +111,6 @@ _STEADY_LEVEL = 1e-3
 # A motion that is not diffusion is a warning below this p-value, shared by both quantities, and
 # half of it by all clusters where several are also judged together.
 _VERDICT_LEVEL = 0.005
-
-# Clusters that are fitted and measured at a time: a tenth of them, so that progress is seen, not
-# fewer than are efficient, nor more than bound the memory.
-_FEWEST_MEASURED, _MOST_MEASURED = 16, 256
 
 # The symmetry of a straight chain is that of places equal within this share of its length.
 _SAME_PLACE = 0.03
@@ -250,6 +248,7 @@ def measure_table(
     remarks: Remarks | None = None,
     singles: pd.DataFrame | None = None,
     progress: Progress | None = None,
+    work: Work | None = None,
 ) -> Report:
     """Measure every cluster of a clean table: `analyze` without reading and checking.
 
@@ -273,6 +272,8 @@ def measure_table(
         Tracks of single particles, as in `measure_singles`, with frames as in the table.
     progress : callable, optional
         Called with the number of finished clusters, their total, and what is done.
+    work : Work, optional
+        The processes that share the clusters; by default this one.
 
     Returns
     -------
@@ -292,23 +293,28 @@ def measure_table(
     recording = recording or Recording(dt=experiment.dt or np.nan)
     recording, more = complete_recording(recording, table, first_frame=first)
     remarks += more
-    bodies, rods, failures = fit_clusters(table, labels, experiment, recording, progress=progress)
-    if improved is not None:
-        motions = improved(bodies, first)
-        bodies = [
-            replace(b, motion=motions[b.tracks.cluster])
-            for b in bodies
-            if b.tracks.cluster in motions
-        ]
-    placed = [b for b in bodies if not b.centre_removed]
-    stage = find_stage_jumps([b.motion for b in placed], [b.tracks.frames for b in placed])
-    remarks.warnings.extend(
-        words.stage_jump_warnings(stage, first_frame=first, kept=experiment.keep_jumps)
-    )
-    if not experiment.keep_jumps:
-        bodies = [replace(b, stage=stage.rows(b.tracks.frames)) for b in bodies]
-    measured, failed = measure_bodies(bodies, experiment, recording, progress=progress)
-    failures += failed
+    with shared_work(work) as in_order:
+        bodies, rods, failures = fit_clusters(
+            table, labels, experiment, recording, in_order=in_order, progress=progress
+        )
+        if improved is not None:
+            motions = improved(bodies, first)
+            bodies = [
+                replace(b, motion=motions[b.tracks.cluster])
+                for b in bodies
+                if b.tracks.cluster in motions
+            ]
+        placed = [b for b in bodies if not b.centre_removed]
+        stage = find_stage_jumps([b.motion for b in placed], [b.tracks.frames for b in placed])
+        remarks.warnings.extend(
+            words.stage_jump_warnings(stage, first_frame=first, kept=experiment.keep_jumps)
+        )
+        if not experiment.keep_jumps:
+            bodies = [replace(b, stage=stage.rows(b.tracks.frames)) for b in bodies]
+        measured, failed = measure_bodies(
+            bodies, experiment, recording, in_order=in_order, progress=progress
+        )
+        failures += failed
     if failures and not (measured or rods):
         raise failures[-1][1]
     remarks += words.common_motion_remarks(
@@ -398,9 +404,10 @@ def fit_clusters(
     experiment: Experiment,
     recording: Recording,
     *,
+    in_order: InOrder,
     progress: Progress | None = None,
 ) -> tuple[list[FittedBody], list[RodResult], list[tuple[str, ValueError]]]:
-    """Fit every cluster of a table; particles on one line are measured as rods.
+    """Fit every cluster of a table, batch by batch; particles on one line are measured as rods.
 
     Returns
     -------
@@ -413,45 +420,62 @@ def fit_clusters(
     rods: list[RodResult] = []
     failures: list[tuple[str, ValueError]] = []
     count = table["cluster"][table["cluster"] >= 0].nunique()
-    clusters, done = each_cluster(table), 0
-    together = _clusters_at_a_time(count)
-    while some := list(islice(clusters, together)):
+    fit = partial(fit_batch, labels=labels, experiment=experiment, recording=recording)
+    batches = batches_of(each_cluster(table), size=clusters_together(count))
+    if progress is not None:
+        progress(0, count, "fitting clusters")
+    for more_bodies, more_rods, more_failures in in_order(fit, batches):
+        bodies += more_bodies
+        rods += more_rods
+        failures += more_failures
         if progress is not None:
-            progress(done, count, "fitting clusters")
-        done += len(some)
-        far = far_points_of_each([positions for _, positions, *_ in some])
-        tracks = [
-            ClusterTracks(
-                cluster,
-                labels.get(cluster),
-                np.where(away[..., None], np.nan, x) if away.any() else x,
-                frames,
-                piece,
-                away,
-                delay,
-            )
-            for (cluster, x, frames, piece, delay), away in zip(some, far, strict=True)
-        ]
-        solid = [one for one in tracks if one.positions.shape[1:] != (2, 3)]
-        fitted = iter(fit_bodies(solid, experiment, recording))
-        for one in tracks:
-            name = one.label or str(one.cluster)
-            pair = one.positions.shape[1:] == (2, 3)
-            body = None if pair else next(fitted)
-            if isinstance(body, FittedBody):
-                bodies.append(body)
-                continue
-            if body is not None and not getattr(body, "collinear", False):
-                failures.append((name, body))
-                continue
-            try:
-                rods.append(measure_rod(one, experiment, recording))
-            except (DegenerateClusterError, TooFewFramesError) as error:
-                failures.append((name, error if body is None else body))
-            except ValueError:
-                if body is None:
-                    raise
-                failures.append((name, body))
+            progress(len(bodies) + len(rods) + len(failures), count, "fitting clusters")
+    return bodies, rods, failures
+
+
+def fit_batch(
+    clusters: Sequence[tuple[int, Floats, Ints, Ints, Floats | None]],
+    labels: Mapping[int, str],
+    experiment: Experiment,
+    recording: Recording,
+) -> tuple[list[FittedBody], list[RodResult], list[tuple[str, ValueError]]]:
+    """Fit some clusters, as `each_cluster` gives them, as `fit_clusters` does."""
+    bodies: list[FittedBody] = []
+    rods: list[RodResult] = []
+    failures: list[tuple[str, ValueError]] = []
+    far = far_points_of_each([positions for _, positions, *_ in clusters])
+    tracks = [
+        ClusterTracks(
+            cluster,
+            labels.get(cluster),
+            np.where(away[..., None], np.nan, x) if away.any() else x,
+            frames,
+            piece,
+            away,
+            delay,
+        )
+        for (cluster, x, frames, piece, delay), away in zip(clusters, far, strict=True)
+    ]
+    solid = [one for one in tracks if one.positions.shape[1:] != (2, 3)]
+    fitted = iter(fit_bodies(solid, experiment, recording))
+    for one in tracks:
+        name = one.label or str(one.cluster)
+        pair = one.positions.shape[1:] == (2, 3)
+        body = None if pair else next(fitted)
+        if isinstance(body, FittedBody):
+            bodies.append(body)
+            continue
+        if body is not None and not getattr(body, "collinear", False):
+            failures.append((name, body))
+            continue
+        try:
+            rods.append(measure_rod(one, experiment, recording))
+        except (DegenerateClusterError, TooFewFramesError) as error:
+            failures.append((name, error if body is None else body))
+        except ValueError:
+            if body is None:
+                raise
+            failures.append((name, body))
     return bodies, rods, failures
 
 
@@ -546,7 +570,7 @@ def _tracked_bodies(
     ]
     for k in scanned:
         # Rigidity and errors are those of the positions at one instant.
-        delays = identities[k].arranged(tracks[k].delay[..., None])[..., 0]
+        delays = identities[k].arranged(np.asarray(tracks[k].delay)[..., None])[..., 0]
         try:
             found[k], positions[k] = track_scanned(
                 positions[k],
@@ -686,23 +710,22 @@ def measure_rod(tracks: ClusterTracks, experiment: Experiment, recording: Record
     )
 
 
-def _clusters_at_a_time(count: int) -> int:
-    return int(np.clip(-(-count // 10), _FEWEST_MEASURED, _MOST_MEASURED))
-
-
 def measure_bodies(
     bodies: Sequence[FittedBody],
     experiment: Experiment,
     recording: Recording,
     *,
+    in_order: InOrder,
     progress: Progress | None = None,
 ) -> tuple[list[MeasuredBody], list[tuple[str, ValueError]]]:
-    """Measure all bodies, a tenth of them at a time.
+    """Measure all bodies, batch by batch.
 
     Parameters
     ----------
     bodies, experiment, recording
         As in `measure_together`.
+    in_order : callable
+        As `shared_work` gives it.
     progress : callable, optional
         As in `measure_table`.
 
@@ -715,14 +738,16 @@ def measure_bodies(
     measured: list[MeasuredBody] = []
     failures: list[tuple[str, ValueError]] = []
     count = len(bodies)
-    together = _clusters_at_a_time(count)
-    for done in range(0, count, together):
-        if progress is not None:
-            progress(done, count, "estimating D_R and D_T")
-        part = bodies[done : done + together]
-        found, failed = measure_together(part, experiment, recording, tested=count)
+    measure = partial(measure_together, experiment=experiment, recording=recording, tested=count)
+    if progress is not None:
+        progress(0, count, "estimating D_R and D_T")
+    batches = batches_of(bodies, size=clusters_together(count))
+    for found, failed in in_order(measure, batches):
         measured += found
         failures += failed
+        if progress is not None:
+            done = len(measured) + len(failures)
+            progress(done, count, "estimating D_R and D_T")
     return measured, failures
 
 
@@ -1019,9 +1044,7 @@ def motion_and_path(body: FittedBody, quantity: Quantity) -> tuple[RigidMotion, 
     return cut_at(motion, body.stage), cut_at(whole, body.stage)
 
 
-def _estimated_quietly(
-    motion: RigidMotion | list[RigidMotion], quantity: Quantity, noise: Noise
-) -> DiffusionEstimate:
+def _estimated_quietly(motion: RigidMotion, quantity: Quantity, noise: Noise) -> DiffusionEstimate:
     """Estimate D_R or D_T; the estimate's own warnings go into the report."""
     with python_warnings.catch_warnings():
         python_warnings.simplefilter("ignore", PrecisionWarning)
@@ -1504,7 +1527,8 @@ def pool_coefficients(
     """
     motions, noise = [one.motion for one in parts], experiment.noise
     quantity = parts[0].estimate.quantity
-    estimate = _estimated_quietly(motions, quantity, noise)
+    each = [one.estimate for one in parts]
+    estimate = estimate_pooled(motions, each, quantity=quantity, noise=noise)
     if verdict is None:
         return estimate, None, []
     estimate, warnings = replace(estimate, motion=verdict.kind), []

@@ -85,7 +85,8 @@ def stated_arguments(settings: Mapping[str, Any], *, dt: float | None = None) ->
     if last is not None and (first, last) != (0, count and count - 1):
         given["frames"] = (first, last + 1)
     opening = _differing(given, dict.fromkeys(OPENING))
-    if others := given.get("other_channels"):  # spheres of another kind each
+    others = given.get("other_channels")  # spheres of another kind each
+    if others and "channel" in given:  # a movie in memory has none
         opening["channel"] = (given["channel"], *(one["channel"] for one in others))
     options = _differing(given, MOVIE_DEFAULTS)
     if "refine" in given and given["refine"] is None:

@@ -13,6 +13,7 @@ from perrin._text import counted
 from perrin.run.experiment import Recording, merged_experiment
 from perrin.run.measure import measure_table
 from perrin.run.remarks import Remarks
+from perrin.run.workers import Work, check_workers
 from perrin.tracks.clusters import identify
 from perrin.tracks.files import check_tracks, read_tracks
 from perrin.tracks.screening import distance_notes, has_trackpy_columns, screen_rows
@@ -47,6 +48,8 @@ def analyze(
     diameter: float | None = None,
     frames: tuple[int | None, int | None] | None = None,
     experiment: Experiment | None = None,
+    workers: int = 0,
+    scheduler: str | None = None,
     progress: Progress | None = None,
 ) -> Report:
     """Measure D_R and D_T of every cluster in a track table.
@@ -98,6 +101,11 @@ def analyze(
     experiment : Experiment, optional
         dt, sigma, noise, exposure, drift, keep_jumps, model, viscosity, temperature and diameter in
         one object; a value is stated here or as its own argument, not both.
+    workers : int
+        Number of processes of this machine that share the clusters; 0 does the work in this one.
+        The results are the same to the last bit.
+    scheduler : str, optional
+        Address of a Dask scheduler whose workers share the clusters, such as tcp://node7:8786.
     progress : callable, optional
         Called with the number of finished clusters, their total, and what is done.
 
@@ -107,6 +115,8 @@ def analyze(
 
     Raises
     ------
+    ModuleNotFoundError, OSError
+        If dask.distributed is needed and not installed, or the scheduler does not answer.
     TrackTableError
         If the table cannot be read, or if its particles belong to no cluster.
     DegenerateClusterError, TooFewFramesError
@@ -136,8 +146,10 @@ def analyze(
         diameter=diameter,
         contact=contact,
     )
+    work = Work(workers=workers, scheduler=scheduler)
     if experiment.dt is None:
         raise ValueError("dt: needed, the time between successive frame numbers, s")
+    check_workers(work)
     table, source, remarks = read_table(
         tracks, scale=scale, columns=columns, frames=frames, contact=contact, size=size
     )
@@ -153,6 +165,7 @@ def analyze(
         recording=Recording(dt=experiment.dt),
         remarks=remarks,
         progress=progress,
+        work=work,
     )
 
 

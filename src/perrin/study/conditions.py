@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 RATIO = "D_T/D_R"
 QUANTITIES = ("D_R", "D_T", RATIO)
-UNITS = {"D_R": "rad^2/s", "D_T": "um^2/s", RATIO: "um^2"}
+QUANTITY_UNITS = {"D_R": "rad^2/s", "D_T": "um^2/s", RATIO: "um^2"}
 
 
 @dataclass(frozen=True)
@@ -223,7 +223,7 @@ def condition_means(manifest: Manifest, values: Sequence[ClusterValue]) -> list[
             continue
         coefficients = [one.coefficient for one in used]
         units = [one.movie.unit for one in used]
-        mean = population_mean(coefficients, movies=units, unit=UNITS[quantity])
+        mean = population_mean(coefficients, movies=units, unit=QUANTITY_UNITS[quantity])
         known = [one.predicted for one in members if one.predicted is not None]
         movies = list(dict.fromkeys(units))
         outlying = [

@@ -8,7 +8,7 @@ import numpy as np
 
 from perrin._text import unit_text
 from perrin.plot.figure_style import GREY, column_figure, save_figure, series_color, style
-from perrin.study.conditions import QUANTITIES, UNITS, condition_text
+from perrin.study.conditions import QUANTITIES, QUANTITY_UNITS, condition_text
 from perrin.study.trends import law_values
 
 if TYPE_CHECKING:
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from perrin.study.conditions import ConditionMean
     from perrin.study.study_results import StudyResult
 
-_SYMBOLS = {"D_R": "$D_R$", "D_T": "$D_T$", "D_T/D_R": "$D_T/D_R$"}
+_QUANTITY_SYMBOLS = {"D_R": "$D_R$", "D_T": "$D_T$", "D_T/D_R": "$D_T/D_R$"}
 
 
 @style()
@@ -107,7 +107,7 @@ def plot_conditions(result: StudyResult, quantity: str, *, ax: Axes) -> Axes:
             x = np.linspace(trend.x.min(), trend.x.max(), 100)
             ax.plot(x, law_values(trend.law, x, trend.parameters), "-", color=color, lw=1)
     ax.set_yscale("log")
-    ax.set_ylabel(f"{_SYMBOLS[quantity]} ({unit_text(UNITS[quantity])})")
+    ax.set_ylabel(f"{_QUANTITY_SYMBOLS[quantity]} ({unit_text(QUANTITY_UNITS[quantity])})")
     if numbers:
         ax.set_xlabel(first[0])
     else:

@@ -180,7 +180,7 @@ def read_manifest(path: str | os.PathLike[str]) -> Manifest:
         listing = "; ".join(f"line {line}: {text}" for line, text in sorted(check.faults))
         raise ManifestError(f"{place}: {listing}")
     return Manifest(
-        movies=tuple(_with_names(movies)),
+        movies=tuple(_with_run_names(movies)),
         title=str(stated.get("title", "Study")),
         conditions=tuple(stated.get("conditions", ())),
         average=tuple(stated.get("average", Manifest.average)),
@@ -340,7 +340,7 @@ def key_lines(text: str) -> dict[tuple[str, ...], int]:
 
     Examples
     --------
-    >>> key_lines("a = 1\\n[[sample]]\\nfiles = [\\n]\\n")
+    >>> key_lines("a = 1\n[[sample]]\nfiles = [\n]\n")
     {('a',): 1, ('sample',): 2, ('sample', '0'): 2, ('sample', '0', 'files'): 3}
     """
     lines: dict[tuple[str, ...], int] = {}
@@ -419,7 +419,7 @@ class _Check:
         for key, value in options.items():
             for line in _option_faults(key, value):
                 self.wrong((*at, key), line)
-        label = _label_of(sample, number)
+        label = _sample_label(sample, number)
         if label in self._labels:
             self.wrong((*at, "label"), f"label {label!r} is that of another sample")
         self._labels.add(label)
@@ -540,7 +540,7 @@ def _matching(stated: str, folder: Path) -> list[str]:
     return sorted(str(p) for p in within.glob(str(Path(stated).relative_to(root or "."))))
 
 
-def _with_names(movies: Iterable[StudyMovie]) -> list[StudyMovie]:
+def _with_run_names(movies: Iterable[StudyMovie]) -> list[StudyMovie]:
     """Return the movies with names of run folders that are unique and do not depend on others."""
     import hashlib
     from dataclasses import replace
@@ -556,7 +556,7 @@ def _with_names(movies: Iterable[StudyMovie]) -> list[StudyMovie]:
     return named
 
 
-def _label_of(sample: Mapping[str, Any], number: int) -> str:
+def _sample_label(sample: Mapping[str, Any], number: int) -> str:
     """Return the label of a sample; that of its first file, or its number, without one."""
     files = sample.get("files")
     usual = _stem(files[0]) if _are_texts(files) and files else f"sample {number + 1}"

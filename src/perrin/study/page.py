@@ -12,7 +12,7 @@ import numpy as np
 from perrin._text import number_text, percent, unit_text
 from perrin.report.embedding import packed, page_script, plotly_script, source_hash
 from perrin.report.html import inline_pictures, render_page
-from perrin.study.conditions import QUANTITIES, UNITS, condition_text
+from perrin.study.conditions import QUANTITIES, QUANTITY_UNITS, condition_text
 from perrin.study.ledger import RUNS
 from perrin.study.trends import law_values
 
@@ -116,7 +116,7 @@ def study_methods(result: StudyResult) -> str:
         "ones are listed but not averaged."
     )
     values = [
-        f"{one.quantity} = {_mean_text(one)} {UNITS[one.quantity]} ({one.body}, {one.label})"
+        f"{one.quantity} = {_mean_text(one)} {one.mean.unit} ({one.body}, {one.label})"
         for one in result.means
         if one.quantity != QUANTITIES[-1]
     ]
@@ -326,7 +326,7 @@ def _figure_data(result: StudyResult) -> str:
                     "key": key,
                     "body": body,
                     "quantity": quantity,
-                    "unit": unit_text(UNITS[quantity]),
+                    "unit": unit_text(QUANTITY_UNITS[quantity]),
                     "every": every,
                     "names": [v.name for v in singles],
                     "x": [place(m.conditions) for m in means],

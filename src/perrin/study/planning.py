@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from typing import Self
 
 _MOST_MOVIES = 200
-_MOST_FRAMES = 100_000
-_FEWEST_FRAMES = 20
+_LONGEST_MOVIE = 100_000
+_SHORTEST_MOVIE = 20
 
 # Numbers of movies that are planned beside the recommended one.
 _OFFERED = (3, 4, 5, 6, 8, 10, 15, 20, 30, 50, 100, 200)
@@ -177,10 +177,10 @@ def plan_study(
         *number_fault("axes", axes, least=1, most=3, whole=True),
     ]
     if most_frames is not None:
-        faults += number_fault("most_frames", most_frames, least=_FEWEST_FRAMES, whole=True)
+        faults += number_fault("most_frames", most_frames, least=_SHORTEST_MOVIE, whole=True)
     refuse(faults)
     frames = np.unique(
-        np.geomspace(_FEWEST_FRAMES, most_frames or _MOST_FRAMES, 120).round().astype(int)
+        np.geomspace(_SHORTEST_MOVIE, most_frames or _LONGEST_MOVIE, 120).round().astype(int)
     )
     errors = np.array([cramer_rao(n_frames=int(n), snr=snr, axes=axes) for n in frames])
     choices = []

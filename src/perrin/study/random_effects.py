@@ -27,10 +27,10 @@ Scope = Literal["movies", "clusters", "cluster"]
 _STEPS_PER_ERROR, _MOST_POINTS, _LEAST_ERROR = 2.5, 400, 1.5
 
 # Spreads at which the likelihood is tabulated: 0, and up to twice the scatter of the estimates.
-_SPREADS, _LEAST_SPREAD, _MOST_SPREAD = 9, 0.07, 2.0
+_SPREADS, _SMALLEST_SPREAD, _LAST_SPREAD = 9, 0.07, 2.0
 _FINE = 81  # spreads to which the table is interpolated
 
-_EDGE = 6.0  # signed root up to which the likelihood of a mean is tabulated
+_TABULATED_ROOT = 6.0  # signed root up to which the likelihood of a mean is tabulated
 
 
 @dataclass(frozen=True, eq=False)
@@ -259,7 +259,7 @@ def population_mean(
         n_movies=len(known),
         dispersion=dispersion,
         unit=unit,
-        movies=MovieLikelihoods(log_D, _summed(by_movie, movie)),
+        movies=MovieLikelihoods(log_D, _movie_sums(by_movie, movie)),
     )
 
 
@@ -322,12 +322,12 @@ class _Levels:
         wide = smoothed(self.rows, cluster_spread, step=step)
         if self.movie is None:
             return wide
-        return smoothed(_summed(wide, self.movie), movie_spread, step=step)
+        return smoothed(_movie_sums(wide, self.movie), movie_spread, step=step)
 
     def spreads(self, most_spread: float) -> tuple[_Spread, _Spread | None]:
         """Return the spread between clusters, and that between movies where there are movies."""
         step = float(self.log_D[1] - self.log_D[0])
-        nodes = most_spread * np.geomspace(_LEAST_SPREAD, 1.0, _SPREADS - 1)
+        nodes = most_spread * np.geomspace(_SMALLEST_SPREAD, 1.0, _SPREADS - 1)
         nodes = np.concatenate([[0.0], nodes])
         n = len(self.rows)
         if self.movie is None:
@@ -336,7 +336,7 @@ class _Levels:
         k = int(self.movie.max()) + 1
         grid = np.empty((_SPREADS, _SPREADS))
         for i, s in enumerate(nodes):
-            within = _summed(smoothed(self.rows, s, step=step), self.movie)
+            within = _movie_sums(smoothed(self.rows, s, step=step), self.movie)
             grid[i] = [_integrated(smoothed(within, b, step=step)) for b in nodes]
         fine = _refined(grid)
         return (
@@ -354,7 +354,7 @@ class _Spread:
     high68: float
 
 
-def _summed(rows: Floats, movie: Ints) -> Floats:
+def _movie_sums(rows: Floats, movie: Ints) -> Floats:
     """Return the sums of the rows of each movie."""
     total = np.zeros((int(movie.max()) + 1, rows.shape[1]))
     np.add.at(total, movie, rows)
@@ -370,7 +370,7 @@ def _tabulated(members: Sequence[Coefficient], *, units: int) -> tuple[Floats, F
     error = np.where(np.isnan(centre), far - high, (far - centre) / NORMAL[0.95])
     error = np.maximum(error, 1e-6)
     place = np.where(np.isnan(centre), high - 2 * error, centre)
-    most = _MOST_SPREAD * max(float(np.std(place, ddof=1)), float(np.sqrt(np.mean(error**2))))
+    most = _LAST_SPREAD * max(float(np.std(place, ddof=1)), float(np.sqrt(np.mean(error**2))))
     margin = 4 * most / np.sqrt(units)
     low, top = (place - 4.5 * error).min() - margin, (place + 4.5 * error).max() + margin
     step = max(error.min() / _STEPS_PER_ERROR, (top - low) / _MOST_POINTS)
@@ -443,7 +443,7 @@ def _mean_interval(
     deviance = 2 * np.sum(_vertices(units)[1] - at_mean)
     dispersion = max(float(deviance / dof), 1e-12)
     root = np.sign(log_D - centre) * np.sqrt(np.maximum(2 * (top - total), 0.0))
-    near = np.abs(root) <= _EDGE
+    near = np.abs(root) <= _TABULATED_ROOT
     x, r = log_D[near], np.maximum.accumulate(root[near])
 
     def place(wanted: float) -> float:

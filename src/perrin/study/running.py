@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from perrin.movie.stacks import analyze_stack
-from perrin.movie.workers import Work, dask_client
 from perrin.report.write import complete_run, write_run
 from perrin.run.folders import filled_folder
 from perrin.run.results import RodResult, write_data
 from perrin.run.tables import analyze
+from perrin.run.workers import Work, dask_client
 from perrin.study.ledger import (
     RUNS,
     Entry,
@@ -84,7 +84,7 @@ def measure_movie(task: Task) -> Entry:
         "stamp": stamp_of(movie.path),
     }
     try:
-        with _one_thread():
+        with _single_thread():
             report = _measured(task)
         entry = Entry(
             status="done",
@@ -348,7 +348,7 @@ def _values(result: ClusterResult | RodResult, kind: int | None) -> dict[str, An
     return entry
 
 
-def _one_thread() -> Any:  # noqa: ANN401 (a context of threadpoolctl's)
+def _single_thread() -> Any:  # noqa: ANN401 (a context of threadpoolctl's)
     """Return a context in which numerical libraries use one thread, so that sums are the same."""
     try:
         from threadpoolctl import threadpool_limits

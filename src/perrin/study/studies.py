@@ -29,7 +29,7 @@ _LOG = "study.log"
 
 @dataclass(frozen=True, eq=False)
 class Study:
-    r"""Movies and tables under several conditions, as a manifest states them.
+    """Movies and tables under several conditions, as a manifest states them.
 
     Attributes
     ----------
@@ -37,17 +37,10 @@ class Study:
 
     Examples
     --------
-    >>> import tempfile
-    >>> from importlib.resources import files
-    >>> table = str(files("perrin") / "data" / "demo_tracks.csv.gz")
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     manifest = Path(folder, "study.toml")
-    ...     _ = manifest.write_text(
-    ...         f"reports = false\\n[[sample]]\\nfiles = ['{table}']\\ndt = 0.73\\n"
-    ...     )
-    ...     result = Study.from_toml(manifest).run(Path(folder, "STUDY"))
-    >>> result.means[0].quantity, result.means[0].mean.scope
-    ('D_R', 'cluster')
+    >>> from perrin.study import StudyMovie
+    >>> movie = StudyMovie("a", "a.csv", "table", "dilute", {"phi": 0.1})
+    >>> Study(Manifest((movie,), conditions=("phi",))).to_frame()["status"].tolist()
+    ['new']
     """
 
     manifest: Manifest

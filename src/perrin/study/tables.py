@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from perrin.study.conditions import UNITS
+from perrin.study.conditions import QUANTITY_UNITS
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -62,7 +62,7 @@ def study_table(
                 "quantity": one.quantity,
                 "value": one.coefficient.value,
                 **_ends(one.coefficient.ci68, one.coefficient.ci95),
-                "unit": UNITS[one.quantity],
+                "unit": QUANTITY_UNITS[one.quantity],
                 "verdict": one.verdict,
                 "averaged": not one.apart_because,
                 "apart_because": one.apart_because or None,
@@ -83,7 +83,7 @@ def study_table(
                 "quantity": mean.quantity,
                 "value": found.value,
                 **_ends(found.ci68, found.ci95),
-                "unit": UNITS[mean.quantity],
+                "unit": QUANTITY_UNITS[mean.quantity],
                 "predicted": mean.predicted,
                 "clusters": found.n_clusters,
                 "movies": found.n_movies,

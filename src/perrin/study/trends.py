@@ -34,11 +34,13 @@ LAWS: dict[str, tuple[tuple[str, ...], bool]] = {
     "power": (("A", "exponent"), True),
     "exponential": (("A", "rate"), False),
 }
-_LEAST_SPREAD, _MOST_SPREAD = 1e-3, 3.0  # of ln D between movies
+_NARROWEST, _WIDEST = 1e-3, 3.0  # of ln D between movies
 
 # Signed roots at which the likelihood of a movie is known, and how far they are continued.
-_EDGE, _FAR = 5.0, 40.0
-_ROOTS = np.concatenate([[-_FAR], np.linspace(-_EDGE, _EDGE, 81), [_FAR]])
+_KNOWN_ROOT, _CONTINUED_ROOT = 5.0, 40.0
+_MOVIE_ROOTS = np.concatenate(
+    [[-_CONTINUED_ROOT], np.linspace(-_KNOWN_ROOT, _KNOWN_ROOT, 81), [_CONTINUED_ROOT]]
+)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -209,8 +211,8 @@ def fit_trend(
     from scipy.special import gammaincc
 
     at = np.atleast_1d(np.asarray(x, dtype=np.float64))
-    names, logarithm = _checked(means, at, law, start)
-    rows, place = _movie_rows(means)
+    names, logarithm = _checked_law(means, at, law, start)
+    rows, place = _movie_likelihoods(means)
     condition = at[place]
     count = len(rows)
     refuse(
@@ -387,7 +389,7 @@ class _MovieRoot:
         return _MovieRoot(self.log_D, smoothed(self.log_likelihood[None], spread, step=step)[0])
 
     def places(self) -> Floats:
-        """Return ln D at the signed roots `_ROOTS`; straight lines beyond the tabulated ones."""
+        """Return ln D at the roots `_MOVIE_ROOTS`, by straight lines beyond the known ones."""
         row = self.log_likelihood
         i = min(max(int(np.argmax(row)), 1), row.size - 2)
         bend, slope = row[i - 1] - 2 * row[i] + row[i + 1], (row[i + 1] - row[i - 1]) / 2
@@ -395,22 +397,22 @@ class _MovieRoot:
         step = float(self.log_D[1] - self.log_D[0])
         centre, top = self.log_D[i] + offset * step, row[i] + offset * slope / 2
         root = np.sign(self.log_D - centre) * np.sqrt(np.maximum(2 * (top - row), 0.0))
-        keep = np.abs(root) < _EDGE
+        keep = np.abs(root) < _KNOWN_ROOT
         x, r = self.log_D[keep], np.maximum.accumulate(root[keep])
-        low = x[0] - _FAR * (centre - x[0]) / max(-r[0], 0.2)
-        high = x[-1] + _FAR * (x[-1] - centre) / max(r[-1], 0.2)
-        roots = np.concatenate([[r[0] - _FAR], r, [r[-1] + _FAR]])
-        places = np.interp(_ROOTS, roots, np.concatenate([[low], x, [high]]))
+        low = x[0] - _CONTINUED_ROOT * (centre - x[0]) / max(-r[0], 0.2)
+        high = x[-1] + _CONTINUED_ROOT * (x[-1] - centre) / max(r[-1], 0.2)
+        roots = np.concatenate([[r[0] - _CONTINUED_ROOT], r, [r[-1] + _CONTINUED_ROOT]])
+        places = np.interp(_MOVIE_ROOTS, roots, np.concatenate([[low], x, [high]]))
         return np.asarray(places, dtype=np.float64)
 
 
 def _roots_at(places: Floats, log_D: Floats) -> Floats:
-    """Return the signed root of each movie at its own ln D, from the places of `_ROOTS`."""
+    """Return the signed root of each movie at its own ln D, from the places of `_MOVIE_ROOTS`."""
     row = np.arange(len(places))
-    k = np.clip(np.sum(places < log_D[:, None], axis=1), 1, _ROOTS.size - 1)
+    k = np.clip(np.sum(places < log_D[:, None], axis=1), 1, _MOVIE_ROOTS.size - 1)
     left, right = places[row, k - 1], places[row, k]
     share = (log_D - left) / np.maximum(right - left, 1e-12)
-    return np.asarray(_ROOTS[k - 1] + share * (_ROOTS[k] - _ROOTS[k - 1]))
+    return np.asarray(_MOVIE_ROOTS[k - 1] + share * (_MOVIE_ROOTS[k] - _MOVIE_ROOTS[k - 1]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -423,7 +425,7 @@ class _Fit:
     covariance: Floats
 
 
-def _checked(
+def _checked_law(
     means: Sequence[PopulationMean],
     x: Floats,
     law: LawName | Law,
@@ -466,7 +468,7 @@ def _checked(
     return LAWS[law][0], linear
 
 
-def _movie_rows(means: Sequence[PopulationMean]) -> tuple[list[_MovieRoot], list[int]]:
+def _movie_likelihoods(means: Sequence[PopulationMean]) -> tuple[list[_MovieRoot], list[int]]:
     """Return the likelihoods of all movies, and the condition of each."""
     rows, place = [], []
     for k, one in enumerate(means):
@@ -521,11 +523,11 @@ def _spread_about(excess: Callable[[float], float]) -> float:
 
     if excess(0.0) <= 0:
         return 0.0
-    if excess(_LEAST_SPREAD) <= 0:
-        return _LEAST_SPREAD
-    if excess(_MOST_SPREAD) >= 0:
-        return _MOST_SPREAD
-    return float(brentq(excess, _LEAST_SPREAD, _MOST_SPREAD, xtol=1e-4))
+    if excess(_NARROWEST) <= 0:
+        return _NARROWEST
+    if excess(_WIDEST) >= 0:
+        return _WIDEST
+    return float(brentq(excess, _NARROWEST, _WIDEST, xtol=1e-4))
 
 
 def _likelihood_ends(

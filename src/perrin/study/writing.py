@@ -17,7 +17,7 @@ from perrin.tracks.writing import write_json, written_whole
 if TYPE_CHECKING:
     from perrin.study.study_results import StudyResult
 
-_LIBRARIES = ("perrin", "numpy", "scipy", "pandas", "pyarrow", "distributed", "trackpy")
+_VERSIONED = ("perrin", "numpy", "scipy", "pandas", "pyarrow", "distributed", "trackpy")
 
 
 def write_results(result: StudyResult, *, command: str = "") -> None:
@@ -63,7 +63,7 @@ def write_results(result: StudyResult, *, command: str = "") -> None:
     with written_whole(place / "study.html") as part:
         part.write_text(render_study(result), encoding="utf-8")
     versions = {}
-    for name in _LIBRARIES:
+    for name in _VERSIONED:
         try:
             versions[name] = version(name)
         except PackageNotFoundError:

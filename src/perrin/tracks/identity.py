@@ -112,8 +112,16 @@ class Identity(Shown):
         frozen(self.order, self.piece, self.swaps, self.cuts, self.extra, self.unsettled)
 
     def arranged(self, positions: ArrayLike) -> Floats:
-        """Return the detections (T, m, d) as particles (T, n, d), NaN where missing."""
+        """Return the detections (T, m, d) as particles (T, n, d), NaN where missing.
+
+        Where every column is its particle throughout, these are the positions themselves.
+        """
         x = np.asarray(positions, dtype=np.float64)
+        if self.order.shape == x.shape[:2]:
+            seen = present(x)
+            own = np.where(seen, np.arange(x.shape[1]), -1)
+            if np.array_equal(self.order, own) and np.isnan(x[~seen]).all():
+                return x
         taken = np.take_along_axis(x, np.maximum(self.order, 0)[..., None], axis=1)
         return np.where(self.order[..., None] >= 0, taken, np.nan)
 
@@ -827,7 +835,8 @@ def certain_labels(x: Floats) -> Bools:
     _, _, n, d = x.shape
     seen = present(x)
     shown = seen.sum(axis=2)
-    certain = ((shown == n).sum(axis=1) >= 2) & seen.any(axis=1).all(axis=1) & (n >= d)
+    every = np.asarray(seen.any(axis=1)).all(axis=1)
+    certain = ((shown == n).sum(axis=1) >= 2) & every & (n >= d)
     bodies = np.flatnonzero(certain)
     if not bodies.size:
         return np.asarray(certain)

@@ -38,6 +38,7 @@ from perrin.images.optics.learn import (
     neighbour_variance,
     photon_transfer,
     saturated_share,
+    without_clipped,
 )
 from perrin.images.optics.learn_radial import (
     RadialSample,
@@ -51,6 +52,7 @@ from perrin.images.optics.learn_radial import (
 )
 from perrin.images.optics.microscope import Camera, Light, RenderSettings, Scan
 from perrin.images.optics.optics import CameraNoise, Optics
+from perrin.images.optics.point_spread import BeadStack, PointSpread, measure_point_spread
 from perrin.images.optics.radial_image import (
     Patch,
     PatchFit,
@@ -82,6 +84,7 @@ from perrin.images.optics.window_fit import (
 __all__ = [
     "Arrangement",
     "BallBlur",
+    "BeadStack",
     "Camera",
     "CameraNoise",
     "CrowdFit",
@@ -98,6 +101,7 @@ __all__ = [
     "Optics",
     "Patch",
     "PatchFit",
+    "PointSpread",
     "PsfTail",
     "RadialImage",
     "RadialSample",
@@ -130,6 +134,7 @@ __all__ = [
     "held_out_misfit",
     "learn_image",
     "log_likelihood",
+    "measure_point_spread",
     "missing_spheres",
     "neighbour_variance",
     "noise_of_neighbours",
@@ -152,4 +157,5 @@ __all__ = [
     "sum_of_spheres",
     "visible_fraction",
     "within",
+    "without_clipped",
 ]

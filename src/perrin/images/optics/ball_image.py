@@ -16,6 +16,8 @@ from perrin.compiled.loading import compiled_kernels
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from perrin.images.optics.point_spread import PointSpread
+
 # Spacing of the table's knots in units of the blur along each axis; the cubic error is below 1e-4.
 _KNOT_SPACING = 0.25
 
@@ -61,10 +63,14 @@ class BallBlur(NamedTuple):
     components : tuple
         ``(share, (z, plane))`` of each component: its share of the intensity and its standard
         deviations with the voxels included, um; the narrowest component is the first.
+    shell : bool
+        The surface of the ball is fluorescent, in place of all of it; the intensity in all is that
+        of the ball.
     """
 
     diameter: float
     components: tuple[tuple[float, tuple[float, float]], ...]
+    shell: bool = False
 
     def ranges(self, narrow: float, wide: float) -> tuple[float, float]:
         """Return distances (z, plane), um, in blurs of the narrowest component or of the others."""
@@ -82,26 +88,45 @@ class BallBlur(NamedTuple):
 
             (erf(b/s√2) + erf(a/s√2))/2 - s/(r√2π) (exp(-a²/2s²) - exp(-b²/2s²))
 
-        (the integral of a Gaussian over a ball); the blur along z in excess of s is added by one
-        numerical convolution.
+        (the integral of a Gaussian over a ball), and so has a surface of as much light,
+        R^2/(3 r s√2π) (exp(-a²/2s²) - exp(-b²/2s²)); the blur along z in excess of s is added by
+        one numerical convolution.
         """
-        from scipy.special import erf
-
         radius = self.diameter / 2
         total = np.zeros((len(z), len(rho)))
         for share, (blur_z, blur) in self.components:
             excess = float(np.sqrt(max(blur_z**2 - blur**2, 0.0)))
             nodes, weights = _gaussian_quadrature(z, excess, blur)
             r = np.hypot(nodes[:, None], rho)
-            a, b = (radius - r) / blur, (radius + r) / blur
-            # Near the centre the difference of exponentials over r is its limit, the derivative.
-            small = r < 1e-4 * blur
-            safe = np.where(small, blur, r)
-            edge = blur / safe * (np.exp(-0.5 * a**2) - np.exp(-0.5 * b**2))
-            edge = np.where(small, 2 * radius / blur * np.exp(-0.5 * (radius / blur) ** 2), edge)
-            ball = 0.5 * (erf(b / np.sqrt(2)) + erf(a / np.sqrt(2))) - edge / np.sqrt(2 * np.pi)
-            total += share * (weights @ ball)
+            sphere = _blurred_surface(r, radius, blur) if self.shell else _blurred(r, radius, blur)
+            total += share * (weights @ sphere)
         return total
+
+
+def _blurred(r: Floats, radius: float, blur: float) -> Floats:
+    """Return the intensity at distances r from the centre of a ball that is blurred evenly."""
+    from scipy.special import erf
+
+    a, b = (radius - r) / blur, (radius + r) / blur
+    edge = _difference_over_distance(r, radius, blur) * blur / np.sqrt(2 * np.pi)
+    return np.asarray(0.5 * (erf(b / np.sqrt(2)) + erf(a / np.sqrt(2))) - edge)
+
+
+def _blurred_surface(r: Floats, radius: float, blur: float) -> Floats:
+    """Return the intensity of the surface of a ball that is blurred evenly, of the ball's light."""
+    edge = _difference_over_distance(r, radius, blur)
+    return np.asarray(radius**2 / 3 / (blur * np.sqrt(2 * np.pi)) * edge)
+
+
+def _difference_over_distance(r: Floats, radius: float, blur: float) -> Floats:
+    """Return (exp(-a^2/2) - exp(-b^2/2)) / r with a, b = (radius -+ r) / blur."""
+    a, b = (radius - r) / blur, (radius + r) / blur
+    # Near the centre the difference of exponentials over r is its limit, the derivative.
+    small = r < 1e-4 * blur
+    safe = np.where(small, blur, r)
+    edge = (np.exp(-0.5 * a**2) - np.exp(-0.5 * b**2)) / safe
+    limit = 2 * radius / blur**2 * np.exp(-0.5 * (radius / blur) ** 2)
+    return np.where(small, limit, edge)
 
 
 class SphereSpot(NamedTuple):
@@ -343,6 +368,8 @@ def sphere_image(
     voxel: tuple[float, float, float],
     tail: PsfTail | None = None,
     spread: float = 0.0,
+    measured: PointSpread | None = None,
+    shell: bool = False,
 ) -> SphereImage:
     """Tabulate a ball convolved with an anisotropic point spread and with the voxels.
 
@@ -358,6 +385,10 @@ def sphere_image(
         A second, wider Gaussian of the point spread.
     spread : float
         Relative standard deviation of the diameters of different spheres.
+    measured : PointSpread, optional
+        A measured point spread, in place of `psf` and `tail`: `psf` is that of its first Gaussian.
+    shell : bool
+        The surface of the sphere is fluorescent, in place of all of it.
 
     Returns
     -------
@@ -390,6 +421,8 @@ def sphere_image(
         if not 0 <= tail.share <= 1:
             raise ValueError(f"tail: expected a share between 0 and 1, got {tail.share}")
         spreads.append((tail.share, tail.psf))
+    if measured is not None:
+        spreads = list(measured.components)
     components = []
     for share, (psf_z, psf_plane) in spreads:
         blur_z = float(np.sqrt(psf_z**2 + voxel[0] ** 2 / 12))
@@ -401,7 +434,7 @@ def sphere_image(
                 "two exchanged?"
             )
         components.append((share, (blur_z, blur)))
-    ball = BallBlur(diameter, tuple(components))
+    ball = BallBlur(diameter, tuple(components), shell)
     blur_z, blur = components[0][1]
     spacing = _KNOT_SPACING * blur_z, _KNOT_SPACING * blur
     radius = diameter / 2 * float(np.exp(_size_range(spread)))

@@ -90,6 +90,7 @@ def cut_crowd_window(
     Parameters
     ----------
     frame : ndarray, shape (nz, ny, nx)
+        Voxels of NaN are left out.
     image : SphereImage
     noise : CameraNoise
     centers, others : ndarray, shape (n, 3), (m, 3)
@@ -107,9 +108,10 @@ def cut_crowd_window(
     y, x = (np.linspace(-1.0, 1.0, len(g)) for g in grid[1:])
     plane = (len(y), len(x))
     basis = (y[:, None], x, y[:, None] ** 2, x**2, y[:, None] * x)
+    known = np.isfinite(frame[box])
     return CrowdWindow(
-        frame[box],
-        ~within(grid, others[near], extent),
+        np.where(known, frame[box], 0.0),
+        known & ~within(grid, others[near], extent),
         np.array([g[0] for g in grid]),
         image,
         noise,

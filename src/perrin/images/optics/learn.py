@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from perrin._arrays import Bools, Floats
+    from perrin.images.optics.point_spread import PointSpread
     from perrin.images.optics.window_fit import Window
 
 
@@ -45,6 +46,9 @@ _NARROWED, _WIDENED, _TAIL_SHARE, _MAX_TAIL_SHARE = 0.85, 3.0, 0.15, 0.6
 # A tail is searched for if its share is this many standard errors above 0 to first order, and it is
 # kept if it increases the logarithm of the likelihood of other groups by at least this.
 _LEAST_SHARE_ERRORS, _LEAST_HELD_OUT_GAIN = 3.0, 3.0
+
+# Median chi-squared per voxel above which shells are tried in place of balls.
+_SHELL_MISFIT = 1.3
 
 # Spread of the diameters with which they are fitted first; a spread is used if it is at least this,
 # and increases the logarithm of the likelihood of the diameters by at least this.
@@ -120,19 +124,57 @@ def saturated_share(data: NDArray[Any]) -> float:
     return share if bdtrc(count - 2, count - 1 + most, 0.5) < _SATURATION_LEVEL else 0.0
 
 
+def without_clipped(data: NDArray[Any]) -> Floats:
+    """Return a frame as float64, with NaN in voxels that are clipped and in their neighbours.
+
+    A voxel that noise keeps just below the end of the range is no sample of its distribution, so
+    that all voxels beside clipped ones are left out too: their selection does not depend on their
+    own noise.
+
+    Parameters
+    ----------
+    data : ndarray
+        One frame, in the type in which it was recorded.
+
+    Returns
+    -------
+    ndarray
+        The frame itself where `saturated_share` finds no clipping.
+
+    Examples
+    --------
+    >>> frame = np.random.default_rng(1).poisson(9.0, size=(9, 40, 40)).astype(np.uint8)
+    >>> frame[3:6, 20:23, 20:23] = 255
+    >>> int(np.isnan(without_clipped(frame)).sum())
+    125
+    """
+    from scipy.ndimage import binary_dilation
+
+    frame = np.asarray(data, dtype=np.float64)
+    if saturated_share(data) == 0:
+        return frame
+    beside = np.ones((3,) * frame.ndim, dtype=np.bool_)
+    return np.where(binary_dilation(data == data.max(), beside), np.nan, frame)
+
+
 @dataclass(frozen=True, eq=False)
 class ImageParameters:
     """The parameters of a sphere's image in the search for the optics.
 
     Attributes
     ----------
-    values : ndarray, shape (3,) or (6,)
+    values : ndarray, shape (1,), (3,) or (6,)
         Logarithms of the diameter and of the blurs along z and in the plane, um; with a tail its
-        share, and the logarithms of its blurs. Blurs include the voxel.
+        share, and the logarithms of its blurs. Blurs include the voxel. With a measured point
+        spread the diameter alone.
     voxel : tuple of float
         Voxel size (z, y, x), um.
     spread : float
         Relative standard deviation of the diameters of different spheres.
+    measured : PointSpread or None
+        A point spread that was measured, and is not searched for.
+    shell : bool
+        The surface of the spheres is fluorescent, in place of all of them.
 
     Examples
     --------
@@ -144,6 +186,8 @@ class ImageParameters:
     values: Floats
     voxel: tuple[float, float, float]
     spread: float = 0.0
+    measured: PointSpread | None = None
+    shell: bool = False
 
     @property
     def voxel_blur(self) -> Floats:
@@ -152,15 +196,32 @@ class ImageParameters:
 
     def ball(self, values: Floats) -> BallBlur:
         """Return the blurred ball at other values of the parameters."""
+        if self.measured is not None:
+            wide_z, wide = self.voxel_blur.tolist()
+            measured = tuple(
+                (share, (float(np.hypot(z, wide_z)), float(np.hypot(plane, wide))))
+                for share, (z, plane) in self.measured.components
+            )
+            return BallBlur(float(np.exp(values[0])), measured, self.shell)
         diameter, blur_z, blur = np.exp(values[:3]).tolist()
         if len(values) == 3:
-            return BallBlur(diameter, ((1.0, (blur_z, blur)),))
+            return BallBlur(diameter, ((1.0, (blur_z, blur)),), self.shell)
         share, (tail_z, tail) = float(values[3]), np.exp(values[4:]).tolist()
-        return BallBlur(diameter, ((1.0 - share, (blur_z, blur)), (share, (tail_z, tail))))
+        both = ((1.0 - share, (blur_z, blur)), (share, (tail_z, tail)))
+        return BallBlur(diameter, both, self.shell)
 
     def image(self) -> SphereImage:
         """Return the sphere's image."""
         ball = self.ball(self.values)
+        if self.measured is not None:
+            return sphere_image(
+                diameter=ball.diameter,
+                psf=self.measured.components[0][1],
+                voxel=self.voxel,
+                spread=self.spread,
+                measured=self.measured,
+                shell=self.shell,
+            )
         (psf_z, psf), *wider = (
             np.sqrt(np.square(blur) - self.voxel_blur**2).tolist() for _, blur in ball.components
         )
@@ -173,6 +234,7 @@ class ImageParameters:
             voxel=self.voxel,
             tail=tail,
             spread=self.spread,
+            shell=self.shell,
         )
 
     def with_tail(self) -> ImageParameters:
@@ -194,6 +256,8 @@ class ImageParameters:
         """
         n = len(self.values)
         low, high = np.full(n, -np.inf), np.full(n, np.inf)
+        if n == 1:
+            return low, high
         least = np.log(_LEAST_OVER_VOXEL * self.voxel_blur)
         low[2] = least[1]
         low[1] = max(least[0], max(self.values[2], low[2]) + np.log(_LEAST_ELONGATION))
@@ -237,10 +301,19 @@ class ImageParameters:
         """Return the optics, with standard errors from the information on the parameters."""
         image = self.image()
         error = np.sqrt(np.diag(np.linalg.pinv(information, hermitian=True)))[:3]
+        if self.measured is not None:
+            stderr = (float(image.diameter * error[0]), 0.0, 0.0)
+            return Optics(
+                *(image.diameter, image.psf, noise, stderr, None, self.spread, self.measured),
+                self.shell,
+            )
         # The blur is the root of the sum of squares of point spread and voxel.
         factor = np.array([image.diameter, *(np.square(image.blur) / np.array(image.psf))])
         a, b, c = (float(value) for value in factor * error)
-        return Optics(image.diameter, image.psf, noise, (a, b, c), image.tail, self.spread)
+        return Optics(
+            *(image.diameter, image.psf, noise, (a, b, c), image.tail, self.spread),
+            shell=self.shell,
+        )
 
 
 class ImageVariations(NamedTuple):
@@ -251,8 +324,8 @@ class ImageVariations(NamedTuple):
     image : SphereImage
         The image at the present values.
     slopes : ndarray, shape (k, ...)
-        Tables of the derivatives (`SphereImage.slopes`); without a tail the last one is that by the
-        share of a tail, at a share of 0.
+        Tables of the derivatives (`SphereImage.slopes`); of a single Gaussian the last one is that
+        by the share of a tail, at a share of 0.
     """
 
     image: SphereImage
@@ -645,6 +718,7 @@ def fit_samples(
     *,
     diameter: float,
     voxel: tuple[float, float, float],
+    measured: PointSpread | None = None,
 ) -> LearnedOptics:
     """Find the sphere diameter, point spread and noise of greatest likelihood for most samples.
 
@@ -658,6 +732,8 @@ def fit_samples(
         Diameter at the start of the search, um; the diameter of the result is fitted.
     voxel : tuple of float
         Voxel size (z, y, x), um.
+    measured : PointSpread, optional
+        A point spread that was measured; diameter and noise are learned.
 
     Returns
     -------
@@ -685,6 +761,8 @@ def fit_samples(
     psf = np.array([max(voxel[0], 0.15 * diameter), max(voxel[1] / 2, 0.06 * diameter)])
     start = ImageParameters(np.log([diameter, 1.0, 1.0]), voxel)
     start.values[1:] = np.log(np.hypot(psf, start.voxel_blur))
+    if measured is not None:
+        start = ImageParameters(np.log([diameter]), voxel, measured=measured)
     start = start.within_bounds()
     usable = _with_enough_voxels(samples, start.image())
     if not usable:
@@ -693,8 +771,8 @@ def fit_samples(
             "check diameter, contact and minmass, and whether spheres are dark (dark=True), state "
             "the optics (optics=), or keep the positions found first (refine=None)"
         )
-    mean = float(np.mean([s.frame.mean() for s in usable]))
-    plain = _settled(usable, start, CameraNoise(1.0, 0.05 * abs(mean)))
+    mean = float(np.mean([np.nanmean(s.frame) for s in usable]))
+    plain = _ball_or_shell(usable, start, CameraNoise(1.0, 0.05 * abs(mean)))
     plain, left_out = _without_dust(plain)
     found = plain
     if not any(isinstance(s, CrowdSample) for s in found.samples):
@@ -707,6 +785,34 @@ def fit_samples(
         found, left_out = _without_dust(found)
     optics = found.parameters.optics(found.noise, found.information)
     return LearnedOptics(optics, replace(_usual_of(found), left_out=left_out))
+
+
+def _ball_or_shell(
+    samples: list[GroupSample | CrowdSample], start: ImageParameters, noise: CameraNoise
+) -> _Settled:
+    """Return the parameters of balls, or of shells if the samples are likelier with them.
+
+    Shells are tried where the search for balls does not converge, or leaves large residuals.
+    """
+    ball: _Settled | None = None
+    try:
+        ball = _settled(samples, start, noise)
+        chi2 = np.median([fit.chi2(ball.noise) for fit in ball.fits])
+        if chi2 < _SHELL_MISFIT or not all(isinstance(s, GroupSample) for s in samples):
+            return ball
+        shell = _settled(ball.samples, replace(start, shell=True), noise)
+    except NoSpheresError:
+        if ball is not None:
+            return ball
+        return _settled(samples, replace(start, shell=True), noise)
+    images = [one.parameters.image() for one in (ball, shell)]
+    within = max(images, key=lambda image: float(image.extent.max()))
+    gain = 0.0
+    for one, image, sign in zip((ball, shell), images, (-1, 1), strict=True):
+        for s in one.samples:
+            if isinstance(s, GroupSample):
+                gain += sign * s.log_likelihood(image, shell.noise, within=within)
+    return shell if gain > _LEAST_HELD_OUT_GAIN else ball
 
 
 def _with_enough_voxels(
@@ -806,9 +912,10 @@ def _settled(
         settled = np.abs(step).max() < _STEP_CONVERGED or (number > 0 and in_errors < tolerance)
         if settled and same:
             return _Settled(parameters, noise, samples, fits, information, score)
-    size, psf_z, psf = np.exp(parameters.values[:3])
+    found = parameters.ball(parameters.values)
+    psf_z, psf = found.components[0][1]
     raise NoSpheresError(
-        f"sphere size and point spread do not converge: diameter {size:.3g}, blur "
+        f"sphere size and point spread do not converge: diameter {found.diameter:.3g}, blur "
         f"({psf_z:.3g}, {psf:.3g}) um after {rounds} rounds "
         f"on {len(samples)} groups: are these spheres, bright enough, or dark (dark=True), and "
         "is the voxel size right? State the optics (optics=), or keep the positions found "
@@ -845,6 +952,8 @@ def _with_spread(equal: _Settled) -> _Settled:
 
 def _shows_tail(found: _Settled) -> bool:
     """Return whether the first step of a tail's share is significantly positive."""
+    if found.parameters.measured is not None:
+        return False
     variance = np.linalg.pinv(found.information, hermitian=True)
     share = float(variance[-1] @ found.score)
     return share > _LEAST_SHARE_ERRORS * float(np.sqrt(variance[-1, -1]))

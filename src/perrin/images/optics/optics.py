@@ -10,6 +10,7 @@ import numpy as np
 from perrin._arrays import to_plain
 from perrin._display import Shown
 from perrin.images.optics.ball_image import PsfTail, SphereImage, sphere_image
+from perrin.images.optics.point_spread import PointSpread
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -86,6 +87,11 @@ class Optics(Shown):
         deviations (z, plane), um; None for a Gaussian point spread.
     spread : float
         Relative standard deviation of the diameters of different spheres; 0 where they are equal.
+    measured : PointSpread or None
+        A point spread that was measured on beads; `psf` is then that of its narrowest Gaussian, and
+        there is no `tail`.
+    shell : bool
+        The surface of the spheres is fluorescent, in place of all of them.
 
     Examples
     --------
@@ -100,10 +106,12 @@ class Optics(Shown):
     stderr: tuple[float, float, float] = (0.0, 0.0, 0.0)
     tail: PsfTail | None = None
     spread: float = 0.0
+    measured: PointSpread | None = None
+    shell: bool = False
 
     def to_dict(self) -> dict[str, Any]:
         """Return values that JSON holds: `noise` as [gain, floor], `tail` as [share, psf]."""
-        return {
+        entry = {
             "diameter": to_plain(self.diameter),
             "psf": to_plain(self.psf),
             "noise": [to_plain(value) for value in self.noise],
@@ -111,6 +119,10 @@ class Optics(Shown):
             "tail": None if self.tail is None else [to_plain(part) for part in self.tail],
             "spread": to_plain(self.spread),
         }
+        # What most movies do not have is not written.
+        shell = {"shell": True} if self.shell else {}
+        measured = {} if self.measured is None else {"measured": self.measured.to_dict()}
+        return entry | measured | shell
 
     @classmethod
     def from_dict(cls, entry: Mapping[str, Any]) -> Optics:
@@ -119,8 +131,9 @@ class Optics(Shown):
         Parameters
         ----------
         entry : mapping
-            The dictionary of `to_dict`; one without `tail` has a Gaussian point spread,
-            and one without `spread` equal spheres.
+            The dictionary of `to_dict`; one without `tail` has a Gaussian point spread, one without
+            `spread` equal spheres, one without `measured` a point spread that was learned, and one
+            without `shell` balls.
 
         Returns
         -------
@@ -132,9 +145,12 @@ class Optics(Shown):
             share, (tail_z, tail_plane) = entry["tail"]
             tail = PsfTail(share, (tail_z, tail_plane))
         noise = CameraNoise(*entry["noise"])
-        return cls(
-            entry["diameter"], (psf_z, psf), noise, (a, b, c), tail, entry.get("spread", 0.0)
-        )
+        measured = None
+        if entry.get("measured") is not None:
+            measured = PointSpread.from_dict(entry["measured"])
+        size, spread = entry["diameter"], entry.get("spread", 0.0)
+        shell = bool(entry.get("shell", False))
+        return cls(size, (psf_z, psf), noise, (a, b, c), tail, spread, measured, shell)
 
     def image(self, voxel: tuple[float, float, float]) -> SphereImage:
         """Return the table of the sphere's image for voxels (z, y, x), um."""
@@ -144,4 +160,6 @@ class Optics(Shown):
             voxel=voxel,
             tail=self.tail,
             spread=self.spread,
+            measured=self.measured,
+            shell=self.shell,
         )

@@ -223,6 +223,7 @@ def cut_window(frame: Floats, image: SphereImage, centers: Floats, *, others: Fl
     Parameters
     ----------
     frame : ndarray, shape (nz, ny, nx)
+        Voxels of NaN are left out.
     image : SphereImage
     centers, others : ndarray, shape (n, 3), (m, 3)
         Positions (z, y, x) of the spheres of the fit and of all others, um.
@@ -238,6 +239,7 @@ def cut_window(frame: Floats, image: SphereImage, centers: Floats, *, others: Fl
     low, high = (np.array([getattr(s, end) for s in box]) * voxel for end in ("start", "stop"))
     near = np.all(np.abs(others - np.clip(others, low, high)) < extent, axis=1)
     mask &= ~within(grid, others[near], extent)
+    mask &= np.isfinite(frame[box])
     z, y, x = np.meshgrid(*(g - g.mean() for g in grid), indexing="ij", sparse=True)
     background = np.stack([np.broadcast_to(b, mask.shape)[mask] for b in (np.ones(()), z, y, x)])
     return Window(box, mask, frame[box][mask].astype(np.float64), background)

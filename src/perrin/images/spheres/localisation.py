@@ -27,6 +27,7 @@ from perrin.images.optics.learn import (
     UsualImage,
     fit_samples,
     saturated_share,
+    without_clipped,
 )
 from perrin.images.optics.window_fit import FreeCenters, fit_window
 from perrin.images.spheres.by_trackpy import Features, find_features, refine_by_trackpy
@@ -55,6 +56,7 @@ if TYPE_CHECKING:
     from perrin._arrays import Ints
     from perrin.images.optics.ball_image import SphereImage
     from perrin.images.optics.optics import CameraNoise, Optics
+    from perrin.images.optics.point_spread import PointSpread
     from perrin.images.optics.radial_image import RadialImage
     from perrin.images.optics.window_fit import ImageFit, Window
 
@@ -135,6 +137,8 @@ class Search:
         Spheres in chains of over 16 are refined too.
     circles : bool
         Spots are centres of circular symmetry, bright or dark: in a 2-D movie for the model.
+    psf : PointSpread or None
+        A point spread that was measured; None learns it with the optics.
 
     Examples
     --------
@@ -150,6 +154,7 @@ class Search:
     border: bool = True
     crowds: bool = False
     circles: bool = False
+    psf: PointSpread | None = None
 
     @classmethod
     def of(
@@ -161,6 +166,7 @@ class Search:
         contact: float,
         refine: Refine,
         crowds: bool,
+        psf: PointSpread | None = None,
     ) -> Search:
         """Return the search that options of spots state; in a 2-D movie it is for circles."""
         return cls(
@@ -172,6 +178,7 @@ class Search:
             border=spots.border,
             crowds=crowds,
             circles=refine == "model" and is_flat(stack),
+            psf=psf,
         )
 
     def spots(self, frame: Floats, voxel: _Voxel) -> Features:
@@ -298,6 +305,7 @@ class Method:
             )
         elif self.refine == "model":
             light = 1.0 if self.fading is None else self.fading.at(i, found.centers)
+            frame = without_clipped(data)
             columns, crowds = group_columns(
                 frame, found, self.search, self.optics, voxel, usual=self.usual, light=light
             )
@@ -455,6 +463,7 @@ def locate(
     contact: float,
     refine: Refine = "model",
     optics: Optics | None = None,
+    psf: PointSpread | None = None,
     spots: Spots | None = None,
     crowds: bool = False,
     frames: Iterable[int] | None = None,
@@ -479,6 +488,9 @@ def locate(
     optics : Optics, optional
         Size, point spread and noise of the image of a sphere; by default learned from a few frames
         (`fit_optics`).
+    psf : PointSpread, optional
+        A point spread that was measured on beads (`measure_point_spread`); diameter and noise are
+        then learned with it.
     spots : Spots, optional
         Which spots are taken for spheres.
     crowds : bool
@@ -550,7 +562,7 @@ def locate(
     faults: list[str] = []
     spots = options_from(Spots, spots, settings, name="spots", faults=faults)
     search = Search.of(
-        stack, spots, diameter=diameter, contact=contact, refine=refine, crowds=crowds
+        stack, spots, diameter=diameter, contact=contact, refine=refine, crowds=crowds, psf=psf
     )
     check_search(stack, search, refine, optics=optics, faults=faults)
     n_frames = stack.shape[0]
@@ -616,16 +628,17 @@ def fit_optics(sample: Sequence[SampledFrame], method: Method, *, voxel: _Voxel)
     pieces: list[GroupSample | CrowdSample] = []
     for sampled in sample:
         found = method.spheres(sampled.spots, sampled.number)
+        frame = without_clipped(sampled.frame)
         groups, crowds = groups_and_crowds(found.centers, contact=search.contact)
-        samples += [_group_sample(sampled.frame, found, group, search.contact) for group in groups]
+        samples += [_group_sample(frame, found, group, search.contact) for group in groups]
         for crowd in crowds if search.crowds else []:
-            piece = crowd_piece(sampled.frame, found.centers[crowd], voxel, count=_PIECE_SPHERES)
+            piece = crowd_piece(frame, found.centers[crowd], voxel, count=_PIECE_SPHERES)
             pieces.append(CrowdSample(*piece, np.empty((0, 3)), search.contact))
     most = _LEARNING_GROUPS
     if sum(len(s.centers) for s in samples) < sum(len(s.centers) for s in pieces):
         samples, most = pieces, _LEARNING_CROWDS
     chosen = [samples[k] for k in _evenly_spaced(len(samples), most)]
-    return fit_samples(chosen, diameter=search.diameter, voxel=voxel)
+    return fit_samples(chosen, diameter=search.diameter, voxel=voxel, measured=search.psf)
 
 
 def without_doubles(columns: Columns, *, contact: float) -> Columns:
@@ -726,7 +739,9 @@ def group_columns(
             reason[group] = _NO_OWN_VOXELS
             continue
         fit = fit_window(window, image, noise, FreeCenters(sample.centers))
-        moved = np.linalg.norm(fit.centers - sample.centers, axis=1) >= furthest
+        # Spheres that only come near were found where they are, not where they would touch.
+        starts = np.stack([sample.centers, found.centers[group]])
+        moved = np.linalg.norm(fit.centers - starts, axis=2).min(axis=0) >= furthest
         dark = ~(fit.brightness / np.median(fit.brightness) > 0.1)
         faults = np.where(dark, _DARK, np.where(moved, _MOVED, "")).astype(object)
         if usual is not None:
@@ -1029,6 +1044,10 @@ def check_search(
             "optics: those of a volume do not describe a 2-D movie, whose image of a sphere is "
             "learned: leave optics out"
         )
+    if search.psf is not None and optics is not None:
+        faults.append("psf: the point spread is stated in optics as well: state one of them")
+    if search.psf is not None and (search.circles or refine != "model"):
+        faults.append('psf: only refine="model" in a volume uses it: leave it out')
     if not lengths and len(stack.shape) == 4:
         faults += size_faults(stack, search, optics)
     refuse(faults)

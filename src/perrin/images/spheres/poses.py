@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from perrin.images.optics.learn import without_clipped
 from perrin.images.optics.window_fit import RigidCenters, cut_window, fit_window
 
 if TYPE_CHECKING:
@@ -101,7 +102,7 @@ def fit_pose(
     image = optics.image((z, y, x))
     poses: dict[int, Pose] = {}
     for k in motion.fitted.tolist():
-        frame = np.asarray(stack.frame(int(number[k])), dtype=np.float64)
+        frame = without_clipped(np.asarray(stack.frame(int(number[k]))))
         away = np.empty((0, 3))
         if others is not None:
             away = others.loc[others["frame"] == number[k], ["x", "y", "z"]].to_numpy(np.float64)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -25,7 +25,7 @@ _KEPT_MEMORY = 2**28  # bytes that the memory allocator of a worker does not ret
 
 @dataclass(frozen=True, kw_only=True)
 class Work:
-    """Where the work of a movie is done, and where its results are kept.
+    """Where the work of a movie or of a table is done, and where the results of a movie are kept.
 
     Parameters
     ----------
@@ -106,6 +106,8 @@ def work_through(
     *,
     workers: int = 0,
     scheduler: str | None = None,
+    client: Any = None,  # noqa: ANN401 (a client of the optional package distributed)
+    at_once: int = _ITEMS_AT_ONCE,
 ) -> Iterator[T]:
     """Yield the result of a task for every item, in the order in which they are finished.
 
@@ -119,6 +121,10 @@ def work_through(
     scheduler : str, optional
         Address of a running Dask scheduler, such as ``tcp://node7:8786``, whose workers do the
         work.
+    client : distributed.Client, optional
+        An open client of `dask_client`, instead of workers or a scheduler.
+    at_once : int
+        Number of items that a worker gets at once.
 
     Raises
     ------
@@ -138,17 +144,17 @@ def work_through(
     >>> list(work_through(float, [1, 2]))
     [1.0, 2.0]
     """
-    if not workers and scheduler is None:
+    if not workers and scheduler is None and client is None:
         for item in items:
-            yield _one_thread(task, item)
+            yield one_thread(task, item)
         return
     from concurrent.futures import CancelledError
 
-    with dask_client(workers, scheduler) as client:
+    opened = dask_client(workers, scheduler) if client is None else nullcontext(client)
+    with opened as client:
         from distributed import KilledWorker, as_completed
 
-        starts = range(0, len(items), _ITEMS_AT_ONCE)
-        chunks = [list(items[k : k + _ITEMS_AT_ONCE]) for k in starts]
+        chunks = [list(items[k : k + at_once]) for k in range(0, len(items), at_once)]
         tasks = [task] * len(chunks)
         futures = client.map(_several_items, tasks, chunks, pure=False, retries=0)
         try:
@@ -202,7 +208,19 @@ def _dask() -> tuple[Any, Any, Any]:
     return dask, Client, LocalCluster
 
 
-def _one_thread(task: Callable[[S], T], item: S) -> T:
+def one_thread(task: Callable[[S], T], item: S) -> T:
+    """Return ``task(item)``, numerical libraries on one thread.
+
+    Raises
+    ------
+    ModuleNotFoundError
+        If threadpoolctl is not installed.
+
+    Examples
+    --------
+    >>> one_thread(float, 1)
+    1.0
+    """
     try:
         from threadpoolctl import threadpool_limits
     except ModuleNotFoundError as missing:
@@ -214,7 +232,7 @@ def _one_thread(task: Callable[[S], T], item: S) -> T:
 
 
 def _several_items(task: Callable[[S], T], items: list[S]) -> list[T]:
-    return [_one_thread(task, item) for item in items]
+    return [one_thread(task, item) for item in items]
 
 
 @contextmanager

@@ -1,0 +1,127 @@
+"""The clusters of a table in batches, which one or several processes work through."""
+
+from __future__ import annotations
+
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib.util import find_spec
+from itertools import islice
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+
+from perrin.run.workers import dask_client, one_thread, work_through
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator
+
+    from perrin.run.workers import Work
+
+S = TypeVar("S")
+T = TypeVar("T")
+
+# Clusters of a batch: a tenth of them, so that progress is seen and several processes share them,
+# not fewer than are efficient, nor more than bound the memory. Results may depend on it in the
+# last digits, and so it does not depend on the number of processes.
+_FEWEST_MEASURED, _MOST_MEASURED = 16, 256
+
+
+class InOrder(Protocol):
+    """A way to do the same with every batch."""
+
+    def __call__(self, task: Callable[[list[S]], T], batches: Iterable[list[S]]) -> Iterator[T]:
+        """Yield the result of each batch, in the order of the batches."""
+
+
+@dataclass(frozen=True)
+class _NumberedTask:
+    """A task whose result has the number of its batch."""
+
+    task: Callable[[list[Any]], Any]
+
+    def __call__(self, item: tuple[int, list[Any]]) -> tuple[int, Any]:
+        number, batch = item
+        return number, self.task(batch)
+
+
+def clusters_together(count: int) -> int:
+    """Return how many of `count` clusters are a batch.
+
+    Examples
+    --------
+    >>> [clusters_together(count) for count in (5, 1000, 10_000)]
+    [16, 100, 256]
+    """
+    return min(max(-(-count // 10), _FEWEST_MEASURED), _MOST_MEASURED)
+
+
+def batches_of(items: Iterable[S], *, size: int) -> Iterator[list[S]]:
+    """Yield the items in lists of one size, the last one perhaps shorter.
+
+    Parameters
+    ----------
+    items : iterable
+    size : int
+
+    Yields
+    ------
+    list
+
+    Examples
+    --------
+    >>> list(batches_of(range(5), size=2))
+    [[0, 1], [2, 3], [4]]
+    """
+    rest = iter(items)
+    while batch := list(islice(rest, size)):
+        yield batch
+
+
+@contextmanager
+def shared_work(work: Work | None) -> Iterator[InOrder]:
+    """Give a way to work through batches: in this process, or in those that `work` states.
+
+    Each batch is computed on one thread (in this process only if threadpoolctl is installed), so
+    that its result is the same to the last bit in every process.
+
+    Parameters
+    ----------
+    work : Work, optional
+
+    Yields
+    ------
+    callable
+        ``in_order(task, batches)`` yields the results in the order of the batches. For other
+        processes task, items and results can be pickled.
+
+    Raises
+    ------
+    ModuleNotFoundError, OSError
+        As in `work_through`.
+
+    Examples
+    --------
+    >>> with shared_work(None) as in_order:
+    ...     list(in_order(sum, [[1, 2], [3]]))
+    [3, 3]
+    """
+    if work is None or not (work.workers or work.scheduler):
+        limited = find_spec("threadpoolctl") is not None
+
+        def alone(task: Callable[[list[S]], T], batches: Iterable[list[S]]) -> Iterator[T]:
+            for batch in batches:
+                yield one_thread(task, batch) if limited else task(batch)
+
+        yield alone
+        return
+    with dask_client(work.workers, work.scheduler) as client:
+
+        def shared(task: Callable[[list[S]], T], batches: Iterable[list[S]]) -> Iterator[T]:
+            done: dict[int, T] = {}
+            numbered, expected = list(enumerate(batches)), 0
+            found = work_through(_NumberedTask(task), numbered, client=client, at_once=1)
+            for number, result in found:
+                done[number] = result
+                while expected in done:
+                    yield done.pop(expected)
+                    expected += 1
+
+        yield shared
