@@ -144,7 +144,8 @@ def xml_root(text: str | bytes) -> Element:
     """
     from xml.etree import ElementTree
 
-    if ("<!doctype" if isinstance(text, str) else b"<!doctype") in text.lower():
+    found = "<!doctype" in text.lower() if isinstance(text, str) else b"<!doctype" in text.lower()
+    if found:
         raise ValueError("has a header with a document type (DOCTYPE), which no microscope writes")
     try:
         return ElementTree.fromstring(text)
