@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 _MODE_SPACING, _MODE_MARGIN = 0.45, 16.0
 
 # Nodes in the window of dense ones: this many, and more by its half-width in log(f/(1 - f)).
-_NODES, _NODES_BY_WIDTH = 9, 5.5
+_LEAST_NODES, _NODES_BY_WIDTH = 9, 5.5
 
 # Distances of the sparse nodes from the window.
 _SPARSE_NODES = np.array([0.8, 2.0, 4.5, 10.0])
@@ -55,7 +55,7 @@ WINDOW = 1.0
 _FAR_STEPS = 50
 
 # Singular values below this part of the largest carry no more than rounding.
-_ROUNDING = 1e-14
+_LEAST_SINGULAR = 1e-14
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,7 +143,7 @@ def compress_steps(
     """
     low, high = window
     half = 0.5 * (high - low)
-    count = _NODES + int(_NODES_BY_WIDTH * half)
+    count = _LEAST_NODES + int(_NODES_BY_WIDTH * half)
     dense = np.cos(np.pi * (np.arange(count) + 0.5) / count)
     place = np.concatenate(
         [low - _SPARSE_NODES, 0.5 * (low + high) + half * dense, high + _SPARSE_NODES]
@@ -161,11 +161,11 @@ def compress_steps(
     kernel = size[:, None] / variance
     reach = kernel.max(axis=0)
     right = (size[:, None, None] * forms).reshape(len(share), b * b)
-    power = np.linalg.lstsq(kernel / reach, right, rcond=_ROUNDING)[0] / reach[:, None]
+    power = np.linalg.lstsq(kernel / reach, right, rcond=_LEAST_SINGULAR)[0] / reach[:, None]
     # log det P = sum_k count_k log v_k + log_det, and the counts add up to the number of steps.
     logs = np.column_stack([np.log(variance), np.ones(len(share))])
     logs = np.vstack([logs, np.append(np.ones(len(grid)), 0.0)])
-    weights = np.linalg.lstsq(logs, np.append(log_dets, len(vectors)), rcond=_ROUNDING)[0]
+    weights = np.linalg.lstsq(logs, np.append(log_dets, len(vectors)), rcond=_LEAST_SINGULAR)[0]
     power = power.reshape(-1, b, b)
     return EffectiveModes(
         scale * (1 - part),

@@ -55,7 +55,7 @@ _NO_STEADY_MOTION = 0.2
 _CLUSTERING_LAGS = 20
 
 # About this many step components are tested at once; more do not stay in the processor's cache.
-_MOST_AT_ONCE = 30_000
+_MOST_SCORES = 30_000
 
 FEWEST_HALF_PERIODS = 6  # of a vibration in the track
 
@@ -966,7 +966,7 @@ def brownian_tests_of_each(
         alike.setdefault(key, []).append(i)
     found: dict[int, BrownianTests] = {}
     for group in alike.values():
-        at_once = max(1, _MOST_AT_ONCE // each[group[0]][1].size)
+        at_once = max(1, _MOST_SCORES // each[group[0]][1].size)
         for k in range(0, len(group), at_once):
             rows = group[k : k + at_once]
             if len(rows) == 1:

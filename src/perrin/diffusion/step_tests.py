@@ -57,7 +57,7 @@ _MEDIAN_SQUARE = 0.4549  # median of chi-squared with one degree of freedom
 # Bodies move alike unless their displacements differ by more than at this level.
 _MOVE_ALIKE = 1e-4
 
-_MOST_AT_ONCE = 20_000  # steps that are tested at once; more do not stay in the processor's cache
+_MOST_STEPS = 20_000  # steps that are tested at once; more do not stay in the processor's cache
 
 # A variance multiplied by this takes a step out of the prediction of the others.
 _LEFT_OUT = 1e6
@@ -273,7 +273,7 @@ def _equally_many_steps(
             alike.setdefault((count, motion.dimension), []).append(k)
     groups = []
     for (count, _), rows in alike.items():
-        at_once = max(1, _MOST_AT_ONCE // count)
+        at_once = max(1, _MOST_STEPS // count)
         groups += [rows[low : low + at_once] for low in range(0, len(rows), at_once)]
     return groups
 

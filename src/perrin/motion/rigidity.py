@@ -80,7 +80,7 @@ _LARGEST_DRIFT = 0.2
 _DRIFT_ERRORS = 5.0
 
 # About this many coordinates are judged at once; more do not stay in the processor's cache.
-_MOST_AT_ONCE = 60_000
+_MOST_RESIDUALS = 60_000
 
 # Smallest relative error of the scale of z that is reported, where it is significant: refractive
 # indices are not known better.
@@ -310,7 +310,7 @@ def judge_each(
         alike.setdefault((x.shape, motion.dt, scanned), []).append(k)
     found: dict[int, Quality] = {}
     for group in alike.values():
-        at_once = max(1, _MOST_AT_ONCE // positions[group[0]].size)
+        at_once = max(1, _MOST_RESIDUALS // positions[group[0]].size)
         for low in range(0, len(group), at_once):
             rows = group[low : low + at_once]
             judged = _judge_alike(

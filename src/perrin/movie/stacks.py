@@ -66,7 +66,7 @@ if TYPE_CHECKING:
 _SCANNED = 0.05
 
 # Frames of two channels that begin less than this share of their interval apart are simultaneous.
-_SAME_TIME = 1e-6
+_ON_TIME = 1e-6
 
 _VIEWS = 8  # frames that are kept as pictures
 _LIBRARIES = ("perrin", "numpy", "scipy", "trackpy")
@@ -246,9 +246,10 @@ def analyze_stack(
         else tempfile.TemporaryDirectory(prefix="perrin-")
     ) as kept:
         folder = Path(kept)
+        names = [_LOCATED, *(f"{_LOCATED}-{k}" for k in range(1, len(stacks)))]
         located = [
             _located(one, search, refine, optics, numbers, own, folder / name, work)
-            for one, own, name in zip(stacks, depends, _folders(len(stacks)), strict=True)
+            for one, own, name in zip(stacks, depends, names, strict=True)
         ]
         if [file_states(one) for one in stacks] != before:
             raise OSError(
@@ -271,13 +272,14 @@ def analyze_stack(
             }
             for one, own in zip(stacks, depends, strict=True)
         ]
+        channels = [{**source, **one.choice} for one, source in zip(stacks, sources, strict=True)]
         run: _Run = {
             "source": sources[0],
             "arguments": experiment.to_dict()
             | {k: v for k, v in depends[0].items() if k not in ("sha256", "versions")}
             | {"size": sizes, "exclude": excluded}
             | {f"stated_{name}": value for name, value in stack.stated.items()}
-            | _other_channels(stacks, sources),
+            | ({"other_channels": channels[1:]} if len(stacks) > 1 else {}),
         }
         recording = Recording(
             stack.dt,
@@ -303,21 +305,6 @@ def analyze_stack(
     return _with_checks(report, stacks, located, bodies, search, findings, offsets)
 
 
-def _folders(count: int) -> list[str]:
-    """Return the folders of the finished frames of all channels."""
-    return [_LOCATED, *(f"{_LOCATED}-{k}" for k in range(1, count))]
-
-
-def _other_channels(
-    stacks: Sequence[Stack], sources: Sequence[dict[str, str | None]]
-) -> dict[str, Any]:
-    """Return where the channels beside the first come from, for run.json."""
-    if len(stacks) == 1:
-        return {}
-    pairs = list(zip(stacks, sources, strict=True))
-    return {"other_channels": [{**source, **one.choice} for one, source in pairs[1:]]}
-
-
 def with_own_times(table: pd.DataFrame, stack: Stack, *channels: Stack) -> pd.DataFrame:
     """Add the time of every sphere after that of its frame, s: that of the planes through it.
 
@@ -333,7 +320,7 @@ def with_own_times(table: pd.DataFrame, stack: Stack, *channels: Stack) -> pd.Da
     """
     late = np.array([one.times - stack.times for one in (stack, *channels)])
     scanned = bool(stack.plane_time) and "z" in table
-    if not scanned and not np.any(np.abs(late) > _SAME_TIME * (stack.dt or 1.0)):
+    if not scanned and not np.any(np.abs(late) > _ON_TIME * (stack.dt or 1.0)):
         return table
     delay = np.zeros(len(table))
     if channels:

@@ -419,7 +419,10 @@ class _Check:
         for key, value in options.items():
             for line in _option_faults(key, value):
                 self.wrong((*at, key), line)
-        label = _sample_label(sample, number)
+        files = sample.get("files")
+        # Without a label, a sample is called after its first file.
+        usual = _stem(files[0]) if _are_texts(files) and files else f"sample {number + 1}"
+        label = str(sample.get("label", usual))
         if label in self._labels:
             self.wrong((*at, "label"), f"label {label!r} is that of another sample")
         self._labels.add(label)
@@ -554,13 +557,6 @@ def _with_run_names(movies: Iterable[StudyMovie]) -> list[StudyMovie]:
         mark = hashlib.sha256(f"{movie.sample}\n{movie.path}".encode()).hexdigest()[:6]
         named.append(replace(movie, name=f"{text[:80]}-{mark}"))
     return named
-
-
-def _sample_label(sample: Mapping[str, Any], number: int) -> str:
-    """Return the label of a sample; that of its first file, or its number, without one."""
-    files = sample.get("files")
-    usual = _stem(files[0]) if _are_texts(files) and files else f"sample {number + 1}"
-    return str(sample.get("label", usual))
 
 
 def _stem(path: str) -> str:

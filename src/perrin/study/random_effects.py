@@ -24,7 +24,7 @@ Scope = Literal["movies", "clusters", "cluster"]
 
 # Steps of the grid of ln D in standard errors of the most precise cluster, and its largest number
 # of points; a cluster that is more precise than 1.5 steps is taken as if it had this error.
-_STEPS_PER_ERROR, _MOST_POINTS, _LEAST_ERROR = 2.5, 400, 1.5
+_STEPS_PER_ERROR, _MOST_GRID_POINTS, _LEAST_ERROR = 2.5, 400, 1.5
 
 # Spreads at which the likelihood is tabulated: 0, and up to twice the scatter of the estimates.
 _SPREADS, _SMALLEST_SPREAD, _LAST_SPREAD = 9, 0.07, 2.0
@@ -373,7 +373,7 @@ def _tabulated(members: Sequence[Coefficient], *, units: int) -> tuple[Floats, F
     most = _LAST_SPREAD * max(float(np.std(place, ddof=1)), float(np.sqrt(np.mean(error**2))))
     margin = 4 * most / np.sqrt(units)
     low, top = (place - 4.5 * error).min() - margin, (place + 4.5 * error).max() + margin
-    step = max(error.min() / _STEPS_PER_ERROR, (top - low) / _MOST_POINTS)
+    step = max(error.min() / _STEPS_PER_ERROR, (top - low) / _MOST_GRID_POINTS)
     log_D = np.arange(low, top + step, step)
     rows = log_likelihoods(members, log_D)
     rows *= (np.minimum(1.0, error / (_LEAST_ERROR * step)) ** 2)[:, None]

@@ -62,7 +62,7 @@ _MOVING_SPREAD, _STILL_SHARE = 10.0, 1e-6
 _LATTICE_TOLERANCE, _WHOLE_TOLERANCE = 1e-3, 0.02
 
 # About this many coordinates are compared at once; more do not stay in the processor's cache.
-_MOST_AT_ONCE = 100_000
+_MOST_COORDINATES = 100_000
 
 _POINTS_SHOWN = 3  # placeholders that a warning names
 
@@ -250,7 +250,7 @@ def of_equal_shape(arrays: Sequence[Floats]) -> list[list[int]]:
         alike.setdefault(one.shape, []).append(k)
     groups = []
     for shape, rows in alike.items():
-        at_once = max(1, _MOST_AT_ONCE // max(int(np.prod(shape)), 1))
+        at_once = max(1, _MOST_COORDINATES // max(int(np.prod(shape)), 1))
         groups += [rows[low : low + at_once] for low in range(0, len(rows), at_once)]
     return groups
 

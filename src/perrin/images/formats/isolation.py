@@ -30,7 +30,7 @@ SWITCH = "PERRIN_GUARD"  # environment variable; "off" reads files in the same p
 _SECONDS = 60
 
 # Memory of the libraries themselves, and of the stacks of their threads, bytes.
-_LIBRARIES = 2**29
+_BYTES_OF_LIBRARIES = 2**29
 
 _START = """
 import sys
@@ -192,7 +192,7 @@ def serve() -> None:
             _renew_time()
             if "path" in question:
                 contents = _opened(question)
-                answer = _described(contents)
+                answer = _in_plain_values(contents)
             else:
                 assert contents is not None
                 image = np.ascontiguousarray(contents.plane(*question["plane"]))
@@ -220,7 +220,7 @@ def _opened(question: dict[str, Any]) -> Contents:
     return found.read(path, Pick(**question["pick"]))
 
 
-def _described(contents: Contents) -> dict[str, Any]:
+def _in_plain_values(contents: Contents) -> dict[str, Any]:
     """Return the description of a file as JSON holds it."""
     times = contents.times
     return {
@@ -264,6 +264,6 @@ def _limit_memory(n_bytes: int) -> None:
     except ImportError:
         return
     _, hard = resource.getrlimit(resource.RLIMIT_DATA)
-    soft = n_bytes + _LIBRARIES
+    soft = n_bytes + _BYTES_OF_LIBRARIES
     if hard == resource.RLIM_INFINITY or soft < hard:
         resource.setrlimit(resource.RLIMIT_DATA, (soft, hard))

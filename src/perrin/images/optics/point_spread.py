@@ -21,7 +21,7 @@ _WIDTHS = np.geomspace(0.03, 0.9, 16)
 _ELONGATIONS = (1.1, 1.5, 2.0, 2.8, 4.0, 5.6, 8.0)
 
 # Largest width along z, um: the light of wider ones is background around a bead.
-_WIDEST = 1.5
+_MOST_RADIUS = 1.5
 
 # A Gaussian with a smaller share of the intensity is left out.
 _LEAST_COMPONENT = 0.01
@@ -190,7 +190,7 @@ def measure_point_spread(stack: BeadStack, *, diameter: float = 0.1) -> PointSpr
         frame += np.asarray(stack.frame(i), dtype=np.float64) / stack.shape[0]
     beads = _beads_of(frame, voxel)
     widths = np.array(
-        [(ratio * r, r) for r in _WIDTHS for ratio in _ELONGATIONS if ratio * r <= _WIDEST]
+        [(ratio * r, r) for r in _WIDTHS for ratio in _ELONGATIONS if ratio * r <= _MOST_RADIUS]
     )
     # Variances of a voxel and of a bead.
     added = np.array([voxel[0] ** 2, voxel[1] * voxel[2]]) / 12 + diameter**2 / 20
