@@ -6,7 +6,7 @@ import inspect
 import json
 import shlex
 from contextlib import nullcontext
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -43,20 +43,22 @@ def report() -> perrin.Report:
     )  # fmt: skip
 
 
+# Arguments of analyze on which results do not depend, and the object that states others.
+HOW = ("experiment", "progress", "workers", "scheduler")
+
+
 def test_defaults_are_those_of_analyze_and_of_the_commands():
     """An argument that differs from its default is stated in run.toml: none is forgotten."""
     known = inspect.signature(perrin.analyze).parameters
     defaults = {n: p.default for n, p in known.items() if p.default is not inspect.Parameter.empty}
-    assert {n: defaults[n] for n in defaults if n not in ("experiment", "progress")} == (
-        repetition.TABLE_DEFAULTS
-    )
+    assert {n: defaults[n] for n in defaults if n not in HOW} == repetition.TABLE_DEFAULTS
     for command, names in (
         (commands.analyze, set(repetition.TABLE_DEFAULTS)),
         (commands.run, {*repetition.MOVIE_DEFAULTS, *repetition.OPENING}),
     ):
         options = set(inspect.signature(command).parameters)
         ours = {"tracks", "stack", "output", "config", "as_json", "quiet", "overwrite"}
-        assert options - ours - {"workers", "scheduler"} == names
+        assert options - ours - {"workers", "scheduler", "psf", "bead_diameter"} == names
 
 
 def test_a_table_in_memory_is_repeated_from_the_folder(report, tmp_path):
@@ -166,6 +168,16 @@ def test_channels_of_several_kinds_are_opened_one_by_one(movie):
     found = replace(movie, settings=movie.settings | {"arguments": arguments})
     assert 'channel = "0,2:1"' in repetition.config_text(found.settings)
     assert "channel=kind) for kind in ([0, 2], 1)]" in repetition.python_lines(found.settings)
+
+
+def test_a_measured_point_spread_is_asked_for_again(movie):
+    """Its stack of beads is not known any more: the command names one, Python its values."""
+    spread = perrin.PointSpread(((0.8, (0.4, 0.15)), (0.2, (0.9, 0.4))))
+    settings = movie.settings | {"arguments": MOVIE | {"optics": None, "psf": asdict(spread)}}
+    assert 'psf = "beads.tif"' in repetition.config_text(settings)
+    assert "--psf beads.tif" in repetition.command_line(settings)
+    stated = repetition.python_lines(settings).split("psf=")[1].split("})")[0] + "})"
+    assert eval(stated) == spread
 
 
 @pytest.mark.parametrize("text", ["2.4,.5,.2,3,1,.05", "2.4,.5,.2,3,1,.1,1,.6,.05"])

@@ -11,6 +11,8 @@ import matplotlib.pyplot as plt
 import perrin
 from perrin.plot import plot_orientations
 
+plt.style.use("perrin.plot.perrin")
+
 body = perrin.Cluster.touching(4, diameter=2.45)
 figure = plt.figure(figsize=(10, 4.8), layout="constrained")
 for place, D_R in ((121, 2e-4), (122, 2e-3)):

@@ -11,6 +11,8 @@ import matplotlib.pyplot as plt
 import perrin
 from perrin.plot import plot_lag_curve
 
+plt.style.use("perrin.plot.perrin")
+
 body = perrin.Cluster.touching(4, diameter=2.45)
 truth = perrin.simulate_motion(body, D_R=4e-4, dt=1.0, n_frames=1000, rng=3)
 

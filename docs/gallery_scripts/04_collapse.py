@@ -12,6 +12,8 @@ import numpy as np
 
 import perrin
 
+plt.style.use("perrin.plot.perrin")
+
 body = perrin.Cluster.tetrahedron(1.5)  # um, from the centre to each sphere
 truth = perrin.simulate_motion(body, D_R=1e-4, dt=1.0, n_frames=5000, rng=7)
 shown = np.unique(np.geomspace(1, 2000, 30).astype(int)) - 1

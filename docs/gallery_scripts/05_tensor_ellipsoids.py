@@ -12,6 +12,8 @@ import numpy as np
 
 import perrin
 
+plt.style.use("perrin.plot.perrin")
+
 chain = np.array([[-1.0, 0, 0], [0, 0, 0], [1.0, 0, 0]])
 bodies = {
     "chain": chain,

@@ -12,6 +12,8 @@ import matplotlib.pyplot as plt
 import perrin
 from perrin.plot import plot_found, plot_masses, plot_misfit, plot_step_angles
 
+plt.style.use("perrin.plot.perrin")
+
 body = perrin.Cluster.touching(4, diameter=2.45)
 truth = [
     perrin.simulate_motion(body, D_R=5e-3, D_T=0.01, dt=0.73, n_frames=6, rng=k) for k in (1, 2)

@@ -12,6 +12,8 @@ import matplotlib.pyplot as plt
 import perrin
 from perrin.plot import plot_plan
 
+plt.style.use("perrin.plot.perrin")
+
 body = perrin.Cluster.touching(4, diameter=2.45)
 figure, axes = plt.subplots(1, 2, figsize=(10, 4.4), sharey=True, layout="constrained")
 for ax, sigma in zip(axes, (0.03, 0.1), strict=True):

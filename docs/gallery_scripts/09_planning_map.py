@@ -11,6 +11,8 @@ import numpy as np
 
 import perrin
 
+plt.style.use("perrin.plot.perrin")
+
 body, D_R = perrin.Cluster.touching(4, diameter=2.45), 4.93e-3
 dt = np.geomspace(0.003, 3, 40)
 sigma = np.geomspace(0.005, 0.2, 36)

@@ -12,6 +12,8 @@ import numpy as np
 
 import perrin
 
+plt.style.use("perrin.plot.perrin")
+
 clusters = {"1": np.zeros((1, 3)), "2": np.array([[-0.5, 0, 0], [0.5, 0, 0]])}
 clusters |= {str(n): perrin.Cluster.touching(n, diameter=1.0).positions for n in range(3, 8)}
 translation, rotation = [], []

@@ -13,6 +13,8 @@ import pandas as pd
 import perrin
 from perrin.plot import plot_forest
 
+plt.style.use("perrin.plot.perrin")
+
 body = perrin.Cluster.touching(4, diameter=2.45)
 tables = []
 for k in range(8):

@@ -11,6 +11,8 @@ import matplotlib.pyplot as plt
 import perrin
 from perrin.plot import plot_van_hove
 
+plt.style.use("perrin.plot.perrin")
+
 body = perrin.Cluster.touching(4, diameter=2.45)
 motions = {
     "diffusion": None,

@@ -11,6 +11,8 @@ import numpy as np
 
 import perrin
 
+plt.style.use("perrin.plot.perrin")
+
 body = perrin.Cluster.touching(4, diameter=2.45)
 dynamics = perrin.Hopping(angle=0.3, interval=60.0, relaxation_time=3.0)
 motion = perrin.simulate_motion(body, D_R=8e-4, dt=1.0, n_frames=6000, dynamics=dynamics, rng=2)

@@ -13,6 +13,8 @@ import perrin
 from perrin.diffusion import Noise, axis_model
 from perrin.plot import plot_step_spectrum
 
+plt.style.use("perrin.plot.perrin")
+
 body = perrin.Cluster.touching(4, diameter=2.45)
 figure, axes = plt.subplots(1, 2, figsize=(10, 4.6), layout="constrained")
 for ax, dynamics in zip(axes, (None, perrin.Confined(relaxation_time=20.0)), strict=True):

@@ -11,6 +11,8 @@ import numpy as np
 
 import perrin
 
+plt.style.use("perrin.plot.perrin")
+
 body = perrin.Cluster.touching(4, diameter=2.45)
 fluid = perrin.cluster_mobility(body, radius=2.45 / 2, viscosity=1e-3, temperature=295.0)
 dilute = np.trace(fluid.D_T) / np.trace(fluid.D_R)

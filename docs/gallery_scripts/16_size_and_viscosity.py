@@ -11,6 +11,8 @@ import numpy as np
 
 import perrin
 
+plt.style.use("perrin.plot.perrin")
+
 temperature = 295.0
 tetrahedron = perrin.Cluster.touching(4, diameter=2.45)
 body = perrin.cluster_mobility(  # solved once; only its shape matters

@@ -11,6 +11,8 @@ import numpy as np
 
 import perrin
 
+plt.style.use("perrin.plot.perrin")
+
 body = perrin.cluster_mobility(
     perrin.Cluster.touching(4, diameter=2.45), radius=1.225, viscosity=1e-3, temperature=295.0
 )

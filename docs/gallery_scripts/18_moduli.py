@@ -12,6 +12,8 @@ import numpy as np
 
 import perrin
 
+plt.style.use("perrin.plot.perrin")
+
 body = perrin.Cluster.touching(4, diameter=2.45)
 motion = perrin.simulate_motion(
     body, D_R=2e-3, dt=0.5, n_frames=4000, dynamics=perrin.Fractional(0.6), rng=8

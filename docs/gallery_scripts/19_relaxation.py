@@ -11,6 +11,8 @@ import numpy as np
 
 import perrin
 
+plt.style.use("perrin.plot.perrin")
+
 body = perrin.Cluster.touching(4, diameter=2.45)
 truth = perrin.simulate_motion(body, D_R=0.02, dt=0.5, n_frames=3000, rng=2)
 motion = perrin.track_rotation(perrin.add_noise(truth.positions(), sigma=0.03, rng=3), dt=0.5)

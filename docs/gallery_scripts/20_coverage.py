@@ -10,6 +10,8 @@ import matplotlib.pyplot as plt
 
 import perrin
 
+plt.style.use("perrin.plot.perrin")
+
 body, D_R = perrin.Cluster.touching(4, diameter=2.45), 4.93e-3
 found = []
 for k in range(60):

@@ -91,6 +91,8 @@ def stated_arguments(settings: Mapping[str, Any], *, dt: float | None = None) ->
     options = _differing(given, MOVIE_DEFAULTS)
     if "refine" in given and given["refine"] is None:
         options["refine"] = None
+    if given.get("psf") is not None:
+        options["psf"] = given["psf"]
     return Repetition("run", path, opening, options)
 
 
@@ -146,10 +148,12 @@ def python_lines(settings: Mapping[str, Any]) -> str:
     """
     again = stated_arguments(settings)
     lines, options = ["import perrin", ""], dict(again.options)
-    optics = options.pop("optics", None)
+    optics, psf = options.pop("optics", None), options.pop("psf", None)
     given = "".join(f", {name}={value!r}" for name, value in options.items())
     if optics is not None:
         given += f", optics=perrin.Optics.from_dict({optics!r})"
+    if psf is not None:
+        given += f", psf=perrin.PointSpread.from_dict({psf!r})"
     if again.command == "run":
         stated, kinds = dict(again.opening), again.opening.get("channel")
         if isinstance(kinds, tuple):
@@ -231,6 +235,8 @@ def _typed(name: str, value: Any) -> Any:  # noqa: ANN401 (arguments of any type
         return "none"
     if name == "channel" and isinstance(value, tuple):
         return ":".join(str(_typed(name, kind)) for kind in value)
+    if name == "psf":
+        return "beads.tif"  # the stack on which it was measured, whose name is not kept
     if name == "optics":
         tail = [] if value["tail"] is None else [value["tail"][0], *value["tail"][1]]
         spread = [value["spread"]] if value["spread"] else []
