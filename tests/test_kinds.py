@@ -74,6 +74,15 @@ def report(mixed):
     return perrin.analyze(mixed, dt=DT)
 
 
+def leaves(entry):
+    """Yield the values of nested dictionaries and lists in order."""
+    if isinstance(entry, dict | list):
+        for part in entry.values() if isinstance(entry, dict) else entry:
+            yield from leaves(part)
+    else:
+        yield entry
+
+
 def test_each_kind_has_pooled_values_of_its_own(mixed, report):
     """They are those of the bodies of this kind alone; nothing is pooled over kinds."""
     assert [kind.size for kind in report.kinds] == [2, 3, 4]
@@ -83,7 +92,12 @@ def test_each_kind_has_pooled_values_of_its_own(mixed, report):
     for kind in report.kinds:
         alone = perrin.analyze(mixed[mixed["cluster"].isin(kind.clusters)], dt=DT)
         (only,) = alone.kinds
-        assert only.to_dict() == kind.to_dict()
+        assert only.size == kind.size
+        # Bodies that are fitted together end their searches within rounding of each other.
+        assert list(leaves(only.to_dict())) == [
+            pytest.approx(value, rel=1e-7) if isinstance(value, float) else value
+            for value in leaves(kind.to_dict())
+        ]
         assert [name for name, _ in kind.coefficients] == [
             "D_perp" if kind.size == 2 else "D_R",
             "D_T",

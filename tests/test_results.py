@@ -182,6 +182,6 @@ def test_progress_counts_the_clusters_of_every_long_step(tmp_path, monkeypatch):
         "drawing the figures", "writing the report",
     ]  # fmt: skip
     for title in ("fitting clusters", "estimating D_R and D_T"):
-        assert calls[title] == [(0, 20), (16, 20)]
+        assert calls[title] == [(0, 20), (16, 20), (20, 20)]
     for title in ("writing the curves", "writing the report"):
         assert calls[title] == [(k, 20) for k in range(20)]

@@ -394,9 +394,11 @@ def information(same: Floats, next_one: Floats, power: Floats, trace: Floats) ->
         flat = turned.reshape(points, count, -1)
         return np.asarray(left.reshape(points, count, -1) @ np.swapaxes(flat, 1, 2))
 
-    mixed = form(1, same, next_one)
-    total = form(0, same, same) + mixed + np.swapaxes(mixed, 1, 2)
-    return np.asarray(total + form(2, next_one, next_one))
+    # Where a coordinate does not move at all its variance tends to 0 and these grow without end.
+    with np.errstate(over="ignore", invalid="ignore"):
+        mixed = form(1, same, next_one)
+        total = form(0, same, same) + mixed + np.swapaxes(mixed, 1, 2)
+        return np.asarray(total + form(2, next_one, next_one))
 
 
 def covariance_slopes(E: Floats, D: Floats, B: Floats, dt: Floats) -> tuple[Floats, Floats]:
