@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -213,7 +214,9 @@ def write_corpus(place, kinds):
         for name, write in CORPORA[kind]():
             path = place / name
             try:
-                write(path)
+                with warnings.catch_warnings():
+                    warnings.simplefilter("ignore")  # what libraries advise those who write files
+                    write(path)
             except ImportError:
                 continue
             made[name] = path

@@ -19,6 +19,7 @@ from perrin.cli.messages import (
     claimed_output,
     escape,
     messages_of,
+    output_console,
     state_kept_frames,
     status_of,
     stop_in_order,
@@ -722,12 +723,10 @@ def paper(
     overwrite: Overwrite = False,
 ) -> None:
     """Reproduce all figures, tables and claims of the paper (Hunter 2011)."""
-    from rich.console import Console
-
     from perrin.paper.remake import reproduce
     from perrin.run.folders import check_place
 
-    console = Console(highlight=False)
+    console = output_console()
     with claimed_output(paper, output):
         check_place(output, overwrite=overwrite)
         with shown_progress() as progress:

@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from pathlib import Path
     from typing import TextIO
 
+    from rich.console import Console
+
 
 STOPPED = "Stopped: nothing is written, and what was there is kept."
 
@@ -243,6 +245,21 @@ def messages_of(command: Callable[..., object]) -> Iterator[None]:
             text = "; ".join(line.strip().removeprefix("- ") for line in str(error).splitlines())
         print(f"perrin: {printable(in_options(text, options))}", file=sys.stderr)
         raise typer.Exit(1 if isinstance(error, no_answer) else 2) from None
+
+
+def output_console() -> Console:
+    """Return what writes tables to standard output.
+
+    Where the reader has stopped, it raises the BrokenPipeError that `messages_of` expects; rich's
+    own console ends the program with status 1.
+    """
+    from rich.console import Console
+
+    class OutputConsole(Console):
+        def on_broken_pipe(self) -> None:
+            raise BrokenPipeError
+
+    return OutputConsole(highlight=False)
 
 
 @contextmanager

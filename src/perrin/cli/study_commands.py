@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from perrin.cli.messages import messages_of
+from perrin.cli.messages import messages_of, output_console
 from perrin.cli.options import OUTPUT, WORK, GroupedCommand, Json, Quiet
 from perrin.cli.progress import shown_progress
 from perrin.cli.tables import show_json
@@ -165,11 +165,10 @@ def _show(result: StudyResult, *, as_json: bool, quiet: bool) -> None:
         return
     if quiet:
         return
-    from rich.console import Console
     from rich.markup import escape
     from rich.table import Table
 
-    console = Console(highlight=False)
+    console = output_console()
     done = len(result.entries) - len(result.failed)
     console.print(
         f"{escape(result.manifest.title)}: {done} of {len(result.manifest.movies)} movies measured"

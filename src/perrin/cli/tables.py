@@ -5,7 +5,7 @@ from __future__ import annotations
 from math import isfinite
 from typing import TYPE_CHECKING
 
-from perrin.cli.messages import escape
+from perrin.cli.messages import escape, output_console
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -31,7 +31,6 @@ _EQUAL_AXES = 0.05
 def show_plan(plan: SamplingPlan) -> None:
     """Print the plan as a short table, and its reasons."""
     from rich.box import SIMPLE_HEAD
-    from rich.console import Console
     from rich.table import Table
 
     from perrin._text import percent
@@ -51,7 +50,7 @@ def show_plan(plan: SamplingPlan) -> None:
     table.add_row("the paper's rules", f"{plan.paper_dt_min:.3g} to {plan.paper_dt_max:.3g} s")
     table.add_row("signal to noise (SNR)", f"{plan.snr:.3g} at the best dt")
     table.add_row("noise floor (Phi^2)", f"{plan.phi2:.3g} rad^2")
-    console = Console(highlight=False)
+    console = output_console()
     console.print(table)
     for reason in plan.reasons:
         console.print(f"- {escape(reason)}", soft_wrap=True)
@@ -91,13 +90,11 @@ def show_diagnosis(checks: Sequence[Check]) -> None:
 
 def show_report(report: Report, output: Path, command: Callable[..., None]) -> None:
     """Print the short tables, the warnings, the notes, and where the run is written."""
-    from rich.console import Console
-
     from perrin._text import counted
     from perrin.run.results import perp_text
     from perrin.run.statements import verdict_lines
 
-    console = Console(highlight=False)
+    console = output_console()
     for result in report.clusters[:_CLUSTERS_SHOWN]:
         kind = report.kind_of(result.cluster) if len(report.kinds) > 1 else None
         console.print(cluster_table(result, kind=kind))
@@ -230,7 +227,6 @@ def _pull_text(compared: Compared) -> str:
 def show_prediction(body: Mobility, *, name: str) -> None:
     """Print the short table of a prediction."""
     from rich.box import SIMPLE_HEAD
-    from rich.console import Console
     from rich.table import Table
 
     from perrin.diffusion.tensors import axes_like
@@ -260,7 +256,7 @@ def show_prediction(body: Mobility, *, name: str) -> None:
         f"* from the centroid of the spheres. Relative error about {body.error:.1g} (degree "
         f"{body.degree})"
     )
-    Console(highlight=False).print(table)
+    output_console().print(table)
 
 
 def pooled_table(pooled: Pooled) -> Table:

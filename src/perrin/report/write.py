@@ -20,6 +20,9 @@ if TYPE_CHECKING:
     from perrin.report.page import Progress
     from perrin.run.results import Report
 
+# Names of files that are not UTF-8 stand in pages as numbers of characters.
+_NO_UNICODE = "xmlcharrefreplace"
+
 
 @contextmanager
 def run_folder(
@@ -110,7 +113,7 @@ def _write_files(report: Report, stage: Path, progress: Progress | None) -> None
     if progress is not None:
         progress(0, 0, "drawing the figures")
     html = render_html(report, save_figures(report, place), progress=progress)
-    (stage / "report.html").write_text(html, encoding="utf-8")
+    (stage / "report.html").write_text(html, encoding="utf-8", errors=_NO_UNICODE)
     if report.imaging is not None:
         html = render_imaging_quality(report, save_image_figures(report, place))
-        (stage / "quality.html").write_text(html, encoding="utf-8")
+        (stage / "quality.html").write_text(html, encoding="utf-8", errors=_NO_UNICODE)

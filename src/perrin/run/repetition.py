@@ -200,13 +200,16 @@ def config_text(settings: Mapping[str, Any], *, dt: float | None = None) -> str:
     again = stated_arguments(settings, dt=dt)
     command, options = again.command, again.opening | again.options
     lines = []
-    if again.source is not None:
-        source = str(Path(again.source).absolute())
-    else:
+    source = "" if again.source is None else str(Path(again.source).absolute())
+    if source.encode(errors="ignore").decode() != source:
+        lines.append("# The name of the input is not UTF-8: this measures the positions it gave.")
+        source = ""
+    if not source:
         source = "tracks.parquet"
         options = {name: value for name, value in options.items() if name not in _READING}
         if command == "run":
-            lines.append("# The movie was in memory: this measures the positions that were found.")
+            if again.source is None:
+                lines.append("# The movie was in memory: this measures the positions in it.")
             command = "analyze"
             left_out = (*_READING, "diameter", *set(MOVIE_DEFAULTS) - set(TABLE_DEFAULTS))
             options = {k: value for k, value in again.options.items() if k not in left_out}

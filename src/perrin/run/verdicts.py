@@ -26,11 +26,14 @@ if TYPE_CHECKING:
     from perrin.run.experiment import MotionModel
 
 
-def _is_at_rest(motion: RigidMotion) -> bool:
-    """Return whether a body does not move at all, within rounding: there is nothing to judge."""
-    center = motion.center[motion.fitted]
-    size = float(np.abs(center).max(initial=0.0) + np.abs(motion.template).max())
-    return bool(np.ptp(center, axis=0).max(initial=0.0) <= 1e-13 * size)
+def _is_at_rest(motion: RigidMotion, quantity: Quantity) -> bool:
+    """Return whether a body does not move, or turn, within rounding: nothing is to be judged."""
+    path = motion.center if quantity == "translation" else motion.rotation
+    path = path[motion.fitted]
+    size = float(np.abs(path).max(initial=0.0))
+    if quantity == "translation":
+        size += float(np.abs(motion.template).max())
+    return bool(np.ptp(path, axis=0).max(initial=0.0) <= 1e-13 * size)
 
 
 def judge_each_and_all(
@@ -55,7 +58,7 @@ def judge_each_and_all(
     Returns
     -------
     each : list of MotionVerdict or None
-        None for a motion of fewer than 20 steps, and for a body that does not move.
+        None for a motion of fewer than 20 steps, and for a body without this motion.
     together : MotionVerdict or None
         Verdict on the pooled motions that can be judged; None if there are none.
 
@@ -75,7 +78,8 @@ def judge_each_and_all(
     settings = replace(noise, drift=False)
 
     def judged(some: RigidMotion | list[RigidMotion]) -> MotionVerdict | None:
-        if any(map(_is_at_rest, some if isinstance(some, list) else [some])):
+        bodies = some if isinstance(some, list) else [some]
+        if any(_is_at_rest(body, quantity) for body in bodies):
             return None
         with python_warnings.catch_warnings():
             python_warnings.simplefilter("ignore", PrecisionWarning)

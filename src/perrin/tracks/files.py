@@ -279,7 +279,11 @@ def read_spheres(path: _PathLike) -> tuple[Floats, Floats | None]:
         faults.append(f"columns other than x, y, z and radius: {listed(unknown)}")
     if not len(table):
         faults.append("no rows; expected one row per sphere")
-    for name in [name for name in (*_AXES, "radius") if name in table]:
+    twice = sorted({str(name) for name in table.columns[table.columns.duplicated()]})
+    if twice:
+        faults.append(f"columns that stand there twice: {listed(twice)}")
+    once = [name for name in (*_AXES, "radius") if name in table and name not in twice]
+    for name in once:
         bad = ~np.isfinite(_as_numbers(table[name])[0])
         if bad.any():
             line = int(table.index[bad][0]) + 2

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import re
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
@@ -119,6 +120,8 @@ def write_json(path: Path, content: object) -> None:
     '{\n  "diameter": 2.45\n}\n'
     """
     text = json.dumps(content, indent=2, allow_nan=False, ensure_ascii=False, default=to_plain)
+    # Half a pair of surrogates is what Python makes of a file's name that is not UTF-8.
+    text = re.sub(r"[\ud800-\udfff]", lambda half: f"\\u{ord(half[0]):04x}", text)
     path.write_text(text + "\n", encoding="utf-8")
 
 
