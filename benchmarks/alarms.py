@@ -88,7 +88,7 @@ KINDS = {
     "grouping": r"no cluster column|by the distances that|no two particles keep",
     "rod": r"no D_R: .* one line|on one line",
     "tensor": r"no diffusion tensor",
-    "missing": r"\bmissing\b|\bNaN\b|without coordinates|no pose",
+    "missing": r"\bmissing\b|\bNaN\b|without coordinates|no pose|without a pose",
     "misfit": r"common shape badly",
     "anisotropic": r"anisotrop|unequally|isotropic body",
     "planar": r"z never changes",
