@@ -207,7 +207,8 @@ def write_imaging(imaging: Imaging, folder: Path) -> None:
         An existing folder.
     """
     for name in _TABLES:
-        getattr(imaging, name).to_parquet(folder / f"{name}.parquet", index=False)
+        with (folder / f"{name}.parquet").open("wb") as file:
+            getattr(imaging, name).to_parquet(file, index=False)
     views = {f"{v.frame}-{side}": getattr(v, side) for v in imaging.views for side in _SIDES}
     np.savez_compressed(folder / "views.npz", **views)
     write_json(folder / "imaging.json", imaging.settings())

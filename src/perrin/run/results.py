@@ -731,8 +731,10 @@ def write_data(report: Report, folder: Path, *, progress: Progress | None = None
     write_json(folder / "run.json", report.settings)
     dt = report.results[0].motion.dt if report.results else None
     (folder / "run.toml").write_text(config_text(report.settings, dt=dt), encoding="utf-8")
-    report.tracks.to_parquet(folder / "tracks.parquet", index=False)
-    motion_table(report).to_parquet(folder / "motion.parquet", index=False)
+    for name, table in (("tracks", report.tracks), ("motion", motion_table(report))):
+        # By an open file: pyarrow itself opens no path that is not UTF-8.
+        with (folder / f"{name}.parquet").open("wb") as file:
+            table.to_parquet(file, index=False)
     curve_table(report, progress=progress).to_csv(folder / "curves.csv", index=False)
     guarded_table(report.to_frame()).to_csv(folder / "results.csv", index=False)
     if report.imaging is not None:

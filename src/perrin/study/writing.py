@@ -52,7 +52,8 @@ def write_results(result: StudyResult, *, command: str = "") -> None:
             and table[name].map(lambda one: isinstance(one, str)).any()
             and name in result.manifest.conditions
         }
-        table.astype(mixed).to_parquet(part, index=False)
+        with part.open("wb") as file:
+            table.astype(mixed).to_parquet(file, index=False)
     with written_whole(place / "movies.csv") as part:
         movie_table(result.manifest, result.entries).to_csv(part, index=False)
     with written_whole(place / "summary.json") as part:
