@@ -57,7 +57,7 @@ def stacks():
     yield "2.zarr", lambda p: _zarr(p, 2)
     yield "3.zarr", lambda p: _zarr(p, 3)
     yield "a.czi", _zeiss
-    data = Path("/work/shared/data/microscopes")
+    data = Path(__file__).resolve().parents[3] / "shared" / "data" / "microscopes"
     for name in ("nd2/cluster.nd2", "other/test.oib"):
         if (data / name).is_file():
             yield Path(name).name, lambda p, name=name: p.write_bytes((data / name).read_bytes())
