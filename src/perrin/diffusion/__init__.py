@@ -67,7 +67,6 @@ from perrin.diffusion.likelihood import (
     excess_scatter,
     excess_scatter_of_each,
     log_slope_ratio,
-    newton_crossing,
     newton_trial,
     ratio_bend,
 )
@@ -364,7 +363,6 @@ __all__ = [
     "motions_and_noise",
     "msd_covariance",
     "neighbour_products",
-    "newton_crossing",
     "newton_trial",
     "noise_faults",
     "offset_gain",

@@ -25,7 +25,7 @@ from perrin.diffusion.step_kernels import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Sequence
 
     from perrin._arrays import Bools, Floats
     from perrin.diffusion.steps import NoisySteps
@@ -442,31 +442,6 @@ def newton_trial(t: Floats, slope: Floats, bend: Floats, low: Floats, high: Floa
     edge = _LEAST_LOG_OFFSET
     target = np.where((target <= low) & (low <= edge), edge, target)
     return np.where(inside | (target == edge), target, 0.5 * (low + high))
-
-
-def newton_crossing(
-    height: Callable[[float], tuple[float, float]], *, inside: float, start: float, outside: float
-) -> float:
-    """Return where a height falls through zero between `inside` (> 0) and `outside` (< 0).
-
-    Newton steps, halved into the bracket, or doubled away from `inside` while there is no bracket.
-
-    Examples
-    --------
-    >>> newton_crossing(lambda x: (2 - x * x, -2 * x), inside=1.0, start=3.0, outside=np.inf)
-    1.414213562373095
-    """
-    x = start if min(inside, outside) < start < max(inside, outside) else (inside + outside) / 2
-    for _ in range(200):
-        value, slope = height(x)
-        inside, outside = (x, outside) if value > 0 else (inside, x)
-        middle = 2 * x if outside == np.inf else (inside + outside) / 2
-        newton = x - value / slope if slope else np.nan
-        within = min(inside, outside) < newton < max(inside, outside)
-        old, x = x, newton if within else middle
-        if abs(x - old) <= 1e-11 * abs(x):
-            break
-    return float(x)
 
 
 def excess_scatter(tracks: Sequence[NoisySteps], D: float, theta: Floats) -> float:
