@@ -11,7 +11,7 @@ from perrin._arrays import from_plain, to_plain
 from perrin.images.optics.optics import Optics
 from perrin.images.optics.radial_image import RadialImage
 from perrin.tracks.checksums import CheckedFiles, refusing_damage
-from perrin.tracks.writing import write_json
+from perrin.tracks.writing import write_json, write_parquet
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -207,8 +207,7 @@ def write_imaging(imaging: Imaging, folder: Path) -> None:
         An existing folder.
     """
     for name in _TABLES:
-        with (folder / f"{name}.parquet").open("wb") as file:
-            getattr(imaging, name).to_parquet(file, index=False)
+        write_parquet(folder / f"{name}.parquet", getattr(imaging, name))
     views = {f"{v.frame}-{side}": getattr(v, side) for v in imaging.views for side in _SIDES}
     np.savez_compressed(folder / "views.npz", **views)
     write_json(folder / "imaging.json", imaging.settings())

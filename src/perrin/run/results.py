@@ -35,7 +35,7 @@ from perrin.run.singles import SingleSpheres
 from perrin.run.verdicts import verdicts_from_dict, verdicts_to_dict
 from perrin.tracks.cells import guarded_table
 from perrin.tracks.checksums import CheckedFiles, refusing_damage, write_checksums
-from perrin.tracks.writing import write_json
+from perrin.tracks.writing import write_json, write_parquet
 
 if TYPE_CHECKING:
     import os
@@ -731,10 +731,8 @@ def write_data(report: Report, folder: Path, *, progress: Progress | None = None
     write_json(folder / "run.json", report.settings)
     dt = report.results[0].motion.dt if report.results else None
     (folder / "run.toml").write_text(config_text(report.settings, dt=dt), encoding="utf-8")
-    for name, table in (("tracks", report.tracks), ("motion", motion_table(report))):
-        # By an open file: pyarrow itself opens no path that is not UTF-8.
-        with (folder / f"{name}.parquet").open("wb") as file:
-            table.to_parquet(file, index=False)
+    write_parquet(folder / "tracks.parquet", report.tracks)
+    write_parquet(folder / "motion.parquet", motion_table(report))
     curve_table(report, progress=progress).to_csv(folder / "curves.csv", index=False)
     guarded_table(report.to_frame()).to_csv(folder / "results.csv", index=False)
     if report.imaging is not None:

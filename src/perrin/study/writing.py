@@ -12,7 +12,7 @@ from perrin.study.figures import save_study_figures
 from perrin.study.manifest import manifest_dict
 from perrin.study.page import render_study
 from perrin.study.tables import movie_table
-from perrin.tracks.writing import write_json, written_whole
+from perrin.tracks.writing import write_json, write_parquet, written_whole
 
 if TYPE_CHECKING:
     from perrin.study.study_results import StudyResult
@@ -52,8 +52,7 @@ def write_results(result: StudyResult, *, command: str = "") -> None:
             and table[name].map(lambda one: isinstance(one, str)).any()
             and name in result.manifest.conditions
         }
-        with part.open("wb") as file:
-            table.astype(mixed).to_parquet(file, index=False)
+        write_parquet(part, table.astype(mixed))
     with written_whole(place / "movies.csv") as part:
         movie_table(result.manifest, result.entries).to_csv(part, index=False)
     with written_whole(place / "summary.json") as part:

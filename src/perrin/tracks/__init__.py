@@ -123,7 +123,7 @@ from perrin.tracks.simulations import is_selection, parse_gsd, selection_table
 from perrin.tracks.sphere_tracks import link_spheres, track_variances
 from perrin.tracks.track_arrays import gdf_table, napari_columns, napari_text
 from perrin.tracks.trackmate import is_trackmate, parse_trackmate_xml, trackmate_table
-from perrin.tracks.writing import hidden_beside, write_json, written_whole
+from perrin.tracks.writing import hidden_beside, write_json, write_parquet, written_whole
 from perrin.tracks.xyz import parse_xyz, xyz_text
 
 __all__ = [
@@ -262,6 +262,7 @@ __all__ = [
     "without_flat_z",
     "write_checksums",
     "write_json",
+    "write_parquet",
     "write_sealed",
     "write_tracks",
     "written_whole",

@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all, and files of JSON."""
+"""Files that appear whole or not at all, and files of JSON and Parquet."""
 
 from __future__ import annotations
 
@@ -14,6 +14,8 @@ from perrin._arrays import to_plain
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
+
+    import pandas as pd
 
 
 # File systems have names of up to 255 bytes; an ending must have its place.
@@ -132,3 +134,27 @@ def _flush(path: Path) -> None:
         os.fsync(handle)
     finally:
         os.close(handle)
+
+
+def write_parquet(path: Path, table: pd.DataFrame) -> None:
+    """Write a table as Parquet, without its index, into a folder of any name.
+
+    Parameters
+    ----------
+    path : Path
+        File that is written.
+    table : pandas.DataFrame
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> import pandas as pd
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     write_parquet(Path(folder, "t.parquet"), pd.DataFrame({"x": [1.0, 2.0]}))
+    ...     pd.read_parquet(Path(folder, "t.parquet"))["x"].tolist()
+    [1.0, 2.0]
+    """
+    # By an open file: pyarrow itself opens no path that is not UTF-8.
+    with path.open("wb") as file:
+        table.to_parquet(file, index=False)
