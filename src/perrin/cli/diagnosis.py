@@ -61,12 +61,13 @@ def installed() -> list[Check]:
     """
     import perrin
     from perrin.compiled import compiled_kernels, kernels_in_use
+    from perrin.run.measure import library_version
 
     system = f"{platform.python_version()}, {platform.system()} {platform.machine()}"
     cores = f"{os.cpu_count()} processors"
     found = [Check("python", f"{system}, {cores}"), Check("perrin", perrin.__version__)]
     for name in _REQUIRED:
-        version = _version(name)
+        version = library_version(name)
         found.append(Check(name, version or "is missing", version is not None))
     good = None if compiled_kernels() is None else True
     return [*found, Check("compiled kernels", kernels_in_use(), good)]
@@ -80,9 +81,11 @@ def optional_readers() -> list[Check]:
     >>> all(check.good is not False for check in optional_readers())
     True
     """
+    from perrin.run.measure import library_version
+
     found = []
     for name, (purpose, extra) in _OPTIONAL.items():
-        version = _version(name)
+        version = library_version(name)
         state = version or f"not installed: pip install 'perrin[{extra}]'"
         found.append(Check(f"{name}, {purpose}", state, True if version else None))
     return found
@@ -136,13 +139,3 @@ def self_test() -> list[Check]:
         good = abs(found.value - planted) < _ERRORS * found.stderr
         checks.append(Check(f"self-test, planted {planted:g}", str(found), good))
     return [*checks, Check("self-test, time", f"{time.monotonic() - start:.1f} s")]
-
-
-def _version(name: str) -> str | None:
-    """Return the installed version of a package."""
-    from importlib.metadata import PackageNotFoundError, version
-
-    try:
-        return version(name)
-    except PackageNotFoundError:
-        return None

@@ -3,7 +3,14 @@
 from perrin.report.citations import folder_links, methods_paragraph, software_bibtex
 from perrin.report.embedding import packed, page_script, plotly_script, source_hash
 from perrin.report.figure_data import body_picture, cluster_data, grouped_tracks
-from perrin.report.html import byline, captioned, inline_pictures, render_page, render_part
+from perrin.report.html import (
+    byline,
+    captioned,
+    inline_pictures,
+    render_page,
+    render_part,
+    write_page,
+)
 from perrin.report.imaging_page import (
     brightness_facts,
     fit_facts,
@@ -64,5 +71,6 @@ __all__ = [
     "software_bibtex",
     "source_hash",
     "tensor_texts",
+    "write_page",
     "write_run",
 ]

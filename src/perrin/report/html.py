@@ -35,6 +35,21 @@ def render_page(template: str, **values: Any) -> str:  # noqa: ANN401 (values of
     return _environment().get_template(template).render(**values)
 
 
+def write_page(path: Path, html: str) -> None:
+    """Write a page in UTF-8.
+
+    Parts of file names that are not UTF-8 become numbers of characters, which browsers show as
+    unknown.
+
+    Parameters
+    ----------
+    path : Path
+        File that is written.
+    html : str
+    """
+    path.write_text(html, encoding="utf-8", errors="xmlcharrefreplace")
+
+
 def render_part(template: str, macro: str, *values: Any) -> str:  # noqa: ANN401 (values of any type)
     """Fill one macro of a template of the package.
 

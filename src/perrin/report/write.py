@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from perrin.plot.imaging import save_image_figures
 from perrin.plot.report_figures import save_figures
+from perrin.report.html import write_page
 from perrin.report.imaging_page import render_imaging_quality
 from perrin.report.page import render_html
 from perrin.run.folders import filled_folder, staged_folder
@@ -19,9 +20,6 @@ if TYPE_CHECKING:
 
     from perrin.report.page import Progress
     from perrin.run.results import Report
-
-# Names of files that are not UTF-8 stand in pages as numbers of characters.
-_NO_UNICODE = "xmlcharrefreplace"
 
 
 @contextmanager
@@ -113,7 +111,7 @@ def _write_files(report: Report, stage: Path, progress: Progress | None) -> None
     if progress is not None:
         progress(0, 0, "drawing the figures")
     html = render_html(report, save_figures(report, place), progress=progress)
-    (stage / "report.html").write_text(html, encoding="utf-8", errors=_NO_UNICODE)
+    write_page(stage / "report.html", html)
     if report.imaging is not None:
         html = render_imaging_quality(report, save_image_figures(report, place))
-        (stage / "quality.html").write_text(html, encoding="utf-8", errors=_NO_UNICODE)
+        write_page(stage / "quality.html", html)

@@ -154,13 +154,10 @@ def napari_reader(path: str | list[str]) -> Callable[[str | list[str]], list[Lay
 
 def _seen_beside_its_plane() -> dict[str, Any]:
     """Return the option by which a sphere is drawn in the planes that it reaches."""
-    from importlib.metadata import PackageNotFoundError, version
+    from perrin.run.measure import library_version
 
-    try:
-        parts = version("napari").split(".")
-    except PackageNotFoundError:
-        parts = []
-    if parts and (int(parts[0]), int(parts[1])) < (0, 9):
+    installed = library_version("napari")
+    if installed is not None and tuple(map(int, installed.split(".")[:2])) < (0, 9):
         return {"out_of_slice_display": True}
     return {"projection_mode": "rescale_spherical"}
 

@@ -5,9 +5,10 @@ from __future__ import annotations
 import platform
 import sys
 from datetime import UTC, datetime
-from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING
 
+from perrin.report.html import write_page
+from perrin.run.measure import library_version
 from perrin.study.figures import save_study_figures
 from perrin.study.manifest import manifest_dict
 from perrin.study.page import render_study
@@ -61,13 +62,8 @@ def write_results(result: StudyResult, *, command: str = "") -> None:
     figures.mkdir(exist_ok=True)
     save_study_figures(result, figures)
     with written_whole(place / "study.html") as part:
-        part.write_text(render_study(result), encoding="utf-8")
-    versions = {}
-    for name in _VERSIONED:
-        try:
-            versions[name] = version(name)
-        except PackageNotFoundError:
-            continue
+        write_page(part, render_study(result))
+    versions = {name: known for name in _VERSIONED if (known := library_version(name))}
     with written_whole(place / "provenance.json") as part:
         write_json(
             part,
