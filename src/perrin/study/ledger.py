@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -65,7 +65,7 @@ class Entry:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the entry for JSON."""
-        entry: dict[str, Any] = to_plain(asdict(self))
+        entry: dict[str, Any] = to_plain(vars(self))
         return entry
 
     @classmethod
