@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import re
+import sys
 
 import numpy as np
 import pandas as pd
@@ -20,10 +22,13 @@ from perrin.study import (
     Study,
     StudyMovie,
     StudyResult,
+    Task,
     cluster_values,
     condition_means,
     key_lines,
     manifest_text,
+    measure_movie,
+    movie_table,
     read_manifest,
     render_study,
     warning_matrix,
@@ -118,6 +123,22 @@ def test_a_new_manifest_is_read_back(tmp_path):
     assert [m.source for m in manifest.movies] == ["table", "movie"]
     assert [m.sample for m in manifest.movies] == ["a", "b"]
     assert all(m.conditions == {"phi": 0.0} for m in manifest.movies)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="names of files are UTF-8 elsewhere")
+def test_a_name_that_is_no_utf8_is_found_again(tmp_path):
+    name = os.fsdecode(b"m\xfcnster[1].csv")
+    (tmp_path / name).write_text("frame,particle\n")
+    text = manifest_text([str(tmp_path / name)], folder=tmp_path)
+    (tmp_path / "study.toml").write_text(text, encoding="utf-8")
+    manifest = read_manifest(tmp_path / "study.toml")
+    (movie,) = manifest.movies
+    assert movie.path == str(tmp_path / name)
+    entry = measure_movie(Task(movie, str(tmp_path / "STUDY")))
+    (row,) = movie_table(manifest, {movie.name: entry}).to_dict("records")
+    assert row["path"].endswith("m\\udcfcnster[1].csv")
+    assert "missing columns x, y" in row["reason"]
+    row["reason"].encode("utf-8")
 
 
 def test_results_are_tidy_and_a_failure_is_a_row(finished):

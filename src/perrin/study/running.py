@@ -105,7 +105,8 @@ def measure_movie(task: Task) -> Entry:
         text = f"{type(fault).__name__}: {fault}" if not str(fault) else str(fault)
         entry = Entry(
             status="failed",
-            reason=" ".join(text.split()),
+            # A path in it may not be UTF-8.
+            reason=" ".join(text.encode("utf-8", "backslashreplace").decode().split()),
             retry=isinstance(fault, _OF_THE_MACHINE),
             seconds=time.monotonic() - start,
             **known,
