@@ -6,6 +6,7 @@ import json
 import os
 import re
 import sys
+import threading
 
 import numpy as np
 import pandas as pd
@@ -27,11 +28,14 @@ from perrin.study import (
     condition_means,
     key_lines,
     manifest_text,
+    measure_all,
     measure_movie,
     movie_table,
     read_manifest,
     render_study,
+    running,
     warning_matrix,
+    writing,
 )
 
 
@@ -176,8 +180,6 @@ def test_every_movie_is_an_ordinary_run_with_the_same_numbers(finished):
 @pytest.fixture
 def quick(finished, monkeypatch):
     """Measure any table that can be read as the first one was, and draw nothing."""
-    from perrin.study import running, writing
-
     known = perrin.analyze(finished[0] / "b.csv", dt=0.7)
 
     def analyze(path, **_):
@@ -232,8 +234,6 @@ def test_only_what_is_new_or_changed_is_measured(tmp_path, quick):
 
 def test_a_second_study_in_one_folder_is_refused(finished, tmp_path):
     """While another thread holds the folder; and a folder that holds something else."""
-    import threading
-
     study, place = Study.from_toml(finished[0] / "study.toml"), finished[0] / "STUDY"
     held, done = threading.Event(), threading.Event()
 
@@ -377,7 +377,11 @@ def test_workers_of_a_scheduler_give_the_same_results(tmp_path, quick):
     study.run(tmp_path / "here")
     shown = []
     with distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, processes=False, protocol="tcp", dashboard_address=None
+        n_workers=2,
+        threads_per_worker=1,
+        processes=False,
+        protocol="tcp",
+        dashboard_address="127.0.0.1:0",
     ) as cluster:
         study.run(
             tmp_path / "there",
@@ -388,3 +392,29 @@ def test_workers_of_a_scheduler_give_the_same_results(tmp_path, quick):
     assert first == second
     assert shown[:7] == [(k, 6) for k in range(7)]
     assert "6/6" in (tmp_path / "there" / "study.log").read_text()
+
+
+TOGETHER = threading.Barrier(3)
+
+
+def measured_by_three(task):
+    """Return an entry once three workers measure at the same time."""
+    TOGETHER.wait(20)
+    return Entry(task.movie.name, "done")
+
+
+def test_workers_that_join_later_get_movies(tmp_path, monkeypatch):
+    distributed = pytest.importorskip("distributed")
+    monkeypatch.setattr(running, "measure_movie", measured_by_three)
+    monkeypatch.setattr(running, "_SECONDS_BETWEEN_COUNTS", 0.0)
+    movies = [StudyMovie(str(k), f"{k}.csv", "table", "s") for k in range(6)]
+    with distributed.LocalCluster(
+        n_workers=1,
+        threads_per_worker=1,
+        processes=False,
+        protocol="tcp",
+        dashboard_address="127.0.0.1:0",
+    ) as cluster:
+        found = measure_all(movies, tmp_path, scheduler=cluster.scheduler_address)
+        cluster.scale(3)
+        assert {entry.name for entry in found} == {movie.name for movie in movies}

@@ -202,7 +202,7 @@ def read_manifest(path: str | os.PathLike[str]) -> Manifest:
         # The same file may be measured twice, as two samples; names differ by label and path, and
         # do not depend on other movies.
         parts = [movie.name] if movie.name.startswith(movie.sample) else [movie.sample, movie.name]
-        text = re.sub(r"[^\w.-]+", "_", "-".join(parts)).strip("._") or "movie"
+        text = re.sub(r"[^\w.-]+", "_", "-".join(parts)).strip("._-") or "movie"
         mark = hashlib.sha256(os.fsencode(f"{movie.sample}\n{movie.path}")).hexdigest()[:6]
         named.append(replace(movie, name=f"{text[:80]}-{mark}"))
     return Manifest(
