@@ -130,17 +130,37 @@ def correlation_covariance(
         # the rotation during what they do not share has left a correlation.
         earliest = max(np.floor(-b.max()), np.floor(min(a - b.max(), 0.0) - reach))
         latest = min(np.ceil(a), np.ceil(max(a - b.min(), 0.0) + reach))
+        alike = len(b) == 1 and a == b[0, 0]
+        if alike:  # opposite shifts have equal terms
+            earliest = 0.0
         shift = np.arange(earliest, latest + 1)
         overlap = np.maximum(np.minimum(a, b + shift) - np.maximum(0.0, shift), 0.0)
-        common = sum(
-            (np.abs(shift - at) < 1e-9).astype(float) for at in (0 * b, a - b, a + 0 * b, -b)
-        )
-        h = D * overlap + 0.5 * s * common
-        shared = sum(w * np.exp(-rate * h) for w, rate in zip(weights, decay, strict=True) if w)
-        shared -= np.exp(-(first + second) * h)
-        alone = first * (D * a + s - h) + second * (D * b + s - h)
-        term = np.exp(-alone) * shared
-        term *= np.where(common > 0, np.sqrt(present[0][i] * present[1][:, None]) ** -common, 1.0)
+        h = D * overlap
+        # The shifts at which the two pairs share a frame, and how many.
+        places = np.stack([0 * b, a - b, a + 0 * b, -b])[..., 0] - earliest
+        whole = np.rint(places).astype(np.int64)
+        inside = (whole >= 0) & (whole < len(shift)) & (np.abs(places - whole) < 1e-9)
+        row = np.broadcast_to(np.arange(len(b)), whole.shape)[inside]
+        shared_frames, joint = np.unique(row * len(shift) + whole[inside], return_counts=True)
+        row, place = np.divmod(shared_frames, len(shift))
+        h[row, place] += 0.5 * s * joint
+        # exp(-L(L + 1) h) are powers of one exponential.
+        once = np.exp(-2 * h)
+        power = {0: np.ones(1), 1: once}
+        for half_rate, (p, q) in {2: (1, 1), 3: (2, 1), 4: (2, 2), 6: (3, 3), 10: (6, 4)}.items():
+            if half_rate <= decay[-1] // 2:
+                power[half_rate] = power[p] * power[q]
+        shared = np.negative(power[(first + second) // 2])
+        for w, order in zip(weights, decay // 2, strict=True):
+            if w:
+                shared += w * power[int(order)]
+        h *= first + second
+        h -= first * (D * a + s) + second * (D * b + s)
+        term = np.exp(h, out=h)
+        term *= shared
+        term[row, place] *= np.sqrt(present[0][i] * present[1][row]) ** (-1.0 * joint)
+        if alike:
+            term[:, 1:] *= 2
         total, pairs = np.zeros(len(b)), np.zeros((2, len(b)))
         for length, count in zip(lengths, times, strict=True):
             n, m = max(length + 1 - a, 0.0), np.maximum(length + 1 - b, 0.0)
