@@ -195,6 +195,13 @@ class AxisModel:
         level = np.broadcast_to(self.mean_known[..., None], self.known[0].shape)
         return replace(self, known=(level, level))
 
+    def of(self, rows: Bools) -> AxisModel:
+        """Return the model of some of the motions; itself where it is that of one motion."""
+        if self.steady.ndim == 3:
+            return self
+        before, after = (known[rows] for known in self.known)
+        return replace(self, known=(before, after), steady=self.steady[rows])
+
     def ratio(self, D: Floats, offset: Floats) -> Floats:
         """Return v = ln(1 + 2 o/(D tau)), o the offset."""
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -570,39 +577,36 @@ class AxisModel:
         """Return a steady velocity or spin, its information, and p of the F test.
 
         Their shapes are (B, p), (B, p, p) and (B,). The motion is found by generalised least
-        squares on `steady`, with D and the offset fitted again to what is left where p is below
-        0.2. F has (p, nu) degrees of freedom, nu being twice the inverse relative variance of D,
+        squares on `steady`. Where p is below 0.2, D and the offset are fitted again to what is
+        left. F has (p, nu) degrees of freedom, nu being twice the inverse relative variance of D,
         mean over the axes.
         """
         from scipy.linalg.lapack import dpttrf, dpttrs
         from scipy.special import fdtrc
 
-        shape, p = fit.y.shape, self.steady.shape[-1]
-        x = np.broadcast_to(np.swapaxes(self.steady, -3, -2), (*shape, p))
-        rows = x.reshape(-1, p)
-        rest, n = fit, self.n_steps
-        separate = self.steady.ndim == 4  # several motions, each tested as if it were alone
-        mean, information = np.zeros((shape[0], p)), np.zeros((shape[0], p, p))
-        p_value, done = np.zeros(shape[0]), np.zeros(shape[0], dtype=np.bool_)
+        p, n, sets = self.steady.shape[-1], self.n_steps, len(fit.y)
+        mean, information, p_value = np.zeros((sets, p)), np.zeros((sets, p, p)), np.zeros(sets)
+        rows, model, rest = np.arange(sets), self, fit
         for refits in range(3):
-            d, lower, _ = dpttrf(*self.bands(rest.D, rest.offset))
-            unit = dpttrs(d, lower, rows)[0].reshape(*shape, p)
-            gram = np.einsum("banp,banq->bpq", x, unit)
-            right = np.einsum("banp,ban->bp", unit, fit.y)
-            found = np.linalg.solve(gram, right[..., None])[..., 0]
-            by_D, by_offset = self.slopes(rest.D, rest.offset)
+            y = fit.y[rows]
+            x = np.broadcast_to(np.swapaxes(model.steady, -3, -2), (*y.shape, p))
+            d, lower, _ = dpttrf(*model.bands(rest.D, rest.offset))
+            unit = dpttrs(d, lower, x.reshape(-1, p))[0].reshape(len(rows), -1, p)
+            gram = np.swapaxes(x.reshape(unit.shape), 1, 2) @ unit
+            right = np.swapaxes(unit, 1, 2) @ y.reshape(len(rows), -1, 1)
+            found = np.linalg.solve(gram, right)[..., 0]
+            by_D, by_offset = model.slopes(rest.D, rest.offset)
             g = np.stack([by_D, by_offset] if self.free else [by_D], axis=-2)
-            matrix = 0.5 * np.einsum("...ik,...jk->...ij", g, g)
+            matrix = 0.5 * g @ np.swapaxes(g, -1, -2)
             nu = np.mean(2 / np.linalg.inv(matrix)[..., 0, 0], axis=1)
-            square = np.einsum("bp,bpq,bq->b", found, gram, found) * (n - 1) / (n * p)
-            mean = np.where(done[:, None], mean, found)
-            information = np.where(done[:, None, None], information, gram)
-            p_value = np.where(done, p_value, fdtrc(p, nu, square))
-            done = p_value > _NO_STEADY_MOTION
-            done = done if separate else np.full_like(done, done.all())
-            if refits == 2 or done.all():
+            square = np.sum(found * right[..., 0], axis=1) * (n - 1) / (n * p)
+            mean[rows], information[rows], p_value[rows] = found, gram, fdtrc(p, nu, square)
+            left = p_value[rows] < _NO_STEADY_MOTION
+            if refits == 2 or not left.any():
                 break
-            rest = self.fit(fit.y - np.einsum("banp,bp->ban", x, mean), near=rest)
+            rows, model = rows[left], model.of(left)
+            residual = y[left] - (x[left] @ found[left, None, :, None])[..., 0]
+            rest = model.fit(residual, near=AxisFit(y[left], rest.D[left], rest.offset[left]))
         return mean, information, p_value
 
 
