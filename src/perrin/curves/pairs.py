@@ -627,7 +627,7 @@ class Products:
             power = np.zeros(len(transform.turn))
             for i, j in group:
                 if parts is None:
-                    moved = transform.spectrum(columns[[i]], out=memory)
+                    moved = transform.spectrum(columns[i : i + 1], out=memory)
                     power += squared_size(moved, overwrite=True)
                 else:
                     # The real part is the transform of the mean of a product and its reverse.
