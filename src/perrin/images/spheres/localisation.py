@@ -58,7 +58,6 @@ if TYPE_CHECKING:
     from perrin.images.optics.optics import CameraNoise, Optics
     from perrin.images.optics.point_spread import PointSpread
     from perrin.images.optics.radial_image import RadialImage
-    from perrin.images.optics.window_fit import ImageFit, Window
 
     Columns: TypeAlias = dict[str, NDArray[Any]]
 
@@ -727,7 +726,7 @@ def group_columns(
     crowds: list[tuple[Ints, CrowdFit]] = []
     if optics is not None:
         image, noise, furthest = optics.image(voxel), optics.noise, optics.diameter / 4
-        dimmed = np.broadcast_to(light, len(centers))
+        dimmed, last = np.broadcast_to(light, len(centers)), (np.array(frame.shape) - 1) * voxel
         groups, chains = groups_to_fit(centers, contact, dusty=bool(usual and usual.left_out))
         for chain in chains if search.crowds else []:
             crowds.append((chain, _crowd_of(frame, found, chain, search, image, noise)))
@@ -745,24 +744,24 @@ def group_columns(
         dark = ~(fit.brightness / np.median(fit.brightness) > 0.1)
         faults = np.where(dark, _DARK, np.where(moved, _MOVED, "")).astype(object)
         if usual is not None:
-            square, voxels = _own_chi2(window, fit)
+            # Chi-squared per voxel of the voxels of every sphere, and their number.
+            voxels = fit.unit_images.sum(axis=1)
+            residual = fit.weight * (window.data - fit.expected) ** 2
+            square = fit.unit_images @ residual / np.maximum(voxels, 1e-300)
             level = usual.brightness * dimmed[group]
             excess = usual.excess(square, fit.brightness / level, voxels=voxels)
             worst = int(excess.argmax())
             bright = fit.brightness / level >= usual.brightest
+            # Spheres at the border, which are often not found, touch those within one contact.
+            at_border = np.any(np.minimum(fit.centers, last - fit.centers) < contact)
+            beside = usual.disturbed(np.array([fit.chi2]), voxels=np.array([window.data.size]))
+            disturbed = beside[0] or usual.disturbed(square, voxels=voxels).any()
             # Light beside spheres of usual brightness may be that of a sphere that was not found.
             if (
                 search.crowds
                 and len(group) <= _LARGEST_CUT_GROUP
                 and not bright.any()
-                and (
-                    excess[worst] > 1
-                    or fit.chi2 > usual.worst_chi2
-                    or (
-                        _touch_border(frame, fit.centers, voxel, reach=contact)
-                        and _is_disturbed(usual, square, voxels, window, fit)
-                    )
-                )
+                and (excess[worst] > 1 or fit.chi2 > usual.worst_chi2 or (at_border and disturbed))
             ):
                 beyond = _crowd_of(frame, found, group, search, image, noise)
                 whole = _usual_spheres(
@@ -823,14 +822,6 @@ def _crowd_of(
     )
 
 
-def _own_chi2(window: Window, fit: ImageFit) -> tuple[Floats, Floats]:
-    """Return chi-squared per voxel of the voxels of every sphere of a fit, and their number."""
-    own = fit.unit_images
-    voxels = own.sum(axis=1)
-    square = own @ (fit.weight * (window.data - fit.expected) ** 2)
-    return square / np.maximum(voxels, 1e-300), voxels
-
-
 def _usual_spheres(
     crowd: CrowdFit, usual: UsualImage, level: float, *, count: int, contact: float
 ) -> CrowdFit | None:
@@ -855,26 +846,6 @@ def _usual_spheres(
         converged=crowd.converged[good],
         origin=crowd.origin[good],
     )
-
-
-def _touch_border(frame: Floats, centers: Floats, voxel: _Voxel, *, reach: float) -> bool:
-    """Return whether one of the centres (n, 3) is nearer to the border than a sphere that it cuts.
-
-    Spheres at the border, which are often not found, touch those within one contact distance.
-    """
-    last = (np.array(frame.shape) - 1) * np.array(voxel)
-    return bool(np.any(np.minimum(centers, last - centers) < reach))
-
-
-def _is_disturbed(
-    usual: UsualImage, square: Floats, voxels: Floats, window: Window, fit: ImageFit
-) -> bool:
-    """Return whether an image has more residual than chance leaves, in its spheres or beside them.
-
-    The light of a sphere that was not found lies beside those of its group.
-    """
-    beside = usual.disturbed(np.array([fit.chi2]), voxels=np.array([window.data.size]))
-    return bool(usual.disturbed(square, voxels=voxels).any() or beside[0])
 
 
 def with_crowds(
