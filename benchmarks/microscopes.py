@@ -171,7 +171,7 @@ def focal_field(rho, z, *, wave, aperture=1.3, index=1.4):
 def blurred_ball(light, *, grid=0.05, half=(3.4, 2.3), diameter=DIAMETER):
     """Return spline coefficients of the image of one ball on a fine grid, and its spacing, um.
 
-    The image is scaled to 1 at its middle.
+    The image is scaled to 1 at its middle, that of a shell at its brightest place.
     """
     n = [2 * round(half[0] / grid), 2 * round(half[1] / grid), 2 * round(half[1] / grid)]
     k = [2 * np.pi * np.fft.fftfreq(m, grid) for m in n]
@@ -189,7 +189,8 @@ def blurred_ball(light, *, grid=0.05, half=(3.4, 2.3), diameter=DIAMETER):
         psf = np.stack([np.interp(r, fine, line) for line in point])
         otf = np.fft.fftn(np.fft.ifftshift(psf))
     image = np.fft.fftshift(np.fft.ifftn(ball * otf).real)
-    return spline_filter(image / image[tuple(m // 2 for m in n)], order=3), grid
+    brightest = image.max() if light.shell else image[tuple(m // 2 for m in n)]
+    return spline_filter(image / brightest, order=3), grid
 
 
 def exposed(bodies, light, *, frame, table, dust=(), tables=None):

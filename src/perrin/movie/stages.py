@@ -251,6 +251,12 @@ def learn_method(
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", PrecisionWarning)
         method = choose_method(stack, search, sample, refine=refine, optics=optics)
+    if method.optics is not None and method.optics.shell:
+        z, y, x = (float(h) for h in stack.voxel)
+        sample = [
+            seen._replace(spots=method.spots(np.asarray(seen.frame, np.float64), (z, y, x)))
+            for seen in sample
+        ]
     return {
         "minmass": method.search.minmass,
         "optics": None if method.optics is None else method.optics.to_dict(),

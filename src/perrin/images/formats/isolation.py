@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 import os
-import signal
 import sys
 import time
 import weakref
@@ -126,6 +125,8 @@ class _Reader:
             answer = json.loads(process.stdout.readline())
             data = process.stdout.read(answer["length"]) if answer.get("length") else b""
         except (OSError, ValueError):
+            import signal
+
             self._process, status = None, process.wait()
             self.close()
             ending = f"its reader stopped (status {status})"

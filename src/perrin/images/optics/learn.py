@@ -719,6 +719,7 @@ def fit_samples(
     diameter: float,
     voxel: tuple[float, float, float],
     measured: PointSpread | None = None,
+    shell: bool = False,
 ) -> LearnedOptics:
     """Find the sphere diameter, point spread and noise of greatest likelihood for most samples.
 
@@ -734,6 +735,8 @@ def fit_samples(
         Voxel size (z, y, x), um.
     measured : PointSpread, optional
         A point spread that was measured; diameter and noise are learned.
+    shell : bool
+        The surface of the spheres is fluorescent; otherwise it is tried where balls do not fit.
 
     Returns
     -------
@@ -772,7 +775,11 @@ def fit_samples(
             "the optics (optics=), or keep the positions found first (refine=None)"
         )
     mean = float(np.mean([np.nanmean(s.frame) for s in usable]))
-    plain = _ball_or_shell(usable, start, CameraNoise(1.0, 0.05 * abs(mean)))
+    noise = CameraNoise(1.0, 0.05 * abs(mean))
+    if shell:
+        plain = _settled(usable, replace(start, shell=True), noise)
+    else:
+        plain = _ball_or_shell(usable, start, noise)
     plain, left_out = _without_dust(plain)
     found = plain
     if not any(isinstance(s, CrowdSample) for s in found.samples):

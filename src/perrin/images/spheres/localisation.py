@@ -18,7 +18,7 @@ from perrin._arrays import (
     refuse_unknown,
 )
 from perrin._text import listed
-from perrin.errors import FrameError, PrecisionWarning
+from perrin.errors import FrameError, NoSpheresError, PrecisionWarning
 from perrin.images.optics.crowd_fit import CrowdFit, crowd_piece, fit_crowd
 from perrin.images.optics.learn import (
     CrowdSample,
@@ -33,6 +33,7 @@ from perrin.images.optics.window_fit import FreeCenters, fit_window
 from perrin.images.spheres.by_trackpy import Features, find_features, refine_by_trackpy
 from perrin.images.spheres.circles import circle_cut, find_circles
 from perrin.images.spheres.planar import learn_plane, plane_columns
+from perrin.images.spheres.shells import find_shells
 from perrin.images.spheres.spots import (
     SPOT_KEYWORDS,
     Fading,
@@ -195,6 +196,16 @@ class Search:
             border=self.border,
         )
 
+    def shells(self, frame: Floats, voxel: _Voxel) -> Features:
+        """Return the centres of fluorescent surfaces in a frame, noise among them."""
+        return find_shells(
+            frame,
+            diameter=self.diameter,
+            contact=self.contact,
+            voxel=voxel,
+            border=self.border,
+        )
+
     def spheres(self, spots: Features, light: Floats | float = 1.0) -> Features:
         """Return the spots of at least the least mass, times the relative brightness at each."""
         keep = spots.mass >= (self.minmass or 0.0) * light
@@ -270,6 +281,12 @@ class Method:
     usual: UsualImage | None = None
     radial: RadialImage | None = None
 
+    def spots(self, frame: Floats, voxel: _Voxel) -> Features:
+        """Return the spots of a frame, noise among them; of shells the centres of surfaces."""
+        if self.optics is not None and self.optics.shell:
+            return self.search.shells(frame, voxel)
+        return self.search.spots(frame, voxel)
+
     def spheres(self, spots: Features, frame: int) -> Features:
         """Return the spots of a frame that pass the mass cut."""
         if self.fading is None:
@@ -296,7 +313,7 @@ class Method:
         """
         data, voxel = np.asarray(stack.frame(i)), _voxel_size(stack)
         frame = _finite_frame(data, i)
-        spots = self.search.spots(frame, voxel)
+        spots = self.spots(frame, voxel)
         found = self.spheres(spots, i)
         if self.radial is not None:
             columns = plane_columns(
@@ -406,14 +423,10 @@ def choose_method(
             pixel=_voxel_size(stack)[1:],
         )
         return Method(search, refine, radial=radial)
-    fading = None
-    if search.minmass is None:
-        fading = find_fading([seen.number for seen in sample], [seen.spots for seen in sample])
-        masses = [seen.spots.mass for seen in sample]
-        if fading is not None:
-            masses = [m.spots.mass / fading.at(m.number, m.spots.centers) for m in sample]
-        search = replace(search, minmass=mass_cut(np.concatenate([np.empty(0), *masses])))
-    method = Method(search, refine, optics if refine == "model" else None, fading)
+    voxel = _voxel_size(stack)
+    if refine == "model" and optics is not None and optics.shell:
+        return _with_mass_cut(Method(search, refine, optics), _of_shells(sample, search, voxel))
+    method = _with_mass_cut(Method(search, refine, optics if refine == "model" else None), sample)
     if refine == "trackpy":
         _refuse_trackpy_in_crowds(
             [method.spheres(s.spots, s.number).centers for s in sample], contact=search.contact
@@ -429,9 +442,57 @@ def choose_method(
             in_groups += sum(map(len, groups))
         # Where most spheres are in crowds that are not to be refined, no optics are needed.
         if search.crowds or in_crowds <= in_groups:
-            learned = fit_optics(sample, method, voxel=_voxel_size(stack))
-            return replace(method, optics=learned.optics, usual=learned.usual)
+            return _with_optics(method, sample, Method(search), voxel)
     return method
+
+
+def _with_mass_cut(method: Method, sample: Sequence[SampledFrame]) -> Method:
+    """Return a method with the mass cut that the spots of some frames show, if none is stated."""
+    if method.search.minmass is not None:
+        return method
+    fading = find_fading([seen.number for seen in sample], [seen.spots for seen in sample])
+    masses = [seen.spots.mass for seen in sample]
+    if fading is not None:
+        masses = [m.spots.mass / fading.at(m.number, m.spots.centers) for m in sample]
+    cut = mass_cut(np.concatenate([np.empty(0), *masses]))
+    return replace(method, search=replace(method.search, minmass=cut), fading=fading)
+
+
+def _of_shells(sample: Sequence[SampledFrame], search: Search, voxel: _Voxel) -> list[SampledFrame]:
+    """Return sampled frames with the spots of spheres whose surface is fluorescent."""
+    return [
+        seen._replace(spots=search.shells(np.asarray(seen.frame, dtype=np.float64), voxel))
+        for seen in sample
+    ]
+
+
+def _with_optics(
+    method: Method, sample: Sequence[SampledFrame], stated: Method, voxel: _Voxel
+) -> Method:
+    """Return a method with the optics that some frames show; `stated` is without its mass cut.
+
+    Where the spots are no balls, or their surface alone is fluorescent, spots are searched for anew
+    as surfaces.
+    """
+    try:
+        learned = fit_optics(sample, method, voxel=voxel)
+        if not learned.optics.shell:
+            return replace(method, optics=learned.optics, usual=learned.usual)
+        fault = NoSpheresError("shells were found, and their centres were not")
+    except NoSpheresError as error:
+        fault = error
+    if method.search.dark:
+        raise fault
+    shells = _of_shells(sample, method.search, voxel)
+    with warnings.catch_warnings():
+        # The spots may be no spheres, of which the masses then say nothing.
+        warnings.simplefilter("ignore", PrecisionWarning)
+        method = _with_mass_cut(stated, shells)
+    try:
+        learned = fit_optics(shells, method, voxel=voxel, shell=True)
+    except NoSpheresError:
+        raise fault from None
+    return replace(method, optics=learned.optics, usual=learned.usual)
 
 
 def _trackpy_groups(centers: Floats, *, contact: float) -> tuple[Ints, int]:
@@ -601,7 +662,9 @@ def locate(
     return table
 
 
-def fit_optics(sample: Sequence[SampledFrame], method: Method, *, voxel: _Voxel) -> LearnedOptics:
+def fit_optics(
+    sample: Sequence[SampledFrame], method: Method, *, voxel: _Voxel, shell: bool = False
+) -> LearnedOptics:
     """Learn the diameter of the fluorescent sphere, the point spread and the noise.
 
     Parameters
@@ -612,6 +675,8 @@ def fit_optics(sample: Sequence[SampledFrame], method: Method, *, voxel: _Voxel)
         Options of the search, with the mass cut.
     voxel : tuple of float
         Voxel size (z, y, x), um.
+    shell : bool
+        The surface of the spheres is fluorescent, in place of all of them.
 
     Returns
     -------
@@ -637,7 +702,9 @@ def fit_optics(sample: Sequence[SampledFrame], method: Method, *, voxel: _Voxel)
     if sum(len(s.centers) for s in samples) < sum(len(s.centers) for s in pieces):
         samples, most = pieces, _LEARNING_CROWDS
     chosen = [samples[k] for k in _evenly_spaced(len(samples), most)]
-    return fit_samples(chosen, diameter=search.diameter, voxel=voxel, measured=search.psf)
+    return fit_samples(
+        chosen, diameter=search.diameter, voxel=voxel, measured=search.psf, shell=shell
+    )
 
 
 def without_doubles(columns: Columns, *, contact: float) -> Columns:
