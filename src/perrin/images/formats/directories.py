@@ -53,6 +53,8 @@ def check_directories(path: str) -> None:
         kind, first = _kind_of(file.read(16))
         if kind is None:
             return
+        width = struct.calcsize(f"{kind.order}{kind.tags}")
+        last = struct.calcsize(f"{kind.order}{kind.offset}")
         seen: set[int] = set()
         chains = [first]
         while chains:
@@ -64,7 +66,16 @@ def check_directories(path: str) -> None:
                         "is damaged"
                     )
                 seen.add(offset)
-                tags, offset = _directory(file, kind, offset)
+                file.seek(offset)
+                (n,) = struct.unpack(
+                    f"{kind.order}{kind.tags}", file.read(width).ljust(width, b"\0")
+                )
+                size = n * kind.tag.itemsize + last
+                data = file.read(size) if n <= _MOST_TAGS else b""
+                if len(data) < size:
+                    break
+                (offset,) = struct.unpack(f"{kind.order}{kind.offset}", data[-last:])
+                tags = np.frombuffer(data, kind.tag, count=n)
                 chains += _check_tags(path, file, kind, tags, length)
 
 
@@ -81,25 +92,6 @@ def _kind_of(head: bytes) -> tuple[_Kind | None, int]:
         kind = _Kind(order, "Q", "Q", np.dtype([(n, order + t) for n, t in fields]))
         return kind, struct.unpack(f"{order}Q", head[8:16])[0]
     return None, 0
-
-
-def _directory(file: BinaryIO, kind: _Kind, offset: int) -> tuple[NDArray[np.void], int]:
-    """Return the tags of a directory, and the position of the next one; 0 where the file ends."""
-    nothing = np.empty(0, kind.tag)
-    width = struct.calcsize(f"{kind.order}{kind.tags}")
-    file.seek(offset)
-    head = file.read(width)
-    if len(head) < width:
-        return nothing, 0
-    (n,) = struct.unpack(f"{kind.order}{kind.tags}", head)
-    if n > _MOST_TAGS:
-        return nothing, 0
-    size = struct.calcsize(f"{kind.order}{kind.offset}")
-    data = file.read(n * kind.tag.itemsize + size)
-    if len(data) < n * kind.tag.itemsize + size:
-        return nothing, 0
-    (following,) = struct.unpack(f"{kind.order}{kind.offset}", data[-size:])
-    return np.frombuffer(data, kind.tag, count=n), int(following)
 
 
 def _check_tags(

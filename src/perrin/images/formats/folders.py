@@ -109,7 +109,17 @@ def sequence(path: str, pick: Pick) -> Contents:
     if all("NDTiffStack" in Path(file).name for file in files):
         return ndtiff([opened(file) for file in files], pick)
     counters = name_counters([Path(file).stem for file in files])
-    _refuse_gaps(counters)
+    # The distances of times or planes whose numbers are uneven would be wrong.
+    for axis, word in (("T", "times"), ("Z", "planes")):
+        numbers = np.unique([int(label[axis]) for label in counters if axis in label])
+        steps = np.diff(numbers)
+        if len(steps) and steps.min() < steps.max():
+            late = int(np.argmax(steps > steps.min()))
+            raise ValueError(
+                f"has files whose {word} are numbered unevenly, with none between "
+                f"{numbers[late]} and {numbers[late + 1]}: add the missing ones, or number them "
+                "evenly if none is missing"
+            )
     sizes, places = grid(counters)
     axes = list(sizes)
     position = {}
@@ -143,20 +153,6 @@ def sequence(path: str, pick: Pick) -> Contents:
         voxel=first.voxel,
         times=even_times(where.t, np.nan),
     )
-
-
-def _refuse_gaps(counters: list[dict[str, int | str]]) -> None:
-    """Refuse times or planes whose numbers are uneven: their distances would be wrong."""
-    for axis, word in (("T", "times"), ("Z", "planes")):
-        numbers = np.unique([int(label[axis]) for label in counters if axis in label])
-        steps = np.diff(numbers)
-        if len(steps) and steps.min() < steps.max():
-            late = int(np.argmax(steps > steps.min()))
-            raise ValueError(
-                f"has files whose {word} are numbered unevenly, with none between "
-                f"{numbers[late]} and {numbers[late + 1]}: add the missing ones, or number them "
-                "evenly if none is missing"
-            )
 
 
 def _frames(sizes: dict[str, int], inner: int, pick: Pick) -> Layout:
