@@ -17,7 +17,7 @@ from perrin.geometry.wahba import svd_rotation
 from perrin.motion.residuals import unit_center_variance, unit_covariance
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Hashable, Sequence
 
     from perrin._arrays import Bools, Floats, Ints
     from perrin.diffusion.noise_model import Noise
@@ -106,7 +106,7 @@ class Steps:
     def variances(self) -> tuple[Floats, Floats]:
         """Noise variances of the first and the last frame of each step by component, (S, c)."""
         diagonal = np.ascontiguousarray(np.einsum("tcc->tc", self.noise[0]))
-        return diagonal[self.start], diagonal[self.stop]
+        return stored_once(diagonal[self.start]), stored_once(diagonal[self.stop])
 
     @cached_property
     def even(self) -> bool:
@@ -257,13 +257,8 @@ def steps_of(motion: RigidMotion, quantity: Quantity) -> Steps:
     ((99, 3), True)
     """
     known = _STEPS_OF_MOTIONS.setdefault(motion, {})
-    if quantity not in known:
-        known[quantity] = _computed_steps(motion, quantity)
-    return known[quantity]
-
-
-def _computed_steps(motion: RigidMotion, quantity: Quantity) -> Steps:
-    """Compute what `steps_of` returns."""
+    if quantity in known:
+        return known[quantity]
     start, stop = motion.steps()
     if len(start) < 2:
         raise TooFewFramesError(
@@ -294,19 +289,62 @@ def _computed_steps(motion: RigidMotion, quantity: Quantity) -> Steps:
         vectors = motion.center[stop] - motion.center[start]
         d = vectors.shape[1]
         noise = np.repeat(unit_center_variance(motion)[:, None], d, axis=1)
-        steady = np.eye(d) * duration[:, None, None]
-    return Steps(
+        steady = stored_once(np.eye(d) * duration[:, None, None])
+    known[quantity] = Steps(
         vectors=vectors,
         duration=duration,
         start=start,
         stop=stop,
-        noise=(noise[..., None] * np.eye(noise.shape[1]))[None],
+        noise=stored_once(noise[..., None] * np.eye(noise.shape[1]))[None],
         dt=motion.dt,
         sigma=motion.sigma,
         freedom=residual_freedom(motion),
         complete=float(np.mean(noise[complete])),
         steady=steady,
     )
+    return known[quantity]
+
+
+def stored_once(rows: Floats) -> Floats:
+    """Return an array (N, ...) whose rows are all the same as a view of one row.
+
+    Thousands of motions are in memory together, and most have equally noisy frames.
+
+    Examples
+    --------
+    >>> stored_once(np.ones((4, 2))).strides[0], stored_once(np.arange(4.0)).strides[0]
+    (0, 8)
+    """
+    if len(rows) < 2 or not np.array_equal(rows[1:], rows[:-1]):
+        return rows
+    return np.broadcast_to(rows[0].copy(), rows.shape)
+
+
+def groups_alike(keys: Sequence[Hashable], sizes: Sequence[int], *, most: int) -> list[list[int]]:
+    """Return the numbers of items in groups of equal keys that are computed at once.
+
+    Parameters
+    ----------
+    keys : sequence
+        Key of every item.
+    sizes : sequence of int
+        Size of every item, the same for equal keys.
+    most : int
+        Largest sum of the sizes of a group of more than one.
+
+    Examples
+    --------
+    >>> groups_alike(["a", "b", "a", "a"], [2, 9, 2, 2], most=4)
+    [[0, 2], [3], [1]]
+    """
+    alike: dict[Hashable, list[int]] = {}
+    for k, key in enumerate(keys):
+        alike.setdefault(key, []).append(k)
+    groups = []
+    for rows in alike.values():
+        at_once = max(1, most // max(sizes[rows[0]], 1))
+        groups += [rows[low : low + at_once] for low in range(0, len(rows), at_once)]
+    return groups
 
 
 def pooled_steps(

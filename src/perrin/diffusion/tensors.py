@@ -13,7 +13,7 @@ from perrin._arrays import choice_fault, refuse
 from perrin.diffusion.effective_modes import WINDOW
 from perrin.diffusion.estimate import UNITS
 from perrin.diffusion.noise_model import Noise, noise_faults
-from perrin.diffusion.steps import Quantity, body_steps
+from perrin.diffusion.steps import Quantity, body_steps, groups_alike
 from perrin.diffusion.tensor_batches import (
     SeparateTensors,
     batch_key,
@@ -292,10 +292,10 @@ def coupled_tensor(
     at_center = isinstance(point, str) and point == "diffusion"
     data = ScaledTracks.of([body_steps(motion, "both", np.eye(3))], Noise())
     basis = symmetric_basis(6)
-    best = data.fit(basis)
+    best = data.fit_coupled(basis)
     while (closer := data.reaching([best])) is not None:
         data = closer
-        best = data.fit(basis)
+        best = data.fit_coupled(basis)
     elements = [(i, j) for i in range(6) for j in range(i + 1)]
     tensor = data.in_units(best.D)
     covariance = data.covariance(spread(data.tracks, best, basis), elements)
@@ -534,6 +534,25 @@ class ScaledTracks:
         D, own = self.start() if near is None else (near.D, near.own)
         return maximise(self.tracks, squares(basis), root_parameters(D, basis), own)
 
+    def fit_coupled(self, basis: Floats) -> Maximum:
+        """Return the best tensor (6, 6) >= 0, of searches from two places.
+
+        The likelihood of short noisy tracks has several maxima. The second search begins with equal
+        axes and without coupling.
+        """
+        D, own = self.start()
+        level = np.repeat(np.diag(D).reshape(2, 3).mean(axis=1), 3)
+        found: list[Maximum] = []
+        faults: list[ValueError] = []
+        for near in (None, Maximum(-np.inf, np.diag(level), own)):
+            try:
+                found.append(self.fit(basis, near))
+            except ValueError as fault:
+                faults.append(fault)
+        if not found:
+            raise faults[0]
+        return max(found, key=lambda m: m.value)
+
     def fit_axial(self, near: Maximum) -> Maximum:
         """Return the best tensor with two values equal, about any axis."""
         found = [
@@ -646,18 +665,15 @@ def tensor_fits(
     True
     """
     found: list[TensorFit | None] = [None] * len(data)
-    together: dict[tuple[object, ...], list[int]] = {}
-    for i, one in enumerate(data):
-        if len(one.tracks) == 1 and one.tracks[0].steps.even:
-            together.setdefault(batch_key(one.tracks[0]), []).append(i)
-    for group in together.values():
-        size = data[group[0]].tracks[0].steps.vectors.size
-        at_once = max(1, _MOST_TENSORS_AT_ONCE // size)
-        for k in range(0, len(group), at_once):
-            some = group[k : k + at_once]
-            fits = _even_fits([data[i] for i in some], [bases[i] for i in some])
-            for i, even_fit in zip(some, fits, strict=True):
-                found[i] = even_fit
+    even = [i for i, one in enumerate(data) if len(one.tracks) == 1 and one.tracks[0].steps.even]
+    tracks = [data[i].tracks[0] for i in even]
+    sizes = [track.steps.vectors.size for track in tracks]
+    keys = [batch_key(track) for track in tracks]
+    for rows in groups_alike(keys, sizes, most=_MOST_TENSORS_AT_ONCE):
+        some = [even[k] for k in rows]
+        fits = _even_fits([data[i] for i in some], [bases[i] for i in some])
+        for i, even_fit in zip(some, fits, strict=True):
+            found[i] = even_fit
     fits_of_all: list[TensorFit | ValueError] = []
     for one, basis, fit in zip(data, bases, found, strict=True):
         try:
