@@ -6,7 +6,6 @@ import os
 import sys
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
-from multiprocessing import current_process
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -260,6 +259,8 @@ def dask_client(workers: int, scheduler: str | None) -> Iterator[Any]:
         If the processes do not start: every one imports the script that starts them, whose work
         must therefore be below the line ``if __name__ == "__main__":``.
     """
+    from multiprocessing import current_process
+
     if getattr(current_process(), "_inheriting", False):
         # A worker imports the script that starts it, and begins its work again: the worker stops,
         # and the process that started it reports why.
