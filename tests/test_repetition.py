@@ -69,7 +69,7 @@ def test_a_table_in_memory_is_repeated_from_the_folder(report, tmp_path):
     assert text.splitlines()[:3] == ['command = "analyze"', 'tracks = "tracks.parquet"', "dt = 0.5"]
     options = ("analyze", "--config", "moved/run.toml", "--json", "-o", "again")
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr("perrin.report.write.save_figures", lambda report, place: [])
+        patched.setattr("perrin.report.write.save_figures", lambda *_, **__: [])
         result = run(*options, cwd=tmp_path)
     assert result.returncode == 0, result.stderr
     again, first = json.loads(result.stdout), report.to_dict()
@@ -81,7 +81,7 @@ def test_a_table_in_memory_is_repeated_from_the_folder(report, tmp_path):
 
 def test_saving_and_writing_give_the_same_data(report, tmp_path, monkeypatch):
     """`Report.save` and `write_run` write the same bytes; the latter adds page and figures."""
-    monkeypatch.setattr("perrin.report.write.save_figures", lambda report, place: [])
+    monkeypatch.setattr("perrin.report.write.save_figures", lambda *_, **__: [])
     report.save(tmp_path / "a")
     perrin.write_run(report, tmp_path / "b")
     names = {path.name for path in (tmp_path / "a").iterdir()}

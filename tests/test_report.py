@@ -373,7 +373,7 @@ def test_the_run_folder_is_complete(single, tmp_path, monkeypatch, repeats):
 
 
 def test_an_existing_folder_is_refused_or_replaced(single, tmp_path, monkeypatch):
-    monkeypatch.setattr(write, "save_figures", lambda *_: [])
+    monkeypatch.setattr(write, "save_figures", lambda *_, **__: [])
     place = tmp_path / "run"
     write.write_run(single, place)
     (place / "old").touch()
@@ -394,7 +394,7 @@ def test_a_failure_leaves_no_files_and_keeps_an_existing_folder(
     def fail(*_, **__):
         raise RuntimeError("disk full")
 
-    monkeypatch.setattr(write, "save_figures", lambda *_: [])
+    monkeypatch.setattr(write, "save_figures", lambda *_, **__: [])
     monkeypatch.setattr(write, step, fail)
     for target in (place, tmp_path / "new"):
         with pytest.raises(RuntimeError, match="disk full"):
