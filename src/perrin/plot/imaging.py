@@ -19,6 +19,7 @@ from perrin.plot.figure_style import (
     ink,
     legend_above,
     line_width,
+    log_ticks,
     marker_size,
     save_drawn,
     series_color,
@@ -169,6 +170,7 @@ def plot_masses(imaging: Imaging, *, ax: Axes) -> Axes:
         label = f"cut at {number_text(cut)}"
         ax.axvline(cut, color=series_color(1), lw=line_width(0.95), ls="--", label=label)
     ax.set(xscale="log", xlabel="mass (grey levels)", ylabel="spots")
+    log_ticks(ax.xaxis)
     _count_axis(ax)
     legend_above(ax, ncols=3)
     return ax
@@ -516,6 +518,7 @@ def _count_axis(ax: Axes) -> None:
     ax.set_yscale("log")
     # Both ends are set, because the tail of the expected curve reaches far below 1.
     ax.set_ylim(0.5, 2 * ax.dataLim.ymax)
+    log_ticks(ax.yaxis)
     ax.yaxis.set_major_formatter("{x:g}")
 
 
