@@ -1,10 +1,123 @@
-"""Closed-form estimates of D from steps: costs of sparse frames."""
+"""Closed-form estimates of D from steps: exact means and errors, and costs of sparse frames."""
 
 import tracemalloc
+from dataclasses import replace
 
 import numpy as np
+import pytest
 
-from perrin import Cluster, estimate_diffusion, simulate_motion, track_rotation
+from perrin import Cluster, Noise, estimate_diffusion, simulate_motion, track_rotation
+from perrin.diffusion.moments import covariance_estimate, step_cosines, trace_estimate
+from perrin.diffusion.steps import NoisySteps, Steps
+
+D, SIGMA, FREEDOM = 0.02, 0.3, 7
+
+
+def covariance(steps, variance, *, D, blur=0.0):
+    """Return the covariance of the steps of one axis; variance (T,) is the noise of the frames."""
+    variance = variance - blur * D
+    shared = np.where(steps.linked[:-1], variance[steps.stop[:-1]], 0.0)
+    own = 2 * D * steps.duration + variance[steps.start] + variance[steps.stop]
+    return np.diag(own) - np.diag(shared, 1) - np.diag(shared, -1)
+
+
+def exact_steps(start, stop, noise, *, offset=None, blur=0.0):
+    """Return steps whose second moments, over as many axes as steps, are those of the model."""
+    start, stop = np.array(start), np.array(stop)
+    n, frames = len(start), np.arange(stop[-1] + 1)
+    noise = np.array(noise)[frames]
+    steps = Steps(
+        vectors=np.zeros((n, n)), duration=0.5 * (stop - start), start=start, stop=stop,
+        noise=(noise[:, None, None] * np.eye(n))[None], dt=0.5, sigma=SIGMA, freedom=FREEDOM,
+        complete=float(noise[:2].mean()),
+    )  # fmt: skip
+    variance = SIGMA**2 * noise
+    if offset is not None:  # the least noisy frame has this offset, the others exceed it
+        variance = offset + variance - variance[[*start, *stop]].min()
+    roots = np.linalg.cholesky(covariance(steps, variance, D=D, blur=blur))
+    return replace(steps, vectors=np.sqrt(n) * roots), variance
+
+
+NOISE_OF_FRAMES = [0.30, 0.34, 0.2, 0.5, 0.3, 0.3, 0.45, 0.3]
+GAPS = [([0, 1, 3, 4, 5], [1, 3, 4, 5, 7]), ([0, 1, 4, 5], [1, 2, 5, 6])]
+MODELS = {
+    "free": (Noise(), {"offset": 0.011}),
+    "free, exposed": (Noise(exposure=0.9), {"offset": 0.011}),
+    "measured": (Noise("residual"), {}),
+    "measured, exposed": (Noise("residual", exposure=0.9), {"blur": 0.15}),
+    "known": (Noise(SIGMA), {}),
+}
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_exact_second_moments_give_the_exact_D_and_the_error_of_quadratic_forms(name):
+    """With gaps, uneven noise and two tracks: D to rounding; errors from dense matrices.
+
+    The variance of y^T Q y is 2 tr QCQC for Gaussian y; noise from residuals adds 2/f of its square.
+    """
+    noise, planted = MODELS[name]
+    made = [exact_steps(*gaps, NOISE_OF_FRAMES, **planted) for gaps in GAPS]
+    tracks = [NoisySteps.of(steps, noise) for steps, _ in made]
+    found = covariance_estimate(tracks)
+    assert found.value == pytest.approx(D, rel=1e-12)
+    blur, free = planted.get("blur", 0.0), "offset" in planted
+    total, variance, of_offset, offsets = 0.0, 0.0, 0.0, []
+    for (steps, noisy), track in zip(made, tracks, strict=True):
+        n, links = len(steps.start), steps.linked[:-1]
+        C = covariance(steps, noisy, D=D, blur=blur)
+        off = np.diag(links, 1).astype(float) + np.diag(links, -1)
+        Q = np.eye(n) + (n / links.sum() * off if free else 0)
+        variance += n * 2 * np.trace(Q @ C @ Q @ C)
+        total += 2 * n * np.sum(steps.duration - blur)
+        if free:
+            product = off / (2 * n * links.sum())
+            of_offset += n * 2 * np.trace(product @ C @ product @ C)
+            offsets.append(planted["offset"] + track.level)
+        else:
+            offsets.append(SIGMA**2 * steps.complete - blur * D)
+        if noise.model == "residual":
+            both = SIGMA**2 * n * (steps.variances[0][:, 0] + steps.variances[1][:, 0]).sum()
+            variance += 2 / FREEDOM * both**2
+            of_offset += 2 / FREEDOM * (SIGMA**2 * steps.complete) ** 2
+    assert found.stderr == pytest.approx(np.sqrt(variance) / total, rel=1e-12)
+    assert found.offset == pytest.approx(np.mean(offsets), rel=1e-9)
+    assert found.offset_stderr == pytest.approx(np.sqrt(of_offset) / 2, rel=1e-9, abs=1e-15)
+
+
+def test_mean_cosines_of_planted_turns():
+    """Turns by a or by b: D and its error are those of the mean cosine; two dt take twice the turn.
+
+    Without noise D = -ln<cos>/t in the plane, and its error, of independent steps with the
+    residuals (m - c)/(m N), adds twice the correlation of neighbours up to two frames apart.
+    """
+    turns = np.array([0.1, 0.3, 0.3, 0.1, 0.2, 0.4, 0.1])
+    angle = np.append(0, np.cumsum(turns))
+    square = np.array([[1, 0], [0, 1], [-1, 0], [0, -1.0]])
+    c, s = np.cos(angle), np.sin(angle)
+    rotation = np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], -2)
+    motion = track_rotation(np.einsum("tij,nj->tni", rotation, square), dt=0.5)
+    np.testing.assert_allclose(step_cosines(motion, 1)[:7], np.cos(turns), rtol=1e-12)
+    np.testing.assert_allclose(step_cosines(motion, 2)[:6], np.cos(turns[:-1] + turns[1:]))
+    assert np.isnan(step_cosines(motion, 1)[7:]).all()
+    one, two = np.cos(turns), np.cos(turns[:-1] + turns[1:])
+    f = [-np.log(cosine.mean()) for cosine in (one, two)]
+    v1 = np.append((one.mean() - one) / (7 * one.mean()), [0, 0, 0])
+    v2 = np.append((two.mean() - two) / (6 * two.mean()), [0, 0, 0, 0])
+
+    def error(v):
+        lags = np.subtract.outer(np.arange(10), np.arange(10))
+        square = v @ (np.abs(lags) <= 2) @ v
+        return np.sqrt(square if square > 0 else v @ v)
+
+    known = trace_estimate([motion], noise=[0.004], blur=0.1)
+    assert known.value == pytest.approx((f[0] - 0.004) / 0.4, rel=1e-12)
+    assert known.stderr == pytest.approx(error(v1) / 0.4, rel=1e-12)
+    assert known.offset == pytest.approx(0.004 - 0.1 * known.value, rel=1e-12)
+    free = trace_estimate([motion], noise=None, blur=0.0)
+    assert free.value == pytest.approx((f[1] - f[0]) / 0.5, rel=1e-12)
+    assert free.offset == pytest.approx(2 * f[0] - f[1], rel=1e-12)
+    assert free.stderr == pytest.approx(error(v2 - v1) / 0.5, rel=1e-12)
+    assert free.offset_stderr == pytest.approx(error(2 * v1 - v2), rel=1e-12)
 
 
 def test_a_long_gap_takes_no_memory_in_the_mean_cosine():
