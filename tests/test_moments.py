@@ -10,7 +10,7 @@ from perrin import Cluster, Noise, estimate_diffusion, simulate_motion, track_ro
 from perrin.diffusion.moments import covariance_estimate, step_cosines, trace_estimate
 from perrin.diffusion.steps import NoisySteps, Steps
 
-D, SIGMA, FREEDOM = 0.02, 0.3, 7
+D, SIGMA, FREEDOM = 0.02, 0.3, 1
 
 
 def covariance(steps, variance, *, D, blur=0.0):
@@ -53,7 +53,7 @@ MODELS = {
 def test_exact_second_moments_give_the_exact_D_and_the_error_of_quadratic_forms(name):
     """With gaps, uneven noise and two tracks: D to rounding; errors from dense matrices.
 
-    The variance of y^T Q y is 2 tr QCQC for Gaussian y; noise from residuals adds 2/f of its square.
+    The variance of y^T Q y is 2 tr QCQC for Gaussian y; noise of residuals adds 2/f of its square.
     """
     noise, planted = MODELS[name]
     made = [exact_steps(*gaps, NOISE_OF_FRAMES, **planted) for gaps in GAPS]
@@ -84,40 +84,51 @@ def test_exact_second_moments_give_the_exact_D_and_the_error_of_quadratic_forms(
     assert found.offset_stderr == pytest.approx(np.sqrt(of_offset) / 2, rel=1e-9, abs=1e-15)
 
 
-def test_mean_cosines_of_planted_turns():
-    """Turns by a or by b: D and its error are those of the mean cosine; two dt take twice the turn.
+def test_steps_that_share_no_frame_have_no_offset():
+    """D is the mean square over twice the time, as if there were no noise."""
+    steps, _ = exact_steps([0, 2, 4], [1, 3, 5], np.zeros(6))
+    found = covariance_estimate([NoisySteps.of(steps, Noise())])
+    assert found.value == pytest.approx(D, rel=1e-12)
+    assert found.offset == found.offset_stderr == 0
 
-    Without noise D = -ln<cos>/t in the plane, and its error, of independent steps with the
-    residuals (m - c)/(m N), adds twice the correlation of neighbours up to two frames apart.
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_mean_cosines_of_planted_turns(d):
+    """D and its error are those of the mean of tr(R)/d, of turns by one dt and by two.
+
+    <cos> = exp(-D t) in the plane, <(1 + 2 cos)/3> = exp(-2 D t) in space. The error is that of
+    a sum of (m - c)/(m N), which are correlated up to two frames apart.
     """
-    turns = np.array([0.1, 0.3, 0.3, 0.1, 0.2, 0.4, 0.1])
-    angle = np.append(0, np.cumsum(turns))
-    square = np.array([[1, 0], [0, 1], [-1, 0], [0, -1.0]])
+    turns = 0.07 * np.array([1, 2, 3, 5, 7, 9, 10])
+    angle, zero = np.append(0, np.cumsum(turns)), np.zeros(8)
     c, s = np.cos(angle), np.sin(angle)
-    rotation = np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], -2)
-    motion = track_rotation(np.einsum("tij,nj->tni", rotation, square), dt=0.5)
-    np.testing.assert_allclose(step_cosines(motion, 1)[:7], np.cos(turns), rtol=1e-12)
-    np.testing.assert_allclose(step_cosines(motion, 2)[:6], np.cos(turns[:-1] + turns[1:]))
-    assert np.isnan(step_cosines(motion, 1)[7:]).all()
+    rotation = np.array([[c, -s, zero], [s, c, zero], [zero, zero, zero + 1]])[:d, :d]
+    body = np.array([[1, 0, 1], [0, 1, -1], [-1, 0, 1], [0, -1.0, -1]])[:, :d]
+    places = np.einsum("ijt,nj->tni", rotation, body)
+    motion = track_rotation(places, dt=0.5, frames=np.arange(10, 18))
     one, two = np.cos(turns), np.cos(turns[:-1] + turns[1:])
-    f = [-np.log(cosine.mean()) for cosine in (one, two)]
-    v1 = np.append((one.mean() - one) / (7 * one.mean()), [0, 0, 0])
-    v2 = np.append((two.mean() - two) / (6 * two.mean()), [0, 0, 0, 0])
+    if d == 3:
+        one, two = (1 + 2 * one) / 3, (1 + 2 * two) / 3
+    np.testing.assert_allclose(step_cosines(motion, 1), [*one, *3 * [np.nan]], rtol=1e-9)
+    np.testing.assert_allclose(step_cosines(motion, 2)[:6], two, rtol=1e-9)
+    f1, f2 = -np.log(one.mean()), -np.log(two.mean())
+    v1 = np.append((one.mean() - one) / (7 * one.mean()), 0.0)
+    v2 = np.append((two.mean() - two) / (6 * two.mean()), [0, 0])
 
     def error(v):
-        lags = np.subtract.outer(np.arange(10), np.arange(10))
-        square = v @ (np.abs(lags) <= 2) @ v
-        return np.sqrt(square if square > 0 else v @ v)
+        near = np.abs(np.subtract.outer(np.arange(8), np.arange(8))) <= 2
+        return np.sqrt(v @ near @ v)
 
+    rate = d - 1
     known = trace_estimate([motion], noise=[0.004], blur=0.1)
-    assert known.value == pytest.approx((f[0] - 0.004) / 0.4, rel=1e-12)
-    assert known.stderr == pytest.approx(error(v1) / 0.4, rel=1e-12)
-    assert known.offset == pytest.approx(0.004 - 0.1 * known.value, rel=1e-12)
+    assert known.value == pytest.approx((f1 / rate - 0.004) / 0.4, rel=1e-9)
+    assert known.stderr == pytest.approx(error(v1) / (rate * 0.4), rel=1e-9)
+    assert known.offset == pytest.approx(0.004 - 0.1 * known.value, rel=1e-9)
     free = trace_estimate([motion], noise=None, blur=0.0)
-    assert free.value == pytest.approx((f[1] - f[0]) / 0.5, rel=1e-12)
-    assert free.offset == pytest.approx(2 * f[0] - f[1], rel=1e-12)
-    assert free.stderr == pytest.approx(error(v2 - v1) / 0.5, rel=1e-12)
-    assert free.offset_stderr == pytest.approx(error(2 * v1 - v2), rel=1e-12)
+    assert free.value == pytest.approx((f2 - f1) / (rate * 0.5), rel=1e-9)
+    assert free.offset == pytest.approx((2 * f1 - f2) / rate, rel=1e-9)
+    assert free.stderr == pytest.approx(error(v2 - v1) / (rate * 0.5), rel=1e-9)
+    assert free.offset_stderr == pytest.approx(error(2 * v1 - v2) / rate, rel=1e-9)
 
 
 def test_a_long_gap_takes_no_memory_in_the_mean_cosine():

@@ -12,7 +12,6 @@ import inspect
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -77,7 +76,7 @@ def coupled(m):
 
 def switching(m):
     found = perrin.fit_switching(m)
-    return [(found.D_mean.value, 0, -1), (found.log_likelihood_gain, 0, 0)]
+    return [(found.D_mean.value, 0, -1), (found.bic_gain, 0, 0)]
 
 
 def anomalous(m):
@@ -193,10 +192,8 @@ def identity(x, dt):
 def clusters(x, dt):
     """Return what is found of two bodies side by side."""
     both = np.concatenate([x, x[:, ::-1] + 10 * size_of(x)], axis=1)
-    frame, particle = np.indices(both.shape[:2])
-    columns = dict(zip("xyz", both.reshape(-1, 3).T, strict=True))
-    rows = {"frame": frame.ravel(), "particle": particle.ravel(), **columns}
-    found = perrin.find_clusters(pd.DataFrame(rows).dropna(), contact=1.8 * size_of(x), size=5)
+    table = perrin.positions_table(both)
+    found = perrin.find_clusters(table, contact=1.8 * size_of(x), size=5)
     numbers = [found["cluster"].nunique()]
     for name in found["cluster"].unique():
         alone, frames = perrin.cluster_positions(found, cluster=name)
@@ -212,6 +209,7 @@ OF_POSITIONS = {
     "settle_identity": identity,
     "find_clusters": clusters,
     "cluster_positions": clusters,
+    "positions_table": clusters,
     "noise_floor": lambda x, dt: [(perrin.noise_floor(x[0], sigma=0.01 * size_of(x)).phi2, 0, 0)],
     "point_group": lambda x, dt: [
         (list(perrin.point_group(x[0], tolerance=0.1 * size_of(x)).encode()), 0, 0)
@@ -284,7 +282,7 @@ def test_a_gap_is_a_frame_without_numbers(name):
     x = places()
     rows = np.flatnonzero(np.isfinite(x).any(axis=(1, 2)))
     without = perrin.track_rotation(x[rows], dt=DT, frames=rows)
-    same(OF_MOTION[name](without), before(name), rel=1e-9)
+    same(OF_MOTION[name](without), before(name), rel=1e-6)
 
 
 @pytest.mark.parametrize("name", ["track_rotation", *OF_POSITIONS])
@@ -295,3 +293,59 @@ def test_single_precision_and_whole_numbers_are_read_as_they_are(name):
     for x in (single, whole):
         given_type = numbers(name, x, 1)
         same(given_type, numbers(name, x.astype(np.float64), 1.0), rel=1e-5)
+
+
+# Where the laws of the other functions are: a planted truth, units, turns, or the way back.
+ELSEWHERE = {
+    "add_noise": "test_simulate.py::test_noise_has_its_sigma_on_every_axis",
+    "analyze": "test_edges.py::test_units_of_any_size",
+    "analyze_stack": "test_plane.py::test_a_planar_movie_ends_in_a_report",
+    "apparent_translation": "test_mobility.py::test_moved_and_relabelled_bodies",
+    "axis_angle": "test_rotations.py::test_axis_and_angle_follow_the_lab",
+    "brownian_alpha2": "test_gaussianity.py::test_moments_are_those_of_the_simulated_angles",
+    "cluster_mobility": "test_mobility.py::test_units",
+    "compare_conditions": "test_study_statistics.py::test_a_comparison_is_the_same_from_both_sides",
+    "cramer_rao": "test_bounds.py::test_the_bound_is_the_inverse_of_a_dense_fisher_matrix",
+    "decoupling_ratio": "test_decoupling.py",
+    "diffusion_correlation": "test_decoupling.py",
+    "fit_pose": "test_locate.py",
+    "fit_power_law": "test_study_statistics.py::test_the_exponent_of_decoupling_comes_back",
+    "fit_trend": "test_study_statistics.py::test_a_planted_law_lies_in_the_intervals",
+    "gravitational_height": "test_surroundings.py::test_gravity",
+    "identify": "test_linking.py",
+    "kabsch": "test_rotations.py::test_kabsch_follows_turns_shifts_permutations_and_units",
+    "leave_one_out": "test_study_statistics.py::test_a_planted_outlier_is_named_and_others_are_not",
+    "load_run": "test_results.py",
+    "locate": "test_locate.py::test_the_fit_follows_shifts_mirrors_units_and_negatives",
+    "measure_point_spread": "test_point_spread.py",
+    "napari_layers": "test_napari.py::test_points_lie_at_fixed_places_of_the_drawn_axes",
+    "open_stack": "test_stacks.py::test_written_stack_reads_back_exactly",
+    "plan_sampling": "test_sampling.py::test_units_rescale_the_plan",
+    "plan_study": "test_study_statistics.py::test_plans_reach_the_wanted_error",
+    "population_mean": "test_study_statistics.py::test_the_mean_follows_units_and_order",
+    "read_tracks": "test_files.py::test_a_table_reads_back_bit_identical",
+    "render_stack": "test_render.py::test_spheres_add_and_turn_with_their_body",
+    "settling_velocity": "test_surroundings.py::test_a_stokes_sphere_settles",
+    "similarity": "test_rotations.py::test_similarity_follows_the_axes_and_units_of_both_sets",
+    "simulate_motion": "test_simulate.py::test_tensors_are_in_body_axes",
+    "size_and_viscosity": "test_hydrodynamics.py::test_planted_sizes_come_back",
+    "size_from_rotation": "test_hydrodynamics.py::test_planted_sizes_come_back",
+    "size_from_translation": "test_hydrodynamics.py::test_planted_sizes_come_back",
+    "wall_diffusion": "test_surroundings.py::test_the_signature_of_a_wall",
+    "wall_factor": "test_surroundings.py::test_the_walls_effect_fades",
+    "water_viscosity": "test_surroundings.py::test_water",
+    "write_run": "test_results.py",
+    "write_stack": "test_stacks.py::test_written_stack_reads_back_exactly",
+    "write_tracks": "test_files.py::test_csv_keeps_every_bit_of_any_float",
+}
+
+
+def test_every_public_function_has_laws():
+    """It is in the tables above, or named with a test that exists and calls it."""
+    functions = {n for n in perrin.__all__ if inspect.isfunction(getattr(perrin, n))}
+    assert {*OF_MOTION, *OF_POSITIONS, *ELSEWHERE} == functions
+    for name, place in ELSEWHERE.items():
+        file, _, test = place.partition("::")
+        text = (HERE / file).read_text(encoding="utf-8")
+        assert f"def {test}(" in text or not test, place
+        assert name in text, place

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-# Every operator with those that replace it. The left shift of another module's meaning, or the
-# product of matrices by a quotient, would only fail to run.
+# Every operator with those that replace it; others would mostly fail to run.
 _BINARY = {
     ast.Add: (ast.Sub, ast.Mult),
     ast.Sub: (ast.Add, ast.Mult),
@@ -55,37 +54,50 @@ class Change:
         return f"{self.where}, line {self.line}: {self.before}  ->  {self.after}"
 
 
+def _replaced_operators(node: ast.Compare) -> list[ast.AST]:
+    """Return a comparison with one of its operators replaced."""
+    return [
+        _with(node, ops=[*node.ops[:k], other(), *node.ops[k + 1 :]])
+        for k, op in enumerate(node.ops)
+        for other in _COMPARISONS[type(op)]
+    ]
+
+
+def _other_constants(node: ast.Constant) -> list[ast.AST]:
+    """Return the other truth value, or the number more and less by 1."""
+    if isinstance(node.value, bool):
+        return [ast.Constant(not node.value)]
+    if isinstance(node.value, int | float):
+        return [ast.Constant(node.value + 1), ast.Constant(node.value - 1)]
+    return []
+
+
+def _negated(node: ast.If | ast.While | ast.IfExp) -> list[ast.AST]:
+    """Return a branch or a loop with the opposite condition."""
+    return [_with(node, test=ast.UnaryOp(ast.Not(), node.test))]
+
+
+_VARIANTS = {
+    ast.BinOp: lambda node: [_with(node, op=op()) for op in _BINARY.get(type(node.op), ())],
+    ast.AugAssign: lambda node: [_with(node, op=op()) for op in _BINARY[type(node.op)][:1]],
+    ast.Compare: _replaced_operators,
+    ast.BoolOp: lambda node: [
+        _with(node, op=ast.Or() if isinstance(node.op, ast.And) else ast.And())
+    ],
+    ast.UnaryOp: lambda node: [node.operand],
+    ast.If: _negated,
+    ast.While: _negated,
+    ast.IfExp: _negated,
+    ast.For: lambda node: [_with(node, iter=ast.List([], ast.Load()))],
+    ast.Break: lambda node: [ast.Continue()],
+    ast.Continue: lambda node: [ast.Break()],
+    ast.Constant: _other_constants,
+}
+
+
 def _variants(node: ast.AST) -> list[ast.AST]:
     """Return what may stand in place of a node."""
-    if isinstance(node, ast.BinOp):
-        return [_with(node, op=op()) for op in _BINARY.get(type(node.op), ())]
-    if isinstance(node, ast.AugAssign):
-        return [_with(node, op=op()) for op in _BINARY.get(type(node.op), ())[:1]]
-    if isinstance(node, ast.Compare):
-        return [
-            _with(node, ops=[*node.ops[:k], other(), *node.ops[k + 1 :]])
-            for k, op in enumerate(node.ops)
-            for other in _COMPARISONS[type(op)]
-        ]
-    if isinstance(node, ast.BoolOp):
-        other = ast.Or() if isinstance(node.op, ast.And) else ast.And()
-        return [_with(node, op=other)]
-    if isinstance(node, ast.UnaryOp):
-        return [node.operand]
-    if isinstance(node, ast.If | ast.While | ast.IfExp):
-        return [_with(node, test=ast.UnaryOp(ast.Not(), node.test))]
-    if isinstance(node, ast.For):
-        return [_with(node, iter=ast.List([], ast.Load()))]
-    if isinstance(node, ast.Break):
-        return [ast.Continue()]
-    if isinstance(node, ast.Continue):
-        return [ast.Break()]
-    if isinstance(node, ast.Constant):
-        if isinstance(node.value, bool):
-            return [ast.Constant(not node.value)]
-        if isinstance(node.value, int | float):
-            return [ast.Constant(node.value + 1), ast.Constant(node.value - 1)]
-    return []
+    return _VARIANTS[type(node)](node) if type(node) in _VARIANTS else []
 
 
 def _with(node: ast.AST, **fields: object) -> ast.AST:
@@ -119,6 +131,7 @@ def _places(tree: ast.Module) -> Iterator[tuple[ast.AST, str, int | None, str]]:
 
 
 def _at(parent: ast.AST, field: str, index: int | None) -> ast.AST:
+    """Return what is at a place."""
     value = getattr(parent, field)
     return value if index is None else value[index]
 

@@ -1,11 +1,12 @@
 """Change the source in small ways and count the changes that no test notices.
 
-``python tests/mutants/run.py --only steps --count 100`` takes a random choice, with a fixed seed, of
-the changes in changes.py, runs the tests of targets.toml on each in a process of its own until one
-fails, and lists the changes with which all of them pass. A change whose tests take three times
-as long as without it counts as noticed.
+``python tests/mutants/run.py --only steps --count 100`` takes a random choice, with a fixed seed,
+of the changes in changes.py, runs the tests of targets.toml on each in a process of its own until
+one fails, and lists the changes with which all of them pass. A change whose tests take three times
+as long as without it counts as noticed. The program is not started anew for every change, as by
+cosmic-ray, which takes most of the time.
 
-The status is 1 where a module has 10 % or more such survivors.
+The status is 1 where a target has 10 % or more such survivors.
 """
 
 from __future__ import annotations
