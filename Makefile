@@ -44,8 +44,10 @@ demo: .venv/.demo  ## the main job on an embedded table, into perrin-demo/
 test: .venv/.test  ## the whole suite, on all cores
 	PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(RUN) pytest -q -n auto --dist loadfile
 
-coverage: .venv/.test  ## the suite with its coverage: lines at least 95 %, branches 90 %
+coverage: .venv/.test  ## coverage by the suite and the paper: lines at least 95 %, branches 90 %
 	OMP_NUM_THREADS=1 $(RUN) pytest -q -n 2 --dist loadfile --cov --cov-report=
+	OMP_NUM_THREADS=1 $(RUN) coverage run benchmarks/paper.py
+	$(RUN) coverage combine --quiet --append
 	$(RUN) coverage report --skip-covered
 	$(RUN) coverage json -q -o - | $(BIN)/python tests/coverage_limits.py
 
