@@ -20,12 +20,13 @@ Usage: python benchmarks/microscopes.py [--only NAME] [--movies 1] [--seed 0] [-
 """
 
 import argparse
+import io
 import time
 import warnings
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.ndimage import map_coordinates, spline_filter
+from scipy.ndimage import gaussian_filter, map_coordinates, spline_filter
 from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
 
@@ -52,7 +53,15 @@ class Microscope:
     gain: float = 3.0
     read_noise: float = 1.0  # grey levels
     pixel_spread: float = 0.0  # of the gain from pixel to pixel (sCMOS)
+    pixel_offset: float = 0.0  # standard deviation of the offset from pixel to pixel, grey levels
+    pixel_noise: float = 0.0  # standard deviation of the logarithm of the read noise of a pixel
+    offset: float = 0.0  # added before the range of the camera clips, grey levels
     bits: int = 8
+    line_flicker: float = 0.0  # of the light, from row to row of the scan
+    plane_flicker: float = 0.0  # of the light, from plane to plane
+    curved: float = 0.0  # bright background, photons at its middle; a third of the field wide
+    smooth: float = 0.0  # of the grey levels before they are saved, standard deviation, voxels
+    jpeg: int = 0  # quality with which every plane is compressed; 0 for none
     bleached: float = 0.0  # share of the light lost at the last frame
     depth_loss: float = 0.0  # share of the light lost at the last plane
     plane_time: float = 0.0
@@ -162,7 +171,7 @@ def focal_field(rho, z, *, wave, aperture=1.3, index=1.4):
 def blurred_ball(light, *, grid=0.05, half=(3.4, 2.3), diameter=DIAMETER):
     """Return spline coefficients of the image of one ball on a fine grid, and its spacing, um.
 
-    The image is scaled to 1 at its middle.
+    The image is scaled to 1 at its middle, that of a shell at its brightest place.
     """
     n = [2 * round(half[0] / grid), 2 * round(half[1] / grid), 2 * round(half[1] / grid)]
     k = [2 * np.pi * np.fft.fftfreq(m, grid) for m in n]
@@ -180,7 +189,8 @@ def blurred_ball(light, *, grid=0.05, half=(3.4, 2.3), diameter=DIAMETER):
         psf = np.stack([np.interp(r, fine, line) for line in point])
         otf = np.fft.fftn(np.fft.ifftshift(psf))
     image = np.fft.fftshift(np.fft.ifftn(ball * otf).real)
-    return spline_filter(image / image[tuple(m // 2 for m in n)], order=3), grid
+    brightest = image.max() if light.shell else image[tuple(m // 2 for m in n)]
+    return spline_filter(image / brightest, order=3), grid
 
 
 def exposed(bodies, light, *, frame, table, dust=(), tables=None):
@@ -232,7 +242,7 @@ def recorded(bodies, light, *, n_frames, rng, dust=(), radius_spread=0.0):
         n = sum(len(b.bright) for b in bodies)
         sizes = DIAMETER * (1 + radius_spread * rng.normal(size=n))
         tables = [blurred_ball(light, diameter=size) for size in sizes]
-    gain = light.gain * (1 + light.pixel_spread * rng.normal(size=light.shape[1:]))
+    camera = Camera(light, rng)
     depth = 1 - light.depth_loss * np.arange(light.shape[0]) / max(light.shape[0] - 1, 1)
     movie = np.empty((n_frames, *light.shape), dtype="uint8" if light.bits == 8 else "uint16")
     for i in range(n_frames):
@@ -243,9 +253,49 @@ def recorded(bodies, light, *, n_frames, rng, dust=(), radius_spread=0.0):
             * exposed(bodies, light, frame=i, table=table, dust=dust, tables=tables)
         )
         mean = mean * depth[:, None, None] + light.background
-        grey = gain * rng.poisson(mean) + rng.normal(0, light.read_noise, light.shape)
-        movie[i] = np.clip(np.round(grey), 0, 2**light.bits - 1)
+        movie[i] = camera.grey_levels(mean)
     return movie
+
+
+class Camera:
+    """The detector, with a pattern of its own, and what is done to an image before it is saved."""
+
+    def __init__(self, light, rng):
+        self.light, self.rng = light, rng
+        size = light.shape[1:]
+        self.gain = light.gain * (1 + light.pixel_spread * rng.normal(size=size))
+        self.offset, self.noise = light.offset, light.read_noise
+        # Cases without these keep their random numbers.
+        if light.pixel_offset:
+            self.offset = self.offset + light.pixel_offset * rng.normal(size=size)
+        if light.pixel_noise:
+            self.noise = self.noise * np.exp(light.pixel_noise * rng.normal(size=size))
+
+    def grey_levels(self, mean):
+        """Return a frame (z, y, x) as it is saved."""
+        light, rng = self.light, self.rng
+        if light.curved:
+            place = np.stack(np.meshgrid(*(np.linspace(-1, 1, n) for n in light.shape[1:])))
+            mean = mean + light.curved * np.exp(-0.5 * np.sum(place**2, axis=0) / (2 / 3) ** 2)
+        if light.line_flicker:
+            mean = mean * (1 + light.line_flicker * rng.normal(size=(*light.shape[:2], 1)))
+        if light.plane_flicker:
+            mean = mean * (1 + light.plane_flicker * rng.normal(size=(light.shape[0], 1, 1)))
+        photons = rng.poisson(np.maximum(mean, 0))
+        grey = self.gain * photons + rng.normal(0, 1, light.shape) * self.noise + self.offset
+        if light.smooth:
+            grey = gaussian_filter(grey, light.smooth)
+        grey = np.clip(np.round(grey), 0, 2**light.bits - 1)
+        return np.stack([compressed(plane, light.jpeg) for plane in grey]) if light.jpeg else grey
+
+
+def compressed(plane, quality):
+    """Return a plane of 8 bits as a JPEG file holds it."""
+    from PIL import Image
+
+    file = io.BytesIO()
+    Image.fromarray(plane.astype("uint8")).save(file, "JPEG", quality=quality)
+    return np.asarray(Image.open(file), dtype=float)
 
 
 def ring_movie(*, n_frames, rng, rim=0.75):
@@ -308,6 +358,8 @@ def monomers(share, light):
 
 
 BASE = Microscope()
+# A camera chip whose pixels differ in read noise.
+SCMOS = {"offset": 30.0, "read_noise": 2.0, "pixel_noise": 0.5, "bits": 16}
 CASES = {
     "base": Case(),
     "planes 18 ms": Case(light=replace(BASE, plane_time=0.018)),
@@ -333,6 +385,21 @@ CASES = {
     "shells": Case(light=replace(BASE, shell=True)),
     "two colours": Case((4, 4, 4, 3, 3), shift=(0.12, -0.09, 0.2)),
     "5 photons": Case(light=replace(BASE, photons=5)),
+    "sCMOS mild": Case(light=replace(BASE, **SCMOS, pixel_spread=0.03, pixel_offset=2.0)),
+    "sCMOS strong": Case(light=replace(BASE, **SCMOS, pixel_spread=0.1, pixel_offset=8.0)),
+    "sCMOS strong, 10 photons": Case(
+        light=replace(BASE, **SCMOS, pixel_spread=0.1, pixel_offset=8.0, photons=10)
+    ),
+    "saturation of 2 %": Case(light=replace(BASE, photons=78.0)),
+    "clipped at zero": Case(light=replace(BASE, offset=-12.0)),
+    "JPEG 75": Case(light=replace(BASE, jpeg=75)),
+    "JPEG 20": Case(light=replace(BASE, jpeg=20)),
+    "smoothing": Case(light=replace(BASE, smooth=0.8)),
+    "line flicker 10 %": Case(light=replace(BASE, line_flicker=0.1)),
+    "line flicker 30 %": Case(light=replace(BASE, line_flicker=0.3)),
+    "plane flicker 5 %": Case(light=replace(BASE, plane_flicker=0.05)),
+    "plane flicker 20 %": Case(light=replace(BASE, plane_flicker=0.2)),
+    "curved background": Case(light=replace(BASE, curved=20.0)),
     "realistic": Case(
         light=replace(
             BASE, psf="confocal", bleached=0.28, plane_time=0.008, pixel_spread=0.03,
@@ -570,6 +637,10 @@ def print_case(report, bodies, case, *, seconds):
     row |= {"clusters found": len(pairs) / len(rigid), "false clusters": len(others)}
     print(f"  clusters: {len(pairs)} of {len(rigid)} found (sizes {sizes}),", end=" ")
     print(f"{len(others)} false, {len(report.rods)} rods")
+    apart = distance_of_touching(report, case)
+    if np.isfinite(apart):
+        row["distances (%)"] = apart
+        print(f"  distances of touching spheres {apart:+.2f} %")
     turns = [
         turn_errors(result, rigid[c], case)
         for c, result in pairs.items()
@@ -594,6 +665,18 @@ def print_case(report, bodies, case, *, seconds):
                 print(f"  {kind.name} ({len(kind.clusters)}):", end=" ")
                 print(compared_values(dict(kind.coefficients), dict(other.coefficients))[0])
     return row
+
+
+def distance_of_touching(report, case):
+    """Return how much longer the distances of touching spheres are than planted, in percent."""
+    table, away = report.imaging.features, []
+    if "refined" in table:
+        table = table[table["refined"]]
+    for _, part in table[table["cluster"] >= 0].groupby(["frame", "cluster"]):
+        x = cdist(*[part[["x", "y", "z"]].to_numpy()] * 2)[np.triu_indices(len(part), 1)]
+        away.append(x[x < 1.2 * DIAMETER])
+    away = np.concatenate(away) if away and not case.shift else np.empty(0)
+    return 100 * (away.mean() / DIAMETER - 1) if away.size else np.nan
 
 
 def print_singles(report, singles, case):

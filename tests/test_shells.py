@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import perrin
-from perrin.images import fit_samples, sphere_image
+from perrin.images import CameraNoise, fit_samples, sphere_image
 from perrin.images.optics.ball_image import BallBlur
 from perrin.images.optics.learn import GroupSample
 
@@ -59,3 +59,34 @@ def test_the_movie_shows_whether_spheres_are_shells(shell):
         assert abs(value - true) < 4 * error + 0.003
     assert found.noise.gain == pytest.approx(GAIN, rel=0.1)
     assert perrin.Optics.from_dict(found.to_dict()) == found
+
+
+class Tetrahedron:
+    """Two frames of a tetrahedron of touching shells, whose contacts are its brightest places."""
+
+    shape, voxel = (2, 30, 36, 36), VOXEL
+
+    def __init__(self):
+        self.centers = np.array([4.0, 3.6, 3.4]) + perrin.Cluster.touching(4, DIAMETER).positions
+        self.image = sphere_image(diameter=DIAMETER, psf=PSF, voxel=VOXEL, shell=True)
+
+    def frame(self, i):
+        mean = np.full(self.shape[1:], 3.0)
+        for center in self.centers:
+            spot = self.image.spot(center, mean.shape)
+            mean[spot.box] += 60 * spot.value / self.image.spot(center, mean.shape).value.max()
+        return (GAIN * np.random.default_rng(i).poisson(mean)).astype(np.uint16)
+
+
+def test_touching_shells_are_found_at_their_centres(repeats):
+    """All of them and no contact, within four stated errors; with --long the optics are learned."""
+    movie, known = Tetrahedron(), perrin.Optics(DIAMETER, PSF, CameraNoise(GAIN, 1.0), shell=True)
+    optics = repeats(known, None)
+    table = perrin.locate(movie, diameter=DIAMETER, contact=DIAMETER, optics=optics)
+    for _, part in table.groupby("frame"):
+        assert len(part) == 4
+        x, sigma = (part[[f"{s}{a}" for a in "zyx"]].to_numpy() for s in ("", "sigma_"))
+        rows = np.linalg.norm(x[:, None] - movie.centers, axis=2).argmin(axis=1)
+        assert sorted(rows.tolist()) == [0, 1, 2, 3]
+        assert np.abs((x - movie.centers[rows]) / sigma).max() < 4
+        assert sigma.max() < 0.02

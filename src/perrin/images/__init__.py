@@ -175,6 +175,7 @@ from perrin.images.spheres.planar import (
     plane_columns,
 )
 from perrin.images.spheres.poses import Pose, fit_pose, pose_in, start_of, with_poses
+from perrin.images.spheres.shells import find_shells
 from perrin.images.spheres.spots import (
     Fading,
     Spots,
@@ -276,6 +277,7 @@ __all__ = [
     "find_circles",
     "find_fading",
     "find_features",
+    "find_shells",
     "first_image",
     "fit_brightness",
     "fit_crowd",

@@ -380,7 +380,20 @@ def file_contents(source: str, pick: Pick, several: tuple[int, ...] | None = Non
             for part in parts:
                 part.close()
             raise
-    contents = _read_alone(source, pick)
+    found = vendor(source)
+    if found is not None:
+        apart = found.apart and os.environ.get(SWITCH) != "off"
+        try:
+            contents = (guarded if apart else found.read)(source, pick)
+        except ValueError as fault:
+            # A library's own error keeps its class, so that the caller adds what to do.
+            if type(fault) is not ValueError:
+                raise
+            raise ValueError(f"{found.name}: {fault}") from fault
+    elif Path(source).is_dir() or (not Path(source).exists() and sequence_files(source)):
+        contents = sequence(source, pick)
+    else:
+        contents = tiff(source, pick)
     try:
         refuse_oversize(source, contents.shape[1:], contents.dtype.itemsize, what="a frame")
         refuse_oversize(source, contents.shape[:1], 8, what="a series of frames")
@@ -388,23 +401,6 @@ def file_contents(source: str, pick: Pick, several: tuple[int, ...] | None = Non
         contents.close()
         raise
     return contents
-
-
-def _read_alone(source: str, pick: Pick) -> Contents:
-    """Return the contents of a file or folder of one channel, by the reader of its format."""
-    found = vendor(source)
-    if found is not None:
-        apart = found.apart and os.environ.get(SWITCH) != "off"
-        try:
-            return (guarded if apart else found.read)(source, pick)
-        except ValueError as fault:
-            # A library's own error keeps its class, so that the caller adds what to do.
-            if type(fault) is not ValueError:
-                raise
-            raise ValueError(f"{found.name}: {fault}") from fault
-    if Path(source).is_dir() or (not Path(source).exists() and sequence_files(source)):
-        return sequence(source, pick)
-    return tiff(source, pick)
 
 
 def file_states(stack: Stack) -> list[tuple[str, int, int]]:

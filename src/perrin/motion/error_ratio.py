@@ -140,34 +140,27 @@ def error_ratio(bodies: Iterable[tuple[RigidMotion, Floats, Floats]]) -> ErrorRa
     off = measured - 1
     held = np.divide(stderr, off, out=np.full(len(off), np.inf), where=off != 0)
     value = 1 + np.maximum(1 - held**2, 0.0) * np.maximum(off, 0.0)
-    by_time, by_depth = _trends(square, mix @ measured, time, depth)
+    # Changes of the logarithm of the squares with time and depth, 0 where insignificant: scoring
+    # for gamma-distributed squares with a logarithmic link.
+    relative = square.sum(axis=1) / (mix @ measured).sum(axis=1)
+    terms = np.stack([np.ones(len(time)), time - time.mean(), depth - depth.mean()], axis=1)
+    used = [0] + [k for k in (1, 2) if np.ptp(terms[:, k]) > 0]
+    trend, rows = np.zeros(3), terms[:, used]
+    if len(time) >= 10 * len(used) and relative.mean() > 0:
+        rate = np.zeros(len(used))
+        rate[0] = np.log(relative.mean())
+        for _ in range(20):
+            error = relative / np.exp(rows @ rate) - 1
+            step = np.linalg.lstsq(rows, error, rcond=None)[0]
+            rate = rate + np.clip(step, -1.0, 1.0)
+            if np.abs(step).max() < 1e-9:
+                break
+        rate_error = np.sqrt(np.diag(np.linalg.inv(rows.T @ rows)) * np.mean(error**2))
+        trend[used] = np.where(np.abs(rate) > _TREND_ERRORS * rate_error, rate, 0.0)
+    by_time, by_depth = trend[1:].tolist()
     return ErrorRatio(
         value, measured, stderr, by_time, by_depth, float(time.mean()), float(depth.mean())
     )
-
-
-def _trends(square: Floats, expected: Floats, time: Floats, depth: Floats) -> tuple[float, float]:
-    """Return changes of the logarithm of the squares with time and depth, 0 where insignificant."""
-    relative = square.sum(axis=1) / expected.sum(axis=1)
-    terms = np.stack([np.ones(len(time)), time - time.mean(), depth - depth.mean()], axis=1)
-    used = [0] + [k for k in (1, 2) if np.ptp(terms[:, k]) > 0]
-    found = np.zeros(3)
-    if len(time) < 10 * len(used) or not relative.mean() > 0:
-        return 0.0, 0.0
-    # Scoring for gamma-distributed squares with a logarithmic link.
-    rate = np.zeros(len(used))
-    rate[0] = np.log(relative.mean())
-    rows = terms[:, used]
-    for _ in range(20):
-        error = relative / np.exp(rows @ rate) - 1
-        step = np.linalg.lstsq(rows, error, rcond=None)[0]
-        rate = rate + np.clip(step, -1.0, 1.0)
-        if np.abs(step).max() < 1e-9:
-            break
-    inverse = np.linalg.inv(rows.T @ rows)
-    stderr = np.sqrt(np.diag(inverse) * np.mean(error**2))
-    found[used] = np.where(np.abs(rate) > _TREND_ERRORS * stderr, rate, 0.0)
-    return float(found[1]), float(found[2])
 
 
 def with_error_ratio(motion: RigidMotion, ratio: Floats, stated: Floats) -> RigidMotion:

@@ -226,36 +226,30 @@ def sample_residuals(motions: Sequence[RigidMotion], positions: Floats) -> Resid
         here = complete.reshape(index.shape)
         return np.where(here, np.take_along_axis(x, index, axis=1), 0.0)
 
-    template = np.stack([m.template for m in motions])
-    return Residuals(
-        rotation=sampled(np.stack([m.rotation for m in motions])),
-        vector=sampled(vector),
-        velocity=sampled(_center_velocity(motions)),
-        count=count,
-        template=template,
-        keeps=fit_projector(template),
-    )
-
-
-def _center_velocity(motions: Sequence[RigidMotion]) -> Floats:
-    """Return the velocity of the centre between the poses before and after, about its mean.
-
-    It is 0 at the first and at the last pose, and at jumps, (B, T, d).
-    """
+    # The velocity of the centre between the poses before and after, about its mean; 0 at the first
+    # and at the last pose, and at jumps.
     center, time = np.stack([m.center for m in motions]), np.stack([m.time for m in motions])
     velocity = np.zeros_like(center)
     poses = np.array([m.fitted.size for m in motions])
     for size in np.unique(poses[poses >= 3]).tolist():
         bodies = np.flatnonzero(poses == size)
-        rows = np.stack([motions[k].fitted for k in bodies.tolist()])
-        x, t = center[bodies[:, None], rows], time[bodies[:, None], rows]
+        fitted = np.stack([motions[k].fitted for k in bodies.tolist()])
+        x, t = center[bodies[:, None], fitted], time[bodies[:, None], fitted]
         v = (x[:, 2:] - x[:, :-2]) / (t[:, 2:] - t[:, :-2])[..., None]
         v = v - np.median(v, axis=1, keepdims=True)
         speed = np.sqrt((v * v).sum(axis=2))
         usual = (speed <= _JUMP_SPEED * np.median(speed, axis=1, keepdims=True))[..., None]
         mean = np.where(usual, v, 0.0).sum(axis=1, keepdims=True) / usual.sum(axis=1)[:, None]
-        velocity[bodies[:, None], rows[:, 1:-1]] = np.where(usual, v - mean, 0.0)
-    return velocity
+        velocity[bodies[:, None], fitted[:, 1:-1]] = np.where(usual, v - mean, 0.0)
+    template = np.stack([m.template for m in motions])
+    return Residuals(
+        rotation=sampled(np.stack([m.rotation for m in motions])),
+        vector=sampled(vector),
+        velocity=sampled(velocity),
+        count=count,
+        template=template,
+        keeps=fit_projector(template),
+    )
 
 
 def median_present(values: Floats) -> Floats:

@@ -391,18 +391,11 @@ def _judge_alike(
     judged = []
     for k, (motion, body) in enumerate(zip(motions, bodies, strict=True)):
         misfit_rows = np.flatnonzero(misfit[k].any(axis=1))
-        drift = drifts[k]
         soft = [
             *_residual_test(body, float(usual[k]), smooth.of_body(k), stated_sigma),
             *flexing[k],
-            *_misfit_test(misfit[k], body.fitted.size),
+            *_shape_tests(misfit[k], body.fitted.size, drifts[k]),
         ]
-        if drift.change > _LARGEST_DRIFT:
-            soft.append(
-                f"not rigid: the distance of particles {drift.pair[0]} and {drift.pair[1]} "
-                f"(counted from 0) changes in time between {drift.distances[0]:.3g} and "
-                f"{drift.distances[1]:.3g} um; a bond breaks, or a label moves to another particle"
-            )
         warnings, notes = imaging[k]
         if misfit_rows.size and not soft:
             notes.insert(
@@ -421,8 +414,8 @@ def _judge_alike(
                 residual_over_R=motion.sigma / motion.R,
                 residual_over_sigma=over,
                 autocorrelation=finite_or_none(smooth.value[k]),
-                bond_drift=drift.change,
-                drifting_pair=drift.pair,
+                bond_drift=drifts[k].change,
+                drifting_pair=drifts[k].pair,
                 sigma_xyz=None if error is None else tuple(error.tolist()),
                 z_scale=finite_or_none(scale.value[k]),
                 z_scale_stderr=finite_or_none(scale.stderr[k]),
@@ -567,25 +560,32 @@ def misplaced_detections(residuals: Floats, radius: Floats) -> Bools:
     return np.asarray(seen & (distance > limit[:, None, None]))
 
 
-def _misfit_test(misfit: Bools, count: int) -> list[str]:
-    """Test the number of frames with a misplaced detection (binomial test)."""
+def _shape_tests(misfit: Bools, count: int, drift: BondDrift) -> list[str]:
+    """Test the frames with a misplaced detection (binomial test), and the drift of distances."""
     from scipy.special import bdtrc
 
+    texts = []
     each, total = misfit.sum(axis=0), int(misfit.any(axis=1).sum())
     worst = int(each.argmax())
+    chance = SIGNIFICANCE / len(each)
     if total and bdtrc(total - 1, count, _MISPLACED_FRAMES) <= SIGNIFICANCE:
-        return [
+        texts.append(
             f"not rigid: in {total} of {count} frames a particle is not at its place in the common "
             f"shape (at most {_MISPLACED_FRAMES:.0%} are taken for bad frames)"
-        ]
-    chance = SIGNIFICANCE / len(each)
-    if total and bdtrc(each[worst] - 1, count, _MISPLACED_PARTICLE) <= chance:
-        return [
+        )
+    elif total and bdtrc(each[worst] - 1, count, _MISPLACED_PARTICLE) <= chance:
+        texts.append(
             f"not rigid: particle {worst} (counted from 0) is not at its place in the common shape "
             f"in {each[worst]} of {count} frames (at most {_MISPLACED_PARTICLE:.0%} are taken for "
             "bad detections)"
-        ]
-    return []
+        )
+    if drift.change > _LARGEST_DRIFT:
+        texts.append(
+            f"not rigid: the distance of particles {drift.pair[0]} and {drift.pair[1]} (counted "
+            f"from 0) changes in time between {drift.distances[0]:.3g} and "
+            f"{drift.distances[1]:.3g} um; a bond breaks, or a label moves to another particle"
+        )
+    return texts
 
 
 def _flexing_tests(motions: Sequence[RigidMotion], residuals: Floats) -> list[list[str]]:

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from perrin._arrays import (
-    Bools,
     Floats,
     Ints,
     as_positions,
@@ -267,7 +266,27 @@ def track_direction(
         raise TooFewFramesError(
             f"{rows.size} frames contain two particles: 2 are needed", rows.size
         )
-    places, direction = _common_axis(x[rows], seen[rows])
+    points, here = x[rows], seen[rows]
+    fullest = points[np.argmax(here.sum(axis=1))]
+    middle = np.nanmean(fullest, axis=0)
+    places = (fullest - middle) @ np.linalg.svd(np.nan_to_num(fullest - middle))[2][0]
+    for _ in range(20):
+        known = np.where(here, places, np.nan)
+        mean = np.nanmean(known, axis=1, keepdims=True)
+        offset = points - np.nanmean(
+            np.where(np.isfinite(known)[..., None], points, np.nan), 1, keepdims=True
+        )
+        direction = np.nansum((known - mean)[..., None] * offset, axis=1)
+        length = np.linalg.norm(direction, axis=1, keepdims=True)
+        if not (length > 0).all():
+            raise DegenerateClusterError("the particles are in one place: they have no direction")
+        direction = direction / length
+        along = np.einsum("tni,ti->tn", offset, direction)
+        new = np.nanmean(np.where(here, along + mean, np.nan), axis=0)
+        new = new - np.mean(new)
+        change, places = np.nanmax(np.abs(new - places)), new
+        if change <= 1e-13 * np.ptp(new):
+            break
     sign, row_piece, swaps = _end_labels(direction, places, time[rows], labelled=labelled)
     direction = direction * sign[:, None]
     along = np.where(seen[rows], places * sign[:, None], np.nan)
@@ -312,33 +331,6 @@ def track_direction(
         sigma=measured,
         dt=float(dt),
     )
-
-
-def _common_axis(x: Floats, seen: Bools) -> tuple[Floats, Floats]:
-    """Return the positions along the common axis, and its direction in every frame."""
-    fullest = x[np.argmax(seen.sum(axis=1))]
-    middle = np.nanmean(fullest, axis=0)
-    axis = np.linalg.svd(np.nan_to_num(fullest - middle))[2][0]
-    places = (fullest - middle) @ axis
-    for _ in range(20):
-        known = np.where(seen, places, np.nan)
-        arm = known - np.nanmean(known, axis=1, keepdims=True)
-        offset = x - np.nanmean(
-            np.where(np.isfinite(known)[..., None], x, np.nan), 1, keepdims=True
-        )
-        direction = np.nansum(arm[..., None] * offset, axis=1)
-        length = np.linalg.norm(direction, axis=1, keepdims=True)
-        if not (length > 0).all():
-            raise DegenerateClusterError("the particles are in one place: they have no direction")
-        direction = direction / length
-        along = np.einsum("tni,ti->tn", offset, direction)
-        shift = np.nanmean(known, axis=1, keepdims=True)
-        new = np.nanmean(np.where(seen, along + shift, np.nan), axis=0)
-        new = new - np.mean(new)
-        change, places = np.nanmax(np.abs(new - places)), new
-        if change <= 1e-13 * np.ptp(new):
-            break
-    return places, direction
 
 
 def _end_labels(

@@ -150,9 +150,20 @@ def fit_scanned(
     rounding = (_ROUNDING * np.abs(fit.template).max()) ** 2
     variance = np.full(d, max(fit.sigma2, rounding)) if sigma is None else sigma**2
     instant = x.copy()
+    inside = piece[rows[1:]] == piece[rows[:-1]]
+    linked, duration = inside[1:] & inside[:-1], np.diff(time[rows]) @ inside
+    share = inside.sum() / max(int(linked.sum()), 1)
     for _ in range(_SCAN_ROUNDS):
-        D_R, D_T = _step_moments(rotation, center, time[rows], piece[rows])
-        Q = np.diag([2 * D_R] * angles + [2 * D_T] * d)
+        # D_R and D_T of the covariance estimator of the steps, from all axes together.
+        turn = log_map(np.swapaxes(rotation[:-1], 1, 2) @ rotation[1:])
+        D = []
+        for steps in (turn.reshape(len(turn), -1), np.diff(center, axis=0)):
+            square = np.sum(steps[inside] ** 2)
+            # The last step has no next one: the noise of both is that of all steps.
+            product = share * np.sum((steps[:-1] * steps[1:])[linked])
+            whole = 2 * duration * steps.shape[1]
+            D.append(max(square + 2 * product, _LEAST_SHARE * square) / whole)
+        Q = np.diag([2 * D[0]] * angles + [2 * D[1]] * d)
         arm = np.einsum("tij,nj->tni", rotation, template)
         slope = pose_slopes(arm) * here[..., None, None]
         moved = np.einsum("tmda,ab,tneb,tmdne->tmdne", slope, Q, slope, shared)
@@ -238,25 +249,6 @@ def _averaged_brownian(t: Floats, d: int, *, crossing: float) -> tuple[Floats, F
             apart = np.abs(first[:, :, None, :, None] - second[:, None, :, None, :]) @ v @ w
             covariance[:, :, a, :, b] = away[:, :, None, a] + away[:, None, :, b] - apart
     return 0.5 * covariance, away
-
-
-def _step_moments(
-    rotation: Floats, center: Floats, time: Floats, piece: Ints
-) -> tuple[float, float]:
-    """Return D_R and D_T of the covariance estimator of the steps, from all axes together."""
-    turn = log_map(np.swapaxes(rotation[:-1], 1, 2) @ rotation[1:])
-    inside = piece[1:] == piece[:-1]
-    duration = np.diff(time) @ inside
-    found = []
-    for steps in (turn.reshape(len(turn), -1), np.diff(center, axis=0)):
-        linked = inside[1:] & inside[:-1]
-        square = np.sum(steps[inside] ** 2)
-        # The last step has no next one: the noise of both is that of all steps.
-        share = inside.sum() / max(int(linked.sum()), 1)
-        product = share * np.sum((steps[:-1] * steps[1:])[linked])
-        whole = 2 * duration * steps.shape[1]
-        found.append(max(square + 2 * product, _LEAST_SHARE * square) / whole)
-    return found[0], found[1]
 
 
 def _generalised_inverses(

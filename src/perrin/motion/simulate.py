@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from perrin._arrays import (
-    Bools,
     Floats,
     as_positions,
     as_sigma,
@@ -288,10 +287,23 @@ def _planted_walk(
     """Return count + 1 centres and orientations; D and D_T are the coefficients times dt."""
     match dynamics:
         case Fractional():
-            return _fractional_walk(dynamics.alpha, D, D_T, d, count, generator)
+            if not _isotropic(D):
+                raise ValueError(
+                    "D_R: Fractional has its memory in the lab frame and needs one D_R, not a "
+                    "tensor"
+                )
+            noise = partial(fractional_noise, dynamics.alpha, generator=generator)
+            vectors = np.sqrt(2 * D[0, 0]) * noise((count, len(D)))
+            jumps = np.sqrt(2 * D_T) * noise((count, d))
+            return _summed(jumps), successive_product(exp_map(vectors))
         case Switching():
+            # Brownian steps of two sizes.
             fast = fast_states(dt / dynamics.dwell, count, generator=generator)
-            return _switching_walk(dynamics.ratio, fast, D, D_T, d, generator)
+            shares = 2 / (1 + dynamics.ratio), 2 * dynamics.ratio / (1 + dynamics.ratio)
+            slow, quick = (_free_steps(share * D, count, generator=generator) for share in shares)
+            rotation = cumulative_product(np.where(fast[:, None, None], quick, slow))
+            scale = np.sqrt(2 * D_T * np.where(fast, shares[1], shares[0]))
+            return _summed(scale[:, None] * generator.normal(size=(count, d))), rotation
         case Confined():
             still = np.broadcast_to(exp_map(np.zeros(len(D))), (count + 1, d, d))
             return _caged_walk(dt / dynamics.relaxation_time, still, D, D_T, generator)
@@ -309,31 +321,6 @@ def _planted_walk(
             turn = exp_map(np.arange(count + 1)[:, None] * dt * rate[-len(D) :])
             rotation = turn @ _free_rotations(D, count, scheme="brownian", generator=generator)
     return _summed(generator.normal(scale=np.sqrt(2 * D_T), size=(count, d))), rotation
-
-
-def _fractional_walk(
-    alpha: float, D: Floats, D_T: float, d: int, count: int, generator: np.random.Generator
-) -> tuple[Floats, Floats]:
-    """Return centres and orientations of fractional Brownian motion with its memory in the lab."""
-    if not _isotropic(D):
-        raise ValueError(
-            "D_R: Fractional has its memory in the lab frame and needs one D_R, not a tensor"
-        )
-    turns = np.sqrt(2 * D[0, 0]) * fractional_noise(alpha, (count, len(D)), generator=generator)
-    jumps = np.sqrt(2 * D_T) * fractional_noise(alpha, (count, d), generator=generator)
-    return _summed(jumps), successive_product(exp_map(turns))
-
-
-def _switching_walk(
-    ratio: float, fast: Bools, D: Floats, D_T: float, d: int, generator: np.random.Generator
-) -> tuple[Floats, Floats]:
-    """Return centres and orientations of Brownian steps of two sizes."""
-    slow_share, fast_share = 2 / (1 + ratio), 2 * ratio / (1 + ratio)
-    slow_steps = _free_steps(slow_share * D, len(fast), generator=generator)
-    fast_steps = _free_steps(fast_share * D, len(fast), generator=generator)
-    rotation = cumulative_product(np.where(fast[:, None, None], fast_steps, slow_steps))
-    scale = np.sqrt(2 * D_T * np.where(fast, fast_share, slow_share))
-    return _summed(scale[:, None] * generator.normal(size=(len(fast), d))), rotation
 
 
 def _caged_walk(

@@ -158,31 +158,17 @@ def track_rotation(
     elif sigma is None or reference != "template":
         raise ValueError('weights="sigma" needs sigma, and reference="template"')
     else:
-        known = _particle_sigma(sigma, x.shape[1:])
+        known = np.asarray(sigma, dtype=np.float64)
+        if known.shape not in ((x.shape[1], 1), x.shape[1:]):
+            known = as_sigma(sigma, x.shape[2])
+        known = np.broadcast_to(known, x.shape[1:])
+        if not (np.isfinite(known) & (known > 0)).all():
+            raise ValueError(f"sigma: expected finite numbers > 0 for the weights, got {sigma!r}")
         require_points(seen, x.shape[2])
         fit, errors = fit_weighted(fit_template(x, seen), x, seen, known**2)
         mean = known.mean(axis=0)
         motion = _motion_of(fit, x, seen, time=time, dt=dt, sigma=mean, errors=errors)
     return replace(motion, piece=np.array(pieces, dtype=np.int64))
-
-
-def _particle_delays(delays: ArrayLike, seen: Bools) -> Floats:
-    """Return the times of the particles after their frames (T, n), finite where one is present."""
-    t = np.asarray(delays, dtype=np.float64)
-    if t.shape != seen.shape:
-        raise ValueError(
-            f"delays: expected an array {seen.shape}, a time (s) for each particle in each frame, "
-            f"got shape {t.shape}"
-        )
-    unknown = seen & ~np.isfinite(t)
-    if unknown.any():
-        row, particle = (int(k[0]) for k in np.nonzero(unknown))
-        raise ValueError(
-            f"delays: {counted(int(unknown.sum()), 'particle', 'have')} coordinates but no time, "
-            f"the first is particle {particle} in row {row}: state all times, or leave these "
-            "particles out (NaN)"
-        )
-    return t
 
 
 def track_scanned(
@@ -243,7 +229,20 @@ def track_scanned(
     seen = present(x)
     known = None if sigma is None else as_sigma(sigma, x.shape[2])
     require_points(seen, x.shape[2])
-    own_times = _particle_delays(delays, seen)
+    own_times = np.asarray(delays, dtype=np.float64)
+    if own_times.shape != seen.shape:
+        raise ValueError(
+            f"delays: expected an array {seen.shape}, a time (s) for each particle in each frame, "
+            f"got shape {own_times.shape}"
+        )
+    unknown = seen & ~np.isfinite(own_times)
+    if unknown.any():
+        row, particle = (int(k[0]) for k in np.nonzero(unknown))
+        raise ValueError(
+            f"delays: {counted(int(unknown.sum()), 'particle', 'have')} coordinates but no time, "
+            f"the first is particle {particle} in row {row}: state all times, or leave these "
+            "particles out (NaN)"
+        )
     scanned = fit_scanned(
         x, seen, own_times, time=time, piece=piece, sigma=known, crossing=crossing, least=least
     )
@@ -394,17 +393,6 @@ def _row_times(
     return t if times is not None else t * dt
 
 
-def _particle_sigma(sigma: ArrayLike, shape: tuple[int, ...]) -> Floats:
-    """Return the known localisation error of every coordinate of every particle, (n, d)."""
-    s = np.asarray(sigma, dtype=np.float64)
-    if s.shape not in ((shape[0], 1), shape):
-        s = as_sigma(sigma, shape[1])
-    s = np.broadcast_to(s, shape).copy()
-    if not (np.isfinite(s) & (s > 0)).all():
-        raise ValueError(f"sigma: expected finite numbers > 0 for the weights, got {sigma!r}")
-    return s
-
-
 def _motion_of(
     fit: PoseFit,
     x: Floats,
@@ -454,6 +442,19 @@ def _motions_of(
     distance = np.sqrt(mean_present(residual.sum(axis=3), axis=2)) + nan
     count = seen.sum(axis=2)
     covariance, variance = covariance + nan[..., None, None], variance + nan
+    # Why frames have no pose; the texts are those of all numbers of particles.
+    numbers = range(x.shape[2] + 1)
+    few = [f"{c} of {numbers[-1]} particles, {d} needed" if c else "no particles" for c in numbers]
+    near = [
+        f"the {c} particles present lie too near one line for their noise: the orientation is "
+        f"uncertain by over {_LOST_AXIS} rad"
+        for c in numbers
+    ]
+    unfixed = [f"the {c} particles present do not fix a rotation" for c in numbers]
+    why = np.full(fitted.shape, "", dtype=object)
+    c = count[~fitted]
+    texts = [np.array(part)[c] for part in (few, near, unfixed)]
+    why[~fitted] = np.select([c < d, lost[~fitted]], texts[:2], texts[2])
     motions: list[RigidMotion | DegenerateClusterError | TooFewFramesError] = []
     for k, fault in enumerate(faults):
         if fault is None and fitted[k].sum() < 2:
@@ -472,7 +473,7 @@ def _motions_of(
                 covariance=covariance[k],
                 center_variance=variance[k],
                 piece=np.zeros(x.shape[1], dtype=np.int64),
-                reason=_missing_reasons(seen[k], fitted[k], lost[k], d),
+                reason=tuple(why[k].tolist()),
                 template=fit.template[k],
                 sigma=float(np.sqrt(square[k])),
                 noise=np.sqrt(noise[k]),
@@ -480,25 +481,3 @@ def _motions_of(
             )
         )
     return motions
-
-
-def _missing_reasons(seen: Bools, fitted: Bools, lost: Bools, d: int) -> tuple[str, ...]:
-    """Return for every frame the reason why it has no pose; empty where it has one."""
-    n = seen.shape[1]
-    if fitted.all():
-        return ("",) * len(seen)
-
-    def reason(count: int, ok: bool, blurred: bool) -> str:
-        if ok:
-            return ""
-        if count < d:
-            return f"{count} of {n} particles, {d} needed" if count else "no particles"
-        if blurred:
-            return (
-                f"the {count} particles present lie too near one line for their noise: the "
-                f"orientation is uncertain by over {_LOST_AXIS} rad"
-            )
-        return f"the {count} particles present do not fix a rotation"
-
-    rows = zip(seen.sum(axis=1), fitted, lost, strict=True)
-    return tuple(reason(int(c), bool(ok), bool(bad)) for c, ok, bad in rows)

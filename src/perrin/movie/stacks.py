@@ -46,7 +46,7 @@ from perrin.tracks.clock import Clock, evenly_spaced
 
 if TYPE_CHECKING:
     import os
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Mapping, Sequence
     from typing import Unpack
 
     import pandas as pd
@@ -231,15 +231,40 @@ def analyze_stack(
         crowds=True,  # clusters that meet may be a crowd for some frames
         psf=psf,
     )
-    faults += _faults_of(check_search, stack, search, refine, optics=optics)
+    try:
+        check_search(stack, search, refine, optics=optics)
+    except ValueError as fault:
+        faults.append(str(fault))
     sizes = _wanted_sizes(size, faults)
     refuse(faults)
     check_workers(work)
 
-    numbers, excluded = _selected_frames(len(stack), frames), sorted({int(c) for c in exclude})
+    first, stop = frames or (None, None)
+    if any(end is not None and end < 0 for end in (first, stop)):
+        raise ValueError(f"frames: expected A:B with whole numbers from 0 on, got {first}:{stop}")
+    numbers, excluded = list(range(len(stack)))[first:stop], sorted({int(c) for c in exclude})
+    if not numbers:
+        raise ValueError(f"frames {first}:{stop} hold none of the stack's, 0 to {len(stack) - 1}")
+    if len(numbers) < 2:
+        raise TooFewFramesError("one frame shows no motion: two or more are needed", len(numbers))
     work.report(0, 0, "taking the file's SHA-256")
     before = [file_states(one) for one in stacks]
-    depends = [_dependencies(one, search, refine, optics, numbers) for one in stacks]
+    # All values that the located spheres depend on.
+    depends: list[dict[str, Any]] = [
+        {
+            "sha256": digest(one),
+            **one.choice,
+            "shape": list(one.shape),
+            "voxel": [finite_or_none(v) for v in one.voxel],
+            "first_frame": numbers[0],
+            "last_frame": numbers[-1],
+            **asdict(search),
+            "refine": refine,
+            "optics": None if optics is None else optics.to_dict(),
+            "versions": {name: library_version(name) for name in _LIBRARIES},
+        }
+        for one in stacks
+    ]
     with (
         claimed_folder(work.keep)
         if work.keep is not None
@@ -361,15 +386,6 @@ def _stack_experiment(
         return known
 
 
-def _faults_of(check: Callable[..., object], *arguments: object, **named: object) -> list[str]:
-    """Return the message of the ValueError that a check raises, if it raises one."""
-    try:
-        check(*arguments, **named)
-    except ValueError as fault:
-        return [str(fault)]
-    return []
-
-
 def _wanted_sizes(size: int | Iterable[int] | None, faults: list[str]) -> list[int] | None:
     """Return the numbers of spheres that are wanted, sorted; collect what is wrong with them."""
     if size is None:
@@ -383,47 +399,12 @@ def _wanted_sizes(size: int | Iterable[int] | None, faults: list[str]) -> list[i
     return None if wrong else sorted({int(n) for n in numbers})
 
 
-def _selected_frames(count: int, frames: tuple[int | None, int | None] | None) -> list[int]:
-    """Return the numbers of the frames of a slice, of which there must be two."""
-    first, stop = frames or (None, None)
-    if any(end is not None and end < 0 for end in (first, stop)):
-        raise ValueError(f"frames: expected A:B with whole numbers from 0 on, got {first}:{stop}")
-    numbers = list(range(count))[slice(first, stop)]
-    if not numbers:
-        raise ValueError(f"frames {first}:{stop} hold none of the stack's, 0 to {count - 1}")
-    if len(numbers) < 2:
-        raise TooFewFramesError("one frame shows no motion: two or more are needed", len(numbers))
-    return numbers
-
-
 def _uneven_clock(stack: Stack) -> Clock | None:
     """Return the times of the frames if they are not evenly spaced."""
     frames = np.arange(len(stack))
     if evenly_spaced(stack.times, frames, dt=stack.dt):
         return None
     return Clock(frames, stack.times, stack.dt)
-
-
-def _dependencies(
-    stack: Stack,
-    search: Search,
-    refine: Refine,
-    optics: Optics | None,
-    frames: Sequence[int],
-) -> dict[str, Any]:
-    """Return all values that the located spheres depend on."""
-    return {
-        "sha256": digest(stack),
-        **stack.choice,
-        "shape": list(stack.shape),
-        "voxel": [finite_or_none(v) for v in stack.voxel],
-        "first_frame": frames[0],
-        "last_frame": frames[-1],
-        **asdict(search),
-        "refine": refine,
-        "optics": None if optics is None else optics.to_dict(),
-        "versions": {name: library_version(name) for name in _LIBRARIES},
-    }
 
 
 def _located(
@@ -561,10 +542,23 @@ def _with_checks(
             texts = (tuple(f"channel {k}: {text}" for text in part) for part in shown)
             found += checks.Findings(*texts)
         found += kinds_of_clusters(features)
+    contrast = checks.Findings()
+    if is_flat(stack) and method.radial is None:
+        seen = [
+            features.loc[features["frame"] == v.frame, ["x", "y"]].to_numpy(dtype=np.float64)
+            for v in imaging.views
+        ]
+        contrast = checks.ring_images(
+            [np.asarray(v.xy, dtype=np.float64) for v in imaging.views],
+            seen,
+            pixel=imaging.voxel[1:],
+            diameter=imaging.diameter,
+            dark=imaging.dark,
+        ) + checks.overlapping_places(seen, contact=contact)
     found += (
         checks.pair_distance_bias(features, contact=contact, refine=method.refine, axes=bodies.axes)
         + checks.Findings(tuple(bodies.warnings), tuple(bodies.notes))
-        + _contrast(imaging, features, flat=is_flat(stack) and method.radial is None)
+        + contrast
         + checks.missing_spheres(features, sizes=bodies.sizes, contact=contact, frames=read)
         + checks.Findings(notes=tuple(uneven))
         + checks.clusters_near_border(features, margin=bodies.margin, sizes=bodies.sizes)
@@ -593,23 +587,6 @@ def _channel_checks(stack: Stack, located: Located, features: pd.DataFrame) -> c
         + checks.depth_dimming(features)
         + checks.unrefined_spheres(features)
     )
-
-
-def _contrast(imaging: Imaging, features: pd.DataFrame, *, flat: bool) -> checks.Findings:
-    """Return the findings on the contrast of a 2-D movie."""
-    if not flat:
-        return checks.Findings()
-    shown = [
-        features.loc[features["frame"] == v.frame, ["x", "y"]].to_numpy(dtype=np.float64)
-        for v in imaging.views
-    ]
-    return checks.ring_images(
-        [np.asarray(v.xy, dtype=np.float64) for v in imaging.views],
-        shown,
-        pixel=imaging.voxel[1:],
-        diameter=imaging.diameter,
-        dark=imaging.dark,
-    ) + checks.overlapping_places(shown, contact=imaging.contact)
 
 
 def _imaging(

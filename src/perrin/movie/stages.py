@@ -251,6 +251,12 @@ def learn_method(
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", PrecisionWarning)
         method = choose_method(stack, search, sample, refine=refine, optics=optics)
+    if method.optics is not None and method.optics.shell:
+        z, y, x = (float(h) for h in stack.voxel)
+        sample = [
+            seen._replace(spots=method.spots(np.asarray(seen.frame, np.float64), (z, y, x)))
+            for seen in sample
+        ]
     return {
         "minmass": method.search.minmass,
         "optics": None if method.optics is None else method.optics.to_dict(),
@@ -330,7 +336,25 @@ def fit_poses(
         Number of fits that did not converge, and damaged parts.
     """
     templates = {c: motion.template for c, (motion, _) in motions.items()}
-    starts = _poses_by_frame(motions, features)
+    places = features[["x", "y", "z"]].to_numpy(dtype=np.float64)
+    owner = features["cluster"].to_numpy(dtype=np.int64)
+    there = features.reset_index(drop=True).groupby("frame").indices
+    bodies: dict[int, list[tuple[int, Floats, Floats]]] = {}
+    for cluster, (motion, frames) in motions.items():
+        for row in motion.fitted.tolist():
+            pose = (cluster, motion.center[row], motion.rotation[row])
+            bodies.setdefault(int(frames[row]), []).append(pose)
+    starts = {
+        i: _FramePoses(
+            i,
+            np.array([cluster for cluster, _, _ in bodies[i]]),
+            np.array([center for _, center, _ in bodies[i]]),
+            np.array([rotation for _, _, rotation in bodies[i]]),
+            places[there[i]],
+            owner[there[i]],
+        )
+        for i in sorted(bodies)
+    }
     total = hashlib.sha256()
     for cluster, template in templates.items():
         total.update(np.int64(cluster).tobytes() + template.tobytes())
@@ -361,31 +385,6 @@ def fit_poses(
         fitted[cluster] = with_poses(motion, poses)
     findings = unsettled_poses(int(rows["x"].isna().sum()), len(rows))
     return fitted, findings + Findings(notes=tuple(notes))
-
-
-def _poses_by_frame(
-    motions: Mapping[int, tuple[RigidMotion, Ints]], features: pd.DataFrame
-) -> dict[int, _FramePoses]:
-    """Return the start of the fits for every frame with a body."""
-    starts: dict[int, list[tuple[int, Floats, Floats]]] = {}
-    for cluster, (motion, frames) in motions.items():
-        for row in motion.fitted.tolist():
-            start = (cluster, motion.center[row], motion.rotation[row])
-            starts.setdefault(int(frames[row]), []).append(start)
-    places = features[["x", "y", "z"]].to_numpy(dtype=np.float64)
-    owner = features["cluster"].to_numpy(dtype=np.int64)
-    rows = features.reset_index(drop=True).groupby("frame").indices
-    return {
-        i: _FramePoses(
-            i,
-            np.array([c for c, _, _ in starts[i]]),
-            np.array([x for _, x, _ in starts[i]]),
-            np.array([r for _, _, r in starts[i]]),
-            places[rows[i]],
-            owner[rows[i]],
-        )
-        for i in sorted(starts)
-    }
 
 
 # Columns of a pose: centre and rotation matrix.

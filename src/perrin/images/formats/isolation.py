@@ -125,9 +125,16 @@ class _Reader:
             answer = json.loads(process.stdout.readline())
             data = process.stdout.read(answer["length"]) if answer.get("length") else b""
         except (OSError, ValueError):
+            import signal
+
             self._process, status = None, process.wait()
             self.close()
-            raise ValueError(_ending(status)) from None
+            ending = f"its reader stopped (status {status})"
+            if status == -getattr(signal, "SIGXCPU", 0):
+                ending = f"its reader did not end within {_SECONDS} s of processor time"
+            elif status < 0:
+                ending = f"its reader crashed (signal {-status})"
+            raise ValueError(ending) from None
         if "error" in answer:
             raise _ERRORS.get(answer["error"], ValueError)(answer["message"])
         return answer, data
@@ -136,7 +143,8 @@ class _Reader:
         import subprocess
 
         process = subprocess.Popen(
-            [sys.executable, "-c", _START.format(path=[p for p in sys.path if p])],
+            # Not with the working directory on its path, whose files could take a library's name.
+            [sys.executable, "-P", "-c", _START.format(path=[p for p in sys.path if p])],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
@@ -166,33 +174,38 @@ def _ended(process: subprocess.Popen[bytes]) -> None:
                 continue
 
 
-def _ending(status: int) -> str:
-    """Return how a reader ended, in words."""
-    import signal
-
-    if status == -getattr(signal, "SIGXCPU", 0):
-        return f"its reader did not end within {_SECONDS} s of processor time"
-    if status < 0:
-        return f"its reader crashed (signal {-status})"
-    return f"its reader stopped (status {status})"
-
-
 def serve() -> None:
     """Answer the questions about one file: read lines of JSON, write lines of JSON and bytes."""
     out = os.fdopen(os.dup(1), "wb")
     # What libraries print must not be among the answers.
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
     contents: Contents | None = None
-    from perrin.images.formats.vendors import WAY_OUT
+    from perrin.images.formats.vendors import WAY_OUT, vendor
 
     for line in sys.stdin.buffer:
         question = json.loads(line)
         data = b""
         try:
-            _renew_time()
+            _limit("RLIMIT_CPU", int(time.process_time()) + 1 + _SECONDS)
+            _limit("RLIMIT_CORE", 0)
             if "path" in question:
-                contents = _opened(question)
-                answer = _in_plain_values(contents)
+                path = question["path"]
+                found = vendor(path)
+                if found is None:
+                    raise ValueError("is of no format that is read")
+                # Mapped files do not count.
+                _limit("RLIMIT_DATA", allowed_memory(length_of(path)) + _BYTES_OF_LIBRARIES)
+                contents = found.read(path, Pick(**question["pick"]))
+                times, interval = contents.times, contents.plane_time
+                answer = {
+                    "shape": [int(n) for n in contents.shape],
+                    "dtype": np.dtype(contents.dtype).str,
+                    "voxel": [float(length) for length in contents.voxel],
+                    "times": None if times is None else np.asarray(times, np.float64).tolist(),
+                    "plane_time": None if interval is None else float(interval),
+                    "notes": list(contents.notes),
+                    "without_times": contents.without_times,
+                }
             else:
                 assert contents is not None
                 image = np.ascontiguousarray(contents.plane(*question["plane"]))
@@ -203,67 +216,24 @@ def serve() -> None:
             answer = {"error": "ValueError", "message": text}
         # The decoders of damaged files raise errors of any class.
         except Exception as fault:
-            answer = _refusal(fault, advice="" if "plane" in question else f": {WAY_OUT}")
+            name, text = type(fault).__name__, str(fault)
+            kind = next((known for known in _ERRORS if isinstance(fault, _ERRORS[known])), "")
+            # That of a decoder is reported with its class, and what to do.
+            if type(fault) is not ValueError and kind in ("", "ValueError"):
+                advice = "" if "plane" in question else f": {WAY_OUT}"
+                kind, text = "ValueError", f"cannot be read ({name}: {text[:500]}){advice}"
+            answer = {"error": kind, "message": text}
         out.write(json.dumps(answer).encode() + b"\n" + data)
         out.flush()
 
 
-def _opened(question: dict[str, Any]) -> Contents:
-    """Open a file, with limited memory."""
-    from perrin.images.formats.vendors import vendor
-
-    path = question["path"]
-    found = vendor(path)
-    if found is None:
-        raise ValueError("is of no format that is read")
-    _limit_memory(allowed_memory(length_of(path)))
-    return found.read(path, Pick(**question["pick"]))
-
-
-def _in_plain_values(contents: Contents) -> dict[str, Any]:
-    """Return the description of a file as JSON holds it."""
-    times = contents.times
-    return {
-        "shape": [int(n) for n in contents.shape],
-        "dtype": np.dtype(contents.dtype).str,
-        "voxel": [float(length) for length in contents.voxel],
-        "times": None if times is None else np.asarray(times, dtype=np.float64).tolist(),
-        "plane_time": None if contents.plane_time is None else float(contents.plane_time),
-        "notes": list(contents.notes),
-        "without_times": contents.without_times,
-    }
-
-
-def _refusal(fault: Exception, *, advice: str) -> dict[str, Any]:
-    """Return an error as JSON holds it; that of a decoder with its class, and what to do."""
-    name, text = type(fault).__name__, str(fault)
-    kind = next((known for known in _ERRORS if isinstance(fault, _ERRORS[known])), "")
-    if type(fault) is ValueError or kind not in ("", "ValueError"):
-        return {"error": kind, "message": text}
-    return {"error": "ValueError", "message": f"cannot be read ({name}: {text[:500]}){advice}"}
-
-
-def _renew_time() -> None:
-    """Allow the next answer its processor time; where the system has no such limit, any time."""
+def _limit(name: str, amount: int) -> None:
+    """Limit what this process may use of a resource; without such limits it may use any amount."""
     try:
         import resource
     except ImportError:
         return
-    _, hard = resource.getrlimit(resource.RLIMIT_CPU)
-    soft = int(time.process_time()) + 1 + _SECONDS
-    if hard != resource.RLIM_INFINITY:
-        soft = min(soft, hard)
-    resource.setrlimit(resource.RLIMIT_CPU, (soft, hard))
-    resource.setrlimit(resource.RLIMIT_CORE, (0, resource.getrlimit(resource.RLIMIT_CORE)[1]))
-
-
-def _limit_memory(n_bytes: int) -> None:
-    """Limit the memory that this process may ask for; mapped files do not count."""
-    try:
-        import resource
-    except ImportError:
-        return
-    _, hard = resource.getrlimit(resource.RLIMIT_DATA)
-    soft = n_bytes + _BYTES_OF_LIBRARIES
-    if hard == resource.RLIM_INFINITY or soft < hard:
-        resource.setrlimit(resource.RLIMIT_DATA, (soft, hard))
+    kind = getattr(resource, name)
+    _, hard = resource.getrlimit(kind)
+    soft = amount if hard == resource.RLIM_INFINITY else min(amount, hard)
+    resource.setrlimit(kind, (soft, hard))

@@ -176,7 +176,14 @@ def ims(path: str, pick: Pick) -> Contents:
     """Describe an Imaris .ims file: HDF5, finest resolution, padded blocks cut to the image."""
     file = needed("h5py", "ims").File(path, "r", rdcc_nbytes=_IMARIS_CACHE)
     try:
-        _refuse_links(file)
+        group: Any = file
+        for name in ("DataSet", "ResolutionLevel 0", "TimePoint 0", "Channel 0", "Data"):
+            link = type(group.get(name, getlink=True)).__name__ if hasattr(group, "get") else ""
+            if link == "ExternalLink":
+                raise ValueError(f"has its {name!r} in another file: save it as one file")
+            group = group[name]
+        if getattr(group, "external", None) or getattr(group, "is_virtual", False):
+            raise ValueError("has its images in other files: save it as one file")
         finest = file["DataSet"]["ResolutionLevel 0"]
         about = file["DataSetInfo"]
         image = {key: _imaris_text(value) for key, value in about["Image"].attrs.items()}
@@ -212,18 +219,6 @@ def ims(path: str, pick: Pick) -> Contents:
         voxel=voxel,
         times=times,
     )
-
-
-def _refuse_links(file: Any) -> None:  # noqa: ANN401 (h5py.File)
-    """Refuse an Imaris file whose images are in other files."""
-    group = file
-    for name in ("DataSet", "ResolutionLevel 0", "TimePoint 0", "Channel 0", "Data"):
-        link = type(group.get(name, getlink=True)).__name__ if hasattr(group, "get") else ""
-        if link == "ExternalLink":
-            raise ValueError(f"has its {name!r} in another file: save it as one file")
-        group = group[name]
-    if getattr(group, "external", None) or getattr(group, "is_virtual", False):
-        raise ValueError("has its images in other files: save it as one file")
 
 
 def imaris_size(image: dict[str, str], channel: Any) -> dict[str, int]:  # noqa: ANN401
@@ -311,7 +306,10 @@ def ome_zarr(path: str, pick: Pick) -> Contents:
     group = needed("zarr", "zarr").open_group(path, mode="r")
     header = group.attrs.get("ome", group.attrs)
     if "bioformats2raw.layout" in header:
-        series = _image_folders(group)
+        attributes = group["OME"].attrs if "OME" in group else {}
+        listed = attributes.get("ome", attributes).get("series")
+        numbered = sorted((name for name in group.group_keys() if name.isdigit()), key=int)
+        series = [str(name) for name in listed or numbered]
         group = group[series[chosen(series, pick.image)]]
         header = group.attrs.get("ome", group.attrs)
     else:
@@ -354,16 +352,6 @@ def ome_zarr(path: str, pick: Pick) -> Contents:
         voxel=np.array([in_um(step.get(a), axes.get(a)) for a in "ZYX"]),
         times=even_times(where.t, in_seconds(step.get("T"), axes.get("T"))),
     )
-
-
-def _image_folders(root: Any) -> list[str]:  # noqa: ANN401 (a zarr group)
-    """Return the names of the images under the root that bioformats2raw writes."""
-    if "OME" in root:
-        attributes = root["OME"].attrs
-        listed = attributes.get("ome", attributes).get("series")
-        if listed:
-            return [str(name) for name in listed]
-    return sorted((name for name in root.group_keys() if name.isdigit()), key=int)
 
 
 def ngff_scale(scales: Any, n: int) -> Floats:  # noqa: ANN401 (a JSON header)

@@ -64,7 +64,10 @@ def czi(path: str, pick: Pick) -> Contents:
         header = xml_root(file.metadata())
         lengths = [header.findtext(f".//Scaling/Items/Distance[@Id='{a}']/Value") for a in "ZYX"]
         started = [_clock_time(blocks_of(t, 0)) for t in range(where.t)]
-        times = czi_times(header, _stamps(file), started)
+        # A file without attachments has no directory of them.
+        attached = file.attachments() if file.header.attachment_directory_position > 0 else ()
+        stamps = [a.data() for a in attached if a.attachment_entry.name == "TimeStamps"]
+        times = czi_times(header, [float(value) for one in stamps[:1] for value in one], started)
         passed = np.diff([_clock_time(blocks_of(0, z)) for z in range(where.z)])
         passed = passed[np.isfinite(passed) & (passed > 0)]
     except Exception:
@@ -152,17 +155,6 @@ def _clock_time(blocks: Sequence[Any]) -> float:
         return np.nan
     moment = datetime.fromisoformat(found[1][:26].rstrip("Z"))
     return moment.replace(tzinfo=UTC).timestamp()
-
-
-def _stamps(file: Any) -> list[float]:  # noqa: ANN401
-    """Return the time stamps attached to a file, s."""
-    # A file without attachments has no directory of them.
-    if file.header.attachment_directory_position <= 0:
-        return []
-    for attachment in file.attachments():
-        if attachment.attachment_entry.name == "TimeStamps":
-            return [float(value) for value in attachment.data()]
-    return []
 
 
 def _decoder(compression: int) -> Any:  # noqa: ANN401

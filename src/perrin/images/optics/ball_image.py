@@ -92,41 +92,26 @@ class BallBlur(NamedTuple):
         R^2/(3 r s√2π) (exp(-a²/2s²) - exp(-b²/2s²)); the blur along z in excess of s is added by
         one numerical convolution.
         """
+        from scipy.special import erf
+
         radius = self.diameter / 2
         total = np.zeros((len(z), len(rho)))
         for share, (blur_z, blur) in self.components:
             excess = float(np.sqrt(max(blur_z**2 - blur**2, 0.0)))
             nodes, weights = _gaussian_quadrature(z, excess, blur)
             r = np.hypot(nodes[:, None], rho)
-            sphere = _blurred_surface(r, radius, blur) if self.shell else _blurred(r, radius, blur)
+            a, b = (radius - r) / blur, (radius + r) / blur
+            # Near the centre the difference of exponentials over r is its limit, the derivative.
+            small = r < 1e-4 * blur
+            edge = (np.exp(-0.5 * a**2) - np.exp(-0.5 * b**2)) / np.where(small, blur, r)
+            edge[small] = 2 * radius / blur**2 * np.exp(-0.5 * (radius / blur) ** 2)
+            if self.shell:
+                sphere = radius**2 / 3 / (blur * np.sqrt(2 * np.pi)) * edge
+            else:
+                sphere = 0.5 * (erf(b / np.sqrt(2)) + erf(a / np.sqrt(2)))
+                sphere -= edge * blur / np.sqrt(2 * np.pi)
             total += share * (weights @ sphere)
         return total
-
-
-def _blurred(r: Floats, radius: float, blur: float) -> Floats:
-    """Return the intensity at distances r from the centre of a ball that is blurred evenly."""
-    from scipy.special import erf
-
-    a, b = (radius - r) / blur, (radius + r) / blur
-    edge = _difference_over_distance(r, radius, blur) * blur / np.sqrt(2 * np.pi)
-    return np.asarray(0.5 * (erf(b / np.sqrt(2)) + erf(a / np.sqrt(2))) - edge)
-
-
-def _blurred_surface(r: Floats, radius: float, blur: float) -> Floats:
-    """Return the intensity of the surface of a ball that is blurred evenly, of the ball's light."""
-    edge = _difference_over_distance(r, radius, blur)
-    return np.asarray(radius**2 / 3 / (blur * np.sqrt(2 * np.pi)) * edge)
-
-
-def _difference_over_distance(r: Floats, radius: float, blur: float) -> Floats:
-    """Return (exp(-a^2/2) - exp(-b^2/2)) / r with a, b = (radius -+ r) / blur."""
-    a, b = (radius - r) / blur, (radius + r) / blur
-    # Near the centre the difference of exponentials over r is its limit, the derivative.
-    small = r < 1e-4 * blur
-    safe = np.where(small, blur, r)
-    edge = (np.exp(-0.5 * a**2) - np.exp(-0.5 * b**2)) / safe
-    limit = 2 * radius / blur**2 * np.exp(-0.5 * (radius / blur) ** 2)
-    return np.where(small, limit, edge)
 
 
 class SphereSpot(NamedTuple):

@@ -719,6 +719,7 @@ def fit_samples(
     diameter: float,
     voxel: tuple[float, float, float],
     measured: PointSpread | None = None,
+    shell: bool = False,
 ) -> LearnedOptics:
     """Find the sphere diameter, point spread and noise of greatest likelihood for most samples.
 
@@ -734,6 +735,8 @@ def fit_samples(
         Voxel size (z, y, x), um.
     measured : PointSpread, optional
         A point spread that was measured; diameter and noise are learned.
+    shell : bool
+        The surface of the spheres is fluorescent; otherwise it is tried where balls do not fit.
 
     Returns
     -------
@@ -772,15 +775,29 @@ def fit_samples(
             "the optics (optics=), or keep the positions found first (refine=None)"
         )
     mean = float(np.mean([np.nanmean(s.frame) for s in usable]))
-    plain = _ball_or_shell(usable, start, CameraNoise(1.0, 0.05 * abs(mean)))
+    noise = CameraNoise(1.0, 0.05 * abs(mean))
+    if shell:
+        plain = _settled(usable, replace(start, shell=True), noise)
+    else:
+        plain = _ball_or_shell(usable, start, noise)
     plain, left_out = _without_dust(plain)
     found = plain
     if not any(isinstance(s, CrowdSample) for s in found.samples):
         found = _with_spread(found)
-    if _shows_tail(found):
-        found = _with_tail(found)
+    if measured is None:
+        # The first step of the share of a tail, and its error.
+        variance = np.linalg.pinv(found.information, hermitian=True)
+        if variance[-1] @ found.score > _LEAST_SHARE_ERRORS * np.sqrt(variance[-1, -1]):
+            found = _with_tail(found)
     if found is not plain and left_out:
-        found, left_out = _judged_again(found, usable)
+        # All samples are judged again by the image that was found.
+        variations = ImageVariations.about(found.parameters)
+        usable = _with_enough_voxels(usable, variations.image)
+        fits = [s.fit(variations, found.noise) for s in usable]
+        kept = _spheres_among(usable, fits, noise=found.noise, usual=_usual_of(found))
+        left_out = len(usable) - len(kept)
+        if len(kept) >= _FEWEST_SAMPLES:
+            found = _settled(kept, found.parameters, found.noise)
     elif found is not plain:
         found, left_out = _without_dust(found)
     optics = found.parameters.optics(found.noise, found.information)
@@ -864,19 +881,6 @@ def _without_dust(found: _Settled) -> tuple[_Settled, int]:
     return found, left_out
 
 
-def _judged_again(
-    found: _Settled, samples: Sequence[GroupSample | CrowdSample]
-) -> tuple[_Settled, int]:
-    """Return the parameters with all samples that are spheres by the image that was found."""
-    variations = ImageVariations.about(found.parameters)
-    samples = _with_enough_voxels(samples, variations.image)
-    fits = [s.fit(variations, found.noise) for s in samples]
-    kept = _spheres_among(samples, fits, noise=found.noise, usual=_usual_of(found))
-    if len(kept) < _FEWEST_SAMPLES:
-        return found, len(samples) - len(kept)
-    return _settled(kept, found.parameters, found.noise), len(samples) - len(kept)
-
-
 def _settled(
     samples: list[GroupSample | CrowdSample],
     parameters: ImageParameters,
@@ -948,15 +952,6 @@ def _with_spread(equal: _Settled) -> _Settled:
     except NoSpheresError:
         # Equal diameters have settled, and different ones have not: the first are used.
         return equal
-
-
-def _shows_tail(found: _Settled) -> bool:
-    """Return whether the first step of a tail's share is significantly positive."""
-    if found.parameters.measured is not None:
-        return False
-    variance = np.linalg.pinv(found.information, hermitian=True)
-    share = float(variance[-1] @ found.score)
-    return share > _LEAST_SHARE_ERRORS * float(np.sqrt(variance[-1, -1]))
 
 
 def _with_tail(plain: _Settled) -> _Settled:

@@ -85,32 +85,6 @@ class RadialSample(NamedTuple):
         )
 
 
-class _Equations(NamedTuple):
-    """Information on the coefficients of the image and its score, from one fit."""
-
-    information: Floats
-    score: Floats
-
-
-def _equations(patch: Patch, fit: PatchFit, image: RadialImage) -> _Equations:
-    """Return what a fit says on the coefficients, its own parameters eliminated (Schur)."""
-    distance = patch.offsets(fit.centers)[1]
-    k = len(image.coefficients)
-    design = np.tensordot(fit.brightness, spline_design(distance, spacing=image.spacing, k=k), 1)
-    weighted = design * fit.weight
-    shared = (fit.jacobian * fit.weight) @ design.T
-    taken = np.linalg.lstsq(fit.information, shared, rcond=1e-12)[0]
-    residual = patch.data - fit.expected
-    score = weighted @ residual - taken.T @ ((fit.jacobian * fit.weight) @ residual)
-    return _Equations(weighted @ design.T - shared.T @ taken, score)
-
-
-def _brightness_error(fit: PatchFit) -> Floats:
-    """Return the standard errors (n,) of the brightness of the spheres of a fit."""
-    n = len(fit.centers)
-    return np.asarray(np.sqrt(np.maximum(np.diag(fit.covariance)[2 * n : 3 * n], 1e-300)))
-
-
 def noise_of_neighbours(
     patches: Sequence[Patch], fits: Sequence[PatchFit], noise: PixelNoise
 ) -> PixelNoise:
@@ -237,14 +211,24 @@ def settled_image(
             return image, samples, np.inf
         fits = [fit_patch(p, image, s.centers) for p, s in zip(patches, samples, strict=True)]
         noise = noise_of_neighbours(patches, fits, image.noise)
-        parts = [_equations(p, f, image) for p, f in zip(patches, fits, strict=True)]
-        information = np.sum([e.information for e in parts], axis=0)
-        score = np.sum([e.score for e in parts], axis=0)
+        m = len(image.coefficients)
+        information, score = np.zeros((m, m)), np.zeros(m)
+        for patch, fit in zip(patches, fits, strict=True):
+            distance = patch.offsets(fit.centers)[1]
+            splines = spline_design(distance, spacing=image.spacing, k=m)
+            design = np.tensordot(fit.brightness, splines, 1)
+            weighted, slopes = design * fit.weight, fit.jacobian * fit.weight
+            shared = slopes @ design.T
+            taken = np.linalg.lstsq(fit.information, shared, rcond=1e-12)[0]
+            residual = patch.data - fit.expected
+            information += weighted @ design.T - shared.T @ taken
+            score += weighted @ residual - taken.T @ (slopes @ residual)
         change = np.linalg.lstsq(information, score, rcond=1e-10)[0]
         step = float(change @ score) / len(score)
         brightness = np.concatenate([f.brightness for f in fits])
         typical = float(np.median(brightness))
-        error = np.concatenate([_brightness_error(f) for f in fits])
+        variances = [np.diag(f.covariance)[2 * n : 3 * n] for f in fits for n in (len(f.centers),)]
+        error = np.sqrt(np.maximum(np.concatenate(variances), 1e-300))
         if k >= _JUDGED and not np.median(brightness / error) > _LEAST_SIGNIFICANCE:
             return image, samples, np.inf
         image = replace(image, coefficients=(image.coefficients + change) * typical, noise=noise)
@@ -290,21 +274,6 @@ def held_out_misfit(
         fit = fit_patch(patch, replace(image, noise=noise), sample.centers)
         out.append(fit.weight @ (patch.data - fit.expected) ** 2)
     return np.array(out)
-
-
-def _simplest_of_best(tried: dict[tuple[float, float], Floats]) -> tuple[float, float]:
-    """Return the spacing and reach of fewest coefficients that are not clearly worse than the best.
-
-    The samples are the same for all, so that the error of a difference is that of its own spread.
-    """
-    best = min(tried.values(), key=lambda chi2: float(chi2.sum()))
-    good = []
-    for pair, chi2 in tried.items():
-        worse = chi2 - best
-        error = float(np.std(worse)) * np.sqrt(len(worse))
-        if worse.sum() <= _CLEARLY_BETTER * error:
-            good.append(pair)
-    return min(good, key=lambda pair: pair[1] / pair[0])
 
 
 def learn_image(
@@ -367,7 +336,16 @@ def learn_image(
                 tried[pair] = held_out_misfit(
                     halves[1], image, reach=widest, pixel=pixel, noise=noise
                 )
-        chosen = _simplest_of_best(tried) if tried else chosen
+        if tried:
+            # The fewest coefficients that are not clearly worse than the best. The samples are the
+            # same for all, so that the error of a difference is that of its own spread.
+            best = min(tried.values(), key=lambda chi2: float(chi2.sum()))
+            good = [
+                pair
+                for pair, chi2 in tried.items()
+                if np.sum(chi2 - best) <= _CLEARLY_BETTER * np.std(chi2 - best) * np.sqrt(len(best))
+            ]
+            chosen = min(good, key=lambda pair: pair[1] / pair[0])
     spacing, reach = max(chosen[0] * contact, least), chosen[1] * contact
     step = np.inf
     if samples and (tried or not halves[1]):

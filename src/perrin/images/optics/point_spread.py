@@ -195,7 +195,14 @@ def measure_point_spread(stack: BeadStack, *, diameter: float = 0.1) -> PointSpr
     # Variances of a voxel and of a bead.
     added = np.array([voxel[0] ** 2, voxel[1] * voxel[2]]) / 12 + diameter**2 / 20
     total = np.sqrt(widths**2 + added)
-    columns = [_gaussians(bead.height, bead.radius, total) for bead in beads]
+    # Gaussians of unit integral.
+    columns = [
+        np.exp(
+            -0.5 * ((b.height[:, None] / total[:, 0]) ** 2 + (b.radius[:, None] / total[:, 1]) ** 2)
+        )
+        / (total[:, 0] * total[:, 1] ** 2 * (2 * np.pi) ** 1.5)
+        for b in beads
+    ]
     shares = np.zeros(len(widths))
     for _ in range(_BEAD_ROUNDS):
         design = np.concatenate(
@@ -216,15 +223,22 @@ def measure_point_spread(stack: BeadStack, *, diameter: float = 0.1) -> PointSpr
     used = np.flatnonzero(shares)
     used = used[np.argsort(widths[used, 1] * widths[used, 0] ** 0.5, kind="stable")]
     components = tuple((float(shares[k]), (float(widths[k, 0]), float(widths[k, 1]))) for k in used)
-    misfit = _mean_misfit(beads, columns, shares)
+    # The mean bead by distance in the plane and height, in steps of a tenth of a micrometre.
+    height = np.concatenate([np.rint(np.abs(b.height) / 0.1) for b in beads]).astype(int)
+    radius = np.concatenate([np.rint(b.radius / 0.1) for b in beads]).astype(int)
+    spreads = [column @ shares for column in columns]
+    off = np.concatenate(
+        [
+            (b.data - b.background) / b.brightness - spread
+            for b, spread in zip(beads, spreads, strict=True)
+        ]
+    )
+    cell = height * (radius.max() + 1) + radius
+    count = np.bincount(cell)
+    mean = np.bincount(cell, off)[count > 0] / count[count > 0]
+    peak = max(float(spread.max()) for spread in spreads)
+    misfit = float(np.sqrt(np.mean(mean**2)) / peak)
     return PointSpread(components, len(beads), misfit)
-
-
-def _gaussians(height: Floats, radius: Floats, widths: Floats) -> Floats:
-    """Return Gaussians of unit integral (m, k), of widths (k, 2), at distances from the centre."""
-    z, plane = widths.T
-    exponent = (height[:, None] / z) ** 2 + (radius[:, None] / plane) ** 2
-    return np.asarray(np.exp(-0.5 * exponent) / (z * plane**2 * (2 * np.pi) ** 1.5))
 
 
 def _beads_of(frame: Floats, voxel: Floats) -> list[_Bead]:
@@ -280,23 +294,3 @@ def _bead_at(frame: Floats, place: Sequence[int] | Floats, half: Floats, voxel: 
     height = np.broadcast_to(z - cz, data.shape).ravel()
     integral = peak * np.exp(wide_z + 2 * wide) * (2 * np.pi) ** 1.5
     return _Bead(height, radius, data.ravel(), float(integral), background)
-
-
-def _mean_misfit(beads: Sequence[_Bead], columns: Sequence[Floats], shares: Floats) -> float:
-    """Return the deviation of the mean bead from the sum of Gaussians, over its maximum.
-
-    The mean is that over distances in the plane and heights in steps of a tenth of a micrometre.
-    """
-    height = np.concatenate([np.rint(np.abs(b.height) / 0.1) for b in beads]).astype(int)
-    radius = np.concatenate([np.rint(b.radius / 0.1) for b in beads]).astype(int)
-    off = np.concatenate(
-        [
-            (b.data - b.background) / b.brightness - column @ shares
-            for b, column in zip(beads, columns, strict=True)
-        ]
-    )
-    peak = max(float((column @ shares).max()) for column in columns)
-    cell = height * (radius.max() + 1) + radius
-    count = np.bincount(cell)
-    mean = np.bincount(cell, off)[count > 0] / count[count > 0]
-    return float(np.sqrt(np.mean(mean**2)) / peak)

@@ -83,21 +83,18 @@ def blurred_ball(offsets: tuple[Floats, Floats, Floats], *, radius: float, psf: 
     inside = 0.5 * (erf((radius + r) / root) + erf((radius - r) / root))
     ball = inside - sigma / np.sqrt(2 * np.pi) * edge / far
     # The rest of the blur, axis by axis.
-    rest = np.sqrt(psf**2 - sigma**2)
-    z, y, x = (_gaussian_weights(d, nodes, s) for d, s in zip(offsets, rest, strict=True))
+    axes = []
+    for distance, blur in zip(offsets, np.sqrt(psf**2 - sigma**2), strict=True):
+        scale = 1 / (blur * np.sqrt(2))
+        to_node = np.exp(-(((distance[..., None] - nodes) * scale) ** 2))
+        to_mirror = np.exp(-(((distance[..., None] + nodes) * scale) ** 2))
+        weights: Floats = (to_node + to_mirror) * (nodes[1] * scale / np.sqrt(np.pi))
+        weights[..., 0] /= 2
+        axes.append(weights)
+    z, y, x = axes
     planes = np.tensordot(z, ball, axes=1)
     image: Floats = y @ planes @ np.swapaxes(x, -1, -2)
     return image
-
-
-def _gaussian_weights(offsets: Floats, nodes: Floats, sigma: float) -> Floats:
-    """Return the weight of each node, and of its mirror image, at each offset."""
-    step, scale = nodes[1], 1 / (sigma * np.sqrt(2))
-    to_node = np.exp(-(((offsets[..., None] - nodes) * scale) ** 2))
-    to_mirror = np.exp(-(((offsets[..., None] + nodes) * scale) ** 2))
-    weights: Floats = (to_node + to_mirror) * (step * scale / np.sqrt(np.pi))
-    weights[..., 0] /= 2
-    return weights
 
 
 @dataclass(frozen=True, eq=False)

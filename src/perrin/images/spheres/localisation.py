@@ -18,7 +18,7 @@ from perrin._arrays import (
     refuse_unknown,
 )
 from perrin._text import listed
-from perrin.errors import FrameError, PrecisionWarning
+from perrin.errors import FrameError, NoSpheresError, PrecisionWarning
 from perrin.images.optics.crowd_fit import CrowdFit, crowd_piece, fit_crowd
 from perrin.images.optics.learn import (
     CrowdSample,
@@ -33,6 +33,7 @@ from perrin.images.optics.window_fit import FreeCenters, fit_window
 from perrin.images.spheres.by_trackpy import Features, find_features, refine_by_trackpy
 from perrin.images.spheres.circles import circle_cut, find_circles
 from perrin.images.spheres.planar import learn_plane, plane_columns
+from perrin.images.spheres.shells import find_shells
 from perrin.images.spheres.spots import (
     SPOT_KEYWORDS,
     Fading,
@@ -58,7 +59,6 @@ if TYPE_CHECKING:
     from perrin.images.optics.optics import CameraNoise, Optics
     from perrin.images.optics.point_spread import PointSpread
     from perrin.images.optics.radial_image import RadialImage
-    from perrin.images.optics.window_fit import ImageFit, Window
 
     Columns: TypeAlias = dict[str, NDArray[Any]]
 
@@ -196,6 +196,16 @@ class Search:
             border=self.border,
         )
 
+    def shells(self, frame: Floats, voxel: _Voxel) -> Features:
+        """Return the centres of fluorescent surfaces in a frame, noise among them."""
+        return find_shells(
+            frame,
+            diameter=self.diameter,
+            contact=self.contact,
+            voxel=voxel,
+            border=self.border,
+        )
+
     def spheres(self, spots: Features, light: Floats | float = 1.0) -> Features:
         """Return the spots of at least the least mass, times the relative brightness at each."""
         keep = spots.mass >= (self.minmass or 0.0) * light
@@ -271,6 +281,12 @@ class Method:
     usual: UsualImage | None = None
     radial: RadialImage | None = None
 
+    def spots(self, frame: Floats, voxel: _Voxel) -> Features:
+        """Return the spots of a frame, noise among them; of shells the centres of surfaces."""
+        if self.optics is not None and self.optics.shell:
+            return self.search.shells(frame, voxel)
+        return self.search.spots(frame, voxel)
+
     def spheres(self, spots: Features, frame: int) -> Features:
         """Return the spots of a frame that pass the mass cut."""
         if self.fading is None:
@@ -297,7 +313,7 @@ class Method:
         """
         data, voxel = np.asarray(stack.frame(i)), _voxel_size(stack)
         frame = _finite_frame(data, i)
-        spots = self.search.spots(frame, voxel)
+        spots = self.spots(frame, voxel)
         found = self.spheres(spots, i)
         if self.radial is not None:
             columns = plane_columns(
@@ -407,14 +423,10 @@ def choose_method(
             pixel=_voxel_size(stack)[1:],
         )
         return Method(search, refine, radial=radial)
-    fading = None
-    if search.minmass is None:
-        fading = find_fading([seen.number for seen in sample], [seen.spots for seen in sample])
-        masses = [seen.spots.mass for seen in sample]
-        if fading is not None:
-            masses = [m.spots.mass / fading.at(m.number, m.spots.centers) for m in sample]
-        search = replace(search, minmass=mass_cut(np.concatenate([np.empty(0), *masses])))
-    method = Method(search, refine, optics if refine == "model" else None, fading)
+    voxel = _voxel_size(stack)
+    if refine == "model" and optics is not None and optics.shell:
+        return _with_mass_cut(Method(search, refine, optics), _of_shells(sample, search, voxel))
+    method = _with_mass_cut(Method(search, refine, optics if refine == "model" else None), sample)
     if refine == "trackpy":
         _refuse_trackpy_in_crowds(
             [method.spheres(s.spots, s.number).centers for s in sample], contact=search.contact
@@ -430,9 +442,57 @@ def choose_method(
             in_groups += sum(map(len, groups))
         # Where most spheres are in crowds that are not to be refined, no optics are needed.
         if search.crowds or in_crowds <= in_groups:
-            learned = fit_optics(sample, method, voxel=_voxel_size(stack))
-            return replace(method, optics=learned.optics, usual=learned.usual)
+            return _with_optics(method, sample, Method(search), voxel)
     return method
+
+
+def _with_mass_cut(method: Method, sample: Sequence[SampledFrame]) -> Method:
+    """Return a method with the mass cut that the spots of some frames show, if none is stated."""
+    if method.search.minmass is not None:
+        return method
+    fading = find_fading([seen.number for seen in sample], [seen.spots for seen in sample])
+    masses = [seen.spots.mass for seen in sample]
+    if fading is not None:
+        masses = [m.spots.mass / fading.at(m.number, m.spots.centers) for m in sample]
+    cut = mass_cut(np.concatenate([np.empty(0), *masses]))
+    return replace(method, search=replace(method.search, minmass=cut), fading=fading)
+
+
+def _of_shells(sample: Sequence[SampledFrame], search: Search, voxel: _Voxel) -> list[SampledFrame]:
+    """Return sampled frames with the spots of spheres whose surface is fluorescent."""
+    return [
+        seen._replace(spots=search.shells(np.asarray(seen.frame, dtype=np.float64), voxel))
+        for seen in sample
+    ]
+
+
+def _with_optics(
+    method: Method, sample: Sequence[SampledFrame], stated: Method, voxel: _Voxel
+) -> Method:
+    """Return a method with the optics that some frames show; `stated` is without its mass cut.
+
+    Where the spots are no balls, or their surface alone is fluorescent, spots are searched for anew
+    as surfaces.
+    """
+    try:
+        learned = fit_optics(sample, method, voxel=voxel)
+        if not learned.optics.shell:
+            return replace(method, optics=learned.optics, usual=learned.usual)
+        fault = NoSpheresError("shells were found, and their centres were not")
+    except NoSpheresError as error:
+        fault = error
+    if method.search.dark:
+        raise fault
+    shells = _of_shells(sample, method.search, voxel)
+    with warnings.catch_warnings():
+        # The spots may be no spheres, of which the masses then say nothing.
+        warnings.simplefilter("ignore", PrecisionWarning)
+        method = _with_mass_cut(stated, shells)
+    try:
+        learned = fit_optics(shells, method, voxel=voxel, shell=True)
+    except NoSpheresError:
+        raise fault from None
+    return replace(method, optics=learned.optics, usual=learned.usual)
 
 
 def _trackpy_groups(centers: Floats, *, contact: float) -> tuple[Ints, int]:
@@ -602,7 +662,9 @@ def locate(
     return table
 
 
-def fit_optics(sample: Sequence[SampledFrame], method: Method, *, voxel: _Voxel) -> LearnedOptics:
+def fit_optics(
+    sample: Sequence[SampledFrame], method: Method, *, voxel: _Voxel, shell: bool = False
+) -> LearnedOptics:
     """Learn the diameter of the fluorescent sphere, the point spread and the noise.
 
     Parameters
@@ -613,6 +675,8 @@ def fit_optics(sample: Sequence[SampledFrame], method: Method, *, voxel: _Voxel)
         Options of the search, with the mass cut.
     voxel : tuple of float
         Voxel size (z, y, x), um.
+    shell : bool
+        The surface of the spheres is fluorescent, in place of all of them.
 
     Returns
     -------
@@ -638,7 +702,9 @@ def fit_optics(sample: Sequence[SampledFrame], method: Method, *, voxel: _Voxel)
     if sum(len(s.centers) for s in samples) < sum(len(s.centers) for s in pieces):
         samples, most = pieces, _LEARNING_CROWDS
     chosen = [samples[k] for k in _evenly_spaced(len(samples), most)]
-    return fit_samples(chosen, diameter=search.diameter, voxel=voxel, measured=search.psf)
+    return fit_samples(
+        chosen, diameter=search.diameter, voxel=voxel, measured=search.psf, shell=shell
+    )
 
 
 def without_doubles(columns: Columns, *, contact: float) -> Columns:
@@ -727,7 +793,7 @@ def group_columns(
     crowds: list[tuple[Ints, CrowdFit]] = []
     if optics is not None:
         image, noise, furthest = optics.image(voxel), optics.noise, optics.diameter / 4
-        dimmed = np.broadcast_to(light, len(centers))
+        dimmed, last = np.broadcast_to(light, len(centers)), (np.array(frame.shape) - 1) * voxel
         groups, chains = groups_to_fit(centers, contact, dusty=bool(usual and usual.left_out))
         for chain in chains if search.crowds else []:
             crowds.append((chain, _crowd_of(frame, found, chain, search, image, noise)))
@@ -745,24 +811,24 @@ def group_columns(
         dark = ~(fit.brightness / np.median(fit.brightness) > 0.1)
         faults = np.where(dark, _DARK, np.where(moved, _MOVED, "")).astype(object)
         if usual is not None:
-            square, voxels = _own_chi2(window, fit)
+            # Chi-squared per voxel of the voxels of every sphere, and their number.
+            voxels = fit.unit_images.sum(axis=1)
+            residual = fit.weight * (window.data - fit.expected) ** 2
+            square = fit.unit_images @ residual / np.maximum(voxels, 1e-300)
             level = usual.brightness * dimmed[group]
             excess = usual.excess(square, fit.brightness / level, voxels=voxels)
             worst = int(excess.argmax())
             bright = fit.brightness / level >= usual.brightest
+            # Spheres at the border, which are often not found, touch those within one contact.
+            at_border = np.any(np.minimum(fit.centers, last - fit.centers) < contact)
+            beside = usual.disturbed(np.array([fit.chi2]), voxels=np.array([window.data.size]))
+            disturbed = beside[0] or usual.disturbed(square, voxels=voxels).any()
             # Light beside spheres of usual brightness may be that of a sphere that was not found.
             if (
                 search.crowds
                 and len(group) <= _LARGEST_CUT_GROUP
                 and not bright.any()
-                and (
-                    excess[worst] > 1
-                    or fit.chi2 > usual.worst_chi2
-                    or (
-                        _touch_border(frame, fit.centers, voxel, reach=contact)
-                        and _is_disturbed(usual, square, voxels, window, fit)
-                    )
-                )
+                and (excess[worst] > 1 or fit.chi2 > usual.worst_chi2 or (at_border and disturbed))
             ):
                 beyond = _crowd_of(frame, found, group, search, image, noise)
                 whole = _usual_spheres(
@@ -823,14 +889,6 @@ def _crowd_of(
     )
 
 
-def _own_chi2(window: Window, fit: ImageFit) -> tuple[Floats, Floats]:
-    """Return chi-squared per voxel of the voxels of every sphere of a fit, and their number."""
-    own = fit.unit_images
-    voxels = own.sum(axis=1)
-    square = own @ (fit.weight * (window.data - fit.expected) ** 2)
-    return square / np.maximum(voxels, 1e-300), voxels
-
-
 def _usual_spheres(
     crowd: CrowdFit, usual: UsualImage, level: float, *, count: int, contact: float
 ) -> CrowdFit | None:
@@ -855,26 +913,6 @@ def _usual_spheres(
         converged=crowd.converged[good],
         origin=crowd.origin[good],
     )
-
-
-def _touch_border(frame: Floats, centers: Floats, voxel: _Voxel, *, reach: float) -> bool:
-    """Return whether one of the centres (n, 3) is nearer to the border than a sphere that it cuts.
-
-    Spheres at the border, which are often not found, touch those within one contact distance.
-    """
-    last = (np.array(frame.shape) - 1) * np.array(voxel)
-    return bool(np.any(np.minimum(centers, last - centers) < reach))
-
-
-def _is_disturbed(
-    usual: UsualImage, square: Floats, voxels: Floats, window: Window, fit: ImageFit
-) -> bool:
-    """Return whether an image has more residual than chance leaves, in its spheres or beside them.
-
-    The light of a sphere that was not found lies beside those of its group.
-    """
-    beside = usual.disturbed(np.array([fit.chi2]), voxels=np.array([window.data.size]))
-    return bool(usual.disturbed(square, voxels=voxels).any() or beside[0])
 
 
 def with_crowds(

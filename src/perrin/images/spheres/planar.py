@@ -267,7 +267,16 @@ def fit_plane(
     for _ in range(n + 1):
         before = fit.reason.copy()
         _sweep(frame, centers, fit, contact, image, pixel)
-        _mark_wrong_spots(centers, fit, contact)
+        # Spots whose fits show no sphere, or that of another spot.
+        good = fit.reason == ""
+        typical = float(np.median(fit.brightness[good])) if good.any() else 0.0
+        dim = good & ~(fit.brightness > LEAST_BRIGHTNESS * typical)
+        moved = np.linalg.norm(fit.centers - centers, axis=1)
+        away = good & (moved > _LEFT_PLACE * contact)
+        close = np.linalg.norm(fit.centers[:, None] - fit.centers, axis=2) < _SAME * contact
+        for i, j in np.argwhere(np.triu(close & good & good[:, None], 1)):
+            away[i if moved[i] > moved[j] else j] = True
+        fit.reason[dim], fit.reason[away & ~dim] = _NO_IMAGE, _AWAY
         # Without the spots that were marked now, the others may be spheres.
         if not np.isin(fit.reason[before != fit.reason], (_NO_IMAGE, _AWAY)).any():
             break
@@ -334,22 +343,6 @@ def _fit_group(
     fit.centers[group], fit.brightness[group] = found.centers, found.brightness
     variance = np.diag(found.covariance)[: 2 * n]
     fit.sigma[group] = np.sqrt(np.maximum(variance, 0.0)).reshape(n, 2)
-
-
-def _mark_wrong_spots(first: Floats, fit: PlaneFit, contact: float) -> None:
-    """Mark the spots whose fits show no sphere, or that of another spot."""
-    good = fit.reason == ""
-    if not good.any():
-        return
-    typical = float(np.median(fit.brightness[good]))
-    dim = good & ~(fit.brightness > LEAST_BRIGHTNESS * typical)
-    away = good & (np.linalg.norm(fit.centers - first, axis=1) > _LEFT_PLACE * contact)
-    close = np.linalg.norm(fit.centers[:, None] - fit.centers, axis=2) < _SAME * contact
-    moved = np.linalg.norm(fit.centers - first, axis=1)
-    for i, j in zip(*np.nonzero(np.triu(close, 1)), strict=True):
-        if good[i] and good[j]:
-            away[i if moved[i] > moved[j] else j] = True
-    fit.reason[dim], fit.reason[away & ~dim] = _NO_IMAGE, _AWAY
 
 
 def plane_columns(

@@ -134,7 +134,7 @@ def mass_cut(mass: Floats) -> float:
             f"the masses of the {mass.size} spots found have no clear gap between spheres and "
             "noise: all are kept; inspect their histogram and set minmass",
             PrecisionWarning,
-            stacklevel=4,
+            stacklevel=5,
         )
         return 0.0
     return cut
