@@ -583,3 +583,16 @@ def test_van_hove_shows_the_bins_and_the_gaussian(space):
     ax = drawn(plot.plot_van_hove(angles, ax=axes()))
     np.testing.assert_allclose(line(ax, "Brownian rotation").get_ydata(), angles.brownian)
     assert ax.get_xlabel() == "rotation angle in 1 s (rad)"
+
+
+def test_the_nearer_sphere_of_a_drawn_cluster_hides_the_other():
+    """The middle of the picture has the colour of the sphere in front, seen from either side."""
+    pair = perrin.Cluster(np.array([[0.0, 0, 1], [0, 0, -1]]))
+    for view, front in ((np.eye(3), 0), (np.diag([1.0, -1, -1]), 1)):
+        ax = Figure().subplots()
+        plot.plot_cluster(pair, ax=ax, diameter=2.0, view=view)
+        image = np.asarray(ax.images[0].get_array())
+        middle, corner = image[len(image) // 2, len(image) // 2], image[0, 0]
+        color = np.array([int(figure_style.series_color(front)[k : k + 2], 16) for k in (1, 3, 5)])
+        np.testing.assert_allclose(middle / middle.max(), color / color.max(), atol=0.02)
+        assert (corner == 1).all()
