@@ -21,7 +21,7 @@ from perrin.plot import figure_style, report_figures
 from perrin.plot import results as plot
 
 
-def measured(*, clusters=1, frames=80, planar=False, labels=None, D_R=0.02, gaps=False):
+def measured(*, clusters=1, frames=201, planar=False, labels=None, D_R=0.02, gaps=False):
     rng = np.random.default_rng(3)
     square = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.2, 1.1]])
     body = perrin.Cluster.from_positions(square) if planar else perrin.Cluster.tetrahedron(1.5)
@@ -53,7 +53,7 @@ def plane():
 
 @pytest.fixture(scope="module")
 def three():
-    return measured(clusters=3, frames=40, labels=["<b>", "a$_b$", "c"])
+    return measured(clusters=3, frames=20, labels=["<b>", "a$_b$", "c"])
 
 
 def axes(**kwargs):
@@ -225,7 +225,7 @@ def test_residuals_presence_and_refused_frames(space):
     assert np.array_equal(t, motion.time)
     assert np.allclose(shown, 1e3 * motion.residual, equal_nan=True)
     assert ax.get_ylabel() == "residual (nm)"
-    assert list(line(ax, "no pose (3 of 80").get_xdata()) == [10.0, 10.5, 20.0]
+    assert list(line(ax, "no pose (3 of 201").get_xdata()) == [10.0, 10.5, 20.0]
     expected = line(ax, "expected").get_ydata()
     assert expected[0] == pytest.approx(1e3 * motion.sigma * np.sqrt(6 / 4))
     assert expected[50] == pytest.approx(1e3 * motion.sigma * np.sqrt(3 / 3))
@@ -335,8 +335,10 @@ def without_layout(figure):
 def test_save_figures_names_its_files_and_changes_no_setting(
     tmp_path, planar, monkeypatch, repeats
 ):
-    if planar and repeats(True, False):
-        # The layout of the figures takes most of the time.
+    sheet = None
+    if repeats(True, False):
+        # The layout of the figures and the subsets of fonts take most of the time.
+        sheet = {"savefig.dpi": 30, "pdf.fonttype": 3}
         figure = report_figures.column_figure
         monkeypatch.setattr(
             report_figures,
@@ -345,7 +347,6 @@ def test_save_figures_names_its_files_and_changes_no_setting(
         )
     before = dict(rcParams)
     report = measured(planar=planar, frames=20)
-    sheet = {"savefig.dpi": 30} if repeats(True, False) else None
     seen = []
     files = report_figures.save_figures(
         report, tmp_path, sheet=sheet, progress=lambda *state: seen.append(state)
@@ -582,3 +583,16 @@ def test_van_hove_shows_the_bins_and_the_gaussian(space):
     ax = drawn(plot.plot_van_hove(angles, ax=axes()))
     np.testing.assert_allclose(line(ax, "Brownian rotation").get_ydata(), angles.brownian)
     assert ax.get_xlabel() == "rotation angle in 1 s (rad)"
+
+
+def test_the_nearer_sphere_of_a_drawn_cluster_hides_the_other():
+    """The middle of the picture has the colour of the sphere in front, seen from either side."""
+    pair = perrin.Cluster(np.array([[0.0, 0, 1], [0, 0, -1]]))
+    for view, front in ((np.eye(3), 0), (np.diag([1.0, -1, -1]), 1)):
+        ax = Figure().subplots()
+        plot.plot_cluster(pair, ax=ax, diameter=2.0, view=view)
+        image = np.asarray(ax.images[0].get_array())
+        middle, corner = image[len(image) // 2, len(image) // 2], image[0, 0]
+        color = np.array([int(figure_style.series_color(front)[k : k + 2], 16) for k in (1, 3, 5)])
+        np.testing.assert_allclose(middle / middle.max(), color / color.max(), atol=0.02)
+        assert (corner == 1).all()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
@@ -661,6 +662,7 @@ def _on_grid(values: Floats, rows: Ints, slots: Ints) -> Floats:
     return grid
 
 
+@lru_cache
 def fft_size(least: int) -> int:
     """Return the smallest 2^a 3^b 5^c that is at least `least`: such transforms are fast.
 
