@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from perrin._arrays import frozen
-from perrin.geometry.rigid import orientation_covariance
+from perrin.geometry.rigid import pose_slopes
 from perrin.motion.residuals import body_residuals, expected_squares, fit_projector
 
 if TYPE_CHECKING:
@@ -178,8 +178,9 @@ def with_error_ratio(motion: RigidMotion, ratio: Floats, stated: Floats) -> Rigi
     Returns
     -------
     RigidMotion
-        With C = L_1 L_0^-1 C L_0^-T L_1^T for the Cholesky factors of the covariances that both
-        variances give to orientations fitted with equal weights.
+        With C = L_1 L_0^-1 C L_0^-T L_1^T for the Cholesky factors of the covariances of
+        orientations fitted with the weights W of the stated variances: P = (H^T W H)^-1 with these,
+        and P H^T W V W H P with the variances V that are larger by the ratio.
 
     Examples
     --------
@@ -192,11 +193,15 @@ def with_error_ratio(motion: RigidMotion, ratio: Floats, stated: Floats) -> Rigi
     """
     rows = motion.fitted
     turn = motion.rotation[rows]
-    factors = []
-    for variance in (np.broadcast_to(stated, (len(rows), len(stated))), ratio[rows] * stated):
-        noise = np.einsum("tji,tj,tjk->tik", turn, variance, turn)
-        factors.append(np.linalg.cholesky(orientation_covariance(motion.template, noise)))
-    change = factors[1] @ np.linalg.inv(factors[0])
+    slope = pose_slopes(motion.template)[..., : motion.covariance.shape[-1]]
+    known, true = (
+        np.einsum("tji,tj,tjk->tik", turn, part, turn)
+        for part in (np.broadcast_to(1 / stated, (len(rows), len(stated))), ratio[rows] / stated)
+    )
+    # The centre of the template is the origin, so that the shift of the body has no common term.
+    P = np.linalg.inv(np.einsum("nia,tij,njb->tab", slope, known, slope))
+    spread = np.einsum("nia,tij,njb->tab", slope, true, slope)
+    change = np.linalg.cholesky(P @ spread @ P) @ np.linalg.inv(np.linalg.cholesky(P))
     covariance, center = motion.covariance.copy(), motion.center_variance.copy()
     scaled = change @ covariance[rows] @ np.swapaxes(change, 1, 2)
     covariance[rows] = 0.5 * (scaled + np.swapaxes(scaled, 1, 2))
