@@ -247,8 +247,10 @@ ONE_CASE_PER_KIND = (
 )  # fmt: skip
 
 
-def test_every_kind_of_fault_is_named():
+def test_every_kind_of_fault_is_named(repeats):
     """One table of every case: the fault is named, and no other warning appears."""
+    if not repeats(0, 1):
+        pytest.skip("benchmarks/alarms.py --quick is run by itself; here with --long")
     tallies = [NAMES.tried(case_of(name), 0, 0) for name in ONE_CASE_PER_KIND]
     for found in tallies:
         assert found.named == int(bool(found.case.expected)), found.case.name

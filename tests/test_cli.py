@@ -19,7 +19,8 @@ import pandas as pd
 import pytest
 
 import perrin
-from perrin.cli.app import analyze, app
+from command_line import command_line
+from perrin.cli.app import analyze
 from perrin.cli.tables import show_report
 
 
@@ -38,7 +39,7 @@ def run(*arguments: object, cwd: Path) -> Outcome:
         contextlib.redirect_stderr(err),
         pytest.raises(SystemExit) as end,
     ):
-        app([str(a) for a in arguments])
+        command_line([str(a) for a in arguments])
     return Outcome(end.value.code, out.getvalue(), err.getvalue())
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import importlib
 import re
 import runpy
@@ -131,13 +130,11 @@ def test_old_paths_work_and_warn(old, new):
 @cache
 def imports_of(path: Path) -> set[str]:
     """Return every module that a file imports, anywhere in it."""
-    found = set()
-    for node in ast.walk(ast.parse(path.read_text())):
-        if isinstance(node, ast.Import):
-            found |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom) and node.module:
-            found.add(node.module)
-    return found
+    statement = r"^ *(?:from|import) +([\w.]+)"
+    # The program of another process, which is text here, imports the module that holds it.
+    return set(re.findall(statement, path.read_text(), re.MULTILINE)) - {
+        f"perrin.{module_of(path)}"
+    }
 
 
 def module_of(path: Path) -> str:

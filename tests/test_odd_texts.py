@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import perrin
+from command_line import command_line
 from perrin._text import printable
-from perrin.cli.app import app
 from perrin.cli.messages import escape
 from perrin.tracks.cells import guarded_cell, unguarded_cell
 
@@ -50,7 +50,7 @@ def test_labels_are_printed_as_they_are(tmp_path, capsys, undrawn, part):
     perrin.write_tracks(table, tmp_path / "tracks.csv")
     arguments = ["analyze", tmp_path / "tracks.csv", "--dt", 0.7, "-o", tmp_path / "run"]
     with pytest.raises(SystemExit) as stopped:
-        app(list(map(str, arguments)))
+        command_line(list(map(str, arguments)))
     out, err = capsys.readouterr()
     assert not stopped.value.code
     assert not set(out + err) & set(map(chr, [*range(10), *range(11, 32), 0x202E]))
@@ -67,7 +67,7 @@ def test_a_name_that_is_no_utf8_is_printed(tmp_path, capsys):
     place = os.fsdecode(os.fsencode(tmp_path) + b"/t\xff\n.csv")
     for command in (["analyze", place, "--dt", "0.7", "-o", str(tmp_path / "run")],):
         with pytest.raises(SystemExit) as stopped:
-            app(command)
+            command_line(command)
         assert stopped.value.code == 2
         error = capsys.readouterr().err
         assert "t\\udcff" in error

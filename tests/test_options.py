@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 import perrin
+from command_line import command_line
 from perrin.cli import app as cli
 from perrin.cli.messages import in_options, options_of
 
@@ -42,9 +43,9 @@ def test_every_argument_has_its_option(command):
 
 def words_of(command) -> set[str]:
     """Return the options that the help of a command offers."""
-    from typer.testing import CliRunner
+    from click.testing import CliRunner
 
-    result = CliRunner().invoke(cli.app, [command.__name__, "--help"], env={"COLUMNS": "200"})
+    result = CliRunner().invoke(command_line, [command.__name__, "--help"], env={"COLUMNS": "200"})
     return set(re.findall(r"--([a-z][a-z-]*)", result.output))
 
 
@@ -123,19 +124,16 @@ def literals() -> tuple[str, ...]:
     for path in SOURCE.rglob("*.py"):
         if path.relative_to(SOURCE).parts[0] == "cli":
             continue
-        tree = ast.parse(path.read_text(encoding="utf-8"))
-        inside: set[int] = set()
-        for node in ast.walk(tree):
-            if isinstance(node, ast.Expr):  # docstrings
-                inside |= {id(part) for part in ast.walk(node)}
-            if id(node) in inside:
-                continue
+        waiting: list[ast.AST] = [ast.parse(path.read_text(encoding="utf-8"))]
+        while waiting:
+            node = waiting.pop()
             if isinstance(node, ast.JoinedStr):
-                inside |= {id(part) for part in ast.walk(node)}
                 parts = (str(p.value) if isinstance(p, ast.Constant) else "7" for p in node.values)
                 found.append("".join(parts))
             elif isinstance(node, ast.Constant) and isinstance(node.value, str):
                 found.append(node.value)
+            elif not (isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)):
+                waiting += ast.iter_child_nodes(node)  # but of docstrings
     return tuple(text for text in found if " " in text)
 
 
@@ -181,9 +179,9 @@ def test_no_message_of_the_library_names_an_option():
 )  # fmt: skip
 def test_many_options_are_shown_in_groups(command, headings):
     """Every option is in one group of the help, under its heading."""
-    from typer.testing import CliRunner
+    from click.testing import CliRunner
 
-    text = CliRunner().invoke(cli.app, [command.__name__, "--help"]).output
+    text = CliRunner().invoke(command_line, [command.__name__, "--help"]).output
     shown = re.findall(r"^(\w[\w ]*):$", text, re.MULTILINE)
     other = ("Other options", "Examples")
     assert [heading for heading in shown if heading not in other] == headings

@@ -449,3 +449,6 @@ def test_the_covariance_of_a_lag_with_itself_is_that_of_the_polynomials(steps, D
         expected = np.where(lag <= steps + 1 - lag, *both) + same
         found = lag_covariance(lag, steps, present=present, D=D, s=s)
         np.testing.assert_allclose(found, expected, rtol=1e-11)
+    complete = lag_covariance(lag, steps, present=None, D=D, s=s)
+    ones = lag_covariance(lag, steps, present=np.ones(steps), D=D, s=s)
+    np.testing.assert_allclose(complete, ones, rtol=1e-13)

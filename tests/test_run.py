@@ -25,6 +25,7 @@ import pandas as pd
 import pytest
 
 import perrin
+from command_line import command_line
 from perrin.diffusion.noise_model import Noise
 from perrin.images.optics.optics import CameraNoise
 from perrin.images.spheres.localisation import Method
@@ -144,10 +145,8 @@ def assert_identical(report, other):
 
 def run(*arguments):
     """Call the command line; return its exit status."""
-    from perrin.cli.app import app
-
     with pytest.raises(SystemExit) as stopped:
-        app(["run", *map(str, arguments)])
+        command_line(["run", *map(str, arguments)])
     return stopped.value.code or 0
 
 
@@ -678,9 +677,7 @@ def test_a_dask_cluster_that_loses_a_worker_gives_the_same(movie_file, known, le
 
 def test_the_page_is_right(request):
     """Every option in docs/run.md exists; with --long its example prints the same."""
-    from typer.testing import CliRunner
-
-    from perrin.cli.app import app
+    from click.testing import CliRunner
 
     page = Path(__file__).resolve().parents[1] / "docs" / "run.md"
     if request.config.getoption("--long"):
@@ -688,7 +685,7 @@ def test_the_page_is_right(request):
         assert result.attempted > 0
         assert result.failed == 0
     wide = {"COLUMNS": "200", "TERMINAL_WIDTH": "200"}
-    offered = CliRunner().invoke(app, ["run", "--help"], env=wide).output
+    offered = CliRunner().invoke(command_line, ["run", "--help"], env=wide).output
     named = set(re.findall(r"(?<![\w-])--[a-z][a-z-]+", page.read_text())) - {"--help"}
     assert len(named) > 12
     assert [option for option in sorted(named) if option not in offered] == []
@@ -716,12 +713,10 @@ def test_a_movie_without_spheres_or_scale_is_refused_in_one_line(
     """A bare TIFF without a sphere: the message names what is missing or wrong."""
     import tifffile
 
-    from perrin.cli.app import app
-
     path = tmp_path / "bare.tif"
     tifffile.imwrite(path, np.full((3, 16, 32, 32), 7, dtype=np.uint8), metadata={"axes": "TZYX"})
     with pytest.raises(SystemExit) as stopped:
-        app(["run", str(path), *OPTIONS, "-o", str(tmp_path / "run"), *options])
+        command_line(["run", str(path), *OPTIONS, "-o", str(tmp_path / "run"), *options])
     error = capsys.readouterr().err
     assert stopped.value.code == status
     assert f"perrin: {path}: {message}" in error or f"perrin: {message}" in error

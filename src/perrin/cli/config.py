@@ -43,7 +43,12 @@ def take_config(ctx: typer.Context, path: Path | None) -> Path | None:
     command = stated.pop("command", ctx.info_name)
     if command != ctx.info_name:
         raise typer.BadParameter(f"{path} is of the command {command}, not of {ctx.info_name}")
-    names = _names_of(ctx)
+    # The argument of each option, by its name without dashes.
+    names = {
+        max(one.opts, key=len, default=one.name).lstrip("-").replace("_", "-"): one.name
+        for one in ctx.command.params
+        if one.name is not None and one.name != "config"
+    }
     unknown = [name for name in stated if name.replace("_", "-") not in names]
     if unknown:
         offered = ", ".join(sorted(names))
@@ -57,16 +62,6 @@ def take_config(ctx: typer.Context, path: Path | None) -> Path | None:
         values |= {} if beside is None else {"output": beside}
     ctx.default_map = {**(ctx.default_map or {}), **values}
     return path
-
-
-def _names_of(ctx: typer.Context) -> dict[str, str]:
-    """Return the argument of each option of the command, by its name without dashes."""
-    found = {}
-    for parameter in ctx.command.params:
-        if parameter.name is not None and parameter.name != "config":
-            longest = max(parameter.opts, key=len, default=parameter.name)
-            found[longest.lstrip("-").replace("_", "-")] = parameter.name
-    return found
 
 
 def _as_option(value: Any) -> Any:  # noqa: ANN401 (whatever TOML holds)

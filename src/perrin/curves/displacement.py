@@ -482,8 +482,9 @@ def mean_square_curve(
     here = np.asarray(present(walks).any(axis=1))
     frames = place_frames(time, piece, here, dt=dt)
     sums = pair_sums(Squares(walks), frames)
-    components = sums.mean
-    sums = sums._replace(sums=components)  # the sums are not needed any more, and as large
+    # The sums are not needed any more: the means take their place.
+    components = sums.sums
+    components /= np.where(sums.pairs > 0, sums.pairs, np.nan)[:, None]
     value = components.sum(axis=1)
     pairs = sums.pairs / walks.shape[1]
     relative = relative_error(sums, frames, value / (2 * dof), pairs)

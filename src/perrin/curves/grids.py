@@ -122,10 +122,14 @@ def place_frames(time: Floats, piece: Ints, here: Bools, *, dt: float) -> Frames
     rows = np.flatnonzero(here)
     if rows.size < 2:
         raise TooFewFramesError("no two frames in one piece: a pair needs two", rows.size)
-    if rows.size == len(time):
-        slot = _one_after_another(time, piece, dt)
-        if slot is not None:
-            # Views: the arrays of the caller stay writable, and long tracks are not copied.
+    if rows.size == len(time) and piece[0] == piece[-1]:
+        slot = np.arange(len(time))
+        off = (time - time[0]) / dt
+        off -= slot
+        np.abs(off, out=off)
+        if off.max() < _EXACT_GRID and np.all(piece == piece[0]):
+            # One piece without a gap at exact times. Views: the arrays of the caller stay writable,
+            # and long tracks are not copied.
             block = np.broadcast_to(np.zeros((), dtype=np.int64), slot.shape)
             return Frames(slot[:], time[:], piece[:], block, slot, dt, exact=True)
     t, label = time[rows], piece[rows]
@@ -161,17 +165,6 @@ def place_frames(time: Floats, piece: Ints, here: Bools, *, dt: float) -> Frames
     begins |= np.append(False, np.diff(slot) > _PLACES_PER_FRAME) & sparse
     block = np.cumsum(begins) - 1
     return Frames(rows, t, label, block, slot - slot[begins][block], step, exact)
-
-
-def _one_after_another(time: Floats, piece: Ints, dt: float) -> Ints | None:
-    """Return the frame numbers of one piece without a gap, times exact; None for other frames."""
-    slot = np.arange(len(time))
-    if piece[0] != piece[-1]:
-        return None
-    off = (time - time[0]) / dt
-    off -= slot
-    np.abs(off, out=off)
-    return slot if off.max() < _EXACT_GRID and np.all(piece == piece[0]) else None
 
 
 def grid_step(durations: Floats, dt: float) -> float:

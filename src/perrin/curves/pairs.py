@@ -15,7 +15,7 @@ from perrin.errors import PrecisionWarning, TooFewFramesError
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from perrin._arrays import Floats, Ints
+    from perrin._arrays import Bools, Floats, Ints
     from perrin.curves.grids import Frames
 
     Complexes: TypeAlias = NDArray[np.complex128]
@@ -343,37 +343,13 @@ class Squares:
         self.walks = walks
 
     def within(self, rows: Ints, slots: Ints, count: int) -> tuple[Floats, Ints]:
-        """Return the sums by FFT, of one component after the other.
-
-        Without gaps the sum over the pairs of lag n is the sum of x^2 over the frames that begin
-        one, plus that over the frames that end one, less twice the autocorrelation of x; with m
-        the presence it is 2 corr(m, x^2) - 2 corr(x, x). The mean is subtracted first: the squares
-        of coordinates far from the origin would lose digits of the displacements. So is a straight
-        line v t where it is most of the motion; its share v^2 n^2 of every pair, and 2 v n times
-        the sum of the other displacements, are added back.
-        """
+        """Return the sums by FFT, of one component after the other."""
         walks = _on_grid(self.walks, rows, slots)
         here = present(walks)
-        n, walkers, components = walks.shape
-        transform = Correlations.of(n + count)
-        sums = np.empty((components, count))
-        at_once = int(np.clip(_NUMBERS_AT_ONCE // (n * walkers), 1, components))
-        parts = [slice(k, k + at_once) for k in range(0, components, at_once)]
         if here.all():
-            x, time = np.empty((at_once, walkers, n)), np.arange(0.5 * (1 - n), 0.5 * n)
-            memory = np.empty((at_once * walkers, len(transform.turn)), dtype=np.complex128)
-            for part in parts:
-                some = x[: len(sums[part])]
-                some[:] = walks[..., part].T
-                _complete_squares(some, transform, time=time, memory=memory, out=sums[part])
-            return sums.T, walkers * (n - np.arange(1, count + 1))
-        mask = np.ascontiguousarray(here.T, dtype=np.float64)
-        spectrum = transform.spectrum(mask)
-        pairs = np.rint(transform.even(squared_size(spectrum))[1 : count + 1])
-        for part in parts:
-            some = np.where(here.T, walks[..., part].T, 0.0)
-            _gapped_squares(some, mask, transform, spectrum=spectrum, pairs=pairs, out=sums[part])
-        return sums.T, pairs.astype(np.int64)
+            n, walkers, _ = walks.shape
+            return complete_squares(walks, count), walkers * (n - np.arange(1, count + 1))
+        return gapped_squares(walks, here, count)
 
     def between(self, first: Ints, last: Ints) -> tuple[Floats, Ints]:
         """Return the squared differences of pairs."""
@@ -382,74 +358,133 @@ class Squares:
         return np.where(here[..., None], square, 0.0).sum(1), here.sum(1)
 
 
-def _complete_squares(
-    x: Floats, transform: Correlations, *, time: Floats, memory: Complexes, out: Floats
-) -> None:
-    """Write sums of squared differences at lags 1, 2, ... of complete walks (q, K, n) to `out`.
+def complete_squares(walks: Floats, count: int) -> Floats:
+    """Return sums of squared differences of complete walks at lags 1 to `count`, by FFT.
 
-    `time` is that from the middle, in steps, and `memory` (q K, H) that of a transform. The walks
-    are overwritten.
+    The sum over the pairs of lag n is the sum of x^2 over the frames that begin one, plus that over
+    the frames that end one, less twice the autocorrelation of x. The mean is subtracted first: the
+    squares of coordinates far from the origin would lose digits of the displacements. So is a
+    straight line v t where it is most of the motion; its share v^2 n^2 of every pair, and 2 v n
+    times the sum of the other displacements, are added back.
+
+    Parameters
+    ----------
+    walks : ndarray, shape (T, K, c)
+        Coordinates of K walkers.
+    count : int
+        Number of lags.
+
+    Returns
+    -------
+    ndarray, shape (count, c)
+        Sums over the pairs of all walkers.
+
+    Examples
+    --------
+    >>> complete_squares(np.array([0.0, 1.0, 3.0])[:, None, None], 2).round(9)
+    array([[5.],
+           [9.]])
     """
-    count, (components, walkers, n) = out.shape[1], x.shape
-    x -= x.sum(axis=2, keepdims=True) / n
-    slope = _steady_slopes(x, time, walkers * float(time @ time))
-    rest = None
-    if slope.any():
-        x -= slope[:, None, None] * time
-        total = x.sum(axis=1)
-        rest = np.cumsum(total[:, : -count - 1 : -1] - total[:, :count], axis=1)
-    power = transform.spectrum(x.reshape(-1, n), out=memory[: components * walkers])
-    power = power.reshape(components, walkers, -1)
-    correlation = transform.even(squared_size(power, overwrite=True))
-    np.multiply(x, x, out=x)
-    square = x[:, 0] if walkers == 1 else x.sum(axis=1)
-    np.add(square[:, :count], square[:, : -count - 1 : -1], out=out)
-    np.cumsum(out, axis=1, out=out)
-    np.subtract(2 * square.sum(axis=1, keepdims=True), out, out=out)
-    correlation *= 2
-    out -= correlation[:, 1 : count + 1]
-    if rest is not None:
-        lag = np.arange(1.0, count + 1)
-        far = slope[:, None] * lag
-        out += far * (far * (walkers * (n - lag)) + 2 * rest)
-    # A sum of squares that rounds below zero is zero.
-    np.maximum(out, 0.0, out=out)
+    n, walkers, components = walks.shape
+    transform = Correlations.of(n + count)
+    half = len(transform.turn)
+    at_once = int(np.clip(_NUMBERS_AT_ONCE // (n * walkers), 1, components))
+    time = np.arange(0.5 * (1 - n), 0.5 * n)
+    spread = walkers * float(time @ time)
+    # New memory takes as long as the transforms: arrays are used again.
+    x, power = np.empty((at_once, walkers, n)), np.empty((at_once, half))
+    spectrum = np.empty((at_once * walkers, half), dtype=np.complex128)
+    sums = np.empty((components, count))
+    for low in range(0, components, at_once):
+        out = sums[low : low + at_once]
+        q = len(out)
+        some = x[:q]
+        some[:] = walks[..., low : low + at_once].T
+        some -= some.sum(axis=2, keepdims=True) / n
+        slope = _steady_slopes(some, time, spread)
+        rest = None
+        if slope.any():
+            some -= slope[:, None, None] * time
+            total = some.sum(axis=1)
+            rest = np.cumsum(total[:, : -count - 1 : -1] - total[:, :count], axis=1)
+        found = transform.spectrum(some.reshape(-1, n), out=spectrum[: q * walkers])
+        squared_size(found.reshape(q, walkers, half), overwrite=True, out=power[:q])
+        # Twice the sum of squares, less the squares of the frames that begin or end no pair.
+        np.multiply(some, some, out=some)
+        square = some[:, 0] if walkers == 1 else some.sum(axis=1)
+        np.add(square[:, :count], square[:, : -count - 1 : -1], out=out)
+        np.cumsum(out, axis=1, out=out)
+        np.subtract(2 * square.sum(axis=1, keepdims=True), out, out=out)
+        correlation = transform.even(power[:q], memory=spectrum, out=power[:q])
+        correlation *= 2
+        out -= correlation[:, 1 : count + 1]
+        if rest is not None:
+            lag = np.arange(1.0, count + 1)
+            far = slope[:, None] * lag
+            out += far * (far * (walkers * (n - lag)) + 2 * rest)
+        # A sum of squares that rounds below zero is zero.
+        np.maximum(out, 0.0, out=out)
+    return sums.T
 
 
-def _gapped_squares(
-    x: Floats,
-    mask: Floats,
-    transform: Correlations,
-    *,
-    spectrum: Complexes,
-    pairs: Floats,
-    out: Floats,
-) -> None:
-    """Write sums of squared differences at lags 1, 2, ... of walks (q, K, n) with gaps to `out`.
+def gapped_squares(walks: Floats, here: Bools, count: int) -> tuple[Floats, Ints]:
+    """Return sums of squared differences of walks with gaps at lags 1 to `count`, by FFT.
 
-    The walks are 0 where they are missing; `spectrum` is that of the presence (K, n), `mask`, and
-    `pairs` their number at every lag.
+    With m the presence the sum over the pairs is 2 corr(m, x^2) - 2 corr(x, x), after the mean and
+    a straight line are subtracted, as in `complete_squares`.
+
+    Parameters
+    ----------
+    walks : ndarray, shape (T, K, c)
+        Coordinates of K walkers.
+    here : ndarray of bool, shape (T, K)
+        Where they are present.
+    count : int
+        Number of lags.
+
+    Returns
+    -------
+    sums : ndarray, shape (count, c)
+    pairs : ndarray of int, shape (count,)
+        Sums over the pairs of all walkers, and their number.
+
+    Examples
+    --------
+    >>> walk, here = np.array([0.0, np.nan, 3.0]), np.array([True, False, True])
+    >>> sums, pairs = gapped_squares(walk[:, None, None], here[:, None], 2)
+    >>> sums.round(9), pairs
+    (array([[0.],
+           [9.]]), array([0, 1]))
     """
-    count, (components, walkers, n) = out.shape[1], x.shape
-    time = np.arange(float(n))
+    n, walkers, components = walks.shape
+    transform = Correlations.of(n + count)
+    at_once = int(np.clip(_NUMBERS_AT_ONCE // (n * walkers), 1, components))
+    mask = np.ascontiguousarray(here.T, dtype=np.float64)
+    spectrum = transform.spectrum(mask)
+    pairs = np.rint(transform.even(squared_size(spectrum))[1 : count + 1])
+    time, lag = np.arange(float(n)), np.arange(1.0, count + 1)
     number = np.maximum(mask.sum(axis=1, keepdims=True), 1.0)
-    x -= mask * (x.sum(axis=2, keepdims=True) / number)
     middle = mask * (time - (mask @ time)[:, None] / number)
-    slope = _steady_slopes(x, time, float(np.vdot(middle, middle)))
-    steady = bool(slope.any())
-    if steady:
-        x -= slope[:, None, None] * middle
-    both = transform.spectrum(np.concatenate([x, x * x]).reshape(-1, n))
-    moved, squared = both.reshape(2, components, walkers, -1)
-    power = (np.conj(spectrum) * squared).real.sum(axis=1) - squared_size(moved)
-    np.multiply(transform.even(power)[:, 1 : count + 1], 2.0, out=out)
-    if steady:
-        lag = np.arange(1.0, count + 1)
-        far = slope[:, None] * lag
-        rest = transform.odd((spectrum * np.conj(moved)).imag.sum(axis=1))[:, 1 : count + 1]
-        out += far * (far * pairs + 4 * rest)
-    # A sum of squares that rounds below zero is zero.
-    np.maximum(out, 0.0, out=out)
+    sums = np.empty((components, count))
+    for low in range(0, components, at_once):
+        out = sums[low : low + at_once]
+        x = np.where(here.T, walks[..., low : low + at_once].T, 0.0)
+        x -= mask * (x.sum(axis=2, keepdims=True) / number)
+        slope = _steady_slopes(x, time, float(np.vdot(middle, middle)))
+        steady = bool(slope.any())
+        if steady:
+            x -= slope[:, None, None] * middle
+        both = transform.spectrum(np.concatenate([x, x * x]).reshape(-1, n))
+        moved, squared = both.reshape(2, len(x), walkers, -1)
+        power = (np.conj(spectrum) * squared).real.sum(axis=1) - squared_size(moved)
+        np.multiply(transform.even(power)[:, 1 : count + 1], 2.0, out=out)
+        if steady:
+            far = slope[:, None] * lag
+            rest = transform.odd((spectrum * np.conj(moved)).imag.sum(axis=1))[:, 1 : count + 1]
+            out += far * (far * pairs + 4 * rest)
+        # A sum of squares that rounds below zero is zero.
+        np.maximum(out, 0.0, out=out)
+    return sums.T, pairs.astype(np.int64)
 
 
 def _steady_slopes(x: Floats, time: Floats, spread: float) -> Floats:
@@ -509,11 +544,19 @@ class Correlations:
             out[:, : rest.shape[1]] -= 1j * rest * self.turn[: rest.shape[1]]
         return np.fft.fft(out, axis=1, out=out) if _IN_PLACE else np.fft.fft(out, axis=1)
 
-    def even(self, power: Floats) -> Floats:
-        """Return sum_k p_k cos(2 pi (2k + 1/2) j/M)/H of p (..., H) at j = 0 to H - 1."""
-        turned = self._summed(power)
-        back = slice(len(self.turn) - turned.shape[-1], 0, -1)
-        return np.concatenate([turned.real, -turned.imag[..., back]], axis=-1)
+    def even(
+        self, power: Floats, *, memory: Complexes | None = None, out: Floats | None = None
+    ) -> Floats:
+        """Return sum_k p_k cos(2 pi (2k + 1/2) j/M)/H of p (..., H) at j = 0 to H - 1.
+
+        The complex `memory` has at least as many numbers as p; `out` may be p.
+        """
+        turned = self._summed(power, memory=memory)
+        split, back = turned.shape[-1], slice(len(self.turn) - turned.shape[-1], 0, -1)
+        out = np.empty(power.shape) if out is None else out
+        out[..., :split] = turned.real
+        np.negative(turned.imag[..., back], out=out[..., split:])
+        return out
 
     def odd(self, power: Floats) -> Floats:
         """Return sum_k p_k sin(2 pi (2k + 1/2) j/M)/H of p (..., H) at j = 0 to H - 1."""
@@ -521,17 +564,25 @@ class Correlations:
         back = slice(len(self.turn) - turned.shape[-1], 0, -1)
         return np.concatenate([-turned.imag, turned.real[..., back]], axis=-1)
 
-    def _summed(self, power: Floats) -> Complexes:
+    def _summed(self, power: Floats, *, memory: Complexes | None = None) -> Complexes:
         """Return sum_k p_k exp(-2 pi i (2k + 1/2) j/M)/H at j = 0 to H/2."""
-        summed = np.fft.rfft(power, norm="forward")
-        summed *= self.turn[: summed.shape[-1]]
+        size = len(self.turn) // 2 + 1
+        if memory is None or not _IN_PLACE:
+            summed = np.fft.rfft(power, norm="forward")
+        else:
+            shape = (*power.shape[:-1], size)
+            summed = memory.reshape(-1)[: int(np.prod(shape))].reshape(shape)
+            np.fft.rfft(power, norm="forward", out=summed)
+        summed *= self.turn[:size]
         return summed
 
 
-def squared_size(spectrum: Complexes, *, overwrite: bool = False) -> Floats:
+def squared_size(
+    spectrum: Complexes, *, overwrite: bool = False, out: Floats | None = None
+) -> Floats:
     """Return the squared absolute values of spectra (..., K, H), summed over K.
 
-    The spectra may be overwritten to save memory.
+    The spectra may be overwritten to save memory, and the sum be written to `out` (..., H).
 
     Examples
     --------
@@ -541,7 +592,7 @@ def squared_size(spectrum: Complexes, *, overwrite: bool = False) -> Floats:
     parts = spectrum.view(np.float64)
     squares = np.multiply(parts, parts, out=parts if overwrite else None)
     total = squares[..., 0, :] if squares.shape[-2] == 1 else squares.sum(axis=-2)
-    return np.asarray(total[..., ::2] + total[..., 1::2])
+    return np.add(total[..., ::2], total[..., 1::2], out=out)
 
 
 class Products:

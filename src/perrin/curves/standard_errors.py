@@ -53,7 +53,23 @@ def relative_error(sums: PairSums, frames: Frames, half: Floats, pairs: Floats) 
     """
     lag = sums.lagtime / frames.step
     d, s = two_lag_fit(lag, half, pairs)
-    total, lengths = np.zeros_like(lag), frames.lengths
+    lengths = frames.lengths
+    if len(lengths) == 1 and sums.listed is None:
+        longest = int(lengths[0])
+        whole = np.arange(1.0, len(lag) + 1)
+        if frames.exact and np.array_equal(pairs, longest + 1 - whole):
+            variance = lag_covariance(whole, longest, present=None, D=d, s=s)
+            variance *= 2
+            np.sqrt(variance, out=variance)
+            whole *= d
+            whole += s
+            whole *= pairs
+            whole *= 2
+            good = whole > 0
+            relative = np.full_like(half, np.nan)
+            np.divide(variance, whole, out=relative, where=good)
+            return relative
+    total = np.zeros_like(lag)
     blocks = [
         (int(n), int(k)) for n, k in zip(*np.unique(lengths, return_counts=True), strict=True)
     ]
@@ -71,7 +87,18 @@ def relative_error(sums: PairSums, frames: Frames, half: Floats, pairs: Floats) 
             own = lag_covariance(steps[use], length, present=present[use], D=d, s=s)
             total[part][use] += times * own * present[use] ** 4
     if sums.listed is not None:
-        total += _listed_covariances(sums.listed, frames, lag, d=d, s=s)
+        # Displacements of length l that begin a time a apart share l - a; with a common first or
+        # last frame the noise s is shared too, and where one ends at the other's beginning it
+        # counts once.
+        listed = sums.listed
+        count = np.bincount(listed.lag, minlength=len(lag)).astype(np.float64)
+        total += count * (2 * d * lag + 2 * s) ** 2
+        total += 2 * (2 * d) ** 2 * squared_shared_times(listed, frames, lag)
+        for ends in (listed.first, listed.last):
+            common = common_frames(listed.lag, ends, ends, n_lags=len(lag)) - count
+            total += common * (4 * d * lag * s + s * s)
+        chained = common_frames(listed.lag, listed.last, listed.first, n_lags=len(lag))
+        total += 2 * chained * s * s
     mean = 2 * (d * lag + s)
     relative = np.full_like(half, np.nan)
     good = (pairs > 0) & (mean > 0)
@@ -132,30 +159,34 @@ def displacement_counts(lengths: Ints, lag: Floats) -> Floats:
     return np.asarray(left[shorter] + (len(rising) - shorter) * (1 - lag))
 
 
-def _listed_covariances(
-    pairs: ListedPairs, frames: Frames, lag: Floats, *, d: float, s: float
-) -> Floats:
-    """Return the squared covariances of displacements of one bin, summed over pairs of them.
+def common_frames(bins: Ints, one: Ints, other: Ints, *, n_lags: int) -> Floats:
+    """Return how many pairs of displacements of one bin have a frame in common.
 
-    Displacements of length l that begin a time a apart share l - a; with a common first or last
-    frame the noise s is shared too, and where one ends at the other's beginning it counts once.
+    Parameters
+    ----------
+    bins : ndarray of int, shape (P,)
+        Bin of every displacement.
+    one, other : ndarray of int, shape (P,)
+        First or last frame of every displacement: the ends that are compared.
+    n_lags : int
+        Number of bins.
+
+    Returns
+    -------
+    ndarray, shape (n_lags,)
+        A displacement and itself count where both ends are the same.
+
+    Examples
+    --------
+    >>> common_frames(np.array([0, 0, 1]), np.array([1, 2, 3]), np.array([0, 1, 2]), n_lags=2)
+    array([1., 0.])
     """
-    count = np.bincount(pairs.lag, minlength=len(lag)).astype(np.float64)
-    total = count * (2 * d * lag + 2 * s) ** 2
-    total += 2 * (2 * d) ** 2 * squared_shared_times(pairs, frames, lag)
-    size = int(max(pairs.last.max(initial=0), pairs.first.max(initial=0))) + 1
-
-    def common_frames(one: Ints, other: Ints) -> Floats:
-        """Return how many pairs of displacements of one bin have a frame in common."""
-        rising = np.sort(pairs.lag * size + other)
-        wanted = pairs.lag * size + one
-        found = np.searchsorted(rising, wanted, side="right") - np.searchsorted(rising, wanted)
-        itself = 1.0 if one is other else 0.0
-        return np.asarray(np.bincount(pairs.lag, found - itself, minlength=len(lag)), np.float64)
-
-    for ends in (pairs.first, pairs.last):
-        total += common_frames(ends, ends) * (4 * d * lag * s + s * s)
-    return np.asarray(total + 2 * common_frames(pairs.last, pairs.first) * s * s)
+    size = int(max(one.max(initial=0), other.max(initial=0))) + 1
+    rising = np.sort(bins * size + other)
+    wanted = bins * size + one
+    found = np.searchsorted(rising, wanted, side="right") - np.searchsorted(rising, wanted)
+    counted = np.bincount(bins, found.astype(np.float64), minlength=n_lags)
+    return np.asarray(counted, dtype=np.float64)
 
 
 def squared_shared_times(pairs: ListedPairs, frames: Frames, lag: Floats) -> Floats:
@@ -210,13 +241,15 @@ def squared_shared_times(pairs: ListedPairs, frames: Frames, lag: Floats) -> Flo
     return np.asarray(square / scale**2)
 
 
-def lag_covariance(lag: Floats, steps: int, *, present: Floats, D: float, s: float) -> Floats:
+def lag_covariance(
+    lag: Floats, steps: int, *, present: Floats | None, D: float, s: float
+) -> Floats:
     """Return S(b, b) of `covariance_polynomials` for rising lags b, without polynomials.
 
     Parameters
     ----------
     lag, steps, present, D, s
-        As in `covariance_polynomials`.
+        As in `covariance_polynomials`; `present` None where no frame is missing.
 
     Returns
     -------
@@ -224,26 +257,41 @@ def lag_covariance(lag: Floats, steps: int, *, present: Floats, D: float, s: flo
 
     Examples
     --------
-    >>> lag_covariance(np.array([1.0, 8.0]), 10, present=np.ones(2), D=0.5, s=0.0)
+    >>> lag_covariance(np.array([1.0, 8.0]), 10, present=None, D=0.5, s=0.0)
     array([ 10., 460.])
     """
-    gap = 1 / present - 1
-    b, p = lag, steps + 1 - lag
-    squares, noise = 4 * D * D, 2 * s * s
-    middle = int(np.searchsorted(2 * b, steps + 1, side="right"))
-    total = 8 * D * s * p * b + noise * np.maximum(2 * p - b, p)
-    total *= 1 + gap
-    total += 2 * squares * p * gap * b * b
-    near, far = slice(0, middle), slice(middle, None)
-    b, q = lag[near], p[near]
-    total[near] += squares * b * (q / 3 + b / 6 + b * b * (2 * q / 3 - b / 6))
-    b, q = lag[far], p[far]
-    total[far] += squares * q * ((q * q - 1) * (q / 6 - 2 * b / 3) + b * b * q)
-    total += p * noise
-    if gap.any():
-        b = lag
-        same = (gap * gap + 2 * gap) * (2 * D * b + 2 * s) ** 2 - 2 * gap * (2 * D * b + s) ** 2
-        total += p * same
+    square, both, noise, n = 4 * D * D, 8 * D * s, 2 * s * s, float(steps + 1)
+    middle = int(np.searchsorted(2 * lag, n, side="right"))
+    # Up to half of the track a polynomial of b, beyond it one of the displacements q = n - b.
+    near = (
+        -5 / 6 * square,
+        2 / 3 * n * square,
+        -square / 6 - both,
+        n * (square / 3 + both) - 4 * noise,
+        3 * n * noise,
+    )
+    far = (
+        11 / 6 * square,
+        -8 / 3 * n * square,
+        (n * n - 5 / 6) * square - both,
+        n * (2 / 3 * square + both) + 2 * noise,
+        0.0,
+    )
+    total = np.empty_like(lag)
+    for value, x, coefficients in (
+        (total[:middle], lag[:middle], near),
+        (total[middle:], n - lag[middle:], far),
+    ):
+        value[:] = coefficients[0]
+        for coefficient in coefficients[1:]:
+            value *= x
+            value += coefficient
+    if present is None:
+        return total
+    gap, b, p = 1 / present - 1, lag, n - lag
+    total += gap * (p * b * (both + 2 * square * b) + noise * np.maximum(2 * p - b, p))
+    same = (gap * gap + 2 * gap) * (2 * D * b + 2 * s) ** 2 - 2 * gap * (2 * D * b + s) ** 2
+    total += p * same
     return total
 
 

@@ -70,7 +70,12 @@ from perrin.diffusion.likelihood import (
     newton_trial,
     ratio_bend,
 )
-from perrin.diffusion.long_time import LongTimeEstimate, long_time_diffusion
+from perrin.diffusion.long_time import (
+    LongTimeEstimate,
+    cage_threshold,
+    long_time_diffusion,
+    straight_window,
+)
 from perrin.diffusion.moments import Moments, covariance_estimate, step_cosines, trace_estimate
 from perrin.diffusion.noise_model import Noise, noise_faults
 from perrin.diffusion.relaxation import (
@@ -147,6 +152,7 @@ from perrin.diffusion.steps import (
     body_steps,
     center_steps,
     direction_steps,
+    groups_alike,
     orientation_about_mean,
     pooled_steps,
     principal_steps,
@@ -293,6 +299,7 @@ __all__ = [
     "brownian_tests_of_each",
     "by_likelihood",
     "cage_size",
+    "cage_threshold",
     "center_steps",
     "clustering",
     "combined_p",
@@ -342,6 +349,7 @@ __all__ = [
     "fractional_mean_square",
     "fractional_slope",
     "gls_weights",
+    "groups_alike",
     "highest_maxima",
     "holm",
     "identity_limits",
@@ -398,6 +406,7 @@ __all__ = [
     "step_covariance",
     "step_modes",
     "steps_of",
+    "straight_window",
     "symmetric_basis",
     "symmetric_inverses",
     "tabulated_p",

@@ -100,8 +100,34 @@ def fit_line(
     lags = GridLags.of(curve)
     if lag_range == "best":
         use = best_window(lags.longest_window())
-    else:
-        use = _lags_between(curve, lags, lag_range)
+        return _curve_estimate(curve, use, line_weights(use.steps), method="line")
+    step = lags.step
+    if isinstance(lag_range, str):
+        if lag_range != "paper":
+            raise ValueError(
+                f'lag_range: expected "best", "paper" or two lag times (s), got {lag_range!r}'
+            )
+        duration = float(lags.n_frames) * step
+        lag_range = (_PAPER_WINDOW[0] * duration, _PAPER_WINDOW[1] * duration)
+    low, high = lag_range
+    inside = (curve.lagtime > low - 1e-6 * step) & (curve.lagtime < high + 1e-6 * step)
+    use = lags.take(np.flatnonzero(inside[lags.index]))
+    if use.size < 3:
+        longest = lags.stretches[-1][0]
+        raise ValueError(
+            f"lag_range: {low:g} to {high:g} s holds {use.size} lags with data, at least 3 are "
+            f"needed; the curve runs from {step:g} to {step * longest:g} s"
+        )
+    across = np.isfinite(curve.value)
+    across[lags.index] = False
+    if np.any(inside & across):
+        first = curve.lagtime[across].min(initial=np.inf)
+        on_grid = curve.lagtime[lags.index]
+        raise ValueError(
+            f"lag_range: {np.sum(inside & across)} of the lags from {low:g} to {high:g} s join "
+            "frames across holes or uneven times, whose errors are not known here; lags up to "
+            f"{on_grid[on_grid < first].max(initial=0.0):g} s do not"
+        )
     return _curve_estimate(curve, use, line_weights(use.steps), method="line")
 
 
@@ -363,40 +389,6 @@ def best_window(lags: GridLags) -> GridLags:
             lowest, size = variance, int(m)
     # Of windows that alternate the longest is least sensitive to the noise.
     return lags.take(slice(max(tried[tried.index(size) :])))
-
-
-def _lags_between(
-    curve: LagCurve, lags: GridLags, lag_range: str | tuple[float, float]
-) -> GridLags:
-    """Return the lags with data in a range of lag times; refuse fewer than three."""
-    if isinstance(lag_range, str):
-        if lag_range != "paper":
-            raise ValueError(
-                f'lag_range: expected "best", "paper" or two lag times (s), got {lag_range!r}'
-            )
-        duration = float(lags.n_frames) * lags.step
-        lag_range = (_PAPER_WINDOW[0] * duration, _PAPER_WINDOW[1] * duration)
-    low, high = lag_range
-    step = lags.step
-    inside = (curve.lagtime > low - 1e-6 * step) & (curve.lagtime < high + 1e-6 * step)
-    use = lags.take(np.flatnonzero(inside[lags.index]))
-    if use.size < 3:
-        longest = lags.stretches[-1][0]
-        raise ValueError(
-            f"lag_range: {low:g} to {high:g} s holds {use.size} lags with data, at least 3 are "
-            f"needed; the curve runs from {step:g} to {step * longest:g} s"
-        )
-    across = np.isfinite(curve.value)
-    across[lags.index] = False
-    if np.any(inside & across):
-        first = curve.lagtime[across].min(initial=np.inf)
-        on_grid = curve.lagtime[lags.index]
-        raise ValueError(
-            f"lag_range: {np.sum(inside & across)} of the lags from {low:g} to {high:g} s join "
-            "frames across holes or uneven times, whose errors are not known here; lags up to "
-            f"{on_grid[on_grid < first].max(initial=0.0):g} s do not"
-        )
-    return use
 
 
 def line_weights(steps: Floats) -> Floats:

@@ -346,7 +346,26 @@ class FewModes:
         """Compress the steps of these motions, which have these noise profiles and numbers."""
         rows, windows, constant = [], [], np.zeros(len(tracks))
         for g, (track, profile) in enumerate(zip(tracks, profiles, strict=True)):
-            found = _modes_of_track(track, profile)
+            steps, blur = track.steps, track.blur
+            linked = steps.linked[:-1].astype(np.float64)
+            scale = float(steps.duration.mean())
+            D, offset = (float(np.trace(x)) / len(x) for x in moment_estimate(steps))
+            D = max(D, 1e-5 * float(np.mean(steps.vectors**2)) / scale)
+            if track.freedom:
+                offset = float(np.mean(profile.by_theta)) * track.theta
+                offset += float(profile.known.mean())
+            else:
+                # The covariance of neighbours contains the blur.
+                offset = max(offset, 0.0) + blur * D
+            excess = offset + profile.known - profile.known.mean()
+            places = np.log(np.maximum(excess, 1e-6 * D * scale) / (D * scale))
+            found = compress_steps(
+                steps.vectors,
+                (2 * (steps.duration - blur), blur * linked),
+                (profile.before + profile.after, -profile.after[:-1] * linked),
+                scale=scale,
+                window=(float(places.min()) - WINDOW, float(places.max()) + WINDOW),
+            )
             axes = found.power.shape[1]
             constant[g] = -0.5 * axes * found.log_det
             level = np.stack([profile.by_theta, profile.known])
@@ -398,24 +417,3 @@ class FewModes:
     def steady_motion(self, D: Floats, theta: Floats) -> tuple[Floats, Floats]:
         """Return the steady motion (G, p) of every track and its inverse covariance (G, p, p)."""
         return self.bands.steady_motion(D, theta)
-
-
-def _modes_of_track(track: NoisySteps, profile: NoiseProfile) -> EffectiveModes:
-    """Return the effective modes of a track, exact about the D and noise that moments estimate."""
-    steps, blur = track.steps, track.blur
-    linked = steps.linked[:-1].astype(np.float64)
-    motion = 2 * (steps.duration - blur), blur * linked
-    noise = profile.before + profile.after, -profile.after[:-1] * linked
-    scale = float(steps.duration.mean())
-    matrices = moment_estimate(steps)
-    D, offset = (float(np.trace(x)) / len(x) for x in matrices)
-    D = max(D, 1e-5 * float(np.mean(steps.vectors**2)) / scale)
-    if track.freedom:
-        offset = float(np.mean(profile.by_theta)) * track.theta + float(profile.known.mean())
-    else:
-        # The covariance of neighbours contains the blur.
-        offset = max(offset, 0.0) + blur * D
-    excess = profile.known - profile.known.mean()
-    places = np.log(np.maximum(offset + excess, 1e-6 * D * scale) / (D * scale))
-    window = float(places.min()) - WINDOW, float(places.max()) + WINDOW
-    return compress_steps(steps.vectors, motion, noise, scale=scale, window=window)

@@ -13,7 +13,14 @@ from perrin.diffusion.estimate import CHI2, DiffusionEstimate, Found
 from perrin.diffusion.likelihood import Likelihood, excess_scatter, excess_scatter_of_each
 from perrin.diffusion.moments import covariance_estimate, trace_estimate
 from perrin.diffusion.noise_model import Noise, noise_faults
-from perrin.diffusion.steps import NoisySteps, Quantity, Steps, pooled_steps, steps_of
+from perrin.diffusion.steps import (
+    NoisySteps,
+    Quantity,
+    Steps,
+    groups_alike,
+    pooled_steps,
+    steps_of,
+)
 from perrin.errors import PrecisionWarning, TooFewFramesError
 from perrin.motion.rigid_motion import RigidMotion
 
@@ -230,13 +237,17 @@ def _judged(
     settings: Noise,
 ) -> DiffusionEstimate:
     """Return the estimate of some motions, with what limits its precision."""
+    # The noise of one orientation or centre coordinate, mean over frames, axes and motions.
+    model = settings.model
+    squares = [float(np.mean(m.noise**2)) if isinstance(model, str) else model**2 for m in motions]
+    means = [0.5 * float(sum(np.mean(end) for end in s.variances)) for s in steps]
     estimate = DiffusionEstimate.judged(
         found,
         quantity=quantity,
         method=method,
         n_frames=sum(m.fitted.size for m in motions),
         dt=float(np.mean([m.usual_interval for m in motions])),
-        noise_variance=_noise_variance(motions, steps, settings),
+        noise_variance=float(np.mean(np.multiply(squares, means))),
         resolution_floor=float(np.mean([m.resolution_floor for m in motions]))
         if quantity == "rotation"
         else None,
@@ -260,19 +271,6 @@ def _found(
     if method == "cve":
         return Found.normal(*covariance_estimate(tracks))
     return by_likelihood(tracks)
-
-
-def _noise_variance(
-    motions: Sequence[RigidMotion], steps: Sequence[Steps], settings: Noise
-) -> float:
-    """Return the noise variance of one orientation or centre coordinate, mean over frames, axes."""
-    model = settings.model
-    squares = [float(np.mean(m.noise**2)) if isinstance(model, str) else model**2 for m in motions]
-    means = [
-        0.5 * float(np.mean(before) + np.mean(after))
-        for before, after in (s.variances for s in steps)
-    ]
-    return float(np.mean(np.multiply(squares, means)))
 
 
 def by_likelihood(tracks: Sequence[NoisySteps], *, apart: float | None = None) -> Found:
@@ -372,16 +370,11 @@ def together(tracks: Sequence[NoisySteps]) -> list[list[int]]:
     >>> together([track, track])
     [[0, 1]]
     """
-    alike: dict[tuple[bool, int, bool], list[int]] = {}
-    for i, track in enumerate(tracks):
+    keys = []
+    for track in tracks:
         even = track.steps.even
-        key = even, len(track.steps.duration) if even else 0, track.drift
-        alike.setdefault(key, []).append(i)
-    return [
-        rows[low : low + _TOGETHER]
-        for rows in alike.values()
-        for low in range(0, len(rows), _TOGETHER)
-    ]
+        keys.append((even, len(track.steps.duration) if even else 0, track.drift))
+    return groups_alike(keys, [1] * len(tracks), most=_TOGETHER)
 
 
 def _found_of_units(likelihood: Likelihood, best: ProfilePoint, wider: Floats) -> list[Found]:

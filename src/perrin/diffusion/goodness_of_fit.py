@@ -20,13 +20,13 @@ from perrin.diffusion.step_spectra import (
     fractional_slope,
     sine_spectrum,
 )
-from perrin.diffusion.steps import NoisySteps, Quantity, principal_steps
+from perrin.diffusion.steps import NoisySteps, Quantity, groups_alike, principal_steps
 from perrin.errors import TooFewFramesError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Hashable, Sequence
 
-    from perrin._arrays import Bools, Floats, Ints
+    from perrin._arrays import Bools, Floats
     from perrin.diffusion.noise_model import Noise
     from perrin.motion.rigid_motion import RigidMotion
 
@@ -194,6 +194,13 @@ class AxisModel:
         """Return the model with the mean noise in all frames."""
         level = np.broadcast_to(self.mean_known[..., None], self.known[0].shape)
         return replace(self, known=(level, level))
+
+    def of(self, rows: Bools) -> AxisModel:
+        """Return the model of some of the motions; itself where it is that of one motion."""
+        if self.steady.ndim == 3:
+            return self
+        before, after = (known[rows] for known in self.known)
+        return replace(self, known=(before, after), steady=self.steady[rows])
 
     def ratio(self, D: Floats, offset: Floats) -> Floats:
         """Return v = ln(1 + 2 o/(D tau)), o the offset."""
@@ -422,7 +429,8 @@ class AxisModel:
         d, lower, _ = dpttrf(*self.bands(fit.D, fit.offset))
         band = np.stack([np.ones_like(d), np.append(lower, 0.0)])
         e = dtbtrs(band, fit.y.reshape(-1, 1), uplo="L", diag="U")[0][:, 0] / np.sqrt(d)
-        return _unit_mean_square(e.reshape(fit.y.shape))
+        e = e.reshape(fit.y.shape)
+        return np.asarray(e / np.sqrt(np.mean(e * e, axis=-1, keepdims=True)))
 
     def mode_ratios(self, fit: AxisFit) -> Floats:
         """Return the powers of the sine modes over their variances, of mean 1, (B, A, N).
@@ -507,8 +515,33 @@ class AxisModel:
         axes, parameters = y.shape[1], 3 + self.free
         U = np.zeros((axes, parameters, len(y)))
         matrix = np.zeros((axes, parameters, parameters))
+        tau = self.tau.mean()
+        rate = _CONFINED_RATE / (self.n_steps * tau)
         for rows in blocks:
-            changes = self._covariance_changes(rows)
+            start, linked = self.start[rows], self.linked[rows]
+            stop = start + self.tau[rows]
+
+            def covariance(
+                square: Callable[[Floats], Floats], start: Floats = start, stop: Floats = stop
+            ) -> Floats:
+                """Return the covariance of the steps, from the mean square over each time."""
+
+                def between(x: Floats, y: Floats) -> Floats:
+                    return square(np.abs(x[:, None] - y))
+
+                inner = between(start, stop) + between(stop, start)
+                return np.asarray(0.5 * (inner - between(start, start) - between(stop, stop)))
+
+            duration = np.diag(2 * (stop - start))
+            chain = -(np.diag(linked[:-1].astype(np.float64), 1))
+            offset_change = 2 * np.eye(len(start)) + chain + chain.T
+            # Derivatives of the covariance for D = 1: the alternatives, ln D, and a free offset.
+            changes = [
+                covariance(lambda t: 2 * t * np.log(np.maximum(t / tau, 1e-12))),
+                covariance(lambda t: -2 * np.expm1(-rate * t) / rate) - duration,
+                duration - self.blur * offset_change,
+                *([offset_change] if self.free else []),
+            ]
             for axis, (D, offset) in enumerate(zip(fit.D[0], fit.offset[0], strict=True)):
                 noise = self.known[0][axis, rows], self.known[1][axis, rows]
                 a, b = covariance_bands(
@@ -540,70 +573,40 @@ class AxisModel:
             Score.of(value[1], g[1], information=known[1]),
         )
 
-    def _covariance_changes(self, rows: Ints) -> list[Floats]:
-        """Return derivatives of the covariance of some steps for D = 1, the alternatives first.
-
-        Then those in the logarithm of D and, where it is free, in the offset.
-        """
-        tau = self.tau.mean()
-        start, linked = self.start[rows], self.linked[rows]
-        stop = start + self.tau[rows]
-        rate = _CONFINED_RATE / (self.n_steps * tau)
-
-        def covariance(square: Callable[[Floats], Floats]) -> Floats:
-            def between(x: Floats, y: Floats) -> Floats:
-                return square(np.abs(x[:, None] - y))
-
-            inner = between(start, stop) + between(stop, start)
-            return np.asarray(0.5 * (inner - between(start, start) - between(stop, stop)))
-
-        duration = np.diag(2 * (stop - start))
-        chain = -(np.diag(linked[:-1].astype(np.float64), 1))
-        offset = 2 * np.eye(len(start)) + chain + chain.T
-        return [
-            covariance(lambda t: 2 * t * np.log(np.maximum(t / tau, 1e-12))),
-            covariance(lambda t: -2 * np.expm1(-rate * t) / rate) - duration,
-            duration - self.blur * offset,
-            *([offset] if self.free else []),
-        ]
-
     def steady_motion(self, fit: AxisFit) -> tuple[Floats, Floats, Floats]:
         """Return a steady velocity or spin, its information, and p of the F test.
 
         Their shapes are (B, p), (B, p, p) and (B,). The motion is found by generalised least
-        squares on `steady`, with D and the offset fitted again to what is left where p is below
-        0.2. F has (p, nu) degrees of freedom, nu being twice the inverse relative variance of D,
+        squares on `steady`. Where p is below 0.2, D and the offset are fitted again to what is
+        left. F has (p, nu) degrees of freedom, nu being twice the inverse relative variance of D,
         mean over the axes.
         """
         from scipy.linalg.lapack import dpttrf, dpttrs
         from scipy.special import fdtrc
 
-        shape, p = fit.y.shape, self.steady.shape[-1]
-        x = np.broadcast_to(np.swapaxes(self.steady, -3, -2), (*shape, p))
-        rows = x.reshape(-1, p)
-        rest, n = fit, self.n_steps
-        separate = self.steady.ndim == 4  # several motions, each tested as if it were alone
-        mean, information = np.zeros((shape[0], p)), np.zeros((shape[0], p, p))
-        p_value, done = np.zeros(shape[0]), np.zeros(shape[0], dtype=np.bool_)
+        p, n, sets = self.steady.shape[-1], self.n_steps, len(fit.y)
+        mean, information, p_value = np.zeros((sets, p)), np.zeros((sets, p, p)), np.zeros(sets)
+        rows, model, rest = np.arange(sets), self, fit
         for refits in range(3):
-            d, lower, _ = dpttrf(*self.bands(rest.D, rest.offset))
-            unit = dpttrs(d, lower, rows)[0].reshape(*shape, p)
-            gram = np.einsum("banp,banq->bpq", x, unit)
-            right = np.einsum("banp,ban->bp", unit, fit.y)
-            found = np.linalg.solve(gram, right[..., None])[..., 0]
-            by_D, by_offset = self.slopes(rest.D, rest.offset)
+            y = fit.y[rows]
+            x = np.broadcast_to(np.swapaxes(model.steady, -3, -2), (*y.shape, p))
+            d, lower, _ = dpttrf(*model.bands(rest.D, rest.offset))
+            unit = dpttrs(d, lower, x.reshape(-1, p))[0].reshape(len(rows), -1, p)
+            gram = np.swapaxes(x.reshape(unit.shape), 1, 2) @ unit
+            right = np.swapaxes(unit, 1, 2) @ y.reshape(len(rows), -1, 1)
+            found = np.linalg.solve(gram, right)[..., 0]
+            by_D, by_offset = model.slopes(rest.D, rest.offset)
             g = np.stack([by_D, by_offset] if self.free else [by_D], axis=-2)
-            matrix = 0.5 * np.einsum("...ik,...jk->...ij", g, g)
+            matrix = 0.5 * g @ np.swapaxes(g, -1, -2)
             nu = np.mean(2 / np.linalg.inv(matrix)[..., 0, 0], axis=1)
-            square = np.einsum("bp,bpq,bq->b", found, gram, found) * (n - 1) / (n * p)
-            mean = np.where(done[:, None], mean, found)
-            information = np.where(done[:, None, None], information, gram)
-            p_value = np.where(done, p_value, fdtrc(p, nu, square))
-            done = p_value > _NO_STEADY_MOTION
-            done = done if separate else np.full_like(done, done.all())
-            if refits == 2 or done.all():
+            square = np.sum(found * right[..., 0], axis=1) * (n - 1) / (n * p)
+            mean[rows], information[rows], p_value[rows] = found, gram, fdtrc(p, nu, square)
+            left = p_value[rows] < _NO_STEADY_MOTION
+            if refits == 2 or not left.any():
                 break
-            rest = self.fit(fit.y - np.einsum("banp,bp->ban", x, mean), near=rest)
+            rows, model = rows[left], model.of(left)
+            residual = y[left] - (x[left] @ found[left, None, :, None])[..., 0]
+            rest = model.fit(residual, near=AxisFit(y[left], rest.D[left], rest.offset[left]))
         return mean, information, p_value
 
 
@@ -956,43 +959,38 @@ def brownian_tests_of_each(
     >>> first.p["cage"] == second.p["cage"]
     True
     """
-    alike: dict[tuple[object, ...], list[int]] = {}
+    keys: list[Hashable] = []
     for i, (model, y) in enumerate(each):
         equal_noise = np.all(np.ptp(model.known[0], axis=-1) == 0)
-        key: tuple[object, ...] = (i,)
-        if model.even and equal_noise:
-            duration = float(model.tau[0])
-            key = (y.shape[1:], model.steady.shape[-1], duration, model.blur, model.free)
-        alike.setdefault(key, []).append(i)
+        duration = float(model.tau[0])
+        key = (y.shape[1:], model.steady.shape[-1], duration, model.blur, model.free)
+        keys.append(key if model.even and equal_noise else i)
     found: dict[int, BrownianTests] = {}
-    for group in alike.values():
-        at_once = max(1, _MOST_SCORES // each[group[0]][1].size)
-        for k in range(0, len(group), at_once):
-            rows = group[k : k + at_once]
-            if len(rows) == 1:
-                found[rows[0]] = brownian_tests(*each[rows[0]])
-                continue
-            some = [each[i] for i in rows]
-            before, after = (np.stack([model.known[e] for model, _ in some]) for e in (0, 1))
-            together = replace(
-                some[0][0],
-                known=(before, after),
-                steady=np.stack([model.steady for model, _ in some]),
+    for rows in groups_alike(keys, [y.size for _, y in each], most=_MOST_SCORES):
+        if len(rows) == 1:
+            found[rows[0]] = brownian_tests(*each[rows[0]])
+            continue
+        some = [each[i] for i in rows]
+        before, after = (np.stack([model.known[e] for model, _ in some]) for e in (0, 1))
+        together = replace(
+            some[0][0],
+            known=(before, after),
+            steady=np.stack([model.steady for model, _ in some]),
+        )
+        fit = together.fit(np.concatenate([y for _, y in some]))
+        scores = together.scores(fit)
+        p = approximate_p(together, fit, scores)
+        for j, (i, (model, _)) in enumerate(zip(rows, some, strict=True)):
+            one = slice(j, j + 1)
+            found[i] = _ranked_if_short(
+                model,
+                AxisFit(fit.y[one], fit.D[one], fit.offset[one]),
+                (
+                    Score(*(x[..., one] for x in scores[0])),
+                    Score(*(x[..., one] for x in scores[1])),
+                ),
+                {name: float(value[j]) for name, value in p.items()},
             )
-            fit = together.fit(np.concatenate([y for _, y in some]))
-            scores = together.scores(fit)
-            p = approximate_p(together, fit, scores)
-            for j, (i, (model, _)) in enumerate(zip(rows, some, strict=True)):
-                one = slice(j, j + 1)
-                found[i] = _ranked_if_short(
-                    model,
-                    AxisFit(fit.y[one], fit.D[one], fit.offset[one]),
-                    (
-                        Score(*(x[..., one] for x in scores[0])),
-                        Score(*(x[..., one] for x in scores[1])),
-                    ),
-                    {name: float(value[j]) for name, value in p.items()},
-                )
     return [found[i] for i in range(len(each))]
 
 
@@ -1014,7 +1012,15 @@ def _ranked_if_short(
         near = model.fit(drawn, near=fit)
         again = model.scores(near) if model.even else model.dense_scores(fit, drawn)
         null = approximate_p(model, near, again)
-        p = {name: _rank(p[name], null[name]) for name in p}
+        ranks = {}
+        for name, one in p.items():
+            # The rank among those of the draws, continued below the smallest of these.
+            order = np.sort(null[name])
+            below = int(np.searchsorted(order, one, side="right"))
+            rank = (1 + max(below, _TAIL_RANK)) / (1 + len(order))
+            edge = float(order[_TAIL_RANK - 1])
+            ranks[name] = rank if below >= _TAIL_RANK else rank * one / edge
+        p = ranks
     u = np.sum(model.prediction_errors(fit) ** 2, axis=1)[0]
     return BrownianTests(p, model, fit, scores, u, ranked)
 
@@ -1047,18 +1053,3 @@ def approximate_p(model: AxisModel, fit: AxisFit, scores: tuple[Score, Score]) -
         "largest": np.exp(-largest_share(u, axes)),
         "line": np.exp(-largest_share(modes[:, FEWEST_HALF_PERIODS - 1 :], axes)),
     }
-
-
-def _rank(p: float, null: Floats) -> float:
-    """Return the rank of a p-value among those of draws, continued below the smallest of these."""
-    order = np.sort(null)
-    below = int(np.searchsorted(order, p, side="right"))
-    if below >= _TAIL_RANK:
-        return (1 + below) / (1 + len(null))
-    edge = order[_TAIL_RANK - 1]
-    return float(min(1.0, (1 + _TAIL_RANK) / (1 + len(null)) * p / edge)) if edge > 0 else 0.0
-
-
-def _unit_mean_square(e: Floats) -> Floats:
-    """Return errors scaled to a mean square of 1 along the last axis."""
-    return np.asarray(e / np.sqrt(np.mean(e * e, axis=-1, keepdims=True)))

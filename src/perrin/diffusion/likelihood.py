@@ -23,6 +23,7 @@ from perrin.diffusion.step_kernels import (
     TridiagonalCovariance,
     difference_eigenvalues,
 )
+from perrin.diffusion.steps import groups_alike
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -509,64 +510,57 @@ def _squared_deviations(tracks: Sequence[NoisySteps], D: Floats, theta: Floats) 
 
     They are those of each motion, (2, G).
     """
-    found = np.zeros((2, len(tracks)))
-    alike: dict[tuple[int, ...], list[int]] = {}
-    for k, track in enumerate(tracks):
-        alike.setdefault(track.steps.vectors.shape, []).append(k)
-    for (count, axes), rows in alike.items():
-        if axes == 1 or count < 5:
-            continue
-        at_once = max(1, _MOST_MOTIONS_AT_ONCE // (count * axes))
-        for low in range(0, len(rows), at_once):
-            some = rows[low : low + at_once]
-            found[:, some] = _deviations_alike([tracks[k] for k in some], D[some], theta[some])
-    return found
-
-
-def _deviations_alike(tracks: Sequence[NoisySteps], D: Floats, theta: Floats) -> Floats:
-    """Return the sums of `_squared_deviations` for motions with equally many steps, (2, G)."""
     from scipy.fft import dst
 
-    count, axes = tracks[0].steps.vectors.shape
-    c = difference_eigenvalues(count)
-    weight, known = (
-        np.stack([0.5 * (pair[0].mean(axis=0) + pair[1].mean(axis=0)) for pair in pairs])
-        for pairs in ([t.weight for t in tracks], [t.known for t in tracks])
-    )
-    noise = theta[:, None] * weight + known
-    level = noise.mean(axis=1)
-    # Uneven steps are taken as even ones of their mean duration: only a width depends on it.
-    duration = np.array([t.steps.duration.mean() for t in tracks])
-    blur = np.array([t.blur for t in tracks])
-    by_D, by_noise = 2 * (duration[:, None] - blur[:, None] * c), 2 * c
-    eigen = by_D * D[:, None] + by_noise * level[:, None]
-    defined = (eigen > 0).all(axis=1)
-    eigen = np.where(defined[:, None], eigen, 1.0)
-    modes = dst(np.stack([t.steps.vectors for t in tracks]), type=1, norm="ortho", axis=1)
-    rows = np.stack([by_D, np.broadcast_to(by_noise, by_D.shape)], axis=1)
-    relative = rows / eigen[:, None]
-    fisher = np.linalg.inv(relative @ np.swapaxes(relative, 1, 2))
-    # The deviations of D and of the noise, less what the unequal noise of the axes makes of them.
-    weights = fisher @ (relative / eigen[:, None])
-    columns = np.swapaxes(modes, 1, 2)[:, None]
-    deviation = columns @ (weights[..., None] * modes[:, None])
-    unequal = (noise - level[:, None])[:, None, None] * np.eye(axes)
-    deviation = deviation - (weights @ by_noise)[..., None, None] * unequal
-    mean = np.trace(deviation, axis1=2, axis2=3)[..., None, None] / axes
-    deviation = deviation - mean * np.eye(axes)
-    flat = deviation.reshape(len(tracks), 2, -1)
-    squares = flat @ np.swapaxes(flat, 1, 2) - (axes - 1) * (axes + 2) * fisher
-    # Weights of the modes in the score of D with theta profiled out.
-    freedom = np.array([t.freedom for t in tracks])
-    free = np.isfinite(freedom)
-    by_theta = by_noise * np.where(free, weight.mean(axis=1), 0.0)[:, None]
-    known_theta = np.where(free, freedom, 0.0) / axes
-    known_theta = np.divide(known_theta, theta**2, out=np.zeros_like(theta), where=theta > 0)
-    power = ((by_theta / eigen) ** 2).sum(axis=1) + known_theta
-    crossed = (by_D * by_theta / eigen**2).sum(axis=1)
-    shared = np.divide(crossed, power, out=np.zeros_like(power), where=power > 0)
-    score = (by_D - shared[:, None] * by_theta) / eigen**2
-    scored = score[:, None] * rows
-    excess = (squares * (scored @ np.swapaxes(scored, 1, 2))).sum(axis=(1, 2))
-    scale = axes * ((score * eigen) ** 2).sum(axis=1)
-    return np.where(defined, np.stack([excess, scale]), 0.0)
+    found = np.zeros((2, len(tracks)))
+    shapes = [track.steps.vectors.shape for track in tracks]
+    sizes = [count * axes for count, axes in shapes]
+    for group in groups_alike(shapes, sizes, most=_MOST_MOTIONS_AT_ONCE):
+        count, axes = shapes[group[0]]
+        if axes == 1 or count < 5:
+            continue
+        some, own_D, own_theta = [tracks[k] for k in group], D[group], theta[group]
+        c = difference_eigenvalues(count)
+        weight, known = (
+            np.stack([0.5 * (pair[0].mean(axis=0) + pair[1].mean(axis=0)) for pair in pairs])
+            for pairs in ([t.weight for t in some], [t.known for t in some])
+        )
+        noise = own_theta[:, None] * weight + known
+        level = noise.mean(axis=1)
+        # Uneven steps are taken as even ones of their mean duration: only a width depends on it.
+        duration = np.array([t.steps.duration.mean() for t in some])
+        blur = np.array([t.blur for t in some])
+        by_D, by_noise = 2 * (duration[:, None] - blur[:, None] * c), 2 * c
+        eigen = by_D * own_D[:, None] + by_noise * level[:, None]
+        defined = (eigen > 0).all(axis=1)
+        eigen = np.where(defined[:, None], eigen, 1.0)
+        modes = dst(np.stack([t.steps.vectors for t in some]), type=1, norm="ortho", axis=1)
+        rows = np.stack([by_D, np.broadcast_to(by_noise, by_D.shape)], axis=1)
+        relative = rows / eigen[:, None]
+        fisher = np.linalg.inv(relative @ np.swapaxes(relative, 1, 2))
+        # The deviations of D and of the noise, less what the unequal noise of the axes makes of
+        # them.
+        weights = fisher @ (relative / eigen[:, None])
+        columns = np.swapaxes(modes, 1, 2)[:, None]
+        deviation = columns @ (weights[..., None] * modes[:, None])
+        unequal = (noise - level[:, None])[:, None, None] * np.eye(axes)
+        deviation = deviation - (weights @ by_noise)[..., None, None] * unequal
+        mean = np.trace(deviation, axis1=2, axis2=3)[..., None, None] / axes
+        deviation = deviation - mean * np.eye(axes)
+        flat = deviation.reshape(len(some), 2, -1)
+        squares = flat @ np.swapaxes(flat, 1, 2) - (axes - 1) * (axes + 2) * fisher
+        # Weights of the modes in the score of D with theta profiled out.
+        freedom = np.array([t.freedom for t in some])
+        free = np.isfinite(freedom)
+        by_theta = by_noise * np.where(free, weight.mean(axis=1), 0.0)[:, None]
+        known_theta = np.where(free & (own_theta > 0), freedom, 0.0) / axes
+        known_theta /= np.where(own_theta > 0, own_theta, 1.0) ** 2
+        power = ((by_theta / eigen) ** 2).sum(axis=1) + known_theta
+        crossed = (by_D * by_theta / eigen**2).sum(axis=1)
+        shared = np.divide(crossed, power, out=np.zeros_like(power), where=power > 0)
+        score = (by_D - shared[:, None] * by_theta) / eigen**2
+        scored = score[:, None] * rows
+        excess = (squares * (scored @ np.swapaxes(scored, 1, 2))).sum(axis=(1, 2))
+        scale = axes * ((score * eigen) ** 2).sum(axis=1)
+        found[:, group] = np.where(defined, np.stack([excess, scale]), 0.0)
+    return found

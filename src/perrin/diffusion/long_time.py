@@ -209,13 +209,13 @@ def long_time_diffusion(
         angle, method = 0.0, "displacements"
     else:
         if threshold is None:
-            threshold = _cage_threshold(_PooledWalk.of(motions, quantity, threshold=0.0).curve)
+            threshold = cage_threshold(_PooledWalk.of(motions, quantity, threshold=0.0).curve)
         angle = float(threshold)
         method = "threshold" if angle else "added steps"
     walk = _PooledWalk.of(motions, quantity, threshold=angle)
     if not np.nanmax(walk.curve.value) > 0:
         raise ValueError(f"motion: no {quantity} at all, so that there is no D")
-    window = _straight_window(walk.lags)
+    window = straight_window(walk.lags)
     weights = line_weights(window.steps)
     value, offset = window.line(weights)
     D, s = window.brownian_line(weights)
@@ -293,23 +293,29 @@ class _PooledWalk:
         )
         return cls(walk, time, piece, curve, GridLags.of(curve))
 
-    def fourth_cumulant(self, lag: float) -> tuple[float, int]:
-        """Return the excess of <r^4> over that of a Gaussian at a lag (s), and the pairs used."""
-        here = np.flatnonzero(np.isfinite(self.walk[:, 0]))
-        time = self.time[here]
-        partner = np.searchsorted(time, time + (lag - 0.1 * self.lags.step))
-        close = np.searchsorted(time, time + (lag + 0.1 * self.lags.step)) > partner
-        first, last = here[close], here[partner[close]]
-        same = self.piece[first] == self.piece[last]
-        x = self.walk[last[same]] - self.walk[first[same]]
-        square = np.sum(x * x, axis=1)
-        covariance = x.T @ x / len(x)
-        gaussian = np.trace(covariance) ** 2 + 2 * np.sum(covariance**2)
-        return float(np.mean(square**2) - gaussian), len(x)
 
+def cage_threshold(curve: LagCurve) -> float:
+    """Return 6 (L^2 + s)^(1/2) from the plateau of the mean square; 0 without a plateau.
 
-def _cage_threshold(curve: LagCurve) -> float:
-    """Return 6 (L^2 + s)^(1/2) from the plateau of the mean square; 0 without a plateau."""
+    L is the rms deviation from the middle of the cage along one axis, and s the noise.
+
+    Parameters
+    ----------
+    curve : LagCurve
+        Mean square of the accumulated rotation, rad^2.
+
+    Returns
+    -------
+    float
+        Angle of the threshold displacement, rad.
+
+    Examples
+    --------
+    >>> from perrin import Cluster, msad_vector, simulate_motion
+    >>> free = simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=300, rng=3)
+    >>> cage_threshold(msad_vector(free))
+    0.0
+    """
     lags = GridLags.of(curve)
     reach = max(int(lags.stretches[-1][0]) // _LONGEST_START, 4)
     edges = np.unique(np.rint(np.geomspace(1, reach, 4 * int(np.log2(reach)))))
@@ -327,8 +333,30 @@ def _cage_threshold(curve: LagCurve) -> float:
     return float(min(_CAGE_WIDTHS * width, _WIDEST_THRESHOLD))
 
 
-def _straight_window(lags: GridLags) -> GridLags:
-    """Return the lags n to 4 n of the smallest n beyond which the mean square is straight."""
+def straight_window(lags: GridLags) -> GridLags:
+    """Return the lags n to 4 n of the smallest n beyond which the mean square is straight.
+
+    Parameters
+    ----------
+    lags : GridLags
+        Lags to choose from.
+
+    Returns
+    -------
+    GridLags
+
+    Raises
+    ------
+    ValueError
+        If the track is too short, or has too few lags with data.
+
+    Examples
+    --------
+    >>> from perrin import Cluster, msad_vector, simulate_motion
+    >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=300, rng=3)
+    >>> straight_window(GridLags.of(msad_vector(truth))).steps[[0, -1]]
+    array([ 9., 36.])
+    """
     length = int(lags.stretches[-1][0])
     most = length // _LONGEST_START
     if most < 1:
@@ -386,7 +414,18 @@ def _slope_variance(
     memory = _cage_memory(walk.lags, window, D=D, s=s)
     b, c = (both - a - c) * memory, c * memory**2
     first = float(window.steps[0])
-    excess, pairs = walk.fourth_cumulant(first * window.step)
+    lag, step = first * window.step, walk.lags.step
+    here = np.flatnonzero(np.isfinite(walk.walk[:, 0]))
+    time = walk.time[here]
+    partner = np.searchsorted(time, time + (lag - 0.1 * step))
+    close = np.searchsorted(time, time + (lag + 0.1 * step)) > partner
+    begin, end = here[close], here[partner[close]]
+    same = walk.piece[begin] == walk.piece[end]
+    x = walk.walk[end[same]] - walk.walk[begin[same]]
+    pairs, covariance = len(x), x.T @ x / len(x)
+    # The fourth cumulant: the excess of <r^4> over that of a Gaussian.
+    gaussian = np.trace(covariance) ** 2 + 2 * np.sum(covariance**2)
+    excess = float(np.mean(np.sum(x * x, axis=1) ** 2) - gaussian)
     hops = max(excess, 0.0) / (first * pairs * (2 * window.dof) ** 2)
     # More hops of the same size: in proportion to D, which is unknown below its other errors.
     known = max(D, np.sqrt(a * D * D + b * D * max(s, 0.0) + c * s * s))

@@ -69,7 +69,20 @@ def covariance_estimate(tracks: Sequence[NoisySteps]) -> Moments:
         t.steps.vectors.shape[1] * float(np.sum(t.steps.duration - (0 if free else t.blur)))
         for t in tracks
     )
-    forms = [_form_of_D(t, free=free) for t in tracks]
+    # The form of each track whose mean is D times twice the time spent, all axes together.
+    forms = []
+    for track in tracks:
+        squares = float(np.sum(track.steps.vectors**2))
+        known = sum(float(k.sum()) for k in track.known)
+        if free:
+            linked = track.steps.linked[:-1]
+            share = len(track.steps.vectors) / max(int(linked.sum()), 1)
+            known -= 2 * share * _known_at_links(track)
+            products = 2 * share * _neighbour_products(track)
+            forms.append(_QuadraticForm(squares + products - known, 1.0, share))
+        else:
+            known += sum(float(w.sum()) for w in track.weight) * track.theta
+            forms.append(_QuadraticForm(squares - known, 1.0, 0.0))
     value = sum(form.value for form in forms) / total
     variance, offset_variance, offsets = 0.0, 0.0, []
     for track, form in zip(tracks, forms, strict=True):
@@ -93,21 +106,6 @@ def covariance_estimate(tracks: Sequence[NoisySteps]) -> Moments:
         float(np.mean(offsets)),
         float(np.sqrt(offset_variance)) / len(tracks),
     )
-
-
-def _form_of_D(track: NoisySteps, *, free: bool) -> _QuadraticForm:
-    """Return the form whose mean is D times twice the time spent, all axes together."""
-    y, linked = track.steps.vectors, track.steps.linked[:-1]
-    squares = float(np.sum(y * y))
-    if not free:
-        noise = sum(
-            float(np.sum(w * track.theta + k))
-            for w, k in zip(track.weight, track.known, strict=True)
-        )
-        return _QuadraticForm(squares - noise, 1.0, 0.0)
-    share = len(y) / max(int(linked.sum()), 1)
-    excess = sum(float(k.sum()) for k in track.known) - 2 * share * _known_at_links(track)
-    return _QuadraticForm(squares + 2 * share * _neighbour_products(track) - excess, 1.0, share)
 
 
 def _known_at_links(track: NoisySteps) -> float:

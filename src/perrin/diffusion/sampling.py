@@ -320,6 +320,44 @@ class SamplingBudget(Shown):
             return ample
         return min(ample, self.total_time / (self.n_frames - 1))
 
+    def limit_text(self, plan: SamplingPlan) -> str:
+        """Return the sentence that explains the best dt of a plan from what is limited."""
+        if self.photons:
+            return (
+                f"Limited photons: the error is nearly constant below SNR {_PHOTON_SNR:g}, and "
+                f"below SNR {_PHOTON_SNR_RESIDUAL:g} ({self.dt_at(_PHOTON_SNR_RESIDUAL):.3g} s) "
+                "with the noise from the residuals. The camera's own noise is not included: where "
+                "it matters, take fewer frames."
+            )
+        if self.n_frames is None:
+            more = plan.dt_best / 5
+            return (
+                "Limited time: there is no optimum, more frames always help, but slowly: five "
+                f"times as many (every {more:.3g} s) would give "
+                f"{percent(self.error(more, 'joint'))}. "
+                "Storage and bleaching limit the number of frames."
+            )
+        if self.total_time is None:
+            return (
+                f"Limited frames ({self.n_frames}): longer steps are better; beyond SNR "
+                f"{_AMPLE_SNR:g} the error falls by less than 2 % of itself."
+            )
+        lasts = plan.dt_best * (plan.n_frames - 1)
+        if lasts < 0.999 * self.total_time:
+            return (
+                f"Limited frames and time: the {plan.n_frames} frames are taken in {lasts:.3g} s; "
+                f"stretching them over all of {self.total_time:.3g} s would gain little or lose "
+                "the identity of particles."
+            )
+        below = plan.dt_best < plan.dt_min
+        limited = (
+            " That is below the window: time more than frames limits the error." if below else ""
+        )
+        return (
+            f"Limited frames and time: all {plan.n_frames} frames, evenly over "
+            f"{self.total_time:.3g} s, SNR {short(plan.snr)}.{limited}"
+        )
+
 
 def plan_sampling(
     cluster: Cluster | ArrayLike,
@@ -539,7 +577,7 @@ def _plan_reasons(
     verdict = ": do that here" if plan.dt_best > plan.dt_link else ""
     reasons = [
         window,
-        _budget_reason(plan, budget),
+        budget.limit_text(plan),
         f"Identity: nearest-neighbour linking is reliable up to {plan.dt_link:.3g} s{centre}; "
         f"assignment by the best rigid fit up to {plan.dt_rigid:.3g} s{verdict}.",
     ]
@@ -565,42 +603,6 @@ def _plan_reasons(
             "of the expected error: take shorter steps or correct for it."
         )
     return tuple(reasons)
-
-
-def _budget_reason(plan: SamplingPlan, budget: SamplingBudget) -> str:
-    """Return the sentence that explains dt_best from what is limited."""
-    if budget.photons:
-        return (
-            f"Limited photons: the error is nearly constant below SNR {_PHOTON_SNR:g}, and below "
-            f"SNR {_PHOTON_SNR_RESIDUAL:g} ({budget.dt_at(_PHOTON_SNR_RESIDUAL):.3g} s) with the "
-            "noise from the residuals. The camera's own noise is not included: where it matters, "
-            "take fewer frames."
-        )
-    if budget.n_frames is None:
-        more = plan.dt_best / 5
-        return (
-            "Limited time: there is no optimum, more frames always help, but slowly: five times "
-            f"as many (every {more:.3g} s) would give {percent(budget.error(more, 'joint'))}. "
-            "Storage and bleaching limit the number of frames."
-        )
-    if budget.total_time is None:
-        return (
-            f"Limited frames ({budget.n_frames}): longer steps are better; beyond SNR "
-            f"{_AMPLE_SNR:g} the error falls by less than 2 % of itself."
-        )
-    lasts = plan.dt_best * (plan.n_frames - 1)
-    if lasts < 0.999 * budget.total_time:
-        return (
-            f"Limited frames and time: the {plan.n_frames} frames are taken in {lasts:.3g} s; "
-            f"stretching them over all of {budget.total_time:.3g} s would gain little or lose the "
-            "identity of particles."
-        )
-    below = plan.dt_best < plan.dt_min
-    limited = " That is below the window: time more than frames limits the error." if below else ""
-    return (
-        f"Limited frames and time: all {plan.n_frames} frames, evenly over "
-        f"{budget.total_time:.3g} s, SNR {short(plan.snr)}.{limited}"
-    )
 
 
 @dataclass(frozen=True, repr=False)

@@ -12,7 +12,7 @@ from perrin._arrays import from_plain, frozen, to_plain
 from perrin.diffusion.estimators import estimate_diffusion, estimate_each, together
 from perrin.diffusion.likelihood import Likelihood
 from perrin.diffusion.step_kernels import covariance_bands
-from perrin.diffusion.steps import NoisySteps, steps_of
+from perrin.diffusion.steps import NoisySteps, groups_alike, steps_of
 from perrin.errors import PrecisionWarning, TooFewFramesError
 from perrin.geometry.rotations import exp_map
 from perrin.motion.residuals import median_present
@@ -201,10 +201,15 @@ def find_jumps(motion: RigidMotion, estimate: DiffusionEstimate) -> Jumps:
         if not more.any() or 2 * np.count_nonzero(likely | more) > len(stop):
             break
         likely |= more
-        try:
-            without_jumps = _estimated_alike(cut_at(motion, stop[likely]), estimate)
-        except TooFewFramesError:
-            return none
+        settings = replace(estimate.settings, drift=estimate.drift is not None)
+        with python_warnings.catch_warnings():
+            python_warnings.simplefilter("ignore", PrecisionWarning)
+            try:
+                without_jumps = estimate_diffusion(
+                    cut_at(motion, stop[likely]), quantity=estimate.quantity, noise=settings
+                )
+            except TooFewFramesError:
+                return none
     if not likely.any():
         return none
     step = leave_one_out_residuals([motion], [without_jumps], without=likely[None]).step[0]
@@ -246,11 +251,19 @@ def find_jumps_of_each(
     [0, 0]
     """
     suspected = np.zeros(len(motions), dtype=np.bool_)
-    for rows in _equally_many_steps(motions, estimates):
-        some, own = [motions[k] for k in rows], [estimates[k] for k in rows]
-        none = np.zeros((len(rows), len(some[0].steps()[0])), dtype=np.bool_)
-        residuals = leave_one_out_residuals(some, own, without=none)
-        suspected[rows] = _jump_candidates(residuals, none).any(axis=1)
+    counts = [len(motion.steps()[0]) for motion in motions]
+    keys = [(count, motion.dimension) for count, motion in zip(counts, motions, strict=True)]
+    testable = [n >= _FEWEST_STEPS and e.value > 0 for n, e in zip(counts, estimates, strict=True)]
+    tested = np.flatnonzero(testable).tolist()
+    for rows in groups_alike(
+        [keys[k] for k in tested], [counts[k] for k in tested], most=_MOST_STEPS
+    ):
+        bodies = [tested[row] for row in rows]
+        none = np.zeros((len(bodies), counts[bodies[0]]), dtype=np.bool_)
+        residuals = leave_one_out_residuals(
+            [motions[k] for k in bodies], [estimates[k] for k in bodies], without=none
+        )
+        suspected[bodies] = _jump_candidates(residuals, none).any(axis=1)
     found = []
     for motion, estimate, likely in zip(motions, estimates, suspected, strict=True):
         if likely:
@@ -260,22 +273,6 @@ def find_jumps_of_each(
         axes = motion.covariance.shape[-1] if estimate.quantity == "rotation" else motion.dimension
         found.append(Jumps(stop[:0], np.empty((0, axes)), np.empty(0), len(stop)))
     return found
-
-
-def _equally_many_steps(
-    motions: Sequence[RigidMotion], estimates: Sequence[DiffusionEstimate]
-) -> list[list[int]]:
-    """Return the numbers of motions that can be tested, in groups of equally many steps."""
-    alike: dict[tuple[int, int], list[int]] = {}
-    for k, (motion, estimate) in enumerate(zip(motions, estimates, strict=True)):
-        count = len(motion.steps()[0])
-        if count >= _FEWEST_STEPS and estimate.value > 0:
-            alike.setdefault((count, motion.dimension), []).append(k)
-    groups = []
-    for (count, _), rows in alike.items():
-        at_once = max(1, _MOST_STEPS // count)
-        groups += [rows[low : low + at_once] for low in range(0, len(rows), at_once)]
-    return groups
 
 
 @dataclass(frozen=True, eq=False)
@@ -892,13 +889,3 @@ def _inverse_root(a: Floats, *, least: float = 0.0) -> Floats:
     moves = values > 1e-12 * np.maximum(values[..., -1:], 1e-300)
     root = np.sqrt(np.maximum(np.where(moves, values, 1.0), least))
     return np.asarray(axes * np.where(moves, 1 / root, 0.0)[..., None, :])
-
-
-def _estimated_alike(
-    motion: RigidMotion, like: DiffusionEstimate, *, drift: bool = False
-) -> DiffusionEstimate:
-    """Estimate a motion with the settings of another estimate."""
-    settings = replace(like.settings, drift=drift or like.drift is not None)
-    with python_warnings.catch_warnings():
-        python_warnings.simplefilter("ignore", PrecisionWarning)
-        return estimate_diffusion(motion, quantity=like.quantity, noise=settings)

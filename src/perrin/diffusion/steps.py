@@ -17,7 +17,7 @@ from perrin.geometry.wahba import svd_rotation
 from perrin.motion.residuals import unit_center_variance, unit_covariance
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Hashable, Sequence
 
     from perrin._arrays import Bools, Floats, Ints
     from perrin.diffusion.noise_model import Noise
@@ -257,13 +257,8 @@ def steps_of(motion: RigidMotion, quantity: Quantity) -> Steps:
     ((99, 3), True)
     """
     known = _STEPS_OF_MOTIONS.setdefault(motion, {})
-    if quantity not in known:
-        known[quantity] = _computed_steps(motion, quantity)
-    return known[quantity]
-
-
-def _computed_steps(motion: RigidMotion, quantity: Quantity) -> Steps:
-    """Compute what `steps_of` returns."""
+    if quantity in known:
+        return known[quantity]
     start, stop = motion.steps()
     if len(start) < 2:
         raise TooFewFramesError(
@@ -295,7 +290,7 @@ def _computed_steps(motion: RigidMotion, quantity: Quantity) -> Steps:
         d = vectors.shape[1]
         noise = np.repeat(unit_center_variance(motion)[:, None], d, axis=1)
         steady = np.eye(d) * duration[:, None, None]
-    return Steps(
+    known[quantity] = Steps(
         vectors=vectors,
         duration=duration,
         start=start,
@@ -307,6 +302,34 @@ def _computed_steps(motion: RigidMotion, quantity: Quantity) -> Steps:
         complete=float(np.mean(noise[complete])),
         steady=steady,
     )
+    return known[quantity]
+
+
+def groups_alike(keys: Sequence[Hashable], sizes: Sequence[int], *, most: int) -> list[list[int]]:
+    """Return the numbers of items in groups of equal keys that are computed at once.
+
+    Parameters
+    ----------
+    keys : sequence
+        Key of every item.
+    sizes : sequence of int
+        Size of every item, the same for equal keys.
+    most : int
+        Largest sum of the sizes of a group of more than one.
+
+    Examples
+    --------
+    >>> groups_alike(["a", "b", "a", "a"], [2, 9, 2, 2], most=4)
+    [[0, 2], [3], [1]]
+    """
+    alike: dict[Hashable, list[int]] = {}
+    for k, key in enumerate(keys):
+        alike.setdefault(key, []).append(k)
+    groups = []
+    for rows in alike.values():
+        at_once = max(1, most // max(sizes[rows[0]], 1))
+        groups += [rows[low : low + at_once] for low in range(0, len(rows), at_once)]
+    return groups
 
 
 def pooled_steps(

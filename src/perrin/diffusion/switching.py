@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from typing import TypeAlias
 
     from perrin._arrays import Bools, Floats, Ints
-    from perrin.diffusion.likelihood import ProfilePoint
 
     # Points at which motions are to be filtered, and what filtering them gives.
     _Requests: TypeAlias = list[tuple["SwitchingSteps", Floats]]
@@ -643,13 +642,14 @@ def fit_switching_each(
     """
     searches: dict[int, _Search] = {}
     found: dict[int, SwitchingEstimate | ValueError] = {}
+    asked: dict[int, _Requests] = {}
+    # All searches take their steps at the same time, so that the motions are filtered together.
     for k, motions in enumerate(pools):
+        searches[k] = _two_states(motions, quantity, noise)
         try:
-            searches[k] = _two_states(motions, quantity, noise)
+            asked[k] = next(searches[k])
         except ValueError as error:
             found[k] = error
-    # All searches take their steps at the same time, so that the motions are filtered together.
-    asked = {k: next(search) for k, search in searches.items()}
     while asked:
         answers = iter(filtered_each([one for requests in asked.values() for one in requests]))
         after = {}
@@ -663,7 +663,7 @@ def fit_switching_each(
 
 
 def _two_states(motions: Sequence[RigidMotion], quantity: Quantity, settings: Noise) -> _Search:
-    """Check the motions of one pool, and return the search for their two states."""
+    """Search for the two states of a pool of motions; the estimate is what the search returns."""
     pooled_steps(motions, quantity)  # names the motion that has too few steps
     tracks = [NoisySteps.of(equalised_steps(m, quantity), settings) for m in motions]
     count = sum(len(t.steps.duration) for t in tracks)
@@ -682,19 +682,7 @@ def _two_states(motions: Sequence[RigidMotion], quantity: Quantity, settings: No
     ]
     least = 1e-6 * likelihood.mean_square
     log_theta = np.log(np.maximum(one.theta, least))
-    return _estimated(motions, steps, one, log_theta, quantity)
-
-
-def _estimated(
-    motions: Sequence[RigidMotion],
-    steps: Sequence[SwitchingSteps],
-    one: ProfilePoint,
-    log_theta: Floats,
-    quantity: Quantity,
-) -> _Search:
-    """Search for the two states of a pool; the estimate is what the search returns."""
     shared, noises, value, covariance = yield from _most_likely(steps, float(one.D[0]), log_theta)
-    count = sum(len(s.elapsed) for s in steps)
     points = [np.append(shared, own)[None] for own in noises]
     filtered = yield list(zip(steps, points, strict=True))
     states, probability = [], []

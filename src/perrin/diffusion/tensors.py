@@ -13,7 +13,7 @@ from perrin._arrays import choice_fault, refuse
 from perrin.diffusion.effective_modes import WINDOW
 from perrin.diffusion.estimate import UNITS
 from perrin.diffusion.noise_model import Noise, noise_faults
-from perrin.diffusion.steps import Quantity, body_steps
+from perrin.diffusion.steps import Quantity, body_steps, groups_alike
 from perrin.diffusion.tensor_batches import (
     SeparateTensors,
     batch_key,
@@ -646,18 +646,15 @@ def tensor_fits(
     True
     """
     found: list[TensorFit | None] = [None] * len(data)
-    together: dict[tuple[object, ...], list[int]] = {}
-    for i, one in enumerate(data):
-        if len(one.tracks) == 1 and one.tracks[0].steps.even:
-            together.setdefault(batch_key(one.tracks[0]), []).append(i)
-    for group in together.values():
-        size = data[group[0]].tracks[0].steps.vectors.size
-        at_once = max(1, _MOST_TENSORS_AT_ONCE // size)
-        for k in range(0, len(group), at_once):
-            some = group[k : k + at_once]
-            fits = _even_fits([data[i] for i in some], [bases[i] for i in some])
-            for i, even_fit in zip(some, fits, strict=True):
-                found[i] = even_fit
+    even = [i for i, one in enumerate(data) if len(one.tracks) == 1 and one.tracks[0].steps.even]
+    tracks = [data[i].tracks[0] for i in even]
+    sizes = [track.steps.vectors.size for track in tracks]
+    keys = [batch_key(track) for track in tracks]
+    for rows in groups_alike(keys, sizes, most=_MOST_TENSORS_AT_ONCE):
+        some = [even[k] for k in rows]
+        fits = _even_fits([data[i] for i in some], [bases[i] for i in some])
+        for i, even_fit in zip(some, fits, strict=True):
+            found[i] = even_fit
     fits_of_all: list[TensorFit | ValueError] = []
     for one, basis, fit in zip(data, bases, found, strict=True):
         try:

@@ -286,7 +286,17 @@ def _verdict(
         return verdict
     first = min(p, key=lambda name: p[name])
     if first == "line":
-        period = _period(tested)
+        peaks = []
+        for one in tested:
+            modes = np.sum(one.model.mode_ratios(one.fit), axis=1)[0]
+            # A vibration of any phase spreads over neighbouring sine modes: their centre of power.
+            slowest = FEWEST_HALF_PERIODS - 1
+            largest = slowest + int(np.argmax(modes[slowest:]))
+            around = np.arange(largest - 2, min(len(modes), largest + 3))
+            k = 1 + float(np.average(around, weights=modes[around]))
+            period = 2 * (one.model.n_steps + 1) * float(one.model.tau.mean()) / k
+            peaks.append((float(largest_share(modes, one.fit.D.shape[1])), period))
+        period = max(peaks)[1]
         text = f"{_SUBJECT[quantity]} vibrates with a period of {number_text(period)} s"
         return replace(verdict, kind="vibration", text=_with_p(text, p_family))
     if first in _SHAPE_TESTS:
@@ -372,8 +382,18 @@ def _shape(
     """
     motion = list(motions) if len(motions) > 1 else motions[0]
     penalty = 0.5 * np.log(sum(one.model.n_steps for one in tested))
-    gain, p_steady, p_rest = _steady_gain(tested)
-    gain -= penalty * sum(one.model.steady.shape[2] for one in tested)
+    # What a steady motion gains, its p, and that of the exponent once it is subtracted.
+    gain, p_of_each, scores = 0.0, [], []
+    for one in tested:
+        model, fit = one.model, one.fit
+        mean, _, p = model.steady_motion(fit)
+        rest = model.fit(fit.y - np.einsum("nap,bp->ban", model.steady, mean), near=fit)
+        gain += model.log_likelihood(rest) - model.log_likelihood(fit)
+        gain -= penalty * model.steady.shape[2]
+        p_of_each.append(float(p[0]))
+        scores.append((model.scores(rest) if model.even else model.dense_scores(rest, rest.y))[0])
+    p_steady = fisher(p_of_each)
+    p_rest = float(score_p(Score.total(scores), one_sided=False)[0])
     anomalous = fit_anomalous(motion, quantity=quantity, noise=settings)
     confined = None
     if anomalous.alpha < 1:
@@ -383,25 +403,11 @@ def _shape(
         taken = replace(settings, drift=True)
         with python_warnings.catch_warnings():
             python_warnings.simplefilter("ignore", PrecisionWarning)
-            model = estimate_diffusion(motion, quantity=quantity, noise=taken)
-        return "spin" if quantity == "rotation" else "drift", model
+            estimate = estimate_diffusion(motion, quantity=quantity, noise=taken)
+        return "spin" if quantity == "rotation" else "drift", estimate
     if confined is not None and others[1] > others[0]:
         return "confined", confined
     return "subdiffusion" if anomalous.alpha < 1 else "superdiffusion", anomalous
-
-
-def _steady_gain(tested: Sequence[BrownianTests]) -> tuple[float, float, float]:
-    """Return the log-likelihood gained by a steady motion, its p, and p of the exponent then."""
-    gain, p_steady, scores = 0.0, [], []
-    for one in tested:
-        model, fit = one.model, one.fit
-        mean, _, p = model.steady_motion(fit)
-        rest = model.fit(fit.y - np.einsum("nap,bp->ban", model.steady, mean), near=fit)
-        gain += model.log_likelihood(rest) - model.log_likelihood(fit)
-        p_steady.append(float(p[0]))
-        scores.append((model.scores(rest) if model.even else model.dense_scores(rest, rest.y))[0])
-    p_rest = score_p(Score.total(scores), one_sided=False)
-    return gain, fisher(p_steady), float(p_rest[0])
 
 
 def _variance(
@@ -503,21 +509,6 @@ def _noise_changes(motions: Sequence[RigidMotion], tested: Sequence[BrownianTest
     if abs(z_residual) > 3 * root:
         return bool(z_residual * z_noise > 0)
     return bool(abs(z_noise) > abs(z_D))
-
-
-def _period(tested: Sequence[BrownianTests]) -> float:
-    """Return the period of the largest line, s."""
-    peaks = []
-    for one in tested:
-        modes = np.sum(one.model.mode_ratios(one.fit), axis=1)[0]
-        # A vibration of any phase spreads over neighbouring sine modes: their centre of power.
-        slowest = FEWEST_HALF_PERIODS - 1
-        largest = slowest + int(np.argmax(modes[slowest:]))
-        around = np.arange(largest - 2, min(len(modes), largest + 3))
-        k = 1 + float(np.average(around, weights=modes[around]))
-        period = 2 * (one.model.n_steps + 1) * float(one.model.tau.mean()) / k
-        peaks.append((float(largest_share(modes, one.fit.D.shape[1])), period))
-    return max(peaks)[1]
 
 
 def _diffusion_text(

@@ -281,60 +281,39 @@ def symmetry_elements_of_each(x: Floats, tolerance: Floats) -> list[Floats]:
             misfits[body][sign, *order] = misfit
     groups: dict[tuple[_Element, ...], list[int]] = {}
     generated: dict[tuple[frozenset[_Element], frozenset[_Element]], set[_Element] | None] = {}
+    identity: _Element = (1, *range(x.shape[1]))
     for k, (misfit, own) in enumerate(zip(misfits, tolerance.tolist(), strict=True)):
-        group = _group_within(misfit, own, x.shape[1], generated)
+        # Elements are accepted best first; all products are to be among those with a known misfit.
+        allowed = frozenset(misfit)
+        within = frozenset(e for e in misfit if misfit[e] <= own) | {identity}
+        if (within, allowed) not in generated:
+            generated[within, allowed] = _generated_group(set(within), set(allowed))
+        # If all of them together generate a group of allowed elements, so do the best of them.
+        chosen = generated[within, allowed]
+        if chosen is None:
+            chosen = {identity}
+            for element in sorted(within, key=lambda e: (misfit.get(e, 0.0), e)):
+                if element not in chosen:
+                    chosen = _generated_group(chosen | {element}, set(allowed)) or chosen
+        group = (identity, *sorted(chosen - {identity}, reverse=True))
         groups.setdefault(group, []).append(k)
     matrices: dict[int, Floats] = {}
     for group, bodies in groups.items():
         elements = np.array(group, dtype=np.int64)
-        exact = _exact_elements(x[bodies], elements[:, 0, None, None], elements[:, 1:])
+        sign_of, order = elements[:, 0, None, None], elements[:, 1:]
+        # Averaging a body over the group makes it symmetric, and the matrices exact, to rounding.
+        symmetric, moving = x[bodies], np.arange(len(bodies))
+        exact = np.empty((len(bodies), len(order), 3, 3))
+        rounds = 0
+        while moving.size and rounds < 50:
+            some, rounds = symmetric[moving], rounds + 1
+            exact[moving] = sign_of * fit_rotations(sign_of * some[:, order], some[:, None])[0]
+            mean = np.einsum("bgji,bgnj->bni", exact[moving], some[:, order]) / len(order)
+            change = np.abs(mean - some).max(axis=(1, 2))
+            symmetric[moving] = mean
+            moving = moving[~(change <= 1e-15 * np.abs(mean).max(axis=(1, 2)))]
         matrices.update(zip(bodies, exact, strict=True))
     return [matrices[k] for k in range(len(x))]
-
-
-def _group_within(
-    misfit: dict[_Element, float],
-    tolerance: float,
-    n: int,
-    generated: dict[tuple[frozenset[_Element], frozenset[_Element]], set[_Element] | None],
-) -> tuple[_Element, ...]:
-    """Return the group of the elements of n particles within a tolerance, the identity first.
-
-    Elements are accepted best first. All products are to be among the elements with a known misfit.
-    `generated` holds the groups that were generated for other bodies.
-    """
-    allowed = frozenset(misfit)
-    identity: _Element = (1, *range(n))
-    within = frozenset(e for e in misfit if misfit[e] <= tolerance) | {identity}
-    if (within, allowed) not in generated:
-        generated[within, allowed] = _generated_group(set(within), set(allowed))
-    # If all of them together generate a group of allowed elements, so do the best of them.
-    group = generated[within, allowed]
-    if group is None:
-        group = {identity}
-        for element in sorted(within, key=lambda e: (misfit.get(e, 0.0), e)):
-            if element not in group:
-                group = _generated_group(group | {element}, set(allowed)) or group
-    return (identity, *sorted(group - {identity}, reverse=True))
-
-
-def _exact_elements(x: Floats, sign: Ints, order: Ints) -> Floats:
-    """Return the matrices (B, g, 3, 3) of a group for several bodies.
-
-    Averaging a body over the group makes it symmetric, and the matrices exact, to rounding.
-    """
-    matrix = np.empty((len(x), len(order), 3, 3))
-    moving = np.arange(len(x))
-    for _ in range(50):
-        some = x[moving]
-        matrix[moving] = sign * fit_rotations(sign * some[:, order], some[:, None])[0]
-        mean = np.einsum("bgji,bgnj->bni", matrix[moving], some[:, order]) / len(order)
-        change = np.abs(mean - some).max(axis=(1, 2))
-        x[moving] = mean
-        moving = moving[~(change <= 1e-15 * np.abs(mean).max(axis=(1, 2)))]
-        if not moving.size:
-            break
-    return matrix
 
 
 def _generated_group(generators: set[_Element], allowed: set[_Element]) -> set[_Element] | None:

@@ -24,9 +24,6 @@ from perrin.plot.figure_style import PALETTE
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from perrin._arrays import Floats
-    from perrin.curves.displacement import LagCurve
-    from perrin.diffusion.estimate import DiffusionEstimate
     from perrin.motion.rigid_motion import RigidMotion
 
 
@@ -66,13 +63,76 @@ def figure_5(study: Study) -> Item:
     first = _tracked(study, rng)
     curves = {"rotation": msad(first), "translation": msd(first)}
     fits = {name: fit_line(curve, lag_range=_FIT_LAGS) for name, curve in curves.items()}
-    slopes = np.array([_line_coefficients(_tracked(study, rng)) for _ in range(repeats)])
+    # D_R and D_T of plain straight lines over the paper's lag times.
+    slopes = np.empty((repeats, 2))
+    for row in slopes:
+        motion = _tracked(study, rng)
+        for column, curve in enumerate((msad(motion), msd(motion))):
+            use = (curve.lagtime >= _FIT_LAGS[0]) & (curve.lagtime <= _FIT_LAGS[1])
+            slope = np.polyfit(curve.lagtime[use], curve.value[use], 1)[0]
+            row[column] = slope / (2 * curve.dof)
     table = pd.concat(
         [pd.DataFrame({"quantity": name, "lag_s": c.lagtime, "value": c.value, "stderr": c.stderr})
          for name, c in curves.items()], ignore_index=True,
     )  # fmt: skip
-    claims = _line_claims(curves, fits)
-    claims += _scatter_claims(slopes)
+    # The fits to one track, with the procedure's own errors, and the first lag.
+    body, at_first = Cluster.touching(4, _DIAMETER), {k: c.value[0] for k, c in curves.items()}
+    floor = noise_floor(body, sigma=_SIGMA).phi2
+    center = 2 * sum(s**2 for s in _SIGMA) / 4
+    claims: tuple[Claim, ...] = (
+        statistical("one track: D_R of the line from 3 to 22 s over the planted one", "Eq. 20, "
+                    "Fig. 5, section 5", expected=1.0,
+                    measured=fits["rotation"].value / _D_R,
+                    stderr=fits["rotation"].stderr / _D_R),
+        statistical("one track: D_T of the line from 3 to 22 s over the planted one", "Eq. 24, "
+                    "Fig. 5, section 5", expected=1.0,
+                    measured=fits["translation"].value / _D_T,
+                    stderr=fits["translation"].stderr / _D_T),
+        statistical("MSAD of one frame over 4 D_R dt + Phi^2", "Eqs. 20-23, Fig. 5, section 5",
+                    expected=1.0, measured=float(at_first["rotation"] / (4 * _D_R * _DT + floor)),
+                    stderr=float(curves["rotation"].stderr[0] / at_first["rotation"])),
+        statistical("MSD of one frame over 6 D_T dt and its own offset 2 sum(sigma^2)/n", "Eq. 24, "
+                    "Fig. 5, section 5", expected=1.0,
+                    measured=float(at_first["translation"] / (6 * _D_T * _DT + center)),
+                    stderr=float(curves["translation"].stderr[0] / at_first["translation"])),
+    )  # fmt: skip
+    # The true scatter of the paper's procedure, and the errors it prints.
+    mean, spread = slopes.mean(axis=0), slopes.std(axis=0, ddof=1)
+    relative = spread / (_D_R, _D_T)
+    # Sizes are proportional to D_T^-1 and D_R^(-1/3) (Eqs. 26 and 27).
+    size_errors = relative / (3, 1)
+    error = 1 / np.sqrt(2 * repeats)
+    claims += (
+        statistical("mean D_R of the repeats over the planted one", "Table 1, section 5",
+                    expected=1.0, measured=float(mean[0] / _D_R),
+                    stderr=float(relative[0] / np.sqrt(repeats))),
+        statistical("mean D_T of the repeats over the planted one", "Table 1, section 5",
+                    expected=1.0, measured=float(mean[1] / _D_T),
+                    stderr=float(relative[1] / np.sqrt(repeats))),
+        statistical("relative error of D_R (printed 0.49/4.93)", "Table 1, section 5",
+                    expected=_D_R_ERROR / _D_R, measured=float(relative[0]),
+                    stderr=float(relative[0] * error),
+                    remark=f"D_R of the paper's procedure scatters by {100 * relative[0]:.0f} % "
+                           f"({1e3 * spread[0]:.2f}e-3 rad^2/s) over {repeats} repeats, not by the "
+                           "printed 10 %."),
+        statistical("relative error of D_T (printed 0.49/3.85)", "Table 1, section 5",
+                    expected=_D_T_ERROR / _D_T, measured=float(relative[1]),
+                    stderr=float(relative[1] * error),
+                    remark=f"D_T of the paper's procedure scatters by {100 * relative[1]:.0f} % "
+                           f"over {repeats} repeats, not by the printed 13 %."),
+        statistical("least squares over all particles explains why the rotational size is the more "
+                    "precise one, by a factor 3: relative spread of D_R over that of D_T",
+                    "section 5", expected=1 / 3,
+                    measured=float(relative[0] / relative[1]),
+                    stderr=float(relative[0] / relative[1] * np.sqrt(2) * error),
+                    remark=f"D_R and D_T scatter alike (ratio {relative[0] / relative[1]:.2f}): "
+                           "the rotational size is the more precise one because d goes as "
+                           "D_R^(-1/3) and as D_T^(-1)."),
+        statistical("relative error of the rotational size over that of the translational one, "
+                    "from Eqs. 26-27", "Eqs. 26-27, section 5", expected=1 / 3,
+                    measured=float(size_errors[0] / size_errors[1]),
+                    stderr=float(np.sqrt(2) * error / 3)),
+    )  # fmt: skip
 
     def draw(figure: Figure) -> None:
         left, right = figure.subplots(1, 2)
@@ -116,83 +176,6 @@ def _tracked(study: Study, rng: np.random.Generator) -> RigidMotion:
                             dt=_DT, n_frames=_EXPERIMENT_FRAMES, rng=rng)  # fmt: skip
     noisy = add_noise(truth.positions(), sigma=_SIGMA, rng=rng)
     return track_rotation(noisy, dt=_DT, reference="previous")
-
-
-def _line_coefficients(motion: RigidMotion) -> tuple[float, float]:
-    """Return D_R and D_T from plain straight lines over the paper's lag times."""
-    found = []
-    for curve in (msad(motion), msd(motion)):
-        use = (curve.lagtime >= _FIT_LAGS[0]) & (curve.lagtime <= _FIT_LAGS[1])
-        slope = np.polyfit(curve.lagtime[use], curve.value[use], 1)[0]
-        found.append(float(slope) / (2 * curve.dof))
-    return found[0], found[1]
-
-
-def _line_claims(
-    curves: dict[str, LagCurve], fits: dict[str, DiffusionEstimate]
-) -> tuple[Claim, ...]:
-    """Check the fits to one track, with the procedure's own errors, and the first lag."""
-    body, first = Cluster.touching(4, _DIAMETER), {k: c.value[0] for k, c in curves.items()}
-    floor = noise_floor(body, sigma=_SIGMA).phi2
-    center = 2 * sum(s**2 for s in _SIGMA) / 4
-    return (
-        statistical("one track: D_R of the line from 3 to 22 s over the planted one", "Eq. 20, "
-                    "Fig. 5, section 5", expected=1.0,
-                    measured=fits["rotation"].value / _D_R,
-                    stderr=fits["rotation"].stderr / _D_R),
-        statistical("one track: D_T of the line from 3 to 22 s over the planted one", "Eq. 24, "
-                    "Fig. 5, section 5", expected=1.0,
-                    measured=fits["translation"].value / _D_T,
-                    stderr=fits["translation"].stderr / _D_T),
-        statistical("MSAD of one frame over 4 D_R dt + Phi^2", "Eqs. 20-23, Fig. 5, section 5",
-                    expected=1.0, measured=float(first["rotation"] / (4 * _D_R * _DT + floor)),
-                    stderr=float(curves["rotation"].stderr[0] / first["rotation"])),
-        statistical("MSD of one frame over 6 D_T dt and its own offset 2 sum(sigma^2)/n", "Eq. 24, "
-                    "Fig. 5, section 5", expected=1.0,
-                    measured=float(first["translation"] / (6 * _D_T * _DT + center)),
-                    stderr=float(curves["translation"].stderr[0] / first["translation"])),
-    )  # fmt: skip
-
-
-def _scatter_claims(slopes: Floats) -> tuple[Claim, ...]:
-    """Compare the true scatter of the paper's procedure with the errors it prints."""
-    count = len(slopes)
-    mean, spread = slopes.mean(axis=0), slopes.std(axis=0, ddof=1)
-    relative = spread / (_D_R, _D_T)
-    # Sizes are proportional to D_T^-1 and D_R^(-1/3) (Eqs. 26 and 27).
-    size_errors = relative / (3, 1)
-    error = 1 / np.sqrt(2 * count)
-    return (
-        statistical("mean D_R of the repeats over the planted one", "Table 1, section 5",
-                    expected=1.0, measured=float(mean[0] / _D_R),
-                    stderr=float(relative[0] / np.sqrt(count))),
-        statistical("mean D_T of the repeats over the planted one", "Table 1, section 5",
-                    expected=1.0, measured=float(mean[1] / _D_T),
-                    stderr=float(relative[1] / np.sqrt(count))),
-        statistical("relative error of D_R (printed 0.49/4.93)", "Table 1, section 5",
-                    expected=_D_R_ERROR / _D_R, measured=float(relative[0]),
-                    stderr=float(relative[0] * error),
-                    remark=f"D_R of the paper's procedure scatters by {100 * relative[0]:.0f} % "
-                           f"({1e3 * spread[0]:.2f}e-3 rad^2/s) over {count} repeats, not by the "
-                           "printed 10 %."),
-        statistical("relative error of D_T (printed 0.49/3.85)", "Table 1, section 5",
-                    expected=_D_T_ERROR / _D_T, measured=float(relative[1]),
-                    stderr=float(relative[1] * error),
-                    remark=f"D_T of the paper's procedure scatters by {100 * relative[1]:.0f} % "
-                           f"over {count} repeats, not by the printed 13 %."),
-        statistical("least squares over all particles explains why the rotational size is the more "
-                    "precise one, by a factor 3: relative spread of D_R over that of D_T",
-                    "section 5", expected=1 / 3,
-                    measured=float(relative[0] / relative[1]),
-                    stderr=float(relative[0] / relative[1] * np.sqrt(2) * error),
-                    remark=f"D_R and D_T scatter alike (ratio {relative[0] / relative[1]:.2f}): "
-                           "the rotational size is the more precise one because d goes as "
-                           "D_R^(-1/3) and as D_T^(-1)."),
-        statistical("relative error of the rotational size over that of the translational one, "
-                    "from Eqs. 26-27", "Eqs. 26-27, section 5", expected=1 / 3,
-                    measured=float(size_errors[0] / size_errors[1]),
-                    stderr=float(np.sqrt(2) * error / 3)),
-    )  # fmt: skip
 
 
 def table_1(study: Study) -> Item:

@@ -83,7 +83,31 @@ def figure_3(study: Study) -> Item:
     )
     claims: list[Claim] = []
     for D in _PLANTED:
-        claims += _diffusion_claims(curves[D], D)
+        each = curves[D]
+        pure, noisiest = each[0.0], each[max(NOISES)]
+        where, source = f"D_R = {D:g}", "Fig. 3, section 4.1"
+        floor = noise_floor(Cluster.tetrahedron(R), sigma=max(NOISES)).phi2
+        line = np.log(pure.value[[0, 9, 99]] / pure.lagtime[[0, 9, 99]])
+        slope = 1 + float(line[2] - line[0]) / np.log(100)
+        late = {s: c.value[999] / (4 * D * 1000) for s, c in each.items()}
+        worst = max(late, key=lambda s: abs(late[s] - 1))
+        claims += [
+            statistical(f"MSAD of one step over 4 D_R dt, no noise, {where}",
+                        "Eqs. 19-20, section 4.1", expected=1.0,
+                        measured=float(pure.value[0] / (4 * D)),
+                        stderr=float(pure.stderr[0] / (4 * D))),
+            statistical(f"log-log slope without noise, lags 1 to 100, {where}", f"Eq. 20, {source}",
+                        expected=1.0, measured=slope,
+                        stderr=float(pure.stderr[99] / pure.value[99] / np.log(100))),
+            statistical("plateau: MSAD of one step at sigma = 100 nm over 4 D_R dt + Phi^2, "
+                        f"{where}", f"Eq. 22, {source}", expected=1.0,
+                        measured=float(noisiest.value[0] / (4 * D + floor)),
+                        stderr=float(noisiest.stderr[0] / noisiest.value[0])),
+            statistical(f"recovery: MSAD over 4 D_R dt at lag 1000, the worst of the noise levels "
+                        f"({1e3 * worst:.0f} nm), {where}", source, expected=1.0,
+                        measured=float(late[worst]),
+                        stderr=float(each[worst].stderr[999] / each[worst].value[999])),
+        ]  # fmt: skip
 
     def draw(figure: Figure) -> None:
         for ax, D, panel in zip(figure.subplots(1, 2), _PLANTED, "ab", strict=True):
@@ -106,34 +130,6 @@ def _curve_rows(curve: LagCurve, D: float, sigma: float) -> pd.DataFrame:
         "D_R": D, "sigma_um": sigma, "lag_ts": curve.lagtime[lags], "msad": curve.value[lags],
         "stderr": curve.stderr[lags], "theory": 4 * D * curve.lagtime[lags],
     })  # fmt: skip
-
-
-def _diffusion_claims(curves: dict[float, LagCurve], D: float) -> list[Claim]:
-    """Check slopes, plateau and recovery of one D_R."""
-    pure, noisiest = curves[0.0], curves[max(NOISES)]
-    where, source = f"D_R = {D:g}", "Fig. 3, section 4.1"
-    floor = noise_floor(Cluster.tetrahedron(R), sigma=max(NOISES)).phi2
-    line = np.log(pure.value[[0, 9, 99]] / pure.lagtime[[0, 9, 99]])
-    slope = 1 + float(line[2] - line[0]) / np.log(100)
-    late = {s: c.value[999] / (4 * D * 1000) for s, c in curves.items()}
-    worst = max(late, key=lambda s: abs(late[s] - 1))
-    return [
-        statistical(f"MSAD of one step over 4 D_R dt, no noise, {where}",
-                    "Eqs. 19-20, section 4.1", expected=1.0,
-                    measured=float(pure.value[0] / (4 * D)),
-                    stderr=float(pure.stderr[0] / (4 * D))),
-        statistical(f"log-log slope without noise, lags 1 to 100, {where}", f"Eq. 20, {source}",
-                    expected=1.0, measured=slope,
-                    stderr=float(pure.stderr[99] / pure.value[99] / np.log(100))),
-        statistical(f"plateau: MSAD of one step at sigma = 100 nm over 4 D_R dt + Phi^2, {where}",
-                    f"Eq. 22, {source}", expected=1.0,
-                    measured=float(noisiest.value[0] / (4 * D + floor)),
-                    stderr=float(noisiest.stderr[0] / noisiest.value[0])),
-        statistical(f"recovery: MSAD over 4 D_R dt at lag 1000, the worst of the noise levels "
-                    f"({1e3 * worst:.0f} nm), {where}", source, expected=1.0,
-                    measured=float(late[worst]),
-                    stderr=float(curves[worst].stderr[999] / curves[worst].value[999])),
-    ]  # fmt: skip
 
 
 def _draw_noisy(

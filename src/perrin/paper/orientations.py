@@ -50,11 +50,28 @@ def figure_2(study: Study) -> Item:
     own = np.mean(np.sum(step**2, axis=2))
     shared = np.mean([np.mean(np.sum(step[:, i] * step[:, j], axis=1))
                       for i, j in zip(*np.triu_indices(4, 1), strict=True)])  # fmt: skip
+    # A body with a constant angular velocity about z (Eq. 18).
+    omega, count = 1e-3, 5000
+    turn = Rotation.from_rotvec(omega * np.arange(count)[:, None] * [0.0, 0.0, 1.0]).as_matrix()
+    turning = track_rotation(np.einsum("tij,nj->tni", turn, body.positions), dt=1.0)
+    theta = np.deg2rad([15.0, 30.0, 60.0, 75.0])
+    tilted = np.stack([np.sin(theta), np.zeros(4), np.cos(theta)], axis=1)
+    across = turning.rotational_displacement([1.0, 0.0, 0.0])[-1]
+    angle = omega * (count - 1)
+    ratio = turning.rotational_displacement(tilted)[-1, :, 2] / (np.sin(theta) ** 2 * angle)
+    mean = turning.rotational_displacement(body.positions)[-1, :, 2].mean() / angle
+    spinning = "Eq. 18, section 4.1"
     claims = (
         Claim("p(t) is the product of rotations on p^0: largest distance to the particle's own "
               "direction, 1e4 noise-free steps", "Eq. 17, section 4.1", 0.0,
               off, 1e-10, "rounding"),
-        *_constant_velocity_claims(),
+        Claim("constant omega along z, p perpendicular: phi = (0, 0, omega t), largest deviation "
+              "(rad)", spinning, 0.0, float(np.abs(across - [0, 0, angle]).max()), 1e-9,
+              "rounding"),
+        Claim("p at an angle theta to z: phi_z/(sin^2(theta) omega t), the worst of four", spinning,
+              1.0, float(ratio[np.argmax(np.abs(ratio - 1))]), 1e-6, "steps of 1e-3 rad"),
+        Claim("average over the particles of a tetrahedron: phi_z/(omega t)", spinning, 2 / 3,
+              float(mean), 1e-6, "steps of 1e-3 rad"),
         # Exact for a tetrahedron and small steps, whatever the distribution of the steps is.
         Claim("the particles' trajectories differ: correlation of dphi of two directions, "
               "(1 + cos^2)/2 = 5/9", "Fig. 2, section 4.1", 5 / 9, float(shared / own), 1e-3,
@@ -83,30 +100,6 @@ def figure_2(study: Study) -> Item:
     )
     return Item("fig2", _ORIENTATIONS, "Fig. 2: trajectories on the sphere and in rotation space",
                 text, table, draw, claims, size=(11, 5.2))  # fmt: skip
-
-
-def _constant_velocity_claims() -> tuple[Claim, ...]:
-    """Check phi of a body with a constant angular velocity about z (Eq. 18)."""
-    omega, count = 1e-3, 5000
-    turn = Rotation.from_rotvec(omega * np.arange(count)[:, None] * [0.0, 0.0, 1.0]).as_matrix()
-    body = Cluster.tetrahedron(R)
-    motion = track_rotation(np.einsum("tij,nj->tni", turn, body.positions), dt=1.0)
-    theta = np.deg2rad([15.0, 30.0, 60.0, 75.0])
-    tilted = np.stack([np.sin(theta), np.zeros(4), np.cos(theta)], axis=1)
-    perpendicular = motion.rotational_displacement([1.0, 0.0, 0.0])[-1]
-    angle = omega * (count - 1)
-    source = "Eq. 18, section 4.1"
-    ratio = motion.rotational_displacement(tilted)[-1, :, 2] / (np.sin(theta) ** 2 * angle)
-    mean = motion.rotational_displacement(body.positions)[-1, :, 2].mean() / angle
-    return (
-        Claim("constant omega along z, p perpendicular: phi = (0, 0, omega t), largest deviation "
-              "(rad)", source, 0.0, float(np.abs(perpendicular - [0, 0, angle]).max()), 1e-9,
-              "rounding"),
-        Claim("p at an angle theta to z: phi_z/(sin^2(theta) omega t), the worst of four", source,
-              1.0, float(ratio[np.argmax(np.abs(ratio - 1))]), 1e-6, "steps of 1e-3 rad"),
-        Claim("average over the particles of a tetrahedron: phi_z/(omega t)", source, 2 / 3,
-              float(mean), 1e-6, "steps of 1e-3 rad"),
-    )  # fmt: skip
 
 
 def axes(study: Study) -> Item:
@@ -241,6 +234,16 @@ def appendix(study: Study) -> Item:
     turned = np.einsum("kij,kj->ki", rotation, w)
     sine = np.sin(angle)[:, None] * axis
     section = "appendix"
+    # Angles near 0 and near pi, and axes along x.
+    hard = np.array([1e-8, 1e-4, 1.0, np.pi - 1e-4, np.pi - 1e-8])
+    hard_axis = unit(
+        np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [1.0, 1e-9, 0.0]])
+    )
+    vectors = (hard[:, None, None] * hard_axis).reshape(-1, 3)
+    found_axis, found = axis_angle(Rotation.from_rotvec(vectors).as_matrix())
+    wanted = np.tile(hard_axis, (len(hard), 1))
+    off = np.linalg.norm(np.cross(found_axis, wanted), axis=1) * found
+    off = max(np.abs(found - np.repeat(hard, len(hard_axis))).max(), off.max())
     claims = [
         Claim("R u = u: largest error, 2000 random rotations", f"Eq. 28, {section}", 0.0,
               float(np.abs(np.einsum("kij,kj->ki", rotation, axis) - axis).max()), 1e-9,
@@ -251,9 +254,17 @@ def appendix(study: Study) -> Item:
         Claim("sin(dphi) u = w x w': largest error", f"Eq. 31, {section}", 0.0,
               float(np.abs(np.cross(w, turned) - sine).max()), 1e-9, "rounding"),
         Claim("angles near 0, near pi, and axes along x, where Eq. 29 is 0/0: largest error (rad)",
-              f"Eqs. 28-31, {section}", 0.0, _hard_case_error(), 1e-9, "rounding"),
+              f"Eqs. 28-31, {section}", 0.0, float(off), 1e-9, "rounding"),
     ]  # fmt: skip
-    table = _turned_directions()
+    # By which angle a rotation turns directions at angles theta to its axis.
+    parts = []
+    for theta in (15.0, 30.0, 60.0, 90.0):
+        turn = np.linspace(0.01, np.pi, 100)
+        p = np.array([np.sin(np.deg2rad(theta)), 0.0, np.cos(np.deg2rad(theta))])
+        moved = Rotation.from_rotvec(turn[:, None] * [0.0, 0.0, 1.0]).apply(p)
+        seen = np.arctan2(np.linalg.norm(np.cross(p, moved), axis=1), moved @ p)
+        parts.append(pd.DataFrame({"theta_deg": theta, "turn": turn, "seen": seen}))
+    table = pd.concat(parts, ignore_index=True)
     square = np.sin(np.deg2rad(table["theta_deg"])) ** 2
     formula = np.arccos(np.clip(square * np.cos(table["turn"]) + 1 - square, -1, 1))
     small = table[table["turn"] == table["turn"].min()]
@@ -290,29 +301,6 @@ def appendix(study: Study) -> Item:
     )
     return Item("appendix", _APPENDIX, "Axis and angle, and the angle by which a direction turns",
                 text, table, draw, tuple(claims), size=(6.5, 4.6))  # fmt: skip
-
-
-def _hard_case_error() -> float:
-    """Return the largest error of the angle and, up to its sign, of the axis in hard cases."""
-    angle = np.array([1e-8, 1e-4, 1.0, np.pi - 1e-4, np.pi - 1e-8])
-    axis = unit(np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [1.0, 1e-9, 0.0]]))
-    planted = (angle[:, None, None] * axis).reshape(-1, 3)
-    found_axis, found = axis_angle(Rotation.from_rotvec(planted).as_matrix())
-    wanted = np.tile(axis, (len(angle), 1))
-    off = np.linalg.norm(np.cross(found_axis, wanted), axis=1) * found
-    return float(max(np.abs(found - np.repeat(angle, len(axis))).max(), off.max()))
-
-
-def _turned_directions() -> pd.DataFrame:
-    """Return by which angle ("seen") a rotation turns directions at angles theta to its axis."""
-    parts = []
-    for theta in (15.0, 30.0, 60.0, 90.0):
-        turn = np.linspace(0.01, np.pi, 100)
-        p = np.array([np.sin(np.deg2rad(theta)), 0.0, np.cos(np.deg2rad(theta))])
-        moved = Rotation.from_rotvec(turn[:, None] * [0.0, 0.0, 1.0]).apply(p)
-        seen = np.arctan2(np.linalg.norm(np.cross(p, moved), axis=1), moved @ p)
-        parts.append(pd.DataFrame({"theta_deg": theta, "turn": turn, "seen": seen}))
-    return pd.concat(parts, ignore_index=True)
 
 
 def figure_6(study: Study) -> Item:

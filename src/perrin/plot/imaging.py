@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
+import pandas as pd
 from matplotlib.collections import EllipseCollection
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator
@@ -27,7 +28,6 @@ from perrin.plot.figure_style import (
 if TYPE_CHECKING:
     import os
 
-    import pandas as pd
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
@@ -151,16 +151,21 @@ def plot_masses(imaging: Imaging, *, ax: Axes) -> Axes:
     mass = mass[mass > 0]
     if not mass.size:
         return write_reason(ax, "no spots in the sampled frames", framed=True)
-    edges = _mass_edges(mass, imaging.minmass)
-    kept = mass >= imaging.minmass
+    # Equal bins of the logarithm over all masses; one of their edges is the cut.
+    low, high, cut = float(mass.min()), float(mass.max()), imaging.minmass
+    edges = np.geomspace(low / 1.01, high * 1.01, _MASS_BINS)
+    if cut > 0:
+        low, high = min(low, cut), max(high, cut)
+        ratio = (1.01 * high / low) ** (1 / _MASS_BINS)
+        below, above = np.ceil(np.log([cut / low, high / cut]) / np.log(ratio)).astype(int) + 1
+        edges = cut * ratio ** np.arange(-below, above + 1)
+    kept = mass >= cut
     for which, color, verdict in ((~kept, GREY, "rejected"), (kept, series_color(0), "kept")):
         if which.any():
             ax.hist(mass[which], edges.tolist(), color=color, label=f"{which.sum()} {verdict}")
-    if imaging.minmass > 0:
-        label = f"cut at {number_text(imaging.minmass)}"
-        ax.axvline(
-            imaging.minmass, color=series_color(1), lw=line_width(0.95), ls="--", label=label
-        )
+    if cut > 0:
+        label = f"cut at {number_text(cut)}"
+        ax.axvline(cut, color=series_color(1), lw=line_width(0.95), ls="--", label=label)
     ax.set(xscale="log", xlabel="mass (grey levels)", ylabel="spots")
     _count_axis(ax)
     legend_above(ax, ncols=3)
@@ -233,8 +238,11 @@ def plot_rigidity(report: Report, *, ax: Axes) -> Axes:
     if not results:
         return write_reason(ax, "no cluster was tracked", framed=True)
     few, start = len(results) <= _COLORED_CLUSTERS, _tracks_start(report)
+    dt, residuals = results[0].motion.dt, []
     for result in results:
         motion = result.motion
+        # The same time of clusters with different first frames may differ by rounding.
+        residuals.append(pd.Series(motion.residual, index=np.rint(motion.time / dt)))
         style: dict[str, Any] = {"color": GREY, "alpha": 0.5, "lw": line_width(0.4)}
         if few:
             style = {
@@ -245,9 +253,10 @@ def plot_rigidity(report: Report, *, ax: Axes) -> Axes:
         raster = len(motion.time) * len(results) > _VECTOR_POINTS
         ax.plot(start + motion.time, 1e3 * motion.residual, rasterized=raster, **style)
     if not few:
-        time, middle = _median_residual(report)
+        middle = pd.concat(residuals).dropna().groupby(level=0).median()
         label = f"median of {len(results)} clusters"
-        ax.plot(start + time, 1e3 * middle, color=ink(), lw=line_width(0.8), label=label)
+        time = start + middle.index.to_numpy() * dt
+        ax.plot(time, 1e3 * middle.to_numpy(), color=ink(), lw=line_width(0.8), label=label)
     tops = [float(np.nanmax(r.motion.residual, initial=0.0)) for r in results]
     worst: ClusterResult | RodResult = results[int(np.argmax(tops))]
     k = int(np.nanargmax(worst.motion.residual))
@@ -281,7 +290,15 @@ def plot_step_angles(report: Report, *, ax: Axes) -> Axes:
         largest steps; a dotted line within the range marks the smallest rotation that maps a body
         onto itself.
     """
-    angle, duration, end = _rotation_steps(report)
+    turns, durations, end = [np.empty(0)], [np.empty(0)], []
+    for result in report.clusters:
+        motion = result.motion
+        first, last = motion.steps()
+        turns.append(np.rad2deg(np.linalg.norm(motion.step_vectors()[last - 1], axis=-1)))
+        durations.append(motion.time[last] - motion.time[first])
+        frames = stack_frames(report, motion)[last]
+        end += [f"{_cluster_label(result)}, frame {frame}" for frame in frames]
+    angle, duration = np.concatenate(turns), np.concatenate(durations)
     if not angle.size:
         return write_reason(ax, "no step between two poses", framed=True)
     top = 1.08 * max(float(angle.max()), 1e-3)
@@ -547,44 +564,6 @@ def _draw_circles(
         )
         ax.add_collection(circles, autolim=False)
     ax.axis(limits)
-
-
-def _mass_edges(mass: Floats, minmass: float) -> Floats:
-    """Return the edges of equal logarithmic bins over all masses; one of them is the cut."""
-    low, high = float(mass.min()), float(mass.max())
-    if minmass <= 0:
-        return np.geomspace(low / 1.01, high * 1.01, _MASS_BINS)
-    low, high = min(low, minmass), max(high, minmass)
-    ratio = (1.01 * high / low) ** (1 / _MASS_BINS)
-    below = int(np.ceil(np.log(minmass / low) / np.log(ratio))) + 1
-    above = int(np.ceil(np.log(high / minmass) / np.log(ratio))) + 1
-    return np.asarray(minmass * ratio ** np.arange(-below, above + 1))
-
-
-def _median_residual(report: Report) -> tuple[Floats, Floats]:
-    """Return times, s, and at each the median of the residuals of all clusters, um."""
-    time = np.concatenate([r.motion.time for r in report.results])
-    residual = np.concatenate([r.motion.residual for r in report.results])
-    known = np.isfinite(residual)
-    # The same time of clusters with different first frames may differ by rounding.
-    frame = np.rint(time[known] / report.results[0].motion.dt)
-    shared, which = np.unique(frame, return_inverse=True)
-    order = np.argsort(which, kind="stable")
-    parts = np.split(residual[known][order], np.cumsum(np.bincount(which))[:-1])
-    return shared * report.results[0].motion.dt, np.array([np.median(p) for p in parts])
-
-
-def _rotation_steps(report: Report) -> tuple[Floats, Floats, list[str]]:
-    """Return angle (degrees), duration (s), and cluster and last frame of every step."""
-    angle, duration = [np.empty(0)], [np.empty(0)]
-    end: list[str] = []
-    for result in report.clusters:
-        motion = result.motion
-        start, stop = motion.steps()
-        angle.append(np.rad2deg(np.linalg.norm(motion.step_vectors()[stop - 1], axis=-1)))
-        duration.append(motion.time[stop] - motion.time[start])
-        end += [f"{_cluster_label(result)}, frame {k}" for k in stack_frames(report, motion)[stop]]
-    return np.concatenate(angle), np.concatenate(duration), end
 
 
 def step_angle_density(

@@ -86,10 +86,52 @@ def plot_lag_curve(
     -------
     matplotlib.axes.Axes
     """
-    _draw_curve_points(curve, ax=ax, label=label)
+    kept = _shown_lags(curve)
+    kept = kept[curve.value[kept] > 0]
+    t, value, error = curve.lagtime[kept], curve.value[kept], curve.stderr[kept]
+    # Where the standard error is as large as the value, the band would reach zero.
+    low, high = np.maximum(value - error, 1e-2 * value), value + error
+    sure = t <= 0.25 * curve.lagtime[-1]
+    rest = t >= t[sure].max(initial=0.0)
+    points: dict[str, Any] = {"color": ink(), "ms": marker_size(0.65), "mew": 0}
+    name = label or CURVE_NAMES[curve.quantity][0]
+    ax.plot(t[sure], value[sure], ".", label=name, **points)
+    if not sure.all():
+        name = "beyond ¼ of the track"
+        ax.plot(t[~sure], value[~sure], ".", alpha=0.3, label=name, **points)
+    band: dict[str, Any] = {"color": GREY, "lw": 0}
+    ax.fill_between(t[sure], low[sure], high[sure], alpha=0.35, label="± 1 standard error", **band)
+    ax.fill_between(t[rest], low[rest], high[rest], alpha=0.15, **band)
     line = model_line(curve, estimate, tensor)
     if line is not None:
-        _draw_model_line(curve, line, ax=ax)
+        slope, first, last = 2 * curve.dof, curve.lagtime[0], curve.lagtime[-1]
+        t = np.geomspace(first, last, _SHOWN_LAGS)
+        value = slope * (line.D * t + line.offset)
+        # With motion blur the offset can be so negative that the line is negative at short lags.
+        ax.plot(
+            t,
+            np.where(value > 0, value, np.nan),
+            color=series_color(0),
+            lw=line_width(0.95),
+            label=line.text,
+        )
+        if line.stderr > 0:
+            half = slope * line.stderr * t
+            low = np.maximum(value - half, 1e-2 * np.abs(value))
+            ax.fill_between(t, low, value + half, color=series_color(0), lw=0, alpha=0.25)
+        if line.resolved:
+            sparse = np.geomspace(first, last, 12)
+            pure, name = slope * line.D * sparse, f"pure diffusion {slope} {line.symbol} t"
+            ax.plot(
+                sparse,
+                pure,
+                "o",
+                mfc="none",
+                mec=series_color(0),
+                ms=marker_size(0.85),
+                mew=line_width(0.6),
+                label=name,
+            )
     unit = unit_text(curve.unit)
     if floor is not None and floor > 0:
         name = f"noise floor {number_text(floor)} {unit}"
@@ -307,7 +349,22 @@ def plot_orientations(motion: RigidMotion, *, ax: Axes) -> Axes:
     if motion.dimension == 2:
         return plot_angle(motion, ax=ax)
     space: Any = ax  # matplotlib has no types for 3-D axes
-    _draw_unit_sphere(space)
+    # A grid on the unit sphere with lab axes, in parallel projection, without a box.
+    polar, around = np.linspace(0, np.pi, 37), np.linspace(0, 2 * np.pi, 73)
+    grid = {"color": "#cccccc", "lw": line_width(0.25), "zorder": 0}
+    for z in np.cos(polar[6:-1:6]):
+        r = np.sqrt(1 - z * z)
+        space.plot(r * np.cos(around), r * np.sin(around), np.full_like(around, z), **grid)
+    for azimuth in around[:-1:6]:
+        r = np.sin(polar)
+        space.plot(r * np.cos(azimuth), r * np.sin(azimuth), np.cos(polar), **grid)
+    for axis, name in zip(np.eye(3), "xyz", strict=True):
+        space.plot(*np.outer(axis, [1.0, 1.2]), color=GREY, lw=line_width(0.6))
+        space.text(*(1.3 * axis), name, color=ink(), ha="center", va="center")
+    space.set(xlim=(-1, 1), ylim=(-1, 1), zlim=(-1, 1), xlabel="x", ylabel="y", zlabel="z")
+    space.set_proj_type("ortho")
+    space.set_box_aspect((1, 1, 1), zoom=1.4)
+    space.set_axis_off()
     up, turn = np.deg2rad([space.elev, space.azim])
     viewer = np.array([np.cos(up) * np.cos(turn), np.cos(up) * np.sin(turn), np.sin(up)])
     length = np.linalg.norm(motion.template, axis=1)
@@ -636,59 +693,6 @@ def _no_pose_style() -> dict[str, Any]:
     return {"marker": "x", "ls": "none", "color": ink(), "clip_on": False, "zorder": 4} | size
 
 
-def _draw_curve_points(curve: LagCurve, *, ax: Axes, label: str | None) -> None:
-    """Draw the values and their band, faint beyond a quarter of the track."""
-    kept = _shown_lags(curve)
-    kept = kept[curve.value[kept] > 0]
-    t, value, error = curve.lagtime[kept], curve.value[kept], curve.stderr[kept]
-    # Where the standard error is as large as the value, the band would reach zero.
-    low, high = np.maximum(value - error, 1e-2 * value), value + error
-    sure = t <= 0.25 * curve.lagtime[-1]
-    rest = t >= t[sure].max(initial=0.0)
-    points: dict[str, Any] = {"color": ink(), "ms": marker_size(0.65), "mew": 0}
-    name = label or CURVE_NAMES[curve.quantity][0]
-    ax.plot(t[sure], value[sure], ".", label=name, **points)
-    if not sure.all():
-        name = "beyond ¼ of the track"
-        ax.plot(t[~sure], value[~sure], ".", alpha=0.3, label=name, **points)
-    band: dict[str, Any] = {"color": GREY, "lw": 0}
-    ax.fill_between(t[sure], low[sure], high[sure], alpha=0.35, label="± 1 standard error", **band)
-    ax.fill_between(t[rest], low[rest], high[rest], alpha=0.15, **band)
-
-
-def _draw_model_line(curve: LagCurve, line: ModelLine, *, ax: Axes) -> None:
-    """Draw a line with its band, and pure diffusion if the coefficient is resolved."""
-    slope = 2 * curve.dof
-    first, last = curve.lagtime[0], curve.lagtime[-1]
-    t = np.geomspace(first, last, _SHOWN_LAGS)
-    value = slope * (line.D * t + line.offset)
-    # With motion blur the offset can be so negative that the line is negative at short lags.
-    ax.plot(
-        t,
-        np.where(value > 0, value, np.nan),
-        color=series_color(0),
-        lw=line_width(0.95),
-        label=line.text,
-    )
-    if line.stderr > 0:
-        half = slope * line.stderr * t
-        low = np.maximum(value - half, 1e-2 * np.abs(value))
-        ax.fill_between(t, low, value + half, color=series_color(0), lw=0, alpha=0.25)
-    if line.resolved:
-        sparse = np.geomspace(first, last, 12)
-        pure, name = slope * line.D * sparse, f"pure diffusion {slope} {line.symbol} t"
-        ax.plot(
-            sparse,
-            pure,
-            "o",
-            mfc="none",
-            mec=series_color(0),
-            ms=marker_size(0.85),
-            mew=line_width(0.6),
-            label=name,
-        )
-
-
 def _set_curve_range(
     ax: Axes, curve: LagCurve, line: ModelLine | None, floor: float | None
 ) -> None:
@@ -712,25 +716,6 @@ def _set_curve_range(
 def _without_pose(motion: RigidMotion) -> Ints:
     """Return the indices of the frames without a pose."""
     return np.setdiff1d(np.arange(len(motion.time)), motion.fitted)
-
-
-def _draw_unit_sphere(ax: Any) -> None:  # noqa: ANN401
-    """Draw a grid on the unit sphere with lab axes, in parallel projection, without a box."""
-    polar, around = np.linspace(0, np.pi, 37), np.linspace(0, 2 * np.pi, 73)
-    grid = {"color": "#cccccc", "lw": line_width(0.25), "zorder": 0}
-    for z in np.cos(polar[6:-1:6]):
-        r = np.sqrt(1 - z * z)
-        ax.plot(r * np.cos(around), r * np.sin(around), np.full_like(around, z), **grid)
-    for azimuth in around[:-1:6]:
-        r = np.sin(polar)
-        ax.plot(r * np.cos(azimuth), r * np.sin(azimuth), np.cos(polar), **grid)
-    for axis, name in zip(np.eye(3), "xyz", strict=True):
-        ax.plot(*np.outer(axis, [1.0, 1.2]), color=GREY, lw=line_width(0.6))
-        ax.text(*(1.3 * axis), name, color=ink(), ha="center", va="center")
-    ax.set(xlim=(-1, 1), ylim=(-1, 1), zlim=(-1, 1), xlabel="x", ylabel="y", zlabel="z")
-    ax.set_proj_type("ortho")
-    ax.set_box_aspect((1, 1, 1), zoom=1.4)
-    ax.set_axis_off()
 
 
 def _forest_range(estimates: Sequence[DiffusionEstimate]) -> tuple[bool, float, float]:

@@ -9,6 +9,7 @@ from perrin.report.html import (
     inline_pictures,
     render_page,
     render_part,
+    symbols,
     write_page,
 )
 from perrin.report.imaging_page import (
@@ -70,6 +71,7 @@ __all__ = [
     "run_folder",
     "software_bibtex",
     "source_hash",
+    "symbols",
     "tensor_texts",
     "write_page",
     "write_run",

@@ -20,9 +20,7 @@ from perrin.report.embedding import packed
 if TYPE_CHECKING:
     import pandas as pd
 
-    from perrin.curves.displacement import LagCurve
     from perrin.motion.rigid_motion import RigidMotion
-    from perrin.plot.results import ModelLine
     from perrin.run.results import ClusterResult, RodResult
 
 _LAGS = 80  # lag times of a curve, evenly over its logarithm
@@ -162,8 +160,25 @@ def _rigid_parts(
         if estimate.absent_because is not None:
             continue
         line = model_line(curve, estimate, result.tensor if name == "msad" else None)
-        header["lines"][name] = _line_entry(curve, line, floors[name])
-        columns |= _curve_columns(name, curve)
+        entry: dict[str, Any] = {"dof": curve.dof, "unit": unit_text(curve.unit)}
+        entry |= {"floor": finite_or_none(floors[name]), "span": float(curve.lagtime[-1])}
+        if line is not None:
+            text = line.text.replace(r"$\langle D\rangle$", "⟨D⟩")
+            text = text.replace("$D_R$", "D<sub>R</sub>").replace("$D_T$", "D<sub>T</sub>")
+            entry |= {"D": line.D, "offset": line.offset, "error": line.stderr, "text": text}
+        header["lines"][name] = entry
+        # At most 80 lags, evenly over the logarithm.
+        kept, count = np.arange(len(curve.lagtime)), len(curve.lagtime)
+        if count > _LAGS:
+            kept = np.unique(np.rint(np.geomspace(1, count, _LAGS)).astype(np.int64)) - 1
+        value, error = curve.value[kept], curve.stderr[kept]
+        shown = value > 0
+        value = np.where(shown, value, 1.0)
+        columns |= {
+            f"{name}_t": np.log10(curve.lagtime[kept]),
+            f"{name}_y": np.where(shown, np.log10(value), np.nan),
+            f"{name}_e": np.where(shown, np.minimum(error / value, 10.0), np.nan),
+        }
     d = motion.dimension
     kinds = zip(("turn", "shift"), get_args(Quantity), ("rad", "µm"), strict=True)
     for name, quantity, unit in kinds:
@@ -183,33 +198,6 @@ def _rigid_parts(
     full = degrees_of_freedom(np.array([len(motion.template)]), d)[0]
     header["expected"] = float(motion.sigma * np.sqrt(full / len(motion.template)))
     return header, columns
-
-
-def _line_entry(curve: LagCurve, line: ModelLine | None, floor: float) -> dict[str, Any]:
-    """Return the line of a curve, and its noise floor."""
-    entry: dict[str, Any] = {"dof": curve.dof, "unit": unit_text(curve.unit)}
-    entry |= {"floor": finite_or_none(floor), "span": float(curve.lagtime[-1])}
-    if line is not None:
-        text = line.text.replace(r"$\langle D\rangle$", "⟨D⟩")
-        text = text.replace("$D_R$", "D<sub>R</sub>").replace("$D_T$", "D<sub>T</sub>")
-        entry |= {"D": line.D, "offset": line.offset, "error": line.stderr, "text": text}
-    return entry
-
-
-def _curve_columns(name: str, curve: LagCurve) -> dict[str, Floats]:
-    """Return lag times, values and errors of at most 80 lags, evenly over the logarithm."""
-    count = len(curve.lagtime)
-    kept = np.arange(count)
-    if count > _LAGS:
-        kept = np.unique(np.rint(np.geomspace(1, count, _LAGS)).astype(np.int64)) - 1
-    t, y, e = curve.lagtime[kept], curve.value[kept], curve.stderr[kept]
-    shown = y > 0
-    y = np.where(shown, y, 1.0)
-    return {
-        f"{name}_t": np.log10(t),
-        f"{name}_y": np.where(shown, np.log10(y), np.nan),
-        f"{name}_e": np.where(shown, np.minimum(e / y, 10.0), np.nan),
-    }
 
 
 def body_picture(template: Floats, diameter: float, *, label: str) -> str:

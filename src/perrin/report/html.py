@@ -79,12 +79,27 @@ def _environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters["symbols"] = _symbols
+    environment.filters["symbols"] = symbols
     return environment
 
 
-def _symbols(text: str) -> Markup:
-    """Escape a text, and set the indices and units of its coefficients."""
+def symbols(text: str) -> Markup:
+    """Escape a text, and set the indices and units of its coefficients.
+
+    Parameters
+    ----------
+    text : str
+        Text of results or of a user: "D_R +- 1 um^2/s".
+
+    Returns
+    -------
+    markupsafe.Markup
+
+    Examples
+    --------
+    >>> print(symbols("D_T < 2 um^2/s"))
+    <i>D</i><sub>T</sub> &lt; 2 µm²/s
+    """
     marked = re.sub(r"\bum\b", "µm", str(escape(text))).replace("^2", "²")
     marked = marked.replace("_inf", "_∞").replace("+-", "±").replace("Phi²", "Φ²")
     marked = re.sub(r"\bsigma_(xy|[xyz])\b", r"σ<sub>\1</sub>", marked)

@@ -29,11 +29,11 @@ from perrin.run.repetition import command_line, python_lines
 from perrin.run.statements import answer_lines, verdict_lines
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping
+    from collections.abc import Callable, Iterable
     from pathlib import Path
     from typing import TypeAlias
 
-    from perrin.run.results import ClusterResult, Report, RodResult
+    from perrin.run.results import Report
 
     Progress: TypeAlias = Callable[[int, int, str], None]
 
@@ -127,13 +127,25 @@ def render_html(
     script = page_script("report")
     plotly, plotly_hash = plotly_script()
     chosen, payloads = None, []
+    if report.results:
+        first = report.results[0]
+        kinds = {
+            "rotation": "motion",
+            "translation": "motion",
+            "curves": "curves",
+            "residuals": "residuals",
+            "orientations": "angle" if first.motion.center.shape[1] == 2 else "sphere",
+        }
+        drawn = [
+            captioned(pictures, f"cluster-{first.cluster}-{name}", kind, _RESULT_CAPTIONS[kind])
+            for name, kind in kinds.items()
+        ]
+        chosen = cluster_texts(first, report) | {"figures": [one for one in drawn if one]}
     tracks = grouped_tracks(report.tracks)
     for done, result in enumerate(report.results):
         if progress is not None:
             progress(done, len(report.results), "writing the report")
         texts = cluster_texts(result, report)
-        if chosen is None:
-            chosen = texts | {"figures": _captioned_figures(result, pictures)}
         data = cluster_data(
             result,
             tracks.get(result.cluster, np.empty((0, 5))),
@@ -195,18 +207,3 @@ def render_html(
         plotly=plotly,
         script_sources=f"{source_hash(script)} {plotly_hash}",
     )
-
-
-def _captioned_figures(
-    result: ClusterResult | RodResult, pictures: Mapping[str, str]
-) -> list[dict[str, str]]:
-    """Return the pictures of a cluster with their captions."""
-    planar = result.motion.center.shape[1] == 2
-    kinds = {"rotation": "motion", "translation": "motion"}
-    kinds |= {"curves": "curves", "residuals": "residuals"}
-    kinds |= {"orientations": "angle" if planar else "sphere"}
-    drawn = [
-        captioned(pictures, f"cluster-{result.cluster}-{name}", kind, _RESULT_CAPTIONS[kind])
-        for name, kind in kinds.items()
-    ]
-    return [one for one in drawn if one]

@@ -134,7 +134,13 @@ from perrin.run.results import (
 from perrin.run.singles import SingleSpheres, measure_singles, track_steps
 from perrin.run.statements import answer_lines, kinds_text, motion_sentences, verdict_lines
 from perrin.run.tables import analyze, read_table
-from perrin.run.verdicts import fit_model, judge_each_and_all, verdicts_from_dict, verdicts_to_dict
+from perrin.run.verdicts import (
+    fit_model,
+    is_at_rest,
+    judge_each_and_all,
+    verdicts_from_dict,
+    verdicts_to_dict,
+)
 from perrin.run.workers import Work, check_workers, dask_client, one_thread, work_through
 
 __all__ = [
@@ -206,6 +212,7 @@ __all__ = [
     "grouped",
     "grouping_note",
     "identity_remarks",
+    "is_at_rest",
     "is_known",
     "is_noise_floor",
     "is_not_diffusion",

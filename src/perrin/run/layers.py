@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 
     import pandas as pd
 
-    from perrin._arrays import Floats, Ints
-    from perrin.run.results import ClusterResult, Report, RodResult
+    from perrin._arrays import Floats
+    from perrin.run.results import Report
 
     # Data, arguments and kind of a layer, as napari's readers return them.
     Layer: TypeAlias = tuple[Floats, dict[str, Any], str]
@@ -64,10 +64,20 @@ def napari_layers(report: Report) -> list[Layer]:
     start = whole.groupby("cluster")["frame"].min()
     arrows, names, numbers = [], [], []
     for result in report.results:
-        for k, arrow in enumerate(_axes_of(result, int(start[result.cluster]))):
-            arrows.append(arrow)
-            names += [result.name] * len(arrow)
-            numbers += [k] * len(arrow)
+        motion = result.motion
+        rows = motion.fitted
+        center = motion.center[rows]
+        if isinstance(motion, RodMotion):
+            directions = [0.5 * float(np.ptp(motion.places)) * motion.direction[rows]]
+        else:
+            directions = [motion.R * axis for axis in np.moveaxis(motion.rotation[rows], 2, 0)]
+        frame = (int(start[result.cluster]) + rows)[:, None].astype(np.float64)
+        origin = np.column_stack([frame, center[:, ::-1]])
+        for k, direction in enumerate(directions):
+            arrow = np.column_stack([np.zeros_like(frame), direction[:, ::-1]])
+            arrows.append(np.stack([origin, arrow], axis=1))
+            names += [result.name] * len(rows)
+            numbers += [k] * len(rows)
     if arrows:
         about = {
             "name": "orientations",
@@ -99,6 +109,10 @@ def table_layers(table: pd.DataFrame) -> list[Layer]:
     >>> table_layers(table)[1][0].tolist()
     [[0.0, 0.0, 3.0, 1.0], [0.0, 1.0, 4.0, 2.0]]
     """
+    from scipy.spatial import cKDTree
+
+    from perrin.run.measure import library_version
+
     axes = [axis for axis in ("z", "y", "x") if axis in table]
     table = table.dropna(subset=axes)
     ids = ["cluster", "particle"] if "cluster" in table else ["particle"]
@@ -108,13 +122,25 @@ def table_layers(table: pd.DataFrame) -> list[Layer]:
     order = np.lexsort((frame, number))
     points = np.column_stack([frame, x])
     features = {name: table[name].to_numpy() for name in ids}
-    about = {
+    # The drawn diameter follows from the distances in the frame with the most particles.
+    frames, counts = np.unique(frame, return_counts=True)
+    fullest = x[frame == frames[np.argmax(counts)]] if len(frames) else x
+    diameter = 1.0
+    if len(fullest) > 1:
+        nearest = cKDTree(fullest).query(fullest, 2)[0][:, 1]
+        diameter = _DRAWN_SIZE * float(np.median(nearest))
+    about: dict[str, Any] = {
         "name": "particles",
         "features": features,
         "face_color": ids[0],
-        "size": _drawn_diameter(frame, x),
-        **_seen_beside_its_plane(),
+        "size": diameter,
     }
+    # A sphere is drawn in all planes that it reaches.
+    installed = library_version("napari")
+    if installed is not None and tuple(map(int, installed.split(".")[:2])) < (0, 9):
+        about["out_of_slice_display"] = True
+    else:
+        about["projection_mode"] = "rescale_spherical"
     paths = np.column_stack([number, points])[order]
     ordered = {
         name: values[order] for name, values in features.items() if values.dtype.kind in "if"
@@ -150,47 +176,3 @@ def napari_reader(path: str | list[str]) -> Callable[[str | list[str]], list[Lay
     if not is_run and not one.lower().endswith((*READABLE_SUFFIXES, ".gz")):
         return None
     return lambda _: napari_layers(load_run(one)) if is_run else table_layers(read_tracks(one))
-
-
-def _seen_beside_its_plane() -> dict[str, Any]:
-    """Return the option by which a sphere is drawn in the planes that it reaches."""
-    from perrin.run.measure import library_version
-
-    installed = library_version("napari")
-    if installed is not None and tuple(map(int, installed.split(".")[:2])) < (0, 9):
-        return {"out_of_slice_display": True}
-    return {"projection_mode": "rescale_spherical"}
-
-
-def _drawn_diameter(frame: Ints, x: Floats) -> float:
-    """Return the diameter of a drawn particle, um, from the frame with the most rows."""
-    from scipy.spatial import cKDTree
-
-    frames, counts = np.unique(frame, return_counts=True)
-    points = x[frame == frames[np.argmax(counts)]] if len(frames) else x
-    if len(points) < 2:
-        return 1.0
-    return _DRAWN_SIZE * float(np.median(cKDTree(points).query(points, 2)[0][:, 1]))
-
-
-def _axes_of(result: ClusterResult | RodResult, first: int) -> list[Floats]:
-    """Return for each axis of a body its arrows (start, direction), with the frame as first."""
-    motion = result.motion
-    rows = motion.fitted
-    center = motion.center[rows]
-    if isinstance(motion, RodMotion):
-        length = 0.5 * float(np.ptp(motion.places))
-        directions = [length * motion.direction[rows]]
-    else:
-        directions = [motion.R * motion.rotation[rows][:, :, k] for k in range(motion.dimension)]
-    frame = (first + rows)[:, None].astype(np.float64)
-    return [
-        np.stack(
-            [
-                np.column_stack([frame, center[:, ::-1]]),
-                np.column_stack([np.zeros_like(frame), direction[:, ::-1]]),
-            ],
-            axis=1,
-        )
-        for direction in directions
-    ]

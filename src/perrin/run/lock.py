@@ -104,7 +104,14 @@ def _lock_file(folder: str | os.PathLike[str], place: Path) -> Iterator[None]:
         path = place / LOCK_INSIDE if inside else hidden_beside(place, "lock")
         handle = _acquired(path, folder)
         silence = threading.Event()
-        beat = threading.Thread(target=_signs_of_life, args=(path, silence), daemon=True)
+
+        def renew() -> None:
+            """Renew the time of the lock file until the lock is given back."""
+            while not silence.wait(_BEAT):
+                with suppress(OSError):
+                    os.utime(path)
+
+        beat = threading.Thread(target=renew, daemon=True)
         beat.start()
         try:
             yield
@@ -133,7 +140,12 @@ def _acquired(path: Path, folder: str | os.PathLike[str]) -> int:
             seen = _flock(handle)
             if seen is False:
                 raise _in_use(folder, _Holder.of(handle))
-            if not _is_at(handle, path):  # its last holder has removed it meanwhile
+            try:
+                there = path.stat()
+            except FileNotFoundError:
+                there = None
+            if there is None or not os.path.samestat(there, os.fstat(handle)):
+                # Its last holder has removed it meanwhile.
                 os.close(handle)
                 continue
             holder = _Holder.of(handle)
@@ -172,16 +184,6 @@ def _flock(handle: int) -> bool | None:
             return False
         raise
     return True
-
-
-def _is_at(handle: int, path: Path) -> bool:
-    """Return whether an open file is still the one at a path."""
-    try:
-        there = path.stat()
-    except FileNotFoundError:
-        return False
-    mine = os.fstat(handle)
-    return (there.st_dev, there.st_ino) == (mine.st_dev, mine.st_ino)
 
 
 @dataclass(frozen=True)
@@ -231,13 +233,6 @@ def _in_use(
         f"{os.fspath(folder)}: {who} is writing there{when}: wait until it ends{unless}, or choose "
         "another folder"
     )
-
-
-def _signs_of_life(path: Path, silence: threading.Event) -> None:
-    """Renew the time of the lock file until the lock is given back."""
-    while not silence.wait(_BEAT):
-        with suppress(OSError):
-            os.utime(path)
 
 
 def _host() -> str:

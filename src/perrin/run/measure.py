@@ -980,7 +980,10 @@ def without_jumps(
         if not (jumps.many or experiment.keep_jumps):
             left_out = jumps.rows
             motion = cut_at(motion, left_out)
-            estimate = _estimated_quietly(motion, quantity, experiment.noise)
+            with python_warnings.catch_warnings():
+                # The estimate's own warnings are entered in the report.
+                python_warnings.simplefilter("ignore", PrecisionWarning)
+                estimate = estimate_diffusion(motion, quantity=quantity, noise=experiment.noise)
     remarks.notes.extend(words.removed_drift_notes(estimate, quantity))
     if not estimate.resolved:
         remarks.notes.append(f"not resolved: {estimate}")
@@ -1042,19 +1045,6 @@ def motion_and_path(body: FittedBody, quantity: Quantity) -> tuple[RigidMotion, 
     if motion.piece.any():
         whole = replace(motion, piece=np.zeros_like(motion.piece))
     return cut_at(motion, body.stage), cut_at(whole, body.stage)
-
-
-def _estimated_quietly(motion: RigidMotion, quantity: Quantity, noise: Noise) -> DiffusionEstimate:
-    """Estimate D_R or D_T; the estimate's own warnings go into the report."""
-    with python_warnings.catch_warnings():
-        python_warnings.simplefilter("ignore", PrecisionWarning)
-        return estimate_diffusion(
-            motion,
-            quantity=quantity,
-            noise=noise.model,
-            exposure=noise.exposure,
-            drift=noise.drift,
-        )
 
 
 def measure_kinds(

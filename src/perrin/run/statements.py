@@ -63,7 +63,9 @@ def answer_lines(report: Report) -> list[str]:
                 f"{verbs.get(name, turns)} with {common}{_value_text(name, one)}"
                 for name, one in known.items()
             )
-            when = f". Both {_of_several(scales.pop())}" if scales != {""} else ""
+            verb, _, times = scales.pop().partition(" ")
+            plural = {"holds": "hold", "is": "are"}.get(verb, verb)
+            when = f". Both {plural} {times}" if verb else ""
             lines.append(f"{subject} {both}{when}.")
         else:
             lines += [
@@ -87,14 +89,6 @@ def _value_text(name: str, estimate: DiffusionEstimate) -> str:
     interval = f"95 % interval {interval_text(estimate.ci95)} {unit_text(estimate.unit)}"
     limit = "" if estimate.resolved else "an upper limit, "
     return f"{name} {sign}{value_text(estimate)} ({limit}{interval})"
-
-
-def _of_several(time_scale: str) -> str:
-    """Return the times at which one value holds as those at which several values hold."""
-    for one, several in (("holds ", "hold "), ("is ", "are ")):
-        if time_scale.startswith(one):
-            return several + time_scale.removeprefix(one)
-    return time_scale
 
 
 def _agreement(pooled: Pooled) -> list[str]:

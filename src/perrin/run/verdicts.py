@@ -26,8 +26,21 @@ if TYPE_CHECKING:
     from perrin.run.experiment import MotionModel
 
 
-def _is_at_rest(motion: RigidMotion, quantity: Quantity) -> bool:
-    """Return whether a body does not move, or turn, within rounding: nothing is to be judged."""
+def is_at_rest(motion: RigidMotion, quantity: Quantity) -> bool:
+    """Return whether a body does not move, or turn, within rounding.
+
+    Parameters
+    ----------
+    motion : RigidMotion
+    quantity : {"rotation", "translation"}
+
+    Examples
+    --------
+    >>> from perrin import Cluster, simulate_motion
+    >>> turning = simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=9, rng=3)
+    >>> is_at_rest(turning, "rotation"), is_at_rest(turning, "translation")
+    (False, True)
+    """
     path = motion.center if quantity == "translation" else motion.rotation
     path = path[motion.fitted]
     size = float(np.abs(path).max(initial=0.0))
@@ -79,7 +92,7 @@ def judge_each_and_all(
 
     def judged(some: RigidMotion | list[RigidMotion]) -> MotionVerdict | None:
         bodies = some if isinstance(some, list) else [some]
-        if any(_is_at_rest(body, quantity) for body in bodies):
+        if any(is_at_rest(body, quantity) for body in bodies):
             return None
         with python_warnings.catch_warnings():
             python_warnings.simplefilter("ignore", PrecisionWarning)

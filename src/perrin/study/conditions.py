@@ -164,13 +164,14 @@ def cluster_values(manifest: Manifest, entries: Mapping[str, Entry]) -> list[Clu
     values = []
     for movie, entry in measured:
         for one in entry.clusters:
-            pair = {name: _coefficient(one[name]) for name in ("D_R", "D_T")}
+            pair = {name: Coefficient.from_dict(one[name]) for name in ("D_R", "D_T")}
             verdicts = {name: str(one[name]["verdict"]) for name in pair}
             predicted = {name: one[name]["predicted"] for name in pair}
             both = None not in predicted.values()
             verdicts[RATIO] = verdicts["D_R"]
             if verdicts["D_T"] not in manifest.average or verdicts["D_R"] == "not judged":
                 verdicts[RATIO] = verdicts["D_T"]
+            excluded = movie.excluded_because(one["cluster"], one["label"])
             coefficients = {**pair, RATIO: ratio_of(pair["D_T"], pair["D_R"])}
             values += [
                 ClusterValue(
@@ -181,7 +182,10 @@ def cluster_values(manifest: Manifest, entries: Mapping[str, Entry]) -> list[Clu
                     quantity=name,
                     coefficient=coefficients[name],
                     verdict=verdicts[name],
-                    apart_because=_apart(movie, one, coefficients[name], verdicts[name], manifest),
+                    apart_because=excluded
+                    or ("not rigid" if one["rigid"] is False else "")
+                    or ("" if verdicts[name] in manifest.average else f"motion: {verdicts[name]}")
+                    or (coefficients[name].absent_because or ""),
                     predicted=predicted["D_T"] / predicted["D_R"]
                     if name == RATIO and both
                     else predicted.get(name),
@@ -244,34 +248,3 @@ def condition_means(manifest: Manifest, values: Sequence[ClusterValue]) -> list[
             )
         )
     return found
-
-
-def _coefficient(entry: Mapping[str, Any]) -> Coefficient:
-    """Return the coefficient that an entry of a cluster holds."""
-
-    def ends(pair: Sequence[float | None]) -> tuple[float, float]:
-        low, high = pair
-        if low is None and high is None:
-            return np.nan, np.nan
-        return 0.0 if low is None else low, np.inf if high is None else high
-
-    value = np.nan if entry["value"] is None else float(entry["value"])
-    return Coefficient.of(Coefficient(value, ends(entry["ci68"]), ends(entry["ci95"])))
-
-
-def _apart(
-    movie: StudyMovie,
-    cluster: Mapping[str, Any],
-    coefficient: Coefficient,
-    verdict: str,
-    manifest: Manifest,
-) -> str:
-    """Return why a coefficient is not averaged; an empty text where it is."""
-    for one in movie.exclusions:
-        if one.cluster is None or one.cluster in (cluster["cluster"], cluster["label"]):
-            return f"excluded: {one.reason}"
-    if cluster["rigid"] is False:
-        return "not rigid"
-    if verdict not in manifest.average:
-        return f"motion: {verdict}"
-    return coefficient.absent_because or ""

@@ -16,7 +16,6 @@ if TYPE_CHECKING:
 
     from matplotlib.axes import Axes
 
-    from perrin.study.conditions import ConditionMean
     from perrin.study.study_results import StudyResult
 
 _QUANTITY_SYMBOLS = {"D_R": "$D_R$", "D_T": "$D_T$", "D_T/D_R": "$D_T/D_R$"}
@@ -101,7 +100,18 @@ def plot_conditions(result: StudyResult, quantity: str, *, ax: Axes) -> Axes:
                 marker, color=color, alpha=0.25, ms=4, mew=0.8,
             )  # fmt: skip
         means = of_body[quantity]
-        _draw_means(means, [place(one.conditions) for one in means], color, body, ax=ax)
+        at = np.array([place(one.conditions) for one in means])
+        value = np.array([one.mean.value for one in means])
+        low, high = (np.array([one.mean.ci95[k] for one in means]) for k in (0, 1))
+        bounded = np.isfinite(high) & (value > 0)
+        # An interval of one degree of freedom may span decades: it is cut at a factor of 30.
+        below, above = value - np.maximum(low, value / 30), np.minimum(high, 30 * value) - value
+        ax.errorbar(
+            at[bounded], value[bounded], [below[bounded], above[bounded]],
+            fmt="o", color=color, ms=5, lw=1.4, capsize=2, label=body, zorder=3,
+        )  # fmt: skip
+        predicted = np.array([one.predicted or np.nan for one in means])
+        ax.plot(at, predicted, "D", mfc="none", color=color, ms=5)
         trend = result.trends.get(f"{body}: {quantity}")
         if trend is not None and numbers and trend.law != "own function":
             x = np.linspace(trend.x.min(), trend.x.max(), 100)
@@ -115,22 +125,3 @@ def plot_conditions(result: StudyResult, quantity: str, *, ax: Axes) -> Axes:
         ax.set_xlim(-0.5, len(labels) - 0.5)
     ax.legend(fontsize="x-small", frameon=False)
     return ax
-
-
-def _draw_means(
-    means: list[ConditionMean], x: list[float], color: str, body: str, *, ax: Axes
-) -> None:
-    """Draw means with their 95 % intervals, and predictions as open diamonds."""
-    value = np.array([one.mean.value for one in means])
-    low, high = (np.array([one.mean.ci95[k] for one in means]) for k in (0, 1))
-    known = np.isfinite(high) & (value > 0)
-    at = np.array(x)[known]
-    value, low, high = value[known], low[known], high[known]
-    # An interval of one degree of freedom may span decades: it is cut at a factor of 30.
-    ax.errorbar(
-        at, value, [value - np.maximum(low, value / 30), np.minimum(high, 30 * value) - value],
-        fmt="o", color=color, ms=5, lw=1.4, capsize=2, label=body, zorder=3,
-    )  # fmt: skip
-    foretold = [(a, one.predicted) for a, one in zip(x, means, strict=True) if one.predicted]
-    if foretold:
-        ax.plot(*zip(*foretold, strict=True), "D", mfc="none", color=color, ms=5)

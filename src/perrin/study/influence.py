@@ -126,7 +126,7 @@ def leave_one_out(
     >>> [one.index for one in leave_one_out(clusters) if one.outlying]
     [6]
     """
-    from scipy.special import stdtr
+    from scipy.special import ndtri, stdtr
 
     members = [Coefficient.of(one) for one in coefficients]
     names = ["one movie"] * len(members) if movies is None else list(movies)
@@ -137,22 +137,26 @@ def leave_one_out(
     if len(groups) < 3:
         return []
     whole = population_mean(members, movies=names) if mean is None else mean
-    centre, variance, unit = _moments(members, names, whole, by_movie=kind == "movie")
+    by_movie = kind == "movie"
+    centre, variance = _log_moments(members, names, whole, by_movie=by_movie)
     weight = 1 / variance
     total, load = float(weight @ centre), float(weight.sum())
     others = (total - weight * centre) / (load - weight)
     change = others - total / load
     spread = np.sqrt(variance + 1 / (load - weight))
     deviation = (centre - others) / spread
-    dof = np.full(len(groups), float(max(unit - 2, 1)))
+    dof = np.full(len(groups), float(max(len(groups) - 2, 1)))
     far = np.argsort(-np.abs(deviation))[:_CANDIDATES]
-    for k in far[np.abs(deviation[far]) > _suspicious(len(groups))]:
+    # Half of the populations of this size have such a deviation somewhere, at least.
+    usual = float(-ndtri((1 - 0.5 ** (1 / len(groups))) / 2))
+    for k in far[np.abs(deviation[far]) > max(_SUSPECT, usual - 0.5)]:
         rest = [i for j, group in enumerate(groups) if j != k for i in group]
         without = population_mean([members[i] for i in rest], movies=[names[i] for i in rest])
-        own = _own_variance([members[i] for i in groups[k]], without, by_movie=kind == "movie")
+        left_out = [members[i] for i in groups[k]]
+        _, (own,) = _log_moments(left_out, ["one"] * len(left_out), without, by_movie=by_movie)
         deviation[k] = (centre[k] - np.log(without.value)) / np.sqrt(own + without.log_stderr**2)
         change[k] = np.log(without.value / whole.value)
-        dof[k] = max(without.dof, 1) if kind == "movie" else max(len(rest) - 1, 1)
+        dof[k] = max(without.dof, 1) if by_movie else max(len(rest) - 1, 1)
     p = _holm(2 * stdtr(dof, -np.abs(deviation)))
     return [
         Influence(
@@ -168,47 +172,25 @@ def leave_one_out(
     ]
 
 
-def _suspicious(count: int) -> float:
-    """Return the deviation that half of the populations of that size have somewhere, at least."""
-    from scipy.special import ndtri
-
-    return max(_SUSPECT, float(-ndtri((1 - 0.5 ** (1 / count)) / 2)) - 0.5)
-
-
-def _moments(
+def _log_moments(
     members: Sequence[Coefficient],
     names: Sequence[Hashable],
-    whole: PopulationMean,
+    population: PopulationMean,
     *,
     by_movie: bool,
-) -> tuple[Floats, Floats, int]:
-    """Return ln D and its variance with the spreads of every member, and the number of members."""
-    centre, error = _log_values(members)
-    inner = error**2 + (whole.spread_clusters or 0.0) ** 2
-    between = (whole.spread_movies or 0.0) ** 2
+) -> tuple[Floats, Floats]:
+    """Return ln D of every cluster or movie, and its variance with the spreads of a population."""
+    # Half the upper limit stands for an absent value.
+    value = np.array([one.value if one.value > 0 else one.ci95[1] / 2 for one in members])
+    centre, high = np.log(value), np.array([one.ci95[1] for one in members])
+    inner = (np.log(high / value) / NORMAL[0.95]) ** 2 + (population.spread_clusters or 0.0) ** 2
+    between = (population.spread_movies or 0.0) ** 2
     if not by_movie:
-        return centre, inner + between, len(members)
+        return centre, inner + between
     known = list(dict.fromkeys(names))
     movie = np.array([known.index(name) for name in names])
     weight = np.bincount(movie, 1 / inner)
-    return np.bincount(movie, centre / inner) / weight, 1 / weight + between, len(known)
-
-
-def _own_variance(
-    members: Sequence[Coefficient], without: PopulationMean, *, by_movie: bool
-) -> float:
-    """Return the variance of ln D of a new member of a population."""
-    _, error = _log_values(members)
-    inner = error**2 + (without.spread_clusters or 0.0) ** 2
-    between = (without.spread_movies or 0.0) ** 2
-    return float((1 / np.sum(1 / inner) if by_movie else inner[0]) + between)
-
-
-def _log_values(members: Sequence[Coefficient]) -> tuple[Floats, Floats]:
-    """Return ln D and its standard error; half the upper limit stands for an absent value."""
-    value = np.array([one.value if one.value > 0 else one.ci95[1] / 2 for one in members])
-    high = np.array([one.ci95[1] for one in members])
-    return np.log(value), np.log(high / value) / NORMAL[0.95]
+    return np.bincount(movie, centre / inner) / weight, 1 / weight + between
 
 
 def _holm(p: Floats) -> Floats:

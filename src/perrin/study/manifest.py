@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import re
 import tomllib
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -17,7 +18,7 @@ from perrin.tracks.formats import READABLE_SUFFIXES
 
 if TYPE_CHECKING:
     import os
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Mapping, Sequence
 
 Source = Literal["table", "movie"]
 
@@ -105,6 +106,19 @@ class StudyMovie:
         """What counts as one independent movie in the statistics."""
         return self.name if self.replicate is None else f"replicate {self.replicate}"
 
+    def excluded_because(self, cluster: int, label: str | None) -> str:
+        """Return why a cluster is not averaged by choice; an empty text where it is averaged.
+
+        Parameters
+        ----------
+        cluster : int
+            Number of the cluster.
+        label : str or None
+            Its label.
+        """
+        reasons = [e.reason for e in self.exclusions if e.cluster in (None, cluster, label)]
+        return f"excluded: {reasons[0]}" if reasons else ""
+
 
 @dataclass(frozen=True)
 class Manifest:
@@ -179,8 +193,16 @@ def read_manifest(path: str | os.PathLike[str]) -> Manifest:
     if check.faults:
         listing = "; ".join(f"line {line}: {text}" for line, text in sorted(check.faults))
         raise ManifestError(f"{place}: {listing}")
+    named = []
+    for movie in movies:
+        # The same file may be measured twice, as two samples; names differ by label and path, and
+        # do not depend on other movies.
+        parts = [movie.sample, movie.name] if movie.sample != movie.name else [movie.name]
+        text = re.sub(r"[^\w.-]+", "_", "-".join(parts)).strip("._") or "movie"
+        mark = hashlib.sha256(f"{movie.sample}\n{movie.path}".encode()).hexdigest()[:6]
+        named.append(replace(movie, name=f"{text[:80]}-{mark}"))
     return Manifest(
-        movies=tuple(_with_run_names(movies)),
+        movies=tuple(named),
         title=str(stated.get("title", "Study")),
         conditions=tuple(stated.get("conditions", ())),
         average=tuple(stated.get("average", Manifest.average)),
@@ -473,7 +495,13 @@ class _Check:
             return []
         paths: list[str] = []
         for one in stated:
-            found = _matching(one, self._folder)
+            found = [one] if "://" in one else []
+            if not found and (self._folder / one).exists():
+                found = [str(self._folder / one)]
+            elif not found and re.search(r"[*?\[]", one):
+                root = Path(one).anchor
+                within = Path(root) if root else self._folder
+                found = sorted(map(str, within.glob(str(Path(one).relative_to(root or ".")))))
             if not found:
                 self.wrong((*at, "files"), f"files: {one} does not exist")
             paths += found
@@ -527,36 +555,6 @@ def _option_faults(key: str, value: Any) -> list[str]:  # noqa: ANN401 (whatever
     if kind == "slice" and not (pair and all(isinstance(end, int) for end in value)):
         return [f"{key}: expected the first frame and the first that is not used, got {value!r}"]
     return []
-
-
-def _matching(stated: str, folder: Path) -> list[str]:
-    """Return the existing paths that a path or glob of a manifest names, in order."""
-    if "://" in stated:
-        return [stated]
-    path = folder / stated
-    if path.exists():
-        return [str(path)]
-    if not re.search(r"[*?\[]", stated):
-        return []
-    root = Path(stated).anchor
-    within = Path(root) if root else folder
-    return sorted(str(p) for p in within.glob(str(Path(stated).relative_to(root or "."))))
-
-
-def _with_run_names(movies: Iterable[StudyMovie]) -> list[StudyMovie]:
-    """Return the movies with names of run folders that are unique and do not depend on others."""
-    import hashlib
-    from dataclasses import replace
-
-    named = []
-    for movie in movies:
-        # The same file may be measured twice, as two samples; names differ by label and path.
-        text = re.sub(r"[^\w.-]+", "_", f"{movie.sample}-{movie.name}").strip("._") or "movie"
-        if movie.sample == movie.name:
-            text = re.sub(r"[^\w.-]+", "_", movie.name).strip("._") or "movie"
-        mark = hashlib.sha256(f"{movie.sample}\n{movie.path}".encode()).hexdigest()[:6]
-        named.append(replace(movie, name=f"{text[:80]}-{mark}"))
-    return named
 
 
 def _stem(path: str) -> str:

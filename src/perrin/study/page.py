@@ -18,7 +18,6 @@ from perrin.study.trends import law_values
 
 if TYPE_CHECKING:
     from perrin.study.conditions import ConditionMean
-    from perrin.study.ledger import Entry
     from perrin.study.study_results import StudyResult
 
 _MOST_SINGLES = 3000  # single clusters that a figure draws; SVG with more is slow
@@ -52,6 +51,8 @@ def render_study(result: StudyResult) -> str:
     pictures = inline_pictures(sorted((result.folder / "figures").glob("conditions.png")))
     bodies = list(result.by_body())
     done = [e for e in result.entries.values() if e.status == "done"]
+    clusters_apart = {(v.body, v.apart_because, v.name) for v in result.values if v.apart_because}
+    apart = Counter((body, reason) for body, reason, _ in clusters_apart)
     return render_page(
         "study",
         title=result.manifest.title,
@@ -67,8 +68,20 @@ def render_study(result: StudyResult) -> str:
             (a.body, a.quantity, condition_text(a.conditions), condition_text(b.conditions), one)
             for a, b, one in result.comparisons
         ],
-        outlying=_outlying(result),
-        apart=_apart_rows(result),
+        outlying=[
+            {
+                "name": name,
+                "kind": one.kind,
+                "where": f"{mean.body}, {mean.label}: {mean.quantity}",
+                "deviation": f"{one.deviation:+.1f}".replace("-", "−"),
+                "p": number_text(one.p),
+                "change": f"{100 * one.change:+.1f} %".replace("-", "−"),
+                "errors": f"{one.change_in_errors:+.1f}".replace("-", "−"),
+            }
+            for mean in result.means
+            for name, one in mean.outlying
+        ],
+        apart=[(body, reason, n) for (body, reason), n in sorted(apart.items())],
         failed=[(e.name, e.reason) for e in result.failed],
         movie_rows=_movie_rows(result),
         matrix=warning_matrix(result),
@@ -230,30 +243,6 @@ def _spread_text(value: float | None, ends: tuple[float, float] | None) -> str:
     return f"{shown} ({low} to {high})"
 
 
-def _outlying(result: StudyResult) -> list[dict[str, str]]:
-    """Return the outlying clusters and movies with what they change."""
-    return [
-        {
-            "name": name,
-            "kind": one.kind,
-            "where": f"{mean.body}, {mean.label}: {mean.quantity}",
-            "deviation": f"{one.deviation:+.1f}".replace("-", "−"),
-            "p": number_text(one.p),
-            "change": f"{100 * one.change:+.1f} %".replace("-", "−"),
-            "errors": f"{one.change_in_errors:+.1f}".replace("-", "−"),
-        }
-        for mean in result.means
-        for name, one in mean.outlying
-    ]
-
-
-def _apart_rows(result: StudyResult) -> list[tuple[str, str, int]]:
-    """Return the reasons why clusters are not averaged: kind, reason, and number of clusters."""
-    seen = {(v.body, v.apart_because, v.name) for v in result.values if v.apart_because}
-    count = Counter((body, reason) for body, reason, _ in seen)
-    return [(body, reason, n) for (body, reason), n in sorted(count.items())]
-
-
 def _movie_rows(result: StudyResult) -> list[dict[str, Any]]:
     """Return a row for each movie, with the link to its run."""
     rows = []
@@ -261,7 +250,9 @@ def _movie_rows(result: StudyResult) -> list[dict[str, Any]]:
         entry = result.entries.get(movie.name)
         link = None
         if entry is not None and entry.status == "done":
-            link = f"{RUNS}/{movie.name}/" + ("report.html" if _has_page(result, entry) else "")
+            link, page = f"{RUNS}/{movie.name}/", "report.html"
+            if entry.settings.get("reports") or (result.folder / link / page).is_file():
+                link += page
         rows.append(
             {
                 "name": movie.name,
@@ -278,13 +269,6 @@ def _movie_rows(result: StudyResult) -> list[dict[str, Any]]:
             }
         )
     return rows
-
-
-def _has_page(result: StudyResult, entry: Entry) -> bool:
-    return (
-        bool(entry.settings.get("reports"))
-        or (result.folder / RUNS / entry.name / "report.html").is_file()
-    )
 
 
 def _figure_data(result: StudyResult) -> str:

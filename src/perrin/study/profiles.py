@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from perrin._arrays import refuse
 from perrin.diffusion.estimate import NORMAL
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from perrin._arrays import Floats
 
@@ -74,6 +74,30 @@ class Coefficient:
             (max(float(low68), 0.0), float(high68)),
             (max(float(low95), 0.0), float(high95)),
         )
+
+    @classmethod
+    def from_dict(cls, entry: Mapping[str, Any]) -> Coefficient:
+        """Return the coefficient that an entry of a file states.
+
+        Parameters
+        ----------
+        entry : mapping
+            "value", "ci68" and "ci95"; None for what is not known, and for an end without bound.
+
+        Examples
+        --------
+        >>> Coefficient.from_dict({"value": 2.0, "ci68": [1.0, 3.0], "ci95": [None, 4.0]}).ci95
+        (0.0, 4.0)
+        """
+
+        def ends(pair: Sequence[float | None]) -> tuple[float, float]:
+            low, high = pair
+            if low is None and high is None:
+                return np.nan, np.nan
+            return 0.0 if low is None else low, np.inf if high is None else high
+
+        value = np.nan if entry["value"] is None else float(entry["value"])
+        return cls.of(cls(value, ends(entry["ci68"]), ends(entry["ci95"])))
 
     @property
     def absent_because(self) -> str | None:

@@ -326,6 +326,8 @@ class _Levels:
 
     def spreads(self, most_spread: float) -> tuple[_Spread, _Spread | None]:
         """Return the spread between clusters, and that between movies where there are movies."""
+        from scipy.interpolate import RectBivariateSpline
+
         step = float(self.log_D[1] - self.log_D[0])
         nodes = most_spread * np.geomspace(_SMALLEST_SPREAD, 1.0, _SPREADS - 1)
         nodes = np.concatenate([[0.0], nodes])
@@ -338,7 +340,11 @@ class _Levels:
         for i, s in enumerate(nodes):
             within = _movie_sums(smoothed(self.rows, s, step=step), self.movie)
             grid[i] = [_integrated(smoothed(within, b, step=step)) for b in nodes]
-        fine = _refined(grid)
+        # Between the nodes by cubic splines; far below the maximum they would only add waves.
+        index = np.arange(_SPREADS)
+        spline = RectBivariateSpline(index, index, np.maximum(grid, grid.max() - 40))
+        between = np.linspace(0, _SPREADS - 1, _FINE)
+        fine = spline(between, between)
         return (
             _peak(nodes, fine.max(axis=1), dof=n - k),
             _peak(nodes, fine.max(axis=0), dof=k - 1),
@@ -387,16 +393,6 @@ def _integrated(units: Floats) -> float:
     return top + float(np.log(np.exp(total - top).sum()))
 
 
-def _refined(table: Floats) -> Floats:
-    """Return a table of restricted likelihoods between its nodes too, by cubic splines."""
-    from scipy.interpolate import RectBivariateSpline
-
-    nodes, fine = np.arange(_SPREADS), np.linspace(0, _SPREADS - 1, _FINE)
-    # Far below the maximum a spline would only add waves.
-    clipped = np.maximum(table, table.max() - 40)
-    return np.asarray(RectBivariateSpline(nodes, nodes, clipped)(fine, fine))
-
-
 def _peak(nodes: Floats, profile: Floats, *, dof: int) -> _Spread:
     """Return the spread of greatest likelihood with its intervals.
 
@@ -439,7 +435,11 @@ def _mean_interval(
     total = units.sum(axis=0)
     (peak,), (top,) = _vertices(total[None])
     centre = float(log_D[0] + step * peak)
-    at_mean = _on_parabola(units, np.full(len(units), np.rint(peak)), peak)
+    # The units at the mean, by parabolas through the three points about it.
+    i = int(np.clip(np.rint(peak), 1, units.shape[1] - 2))
+    left, here, right = units[:, i - 1], units[:, i], units[:, i + 1]
+    offset = peak - i
+    at_mean = here + offset * ((right - left) / 2 + offset * (left - 2 * here + right) / 2)
     deviance = 2 * np.sum(_vertices(units)[1] - at_mean)
     dispersion = max(float(deviance / dof), 1e-12)
     root = np.sign(log_D - centre) * np.sqrt(np.maximum(2 * (top - total), 0.0))
@@ -473,14 +473,6 @@ def _vertices(rows: Floats) -> tuple[Floats, Floats]:
     bend, slope = left - 2 * here + right, (right - left) / 2
     offset = np.where(bend < 0, np.clip(-slope / np.where(bend < 0, bend, 1.0), -1, 1), 0.0)
     return middle + offset, here + offset * (slope + offset * bend / 2)
-
-
-def _on_parabola(rows: Floats, middle: Floats, place: float) -> Floats:
-    """Return the rows at a place (in steps), by the parabolas through three points about it."""
-    i = np.clip(middle.astype(np.int64), 1, rows.shape[1] - 2)
-    left, here, right = (np.take_along_axis(rows, (i + d)[:, None], 1)[:, 0] for d in (-1, 0, 1))
-    offset = place - i
-    return np.asarray(here + offset * ((right - left) / 2 + offset * (left - 2 * here + right) / 2))
 
 
 def _one_cluster(one: Coefficient, unit: str) -> PopulationMean:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from perrin.motion.rods import RodMotion
 from perrin.movie.stacks import analyze_stack
 from perrin.report.write import complete_run, write_run
 from perrin.run.folders import filled_folder
@@ -29,8 +30,8 @@ from perrin.study.manifest import STACK_OPTIONS, TABLE_OPTIONS
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
+    from contextlib import AbstractContextManager
 
-    from perrin._arrays import Floats
     from perrin.run.results import ClusterResult, Report
     from perrin.study.manifest import StudyMovie
 
@@ -83,8 +84,14 @@ def measure_movie(task: Task) -> Entry:
         "settings": settings_of(movie, reports=task.reports),
         "stamp": stamp_of(movie.path),
     }
+    # On one thread the sums of numerical libraries are the same everywhere.
+    one_thread: AbstractContextManager[object] = nullcontext()
+    with suppress(ModuleNotFoundError):
+        from threadpoolctl import threadpool_limits
+
+        one_thread = threadpool_limits(1)
     try:
-        with _single_thread():
+        with one_thread:
             report = _measured(task)
         entry = Entry(
             status="done",
@@ -220,7 +227,16 @@ def _distributed(tasks: Sequence[Task], client: Any) -> Iterator[Entry]:  # noqa
         try:
             entry = future.result()
         except KilledWorker as fault:
-            entry = _lost(task, fault)
+            entry = Entry(
+                name=task.movie.name,
+                status="failed",
+                reason="workers were killed repeatedly while they measured it (out of memory, or "
+                f"out of time?): {fault}",
+                retry=True,
+                settings=settings_of(task.movie, reports=task.reports),
+                stamp=stamp_of(task.movie.path),
+            )
+            write_entry(Path(task.folder), entry)
         except CancelledError as fault:
             raise ConnectionError(
                 "the Dask scheduler has stopped; finished movies are kept, and the same command "
@@ -229,21 +245,6 @@ def _distributed(tasks: Sequence[Task], client: Any) -> Iterator[Entry]:  # noqa
         future.release()
         submit()
         yield entry
-
-
-def _lost(task: Task, fault: Exception) -> Entry:
-    """Return the entry of a movie whose workers were killed."""
-    entry = Entry(
-        name=task.movie.name,
-        status="failed",
-        reason="workers were killed repeatedly while they measured it (out of memory, or out of "
-        f"time?): {fault}",
-        retry=True,
-        settings=settings_of(task.movie, reports=task.reports),
-        stamp=stamp_of(task.movie.path),
-    )
-    write_entry(Path(task.folder), entry)
-    return entry
 
 
 def _measured(task: Task) -> Report:
@@ -290,13 +291,18 @@ def _content(report: Report, movie: StudyMovie) -> dict[str, Any]:
     by_number = {one.cluster: one for one in report.results}
     for k, kind in enumerate(report.kinds):
         number |= dict.fromkeys(kind.clusters, k)
-        first = by_number[next(iter(kind.clusters))]
+        motion = by_number[next(iter(kind.clusters))].motion
+        template = (
+            motion.places[:, None] * np.array([[1.0, 0.0, 0.0]])
+            if isinstance(motion, RodMotion)
+            else motion.template
+        )
         kinds.append(
             {
                 "size": kind.size,
                 "point_group": kind.point_group,
                 "count": len(kind.clusters),
-                "template": np.round(_template(first) / (diameter or 1.0), 6).tolist(),
+                "template": np.round(template / (diameter or 1.0), 6).tolist(),
             }
         )
     return {
@@ -305,13 +311,6 @@ def _content(report: Report, movie: StudyMovie) -> dict[str, Any]:
         "warnings": report.warnings,
         "notes": report.notes,
     }
-
-
-def _template(result: ClusterResult | RodResult) -> Floats:
-    """Return the positions of the particles of a cluster or rod."""
-    if isinstance(result, RodResult):
-        return np.asarray(result.motion.places[:, None] * np.array([[1.0, 0.0, 0.0]]))
-    return result.motion.template
 
 
 def _values(result: ClusterResult | RodResult, kind: int | None) -> dict[str, Any]:
@@ -346,12 +345,3 @@ def _values(result: ClusterResult | RodResult, kind: int | None) -> dict[str, An
             "predicted": None if compared is None else compared.predicted,
         }
     return entry
-
-
-def _single_thread() -> Any:  # noqa: ANN401 (a context of threadpoolctl's)
-    """Return a context in which numerical libraries use one thread, so that sums are the same."""
-    try:
-        from threadpoolctl import threadpool_limits
-    except ModuleNotFoundError:
-        return nullcontext()
-    return threadpool_limits(1)

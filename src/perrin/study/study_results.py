@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -91,13 +92,32 @@ class StudyResult(Shown):
     def trends(self) -> dict[str, Trend]:
         """Laws that are fitted, by kind of bodies and quantity."""
         found = {}
+        first = "".join(self.manifest.conditions[:1])
         for body, of_body in self.by_body().items():
-            if self.manifest.law is not None:
-                for quantity in QUANTITIES:
-                    trend = _trend(of_body[quantity], self.manifest)
-                    if trend is not None:
-                        found[f"{body}: {quantity}"] = trend
-            pairs = _common(of_body["D_R"], of_body["D_T"])
+            for quantity in QUANTITIES if self.manifest.law is not None else ():
+                usable = [
+                    m
+                    for m in of_body[quantity]
+                    if m.mean.movies is not None
+                    and isinstance(m.conditions.get(first), int | float)
+                ]
+                x = [float(m.conditions[first]) for m in usable]
+                if len(set(x)) < 3:
+                    continue
+                # A condition of 0 may have no value under the law.
+                with suppress(ValueError):
+                    found[f"{body}: {quantity}"] = fit_trend(
+                        [m.mean for m in usable],
+                        x,
+                        law=self.manifest.law or "constant",  # type: ignore[arg-type]
+                    )
+            pairs = [
+                (a, b)
+                for a in of_body["D_R"]
+                for b in of_body["D_T"]
+                if a.conditions == b.conditions
+                and all(m.mean.value > 0 and 0 < m.mean.log_stderr < np.inf for m in (a, b))
+            ]
             if len(pairs) >= 3:
                 found[f"{body}: D_T against D_R"] = fit_power_law(
                     [a.mean for a, _ in pairs], [b.mean for _, b in pairs]
@@ -192,34 +212,3 @@ class StudyResult(Shown):
         lines += [f"  {one}" for one in self.means]
         lines += [f"  {one.name} failed: {one.reason}" for one in self.failed[:10]]
         return "\n".join(lines)
-
-
-def _trend(means: list[ConditionMean], manifest: Manifest) -> Trend | None:
-    """Return the law of one coefficient; None where there are too few conditions for it."""
-    usable = [
-        m
-        for m in means
-        if m.mean.movies is not None
-        and isinstance(
-            m.conditions.get(manifest.conditions[0] if manifest.conditions else ""), int | float
-        )
-    ]
-    x = [float(m.conditions[manifest.conditions[0]]) for m in usable]
-    if len(set(x)) < 3:
-        return None
-    try:
-        return fit_trend([m.mean for m in usable], x, law=manifest.law or "constant")  # type: ignore[arg-type]
-    except ValueError:  # a condition of 0 under a law that has no value there
-        return None
-
-
-def _common(
-    first: list[ConditionMean], second: list[ConditionMean]
-) -> list[tuple[ConditionMean, ConditionMean]]:
-    """Return the means of two quantities under the same conditions, with finite errors."""
-    pairs = [(a, b) for a in first for b in second if a.conditions == b.conditions]
-    return [
-        pair
-        for pair in pairs
-        if all(one.mean.value > 0 and 0 < one.mean.log_stderr < np.inf for one in pair)
-    ]

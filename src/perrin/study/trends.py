@@ -212,9 +212,10 @@ def fit_trend(
 
     at = np.atleast_1d(np.asarray(x, dtype=np.float64))
     names, logarithm = _checked_law(means, at, law, start)
-    rows, place = _movie_likelihoods(means)
-    condition = at[place]
-    count = len(rows)
+    movies = [one.movies for one in means if one.movies is not None]
+    condition = np.repeat(at, [len(one.log_likelihood) for one in movies])
+    centres = np.concatenate([one.log_D[one.log_likelihood.argmax(axis=1)] for one in movies])
+    count = len(condition)
     refuse(
         [f"means: expected more movies than parameters ({len(names)}), got {count}"]
         if count <= len(names)
@@ -224,17 +225,29 @@ def fit_trend(
     if callable(law):
         first = np.array([dict(start or {})[name] for name in names], dtype=np.float64)
     else:
-        first = _line_start(law, condition, np.array([one.centre for one in rows]))
+        # The laws are linear in their parameters: least squares of ln D without weights.
+        base = logarithm(condition, *np.zeros(len(names)))
+        units = np.eye(len(names))
+        design = np.stack([logarithm(condition, *one) - base for one in units], axis=1)
+        line, _, rank, _ = np.linalg.lstsq(design, centres - base, rcond=None)
+        first = np.asarray(line, dtype=np.float64)
+        refuse(
+            [f"x: expected at least two different conditions for the law {law!r}"]
+            if rank < len(names)
+            else []
+        )
 
     @lru_cache(maxsize=1)
     def lines(spread: float) -> Floats:
-        return np.array([one.widened(spread).places() for one in rows])
+        return np.array(
+            [_root_places(one.log_D, row) for one in movies for row in one.widened(spread)]
+        )
 
     def fit(spread: float, fixed: tuple[int, float] | None, at_first: Floats) -> _Fit:
         return _least_deviance(lines(spread), condition, logarithm, at_first, fixed)
 
     without = fit(0.0, None, first)
-    spread = _spread_about(lambda s: fit(s, None, without.parameters).deviance - dof)
+    spread = _paule_mandel_spread(lambda s: fit(s, None, without.parameters).deviance - dof)
     best = without if spread == 0 else fit(spread, None, without.parameters)
     ends, errors = [], []
 
@@ -267,7 +280,7 @@ def fit_trend(
         p=float(gammaincc(dof / 2, without.deviance / 2)),
         x=condition,
         residuals=best.roots,
-        log_deviations=np.array([one.centre for one in rows]) - predicted,
+        log_deviations=centres - predicted,
     )
 
 
@@ -370,49 +383,23 @@ def fit_power_law(D_R: Sequence[PopulationMean], D_T: Sequence[PopulationMean]) 
     )
 
 
-@dataclass(frozen=True, eq=False)
-class _MovieRoot:
-    """The likelihood of one movie as the signed root of its deviance."""
+def _root_places(log_D: Floats, row: Floats) -> Floats:
+    """Return ln D of a movie at the signed roots `_MOVIE_ROOTS` of its deviance.
 
-    log_D: Floats
-    log_likelihood: Floats
-
-    @property
-    def centre(self) -> float:
-        """Value of ln D of greatest likelihood."""
-        return float(self.log_D[np.argmax(self.log_likelihood)])
-
-    def widened(self, spread: float) -> _MovieRoot:
-        from perrin.study.random_effects import smoothed
-
-        step = float(self.log_D[1] - self.log_D[0])
-        return _MovieRoot(self.log_D, smoothed(self.log_likelihood[None], spread, step=step)[0])
-
-    def places(self) -> Floats:
-        """Return ln D at the roots `_MOVIE_ROOTS`, by straight lines beyond the known ones."""
-        row = self.log_likelihood
-        i = min(max(int(np.argmax(row)), 1), row.size - 2)
-        bend, slope = row[i - 1] - 2 * row[i] + row[i + 1], (row[i + 1] - row[i - 1]) / 2
-        offset = float(np.clip(-slope / bend, -1, 1)) if bend < 0 else 0.0
-        step = float(self.log_D[1] - self.log_D[0])
-        centre, top = self.log_D[i] + offset * step, row[i] + offset * slope / 2
-        root = np.sign(self.log_D - centre) * np.sqrt(np.maximum(2 * (top - row), 0.0))
-        keep = np.abs(root) < _KNOWN_ROOT
-        x, r = self.log_D[keep], np.maximum.accumulate(root[keep])
-        low = x[0] - _CONTINUED_ROOT * (centre - x[0]) / max(-r[0], 0.2)
-        high = x[-1] + _CONTINUED_ROOT * (x[-1] - centre) / max(r[-1], 0.2)
-        roots = np.concatenate([[r[0] - _CONTINUED_ROOT], r, [r[-1] + _CONTINUED_ROOT]])
-        places = np.interp(_MOVIE_ROOTS, roots, np.concatenate([[low], x, [high]]))
-        return np.asarray(places, dtype=np.float64)
-
-
-def _roots_at(places: Floats, log_D: Floats) -> Floats:
-    """Return the signed root of each movie at its own ln D, from the places of `_MOVIE_ROOTS`."""
-    row = np.arange(len(places))
-    k = np.clip(np.sum(places < log_D[:, None], axis=1), 1, _MOVIE_ROOTS.size - 1)
-    left, right = places[row, k - 1], places[row, k]
-    share = (log_D - left) / np.maximum(right - left, 1e-12)
-    return np.asarray(_MOVIE_ROOTS[k - 1] + share * (_MOVIE_ROOTS[k] - _MOVIE_ROOTS[k - 1]))
+    Beyond the known roots they are straight lines in ln D.
+    """
+    i = min(max(int(np.argmax(row)), 1), row.size - 2)
+    bend, slope = row[i - 1] - 2 * row[i] + row[i + 1], (row[i + 1] - row[i - 1]) / 2
+    offset = float(np.clip(-slope / bend, -1, 1)) if bend < 0 else 0.0
+    centre, top = log_D[i] + offset * float(log_D[1] - log_D[0]), row[i] + offset * slope / 2
+    root = np.sign(log_D - centre) * np.sqrt(np.maximum(2 * (top - row), 0.0))
+    keep = np.abs(root) < _KNOWN_ROOT
+    x, r = log_D[keep], np.maximum.accumulate(root[keep])
+    low = x[0] - _CONTINUED_ROOT * (centre - x[0]) / max(-r[0], 0.2)
+    high = x[-1] + _CONTINUED_ROOT * (x[-1] - centre) / max(r[-1], 0.2)
+    roots = np.concatenate([[r[0] - _CONTINUED_ROOT], r, [r[-1] + _CONTINUED_ROOT]])
+    places = np.interp(_MOVIE_ROOTS, roots, np.concatenate([[low], x, [high]]))
+    return np.asarray(places, dtype=np.float64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -468,30 +455,6 @@ def _checked_law(
     return LAWS[law][0], linear
 
 
-def _movie_likelihoods(means: Sequence[PopulationMean]) -> tuple[list[_MovieRoot], list[int]]:
-    """Return the likelihoods of all movies, and the condition of each."""
-    rows, place = [], []
-    for k, one in enumerate(means):
-        assert one.movies is not None
-        rows += [_MovieRoot(one.movies.log_D, row) for row in one.movies.log_likelihood]
-        place += [k] * len(one.movies.log_likelihood)
-    return rows, place
-
-
-def _line_start(law: str, x: Floats, y: Floats) -> Floats:
-    """Return the parameters of a law by an unweighted line through ln D."""
-    if law == "constant":
-        return np.array([y.mean()])
-    if law in ("proportional", "inverse"):
-        sign = 1.0 if law == "proportional" else -1.0
-        return np.array([np.mean(y - sign * np.log(x))])
-    at = np.log(x) if law == "power" else x
-    if np.ptp(at) == 0:
-        refuse([f"x: expected at least two different conditions for the law {law!r}"])
-    slope, height = np.polyfit(at, y, 1)
-    return np.array([height, slope])
-
-
 def _least_deviance(
     places: Floats,
     x: Floats,
@@ -506,18 +469,26 @@ def _least_deviance(
         return free if fixed is None else np.insert(free, fixed[0], fixed[1])
 
     def roots(free: Floats) -> Floats:
-        return _roots_at(places, logarithm(x, *whole(free)))
+        # The signed root of each movie at its own ln D, between the places of `_MOVIE_ROOTS`.
+        log_D = logarithm(x, *whole(free))
+        row = np.arange(len(places))
+        k = np.clip(np.sum(places < log_D[:, None], axis=1), 1, _MOVIE_ROOTS.size - 1)
+        left, right = places[row, k - 1], places[row, k]
+        share = (log_D - left) / np.maximum(right - left, 1e-12)
+        return np.asarray(_MOVIE_ROOTS[k - 1] + share * (_MOVIE_ROOTS[k] - _MOVIE_ROOTS[k - 1]))
 
     free = first if fixed is None else np.delete(first, fixed[0])
     if free.size == 0:
         values = roots(free)
         return _Fit(whole(free), float(values @ values), -values, np.empty((0, 0)))
-    found = least_squares(roots, free, x_scale=np.maximum(np.abs(free), 0.1), xtol=1e-10)
+    found = least_squares(
+        roots, free, x_scale=np.maximum(np.abs(free), 0.1), ftol=1e-14, xtol=1e-12
+    )
     covariance = np.linalg.pinv(found.jac.T @ found.jac)
     return _Fit(whole(found.x), 2 * float(found.cost), -found.fun, covariance)
 
 
-def _spread_about(excess: Callable[[float], float]) -> float:
+def _paule_mandel_spread(excess: Callable[[float], float]) -> float:
     """Return the spread at which the excess of the deviance is 0; 0 where there is none."""
     from scipy.optimize import brentq
 
@@ -527,7 +498,7 @@ def _spread_about(excess: Callable[[float], float]) -> float:
         return _NARROWEST
     if excess(_WIDEST) >= 0:
         return _WIDEST
-    return float(brentq(excess, _NARROWEST, _WIDEST, xtol=1e-4))
+    return float(brentq(excess, _NARROWEST, _WIDEST, xtol=1e-10))
 
 
 def _likelihood_ends(

@@ -48,6 +48,7 @@ from perrin.tracks.delimited import (
     Layout,
     delimited_table,
     first_lines,
+    is_number,
     layout_of,
     parse_text,
     utf8_text,
@@ -64,6 +65,7 @@ from perrin.tracks.file_limits import (
 from perrin.tracks.files import RowNumbers, check_tracks, read_spheres, read_tracks, write_tracks
 from perrin.tracks.formats import (
     SUFFIXES,
+    parse_parquet,
     parse_table,
     sheet_text,
     table_bytes,
@@ -72,7 +74,14 @@ from perrin.tracks.formats import (
     unpacked,
 )
 from perrin.tracks.gdf import gdf_bytes, parse_ascii_gdf, parse_gdf
-from perrin.tracks.groups import TOUCHING_REACH, connected_groups, frames_of, touching_groups
+from perrin.tracks.groups import (
+    TOUCHING_REACH,
+    connected_groups,
+    frames_of,
+    group_quantiles,
+    near_pairs,
+    touching_groups,
+)
 from perrin.tracks.identity import (
     BodyModel,
     Candidates,
@@ -177,6 +186,7 @@ __all__ = [
     "frames_of",
     "gdf_bytes",
     "gdf_table",
+    "group_quantiles",
     "guarded_cell",
     "guarded_table",
     "has_trackpy_columns",
@@ -188,6 +198,7 @@ __all__ = [
     "imaris_table",
     "is_imaris",
     "is_motive",
+    "is_number",
     "is_selection",
     "is_trackmate",
     "joined_pairs",
@@ -204,6 +215,7 @@ __all__ = [
     "motive_table",
     "napari_columns",
     "napari_text",
+    "near_pairs",
     "neighbour_pairs",
     "noise_along",
     "of_equal_shape",
@@ -214,6 +226,7 @@ __all__ = [
     "parse_c3d",
     "parse_gdf",
     "parse_gsd",
+    "parse_parquet",
     "parse_table",
     "parse_text",
     "parse_trackmate_xml",

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from perrin.tracks.groups import connected_groups, frames_of
+from perrin.tracks.groups import connected_groups, frames_of, group_quantiles
 
 if TYPE_CHECKING:
     from perrin._arrays import Bools, Floats, Ints
@@ -98,7 +98,11 @@ class Pairs(NamedTuple):
         """Return the statistics of separations (N, d), sorted by pair and time."""
         count = len(first)
         distance = np.linalg.norm(separation, axis=1)
-        median, spread = _median_and_spread(pair, distance, count)
+        low, median, high = (
+            group_quantiles(pair, distance, count, q=q)
+            for q in (_TAIL_QUANTILE, 0.5, 1 - _TAIL_QUANTILE)
+        )
+        spread = (high - low) / _NORMAL_RANGE
         good = np.abs(distance - median[pair]) <= _GROSS_ERROR * spread[pair] + 1e-9 * median[pair]
         pair, separation, distance = pair[good], separation[good], distance[good]
         shared = np.bincount(pair, minlength=count)
@@ -253,23 +257,12 @@ def noise_along(pairs: Pairs, *, count: int) -> Floats:
         for axis in range(dimensions):
             trial = np.where(np.arange(dimensions) == axis, factor, 1.0)
             excess = np.log(pairs.variance[used] / (pairs.direction[used] @ trial))
-            misfit = _absolute_deviation(group, excess) + price * abs(np.log(factor))
+            off = np.abs(excess - group_quantiles(group, excess, count)[group])
+            misfit = (float(off.mean()) if off.size else 0.0) + price * abs(np.log(factor))
             if misfit < best:
                 best, weights = misfit, trial
     along: Floats = pairs.direction @ (weights / weights.mean())
     return along
-
-
-def _absolute_deviation(group: Ints, values: Floats) -> float:
-    """Return the mean absolute difference of values from the median of their group."""
-    if not len(values):
-        return 0.0
-    number, order = np.unique(group, return_inverse=True)[1], np.lexsort((values, group))
-    start = np.searchsorted(group[order], np.unique(group))
-    size = np.bincount(number)
-    low, high = order[start + (size - 1) // 2], order[start + size // 2]
-    median = 0.5 * (values[low] + values[high])
-    return float(np.mean(np.abs(values - median[number])))
 
 
 def followed_pairs(frame: Ints, code: Ints, x: Floats, *, count: int) -> Pairs:
@@ -332,22 +325,6 @@ def shared_rows(number: Ints, code: Ints, brief: Ints, other: Ints) -> tuple[Int
     two = np.minimum(np.searchsorted(key, wanted), len(key) - 1)
     both = key[two] == wanted
     return pair[both], one[both], two[both]
-
-
-def _median_and_spread(pair: Ints, values: Floats, count: int) -> tuple[Floats, Floats]:
-    """Return the median of each pair's values, and their spread in standard deviations."""
-    ordered = values[np.lexsort((values, pair))]
-    size = np.bincount(pair, minlength=count)
-    start = np.cumsum(size) - size
-    quantiles = []
-    for q in (_TAIL_QUANTILE, 0.5, 1 - _TAIL_QUANTILE):
-        place = start + q * np.maximum(size - 1, 0)
-        low = np.minimum(place.astype(np.int64), max(len(ordered) - 1, 0))
-        high = np.minimum(low + 1, max(len(ordered) - 1, 0))
-        low, high = (ordered[k] if len(ordered) else np.zeros(count) for k in (low, high))
-        share = place % 1.0
-        quantiles.append(np.where(share > 0, (1 - share) * low + share * high, low))
-    return quantiles[1], (quantiles[2] - quantiles[0]) / _NORMAL_RANGE
 
 
 def _variances(

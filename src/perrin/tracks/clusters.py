@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -26,7 +27,7 @@ from perrin.errors import (
 )
 from perrin.motion.rods import track_direction
 from perrin.tracks.bonds import rigid_groups
-from perrin.tracks.groups import TOUCHING_REACH, connected_groups, frames_of
+from perrin.tracks.groups import TOUCHING_REACH, connected_groups, near_pairs
 from perrin.tracks.identity import settle_identity
 from perrin.tracks.linking import link_clusters
 
@@ -253,6 +254,8 @@ def find_clusters(
     >>> find_clusters(table, contact=1.0)["cluster"].tolist()
     [0, 0, -1, 0, 0, -1]
     """
+    from scipy.sparse import csr_array
+
     if contact is not None:
         require_positive(contact=contact)
     if size is not None:
@@ -267,7 +270,22 @@ def find_clusters(
         first = np.unique(group[group >= 0])
         labels = np.where(group >= 0, np.searchsorted(first, group), -1)
     else:
-        pairs = _lasting_pairs(tracks, TOUCHING_REACH * contact)
+        # Pairs that are near each other in over half of the frames they share; one near frame can
+        # never be over half of two or more.
+        frame, code, x = tracks.frame[tracks.seen], tracks.code[tracks.seen], tracks.x[tracks.seen]
+        pairs, n_near = near_pairs(frame, code, x, reach=TOUCHING_REACH * contact, fewest=2)
+        frames, column = np.unique(frame, return_inverse=True)
+        present_in = csr_array(
+            (np.ones(len(code), dtype=np.int64), (code, column)),
+            shape=(count, max(len(frames), 1)),
+        )
+        shared = np.zeros(len(pairs), dtype=np.int64)
+        # In parts, so that memory stays bounded for any number of pairs.
+        step = max(1, 500_000 // max(len(frames), 1))
+        for i in range(0, len(pairs), step):
+            one, other = pairs[i : i + step].T
+            shared[i : i + step] = present_in[one].multiply(present_in[other]).sum(axis=1)
+        pairs = pairs[2 * n_near > shared]
         group = connected_groups(pairs[:, 0], pairs[:, 1], count=count)
         _, first, inverse, members = np.unique(
             group, return_index=True, return_inverse=True, return_counts=True
@@ -404,7 +422,12 @@ def particles_and_pieces(frame: Ints, x: Floats, size: int) -> tuple[Ints, Ints]
     positions = np.full((len(times), width, x.shape[1]), np.nan)
     positions[row, column] = x[order]
     if size == 2 and x.shape[1] == 3:
-        taken, piece = _rod_ends(positions, times)
+        taken, piece = np.full((len(times), width), -1), np.zeros(len(times), dtype=np.int64)
+        with suppress(DegenerateClusterError, TooFewFramesError):
+            rod = track_direction(positions, dt=1.0, times=times.astype(np.float64), labelled=False)
+            along = np.einsum("td,td->t", positions[:, 1] - positions[:, 0], rod.direction)
+            ends = np.where((along < 0)[:, None], [1, 0], [0, 1])
+            taken, piece = np.where(np.isfinite(along)[:, None], ends, -1), rod.piece
     else:
         found = settle_identity(positions, times=times, size=size, labelled=False)
         taken, piece = found.order, found.piece
@@ -414,17 +437,6 @@ def particles_and_pieces(frame: Ints, x: Floats, size: int) -> tuple[Ints, Ints]
     out = np.empty((2, len(frame)), dtype=np.int64)
     out[:, order] = particle[row, column], piece[row]
     return out[0], out[1]
-
-
-def _rod_ends(positions: Floats, times: Ints) -> tuple[Ints, Ints]:
-    """Return the order of the two ends of a rod in every frame, and the pieces."""
-    try:
-        rod = track_direction(positions, dt=1.0, times=times.astype(np.float64), labelled=False)
-    except (DegenerateClusterError, TooFewFramesError):
-        return np.full(positions.shape[:2], -1), np.zeros(len(positions), dtype=np.int64)
-    along = np.einsum("td,td->t", positions[:, 1] - positions[:, 0], rod.direction)
-    order = np.where((along < 0)[:, None], [1, 0], [0, 1])
-    return np.where(np.isfinite(along)[:, None], order, -1), rod.piece
 
 
 class _Columns(NamedTuple):
@@ -470,37 +482,3 @@ def _columns_of(table: pd.DataFrame, *, unique: Sequence[str] = ("frame", "parti
     code, ids = pd.factorize(table["particle"], sort=True)
     frame = table["frame"].to_numpy(dtype=np.int64)
     return _Columns(frame, code.astype(np.int64), x, ~np.isnan(x).any(axis=1), len(ids))
-
-
-def _lasting_pairs(tracks: _Columns, reach: float) -> Ints:
-    """Return the pairs (P, 2) of codes that are near in over half of the frames they share."""
-    from scipy.sparse import csr_array
-    from scipy.spatial import cKDTree
-
-    order = np.lexsort((tracks.code, tracks.frame))
-    order = order[tracks.seen[order]]
-    found = [np.empty(0, np.int64)]
-    for part in frames_of(tracks.frame[order]):
-        rows = order[part]
-        if len(rows) > 1:
-            near = cKDTree(tracks.x[rows]).query_pairs(reach, output_type="ndarray")
-            one, other = tracks.code[rows][near].T
-            found.append(one * tracks.n_particles + other)
-    keys, n_near = np.unique(np.concatenate(found), return_counts=True)
-    # One near frame can never be over half of two or more.
-    keys, n_near = keys[n_near > 1], n_near[n_near > 1]
-    pairs = np.stack(np.divmod(keys, tracks.n_particles), axis=1)
-    frames, column = np.unique(tracks.frame[tracks.seen], return_inverse=True)
-    code = tracks.code[tracks.seen]
-    present = csr_array(
-        (np.ones(len(code), dtype=np.int64), (code, column)),
-        shape=(tracks.n_particles, max(len(frames), 1)),
-    )
-    shared = np.zeros(len(pairs), dtype=np.int64)
-    # In parts, so that memory stays bounded for any number of pairs.
-    step = max(1, 500_000 // max(len(frames), 1))
-    for i in range(0, len(pairs), step):
-        one, other = pairs[i : i + step].T
-        shared[i : i + step] = present[one].multiply(present[other]).sum(axis=1)
-    lasting: Ints = pairs[2 * n_near > shared]
-    return lasting

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from perrin.tracks.bonds import shared_rows
-from perrin.tracks.groups import frames_of
+from perrin.tracks.groups import near_pairs
 
 if TYPE_CHECKING:
     from perrin._arrays import Floats, Ints
@@ -118,7 +118,7 @@ def lasting_contacts(
     """
     order = np.lexsort((frame, track))
     time, code, x = frame[order].astype(np.int64), track[order], x[order]
-    first, second = _near_pairs(time, code, x, reach=reach)
+    first, second = near_pairs(time, code, x, reach=reach, fewest=_FEWEST_NEAR)[0].T
     nothing = np.empty(0, dtype=np.int64)
     if not first.size:
         return Contacts(nothing, nothing, nothing, nothing, np.empty(0))
@@ -150,21 +150,6 @@ def lasting_contacts(
         begin + found.last,
         found.score,
     )
-
-
-def _near_pairs(number: Ints, code: Ints, x: Floats, *, reach: float) -> tuple[Ints, Ints]:
-    """Return the pairs of tracks that are within reach in three frames or more."""
-    from scipy.spatial import cKDTree
-
-    count = int(code.max(initial=0)) + 1
-    keys = [np.empty(0, dtype=np.int64)]
-    for rows in frames_of(number):
-        near = cKDTree(x[rows]).query_pairs(reach, output_type="ndarray")
-        pairs = np.sort(code[rows[near]], axis=1)
-        keys.append(pairs[:, 0] * count + pairs[:, 1])
-    key, times = np.unique(np.concatenate(keys), return_counts=True)
-    first, second = np.divmod(key[times >= _FEWEST_NEAR], count)
-    return first, second
 
 
 def _sequential_test(

@@ -159,14 +159,14 @@ def parse_text(text: bytes, source: str) -> RawTable:
         following = lines[first : first + _LINES_COMPARED]
         layout = layout_of(following, source)
         # numpy.savetxt writes the names of the columns into a comment.
-        in_comment = bool(following) and all(map(_is_number, layout.fields(following[0])))
+        in_comment = bool(following) and all(map(is_number, layout.fields(following[0])))
         header = comments - 1 if in_comment else first
         lines[header:header] = [lines.pop(header).lstrip("#\t ")] if in_comment else []
         if header > 0:
             notes = (f"line {header + 1} has the names of the columns; those before are comments",)
     layout = layout_of(lines[header:], source)
     names = layout.fields(lines[header])
-    if all(map(_is_number, names)):
+    if all(map(is_number, names)):
         shown = lines[header].strip()[:60]
         unnamed = (
             f"line {header + 1} holds numbers ({shown}) where the names of the columns are "
@@ -213,7 +213,7 @@ def layout_of(lines: Sequence[str], source: str) -> Layout:
     mark = next(iter([*regular, *inside]), ",")
     parts = head.split()
     # Numbers with decimal commas and blanks between them, under no header.
-    commas = inside == [","] and all(_is_number(p) and not p.endswith(",") for p in parts)
+    commas = inside == [","] and all(is_number(p) and not p.endswith(",") for p in parts)
     if (not inside or commas) and len(parts) > 1:
         mark = r"\s+" if all(len(row.split()) == len(parts) for row in rest) else mark
     if mark == ",":
@@ -311,25 +311,27 @@ def delimited_table(
     lines = text.decode().splitlines()[header + 1 + skipped :] if empty else []
     table = table.drop(index=[i for i in empty if not lines[i].strip(" \t,;")])
     table.index += header + skipped
-    return table if names is None else _with_names(table, names)
-
-
-def _with_names(table: pd.DataFrame, names: Sequence[str]) -> pd.DataFrame:
-    """Return the table with names, but without repeated columns of equal content.
-
-    A DataFrame whose index has the name of a column is written with both.
-    """
-    first: dict[str, int] = {}
-    kept = []
-    for column, name in enumerate(names):
-        again = name and name in first and table[column].equals(table[first[name]])
-        first.setdefault(name, column)
-        if not again:
-            kept.append(column)
+    if names is None:
+        return table
+    # A DataFrame whose index has the name of a column is written with both: one of two columns of
+    # one name and of equal content is left out.
+    first = {name: column for column, name in reversed(list(enumerate(names)))}
+    kept = [
+        column
+        for column, name in enumerate(names)
+        if not name or column == first[name] or not table[column].equals(table[first[name]])
+    ]
     return table[kept].set_axis([names[column] for column in kept], axis=1)
 
 
-def _is_number(text: str) -> bool:
+def is_number(text: str) -> bool:
+    """Return whether a text is a number, with a point or a comma.
+
+    Examples
+    --------
+    >>> is_number("1,5"), is_number("***")
+    (True, False)
+    """
     try:
         float(text.replace(",", "."))
     except ValueError:

@@ -420,7 +420,16 @@ def _clean_table(
     table, note, faults = _with_frames(table, spelling)
     notes = [*spelling.notes, *note]
     faults += [*spelling.faults, *_column_faults(table, names, spelling, detections=detections)]
-    factors = _um_per_unit(scale, axes) if {"x", "y"} <= set(axes) else {}
+    factors: dict[str, float] = {}
+    if {"x", "y"} <= set(axes):
+        factor = np.asarray(scale, dtype=np.float64)
+        one_or_each = factor.shape in ((), (len(axes),))
+        if not one_or_each or not (np.isfinite(factor) & (factor > 0)).all():
+            raise ValueError(
+                f"scale: expected one positive number, or {len(axes)} of them (one per axis), in "
+                f"um per unit of the file, got {scale!r}"
+            )
+        factors = dict(zip(axes, np.broadcast_to(factor, len(axes)).tolist(), strict=True))
     faults += unit_faults(spelling.units, factors)
     clean: dict[str, NDArray[Any]] = {}
     for name in COLUMNS:
@@ -440,18 +449,6 @@ def _clean_table(
         tracks.attrs["notes"] = notes
     tracks.attrs["columns"] = list(names)
     return tracks
-
-
-def _um_per_unit(scale: ArrayLike, axes: list[str]) -> dict[str, float]:
-    """Return the scale of each axis; refuse one that is not positive."""
-    factor = np.asarray(scale, dtype=np.float64)
-    one_or_each = factor.shape in ((), (len(axes),))
-    if not one_or_each or not (np.isfinite(factor) & (factor > 0)).all():
-        raise ValueError(
-            f"scale: expected one positive number, or {len(axes)} of them (one per axis), in "
-            f"um per unit of the file, got {scale!r}"
-        )
-    return dict(zip(axes, np.broadcast_to(factor, len(axes)).tolist(), strict=True))
 
 
 def _with_frames(

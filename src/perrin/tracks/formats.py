@@ -117,7 +117,7 @@ def parse_table(data: bytes, suffix: str, source: str) -> RawTable:
         )
     parsers: dict[str, Callable[[bytes, str], RawTable]] = {
         ".gdf": lambda data, source: gdf_table(parse_gdf(data, source)),
-        ".parquet": _parse_parquet,
+        ".parquet": parse_parquet,
         ".xml": parse_trackmate_xml,
         ".c3d": parse_c3d,
         ".gsd": parse_gsd,
@@ -266,8 +266,22 @@ def sheet_text(data: bytes, source: str) -> tuple[str, str]:
     return text.getvalue(), note
 
 
-def _parse_parquet(data: bytes, source: str) -> RawTable:
-    """Return the table of a Parquet file."""
+def parse_parquet(data: bytes, source: str) -> RawTable:
+    """Return the table in the bytes of a Parquet file.
+
+    Raises
+    ------
+    TrackTableError
+        If these are not the bytes of such a file, or its table does not fit into memory; `source`
+        is its name.
+
+    Examples
+    --------
+    >>> import pandas as pd
+    >>> data = table_bytes(pd.DataFrame({"x": [0.5]}), ".parquet", "t.parquet")
+    >>> parse_parquet(data, "t.parquet").table["x"].tolist()
+    [0.5]
+    """
     import pyarrow as pa
     import pyarrow.parquet as pq
 

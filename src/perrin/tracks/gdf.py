@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from perrin.errors import table_error
+from perrin.tracks.delimited import is_number
 
 if TYPE_CHECKING:
     from perrin._arrays import Floats
@@ -120,22 +121,16 @@ def parse_ascii_gdf(data: bytes, source: str) -> Floats:
         values = np.array(found, dtype=np.float64)
     except ValueError:
         # A number that is too long for its place is a row of asterisks.
-        wrong = next(i for i, word in enumerate(found) if not _reads_as_number(word))
-        text = found[wrong].decode("ascii", "replace")
+        texts = [word.decode("ascii", "replace") for word in found]
+        wrong, text = next(
+            (i, text) for i, text in enumerate(texts) if "," in text or not is_number(text)
+        )
         raise table_error(
             source,
             f"row {wrong // n_columns}, column {wrong % n_columns}: expected a number, got "
             f"{text!r}; write it again in binary, without /ascii",
         ) from None
     return values.reshape((n_rows, n_columns))
-
-
-def _reads_as_number(word: bytes) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True
 
 
 def gdf_bytes(values: Floats) -> bytes:

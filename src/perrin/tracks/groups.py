@@ -109,3 +109,77 @@ def touching_groups(x: Floats, *, reach: float, size: int, smallest: int) -> Int
     _, label, counts = np.unique(label, return_inverse=True, return_counts=True)
     number = np.where(counts >= smallest, np.cumsum(counts >= smallest) - 1, -1)
     return np.asarray(number[label], dtype=np.int64)
+
+
+def near_pairs(
+    frame: Ints, code: Ints, x: Floats, *, reach: float, fewest: int
+) -> tuple[Ints, Ints]:
+    """Return the pairs of particles that are near each other in some frames.
+
+    Parameters
+    ----------
+    frame, code : ndarray of int, shape (N,)
+        Frame and particle (from 0) of every detection.
+    x : ndarray, shape (N, d)
+        Coordinates of each detection, um; no NaN.
+    reach : float
+        Largest distance of near particles, um.
+    fewest : int
+        Number of frames in which the particles of a pair are near each other, at least.
+
+    Returns
+    -------
+    pairs : ndarray of int, shape (P, 2)
+        Two particles, the smaller number first.
+    count : ndarray of int, shape (P,)
+        Number of frames in which they are near each other.
+
+    Examples
+    --------
+    >>> x = np.array([[0.0], [1.0], [5.0], [0.0], [1.1], [6.0]])
+    >>> near_pairs(np.repeat([0, 1], 3), np.tile(np.arange(3), 2), x, reach=1.3, fewest=2)
+    (array([[0, 1]]), array([2]))
+    """
+    from scipy.spatial import cKDTree
+
+    particles = int(code.max(initial=0)) + 1
+    keys = [np.empty(0, dtype=np.int64)]
+    for rows in frames_of(frame):
+        near = cKDTree(x[rows]).query_pairs(reach, output_type="ndarray")
+        pairs = np.sort(code[rows[near]], axis=1)
+        keys.append(pairs[:, 0] * particles + pairs[:, 1])
+    key, count = np.unique(np.concatenate(keys), return_counts=True)
+    key, count = key[count >= fewest], count[count >= fewest]
+    return np.stack(np.divmod(key, particles), axis=1), count
+
+
+def group_quantiles(group: Ints, values: Floats, count: int, *, q: float = 0.5) -> Floats:
+    """Return a quantile of the values in each group, NaN for none.
+
+    Parameters
+    ----------
+    group : ndarray of int, shape (N,)
+        Group of each value, 0 to count - 1.
+    values : ndarray, shape (N,)
+    count : int
+        Number of groups.
+    q : float
+        Between the ordered values quantiles are interpolated linearly.
+
+    Returns
+    -------
+    ndarray, shape (count,)
+
+    Examples
+    --------
+    >>> group_quantiles(np.array([0, 0, 2]), np.array([1.0, 2.0, 5.0]), 3)
+    array([1.5, nan, 5. ])
+    """
+    size = np.bincount(group, minlength=count)
+    ordered = np.append(values[np.lexsort((values, group))], np.nan)
+    place = q * np.maximum(size - 1, 0)
+    low = np.cumsum(size) - size + place.astype(np.int64)
+    share = place % 1.0
+    between = (1 - share) * ordered[low] + share * ordered[np.minimum(low + 1, len(values))]
+    quantile: Floats = np.where(size == 0, np.nan, np.where(share > 0, between, ordered[low]))
+    return quantile

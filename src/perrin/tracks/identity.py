@@ -463,7 +463,10 @@ class BodyModel(NamedTuple):
         )
         good = misfit <= 2 * _NOISE_LIKE * sigma2 * freedom
         points = assigned_points(detections.x[rows[good]], assignment[good][:, None])[:, 0]
-        return cls.averaged(points, template, _label_of(order, detections))
+        # The particle of each column.
+        label = np.full(int(detections.column.max()) + 1, -1, dtype=np.int64)
+        label[order] = np.arange(n)
+        return cls.averaged(points, template, label)
 
     def of_piece(self, found: Identity, x: Floats) -> BodyModel:
         """Return the shape averaged over the longest piece of an identity."""
@@ -504,13 +507,6 @@ def _evenly(rows: Ints) -> Ints:
     """Return evenly spaced rows of some, at most as many as the shape is averaged from."""
     spaced: Ints = rows[np.linspace(0, rows.size - 1, min(rows.size, _MOST_MODEL_ROWS)).astype(int)]
     return spaced
-
-
-def _label_of(order: Ints, detections: Detections) -> Ints:
-    """Return the particle of each column, given the column of each particle."""
-    label = np.full(int(detections.column.max()) + 1, -1, dtype=np.int64)
-    label[order] = np.arange(order.size)
-    return label
 
 
 def rigid_fits(points: Floats, template: Floats) -> tuple[Floats, Floats]:
@@ -1129,28 +1125,21 @@ def _search_all(
             rotation, misfit = rigid_fits(assigned_points(points, tried), body.template)
             fits = misfit <= limit
             if left_out and count <= n:
-                fits &= _are_strays(points[:, :count], tried, rotation, body.template)
+                # A detection that is left out within half a particle distance of a free particle is
+                # that particle, measured badly.
+                taken = (tried[:, :, None] == np.arange(count)).any(axis=1)
+                left = points[:, np.argmin(taken, axis=1)]
+                here = (tried >= 0)[..., None]
+                share = here / here.sum(axis=1, keepdims=True)
+                center = (np.nan_to_num(assigned_points(points, tried)) * share).sum(axis=2)
+                arms = body.template - (body.template * share).sum(axis=1, keepdims=True)
+                places = center[:, :, None] + np.einsum("kcij,cnj->kcni", rotation, arms)
+                distance = np.linalg.norm(places - left[:, :, None], axis=3)
+                least = np.where(tried < 0, distance, np.inf).min(axis=2)
+                fits &= least > 0.5 * pair_distances(body.template).min()
             for k, fit in zip(rows[part].tolist(), fits, strict=True):
                 if fit.any():
                     found[k] = tried[fit]
-
-
-def _are_strays(points: Floats, tried: Ints, rotation: Floats, template: Floats) -> Bools:
-    """Return where the detection left out is over half a particle distance from all free particles.
-
-    Nearer it is one of the body's particles, measured badly.
-    """
-    count = points.shape[1]
-    taken = (tried[:, :, None] == np.arange(count)).any(axis=1)
-    left = points[:, np.argmin(taken, axis=1)]
-    here = (tried >= 0)[..., None]
-    share = here / here.sum(axis=1, keepdims=True)
-    center = (np.nan_to_num(assigned_points(points, tried)) * share).sum(axis=2)
-    arms = template[None] - (template[None] * share).sum(axis=1, keepdims=True)
-    places = center[:, :, None] + np.einsum("kcij,cnj->kcni", rotation, arms)
-    distance = np.linalg.norm(places - left[:, :, None], axis=3)
-    least = np.where(tried < 0, distance, np.inf).min(axis=2)
-    return np.asarray(least > 0.5 * pair_distances(template).min())
 
 
 def _search_near_labels(

@@ -253,41 +253,13 @@ def _common_step(old: Floats, new: Floats, variance: float) -> Floats:
 def _links(
     centers: Centers, old: Ints, new: Ints, variance: float
 ) -> Iterator[tuple[int, int, bool]]:
-    """Yield the likeliest links of tracks' last groups to groups of this frame, and if certain."""
-    from scipy.optimize import linear_sum_assignment
+    """Yield the likeliest links of tracks' last groups to groups of this frame, and if certain.
 
-    for rows, columns, cost in _link_costs(centers, old, new, variance):
-        n, m = cost.shape
-        if n == m == 1:
-            yield int(old[rows[0]]), int(new[columns[0]]), True
-            continue
-        # No group has to be linked: leaving one out costs as much as a link at the gate.
-        full = np.full((n + m, n + m), _GATE / 2)
-        full[:n, :m] = cost
-        full[n:, m:] = 0.0
-        i, j = linear_sum_assignment(full)
-        best = full[i, j].sum()
-        for a, b in zip(i.tolist(), j.tolist(), strict=True):
-            if a < n and b < m:
-                other = full.copy()
-                other[a, b] = _NO_LINK
-                rival = other[linear_sum_assignment(other)].sum()
-                yield (
-                    int(old[rows[a]]),
-                    int(new[columns[b]]),
-                    bool(rival - best > SETTLED_LOG_ODDS),
-                )
-
-
-def _link_costs(
-    centers: Centers, old: Ints, new: Ints, variance: float
-) -> Iterator[tuple[Ints, Ints, Floats]]:
-    """Yield independent sets of last groups and new groups within each other's gates, with costs.
-
-    A cost is half the squared distance over its variance, and the logarithm of the volume over
-    which a track may have moved: one that was lost for some frames is no rival of one seen just
-    before. Out of the gate it is above all others.
+    The cost of a link is half the squared distance over its variance, and the logarithm of the
+    volume over which a track may have moved: one that was lost for some frames is no rival of one
+    seen just before. Out of the gate it is above all others.
     """
+    from scipy.optimize import linear_sum_assignment
     from scipy.spatial import cKDTree
 
     if not old.size or not new.size:
@@ -306,10 +278,25 @@ def _link_costs(
     i, j, half = near.row[kept], near.col[kept], (half + spread)[kept]
     part = connected_groups(i, old.size + j, count=old.size + new.size)
     order = np.argsort(part[i], kind="stable")
+    # Sets of last groups and new groups that are within each other's gates, one after the other.
     for edges in np.split(order, np.flatnonzero(np.diff(part[i[order]])) + 1):
-        if edges.size:
-            rows, a = np.unique(i[edges], return_inverse=True)
-            columns, b = np.unique(j[edges], return_inverse=True)
-            cost = np.full((rows.size, columns.size), _NO_LINK)
-            cost[a, b] = half[edges]
-            yield rows, columns, cost
+        rows, a = np.unique(i[edges], return_inverse=True)
+        columns, b = np.unique(j[edges], return_inverse=True)
+        n, m = rows.size, columns.size
+        if n == m == 1:
+            yield int(old[rows[0]]), int(new[columns[0]]), True
+            continue
+        # No group has to be linked: leaving one out costs as much as a link at the gate.
+        full = np.full((n + m, n + m), _GATE / 2)
+        full[:n, :m] = _NO_LINK
+        full[a, b] = half[edges]
+        full[n:, m:] = 0.0
+        taken, to = linear_sum_assignment(full)
+        best = full[taken, to].sum()
+        for k, there in zip(taken.tolist(), to.tolist(), strict=True):
+            if k < n and there < m:
+                other = full.copy()
+                other[k, there] = _NO_LINK
+                rival = other[linear_sum_assignment(other)].sum()
+                certain = bool(rival - best > SETTLED_LOG_ODDS)
+                yield int(old[rows[k]]), int(new[columns[there]]), certain

@@ -167,16 +167,39 @@ class _Members(NamedTuple):
 
     Attributes
     ----------
-    track, first, last : ndarray of int, shape (M,)
-        Track of each member, and the first and last frame of its contacts.
     row : ndarray of int, shape (M, T)
         Detection of each member in every frame of the movie, -1 where there is none.
+    one, other : ndarray of int, shape (C,)
+        The two members of each contact.
     """
 
-    track: Ints
-    first: Ints
-    last: Ints
     row: Ints
+    one: Ints
+    other: Ints
+
+    @classmethod
+    def of(cls, frame: Ints, track: Ints, contacts: Contacts) -> _Members:
+        """Return the stretches of tracks that are in contact."""
+        count = contacts.one.size
+        code = np.concatenate([contacts.one, contacts.other])
+        first, last = np.tile(contacts.first, 2), np.tile(contacts.last, 2)
+        member = np.empty(2 * count, dtype=np.int64)
+        ends: list[tuple[int, int, int]] = []
+        for k in np.lexsort((first, code)).tolist():
+            if ends and ends[-1][0] == code[k] and first[k] <= ends[-1][2]:
+                ends[-1] = (*ends[-1][:2], max(ends[-1][2], int(last[k])))
+            else:
+                ends.append((int(code[k]), int(first[k]), int(last[k])))
+            member[k] = len(ends) - 1
+        row = np.full((len(ends), int(np.ptp(frame)) + 1), -1, dtype=np.int64)
+        at = frame - frame.min()
+        by_track = np.argsort(track, kind="stable")
+        for m, (number, start, end) in enumerate(ends):
+            low, high = np.searchsorted(track[by_track], [number, number + 1])
+            rows = by_track[low:high]
+            rows = rows[(frame[rows] >= start) & (frame[rows] <= end)]
+            row[m, at[rows]] = rows
+        return cls(row, member[:count], member[count:])
 
 
 def rigid_bodies(
@@ -230,51 +253,24 @@ def rigid_bodies(
     body = np.full(len(x), -1, dtype=np.int64)
     if not contacts.one.size:
         return RigidBodies(body, np.empty(0, dtype=np.int64), track)
-    members, one, other = _members(frame, track, contacts)
-    group = _joined_members(members, contacts, one, other, frame, x, contact=contact)
+    members = _Members.of(frame, track, contacts)
+    group = _joined_members(members, contacts, frame, x, contact=contact)
     for rows, label in zip(members.row, group, strict=True):
         body[rows[rows >= 0]] = label
     body = _joined_in_time(frame, x, body, variance=variance)
     return RigidBodies(body, _sizes(frame, body), track)
 
 
-def _members(frame: Ints, track: Ints, contacts: Contacts) -> tuple[_Members, Ints, Ints]:
-    """Return the stretches of tracks in contact, and those of the two sides of each contact."""
-    count = contacts.one.size
-    code = np.concatenate([contacts.one, contacts.other])
-    first, last = np.tile(contacts.first, 2), np.tile(contacts.last, 2)
-    order = np.lexsort((first, code))
-    member = np.empty(2 * count, dtype=np.int64)
-    ends: list[tuple[int, int, int]] = []
-    for k in order.tolist():
-        if ends and ends[-1][0] == code[k] and first[k] <= ends[-1][2]:
-            ends[-1] = (*ends[-1][:2], max(ends[-1][2], int(last[k])))
-        else:
-            ends.append((int(code[k]), int(first[k]), int(last[k])))
-        member[k] = len(ends) - 1
-    codes, begin, stop = (np.array(column, dtype=np.int64) for column in zip(*ends, strict=True))
-    row = np.full((len(ends), int(np.ptp(frame)) + 1), -1, dtype=np.int64)
-    at = frame - frame.min()
-    by_track = np.argsort(track, kind="stable")
-    for m, (number, start, end) in enumerate(ends):
-        low, high = np.searchsorted(track[by_track], [number, number + 1])
-        rows = by_track[low:high]
-        rows = rows[(frame[rows] >= start) & (frame[rows] <= end)]
-        row[m, at[rows]] = rows
-    return _Members(codes, begin, stop, row), member[:count], member[count:]
-
-
 def _joined_members(
     members: _Members,
     contacts: Contacts,
-    one: Ints,
-    other: Ints,
     frame: Ints,
     x: Floats,
     *,
     contact: float,
 ) -> Ints:
     """Join members to bodies along the bonds, the most certain first; return the body of each."""
+    one, other = members.one, members.other
     seen = members.row >= 0
     number = np.arange(seen.shape[1]) + frame.min()
     inside: dict[int, list[int]] = {m: [m] for m in range(len(seen))}

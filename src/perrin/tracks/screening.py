@@ -12,7 +12,7 @@ from perrin._text import counted
 from perrin.geometry.shapes import pair_distances
 from perrin.motion.degenerate import mean_present
 from perrin.motion.residuals import median_present
-from perrin.tracks.groups import frames_of
+from perrin.tracks.groups import frames_of, group_quantiles
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -422,7 +422,7 @@ def distance_notes(
     known = np.isfinite(nearest)
     if not known.any():
         return (), ()
-    medians = _group_medians(code[known], nearest[known], int(code.max()) + 1)
+    medians = group_quantiles(code[known], nearest[known], int(code.max()) + 1)
     apart = float(np.nanmean(medians))
     text = f"nearest particles are {apart:.3g} um apart on average"
     warnings = []
@@ -485,7 +485,7 @@ def placeholder_rows(code: Ints, x: Floats) -> Bools:
     step = np.linalg.norm(np.diff(x[first], axis=0), axis=1)
     same = np.diff(particle) == 0
     particles = int(code.max()) + 1
-    usual = _group_medians(particle[1:][same], step[same], particles)
+    usual = group_quantiles(particle[1:][same], step[same], particles)
     usual[np.bincount(particle[1:][same], minlength=particles) < _FEWEST_MOVES] = np.inf
     step[~same] = np.inf
     leap = np.minimum(np.append(np.inf, step), np.append(step, np.inf))
@@ -557,13 +557,27 @@ def repeated_rows(code: Ints, x: Floats) -> Bools:
         return repeated
     held = (np.diff(code) == 0) & (np.diff(x, axis=0) == 0).all(axis=1)
     particles = int(code.max()) + 1
+    window = np.ones(2 * _ROWS_AROUND + 1)
     for particle in np.unique(code[1:][held]):
         rows = np.arange(*np.searchsorted(code, [particle, particle + 1]))
         stays = held[rows[1:] - 1]
-        if np.count_nonzero(~stays) < _FEWEST_MOVES or not _moves_after_stays(x[rows], stays):
+        if np.count_nonzero(~stays) < _FEWEST_MOVES:
             continue
+        # A particle at rest on the grid of a camera repeats its place too, and leaves it by one
+        # unit of the grid, which is also the smallest of its steps.
+        step = np.abs(np.diff(x[rows], axis=0))
+        small = [
+            np.quantile(s[s > 0], _SMALL_STEP_QUANTILE) if (s > 0).any() else np.inf for s in step.T
+        ]
+        after = step[1:][stays[:-1] & ~stays[1:]]
+        if not len(after) or float(np.median((after / small).max(axis=1))) < _MOVING_STEP:
+            continue
+        # Near repeats: the share of steps in which one coordinate stays and others do not.
+        around = np.convolve(stays, window, mode="full")[_ROWS_AROUND : _ROWS_AROUND + len(stays)]
+        zero = step[(around > 0.5) & ~stays] == 0
+        others_move = zero.sum(axis=1, keepdims=True) - zero < x.shape[1] - 1
+        alone = ((zero & others_move).sum(axis=0) + 1) / (others_move.sum(axis=0) + 1)
         chance = rounding_chances(x[rows])
-        alone = _lone_stays(x[rows], stays)
         by_rounding = len(stays) * float(np.prod(chance))
         near_by = len(stays) * float(np.prod(np.maximum(chance, alone)))
         episodes = int(np.count_nonzero(np.diff(np.append(0, stays)) == 1))
@@ -573,33 +587,6 @@ def repeated_rows(code: Ints, x: Floats) -> Bools:
         if too_many or by_rounding * particles < _COINCIDENCE_LEVEL:
             repeated[rows[1:]] = stays
     return repeated
-
-
-def _moves_after_stays(x: Floats, stays: Bools) -> bool:
-    """Return whether the steps that end repeats are steps of a moving particle.
-
-    A particle at rest on the grid of a camera repeats its place too, and leaves it by one unit of
-    the grid, which is also the smallest of its steps.
-    """
-    step = np.abs(np.diff(x, axis=0))
-    small = [
-        np.quantile(s[s > 0], _SMALL_STEP_QUANTILE) if (s > 0).any() else np.inf for s in step.T
-    ]
-    after = step[1:][stays[:-1] & ~stays[1:]]
-    return bool(len(after)) and float(np.median((after / small).max(axis=1))) >= _MOVING_STEP
-
-
-def _lone_stays(x: Floats, stays: Bools) -> Floats:
-    """Return the share of steps near repeats in which a coordinate stays but others do not."""
-    window = np.ones(2 * _ROWS_AROUND + 1)
-    around = np.convolve(stays, window, mode="full")[_ROWS_AROUND : _ROWS_AROUND + len(stays)]
-    zero = np.diff(x, axis=0)[(around > 0.5) & ~stays] == 0
-    shares = []
-    for axis in range(x.shape[1]):
-        others_move = ~np.delete(zero, axis, axis=1).all(axis=1)
-        kept = zero[others_move, axis]
-        shares.append((kept.sum() + 1) / (len(kept) + 1))
-    return np.array(shares)
 
 
 def rounding_chances(x: Floats) -> Floats:
@@ -667,16 +654,6 @@ def lattice_step(values: Floats) -> float:
             finer = gap / times if abs(gap - times * finer) <= _WHOLE_TOLERANCE * finer else finer
         step = min(finer, 0.75 * step)
     return rounding
-
-
-def _group_medians(group: Ints, values: Floats, count: int) -> Floats:
-    """Return the median of the values in each group, NaN for none."""
-    size = np.bincount(group, minlength=count)
-    ordered = np.append(values[np.lexsort((values, group))], np.nan)
-    start = np.cumsum(size) - size
-    middle = 0.5 * (ordered[start + np.maximum(size - 1, 0) // 2] + ordered[start + size // 2])
-    medians: Floats = np.where(size > 0, middle, np.nan)
-    return medians
 
 
 def _rows_sentence(rows: Ints, frame: Ints, code: Ints, what: str, meaning: str) -> tuple[str, ...]:

@@ -66,7 +66,16 @@ def parse_gsd(data: bytes, source: str) -> RawTable:
     if not sum(frame.particles.N for frame in frames):
         raise table_error(source, "a GSD file without particles")
     axes = 2 if frames[0].configuration.dimensions == 2 else 3
-    x = [_unwrapped(frame) for frame in frames]
+    x = []
+    for frame in frames:
+        position = np.asarray(frame.particles.position, dtype=np.float64)
+        image, box = frame.particles.image, frame.configuration.box
+        if image is not None and box is not None:
+            # The periods that particles have crossed, along the edges of HOOMD's box.
+            lx, ly, lz, xy, xz, yz = (float(side) for side in box)
+            edges = np.array([[lx, 0, 0], [xy * ly, ly, 0], [xz * lz, yz * lz, lz]])
+            position = position + np.asarray(image, dtype=np.float64) @ edges
+        x.append(position)
     table = _long_table([np.arange(frame.particles.N) for frame in frames], x, axes)
     bodies = np.concatenate([np.asarray(frame.particles.body) for frame in frames])
     own = (bodies != _NO_BODY) & (bodies >= 0)
@@ -123,17 +132,6 @@ def selection_table(selection: Any) -> pd.DataFrame:  # noqa: ANN401 (a class of
     if len(np.unique(residues)) > 1:
         table["cluster"] = np.tile(residues, len(x))
     return table
-
-
-def _unwrapped(frame: Any) -> Floats:  # noqa: ANN401
-    """Return the positions of a frame of HOOMD, with the periods that particles have crossed."""
-    position = np.asarray(frame.particles.position, dtype=np.float64)
-    image, box = frame.particles.image, frame.configuration.box
-    if image is None or box is None:
-        return position
-    lx, ly, lz, xy, xz, yz = (float(side) for side in box)
-    edges = np.array([[lx, 0, 0], [xy * ly, ly, 0], [xz * lz, yz * lz, lz]])
-    return np.asarray(position + np.asarray(image, dtype=np.float64) @ edges)
 
 
 def _long_table(ids: list[Ints], x: list[Floats], axes: int) -> pd.DataFrame:

@@ -104,7 +104,11 @@ def napari_text(table: pd.DataFrame) -> str:
 def _feature_names(values: Floats) -> tuple[str, ...]:
     """Return ("x", "y") or ("x", "y", "z") by the place of the brightness; () where uncertain."""
     count = values.shape[1]
-    if count < 7 or not len(values) or not _is_tracked(values):
+    # The last two columns can be frames and ids where they are whole, and each pair occurs once.
+    ends = values[:, -2:]
+    if count < 7 or not len(values) or not (ends == np.floor(ends)).all():
+        return ()
+    if not np.isfinite(ends).all() or len(np.unique(ends, axis=0)) < len(ends):
         return ()
     typical = np.median(np.abs(values[:, :-2]), axis=0)
     bright = int(np.argmax(typical))
@@ -115,11 +119,3 @@ def _feature_names(values: Floats) -> tuple[str, ...]:
         flat = bool(((eccentricity >= 0) & (eccentricity <= 1)).all())
         return ("x", "y") if flat else ()
     return ("x", "y", "z") if bright == 3 else ()
-
-
-def _is_tracked(values: Floats) -> bool:
-    """Return whether the last two columns can be frames and ids: whole, and each pair once."""
-    ends = values[:, -2:]
-    if not (np.isfinite(ends).all() and (ends == np.floor(ends)).all()):
-        return False
-    return len(np.unique(ends, axis=0)) == len(ends)

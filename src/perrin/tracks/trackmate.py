@@ -65,7 +65,11 @@ def trackmate_table(text: bytes, source: str) -> RawTable:
     lines = first_lines(text)
     names = Layout().fields(lines[0])
     extra = 0
-    while extra < _MOST_EXTRA_LINES and not _has_numbers(lines, extra + 1, names):
+    for line in lines[1 : 1 + _MOST_EXTRA_LINES]:
+        # The first row has a number where the header says FRAME.
+        entry = dict(zip(names, Layout().fields(line), strict=False)).get("FRAME", "")
+        if entry.replace(".", "", 1).isdecimal():
+            break
         extra += 1
     units = {}
     if extra:
@@ -217,14 +221,6 @@ class _SpotsInFile:
             {f"POSITION_{axis.upper()}": attributes.get(axis) for axis in "xyz"}
             | {"TRACK_ID": self._track, "FRAME": frame, "POSITION_T": frame * self._interval}
         )
-
-
-def _has_numbers(lines: Sequence[str], row: int, names: list[str]) -> bool:
-    """Return whether a line has a number where the header says FRAME."""
-    if row >= len(lines):
-        return True
-    entry = dict(zip(names, Layout().fields(lines[row]), strict=False)).get("FRAME", "")
-    return entry.replace(".", "", 1).isdecimal()
 
 
 def _spots(raw: RawTable) -> RawTable:

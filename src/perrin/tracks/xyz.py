@@ -67,9 +67,12 @@ def parse_xyz(text: str, source: str) -> RawTable:
         for line in lines[start + 2 : start + 2 + count]
     ]
     table, found = _particle_columns(body, comments[0], source)
-    table["frame"] = np.repeat(_frame_numbers(comments), counts)
-    at = np.concatenate([np.arange(n) + start + 2 for start, n in zip(starts, counts, strict=True)])
-    table.index = at - 1
+    # Numbers of frames in the comments count where all frames have one and all rise.
+    stated = [int(match[1]) for match in map(_FRAME_STATED.search, comments) if match]
+    rising = len(stated) == len(comments) and all(a < b for a, b in pairwise(stated))
+    table["frame"] = np.repeat(stated if rising else range(len(comments)), counts)
+    rows = [np.arange(n) + start + 2 for start, n in zip(starts, counts, strict=True)]
+    table.index = np.concatenate(rows) - 1
     times = [_TIME_STATED.search(comment) for comment in comments]
     if "time" not in table and all(times):
         table["time"] = np.repeat([float(time[1]) for time in times if time], counts)
@@ -187,12 +190,3 @@ def _particle_columns(body: list[str], comment: str, source: str) -> tuple[pd.Da
         )
     table = table[list(names)].set_axis(list(names.values()), axis=1)
     return table, set(names.values())
-
-
-def _frame_numbers(comments: list[str]) -> list[int]:
-    """Return the numbers of the frames: those in the comments where all rise, or their order."""
-    found = [_FRAME_STATED.search(comment) for comment in comments]
-    stated = [int(match[1]) for match in found if match]
-    if len(stated) == len(comments) and all(a < b for a, b in pairwise(stated)):
-        return stated
-    return list(range(len(comments)))

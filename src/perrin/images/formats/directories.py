@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
+import math
 import os
 import struct
-from typing import TYPE_CHECKING, BinaryIO, NamedTuple
+from typing import BinaryIO, NamedTuple
 
-import numpy as np
-
-from perrin.tracks.file_limits import refuse_oversize
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
+from perrin.tracks.file_limits import allowed_memory, refuse_oversize
 
 # Numbers of the tags that state sizes.
 _WIDTH, _LENGTH, _BITS, _SAMPLES, _TILE_WIDTH, _TILE_LENGTH = 256, 257, 258, 277, 322, 323
+_SIZES = frozenset((_WIDTH, _LENGTH, _BITS, _SAMPLES, _TILE_WIDTH, _TILE_LENGTH))
 _SUB_DIRECTORIES = 330
 
 # Bytes of a value by the number of its type.
@@ -31,8 +28,28 @@ class _Kind(NamedTuple):
 
     order: str
     tags: str  # number of the tags of a directory
-    offset: str  # position in the file
-    tag: np.dtype[np.void]
+    offset: str  # position in the file, and what a tag holds
+    tag: struct.Struct
+
+
+class _Tag(NamedTuple):
+    """One entry of a directory."""
+
+    code: int
+    type: int
+    number: int
+    value: bytes  # or the position of the values, where they need more bytes
+
+    @property
+    def width(self) -> int:
+        """Bytes of one value."""
+        return _BYTES.get(self.type, 4)
+
+    def one_value(self, order: str) -> int:
+        """Return the value of a tag that has one, else 1; of the bits of several channels, 16."""
+        if self.width * self.number > len(self.value):
+            return 16 if self.code == _BITS else 1
+        return int.from_bytes(self.value[: self.width], "big" if order == ">" else "little")
 
 
 def check_directories(path: str) -> None:
@@ -49,12 +66,12 @@ def check_directories(path: str) -> None:
     ValueError
     """
     length = os.path.getsize(path)
+    most = allowed_memory(length)
     with open(path, "rb") as file:
         kind, first = _kind_of(file.read(16))
         if kind is None:
             return
-        width = struct.calcsize(f"{kind.order}{kind.tags}")
-        last = struct.calcsize(f"{kind.order}{kind.offset}")
+        width, last = (struct.calcsize(f"={code}") for code in (kind.tags, kind.offset))
         seen: set[int] = set()
         chains = [first]
         while chains:
@@ -70,13 +87,14 @@ def check_directories(path: str) -> None:
                 (n,) = struct.unpack(
                     f"{kind.order}{kind.tags}", file.read(width).ljust(width, b"\0")
                 )
-                size = n * kind.tag.itemsize + last
+                size = n * kind.tag.size + last
                 data = file.read(size) if n <= _MOST_TAGS else b""
                 if len(data) < size:
                     break
                 (offset,) = struct.unpack(f"{kind.order}{kind.offset}", data[-last:])
-                tags = np.frombuffer(data, kind.tag, count=n)
-                chains += _check_tags(path, file, kind, tags, length)
+                tags = [_Tag(*entry) for entry in kind.tag.iter_unpack(data[:-last])]
+                _check_sizes(path, tags, kind, length, most)
+                chains += _below(file, tags, kind, length)
 
 
 def _kind_of(head: bytes) -> tuple[_Kind | None, int]:
@@ -84,56 +102,43 @@ def _kind_of(head: bytes) -> tuple[_Kind | None, int]:
     order = {b"II": "<", b"MM": ">"}.get(head[:2], "")
     version = struct.unpack(f"{order}H", head[2:4])[0] if order and len(head) == 16 else 0
     if version == 42:
-        fields = [("code", "u2"), ("type", "u2"), ("count", "u4"), ("value", "u4")]
-        kind = _Kind(order, "H", "I", np.dtype([(n, order + t) for n, t in fields]))
+        kind = _Kind(order, "H", "I", struct.Struct(f"{order}HHI4s"))
         return kind, struct.unpack(f"{order}I", head[4:8])[0]
     if version == 43:
-        fields = [("code", "u2"), ("type", "u2"), ("count", "u8"), ("value", "u8")]
-        kind = _Kind(order, "Q", "Q", np.dtype([(n, order + t) for n, t in fields]))
+        kind = _Kind(order, "Q", "Q", struct.Struct(f"{order}HHQ8s"))
         return kind, struct.unpack(f"{order}Q", head[8:16])[0]
     return None, 0
 
 
-def _check_tags(
-    path: str, file: BinaryIO, kind: _Kind, tags: NDArray[np.void], length: int
-) -> list[int]:
-    """Check the sizes that a directory states; return the positions of those below it."""
-    for tag in tags[tags["count"] > 8]:
-        if int(tag["count"]) * _BYTES.get(int(tag["type"]), 1) > length:
+def _check_sizes(path: str, tags: list[_Tag], kind: _Kind, length: int, most: int) -> None:
+    """Refuse tags that are longer than the file, and images that need more than `most` bytes."""
+    small = {}
+    for tag in tags:
+        if tag.number > 8 and tag.number * tag.width > length:
             raise ValueError(
-                f"its tag {tag['code']} of {tag['count']} values is longer than the file: the file "
-                "is damaged"
+                f"its tag {tag.code} of {tag.number} values is longer than the file: the file is "
+                "damaged"
             )
-    small = {
-        int(tag["code"]): _first_value(kind, tag) for tag in tags[np.isin(tags["code"], _SIZES)]
-    }
+        if tag.code in _SIZES:
+            small[tag.code] = tag.one_value(kind.order)
     for height, width in ((_LENGTH, _WIDTH), (_TILE_LENGTH, _TILE_WIDTH)):
         shape = (small.get(height, 0), small.get(width, 0), small.get(_SAMPLES, 1))
-        refuse_oversize(path, shape, max(small.get(_BITS, 8) // 8, 1), what="an image")
-    below = tags[tags["code"] == _SUB_DIRECTORIES][:1]
-    if not below.size:
-        return []
-    n = min(int(below["count"][0]), 64)
-    if n == 1:
-        return [int(below["value"][0])]
-    width = _BYTES.get(int(below["type"][0]), 4)
-    file.seek(min(int(below["value"][0]), length))
-    data = file.read(n * width)
-    return [
-        int(v) for v in np.frombuffer(data[: len(data) // width * width], f"{kind.order}u{width}")
-    ]
+        itemsize = max(small.get(_BITS, 8) // 8, 1)
+        if math.prod(shape) * itemsize > most:
+            refuse_oversize(path, shape, itemsize, what="an image")
 
 
-_SIZES = (_WIDTH, _LENGTH, _BITS, _SAMPLES, _TILE_WIDTH, _TILE_LENGTH)
-
-
-def _first_value(kind: _Kind, tag: np.void) -> int:
-    """Return the value in a tag that has one; 8 bits where several are stored elsewhere."""
-    width = _BYTES.get(int(tag["type"]), 4)
-    field = kind.tag["value"].itemsize
-    if width > field or int(tag["count"]) * width > field:
-        return 16 if tag["code"] == _BITS else 1
-    data = np.asarray(tag["value"]).astype(f"{kind.order}u{field}").tobytes()
-    return (
-        int(np.frombuffer(data[:width], f"{kind.order}u{width}")[0]) if width in (1, 2, 4, 8) else 1
-    )
+def _below(file: BinaryIO, tags: list[_Tag], kind: _Kind, length: int) -> list[int]:
+    """Return the positions of the directories below one directory."""
+    for tag in tags:
+        if tag.code != _SUB_DIRECTORIES:
+            continue
+        n = min(tag.number, 64)
+        if n == 1:
+            return [struct.unpack(f"{kind.order}{kind.offset}", tag.value)[0]]
+        file.seek(min(struct.unpack(f"{kind.order}{kind.offset}", tag.value)[0], length))
+        data = file.read(n * tag.width)
+        code = {1: "B", 2: "H", 4: "I", 8: "Q"}[tag.width]
+        whole = data[: len(data) // tag.width * tag.width]
+        return [place for (place,) in struct.iter_unpack(f"{kind.order}{code}", whole)]
+    return []

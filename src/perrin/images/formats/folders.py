@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -134,25 +133,49 @@ def sequence(path: str, pick: Pick) -> Contents:
     _, inner, y, x = first.shape
     where = _frames(sizes, inner, pick if "C" in sizes else pick._replace(channel=None))
 
+    opener = _OneFileOpen(inside)
+
     def plane(t: int, z: int) -> NDArray[Any]:
         at = where.at(t, 0 if inner > 1 else z) | position
         name = files[places[tuple(at.get(axis, 0) for axis in axes)]]
-        with closing(tiff(name, inside, one_frame=True)) as file:
-            if file.shape != first.shape or file.dtype != first.dtype:
-                raise ValueError(
-                    f"{name} is {file.shape[1:]} {file.dtype}, the first file "
-                    f"{first.shape[1:]} {first.dtype}"
-                )
-            return file.plane(0, z if inner > 1 else 0)
+        file = opener.opened(name)
+        if file.shape != first.shape or file.dtype != first.dtype:
+            raise ValueError(
+                f"{name} is {file.shape[1:]} {file.dtype}, the first file "
+                f"{first.shape[1:]} {first.dtype}"
+            )
+        return file.plane(0, z if inner > 1 else 0)
 
     return Contents(
         shape=(where.t, inner if inner > 1 else where.z, y, x),
         dtype=first.dtype,
         plane=plane,
-        close=lambda: None,
+        close=opener.close,
         voxel=first.voxel,
         times=even_times(where.t, np.nan),
     )
+
+
+class _OneFileOpen:
+    """The file of a sequence that was read last, kept open for the other planes that it has."""
+
+    def __init__(self, pick: Pick) -> None:
+        self._pick = pick
+        self._name = ""
+        self._contents: Contents | None = None
+
+    def opened(self, name: str) -> Contents:
+        """Return a file, and close the one before it."""
+        if self._contents is None or name != self._name:
+            self.close()
+            self._name, self._contents = name, tiff(name, self._pick, one_frame=True)
+        return self._contents
+
+    def close(self) -> None:
+        """Close the file."""
+        if self._contents is not None:
+            self._contents.close()
+        self._contents = None
 
 
 def _frames(sizes: dict[str, int], inner: int, pick: Pick) -> Layout:
