@@ -33,7 +33,7 @@ venv_works = $(shell $(1)/bin/python -c 'import sys, pip; sys.exit(sys.version_i
 make_venv = $(if $(call venv_works,$(1)),:,$(call new_venv,$(1),$(find_python)))
 new_venv = $(call check_python,$(2))rm -rf $(1); $(2) -m venv $(1) || { echo '$(call no_venv,$(2))' >&2; exit 1; }
 
-.PHONY: help demo faults fuzz fuzz-short test test-numpy test-lowest benchmarks long lint types doctests docs release lock clean
+.PHONY: help coverage demo faults fuzz fuzz-short mutants test test-numpy test-lowest benchmarks long lint types doctests docs release lock clean
 
 help:  ## list these targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1 - \2/p' Makefile | awk -F ' - ' '{printf "%-18s %s\n", $$1, $$2}'
@@ -43,6 +43,11 @@ demo: .venv/.demo  ## the main job on an embedded table, into perrin-demo/
 
 test: .venv/.test  ## the whole suite, on all cores
 	PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(RUN) pytest -q -n auto --dist loadfile
+
+coverage: .venv/.test  ## the suite with its coverage: lines at least 95 %, branches 90 %
+	OMP_NUM_THREADS=1 $(RUN) pytest -q -n 2 --dist loadfile --cov --cov-report=
+	$(RUN) coverage report --skip-covered
+	$(RUN) coverage json -q -o - | $(BIN)/python tests/coverage_limits.py
 
 test-numpy: .venv/.test  ## the numeric tests again, without the compiled kernels
 	PERRIN_COMPILED=0 OMP_NUM_THREADS=1 $(RUN) pytest -q -n auto --dist loadfile $(NUMERIC)
@@ -56,6 +61,9 @@ fuzz: .venv/.test  ## damaged files of all formats, an hour (SECONDS=...); fault
 
 fuzz-short: .venv/.test  ## the same for a minute
 	OMP_NUM_THREADS=1 $(RUN) pytest -q -m fuzz tests/fuzz
+
+mutants: .venv/.test  ## small changes of the source of which tests must notice 90 % (hours)
+	nice -n 5 $(BIN)/python tests/mutants/run.py
 
 test-lowest:  ## the suite on the oldest dependencies allowed (Python 3.11)
 	@$(call make_venv,.venv-lowest)

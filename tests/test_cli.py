@@ -95,7 +95,7 @@ def no_progress(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Write run folders without pictures, which take most of the time of a run."""
-    monkeypatch.setattr("perrin.report.write.save_figures", lambda report, place: [])
+    monkeypatch.setattr("perrin.report.write.save_figures", lambda *_, **__: [])
 
 
 @pytest.fixture(scope="module")
@@ -202,7 +202,7 @@ def test_demo_replaces_only_its_own(demo, csv, tmp_path, monkeypatch):
     (place / "thesis.txt").unlink()
     place.rmdir()
     with monkeypatch.context() as patched:
-        patched.setattr("perrin.report.write.save_figures", lambda report, place: [])
+        patched.setattr("perrin.report.write.save_figures", lambda *_, **__: [])
         assert run("analyze", csv, "--dt", 0.73, "-o", place, cwd=tmp_path).returncode == 0
     before = contents(place)
     refused(run("demo", cwd=tmp_path), 2, "perrin-demo", "not overwritten")
@@ -220,7 +220,7 @@ def test_demo_replaces_only_its_own(demo, csv, tmp_path, monkeypatch):
     figures = demo[0] / "figures"
     monkeypatch.setattr(
         "perrin.report.write.save_figures",
-        lambda report, to: [shutil.copy(p, to) for p in sorted(figures.iterdir())] and [],
+        lambda report, to, **_: [shutil.copy(p, to) for p in sorted(figures.iterdir())] and [],
     )
     result = run("demo", cwd=tmp_path)
     assert result.returncode == 0, result.stderr
