@@ -50,7 +50,7 @@ class PixelPattern(NamedTuple):
     @property
     def significant(self) -> bool:
         """Whether pixels differ by over a quarter of the noise of a voxel."""
-        return self.offset > _LEAST_PATTERN * self.noise
+        return 0 < _LEAST_PATTERN * self.noise < self.offset
 
 
 def find_pixel_pattern(frames: Sequence[NDArray[Any]]) -> PixelPattern:
