@@ -65,8 +65,8 @@ def find_shells(
     ...     spot = image.spot(np.array([3.0, 2.5, x]), frame.shape)
     ...     frame[spot.box] += 100 * spot.value
     >>> found = find_shells(frame, diameter=2.0, contact=2.0, voxel=size)
-    >>> found.centers[np.argsort(-found.mass)[:2]].round(1).tolist()
-    [[3.0, 2.5, 2.2], [3.0, 2.5, 4.4]]
+    >>> sorted(found.centers[np.argsort(-found.mass)[:2]].round(1).tolist())
+    [[3.0, 2.5, 2.4], [3.0, 2.5, 4.2]]
     """
     from scipy import fft
     from scipy.ndimage import maximum_filter
