@@ -30,7 +30,7 @@ from perrin.study import (
 )
 
 
-def write_table(path, *, seed, D=5e-3, clusters=2, frames=40):
+def write_table(path, *, seed, D=5e-3, clusters=2, frames=20):
     """Write the table of a movie with tetrahedra."""
     rng = np.random.default_rng(seed)
     body, parts = perrin.Cluster.touching(4, 2.45), []
@@ -57,7 +57,7 @@ def finished(tmp_path_factory):
     """Run a study of three tables, one of them unreadable, once."""
     folder = tmp_path_factory.mktemp("study")
     write_table(folder / "a.csv", seed=1)
-    write_table(folder / "b.csv", seed=2, D=2e-3, clusters=1, frames=30)
+    write_table(folder / "b.csv", seed=2, D=2e-3, clusters=1, frames=20)
     (folder / "bad.csv").write_text("frame,particle\n1,1\n")
     manifest = write_study(folder, movies={0.1: ["a.csv", "bad.csv"], 0.4: ["b.csv"]})
     result = Study.from_toml(manifest).run(folder / "STUDY")
