@@ -39,6 +39,19 @@ def values(report: perrin.Report) -> np.ndarray:
     return np.array([[c.D_R.value, *c.D_R.ci95, c.D_T.value, *c.D_T.ci95] for c in report.clusters])
 
 
+@pytest.fixture(autouse=True)
+def unjudged(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch, repeats) -> None:
+    """Leave out the kind of motion in the quick form, but where results are written and read.
+
+    It takes half of the time of an analysis; tests/test_run_verdicts.py tests it.
+    """
+    if not repeats(0, 1) and not {"tmp_path", "whole"} & set(request.fixturenames):
+        monkeypatch.setattr(
+            "perrin.run.measure.judge_each_and_all",
+            lambda motions, **_: ([None] * len(motions), None),
+        )
+
+
 @pytest.fixture(scope="module")
 def base() -> pd.DataFrame:
     return tracks(seed=4)
@@ -721,6 +734,7 @@ def same(one: object, other: object) -> bool:
     return bool(one == other)
 
 
+@pytest.mark.usefixtures("whole")
 def test_results_come_back_from_json(base):
     """Clusters, rods, pooled values, predictions and sizes are the same after JSON."""
     truth = perrin.simulate_motion(
