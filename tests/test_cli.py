@@ -7,6 +7,7 @@ import io
 import json
 import math
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -21,7 +22,7 @@ import pytest
 import perrin
 from command_line import command_line
 from perrin.cli.app import analyze
-from perrin.cli.tables import show_report
+from perrin.cli.tables import kinds_table, show_report, terms_of
 
 
 class Outcome(NamedTuple):
@@ -101,7 +102,7 @@ def no_progress(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Write run folders without pictures, which take most of the time of a run."""
-    monkeypatch.setattr("perrin.report.write.save_figures", lambda report, place: [])
+    monkeypatch.setattr("perrin.report.write.save_figures", lambda *_, **__: [])
 
 
 @pytest.fixture(scope="module")
@@ -208,7 +209,7 @@ def test_demo_replaces_only_its_own(demo, csv, tmp_path, monkeypatch):
     (place / "thesis.txt").unlink()
     place.rmdir()
     with monkeypatch.context() as patched:
-        patched.setattr("perrin.report.write.save_figures", lambda report, place: [])
+        patched.setattr("perrin.report.write.save_figures", lambda *_, **__: [])
         assert run("analyze", csv, "--dt", 0.73, "-o", place, cwd=tmp_path).returncode == 0
     before = contents(place)
     refused(run("demo", cwd=tmp_path), 2, "perrin-demo", "not overwritten")
@@ -226,7 +227,7 @@ def test_demo_replaces_only_its_own(demo, csv, tmp_path, monkeypatch):
     figures = demo[0] / "figures"
     monkeypatch.setattr(
         "perrin.report.write.save_figures",
-        lambda report, to: [shutil.copy(p, to) for p in sorted(figures.iterdir())] and [],
+        lambda report, to, **_: [shutil.copy(p, to) for p in sorted(figures.iterdir())] and [],
     )
     result = run("demo", cwd=tmp_path)
     assert result.returncode == 0, result.stderr
@@ -886,3 +887,32 @@ def test_progress_in_a_log_is_a_line_for_each_tenth():
         f" {10 * k} " for k in range(3, 11)
     ]
     assert lines[-1].startswith("writing the report, ")
+
+
+def test_kinds_of_bodies_are_rows_of_one_table():
+    """Size, symmetry and number, then its coefficients; limits and what is not pooled in words."""
+    from types import SimpleNamespace
+
+    from rich.console import Console
+
+    truth = perrin.simulate_motion(
+        perrin.Cluster.tetrahedron(1.5), D_R=5e-3, D_T=0.04, dt=0.7, n_frames=50, rng=1
+    )
+    known = perrin.estimate_diffusion(truth)
+    limit = replace(known, resolved=False, ci95=(0.0, 0.02))
+    kinds = [
+        SimpleNamespace(size=4, point_group="T_d", clusters=(0, 1), coefficients=[("D_R", known)]),
+        SimpleNamespace(size=5, point_group="D_3h", clusters=(2,), coefficients=[]),
+    ]
+    singles = SimpleNamespace(n_tracks=7, D_T=limit)
+    report = SimpleNamespace(clusters=(), kinds=kinds, singles=singles)
+    console = Console(record=True, width=120)
+    console.print(kinds_table(report))
+    text = console.export_text()
+    for words in (
+        r"4 T_d +2 +D_R \(rad",
+        "5 D_3h +1 +not rigid: not pooled",
+        "7 tracks +D_T.*< 0.02",
+    ):
+        assert re.search(words, text), (words, text)
+    assert terms_of(report)[-1].startswith("T_d, D_3h")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import functools
+import gc
 import inspect
 import re
 from pathlib import Path
@@ -124,7 +125,12 @@ def literals() -> tuple[str, ...]:
     for path in SOURCE.rglob("*.py"):
         if path.relative_to(SOURCE).parts[0] == "cli":
             continue
-        waiting: list[ast.AST] = [ast.parse(path.read_text(encoding="utf-8"))]
+        # Trees of syntax have no cycles: most of the time would go into the search for some.
+        gc.disable()
+        try:
+            waiting: list[ast.AST] = [ast.parse(path.read_text(encoding="utf-8"))]
+        finally:
+            gc.enable()
         while waiting:
             node = waiting.pop()
             if isinstance(node, ast.JoinedStr):

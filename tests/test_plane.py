@@ -220,11 +220,11 @@ def learned(rings):
 def test_touching_discs_come_back_within_their_errors():
     """All found, no others; squared errors are those stated, and distances are those of contact.
 
-    Of 60 coordinates the mean square has a standard error of sqrt(2/60) = 18 %, of 24 distances
-    the mean is known to 15 nm/sqrt(24) or 0.15 %; trackpy's distances are 4 % too long.
+    Of 40 coordinates the mean square has a standard error of sqrt(2/40) = 22 %, of 16 distances
+    the mean is known to 15 nm/sqrt(16) or 0.19 %; trackpy's distances are 4 % too long.
     """
     rng = np.random.default_rng(5)
-    places = chains(6, rng)
+    places = chains(4, rng)
     table = located(drawn(places, disc, rng))
     assert table["refined"].all()
     error = off(table, places)
@@ -237,13 +237,21 @@ def test_touching_discs_come_back_within_their_errors():
         away = np.linalg.norm(x[:, None] - x, axis=2)[np.triu_indices(len(x), 1)]
         lengths += away[away < 1.3 * CONTACT].tolist()
     assert len(lengths) == 4 * len(places)
-    assert np.mean(lengths) == pytest.approx(CONTACT, rel=0.004)
+    assert np.mean(lengths) == pytest.approx(CONTACT, rel=0.005)
 
 
 def test_touching_rings_come_back_within_their_errors(rings, learned):
-    """Bright-field rings: squared errors are those stated, within 4 of sqrt(2/60) = 18 %."""
+    """Bright-field rings: squared errors are those stated, within 4 of sqrt(2/60) = 18 %.
+
+    Their light adds, as the movie shows, and its noise is that of the background of 120 photons.
+    """
     places, movie = rings
     image, starts = learned
+    assert isinstance(image.noise, CameraNoise)
+    assert image.noise.gain * GAIN * 120 + image.noise.floor == pytest.approx(
+        GAIN**2 * 120, rel=0.1
+    )
+    assert RadialImage.from_dict(image.to_dict()).noise == image.noise
     square = []
     for truth, frame, start in zip(places, movie[:, 0], starts, strict=True):
         fit = fit_plane(frame, start, contact=CONTACT, image=image, pixel=(STEP, STEP))
@@ -254,27 +262,24 @@ def test_touching_rings_come_back_within_their_errors(rings, learned):
     assert abs(np.mean(square) - 1) < 4 * np.sqrt(2 / np.size(square))
 
 
-@pytest.mark.parametrize("multiplied", [True, False])
-def test_images_add_or_their_transmissions_multiply_as_the_movie_shows(multiplied):
-    """Touching rims that absorb light in turn come back; those whose light adds are distinguished.
+def test_transmissions_multiply_where_the_movie_shows_it():
+    """Touching rims that absorb light in turn come back, distinguished from those that add.
 
     Added where they multiply, distances of touching spheres are some percent too long.
     """
     rng = np.random.default_rng(21)
-    places = chains(6, rng)
+    places = chains(4, rng)
     y, x = (STEP * np.arange(n) for n in (40, 64))
     movie = []
     for frame in places:
         away = np.hypot(x - frame[:, 0, None, None], y[:, None] - frame[:, 1, None, None])
-        contrast = 0.45 * ring(away / CONTACT)
-        share = np.prod(1 + contrast, axis=0) if multiplied else 1 + contrast.sum(axis=0)
-        movie.append(rng.poisson(200 * share))
+        movie.append(rng.poisson(200 * np.prod(1 + 0.45 * ring(away / CONTACT), axis=0)))
     movie = GAIN * np.array(movie)[:, None].astype(np.float64)
     spots = [find_circles(f[0], contact=CONTACT, pixel=(STEP, STEP)) for f in movie]
     cut = circle_cut(np.concatenate([s.mass for s in spots]))
     starts = [s.centers[s.mass > cut, 1:] for s in spots]
     image = learn_plane([f[0] for f in movie], starts, contact=CONTACT, pixel=(STEP, STEP))
-    assert isinstance(image.noise, TransmissionNoise if multiplied else CameraNoise)
+    assert isinstance(image.noise, TransmissionNoise)
     variance = image.noise.gain * GAIN * 200 + image.noise.floor
     assert variance == pytest.approx(GAIN**2 * 200, rel=0.1)
     again = RadialImage.from_dict(image.to_dict())
@@ -285,7 +290,7 @@ def test_images_add_or_their_transmissions_multiply_as_the_movie_shows(multiplie
         assert (fit.reason == "").all()
         away = np.linalg.norm(fit.centers[:, ::-1][:, None] - truth, axis=2).argmin(axis=1)
         square.append(((fit.centers[:, ::-1] - truth[away]) / fit.sigma[:, ::-1]) ** 2)
-    # Of 60 coordinates the mean square has a standard error of sqrt(2/60) = 18 %.
+    # Of 40 coordinates the mean square has a standard error of sqrt(2/40) = 22 %.
     assert abs(np.mean(square) - 1) < 4 * np.sqrt(2 / np.size(square))
 
 
@@ -367,7 +372,7 @@ def test_a_crowd_in_a_plane_is_fitted_in_parts(learned):
 def test_images_of_unequal_sizes_are_named():
     """Circles that spread by 17 %, as in a slice of a volume, are no images of equal spheres."""
     rng = np.random.default_rng(3)
-    places = chains(4, rng, sizes=(2, 2))
+    places = chains(2, rng, sizes=(2, 2))
     movie = drawn(places, disc, rng, sizes=np.array([0.8, 1.2, 0.85, 1.1]))
     with pytest.warns(perrin.PrecisionWarning, match=r"differ in size by [12]\d %"):
         located(movie)
@@ -388,7 +393,7 @@ def test_a_planar_movie_ends_in_a_report():
     rng = np.random.default_rng(8)
     body = perrin.Cluster.touching(3, CONTACT).positions[:, :2]
     truth = perrin.simulate_motion(
-        perrin.Cluster(body), D_R=0.02, D_T=0.01, dt=1.0, n_frames=15, rng=4
+        perrin.Cluster(body), D_R=0.02, D_T=0.01, dt=1.0, n_frames=10, rng=4
     )
     places = truth.positions() + 4.5
     movie = drawn(places, ring, rng, shape=(46, 46))
@@ -400,8 +405,8 @@ def test_a_planar_movie_ends_in_a_report():
         found, true = getattr(cluster, name), getattr(known, name)
         assert abs(found.value - true.value) < 0.5 * true.stderr
     features = report.imaging.features
-    # Of the 3 internal coordinates in 15 frames: 1/sqrt(2 * 45), 11 %.
-    assert cluster.motion.sigma == pytest.approx(features["sigma_x"].median(), rel=0.35)
+    # Of the 3 internal coordinates in 10 frames: 1/sqrt(2 * 30), 13 %.
+    assert cluster.motion.sigma == pytest.approx(features["sigma_x"].median(), rel=0.42)
     again = type(report.imaging).from_dict(report.imaging.to_dict())
     r = np.linspace(0, 3, 20)
     np.testing.assert_array_equal(again.radial.value(r), report.imaging.radial.value(r))
