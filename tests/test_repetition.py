@@ -25,9 +25,9 @@ def table(**more: object) -> pd.DataFrame:
     """Return a tetrahedron, its centre moving, in frames from 5 on, with times that are uneven."""
     rng = np.random.default_rng(4)
     body = perrin.Cluster.touching(4, 2.45)
-    truth = perrin.simulate_motion(body, D_R=0.02, D_T=0.04, dt=0.5, n_frames=60, rng=rng)
+    truth = perrin.simulate_motion(body, D_R=0.02, D_T=0.04, dt=0.5, n_frames=24, rng=rng)
     found = perrin.positions_table(perrin.add_noise(truth.positions(), sigma=0.03, rng=rng))
-    pause = np.where(found["frame"] >= 30, 4.0, 0.0)
+    pause = np.where(found["frame"] >= 12, 4.0, 0.0)
     found["time"] = 0.5 * found["frame"] + pause
     return found.assign(frame=found["frame"] + 5, **more)
 
@@ -35,7 +35,7 @@ def table(**more: object) -> pd.DataFrame:
 @pytest.fixture(scope="module")
 def report() -> perrin.Report:
     return perrin.analyze(
-        table(), dt=0.5, frames=(10, 50), noise="residual", sigma=(0.03, 0.03, 0.04), drift=True,
+        table(), dt=0.5, frames=(8, 26), noise="residual", sigma=(0.03, 0.03, 0.04), drift=True,
         scale=0.9, viscosity=1e-3, temperature=295.0, diameter=2.2,
     )  # fmt: skip
 

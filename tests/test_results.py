@@ -15,7 +15,7 @@ from test_plot import measured
 
 @pytest.fixture(scope="module")
 def report():
-    found = measured(clusters=2, frames=40, labels=["<b>one</b>", "two"])
+    found = measured(clusters=2, frames=205, labels=["<b>one</b>", "two"])
     compared = perrin.Compared(0.02, found.clusters[0].D_R.value, found.clusters[0].D_R.stderr)
     known = perrin.Prediction(1.0, 1e-5, D_T=compared, D_R=compared)
     first, *others = found.clusters
