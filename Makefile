@@ -33,7 +33,7 @@ venv_works = $(shell $(1)/bin/python -c 'import sys, pip; sys.exit(sys.version_i
 make_venv = $(if $(call venv_works,$(1)),:,$(call new_venv,$(1),$(find_python)))
 new_venv = $(call check_python,$(2))rm -rf $(1); $(2) -m venv $(1) || { echo '$(call no_venv,$(2))' >&2; exit 1; }
 
-.PHONY: help demo faults fuzz fuzz-short test test-numpy test-lowest benchmarks long lint types doctests docs release lock clean
+.PHONY: help coverage demo faults fuzz fuzz-short mutants test test-numpy test-lowest benchmarks long lint types doctests docs release lock clean
 
 help:  ## list these targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1 - \2/p' Makefile | awk -F ' - ' '{printf "%-18s %s\n", $$1, $$2}'
@@ -43,6 +43,17 @@ demo: .venv/.demo  ## the main job on an embedded table, into perrin-demo/
 
 test: .venv/.test  ## the whole suite, on all cores
 	PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(RUN) pytest -q -n auto --dist loadfile
+
+coverage:  ## coverage by the suite and the paper: lines at least 95 %, branches 90 %
+	@$(call make_venv,.venv-coverage)
+	.venv-coverage/bin/python -m pip install --quiet --disable-pip-version-check --no-deps --require-hashes \
+	  -r requirements/test.lock
+	.venv-coverage/bin/python -m pip install --quiet --disable-pip-version-check -e '.[formats]'
+	OMP_NUM_THREADS=1 .venv-coverage/bin/python -m pytest -q -n 2 --dist loadfile --cov --cov-report=
+	OMP_NUM_THREADS=1 .venv-coverage/bin/coverage run benchmarks/paper.py
+	.venv-coverage/bin/coverage combine --quiet --append
+	.venv-coverage/bin/coverage report --skip-covered
+	.venv-coverage/bin/coverage json -q -o - | .venv-coverage/bin/python tests/coverage_limits.py
 
 test-numpy: .venv/.test  ## the numeric tests again, without the compiled kernels
 	PERRIN_COMPILED=0 OMP_NUM_THREADS=1 $(RUN) pytest -q -n auto --dist loadfile $(NUMERIC)
@@ -56,6 +67,9 @@ fuzz: .venv/.test  ## damaged files of all formats, an hour (SECONDS=...); fault
 
 fuzz-short: .venv/.test  ## the same for a minute
 	OMP_NUM_THREADS=1 $(RUN) pytest -q -m fuzz tests/fuzz
+
+mutants: .venv/.test  ## small changes of the source of which tests must notice 90 % (hours)
+	nice -n 5 $(BIN)/python tests/mutants/run.py
 
 test-lowest:  ## the suite on the oldest dependencies allowed (Python 3.11)
 	@$(call make_venv,.venv-lowest)
@@ -109,9 +123,9 @@ lock:  ## resolve the dependencies of pyproject.toml anew into requirements/
 	UV=.venv-lock/bin/uv sh requirements/lock.sh
 
 clean:  ## remove what was installed and built, demo output included
-	rm -rf .venv .venv-lowest .venv-lock dist docs/_build perrin-demo
+	rm -rf .venv .venv-coverage .venv-lowest .venv-lock dist docs/_build perrin-demo
 	rm -rf docs/gallery docs/tutorials/examples docs/reference/python docs/reference/backreferences
-	rm -rf .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf .coverage .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	find src tests -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # The locks are complete, so pip resolves nothing; `pip check` would show a gap.

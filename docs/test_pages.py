@@ -74,9 +74,9 @@ def run_block(code):
                 run_command("perrin demo --quiet")
             continue
         assert command.startswith("perrin "), f"not a command that is known: {line}"
-        # Other processes and machines have tests of their own.
-        if not re.search("--scheduler|--workers", command) and not missing_file(command):
-            run_command(command)
+        # A scheduler has tests of its own.
+        if "--scheduler" not in command and not missing_file(command):
+            run_command(re.sub(r"--workers \d+", "--workers 2", command))
 
 
 def missing_file(command):
@@ -108,18 +108,33 @@ def test_notebooks_run_from_top_to_bottom(notebook, tmp_path, monkeypatch):
     assert len(names) > 5
 
 
-def test_the_manifest_of_the_page_on_studies_is_valid(tmp_path, monkeypatch):
-    """The manifest on the page names samples whose files exist, and the plan is computed."""
-    from perrin import Study
+def test_the_page_on_studies_runs(tmp_path, monkeypatch, capsys):
+    """Its commands and its Python lines run on the manifest of the page, with two workers.
+
+    The files are tables of one tetrahedron each, without figures and pages.
+    """
+    from perrin import Cluster, Study, add_noise, positions_table, simulate_motion
 
     monkeypatch.chdir(tmp_path)
     text = (DOCS / "study.md").read_text(encoding="utf-8")
-    for name in ("monday/a.csv", "monday/b.csv", "tuesday/c.csv"):
-        (tmp_path / name).parent.mkdir(exist_ok=True)
-        (tmp_path / name).write_text("frame,particle,x,y,z\n0,0,1,2,3\n")
-    (manifest,) = re.findall(r"^```toml\n(.*?)^```", text, re.DOTALL | re.M)
-    (tmp_path / "study.toml").write_text(manifest, encoding="utf-8")
-    study = Study.from_toml(tmp_path / "study.toml")
-    assert [movie.sample for movie in study.manifest.movies] == ["dilute", "dilute", "dense"]
-    plan = re.findall(r"^```python\n(.*?)^```", text, re.DOTALL | re.M)[-1]
+    for k, name in enumerate(("monday/a.csv", "monday/b.csv", "tuesday/c.csv", "data/a.csv")):
+        Path(name).parent.mkdir(exist_ok=True)
+        body = Cluster.touching(4, 2.45)
+        truth = simulate_motion(body, D_R=8e-3, D_T=0.03, dt=0.73, n_frames=40, rng=k)
+        table = positions_table(add_noise(truth.positions(), sigma=0.03, rng=k + 10))
+        table.assign(cluster=3).to_csv(name, index=False)
+    blocks = re.findall(r"^```(sh|toml|python)\n(.*?)^```", text, re.DOTALL | re.M)
+    assert [language for language, _ in blocks] == ["sh", "toml", "sh", "python", "python"]
+    new, manifest, run, python, plan = (code for _, code in blocks)
+    run_block(new.replace("data/*.csv", "data/a.csv"))
+    assert [m.sample for m in Study.from_toml("study.toml").manifest.movies] == ["a"]
+    Path("study.toml").write_text("reports = false\n" + manifest, encoding="utf-8")
+    run_block(run)
+    assert Path("STUDY/study.html").is_file()
+    names = {}
+    capsys.readouterr()
+    exec(compile(python.replace("workers=8", "workers=0"), "study.md", "exec"), names)
+    # The cluster of the second sample is excluded.
+    assert set(names["table"]["sample"].dropna()) == {"dilute", "dense"}
+    assert "D_R" in capsys.readouterr().out
     exec(compile(plan, "study.md", "exec"), {})

@@ -385,3 +385,16 @@ def test_a_gap_is_not_a_step():
     assert checks.step_length(with_gap, contact=CONTACT) < 1.1 * checks.step_length(
         whole, contact=CONTACT
     )
+
+
+def test_what_shows_no_change_has_no_text():
+    """One height, one frame, spheres that touch none: None; errors as stated: no finding."""
+    rows = table()
+    assert checks.depth_change(rows.assign(z=1.0)) is None
+    assert checks.bleaching(rows[rows["particle"] == 0].iloc[:1]) is None
+    far = rows.assign(x=100.0 * rows["particle"])
+    assert checks.distance_error(far, contact=CONTACT, axes=["x", "y", "z"]) is None
+    nothing = checks.Findings()
+    assert nothing + nothing == nothing
+    with pytest.raises(TypeError):
+        nothing + 1

@@ -10,7 +10,7 @@ import pytest
 
 import perrin
 from perrin._text import number_text
-from perrin.plot import imaging
+from perrin.plot import figure_style
 from perrin.report import write
 from perrin.report.imaging_page import render_imaging_quality
 from test_plot_images import BALL, seen
@@ -135,9 +135,9 @@ def test_pictures_are_embedded_and_explained(report, tmp_path):
 
 def test_the_run_folder_has_the_page_for_a_movie_only(report, tmp_path, monkeypatch, repeats):
     """For a movie it is written and linked both ways; read back it is the same page."""
-    monkeypatch.setattr(write, "save_figures", lambda *_: [])
+    monkeypatch.setattr(write, "save_figures", lambda *_, **__: [])
     if repeats(True, False):
-        monkeypatch.setattr(imaging, "save_figure", save_blank)
+        monkeypatch.setattr(figure_style, "save_figure", save_blank)
     few = replace(report, imaging=replace(report.imaging, views=report.imaging.views[:1]))
     for name, one in (("images", few), ("table", replace(report, imaging=None))):
         write.write_run(one, tmp_path / name)

@@ -7,6 +7,7 @@ import pandas as pd
 import pytest
 
 import perrin
+from perrin._text import with_error
 from perrin.geometry.rotations import exp_map
 from perrin.report.page import render_html
 from perrin.run.experiment import Experiment, Recording
@@ -171,3 +172,13 @@ def test_kinds_and_single_spheres_come_back_and_are_on_the_page(mixed, tmp_path)
     page = render_html(back, [])
     for text in ("3, D_3h", "4, T_d", "2, D_∞_h", "1 (single spheres)"):
         assert text in page
+
+
+def test_the_text_of_a_report_names_every_kind(report):
+    """Each with its pooled coefficients and their errors, as in the table."""
+    assert f"{len(report.kinds)} kinds" in repr(report)
+    lines = str(report).splitlines()
+    for kind in report.kinds:
+        (line,) = [one for one in lines if one.startswith(f"  {kind.name}, pooled: ")]
+        for name, found in kind.coefficients:
+            assert f"{name} = {with_error(found.value, found.stderr)} {found.unit}" in line

@@ -8,6 +8,7 @@ import pytest
 
 import perrin
 from perrin.tracks.groups import touching_groups
+from perrin.tracks.linking import Centers, linked_tracks
 
 DIAMETER = 2.45
 
@@ -173,3 +174,20 @@ def test_one_cluster_that_jumps_is_no_stage():
     places[0][10:] -= [0.0, 5.0, 0.0]
     found = perrin.identify(raw(places, rng), contact=DIAMETER, size=4)
     assert found.groupby("body")["cluster"].nunique().tolist() == [2, 1, 1, 1]
+
+
+def test_centres_that_may_have_changed_places_begin_new_tracks():
+    """Two that step by a quarter of a turn about each other may be either; two that stay are known.
+
+    Twenty others, far away, give the size of a step, 0.1 in each coordinate.
+    """
+    rng = np.random.default_rng(4)
+    others = 100.0 + 20 * np.arange(40).reshape(20, 2)
+    turning, staying = np.array([[0, 0.1], [0, -0.1]]), np.array([[50, 0.25], [50, -0.25]])
+    before = np.concatenate([turning, staying, others])
+    after = np.concatenate([turning[:, ::-1], staying, others + 0.1 * rng.normal(size=(20, 2))])
+    frame = np.repeat([0, 1], 24)
+    track = linked_tracks(Centers(frame, np.concatenate([before, after]), np.zeros(48)))
+    assert track[:24].tolist() == list(range(24))
+    assert track[24:26].tolist() == [24, 25]
+    assert track[26:].tolist() == list(range(2, 24))

@@ -40,7 +40,7 @@ def labelled(labels, n_frames=12):
 @pytest.fixture
 def undrawn(monkeypatch):
     """Write no figures: their texts are tested with the plots."""
-    monkeypatch.setattr("perrin.report.write.save_figures", lambda *_: [])
+    monkeypatch.setattr("perrin.report.write.save_figures", lambda *_, **__: [])
 
 
 @pytest.mark.parametrize("part", [ODD[:5], ODD[5:10]])

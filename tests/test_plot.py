@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import re
+import zlib
 from dataclasses import replace
+from io import BytesIO
 
 import numpy as np
 import pandas as pd
@@ -342,12 +345,13 @@ def test_save_figures_names_its_files_and_changes_no_setting(
             "column_figure",
             lambda height, columns=2: without_layout(figure(height, columns=columns)),
         )
-        if planar:
-            # Curves are drawn as in space.
-            monkeypatch.setattr(report_figures, "curve_figure", report_figures.orientation_figure)
     before = dict(rcParams)
     report = measured(planar=planar, frames=20)
-    files = report_figures.save_figures(report, tmp_path, sheet=sheet)
+    seen = []
+    files = report_figures.save_figures(
+        report, tmp_path, sheet=sheet, progress=lambda *state: seen.append(state)
+    )
+    assert seen == [(k, 3, "drawing the figures") for k in range(3)]
     kinds = ("curves", "residuals", "orientations")
     names = [f"cluster-0-{kind}.{end}" for kind in kinds for end in ("png", "pdf")]
     assert [f.name for f in files] == names
@@ -357,7 +361,7 @@ def test_save_figures_names_its_files_and_changes_no_setting(
 
 
 def test_save_figures_draws_the_first_cluster_and_all_in_one(three, tmp_path, monkeypatch):
-    monkeypatch.setattr(report_figures, "save_figure", lambda _, stem: [stem])
+    monkeypatch.setattr(figure_style, "save_figure", lambda _, stem: [stem])
     files = report_figures.save_figures(three, tmp_path)
     stems = {f.name for f in files}
     assert "clusters" in stems
@@ -365,6 +369,38 @@ def test_save_figures_draws_the_first_cluster_and_all_in_one(three, tmp_path, mo
     monkeypatch.setattr(report_figures, "orientation_figure", lambda _, columns: None)
     wanted = report_figures.save_figures(three, tmp_path, clusters=(2,))
     assert {f.name.split("-")[1] for f in wanted if "-" in f.name} == {"2"}
+
+
+def test_fonts_in_pdf_files_are_glyphs_without_tables_that_place_them(tmp_path):
+    """The texts of a PDF have all their glyphs as TrueType outlines, and the option is restored."""
+    from fontTools.subset import Options
+    from fontTools.ttLib import TTFont
+
+    before = list(Options().drop_tables)
+    with figure_style.style():
+        figure = figure_style.new_figure(2, 1)
+        figure.text(0, 0.5, "AVON σ² 10⁻³")
+        content = figure_style.save_figure(figure, tmp_path / "text")[1].read_bytes()
+    fonts = []
+    for part in re.findall(rb"/Length1 \d+.*?stream\r?\n(.*?)\r?\nendstream", content, re.S):
+        fonts.append(TTFont(BytesIO(zlib.decompress(part))))
+    outlines = [g for f in fonts for g in f.getGlyphOrder() if f["glyf"][g].numberOfContours > 0]
+    assert len(outlines) >= len(set("AVONσ²10⁻³"))
+    assert not any(table in font for font in fonts for table in ("GSUB", "GPOS", "GDEF"))
+    assert Options().drop_tables == before
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "texts"), [(0.3, 20, "0.5 1 2 5 10"), (0.3, 2000, "10⁰ 10¹ 10²")]
+)
+def test_ticks_of_logarithmic_axes_are_few_and_in_plain_text(low, high, texts):
+    ax = axes()
+    ax.set(yscale="log", ylim=(low, high))
+    figure_style.log_ticks(ax.yaxis)
+    shown = [t for t in ax.get_yticks() if low <= t <= high]
+    written = [ax.yaxis.get_major_formatter()(t) for t in shown]
+    assert set(texts.split()) <= set(written)
+    assert len(shown) + np.sum(np.abs(np.log(ax.get_yticks(minor=True))) < 20) < 25
 
 
 @pytest.mark.parametrize("columns", [1, 2])
@@ -547,3 +583,16 @@ def test_van_hove_shows_the_bins_and_the_gaussian(space):
     ax = drawn(plot.plot_van_hove(angles, ax=axes()))
     np.testing.assert_allclose(line(ax, "Brownian rotation").get_ydata(), angles.brownian)
     assert ax.get_xlabel() == "rotation angle in 1 s (rad)"
+
+
+def test_the_nearer_sphere_of_a_drawn_cluster_hides_the_other():
+    """The middle of the picture has the colour of the sphere in front, seen from either side."""
+    pair = perrin.Cluster(np.array([[0.0, 0, 1], [0, 0, -1]]))
+    for view, front in ((np.eye(3), 0), (np.diag([1.0, -1, -1]), 1)):
+        ax = Figure().subplots()
+        plot.plot_cluster(pair, ax=ax, diameter=2.0, view=view)
+        image = np.asarray(ax.images[0].get_array())
+        middle, corner = image[len(image) // 2, len(image) // 2], image[0, 0]
+        color = np.array([int(figure_style.series_color(front)[k : k + 2], 16) for k in (1, 3, 5)])
+        np.testing.assert_allclose(middle / middle.max(), color / color.max(), atol=0.02)
+        assert (corner == 1).all()

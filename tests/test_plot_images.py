@@ -15,6 +15,7 @@ from scipy.stats import halfnorm, maxwell
 import perrin
 from perrin.images.imaging import Imaging, View
 from perrin.images.optics.optics import CameraNoise, Optics
+from perrin.plot import figure_style
 from perrin.plot import imaging as plot_images
 from perrin.plot.figure_style import series_color
 
@@ -410,7 +411,7 @@ def test_a_movie_in_the_plane_has_one_projection_and_no_misfit(
             FigureCanvasAgg(figure).draw()
         return [stem]
 
-    monkeypatch.setattr(plot_images, "save_figure", keep)
+    monkeypatch.setattr(figure_style, "save_figure", keep)
     files = plot_images.save_image_figures(plane, tmp_path)
     assert [f.name for f in files] == [f"images-{n}" for n in names]
     assert len(figures["images-found"].axes) == 1

@@ -19,7 +19,12 @@ from perrin import (
     simulate_motion,
     track_rotation,
 )
-from perrin.curves import LagCurve, correlation_covariance, product_weights
+from perrin.curves import (
+    LagCurve,
+    correlation_covariance,
+    correlation_variances,
+    product_weights,
+)
 
 
 def brownian(seed, n_frames=401, *, D=1e-2, s=0.0, gaps=0.0):
@@ -101,6 +106,22 @@ def test_independent_rotations_have_the_variance_of_their_characters():
             assert np.linalg.eigvalsh(matrix).min() > 0
             if D > 1:
                 assert matrix[0, 0] == pytest.approx(1 / (80 * (2 * degree + 1)))
+
+
+@pytest.mark.parametrize("degree", [1, 2])
+@pytest.mark.parametrize(("D", "s"), [(1e-3, 0.0), (0.02, 1e-3), (20.0, 0.1), (0.0, 0.01)])
+def test_the_variance_of_a_lag_is_the_diagonal_of_the_covariance(degree, D, s):
+    """Both sums agree for several stretches, missing frames, slow and fast rotation, and noise."""
+    lag = np.array([1, 2, 3, 7, 29, 30, 49, 50, 200])
+    weights = product_weights(np.eye(3)[:2], degrees=(degree, degree))
+    for present in (np.ones(9), np.linspace(0.6, 1, 9)):
+        given = {"weights": weights, "blocks": [50, 30, 50, 300], "D": D, "s": s}
+        found = correlation_variances(lag, degree=degree, present=present, **given)
+        matrix = correlation_covariance(
+            (1.0 * lag, 1.0 * lag), degrees=(degree, degree), present=(present, present), **given
+        )
+        # Slow rotation: differences of exponentials near 1, of which digits are lost.
+        np.testing.assert_allclose(found, matrix.diagonal(), rtol=1e-7)
 
 
 def shaped(curve, values):

@@ -7,9 +7,9 @@ import json
 import shlex
 from contextlib import nullcontext
 from dataclasses import asdict, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
+import pandas as pd
 import pytest
 
 import perrin
@@ -18,9 +18,6 @@ from perrin.cli.options import read_optics
 from perrin.images.optics.ball_image import PsfTail
 from perrin.images.optics.optics import CameraNoise, Optics
 from perrin.run import repetition
-
-if TYPE_CHECKING:
-    import pandas as pd
 from test_cli import run
 
 
@@ -69,7 +66,7 @@ def test_a_table_in_memory_is_repeated_from_the_folder(report, tmp_path):
     assert text.splitlines()[:3] == ['command = "analyze"', 'tracks = "tracks.parquet"', "dt = 0.5"]
     options = ("analyze", "--config", "moved/run.toml", "--json", "-o", "again")
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr("perrin.report.write.save_figures", lambda report, place: [])
+        patched.setattr("perrin.report.write.save_figures", lambda *_, **__: [])
         result = run(*options, cwd=tmp_path)
     assert result.returncode == 0, result.stderr
     again, first = json.loads(result.stdout), report.to_dict()
@@ -79,9 +76,25 @@ def test_a_table_in_memory_is_repeated_from_the_folder(report, tmp_path):
             assert str(one[name]) == str(other[name]) or name == "motion"
 
 
+def test_text_labels_of_clusters_are_those_of_the_repeated_run(tmp_path, monkeypatch):
+    """The tracks of a folder keep the labels by number, and a part of them as well."""
+    monkeypatch.setattr("perrin.report.write.save_figures", lambda *_, **__: [])
+    apart = [table(cluster=name) for name in ("knee", "b 2", "foot")]
+    for k, one in enumerate(apart):
+        one[["particle", "x"]] += [10 * k, 20.0 * k]
+    first = perrin.analyze(pd.concat(apart, ignore_index=True), dt=0.5)
+    first.save(tmp_path / "run")
+    again = perrin.analyze(tmp_path / "run" / "tracks.parquet", dt=0.5)
+    assert {c.cluster: c.label for c in again.clusters} == {0: "b 2", 1: "foot", 2: "knee"}
+    assert [c.D_R.value for c in again.clusters] == [c.D_R.value for c in first.clusters]
+    loaded = perrin.load_run(tmp_path / "run")
+    some = perrin.analyze(loaded.tracks.query("cluster != 1"), dt=0.5)
+    assert [c.name for c in some.clusters] == ["b 2", "knee"]
+
+
 def test_saving_and_writing_give_the_same_data(report, tmp_path, monkeypatch):
     """`Report.save` and `write_run` write the same bytes; the latter adds page and figures."""
-    monkeypatch.setattr("perrin.report.write.save_figures", lambda report, place: [])
+    monkeypatch.setattr("perrin.report.write.save_figures", lambda *_, **__: [])
     report.save(tmp_path / "a")
     perrin.write_run(report, tmp_path / "b")
     names = {path.name for path in (tmp_path / "a").iterdir()}

@@ -174,6 +174,31 @@ def test_the_page_loads_nothing_from_outside(single, tmp_path):
     assert "'unsafe-inline'" not in policy.partition("script-src")[2]
 
 
+def luminance(color):
+    """Return the relative luminance of a colour, as WCAG 2.2 defines it."""
+    digits = color if len(color) == 6 else "".join(2 * c for c in color)
+    values = np.array([int(digits[k : k + 2], 16) for k in (0, 2, 4)]) / 255
+    linear = np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
+    return float(linear @ [0.2126, 0.7152, 0.0722])
+
+
+def test_texts_have_the_contrast_of_wcag_aa(single):
+    """Texts differ from their background by a factor 4.5 in light, dark and print."""
+    page = report.render_html(single, [])
+    schemes = [
+        {name: luminance(color) for name, color in re.findall(r"--([\w-]+): #(\w+)", block)}
+        for block in re.findall(r":root \{(.*?)\}", page, re.S)
+    ]
+    assert len(schemes) == 3
+    pairs = [(text, "paper") for text in ("ink", "soft", "blue", "red", "green", "violet")]
+    pairs += [(text, "raised") for text, _ in pairs] + [("paper", "blue")]
+    pairs += [(text, "amber") for text in ("ink", "soft", "blue")]
+    for scheme in schemes:
+        for text, ground in pairs:
+            low, high = sorted((scheme[text] + 0.05, scheme[ground] + 0.05))
+            assert high / low > 4.5, (text, ground)
+
+
 def test_only_the_scripts_of_the_package_may_run(single):
     """The policy has the hashes of the page's own script and of plotly.js, and no other."""
     html = report.render_html(single, [])
@@ -373,7 +398,7 @@ def test_the_run_folder_is_complete(single, tmp_path, monkeypatch, repeats):
 
 
 def test_an_existing_folder_is_refused_or_replaced(single, tmp_path, monkeypatch):
-    monkeypatch.setattr(write, "save_figures", lambda *_: [])
+    monkeypatch.setattr(write, "save_figures", lambda *_, **__: [])
     place = tmp_path / "run"
     write.write_run(single, place)
     (place / "old").touch()
@@ -394,7 +419,7 @@ def test_a_failure_leaves_no_files_and_keeps_an_existing_folder(
     def fail(*_, **__):
         raise RuntimeError("disk full")
 
-    monkeypatch.setattr(write, "save_figures", lambda *_: [])
+    monkeypatch.setattr(write, "save_figures", lambda *_, **__: [])
     monkeypatch.setattr(write, step, fail)
     for target in (place, tmp_path / "new"):
         with pytest.raises(RuntimeError, match="disk full"):

@@ -164,7 +164,7 @@ class TestFromRotations:
 
 def test_progress_counts_the_clusters_of_every_long_step(tmp_path, monkeypatch):
     """Steps begin at 0 of their total; 20 clusters are estimated in two parts, written singly."""
-    monkeypatch.setattr("perrin.report.write.save_figures", lambda report, place: [])
+    monkeypatch.setattr("perrin.report.write.save_figures", lambda *_, **__: [])
     calls: dict[str, list[tuple[int, int]]] = {}
 
     def progress(done, total, title):

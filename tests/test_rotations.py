@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from perrin import Cluster, DegenerateClusterError, axis_angle, kabsch, similarity
 from perrin.geometry.rotations import cumulative_product, exp_map, fit_rotations, log_map, skew
+from perrin.geometry.wahba import certified_rotation
 
 TETRA = Cluster.tetrahedron(1.0).positions
 TRIMER = Cluster.trimer(1.0).positions
@@ -144,6 +145,16 @@ def test_a_noisy_chain_is_certified_only_where_newton_converged(spread, repeats)
     error = np.abs(got - expected).max((1, 2))
     assert np.all(error < 1e-13 + 100 * np.finfo(float).eps / gap)
     np.testing.assert_allclose(np.linalg.det(got), 1.0, rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_ordinary_bodies_need_no_svd(sign):
+    """The closed form is certified in every row of well separated singular values, and exact."""
+    u, v = random_rotations(300), random_rotations(300)[::-1]
+    c = u @ np.diag([3.0, 2.0, 0.5 * sign]) @ np.swapaxes(v, 1, 2) * 1e4
+    rotation, certain = certified_rotation(c.transpose(1, 2, 0), np.full(300, 1e-10))
+    assert certain.all()
+    np.testing.assert_allclose(rotation.transpose(2, 0, 1), u @ np.swapaxes(v, 1, 2), atol=1e-13)
 
 
 @pytest.mark.parametrize("offset", [1e4, 1e6])

@@ -67,7 +67,7 @@ def undrawn(request, monkeypatch):
             monkeypatch.setattr(f"perrin.report.write.{name}", no_figures)
 
 
-def no_figures(_, folder):
+def no_figures(_, folder, **__):
     """Make the folder of the figures."""
     Path(folder).mkdir(exist_ok=True)
     return []

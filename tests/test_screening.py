@@ -7,6 +7,7 @@ import pandas as pd
 import pytest
 
 import perrin
+from perrin.run.tables import read_table
 from perrin.tracks.screening import (
     centre_removed,
     distance_notes,
@@ -231,6 +232,24 @@ def test_trackpy_is_recognised_by_two_of_its_columns():
     """Other programs write one column of mass or size, too."""
     assert has_trackpy_columns(["frame", "x", "y", "mass", "ecc"])
     assert not has_trackpy_columns(["frame", "x", "y", "size"])
+
+
+def test_a_part_of_a_trackpy_table_is_asked_for_its_unit_where_distances_are_pixels():
+    """z, y, x and mass: 22 pixels apart is a question; 2.45 um, a stated scale or unit is none."""
+    names = ["z", "y", "x", "frame", "particle", "mass"]
+    table = table_of(tracks(15))
+    pixels = table.assign(**{axis: table[axis] / 0.11 for axis in "xyz"}, mass=900.0)
+    (text,) = read_table(pixels[names])[2].warnings
+    assert "order of trackpy, whose coordinates are pixels" in text
+    assert "(nearest particles are 22" in text
+    for silent in (
+        read_table(pixels[names], scale=0.11),
+        read_table(table.assign(mass=900.0)[names]),
+        read_table(pixels[["frame", "particle", "x", "y", "z", "mass"]]),
+        read_table(pixels[names].rename(columns={a: f"{a}_um" for a in "xyz"})),
+        read_table(pixels[names[:-1]]),
+    ):
+        assert silent[2].warnings == []
 
 
 def test_particles_at_rest_on_a_cameras_grid_are_measured():

@@ -100,6 +100,42 @@ exclude = [{ cluster = 1 }]
         read_manifest(path)
 
 
+@pytest.mark.parametrize(
+    ("head", "sample", "words"),
+    [
+        ("conditions = 3", "", "conditions: expected names, got 3"),
+        ('conditions = ["dt"]', "", "conditions: 'dt' is an option; choose another name"),
+        ('average = ["odd"]', "", "average: expected some of"),
+        ("reports = 1", "", "reports: expected"),
+        ("[defaults]\nodd = 1", "", "defaults: unknown 'odd'; expected"),
+        ("", "odd = 1", "unknown 'odd'; expected"),
+        ("", "[sample.conditions]\npsi = 1", "condition 'psi' is not in the list"),
+        ("", 'exclude = [{ file = "b.csv", cluster = 1, reason = "wall" }]', "b.csv is none of"),
+        ("", "dt = 0", "dt: expected a finite number > 0"),
+        ("", "drift = 1", "drift: expected"),
+        ("", "columns = 3", "columns: expected a table such as"),
+        ("", "frames = [1]", "frames: expected the first frame and the first that is not used"),
+    ],
+)
+def test_a_fault_of_a_manifest_is_named(tmp_path, head, sample, words):
+    (tmp_path / "a.csv").write_text("frame,particle,x,y,z\n")
+    text = f'{head}\n[[sample]]\nfiles = ["a.csv"]\n{sample}\n'
+    (tmp_path / "study.toml").write_text(text)
+    with pytest.raises(ManifestError, match=re.escape(words)):
+        read_manifest(tmp_path / "study.toml")
+
+
+def test_a_manifest_without_samples_or_files_is_refused(tmp_path):
+    for text, words in (
+        ("conditions = []", "expected at least one [[sample]]"),
+        ("[[sample]]\nfiles = []", "files: expected one or more paths in brackets, got []"),
+        ('[[sample]]\nfiles = ["*.csv"]', "*.csv"),
+    ):
+        (tmp_path / "study.toml").write_text(text)
+        with pytest.raises(ManifestError, match=re.escape(words)):
+            read_manifest(tmp_path / "study.toml")
+
+
 def test_lines_are_those_of_keys_in_all_kinds_of_tables():
     text = '# c\na = """\n"""\n[defaults]\n"dt" = 1\n[[sample]]\nx = [\n 1,\n]\n'
     text += "[sample.conditions]\nphi = 1\n[[sample]]\nx = 2\n"

@@ -223,6 +223,21 @@ def test_faults_of_a_trend_are_listed_together():
         fit_trend(means, [0.0, 1.0], law="power")
 
 
+def test_what_no_law_can_be_fitted_to_is_named():
+    means = means_of([1.0, 2.0], np.random.default_rng(12))
+    with pytest.raises(ValueError, match="start: expected a value for every parameter"):
+        fit_trend(means, [1.0, 2.0], law=lambda x, a: a * x)
+    with pytest.raises(ValueError, match="start: expected parameters at which the law is above 0"):
+        fit_trend(means, [1.0, 2.0], law=lambda x, a: a * x, start={"a": -1.0})
+    with pytest.raises(ValueError, match="at least two different conditions"):
+        fit_trend(means, [2.0, 2.0], law="power")
+    with pytest.raises(ValueError, match="as many means of both, three or more, got 2 and 1"):
+        fit_power_law(means, means[:1])
+    read = type(means[0]).from_dict(means[0].to_dict())
+    with pytest.raises(ValueError, match="condition 0 has no likelihoods of movies"):
+        fit_trend([read, means[1]], [1.0, 2.0], law="power")
+
+
 def test_the_exponent_of_decoupling_comes_back():
     rng = np.random.default_rng(13)
     D_R = np.array([1e-3, 4e-3, 1e-2, 3e-2])

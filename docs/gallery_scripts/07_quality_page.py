@@ -24,9 +24,12 @@ movie = perrin.render_stack(
 )  # fmt: skip
 report = perrin.analyze_stack(movie, diameter=2.45, contact=2.45)
 
-figure, axes = plt.subplots(2, 2, figsize=(10, 8), layout="constrained")
-plot_found(report.imaging, report.imaging.views[0], ax=axes[0, 0])
-plot_masses(report.imaging, ax=axes[0, 1])
-plot_misfit(report.imaging, ax=axes[1, 0])
-plot_step_angles(report, ax=axes[1, 1])
+figure = plt.figure(figsize=(10, 11), layout="constrained")
+axes = figure.subplot_mosaic(
+    [["found", "masses"], ["misfit", "misfit"], ["steps", "steps"]], height_ratios=[2, 1, 1]
+)
+plot_found(report.imaging, report.imaging.views[0], ax=axes["found"])
+plot_masses(report.imaging, ax=axes["masses"])
+plot_misfit(report.imaging, ax=axes["misfit"])
+plot_step_angles(report, ax=axes["steps"])
 plt.show()

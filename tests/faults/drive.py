@@ -5,6 +5,7 @@ import sys
 from pathlib import Path
 
 import perrin.report.write as pages
+import perrin.study.writing as study_pages
 from perrin.cli.app import main
 
 
@@ -18,6 +19,7 @@ def without_pictures():
     """Let runs write their data, and pages without content."""
     pages.save_figures = pages.save_image_figures = no_figures
     pages.render_html = pages.render_imaging_quality = lambda *_, **__: "<html></html>"
+    study_pages.save_study_figures, study_pages.render_study = no_figures, pages.render_html
 
 
 if __name__ == "__main__":

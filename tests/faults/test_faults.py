@@ -47,6 +47,11 @@ def inputs(tmp_path_factory):
         ids = {"frame": frame.ravel(), "particle": particle.ravel() + 4 * k, "cluster": k}
         rows.append(pd.DataFrame({**ids, **columns}))
     perrin.write_tracks(pd.concat(rows), folder / "tracks.csv")
+    perrin.write_tracks(pd.concat(rows).query("frame < 30"), folder / "more.csv")
+    lines = ['conditions = ["phi"]', "reports = false", "[defaults]", f"dt = {DT}"]
+    for phi, name in enumerate(("tracks.csv", "more.csv")):
+        lines += ["[[sample]]", f'files = ["{name}"]', f"phi = {phi}"]
+    (folder / "study.toml").write_text("\n".join(lines), encoding="utf-8")
     motion = perrin.simulate_motion(body, D_R=5e-3, D_T=0.01, dt=DT, n_frames=FRAMES, rng=3)
     movie = perrin.render_stack(
         motion, centers=[(4.5, 4.5, 4.0)], voxel=(0.3, 0.25, 0.25), shape=(27, 36, 36),
@@ -67,6 +72,7 @@ def command(inputs, name, output, *more):
         "analyze": ["analyze", tracks, "--dt", DT, "-o", output],
         "run": ["run", movie, *optics, "-o", output],
         "convert": ["convert", tracks, output / "t.parquet"],
+        "study": ["study", "run", inputs / "study.toml", "-o", output],
         "paper": ["paper", "-o", output],
         "demo": ["demo", "-o", output],
     }[name]
@@ -107,6 +113,8 @@ def called(capsys, monkeypatch):
 
     for name in ("save_figures", "save_image_figures", "render_html", "render_imaging_quality"):
         monkeypatch.setattr(f"perrin.report.write.{name}", lambda *_, **__: "")
+    for name in ("save_study_figures", "render_study"):
+        monkeypatch.setattr(f"perrin.study.writing.{name}", lambda *_, **__: "")
 
     def call(arguments):
         with pytest.raises(SystemExit) as end:
@@ -121,7 +129,7 @@ def called(capsys, monkeypatch):
 def whole(inputs, tmp_path_factory):
     """Return the result of each command, and how long it takes from its beginning, s."""
     results = {}
-    for name in ("analyze", "run", "convert"):
+    for name in ("analyze", "run", "convert", "study"):
         folder = tmp_path_factory.mktemp("whole") / "out"
         if name == "convert":
             folder.mkdir()
@@ -137,6 +145,9 @@ def content_of(folder):
     """Return all results in a folder."""
     if (folder / "t.parquet").exists():
         return pd.read_parquet(folder / "t.parquet")
+    if (folder / "study.toml").exists():
+        runs = [p for name in ("summary.json", "tracks.parquet") for p in folder.rglob(name)]
+        return {p.relative_to(folder): p.read_bytes() for p in [folder / "results.csv", *runs]}
     return perrin.load_run(folder)
 
 
@@ -144,6 +155,8 @@ def same(one, two):
     """Return whether two results are equal, bit by bit."""
     if isinstance(one, pd.DataFrame):
         return one.equals(two)
+    if isinstance(one, dict):
+        return one == two
     return one.to_dict() == two.to_dict() and one.tracks.equals(two.tracks)
 
 
@@ -165,7 +178,7 @@ def stopped(arguments, moment, stop, **keywords):
 
 
 @pytest.mark.parametrize("stop", STOPS)
-@pytest.mark.parametrize("name", ["analyze", "run", "convert"])
+@pytest.mark.parametrize("name", ["analyze", "run", "convert", "study"])
 def test_a_stop_at_any_moment_loses_nothing(tmp_path, inputs, whole, name, stop, request):
     """The folder is whole or absent (or holds parts), and the same command ends the work."""
     moments = random.Random(f"{name} {stop}")
@@ -178,7 +191,8 @@ def test_a_stop_at_any_moment_loses_nothing(tmp_path, inputs, whole, name, stop,
         status, _, err = stopped(arguments, moments.uniform(0, duration), stop)
         assert "Traceback" not in err
         assert status in STATUS[stop] | {0}, err
-        if folder.exists() and name != "convert" and not (folder / "located").exists():
+        whole_or_absent = name in ("analyze", "run") and not (folder / "located").exists()
+        if folder.exists() and whole_or_absent:
             assert same(content_of(folder), known)
         again, _, err = finished(arguments)
         if again:  # finished before it was stopped
@@ -217,7 +231,9 @@ def test_the_paper_stops_in_order(tmp_path, inputs):
         assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize(("name", "more"), [("analyze", []), ("run", []), ("run", ["--overwrite"])])
+@pytest.mark.parametrize(
+    ("name", "more"), [("analyze", []), ("run", []), ("run", ["--overwrite"]), ("study", [])]
+)
 def test_of_two_at_once_one_is_refused_in_one_line(tmp_path, inputs, whole, name, more):
     """The folder holds the result of one of them, whole."""
     folder = tmp_path / "out"
@@ -237,7 +253,14 @@ def test_of_two_at_once_one_is_refused_in_one_line(tmp_path, inputs, whole, name
 
 @pytest.mark.parametrize(
     ("name", "most"),
-    [("analyze", 0), ("analyze", 9000), ("run", 3000), ("run", 12000), ("convert", 100)],
+    [
+        ("analyze", 0),
+        ("analyze", 9000),
+        ("run", 3000),
+        ("run", 12000),
+        ("convert", 100),
+        ("study", 900),
+    ],
 )
 def test_a_full_disk_is_reported_in_one_line(tmp_path, inputs, whole, called, name, most):
     """A limit on the length of files stands for it; the work is ended when there is space."""

@@ -9,6 +9,7 @@ from perrin.curves.correlation_errors import (
     brownian_decay,
     correlation_covariance,
     correlation_stderr,
+    correlation_variances,
     frames_present,
     product_weights,
 )
@@ -105,6 +106,7 @@ __all__ = [
     "correction_fault",
     "correlation_covariance",
     "correlation_stderr",
+    "correlation_variances",
     "covariance_polynomials",
     "direction_weights",
     "displacement_counts",

@@ -206,7 +206,8 @@ def orientation_correlation(
         x, y, z = np.moveaxis(p, -1, 0)
         root = np.sqrt(3.0)
         squares = [root / 2 * (x * x - y * y), 1.5 * z * z - 0.5]
-        features = np.stack([root * x * y, root * y * z, root * z * x, *squares], axis=-1)
+        columns = np.stack([root * x * y, root * y * z, root * z * x, *squares])
+        features = np.moveaxis(columns, 0, -1)
     unit = body / np.linalg.norm(body, axis=1, keepdims=True)
     rate = degree * (degree + 1)
     offset = 0.0

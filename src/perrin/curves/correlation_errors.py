@@ -119,8 +119,6 @@ def correlation_covariance(
     1.0
     """
     first, second = (n * (n + 1) for n in degrees)
-    order = np.arange(len(weights))
-    decay = order * (order + 1)
     weights = np.where(np.abs(weights) > 1e-12, weights, 0.0)
     lengths, times = np.unique(np.asarray(blocks, dtype=np.int64), return_counts=True)
     covariance, b = np.zeros((len(lags[0]), len(lags[1]))), lags[1][:, None]
@@ -132,15 +130,21 @@ def correlation_covariance(
         latest = min(np.ceil(a), np.ceil(max(a - b.min(), 0.0) + reach))
         shift = np.arange(earliest, latest + 1)
         overlap = np.maximum(np.minimum(a, b + shift) - np.maximum(0.0, shift), 0.0)
-        common = sum(
-            (np.abs(shift - at) < 1e-9).astype(float) for at in (0 * b, a - b, a + 0 * b, -b)
-        )
-        h = D * overlap + 0.5 * s * common
-        shared = sum(w * np.exp(-rate * h) for w, rate in zip(weights, decay, strict=True) if w)
-        shared -= np.exp(-(first + second) * h)
-        alone = first * (D * a + s - h) + second * (D * b + s - h)
-        term = np.exp(-alone) * shared
-        term *= np.where(common > 0, np.sqrt(present[0][i] * present[1][:, None]) ** -common, 1.0)
+        h = D * overlap
+        # The shifts at which the two pairs share a frame, and how many.
+        places = np.stack([0 * b, a - b, a + 0 * b, -b])[..., 0] - earliest
+        whole = np.rint(places).astype(np.int64)
+        inside = (whole >= 0) & (whole < len(shift)) & (np.abs(places - whole) < 1e-9)
+        row = np.broadcast_to(np.arange(len(b)), whole.shape)[inside]
+        shared_frames, joint = np.unique(row * len(shift) + whole[inside], return_counts=True)
+        row, place = np.divmod(shared_frames, len(shift))
+        h[row, place] += 0.5 * s * joint
+        shared = _shared_rotation(np.exp(-2 * h), weights=weights, alone=(first + second) // 2)
+        h *= first + second
+        h -= first * (D * a + s) + second * (D * b + s)
+        term = np.exp(h, out=h)
+        term *= shared
+        term[row, place] *= np.sqrt(present[0][i] * present[1][row]) ** (-1.0 * joint)
         total, pairs = np.zeros(len(b)), np.zeros((2, len(b)))
         for length, count in zip(lengths, times, strict=True):
             n, m = max(length + 1 - a, 0.0), np.maximum(length + 1 - b, 0.0)
@@ -150,6 +154,84 @@ def correlation_covariance(
         product = pairs[0] * pairs[1]
         covariance[i] = np.divide(total, product, out=np.full(len(b), np.inf), where=product > 0)
     return covariance
+
+
+def _shared_rotation(once: Floats, *, weights: Floats, alone: int) -> Floats:
+    """Return sum_L w_L exp(-L(L + 1) h) - exp(-2 alone h), powers of `once`, exp(-2 h)."""
+    power = {0: np.ones(1), 1: once}
+    for k, (p, q) in {2: (1, 1), 3: (2, 1), 4: (2, 2), 6: (3, 3), 10: (6, 4)}.items():
+        if k <= max(alone, len(weights) * (len(weights) - 1) // 2):
+            power[k] = power[p] * power[q]
+    shared = np.negative(power[alone])
+    for order, w in enumerate(weights):
+        if w:
+            shared = shared + w * power[order * (order + 1) // 2]
+    return np.asarray(shared)
+
+
+def correlation_variances(
+    lag: Ints,
+    *,
+    degree: int,
+    weights: Floats,
+    blocks: Sequence[int],
+    present: Floats,
+    D: float,
+    s: float,
+) -> Floats:
+    """Return the diagonal of `correlation_covariance` of one curve, at lags of whole steps.
+
+    The factors of a term depend on the shift, and on the lag less the shift: each is computed once
+    for all lags.
+
+    Parameters
+    ----------
+    lag : ndarray of int, shape (A,)
+        Lags, steps.
+    degree : int
+        Degree of the curve.
+    weights, blocks, present, D, s
+        As in `correlation_covariance`.
+
+    Returns
+    -------
+    ndarray, shape (A,)
+
+    Examples
+    --------
+    >>> weights, lag = product_weights(np.eye(3), degrees=(1, 1)), np.array([1])
+    >>> correlation_variances(
+    ...     lag, degree=1, weights=weights, blocks=[100], present=np.ones(1), D=9.0, s=0.0
+    ... ).round(6)  # a hundred uniform rotations: 1/9 each
+    array([0.001111])
+    """
+    rate = 2 * degree * (degree + 1)
+    weights = np.where(np.abs(weights) > 1e-12, weights, 0.0)
+    lengths, times = np.unique(np.asarray(blocks, dtype=np.int64), return_counts=True)
+    reach = int(min(np.ceil(_NO_COVARIANCE / max(rate * D, 1e-12)), lag.max()))
+    shift = np.arange(1.0, reach + 1)
+    fall = 2 * np.exp(-rate * (D * shift + s))
+    longest = int(lag.max())
+    # What h of each whole number of steps shares, and that of both frames, and of one, shared.
+    h = D * np.arange(longest + 1.0)
+    once = np.exp(-2 * np.concatenate([h, D * lag + s, [0.5 * s]]))
+    shared = _shared_rotation(once, weights=weights, alone=rate // 2)
+    together, one_frame = shared[longest + 1 : -1], shared[-1]
+    variance = np.full(len(lag), np.inf)
+    for i, a in enumerate(lag.tolist()):
+        last = min(a - 1, reach)
+        terms = fall[:last] * shared[a - last : a][::-1]
+        end = 2 * np.exp(-rate * (D * a + 0.5 * s)) * one_frame / present[i] if a <= reach else 0.0
+        total, pairs = 0.0, 0.0
+        for length, count in zip(lengths.tolist(), times.tolist(), strict=True):
+            n = max(length + 1 - a, 0)
+            inside = min(last, n)
+            total += count * float((n - shift[:inside]) @ terms[:inside])
+            total += count * (n * together[i] / present[i] ** 2 + max(n - a, 0) * end)
+            pairs += count * n
+        if pairs:
+            variance[i] = total / pairs**2
+    return variance
 
 
 def brownian_decay(lag: Floats, value: Floats, *, degree: int) -> tuple[float, float]:
@@ -181,7 +263,8 @@ def brownian_decay(lag: Floats, value: Floats, *, degree: int) -> tuple[float, f
     good = np.flatnonzero(np.isfinite(value))
     if not good.size or value[good[0]] <= 0:
         return 1.0, 0.0  # uncorrelated after one step
-    lag, value = lag[good], value[good]
+    if good.size < len(lag):
+        lag, value = lag[good], value[good]
     below = np.flatnonzero(value < value[0] * np.exp(-1))
     quarter = max(int(np.searchsorted(lag, 0.25 * lag[-1], side="right")), 1)
     end = max(min(int(below[0]) if below.size else quarter, quarter), 1)
@@ -272,17 +355,29 @@ def correlation_stderr(
     good = np.flatnonzero(pairs > 0)
     D, s = brownian_decay(lag[good], value[good], degree=degree)
     stretches, present = frames_present(lag, pairs, blocks)
-    degrees = (degree, degree)
-    weights = product_weights(directions, degrees=degrees)
+    weights = product_weights(directions, degrees=(degree, degree))
     spaced = np.geomspace(1, len(good), _ERROR_LAGS)
     use = good[np.unique(np.minimum(np.rint(spaced), len(good)).astype(int)) - 1]
-    variance = [
-        correlation_covariance(
-            (lag[[k]], lag[[k]]), degrees=degrees, weights=weights, blocks=stretches,
-            present=(present[[k]], present[[k]]), D=D, s=s,
-        )[0, 0]
-        for k in use
-    ]  # fmt: skip
+    whole = np.rint(lag[use]).astype(np.int64)
+    if np.all(np.abs(lag[use] - whole) < 1e-9):
+        variance = correlation_variances(
+            whole, degree=degree, weights=weights, blocks=stretches, present=present[use], D=D, s=s
+        )
+    else:
+        variance = np.array(
+            [
+                correlation_covariance(
+                    (lag[[k]], lag[[k]]),
+                    degrees=(degree, degree),
+                    weights=weights,
+                    blocks=stretches,
+                    present=(present[[k]], present[[k]]),
+                    D=D,
+                    s=s,
+                )[0, 0]
+                for k in use
+            ]
+        )
     error = np.sqrt(np.maximum(variance, 0.0))  # that of a body at rest may round below zero
     stderr[good] = np.interp(np.log(lag[good]), np.log(lag[use]), error)
     return stderr

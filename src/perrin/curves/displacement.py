@@ -479,7 +479,8 @@ def mean_square_curve(
     >>> mean_square_curve(walk, time, piece, dt=1.0, quantity="translation", dof=1).value
     array([2.5, 9. ])
     """
-    here = np.asarray(present(walks).any(axis=1))
+    seen = present(walks)
+    here = seen[:, 0] if seen.shape[1] == 1 else np.asarray(seen.any(axis=1))
     frames = place_frames(time, piece, here, dt=dt)
     sums = pair_sums(Squares(walks), frames)
     # The sums are not needed any more: the means take their place.

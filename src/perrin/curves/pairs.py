@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
@@ -614,20 +615,31 @@ class Products:
         """Return the sums by FFT."""
         values = _on_grid(self.features, rows, slots)
         here = present(values)
-        size = fft_size(len(values) + count)
+        transform = Correlations.of(len(values) + count)
         whole = bool(here.all())
-        columns = np.ascontiguousarray(values.T)
-        f = np.fft.rfft(columns if whole else np.where(here, columns, 0.0), size)
-        sums = np.empty((count, len(self.groups)))
-        for k, group in enumerate(self.groups):
-            # The real part is the transform of the mean of a product and its reverse.
-            power = sum(f[i].real * f[j].real + f[i].imag * f[j].imag for i, j in group)
-            sums[:, k] = np.fft.irfft(power, size)[1 : count + 1]
+        columns = np.ascontiguousarray(
+            (values if whole else np.where(here[:, None], values, 0.0)).T
+        )
+        sums = np.empty((len(self.groups), count))
+        memory = np.empty((1, len(transform.turn)), dtype=np.complex128)
+        squares = all(i == j for group in self.groups for i, j in group)
+        parts = None if squares else transform.spectrum(columns).view(np.float64)
+        for out, group in zip(sums, self.groups, strict=True):
+            power = np.zeros(len(transform.turn))
+            for i, j in group:
+                if parts is None:
+                    moved = transform.spectrum(columns[i : i + 1], out=memory)
+                    power += squared_size(moved, overwrite=True)
+                else:
+                    # The real part is the transform of the mean of a product and its reverse.
+                    product = parts[i] * parts[j]
+                    power += product[::2] + product[1::2]
+            out[:] = transform.even(power, memory=memory, out=power)[1 : count + 1]
         if whole:
-            return sums, len(values) - np.arange(1, count + 1)
-        m = np.fft.rfft(here.astype(np.float64), size)
-        pairs = np.fft.irfft(m.real**2 + m.imag**2, size)[1 : count + 1]
-        return sums, np.rint(pairs).astype(np.int64)
+            return sums.T, len(values) - np.arange(1, count + 1)
+        mask = transform.spectrum(here.astype(np.float64)[None])
+        pairs = transform.even(squared_size(mask))[1 : count + 1]
+        return sums.T, np.rint(pairs).astype(np.int64)
 
     def between(self, first: Ints, last: Ints) -> tuple[Floats, Ints]:
         """Return the products of pairs."""
@@ -650,6 +662,7 @@ def _on_grid(values: Floats, rows: Ints, slots: Ints) -> Floats:
     return grid
 
 
+@lru_cache
 def fft_size(least: int) -> int:
     """Return the smallest 2^a 3^b 5^c that is at least `least`: such transforms are fast.
 

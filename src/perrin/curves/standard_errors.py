@@ -58,16 +58,14 @@ def relative_error(sums: PairSums, frames: Frames, half: Floats, pairs: Floats) 
         longest = int(lengths[0])
         whole = np.arange(1.0, len(lag) + 1)
         if frames.exact and np.array_equal(pairs, longest + 1 - whole):
-            variance = lag_covariance(whole, longest, present=None, D=d, s=s)
-            variance *= 2
-            np.sqrt(variance, out=variance)
-            whole *= d
-            whole += s
+            if not d + s > 0:
+                return np.full_like(half, np.nan)
+            relative = lag_covariance(whole, longest, present=None, D=d, s=s)
+            np.sqrt(relative, out=relative)
+            whole *= d * 2**0.5
+            whole += s * 2**0.5
             whole *= pairs
-            whole *= 2
-            good = whole > 0
-            relative = np.full_like(half, np.nan)
-            np.divide(variance, whole, out=relative, where=good)
+            relative /= whole
             return relative
     total = np.zeros_like(lag)
     blocks = [
@@ -127,8 +125,10 @@ def two_lag_fit(lag: Floats, half: Floats, pairs: Floats | Ints) -> tuple[float,
     >>> two_lag_fit(np.array([1.0, 2.0]), np.array([0.75, 1.25]), np.array([9, 8]))
     (0.5, 0.25)
     """
-    good = np.flatnonzero(pairs > 0)
-    first, second = (good[0], good[1]) if good.size > 1 else (good[0], good[0])
+    good = pairs > 0
+    first = second = int(np.argmax(good))
+    if good[first + 1 :].any():
+        second += 1 + int(np.argmax(good[first + 1 :]))
     rise = (half[second] - half[first]) / max(lag[second] - lag[first], 1e-9)
     d = min(max(rise, 0.0), half[first] / lag[first])
     return float(d), float(half[first] - d * lag[first])

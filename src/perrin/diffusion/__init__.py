@@ -158,6 +158,7 @@ from perrin.diffusion.steps import (
     principal_steps,
     residual_freedom,
     steps_of,
+    stored_once,
 )
 from perrin.diffusion.switching import (
     Parameter,
@@ -406,6 +407,7 @@ __all__ = [
     "step_covariance",
     "step_modes",
     "steps_of",
+    "stored_once",
     "straight_window",
     "symmetric_basis",
     "symmetric_inverses",

@@ -646,6 +646,9 @@ def axis_model(motion: RigidMotion, quantity: Quantity, noise: Noise) -> tuple[A
     if not square.max() > 0:
         raise ValueError(f"the body does not move: there is no {quantity} to judge")
     moves = square > _SMALLEST_AXIS * square.max()
+    # Eigenvectors have any sign; one that the steps determine gives p, which are simulated from a
+    # seed made of the steps, that do not change with the axes of the laboratory.
+    sign = np.where(np.sum(steps.vectors**3, axis=0) < 0, -1.0, 1.0)[moves]
     model = AxisModel(
         start=motion.time[steps.start],
         tau=steps.duration,
@@ -653,9 +656,9 @@ def axis_model(motion: RigidMotion, quantity: Quantity, noise: Noise) -> tuple[A
         known=(before[moves], after[moves]),
         blur=0.0 if free else track.blur,
         free=free,
-        steady=np.ascontiguousarray(steps.steady[:, moves]),
+        steady=np.ascontiguousarray(steps.steady[:, moves] * sign[:, None]),
     )
-    y = np.ascontiguousarray(steps.vectors.T[moves])[None]
+    y = np.ascontiguousarray(steps.vectors.T[moves] * sign[:, None])[None]
     spread = 0.5 * (model.known[0].std(axis=1) + model.known[1].std(axis=1))
     if np.all(spread <= _EQUAL_NOISE * square[moves]):
         model = model.with_equal_noise()

@@ -106,7 +106,7 @@ class Steps:
     def variances(self) -> tuple[Floats, Floats]:
         """Noise variances of the first and the last frame of each step by component, (S, c)."""
         diagonal = np.ascontiguousarray(np.einsum("tcc->tc", self.noise[0]))
-        return diagonal[self.start], diagonal[self.stop]
+        return stored_once(diagonal[self.start]), stored_once(diagonal[self.stop])
 
     @cached_property
     def even(self) -> bool:
@@ -289,13 +289,13 @@ def steps_of(motion: RigidMotion, quantity: Quantity) -> Steps:
         vectors = motion.center[stop] - motion.center[start]
         d = vectors.shape[1]
         noise = np.repeat(unit_center_variance(motion)[:, None], d, axis=1)
-        steady = np.eye(d) * duration[:, None, None]
+        steady = stored_once(np.eye(d) * duration[:, None, None])
     known[quantity] = Steps(
         vectors=vectors,
         duration=duration,
         start=start,
         stop=stop,
-        noise=(noise[..., None] * np.eye(noise.shape[1]))[None],
+        noise=stored_once(noise[..., None] * np.eye(noise.shape[1]))[None],
         dt=motion.dt,
         sigma=motion.sigma,
         freedom=residual_freedom(motion),
@@ -303,6 +303,21 @@ def steps_of(motion: RigidMotion, quantity: Quantity) -> Steps:
         steady=steady,
     )
     return known[quantity]
+
+
+def stored_once(rows: Floats) -> Floats:
+    """Return an array (N, ...) whose rows are all the same as a view of one row.
+
+    Thousands of motions are in memory together, and most have equally noisy frames.
+
+    Examples
+    --------
+    >>> stored_once(np.ones((4, 2))).strides[0], stored_once(np.arange(4.0)).strides[0]
+    (0, 8)
+    """
+    if len(rows) < 2 or not np.array_equal(rows[1:], rows[:-1]):
+        return rows
+    return np.broadcast_to(rows[0].copy(), rows.shape)
 
 
 def groups_alike(keys: Sequence[Hashable], sizes: Sequence[int], *, most: int) -> list[list[int]]:

@@ -682,13 +682,12 @@ def _two_states(motions: Sequence[RigidMotion], quantity: Quantity, settings: No
     ]
     least = 1e-6 * likelihood.mean_square
     log_theta = np.log(np.maximum(one.theta, least))
-    shared, noises, value, covariance = yield from _most_likely(steps, float(one.D[0]), log_theta)
-    points = [np.append(shared, own)[None] for own in noises]
-    filtered = yield list(zip(steps, points, strict=True))
+    found = yield from _most_likely(steps, float(one.D[0]), log_theta)
+    shared, value, covariance, pairs_of_each = found
     states, probability = [], []
-    for track, m, point, (_, pairs) in zip(steps, motions, points, filtered, strict=True):
+    for track, m, pairs in zip(steps, motions, pairs_of_each, strict=True):
         fast = np.full(len(m.time), np.nan)
-        fast[track.track.steps.stop] = smoothed(pairs, point[:, 2:4])[:, 0]
+        fast[track.track.steps.stop] = smoothed(pairs, shared[None, 2:])[:, 0]
         probability.append(fast)
         states.append(np.where(np.isnan(fast), -1, fast > 0.5).astype(np.int64))
     gain = value - float(one.value[0])
@@ -718,12 +717,12 @@ def _two_states(motions: Sequence[RigidMotion], quantity: Quantity, settings: No
 
 def _most_likely(
     steps: Sequence[SwitchingSteps], D: float, log_theta: Floats
-) -> Generator[_Requests, _Answers, tuple[Floats, Floats, float, Floats]]:
-    """Search for the most likely parameters: shared (4,), noise (G,), value, covariance.
+) -> Generator[_Requests, _Answers, tuple[Floats, float, Floats, list[Floats]]]:
+    """Search for the most likely parameters: shared (4,), value, covariance, weights of states.
 
     The points at which the likelihood is needed are yielded. `D` and `log_theta` (G,) are those of
-    one D; the parameters are logarithms, and the covariance is that of all of them, NaN where the
-    data do not bound a parameter.
+    one D; the parameters are logarithms, and the covariance is that of all of them, noise included,
+    NaN where the data do not bound a parameter. The weights are those of every motion.
     """
     dt = float(np.median(np.concatenate([s.track.steps.duration for s in steps])))
     grid = np.array(
@@ -747,7 +746,7 @@ def _most_likely(
 
     def expanded(
         x: Floats,
-    ) -> Generator[_Requests, _Answers, tuple[float, Floats, Floats]]:
+    ) -> Generator[_Requests, _Answers, tuple[float, Floats, Floats, list[Floats]]]:
         value, slope, curvature = 0.0, np.zeros(len(x)), np.zeros((len(x), len(x)))
         every = [np.array([0, 1, 2, 3, 4 + g]) for g in range(len(steps))]
         filtered = yield [(s, around(x[rows])) for s, rows in zip(steps, every, strict=True)]
@@ -756,11 +755,12 @@ def _most_likely(
             value += part[0]
             slope[rows] += part[1]
             curvature[np.ix_(rows, rows)] += part[2]
-        return value, np.where(fixed, 0.0, slope), curvature
+        weights = [pairs[..., :1].copy() for _, pairs in filtered]  # at the point itself
+        return value, np.where(fixed, 0.0, slope), curvature, weights
 
     here, damping = (yield from expanded(x)), 1e-3
     for _ in range(_NEWTON_ROUNDS):
-        value, slope, curvature = here
+        value, slope, curvature, weights = here
         free = ~fixed
         # A rate at the end of its range stays there unless the slope leads away from it.
         free[2:4] &= ~((x[2:4] <= slowest) & (slope[2:4] < 0))
@@ -775,7 +775,7 @@ def _most_likely(
             break
         trial = x + step
         trial[2:4] = np.clip(trial[2:4], slowest, quickest)
-        there = -np.inf, slope, curvature
+        there = -np.inf, slope, curvature, weights
         if trial[0] <= trial[1]:
             there = yield from expanded(trial)
         if there[0] >= value:
@@ -790,4 +790,4 @@ def _most_likely(
         inverse = np.full_like(information, np.nan)
     inverse[np.diag(inverse) <= 0] = np.nan
     covariance[np.ix_(~fixed, ~fixed)] = inverse
-    return x[:4], x[4:], here[0], covariance
+    return x[:4], here[0], covariance, here[3]

@@ -292,10 +292,10 @@ def coupled_tensor(
     at_center = isinstance(point, str) and point == "diffusion"
     data = ScaledTracks.of([body_steps(motion, "both", np.eye(3))], Noise())
     basis = symmetric_basis(6)
-    best = data.fit(basis)
+    best = data.fit_coupled(basis)
     while (closer := data.reaching([best])) is not None:
         data = closer
-        best = data.fit(basis)
+        best = data.fit_coupled(basis)
     elements = [(i, j) for i in range(6) for j in range(i + 1)]
     tensor = data.in_units(best.D)
     covariance = data.covariance(spread(data.tracks, best, basis), elements)
@@ -533,6 +533,25 @@ class ScaledTracks:
         """Return the best tensor >= 0 in the span of a basis, near another maximum if given."""
         D, own = self.start() if near is None else (near.D, near.own)
         return maximise(self.tracks, squares(basis), root_parameters(D, basis), own)
+
+    def fit_coupled(self, basis: Floats) -> Maximum:
+        """Return the best tensor (6, 6) >= 0, of searches from two places.
+
+        The likelihood of short noisy tracks has several maxima. The second search begins with equal
+        axes and without coupling.
+        """
+        D, own = self.start()
+        level = np.repeat(np.diag(D).reshape(2, 3).mean(axis=1), 3)
+        found: list[Maximum] = []
+        faults: list[ValueError] = []
+        for near in (None, Maximum(-np.inf, np.diag(level), own)):
+            try:
+                found.append(self.fit(basis, near))
+            except ValueError as fault:
+                faults.append(fault)
+        if not found:
+            raise faults[0]
+        return max(found, key=lambda m: m.value)
 
     def fit_axial(self, near: Maximum) -> Maximum:
         """Return the best tensor with two values equal, about any axis."""

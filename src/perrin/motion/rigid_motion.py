@@ -183,12 +183,17 @@ class RigidMotion(Shown):
         """What the error of every centre adds to the variance of steps, um^2, (T,)."""
         return self.center_variance if self.shift_noise is None else self.shift_noise
 
-    @property
+    @cached_property
     def orientation_noise(self) -> Floats:
         """The noise of one orientation, mean over the ends of all steps, rad^2, (3, 3)."""
         rows = np.concatenate(self.steps())
         rows = rows if rows.size else self.fitted
-        return np.asarray(self.step_covariance[rows].mean(axis=0))
+        used, number = np.unique(rows, return_counts=True)
+        covariance = self.step_covariance
+        covariance = covariance if used.size == len(covariance) else covariance[used]
+        mean = np.asarray(np.einsum("t,tij->ij", number / rows.size, covariance))
+        frozen(mean)
+        return mean
 
     @property
     def center_noise(self) -> float:
@@ -258,8 +263,8 @@ class RigidMotion(Shown):
         length = np.linalg.norm(p, axis=-1, keepdims=True)
         if p.ndim > 2 or p.shape[-1] != d or not np.all((length > 0) & (length < np.inf)):
             raise ValueError(f"p0: expected directions ({d},) or (K, {d}), none zero, got {p0!r}")
-        turned = np.einsum("tij,...j->t...i", self.rotation, p / length)
-        return np.asarray(turned)
+        turned = self.rotation.reshape(-1, d) @ (p / length).T
+        return np.asarray(np.moveaxis(turned.reshape(-1, d, *p.shape[:-1]), 1, -1))
 
     def rotational_displacement(self, p0: ArrayLike) -> Floats:
         """Integrate the unbounded vector angle phi of body-fixed directions (Hunter 2011, Eq. 18).

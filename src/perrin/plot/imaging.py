@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -18,15 +19,16 @@ from perrin.plot.figure_style import (
     ink,
     legend_above,
     line_width,
+    log_ticks,
     marker_size,
-    save_figure,
+    save_drawn,
     series_color,
-    style,
     write_reason,
 )
 
 if TYPE_CHECKING:
     import os
+    from collections.abc import Callable
 
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
@@ -38,6 +40,7 @@ if TYPE_CHECKING:
     from perrin.motion.rods import RodMotion
     from perrin.plot.figure_style import Sheet
     from perrin.run.results import ClusterResult, Report, RodResult
+    from perrin.run.workers import Progress
 
 
 Side = Literal["xy", "xz", "yz"]
@@ -167,6 +170,7 @@ def plot_masses(imaging: Imaging, *, ax: Axes) -> Axes:
         label = f"cut at {number_text(cut)}"
         ax.axvline(cut, color=series_color(1), lw=line_width(0.95), ls="--", label=label)
     ax.set(xscale="log", xlabel="mass (grey levels)", ylabel="spots")
+    log_ticks(ax.xaxis)
     _count_axis(ax)
     legend_above(ax, ncols=3)
     return ax
@@ -402,7 +406,11 @@ def plot_health(imaging: Imaging, *, ax: Axes, series: Series = "spheres") -> Ax
 
 
 def save_image_figures(
-    report: Report, folder: str | os.PathLike[str], *, sheet: Sheet | None = None
+    report: Report,
+    folder: str | os.PathLike[str],
+    *,
+    sheet: Sheet | None = None,
+    progress: Progress | None = None,
 ) -> list[Path]:
     """Write the figures of imaging quality into an existing folder, each as PNG and PDF.
 
@@ -413,6 +421,8 @@ def save_image_figures(
     folder : path
     sheet : path, str or mapping, optional
         Style sheet that outranks perrin's, as in `style`.
+    progress : callable, optional
+        Called with the number of finished figures, their total, and what is done.
 
     Returns
     -------
@@ -420,22 +430,16 @@ def save_image_figures(
         ``images-found.*``, ``-tracks.*`` (both only if the movie has views), ``-masses.*``,
         ``-residuals.*``, ``-steps.*`` and ``-health.*``.
     """
-    place = Path(folder)
     imaging = imaging_of(report)
-    drawn: dict[str, Figure] = {}
-    with style(sheet=sheet):
-        if imaging.views:
-            drawn["found"] = found_figure(imaging)
-            drawn["tracks"] = tracks_figure(report)
-        drawn["masses"] = _single_figure()
-        plot_masses(imaging, ax=drawn["masses"].axes[0])
-        drawn["residuals"] = misfit_figure(report)
-        drawn["steps"] = _single_figure()
-        plot_step_angles(report, ax=drawn["steps"].axes[0])
-        drawn["health"] = health_figure(imaging)
-        return [
-            f for name, one in drawn.items() for f in save_figure(one, place / f"images-{name}")
-        ]
+    figures: dict[str, Callable[[], Figure]] = {}
+    if imaging.views:
+        figures["images-found"] = partial(found_figure, imaging)
+        figures["images-tracks"] = partial(tracks_figure, report)
+    figures["images-masses"] = partial(_single_figure, plot_masses, imaging)
+    figures["images-residuals"] = partial(misfit_figure, report)
+    figures["images-steps"] = partial(_single_figure, plot_step_angles, report)
+    figures["images-health"] = partial(health_figure, imaging)
+    return save_drawn(figures, Path(folder), sheet=sheet, progress=progress)
 
 
 def imaging_of(report: Report) -> Imaging:
@@ -514,6 +518,7 @@ def _count_axis(ax: Axes) -> None:
     ax.set_yscale("log")
     # Both ends are set, because the tail of the expected curve reaches far below 1.
     ax.set_ylim(0.5, 2 * ax.dataLim.ymax)
+    log_ticks(ax.yaxis)
     ax.yaxis.set_major_formatter("{x:g}")
 
 
@@ -648,9 +653,10 @@ def least_turns(report: Report) -> list[float]:
     return sorted(t for t in turns if np.isfinite(t))
 
 
-def _single_figure() -> Figure:
+def _single_figure(draw: Callable[..., Axes], source: Imaging | Report) -> Figure:
+    """Return a figure of one drawing over two columns."""
     figure = column_figure(0.42)
-    figure.add_subplot()
+    draw(source, ax=figure.add_subplot())
     return figure
 
 
@@ -749,9 +755,7 @@ def misfit_figure(report: Report) -> Figure:
     """
     imaging = imaging_of(report)
     if "chi2" not in imaging.features:
-        figure = _single_figure()
-        plot_rigidity(report, ax=figure.axes[0])
-        return figure
+        return _single_figure(plot_rigidity, report)
     figure = column_figure(0.56)
     top, bottom = figure.subplots(2, 1, sharex=True)
     plot_misfit(imaging, ax=top)

@@ -7,7 +7,6 @@ import textwrap
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from perrin._arrays import refuse
 from perrin._text import number_text, unit_text
@@ -29,13 +28,13 @@ from perrin.plot.figure_style import (
     ink,
     legend_above,
     line_width,
+    log_ticks,
     marker_size,
     series_color,
 )
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes as Axes
-    from matplotlib.axis import Axis
     from matplotlib.figure import Figure as Figure
 
     from perrin._arrays import Floats, Ints
@@ -69,7 +68,6 @@ _SMALLEST_SQUARE, _SMALLEST_QUANTILE = 0.01, 0.01
 _MOST_VECTOR_POINTS = 1000  # more points are an image inside a PDF
 _NUMBERED_JUMPS = 5  # jumps whose row is written
 _WIDEST_ERROR = 8.0  # errors beyond this are counted in the legend
-_FEW_DECADES = 300.0  # ratio of the ends of an axis with more ticks than powers of ten
 _TITLE_LETTERS = 120  # letters in one line of the title
 
 # Shares of Brownian data inside the dark and the light band, and the opacity of both.
@@ -243,8 +241,8 @@ def plot_step_spectrum(
         xscale="log", yscale="log", xlabel="frequency (Hz)", ylim=(bottom / margin, top * margin)
     )
     ax.set_xlim(ends[0, 0], ends[-1, 1])
-    _set_log_ticks(ax.xaxis)
-    _set_log_ticks(ax.yaxis)
+    log_ticks(ax.xaxis)
+    log_ticks(ax.yaxis)
     ax.set_ylabel(f"power of the steps / 2Δt ({unit_text(UNITS[quantity])})")
     legend_above(ax, ncols=2)
     return ax
@@ -336,7 +334,7 @@ def plot_prediction_errors(
         top *= 3
     ax.set(yscale="log", xlabel="time (s)", ylabel="squared error\nof prediction")
     ax.set_ylim(0.8 * bottom, 1.6 * top)
-    _set_log_ticks(ax.yaxis)
+    log_ticks(ax.yaxis)
     margin = 0.01 * (time[-1] - time[0])
     ax.set_xlim(time[0] - margin, time[-1] + margin)
     legend_above(ax, ncols=5)
@@ -494,15 +492,6 @@ def motion_figure(
 def _bin_means(x: Floats, edges: Ints) -> Floats:
     """Return the means of consecutive values between edges."""
     return np.asarray(np.add.reduceat(x, edges[:-1]) / np.diff(edges))
-
-
-def _set_log_ticks(axis: Axis) -> None:
-    """Write 1, 2 and 5 on a logarithmic axis of few decades, and powers of ten on a longer one."""
-    low, high = axis.get_view_interval()
-    axis.set_minor_formatter(NullFormatter())
-    if high < _FEW_DECADES * low:
-        axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-        axis.set_major_formatter(FuncFormatter(lambda x, _: number_text(x, digits=1)))
 
 
 def _mark_jumps(time: Floats, square: Floats, row: Ints, jumps: Ints, *, ax: Axes) -> None:

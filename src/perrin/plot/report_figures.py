@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
@@ -17,7 +18,7 @@ from perrin.plot.figure_style import (
     legend_above,
     line_width,
     marker_size,
-    save_figure,
+    save_drawn,
     series_color,
     style,
     write_reason,
@@ -46,6 +47,7 @@ if TYPE_CHECKING:
 
     from perrin.plot.figure_style import Columns, Sheet
     from perrin.run.results import Pooled, Report
+    from perrin.run.workers import Progress
 
 Quantity: TypeAlias = Literal["rotation", "translation"]
 
@@ -427,6 +429,7 @@ def save_figures(
     clusters: Iterable[int] | None = None,
     columns: Columns = 2,
     sheet: Sheet | None = None,
+    progress: Progress | None = None,
 ) -> list[Path]:
     """Write figures of a report into an existing folder, each as PNG and PDF.
 
@@ -441,6 +444,8 @@ def save_figures(
         Columns of a journal that a figure is wide; see `column_width`.
     sheet : path, str or mapping, optional
         Style sheet that outranks perrin's, as in `style`.
+    progress : callable, optional
+        Called with the number of finished figures, their total, and what is done.
 
     Returns
     -------
@@ -449,39 +454,34 @@ def save_figures(
         ``cluster-<n>-curves.*``, ``-residuals.*`` and ``-orientations.*``, with ``-rotation.*`` and
         ``-translation.*``, against diffusion, over two columns, where the motion is not diffusion.
     """
-    place = Path(folder)
     drawn = {c.cluster for c in report.clusters[:1]} if clusters is None else set(clusters)
     first = report.tracks.dropna(subset=["x", "y"]).groupby("cluster")["frame"].min()
-    files: list[Path] = []
-    kinds: dict[str, Callable[..., Figure]] = {
-        "curves": curve_figure,
-        "residuals": residual_figure,
-        "orientations": orientation_figure,
-    }
-    with style(sheet=sheet):
-        if report.pooled is not None and len(report.clusters) > 1:
-            figure = forest_figure(report.clusters, report.pooled, columns=columns)
-            files += save_figure(figure, place / "clusters")
-        for result in [c for c in report.clusters if c.cluster in drawn]:
-            for kind, draw in kinds.items():
-                figure = draw(result, columns=columns)
-                files += save_figure(figure, place / f"cluster-{result.cluster}-{kind}")
-            for quantity, verdict in result.verdicts.items():
-                if verdict is None or verdict.kind == "diffusion":
-                    continue
-                motion = result.motion
-                if verdict.quantity == "translation":  # the path crosses doubt about labels
-                    motion = replace(motion, piece=np.zeros_like(motion.piece))
-                # In a report frames count from the table's first, in a motion from its own.
-                rows = tuple(frame - int(first[result.cluster]) for frame in verdict.frames)
-                figure = motion_figure(
-                    motion,
-                    quantity=verdict.quantity,
-                    noise=result.D_R.settings,
-                    verdict=replace(verdict, frames=rows),
-                )
-                files += save_figure(figure, place / f"cluster-{result.cluster}-{quantity}")
-    return files
+    figures: dict[str, Callable[[], Figure]] = {}
+    if report.pooled is not None and len(report.clusters) > 1:
+        figures["clusters"] = partial(
+            forest_figure, report.clusters, report.pooled, columns=columns
+        )
+    for result in [c for c in report.clusters if c.cluster in drawn]:
+        name = f"cluster-{result.cluster}"
+        figures[f"{name}-curves"] = partial(curve_figure, result, columns=columns)
+        figures[f"{name}-residuals"] = partial(residual_figure, result, columns=columns)
+        figures[f"{name}-orientations"] = partial(orientation_figure, result, columns=columns)
+        for quantity, verdict in result.verdicts.items():
+            if verdict is None or verdict.kind == "diffusion":
+                continue
+            motion = result.motion
+            if verdict.quantity == "translation":  # the path crosses doubt about labels
+                motion = replace(motion, piece=np.zeros_like(motion.piece))
+            # In a report frames count from the table's first, in a motion from its own.
+            rows = tuple(frame - int(first[result.cluster]) for frame in verdict.frames)
+            figures[f"{name}-{quantity}"] = partial(
+                motion_figure,
+                motion,
+                quantity=verdict.quantity,
+                noise=result.D_R.settings,
+                verdict=replace(verdict, frames=rows),
+            )
+    return save_drawn(figures, Path(folder), sheet=sheet, progress=progress)
 
 
 def _cluster_of(

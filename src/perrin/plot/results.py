@@ -16,6 +16,7 @@ from perrin.plot.figure_style import (
     ink,
     legend_above,
     line_width,
+    log_ticks,
     marker_size,
     series_color,
     write_reason,
@@ -139,6 +140,8 @@ def plot_lag_curve(
     ax.set(xscale="log", yscale="log", xlabel="lag time (s)")
     ax.set_ylabel(f"{CURVE_NAMES[curve.quantity][0]} ({unit})")
     _set_curve_range(ax, curve, line, floor)
+    log_ticks(ax.xaxis)
+    log_ticks(ax.yaxis)
     legend_above(ax, ncols=2)
     return ax
 
@@ -187,6 +190,7 @@ def plot_curve_ratio(
     shown = np.concatenate([value[sure], fit, [0.0, 1.0]])
     ax.set(xscale="log", xlabel="lag time (s)", ylim=(1.1 * shown.min(), 1.25 * shown.max()))
     ax.set_ylabel(f"{name} / ({2 * curve.dof} {line.symbol} t)")
+    log_ticks(ax.xaxis)
     legend_above(ax, ncols=2)
     return ax
 
@@ -350,14 +354,13 @@ def plot_orientations(motion: RigidMotion, *, ax: Axes) -> Axes:
         return plot_angle(motion, ax=ax)
     space: Any = ax  # matplotlib has no types for 3-D axes
     # A grid on the unit sphere with lab axes, in parallel projection, without a box.
+    # Lines are separated by NaN and drawn as one, which is faster.
     polar, around = np.linspace(0, np.pi, 37), np.linspace(0, 2 * np.pi, 73)
+    parallels = np.broadcast_arrays(polar[6:-1:6, None], np.append(around, np.nan))
+    meridians = np.broadcast_arrays(np.append(polar, np.nan), around[:-1:6, None])
+    p, a = (np.append(*angles) for angles in zip(parallels, meridians, strict=True))
     grid = {"color": "#cccccc", "lw": line_width(0.25), "zorder": 0}
-    for z in np.cos(polar[6:-1:6]):
-        r = np.sqrt(1 - z * z)
-        space.plot(r * np.cos(around), r * np.sin(around), np.full_like(around, z), **grid)
-    for azimuth in around[:-1:6]:
-        r = np.sin(polar)
-        space.plot(r * np.cos(azimuth), r * np.sin(azimuth), np.cos(polar), **grid)
+    space.plot(np.sin(p) * np.cos(a), np.sin(p) * np.sin(a), np.cos(p), **grid)
     for axis, name in zip(np.eye(3), "xyz", strict=True):
         space.plot(*np.outer(axis, [1.0, 1.2]), color=GREY, lw=line_width(0.6))
         space.text(*(1.3 * axis), name, color=ink(), ha="center", va="center")

@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from perrin.run.results import ClusterResult, RodResult
 
 _LAGS = 80  # lag times of a curve, evenly over its logarithm
-_FEWEST_DRAWN_FRAMES, _MOST_DRAWN_FRAMES = 100, 2000  # frames of a path that are drawn
-_MOST_BYTES = 4_000_000  # of the paths of all clusters together, before compression
+_FEWEST_DRAWN_FRAMES, _MOST_DRAWN_FRAMES = 60, 2000  # frames of a path that are drawn
+_MOST_BYTES = 3_200_000  # of the paths of all clusters together, before compression
 
 
 def cluster_data(

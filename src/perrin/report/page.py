@@ -29,13 +29,11 @@ from perrin.run.repetition import command_line, python_lines
 from perrin.run.statements import answer_lines, verdict_lines
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import Iterable
     from pathlib import Path
-    from typing import TypeAlias
 
     from perrin.run.results import Report
-
-    Progress: TypeAlias = Callable[[int, int, str], None]
+    from perrin.run.workers import Progress
 
 
 # Caption of each figure: its title, what it shows, and what to check.

@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-    from perrin.report.page import Progress
     from perrin.run.results import Report
+    from perrin.run.workers import Progress
 
 
 @contextmanager
@@ -108,10 +108,8 @@ def _write_files(report: Report, stage: Path, progress: Progress | None) -> None
     write_data(report, stage, progress=progress)
     place = stage / "figures"
     place.mkdir()
-    if progress is not None:
-        progress(0, 0, "drawing the figures")
-    html = render_html(report, save_figures(report, place), progress=progress)
+    html = render_html(report, save_figures(report, place, progress=progress), progress=progress)
     write_page(stage / "report.html", html)
     if report.imaging is not None:
-        html = render_imaging_quality(report, save_image_figures(report, place))
+        html = render_imaging_quality(report, save_image_figures(report, place, progress=progress))
         write_page(stage / "quality.html", html)

@@ -33,7 +33,8 @@ def assign_clusters(
     Parameters
     ----------
     table : pandas.DataFrame
-        A clean track table. A column cluster of texts is numbered in the order of the texts.
+        A clean track table. A column cluster of texts is numbered in the order of the texts, which
+        ``attrs["labels"]`` then holds by number; the texts of numbered clusters are taken from it.
     contact : float, optional
         Centre distance of touching particles, um, for a table without that column. Without it
         clusters are found by the distances that stay the same; pairs where there is nothing larger.
@@ -67,10 +68,13 @@ def assign_clusters(
     marked = "cluster" in table
     if marked and pd.api.types.is_numeric_dtype(table["cluster"]):
         table = table.astype({"cluster": np.int64})
+        stated = table.attrs.get("labels", {})
+        labels = {int(number): str(name) for number, name in stated.items()}
     elif marked:
         codes, names = pd.factorize(table["cluster"], sort=True)
         labels = {number: str(name) for number, name in enumerate(names)}
         table = table.assign(cluster=codes.astype(np.int64))
+        table.attrs["labels"] = {str(number): name for number, name in labels.items()}
     else:
         count, frames = table["particle"].nunique(), table["frame"].nunique()
         if contact is None and frames < _FRAMES_FOR_DISTANCES and count <= _PARTICLES_OF_ONE_BODY:

@@ -286,6 +286,8 @@ def measure_table(
     DegenerateClusterError, TooFewFramesError
         If no cluster can be measured.
     """
+    if progress is not None:
+        progress(0, 0, "finding the clusters")
     table, labels, found = assign_clusters(table, contact=contact)
     remarks = found if remarks is None else remarks + found
     first = int(table["frame"].min())

@@ -16,10 +16,15 @@ from perrin.run.remarks import Remarks
 from perrin.run.workers import Work, check_workers
 from perrin.tracks.clusters import identify
 from perrin.tracks.files import check_tracks, read_tracks
-from perrin.tracks.screening import distance_notes, has_trackpy_columns, screen_rows
+from perrin.tracks.screening import (
+    distance_notes,
+    has_trackpy_columns,
+    has_trackpy_order,
+    screen_rows,
+)
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Mapping
 
     import pandas as pd
     from numpy.typing import ArrayLike
@@ -212,7 +217,7 @@ def read_table(
     if size is not None and (contact is None or "particle" in table):
         wrong = "contact is needed too" if contact is None else "the table has a column particle"
         raise ValueError(f"size: finds the particles of a table without ids; {wrong}")
-    names: Iterable[str] = table.attrs["columns"]
+    names: list[str] = table.attrs["columns"]
     read_notes = list(table.attrs.get("notes", ()))
     first, stop = frames or (None, None)
     keep = np.ones(len(table), dtype=np.bool_)
@@ -237,6 +242,7 @@ def read_table(
         screened.table,
         scale_given=bool(np.any(np.asarray(scale) != 1)),
         trackpy_columns=has_trackpy_columns(names),
+        trackpy_order=has_trackpy_order(names),
     )
     remarks = Remarks([*screened.warnings, *warnings], [*read_notes, *screened.notes, *notes])
     return screened.table, source, remarks

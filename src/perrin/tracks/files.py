@@ -448,6 +448,8 @@ def _clean_table(
     if notes:
         tracks.attrs["notes"] = notes
     tracks.attrs["columns"] = list(names)
+    if "labels" in raw.attrs:
+        tracks.attrs["labels"] = dict(raw.attrs["labels"])
     return tracks
 
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import io
+import json
+import re
 import zlib
 from typing import TYPE_CHECKING
 
@@ -292,9 +294,13 @@ def parse_parquet(data: bytes, source: str) -> RawTable:
             raise table_error(source, oversize_text("its table", needed))
         # Metadata of pandas could hide the frame column in the index.
         table = file.read().to_pandas(ignore_metadata=True)
-    except (pa.ArrowException, OSError) as error:
+        attributes = json.loads((file.schema_arrow.metadata or {}).get(b"PANDAS_ATTRS", b"{}"))
+    except (pa.ArrowException, OSError, ValueError) as error:
         reason = str(error).strip().splitlines()[0]
         raise table_error(source, f"not a parquet file that can be read ({reason})") from None
+    labels = attributes.get("labels") if isinstance(attributes, dict) else None
+    if isinstance(labels, dict):  # texts of the clusters that `assign_clusters` has numbered
+        table.attrs["labels"] = {k: v for k, v in labels.items() if re.fullmatch("[0-9]+", k)}
     return RawTable(table)
 
 

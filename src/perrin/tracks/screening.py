@@ -30,6 +30,8 @@ CENTRE_REMOVED = (
 
 # Colloidal particles are between these distances apart, um.
 _LEAST_DISTANCE, _MOST_DISTANCE = 0.05, 50.0
+# Particles that trackpy resolves are at least 5 pixels apart; few colloids are 5 um apart.
+_LEAST_PIXELS = 5.0
 
 # Expected number, and probability, of coincidences below which they are not due to chance.
 _COINCIDENCE_LEVEL = 1e-3
@@ -376,7 +378,7 @@ def centres_removed(positions: Sequence[Floats]) -> list[bool]:
 
 
 def distance_notes(
-    table: pd.DataFrame, *, scale_given: bool, trackpy_columns: bool
+    table: pd.DataFrame, *, scale_given: bool, trackpy_columns: bool, trackpy_order: bool = False
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """State the distance of nearest particles, and warn where it is unusual for colloids.
 
@@ -388,6 +390,9 @@ def distance_notes(
         Whether a scale other than 1 was given.
     trackpy_columns : bool
         Whether the table has trackpy's own columns: `has_trackpy_columns`.
+    trackpy_order : bool
+        Whether the columns are in trackpy's order: `has_trackpy_order`. A table in um that came
+        from trackpy has it as well; it is asked for its unit where the distance is one of pixels.
 
     Returns
     -------
@@ -431,6 +436,12 @@ def distance_notes(
             "the table has columns that trackpy writes, whose coordinates are pixels, but the "
             f"scale is 1 um per unit ({text}): state the um per pixel with scale"
         )
+    elif trackpy_order and not scale_given and _LEAST_PIXELS <= apart <= _MOST_DISTANCE:
+        warnings.append(
+            "the columns are in the order of trackpy, whose coordinates are pixels, and the scale "
+            f"is 1 um per unit ({text}): state the um per pixel with scale; if the coordinates are "
+            "in um, name the columns x_um, y_um and z_um"
+        )
     if not _LEAST_DISTANCE <= apart <= _MOST_DISTANCE:
         remedy = "correct scale" if scale_given else "state the um per unit with scale"
         warnings.append(
@@ -449,6 +460,21 @@ def has_trackpy_columns(columns: Iterable[object]) -> bool:
     True
     """
     return len(set(columns) & set(TRACKPY_COLUMNS)) >= 2
+
+
+def has_trackpy_order(columns: Iterable[object]) -> bool:
+    """Return whether a table has a mass, and its coordinates in trackpy's order: z, y, x.
+
+    Examples
+    --------
+    >>> has_trackpy_order(["z", "y", "x", "frame", "particle", "mass"])
+    True
+    >>> has_trackpy_order(["frame", "particle", "x", "y", "mass"])
+    False
+    """
+    names = list(columns)
+    axes = [name for name in names if name in ("x", "y", "z")]
+    return "mass" in names and axes in (["z", "y", "x"], ["y", "x"])
 
 
 def placeholder_rows(code: Ints, x: Floats) -> Bools:
