@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import replace
 
 import numpy as np
@@ -49,6 +50,7 @@ def views_of(features, shape, voxel, frames):
     return tuple(made)
 
 
+@functools.cache
 def seen(*, clusters=2, frames=40, planar=False, refine="model", size=16.0, seed=3):
     """Return the report of a movie of tetrahedra (squares in the plane) without rendering it."""
     rng = np.random.default_rng(seed)
