@@ -1,12 +1,16 @@
 """Clusters of a table on several processes: the results of one, in the same order."""
 
+import subprocess
+import sys
+from multiprocessing import current_process
+
 import numpy as np
 import pandas as pd
 import pytest
 
 import perrin
 from perrin.run import batches_of, measure, shared_work
-from perrin.run.workers import Work
+from perrin.run.workers import Work, dask_client
 
 
 @pytest.fixture(scope="module")
@@ -61,3 +65,40 @@ def test_arguments_of_the_work_are_checked_before_the_table_is_read():
     """A scheduler and processes of this machine exclude each other."""
     with pytest.raises(ValueError, match="workers: expected processes of this machine"):
         perrin.analyze("absent.csv", dt=1.0, workers=2, scheduler="tcp://127.0.0.1:9")
+
+
+def test_a_worker_that_imports_its_script_starts_no_workers(monkeypatch):
+    monkeypatch.setattr(current_process(), "_inheriting", True, raising=False)
+    with pytest.raises(SystemExit), dask_client(1, None):
+        pass
+
+
+@pytest.mark.parametrize("guarded", [True, False])
+def test_workers_of_a_script_without_guard_are_explained(tmp_path, monkeypatch, guarded):
+    script = tmp_path / "mine.py"
+    script.write_text('if __name__ == "__main__": main()' if guarded else "main()")
+
+    def fails(**_):
+        raise RuntimeError("Nanny failed to start.")
+
+    monkeypatch.setattr("distributed.LocalCluster", fails)
+    monkeypatch.setattr(sys.modules["__main__"], "__file__", str(script), raising=False)
+    expected = "Nanny failed" if guarded else "processes that import mine.py"
+    with pytest.raises(RuntimeError, match=expected), dask_client(1, None):
+        pass
+
+
+def test_a_script_that_workers_would_run_again_ends_with_one_message(tmp_path, request):
+    """Every process imports the script: without the guard it would start processes itself."""
+    if not request.config.getoption("--long"):
+        pytest.skip("--long: starts processes")
+    script = tmp_path / "mine.py"
+    script.write_text(
+        "from perrin.run.workers import dask_client\nwith dask_client(1, None): pass\n"
+    )
+    ended = subprocess.run([sys.executable, script], capture_output=True, text=True, check=False)
+    assert ended.returncode == 1
+    assert ended.stderr.count("Traceback") == 1
+    message = "workers=1 starts processes that import mine.py"
+    assert ended.stderr.partition("RuntimeError: ")[2].startswith(message)
+    assert ended.stderr.endswith('if __name__ == "__main__":\n    main()\n')

@@ -195,7 +195,7 @@ def test_a_planted_law_lies_in_the_intervals(law, planted):
 
 def test_a_function_of_the_user_gives_what_the_named_law_gives():
     x = np.array([0.5, 1.0, 2.0, 4.0])
-    means = means_of(2.0 * x**-0.7, np.random.default_rng(10))
+    means = means_of(2.0 * x**-0.7, np.random.default_rng(10), movies=2)
     named = fit_trend(means, x, law="power")
     own = fit_trend(means, x, law=lambda x, A, n: A * x**n, start={"A": 1.0, "n": -1.0})
     assert own.parameters["A"] == pytest.approx(named.parameters["A"], rel=1e-4)

@@ -108,7 +108,8 @@ def analyze(
         one object; a value is stated here or as its own argument, not both.
     workers : int
         Number of processes of this machine that share the clusters; 0 does the work in this one.
-        The results are the same to the last bit.
+        The results are the same to the last bit. A script calls with workers below the line
+        ``if __name__ == "__main__":``, since each process imports the script.
     scheduler : str, optional
         Address of a Dask scheduler whose workers share the clusters, such as tcp://node7:8786.
     progress : callable, optional

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+import sys
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from perrin._arrays import flag_fault, number_fault, numpy_to_python, refuse
@@ -34,7 +36,8 @@ class Work:
     anew : bool
         Remove the parts of another input or of other settings in the folder, instead of an error.
     workers : int
-        Number of processes of this machine; 0 does the work in this one.
+        Number of processes of this machine; 0 does the work in this one. A script calls with
+        workers below the line ``if __name__ == "__main__":``, since each process imports it.
     scheduler : str, optional
         Address of a Dask scheduler whose workers do the work; they must be able to read the file.
     progress : callable, optional
@@ -252,7 +255,16 @@ def dask_client(workers: int, scheduler: str | None) -> Iterator[Any]:
     ------
     ModuleNotFoundError, OSError
         As in `work_through`.
+    RuntimeError
+        If the processes do not start: every one imports the script that starts them, whose work
+        must therefore be below the line ``if __name__ == "__main__":``.
     """
+    from multiprocessing import current_process
+
+    if getattr(current_process(), "_inheriting", False):
+        # A worker imports the script that starts it, and begins its work again: the worker stops,
+        # and the process that started it reports why.
+        raise SystemExit(1)
     dask, Client, LocalCluster = _dask()
     if scheduler is not None:
         with Client(scheduler, timeout=_TIMEOUT, set_as_default=False) as client:
@@ -272,11 +284,22 @@ def dask_client(workers: int, scheduler: str | None) -> Iterator[Any]:
         "distributed.admin.tick.interval": "1s",
     }
     with dask.config.set(quiet):
-        cluster = LocalCluster(
-            n_workers=workers,
-            threads_per_worker=1,
-            dashboard_address="127.0.0.1:0",
-            silence_logs=50,
-        )
+        try:
+            cluster = LocalCluster(
+                n_workers=workers,
+                threads_per_worker=1,
+                dashboard_address="127.0.0.1:0",
+                silence_logs=50,
+            )
+        except RuntimeError:
+            path = Path(getattr(sys.modules["__main__"], "__file__", None) or os.devnull)
+            script = path.read_text(errors="replace") if path.suffix == ".py" else ""
+            if not script or "__main__" in script:
+                raise
+            raise RuntimeError(
+                f"workers={workers} starts processes that import {path.name}, and each began its "
+                "work anew; move the work into a function, and end the script with\n"
+                'if __name__ == "__main__":\n    main()'
+            ) from None
     with cluster, Client(cluster, set_as_default=False) as client:
         yield client

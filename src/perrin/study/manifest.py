@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import glob
 import hashlib
 import json
+import os
 import re
 import tomllib
 from dataclasses import asdict, dataclass, field, replace
@@ -17,10 +19,12 @@ from perrin.study.trends import LAWS
 from perrin.tracks.formats import READABLE_SUFFIXES
 
 if TYPE_CHECKING:
-    import os
     from collections.abc import Mapping, Sequence
 
 Source = Literal["table", "movie"]
+
+# What Python makes of a byte of a file's name that is not UTF-8.
+_NO_UTF8 = "[\udc80-\udcff]"
 
 # Options of `analyze` and of `analyze_stack` that a manifest may state, and what each must be.
 _COMMON = {
@@ -197,9 +201,9 @@ def read_manifest(path: str | os.PathLike[str]) -> Manifest:
     for movie in movies:
         # The same file may be measured twice, as two samples; names differ by label and path, and
         # do not depend on other movies.
-        parts = [movie.sample, movie.name] if movie.sample != movie.name else [movie.name]
-        text = re.sub(r"[^\w.-]+", "_", "-".join(parts)).strip("._") or "movie"
-        mark = hashlib.sha256(f"{movie.sample}\n{movie.path}".encode()).hexdigest()[:6]
+        parts = [movie.name] if movie.name.startswith(movie.sample) else [movie.sample, movie.name]
+        text = re.sub(r"[^\w.-]+", "_", "-".join(parts)).strip("._-") or "movie"
+        mark = hashlib.sha256(os.fsencode(f"{movie.sample}\n{movie.path}")).hexdigest()[:6]
         named.append(replace(movie, name=f"{text[:80]}-{mark}"))
     return Manifest(
         movies=tuple(named),
@@ -273,6 +277,9 @@ def manifest_text(files: Sequence[str | os.PathLike[str]], *, folder: Path) -> s
         name = path.relative_to(home).as_posix() if inside else str(path)
         if "://" in str(one):
             name = str(one)
+        if re.search(_NO_UTF8, name):
+            # TOML is UTF-8: a name that is not is found by a pattern.
+            name = re.sub(_NO_UTF8, "?", glob.escape(name))
         lines += [
             "",
             "[[sample]]",

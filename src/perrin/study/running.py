@@ -38,6 +38,9 @@ if TYPE_CHECKING:
 # Movies that are given to the scheduler for each worker: one that it measures, and the next one.
 _MOVIES_PER_WORKER = 2
 
+# Time between two counts of the workers, and between two looks for finished movies, s.
+_SECONDS_BETWEEN_COUNTS, _SECONDS_BETWEEN_LOOKS = 5.0, 0.02
+
 # Workers that the frames of one movie keep busy.
 _MOST_SHARED = 32
 
@@ -105,7 +108,8 @@ def measure_movie(task: Task) -> Entry:
         text = f"{type(fault).__name__}: {fault}" if not str(fault) else str(fault)
         entry = Entry(
             status="failed",
-            reason=" ".join(text.split()),
+            # A path in it may not be UTF-8.
+            reason=" ".join(text.encode("utf-8", "backslashreplace").decode().split()),
             retry=isinstance(fault, _OF_THE_MACHINE),
             seconds=time.monotonic() - start,
             **known,
@@ -206,22 +210,24 @@ def _distributed(tasks: Sequence[Task], client: Any) -> Iterator[Entry]:  # noqa
 
     from distributed import KilledWorker, as_completed
 
-    waiting = iter(tasks)
+    waiting = list(reversed(tasks))
     running: dict[Any, Task] = {}
     finished = as_completed(loop=client.loop)
-
-    def submit() -> None:
-        task = next(waiting, None)
-        if task is not None:
+    wanted, counted = _MOVIES_PER_WORKER, -np.inf
+    while running or waiting:
+        if time.monotonic() > counted + _SECONDS_BETWEEN_COUNTS:
+            # Workers of a queueing system join and leave while others measure.
+            with suppress(OSError):  # a lost scheduler: its futures state that
+                wanted = _MOVIES_PER_WORKER * max(len(client.nthreads()), 1)
+            counted = time.monotonic()
+        while waiting and len(running) < wanted:
+            task = waiting.pop()
             future = client.submit(measure_movie, task, pure=False, retries=0)
             running[future] = task
             finished.add(future)
-
-    for _ in range(
-        _MOVIES_PER_WORKER * max(len(client.scheduler_info(n_workers=-1)["workers"]), 1)
-    ):
-        submit()
-    while running:
+        if not finished.has_ready():
+            time.sleep(_SECONDS_BETWEEN_LOOKS)
+            continue
         future = next(finished)
         task = running.pop(future)
         try:
@@ -243,7 +249,6 @@ def _distributed(tasks: Sequence[Task], client: Any) -> Iterator[Entry]:  # noqa
                 "resumes the study"
             ) from fault
         future.release()
-        submit()
         yield entry
 
 

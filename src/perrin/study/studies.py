@@ -81,7 +81,8 @@ class Study:
             Folder of the study, new or of the same study. It holds a run folder for each movie in
             ``runs/``.
         workers : int
-            Number of processes of this machine; 0 does the work in this one.
+            Number of processes of this machine; 0 does the work in this one. A script calls with
+            workers below the line ``if __name__ == "__main__":``, since each process imports it.
         scheduler : str, optional
             Address of a Dask scheduler, whose workers read the files and write into the folder.
         progress : callable, optional

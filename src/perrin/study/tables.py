@@ -116,7 +116,8 @@ def movie_table(manifest: Manifest, entries: Mapping[str, Entry]) -> pd.DataFram
     -------
     pandas.DataFrame
         Columns movie, sample, path, source, replicate, a column for every condition, status,
-        reason, clusters, warnings (their number), seconds, sha256.
+        reason, clusters, warnings (their number), seconds, sha256. A byte of a path that is
+        not UTF-8 is written as its code, a backslash and udc80 to udcff.
     """
     import pandas as pd
 
@@ -127,7 +128,7 @@ def movie_table(manifest: Manifest, entries: Mapping[str, Entry]) -> pd.DataFram
             {
                 "movie": movie.name,
                 "sample": movie.sample,
-                "path": movie.path,
+                "path": movie.path.encode("utf-8", "backslashreplace").decode(),
                 "source": movie.source,
                 "replicate": movie.replicate,
                 **{_column(name): movie.conditions[name] for name in manifest.conditions},

@@ -96,7 +96,9 @@ class _Reader:
     """A process that reads one file; started again after it has ended."""
 
     def __init__(self, path: str, pick: Pick) -> None:
-        self._request = {"path": os.path.abspath(path), "pick": pick._asdict()}
+        # Addresses in object stores are not paths.
+        where = path if "://" in path else os.path.abspath(path)
+        self._request = {"path": where, "pick": pick._asdict()}
         self._end: Callable[[], object] | None = None
         self._process: subprocess.Popen[bytes] | None = None
 

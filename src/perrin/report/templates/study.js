@@ -40,16 +40,22 @@
         error_y: { type: "data", symmetric: false, array: panel.high.map((v, i) => (v === null ? 0 : v - panel.value[i])), arrayminus: panel.low.map((v, i) => (v === null ? 0 : panel.value[i] - v)), color: color("ink"), thickness: 1.8 },
         hovertemplate: "%{text}<br>%{y:.4g}<extra></extra>" });
       if (panel.predicted.some((v) => v !== null)) traces.push({ x: panel.x, y: panel.predicted, mode: "markers", name: "predicted", marker: { symbol: "diamond-open", size: 11, color: color("ink") }, hovertemplate: "predicted %{y:.4g}<extra></extra>" });
-      // Intervals of one degree of freedom may span decades: the axis shows the points, and cuts them.
-      const shown = [...(singles ? y : []), ...panel.value, ...panel.predicted].filter((v) => v > 0);
+      // Intervals of one degree of freedom may span decades: the axis cuts those of more than a factor of ten.
+      const ends = panel.value.flatMap((v, i) => [panel.low[i], panel.high[i]].filter((end) => end > v / 10 && end < v * 10));
+      const shown = [...(singles ? y : []), ...panel.value, ...panel.predicted, ...ends].filter((v) => v > 0);
       const low = Math.min(...shown), high = Math.max(...shown);
+      // Plotly labels a logarithmic axis between its powers of ten by single digits.
+      const decades = Math.log10(high / low), digits = decades < 0.6 ? [1, 1.5, 2, 3, 4, 5, 6, 8] : decades < 1.2 ? [1, 2, 3, 5] : decades < 4 ? [1, 2, 5] : [1];
+      const first = Math.floor(Math.log10(low)) - 1, powers = Array.from({ length: Math.ceil(decades) + 4 }, (_, i) => first + i);
+      const tickvals = powers.flatMap((power) => digits.map((digit) => Number(`${digit}e${power}`)));
+      const values = logarithmic ? { tickvals, ticktext: tickvals.map(String) } : {};
       const range = logarithmic ? [Math.log10(low / 1.5), Math.log10(high * 1.5)] : [0, high * 1.15];
       const axis = (title, more) => ({ title: { text: title, standoff: 6 }, color: color("ink"), gridcolor: color("line"), zerolinecolor: color("line"), linecolor: color("soft"), automargin: true, exponentformat: "power", ...more });
       const ticks = data.labels.length ? { tickvals: data.labels.map((_, i) => i), ticktext: data.labels.map((t) => literal(t.length > 18 ? `${t.slice(0, 17)}…` : t)), range: [-0.5, data.labels.length - 0.5] } : {};
       await window.Plotly.react(find(`#plot-${k}`), traces, {
         paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)", font: { family: "system-ui, sans-serif", size: 13, color: color("ink") }, margin: { l: 60, r: 8, t: 8, b: 44 },
         legend: { orientation: "h", x: 0, y: 1.02, yanchor: "bottom", font: { size: 11 } }, hoverlabel: { bgcolor: color("raised"), font: { color: color("ink") } },
-        xaxis: axis(literal(data.axis), ticks), yaxis: axis(`${TITLES[panel.quantity]} (${panel.unit})`, { type: logarithmic ? "log" : "linear", range, nticks: 6 }),
+        xaxis: axis(literal(data.axis), ticks), yaxis: axis(`${TITLES[panel.quantity]} (${panel.unit})`, { type: logarithmic ? "log" : "linear", range, nticks: 6, ...values }),
       }, { displaylogo: false, responsive: true, displayModeBar: matchMedia("(hover: hover)").matches ? "hover" : false, modeBarButtonsToRemove: ["select2d", "lasso2d", "autoScale2d"], toImageButtonOptions: { format: "svg", filename: "perrin-study" } });
     }
     const thinned = mine.filter((panel) => panel.every > 1);
