@@ -87,12 +87,12 @@ def test_lags_without_data_are_left_out():
 
 
 def test_the_stated_error_of_the_paper_line_is_the_true_one(repeats):
-    """Over 50 tracks (long: 300) in the paper's window stderr is the scatter, a quarter of D.
+    """Over 36 tracks (long: 300) in the paper's window stderr is the scatter, a quarter of D.
 
     Within 3 Monte-Carlo errors. For D_R it is 6(2) % conservative (measured, 1200 tracks): the
     four directions of a body that has turned are worth more than three walks.
     """
-    n, lines = repeats(50, 300), {"R": [], "T": []}
+    n, lines = repeats(36, 300), {"R": [], "T": []}
     noise = {"angle_noise": 5e-4, "center_noise": 3e-4}
     for seed in range(n):
         motion = brownian_motion(

@@ -283,7 +283,7 @@ def test_a_caged_body_diffuses_by_its_hops_alone():
     """
     angle, interval, tau, D_R = 0.8, 100.0, 5.0, 2e-3
     kept = []
-    for seed in range(30):
+    for seed in range(20):
         motion = simulate(
             Hopping(angle, interval, relaxation_time=tau), D_R=D_R, n_frames=1001, rng=seed
         )

@@ -112,7 +112,7 @@ def test_few_frames_determine_no_ratio():
     assert np.isnan(ratio.measured).all()
 
 
-def moving_together(common, *, count=3, n_frames=60, seed=1):
+def moving_together(common, *, count=3, n_frames=201, seed=1):
     """Return a table of bodies far apart whose positions share a displacement in every frame."""
     tables = []
     for k in range(count):
@@ -127,15 +127,15 @@ def moving_together(common, *, count=3, n_frames=60, seed=1):
 
 def test_a_stage_that_does_not_return_is_named_and_harmless():
     """Random common places along z are a note with their size, and D_T is that of the bodies."""
-    jitter = np.zeros((60, 3))
+    jitter = np.zeros((201, 3))
     still = perrin.analyze(moving_together(jitter), dt=0.7)
-    jitter[:, 2] = np.random.default_rng(3).normal(0, 0.3, 60)
+    jitter[:, 2] = np.random.default_rng(3).normal(0, 0.3, 201)
     report = perrin.analyze(moving_together(jitter), dt=0.7)
     (note,) = [n for n in report.notes if n.startswith("common motion")]
     assert "along z" in note
-    # The square of the common step is 2 sigma^2: 420 nm; 59 steps give it to 10 %.
+    # The square of the common step is 2 sigma^2: 420 nm; 200 steps give it to 5 %.
     size = float(note.split(" nm a frame")[0].split()[-1])
-    assert size == pytest.approx(1e3 * np.sqrt(2) * 0.3, rel=0.3)
+    assert size == pytest.approx(1e3 * np.sqrt(2) * 0.3, rel=0.15)
     difference = report.pooled.D_T.value - still.pooled.D_T.value
     assert abs(difference) < 2 * report.pooled.D_T.stderr
     assert not [n for n in (*still.notes, *still.warnings) if n.startswith("common motion")]
@@ -143,7 +143,7 @@ def test_a_stage_that_does_not_return_is_named_and_harmless():
 
 def test_a_common_random_walk_is_a_warning():
     """A stage that wanders is in D_T, and the warning says so."""
-    walk = np.random.default_rng(4).normal(0, 0.4, (60, 3)).cumsum(axis=0)
+    walk = np.random.default_rng(4).normal(0, 0.4, (201, 3)).cumsum(axis=0)
     report = perrin.analyze(moving_together(walk), dt=0.7)
     (text,) = [w for w in report.warnings if w.startswith("common motion")]
     assert "along x, y, z" in text

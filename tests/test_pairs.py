@@ -329,12 +329,12 @@ def test_nearly_even_times_state_their_mean_lags():
 
 
 def test_pauses_leave_curve_and_fit_unbiased_with_their_true_error(repeats):
-    """28 walks (long: 120) with pauses of 20 s: mean 6 (D t + s), stated errors, intervals right.
+    """18 walks (long: 120) with pauses of 20 s: mean 6 (D t + s), stated errors, intervals right.
 
     Stated errors within 3.2 Monte-Carlo errors of the scatter, the mean of each lag within 4, of
     the fit (long: also GLS) within 3; the coverage of the 95 % interval within 3.
     """
-    time, D, s, n = pauses(), 0.02, 2e-4, repeats(28, 120)
+    time, D, s, n = pauses(), 0.02, 2e-4, repeats(18, 120)
     curves = [walk_msd(time, k, D=D, s=s) for k in range(n)]
     within = 3.2 / np.sqrt(2 * n)
     use = np.array([0, 3, 11, 28, 60, 130])

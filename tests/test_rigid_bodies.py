@@ -65,7 +65,7 @@ def partition(label):
 def crowd():
     """Return a tetrahedron, two trimers and a dimer among 40 spheres, 20 % by volume."""
     kinds = (4, 3, 3, 2, *[1] * 40)
-    return suspension(kinds, 8.5, 24, np.random.default_rng(3))
+    return suspension(kinds, 8.5, 16, np.random.default_rng(3))
 
 
 def bodies_of(frame, owner):

@@ -152,9 +152,9 @@ def test_missing_particles_have_no_weight():
 def test_a_table_with_its_own_times_is_fitted_with_them():
     """The column time of a table, one value a row, is used like `delays`."""
     rng = np.random.default_rng(6)
-    x, delays, _ = recorded(40, rng=rng)
+    x, delays, _ = recorded(20, rng=rng)
     table = perrin.positions_table(x)
-    table["time"] = (np.arange(40)[:, None] * DT + delays).ravel()
+    table["time"] = (np.arange(20)[:, None] * DT + delays).ravel()
     report = perrin.analyze(table, dt=DT)
     motion = perrin.track_rotation(x, dt=DT, delays=delays)
     found = report.clusters[0].motion
@@ -162,7 +162,7 @@ def test_a_table_with_its_own_times_is_fitted_with_them():
     assert found.turn_noise is not None
     assert any("own times" in note for note in report.notes)
     # All particles of a frame at one time: nothing to correct.
-    table["time"] = np.repeat(np.arange(40) * DT, 4)
+    table["time"] = np.repeat(np.arange(20) * DT, 4)
     assert perrin.analyze(table, dt=DT).clusters[0].motion.turn_noise is None
     table.loc[7, "time"] = np.nan
     table.loc[8, "time"] += 0.1

@@ -305,8 +305,8 @@ def test_a_table_leaves_the_jump_of_the_stage_out_of_the_translation():
     still, moved = (
         perrin.analyze(
             pd.concat(
-                perrin.positions_table(x, frames=np.arange(5, 29)).assign(cluster=k)
-                for k, x in enumerate(m.positions() for m in together(jump, bodies=2)[0])
+                perrin.positions_table(x, frames=np.arange(5, 25)).assign(cluster=k)
+                for k, x in enumerate(m.positions() for m in together(jump, frames=20, bodies=2)[0])
             ),
             dt=DT,
         )

@@ -14,7 +14,7 @@ from perrin.movie.stacks import with_own_times
 
 pytest.importorskip("trackpy")
 
-DIAMETER, DT, FRAMES = 2.45, 0.73, 6
+DIAMETER, DT, FRAMES = 2.45, 0.73, 4
 SHIFT = np.array([0.12, -0.09, 0.2])
 CENTERS = np.array([(4.2, 4.2, 4.3), (10.2, 9.6, 4.4)])
 SCENE = {
@@ -146,9 +146,9 @@ def test_the_light_of_the_other_dye_makes_no_spheres():
 
 
 def test_a_shift_comes_back_within_its_error():
-    """The squares over the stated ones of 60 planted shifts average 1 within 3 errors (0.3)."""
+    """The squares over the stated ones of 30 planted shifts average 1 within 3 errors (0.45)."""
     ratio = []
-    for seed in range(60):
+    for seed in range(30):
         rng = np.random.default_rng(seed)
         away = rng.normal(size=(60, 3))
         away *= rng.normal(2.0, 0.02, 60)[:, None] / np.linalg.norm(away, axis=1)[:, None]
@@ -158,7 +158,7 @@ def test_a_shift_comes_back_within_its_error():
         table = pd.DataFrame(x, columns=["x", "y", "z"]).assign(frame=0, kind=np.repeat([0, 1], 60))
         found = channel_offset(table, 1, contact=2.0)
         ratio.append(((found.value - SHIFT) / found.stderr) ** 2)
-    assert abs(np.mean(ratio) - 1) < 0.3
+    assert abs(np.mean(ratio) - 1) < 0.45
 
 
 def test_the_command_line_reads_kinds_of_channels():

@@ -77,7 +77,7 @@ def test_the_sine_spectrum_is_the_diagonal_of_the_transformed_covariance(g):
 
 
 def test_brownian_steps_are_rejected_at_the_stated_levels(repeats):
-    tracks = repeats(800, 4000)
+    tracks = repeats(400, 4000)
     model = even_model(300)
     y = noisy_steps(300, tracks, 5.0, np.random.default_rng(5))
     fit = model.fit(y)
@@ -91,7 +91,7 @@ def test_brownian_steps_are_rejected_at_the_stated_levels(repeats):
 
 
 def test_ranks_of_a_short_noisy_track_are_uniform(repeats):
-    tracks = repeats(24, 400)
+    tracks = repeats(14, 400)
     model = even_model(50)
     y = noisy_steps(50, tracks, 0.5, np.random.default_rng(6))
     p = np.array([list(brownian_tests(model, one[None]).p.values()) for one in y])
@@ -264,7 +264,7 @@ def test_what_cannot_be_judged_is_refused():
 def test_the_law_of_a_score_is_that_of_its_modes(repeats):
     """Half the sum of g (chi-squared - 1), few large and many small modes: p is uniform."""
     rng, g = np.random.default_rng(3), np.concatenate([[-0.8, -0.6, -0.4], np.full(200, 0.05)])
-    draws = repeats(20_000, 200_000)
+    draws = repeats(8_000, 200_000)
     value = 0.5 * (rng.chisquare(1, (draws, len(g))) - 1) @ g
     one = Score.of(value[:1], g[None, None], information=np.array([0.5 * g @ g]))
     score = Score(value, np.tile(one.variance, draws), np.tile(one.third, draws))

@@ -297,7 +297,9 @@ class Method:
             return self.search.spheres(spots)
         return self.search.spheres(spots, self.fading.at(frame, spots.centers))
 
-    def locate_in(self, stack: StackLike, i: int) -> LocatedFrame:
+    def locate_in(
+        self, stack: StackLike, i: int, *, known: SampledFrame | None = None
+    ) -> LocatedFrame:
         """Find and refine the spheres of frame i.
 
         Parameters
@@ -305,6 +307,9 @@ class Method:
         stack : Stack
         i : int
             Number of the frame.
+        known : SampledFrame, optional
+            The frame with its spots, where the method was learned from it; its spots are not
+            searched for again unless the method searches for shells.
 
         Returns
         -------
@@ -317,7 +322,8 @@ class Method:
         """
         data, voxel = np.asarray(stack.frame(i)), _voxel_size(stack)
         frame = _finite_frame(data, i)
-        spots = self.spots(frame, voxel)
+        shells = self.optics is not None and self.optics.shell
+        spots = self.spots(frame, voxel) if known is None or shells else known.spots
         found = self.spheres(spots, i)
         if self.radial is not None:
             columns = plane_columns(
@@ -661,10 +667,10 @@ def locate(
         )
     sample = sample_frames(stack, search, numbers)
     method = choose_method(stack, search, sample, refine=refine, optics=optics)
-    located, unread = [], []
+    located, unread, seen = [], [], {sampled.number: sampled for sampled in sample}
     for i in numbers:
         try:
-            located.append(method.locate_in(stack, i))
+            located.append(method.locate_in(stack, i, known=seen.get(i)))
         except FrameError as fault:
             unread.append(str(fault))
     if unread:
