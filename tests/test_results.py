@@ -179,7 +179,7 @@ def test_progress_counts_the_clusters_of_every_long_step(tmp_path, monkeypatch):
     perrin.write_run(report, tmp_path / "run", progress=progress)
     assert list(calls) == [
         "finding the clusters", "fitting clusters", "estimating D_R and D_T", "judging the motion",
-        "writing the curves", "drawing the figures", "writing the report",
+        "writing the curves", "writing the report",
     ]  # fmt: skip
     for title in ("fitting clusters", "estimating D_R and D_T"):
         assert calls[title] == [(0, 20), (16, 20), (20, 20)]
