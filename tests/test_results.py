@@ -178,8 +178,8 @@ def test_progress_counts_the_clusters_of_every_long_step(tmp_path, monkeypatch):
     report = perrin.analyze(table, dt=0.5, progress=progress)
     perrin.write_run(report, tmp_path / "run", progress=progress)
     assert list(calls) == [
-        "fitting clusters", "estimating D_R and D_T", "judging the motion", "writing the curves",
-        "drawing the figures", "writing the report",
+        "finding the clusters", "fitting clusters", "estimating D_R and D_T", "judging the motion",
+        "writing the curves", "drawing the figures", "writing the report",
     ]  # fmt: skip
     for title in ("fitting clusters", "estimating D_R and D_T"):
         assert calls[title] == [(0, 20), (16, 20), (20, 20)]
