@@ -15,6 +15,7 @@ import pytest
 import perrin
 from perrin._text import number_text
 from perrin.diffusion.estimate import bare_text
+from perrin.plot import figure_style
 from perrin.report import citations, embedding, figure_data, write
 from perrin.report import page as report
 from perrin.run import repetition
@@ -375,7 +376,7 @@ def test_what_is_copied_repeats_the_run(single, tmp_path):
 
 def test_the_run_folder_is_complete(single, tmp_path, monkeypatch, repeats):
     if repeats(True, False):
-        monkeypatch.setattr("perrin.plot.figure_style.save_figure", save_blank)
+        monkeypatch.setattr(figure_style, "save_figure", save_blank)
     place = tmp_path / "run"
     write.write_run(single, place)
     names = {f.name for f in place.iterdir()}
