@@ -390,7 +390,7 @@ CASES = {
     "sCMOS strong, 10 photons": Case(
         light=replace(BASE, **SCMOS, pixel_spread=0.1, pixel_offset=8.0, photons=10)
     ),
-    "saturation of 2 %": Case(light=replace(BASE, photons=78.0)),
+    "saturation": Case(light=replace(BASE, photons=110.0)),
     "clipped at zero": Case(light=replace(BASE, offset=-12.0)),
     "JPEG 75": Case(light=replace(BASE, jpeg=75)),
     "JPEG 20": Case(light=replace(BASE, jpeg=20)),

@@ -19,7 +19,12 @@ from perrin.report.page import render_html
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data" / "optitrack"
 
 
-def tracks(*, seed: int = 0, n_frames: int = 150, cluster: int = 0, sigma: float = 0.03):
+# From 200 steps on, and below 20, no test of Brownian motion is ranked among draws: this is half of
+# the time of an analysis.
+LENGTH, SHORT = 210, 20
+
+
+def tracks(*, seed: int = 0, n_frames: int = LENGTH, cluster: int = 0, sigma: float = 0.03):
     rng = np.random.default_rng(seed)
     truth = perrin.simulate_motion(
         perrin.Cluster.touching(4, 2.45), D_R=5e-3, D_T=0.04, dt=0.73, n_frames=n_frames, rng=rng
@@ -34,9 +39,27 @@ def values(report: perrin.Report) -> np.ndarray:
     return np.array([[c.D_R.value, *c.D_R.ci95, c.D_T.value, *c.D_T.ci95] for c in report.clusters])
 
 
+@pytest.fixture(autouse=True)
+def unjudged(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch, repeats) -> None:
+    """Leave out the kind of motion in the quick form, but where results are written and read.
+
+    It takes half of the time of an analysis; tests/test_run_verdicts.py tests it.
+    """
+    if not repeats(0, 1) and not {"tmp_path", "whole"} & set(request.fixturenames):
+        monkeypatch.setattr(
+            "perrin.run.measure.judge_each_and_all",
+            lambda motions, **_: ([None] * len(motions), None),
+        )
+
+
 @pytest.fixture(scope="module")
 def base() -> pd.DataFrame:
     return tracks(seed=4)
+
+
+@pytest.fixture(scope="module")
+def short(base: pd.DataFrame) -> pd.DataFrame:
+    return base[base["frame"] < SHORT]
 
 
 @pytest.fixture(scope="module")
@@ -95,27 +118,29 @@ def test_anisotropic_scale_undoes_anisotropic_pixels(base, answer):
     np.testing.assert_allclose(values(report), answer, rtol=1e-7)
 
 
-def test_frames_and_particles_may_be_missing(base, whole):
+def test_frames_and_particles_may_be_missing(short):
     """Dropping frames and single points leaves D_R within its error; both are counted in notes."""
-    thinned = base[(base["frame"] % 10 != 3) & ~((base["frame"] == 7) & (base["particle"] == 2))]
+    thinned = short[
+        (short["frame"] % 10 != 3) & ~((short["frame"] == 7) & (short["particle"] == 2))
+    ]
     thinned = thinned[~((thinned["frame"] == 9) & (thinned["particle"] < 2))]
     report = perrin.analyze(thinned, dt=0.73)
     (result,) = report.clusters
-    full = whole.clusters[0]
-    assert result.motion.fitted.size == 150 - 15 - 1
+    (full,) = perrin.analyze(short, dt=0.73).clusters
+    assert result.motion.fitted.size == SHORT - 2 - 1
     assert result.motion.n_present[7] == 3
     assert "2 of 4 particles" in result.motion.reason[9]
     assert abs(result.D_R.value - full.D_R.value) < full.D_R.stderr
-    assert any("frames without a pose: 1 of 135" in w for w in result.notes)
-    assert any("15 frame numbers have no row (the first is 3)" in w for w in report.notes)
+    assert any("frames without a pose: 1 of 18" in w for w in result.notes)
+    assert any("2 frame numbers have no row (the first is 3)" in w for w in report.notes)
 
 
-def test_nan_coordinates_are_missing_points_counted_in_a_warning(base):
+def test_nan_coordinates_are_missing_points_counted_in_a_warning(short):
     """A NaN row is the same as no row, but for the warning that counts it."""
-    holes = base.copy()
-    holes.loc[holes["frame"] == 20, "z"] = np.nan
+    holes = short.copy()
+    holes.loc[holes["frame"] == 11, "z"] = np.nan
     with_nan = perrin.analyze(holes, dt=0.73)
-    without = perrin.analyze(base[base["frame"] != 20], dt=0.73)
+    without = perrin.analyze(short[short["frame"] != 11], dt=0.73)
     np.testing.assert_array_equal(values(with_nan), values(without))
     assert any("4 rows" in w and "NaN" in w for w in with_nan.notes)
     assert not any("NaN" in w for w in without.notes)
@@ -127,7 +152,7 @@ def test_without_a_cluster_column_bodies_are_found(base):
     report = perrin.analyze(plain, dt=0.73)
     assert len(report.clusters) == 1
     assert any("one cluster" in w for w in report.notes)
-    crowd = pd.concat([tracks(seed=k, cluster=k, n_frames=20) for k in range(2)])
+    crowd = pd.concat([tracks(seed=k, cluster=k, n_frames=SHORT) for k in range(2)])
     marked = values(perrin.analyze(crowd, dt=0.73))
     for contact in (2.45, None):
         found = perrin.analyze(crowd.drop(columns="cluster"), dt=0.73, contact=contact)
@@ -140,7 +165,7 @@ def test_without_a_cluster_column_bodies_are_found(base):
 
 def test_several_clusters_are_pooled():
     """Pooling four clusters halves the error, and equals pooling their motions."""
-    table = pd.concat([tracks(seed=10 + k, cluster=k, n_frames=100) for k in range(4)])
+    table = pd.concat([tracks(seed=10 + k, cluster=k) for k in range(4)])
     report = perrin.analyze(table, dt=0.73)
     pooled = perrin.estimate_diffusion([c.motion for c in report.clusters])
     assert report.pooled.D_R.value == pooled.value
@@ -180,7 +205,7 @@ def test_loose_particles_are_counted_and_left_out(base):
 def test_a_constant_z_is_warned_of(base, whole):
     """A table whose z never changes is analysed with a warning that advises."""
     flat = perrin.Cluster.from_positions([[0, 0], [2, 0], [1, 1.7]])
-    truth = perrin.simulate_motion(flat, D_R=5e-3, D_T=0.03, dt=1.0, n_frames=60, rng=1)
+    truth = perrin.simulate_motion(flat, D_R=5e-3, D_T=0.03, dt=1.0, n_frames=SHORT, rng=1)
     noisy = perrin.add_noise(truth.positions(), sigma=0.02, rng=2)
     flat_table = perrin.positions_table(noisy).assign(z=1.5)
     warnings = perrin.analyze(flat_table, dt=1.0).warnings
@@ -196,11 +221,11 @@ def test_a_contact_distance_that_finds_nothing_is_refused(base):
 
 def test_frames_are_sliced(base):
     """frames=(A, B) uses A <= frame < B; an empty slice is refused with the frames of the table."""
-    report = perrin.analyze(base, dt=0.73, frames=(20, 80))
-    assert len(report.clusters[0].motion.time) == 60
-    expected = values(perrin.analyze(base[base["frame"].between(20, 79)], dt=0.73))
+    report = perrin.analyze(base, dt=0.73, frames=(4, 206))
+    assert len(report.clusters[0].motion.time) == 202
+    expected = values(perrin.analyze(base[base["frame"].between(4, 205)], dt=0.73))
     np.testing.assert_array_equal(values(report), expected)
-    with pytest.raises(ValueError, match=r"500.*0 to 149"):
+    with pytest.raises(ValueError, match=r"500.*0 to 209"):
         perrin.analyze(base, dt=0.73, frames=(500, None))
 
 
@@ -227,7 +252,7 @@ def test_sizes_are_those_of_the_measured_shape(base, sized):
         d_t = kT / (3 * np.pi * 2.18e-3 * result.D_T.value * 1e-12) * 1e6
         d_r = (kT / (np.pi * 2.18e-3 * result.D_R.value)) ** (1 / 3) * 1e6
         assert result.sizes["translation"].cluster == pytest.approx(d_t)
-        # The measured shape differs from touching spheres by 30 nm/sqrt(150) in 2.45 um.
+        # The measured shape differs from touching spheres by 30 nm/sqrt(210) in 2.45 um.
         assert result.sizes["translation"].sphere == pytest.approx(d_t / c_t, rel=2e-3)
         assert result.sizes["rotation"].sphere == pytest.approx(d_r / c_r, rel=2e-3)
         relative = result.D_R.stderr / result.D_R.value / 3
@@ -291,10 +316,10 @@ def test_what_is_predicted_is_measured(n, tmp_path, repeats):
 
 def test_like_clusters_share_one_solution(monkeypatch):
     """Relabelled and turned tetrahedra are solved once, another shape once more."""
-    tables = [tracks(seed=k, cluster=k, n_frames=60) for k in range(3)]
+    tables = [tracks(seed=k, cluster=k, n_frames=SHORT) for k in range(3)]
     swap = {4: 6, 5: 4, 6: 7, 7: 5}
     tables[1] = tables[1].assign(particle=tables[1]["particle"].map(swap))
-    trimer = tracks(seed=5, cluster=3, n_frames=60)
+    trimer = tracks(seed=5, cluster=3, n_frames=SHORT)
     tables.append(trimer[trimer["particle"] < 15])
     solved = []
 
@@ -314,15 +339,15 @@ def test_a_shared_solution_is_turned_into_the_axes_of_each_body(monkeypatch):
     """A bent chain of four, relabelled and turned: along its axes the same as solved for itself."""
     bent = 2.0 * np.array([[0.0, 0, 0], [1, 0, 0], [1.5, 0.9, 0], [1.5, 0.9, 1.1]])
     body = perrin.cluster_mobility(bent, radius=1.0, **KNOWN)
-    one = spheres(body, seed=31, n_frames=150)
-    other = spheres(body, seed=35, n_frames=150, cluster=1)
+    one = spheres(body, seed=31, n_frames=LENGTH)
+    other = spheres(body, seed=35, n_frames=LENGTH, cluster=1)
     other = other.assign(particle=other["particle"].map({100: 102, 101: 100, 102: 103, 103: 101}))
     measured = list(perrin.analyze(pd.concat([one, other]), dt=0.5).clusters)
     experiment = perrin.run.Experiment(diameter=2.0, **KNOWN)
     both, _ = perrin.run.add_predictions(measured, [], experiment)
     monkeypatch.setattr("perrin.run.predictions.matching_rotation", lambda *_, **__: None)
     alone, _ = perrin.run.add_predictions(measured, [], experiment)
-    # The templates differ by 20 nm/sqrt(150) a coordinate, a thousandth of the diameter.
+    # The templates differ by 20 nm/sqrt(210) a coordinate, a thousandth of the diameter.
     for shared, own in zip(both, alone, strict=True):
         for quantity in ("principal_D_T", "principal_D_R"):
             for a, b in zip(
@@ -345,7 +370,7 @@ def test_rods_are_predicted():
     assert "pull" in str(rod.prediction)
 
 
-def test_shapes_that_cannot_be_solved_are_warned_of(base, whole, monkeypatch):
+def test_shapes_that_cannot_be_solved_are_warned_of(short, whole, monkeypatch):
     """A plane, a diameter in nm, overlaps, too many spheres, poor accuracy: a warning each."""
 
     def measured(**known: float) -> tuple[perrin.ClusterResult, str]:
@@ -353,7 +378,7 @@ def test_shapes_that_cannot_be_solved_are_warned_of(base, whole, monkeypatch):
         ((result,), _) = perrin.run.add_predictions([whole.clusters[0]], [], experiment)
         return result, "; ".join(result.warnings)
 
-    plane = perrin.analyze(base.drop(columns="z"), dt=0.73, diameter=2.45, **KNOWN)
+    plane = perrin.analyze(short.drop(columns="z"), dt=0.73, diameter=2.45, **KNOWN)
     (flat,) = plane.clusters
     assert flat.sizes is flat.prediction is None
     assert "no sizes and no prediction: they follow from motion in three dimensions" in "; ".join(
@@ -378,9 +403,9 @@ def test_shapes_that_cannot_be_solved_are_warned_of(base, whole, monkeypatch):
 def test_a_soft_body_is_flagged_and_a_noisy_one_is_not():
     """Breathing particles warn; white noise as large does not; a stated sigma decides."""
     rng = np.random.default_rng(5)
-    noisy = tracks(seed=5, sigma=0.12, n_frames=300)
-    soft = tracks(seed=5, sigma=0.01, n_frames=300)
-    walk = np.cumsum(rng.normal(size=(300, 4, 3)), axis=0)
+    noisy = tracks(seed=5, sigma=0.12)
+    soft = tracks(seed=5, sigma=0.01)
+    walk = np.cumsum(rng.normal(size=(LENGTH, 4, 3)), axis=0)
     walk = 0.12 * (walk - walk.mean(0)) / walk.std()
     soft[["x", "y", "z"]] += walk.reshape(-1, 3)
 
@@ -397,7 +422,7 @@ def test_a_soft_body_is_flagged_and_a_noisy_one_is_not():
 def test_a_soft_body_is_left_out_of_the_pool():
     """Pooling takes the rigid clusters and names those it leaves out."""
     rng = np.random.default_rng(6)
-    walk = np.cumsum(rng.normal(size=(150, 4, 3)), axis=0)
+    walk = np.cumsum(rng.normal(size=(LENGTH, 4, 3)), axis=0)
     soft = tracks(seed=7, cluster=1)
     soft[["x", "y", "z"]] += (0.2 * walk / walk.std()).reshape(-1, 3)
     report = perrin.analyze(pd.concat([tracks(seed=8), soft]), dt=0.73)
@@ -420,13 +445,13 @@ def test_a_wrong_sigma_shows_in_the_noise_floor():
     x = perrin.add_noise(shaken, sigma=0.03, rng=rng)
     (result,) = perrin.analyze(perrin.positions_table(x), dt=0.73).clusters
     assert any("noise floor" in w for w in result.warnings)
-    quiet = perrin.analyze(tracks(seed=9, n_frames=300), dt=0.73).clusters[0]
+    quiet = perrin.analyze(tracks(seed=9), dt=0.73).clusters[0]
     assert not any("noise floor" in w for w in quiet.warnings)
 
 
 def test_a_motionless_cluster_is_an_upper_limit():
     """Without diffusion nothing is resolved, and the report states it."""
-    x = np.repeat(perrin.Cluster.touching(4, 2.45).positions[None], 100, axis=0)
+    x = np.repeat(perrin.Cluster.touching(4, 2.45).positions[None], LENGTH, axis=0)
     table = perrin.positions_table(perrin.add_noise(x, sigma=0.03, rng=2))
     report = perrin.analyze(table, dt=0.73, viscosity=1e-3, temperature=300, diameter=2.45)
     (result,) = report.clusters
@@ -461,10 +486,10 @@ def test_real_marker_bodies(repeats):
     """Leg and knee are rigid at 0.39 and 0.70 mm, the foot in its soft shoe (1.83 mm) is not.
 
     In frame 1952 two markers of the foot have exchanged their labels; uncorrected it has 1.94 mm.
-    The residuals are those of the whole record; the quick form takes 300 frames about the exchange.
+    The residuals are those of the whole record; the quick form takes 205 frames about the exchange.
     """
     whole = bool(repeats(0, 1))
-    start, stop = (0, 3361) if whole else (1800, 2100)
+    start, stop = (0, 3361) if whole else (1850, 2055)
     table = pd.read_csv(SHARED / "walking.csv.gz")
     bodies = pd.read_csv(SHARED / "walking_labels.csv").rename(columns={"body": "cluster"})
     table = table.merge(bodies[["particle", "cluster"]], on="particle")
@@ -497,14 +522,14 @@ def test_real_marker_bodies_are_found_without_labels():
 
 
 def test_exchanged_labels_are_corrected_and_reported(base, answer):
-    """Pairs and cycles exchanged for good: the answer stays, each frame is in a warning."""
+    """Pairs and cycles exchanged for good: the answer stays, each frame is in a note."""
     x, _ = perrin.cluster_positions(base)
     mixed = x.copy()
     mixed[40:, [0, 2]] = mixed[40:, [2, 0]]
     mixed[77:, [1, 2, 3]] = mixed[77:, [2, 3, 1]]
     report = perrin.analyze(perrin.positions_table(mixed), dt=0.73)
     np.testing.assert_allclose(values(report), answer, rtol=1e-6)
-    (text,) = (w for w in report.clusters[0].warnings if "labels change" in w)
+    (text,) = (w for w in report.clusters[0].notes if "labels change" in w)
     assert "40" in text
     assert "77" in text
     assert report.to_dict()["clusters"][0]["quality"]["swaps"] == [40, 77]
@@ -518,7 +543,7 @@ def test_ids_that_break_off_do_not_split_a_cluster(base, whole):
     broken = broken[~((broken["particle"] == 2) & (broken["frame"] >= 76))]
     (result,) = perrin.analyze(broken, dt=0.73, contact=2.45).clusters
     assert len(result.motion.template) == 4
-    assert result.motion.fitted.size == 150
+    assert result.motion.fitted.size == LENGTH
     full = whole.clusters[0]
     assert abs(result.D_R.value - full.D_R.value) < full.D_R.stderr
 
@@ -526,7 +551,7 @@ def test_ids_that_break_off_do_not_split_a_cluster(base, whole):
 def test_rods_are_measured_and_full_rotation_refused(tmp_path):
     """A dumbbell and a tetrahedron: D_perp in the summary, D_R null with the reason."""
     truth = perrin.simulate_motion(
-        perrin.Cluster.touching(2, 2.45), D_R=0.01, D_T=0.05, dt=0.73, n_frames=150, rng=1
+        perrin.Cluster.touching(2, 2.45), D_R=0.01, D_T=0.05, dt=0.73, n_frames=LENGTH, rng=1
     )
     pair = perrin.positions_table(perrin.add_noise(truth.positions(), sigma=0.03, rng=2))
     pair = pair.assign(cluster=5, particle=pair["particle"] + 50)
@@ -574,13 +599,13 @@ def test_noise_exposure_and_drift_reach_the_estimates(base, whole):
 
 def test_clusters_that_differ_are_pooled_with_a_warning():
     """A cluster that turns three times as fast makes p_same small and raises a warning."""
-    tables = [tracks(seed=k, cluster=k, n_frames=100) for k in range(2)]
+    tables = [tracks(seed=k, cluster=k) for k in range(2)]
     alike = perrin.analyze(pd.concat(tables), dt=0.73)
     assert alike.to_dict()["pooled"]["p_same"] > 0.01
     assert not any("do not agree" in w for w in alike.warnings)
     rng = np.random.default_rng(9)
     fast = perrin.simulate_motion(
-        perrin.Cluster.touching(4, 2.45), D_R=1.5e-2, D_T=0.04, dt=0.73, n_frames=100, rng=rng
+        perrin.Cluster.touching(4, 2.45), D_R=1.5e-2, D_T=0.04, dt=0.73, n_frames=LENGTH, rng=rng
     )
     noisy = perrin.add_noise(fast.positions() + np.array([0.0, 50.0, 0.0]), sigma=0.03, rng=rng)
     table = perrin.positions_table(noisy)
@@ -593,11 +618,11 @@ def test_clusters_that_differ_are_pooled_with_a_warning():
 
 def test_coarse_sampling_and_few_frames_are_warned_of():
     """What estimate_diffusion warns of is in the cluster's warnings; nothing is raised."""
-    short = perrin.analyze(tracks(n_frames=20), dt=0.73).clusters[0]
+    short = perrin.analyze(tracks(n_frames=SHORT), dt=0.73).clusters[0]
     assert any("19 steps, fewer than 30" in w for w in short.warnings)
 
 
-def test_the_tensor_of_unequal_axes_reaches_the_summary(base, tmp_path, whole):
+def test_the_tensor_of_unequal_axes_reaches_the_summary(short, tmp_path, whole):
     """Planted axes come back in the summary and from the run folder; a plane has no tensor."""
     body = perrin.Cluster.from_positions([[0, 0, 0], [3, 0, 0], [0, 2, 0], [0, 0, 1]])
     planted = np.array([2e-3, 4e-3, 12e-3])
@@ -611,7 +636,7 @@ def test_the_tensor_of_unequal_axes_reaches_the_summary(base, tmp_path, whole):
     report.save(tmp_path / "run")
     assert perrin.load_run(tmp_path / "run").to_dict() == report.to_dict()
     assert "<th>axis 3</th>" in render_html(report, [])
-    assert perrin.analyze(base.drop(columns="z"), dt=0.73).clusters[0].tensor is None
+    assert perrin.analyze(short.drop(columns="z"), dt=0.73).clusters[0].tensor is None
     even = whole
     assert even.clusters[0].tensor.symmetry == "T_d"
     assert "<th>axis 3</th>" not in render_html(even, [])
@@ -620,12 +645,12 @@ def test_the_tensor_of_unequal_axes_reaches_the_summary(base, tmp_path, whole):
 def test_a_swap_reports_the_residual_it_would_have_left():
     """Two exchanged spheres are a mirror image: far from the body, with the residual in numbers."""
     body = perrin.Cluster.touching(4, 2.45)
-    truth = perrin.simulate_motion(body, D_R=5e-3, dt=0.73, n_frames=60, rng=1)
+    truth = perrin.simulate_motion(body, D_R=5e-3, dt=0.73, n_frames=SHORT, rng=1)
     x = perrin.add_noise(truth.positions(), sigma=0.03, rng=2)
-    x[30:] = x[30:, [1, 0, 2, 3]]
+    x[9:] = x[9:, [1, 0, 2, 3]]
     report = perrin.analyze(perrin.positions_table(x), dt=0.73)
     (text,) = (w for w in report.clusters[0].warnings if "labels change" in w)
-    assert text.startswith("identity: labels change particles at frame 30; corrected (residual as")
+    assert text.startswith("identity: labels change particles at frame 9; corrected (residual as")
     swapped, usual = (float(word) for word in re.findall(r"([0-9.]+) (?:um|median)", text))
     mirrored = body.positions[[1, 0, 2, 3]]
     # What no proper rotation can do: the least singular value counts against the fit.
@@ -633,14 +658,14 @@ def test_a_swap_reports_the_residual_it_would_have_left():
     left = 2 * (body.positions**2).sum() - 2 * (s[0] + s[1] - s[2])
     assert swapped == pytest.approx(np.sqrt(left / 4), rel=0.05)
     assert swapped > 20 * usual
-    # Six of twelve numbers are fitted.
-    assert usual == pytest.approx(0.03 * np.sqrt(3 / 2), rel=0.1)
+    # Six of twelve numbers are fitted; a median of 20 has an error of 1.25/sqrt(2*6*20) of itself.
+    assert usual == pytest.approx(0.03 * np.sqrt(3 / 2), rel=0.2)
 
 
 def test_a_cut_reports_how_far_the_body_turned():
     """A turn by about half the angle of the body's symmetry may be either of two."""
     truth = perrin.simulate_motion(
-        perrin.Cluster.touching(4, 2.45), D_R=0.08, dt=0.73, n_frames=100, rng=1
+        perrin.Cluster.touching(4, 2.45), D_R=0.08, dt=0.73, n_frames=LENGTH, rng=1
     )
     x = perrin.add_noise(truth.positions(), sigma=0.03, rng=1)
     raw = perrin.positions_table(x).drop(columns="particle")
@@ -653,10 +678,9 @@ def test_a_cut_reports_how_far_the_body_turned():
     assert "cannot be distinguished from a real turn" in text
 
 
-def test_an_experiment_states_what_arguments_state(base):
+def test_an_experiment_states_what_arguments_state(short):
     """The same report from arguments, from an Experiment, and from both, each stating a part."""
     known = perrin.run.Experiment(dt=0.73, sigma=0.03, noise=Noise("residual", exposure=0.5))
-    short = base[base["frame"] < 30]
     one = perrin.analyze(short, experiment=known).to_dict()
     assert (
         one == perrin.analyze(short, dt=0.73, sigma=0.03, noise="residual", exposure=0.5).to_dict()
@@ -664,7 +688,7 @@ def test_an_experiment_states_what_arguments_state(base):
     part = perrin.run.Experiment(sigma=0.03, noise=Noise(exposure=0.5))
     assert one == perrin.analyze(short, dt=0.73, noise="residual", experiment=part).to_dict()
     with pytest.raises(ValueError, match="dt: needed"):
-        perrin.analyze(base)
+        perrin.analyze(short)
 
 
 def test_a_value_stated_twice_is_refused(base):
@@ -710,10 +734,11 @@ def same(one: object, other: object) -> bool:
     return bool(one == other)
 
 
+@pytest.mark.usefixtures("whole")
 def test_results_come_back_from_json(base):
     """Clusters, rods, pooled values, predictions and sizes are the same after JSON."""
     truth = perrin.simulate_motion(
-        perrin.Cluster.touching(2, 2.45), D_R=0.01, D_T=0.05, dt=0.73, n_frames=60, rng=1
+        perrin.Cluster.touching(2, 2.45), D_R=0.01, D_T=0.05, dt=0.73, n_frames=SHORT, rng=1
     )
     pair = perrin.positions_table(perrin.add_noise(truth.positions(), sigma=0.03, rng=2))
     pair = pair.assign(cluster=5, particle=pair["particle"] + 50)

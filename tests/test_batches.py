@@ -48,8 +48,8 @@ def motions():
         tracked(TETRAHEDRON, 210, 1),
         tracked(IRREGULAR, 210, 2),
         tracked(TETRAHEDRON, 210, 3),
-        tracked(IRREGULAR, 120, 4),
-        tracked(TETRAHEDRON, 120, 5, gaps=(7, 50, 51)),
+        tracked(IRREGULAR, 60, 4),
+        tracked(TETRAHEDRON, 60, 5, gaps=(7, 50, 51)),
     ]
 
 
@@ -125,8 +125,8 @@ def unlike_clusters():
         rows_of(1, TETRAHEDRON, 210, seed=2, gaps=0.05),
         rows_of(2, IRREGULAR, 210, seed=3, swapped=40),
         rows_of(3, TETRAHEDRON, 210, seed=4, stretch=1.2),
-        rows_of(4, TETRAHEDRON, 204, seed=5, first=6, gaps=0.1),
-        rows_of(5, Cluster.touching(5, 2.0), 210, seed=6, gaps=0.03),
+        rows_of(4, TETRAHEDRON, 20, seed=5, first=6, gaps=0.1),
+        rows_of(5, Cluster.touching(5, 2.0), 20, seed=6, gaps=0.03),
     ]
 
 

@@ -74,7 +74,7 @@ addEventListener("load", async () => {
 @pytest.mark.skipif(CHROMIUM is None, reason="there is no chromium")
 def test_a_reader_sorts_filters_chooses_and_turns(tmp_path):
     """From a file, with the page's own policy: figures are drawn and nothing is an error."""
-    report = measured(clusters=3, frames=40, labels=["a", "<script>alert(1)</script>", "c"])
+    report = measured(clusters=3, frames=20, labels=["a", "<script>alert(1)</script>", "c"])
     policy = base64.b64encode(hashlib.sha256(READER.encode()).digest()).decode()
     html = render_html(report, []).replace("script-src ", f"script-src 'sha256-{policy}' ", 1)
     html = html.replace("<body>", f"<body><script>{READER}</script>", 1)
@@ -105,7 +105,7 @@ def test_a_reader_sorts_filters_chooses_and_turns(tmp_path):
 
 def test_a_page_without_scripting_shows_the_first_cluster():
     """Numbers and a picture of the body are in the page itself, not in its data."""
-    report = measured(frames=40)
+    report = measured(frames=20)
     html = render_html(replace(report, warnings=("<b>",)), [])
     before = html[: html.index("<script>")]
     assert '<svg class="still"' in before

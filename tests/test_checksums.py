@@ -19,14 +19,14 @@ from perrin.tracks.checksums import CHECKSUMS, CheckedFiles, read_sealed, write_
 def saved(tmp_path_factory):
     """Write a run with one cluster, and images; return its folder."""
     body = perrin.Cluster.touching(4, 2.45)
-    motion = perrin.simulate_motion(body, D_R=5e-3, D_T=0.04, dt=0.7, n_frames=25, rng=1)
+    motion = perrin.simulate_motion(body, D_R=5e-3, D_T=0.04, dt=0.7, n_frames=20, rng=1)
     places = perrin.add_noise(motion.positions(), sigma=0.02, rng=2)
     frame, particle = np.indices(places.shape[:2])
     columns = dict(zip("xyz", places.reshape(-1, 3).T, strict=True))
     table = pd.DataFrame({"frame": frame.ravel(), "particle": particle.ravel(), **columns})
     report = perrin.analyze(table, dt=0.7)
     spheres = table.assign(mass=1.0, cluster=0, piece=0)
-    frames = pd.DataFrame({"frame": np.arange(25), "time": 0.7 * np.arange(25), "fault": ""})
+    frames = pd.DataFrame({"frame": np.arange(20), "time": 0.7 * np.arange(20), "fault": ""})
     views = (View(0, np.ones((4, 5)), np.ones((3, 5)), np.ones((3, 4))),)
     imaging = Imaging(
         spheres, frames, spheres[["frame", "mass"]], views, None, 0.0, (0.3, 0.2, 0.2), 2.45, 2.45,

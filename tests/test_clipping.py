@@ -41,6 +41,22 @@ def test_clipped_spheres_have_their_stated_errors():
     assert abs(found.mean() - 1) < 4 * np.sqrt(2 / found.size)
 
 
+def test_spheres_above_a_floor_have_their_stated_errors():
+    """Where the background is below the range: mean squares are 1, and no centre is drawn away."""
+    rng = np.random.default_rng(8)
+    frames, centers = [], []
+    for _ in range(40):
+        center = np.array([[2.9, 2.9, 2.9]]) + rng.uniform(-0.2, 0.2, (1, 3))
+        spot, mean = IMAGE.spot(center[0], SHAPE), np.full(SHAPE, 4.0)
+        mean[spot.box] += 40 * spot.value
+        grey = np.round(GAIN * rng.poisson(mean) + rng.normal(-16, 1, SHAPE))
+        frames.append(np.maximum(grey, 0).astype(np.uint8))
+        centers.append(center)
+    assert np.mean([f == 0 for f in frames]) > 0.5
+    found = squares(frames, centers, without_clipped)
+    assert abs(found.mean() - 1) < 4 * np.sqrt(2 / found.size)
+
+
 def test_what_is_left_out_is_what_touches_clipped_voxels():
     """Nothing in a frame without clipping; else the clipped voxels with their 26 neighbours."""
     rng = np.random.default_rng(5)

@@ -53,6 +53,24 @@ def test_ratios_of_the_axes_are_found_and_scale_the_poses():
     assert np.mean(squares) == pytest.approx(1, abs=0.1)
 
 
+def test_poses_that_weigh_the_axes_err_as_is_then_stated():
+    """Fitted with stated errors of 1, 1, 1.4 where that of z is 3.5: squares are 1 within 10 %."""
+    sigma, true = np.array([0.01, 0.01, 0.014]), np.array([0.01, 0.01, 0.035])
+    squares = []
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        truth = perrin.simulate_motion(BODY, D_R=5e-3, dt=0.7, n_frames=40, rng=rng)
+        x = truth.positions() + true * rng.normal(size=(40, 4, 3))
+        plain = perrin.track_rotation(x, dt=0.7, sigma=sigma, weights="sigma")
+        scaled = with_error_ratio(plain, np.tile((true / sigma) ** 2, (40, 1)), sigma**2)
+        apart = np.swapaxes(truth.rotation, 1, 2) @ plain.rotation
+        error = Rotation.from_matrix(apart)
+        error = (error.mean().inv() * error).as_rotvec()
+        inverse = np.linalg.inv(scaled.covariance)
+        squares.append(np.einsum("ta,tab,tb->", error, inverse, error) / (3 * 39))
+    assert np.mean(squares) == pytest.approx(1, abs=0.1)
+
+
 def test_true_errors_are_left_as_they_are():
     """Where the stated errors are right the ratios stay within two errors, mostly at one."""
     values = [

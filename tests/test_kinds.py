@@ -60,7 +60,7 @@ def mixed():
     for number, (n, D_R) in enumerate(planted):
         truth = perrin.simulate_motion(
             perrin.Cluster.touching(n, DIAMETER),
-            D_R=D_R, D_T=10 * D_R, dt=DT, n_frames=60, rng=number,
+            D_R=D_R, D_T=10 * D_R, dt=DT, n_frames=210, rng=number,
         )  # fmt: skip
         x = perrin.add_noise(truth.positions(), sigma=0.01, rng=10 + number)
         table = perrin.positions_table(x).assign(cluster=number)

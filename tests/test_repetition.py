@@ -25,9 +25,9 @@ def table(**more: object) -> pd.DataFrame:
     """Return a tetrahedron, its centre moving, in frames from 5 on, with times that are uneven."""
     rng = np.random.default_rng(4)
     body = perrin.Cluster.touching(4, 2.45)
-    truth = perrin.simulate_motion(body, D_R=0.02, D_T=0.04, dt=0.5, n_frames=60, rng=rng)
+    truth = perrin.simulate_motion(body, D_R=0.02, D_T=0.04, dt=0.5, n_frames=24, rng=rng)
     found = perrin.positions_table(perrin.add_noise(truth.positions(), sigma=0.03, rng=rng))
-    pause = np.where(found["frame"] >= 30, 4.0, 0.0)
+    pause = np.where(found["frame"] >= 12, 4.0, 0.0)
     found["time"] = 0.5 * found["frame"] + pause
     return found.assign(frame=found["frame"] + 5, **more)
 
@@ -35,7 +35,7 @@ def table(**more: object) -> pd.DataFrame:
 @pytest.fixture(scope="module")
 def report() -> perrin.Report:
     return perrin.analyze(
-        table(), dt=0.5, frames=(10, 50), noise="residual", sigma=(0.03, 0.03, 0.04), drift=True,
+        table(), dt=0.5, frames=(8, 26), noise="residual", sigma=(0.03, 0.03, 0.04), drift=True,
         scale=0.9, viscosity=1e-3, temperature=295.0, diameter=2.2,
     )  # fmt: skip
 
@@ -79,7 +79,8 @@ def test_a_table_in_memory_is_repeated_from_the_folder(report, tmp_path):
 def test_text_labels_of_clusters_are_those_of_the_repeated_run(tmp_path, monkeypatch):
     """The tracks of a folder keep the labels by number, and a part of them as well."""
     monkeypatch.setattr("perrin.report.write.save_figures", lambda *_, **__: [])
-    apart = [table(cluster=name) for name in ("knee", "b 2", "foot")]
+    # Fewer than 20 steps are not judged.
+    apart = [table(cluster=name)[:76] for name in ("knee", "b 2", "foot")]
     for k, one in enumerate(apart):
         one[["particle", "x"]] += [10 * k, 20.0 * k]
     first = perrin.analyze(pd.concat(apart, ignore_index=True), dt=0.5)

@@ -15,7 +15,7 @@ import pytest
 import perrin
 from perrin._text import number_text
 from perrin.diffusion.estimate import bare_text
-from perrin.plot import report_figures
+from perrin.plot import figure_style
 from perrin.report import citations, embedding, figure_data, write
 from perrin.report import page as report
 from perrin.run import repetition
@@ -268,7 +268,7 @@ def test_limits_open_ends_and_unknown_errors_are_text(single):
 
 
 def test_two_dimensions_have_their_own_text():
-    found = measured(planar=True, frames=40)
+    found = measured(planar=True, frames=20)
     text = Page(report.render_html(found, [])).text
     assert "MSAD = 2" in text
     assert "in 2 dimensions" in text
@@ -329,7 +329,7 @@ def test_packed_columns_come_back():
 @pytest.mark.parametrize("planar", [False, True])
 def test_the_data_of_the_figures_are_those_of_the_result(single, planar):
     """The drawn poses, places and curves are the motion, the table and the curves of the run."""
-    found = measured(planar=planar, frames=40) if planar else single
+    found = measured(planar=planar, frames=20) if planar else single
     (result,) = found.clusters
     rows = figure_data.grouped_tracks(found.tracks)[result.cluster]
     header, column = unpacked(figure_data.cluster_data(result, rows, clusters=1))
@@ -376,7 +376,7 @@ def test_what_is_copied_repeats_the_run(single, tmp_path):
 
 def test_the_run_folder_is_complete(single, tmp_path, monkeypatch, repeats):
     if repeats(True, False):
-        monkeypatch.setattr(report_figures, "save_figure", save_blank)
+        monkeypatch.setattr(figure_style, "save_figure", save_blank)
     place = tmp_path / "run"
     write.write_run(single, place)
     names = {f.name for f in place.iterdir()}

@@ -15,7 +15,7 @@ from test_plot import measured
 
 @pytest.fixture(scope="module")
 def report():
-    found = measured(clusters=2, frames=40, labels=["<b>one</b>", "two"])
+    found = measured(clusters=2, frames=205, labels=["<b>one</b>", "two"])
     compared = perrin.Compared(0.02, found.clusters[0].D_R.value, found.clusters[0].D_R.stderr)
     known = perrin.Prediction(1.0, 1e-5, D_T=compared, D_R=compared)
     first, *others = found.clusters
@@ -178,8 +178,8 @@ def test_progress_counts_the_clusters_of_every_long_step(tmp_path, monkeypatch):
     report = perrin.analyze(table, dt=0.5, progress=progress)
     perrin.write_run(report, tmp_path / "run", progress=progress)
     assert list(calls) == [
-        "fitting clusters", "estimating D_R and D_T", "judging the motion", "writing the curves",
-        "drawing the figures", "writing the report",
+        "finding the clusters", "fitting clusters", "estimating D_R and D_T", "judging the motion",
+        "writing the curves", "drawing the figures", "writing the report",
     ]  # fmt: skip
     for title in ("fitting clusters", "estimating D_R and D_T"):
         assert calls[title] == [(0, 20), (16, 20), (20, 20)]

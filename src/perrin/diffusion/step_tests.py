@@ -886,6 +886,7 @@ def _inverse_root(a: Floats, *, least: float = 0.0) -> Floats:
     Axes without any motion are 0.
     """
     values, axes = np.linalg.eigh(a)
-    moves = values > 1e-12 * np.maximum(values[..., -1:], 1e-300)
+    # Below 1e-200 the inverse would overflow where a body at rest moves in one frame.
+    moves = values > np.maximum(1e-12 * values[..., -1:], 1e-200)
     root = np.sqrt(np.maximum(np.where(moves, values, 1.0), least))
     return np.asarray(axes * np.where(moves, 1 / root, 0.0)[..., None, :])

@@ -100,6 +100,7 @@ from perrin.images.optics.learn import (
     SampleFit,
     UsualImage,
     fit_samples,
+    floor_share,
     neighbour_variance,
     photon_transfer,
     saturated_share,
@@ -117,6 +118,12 @@ from perrin.images.optics.learn_radial import (
 )
 from perrin.images.optics.microscope import Camera, Light, RenderSettings, Scan
 from perrin.images.optics.optics import CameraNoise, Optics
+from perrin.images.optics.pixel_pattern import (
+    PixelPattern,
+    find_pixel_pattern,
+    pixel_offsets,
+    without_pattern,
+)
 from perrin.images.optics.point_spread import BeadStack, PointSpread, measure_point_spread
 from perrin.images.optics.radial_image import (
     Patch,
@@ -221,6 +228,7 @@ __all__ = [
     "Patch",
     "PatchFit",
     "Pick",
+    "PixelPattern",
     "PlaneFit",
     "PointSpread",
     "Pose",
@@ -277,6 +285,7 @@ __all__ = [
     "find_circles",
     "find_fading",
     "find_features",
+    "find_pixel_pattern",
     "find_shells",
     "first_image",
     "fit_brightness",
@@ -288,6 +297,7 @@ __all__ = [
     "fit_samples",
     "fit_window",
     "fitted_together",
+    "floor_share",
     "found_table",
     "frame_digest",
     "frames_of_planes",
@@ -340,6 +350,7 @@ __all__ = [
     "open_stack",
     "opened",
     "photon_transfer",
+    "pixel_offsets",
     "plane_columns",
     "plausible_spheres",
     "pose_in",
@@ -380,6 +391,7 @@ __all__ = [
     "within",
     "without_clipped",
     "without_doubles",
+    "without_pattern",
     "write_imaging",
     "write_stack",
     "xml_root",

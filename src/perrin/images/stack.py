@@ -6,7 +6,7 @@ import hashlib
 import os
 import threading
 import warnings
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -21,6 +21,7 @@ from perrin.images.formats.folders import sequence, sequence_files
 from perrin.images.formats.isolation import SWITCH, guarded
 from perrin.images.formats.tiff import tiff
 from perrin.images.formats.vendors import WAY_OUT, vendor
+from perrin.images.optics.pixel_pattern import without_pattern
 from perrin.tracks.file_limits import refuse_oversize
 from perrin.tracks.writing import written_whole
 
@@ -156,10 +157,31 @@ class Stack:
             )
         return data
 
+    def corrected(self, pattern: Floats | None) -> Stack:
+        """Return the stack for fits, with the pattern (ny, nx) of the pixels subtracted.
+
+        Clipped voxels are NaN then. Without a pattern it is the same stack.
+        """
+        if pattern is None:
+            return self
+        read = _CorrectedFrames(self.read, pattern)
+        return replace(self, read=read, dtype=np.dtype(np.float64))
+
     def close(self) -> None:
         """Close the file."""
         if isinstance(self.read, _FileFrames):
             self.read.close()
+
+
+@dataclass(frozen=True, eq=False)
+class _CorrectedFrames:
+    """Frames of a stack for fits: without clipped voxels and without the pattern of the pixels."""
+
+    read: Callable[[int], NDArray[Any]]
+    pattern: Floats
+
+    def __call__(self, i: int) -> NDArray[Any]:
+        return without_pattern(self.read(i), self.pattern)
 
 
 class _UnopenedError(OSError):

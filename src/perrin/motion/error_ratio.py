@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from perrin._arrays import frozen
-from perrin.geometry.rigid import orientation_covariance
+from perrin.geometry.rigid import pose_slopes
 from perrin.motion.residuals import body_residuals, expected_squares, fit_projector
 
 if TYPE_CHECKING:
@@ -22,6 +22,10 @@ _TREND_ERRORS = 3.3
 
 # A measured ratio is at least this one; few frames can give a negative variance.
 _LEAST_ERROR_RATIO = 0.1
+
+# A ratio below 1 makes the stated errors smaller if its logarithm is this many standard errors
+# below 0.
+_CLEARLY_SMALLER = 4.0
 
 _WEIGHTING_ROUNDS = 8  # of the weights
 
@@ -40,8 +44,9 @@ class ErrorRatio:
     ----------
     value : ndarray, shape (d,)
         Ratio of each lab axis, drawn to 1 by its own error: 1 + (1 - s^2/(r - 1)^2) (r - 1) for the
-        measured ratio r of standard error s, and 1 where r - 1 is less than s: positions are not
-        better than their light allows.
+        measured ratio r of standard error s, and 1 where r - 1 is less than s. It is below 1 only
+        where the logarithm of r is four standard errors below 0: the noise that a fit assumes is
+        then common to many voxels.
     measured, stderr : ndarray, shape (d,)
         Measured ratios and their standard errors; NaN where no frame determines them.
     by_time : float
@@ -139,7 +144,9 @@ def error_ratio(bodies: Iterable[tuple[RigidMotion, Floats, Floats]]) -> ErrorRa
     stderr = np.sqrt(np.diag(inverse @ scores.T @ scores @ inverse.T))
     off = measured - 1
     held = np.divide(stderr, off, out=np.full(len(off), np.inf), where=off != 0)
-    value = 1 + np.maximum(1 - held**2, 0.0) * np.maximum(off, 0.0)
+    # Light alone leaves the stated errors; they are too large where noise is common to many voxels.
+    smaller = np.log(measured) < -_CLEARLY_SMALLER * stderr / measured
+    value = 1 + np.maximum(1 - held**2, 0.0) * np.where(smaller, off, np.maximum(off, 0.0))
     # Changes of the logarithm of the squares with time and depth, 0 where insignificant: scoring
     # for gamma-distributed squares with a logarithmic link.
     relative = square.sum(axis=1) / (mix @ measured).sum(axis=1)
@@ -178,8 +185,9 @@ def with_error_ratio(motion: RigidMotion, ratio: Floats, stated: Floats) -> Rigi
     Returns
     -------
     RigidMotion
-        With C = L_1 L_0^-1 C L_0^-T L_1^T for the Cholesky factors of the covariances that both
-        variances give to orientations fitted with equal weights.
+        With C = L_1 L_0^-1 C L_0^-T L_1^T for the Cholesky factors of the covariances of
+        orientations fitted with the weights W of the stated variances: P = (H^T W H)^-1 with these,
+        and P H^T W V W H P with the variances V that are larger by the ratio.
 
     Examples
     --------
@@ -192,11 +200,15 @@ def with_error_ratio(motion: RigidMotion, ratio: Floats, stated: Floats) -> Rigi
     """
     rows = motion.fitted
     turn = motion.rotation[rows]
-    factors = []
-    for variance in (np.broadcast_to(stated, (len(rows), len(stated))), ratio[rows] * stated):
-        noise = np.einsum("tji,tj,tjk->tik", turn, variance, turn)
-        factors.append(np.linalg.cholesky(orientation_covariance(motion.template, noise)))
-    change = factors[1] @ np.linalg.inv(factors[0])
+    slope = pose_slopes(motion.template)[..., : motion.covariance.shape[-1]]
+    known, true = (
+        np.einsum("tji,tj,tjk->tik", turn, part, turn)
+        for part in (np.broadcast_to(1 / stated, (len(rows), len(stated))), ratio[rows] / stated)
+    )
+    # The centre of the template is the origin, so that the shift of the body has no common term.
+    P = np.linalg.inv(np.einsum("nia,tij,njb->tab", slope, known, slope))
+    spread = np.einsum("nia,tij,njb->tab", slope, true, slope)
+    change = np.linalg.cholesky(P @ spread @ P) @ np.linalg.inv(np.linalg.cholesky(P))
     covariance, center = motion.covariance.copy(), motion.center_variance.copy()
     scaled = change @ covariance[rows] @ np.swapaxes(change, 1, 2)
     covariance[rows] = 0.5 * (scaled + np.swapaxes(scaled, 1, 2))

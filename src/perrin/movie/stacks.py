@@ -288,7 +288,10 @@ def analyze_stack(
             tables = [one.features for one in located]
             features, offsets, findings = joined_kinds(tables, contact=contact)
         bodies = find_bodies(features, stack, search, optics=learned, sizes=sizes)
-        poses = _PoseFits(stacks, learned, bodies, contact, folder / _POSED, work)
+        corrected = tuple(
+            one.corrected(own.method.pattern) for one, own in zip(stacks, located, strict=True)
+        )
+        poses = _PoseFits(corrected, learned, bodies, contact, folder / _POSED, work)
         errors = median_errors(bodies.features, axes=bodies.axes)
         sources = [
             {

@@ -177,6 +177,7 @@ def locate_frames(
         None if learned["fading"] is None else Fading.from_dict(learned["fading"]),
         None if learned["usual"] is None else UsualImage.from_dict(learned["usual"]),
         None if radial is None else RadialImage.from_dict(radial),
+        None if learned["pattern"] is None else np.array(learned["pattern"]),
     )
     rows, entries, notes = run_frames(
         _LocateTask(_without_times(stack), method),
@@ -222,7 +223,8 @@ def learn_method(
     Returns
     -------
     dict
-        Values that JSON can hold: ``minmass``, ``optics``, ``fading``, ``usual``, ``radial``, the
+        Values that JSON can hold: ``minmass``, ``optics``, ``fading``, ``usual``, ``radial``,
+        ``pattern``, the
         ``spots`` of the sampled frames as (frame, mass), and the warnings under ``told``.
 
     Raises
@@ -263,6 +265,7 @@ def learn_method(
         "fading": None if method.fading is None else method.fading.to_dict(),
         "usual": None if method.usual is None else method.usual.to_dict(),
         "radial": None if method.radial is None else method.radial.to_dict(),
+        "pattern": None if method.pattern is None else method.pattern.tolist(),
         "spots": [[seen.number, mass] for seen in sample for mass in seen.spots.mass.tolist()],
         "told": [str(warning.message) for warning in caught],
     }
