@@ -39,9 +39,10 @@ def suspension(kinds, box, n_frames, rng, *, step=0.1, substeps=4):
     path = np.empty((n_frames, len(owner), 3))
     for k in range(n_frames):
         for _ in range(substeps):
+            moves = step * rng.normal(size=(len(shapes), 3))
+            small = exp_map(step / 3 * rng.normal(size=(len(shapes), 3)) / np.sqrt(3))
             for b, shape in enumerate(shapes):
-                place = places[b] + step * rng.normal(size=3)
-                turn = random_turn(rng, step / 3) @ turns[b]
+                place, turn = places[b] + moves[b], small[b] @ turns[b]
                 new = place + shape @ turn.T
                 inside = np.all((new > 0) & (new < box))
                 if inside and cdist(new, spheres[owner != b]).min() > CONTACT:
