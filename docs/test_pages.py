@@ -131,7 +131,7 @@ def test_the_page_on_studies_runs(tmp_path, monkeypatch, capsys):
     Path("study.toml").write_text("reports = false\n" + manifest, encoding="utf-8")
     run_block(run)
     assert Path("STUDY/study.html").is_file()
-    names = {}
+    names = {"__name__": "__main__"}
     capsys.readouterr()
     exec(compile(python.replace("workers=8", "workers=0"), "study.md", "exec"), names)
     # The cluster of the second sample is excluded.
