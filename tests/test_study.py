@@ -32,6 +32,7 @@ from perrin.study import (
     measure_movie,
     movie_table,
     read_manifest,
+    render_samples,
     render_study,
     running,
     warning_matrix,
@@ -361,6 +362,19 @@ def test_the_page_of_hundreds_of_movies_escapes_and_loads_nothing(large):
     assert "<script>" not in body
     assert not re.search(r"""(?:src|href)=["']?(?:https?:)?//""", body)
     assert body.count("runs/m") == 160
+
+
+def test_a_page_of_a_sample_lists_its_movies_clusters_and_warnings(large):
+    """Every movie links to its run, every warning is named with its cluster; texts are escaped."""
+    (page,) = render_samples(large)
+    body = page.split("<body", 1)[1] if "<body" in page else page.split("</style>", 1)[1]
+    assert "<script>" not in body
+    assert "m3-<b>" not in body
+    done = [e for e in large.entries.values() if e.status == "done"]
+    assert body.count("../runs/m") == len(done)
+    assert body.count("a jump of") == 40 * (1 + 2 + 2)
+    study = render_study(large)
+    assert study.count('href="samples/1.html"') == len(large.entries)
 
 
 def test_warnings_that_differ_in_numbers_are_one_column(large):

@@ -23,7 +23,13 @@ from perrin.study.manifest import (
     source_of,
 )
 from perrin.study.mixture import RunKind, study_kinds
-from perrin.study.page import ordered_conditions, render_study, study_methods, warning_matrix
+from perrin.study.page import (
+    ordered_conditions,
+    render_samples,
+    render_study,
+    study_methods,
+    warning_matrix,
+)
 from perrin.study.planning import StudyPlan, expected_half_width, plan_study
 from perrin.study.profiles import Coefficient, Interval, log_likelihoods, ratio_of
 from perrin.study.random_effects import MovieLikelihoods, PopulationMean, population_mean, smoothed
@@ -79,6 +85,7 @@ __all__ = [
     "ratio_of",
     "read_entries",
     "read_manifest",
+    "render_samples",
     "render_study",
     "save_study_figures",
     "settings_of",

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from perrin.study.conditions import ConditionMean
     from perrin.study.study_results import StudyResult
 
+SAMPLES = "samples"  # folder of the pages of samples
+
 _MOST_SINGLES = 3000  # single clusters that a figure draws; SVG with more is slow
 _MOST_WARNINGS = 24  # columns of the matrix of warnings
 _DOWNLOADS = (
@@ -96,6 +98,71 @@ def render_study(result: StudyResult) -> str:
         plotly=plotly,
         script_sources=f"{source_hash(script)} {plotly_hash}",
     )
+
+
+def render_samples(result: StudyResult) -> list[str]:
+    """Return a page for each sample: its movies with links to their runs, its clusters, warnings.
+
+    Parameters
+    ----------
+    result : StudyResult
+
+    Returns
+    -------
+    list of str
+        In the order in which the manifest names the samples.
+    """
+    pages = []
+    rows = _movie_rows(result)
+    for sample in _samples(result):
+        movies = [m for m in result.manifest.movies if m.sample == sample]
+        names = {m.name for m in movies}
+        clusters: dict[str, dict[str, Any]] = {}
+        for one in result.values:
+            if one.movie.name not in names or one.quantity not in ("D_R", "D_T"):
+                continue
+            low, high = one.coefficient.ci95
+            known = clusters.setdefault(
+                one.name,
+                {
+                    "name": one.name,
+                    "body": one.body,
+                    "frames": one.frames,
+                    "motion": [],
+                    "apart": [],
+                },
+            )
+            known[one.quantity] = (
+                f"{number_text(one.coefficient.value)} ({number_text(low)} to {number_text(high)})"
+            )
+            known["motion"].append(one.verdict)
+            known["apart"] += [one.apart_because] if one.apart_because else []
+        for known in clusters.values():
+            for key in ("motion", "apart"):
+                known[key] = ", ".join(dict.fromkeys(known[key]))
+        warnings = []
+        for entry in (result.entries[name] for name in names if name in result.entries):
+            warnings += [(entry.name, text) for text in entry.warnings]
+            for cluster in entry.clusters:
+                name = f"{entry.name}, cluster {cluster['label'] or cluster['cluster']}"
+                warnings += [(name, text) for text in cluster["warnings"]]
+        pages.append(
+            render_page(
+                "sample",
+                title=result.manifest.title,
+                sample=sample,
+                condition=" / ".join(dict.fromkeys(condition_text(m.conditions) for m in movies)),
+                movies=[row for row in rows if row["sample"] == sample],
+                clusters=list(clusters.values()),
+                warnings=sorted(warnings),
+            )
+        )
+    return pages
+
+
+def _samples(result: StudyResult) -> list[str]:
+    """Return the samples in the order of the manifest."""
+    return list(dict.fromkeys(m.sample for m in result.manifest.movies))
 
 
 def study_methods(result: StudyResult) -> str:
@@ -246,6 +313,7 @@ def _spread_text(value: float | None, ends: tuple[float, float] | None) -> str:
 def _movie_rows(result: StudyResult) -> list[dict[str, Any]]:
     """Return a row for each movie, with the link to its run."""
     rows = []
+    number = {sample: k for k, sample in enumerate(_samples(result), start=1)}
     for movie in result.manifest.movies:
         entry = result.entries.get(movie.name)
         link = None
@@ -257,6 +325,7 @@ def _movie_rows(result: StudyResult) -> list[dict[str, Any]]:
             {
                 "name": movie.name,
                 "sample": movie.sample,
+                "page": f"{SAMPLES}/{number[movie.sample]}.html",
                 "condition": condition_text(movie.conditions),
                 "replicate": movie.replicate or "",
                 "link": link,

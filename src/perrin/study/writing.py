@@ -11,7 +11,7 @@ from perrin.report.html import write_page
 from perrin.run.measure import library_version
 from perrin.study.figures import save_study_figures
 from perrin.study.manifest import manifest_dict
-from perrin.study.page import render_study
+from perrin.study.page import SAMPLES, render_samples, render_study
 from perrin.study.tables import movie_table
 from perrin.tracks.writing import write_json, write_parquet, written_whole
 
@@ -61,6 +61,16 @@ def write_results(result: StudyResult, *, command: str = "") -> None:
     figures = place / "figures"
     figures.mkdir(exist_ok=True)
     save_study_figures(result, figures)
+    pages = place / SAMPLES
+    pages.mkdir(exist_ok=True)
+    kept = set()
+    for number, text in enumerate(render_samples(result), start=1):
+        kept.add(f"{number}.html")
+        with written_whole(pages / f"{number}.html") as part:
+            write_page(part, text)
+    for old in pages.glob("*.html"):
+        if old.name not in kept:
+            old.unlink()
     with written_whole(place / "study.html") as part:
         write_page(part, render_study(result))
     versions = {name: known for name in _VERSIONED if (known := library_version(name))}
