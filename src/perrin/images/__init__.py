@@ -124,7 +124,7 @@ from perrin.images.optics.pixel_pattern import (
     pixel_offsets,
     without_pattern,
 )
-from perrin.images.optics.point_spread import BeadStack, PointSpread, measure_point_spread
+from perrin.images.optics.point_spread import PointSpread, StackLike, measure_point_spread
 from perrin.images.optics.radial_image import (
     Patch,
     PatchFit,
@@ -159,7 +159,6 @@ from perrin.images.spheres.localisation import (
     Method,
     SampledFrame,
     Search,
-    StackLike,
     check_search,
     choose_method,
     fit_optics,
@@ -200,7 +199,6 @@ __all__ = [
     "Arrangement",
     "ArrayFrames",
     "BallBlur",
-    "BeadStack",
     "Camera",
     "CameraNoise",
     "Contents",

@@ -4,6 +4,7 @@ from perrin.study.comparison import Comparison, compare_conditions
 from perrin.study.conditions import (
     ClusterValue,
     ConditionMean,
+    cluster_name,
     cluster_values,
     condition_means,
     condition_text,
@@ -59,6 +60,7 @@ __all__ = [
     "StudyResult",
     "Task",
     "Trend",
+    "cluster_name",
     "cluster_values",
     "compare_conditions",
     "condition_means",

@@ -65,7 +65,7 @@ class ClusterValue:
     @property
     def name(self) -> str:
         """Movie and cluster."""
-        return f"{self.movie.name}, cluster {self.label or self.cluster}"
+        return cluster_name(self.movie.name, self.label, self.cluster)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -116,6 +116,25 @@ class ConditionMean(Shown):
             "predicted": self.predicted,
             "outlying": [{"name": name, **one.to_dict()} for name, one in self.outlying],
         }
+
+
+def cluster_name(movie: str, label: str | None, number: int) -> str:
+    """Return how a cluster of a study is called in texts.
+
+    Parameters
+    ----------
+    movie : str
+        Name of the movie.
+    label : str or None
+        The user's label of the cluster.
+    number : int
+
+    Examples
+    --------
+    >>> cluster_name("monday", None, 3)
+    'monday, cluster 3'
+    """
+    return f"{movie}, cluster {label or number}"
 
 
 def condition_text(conditions: Mapping[str, float | str]) -> str:

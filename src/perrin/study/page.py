@@ -12,12 +12,13 @@ import numpy as np
 from perrin._text import number_text, percent, unit_text
 from perrin.report.embedding import packed, page_script, plotly_script, source_hash
 from perrin.report.html import inline_pictures, render_page
-from perrin.study.conditions import QUANTITIES, QUANTITY_UNITS, condition_text
+from perrin.study.conditions import QUANTITIES, QUANTITY_UNITS, cluster_name, condition_text
 from perrin.study.ledger import RUNS
 from perrin.study.trends import law_values
 
 if TYPE_CHECKING:
-    from perrin.study.conditions import ConditionMean
+    from perrin.study.manifest import StudyMovie
+    from perrin.study.profiles import Interval
     from perrin.study.study_results import StudyResult
 
 SAMPLES = "samples"  # folder of the pages of samples
@@ -112,57 +113,50 @@ def render_samples(result: StudyResult) -> list[str]:
     list of str
         In the order in which the manifest names the samples.
     """
+    clusters: dict[str, dict[str, dict[str, Any]]] = {}
+    for one in result.values:
+        if one.quantity not in ("D_R", "D_T"):
+            continue
+        known = clusters.setdefault(one.movie.sample, {}).setdefault(
+            one.name,
+            {
+                "name": one.name,
+                "body": one.body,
+                "frames": one.frames,
+                "motion": [],
+                "apart": [],
+            },
+        )
+        known[one.quantity] = _interval_text(one.coefficient)
+        for key, text in (("motion", one.verdict), ("apart", one.apart_because)):
+            if text and text not in known[key]:
+                known[key].append(text)
+    movies: dict[str, list[StudyMovie]] = {}
+    for movie in result.manifest.movies:
+        movies.setdefault(movie.sample, []).append(movie)
+    rows: dict[str, list[dict[str, Any]]] = {}
+    for row in _movie_rows(result):
+        rows.setdefault(row["sample"], []).append(row)
     pages = []
-    rows = _movie_rows(result)
-    for sample in _samples(result):
-        movies = [m for m in result.manifest.movies if m.sample == sample]
-        names = {m.name for m in movies}
-        clusters: dict[str, dict[str, Any]] = {}
-        for one in result.values:
-            if one.movie.name not in names or one.quantity not in ("D_R", "D_T"):
-                continue
-            low, high = one.coefficient.ci95
-            known = clusters.setdefault(
-                one.name,
-                {
-                    "name": one.name,
-                    "body": one.body,
-                    "frames": one.frames,
-                    "motion": [],
-                    "apart": [],
-                },
-            )
-            known[one.quantity] = (
-                f"{number_text(one.coefficient.value)} ({number_text(low)} to {number_text(high)})"
-            )
-            known["motion"].append(one.verdict)
-            known["apart"] += [one.apart_because] if one.apart_because else []
-        for known in clusters.values():
-            for key in ("motion", "apart"):
-                known[key] = ", ".join(dict.fromkeys(known[key]))
+    for sample, members in movies.items():
         warnings = []
-        for entry in (result.entries[name] for name in names if name in result.entries):
+        for entry in (result.entries[m.name] for m in members if m.name in result.entries):
             warnings += [(entry.name, text) for text in entry.warnings]
             for cluster in entry.clusters:
-                name = f"{entry.name}, cluster {cluster['label'] or cluster['cluster']}"
+                name = cluster_name(entry.name, cluster["label"], cluster["cluster"])
                 warnings += [(name, text) for text in cluster["warnings"]]
         pages.append(
             render_page(
                 "sample",
                 title=result.manifest.title,
                 sample=sample,
-                condition=" / ".join(dict.fromkeys(condition_text(m.conditions) for m in movies)),
-                movies=[row for row in rows if row["sample"] == sample],
-                clusters=list(clusters.values()),
-                warnings=sorted(warnings),
+                condition=" / ".join(dict.fromkeys(condition_text(m.conditions) for m in members)),
+                movies=rows[sample],
+                clusters=list(clusters.get(sample, {}).values()),
+                warnings=warnings,
             )
         )
     return pages
-
-
-def _samples(result: StudyResult) -> list[str]:
-    """Return the samples in the order of the manifest."""
-    return list(dict.fromkeys(m.sample for m in result.manifest.movies))
 
 
 def study_methods(result: StudyResult) -> str:
@@ -196,7 +190,7 @@ def study_methods(result: StudyResult) -> str:
         "ones are listed but not averaged."
     )
     values = [
-        f"{one.quantity} = {_mean_text(one)} {one.mean.unit} ({one.body}, {one.label})"
+        f"{one.quantity} = {_interval_text(one.mean)} {one.mean.unit} ({one.body}, {one.label})"
         for one in result.means
         if one.quantity != QUANTITIES[-1]
     ]
@@ -281,7 +275,7 @@ def _condition_rows(result: StudyResult) -> list[dict[str, Any]]:
         row["scope"] = one.mean.scope
         decoupled = result.decoupling(one)
         row["cells"][one.quantity] = {
-            "value": _mean_text(one),
+            "value": _interval_text(one.mean),
             "within": _spread_text(one.mean.spread_clusters, one.mean.spread_clusters_ci95),
             "between": _spread_text(one.mean.spread_movies, one.mean.spread_movies_ci95),
             "predicted": None if one.predicted is None else number_text(one.predicted),
@@ -292,11 +286,11 @@ def _condition_rows(result: StudyResult) -> list[dict[str, Any]]:
     )
 
 
-def _mean_text(one: ConditionMean) -> str:
-    """Return a mean with its 95 % interval."""
-    low, high = one.mean.ci95
-    value = number_text(one.mean.value)
-    if not np.isfinite(high) or high > 1e3 * max(one.mean.value, 1e-300):
+def _interval_text(one: Interval) -> str:
+    """Return a coefficient or a mean with its 95 % interval."""
+    low, high = one.ci95
+    value = number_text(one.value)
+    if not np.isfinite(high) or high > 1e3 * max(one.value, 1e-300):
         return f"{value} (above {number_text(low)})"
     return f"{value} ({number_text(low)} to {number_text(high)})"
 
@@ -313,7 +307,8 @@ def _spread_text(value: float | None, ends: tuple[float, float] | None) -> str:
 def _movie_rows(result: StudyResult) -> list[dict[str, Any]]:
     """Return a row for each movie, with the link to its run."""
     rows = []
-    number = {sample: k for k, sample in enumerate(_samples(result), start=1)}
+    samples = list(dict.fromkeys(movie.sample for movie in result.manifest.movies))
+    number = {sample: k for k, sample in enumerate(samples, start=1)}
     for movie in result.manifest.movies:
         entry = result.entries.get(movie.name)
         link = None

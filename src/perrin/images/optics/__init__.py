@@ -35,6 +35,7 @@ from perrin.images.optics.learn import (
     SampleFit,
     UsualImage,
     fit_samples,
+    floor_share,
     neighbour_variance,
     photon_transfer,
     saturated_share,
@@ -52,7 +53,13 @@ from perrin.images.optics.learn_radial import (
 )
 from perrin.images.optics.microscope import Camera, Light, RenderSettings, Scan
 from perrin.images.optics.optics import CameraNoise, Optics
-from perrin.images.optics.point_spread import BeadStack, PointSpread, measure_point_spread
+from perrin.images.optics.pixel_pattern import (
+    PixelPattern,
+    find_pixel_pattern,
+    pixel_offsets,
+    without_pattern,
+)
+from perrin.images.optics.point_spread import PointSpread, StackLike, measure_point_spread
 from perrin.images.optics.radial_image import (
     Patch,
     PatchFit,
@@ -84,7 +91,6 @@ from perrin.images.optics.window_fit import (
 __all__ = [
     "Arrangement",
     "BallBlur",
-    "BeadStack",
     "Camera",
     "CameraNoise",
     "CrowdFit",
@@ -101,6 +107,7 @@ __all__ = [
     "Optics",
     "Patch",
     "PatchFit",
+    "PixelPattern",
     "PointSpread",
     "PsfTail",
     "RadialImage",
@@ -112,6 +119,7 @@ __all__ = [
     "Scan",
     "SphereImage",
     "SphereSpot",
+    "StackLike",
     "TransmissionNoise",
     "UsualImage",
     "Window",
@@ -125,12 +133,14 @@ __all__ = [
     "cut_window",
     "detection_chi2",
     "drawing_faults",
+    "find_pixel_pattern",
     "first_image",
     "fit_brightness",
     "fit_crowd",
     "fit_patch",
     "fit_samples",
     "fit_window",
+    "floor_share",
     "held_out_misfit",
     "learn_image",
     "log_likelihood",
@@ -140,6 +150,7 @@ __all__ = [
     "noise_of_neighbours",
     "normal_equations",
     "photon_transfer",
+    "pixel_offsets",
     "plausible_spheres",
     "profile_information",
     "project",
@@ -158,4 +169,5 @@ __all__ = [
     "visible_fraction",
     "within",
     "without_clipped",
+    "without_pattern",
 ]

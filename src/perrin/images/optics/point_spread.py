@@ -37,8 +37,8 @@ _AROUND, _MOST_BEADS = (2.6, 1.4), 60
 _BEAD_ROUNDS = 3
 
 
-class BeadStack(Protocol):
-    """Frames with a voxel size, as a `Stack`."""
+class StackLike(Protocol):
+    """A movie as search and fits need it: its sizes, and one frame at a time."""
 
     @property
     def shape(self) -> tuple[int, int, int, int]:
@@ -46,7 +46,7 @@ class BeadStack(Protocol):
 
     @property
     def voxel(self) -> Floats | tuple[float, float, float]:
-        """Voxel size (z, y, x), um."""
+        """Voxel size (z, y, x), um; z is NaN for a 2-D movie."""
 
     def frame(self, i: int, /) -> Floats:
         """Return frame i, (z, y, x)."""
@@ -138,7 +138,7 @@ class _Bead(NamedTuple):
     background: float
 
 
-def measure_point_spread(stack: BeadStack, *, diameter: float = 0.1) -> PointSpread:
+def measure_point_spread(stack: StackLike, *, diameter: float = 0.1) -> PointSpread:
     """Measure the point spread function on a stack of beads.
 
     Parameters

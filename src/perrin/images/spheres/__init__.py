@@ -7,7 +7,6 @@ from perrin.images.spheres.localisation import (
     Method,
     SampledFrame,
     Search,
-    StackLike,
     check_search,
     choose_method,
     fit_optics,
@@ -30,6 +29,7 @@ from perrin.images.spheres.planar import (
     plane_columns,
 )
 from perrin.images.spheres.poses import Pose, fit_pose, pose_in, start_of, with_poses
+from perrin.images.spheres.shells import find_shells
 from perrin.images.spheres.spots import (
     Fading,
     Spots,
@@ -53,7 +53,6 @@ __all__ = [
     "Search",
     "SpotSettings",
     "Spots",
-    "StackLike",
     "at_contact",
     "check_search",
     "choose_method",
@@ -62,6 +61,7 @@ __all__ = [
     "find_circles",
     "find_fading",
     "find_features",
+    "find_shells",
     "fit_optics",
     "fit_plane",
     "fit_pose",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import warnings
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol, Unpack
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Unpack
 
 import numpy as np
 
@@ -58,7 +58,7 @@ if TYPE_CHECKING:
     from perrin._arrays import Ints
     from perrin.images.optics.ball_image import SphereImage
     from perrin.images.optics.optics import CameraNoise, Optics
-    from perrin.images.optics.point_spread import PointSpread
+    from perrin.images.optics.point_spread import PointSpread, StackLike
     from perrin.images.optics.radial_image import RadialImage
 
     Columns: TypeAlias = dict[str, NDArray[Any]]
@@ -99,21 +99,6 @@ _NOT_CONVERGED, _MOVED, _DARK = (
     "moved over half a radius",
     "no light of its own",
 )
-
-
-class StackLike(Protocol):
-    """A movie from which spheres can be located: sizes, and one frame at a time."""
-
-    @property
-    def shape(self) -> tuple[int, int, int, int]:
-        """Number of frames, and voxels of a frame: (t, z, y, x)."""
-
-    @property
-    def voxel(self) -> Floats | tuple[float, float, float]:
-        """Voxel size (z, y, x), um; z is NaN for a 2-D movie."""
-
-    def frame(self, i: int, /) -> Floats:
-        """Return frame i, (z, y, x)."""
 
 
 @dataclass(frozen=True)

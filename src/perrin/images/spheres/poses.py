@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from perrin._arrays import Floats, Ints
     from perrin.images.optics.ball_image import SphereImage
     from perrin.images.optics.optics import CameraNoise, Optics
-    from perrin.images.spheres.localisation import StackLike
+    from perrin.images.optics.point_spread import StackLike
     from perrin.motion.rigid_motion import RigidMotion
 
 

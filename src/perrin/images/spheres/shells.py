@@ -90,9 +90,8 @@ def find_shells(
         at = at[(edge >= radius).all(axis=1)]
     at = at[np.argsort(-mean[tuple(at.T)], kind="stable")]
     kept = np.ones(len(at), dtype=np.bool_)
-    for i, j in (
-        sorted(cKDTree(at * step).query_pairs(_CLOSEST_SHELLS * contact)) if len(at) else ()
-    ):
+    near = cKDTree(at * step).query_pairs(_CLOSEST_SHELLS * contact) if len(at) else set()
+    for i, j in sorted(near):
         # Pairs are in the order of the higher one, of which it is known whether it is kept.
         kept[j] &= not kept[i]
     at = at[kept]
