@@ -377,6 +377,24 @@ def test_a_page_of_a_sample_lists_its_movies_clusters_and_warnings(large):
     assert study.count('href="samples/1.html"') == len(large.entries)
 
 
+def test_a_sample_has_its_own_clusters_and_an_interval_without_an_end_is_worded(tmp_path):
+    """A page for each sample, in the order of the manifest; no "inf" on a page."""
+    movies = tuple(StudyMovie(name, name, "table", name) for name in "ba")
+    entries = {
+        "b": Entry("b", "done", **entries_of([1.0, 1.1])),
+        "a": Entry("a", "done", **entries_of([7.0], verdict="confined")),
+    }
+    (open_cluster,) = entries["a"].clusters
+    open_cluster["D_R"]["ci95"][1] = np.inf
+    first, second = render_samples(StudyResult(Manifest(movies), tmp_path, entries))
+    assert "<h1>b</h1>" in first
+    assert [first.count(f"b, cluster {k}") for k in (0, 1)] == [1, 1]
+    assert "a, cluster" not in first
+    assert "7.00 (above 5.60)" in second
+    assert "motion: confined" in second
+    assert "inf" not in second.split("</style>", 1)[1]
+
+
 def test_warnings_that_differ_in_numbers_are_one_column(large):
     matrix = warning_matrix(large)
     assert len(matrix["kinds"]) == 2
