@@ -174,8 +174,8 @@ class NoisySteps:
     theta: float
     freedom: float
     level: float
-    drift: bool = False
-    steady: Floats = field(default_factory=lambda: np.zeros(0))
+    drift: bool
+    steady: Floats
 
     def theta_at(self, D: float, offset: float) -> float:
         """Return the free part of the noise: the offset is theta + level - blur D."""
