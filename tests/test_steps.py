@@ -165,7 +165,7 @@ def test_steps_in_the_plane_have_one_angle():
     motion = motion_with(rotation, covariance=variance[:, None, None])
     steps = principal_steps(motion, "rotation")
     np.testing.assert_allclose(steps.vectors[:, 0], angle[STOP] - angle[START])
-    np.testing.assert_allclose(steps.steady[:, 0, 0], DURATION)
+    np.testing.assert_allclose(steps.steady, DURATION[:, None, None])
     np.testing.assert_allclose(np.delete(steps.noise[0, :, 0, 0], 3), np.delete(variance, 3))
     assert steps.freedom == 5 * 7 + 3 * 5 + 3 - 7
 
@@ -316,6 +316,7 @@ def test_steps_of_a_direction_are_carried_along_without_turning():
     assert steps.complete == pytest.approx(np.nanmean(rod.variance))
     assert (steps.sigma, steps.freedom, steps.dt) == (1.0, 0, DT)
     assert steps.steady.shape == (5, 2, 0)
+    assert NoisySteps.of(steps, Noise()).steady.size == 0
     center = center_steps(rod)
     np.testing.assert_allclose(center.vectors, rod.center[steps.stop] - rod.center[steps.start])
     np.testing.assert_allclose(center.duration, rod.time[steps.stop] - rod.time[steps.start])
