@@ -11,7 +11,6 @@ import perrin
 from perrin.geometry.rotations import exp_map
 from perrin.tracks.identity import (
     BodyModel,
-    Candidates,
     Detections,
     Pose,
     all_assignments,
@@ -24,7 +23,6 @@ from perrin.tracks.identity import (
     icp_fit,
     icp_search,
     labels_in_time,
-    most_likely_identity,
     rigid_fits,
     settle_each,
     settle_identity,
@@ -65,9 +63,7 @@ def test_detections_are_moved_to_the_left_and_keep_their_columns():
     x = np.array([[[1.0], [NONE], [3.0]], [[NONE], [5.0], [NONE]], [[7.0], [8.0], [9.0]]])
     two, four = Detections.of(x, 2), Detections.of(x, 4)
     assert two.column.tolist() == [[0, 2, -1], [1, -1, -1], [0, 1, 2]]
-    np.testing.assert_array_equal(
-        two.x[..., 0], [[1, 3, NONE], [5, NONE, NONE], [7, 8, 9]]
-    )
+    np.testing.assert_array_equal(two.x[..., 0], [[1, 3, NONE], [5, NONE, NONE], [7, 8, 9]])
     assert (two.shown.tolist(), two.n) == ([2, 1, 3], 2)
     assert four.column.tolist() == [[0, 2, -1, -1], [1, -1, -1, -1], [0, 1, 2, -1]]
     assert np.isnan(four.x[:, 3]).all()
@@ -104,7 +100,7 @@ def test_the_size_of_a_body_is_that_of_its_fullest_rows():
 
 
 def test_fits_are_those_of_proper_rotations_about_the_points_present():
-    """The misfit of an expansion is its square; of a line it is unknown; absent points do not count."""
+    """The misfit of an expansion is its square, of a line unknown; absent points do not count."""
     turn = exp_map(np.array([0.3, -1.0, 2.0]))
     x = 5 + 1.01 * TETRAHEDRON @ turn.T
     rotation, misfit = rigid_fits(x, TETRAHEDRON)
@@ -144,7 +140,7 @@ def test_the_order_of_least_misfit_is_that_which_was_planted(body):
 
 
 def test_symmetries_are_those_of_the_shape_within_noise():
-    """12 of a tetrahedron, 24 of cube and octahedron, 4 of a square; noise hides small differences."""
+    """12 of a tetrahedron, 24 of cube and octahedron, 4 of a square; noise hides differences."""
     assert len(shape_symmetry(TETRAHEDRON, 1e-8)) == 12
     assert len(shape_symmetry(CUBE, 1e-8)) == 24
     octahedron = np.concatenate([np.eye(3), -np.eye(3)])
@@ -319,7 +315,7 @@ def model_of(x, *, labelled=True):
 
 @pytest.mark.parametrize("labelled", [True, False])
 def test_the_variance_of_steps_is_that_of_their_median_angle(labelled):
-    """Median squared angle over that of chi squared, longer over gaps; least where labels are free."""
+    """Median squared angle over that of chi squared, longer over gaps; of free labels the least."""
     angles = np.array([0.1, 0.2, 0.3, 0.25, 0.15, 0.12, 0.22])
     turns = np.append(0, np.cumsum(angles))[:, None] * [0.6, 0, 0.8]
     x = track_of(TETRAHEDRON, turns) + 1e-6 * np.random.default_rng(1).normal(size=(8, 4, 3))

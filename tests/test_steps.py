@@ -225,7 +225,9 @@ def test_two_steps_are_enough_and_one_is_not():
     two = replace(motion, piece=np.array([0, 0, 0, 1, 1, 2, 3, 4, 5, 6]))
     assert len(steps_of(two, "translation").start) == 2
     one = replace(motion, piece=np.array([0, 0, 1, 1, 2, 3, 4, 5, 6, 7]))
-    with pytest.raises(TooFewFramesError, match=r"^9 frames with a pose in too few steps") as caught:
+    with pytest.raises(
+        TooFewFramesError, match=r"^9 frames with a pose in too few steps"
+    ) as caught:
         pooled_steps([one], "translation")
     assert caught.value.n_frames == 9
     with pytest.raises(TooFewFramesError, match=r"^motion 1: 9 frames") as caught:
