@@ -1078,7 +1078,7 @@ def candidate_assignments(detections: Detections, body: BodyModel, *, labelled: 
     found: dict[int, Ints] = {}
     by_label = detections.assignment(body.label)
     known = (by_label >= 0).sum(axis=1) == detections.shown
-    trusted = np.flatnonzero(known & (detections.shown > 0) & labelled)
+    trusted = np.flatnonzero(known & labelled)
     points = assigned_points(detections.x[trusted], by_label[trusted, None])[:, 0]
     misfit = np.full(len(detections.x), np.inf)
     misfit[trusted] = rigid_fits(points, body.template)[1]
@@ -1210,7 +1210,7 @@ def most_likely_identity(
         # Rows without assignment keep the labels that held before them (at the start, after).
         first = np.argmax(label >= 0, axis=0)
         opening = label[first, np.arange(label.shape[1])]
-        for k in np.flatnonzero((order < 0).all(axis=1) & (detections.shown > 0)).tolist():
+        for k in np.flatnonzero((order < 0).all(axis=1)).tolist():
             held = np.where(label[k] >= 0, label[k], opening)
             for column in detections.column[k, : detections.shown[k]].tolist():
                 if column < len(held) and held[column] >= 0 and order[k, held[column]] < 0:
