@@ -7,8 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import perrin.curves.pairs as pairs_module
 from brownian_motions import flat, rod, tetrahedron, with_poses
-from perrin import Cluster, TooFewFramesError, msad, msad_axes, msad_vector, msd
+from perrin import Cluster, PrecisionWarning, TooFewFramesError, msad, msad_axes, msad_vector, msd
 from perrin.curves import (
     ListedPairs,
     Products,
@@ -18,6 +19,7 @@ from perrin.curves import (
     body_directions,
     common_frames,
     displacement_counts,
+    drift_corrected,
     fft_size,
     gapped_squares,
     grid_step,
@@ -75,6 +77,9 @@ def test_frames_at_whole_numbers_of_steps_have_one_grid():
     with pytest.raises(TooFewFramesError) as caught:
         frames_of([0, 1], here=[True, False])
     assert caught.value.n_frames == 1
+    # The times of a track without gaps are not copied.
+    time, piece = DT * np.arange(4.0), np.zeros(4, dtype=int)
+    assert np.shares_memory(place_frames(time, piece, piece == 0, dt=DT).time, time)
 
 
 def test_pieces_have_grids_of_their_own():
@@ -117,6 +122,7 @@ def test_long_holes_are_cut_where_a_grid_would_be_mostly_empty():
     frames = frames_of([*range(10), 17, 26, 1000])
     assert blocks_of(frames) == ([0] * 11 + [1, 2], [*range(10), 17, 0, 0])
     assert (frames.separate, frames.exact) == (False, True)
+    assert not frames_of([*range(10), 1000]).separate
     # Only the piece that is mostly empty is cut.
     both = frames_of([0, 1, 20, 0, 1, 1000], piece=[0] * 3 + [1] * 3)
     assert both.block.tolist() == [0, 0, 0, 1, 1, 2]
@@ -192,6 +198,22 @@ def test_sums_over_pairs_are_those_one_by_one(name, most):
     assert (found.listed is None) == frames.separate
     if most is not None and frames.separate:
         assert len(found.lagtime) == 2
+
+
+def test_pairs_across_blocks_are_formed_up_to_the_lag_at_which_they_are_few(monkeypatch):
+    """With 4 allowed, up to 3.1 steps; pairs of one block are those on its grid as before."""
+    monkeypatch.setattr(pairs_module, "_MOST_LISTED_PAIRS", 4)
+    frames = frames_of(UNEVEN["off"][0])
+    walk = np.random.default_rng(4).normal(size=(6, 1, 3))
+    with pytest.warns(PrecisionWarning, match=r"lie in 2 groups .* more than 4 pairs: .* 1.55 s"):
+        found = pair_sums(Squares(walk), frames)
+    number, lag, square = direct(frames, walk, 6)
+    np.testing.assert_array_equal(found.pairs, number)
+    np.testing.assert_allclose(found.lagtime, lag, rtol=1e-12)
+    np.testing.assert_allclose(found.sums, square, rtol=1e-9)
+    np.testing.assert_array_equal(found.on_grid, [4, 0, 2, 0])
+    np.testing.assert_array_equal(found.listed.lag, [1, 3, 3])
+    np.testing.assert_array_equal(found.listed.first, [2, 1, 2])
 
 
 def test_no_pair_of_frames_is_an_error():
@@ -462,6 +484,16 @@ def test_the_mean_velocity_is_that_from_first_to_last_frames():
     assert caught.value.n_frames == 0
 
 
+def test_a_mean_velocity_is_corrected_where_the_first_lag_has_no_pair():
+    """Without an offset 2 D t (1 - t/T) is left, whatever lags there are."""
+    lag = np.arange(1.0, 7)
+    left = np.where(lag == 1, np.nan, 2 * lag * (1 - lag / 8))[:, None] * [1.0, 3.0]
+    pairs = np.array([0, 4, 3, 2, 2, 1])
+    found = drift_corrected(left, pairs, lagtime=lag, durations=np.array([2.0, 6.0]))
+    np.testing.assert_allclose(found[1:], 2 * lag[1:, None] * [1.0, 3.0], rtol=1e-9)
+    assert np.isnan(found[0]).all()
+
+
 def test_curves_state_what_they_are():
     """Kind, unit, degrees of freedom, walks and noise, and one line of text."""
     motion = turning_by(0.05 * np.random.default_rng(2).normal(size=(30, 3)))
@@ -469,7 +501,7 @@ def test_curves_state_what_they_are():
     motion = replace(motion, covariance=noise, center_variance=np.full(31, 7e-4), sigma=0.02)
     one, vector, axis, place = (
         msad(motion, directions=[1, 0, 0]), msad_vector(motion),
-        msad_axes(motion, axes=[0, 0, 3])[0], msd(motion),
+        msad_axes(motion, axes=[0, 0, 0.3])[0], msd(motion),
     )  # fmt: skip
     assert [c.dof for c in (one, vector, axis, place)] == [2, 3, 1, 3]
     noises = [one.noise, vector.noise, axis.noise, place.noise]
