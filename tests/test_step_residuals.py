@@ -166,6 +166,10 @@ def test_the_probability_of_a_jump_is_that_of_hotellings_law():
     freedom = 58 - 3 + 1
     p = 59 * stats.f.sf(square * freedom / (3 * 58), 3, freedom)
     assert found.p[0] == pytest.approx(p[0], rel=1e-6)
+    # A body that never leaves a plane jumps in it.
+    level = replace(motion, center=center * [1.0, 1.0, 0.0])
+    in_plane = perrin.estimate_diffusion(level, quantity="translation")
+    assert find_jumps(level, in_plane).rows.tolist() == [25]
     # Each of several motions alone; a track of 7 steps has no scale, of 8 it has.
     short = [replace_frames(motion, np.arange(20, 20 + n)) for n in (8, 9)]
     still = replace(motion, center=np.zeros_like(center))
@@ -276,12 +280,13 @@ def test_steps_smoother_than_by_motion_blur_gain():
     assert persistence_gain(smooth, at_limit) == 0
     below = replace(estimate, offset=-estimate.value * DT / 3 * 1.001)
     assert persistence_gain(smooth, below) == pytest.approx(gain)
-    # The likelihoods with half a step and with a third of one as the most blur.
-    best = [
-        perrin.estimate_diffusion(smooth, quantity="translation", exposure=e).offset
-        for e in (None, 1.0)
-    ]
-    assert best[0] < best[1] <= 0
+    # Twice the difference of the likelihoods with half a step and a third of one as the most blur.
+    densities = []
+    for exposure in (None, 1.0):
+        one = perrin.estimate_diffusion(smooth, quantity="translation", exposure=exposure)
+        density = stats.multivariate_normal(cov=dense_covariance(smooth, one))
+        densities.append(density.logpdf(np.diff(smooth.center, axis=0).T).sum())
+    assert gain == pytest.approx(2 * (densities[0] - densities[1]), rel=1e-4)
     drifting = replace(smooth, center=smooth.center + smooth.time[:, None] * [3.0, 0, 0])
     free = perrin.estimate_diffusion(drifting, quantity="translation", drift=True)
     kept = persistence_gain(drifting, free)
@@ -330,7 +335,7 @@ def test_jumps_of_the_stage_over_gaps_and_of_some_bodies():
     """A step over a gap is as long as its time; bodies that are absent do not count."""
     motions = bodies(jump=1.8)
     keep = np.delete(np.arange(24), [8, 9])
-    frames = [keep, keep, keep, keep[:6]]
+    frames = [keep, keep, keep, keep[:4]]
     some = [replace_frames(m, f) for m, f in zip(motions, frames, strict=True)]
     found = find_stage_jumps(some, frames)
     assert found.frames.tolist() == [10]
@@ -339,8 +344,17 @@ def test_jumps_of_the_stage_over_gaps_and_of_some_bodies():
     assert np.abs(found.size[0] - back).max() < 0.5
     near = find_stage_jumps(bodies(jump=1.8)[:3], [np.arange(24)] * 3)
     assert np.all(found.stderr[0] > 1.3 * near.stderr[0])
-    assert not find_stage_jumps(motions[:1], [np.arange(24)]).frames.size
-    assert not find_stage_jumps([], []).frames.size
+    # Three steps are the fewest that have a scale.
+    frames[3] = keep[:3]
+    some[3] = replace_frames(motions[3], keep[:3])
+    assert not find_stage_jumps(some, frames).frames.size
+    # No body at all has the step that ends at frame 16.
+    frames = [np.delete(np.arange(24), lost) for lost in (15, 15, 16, 16)]
+    some = [replace_frames(m, f) for m, f in zip(motions, frames, strict=True)]
+    assert find_stage_jumps(some, frames).frames.tolist() == [10]
+    for none in (find_stage_jumps(motions[:1], [np.arange(24)]), find_stage_jumps([], [])):
+        assert none.size.shape == none.stderr.shape == (0, 3)
+        assert none.frames.size == none.p.size == none.bodies.size == 0
     # One body alone, 8 steps with the jump among them, or a jump every few steps: none.
     alone = [*bodies(jump=0.0)[:3], bodies(jump=5.0)[3]]
     assert not find_stage_jumps(alone, [np.arange(24)] * 4).frames.size
