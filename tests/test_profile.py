@@ -164,6 +164,38 @@ def test_a_D_of_each_motion_has_its_own_interval():
     assert least[1] == pytest.approx(1e-24 * least[0])
 
 
+@pytest.mark.parametrize(
+    ("n_frames", "seed", "still"), [(5, 94, True), (6, 77, True), (8, 151, True), (6, 132, False)]
+)
+def test_the_highest_of_several_maxima_counts(n_frames, seed, still):
+    """Short tracks whose profile falls from D = 0 and has a maximum elsewhere, lower or higher."""
+    likelihood = Likelihood.of([track("joint", seed=seed, n_frames=n_frames, D=1e-4)])
+    D = np.append(0, np.geomspace(1e-3, 30, 60))[:, None] * likelihood.scale
+    value = likelihood.profile(D, tolerance=1e-7).value[:, 0]
+    inside = (value[1:-1] > value[:-2]) & (value[1:-1] > value[2:])
+    assert value[1] < value[0]
+    assert inside.sum() == 1
+    best = likelihood.best()
+    assert (best.D[0] == 0) == still
+    assert best.value[0] >= value.max()
+
+
+@pytest.mark.parametrize("name", POOLS)
+def test_the_slope_at_the_maximum_is_zero(name):
+    """To a millionth of a standard error, D in units of itself; ends of intervals to 1e-6."""
+    likelihood = Likelihood.of(POOLS[name]())
+    best = likelihood.best()
+    at = likelihood.profile(best.D, tolerance=1e-10)
+    assert abs(at.slope[0] / np.sqrt(-at.curvature[0])) < 1e-6
+    drops = np.array([[1.0], [3.84], [20.0]])
+    for ends in likelihood.intervals(best, drops):
+        for end, drop in zip(ends[:, 0], drops[:, 0], strict=True):
+            fall = 2 * (
+                best.value[0] - likelihood.profile(np.array([end]), tolerance=1e-9).value[0]
+            )
+            assert fall == pytest.approx(drop, rel=1e-6) or (end == 0 and fall < drop)
+
+
 def test_a_maximum_and_its_interval_take_few_evaluations(monkeypatch):
     """Of 30 tracks with noise from far below the steps to far above: at most 30 on average.
 
