@@ -196,8 +196,23 @@ def test_the_slope_at_the_maximum_is_zero(name):
             assert fall == pytest.approx(drop, rel=1e-6) or (end == 0 and fall < drop)
 
 
+def test_another_unit_of_length_changes_D_and_its_interval_by_its_square():
+    """Also where D is far above 1."""
+    one = track("joint")
+    other = replace(
+        one, steps=replace(one.steps, vectors=1e3 * one.steps.vectors, sigma=1e3 * SIGMA)
+    )
+    found = []
+    for steps in (one, other):
+        likelihood = Likelihood.of([steps])
+        best = likelihood.best()
+        low, high = likelihood.intervals(best, np.array([[1.0], [3.84]]))
+        found.append(np.concatenate([best.D, best.theta, low[:, 0], high[:, 0]]))
+    np.testing.assert_allclose(found[1], 1e6 * found[0], rtol=1e-6)
+
+
 def test_a_maximum_and_its_interval_take_few_evaluations(monkeypatch):
-    """Of 30 tracks with noise from far below the steps to far above: at most 30 on average.
+    """Of 30 tracks, noise free or known and from far below the steps to far above: 30 on average.
 
     Slower steps of the search would find the same maxima.
     """
@@ -205,9 +220,10 @@ def test_a_maximum_and_its_interval_take_few_evaluations(monkeypatch):
     sums = Likelihood.sums
     monkeypatch.setattr(Likelihood, "sums", lambda *a, **k: calls.append(1) or sums(*a, **k))
     for k, noise in enumerate(np.geomspace(1e-5, 0.1, 30)):
-        likelihood = Likelihood.of([track("joint", seed=k, noise=noise)])
-        likelihood.intervals(likelihood.best(), np.array([[1.0], [3.84]]))
-    assert len(calls) < 30 * 30
+        for mode in ("joint", "known"):
+            likelihood = Likelihood.of([track(mode, seed=k, noise=noise)])
+            likelihood.intervals(likelihood.best(), np.array([[1.0], [3.84]]))
+    assert len(calls) < 60 * 30
 
 
 def test_a_point_predicts_theta_by_a_power_of_D():
