@@ -435,7 +435,7 @@ def test_rows_without_a_pose_keep_the_labels_that_held():
 @pytest.mark.filterwarnings("ignore::perrin.IdentityWarning")
 def test_an_exchange_in_an_incomplete_row_of_a_large_body_is_found():
     """Its points are compared to the body where the particles present say it is."""
-    x = track_of(SEVEN, 0.02 * np.arange(12)[:, None] * [0.6, 0, 0.8])
+    x = track_of(SEVEN, 0.02 * np.arange(8)[:, None] * [0.6, 0, 0.8])
     x += 0.001 * np.random.default_rng(1).normal(size=x.shape)
     x[6, [0, 2]] = x[6, [2, 0]]
     x[6, 5:] = NONE

@@ -224,6 +224,11 @@ def test_a_drift_is_named_with_its_velocity(brownian):
     )
     still = judge_motion(brownian, quantity="translation")
     assert re.search(r"a cage under [\d.]+ um, or a drift over [\d.]+ um/s\.$", still.text)
+    assert verdict.model.drift[0][0] == pytest.approx(0.1, abs=4 * verdict.model.drift_stderr[0][0])
+
+
+def test_drifts_of_several_bodies_are_named_with_their_range(brownian):
+    flow = replace(brownian, center=brownian.center + brownian.time[:, None] * [0.1, 0.0, 0.0])
     faster = replace(flow, center=flow.center + brownian.time[:, None] * [0.2, 0.0, 0.0])
     both = judge_motion([flow, faster], quantity="translation")
     assert re.match(
@@ -231,7 +236,6 @@ def test_a_drift_is_named_with_its_velocity(brownian):
         both.text,
     )
     assert both.text.endswith("Singly: 2 drift.")
-    assert verdict.model.drift[0][0] == pytest.approx(0.1, abs=4 * verdict.model.drift_stderr[0][0])
 
 
 def test_jumps_are_named_with_their_rows(brownian):
