@@ -184,6 +184,9 @@ def test_closest_points_converge_from_a_rotation_nearby(monkeypatch):
     # A close fit ends the search, and the next row begins at its rotation.
     fits = []
     monkeypatch.setattr(identity, "icp_fit", lambda *a: fits.append(1) or icp_fit(*a))
+    # So it does in nanometres, with noise of a hundredth of the least distance.
+    noise = 0.02 * np.random.default_rng(1).normal(size=x.shape)
+    x, far, body = (1e3 * one for one in (x + noise, far + noise, body))
     icp_search(np.stack([x, far, far, far]), body)
     first = len(fits)
     icp_search(np.stack([x, far]), body)

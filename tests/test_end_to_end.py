@@ -7,6 +7,9 @@ import numpy as np
 import pytest
 
 BENCHMARK = Path(__file__).resolve().parents[1] / "benchmarks" / "end_to_end.py"
+pytest.importorskip("tifffile")
+pytest.importorskip("trackpy")
+
 RECIPE = {"clusters": 2, "n_frames": 6, "shape": (40, 60, 100), "photons": 40.0, "seed": 0}
 
 

@@ -165,7 +165,8 @@ def test_a_D_of_each_motion_has_its_own_interval():
 
 
 @pytest.mark.parametrize(
-    ("n_frames", "seed", "still"), [(5, 94, True), (6, 77, True), (8, 151, True), (6, 132, False)]
+    ("n_frames", "seed", "still"),
+    [(5, 18, True), (5, 242, True), (5, 491, True), (5, 338, False), (6, 132, False)],
 )
 def test_the_highest_of_several_maxima_counts(n_frames, seed, still):
     """Short tracks whose profile falls from D = 0 and has a maximum elsewhere, lower or higher."""
@@ -177,7 +178,7 @@ def test_the_highest_of_several_maxima_counts(n_frames, seed, still):
     assert inside.sum() == 1
     best = likelihood.best()
     assert (best.D[0] == 0) == still
-    assert best.value[0] >= value.max()
+    assert best.value[0] >= value.max() - 1e-9
 
 
 @pytest.mark.parametrize("name", POOLS)
@@ -283,7 +284,7 @@ def scatter_by_definition(one, D, theta):
     for a in range(axes):
         for b in range(axes):
             power = m[:, a] * m[:, b] - (a == b) * rows[1] * (noise[a] - noise.mean())
-            deviation[:, a, b] = np.linalg.lstsq((rows / eigen).T, power / eigen)[0]
+            deviation[:, a, b] = np.linalg.lstsq((rows / eigen).T, power / eigen, rcond=None)[0]
     deviation -= np.trace(deviation, axis1=1, axis2=2)[:, None, None] / axes * np.eye(axes)
     by_theta = 2 * c * (weight.mean() if np.isfinite(one.freedom) else 0.0)
     prior = one.freedom / axes / theta**2 if np.isfinite(one.freedom) and theta > 0 else 0.0
