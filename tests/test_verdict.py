@@ -280,6 +280,22 @@ def test_without_residuals_the_larger_score_tells_noise_from_D(brownian, growing
     assert verdict.kind == ("changing D" if growing == "D" else "diffusion")
 
 
+@pytest.mark.parametrize(
+    ("errors", "kind"), [(3.2, "diffusion"), (-3.2, "diffusion"), (2.8, "changing D")]
+)
+def test_residuals_that_change_beyond_three_errors_tell_noise_from_D(brownian, errors, kind):
+    rng, direction = np.random.default_rng(6), 1 if errors > 0 else -1
+    size = np.linspace(0.4, 1.6, 301)[::direction, None]
+    center = np.cumsum(0.1 * size * rng.normal(size=(301, 3)), axis=0)
+    center += 0.1 * rng.normal(size=(301, 3))
+    # The squares are correlated with time by this number of errors, 1/sqrt(301) each.
+    t, share = np.linspace(-1, 1, 301), errors / np.sqrt(301)
+    other = np.sqrt(1 - share**2) * np.where(np.arange(301) % 2, 1, -1)
+    square = 1 + 0.05 * (share * t / t.std() + other)
+    motion = replace(brownian, center=center, residual=0.03 * np.sqrt(square))
+    assert judge_motion(motion, quantity="translation").kind == kind
+
+
 def test_several_motions_show_what_one_cannot():
     motions = [planted(Fractional(0.75), frames=301, seed=100 + 3 * k) for k in range(4)]
     verdict = judge_motion(motions)
