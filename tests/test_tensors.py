@@ -24,6 +24,7 @@ from perrin import (
 from perrin.diffusion import effective_modes, tensor_likelihood
 from perrin.diffusion.noise_model import Noise
 from perrin.diffusion.steps import Steps, body_steps
+from perrin.diffusion.tensor_batches import SeparateTensors, maximise_each
 from perrin.diffusion.tensor_likelihood import (
     Maximum,
     NoisyVectors,
@@ -818,3 +819,19 @@ def test_axes_are_named_as_those_of_a_reference():
         turned = reference @ exp_map(0.2 * rng.normal(size=3))
         shuffled = (turned * [1, -1, -1])[:, order]
         np.testing.assert_array_equal(np.array(order)[axes_like(shuffled, reference)], range(3))
+
+
+def test_the_highest_likelihood_does_not_depend_on_the_noise_a_search_begins_with():
+    """Noise and blur are hardly told apart where D is nearly the same along all axes."""
+    body, data = Cluster.tetrahedron(1.5), []
+    for seed in range(8):
+        truth = simulate_motion(body, D_R=5e-3, D_T=0.02, dt=0.7, n_frames=250, rng=seed)
+        motion = track_rotation(add_noise(truth.positions(), sigma=0.03, rng=1), dt=0.7)
+        data.append(ScaledTracks.of([body_steps(motion, "translation", np.eye(3))], Noise()))
+    each = SeparateTensors.of([one.tracks[0] for one in data])
+    family, q = squares(symmetric_basis(3)), np.tile([0.5, 0.5, 0.5, 0, 0, 0], (len(data), 1))
+    size, values = np.array([one.start()[1][0, 0] for one in data]), []
+    for amplitude, angle in [(0.3, 0.05), (1.0, 0.6), (3.0, 1.5)]:
+        own = np.column_stack([amplitude * size, np.full(len(data), angle)])
+        values.append([one.value for one in maximise_each(each, family, q, own)])
+    np.testing.assert_allclose(values[1:], [values[0]] * 2, atol=1e-6)
