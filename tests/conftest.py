@@ -25,3 +25,28 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 def repeats(request: pytest.FixtureRequest) -> Callable[[int, int], int]:
     """Choose between two numbers of repeats: the first, or with --long the second."""
     return lambda quick, long: long if request.config.getoption("--long") else quick
+
+
+@pytest.fixture
+def no_tensors(monkeypatch: pytest.MonkeyPatch, repeats: Callable[[int, int], int]) -> None:
+    """Leave out the tensors of an analysis in the quick form of a test that does not look at them.
+
+    They take a third of the time of an analysis; tests/test_tensors.py tests them.
+    """
+    if not repeats(0, 1):
+        monkeypatch.setattr(
+            "perrin.run.measure.measure_tensors", lambda motions, *_: [(None, [])] * len(motions)
+        )
+
+
+@pytest.fixture
+def no_verdicts(monkeypatch: pytest.MonkeyPatch, repeats: Callable[[int, int], int]) -> None:
+    """Leave out the kind of motion in the quick form of a test that does not look at it.
+
+    It takes up to half of the time of an analysis; tests/test_run_verdicts.py tests it.
+    """
+    if not repeats(0, 1):
+        monkeypatch.setattr(
+            "perrin.run.measure.judge_each_and_all",
+            lambda motions, **_: ([None] * len(motions), None),
+        )

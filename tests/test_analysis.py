@@ -39,17 +39,17 @@ def values(report: perrin.Report) -> np.ndarray:
     return np.array([[c.D_R.value, *c.D_R.ci95, c.D_T.value, *c.D_T.ci95] for c in report.clusters])
 
 
-@pytest.fixture(autouse=True)
-def unjudged(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch, repeats) -> None:
-    """Leave out the kind of motion in the quick form, but where results are written and read.
+@pytest.fixture
+def everything() -> None:
+    """Leave nothing out of the analyses of a test."""
 
-    It takes half of the time of an analysis; tests/test_run_verdicts.py tests it.
-    """
-    if not repeats(0, 1) and not {"tmp_path", "whole"} & set(request.fixturenames):
-        monkeypatch.setattr(
-            "perrin.run.measure.judge_each_and_all",
-            lambda motions, **_: ([None] * len(motions), None),
-        )
+
+@pytest.fixture(autouse=True)
+def coefficients_alone(request: pytest.FixtureRequest) -> None:
+    """Leave out the kind of motion and the tensor, but where results are written or compared."""
+    if not {"tmp_path", "everything"} & set(request.fixturenames):
+        request.getfixturevalue("no_tensors")
+        request.getfixturevalue("no_verdicts")
 
 
 @pytest.fixture(scope="module")
@@ -335,6 +335,7 @@ def test_like_clusters_share_one_solution(monkeypatch):
     assert trimer > 1.1 * values[0]
 
 
+@pytest.mark.usefixtures("everything")
 def test_a_shared_solution_is_turned_into_the_axes_of_each_body(monkeypatch):
     """A bent chain of four, relabelled and turned: along its axes the same as solved for itself."""
     bent = 2.0 * np.array([[0.0, 0, 0], [1, 0, 0], [1.5, 0.9, 0], [1.5, 0.9, 1.1]])
@@ -734,7 +735,7 @@ def same(one: object, other: object) -> bool:
     return bool(one == other)
 
 
-@pytest.mark.usefixtures("whole")
+@pytest.mark.usefixtures("everything")
 def test_results_come_back_from_json(base):
     """Clusters, rods, pooled values, predictions and sizes are the same after JSON."""
     truth = perrin.simulate_motion(

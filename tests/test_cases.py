@@ -13,6 +13,8 @@ from scipy.spatial.transform import Rotation
 
 import perrin
 
+pytestmark = pytest.mark.usefixtures("no_tensors")
+
 DT = 0.73
 D_R = 5e-3
 TETRA = 1.5 * np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / np.sqrt(3)

@@ -40,7 +40,7 @@ from perrin.study import (
 )
 
 
-def write_table(path, *, seed, D=5e-3, clusters=2, frames=40):
+def write_table(path, *, seed, D=5e-3, clusters=2, frames=205):
     """Write the table of a movie with tetrahedra."""
     rng = np.random.default_rng(seed)
     body, parts = perrin.Cluster.touching(4, 2.45), []
@@ -67,7 +67,7 @@ def finished(tmp_path_factory):
     """Run a study of three tables, one of them unreadable, once."""
     folder = tmp_path_factory.mktemp("study")
     write_table(folder / "a.csv", seed=1)
-    write_table(folder / "b.csv", seed=2, D=2e-3, clusters=1, frames=30)
+    write_table(folder / "b.csv", seed=2, D=2e-3, clusters=1)
     (folder / "bad.csv").write_text("frame,particle\n1,1\n")
     manifest = write_study(folder, movies={0.1: ["a.csv", "bad.csv"], 0.4: ["b.csv"]})
     result = Study.from_toml(manifest).run(folder / "STUDY")
@@ -214,10 +214,17 @@ def test_every_movie_is_an_ordinary_run_with_the_same_numbers(finished):
     assert values == {c.cluster: c.D_T.value for c in run.clusters}
 
 
+@pytest.fixture(scope="module")
+def known(tmp_path_factory):
+    """Return the report of one short table."""
+    path = tmp_path_factory.mktemp("known") / "one.csv"
+    write_table(path, seed=2, D=2e-3, clusters=1, frames=15)
+    return perrin.analyze(path, dt=0.7)
+
+
 @pytest.fixture
-def quick(finished, monkeypatch):
-    """Measure any table that can be read as the first one was, and draw nothing."""
-    known = perrin.analyze(finished[0] / "b.csv", dt=0.7)
+def quick(known, monkeypatch):
+    """Measure any table that can be read as a known one, and draw nothing."""
 
     def analyze(path, **_):
         perrin.read_tracks(path)
