@@ -144,6 +144,9 @@ def test_a_failed_run_leaves_nothing(tmp_path, monkeypatch):
         raise RuntimeError("stopped")
 
     monkeypatch.setattr(remake, "ITEMS", (localisation,))
+    monkeypatch.setattr(
+        "matplotlib.figure.Figure.savefig", lambda _, to, **__: to.write_bytes(b"figure")
+    )
     with pytest.raises(RuntimeError, match="stopped"):
         remake.reproduce(tmp_path / "run", progress=broken)
     assert list(tmp_path.iterdir()) == []
