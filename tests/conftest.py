@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from left_out import leave_out_tensors, leave_out_verdicts
+
 if TYPE_CHECKING:
     from collections.abc import Callable
 
@@ -29,24 +31,13 @@ def repeats(request: pytest.FixtureRequest) -> Callable[[int, int], int]:
 
 @pytest.fixture
 def no_tensors(monkeypatch: pytest.MonkeyPatch, repeats: Callable[[int, int], int]) -> None:
-    """Leave out the tensors of an analysis in the quick form of a test that does not look at them.
-
-    They take a third of the time of an analysis; tests/test_tensors.py tests them.
-    """
+    """Leave out the tensors of an analysis in the quick form of a test."""
     if not repeats(0, 1):
-        monkeypatch.setattr(
-            "perrin.run.measure.measure_tensors", lambda motions, *_: [(None, [])] * len(motions)
-        )
+        leave_out_tensors(monkeypatch)
 
 
 @pytest.fixture
 def no_verdicts(monkeypatch: pytest.MonkeyPatch, repeats: Callable[[int, int], int]) -> None:
-    """Leave out the kind of motion in the quick form of a test that does not look at it.
-
-    It takes up to half of the time of an analysis; tests/test_run_verdicts.py tests it.
-    """
+    """Leave out the kind of motion in the quick form of a test."""
     if not repeats(0, 1):
-        monkeypatch.setattr(
-            "perrin.run.measure.judge_each_and_all",
-            lambda motions, **_: ([None] * len(motions), None),
-        )
+        leave_out_verdicts(monkeypatch)

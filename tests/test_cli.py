@@ -21,6 +21,7 @@ import pytest
 
 import perrin
 from command_line import command_line
+from left_out import make_figures_without_rendering
 from perrin.cli.app import analyze
 from perrin.cli.tables import kinds_table, show_report, terms_of
 
@@ -85,9 +86,7 @@ def demo(tmp_path_factory: pytest.TempPathFactory, repeats) -> tuple[Path, str]:
     with pytest.MonkeyPatch.context() as patched:
         patched.setenv("COLUMNS", "100")
         if not repeats(0, 1):
-            patched.setattr(
-                "matplotlib.figure.Figure.savefig", lambda _, to, **__: to.write_bytes(b"figure")
-            )
+            make_figures_without_rendering(patched)
         result = run("demo", cwd=folder)
     assert result.returncode == 0, result.stderr
     return folder / "perrin-demo", result.stdout

@@ -6,7 +6,6 @@ import json
 import pickle
 import sys
 import tracemalloc
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np

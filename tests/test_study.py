@@ -14,6 +14,7 @@ import pytest
 from typer.testing import CliRunner
 
 import perrin
+from left_out import make_figures_without_rendering
 from perrin.cli.app import app
 from perrin.errors import FolderInUseError, ManifestError
 from perrin.run.lock import locked
@@ -75,9 +76,7 @@ def finished(tmp_path_factory, repeats):
     manifest = write_study(folder, movies={0.1: ["a.csv", "bad.csv"], 0.4: ["b.csv"]})
     with pytest.MonkeyPatch.context() as patched:
         if not repeats(0, 1):
-            patched.setattr(
-                "matplotlib.figure.Figure.savefig", lambda _, to, **__: to.write_bytes(b"figure")
-            )
+            make_figures_without_rendering(patched)
         result = Study.from_toml(manifest).run(folder / "STUDY")
     return folder, result
 
