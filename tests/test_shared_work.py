@@ -41,10 +41,10 @@ def tetrahedra(count, n_frames):
 def test_a_dask_cluster_gives_the_results_of_one_process(scheduler, monkeypatch):
     """Every number, remark and failure is the same to the last bit, in the same order."""
     monkeypatch.setattr(measure, "clusters_together", lambda count: 2)
-    table = tetrahedra(6, 20)
+    table = tetrahedra(4, 15)
     alone = perrin.analyze(table, dt=0.7)
     shared = perrin.analyze(table, dt=0.7, scheduler=scheduler)
-    assert [one.cluster for one in shared.clusters] == [0, 1, 2, 3, 4]
+    assert [one.cluster for one in shared.clusters] == [0, 1, 2]
     assert shared.warnings == alone.warnings
     ours, theirs = alone.to_dict(), shared.to_dict()
     for entry in (ours, theirs):
