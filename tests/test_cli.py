@@ -194,6 +194,7 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
 
 
+@pytest.mark.usefixtures("no_tensors", "no_verdicts")
 def test_demo_replaces_only_its_own(demo, csv, tmp_path, monkeypatch):
     """The demo can be repeated; a folder that holds anything else stays as it is.
 
@@ -234,7 +235,7 @@ def test_demo_replaces_only_its_own(demo, csv, tmp_path, monkeypatch):
     assert b"earlier version" not in (place / "report.html").read_bytes()
 
 
-@pytest.mark.usefixtures("no_figures")
+@pytest.mark.usefixtures("no_figures", "no_verdicts")
 def test_demo_with_a_folder_overwrites_nothing(demo, tmp_path):
     """With -o even the demo's own folder is refused, unless --overwrite; status 2, no work."""
     place = tmp_path / "perrin-demo"

@@ -66,6 +66,7 @@ def test_coordinates_far_from_the_origin(places, usual):
     assert_equal(measured(places + 1e6), usual, rel=1e-5)
 
 
+@pytest.mark.usefixtures("no_tensors", "no_verdicts")
 def test_numbers_of_frames_that_begin_anywhere(places, usual):
     """Negative and large ones; every third frame has the time of three."""
     for first in (-30, 10**9):
@@ -74,6 +75,7 @@ def test_numbers_of_frames_that_begin_anywhere(places, usual):
     assert_equal(measured(few, np.arange(0, 60, 3)), measured(few, dt=3 * DT), rel=1e-6)
 
 
+@pytest.mark.usefixtures("no_tensors", "no_verdicts")
 def test_types_of_numbers(places, usual):
     """float32 and whole numbers are read as they are."""
     assert_equal(measured(places.astype(np.float32)), usual, rel=1e-3)
@@ -131,6 +133,7 @@ def test_what_shows_no_motion_is_refused_in_words(places, change, message):
         measured(change(places))
 
 
+@pytest.mark.usefixtures("no_tensors", "no_verdicts")
 def test_mirrored_frames_and_particles_at_one_place(places, usual):
     """A mirrored body has the same D; a frame with two particles at one place is left out."""
     assert_equal(measured(places * [1, 1, -1]), usual)
@@ -145,6 +148,7 @@ def test_mirrored_frames_and_particles_at_one_place(places, usual):
     assert measured(far).D_R.value == pytest.approx(usual.D_R.value, rel=0.2)
 
 
+@pytest.mark.usefixtures("no_tensors", "no_verdicts")
 def test_nearly_collinear_particles(places):
     """Three on a line and one beside it have a full rotation, of the planted D_R."""
     line = np.array([[0.0, 0, 0], [2.45, 0, 0], [4.9, 0, 0], [2.45, 0.3, 0]])
