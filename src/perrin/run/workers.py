@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
     from typing import TypeAlias
 
+    from threadpoolctl import ThreadpoolController
+
     Progress: TypeAlias = Callable[[int, int, str], None]
 
 
@@ -230,7 +232,7 @@ def one_thread(task: Callable[[S], T], item: S) -> T:
 
 
 @lru_cache(maxsize=1)
-def _thread_pools(_modules: int) -> Any:
+def _thread_pools(_modules: int) -> ThreadpoolController:
     """Return the controller of the threads of all loaded libraries.
 
     The search for them takes milliseconds; it is repeated only after an import, which may load
