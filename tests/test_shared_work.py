@@ -10,7 +10,33 @@ import pytest
 
 import perrin
 from perrin.run import batches_of, measure, shared_work
-from perrin.run.workers import Work, dask_client
+from perrin.run.workers import Work, dask_client, one_thread
+
+
+def test_work_is_done_on_one_thread_and_the_number_before_comes_back(monkeypatch):
+    """The libraries are searched once, and again after an import, which may load another one."""
+    pools = pytest.importorskip("threadpoolctl")
+    pytest.importorskip("scipy.linalg")
+    searched, search = [], pools.ThreadpoolController.__init__
+
+    def counted(controller):
+        searched.append(1)
+        search(controller)
+
+    def threads(_=None):
+        return [one["num_threads"] for one in pools.threadpool_info()]
+
+    with pools.threadpool_limits(2):
+        before = threads()
+        assert max(before) == 2
+        assert set(one_thread(threads, 0)) == {1}
+        assert threads() == before
+    monkeypatch.setattr(pools.ThreadpoolController, "__init__", counted)
+    one_thread(float, 0)
+    assert searched == []
+    monkeypatch.setitem(sys.modules, "another", pools)
+    one_thread(float, 0)
+    assert searched == [1]
 
 
 @pytest.fixture(scope="module")
