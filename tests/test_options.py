@@ -134,7 +134,7 @@ def literals() -> tuple[str, ...]:
                 waiting.append(constant)
             elif isinstance(constant, str):
                 found.append(constant)
-    return tuple(text for text in found if " " in text)
+    return tuple(text for text in found if re.search(r"[ =]", text))
 
 
 @pytest.mark.parametrize("command", COMMANDS, ids=lambda c: c.__name__)
