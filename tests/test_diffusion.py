@@ -8,6 +8,7 @@ import warnings
 import numpy as np
 import pytest
 
+from brownian_motions import all_tracked
 from perrin import (
     Cluster,
     DiffusionEstimate,
@@ -27,7 +28,6 @@ from perrin.diffusion.estimate import Found
 from perrin.diffusion.likelihood import Likelihood
 from perrin.diffusion.noise_model import Noise
 from perrin.diffusion.steps import NoisySteps, steps_of
-from perrin.motion.tracking import track_each
 
 TETRAHEDRON = Cluster.tetrahedron(1.5)
 SIGMA = 0.03  # sigma/R = 0.02
@@ -67,12 +67,6 @@ def lossy(seed, frames=0.0, particles=0.0, **what):
 
 def tracked(x, **how):
     return track_rotation(x, dt=how.pop("dt", 1.0), **how)
-
-
-def all_tracked(positions):
-    """Return the motions of tracks of one length, fitted together as each would be alone."""
-    x = np.stack(list(positions))
-    return track_each(x, time=np.tile(np.arange(x.shape[1], dtype=float), (len(x), 1)), dt=1.0)
 
 
 def all_estimated(motions, quantity="rotation", *, method="mle", noise="joint", **more):

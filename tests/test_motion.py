@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 import perrin
+from brownian_motions import all_tracked
 from perrin import (
     Cluster,
     DegenerateClusterError,
@@ -23,7 +24,6 @@ from perrin import (
 )
 from perrin.geometry.rotations import exp_map, log_map
 from perrin.motion.residuals import body_residuals
-from perrin.motion.tracking import track_each
 
 TETRA = Cluster.tetrahedron(1.5)
 TRIMER = Cluster.trimer(1.5)
@@ -39,12 +39,6 @@ BODIES = {"tetrahedron": TETRA, "trimer": TRIMER, "bipyramid": BIPYRAMID}
 FLATS = {"2-D pair": PAIR, "2-D four": FLAT}
 
 laws = settings(max_examples=3, deadline=None, derandomize=True)
-
-
-def all_tracked(tracks):
-    """Return the motions of tracks of one length, fitted together as each would be alone."""
-    x = np.stack(tracks)
-    return track_each(x, time=np.tile(0.5 * np.arange(x.shape[1]), (len(x), 1)), dt=0.5)
 
 
 def simulated(cluster, n_frames=120, seed=0, sigma=0.0, D_R=2e-2, D_T=0.05):
@@ -305,7 +299,7 @@ def test_sigma_has_the_error_of_its_degrees_of_freedom(cluster, fraction, repeat
     for seed in range(repeats(8, 40)):
         _, x = simulated(cluster, n_frames=repeats(20, 100), sigma=0.03, seed=seed)
         tracks.append(with_holes(x, fraction, gap=(0, 0), seed=seed))
-    for motion in all_tracked(tracks):
+    for motion in all_tracked(tracks, dt=0.5):
         lost = 6 if d == 3 else 3
         dof = np.sum(d * motion.n_present[motion.fitted] - lost) - (d * n - lost)
         score.append((motion.sigma / 0.03 - 1) / (np.sqrt(2 / dof) / 2))

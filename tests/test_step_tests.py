@@ -9,6 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import perrin
+from brownian_motions import all_tracked
 from perrin.diffusion import estimate_each
 from perrin.diffusion.step_tests import (
     StageJumps,
@@ -17,7 +18,7 @@ from perrin.diffusion.step_tests import (
     find_stage_jumps,
     steady_motion,
 )
-from perrin.motion.tracking import track_each, track_rotation
+from perrin.motion.tracking import track_rotation
 
 DT = 0.73
 TETRA = 1.5 * np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / np.sqrt(3)
@@ -209,8 +210,8 @@ def test_the_test_for_a_steady_motion_keeps_its_level(quantity, repeats):
     is within 3 standard errors.
     """
     count = repeats(20, 80)
-    x = np.stack([brownian(s, frames=repeats(60, 100)) for s in range(count)])
-    motions = track_each(x, time=np.tile(DT * np.arange(x.shape[1]), (count, 1)), dt=DT)
+    tracks = (brownian(s, frames=repeats(60, 100)) for s in range(count))
+    motions = all_tracked(tracks, dt=DT)
     estimates = estimate_each(motions, quantity=quantity, noise=perrin.Noise())
     p = np.array([steady_motion(m, D).p for m, D in zip(motions, estimates, strict=True)])
     assert np.count_nonzero(p < 0.05) < repeats(5, 12)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
+from brownian_motions import all_tracked
 from perrin import (
     Cluster,
     PrecisionWarning,
@@ -37,7 +38,6 @@ from perrin.diffusion.tensor_modes import ChainTrack, FewModesTrack
 from perrin.diffusion.tensors import ScaledTracks, axes_like, symmetric_basis
 from perrin.geometry.rigid import diffusion_center, shifted
 from perrin.geometry.rotations import exp_map, skew
-from perrin.motion.tracking import track_each
 
 SLANT = exp_map(np.array([0.4, -0.7, 0.3]))
 BODY = Cluster.from_positions(np.random.default_rng(5).normal(size=(6, 3)))
@@ -63,12 +63,6 @@ def cloud(seed, n_frames=300, tensor=None, missing=0.0, **how):
 
 def tracked(seed, **what):
     return track_rotation(cloud(seed, **what), dt=1.0)
-
-
-def all_tracked(positions):
-    """Return the motions of tracks of one length, fitted together as each would be alone."""
-    x = np.stack(list(positions))
-    return track_each(x, time=np.tile(np.arange(x.shape[1], dtype=float), (len(x), 1)), dt=1.0)
 
 
 def in_body(motion, tensor):
