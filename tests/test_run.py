@@ -47,8 +47,8 @@ DIAMETER, DT, FRAMES = 2.45, 0.73, 8
 FEW = 4  # frames of the runs that are compared bit by bit
 SEARCH = {"diameter": DIAMETER, "contact": DIAMETER}
 OPTIONS = ["--diameter", "2.45", "--contact", "2.45"]
-CENTERS = [(4.0, 4.0, 4.0), (9.0, 9.0, 4.0)]
-VOXEL, SHAPE = (0.3, 0.25, 0.25), (27, 52, 52)
+CENTERS = [(3.75, 3.75, 4.0), (8.25, 8.25, 4.0)]
+VOXEL, SHAPE = (0.3, 0.25, 0.25), (26, 48, 48)
 SCENE = {
     "voxel": VOXEL,
     "diameter": DIAMETER,
@@ -478,7 +478,7 @@ def test_lengths_in_another_unit_are_refused(movie_file, counted, find, changed,
         pytest.raises(ValueError, match=message) as failed,
     ):
         find(stack, **SEARCH | changed)
-    sizes = "the stack is 8.1 x 13 x 13 um (z, y, x), its voxels are 0.3 x 0.25 x 0.25 um"
+    sizes = "the stack is 7.8 x 12 x 12 um (z, y, x), its voxels are 0.3 x 0.25 x 0.25 um"
     assert sizes in str(failed.value)
     assert counted == []
 
