@@ -48,7 +48,6 @@ def motions():
         tracked(TETRAHEDRON, 210, 1),
         tracked(IRREGULAR, 210, 2),
         tracked(TETRAHEDRON, 210, 3),
-        tracked(IRREGULAR, 60, 4),
         tracked(TETRAHEDRON, 60, 5, gaps=(7, 50, 51)),
     ]
 
