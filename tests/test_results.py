@@ -164,7 +164,7 @@ class TestFromRotations:
 
 @pytest.mark.usefixtures("no_tensors")
 def test_progress_counts_the_clusters_of_every_long_step(tmp_path, monkeypatch):
-    """Steps begin at 0 of their total; 17 clusters are estimated in two parts, written singly."""
+    """Steps begin at 0 of their total; 20 clusters are estimated in two parts, written singly."""
     monkeypatch.setattr("perrin.report.write.save_figures", lambda *_, **__: [])
     calls: dict[str, list[tuple[int, int]]] = {}
 
@@ -173,7 +173,7 @@ def test_progress_counts_the_clusters_of_every_long_step(tmp_path, monkeypatch):
 
     one = measured(frames=6).tracks
     table = pd.concat(
-        [one.assign(cluster=k, particle=one["particle"] + 4 * k) for k in range(17)],
+        [one.assign(cluster=k, particle=one["particle"] + 4 * k) for k in range(20)],
         ignore_index=True,
     )
     report = perrin.analyze(table, dt=0.5, progress=progress)
@@ -183,6 +183,6 @@ def test_progress_counts_the_clusters_of_every_long_step(tmp_path, monkeypatch):
         "writing the curves", "writing the report",
     ]  # fmt: skip
     for title in ("fitting clusters", "estimating D_R and D_T"):
-        assert calls[title] == [(0, 17), (16, 17), (17, 17)]
+        assert calls[title] == [(0, 20), (16, 20), (20, 20)]
     for title in ("writing the curves", "writing the report"):
-        assert calls[title] == [(k, 17) for k in range(17)]
+        assert calls[title] == [(k, 20) for k in range(20)]
