@@ -452,10 +452,10 @@ def test_labels_outweigh_a_shorter_turn_where_a_particle_is_missing():
     turns = np.deg2rad(75) * (np.arange(40)[:, None] >= 20) * TETRAHEDRON[0]
     x = track_of(TETRAHEDRON, turns / np.linalg.norm(TETRAHEDRON[0]))
     x += 0.01 * np.random.default_rng(2).normal(size=x.shape)
-    x[20, 3] = NONE
+    x[20, 2] = NONE
     found = settle_identity(x)
     assert settled(found) == [0, 0, 0, 0]
-    assert found.order[20].tolist() == [0, 1, 2, -1]
+    assert found.order[20].tolist() == [0, 1, -1, 3]
 
 
 def test_a_lasting_label_outweighs_a_displaced_particle():
