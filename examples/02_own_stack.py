@@ -66,6 +66,9 @@ plt.show()
 # fluorescent. The same on the command line::
 #
 #     perrin run movie.ome.tif --diameter 2.45 --contact 2.45 -o my-run
+#
+# A file that does not state its voxels or times (a TIFF of ImageJ often does not) needs them, with
+# ``--voxel 0.3,0.24,0.24 --dt 0.73``.
 
 report = perrin.analyze_stack(stack, diameter=2.45, contact=2.45)
 report
