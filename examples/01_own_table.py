@@ -98,6 +98,7 @@ print(f"p_same = {report.pooled.D_R.p_same:.2f}")
 cluster = report.clusters[0]
 figure, ax = plt.subplots(figsize=(7, 4.6), layout="constrained")
 plot_lag_curve(perrin.msad(cluster.motion), ax=ax, estimate=cluster.D_R, floor=cluster.noise.phi2)
+# sphinx_gallery_alt = "MSAD of cluster 0 against lag time, the estimated line and the noise floor"
 plt.show()
 
 # %%

@@ -55,6 +55,7 @@ axes[0].imshow(frame.max(axis=0), cmap="gray", extent=(0, 13.9, 13.9, 0))
 axes[0].set(xlabel="x (µm)", ylabel="y (µm)", title="maximum along z")
 axes[1].imshow(frame.max(axis=1), cmap="gray", extent=(0, 13.9, 9.6, 0))
 axes[1].set(xlabel="x (µm)", ylabel="z (µm)", title="maximum along y")
+# sphinx_gallery_alt = "One frame as maxima along z and along y: two clusters of bright spheres"
 plt.show()
 
 # %%
@@ -86,6 +87,7 @@ report
 figure, (left, right) = plt.subplots(1, 2, figsize=(10, 4.4), layout="constrained")
 plot_found(report.imaging, report.imaging.views[0], ax=left)
 plot_misfit(report.imaging, ax=right)
+# sphinx_gallery_alt = "Circles around the spheres that were found, and the misfit of their images"
 plt.show()
 
 # %%
