@@ -8,7 +8,7 @@ from pathlib import Path
 import sphinx.ext.autosummary
 
 sys.path.insert(0, str(Path(__file__).parent / "_extensions"))
-from figure_texts import described_figures  # noqa: E402 (from the folder added above)
+from figure_texts import described_figures
 
 for threads in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(threads, "1")  # scripts of the gallery are small: threads only wait

@@ -11,8 +11,8 @@ STATED = re.compile(r'^# sphinx_gallery_alt = "(.+)"$', re.MULTILINE)
 def described_figures(block, block_vars, gallery_conf):
     """Return the figures of a block of code with their texts.
 
-    A comment ``# sphinx_gallery_alt = "..."`` in the block is the text, one for each figure; without
-    it the text is the first paragraph of the script, which describes its only figure.
+    A comment ``# sphinx_gallery_alt = "..."`` in the block is the text, one for each figure;
+    without it the text is the first paragraph of the script, which describes its only figure.
     """
     rst = matplotlib_scraper(block, block_vars, gallery_conf)
     texts = iter(STATED.findall(block[1]) or [introduction(Path(block_vars["src_file"]))])
