@@ -592,15 +592,15 @@ def coupled():
 
 
 def test_the_coupled_tensor_is_at_the_highest_of_several_maxima():
-    """Of this short track the first search alone ends 0.63 below the highest maximum."""
+    """Of this short track the first search alone ends 0.19 below the highest maximum."""
     body = Cluster.from_positions([[0, 0, 0], [1, 0, 0], [0, 1.3, 0], [0.2, 0.3, 1.7]])
-    truth = simulate_motion(body, D_R=[3e-3, 5e-3, 9e-3], D_T=0.03, dt=0.7, n_frames=200, rng=13)
-    motion = track_rotation(add_noise(truth.positions(), sigma=0.1, rng=13), dt=0.7)
+    truth = simulate_motion(body, D_R=[3e-3, 5e-3, 9e-3], D_T=0.03, dt=0.7, n_frames=60, rng=16)
+    motion = track_rotation(add_noise(truth.positions(), sigma=0.1, rng=16), dt=0.7)
     data = ScaledTracks.of([body_steps(motion, "both", np.eye(3))], Noise())
     basis, (D, own) = symmetric_basis(6), data.start()
     starts = [(D, own), (np.diag(np.diag(D)), own), (D, 0.3 * own), (2 * D, 0.6 * own)]
     values = [data.fit(basis, near=Maximum(0.0, *start)).value for start in starts]
-    assert max(values) > values[0] + 0.5
+    assert max(values) > values[0] + 0.1
     found = data.fit_coupled(basis)
     assert found.value > max(values) - 1e-6
     tensor = coupled_tensor(motion, point="centroid").tensor
