@@ -25,6 +25,7 @@ from perrin import (
 from perrin.diffusion import effective_modes, tensor_likelihood, tensor_of_each
 from perrin.diffusion.noise_model import Noise
 from perrin.diffusion.steps import Steps, body_steps
+from perrin.diffusion.tensor_batches import SeparateTensors, maximise_each
 from perrin.diffusion.tensor_likelihood import (
     Maximum,
     NoisyVectors,
@@ -588,15 +589,15 @@ def coupled():
 
 
 def test_the_coupled_tensor_is_at_the_highest_of_several_maxima():
-    """Of this short track the first search alone ends 0.63 below the highest maximum."""
+    """Of this short track the first search alone ends 0.19 below the highest maximum."""
     body = Cluster.from_positions([[0, 0, 0], [1, 0, 0], [0, 1.3, 0], [0.2, 0.3, 1.7]])
-    truth = simulate_motion(body, D_R=[3e-3, 5e-3, 9e-3], D_T=0.03, dt=0.7, n_frames=200, rng=13)
-    motion = track_rotation(add_noise(truth.positions(), sigma=0.1, rng=13), dt=0.7)
+    truth = simulate_motion(body, D_R=[3e-3, 5e-3, 9e-3], D_T=0.03, dt=0.7, n_frames=60, rng=16)
+    motion = track_rotation(add_noise(truth.positions(), sigma=0.1, rng=16), dt=0.7)
     data = ScaledTracks.of([body_steps(motion, "both", np.eye(3))], Noise())
     basis, (D, own) = symmetric_basis(6), data.start()
     starts = [(D, own), (np.diag(np.diag(D)), own), (D, 0.3 * own), (2 * D, 0.6 * own)]
     values = [data.fit(basis, near=Maximum(0.0, *start)).value for start in starts]
-    assert max(values) > values[0] + 0.5
+    assert max(values) > values[0] + 0.1
     found = data.fit_coupled(basis)
     assert found.value > max(values) - 1e-6
     tensor = coupled_tensor(motion, point="centroid").tensor
@@ -814,3 +815,19 @@ def test_axes_are_named_as_those_of_a_reference():
         turned = reference @ exp_map(0.2 * rng.normal(size=3))
         shuffled = (turned * [1, -1, -1])[:, order]
         np.testing.assert_array_equal(np.array(order)[axes_like(shuffled, reference)], range(3))
+
+
+def test_the_highest_likelihood_does_not_depend_on_the_noise_a_search_begins_with():
+    """Noise and blur are hardly told apart where D is nearly the same along all axes."""
+    body, data = Cluster.tetrahedron(1.5), []
+    for seed in range(8):
+        truth = simulate_motion(body, D_R=5e-3, D_T=0.02, dt=0.7, n_frames=250, rng=seed)
+        motion = track_rotation(add_noise(truth.positions(), sigma=0.03, rng=1), dt=0.7)
+        data.append(ScaledTracks.of([body_steps(motion, "translation", np.eye(3))], Noise()))
+    each = SeparateTensors.of([one.tracks[0] for one in data])
+    family, q = squares(symmetric_basis(3)), np.tile([0.5, 0.5, 0.5, 0, 0, 0], (len(data), 1))
+    size, values = np.array([one.start()[1][0, 0] for one in data]), []
+    for amplitude, angle in [(0.3, 0.05), (1.0, 0.6), (3.0, 1.5)]:
+        own = np.column_stack([amplitude * size, np.full(len(data), angle)])
+        values.append([one.value for one in maximise_each(each, family, q, own)])
+    np.testing.assert_allclose(values[1:], [values[0]] * 2, atol=1e-6)
