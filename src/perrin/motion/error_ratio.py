@@ -23,10 +23,6 @@ _TREND_ERRORS = 3.3
 # A measured ratio is at least this one; few frames can give a negative variance.
 _LEAST_ERROR_RATIO = 0.1
 
-# A ratio below 1 makes the stated errors smaller if its logarithm is this many standard errors
-# below 0.
-_CLEARLY_SMALLER = 4.0
-
 _WEIGHTING_ROUNDS = 8  # of the weights
 
 # The logarithm of the ratio changes by at most this over the movie or the depth.
@@ -44,9 +40,8 @@ class ErrorRatio:
     ----------
     value : ndarray, shape (d,)
         Ratio of each lab axis, drawn to 1 by its own error: 1 + (1 - s^2/(r - 1)^2) (r - 1) for the
-        measured ratio r of standard error s, and 1 where r - 1 is less than s. It is below 1 only
-        where the logarithm of r is four standard errors below 0: the noise that a fit assumes is
-        then common to many voxels.
+        measured ratio r of standard error s, and 1 where r - 1 is less than s: errors that the
+        spheres of a body have in common leave no residual, so that it is never below 1.
     measured, stderr : ndarray, shape (d,)
         Measured ratios and their standard errors; NaN where no frame determines them.
     by_time : float
@@ -144,9 +139,8 @@ def error_ratio(bodies: Iterable[tuple[RigidMotion, Floats, Floats]]) -> ErrorRa
     stderr = np.sqrt(np.diag(inverse @ scores.T @ scores @ inverse.T))
     off = measured - 1
     held = np.divide(stderr, off, out=np.full(len(off), np.inf), where=off != 0)
-    # Light alone leaves the stated errors; they are too large where noise is common to many voxels.
-    smaller = np.log(measured) < -_CLEARLY_SMALLER * stderr / measured
-    value = 1 + np.maximum(1 - held**2, 0.0) * np.where(smaller, off, np.maximum(off, 0.0))
+    # Errors that the spheres of a body have in common are stated and leave no residual.
+    value = 1 + np.maximum(1 - held**2, 0.0) * np.maximum(off, 0.0)
     # Changes of the logarithm of the squares with time and depth, 0 where insignificant: scoring
     # for gamma-distributed squares with a logarithmic link.
     relative = square.sum(axis=1) / (mix @ measured).sum(axis=1)
