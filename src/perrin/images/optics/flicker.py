@@ -18,7 +18,6 @@ if TYPE_CHECKING:
 # over this fraction of the light.
 _LEAST_FLICKER_ERRORS, _LEAST_FLICKER = 5.0, 0.02
 
-
 # Distance from the middle of a line, in voxels, within which voxels are on none of its sides.
 _GAP = 2.0
 
@@ -349,9 +348,9 @@ def _common_variance(differences: Floats, *, known: float = 0.0) -> float:
     known : float
         Variance of a single value that both sides have in common.
     """
-    (first, second), noise = differences
+    # The only lines of their planes do not differ from these.
+    (first, second), noise = differences[:, :, differences[1].min(axis=0) > 0]
     single = float(np.sum(THIRD_DIFFERENCE**2))
-    noise = noise + 1e-300
     if not first.size:
         return 0.0
     product, found = first * second, 0.0
