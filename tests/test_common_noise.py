@@ -14,7 +14,7 @@ from perrin.images.optics.flicker import (
     find_flicker,
     find_gain_spread,
 )
-from perrin.images.optics.neighbours import find_neighbours, neighbour_covariance
+from perrin.images.optics.neighbours import find_along_z, find_neighbours, neighbour_covariance
 from perrin.images.optics.window_fit import FreeCenters, cut_window, fit_window
 from perrin.movie.checks import noise_in_common
 
@@ -115,32 +115,38 @@ def test_correlations_add_what_the_dense_covariance_has():
     neighbours = tuple(tuple(row) for row in np.outer(lags, lags))
     z, y, x = np.nonzero(mask)
     far = [np.abs(a[:, None] - a) for a in (z, y, x)]
-    near = (far[0] == 0) & (far[1] < 4) & (far[2] < 4)
+    near = (far[1] < 4) & (far[2] < 4)
     shared = np.where(near, np.outer(lags, lags)[far[1] % 4, far[2] % 4], 0.0)
     rows = rng.normal(size=(2, mask.sum()))
-    added = neighbour_covariance(rows, mask, neighbours)
-    assert added == pytest.approx(rows @ (shared - np.eye(len(z))) @ rows.T)
+    for along_z in ((), (1.0, 0.3)):
+        planes = np.append(along_z or (1.0,), (0.0, 0.0))[far[0]]
+        added = neighbour_covariance(rows, mask, neighbours, along_z=along_z)
+        assert added == pytest.approx(rows @ (shared * planes - np.eye(len(z))) @ rows.T)
 
 
 def test_correlations_of_neighbours_are_found_and_stated(repeats):
-    """Noise blurred in its plane: its correlation, and errors of fits that are then true.
+    """Noise blurred along all axes: its correlation, and errors of fits that are then true.
 
-    Without the correlation the squares are 6.
+    Without the correlation the squares are over 10.
     """
     n = repeats(8, 100)
     rng, camera = np.random.default_rng(8), CameraNoise(0.0, 1.0)
     width, squares = 0.7, []
-    factor = 2 * width * np.sqrt(np.pi)
+    factor = (2 * width * np.sqrt(np.pi)) ** 1.5
 
     def blurred(shape):
-        rows = gaussian_filter1d(rng.normal(size=shape), width, axis=1)
-        return factor * gaussian_filter1d(rows, width, axis=2)
+        rows = rng.normal(size=shape)
+        for axis in range(3):
+            rows = gaussian_filter1d(rows, width, axis=axis, mode="wrap")
+        return factor * rows
 
     mask = np.ones((20, 40, 40), dtype=bool)
-    found = find_neighbours([(mask, blurred(mask.shape).ravel())])
+    found, along_z = find_neighbours([(mask, blurred(mask.shape).ravel())])
     assert found[0][1] == pytest.approx(np.exp(-1 / (4 * width**2)), abs=0.03)
-    assert find_neighbours([(mask, rng.normal(size=mask.size))]) == ()
-    camera = camera._replace(floor=4.0, neighbours=found)
+    assert find_neighbours([(mask, rng.normal(size=mask.size))]) == ((), ())
+    assert along_z[1] == pytest.approx(np.exp(-1 / (4 * width**2)), abs=0.09)
+    assert find_along_z([(mask, rng.normal(size=mask.size))]) == ()
+    camera = camera._replace(floor=4.0, neighbours=found, along_z=along_z)
     for _ in range(n):
         frame = LEVEL + 2 * blurred(SHAPE)
         window = cut_window(frame, IMAGE, CENTER, others=np.empty((0, 3)))
@@ -164,7 +170,7 @@ def test_learned_optics_have_the_flicker_of_the_movie():
 
 def test_noise_in_common_is_kept_and_named():
     """JSON keeps all values; flicker over 10 % and correlated neighbours are warnings."""
-    noise = CameraNoise(3.0, 4.0, 0.2, 0.05, 0.0, ((1.0, 0.5), (0.5, 0.25)))
+    noise = CameraNoise(3.0, 4.0, 0.2, 0.05, 0.0, ((1.0, 0.5), (0.5, 0.25)), (1.0, 0.4))
     optics = Optics(2.0, (0.4, 0.15), noise)
     assert Optics.from_dict(json.loads(json.dumps(optics.to_dict()))) == optics
     warnings, notes = noise_in_common(optics)

@@ -838,7 +838,8 @@ def fit_samples(
         for fit in found.fits
         if not found.noise.correlated
     ]
-    noise = found.noise._replace(neighbours=find_neighbours(in_deviations))
+    neighbours, along_z = find_neighbours(in_deviations)
+    noise = found.noise._replace(neighbours=neighbours, along_z=along_z)
     optics = found.parameters.optics(noise, found.information)
     return LearnedOptics(optics, replace(_usual_of(found), left_out=left_out))
 

@@ -26,6 +26,10 @@ _REACH = 4
 # voxels by at least this share.
 _LEAST_ERRORS, _LEAST_NEAREST, _LEAST_INCREASE = 5.0, 0.05, 0.2
 
+# Correlation of voxels of neighbouring planes from which on an image was smoothed along z too:
+# errors of the model of the image, and the blocks of compressed images, leave smaller ones.
+_LEAST_ALONG_Z = 0.3
+
 # Least variance of a spatial frequency over that of independent voxels.
 _LEAST_POWER = 0.05
 
@@ -82,8 +86,8 @@ def neighbour_variance(
 
 def find_neighbours(
     windows: Sequence[tuple[Bools, Floats]],
-) -> tuple[tuple[float, ...], ...]:
-    """Measure the correlation of the noise of neighbouring voxels of a plane.
+) -> tuple[tuple[tuple[float, ...], ...], tuple[float, ...]]:
+    """Measure the correlation of the noise of neighbouring voxels.
 
     Parameters
     ----------
@@ -93,14 +97,16 @@ def find_neighbours(
 
     Returns
     -------
-    tuple of tuple of float
-        Correlation of voxels i rows and j columns apart (either sign), i, j up to 4; empty where
-        nearest neighbours are not correlated.
+    neighbours : tuple of tuple of float
+        Correlation of voxels of a plane i rows and j columns apart (either sign), i, j up to 4;
+        empty where nearest neighbours are not correlated.
+    along_z : tuple of float
+        What `find_along_z` returns, empty where `neighbours` is.
 
     Notes
     -----
-    Third differences along z, to which errors of the model of the image, which are blurred as
-    the image is, contribute a hundredth of their variance.
+    In a plane third differences along z, to which errors of the model of the image, which are
+    blurred as the image is, contribute a hundredth of their variance.
 
     Examples
     --------
@@ -108,8 +114,8 @@ def find_neighbours(
     >>> found = find_neighbours([(np.ones(noise.shape, dtype=bool), noise.ravel())])
     >>> pairs = (noise + np.roll(noise, 1, axis=2)) / np.sqrt(2)
     >>> mask = np.ones(noise.shape, dtype=bool)
-    >>> found, round(find_neighbours([(mask, pairs.ravel())])[0][1], 1)
-    ((), 0.5)
+    >>> found, round(find_neighbours([(mask, pairs.ravel())])[0][0][1], 1)
+    (((), ()), 0.5)
     """
     fields = []
     for mask, residual in windows:
@@ -124,7 +130,7 @@ def find_neighbours(
     square = sum(float(np.sum(field**2)) for field, _ in fields)
     count = sum(float(there.sum()) for _, there in fields)
     if not square > 0:
-        return ()
+        return (), ()
     error = np.sqrt(OVERLAP / count)
 
     def correlation(i: int, j: int) -> float:
@@ -137,15 +143,53 @@ def find_neighbours(
         return float(found) if abs(found) > _LEAST_ERRORS * error else 0.0
 
     if max(correlation(0, 1), correlation(1, 0)) < _LEAST_NEAREST:
-        return ()
+        return (), ()
     lags = range(_REACH + 1)
     found = tuple(tuple(correlation(i, j) if i or j else 1.0 for j in lags) for i in lags)
     increase = float(_both_signs(found).sum()) - 1
-    return found if increase > _LEAST_INCREASE else ()
+    return (found, find_along_z(windows)) if increase > _LEAST_INCREASE else ((), ())
+
+
+def find_along_z(windows: Sequence[tuple[Bools, Floats]]) -> tuple[float, ...]:
+    """Measure the correlation of the noise of voxels above each other, in a smoothed image.
+
+    Parameters
+    ----------
+    windows : sequence of tuple
+        As in `find_neighbours`.
+
+    Returns
+    -------
+    tuple of float
+        Correlation of voxels k planes apart, k up to 4; empty where that of neighbouring planes is
+        below 0.3.
+
+    Examples
+    --------
+    >>> noise, mask = np.random.default_rng(1).normal(size=(20, 50, 50)), np.ones((19, 50, 50))
+    >>> pairs = (noise[1:] + noise[:-1]) / np.sqrt(2)
+    >>> [round(value, 1) for value in find_along_z([(mask > 0, pairs.ravel())])[:2]]
+    [1.0, 0.5]
+    """
+    products, pairs = np.zeros((2, _REACH + 1))
+    for mask, residual in windows:
+        box = np.zeros(mask.shape)
+        box[mask] = residual
+        for k in range(min(_REACH + 1, len(box))):
+            products[k] += np.sum(box[k:] * box[: len(box) - k])
+            pairs[k] += np.count_nonzero(mask[k:] & mask[: len(box) - k])
+    if not products[0] > 0:
+        return ()
+    found = products / np.maximum(pairs, 1) / (products[0] / pairs[0])
+    return tuple(found.tolist()) if found[1] > _LEAST_ALONG_Z else ()
 
 
 def neighbour_covariance(
-    rows: Floats, mask: Bools, neighbours: tuple[tuple[float, ...], ...]
+    rows: Floats,
+    mask: Bools,
+    neighbours: tuple[tuple[float, ...], ...],
+    *,
+    along_z: tuple[float, ...] = (),
 ) -> Floats:
     """Return what correlations of neighbours add to the covariance of sums over voxels.
 
@@ -157,6 +201,8 @@ def neighbour_covariance(
         The voxels.
     neighbours : tuple of tuple of float
         As `find_neighbours` returns it.
+    along_z : tuple of float
+        As `find_along_z` returns it: factors of the correlation of voxels in different planes.
 
     Returns
     -------
@@ -174,16 +220,19 @@ def neighbour_covariance(
     kernel = np.zeros(size)
     offset = np.arange(-reach, reach + 1)
     kernel[np.ix_(offset, offset)] = both
-    power = np.maximum(np.fft.rfft2(kernel).real, _LEAST_POWER) - 1.0
+    power = np.maximum(np.fft.rfft2(kernel).real, _LEAST_POWER)
     # Frequencies that the real transform leaves out are the conjugates of others.
     power[:, 1 : (size[1] + 1) // 2] *= 2.0
     boxes = np.zeros((len(rows), *mask.shape))
     boxes[:, mask] = rows
-    total = np.zeros((len(rows), len(rows)))
-    for plane in np.swapaxes(boxes, 0, 1):
-        wave = np.fft.rfft2(plane, size).reshape(len(rows), -1)
-        total += ((wave * power.ravel()) @ wave.conj().T).real
-    return np.asarray(total / (size[0] * size[1]))
+    wave = np.fft.rfft2(boxes, size).reshape(*boxes.shape[:2], -1)
+    planes = np.arange(len(mask))
+    apart = np.abs(planes[:, None] - planes)
+    shares = np.append(along_z or (1.0,), 0.0)
+    beside = shares[np.minimum(apart, len(shares) - 1)]
+    other = np.einsum("yz,pzf->pyf", beside, wave)
+    total = np.einsum("pzf,qzf->pq", wave * power.ravel(), other.conj(), optimize=True).real
+    return np.asarray(total / (size[0] * size[1]) - rows @ rows.T)
 
 
 def _both_signs(neighbours: tuple[tuple[float, ...], ...]) -> Floats:

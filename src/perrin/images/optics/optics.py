@@ -38,6 +38,9 @@ class CameraNoise(NamedTuple):
     neighbours : tuple of tuple of float
         Correlation of the noise of voxels of a plane that are i rows and j columns apart,
         ``neighbours[i][j]``; empty where the noise of voxels is independent.
+    along_z : tuple of float
+        Factor of that correlation for voxels k planes apart, ``along_z[k]``; empty where planes are
+        independent.
 
     Examples
     --------
@@ -51,6 +54,7 @@ class CameraNoise(NamedTuple):
     line: float = 0.0
     pixel: float = 0.0
     neighbours: tuple[tuple[float, ...], ...] = ()
+    along_z: tuple[float, ...] = ()
 
     @property
     def correlated(self) -> bool:
@@ -98,8 +102,9 @@ class CameraNoise(NamedTuple):
         -------
         CameraNoise
         """
-        rows = entry.get("neighbours", ())
-        return cls(**{**entry, "neighbours": tuple(tuple(row) for row in rows)})
+        rows = tuple(tuple(row) for row in entry.get("neighbours", ()))
+        values = {**entry, "neighbours": rows, "along_z": tuple(entry.get("along_z", ()))}
+        return cls(**values)
 
 
 @dataclass(frozen=True, repr=False)

@@ -360,7 +360,9 @@ def fit_window(
     if noise.neighbours:
         spread = variance @ state.precision.times(state.jacobian)
         spread /= np.sqrt(state.precision.weight)
-        variance = variance + neighbour_covariance(spread, window.mask, noise.neighbours)
+        variance = variance + neighbour_covariance(
+            spread, window.mask, noise.neighbours, along_z=noise.along_z
+        )
     size_variance = np.zeros(len(state.sizes))
     size_variance[:free] = np.diag(variance)[k : k + free]
     chi2 = state.chi2(window, state.expected) / max(len(window.data) - len(state.jacobian), 1)
