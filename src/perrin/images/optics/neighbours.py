@@ -226,12 +226,12 @@ def neighbour_covariance(
     boxes = np.zeros((len(rows), *mask.shape))
     boxes[:, mask] = rows
     wave = np.fft.rfft2(boxes, size).reshape(*boxes.shape[:2], -1)
-    planes = np.arange(len(mask))
-    apart = np.abs(planes[:, None] - planes)
-    shares = np.append(along_z or (1.0,), 0.0)
-    beside = shares[np.minimum(apart, len(shares) - 1)]
-    other = np.einsum("yz,pzf->pyf", beside, wave)
-    total = np.einsum("pzf,qzf->pq", wave * power.ravel(), other.conj(), optimize=True).real
+    other = wave * power.ravel()
+    if along_z:
+        planes = np.arange(len(mask))
+        apart = np.minimum(np.abs(planes[:, None] - planes), len(along_z))
+        other = np.append(along_z, 0.0)[apart].astype(np.complex128) @ other
+    total = (other.reshape(len(rows), -1) @ wave.reshape(len(rows), -1).conj().T).real
     return np.asarray(total / (size[0] * size[1]) - rows @ rows.T)
 
 
