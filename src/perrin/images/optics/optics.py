@@ -61,6 +61,21 @@ class CameraNoise(NamedTuple):
         """Whether voxels have noise in common: flicker, or the gain of their pixel."""
         return self.plane > 0 or self.line > 0 or self.pixel > 0
 
+    @property
+    def voxels_in_one(self) -> float:
+        """Number of voxels over which a mean square scatters as over one independent voxel.
+
+        The sum of the squared correlations, of both signs of every lag.
+
+        Examples
+        --------
+        >>> CameraNoise(3.0, 4.0, neighbours=((1.0, 0.5), (0.5, 0.0))).voxels_in_one
+        2.0
+        """
+        square = np.square(self.neighbours or ((1.0,),))
+        in_plane = 4 * square.sum() - 2 * square[0].sum() - 2 * square[:, 0].sum() + square[0, 0]
+        return float(in_plane * (2 * np.square(self.along_z or (1.0,)).sum() - 1))
+
     def light(self, expected: Floats) -> Floats:
         """Return expected values above the level without light, grey levels.
 

@@ -835,17 +835,19 @@ def group_columns(
         if usual is not None:
             # Chi-squared per voxel of the voxels of every sphere, and their number.
             voxels = fit.unit_images.sum(axis=1)
+            independent = voxels / noise.voxels_in_one
             residual = fit.precision.left(window.data - fit.expected)
             residual = fit.precision.weight * residual**2
             square = fit.unit_images @ residual / np.maximum(voxels, 1e-300)
             level = usual.brightness * dimmed[group]
-            excess = usual.excess(square, fit.brightness / level, voxels=voxels)
+            excess = usual.excess(square, fit.brightness / level, voxels=independent)
             worst = int(excess.argmax())
             bright = fit.brightness / level >= usual.brightest
             # Spheres at the border, which are often not found, touch those within one contact.
             at_border = np.any(np.minimum(fit.centers, last - fit.centers) < contact)
-            beside = usual.disturbed(np.array([fit.chi2]), voxels=np.array([window.data.size]))
-            disturbed = beside[0] or usual.disturbed(square, voxels=voxels).any()
+            size = np.array([window.data.size / noise.voxels_in_one])
+            beside = usual.disturbed(np.array([fit.chi2]), voxels=size)
+            disturbed = beside[0] or usual.disturbed(square, voxels=independent).any()
             # Light beside spheres of usual brightness may be that of a sphere that was not found.
             if (
                 search.crowds
