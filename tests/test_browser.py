@@ -20,7 +20,7 @@ CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 OPTIONS = [
     "--headless", "--no-sandbox", "--disable-gpu", "--enable-unsafe-swiftshader", "--use-gl=angle",
     "--use-angle=swiftshader", "--disable-background-networking", "--no-first-run",
-    "--window-size=800,600", "--virtual-time-budget=60000", "--dump-dom",
+    "--window-size=800,600", "--virtual-time-budget=30000", "--dump-dom",
 ]  # fmt: skip
 
 # What a reader does: waits, sorts, filters, goes to the next cluster, and plays.

@@ -9,12 +9,21 @@ import numpy as np
 
 from perrin.diffusion.tensor_likelihood import (
     CONVERGED_GAIN,
+    FARTHEST_REACH,
+    FIRST_REACH,
     LEAST_BLUR,
     MOST_BLUR,
+    MOST_STRAIGHT_STEPS,
+    NEAREST_REACH,
     ROUNDING_GAIN,
+    START_ANGLES,
+    STRAIGHT_GAIN,
+    ArrowHessian,
     Maximum,
+    at_blur,
     bfgs_update,
-    positive_inverse,
+    changed_noise,
+    noise_range,
 )
 from perrin.diffusion.tensor_modes import EvenTracks
 
@@ -23,6 +32,7 @@ if TYPE_CHECKING:
 
     from perrin._arrays import Floats, Ints
     from perrin.diffusion.tensor_likelihood import Family, NoisyVectors
+    from perrin.diffusion.tensor_modes import TensorSlopes
 
 # Hessians that a search may need less one, steps from one of them, and times that a step may be
 # shortened, by this factor.
@@ -90,16 +100,31 @@ class SeparateTensors:
         theta, B = self.amplitudes(own)
         modes = self.tracks.diagonal(tensor[0], theta, B)
         found = self.tracks.slopes(tensor[0], B, modes)
-        value, by_own = found.value, []
+        value, slope = self.straight_slopes(tensor, theta, B, found)
+        slope[:, tensor[1].shape[1] :] *= self.noise_turns(own)[0]
+        return value, slope
+
+    def straight_slopes(
+        self, tensor: tuple[Floats, Floats, Floats], theta: Floats, B: Floats, found: TensorSlopes
+    ) -> tuple[Floats, Floats]:
+        """Return log-likelihoods (P,) and slopes by the noise amplitudes and B themselves."""
+        value, slopes = found.value, [np.einsum("pab,pkab->pk", found.D, tensor[1])]
         if np.isfinite(self.freedom).all():
             measured, by_theta, _ = self.measurement(theta)
             value = value + measured.sum(axis=1)
-            by_own.append(2 * own[:, : theta.shape[1]] * (found.theta + by_theta))
+            slopes.append(found.theta + by_theta)
         if self.B is None:
             value = value - LEAST_BLUR * B
-            by_own.append(((found.B - LEAST_BLUR) * MOST_BLUR * np.sin(2 * own[:, -1]))[:, None])
-        by_q = np.einsum("pab,pkab->pk", found.D, tensor[1])
-        return value, np.concatenate([by_q, *by_own], axis=1)
+            slopes.append((found.B - LEAST_BLUR)[:, None])
+        return value, np.concatenate(slopes, axis=1)
+
+    def noise_turns(self, own: Floats) -> tuple[Floats, Floats]:
+        """Return the derivatives (P, c) of the amplitudes and B by their parameters, two each."""
+        first, second = 2 * own, np.full(own.shape, 2.0)
+        if self.B is None:
+            first[:, -1] = MOST_BLUR * np.sin(2 * own[:, -1])
+            second[:, -1] = 2 * MOST_BLUR * np.cos(2 * own[:, -1])
+        return first, second
 
     def measurement(self, theta: Floats) -> tuple[Floats, Floats, Floats]:
         """Return the log-likelihood of the measured amplitudes and two derivatives, (P, r) each."""
@@ -110,8 +135,13 @@ class SeparateTensors:
         value = half * (np.log(ratio) - ratio)
         return value, half * (ratio - 1) / theta, half * (1 - 2 * ratio) / theta**2
 
-    def hessians(self, tensor: tuple[Floats, Floats, Floats], own: Floats) -> Floats:
-        """Return minus the Hessians (P, m + c, m + c) by the parameters of D and noise."""
+    def straight_expansion(
+        self, tensor: tuple[Floats, Floats, Floats], own: Floats
+    ) -> tuple[Floats, Floats, Floats]:
+        """Return log-likelihoods (P,), slopes (P, m + c) and minus the Hessians (P, m + c, m + c).
+
+        The derivatives are those by the parameters of D, the noise amplitudes and B themselves.
+        """
         (D, slopes, bends), tracks = tensor, self.tracks
         m, r = slopes.shape[1], self.theta.shape[1]
         theta, B = self.amplitudes(own)
@@ -123,22 +153,26 @@ class SeparateTensors:
         mixed = 2 * tracks.dt[:, None] * np.einsum("pkab,pab->pk", slopes, found.noise)
         full[:, :m, -1] += mixed
         full[:, -1, :m] += mixed
-        turn, kept, amplitudes = np.ones((len(own), m + r + 1)), list(range(m)), np.arange(m, m + r)
-        twice = np.zeros_like(turn)
+        kept = list(range(m))
         if np.isfinite(self.freedom).all():
-            _, by_theta, bend = self.measurement(theta)
-            full[:, amplitudes, amplitudes] -= bend
-            turn[:, m : m + r] = 2 * own[:, :r]
-            twice[:, m : m + r] = 2 * (found.theta + by_theta)
+            amplitudes = np.arange(m, m + r)
+            full[:, amplitudes, amplitudes] -= self.measurement(theta)[2]
             kept += amplitudes.tolist()
         if self.B is None:
-            turn[:, -1] = MOST_BLUR * np.sin(2 * own[:, -1])
-            twice[:, -1] = (found.B - LEAST_BLUR) * 2 * MOST_BLUR * np.cos(2 * own[:, -1])
             kept.append(m + r)
+        value, slope = self.straight_slopes(tensor, theta, B, found)
+        return value, slope, np.asarray(full[:, kept][:, :, kept])
+
+    def hessians(self, tensor: tuple[Floats, Floats, Floats], own: Floats) -> Floats:
+        """Return minus the Hessians (P, m + c, m + c) by the parameters of D and noise."""
+        _, slope, full = self.straight_expansion(tensor, own)
+        m = tensor[1].shape[1]
+        first, second = self.noise_turns(own)
+        turn = np.concatenate([np.ones((len(own), m)), first], axis=1)
         full *= turn[:, :, None] * turn[:, None]
-        every = np.arange(m + r + 1)
-        full[:, every, every] -= twice
-        return np.asarray(full[:, kept][:, :, kept])
+        noise = np.arange(m, turn.shape[1])
+        full[:, noise, noise] -= second * slope[:, m:]
+        return full
 
 
 def batch_key(track: NoisyVectors) -> tuple[object, ...]:
@@ -162,8 +196,10 @@ def maximise_each(
 ) -> list[Maximum | None]:
     """Return the maxima over a family of D, one for each motion, and over their noise.
 
-    The search is that of `maximise`: quasi-Newton (BFGS) from the Hessian, which is computed again
-    where no step increases the likelihood, and after every 30 steps.
+    The search is that of `maximise`: from a small and from a large blur where that is unknown, with
+    Newton steps by the noise amplitudes and the blur themselves, then quasi-Newton (BFGS) ones from
+    the Hessian, which is computed again where no step increases the likelihood, and after every 30
+    steps.
 
     Parameters
     ----------
@@ -192,10 +228,35 @@ def maximise_each(
     >>> bool(abs(data.in_units(best.D)[0, 0] - 5e-3) < 1e-3)
     True
     """
-    m, p, active = q.shape[1], np.concatenate([q, own], axis=1), np.arange(len(q))
+    if tracks.B is not None:
+        return _searched_each(tracks, family, q, own)
+    count, every = len(q), np.arange(len(q))
+    shapes, D = tracks.tracks.shapes.sum(axis=1), family(q, every)[0]
+    ratio = (
+        2 * tracks.tracks.dt * np.trace(D, axis1=1, axis2=2) / np.trace(shapes, axis1=1, axis2=2)
+    )
+    ends = _searched_each(
+        tracks.rows(np.tile(every, 2)),
+        lambda q, rows: family(q, rows % count),
+        np.tile(q, (2, 1)),
+        np.concatenate([at_blur(own, angle, ratio) for angle in START_ANGLES]),
+    )
+    found: list[Maximum | None] = []
+    for pair in zip(ends[:count], ends[count:], strict=True):
+        maxima = [one for one in pair if one is not None]
+        found.append(max(maxima, key=lambda m: m.value) if maxima else None)
+    return found
+
+
+def _searched_each(
+    tracks: SeparateTensors, family: Family, q: Floats, own: Floats
+) -> list[Maximum | None]:
+    """Return the maxima that searches from these parameters find; None without convergence."""
+    m, p, active = q.shape[1], climbed_each(tracks, family, q, own), np.arange(len(q))
     found: list[Maximum | None] = [None] * len(q)
-    value, slope = tracks.slopes(family(q, active), own)
-    inverse = _rising_inverse(tracks.hessians(family(q, active), own), m)
+    start = family(p[:, :m], active), p[:, m:]
+    (value, slope), hessian = tracks.slopes(*start), tracks.hessians(*start)
+    inverse = ArrowHessian.of_single_motions(hessian, m).inverse()
     # Steps since the last Hessian, number of Hessians, and times that this step was shortened.
     steps, hessians, shorter = np.zeros((3, len(q)), dtype=np.int64)
     while active.size:
@@ -233,24 +294,54 @@ def maximise_each(
         if again.size:
             place = p[active[again]]
             hessian = tracks.rows(again).hessians(family(place[:, :m], active[again]), place[:, m:])
-            inverse[again] = _rising_inverse(hessian, m)
+            inverse[again] = ArrowHessian.of_single_motions(hessian, m).inverse()
             steps[again] = shorter[again] = 0
             hessians[again] += 1
     return found
 
 
-def _rising_inverse(hessian: Floats, m: int) -> Floats:
-    """Return inverses (P, m + c, m + c), negative curvatures turned positive, as `ArrowHessian`."""
-    mixed = hessian[:, :m, m:]
-    own = positive_inverse(hessian[:, m:, m:])
-    lever = mixed @ own
-    shared = positive_inverse(hessian[:, :m, :m] - lever @ np.swapaxes(mixed, 1, 2))
-    inverse = np.empty_like(hessian)
-    inverse[:, :m, :m] = shared
-    inverse[:, :m, m:] = -shared @ lever
-    inverse[:, m:, :m] = np.swapaxes(inverse[:, :m, m:], 1, 2)
-    inverse[:, m:, m:] = own + np.swapaxes(lever, 1, 2) @ shared @ lever
-    return inverse
+def climbed_each(tracks: SeparateTensors, family: Family, q: Floats, own: Floats) -> Floats:
+    """Return higher points (P, m + c) of a search, by Newton steps while they gain.
+
+    The steps are those of `PooledLikelihood.climbed`: by the parameters of D, the noise amplitudes
+    and the blur, at most a part of the way to the edges of the latter. The parameters are those of
+    `maximise_each`.
+
+    Examples
+    --------
+    >>> from perrin import Cluster, Noise, simulate_motion
+    >>> from perrin.diffusion import ScaledTracks, body_steps, squares
+    >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=300, rng=3)
+    >>> data = ScaledTracks.of([body_steps(truth, "rotation", np.eye(3))], Noise())
+    >>> own = np.array([track.start() for track in data.tracks])
+    >>> each, start = SeparateTensors.of(data.tracks), np.full((1, 1), 3.0)
+    >>> end = climbed_each(each, squares(np.eye(3)[None]), start, own)[0]
+    >>> bool(abs(data.in_units(end[0] ** 2 * np.eye(3))[0, 0] - 5e-3) < 1e-3)
+    True
+    """
+    p, m, active = np.concatenate([q, own], axis=1), q.shape[1], np.arange(len(q))
+    blurred, reach = tracks.B is None, np.full(len(q), FIRST_REACH)
+    value, slope, hessian = tracks.straight_expansion(family(q, active), own)
+    for _ in range(MOST_STRAIGHT_STEPS):
+        here = p[active]
+        limits = noise_range(here[:, None, m:], reach[:, None, None], blurred=blurred)
+        arrow = ArrowHessian.of_single_motions(hessian, m)
+        of_D, of_noise = arrow.step_within(slope[:, :m], slope[:, None, m:], limits)
+        gain = np.sum(slope[:, :m] * of_D, axis=1) + np.sum(slope[:, m:] * of_noise[:, 0], axis=1)
+        kept = np.flatnonzero((gain > STRAIGHT_GAIN) & (reach >= NEAREST_REACH))
+        if not kept.size:
+            break
+        active, here, reach, tracks = active[kept], here[kept], reach[kept], tracks.rows(kept)
+        value, slope, hessian = value[kept], slope[kept], hessian[kept]
+        noise = changed_noise(here[:, m:], of_noise[kept, 0], blurred=blurred)
+        trial = np.concatenate([here[:, :m] + of_D[kept], noise], axis=1)
+        ahead = tracks.straight_expansion(family(trial[:, :m], active), noise)
+        rises = ahead[0] > value
+        p[active[rises]] = trial[rises]
+        for old, new in zip((value, slope, hessian), ahead, strict=True):
+            old[rises] = new[rises]
+        reach = np.where(rises, np.minimum(2 * reach, FARTHEST_REACH), 0.25 * reach)
+    return p
 
 
 def spread_each(

@@ -35,12 +35,18 @@ MOST_BLUR = 0.25
 # log-likelihood selects the least blur. It changes the log-likelihood by 0.025 at most.
 LEAST_BLUR = 0.1
 
+# Searches begin at these angles of B = sin^2/4, a small and a large blur: the likelihood of short,
+# noisy steps may have a maximum at both ends of the ridge on which noise less blur is the same.
+START_ANGLES = (0.2, 1.2)
+
 # A search has converged where another step would gain this much: 5e-9 standard errors. A gain below
 # the second number is hidden by rounding, and steps are accepted without it.
 CONVERGED_GAIN, ROUNDING_GAIN = 1e-17, 1e-9
 
-# Newton steps along a ridge: their number, the part of the way to an edge, and the least gain.
-_MOST_STRAIGHT_STEPS, _TOWARDS_EDGE, _STRAIGHT_GAIN = 50, 0.95, 1e-6
+# Newton steps along a ridge: their number, their least gain, and the part of the way to an edge of
+# the noise's range that a step may go at first, at most and at least.
+MOST_STRAIGHT_STEPS, STRAIGHT_GAIN = 50, 1e-6
+FIRST_REACH, FARTHEST_REACH, NEAREST_REACH = 0.25, 0.95, 0.01
 
 # Frames are equally noisy if the elements of their noise agree to this.
 _EQUALLY_NOISY_FRAMES = 1e-9
@@ -129,6 +135,11 @@ class NoisyVectors:
         shape = 0.5 * (self.steps.before + self.steps.after).mean(axis=1)
         offset: Floats = np.tensordot(theta[0], shape, 1) - 2 * B[0] * self.steps.dt * D
         return offset
+
+    def blur_ratio(self, D: Floats) -> float:
+        """Return the noise amplitude that has the mean variance of a blur of B = 1."""
+        shape = 0.5 * (self.steps.before + self.steps.after).mean(axis=1).sum(axis=0)
+        return float(2 * self.steps.dt * np.trace(D) / np.trace(shape))
 
     @cached_property
     def chain_track(self) -> ChainTrack | None:
@@ -469,7 +480,8 @@ class Maximum(NamedTuple):
 def maximise(tracks: Sequence[NoisyVectors], family: Family, q: Floats, own: Floats) -> Maximum:
     """Return the maximum over a family of D, common to all, and over the noise of each motion.
 
-    Where the steps are modes the search begins with Newton steps by the noise amplitudes and the
+    There are two searches where the blur is unknown, from a small and from a large one. Where the
+    steps are modes a search begins with Newton steps by the noise amplitudes and the
     blur themselves: noise and blur may have nearly the same effect, and the narrow ridge of the
     likelihood is straight in these. Then it is quasi-Newton (BFGS), by their square roots and an
     angle, and begins with the Hessian, with the average information in it where steps are not
@@ -487,6 +499,23 @@ def maximise(tracks: Sequence[NoisyVectors], family: Family, q: Floats, own: Flo
     >>> bool(abs(data.in_units(best.D)[0, 0] - 5e-3) < 1e-3)
     True
     """
+    if tracks[0].B is not None:
+        return _searched(tracks, family, q, own)
+    ratio = np.array([t.blur_ratio(family(q)[0]) for t in tracks])
+    found: list[Maximum] = []
+    faults: list[ValueError] = []
+    for angle in START_ANGLES:
+        try:
+            found.append(_searched(tracks, family, q, at_blur(own, angle, ratio)))
+        except ValueError as fault:
+            faults.append(fault)
+    if not found:
+        raise faults[0]
+    return max(found, key=lambda m: m.value)
+
+
+def _searched(tracks: Sequence[NoisyVectors], family: Family, q: Floats, own: Floats) -> Maximum:
+    """Return the maximum that a search from these parameters finds."""
     problem = PooledLikelihood(tracks, family, len(q), own.shape)
     p = np.concatenate([q, own.ravel()])
     value, slope = problem.slopes(p)
@@ -603,33 +632,35 @@ class PooledLikelihood:
     def climbed(self, p: Floats, value: float, slope: Floats) -> tuple[Floats, float, Floats]:
         """Return a higher point with its value and slopes, by Newton steps while they gain.
 
-        Steps are by the parameters of D, the noise amplitudes and the blur; they go at most this
+        Steps are by the parameters of D, the noise amplitudes and the blur; they go at most a
         part of the way to the edges of the latter, which the search that follows reaches.
         """
-        for _ in range(_MOST_STRAIGHT_STEPS):
-            tensors, m, own = self.family(p[: self.m]), self.m, p[self.m :].reshape(self.shape)
-            pairs = list(zip(self.tracks, own, strict=True))
-            parts = [t.straight_curvatures(*tensors, one) for t, one in pairs]
-            found = np.array([full for full, _ in parts])
-            hessian = ArrowHessian(found[:, :m, :m].sum(axis=0), found[:, :m, m:], found[:, m:, m:])
-            by_noise = np.array([one for _, one in parts])
-            step = hessian.inverse() @ np.append(slope[:m], by_noise)
-            change = step[m:].reshape(self.shape)
-            blurred = self.tracks[0].B is None
-            size, most = own**2, np.full(self.shape, np.inf)
-            if blurred:
-                size[:, -1], most[:, -1] = MOST_BLUR * np.sin(own[:, -1]) ** 2, MOST_BLUR
-            with np.errstate(divide="ignore", invalid="ignore"):
-                room = np.where(change < 0, -size / change, (most - size) / change)
-            part = min(1.0, _TOWARDS_EDGE * float(np.min(room, initial=np.inf, where=change != 0)))
-            size = np.sqrt(size + part * change)
-            if blurred:
-                size[:, -1] = np.arcsin(size[:, -1] / np.sqrt(MOST_BLUR))
-            trial = np.append(p[:m] + part * step[:m], size)
-            new, new_slope = self.slopes(trial)
-            if not new > value + _STRAIGHT_GAIN:
+        blurred, reach, m = self.tracks[0].B is None, FIRST_REACH, self.m
+        hessian = None
+        for _ in range(MOST_STRAIGHT_STEPS):
+            own = p[m:].reshape(self.shape)
+            if hessian is None:
+                tensors = self.family(p[:m])
+                pairs = list(zip(self.tracks, own, strict=True))
+                parts = [t.straight_curvatures(*tensors, one) for t, one in pairs]
+                full = np.array([full for full, _ in parts])
+                by_noise = np.array([one for _, one in parts])
+                hessian = ArrowHessian(
+                    full[:, :m, :m].sum(axis=0), full[:, :m, m:], full[:, m:, m:]
+                )
+            limits = noise_range(own, reach, blurred=blurred)
+            of_D, of_noise = hessian.step_within(slope[:m], by_noise, limits)
+            gain = float(slope[:m] @ of_D + np.sum(by_noise * of_noise))
+            if not gain > STRAIGHT_GAIN or reach < NEAREST_REACH:
                 break
-            p, value, slope = trial, new, new_slope
+            noise = changed_noise(own, of_noise, blurred=blurred)
+            trial = np.append(p[:m] + of_D, noise)
+            new, new_slope = self.slopes(trial)
+            if new > value:
+                p, value, slope, hessian = trial, new, new_slope, None
+                reach = min(2 * reach, FARTHEST_REACH)
+            else:
+                reach *= 0.25
         return p, value, slope
 
     def curvatures(self, p: Floats) -> ArrowHessian:
@@ -658,17 +689,84 @@ class PooledLikelihood:
         return ArrowHessian(0.5 * (shared + shared.T), mixed, 0.5 * (own + np.swapaxes(own, 1, 2)))
 
 
+def noise_range(own: Floats, reach: Floats | float, *, blurred: bool) -> tuple[Floats, Floats]:
+    """Return the least and the largest change of noise amplitudes and B in a step, (..., c) each.
+
+    Parameters
+    ----------
+    own : ndarray, shape (..., c)
+        Free parameters of the noise, as in `NoisyVectors.start`.
+    reach : float or ndarray, shape (..., 1)
+        Part of the way to the edges of their range.
+    blurred : bool
+        Whether the last one is B, which is at most 1/4.
+
+    Examples
+    --------
+    >>> noise_range(np.array([2.0, 0.0]), 0.5, blurred=True)
+    (array([-2., -0.]), array([  inf, 0.125]))
+    """
+    size, most = _amplitudes_and_blur(own, blurred=blurred), np.full(own.shape, np.inf)
+    if blurred:
+        most[..., -1] = MOST_BLUR
+    return -reach * size, reach * (most - size)
+
+
+def at_blur(own: Floats, angle: float, ratio: Floats) -> Floats:
+    """Return the free parameters (..., c) of about the same noise less blur, at another blur.
+
+    Parameters
+    ----------
+    own : ndarray, shape (..., c)
+        Free parameters of the noise, as in `NoisyVectors.start`; the last one is the angle of B.
+    angle : float
+        The other angle.
+    ratio : ndarray, shape (...,)
+        Noise amplitude that has the mean variance of a blur of B = 1.
+
+    Examples
+    --------
+    >>> at_blur(np.array([0.5, 0.0]), np.pi / 2, np.array(3.0)).round(9)
+    array([1.        , 1.57079633])
+    """
+    more = MOST_BLUR * (np.sin(angle) ** 2 - np.sin(own[..., -1]) ** 2) * ratio
+    size = np.maximum(own[..., :-1] ** 2 + more[..., None], 0.01 * ratio[..., None])
+    return np.concatenate([np.sqrt(size), np.full((*own.shape[:-1], 1), angle)], axis=-1)
+
+
+def changed_noise(own: Floats, change: Floats, *, blurred: bool) -> Floats:
+    """Return the free parameters (..., c) of the noise after a change of amplitudes and B.
+
+    Examples
+    --------
+    >>> changed_noise(np.array([2.0, 0.0]), np.array([5.0, 0.25]), blurred=True).round(9)
+    array([3.        , 1.57079633])
+    """
+    size = np.sqrt(_amplitudes_and_blur(own, blurred=blurred) + change)
+    if blurred:
+        size[..., -1] = np.arcsin(size[..., -1] / np.sqrt(MOST_BLUR))
+    return np.asarray(size)
+
+
+def _amplitudes_and_blur(own: Floats, *, blurred: bool) -> Floats:
+    """Return the noise amplitudes and B of the free parameters (..., c)."""
+    size = own**2
+    if blurred:
+        size[..., -1] = MOST_BLUR * np.sin(own[..., -1]) ** 2
+    return np.asarray(size)
+
+
 @dataclass(frozen=True, eq=False)
 class ArrowHessian:
-    """Minus a Hessian in which the motions share the parameters of D alone.
+    """Minus a Hessian in which the motions share the parameters of D alone; or several of them.
 
     Attributes
     ----------
-    shared : ndarray, shape (m, m)
+    shared : ndarray, shape (..., m, m)
         Block of the parameters of D.
-    mixed : ndarray, shape (G, m, c)
+    mixed : ndarray, shape (..., G, m, c)
         Blocks of D and the noise of each motion.
-    own : ndarray, shape (G, c, c)
+    own : ndarray, shape (..., G, c, c)
         Blocks of the noise of each motion.
     """
 
@@ -676,27 +774,62 @@ class ArrowHessian:
     mixed: Floats
     own: Floats
 
+    @classmethod
+    def of_single_motions(cls, full: Floats, m: int) -> ArrowHessian:
+        """Return the blocks of Hessians (P, m + c, m + c), each of one motion."""
+        return cls(full[:, :m, :m], full[:, None, :m, m:], full[:, None, m:, m:])
+
     def inverse(self) -> Floats:
-        """Return the inverse (m + Gc, m + Gc), its negative curvatures turned positive."""
-        count, m, c = self.mixed.shape
+        """Return the inverse (..., m + Gc, m + Gc), its negative curvatures turned positive."""
+        *several, count, m, c = self.mixed.shape
         own = positive_inverse(self.own)
         lever = self.mixed @ own
-        shared = positive_inverse(self.shared - np.einsum("gmc,gnc->mn", lever, self.mixed))
-        tail = -np.swapaxes(lever, 1, 2).reshape(count * c, m)
-        inverse = np.empty((m + count * c,) * 2)
-        inverse[:m, :m] = shared
-        inverse[m:, :m] = tail @ shared
-        inverse[:m, m:] = inverse[m:, :m].T
-        inverse[m:, m:] = tail @ shared @ tail.T
+        by_shared = np.einsum("...gmc,...gnc->...mn", lever, self.mixed)
+        shared = positive_inverse(self.shared - by_shared)
+        tail = -np.swapaxes(lever, -1, -2).reshape(*several, count * c, m)
+        inverse = np.empty((*several, m + count * c, m + count * c))
+        inverse[..., :m, :m] = shared
+        inverse[..., m:, :m] = tail @ shared
+        inverse[..., :m, m:] = np.swapaxes(inverse[..., m:, :m], -1, -2)
+        inverse[..., m:, m:] = inverse[..., m:, :m] @ np.swapaxes(tail, -1, -2)
         for g in range(count):
             rows = slice(m + g * c, m + (g + 1) * c)
-            inverse[rows, rows] += own[g]
+            inverse[..., rows, rows] += own[..., g, :, :]
         return inverse
+
+    def step_within(
+        self, slope: Floats, by_noise: Floats, limits: tuple[Floats, Floats]
+    ) -> tuple[Floats, Floats]:
+        """Return the Newton step (..., m) and (..., G, c), the change of the noise within limits.
+
+        A change beyond a limit (..., G, c) is fixed there, and all others are found again for it:
+        where noise and blur have nearly the same effect the step remains on the ridge.
+        """
+        m, c = slope.shape[-1], by_noise.shape[-1]
+        fixed, change = np.zeros(by_noise.shape, dtype=np.bool_), np.zeros_like(by_noise)
+        for _ in range(c + 1):
+            moved, free = np.where(fixed, change, 0.0), ~fixed
+            by_D = slope - np.einsum("...gmc,...gc->...m", self.mixed, moved)
+            rest = by_noise - np.einsum("...gcd,...gd->...gc", self.own, moved)
+            rest = np.where(fixed, change, rest).reshape(*slope.shape[:-1], -1)
+            own = self.own * (free[..., :, None] & free[..., None, :])
+            own += fixed[..., :, None] * np.eye(c)
+            inverse = ArrowHessian(self.shared, self.mixed * free[..., None, :], own).inverse()
+            step = (inverse @ np.concatenate([by_D, rest], axis=-1)[..., None])[..., 0]
+            noise = step[..., m:].reshape(by_noise.shape)
+            change = np.where(fixed, change, np.clip(noise, *limits))
+            within = np.divide(change, noise, out=np.ones_like(noise), where=free & (noise != 0))
+            # The one of each motion that comes to its limit first.
+            first = (within < 1) & (within == within.min(axis=-1, keepdims=True, initial=1.0))
+            if not first.any():
+                break
+            fixed |= first
+        return step[..., :m], change
 
     def information(self) -> Floats:
         """Return the information on what is shared, the noise of every motion left free."""
-        solved = np.linalg.solve(self.own, np.swapaxes(self.mixed, 1, 2))
-        information: Floats = self.shared - np.einsum("gmc,gcn->mn", self.mixed, solved)
+        solved = np.linalg.solve(self.own, np.swapaxes(self.mixed, -1, -2))
+        information: Floats = self.shared - np.einsum("...gmc,...gcn->...mn", self.mixed, solved)
         return information
 
 
