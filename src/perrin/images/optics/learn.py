@@ -650,7 +650,7 @@ class GroupSample(NamedTuple):
         fit = fit_window(window, image, noise, FreeCenters(self.centers))
         residual = window.data - fit.expected
         square = residual * fit.precision.times(residual)
-        return -0.5 * float(np.sum(square - np.log(fit.precision.weight)))
+        return -0.5 * float(np.sum(square - np.log(fit.weight)))
 
 
 class CrowdSample(NamedTuple):

@@ -210,6 +210,11 @@ class ImageFit(NamedTuple):
     prior: Floats
 
     @property
+    def weight(self) -> Floats:
+        """Inverse variances (m,) of the voxels, without what they have in common."""
+        return self.precision.weight
+
+    @property
     def unit_images(self) -> Floats:
         """Images (n, m) of the spheres at a brightness of 1."""
         return self.jacobian[-_N_BACKGROUND - len(self.brightness) : -_N_BACKGROUND]

@@ -837,7 +837,7 @@ def group_columns(
             voxels = fit.unit_images.sum(axis=1)
             independent = voxels / noise.voxels_in_one
             residual = fit.precision.left(window.data - fit.expected)
-            residual = fit.precision.weight * residual**2
+            residual = fit.weight * residual**2
             square = fit.unit_images @ residual / np.maximum(voxels, 1e-300)
             level = usual.brightness * dimmed[group]
             excess = usual.excess(square, fit.brightness / level, voxels=independent)
