@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
 PAGES = [ROOT / "README.md", DOCS / "conventions.md", DOCS / "tables.md", DOCS / "dense.md"]
-PAGES += [DOCS / "index.md", DOCS / "reference" / "files.md"]
+PAGES += [DOCS / "stacks.md", DOCS / "index.md", DOCS / "reference" / "files.md"]
 for folder in ("start", "howto", "theory", "tutorials", "coming-from"):
     PAGES += sorted((DOCS / folder).glob("*.md"))
 PAGES = [page for page in PAGES if re.search(r"^```(python|sh)$", page.read_text("utf-8"), re.M)]

@@ -9,6 +9,7 @@ import numpy as np
 
 from perrin import Cluster, RigidMotion, add_noise, simulate_motion, track_rotation
 from perrin.geometry.rotations import cumulative_product, exp_map
+from perrin.motion.tracking import track_each
 
 
 @cache
@@ -33,6 +34,12 @@ def flat() -> Cluster:
 def at_rest(cluster: Cluster) -> RigidMotion:
     """Return the motion of a body that rests for two frames."""
     return track_rotation(np.tile(cluster.positions, (2, 1, 1)), dt=1.0)
+
+
+def all_tracked(tracks, *, dt=1.0):
+    """Return the motions of tracks of one length, fitted together as each would be alone."""
+    x = np.stack(list(tracks))
+    return track_each(x, time=np.tile(dt * np.arange(x.shape[1]), (len(x), 1)), dt=dt)
 
 
 def with_poses(cluster, time, *, center=None, rotation=None, dt=1.0):

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import gc
 import os
 from typing import TYPE_CHECKING
 
 import pytest
+
+from left_out import leave_out_tensors, leave_out_verdicts
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -21,7 +24,29 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--long", action="store_true", help="all repeats of the Monte-Carlo tests")
 
 
+def pytest_collection_finish() -> None:
+    """Leave what is loaded before the first test out of the search for cycles.
+
+    Each search takes a third of a second of processor time, for objects that all stay.
+    """
+    gc.freeze()
+
+
 @pytest.fixture(scope="session")
 def repeats(request: pytest.FixtureRequest) -> Callable[[int, int], int]:
     """Choose between two numbers of repeats: the first, or with --long the second."""
     return lambda quick, long: long if request.config.getoption("--long") else quick
+
+
+@pytest.fixture
+def no_tensors(monkeypatch: pytest.MonkeyPatch, repeats: Callable[[int, int], int]) -> None:
+    """Leave out the tensors of an analysis in the quick form of a test."""
+    if not repeats(0, 1):
+        leave_out_tensors(monkeypatch)
+
+
+@pytest.fixture
+def no_verdicts(monkeypatch: pytest.MonkeyPatch, repeats: Callable[[int, int], int]) -> None:
+    """Leave out the kind of motion in the quick form of a test."""
+    if not repeats(0, 1):
+        leave_out_verdicts(monkeypatch)

@@ -39,17 +39,17 @@ def values(report: perrin.Report) -> np.ndarray:
     return np.array([[c.D_R.value, *c.D_R.ci95, c.D_T.value, *c.D_T.ci95] for c in report.clusters])
 
 
-@pytest.fixture(autouse=True)
-def unjudged(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch, repeats) -> None:
-    """Leave out the kind of motion in the quick form, but where results are written and read.
+@pytest.fixture
+def everything() -> None:
+    """Leave nothing out of the analyses of a test."""
 
-    It takes half of the time of an analysis; tests/test_run_verdicts.py tests it.
-    """
-    if not repeats(0, 1) and not {"tmp_path", "whole"} & set(request.fixturenames):
-        monkeypatch.setattr(
-            "perrin.run.measure.judge_each_and_all",
-            lambda motions, **_: ([None] * len(motions), None),
-        )
+
+@pytest.fixture(autouse=True)
+def coefficients_alone(request: pytest.FixtureRequest) -> None:
+    """Leave out the kind of motion and the tensor, but where results are written or compared."""
+    if not {"tmp_path", "everything"} & set(request.fixturenames):
+        request.getfixturevalue("no_tensors")
+        request.getfixturevalue("no_verdicts")
 
 
 @pytest.fixture(scope="module")
@@ -73,6 +73,11 @@ def answer(whole: perrin.Report) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
+def short_answer(short: pd.DataFrame) -> np.ndarray:
+    return values(perrin.analyze(short, dt=0.73))
+
+
+@pytest.fixture(scope="module")
 def sized(base: pd.DataFrame) -> perrin.Report:
     return perrin.analyze(base, dt=0.73, **KNOWN)
 
@@ -89,33 +94,37 @@ def sized(base: pd.DataFrame) -> perrin.Report:
     ],
     ids=["rows shuffled", "ids permuted", "text ids", "frames renumbered", "moved", "turned"],
 )
-def test_the_same_table_written_otherwise_gives_the_same_answer(base, answer, change):
+def test_the_same_table_written_otherwise_gives_the_same_answer(short, short_answer, change):
     """Row order, ids, frame numbers, origin and axes of the lab do not matter (1e-7)."""
-    np.testing.assert_allclose(values(perrin.analyze(change(base), dt=0.73)), answer, rtol=1e-7)
+    np.testing.assert_allclose(
+        values(perrin.analyze(change(short), dt=0.73)), short_answer, rtol=1e-7
+    )
 
 
-def test_a_rotated_lab_gives_the_same_answer(base, answer):
+def test_a_rotated_lab_gives_the_same_answer(short, short_answer):
     """A rotation by any angle mixes the lab axes; D_R, D_T and their intervals stay (1e-7)."""
     turn = perrin.simulate_motion(
         perrin.Cluster.trimer(1.0), D_R=1.0, dt=1.0, n_frames=2, rng=3
     ).rotation[1]
-    turned = base.copy()
-    turned[["x", "y", "z"]] = base[["x", "y", "z"]].to_numpy() @ turn.T
-    np.testing.assert_allclose(values(perrin.analyze(turned, dt=0.73)), answer, rtol=1e-7)
+    turned = short.copy()
+    turned[["x", "y", "z"]] = short[["x", "y", "z"]].to_numpy() @ turn.T
+    np.testing.assert_allclose(values(perrin.analyze(turned, dt=0.73)), short_answer, rtol=1e-7)
 
 
-def test_units_scale_the_answer(base, answer):
+def test_units_scale_the_answer(short, short_answer):
     """Millimetres read with scale 1000 give the same; another dt divides every coefficient."""
-    mm = base.assign(**{a: base[a] / 1000 for a in "xyz"})
-    np.testing.assert_allclose(values(perrin.analyze(mm, dt=0.73, scale=1000)), answer, rtol=1e-7)
-    np.testing.assert_allclose(values(perrin.analyze(base, dt=7.3)), answer / 10, rtol=1e-7)
+    mm = short.assign(**{a: short[a] / 1000 for a in "xyz"})
+    np.testing.assert_allclose(
+        values(perrin.analyze(mm, dt=0.73, scale=1000)), short_answer, rtol=1e-7
+    )
+    np.testing.assert_allclose(values(perrin.analyze(short, dt=7.3)), short_answer / 10, rtol=1e-7)
 
 
-def test_anisotropic_scale_undoes_anisotropic_pixels(base, answer):
+def test_anisotropic_scale_undoes_anisotropic_pixels(short, short_answer):
     """One scale per axis turns voxels into um."""
-    voxels = base.assign(x=base["x"] / 0.2, y=base["y"] / 0.2, z=base["z"] / 0.25)
+    voxels = short.assign(x=short["x"] / 0.2, y=short["y"] / 0.2, z=short["z"] / 0.25)
     report = perrin.analyze(voxels, dt=0.73, scale=(0.2, 0.2, 0.25))
-    np.testing.assert_allclose(values(report), answer, rtol=1e-7)
+    np.testing.assert_allclose(values(report), short_answer, rtol=1e-7)
 
 
 def test_frames_and_particles_may_be_missing(short):
@@ -146,9 +155,9 @@ def test_nan_coordinates_are_missing_points_counted_in_a_warning(short):
     assert not any("NaN" in w for w in without.notes)
 
 
-def test_without_a_cluster_column_bodies_are_found(base):
+def test_without_a_cluster_column_bodies_are_found(short):
     """One body is noted as one; two are found with and without contact; a gas is refused."""
-    plain = base.drop(columns="cluster")
+    plain = short.drop(columns="cluster")
     report = perrin.analyze(plain, dt=0.73)
     assert len(report.clusters) == 1
     assert any("one cluster" in w for w in report.notes)
@@ -178,10 +187,10 @@ def test_several_clusters_are_pooled():
 
 def test_a_bad_cluster_among_good_ones_is_a_warning():
     """A single particle and a single frame are left out by name; the good cluster is measured."""
-    good = tracks(seed=1, cluster=0)
-    single = tracks(seed=2, cluster=1)
+    good = tracks(seed=1, cluster=0, n_frames=SHORT)
+    single = tracks(seed=2, cluster=1, n_frames=SHORT)
     single = single[single["particle"] < 5]
-    flash = tracks(seed=3, cluster=2)
+    flash = tracks(seed=3, cluster=2, n_frames=SHORT)
     flash = flash[flash["frame"] == 0]
     report = perrin.analyze(pd.concat([good, single, flash]), dt=0.73)
     assert [c.cluster for c in report.clusters] == [0]
@@ -193,13 +202,13 @@ def test_a_bad_cluster_among_good_ones_is_a_warning():
         perrin.analyze(flash, dt=0.73)
 
 
-def test_loose_particles_are_counted_and_left_out(base):
+def test_loose_particles_are_counted_and_left_out(short):
     """Rows with cluster -1 take no part but stay in the table."""
-    loose = base.assign(cluster=-1, particle=base["particle"] + 50)
-    report = perrin.analyze(pd.concat([base, loose]), dt=0.73)
+    loose = short.assign(cluster=-1, particle=short["particle"] + 50)
+    report = perrin.analyze(pd.concat([short, loose]), dt=0.73)
     assert len(report.clusters) == 1
     assert any("4 particles belong to no cluster" in w for w in report.notes)
-    assert len(report.tracks) == 2 * len(base)
+    assert len(report.tracks) == 2 * len(short)
 
 
 def test_a_constant_z_is_warned_of(base, whole):
@@ -219,14 +228,14 @@ def test_a_contact_distance_that_finds_nothing_is_refused(base):
         perrin.analyze(base.drop(columns="cluster"), dt=0.73, contact=0.3)
 
 
-def test_frames_are_sliced(base):
+def test_frames_are_sliced(short):
     """frames=(A, B) uses A <= frame < B; an empty slice is refused with the frames of the table."""
-    report = perrin.analyze(base, dt=0.73, frames=(4, 206))
-    assert len(report.clusters[0].motion.time) == 202
-    expected = values(perrin.analyze(base[base["frame"].between(4, 205)], dt=0.73))
+    report = perrin.analyze(short, dt=0.73, frames=(4, 18))
+    assert len(report.clusters[0].motion.time) == 14
+    expected = values(perrin.analyze(short[short["frame"].between(4, 17)], dt=0.73))
     np.testing.assert_array_equal(values(report), expected)
-    with pytest.raises(ValueError, match=r"500.*0 to 209"):
-        perrin.analyze(base, dt=0.73, frames=(500, None))
+    with pytest.raises(ValueError, match=r"500.*0 to 19"):
+        perrin.analyze(short, dt=0.73, frames=(500, None))
 
 
 KNOWN = {"viscosity": 2.18e-3, "temperature": 295.0}
@@ -335,6 +344,7 @@ def test_like_clusters_share_one_solution(monkeypatch):
     assert trimer > 1.1 * values[0]
 
 
+@pytest.mark.usefixtures("everything")
 def test_a_shared_solution_is_turned_into_the_axes_of_each_body(monkeypatch):
     """A bent chain of four, relabelled and turned: along its axes the same as solved for itself."""
     bent = 2.0 * np.array([[0.0, 0, 0], [1, 0, 0], [1.5, 0.9, 0], [1.5, 0.9, 1.1]])
@@ -464,11 +474,11 @@ def test_a_motionless_cluster_is_an_upper_limit():
     assert any("not resolved: D_R <" in w for w in result.notes)
 
 
-def test_text_clusters_are_numbered_and_named(base):
+def test_text_clusters_are_numbered_and_named(short):
     """Names become numbers in the order of the names and stay as labels; no name is no cluster."""
-    other = tracks(seed=2, cluster=1).assign(cluster="knee")
-    loose = base.assign(cluster=None, particle=base["particle"] + 70)
-    table = pd.concat([base.assign(cluster="leg"), other, loose])
+    other = tracks(seed=2, cluster=1, n_frames=SHORT).assign(cluster="knee")
+    loose = short.assign(cluster=None, particle=short["particle"] + 70)
+    table = pd.concat([short.assign(cluster="leg"), other, loose])
     report = perrin.analyze(table, dt=0.73)
     assert [(c.cluster, c.label) for c in report.clusters] == [(0, "knee"), (1, "leg")]
     assert any("belong to no cluster" in w for w in report.notes)
@@ -734,7 +744,7 @@ def same(one: object, other: object) -> bool:
     return bool(one == other)
 
 
-@pytest.mark.usefixtures("whole")
+@pytest.mark.usefixtures("everything")
 def test_results_come_back_from_json(base):
     """Clusters, rods, pooled values, predictions and sizes are the same after JSON."""
     truth = perrin.simulate_motion(

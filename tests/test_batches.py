@@ -48,7 +48,6 @@ def motions():
         tracked(TETRAHEDRON, 210, 1),
         tracked(IRREGULAR, 210, 2),
         tracked(TETRAHEDRON, 210, 3),
-        tracked(IRREGULAR, 60, 4),
         tracked(TETRAHEDRON, 60, 5, gaps=(7, 50, 51)),
     ]
 
@@ -121,12 +120,11 @@ def rows_of(cluster, body, n_frames, *, seed, first=0, gaps=0.0, swapped=None, s
 def unlike_clusters():
     """Tables of bodies of several shapes, with gaps, exchanged labels and other lengths."""
     return [
-        rows_of(0, TETRAHEDRON, 210, seed=1),
-        rows_of(1, TETRAHEDRON, 210, seed=2, gaps=0.05),
-        rows_of(2, IRREGULAR, 210, seed=3, swapped=40),
-        rows_of(3, TETRAHEDRON, 210, seed=4, stretch=1.2),
-        rows_of(4, TETRAHEDRON, 20, seed=5, first=6, gaps=0.1),
-        rows_of(5, Cluster.touching(5, 2.0), 20, seed=6, gaps=0.03),
+        rows_of(0, TETRAHEDRON, 210, seed=2, gaps=0.05),
+        rows_of(1, IRREGULAR, 210, seed=3, swapped=40),
+        rows_of(2, TETRAHEDRON, 210, seed=4, stretch=1.2),
+        rows_of(3, TETRAHEDRON, 20, seed=5, first=6, gaps=0.1),
+        rows_of(4, Cluster.touching(5, 2.0), 20, seed=6, gaps=0.03),
     ]
 
 
@@ -146,11 +144,15 @@ def numbers_of(result):
     return numbers
 
 
+@pytest.mark.usefixtures("no_tensors")
 def test_a_table_of_unlike_clusters_is_each_of_them_alone(unlike_clusters):
-    """Fits, quality, coefficients and p-values are those of tables of one cluster, to 1e-9."""
+    """Fits, quality, coefficients and p-values are those of tables of one cluster, to 1e-9.
+
+    Tensors are compared in `test_tensors`.
+    """
     together = analyze(pd.concat(unlike_clusters, ignore_index=True), dt=0.7)
     found = {one.cluster: one for one in together.clusters}
-    assert sorted(found) == list(range(6))
+    assert sorted(found) == list(range(5))
     for number, table in enumerate(unlike_clusters):
         alone = analyze(table, dt=0.7).clusters[0]
         one = found[number]
@@ -163,8 +165,8 @@ def test_a_table_of_unlike_clusters_is_each_of_them_alone(unlike_clusters):
             np.testing.assert_allclose(
                 value, expected[name], rtol=1e-9, atol=1e-12, err_msg=f"cluster {number}: {name}"
             )
-    assert found[2].quality.swaps == (40,)
-    assert found[3].quality.z_scale == pytest.approx(1.2, abs=0.05)
+    assert found[1].quality.swaps == (40,)
+    assert found[2].quality.z_scale == pytest.approx(1.2, abs=0.05)
 
 
 def test_two_states_of_several_motions_are_those_of_each_alone():

@@ -132,9 +132,9 @@ def test_particles_may_come_and_go(d, repeats):
     """Tracks of 40 to 150 frames with 30 % missing: D within 2 %, 7 (2-D: 6) Monte-Carlo errors.
 
     Of 2500 tracks about 310 a frame are present in it and in the next one. The quick form has a
-    third of the frames.
+    quarter of the frames.
     """
-    frames = repeats(100, 300)
+    frames = repeats(75, 300)
     y = walkers(d, n=2500, n_frames=frames, seed=4)
     x = come_and_go(carried(y))
     body, motion = remove_rotation(x, dt=1.0)
@@ -322,8 +322,8 @@ def water():
 
 @pytest.fixture(scope="module")
 def beads(water, repeats):
-    """Return the beads' positions (T, n, 2), all frames or the first 100, and without rotation."""
-    x, _, _ = on_a_grid(water[water["frame"] < repeats(100, 300)])
+    """Return the beads' positions (T, n, 2), all frames or the first 60, and without rotation."""
+    x, _, _ = on_a_grid(water[water["frame"] < repeats(60, 300)])
     return x, *remove_rotation(x)
 
 

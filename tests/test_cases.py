@@ -12,6 +12,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import perrin
+from left_out import make_figures_without_rendering
+
+pytestmark = pytest.mark.usefixtures("no_tensors")
 
 DT = 0.73
 D_R = 5e-3
@@ -218,9 +221,7 @@ def test_a_report_without_translation_comes_back(centred, tmp_path, monkeypatch,
     The quick form makes the figures, but does not render them.
     """
     if not repeats(0, 1):
-        monkeypatch.setattr(
-            "matplotlib.figure.Figure.savefig", lambda _, path, **__: path.write_bytes(b"figure")
-        )
+        make_figures_without_rendering(monkeypatch)
     perrin.write_run(centred, tmp_path / "run")
     back = perrin.load_run(tmp_path / "run")
     assert np.isnan(only(back).D_T.value)

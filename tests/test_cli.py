@@ -21,6 +21,7 @@ import pytest
 
 import perrin
 from command_line import command_line
+from left_out import make_figures_without_rendering
 from perrin.cli.app import analyze
 from perrin.cli.tables import kinds_table, show_report, terms_of
 
@@ -85,9 +86,7 @@ def demo(tmp_path_factory: pytest.TempPathFactory, repeats) -> tuple[Path, str]:
     with pytest.MonkeyPatch.context() as patched:
         patched.setenv("COLUMNS", "100")
         if not repeats(0, 1):
-            patched.setattr(
-                "matplotlib.figure.Figure.savefig", lambda _, to, **__: to.write_bytes(b"figure")
-            )
+            make_figures_without_rendering(patched)
         result = run("demo", cwd=folder)
     assert result.returncode == 0, result.stderr
     return folder / "perrin-demo", result.stdout
@@ -100,8 +99,8 @@ def no_progress(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Write run folders without pictures, which take most of the time of a run."""
+def no_figures(monkeypatch: pytest.MonkeyPatch, no_tensors: None) -> None:
+    """Write run folders without pictures and tensors, which take most of the time of a run."""
     monkeypatch.setattr("perrin.report.write.save_figures", lambda *_, **__: [])
 
 
@@ -195,6 +194,7 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
 
 
+@pytest.mark.usefixtures("no_tensors", "no_verdicts")
 def test_demo_replaces_only_its_own(demo, csv, tmp_path, monkeypatch):
     """The demo can be repeated; a folder that holds anything else stays as it is.
 
@@ -235,7 +235,7 @@ def test_demo_replaces_only_its_own(demo, csv, tmp_path, monkeypatch):
     assert b"earlier version" not in (place / "report.html").read_bytes()
 
 
-@pytest.mark.usefixtures("no_figures")
+@pytest.mark.usefixtures("no_figures", "no_verdicts")
 def test_demo_with_a_folder_overwrites_nothing(demo, tmp_path):
     """With -o even the demo's own folder is refused, unless --overwrite; status 2, no work."""
     place = tmp_path / "perrin-demo"
@@ -650,10 +650,12 @@ def test_plan_takes_either_size_and_every_budget(tmp_path):
     assert "Limited photons" in light.stdout
 
 
-def test_plan_draws_and_never_overwrites_silently(tmp_path):
+def test_plan_draws_and_never_overwrites_silently(tmp_path, monkeypatch):
     """The picture has the format of its suffix; one that exists stays, unless --overwrite."""
     assert run(*PLAN, "-o", "a.svg", cwd=tmp_path).returncode == 0
     assert (tmp_path / "a.svg").read_bytes().startswith(b"<?xml")
+    # The second picture is empty: the layout of its texts takes half of the time.
+    monkeypatch.setattr("perrin.plot.results.plot_plan", lambda *_, **__: None)
     (tmp_path / "a.png").write_text("precious")
     refused(run(*PLAN, "-o", "a.png", cwd=tmp_path), 2, "a.png", "exists", "--overwrite")
     assert (tmp_path / "a.png").read_text() == "precious"

@@ -8,6 +8,7 @@ import warnings
 import numpy as np
 import pytest
 
+from brownian_motions import all_tracked
 from perrin import (
     Cluster,
     DiffusionEstimate,
@@ -22,6 +23,7 @@ from perrin import (
     track_rotation,
 )
 from perrin._text import with_error
+from perrin.diffusion import estimate_each
 from perrin.diffusion.estimate import Found
 from perrin.diffusion.likelihood import Likelihood
 from perrin.diffusion.noise_model import Noise
@@ -65,6 +67,14 @@ def lossy(seed, frames=0.0, particles=0.0, **what):
 
 def tracked(x, **how):
     return track_rotation(x, dt=how.pop("dt", 1.0), **how)
+
+
+def all_estimated(motions, quantity="rotation", *, method="mle", noise="joint", **more):
+    """Return the estimate of every motion; those of likelihood together, as each would be alone."""
+    if method == "mle":
+        return estimate_each(motions, quantity=quantity, noise=Noise(noise, **more))
+    how = {"quantity": quantity, "method": method, "noise": noise}
+    return [estimate_diffusion(m, **how, **more) for m in motions]
 
 
 def numbers(estimate):
@@ -237,8 +247,8 @@ def test_a_cut_loses_only_the_step_between(quantity):
 @pytest.fixture(scope="module")
 def standard(repeats):
     """Return 30 or 200 tracks (N = 300, SNR 20, sigma/R = 0.02) and their D_R and D_T."""
-    motions = [tracked(cloud(1000 + seed)) for seed in range(repeats(30, 200))]
-    found = {q: [estimate_diffusion(m, quantity=q) for m in motions] for q in QUANTITIES}
+    motions = all_tracked(cloud(1000 + seed) for seed in range(repeats(30, 200)))
+    found = {q: all_estimated(motions, q) for q in QUANTITIES}
     return motions, found
 
 
@@ -292,7 +302,7 @@ def test_offsets_scatter_about_the_planted_noise(standard, quantity):
 @pytest.fixture(scope="module")
 def noisy(repeats):
     """Return tracks at a signal-to-noise ratio of 0.3."""
-    return [tracked(cloud(s, snr=0.3)) for s in range(repeats(12, 40))]
+    return all_tracked(cloud(s, snr=0.3) for s in range(repeats(12, 40)))
 
 
 @pytest.mark.parametrize("quantity", QUANTITIES)
@@ -301,7 +311,7 @@ def test_noisy_offsets_equal_the_floor(quantity, noisy):
 
     The sd of the z-scores is 1 within 3 errors (34 % of 40 tracks).
     """
-    found = [estimate_diffusion(m, quantity=quantity) for m in noisy]
+    found = all_estimated(noisy, quantity)
     s = S_R if quantity == "rotation" else S_T
     offsets = np.array([e.offset for e in found])
     z = (offsets - s) / [e.offset_stderr for e in found]
@@ -333,7 +343,7 @@ def check_unbiased(motions, truths=None):
     every, least = {}, min(least_cover(len(motions)), 0.85)
     for quantity in QUANTITIES:
         truth = (truths or {}).get(quantity, planted(quantity))
-        found = [estimate_diffusion(m, quantity=quantity) for m in motions]
+        found = all_estimated(motions, quantity)
         values = np.array([e.value for e in found]) / truth
         assert abs(values.mean() - 1) < 3 * standard_error(values), (quantity, values.mean())
         assert np.mean([e.ci95[0] < truth < e.ci95[1] for e in found]) >= least, quantity
@@ -347,10 +357,10 @@ def test_missing_frames_do_not_bias(repeats):
     A gap taken for one step would add 45 %, 45 standard errors of 100 tracks and 9 of 8 short ones.
     """
     check_unbiased(
-        [
-            tracked(lossy(s, frames=0.3, snr=5.0, n_frames=repeats(150, 300)))
+        all_tracked(
+            lossy(s, frames=0.3, snr=5.0, n_frames=repeats(150, 300))
             for s in range(repeats(8, 100))
-        ],
+        ),
         {q: planted(q, 5.0) for q in QUANTITIES},
     )
 
@@ -363,10 +373,9 @@ def test_missing_particles_do_not_bias(blur, repeats):
     """
     cluster = Cluster.touching(5, 2.45)
     check_unbiased(
-        [
-            tracked(lossy(s, particles=0.15, cluster=cluster, substeps=blur))
-            for s in range(repeats(5, 30))
-        ]
+        all_tracked(
+            lossy(s, particles=0.15, cluster=cluster, substeps=blur) for s in range(repeats(5, 30))
+        )
     )
 
 
@@ -376,7 +385,7 @@ def test_missing_particles_do_not_bias(blur, repeats):
 def test_blur_makes_negative_offsets_and_no_bias(cluster, repeats):
     """A shutter that never closes: the offset is s - D dt/3 < 0 and D is unbiased."""
     count = repeats(6, 30)
-    motions = [tracked(cloud(s, cluster=cluster, substeps=8, snr=50.0)) for s in range(count)]
+    motions = all_tracked(cloud(s, cluster=cluster, substeps=8, snr=50.0) for s in range(count))
     every = check_unbiased(motions, {q: planted(q, 50.0) for q in QUANTITIES})
     for quantity, found in every.items():
         offsets = [e.offset / planted(quantity, 50.0) for e in found]
@@ -390,17 +399,16 @@ def test_noise_that_differs_by_axis_is_distinguished_from_blur(repeats):
     body = Cluster.from_positions(
         [[-1.5, 0.3, 0], [-0.5, -0.3, 0.3], [0.5, 0.3, -0.3], [1.5, -0.3, 0]]
     )
-    check_unbiased([tracked(cloud(s, cluster=body, substeps=8)) for s in range(repeats(6, 30))])
+    check_unbiased(all_tracked(cloud(s, cluster=body, substeps=8) for s in range(repeats(6, 30))))
 
 
 def test_poor_z_does_not_bias_D_T(repeats):
     """With sigma_z = 4 sigma_xy D_T is unbiased and covers, however the laboratory is turned."""
-    motions = [
-        tracked(cloud(s, sigma=(0.03, 0.03, 0.12), snr=2.0) @ TURN.T)
-        for s in range(repeats(12, 60))
-    ]
+    motions = all_tracked(
+        cloud(s, sigma=(0.03, 0.03, 0.12), snr=2.0) @ TURN.T for s in range(repeats(12, 60))
+    )
     truth = planted("translation", 2.0)
-    found = [estimate_diffusion(m, quantity="translation") for m in motions]
+    found = all_estimated(motions, "translation")
     values = np.array([e.value for e in found]) / truth
     assert abs(values.mean() - 1) < 3 * standard_error(values)
     assert np.mean([e.ci95[0] < truth < e.ci95[1] for e in found]) >= least_cover(len(found))
@@ -411,12 +419,12 @@ def test_in_the_plane_one_angle_and_two_coordinates(repeats):
 
     The known limits of joint estimates within 3 Monte-Carlo errors (34 % of 40 tracks).
     """
-    flat, motions = Cluster.from_positions([[0, 0], [2, 0], [1, 1.6]]), []
+    flat, tracks = Cluster.from_positions([[0, 0], [2, 0], [1, 1.6]]), []
     truth, frames = {"rotation": 4e-3, "translation": 0.03}, repeats(150, 300)
     for seed in range(repeats(12, 40)):
         m = simulate_motion(flat, D_R=4e-3, D_T=0.03, dt=1.0, n_frames=frames, rng=seed)
-        motions.append(tracked(add_noise(m.positions(), sigma=0.02, rng=900 + seed)))
-    every = check_unbiased(motions, truth)
+        tracks.append(add_noise(m.positions(), sigma=0.02, rng=900 + seed))
+    every = check_unbiased(all_tracked(tracks), truth)
     for quantity, angles in (("rotation", 1), ("translation", 2)):
         values = np.array([e.value for e in every[quantity]])
         rms = np.sqrt(np.mean((values / truth[quantity] - 1) ** 2))
@@ -432,12 +440,12 @@ def test_an_anisotropic_body_has_a_third_of_the_trace(repeats):
     """
     tensor = kabsch(*np.random.default_rng(5).normal(size=(2, 5, 3)))
     tensor = tensor @ np.diag([1e-3, 1e-3, 10e-3]) @ tensor.T
-    found = []
+    tracks = []
     for seed in range(repeats(50, 150)):
         frames = repeats(100, 300)
         m = simulate_motion(TETRAHEDRON, D_R=tensor, dt=1.0, n_frames=frames, rng=seed)
-        x = add_noise(m.positions(), sigma=SIGMA, rng=500 + seed)
-        found.append(estimate_diffusion(tracked(x)))
+        tracks.append(add_noise(m.positions(), sigma=SIGMA, rng=500 + seed))
+    found = all_estimated(all_tracked(tracks))
     values = np.array([e.value for e in found])
     # The longest axis turns by 4 D dt = 0.04: rotation vectors read the mean low by 0.1 %.
     assert abs(values.mean() - 4e-3) < 3 * standard_error(values)
@@ -465,9 +473,10 @@ def test_a_motionless_cluster_gets_an_upper_limit(repeats):
     below ten such floors.
     """
     beyond, count = 0, repeats(8, 30)
+    motions = all_tracked(cloud(seed, snr=0.0) for seed in range(count))
+    spins, drifts = (all_estimated(motions, q) for q in QUANTITIES)
     for seed in range(count):
-        motion = tracked(cloud(seed, snr=0.0))
-        spin, drift = (estimate_diffusion(motion, quantity=q) for q in QUANTITIES)
+        spin, drift = spins[seed], drifts[seed]
         assert spin.resolution_floor == pytest.approx(0.04 * 0.02**4, rel=0.2)
         assert spin.ci95[0] == 0 or spin.value < 10 * spin.resolution_floor
         assert not spin.resolved
@@ -486,7 +495,7 @@ def test_a_motionless_cluster_gets_an_upper_limit(repeats):
 
 def relative(motions, truth, **how):
     """Return the mean of D over the truth, its standard error, the spread, and the 95 % cover."""
-    found = [estimate_diffusion(m, **how) for m in motions]
+    found = all_estimated(motions, **how)
     values = np.array([e.value for e in found]) / truth
     cover = np.mean([e.ci95[0] < truth < e.ci95[1] for e in found])
     return values.mean(), standard_error(values), values.std(), cover
@@ -508,7 +517,7 @@ def test_known_noise_saves_two_thirds_of_the_frames(standard, method, noise):
 
 def test_a_wrong_sigma_moves_D_the_other_way(repeats):
     """Noise held 10 % too high lowers D at SNR 1: d ln D/d ln s = -0.5, so by 10 %."""
-    motions = [tracked(cloud(s, snr=1.0)) for s in range(repeats(10, 60))]
+    motions = all_tracked(cloud(s, snr=1.0) for s in range(repeats(10, 60)))
     right, high = (relative(motions, planted("rotation", 1.0), noise=k * SIGMA) for k in (1, 1.1))
     assert high[0] - right[0] == pytest.approx(-0.10, abs=0.02)
 
@@ -519,9 +528,9 @@ def test_stated_exposure_undoes_the_blur(repeats):
     Stated to the joint estimate it changes only the range of the noise offset.
     """
     frames, substeps = repeats(150, 300), repeats(10, 20)
-    motions = [
-        tracked(cloud(s, frames, substeps=substeps, snr=5.0)) for s in range(repeats(10, 40))
-    ]
+    motions = all_tracked(
+        cloud(s, frames, substeps=substeps, snr=5.0) for s in range(repeats(10, 40))
+    )
     truth = planted("rotation", 5.0)
     unstated = relative(motions, truth, noise="residual")
     stated = relative(motions, truth, noise="residual", exposure=1.0)
@@ -539,7 +548,7 @@ def test_exposure_zero_keeps_the_offset_above_zero(standard, repeats):
     """
     offsets = np.array([e.offset for e in standard[1]["translation"][:60]])
     lowest = np.argsort(offsets)[: repeats(10, 60)]
-    kept = [estimate_diffusion(standard[0][i], quantity="translation", exposure=0) for i in lowest]
+    kept = all_estimated([standard[0][i] for i in lowest], "translation", exposure=0.0)
     assert min(offsets) < 0 <= min(e.offset for e in kept)
 
 
@@ -556,7 +565,9 @@ def test_covariances_agree_with_the_likelihood_where_they_should(standard):
 @pytest.fixture(scope="module")
 def gapped(repeats):
     """Return tracks with 30 % of frames and 3 % of particles missing at SNR 2."""
-    return [tracked(lossy(s, frames=0.3, particles=0.03, snr=2.0)) for s in range(repeats(12, 100))]
+    return all_tracked(
+        lossy(s, frames=0.3, particles=0.03, snr=2.0) for s in range(repeats(12, 100))
+    )
 
 
 @pytest.mark.parametrize("noise", ["joint", "residual"])
@@ -575,8 +586,8 @@ def coarse(repeats):
     tracks = []
     for seed in range(repeats(16, 30)):
         m = simulate_motion(TETRAHEDRON, D_R=0.5, dt=1.0, n_frames=400, rng=seed)
-        tracks.append(tracked(add_noise(m.positions(), sigma=SIGMA, rng=900 + seed)))
-    return tracks
+        tracks.append(add_noise(m.positions(), sigma=SIGMA, rng=900 + seed))
+    return all_tracked(tracks)
 
 
 @pytest.mark.parametrize("noise", ["joint", "residual"])
@@ -619,7 +630,7 @@ def test_drift_is_subtracted_and_reported(repeats):
     flow = np.array([0.9, -0.3, 1.2]) * 5 * np.sqrt(2 * planted("translation"))
     frames = repeats(150, 300)
     time = np.arange(frames)[:, None, None]
-    motions = [tracked(cloud(s, frames) + flow * time) for s in range(repeats(8, 60))]
+    motions = all_tracked(cloud(s, frames) + flow * time for s in range(repeats(8, 60)))
     truth = planted("translation")
     mean, error, _, cover = relative(motions, truth, quantity="translation", drift=True)
     assert abs(mean - 1) < 3 * error
@@ -646,7 +657,7 @@ def test_drift_by_reversal_and_time_unit():
 def test_the_probability_that_pooled_motions_agree(repeats):
     """p_same is uniform for equal D (pools of 3 or 5; Kolmogorov 1 %), tiny for D that differ."""
     count, size = repeats(10, 40), repeats(3, 5)
-    motions = [tracked(cloud(2000 + s, n_frames=repeats(50, 100))) for s in range(size * count)]
+    motions = all_tracked(cloud(2000 + s, n_frames=repeats(50, 100)) for s in range(size * count))
     pools = [motions[size * k : size * (k + 1)] for k in range(count)]
     p = np.sort([estimate_diffusion(pool).p_same for pool in pools])
     ranks = np.arange(1, count + 1) / count

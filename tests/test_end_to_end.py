@@ -6,8 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+pytest.importorskip("tifffile")
+pytest.importorskip("trackpy")
+
 BENCHMARK = Path(__file__).resolve().parents[1] / "benchmarks" / "end_to_end.py"
-RECIPE = {"clusters": 2, "n_frames": 6, "shape": (40, 60, 100), "photons": 40.0, "seed": 0}
+RECIPE = {"clusters": 2, "n_frames": 6, "shape": (38, 50, 84), "photons": 40.0, "seed": 0}
 
 
 @pytest.fixture(scope="module")

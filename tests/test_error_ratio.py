@@ -125,6 +125,7 @@ def moving_together(common, *, count=3, n_frames=201, seed=1):
     return pd.concat(tables, ignore_index=True)
 
 
+@pytest.mark.usefixtures("no_tensors", "no_verdicts")
 def test_a_stage_that_does_not_return_is_named_and_harmless():
     """Random common places along z are a note with their size, and D_T is that of the bodies."""
     jitter = np.zeros((201, 3))

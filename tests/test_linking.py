@@ -94,6 +94,7 @@ def test_raw_detections_give_the_result_of_the_labelled_tracks():
     assert values[1] == pytest.approx(values[0], rel=1e-6)
 
 
+@pytest.mark.usefixtures("no_tensors", "no_verdicts")
 def test_cuts_of_identify_reach_the_analysis():
     """Sampled too slowly for its symmetry a cluster is cut; no step joins two pieces."""
     rng = np.random.default_rng(3)

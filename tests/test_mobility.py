@@ -95,8 +95,13 @@ def deviation(D, reference):
 
 
 @pytest.mark.parametrize("name", TABLE)
-def test_published_and_converged_values(name):
-    """Means and principal values of ten bodies come out within 1e-4 with the defaults."""
+def test_published_and_converged_values(name, repeats):
+    """Means and principal values of ten bodies come out within 1e-4 with the defaults.
+
+    The quick form leaves out four of the ten.
+    """
+    if name in repeats(("square", "bipyramid", "pentahedron", "pentagonal bipyramid"), ()):
+        pytest.skip("with --long only")
     mean_T, principal_T, mean_R, principal_R = TABLE[name]
     t, values_T, r, values_R = ratios(body(name))
     assert t == pytest.approx(mean_T, rel=1e-4)
@@ -171,10 +176,10 @@ def axial_torque(gap):
     return np.sum((-1.0) ** m * (np.sinh(alpha) / np.sinh((m + 1) * alpha)) ** 3)
 
 
-@pytest.mark.parametrize("gap", [0.0, 0.1, 1.0, 3.0])
-def test_exact_series_of_the_dimer(gap):
-    """Along and about the axis the exact series hold within 1e-5 at degree 12."""
-    mobility = cluster_mobility([[0, 0, 0], [0, 0, 2 + gap]], radius=1.0, degree=12, **WATERY)
+@pytest.mark.parametrize(("gap", "degree"), [(0.0, 12), (0.1, 12), (1.0, 6), (3.0, 5)])
+def test_exact_series_of_the_dimer(gap, degree):
+    """Along and about the axis the exact series hold within 1e-5, at a distance at low degrees."""
+    mobility = cluster_mobility([[0, 0, 0], [0, 0, 2 + gap]], radius=1.0, degree=degree, **WATERY)
     along = KT_OVER_ETA / (12 * np.pi * axial_drag(gap))
     about = KT_OVER_ETA / (16 * np.pi * axial_torque(gap))
     assert mobility.D_T[2, 2] == pytest.approx(along, rel=1e-5)

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 import perrin
+from brownian_motions import all_tracked
 from perrin import (
     Cluster,
     DegenerateClusterError,
@@ -294,11 +295,11 @@ def test_sigma_has_the_error_of_its_degrees_of_freedom(cluster, fraction, repeat
     Mean within 4 standard errors, standard deviation within 4 of its own, 1/sqrt(2 tracks).
     """
     n, d = cluster.positions.shape
-    score = []
+    tracks, score = [], []
     for seed in range(repeats(8, 40)):
         _, x = simulated(cluster, n_frames=repeats(20, 100), sigma=0.03, seed=seed)
-        x = with_holes(x, fraction, gap=(0, 0), seed=seed)
-        motion = track_rotation(x, dt=0.5)
+        tracks.append(with_holes(x, fraction, gap=(0, 0), seed=seed))
+    for motion in all_tracked(tracks, dt=0.5):
         lost = 6 if d == 3 else 3
         dof = np.sum(d * motion.n_present[motion.fitted] - lost) - (d * n - lost)
         score.append((motion.sigma / 0.03 - 1) / (np.sqrt(2 / dof) / 2))
@@ -310,10 +311,8 @@ def test_sigma_of_the_shortest_tracks(repeats):
     """The template takes degrees of freedom: sigma^2 of 1000 (80) two-frame tracks, 4 errors."""
     count = repeats(80, 1000)
     truth = simulate_motion(TETRA, D_R=0.1, dt=1.0, n_frames=2, rng=1).positions()
-    sigma2 = [
-        track_rotation(add_noise(truth, sigma=0.03, rng=seed), dt=1.0).sigma ** 2
-        for seed in range(count)
-    ]
+    tracks = [add_noise(truth, sigma=0.03, rng=seed) for seed in range(count)]
+    sigma2 = [motion.sigma**2 for motion in all_tracked(tracks)]
     assert np.mean(sigma2) / 0.03**2 == pytest.approx(1, abs=4 * np.sqrt(2 / 6 / count) + 0.003)
 
 

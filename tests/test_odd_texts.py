@@ -56,6 +56,7 @@ def undrawn(monkeypatch):
     monkeypatch.setattr("perrin.report.write.save_figures", lambda *_, **__: [])
 
 
+@pytest.mark.usefixtures("no_tensors")
 @pytest.mark.parametrize("part", [ODD[:5], ODD[5:10]])
 def test_labels_are_printed_as_they_are(tmp_path, capsys, undrawn, part):
     """In the table of the terminal, in warnings and in notes; no code reaches the terminal."""

@@ -15,6 +15,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from left_out import make_figures_without_rendering
 from perrin.paper import remake
 from perrin.paper.claims import Claim, Study, claims_page, statistical
 from perrin.paper.experiment import conclusion, table_1
@@ -144,6 +145,7 @@ def test_a_failed_run_leaves_nothing(tmp_path, monkeypatch):
         raise RuntimeError("stopped")
 
     monkeypatch.setattr(remake, "ITEMS", (localisation,))
+    make_figures_without_rendering(monkeypatch)
     with pytest.raises(RuntimeError, match="stopped"):
         remake.reproduce(tmp_path / "run", progress=broken)
     assert list(tmp_path.iterdir()) == []

@@ -15,6 +15,7 @@ from matplotlib.colors import to_hex, to_rgba
 from matplotlib.figure import Figure
 
 import perrin
+from left_out import leave_out_verdicts, make_figures_without_rendering
 from perrin._text import number_text
 from perrin.diffusion.estimate import DiffusionEstimate, bare_text, value_text
 from perrin.plot import figure_style, report_figures
@@ -43,7 +44,9 @@ def measured(*, clusters=1, frames=201, planar=False, labels=None, D_R=0.02, gap
 
 @pytest.fixture(scope="module")
 def space():
-    return measured(gaps=True).clusters[0]
+    with pytest.MonkeyPatch.context() as patch:
+        leave_out_verdicts(patch)
+        return measured(gaps=True).clusters[0]
 
 
 @pytest.fixture(scope="module")
@@ -345,6 +348,8 @@ def test_save_figures_names_its_files_and_changes_no_setting(
             "column_figure",
             lambda height, columns=2: without_layout(figure(height, columns=columns)),
         )
+        if planar:
+            make_figures_without_rendering(monkeypatch)
     before = dict(rcParams)
     report = measured(planar=planar, frames=20)
     seen = []

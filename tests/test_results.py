@@ -162,6 +162,7 @@ class TestFromRotations:
             perrin.RigidMotion.from_rotations(rotations, dt=1.0, **more)
 
 
+@pytest.mark.usefixtures("no_tensors")
 def test_progress_counts_the_clusters_of_every_long_step(tmp_path, monkeypatch):
     """Steps begin at 0 of their total; 20 clusters are estimated in two parts, written singly."""
     monkeypatch.setattr("perrin.report.write.save_figures", lambda *_, **__: [])
@@ -170,7 +171,7 @@ def test_progress_counts_the_clusters_of_every_long_step(tmp_path, monkeypatch):
     def progress(done, total, title):
         calls.setdefault(title, []).append((done, total))
 
-    one = measured(frames=20).tracks
+    one = measured(frames=6).tracks
     table = pd.concat(
         [one.assign(cluster=k, particle=one["particle"] + 4 * k) for k in range(20)],
         ignore_index=True,

@@ -149,6 +149,7 @@ def test_missing_particles_have_no_weight():
     assert one.n_present[4] == 3
 
 
+@pytest.mark.usefixtures("no_tensors")
 def test_a_table_with_its_own_times_is_fitted_with_them():
     """The column time of a table, one value a row, is used like `delays`."""
     rng = np.random.default_rng(6)

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import doctest
 import json
 import pickle
 import sys
 import tracemalloc
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -642,11 +640,3 @@ def test_zarr_folder_without_scales(tmp_path):
     (tmp_path / "a.zarr" / "zarr.json").write_text(json.dumps(header))
     with pytest.raises(ValueError, match="without OME-Zarr"):
         open_stack(tmp_path / "a.zarr", **GIVEN)
-
-
-def test_the_page_about_stacks_runs():
-    """The example of docs/stacks.md prints the output on the page."""
-    page = Path(__file__).resolve().parents[1] / "docs" / "stacks.md"
-    result = doctest.testfile(str(page), module_relative=False)
-    assert result.attempted > 0
-    assert result.failed == 0

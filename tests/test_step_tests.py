@@ -9,6 +9,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import perrin
+from brownian_motions import all_tracked
+from perrin.diffusion import estimate_each
 from perrin.diffusion.step_tests import (
     StageJumps,
     cut_at,
@@ -208,14 +210,10 @@ def test_the_test_for_a_steady_motion_keeps_its_level(quantity, repeats):
     is within 3 standard errors.
     """
     count = repeats(20, 80)
-    p = np.array(
-        [
-            steady_motion(m, perrin.estimate_diffusion(m, quantity=quantity)).p
-            for m in (
-                track_rotation(brownian(s, frames=repeats(60, 100)), dt=DT) for s in range(count)
-            )
-        ]
-    )
+    tracks = (brownian(s, frames=repeats(60, 100)) for s in range(count))
+    motions = all_tracked(tracks, dt=DT)
+    estimates = estimate_each(motions, quantity=quantity, noise=perrin.Noise())
+    p = np.array([steady_motion(m, D).p for m, D in zip(motions, estimates, strict=True)])
     assert np.count_nonzero(p < 0.05) < repeats(5, 12)
     assert abs(np.median(p) - 0.5) < 1.5 / np.sqrt(count)
 
@@ -300,6 +298,7 @@ def test_diffusion_drift_and_one_body_are_no_jumps_of_the_stage(repeats):
     assert not find_stage_jumps(motions[:1], frames[:1]).frames.size
 
 
+@pytest.mark.usefixtures("no_tensors")
 def test_a_table_leaves_the_jump_of_the_stage_out_of_the_translation():
     """D_T is that without the step, D_R keeps all frames, and the report names the jump."""
     still, moved = (

@@ -145,7 +145,13 @@ def test_one_movie_and_one_cluster_say_what_their_interval_is_about():
     [((2, (1, 5)), (0.2, 0.2)), ((5, (1, 3)), (0.5, 0.5)), ((10, (1, 9)), (0.0, 0.0))],
 )
 def test_intervals_of_means_cover(design, spread, repeats):
-    """95 % intervals cover at least 0.93, from 5 movies on at most 0.97, within 3 errors."""
+    """95 % intervals cover at least 0.93, from 5 movies on at most 0.97, within 3 errors.
+
+    benchmarks/study_coverage.py --quick, a part of .ci/run, does it with 40 repeats of every
+    design.
+    """
+    if design[0] != 5 and not repeats(0, 1):
+        pytest.skip("with --long only")
     count = repeats(12, 1000)
     found = BENCHMARK["covered"](design, spread, repeats=count, rng=np.random.default_rng(8))
     error = np.sqrt(0.95 * 0.05 / count)

@@ -111,7 +111,8 @@ def _with(node: ast.AST, **fields: object) -> ast.AST:
 def _places(tree: ast.Module) -> Iterator[tuple[ast.AST, str, int | None, str]]:
     """Yield every place that holds code: parent, field, index in it, and the function around.
 
-    Annotations, decorators and the texts of errors are left out.
+    Annotations, decorators, the texts of errors and what only guards the program against its own
+    mistakes or states the caller's line (strict=, stacklevel=) are left out.
     """
     waiting: list[tuple[ast.AST, str]] = [(tree, "module")]
     while waiting:
@@ -124,6 +125,8 @@ def _places(tree: ast.Module) -> Iterator[tuple[ast.AST, str, int | None, str]]:
                 if not isinstance(child, ast.AST) or isinstance(child, ast.JoinedStr | ast.Raise):
                     continue
                 if isinstance(child, ast.If) and ast.unparse(child.test) == "TYPE_CHECKING":
+                    continue
+                if isinstance(child, ast.keyword) and child.arg in ("strict", "stacklevel"):
                     continue
                 yield parent, field, index if several else None, where
                 named = isinstance(child, ast.FunctionDef | ast.ClassDef)

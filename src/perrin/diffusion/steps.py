@@ -174,8 +174,8 @@ class NoisySteps:
     theta: float
     freedom: float
     level: float
-    drift: bool = False
-    steady: Floats = field(default_factory=lambda: np.zeros(0))
+    drift: bool
+    steady: Floats
 
     def theta_at(self, D: float, offset: float) -> float:
         """Return the free part of the noise: the offset is theta + level - blur D."""
@@ -277,7 +277,7 @@ def steps_of(motion: RigidMotion, quantity: Quantity) -> Steps:
         apart = np.diff(values) > _EQUALLY_NOISY_AXES * values[1:]
         for group in np.split(np.arange(len(values)), 1 + np.flatnonzero(apart)):
             alike = noise[:, group].mean(axis=1)
-            for axis in group if len(group) > 1 else ():
+            for axis in group:
                 noise[complete, axis] = alike[complete]
         vectors = motion.step_vectors()[stop - 1] @ axes
         # A spin of the lab moves the body by R^T of it; in the plane both are one number.
@@ -503,10 +503,11 @@ def body_steps(motion: RigidMotion, quantity: Quantity | Literal["both"], turn: 
     else:
         jump = np.einsum("sji,sj->si", motion.rotation[start], displacement)
         half = 0.5 * np.linalg.norm(w, axis=1)
-        # (1 - h cot h)/(2h)^2 -> 1/12 (1 + h^2/15) at small h, where the quotient loses its digits.
+        # (1 - h cot h)/(2h)^2 -> 1/12 at small h, where the quotient loses its digits; the next
+        # term, h^2/180, changes a step by 1e-14 at most.
         small = half < 1e-3
         h = np.where(small, 1.0, half)
-        factor = np.where(small, (1 + half**2 / 15) / 12, (1 - h / np.tan(h)) / (4 * h * h))
+        factor = np.where(small, 1 / 12, (1 - h / np.tan(h)) / (4 * h * h))
         once = np.cross(w, jump)
         u = jump - 0.5 * once + factor[:, None] * np.cross(w, once)
         vectors = np.concatenate([u, w], axis=1)

@@ -229,13 +229,13 @@ def maximise_each(
     True
     """
     if tracks.B is not None:
-        return _searched(tracks, family, q, own)
+        return _searched_each(tracks, family, q, own)
     count, every = len(q), np.arange(len(q))
     shapes, D = tracks.tracks.shapes.sum(axis=1), family(q, every)[0]
     ratio = (
         2 * tracks.tracks.dt * np.trace(D, axis1=1, axis2=2) / np.trace(shapes, axis1=1, axis2=2)
     )
-    ends = _searched(
+    ends = _searched_each(
         tracks.rows(np.tile(every, 2)),
         lambda q, rows: family(q, rows % count),
         np.tile(q, (2, 1)),
@@ -248,7 +248,7 @@ def maximise_each(
     return found
 
 
-def _searched(
+def _searched_each(
     tracks: SeparateTensors, family: Family, q: Floats, own: Floats
 ) -> list[Maximum | None]:
     """Return the maxima that searches from these parameters find; None without convergence."""

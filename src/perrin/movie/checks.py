@@ -681,13 +681,17 @@ def mean_pair_distance(
     distances, pairs = [np.empty(0)], [np.empty(0, dtype=np.int64)]
     tracked = features[features["cluster"] >= 0].sort_values(["frame", "cluster", "particle"])
     most = int(tracked["particle"].max()) + 1 if len(tracked) else 1
-    for (_, cluster), rows in tracked.groupby(["frame", "cluster"]):
-        x, particle = rows[axes].to_numpy(dtype=np.float64), rows["particle"].to_numpy()
-        first, second = np.triu_indices(len(x), 1)
-        distance = pair_distances(x)
+    x, particle = tracked[axes].to_numpy(dtype=np.float64), tracked["particle"].to_numpy()
+    frame, cluster = tracked["frame"].to_numpy(), tracked["cluster"].to_numpy()
+    # The rows of one cluster in one frame are neighbours.
+    ends = np.flatnonzero((np.diff(frame) != 0) | (np.diff(cluster) != 0)) + 1
+    for rows in np.split(np.arange(len(tracked)), ends):
+        first, second = rows[np.array(np.triu_indices(len(rows), 1))]
+        distance = pair_distances(x[rows])
         near = distance < TOUCHING_REACH * contact
         distances.append(distance[near])
-        pairs.append(((int(cluster) * most + particle[first]) * most + particle[second])[near])
+        number = (cluster[first].astype(np.int64) * most + particle[first]) * most
+        pairs.append((number + particle[second])[near])
     every, pair = np.concatenate(distances), np.concatenate(pairs)
     if not every.size:
         return np.nan, np.nan

@@ -6,6 +6,7 @@ import os
 import sys
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -14,6 +15,8 @@ from perrin._arrays import flag_fault, number_fault, numpy_to_python, refuse
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
     from typing import TypeAlias
+
+    from threadpoolctl import ThreadpoolController
 
     Progress: TypeAlias = Callable[[int, int, str], None]
 
@@ -224,14 +227,24 @@ def one_thread(task: Callable[[S], T], item: S) -> T:
     >>> one_thread(float, 1)
     1.0
     """
+    with _thread_pools(len(sys.modules)).limit(limits=1):
+        return task(item)
+
+
+@lru_cache(maxsize=1)
+def _thread_pools(_modules: int) -> ThreadpoolController:
+    """Return the controller of the threads of all loaded libraries.
+
+    The search for them takes milliseconds; it is repeated only after an import, which may load
+    another one.
+    """
     try:
-        from threadpoolctl import threadpool_limits
+        from threadpoolctl import ThreadpoolController
     except ModuleNotFoundError as missing:
         raise ModuleNotFoundError(
             "threadpoolctl is not installed: pip install 'perrin[images]'"
         ) from missing
-    with threadpool_limits(1):
-        return task(item)
+    return ThreadpoolController()
 
 
 def _several_items(task: Callable[[S], T], items: list[S]) -> list[T]:

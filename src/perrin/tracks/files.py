@@ -606,8 +606,9 @@ def _repeat_faults(clean: dict[str, NDArray[Any]], rows: RowNumbers) -> list[str
         return []
     key = [name for name in ("frame", "cluster", "particle") if name in clean]
     keys = pd.DataFrame({name: clean[name] for name in key})
-    usable = keys[["frame", "particle"]].notna().all(axis=1)
-    repeated = (keys.duplicated() & usable).to_numpy()
+    repeated = keys.duplicated().to_numpy()
+    if repeated.any():
+        repeated = repeated & keys[["frame", "particle"]].notna().all(axis=1).to_numpy()
     if not repeated.any():
         return []
     first = ", ".join(f"{name} {keys[name].to_numpy()[repeated][0]}" for name in key)

@@ -122,7 +122,7 @@ class Identity(Shown):
             own = np.where(seen, np.arange(x.shape[1]), -1)
             if np.array_equal(self.order, own) and np.isnan(x[~seen]).all():
                 return x
-        taken = np.take_along_axis(x, np.maximum(self.order, 0)[..., None], axis=1)
+        taken = np.take_along_axis(x, self.order[..., None], axis=1)
         return np.where(self.order[..., None] >= 0, taken, np.nan)
 
     def to_dict(self) -> dict[str, Any]:
@@ -587,7 +587,7 @@ def assigned_points(points: Floats, assignment: Ints) -> Floats:
     """
     index = np.broadcast_to(assignment, (len(points), *assignment.shape[-2:]))
     rows = np.arange(len(points))[:, None, None]
-    return np.where((index >= 0)[..., None], points[rows, np.maximum(index, 0)], np.nan)
+    return np.where((index >= 0)[..., None], points[rows, index], np.nan)
 
 
 def best_assignments(
@@ -840,7 +840,7 @@ def certain_labels(x: Floats) -> Bools:
     shape, usable, sampled = _labelled_shapes(x, shown == n)
     rotation, misfit = rigid_fits(x, shape[:, None])
     freedom = float(degrees_of_freedom(np.array(n), d))
-    chosen = np.take_along_axis(misfit, np.maximum(sampled, 0), axis=1)
+    chosen = np.take_along_axis(misfit, sampled, axis=1)
     sigma2 = np.array(
         [np.median(m[k >= 0]) for m, k in zip(chosen, sampled, strict=True)]
     ) / median_chi2(freedom)
@@ -900,7 +900,7 @@ def _labelled_shapes(x: Floats, whole: Bools) -> tuple[Floats, Bools, Ints]:
     used = sampled >= 0
     points = x
     if x.shape[1] > width or not whole.all():
-        points = np.take_along_axis(x, np.maximum(sampled, 0)[..., None, None], axis=1)
+        points = np.take_along_axis(x, sampled[..., None, None], axis=1)
         points = np.where(used[..., None, None], points, np.nan)
     template = points[:, 0] - points[:, 0].mean(axis=1, keepdims=True)
     rotation, misfit = rigid_fits(points, template[:, None])
@@ -987,7 +987,7 @@ class Candidates(NamedTuple):
     def order(self, detections: Detections, rows: Ints) -> Ints:
         """Return the column of each particle in the candidates of some rows, (K, C, n)."""
         assignment = self.assignment[rows]
-        column = detections.column[rows[:, None, None], np.maximum(assignment, 0)]
+        column = detections.column[rows[:, None, None], assignment]
         return np.where(assignment >= 0, column, -1)
 
     def include(self, detections: Detections, body: BodyModel, row: int, label: Ints) -> None:
@@ -1078,7 +1078,7 @@ def candidate_assignments(detections: Detections, body: BodyModel, *, labelled: 
     found: dict[int, Ints] = {}
     by_label = detections.assignment(body.label)
     known = (by_label >= 0).sum(axis=1) == detections.shown
-    trusted = np.flatnonzero(known & (detections.shown > 0) & labelled)
+    trusted = np.flatnonzero(known & labelled)
     points = assigned_points(detections.x[trusted], by_label[trusted, None])[:, 0]
     misfit = np.full(len(detections.x), np.inf)
     misfit[trusted] = rigid_fits(points, body.template)[1]
@@ -1210,7 +1210,7 @@ def most_likely_identity(
         # Rows without assignment keep the labels that held before them (at the start, after).
         first = np.argmax(label >= 0, axis=0)
         opening = label[first, np.arange(label.shape[1])]
-        for k in np.flatnonzero((order < 0).all(axis=1) & (detections.shown > 0)).tolist():
+        for k in np.flatnonzero((order < 0).all(axis=1)).tolist():
             held = np.where(label[k] >= 0, label[k], opening)
             for column in detections.column[k, : detections.shown[k]].tolist():
                 if column < len(held) and held[column] >= 0 and order[k, held[column]] < 0:
@@ -1248,7 +1248,7 @@ def labels_in_time(order: Ints) -> Ints:
     row, particle = np.nonzero(order >= 0)
     label[row, order[row, particle]] = particle
     last = np.maximum.accumulate(np.where(label >= 0, np.arange(len(label))[:, None], -1), axis=0)
-    held = np.take_along_axis(label, np.maximum(last, 0), axis=0)
+    held = np.take_along_axis(label, last, axis=0)
     return np.where(last >= 0, held, -1)
 
 
