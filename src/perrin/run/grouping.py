@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 _PARTICLES_OF_ONE_BODY, _FRAMES_FOR_DISTANCES = 20, 8
 
 # Particles whose distances are compared with those of another scale of z: 2016 pairs.
-_COMPARED = 64
+_PARTICLES_PAIRED = 64
 
 
 def assign_clusters(
@@ -120,7 +120,7 @@ def stretch_warnings(table: pd.DataFrame) -> list[str]:
     """
     if "z" not in table:
         return []
-    some = table[table["particle"].isin(table["particle"].unique()[:_COMPARED])]
+    some = table[table["particle"].isin(table["particle"].unique()[:_PARTICLES_PAIRED])]
     wide = some.pivot_table(index="frame", columns="particle", values=["x", "y", "z"])
     x = wide.to_numpy(dtype=np.float64).reshape(len(wide), 3, -1).transpose(0, 2, 1)
     factor, pairs = stretch_of_pairs(x)
