@@ -105,6 +105,19 @@ def test_units_and_the_order_of_bodies_do_not_matter():
     np.testing.assert_allclose(error_ratio(nm[::-1]).measured, one.measured, rtol=1e-6)
 
 
+def test_axes_that_agree_have_one_ratio():
+    """Twenty frames of errors twice the stated ones: axes that differ by chance are drawn together.
+
+    With an error along z that is five times as large, that of x and y stays below 1.5.
+    """
+    ratio = error_ratio(bodies(lambda t, z: 0.02, 0.01, n_frames=20, seed=3))
+    assert np.ptp(ratio.value) < 0.5 * np.ptp(ratio.measured)
+    assert ratio.value.mean() == pytest.approx(4, abs=1)
+    ratio = error_ratio(bodies(lambda t, z: np.array([0.01, 0.01, 0.05]), 0.01, n_frames=20))
+    assert ratio.value[:2].max() < 1.5
+    assert ratio.value[2] > 15
+
+
 def test_few_frames_determine_no_ratio():
     """Two frames leave the stated errors."""
     ratio = error_ratio(bodies(lambda t, z: 0.03, 0.01, n_frames=2))

@@ -69,6 +69,12 @@ def _short_text(value: Any) -> str:  # noqa: ANN401 (values of any type)
             return f"{len(value)} entries"
         return "{" + ", ".join(f"{k}: {_short_text(x)}" for k, x in value.items()) + "}"
     if isinstance(value, tuple | list):
+        # Last values of a named tuple that are the usual ones are not shown.
+        usual = getattr(value, "_field_defaults", {})
+        names = list(getattr(value, "_fields", ()))
+        while names and names[-1] in usual and value[len(names) - 1] == usual[names[-1]]:
+            value = value[: len(names) - 1]
+            names.pop()
         if len(value) > _SHOWN_ITEMS:
             return f"{len(value)} items"
         return f"({', '.join(map(_short_text, value))})"

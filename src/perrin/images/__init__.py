@@ -101,7 +101,6 @@ from perrin.images.optics.learn import (
     UsualImage,
     fit_samples,
     floor_share,
-    neighbour_variance,
     photon_transfer,
     saturated_share,
     without_clipped,
@@ -117,6 +116,7 @@ from perrin.images.optics.learn_radial import (
     size_spread,
 )
 from perrin.images.optics.microscope import Camera, Light, RenderSettings, Scan
+from perrin.images.optics.neighbours import neighbour_variance
 from perrin.images.optics.optics import CameraNoise, Optics
 from perrin.images.optics.pixel_pattern import (
     PixelPattern,

@@ -23,10 +23,6 @@ _TREND_ERRORS = 3.3
 # A measured ratio is at least this one; few frames can give a negative variance.
 _LEAST_ERROR_RATIO = 0.1
 
-# A ratio below 1 makes the stated errors smaller if its logarithm is this many standard errors
-# below 0.
-_CLEARLY_SMALLER = 4.0
-
 _WEIGHTING_ROUNDS = 8  # of the weights
 
 # The logarithm of the ratio changes by at most this over the movie or the depth.
@@ -43,10 +39,10 @@ class ErrorRatio:
     Attributes
     ----------
     value : ndarray, shape (d,)
-        Ratio of each lab axis, drawn to 1 by its own error: 1 + (1 - s^2/(r - 1)^2) (r - 1) for the
-        measured ratio r of standard error s, and 1 where r - 1 is less than s. It is below 1 only
-        where the logarithm of r is four standard errors below 0: the noise that a fit assumes is
-        then common to many voxels.
+        Ratio of each lab axis, drawn to that of the others where they agree, and then to 1 by its
+        own error: 1 + (1 - s^2/(r - 1)^2) (r - 1) for the ratio r of standard error s, and 1 where
+        r - 1 is less than s: errors that the spheres of a body have in common leave no residual, so
+        that it is never below 1.
     measured, stderr : ndarray, shape (d,)
         Measured ratios and their standard errors; NaN where no frame determines them.
     by_time : float
@@ -142,11 +138,11 @@ def error_ratio(bodies: Iterable[tuple[RigidMotion, Floats, Floats]]) -> ErrorRa
         scores = np.einsum("tab,tb->ta", weighted, square - mix @ measured)
         measured = np.maximum(measured + inverse @ scores.sum(axis=0), _LEAST_ERROR_RATIO)
     stderr = np.sqrt(np.diag(inverse @ scores.T @ scores @ inverse.T))
-    off = measured - 1
-    held = np.divide(stderr, off, out=np.full(len(off), np.inf), where=off != 0)
-    # Light alone leaves the stated errors; they are too large where noise is common to many voxels.
-    smaller = np.log(measured) < -_CLEARLY_SMALLER * stderr / measured
-    value = 1 + np.maximum(1 - held**2, 0.0) * np.where(smaller, off, np.maximum(off, 0.0))
+    shared, error = _drawn_together(measured, stderr)
+    off = shared - 1
+    held = np.divide(error, off, out=np.full(len(off), np.inf), where=off != 0)
+    # Errors that the spheres of a body have in common are stated and leave no residual.
+    value = 1 + np.maximum(1 - held**2, 0.0) * np.maximum(off, 0.0)
     # Changes of the logarithm of the squares with time and depth, 0 where insignificant: scoring
     # for gamma-distributed squares with a logarithmic link.
     relative = square.sum(axis=1) / (mix @ measured).sum(axis=1)
@@ -168,6 +164,27 @@ def error_ratio(bodies: Iterable[tuple[RigidMotion, Floats, Floats]]) -> ErrorRa
     return ErrorRatio(
         value, measured, stderr, by_time, by_depth, float(time.mean()), float(depth.mean())
     )
+
+
+def _drawn_together(measured: Floats, stderr: Floats) -> tuple[Floats, Floats]:
+    """Return ratios of the axes, drawn to their common value by their errors, and their errors.
+
+    Logarithms that scatter between axes with the variance that is left of their weighted squares
+    (DerSimonian and Laird 1986), normal about a common mean. What is unlike in all axes (flicker
+    of planes) stays so; where they agree within their errors they are equal.
+    """
+    logarithm, variance = np.log(measured), (stderr / measured) ** 2
+    if not (variance > 0).all():
+        return measured, stderr
+    weight = 1 / variance
+    mean = np.average(logarithm, weights=weight)
+    excess = weight @ (logarithm - mean) ** 2 - (len(weight) - 1)
+    between = max(float(excess / (weight.sum() - weight @ weight / weight.sum())), 0.0)
+    weight = 1 / (variance + between)
+    mean = np.average(logarithm, weights=weight)
+    own = between * weight
+    drawn = np.exp(mean + own * (logarithm - mean))
+    return drawn, drawn * np.sqrt(own * variance + (1 - own) ** 2 / weight.sum())
 
 
 def with_error_ratio(motion: RigidMotion, ratio: Floats, stated: Floats) -> RigidMotion:

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from perrin._arrays import Floats, Ints
+    from perrin.images.optics.optics import Optics
     from perrin.motion.error_ratio import ErrorRatio
     from perrin.motion.rigid_motion import RigidMotion
     from perrin.run.results import BodyKind, ClusterResult
@@ -37,6 +38,7 @@ _BLEACHED = 0.1  # relative loss of brightness over the movie
 _DEPTH_CHANGE = 0.1  # relative change of brightness over the depth of the spheres
 _MISSING_SHARE = 0.1  # missing share of the spheres of the clusters
 _NOTED_ERROR_RATIO, _LARGE_ERROR_RATIO = 1.15, 2.0  # errors of positions over the stated ones
+_LARGE_FLICKER = 0.1  # relative standard deviation of the light
 _FAILED_SHARE = 0.01  # share of fits that did not converge
 _UNSAFE_STEP, _REFUSED_STEP = 0.25, 0.5  # rms step over the contact distance
 _RING_ERRORS = 5.0  # standard errors of the contrasts of a 2-D image
@@ -466,6 +468,48 @@ def error_ratio_shown(ratio: ErrorRatio, *, axes: list[str]) -> Findings:
     if trend or factor.max() > _NOTED_ERROR_RATIO:
         return Findings(notes=(text,))
     return _NOTHING
+
+
+def noise_in_common(optics: Optics | None) -> Findings:
+    """State what the noise of voxels has in common, which the fits allow for.
+
+    Flicker of over 10 % and correlations of neighbours are warnings, other flicker and gains of
+    pixels are notes.
+
+    Parameters
+    ----------
+    optics : Optics or None
+    """
+    if optics is None:
+        return _NOTHING
+    noise, found = optics.noise, _NOTHING
+    kinds = [
+        f"by {100 * size:.2g} % from {kind} to {kind}"
+        for kind, size in (("plane", noise.plane), ("line", noise.line))
+        if size
+    ]
+    if kinds:
+        text = (
+            f"flicker: the light differs {' and '.join(kinds)} (rms), as a source or a scanner "
+            "that is not steady; the fits allow for it, and the stated errors contain what is left"
+        )
+        large = max(noise.plane, noise.line) > _LARGE_FLICKER
+        found += Findings((text,)) if large else Findings(notes=(text,))
+    if noise.pixel:
+        text = (
+            f"gains of pixels differ by {100 * noise.pixel:.2g} % (rms); the fits allow for it, "
+            "and the stated errors contain what is left"
+        )
+        found += Findings(notes=(text,))
+    if noise.neighbours:
+        text = (
+            f"correlated noise: that of neighbouring voxels of a plane has a correlation of "
+            f"{max(noise.neighbours[0][1], noise.neighbours[1][0]):.2f}, as in an image that was "
+            "compressed with loss or smoothed; the stated errors contain it: save the images as "
+            "they are recorded"
+        )
+        found += Findings((text,))
+    return found
 
 
 def unsettled_poses(count: int, of: int) -> Findings:

@@ -589,6 +589,7 @@ def _channel_checks(stack: Stack, located: Located, features: pd.DataFrame) -> c
         + checks.bleached(features)
         + checks.depth_dimming(features)
         + checks.unrefined_spheres(features)
+        + checks.noise_in_common(located.method.optics)
     )
 
 

@@ -11,6 +11,12 @@ from perrin.errors import NoSpheresError
 from perrin.images.optics.ball_image import BallBlur, PsfTail, SphereImage, sphere_image
 from perrin.images.optics.crowd_equations import profile_information, slopes_of_spheres
 from perrin.images.optics.crowd_fit import fit_crowd
+from perrin.images.optics.flicker import LineChanges, Lines, find_flicker, find_gain_spread
+from perrin.images.optics.neighbours import (
+    THIRD_DIFFERENCE,
+    find_neighbours,
+    neighbour_variance,
+)
 from perrin.images.optics.optics import CameraNoise, Optics
 from perrin.images.optics.window_fit import FreeCenters, cut_window, fit_window
 
@@ -56,9 +62,6 @@ _FIRST_SPREAD, _LEAST_SPREAD, _LEAST_SPREAD_GAIN = 0.06, 0.007, 5.0
 
 # Change of the spread, relative to it, at which its search ends.
 _SPREAD_CONVERGED = 0.05
-
-# Order of the differences between neighbouring voxels, and their factors: a variance of 20.
-_NEIGHBOURS = np.array([-1.0, 3.0, -3.0, 1.0])
 
 # What is no sphere has over this multiple of the usual chi-squared, beyond this number of standard
 # errors of it, or over this multiple of the usual brightness, beyond this number of standard
@@ -414,7 +417,7 @@ class SampleFit(NamedTuple):
         Score of these parameters.
     expected, squared_residual : ndarray, shape (m,)
         Expected grey levels of the voxels of the fit, and squared differences of their grey levels
-        from these.
+        from these, without those that flicker explains.
     brightness : ndarray, shape (n,)
         Fitted intensity inside each sphere, grey levels.
     level, variance : ndarray, shape (q,)
@@ -422,6 +425,10 @@ class SampleFit(NamedTuple):
         these voxels from their differences (`neighbour_variance`).
     sizes, size_variance : ndarray, shape (n,)
         Deviations of the logarithms of the diameters and their variances, where they are fitted.
+    residual : ndarray, shape (m,)
+        Grey levels minus expected grey levels.
+    mask : ndarray of bool, shape (nz, ny, nx)
+        The voxels of the fit.
     """
 
     centers: Floats
@@ -434,6 +441,8 @@ class SampleFit(NamedTuple):
     variance: Floats
     sizes: Floats
     size_variance: Floats
+    residual: Floats
+    mask: Bools
 
     def chi2(self, noise: CameraNoise) -> float:
         """Return the mean squared residual over the variance that a camera noise predicts."""
@@ -588,8 +597,8 @@ class GroupSample(NamedTuple):
         fit = fit_window(window, image, noise, FreeCenters(self.centers))
         slope = window.slopes(image, variations.slopes, fit.centers, fit.brightness, fit.sizes)
         # The Schur complement of the information, with the fit's own parameters eliminated.
-        weighted = slope * fit.weight
-        nuisance = fit.jacobian * fit.weight
+        weighted = fit.precision.times(slope)
+        nuisance = fit.precision.times(fit.jacobian)
         shared = nuisance @ slope.T
         own = nuisance @ fit.jacobian.T + np.diag(fit.prior)
         taken = np.linalg.lstsq(own, shared, rcond=None)[0]
@@ -599,27 +608,31 @@ class GroupSample(NamedTuple):
         if image.spread > 0:
             left_over[fit.prior > 0] -= fit.sizes / image.spread**2
         score = weighted @ residual - taken.T @ left_over
-        left, expected = np.zeros((2, *window.mask.shape))
-        left[window.mask], expected[window.mask] = residual, fit.expected
-        axis = _most_blurred_axis(image, left.shape)
-        level, variance = neighbour_variance(left, expected, window.mask, axis=axis)
+        # Flicker is noise that the voxels of a line have in common.
+        flickers = noise.correlated and not noise.pixel
+        axis = 2 if flickers else _most_blurred_axis(image, window.mask.shape)
+        level, variance = _variance_along(axis, window.mask, residual, fit.expected)
         return SampleFit(
             fit.centers,
             information,
             score,
             fit.expected,
-            residual**2,
+            fit.precision.left(residual) ** 2,
             fit.brightness,
             level,
             variance,
             fit.sizes,
             fit.size_variance,
+            residual,
+            window.mask,
         )
 
     def log_likelihood(
         self, image: SphereImage, noise: CameraNoise, *, within: SphereImage
     ) -> float:
         """Return the logarithm of the likelihood of the group's voxels, up to a constant.
+
+        The variance of the factors of flicker, which the image hardly changes, is left out.
 
         Parameters
         ----------
@@ -635,7 +648,8 @@ class GroupSample(NamedTuple):
         """
         window = self.window(within)
         fit = fit_window(window, image, noise, FreeCenters(self.centers))
-        square = fit.weight * (window.data - fit.expected) ** 2
+        residual = window.data - fit.expected
+        square = residual * fit.precision.times(residual)
         return -0.5 * float(np.sum(square - np.log(fit.weight)))
 
 
@@ -697,63 +711,24 @@ class CrowdSample(NamedTuple):
             variance,
             equal,
             equal,
+            residual[used],
+            used,
         )
 
 
-def neighbour_variance(
-    residual: Floats, expected: Floats, used: Bools, *, axis: int
+def _variance_along(
+    axis: int, mask: Bools, residual: Floats, expected: Floats
 ) -> tuple[Floats, Floats]:
-    """Estimate the variance of voxels or pixels from the differences of neighbours.
-
-    Parameters
-    ----------
-    residual, expected : ndarray, shape (nz, ny, nx) or (ny, nx)
-        Grey levels minus expected grey levels, and expected grey levels.
-    used : ndarray of bool, shape (nz, ny, nx) or (ny, nx)
-        The voxels that are used.
-    axis : int
-        The axis along which they are neighbours.
-
-    Returns
-    -------
-    expected : ndarray, shape (m,)
-        Expected grey level of every four neighbours along the axis.
-    variance : ndarray, shape (m,)
-        Their squared third differences over 20, the sum of squares of the factors 1, 3, 3, 1.
-
-    Notes
-    -----
-    An error of the model of the image is blurred as the image is, so that its third differences
-    are small: with a blur of b voxels they have 15 / (2 b^2)^3 / 20 of the error's variance (the
-    sixth moment of its Gaussian spectrum), 1 % for b = 1.5. Noise that is constant along the axis
-    does not contribute.
-
-    Examples
-    --------
-    >>> noise = np.random.default_rng(1).normal(0.0, 3.0, (20, 30, 30))
-    >>> misfit = 5 * np.cos(np.arange(20) / 3)[:, None, None]
-    >>> used, level = np.ones(noise.shape, dtype=bool), np.full(noise.shape, 7.0)
-    >>> expected, variance = neighbour_variance(noise + misfit, level, used, axis=0)
-    >>> expected.mean().round(), variance.mean().round(1), (noise + misfit).var().round(1)
-    (np.float64(7.0), np.float64(8.9), np.float64(22.1))
-    """
-    if used.shape[axis] < len(_NEIGHBOURS):
-        return np.empty(0), np.empty(0)
-    quads = (
-        np.lib.stride_tricks.sliding_window_view(field, len(_NEIGHBOURS), axis=axis)
-        for field in (residual, expected, used)
-    )
-    difference, level, together = quads
-    kept = together.all(axis=-1)
-    share = _NEIGHBOURS**2 / np.sum(_NEIGHBOURS**2)
-    square = (difference @ _NEIGHBOURS)[kept] ** 2 / np.sum(_NEIGHBOURS**2)
-    return (level @ share)[kept], square
+    """Return `neighbour_variance` of the voxels (m,) of a window."""
+    left, level = np.zeros((2, *mask.shape))
+    left[mask], level[mask] = residual, expected
+    return neighbour_variance(left, level, mask, axis=axis)
 
 
 def _most_blurred_axis(image: SphereImage, shape: tuple[int, ...]) -> int:
     """Return the axis along which the blur covers most voxels, of those with four neighbours."""
     blur = np.array([image.blur[0], image.blur[1], image.blur[1]]) / image.voxel
-    return int(np.argmax(np.where(np.array(shape) >= len(_NEIGHBOURS), blur, -1.0)))
+    return int(np.argmax(np.where(np.array(shape) >= len(THIRD_DIFFERENCE), blur, -1.0)))
 
 
 class _Settled(NamedTuple):
@@ -774,6 +749,7 @@ def fit_samples(
     voxel: tuple[float, float, float],
     measured: PointSpread | None = None,
     shell: bool = False,
+    camera_pattern: bool = False,
 ) -> LearnedOptics:
     """Find the sphere diameter, point spread and noise of greatest likelihood for most samples.
 
@@ -791,6 +767,8 @@ def fit_samples(
         A point spread that was measured; diameter and noise are learned.
     shell : bool
         The surface of the spheres is fluorescent; otherwise it is tried where balls do not fit.
+    camera_pattern : bool
+        The pixels of the camera differ, so that their gains are compared.
 
     Returns
     -------
@@ -834,6 +812,7 @@ def fit_samples(
         plain = _settled(usable, replace(start, shell=True), noise)
     else:
         plain = _ball_or_shell(usable, start, noise)
+    plain = _with_common_noise(plain, camera_pattern=camera_pattern)
     plain, left_out = _without_dust(plain)
     found = plain
     if not any(isinstance(s, CrowdSample) for s in found.samples):
@@ -854,6 +833,7 @@ def fit_samples(
             found = _settled(kept, found.parameters, found.noise)
     elif found is not plain:
         found, left_out = _without_dust(found)
+    found = _with_neighbours(found)
     optics = found.parameters.optics(found.noise, found.information)
     return LearnedOptics(optics, replace(_usual_of(found), left_out=left_out))
 
@@ -951,10 +931,11 @@ def _settled(
         samples = [s._replace(centers=fit.centers) for s, fit in zip(samples, fits, strict=True)]
         information = np.sum([fit.information for fit in fits], axis=0)
         score = np.sum([fit.score for fit in fits], axis=0)
-        noise = photon_transfer(
+        transfer = photon_transfer(
             np.concatenate([fit.level for fit in fits]),
             np.concatenate([fit.variance for fit in fits]),
         )
+        noise = noise._replace(gain=transfer.gain, floor=transfer.floor)
         spread, larger = parameters.spread, None
         if spread > 0:
             sizes = np.concatenate([fit.sizes for fit in fits])
@@ -979,6 +960,49 @@ def _settled(
         "is the voxel size right? State the optics (optics=), or keep the positions found "
         "first (refine=None)"
     )
+
+
+def _with_common_noise(plain: _Settled, *, camera_pattern: bool) -> _Settled:
+    """Return the parameters with noise that voxels have in common, if the residuals show any.
+
+    That is the gain of pixels where a camera has a pattern, and flicker of the light otherwise.
+    """
+    if not all(isinstance(s, GroupSample) for s in plain.samples):
+        return plain
+    # Differences along a line are free from what its voxels have in common.
+    axis, lines_of = (0, Lines.of_pixels) if camera_pattern else (2, Lines.of_scan)
+    along = [_variance_along(axis, fit.mask, fit.residual, fit.expected) for fit in plain.fits]
+    noise = photon_transfer(*(np.concatenate(part) for part in zip(*along, strict=True)))
+    if noise.gain <= 0:
+        return plain
+    windows = []
+    for fit in plain.fits:
+        light, weight = noise.light(fit.expected), noise.weight(fit.expected)
+        windows.append(LineChanges.of(lines_of(fit.mask), fit.residual, light, weight))
+    if camera_pattern:
+        noise = noise._replace(pixel=find_gain_spread(windows))
+    else:
+        plane, line = find_flicker(windows)
+        noise = noise._replace(plane=plane, line=line)
+    return _settled(plain.samples, plain.parameters, noise) if noise.correlated else plain
+
+
+def _with_neighbours(found: _Settled) -> _Settled:
+    """Return the same with the correlation of the noise of neighbouring voxels, if there is any."""
+    if found.noise.correlated:
+        return found
+    neighbours, along_z = find_neighbours(
+        [(fit.mask, fit.residual * np.sqrt(found.noise.weight(fit.expected))) for fit in found.fits]
+    )
+    noise = found.noise._replace(neighbours=neighbours, along_z=along_z)
+    if along_z:
+        # Of smoothed noise, differences of neighbours show little but the rounding.
+        transfer = photon_transfer(
+            np.concatenate([fit.expected for fit in found.fits]),
+            np.concatenate([fit.residual**2 for fit in found.fits]),
+        )
+        noise = noise._replace(gain=transfer.gain, floor=transfer.floor)
+    return found._replace(noise=noise)
 
 
 def _with_spread(equal: _Settled) -> _Settled:

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from perrin.errors import NoSpheresError
-from perrin.images.optics.learn import neighbour_variance, photon_transfer
+from perrin.images.optics.learn import photon_transfer
+from perrin.images.optics.neighbours import neighbour_variance
 from perrin.images.optics.optics import CameraNoise
 from perrin.images.optics.radial_image import (
     Patch,
@@ -121,9 +122,8 @@ def noise_of_neighbours(
     mean, square = np.concatenate(levels), np.concatenate(variances)
     if isinstance(noise, TransmissionNoise):
         grey = noise.grey(mean)
-        return TransmissionNoise(
-            *photon_transfer(grey, square * (grey / noise.level) ** 2), noise.level
-        )
+        found = photon_transfer(grey, square * (grey / noise.level) ** 2)
+        return TransmissionNoise(found.gain, found.floor, noise.level)
     return photon_transfer(mean, square)
 
 

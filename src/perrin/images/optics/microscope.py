@@ -287,8 +287,8 @@ class Camera(PlainOptions):
 
     Examples
     --------
-    >>> Camera(gain=3.0, offset=100.0, read_noise=2.0).variance_model()
-    CameraNoise(gain=3.0, floor=-296.0)
+    >>> Camera(gain=3.0, offset=100.0, read_noise=2.0).variance_model()[:2]
+    (3.0, -296.0)
     """
 
     gain: float = 1.0

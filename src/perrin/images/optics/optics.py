@@ -21,12 +21,26 @@ if TYPE_CHECKING:
 class CameraNoise(NamedTuple):
     """Variance of a voxel: ``gain * expected value + floor``, in squared grey levels.
 
+    Flicker of the light adds variance that all voxels of a plane, or of a line, have in common, and
+    unequal gains of pixels one that the voxels of a pixel in all planes have in common.
+
     Attributes
     ----------
     gain : float
         Grey levels per photon.
     floor : float
         Variance of a voxel whose expected value is 0, squared grey levels.
+    plane, line : float
+        Relative standard deviation of the light from plane to plane, and of that of a line along x
+        about its plane; 0 where the light does not flicker.
+    pixel : float
+        Relative standard deviation of the gain from pixel to pixel; with it, no flicker.
+    neighbours : tuple of tuple of float
+        Correlation of the noise of voxels of a plane that are i rows and j columns apart,
+        ``neighbours[i][j]``; empty where the noise of voxels is independent.
+    along_z : tuple of float
+        Factor of that correlation for voxels k planes apart, ``along_z[k]``; empty where planes are
+        independent.
 
     Examples
     --------
@@ -36,6 +50,41 @@ class CameraNoise(NamedTuple):
 
     gain: float
     floor: float
+    plane: float = 0.0
+    line: float = 0.0
+    pixel: float = 0.0
+    neighbours: tuple[tuple[float, ...], ...] = ()
+    along_z: tuple[float, ...] = ()
+
+    @property
+    def correlated(self) -> bool:
+        """Whether voxels have noise in common: flicker, or the gain of their pixel."""
+        return self.plane > 0 or self.line > 0 or self.pixel > 0
+
+    @property
+    def voxels_in_one(self) -> float:
+        """Number of voxels over which a mean square scatters as over one independent voxel.
+
+        The sum of the squared correlations, of both signs of every lag.
+
+        Examples
+        --------
+        >>> CameraNoise(3.0, 4.0, neighbours=((1.0, 0.5), (0.5, 0.0))).voxels_in_one
+        2.0
+        """
+        square = np.square(self.neighbours or ((1.0,),))
+        in_plane = 4 * square.sum() - 2 * square[0].sum() - 2 * square[:, 0].sum() + square[0, 0]
+        return float(in_plane * (2 * np.square(self.along_z or (1.0,)).sum() - 1))
+
+    def light(self, expected: Floats) -> Floats:
+        """Return expected values above the level without light, grey levels.
+
+        The variance of a voxel over the gain is this level where read noise is small, whatever the
+        offset of the camera.
+        """
+        if self.gain <= 0:
+            return expected
+        return np.asarray(1.0 / (self.gain * self.weight(expected)))
 
     def weight(self, expected: Floats) -> Floats:
         """Return the inverse variance of voxels with these expected values.
@@ -46,12 +95,17 @@ class CameraNoise(NamedTuple):
         least = 0.05 * (self.gain * float(np.abs(expected).mean()) + self.floor)
         return np.asarray(1.0 / np.maximum(self.gain * expected + self.floor, least))
 
-    def to_dict(self) -> dict[str, float]:
-        """Return gain and floor as values that JSON holds."""
-        return {"gain": float(self.gain), "floor": float(self.floor)}
+    def to_dict(self) -> dict[str, Any]:
+        """Return gain and floor, and what voxels have in common, as values that JSON holds."""
+        entry = {name: to_plain(value) for name, value in self._asdict().items()}
+        return (
+            entry
+            if self != CameraNoise(*self[:2])
+            else {name: entry[name] for name in ("gain", "floor")}
+        )
 
     @classmethod
-    def from_dict(cls, entry: Mapping[str, float]) -> CameraNoise:
+    def from_dict(cls, entry: Mapping[str, Any]) -> CameraNoise:
         """Return the noise that `to_dict` wrote.
 
         Parameters
@@ -63,7 +117,9 @@ class CameraNoise(NamedTuple):
         -------
         CameraNoise
         """
-        return cls(entry["gain"], entry["floor"])
+        rows = tuple(tuple(row) for row in entry.get("neighbours", ()))
+        values = {**entry, "neighbours": rows, "along_z": tuple(entry.get("along_z", ()))}
+        return cls(**values)
 
 
 @dataclass(frozen=True, repr=False)
@@ -78,8 +134,8 @@ class Optics(Shown):
         Standard deviations of the Gaussian point spread, (z, plane), um; with a tail those of its
         narrower Gaussian.
     noise : CameraNoise
-        ``(gain, floor)``: the variance of a voxel is gain times its expected value plus floor, in
-        squared grey levels; the floor includes read noise and the camera's offset.
+        ``(gain, floor, ...)``: the variance of a voxel is gain times its expected value plus floor,
+        in squared grey levels; the floor includes read noise and the camera's offset.
     stderr : tuple of float
         Standard errors of diameter, psf z and psf plane, um; 0 where the user stated the values.
     tail : PsfTail or None
@@ -110,11 +166,15 @@ class Optics(Shown):
     shell: bool = False
 
     def to_dict(self) -> dict[str, Any]:
-        """Return values that JSON holds: `noise` as [gain, floor], `tail` as [share, psf]."""
+        """Return values that JSON holds.
+
+        `noise` is [gain, floor], or with noise that voxels have in common all its values; `tail` is
+        [share, psf].
+        """
         entry = {
             "diameter": to_plain(self.diameter),
             "psf": to_plain(self.psf),
-            "noise": [to_plain(value) for value in self.noise],
+            "noise": list(self.noise.to_dict().values()),
             "stderr": to_plain(self.stderr),
             "tail": None if self.tail is None else [to_plain(part) for part in self.tail],
             "spread": to_plain(self.spread),
@@ -144,7 +204,8 @@ class Optics(Shown):
         if entry.get("tail") is not None:
             share, (tail_z, tail_plane) = entry["tail"]
             tail = PsfTail(share, (tail_z, tail_plane))
-        noise = CameraNoise(*entry["noise"])
+        values = dict(zip(CameraNoise._fields, entry["noise"], strict=False))
+        noise = CameraNoise.from_dict(values)
         measured = None
         if entry.get("measured") is not None:
             measured = PointSpread.from_dict(entry["measured"])

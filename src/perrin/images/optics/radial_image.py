@@ -156,10 +156,11 @@ class RadialImage:
 
     def to_dict(self) -> dict[str, Any]:
         """Return values that JSON holds; `noise` is [gain, floor], or [gain, floor, level]."""
+        noise = self.noise[:2] if isinstance(self.noise, CameraNoise) else self.noise
         return {
             "spacing": to_plain(self.spacing),
             "coefficients": to_plain(self.coefficients),
-            "noise": [to_plain(value) for value in self.noise],
+            "noise": [to_plain(value) for value in noise],
         }
 
     @classmethod

@@ -13,10 +13,13 @@ import numpy as np
 
 from perrin.geometry.rigid import pose_slopes
 from perrin.geometry.rotations import exp_map
+from perrin.images.optics.flicker import VoxelPrecision
+from perrin.images.optics.neighbours import neighbour_covariance
 
 if TYPE_CHECKING:
     from perrin._arrays import Bools, Floats
     from perrin.images.optics.ball_image import SphereImage
+    from perrin.images.optics.flicker import Lines
     from perrin.images.optics.optics import CameraNoise
 
 
@@ -183,8 +186,8 @@ class ImageFit(NamedTuple):
         Chi-squared per degree of freedom.
     expected : ndarray, shape (m,)
         Expected grey levels.
-    weight : ndarray, shape (m,)
-        Inverse variances of the voxels.
+    precision : VoxelPrecision
+        Inverse covariance of the voxels.
     jacobian : ndarray, shape (p, m)
         Derivatives of the expected grey levels by all parameters.
     sizes, size_variance : ndarray, shape (n,)
@@ -200,11 +203,16 @@ class ImageFit(NamedTuple):
     converged: bool
     chi2: float
     expected: Floats
-    weight: Floats
+    precision: VoxelPrecision
     jacobian: Floats
     sizes: Floats
     size_variance: Floats
     prior: Floats
+
+    @property
+    def weight(self) -> Floats:
+        """Inverse variances (m,) of the voxels, without what they have in common."""
+        return self.precision.weight
 
     @property
     def unit_images(self) -> Floats:
@@ -304,8 +312,12 @@ def fit_window(
     that the fixed point is the root of the score of the Poisson likelihood shifted by the camera's
     floor; the covariance is the inverse Fisher information there. Where the residuals exceed the
     noise (chi-squared per degree of freedom above 1), the model misses something of the image, and
-    the covariance is multiplied by chi-squared. Where diameters differ (`SphereImage.spread`), that
-    of every sphere is fitted too, with a Gaussian distribution of its logarithm about the mean.
+    the covariance is multiplied by chi-squared. Flicker of the light is a random factor of every
+    plane or line, the gain of a pixel one of all its voxels, of known variance, over which the
+    likelihood is averaged. Noise that neighbours in a plane have in common (of an image that was
+    compressed or smoothed) leaves the estimate as it is, and its covariance is that of this noise.
+    Where diameters differ (`SphereImage.spread`), that of every sphere is fitted too, with a
+    Gaussian distribution of its logarithm about the mean.
 
     Examples
     --------
@@ -320,7 +332,8 @@ def fit_window(
     >>> fit.centers.round(4), fit.brightness.round(2)
     (array([[3.01, 3.12, 3.23]]), array([100.]))
     """
-    state = _fit_state(window, image, noise, start)
+    lines = VoxelPrecision.lines_of(window.mask, noise)
+    state = _fit_state(window, image, noise, start, lines)
     damping, converged = 1e-3, False
     for _ in range(_MAX_WINDOW_ROUNDS):
         information, score = state.normal_equations(window)
@@ -336,7 +349,7 @@ def fit_window(
             sizes[:free] + step[k : k + free], -image.size_range, image.size_range
         )
         trial = _fit_state(
-            window, image, noise, moved, linear=state.linear + step[k + free :], sizes=sizes
+            window, image, noise, moved, lines, linear=state.linear + step[k + free :], sizes=sizes
         )
         if state.deviance(window, trial) > state.deviance(window, state) * (1 + 1e-12):
             damping *= 10.0
@@ -349,6 +362,12 @@ def fit_window(
     information, _ = state.normal_equations(window)
     k, free = state.n_arrangement, state.n_sizes
     variance = np.linalg.pinv(information, hermitian=True)
+    if noise.neighbours:
+        spread = variance @ state.precision.times(state.jacobian)
+        spread /= np.sqrt(state.precision.weight)
+        variance = variance + neighbour_covariance(
+            spread, window.mask, noise.neighbours, along_z=noise.along_z
+        )
     size_variance = np.zeros(len(state.sizes))
     size_variance[:free] = np.diag(variance)[k : k + free]
     chi2 = state.chi2(window, state.expected) / max(len(window.data) - len(state.jacobian), 1)
@@ -360,7 +379,7 @@ def fit_window(
         converged,
         chi2,
         state.expected,
-        state.weight,
+        state.precision,
         state.jacobian,
         state.sizes,
         size_variance,
@@ -374,7 +393,7 @@ class _FitState(NamedTuple):
     arrangement: Arrangement
     linear: Floats  # brightness (n,) and background (4,)
     expected: Floats
-    weight: Floats
+    precision: VoxelPrecision
     jacobian: Floats
     sizes: Floats
     prior: Floats
@@ -396,11 +415,14 @@ class _FitState(NamedTuple):
 
     def chi2(self, window: Window, expected: Floats) -> float:
         """Return chi-squared of an expected intensity, with the weights of this state."""
-        return float(self.weight @ (window.data - expected) ** 2)
+        residual = window.data - expected
+        if self.precision.lines is None:
+            return float(self.precision.weight @ residual**2)
+        return float(residual @ self.precision.times(residual))
 
     def normal_equations(self, window: Window) -> tuple[Floats, Floats]:
         """Return the Fisher information and the score."""
-        weighted = self.jacobian * self.weight
+        weighted = self.precision.times(self.jacobian)
         information = weighted @ self.jacobian.T
         score = weighted @ (window.data - self.expected)
         if self.n_sizes:
@@ -423,6 +445,7 @@ def _fit_state(
     image: SphereImage,
     noise: CameraNoise,
     arrangement: Arrangement,
+    lines: Lines | None,
     *,
     linear: Floats | None = None,
     sizes: Floats | None = None,
@@ -454,4 +477,5 @@ def _fit_state(
     prior = np.zeros(len(jacobian))
     if free:
         prior[k - n : k] = image.spread**-2
-    return _FitState(arrangement, linear, expected, noise.weight(expected), jacobian, sizes, prior)
+    precision = VoxelPrecision.of(expected, noise, lines)
+    return _FitState(arrangement, linear, expected, precision, jacobian, sizes, prior)

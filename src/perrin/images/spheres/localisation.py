@@ -486,8 +486,8 @@ def _with_optics(
         warnings.warn(
             f"pixel pattern: the background of pixels differs by {pixels.offset:.2g} grey levels "
             f"(rms) in all planes and frames, the noise of a voxel is {pixels.noise:.2g}; the "
-            f"offsets that {len(sample)} frames show are subtracted for the fits, and gains of "
-            "pixels are not corrected: correct the movie by dark and flat frames of the camera",
+            f"offsets that {len(sample)} frames show are subtracted for the fits, and the stated "
+            "errors contain what is left: correct the movie by dark and flat frames of the camera",
             PrecisionWarning,
             stacklevel=4,
         )
@@ -720,7 +720,12 @@ def fit_optics(
         samples, most = pieces, _LEARNING_CROWDS
     chosen = [samples[k] for k in _evenly_spaced(len(samples), most)]
     return fit_samples(
-        chosen, diameter=search.diameter, voxel=voxel, measured=search.psf, shell=shell
+        chosen,
+        diameter=search.diameter,
+        voxel=voxel,
+        measured=search.psf,
+        shell=shell,
+        camera_pattern=method.pattern is not None,
     )
 
 
@@ -830,16 +835,19 @@ def group_columns(
         if usual is not None:
             # Chi-squared per voxel of the voxels of every sphere, and their number.
             voxels = fit.unit_images.sum(axis=1)
-            residual = fit.weight * (window.data - fit.expected) ** 2
+            independent = voxels / noise.voxels_in_one
+            residual = fit.precision.left(window.data - fit.expected)
+            residual = fit.weight * residual**2
             square = fit.unit_images @ residual / np.maximum(voxels, 1e-300)
             level = usual.brightness * dimmed[group]
-            excess = usual.excess(square, fit.brightness / level, voxels=voxels)
+            excess = usual.excess(square, fit.brightness / level, voxels=independent)
             worst = int(excess.argmax())
             bright = fit.brightness / level >= usual.brightest
             # Spheres at the border, which are often not found, touch those within one contact.
             at_border = np.any(np.minimum(fit.centers, last - fit.centers) < contact)
-            beside = usual.disturbed(np.array([fit.chi2]), voxels=np.array([window.data.size]))
-            disturbed = beside[0] or usual.disturbed(square, voxels=voxels).any()
+            size = np.array([window.data.size / noise.voxels_in_one])
+            beside = usual.disturbed(np.array([fit.chi2]), voxels=size)
+            disturbed = beside[0] or usual.disturbed(square, voxels=independent).any()
             # Light beside spheres of usual brightness may be that of a sphere that was not found.
             if (
                 search.crowds
