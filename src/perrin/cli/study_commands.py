@@ -168,6 +168,8 @@ def _show(result: StudyResult, *, as_json: bool, quiet: bool) -> None:
     from rich.markup import escape
     from rich.table import Table
 
+    from perrin._text import interval_text
+
     console = output_console()
     done = len(result.entries) - len(result.failed)
     console.print(
@@ -177,13 +179,12 @@ def _show(result: StudyResult, *, as_json: bool, quiet: bool) -> None:
     for name in ("bodies", "condition", "quantity", "mean", "95 %", "movies", "clusters"):
         table.add_column(name)
     for one in result.means:
-        low, high = one.mean.ci95
         table.add_row(
             escape(one.body),
             escape(one.label),
             f"{one.quantity} ({one.mean.unit})",
             f"{one.mean.value:.3g}",
-            f"{low:.3g} to {high:.3g}",
+            interval_text(one.mean.ci95),
             f"{one.mean.n_movies}{' *' * (one.mean.scope != 'movies')}",
             str(one.mean.n_clusters),
         )

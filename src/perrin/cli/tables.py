@@ -309,12 +309,11 @@ def kinds_table(report: Report) -> Table:
 
 def _estimate_cells(estimate: DiffusionEstimate) -> tuple[str, str, str]:
     """Return value and intervals as text; an unresolved value is an upper limit."""
-    from perrin._text import with_error
+    from perrin._text import interval_text, with_error
 
     if estimate.absent_because is not None:
         return "none", estimate.absent_because, ""
     value = with_error(estimate.value, estimate.stderr)
     if not estimate.resolved:
         value = f"< {estimate.ci95[1]:.2g} (95 %)"
-    (low68, high68), (low95, high95) = estimate.ci68, estimate.ci95
-    return value, f"{low68:.3g} to {high68:.3g}", f"{low95:.3g} to {high95:.3g}"
+    return value, interval_text(estimate.ci68), interval_text(estimate.ci95)
