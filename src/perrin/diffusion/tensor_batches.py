@@ -196,10 +196,10 @@ def maximise_each(
 ) -> list[Maximum | None]:
     """Return the maxima over a family of D, one for each motion, and over their noise.
 
-    The search is that of `maximise`: from a small and from a large blur where that is unknown, with
-    Newton steps by the noise amplitudes and the blur themselves, then quasi-Newton (BFGS) ones from
-    the Hessian, which is computed again where no step increases the likelihood, and after every 30
-    steps.
+    The search is that of `maximise`: with Newton steps by the noise amplitudes and the blur
+    themselves, from a small and from a large blur where that is unknown; then, from the higher end
+    of the two, with quasi-Newton (BFGS) ones from the Hessian, which is computed again where no
+    step increases the likelihood, and after every 30 steps.
 
     Parameters
     ----------
@@ -228,31 +228,20 @@ def maximise_each(
     >>> bool(abs(data.in_units(best.D)[0, 0] - 5e-3) < 1e-3)
     True
     """
-    if tracks.B is not None:
-        return _searched_each(tracks, family, q, own)
-    count, every = len(q), np.arange(len(q))
-    shapes, D = tracks.tracks.shapes.sum(axis=1), family(q, every)[0]
-    ratio = (
-        2 * tracks.tracks.dt * np.trace(D, axis1=1, axis2=2) / np.trace(shapes, axis1=1, axis2=2)
-    )
-    ends = _searched_each(
-        tracks.rows(np.tile(every, 2)),
-        lambda q, rows: family(q, rows % count),
-        np.tile(q, (2, 1)),
-        np.concatenate([at_blur(own, angle, ratio) for angle in START_ANGLES]),
-    )
-    found: list[Maximum | None] = []
-    for pair in zip(ends[:count], ends[count:], strict=True):
-        maxima = [one for one in pair if one is not None]
-        found.append(max(maxima, key=lambda m: m.value) if maxima else None)
-    return found
-
-
-def _searched_each(
-    tracks: SeparateTensors, family: Family, q: Floats, own: Floats
-) -> list[Maximum | None]:
-    """Return the maxima that searches from these parameters find; None without convergence."""
-    m, p, active = q.shape[1], climbed_each(tracks, family, q, own), np.arange(len(q))
+    count, m, active = len(q), q.shape[1], np.arange(len(q))
+    if tracks.B is None:
+        noise, D = tracks.tracks.shapes.sum(axis=1), family(q, active)[0]
+        ratio = 2 * tracks.tracks.dt * np.trace(D, axis1=1, axis2=2)
+        ratio /= np.trace(noise, axis1=1, axis2=2)
+        ends, heights = climbed_each(
+            tracks.rows(np.tile(active, 2)),
+            lambda q, rows: family(q, rows % count),
+            np.tile(q, (2, 1)),
+            np.concatenate([at_blur(own, angle, ratio) for angle in START_ANGLES]),
+        )
+        p = ends[np.argmax(heights.reshape(2, count), axis=0) * count + active]
+    else:
+        p, _ = climbed_each(tracks, family, q, own)
     found: list[Maximum | None] = [None] * len(q)
     start = family(p[:, :m], active), p[:, m:]
     (value, slope), hessian = tracks.slopes(*start), tracks.hessians(*start)
@@ -300,8 +289,10 @@ def _searched_each(
     return found
 
 
-def climbed_each(tracks: SeparateTensors, family: Family, q: Floats, own: Floats) -> Floats:
-    """Return higher points (P, m + c) of a search, by Newton steps while they gain.
+def climbed_each(
+    tracks: SeparateTensors, family: Family, q: Floats, own: Floats
+) -> tuple[Floats, Floats]:
+    """Return higher points (P, m + c) of a search and their values, by Newton steps that gain.
 
     The steps are those of `PooledLikelihood.climbed`: by the parameters of D, the noise amplitudes
     and the blur, at most a part of the way to the edges of the latter. The parameters are those of
@@ -315,13 +306,14 @@ def climbed_each(tracks: SeparateTensors, family: Family, q: Floats, own: Floats
     >>> data = ScaledTracks.of([body_steps(truth, "rotation", np.eye(3))], Noise())
     >>> own = np.array([track.start() for track in data.tracks])
     >>> each, start = SeparateTensors.of(data.tracks), np.full((1, 1), 3.0)
-    >>> end = climbed_each(each, squares(np.eye(3)[None]), start, own)[0]
-    >>> bool(abs(data.in_units(end[0] ** 2 * np.eye(3))[0, 0] - 5e-3) < 1e-3)
+    >>> ends, values = climbed_each(each, squares(np.eye(3)[None]), start, own)
+    >>> bool(abs(data.in_units(ends[0, 0] ** 2 * np.eye(3))[0, 0] - 5e-3) < 1e-3)
     True
     """
     p, m, active = np.concatenate([q, own], axis=1), q.shape[1], np.arange(len(q))
     blurred, reach = tracks.B is None, np.full(len(q), FIRST_REACH)
     value, slope, hessian = tracks.straight_expansion(family(q, active), own)
+    highest = value.copy()
     for _ in range(MOST_STRAIGHT_STEPS):
         here = p[active]
         limits = noise_range(here[:, None, m:], reach[:, None, None], blurred=blurred)
@@ -337,11 +329,11 @@ def climbed_each(tracks: SeparateTensors, family: Family, q: Floats, own: Floats
         trial = np.concatenate([here[:, :m] + of_D[kept], noise], axis=1)
         ahead = tracks.straight_expansion(family(trial[:, :m], active), noise)
         rises = ahead[0] > value
-        p[active[rises]] = trial[rises]
+        p[active[rises]], highest[active[rises]] = trial[rises], ahead[0][rises]
         for old, new in zip((value, slope, hessian), ahead, strict=True):
             old[rises] = new[rises]
         reach = np.where(rises, np.minimum(2 * reach, FARTHEST_REACH), 0.25 * reach)
-    return p
+    return p, highest
 
 
 def spread_each(
