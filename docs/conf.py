@@ -8,6 +8,8 @@ from pathlib import Path
 import sphinx.ext.autosummary
 
 sys.path.insert(0, str(Path(__file__).parent / "_extensions"))
+from figure_texts import described_figures
+
 for threads in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(threads, "1")  # scripts of the gallery are small: threads only wait
 
@@ -42,6 +44,8 @@ autosummary_generate = True
 sphinx.ext.autosummary.WELL_KNOWN_ABBREVIATIONS += ("Eq.", "Eqs.", "Fig.", " .")
 autodoc_typehints = "none"  # the docstrings carry types with shapes
 autodoc_member_order = "groupwise"
+default_role = "py:obj"  # names in single backticks are links where they have a page
+toc_object_entries_show_parents = "hide"
 numpydoc_show_class_members = False
 
 sphinx_gallery_conf = {
@@ -60,7 +64,8 @@ sphinx_gallery_conf = {
     "min_reported_time": 1e9,
     "plot_gallery": True,
     "thumbnail_size": (480, 336),
-    "image_scrapers": ("matplotlib",),
+    "image_scrapers": (described_figures,),
+    "remove_config_comments": True,
 }
 
 copybutton_prompt_text = r">>> |\.\.\. |\$ "

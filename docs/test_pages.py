@@ -74,7 +74,7 @@ def run_block(code):
                 run_command("perrin demo --quiet")
             continue
         assert command.startswith("perrin "), f"not a command that is known: {line}"
-        # A scheduler has tests of its own.
+        # Lines with a scheduler have a test below.
         if "--scheduler" not in command and not missing_file(command):
             run_command(re.sub(r"--workers \d+", "--workers 2", command))
 
@@ -92,6 +92,58 @@ def run_command(command):
 
     result = CliRunner().invoke(app, shlex.split(command)[1:])
     assert result.exit_code == 0, f"{command}\n{result.output}\n{result.exception!r}"
+
+
+@pytest.fixture(scope="module")
+def address():
+    """Start a scheduler with one worker, a process of its own, as on another machine."""
+    distributed = pytest.importorskip("distributed")
+    with distributed.LocalCluster(
+        n_workers=1, threads_per_worker=1, host="127.0.0.1", dashboard_address="127.0.0.1:0"
+    ) as cluster:
+        yield cluster.scheduler_address
+
+
+def test_lines_with_a_scheduler_run(address, tmp_path, monkeypatch):
+    """Every command with --scheduler in the pages, on a small movie and a study of one table."""
+    from perrin import (
+        Cluster,
+        add_noise,
+        positions_table,
+        render_stack,
+        simulate_motion,
+        write_stack,
+    )
+
+    monkeypatch.chdir(tmp_path)
+    commands = {
+        re.sub(r'--scheduler ("[^"]*"|\S+)', f"--scheduler {address}", line)
+        for page in sorted(DOCS.rglob("*.md"))
+        if "_build" not in page.parts
+        for _, code, _ in BOX.findall(page.read_text(encoding="utf-8"))
+        for line in code.replace("\\\n", " ").splitlines()
+        if "--scheduler" in line
+    }
+    assert {command.split(" -o ")[0] for command in commands} == {
+        "perrin run /shared/movie.ome.tif --diameter 2.45 --contact 2.45",
+        "perrin study run study.toml",
+    }
+    body = Cluster.touching(3, diameter=2.45)
+    truth = simulate_motion(body, D_R=5e-3, D_T=0.004, dt=0.73, n_frames=205, rng=1)
+    movie = render_stack(
+        truth.positions()[:3], dt=0.73, centers=[(4.0, 4.0, 4.4)], voxel=(0.4, 0.3, 0.3),
+        shape=(22, 28, 28), diameter=2.45, psf=(0.4, 0.15, 0.15), photons=40, rng=1,
+    )  # fmt: skip
+    write_stack(movie, "movie.ome.tif")
+    noisy = add_noise(truth.positions(), sigma=0.03, rng=2)
+    positions_table(noisy).to_csv("a.csv", index=False)
+    Path("study.toml").write_text(
+        'reports = false\n[defaults]\ndt = 0.73\n[[sample]]\nfiles = ["a.csv"]\n', encoding="utf-8"
+    )
+    for command in sorted(commands):
+        run_command(command.replace("/shared/", ""))
+    assert Path("my-run", "report.html").is_file()
+    assert Path("STUDY", "study.html").is_file()
 
 
 @pytest.mark.parametrize("notebook", NOTEBOOKS, ids=lambda notebook: notebook.stem)

@@ -55,6 +55,7 @@ axes[0].imshow(frame.max(axis=0), cmap="gray", extent=(0, 13.9, 13.9, 0))
 axes[0].set(xlabel="x (µm)", ylabel="y (µm)", title="maximum along z")
 axes[1].imshow(frame.max(axis=1), cmap="gray", extent=(0, 13.9, 9.6, 0))
 axes[1].set(xlabel="x (µm)", ylabel="z (µm)", title="maximum along y")
+# sphinx_gallery_alt = "One frame as maxima along z and along y: two clusters of bright spheres"
 plt.show()
 
 # %%
@@ -66,6 +67,9 @@ plt.show()
 # fluorescent. The same on the command line::
 #
 #     perrin run movie.ome.tif --diameter 2.45 --contact 2.45 -o my-run
+#
+# A file that does not state its voxels or times (a TIFF of ImageJ often does not) needs them, with
+# ``--voxel 0.3,0.24,0.24 --dt 0.73``.
 
 report = perrin.analyze_stack(stack, diameter=2.45, contact=2.45)
 report
@@ -83,6 +87,7 @@ report
 figure, (left, right) = plt.subplots(1, 2, figsize=(10, 4.4), layout="constrained")
 plot_found(report.imaging, report.imaging.views[0], ax=left)
 plot_misfit(report.imaging, ax=right)
+# sphinx_gallery_alt = "Circles around the spheres that were found, and the misfit of their images"
 plt.show()
 
 # %%

@@ -38,6 +38,7 @@ plan = perrin.plan_sampling(body, D_R=D_R, D_T=D_T, sigma=sigma, total_time=220.
 print(plan)
 figure, ax = plt.subplots(figsize=(7, 4.6), layout="constrained")
 plot_plan(plan, ax=ax)
+# sphinx_gallery_alt = "Expected error of D_R against the time between frames, with its minimum"
 plt.show()
 
 # %%

@@ -93,6 +93,7 @@ ax.axvline(1e3 * viscosity, color="0.5", ls=":", label="true viscosity")
 ax.axhline(2.45, color="0.5", ls="--", label="true diameter")
 ax.set(xlabel="assumed viscosity (mPa s)", ylabel="sphere diameter (µm)")
 ax.legend(frameon=False)
+# sphinx_gallery_alt = "Sphere diameter from D_T and from D_R against the assumed viscosity"
 plt.show()
 
 # %%

@@ -65,6 +65,7 @@ for curve, D, name in zip(curves, tensor.principal_values, ("1", "2", "3"), stri
     ax.loglog(curve.lagtime[shown], 2 * D * curve.lagtime[shown], "--", color=line.get_color())
 ax.set(xlabel="lag time (s)", ylabel="mean square angle (rad²)")
 ax.legend(frameon=False)
+# sphinx_gallery_alt = "Mean square angle about three body axes against lag time, with fitted lines"
 plt.show()
 
 # %%

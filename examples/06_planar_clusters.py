@@ -57,6 +57,7 @@ print("warnings:", *(cluster.warnings or ["none"]))
 
 figure, ax = plt.subplots(figsize=(8, 3.6), layout="constrained")
 plot_angle(cluster.motion, ax=ax)
+# sphinx_gallery_alt = "Angle of a planar cluster against time"
 plt.show()
 
 # %%

@@ -81,4 +81,5 @@ predicted = np.trace(fluid.D_R) / 3 * 4.0  # of the last fluid, 4 mPa s
 ax.plot(line, predicted * line, "k--", lw=1, label="predicted")
 ax.set(xlabel="1/viscosity (1/(mPa s))", ylabel="$D_R$ (rad²/s)", xlim=(0, 1.1), ylim=(0, None))
 ax.legend(frameon=False)
+# sphinx_gallery_alt = "D_R of clusters and their means against one over the viscosity, with a line"
 plt.show()

@@ -91,6 +91,10 @@ def test_scripts_have_a_title_and_links_that_exist(script):
     """A script begins with a title and a sentence; the pages that it names exist."""
     text = script.read_text(encoding="utf-8")
     assert re.match(r'"""\n(.+)\n=+\n\n\S', text)
+    # A tutorial states the text of every figure; a gallery's script has one, its first paragraph.
+    if "examples" in script.parts:
+        stated = re.findall(r'^# sphinx_gallery_alt = ".{20,}"\nplt\.show', text, re.MULTILINE)
+        assert len(stated) == text.count("plt.show()")
     folder = DOCS / "tutorials" / "examples" if "examples" in script.parts else DOCS / "gallery"
     for target in re.findall(r":doc:`(?:[^`<]*<)?([^`>]+)>?`", text):
         place = DOCS / target[1:] if target.startswith("/") else folder / target

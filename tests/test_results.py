@@ -184,5 +184,7 @@ def test_progress_counts_the_clusters_of_every_long_step(tmp_path, monkeypatch):
     ]  # fmt: skip
     for title in ("fitting clusters", "estimating D_R and D_T"):
         assert calls[title] == [(0, 20), (16, 20), (20, 20)]
+    # Two verdicts for each cluster; none is possible in 19 steps.
+    assert calls["judging the motion"] == [(0, 40), (40, 40)]
     for title in ("writing the curves", "writing the report"):
         assert calls[title] == [(k, 20) for k in range(20)]

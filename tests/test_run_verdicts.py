@@ -88,6 +88,14 @@ def test_clusters_are_judged_together_as_each_alone(report):
     assert "in cluster 0 " in report.pooled.verdicts["translation"].text
 
 
+def test_progress_counts_the_motions_that_are_tested(report):
+    """Each of three motions is counted when it has been tested, and again by no other way."""
+    motions = [one.motion for one in report.clusters]
+    calls = []
+    judge_motion(motions, progress=lambda: calls.append(len(calls)))
+    assert calls == [0, 1, 2]
+
+
 def test_the_summary_holds_the_verdicts(report):
     entry = json.loads(json.dumps(report.to_dict()))
     again = perrin.Report.from_dict(

@@ -250,6 +250,10 @@ def test_a_part_of_a_trackpy_table_is_asked_for_its_unit_where_distances_are_pix
         read_table(pixels[names[:-1]]),
     ):
         assert silent[2].warnings == []
+    # Planes have mostly another distance than pixels.
+    alike, apart = (read_table(pixels[names], scale=s)[2].notes for s in (0.11, (0.11, 0.11, 0.25)))
+    assert any("0.11 um for z as for x and y" in note for note in alike)
+    assert not any("for z as" in note for note in apart)
 
 
 def test_particles_at_rest_on_a_cameras_grid_are_measured():

@@ -35,17 +35,24 @@ CLOSED = (
 
 
 @cache
-def terms(path):
-    """Return the terms of the glossary page: lines without indent inside its directive."""
+def entries(path):
+    """Return the first term of the entry of every term: synonyms have one entry."""
     text = Path(path).read_text(encoding="utf-8")
     (block,) = re.findall(r"^:::\{glossary\}\n(.*?)^:::", text, re.DOTALL | re.MULTILINE)
-    return tuple(line.strip() for line in block.splitlines() if line and not line.startswith(" "))
+    first, found = None, {}
+    for line in block.splitlines():
+        if not line or line.startswith(" "):
+            first = None
+        else:
+            first = first or line.strip()
+            found[line.strip()] = first
+    return found
 
 
 @cache
 def pattern(path):
     """Return the expression that finds any of the terms, the longest first."""
-    longest = sorted(set(terms(path)) - COMMON, key=len, reverse=True)
+    longest = sorted(set(entries(path)) - COMMON, key=len, reverse=True)
     return re.compile(r"(?<![\w-])(" + "|".join(map(re.escape, longest)) + r")(?![\w-])")
 
 
@@ -65,7 +72,7 @@ class GlossaryLinks(SphinxTransform):
         used = set()
         for text in list(self.document.findall(nodes.Text)):
             if not in_closed(text):
-                link_terms(text, pattern(path), used, page)
+                link_terms(text, path, used, page)
 
 
 def in_closed(text):
@@ -78,14 +85,15 @@ def in_closed(text):
     return False
 
 
-def link_terms(text, expression, used, page):
-    """Replace the terms in a text that are not in `used`."""
+def link_terms(text, path, used, page):
+    """Replace the terms in a text whose entries of the glossary are not in `used`."""
     content, parts, end = text.astext(), [], 0
-    for found in expression.finditer(content):
+    for found in pattern(path).finditer(content):
         term = found[1]
-        if term in used:
+        entry = entries(path)[term]
+        if entry in used:
             continue
-        used.add(term)
+        used.add(entry)
         parts.append(nodes.Text(content[end : found.start()]))
         link = addnodes.pending_xref(
             "", nodes.inline("", term), refdomain="std", reftype="term", reftarget=term,

@@ -945,6 +945,8 @@ def brownian_tests(model: AxisModel, y: Floats) -> BrownianTests:
 
 def brownian_tests_of_each(
     each: Sequence[tuple[AxisModel, Floats]],
+    *,
+    progress: Callable[[], None] | None = None,
 ) -> list[BrownianTests]:
     """Test the steps of several motions, each alone, as `brownian_tests`; alike ones together.
 
@@ -952,6 +954,8 @@ def brownian_tests_of_each(
     ----------
     each : sequence of tuple
         Model and steps (1, A, N) of every motion.
+    progress : callable, optional
+        Is called after each motion that has been tested.
 
     Examples
     --------
@@ -972,6 +976,8 @@ def brownian_tests_of_each(
     for rows in groups_alike(keys, [y.size for _, y in each], most=_MOST_SCORES):
         if len(rows) == 1:
             found[rows[0]] = brownian_tests(*each[rows[0]])
+            if progress is not None:
+                progress()
             continue
         some = [each[i] for i in rows]
         before, after = (np.stack([model.known[e] for model, _ in some]) for e in (0, 1))
@@ -994,6 +1000,8 @@ def brownian_tests_of_each(
                 ),
                 {name: float(value[j]) for name, value in p.items()},
             )
+            if progress is not None:
+                progress()
     return [found[i] for i in range(len(each))]
 
 

@@ -36,7 +36,7 @@ from perrin.errors import PrecisionWarning
 from perrin.motion.rigid_motion import RigidMotion
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
 
 Kind = Literal[
@@ -172,6 +172,7 @@ def judge_motion(
     quantity: Quantity = "rotation",
     noise: Literal["joint", "residual"] | float | Noise = "joint",
     exposure: float | None = None,
+    progress: Callable[[], None] | None = None,
 ) -> MotionVerdict:
     """Judge whether a motion is diffusion, and name what it is if not.
 
@@ -188,6 +189,8 @@ def judge_motion(
         recorded at the same instant.
     exposure : float, optional
         Open fraction of the time between frames, with a known noise; a free offset contains it.
+    progress : callable, optional
+        Is called after each motion that has been tested.
 
     Returns
     -------
@@ -239,7 +242,9 @@ def judge_motion(
         faults.append("noise: expected no drift; the verdict tests for a steady motion itself")
     refuse(faults)
     settings = Noise.of(noise, exposure=exposure)
-    tested = brownian_tests_of_each([axis_model(m, quantity, settings) for m in motions])
+    tested = brownian_tests_of_each(
+        [axis_model(m, quantity, settings) for m in motions], progress=progress
+    )
     singly = [
         _verdict([m], [one], quantity, settings) for m, one in zip(motions, tested, strict=True)
     ]

@@ -165,8 +165,9 @@ def locate_frames(
                 shutil.rmtree(folder)
             repeated.append(f"{damage.file} was damaged: what followed from it was computed again")
     if learned is None:
-        work.report(0, 0, "learning mass cut and optics")
-        learned = learn_method(stack, search, refine=refine, optics=optics, frames=frames)
+        learned = learn_method(
+            stack, search, refine=refine, optics=optics, frames=frames, work=work
+        )
         open_parts(folder, settings)
         write_sealed(known, learned)
     found, radial = learned["optics"], learned["radial"]
@@ -210,6 +211,7 @@ def learn_method(
     refine: Refine,
     optics: Optics | None,
     frames: Sequence[int],
+    work: Work,
 ) -> dict[str, Any]:
     """Choose mass cut and optics from a few frames.
 
@@ -219,6 +221,8 @@ def learn_method(
         As in `choose_method`.
     frames : sequence of int
         Frames of the run.
+    work : Work
+        Whose progress is reported.
 
     Returns
     -------
@@ -232,7 +236,10 @@ def learn_method(
     TooFewFramesError
         If all frames are the same image; images without any contrast are not compared.
     """
+    title = "learning mass cut and optics"
+    work.report(0, 2, title)
     sample = sample_frames(stack, search, frames)
+    work.report(1, 2, title)
     first = sample[0].frame
     equal = (
         len(frames) > 1
@@ -253,6 +260,7 @@ def learn_method(
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", PrecisionWarning)
         method = choose_method(stack, search, sample, refine=refine, optics=optics)
+    work.report(2, 2, title)
     if method.optics is not None and method.optics.shell:
         z, y, x = (float(h) for h in stack.voxel)
         sample = [

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import platform
 import warnings as python_warnings
 from dataclasses import dataclass, field, replace
@@ -1085,10 +1086,23 @@ def measure_kinds(
     judged: list[MeasuredBody] = []
     kinds: list[BodyKind] = []
     found: list[tuple[str, str]] = []
+
+    total, counter = 2 * len(measured), itertools.count(1)
+
+    def tested() -> None:
+        if progress is not None:
+            progress(min(next(counter), total), total, "judging the motion")
+
+    if progress is not None:
+        progress(0, total, "judging the motion")
     for number in np.unique(shapes).tolist():
         members = [one for one, shape in zip(measured, shapes, strict=True) if shape == number]
         part, together = judge_bodies(
-            members, experiment, first_frame=first_frame, tested=len(measured), progress=progress
+            members,
+            experiment,
+            first_frame=first_frame,
+            tested=len(measured),
+            progress=tested,
         )
         pooled, texts = pool_clusters(part, experiment, together)
         judged += part
@@ -1113,6 +1127,8 @@ def measure_kinds(
                 D_T=estimate_rod([rod.motion for rod in same], quantity="translation"),
             )
         )
+    if progress is not None:
+        progress(total, total, "judging the motion")
     kinds.sort(key=lambda kind: kind.size)
     warnings = [f"{name}: {text}" if len(kinds) > 1 else text for name, text in found]
     return judged, kinds, warnings
@@ -1124,7 +1140,7 @@ def judge_bodies(
     *,
     first_frame: int,
     tested: int,
-    progress: Progress | None = None,
+    progress: Callable[[], None] | None = None,
 ) -> tuple[list[MeasuredBody], dict[str, MotionVerdict | None]]:
     """Judge what kind of motion every body shows, and all rigid ones together.
 
@@ -1137,7 +1153,7 @@ def judge_bodies(
     tested : int
         Number of clusters that share the level of a warning.
     progress : callable, optional
-        As in `measure_table`.
+        Is called after each of two coefficients of a body whose steps have been tested.
 
     Returns
     -------
@@ -1152,14 +1168,13 @@ def judge_bodies(
         ("rotation", [one.rotation for one in measured]),
         ("translation", [one.translation for one in measured]),
     ):
-        if progress is not None:
-            progress(len(judged), 2, "judging the motion")
         shown = [i for i, c in enumerate(coefficients) if c.estimate.absent_because is None]
         each, common = judge_each_and_all(
             [coefficients[i].whole for i in shown],
             quantity=coefficients[0].estimate.quantity if coefficients else "rotation",
             noise=experiment.noise,
             pooled=[measured[i].body.quality.rigid for i in shown],
+            progress=progress,
         )
         judged[quantity] = list(coefficients)
         for i, verdict in zip(shown, each, strict=True):

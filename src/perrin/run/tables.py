@@ -245,5 +245,11 @@ def read_table(
         trackpy_columns=has_trackpy_columns(names),
         trackpy_order=has_trackpy_order(names),
     )
+    of_trackpy = has_trackpy_columns(names) or has_trackpy_order(names)
+    if "z" in table and of_trackpy and np.ndim(scale) == 0 and scale != 1:
+        read_notes.append(
+            f"scale: {float(np.asarray(scale)):g} um for z as for x and y; if the planes of the "
+            "stack are not as far apart as the pixels, state three numbers, for x, y and z"
+        )
     remarks = Remarks([*screened.warnings, *warnings], [*read_notes, *screened.notes, *notes])
     return screened.table, source, remarks

@@ -55,6 +55,7 @@ def judge_each_and_all(
     quantity: Quantity,
     noise: Noise,
     pooled: Sequence[bool],
+    progress: Callable[[], None] | None = None,
 ) -> tuple[list[MotionVerdict | None], MotionVerdict | None]:
     """Judge every motion, and several of them together, testing each motion once.
 
@@ -67,6 +68,8 @@ def judge_each_and_all(
         What the estimates assume of the noise.
     pooled : sequence of bool
         Which motions are judged together.
+    progress : callable, optional
+        Is called after each motion that has been tested.
 
     Returns
     -------
@@ -90,25 +93,29 @@ def judge_each_and_all(
     """
     settings = replace(noise, drift=False)
 
-    def judged(some: RigidMotion | list[RigidMotion]) -> MotionVerdict | None:
+    def judged(
+        some: RigidMotion | list[RigidMotion], report: Callable[[], None] | None = None
+    ) -> MotionVerdict | None:
         bodies = some if isinstance(some, list) else [some]
         if any(is_at_rest(body, quantity) for body in bodies):
             return None
         with python_warnings.catch_warnings():
             python_warnings.simplefilter("ignore", PrecisionWarning)
             try:
-                return judge_motion(some, quantity=quantity, noise=settings)
+                return judge_motion(some, quantity=quantity, noise=settings, progress=report)
             except ValueError:
                 return None
 
     each: list[MotionVerdict | None] = [None] * len(motions)
     used = [i for i, one in enumerate(pooled) if one]
-    together = judged([motions[i] for i in used]) if len(used) > 1 else None
+    together = judged([motions[i] for i in used], progress) if len(used) > 1 else None
     if together is not None:
         for i, one in zip(used, together.each, strict=True):
             each[i] = one
         together = replace(together, each=())
-    each = [judged(m) if one is None else one for m, one in zip(motions, each, strict=True)]
+    each = [
+        judged(m, progress) if one is None else one for m, one in zip(motions, each, strict=True)
+    ]
     if together is not None:
         return each, together
     known = [i for i in used if each[i] is not None]

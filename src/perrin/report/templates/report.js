@@ -63,9 +63,9 @@
   const literal = (text) => text.replace(/&/g, "&amp;").replace(/</g, "&lt;");
   const layout = (x, y, more = {}) => {
     const axis = (title, given = {}) => ({ title: { text: title, standoff: 6 }, color: color("ink"), gridcolor: color("line"),
-      zerolinecolor: color("line"), linecolor: color("soft"), automargin: true, exponentformat: "power", ...given });
+      zerolinecolor: color("line"), linecolor: color("soft"), ticklabeloverflow: "allow", exponentformat: "power", ...given });
     return { paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)", font: { family: "system-ui, sans-serif", size: 13, color: color("ink") },
-      margin: { l: 60, r: 12, t: 8, b: 44 }, legend: { orientation: "h", x: 0, y: 1.02, yanchor: "bottom", font: { size: narrow() ? 11 : 12 } },
+      margin: { l: 68, r: 12, t: 8, b: 46 }, legend: { orientation: "h", x: 0, y: 1.02, yanchor: "bottom", font: { size: narrow() ? 11 : 12 } },
       hoverlabel: { bgcolor: color("raised"), font: { color: color("ink") } },
       modebar: { bgcolor: "rgba(0,0,0,0)", color: color("soft"), activecolor: color("ink") },
       ...more, xaxis: axis(x, more.xaxis), yaxis: axis(y, more.yaxis) };
@@ -80,8 +80,6 @@
   const scale = { msad: "log", msd: "log" };
   const drawCurve = (kind, data) => {
     const line = data.lines[kind], place = `plot-${kind}`;
-    find(`#${place}`).closest("figure").hidden = !line;
-    if (!line) return null;
     const known = data.column[`${kind}_y`].map((v, k) => k).filter((k) => !Number.isNaN(data.column[`${kind}_y`][k]));
     const power = (name) => known.map((k) => 10 ** data.column[`${kind}_${name}`][k]);
     const t = power("t"), y = power("y"), e = known.map((k, i) => data.column[`${kind}_e`][k] * y[i]);
@@ -138,8 +136,6 @@
   const HUES = ["blue", "red", "green"];
   const drawSeries = (id, data, names, labels, unit) => {
     const present = names.filter((name) => data.column[name]);
-    find(`#${id}`).closest("figure").hidden = !present.length;
-    if (!present.length) return null;
     const from = names[0] === "center0" ? present.map((name) => data.column[name].find((v) => !Number.isNaN(v))) : present.map(() => 0);
     const traces = present.map((name, k) => ({ x: data.column.time, y: data.column[name].map((v) => v - from[k]), mode: "lines",
       line: { width: 1.4, color: color(HUES[k]), dash: ["solid", "dot", "dash"][k] }, name: labels[names.indexOf(name)],
@@ -147,9 +143,7 @@
     return draw(id, traces, layout("time (s)", unit));
   };
   const drawSteps = (name, data) => {
-    const about = data.steps && data.steps[name], id = `plot-${name}-steps`;
-    find(`#${id}`).closest("figure").hidden = !about;
-    if (!about) return null;
+    const about = data.steps[name], id = `plot-${name}-steps`;
     const counts = data.column[`${name}_steps`].map(Math.round), width = (2 * about.half) / counts.length, unit = 1 / (about.count * width);
     const p = counts.map((v) => v * unit), e = counts.map((v) => Math.sqrt(v) * unit), kept = counts.map((v, k) => k).filter((k) => counts[k] > 0);
     const x = counts.map((_, k) => -about.half + (k + 0.5) * width), fine = Array.from({ length: 161 }, (_, k) => about.half * (k / 80 - 1));
@@ -290,6 +284,7 @@
     find("#time-text").textContent = Number.isNaN(body.data.column.residual[body.row]) ? `${t.toPrecision(4)} s: no pose` : `${t.toPrecision(4)} s`;
   };
   const moveBody = async () => {
+    if (waiting.has("plot-body")) { showTime(); return; }
     const { mesh, places, axes } = bodyAt(body.data, body.row), Plotly = await plotly();
     const parts = [mesh, places, ...[0, 1, 2].map((k) => { const ends = axes[k] ?? [[], []]; return [0, 1, 2].map((c) => ends.map((v) => v[c])); })];
     await Plotly.restyle(find("#plot-body"), { x: parts.map((p) => p[0]), y: parts.map((p) => p[1]), z: parts.map((p) => p[2]) }, [0, 1, 2, 3, 4]);
@@ -315,8 +310,52 @@
     body.timer = setTimeout(step, 0);
   };
 
+  // ---- rows of the table of clusters -----------------------------------------------------------
+  // A browser lays out all rows that a page has: where there are many, only those near the visible part are in the table.
+  const AT_ONCE = 100, BEFORE = 30;
+  const list = { table: null, frame: null, rows: [], visible: [], rowOf: new Map(), height: 1, chosen: null };
+  const place = (which) => {
+    const count = list.visible.length, few = which === "all" || count <= AT_ONCE, rows = list.table.tBodies[0];
+    const first = few ? 0 : Math.max(0, Math.min(Math.floor(list.frame.scrollTop / list.height) - BEFORE, count - AT_ONCE));
+    const wanted = list.visible.slice(first, few ? count : first + AT_ONCE), kept = new Set(wanted);
+    for (const row of [...rows.rows]) if (!kept.has(row)) row.remove();
+    let next = rows.firstElementChild;
+    for (const [k, row] of wanted.entries()) {  // rows that stay are not moved, so that they keep the focus
+      if (row === next) next = next.nextElementSibling; else rows.insertBefore(row, next);
+      row.setAttribute("aria-rowindex", first + k + 2);
+    }
+    list.table.style.marginTop = `${first * list.height}px`;
+    list.table.style.marginBottom = `${(count - first - wanted.length) * list.height}px`;
+  };
+  // Columns keep their widths and rows their mean height, whatever rows are in the table.
+  const measure = () => {
+    const heads = all("thead th", list.table), rows = list.table.tBodies[0];
+    for (const head of heads) head.style.minWidth = "";
+    const widths = heads.map((head) => head.getBoundingClientRect().width);
+    for (const [k, head] of heads.entries()) head.style.minWidth = `${widths[k]}px`;
+    list.height = Math.max(1, rows.offsetHeight / Math.max(1, rows.rows.length));
+  };
+  const bringIntoView = (row) => {
+    if (!row) return;
+    const { frame } = list, at = list.visible.indexOf(row) * list.height;
+    if (at < frame.scrollTop || at > frame.scrollTop + frame.clientHeight - 3 * list.height) frame.scrollTop = at - frame.clientHeight / 2;
+  };
+
   // ---- one cluster ---------------------------------------------------------------------------
   let shown = order[0], turn = 0;
+  // Figures are drawn when the window comes near them, and all of them for print; the old ones are hidden until then.
+  const waiting = new Map();
+  const drawWaiting = (id) => {
+    const one = waiting.get(id);
+    if (!one) return null;
+    waiting.delete(id);
+    near.unobserve(find(`#${id}`));
+    find(`#${id}`).classList.remove("stale");
+    return one();
+  };
+  const near = new IntersectionObserver((entries) => {
+    for (const entry of entries) if (entry.isIntersecting) drawWaiting(entry.target.id);
+  }, { rootMargin: "400px" });
   const drawAll = async () => {
     const key = shown, ticket = (turn += 1), state = find("#plots-state");
     try {
@@ -334,32 +373,46 @@
       find("#body-caption").textContent = `Spheres of ${data.diameter.toPrecision(3)} µm, to scale; diamonds: the places measured in this frame. `
         + `${data.axes ? "Lines: axes of the rotational diffusion tensor, as long as its values. " : ""}Drag to turn, scroll to zoom.${thinned}`;
       if (!library) state.textContent = "Drawing …";
-      const rest = [() => drawCurve("msad", data.rod ? { lines: {} } : data), () => drawCurve("msd", data.rod ? { lines: {} } : data),
-        () => drawSeries("plot-turn", data, ["turn0", "turn1", "turn2"], data.dimension === 2 ? ["φ"] : ["about x", "about y", "about z"], "rotation (rad)"),
-        () => drawSeries("plot-center", data, ["center0", "center1", "center2"], ["x", "y", "z"], "from the first frame (µm)"),
-        () => drawSteps("turn", data), () => drawSteps("shift", data), () => drawResidual(data)];
-      if (SPACE) {
-        await drawBody();
-        document.documentElement.classList.add("drawn");
-      } else find("#body-figure").hidden = true;  // the still picture is shown instead
-      for (const one of rest) {
+      const axes = ["0", "1", "2"], any = (name) => axes.some((k) => data.column[name + k]);
+      const figures = [["plot-body", SPACE, () => drawBody()],
+        ["plot-msad", !data.rod && data.lines.msad, () => drawCurve("msad", data)], ["plot-msd", !data.rod && data.lines.msd, () => drawCurve("msd", data)],
+        ["plot-turn", any("turn"), () => drawSeries("plot-turn", data, axes.map((k) => `turn${k}`), data.dimension === 2 ? ["φ"] : ["about x", "about y", "about z"], "rotation (rad)")],
+        ["plot-center", any("center"), () => drawSeries("plot-center", data, axes.map((k) => `center${k}`), ["x", "y", "z"], "from the first frame (µm)")],
+        ["plot-turn-steps", data.steps?.turn, () => drawSteps("turn", data)], ["plot-shift-steps", data.steps?.shift, () => drawSteps("shift", data)],
+        ["plot-residual", true, () => drawResidual(data)]];
+      if (SPACE) document.documentElement.classList.add("drawn");  // else the still picture is shown instead
+      for (const [id, present] of figures) {
+        find(`#${id}`).closest("figure").hidden = !present;
+        near.unobserve(find(`#${id}`));
+      }
+      waiting.clear();
+      for (const [id, present, one] of figures) if (present) {
+        waiting.set(id, one);
+        find(`#${id}`).classList.add("stale");
+      }
+      const seen = (id) => { const box = find(`#${id}`).getBoundingClientRect(); return box.top < window.innerHeight && box.bottom > 0; };
+      for (const id of [...waiting.keys()].filter(seen)) {
         await new Promise((done) => setTimeout(done, 0));
         if (ticket !== turn) return;
-        await one();
+        await drawWaiting(id);
       }
+      for (const id of waiting.keys()) near.observe(find(`#${id}`));
       state.textContent = "";
       document.documentElement.dataset.drawn = key;
+      const names = visibleOrder(), at = names.indexOf(key);
+      for (const name of [names[at + 1], names[at - 1]]) if (payloads.has(name)) dataOf(name);  // the next ones, ahead
     } catch (error) {
       state.textContent = `The figures could not be drawn: ${error.message}. A browser of 2023 or newer is needed.`;
       throw error;
     }
   };
   const mark = () => {
-    for (const row of all("#clusters tbody tr")) {
-      const chosen = row.dataset.cluster === shown;
+    for (const [row, chosen] of [[list.chosen, false], [list.rowOf.get(shown), true]]) {
+      if (!row) continue;
       row.classList.toggle("chosen", chosen);
       if (chosen) row.setAttribute("aria-current", "true"); else row.removeAttribute("aria-current");
     }
+    list.chosen = list.rowOf.get(shown);
   };
   const show = async (key) => {
     if (!payloads.has(key)) return;
@@ -374,17 +427,14 @@
     offerTables(find("#one"));
     await drawAll();
   };
-  const visibleOrder = () => {
-    const rows = all("#clusters tbody tr").filter((row) => !row.hidden).map((row) => row.dataset.cluster);
-    return rows.length ? rows : order;
-  };
+  const visibleOrder = () => (list.visible.length ? list.visible.map((row) => row.dataset.cluster) : order);
   const neighbour = (step) => {
     const rows = visibleOrder(), at = rows.indexOf(shown);
     const next = rows[(at + step + rows.length) % rows.length];
     if (next !== undefined && next !== shown) {
       history.replaceState(null, "", `#cluster-${next}`);
       show(next);
-      find(`#clusters tr[data-cluster="${next}"]`)?.scrollIntoView({ block: "nearest" });
+      bringIntoView(list.rowOf.get(next));
     }
   };
   const fromHash = () => {
@@ -394,7 +444,7 @@
 
   // ---- tables --------------------------------------------------------------------------------
   const cellText = (cell) => cell.textContent.replace(/\s+/g, " ").trim();
-  const csvOf = (table) => all("tr", table).filter((row) => !row.hidden).map((row) => all("th, td", row).map((cell) => {
+  const csvOf = (rows) => rows.map((row) => all("th, td", row).map((cell) => {
     const text = cellText(cell).replace(/ [▲▼]$/, "");
     return /[",\n]/.test(text) ? `"${text.replace(/"/g, '""')}"` : text;
   }).join(",")).join("\r\n");
@@ -414,12 +464,12 @@
       button.className = "csv";
       button.textContent = "CSV";
       button.setAttribute("aria-label", `download the table ${table.dataset.csv} as CSV`);
-      button.addEventListener("click", () => download(`${table.dataset.csv}${within.id === "one" && order.length > 1 ? `-cluster-${shown}` : ""}.csv`, csvOf(table)));
+      button.addEventListener("click", () => download(`${table.dataset.csv}${within.id === "one" && order.length > 1 ? `-cluster-${shown}` : ""}.csv`, csvOf(all("tr", table))));
       table.parentElement.after(button);
     }
   };
+  const numeric = new Intl.Collator(undefined, { numeric: true });
   const sortable = (table) => {
-    const bodyOf = table.tBodies[0];
     all("thead th", table).forEach((head, column) => {
       const button = document.createElement("button");
       button.type = "button";
@@ -430,68 +480,87 @@
         for (const other of all("thead th", table)) other.removeAttribute("aria-sort");
         head.setAttribute("aria-sort", down ? "descending" : "ascending");
         const value = (row) => { const cell = row.cells[column]; return cell.dataset.v === undefined ? cellText(cell) : Number(cell.dataset.v); };
-        const keyed = [...bodyOf.rows].map((row) => [value(row), row]);
+        const keyed = list.rows.map((row) => [value(row), row]);
         const last = (v) => typeof v === "number" && Number.isNaN(v);
         keyed.sort(([a], [b]) => {
           if (last(a) || last(b)) return last(a) - last(b);
-          return sign * (typeof a === "number" && typeof b === "number" ? a - b : String(a).localeCompare(String(b), undefined, { numeric: true }));
+          return sign * (typeof a === "number" && typeof b === "number" ? a - b : numeric.compare(a, b));
         });
-        bodyOf.append(...keyed.map(([, row]) => row));
-        drawForest();
+        list.rows = keyed.map(([, row]) => row);
+        select();
       });
     });
-    const filter = () => {
+    let texts = null;
+    const select = () => {
       const wanted = find("#filter").value.trim().toLowerCase(), warned = find("#only-warned").checked;
-      let count = 0;
-      for (const row of bodyOf.rows) {
-        row.hidden = !(cellText(row).toLowerCase().includes(wanted) && (!warned || Number(row.lastElementChild.dataset.v) > 0));
-        count += !row.hidden;
-      }
-      find("#shown").textContent = count === bodyOf.rows.length ? `${count} clusters` : `${count} of ${bodyOf.rows.length} clusters`;
+      texts ??= new Map(list.rows.map((row) => [row, cellText(row).toLowerCase()]));
+      list.visible = list.rows.filter((row) => texts.get(row).includes(wanted) && (!warned || Number(row.lastElementChild.dataset.v) > 0));
+      const count = list.visible.length;
+      find("#shown").textContent = count === list.rows.length ? `${count} clusters` : `${count} of ${list.rows.length} clusters`;
+      list.frame.scrollTop = 0;
+      place();
       clearTimeout(table.waiting);
       table.waiting = setTimeout(drawForest, 250);
     };
-    find("#filter").addEventListener("input", filter);
-    find("#only-warned").addEventListener("change", filter);
-    filter();
-    bodyOf.addEventListener("click", (event) => {
+    find("#filter").addEventListener("input", select);
+    find("#only-warned").addEventListener("change", select);
+    Object.assign(list, { table, frame: table.parentElement, rows: [...table.tBodies[0].rows] });
+    list.rowOf = new Map(list.rows.map((row) => [row.dataset.cluster, row]));
+    table.setAttribute("aria-rowcount", list.rows.length + 1);
+    measure();
+    select();
+    list.frame.addEventListener("scroll", place, { passive: true });
+    window.addEventListener("resize", () => { measure(); place(); });
+    window.addEventListener("beforeprint", () => place("all"));
+    window.addEventListener("afterprint", place);
+    table.tBodies[0].addEventListener("click", (event) => {
       const row = event.target.closest("tr");
       if (!row || event.target.closest("a")) return;
       location.hash = `#cluster-${row.dataset.cluster}`;
     });
   };
+  let overview = null;
   const drawForest = async () => {
     if (!find("#forest")) return;
-    const overview = await unpack(find("#overview").textContent);
+    overview ??= await unpack(find("#overview").textContent);
     const names = visibleOrder(), at = new Map(overview.keys.map((key, k) => [String(key), k]));
     const rows = names.map((name) => at.get(name)).filter((k) => k !== undefined);
     const Plotly = await plotly();
     for (const [kind, title] of [["turn", "D<sub>R</sub> (rad²/s)"], ["shift", "D<sub>T</sub> (µm²/s)"]]) {
       const c = (name) => rows.map((k) => overview.column[`${kind}_${name}`][k]);
-      const value = c("value"), kept = value.map((_, k) => k).filter((k) => !Number.isNaN(value[k]));
-      const y = kept.map((k) => k), many = rows.length > 60;
+      const value = c("value"), low95 = c("low95"), high95 = c("high95"), low68 = c("low68"), high68 = c("high68"), kept = value.map((_, k) => k).filter((k) => !Number.isNaN(value[k]));
+      const many = rows.length > 60;
       const bars = (low, high) => {
         const x = [], line = [];
         for (const k of kept) { x.push(low[k], Number.isFinite(high[k]) ? high[k] : low[k], null); line.push(k, k, null); }
         return { x, y: line };
       };
-      const traces = [
-        { ...bars(c("low95"), c("high95")), mode: "lines", line: { width: many ? 0.7 : 1.2, color: many ? faint("soft", 0.7) : color("blue") }, hoverinfo: "skip", name: "95 %" },
-        { ...bars(c("low68"), c("high68")), mode: "lines", line: { width: many ? 1.6 : 4, color: color("blue") }, hoverinfo: "skip", name: "68 %" },
-        { x: kept.map((k) => value[k]), y, mode: "markers", marker: { size: many ? 3 : 6, color: color("ink") }, name: "value",
-          text: kept.map((k) => literal(overview.names[rows[k]])), customdata: kept.map((k) => names[k]), hovertemplate: "%{text}: %{x:.4g}<extra></extra>" },
-      ];
-      const pooled = overview.pooled[kind], shapes = pooled ? [
+      const pooled = overview.pooled[kind], shapes = [];
+      const named = { text: kept.map((k) => literal(overview.names[rows[k]])), customdata: kept.map((k) => names[k]), hovertemplate: "%{text}: %{x:.4g}<extra></extra>" };
+      const traces = [{ x: kept.map((k) => value[k]), y: kept, mode: many ? "none" : "markers", marker: { size: 6, color: color("ink") }, name: "value", ...named }];
+      if (many) {
+        // A trace has an element for every bar and every marker, a shape has one for all of them.
+        const ends = (low, high) => kept.map((k) => `M${low[k]},${k}L${Number.isFinite(high[k]) ? high[k] : low[k]},${k}`).join("");
+        const known = (path) => (path.includes("NaN") ? path.replace(/M[^M]*NaN[^M]*/g, "") : path);
+        const stroke = (path, width, ink) => shapes.push({ type: "path", path: known(path), line: { width, color: ink } });
+        if (kept.length) {
+          stroke(ends(low95, high95), 0.7, faint("soft", 0.7));
+          stroke(ends(low68, high68), 1.6, color("blue"));
+          stroke(kept.map((k) => `M${value[k]},${k - 0.4}L${value[k]},${k + 0.4}`).join(""), 3, color("ink"));
+        }
+      } else traces.unshift({ ...bars(low95, high95), mode: "lines", line: { width: 1.2, color: color("blue") }, hoverinfo: "skip", name: "95 %" },
+        { ...bars(low68, high68), mode: "lines", line: { width: 4, color: color("blue") }, hoverinfo: "skip", name: "68 %" });
+      if (pooled) shapes.push(
         { type: "rect", xref: "x", yref: "paper", x0: pooled[1], x1: pooled[2], y0: 0, y1: 1, fillcolor: faint("red", 0.18), line: { width: 0 }, layer: "below" },
-        { type: "line", xref: "x", yref: "paper", x0: pooled[0], x1: pooled[0], y0: 0, y1: 1, line: { color: color("red"), width: 1.5 } }] : [];
+        { type: "line", xref: "x", yref: "paper", x0: pooled[0], x1: pooled[0], y0: 0, y1: 1, line: { color: color("red"), width: 1.5 } });
       const ticks = rows.length <= 40 ? { tickvals: rows.map((_, k) => k), ticktext: rows.map((k) => literal(overview.names[k].slice(0, 16))) } : { showticklabels: false };
-      const bounds = kept.flatMap((k) => [c("low95")[k], c("high95")[k]]).filter((v) => Number.isFinite(v) && v >= 0).sort((a, b) => a - b);
+      const bounds = kept.flatMap((k) => [low95[k], high95[k]]).filter((v) => Number.isFinite(v) && v >= 0).sort((a, b) => a - b);
       const far = kept.map((k) => value[k]).reduce((a, b) => Math.max(a, b), 0) * 3;
       const top = Math.min(bounds[bounds.length - 1] ?? 1, far || Infinity);
       const plot = find(`#plot-forest-${kind}`);
       plot.style.height = `${Math.min(Math.max(150, 64 + 15 * rows.length), 640)}px`;
       await Plotly.react(plot, traces, layout(title, "", { shapes, showlegend: false, hovermode: "closest", xaxis: { range: [(bounds[0] ?? 0) * 0.9, top * 1.05], nticks: 5 },
-        yaxis: { range: [rows.length - 0.4, -0.6], zeroline: false, showgrid: false, ...ticks } }), SETTINGS);
+        yaxis: { range: [rows.length - 0.4, -0.6], zeroline: false, showgrid: false, automargin: true, ...ticks } }), SETTINGS);
       if (!plot.dataset.linked) {
         plot.dataset.linked = "yes";
         plot.on("plotly_click", (event) => { const key = event.points.map((p) => p.customdata).find((k) => k !== undefined); if (key !== undefined) location.hash = `#cluster-${key}`; });
@@ -519,7 +588,7 @@
   const table = find("#clusters");
   if (table) {
     sortable(table);
-    find("button[data-table=clusters]").addEventListener("click", () => download("clusters.csv", csvOf(table)));
+    find("button[data-table=clusters]").addEventListener("click", () => download("clusters.csv", csvOf([...table.tHead.rows, ...list.visible, ...(table.tFoot?.rows ?? [])])));
   }
   if (!order.length) return;
   choices();
@@ -536,14 +605,14 @@
     else return;
     event.preventDefault();
   });
-  window.addEventListener("hashchange", async () => {
+  window.addEventListener("hashchange", () => {
     const key = fromHash();
     if (key === null) return;
-    if (key !== shown) await show(key);
-    find("#one").scrollIntoView();
+    find("#one").scrollIntoView();  // first, so that the figures are drawn that will be seen
+    if (key !== shown) show(key);
   });
   const resized = () => { for (const plot of all(".js-plotly-plot")) window.Plotly.Plots.resize(plot); };
-  window.addEventListener("beforeprint", resized);
+  window.addEventListener("beforeprint", () => { for (const id of [...waiting.keys()]) drawWaiting(id); resized(); });
   window.addEventListener("afterprint", resized);
   const redraw = () => { drawAll(); drawForest(); };
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", redraw);
