@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 
 import perrin
+from perrin.run.grouping import assign_clusters, stretch_warnings
 from perrin.tracks.bonds import rigid_groups
 from perrin.tracks.clusters import find_clusters
 
@@ -211,3 +214,20 @@ def test_tables_without_pairs_have_no_bodies():
     x, _ = bodies(1, seed=2)
     doubled = np.concatenate([x, np.full((100, 2, 3), 50.0)], axis=1)
     assert found_in(doubled)[:4].tolist() == [0] * 4
+
+
+def test_bodies_that_another_scale_of_z_makes_loose_are_named():
+    """A table with z in planes names the factor; free particles and bodies with their z do not."""
+    x, free = bodies(2, seed=4)[0], bodies(0, loose=8)[0]
+    tables = [
+        perrin.positions_table(y).drop(columns="cluster") for y in (x / [1.0, 1.0, 2.2], x, free)
+    ]
+    (text,) = stretch_warnings(tables[0])
+    factor, pairs = re.search(r"multiplied by ([\d.]+) the distances of (\d+)", text).groups()
+    assert float(factor) == pytest.approx(2.2, rel=0.03)
+    assert 6 <= int(pairs) <= 12
+    assert stretch_warnings(tables[1]) == stretch_warnings(tables[2]) == []
+    assert text in assign_clusters(tables[0])[2].warnings
+    narrow = perrin.positions_table(x / [1.0, 1.0, 0.4]).drop(columns="cluster")
+    with pytest.raises(perrin.TrackTableError, match=r"no cluster: .*with z multiplied by 0\.[34]"):
+        assign_clusters(narrow)

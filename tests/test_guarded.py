@@ -131,6 +131,7 @@ SMALL = {256: 4, 257: 4, 258: 8, 259: 1, 262: 1, 273: 8, 277: 1, 279: 16}
 
 def test_directories_that_loop_are_refused(tmp_path):
     """A chain that returns to an earlier image has no end."""
+    pytest.importorskip("tifffile")
     for loop in ([0], [1, 0], [1, 2, 1]):
         path = tiff_file(tmp_path / "a.tif", *((SMALL, following) for following in loop))
         with pytest.raises(
@@ -189,6 +190,7 @@ def test_whole_and_cut_files_pass(tmp_path):
 
 def test_packed_tables_larger_than_they_warrant_are_refused(tmp_path, monkeypatch):
     """Zip, gzip and Parquet: a small file cannot take all memory."""
+    pytest.importorskip("python_calamine")
     monkeypatch.setattr("perrin.tracks.file_limits._ALWAYS", 2**20)
     (tmp_path / "t.csv.gz").write_bytes(gzip.compress(b"frame,particle,x,y\n" + b"0" * 2**22))
     column = pd.DataFrame({"frame": np.zeros(10**6, int), "particle": 0, "x": 0.0, "y": 0.0})

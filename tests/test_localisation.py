@@ -85,7 +85,8 @@ def test_arguments_are_refused_at_their_limits():
     for percentile in (-1.0, 100.0):
         assert faults_of(Search(1.0, 1.0, percentile=percentile)).startswith("percentile: ")
     assert faults_of(Search(0.0, 1.0)).startswith("diameter: ")
-    assert faults_of(Search(1.0, -1.0)).startswith("contact: ")
+    for contact in (-1.0, 0.0):
+        assert faults_of(Search(1.0, contact)).startswith("contact: ")
     assert faults_of(refine="disc").startswith("refine: ")
     for refine in ("trackpy", None):
         assert faults_of(refine=refine) == ""
@@ -348,6 +349,11 @@ def test_an_image_that_is_no_sphere_is_named_and_left_out_of_the_others():
     found, _ = group_columns(frame, spots, SEARCH, OPTICS, VOXEL, usual=usual)
     assert found["reason"].tolist()[1] == NO_SPHERE
     assert not found["refined"][1]
+    alone = drawn(places[1:], [300.0])
+    found, _ = group_columns(
+        alone, Features(places[1:], np.ones(1)), SEARCH, OPTICS, VOXEL, usual=usual
+    )
+    assert found["reason"].tolist() == [NO_SPHERE]
     both, _ = group_columns(
         frame, spots, SEARCH, OPTICS, VOXEL, usual=usual, light=np.array([1.0, 3.0])
     )

@@ -165,7 +165,8 @@ def test_a_D_of_each_motion_has_its_own_interval():
 
 
 @pytest.mark.parametrize(
-    ("n_frames", "seed", "still"), [(5, 94, True), (6, 77, True), (8, 151, True), (6, 132, False)]
+    ("n_frames", "seed", "still"),
+    [(5, 18, True), (5, 242, True), (5, 491, True), (5, 338, False), (6, 132, False)],
 )
 def test_the_highest_of_several_maxima_counts(n_frames, seed, still):
     """Short tracks whose profile falls from D = 0 and has a maximum elsewhere, lower or higher."""
@@ -177,7 +178,7 @@ def test_the_highest_of_several_maxima_counts(n_frames, seed, still):
     assert inside.sum() == 1
     best = likelihood.best()
     assert (best.D[0] == 0) == still
-    assert best.value[0] >= value.max()
+    assert best.value[0] >= value.max() - 1e-9
 
 
 @pytest.mark.parametrize("name", POOLS)
@@ -196,17 +197,33 @@ def test_the_slope_at_the_maximum_is_zero(name):
             assert fall == pytest.approx(drop, rel=1e-6) or (end == 0 and fall < drop)
 
 
+def test_another_unit_of_length_changes_D_and_its_interval_by_its_square():
+    """Also where D is far above 1."""
+    one = track("joint")
+    other = replace(
+        one, steps=replace(one.steps, vectors=1e3 * one.steps.vectors, sigma=1e3 * SIGMA)
+    )
+    found = []
+    for steps in (one, other):
+        likelihood = Likelihood.of([steps])
+        best = likelihood.best()
+        low, high = likelihood.intervals(best, np.array([[1.0], [3.84]]))
+        found.append(np.concatenate([best.D, best.theta, low[:, 0], high[:, 0]]))
+    np.testing.assert_allclose(found[1], 1e6 * found[0], rtol=1e-6)
+
+
 def test_a_maximum_and_its_interval_take_few_evaluations(monkeypatch):
-    """Of 30 tracks with noise from far below the steps to far above: at most 30 on average.
+    """Of 15 tracks with noise from far below the steps to far above, free or known: 30 on average.
 
     Slower steps of the search would find the same maxima.
     """
     calls = []
     sums = Likelihood.sums
     monkeypatch.setattr(Likelihood, "sums", lambda *a, **k: calls.append(1) or sums(*a, **k))
-    for k, noise in enumerate(np.geomspace(1e-5, 0.1, 30)):
-        likelihood = Likelihood.of([track("joint", seed=k, noise=noise)])
-        likelihood.intervals(likelihood.best(), np.array([[1.0], [3.84]]))
+    for k, noise in enumerate(np.geomspace(1e-5, 0.1, 15)):
+        for mode in ("joint", "known"):
+            likelihood = Likelihood.of([track(mode, seed=k, noise=noise)])
+            likelihood.intervals(likelihood.best(), np.array([[1.0], [3.84]]))
     assert len(calls) < 30 * 30
 
 
@@ -267,7 +284,7 @@ def scatter_by_definition(one, D, theta):
     for a in range(axes):
         for b in range(axes):
             power = m[:, a] * m[:, b] - (a == b) * rows[1] * (noise[a] - noise.mean())
-            deviation[:, a, b] = np.linalg.lstsq((rows / eigen).T, power / eigen)[0]
+            deviation[:, a, b] = np.linalg.lstsq((rows / eigen).T, power / eigen, rcond=None)[0]
     deviation -= np.trace(deviation, axis1=1, axis2=2)[:, None, None] / axes * np.eye(axes)
     by_theta = 2 * c * (weight.mean() if np.isfinite(one.freedom) else 0.0)
     prior = one.freedom / axes / theta**2 if np.isfinite(one.freedom) and theta > 0 else 0.0

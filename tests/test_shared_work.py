@@ -101,6 +101,7 @@ def test_a_worker_that_imports_its_script_starts_no_workers(monkeypatch):
 
 @pytest.mark.parametrize("guarded", [True, False])
 def test_workers_of_a_script_without_guard_are_explained(tmp_path, monkeypatch, guarded):
+    pytest.importorskip("distributed")
     script = tmp_path / "mine.py"
     script.write_text('if __name__ == "__main__": main()' if guarded else "main()")
 

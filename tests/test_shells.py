@@ -80,6 +80,7 @@ class Tetrahedron:
 
 def test_touching_shells_are_found_at_their_centres(repeats):
     """All of them and no contact, within four stated errors; with --long the optics are learned."""
+    pytest.importorskip("trackpy")
     movie, known = Tetrahedron(), perrin.Optics(DIAMETER, PSF, CameraNoise(GAIN, 1.0), shell=True)
     optics = repeats(known, None)
     table = perrin.locate(movie, diameter=DIAMETER, contact=DIAMETER, optics=optics)

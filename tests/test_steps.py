@@ -185,7 +185,7 @@ def test_principal_steps_have_a_diagonal_tensor_in_ascending_order():
     trace = np.trace(covariance, axis1=1, axis2=2)
     found = np.trace(steps.noise[0], axis1=1, axis2=2)
     np.testing.assert_allclose(np.delete(found, 3), np.delete(trace, 3))
-    axes = np.linalg.lstsq(PLANTED, steps.vectors)[0]
+    axes = np.linalg.lstsq(PLANTED, steps.vectors, rcond=None)[0]
     np.testing.assert_allclose(
         np.delete(steps.noise[0], 3, axis=0),
         [np.diag(np.diag(axes.T @ c @ axes)) for c in np.delete(covariance, 3, axis=0)],
@@ -212,7 +212,7 @@ def test_noise_that_does_not_turn_with_the_body_is_the_same_in_all_frames(frame)
             w = about[STOP] - about[START]
         own = PIECE[START] == piece
         # The axes follow from all steps, those of both pieces.
-        axes = np.linalg.lstsq(w[own], steps.vectors[own])[0]
+        axes = np.linalg.lstsq(w[own], steps.vectors[own], rcond=None)[0]
         np.testing.assert_allclose(w[own] @ axes, steps.vectors[own], atol=1e-9)
         expected = np.diag(np.diag(axes.T @ turn.T @ noise @ turn @ axes))
         np.testing.assert_allclose(steps.noise[0, rows], [expected] * len(rows), rtol=1e-7)

@@ -68,7 +68,8 @@ def enumerated(steps, point):
         C = np.eye(len(y)) * (blurred + before[:, a] + after[:, a])[:, None]
         C[:, linked, linked + 1] = b * D[paths[:, linked]] - after[linked, a]
         C[:, linked + 1, linked] = C[:, linked, linked + 1]
-        logs -= 0.5 * (np.linalg.slogdet(C)[1] + np.linalg.solve(C, y[:, None])[..., 0] @ y)
+        columns = np.broadcast_to(y[:, None], (len(C), len(y), 1))
+        logs -= 0.5 * (np.linalg.slogdet(C)[1] + np.linalg.solve(C, columns)[..., 0] @ y)
     weight = np.exp(logs - logs.max())
     return logs.max() + np.log(weight.sum()), weight @ paths / weight.sum()
 

@@ -200,11 +200,45 @@ def test_planted_motions_get_their_names(verdicts, kind):
     assert (verdict.model is None) == (kind == "diffusion")
 
 
+NUMBER = r"[\d.]+"
+TEXTS = {
+    "diffusion": rf"^The rotation is consistent with diffusion \(p = {NUMBER} over 8 tests\); this "
+    rf"track could have shown an exponent below {NUMBER} or above {NUMBER}, a cage under {NUMBER} "
+    rf"rad, or a spin over {NUMBER} rad/s\.$",
+    "subdiffusion": rf"^The rotation is subdiffusive: .* \(p = {NUMBER} for diffusion with a",
+    "superdiffusion": r"^The rotation is superdiffusive: ",
+    "confined": r"^The rotation is confined: ",
+    "spin": rf"^The body turns steadily at {NUMBER}\(\d+\) rad/s while it diffuses \(p ",
+    "changing D": r"^The diffusion coefficient of the rotation changes in time",
+}
+
+
+@pytest.mark.parametrize("kind", TEXTS)
+def test_a_verdict_is_a_sentence_with_numbers_and_units(verdicts, kind):
+    assert re.match(TEXTS[kind], verdicts[kind].text)
+
+
 def test_a_drift_is_named_with_its_velocity(brownian):
     flow = replace(brownian, center=brownian.center + brownian.time[:, None] * [0.1, 0.0, 0.0])
     verdict = judge_motion(flow, quantity="translation")
     assert verdict.kind == "drift"
+    assert re.match(
+        r"The body moves steadily at 0\.\d+\(\d+\) um/s while it diffuses", verdict.text
+    )
+    still = judge_motion(brownian, quantity="translation")
+    assert re.search(r"a cage under [\d.]+ um, or a drift over [\d.]+ um/s\.$", still.text)
     assert verdict.model.drift[0][0] == pytest.approx(0.1, abs=4 * verdict.model.drift_stderr[0][0])
+
+
+def test_drifts_of_several_bodies_are_named_with_their_range(brownian):
+    flow = replace(brownian, center=brownian.center + brownian.time[:, None] * [0.1, 0.0, 0.0])
+    faster = replace(flow, center=flow.center + brownian.time[:, None] * [0.2, 0.0, 0.0])
+    both = judge_motion([flow, faster], quantity="translation")
+    assert re.match(
+        r"The bodies move steadily, at 0\.095\(13\) to 0\.295\(13\) um/s, while they diffuse",
+        both.text,
+    )
+    assert both.text.endswith("Singly: 2 drift.")
 
 
 def test_jumps_are_named_with_their_rows(brownian):
@@ -234,6 +268,35 @@ def test_noise_that_grows_is_not_called_a_changing_diffusion():
     assert verdict.p_family < 0.05
     assert verdict.kind == "diffusion"
     assert "noise" in verdict.text
+
+
+@pytest.mark.parametrize("growing", ["D", "noise"])
+def test_without_residuals_the_larger_score_tells_noise_from_D(brownian, growing):
+    rng = np.random.default_rng(5)
+    size = np.linspace(0.4, 1.6, 301)[:, None]
+    D, noise = (size if growing == name else np.ones((301, 1)) for name in ("D", "noise"))
+    walk = np.cumsum(0.1 * D * rng.normal(size=(301, 3)), axis=0)
+    center = walk + 0.1 * noise * rng.normal(size=(301, 3))
+    motion = replace(brownian, center=center, residual=np.full(301, 0.03))
+    verdict = judge_motion(motion, quantity="translation")
+    assert verdict.p_family < 0.05
+    assert verdict.kind == ("changing D" if growing == "D" else "diffusion")
+
+
+@pytest.mark.parametrize(
+    ("errors", "kind"), [(3.2, "diffusion"), (-3.2, "diffusion"), (2.8, "changing D")]
+)
+def test_residuals_that_change_beyond_three_errors_tell_noise_from_D(brownian, errors, kind):
+    rng, direction = np.random.default_rng(6), 1 if errors > 0 else -1
+    size = np.linspace(0.4, 1.6, 301)[::direction, None]
+    center = np.cumsum(0.1 * size * rng.normal(size=(301, 3)), axis=0)
+    center += 0.1 * rng.normal(size=(301, 3))
+    # The squares are correlated with time by this number of errors, 1/sqrt(301) each.
+    t, share = np.linspace(-1, 1, 301), errors / np.sqrt(301)
+    other = np.sqrt(1 - share**2) * np.where(np.arange(301) % 2, 1, -1)
+    square = 1 + 0.05 * (share * t / t.std() + other)
+    motion = replace(brownian, center=center, residual=0.03 * np.sqrt(square))
+    assert judge_motion(motion, quantity="translation").kind == kind
 
 
 def test_several_motions_show_what_one_cannot():

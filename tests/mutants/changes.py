@@ -50,9 +50,6 @@ class Change:
     before: str
     after: str
 
-    def __str__(self) -> str:
-        return f"{self.where}, line {self.line}: {self.before}  ->  {self.after}"
-
 
 def _replaced_operators(node: ast.Compare) -> list[ast.AST]:
     """Return a comparison with one of its operators replaced."""

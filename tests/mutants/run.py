@@ -6,7 +6,8 @@ one fails, and lists the changes with which all of them pass. A change whose tes
 as long as without it counts as noticed. The program is not started anew for every change, as by
 cosmic-ray, which takes most of the time.
 
-The status is 1 where a target has 10 % or more such survivors.
+Survivors that cannot change a result, or change only speed, are in explained.toml with the reason.
+The status is 1 where a target has 10 % or more survivors that are not explained there.
 """
 
 from __future__ import annotations
@@ -92,23 +93,34 @@ def passes(module: str, tree: ast.Module, tests: list[str], *, limit: float) -> 
     return status == 0, time.monotonic() - start
 
 
+def explained_changes() -> set[str]:
+    """Return the texts of all changes in explained.toml, with their modules."""
+    reasons = tomllib.loads((HERE / "explained.toml").read_text(encoding="utf-8"))["explained"]
+    return {f"{one['module']}: {change}" for one in reasons for change in one["changes"]}
+
+
 def survivors_of(module: str, tests: list[str], *, count: int, seed: int, verbose: bool):
-    """Return the number of changes of a module that were tried, and those that no test notices."""
+    """Return how many changes of a module were tried, are not noticed, and are not explained."""
     source = (ROOT / "src" / "perrin" / module).read_text(encoding="utf-8")
     fine, usual = passes(module, ast.parse(source), tests, limit=3600)
     if not fine:
         raise SystemExit(f"{module}: its tests fail without a change; nothing can be measured")
     print(f"{module}: the tests take {usual:.0f} s", flush=True)
     chosen = sample(source, count, seed=seed)
-    found = []
+    explained, lines = explained_changes(), source.splitlines()
+    surviving = unexplained = 0
     for number, change in enumerate(chosen, 1):
         survives, took = passes(module, changed(source, change), tests, limit=3 * usual + 10)
-        if survives:
-            found.append(change)
+        text = (
+            f"{change.where} | {lines[change.line - 1].strip()} | {change.before} -> {change.after}"
+        )
+        known = survives and f"{module}: {text}" in explained
+        surviving += survives
+        unexplained += survives and not known
         if survives or verbose:
-            word = "survives" if survives else "noticed"
-            print(f"  {number}/{len(chosen)} {word} ({took:.0f} s) {change}", flush=True)
-    return len(chosen), found
+            word = "is explained" if known else "survives" if survives else "is noticed"
+            print(f"  {number}/{len(chosen)} {word} ({took:.0f} s) {text}", flush=True)
+    return len(chosen), surviving, unexplained
 
 
 def main() -> int:
@@ -137,17 +149,19 @@ def measure(targets: dict[str, dict[str, list[str]]], options: argparse.Namespac
     lines, too_many = [], False
     for name in options.only.split(","):
         target = targets[name]
-        tried, found = 0, []
+        counts = [0, 0, 0]
         for module in target["modules"]:
             tests = [f"src/perrin/{module}", *(f"tests/{test}" for test in target["tests"])]
             share = -(-options.count // len(target["modules"]))
-            more, surviving = survivors_of(
+            of_module = survivors_of(
                 module, tests, count=share, seed=options.seed, verbose=options.verbose
             )
-            tried, found = tried + more, found + surviving
-        too_many |= len(found) >= _LIMIT * tried
-        lines.append(f"| {name} | {tried} | {len(found)} | {len(found) / tried:.1%} |")
-    print("\n| target | changes | survive | share |\n|---|---|---|---|", *lines, sep="\n")
+            counts = [a + b for a, b in zip(counts, of_module, strict=True)]
+        tried, surviving, rest = counts
+        too_many |= rest >= _LIMIT * tried
+        lines.append(f"| {name} | {tried} | {surviving} | {rest} | {rest / tried:.1%} |")
+    head = "\n| target | changes | survive | not explained | share |\n|---|---|---|---|---|"
+    print(head, *lines, sep="\n")
     return int(too_many)
 
 

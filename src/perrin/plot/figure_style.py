@@ -338,7 +338,8 @@ def legend_above(ax: Axes, *, ncols: int) -> None:
     ncols : int
         Number of columns of the legend, at most 2 in a figure of one column.
     """
-    narrow = ax.figure is not None and ax.figure.get_figure(root=True).get_figwidth() < _NARROW
+    # The canvas is that of the whole figure, also for axes in a part of it.
+    narrow = ax.figure is not None and ax.figure.canvas.figure.get_figwidth() < _NARROW
     ax.legend(
         loc="lower left",
         bbox_to_anchor=(0, 1),

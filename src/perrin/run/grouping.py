@@ -13,7 +13,9 @@ from perrin.run.remarks import (
     grouping_note,
     loose_particles_note,
     no_cluster_text,
+    stretched_pairs_warning,
 )
+from perrin.tracks.bonds import stretch_of_pairs
 from perrin.tracks.clusters import find_clusters
 
 if TYPE_CHECKING:
@@ -23,6 +25,9 @@ if TYPE_CHECKING:
 # With at most this number of particles in fewer than this number of frames, all particles of a
 # table without a cluster column may be one body: distances in that few frames do not show it.
 _PARTICLES_OF_ONE_BODY, _FRAMES_FOR_DISTANCES = 20, 8
+
+# Particles whose distances are compared with those of another scale of z: 2016 pairs.
+_PARTICLES_PAIRED = 64
 
 
 def assign_clusters(
@@ -88,8 +93,35 @@ def assign_clusters(
                 grouping_note(table["cluster"].to_numpy(dtype=np.int64), particles=count)
             )
     loose = table["cluster"] == -1
+    stretched: list[str] = []
+    if not marked and contact is None and 2 * loose.sum() >= len(table):
+        stretched = stretch_warnings(table)
     if loose.all():
-        raise TrackTableError(no_cluster_text(contact, marked=marked))
+        raise TrackTableError("; ".join([no_cluster_text(contact, marked=marked), *stretched]))
+    remarks.warnings.extend(stretched)
     if loose.any():
         remarks.notes.append(loose_particles_note(table.loc[loose, "particle"].nunique()))
     return table, labels, remarks
+
+
+def stretch_warnings(table: pd.DataFrame) -> list[str]:
+    """Warn where particles keep their distances with another scale of z.
+
+    Parameters
+    ----------
+    table : pandas.DataFrame
+        Columns frame, particle, x, y[, z]; the first 64 particles are compared.
+
+    Examples
+    --------
+    >>> import pandas as pd
+    >>> stretch_warnings(pd.DataFrame({"frame": [0], "particle": [0], "x": [0.0], "y": [0.0]}))
+    []
+    """
+    if "z" not in table:
+        return []
+    some = table[table["particle"].isin(table["particle"].unique()[:_PARTICLES_PAIRED])]
+    wide = some.pivot_table(index="frame", columns="particle", values=["x", "y", "z"])
+    x = wide.to_numpy(dtype=np.float64).reshape(len(wide), 3, -1).transpose(0, 2, 1)
+    factor, pairs = stretch_of_pairs(x)
+    return [stretched_pairs_warning(factor, pairs)] if pairs else []

@@ -278,6 +278,20 @@ def loose_particles_note(count: int) -> str:
     return f"{counted(count, 'particle', 'belong')} to no cluster: left out"
 
 
+def stretched_pairs_warning(factor: float, pairs: int) -> str:
+    """State that distances stay the same with another scale of z.
+
+    Examples
+    --------
+    >>> stretched_pairs_warning(2.17, 15)[:66]
+    'z scale: with z multiplied by 2.17 the distances of 15 pairs of pa'
+    """
+    return (
+        f"z scale: with z multiplied by {factor:.3g} the distances of {pairs} pairs of particles "
+        "stay the same, which most are not now: state the scale as three numbers, for x, y and z"
+    )
+
+
 def no_cluster_text(contact: float | None, *, marked: bool) -> str:
     """Return the error of a table without any cluster, with what to do.
 

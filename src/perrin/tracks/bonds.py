@@ -55,6 +55,10 @@ _LOOSE_RATIO, _TURNING_SHARE = 6.0, 0.7
 # equal errors stay equal.
 _WORST_AXIS_RATIO, _AXIS_STEPS, _AXIS_PRICE = 5.0, 12, 0.25
 
+# A distance that is constant but for the scale of z: its squares along z and across it are
+# anticorrelated more than this. The scale counts where the ratios of three pairs agree within 5 %.
+_FEWEST_STRETCHED, _STRETCHED, _EQUAL_STRETCH, _LEAST_STRETCH = 3, -0.9, 0.05, 0.1
+
 
 class Pairs(NamedTuple):
     """Variances of the separations of pairs of particles, one entry per pair.
@@ -490,3 +494,51 @@ def are_one_body(
     freedom = [float(np.sum(pairs.blocks[k] - 1)) for k in (across, inside)]
     limit = _MOST_EXCESS**2 * float(fdtri(*freedom, 1 - _SLOW_TEST_LEVEL))
     return slow[0] <= limit * slow[1] + 1e-300
+
+
+def stretch_of_pairs(x: Floats) -> tuple[float, int]:
+    """Return the factor of z with which distances of neighbours stay the same, and their number.
+
+    Where dx^2 + dy^2 + s^2 dz^2 is constant while the pair turns, its first two terms and dz^2 lie
+    on a line with the slope -s^2.
+
+    Parameters
+    ----------
+    x : ndarray, shape (T, n, 3)
+        Positions, NaN where a particle is missing.
+
+    Returns
+    -------
+    factor : float
+        1 where fewer than three pairs agree on another one.
+    pairs : int
+        Number of these pairs.
+
+    Examples
+    --------
+    >>> from perrin import Cluster, simulate_motion
+    >>> turning = simulate_motion(Cluster.tetrahedron(1.5), D_R=0.02, dt=1.0, n_frames=200, rng=1)
+    >>> factor, pairs = stretch_of_pairs(turning.positions() / [1.0, 1.0, 2.0])
+    >>> round(factor, 3), pairs
+    (2.0, 6)
+    """
+    first, second = np.triu_indices(x.shape[1], 1)
+    square = (x[:, first] - x[:, second]) ** 2
+    across, along = square[..., :2].sum(axis=-1), square[..., 2]
+    known = np.isfinite(across)
+    shared = np.maximum(known.sum(axis=0), 1)
+    mean_across, mean_along = (np.where(known, v, 0).sum(axis=0) / shared for v in (across, along))
+    a = np.where(known, across - mean_across, 0)
+    b = np.where(known, along - mean_along, 0)
+    spread_a, spread_b, both = (a * a).sum(axis=0), (b * b).sum(axis=0), (a * b).sum(axis=0)
+    moving = (shared >= _BLOCK_FRAMES * _MOST_BLOCKS) & (spread_a > 0) & (spread_b > 0)
+    correlation = both[moving] / np.sqrt(spread_a[moving] * spread_b[moving])
+    factor = np.sqrt(np.maximum(-both[moving] / spread_b[moving], 0))
+    factor = factor[correlation < _STRETCHED]
+    if len(factor) < _FEWEST_STRETCHED:
+        return 1.0, 0
+    middle = float(np.median(factor))
+    agree = np.abs(factor / middle - 1) < _EQUAL_STRETCH
+    if agree.sum() < max(_FEWEST_STRETCHED, len(factor) / 2) or abs(middle - 1) < _LEAST_STRETCH:
+        return 1.0, 0
+    return middle, int(agree.sum())
