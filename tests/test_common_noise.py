@@ -157,10 +157,10 @@ def test_correlations_of_neighbours_are_found_and_stated(repeats):
 
 
 def test_learned_optics_have_the_flicker_of_the_movie():
-    """Four frames with lines that differ by 20 %: the flicker, and the gain without it."""
+    """Three frames with lines that differ by 20 %: the flicker, and the gain without it."""
     rng = np.random.default_rng(9)
     samples = [
-        GroupSample(recorded(rng, line=0.2), CENTER.copy(), np.empty((0, 3))) for _ in range(4)
+        GroupSample(recorded(rng, line=0.2), CENTER.copy(), np.empty((0, 3))) for _ in range(3)
     ]
     noise = fit_samples(samples, diameter=1.6, voxel=VOXEL).optics.noise
     assert noise.line == pytest.approx(0.2, rel=0.15)

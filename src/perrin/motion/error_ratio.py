@@ -138,8 +138,17 @@ def error_ratio(bodies: Iterable[tuple[RigidMotion, Floats, Floats]]) -> ErrorRa
         scores = np.einsum("tab,tb->ta", weighted, square - mix @ measured)
         measured = np.maximum(measured + inverse @ scores.sum(axis=0), _LEAST_ERROR_RATIO)
     stderr = np.sqrt(np.diag(inverse @ scores.T @ scores @ inverse.T))
-    shared, error = _drawn_together(measured, stderr)
-    off = shared - 1
+    # Axes are drawn to a common ratio: their logarithms scatter with the variance that is left of
+    # their weighted squares (DerSimonian and Laird 1986), so that unlike ones stay so.
+    logarithm, variance = np.log(measured), np.maximum((stderr / measured) ** 2, 1e-12)
+    weight = 1 / variance
+    excess = weight @ (logarithm - np.average(logarithm, weights=weight)) ** 2 - (len(weight) - 1)
+    between = max(float(excess / (weight.sum() - weight @ weight / weight.sum())), 0.0)
+    weight = 1 / (variance + between)
+    mean, own = np.average(logarithm, weights=weight), between * weight
+    drawn = np.exp(mean + own * (logarithm - mean))
+    error = drawn * np.sqrt(own * variance + (1 - own) ** 2 / weight.sum())
+    off = drawn - 1
     held = np.divide(error, off, out=np.full(len(off), np.inf), where=off != 0)
     # Errors that the spheres of a body have in common are stated and leave no residual.
     value = 1 + np.maximum(1 - held**2, 0.0) * np.maximum(off, 0.0)
@@ -164,27 +173,6 @@ def error_ratio(bodies: Iterable[tuple[RigidMotion, Floats, Floats]]) -> ErrorRa
     return ErrorRatio(
         value, measured, stderr, by_time, by_depth, float(time.mean()), float(depth.mean())
     )
-
-
-def _drawn_together(measured: Floats, stderr: Floats) -> tuple[Floats, Floats]:
-    """Return ratios of the axes, drawn to their common value by their errors, and their errors.
-
-    Logarithms that scatter between axes with the variance that is left of their weighted squares
-    (DerSimonian and Laird 1986), normal about a common mean. What is unlike in all axes (flicker
-    of planes) stays so; where they agree within their errors they are equal.
-    """
-    logarithm, variance = np.log(measured), (stderr / measured) ** 2
-    if not (variance > 0).all():
-        return measured, stderr
-    weight = 1 / variance
-    mean = np.average(logarithm, weights=weight)
-    excess = weight @ (logarithm - mean) ** 2 - (len(weight) - 1)
-    between = max(float(excess / (weight.sum() - weight @ weight / weight.sum())), 0.0)
-    weight = 1 / (variance + between)
-    mean = np.average(logarithm, weights=weight)
-    own = between * weight
-    drawn = np.exp(mean + own * (logarithm - mean))
-    return drawn, drawn * np.sqrt(own * variance + (1 - own) ** 2 / weight.sum())
 
 
 def with_error_ratio(motion: RigidMotion, ratio: Floats, stated: Floats) -> RigidMotion:

@@ -741,6 +741,26 @@ class _Settled(NamedTuple):
     information: Floats
     score: Floats
 
+    def with_neighbours(self) -> _Settled:
+        """Return the same with the correlation of the noise of neighbouring voxels, if any."""
+        if self.noise.correlated:
+            return self
+        neighbours, along_z = find_neighbours(
+            [
+                (fit.mask, fit.residual * np.sqrt(self.noise.weight(fit.expected)))
+                for fit in self.fits
+            ]
+        )
+        noise = self.noise._replace(neighbours=neighbours, along_z=along_z)
+        if along_z:
+            # Of smoothed noise, differences of neighbours show little but the rounding.
+            transfer = photon_transfer(
+                np.concatenate([fit.expected for fit in self.fits]),
+                np.concatenate([fit.residual**2 for fit in self.fits]),
+            )
+            noise = noise._replace(gain=transfer.gain, floor=transfer.floor)
+        return self._replace(noise=noise)
+
 
 def fit_samples(
     samples: Sequence[GroupSample | CrowdSample],
@@ -833,7 +853,7 @@ def fit_samples(
             found = _settled(kept, found.parameters, found.noise)
     elif found is not plain:
         found, left_out = _without_dust(found)
-    found = _with_neighbours(found)
+    found = found.with_neighbours()
     optics = found.parameters.optics(found.noise, found.information)
     return LearnedOptics(optics, replace(_usual_of(found), left_out=left_out))
 
@@ -985,24 +1005,6 @@ def _with_common_noise(plain: _Settled, *, camera_pattern: bool) -> _Settled:
         plane, line = find_flicker(windows)
         noise = noise._replace(plane=plane, line=line)
     return _settled(plain.samples, plain.parameters, noise) if noise.correlated else plain
-
-
-def _with_neighbours(found: _Settled) -> _Settled:
-    """Return the same with the correlation of the noise of neighbouring voxels, if there is any."""
-    if found.noise.correlated:
-        return found
-    neighbours, along_z = find_neighbours(
-        [(fit.mask, fit.residual * np.sqrt(found.noise.weight(fit.expected))) for fit in found.fits]
-    )
-    noise = found.noise._replace(neighbours=neighbours, along_z=along_z)
-    if along_z:
-        # Of smoothed noise, differences of neighbours show little but the rounding.
-        transfer = photon_transfer(
-            np.concatenate([fit.expected for fit in found.fits]),
-            np.concatenate([fit.residual**2 for fit in found.fits]),
-        )
-        noise = noise._replace(gain=transfer.gain, floor=transfer.floor)
-    return found._replace(noise=noise)
 
 
 def _with_spread(equal: _Settled) -> _Settled:

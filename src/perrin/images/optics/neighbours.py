@@ -117,7 +117,8 @@ def find_neighbours(
     >>> found, round(find_neighbours([(mask, pairs.ravel())])[0][0][1], 1)
     (((), ()), 0.5)
     """
-    fields = []
+    lags, square, count = _REACH + 1, 0.0, 0.0
+    products, pairs = np.zeros((2, lags, lags))
     for mask, residual in windows:
         box = np.full(mask.shape, np.nan)
         box[mask] = residual
@@ -126,28 +127,24 @@ def find_neighbours(
         quads = np.lib.stride_tricks.sliding_window_view(box, len(THIRD_DIFFERENCE), axis=0)
         difference = quads @ THIRD_DIFFERENCE
         there = np.isfinite(difference)
-        fields.append((np.where(there, difference, 0.0), there.astype(np.float64)))
-    square = sum(float(np.sum(field**2)) for field, _ in fields)
-    count = sum(float(there.sum()) for _, there in fields)
+        difference = np.where(there, difference, 0.0)
+        square, count = square + float(np.sum(difference**2)), count + float(there.sum())
+        size = (mask.shape[1] + _REACH, mask.shape[2] + _REACH)
+        for total, field in ((products, difference), (pairs, there)):
+            power = np.sum(np.abs(np.fft.rfft2(field, size)) ** 2, axis=0)
+            lagged = np.fft.irfft2(power, size)[:lags]
+            total += lagged[:, :lags]
+            total[:, 1:] += lagged[:, :-lags:-1]
     if not square > 0:
         return (), ()
-    error = np.sqrt(OVERLAP / count)
-
-    def correlation(i: int, j: int) -> float:
-        total = pairs = 0.0
-        for field, there in fields:
-            for k in {j, -j}:
-                total += _lagged_product(field, i, k)
-                pairs += _lagged_product(there, i, k)
-        found = total / pairs / (square / count) if pairs else 0.0
-        return float(found) if abs(found) > _LEAST_ERRORS * error else 0.0
-
-    if max(correlation(0, 1), correlation(1, 0)) < _LEAST_NEAREST:
+    found = products / np.maximum(pairs, 1.0) / (square / count)
+    found[np.abs(found) <= _LEAST_ERRORS * np.sqrt(OVERLAP / count)] = 0.0
+    found[0, 0] = 1.0
+    neighbours = tuple(tuple(row) for row in found.tolist())
+    increase = float(_both_signs(neighbours).sum()) - 1
+    if max(found[0, 1], found[1, 0]) < _LEAST_NEAREST or increase <= _LEAST_INCREASE:
         return (), ()
-    lags = range(_REACH + 1)
-    found = tuple(tuple(correlation(i, j) if i or j else 1.0 for j in lags) for i in lags)
-    increase = float(_both_signs(found).sum()) - 1
-    return (found, find_along_z(windows)) if increase > _LEAST_INCREASE else ((), ())
+    return neighbours, find_along_z(windows)
 
 
 def find_along_z(windows: Sequence[tuple[Bools, Floats]]) -> tuple[float, ...]:
@@ -240,11 +237,3 @@ def _both_signs(neighbours: tuple[tuple[float, ...], ...]) -> Floats:
     quarter = np.array(neighbours)
     half = np.concatenate([quarter[:0:-1], quarter])
     return np.concatenate([half[:, :0:-1], half], axis=1)
-
-
-def _lagged_product(field: Floats, i: int, j: int) -> float:
-    """Return the sum of the products of voxels i >= 0 rows and j columns apart."""
-    ny, nx = field.shape[1:]
-    first = field[:, : max(ny - i, 0), max(-j, 0) : nx - max(j, 0)]
-    second = field[:, i:, max(j, 0) : nx + min(j, 0)]
-    return float(np.sum(first * second))
