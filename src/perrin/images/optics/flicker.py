@@ -19,10 +19,10 @@ if TYPE_CHECKING:
 _LEAST_FLICKER_ERRORS, _LEAST_FLICKER = 5.0, 0.02
 
 # Distance from the middle of a line, in voxels, within which voxels are on none of its sides.
-_GAP = 2.0
+_GAP_OF_SIDES = 2.0
 
 # Information on the light of a line that is dark.
-_LEAST_POWER = 1e-9
+_LEAST_POWER_OF_SIDES = 1e-9
 
 _WEIGHTING_ROUNDS = 8  # of the weights
 
@@ -219,8 +219,8 @@ class LineChanges(NamedTuple):
         """
         away = lines.from_middle
         # Noise that neighbours have in common is not that of both sides.
-        sides = np.stack([away < -_GAP, away > _GAP]) * light * weight
-        power = np.maximum(lines.sums(sides * light), _LEAST_POWER)
+        sides = np.stack([away < -_GAP_OF_SIDES, away > _GAP_OF_SIDES]) * light * weight
+        power = np.maximum(lines.sums(sides * light), _LEAST_POWER_OF_SIDES)
         return cls(lines, lines.sums(sides * residual) / power, power)
 
     def differences(self, change: Floats, variance: Floats) -> Floats:
@@ -238,7 +238,7 @@ class LineChanges(NamedTuple):
         place = self.lines.place
         grid = np.full((2, 2, *(place.max(axis=1) + 1)), np.nan)
         grid[:, :, place[0], place[1]] = change, variance
-        return _differences(grid)
+        return _differences_of_sides(grid)
 
 
 def find_flicker(windows: Sequence[LineChanges]) -> tuple[float, float]:
@@ -284,7 +284,7 @@ def find_flicker(windows: Sequence[LineChanges]) -> tuple[float, float]:
         of_lines.append(window.differences(change - middle, own))
         planes = np.full((2, 2, int(lines.place[0].max()) + 1, 1), np.nan)
         planes[:, :, lines.place[0, lines.first_line], 0] = mean, 1 / total
-        of_planes.append(_differences(planes))
+        of_planes.append(_differences_of_sides(planes))
         shares.append(np.add.reduceat(np.prod(power / whole, axis=0), lines.first_line))
     share = float(np.mean(np.concatenate(shares)))
     line = _common_variance(np.concatenate(of_lines, axis=2)) / max(1 - share, 0.1)
@@ -319,7 +319,7 @@ def find_gain_spread(windows: Sequence[LineChanges]) -> float:
     return float(np.sqrt(_common_variance(np.concatenate(differences, axis=2))))
 
 
-def _differences(grid: Floats) -> Floats:
+def _differences_of_sides(grid: Floats) -> Floats:
     """Return third differences of values along the first axis of a grid, and their variances.
 
     Parameters

@@ -31,7 +31,7 @@ _LEAST_ERRORS, _LEAST_NEAREST, _LEAST_INCREASE = 5.0, 0.05, 0.2
 _LEAST_ALONG_Z = 0.3
 
 # Least variance of a spatial frequency over that of independent voxels.
-_LEAST_POWER = 0.05
+_LEAST_NEIGHBOUR_POWER = 0.05
 
 
 def neighbour_variance(
@@ -217,7 +217,7 @@ def neighbour_covariance(
     kernel = np.zeros(size)
     offset = np.arange(-reach, reach + 1)
     kernel[np.ix_(offset, offset)] = both
-    power = np.maximum(np.fft.rfft2(kernel).real, _LEAST_POWER)
+    power = np.maximum(np.fft.rfft2(kernel).real, _LEAST_NEIGHBOUR_POWER)
     # Frequencies that the real transform leaves out are the conjugates of others.
     power[:, 1 : (size[1] + 1) // 2] *= 2.0
     boxes = np.zeros((len(rows), *mask.shape))
