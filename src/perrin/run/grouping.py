@@ -120,7 +120,10 @@ def stretch_warnings(table: pd.DataFrame) -> list[str]:
     """
     if "z" not in table:
         return []
-    some = table[table["particle"].isin(table["particle"].unique()[:_PARTICLES_PAIRED])]
+    seen = table.dropna(subset=["x", "y", "z"])
+    some = seen[seen["particle"].isin(seen["particle"].unique()[:_PARTICLES_PAIRED])]
+    if some.empty:
+        return []
     wide = some.pivot_table(index="frame", columns="particle", values=["x", "y", "z"])
     x = wide.to_numpy(dtype=np.float64).reshape(len(wide), 3, -1).transpose(0, 2, 1)
     factor, pairs = stretch_of_pairs(x)
