@@ -94,6 +94,14 @@ def test_steady_light_has_no_flicker(repeats):
     assert find_flicker(windows) == (0.0, 0.0)
 
 
+def square_over_stated(frame, camera):
+    """Fit the sphere of a frame; return the squared error of its centre over the stated one."""
+    window = cut_window(frame, IMAGE, CENTER, others=np.empty((0, 3)))
+    fit = fit_window(window, IMAGE, camera, FreeCenters(CENTER + 0.02))
+    error = (fit.centers - CENTER)[0]
+    return error @ np.linalg.solve(fit.covariance, error) / 3
+
+
 @pytest.mark.parametrize("noise", [{"plane": 0.3}, {"line": 0.4}, {"pixel": 0.3}])
 def test_errors_of_fits_in_flickering_light_are_those_stated(noise, repeats):
     """Squared errors over the stated ones: 1 within four errors of it (3 to 11 without it)."""
@@ -102,10 +110,7 @@ def test_errors_of_fits_in_flickering_light_are_those_stated(noise, repeats):
     camera, squares = CameraNoise(GAIN, 0.0, **noise), []
     for _ in range(n):
         frame = recorded(rng, **noise)
-        window = cut_window(frame, IMAGE, CENTER, others=np.empty((0, 3)))
-        fit = fit_window(window, IMAGE, camera, FreeCenters(CENTER + 0.02))
-        error = (fit.centers - CENTER)[0]
-        squares.append(error @ np.linalg.solve(fit.covariance, error) / 3)
+        squares.append(square_over_stated(frame, camera))
     assert np.mean(squares) == pytest.approx(1, abs=4 * np.sqrt(2 / (3 * n)))
 
 
@@ -150,10 +155,7 @@ def test_correlations_of_neighbours_are_found_and_stated(repeats):
     camera = camera._replace(floor=4.0, neighbours=found, along_z=along_z)
     for _ in range(n):
         frame = LEVEL + 2 * blurred(SHAPE)
-        window = cut_window(frame, IMAGE, CENTER, others=np.empty((0, 3)))
-        fit = fit_window(window, IMAGE, camera, FreeCenters(CENTER + 0.02))
-        error = (fit.centers - CENTER)[0]
-        squares.append(error @ np.linalg.solve(fit.covariance, error) / 3)
+        squares.append(square_over_stated(frame, camera))
     assert np.mean(squares) == pytest.approx(1, abs=4 * np.sqrt(2 / (3 * n)))
 
 

@@ -24,6 +24,7 @@ from perrin.diffusion.tensor_likelihood import (
     bfgs_update,
     changed_noise,
     noise_range,
+    noise_turns,
 )
 from perrin.diffusion.tensor_modes import EvenTracks
 
@@ -101,7 +102,7 @@ class SeparateTensors:
         modes = self.tracks.diagonal(tensor[0], theta, B)
         found = self.tracks.slopes(tensor[0], B, modes)
         value, slope = self.straight_slopes(tensor, theta, B, found)
-        slope[:, tensor[1].shape[1] :] *= self.noise_turns(own)[0]
+        slope[:, tensor[1].shape[1] :] *= noise_turns(own, blurred=self.B is None)[0]
         return value, slope
 
     def straight_slopes(
@@ -117,14 +118,6 @@ class SeparateTensors:
             value = value - LEAST_BLUR * B
             slopes.append((found.B - LEAST_BLUR)[:, None])
         return value, np.concatenate(slopes, axis=1)
-
-    def noise_turns(self, own: Floats) -> tuple[Floats, Floats]:
-        """Return the derivatives (P, c) of the amplitudes and B by their parameters, two each."""
-        first, second = 2 * own, np.full(own.shape, 2.0)
-        if self.B is None:
-            first[:, -1] = MOST_BLUR * np.sin(2 * own[:, -1])
-            second[:, -1] = 2 * MOST_BLUR * np.cos(2 * own[:, -1])
-        return first, second
 
     def measurement(self, theta: Floats) -> tuple[Floats, Floats, Floats]:
         """Return the log-likelihood of the measured amplitudes and two derivatives, (P, r) each."""
@@ -163,16 +156,18 @@ class SeparateTensors:
         value, slope = self.straight_slopes(tensor, theta, B, found)
         return value, slope, np.asarray(full[:, kept][:, :, kept])
 
-    def hessians(self, tensor: tuple[Floats, Floats, Floats], own: Floats) -> Floats:
-        """Return minus the Hessians (P, m + c, m + c) by the parameters of D and noise."""
-        _, slope, full = self.straight_expansion(tensor, own)
+    def expansion(
+        self, tensor: tuple[Floats, Floats, Floats], own: Floats
+    ) -> tuple[Floats, Floats, Floats]:
+        """Return what `straight_expansion` does, by the free parameters of the noise."""
+        value, slope, full = self.straight_expansion(tensor, own)
         m = tensor[1].shape[1]
-        first, second = self.noise_turns(own)
+        first, second = noise_turns(own, blurred=self.B is None)
         turn = np.concatenate([np.ones((len(own), m)), first], axis=1)
         full *= turn[:, :, None] * turn[:, None]
         noise = np.arange(m, turn.shape[1])
         full[:, noise, noise] -= second * slope[:, m:]
-        return full
+        return value, slope * turn, full
 
 
 def batch_key(track: NoisyVectors) -> tuple[object, ...]:
@@ -243,8 +238,7 @@ def maximise_each(
     else:
         p, _ = climbed_each(tracks, family, q, own)
     found: list[Maximum | None] = [None] * len(q)
-    start = family(p[:, :m], active), p[:, m:]
-    (value, slope), hessian = tracks.slopes(*start), tracks.hessians(*start)
+    value, slope, hessian = tracks.expansion(family(p[:, :m], active), p[:, m:])
     inverse = ArrowHessian.of_single_motions(hessian, m).inverse()
     # Steps since the last Hessian, number of Hessians, and times that this step was shortened.
     steps, hessians, shorter = np.zeros((3, len(q)), dtype=np.int64)
@@ -282,7 +276,8 @@ def maximise_each(
         again = np.flatnonzero((steps >= _STEPS_A_HESSIAN) | (shorter >= _MOST_SHORTENED))
         if again.size:
             place = p[active[again]]
-            hessian = tracks.rows(again).hessians(family(place[:, :m], active[again]), place[:, m:])
+            tensor = family(place[:, :m], active[again])
+            hessian = tracks.rows(again).expansion(tensor, place[:, m:])[2]
             inverse[again] = ArrowHessian.of_single_motions(hessian, m).inverse()
             steps[again] = shorter[again] = 0
             hessians[again] += 1
@@ -359,7 +354,7 @@ def spread_each(
     directions = root @ basis @ root
     m = directions.shape[1]
     straight = np.zeros((len(D), m, m, *D.shape[1:]))
-    hessian = tracks.hessians((D, directions, straight), own)
+    hessian = tracks.expansion((D, directions, straight), own)[2]
     covariance = np.full((len(D), m, m), np.nan)
     shared, mixed, noise = hessian[:, :m, :m], hessian[:, :m, m:], hessian[:, m:, m:]
     for k in range(len(D)):

@@ -241,14 +241,6 @@ class NoisyVectors:
             return np.full((len(E) + len(theta) + 1,) * 2, np.nan)
         return self.chain_track.curvatures(E, D, B, chains)
 
-    def noise_turns(self, own: Floats) -> tuple[Floats, Floats]:
-        """Return the derivatives of the amplitudes and B by their parameters, first and second."""
-        first, second = 2 * own, np.full(len(own), 2.0)
-        if self.B is None:
-            first[-1] = MOST_BLUR * np.sin(2 * own[-1])
-            second[-1] = 2 * MOST_BLUR * np.cos(2 * own[-1])
-        return first, second
-
     def curvatures(self, D: Floats, slopes: Floats, bends: Floats, own: Floats) -> Floats:
         """Return minus the Hessian by the parameters of D and of the noise, (m + c, m + c).
 
@@ -257,7 +249,7 @@ class NoisyVectors:
         derivatives by the covariance are the average of observed and expected information.
         """
         full, by_noise = self.straight_curvatures(D, slopes, bends, own)
-        first, second = self.noise_turns(own)
+        first, second = noise_turns(own, blurred=self.B is None)
         turn = np.append(np.ones(len(slopes)), first)
         full *= turn[:, None] * turn
         noise = np.arange(len(slopes), len(turn))
@@ -710,6 +702,21 @@ def noise_range(own: Floats, reach: Floats | float, *, blurred: bool) -> tuple[F
     if blurred:
         most[..., -1] = MOST_BLUR
     return -reach * size, reach * (most - size)
+
+
+def noise_turns(own: Floats, *, blurred: bool) -> tuple[Floats, Floats]:
+    """Return first and second derivatives (..., c) of noise amplitudes and B by their parameters.
+
+    Examples
+    --------
+    >>> noise_turns(np.array([2.0, 0.0]), blurred=True)
+    (array([4., 0.]), array([2. , 0.5]))
+    """
+    first, second = 2 * own, np.full(own.shape, 2.0)
+    if blurred:
+        first[..., -1] = MOST_BLUR * np.sin(2 * own[..., -1])
+        second[..., -1] = 2 * MOST_BLUR * np.cos(2 * own[..., -1])
+    return first, second
 
 
 def at_blur(own: Floats, angle: float, ratio: Floats) -> Floats:
