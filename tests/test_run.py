@@ -7,6 +7,7 @@ drawn with --long only.
 from __future__ import annotations
 
 import doctest
+import hashlib
 import json
 import math
 import multiprocessing
@@ -28,6 +29,7 @@ import perrin
 from command_line import command_line
 from perrin.diffusion.noise_model import Noise
 from perrin.images.optics.optics import CameraNoise
+from perrin.images.spheres.by_trackpy import find_features
 from perrin.images.spheres.localisation import Method
 from perrin.images.spheres.spots import Spots
 from perrin.movie import stages
@@ -65,6 +67,28 @@ def undrawn(request, monkeypatch):
     if not request.config.getoption("--long"):
         for name in ("save_figures", "save_image_figures"):
             monkeypatch.setattr(f"perrin.report.write.{name}", no_figures)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def spots_found_once():
+    """Find the spots of a frame with the same arguments once for all tests of this module.
+
+    Many of them search the same movie, and trackpy takes a quarter of their time.
+    """
+    known = {}
+
+    def found(frame, **asked):
+        digest = hashlib.blake2b(np.ascontiguousarray(frame)).digest()
+        key = digest, frame.shape, frame.dtype, repr(sorted(asked.items()))
+        if key not in known:
+            known[key] = find_features(frame, **asked)
+            for column in known[key]:
+                column.flags.writeable = False
+        return known[key]
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr("perrin.images.spheres.localisation.find_features", found)
+        yield
 
 
 def no_figures(_, folder, **__):
