@@ -96,13 +96,13 @@ def test_bins_of_the_spectrum_contain_every_mode_once(free):
 
 
 def test_bands_contain_their_share_of_diffusion():
-    """68 % and 95 % of the bins and of the means of Brownian motion, of 8 tracks.
+    """68 % and 95 % of the bins and of the means of Brownian motion, of 6 tracks.
 
     The tolerance is three binomial standard errors; counts are whole numbers, so that more than
     the share lies inside.
     """
     spectrum, squares, distribution = [], [], []
-    for seed in range(8):
+    for seed in range(6):
         motion = track(300, seed=seed)
         model, fit = fitted(motion)
         ax = plot_step_spectrum(model, fit, ax=axes())
