@@ -235,11 +235,19 @@ def exp_map(vector: ArrayLike) -> Floats:
         c, s = np.cos(v[..., 0]), np.sin(v[..., 0])
         return np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], -2)
     angle = np.linalg.norm(v, axis=-1)
-    k = skew(v)
     # Rodrigues: sin(a)/a and (1 - cos a)/a^2 as sinc, which stays exact through a = 0.
-    a = np.sinc(angle / np.pi)[..., None, None]
-    b = (0.5 * np.sinc(angle / (2 * np.pi)) ** 2)[..., None, None]
-    rotation: Floats = np.eye(3) + a * k + b * (k @ k)
+    a = np.sinc(angle / np.pi)
+    b = 0.5 * np.sinc(angle / (2 * np.pi)) ** 2
+    # The matrix 1 + a [v]x + b [v]x [v]x, element by element.
+    u = [v[..., i] for i in range(3)]
+    of_b = [b * one for one in u]
+    square = [one * other for one, other in zip(of_b, u, strict=True)]
+    rotation = np.empty((*v.shape, 3))
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        rotation[..., i, i] = 1.0 - (square[j] + square[k])
+        even, odd = of_b[i] * u[j], a * u[k]
+        rotation[..., i, j] = even - odd
+        rotation[..., j, i] = even + odd
     return rotation
 
 
