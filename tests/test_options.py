@@ -125,7 +125,9 @@ def literals() -> tuple[str, ...]:
     found = []
     for path in SOURCE.rglob("*.py"):
         if path.relative_to(SOURCE).parts[0] != "cli":
-            code = re.sub(r'r?"""[\s\S]*?"""|^ *#.*', "", path.read_text("utf-8"), flags=re.MULTILINE)
+            code = re.sub(
+                r'r?"""[\s\S]*?"""|^ *#.*', "", path.read_text("utf-8"), flags=re.MULTILINE
+            )
             for line in re.findall(r'"(?:[^"\\\n]|\\.)*"|\'(?:[^\'\\\n]|\\.)*\'', code):
                 found += re.split(r"\{[^{}]*\}", line[1:-1])
                 for value in re.findall(r"\{[^{}]*\}", line[1:-1]):

@@ -53,9 +53,9 @@ def run(tmp_path_factory, request):
             patch.setattr(
                 Figure,
                 "savefig",
-                lambda figure, to, **how: to.write_bytes(bytes(5001))
-                if to.suffix == ".pdf"
-                else draw(figure, to, **how),
+                lambda figure, to, **how: (
+                    to.write_bytes(bytes(5001)) if to.suffix == ".pdf" else draw(figure, to, **how)
+                ),
             )
         total = len(remake.ITEMS)
         claims = remake.reproduce(folder, progress=lambda done, all_, _: seen.append((done, all_)))

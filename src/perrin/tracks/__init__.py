@@ -76,9 +76,7 @@ from perrin.tracks.formats import (
 from perrin.tracks.gdf import gdf_bytes, parse_ascii_gdf, parse_gdf
 from perrin.tracks.groups import (
     TOUCHING_REACH,
-    are_distinct,
     connected_groups,
-    coordinates,
     frames_of,
     group_quantiles,
     near_pairs,

@@ -487,4 +487,4 @@ def _columns_of(table: pd.DataFrame, *, unique: Sequence[str] = ("frame", "parti
         )
     code, ids = pd.factorize(table["particle"], sort=True)
     frame = table["frame"].to_numpy(dtype=np.int64)
-    return _Columns(frame, code.astype(np.int64), x, ~np.isnan(x).any(axis=1), len(ids))
+    return _Columns(frame, code.astype(np.int64), x, present(x), len(ids))

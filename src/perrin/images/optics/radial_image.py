@@ -148,7 +148,7 @@ class RadialImage:
         return np.asarray(a + t * (b + t * (c + t * d))), np.asarray(slope)
 
     def _pieces(self, distance: Floats) -> tuple[list[Floats], Floats]:
-        """Return the four coefficients of the piece of the spline at each distance, and the place."""
+        """Return the coefficients of the spline's piece at each distance, and the place in it."""
         knot, part = _in_knots(distance, self.spacing, len(self.coefficients))
         return [of_order.take(knot, mode="clip") for of_order in self._cubics], part
 
