@@ -491,8 +491,8 @@ def test_isotropy_is_rejected_no_more_often_than_stated(repeats):
 def test_missing_frames_and_blur_do_not_bias_the_mean(repeats):
     """10 % of frames missing, or a shutter open all the time: the mean D is right to 4 errors.
 
-    Ignored, blur would lower the mean by 20 % and gaps would raise it by 10 %. Gaps change D by 2.4 %
-    (one standard error) of that of the track without gaps.
+    Ignored, blur would lower the mean by 20 % and gaps would raise it by 10 %. Gaps change D of a
+    track by 2.4 % (one standard error).
     """
     count, mean, tracks = repeats(3, 12), np.trace(planted()) / 3, []
     for seed in range(count):
