@@ -9,6 +9,7 @@ import time
 import numpy as np
 
 import perrin
+from perrin.hydrodynamics import resistance
 
 KNOWN = {"viscosity": 1e-3, "temperature": 300.0}
 KT_OVER_ETA = 1.380649e-23 * 300 / 1e-3 * 1e18
@@ -44,6 +45,8 @@ ROWS = {
 
 def solve(body, **options):
     """Return the mobility of centres and radii, and the seconds it took."""
+    # A body that was solved before is not solved again.
+    resistance._fit_flows.cache_clear()
     start = time.perf_counter()
     mobility = perrin.cluster_mobility(body[0], radius=body[1], **KNOWN, **options)
     return mobility, time.perf_counter() - start

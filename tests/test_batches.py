@@ -144,11 +144,12 @@ def numbers_of(result):
     return numbers
 
 
-@pytest.mark.usefixtures("no_tensors")
+@pytest.mark.usefixtures("no_tensors", "no_verdicts")
 def test_a_table_of_unlike_clusters_is_each_of_them_alone(unlike_clusters):
-    """Fits, quality, coefficients and p-values are those of tables of one cluster, to 1e-9.
+    """Fits, quality and coefficients are those of tables of one cluster, to 1e-9.
 
-    Tensors are compared in `test_tensors`.
+    Tensors are compared in `test_tensors`, p-values in `test_tests_against_diffusion` (and with
+    --long here).
     """
     together = analyze(pd.concat(unlike_clusters, ignore_index=True), dt=0.7)
     found = {one.cluster: one for one in together.clusters}

@@ -61,7 +61,7 @@ def test_no_damage_of_a_finished_run_is_accepted(saved, tmp_path, repeats):
     names = sorted(p.name for p in folder.iterdir() if p.suffix not in (".csv", ".toml"))
     assert len(names) == 10
     accepted = 0
-    for _ in range(repeats(40, 3000)):
+    for _ in range(repeats(25, 3000)):
         name = names[rng.integers(len(names))]
         data = (saved / name).read_bytes()
         hurt = damaged(data, rng)
@@ -79,7 +79,7 @@ def test_no_damage_of_a_finished_run_is_accepted(saved, tmp_path, repeats):
             assert report == whole
             accepted += 1
         (folder / name).write_bytes(data)
-    assert accepted < 0.05 * repeats(40, 3000)
+    assert accepted < 0.05 * repeats(25, 3000)
     assert perrin.load_run(folder) == whole
 
 

@@ -49,12 +49,13 @@ LAZY = ("pandas", "scipy", "matplotlib", "pyarrow", "jinja2", "typer", "rich", "
 LAZY += ("tifffile", "liffile", "nd2", "czifile", "oiffile", "h5py", "zarr", "imagecodecs")
 
 
-def loaded_after(statement: str) -> set[str]:
-    code = f"{statement}\nimport sys\nprint(*sys.modules)"
+def loaded_after(*statements: str) -> list[set[str]]:
+    """Return the modules loaded after each statement of one process."""
+    code = "import sys\n" + "\n".join(f"{one}\nprint(*sys.modules)" for one in statements)
     result = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True
     )
-    return set(result.stdout.split())
+    return [set(line.split()) for line in result.stdout.splitlines()]
 
 
 def test_import_loads_numpy_alone():
@@ -63,11 +64,12 @@ def test_import_loads_numpy_alone():
     `import perrin` is under 250 modules; all names together add under 45 to numpy's own (which are
     173 to 217) and those of perrin.
     """
-    assert len(loaded_after("import perrin")) < 250
     drawing = (*perrin._FACES["report"], *perrin._FACES["study"])
     names = [n for n in perrin.__all__ if n not in drawing]
-    modules = loaded_after(f"from perrin import {', '.join(names)}")
-    more = modules - loaded_after("import numpy")
+    alone, modules = loaded_after("import perrin", f"from perrin import {', '.join(names)}")
+    assert len(alone) < 250
+    (of_numpy,) = loaded_after("import numpy")
+    more = modules - of_numpy
     assert sum(not m.startswith("perrin") for m in more) < 45
     assert modules.isdisjoint(LAZY)
     assert "perrin.compiled.kernels" not in modules
@@ -75,7 +77,7 @@ def test_import_loads_numpy_alone():
 
 def test_help_loads_no_numerical_package():
     """`perrin --help` imports the parser of its options, and no numpy, pandas or matplotlib."""
-    modules = loaded_after("import sys; sys.argv = ['perrin']; from perrin.cli import main")
+    (modules,) = loaded_after("sys.argv = ['perrin']; from perrin.cli import main")
     assert modules.isdisjoint(set(LAZY) - {"typer", "rich"})
     assert len(modules) < 450
 
@@ -103,8 +105,9 @@ def test_every_subpackage_is_an_attribute():
     for name in sorted(set().union(*SUBPACKAGES)):
         assert perrin.__getattr__(name) is importlib.import_module(f"perrin.{name}")
     # One that imports no other shows in a process of its own that nothing had to import it before.
-    assert "perrin.geometry" not in loaded_after("import perrin")
-    assert "perrin.geometry" in loaded_after("import perrin; perrin.geometry")
+    before, after = loaded_after("import perrin", "perrin.geometry")
+    assert "perrin.geometry" not in before
+    assert "perrin.geometry" in after
 
 
 def test_names_survive_the_import_of_every_module():

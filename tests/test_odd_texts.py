@@ -88,7 +88,7 @@ def test_a_name_that_is_no_utf8_is_printed(tmp_path, capsys):
         error.encode()
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(st.text(CHARACTERS, max_size=12))
 def test_every_text_is_harmless_on_a_terminal(text):
     """Rich prints an escaped text as it is; printable texts are unchanged."""
@@ -106,7 +106,7 @@ def test_every_text_is_harmless_on_a_terminal(text):
     assert out.getvalue() == f"a {shown}"
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(st.text(alphabet="'=+-@ab1.e\t |", max_size=8) | st.text(CHARACTERS, max_size=8))
 def test_guarded_cells_come_back_and_are_no_formulas(text):
     """Different texts stay different; numbers stay numbers."""

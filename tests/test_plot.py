@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from scipy.integrate import trapezoid
 
 import perrin
-from left_out import leave_out_verdicts, make_figures_without_rendering
+from left_out import leave_out_tensors, leave_out_verdicts, make_figures_without_rendering
 from perrin._text import number_text
 from perrin.diffusion.estimate import DiffusionEstimate, bare_text, value_text
 from perrin.plot import figure_style, report_figures
@@ -46,6 +46,7 @@ def measured(*, clusters=1, frames=201, planar=False, labels=None, D_R=0.02, gap
 @pytest.fixture(scope="module")
 def space():
     with pytest.MonkeyPatch.context() as patch:
+        leave_out_tensors(patch)
         leave_out_verdicts(patch)
         return measured(gaps=True).clusters[0]
 
@@ -57,7 +58,9 @@ def plane():
 
 @pytest.fixture(scope="module")
 def three():
-    return measured(clusters=3, frames=20, labels=["<b>", "a$_b$", "c"])
+    with pytest.MonkeyPatch.context() as patch:
+        leave_out_tensors(patch)
+        return measured(clusters=3, frames=20, labels=["<b>", "a$_b$", "c"])
 
 
 def axes(**kwargs):
@@ -351,6 +354,18 @@ def test_save_figures_names_its_files_and_changes_no_setting(
         )
         if planar:
             make_figures_without_rendering(monkeypatch)
+        else:
+            # The fonts of one PDF file are those of all.
+            draw = Figure.savefig
+            monkeypatch.setattr(
+                Figure,
+                "savefig",
+                lambda figure, to, **how: (
+                    to.write_bytes(bytes(2001))
+                    if to.name in ("cluster-0-residuals.pdf", "cluster-0-orientations.pdf")
+                    else draw(figure, to, **how)
+                ),
+            )
     before = dict(rcParams)
     report = measured(planar=planar, frames=20)
     seen = []

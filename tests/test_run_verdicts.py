@@ -12,7 +12,7 @@ import pytest
 import perrin
 from left_out import leave_out_tensors
 from perrin.cli.options import read_model
-from perrin.diffusion import Noise, Parameter, fit_switching, judge_motion, with_changing_interval
+from perrin.diffusion import Parameter, fit_switching, judge_motion, with_changing_interval
 from perrin.report.page import render_html
 from perrin.run import is_not_diffusion, verdict_lines
 
@@ -178,7 +178,8 @@ def test_the_interval_of_a_changing_D(report):
     interval of a logarithm differs from that of the likelihood by less than 1 % here.
     """
     motion, one = report.clusters[2].motion, report.clusters[2].D_R
-    states = fit_switching(motion, noise=Noise())
+    body = perrin.Cluster.touching(4, 2.45)
+    states = fit_switching(perrin.simulate_motion(body, D_R=D_R, dt=DT, n_frames=40, rng=1))
     unknown = replace(states, D_mean=Parameter.log_normal(one.value, np.inf, one.unit))
     blocks = with_changing_interval(one, motion, unknown)
     assert blocks.method == "mle, error from blocks"

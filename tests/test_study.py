@@ -41,7 +41,7 @@ from perrin.study import (
 )
 
 
-def write_table(path, *, seed, D=5e-3, clusters=2, frames=205):
+def write_table(path, *, seed, D=5e-3, clusters=2, frames=20):
     """Write the table of a movie with tetrahedra."""
     rng = np.random.default_rng(seed)
     body, parts = perrin.Cluster.touching(4, 2.45), []

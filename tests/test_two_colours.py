@@ -14,7 +14,7 @@ from perrin.movie.stacks import with_own_times
 
 pytest.importorskip("trackpy")
 
-DIAMETER, DT, FRAMES = 2.45, 0.73, 4
+DIAMETER, DT, FRAMES = 2.45, 0.73, 3
 SHIFT = np.array([0.12, -0.09, 0.2])
 CENTERS = np.array([(4.2, 4.2, 4.3), (10.2, 9.6, 4.4)])
 SCENE = {

@@ -93,8 +93,8 @@ def test_brownian_steps_are_rejected_at_the_stated_levels(repeats):
 def test_ranks_of_a_short_noisy_track_are_uniform(repeats, monkeypatch):
     tracks = repeats(20, 400)
     if not repeats(0, 1):
-        # Ranks among 199 draws are as uniform as those among 666, and take less time.
-        monkeypatch.setattr("perrin.diffusion.goodness_of_fit._MOST_DRAWS", 199)
+        # Ranks among 99 draws are as uniform as those among 666, and take less time.
+        monkeypatch.setattr("perrin.diffusion.goodness_of_fit._MOST_DRAWS", 99)
     model = even_model(50)
     y = noisy_steps(50, tracks, 0.5, np.random.default_rng(6))
     p = np.array([list(brownian_tests(model, one[None]).p.values()) for one in y])

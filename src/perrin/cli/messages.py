@@ -6,6 +6,7 @@ import os
 import re
 import sys
 from contextlib import contextmanager
+from functools import cache
 from typing import TYPE_CHECKING, get_type_hints
 
 import typer
@@ -45,6 +46,7 @@ _ARGUMENTS_ALONE = ("n_frames", "total_time", "plane_time", "minmass", "keep_jum
 _ARGUMENT_VALUE = r"\{[^{}]*\}|\([^()]*\)|\[[^\[\]]*\]|'[^']*'|\"[^\"]*\"|[^\s,;:()]*"
 
 
+@cache
 def options_of(command: Callable[..., object]) -> dict[str, str]:
     """Return the options of a command by the arguments of the library that they become.
 

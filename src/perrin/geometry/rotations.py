@@ -5,6 +5,7 @@ Rotations are active matrices, lab from body: ``x = R x0``. All functions take l
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -184,8 +185,10 @@ def fit_rotations(
     array([ True, False])
     """
     y, x, w = _checked(points, reference, weights)
-    batch = np.broadcast_shapes(y.shape[:-2], x.shape[:-2], () if w is None else w.shape[:-1])
-    d, size = y.shape[-1], int(np.prod(batch))
+    batch = y.shape[:-2]
+    if w is not None or x.shape[:-2] != batch:
+        batch = np.broadcast_shapes(batch, x.shape[:-2], () if w is None else w.shape[:-1])
+    d, size = y.shape[-1], math.prod(batch)
     y, x = _rows(y, batch), _rows(x, batch)
     w = None if w is None else _rows(w[..., None], batch)
     rotation, unique = np.empty((size, d, d)), np.zeros(size, dtype=np.bool_)
@@ -232,11 +235,19 @@ def exp_map(vector: ArrayLike) -> Floats:
         c, s = np.cos(v[..., 0]), np.sin(v[..., 0])
         return np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], -2)
     angle = np.linalg.norm(v, axis=-1)
-    k = skew(v)
     # Rodrigues: sin(a)/a and (1 - cos a)/a^2 as sinc, which stays exact through a = 0.
-    a = np.sinc(angle / np.pi)[..., None, None]
-    b = (0.5 * np.sinc(angle / (2 * np.pi)) ** 2)[..., None, None]
-    rotation: Floats = np.eye(3) + a * k + b * (k @ k)
+    a = np.sinc(angle / np.pi)
+    b = 0.5 * np.sinc(angle / (2 * np.pi)) ** 2
+    # The matrix 1 + a [v]x + b [v]x [v]x, element by element.
+    u = [v[..., i] for i in range(3)]
+    of_b = [b * one for one in u]
+    square = [one * other for one, other in zip(of_b, u, strict=True)]
+    rotation = np.empty((*v.shape, 3))
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        rotation[..., i, i] = 1.0 - (square[j] + square[k])
+        even, odd = of_b[i] * u[j], a * u[k]
+        rotation[..., i, j] = even - odd
+        rotation[..., j, i] = even + odd
     return rotation
 
 
@@ -324,10 +335,11 @@ def skew(vector: Floats) -> Floats:
     >>> skew(np.array([0.0, 0.0, 2.0])) @ [1.0, 0.0, 0.0]
     array([0., 2., 0.])
     """
-    zero = np.zeros(vector.shape[:-1])
-    x, y, z = np.moveaxis(vector, -1, 0)
-    rows = [(zero, -z, y), (z, zero, -x), (-y, x, zero)]
-    return np.stack([np.stack(row, -1) for row in rows], -2)
+    matrix = np.zeros((*vector.shape, 3))
+    for i, (j, k) in enumerate(((1, 2), (2, 0), (0, 1))):
+        matrix[..., k, j] = vector[..., i]
+        matrix[..., j, k] = -vector[..., i]
+    return matrix
 
 
 def unit_quaternion(rotation: Floats) -> Floats:
@@ -455,10 +467,9 @@ def _without_absent(y: Floats, x: Floats, w: Floats | None) -> tuple[Floats, Flo
 
 def _rows(a: Floats, batch: tuple[int, ...]) -> Floats:
     """Flatten the leading axes to one, or keep a single set as it is (it broadcasts)."""
-    if int(np.prod(a.shape[:-2])) == 1:
-        return np.ascontiguousarray(a.reshape(1, *a.shape[-2:]))
-    rows = np.broadcast_to(a, (*batch, *a.shape[-2:])).reshape(-1, *a.shape[-2:])
-    return np.ascontiguousarray(rows)
+    if math.prod(a.shape[:-2]) != 1 and a.shape[:-2] != batch:
+        a = np.broadcast_to(a, (*batch, *a.shape[-2:]))
+    return np.ascontiguousarray(a.reshape(math.prod(a.shape[:-2]), *a.shape[-2:]))
 
 
 def _batch_last(a: Floats) -> Floats:

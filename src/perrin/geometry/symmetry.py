@@ -6,6 +6,7 @@ for a rotation times the inversion. On a body that is not a line the two determi
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
@@ -280,21 +281,18 @@ def symmetry_elements_of_each(x: Floats, tolerance: Floats) -> list[Floats]:
         for body, order, misfit in zip(*(part.tolist() for part in found), strict=True):
             misfits[body][sign, *order] = misfit
     groups: dict[tuple[_Element, ...], list[int]] = {}
-    generated: dict[tuple[frozenset[_Element], frozenset[_Element]], set[_Element] | None] = {}
     identity: _Element = (1, *range(x.shape[1]))
     for k, (misfit, own) in enumerate(zip(misfits, tolerance.tolist(), strict=True)):
         # Elements are accepted best first; all products are to be among those with a known misfit.
         allowed = frozenset(misfit)
         within = frozenset(e for e in misfit if misfit[e] <= own) | {identity}
-        if (within, allowed) not in generated:
-            generated[within, allowed] = _generated_group(set(within), set(allowed))
         # If all of them together generate a group of allowed elements, so do the best of them.
-        chosen = generated[within, allowed]
+        chosen = _generated_group(within, allowed)
         if chosen is None:
-            chosen = {identity}
+            chosen = frozenset({identity})
             for element in sorted(within, key=lambda e: (misfit.get(e, 0.0), e)):
                 if element not in chosen:
-                    chosen = _generated_group(chosen | {element}, set(allowed)) or chosen
+                    chosen = _generated_group(chosen | {element}, allowed) or chosen
         group = (identity, *sorted(chosen - {identity}, reverse=True))
         groups.setdefault(group, []).append(k)
     matrices: dict[int, Floats] = {}
@@ -316,7 +314,10 @@ def symmetry_elements_of_each(x: Floats, tolerance: Floats) -> list[Floats]:
     return [matrices[k] for k in range(len(x))]
 
 
-def _generated_group(generators: set[_Element], allowed: set[_Element]) -> set[_Element] | None:
+@lru_cache(maxsize=128)
+def _generated_group(
+    generators: frozenset[_Element], allowed: frozenset[_Element]
+) -> frozenset[_Element] | None:
     """Return the group that some elements generate, or None if it is not a subset of `allowed`."""
     group, fresh = set(generators), set(generators)
     while fresh:
@@ -325,7 +326,7 @@ def _generated_group(generators: set[_Element], allowed: set[_Element]) -> set[_
         if not fresh <= allowed:
             return None
         group |= fresh
-    return group
+    return frozenset(group)
 
 
 def schoenflies(elements: Floats) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import asdict, dataclass
+from functools import lru_cache
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
@@ -137,8 +138,9 @@ def solve_resistance(centers: Floats, radii: Floats, *, degree: int) -> Resistan
     array([6., 6., 6., 8., 8., 8.])
     """
     # No degree is lower than 1, whose error is the change to degree 2.
-    other = _fit_flows(centers, radii, max(degree - 2, 1) if degree > 1 else 2)
-    return _with_error_estimate(_fit_flows(centers, radii, degree), other, degree)
+    spheres = centers.tobytes(), radii.tobytes()
+    other = _fit_flows(*spheres, max(degree - 2, 1) if degree > 1 else 2)
+    return _with_error_estimate(_fit_flows(*spheres, degree), other, degree)
 
 
 def converge_resistance(centers: Floats, radii: Floats, *, accuracy: float) -> Resistance:
@@ -178,11 +180,12 @@ def converge_resistance(centers: Floats, radii: Floats, *, accuracy: float) -> R
             f"centers: {len(centers)} spheres; an error estimate is possible for up to {most}; "
             f"state a degree (1 to {lowest - 1}) for more"
         )
-    solved = {lowest - 2: _fit_flows(centers, radii, lowest - 2)}
+    spheres = centers.tobytes(), radii.tobytes()
+    solved = {lowest - 2: _fit_flows(*spheres, lowest - 2)}
     for degree, further in pairwise(_DEGREES):
         for needed in (degree - 2, degree):
             if needed not in solved:
-                solved[needed] = _fit_flows(centers, radii, needed)
+                solved[needed] = _fit_flows(*spheres, needed)
         result = _with_error_estimate(solved[degree], solved[degree - 2], degree)
         if result.error <= accuracy:
             return result
@@ -223,14 +226,17 @@ def _with_error_estimate(solution: _FlowFit, other: _FlowFit, degree: int) -> Re
     )
 
 
-def _fit_flows(centers: Floats, radii: Floats, degree: int) -> _FlowFit:
+@lru_cache(maxsize=64)
+def _fit_flows(centers_bytes: bytes, radii_bytes: bytes, degree: int) -> _FlowFit:
     """Fit the flows about all spheres to rigid motion on the surface and sum their forces.
 
     The flows are nearly orthogonal, so that normal equations are as accurate as a QR factorisation,
-    and several times faster.
+    and several times faster. A body that is asked for again, for another quantity or another fluid,
+    is not solved again.
     """
     from scipy.linalg import cho_factor, cho_solve
 
+    centers, radii = np.frombuffer(centers_bytes).reshape(-1, 3), np.frombuffer(radii_bytes)
     on_surface, weights, spheres = [], [], []
     for i, (center, radius) in enumerate(zip(centers, radii, strict=True)):
         fraction = _exposed(i, centers, radii, _PROBES)[1]
@@ -271,6 +277,7 @@ def _fit_flows(centers: Floats, radii: Floats, degree: int) -> _FlowFit:
     # Rounding may give a residual of -1e-16 for an exact fit, such as that of one sphere.
     residual = np.maximum(1 - np.sum(right * strength, axis=0) / power, 0.0)
     raw = flow_forces(spheres, degree) @ (scale[:, None] * strength)
+    frozen(raw)
     return _FlowFit(raw, float(np.sqrt(residual.max())))
 
 

@@ -208,9 +208,10 @@ def mean_present(x: Floats, *, axis: int) -> Floats:
     >>> mean_present(np.array([[1.0, np.nan], [3.0, np.nan]]), axis=0)
     array([ 2., nan])
     """
+    whole = x.sum(axis=axis)
+    if x.shape[axis] and np.isfinite(whole).all():
+        return np.asarray(whole / x.shape[axis])
     here = np.isfinite(x)
-    if here.all() and x.shape[axis]:
-        return np.asarray(x.mean(axis=axis))
     count = here.sum(axis=axis)
     total = np.where(here, x, 0.0).sum(axis=axis)
     mean: Floats = np.divide(total, count, out=np.full(total.shape, np.nan), where=count > 0)

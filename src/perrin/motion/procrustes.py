@@ -372,12 +372,12 @@ def pose_errors(fit: PoseFit, seen: Bools, noise: Floats) -> tuple[Floats, Float
     fitted = np.isfinite(fit.rotation[..., 0, 0])
     sigma = np.sqrt(noise.mean(axis=1))
     equal = np.ptp(noise, axis=1) == 0
-    code = np.packbits(seen, axis=2)
-    patterns, first, which = np.unique(
-        code.reshape(-1, code.shape[2]), axis=0, return_index=True, return_inverse=True
-    )
-    which = which.reshape(bodies, frames)
-    for i in range(len(patterns)):
+    first, which = np.zeros(1, dtype=np.int64), np.zeros((bodies, frames), dtype=np.int64)
+    if not seen.all():
+        code = np.packbits(seen, axis=2).reshape(bodies * frames, -1)
+        _, first, found = np.unique(code, axis=0, return_index=True, return_inverse=True)
+        which = found.reshape(bodies, frames)
+    for i in range(len(first)):
         pattern = seen.reshape(-1, n)[first[i]]
         rows = fitted & (which == i)
         some = np.flatnonzero(rows.any(axis=1))
@@ -404,11 +404,11 @@ def _in_body(x: Floats, seen: Bools, rotation: Floats, shape: Floats) -> Floats:
 
 def _shape_centers(x: Floats, rotation: Floats, shape: Floats) -> Floats:
     """Return the lab position of the shape's origin, from the particles present in both."""
-    known = np.isfinite(x) & np.isfinite(shape[..., None, :, :])
-    if known.all():
-        arm = np.broadcast_to(shape.mean(axis=-2)[..., None, :], (*x.shape[:-2], x.shape[-1]))
-        centroid = x.mean(axis=-2)
+    centroid = x.sum(axis=-2) / x.shape[-2]
+    if np.isfinite(centroid).all() and np.isfinite(shape).all():
+        arm = np.broadcast_to(shape.mean(axis=-2)[..., None, :], centroid.shape)
     else:
+        known = np.isfinite(x) & np.isfinite(shape[..., None, :, :])
         arm = mean_present(np.where(known, shape[..., None, :, :], np.nan), axis=-2)
         centroid = mean_present(np.where(known, x, np.nan), axis=-2)
     center: Floats = centroid - (rotation @ arm[..., None])[..., 0]

@@ -72,7 +72,7 @@ def assign_clusters(
     labels: dict[int, str] = {}
     marked = "cluster" in table
     if marked and pd.api.types.is_numeric_dtype(table["cluster"]):
-        table = table.astype({"cluster": np.int64})
+        table = table.assign(cluster=table["cluster"].to_numpy(dtype=np.int64))
         stated = table.attrs.get("labels", {})
         labels = {int(number): str(name) for number, name in stated.items()}
     elif marked:

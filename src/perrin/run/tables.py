@@ -229,7 +229,7 @@ def read_table(
     if not keep.any():
         low, high = int(table["frame"].min()), int(table["frame"].max())
         raise ValueError(f"frames {first}:{stop} hold no rows; the table runs from {low} to {high}")
-    table = table[keep].reset_index(drop=True)
+    table = table if keep.all() else table[keep].reset_index(drop=True)
     if size is not None and contact is not None:
         table = identify(table, contact=contact, size=size)
         known = table["cluster"] >= 0

@@ -27,7 +27,13 @@ from perrin.errors import (
 )
 from perrin.motion.rods import track_direction
 from perrin.tracks.bonds import rigid_groups
-from perrin.tracks.groups import TOUCHING_REACH, connected_groups, near_pairs
+from perrin.tracks.groups import (
+    TOUCHING_REACH,
+    are_distinct,
+    connected_groups,
+    coordinates,
+    near_pairs,
+)
 from perrin.tracks.identity import settle_identity
 from perrin.tracks.linking import link_clusters
 
@@ -458,20 +464,20 @@ def _columns_of(table: pd.DataFrame, *, unique: Sequence[str] = ("frame", "parti
 
     missing = [name for name in ("frame", "particle", "x", "y") if name not in table]
     faults = [f"missing columns {', '.join(missing)}"] if missing else []
-    faults += [
-        f"{counted(int(table[name].isna().sum()), 'row')} without {name}"
-        for name in ("frame", "particle")
-        if name in table and table[name].isna().any()
-    ]
+    for name in ("frame", "particle"):
+        absent = int(table[name].isna().sum()) if name in table else 0
+        faults += [f"{counted(absent, 'row')} without {name}"] if absent else []
     faults += [] if len(table) else ["no rows"]
     if not faults:
-        axes = ["x", "y", "z"] if "z" in table else ["x", "y"]
-        x = table[axes].to_numpy(dtype=np.float64, na_value=np.nan)
+        x = coordinates(table)
         number = table["frame"].to_numpy(dtype=np.float64)
+        distinct = are_distinct([table[name].to_numpy() for name in unique])
         counts = {
             "frame numbers that are not whole": (number != np.round(number)).sum(),
             "rows with an infinite coordinate": np.isinf(x).any(axis=1).sum(),
-            "rows that repeat a particle in a frame": table.duplicated(list(unique)).sum(),
+            "rows that repeat a particle in a frame": 0
+            if distinct
+            else table.duplicated(list(unique)).sum(),
         }
         faults = [f"{count} {what}" for what, count in counts.items() if count]
     if faults:
@@ -481,4 +487,4 @@ def _columns_of(table: pd.DataFrame, *, unique: Sequence[str] = ("frame", "parti
         )
     code, ids = pd.factorize(table["particle"], sort=True)
     frame = table["frame"].to_numpy(dtype=np.int64)
-    return _Columns(frame, code.astype(np.int64), x, ~np.isnan(x).any(axis=1), len(ids))
+    return _Columns(frame, code.astype(np.int64), x, present(x), len(ids))

@@ -24,6 +24,7 @@ from perrin.tracks.column_names import (
 from perrin.tracks.delimited import parse_text, utf8_text
 from perrin.tracks.file_limits import refusing_foreign_errors
 from perrin.tracks.formats import LARGEST_EXACT, parse_table, table_bytes, table_suffix
+from perrin.tracks.groups import are_distinct
 from perrin.tracks.simulations import is_selection, selection_table
 from perrin.tracks.writing import written_whole
 
@@ -414,8 +415,8 @@ def _clean_table(
     """Check a table, convert its units to um and s, and attach its notes; list all faults."""
     import pandas as pd
 
-    names = raw.attrs.get("names", [str(name) for name in raw.columns])
-    table = raw.rename(columns=dict(spelling.renamed))
+    names = raw.attrs["names"] if "names" in raw.attrs else [str(name) for name in raw.columns]
+    table = raw.rename(columns=dict(spelling.renamed)) if spelling.renamed else raw
     axes = [axis for axis in _AXES if axis in table]
     table, note, faults = _with_frames(table, spelling)
     notes = [*spelling.notes, *note]
@@ -432,19 +433,18 @@ def _clean_table(
         factors = dict(zip(axes, np.broadcast_to(factor, len(axes)).tolist(), strict=True))
     faults += unit_faults(spelling.units, factors)
     clean: dict[str, NDArray[Any]] = {}
+    present = list(table.columns)
     for name in COLUMNS:
-        if list(table.columns).count(name) == 1:
+        if present.count(name) == 1:
             check = _checked_ids if name in ("particle", "cluster") else _checked_numbers
             clean[name], found = check(table[name], name, rows)
             faults += found
     faults += _repeat_faults(clean, rows)
     if faults:
         raise table_error(source, *faults)
-    tracks = pd.DataFrame(clean)
-    for axis in axes:
-        tracks[axis] *= factors[axis]
-    if "time" in tracks:
-        tracks["time"] *= seconds(spelling.units)
+    if "time" in clean:
+        factors["time"] = seconds(spelling.units)
+    tracks = pd.DataFrame({name: column * factors.get(name, 1) for name, column in clean.items()})
     if notes:
         tracks.attrs["notes"] = notes
     tracks.attrs["columns"] = list(names)
@@ -605,6 +605,8 @@ def _repeat_faults(clean: dict[str, NDArray[Any]], rows: RowNumbers) -> list[str
     if "frame" not in clean or "particle" not in clean:
         return []
     key = [name for name in ("frame", "cluster", "particle") if name in clean]
+    if are_distinct([clean[name] for name in key]):
+        return []
     keys = pd.DataFrame({name: clean[name] for name in key})
     repeated = keys.duplicated().to_numpy()
     if repeated.any():

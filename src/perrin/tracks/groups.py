@@ -1,4 +1,4 @@
-"""Points in groups: the rows of one frame, connected pairs, and touching particles."""
+"""Points in groups: rows of one frame or one key, connected pairs, and touching particles."""
 
 from __future__ import annotations
 
@@ -7,7 +7,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
+    from typing import Any
+
+    import pandas as pd
+    from numpy.typing import NDArray
 
     from perrin._arrays import Floats, Ints
 
@@ -38,6 +42,54 @@ def frames_of(frame: Ints) -> Iterator[Ints]:
     yield from np.split(order, np.flatnonzero(np.diff(frame[order])) + 1)
 
 
+def coordinates(table: pd.DataFrame) -> Floats:
+    """Return the coordinates (N, d) of a table with the columns x, y and perhaps z.
+
+    Examples
+    --------
+    >>> import pandas as pd
+    >>> coordinates(pd.DataFrame({"y": [2, 3], "x": [0.0, np.nan]}))
+    array([[ 0.,  2.],
+           [nan,  3.]])
+    """
+    columns = [
+        table[axis].to_numpy(dtype=np.float64, na_value=np.nan) for axis in "xyz" if axis in table
+    ]
+    return np.stack(columns, axis=1)
+
+
+def are_distinct(columns: Sequence[NDArray[Any]]) -> bool:
+    """Return whether columns are whole numbers of which no two rows are the same.
+
+    Parameters
+    ----------
+    columns : sequence of ndarray, shape (N,)
+
+    Returns
+    -------
+    bool
+        False for columns of other kinds, and for numbers whose combinations exceed int64.
+
+    Examples
+    --------
+    >>> frame, particle = np.array([0, 0, 1]), np.array([3, 4, 3])
+    >>> are_distinct([frame, particle]), are_distinct([frame])
+    (True, False)
+    """
+    key, combinations = np.zeros(len(columns[0]), dtype=np.int64), 1
+    for column in columns:
+        if column.dtype.kind != "i" or not column.size:
+            return False
+        low, high = int(column.min()), int(column.max())
+        combinations *= high - low + 1
+        if combinations > np.iinfo(np.int64).max:
+            return False
+        key = key * (high - low + 1) + (column.astype(np.int64) - low)
+    if not (np.diff(key) > 0).all():
+        key.sort()
+    return bool((np.diff(key) > 0).all())
+
+
 def connected_groups(first: Ints, second: Ints, *, count: int) -> Ints:
     """Return the connected component of each of `count` points that are joined in pairs.
 
@@ -57,11 +109,16 @@ def connected_groups(first: Ints, second: Ints, *, count: int) -> Ints:
     >>> connected_groups(np.array([0, 2]), np.array([2, 4]), count=5)
     array([0, 1, 0, 2, 0])
     """
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
-    graph = coo_array((np.ones(len(first)), (first, second)), shape=(count, count))
-    return np.asarray(connected_components(graph, directed=False)[1], dtype=np.int64)
+    label = np.arange(count)
+    while True:
+        one, other = label[first], label[second]
+        lowest = np.minimum(one, other)
+        if np.array_equal(one, other):
+            break
+        np.minimum.at(label, one, lowest)
+        np.minimum.at(label, other, lowest)
+        label = label[label]
+    return np.unique(label, return_inverse=True)[1]
 
 
 def touching_groups(x: Floats, *, reach: float, size: int, smallest: int) -> Ints:

@@ -12,7 +12,7 @@ from perrin._text import counted
 from perrin.geometry.shapes import pair_distances
 from perrin.motion.degenerate import mean_present
 from perrin.motion.residuals import median_present
-from perrin.tracks.groups import frames_of, group_quantiles
+from perrin.tracks.groups import coordinates, group_quantiles
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -129,11 +129,12 @@ def screen_rows(table: pd.DataFrame) -> Screened:
     >>> int(screened.table["x"].isna().sum())
     1
     """
-    axes = [axis for axis in ("x", "y", "z") if axis in table]
-    x = table[axes].to_numpy(dtype=np.float64, na_value=np.nan)
+    x = coordinates(table)
     frame = table["frame"].to_numpy(dtype=np.int64)
-    names = ["particle", "cluster"] if "cluster" in table else ["particle"]
-    code = table.groupby(names, sort=False, dropna=False).ngroup().to_numpy(dtype=np.int64)
+    code = table["particle"].factorize(use_na_sentinel=False)[0].astype(np.int64)
+    if "cluster" in table:
+        cluster, clusters = table["cluster"].factorize(use_na_sentinel=False)
+        code = np.unique(code * len(clusters) + cluster, return_inverse=True)[1]
     empty = ~present(x)
     rows = np.lexsort((frame, code))
     rows = rows[~empty[rows]]
@@ -165,10 +166,9 @@ def screen_rows(table: pd.DataFrame) -> Screened:
     bad = np.concatenate([filled, repeated])
     if bad.size:
         table = table.copy()
-    for axis in axes if bad.size else []:
-        values = table[axis].to_numpy(dtype=np.float64, na_value=np.nan, copy=True)
-        values[bad] = np.nan
-        table[axis] = values
+        x[bad] = np.nan
+        for axis, values in zip("xyz", x.T, strict=False):
+            table[axis] = values
     return Screened(table, notes, placeholders + repeats)
 
 
@@ -410,21 +410,18 @@ def distance_notes(
     """
     from scipy.spatial import cKDTree
 
-    axes = [axis for axis in ("x", "y", "z") if axis in table]
-    x = table[axes].to_numpy(dtype=np.float64, na_value=np.nan)
+    x = coordinates(table)
     frame = table["frame"].to_numpy(dtype=np.int64)
     frames = np.unique(frame)
     spaced = np.linspace(0, len(frames) - 1, _DISTANCE_FRAMES).astype(int)
     some = frames[spaced] if len(frames) else frames
     rows = np.flatnonzero(present(x) & np.isin(frame, some))
-    rows = rows[np.argsort(frame[rows], kind="stable")]
     code = table["particle"].iloc[rows].factorize()[0].astype(np.int64)
-    nearest = np.full(len(rows), np.nan)
-    for part in frames_of(frame[rows]):
-        if len(part) > 1:
-            near = x[rows[part]]
-            nearest[part] = cKDTree(near).query(near, 2)[0][:, 1]
-    known = np.isfinite(nearest)
+    # Frames are so far apart along an axis of their own that the nearest particle is in the same.
+    apart_by = 2 * float(np.ptp(x[rows], axis=0).sum()) + 1.0 if rows.size else 1.0
+    placed = np.column_stack([x[rows], apart_by * np.searchsorted(some, frame[rows])])
+    nearest = cKDTree(placed).query(placed, 2)[0][:, 1] if rows.size else np.empty(0)
+    known = nearest < 0.75 * apart_by
     if not known.any():
         return (), ()
     medians = group_quantiles(code[known], nearest[known], int(code.max()) + 1)

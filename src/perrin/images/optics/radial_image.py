@@ -8,6 +8,7 @@ neighbours add. Positions are (y, x), um, with the origin at the centre of pixel
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -146,13 +147,17 @@ class RadialImage:
         slope = (b + t * (2 * c + 3 * t * d)) / self.spacing
         return np.asarray(a + t * (b + t * (c + t * d))), np.asarray(slope)
 
-    def _pieces(self, distance: Floats) -> tuple[Floats, Floats]:
-        """Return the cubic (4, ...) of the piece of the spline at each distance, and the place."""
+    def _pieces(self, distance: Floats) -> tuple[list[Floats], Floats]:
+        """Return the coefficients of the spline's piece at each distance, and the place in it."""
+        knot, part = _in_knots(distance, self.spacing, len(self.coefficients))
+        return [of_order.take(knot, mode="clip") for of_order in self._cubics], part
+
+    @cached_property
+    def _cubics(self) -> Floats:
+        """Coefficients (4, k + 2) of the pieces of the spline."""
         mirrored = np.concatenate([self.coefficients[1:2], self.coefficients, np.zeros(4)])
-        k = len(self.coefficients)
-        pieces = _CUBIC @ np.lib.stride_tricks.sliding_window_view(mirrored, 4).T
-        knot, part = _in_knots(distance, self.spacing, k)
-        return pieces[:, knot], part
+        pieces: Floats = _CUBIC @ np.lib.stride_tricks.sliding_window_view(mirrored, 4).T
+        return pieces
 
     def to_dict(self) -> dict[str, Any]:
         """Return values that JSON holds; `noise` is [gain, floor], or [gain, floor, level]."""
