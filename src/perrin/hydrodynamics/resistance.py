@@ -138,7 +138,7 @@ def solve_resistance(centers: Floats, radii: Floats, *, degree: int) -> Resistan
     array([6., 6., 6., 8., 8., 8.])
     """
     # No degree is lower than 1, whose error is the change to degree 2.
-    spheres = centers.tobytes(), radii.tobytes()
+    spheres = _as_bytes(centers), _as_bytes(radii)
     other = _fit_flows(*spheres, max(degree - 2, 1) if degree > 1 else 2)
     return _with_error_estimate(_fit_flows(*spheres, degree), other, degree)
 
@@ -180,7 +180,7 @@ def converge_resistance(centers: Floats, radii: Floats, *, accuracy: float) -> R
             f"centers: {len(centers)} spheres; an error estimate is possible for up to {most}; "
             f"state a degree (1 to {lowest - 1}) for more"
         )
-    spheres = centers.tobytes(), radii.tobytes()
+    spheres = _as_bytes(centers), _as_bytes(radii)
     solved = {lowest - 2: _fit_flows(*spheres, lowest - 2)}
     for degree, further in pairwise(_DEGREES):
         for needed in (degree - 2, degree):
@@ -224,6 +224,11 @@ def _with_error_estimate(solution: _FlowFit, other: _FlowFit, degree: int) -> Re
         change=float(np.abs(ratio - 1).max()),
         residual=solution.residual,
     )
+
+
+def _as_bytes(values: Floats) -> bytes:
+    """Return numbers as a key, from which `_fit_flows` reads them."""
+    return np.asarray(values, dtype=np.float64).tobytes()
 
 
 @lru_cache(maxsize=64)

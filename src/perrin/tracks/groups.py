@@ -109,16 +109,11 @@ def connected_groups(first: Ints, second: Ints, *, count: int) -> Ints:
     >>> connected_groups(np.array([0, 2]), np.array([2, 4]), count=5)
     array([0, 1, 0, 2, 0])
     """
-    label = np.arange(count)
-    while True:
-        one, other = label[first], label[second]
-        lowest = np.minimum(one, other)
-        if np.array_equal(one, other):
-            break
-        np.minimum.at(label, one, lowest)
-        np.minimum.at(label, other, lowest)
-        label = label[label]
-    return np.unique(label, return_inverse=True)[1]
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    graph = coo_array((np.ones(len(first)), (first, second)), shape=(count, count))
+    return np.asarray(connected_components(graph, directed=False)[1], dtype=np.int64)
 
 
 def touching_groups(x: Floats, *, reach: float, size: int, smallest: int) -> Ints:
