@@ -48,13 +48,15 @@ class Change:
     length: float = 1.0
     time: float = 1.0
     backwards: bool = False
+    every: int = 1
     left_out: bool = False
     dtype: str = "float64"
 
 
 # What is changed: rotation (a quaternion, w first), translation (um), velocity (um per frame), the
-# permutation of the particles, the units of length and time, reversal of time, whether gaps are
-# frames that are left out or frames of NaN, and the type of the numbers.
+# permutation of the particles, the units of length and time, reversal of time, whether the frames
+# are every second or third of a faster clock, whether gaps are frames that are left out or frames
+# of NaN, and the type of the numbers.
 KINDS = tuple(field.name for field in fields(Change))
 
 
@@ -76,6 +78,7 @@ def applied(data: Data, change: Change, *, without: Collection[str]) -> tuple[Da
     """Take out the kinds of change that do not apply; without gaps every frame is full."""
     if "left_out" in without:
         data = replace(data, gaps=frozenset(), absent=None)
+        without = {*without, "every"}
     return data, replace(change, **{kind: getattr(Change(), kind) for kind in without})
 
 
@@ -96,7 +99,7 @@ class Laboratory:
     @property
     def dt(self) -> float:
         """Time between frames, in the unit of this laboratory."""
-        return DT * self.time
+        return DT * self.time / self.every
 
     @property
     def matrix(self) -> NDArray[np.float64]:
@@ -140,7 +143,10 @@ class Laboratory:
         x = self.seen(x)[:, list(self.order or range(x.shape[1]))]
         if self.left_out:
             frames = np.flatnonzero(np.isfinite(x).any(axis=(1, 2)))
-        return self.typed(x[frames]), frames
+            return self.typed(x[frames]), frames * self.every
+        rows = np.full((self.every * (len(x) - 1) + 1, *x.shape[1:]), np.nan)
+        rows[:: self.every] = x
+        return self.typed(rows), np.arange(len(rows))
 
     def seen(self, points: Any) -> NDArray[np.float64]:
         """Return points at rest in the axes, origin and unit of this laboratory."""
@@ -149,7 +155,9 @@ class Laboratory:
     def before(self, points: Any, frames: NDArray[np.int64]) -> NDArray[np.float64]:
         """Take points (T, ..., 3) of some frames back to the laboratory before, in its order."""
         back = (np.asarray(points) / self.length - self.shift) @ self.matrix
-        time = self.data.n_frames - 1 - frames if self.backwards else frames
+        time = frames / self.every
+        if self.backwards:
+            time = self.data.n_frames - 1 - time
         away = time[:, None] * np.array(self.velocity)
         return self.forwards(back - away.reshape(-1, *[1] * (back.ndim - 2), 3))
 
@@ -217,6 +225,7 @@ def cases(draw: st.DrawFn, dtype: str | None = None) -> tuple[Data, Change]:
         length=length,
         time=draw(st.sampled_from([60.0, 1e-3, 1.0])),
         backwards=draw(st.sampled_from([True, False])),
+        every=draw(st.sampled_from([2, 1, 3])),
         left_out=dtype == "int64" or draw(st.sampled_from([True, False])),
         dtype=dtype,
     )

@@ -48,20 +48,26 @@ class Law:
 
 TRANSLATION = {"velocity": "a velocity of the whole body is part of the translation"}
 FIRST_FRAME = {"backwards": "blocks and trends of time are counted from the first frame"}
+BLUR = {"every": "an exposure of up to dt is fitted"}
 SPIN = {"backwards": "a mean rotation is removed in the axes at the beginning of a step"}
 STATE = {"backwards": "the state of a step is that at its beginning"}
 REFERENCE = {"backwards": "the reference orientation is renewed forwards in time"}
 NAMED_FIRST = {"backwards": "ids and labels are given in the first frame"}
-AT_REST = dict.fromkeys(["velocity", "backwards", "left_out"], "takes one configuration, no times")
+AT_REST = dict.fromkeys(
+    ["velocity", "backwards", "every", "left_out"], "takes one configuration, no times"
+)
+NO_ROWS = {"every": "takes one row after the other"}
 NO_TIME = {"time": "takes no times"}
 NO_POSITIONS = dict.fromkeys(
-    ["turn", "shift", "velocity", "backwards", "left_out"], "takes coefficients, no positions"
+    ["turn", "shift", "velocity", "backwards", "every", "left_out"],
+    "takes coefficients, no positions",
 )
 IN_DOUBLE = {"dtype": "takes results of other functions, which are in double precision"}
 NO_LIST = {"order": "takes one value"}
 IMAGES = {
     "order": "spheres in images have no labels",
     "velocity": "images of each time are found alone; render_stack moves the spheres",
+    "every": "a movie has all of its frames",
     "left_out": "a movie has all of its frames",
 }
 OF_FILES = {"length": "a voxel of a file must be of 1 nm to 20 um"}
@@ -72,18 +78,24 @@ NO_UNITS = dict.fromkeys(["length", "time"], "takes pure numbers")
 
 
 def curve(found, length=0):
-    """Return the numbers of a curve."""
+    """Return the numbers of a curve at the lags of its pairs."""
+    known = found.n_pairs > 0
     return [
-        (found.lagtime, 0, 1),
-        (found.value, length, 0),
-        (found.stderr, length, 0),
-        (found.n_pairs, 0, 0),
+        (found.lagtime[known], 0, 1),
+        (found.value[known], length, 0),
+        (found.stderr[known], length, 0),
+        (found.n_pairs[known], 0, 0),
     ]
 
 
 def estimate(found, length=0):
     """Return the numbers of a diffusion coefficient."""
     return [(found.value, length, -1), (found.stderr, length, -1), (found.ci95, length, -1)]
+
+
+def step_of(m):
+    """Return the shortest time between poses, of which dt is a part where frames are left out."""
+    return np.diff(m.time[m.fitted]).min()
 
 
 def pose_numbers(lab):
@@ -96,7 +108,7 @@ def pose_numbers(lab):
     return [
         (m.sigma, 1, 0),
         (m.R, 1, 0),
-        (m.dt, 0, 1),
+        (step_of(m), 0, 1),
         (np.sort(np.linalg.norm(m.template, axis=1)), 1, 0),
         (lab.before(center, frames[m.fitted]), 0, 0),
         (turned, 0, 0),
@@ -130,7 +142,7 @@ def verdict(m):
 
 
 def distribution(m):
-    found = perrin.van_hove(m, lag=3 * m.dt, quantity="angle")
+    found = perrin.van_hove(m, lag=3 * step_of(m), quantity="angle")
     return [(found.edges, 0, 0), (found.density, 0, 0), (found.alpha2, 0, 0)]
 
 
@@ -160,7 +172,8 @@ def sampling(m):
 
 
 def line(m):
-    return estimate(perrin.fit_line(perrin.msad(m), lag_range=(3 * m.dt, 12 * m.dt)))
+    lag_range = 2.5 * step_of(m), 12.5 * step_of(m)
+    return estimate(perrin.fit_line(perrin.msad(m), lag_range=lag_range))
 
 
 def of_motion(numbers, without=None, **options):
@@ -170,8 +183,10 @@ def of_motion(numbers, without=None, **options):
 
 OF_MOTION = {
     "track_rotation": Law(pose_numbers),
-    "coupled_tensor": of_motion(coupled, TRANSLATION),
-    "diffusion_tensor": of_motion(lambda m: [(perrin.diffusion_tensor(m).principal_values, 0, -1)]),
+    "coupled_tensor": of_motion(coupled, TRANSLATION | BLUR),
+    "diffusion_tensor": of_motion(
+        lambda m: [(perrin.diffusion_tensor(m).principal_values, 0, -1)], BLUR
+    ),
     "estimate_diffusion": of_motion(lambda m: estimate(perrin.estimate_diffusion(m))),
     "estimate_diffusion, of translation": of_motion(
         lambda m: estimate(perrin.estimate_diffusion(m, quantity="translation", drift=True), 2)
@@ -190,7 +205,7 @@ OF_MOTION = {
     "msad_vector": of_motion(lambda m: curve(perrin.msad_vector(m))),
     "msd": of_motion(lambda m: curve(perrin.msd(m), 2), TRANSLATION),
     "msd, without drift": of_motion(lambda m: curve(perrin.msd(m, drift=True), 2)),
-    "non_gaussian": of_motion(lambda m: [(perrin.non_gaussian(m).value, 0, 0)], FIRST_FRAME),
+    "non_gaussian": of_motion(lambda m: curve(perrin.non_gaussian(m))[:2], FIRST_FRAME),
     "orientation_correlation": of_motion(lambda m: curve(perrin.orientation_correlation(m))),
     "quaternion_covariance": of_motion(quaternions),
     "threshold_displacement": of_motion(threshold, REFERENCE),
@@ -254,7 +269,7 @@ def identity(lab):
     """Return the particles of a track whose labels of two particles are exchanged halfway."""
     x, frames = lab.positions()
     place = np.argsort(lab.order or range(lab.data.n))
-    later = frames >= lab.data.n_frames // 2
+    later = frames >= lab.data.n_frames // 2 * lab.every
     x[np.ix_(later, place[[0, 1]])] = x[np.ix_(later, place[[1, 0]])]
     with pytest.warns(perrin.IdentityWarning, match="2 labels pass to another particle"):
         found = perrin.settle_identity(x, times=lab.dt * frames)
@@ -412,10 +427,12 @@ def similarities(lab):
     ]
 
 
-WHOLE = {"left_out": "a frame without particles has no rotation, and is refused"}
+WHOLE = dict.fromkeys(
+    ["every", "left_out"], "a frame without particles has no rotation, and is refused"
+)
 
 OF_POSITIONS = {
-    "add_noise": Law(noise_added, NO_TIME),
+    "add_noise": Law(noise_added, NO_TIME | NO_ROWS),
     "analyze": Law(analysis, SPIN),
     "cluster_positions": Law(there_and_back, NO_TIME),
     "estimate_rod": Law(direction),
@@ -424,11 +441,14 @@ OF_POSITIONS = {
     "identify": Law(identified, NO_TIME),
     "judge_quality": Law(rigidity),
     "judge_quality, in time": Law(
-        changes_in_time, {"left_out": "neighbours, eighths and shares are those of the rows given"}
+        changes_in_time,
+        dict.fromkeys(
+            ["left_out", "every"], "neighbours, eighths and shares are those of the rows"
+        ),
     ),
     "kabsch": Law(fitted_rotations, NO_TIME | WHOLE),
     "msd, of positions": Law(
-        displacement, TRANSLATION | {"left_out": "has no numbers of frames: a gap is NaN"}
+        displacement, TRANSLATION | {"left_out": "has no numbers of frames: a gap is NaN"} | NO_ROWS
     ),
     "napari_layers": Law(layers, SPIN),
     "noise_floor": Law(floor, NO_TIME | AT_REST),
