@@ -431,3 +431,12 @@ def test_free_particles_share_their_drift():
     assert np.abs(np.subtract(curve.drift, [0.3, 0.0, -0.1])).max() < 4 * error
     found = fit_line(curve)
     assert abs(found.value - 0.2) < 3.5 * found.stderr
+
+
+def test_the_lag_of_the_whole_track_has_neither_msd_nor_error_without_its_drift():
+    """The velocity is that from the first to the last frame, so that nothing is left to measure."""
+    walk = np.zeros((5, 1, 3))
+    walk[:, 0, 0] = [0, 3, 1, 2, 4]  # less one per frame: exactly 0 at both ends
+    curve = msd(walk, dt=1.0, drift=True)
+    assert np.isnan([curve.value[-1], curve.stderr[-1]]).all()
+    assert np.isfinite(curve.stderr[:-1]).all()
