@@ -117,7 +117,7 @@ class Laboratory:
     @property
     def voxels(self) -> NDArray[np.int64]:
         """Shift of an image, whole voxels along z, y and x."""
-        return np.rint(self.shift).astype(int) % 4
+        return np.rint(self.shift).astype(int) % 2
 
     def typed(self, values: Any) -> Any:
         """Return numbers in the type of this laboratory, which holds them exactly."""

@@ -709,7 +709,7 @@ OF_NUMBERS = {
 # ---- functions of images ------------------------------------------------------------------------
 
 VOXEL, OPTICS = 0.3125, perrin.Optics(DIAMETER, (0.4, 0.15), CameraNoise(3.0, 4.0))
-SHAPE, FRAMES = (28, 28, 28), 4
+SHAPE, FRAMES, MIDDLE = (32, 28, 28), 4, (4.2, 4.2, 4.8)
 
 
 @functools.lru_cache(maxsize=4)
@@ -719,10 +719,10 @@ def recorded(seed):
         perrin.Cluster.touching(4, DIAMETER), D_R=5e-3, D_T=1e-4, dt=DT, n_frames=FRAMES, rng=seed
     )
     movie = perrin.render_stack(
-        truth, centers=[(4.0, 4.0, 4.0)], voxel=[VOXEL] * 3, shape=SHAPE, diameter=DIAMETER,
+        truth, centers=[MIDDLE], voxel=[VOXEL] * 3, shape=SHAPE, diameter=DIAMETER,
         psf=(0.4, 0.15, 0.15), photons=75, background=5, gain=3, read_noise=2, offset=5, rng=seed,
     )  # fmt: skip
-    return np.stack([movie.frame(i) for i in range(FRAMES)]), truth.positions() + 4.0
+    return np.stack([movie.frame(i) for i in range(FRAMES)]), truth.positions() + MIDDLE
 
 
 def moved(lab, frames):
