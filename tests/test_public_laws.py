@@ -764,7 +764,6 @@ def located(lab):
     away = np.linalg.norm(found[["x", "y", "z"]].to_numpy()[:, None] - true_places(lab), axis=2)
     return [
         (length + away.min(axis=0), 1, 0),
-        (found["mass"].to_numpy()[away.argmin(axis=0)], 0, 0),
         (found["sigma_z"].to_numpy()[away.argmin(axis=0)], 1, 0),
     ]
 
