@@ -764,7 +764,7 @@ def located(lab):
     away = np.linalg.norm(found[["x", "y", "z"]].to_numpy()[:, None] - true_places(lab), axis=2)
     return [
         (length + away.min(axis=0), 1, 0),
-        (found["sigma_z"].to_numpy()[away.argmin(axis=0)], 1, 0),
+        (length + found["sigma_z"].to_numpy()[away.argmin(axis=0)], 1, 0),
     ]
 
 
