@@ -26,11 +26,13 @@ import warnings
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from pupil import Lens, behind_pinhole
 from scipy.ndimage import gaussian_filter, map_coordinates, spline_filter
 from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
 
 DIAMETER, DT, D_R, D_T = 2.45, 0.73, 0.0049, 0.0385
+LENS = Lens()
 SHAPES = {
     1: np.zeros((1, 3)),
     2: np.array([[-0.5, 0, 0], [0.5, 0, 0]]),
@@ -46,8 +48,15 @@ class Microscope:
 
     shape: tuple[int, int, int] = (40, 128, 128)
     voxel: tuple[float, float, float] = (0.25, 0.2, 0.2)
-    psf: str = "gaussian"
+    psf: str = "gaussian"  # or "tails" (30 % of it Lorentzian), "confocal", "lens", "widefield"
     blur: tuple[float, float] = (0.4, 0.15)  # z and xy, um; of the Gaussian
+    tilt: float = 0.0  # of the optical axis, or of the light sheet where there is one, degrees
+    sheet: float = 0.0  # standard deviation of the thickness of a light sheet, um
+    lens: Lens = LENS
+    pinhole: float = 0.0  # diameter, Airy units of 1.22 wavelengths over the aperture
+    cover: float | None = None  # depth of the first plane below the cover glass, um
+    haze: float = 0.0  # light of the spheres that is spread over 3 um, in units of the rest
+    stage_noise: float = 0.0  # of the height of every frame, um
     photons: float = 40.0
     background: float = 3.0
     gain: float = 3.0
@@ -168,50 +177,103 @@ def focal_field(rho, z, *, wave, aperture=1.3, index=1.4):
     return np.abs(np.einsum("zt,rt,t->zr", phase, j0(k * np.outer(rho, np.sin(theta))), ring)) ** 2
 
 
-def blurred_ball(light, *, grid=0.05, half=(3.4, 2.3), diameter=DIAMETER):
+def blurred_ball(light, *, grid=0.05, half=(3.4, 2.3), diameter=DIAMETER, depth=0.0):
     """Return spline coefficients of the image of one ball on a fine grid, and its spacing, um.
 
     The image is scaled to 1 at its middle, that of a shell at its brightest place.
     """
+    if light.psf in ("lens", "widefield", "tails"):
+        half = (5.0, 3.4)
     n = [2 * round(half[0] / grid), 2 * round(half[1] / grid), 2 * round(half[1] / grid)]
     k = [2 * np.pi * np.fft.fftfreq(m, grid) for m in n]
     kz, ky, kx = np.meshgrid(*k, indexing="ij", sparse=True)
     kr = np.sqrt(kz**2 + ky**2 + kx**2) * diameter / 2
     kr[0, 0, 0] = 1e-6
     ball = np.sin(kr) / kr if light.shell else 3 * (np.sin(kr) - kr * np.cos(kr)) / kr**3
-    if light.psf == "gaussian":
-        otf = np.exp(-((kz * light.blur[0]) ** 2 + (ky**2 + kx**2) * light.blur[1] ** 2) / 2)
+    if light.psf in ("gaussian", "tails"):
+        otf = gaussian_transfer(light, kz, ky, kx)
     else:
-        z, y, x = ((np.arange(m) - m // 2) * grid for m in n)
-        fine = np.linspace(0, 1.5 * half[1], 400)
-        point = focal_field(fine, z, wave=0.488) * focal_field(fine, z, wave=0.52)
-        r = np.hypot(*np.meshgrid(y, x, indexing="ij"))
-        psf = np.stack([np.interp(r, fine, line) for line in point])
-        otf = np.fft.fftn(np.fft.ifftshift(psf))
+        otf = np.fft.fftn(np.fft.ifftshift(point_image(light, n, grid, depth)))
     image = np.fft.fftshift(np.fft.ifftn(ball * otf).real)
     brightest = image.max() if light.shell else image[tuple(m // 2 for m in n)]
     return spline_filter(image / brightest, order=3), grid
 
 
-def exposed(bodies, light, *, frame, table, dust=(), tables=None):
-    """Return the mean number of photons of every voxel of one frame.
+def gaussian_transfer(light, kz, ky, kx):
+    """Return the transfer function of a Gaussian, its axis tilted towards x, with its tails."""
+    width = np.diag(np.square([light.blur[0], light.blur[1], light.blur[1]]))
+    turn = np.radians(light.tilt)
+    if light.sheet:
+        normal = np.array([np.cos(turn), 0.0, np.sin(turn)])
+        width = np.linalg.inv(np.linalg.inv(width) + np.outer(normal, normal) / light.sheet**2)
+    elif turn:
+        c, s = np.cos(turn), np.sin(turn)
+        axes = np.array([[c, 0, -s], [0, 1, 0], [s, 0, c]])
+        width = axes @ width @ axes.T
+    k = (kz, ky, kx)
+    square = sum(width[i, j] * k[i] * k[j] for i in range(3) for j in range(3))
+    if light.psf == "gaussian":
+        return np.exp(-square / 2)
+    return 0.7 * np.exp(-square / 2) + 0.3 * np.exp(-np.sqrt(square))
 
-    `tables` are those of the spheres of `bodies` in their order, where they differ.
+
+def point_image(light, n, grid, depth):
+    """Return the image (z, y, x) of a point at this depth below the cover glass, um."""
+    z, y, x = ((np.arange(m) - m // 2) * grid for m in n)
+    if light.psf == "confocal":
+        fine = np.linspace(0, 1.5 * n[1] * grid / 2, 400)
+        point = focal_field(fine, z, wave=0.488) * focal_field(fine, z, wave=0.52)
+        r = np.hypot(*np.meshgrid(y, x, indexing="ij"))
+        return np.stack([np.interp(r, fine, line) for line in point])
+    lens, where = light.lens, {"depth": depth, "scale": 1.0}
+    if light.cover is not None:
+        # The user's heights are those of the spheres: the mean shift of the focus is taken off.
+        middle = light.cover + light.box[2] / 2
+        where["scale"] = lens.focal_scale(middle)
+    emitted = lens.intensity(n[1], grid, z, wave=0.52, **where)
+    if light.psf == "widefield":
+        return emitted
+    radius = light.pinhole * 1.22 * 0.52 / lens.aperture / 2
+    excited = lens.intensity(n[1], grid, z, wave=0.488, **where)
+    return excited * behind_pinhole(emitted, grid, radius)
+
+
+def image_of(light, *, diameter=DIAMETER):
+    """Return the image of a ball as a function of its height: spline coefficients and spacing."""
+    if light.cover is None:
+        table = blurred_ball(light, diameter=diameter)
+        return lambda _: table
+    heights = np.linspace(0, light.box[2], 6)
+    tables = [blurred_ball(light, diameter=diameter, depth=light.cover + z) for z in heights]
+
+    def between(height):
+        at = np.clip(height / heights[1], 0, len(heights) - 1.001)
+        low, share = int(at), at - int(at)
+        one, two = tables[low][0], tables[low + 1][0]
+        return (1 - share) * one + share * two, tables[0][1]
+
+    return between
+
+
+def exposed(bodies, light, *, frame, image, dust=(), images=None, lift=0.0):
+    """Return the mean light of every voxel of one frame, all bodies `lift` um higher.
+
+    `image` is that of a sphere by its height; `images` are those of the spheres of `bodies` in
+    their order, where they differ.
     """
-    coefficients, grid = table
-    tables = iter(tables or ())
+    images = iter(images or ())
     planes, ny, nx = light.shape
     voxel = np.array(light.voxel)
-    size = np.array(coefficients.shape)
     out = np.zeros(light.shape)
-    reach = size / 2 * grid - 2 * grid
     # Paths have one position per plane where planes are drawn at their own times.
     per = planes if light.plane_time else 1
     for b in (*bodies, *dust):
         for j, bright in enumerate(b.bright):
-            coefficients, _ = next(tables, table)
-            x = b.path[frame * per : frame * per + per, j]
+            x = b.path[frame * per : frame * per + per, j] + [0, 0, lift]
             x = np.broadcast_to(x, (planes, 3))
+            coefficients, grid = next(images, image)(x[:, 2].mean())
+            size = np.array(coefficients.shape)
+            reach = size / 2 * grid - 2 * grid
             z = np.arange(planes) * voxel[0] - x[:, 2]
             seen = np.flatnonzero(np.abs(z) < reach[0])
             if not seen.size or bright == 0:
@@ -232,25 +294,28 @@ def exposed(bodies, light, *, frame, table, dust=(), tables=None):
             )
             part = map_coordinates(coefficients, where, order=3, prefilter=False)
             out[seen, y0:y1, x0:x1] += bright * np.maximum(part, 0)
+    if light.haze:
+        out += light.haze * gaussian_filter(out, 3.0 / voxel)
     return out
 
 
 def recorded(bodies, light, *, n_frames, rng, dust=(), radius_spread=0.0):
     """Return the movie (T, z, y, x) as the camera writes it."""
-    table, tables = blurred_ball(light), None
+    image, images = image_of(light), None
     if radius_spread:
         n = sum(len(b.bright) for b in bodies)
         sizes = DIAMETER * (1 + radius_spread * rng.normal(size=n))
-        tables = [blurred_ball(light, diameter=size) for size in sizes]
+        images = [image_of(light, diameter=size) for size in sizes]
     camera = Camera(light, rng)
     depth = 1 - light.depth_loss * np.arange(light.shape[0]) / max(light.shape[0] - 1, 1)
     movie = np.empty((n_frames, *light.shape), dtype="uint8" if light.bits == 8 else "uint16")
     for i in range(n_frames):
         left = (1 - light.bleached) ** (i / max(n_frames - 1, 1))
+        lift = rng.normal(0, light.stage_noise) if light.stage_noise else 0.0
         mean = (
             light.photons
             * left
-            * exposed(bodies, light, frame=i, table=table, dust=dust, tables=tables)
+            * exposed(bodies, light, frame=i, image=image, dust=dust, images=images, lift=lift)
         )
         mean = mean * depth[:, None, None] + light.background
         movie[i] = camera.grey_levels(mean)
@@ -383,6 +448,30 @@ CASES = {
     "radii spread by 5 %": Case(radius_spread=0.05),
     "radii spread by 8 %": Case(radius_spread=0.08),
     "shells": Case(light=replace(BASE, shell=True)),
+    "Lorentzian tails": Case(light=replace(BASE, psf="tails")),
+    "tilted axis": Case(light=replace(BASE, tilt=20.0)),
+    "astigmatism and coma": Case(
+        light=replace(BASE, psf="lens", lens=Lens(astigmatism=0.1, coma=0.1))
+    ),
+    "pinhole of 4 Airy units": Case(light=replace(BASE, psf="lens", pinhole=4.0)),
+    "index 1.42 at the cover glass": Case(
+        light=replace(BASE, psf="lens", lens=Lens(index=1.518, medium=1.42), cover=0.0)
+    ),
+    "index 1.33 at the cover glass": Case(
+        light=replace(BASE, psf="lens", lens=Lens(index=1.518, medium=1.33), cover=0.0)
+    ),
+    "index 1.33, 20 um deep": Case(
+        light=replace(BASE, psf="lens", lens=Lens(index=1.518, medium=1.33), cover=20.0)
+    ),
+    "widefield": Case(light=replace(BASE, psf="widefield")),
+    "haze": Case(light=replace(BASE, haze=2.0)),
+    "light sheet tilted by 20 degrees": Case(
+        light=replace(BASE, blur=(1.0, 0.15), sheet=0.4, tilt=20.0)
+    ),
+    "light sheet tilted by 45 degrees": Case(
+        light=replace(BASE, blur=(1.0, 0.15), sheet=0.4, tilt=45.0)
+    ),
+    "stage noise": Case(light=replace(BASE, stage_noise=0.115)),
     "two colours": Case((4, 4, 4, 3, 3), shift=(0.12, -0.09, 0.2)),
     "5 photons": Case(light=replace(BASE, photons=5)),
     "sCMOS mild": Case(light=replace(BASE, **SCMOS, pixel_spread=0.03, pixel_offset=2.0)),
@@ -505,7 +594,8 @@ def measured_psf(light):
         for x in places
     ]
     rng = np.random.default_rng(0)
-    mean = fine.photons * exposed(bodies, fine, frame=0, table=bead) + fine.background
+    light = exposed(bodies, fine, frame=0, image=lambda _: bead)
+    mean = fine.photons * light + fine.background
     grey = fine.gain * rng.poisson(mean) + rng.normal(0, fine.read_noise, fine.shape)
     stack = perrin.open_stack(np.round(np.clip(grey, 0, None))[None], voxel=fine.voxel, dt=1.0)
     return perrin.measure_point_spread(stack, diameter=0.1)
