@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import os
 import threading
-import uuid
 import warnings
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
@@ -207,7 +206,7 @@ class _FileFrames:
         name: str = "",
     ) -> None:
         self.path, self.pick, self.several, self._contents = path, pick, several, contents
-        self.name = name or uuid.uuid4().hex
+        self.name = name or os.urandom(16).hex()
         self._lock = threading.Lock()
 
     @staticmethod
