@@ -41,7 +41,11 @@ class Law:
 
     numbers: Callable[[Laboratory], list[tuple[Any, float, float]]]
     without: dict[str, str] = field(default_factory=dict)
-    rel: float = 1e-6
+    rel: float = 1e-9
+
+
+# Relative difference at which searches for a maximum end.
+SEARCH = 1e-6
 
 
 # ---- why a change does not apply ----------------------------------------------------------------
@@ -191,7 +195,7 @@ OF_MOTION = {
     "estimate_diffusion, of translation": of_motion(
         lambda m: estimate(perrin.estimate_diffusion(m, quantity="translation", drift=True), 2)
     ),
-    "fit_anomalous": of_motion(anomalous),
+    "fit_anomalous": of_motion(anomalous, rel=SEARCH),
     "fit_confined": of_motion(confined),
     "fit_gls": of_motion(lambda m: estimate(perrin.fit_gls(perrin.msad(m)))),
     "fit_line": of_motion(line),
@@ -213,7 +217,7 @@ OF_MOTION = {
         lambda m: [(perrin.translation_rotation_correlation(m).value, 0, 0)], TRANSLATION | STATE
     ),
     "van_hove": of_motion(distribution),
-    "viscoelastic_moduli": of_motion(moduli),
+    "viscoelastic_moduli": of_motion(moduli, rel=SEARCH),
 }
 
 # ---- functions of positions and of tables -------------------------------------------------------
@@ -684,7 +688,7 @@ OF_NUMBERS = {
     "cramer_rao": Law(bound, NO_UNITS | NO_POSITIONS | NO_LIST),
     "decoupling_ratio": Law(decoupling, AT_REST, BY_SERIES),
     "diffusion_correlation": Law(correlation, NO_POSITIONS | IN_DOUBLE),
-    "fit_power_law": Law(power, NO_POSITIONS | IN_DOUBLE),
+    "fit_power_law": Law(power, NO_POSITIONS | IN_DOUBLE, SEARCH),
     "fit_trend": Law(trend, NO_POSITIONS),
     "gravitational_height": Law(height_of_fall, AT_REST, BY_SERIES),
     "leave_one_out": Law(influence, NO_POSITIONS | IN_DOUBLE),
@@ -909,7 +913,9 @@ OF_ARRAYS = [
 def test_single_precision_and_whole_numbers_are_read_as_they_are(name, dtype):
     """The numbers are those of the same positions in double precision."""
     data = Data(n_frames=24, gaps=frozenset(), absent=None)
-    holds(LAWS[name], data, Change(length=1024.0, dtype=dtype))
+    # A unit of 2^10 leaves the numbers of a series the same; single precision has an eps of 1e-7.
+    law = LAWS[name] if name in OF_IMAGES else replace(LAWS[name], rel=1e-9)
+    holds(law, data, Change(length=1024.0, dtype=dtype))
 
 
 def test_every_public_function_has_laws():
