@@ -274,7 +274,8 @@ def water_viscosity(temperature: float) -> float:
         faults.append(f"temperature: expected {low} to {high} K, liquid water, got {temperature!r}")
     refuse(faults)
     # A number of numpy in single precision would be computed with in single precision.
-    return sum(a * (float(temperature) / 300) ** b for a, b in _WATER_TERMS) * 1e-6
+    reduced = float(temperature) / 300
+    return float(sum(a * reduced**b for a, b in _WATER_TERMS)) * 1e-6
 
 
 def _weight(body: Mobility, density_difference: float) -> float:
