@@ -187,22 +187,22 @@ def of_motion(numbers, without=None, **options):
 
 OF_MOTION = {
     "track_rotation": Law(pose_numbers),
-    "coupled_tensor": of_motion(coupled, TRANSLATION | BLUR),
+    "coupled_tensor": of_motion(coupled, TRANSLATION | BLUR, rel=SEARCH),
     "diffusion_tensor": of_motion(
-        lambda m: [(perrin.diffusion_tensor(m).principal_values, 0, -1)], BLUR
+        lambda m: [(perrin.diffusion_tensor(m).principal_values, 0, -1)], BLUR, rel=SEARCH
     ),
     "estimate_diffusion": of_motion(lambda m: estimate(perrin.estimate_diffusion(m))),
     "estimate_diffusion, of translation": of_motion(
         lambda m: estimate(perrin.estimate_diffusion(m, quantity="translation", drift=True), 2)
     ),
     "fit_anomalous": of_motion(anomalous, rel=SEARCH),
-    "fit_confined": of_motion(confined),
+    "fit_confined": of_motion(confined, rel=SEARCH),
     "fit_gls": of_motion(lambda m: estimate(perrin.fit_gls(perrin.msad(m)))),
     "fit_line": of_motion(line),
-    "fit_relaxation": of_motion(relaxation),
+    "fit_relaxation": of_motion(relaxation, rel=SEARCH),
     "fit_switching": of_motion(switching, STATE, rel=1e-4),  # where its search ends
-    "judge_motion": of_motion(verdict, FIRST_FRAME),
-    "judge_sampling": of_motion(sampling),
+    "judge_motion": of_motion(verdict, FIRST_FRAME, rel=SEARCH),
+    "judge_sampling": of_motion(sampling, rel=SEARCH),
     "long_time_diffusion": of_motion(lambda m: estimate(perrin.long_time_diffusion(m)), REFERENCE),
     "msad": of_motion(lambda m: curve(perrin.msad(m))),
     "msad_axes": of_motion(lambda m: [n for axis in perrin.msad_axes(m) for n in curve(axis)]),
@@ -437,7 +437,7 @@ WHOLE = dict.fromkeys(
 
 OF_POSITIONS = {
     "add_noise": Law(noise_added, NO_TIME | NO_ROWS),
-    "analyze": Law(analysis, SPIN),
+    "analyze": Law(analysis, SPIN, SEARCH),
     "cluster_positions": Law(there_and_back, NO_TIME),
     "estimate_rod": Law(direction),
     "estimate_rod, of translation": Law(rod_translation, TRANSLATION),
