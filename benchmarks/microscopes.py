@@ -829,17 +829,35 @@ def matched(report, bodies, case):
     return pairs, others
 
 
+def orientations(body, case):
+    """Return the true orientations (T) of a body when its own planes are recorded."""
+    shape, planes = body.shape - body.shape.mean(axis=0), case.light.shape[0]
+
+    def turned(x):
+        return Rotation.concatenate(
+            [Rotation.align_vectors(p - p.mean(axis=0), shape)[0] for p in x]
+        )
+
+    if not case.light.plane_time:
+        return turned(body.path)
+    # The instant of a pose is the mean time of the spheres, between those of two planes.
+    first = np.arange(case.n_frames) * planes
+    height = np.full(case.n_frames, planes / 2)
+    for _ in range(3):
+        at = np.clip(height, 0, planes - 1.001)
+        height = body.path[first + at.astype(int), :, 2].mean(axis=1) / case.light.voxel[0]
+    low = np.clip(height, 0, planes - 1.001).astype(int)
+    before, after = turned(body.path[first + low]), turned(body.path[first + low + 1])
+    between = (before.inv() * after).as_rotvec() * (height - low)[:, None]
+    return before * Rotation.from_rotvec(between)
+
+
 def turn_errors(result, body, case):
-    """Return errors (T, 3) of the orientation against the true one at the middle plane, mrad.
+    """Return errors (T, 3) of the orientation against the true one, mrad.
 
     Also the mean squared ratios (T,) of these errors to the stated ones, of three components.
     """
-    rows = rows_of(result)
-    x = instants(body, case)
-    shape = body.shape - body.shape.mean(axis=0)
-    true = Rotation.concatenate(
-        [Rotation.align_vectors(x[i] - x[i].mean(axis=0), shape)[0] for i in rows]
-    )
+    true = orientations(body, case)[rows_of(result)]
     fitted = np.isfinite(result.motion.rotation).all(axis=(1, 2))
     apart = true[fitted].inv() * Rotation.from_matrix(result.motion.rotation[fitted])
     mean = apart.mean()

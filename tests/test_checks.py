@@ -268,6 +268,35 @@ def test_the_mean_pair_distance_knows_its_error(repeats):
     assert 0.8 < np.std(off) < 1.5
 
 
+def turned_tetrahedra(rng, *, bodies=4, frames=3, z_scale=1.0, constant=0.0):
+    """Return touching tetrahedra in random directions; their spheres have constant errors."""
+    tables, body = [], perrin.Cluster.touching(4, CONTACT)
+    for k in range(bodies):
+        motion = perrin.simulate_motion(body, D_R=5e-3, dt=DT, n_frames=frames, rng=rng)
+        x = motion.positions() @ exp_map(rng.normal(size=3) * 2).T
+        x = x + rng.normal(0, constant, x.shape[1:]) + 20.0 * k
+        x[..., 2] *= z_scale
+        rows = perrin.positions_table(x).assign(cluster=k)
+        tables.append(rows.assign(particle=rows["particle"] + 4 * k))
+    return pd.concat(tables, ignore_index=True)
+
+
+def test_distances_along_z_are_compared_with_those_across(repeats):
+    """A z step that is 2 % too short is noted; steps as stated with constant errors are not."""
+    rng, ask = np.random.default_rng(8), {"contact": CONTACT, "axes": ["x", "y", "z"]}
+    note = noted(checks.distances_by_direction(turned_tetrahedra(rng, z_scale=0.98), **ask))
+    assert note.startswith("distances along z: touching spheres above each other read 2 +- ")
+    assert "nearer" in note
+    planar = turned_tetrahedra(rng, z_scale=0.98).drop(columns="z")
+    assert checks.distances_by_direction(planar, contact=CONTACT, axes=["x", "y"]) == NOTHING
+    false = [
+        checks.distances_by_direction(turned_tetrahedra(rng, constant=0.02), **ask) != NOTHING
+        for _ in range(repeats(6, 400))
+    ]
+    # The level of the test is 1 % on its bound, on either side.
+    assert np.mean(false) <= 0.05
+
+
 def test_clusters_with_other_numbers_of_spheres_are_reported():
     """Fewer, none, and more, as where two clusters meet."""
     x = table(20)

@@ -10,6 +10,7 @@ import pytest
 
 import perrin
 from perrin._text import number_text
+from perrin.images import Asymmetry
 from perrin.plot import figure_style
 from perrin.report import write
 from perrin.report.imaging_page import render_imaging_quality
@@ -51,6 +52,13 @@ def test_the_page_holds_the_numbers(report):
     sigma = np.median([c.motion.sigma for c in report.clusters])
     assert f"error from rigid bodies {number_text(1e3 * sigma, digits=2)} nm" in text
     assert "Warnings" not in text
+
+
+def test_the_shape_of_an_asymmetric_point_spread_is_named(report):
+    optics = replace(report.imaging.optics, asymmetry=Asymmetry(zx=0.02, zzz=1e-3))
+    other = replace(report, imaging=replace(report.imaging, optics=optics))
+    assert "shape of the point spread a tilted axis, a difference above and below" in text_of(other)
+    assert "shape of the point spread" not in text_of(report)
 
 
 def test_the_distance_of_touching_spheres_is_compared_with_the_contact_distance(report):

@@ -65,6 +65,13 @@ from perrin.images.formats.vendors import (
 )
 from perrin.images.formats.zeiss import czi, czi_times
 from perrin.images.imaging import Imaging, View, read_imaging, write_imaging
+from perrin.images.optics.asymmetry import (
+    Asymmetry,
+    asymmetry_tables,
+    change_of_image,
+    component_images,
+    plane_factors,
+)
 from perrin.images.optics.ball_image import BallBlur, PsfTail, SphereImage, SphereSpot, sphere_image
 from perrin.images.optics.crowd_equations import (
     CrowdIntensity,
@@ -91,6 +98,13 @@ from perrin.images.optics.crowd_fit import (
     missing_spheres,
     plausible_spheres,
 )
+from perrin.images.optics.flicker import (
+    LineChanges,
+    Lines,
+    VoxelPrecision,
+    find_flicker,
+    find_gain_spread,
+)
 from perrin.images.optics.learn import (
     CrowdSample,
     GroupSample,
@@ -116,7 +130,12 @@ from perrin.images.optics.learn_radial import (
     size_spread,
 )
 from perrin.images.optics.microscope import Camera, Light, RenderSettings, Scan
-from perrin.images.optics.neighbours import neighbour_variance
+from perrin.images.optics.neighbours import (
+    find_along_z,
+    find_neighbours,
+    neighbour_covariance,
+    neighbour_variance,
+)
 from perrin.images.optics.optics import CameraNoise, Optics
 from perrin.images.optics.pixel_pattern import (
     PixelPattern,
@@ -198,6 +217,7 @@ from perrin.images.stack import Stack, digest, file_contents, file_states, open_
 __all__ = [
     "Arrangement",
     "ArrayFrames",
+    "Asymmetry",
     "BallBlur",
     "Camera",
     "CameraNoise",
@@ -220,6 +240,8 @@ __all__ = [
     "Layout",
     "LearnedOptics",
     "Light",
+    "LineChanges",
+    "Lines",
     "LocatedFrame",
     "Method",
     "Optics",
@@ -249,14 +271,17 @@ __all__ = [
     "TransmissionNoise",
     "UsualImage",
     "View",
+    "VoxelPrecision",
     "Window",
     "array_contents",
+    "asymmetry_tables",
     "at_contact",
     "axes_without_colours",
     "axis_roles",
     "blurred_ball",
     "box_around",
     "brightness_parameters",
+    "change_of_image",
     "channel_index",
     "check_directories",
     "check_search",
@@ -265,6 +290,7 @@ __all__ = [
     "circle_cut",
     "clear_mass_cut",
     "clock_scale",
+    "component_images",
     "crowd_intensity",
     "crowd_piece",
     "cut_crowd_window",
@@ -280,9 +306,13 @@ __all__ = [
     "even_times",
     "file_contents",
     "file_states",
+    "find_along_z",
     "find_circles",
     "find_fading",
     "find_features",
+    "find_flicker",
+    "find_gain_spread",
+    "find_neighbours",
     "find_pixel_pattern",
     "find_shells",
     "first_image",
@@ -334,6 +364,7 @@ __all__ = [
     "nd2",
     "ndtiff",
     "needed",
+    "neighbour_covariance",
     "neighbour_variance",
     "ngff_scale",
     "noise_of_neighbours",
@@ -350,6 +381,7 @@ __all__ = [
     "photon_transfer",
     "pixel_offsets",
     "plane_columns",
+    "plane_factors",
     "plausible_spheres",
     "pose_in",
     "profile_information",

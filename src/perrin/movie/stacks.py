@@ -563,6 +563,7 @@ def _with_checks(
         ) + checks.overlapping_places(seen, contact=contact)
     found += (
         checks.pair_distance_bias(features, contact=contact, refine=method.refine, axes=bodies.axes)
+        + checks.distances_by_direction(features, contact=contact, axes=bodies.axes)
         + checks.Findings(tuple(bodies.warnings), tuple(bodies.notes))
         + contrast
         + checks.missing_spheres(features, sizes=bodies.sizes, contact=contact, frames=read)
@@ -593,6 +594,7 @@ def _channel_checks(stack: Stack, located: Located, features: pd.DataFrame) -> c
         + checks.depth_dimming(features)
         + checks.unrefined_spheres(features)
         + checks.noise_in_common(located.method.optics)
+        + checks.asymmetric_point_spread(located.method.optics)
     )
 
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from perrin._text import number_text
+from perrin._text import listed, number_text
 from perrin.geometry.shapes import pair_distances
 from perrin.movie.checks import bleaching
 from perrin.plot.imaging import imaging_of, least_turns
@@ -299,6 +299,10 @@ def _channel_facts(imaging: Imaging, optics: Optics) -> list[Fact]:
         wide_z, wide = (number_text(width) for width in optics.tail.psf)
         share = f"{100 * optics.tail.share:.0f} % of the intensity, {wide_z} µm along z"
         tail = [("tail of the point spread", f"{wide} µm", share)]
+    if optics.asymmetry is not None:
+        kinds = listed(optics.asymmetry.kinds)
+        remark = "no even body of revolution; the fits allow for it to first order"
+        tail.append(("shape of the point spread", kinds, remark))
     if optics.spread:
         expected += f"; spheres differ by {100 * optics.spread:.1f} % (standard deviation)"
     return [

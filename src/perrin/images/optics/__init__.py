@@ -1,5 +1,12 @@
 """The image of a sphere: optics, noise, fits to images, and rendered movies."""
 
+from perrin.images.optics.asymmetry import (
+    Asymmetry,
+    asymmetry_tables,
+    change_of_image,
+    component_images,
+    plane_factors,
+)
 from perrin.images.optics.ball_image import BallBlur, PsfTail, SphereImage, SphereSpot, sphere_image
 from perrin.images.optics.crowd_equations import (
     CrowdIntensity,
@@ -26,6 +33,13 @@ from perrin.images.optics.crowd_fit import (
     missing_spheres,
     plausible_spheres,
 )
+from perrin.images.optics.flicker import (
+    LineChanges,
+    Lines,
+    VoxelPrecision,
+    find_flicker,
+    find_gain_spread,
+)
 from perrin.images.optics.learn import (
     CrowdSample,
     GroupSample,
@@ -51,7 +65,12 @@ from perrin.images.optics.learn_radial import (
     size_spread,
 )
 from perrin.images.optics.microscope import Camera, Light, RenderSettings, Scan
-from perrin.images.optics.neighbours import neighbour_variance
+from perrin.images.optics.neighbours import (
+    find_along_z,
+    find_neighbours,
+    neighbour_covariance,
+    neighbour_variance,
+)
 from perrin.images.optics.optics import CameraNoise, Optics
 from perrin.images.optics.pixel_pattern import (
     PixelPattern,
@@ -90,6 +109,7 @@ from perrin.images.optics.window_fit import (
 
 __all__ = [
     "Arrangement",
+    "Asymmetry",
     "BallBlur",
     "Camera",
     "CameraNoise",
@@ -104,6 +124,8 @@ __all__ = [
     "ImageVariations",
     "LearnedOptics",
     "Light",
+    "LineChanges",
+    "Lines",
     "Optics",
     "Patch",
     "PatchFit",
@@ -122,10 +144,14 @@ __all__ = [
     "StackLike",
     "TransmissionNoise",
     "UsualImage",
+    "VoxelPrecision",
     "Window",
+    "asymmetry_tables",
     "blurred_ball",
     "box_around",
     "brightness_parameters",
+    "change_of_image",
+    "component_images",
     "crowd_intensity",
     "crowd_piece",
     "cut_crowd_window",
@@ -133,6 +159,10 @@ __all__ = [
     "cut_window",
     "detection_chi2",
     "drawing_faults",
+    "find_along_z",
+    "find_flicker",
+    "find_gain_spread",
+    "find_neighbours",
     "find_pixel_pattern",
     "first_image",
     "fit_brightness",
@@ -146,11 +176,13 @@ __all__ = [
     "log_likelihood",
     "measure_point_spread",
     "missing_spheres",
+    "neighbour_covariance",
     "neighbour_variance",
     "noise_of_neighbours",
     "normal_equations",
     "photon_transfer",
     "pixel_offsets",
+    "plane_factors",
     "plausible_spheres",
     "profile_information",
     "project",

@@ -12,6 +12,13 @@ import numpy as np
 
 from perrin._arrays import Bools, Floats, frozen, require_positive
 from perrin.compiled.loading import compiled_kernels
+from perrin.images.optics.asymmetry import (
+    Asymmetry,
+    asymmetry_tables,
+    change_of_image,
+    component_images,
+    plane_factors,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -150,6 +157,9 @@ class SphereImage:
         The second, wider Gaussian of the point spread; `psf` and `blur` are of the first.
     spread : float
         Relative standard deviation of the diameters; 0 where all spheres are equal.
+    asymmetry : Asymmetry or None
+        By what the point spread differs from an even body of revolution. It changes the value of
+        the image; the gradient is that without it.
 
     Examples
     --------
@@ -170,6 +180,8 @@ class SphereImage:
     _spacing: tuple[float, float]
     _sizes: Floats
     _tables: Floats
+    asymmetry: Asymmetry | None = None
+    _changes: Floats | None = None
 
     @property
     def reach(self) -> tuple[float, float, float]:
@@ -228,6 +240,8 @@ class SphereImage:
     def on_voxels(self, mask: Bools, centers: Floats, sizes: Floats) -> Floats:
         """Return the images of spheres and their gradients on the voxels of a mask.
 
+        Both are those without the asymmetry of the point spread, see `changes_on_voxels`.
+
         Parameters
         ----------
         mask : ndarray of bool, shape (nz, ny, nx)
@@ -244,9 +258,10 @@ class SphereImage:
         """
         kernels = compiled_kernels()
         if kernels is None:
+            even = replace(self, asymmetry=None, _changes=None)
             whole = np.zeros((len(centers), 4, *mask.shape))
             for layer, center, size in zip(whole, centers, sizes, strict=True):
-                spot = self.sized(size).spot(center, mask.shape)
+                spot = even.sized(size).spot(center, mask.shape)
                 layer[(0, *spot.box)] = spot.value
                 layer[(slice(1, None), *spot.box)] = spot.gradient
             kept = whole.reshape(4 * len(centers), -1).take(np.flatnonzero(mask), axis=1)
@@ -258,6 +273,74 @@ class SphereImage:
         lengths = (np.array(length) for length in (self.voxel, self.reach, self._spacing))
         kernels.spots(mask, np.ascontiguousarray(centers), *lengths, tables, out)
         return out
+
+    def changes_on_voxels(self, mask: Bools, centers: Floats, sizes: Floats) -> Floats:
+        """Return what the asymmetry adds to the images of spheres on the voxels of a mask, (n, m).
+
+        The parameters are those of `on_voxels`.
+        """
+        whole = np.zeros((len(centers), *mask.shape))
+        if self.asymmetry is not None:
+            for layer, center, size in zip(whole, centers, sizes, strict=True):
+                box, offsets = self._covered(center, mask.shape)
+                layer[box] = self._change(*(x * float(np.exp(-size)) for x in offsets))
+        return whole[:, mask]
+
+    def _change(self, z: Floats, y: Floats, x: Floats) -> Floats:
+        """Return what the asymmetry of the point spread adds to the image, on a grid of offsets."""
+        assert self.asymmetry is not None
+        assert self._changes is not None
+        along, across = self._splines(z, y, x, knots=self._changes)
+        change = change_of_image(
+            *(self.asymmetry, self._changes),
+            along=along,
+            across=across,
+            z=z,
+            plane=plane_factors(y, x),
+        )
+        return change.reshape(len(z), len(y), len(x))
+
+    def asymmetry_knots(self) -> Floats:
+        """Return the tables of the derivatives by the asymmetry, for `asymmetry_spot`."""
+        z, rho = self._grid
+        tables = asymmetry_tables(self._ball.intensity, z, rho, blur=self.blur)
+        return np.stack([_spline_knots(table) for table in tables])
+
+    def asymmetry_spot(
+        self, knots: Floats, center: Floats, shape: tuple[int, ...]
+    ) -> tuple[tuple[slice, slice, slice], Floats]:
+        """Return the voxels that the image covers, and its derivatives (12, nz, ny, nx).
+
+        The derivatives are by the components of `Asymmetry`.
+
+        Parameters
+        ----------
+        knots : ndarray, shape (7, ...)
+            What `asymmetry_knots` returns.
+        center : ndarray, shape (3,)
+            Position (z, y, x), um.
+        shape : tuple of int
+            Shape of the array.
+        """
+        box, (z, y, x) = self._covered(center, shape)
+        along, across = self._splines(z, y, x, knots=knots)
+        found = component_images(knots, along=along, across=across, z=z, plane=plane_factors(y, x))
+        return box, found.reshape(len(found), len(z), len(y), len(x))
+
+    @property
+    def _grid(self) -> tuple[Floats, Floats]:
+        """Heights and distances of the table's knots, um."""
+        z, rho = (
+            h * np.arange(n - 2) for h, n in zip(self._spacing, self._knots.shape, strict=True)
+        )
+        return z, rho
+
+    def _splines(self, z: Floats, y: Floats, x: Floats, *, knots: Floats) -> tuple[Floats, Floats]:
+        """Return the splines of knots (..., a, b) on a grid, (nz, a) and (ny nx, b)."""
+        rho = np.hypot(y[:, None], x)
+        along, _ = _cubic_splines(np.abs(z) / self._spacing[0], knots.shape[-2])
+        across, _ = _cubic_splines(rho.ravel() / self._spacing[1], knots.shape[-1])
+        return along, across
 
     def slope_spot(
         self, slopes: Floats, center: Floats, shape: tuple[int, ...], *, deviation: float = 0.0
@@ -278,10 +361,8 @@ class SphereImage:
         """
         box, offsets = self._covered(center, shape)
         z, y, x = (offset * float(np.exp(-deviation)) for offset in offsets)
-        rho = np.hypot(y[:, None], x)
-        along, _ = _cubic_splines(np.abs(z) / self._spacing[0], slopes.shape[1])
-        across, _ = _cubic_splines(rho.ravel() / self._spacing[1], slopes.shape[2])
-        return box, (along @ slopes @ across.T).reshape(len(slopes), len(z), *rho.shape)
+        along, across = self._splines(z, y, x, knots=slopes)
+        return box, (along @ slopes @ across.T).reshape(len(slopes), len(z), len(y), len(x))
 
     def slopes(self, pairs: Sequence[tuple[BallBlur, BallBlur]], difference: float) -> Floats:
         """Return the tables of derivatives (k, ...) by k parameters, for `slope_spot`.
@@ -293,9 +374,7 @@ class SphereImage:
         difference : float
             The change of the parameter between the two.
         """
-        z, rho = (
-            h * np.arange(n - 2) for h, n in zip(self._spacing, self._knots.shape, strict=True)
-        )
+        z, rho = self._grid
         tables = [larger.intensity(z, rho) - smaller.intensity(z, rho) for larger, smaller in pairs]
         return np.stack([_spline_knots(table / difference) for table in tables])
 
@@ -338,6 +417,8 @@ class SphereImage:
         by_z = along_slope @ self._knots * (-np.sign(z) / self._spacing[0])[:, None]
         outward = across_slope / (self._spacing[1] * np.where(rho > 0, rho, 1.0)).reshape(-1, 1)
         value = (profile @ across.T).reshape(shape)
+        if self._changes is not None:
+            value += self._change(z, y, x)
         by_rho = (profile @ outward.T).reshape(shape)
         gradient = np.empty((3, *shape))
         np.matmul(by_z, across.T, out=gradient[0].reshape(len(z), rho.size))
@@ -355,6 +436,7 @@ def sphere_image(
     spread: float = 0.0,
     measured: PointSpread | None = None,
     shell: bool = False,
+    asymmetry: Asymmetry | None = None,
 ) -> SphereImage:
     """Tabulate a ball convolved with an anisotropic point spread and with the voxels.
 
@@ -374,6 +456,8 @@ def sphere_image(
         A measured point spread, in place of `psf` and `tail`: `psf` is that of its first Gaussian.
     shell : bool
         The surface of the sphere is fluorescent, in place of all of it.
+    asymmetry : Asymmetry, optional
+        By what the point spread differs from an even body of revolution.
 
     Returns
     -------
@@ -435,9 +519,12 @@ def sphere_image(
         balls = [ball._replace(diameter=diameter * float(np.exp(size))) for size in sizes]
         tables = np.stack([_spline_knots(sphere.intensity(z, rho)) for sphere in balls])
     frozen(knots, sizes, tables)
-    return SphereImage(
+    image = SphereImage(
         diameter, psf, voxel, (blur_z, blur), tail, spread, ball, knots, spacing, sizes, tables
     )
+    if asymmetry is None or not any(asymmetry):
+        return image
+    return replace(image, asymmetry=asymmetry, _changes=image.asymmetry_knots())
 
 
 def _size_range(spread: float) -> float:

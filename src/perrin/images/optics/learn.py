@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from perrin.errors import NoSpheresError
+from perrin.images.optics.asymmetry import Asymmetry
 from perrin.images.optics.ball_image import BallBlur, PsfTail, SphereImage, sphere_image
 from perrin.images.optics.crowd_equations import profile_information, slopes_of_spheres
 from perrin.images.optics.crowd_fit import fit_crowd
@@ -59,6 +60,11 @@ _SHELL_MISFIT = 1.3
 # Spread of the diameters with which they are fitted first; a spread is used if it is at least this,
 # and increases the logarithm of the likelihood of the diameters by at least this.
 _FIRST_SPREAD, _LEAST_SPREAD, _LEAST_SPREAD_GAIN = 0.06, 0.007, 5.0
+
+# A component of the asymmetry of the point spread is used if it is this many standard errors of the
+# noise from 0, and if it is not 0 at this level by its scatter between the samples. Its search has
+# so many rounds.
+_SHOWN_ASYMMETRY, _ASYMMETRY_LEVEL, _ASYMMETRY_ROUNDS = 5.0, 1e-4, 4
 
 # Change of the spread, relative to it, at which its search ends.
 _SPREAD_CONVERGED = 0.05
@@ -232,6 +238,8 @@ class ImageParameters:
         A point spread that was measured, and is not searched for.
     shell : bool
         The surface of the spheres is fluorescent, in place of all of them.
+    asymmetry : Asymmetry or None
+        By what the point spread differs from an even body of revolution.
 
     Examples
     --------
@@ -245,6 +253,7 @@ class ImageParameters:
     spread: float = 0.0
     measured: PointSpread | None = None
     shell: bool = False
+    asymmetry: Asymmetry | None = None
 
     @property
     def voxel_blur(self) -> Floats:
@@ -278,6 +287,7 @@ class ImageParameters:
                 spread=self.spread,
                 measured=self.measured,
                 shell=self.shell,
+                asymmetry=self.asymmetry,
             )
         (psf_z, psf), *wider = (
             np.sqrt(np.square(blur) - self.voxel_blur**2).tolist() for _, blur in ball.components
@@ -292,6 +302,7 @@ class ImageParameters:
             tail=tail,
             spread=self.spread,
             shell=self.shell,
+            asymmetry=self.asymmetry,
         )
 
     def with_tail(self) -> ImageParameters:
@@ -362,7 +373,8 @@ class ImageParameters:
             stderr = (float(image.diameter * error[0]), 0.0, 0.0)
             return Optics(
                 *(image.diameter, image.psf, noise, stderr, None, self.spread, self.measured),
-                self.shell,
+                shell=self.shell,
+                asymmetry=self.asymmetry,
             )
         # The blur is the root of the sum of squares of point spread and voxel.
         factor = np.array([image.diameter, *(np.square(image.blur) / np.array(image.psf))])
@@ -370,6 +382,7 @@ class ImageParameters:
         return Optics(
             *(image.diameter, image.psf, noise, (a, b, c), image.tail, self.spread),
             shell=self.shell,
+            asymmetry=self.asymmetry,
         )
 
 
@@ -383,13 +396,16 @@ class ImageVariations(NamedTuple):
     slopes : ndarray, shape (k, ...)
         Tables of the derivatives (`SphereImage.slopes`); of a single Gaussian the last one is that
         by the share of a tail, at a share of 0.
+    asymmetry : ndarray or None
+        Tables of the derivatives by the asymmetry of the point spread, if they are wanted.
     """
 
     image: SphereImage
     slopes: Floats
+    asymmetry: Floats | None = None
 
     @classmethod
-    def about(cls, parameters: ImageParameters) -> ImageVariations:
+    def about(cls, parameters: ImageParameters, *, asymmetry: bool = False) -> ImageVariations:
         """Return image and derivatives at the values of parameters."""
         values, d = parameters.values, _PARAMETER_DIFFERENCE
         pairs = [
@@ -401,7 +417,8 @@ class ImageVariations(NamedTuple):
             wide = np.concatenate([values, [2 * d], values[1:] + np.log(_WIDENED)])
             pairs.append((parameters.ball(wide), plain))
         image = parameters.image()
-        return cls(image, image.slopes(pairs, 2 * d))
+        knots = image.asymmetry_knots() if asymmetry else None
+        return cls(image, image.slopes(pairs, 2 * d), knots)
 
 
 class SampleFit(NamedTuple):
@@ -596,6 +613,10 @@ class GroupSample(NamedTuple):
         window = self.window(image)
         fit = fit_window(window, image, noise, FreeCenters(self.centers))
         slope = window.slopes(image, variations.slopes, fit.centers, fit.brightness, fit.sizes)
+        if variations.asymmetry is not None:
+            knots = variations.asymmetry
+            more = window.asymmetry_slopes(image, knots, fit.centers, fit.brightness)
+            slope = np.concatenate([slope, more])
         # The Schur complement of the information, with the fit's own parameters eliminated.
         weighted = fit.precision.times(slope)
         nuisance = fit.precision.times(fit.jacobian)
@@ -810,8 +831,10 @@ def fit_samples(
     is used if the likelihood of the groups between them is the larger one. Where the diameters of
     single spheres, fitted with a wide distribution, differ by more than their errors, their spread
     is learned too: that of greatest likelihood, and the mean diameter is the mean of the spheres.
-    Crowds have one Gaussian and one diameter. Samples are left out first, because dust among them
-    would appear as a tail or as a spread, and all are judged again by the image that is found.
+    A point spread that is no body of revolution, or differs above and below the focus, changes the
+    image by derivatives of it (`Asymmetry`), whose factors are found where they are significant.
+    Crowds have one even Gaussian and one diameter. Samples are left out first, because dust among
+    them would appear as a tail or as a spread, and all are judged again by the image that is found.
     """
     psf = np.array([max(voxel[0], 0.15 * diameter), max(voxel[1] / 2, 0.06 * diameter)])
     start = ImageParameters(np.log([diameter, 1.0, 1.0]), voxel)
@@ -853,7 +876,7 @@ def fit_samples(
             found = _settled(kept, found.parameters, found.noise)
     elif found is not plain:
         found, left_out = _without_dust(found)
-    found = found.with_neighbours()
+    found = _with_asymmetry(found.with_neighbours())
     optics = found.parameters.optics(found.noise, found.information)
     return LearnedOptics(optics, replace(_usual_of(found), left_out=left_out))
 
@@ -1064,6 +1087,60 @@ def _with_tail(plain: _Settled) -> _Settled:
     except NoSpheresError:
         # The Gaussian has settled, and the sum of two Gaussians has not: the first one is used.
         return plain
+
+
+def _with_asymmetry(even: _Settled) -> _Settled:
+    """Return the parameters with an asymmetric point spread, if the residuals show one.
+
+    Its components multiply derivatives of the image, so that they are the solution of linear
+    equations together with the other parameters; few rounds are enough. Those are kept that differ
+    from 0 by more than the noise and by more than the scatter between the samples, in which
+    spheres that move during a scan, say, have images that are asymmetric in one way or another.
+    """
+    of_groups = all(isinstance(s, GroupSample) for s in even.samples)
+    if not of_groups or even.noise.neighbours:
+        return even
+    parameters, samples, n = even.parameters, even.samples, len(even.parameters.values)
+    count = len(Asymmetry._fields)
+    values, used, settled = np.zeros(count), np.ones(count, dtype=np.bool_), even
+    for number in range(_ASYMMETRY_ROUNDS):
+        variations = ImageVariations.about(parameters, asymmetry=True)
+        fits = [s.fit(variations, even.noise) for s in samples]
+        samples = [s._replace(centers=fit.centers) for s, fit in zip(samples, fits, strict=True)]
+        size = len(fits[0].score) - count  # those of the image, and of the share of a tail
+        kept = np.r_[:n, size + np.flatnonzero(used)]
+        information = np.sum([fit.information for fit in fits], axis=0)[np.ix_(kept, kept)]
+        scores = np.array([fit.score[kept] for fit in fits])
+        if number == 0:
+            covariance = np.linalg.pinv(information, hermitian=True)
+            used = _significant(scores @ covariance, np.diag(covariance))[n:]
+            if not used.any():
+                return even
+            kept = np.r_[:n, n + np.flatnonzero(used)]
+            information, scores = information[np.ix_(kept, kept)], scores[:, kept]
+        step = np.linalg.pinv(information, hermitian=True) @ scores.sum(axis=0)
+        values[used] += step[n:]
+        moved = parameters.moved(information[:n, :n], information[:n, :n] @ step[:n])
+        parameters = replace(moved, asymmetry=Asymmetry(*values.tolist()))
+        settled = even._replace(
+            parameters=parameters, samples=samples, fits=fits, information=information[:n, :n]
+        )
+        if step @ information @ step < _STEP_IN_ERRORS**2:
+            break
+    return settled
+
+
+def _significant(shares: Floats, variance: Floats) -> Bools:
+    """Return which sums of the shares (N, k) of samples are not 0, by noise and by scatter."""
+    from scipy.special import stdtrit
+
+    total, freedom = shares.sum(axis=0), len(shares) - 1
+    if freedom < 1:
+        return np.zeros(len(variance), dtype=np.bool_)
+    scatter = np.sum((shares - total / len(shares)) ** 2, axis=0) * len(shares) / freedom
+    bound = stdtrit(freedom, 1 - _ASYMMETRY_LEVEL / 2)
+    by_noise = np.abs(total) > _SHOWN_ASYMMETRY * np.sqrt(variance)
+    return np.asarray(by_noise & (np.abs(total) > bound * np.sqrt(scatter)))
 
 
 def photon_transfer(expected: Floats, variance: Floats) -> CameraNoise:

@@ -9,6 +9,7 @@ import numpy as np
 
 from perrin._arrays import to_plain
 from perrin._display import Shown
+from perrin.images.optics.asymmetry import Asymmetry
 from perrin.images.optics.ball_image import PsfTail, SphereImage, sphere_image
 from perrin.images.optics.point_spread import PointSpread
 
@@ -148,6 +149,9 @@ class Optics(Shown):
         there is no `tail`.
     shell : bool
         The surface of the spheres is fluorescent, in place of all of them.
+    asymmetry : Asymmetry or None
+        By what the point spread differs from a body of revolution that is even along z; None where
+        the movie shows no difference.
 
     Examples
     --------
@@ -164,6 +168,7 @@ class Optics(Shown):
     spread: float = 0.0
     measured: PointSpread | None = None
     shell: bool = False
+    asymmetry: Asymmetry | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """Return values that JSON holds.
@@ -182,7 +187,8 @@ class Optics(Shown):
         # What most movies do not have is not written.
         shell = {"shell": True} if self.shell else {}
         measured = {} if self.measured is None else {"measured": self.measured.to_dict()}
-        return entry | measured | shell
+        uneven = {} if self.asymmetry is None else {"asymmetry": self.asymmetry._asdict()}
+        return entry | measured | shell | uneven
 
     @classmethod
     def from_dict(cls, entry: Mapping[str, Any]) -> Optics:
@@ -211,7 +217,9 @@ class Optics(Shown):
             measured = PointSpread.from_dict(entry["measured"])
         size, spread = entry["diameter"], entry.get("spread", 0.0)
         shell = bool(entry.get("shell", False))
-        return cls(size, (psf_z, psf), noise, (a, b, c), tail, spread, measured, shell)
+        uneven = entry.get("asymmetry")
+        asymmetry = None if uneven is None else Asymmetry(**uneven)
+        return cls(size, (psf_z, psf), noise, (a, b, c), tail, spread, measured, shell, asymmetry)
 
     def image(self, voxel: tuple[float, float, float]) -> SphereImage:
         """Return the table of the sphere's image for voxels (z, y, x), um."""
@@ -223,4 +231,5 @@ class Optics(Shown):
             spread=self.spread,
             measured=self.measured,
             shell=self.shell,
+            asymmetry=self.asymmetry,
         )

@@ -7,12 +7,14 @@ poses, which belong to a body, are in (x, y, z).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
 
 from perrin.geometry.rigid import pose_slopes
 from perrin.geometry.rotations import exp_map
+from perrin.images.optics.asymmetry import Asymmetry
 from perrin.images.optics.flicker import VoxelPrecision
 from perrin.images.optics.neighbours import neighbour_covariance
 
@@ -25,6 +27,10 @@ if TYPE_CHECKING:
 
 # Step of a sphere over the blur at which the search ends: far below any standard error.
 _WINDOW_STEP_CONVERGED = 1e-4
+
+# What an asymmetric point spread adds to an image is computed again where a sphere has moved by
+# this, over the blur: it changes by a tenth of the image's own change.
+_CHANGE_CONVERGED = 0.02
 
 _MAX_WINDOW_ROUNDS = 40
 
@@ -62,11 +68,19 @@ class Window(NamedTuple):
     def spots(self, image: SphereImage, centers: Floats, sizes: Floats) -> tuple[Floats, Floats]:
         """Return unit images (n, m) of spheres on these voxels and their gradients (n, 3, m).
 
-        `sizes` (n,) are deviations of the logarithms of the diameters.
+        `sizes` (n,) are deviations of the logarithms of the diameters. Without the asymmetry of the
+        point spread.
         """
         origin = np.array([s.start for s in self.box]) * np.array(image.voxel)
         layers = image.on_voxels(self.mask, centers - origin, sizes)
         return layers[:, 0], layers[:, 1:]
+
+    def changes(self, image: SphereImage, centers: Floats, sizes: Floats) -> Floats | None:
+        """Return what the asymmetry of the point spread adds to `spots` (n, m), None if nothing."""
+        if image.asymmetry is None:
+            return None
+        origin = np.array([s.start for s in self.box]) * np.array(image.voxel)
+        return image.changes_on_voxels(self.mask, centers - origin, sizes)
 
     def size_slopes(self, image: SphereImage, centers: Floats, sizes: Floats) -> Floats:
         """Return the derivatives (n, m) of unit images by the logarithms of the diameters."""
@@ -99,6 +113,26 @@ class Window(NamedTuple):
         whole = np.zeros((len(slopes), *self.mask.shape))
         for center, bright, size in zip(centers - origin, brightness, sizes, strict=True):
             box, value = image.slope_spot(slopes, center, self.mask.shape, deviation=size)
+            whole[(slice(None), *box)] += bright * value
+        return whole[:, self.mask]
+
+    def asymmetry_slopes(
+        self, image: SphereImage, knots: Floats, centers: Floats, brightness: Floats
+    ) -> Floats:
+        """Return derivatives (12, m) of the intensity by the components of an `Asymmetry`.
+
+        Parameters
+        ----------
+        image : SphereImage
+        knots : ndarray, shape (7, ...)
+            What `SphereImage.asymmetry_knots` returns.
+        centers, brightness : ndarray, shape (n, 3), (n,)
+            The spheres.
+        """
+        origin = np.array([s.start for s in self.box]) * np.array(image.voxel)
+        whole = np.zeros((len(Asymmetry._fields), *self.mask.shape))
+        for center, bright in zip(centers - origin, brightness, strict=True):
+            box, value = image.asymmetry_spot(knots, center, self.mask.shape)
             whole[(slice(None), *box)] += bright * value
         return whole[:, self.mask]
 
@@ -316,6 +350,8 @@ def fit_window(
     plane or line, the gain of a pixel one of all its voxels, of known variance, over which the
     likelihood is averaged. Noise that neighbours in a plane have in common (of an image that was
     compressed or smoothed) leaves the estimate as it is, and its covariance is that of this noise.
+    What an asymmetric point spread adds to the images is fixed at the centres of the start, and
+    computed again at those that are found, until these stay.
     Where diameters differ (`SphereImage.spread`), that of every sphere is fitted too, with a
     Gaussian distribution of its logarithm about the mean.
 
@@ -333,7 +369,10 @@ def fit_window(
     (array([[3.01, 3.12, 3.23]]), array([100.]))
     """
     lines = VoxelPrecision.lines_of(window.mask, noise)
-    state = _fit_state(window, image, noise, start, lines)
+    state_at = partial(_fit_state, window, image=image, noise=noise, lines=lines)
+    changed_at = start.centers
+    change = window.changes(image, changed_at, np.zeros(len(changed_at)))
+    state = state_at(start, change=change)
     damping, converged = 1e-3, False
     for _ in range(_MAX_WINDOW_ROUNDS):
         information, score = state.normal_equations(window)
@@ -348,17 +387,23 @@ def fit_window(
         sizes[:free] = np.clip(
             sizes[:free] + step[k : k + free], -image.size_range, image.size_range
         )
-        trial = _fit_state(
-            window, image, noise, moved, lines, linear=state.linear + step[k + free :], sizes=sizes
-        )
+        linear = state.linear + step[k + free :]
+        trial = state_at(moved, change=change, linear=linear, sizes=sizes)
         if state.deviance(window, trial) > state.deviance(window, state) * (1 + 1e-12):
             damping *= 10.0
             continue
-        change = np.abs(trial.arrangement.centers - state.arrangement.centers).max()
+        shift = np.abs(trial.arrangement.centers - state.arrangement.centers).max()
         state, damping = trial, damping / 10.0
-        if change < _WINDOW_STEP_CONVERGED * image.blur[1]:
-            converged = True
-            break
+        if shift < _WINDOW_STEP_CONVERGED * image.blur[1]:
+            moved_since = np.abs(state.arrangement.centers - changed_at).max()
+            if change is None or moved_since < _CHANGE_CONVERGED * image.blur[1]:
+                converged = True
+                break
+            changed_at = state.arrangement.centers
+            change = window.changes(image, changed_at, state.sizes)
+            state = state_at(
+                state.arrangement, change=change, linear=state.linear, sizes=state.sizes
+            )
     information, _ = state.normal_equations(window)
     k, free = state.n_arrangement, state.n_sizes
     variance = np.linalg.pinv(information, hermitian=True)
@@ -442,18 +487,24 @@ def _least_squares(data: Floats, design: Floats, noise: CameraNoise, expected: F
 
 def _fit_state(
     window: Window,
+    arrangement: Arrangement,
+    *,
     image: SphereImage,
     noise: CameraNoise,
-    arrangement: Arrangement,
     lines: Lines | None,
-    *,
+    change: Floats | None,
     linear: Floats | None = None,
     sizes: Floats | None = None,
 ) -> _FitState:
-    """Return the state of an arrangement; `linear` None is fitted by least squares."""
+    """Return the state of an arrangement; `linear` None is fitted by least squares.
+
+    `change` is what the asymmetry of the point spread adds to the images of the spheres.
+    """
     if sizes is None:
         sizes = np.zeros(len(arrangement.centers))
     value, gradient = window.spots(image, arrangement.centers, sizes)
+    if change is not None:
+        value = value + change
     if linear is None:
         design = np.concatenate([value, window.background])
         flat = np.full_like(window.data, window.data.mean())

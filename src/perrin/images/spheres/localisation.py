@@ -495,7 +495,13 @@ def _with_optics(
         learned = fit_optics(sample, method, voxel=voxel)
         if not learned.optics.shell:
             return replace(method, optics=learned.optics, usual=learned.usual)
-        fault = NoSpheresError("shells were found, and their centres were not")
+        fault = NoSpheresError(
+            "the images at the places found are neither those of balls nor of shells that a point "
+            "spread of limited size blurs: in a stack of a wide-field microscope, without pinhole "
+            "or light sheet, every plane has light from all depths, and spheres above each other "
+            "cannot be separated; the diameter or the contact may be wrong as well. Record with "
+            "optical sectioning, or keep the positions found first (refine=None)"
+        )
     except NoSpheresError as error:
         fault = error
     if method.search.dark:
