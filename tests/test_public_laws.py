@@ -885,6 +885,8 @@ def holds(law, data, change):
 @pytest.mark.usefixtures("no_tensors", "no_verdicts")
 def test_numbers_follow_every_change_of_the_laboratory(name, repeats):
     """With --long 25 changes are drawn; otherwise the simplest, which changes everything."""
+    if name == "analyze_stack" and not repeats(0, 1):
+        pytest.skip("--long: two whole movies, of which tests/test_run.py has others")
 
     @settings(
         max_examples=repeats(1, 25), derandomize=True, database=None, deadline=None,
@@ -899,11 +901,11 @@ def test_numbers_follow_every_change_of_the_laboratory(name, repeats):
     every_change()
 
 
-SLOW = {"analyze", "analyze_stack", "measure_point_spread", "napari_layers"}
-# Functions that take arrays or numbers; the types that slow ones are given are drawn with --long.
+SLOW = {"analyze", "napari_layers"}
+# Functions that take arrays or numbers; for slow ones and images types are drawn with --long.
 OF_ARRAYS = [
     name
-    for name, law in (OF_POSITIONS | OF_NUMBERS | OF_IMAGES).items()
+    for name, law in (OF_POSITIONS | OF_NUMBERS).items()
     if "dtype" not in law.without and name not in SLOW
 ]
 
@@ -914,8 +916,7 @@ def test_single_precision_and_whole_numbers_are_read_as_they_are(name, dtype):
     """The numbers are those of the same positions in double precision."""
     data = Data(n_frames=24, gaps=frozenset(), absent=None)
     # A unit of 2^10 leaves the numbers of a series the same; single precision has an eps of 1e-7.
-    law = LAWS[name] if name in OF_IMAGES else replace(LAWS[name], rel=1e-9)
-    holds(law, data, Change(length=1024.0, dtype=dtype))
+    holds(replace(LAWS[name], rel=1e-9), data, Change(length=1024.0, dtype=dtype))
 
 
 def test_every_public_function_has_laws():
