@@ -71,6 +71,7 @@ from perrin.images.optics.asymmetry import (
     change_of_image,
     component_images,
     plane_factors,
+    significant_sums,
 )
 from perrin.images.optics.ball_image import BallBlur, PsfTail, SphereImage, SphereSpot, sphere_image
 from perrin.images.optics.crowd_equations import (
@@ -398,6 +399,7 @@ __all__ = [
     "sequence_files",
     "serve",
     "settled_image",
+    "significant_sums",
     "size_faults",
     "size_spread",
     "slopes_of_spheres",

@@ -6,6 +6,7 @@ from perrin.images.optics.asymmetry import (
     change_of_image,
     component_images,
     plane_factors,
+    significant_sums,
 )
 from perrin.images.optics.ball_image import BallBlur, PsfTail, SphereImage, SphereSpot, sphere_image
 from perrin.images.optics.crowd_equations import (
@@ -190,6 +191,7 @@ __all__ = [
     "residual_maps",
     "saturated_share",
     "settled_image",
+    "significant_sums",
     "size_spread",
     "slopes_of_spheres",
     "sphere_chi2",

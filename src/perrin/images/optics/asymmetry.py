@@ -9,14 +9,19 @@ import numpy as np
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from perrin._arrays import Floats
+    from perrin._arrays import Bools, Floats
 
 # Step of the finite differences of the image, in units of the blur along each axis.
 _STEP = 0.1
 
 # Where a table is divided by the height or by the distance from the axis, their least values in
 # units of the blur: the quotient is even, and differs from its limit by the square of this.
-_LEAST_DISTANCE = 0.1
+_NEAR_AXIS = 0.1
+
+
+# A component is used if it is this many standard errors of the noise from 0, and if it is not 0 at
+# this level by its scatter between the samples.
+_FROM_NOISE, _SAMPLES_LEVEL = 5.0, 1e-4
 
 
 class Asymmetry(NamedTuple):
@@ -120,7 +125,7 @@ def asymmetry_tables(
            [0.6, 0.4]])
     """
     a, h = _STEP * blur[0], _STEP * blur[1]
-    z, rho = np.maximum(z, _LEAST_DISTANCE * blur[0]), np.maximum(rho, _LEAST_DISTANCE * blur[1])
+    z, rho = np.maximum(z, _NEAR_AXIS * blur[0]), np.maximum(rho, _NEAR_AXIS * blur[1])
     known: dict[tuple[int, int, int], Floats] = {}
 
     def f(up: int, out: int, across: int = 0) -> Floats:
@@ -233,3 +238,36 @@ def component_images(
         for table, factor, odd, sign in _COMPONENTS
     ]
     return np.stack(rows)
+
+
+def significant_sums(shares: Floats, variance: Floats) -> Bools:
+    """Return which sums over samples are not 0, by their noise and by the scatter of the samples.
+
+    Parameters
+    ----------
+    shares : ndarray, shape (N, k)
+        What each of N samples adds to k sums.
+    variance : ndarray, shape (k,)
+        Variance of the sums by noise alone.
+
+    Returns
+    -------
+    ndarray of bool, shape (k,)
+        True beyond five standard errors of the noise and at a level of 1e-4 of Student's t of the
+        samples; False where there is one sample.
+
+    Examples
+    --------
+    >>> even, uneven = np.full(15, 0.6), np.where(np.arange(15) % 5, -0.4, 4.6)
+    >>> significant_sums(np.stack([even, uneven], axis=1), np.ones(2))
+    array([ True, False])
+    """
+    from scipy.special import stdtrit
+
+    total, freedom = shares.sum(axis=0), len(shares) - 1
+    if freedom < 1:
+        return np.zeros(len(variance), dtype=np.bool_)
+    scatter = np.sum((shares - total / len(shares)) ** 2, axis=0) * len(shares) / freedom
+    by_noise = np.abs(total) > _FROM_NOISE * np.sqrt(variance)
+    by_scatter = np.abs(total) > stdtrit(freedom, 1 - _SAMPLES_LEVEL / 2) * np.sqrt(scatter)
+    return np.asarray(by_noise & by_scatter)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from perrin.errors import NoSpheresError
-from perrin.images.optics.asymmetry import Asymmetry
+from perrin.images.optics.asymmetry import Asymmetry, significant_sums
 from perrin.images.optics.ball_image import BallBlur, PsfTail, SphereImage, sphere_image
 from perrin.images.optics.crowd_equations import profile_information, slopes_of_spheres
 from perrin.images.optics.crowd_fit import fit_crowd
@@ -61,10 +61,8 @@ _SHELL_MISFIT = 1.3
 # and increases the logarithm of the likelihood of the diameters by at least this.
 _FIRST_SPREAD, _LEAST_SPREAD, _LEAST_SPREAD_GAIN = 0.06, 0.007, 5.0
 
-# A component of the asymmetry of the point spread is used if it is this many standard errors of the
-# noise from 0, and if it is not 0 at this level by its scatter between the samples. Its search has
-# so many rounds.
-_SHOWN_ASYMMETRY, _ASYMMETRY_LEVEL, _ASYMMETRY_ROUNDS = 5.0, 1e-4, 4
+# Rounds of the search for an asymmetry of the point spread.
+_ASYMMETRY_ROUNDS = 4
 
 # Change of the spread, relative to it, at which its search ends.
 _SPREAD_CONVERGED = 0.05
@@ -1113,7 +1111,7 @@ def _with_asymmetry(even: _Settled) -> _Settled:
         scores = np.array([fit.score[kept] for fit in fits])
         if number == 0:
             covariance = np.linalg.pinv(information, hermitian=True)
-            used = _significant(scores @ covariance, np.diag(covariance))[n:]
+            used = significant_sums(scores @ covariance, np.diag(covariance))[n:]
             if not used.any():
                 return even
             kept = np.r_[:n, n + np.flatnonzero(used)]
@@ -1128,19 +1126,6 @@ def _with_asymmetry(even: _Settled) -> _Settled:
         if step @ information @ step < _STEP_IN_ERRORS**2:
             break
     return settled
-
-
-def _significant(shares: Floats, variance: Floats) -> Bools:
-    """Return which sums of the shares (N, k) of samples are not 0, by noise and by scatter."""
-    from scipy.special import stdtrit
-
-    total, freedom = shares.sum(axis=0), len(shares) - 1
-    if freedom < 1:
-        return np.zeros(len(variance), dtype=np.bool_)
-    scatter = np.sum((shares - total / len(shares)) ** 2, axis=0) * len(shares) / freedom
-    bound = stdtrit(freedom, 1 - _ASYMMETRY_LEVEL / 2)
-    by_noise = np.abs(total) > _SHOWN_ASYMMETRY * np.sqrt(variance)
-    return np.asarray(by_noise & (np.abs(total) > bound * np.sqrt(scatter)))
 
 
 def photon_transfer(expected: Floats, variance: Floats) -> CameraNoise:
