@@ -9,9 +9,10 @@ Usage: python benchmarks/load.py [--share S] [--jobs NAME ...]
 import argparse
 import json
 import resource
+import shutil
 import subprocess
 import sys
-import time
+import tempfile
 
 import numpy as np
 
@@ -68,16 +69,35 @@ def lags(n, rng):
     return lambda: (perrin.msad(motion), perrin.msd(motion))
 
 
-def stack(n, rng):
-    """Locate the spheres of a movie of n frames, and measure their cluster."""
+def rendered(n, rng):
+    """Return a movie of n frames of one cluster, which are rendered when they are read."""
     body = perrin.Cluster.touching(4, 2.45)
     motion = perrin.simulate_motion(body, D_R=5e-3, D_T=1e-4, dt=DT, n_frames=n, rng=rng)
-    movie = perrin.render_stack(
+    return perrin.render_stack(
         motion, centers=[(4.5, 4.5, 4.0)], voxel=(0.3, 0.25, 0.25), shape=(27, 36, 36),
         diameter=2.45, psf=(0.4, 0.15, 0.15), photons=75, background=5, gain=3, read_noise=2,
         offset=5, rng=7,
     )  # fmt: skip
+
+
+def stack(n, rng):
+    """Locate the spheres of a movie of n frames, and measure their cluster."""
+    movie = rendered(n, rng)
     return lambda: perrin.analyze_stack(movie, diameter=2.45, contact=2.45)
+
+
+def file(n, rng):
+    """Find the spheres in a TIFF file of n frames of 27 planes, with one worker."""
+    folder = tempfile.mkdtemp(prefix="perrin-")
+    path = f"{folder}/movie.ome.tif"
+    perrin.write_stack(rendered(n, rng), path)
+
+    def job():
+        with perrin.open_stack(path) as movie:
+            perrin.analyze_stack(movie, diameter=2.45, contact=2.45, refine=None, workers=1)
+        shutil.rmtree(folder)
+
+    return job
 
 
 JOBS = {
@@ -86,7 +106,16 @@ JOBS = {
     "particles of a body": (particles, 200),
     "lags of two curves": (lags, 20_000),
     "frames of a stack": (stack, 2000),
+    "frames of a file": (file, 2000),
 }
+
+
+def used():
+    """Return processor time, s, and largest memory, MiB, of this process and those it started."""
+    kinds = (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
+    usage = [resource.getrusage(kind) for kind in kinds]
+    seconds = sum(one.ru_utime + one.ru_stime for one in usage)
+    return seconds, max(one.ru_maxrss for one in usage) / 1024
 
 
 def measured(name, n):
@@ -108,12 +137,10 @@ def main():
     options = parser.parse_args()
     if options.one:
         job = JOBS[options.one][0](options.size, np.random.default_rng(1))
-        before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-        start = time.process_time()
+        start, before = used()
         job()
-        seconds = time.process_time() - start
-        largest = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-        print(json.dumps([seconds, before, largest]))
+        end, largest = used()
+        print(json.dumps([end - start, before, largest]))
         return
     for name in options.jobs:
         whole = max(int(JOBS[name][1] * options.share), 8)

@@ -892,6 +892,20 @@ def test_progress_in_a_log_is_a_line_for_each_tenth():
     assert lines[-1].startswith("writing the report, ")
 
 
+def test_progress_in_a_log_is_never_silent_for_minutes():
+    """Of 2000 frames of 20 s, a tenth of which takes an hour, a log gets a line a minute."""
+    from perrin.cli.progress import progress_lines
+
+    stream, now = io.StringIO(), iter(range(0, 100_000, 20))
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr("perrin.cli.progress._SHORT", 2.0)
+        show = progress_lines(stream, clock=lambda: float(next(now)))
+        for done in range(201):
+            show(done, 2000, "locating spheres")
+    seconds = [int(line.split()[-2]) for line in stream.getvalue().splitlines()]
+    assert seconds == [20, *range(80, 4001, 60), 4000]
+
+
 def test_kinds_of_bodies_are_rows_of_one_table():
     """Size, symmetry and number, then its coefficients; limits and what is not pooled in words."""
     from types import SimpleNamespace

@@ -431,3 +431,13 @@ def test_free_particles_share_their_drift():
     assert np.abs(np.subtract(curve.drift, [0.3, 0.0, -0.1])).max() < 4 * error
     found = fit_line(curve)
     assert abs(found.value - 0.2) < 3.5 * found.stderr
+
+
+def test_the_lag_of_the_whole_track_has_neither_msd_nor_error_without_its_drift():
+    """Nothing but rounding is left there, which is exactly 0 in one of these tracks at least."""
+    for seed in range(20, 40):
+        walk = np.random.default_rng(seed).integers(-8, 8, size=(9, 1, 3)).astype(float)
+        walk[[0, -1]], walk[4] = np.array([0.0, 8.0])[:, None, None], np.nan
+        curve = msd(walk, dt=1.0, drift=True)
+        assert np.isnan([curve.value[-1], curve.stderr[-1]]).all()
+        assert np.isfinite(curve.stderr[:-1]).all()

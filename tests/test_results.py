@@ -48,7 +48,7 @@ def test_the_table_has_a_row_for_every_cluster_and_quantity(report, tmp_path):
 
 def test_a_report_that_is_read_equals_the_written_one(report, tmp_path):
     """Equality compares numbers, texts, settings, positions and motions."""
-    report.save(tmp_path / "run")
+    perrin.write_run(report, tmp_path / "run")
     again = perrin.load_run(tmp_path / "run")
     assert again == report
     pd.testing.assert_frame_equal(again.to_frame(), report.to_frame())

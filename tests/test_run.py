@@ -351,6 +351,11 @@ def test_options_objects_are_the_same_as_keywords(movie_file):
         assert_identical(perrin.analyze_stack(stack, **asked, **objects), report)
         assert report.settings["arguments"]["drift"] is True
         assert (3, 3, "locating spheres") in seen
+        assert list(dict.fromkeys(title for *_, title in seen))[:8] == [
+            "taking the file's SHA-256", "learning mass cut and optics", "locating spheres",
+            "linking the spheres", "identifying the particles", "finding the clusters",
+            "fitting clusters", "estimating D_R and D_T",
+        ]  # fmt: skip
         for name, value in (keywords | {"workers": 0, "keep": None}).items():
             with pytest.raises(ValueError, match=rf"^{name}: stated .*; state it once"):
                 perrin.analyze_stack(stack, **asked, **objects, **{name: value})

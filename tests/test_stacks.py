@@ -424,6 +424,25 @@ def test_another_process_opens_the_file_again(tmp_path, movie):
             assert_same(other, movie)
 
 
+def test_a_worker_opens_a_file_once(tmp_path, movie, monkeypatch):
+    """It unpickles a stack with every piece of its work; one that is opened anew is another."""
+    from perrin.images import stack as module
+
+    write_stack(open_stack(movie, **GIVEN), tmp_path / "a.ome.tif")
+    opened, known = [], module.file_contents
+    monkeypatch.setattr(module, "file_contents", lambda *a: opened.append(a) or known(*a))
+    for _ in range(2):
+        with open_stack(tmp_path / "a.ome.tif") as stack:
+            sent = pickle.dumps(stack)
+        opened.clear()
+        pieces = [pickle.loads(sent), pickle.loads(sent)]
+        pieces.append(pickle.loads(pickle.dumps(pieces[1])))
+        for i, piece in enumerate(pieces):
+            np.testing.assert_array_equal(piece.frame(i), movie[i])
+        assert len(opened) == 1
+        pieces[0].close()
+
+
 def test_missing_reader_is_named(tmp_path, monkeypatch):
     """Without the library of a format the error names the package to install."""
     for suffix, module in ((".lif", "liffile"), (".nd2", "nd2"), (".ims", "h5py")):

@@ -424,6 +424,8 @@ def run(
     with claimed_output(run, output), state_kept_frames(output):
         check_resumable(output, parts="located", overwrite=overwrite)
         with ExitStack() as files:
+            progress = files.enter_context(shown_progress(quiet=quiet, unit="frames"))
+            progress(0, 0, "opening the stack")
             movies = [
                 files.enter_context(
                     perrin.open_stack(
@@ -438,7 +440,6 @@ def run(
                 )
                 for one in read_channels(channel)
             ]
-            progress = files.enter_context(shown_progress(quiet=quiet, unit="frames"))
             report = perrin.analyze_stack(
                 movies,
                 diameter=diameter,

@@ -1,4 +1,4 @@
-"""Progress of long work: a bar on a terminal, a line for each tenth in a log."""
+"""Progress of long work: a bar on a terminal, lines in a log."""
 
 from __future__ import annotations
 
@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 
 # Work that takes less than this, s, has no lines in a log.
 _SHORT = 2.0
+# Longest time without a line in a log, s, while parts of the work are finished.
+_SILENT = 60.0
 
 
 @contextmanager
@@ -50,7 +52,7 @@ def shown_progress(*, quiet: bool = False, unit: str = "") -> Iterator[Show]:
 
 
 def progress_lines(stream: TextIO, *, clock: Callable[[], float] = time.monotonic) -> Show:
-    """Return a function that writes a line for each tenth of the work, flushed.
+    """Return a function that writes a line for each tenth of the work, or each minute, flushed.
 
     Parameters
     ----------
@@ -65,25 +67,26 @@ def progress_lines(stream: TextIO, *, clock: Callable[[], float] = time.monotoni
 
     Examples
     --------
-    >>> seconds = iter([0.0, 3.0, 4.0, 5.0])
+    >>> seconds = iter([0.0, 3.0, 64.0, 65.0, 66.0])
     >>> show = progress_lines(sys.stdout, clock=lambda: next(seconds))
-    >>> for done in (0, 4, 5, 8):
-    ...     show(done, 8, "fitting clusters")
-    fitting clusters: 50 % (4 of 8), 3 s
-    fitting clusters: 60 % (5 of 8), 4 s
-    fitting clusters: 100 % (8 of 8), 5 s
+    >>> for done in (0, 40, 42, 43, 80):
+    ...     show(done, 80, "fitting clusters")
+    fitting clusters: 50 % (40 of 80), 3 s
+    fitting clusters: 52 % (42 of 80), 64 s
+    fitting clusters: 100 % (80 of 80), 66 s
     """
     calls: list[float] = []
-    written: dict[str, int] = {}
+    written: dict[str, tuple[int, float]] = {}
 
     def show(done: int, total: int, title: str) -> None:
         calls[1:] = [clock()]
         passed = calls[-1] - calls[0]
         tenth = 10 * done // total if total else 0
-        if passed < _SHORT or written.get(title, -1) >= tenth:
+        last, when = written.get(title, (-1, 0.0))
+        if passed < _SHORT or (last >= tenth and passed < when + _SILENT):
             return
-        written[title] = tenth
-        share = f": {10 * tenth} % ({done} of {total})" if total else ""
+        written[title] = tenth, passed
+        share = f": {100 * done // total} % ({done} of {total})" if total else ""
         print(f"{title}{share}, {passed:.0f} s", file=stream, flush=True)
 
     return show

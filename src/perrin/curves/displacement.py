@@ -272,7 +272,9 @@ def msd(
         curve.components, curve.n_pairs, lagtime=curve.lagtime, durations=durations
     )
     value = components.sum(axis=1)
-    ratio = np.divide(value, curve.value, out=np.ones_like(value), where=curve.value > 0)
+    # At the lag of the whole track the value is unknown, and what is left of it is rounding.
+    ratio = np.where(np.isnan(value), np.nan, 1.0)
+    np.divide(value, curve.value, out=ratio, where=curve.value > 0)
     return replace(curve, value=value, components=components, stderr=curve.stderr * ratio)
 
 

@@ -394,7 +394,8 @@ def condition_faults(**values: object) -> list[str]:
 
 def _thermal_volume(viscosity: float, temperature: float) -> float:
     """Return kT/eta, um^3/s."""
-    return BOLTZMANN * temperature / viscosity * 1e18
+    # A number of numpy in single precision would be computed with in single precision.
+    return BOLTZMANN * float(temperature) / float(viscosity) * 1e18
 
 
 def _valid_spheres(

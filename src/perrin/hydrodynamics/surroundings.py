@@ -127,7 +127,7 @@ def wall_factor(body: Mobility | float, *, height: float) -> WallFactor:
             "D_R"
         )
     refuse(faults)
-    x, y = by_T / height, by_R / height
+    x, y = float(by_T) / float(height), float(by_R) / float(height)
     return WallFactor(
         T_parallel=1 - 9 * x / 16 + x**3 / 8 - 45 * x**4 / 256 - x**5 / 16,
         T_perpendicular=1 - 9 * x / 8 + x**3 / 2 - x**5 / 8,
@@ -273,10 +273,12 @@ def water_viscosity(temperature: float) -> float:
     if not faults and not low <= temperature <= high:
         faults.append(f"temperature: expected {low} to {high} K, liquid water, got {temperature!r}")
     refuse(faults)
-    return float(sum(a * (temperature / 300) ** b for a, b in _WATER_TERMS)) * 1e-6
+    # A number of numpy in single precision would be computed with in single precision.
+    reduced = float(temperature) / 300
+    return float(sum(a * reduced**b for a, b in _WATER_TERMS)) * 1e-6
 
 
 def _weight(body: Mobility, density_difference: float) -> float:
     """Return the weight of a body less its buoyancy, N."""
     refuse(number_fault("density_difference", density_difference, unit="kg/m^3"))
-    return density_difference * _GRAVITY * body.volume * 1e-18
+    return float(density_difference) * _GRAVITY * body.volume * 1e-18

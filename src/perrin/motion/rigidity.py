@@ -106,10 +106,10 @@ class Quality(Shown):
     residual_over_sigma : float or None
         Localisation error from the residuals over the one stated by the user.
     autocorrelation : float or None
-        Autocorrelation of the residuals between neighbouring frames. Errors of real cameras are
+        Autocorrelation of the residuals between neighbouring rows. Errors of real cameras are
         smooth in time (0.9 and more), so that a large value alone is no sign of softness.
     bond_drift : float
-        Largest relative change of a pair's distance between eighths of the time.
+        Largest relative change of a pair's distance between eighths of the rows.
     drifting_pair : tuple of int
         Columns of the two particles whose distance changes most.
     sigma_xyz : tuple of float or None

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from perrin.images.spheres.localisation import Search
     from perrin.images.stack import Stack
     from perrin.motion.error_ratio import ErrorRatio
+    from perrin.run.workers import Progress
     from perrin.tracks.rigid_bodies import IdentifiedBodies
 
 
@@ -73,6 +74,7 @@ def find_bodies(
     *,
     optics: Optics | None,
     sizes: Sequence[int] | None = None,
+    progress: Progress | None = None,
 ) -> Bodies:
     """Assign the spheres of a movie to its clusters: groups that move as rigid bodies.
 
@@ -85,6 +87,8 @@ def find_bodies(
     optics : Optics or None
     sizes : sequence of int, optional
         Numbers of spheres of the clusters that are wanted; default: all that are found.
+    progress : callable, optional
+        As in `Work`.
 
     Returns
     -------
@@ -115,7 +119,9 @@ def find_bodies(
     # The spheres of a pair are a contact distance apart in height at most, a third in its square.
     between = abs(stack.plane_time or 0.0) * search.contact / float(stack.voxel[0]) / np.sqrt(3)
     scan = between / stack.dt if between > 0 else 0.0
-    found = identify_bodies(frame, x, contact=search.contact, error=error, scan=scan)
+    found = identify_bodies(
+        frame, x, contact=search.contact, error=error, scan=scan, progress=progress
+    )
     number, notes, warnings = _chosen_bodies(found, frame, sizes)
     label = np.append(number, -1)[found.body]
     size = {int(c): int(n) for c, n in zip(number, found.size, strict=True) if c >= 0}

@@ -287,7 +287,9 @@ def analyze_stack(
         if len(stacks) > 1:
             tables = [one.features for one in located]
             features, offsets, findings = joined_kinds(tables, contact=contact)
-        bodies = find_bodies(features, stack, search, optics=learned, sizes=sizes)
+        bodies = find_bodies(
+            features, stack, search, optics=learned, sizes=sizes, progress=work.report
+        )
         corrected = tuple(
             one.corrected(own.method.pattern) for one, own in zip(stacks, located, strict=True)
         )
@@ -322,6 +324,7 @@ def analyze_stack(
                 recording=recording,
                 improved=poses.improved,
                 singles=bodies.singles,
+                progress=work.progress,
                 **run,
             )
         else:

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 S = TypeVar("S")
 T = TypeVar("T")
-_ITEMS_AT_ONCE = 4  # items that a worker gets at once; it opens the file once for all of them
+_ITEMS_AT_ONCE = 4  # items that a worker gets at once
 _TIMEOUT = 15  # s, to find the scheduler
 _KEPT_MEMORY = 2**28  # bytes that the memory allocator of a worker does not return to the system
 

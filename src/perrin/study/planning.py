@@ -182,6 +182,9 @@ def plan_study(
     frames = np.unique(
         np.geomspace(_SHORTEST_MOVIE, most_frames or _LONGEST_MOVIE, 120).round().astype(int)
     )
+    # Numbers of numpy in single precision would be computed with in single precision.
+    half_width, snr = float(half_width), float(snr)
+    spread_clusters, spread_movies = float(spread_clusters), float(spread_movies)
     errors = np.array([cramer_rao(n_frames=int(n), snr=snr, axes=axes) for n in frames])
     choices = []
     for movies in range(2, _MOST_MOVIES + 1):

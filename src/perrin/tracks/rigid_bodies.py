@@ -15,6 +15,8 @@ from perrin.tracks.linking import Centers, stage_path, step_variance
 from perrin.tracks.sphere_tracks import link_spheres, track_variances
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from perrin._arrays import Bools, Floats, Ints
 
 # Two groups are one body if they are in contact in this share of the frames that show both.
@@ -83,7 +85,13 @@ class IdentifiedBodies(NamedTuple):
 
 
 def identify_bodies(
-    frame: Ints, x: Floats, *, contact: float, error: float | None = None, scan: float = 0.0
+    frame: Ints,
+    x: Floats,
+    *,
+    contact: float,
+    error: float | None = None,
+    scan: float = 0.0,
+    progress: Callable[[int, int, str], None] | None = None,
 ) -> IdentifiedBodies:
     """Find rigid bodies of all sizes, and which detection is which sphere of each.
 
@@ -91,6 +99,8 @@ def identify_bodies(
     ----------
     frame, x, contact, error, scan
         As in `rigid_bodies`.
+    progress : callable, optional
+        Takes the number of finished bodies, of all (0: not known yet), and what is done.
 
     Returns
     -------
@@ -113,10 +123,13 @@ def identify_bodies(
     >>> found.size.tolist(), np.bincount(found.particle).tolist()
     ([3], [30, 30, 30])
     """
+    report = progress or (lambda *_: None)
+    report(0, 0, "linking the spheres")
     found = rigid_bodies(frame, x, contact=contact, error=error, scan=scan)
     body = found.body.copy()
     particle, piece = np.full(len(x), -1, dtype=np.int64), np.zeros(len(x), dtype=np.int64)
     for b, size in enumerate(found.size.tolist()):
+        report(b, len(found.size), "identifying the particles")
         rows = np.flatnonzero(body == b)
         if size == 2:
             at = frame[rows]
