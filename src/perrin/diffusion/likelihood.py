@@ -352,8 +352,10 @@ class Likelihood:
             )
             moved = np.where(settled, 0.0, np.where(between, step, middle - x))
             x = x + moved
-            # The error of the next Newton step is of the order of the square of this one.
-            settled |= np.abs(moved) <= np.where(between, 1e-7, 1e-11) * np.abs(x)
+            # The error of the next Newton step is of the order of the square of this one. What is
+            # nothing beside the least D that steps of this size could show is as good as 0.
+            nearest = np.where(between, 1e-7, 1e-11) * np.abs(x) + 1e-12 * self.scale / sizes
+            settled |= np.abs(moved) <= nearest
             if settled.all():
                 break
         return np.where(has_low, x[count:], 0.0), x[:count]
