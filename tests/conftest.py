@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from left_out import leave_out_tensors, leave_out_verdicts
+from left_out import leave_out_tensors, leave_out_verdicts, make_figures_without_rendering
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -52,3 +52,10 @@ def no_verdicts(monkeypatch: pytest.MonkeyPatch, repeats: Callable[[int, int], i
     """Leave out the kind of motion in the quick form of a test."""
     if not repeats(0, 1):
         leave_out_verdicts(monkeypatch)
+
+
+@pytest.fixture
+def no_pictures(monkeypatch: pytest.MonkeyPatch, repeats: Callable[[int, int], int]) -> None:
+    """Make figures without their pictures in the quick form of a test."""
+    if not repeats(0, 1):
+        make_figures_without_rendering(monkeypatch)

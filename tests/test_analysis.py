@@ -155,6 +155,7 @@ def test_nan_coordinates_are_missing_points_counted_in_a_warning(short):
     assert not any("NaN" in w for w in without.notes)
 
 
+@pytest.mark.usefixtures("no_tensors", "no_verdicts")
 def test_without_a_cluster_column_bodies_are_found(short):
     """One body is noted as one; two are found with and without contact; a gas is refused."""
     plain = short.drop(columns="cluster")
@@ -251,6 +252,7 @@ def spheres(
     return table.assign(cluster=cluster, particle=table["particle"] + first, x=table["x"] + first)
 
 
+@pytest.mark.usefixtures("no_tensors", "no_verdicts")
 def test_sizes_are_those_of_the_measured_shape(base, sized):
     """Tetrahedron and trimer: the sizes of `size_from_*` at the template, by factors of its own."""
     kT = 1.380649e-23 * 295
@@ -492,6 +494,7 @@ def test_arguments_out_of_range_are_refused(base, bad):
 
 
 @pytest.mark.skipif(not SHARED.exists(), reason="the real data is not here")
+@pytest.mark.usefixtures("no_tensors", "no_verdicts")
 def test_real_marker_bodies(repeats):
     """Leg and knee are rigid at 0.39 and 0.70 mm, the foot in its soft shoe (1.83 mm) is not.
 

@@ -95,6 +95,7 @@ def test_right_labels_of_an_irregular_trimer_stay():
     assert not texts(report)
 
 
+@pytest.mark.usefixtures("no_tensors", "no_verdicts")
 def test_a_flow_is_named_and_its_removal_exact():
     """1 um/s: named with its error; with drift=True the answer of the table without it."""
     x, _ = tetrahedra(88, 0.02, times=EVEN[:FEW])
@@ -121,6 +122,7 @@ def clean():
     return perrin.analyze(table(tetrahedra(88, 0.02)[0]), dt=DT)
 
 
+@pytest.mark.usefixtures("no_tensors", "no_verdicts")
 def test_a_stage_jump_is_named_and_left_out(clean):
     """3 um between frames 149 and 150: D_T of the table without it but for one step in 299.
 
@@ -177,6 +179,7 @@ def test_a_body_at_rest_is_one_body():
     assert cluster.quality.rigid
 
 
+@pytest.mark.usefixtures("no_tensors", "no_verdicts")
 def test_lost_particles_however_written():
     """5 % of the particles lost: rows left out, (0, 0, 0), or the last position: one answer."""
     x, rng = tetrahedra(227, 0.04, times=EVEN[:FEW], offset=20.0)

@@ -10,7 +10,7 @@ pytest.importorskip("tifffile")
 pytest.importorskip("trackpy")
 
 BENCHMARK = Path(__file__).resolve().parents[1] / "benchmarks" / "end_to_end.py"
-RECIPE = {"clusters": 2, "n_frames": 4, "shape": (40, 60, 100), "photons": 40.0, "seed": 0}
+RECIPE = {"clusters": 2, "n_frames": 3, "shape": (40, 60, 100), "photons": 40.0, "seed": 0}
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +45,7 @@ def test_both_clusters_are_found_as_they_move(names, found):
 
 
 def test_stated_errors_of_positions_are_right(names, found):
-    """32 positions an axis: their scatter over the stated one is 1 within 4 errors."""
+    """24 positions an axis: their scatter over the stated one is 1 within 4 errors."""
     report, truth = found
     errors, stated = names["place_errors"](report.imaging.features, truth)
     assert len(errors) == truth[..., 0].size

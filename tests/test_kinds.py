@@ -162,6 +162,7 @@ def test_a_movie_of_free_spheres_has_a_report_without_clusters(tmp_path):
         measure_free_spheres(table[:20], Experiment(dt=DT), Recording(dt=DT), **run)
 
 
+@pytest.mark.usefixtures("no_tensors", "no_verdicts")
 def test_kinds_and_single_spheres_come_back_and_are_on_the_page(mixed, tmp_path):
     """The folder of a run with several kinds and single spheres holds all of them."""
     run = {"source": {"path": None, "sha256": None}, "arguments": {}}

@@ -20,6 +20,8 @@ from perrin.images.optics.optics import CameraNoise, Optics
 from perrin.run import repetition
 from test_cli import run
 
+pytestmark = pytest.mark.usefixtures("no_pictures")
+
 
 def table(**more: object) -> pd.DataFrame:
     """Return a tetrahedron, its centre moving, in frames from 5 on, with times that are uneven."""

@@ -22,6 +22,7 @@ def report():
     return replace(found, clusters=(replace(first, prediction=known), *others))
 
 
+@pytest.mark.usefixtures("no_pictures")
 def test_the_table_has_a_row_for_every_cluster_and_quantity(report, tmp_path):
     """Values and interval ends are those of the results; the file holds the same table."""
     table = report.to_frame()
@@ -46,6 +47,7 @@ def test_the_table_has_a_row_for_every_cluster_and_quantity(report, tmp_path):
     assert read["quantity"].tolist() == table["quantity"].tolist()
 
 
+@pytest.mark.usefixtures("no_pictures")
 def test_a_report_that_is_read_equals_the_written_one(report, tmp_path):
     """Equality compares numbers, texts, settings, positions and motions."""
     perrin.write_run(report, tmp_path / "run")

@@ -327,6 +327,7 @@ def test_a_full_disk_is_reported_and_the_run_resumes(
     assert_identical(report, known)
 
 
+@pytest.mark.usefixtures("no_tensors", "no_verdicts")
 def test_options_objects_are_the_same_as_keywords(movie_file):
     """Every field in its object, and as a keyword: the same report, and the same refusals."""
     keywords = {
@@ -519,6 +520,7 @@ def test_a_movie_without_a_fault_has_no_warning_of_its_images(whole):
     assert found == []
 
 
+@pytest.mark.usefixtures("no_tensors", "no_verdicts")
 def test_clusters_of_all_sizes_are_measured_each_kind_by_itself():
     """A trimer and a bipyramid have templates and pooled values of their own; size= selects."""
     bodies = [perrin.Cluster.touching(3, DIAMETER), perrin.Cluster.touching(5, DIAMETER)]

@@ -65,6 +65,7 @@ def report(channels):
     return perrin.analyze_stack(channels[0], **SEARCH)
 
 
+@pytest.mark.usefixtures("no_tensors", "no_verdicts")
 def test_clusters_of_two_colours_give_what_their_true_positions_give(channels, report):
     """All are found, with D_R and D_T of the true positions within 0.2 standard errors."""
     _, motions, _ = channels
