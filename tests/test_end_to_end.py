@@ -6,6 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from left_out import leave_out_tensors, leave_out_verdicts
+
 pytest.importorskip("tifffile")
 pytest.importorskip("trackpy")
 
@@ -26,10 +28,13 @@ def found(names, tmp_path_factory):
     recipe = RECIPE | {"shape": (38, 50, 84)}
     names["kept"](movie, **recipe)[0].close()
     stack, truth = names["kept"](movie, **recipe)
-    with stack:
+    with stack, pytest.MonkeyPatch.context() as patch:
+        leave_out_tensors(patch)
+        leave_out_verdicts(patch)
         return names["pipeline"](stack)[0], truth
 
 
+@pytest.mark.usefixtures("no_tensors", "no_verdicts")
 def test_both_clusters_are_found_as_they_move(names, found):
     """D_R and D_T are those of the true positions within 0.2 of their standard errors.
 

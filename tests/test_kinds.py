@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 import perrin
-from left_out import leave_out_tensors
+from left_out import leave_out_tensors, leave_out_verdicts
 from perrin._text import with_error
 from perrin.geometry.rotations import exp_map
 from perrin.report.page import render_html
@@ -75,6 +75,7 @@ def mixed():
 def report(mixed):
     with pytest.MonkeyPatch.context() as patch:
         leave_out_tensors(patch)
+        leave_out_verdicts(patch)
         return perrin.analyze(mixed, dt=DT)
 
 
@@ -88,6 +89,7 @@ def leaves(entry):
 
 
 @pytest.mark.usefixtures("no_tensors")
+@pytest.mark.usefixtures("no_verdicts")
 def test_each_kind_has_pooled_values_of_its_own(mixed, report):
     """They are those of the bodies of this kind alone; nothing is pooled over kinds."""
     assert [kind.size for kind in report.kinds] == [2, 3, 4]

@@ -79,6 +79,7 @@ def test_a_table_in_memory_is_repeated_from_the_folder(report, tmp_path):
 
 
 @pytest.mark.usefixtures("no_tensors")
+@pytest.mark.usefixtures("no_tensors", "no_verdicts")
 def test_text_labels_of_clusters_are_those_of_the_repeated_run(tmp_path, monkeypatch):
     """The tracks of a folder keep the labels by number, and a part of them as well."""
     monkeypatch.setattr("perrin.report.write.save_figures", lambda *_, **__: [])

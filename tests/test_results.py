@@ -165,6 +165,7 @@ class TestFromRotations:
 
 
 @pytest.mark.usefixtures("no_tensors")
+@pytest.mark.usefixtures("no_pictures")
 def test_progress_counts_the_clusters_of_every_long_step(tmp_path, monkeypatch):
     """Steps begin at 0 of their total; 20 clusters are estimated in two parts, written singly."""
     monkeypatch.setattr("perrin.report.write.save_figures", lambda *_, **__: [])

@@ -27,6 +27,7 @@ import pytest
 
 import perrin
 from command_line import command_line
+from left_out import leave_out_tensors, leave_out_verdicts
 from perrin.diffusion.noise_model import Noise
 from perrin.images.optics.optics import CameraNoise
 from perrin.images.spheres.by_trackpy import find_features
@@ -67,6 +68,16 @@ def undrawn(request, monkeypatch):
     if not request.config.getoption("--long"):
         for name in ("save_figures", "save_image_figures"):
             monkeypatch.setattr(f"perrin.report.write.{name}", no_figures)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def left_out(repeats):
+    """Estimate no tensors and judge no motion: other files test them."""
+    with pytest.MonkeyPatch.context() as patch:
+        if not repeats(0, 1):
+            leave_out_tensors(patch)
+            leave_out_verdicts(patch)
+        yield
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -327,7 +338,6 @@ def test_a_full_disk_is_reported_and_the_run_resumes(
     assert_identical(report, known)
 
 
-@pytest.mark.usefixtures("no_tensors", "no_verdicts")
 def test_options_objects_are_the_same_as_keywords(movie_file):
     """Every field in its object, and as a keyword: the same report, and the same refusals."""
     keywords = {
@@ -520,7 +530,6 @@ def test_a_movie_without_a_fault_has_no_warning_of_its_images(whole):
     assert found == []
 
 
-@pytest.mark.usefixtures("no_tensors", "no_verdicts")
 def test_clusters_of_all_sizes_are_measured_each_kind_by_itself():
     """A trimer and a bipyramid have templates and pooled values of their own; size= selects."""
     bodies = [perrin.Cluster.touching(3, DIAMETER), perrin.Cluster.touching(5, DIAMETER)]
