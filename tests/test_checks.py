@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,6 +12,7 @@ from scipy.stats import t
 
 import perrin
 from perrin.geometry.rotations import exp_map
+from perrin.images import CameraNoise, Optics
 from perrin.images.optics.learn import saturated_share
 from perrin.images.spheres.spots import mass_cut
 from perrin.movie import checks
@@ -295,6 +297,17 @@ def test_distances_along_z_are_compared_with_those_across(repeats):
     ]
     # The level of the test is 1 % on its bound, on either side.
     assert np.mean(false) <= 0.05
+
+
+def test_residuals_above_the_noise_are_noted():
+    """A mean chi-squared of 1.04 is noted; one of 1.02 is not, nor are images of smoothed noise."""
+    rng, optics = np.random.default_rng(3), Optics(2.45, (0.4, 0.15), CameraNoise(3.0, 4.0))
+    fits = table().assign(refined=True, chi2=1.04 + 0.015 * rng.normal(size=40))
+    assert noted(checks.image_misfit(fits, optics)).startswith("image misfit: the residuals of")
+    assert checks.image_misfit(fits.assign(chi2=fits["chi2"] - 0.02), optics) == NOTHING
+    assert checks.image_misfit(fits.assign(refined=False), optics) == NOTHING
+    smooth = replace(optics, noise=CameraNoise(3.0, 4.0, neighbours=((1.0, 0.3), (0.3, 0.0))))
+    assert checks.image_misfit(fits, smooth) == checks.image_misfit(fits, None) == NOTHING
 
 
 def test_clusters_with_other_numbers_of_spheres_are_reported():
