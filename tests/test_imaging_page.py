@@ -57,7 +57,9 @@ def test_the_page_holds_the_numbers(report):
 def test_the_shape_of_an_asymmetric_point_spread_is_named(report):
     optics = replace(report.imaging.optics, asymmetry=Asymmetry(zx=0.02, zzz=1e-3))
     other = replace(report, imaging=replace(report.imaging, optics=optics))
-    assert "shape of the point spread a tilted axis, a difference above and below" in text_of(other)
+    assert "shape of the point spread asymmetric a tilted axis, a difference above" in text_of(
+        other
+    )
     assert "shape of the point spread" not in text_of(report)
 
 

@@ -301,8 +301,8 @@ def _channel_facts(imaging: Imaging, optics: Optics) -> list[Fact]:
         tail = [("tail of the point spread", f"{wide} µm", share)]
     if optics.asymmetry is not None:
         kinds = listed(optics.asymmetry.kinds)
-        remark = "no even body of revolution; the fits allow for it to first order"
-        tail.append(("shape of the point spread", kinds, remark))
+        remark = f"{kinds}; the fits allow for it to first order"
+        tail.append(("shape of the point spread", "asymmetric", remark))
     if optics.spread:
         expected += f"; spheres differ by {100 * optics.spread:.1f} % (standard deviation)"
     return [
