@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 # Work that takes less than this, s, has no lines in a log.
 _SHORT = 2.0
 # Longest time without a line in a log, s, while parts of the work are finished.
-_SILENT = 60.0
+_LONGEST_PAUSE = 60.0
 
 
 @contextmanager
@@ -83,7 +83,7 @@ def progress_lines(stream: TextIO, *, clock: Callable[[], float] = time.monotoni
         passed = calls[-1] - calls[0]
         tenth = 10 * done // total if total else 0
         last, when = written.get(title, (-1, 0.0))
-        if passed < _SHORT or (last >= tenth and passed < when + _SILENT):
+        if passed < _SHORT or (last >= tenth and passed < when + _LONGEST_PAUSE):
             return
         written[title] = tenth, passed
         share = f": {100 * done // total} % ({done} of {total})" if total else ""

@@ -805,7 +805,9 @@ def fit_samples(
     measured : PointSpread, optional
         A point spread that was measured; diameter and noise are learned.
     shell : bool
-        The surface of the spheres is fluorescent; otherwise it is tried where balls do not fit.
+        The surface of the spheres is fluorescent; otherwise it is tried where balls do not fit, and
+        where it is likelier the result is that of this comparison alone, without tail, spread or
+        asymmetry.
     camera_pattern : bool
         The pixels of the camera differ, so that their gains are compared.
 
@@ -849,10 +851,11 @@ def fit_samples(
         )
     mean = float(np.mean([np.nanmean(s.frame) for s in usable]))
     noise = CameraNoise(1.0, 0.05 * abs(mean))
-    if shell:
-        plain = _settled(usable, replace(start, shell=True), noise)
-    else:
-        plain = _ball_or_shell(usable, start, noise)
+    plain = _ball_or_shell(usable, replace(start, shell=shell), noise)
+    if plain.parameters.shell and not shell:
+        # Spheres whose surface is fluorescent are searched for in another way first.
+        optics = plain.parameters.optics(plain.noise, plain.information)
+        return LearnedOptics(optics, _usual_of(plain))
     plain = _with_common_noise(plain, camera_pattern=camera_pattern)
     plain, left_out = _without_dust(plain)
     found = plain
@@ -884,8 +887,11 @@ def _ball_or_shell(
 ) -> _Settled:
     """Return the parameters of balls, or of shells if the samples are likelier with them.
 
-    Shells are tried where the search for balls does not converge, or leaves large residuals.
+    Shells are tried where the search for balls does not converge, or leaves large residuals; the
+    start may be that of shells already.
     """
+    if start.shell:
+        return _settled(samples, start, noise)
     ball: _Settled | None = None
     try:
         ball = _settled(samples, start, noise)
