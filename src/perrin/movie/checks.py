@@ -850,9 +850,11 @@ def distances_by_direction(features: pd.DataFrame, *, contact: float, axes: list
     """
     from scipy.special import stdtrit
 
+    if "z" not in axes:
+        return _NOTHING
     pairs = _touching_pairs(features, contact=contact, axes=axes)
     freedom = pairs.spheres / 2 - 2
-    if "z" not in axes or freedom < _FEWEST_DIRECTIONS or not pairs.distance.size:
+    if freedom < _FEWEST_DIRECTIONS or not pairs.distance.size:
         return _NOTHING
     relative = pairs.distance / contact
     lever = pairs.upright - pairs.upright.mean()

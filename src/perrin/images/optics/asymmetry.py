@@ -18,7 +18,6 @@ _STEP = 0.1
 # units of the blur: the quotient is even, and differs from its limit by the square of this.
 _NEAR_AXIS = 0.1
 
-
 # A component is used if it is this many standard errors of the noise from 0, and if it is not 0 at
 # this level by its scatter between the samples.
 _FROM_NOISE, _SAMPLES_LEVEL = 5.0, 1e-4

@@ -181,7 +181,7 @@ class SphereImage:
     _sizes: Floats
     _tables: Floats
     asymmetry: Asymmetry | None = None
-    _changes: Floats | None = None
+    _uneven_knots: Floats | None = None
 
     @property
     def reach(self) -> tuple[float, float, float]:
@@ -258,7 +258,7 @@ class SphereImage:
         """
         kernels = compiled_kernels()
         if kernels is None:
-            even = replace(self, asymmetry=None, _changes=None)
+            even = replace(self, asymmetry=None, _uneven_knots=None)
             whole = np.zeros((len(centers), 4, *mask.shape))
             for layer, center, size in zip(whole, centers, sizes, strict=True):
                 spot = even.sized(size).spot(center, mask.shape)
@@ -289,10 +289,10 @@ class SphereImage:
     def _change(self, z: Floats, y: Floats, x: Floats) -> Floats:
         """Return what the asymmetry of the point spread adds to the image, on a grid of offsets."""
         assert self.asymmetry is not None
-        assert self._changes is not None
-        along, across = self._splines(z, y, x, knots=self._changes)
+        assert self._uneven_knots is not None
+        along, across = self._splines(z, y, x, knots=self._uneven_knots)
         change = change_of_image(
-            *(self.asymmetry, self._changes),
+            *(self.asymmetry, self._uneven_knots),
             along=along,
             across=across,
             z=z,
@@ -417,7 +417,7 @@ class SphereImage:
         by_z = along_slope @ self._knots * (-np.sign(z) / self._spacing[0])[:, None]
         outward = across_slope / (self._spacing[1] * np.where(rho > 0, rho, 1.0)).reshape(-1, 1)
         value = (profile @ across.T).reshape(shape)
-        if self._changes is not None:
+        if self._uneven_knots is not None:
             value += self._change(z, y, x)
         by_rho = (profile @ outward.T).reshape(shape)
         gradient = np.empty((3, *shape))
@@ -524,7 +524,7 @@ def sphere_image(
     )
     if asymmetry is None or not any(asymmetry):
         return image
-    return replace(image, asymmetry=asymmetry, _changes=image.asymmetry_knots())
+    return replace(image, asymmetry=asymmetry, _uneven_knots=image.asymmetry_knots())
 
 
 def _size_range(spread: float) -> float:
