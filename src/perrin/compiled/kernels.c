@@ -408,6 +408,131 @@ static void write_spot(const Window *window, const double *center, const double 
     }
 }
 
+/* Modes of steps, summed in blocks of so many; no more components than a body has coordinates. */
+enum { BLOCK = 64, MOST_AXES = 3 };
+
+/* Modes (rows or 1, count, b) of P rows, in the axes (P, b, b) in which they are independent. */
+typedef struct {
+    Py_ssize_t rows, count, b, stride, columns;
+    const double *modes, *axes, *share, *weight;
+    double *sums;
+} Modes;
+
+/* Sum of the products of two lists of BLOCK numbers, in four parts: one order of additions on every
+ * machine. */
+INLINE double dot(const double *a, const double *b)
+{
+    double part[4] = {0.0, 0.0, 0.0, 0.0};
+    for (int k = 0; k < BLOCK; k += 4)
+        for (int i = 0; i < 4; i++)
+            part[i] += a[k + i] * b[k + i];
+    return (part[0] + part[1]) + (part[2] + part[3]);
+}
+
+/* One block of modes along their axes: inverse variances, and modes over variances. */
+typedef struct {
+    double inverse[MOST_AXES][BLOCK], scaled[MOST_AXES][BLOCK];
+} Block;
+
+/* Fill a block from `count` modes, the rest with zeros; add to log det, form and least variance. */
+INLINE void fill_block(const double *modes, const double *w, Py_ssize_t count, Py_ssize_t b,
+                       const double *axes, const double *share, Block *block, double *totals)
+{
+    double variance[MOST_AXES][BLOCK];
+    for (Py_ssize_t a = 0; a < b; a++) {
+        double along[BLOCK];
+        for (Py_ssize_t k = 0; k < BLOCK; k++) {
+            along[k] = block->inverse[a][k] = 0.0;
+            variance[a][k] = 1.0;
+        }
+        for (Py_ssize_t k = 0; k < count; k++) {
+            for (Py_ssize_t c = 0; c < b; c++)
+                along[k] += modes[k * b + c] * axes[c * b + a];
+            variance[a][k] = share[a] + 0.5 * w[k] * (1 - share[a]);
+        }
+        for (Py_ssize_t k = 0; k < count; k++)
+            block->inverse[a][k] = 1 / variance[a][k];
+        for (Py_ssize_t k = 0; k < BLOCK; k++)
+            block->scaled[a][k] = along[k] * block->inverse[a][k];
+        totals[1] += dot(along, block->scaled[a]);
+        for (Py_ssize_t k = 0; k < count; k++)
+            totals[2] = variance[a][k] < totals[2] ? variance[a][k] : totals[2];
+    }
+    for (Py_ssize_t k = 0; k < BLOCK; k += 4) {
+        double product = 1.0; /* one logarithm for a few variances */
+        for (Py_ssize_t a = 0; a < b; a++)
+            product *= (variance[a][k] * variance[a][k + 1]) *
+                       (variance[a][k + 2] * variance[a][k + 3]);
+        totals[0] += log(product);
+    }
+}
+
+/* Add the sums of q_a q_b V_c and of V_a V_c, times 1, w and w^2, of one block. */
+INLINE void add_curvatures(const Block *block, const double *powers, Py_ssize_t b, double *power,
+                           double *trace)
+{
+    double pair[BLOCK], weighted[3][MOST_AXES][BLOCK];
+    for (Py_ssize_t j = 0; j < 3; j++)
+        for (Py_ssize_t c = 0; c < b; c++)
+            for (Py_ssize_t k = 0; k < BLOCK; k++)
+                weighted[j][c][k] = block->inverse[c][k] * powers[j * BLOCK + k];
+    for (Py_ssize_t a = 0; a < b; a++)
+        for (Py_ssize_t d = a; d < b; d++) {
+            for (Py_ssize_t k = 0; k < BLOCK; k++)
+                pair[k] = block->scaled[a][k] * block->scaled[d][k];
+            for (Py_ssize_t j = 0; j < 3; j++)
+                for (Py_ssize_t c = 0; c < b; c++) {
+                    double sum = dot(pair, weighted[j][c]);
+                    power[((a * b + d) * 3 + j) * b + c] += sum;
+                    if (d != a)
+                        power[((d * b + a) * 3 + j) * b + c] += sum;
+                }
+        }
+    for (Py_ssize_t a = 0; a < b; a++)
+        for (Py_ssize_t j = 0; j < 3; j++)
+            for (Py_ssize_t c = 0; c < b; c++)
+                trace[(a * 3 + j) * b + c] += dot(block->inverse[a], weighted[j][c]);
+}
+
+EVERY_MACHINE
+static void sum_modes(const Modes *modes)
+{
+    Py_ssize_t b = modes->b, squares = b * b;
+    int curved = modes->columns > 3 + 2 * squares;
+    for (Py_ssize_t row = 0; row < modes->rows; row++) {
+        double *sums = modes->sums + row * modes->columns;
+        const double *first = modes->modes + row * modes->stride;
+        memset(sums, 0, (size_t)modes->columns * sizeof(double));
+        sums[2] = DBL_MAX;
+        for (Py_ssize_t start = 0; start < modes->count; start += BLOCK) {
+            Py_ssize_t left = modes->count - start, count = left < BLOCK ? left : BLOCK;
+            const double *w = modes->weight + start;
+            Block block;
+            double powers[3 * BLOCK], next[BLOCK];
+            fill_block(first + start * b, w, count, b, modes->axes + row * squares,
+                       modes->share + row * b, &block, sums);
+            for (Py_ssize_t k = 0; k < BLOCK; k++) {
+                powers[k] = 1.0;
+                powers[BLOCK + k] = k < count ? w[k] : 0.0;
+                powers[2 * BLOCK + k] = powers[BLOCK + k] * powers[BLOCK + k];
+            }
+            for (Py_ssize_t d = 0; d < b; d++) {
+                for (Py_ssize_t k = 0; k < BLOCK; k++)
+                    next[k] = powers[BLOCK + k] * block.scaled[d][k];
+                for (Py_ssize_t a = 0; a < b; a++) {
+                    sums[3 + a * b + d] += dot(block.scaled[a], block.scaled[d]);
+                    sums[3 + squares + a * b + d] += dot(block.scaled[a], next);
+                }
+                sums[3 + d * b + d] -= dot(powers, block.inverse[d]);
+                sums[3 + squares + d * b + d] -= dot(powers + BLOCK, block.inverse[d]);
+            }
+            if (curved)
+                add_curvatures(&block, powers, b, sums + 3 + 2 * squares,
+                               sums + 3 + 2 * squares + 3 * squares * b);
+        }
+    }
+}
+
 /* Keep `view` as doubles, C-contiguous; returns 0 with an exception set where it is not. */
 static int doubles(PyObject *array, int flags, Py_buffer *view)
 {
@@ -560,9 +685,68 @@ PyDoc_STRVAR(spots_doc,
 "mask (nz, ny, nx) of bytes, centers (n, 3), voxel (3,) and reach (3,) in um, spacing (2,) of the\n"
 "knots of tables (n or 1, a, b) are read, out (n, 4, voxels of the mask) is written.");
 
+static PyObject *sum_mode_views(Py_buffer views[5])
+{
+    Py_buffer *sums = &views[4];
+    Modes modes = {.modes = views[0].buf, .axes = views[1].buf, .share = views[2].buf,
+                   .weight = views[3].buf, .sums = sums->buf};
+    int fits = views[0].ndim == 3 && sums->ndim == 2 && views[0].shape[2] <= MOST_AXES;
+    if (fits) {
+        modes.rows = sums->shape[0];
+        modes.columns = sums->shape[1];
+        modes.count = views[0].shape[1];
+        modes.b = views[0].shape[2];
+        modes.stride = stride_of(&views[0], modes.rows, modes.count * modes.b);
+        Py_ssize_t squares = modes.b * modes.b, fewer = 3 + 2 * squares;
+        fits = modes.stride >= 0 && stride_of(&views[1], modes.rows, squares) > 0 &&
+               stride_of(&views[2], modes.rows, modes.b) > 0 &&
+               views[3].len == modes.count * (Py_ssize_t)sizeof(double) &&
+               (modes.columns == fewer || modes.columns == fewer + 3 * squares * (modes.b + 1));
+    }
+    if (!fits)
+        return PyErr_Format(PyExc_ValueError, "expected modes (rows or 1, count, b), axes (rows, b, "
+                            "b), share (rows, b), weight (count,), sums (rows, 3 + 2 b^2) or (rows, "
+                            "3 + 5 b^2 + 3 b^3), b up to 3");
+    Py_BEGIN_ALLOW_THREADS
+    sum_modes(&modes);
+    Py_END_ALLOW_THREADS
+    Py_RETURN_NONE;
+}
+
+enum { MOST_ARRAYS = 16 };
+
+/* Call a function with `count` arrays of doubles, the last of which it writes. */
+static PyObject *with_doubles(PyObject *args, int count, PyObject *(*work)(Py_buffer *))
+{
+    Py_buffer views[MOST_ARRAYS];
+    int held = 0;
+    if (PyTuple_Size(args) != count)
+        return PyErr_Format(PyExc_TypeError, "expected %d arrays", count);
+    while (held < count && doubles(PyTuple_GetItem(args, held),
+                                   held == count - 1 ? PyBUF_WRITABLE : 0, &views[held]))
+        held++;
+    PyObject *done = held == count ? work(views) : NULL;
+    while (held > 0)
+        PyBuffer_Release(&views[--held]);
+    return done;
+}
+
+static PyObject *mode_sums(PyObject *self, PyObject *args)
+{
+    (void)self;
+    return with_doubles(args, 5, sum_mode_views);
+}
+
+PyDoc_STRVAR(mode_sums_doc,
+"mode_sums(modes, axes, share, weight, sums)\n--\n\n"
+"Write what a likelihood of modes and its derivatives need, in axes where the modes are independent.\n\n"
+"modes (rows or 1, count, b), axes (rows, b, b), share (rows, b) and weight (count,) are read; sums\n"
+"(rows, 3 + 2 b^2), or with second derivatives (rows, 3 + 5 b^2 + 3 b^3), is written.");
+
 static PyMethodDef functions[] = {
     {"wahba", wahba, METH_VARARGS, wahba_doc},
     {"spots", spots, METH_VARARGS, spots_doc},
+    {"mode_sums", mode_sums, METH_VARARGS, mode_sums_doc},
     {NULL, NULL, 0, NULL},
 };
 

@@ -18,3 +18,6 @@ def spots(
     out: Floats,
     /,
 ) -> None: ...
+def mode_sums(
+    modes: Floats, axes: Floats, share: Floats, weight: Floats, sums: Floats, /
+) -> None: ...

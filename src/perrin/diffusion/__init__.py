@@ -190,13 +190,14 @@ from perrin.diffusion.tensor_likelihood import (
 from perrin.diffusion.tensor_modes import (
     Chains,
     ChainTrack,
-    DiagonalModes,
     EvenTracks,
     FewDiagonalModes,
     FewModesTrack,
+    ModeSums,
     TensorSlopes,
     covariance_slopes,
     information,
+    mode_sums,
 )
 from perrin.diffusion.tensor_results import CoupledTensor, DiffusionTensor
 from perrin.diffusion.tensors import (
@@ -234,7 +235,6 @@ __all__ = [
     "CoupledTensor",
     "Decay",
     "DecouplingRatio",
-    "DiagonalModes",
     "DiffusionEstimate",
     "DiffusionTensor",
     "EffectiveModes",
@@ -250,6 +250,7 @@ __all__ = [
     "LongTimeEstimate",
     "Maximum",
     "MobilityCorrelation",
+    "ModeSums",
     "Moduli",
     "Moments",
     "MotionVerdict",
@@ -368,6 +369,7 @@ __all__ = [
     "long_time_diffusion",
     "maximise",
     "maximise_each",
+    "mode_sums",
     "moment_estimate",
     "motions_and_noise",
     "msd_covariance",

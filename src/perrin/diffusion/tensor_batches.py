@@ -99,8 +99,8 @@ class SeparateTensors:
             Free parameters of the noise, as in `NoisyVectors.start`.
         """
         theta, B = self.amplitudes(own)
-        modes = self.tracks.diagonal(tensor[0], theta, B)
-        found = self.tracks.slopes(tensor[0], B, modes)
+        sums = self.tracks.diagonal(tensor[0], theta, B)
+        found = self.tracks.slopes(tensor[0], B, sums)
         value, slope = self.straight_slopes(tensor, theta, B, found)
         slope[:, tensor[1].shape[1] :] *= noise_turns(own, blurred=self.B is None)[0]
         return value, slope
@@ -138,9 +138,9 @@ class SeparateTensors:
         (D, slopes, bends), tracks = tensor, self.tracks
         m, r = slopes.shape[1], self.theta.shape[1]
         theta, B = self.amplitudes(own)
-        modes = tracks.diagonal(D, theta, B)
-        found = tracks.slopes(D, B, modes)
-        full = tracks.curvatures(slopes, D, B, modes)
+        sums = tracks.diagonal(D, theta, B, curved=True)
+        found = tracks.slopes(D, B, sums)
+        full = tracks.curvatures(slopes, D, B, sums)
         full[:, :m, :m] -= np.einsum("pklab,pab->pkl", bends, found.D)
         # The noise less its blur contains -2 B dt D, which is not linear.
         mixed = 2 * tracks.dt[:, None] * np.einsum("pkab,pab->pk", slopes, found.noise)

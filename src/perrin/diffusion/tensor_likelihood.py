@@ -267,7 +267,7 @@ class NoisyVectors:
         m, r = len(slopes), len(self.theta)
         track = self.mode_track
         if isinstance(track, EvenTracks):
-            even = track.diagonal(D[None], theta, B)
+            even = track.diagonal(D[None], theta, B, curved=True)
             found = track.slopes(D[None], B, even)
             full = track.curvatures(slopes[None], D[None], B, even)[0]
         elif track is not None:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from perrin.compiled.loading import compiled_kernels
 from perrin.diffusion.effective_modes import WINDOW, compress_steps, moment_estimate
 from perrin.diffusion.step_kernels import difference_eigenvalues
 
@@ -64,29 +65,37 @@ class TensorSlopes(NamedTuple):
                 slopes[bad] = np.nan
 
 
-class DiagonalModes(NamedTuple):
-    """The sine modes of even steps at P points, in the axes that diagonalise their covariances.
+class ModeSums(NamedTuple):
+    """Sums over the sine modes of even steps at P points, in the axes that diagonalise them all.
+
+    q are the modes along these axes over their variances, V one over the variances, and w the
+    weight of the noise in every mode.
 
     Attributes
     ----------
     axes : ndarray, shape (P, b, b)
         Those axes as columns, not of unit length.
-    power, inverse : ndarray, shape (P, K, b)
-        Variances of the K modes along them, and one over these.
-    values, scaled : ndarray, shape (P, K, b)
-        Modes along them, and the same over their variances.
     log_det : ndarray, shape (P,)
-        Logarithm of the determinant of a covariance less that of its variances.
+        Logarithm of the determinant of the covariance of all modes.
+    form : ndarray, shape (P,)
+        Sum of the squared modes over their variances.
+    same, next_one : ndarray, shape (P, b, b)
+        Sums of q_a q_b, less V_a on the diagonal, times 1 and w.
+    power : ndarray, shape (P, b, b, 3, b)
+        Sums of q_a q_b V_c times 1, w and w^2; empty where no second derivatives are wanted.
+    trace : ndarray, shape (P, b, 3, b)
+        Sums of V_a V_c times 1, w and w^2; empty as `power`.
     undefined : ndarray of bool, shape (P,)
         Whether the covariance is not positive definite.
     """
 
     axes: Floats
-    power: Floats
-    inverse: Floats
-    values: Floats
-    scaled: Floats
     log_det: Floats
+    form: Floats
+    same: Floats
+    next_one: Floats
+    power: Floats
+    trace: Floats
     undefined: Bools
 
 
@@ -135,64 +144,121 @@ class EvenTracks:
         blur = (2 * B * self.dt)[:, None, None] * D
         return np.asarray(np.einsum("pr,prab->pab", theta, self.shapes) - blur)
 
-    def diagonal(self, D: Floats, theta: Floats, B: Floats) -> DiagonalModes:
-        """Return the modes in the axes that diagonalise all of them, at P points."""
-        w, motion = self.weight, (2 * self.tau)[:, None, None] * D
+    def diagonal(self, D: Floats, theta: Floats, B: Floats, *, curved: bool = False) -> ModeSums:
+        """Return the sums over the modes at P points; `curved`: also for second derivatives."""
+        motion = (2 * self.tau)[:, None, None] * D
         values, turn = np.linalg.eigh(motion + 2 * self.noise(D, theta, B))
         undefined = ~(values[:, 0] > 0)
         if undefined.any():
             values = np.where(undefined[:, None], 1.0, values)
         root = turn / np.sqrt(values)[:, None]
         share, turn = np.linalg.eigh(np.swapaxes(root, 1, 2) @ motion @ root)
-        axes = root @ turn
-        power = share[:, None] + 0.5 * w[:, None] * (1 - share[:, None])
-        inverse, along = 1 / power, self.modes @ axes
-        log_det = np.log(values).sum(axis=1)
-        undefined |= ~(power.min(axis=(1, 2)) > 0)
-        return DiagonalModes(axes, power, inverse, along, along * inverse, log_det, undefined)
+        axes, b = root @ turn, D.shape[1]
+        sums = mode_sums(self.modes, axes, share, self.weight, curved=curved)
+        log_det, form, least = sums[:, :3].T
+        squares, second = sums[:, 3 : 3 + 2 * b * b], sums[:, 3 + 2 * b * b :]
+        same, next_one = squares.reshape(-1, 2, b, b).swapaxes(0, 1)
+        count = len(second) if curved else 0
+        power, trace = second[:count, : 3 * b**3], second[:count, 3 * b**3 :]
+        return ModeSums(
+            axes,
+            log_det + self.modes.shape[1] * np.log(values).sum(axis=1),
+            form,
+            same,
+            next_one,
+            power.reshape(count, b, b, 3, b),
+            trace.reshape(count, b, 3, b),
+            undefined | ~(least > 0),
+        )
 
-    def slopes(self, D: Floats, B: Floats, modes: DiagonalModes) -> TensorSlopes:
-        """Return the log-likelihoods and their derivatives at the points of these modes."""
-        w, (axes, power, inverse, values, q, log_det, undefined) = self.weight, modes
-        columns, back = np.swapaxes(q, 1, 2), np.swapaxes(axes, 1, 2)
-        same, next_one = columns @ q, columns @ (w[:, None] * q)
-        kept = np.arange(D.shape[1])
-        same[:, kept, kept] -= inverse.sum(axis=1)
-        next_one[:, kept, kept] -= w @ inverse
-        plain, weighted = axes @ same @ back, axes @ next_one @ back
-        with np.errstate(divide="ignore", invalid="ignore"):
-            log_det = np.log(power).sum(axis=(1, 2)) + len(w) * log_det
-        value = -0.5 * (log_det + (values * q).sum(axis=(1, 2)))
+    def slopes(self, D: Floats, B: Floats, sums: ModeSums) -> TensorSlopes:
+        """Return the log-likelihoods and their derivatives at the points of these sums."""
+        axes, back = sums.axes, np.swapaxes(sums.axes, 1, 2)
+        plain, weighted = axes @ sums.same @ back, axes @ sums.next_one @ back
+        value = -0.5 * (sums.log_det + sums.form)
         by_theta = 0.5 * np.einsum("pjab,pab->pj", self.shapes, weighted)
         by_B = -self.dt * (weighted * D).sum(axis=(1, 2))
         by_D = self.tau[:, None, None] * plain - (B * self.dt)[:, None, None] * weighted
         found = TensorSlopes(value, by_D, by_theta, by_B, 0.5 * weighted)
-        found.lose(undefined)
+        found.lose(sums.undefined)
         return found
 
-    def curvatures(self, E: Floats, D: Floats, B: Floats, modes: DiagonalModes) -> Floats:
+    def curvatures(self, E: Floats, D: Floats, B: Floats, sums: ModeSums) -> Floats:
         """Return minus the second derivatives along E (P, m, b, b), in theta and in B.
 
         They are those of the covariances alone, as if these were linear. With the slopes
         X_i = A_i + w_k N_i of mode k and its inverse covariance V, they are
         y^T V X_i V X_j V y - tr(V X_i V X_j)/2 summed over the modes.
         """
-        w, inverse, q = self.weight, modes.inverse, modes.scaled
         of_D, of_noise = covariance_slopes(E, D, B, self.dt)
         points, m, b = E.shape[:3]
         none = np.zeros((points, self.shapes.shape[1] + 1, b, b))
         same = np.concatenate([self.tau[:, None, None, None] * of_D, none], axis=1)
         shapes = np.broadcast_to(self.shapes, (points, *self.shapes.shape[1:]))
         next_one = np.concatenate([of_noise[:, :m], shapes, of_noise[:, m:]], axis=1)
-        axes = modes.axes[:, None]
+        axes = sums.axes[:, None]
         same, next_one = (np.swapaxes(axes, 2, 3) @ x @ axes for x in (same, next_one))
-        # Sums over the modes of q_a q_b V_c and of V_a V_c, times 1, w and w^2.
-        powers = w[:, None, None] ** np.arange(3)[:, None]
+        return information(same, next_one, sums.power, sums.trace)
+
+
+def mode_sums(
+    modes: Floats, axes: Floats, share: Floats, weight: Floats, *, curved: bool
+) -> Floats:
+    """Return sums over modes that a likelihood with a tensor, and its derivatives, consist of.
+
+    Mode k has the variances V_a = share_a + w_k (1 - share_a)/2 along the axes, and the amplitudes
+    q over these.
+
+    Parameters
+    ----------
+    modes : ndarray, shape (P or 1, K, b)
+    axes : ndarray, shape (P, b, b)
+        Axes as columns.
+    share : ndarray, shape (P, b)
+    weight : ndarray, shape (K,)
+        Weights w.
+    curved : bool
+        Whether the sums for second derivatives are wanted.
+
+    Returns
+    -------
+    ndarray, shape (P, 3 + 2 b^2) or (P, 3 + 5 b^2 + 3 b^3)
+        Sum of log V; of q_a^2 V_a; the least V; sums of q_a q_b less 1/V_a on the diagonal, then
+        the same times w. If `curved`: sums of q_a q_b/V_c times 1, w and w^2, as (b, b, 3, b), and
+        of 1/(V_a V_c), as (b, 3, b).
+
+    Examples
+    --------
+    >>> one = np.ones((1, 1, 1))
+    >>> mode_sums(one, one, one[0], np.array([0.5]), curved=False)
+    array([[0., 1., 1., 0., 0.]])
+    """
+    (points, b), count = share.shape, modes.shape[1]
+    fewer = 3 + 2 * b * b
+    sums = np.empty((points, fewer + 3 * b * b * (b + 1) if curved else fewer))
+    kernels = compiled_kernels() if b <= 3 else None
+    if kernels is not None:
+        kernels.mode_sums(*map(np.ascontiguousarray, (modes, axes, share, weight)), sums)
+        return sums
+    variance = share[:, None] + 0.5 * weight[:, None] * (1 - share[:, None])
+    inverse, along = 1 / variance, modes @ axes
+    q = along * inverse
+    with np.errstate(divide="ignore", invalid="ignore"):
+        sums[:, 0] = np.log(variance).sum(axis=(1, 2))
+    sums[:, 1], sums[:, 2] = (along * q).sum(axis=(1, 2)), variance.min(axis=(1, 2))
+    squares = np.stack([np.swapaxes(q, 1, 2) @ (w[:, None] * q) for w in (np.ones(count), weight)])
+    kept = np.arange(b)
+    squares[0][:, kept, kept] -= inverse.sum(axis=1)
+    squares[1][:, kept, kept] -= weight @ inverse
+    sums[:, 3:fewer] = squares.swapaxes(0, 1).reshape(points, -1)
+    if curved:
+        powers = weight[:, None, None] ** np.arange(3)[:, None]
         weights = (inverse[:, :, None] * powers).reshape(points, -1, 3 * b)
         pairs = (q[..., None] * q[:, :, None]).reshape(points, -1, b * b)
-        power = (np.swapaxes(pairs, 1, 2) @ weights).reshape(points, b, b, 3, b)
-        trace = (np.swapaxes(inverse, 1, 2) @ weights).reshape(points, b, 3, b)
-        return information(same, next_one, power, trace)
+        power, trace = np.swapaxes(pairs, 1, 2) @ weights, np.swapaxes(inverse, 1, 2) @ weights
+        sums[:, fewer : fewer + 3 * b**3] = power.reshape(points, -1)
+        sums[:, fewer + 3 * b**3 :] = trace.reshape(points, -1)
+    return sums
 
 
 class FewDiagonalModes(NamedTuple):

@@ -50,7 +50,7 @@ def clusters_together(count: int) -> int:
     >>> [clusters_together(count) for count in (5, 1000, 10_000)]
     [16, 100, 256]
     """
-    return min(max(-(-count // 10), _FEWEST_MEASURED), _MOST_MEASURED)
+    return min(max(-(-count // 4), _FEWEST_MEASURED), _MOST_MEASURED)
 
 
 def batches_of(items: Iterable[S], *, size: int) -> Iterator[list[S]]:
