@@ -429,6 +429,27 @@ INLINE double dot(const double *a, const double *b)
     return (part[0] + part[1]) + (part[2] + part[3]);
 }
 
+/* Sum of the logarithms of BLOCK normal numbers: that of the product of their fractions, and their
+ * exponents, which are added as they stand in the numbers. */
+INLINE double sum_of_logs(const double *numbers)
+{
+    double product[4] = {1.0, 1.0, 1.0, 1.0};
+    int64_t exponents[4] = {0, 0, 0, 0};
+    for (int k = 0; k < BLOCK; k += 4)
+        for (int i = 0; i < 4; i++) {
+            int64_t bits;
+            double fraction;
+            memcpy(&bits, numbers + k + i, sizeof bits);
+            exponents[i] += bits >> 52;
+            bits = (bits & 0xFFFFFFFFFFFFFLL) | 0x3FF0000000000000LL; /* from 1 to 2 */
+            memcpy(&fraction, &bits, sizeof fraction);
+            product[i] *= fraction;
+        }
+    int64_t exponent = exponents[0] + exponents[1] + exponents[2] + exponents[3];
+    return log((product[0] * product[1]) * (product[2] * product[3])) +
+           (double)(exponent - 1023 * BLOCK) * 0.69314718055994530942;
+}
+
 /* One block of modes along their axes: inverse variances, and modes over variances. */
 typedef struct {
     double inverse[MOST_AXES][BLOCK], scaled[MOST_AXES][BLOCK];
@@ -438,32 +459,25 @@ typedef struct {
 INLINE void fill_block(const double *modes, const double *w, Py_ssize_t count, Py_ssize_t b,
                        const double *axes, const double *share, Block *block, double *totals)
 {
-    double variance[MOST_AXES][BLOCK];
     for (Py_ssize_t a = 0; a < b; a++) {
-        double along[BLOCK];
+        double along[BLOCK], variance[BLOCK];
         for (Py_ssize_t k = 0; k < BLOCK; k++) {
             along[k] = block->inverse[a][k] = 0.0;
-            variance[a][k] = 1.0;
+            variance[k] = 1.0;
         }
         for (Py_ssize_t k = 0; k < count; k++) {
             for (Py_ssize_t c = 0; c < b; c++)
                 along[k] += modes[k * b + c] * axes[c * b + a];
-            variance[a][k] = share[a] + 0.5 * w[k] * (1 - share[a]);
+            variance[k] = share[a] + 0.5 * w[k] * (1 - share[a]);
         }
         for (Py_ssize_t k = 0; k < count; k++)
-            block->inverse[a][k] = 1 / variance[a][k];
+            block->inverse[a][k] = 1 / variance[k];
         for (Py_ssize_t k = 0; k < BLOCK; k++)
             block->scaled[a][k] = along[k] * block->inverse[a][k];
         totals[1] += dot(along, block->scaled[a]);
         for (Py_ssize_t k = 0; k < count; k++)
-            totals[2] = variance[a][k] < totals[2] ? variance[a][k] : totals[2];
-    }
-    for (Py_ssize_t k = 0; k < BLOCK; k += 4) {
-        double product = 1.0; /* one logarithm for a few variances */
-        for (Py_ssize_t a = 0; a < b; a++)
-            product *= (variance[a][k] * variance[a][k + 1]) *
-                       (variance[a][k + 2] * variance[a][k + 3]);
-        totals[0] += log(product);
+            totals[2] = variance[k] < totals[2] ? variance[k] : totals[2];
+        totals[0] += sum_of_logs(variance);
     }
 }
 
@@ -530,6 +544,84 @@ static void sum_modes(const Modes *modes)
                 add_curvatures(&block, powers, b, sums + 3 + 2 * squares,
                                sums + 3 + 2 * squares + 3 * squares * b);
         }
+    }
+}
+
+/* Powers of the sine modes of `motions` tracks, (motions, count) each, at `points` places. */
+typedef struct {
+    Py_ssize_t points, motions, count;
+    const double *power, *axes, *by_D, *by_theta, *given, *D, *theta;
+    double *sums;
+} Spectra;
+
+enum { SPECTRUM_SUMS = 11 };
+
+/* Add the sums of one block of modes of one track. */
+INLINE void add_spectrum(const Spectra *all, Py_ssize_t first, Py_ssize_t count, double D,
+                         double theta, double *sums)
+{
+    const double *by_D = all->by_D + first, *by_theta = all->by_theta + first;
+    const double *given = all->given + first, *axes = all->axes + first;
+    double variance[BLOCK], inverse[BLOCK], rise[BLOCK], fall[BLOCK], slope[2][BLOCK];
+    int alike = 1;
+    for (Py_ssize_t k = 0; k < count; k++) {
+        double sum = D * by_D[k] + theta * by_theta[k] + given[k];
+        variance[k] = sum > 1e-100 ? sum : 1e-100;
+        slope[0][k] = by_D[k];
+        slope[1][k] = by_theta[k];
+        rise[k] = all->power[first + k];
+        fall[k] = axes[k];
+        alike &= axes[k] == axes[0];
+    }
+    for (Py_ssize_t k = count; k < BLOCK; k++) {
+        variance[k] = 1.0;
+        slope[0][k] = slope[1][k] = rise[k] = fall[k] = 0.0;
+    }
+    if (alike)
+        sums[0] += axes[0] * sum_of_logs(variance);
+    else
+        for (Py_ssize_t k = 0; k < count; k++)
+            sums[0] += axes[k] * log(variance[k]);
+    for (int k = 0; k < BLOCK; k++)
+        inverse[k] = 1 / variance[k];
+    sums[0] += dot(rise, inverse);
+    for (int k = 0; k < BLOCK; k++) {
+        fall[k] *= inverse[k];
+        rise[k] *= inverse[k] * inverse[k];
+    }
+    for (int j = 0; j < 2; j++) {
+        sums[1 + 2 * j] += dot(rise, slope[j]);
+        sums[2 + 2 * j] += dot(fall, slope[j]);
+    }
+    for (int k = 0; k < BLOCK; k++) {
+        fall[k] *= inverse[k];
+        rise[k] *= inverse[k];
+    }
+    for (int j = 0; j < 3; j++) {
+        double square[BLOCK];
+        for (int k = 0; k < BLOCK; k++)
+            square[k] = slope[j > 1][k] * slope[j > 0][k];
+        sums[5 + j] += dot(rise, square);
+        sums[8 + j] += dot(fall, square);
+    }
+}
+
+EVERY_MACHINE
+static void sum_spectra(const Spectra *all)
+{
+    for (Py_ssize_t i = 0; i < all->points * all->motions; i++) {
+        Py_ssize_t motion = i % all->motions;
+        double *sums = all->sums + i * SPECTRUM_SUMS;
+        for (int j = 0; j < SPECTRUM_SUMS; j++)
+            sums[j] = 0.0;
+        for (Py_ssize_t start = 0; start < all->count; start += BLOCK) {
+            Py_ssize_t left = all->count - start, count = left < BLOCK ? left : BLOCK;
+            add_spectrum(all, motion * all->count + start, count, all->D[i], all->theta[i], sums);
+        }
+        for (int j = 0; j < 5; j++)
+            sums[j] *= j ? 0.5 : -0.5;
+        for (int j = 5; j < SPECTRUM_SUMS; j++)
+            sums[j] *= j < 8 ? -1.0 : -0.5;
     }
 }
 
@@ -743,10 +835,50 @@ PyDoc_STRVAR(mode_sums_doc,
 "modes (rows or 1, count, b), axes (rows, b, b), share (rows, b) and weight (count,) are read; sums\n"
 "(rows, 3 + 2 b^2), or with second derivatives (rows, 3 + 5 b^2 + 3 b^3), is written.");
 
+static PyObject *sum_spectrum_views(Py_buffer views[8])
+{
+    Py_buffer *sums = &views[7];
+    Spectra all = {.power = views[0].buf, .axes = views[1].buf, .by_D = views[2].buf,
+                   .by_theta = views[3].buf, .given = views[4].buf, .D = views[5].buf,
+                   .theta = views[6].buf, .sums = sums->buf};
+    int fits = views[0].ndim == 2 && sums->ndim == 3 && sums->shape[2] == SPECTRUM_SUMS;
+    if (fits) {
+        all.motions = views[0].shape[0];
+        all.count = views[0].shape[1];
+        all.points = sums->shape[0];
+        fits = sums->shape[1] == all.motions;
+        for (int i = 1; i < 5; i++)
+            fits &= views[i].len == views[0].len;
+        for (int i = 5; i < 7; i++)
+            fits &= views[i].len == all.points * all.motions * (Py_ssize_t)sizeof(double);
+    }
+    if (!fits)
+        return PyErr_Format(PyExc_ValueError, "expected power, axes, by_D, by_theta and given "
+                            "(motions, count), D and theta (points, motions), sums (points, "
+                            "motions, 11)");
+    Py_BEGIN_ALLOW_THREADS
+    sum_spectra(&all);
+    Py_END_ALLOW_THREADS
+    Py_RETURN_NONE;
+}
+
+static PyObject *spectrum_sums(PyObject *self, PyObject *args)
+{
+    (void)self;
+    return with_doubles(args, 8, sum_spectrum_views);
+}
+
+PyDoc_STRVAR(spectrum_sums_doc,
+"spectrum_sums(power, axes, by_D, by_theta, given, D, theta, sums)\n--\n\n"
+"Write the log-likelihoods of sine modes, and the positive and negative parts of their slopes.\n\n"
+"power, axes, by_D, by_theta and given (motions, count), D and theta (points, motions) are read,\n"
+"sums (points, motions, 11) is written.");
+
 static PyMethodDef functions[] = {
     {"wahba", wahba, METH_VARARGS, wahba_doc},
     {"spots", spots, METH_VARARGS, spots_doc},
     {"mode_sums", mode_sums, METH_VARARGS, mode_sums_doc},
+    {"spectrum_sums", spectrum_sums, METH_VARARGS, spectrum_sums_doc},
     {NULL, NULL, 0, NULL},
 };
 

@@ -21,3 +21,14 @@ def spots(
 def mode_sums(
     modes: Floats, axes: Floats, share: Floats, weight: Floats, sums: Floats, /
 ) -> None: ...
+def spectrum_sums(
+    power: Floats,
+    axes: Floats,
+    by_D: Floats,
+    by_theta: Floats,
+    given: Floats,
+    D: Floats,
+    theta: Floats,
+    sums: Floats,
+    /,
+) -> None: ...

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol
 import numpy as np
 
 from perrin._arrays import frozen
+from perrin.compiled.loading import compiled_kernels
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -253,6 +254,26 @@ class SineModes:
 
     def sums(self, D: Floats, theta: Floats) -> GroupSlopes:
         """Evaluate all motions at the D and the theta of each, (..., G)."""
+        kernels = compiled_kernels() if self.length else None
+        if kernels is None:
+            found = self.sums_of_numpy(D, theta)
+        else:
+            sums = np.empty((theta.size // len(self.groups), len(self.groups), 11))
+            points = np.broadcast_to(D, theta.shape), theta
+            kernels.spectrum_sums(*self.rows, *map(np.ascontiguousarray, points), sums)
+            found = GroupSlopes(*np.moveaxis(sums.reshape(*theta.shape, 11), -1, 0))
+        if self.steady is None:
+            return found
+        return self.without_steady_motion(found, 1 / self.eigenvalues(D, theta))
+
+    @cached_property
+    def rows(self) -> list[Floats]:
+        """Power, count, slopes and known part of the eigenvalues, a row of K modes each motion."""
+        columns = self.power, self.count, self.by_D, self.by_theta, self.given
+        return [np.ascontiguousarray(x.reshape(len(self.groups), self.length)) for x in columns]
+
+    def sums_of_numpy(self, D: Floats, theta: Floats) -> GroupSlopes:
+        """Evaluate all motions without a free steady motion, as the compiled kernel does."""
         halves, products = self.slope_columns[:2], self.slope_columns[2:]
         eigen = self.eigenvalues(D, theta)
         power, count = (
@@ -266,13 +287,12 @@ class SineModes:
         each = value.sum(axis=-1) if self.length else np.add.reduceat(value, self.starts, axis=-1)
         rises, falls = (self.by_motion(x, halves) for x in (rise, fall))
         rise_bends, fall_bends = (self.by_motion(x * inverse, products) for x in (rise, fall))
-        found = GroupSlopes(
+        return GroupSlopes(
             -0.5 * each,
             *(rises[..., 0], falls[..., 0], rises[..., 1], falls[..., 1]),
             *(-rise_bends[..., k] for k in range(3)),
             *(-0.5 * fall_bends[..., k] for k in range(3)),
         )
-        return found if self.steady is None else self.without_steady_motion(found, inverse)
 
     def eigenvalues(self, D: Floats, theta: Floats) -> Floats:
         """Return the variances of the modes, (..., G, K) where motions are of one length K."""
