@@ -625,6 +625,147 @@ static void sum_spectra(const Spectra *all)
     }
 }
 
+/* Steps (count, axes) of one motion, and the points at which two states of it are filtered.
+ *
+ * Axes with the same noise are a group; sizes (groups,) are their numbers of axes. noise (4, count,
+ * groups) holds weight and known part of the frame before a step, then of that after it; clock (3,
+ * count) duration, time since the step before, and whether a step follows it without a gap.
+ */
+typedef struct {
+    Py_ssize_t points, count, axes, groups;
+    const double *vectors, *noise, *clock, *sizes, *blur, *point;
+    double *value, *pairs;
+} States;
+
+/* What is known of the noise of the last frame, for each state. */
+typedef struct {
+    double probability[2], mean[2][MOST_AXES], variance[2][MOST_AXES];
+} Belief;
+
+/* One step at one point: variances and noises of the two states. */
+typedef struct {
+    const double *y;
+    double spread[2], blur[2], noise[MOST_AXES];
+} Step;
+
+/* Densities of a step relative to the largest, by states before and after; returns its logarithm. */
+INLINE double densities(const States *states, const Step *step, const Belief *belief,
+                        double square[2][MOST_AXES], double total[2][2][MOST_AXES],
+                        double density[2][2])
+{
+    double top = -DBL_MAX;
+    for (int from = 0; from < 2; from++) {
+        Py_ssize_t axis = 0;
+        for (Py_ssize_t g = 0; g < states->groups; g++) {
+            square[from][g] = 0.0;
+            for (int i = 0; i < (int)states->sizes[g]; i++, axis++) {
+                double surprise = step->y[axis] + belief->mean[from][axis];
+                square[from][g] += surprise * surprise;
+            }
+        }
+        for (int to = 0; to < 2; to++) {
+            double deviance = 0.0;
+            for (Py_ssize_t g = 0; g < states->groups; g++) {
+                double sum = belief->variance[from][g] + (step->spread[to] + step->noise[g]);
+                total[from][to][g] = sum > 1e-100 ? sum : 1e-100;
+                deviance += states->sizes[g] * log(total[from][to][g]) +
+                            square[from][g] / total[from][to][g];
+            }
+            density[from][to] = -0.5 * deviance;
+            top = density[from][to] > top ? density[from][to] : top;
+        }
+    }
+    for (int i = 0; i < 4; i++)
+        density[i / 2][i % 2] = exp(density[i / 2][i % 2] - top);
+    return top;
+}
+
+/* Merge the noise of the last frame over the states before; `joint` has their weights. */
+INLINE void merge(const States *states, const Step *step, double joint[2][2],
+                  double square[2][MOST_AXES], double total[2][2][MOST_AXES], Belief *belief)
+{
+    Belief next;
+    for (int to = 0; to < 2; to++) {
+        double both = joint[0][to] + joint[1][to];
+        Py_ssize_t axis = 0;
+        for (Py_ssize_t g = 0; g < states->groups; g++) {
+            double shared = step->noise[g] - step->blur[to], share[2], second = 0.0;
+            for (int from = 0; from < 2; from++) {
+                double gain = shared / total[from][to][g];
+                share[from] = joint[from][to] / both * gain;
+                second += share[from] * gain * square[from][g];
+            }
+            for (int i = 0; i < (int)states->sizes[g]; i++, axis++) {
+                double mean = share[0] * (step->y[axis] + belief->mean[0][axis]) +
+                              share[1] * (step->y[axis] + belief->mean[1][axis]);
+                next.mean[to][axis] = mean;
+                second -= mean * mean;
+            }
+            next.variance[to][g] = step->noise[g] + 2 * step->blur[to] -
+                                   shared * (share[0] + share[1]) + second / states->sizes[g];
+        }
+        next.probability[to] = both;
+    }
+    double sum = next.probability[0] + next.probability[1];
+    for (int to = 0; to < 2; to++)
+        next.probability[to] /= sum;
+    *belief = next;
+}
+
+/* Noise variance of the frame before (end 0) or after (end 1) step j. */
+INLINE double noise_of(const States *states, int end, Py_ssize_t j, Py_ssize_t g,
+                       const double *point)
+{
+    Py_ssize_t place = j * states->groups + g, size = states->count * states->groups;
+    const double *noise = states->noise + 2 * end * size;
+    return point[4] * noise[place] + noise[size + place] - states->blur[1] * point[0];
+}
+
+static void filter_states(const States *states)
+{
+    for (Py_ssize_t p = 0; p < states->points; p++) {
+        const double *point = states->point + 5 * p, *rate = point + 2;
+        double both = rate[0] + rate[1], value = 0.0;
+        Belief belief;
+        Step step;
+        for (int k = 0; k < 2; k++) {
+            step.blur[k] = states->blur[0] * point[k];
+            belief.probability[k] = rate[1 - k] / both;
+        }
+        for (Py_ssize_t j = 0; j < states->count; j++) {
+            const double *clock = states->clock + j;
+            step.y = states->vectors + j * states->axes;
+            for (int k = 0; k < 2; k++)
+                step.spread[k] = 2 * point[k] * clock[0] - 4 * step.blur[k];
+            if (!(clock[2 * states->count] > 0)) {
+                memset(belief.mean, 0, sizeof belief.mean);
+                for (int k = 0; k < 2; k++)
+                    for (Py_ssize_t g = 0; g < states->groups; g++)
+                        belief.variance[k][g] =
+                            noise_of(states, 0, j, g, point) + 2 * step.blur[k];
+            }
+            for (Py_ssize_t g = 0; g < states->groups; g++)
+                step.noise[g] = noise_of(states, 1, j, g, point);
+            double square[2][MOST_AXES], total[2][2][MOST_AXES], pair[2][2];
+            value += densities(states, &step, &belief, square, total, pair);
+            double change = -expm1(-both * clock[states->count]), sum = 0.0;
+            for (int from = 0; from < 2; from++)
+                for (int to = 0; to < 2; to++) {
+                    double leaving = rate[from] / both * change;
+                    pair[from][to] *= from == to ? 1 - leaving : leaving;
+                    if (p == 0)
+                        states->pairs[4 * j + 2 * from + to] = pair[from][to];
+                    pair[from][to] = belief.probability[from] * pair[from][to] + 1e-300;
+                }
+            for (int to = 0; to < 2; to++)
+                sum += pair[0][to] + pair[1][to];
+            value += log(sum);
+            merge(states, &step, pair, square, total, &belief);
+        }
+        states->value[p] = value;
+    }
+}
+
 /* Keep `view` as doubles, C-contiguous; returns 0 with an exception set where it is not. */
 static int doubles(PyObject *array, int flags, Py_buffer *view)
 {
@@ -807,15 +948,16 @@ static PyObject *sum_mode_views(Py_buffer views[5])
 
 enum { MOST_ARRAYS = 16 };
 
-/* Call a function with `count` arrays of doubles, the last of which it writes. */
-static PyObject *with_doubles(PyObject *args, int count, PyObject *(*work)(Py_buffer *))
+/* Call a function with `count` arrays of doubles, the last of which, `written`, it writes. */
+static PyObject *with_doubles(PyObject *args, int count, int written,
+                              PyObject *(*work)(Py_buffer *))
 {
     Py_buffer views[MOST_ARRAYS];
     int held = 0;
     if (PyTuple_Size(args) != count)
         return PyErr_Format(PyExc_TypeError, "expected %d arrays", count);
     while (held < count && doubles(PyTuple_GetItem(args, held),
-                                   held == count - 1 ? PyBUF_WRITABLE : 0, &views[held]))
+                                   held >= count - written ? PyBUF_WRITABLE : 0, &views[held]))
         held++;
     PyObject *done = held == count ? work(views) : NULL;
     while (held > 0)
@@ -826,7 +968,7 @@ static PyObject *with_doubles(PyObject *args, int count, PyObject *(*work)(Py_bu
 static PyObject *mode_sums(PyObject *self, PyObject *args)
 {
     (void)self;
-    return with_doubles(args, 5, sum_mode_views);
+    return with_doubles(args, 5, 1, sum_mode_views);
 }
 
 PyDoc_STRVAR(mode_sums_doc,
@@ -865,7 +1007,7 @@ static PyObject *sum_spectrum_views(Py_buffer views[8])
 static PyObject *spectrum_sums(PyObject *self, PyObject *args)
 {
     (void)self;
-    return with_doubles(args, 8, sum_spectrum_views);
+    return with_doubles(args, 8, 1, sum_spectrum_views);
 }
 
 PyDoc_STRVAR(spectrum_sums_doc,
@@ -874,10 +1016,54 @@ PyDoc_STRVAR(spectrum_sums_doc,
 "power, axes, by_D, by_theta and given (motions, count), D and theta (points, motions) are read,\n"
 "sums (points, motions, 11) is written.");
 
+static PyObject *filter_state_views(Py_buffer views[8])
+{
+    Py_ssize_t size = sizeof(double);
+    States states = {.vectors = views[0].buf, .noise = views[1].buf, .clock = views[2].buf,
+                     .sizes = views[3].buf, .blur = views[4].buf, .point = views[5].buf,
+                     .pairs = views[6].buf, .value = views[7].buf};
+    int fits = views[0].ndim == 2 && views[0].shape[1] <= MOST_AXES;
+    if (fits) {
+        double axes = 0.0;
+        states.count = views[0].shape[0];
+        states.axes = views[0].shape[1];
+        states.groups = views[3].len / size;
+        states.points = views[7].len / size;
+        for (Py_ssize_t g = 0; g < states.groups; g++)
+            axes += states.sizes[g] >= 1 ? floor(states.sizes[g]) : MOST_AXES + 1;
+        fits = axes == (double)states.axes &&
+               views[1].len == 4 * states.count * states.groups * size &&
+               views[2].len == 3 * states.count * size && views[4].len == 2 * size &&
+               views[5].len == 5 * states.points * size && views[6].len == 4 * states.count * size;
+    }
+    if (!fits)
+        return PyErr_Format(PyExc_ValueError, "expected vectors (count, axes), noise (4, count, "
+                            "groups), clock (3, count), sizes (groups,), blur (2,), points (P, 5), "
+                            "pairs (count, 2, 2), value (P,), up to 3 axes");
+    Py_BEGIN_ALLOW_THREADS
+    filter_states(&states);
+    Py_END_ALLOW_THREADS
+    Py_RETURN_NONE;
+}
+
+static PyObject *two_states(PyObject *self, PyObject *args)
+{
+    (void)self;
+    return with_doubles(args, 8, 2, filter_state_views);
+}
+
+PyDoc_STRVAR(two_states_doc,
+"two_states(vectors, noise, clock, sizes, blur, points, pairs, value)\n--\n\n"
+"Write the log-likelihoods of two states at some points, and the weights of pairs at the first.\n\n"
+"vectors (count, axes) in the order of their groups, noise (4, count, groups), clock (3, count),\n"
+"sizes (groups,), blur (2,) and points (P, 5) are read; pairs (count, 2, 2) and value (P,) are\n"
+"written.");
+
 static PyMethodDef functions[] = {
     {"wahba", wahba, METH_VARARGS, wahba_doc},
     {"spots", spots, METH_VARARGS, spots_doc},
     {"mode_sums", mode_sums, METH_VARARGS, mode_sums_doc},
+    {"two_states", two_states, METH_VARARGS, two_states_doc},
     {"spectrum_sums", spectrum_sums, METH_VARARGS, spectrum_sums_doc},
     {NULL, NULL, 0, NULL},
 };

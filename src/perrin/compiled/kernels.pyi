@@ -32,3 +32,14 @@ def spectrum_sums(
     sums: Floats,
     /,
 ) -> None: ...
+def two_states(
+    vectors: Floats,
+    noise: Floats,
+    clock: Floats,
+    sizes: Floats,
+    blur: Floats,
+    points: Floats,
+    pairs: Floats,
+    value: Floats,
+    /,
+) -> None: ...

@@ -39,7 +39,7 @@ _COARSE_STEP, _COARSE_STEP_IN_PLANE, _LOW_SNR, _FEW_STEPS = 0.2, 2.0, 0.2, 30
 # Beyond this the mean of the square of rotation vectors, which end at pi, says little of D_R.
 _LOST_TURNS = 1.0
 
-_TOGETHER = 32  # motions that are evaluated at once; more do not stay in the processor's cache
+_TOGETHER = 128  # motions that are evaluated at once; more do not stay in the processor's cache
 
 _NO_MOTION = Found(0.0, (0.0, 0.0), (0.0, 0.0), 0.0, np.nan)
 

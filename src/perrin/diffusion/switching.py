@@ -11,6 +11,7 @@ import numpy as np
 from perrin._arrays import choice_fault, finite_or_none, from_plain, frozen, refuse, to_plain
 from perrin._display import Shown
 from perrin._text import with_error
+from perrin.compiled.loading import compiled_kernels
 from perrin.diffusion.estimate import NORMAL, UNITS
 from perrin.diffusion.likelihood import Likelihood
 from perrin.diffusion.noise_model import Noise, noise_faults
@@ -21,6 +22,7 @@ from perrin.motion.rigid_motion import RigidMotion
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Mapping, Sequence
+    from types import ModuleType
     from typing import TypeAlias
 
     from perrin._arrays import Bools, Floats, Ints
@@ -263,7 +265,7 @@ class SwitchingSteps:
         return equal_columns(np.concatenate([*self.track.weight, *self.track.known]))
 
     def filtered(self, points: Floats) -> tuple[Floats, Floats]:
-        """Return the log-likelihood at several points, and the weights of all pairs of states.
+        """Return the log-likelihood at some points, and weights of pairs of states at the first.
 
         Parameters
         ----------
@@ -274,7 +276,7 @@ class SwitchingSteps:
         Returns
         -------
         value : ndarray, shape (P,)
-        pairs : ndarray, shape (S, 2, 2, P)
+        pairs : ndarray, shape (S, 2, 2)
             For every step, by the states before and after it, the probability of the change times
             the density of the step, relative to the largest of the four densities.
 
@@ -295,7 +297,31 @@ class SwitchingSteps:
 
     def fast_probability(self, point: Floats) -> Floats:
         """Return the probability of the fast state of every step, given all steps, (S,)."""
-        return smoothed(self.filtered(point[None])[1], point[None, 2:4])[:, 0]
+        return smoothed(self.filtered(point[None])[1], point[2:4])
+
+    @cached_property
+    def of_groups(self) -> tuple[Floats, Floats, Floats, Floats, Floats]:
+        """Vectors, noise, clock, sizes and blur, as the compiled kernel reads them."""
+        track, firsts = self.track, [axes[0] for axes in self.equal_axes]
+        noise = [part[end][:, firsts] for end in (0, 1) for part in (track.weight, track.known)]
+        return (
+            np.ascontiguousarray(track.steps.vectors[:, np.concatenate(self.equal_axes)]),
+            np.array(noise),
+            np.array([track.steps.duration, self.elapsed, self.follows]),
+            np.array([float(len(axes)) for axes in self.equal_axes]),
+            np.array([self.exposed, track.blur - self.exposed]),
+        )
+
+    def filtered_by(self, kernels: ModuleType, points: Floats) -> tuple[Floats, Floats]:
+        """Return what `filtered` does, computed by the compiled kernels."""
+        place = np.exp(points)
+        if not self.free:
+            place[:, 4] = self.track.theta
+        value, pairs = np.empty(len(points)), np.empty((len(self.elapsed), 2, 2))
+        kernels.two_states(*self.of_groups, place, pairs, value)
+        if self.free and self.track.freedom:
+            value -= 0.5 * self.track.freedom * (points[:, 4] + self.track.theta / place[:, 4])
+        return value, pairs
 
 
 def filtered_each(
@@ -303,7 +329,7 @@ def filtered_each(
 ) -> list[tuple[Floats, Floats]]:
     """Filter several motions, each at points of its own, as `SwitchingSteps.filtered`.
 
-    Motions with equally many steps are filtered together.
+    Without compiled kernels motions with equally many steps are filtered together.
 
     Parameters
     ----------
@@ -313,7 +339,7 @@ def filtered_each(
     Returns
     -------
     list of tuple
-        Log-likelihoods (P,) and weights (S, 2, 2, P) of each.
+        Log-likelihoods (P,) of each, and weights (S, 2, 2) at its first point.
 
     Examples
     --------
@@ -327,6 +353,9 @@ def filtered_each(
     >>> one[0] == two[0]
     array([ True])
     """
+    kernels = compiled_kernels()
+    if kernels is not None and all(len(s.track.steps.vectors[0]) <= 3 for s, _ in requests):
+        return [steps.filtered_by(kernels, points) for steps, points in requests]
     alike: dict[tuple[int, ...], list[list[int]]] = {}
     for k, (steps, points) in enumerate(requests):
         sizes = [len(axes) for axes in steps.equal_axes]
@@ -342,7 +371,7 @@ def filtered_each(
             ends = np.cumsum([len(requests[k][1]) for k in rows])
             for k, high in zip(rows, ends.tolist(), strict=True):
                 own = slice(high - len(requests[k][1]), high)
-                found[k] = value[own], pairs[..., own]
+                found[k] = value[own], pairs[..., own.start].copy()
     return [found[k] for k in range(len(requests))]
 
 
@@ -466,33 +495,33 @@ def smoothed(pairs: Floats, log_rate: Floats) -> Floats:
 
     Parameters
     ----------
-    pairs : ndarray, shape (S, 2, 2, P)
+    pairs : ndarray, shape (S, 2, 2)
         Weights of the pairs of states, as `SwitchingSteps.filtered` returns them.
-    log_rate : ndarray, shape (P, 2)
+    log_rate : ndarray, shape (2,)
         Logarithms of the rates of leaving the slow and the fast state, 1/s.
 
     Returns
     -------
-    ndarray, shape (S, P)
+    ndarray, shape (S,)
 
     Examples
     --------
-    >>> smoothed(np.ones((3, 2, 2, 1)), np.zeros((1, 2)))[:, 0]
+    >>> smoothed(np.ones((3, 2, 2)), np.zeros(2))
     array([0.5, 0.5, 0.5])
     """
-    rate = np.exp(log_rate.T)
-    forward, backward = rate[::-1] / rate.sum(axis=0), np.ones_like(rate)
-    seen = np.empty((len(pairs), *forward.shape))
+    rate = np.exp(log_rate)
+    forward, backward = rate[::-1] / rate.sum(), np.ones(2)
+    seen = np.empty((len(pairs), 2))
     for j, pair in enumerate(pairs):
-        forward = (forward[:, None] * pair).sum(axis=0)
-        forward = forward / forward.sum(axis=0)
+        forward = forward @ pair
+        forward = forward / forward.sum()
         seen[j] = forward
-    fast = np.empty((len(pairs), forward.shape[1]))
+    fast = np.empty(len(pairs))
     for j in range(len(pairs) - 1, -1, -1):
         both = seen[j] * backward
-        fast[j] = both[1] / both.sum(axis=0)
-        backward = (pairs[j] * backward).sum(axis=1)
-        backward = backward / backward.sum(axis=0)
+        fast[j] = both[1] / both.sum()
+        backward = pairs[j] @ backward
+        backward = backward / backward.sum()
     return fast
 
 
@@ -687,7 +716,7 @@ def _two_states(motions: Sequence[RigidMotion], quantity: Quantity, settings: No
     states, probability = [], []
     for track, m, pairs in zip(steps, motions, pairs_of_each, strict=True):
         fast = np.full(len(m.time), np.nan)
-        fast[track.track.steps.stop] = smoothed(pairs, shared[None, 2:])[:, 0]
+        fast[track.track.steps.stop] = smoothed(pairs, shared[2:])
         probability.append(fast)
         states.append(np.where(np.isnan(fast), -1, fast > 0.5).astype(np.int64))
     gain = value - float(one.value[0])
@@ -755,7 +784,7 @@ def _most_likely(
             value += part[0]
             slope[rows] += part[1]
             curvature[np.ix_(rows, rows)] += part[2]
-        weights = [pairs[..., :1].copy() for _, pairs in filtered]  # at the point itself
+        weights = [pairs for _, pairs in filtered]  # at the point itself
         return value, np.where(fixed, 0.0, slope), curvature, weights
 
     here, damping = (yield from expanded(x)), 1e-3

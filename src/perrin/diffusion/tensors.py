@@ -55,7 +55,7 @@ if TYPE_CHECKING:
 _NOISELESS = 1e-8
 
 # About this many step components are evaluated at once; more do not stay in the processor's cache.
-_MOST_TENSORS_AT_ONCE = 60_000
+_MOST_TENSORS_AT_ONCE = 400_000
 
 # Beyond this log ratio of noise to motion one of the two is as good as none.
 _FARTHEST = 20.0
