@@ -21,6 +21,7 @@ from perrin.curves.displacement import (
     body_directions,
     direction_weights,
     drift_corrected,
+    frames_of,
     independent_walks,
     mean_square_curve,
     mean_velocity,
@@ -47,7 +48,7 @@ from perrin.curves.gaussianity import (
     whole_lags,
     without_noise,
 )
-from perrin.curves.grids import GRID_TOLERANCE, Frames, grid_step, place_frames
+from perrin.curves.grids import GRID_TOLERANCE, Frames, complete_frames, grid_step, place_frames
 from perrin.curves.noise_offsets import (
     center_offset,
     correction_fault,
@@ -101,6 +102,7 @@ __all__ = [
     "brownian_decay",
     "center_offset",
     "common_frames",
+    "complete_frames",
     "complete_squares",
     "corrected_excess",
     "correction_fault",
@@ -112,6 +114,7 @@ __all__ = [
     "displacement_counts",
     "drift_corrected",
     "fft_size",
+    "frames_of",
     "frames_present",
     "gapped_squares",
     "gaussian_bins",

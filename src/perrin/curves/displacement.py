@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,7 +20,7 @@ from perrin._arrays import (
     to_plain,
 )
 from perrin._display import Shown
-from perrin.curves.grids import place_frames
+from perrin.curves.grids import complete_frames, place_frames
 from perrin.curves.pairs import Squares, pair_sums
 from perrin.curves.standard_errors import relative_error
 from perrin.errors import TooFewFramesError
@@ -27,6 +28,8 @@ from perrin.motion.rigid_motion import RigidMotion, threshold_displacement
 
 if TYPE_CHECKING:
     import pandas as pd
+
+    from perrin.curves.grids import Frames
 
 # Directions whose mean weighs the axes this evenly change a slope by at most this fraction.
 _EVEN_WEIGHTS = 0.01
@@ -241,6 +244,7 @@ def msd(
         motion, dt = motion_or_positions, motion_or_positions.dt
         walks, time, piece = motion.center[:, None], motion.time, motion.piece
         noise = motion.center_noise
+        frames = frames_of(walks, time, piece, dt=dt)
     elif dt is None:
         raise ValueError("dt: the time between frames (s) is needed with positions")
     else:
@@ -248,6 +252,8 @@ def msd(
         walks = as_positions(motion_or_positions)
         time = dt * np.arange(len(walks), dtype=np.float64)
         piece = np.broadcast_to(np.zeros((), dtype=np.int64), len(walks))
+        whole = len(walks) > 1 and present(walks).all()
+        frames = (complete_frames if whole else partial(frames_of, walks))(time, piece, dt=dt)
     dof = walks.shape[2]
     estimated = isinstance(drift, (bool, np.bool_)) and bool(drift)
     velocity = None
@@ -261,8 +267,7 @@ def msd(
             )
     if velocity is not None:
         walks = walks - (time - time[0])[:, None, None] * velocity
-    curve = mean_square_curve(walks, time, piece, dt=dt, quantity="translation", dof=dof)
-    curve = replace(curve, noise=noise)
+    curve = mean_square_curve(walks, frames, quantity="translation", dof=dof, noise=noise)
     if velocity is None:
         return curve
     curve = replace(curve, drift=tuple(float(v) for v in velocity))
@@ -435,17 +440,8 @@ def msad_axes(motion: RigidMotion, *, axes: ArrayLike | None = None) -> tuple[La
     )
 
 
-def mean_square_curve(
-    walks: Floats,
-    time: Floats,
-    piece: Ints,
-    *,
-    dt: float,
-    quantity: str,
-    dof: int,
-    n_walks: float | None = None,
-) -> LagCurve:
-    """Return the mean square differences of walks over time, pieces and walkers.
+def frames_of(walks: Floats, time: Floats, piece: Ints, *, dt: float) -> Frames:
+    """Return the frames in which any of the walkers is present.
 
     Parameters
     ----------
@@ -457,6 +453,44 @@ def mean_square_curve(
         Piece of each frame; no pair of frames joins two of them.
     dt : float
         Time between frames, s.
+
+    Returns
+    -------
+    Frames
+
+    Raises
+    ------
+    TooFewFramesError
+        If there are fewer than two.
+
+    Examples
+    --------
+    >>> walk = np.array([0.0, np.nan, 3.0])[:, None, None]
+    >>> frames_of(walk, np.arange(3.0), np.zeros(3, dtype=int), dt=1.0).row
+    array([0, 2])
+    """
+    seen = present(walks)
+    here = seen[:, 0] if seen.shape[1] == 1 else np.asarray(seen.any(axis=1))
+    return place_frames(time, piece, here, dt=dt)
+
+
+def mean_square_curve(
+    walks: Floats,
+    frames: Frames,
+    *,
+    quantity: str,
+    dof: int,
+    n_walks: float | None = None,
+    noise: float = np.nan,
+) -> LagCurve:
+    """Return the mean square differences of walks over time, pieces and walkers.
+
+    Parameters
+    ----------
+    walks : ndarray, shape (T, K, c)
+        Coordinates of K walkers, NaN where missing.
+    frames : Frames
+        Frames that form the pairs.
     quantity : {"rotation", "translation"}
         Kind of curve.
     dof : int
@@ -464,6 +498,8 @@ def mean_square_curve(
     n_walks : float, optional
         Number of independent one-dimensional walks, for directions of one body. Default: free
         particles, K c walks, whose pairs are all counted.
+    noise : float
+        Noise variance of one coordinate that is known from elsewhere.
 
     Returns
     -------
@@ -477,17 +513,14 @@ def mean_square_curve(
     Examples
     --------
     >>> walk, time = np.array([0.0, 1.0, 3.0])[:, None, None], np.arange(3.0)
-    >>> piece = np.zeros(3, dtype=int)
-    >>> mean_square_curve(walk, time, piece, dt=1.0, quantity="translation", dof=1).value
+    >>> frames = frames_of(walk, time, np.zeros(3, dtype=int), dt=1.0)
+    >>> mean_square_curve(walk, frames, quantity="translation", dof=1).value
     array([2.5, 9. ])
     """
-    seen = present(walks)
-    here = seen[:, 0] if seen.shape[1] == 1 else np.asarray(seen.any(axis=1))
-    frames = place_frames(time, piece, here, dt=dt)
     sums = pair_sums(Squares(walks), frames)
     # The sums are not needed any more: the means take their place.
     components = sums.sums
-    components /= np.where(sums.pairs > 0, sums.pairs, np.nan)[:, None]
+    components /= sums.divisor[:, None]
     value = components.sum(axis=1)
     pairs = sums.pairs / walks.shape[1]
     relative = relative_error(sums, frames, value / (2 * dof), pairs)
@@ -503,6 +536,7 @@ def mean_square_curve(
         quantity=quantity,
         unit="rad^2" if quantity == "rotation" else "um^2",
         n_walks=n_walks,
+        noise=noise,
         step=frames.step,
         blocks=tuple(int(n) for n in frames.lengths),
     )
@@ -544,9 +578,7 @@ def angle_curve(
     """
     curve = mean_square_curve(
         angles,
-        motion.time,
-        motion.piece,
-        dt=motion.dt,
+        frames_of(angles, motion.time, motion.piece, dt=motion.dt),
         quantity="rotation",
         dof=dof,
         n_walks=n_walks,

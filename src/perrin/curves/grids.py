@@ -119,19 +119,17 @@ def place_frames(time: Floats, piece: Ints, here: Bools, *, dt: float) -> Frames
     >>> place_frames(time, piece, np.ones(4, dtype=bool), dt=0.5).slot
     array([0, 1, 2, 4])
     """
-    rows = np.flatnonzero(here)
-    if rows.size < 2:
-        raise TooFewFramesError("no two frames in one piece: a pair needs two", rows.size)
-    if rows.size == len(time) and piece[0] == piece[-1]:
-        slot = np.arange(len(time))
+    count = int(np.count_nonzero(here))
+    if count < 2:
+        raise TooFewFramesError("no two frames in one piece: a pair needs two", count)
+    if count == len(time) and piece[0] == piece[-1]:
         off = (time - time[0]) / dt
-        off -= slot
-        np.abs(off, out=off)
-        if off.max() < _EXACT_GRID and np.all(piece == piece[0]):
-            # One piece without a gap at exact times. Views: the arrays of the caller stay writable,
-            # and long tracks are not copied.
-            block = np.broadcast_to(np.zeros((), dtype=np.int64), slot.shape)
-            return Frames(slot[:], time[:], piece[:], block, slot, dt, exact=True)
+        off -= np.arange(count)
+        exact = max(off.max(), -off.min()) < _EXACT_GRID
+        if exact and np.all(piece == piece[0]):
+            # Views: the arrays of the caller stay writable, and long tracks are not copied.
+            return complete_frames(time[:], piece[:], dt=dt)
+    rows = np.flatnonzero(here)
     t, label = time[rows], piece[rows]
     same = label[1:] == label[:-1]
     if np.any(label[1:] < label[:-1]) or np.any((t[1:] < t[:-1]) & same):
@@ -165,6 +163,32 @@ def place_frames(time: Floats, piece: Ints, here: Bools, *, dt: float) -> Frames
     begins |= np.append(False, np.diff(slot) > _PLACES_PER_FRAME) & sparse
     block = np.cumsum(begins) - 1
     return Frames(rows, t, label, block, slot - slot[begins][block], step, exact)
+
+
+def complete_frames(time: Floats, piece: Ints, *, dt: float) -> Frames:
+    """Return the frames of one piece without a gap at multiples of dt.
+
+    Parameters
+    ----------
+    time : ndarray, shape (T,)
+        Time of each frame, s.
+    piece : ndarray of int, shape (T,)
+        Piece of each frame, one for all.
+    dt : float
+        Time between frames, s.
+
+    Returns
+    -------
+    Frames
+
+    Examples
+    --------
+    >>> complete_frames(np.arange(3.0), np.zeros(3, dtype=int), dt=1.0).lengths
+    array([2])
+    """
+    slot = np.arange(len(time))
+    block = np.broadcast_to(np.zeros((), dtype=np.int64), slot.shape)
+    return Frames(slot, time, piece, block, slot, dt, exact=True)
 
 
 def grid_step(durations: Floats, dt: float) -> float:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from dataclasses import dataclass
 from functools import lru_cache
+from math import prod
 from typing import TYPE_CHECKING, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
@@ -90,9 +91,16 @@ class PairSums(NamedTuple):
     listed: ListedPairs | None
 
     @property
+    def divisor(self) -> Floats:
+        """Number of pairs, shape (L,); NaN at a lag without a pair."""
+        number = self.pairs.astype(np.float64)
+        number[number == 0] = np.nan
+        return number
+
+    @property
     def mean(self) -> Floats:
         """Mean over the pairs, shape (L, q); NaN at a lag without a pair."""
-        average: Floats = self.sums / np.where(self.pairs > 0, self.pairs, np.nan)[:, None]
+        average: Floats = self.sums / self.divisor[:, None]
         return average
 
 
@@ -138,7 +146,7 @@ def pair_sums(kernel: Kernel, frames: Frames, *, most: int | None = None) -> Pai
     """
     pairs, complete = (None, False) if frames.separate else _pairs_one_by_one(frames)
     longest = int(frames.lengths.max())
-    if frames.exact and frames.separate:
+    if frames.exact and frames.separate and len(frames.blocks) > 1:
         span = round(float(np.ptp(frames.time)) / frames.step)
         longest = span if span <= frames.most_lags else longest
     longest = longest if most is None else min(longest, most)
@@ -389,7 +397,7 @@ def complete_squares(walks: Floats, count: int) -> Floats:
     n, walkers, components = walks.shape
     transform = Correlations.of(n + count)
     half = len(transform.turn)
-    at_once = int(np.clip(_NUMBERS_AT_ONCE // (n * walkers), 1, components))
+    at_once = min(max(_NUMBERS_AT_ONCE // (n * walkers), 1), components)
     time = np.arange(0.5 * (1 - n), 0.5 * n)
     spread = walkers * float(time @ time)
     # New memory takes as long as the transforms: arrays are used again.
@@ -459,7 +467,7 @@ def gapped_squares(walks: Floats, here: Bools, count: int) -> tuple[Floats, Ints
     """
     n, walkers, components = walks.shape
     transform = Correlations.of(n + count)
-    at_once = int(np.clip(_NUMBERS_AT_ONCE // (n * walkers), 1, components))
+    at_once = min(max(_NUMBERS_AT_ONCE // (n * walkers), 1), components)
     mask = np.ascontiguousarray(here.T, dtype=np.float64)
     spectrum = transform.spectrum(mask)
     pairs = np.rint(transform.even(squared_size(spectrum))[1 : count + 1])
@@ -526,12 +534,7 @@ class Correlations:
     @classmethod
     def of(cls, places: int) -> Correlations:
         """Return the transforms of a period of at least this many places."""
-        half = fft_size(-(-places // 2))
-        # Products of two short lists: a trigonometric function for every place takes longer.
-        width = int(np.sqrt(half)) + 1
-        step = -0.5j * np.pi / half
-        rows, columns = np.exp(step * width * np.arange(width)), np.exp(step * np.arange(width))
-        return cls(np.multiply.outer(rows, columns).ravel()[:half])
+        return cls(half_turn(fft_size(-(-places // 2))))
 
     def spectrum(self, x: Floats, *, out: Complexes | None = None) -> Complexes:
         """Return the transform of sequences (K, N) at the frequencies (2k + 1/2)/M, (K, H)."""
@@ -572,10 +575,28 @@ class Correlations:
             summed = np.fft.rfft(power, norm="forward")
         else:
             shape = (*power.shape[:-1], size)
-            summed = memory.reshape(-1)[: int(np.prod(shape))].reshape(shape)
+            summed = memory.reshape(-1)[: prod(shape)].reshape(shape)
             np.fft.rfft(power, norm="forward", out=summed)
         summed *= self.turn[:size]
         return summed
+
+
+@lru_cache(maxsize=1)
+def half_turn(count: int) -> Complexes:
+    """Return exp(-i pi j/(2 H)) for j = 0 to H - 1; the last is kept for curves of one length.
+
+    Examples
+    --------
+    >>> half_turn(2).round(3)
+    array([1.   +0.j   , 0.707-0.707j])
+    """
+    # Products of two short lists: a trigonometric function for every place takes longer.
+    width = int(np.sqrt(count)) + 1
+    step = -0.5j * np.pi / count
+    rows, columns = np.exp(step * width * np.arange(width)), np.exp(step * np.arange(width))
+    turn: Complexes = np.multiply.outer(rows, columns).ravel()[:count]
+    turn.flags.writeable = False
+    return turn
 
 
 def squared_size(
@@ -654,7 +675,9 @@ class Products:
 def _on_grid(values: Floats, rows: Ints, slots: Ints) -> Floats:
     """Return rows of an array at their places on a grid, NaN between them."""
     if len(slots) == slots[-1] + 1:
-        if rows[-1] - rows[0] == len(rows) - 1 and np.all(np.diff(rows) == 1):
+        if len(rows) == len(values) and np.array_equal(rows, slots):
+            return values
+        if rows[-1] - rows[0] == len(rows) - 1 and np.array_equal(rows, slots + rows[0]):
             return values[rows[0] : rows[-1] + 1]
         return values[rows]
     grid = np.full((int(slots[-1]) + 1, *values.shape[1:]), np.nan)

@@ -51,13 +51,12 @@ def relative_error(sums: PairSums, frames: Frames, half: Floats, pairs: Floats) 
     >>> bool(abs(error[0] - np.sqrt(2 / 100)) < 1e-3)  # 100 independent squares
     True
     """
-    lag = sums.lagtime / frames.step
-    d, s = two_lag_fit(lag, half, pairs)
     lengths = frames.lengths
-    if len(lengths) == 1 and sums.listed is None:
+    if len(lengths) == 1 and sums.listed is None and frames.exact:
         longest = int(lengths[0])
-        whole = np.arange(1.0, len(lag) + 1)
-        if frames.exact and np.array_equal(pairs, longest + 1 - whole):
+        whole = np.arange(1.0, len(half) + 1)
+        if np.array_equal(pairs, longest + 1 - whole):
+            d, s = two_lag_fit(whole, half, pairs)
             if not d + s > 0:
                 return np.full_like(half, np.nan)
             relative = lag_covariance(whole, longest, present=None, D=d, s=s)
@@ -67,6 +66,8 @@ def relative_error(sums: PairSums, frames: Frames, half: Floats, pairs: Floats) 
             whole *= pairs
             relative /= whole
             return relative
+    lag = sums.lagtime / frames.step
+    d, s = two_lag_fit(lag, half, pairs)
     total = np.zeros_like(lag)
     blocks = [
         (int(n), int(k)) for n, k in zip(*np.unique(lengths, return_counts=True), strict=True)
@@ -125,10 +126,13 @@ def two_lag_fit(lag: Floats, half: Floats, pairs: Floats | Ints) -> tuple[float,
     >>> two_lag_fit(np.array([1.0, 2.0]), np.array([0.75, 1.25]), np.array([9, 8]))
     (0.5, 0.25)
     """
-    good = pairs > 0
-    first = second = int(np.argmax(good))
-    if good[first + 1 :].any():
-        second += 1 + int(np.argmax(good[first + 1 :]))
+    if len(pairs) > 1 and pairs[0] > 0 and pairs[1] > 0:
+        first, second = 0, 1
+    else:
+        good = pairs > 0
+        first = second = int(np.argmax(good))
+        if good[first + 1 :].any():
+            second += 1 + int(np.argmax(good[first + 1 :]))
     rise = (half[second] - half[first]) / max(lag[second] - lag[first], 1e-9)
     d = min(max(rise, 0.0), half[first] / lag[first])
     return float(d), float(half[first] - d * lag[first])
@@ -261,7 +265,7 @@ def lag_covariance(
     array([ 10., 460.])
     """
     square, both, noise, n = 4 * D * D, 8 * D * s, 2 * s * s, float(steps + 1)
-    middle = int(np.searchsorted(2 * lag, n, side="right"))
+    middle = int(np.searchsorted(lag, 0.5 * n, side="right"))
     # Up to half of the track a polynomial of b, beyond it one of the displacements q = n - b.
     near = (
         -5 / 6 * square,

@@ -10,7 +10,7 @@ import numpy as np
 from perrin._arrays import choice_fault, number_fault, refuse, to_plain
 from perrin._display import Shown
 from perrin._text import number_text, unit_text
-from perrin.curves.displacement import independent_walks, mean_square_curve
+from perrin.curves.displacement import frames_of, independent_walks, mean_square_curve
 from perrin.diffusion.curve_fits import GridLags, line_weights, slope_interval
 from perrin.diffusion.estimate import NORMAL, UNITS
 from perrin.diffusion.steps import Quantity
@@ -284,9 +284,7 @@ class _PooledWalk:
             n_walks = float(np.mean([independent_walks(m, np.eye(3)) for m in motions]))
         curve = mean_square_curve(
             walk[:, None],
-            time,
-            piece,
-            dt=motions[0].dt,
+            frames_of(walk[:, None], time, piece, dt=motions[0].dt),
             quantity=quantity,
             dof=dof,
             n_walks=n_walks,
