@@ -10,7 +10,8 @@ Usage: OMP_NUM_THREADS=1 python benchmarks/peers.py [--quick] [--only WORD ...] 
 
 --quick takes smaller jobs, one round, and no row that needs minutes; the demands are those of the
 whole jobs, so that it gives no verdicts. --only takes some groups of rows: rotations, mean
-squares, correlations, simulation, estimates, images, start, memory. --strict exits with status 1 where a demand is not met.
+squares, correlations, simulation, estimates, images, start, memory. --strict exits with status 1
+where a demand is not met.
 """
 
 from __future__ import annotations
