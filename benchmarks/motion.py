@@ -161,7 +161,8 @@ def p_values(cell, seed):
             found += [list(brownian_tests(model, one[None]).p.values()) for one in y]
         else:
             fit = model.fit(y)
-            found += list(np.stack(list(approximate_p(model, fit, model.scores(fit)).values()), 1))
+            p = approximate_p(model, fit, model.scores(fit), model.squared_errors(fit))
+            found += list(np.stack(list(p.values()), 1))
     return np.array(found)
 
 

@@ -81,7 +81,7 @@ def test_brownian_steps_are_rejected_at_the_stated_levels(repeats):
     model = even_model(300)
     y = noisy_steps(300, tracks, 5.0, np.random.default_rng(5))
     fit = model.fit(y)
-    p = approximate_p(model, fit, model.scores(fit))
+    p = approximate_p(model, fit, model.scores(fit), model.squared_errors(fit))
     for level in (0.05, 0.2):
         error = np.sqrt(level * (1 - level) / tracks)
         for name, values in p.items():

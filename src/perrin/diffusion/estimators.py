@@ -39,7 +39,8 @@ _COARSE_STEP, _COARSE_STEP_IN_PLANE, _LOW_SNR, _FEW_STEPS = 0.2, 2.0, 0.2, 30
 # Beyond this the mean of the square of rotation vectors, which end at pi, says little of D_R.
 _LOST_TURNS = 1.0
 
-_TOGETHER = 128  # motions that are evaluated at once; more do not stay in the processor's cache
+# About this many steps are evaluated at once: more gain no time, and take memory.
+_STEPS_TOGETHER = 60_000
 
 _NO_MOTION = Found(0.0, (0.0, 0.0), (0.0, 0.0), 0.0, np.nan)
 
@@ -374,7 +375,8 @@ def together(tracks: Sequence[NoisySteps]) -> list[list[int]]:
     for track in tracks:
         even = track.steps.even
         keys.append((even, len(track.steps.duration) if even else 0, track.drift))
-    return groups_alike(keys, [1] * len(tracks), most=_TOGETHER)
+    sizes = [len(track.steps.duration) for track in tracks]
+    return groups_alike(keys, sizes, most=_STEPS_TOGETHER)
 
 
 def _found_of_units(likelihood: Likelihood, best: ProfilePoint, wider: Floats) -> list[Found]:

@@ -267,11 +267,6 @@ class AxisModel:
         def relative(v: Floats) -> Floats:
             return np.asarray(2 * tau * (1 + np.expm1(v)[..., None] / 2 * c))
 
-        def cost(v: Floats) -> Floats:
-            shape = relative(v)
-            mean = np.mean(power / shape, axis=-1)
-            return np.asarray(np.log(mean) + np.mean(np.log(shape), axis=-1))
-
         if not self.free:
             # One parameter: the root of the score in ln D, from the variance of the steps.
             D = np.maximum(np.mean(power, axis=-1) / 2 - noise, 1e-3 * power.mean(axis=-1)) / tau
@@ -285,7 +280,9 @@ class AxisModel:
             return AxisFit(y, D, np.zeros_like(D))
         if near is None:
             trials = np.linspace(-5.0, 9.0, 15)
-            v = trials[np.argmin([cost(np.full(y.shape[:2], t)) for t in trials], axis=0)]
+            shape = relative(trials)
+            cost = np.log(power @ (1 / shape).T / len(c)) + np.mean(np.log(shape), axis=1)
+            v = trials[np.argmin(cost, axis=-1)]
         else:
             v = np.broadcast_to(self.ratio(near.D, near.offset + noise), y.shape[:2])
         for _ in range(60 if near is None else 4):
@@ -431,6 +428,10 @@ class AxisModel:
         e = dtbtrs(band, fit.y.reshape(-1, 1), uplo="L", diag="U")[0][:, 0] / np.sqrt(d)
         e = e.reshape(fit.y.shape)
         return np.asarray(e / np.sqrt(np.mean(e * e, axis=-1, keepdims=True)))
+
+    def squared_errors(self, fit: AxisFit) -> Floats:
+        """Return the squares of the prediction errors, summed over the axes, (B, N)."""
+        return np.asarray(np.sum(self.prediction_errors(fit) ** 2, axis=1))
 
     def mode_ratios(self, fit: AxisFit) -> Floats:
         """Return the powers of the sine modes over their variances, of mean 1, (B, A, N).
@@ -939,8 +940,9 @@ def brownian_tests(model: AxisModel, y: Floats) -> BrownianTests:
     """
     fit = model.fit(y)
     scores = model.scores(fit) if model.even else model.dense_scores(fit, y)
-    p = {name: float(value[0]) for name, value in approximate_p(model, fit, scores).items()}
-    return _ranked_if_short(model, fit, scores, p)
+    u = model.squared_errors(fit)
+    p = {name: float(value[0]) for name, value in approximate_p(model, fit, scores, u).items()}
+    return _ranked_if_short(model, fit, scores, u[0], p)
 
 
 def brownian_tests_of_each(
@@ -988,7 +990,8 @@ def brownian_tests_of_each(
         )
         fit = together.fit(np.concatenate([y for _, y in some]))
         scores = together.scores(fit)
-        p = approximate_p(together, fit, scores)
+        u = together.squared_errors(fit)
+        p = approximate_p(together, fit, scores, u)
         for j, (i, (model, _)) in enumerate(zip(rows, some, strict=True)):
             one = slice(j, j + 1)
             found[i] = _ranked_if_short(
@@ -998,6 +1001,7 @@ def brownian_tests_of_each(
                     Score(*(x[..., one] for x in scores[0])),
                     Score(*(x[..., one] for x in scores[1])),
                 ),
+                u[j],
                 {name: float(value[j]) for name, value in p.items()},
             )
             if progress is not None:
@@ -1006,7 +1010,11 @@ def brownian_tests_of_each(
 
 
 def _ranked_if_short(
-    model: AxisModel, fit: AxisFit, scores: tuple[Score, Score], p: dict[str, float]
+    model: AxisModel,
+    fit: AxisFit,
+    scores: tuple[Score, Score],
+    u: Floats,
+    p: dict[str, float],
 ) -> BrownianTests:
     """Return the tests of one motion, ranked among draws where the laws of p do not hold."""
     n, y = model.n_steps, fit.y
@@ -1022,7 +1030,7 @@ def _ranked_if_short(
         drawn = model.draws(fit, count=count, rng=np.random.default_rng(seed))
         near = model.fit(drawn, near=fit)
         again = model.scores(near) if model.even else model.dense_scores(fit, drawn)
-        null = approximate_p(model, near, again)
+        null = approximate_p(model, near, again, model.squared_errors(near))
         ranks = {}
         for name, one in p.items():
             # The rank among those of the draws, continued below the smallest of these.
@@ -1032,12 +1040,20 @@ def _ranked_if_short(
             edge = float(order[_TAIL_RANK - 1])
             ranks[name] = rank if below >= _TAIL_RANK else rank * one / edge
         p = ranks
-    u = np.sum(model.prediction_errors(fit) ** 2, axis=1)[0]
     return BrownianTests(p, model, fit, scores, u, ranked)
 
 
-def approximate_p(model: AxisModel, fit: AxisFit, scores: tuple[Score, Score]) -> dict[str, Floats]:
+def approximate_p(
+    model: AxisModel, fit: AxisFit, scores: tuple[Score, Score], u: Floats
+) -> dict[str, Floats]:
     """Return the p-values of every test of every data set by their approximate laws, (B,) each.
+
+    Parameters
+    ----------
+    model, fit, scores
+        Model, its fit, and the scores of the two alternatives.
+    u : ndarray, shape (B, N)
+        Squared prediction errors of every step.
 
     Examples
     --------
@@ -1045,11 +1061,10 @@ def approximate_p(model: AxisModel, fit: AxisFit, scores: tuple[Score, Score]) -
     >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=300, rng=3)
     >>> model, y = axis_model(truth, "rotation", Noise())
     >>> fit = model.fit(y)
-    >>> tuple(approximate_p(model, fit, model.scores(fit))) == TESTS
+    >>> tuple(approximate_p(model, fit, model.scores(fit), model.squared_errors(fit))) == TESTS
     True
     """
     axes = fit.D.shape[1]
-    u = np.sum(model.prediction_errors(fit) ** 2, axis=1)
     statistics = tabulated_statistics(u, axes)
     by_table = {
         name: tabulated_p(name, x, axes=axes, n_steps=model.n_steps)

@@ -105,6 +105,9 @@ class Steps:
     @cached_property
     def variances(self) -> tuple[Floats, Floats]:
         """Noise variances of the first and the last frame of each step by component, (S, c)."""
+        if self.noise.strides[1] == 0:
+            rows = np.broadcast_to(np.diagonal(self.noise[0, 0]).copy(), self.vectors.shape)
+            return rows, rows
         diagonal = np.ascontiguousarray(np.einsum("tcc->tc", self.noise[0]))
         return stored_once(diagonal[self.start]), stored_once(diagonal[self.stop])
 
@@ -114,6 +117,8 @@ class Steps:
         same_time = np.ptp(self.duration) <= _EVEN_STEPS * self.duration[0]
         if not (same_time and self.linked[:-1].all()):
             return False
+        if self.noise.strides[1] == 0:  # the frames are stored once
+            return True
         ends = np.zeros(self.noise.shape[1], dtype=np.bool_)
         ends[self.start] = ends[self.stop] = True
         noise = self.noise[:, ends]
@@ -198,13 +203,15 @@ class NoisySteps:
     @classmethod
     def free(cls, steps: Steps, *, blur: float, drift: bool) -> NoisySteps:
         """Leave the offset free; known is by how much a frame exceeds the least noisy one."""
-        noise = [steps.sigma**2 * n for n in steps.variances]
-        least = min(float(n.min()) for n in noise)
-        one = np.ones_like(noise[0])
-        known = noise[0] - least, noise[1] - least
+        before, after = steps.variances
+        # The extremes of rows that are stored once are those of one row.
+        rows = [n[:1] if n.strides[0] == 0 else n for n in (before, after)]
+        least = steps.sigma**2 * min(float(n.min()) for n in rows)
+        one = np.broadcast_to(np.ones(1), before.shape)
+        known = tuple(np.broadcast_to(steps.sigma**2 * n - least, before.shape) for n in rows)
         level = steps.sigma**2 * steps.complete - least
         steps, steady = _subtracted(steps, drift=drift)
-        return cls(steps, (one, one), known, blur, 0.0, 0.0, level, drift, steady)
+        return cls(steps, (one, one), (known[0], known[1]), blur, 0.0, 0.0, level, drift, steady)
 
     @classmethod
     def from_residuals(cls, steps: Steps, *, blur: float, drift: bool) -> NoisySteps:
@@ -431,13 +438,15 @@ def principal_steps(
     axes = np.linalg.eigh((tensor + tensor.T) / 2)[1]
     turned = np.broadcast_to(axes.T @ from_lab, (len(motion.time), 3, 3))[steps.start]
     from_body = axes.T @ from_body
-    noise = np.einsum(
-        "tai,tij,taj->ta", *np.broadcast_arrays(from_body, unit_covariance(motion), from_body)
-    )
+    covariance = stored_once(unit_covariance(motion))
+    if covariance.strides[0] == 0 and len(from_body) == 1:
+        covariance = covariance[:1]
+    noise = np.sum((from_body @ covariance) * from_body, axis=2)
+    noise = np.broadcast_to(noise, (len(motion.time), 3))
     return replace(
         steps,
         vectors=w @ axes,
-        noise=(noise[..., None] * np.eye(3))[None],
+        noise=stored_once(noise[..., None] * np.eye(3))[None],
         steady=turned * steps.duration[:, None, None],
     )
 
@@ -495,11 +504,11 @@ def body_steps(motion: RigidMotion, quantity: Quantity | Literal["both"], turn: 
     center_noise = unit_center_variance(motion)[:, None, None] * np.eye(3)
     if quantity == "rotation":
         vectors = w @ turn.T
-        noise = (turn @ unit_covariance(motion) @ turn.T)[None]
+        noise = stored_once(turn @ unit_covariance(motion) @ turn.T)[None]
     elif quantity == "translation":
         middle = motion.rotation[start] @ exp_map(0.5 * w)
         vectors = np.einsum("sji,sj->si", middle, displacement) @ turn.T
-        noise = center_noise[None]
+        noise = stored_once(center_noise)[None]
     else:
         jump = np.einsum("sji,sj->si", motion.rotation[start], displacement)
         half = 0.5 * np.linalg.norm(w, axis=1)

@@ -637,11 +637,11 @@ class PooledLikelihood:
                 parts = [t.straight_curvatures(*tensors, one) for t, one in pairs]
                 full = np.array([full for full, _ in parts])
                 by_noise = np.array([one for _, one in parts])
-                hessian = ArrowHessian(
-                    full[:, :m, :m].sum(axis=0), full[:, :m, m:], full[:, m:, m:]
-                )
-            limits = noise_range(own, reach, blurred=blurred)
-            of_D, of_noise = hessian.step_within(slope[:m], by_noise, limits)
+                shared, mixed = full[:, :m, :m].sum(axis=0), full[:, :m, m:]
+                hessian = ArrowHessian(shared[None], mixed[None], full[None, :, m:, m:])
+            limits = noise_range(own[None], reach, blurred=blurred)
+            steps = hessian.step_within(slope[None, :m], by_noise[None], limits)
+            of_D, of_noise = (step[0] for step in steps)
             gain = float(slope[:m] @ of_D + np.sum(by_noise * of_noise))
             if not gain > STRAIGHT_GAIN or reach < NEAREST_REACH:
                 break
@@ -807,31 +807,37 @@ class ArrowHessian:
     def step_within(
         self, slope: Floats, by_noise: Floats, limits: tuple[Floats, Floats]
     ) -> tuple[Floats, Floats]:
-        """Return the Newton step (..., m) and (..., G, c), the change of the noise within limits.
+        """Return the Newton steps (P, m) and (P, G, c), the change of the noise within limits.
 
-        A change beyond a limit (..., G, c) is fixed there, and all others are found again for it:
+        A change beyond a limit (P, G, c) is fixed there, and all others are found again for it:
         where noise and blur have nearly the same effect the step remains on the ridge.
         """
-        m, c = slope.shape[-1], by_noise.shape[-1]
+        m, c = slope.shape[1], by_noise.shape[2]
         fixed, change = np.zeros(by_noise.shape, dtype=np.bool_), np.zeros_like(by_noise)
+        of_D, rows = np.zeros_like(slope), np.arange(len(slope))
         for _ in range(c + 1):
-            moved, free = np.where(fixed, change, 0.0), ~fixed
-            by_D = slope - np.einsum("...gmc,...gc->...m", self.mixed, moved)
-            rest = by_noise - np.einsum("...gcd,...gd->...gc", self.own, moved)
-            rest = np.where(fixed, change, rest).reshape(*slope.shape[:-1], -1)
-            own = self.own * (free[..., :, None] & free[..., None, :])
-            own += fixed[..., :, None] * np.eye(c)
-            inverse = ArrowHessian(self.shared, self.mixed * free[..., None, :], own).inverse()
-            step = (inverse @ np.concatenate([by_D, rest], axis=-1)[..., None])[..., 0]
-            noise = step[..., m:].reshape(by_noise.shape)
-            change = np.where(fixed, change, np.clip(noise, *limits))
-            within = np.divide(change, noise, out=np.ones_like(noise), where=free & (noise != 0))
+            held, free = fixed[rows], ~fixed[rows]
+            moved = np.where(held, change[rows], 0.0)
+            by_D = slope[rows] - np.einsum("pgmc,pgc->pm", self.mixed[rows], moved)
+            rest = by_noise[rows] - np.einsum("pgcd,pgd->pgc", self.own[rows], moved)
+            rest = np.where(held, moved, rest).reshape(len(rows), -1)
+            own = self.own[rows] * (free[..., :, None] & free[..., None, :])
+            own += held[..., :, None] * np.eye(c)
+            mixed = self.mixed[rows] * free[..., None, :]
+            inverse = ArrowHessian(self.shared[rows], mixed, own).inverse()
+            step = (inverse @ np.concatenate([by_D, rest], axis=1)[..., None])[..., 0]
+            noise = step[:, m:].reshape(moved.shape)
+            low, high = (limit[rows] for limit in limits)
+            within = np.where(held, moved, np.clip(noise, low, high))
+            of_D[rows], change[rows] = step[:, :m], within
+            share = np.divide(within, noise, out=np.ones_like(noise), where=free & (noise != 0))
             # The one of each motion that comes to its limit first.
-            first = (within < 1) & (within == within.min(axis=-1, keepdims=True, initial=1.0))
-            if not first.any():
+            first = (share < 1) & (share == share.min(axis=2, keepdims=True, initial=1.0))
+            fixed[rows] |= first
+            rows = rows[first.any(axis=(1, 2))]
+            if not rows.size:
                 break
-            fixed |= first
-        return step[..., :m], change
+        return of_D, change
 
     def information(self) -> Floats:
         """Return the information on what is shared, the noise of every motion left free."""
@@ -842,6 +848,9 @@ class ArrowHessian:
 
 def positive_inverse(a: Floats) -> Floats:
     """Return the inverse of symmetric matrices (..., c, c) with the sizes of their eigenvalues."""
+    if a.shape[-1] == 1:
+        size = np.maximum(np.abs(a), 1e-309)
+        return np.asarray(1 / size)
     values, vectors = np.linalg.eigh(a)
     size = np.abs(values)
     size = np.maximum(size, 1e-9 * size.max(axis=-1, keepdims=True, initial=1e-300))

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass, replace
+from functools import cache
 from itertools import permutations
 from typing import TYPE_CHECKING, Literal, NamedTuple, get_args
 
 import numpy as np
 
-from perrin._arrays import choice_fault, refuse
+from perrin._arrays import choice_fault, frozen, refuse
 from perrin.diffusion.effective_modes import WINDOW
 from perrin.diffusion.estimate import UNITS
 from perrin.diffusion.noise_model import Noise, noise_faults
@@ -54,8 +55,8 @@ if TYPE_CHECKING:
 # Noise below this variance, relative to a step's, is rounding: that of simulated truth.
 _NOISELESS = 1e-8
 
-# About this many step components are evaluated at once; more do not stay in the processor's cache.
-_MOST_TENSORS_AT_ONCE = 400_000
+# About this many step components are evaluated at once: more gain no time, and take memory.
+_MOST_TENSORS_AT_ONCE = 200_000
 
 # Beyond this log ratio of noise to motion one of the two is as good as none.
 _FARTHEST = 20.0
@@ -423,6 +424,7 @@ def imposed_symmetry(motion: RigidMotion, wanted: str | None) -> tuple[str, Floa
     )
 
 
+@cache
 def symmetric_basis(b: int) -> Floats:
     """Return a basis of the symmetric matrices, orthonormal, (b (b + 1) / 2, b, b).
 
@@ -434,12 +436,14 @@ def symmetric_basis(b: int) -> Floats:
     """
     unit = np.eye(b)
     pairs = zip(*np.tril_indices(b), strict=True)
-    return np.array(
+    basis = np.array(
         [
             (np.outer(unit[i], unit[j]) + np.outer(unit[j], unit[i])) / (2 if i == j else 2**0.5)
             for i, j in pairs
         ]
     )
+    frozen(basis)
+    return basis
 
 
 def invariant_basis(elements: Floats) -> Floats:
@@ -451,10 +455,10 @@ def invariant_basis(elements: Floats) -> Floats:
     4
     """
     basis = symmetric_basis(3)
-    mapped = np.einsum("gij,mjk,glk->mil", elements, basis, elements) / len(elements)
-    share, mix = np.linalg.eigh(np.einsum("mij,nij->mn", basis, mapped))
-    invariant: Floats = np.einsum("mn,mij->nij", mix[:, share > 0.5], basis)
-    return invariant
+    turned = elements[:, None] @ basis @ np.swapaxes(elements, 1, 2)[:, None]
+    flat = basis.reshape(len(basis), -1)
+    share, mix = np.linalg.eigh(flat @ turned.mean(axis=0).reshape(flat.shape).T)
+    return np.asarray((mix[:, share > 0.5].T @ flat).reshape(-1, 3, 3))
 
 
 @dataclass(frozen=True, eq=False)
@@ -492,13 +496,16 @@ class ScaledTracks:
         B = None if unknown else (noise.exposure or 0.0) / 6
         tracks = []
         for one in steps:
-            shapes = one.noise / np.outer(scale, scale)
+            # Noise that is stored once for all frames is scaled once.
+            alike = one.noise.strides[1] == 0
+            shapes = (one.noise[:, :1] if alike else one.noise) / np.outer(scale, scale)
             size = np.nanmean(np.trace(shapes, axis1=2, axis2=3), axis=1) / 3
+            shapes = np.broadcast_to(shapes / size[:, None, None, None], one.noise.shape)
             scaled = replace(
                 one,
                 vectors=one.vectors / scale,
                 duration=one.duration / time,
-                noise=shapes / size[:, None, None, None],
+                noise=shapes,
                 dt=one.dt / time,
             )
             if noise.model == "joint":

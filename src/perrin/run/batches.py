@@ -18,9 +18,9 @@ if TYPE_CHECKING:
 S = TypeVar("S")
 T = TypeVar("T")
 
-# Clusters of a batch: a tenth of them, so that progress is seen and several processes share them,
-# not fewer than are efficient, nor more than bound the memory. Results may depend on it in the
-# last digits, and so it does not depend on the number of processes.
+# Clusters of a batch: half of them, so that two processes share them, not fewer than are efficient,
+# nor more than bound the memory. Results may depend on it in the last digits, and so it does not
+# depend on the number of processes.
 _FEWEST_MEASURED, _MOST_MEASURED = 16, 256
 
 
@@ -48,9 +48,9 @@ def clusters_together(count: int) -> int:
     Examples
     --------
     >>> [clusters_together(count) for count in (5, 1000, 10_000)]
-    [16, 100, 256]
+    [16, 256, 256]
     """
-    return min(max(-(-count // 4), _FEWEST_MEASURED), _MOST_MEASURED)
+    return min(max(-(-count // 2), _FEWEST_MEASURED), _MOST_MEASURED)
 
 
 def batches_of(items: Iterable[S], *, size: int) -> Iterator[list[S]]:
