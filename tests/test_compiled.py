@@ -3,12 +3,23 @@
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from perrin import Cluster, Noise, simulate_motion, track_rotation
 from perrin.compiled import compiled_kernels, kernels_in_use, loading
+from perrin.diffusion import (
+    NoisySteps,
+    SineModes,
+    SwitchingSteps,
+    mode_sums,
+    steps_of,
+    switching,
+    tensor_modes,
+)
 from perrin.geometry import rotations
 from perrin.images.optics import ball_image, sphere_image
 from test_rotations import hard_cases
@@ -97,6 +108,77 @@ def test_images_of_spheres_equal_those_of_numpy(monkeypatch, spread):
 
 
 @compiled
+@pytest.mark.parametrize("axes", [1, 2, 3])
+@pytest.mark.parametrize("modes", [1, 63, 64, 130])
+def test_sums_over_modes_equal_those_of_numpy(monkeypatch, axes, modes):
+    """With and without second derivatives, of a set for each point and of one set for all.
+
+    64 modes are a block of the kernel. A point whose variances are not positive says so by the
+    least of them; its other sums mean nothing.
+    """
+    rng = np.random.default_rng(axes)
+    y, turn = rng.normal(size=(5, modes, axes)), rng.normal(size=(5, axes, axes))
+    share, weight = rng.uniform(0.01, 1.2, (5, axes)), np.linspace(0.0, 4.0, modes)
+    share[0, 0] = -0.1
+    for own in (y, y[:1]):
+        for curved in (False, True):
+            kernel = mode_sums(own, turn, share, weight, curved=curved)
+            with monkeypatch.context() as patch:
+                patch.setattr(tensor_modes, "compiled_kernels", lambda: None)
+                twin = mode_sums(own, turn, share, weight, curved=curved)
+            assert kernel[0, 2] == pytest.approx(twin[0, 2], rel=1e-12)
+            scale = np.abs(twin[1:]).max(axis=1, keepdims=True)
+            np.testing.assert_allclose(kernel[1:] / scale, twin[1:] / scale, rtol=0, atol=1e-12)
+
+
+@compiled
+def test_spectra_of_steps_equal_those_of_numpy():
+    """Of several motions at several points, down to the least variance, and of unequal axes."""
+    rng = np.random.default_rng(4)
+    motions = [
+        simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=150, rng=seed)
+        for seed in range(4)
+    ]
+    modes = SineModes.of(
+        [NoisySteps.of(steps_of(m, "rotation"), Noise()) for m in motions], [*range(4)]
+    )
+    mixed = replace(modes, count=np.tile([1.0, 2.0], modes.count.size // 2))
+    for one in (modes, mixed):
+        D, theta = 5e-3 * rng.uniform(0.1, 3, (2, 3, 4)), 1e-3 * rng.uniform(0, 2, (2, 3, 4))
+        D[0, 0], theta[0, 0] = 0.0, 0.0
+        pairs = zip(one.sums(D, theta), one.sums_of_numpy(D, theta), strict=True)
+        for kernel, twin in pairs:
+            np.testing.assert_allclose(kernel, twin, rtol=1e-12)
+
+
+@compiled
+@pytest.mark.parametrize("quantity", ["rotation", "translation"])
+@pytest.mark.parametrize("exposure", [None, 0.5])
+def test_two_states_equal_those_of_numpy(monkeypatch, quantity, exposure):
+    """With gaps, unequal noise of frames and axes, noise from residuals and unknown noise."""
+    rng = np.random.default_rng(5)
+    truth = simulate_motion(
+        Cluster.from_positions([[0, 0, 0], [3, 0, 0], [0, 1, 0], [0, 0, 1.5]]),
+        D_R=5e-3, D_T=0.02, dt=0.7, n_frames=120, rng=7,
+    )  # fmt: skip
+    positions = truth.positions() + 0.05 * rng.normal(size=(120, 4, 3))
+    positions[rng.random(120) < 0.1] = np.nan
+    positions[20:40, 0] = np.nan
+    motion = track_rotation(positions, dt=0.7)
+    points = np.log([[2e-3, 8e-3, 0.1, 0.2, 1e-3], [1e-3, 0.5, 3.0, 1e-3, 1e-9]])
+    for model in ("joint", "residual"):
+        noise = Noise(model=model, exposure=exposure)
+        track = NoisySteps.of(steps_of(motion, quantity), noise)
+        steps = SwitchingSteps.of(track, motion.time, exposed=(exposure or 0.0) * 0.7 / 3)
+        kernel = steps.filtered(points)
+        with monkeypatch.context() as patch:
+            patch.setattr(switching, "compiled_kernels", lambda: None)
+            twin = steps.filtered(points)
+        np.testing.assert_allclose(kernel[0], twin[0], rtol=1e-12)
+        np.testing.assert_allclose(kernel[1], twin[1], rtol=1e-9, atol=1e-12)
+
+
+@compiled
 def test_the_kernels_refuse_arrays_that_do_not_fit():
     """A wrong number of rows or type is an error, not a read beyond the array."""
     kernels = compiled_kernels()
@@ -114,6 +196,26 @@ def test_the_kernels_refuse_arrays_that_do_not_fit():
     for out in (np.empty((1, 4, 59)), np.empty((2, 4, 60)), np.empty((1, 3, 60))):
         with pytest.raises(ValueError, match="expected mask"):
             kernels.spots(mask, three[None], three, three, three[:2], table, out)
+    with pytest.raises(TypeError, match="5 arrays"):
+        kernels.mode_sums(three, three)
+    y, turn, share, weight = np.ones((2, 7, 3)), np.ones((2, 3, 3)), np.ones((2, 3)), np.ones(7)
+    for wrong in ((y[:, :6], weight, 21), (y, weight[:6], 21), (y, weight, 22), (y[0], weight, 21)):
+        with pytest.raises(ValueError, match="expected modes"):
+            kernels.mode_sums(
+                np.ascontiguousarray(wrong[0]), turn, share, wrong[1], np.ones((2, wrong[2]))
+            )
+    rows, place = np.ones((2, 7)), np.ones((1, 2))
+    for sums in (np.ones((1, 2, 10)), np.ones((2, 2, 11)), np.ones((1, 3, 11))):
+        with pytest.raises(ValueError, match="expected power"):
+            kernels.spectrum_sums(rows, rows, rows, rows, rows, place, place, sums)
+    clock, sizes, points = np.ones((3, 7)), np.ones(3), np.ones((2, 5))
+    for vectors, noise, pairs in (
+        (np.ones((7, 2)), np.ones((4, 7, 3)), np.ones((7, 2, 2))),
+        (np.ones((7, 3)), np.ones((4, 6, 3)), np.ones((7, 2, 2))),
+        (np.ones((7, 3)), np.ones((4, 7, 3)), np.ones((6, 2, 2))),
+    ):
+        with pytest.raises(ValueError, match="expected vectors"):
+            kernels.two_states(vectors, noise, clock, sizes, np.ones(2), points, pairs, np.ones(2))
 
 
 def test_the_environment_chooses_numpy(monkeypatch):

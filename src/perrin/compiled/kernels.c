@@ -434,18 +434,18 @@ INLINE double dot(const double *a, const double *b)
 INLINE double sum_of_logs(const double *numbers)
 {
     double product[4] = {1.0, 1.0, 1.0, 1.0};
-    int64_t exponents[4] = {0, 0, 0, 0};
+    uint64_t exponents[4] = {0, 0, 0, 0};
     for (int k = 0; k < BLOCK; k += 4)
         for (int i = 0; i < 4; i++) {
-            int64_t bits;
+            uint64_t bits;
             double fraction;
             memcpy(&bits, numbers + k + i, sizeof bits);
             exponents[i] += bits >> 52;
-            bits = (bits & 0xFFFFFFFFFFFFFLL) | 0x3FF0000000000000LL; /* from 1 to 2 */
+            bits = (bits & 0xFFFFFFFFFFFFFULL) | 0x3FF0000000000000ULL; /* from 1 to 2 */
             memcpy(&fraction, &bits, sizeof fraction);
             product[i] *= fraction;
         }
-    int64_t exponent = exponents[0] + exponents[1] + exponents[2] + exponents[3];
+    int64_t exponent = (int64_t)(exponents[0] + exponents[1] + exponents[2] + exponents[3]);
     return log((product[0] * product[1]) * (product[2] * product[3])) +
            (double)(exponent - 1023 * BLOCK) * 0.69314718055994530942;
 }
@@ -459,20 +459,23 @@ typedef struct {
 INLINE void fill_block(const double *modes, const double *w, Py_ssize_t count, Py_ssize_t b,
                        const double *axes, const double *share, Block *block, double *totals)
 {
+    double component[MOST_AXES][BLOCK];
+    memset(component, 0, sizeof component);
+    for (Py_ssize_t k = 0; k < count; k++)
+        for (Py_ssize_t c = 0; c < b; c++)
+            component[c][k] = modes[k * b + c];
     for (Py_ssize_t a = 0; a < b; a++) {
         double along[BLOCK], variance[BLOCK];
-        for (Py_ssize_t k = 0; k < BLOCK; k++) {
-            along[k] = block->inverse[a][k] = 0.0;
-            variance[k] = 1.0;
-        }
-        for (Py_ssize_t k = 0; k < count; k++) {
-            for (Py_ssize_t c = 0; c < b; c++)
-                along[k] += modes[k * b + c] * axes[c * b + a];
-            variance[k] = share[a] + 0.5 * w[k] * (1 - share[a]);
-        }
-        for (Py_ssize_t k = 0; k < count; k++)
-            block->inverse[a][k] = 1 / variance[k];
-        for (Py_ssize_t k = 0; k < BLOCK; k++)
+        for (int k = 0; k < BLOCK; k++)
+            along[k] = component[0][k] * axes[a];
+        for (Py_ssize_t c = 1; c < b; c++)
+            for (int k = 0; k < BLOCK; k++)
+                along[k] += component[c][k] * axes[c * b + a];
+        for (int k = 0; k < BLOCK; k++)
+            variance[k] = k < count ? share[a] + 0.5 * w[k] * (1 - share[a]) : 1.0;
+        for (int k = 0; k < BLOCK; k++)
+            block->inverse[a][k] = k < count ? 1 / variance[k] : 0.0;
+        for (int k = 0; k < BLOCK; k++)
             block->scaled[a][k] = along[k] * block->inverse[a][k];
         totals[1] += dot(along, block->scaled[a]);
         for (Py_ssize_t k = 0; k < count; k++)

@@ -203,15 +203,13 @@ class NoisySteps:
     @classmethod
     def free(cls, steps: Steps, *, blur: float, drift: bool) -> NoisySteps:
         """Leave the offset free; known is by how much a frame exceeds the least noisy one."""
-        before, after = steps.variances
-        # The extremes of rows that are stored once are those of one row.
-        rows = [n[:1] if n.strides[0] == 0 else n for n in (before, after)]
-        least = steps.sigma**2 * min(float(n.min()) for n in rows)
-        one = np.broadcast_to(np.ones(1), before.shape)
-        known = tuple(np.broadcast_to(steps.sigma**2 * n - least, before.shape) for n in rows)
+        before, after = (steps.sigma**2 * n for n in steps.variances)
+        least = min(float(before.min()), float(after.min()))
+        one = np.ones_like(before)
+        known = before - least, after - least
         level = steps.sigma**2 * steps.complete - least
         steps, steady = _subtracted(steps, drift=drift)
-        return cls(steps, (one, one), (known[0], known[1]), blur, 0.0, 0.0, level, drift, steady)
+        return cls(steps, (one, one), known, blur, 0.0, 0.0, level, drift, steady)
 
     @classmethod
     def from_residuals(cls, steps: Steps, *, blur: float, drift: bool) -> NoisySteps:
@@ -442,11 +440,11 @@ def principal_steps(
     if covariance.strides[0] == 0 and len(from_body) == 1:
         covariance = covariance[:1]
     noise = np.sum((from_body @ covariance) * from_body, axis=2)
-    noise = np.broadcast_to(noise, (len(motion.time), 3))
+    noise = np.broadcast_to(noise[..., None] * np.eye(3), (len(motion.time), 3, 3))
     return replace(
         steps,
         vectors=w @ axes,
-        noise=stored_once(noise[..., None] * np.eye(3))[None],
+        noise=noise[None],
         steady=turned * steps.duration[:, None, None],
     )
 
