@@ -17,6 +17,7 @@ from perrin.diffusion.steps import (
     NoisySteps,
     Quantity,
     Steps,
+    distinct,
     groups_alike,
     pooled_steps,
     steps_of,
@@ -241,7 +242,7 @@ def _judged(
     # The noise of one orientation or centre coordinate, mean over frames, axes and motions.
     model = settings.model
     squares = [float(np.mean(m.noise**2)) if isinstance(model, str) else model**2 for m in motions]
-    means = [0.5 * float(sum(np.mean(end) for end in s.variances)) for s in steps]
+    means = [0.5 * float(sum(np.mean(distinct(end)) for end in s.variances)) for s in steps]
     estimate = DiffusionEstimate.judged(
         found,
         quantity=quantity,

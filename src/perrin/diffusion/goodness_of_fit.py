@@ -20,7 +20,7 @@ from perrin.diffusion.step_spectra import (
     fractional_slope,
     sine_spectrum,
 )
-from perrin.diffusion.steps import NoisySteps, Quantity, groups_alike, principal_steps
+from perrin.diffusion.steps import NoisySteps, Quantity, distinct, groups_alike, principal_steps
 from perrin.errors import TooFewFramesError
 
 if TYPE_CHECKING:
@@ -642,7 +642,10 @@ def axis_model(motion: RigidMotion, quantity: Quantity, noise: Noise) -> tuple[A
     track = NoisySteps.of(steps, replace(noise, drift=False))
     free = noise.model == "joint"
     theta = 0.0 if free else track.theta
-    before, after = ((k + w * theta).T for k, w in zip(track.known, track.weight, strict=True))
+    noise_of_ends = [
+        (distinct(k) + distinct(w) * theta).T
+        for k, w in zip(track.known, track.weight, strict=True)
+    ]
     square = np.mean(steps.vectors**2, axis=0)
     if not square.max() > 0:
         raise ValueError(f"the body does not move: there is no {quantity} to judge")
@@ -650,11 +653,12 @@ def axis_model(motion: RigidMotion, quantity: Quantity, noise: Noise) -> tuple[A
     # Eigenvectors have any sign; one that the steps determine gives p, which are simulated from a
     # seed made of the steps, that do not change with the axes of the laboratory.
     sign = np.where(np.sum(steps.vectors**3, axis=0) < 0, -1.0, 1.0)[moves]
+    before, after = (np.broadcast_to(n[moves], (moves.sum(), count)) for n in noise_of_ends)
     model = AxisModel(
         start=motion.time[steps.start],
         tau=steps.duration,
         linked=steps.linked,
-        known=(before[moves], after[moves]),
+        known=(before, after),
         blur=0.0 if free else track.blur,
         free=free,
         steady=np.ascontiguousarray(steps.steady[:, moves] * sign[:, None]),

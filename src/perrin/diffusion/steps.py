@@ -203,10 +203,11 @@ class NoisySteps:
     @classmethod
     def free(cls, steps: Steps, *, blur: float, drift: bool) -> NoisySteps:
         """Leave the offset free; known is by how much a frame exceeds the least noisy one."""
-        before, after = (steps.sigma**2 * n for n in steps.variances)
+        shape = steps.vectors.shape
+        before, after = (steps.sigma**2 * distinct(n) for n in steps.variances)
         least = min(float(before.min()), float(after.min()))
-        one = np.ones_like(before)
-        known = before - least, after - least
+        one = np.broadcast_to(np.ones((1, shape[1])), shape)
+        known = np.broadcast_to(before - least, shape), np.broadcast_to(after - least, shape)
         level = steps.sigma**2 * steps.complete - least
         steps, steady = _subtracted(steps, drift=drift)
         return cls(steps, (one, one), known, blur, 0.0, 0.0, level, drift, steady)
@@ -323,6 +324,17 @@ def stored_once(rows: Floats) -> Floats:
     if len(rows) < 2 or not np.array_equal(rows[1:], rows[:-1]):
         return rows
     return np.broadcast_to(rows[0].copy(), rows.shape)
+
+
+def distinct(rows: Floats) -> Floats:
+    """Return the rows of an array (N, ...), one of them where they are stored once.
+
+    Examples
+    --------
+    >>> distinct(np.broadcast_to(2.0, (5, 3))).shape, distinct(np.ones((5, 3))).shape
+    ((1, 3), (5, 3))
+    """
+    return rows[:1] if rows.strides[0] == 0 else rows
 
 
 def groups_alike(keys: Sequence[Hashable], sizes: Sequence[int], *, most: int) -> list[list[int]]:
