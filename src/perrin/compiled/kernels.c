@@ -536,9 +536,15 @@ static void sum_modes(const Modes *modes)
             for (Py_ssize_t d = 0; d < b; d++) {
                 for (Py_ssize_t k = 0; k < BLOCK; k++)
                     next[k] = powers[BLOCK + k] * block.scaled[d][k];
-                for (Py_ssize_t a = 0; a < b; a++) {
-                    sums[3 + a * b + d] += dot(block.scaled[a], block.scaled[d]);
-                    sums[3 + squares + a * b + d] += dot(block.scaled[a], next);
+                for (Py_ssize_t a = 0; a <= d; a++) {
+                    double same = dot(block.scaled[a], block.scaled[d]);
+                    double weighted = dot(block.scaled[a], next);
+                    sums[3 + a * b + d] += same;
+                    sums[3 + squares + a * b + d] += weighted;
+                    if (a < d) {
+                        sums[3 + d * b + a] += same;
+                        sums[3 + squares + d * b + a] += weighted;
+                    }
                 }
                 sums[3 + d * b + d] -= dot(powers, block.inverse[d]);
                 sums[3 + squares + d * b + d] -= dot(powers + BLOCK, block.inverse[d]);
