@@ -188,7 +188,9 @@ class AxisModel:
     @cached_property
     def mean_known(self) -> Floats:
         """Mean known noise variance of each axis, (A,) or (B, A)."""
-        return np.asarray(0.5 * (self.known[0] + self.known[1]).mean(axis=-1))
+        # Of noise that is stored once for all frames one number is the mean.
+        ends = [known[..., :1] if known.strides[-1] == 0 else known for known in self.known]
+        return np.asarray(0.5 * (ends[0].mean(axis=-1) + ends[1].mean(axis=-1)))
 
     def with_equal_noise(self) -> AxisModel:
         """Return the model with the mean noise in all frames."""
@@ -652,7 +654,8 @@ def axis_model(motion: RigidMotion, quantity: Quantity, noise: Noise) -> tuple[A
     moves = square > _SMALLEST_AXIS * square.max()
     # Eigenvectors have any sign; one that the steps determine gives p, which are simulated from a
     # seed made of the steps, that do not change with the axes of the laboratory.
-    sign = np.where(np.sum(steps.vectors**3, axis=0) < 0, -1.0, 1.0)[moves]
+    cubes = np.einsum("na,na,na->a", steps.vectors, steps.vectors, steps.vectors)
+    sign = np.where(cubes < 0, -1.0, 1.0)[moves]
     before, after = (np.broadcast_to(n[moves], (moves.sum(), count)) for n in noise_of_ends)
     model = AxisModel(
         start=motion.time[steps.start],
@@ -664,7 +667,8 @@ def axis_model(motion: RigidMotion, quantity: Quantity, noise: Noise) -> tuple[A
         steady=np.ascontiguousarray(steps.steady[:, moves] * sign[:, None]),
     )
     y = np.ascontiguousarray(steps.vectors.T[moves] * sign[:, None])[None]
-    spread = 0.5 * (model.known[0].std(axis=1) + model.known[1].std(axis=1))
+    ends = (n if n.shape[1] == 1 else n[moves] for n in noise_of_ends)
+    spread = 0.5 * sum(n.std(axis=1) for n in ends)
     if np.all(spread <= _EQUAL_NOISE * square[moves]):
         model = model.with_equal_noise()
     return model, y

@@ -837,11 +837,9 @@ def _jump_candidates(residuals: StepResiduals, known: Bools) -> Bools:
     """Return further steps (B, S) unlike the bulk that are not due to one displaced frame."""
     from scipy.special import chdtri
 
-    count = known.shape[1]
+    count, root = known.shape[1], _robust_root(residuals.step)
     displaced = np.where(
-        residuals.linked & residuals.measured_badly,
-        _robust_square(residuals.frame, residuals.step),
-        0.0,
+        residuals.linked & residuals.measured_badly, _squared_lengths(residuals.frame @ root), 0.0
     )
 
     def before(x: Floats) -> Floats:
@@ -856,28 +854,38 @@ def _jump_candidates(residuals: StepResiduals, known: Bools) -> Bools:
     pairs = residuals.linked.astype(np.float64)
     inside = (before(pairs) > 0) & (after(pairs) > 0)
     limit = chdtri(residuals.step.shape[2], _CANDIDATE_LEVEL / count)
-    given_others = _robust_square(residuals.step, residuals.step)
+    given_others = _squared_lengths(residuals.step @ root)
     # Jumps back and forth resemble noise once the noise is fitted to them: the length alone.
-    alone = np.where(around == 0, _robust_square(residuals.length, residuals.length), 0.0)
+    own = _squared_lengths(residuals.length @ _robust_root(residuals.length))
+    alone = np.where(around == 0, own, 0.0)
     # A jump distorts the prediction of its neighbours: the largest of them is taken first.
     largest = np.maximum(after(given_others[:, 1:]), before(given_others[:, :-1]))
     likely = (given_others > limit) & (given_others > around) & (given_others > largest)
     return np.asarray((likely | (alone > limit)) & inside & ~known)
 
 
-def _robust_square(z: Floats, bulk: Floats) -> Floats:
-    """Return z^T M^-1 z (B, K) with M from the half of `bulk` that is shortest, as chi-squared."""
+def _robust_root(bulk: Floats) -> Floats:
+    """Return roots of M^-1 (B, A, A), M from the shorter half of `bulk` (B, K, A).
+
+    A vector times the root has the squared length of chi-squared for vectors like the bulk.
+    """
     from scipy.special import chdtri
 
     typical = np.median(bulk**2, axis=1, keepdims=True)
-    power = np.sum(bulk**2 / np.maximum(typical, 1e-300), axis=2)
+    power = _squared_lengths(bulk / np.sqrt(np.maximum(typical, 1e-300)))
     short = power <= np.median(power, axis=1, keepdims=True)
     half = np.where(short[..., None], bulk, 0.0)
     mean = np.swapaxes(half, 1, 2) @ half / short.sum(axis=1)[:, None, None]
     root = _inverse_root(mean)
-    median = np.median(np.sum((bulk @ root) ** 2, axis=2), axis=1)
-    scale = np.divide(chdtri(z.shape[2], 0.5), median, out=np.zeros_like(median), where=median > 0)
-    return np.asarray(np.sum((z @ root) ** 2, axis=2) * scale[:, None])
+    median = np.median(_squared_lengths(bulk @ root), axis=1)
+    usual = chdtri(bulk.shape[2], 0.5)
+    scale = np.divide(usual, median, out=np.zeros_like(median), where=median > 0)
+    return np.asarray(root * np.sqrt(scale)[:, None, None])
+
+
+def _squared_lengths(vectors: Floats) -> Floats:
+    """Return the squared lengths of vectors (..., A), A so small that `sum` is slow."""
+    return np.asarray(np.einsum("...a,...a->...", vectors, vectors))
 
 
 def _inverse_root(a: Floats, *, least: float = 0.0) -> Floats:

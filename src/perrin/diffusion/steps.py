@@ -90,17 +90,25 @@ class Steps:
     @cached_property
     def linked(self) -> Bools:
         """Whether the next step begins with the frame that this one ends with, (S,)."""
-        return np.append(self.start[1:] == self.stop[:-1], False)
+        linked = np.zeros(len(self.start), dtype=np.bool_)
+        np.equal(self.start[1:], self.stop[:-1], out=linked[:-1])
+        return linked
 
     @cached_property
     def before(self) -> Floats:
         """Noise covariance of the frame in which each step begins, (r, S, c, c)."""
-        return self.noise[:, self.start]
+        return self.of_frames(self.start)
 
     @cached_property
     def after(self) -> Floats:
         """Noise covariance of the frame in which each step ends, (r, S, c, c)."""
-        return self.noise[:, self.stop]
+        return self.of_frames(self.stop)
+
+    def of_frames(self, frames: Ints) -> Floats:
+        """Return the noise covariance of some frames, (r, F, c, c)."""
+        if self.noise.strides[1] == 0:  # the frames are stored once
+            return self.noise[:, : len(frames)]
+        return self.noise[:, frames]
 
     @cached_property
     def variances(self) -> tuple[Floats, Floats]:
@@ -138,7 +146,10 @@ class Steps:
         rows = steady.reshape(vectors.size, -1)
         # The columns are orthogonal, or nearly so: squaring them loses no digits.
         normal = rows.T @ rows, rows.T @ vectors.ravel()
-        mean: Floats = np.linalg.lstsq(*normal, rcond=None)[0].astype(np.float64)
+        try:
+            mean: Floats = np.linalg.solve(*normal).astype(np.float64)
+        except np.linalg.LinAlgError:  # no step that a steady motion would change
+            mean = np.linalg.lstsq(*normal, rcond=None)[0].astype(np.float64)
         return replace(self, vectors=self.vectors - self.steady @ mean), mean
 
 
