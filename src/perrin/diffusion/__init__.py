@@ -1,6 +1,12 @@
 """Diffusion coefficients and tensors of a body, their errors, and tests of its steps."""
 
-from perrin.diffusion.anomalous import AnomalousEstimate, fit_anomalous
+from perrin.diffusion.anomalous import (
+    AnomalousEstimate,
+    ExponentPeak,
+    anomalous_estimate,
+    find_exponent,
+    fit_anomalous,
+)
 from perrin.diffusion.bounds import cramer_rao
 from perrin.diffusion.changing import with_changing_interval
 from perrin.diffusion.confined import ConfinedEstimate, cage_size, fit_confined, fit_confined_steps
@@ -240,6 +246,7 @@ __all__ = [
     "DiffusionTensor",
     "EffectiveModes",
     "EvenTracks",
+    "ExponentPeak",
     "FewDiagonalModes",
     "FewModes",
     "FewModesTrack",
@@ -285,6 +292,7 @@ __all__ = [
     "TensorFit",
     "TensorSlopes",
     "TridiagonalCovariance",
+    "anomalous_estimate",
     "approximate_p",
     "around",
     "axes_like",
@@ -334,6 +342,7 @@ __all__ = [
     "excess_scatter_of_each",
     "expanded_about",
     "filtered_each",
+    "find_exponent",
     "find_jumps",
     "find_jumps_of_each",
     "find_stage_jumps",

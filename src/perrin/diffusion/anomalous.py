@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
 from perrin._arrays import to_plain
 from perrin._display import Shown
 from perrin._text import with_error
-from perrin.diffusion.spectral_likelihood import ShapeLikelihood, motions_and_noise
+from perrin.diffusion.spectral_likelihood import ShapeLikelihood, ShapePoint, motions_and_noise
 from perrin.diffusion.step_spectra import fractional_mean_square
 from perrin.diffusion.steps import Quantity, pooled_steps, principal_steps
 
@@ -174,6 +174,59 @@ def fit_anomalous(
     True
     """
     motions, settings = motions_and_noise(motion, quantity, noise, exposure)
+    return anomalous_estimate(find_exponent(motions, quantity, settings), motions)
+
+
+class ExponentPeak(NamedTuple):
+    """The most likely exponent of some motions, before its intervals.
+
+    Attributes
+    ----------
+    likelihood : ShapeLikelihood
+        Likelihood of the exponent.
+    best : ShapePoint
+        Its maximum.
+    points : list of ShapePoint
+        Trial exponents.
+    gain : float
+        Logarithm of the likelihood at the maximum over that of Brownian motion.
+    quantity : {"rotation", "translation"}
+    frame : {"body", "lab"}
+        Axes along which the steps remember each other.
+    settings : Noise
+    """
+
+    likelihood: ShapeLikelihood
+    best: ShapePoint
+    points: list[ShapePoint]
+    gain: float
+    quantity: Quantity
+    frame: Literal["body", "lab"]
+    settings: Noise
+
+
+def find_exponent(
+    motions: Sequence[RigidMotion], quantity: Quantity, settings: Noise
+) -> ExponentPeak:
+    """Return the most likely exponent of fractional Brownian motion.
+
+    Parameters
+    ----------
+    motions : sequence of RigidMotion
+    quantity : {"rotation", "translation"}
+    settings : Noise
+
+    Returns
+    -------
+    ExponentPeak
+
+    Examples
+    --------
+    >>> from perrin import Cluster, Noise, simulate_motion
+    >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=99, rng=3)
+    >>> 0.5 < find_exponent([truth], "translation", Noise()).best.shape < 1.5
+    True
+    """
 
     def mean_square(lag: Floats, shape: float) -> Floats:
         return fractional_mean_square(lag, shape, exposure=settings.exposure or 0.0)
@@ -188,7 +241,22 @@ def fit_anomalous(
     found = [likelihood.best(_EXPONENTS) for likelihood in choices]
     brownian = max(likelihood.at(1.0).value for likelihood in choices)
     i = max(range(len(found)), key=lambda i: found[i][0].value)
-    likelihood, (best, points) = choices[i], found[i]
+    best, points = found[i]
+    gain = max(best.value - brownian, 0.0)
+    return ExponentPeak(choices[i], best, points, gain, quantity, frames[i], settings)
+
+
+def anomalous_estimate(peak: ExponentPeak, motions: Sequence[RigidMotion]) -> AnomalousEstimate:
+    """Return the estimate with its intervals from the most likely exponent of some motions.
+
+    Examples
+    --------
+    >>> from perrin import Cluster, Noise, simulate_motion
+    >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=99, rng=3)
+    >>> anomalous_estimate(find_exponent([truth], "translation", Noise()), [truth]).n_frames
+    99
+    """
+    likelihood, best, points, gain, quantity, frame, settings = peak
     ends = likelihood.intervals(best, points)
     ci68, ci95 = (
         (low.shape if low else 0.0, high.shape if high else 2.0)
@@ -220,8 +288,8 @@ def fit_anomalous(
         n_axes=n_axes,
         dt=dt,
         quantity=quantity,
-        frame=frames[i],
+        frame=frame,
         noise=settings.model,
         exposure=settings.exposure,
-        log_likelihood_gain=max(best.value - brownian, 0.0),
+        log_likelihood_gain=gain,
     )

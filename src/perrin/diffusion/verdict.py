@@ -12,7 +12,7 @@ import numpy as np
 from perrin._arrays import choice_fault, refuse, to_plain
 from perrin._display import Shown
 from perrin._text import listed, number_text
-from perrin.diffusion.anomalous import AnomalousEstimate, fit_anomalous
+from perrin.diffusion.anomalous import AnomalousEstimate, anomalous_estimate, find_exponent
 from perrin.diffusion.confined import ConfinedEstimate, fit_confined
 from perrin.diffusion.estimate import DiffusionEstimate
 from perrin.diffusion.estimators import estimate_diffusion
@@ -399,20 +399,22 @@ def _shape(
         scores.append((model.scores(rest) if model.even else model.dense_scores(rest, rest.y))[0])
     p_steady = fisher(p_of_each)
     p_rest = float(score_p(Score.total(scores), one_sided=False)[0])
-    anomalous = fit_anomalous(motion, quantity=quantity, noise=settings)
-    confined = None
-    if anomalous.alpha < 1:
-        confined = fit_confined(motion, quantity=quantity, noise=settings)
-    others = [one.log_likelihood_gain - penalty for one in (anomalous, confined) if one is not None]
-    if (p_steady < LEVEL and p_rest > LEVEL) or gain > max(others):
-        taken = replace(settings, drift=True)
-        with python_warnings.catch_warnings():
-            python_warnings.simplefilter("ignore", PrecisionWarning)
-            estimate = estimate_diffusion(motion, quantity=quantity, noise=taken)
-        return "spin" if quantity == "rotation" else "drift", estimate
-    if confined is not None and others[1] > others[0]:
-        return "confined", confined
-    return "subdiffusion" if anomalous.alpha < 1 else "superdiffusion", anomalous
+    if not (p_steady < LEVEL and p_rest > LEVEL):
+        peak = find_exponent(motions, quantity, settings)
+        slower, confined = peak.best.shape < 1, None
+        if slower:
+            confined = fit_confined(motion, quantity=quantity, noise=settings)
+        caged = -np.inf if confined is None else confined.log_likelihood_gain - penalty
+        if gain <= max(peak.gain - penalty, caged):
+            if confined is not None and caged > peak.gain - penalty:
+                return "confined", confined
+            kind: Kind = "subdiffusion" if slower else "superdiffusion"
+            return kind, anomalous_estimate(peak, motions)
+    taken = replace(settings, drift=True)
+    with python_warnings.catch_warnings():
+        python_warnings.simplefilter("ignore", PrecisionWarning)
+        estimate = estimate_diffusion(motion, quantity=quantity, noise=taken)
+    return "spin" if quantity == "rotation" else "drift", estimate
 
 
 def _variance(
