@@ -648,14 +648,14 @@ def axis_model(motion: RigidMotion, quantity: Quantity, noise: Noise) -> tuple[A
         (distinct(k) + distinct(w) * theta).T
         for k, w in zip(track.known, track.weight, strict=True)
     ]
-    square = np.mean(steps.vectors**2, axis=0)
+    squares = steps.vectors * steps.vectors
+    square = np.mean(squares, axis=0)
     if not square.max() > 0:
         raise ValueError(f"the body does not move: there is no {quantity} to judge")
     moves = square > _SMALLEST_AXIS * square.max()
     # Eigenvectors have any sign; one that the steps determine gives p, which are simulated from a
     # seed made of the steps, that do not change with the axes of the laboratory.
-    cubes = np.einsum("na,na,na->a", steps.vectors, steps.vectors, steps.vectors)
-    sign = np.where(cubes < 0, -1.0, 1.0)[moves]
+    sign = np.where(np.sum(squares * steps.vectors, axis=0) < 0, -1.0, 1.0)[moves]
     before, after = (np.broadcast_to(n[moves], (moves.sum(), count)) for n in noise_of_ends)
     model = AxisModel(
         start=motion.time[steps.start],

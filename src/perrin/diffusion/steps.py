@@ -111,6 +111,13 @@ class Steps:
         return self.noise[:, frames]
 
     @cached_property
+    def mean_noise(self) -> Floats:
+        """Noise covariance of a frame, mean over the ends of the steps, (r, c, c)."""
+        if self.noise.strides[1] == 0:
+            return self.noise[:, 0]
+        return np.asarray(0.5 * (self.before + self.after).mean(axis=1))
+
+    @cached_property
     def variances(self) -> tuple[Floats, Floats]:
         """Noise variances of the first and the last frame of each step by component, (S, c)."""
         if self.noise.strides[1] == 0:

@@ -132,13 +132,13 @@ class NoisyVectors:
     def noise(self, D: Floats, own: Floats) -> Floats:
         """Return the mean noise O of a frame, less its blur, (b, b)."""
         theta, B = self.amplitudes(own[None])
-        shape = 0.5 * (self.steps.before + self.steps.after).mean(axis=1)
+        shape = self.steps.mean_noise
         offset: Floats = np.tensordot(theta[0], shape, 1) - 2 * B[0] * self.steps.dt * D
         return offset
 
     def blur_ratio(self, D: Floats) -> float:
         """Return the noise amplitude that has the mean variance of a blur of B = 1."""
-        shape = 0.5 * (self.steps.before + self.steps.after).mean(axis=1).sum(axis=0)
+        shape = self.steps.mean_noise.sum(axis=0)
         return float(2 * self.steps.dt * np.trace(D) / np.trace(shape))
 
     @cached_property

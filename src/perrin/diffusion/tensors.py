@@ -455,9 +455,10 @@ def invariant_basis(elements: Floats) -> Floats:
     4
     """
     basis = symmetric_basis(3)
-    turned = elements[:, None] @ basis @ np.swapaxes(elements, 1, 2)[:, None]
-    flat = basis.reshape(len(basis), -1)
-    share, mix = np.linalg.eigh(flat @ turned.mean(axis=0).reshape(flat.shape).T)
+    flat, rows = basis.reshape(len(basis), 9), elements.reshape(-1, 9)
+    # The mean of R_ij R_lk maps B_jk to the mean of (R B R^T)_il.
+    mean = (rows.T @ rows / len(rows)).reshape(3, 3, 3, 3).transpose(1, 3, 0, 2).reshape(9, 9)
+    share, mix = np.linalg.eigh(flat @ mean @ flat.T)
     return np.asarray((mix[:, share > 0.5].T @ flat).reshape(-1, 3, 3))
 
 
