@@ -2,7 +2,9 @@
 
 Each job is timed at sizes a factor of two apart, the median of three rounds, in turn; the exponent
 is the slope of a straight line through the logarithms of the larger half of the sizes, where the
-constant part does not matter any more. Processor time, one thread (set OMP_NUM_THREADS=1).
+constant part does not matter any more. Processor time, one thread (set OMP_NUM_THREADS=1). The last
+row is by the clock, on a machine that does nothing else: what a further cluster takes with one and
+with two workers, without their start.
 
 Usage: OMP_NUM_THREADS=1 python benchmarks/scaling.py [--quick] [--only WORD ...]
 """
@@ -66,7 +68,7 @@ def rotation_fit_of_particles(n):
 
 
 def analysis_of_clusters(count):
-    table = tetrahedra_table(count, 100)
+    table = tetrahedra_table(count, 300)
     return lambda: perrin.analyze(table, dt=0.73)
 
 
@@ -95,6 +97,17 @@ def seconds_by_size(job, sizes, rounds):
     return np.median(found, axis=0)
 
 
+def seconds_a_cluster(workers, quick):
+    """Return the seconds by the clock that a further cluster takes with so many workers."""
+    sizes, seconds = (16, 48) if quick else (200, 800), []
+    for count in sizes:
+        table = tetrahedra_table(count, 300)
+        start = time.perf_counter()
+        perrin.analyze(table, dt=0.73, workers=workers)
+        seconds.append(time.perf_counter() - start)
+    return (seconds[1] - seconds[0]) / (sizes[1] - sizes[0])
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true")
@@ -111,6 +124,11 @@ def main():
         exponent = np.polyfit(np.log(sizes[half:]), np.log(seconds[half:]), 1)[0]
         spread = ", ".join(f"{s:.2g}" for s in seconds)
         cells = (name, f"{sizes[0]} to {sizes[-1]}", spread, f"{exponent:.2f}", str(most))
+        print(f"| {' | '.join(cells)} |", flush=True)
+    name = "workers: analyze, a further cluster"
+    if any(word in name for word in given.only):
+        one, two = (seconds_a_cluster(workers, given.quick) for workers in (1, 2))
+        cells = (name, "1 to 2", f"{one:.2g}, {two:.2g}", f"{np.log2(two / one):.2f}", "")
         print(f"| {' | '.join(cells)} |", flush=True)
 
 
