@@ -208,16 +208,17 @@ class SineModes:
 
         count, axes = tracks[0].steps.vectors.shape
         c = difference_eigenvalues(count)
-        # Axes first: a sum over three neighbouring numbers takes nine times as long.
+        # Modes last: sums over three neighbouring numbers take nine times as long.
         modes = dst(np.stack([t.steps.vectors.T for t in tracks]), type=1, norm="ortho", axis=2)
         duration, blur, weight, known = np.array(
             [(t.steps.duration[0], t.blur, t.weight[0][0, 0], t.known[0][0, 0]) for t in tracks]
         ).T[..., None]
         steady = None
         if tracks[0].drift:
-            effect = dst(np.stack([t.steps.steady for t in tracks]), type=1, norm="ortho", axis=1)
-            squares = np.einsum("gkap,gkaq->pqgk", effect, effect)
-            products = np.einsum("gkap,gak->pgk", effect, modes)
+            steady_motions = np.stack([t.steps.steady.transpose(1, 2, 0) for t in tracks])
+            effect = dst(steady_motions, type=1, norm="ortho", axis=3)
+            squares = np.einsum("gapk,gaqk->pqgk", effect, effect)
+            products = np.einsum("gapk,gak->pgk", effect, modes)
             steady = squares.reshape(*squares.shape[:2], -1), products.reshape(len(products), -1)
         return cls(
             groups=np.array(groups),
@@ -309,16 +310,20 @@ class SineModes:
         return np.asarray(np.maximum(eigen, LEAST_EIGENVALUE, out=eigen))
 
     @cached_property
-    def steady_columns(self) -> tuple[Floats, Floats, Floats]:
-        """X^T X and X^T y of every mode, (p^2 + p, M), and times slopes, and products of slopes."""
+    def steady_columns(self) -> Floats:
+        """X^T X and X^T y of every mode, (p^2 + p, M)."""
         if self.steady is None:
             raise ValueError("these steps have no free steady motion")
         squares, products = self.steady
-        plain = np.concatenate([squares.reshape(-1, squares.shape[-1]), products])
+        return np.concatenate([squares.reshape(-1, squares.shape[-1]), products])
+
+    @cached_property
+    def steady_slopes(self) -> tuple[Floats, Floats]:
+        """The same columns times the slopes (2 (p^2 + p), M), and times their products."""
         slopes = np.stack([self.by_D, self.by_theta])
-        pairs = slopes[[0, 0, 1]] * slopes[[0, 1, 1]]
+        pairs, plain = slopes[[0, 0, 1]] * slopes[[0, 1, 1]], self.steady_columns
         once, twice = ((x[:, None] * plain).reshape(-1, plain.shape[1]) for x in (slopes, pairs))
-        return plain, once, twice
+        return once, twice
 
     def steady_sums(self, weight: Floats, order: int) -> tuple[Floats, Floats]:
         """Return sums of weight times X^T X (..., G, s, p, p) and X^T y (..., G, s, p).
@@ -326,7 +331,7 @@ class SineModes:
         The weights are multiplied by `order` slopes: none, D and theta, or their products DD, Do
         and oo.
         """
-        columns = self.steady_columns[order]
+        columns = self.steady_slopes[order - 1] if order else self.steady_columns
         count, total = order + 1, self.by_motion(weight, columns)
         p = int(np.sqrt(len(columns) / count))  # p^2 + p columns each
         total = total.reshape(*total.shape[:-1], count, p * p + p)
