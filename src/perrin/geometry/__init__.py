@@ -24,6 +24,7 @@ from perrin.geometry.rotations import (
 )
 from perrin.geometry.shapes import Cluster, is_tetrahedron, pair_distances
 from perrin.geometry.symmetry import (
+    are_collinear,
     matching_rotation,
     point_group,
     projected_on_line,
@@ -44,6 +45,7 @@ from perrin.geometry.wahba import (
 __all__ = [
     "Cluster",
     "Similarity",
+    "are_collinear",
     "axis_angle",
     "center_variance",
     "certified_rotation",

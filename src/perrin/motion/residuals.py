@@ -563,12 +563,12 @@ def expected_squares(rotation: Floats, keeps: Floats) -> Floats:
     products = np.swapaxes(blocks, -1, -2) @ blocks
     form = np.swapaxes(products.reshape(*keeps.shape[:-4], d, d, d, d), -3, -2)
     form = _of_products(np.moveaxis(_of_products(form), -1, -3))
-    axes = axis_products(rotation)
+    axes = _axis_products(rotation)
     along = axes.reshape(*rotation.shape[:-3], -1, axes.shape[-1]) @ form
     return np.asarray(along.reshape(axes.shape) @ np.swapaxes(axes, -1, -2))
 
 
-def axis_products(rotation: Floats) -> Floats:
+def _axis_products(rotation: Floats) -> Floats:
     """Return the products u_i u_j, i <= j, of the components of the lab's axes in body axes.
 
     Parameters
@@ -582,7 +582,7 @@ def axis_products(rotation: Floats) -> Floats:
 
     Examples
     --------
-    >>> axis_products(np.array([[0.6, 0.8], [-0.8, 0.6]])).round(2)
+    >>> _axis_products(np.array([[0.6, 0.8], [-0.8, 0.6]])).round(2)
     array([[ 0.36,  0.48,  0.64],
            [ 0.64, -0.48,  0.36]])
     """
@@ -805,7 +805,7 @@ def _noise_products(sample: Residuals, left: Floats) -> tuple[Floats, Floats]:
     coefficients are those of the body; the frames enter by the sums of the products u_i u_j.
     """
     form = _noise_forms(sample)
-    axes = axis_products(sample.rotation)
+    axes = _axis_products(sample.rotation)
     bodies, count, _, products = axes.shape
     up, every = axes[:, :, 2], axes.reshape(bodies, count, -1)
     up_pairs = (up[..., :, None] * up[..., None, :]).reshape(bodies, count, -1)

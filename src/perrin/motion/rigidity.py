@@ -304,6 +304,7 @@ def judge_each(
     corrections = [Corrections()] * count if corrections is None else corrections
     detections = [None] * count if detections is None else detections
     unsettled = [np.empty(0, np.int64)] * count if unsettled is None else unsettled
+    find_symmetries(motions)
     alike: dict[tuple[object, ...], list[int]] = {}
     for k, (motion, x) in enumerate(zip(motions, positions, strict=True)):
         scanned = motion.turn_noise is not None
@@ -318,13 +319,9 @@ def judge_each(
                 np.stack([positions[k] for k in rows]),
                 sigma=sigma,
                 sigma_ratio=sigma_ratio,
-                corrections=[
-                    Corrections() if corrections is None else corrections[k] for k in rows
-                ],
+                corrections=[corrections[k] for k in rows],
                 detections=[detections[k] for k in rows],
-                unsettled=[
-                    np.empty(0, np.int64) if unsettled is None else unsettled[k] for k in rows
-                ],
+                unsettled=[unsettled[k] for k in rows],
             )
             found.update(zip(rows, judged, strict=True))
     return [found[k] for k in range(count)]
@@ -387,7 +384,6 @@ def _judge_alike(
         usual = np.where(stretched, stretch.sample.median_sigma, usual)
     flexing = _flexing_tests(bodies, all_residuals)
     imaging = _imaging_texts(scale, stretched, delay, blur, ratio is not None)
-    find_symmetries(motions)
     judged = []
     for k, (motion, body) in enumerate(zip(motions, bodies, strict=True)):
         misfit_rows = np.flatnonzero(misfit[k].any(axis=1))
