@@ -22,7 +22,7 @@ from perrin.geometry.rotations import (
     successive_product,
     unit_quaternion,
 )
-from perrin.geometry.shapes import Cluster, is_tetrahedron, pair_distances
+from perrin.geometry.shapes import Cluster, is_tetrahedron, lengths, pair_distances
 from perrin.geometry.symmetry import (
     are_collinear,
     matching_rotation,
@@ -59,6 +59,7 @@ __all__ = [
     "inertia_tensor",
     "is_tetrahedron",
     "kabsch",
+    "lengths",
     "log_map",
     "matching_rotation",
     "orientation_covariance",

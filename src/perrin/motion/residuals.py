@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from perrin._arrays import Bools, Floats, Ints, frozen
+from perrin._arrays import Bools, Floats, Ints, frozen, present
 from perrin.geometry.rigid import (
     degrees_of_freedom,
     inertia_tensor,
@@ -16,6 +16,7 @@ from perrin.geometry.rigid import (
     pose_slopes,
 )
 from perrin.geometry.rotations import skew
+from perrin.geometry.shapes import lengths
 from perrin.motion.rigid_motion import RigidMotion
 from perrin.motion.tracking import track_each
 
@@ -117,7 +118,8 @@ class Residuals:
         freedom, count = self.freedom, self.count
         if freedom == 0:
             return np.full(count.shape, np.nan)
-        square = np.where(self.complete, (self.vector**2).sum(axis=(2, 3)), np.nan)
+        square = np.einsum("bkni,bkni->bk", self.vector, self.vector)
+        square = np.where(self.complete, square, np.nan)
         square = median_present(square)
         unbiased = np.divide(count, count - 1, out=np.full(count.shape, np.nan), where=count > 1)
         return np.asarray(np.sqrt(square * unbiased / median_chi2(freedom)))
@@ -137,10 +139,10 @@ class Residuals:
         """Return what a rigid fit leaves of displacements (B, K, n, d), less their mean shape."""
         bodies, rows, n, d = displacement.shape
         keeps = self.keeps.transpose(0, 2, 4, 1, 3).reshape(bodies, n * d, n * d)
-        left = (displacement.reshape(bodies, rows, n * d) @ keeps).reshape(displacement.shape)
-        mean = left.sum(axis=1) / np.maximum(self.count, 1)[:, None, None]
-        from_mean: Floats = np.where(self.complete[..., None, None], left - mean[:, None], 0.0)
-        return from_mean
+        left = displacement.reshape(bodies, rows, n * d) @ keeps
+        mean = left.sum(axis=1) / np.maximum(self.count, 1)[:, None]
+        from_mean: Floats = np.where(self.complete[..., None], left - mean[:, None], 0.0)
+        return from_mean.reshape(displacement.shape)
 
     def in_lab(self, vectors: Floats) -> Floats:
         """Return vectors (B, K, n, d) given in body axes along the axes of the lab."""
@@ -194,7 +196,9 @@ class Slope(NamedTuple):
         return np.asarray(known & (off > -quantile * np.where(known, self.stderr, 0.0)))
 
 
-def sample_residuals(motions: Sequence[RigidMotion], positions: Floats) -> Residuals:
+def sample_residuals(
+    motions: Sequence[RigidMotion], positions: Floats, *, residuals: Floats | None = None
+) -> Residuals:
     """Collect the residuals of the complete frames, at most 2000 a body, evenly chosen.
 
     Parameters
@@ -203,6 +207,8 @@ def sample_residuals(motions: Sequence[RigidMotion], positions: Floats) -> Resid
         Motions of B bodies.
     positions : ndarray, shape (B, T, n, d)
         The positions that the motions were fitted to, um.
+    residuals : ndarray, shape (B, T, n, d), optional
+        Their residuals, as `residuals_of_each` returns them, where these are known already.
 
     Examples
     --------
@@ -212,9 +218,10 @@ def sample_residuals(motions: Sequence[RigidMotion], positions: Floats) -> Resid
     >>> sample_residuals([track_rotation(x, dt=0.7)], x[None]).vector.shape
     (1, 300, 4, 3)
     """
-    vector = residuals_of_each(motions, positions)
-    whole = np.asarray(np.isfinite(vector).all(axis=(2, 3)))
+    vector = residuals_of_each(motions, positions) if residuals is None else residuals
+    whole = present(vector).all(axis=2)
     count = np.minimum(whole.sum(axis=1), _SAMPLED_FRAMES)
+    every = bool(whole.all()) and whole.shape[1] <= _SAMPLED_FRAMES
     rows = np.argsort(~whole, axis=1, kind="stable")[:, :_SAMPLED_FRAMES]
     for k in np.flatnonzero(whole.sum(axis=1) > _SAMPLED_FRAMES):
         all_rows = np.flatnonzero(whole[k])
@@ -222,6 +229,8 @@ def sample_residuals(motions: Sequence[RigidMotion], positions: Floats) -> Resid
     complete = np.arange(rows.shape[1]) < count[:, None]
 
     def sampled(x: Floats) -> Floats:
+        if every:
+            return x
         index = rows.reshape(*rows.shape, *[1] * (x.ndim - 2))
         here = complete.reshape(index.shape)
         return np.where(here, np.take_along_axis(x, index, axis=1), 0.0)
@@ -237,7 +246,7 @@ def sample_residuals(motions: Sequence[RigidMotion], positions: Floats) -> Resid
         x, t = center[bodies[:, None], fitted], time[bodies[:, None], fitted]
         v = (x[:, 2:] - x[:, :-2]) / (t[:, 2:] - t[:, :-2])[..., None]
         v = v - np.median(v, axis=1, keepdims=True)
-        speed = np.sqrt((v * v).sum(axis=2))
+        speed = lengths(v)
         usual = (speed <= _JUMP_SPEED * np.median(speed, axis=1, keepdims=True))[..., None]
         mean = np.where(usual, v, 0.0).sum(axis=1, keepdims=True) / usual.sum(axis=1)[:, None]
         velocity[bodies[:, None], fitted[:, 1:-1]] = np.where(usual, v - mean, 0.0)
