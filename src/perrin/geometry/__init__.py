@@ -22,7 +22,14 @@ from perrin.geometry.rotations import (
     successive_product,
     unit_quaternion,
 )
-from perrin.geometry.shapes import Cluster, is_tetrahedron, lengths, pair_distances
+from perrin.geometry.shapes import (
+    Cluster,
+    centred,
+    centroids,
+    is_tetrahedron,
+    lengths,
+    pair_distances,
+)
 from perrin.geometry.symmetry import (
     are_collinear,
     matching_rotation,
@@ -48,6 +55,8 @@ __all__ = [
     "are_collinear",
     "axis_angle",
     "center_variance",
+    "centred",
+    "centroids",
     "certified_rotation",
     "characteristic_root",
     "cumulative_product",

@@ -226,6 +226,29 @@ def pair_distances(points: Floats) -> Floats:
     return np.concatenate([np.zeros((*points.shape[:-2], 0)), *parts], axis=-1)
 
 
+def centroids(points: Floats) -> Floats:
+    """Return the means of sets of points (..., n, d); NaN where a point is missing.
+
+    Examples
+    --------
+    >>> centroids(np.array([[0.0, 0.0], [3.0, 0.0], [0.0, 6.0]]))
+    array([1., 2.])
+    """
+    return np.asarray(np.einsum("...ni->...i", points) / points.shape[-2])
+
+
+def centred(points: Floats) -> Floats:
+    """Return sets of points (..., n, d) relative to their means.
+
+    Examples
+    --------
+    >>> centred(np.array([[0.0, 0.0], [4.0, 2.0]]))
+    array([[-2., -1.],
+           [ 2.,  1.]])
+    """
+    return np.asarray(points - centroids(points)[..., None, :])
+
+
 def lengths(vectors: Floats) -> Floats:
     """Return the lengths of vectors (..., d), without the temporary arrays of `numpy.linalg.norm`.
 

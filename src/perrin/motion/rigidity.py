@@ -357,15 +357,13 @@ def _judge_alike(
     if stretched.any():
         corrected = x / unit[:, None, None]
         residuals = residuals_of_each(bodies, corrected)
-    all_detections, all_residuals = corrected, residuals
-    if any(found is not None for found in detections):
-        filled = [
-            one if found is None else _restored_detections(body, one, found / own)
-            for body, one, found, own in zip(bodies, corrected, detections, unit, strict=True)
-        ]
-        if any(more is not one for more, one in zip(filled, corrected, strict=True)):
-            all_detections = np.stack(filled)
-            all_residuals = residuals_of_each(bodies, all_detections)
+    filled = [
+        one if found is None else _restored_detections(body, one, found, own)
+        for body, one, found, own in zip(bodies, corrected, detections, unit, strict=True)
+    ]
+    all_residuals = residuals
+    if any(more is not one for more, one in zip(filled, corrected, strict=True)):
+        all_residuals = residuals_of_each(bodies, np.stack(filled))
     radius = np.array([body.R for body in bodies])
     misfit = misplaced_detections(all_residuals, radius)
     for own, rows in zip(misfit, unsettled, strict=True):
@@ -505,10 +503,11 @@ def _residual_test(
     ]
 
 
-def _restored_detections(motion: RigidMotion, x: Floats, found: Floats) -> Floats:
+def _restored_detections(motion: RigidMotion, x: Floats, found: Floats, unit: Floats) -> Floats:
     """Assign detections that were left out to the nearest missing particles, (T, n, d).
 
-    A detection farther than R from every missing particle does not belong to the body.
+    A detection farther than R from every missing particle does not belong to the body. `unit` is
+    the scale of each axis that the positions were already divided by.
     """
     if len(found) != len(x):
         raise ValueError(f"detections: expected {len(x)} rows as in positions, got {len(found)}")
@@ -516,6 +515,7 @@ def _restored_detections(motion: RigidMotion, x: Floats, found: Floats) -> Float
     # As many positions as detections: none was left out.
     if (seen.sum(axis=1) == detected.sum(axis=1)).all():
         return x
+    found = found / unit
     filled, expected = x.copy(), motion.positions()
     used = (found[:, :, None] == x[:, None]).all(axis=3).any(axis=2)
     spare = detected & ~used
