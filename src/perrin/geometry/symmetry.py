@@ -339,7 +339,7 @@ def _groups_of_permutations(x: Floats, tolerance: Floats) -> list[tuple[_Element
     ends = np.searchsorted(body, np.arange(len(x) + 1)).tolist()
     # Most bodies have the same elements as the one before, all of which generate a group.
     together: dict[tuple[bytes, bytes], frozenset[_Element] | None] = {}
-    groups = []
+    groups: list[tuple[_Element, ...]] = []
     for low, high in pairwise(ends):
         some, close = elements[low:high], within[low:high]
         key = some.tobytes(), close.tobytes()

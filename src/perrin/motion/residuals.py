@@ -219,7 +219,7 @@ def sample_residuals(
     (1, 300, 4, 3)
     """
     vector = residuals_of_each(motions, positions) if residuals is None else residuals
-    whole = present(vector).all(axis=2)
+    whole = np.asarray(present(vector).all(axis=2))
     count = np.minimum(whole.sum(axis=1), _SAMPLED_FRAMES)
     every = bool(whole.all()) and whole.shape[1] <= _SAMPLED_FRAMES
     rows = np.argsort(~whole, axis=1, kind="stable")[:, :_SAMPLED_FRAMES]

@@ -605,7 +605,7 @@ def _flexing_tests(
     # Contribution of each particle's variance to the mean squares of all residuals.
     share = np.einsum("bnmij,bnmij->bnm", keeps, keeps)
     singular = np.linalg.svd(share, compute_uv=False)
-    whole = present(residuals).all(axis=2)
+    whole = np.asarray(present(residuals).all(axis=2))
     following = whole[:, 1:] & whole[:, :-1]
     pairs = following.sum(axis=1)
     tested = np.flatnonzero((pairs >= 10) & ~(singular[:, 0] > 1e6 * singular[:, -1]))

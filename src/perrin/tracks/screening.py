@@ -145,7 +145,8 @@ def screen_rows(table: pd.DataFrame) -> Screened:
     at_placeholder = placeholder_rows(own, points)
     filled, rest = rows[at_placeholder], rows
     if filled.size:
-        rest, own, points = (part[~at_placeholder] for part in (rows, own, points))
+        left = ~at_placeholder
+        rest, own, points = rows[left], own[left], points[left]
     repeated = rest[repeated_rows(own, points)]
     notes = _rows_sentence(
         np.flatnonzero(empty), frame, code, "without coordinates (NaN)", "they count as missing"
