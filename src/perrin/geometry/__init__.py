@@ -22,8 +22,16 @@ from perrin.geometry.rotations import (
     successive_product,
     unit_quaternion,
 )
-from perrin.geometry.shapes import Cluster, is_tetrahedron, pair_distances
+from perrin.geometry.shapes import (
+    Cluster,
+    centred,
+    centroids,
+    is_tetrahedron,
+    lengths,
+    pair_distances,
+)
 from perrin.geometry.symmetry import (
+    are_collinear,
     matching_rotation,
     point_group,
     projected_on_line,
@@ -44,8 +52,11 @@ from perrin.geometry.wahba import (
 __all__ = [
     "Cluster",
     "Similarity",
+    "are_collinear",
     "axis_angle",
     "center_variance",
+    "centred",
+    "centroids",
     "certified_rotation",
     "characteristic_root",
     "cumulative_product",
@@ -57,6 +68,7 @@ __all__ = [
     "inertia_tensor",
     "is_tetrahedron",
     "kabsch",
+    "lengths",
     "log_map",
     "matching_rotation",
     "orientation_covariance",

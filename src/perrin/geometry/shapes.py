@@ -219,9 +219,45 @@ def pair_distances(points: Floats) -> Floats:
     >>> pair_distances(np.array([[0.0, 0.0], [3.0, 0.0], [0.0, 4.0]]))
     array([3., 4., 5.])
     """
-    first, second = np.triu_indices(points.shape[-2], 1)
-    distances: Floats = np.linalg.norm(points[..., first, :] - points[..., second, :], axis=-1)
-    return distances
+    parts = [
+        lengths(points[..., k + 1 :, :] - points[..., k : k + 1, :])
+        for k in range(points.shape[-2])
+    ]
+    return np.concatenate([np.zeros((*points.shape[:-2], 0)), *parts], axis=-1)
+
+
+def centroids(points: Floats) -> Floats:
+    """Return the means of sets of points (..., n, d); NaN where a point is missing.
+
+    Examples
+    --------
+    >>> centroids(np.array([[0.0, 0.0], [3.0, 0.0], [0.0, 6.0]]))
+    array([1., 2.])
+    """
+    return np.asarray(np.einsum("...ni->...i", points) / points.shape[-2])
+
+
+def centred(points: Floats) -> Floats:
+    """Return sets of points (..., n, d) relative to their means.
+
+    Examples
+    --------
+    >>> centred(np.array([[0.0, 0.0], [4.0, 2.0]]))
+    array([[-2., -1.],
+           [ 2.,  1.]])
+    """
+    return np.asarray(points - centroids(points)[..., None, :])
+
+
+def lengths(vectors: Floats) -> Floats:
+    """Return the lengths of vectors (..., d), without the temporary arrays of `numpy.linalg.norm`.
+
+    Examples
+    --------
+    >>> lengths(np.array([[3.0, 4.0], [0.0, 2.0]]))
+    array([5., 2.])
+    """
+    return np.asarray(np.sqrt(np.einsum("...i,...i->...", vectors, vectors)))
 
 
 def is_tetrahedron(positions: Floats, *, tolerance: float = 0.1) -> bool:

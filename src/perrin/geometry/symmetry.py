@@ -7,6 +7,7 @@ for a rotation times the inversion. On a body that is not a line the two determi
 from __future__ import annotations
 
 from functools import lru_cache
+from itertools import pairwise
 from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
@@ -17,7 +18,9 @@ from perrin.geometry.rotations import axis_angle, fit_rotations
 from perrin.geometry.shapes import Cluster
 
 if TYPE_CHECKING:
-    from perrin._arrays import Floats, Ints
+    from collections.abc import Mapping
+
+    from perrin._arrays import Bools, Floats, Ints
 
 # Sign of a symmetry element, then for each particle the number of the one it is mapped to.
 _Element: TypeAlias = tuple[int, ...]
@@ -159,10 +162,34 @@ def projected_on_line(x: Floats, tolerance: float) -> Floats | None:
     >>> projected_on_line(np.eye(3) - 1 / 3, 0.1) is None
     True
     """
+    if not are_collinear(x[None], np.array([tolerance]))[0]:
+        return None
     axis = np.linalg.svd(x)[2][0]
     along = x @ axis
-    off = np.linalg.norm(x - along[:, None] * axis, axis=1).max()
-    return along[:, None] * axis if off <= max(tolerance, 1e-12 * np.abs(x).max()) else None
+    projected: Floats = along[:, None] * axis
+    return projected
+
+
+def are_collinear(x: Floats, tolerance: Floats) -> Bools:
+    """Return which of several bodies have all their particles on one line.
+
+    Parameters
+    ----------
+    x : ndarray, shape (B, n, d)
+        Centred positions of the particles of each body.
+    tolerance : ndarray, shape (B,)
+        Largest distance (um) of a particle from the line.
+
+    Examples
+    --------
+    >>> x = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
+    >>> are_collinear(np.stack([x, np.eye(3) - 1 / 3]), np.full(2, 0.1))
+    array([ True, False])
+    """
+    axis = np.linalg.svd(x, full_matrices=False)[2][:, :1]
+    off = x - (x @ np.swapaxes(axis, 1, 2)) * axis
+    least = 1e-12 * np.abs(x).max(axis=(1, 2))
+    return np.asarray(np.linalg.norm(off, axis=2).max(axis=1) <= np.maximum(tolerance, least))
 
 
 def _line_rotations(line: Floats, d: int, tolerance: float) -> Floats:
@@ -275,25 +302,8 @@ def symmetry_elements_of_each(x: Floats, tolerance: Floats) -> list[Floats]:
     [24, 24]
     """
     tolerance = np.maximum(tolerance, 1e-12 * np.abs(x).max(axis=(1, 2)))
-    misfits: list[dict[_Element, float]] = [{} for _ in x]
-    for sign in (1, -1):
-        found = _congruences(x, sign * x, 2 * tolerance)
-        for body, order, misfit in zip(*(part.tolist() for part in found), strict=True):
-            misfits[body][sign, *order] = misfit
     groups: dict[tuple[_Element, ...], list[int]] = {}
-    identity: _Element = (1, *range(x.shape[1]))
-    for k, (misfit, own) in enumerate(zip(misfits, tolerance.tolist(), strict=True)):
-        # Elements are accepted best first; all products are to be among those with a known misfit.
-        allowed = frozenset(misfit)
-        within = frozenset(e for e in misfit if misfit[e] <= own) | {identity}
-        # If all of them together generate a group of allowed elements, so do the best of them.
-        chosen = _generated_group(within, allowed)
-        if chosen is None:
-            chosen = frozenset({identity})
-            for element in sorted(within, key=lambda e: (misfit.get(e, 0.0), e)):
-                if element not in chosen:
-                    chosen = _generated_group(chosen | {element}, allowed) or chosen
-        group = (identity, *sorted(chosen - {identity}, reverse=True))
+    for k, group in enumerate(_groups_of_permutations(x, tolerance)):
         groups.setdefault(group, []).append(k)
     matrices: dict[int, Floats] = {}
     for group, bodies in groups.items():
@@ -306,12 +316,56 @@ def symmetry_elements_of_each(x: Floats, tolerance: Floats) -> list[Floats]:
         while moving.size and rounds < 50:
             some, rounds = symmetric[moving], rounds + 1
             exact[moving] = sign_of * fit_rotations(sign_of * some[:, order], some[:, None])[0]
-            mean = np.einsum("bgji,bgnj->bni", exact[moving], some[:, order]) / len(order)
+            images = np.moveaxis(some[:, order], 1, 2).reshape(len(some), x.shape[1], -1)
+            mean = images @ exact[moving].reshape(len(some), -1, 3) / len(order)
             change = np.abs(mean - some).max(axis=(1, 2))
             symmetric[moving] = mean
             moving = moving[~(change <= 1e-15 * np.abs(mean).max(axis=(1, 2)))]
         matrices.update(zip(bodies, exact, strict=True))
     return [matrices[k] for k in range(len(x))]
+
+
+def _groups_of_permutations(x: Floats, tolerance: Floats) -> list[tuple[_Element, ...]]:
+    """Return the symmetry elements of several bodies, the identity first."""
+    n = x.shape[1]
+    identity: _Element = (1, *range(n))
+    found = [_congruences(x, sign * x, 2 * tolerance) for sign in (1, -1)]
+    body, order, misfit = (np.concatenate(part) for part in zip(*found, strict=True))
+    sign = np.repeat([1, -1], [len(part[0]) for part in found])
+    elements = np.column_stack([sign, order])
+    rows = np.lexsort((*elements.T[::-1], body))
+    body, elements, misfit = body[rows], elements[rows], misfit[rows]
+    within = misfit <= tolerance[body]
+    ends = np.searchsorted(body, np.arange(len(x) + 1)).tolist()
+    # Most bodies have the same elements as the one before, all of which generate a group.
+    together: dict[tuple[bytes, bytes], frozenset[_Element] | None] = {}
+    groups: list[tuple[_Element, ...]] = []
+    for low, high in pairwise(ends):
+        some, close = elements[low:high], within[low:high]
+        key = some.tobytes(), close.tobytes()
+        if key not in together:
+            allowed = frozenset(map(tuple, some.tolist()))
+            together[key] = _generated_group(
+                frozenset(map(tuple, some[close].tolist())) | {identity}, allowed
+            )
+        group = together[key]
+        if group is None:
+            misfits = dict(zip(map(tuple, some.tolist()), misfit[low:high].tolist(), strict=True))
+            group = _group_of_best(misfits, float(tolerance[len(groups)]), identity)
+        groups.append((identity, *sorted(group - {identity}, reverse=True)))
+    return groups
+
+
+def _group_of_best(
+    misfits: Mapping[_Element, float], tolerance: float, identity: _Element
+) -> frozenset[_Element]:
+    """Return a group of elements, accepted best first, whose products all have a known misfit."""
+    group = frozenset({identity})
+    within = [element for element, misfit in misfits.items() if misfit <= tolerance]
+    for element in sorted(within, key=lambda e: (misfits[e], e)):
+        if element not in group:
+            group = _generated_group(group | {element}, frozenset(misfits)) or group
+    return group
 
 
 @lru_cache(maxsize=128)

@@ -176,15 +176,13 @@ def floor_range(template: Floats, rotation: Floats, *, ratio: float) -> tuple[fl
     >>> [round(factor, 9) for factor in floor_range(body, still, ratio=3.0)]
     [1.0, 1.0]
     """
-    along_z = np.einsum("ti,tj->ij", rotation[:, 2], rotation[:, 2]) / len(rotation)
-    inertia = inertia_tensor(template)
-
-    def floor_per_residual(square: float) -> float:
-        noise = np.eye(3) + (square - 1) * along_z
-        covariance = orientation_covariance(template, noise)
-        left = (len(template) - 1) * np.trace(noise) - np.trace(inertia @ covariance)
-        return float(np.trace(covariance) / left)
-
-    equal = floor_per_residual(1.0)
-    ends = [floor_per_residual(square) / equal for square in (ratio**-2, ratio**2)]
+    axis = rotation[:, 2]
+    along_z = axis.T @ axis / len(axis)
+    squares = np.array([1.0, ratio**-2, ratio**2])
+    noise = np.eye(3) + (squares - 1)[:, None, None] * along_z
+    covariance = orientation_covariance(template, noise)
+    left = (len(template) - 1) * np.trace(noise, axis1=1, axis2=2)
+    left = left - np.einsum("ij,sij->s", inertia_tensor(template), covariance)
+    floor = np.trace(covariance, axis1=1, axis2=2) / left
+    ends = (floor[1:] / floor[0]).tolist()
     return min(1.0, *ends), max(1.0, *ends)

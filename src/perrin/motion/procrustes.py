@@ -14,6 +14,7 @@ from perrin.geometry.rigid import (
     pose_slopes,
 )
 from perrin.geometry.rotations import exp_map, fit_rotations, successive_product
+from perrin.geometry.shapes import centred, centroids
 from perrin.motion.degenerate import mean_present, no_rotation, require_points
 
 if TYPE_CHECKING:
@@ -113,13 +114,17 @@ def fit_templates(
     rotation = np.empty((*x.shape[:2], x.shape[3], x.shape[3]))
     unique = np.empty(x.shape[:2], dtype=np.bool_)
     moving = np.arange(len(x))
+    arms = _arms_of_particles(x) if seen.all() else None
     for _ in range(100):
         every = moving.size == len(x)
         some, here = (x, seen) if every else (x[moving], seen[moving])
         before = shape[moving]
         turned, found = fit_rotations(some, before[:, None])
         rotation[moving], unique[moving] = turned, found
-        new = _centred_mean(_in_body(some, here, turned, before))
+        if arms is None:
+            new = _mean_in_body(some, here, turned, before)
+        else:
+            new = _mean_of_complete(arms if every else arms[moving], turned, found)
         back, known = fit_rotations(before, new)
         new = np.where(known[:, None, None], new @ np.swapaxes(back, -1, -2), new)
         usable = np.asarray(found.any(axis=1))
@@ -178,7 +183,7 @@ def fit_chain(x: Floats, seen: Bools) -> PoseFit:
     rotation[rows] = successive_product(step)
     shape = x[rows[0]]
     for _ in range(100):
-        new = _centred_mean(_in_body(x, seen, rotation, shape))
+        new = _mean_in_body(x, seen, rotation, shape)
         change = np.nanmax(np.abs(new - shape))
         size = np.nanmax(np.abs(new - mean_present(new, axis=-2)))
         grown = np.isfinite(new).sum() > np.isfinite(shape).sum()
@@ -395,16 +400,15 @@ def pose_errors(fit: PoseFit, seen: Bools, noise: Floats) -> tuple[Floats, Float
     return covariance, variance
 
 
-def _in_body(x: Floats, seen: Bools, rotation: Floats, shape: Floats) -> Floats:
+def _in_body(x: Floats, seen: Bools, rotation: Floats, center: Floats) -> Floats:
     """Return the particles in the axes of the body, (..., T, n, d)."""
-    center = _shape_centers(x, rotation, shape)
     turned: Floats = (x - center[..., None, :]) @ rotation
     return turned if seen.all() else np.where(seen[..., None], turned, np.nan)
 
 
 def _shape_centers(x: Floats, rotation: Floats, shape: Floats) -> Floats:
     """Return the lab position of the shape's origin, from the particles present in both."""
-    centroid = x.sum(axis=-2) / x.shape[-2]
+    centroid = centroids(x)
     if np.isfinite(centroid).all() and np.isfinite(shape).all():
         arm = np.broadcast_to(shape.mean(axis=-2)[..., None, :], centroid.shape)
     else:
@@ -415,11 +419,30 @@ def _shape_centers(x: Floats, rotation: Floats, shape: Floats) -> Floats:
     return center
 
 
-def _centred_mean(body: Floats) -> Floats:
-    """Average the frames (..., T, n, d), and move the centre of the shape to the origin."""
-    shape = mean_present(body, axis=-3)
-    centred: Floats = shape - mean_present(shape, axis=-2)[..., None, :]
-    return centred
+def _mean_in_body(x: Floats, seen: Bools, rotation: Floats, shape: Floats) -> Floats:
+    """Average the particles in the axes of the body over the frames; their centre is the origin."""
+    body = _in_body(x, seen, rotation, _shape_centers(x, rotation, shape))
+    mean = mean_present(body, axis=-3)
+    mean_shape: Floats = mean - mean_present(mean, axis=-2)[..., None, :]
+    return mean_shape
+
+
+def _arms_of_particles(x: Floats) -> Floats:
+    """Return each particle's positions relative to the centroids of its frames, (B, n, T d)."""
+    return np.swapaxes(centred(x), 1, 2).reshape(len(x), x.shape[2], -1)
+
+
+def _mean_of_complete(arms: Floats, rotation: Floats, unique: Bools) -> Floats:
+    """Return what `_mean_in_body` returns for frames without missing particles.
+
+    A particle's mean in the axes of the body is the sum of R^T (x - centroid) over the frames: one
+    product of matrices.
+    """
+    bodies, _, d, _ = rotation.shape
+    known = rotation if unique.all() else np.where(unique[..., None, None], rotation, 0.0)
+    total: Floats = arms @ known.reshape(bodies, -1, d)
+    mean = total / np.maximum(unique.sum(axis=1), 1)[:, None, None]
+    return centred(mean)
 
 
 def _fit_of(x: Floats, seen: Bools, rotation: Floats, shape: Floats) -> PoseFit:
@@ -430,13 +453,15 @@ def _fit_of(x: Floats, seen: Bools, rotation: Floats, shape: Floats) -> PoseFit:
     gauge = np.swapaxes(rotation[bodies, first], 1, 2)
     shape, rotation = shape @ gauge, rotation @ gauge[:, None]
     rotation[bodies, first] = np.eye(d)
-    residual = _in_body(x, seen, rotation, shape) - shape[:, None]
+    center = _shape_centers(x, rotation, shape)
+    residual = _in_body(x, seen, rotation, center) - shape[:, None]
     # The template was fitted too: it takes the degrees of freedom of one complete frame.
     freedom = (degrees_of_freedom(seen.sum(axis=2), d) * fitted).sum(axis=1)
     freedom = freedom - degrees_of_freedom(np.array(shape.shape[1]), d)
-    square = np.nansum(residual**2, axis=(1, 2, 3))
+    known = np.where(np.isnan(residual), 0.0, residual)
+    square = np.einsum("btni,btni->b", known, known)
     sigma2 = np.divide(square, freedom, out=np.full(len(x), np.nan), where=freedom > 0)
-    return PoseFit(rotation, _shape_centers(x, rotation, shape), shape, residual, sigma2)
+    return PoseFit(rotation, center, shape, residual, sigma2)
 
 
 def _too_few_poses(count: int) -> TooFewFramesError:

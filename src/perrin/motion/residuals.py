@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from perrin._arrays import Bools, Floats, Ints, frozen
+from perrin._arrays import Bools, Floats, Ints, frozen, present
 from perrin.geometry.rigid import (
     degrees_of_freedom,
     inertia_tensor,
@@ -16,6 +16,7 @@ from perrin.geometry.rigid import (
     pose_slopes,
 )
 from perrin.geometry.rotations import skew
+from perrin.geometry.shapes import lengths
 from perrin.motion.rigid_motion import RigidMotion
 from perrin.motion.tracking import track_each
 
@@ -117,7 +118,8 @@ class Residuals:
         freedom, count = self.freedom, self.count
         if freedom == 0:
             return np.full(count.shape, np.nan)
-        square = np.where(self.complete, (self.vector**2).sum(axis=(2, 3)), np.nan)
+        square = np.einsum("bkni,bkni->bk", self.vector, self.vector)
+        square = np.where(self.complete, square, np.nan)
         square = median_present(square)
         unbiased = np.divide(count, count - 1, out=np.full(count.shape, np.nan), where=count > 1)
         return np.asarray(np.sqrt(square * unbiased / median_chi2(freedom)))
@@ -137,10 +139,10 @@ class Residuals:
         """Return what a rigid fit leaves of displacements (B, K, n, d), less their mean shape."""
         bodies, rows, n, d = displacement.shape
         keeps = self.keeps.transpose(0, 2, 4, 1, 3).reshape(bodies, n * d, n * d)
-        left = (displacement.reshape(bodies, rows, n * d) @ keeps).reshape(displacement.shape)
-        mean = left.sum(axis=1) / np.maximum(self.count, 1)[:, None, None]
-        from_mean: Floats = np.where(self.complete[..., None, None], left - mean[:, None], 0.0)
-        return from_mean
+        left = displacement.reshape(bodies, rows, n * d) @ keeps
+        mean = left.sum(axis=1) / np.maximum(self.count, 1)[:, None]
+        from_mean: Floats = np.where(self.complete[..., None], left - mean[:, None], 0.0)
+        return from_mean.reshape(displacement.shape)
 
     def in_lab(self, vectors: Floats) -> Floats:
         """Return vectors (B, K, n, d) given in body axes along the axes of the lab."""
@@ -194,7 +196,9 @@ class Slope(NamedTuple):
         return np.asarray(known & (off > -quantile * np.where(known, self.stderr, 0.0)))
 
 
-def sample_residuals(motions: Sequence[RigidMotion], positions: Floats) -> Residuals:
+def sample_residuals(
+    motions: Sequence[RigidMotion], positions: Floats, *, residuals: Floats | None = None
+) -> Residuals:
     """Collect the residuals of the complete frames, at most 2000 a body, evenly chosen.
 
     Parameters
@@ -203,6 +207,8 @@ def sample_residuals(motions: Sequence[RigidMotion], positions: Floats) -> Resid
         Motions of B bodies.
     positions : ndarray, shape (B, T, n, d)
         The positions that the motions were fitted to, um.
+    residuals : ndarray, shape (B, T, n, d), optional
+        Their residuals, as `residuals_of_each` returns them, where these are known already.
 
     Examples
     --------
@@ -212,9 +218,10 @@ def sample_residuals(motions: Sequence[RigidMotion], positions: Floats) -> Resid
     >>> sample_residuals([track_rotation(x, dt=0.7)], x[None]).vector.shape
     (1, 300, 4, 3)
     """
-    vector = residuals_of_each(motions, positions)
-    whole = np.asarray(np.isfinite(vector).all(axis=(2, 3)))
+    vector = residuals_of_each(motions, positions) if residuals is None else residuals
+    whole = np.asarray(present(vector).all(axis=2))
     count = np.minimum(whole.sum(axis=1), _SAMPLED_FRAMES)
+    every = bool(whole.all()) and whole.shape[1] <= _SAMPLED_FRAMES
     rows = np.argsort(~whole, axis=1, kind="stable")[:, :_SAMPLED_FRAMES]
     for k in np.flatnonzero(whole.sum(axis=1) > _SAMPLED_FRAMES):
         all_rows = np.flatnonzero(whole[k])
@@ -222,6 +229,8 @@ def sample_residuals(motions: Sequence[RigidMotion], positions: Floats) -> Resid
     complete = np.arange(rows.shape[1]) < count[:, None]
 
     def sampled(x: Floats) -> Floats:
+        if every:
+            return x
         index = rows.reshape(*rows.shape, *[1] * (x.ndim - 2))
         here = complete.reshape(index.shape)
         return np.where(here, np.take_along_axis(x, index, axis=1), 0.0)
@@ -237,7 +246,7 @@ def sample_residuals(motions: Sequence[RigidMotion], positions: Floats) -> Resid
         x, t = center[bodies[:, None], fitted], time[bodies[:, None], fitted]
         v = (x[:, 2:] - x[:, :-2]) / (t[:, 2:] - t[:, :-2])[..., None]
         v = v - np.median(v, axis=1, keepdims=True)
-        speed = np.sqrt((v * v).sum(axis=2))
+        speed = lengths(v)
         usual = (speed <= _JUMP_SPEED * np.median(speed, axis=1, keepdims=True))[..., None]
         mean = np.where(usual, v, 0.0).sum(axis=1, keepdims=True) / usual.sum(axis=1)[:, None]
         velocity[bodies[:, None], fitted[:, 1:-1]] = np.where(usual, v - mean, 0.0)
@@ -338,8 +347,9 @@ def autocorrelation(vectors: Floats, count: Ints, freedom: float) -> Floats:
     True
     """
     flat = vectors.reshape(*vectors.shape[:2], -1)
-    power = np.einsum("bkc,bkc->b", flat, flat)
-    following = np.einsum("bkc,bkc->b", flat[:, 1:], flat[:, :-1])
+    series, step = flat.reshape(len(flat), -1), flat.shape[2]
+    power = np.einsum("bx,bx->b", series, series)
+    following = np.einsum("bx,bx->b", series[:, step:], series[:, :-step])
     least = 2.0 / np.sqrt(np.maximum(count * freedom, 1.0))
     first = np.divide(following, power, out=np.zeros(len(flat)), where=power > 0)
     smooth = np.flatnonzero((first >= least) & (count > 1) & (power > 0))
@@ -457,17 +467,11 @@ def regress(
     True
     """
     left = sample.left_of(displacement) if left is None else left
-    if sample.freedom == 0:
-        return Slope.unknown(sample.count.shape)
-    frames = np.einsum("bkni,bkni->bk", left, left)
-    total = frames.sum(axis=1)
-    power = total - imitated
-    moved = np.einsum("bkni,bkni->b", displacement, displacement)
-    least = np.maximum(_LEAST_POWER * np.asarray(imitated), 1e-9 * moved)
-    known = (sample.count >= 3) & (power > least)
+    power, known = _measurable_power(sample, displacement, left, imitated)
     if not known.any():
         return Slope.unknown(sample.count.shape)
-    total, power = np.where(known, total, 1.0), np.where(known, power, 1.0)
+    frames = np.einsum("bkni,bkni->bk", left, left)
+    total = np.where(known, frames.sum(axis=1), 1.0)
     along = np.einsum("bkni,bkni->bk", left, sample.vector)
     slope = (along.sum(axis=1) - offset) / power
     rest = sample.vector - slope[:, None, None, None] * left
@@ -490,6 +494,20 @@ def regress(
         slope, np.sqrt(variance * inflation * mean_lost) / power, 1.0 / concentration / repeats
     )
     return found.where(known, Slope.unknown(known.shape))
+
+
+def _measurable_power(
+    sample: Residuals, displacement: Floats, left: Floats, imitated: Floats | float = 0.0
+) -> tuple[Floats, Bools]:
+    """Return the square of what a fit leaves, less that of noise, and where it is large enough.
+
+    The power is 1 where the displacement is too small to measure its slope.
+    """
+    power = np.einsum("bkni,bkni->b", left, left) - imitated
+    moved = np.einsum("bkni,bkni->b", displacement, displacement)
+    least = np.maximum(_LEAST_POWER * np.asarray(imitated), 1e-9 * moved)
+    known = (sample.freedom > 0) & (sample.count >= 3) & (power > least)
+    return np.where(known, power, 1.0), np.asarray(known)
 
 
 class AxisNoise(NamedTuple):
@@ -550,11 +568,41 @@ def expected_squares(rotation: Floats, keeps: Floats) -> Floats:
     """
     d = rotation.shape[-1]
     blocks = keeps.reshape(*keeps.shape[:-4], -1, d * d)
-    pairs = rotation[..., :, None, :, None] * rotation[..., None, :, None, :]
-    pairs = pairs.reshape(*rotation.shape[:-2], d * d, d * d)
+    # u_i K_ij v_j u_k K_kl v_l is a quadratic form in the axis u and in the axis v.
     products = np.swapaxes(blocks, -1, -2) @ blocks
-    sums = np.einsum("...x,...x->...", pairs @ products[..., None, :, :], pairs)
-    return np.asarray(sums.reshape(rotation.shape))
+    form = np.swapaxes(products.reshape(*keeps.shape[:-4], d, d, d, d), -3, -2)
+    form = _of_products(np.moveaxis(_of_products(form), -1, -3))
+    axes = _axis_products(rotation)
+    along = axes.reshape(*rotation.shape[:-3], -1, axes.shape[-1]) @ form
+    return np.asarray(along.reshape(axes.shape) @ np.swapaxes(axes, -1, -2))
+
+
+def _axis_products(rotation: Floats) -> Floats:
+    """Return the products u_i u_j, i <= j, of the components of the lab's axes in body axes.
+
+    Parameters
+    ----------
+    rotation : ndarray, shape (..., d, d)
+        Orientations of a body, lab from body: row a is the lab's axis a in body axes.
+
+    Returns
+    -------
+    ndarray, shape (..., d, d (d + 1) / 2)
+
+    Examples
+    --------
+    >>> _axis_products(np.array([[0.6, 0.8], [-0.8, 0.6]])).round(2)
+    array([[ 0.36,  0.48,  0.64],
+           [ 0.64, -0.48,  0.36]])
+    """
+    i, j = np.triu_indices(rotation.shape[-1])
+    return np.asarray(rotation[..., i] * rotation[..., j])
+
+
+def _of_products(form: Floats) -> Floats:
+    """Return the coefficients of the products u_i u_j, i <= j, in quadratic forms (..., d, d)."""
+    i, j = np.triu_indices(form.shape[-1])
+    return np.asarray(np.where(i == j, 0.5, 1.0) * (form[..., i, j] + form[..., j, i]))
 
 
 def axis_noise(sample: Residuals) -> AxisNoise:
@@ -715,11 +763,12 @@ def _stretch_step(sample: Residuals) -> tuple[Slope, Floats]:
     height = up @ np.swapaxes(sample.template, 1, 2)
     displacement = height[..., None] * up[:, :, None]
     left = sample.left_of(displacement)
-    plain = regress(sample, displacement, left=left)
-    known = plain.known
+    unknown = Slope.unknown(sample.count.shape)
+    power, known = _measurable_power(sample, displacement, left)
     if not known.any():
-        return plain, left
-    vector = sample.vector - np.where(known, plain.value, 0.0)[:, None, None, None] * left
+        return unknown, left
+    plain = np.where(known, np.einsum("bkni,bkni->b", left, sample.vector) / power, 0.0)
+    vector = sample.vector - plain[:, None, None, None] * left
     # The noise of the axes is shrunk to equal noise, the more the larger its error. A body whose
     # residuals do not separate the axes (a trimer that hardly turns) is left with equal noise, and
     # with an error that allows standard deviations of 1 : 1 : 3.
@@ -750,45 +799,75 @@ def _stretch_step(sample: Residuals) -> tuple[Slope, Floats]:
     noise_error = np.einsum("ba,bac,bc->b", products, covariance, products)
     with np.errstate(divide="ignore", invalid="ignore"):
         error = np.sqrt(found.stderr**2 + noise_error / power**2)
-    return found._replace(stderr=error).where(known, plain), left
+    return found._replace(stderr=error).where(known, unknown), left
 
 
 def _noise_products(sample: Residuals, left: Floats) -> tuple[Floats, Floats]:
-    """Return the mean of residual times stretch, and of stretch squared, for unit noise by axis.
+    """Return the sums of residual times stretch, and of stretch squared, for unit noise by axis.
 
     Second order in the noise: the fitted orientation errs by delta = sum A_i e_i with
     A_i = M^-1 [r_i]x, so that the residual has the mean (C - tr C) r_i / 2 - <delta x e_i>
     with C = <delta delta^T>, and the direction of z in the body, which errs with delta, is
     correlated with the residual where the axes of the lab have unequal noise.
+
+    All of these are polynomials in the components of the lab's axes u in body axes, whose
+    coefficients are those of the body; the frames enter by the sums of the products u_i u_j.
     """
-    turn, r = sample.rotation, sample.template
-    arm = np.linalg.pinv(inertia_tensor(r))[:, None] @ skew(r)
-    # The derivative of u (u . r) with u -> u - delta x u; its last index is that of delta.
-    up = turn[:, :, 2]
-    bodies, count, n, d = left.shape
-    turned = skew(up)
-    slope = turned[:, :, None] * (up @ np.swapaxes(r, 1, 2))[..., None, None]
-    slope = slope + up[:, :, None, :, None] * (r[:, None] @ turned)[:, :, :, None, :]
-    keeps = sample.keeps.transpose(0, 1, 3, 2, 4).reshape(bodies, 1, n * d, n * d)
-    slope = keeps @ slope.reshape(bodies, count, n * d, 3)
-    shared = np.einsum("zlbp,zliqc->zibcpq", arm, sample.keeps).reshape(bodies, -1, 9)
-    products, squares = np.empty((2, bodies, 3))
-    of_slope = np.swapaxes(slope.reshape(bodies, count, n, d, 3), 3, 4).reshape(bodies, count, -1)
-    flat_arm = np.swapaxes(arm.reshape(bodies, n * 3, 3), 1, 2)
-    for axis in range(3):
-        u = turn[:, :, axis]
-        # what unit noise along this axis turns the fit by
-        turns = (u @ flat_arm).reshape(bodies, count, n, 3)
-        c = np.swapaxes(turns, 2, 3) @ turns
-        trace = np.trace(c, axis1=2, axis2=3)[..., None, None]
-        shift = 0.5 * (r[:, None] @ c - trace * r[:, None])
-        shift -= turns @ skew(u)
-        noise = (u[..., :, None] * u[..., None, :]).reshape(bodies, count, 9)
-        crossed = noise @ np.swapaxes(shared, 1, 2)
-        products[:, axis] = np.einsum("bkni,bkni->b", left, shift)
-        products[:, axis] += np.einsum("bkx,bkx->b", of_slope, crossed)
-        squares[:, axis] = np.einsum("bkxi,bkxi->b", slope @ c, slope)
-    return products, squares
+    form = _noise_forms(sample)
+    axes = _axis_products(sample.rotation)
+    bodies, count, _, products = axes.shape
+    up, every = axes[:, :, 2], axes.reshape(bodies, count, -1)
+    up_pairs = (up[..., :, None] * up[..., None, :]).reshape(bodies, count, -1)
+
+    def summed(factor: Floats) -> Floats:
+        """Sum the products of a factor (B, K, x) with those of each axis, (B, x, 3, 6)."""
+        sums = np.swapaxes(factor, 1, 2) @ every
+        return sums.reshape(bodies, -1, 3, products)
+
+    residual = np.einsum("zxau,zxu->za", summed(left.reshape(bodies, count, -1)), form.shift)
+    residual += np.einsum("zxau,zxu->za", summed(up), form.crossed)
+    return residual, np.einsum("zxau,zxu->za", summed(up_pairs), form.square)
+
+
+class _NoiseForms(NamedTuple):
+    """Second-order moments for unit noise along the lab's axis u, by the products of axes.
+
+    Attributes
+    ----------
+    shift : ndarray, shape (B, 3 n, 6)
+        Mean residual of every coordinate in body axes, by u_i u_j.
+    crossed : ndarray, shape (B, 6, 6)
+        Mean product of the residual and of the error of the stretch, by z_i z_j and u_k u_l.
+    square : ndarray, shape (B, 36, 6)
+        Mean square of the error of the stretch, by z_i z_j z_k z_l and u_m u_n.
+    """
+
+    shift: Floats
+    crossed: Floats
+    square: Floats
+
+
+def _noise_forms(sample: Residuals) -> _NoiseForms:
+    """Return the moments that `_noise_products` sums over the frames."""
+    r, unit = sample.template, np.eye(3)
+    bodies, n, d = r.shape
+    cross, moment = skew(unit), skew(r)  # cross[k] is [e_k]x
+    arm = np.linalg.pinv(inertia_tensor(r))[:, None] @ moment
+    # C by u_b u_c.
+    turn = np.einsum("zipb,ziqc->zpqbc", arm, arm)
+    shift = np.einsum("zip,zpxbc->zixbc", r, turn) - np.einsum("zix,zppbc->zixbc", r, turn)
+    shift = 0.5 * shift - np.einsum("zipb,cpx->zixbc", arm, cross)
+    # The derivative of z (z . r) with z -> z - delta x z, by delta_p z_b z_c.
+    slope = np.einsum("bxp,znc->znxpbc", cross, r) + np.einsum("xb,znpc->znxpbc", unit, moment)
+    slope = np.einsum("zmnxy,znypbc->zmxpbc", sample.keeps, slope)
+    # <delta_p e_ix> of what the fit leaves of the noise, by u_b u_c.
+    shared = np.einsum("zlpb,zlicx->zixpbc", arm, sample.keeps)
+    turn, shift, slope, shared = (_of_products(part) for part in (turn, shift, slope, shared))
+    crossed = np.einsum("zixpu,zixpv->zuv", slope, shared)
+    slope = slope.reshape(bodies, n * d, -1)
+    pairs = (np.swapaxes(slope, 1, 2) @ slope).reshape(bodies, 3, 6, 3, 6)
+    square = pairs.transpose(0, 2, 4, 1, 3).reshape(bodies, 36, 9) @ turn.reshape(bodies, 9, 6)
+    return _NoiseForms(shift.reshape(bodies, n * d, -1), crossed, square)
 
 
 def measure_scan(sample: Residuals) -> Slope:

@@ -25,14 +25,14 @@ from perrin._display import Shown
 from perrin.errors import TooFewFramesError
 from perrin.geometry.rotations import log_map, skew
 from perrin.geometry.symmetry import (
+    are_collinear,
     point_group,
-    projected_on_line,
     schoenflies,
     symmetry_elements_of_each,
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Sequence
 
     import pandas as pd
     from scipy.spatial.transform import Rotation
@@ -42,6 +42,9 @@ _RESTING_DIFFUSION = 0.04
 
 # Nodes of the nominal template of a body whose particles are not known.
 _UNEVEN_POINTS = (0.0, 1.0, 2.0, 4.0, 7.0)
+
+# Distances of particles of bodies whose symmetries are searched for at once: bounds the memory.
+_MOST_COMPARED = 1_000_000
 
 _ROTATION_ERROR = 1e-5  # largest departure of R^T R from the identity
 
@@ -131,12 +134,12 @@ class RigidMotion(Shown):
         frozen(rows)
         return rows
 
-    @property
+    @cached_property
     def R(self) -> float:
         """Mean distance of the particles to the centre, um."""
         return float(np.linalg.norm(self.template, axis=1).mean())
 
-    @property
+    @cached_property
     def template_error(self) -> float:
         """Bound of the error of the template's positions, um.
 
@@ -571,28 +574,37 @@ def find_symmetries(motions: Iterable[RigidMotion]) -> None:
     >>> truth.symmetry_elements.shape, truth.point_group
     ((24, 3, 3), 'T_d')
     """
-    alike: dict[int, list[tuple[RigidMotion, float]]] = {}
+    alike: dict[tuple[int, ...], list[RigidMotion]] = {}
     for motion in motions:
-        error = motion.template_error
-        if motion.dimension == 2 or projected_on_line(motion.template, error) is not None:
-            vars(motion)["symmetry_elements"] = None
-            vars(motion)["point_group"] = point_group(motion.template, tolerance=error)
-        else:
-            alike.setdefault(len(motion.template), []).append((motion, error))
+        alike.setdefault(motion.template.shape, []).append(motion)
+    for (n, _), bodies in alike.items():
+        at_once = max(1, _MOST_COMPARED // n**4)
+        for low in range(0, len(bodies), at_once):
+            _find_symmetries_together(bodies[low : low + at_once])
+
+
+def _find_symmetries_together(motions: Sequence[RigidMotion]) -> None:
+    """Find the point groups of bodies with the same number of particles."""
+    templates = np.stack([motion.template for motion in motions])
+    errors = np.array([motion.template_error for motion in motions])
+    solid = ~are_collinear(templates, errors) & (templates.shape[2] == 3)
+    for k in np.flatnonzero(~solid).tolist():
+        vars(motions[k])["symmetry_elements"] = None
+        vars(motions[k])["point_group"] = point_group(templates[k], tolerance=errors[k])
+    rows = np.flatnonzero(solid)
+    if not rows.size:
+        return
+    found = symmetry_elements_of_each(templates[rows], errors[rows])
     symbols: dict[tuple[int, bytes], str] = {}
-    for bodies in alike.values():
-        templates = np.stack([motion.template for motion, _ in bodies])
-        errors = np.array([error for _, error in bodies])
-        found = symmetry_elements_of_each(templates, errors)
-        for (motion, _), elements in zip(bodies, found, strict=True):
-            # Groups with the same angles between all their elements have the same symbol.
-            flat = elements.reshape(len(elements), -1)
-            angles = np.rint(1e4 * (flat @ flat.T)).astype(np.int64)
-            key = len(elements), angles.tobytes()
-            if key not in symbols:
-                symbols[key] = schoenflies(elements)
-            vars(motion)["symmetry_elements"] = elements
-            vars(motion)["point_group"] = symbols[key]
+    for k, elements in zip(rows.tolist(), found, strict=True):
+        # Groups with the same angles between all their elements have the same symbol.
+        flat = elements.reshape(len(elements), -1)
+        angles = np.rint(1e4 * (flat @ flat.T)).astype(np.int64)
+        key = len(elements), angles.tobytes()
+        if key not in symbols:
+            symbols[key] = schoenflies(elements)
+        vars(motions[k])["symmetry_elements"] = elements
+        vars(motions[k])["point_group"] = symbols[key]
 
 
 def _rotation_matrices(

@@ -18,7 +18,7 @@ from perrin._arrays import (
     to_plain,
 )
 from perrin._display import Shown
-from perrin.geometry.shapes import pair_distances
+from perrin.geometry.shapes import lengths, pair_distances
 from perrin.motion.residuals import (
     SIGNIFICANCE,
     Slope,
@@ -80,7 +80,7 @@ _LARGEST_DRIFT = 0.2
 _DRIFT_ERRORS = 5.0
 
 # About this many coordinates are judged at once; more do not stay in the processor's cache.
-_MOST_RESIDUALS = 60_000
+_MOST_RESIDUALS = 90_000
 
 # Smallest relative error of the scale of z that is reported, where it is significant: refractive
 # indices are not known better.
@@ -304,6 +304,7 @@ def judge_each(
     corrections = [Corrections()] * count if corrections is None else corrections
     detections = [None] * count if detections is None else detections
     unsettled = [np.empty(0, np.int64)] * count if unsettled is None else unsettled
+    find_symmetries(motions)
     alike: dict[tuple[object, ...], list[int]] = {}
     for k, (motion, x) in enumerate(zip(motions, positions, strict=True)):
         scanned = motion.turn_noise is not None
@@ -318,13 +319,9 @@ def judge_each(
                 np.stack([positions[k] for k in rows]),
                 sigma=sigma,
                 sigma_ratio=sigma_ratio,
-                corrections=[
-                    Corrections() if corrections is None else corrections[k] for k in rows
-                ],
+                corrections=[corrections[k] for k in rows],
                 detections=[detections[k] for k in rows],
-                unsettled=[
-                    np.empty(0, np.int64) if unsettled is None else unsettled[k] for k in rows
-                ],
+                unsettled=[unsettled[k] for k in rows],
             )
             found.update(zip(rows, judged, strict=True))
     return [found[k] for k in range(count)]
@@ -345,7 +342,8 @@ def _judge_alike(
     stated = None if sigma is None else as_sigma(sigma, d)
     ratio = stated if sigma_ratio is None else as_sigma(sigma_ratio, d)
     stated_sigma = None if stated is None else float(np.sqrt(np.mean(stated**2)))
-    plain = sample_residuals(motions, x)
+    residuals = residuals_of_each(motions, x)
+    plain = sample_residuals(motions, x, residuals=residuals)
     stretch = measure_stretch(motions, x, plain)
     scale = stretch.scale
     stretched = (np.abs(scale.value - 1) > _SCALE_ERROR) & scale.differs_from(1.0)
@@ -355,17 +353,17 @@ def _judge_alike(
     bodies = [
         s if yes else m for s, yes, m in zip(stretch.motions, stretched, motions, strict=True)
     ]
-    corrected = x / unit[:, None, None] if stretched.any() else x
-    residuals = residuals_of_each(bodies, corrected)
-    all_detections, all_residuals = corrected, residuals
-    if any(found is not None for found in detections):
-        filled = [
-            one if found is None else _restored_detections(body, one, found / own)
-            for body, one, found, own in zip(bodies, corrected, detections, unit, strict=True)
-        ]
-        if any(more is not one for more, one in zip(filled, corrected, strict=True)):
-            all_detections = np.stack(filled)
-            all_residuals = residuals_of_each(bodies, all_detections)
+    corrected = x
+    if stretched.any():
+        corrected = x / unit[:, None, None]
+        residuals = residuals_of_each(bodies, corrected)
+    filled = [
+        one if found is None else _restored_detections(body, one, found, own)
+        for body, one, found, own in zip(bodies, corrected, detections, unit, strict=True)
+    ]
+    all_residuals = residuals
+    if any(more is not one for more, one in zip(filled, corrected, strict=True)):
+        all_residuals = residuals_of_each(bodies, np.stack(filled))
     radius = np.array([body.R for body in bodies])
     misfit = misplaced_detections(all_residuals, radius)
     for own, rows in zip(misfit, unsettled, strict=True):
@@ -374,10 +372,10 @@ def _judge_alike(
     drifts = bond_drifts(corrected)
     noise = axis_noise(stretch.sample)
     per_unit = unit / ratio if ratio is not None and (ratio > 0).all() else unit
-    blur = Slope.unknown((len(x),))
+    blur, noise_known = Slope.unknown((len(x),)), noise.known
     if d == 3:
         with np.errstate(divide="ignore", invalid="ignore"):
-            blur = noise.z_ratio(per_unit).where(noise.known, blur)
+            blur = noise.z_ratio(per_unit).where(noise_known, blur)
     # Positions of particles with their own times were moved to one instant.
     delay = Slope.unknown((len(x),))
     if motions[0].turn_noise is None:
@@ -385,9 +383,11 @@ def _judge_alike(
     usual = plain.median_sigma
     if stretched.any():
         usual = np.where(stretched, stretch.sample.median_sigma, usual)
-    flexing = _flexing_tests(bodies, all_residuals)
+    keeps = plain.keeps
+    if stretched.any():
+        keeps = fit_projector(np.stack([body.template for body in bodies]))
+    flexing = _flexing_tests(bodies, all_residuals, keeps)
     imaging = _imaging_texts(scale, stretched, delay, blur, ratio is not None)
-    find_symmetries(motions)
     judged = []
     for k, (motion, body) in enumerate(zip(motions, bodies, strict=True)):
         misfit_rows = np.flatnonzero(misfit[k].any(axis=1))
@@ -405,7 +405,7 @@ def _judge_alike(
                 f"{_MISPLACED_MULTIPLE:g} times as far from its place as {_USUAL_SHARE:.0%} of all "
                 "detections are",
             )
-        error = np.sqrt(noise.variance[k]) * unit[k] if noise.known[k] else None
+        error = np.sqrt(noise.variance[k]) * unit[k] if noise_known[k] else None
         over = finite_or_none(motion.sigma / stated_sigma) if stated_sigma else None
         judged.append(
             Quality(
@@ -503,10 +503,11 @@ def _residual_test(
     ]
 
 
-def _restored_detections(motion: RigidMotion, x: Floats, found: Floats) -> Floats:
+def _restored_detections(motion: RigidMotion, x: Floats, found: Floats, unit: Floats) -> Floats:
     """Assign detections that were left out to the nearest missing particles, (T, n, d).
 
-    A detection farther than R from every missing particle does not belong to the body.
+    A detection farther than R from every missing particle does not belong to the body. `unit` is
+    the scale of each axis that the positions were already divided by.
     """
     if len(found) != len(x):
         raise ValueError(f"detections: expected {len(x)} rows as in positions, got {len(found)}")
@@ -514,6 +515,7 @@ def _restored_detections(motion: RigidMotion, x: Floats, found: Floats) -> Float
     # As many positions as detections: none was left out.
     if (seen.sum(axis=1) == detected.sum(axis=1)).all():
         return x
+    found = found / unit
     filled, expected = x.copy(), motion.positions()
     used = (found[:, :, None] == x[:, None]).all(axis=3).any(axis=2)
     spare = detected & ~used
@@ -552,7 +554,7 @@ def misplaced_detections(residuals: Floats, radius: Floats) -> Bools:
     >>> np.argwhere(misplaced_detections(residuals_of_each([truth], x[None]), np.array([1.5])))
     array([[0, 7, 2]])
     """
-    distance = np.sqrt((residuals * residuals).sum(axis=3))
+    distance = lengths(residuals)
     seen = np.isfinite(distance)
     usual = quantile_present(distance.reshape(len(distance), -1), _USUAL_SHARE)
     # A difference of rounding is no misfit.
@@ -588,7 +590,9 @@ def _shape_tests(misfit: Bools, count: int, drift: BondDrift) -> list[str]:
     return texts
 
 
-def _flexing_tests(motions: Sequence[RigidMotion], residuals: Floats) -> list[list[str]]:
+def _flexing_tests(
+    motions: Sequence[RigidMotion], residuals: Floats, keeps: Floats
+) -> list[list[str]]:
     """Test the particle that moves against the others more than noise of all of them explains.
 
     Noise that differs between particles has no memory, and noise that is smooth in time is as
@@ -598,34 +602,35 @@ def _flexing_tests(motions: Sequence[RigidMotion], residuals: Floats) -> list[li
     from scipy.special import stdtrit
 
     bodies, frames, n, d = residuals.shape
-    keeps = fit_projector(np.stack([m.template for m in motions]))
     # Contribution of each particle's variance to the mean squares of all residuals.
     share = np.einsum("bnmij,bnmij->bnm", keeps, keeps)
     singular = np.linalg.svd(share, compute_uv=False)
-    whole = np.asarray(np.isfinite(residuals).all(axis=(2, 3)))
+    whole = np.asarray(present(residuals).all(axis=2))
     following = whole[:, 1:] & whole[:, :-1]
     pairs = following.sum(axis=1)
     tested = np.flatnonzero((pairs >= 10) & ~(singular[:, 0] > 1e6 * singular[:, -1]))
     texts: list[list[str]] = [[] for _ in range(bodies)]
     if not tested.size:
         return texts
-    # Complete frames first, each with the number of the frame after it.
-    order = np.argsort(~whole[tested], axis=1, kind="stable")
+    rows, linked = residuals[tested], following[tested]
     count, pairs = whole[tested].sum(axis=1), pairs[tested]
     complete = np.arange(frames) < count[:, None]
-    linked = np.take_along_axis(np.pad(following[tested], ((0, 0), (0, 1))), order, axis=1)[:, :-1]
+    if not complete.all():
+        # Complete frames first, each with the number of the frame after it.
+        order = np.argsort(~whole[tested], axis=1, kind="stable")
+        linked = np.take_along_axis(np.pad(linked, ((0, 0), (0, 1))), order, axis=1)[:, :-1]
+        rows = np.take_along_axis(rows, order[..., None, None], axis=1)
+        rows = np.where(complete[..., None, None], rows, np.nan)
     matrix = keeps[tested].transpose(0, 2, 4, 1, 3).reshape(len(tested), n * d, n * d)
-    rows = np.take_along_axis(residuals[tested], order[..., None, None], axis=1)
-    rows = np.where(complete[..., None, None], rows, np.nan)
     vector = (rows.reshape(len(tested), frames, n * d) @ matrix).reshape(rows.shape)
     vector = vector - median_present(np.moveaxis(vector, 1, -1))[:, None]
     # The longest vectors of every particle are shortened to the length of the next (winsorised).
-    length = np.sqrt((vector * vector).sum(axis=3))
+    length = lengths(vector)
     limit = quantile_present(np.moveaxis(length, 1, -1), 1 - _TRIMMED_SHARE)
     vector = vector * np.minimum(1.0, limit[:, None] / np.maximum(length, 1e-300))[..., None]
     vector = np.where(complete[..., None, None], vector, 0.0)
     inverse = np.linalg.inv(share[tested])
-    product = (vector[:, :-1] * vector[:, 1:]).sum(axis=3) @ inverse
+    product = np.einsum("bkni,bkni->bkn", vector[:, :-1], vector[:, 1:]) @ inverse
     product = np.where(linked[..., None], product, 0.0)
     mean = product.sum(axis=1) / pairs[:, None]
     ranks = np.argsort(mean, axis=1)
@@ -697,7 +702,7 @@ def bond_drifts(x: Floats) -> list[BondDrift]:
     [BondDrift(change=0.5, pair=(0, 1), distances=(1.0, 1.5))]
     """
     bodies, frames, n, _ = x.shape
-    distances = np.moveaxis(pair_distances(x), 1, -1)  # (B, pairs, T)
+    distances = np.ascontiguousarray(np.moveaxis(pair_distances(x), 1, -1))  # (B, pairs, T)
     blocks = np.array_split(np.arange(frames), min(_TIME_BLOCKS, max(1, frames // 5)))
     width = max(len(rows) for rows in blocks)
     # The values of every block without the missing ones, those to the right.

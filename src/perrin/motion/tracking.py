@@ -427,8 +427,8 @@ def _motions_of(
 ) -> list[RigidMotion | DegenerateClusterError | TooFewFramesError]:
     """Return the motions of the fitted poses of several bodies, or why there is none."""
     d = x.shape[3]
-    square = np.asarray(fit.sigma2)
-    own = square[:, None] if sigma is None else sigma**2
+    sigma2 = np.asarray(fit.sigma2)
+    own = sigma2[:, None] if sigma is None else sigma**2
     noise = np.broadcast_to(own, (len(x), d))
     covariance, variance = pose_errors(fit, seen, noise) if errors is None else errors
     # The largest variance of an orientation about any axis is at most their sum.
@@ -436,10 +436,10 @@ def _motions_of(
     worst = np.sqrt(np.linalg.eigvalsh(covariance[lost])[:, -1])
     lost[lost] = worst > _LOST_AXIS
     fitted = np.isfinite(fit.rotation[..., 0, 0]) & ~lost
-    residual = np.where(seen[..., None], fit.residual, np.nan) ** 2
+    square = np.einsum("btni,btni->btn", fit.residual, fit.residual)
     nan = np.where(fitted, 0.0, np.nan)
     center, rotation = fit.center + nan[..., None], fit.rotation + nan[..., None, None]
-    distance = np.sqrt(mean_present(residual.sum(axis=3), axis=2)) + nan
+    distance = np.sqrt(mean_present(np.where(seen, square, np.nan), axis=2)) + nan
     count = seen.sum(axis=2)
     covariance, variance = covariance + nan[..., None, None], variance + nan
     # Why frames have no pose; the texts are those of all numbers of particles.
@@ -475,7 +475,7 @@ def _motions_of(
                 piece=np.zeros(x.shape[1], dtype=np.int64),
                 reason=tuple(why[k].tolist()),
                 template=fit.template[k],
-                sigma=float(np.sqrt(square[k])),
+                sigma=float(np.sqrt(sigma2[k])),
                 noise=np.sqrt(noise[k]),
                 dt=float(dt),
             )

@@ -172,16 +172,20 @@ def _as_array(frame: Ints, code: Ints, x: Floats) -> tuple[Floats, Ints]:
     if not len(frame):
         raise TrackTableError("no row has coordinates", ("no coordinates",))
     first, last = int(frame.min()), int(frame.max())
-    span, distinct = last - first + 1, len(np.unique(frame))
-    if span > max(_LONGEST_SPAN, _SPARSEST_FRAMES * distinct):
+    span = last - first + 1
+    if span > _LONGEST_SPAN and span > _SPARSEST_FRAMES * (distinct := len(np.unique(frame))):
         fault = (
             f"frames run from {first} to {last}, a span of {span}, but only {distinct} of them "
             "occur: these numbers look like times or ids; number the frames 0, 1, 2, ..."
         )
         raise TrackTableError(fault, (fault,))
-    ids = np.unique(code)
-    positions = np.full((span, len(ids), x.shape[1]), np.nan)
-    positions[frame - first, np.searchsorted(ids, code)] = x
+    # The columns are the particles that occur, in the order of their numbers.
+    number = code - code.min()
+    occurs = np.zeros(int(number.max()) + 1, dtype=np.bool_)
+    occurs[number] = True
+    column = np.cumsum(occurs) - 1
+    positions = np.full((span, int(column[-1]) + 1, x.shape[1]), np.nan)
+    positions[frame - first, column[number]] = x
     return positions, np.arange(first, last + 1, dtype=np.int64)
 
 

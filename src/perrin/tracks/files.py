@@ -546,11 +546,13 @@ def _checked_ids(column: pd.Series, name: str, rows: RowNumbers) -> tuple[NDArra
     """
     import pandas as pd
 
-    raw, missing = column.astype(object), column.isna().to_numpy()
+    missing = column.isna().to_numpy()
     labels, text = _as_numbers(column)
-    all_text = pd.api.types.infer_dtype(raw, skipna=True) == "string"
+    all_text = column.dtype.kind not in "iufb" and (
+        pd.api.types.infer_dtype(column.astype(object), skipna=True) == "string"
+    )
     if text.any() or all_text:
-        labels = raw.where(column.notna(), np.nan).to_numpy()
+        labels = column.astype(object).where(column.notna(), np.nan).to_numpy()
         if rows.word == "line":
             plain = np.array([unguarded_cell(label) for label in labels], dtype=object)
             # Two labels of a file stay two.

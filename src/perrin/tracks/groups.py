@@ -228,7 +228,10 @@ def group_quantiles(group: Ints, values: Floats, count: int, *, q: float = 0.5) 
     array([1.5, nan, 5. ])
     """
     size = np.bincount(group, minlength=count)
-    ordered = np.append(values[np.lexsort((values, group))], np.nan)
+    order = np.argsort(values)
+    # Numbers of two bytes are sorted by counting.
+    order = order[np.argsort(group[order].astype(np.min_scalar_type(count)), kind="stable")]
+    ordered = np.append(values[order], np.nan)
     place = q * np.maximum(size - 1, 0)
     low = np.cumsum(size) - size + place.astype(np.int64)
     share = place % 1.0

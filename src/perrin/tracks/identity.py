@@ -43,7 +43,7 @@ from perrin._text import counted, frames_text
 from perrin.errors import IdentityWarning
 from perrin.geometry.rigid import degrees_of_freedom
 from perrin.geometry.rotations import fit_rotations
-from perrin.geometry.shapes import pair_distances
+from perrin.geometry.shapes import centred, pair_distances
 from perrin.motion.residuals import median_chi2
 from perrin.motion.rods import LABEL_LOG_ODDS, LEAP_LABELLED, LEAP_UNLABELLED, SETTLED_LOG_ODDS
 
@@ -534,16 +534,15 @@ def rigid_fits(points: Floats, template: Floats) -> tuple[Floats, Floats]:
     rotation, unique = fit_rotations(points, template)
     here = present(points) & present(template)
     if here.all():
-        y = points - points.mean(axis=-2, keepdims=True)
-        t = template - template.mean(axis=-2, keepdims=True)
+        y, t = centred(points), centred(template)
         e = y - t @ np.swapaxes(rotation, -1, -2)
-        return rotation, np.where(unique, (e * e).sum(axis=(-2, -1)), np.inf)
-    weight = here[..., None] / np.maximum(here.sum(axis=-1), 1)[..., None, None]
-    y, t = np.where(here[..., None], points, 0.0), np.where(here[..., None], template, 0.0)
-    y = y - (y * weight).sum(axis=-2, keepdims=True)
-    t = t - (t * weight).sum(axis=-2, keepdims=True)
-    e = np.where(here[..., None], y - t @ np.swapaxes(rotation, -1, -2), 0.0)
-    return rotation, np.where(unique, (e * e).sum(axis=(-2, -1)), np.inf)
+    else:
+        weight = here[..., None] / np.maximum(here.sum(axis=-1), 1)[..., None, None]
+        y, t = np.where(here[..., None], points, 0.0), np.where(here[..., None], template, 0.0)
+        y = y - (y * weight).sum(axis=-2, keepdims=True)
+        t = t - (t * weight).sum(axis=-2, keepdims=True)
+        e = np.where(here[..., None], y - t @ np.swapaxes(rotation, -1, -2), 0.0)
+    return rotation, np.where(unique, np.einsum("...ni,...ni->...", e, e), np.inf)
 
 
 @lru_cache(maxsize=64)
@@ -840,10 +839,12 @@ def certain_labels(x: Floats) -> Bools:
     shape, usable, sampled = _labelled_shapes(x, shown == n)
     rotation, misfit = rigid_fits(x, shape[:, None])
     freedom = float(degrees_of_freedom(np.array(n), d))
-    chosen = np.take_along_axis(misfit, sampled, axis=1)
-    sigma2 = np.array(
-        [np.median(m[k >= 0]) for m, k in zip(chosen, sampled, strict=True)]
-    ) / median_chi2(freedom)
+    chosen = np.where(sampled >= 0, np.take_along_axis(misfit, sampled, axis=1), np.nan)
+    count = (sampled >= 0).sum(axis=1)[:, None]
+    middle = np.concatenate([(count - 1) // 2, count // 2], axis=1)
+    # The median; NaN, which is sorted last, where no row was sampled.
+    sigma2 = np.take_along_axis(np.sort(chosen, axis=1), middle, axis=1).mean(axis=1)
+    sigma2 = sigma2 / median_chi2(freedom)
     # Where there is no noise, the rounding error is taken as noise.
     sigma2 = np.maximum(sigma2, (1e-7 * np.abs(shape).max(axis=(1, 2))) ** 2)
     posed = shown >= d
@@ -852,10 +853,12 @@ def certain_labels(x: Floats) -> Bools:
     least = np.full(shown.shape, np.pi)
     # Of large bodies the symmetries are compared, which all particles determine.
     compared = seen if n <= _MOST_PERMUTED else np.ones_like(seen)
-    code = np.packbits(compared, axis=2).reshape(-1, -(-n // 8))
-    patterns, first, which = np.unique(code, axis=0, return_index=True, return_inverse=True)
-    which = which.reshape(shown.shape)
-    for i in range(len(patterns)):
+    first, which = np.zeros(1, dtype=np.int64), np.zeros(shown.shape, dtype=np.int64)
+    if not compared.all():
+        code = np.packbits(compared, axis=2).reshape(-1, -(-n // 8))
+        _, first, found = np.unique(code, axis=0, return_index=True, return_inverse=True)
+        which = found.reshape(shown.shape)
+    for i in range(len(first)):
         particles = np.flatnonzero(compared.reshape(-1, n)[first[i]])
         rows = (which == i) & usable[:, None]
         some = np.flatnonzero(rows.any(axis=1))
@@ -863,11 +866,12 @@ def certain_labels(x: Floats) -> Bools:
             angle = np.full(len(x), np.pi)
             angle[some] = _least_angles(shape[some], sigma2[some], particles)
             least = np.where(rows, angle[:, None], least)
-    # Rows with a pose first, so that a step over a gap is one step.
-    order = np.argsort(~posed, axis=1, kind="stable")
-    turned = np.take_along_axis(rotation, order[..., None, None], axis=1)
-    least = np.take_along_axis(least, order, axis=1)
-    angle = np.sqrt(squared_angle(turned[:, :-1], turned[:, 1:]))
+    if not posed.all():
+        # Rows with a pose first, so that a step over a gap is one step.
+        order = np.argsort(~posed, axis=1, kind="stable")
+        rotation = np.take_along_axis(rotation, order[..., None, None], axis=1)
+        least = np.take_along_axis(least, order, axis=1)
+    angle = np.sqrt(squared_angle(rotation[:, :-1], rotation[:, 1:]))
     step = np.arange(1, x.shape[1]) < posed.sum(axis=1)[:, None]
     short = angle < _SHORT_STEP * np.minimum(least[:, :-1], least[:, 1:])
     certain[bodies] = usable & (short | ~step).all(axis=1)
@@ -894,15 +898,18 @@ def _labelled_shapes(x: Floats, whole: Bools) -> tuple[Floats, Bools, Ints]:
     """
     width = min(x.shape[1], _MOST_MODEL_ROWS)
     sampled = np.full((len(x), width), -1, dtype=np.int64)
-    for own, complete in zip(sampled, whole, strict=True):
-        rows = _evenly(np.flatnonzero(complete))
-        own[: rows.size] = rows
+    if whole.all():
+        sampled[:] = _evenly(np.arange(x.shape[1]))
+    else:
+        for own, complete in zip(sampled, whole, strict=True):
+            rows = _evenly(np.flatnonzero(complete))
+            own[: rows.size] = rows
     used = sampled >= 0
     points = x
     if x.shape[1] > width or not whole.all():
         points = np.take_along_axis(x, sampled[..., None, None], axis=1)
         points = np.where(used[..., None, None], points, np.nan)
-    template = points[:, 0] - points[:, 0].mean(axis=1, keepdims=True)
+    template = centred(points[:, 0])
     rotation, misfit = rigid_fits(points, template[:, None])
     # Of two labellings that share the time, neither is right for all: the lower tenth of the
     # misfits belongs to one.
@@ -913,10 +920,14 @@ def _labelled_shapes(x: Floats, whole: Bools) -> tuple[Floats, Bools, Ints]:
     worst = np.where(used, misfit, 0.0).max(axis=1)
     usable = np.asarray(worst <= 2 * _NOISE_LIKE * usual)
     fits = np.isfinite(misfit) & used
-    centred = points - points.mean(axis=2, keepdims=True)
-    turned = np.where(fits[..., None, None], centred @ rotation, 0.0)
+    arms, turn = centred(points), rotation
+    if not fits.all():
+        arms, turn = (np.where(fits[..., None, None], part, 0.0) for part in (arms, turn))
+    # The sum of R^T (x - centroid) over the rows is one product of matrices.
+    bodies, _, n, d = points.shape
+    total = np.swapaxes(arms, 1, 2).reshape(bodies, n, -1) @ turn.reshape(bodies, -1, d)
     count = fits.sum(axis=1)[:, None, None]
-    shape = np.where(count > 0, turned.sum(axis=1) / np.maximum(count, 1), template)
+    shape = np.where(count > 0, total / np.maximum(count, 1), template)
     return shape, usable, sampled
 
 

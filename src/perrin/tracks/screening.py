@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import reduce
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from perrin._arrays import Bools, Floats, Ints, present
 from perrin._text import counted
-from perrin.geometry.shapes import pair_distances
+from perrin.geometry.shapes import centroids, lengths
 from perrin.motion.degenerate import mean_present
 from perrin.motion.residuals import median_present
 from perrin.tracks.groups import coordinates, group_quantiles
@@ -129,18 +130,24 @@ def screen_rows(table: pd.DataFrame) -> Screened:
     >>> int(screened.table["x"].isna().sum())
     1
     """
+    import pandas as pd
+
     x = coordinates(table)
     frame = table["frame"].to_numpy(dtype=np.int64)
     code = table["particle"].factorize(use_na_sentinel=False)[0].astype(np.int64)
     if "cluster" in table:
         cluster, clusters = table["cluster"].factorize(use_na_sentinel=False)
-        code = np.unique(code * len(clusters) + cluster, return_inverse=True)[1]
+        code = pd.factorize(code * len(clusters) + cluster)[0].astype(np.int64)
     empty = ~present(x)
     rows = np.lexsort((frame, code))
-    rows = rows[~empty[rows]]
-    at_placeholder = placeholder_rows(code[rows], x[rows])
-    filled, rest = rows[at_placeholder], rows[~at_placeholder]
-    repeated = rest[repeated_rows(code[rest], x[rest])]
+    rows = rows[~empty[rows]] if empty.any() else rows
+    own, points = code[rows], x[rows]
+    at_placeholder = placeholder_rows(own, points)
+    filled, rest = rows[at_placeholder], rows
+    if filled.size:
+        left = ~at_placeholder
+        rest, own, points = rows[left], own[left], points[left]
+    repeated = rest[repeated_rows(own, points)]
     notes = _rows_sentence(
         np.flatnonzero(empty), frame, code, "without coordinates (NaN)", "they count as missing"
     )
@@ -230,10 +237,12 @@ def far_points_of_each(positions: Sequence[Floats]) -> list[Bools]:
         x = np.stack([positions[k] for k in rows])
         if x.shape[2] < 2:
             continue
-        distance = pair_distances(x)
-        # A far point is farther from all others than many times any median distance.
-        limit = _FAR_SIZES * median_present(distance[..., 0])
-        largest = np.nan_to_num(distance).max(axis=(1, 2), initial=0.0)
+        # A far point is farther from all others than many times any median distance. No distance
+        # exceeds the diagonal of the box around the particles of a frame.
+        limit = _FAR_SIZES * median_present(lengths(x[:, :, 1] - x[:, :, 0]))
+        particles = np.moveaxis(x, 2, 0)
+        box = reduce(np.fmax, particles) - reduce(np.fmin, particles)
+        largest = np.nan_to_num(lengths(box)).max(axis=1, initial=0.0)
         for i in np.flatnonzero(~(largest <= limit)).tolist():
             found[rows[i]] = far_points(positions[rows[i]])
     return found
@@ -341,8 +350,8 @@ def centres_removed(positions: Sequence[Floats]) -> list[bool]:
 
     Notes
     -----
-    The resolution of a coordinate is at most the smallest of its steps, so that a mean that moves
-    by more is not constant; only the other clusters are tested in detail.
+    The resolution of a coordinate is at most the smallest step of the first particle, so that a
+    mean that moves by more is not constant; only the other clusters are tested in detail.
 
     Examples
     --------
@@ -355,20 +364,22 @@ def centres_removed(positions: Sequence[Floats]) -> list[bool]:
         x = np.stack([positions[k] for k in rows])
         seen = present(x)
         several = seen.sum(axis=2) >= 2
-        largest = np.nan_to_num(np.abs(x)).max(axis=(1, 2), initial=0.0)
-        rounding = 8 * float(np.finfo(np.float64).eps) * largest
+        axes = np.ascontiguousarray(np.moveaxis(x, 3, 1))  # (B, d, T, n)
+        every = axes.reshape(*axes.shape[:2], -1)
+        low, high = np.fmin.reduce(every, axis=2), np.fmax.reduce(every, axis=2)
+        rounding = 8 * float(np.finfo(np.float64).eps) * np.maximum(np.abs(low), np.abs(high))
+        mean = centroids(x) if seen.all() else mean_present(x, axis=2)
+        mean = np.ascontiguousarray(np.moveaxis(mean, 2, 1))
         clear = np.ones(len(rows), dtype=np.bool_)
         for whole in (seen.all(axis=2) & several, several):
-            some = np.where((whole[..., None] & seen)[..., None], x, np.nan)
-            step = np.nan_to_num(np.abs(np.diff(some, axis=1)))
-            step = np.where(step > rounding[:, None, None], step, np.inf)
-            finest = np.maximum(step.min(axis=(1, 2), initial=np.inf), rounding)
-            centre = mean_present(some, axis=2)
-            moved = np.where(whole[..., None], centre, -np.inf).max(axis=1)
-            moved = moved - np.where(whole[..., None], centre, np.inf).min(axis=1)
-            spread = mean_present((some - mean_present(some, axis=1)[:, None]) ** 2, axis=1)
-            spread = np.sqrt(median_present(np.swapaxes(spread, 1, 2)))
-            moves = (moved > np.maximum(finest, _STILL_SHARE * spread)).any(axis=1)
+            first = np.where(whole[:, None], axes[..., 0], np.nan)
+            step = np.abs(np.diff(first, axis=2))
+            step = np.where(step > rounding[..., None], step, np.inf)
+            finest = step.min(axis=2, initial=np.inf)
+            centre = np.where(whole[:, None], mean, np.nan)
+            moved = np.fmax.reduce(centre, axis=2) - np.fmin.reduce(centre, axis=2)
+            # No standard deviation exceeds the range.
+            moves = (moved > np.maximum(finest, _STILL_SHARE * (high - low))).any(axis=1)
             clear &= moves | (whole.sum(axis=1) <= 2)
             if seen.all():
                 break
@@ -412,15 +423,18 @@ def distance_notes(
 
     x = coordinates(table)
     frame = table["frame"].to_numpy(dtype=np.int64)
-    frames = np.unique(frame)
+    frames = np.sort(table["frame"].unique()).astype(np.int64)
     spaced = np.linspace(0, len(frames) - 1, _DISTANCE_FRAMES).astype(int)
     some = frames[spaced] if len(frames) else frames
     rows = np.flatnonzero(present(x) & np.isin(frame, some))
     code = table["particle"].iloc[rows].factorize()[0].astype(np.int64)
     # Frames are so far apart along an axis of their own that the nearest particle is in the same.
-    apart_by = 2 * float(np.ptp(x[rows], axis=0).sum()) + 1.0 if rows.size else 1.0
-    placed = np.column_stack([x[rows], apart_by * np.searchsorted(some, frame[rows])])
-    nearest = cKDTree(placed).query(placed, 2)[0][:, 1] if rows.size else np.empty(0)
+    axes = np.ascontiguousarray(x[rows].T)
+    apart_by, nearest = 1.0, np.empty(0)
+    if rows.size:
+        apart_by += 2 * float(np.ptp(axes, axis=1).sum())
+        placed = np.column_stack([*axes, apart_by * np.searchsorted(some, frame[rows])])
+        nearest = cKDTree(placed, balanced_tree=False).query(placed, 2)[0][:, 1]
     known = nearest < 0.75 * apart_by
     if not known.any():
         return (), ()
@@ -495,8 +509,42 @@ def placeholder_rows(code: Ints, x: Floats) -> Bools:
     >>> np.flatnonzero(placeholder_rows(np.zeros(40, dtype=int), x)).tolist()
     [20]
     """
-    if not len(code):
-        return np.zeros(0, dtype=np.bool_)
+    marked = np.zeros(len(code), dtype=np.bool_)
+    particles = int(code.max(initial=-1)) + 1
+    # Only points that occur twice, and the origin, may be placeholders.
+    suspected = np.zeros(particles, dtype=np.bool_)
+    suspected[code[_rows_of_repeated_values(x)]] = True
+    suspected[code[_are_equal(x, np.zeros_like(x[:1]))]] = True
+    rows = np.flatnonzero(suspected[code])
+    if rows.size:
+        marked[rows] = _at_placeholders(code[rows], x[rows], particles)
+    return marked
+
+
+def _rows_of_repeated_values(x: Floats) -> Ints:
+    """Return rows that include all rows of points that occur more than once."""
+    rows = np.arange(len(x))
+    for axis in range(x.shape[1]):
+        values = x[rows, axis]
+        ordered = np.sort(values)
+        repeated = ordered[1:][ordered[1:] == ordered[:-1]]
+        if not repeated.size:
+            return rows[:0]
+        place = np.minimum(np.searchsorted(repeated, values), repeated.size - 1)
+        rows = rows[repeated[place] == values]
+    return rows
+
+
+def _are_equal(x: Floats, y: Floats) -> Bools:
+    """Return which points (N, d) are equal to others (N or 1, d)."""
+    equal: Bools = x[:, 0] == y[:, 0]
+    for axis in range(1, x.shape[1]):
+        equal &= x[:, axis] == y[:, axis]
+    return equal
+
+
+def _at_placeholders(code: Ints, x: Floats, particles: int) -> Bools:
+    """Mark the rows at placeholders among all rows of some of the particles of a table."""
     # A number for each distinct point.
     order = np.lexsort(x.T)
     place = np.empty(len(x), dtype=np.int64)
@@ -507,7 +555,6 @@ def placeholder_rows(code: Ints, x: Floats) -> Bools:
     particle, stay_place = code[first], place[first]
     step = np.linalg.norm(np.diff(x[first], axis=0), axis=1)
     same = np.diff(particle) == 0
-    particles = int(code.max()) + 1
     usual = group_quantiles(particle[1:][same], step[same], particles)
     usual[np.bincount(particle[1:][same], minlength=particles) < _FEWEST_MOVES] = np.inf
     step[~same] = np.inf
@@ -519,23 +566,25 @@ def placeholder_rows(code: Ints, x: Floats) -> Bools:
     known = np.bincount(stay_place, weights=np.isfinite(leap), minlength=count)
     leaps = np.bincount(stay_place, weights=leap > _PLACEHOLDER_STEP, minlength=count)
     origin = np.zeros(count, dtype=np.bool_)
-    origin[place] = (x == 0).all(axis=1)
+    origin[place] = ~x.any(axis=1)
     brisk = 2 * np.bincount(stay_place, weights=leap >= 1, minlength=count) > known
     reached = ((rows >= _PLACEHOLDER_ROWS) | origin) & (2 * leaps > known)
-    often = _revisited_places(code, x, particle, stay_place, origin)
+    often = _revisited_places(code, x, particle, stay_place, origin, particles)
     reached[often] |= brisk[often]
     marked: Bools = reached[place]
     return marked
 
 
-def _revisited_places(code: Ints, x: Floats, particle: Ints, place: Ints, origin: Bools) -> Ints:
+def _revisited_places(
+    code: Ints, x: Floats, particle: Ints, place: Ints, origin: Bools, particles: int
+) -> Ints:
     """Return the places to which a particle returned more often than rounding explains.
 
-    `particle` and `place` are those of each stay, `origin` marks the place at the origin.
+    `particle` and `place` are those of each stay, `origin` marks the place at the origin, and
+    `particles` is their number in the table.
     """
     from scipy.special import pdtrc
 
-    particles = int(code.max()) + 1
     both, times = np.unique(place * particles + particle, return_counts=True)
     place, particle = np.divmod(both[times > 1], particles)
     times = times[times > 1]
@@ -578,7 +627,7 @@ def repeated_rows(code: Ints, x: Floats) -> Bools:
     repeated = np.zeros(len(code), dtype=np.bool_)
     if len(code) < 2:
         return repeated
-    held = (np.diff(code) == 0) & (np.diff(x, axis=0) == 0).all(axis=1)
+    held = (np.diff(code) == 0) & _are_equal(x[1:], x[:-1])
     particles = int(code.max()) + 1
     window = np.ones(2 * _ROWS_AROUND + 1)
     for particle in np.unique(code[1:][held]):
