@@ -656,7 +656,8 @@ def axis_model(motion: RigidMotion, quantity: Quantity, noise: Noise) -> tuple[A
     # Eigenvectors have any sign; one that the steps determine gives p, which are simulated from a
     # seed made of the steps, that do not change with the axes of the laboratory.
     sign = np.where(np.sum(squares * steps.vectors, axis=0) < 0, -1.0, 1.0)[moves]
-    before, after = (np.broadcast_to(n[moves], (moves.sum(), count)) for n in noise_of_ends)
+    shape = int(moves.sum()), count
+    before, after = (np.broadcast_to(n[moves], shape) for n in noise_of_ends)
     model = AxisModel(
         start=motion.time[steps.start],
         tau=steps.duration,
@@ -667,8 +668,9 @@ def axis_model(motion: RigidMotion, quantity: Quantity, noise: Noise) -> tuple[A
         steady=np.ascontiguousarray(steps.steady[:, moves] * sign[:, None]),
     )
     y = np.ascontiguousarray(steps.vectors.T[moves] * sign[:, None])[None]
-    ends = (n if n.shape[1] == 1 else n[moves] for n in noise_of_ends)
-    spread = 0.5 * sum(n.std(axis=1) for n in ends)
+    if all(n.shape[1] == 1 for n in noise_of_ends) and np.array_equal(before, after):
+        return model, y
+    spread = 0.5 * (before.std(axis=1) + after.std(axis=1))
     if np.all(spread <= _EQUAL_NOISE * square[moves]):
         model = model.with_equal_noise()
     return model, y

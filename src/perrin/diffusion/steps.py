@@ -294,15 +294,17 @@ def steps_of(motion: RigidMotion, quantity: Quantity) -> Steps:
     complete = fitted & (motion.n_present == motion.n_present[fitted].max())
     duration = motion.time[stop] - motion.time[start]
     if quantity == "rotation":
-        covariance = unit_covariance(motion)
-        values, axes = np.linalg.eigh(np.mean(covariance[complete], axis=0))
+        # Where all frames are equally noisy they are one row.
+        covariance = distinct(stored_once(unit_covariance(motion)))
+        whole = complete if len(covariance) > 1 else np.ones(1, dtype=np.bool_)
+        values, axes = np.linalg.eigh(np.mean(covariance[whole], axis=0))
         turned = (covariance.reshape(-1, len(axes)) @ axes).reshape(covariance.shape)
         noise = np.einsum("ji,tji->ti", axes, turned)
         apart = np.diff(values) > _EQUALLY_NOISY_AXES * values[1:]
         for group in np.split(np.arange(len(values)), 1 + np.flatnonzero(apart)):
             alike = noise[:, group].mean(axis=1)
             for axis in group:
-                noise[complete, axis] = alike[complete]
+                noise[whole, axis] = alike[whole]
         vectors = motion.step_vectors()[stop - 1] @ axes
         # A spin of the lab moves the body by R^T of it; in the plane both are one number.
         turned = np.ones((len(start), 1, 1))
@@ -312,18 +314,22 @@ def steps_of(motion: RigidMotion, quantity: Quantity) -> Steps:
     else:
         vectors = motion.center[stop] - motion.center[start]
         d = vectors.shape[1]
-        noise = np.repeat(unit_center_variance(motion)[:, None], d, axis=1)
-        steady = stored_once(np.eye(d) * duration[:, None, None])
+        variance = distinct(stored_once(unit_center_variance(motion)))
+        whole = complete if len(variance) > 1 else np.ones(1, dtype=np.bool_)
+        noise = np.repeat(variance[:, None], d, axis=1)
+        lasting = distinct(stored_once(duration))[:, None, None]
+        steady = np.broadcast_to(np.eye(d) * lasting, (len(start), d, d))
+    d = vectors.shape[1]
     known[quantity] = Steps(
         vectors=vectors,
         duration=duration,
         start=start,
         stop=stop,
-        noise=stored_once(noise[..., None] * np.eye(noise.shape[1]))[None],
+        noise=np.broadcast_to(noise[..., None] * np.eye(d), (1, len(motion.time), d, d)),
         dt=motion.dt,
         sigma=motion.sigma,
         freedom=residual_freedom(motion),
-        complete=float(np.mean(noise[complete])),
+        complete=float(np.mean(noise[whole])),
         steady=steady,
     )
     return known[quantity]
@@ -466,9 +472,7 @@ def principal_steps(
     axes = np.linalg.eigh((tensor + tensor.T) / 2)[1]
     turned = np.broadcast_to(axes.T @ from_lab, (len(motion.time), 3, 3))[steps.start]
     from_body = axes.T @ from_body
-    covariance = stored_once(unit_covariance(motion))
-    if covariance.strides[0] == 0 and len(from_body) == 1:
-        covariance = covariance[:1]
+    covariance = distinct(stored_once(unit_covariance(motion)))
     noise = np.sum((from_body @ covariance) * from_body, axis=2)
     noise = np.broadcast_to(noise[..., None] * np.eye(3), (len(motion.time), 3, 3))
     return replace(
@@ -529,14 +533,17 @@ def body_steps(motion: RigidMotion, quantity: Quantity | Literal["both"], turn: 
     start, stop = motion.steps()
     w = motion.step_vectors()[stop - 1]
     displacement = motion.center[stop] - motion.center[start]
-    center_noise = unit_center_variance(motion)[:, None, None] * np.eye(3)
+    variance = distinct(stored_once(unit_center_variance(motion)))
+    center_noise = variance[:, None, None] * np.eye(3)
+    covariance = distinct(stored_once(unit_covariance(motion)))
+    every = (1, len(motion.time), 3, 3)
     if quantity == "rotation":
         vectors = w @ turn.T
-        noise = stored_once(turn @ unit_covariance(motion) @ turn.T)[None]
+        noise = np.broadcast_to(turn @ covariance @ turn.T, every)
     elif quantity == "translation":
         middle = motion.rotation[start] @ exp_map(0.5 * w)
         vectors = np.einsum("sji,sj->si", middle, displacement) @ turn.T
-        noise = stored_once(center_noise)[None]
+        noise = np.broadcast_to(center_noise, every)
     else:
         jump = np.einsum("sji,sj->si", motion.rotation[start], displacement)
         half = 0.5 * np.linalg.norm(w, axis=1)
@@ -550,7 +557,7 @@ def body_steps(motion: RigidMotion, quantity: Quantity | Literal["both"], turn: 
         vectors = np.concatenate([u, w], axis=1)
         noise = np.zeros((2, len(motion.time), 6, 6))
         noise[0, :, :3, :3] = center_noise
-        noise[1, :, 3:, 3:] = unit_covariance(motion)
+        noise[1, :, 3:, 3:] = covariance
     return Steps(
         vectors=vectors,
         duration=motion.time[stop] - motion.time[start],
