@@ -657,12 +657,14 @@ typedef struct {
     double spread[2], blur[2], noise[MOST_AXES];
 } Step;
 
-/* Densities of a step relative to the largest, by states before and after; returns its logarithm. */
+/* Densities of a step relative to the largest, by states before and after. The largest is the first
+ * number that is returned times exp of minus the second. */
 INLINE double densities(const States *states, const Step *step, const Belief *belief,
                         double square[2][MOST_AXES], double total[2][2][MOST_AXES],
-                        double density[2][2])
+                        double density[2][2], double *least)
 {
-    double top = -DBL_MAX;
+    double half_square[2][2], top = 0.0;
+    *least = DBL_MAX;
     for (int from = 0; from < 2; from++) {
         Py_ssize_t axis = 0;
         for (Py_ssize_t g = 0; g < states->groups; g++) {
@@ -673,19 +675,25 @@ INLINE double densities(const States *states, const Step *step, const Belief *be
             }
         }
         for (int to = 0; to < 2; to++) {
-            double deviance = 0.0;
+            double sum_of_squares = 0.0, determinant = 1.0;
             for (Py_ssize_t g = 0; g < states->groups; g++) {
                 double sum = belief->variance[from][g] + (step->spread[to] + step->noise[g]);
                 total[from][to][g] = sum > 1e-100 ? sum : 1e-100;
-                deviance += states->sizes[g] * log(total[from][to][g]) +
-                            square[from][g] / total[from][to][g];
+                sum_of_squares += square[from][g] / total[from][to][g];
+                for (int i = 0; i < (int)states->sizes[g]; i++)
+                    determinant *= total[from][to][g];
             }
-            density[from][to] = -0.5 * deviance;
-            top = density[from][to] > top ? density[from][to] : top;
+            half_square[from][to] = 0.5 * sum_of_squares;
+            *least = half_square[from][to] < *least ? half_square[from][to] : *least;
+            density[from][to] = 1 / sqrt(determinant);
         }
     }
+    for (int i = 0; i < 4; i++) {
+        density[i / 2][i % 2] *= exp(*least - half_square[i / 2][i % 2]);
+        top = density[i / 2][i % 2] > top ? density[i / 2][i % 2] : top;
+    }
     for (int i = 0; i < 4; i++)
-        density[i / 2][i % 2] = exp(density[i / 2][i % 2] - top);
+        density[i / 2][i % 2] /= top;
     return top;
 }
 
@@ -734,7 +742,7 @@ static void filter_states(const States *states)
 {
     for (Py_ssize_t p = 0; p < states->points; p++) {
         const double *point = states->point + 5 * p, *rate = point + 2;
-        double both = rate[0] + rate[1], value = 0.0;
+        double both = rate[0] + rate[1], value = 0.0, elapsed = -1.0, change = 0.0;
         Belief belief;
         Step step;
         for (int k = 0; k < 2; k++) {
@@ -755,9 +763,12 @@ static void filter_states(const States *states)
             }
             for (Py_ssize_t g = 0; g < states->groups; g++)
                 step.noise[g] = noise_of(states, 1, j, g, point);
-            double square[2][MOST_AXES], total[2][2][MOST_AXES], pair[2][2];
-            value += densities(states, &step, &belief, square, total, pair);
-            double change = -expm1(-both * clock[states->count]), sum = 0.0;
+            double square[2][MOST_AXES], total[2][2][MOST_AXES], pair[2][2], least, sum = 0.0;
+            double top = densities(states, &step, &belief, square, total, pair, &least);
+            if (clock[states->count] != elapsed) {
+                elapsed = clock[states->count];
+                change = -expm1(-both * elapsed);
+            }
             for (int from = 0; from < 2; from++)
                 for (int to = 0; to < 2; to++) {
                     double leaving = rate[from] / both * change;
@@ -768,7 +779,7 @@ static void filter_states(const States *states)
                 }
             for (int to = 0; to < 2; to++)
                 sum += pair[0][to] + pair[1][to];
-            value += log(sum);
+            value += log(top * sum) - least;
             merge(states, &step, pair, square, total, &belief);
         }
         states->value[p] = value;
