@@ -157,7 +157,8 @@ class Steps:
             mean: Floats = np.linalg.solve(*normal).astype(np.float64)
         except np.linalg.LinAlgError:  # no step that a steady motion would change
             mean = np.linalg.lstsq(*normal, rcond=None)[0].astype(np.float64)
-        return replace(self, vectors=self.vectors - distinct(self.steady) @ mean), mean
+        moved = (self.steady.reshape(self.vectors.size, -1) @ mean).reshape(self.vectors.shape)
+        return replace(self, vectors=self.vectors - moved), mean
 
 
 @dataclass(frozen=True, eq=False)

@@ -133,7 +133,8 @@ class NoisyVectors:
         """Return the mean noise O of a frame, less its blur, (b, b)."""
         theta, B = self.amplitudes(own[None])
         shape = self.steps.mean_noise
-        offset: Floats = np.tensordot(theta[0], shape, 1) - 2 * B[0] * self.steps.dt * D
+        offset: Floats = (theta[0][:, None, None] * shape).sum(axis=0)
+        offset = offset - 2 * B[0] * self.steps.dt * D
         return offset
 
     def blur_ratio(self, D: Floats) -> float:

@@ -500,7 +500,7 @@ class ScaledTracks:
             # Noise that is stored once for all frames is scaled once.
             alike = one.noise.strides[1] == 0
             shapes = (one.noise[:, :1] if alike else one.noise) / np.outer(scale, scale)
-            size = np.nanmean(np.trace(shapes, axis1=2, axis2=3), axis=1) / 3
+            size = np.nanmean(np.einsum("rtaa->rt", shapes), axis=1) / 3
             shapes = np.broadcast_to(shapes / size[:, None, None, None], one.noise.shape)
             scaled = replace(
                 one,
@@ -801,7 +801,9 @@ def neighbour_products(steps: Steps) -> Floats:
     >>> neighbour_products(body_steps(truth, "rotation", np.eye(3))).shape
     (3, 3)
     """
-    product = (steps.vectors[:-1] * steps.linked[:-1, None]).T @ steps.vectors[1:]
+    linked = steps.linked[:-1]
+    first, second = steps.vectors[:-1], steps.vectors[1:]
+    product = first.T @ second if linked.all() else first[linked].T @ second[linked]
     return np.asarray(0.5 * (product + product.T))
 
 
