@@ -357,12 +357,13 @@ def _judge_alike(
     if stretched.any():
         corrected = x / unit[:, None, None]
         residuals = residuals_of_each(bodies, corrected)
+    each = list(corrected)
     filled = [
         one if found is None else _restored_detections(body, one, found, own)
-        for body, one, found, own in zip(bodies, corrected, detections, unit, strict=True)
+        for body, one, found, own in zip(bodies, each, detections, unit, strict=True)
     ]
     all_residuals = residuals
-    if any(more is not one for more, one in zip(filled, corrected, strict=True)):
+    if any(more is not one for more, one in zip(filled, each, strict=True)):
         all_residuals = residuals_of_each(bodies, np.stack(filled))
     radius = np.array([body.R for body in bodies])
     misfit = misplaced_detections(all_residuals, radius)
