@@ -563,56 +563,102 @@ typedef struct {
     double *sums;
 } Spectra;
 
-enum { SPECTRUM_SUMS = 11 };
+enum { SPECTRUM_SUMS = 11, TRACK_BLOCK = 512 };
+
+/* The logarithms of normal numbers: the product of their fractions, and the sum of their exponents
+ * as they stand in the numbers. Up to TRACK_BLOCK of them have a finite product. */
+typedef struct {
+    Lanes product;
+    uint64_t exponents[WIDTH];
+} Logarithm;
+
+INLINE void add_logarithm(Logarithm *sum, Lanes number)
+{
+    uint64_t bits[WIDTH];
+    memcpy(bits, &number, sizeof bits);
+    for (int i = 0; i < WIDTH; i++) {
+        sum->exponents[i] += bits[i] >> 52;
+        bits[i] = (bits[i] & 0xFFFFFFFFFFFFFULL) | 0x3FF0000000000000ULL; /* from 1 to 2 */
+    }
+    memcpy(&number, bits, sizeof bits);
+    sum->product *= number;
+}
+
+INLINE double logarithm(const Logarithm *sum, Py_ssize_t added)
+{
+    double found = 0.0;
+    int64_t exponent = -1023 * WIDTH * (int64_t)added;
+    for (int i = 0; i < WIDTH; i++) {
+        found += log(LANE(sum->product, i));
+        exponent += (int64_t)sum->exponents[i];
+    }
+    return found + (double)exponent * 0.69314718055994530942;
+}
+
+/* The next modes of a track, of which `left` are left; `fill` in the place of those beyond. */
+INLINE Lanes next_modes(const double *modes, Py_ssize_t left, double fill)
+{
+    Lanes found = all_equal(fill);
+    if (left >= WIDTH)
+        memcpy(&found, modes, sizeof found);
+    else
+        for (Py_ssize_t i = 0; i < left; i++)
+            LANE(found, i) = modes[i];
+    return found;
+}
+
+INLINE double sum_of_lanes(Lanes lanes)
+{
+    double sum = 0.0;
+    for (int i = 0; i < WIDTH; i++)
+        sum += LANE(lanes, i);
+    return sum;
+}
 
 /* Add the sums of one block of modes of one track. */
 INLINE void add_spectrum(const Spectra *all, Py_ssize_t first, Py_ssize_t count, double D,
                          double theta, double *sums)
 {
-    const double *by_D = all->by_D + first, *by_theta = all->by_theta + first;
-    const double *given = all->given + first, *axes = all->axes + first;
-    double variance[BLOCK], inverse[BLOCK], rise[BLOCK], fall[BLOCK], slope[2][BLOCK];
+    const double *axes = all->axes + first;
+    Lanes zero = all_equal(0.0), least = all_equal(1e-100), part[SPECTRUM_SUMS];
+    Logarithm log_variance = {all_equal(1.0), {0}};
     int alike = 1;
-    for (Py_ssize_t k = 0; k < count; k++) {
-        double sum = D * by_D[k] + theta * by_theta[k] + given[k];
-        variance[k] = sum > 1e-100 ? sum : 1e-100;
-        slope[0][k] = by_D[k];
-        slope[1][k] = by_theta[k];
-        rise[k] = all->power[first + k];
-        fall[k] = axes[k];
+    for (int j = 0; j < SPECTRUM_SUMS; j++)
+        part[j] = zero;
+    for (Py_ssize_t k = 0; k < count; k++)
         alike &= axes[k] == axes[0];
+    for (Py_ssize_t k = 0; k < count; k += WIDTH) {
+        Py_ssize_t left = count - k, place = first + k;
+        Lanes by_D = next_modes(all->by_D + place, left, 0.0);
+        Lanes by_theta = next_modes(all->by_theta + place, left, 0.0);
+        Lanes variance = by_D * D + by_theta * theta + next_modes(all->given + place, left, 1.0);
+        variance = larger(variance, least);
+        if (alike)
+            add_logarithm(&log_variance, variance);
+        else
+            for (int i = 0; i < WIDTH && i < left; i++)
+                sums[0] += axes[k + i] * log(LANE(variance, i));
+        Lanes inverse = 1 / variance;
+        Lanes rise = next_modes(all->power + place, left, 0.0) * inverse;
+        Lanes fall = next_modes(axes + k, left, 0.0) * inverse;
+        part[0] += rise;
+        rise *= inverse;
+        part[1] += rise * by_D;
+        part[2] += fall * by_D;
+        part[3] += rise * by_theta;
+        part[4] += fall * by_theta;
+        rise *= inverse;
+        fall *= inverse;
+        Lanes squares[3] = {by_D * by_D, by_D * by_theta, by_theta * by_theta};
+        for (int j = 0; j < 3; j++) {
+            part[5 + j] += rise * squares[j];
+            part[8 + j] += fall * squares[j];
+        }
     }
-    for (Py_ssize_t k = count; k < BLOCK; k++) {
-        variance[k] = 1.0;
-        slope[0][k] = slope[1][k] = rise[k] = fall[k] = 0.0;
-    }
+    for (int j = 0; j < SPECTRUM_SUMS; j++)
+        sums[j] += sum_of_lanes(part[j]);
     if (alike)
-        sums[0] += axes[0] * sum_of_logs(variance);
-    else
-        for (Py_ssize_t k = 0; k < count; k++)
-            sums[0] += axes[k] * log(variance[k]);
-    for (int k = 0; k < BLOCK; k++)
-        inverse[k] = 1 / variance[k];
-    sums[0] += dot(rise, inverse);
-    for (int k = 0; k < BLOCK; k++) {
-        fall[k] *= inverse[k];
-        rise[k] *= inverse[k] * inverse[k];
-    }
-    for (int j = 0; j < 2; j++) {
-        sums[1 + 2 * j] += dot(rise, slope[j]);
-        sums[2 + 2 * j] += dot(fall, slope[j]);
-    }
-    for (int k = 0; k < BLOCK; k++) {
-        fall[k] *= inverse[k];
-        rise[k] *= inverse[k];
-    }
-    for (int j = 0; j < 3; j++) {
-        double square[BLOCK];
-        for (int k = 0; k < BLOCK; k++)
-            square[k] = slope[j > 1][k] * slope[j > 0][k];
-        sums[5 + j] += dot(rise, square);
-        sums[8 + j] += dot(fall, square);
-    }
+        sums[0] += axes[0] * logarithm(&log_variance, (count + WIDTH - 1) / WIDTH);
 }
 
 EVERY_MACHINE
@@ -623,8 +669,8 @@ static void sum_spectra(const Spectra *all)
         double *sums = all->sums + i * SPECTRUM_SUMS;
         for (int j = 0; j < SPECTRUM_SUMS; j++)
             sums[j] = 0.0;
-        for (Py_ssize_t start = 0; start < all->count; start += BLOCK) {
-            Py_ssize_t left = all->count - start, count = left < BLOCK ? left : BLOCK;
+        for (Py_ssize_t start = 0; start < all->count; start += TRACK_BLOCK) {
+            Py_ssize_t left = all->count - start, count = left < TRACK_BLOCK ? left : TRACK_BLOCK;
             add_spectrum(all, motion * all->count + start, count, all->D[i], all->theta[i], sums);
         }
         for (int j = 0; j < 5; j++)
