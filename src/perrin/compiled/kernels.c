@@ -408,162 +408,9 @@ static void write_spot(const Window *window, const double *center, const double 
     }
 }
 
-/* Modes of steps, summed in blocks of so many; no more components than a body has coordinates. */
-enum { BLOCK = 64, MOST_AXES = 3 };
-
-/* Modes (rows or 1, count, b) of P rows, in the axes (P, b, b) in which they are independent. */
-typedef struct {
-    Py_ssize_t rows, count, b, stride, columns;
-    const double *modes, *axes, *share, *weight;
-    double *sums;
-} Modes;
-
-/* Sum of the products of two lists of BLOCK numbers, in four parts: one order of additions on every
- * machine. */
-INLINE double dot(const double *a, const double *b)
-{
-    double part[4] = {0.0, 0.0, 0.0, 0.0};
-    for (int k = 0; k < BLOCK; k += 4)
-        for (int i = 0; i < 4; i++)
-            part[i] += a[k + i] * b[k + i];
-    return (part[0] + part[1]) + (part[2] + part[3]);
-}
-
-/* Sum of the logarithms of BLOCK normal numbers: that of the product of their fractions, and their
- * exponents, which are added as they stand in the numbers. */
-INLINE double sum_of_logs(const double *numbers)
-{
-    double product[4] = {1.0, 1.0, 1.0, 1.0};
-    uint64_t exponents[4] = {0, 0, 0, 0};
-    for (int k = 0; k < BLOCK; k += 4)
-        for (int i = 0; i < 4; i++) {
-            uint64_t bits;
-            double fraction;
-            memcpy(&bits, numbers + k + i, sizeof bits);
-            exponents[i] += bits >> 52;
-            bits = (bits & 0xFFFFFFFFFFFFFULL) | 0x3FF0000000000000ULL; /* from 1 to 2 */
-            memcpy(&fraction, &bits, sizeof fraction);
-            product[i] *= fraction;
-        }
-    int64_t exponent = (int64_t)(exponents[0] + exponents[1] + exponents[2] + exponents[3]);
-    return log((product[0] * product[1]) * (product[2] * product[3])) +
-           (double)(exponent - 1023 * BLOCK) * 0.69314718055994530942;
-}
-
-/* One block of modes along their axes: inverse variances, and modes over variances. */
-typedef struct {
-    double inverse[MOST_AXES][BLOCK], scaled[MOST_AXES][BLOCK];
-} Block;
-
-/* Fill a block from `count` modes, the rest with zeros; add to log det, form and least variance. */
-INLINE void fill_block(const double *modes, const double *w, Py_ssize_t count, Py_ssize_t b,
-                       const double *axes, const double *share, Block *block, double *totals)
-{
-    double component[MOST_AXES][BLOCK];
-    memset(component, 0, sizeof component);
-    for (Py_ssize_t k = 0; k < count; k++)
-        for (Py_ssize_t c = 0; c < b; c++)
-            component[c][k] = modes[k * b + c];
-    for (Py_ssize_t a = 0; a < b; a++) {
-        double along[BLOCK], variance[BLOCK];
-        for (int k = 0; k < BLOCK; k++)
-            along[k] = component[0][k] * axes[a];
-        for (Py_ssize_t c = 1; c < b; c++)
-            for (int k = 0; k < BLOCK; k++)
-                along[k] += component[c][k] * axes[c * b + a];
-        for (int k = 0; k < BLOCK; k++)
-            variance[k] = k < count ? share[a] + 0.5 * w[k] * (1 - share[a]) : 1.0;
-        for (int k = 0; k < BLOCK; k++)
-            block->inverse[a][k] = k < count ? 1 / variance[k] : 0.0;
-        for (int k = 0; k < BLOCK; k++)
-            block->scaled[a][k] = along[k] * block->inverse[a][k];
-        totals[1] += dot(along, block->scaled[a]);
-        for (Py_ssize_t k = 0; k < count; k++)
-            totals[2] = variance[k] < totals[2] ? variance[k] : totals[2];
-        totals[0] += sum_of_logs(variance);
-    }
-}
-
-/* Add the sums of q_a q_b V_c and of V_a V_c, times 1, w and w^2, of one block. */
-INLINE void add_curvatures(const Block *block, const double *powers, Py_ssize_t b, double *power,
-                           double *trace)
-{
-    double pair[BLOCK], weighted[3][MOST_AXES][BLOCK];
-    for (Py_ssize_t j = 0; j < 3; j++)
-        for (Py_ssize_t c = 0; c < b; c++)
-            for (Py_ssize_t k = 0; k < BLOCK; k++)
-                weighted[j][c][k] = block->inverse[c][k] * powers[j * BLOCK + k];
-    for (Py_ssize_t a = 0; a < b; a++)
-        for (Py_ssize_t d = a; d < b; d++) {
-            for (Py_ssize_t k = 0; k < BLOCK; k++)
-                pair[k] = block->scaled[a][k] * block->scaled[d][k];
-            for (Py_ssize_t j = 0; j < 3; j++)
-                for (Py_ssize_t c = 0; c < b; c++) {
-                    double sum = dot(pair, weighted[j][c]);
-                    power[((a * b + d) * 3 + j) * b + c] += sum;
-                    if (d != a)
-                        power[((d * b + a) * 3 + j) * b + c] += sum;
-                }
-        }
-    for (Py_ssize_t a = 0; a < b; a++)
-        for (Py_ssize_t j = 0; j < 3; j++)
-            for (Py_ssize_t c = 0; c < b; c++)
-                trace[(a * 3 + j) * b + c] += dot(block->inverse[a], weighted[j][c]);
-}
-
-EVERY_MACHINE
-static void sum_modes(const Modes *modes)
-{
-    Py_ssize_t b = modes->b, squares = b * b;
-    int curved = modes->columns > 3 + 2 * squares;
-    for (Py_ssize_t row = 0; row < modes->rows; row++) {
-        double *sums = modes->sums + row * modes->columns;
-        const double *first = modes->modes + row * modes->stride;
-        memset(sums, 0, (size_t)modes->columns * sizeof(double));
-        sums[2] = DBL_MAX;
-        for (Py_ssize_t start = 0; start < modes->count; start += BLOCK) {
-            Py_ssize_t left = modes->count - start, count = left < BLOCK ? left : BLOCK;
-            const double *w = modes->weight + start;
-            Block block;
-            double powers[3 * BLOCK], next[BLOCK];
-            fill_block(first + start * b, w, count, b, modes->axes + row * squares,
-                       modes->share + row * b, &block, sums);
-            for (Py_ssize_t k = 0; k < BLOCK; k++) {
-                powers[k] = 1.0;
-                powers[BLOCK + k] = k < count ? w[k] : 0.0;
-                powers[2 * BLOCK + k] = powers[BLOCK + k] * powers[BLOCK + k];
-            }
-            for (Py_ssize_t d = 0; d < b; d++) {
-                for (Py_ssize_t k = 0; k < BLOCK; k++)
-                    next[k] = powers[BLOCK + k] * block.scaled[d][k];
-                for (Py_ssize_t a = 0; a <= d; a++) {
-                    double same = dot(block.scaled[a], block.scaled[d]);
-                    double weighted = dot(block.scaled[a], next);
-                    sums[3 + a * b + d] += same;
-                    sums[3 + squares + a * b + d] += weighted;
-                    if (a < d) {
-                        sums[3 + d * b + a] += same;
-                        sums[3 + squares + d * b + a] += weighted;
-                    }
-                }
-                sums[3 + d * b + d] -= dot(powers, block.inverse[d]);
-                sums[3 + squares + d * b + d] -= dot(powers + BLOCK, block.inverse[d]);
-            }
-            if (curved)
-                add_curvatures(&block, powers, b, sums + 3 + 2 * squares,
-                               sums + 3 + 2 * squares + 3 * squares * b);
-        }
-    }
-}
-
-/* Powers of the sine modes of `motions` tracks, (motions, count) each, at `points` places. */
-typedef struct {
-    Py_ssize_t points, motions, count;
-    const double *power, *axes, *by_D, *by_theta, *given, *D, *theta;
-    double *sums;
-} Spectra;
-
-enum { SPECTRUM_SUMS = 11, TRACK_BLOCK = 512 };
+/* Modes of steps: so many of them are summed before their logarithms are added; no more components
+ * than a body has coordinates. */
+enum { TRACK_BLOCK = 512, MOST_AXES = 3 };
 
 /* The logarithms of normal numbers: the product of their fractions, and the sum of their exponents
  * as they stand in the numbers. Up to TRACK_BLOCK of them have a finite product. */
@@ -614,6 +461,135 @@ INLINE double sum_of_lanes(Lanes lanes)
         sum += LANE(lanes, i);
     return sum;
 }
+
+/* Modes (rows or 1, b, count) of P rows, in the axes (P, b, b) in which they are independent. */
+typedef struct {
+    Py_ssize_t rows, count, b, stride, columns;
+    const double *modes, *axes, *share, *weight;
+    double *sums;
+} Modes;
+
+/* The sums of one row over a block of modes. */
+typedef struct {
+    Logarithm variance[MOST_AXES];
+    Lanes form, least, same[MOST_AXES][MOST_AXES], next[MOST_AXES][MOST_AXES];
+    Lanes power[MOST_AXES][MOST_AXES][3][MOST_AXES], trace[MOST_AXES][3][MOST_AXES];
+} ModeSums;
+
+/* Variances of the next modes along an axis; 1 beyond the last of them. */
+INLINE Lanes variance_of(double share, Lanes weight, Py_ssize_t left)
+{
+    Lanes variance = share + 0.5 * weight * (1 - share);
+    for (Py_ssize_t i = left; i < WIDTH; i++)
+        LANE(variance, i) = 1.0;
+    return variance;
+}
+
+/* Add to the sums of one row those of the `left` modes from `k` on, at most WIDTH of them. */
+INLINE void add_modes(const Modes *all, Py_ssize_t row, Py_ssize_t k, Py_ssize_t left, int b,
+                      int curved, ModeSums *sums)
+{
+    const double *modes = all->modes + row * all->stride + k, *share = all->share + row * b;
+    const double *axes = all->axes + row * b * b;
+    Lanes w = next_modes(all->weight + k, left, 0.0);
+    Lanes y[MOST_AXES], inverse[MOST_AXES], scaled[MOST_AXES], weighted[3][MOST_AXES];
+    for (int c = 0; c < b; c++)
+        y[c] = next_modes(modes + c * all->count, left, 0.0);
+    for (int a = 0; a < b; a++) {
+        Lanes along = y[0] * axes[a], variance = variance_of(share[a], w, left);
+        for (int c = 1; c < b; c++)
+            along += y[c] * axes[c * b + a];
+        add_logarithm(&sums->variance[a], variance);
+        sums->least = -larger(-sums->least, -variance);
+        inverse[a] = 1 / variance;
+        for (Py_ssize_t i = left; i < WIDTH; i++)
+            LANE(inverse[a], i) = 0.0;
+        scaled[a] = along * inverse[a];
+        sums->form += along * scaled[a];
+        weighted[0][a] = inverse[a];
+        weighted[1][a] = inverse[a] * w;
+        weighted[2][a] = weighted[1][a] * w;
+        sums->same[a][a] -= inverse[a];
+        sums->next[a][a] -= weighted[1][a];
+    }
+    for (int a = 0; a < b; a++)
+        for (int d = a; d < b; d++) {
+            Lanes pair = scaled[a] * scaled[d];
+            sums->same[a][d] += pair;
+            sums->next[a][d] += pair * w;
+            for (int i = 0; curved && i < 3 * b; i++)
+                sums->power[a][d][i / b][i % b] += pair * weighted[i / b][i % b];
+        }
+    for (int a = 0; curved && a < b; a++)
+        for (int i = 0; i < 3 * b; i++)
+            sums->trace[a][i / b][i % b] += inverse[a] * weighted[i / b][i % b];
+}
+
+/* Write the sums over a block, all modes of a row or a part of them, to those of the row. */
+INLINE void add_to_row(const ModeSums *sums, Py_ssize_t added, int b, int curved, double *row)
+{
+    double *same = row + 3, *next = same + b * b, *power = next + b * b;
+    double *trace = power + 3 * b * b * b;
+    row[1] += sum_of_lanes(sums->form);
+    for (int i = 0; i < WIDTH; i++)
+        row[2] = LANE(sums->least, i) < row[2] ? LANE(sums->least, i) : row[2];
+    for (int a = 0; a < b; a++) {
+        row[0] += logarithm(&sums->variance[a], added);
+        for (int d = 0; d < b; d++) {
+            int low = a < d ? a : d, high = a < d ? d : a;
+            same[a * b + d] += sum_of_lanes(sums->same[low][high]);
+            next[a * b + d] += sum_of_lanes(sums->next[low][high]);
+            for (int i = 0; curved && i < 3 * b; i++)
+                power[(a * b + d) * 3 * b + i] +=
+                    sum_of_lanes(sums->power[low][high][i / b][i % b]);
+        }
+        for (int i = 0; curved && i < 3 * b; i++)
+            trace[a * 3 * b + i] += sum_of_lanes(sums->trace[a][i / b][i % b]);
+    }
+}
+
+/* Sum the modes of all rows; the number of axes is a constant for the compiler. */
+INLINE void sum_rows(const Modes *all, int b, int curved)
+{
+    for (Py_ssize_t row = 0; row < all->rows; row++) {
+        double *out = all->sums + row * all->columns;
+        memset(out, 0, (size_t)all->columns * sizeof(double));
+        out[2] = DBL_MAX;
+        for (Py_ssize_t start = 0; start < all->count; start += TRACK_BLOCK) {
+            Py_ssize_t stop = start + TRACK_BLOCK;
+            stop = stop < all->count ? stop : all->count;
+            ModeSums sums;
+            memset(&sums, 0, sizeof sums);
+            sums.least = all_equal(DBL_MAX);
+            for (int a = 0; a < b; a++)
+                sums.variance[a].product = all_equal(1.0);
+            for (Py_ssize_t k = start; k < stop; k += WIDTH)
+                add_modes(all, row, k, stop - k, b, curved, &sums);
+            add_to_row(&sums, (stop - start + WIDTH - 1) / WIDTH, b, curved, out);
+        }
+    }
+}
+
+EVERY_MACHINE
+static void sum_modes(const Modes *modes)
+{
+    int curved = modes->columns > 3 + 2 * modes->b * modes->b;
+    if (modes->b == 3 && curved)
+        sum_rows(modes, 3, 1);
+    else if (modes->b == 3)
+        sum_rows(modes, 3, 0);
+    else
+        sum_rows(modes, (int)modes->b, curved);
+}
+
+/* Powers of the sine modes of `motions` tracks, (motions, count) each, at `points` places. */
+typedef struct {
+    Py_ssize_t points, motions, count;
+    const double *power, *axes, *by_D, *by_theta, *given, *D, *theta;
+    double *sums;
+} Spectra;
+
+enum { SPECTRUM_SUMS = 11 };
 
 /* Add the sums of one block of modes of one track. */
 INLINE void add_spectrum(const Spectra *all, Py_ssize_t first, Py_ssize_t count, double D,
@@ -989,12 +965,12 @@ static PyObject *sum_mode_views(Py_buffer views[5])
     Py_buffer *sums = &views[4];
     Modes modes = {.modes = views[0].buf, .axes = views[1].buf, .share = views[2].buf,
                    .weight = views[3].buf, .sums = sums->buf};
-    int fits = views[0].ndim == 3 && sums->ndim == 2 && views[0].shape[2] <= MOST_AXES;
+    int fits = views[0].ndim == 3 && sums->ndim == 2 && views[0].shape[1] <= MOST_AXES;
     if (fits) {
         modes.rows = sums->shape[0];
         modes.columns = sums->shape[1];
-        modes.count = views[0].shape[1];
-        modes.b = views[0].shape[2];
+        modes.b = views[0].shape[1];
+        modes.count = views[0].shape[2];
         modes.stride = stride_of(&views[0], modes.rows, modes.count * modes.b);
         Py_ssize_t squares = modes.b * modes.b, fewer = 3 + 2 * squares;
         fits = modes.stride >= 0 && stride_of(&views[1], modes.rows, squares) > 0 &&
@@ -1003,7 +979,7 @@ static PyObject *sum_mode_views(Py_buffer views[5])
                (modes.columns == fewer || modes.columns == fewer + 3 * squares * (modes.b + 1));
     }
     if (!fits)
-        return PyErr_Format(PyExc_ValueError, "expected modes (rows or 1, count, b), axes (rows, b, "
+        return PyErr_Format(PyExc_ValueError, "expected modes (rows or 1, b, count), axes (rows, b, "
                             "b), share (rows, b), weight (count,), sums (rows, 3 + 2 b^2) or (rows, "
                             "3 + 5 b^2 + 3 b^3), b up to 3");
     Py_BEGIN_ALLOW_THREADS
@@ -1040,7 +1016,7 @@ static PyObject *mode_sums(PyObject *self, PyObject *args)
 PyDoc_STRVAR(mode_sums_doc,
 "mode_sums(modes, axes, share, weight, sums)\n--\n\n"
 "Write what a likelihood of modes and its derivatives need, in axes where the modes are independent.\n\n"
-"modes (rows or 1, count, b), axes (rows, b, b), share (rows, b) and weight (count,) are read; sums\n"
+"modes (rows or 1, b, count), axes (rows, b, b), share (rows, b) and weight (count,) are read; sums\n"
 "(rows, 3 + 2 b^2), or with second derivatives (rows, 3 + 5 b^2 + 3 b^3), is written.");
 
 static PyObject *sum_spectrum_views(Py_buffer views[8])

@@ -105,7 +105,7 @@ class EvenTracks:
 
     Attributes
     ----------
-    modes : ndarray, shape (P, K, b)
+    modes : ndarray, shape (P, b, K)
         Sine transforms of the steps.
     tau, dt : ndarray, shape (P,)
         Duration of the steps, and time between frames.
@@ -124,7 +124,7 @@ class EvenTracks:
         from scipy.fft import dst
 
         return cls(
-            dst(np.stack([s.vectors for s in steps]), type=1, norm="ortho", axis=1),
+            dst(np.stack([s.vectors.T for s in steps]), type=1, norm="ortho", axis=2),
             np.array([s.duration[0] for s in steps]),
             np.array([s.dt for s in steps]),
             np.stack([s.noise[:, s.start[0]] for s in steps]),
@@ -137,7 +137,7 @@ class EvenTracks:
     @property
     def weight(self) -> Floats:
         """Weight w of the noise in every mode, (K,)."""
-        return np.asarray(2 * difference_eigenvalues(self.modes.shape[1]))
+        return np.asarray(2 * difference_eigenvalues(self.modes.shape[2]))
 
     def noise(self, D: Floats, theta: Floats, B: Floats) -> Floats:
         """Return the noise O of a frame, less its blur, (P, b, b)."""
@@ -162,7 +162,7 @@ class EvenTracks:
         power, trace = second[:count, : 3 * b**3], second[:count, 3 * b**3 :]
         return ModeSums(
             axes,
-            log_det + self.modes.shape[1] * np.log(values).sum(axis=1),
+            log_det + self.modes.shape[2] * np.log(values).sum(axis=1),
             form,
             same,
             next_one,
@@ -211,7 +211,7 @@ def mode_sums(
 
     Parameters
     ----------
-    modes : ndarray, shape (P or 1, K, b)
+    modes : ndarray, shape (P or 1, b, K)
     axes : ndarray, shape (P, b, b)
         Axes as columns.
     share : ndarray, shape (P, b)
@@ -233,31 +233,31 @@ def mode_sums(
     >>> mode_sums(one, one, one[0], np.array([0.5]), curved=False)
     array([[0., 1., 1., 0., 0.]])
     """
-    (points, b), count = share.shape, modes.shape[1]
+    points, b = share.shape
     fewer = 3 + 2 * b * b
     sums = np.empty((points, fewer + 3 * b * b * (b + 1) if curved else fewer))
     kernels = compiled_kernels() if b <= 3 else None
     if kernels is not None:
         kernels.mode_sums(*map(np.ascontiguousarray, (modes, axes, share, weight)), sums)
         return sums
-    variance = share[:, None] + 0.5 * weight[:, None] * (1 - share[:, None])
-    inverse, along = 1 / variance, modes @ axes
+    variance = share[..., None] + 0.5 * weight * (1 - share[..., None])
+    inverse, along = 1 / variance, np.swapaxes(axes, 1, 2) @ modes
     q = along * inverse
     with np.errstate(divide="ignore", invalid="ignore"):
         sums[:, 0] = np.log(variance).sum(axis=(1, 2))
     sums[:, 1], sums[:, 2] = (along * q).sum(axis=(1, 2)), variance.min(axis=(1, 2))
-    squares = np.stack([np.swapaxes(q, 1, 2) @ (w[:, None] * q) for w in (np.ones(count), weight)])
+    same, next_one = (x @ np.swapaxes(q, 1, 2) for x in (q, weight * q))
     kept = np.arange(b)
-    squares[0][:, kept, kept] -= inverse.sum(axis=1)
-    squares[1][:, kept, kept] -= weight @ inverse
-    sums[:, 3:fewer] = squares.swapaxes(0, 1).reshape(points, -1)
+    same[:, kept, kept] -= inverse.sum(axis=2)
+    next_one[:, kept, kept] -= inverse @ weight
+    sums[:, 3:fewer] = np.stack([same, next_one], axis=1).reshape(points, -1)
     if curved:
-        powers = weight[:, None, None] ** np.arange(3)[:, None]
-        weights = (inverse[:, :, None] * powers).reshape(points, -1, 3 * b)
-        pairs = (q[..., None] * q[:, :, None]).reshape(points, -1, b * b)
-        power, trace = np.swapaxes(pairs, 1, 2) @ weights, np.swapaxes(inverse, 1, 2) @ weights
-        sums[:, fewer : fewer + 3 * b**3] = power.reshape(points, -1)
-        sums[:, fewer + 3 * b**3 :] = trace.reshape(points, -1)
+        powers = weight ** np.arange(3)[:, None]
+        weights = (inverse[:, None] * powers[:, None]).reshape(points, 3 * b, -1)
+        weights = np.swapaxes(weights, 1, 2)
+        pairs = (q[:, :, None] * q[:, None]).reshape(points, b * b, -1)
+        sums[:, fewer : fewer + 3 * b**3] = (pairs @ weights).reshape(points, -1)
+        sums[:, fewer + 3 * b**3 :] = (inverse @ weights).reshape(points, -1)
     return sums
 
 
