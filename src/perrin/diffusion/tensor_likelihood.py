@@ -133,9 +133,8 @@ class NoisyVectors:
         """Return the mean noise O of a frame, less its blur, (b, b)."""
         theta, B = self.amplitudes(own[None])
         shape = self.steps.mean_noise
-        offset: Floats = (theta[0][:, None, None] * shape).sum(axis=0)
-        offset = offset - 2 * B[0] * self.steps.dt * D
-        return offset
+        mean = (theta[0][:, None, None] * shape).sum(axis=0)
+        return np.asarray(mean - 2 * B[0] * self.steps.dt * D)
 
     def blur_ratio(self, D: Floats) -> float:
         """Return the noise amplitude that has the mean variance of a blur of B = 1."""
