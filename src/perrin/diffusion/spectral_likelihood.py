@@ -462,7 +462,8 @@ def highest_maxima(
     array([0.3])
     """
     top, column = np.argmax(height, axis=0), np.arange(height.shape[1])
-    low, high = (trial[np.clip(top + side, 0, len(trial) - 1), column] for side in (-1, 1))
+    low = trial[np.maximum(top - 1, 0), column]
+    high = trial[np.minimum(top + 1, len(trial) - 1), column]
     x = trial[top, column]
     for _ in range(40):
         slope, bend = score(x)
