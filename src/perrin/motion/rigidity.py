@@ -321,9 +321,7 @@ def judge_each(
                 sigma_ratio=sigma_ratio,
                 corrections=[corrections[k] for k in rows],
                 # Of the positions themselves none was left out.
-                detections=[
-                    None if detections[k] is positions[k] else detections[k] for k in rows
-                ],
+                detections=[None if detections[k] is positions[k] else detections[k] for k in rows],
                 unsettled=[unsettled[k] for k in rows],
             )
             found.update(zip(rows, judged, strict=True))
