@@ -114,14 +114,13 @@ def orientation_covariance(positions: Floats, noise: Floats) -> Floats:
     array([[0.005]])
     """
     r = positions - positions.mean(axis=-2, keepdims=True)
-    slopes = pose_slopes(r)
     if r.shape[-1] == 2:
-        across = slopes[..., 0]
+        across = pose_slopes(r)[..., 0]
         inertia = (r * r).sum(axis=(-2, -1))
         variance = np.einsum("...ia,...ab,...ib->...", across, noise, across) / inertia**2
         return np.asarray(variance)[..., None, None]
     inverse = np.linalg.inv(inertia_tensor(r))[..., None, :, :]
-    response = inverse @ np.swapaxes(slopes[..., :3], -1, -2)
+    response = inverse @ skew(r)
     covariance: Floats = np.einsum("...iab,...bc,...idc->...ad", response, noise, response)
     # Symmetric to the last bit, as tables store one triangle of it.
     return 0.5 * (covariance + np.swapaxes(covariance, -1, -2))

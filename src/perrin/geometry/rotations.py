@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from perrin._arrays import Bools, Floats, from_plain, present, to_plain
 from perrin.compiled.loading import compiled_kernels
 from perrin.errors import DegenerateClusterError
+from perrin.geometry.shapes import lengths
 from perrin.geometry.wahba import planar_rotation, spatial_rotation
 
 if TYPE_CHECKING:
@@ -274,7 +275,7 @@ def log_map(rotation: ArrayLike) -> Floats:
         return np.arctan2(r[..., 1, 0], r[..., 0, 0])[..., None]
     q = unit_quaternion(r)
     v, w = q[..., 1:], q[..., 0]
-    sine = np.linalg.norm(v, axis=-1)
+    sine = lengths(v)
     angle = 2.0 * np.arctan2(sine, w)
     # sine < 1e-9 means cos = 1 to rounding: the angle is 2 sine, so the ratio is 2.
     ratio = np.divide(angle, sine, out=np.full_like(sine, 2.0), where=sine > 1e-9)
@@ -345,7 +346,8 @@ def skew(vector: Floats) -> Floats:
 def unit_quaternion(rotation: Floats) -> Floats:
     """Return the unit quaternion (w, x, y, z), w >= 0, of a rotation matrix.
 
-    It is read from the best-conditioned column of q q^T, which is accurate at every angle.
+    It is read from a well-conditioned column of q q^T, which is accurate at every angle: the first
+    one, w q, up to 120 degrees, and the best one beyond.
 
     Parameters
     ----------
@@ -361,6 +363,18 @@ def unit_quaternion(rotation: Floats) -> Floats:
     array([0., 1., 0., 0.])
     """
     r = rotation
+    q = np.empty((*r.shape[:-2], 4))
+    q[..., 0] = 1.0 + r[..., 0, 0] + r[..., 1, 1] + r[..., 2, 2]
+    for i, (a, b) in enumerate(((2, 1), (0, 2), (1, 0))):
+        np.subtract(r[..., a, b], r[..., b, a], out=q[..., i + 1])
+    far = ~(q[..., 0] >= 1.0)
+    if far.any():
+        q[far] = _best_column(r[far])
+    return np.asarray(q / lengths(q)[..., None])
+
+
+def _best_column(r: Floats) -> Floats:
+    """Return the longest column of 4 q q^T, with w >= 0, of rotation matrices (K, 3, 3)."""
     t = np.trace(r, axis1=-2, axis2=-1)
     k = np.empty((*r.shape[:-2], 4, 4))
     k[..., 0, 0] = 1.0 + t
@@ -371,7 +385,6 @@ def unit_quaternion(rotation: Floats) -> Floats:
         k[..., i + 1, j + 1] = k[..., j + 1, i + 1] = r[..., i, j] + r[..., j, i]
     best = np.argmax(np.einsum("...ii->...i", k), axis=-1)
     q: Floats = np.take_along_axis(k, best[..., None, None], axis=-1)[..., 0]
-    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
     return np.where(q[..., :1] < 0, -q, q)
 
 

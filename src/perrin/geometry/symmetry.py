@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from perrin._arrays import number_fault, refuse
 from perrin.geometry.rotations import axis_angle, fit_rotations
-from perrin.geometry.shapes import Cluster
+from perrin.geometry.shapes import Cluster, lengths
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -242,16 +242,16 @@ def _congruences(x: Floats, onto: Floats, tolerance: Floats) -> tuple[Ints, Ints
     rotation, body, order = rotation[unique], body[unique], np.empty((0, n), dtype=np.int64)
     for _ in range(3):
         rotated, before = x[body] @ np.swapaxes(rotation, 1, 2), order
-        away = np.linalg.norm(rotated[:, :, None] - onto[body][:, None], axis=3)
+        away = lengths(rotated[:, :, None] - onto[body][:, None])
         order = np.argmin(away, axis=2)
-        permutes = (np.sort(order, axis=1) == np.arange(n)).all(axis=1)
+        permutes = np.asarray((np.sort(order, axis=1) == np.arange(n)).all(axis=1))
         order, body = order[permutes], body[permutes]
         if np.array_equal(order, before):
             break
         rotation, unique = fit_rotations(onto[body[:, None], order], x[body])
         order, rotation, body = order[unique], rotation[unique], body[unique]
     away = x[body] @ np.swapaxes(rotation, 1, 2) - onto[body[:, None], order]
-    misfit = np.linalg.norm(away, axis=2).max(axis=1)
+    misfit = lengths(away).max(axis=1)
     kept = misfit <= tolerance[body]
     return body[kept], order[kept], misfit[kept]
 

@@ -124,6 +124,17 @@ class Residuals:
         unbiased = np.divide(count, count - 1, out=np.full(count.shape, np.nan), where=count > 1)
         return np.asarray(np.sqrt(square * unbiased / median_chi2(freedom)))
 
+    @cached_property
+    def expected(self) -> Floats:
+        """The `expected_squares` of every frame, (B, K, d, d)."""
+        return expected_squares(self.rotation, self.keeps)
+
+    def with_vector(self, vector: Floats) -> Residuals:
+        """Return the same poses with other residuals."""
+        other = replace(self, vector=vector)
+        vars(other)["expected"] = self.expected
+        return other
+
     def of_bodies(self, bodies: Ints) -> Residuals:
         """Return the residuals of some of the bodies."""
         return Residuals(*(getattr(self, part.name)[bodies] for part in fields(self)))
@@ -245,9 +256,9 @@ def sample_residuals(
         fitted = np.stack([motions[k].fitted for k in bodies.tolist()])
         x, t = center[bodies[:, None], fitted], time[bodies[:, None], fitted]
         v = (x[:, 2:] - x[:, :-2]) / (t[:, 2:] - t[:, :-2])[..., None]
-        v = v - np.median(v, axis=1, keepdims=True)
+        v = v - median_present(np.swapaxes(v, 1, 2))[:, None]
         speed = lengths(v)
-        usual = (speed <= _JUMP_SPEED * np.median(speed, axis=1, keepdims=True))[..., None]
+        usual = (speed <= _JUMP_SPEED * median_present(speed)[:, None])[..., None]
         mean = np.where(usual, v, 0.0).sum(axis=1, keepdims=True) / usual.sum(axis=1)[:, None]
         velocity[bodies[:, None], fitted[:, 1:-1]] = np.where(usual, v - mean, 0.0)
     template = np.stack([m.template for m in motions])
@@ -286,8 +297,10 @@ def quantile_present(values: Floats, share: float) -> Floats:
     >>> quantile_present(np.array([[1.0, 5.0, 3.0], [7.0, np.nan, np.nan]]), 0.75)
     array([4., 7.])
     """
-    last = np.maximum(np.isfinite(values).sum(axis=-1) - 1, 0)
     ordered = np.sort(values, axis=-1)  # NaN last
+    last = np.full(ordered.shape[:-1], ordered.shape[-1] - 1)
+    if not np.isfinite(ordered[..., -1:]).all():
+        last = np.maximum((~np.isnan(ordered)).sum(axis=-1) - 1, 0)
     place = share * last
     below = np.floor(place).astype(np.int64)
     low = np.take_along_axis(ordered, below[..., None], axis=-1)[..., 0]
@@ -572,37 +585,33 @@ def expected_squares(rotation: Floats, keeps: Floats) -> Floats:
     products = np.swapaxes(blocks, -1, -2) @ blocks
     form = np.swapaxes(products.reshape(*keeps.shape[:-4], d, d, d, d), -3, -2)
     form = _of_products(np.moveaxis(_of_products(form), -1, -3))
-    axes = _axis_products(rotation)
+    axes = _products(rotation)
     along = axes.reshape(*rotation.shape[:-3], -1, axes.shape[-1]) @ form
     return np.asarray(along.reshape(axes.shape) @ np.swapaxes(axes, -1, -2))
 
 
-def _axis_products(rotation: Floats) -> Floats:
-    """Return the products u_i u_j, i <= j, of the components of the lab's axes in body axes.
+def _products(vectors: Floats) -> Floats:
+    """Return the products u_i u_j, i <= j, of the components of vectors (..., d).
 
-    Parameters
-    ----------
-    rotation : ndarray, shape (..., d, d)
-        Orientations of a body, lab from body: row a is the lab's axis a in body axes.
-
-    Returns
-    -------
-    ndarray, shape (..., d, d (d + 1) / 2)
+    The rows of an orientation, lab from body, are the lab's axes in body axes.
 
     Examples
     --------
-    >>> _axis_products(np.array([[0.6, 0.8], [-0.8, 0.6]])).round(2)
+    >>> _products(np.array([[0.6, 0.8], [-0.8, 0.6]])).round(2)
     array([[ 0.36,  0.48,  0.64],
            [ 0.64, -0.48,  0.36]])
     """
-    i, j = np.triu_indices(rotation.shape[-1])
-    return np.asarray(rotation[..., i] * rotation[..., j])
+    i, j = np.triu_indices(vectors.shape[-1])
+    return np.asarray(np.take(vectors, i, axis=-1) * np.take(vectors, j, axis=-1))
 
 
 def _of_products(form: Floats) -> Floats:
     """Return the coefficients of the products u_i u_j, i <= j, in quadratic forms (..., d, d)."""
-    i, j = np.triu_indices(form.shape[-1])
-    return np.asarray(np.where(i == j, 0.5, 1.0) * (form[..., i, j] + form[..., j, i]))
+    d = form.shape[-1]
+    i, j = np.triu_indices(d)
+    place = np.arange(d * d)[:, None]
+    each = (place == i * d + j) | (place == j * d + i)
+    return np.asarray(form.reshape(*form.shape[:-2], d * d) @ each.astype(np.float64))
 
 
 def axis_noise(sample: Residuals) -> AxisNoise:
@@ -632,7 +641,7 @@ def axis_noise(sample: Residuals) -> AxisNoise:
     array([0.031, 0.032, 0.059])
     """
     count, d = sample.count, sample.template.shape[2]
-    mix = expected_squares(sample.rotation, sample.keeps)
+    mix = sample.expected
     lab = sample.in_lab(sample.vector)
     unbiased = count / np.maximum(count - 1, 1)
     square = np.einsum("bkni,bkni->bki", lab, lab) * unbiased[:, None, None]
@@ -732,7 +741,7 @@ def measure_stretch(
     # The step is linear in the stretch; its second order is then small against the error.
     settled = usable & ((step.value**2 <= 0.1 * step.stderr) | (trials == 1))
     taken = np.where(settled, step.value, 0.0)[:, None, None, None]
-    rest = replace(sample, vector=sample.vector - taken * left)
+    rest = sample.with_vector(sample.vector - taken * left)
     found = Slope(scale * (1.0 + step.value), scale * step.stderr, step.freedom)
     stretch = Stretch(found.where(settled, unknown), rest, list(motions))
     bodies = np.flatnonzero(usable & ~settled)
@@ -776,7 +785,7 @@ def _stretch_step(sample: Residuals) -> tuple[Slope, Floats]:
     mean = square / (sample.freedom * np.maximum(sample.count - 1, 1))
     variance = np.repeat(mean[:, None], 3, axis=1)
     covariance = ((_VARIANCE_SPREAD * mean) ** 2)[:, None, None] * np.eye(3)
-    noise = axis_noise(replace(sample, vector=vector))
+    noise = axis_noise(sample.with_vector(vector))
     measured = np.isfinite(noise.variance).all(axis=1)
     if measured.any():
         some = covariance[measured]
@@ -814,10 +823,9 @@ def _noise_products(sample: Residuals, left: Floats) -> tuple[Floats, Floats]:
     coefficients are those of the body; the frames enter by the sums of the products u_i u_j.
     """
     form = _noise_forms(sample)
-    axes = _axis_products(sample.rotation)
+    axes = _products(sample.rotation)
     bodies, count, _, products = axes.shape
     up, every = axes[:, :, 2], axes.reshape(bodies, count, -1)
-    up_pairs = (up[..., :, None] * up[..., None, :]).reshape(bodies, count, -1)
 
     def summed(factor: Floats) -> Floats:
         """Sum the products of a factor (B, K, x) with those of each axis, (B, x, 3, 6)."""
@@ -826,7 +834,7 @@ def _noise_products(sample: Residuals, left: Floats) -> tuple[Floats, Floats]:
 
     residual = np.einsum("zxau,zxu->za", summed(left.reshape(bodies, count, -1)), form.shift)
     residual += np.einsum("zxau,zxu->za", summed(up), form.crossed)
-    return residual, np.einsum("zxau,zxu->za", summed(up_pairs), form.square)
+    return residual, np.einsum("zxau,zxu->za", summed(_products(up)), form.square)
 
 
 class _NoiseForms(NamedTuple):
@@ -838,8 +846,8 @@ class _NoiseForms(NamedTuple):
         Mean residual of every coordinate in body axes, by u_i u_j.
     crossed : ndarray, shape (B, 6, 6)
         Mean product of the residual and of the error of the stretch, by z_i z_j and u_k u_l.
-    square : ndarray, shape (B, 36, 6)
-        Mean square of the error of the stretch, by z_i z_j z_k z_l and u_m u_n.
+    square : ndarray, shape (B, 21, 6)
+        Mean square of the error of the stretch, by the products of two z_i z_j, and by u_k u_l.
     """
 
     shift: Floats
@@ -866,7 +874,8 @@ def _noise_forms(sample: Residuals) -> _NoiseForms:
     crossed = np.einsum("zixpu,zixpv->zuv", slope, shared)
     slope = slope.reshape(bodies, n * d, -1)
     pairs = (np.swapaxes(slope, 1, 2) @ slope).reshape(bodies, 3, 6, 3, 6)
-    square = pairs.transpose(0, 2, 4, 1, 3).reshape(bodies, 36, 9) @ turn.reshape(bodies, 9, 6)
+    pairs = _of_products(pairs.transpose(0, 1, 3, 2, 4)).reshape(bodies, 9, -1)
+    square = np.swapaxes(pairs, 1, 2) @ turn.reshape(bodies, 9, -1)
     return _NoiseForms(shift.reshape(bodies, n * d, -1), crossed, square)
 
 
@@ -900,7 +909,7 @@ def measure_scan(sample: Residuals) -> Slope:
     if sample.rotation.shape[-1] != 3:
         return Slope.unknown(sample.count.shape)
     height = sample.rotation[:, :, 2] @ np.swapaxes(sample.template, 1, 2)
-    velocity = (sample.velocity[:, :, None] @ sample.rotation)[:, :, 0]
+    velocity = np.einsum("bki,bkij->bkj", sample.velocity, sample.rotation)
     return regress(sample, height[..., None] * velocity[:, :, None])
 
 

@@ -174,7 +174,9 @@ class RigidMotion(Shown):
     def usual_interval(self) -> float:
         """The median time between neighbouring poses of one piece, s; dt where there is no step."""
         start, stop = self.steps()
-        return float(np.median(self.time[stop] - self.time[start])) if start.size else self.dt
+        interval = np.sort(self.time[stop] - self.time[start])
+        middle = interval[[(start.size - 1) // 2, start.size // 2]] if start.size else self.dt
+        return float(np.mean(middle))
 
     @property
     def step_covariance(self) -> Floats:

@@ -18,7 +18,7 @@ from perrin._arrays import (
     to_plain,
 )
 from perrin._display import Shown
-from perrin.geometry.shapes import lengths, pair_distances
+from perrin.geometry.shapes import lengths
 from perrin.motion.residuals import (
     SIGNIFICANCE,
     Slope,
@@ -320,7 +320,8 @@ def judge_each(
                 sigma=sigma,
                 sigma_ratio=sigma_ratio,
                 corrections=[corrections[k] for k in rows],
-                detections=[detections[k] for k in rows],
+                # Of the positions themselves none was left out.
+                detections=[None if detections[k] is positions[k] else detections[k] for k in rows],
                 unsettled=[unsettled[k] for k in rows],
             )
             found.update(zip(rows, judged, strict=True))
@@ -703,7 +704,10 @@ def bond_drifts(x: Floats) -> list[BondDrift]:
     [BondDrift(change=0.5, pair=(0, 1), distances=(1.0, 1.5))]
     """
     bodies, frames, n, _ = x.shape
-    distances = np.ascontiguousarray(np.moveaxis(pair_distances(x), 1, -1))  # (B, pairs, T)
+    first, second = np.triu_indices(n, 1)
+    along = np.ascontiguousarray(np.moveaxis(x, 1, -1))  # (B, n, d, T)
+    off = along[:, first] - along[:, second]
+    distances = np.sqrt(np.einsum("bpit,bpit->bpt", off, off))
     blocks = np.array_split(np.arange(frames), min(_TIME_BLOCKS, max(1, frames // 5)))
     width = max(len(rows) for rows in blocks)
     # The values of every block without the missing ones, those to the right.
@@ -738,7 +742,6 @@ def bond_drifts(x: Floats) -> list[BondDrift]:
     error = noise * np.sqrt(1 / np.maximum(n_low, 1) + 1 / np.maximum(n_high, 1))
     changed = several & (high - low > _DRIFT_ERRORS * error)
     change = np.divide(high - low, low, out=np.zeros_like(low), where=changed)
-    first, second = np.triu_indices(n, 1)
     found = []
     for k, worst in enumerate(change.argmax(axis=1).tolist() if n > 1 else [0] * bodies):
         if n < 2 or not change[k, worst] > 0:

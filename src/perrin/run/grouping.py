@@ -67,7 +67,7 @@ def assign_clusters(
     import pandas as pd
 
     remarks = Remarks()
-    if "z" in table and table["z"].nunique() == 1:
+    if "z" in table and table["z"].min() == table["z"].max():
         remarks.warnings.append(CONSTANT_Z)
     labels: dict[int, str] = {}
     marked = "cluster" in table

@@ -281,7 +281,7 @@ def frame_stride(table: pd.DataFrame) -> tuple[str, ...]:
     >>> frame_stride(pd.DataFrame({"frame": [0, 5, 10, 20]}))[0][:36]
     'frame numbers are multiples of 5: a '
     """
-    frame = np.unique(table["frame"].to_numpy(dtype=np.int64))
+    frame = np.sort(table["frame"].unique().astype(np.int64))
     stride = int(np.gcd.reduce(np.diff(frame))) if len(frame) > 2 else 1
     if stride == 1:
         return ()

@@ -474,11 +474,15 @@ def _columns_of(table: pd.DataFrame, *, unique: Sequence[str] = ("frame", "parti
     faults += [] if len(table) else ["no rows"]
     if not faults:
         x = coordinates(table)
-        number = table["frame"].to_numpy(dtype=np.float64)
+        broken = 0
+        if table["frame"].dtype.kind not in "iu":
+            number = table["frame"].to_numpy(dtype=np.float64)
+            broken = int(np.count_nonzero(number != np.round(number)))
+        infinite = np.logical_or.reduce([np.isinf(axis) for axis in x.T])
         distinct = are_distinct([table[name].to_numpy() for name in unique])
         counts = {
-            "frame numbers that are not whole": (number != np.round(number)).sum(),
-            "rows with an infinite coordinate": np.isinf(x).any(axis=1).sum(),
+            "frame numbers that are not whole": broken,
+            "rows with an infinite coordinate": np.count_nonzero(infinite),
             "rows that repeat a particle in a frame": 0
             if distinct
             else table.duplicated(list(unique)).sum(),
