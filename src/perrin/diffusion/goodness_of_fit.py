@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from perrin._arrays import frozen
-from perrin.diffusion.step_kernels import covariance_bands, difference_eigenvalues
+from perrin.diffusion.step_kernels import SineModes, covariance_bands, difference_eigenvalues
 from perrin.diffusion.step_spectra import (
     confined_autocovariance,
     fractional_slope,
@@ -287,16 +287,20 @@ class AxisModel:
             v = trials[np.argmin(cost, axis=-1)]
         else:
             v = np.broadcast_to(self.ratio(near.D, near.offset + noise), y.shape[:2])
+        # The variances of the modes for D = 1, 2 tau + 2 c theta with theta = tau (e^v - 1)/2.
+        count, v = len(c), np.array(v).ravel()
+        modes = SineModes.of_powers(power.reshape(-1, count), by_D=2 * tau, by_theta=2 * c)
         for _ in range(60 if near is None else 4):
-            shape = relative(v)
-            D = np.mean(power / shape, axis=-1)
-            g = tau * np.exp(v)[..., None] * c / shape
-            g = g - g.mean(axis=-1, keepdims=True)
-            r = power / (D[..., None] * shape)
-            move = np.sum(g * r, axis=-1) / np.sum(g * g, axis=-1)
+            theta, growth = tau * np.expm1(v) / 2, tau * np.exp(v)
+            sums = modes.sums(np.ones_like(v), theta)
+            # Sums over the modes of power/variance and of c power/variance^2, over D.
+            D = 2 * (sums.rise_D + theta * sums.rise) / count
+            slope = growth * (sums.rise / D - sums.fall)
+            move = slope / (growth**2 * (-0.5 * sums.fall_oo - sums.fall**2 / count))
             v = np.clip(v + np.clip(move, -1.0, 1.0), _LEAST_V, _MOST_V)
             if np.all(np.abs(move) < 1e-10):
                 break
+        v = v.reshape(y.shape[:2])
         D = np.mean(power / relative(v), axis=-1)
         return AxisFit(y, D, D * tau * np.expm1(v) / 2 - noise)
 

@@ -232,6 +232,28 @@ class SineModes:
             steady=steady,
         )
 
+    @classmethod
+    def of_powers(cls, power: Floats, *, by_D: float, by_theta: Floats) -> SineModes:
+        """Return the modes of several single axes, of eigenvalues D by_D + theta by_theta.
+
+        Parameters
+        ----------
+        power : ndarray, shape (G, K)
+        by_D : float
+        by_theta : ndarray, shape (K,)
+        """
+        groups, count = np.arange(len(power)), power.shape[1]
+        return cls(
+            groups=groups,
+            starts=groups * count,
+            which=np.repeat(groups, count),
+            power=power.ravel(),
+            count=np.ones(power.size),
+            by_D=np.full(power.size, by_D),
+            by_theta=np.tile(by_theta, len(groups)),
+            given=np.zeros(power.size),
+        )
+
     @property
     def size(self) -> int:
         """Number of modes of all axes."""
