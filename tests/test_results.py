@@ -169,6 +169,7 @@ class TestFromRotations:
 def test_progress_counts_the_clusters_of_every_long_step(tmp_path, monkeypatch):
     """Steps begin at 0 of their total; 20 clusters are estimated in two parts, written singly."""
     monkeypatch.setattr("perrin.report.write.save_figures", lambda *_, **__: [])
+    monkeypatch.setattr("perrin.run.measure.clusters_together", lambda *_: 16)
     calls: dict[str, list[tuple[int, int]]] = {}
 
     def progress(done, total, title):

@@ -66,7 +66,7 @@ def tetrahedra(count, n_frames):
 
 def test_a_dask_cluster_gives_the_results_of_one_process(scheduler, monkeypatch):
     """Every number, remark and failure is the same to the last bit, in the same order."""
-    monkeypatch.setattr(measure, "clusters_together", lambda count: 2)
+    monkeypatch.setattr(measure, "clusters_together", lambda count, poses: 2)
     table = tetrahedra(4, 15)
     alone = perrin.analyze(table, dt=0.7)
     shared = perrin.analyze(table, dt=0.7, scheduler=scheduler)

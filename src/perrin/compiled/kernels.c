@@ -640,8 +640,9 @@ INLINE void add_spectrum(const Spectra *all, Py_ssize_t first, Py_ssize_t count,
 EVERY_MACHINE
 static void sum_spectra(const Spectra *all)
 {
-    for (Py_ssize_t i = 0; i < all->points * all->motions; i++) {
-        Py_ssize_t motion = i % all->motions;
+    /* All points of one track after each other: its modes stay in the cache. */
+    for (Py_ssize_t n = 0; n < all->points * all->motions; n++) {
+        Py_ssize_t motion = n / all->points, i = n % all->points * all->motions + motion;
         double *sums = all->sums + i * SPECTRUM_SUMS;
         for (int j = 0; j < SPECTRUM_SUMS; j++)
             sums[j] = 0.0;

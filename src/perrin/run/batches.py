@@ -18,10 +18,10 @@ if TYPE_CHECKING:
 S = TypeVar("S")
 T = TypeVar("T")
 
-# Clusters of a batch: half of them, so that two processes share them, not fewer than are efficient,
-# nor more than bound the memory. Results may depend on it in the last digits, and so it does not
-# depend on the number of processes.
-_FEWEST_MEASURED, _MOST_MEASURED = 16, 256
+# Clusters of a batch have so many poses together, which take a second or two: a process starts in
+# longer. More clusters gain no time, and fewer are not efficient. Results may depend on it in the
+# last digits, and so it does not depend on the number of processes.
+_POSES_TOGETHER, _FEWEST_MEASURED, _MOST_MEASURED = 80_000, 16, 256
 
 
 class InOrder(Protocol):
@@ -42,15 +42,16 @@ class _NumberedTask:
         return number, self.task(batch)
 
 
-def clusters_together(count: int) -> int:
-    """Return how many of `count` clusters are a batch.
+def clusters_together(count: int, poses: int) -> int:
+    """Return how many of `count` clusters, which have this many poses together, are a batch.
 
     Examples
     --------
-    >>> [clusters_together(count) for count in (5, 1000, 10_000)]
-    [16, 256, 256]
+    >>> [clusters_together(500, 500 * frames) for frames in (100, 400, 10_000)]
+    [256, 200, 16]
     """
-    return min(max(-(-count // 2), _FEWEST_MEASURED), _MOST_MEASURED)
+    size = count * _POSES_TOGETHER // max(poses, 1)
+    return min(max(size, _FEWEST_MEASURED), _MOST_MEASURED)
 
 
 def batches_of(items: Iterable[S], *, size: int) -> Iterator[list[S]]:

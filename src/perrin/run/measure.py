@@ -424,7 +424,9 @@ def fit_clusters(
     failures: list[tuple[str, ValueError]] = []
     count = table["cluster"][table["cluster"] >= 0].nunique()
     fit = partial(fit_batch, labels=labels, experiment=experiment, recording=recording)
-    batches = batches_of(each_cluster(table), size=clusters_together(count))
+    # A pose has four rows or more in most tables.
+    size = clusters_together(count, len(table) // 4)
+    batches = batches_of(each_cluster(table), size=size)
     if progress is not None:
         progress(0, count, "fitting clusters")
     for more_bodies, more_rods, more_failures in in_order(fit, batches):
@@ -744,7 +746,8 @@ def measure_bodies(
     measure = partial(measure_together, experiment=experiment, recording=recording, tested=count)
     if progress is not None:
         progress(0, count, "estimating D_R and D_T")
-    batches = batches_of(bodies, size=clusters_together(count))
+    poses = sum(len(body.motion.time) for body in bodies)
+    batches = batches_of(bodies, size=clusters_together(count, poses))
     for found, failed in in_order(measure, batches):
         measured += found
         failures += failed
