@@ -99,6 +99,7 @@ from perrin.images.optics.crowd_fit import (
     missing_spheres,
     plausible_spheres,
 )
+from perrin.images.optics.depth import DepthChange, significant_slopes
 from perrin.images.optics.flicker import (
     LineChanges,
     Lines,
@@ -228,6 +229,7 @@ __all__ = [
     "CrowdSample",
     "CrowdWindow",
     "DeclaredSeries",
+    "DepthChange",
     "Fading",
     "Features",
     "Format",
@@ -399,6 +401,7 @@ __all__ = [
     "sequence_files",
     "serve",
     "settled_image",
+    "significant_slopes",
     "significant_sums",
     "size_faults",
     "size_spread",

@@ -536,6 +536,31 @@ def asymmetric_point_spread(optics: Optics | None) -> Findings:
     return Findings(notes=(text,))
 
 
+def changing_point_spread(optics: Optics | None) -> Findings:
+    """Note that the point spread changes with the height of a sphere, which the fits allow for.
+
+    Parameters
+    ----------
+    optics : Optics or None
+
+    Examples
+    --------
+    >>> changing_point_spread(None)
+    Findings(warnings=(), notes=())
+    """
+    if optics is None or optics.depth is None:
+        return _NOTHING
+    depth = optics.depth
+    first, last = (depth.psf(optics.psf, height) for height in (depth.low, depth.high))
+    text = (
+        f"point spread by depth: its standard deviations are {first[0]:.3g} um along z and "
+        f"{first[1]:.3g} um in the plane at a height of {depth.low:.3g} um, and {last[0]:.3g} and "
+        f"{last[1]:.3g} um at {depth.high:.3g} um, as in a sample with another refractive index "
+        "than the immersion; the fits allow for it"
+    )
+    return Findings(notes=(text,))
+
+
 def image_misfit(features: pd.DataFrame, optics: Optics | None) -> Findings:
     """Note that the residuals of the fits to images exceed the noise, at a level of 1 %.
 

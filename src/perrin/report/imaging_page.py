@@ -303,6 +303,11 @@ def _channel_facts(imaging: Imaging, optics: Optics) -> list[Fact]:
         kinds = listed(optics.asymmetry.kinds)
         remark = f"{kinds}; the fits allow for it to first order"
         tail.append(("shape of the point spread", "asymmetric", remark))
+    if optics.depth is not None:
+        low, high = optics.depth.low, optics.depth.high
+        widths = [number_text(optics.depth.psf(optics.psf, height)[0]) for height in (low, high)]
+        remark = f"{number_text(low)} and {number_text(high)} µm high in the stack"
+        tail.append(("point spread along z by depth", f"{' to '.join(widths)} µm", remark))
     if optics.spread:
         expected += f"; spheres differ by {100 * optics.spread:.1f} % (standard deviation)"
     return [

@@ -34,6 +34,7 @@ from perrin.images.optics.crowd_fit import (
     missing_spheres,
     plausible_spheres,
 )
+from perrin.images.optics.depth import DepthChange, significant_slopes
 from perrin.images.optics.flicker import (
     LineChanges,
     Lines,
@@ -118,6 +119,7 @@ __all__ = [
     "CrowdIntensity",
     "CrowdSample",
     "CrowdWindow",
+    "DepthChange",
     "FreeCenters",
     "GroupSample",
     "ImageFit",
@@ -191,6 +193,7 @@ __all__ = [
     "residual_maps",
     "saturated_share",
     "settled_image",
+    "significant_slopes",
     "significant_sums",
     "size_spread",
     "slopes_of_spheres",

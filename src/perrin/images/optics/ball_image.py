@@ -23,6 +23,7 @@ from perrin.images.optics.asymmetry import (
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from perrin.images.optics.depth import DepthChange
     from perrin.images.optics.point_spread import PointSpread
 
 # Spacing of the table's knots in units of the blur along each axis; the cubic error is below 1e-4.
@@ -38,6 +39,10 @@ _TABLE_RANGE, _TAIL_TABLE_RANGE = 4.5, 3.5
 # Where diameters differ: largest deviation of a sphere's from the mean, in standard deviations and
 # in its logarithm, and the spacing of the tables in units of the blur; the cubic error is 1e-3.
 _SIZE_RANGE, _MAX_SIZE_RANGE, _SIZE_SPACING = 4.0, 0.3, 0.4
+
+# Heights at which the image is tabulated where the point spread changes with the height: between
+# them the cubic error of a width that doubles is 1e-3.
+_HEIGHT_NODES = 5
 
 
 class PsfTail(NamedTuple):
@@ -87,6 +92,18 @@ class BallBlur(NamedTuple):
             for axis in (0, 1)
         )
         return z, plane
+
+    def widened(self, z: float, plane: float) -> BallBlur:
+        """Return the ball with these added to the variances (z, plane) of all blurs, um^2.
+
+        A blur along z stays at least that in the plane, and each at least half of its own.
+        """
+        components = []
+        for share, (blur_z, blur) in self.components:
+            across = float(np.sqrt(max(blur**2 + plane, blur**2 / 4)))
+            along = float(np.sqrt(max(blur_z**2 + z, blur_z**2 / 4, across**2)))
+            components.append((share, (along, across)))
+        return self._replace(components=tuple(components))
 
     def intensity(self, z: Floats, rho: Floats) -> Floats:
         """Return the intensity (len(z), len(rho)) at heights z and distances rho from the axis.
@@ -160,6 +177,8 @@ class SphereImage:
     asymmetry : Asymmetry or None
         By what the point spread differs from an even body of revolution. It changes the value of
         the image; the gradient is that without it.
+    depth : DepthChange or None
+        How the point spread changes with the height of a sphere in the stack.
 
     Examples
     --------
@@ -182,6 +201,9 @@ class SphereImage:
     _tables: Floats
     asymmetry: Asymmetry | None = None
     _uneven_knots: Floats | None = None
+    depth: DepthChange | None = None
+    _height_tables: Floats | None = None
+    _height_slope: Floats | None = None
 
     @property
     def reach(self) -> tuple[float, float, float]:
@@ -201,43 +223,75 @@ class SphereImage:
         """Largest deviation of the logarithm of a diameter from the mean."""
         return _size_range(self.spread)
 
-    def sized(self, deviation: float) -> SphereImage:
-        """Return the image of a sphere whose logarithm of the diameter deviates from the mean."""
-        if self.spread == 0:
+    @property
+    def is_uneven(self) -> bool:
+        """Whether the point spread is no even body of revolution, at some height at least."""
+        return self._uneven_knots is not None
+
+    def sized(self, deviation: float, height: float | None = None) -> SphereImage:
+        """Return the image of one sphere.
+
+        Parameters
+        ----------
+        deviation : float
+            Deviation of the logarithm of its diameter from the mean.
+        height : float, optional
+            Its height in the stack, um; by default the one at which the point spread is `psf`.
+        """
+        if self.spread == 0 and self.depth is None:
             return self
         value, _ = self._between_sizes(deviation)
-        return replace(self, _knots=np.tensordot(value, self._tables, 1))
+        tables, slopes = self._tables_at(height)
+        image = replace(self, _knots=np.tensordot(value, tables, 1))
+        if self.depth is None:
+            return image
+        uneven = None
+        if self.is_uneven:
+            at = self.depth.middle if height is None else height
+            uneven = self.depth.asymmetry(self.asymmetry, at)
+        slope = np.tensordot(value, slopes, 1)
+        return replace(image, depth=None, asymmetry=uneven, _height_slope=slope)
 
-    def size_slope(self, deviation: float) -> Floats:
-        """Return the table (1, ...) of the derivative by this deviation, for `slope_spot`."""
+    def size_slope(self, deviation: float, height: float | None = None) -> Floats:
+        """Return the table (1, ...) of the derivative of `sized` by the deviation."""
         _, slope = self._between_sizes(deviation)
-        return np.asarray(np.tensordot(slope, self._tables, 1)[None])
+        return np.asarray(np.tensordot(slope, self._tables_at(height)[0], 1)[None])
+
+    def _tables_at(self, height: float | None) -> tuple[Floats, Floats]:
+        """Return the tables of all sizes at a height, and their derivatives by the height."""
+        if self.depth is None or height is None:
+            return self._tables, np.zeros_like(self._tables)
+        assert self._height_tables is not None
+        nodes = self.depth.nodes(_HEIGHT_NODES)
+        within = float(np.clip(height, nodes[0], nodes[-1]))
+        value, slope = _between(nodes, within)
+        if within != height:
+            slope = np.zeros_like(slope)
+        tables = self._height_tables
+        return np.tensordot(value, tables, 1), np.tensordot(slope, tables, 1)
 
     def _between_sizes(self, deviation: float) -> tuple[Floats, Floats]:
         """Return the factors of the tables at a deviation, and their derivatives."""
-        step = self._sizes[1] - self._sizes[0]
-        t = (deviation - self._sizes[0]) / step
-        first = int(np.clip(np.floor(t) - 1, 0, len(self._sizes) - 4))
-        u = t - first
-        value, slope = np.zeros((2, len(self._sizes)))
-        for k in range(4):
-            other = np.array([j for j in range(4) if j != k])
-            scale = float(np.prod(k - other))
-            a, b, c = u - other
-            value[first + k] = a * b * c / scale
-            slope[first + k] = (a * b + b * c + a * c) / (scale * step)
-        return value, slope
+        if self.spread == 0:
+            return np.ones(1), np.zeros(1)
+        return _between(self._sizes, deviation)
 
-    def spot(self, center: Floats, shape: tuple[int, ...]) -> SphereSpot:
+    def spot(
+        self, center: Floats, shape: tuple[int, ...], *, height: float | None = None
+    ) -> SphereSpot:
         """Return the image of a sphere at `center` (z, y, x), um, inside an array of `shape`.
 
-        The origin is the centre of voxel (0, 0, 0); the box is cut at the array's borders.
+        The origin is the centre of voxel (0, 0, 0); the box is cut at the array's borders. `height`
+        is that in the stack; by default it is the height in the array.
         """
         box, (z, y, x) = self._covered(center, shape)
-        value, gradient = self.at(z, y, x)
+        image = self
+        if self.depth is not None:
+            image = self.sized(0.0, float(center[0]) if height is None else height)
+        value, gradient = image.at(z, y, x)
         return SphereSpot(box, value, gradient)
 
-    def on_voxels(self, mask: Bools, centers: Floats, sizes: Floats) -> Floats:
+    def on_voxels(self, mask: Bools, centers: Floats, sizes: Floats, heights: Floats) -> Floats:
         """Return the images of spheres and their gradients on the voxels of a mask.
 
         Both are those without the asymmetry of the point spread, see `changes_on_voxels`.
@@ -250,6 +304,8 @@ class SphereImage:
             Positions (z, y, x) from the centre of voxel (0, 0, 0), um.
         sizes : ndarray, shape (n,)
             Deviations of the logarithms of the diameters from the mean.
+        heights : ndarray, shape (n,)
+            Heights in the stack, um.
 
         Returns
         -------
@@ -260,39 +316,51 @@ class SphereImage:
         if kernels is None:
             even = replace(self, asymmetry=None, _uneven_knots=None)
             whole = np.zeros((len(centers), 4, *mask.shape))
-            for layer, center, size in zip(whole, centers, sizes, strict=True):
-                spot = even.sized(size).spot(center, mask.shape)
+            for layer, center, size, high in zip(whole, centers, sizes, heights, strict=True):
+                spot = even.sized(size, high).spot(center, mask.shape)
                 layer[(0, *spot.box)] = spot.value
                 layer[(slice(1, None), *spot.box)] = spot.gradient
             kept = whole.reshape(4 * len(centers), -1).take(np.flatnonzero(mask), axis=1)
             return kept.reshape(len(centers), 4, -1)
-        tables = self._knots[None]
-        if self.spread > 0 and len(sizes):
-            tables = np.stack([self.sized(size)._knots for size in sizes])
+        own = [self]
+        if self.spread > 0 or self.depth is not None:
+            own = [self.sized(s, high) for s, high in zip(sizes, heights, strict=True)] or own
+        place = np.ascontiguousarray(centers)
+        lengths = [np.array(length) for length in (self.voxel, self.reach, self._spacing)]
         out = np.empty((len(centers), 4, np.count_nonzero(mask)))
-        lengths = (np.array(length) for length in (self.voxel, self.reach, self._spacing))
-        kernels.spots(mask, np.ascontiguousarray(centers), *lengths, tables, out)
+        kernels.spots(mask, place, *lengths, np.stack([image._knots for image in own]), out)
+        slopes = [image._height_slope for image in own if image._height_slope is not None]
+        if slopes:
+            # A sphere that moves up has another point spread, too.
+            more = np.empty_like(out)
+            kernels.spots(mask, place, *lengths, np.stack(slopes), more)
+            out[:, 1] += more[:, 0]
         return out
 
-    def changes_on_voxels(self, mask: Bools, centers: Floats, sizes: Floats) -> Floats:
+    def changes_on_voxels(
+        self, mask: Bools, centers: Floats, sizes: Floats, heights: Floats
+    ) -> Floats:
         """Return what the asymmetry adds to the images of spheres on the voxels of a mask, (n, m).
 
         The parameters are those of `on_voxels`.
         """
         whole = np.zeros((len(centers), *mask.shape))
-        if self.asymmetry is not None:
-            for layer, center, size in zip(whole, centers, sizes, strict=True):
+        if self.is_uneven:
+            for layer, center, size, high in zip(whole, centers, sizes, heights, strict=True):
                 box, offsets = self._covered(center, mask.shape)
-                layer[box] = self._change(*(x * float(np.exp(-size)) for x in offsets))
+                own = self.asymmetry
+                if self.depth is not None:
+                    own = self.depth.asymmetry(own, high)
+                layer[box] = self._change(own, *(x * float(np.exp(-size)) for x in offsets))
         return whole[:, mask]
 
-    def _change(self, z: Floats, y: Floats, x: Floats) -> Floats:
-        """Return what the asymmetry of the point spread adds to the image, on a grid of offsets."""
-        assert self.asymmetry is not None
+    def _change(self, own: Asymmetry | None, z: Floats, y: Floats, x: Floats) -> Floats:
+        """Return what an asymmetry of the point spread adds to the image, on a grid of offsets."""
+        assert own is not None
         assert self._uneven_knots is not None
         along, across = self._splines(z, y, x, knots=self._uneven_knots)
         change = change_of_image(
-            *(self.asymmetry, self._uneven_knots),
+            *(own, self._uneven_knots),
             along=along,
             across=across,
             z=z,
@@ -418,9 +486,11 @@ class SphereImage:
         outward = across_slope / (self._spacing[1] * np.where(rho > 0, rho, 1.0)).reshape(-1, 1)
         value = (profile @ across.T).reshape(shape)
         if self._uneven_knots is not None:
-            value += self._change(z, y, x)
+            value += self._change(self.asymmetry, z, y, x)
         by_rho = (profile @ outward.T).reshape(shape)
         gradient = np.empty((3, *shape))
+        if self._height_slope is not None:
+            by_z = by_z + along @ self._height_slope
         np.matmul(by_z, across.T, out=gradient[0].reshape(len(z), rho.size))
         np.multiply(by_rho, -y[:, None], out=gradient[1])
         np.multiply(by_rho, -x, out=gradient[2])
@@ -437,6 +507,7 @@ def sphere_image(
     measured: PointSpread | None = None,
     shell: bool = False,
     asymmetry: Asymmetry | None = None,
+    depth: DepthChange | None = None,
 ) -> SphereImage:
     """Tabulate a ball convolved with an anisotropic point spread and with the voxels.
 
@@ -458,6 +529,8 @@ def sphere_image(
         The surface of the sphere is fluorescent, in place of all of it.
     asymmetry : Asymmetry, optional
         By what the point spread differs from an even body of revolution.
+    depth : DepthChange, optional
+        How the point spread changes with the height of a sphere in the stack.
 
     Returns
     -------
@@ -516,15 +589,45 @@ def sphere_image(
     if spread > 0:
         half = int(np.ceil(_size_range(spread) * diameter / 2 / (_SIZE_SPACING * blur))) + 1
         sizes = np.linspace(-1.0, 1.0, 2 * half + 1) * _size_range(spread)
-        balls = [ball._replace(diameter=diameter * float(np.exp(size))) for size in sizes]
-        tables = np.stack([_spline_knots(sphere.intensity(z, rho)) for sphere in balls])
+        tables = _tables_of_sizes(ball, sizes, z, rho)
     frozen(knots, sizes, tables)
     image = SphereImage(
         diameter, psf, voxel, (blur_z, blur), tail, spread, ball, knots, spacing, sizes, tables
     )
-    if asymmetry is None or not any(asymmetry):
-        return image
-    return replace(image, asymmetry=asymmetry, _uneven_knots=image.asymmetry_knots())
+    if asymmetry is not None and not any(asymmetry):
+        asymmetry = None
+    uneven = None
+    if asymmetry is not None or (depth is not None and any(depth.slopes[2:])):
+        uneven = image.asymmetry_knots()
+    high = None
+    if depth is not None:
+        balls = [ball.widened(*depth.variances(at)) for at in depth.nodes(_HEIGHT_NODES)]
+        high = np.stack([_tables_of_sizes(one, sizes, z, rho) for one in balls])
+    return replace(
+        image, asymmetry=asymmetry, _uneven_knots=uneven, depth=depth, _height_tables=high
+    )
+
+
+def _tables_of_sizes(ball: BallBlur, sizes: Floats, z: Floats, rho: Floats) -> Floats:
+    """Return the knots of the images of balls whose logarithms of the diameter deviate."""
+    balls = [ball._replace(diameter=ball.diameter * float(np.exp(size))) for size in sizes]
+    return np.stack([_spline_knots(one.intensity(z, rho)) for one in balls])
+
+
+def _between(grid: Floats, at: float) -> tuple[Floats, Floats]:
+    """Return the factors of tables on an even grid in the cubic between them, and their slopes."""
+    step = grid[1] - grid[0]
+    t = (at - grid[0]) / step
+    first = int(np.clip(np.floor(t) - 1, 0, len(grid) - 4))
+    u = t - first
+    value, slope = np.zeros((2, len(grid)))
+    for k in range(4):
+        other = np.array([j for j in range(4) if j != k])
+        scale = float(np.prod(k - other))
+        a, b, c = u - other
+        value[first + k] = a * b * c / scale
+        slope[first + k] = (a * b + b * c + a * c) / (scale * step)
+    return value, slope
 
 
 def _size_range(spread: float) -> float:

@@ -12,6 +12,7 @@ from perrin.images.optics.asymmetry import Asymmetry, significant_sums
 from perrin.images.optics.ball_image import BallBlur, PsfTail, SphereImage, sphere_image
 from perrin.images.optics.crowd_equations import profile_information, slopes_of_spheres
 from perrin.images.optics.crowd_fit import fit_crowd
+from perrin.images.optics.depth import DepthChange, significant_slopes
 from perrin.images.optics.flicker import LineChanges, Lines, find_flicker, find_gain_spread
 from perrin.images.optics.neighbours import (
     THIRD_DIFFERENCE,
@@ -61,8 +62,14 @@ _SHELL_MISFIT = 1.3
 # and increases the logarithm of the likelihood of the diameters by at least this.
 _FIRST_SPREAD, _LEAST_SPREAD, _LEAST_SPREAD_GAIN = 0.06, 0.007, 5.0
 
-# Rounds of the search for an asymmetry of the point spread.
-_ASYMMETRY_ROUNDS = 4
+# Rounds of the search for moments of the point spread, and their number: the components of an
+# asymmetry, and the slopes of four moments against the height.
+_MOMENT_ROUNDS, _N_SLOPES = 4, len(DepthChange(0.0, 0.0, 0.0).slopes)
+_N_MOMENTS = len(Asymmetry._fields) + _N_SLOPES
+_OF_DEPTH = np.arange(_N_MOMENTS) >= _N_MOMENTS - _N_SLOPES
+
+# Components of an asymmetry that differ above and below the focus alone.
+_ABOVE_FOCUS = [Asymmetry._fields.index(name) for name in ("zzz", "zrr")]
 
 # Change of the spread, relative to it, at which its search ends.
 _SPREAD_CONVERGED = 0.05
@@ -238,6 +245,8 @@ class ImageParameters:
         The surface of the spheres is fluorescent, in place of all of them.
     asymmetry : Asymmetry or None
         By what the point spread differs from an even body of revolution.
+    depth : DepthChange or None
+        How the point spread changes with the height of a sphere.
 
     Examples
     --------
@@ -252,6 +261,7 @@ class ImageParameters:
     measured: PointSpread | None = None
     shell: bool = False
     asymmetry: Asymmetry | None = None
+    depth: DepthChange | None = None
 
     @property
     def voxel_blur(self) -> Floats:
@@ -286,6 +296,7 @@ class ImageParameters:
                 measured=self.measured,
                 shell=self.shell,
                 asymmetry=self.asymmetry,
+                depth=self.depth,
             )
         (psf_z, psf), *wider = (
             np.sqrt(np.square(blur) - self.voxel_blur**2).tolist() for _, blur in ball.components
@@ -301,6 +312,7 @@ class ImageParameters:
             spread=self.spread,
             shell=self.shell,
             asymmetry=self.asymmetry,
+            depth=self.depth,
         )
 
     def with_tail(self) -> ImageParameters:
@@ -373,6 +385,7 @@ class ImageParameters:
                 *(image.diameter, image.psf, noise, stderr, None, self.spread, self.measured),
                 shell=self.shell,
                 asymmetry=self.asymmetry,
+                depth=self.depth,
             )
         # The blur is the root of the sum of squares of point spread and voxel.
         factor = np.array([image.diameter, *(np.square(image.blur) / np.array(image.psf))])
@@ -381,7 +394,26 @@ class ImageParameters:
             *(image.diameter, image.psf, noise, (a, b, c), image.tail, self.spread),
             shell=self.shell,
             asymmetry=self.asymmetry,
+            depth=self.depth,
         )
+
+
+class MomentTables(NamedTuple):
+    """Tables of the derivatives of an image by the moments of the point spread.
+
+    Attributes
+    ----------
+    asymmetry : ndarray
+        Those by the components of an `Asymmetry` (`SphereImage.asymmetry_knots`).
+    widths : ndarray
+        Those by the variances along z and in the plane.
+    heights : DepthChange
+        The middle and the range of the heights of the spheres.
+    """
+
+    asymmetry: Floats
+    widths: Floats
+    heights: DepthChange
 
 
 class ImageVariations(NamedTuple):
@@ -394,17 +426,22 @@ class ImageVariations(NamedTuple):
     slopes : ndarray, shape (k, ...)
         Tables of the derivatives (`SphereImage.slopes`); of a single Gaussian the last one is that
         by the share of a tail, at a share of 0.
-    asymmetry : ndarray or None
-        Tables of the derivatives by the asymmetry of the point spread, if they are wanted.
+    moments : MomentTables or None
+        Tables of the derivatives by the moments of the point spread, if they are wanted.
     """
 
     image: SphereImage
     slopes: Floats
-    asymmetry: Floats | None = None
+    moments: MomentTables | None = None
 
     @classmethod
-    def about(cls, parameters: ImageParameters, *, asymmetry: bool = False) -> ImageVariations:
-        """Return image and derivatives at the values of parameters."""
+    def about(
+        cls, parameters: ImageParameters, *, heights: DepthChange | None = None
+    ) -> ImageVariations:
+        """Return image and derivatives at the values of parameters.
+
+        Those by the moments of the point spread are wanted where `heights` are stated.
+        """
         values, d = parameters.values, _PARAMETER_DIFFERENCE
         pairs = [
             (parameters.ball(values + shift), parameters.ball(values - shift))
@@ -415,8 +452,17 @@ class ImageVariations(NamedTuple):
             wide = np.concatenate([values, [2 * d], values[1:] + np.log(_WIDENED)])
             pairs.append((parameters.ball(wide), plain))
         image = parameters.image()
-        knots = image.asymmetry_knots() if asymmetry else None
-        return cls(image, image.slopes(pairs, 2 * d), knots)
+        slopes = image.slopes(pairs, 2 * d)
+        if heights is None:
+            return cls(image, slopes)
+        ball, square = parameters.ball(values), np.square(image.blur)
+        changes = ((d * square[0], 0.0), (0.0, d * square[1]))
+        widths = [
+            image.slopes([(ball.widened(*c), ball.widened(*(-x for x in c)))], 2 * sum(c))[0]
+            for c in changes
+        ]
+        tables = MomentTables(image.asymmetry_knots(), np.stack(widths), heights)
+        return cls(image, slopes, tables)
 
 
 class SampleFit(NamedTuple):
@@ -611,10 +657,12 @@ class GroupSample(NamedTuple):
         window = self.window(image)
         fit = fit_window(window, image, noise, FreeCenters(self.centers))
         slope = window.slopes(image, variations.slopes, fit.centers, fit.brightness, fit.sizes)
-        if variations.asymmetry is not None:
-            knots = variations.asymmetry
-            more = window.asymmetry_slopes(image, knots, fit.centers, fit.brightness)
-            slope = np.concatenate([slope, more])
+        if variations.moments is not None:
+            knots, widths, heights = variations.moments
+            spheres = fit.centers, fit.brightness
+            more = window.asymmetry_slopes(image, knots, *spheres)
+            deep = window.depth_slopes(image, widths, knots[2:4], *spheres, heights=heights)
+            slope = np.concatenate([slope, more, deep])
         # The Schur complement of the information, with the fit's own parameters eliminated.
         weighted = fit.precision.times(slope)
         nuisance = fit.precision.times(fit.jacobian)
@@ -832,7 +880,8 @@ def fit_samples(
     single spheres, fitted with a wide distribution, differ by more than their errors, their spread
     is learned too: that of greatest likelihood, and the mean diameter is the mean of the spheres.
     A point spread that is no body of revolution, or differs above and below the focus, changes the
-    image by derivatives of it (`Asymmetry`), whose factors are found where they are significant.
+    image by derivatives of it (`Asymmetry`), whose factors are found where they are significant;
+    so are changes with the height of a sphere in the stack (`DepthChange`).
     Crowds have one even Gaussian and one diameter. Samples are left out first, because dust among
     them would appear as a tail or as a spread, and all are judged again by the image that is found.
     """
@@ -877,7 +926,7 @@ def fit_samples(
             found = _settled(kept, found.parameters, found.noise)
     elif found is not plain:
         found, left_out = _without_dust(found)
-    found = _with_asymmetry(found.with_neighbours())
+    found = _with_moments(found.with_neighbours())
     optics = found.parameters.optics(found.noise, found.information)
     return LearnedOptics(optics, replace(_usual_of(found), left_out=left_out))
 
@@ -1093,45 +1142,128 @@ def _with_tail(plain: _Settled) -> _Settled:
         return plain
 
 
-def _with_asymmetry(even: _Settled) -> _Settled:
-    """Return the parameters with an asymmetric point spread, if the residuals show one.
+def _with_moments(even: _Settled) -> _Settled:
+    """Return the parameters with moments of the point spread that the residuals show.
 
-    Its components multiply derivatives of the image, so that they are the solution of linear
-    equations together with the other parameters; few rounds are enough. Those are kept that differ
-    from 0 by more than the noise and by more than the scatter between the samples, in which
-    spheres that move during a scan, say, have images that are asymmetric in one way or another.
+    These are an asymmetric point spread, and moments that change with the height of a sphere. They
+    multiply derivatives of the image, so that they are the solution of linear equations together
+    with the other parameters; few rounds are enough. Those are kept that differ from 0 by more than
+    the noise and by more than the scatter between the samples, in which spheres that move during a
+    scan, say, have images that are asymmetric in one way or another.
     """
     of_groups = all(isinstance(s, GroupSample) for s in even.samples)
     if not of_groups or even.noise.neighbours:
         return even
-    parameters, samples, n = even.parameters, even.samples, len(even.parameters.values)
-    count = len(Asymmetry._fields)
-    values, used, settled = np.zeros(count), np.ones(count, dtype=np.bool_), even
-    for number in range(_ASYMMETRY_ROUNDS):
-        variations = ImageVariations.about(parameters, asymmetry=True)
-        fits = [s.fit(variations, even.noise) for s in samples]
-        samples = [s._replace(centers=fit.centers) for s, fit in zip(samples, fits, strict=True)]
-        size = len(fits[0].score) - count  # those of the image, and of the share of a tail
-        kept = np.r_[:n, size + np.flatnonzero(used)]
-        information = np.sum([fit.information for fit in fits], axis=0)[np.ix_(kept, kept)]
-        scores = np.array([fit.score[kept] for fit in fits])
-        if number == 0:
-            covariance = np.linalg.pinv(information, hermitian=True)
-            used = significant_sums(scores @ covariance, np.diag(covariance))[n:]
-            if not used.any():
-                return even
-            kept = np.r_[:n, n + np.flatnonzero(used)]
-            information, scores = information[np.ix_(kept, kept)], scores[:, kept]
-        step = np.linalg.pinv(information, hermitian=True) @ scores.sum(axis=0)
-        values[used] += step[n:]
-        moved = parameters.moved(information[:n, :n], information[:n, :n] @ step[:n])
-        parameters = replace(moved, asymmetry=Asymmetry(*values.tolist()))
-        settled = even._replace(
-            parameters=parameters, samples=samples, fits=fits, information=information[:n, :n]
+    found = _MomentFit.of(even).with_asymmetry()
+    if found.used.any():
+        found = found.settled()
+    deeper = found.with_depth()
+    if deeper is not found:
+        found = (deeper.refitted() if found.used.any() else deeper).settled()
+    return found.now if found.used.any() else even
+
+
+class _MomentFit(NamedTuple):
+    """Fits of the samples with derivatives by the moments of the point spread.
+
+    Attributes
+    ----------
+    now : _Settled
+        Parameters and fits.
+    used : ndarray of bool, shape (16,)
+        Which components of `Asymmetry` and which slopes of `DepthChange` are fitted.
+    values : ndarray, shape (16,)
+        Their values.
+    heights : DepthChange
+        The middle and the range of the heights.
+    """
+
+    now: _Settled
+    used: Bools
+    values: Floats
+    heights: DepthChange
+
+    @classmethod
+    def of(cls, even: _Settled) -> _MomentFit:
+        """Return the fits without any of the moments."""
+        z = np.concatenate([s.centers[:, 0] for s in even.samples])
+        heights = DepthChange(float(z.mean()), float(z.min()), float(z.max()))
+        none = np.zeros(_N_MOMENTS, dtype=np.bool_)
+        return cls(even, none, np.zeros(_N_MOMENTS), heights).refitted()
+
+    def refitted(self) -> _MomentFit:
+        """Return fits of the samples at the present parameters."""
+        variations = ImageVariations.about(self.now.parameters, heights=self.heights)
+        fits = [s.fit(variations, self.now.noise) for s in self.now.samples]
+        samples = [
+            s._replace(centers=fit.centers) for s, fit in zip(self.now.samples, fits, strict=True)
+        ]
+        return self._replace(now=self.now._replace(samples=samples, fits=fits))
+
+    def equations(self, moments: Bools) -> tuple[Floats, Floats]:
+        """Return information (N, k, k) and scores (N, k) of the image and of some moments."""
+        fits, n = self.now.fits, len(self.now.parameters.values)
+        size = len(fits[0].score) - _N_MOMENTS  # those of the image, and of the share of a tail
+        kept = np.r_[:n, size + np.flatnonzero(moments)]
+        information = np.array([fit.information[np.ix_(kept, kept)] for fit in fits])
+        return information, np.array([fit.score[kept] for fit in fits])
+
+    def with_asymmetry(self) -> _MomentFit:
+        """Return the fits with the components of an asymmetry that are significant."""
+        tested = ~_OF_DEPTH
+        information, scores = self.equations(tested)
+        covariance = np.linalg.pinv(information.sum(axis=0), hermitian=True)
+        shown = significant_sums(scores @ covariance, np.diag(covariance))
+        used = self.used.copy()
+        used[tested] = shown[-np.count_nonzero(tested) :]
+        return self._replace(used=used)
+
+    def with_depth(self) -> _MomentFit:
+        """Return the fits with the slopes against the height, if that of a width is significant.
+
+        Both widths change then, and with a point spread that differs above and below the focus its
+        third moments too. Light of other spheres that is spread over the field changes third
+        moments alone.
+        """
+        shown = significant_slopes(*self.equations(self.used | _OF_DEPTH))
+        if not shown[-_N_SLOPES:][:2].any():
+            return self
+        uneven = self.used[_ABOVE_FOCUS].any()
+        used = self.used.copy()
+        used[_OF_DEPTH] = [True, True, uneven, uneven]
+        return self._replace(used=used)
+
+    def settled(self) -> _MomentFit:
+        """Return the fits with the moments in use of greatest likelihood."""
+        found = self
+        for number in range(_MOMENT_ROUNDS):
+            if number:
+                found = found.refitted()
+            information, scores = found.equations(found.used)
+            information = information.sum(axis=0)
+            step = np.linalg.pinv(information, hermitian=True) @ scores.sum(axis=0)
+            found = found.moved(information, step)
+            if step @ information @ step < _STEP_IN_ERRORS**2:
+                break
+        return found
+
+    def moved(self, information: Floats, step: Floats) -> _MomentFit:
+        """Return the fits at the parameters after a step."""
+        n, values = len(self.now.parameters.values), self.values.copy()
+        values[self.used] += step[n:]
+        own = information[:n, :n]
+        parameters = self.now.parameters.moved(own, own @ step[:n])
+        stderr = np.zeros(len(values))
+        stderr[self.used] = np.sqrt(np.diag(np.linalg.pinv(information, hermitian=True))[n:])
+        uneven, slopes = values[~_OF_DEPTH], values[_OF_DEPTH]
+        depth = self.heights.with_slopes(slopes, stderr[_OF_DEPTH])
+        parameters = replace(
+            parameters,
+            asymmetry=Asymmetry(*uneven.tolist()) if uneven.any() else None,
+            depth=depth if slopes.any() else None,
         )
-        if step @ information @ step < _STEP_IN_ERRORS**2:
-            break
-    return settled
+        now = self.now._replace(parameters=parameters, information=own)
+        return self._replace(now=now, values=values)
 
 
 def photon_transfer(expected: Floats, variance: Floats) -> CameraNoise:

@@ -11,6 +11,7 @@ from perrin._arrays import to_plain
 from perrin._display import Shown
 from perrin.images.optics.asymmetry import Asymmetry
 from perrin.images.optics.ball_image import PsfTail, SphereImage, sphere_image
+from perrin.images.optics.depth import DepthChange
 from perrin.images.optics.point_spread import PointSpread
 
 if TYPE_CHECKING:
@@ -152,6 +153,9 @@ class Optics(Shown):
     asymmetry : Asymmetry or None
         By what the point spread differs from a body of revolution that is even along z; None where
         the movie shows no difference.
+    depth : DepthChange or None
+        How the point spread changes with the height of a sphere in the stack; None where the movie
+        shows no change.
 
     Examples
     --------
@@ -169,6 +173,7 @@ class Optics(Shown):
     measured: PointSpread | None = None
     shell: bool = False
     asymmetry: Asymmetry | None = None
+    depth: DepthChange | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """Return values that JSON holds.
@@ -188,7 +193,8 @@ class Optics(Shown):
         shell = {"shell": True} if self.shell else {}
         measured = {} if self.measured is None else {"measured": self.measured.to_dict()}
         uneven = {} if self.asymmetry is None else {"asymmetry": self.asymmetry._asdict()}
-        return entry | measured | shell | uneven
+        deep = {} if self.depth is None else {"depth": to_plain(self.depth._asdict())}
+        return entry | measured | shell | uneven | deep
 
     @classmethod
     def from_dict(cls, entry: Mapping[str, Any]) -> Optics:
@@ -219,7 +225,14 @@ class Optics(Shown):
         shell = bool(entry.get("shell", False))
         uneven = entry.get("asymmetry")
         asymmetry = None if uneven is None else Asymmetry(**uneven)
-        return cls(size, (psf_z, psf), noise, (a, b, c), tail, spread, measured, shell, asymmetry)
+        deep, depth = entry.get("depth"), None
+        if deep is not None:
+            depth = DepthChange(**{**deep, "stderr": tuple(deep["stderr"])})
+        return cls(
+            *(size, (psf_z, psf), noise, (a, b, c), tail, spread, measured, shell),
+            asymmetry=asymmetry,
+            depth=depth,
+        )
 
     def image(self, voxel: tuple[float, float, float]) -> SphereImage:
         """Return the table of the sphere's image for voxels (z, y, x), um."""
@@ -232,4 +245,5 @@ class Optics(Shown):
             measured=self.measured,
             shell=self.shell,
             asymmetry=self.asymmetry,
+            depth=self.depth,
         )
