@@ -467,6 +467,7 @@ CASES = {
     "astigmatism and coma": Case(
         light=replace(BASE, psf="lens", lens=Lens(astigmatism=0.1, coma=0.1))
     ),
+    "pinhole of 2 Airy units": Case(light=replace(BASE, psf="lens", pinhole=2.0)),
     "pinhole of 4 Airy units": Case(light=replace(BASE, psf="lens", pinhole=4.0)),
     "index 1.42 at the cover glass": Case(
         light=replace(BASE, psf="lens", lens=Lens(index=1.518, medium=1.42), cover=0.0)

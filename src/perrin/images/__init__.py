@@ -146,6 +146,7 @@ from perrin.images.optics.pixel_pattern import (
     without_pattern,
 )
 from perrin.images.optics.point_spread import PointSpread, StackLike, measure_point_spread
+from perrin.images.optics.pupil import Pupil, PupilBall
 from perrin.images.optics.radial_image import (
     Patch,
     PatchFit,
@@ -256,6 +257,8 @@ __all__ = [
     "PointSpread",
     "Pose",
     "PsfTail",
+    "Pupil",
+    "PupilBall",
     "RadialImage",
     "RadialSample",
     "RenderSettings",

@@ -536,6 +536,29 @@ def asymmetric_point_spread(optics: Optics | None) -> Findings:
     return Findings(notes=(text,))
 
 
+def confocal_point_spread(optics: Optics | None) -> Findings:
+    """Note that the point spread is computed from an aperture and a pinhole.
+
+    Parameters
+    ----------
+    optics : Optics or None
+
+    Examples
+    --------
+    >>> confocal_point_spread(None)
+    Findings(warnings=(), notes=())
+    """
+    if optics is None or optics.pupil is None:
+        return _NOTHING
+    pupil = optics.pupil
+    text = (
+        f"confocal point spread: that of an aperture with a pinhole of {pupil.pinhole:.2g} um "
+        f"(radius in the sample; {pupil.airy_units:.2g} Airy units), which fits images that were "
+        "left out better than Gaussians"
+    )
+    return Findings(notes=(text,))
+
+
 def changing_point_spread(optics: Optics | None) -> Findings:
     """Note that the point spread changes with the height of a sphere, which the fits allow for.
 

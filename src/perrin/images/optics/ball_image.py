@@ -19,6 +19,7 @@ from perrin.images.optics.asymmetry import (
     component_images,
     plane_factors,
 )
+from perrin.images.optics.pupil import Pupil, PupilBall
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -92,6 +93,16 @@ class BallBlur(NamedTuple):
             for axis in (0, 1)
         )
         return z, plane
+
+    @property
+    def fit_range(self) -> tuple[float, float]:
+        """Distances (z, plane) outside the surface up to which a fit uses voxels, um."""
+        return self.ranges(_FIT_RANGE, _TAIL_FIT_RANGE)
+
+    @property
+    def table_range(self) -> tuple[float, float]:
+        """Distances (z, plane) outside the surface at which the table of the image ends, um."""
+        return self.ranges(_TABLE_RANGE, _TAIL_TABLE_RANGE)
 
     def widened(self, z: float, plane: float) -> BallBlur:
         """Return the ball with these added to the variances (z, plane) of all blurs, um^2.
@@ -194,7 +205,7 @@ class SphereImage:
     blur: tuple[float, float]
     tail: PsfTail | None
     spread: float
-    _ball: BallBlur
+    _ball: BallBlur | PupilBall
     _knots: Floats
     _spacing: tuple[float, float]
     _sizes: Floats
@@ -208,14 +219,14 @@ class SphereImage:
     @property
     def reach(self) -> tuple[float, float, float]:
         """Distances from the centre along z, y and x at which the image ends, um."""
-        z, plane = self._ball.ranges(_TABLE_RANGE, _TAIL_TABLE_RANGE)
+        z, plane = self._ball.table_range
         radius = self.diameter / 2 * float(np.exp(_size_range(self.spread)))
         return radius + z, radius + plane, radius + plane
 
     @property
     def extent(self) -> Floats:
         """Half axes (z, y, x) of the ellipsoid of voxels that a fit uses, um."""
-        z, plane = self._ball.ranges(_FIT_RANGE, _TAIL_FIT_RANGE)
+        z, plane = self._ball.fit_range
         return self.diameter / 2 * (1 + self.spread) + np.array([z, plane, plane])
 
     @property
@@ -432,7 +443,9 @@ class SphereImage:
         along, across = self._splines(z, y, x, knots=slopes)
         return box, (along @ slopes @ across.T).reshape(len(slopes), len(z), len(y), len(x))
 
-    def slopes(self, pairs: Sequence[tuple[BallBlur, BallBlur]], difference: float) -> Floats:
+    def slopes(
+        self, pairs: Sequence[tuple[BallBlur | PupilBall, BallBlur | PupilBall]], difference: float
+    ) -> Floats:
         """Return the tables of derivatives (k, ...) by k parameters, for `slope_spot`.
 
         Parameters
@@ -508,6 +521,7 @@ def sphere_image(
     shell: bool = False,
     asymmetry: Asymmetry | None = None,
     depth: DepthChange | None = None,
+    pupil: Pupil | None = None,
 ) -> SphereImage:
     """Tabulate a ball convolved with an anisotropic point spread and with the voxels.
 
@@ -531,6 +545,8 @@ def sphere_image(
         By what the point spread differs from an even body of revolution.
     depth : DepthChange, optional
         How the point spread changes with the height of a sphere in the stack.
+    pupil : Pupil, optional
+        The point spread of a confocal microscope, in place of `psf` and `tail`.
 
     Returns
     -------
@@ -557,32 +573,18 @@ def sphere_image(
     """
     require_positive(diameter=diameter, **{"psf[z]": psf[0], "psf[plane]": psf[1]})
     require_positive(**{f"voxel[{axis}]": h for axis, h in zip("zyx", voxel, strict=True)})
-    spreads = [(1.0 if tail is None else 1.0 - tail.share, psf)]
-    if tail is not None:
-        require_positive(**{"tail psf[z]": tail.psf[0], "tail psf[plane]": tail.psf[1]})
-        if not 0 <= tail.share <= 1:
-            raise ValueError(f"tail: expected a share between 0 and 1, got {tail.share}")
-        spreads.append((tail.share, tail.psf))
-    if measured is not None:
-        spreads = list(measured.components)
-    components = []
-    for share, (psf_z, psf_plane) in spreads:
-        blur_z = float(np.sqrt(psf_z**2 + voxel[0] ** 2 / 12))
-        blur = float(np.sqrt(psf_plane**2 + voxel[1] * voxel[2] / 12))
-        if blur_z < blur:
-            raise ValueError(
-                f"psf: expected (z, plane) with the larger blur along z, as in every microscope, "
-                f"got {(psf_z, psf_plane)} um, with the voxel {blur_z:.3g} and {blur:.3g}; are the "
-                "two exchanged?"
-            )
-        components.append((share, (blur_z, blur)))
-    ball = BallBlur(diameter, tuple(components), shell)
-    blur_z, blur = components[0][1]
+    ball: BallBlur | PupilBall
+    if pupil is not None:
+        ball = PupilBall(diameter, pupil, (voxel[0] ** 2 / 12, voxel[1] * voxel[2] / 12), shell)
+    else:
+        spreads = _gaussians(psf, tail) if measured is None else measured.components
+        ball = BallBlur(diameter, _with_voxel(spreads, voxel), shell)
+    blur_z, blur = ball.components[0][1]
     spacing = _KNOT_SPACING * blur_z, _KNOT_SPACING * blur
     radius = diameter / 2 * float(np.exp(_size_range(spread)))
     z, rho = (
         np.asarray(h * np.arange(int(np.ceil((radius + end) / h)) + 2), dtype=np.float64)
-        for h, end in zip(spacing, ball.ranges(_TABLE_RANGE, _TAIL_TABLE_RANGE), strict=True)
+        for h, end in zip(spacing, ball.table_range, strict=True)
     )
     knots = _spline_knots(ball.intensity(z, rho))
     sizes, tables = np.zeros(1), knots[None]
@@ -608,7 +610,37 @@ def sphere_image(
     )
 
 
-def _tables_of_sizes(ball: BallBlur, sizes: Floats, z: Floats, rho: Floats) -> Floats:
+def _gaussians(
+    psf: tuple[float, float], tail: PsfTail | None
+) -> tuple[tuple[float, tuple[float, float]], ...]:
+    """Return the shares and standard deviations of one Gaussian, or of two."""
+    if tail is None:
+        return ((1.0, psf),)
+    require_positive(**{"tail psf[z]": tail.psf[0], "tail psf[plane]": tail.psf[1]})
+    if not 0 <= tail.share <= 1:
+        raise ValueError(f"tail: expected a share between 0 and 1, got {tail.share}")
+    return (1.0 - tail.share, psf), (tail.share, tail.psf)
+
+
+def _with_voxel(
+    spreads: Sequence[tuple[float, tuple[float, float]]], voxel: tuple[float, float, float]
+) -> tuple[tuple[float, tuple[float, float]], ...]:
+    """Return the shares of Gaussians and their standard deviations with those of a voxel."""
+    components = []
+    for share, (psf_z, psf_plane) in spreads:
+        blur_z = float(np.sqrt(psf_z**2 + voxel[0] ** 2 / 12))
+        blur = float(np.sqrt(psf_plane**2 + voxel[1] * voxel[2] / 12))
+        if blur_z < blur:
+            raise ValueError(
+                f"psf: expected (z, plane) with the larger blur along z, as in every microscope, "
+                f"got {(psf_z, psf_plane)} um, with the voxel {blur_z:.3g} and {blur:.3g}; are the "
+                "two exchanged?"
+            )
+        components.append((share, (blur_z, blur)))
+    return tuple(components)
+
+
+def _tables_of_sizes(ball: BallBlur | PupilBall, sizes: Floats, z: Floats, rho: Floats) -> Floats:
     """Return the knots of the images of balls whose logarithms of the diameter deviate."""
     balls = [ball._replace(diameter=ball.diameter * float(np.exp(size))) for size in sizes]
     return np.stack([_spline_knots(one.intensity(z, rho)) for one in balls])

@@ -20,6 +20,7 @@ from perrin.images.optics.neighbours import (
     neighbour_variance,
 )
 from perrin.images.optics.optics import CameraNoise, Optics
+from perrin.images.optics.pupil import AIRY, Pupil, PupilBall
 from perrin.images.optics.window_fit import FreeCenters, cut_window, fit_window
 
 if TYPE_CHECKING:
@@ -50,6 +51,16 @@ _LEAST_ELONGATION, _LEAST_OVER_VOXEL, _LEAST_TAIL = 1.025, 1.02, 1.2
 
 # Blurs and share of the tail at the start of its search, over the Gaussian point spread found.
 _NARROWED, _WIDENED, _TAIL_SHARE, _MAX_TAIL_SHARE = 0.85, 3.0, 0.15, 0.6
+
+# Share of the tail from which on a confocal point spread is tried, which takes seconds.
+_OPEN_SHARE = 0.4
+
+# Values of a `Pupil` at the start of the search for a confocal point spread, pinholes of which the
+# likeliest is the start, in Airy units, and the least and the largest values: apertures of 0.3 to
+# 1.5 and visible light, or, where voxels are points, a narrower point spread.
+_PUPIL_START, _PINHOLES_TRIED = (13.0, 0.55), (0.7, 2.0, 5.0)
+_PUPIL_LEAST, _PUPIL_MOST = np.log([2.5, 0.1, 0.02]), np.log([40.0, 0.75, 4.0])
+_MAX_PUPIL_ROUNDS = 12
 
 # A tail is searched for if its share is this many standard errors above 0 to first order, and it is
 # kept if it increases the logarithm of the likelihood of other groups by at least this.
@@ -231,10 +242,11 @@ class ImageParameters:
 
     Attributes
     ----------
-    values : ndarray, shape (1,), (3,) or (6,)
+    values : ndarray, shape (1,), (3,), (4,) or (6,)
         Logarithms of the diameter and of the blurs along z and in the plane, um; with a tail its
         share, and the logarithms of its blurs. Blurs include the voxel. With a measured point
-        spread the diameter alone.
+        spread the diameter alone; of a confocal one the logarithms of the diameter and of the
+        three values of a `Pupil`.
     voxel : tuple of float
         Voxel size (z, y, x), um.
     spread : float
@@ -268,8 +280,18 @@ class ImageParameters:
         """Standard deviations (z, plane) of a voxel, um."""
         return np.sqrt(np.array([self.voxel[0] ** 2, self.voxel[1] * self.voxel[2]]) / 12)
 
-    def ball(self, values: Floats) -> BallBlur:
+    @property
+    def of_pupil(self) -> bool:
+        """Whether the point spread is that of a confocal microscope."""
+        return len(self.values) == 1 + len(Pupil._fields)
+
+    def ball(self, values: Floats) -> BallBlur | PupilBall:
         """Return the blurred ball at other values of the parameters."""
+        if self.of_pupil:
+            size, lateral, slope, pinhole = np.exp(values).tolist()
+            wide_z, wide = np.square(self.voxel_blur).tolist()
+            pupil = Pupil(lateral, slope, pinhole)
+            return PupilBall(size, pupil, (wide_z, wide), self.shell)
         if self.measured is not None:
             wide_z, wide = self.voxel_blur.tolist()
             measured = tuple(
@@ -297,6 +319,17 @@ class ImageParameters:
                 shell=self.shell,
                 asymmetry=self.asymmetry,
                 depth=self.depth,
+            )
+        if isinstance(ball, PupilBall):
+            return sphere_image(
+                diameter=ball.diameter,
+                psf=ball.pupil.psf,
+                voxel=self.voxel,
+                spread=self.spread,
+                shell=self.shell,
+                asymmetry=self.asymmetry,
+                depth=self.depth,
+                pupil=ball.pupil,
             )
         (psf_z, psf), *wider = (
             np.sqrt(np.square(blur) - self.voxel_blur**2).tolist() for _, blur in ball.components
@@ -326,6 +359,12 @@ class ImageParameters:
         ]
         return replace(self, values=np.concatenate(start)).within_bounds()
 
+    def with_pupil(self, airy_units: float) -> ImageParameters:
+        """Return parameters of a confocal point spread at the start of its search."""
+        lateral, slope = _PUPIL_START
+        start = np.log([lateral, slope, airy_units * AIRY / lateral])
+        return replace(self, values=np.append(self.values[:1], start))
+
     def bounds(self) -> tuple[Floats, Floats]:
         """Return the least and the largest values of the parameters.
 
@@ -335,6 +374,9 @@ class ImageParameters:
         n = len(self.values)
         low, high = np.full(n, -np.inf), np.full(n, np.inf)
         if n == 1:
+            return low, high
+        if self.of_pupil:
+            low[1:], high[1:] = _PUPIL_LEAST, _PUPIL_MOST
             return low, high
         least = np.log(_LEAST_OVER_VOXEL * self.voxel_blur)
         low[2] = least[1]
@@ -378,7 +420,21 @@ class ImageParameters:
     def optics(self, noise: CameraNoise, information: Floats) -> Optics:
         """Return the optics, with standard errors from the information on the parameters."""
         image = self.image()
-        error = np.sqrt(np.diag(np.linalg.pinv(information, hermitian=True)))[:3]
+        covariance = np.linalg.pinv(information, hermitian=True)
+        error = np.sqrt(np.diag(covariance))[:3]
+        ball = self.ball(self.values)
+        if isinstance(ball, PupilBall):
+            # The width in the plane is as 1 / lateral, that along z as 1 / (lateral slope).
+            along = float(np.sqrt(max(covariance[1:3, 1:3].sum(), 0.0)))
+            z, plane = ball.pupil.psf
+            stderr = (float(image.diameter * error[0]), z * along, plane * float(error[1]))
+            return Optics(
+                *(image.diameter, image.psf, noise, stderr, None, self.spread),
+                shell=self.shell,
+                asymmetry=self.asymmetry,
+                depth=self.depth,
+                pupil=ball.pupil,
+            )
         if self.measured is not None:
             stderr = (float(image.diameter * error[0]), 0.0, 0.0)
             return Optics(
@@ -914,7 +970,7 @@ def fit_samples(
         # The first step of the share of a tail, and its error.
         variance = np.linalg.pinv(found.information, hermitian=True)
         if variance[-1] @ found.score > _LEAST_SHARE_ERRORS * np.sqrt(variance[-1, -1]):
-            found = _with_tail(found)
+            found = _with_pupil(_with_tail(found))
     if found is not plain and left_out:
         # All samples are judged again by the image that was found.
         variations = ImageVariations.about(found.parameters)
@@ -1140,6 +1196,44 @@ def _with_tail(plain: _Settled) -> _Settled:
     except NoSpheresError:
         # The Gaussian has settled, and the sum of two Gaussians has not: the first one is used.
         return plain
+
+
+def _with_pupil(found: _Settled) -> _Settled:
+    """Return the parameters of a confocal point spread if groups not fitted are likelier with it.
+
+    It is tried where the sum of two Gaussians is not used, or much of the light is in the wider
+    one, as behind an open pinhole. `found` has Gaussians, and is fitted to all groups; the other to half of them.
+    """
+    tail = found.parameters.image().tail
+    if tail is not None and tail.share < _OPEN_SHARE:
+        return found
+    groups = [s for s in found.samples if isinstance(s, GroupSample)]
+    if len(groups) < max(2, len(found.samples)):
+        return found
+    starts = [found.parameters.with_pupil(pinhole) for pinhole in _PINHOLES_TRIED]
+    before = found.parameters.image()
+
+    def likelihood(parameters: ImageParameters, noise: CameraNoise, part: Sequence[int]) -> float:
+        image = parameters.image()
+        return sum(groups[k].log_likelihood(image, noise, within=before) for k in part)
+
+    fitted, others = range(0, len(groups), 2), range(1, len(groups), 2)
+    try:
+        start = max(starts, key=lambda one: likelihood(one, found.noise, fitted))
+        half = _settled(
+            list(groups[::2]),
+            start,
+            found.noise,
+            rounds=_MAX_PUPIL_ROUNDS,
+            tolerance=_TRIAL_STEP_IN_ERRORS,
+        )
+        gain = likelihood(half.parameters, half.noise, others)
+        if gain - likelihood(found.parameters, half.noise, others) < _LEAST_HELD_OUT_GAIN:
+            return found
+        return _settled(list(groups), half.parameters, half.noise)
+    except NoSpheresError:
+        # The Gaussians have settled, and this point spread has not: they are used.
+        return found
 
 
 def _with_moments(even: _Settled) -> _Settled:

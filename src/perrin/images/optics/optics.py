@@ -13,6 +13,7 @@ from perrin.images.optics.asymmetry import Asymmetry
 from perrin.images.optics.ball_image import PsfTail, SphereImage, sphere_image
 from perrin.images.optics.depth import DepthChange
 from perrin.images.optics.point_spread import PointSpread
+from perrin.images.optics.pupil import Pupil
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -156,6 +157,9 @@ class Optics(Shown):
     depth : DepthChange or None
         How the point spread changes with the height of a sphere in the stack; None where the movie
         shows no change.
+    pupil : Pupil or None
+        The point spread of a confocal microscope, where it is likelier than one or two Gaussians;
+        `psf` is then the Gaussian that is as wide at half of its maximum, and there is no `tail`.
 
     Examples
     --------
@@ -174,6 +178,7 @@ class Optics(Shown):
     shell: bool = False
     asymmetry: Asymmetry | None = None
     depth: DepthChange | None = None
+    pupil: Pupil | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """Return values that JSON holds.
@@ -194,7 +199,8 @@ class Optics(Shown):
         measured = {} if self.measured is None else {"measured": self.measured.to_dict()}
         uneven = {} if self.asymmetry is None else {"asymmetry": self.asymmetry._asdict()}
         deep = {} if self.depth is None else {"depth": to_plain(self.depth._asdict())}
-        return entry | measured | shell | uneven | deep
+        pupil = {} if self.pupil is None else {"pupil": to_plain(self.pupil._asdict())}
+        return entry | measured | shell | uneven | deep | pupil
 
     @classmethod
     def from_dict(cls, entry: Mapping[str, Any]) -> Optics:
@@ -232,6 +238,7 @@ class Optics(Shown):
             *(size, (psf_z, psf), noise, (a, b, c), tail, spread, measured, shell),
             asymmetry=asymmetry,
             depth=depth,
+            pupil=Pupil(**entry["pupil"]) if "pupil" in entry else None,
         )
 
     def image(self, voxel: tuple[float, float, float]) -> SphereImage:
@@ -246,4 +253,5 @@ class Optics(Shown):
             shell=self.shell,
             asymmetry=self.asymmetry,
             depth=self.depth,
+            pupil=self.pupil,
         )
