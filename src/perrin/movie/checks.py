@@ -614,8 +614,8 @@ def image_misfit(features: pd.DataFrame, optics: Optics | None) -> Findings:
         return _NOTHING
     text = (
         f"image misfit: the residuals of the fits are {100 * more:.2g} % above the noise, by their "
-        "squares: a point spread other than two Gaussians (an open pinhole, haze), spheres of "
-        "another shape, or spheres that move while they are recorded; touching spheres may be off "
+        "squares: a point spread that is not modelled (haze, an aberration), spheres of another "
+        "shape, or spheres that move while they are recorded; touching spheres may be off "
         "by more than is stated, by as much in all frames, which D does not contain"
     )
     return Findings(notes=(text,))

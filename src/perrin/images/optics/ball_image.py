@@ -176,7 +176,8 @@ class SphereImage:
     diameter : float
         Diameter of the fluorescent sphere (the core of a core-shell sphere), um.
     psf : tuple of float
-        Standard deviations of the Gaussian point spread along z and within the plane, um.
+        Standard deviations of the Gaussian point spread along z and within the plane, um; of a
+        confocal one those of the Gaussian that is as wide.
     voxel : tuple of float
         Voxel size (z, y, x), um.
     blur : tuple of float

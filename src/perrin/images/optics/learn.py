@@ -932,8 +932,10 @@ def fit_samples(
 
     The point spread is a Gaussian. Where the derivative of the likelihood by the share of a wider
     second Gaussian is significant, the sum of two Gaussians is fitted to every other group, and it
-    is used if the likelihood of the groups between them is the larger one. Where the diameters of
-    single spheres, fitted with a wide distribution, differ by more than their errors, their spread
+    is used if the likelihood of the groups between them is the larger one. Where it is not, or much
+    of the light is in the wider Gaussian, the point spread of an aperture with a pinhole (`Pupil`)
+    is tried in the same way. Where the diameters of single spheres, fitted with a wide
+    distribution, differ by more than their errors, their spread
     is learned too: that of greatest likelihood, and the mean diameter is the mean of the spheres.
     A point spread that is no body of revolution, or differs above and below the focus, changes the
     image by derivatives of it (`Asymmetry`), whose factors are found where they are significant;
@@ -1202,7 +1204,8 @@ def _with_pupil(found: _Settled) -> _Settled:
     """Return the parameters of a confocal point spread if groups not fitted are likelier with it.
 
     It is tried where the sum of two Gaussians is not used, or much of the light is in the wider
-    one, as behind an open pinhole. `found` has Gaussians, and is fitted to all groups; the other to half of them.
+    one, as behind an open pinhole. `found` has Gaussians, and is fitted to all groups; the other to
+    half of them.
     """
     tail = found.parameters.image().tail
     if tail is not None and tail.share < _OPEN_SHARE:
