@@ -174,7 +174,8 @@ class PupilBall(NamedTuple):
         Diameter of the ball, um.
     pupil : Pupil
     variances : tuple of float
-        Variances (z, plane) by which the image is blurred besides, um^2: those of a voxel.
+        Variances (z, plane) by which the image is blurred besides, um^2: those of a voxel. Below 0
+        they count as 0.
     shell : bool
         The surface of the ball is fluorescent, in place of all of it.
 
@@ -233,7 +234,7 @@ def _ball_transfer(ball: PupilBall) -> tuple[_Space, Floats]:
         form = 4 / 3 * np.pi * radius**3 * np.sin(q) / q
     else:
         form = 4 * np.pi * radius**3 * (np.sin(q) - q * np.cos(q)) / q**3
-    # The band ends where a negative variance would amplify nothing but rounding.
+    # No point spread is narrower than that of the aperture.
     wide_z, wide = (max(v, 0.0) for v in ball.variances)
     blur = np.exp(-0.5 * (wide_z * space.kz[:, None] ** 2 + wide * space.k**2))
     found = np.asarray(whole * form * blur)
