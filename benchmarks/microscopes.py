@@ -50,6 +50,7 @@ class Microscope:
     voxel: tuple[float, float, float] = (0.25, 0.2, 0.2)
     psf: str = "gaussian"  # or "tails" (30 % of it Lorentzian), "confocal", "lens", "widefield"
     blur: tuple[float, float] = (0.4, 0.15)  # z and xy, um; of the Gaussian
+    last_blur: tuple[float, float] | None = None  # the same at the last plane, where it differs
     tilt: float = 0.0  # of the optical axis, or of the light sheet where there is one, degrees
     sheet: float = 0.0  # standard deviation of the thickness of a light sheet, um
     lens: Lens = LENS
@@ -238,13 +239,26 @@ def point_image(light, n, grid, depth):
     return excited * behind_pinhole(emitted, grid, radius)
 
 
+def blurred_at(light, height):
+    """Return a microscope whose Gaussian is that at a height in the stack, um."""
+    if light.last_blur is None:
+        return light
+    share = height / light.box[2]
+    first, last = np.square(light.blur), np.square(light.last_blur)
+    wide_z, wide = np.sqrt(first + share * (last - first)).tolist()
+    return replace(light, blur=(wide_z, wide))
+
+
 def image_of(light, *, diameter=DIAMETER):
     """Return the image of a ball as a function of its height: spline coefficients and spacing."""
-    if light.cover is None:
+    if light.cover is None and light.last_blur is None:
         table = blurred_ball(light, diameter=diameter)
         return lambda _: table
     heights = np.linspace(0, light.box[2], 6)
-    tables = [blurred_ball(light, diameter=diameter, depth=light.cover + z) for z in heights]
+    tables = [
+        blurred_ball(blurred_at(light, z), diameter=diameter, depth=(light.cover or 0.0) + z)
+        for z in heights
+    ]
 
     def between(height):
         at = np.clip(height / heights[1], 0, len(heights) - 1.001)
@@ -453,6 +467,7 @@ CASES = {
     "astigmatism and coma": Case(
         light=replace(BASE, psf="lens", lens=Lens(astigmatism=0.1, coma=0.1))
     ),
+    "pinhole of 2 Airy units": Case(light=replace(BASE, psf="lens", pinhole=2.0)),
     "pinhole of 4 Airy units": Case(light=replace(BASE, psf="lens", pinhole=4.0)),
     "index 1.42 at the cover glass": Case(
         light=replace(BASE, psf="lens", lens=Lens(index=1.518, medium=1.42), cover=0.0)
@@ -462,6 +477,12 @@ CASES = {
     ),
     "index 1.33, 20 um deep": Case(
         light=replace(BASE, psf="lens", lens=Lens(index=1.518, medium=1.33), cover=20.0)
+    ),
+    "widens with depth": Case(
+        light=replace(BASE, blur=(0.3, 0.15), last_blur=(0.42, 0.15), depth_loss=0.2)
+    ),
+    "widens much with depth": Case(
+        light=replace(BASE, blur=(0.3, 0.15), last_blur=(0.8, 0.2), depth_loss=0.2)
     ),
     "widefield": Case(light=replace(BASE, psf="widefield")),
     "haze": Case(light=replace(BASE, haze=2.0)),

@@ -100,9 +100,9 @@ def test_images_of_spheres_equal_those_of_numpy(monkeypatch, spread):
     centers = rng.uniform(-1, 6, (12, 3))
     centers[:2] = [[2.0, 2.0, 2.0], [40.0, -40.0, 2.0]]
     sizes = rng.normal(scale=spread, size=12)
-    kernel = image.on_voxels(mask, centers, sizes)
+    kernel = image.on_voxels(mask, centers, sizes, centers[:, 0])
     monkeypatch.setattr(ball_image, "compiled_kernels", lambda: None)
-    twin = image.on_voxels(mask, centers, sizes)
+    twin = image.on_voxels(mask, centers, sizes, centers[:, 0])
     assert np.abs(twin).max(axis=(1, 2))[1:].tolist().count(0.0) >= 1
     np.testing.assert_allclose(kernel, twin, rtol=0, atol=1e-12)
 

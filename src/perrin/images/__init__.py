@@ -99,6 +99,7 @@ from perrin.images.optics.crowd_fit import (
     missing_spheres,
     plausible_spheres,
 )
+from perrin.images.optics.depth import DepthChange, significant_slopes
 from perrin.images.optics.flicker import (
     LineChanges,
     Lines,
@@ -145,6 +146,7 @@ from perrin.images.optics.pixel_pattern import (
     without_pattern,
 )
 from perrin.images.optics.point_spread import PointSpread, StackLike, measure_point_spread
+from perrin.images.optics.pupil import Pupil, PupilBall
 from perrin.images.optics.radial_image import (
     Patch,
     PatchFit,
@@ -228,6 +230,7 @@ __all__ = [
     "CrowdSample",
     "CrowdWindow",
     "DeclaredSeries",
+    "DepthChange",
     "Fading",
     "Features",
     "Format",
@@ -254,6 +257,8 @@ __all__ = [
     "PointSpread",
     "Pose",
     "PsfTail",
+    "Pupil",
+    "PupilBall",
     "RadialImage",
     "RadialSample",
     "RenderSettings",
@@ -399,6 +404,7 @@ __all__ = [
     "sequence_files",
     "serve",
     "settled_image",
+    "significant_slopes",
     "significant_sums",
     "size_faults",
     "size_spread",

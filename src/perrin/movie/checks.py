@@ -536,6 +536,54 @@ def asymmetric_point_spread(optics: Optics | None) -> Findings:
     return Findings(notes=(text,))
 
 
+def confocal_point_spread(optics: Optics | None) -> Findings:
+    """Note that the point spread is computed from an aperture and a pinhole.
+
+    Parameters
+    ----------
+    optics : Optics or None
+
+    Examples
+    --------
+    >>> confocal_point_spread(None)
+    Findings(warnings=(), notes=())
+    """
+    if optics is None or optics.pupil is None:
+        return _NOTHING
+    pupil = optics.pupil
+    text = (
+        f"confocal point spread: that of an aperture with a pinhole of {pupil.pinhole:.2g} um "
+        f"(radius in the sample; {pupil.airy_units:.2g} Airy units), which fits images that were "
+        "left out better than Gaussians"
+    )
+    return Findings(notes=(text,))
+
+
+def changing_point_spread(optics: Optics | None) -> Findings:
+    """Note that the point spread changes with the height of a sphere, which the fits allow for.
+
+    Parameters
+    ----------
+    optics : Optics or None
+
+    Examples
+    --------
+    >>> changing_point_spread(None)
+    Findings(warnings=(), notes=())
+    """
+    if optics is None or optics.depth is None:
+        return _NOTHING
+    depth = optics.depth
+    first, last = (depth.psf(optics.psf, height) for height in (depth.low, depth.high))
+    text = (
+        f"point spread by depth: its standard deviations are {first[0]:.3g} um along z and "
+        f"{first[1]:.3g} um in the plane at a height of {depth.low:.3g} um, and {last[0]:.3g} and "
+        f"{last[1]:.3g} um at {depth.high:.3g} um, as in a sample with another refractive index "
+        "than the immersion; the fits allow for it"
+    )
+    return Findings(notes=(text,))
+
+
 def image_misfit(features: pd.DataFrame, optics: Optics | None) -> Findings:
     """Note that the residuals of the fits to images exceed the noise, at a level of 1 %.
 
@@ -566,8 +614,8 @@ def image_misfit(features: pd.DataFrame, optics: Optics | None) -> Findings:
         return _NOTHING
     text = (
         f"image misfit: the residuals of the fits are {100 * more:.2g} % above the noise, by their "
-        "squares: a point spread other than two Gaussians (an open pinhole, haze), spheres of "
-        "another shape, or spheres that move while they are recorded; touching spheres may be off "
+        "squares: a point spread that is not modelled (haze, an aberration), spheres of another "
+        "shape, or spheres that move while they are recorded; touching spheres may be off "
         "by more than is stated, by as much in all frames, which D does not contain"
     )
     return Findings(notes=(text,))

@@ -595,6 +595,8 @@ def _channel_checks(stack: Stack, located: Located, features: pd.DataFrame) -> c
         + checks.unrefined_spheres(features)
         + checks.noise_in_common(located.method.optics)
         + checks.asymmetric_point_spread(located.method.optics)
+        + checks.confocal_point_spread(located.method.optics)
+        + checks.changing_point_spread(located.method.optics)
         + checks.image_misfit(features, located.method.optics)
     )
 

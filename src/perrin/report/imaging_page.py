@@ -299,10 +299,19 @@ def _channel_facts(imaging: Imaging, optics: Optics) -> list[Fact]:
         wide_z, wide = (number_text(width) for width in optics.tail.psf)
         share = f"{100 * optics.tail.share:.0f} % of the intensity, {wide_z} µm along z"
         tail = [("tail of the point spread", f"{wide} µm", share)]
+    if optics.pupil is not None:
+        size, airy = number_text(optics.pupil.pinhole), number_text(optics.pupil.airy_units)
+        remark = f"radius in the sample, learned; a diameter of {airy} Airy units"
+        tail.append(("pinhole", f"{size} µm", remark))
     if optics.asymmetry is not None:
         kinds = listed(optics.asymmetry.kinds)
         remark = f"{kinds}; the fits allow for it to first order"
         tail.append(("shape of the point spread", "asymmetric", remark))
+    if optics.depth is not None:
+        low, high = optics.depth.low, optics.depth.high
+        widths = [number_text(optics.depth.psf(optics.psf, height)[0]) for height in (low, high)]
+        remark = f"{number_text(low)} and {number_text(high)} µm high in the stack"
+        tail.append(("point spread along z by depth", f"{' to '.join(widths)} µm", remark))
     if optics.spread:
         expected += f"; spheres differ by {100 * optics.spread:.1f} % (standard deviation)"
     return [

@@ -34,6 +34,7 @@ from perrin.images.optics.crowd_fit import (
     missing_spheres,
     plausible_spheres,
 )
+from perrin.images.optics.depth import DepthChange, significant_slopes
 from perrin.images.optics.flicker import (
     LineChanges,
     Lines,
@@ -80,6 +81,7 @@ from perrin.images.optics.pixel_pattern import (
     without_pattern,
 )
 from perrin.images.optics.point_spread import PointSpread, StackLike, measure_point_spread
+from perrin.images.optics.pupil import Pupil, PupilBall
 from perrin.images.optics.radial_image import (
     Patch,
     PatchFit,
@@ -118,6 +120,7 @@ __all__ = [
     "CrowdIntensity",
     "CrowdSample",
     "CrowdWindow",
+    "DepthChange",
     "FreeCenters",
     "GroupSample",
     "ImageFit",
@@ -133,6 +136,8 @@ __all__ = [
     "PixelPattern",
     "PointSpread",
     "PsfTail",
+    "Pupil",
+    "PupilBall",
     "RadialImage",
     "RadialSample",
     "RenderSettings",
@@ -191,6 +196,7 @@ __all__ = [
     "residual_maps",
     "saturated_share",
     "settled_image",
+    "significant_slopes",
     "significant_sums",
     "size_spread",
     "slopes_of_spheres",

@@ -20,7 +20,7 @@ _NEAR_AXIS = 0.1
 
 # A component is used if it is this many standard errors of the noise from 0, and if it is not 0 at
 # this level by its scatter between the samples.
-_FROM_NOISE, _SAMPLES_LEVEL = 5.0, 1e-4
+FROM_NOISE, SAMPLES_LEVEL = 5.0, 1e-4
 
 
 class Asymmetry(NamedTuple):
@@ -267,6 +267,6 @@ def significant_sums(shares: Floats, variance: Floats) -> Bools:
     if freedom < 1:
         return np.zeros(len(variance), dtype=np.bool_)
     scatter = np.sum((shares - total / len(shares)) ** 2, axis=0) * len(shares) / freedom
-    by_noise = np.abs(total) > _FROM_NOISE * np.sqrt(variance)
-    by_scatter = np.abs(total) > stdtrit(freedom, 1 - _SAMPLES_LEVEL / 2) * np.sqrt(scatter)
+    by_noise = np.abs(total) > FROM_NOISE * np.sqrt(variance)
+    by_scatter = np.abs(total) > stdtrit(freedom, 1 - SAMPLES_LEVEL / 2) * np.sqrt(scatter)
     return np.asarray(by_noise & by_scatter)

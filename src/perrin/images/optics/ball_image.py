@@ -19,10 +19,12 @@ from perrin.images.optics.asymmetry import (
     component_images,
     plane_factors,
 )
+from perrin.images.optics.pupil import Pupil, PupilBall
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from perrin.images.optics.depth import DepthChange
     from perrin.images.optics.point_spread import PointSpread
 
 # Spacing of the table's knots in units of the blur along each axis; the cubic error is below 1e-4.
@@ -38,6 +40,10 @@ _TABLE_RANGE, _TAIL_TABLE_RANGE = 4.5, 3.5
 # Where diameters differ: largest deviation of a sphere's from the mean, in standard deviations and
 # in its logarithm, and the spacing of the tables in units of the blur; the cubic error is 1e-3.
 _SIZE_RANGE, _MAX_SIZE_RANGE, _SIZE_SPACING = 4.0, 0.3, 0.4
+
+# Heights at which the image is tabulated where the point spread changes with the height: between
+# them the cubic error of a width that doubles is 1e-3.
+_HEIGHT_NODES = 5
 
 
 class PsfTail(NamedTuple):
@@ -87,6 +93,28 @@ class BallBlur(NamedTuple):
             for axis in (0, 1)
         )
         return z, plane
+
+    @property
+    def fit_range(self) -> tuple[float, float]:
+        """Distances (z, plane) outside the surface up to which a fit uses voxels, um."""
+        return self.ranges(_FIT_RANGE, _TAIL_FIT_RANGE)
+
+    @property
+    def table_range(self) -> tuple[float, float]:
+        """Distances (z, plane) outside the surface at which the table of the image ends, um."""
+        return self.ranges(_TABLE_RANGE, _TAIL_TABLE_RANGE)
+
+    def widened(self, z: float, plane: float) -> BallBlur:
+        """Return the ball with these added to the variances (z, plane) of all blurs, um^2.
+
+        A blur along z stays at least that in the plane, and each at least half of its own.
+        """
+        components = []
+        for share, (blur_z, blur) in self.components:
+            across = float(np.sqrt(max(blur**2 + plane, blur**2 / 4)))
+            along = float(np.sqrt(max(blur_z**2 + z, blur_z**2 / 4, across**2)))
+            components.append((share, (along, across)))
+        return self._replace(components=tuple(components))
 
     def intensity(self, z: Floats, rho: Floats) -> Floats:
         """Return the intensity (len(z), len(rho)) at heights z and distances rho from the axis.
@@ -148,7 +176,8 @@ class SphereImage:
     diameter : float
         Diameter of the fluorescent sphere (the core of a core-shell sphere), um.
     psf : tuple of float
-        Standard deviations of the Gaussian point spread along z and within the plane, um.
+        Standard deviations of the Gaussian point spread along z and within the plane, um; of a
+        confocal one those of the Gaussian that is as wide.
     voxel : tuple of float
         Voxel size (z, y, x), um.
     blur : tuple of float
@@ -160,6 +189,8 @@ class SphereImage:
     asymmetry : Asymmetry or None
         By what the point spread differs from an even body of revolution. It changes the value of
         the image; the gradient is that without it.
+    depth : DepthChange or None
+        How the point spread changes with the height of a sphere in the stack.
 
     Examples
     --------
@@ -175,25 +206,28 @@ class SphereImage:
     blur: tuple[float, float]
     tail: PsfTail | None
     spread: float
-    _ball: BallBlur
+    _ball: BallBlur | PupilBall
     _knots: Floats
     _spacing: tuple[float, float]
     _sizes: Floats
     _tables: Floats
     asymmetry: Asymmetry | None = None
     _uneven_knots: Floats | None = None
+    depth: DepthChange | None = None
+    _height_tables: Floats | None = None
+    _height_slope: Floats | None = None
 
     @property
     def reach(self) -> tuple[float, float, float]:
         """Distances from the centre along z, y and x at which the image ends, um."""
-        z, plane = self._ball.ranges(_TABLE_RANGE, _TAIL_TABLE_RANGE)
+        z, plane = self._ball.table_range
         radius = self.diameter / 2 * float(np.exp(_size_range(self.spread)))
         return radius + z, radius + plane, radius + plane
 
     @property
     def extent(self) -> Floats:
         """Half axes (z, y, x) of the ellipsoid of voxels that a fit uses, um."""
-        z, plane = self._ball.ranges(_FIT_RANGE, _TAIL_FIT_RANGE)
+        z, plane = self._ball.fit_range
         return self.diameter / 2 * (1 + self.spread) + np.array([z, plane, plane])
 
     @property
@@ -201,43 +235,75 @@ class SphereImage:
         """Largest deviation of the logarithm of a diameter from the mean."""
         return _size_range(self.spread)
 
-    def sized(self, deviation: float) -> SphereImage:
-        """Return the image of a sphere whose logarithm of the diameter deviates from the mean."""
-        if self.spread == 0:
+    @property
+    def is_uneven(self) -> bool:
+        """Whether the point spread is no even body of revolution, at some height at least."""
+        return self._uneven_knots is not None
+
+    def sized(self, deviation: float, height: float | None = None) -> SphereImage:
+        """Return the image of one sphere.
+
+        Parameters
+        ----------
+        deviation : float
+            Deviation of the logarithm of its diameter from the mean.
+        height : float, optional
+            Its height in the stack, um; by default the one at which the point spread is `psf`.
+        """
+        if self.spread == 0 and self.depth is None:
             return self
         value, _ = self._between_sizes(deviation)
-        return replace(self, _knots=np.tensordot(value, self._tables, 1))
+        tables, slopes = self._tables_at(height)
+        image = replace(self, _knots=np.tensordot(value, tables, 1))
+        if self.depth is None:
+            return image
+        uneven = None
+        if self.is_uneven:
+            at = self.depth.middle if height is None else height
+            uneven = self.depth.asymmetry(self.asymmetry, at)
+        slope = np.tensordot(value, slopes, 1)
+        return replace(image, depth=None, asymmetry=uneven, _height_slope=slope)
 
-    def size_slope(self, deviation: float) -> Floats:
-        """Return the table (1, ...) of the derivative by this deviation, for `slope_spot`."""
+    def size_slope(self, deviation: float, height: float | None = None) -> Floats:
+        """Return the table (1, ...) of the derivative of `sized` by the deviation."""
         _, slope = self._between_sizes(deviation)
-        return np.asarray(np.tensordot(slope, self._tables, 1)[None])
+        return np.asarray(np.tensordot(slope, self._tables_at(height)[0], 1)[None])
+
+    def _tables_at(self, height: float | None) -> tuple[Floats, Floats]:
+        """Return the tables of all sizes at a height, and their derivatives by the height."""
+        if self.depth is None or height is None:
+            return self._tables, np.zeros_like(self._tables)
+        assert self._height_tables is not None
+        nodes = self.depth.nodes(_HEIGHT_NODES)
+        within = float(np.clip(height, nodes[0], nodes[-1]))
+        value, slope = _between(nodes, within)
+        if within != height:
+            slope = np.zeros_like(slope)
+        tables = self._height_tables
+        return np.tensordot(value, tables, 1), np.tensordot(slope, tables, 1)
 
     def _between_sizes(self, deviation: float) -> tuple[Floats, Floats]:
         """Return the factors of the tables at a deviation, and their derivatives."""
-        step = self._sizes[1] - self._sizes[0]
-        t = (deviation - self._sizes[0]) / step
-        first = int(np.clip(np.floor(t) - 1, 0, len(self._sizes) - 4))
-        u = t - first
-        value, slope = np.zeros((2, len(self._sizes)))
-        for k in range(4):
-            other = np.array([j for j in range(4) if j != k])
-            scale = float(np.prod(k - other))
-            a, b, c = u - other
-            value[first + k] = a * b * c / scale
-            slope[first + k] = (a * b + b * c + a * c) / (scale * step)
-        return value, slope
+        if self.spread == 0:
+            return np.ones(1), np.zeros(1)
+        return _between(self._sizes, deviation)
 
-    def spot(self, center: Floats, shape: tuple[int, ...]) -> SphereSpot:
+    def spot(
+        self, center: Floats, shape: tuple[int, ...], *, height: float | None = None
+    ) -> SphereSpot:
         """Return the image of a sphere at `center` (z, y, x), um, inside an array of `shape`.
 
-        The origin is the centre of voxel (0, 0, 0); the box is cut at the array's borders.
+        The origin is the centre of voxel (0, 0, 0); the box is cut at the array's borders. `height`
+        is that in the stack; by default it is the height in the array.
         """
         box, (z, y, x) = self._covered(center, shape)
-        value, gradient = self.at(z, y, x)
+        image = self
+        if self.depth is not None:
+            image = self.sized(0.0, float(center[0]) if height is None else height)
+        value, gradient = image.at(z, y, x)
         return SphereSpot(box, value, gradient)
 
-    def on_voxels(self, mask: Bools, centers: Floats, sizes: Floats) -> Floats:
+    def on_voxels(self, mask: Bools, centers: Floats, sizes: Floats, heights: Floats) -> Floats:
         """Return the images of spheres and their gradients on the voxels of a mask.
 
         Both are those without the asymmetry of the point spread, see `changes_on_voxels`.
@@ -250,6 +316,8 @@ class SphereImage:
             Positions (z, y, x) from the centre of voxel (0, 0, 0), um.
         sizes : ndarray, shape (n,)
             Deviations of the logarithms of the diameters from the mean.
+        heights : ndarray, shape (n,)
+            Heights in the stack, um.
 
         Returns
         -------
@@ -260,39 +328,51 @@ class SphereImage:
         if kernels is None:
             even = replace(self, asymmetry=None, _uneven_knots=None)
             whole = np.zeros((len(centers), 4, *mask.shape))
-            for layer, center, size in zip(whole, centers, sizes, strict=True):
-                spot = even.sized(size).spot(center, mask.shape)
+            for layer, center, size, high in zip(whole, centers, sizes, heights, strict=True):
+                spot = even.sized(size, high).spot(center, mask.shape)
                 layer[(0, *spot.box)] = spot.value
                 layer[(slice(1, None), *spot.box)] = spot.gradient
             kept = whole.reshape(4 * len(centers), -1).take(np.flatnonzero(mask), axis=1)
             return kept.reshape(len(centers), 4, -1)
-        tables = self._knots[None]
-        if self.spread > 0 and len(sizes):
-            tables = np.stack([self.sized(size)._knots for size in sizes])
+        own = [self]
+        if self.spread > 0 or self.depth is not None:
+            own = [self.sized(s, high) for s, high in zip(sizes, heights, strict=True)] or own
+        place = np.ascontiguousarray(centers)
+        lengths = [np.array(length) for length in (self.voxel, self.reach, self._spacing)]
         out = np.empty((len(centers), 4, np.count_nonzero(mask)))
-        lengths = (np.array(length) for length in (self.voxel, self.reach, self._spacing))
-        kernels.spots(mask, np.ascontiguousarray(centers), *lengths, tables, out)
+        kernels.spots(mask, place, *lengths, np.stack([image._knots for image in own]), out)
+        slopes = [image._height_slope for image in own if image._height_slope is not None]
+        if slopes:
+            # A sphere that moves up has another point spread, too.
+            more = np.empty_like(out)
+            kernels.spots(mask, place, *lengths, np.stack(slopes), more)
+            out[:, 1] += more[:, 0]
         return out
 
-    def changes_on_voxels(self, mask: Bools, centers: Floats, sizes: Floats) -> Floats:
+    def changes_on_voxels(
+        self, mask: Bools, centers: Floats, sizes: Floats, heights: Floats
+    ) -> Floats:
         """Return what the asymmetry adds to the images of spheres on the voxels of a mask, (n, m).
 
         The parameters are those of `on_voxels`.
         """
         whole = np.zeros((len(centers), *mask.shape))
-        if self.asymmetry is not None:
-            for layer, center, size in zip(whole, centers, sizes, strict=True):
+        if self.is_uneven:
+            for layer, center, size, high in zip(whole, centers, sizes, heights, strict=True):
                 box, offsets = self._covered(center, mask.shape)
-                layer[box] = self._change(*(x * float(np.exp(-size)) for x in offsets))
+                own = self.asymmetry
+                if self.depth is not None:
+                    own = self.depth.asymmetry(own, high)
+                layer[box] = self._change(own, *(x * float(np.exp(-size)) for x in offsets))
         return whole[:, mask]
 
-    def _change(self, z: Floats, y: Floats, x: Floats) -> Floats:
-        """Return what the asymmetry of the point spread adds to the image, on a grid of offsets."""
-        assert self.asymmetry is not None
+    def _change(self, own: Asymmetry | None, z: Floats, y: Floats, x: Floats) -> Floats:
+        """Return what an asymmetry of the point spread adds to the image, on a grid of offsets."""
+        assert own is not None
         assert self._uneven_knots is not None
         along, across = self._splines(z, y, x, knots=self._uneven_knots)
         change = change_of_image(
-            *(self.asymmetry, self._uneven_knots),
+            *(own, self._uneven_knots),
             along=along,
             across=across,
             z=z,
@@ -364,7 +444,9 @@ class SphereImage:
         along, across = self._splines(z, y, x, knots=slopes)
         return box, (along @ slopes @ across.T).reshape(len(slopes), len(z), len(y), len(x))
 
-    def slopes(self, pairs: Sequence[tuple[BallBlur, BallBlur]], difference: float) -> Floats:
+    def slopes(
+        self, pairs: Sequence[tuple[BallBlur | PupilBall, BallBlur | PupilBall]], difference: float
+    ) -> Floats:
         """Return the tables of derivatives (k, ...) by k parameters, for `slope_spot`.
 
         Parameters
@@ -418,9 +500,11 @@ class SphereImage:
         outward = across_slope / (self._spacing[1] * np.where(rho > 0, rho, 1.0)).reshape(-1, 1)
         value = (profile @ across.T).reshape(shape)
         if self._uneven_knots is not None:
-            value += self._change(z, y, x)
+            value += self._change(self.asymmetry, z, y, x)
         by_rho = (profile @ outward.T).reshape(shape)
         gradient = np.empty((3, *shape))
+        if self._height_slope is not None:
+            by_z = by_z + along @ self._height_slope
         np.matmul(by_z, across.T, out=gradient[0].reshape(len(z), rho.size))
         np.multiply(by_rho, -y[:, None], out=gradient[1])
         np.multiply(by_rho, -x, out=gradient[2])
@@ -437,6 +521,8 @@ def sphere_image(
     measured: PointSpread | None = None,
     shell: bool = False,
     asymmetry: Asymmetry | None = None,
+    depth: DepthChange | None = None,
+    pupil: Pupil | None = None,
 ) -> SphereImage:
     """Tabulate a ball convolved with an anisotropic point spread and with the voxels.
 
@@ -458,6 +544,10 @@ def sphere_image(
         The surface of the sphere is fluorescent, in place of all of it.
     asymmetry : Asymmetry, optional
         By what the point spread differs from an even body of revolution.
+    depth : DepthChange, optional
+        How the point spread changes with the height of a sphere in the stack.
+    pupil : Pupil, optional
+        The point spread of a confocal microscope, in place of `psf` and `tail`.
 
     Returns
     -------
@@ -484,14 +574,59 @@ def sphere_image(
     """
     require_positive(diameter=diameter, **{"psf[z]": psf[0], "psf[plane]": psf[1]})
     require_positive(**{f"voxel[{axis}]": h for axis, h in zip("zyx", voxel, strict=True)})
-    spreads = [(1.0 if tail is None else 1.0 - tail.share, psf)]
-    if tail is not None:
-        require_positive(**{"tail psf[z]": tail.psf[0], "tail psf[plane]": tail.psf[1]})
-        if not 0 <= tail.share <= 1:
-            raise ValueError(f"tail: expected a share between 0 and 1, got {tail.share}")
-        spreads.append((tail.share, tail.psf))
-    if measured is not None:
-        spreads = list(measured.components)
+    ball: BallBlur | PupilBall
+    if pupil is not None:
+        ball = PupilBall(diameter, pupil, (voxel[0] ** 2 / 12, voxel[1] * voxel[2] / 12), shell)
+    else:
+        spreads = _gaussians(psf, tail) if measured is None else measured.components
+        ball = BallBlur(diameter, _with_voxel(spreads, voxel), shell)
+    blur_z, blur = ball.components[0][1]
+    spacing = _KNOT_SPACING * blur_z, _KNOT_SPACING * blur
+    radius = diameter / 2 * float(np.exp(_size_range(spread)))
+    z, rho = (
+        np.asarray(h * np.arange(int(np.ceil((radius + end) / h)) + 2), dtype=np.float64)
+        for h, end in zip(spacing, ball.table_range, strict=True)
+    )
+    knots = _spline_knots(ball.intensity(z, rho))
+    sizes, tables = np.zeros(1), knots[None]
+    if spread > 0:
+        half = int(np.ceil(_size_range(spread) * diameter / 2 / (_SIZE_SPACING * blur))) + 1
+        sizes = np.linspace(-1.0, 1.0, 2 * half + 1) * _size_range(spread)
+        tables = _tables_of_sizes(ball, sizes, z, rho)
+    frozen(knots, sizes, tables)
+    image = SphereImage(
+        diameter, psf, voxel, (blur_z, blur), tail, spread, ball, knots, spacing, sizes, tables
+    )
+    if asymmetry is not None and not any(asymmetry):
+        asymmetry = None
+    uneven = None
+    if asymmetry is not None or (depth is not None and any(depth.slopes[2:])):
+        uneven = image.asymmetry_knots()
+    high = None
+    if depth is not None:
+        balls = [ball.widened(*depth.variances(at)) for at in depth.nodes(_HEIGHT_NODES)]
+        high = np.stack([_tables_of_sizes(one, sizes, z, rho) for one in balls])
+    return replace(
+        image, asymmetry=asymmetry, _uneven_knots=uneven, depth=depth, _height_tables=high
+    )
+
+
+def _gaussians(
+    psf: tuple[float, float], tail: PsfTail | None
+) -> tuple[tuple[float, tuple[float, float]], ...]:
+    """Return the shares and standard deviations of one Gaussian, or of two."""
+    if tail is None:
+        return ((1.0, psf),)
+    require_positive(**{"tail psf[z]": tail.psf[0], "tail psf[plane]": tail.psf[1]})
+    if not 0 <= tail.share <= 1:
+        raise ValueError(f"tail: expected a share between 0 and 1, got {tail.share}")
+    return (1.0 - tail.share, psf), (tail.share, tail.psf)
+
+
+def _with_voxel(
+    spreads: Sequence[tuple[float, tuple[float, float]]], voxel: tuple[float, float, float]
+) -> tuple[tuple[float, tuple[float, float]], ...]:
+    """Return the shares of Gaussians and their standard deviations with those of a voxel."""
     components = []
     for share, (psf_z, psf_plane) in spreads:
         blur_z = float(np.sqrt(psf_z**2 + voxel[0] ** 2 / 12))
@@ -503,28 +638,29 @@ def sphere_image(
                 "two exchanged?"
             )
         components.append((share, (blur_z, blur)))
-    ball = BallBlur(diameter, tuple(components), shell)
-    blur_z, blur = components[0][1]
-    spacing = _KNOT_SPACING * blur_z, _KNOT_SPACING * blur
-    radius = diameter / 2 * float(np.exp(_size_range(spread)))
-    z, rho = (
-        np.asarray(h * np.arange(int(np.ceil((radius + end) / h)) + 2), dtype=np.float64)
-        for h, end in zip(spacing, ball.ranges(_TABLE_RANGE, _TAIL_TABLE_RANGE), strict=True)
-    )
-    knots = _spline_knots(ball.intensity(z, rho))
-    sizes, tables = np.zeros(1), knots[None]
-    if spread > 0:
-        half = int(np.ceil(_size_range(spread) * diameter / 2 / (_SIZE_SPACING * blur))) + 1
-        sizes = np.linspace(-1.0, 1.0, 2 * half + 1) * _size_range(spread)
-        balls = [ball._replace(diameter=diameter * float(np.exp(size))) for size in sizes]
-        tables = np.stack([_spline_knots(sphere.intensity(z, rho)) for sphere in balls])
-    frozen(knots, sizes, tables)
-    image = SphereImage(
-        diameter, psf, voxel, (blur_z, blur), tail, spread, ball, knots, spacing, sizes, tables
-    )
-    if asymmetry is None or not any(asymmetry):
-        return image
-    return replace(image, asymmetry=asymmetry, _uneven_knots=image.asymmetry_knots())
+    return tuple(components)
+
+
+def _tables_of_sizes(ball: BallBlur | PupilBall, sizes: Floats, z: Floats, rho: Floats) -> Floats:
+    """Return the knots of the images of balls whose logarithms of the diameter deviate."""
+    balls = [ball._replace(diameter=ball.diameter * float(np.exp(size))) for size in sizes]
+    return np.stack([_spline_knots(one.intensity(z, rho)) for one in balls])
+
+
+def _between(grid: Floats, at: float) -> tuple[Floats, Floats]:
+    """Return the factors of tables on an even grid in the cubic between them, and their slopes."""
+    step = grid[1] - grid[0]
+    t = (at - grid[0]) / step
+    first = int(np.clip(np.floor(t) - 1, 0, len(grid) - 4))
+    u = t - first
+    value, slope = np.zeros((2, len(grid)))
+    for k in range(4):
+        other = np.array([j for j in range(4) if j != k])
+        scale = float(np.prod(k - other))
+        a, b, c = u - other
+        value[first + k] = a * b * c / scale
+        slope[first + k] = (a * b + b * c + a * c) / (scale * step)
+    return value, slope
 
 
 def _size_range(spread: float) -> float:

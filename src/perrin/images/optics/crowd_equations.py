@@ -77,7 +77,8 @@ class CrowdWindow:
 
     def spots(self, image: SphereImage, centers: Floats) -> list[SphereSpot]:
         """Return the unit images of spheres in this window."""
-        return [image.spot(c, self.data.shape) for c in centers - self.origin]
+        shape, origin = self.data.shape, self.origin
+        return [image.spot(c - origin, shape, height=float(c[0])) for c in centers]
 
 
 def cut_crowd_window(

@@ -12,6 +12,7 @@ from perrin.images.optics.asymmetry import Asymmetry, significant_sums
 from perrin.images.optics.ball_image import BallBlur, PsfTail, SphereImage, sphere_image
 from perrin.images.optics.crowd_equations import profile_information, slopes_of_spheres
 from perrin.images.optics.crowd_fit import fit_crowd
+from perrin.images.optics.depth import DepthChange, significant_slopes
 from perrin.images.optics.flicker import LineChanges, Lines, find_flicker, find_gain_spread
 from perrin.images.optics.neighbours import (
     THIRD_DIFFERENCE,
@@ -19,6 +20,7 @@ from perrin.images.optics.neighbours import (
     neighbour_variance,
 )
 from perrin.images.optics.optics import CameraNoise, Optics
+from perrin.images.optics.pupil import AIRY, Pupil, PupilBall
 from perrin.images.optics.window_fit import FreeCenters, cut_window, fit_window
 
 if TYPE_CHECKING:
@@ -50,6 +52,16 @@ _LEAST_ELONGATION, _LEAST_OVER_VOXEL, _LEAST_TAIL = 1.025, 1.02, 1.2
 # Blurs and share of the tail at the start of its search, over the Gaussian point spread found.
 _NARROWED, _WIDENED, _TAIL_SHARE, _MAX_TAIL_SHARE = 0.85, 3.0, 0.15, 0.6
 
+# Share of the tail from which on a confocal point spread is tried, which takes seconds.
+_OPEN_SHARE = 0.4
+
+# Values of a `Pupil` at the start of the search for a confocal point spread, pinholes of which the
+# likeliest is the start, in Airy units, and the least and the largest values: apertures of 0.3 to
+# 1.5 and visible light, or, where voxels are points, a narrower point spread.
+_PUPIL_START, _PINHOLES_TRIED = (13.0, 0.55), (0.7, 2.0, 5.0)
+_PUPIL_LEAST, _PUPIL_MOST = np.log([2.5, 0.1, 0.02]), np.log([40.0, 0.75, 4.0])
+_MAX_PUPIL_ROUNDS = 12
+
 # A tail is searched for if its share is this many standard errors above 0 to first order, and it is
 # kept if it increases the logarithm of the likelihood of other groups by at least this.
 _LEAST_SHARE_ERRORS, _LEAST_HELD_OUT_GAIN = 3.0, 3.0
@@ -61,8 +73,14 @@ _SHELL_MISFIT = 1.3
 # and increases the logarithm of the likelihood of the diameters by at least this.
 _FIRST_SPREAD, _LEAST_SPREAD, _LEAST_SPREAD_GAIN = 0.06, 0.007, 5.0
 
-# Rounds of the search for an asymmetry of the point spread.
-_ASYMMETRY_ROUNDS = 4
+# Rounds of the search for moments of the point spread, and their number: the components of an
+# asymmetry, and the slopes of four moments against the height.
+_MOMENT_ROUNDS, _N_SLOPES = 4, len(DepthChange(0.0, 0.0, 0.0).slopes)
+_N_MOMENTS = len(Asymmetry._fields) + _N_SLOPES
+_OF_DEPTH = np.arange(_N_MOMENTS) >= _N_MOMENTS - _N_SLOPES
+
+# Components of an asymmetry that differ above and below the focus alone.
+_ABOVE_FOCUS = [Asymmetry._fields.index(name) for name in ("zzz", "zrr")]
 
 # Change of the spread, relative to it, at which its search ends.
 _SPREAD_CONVERGED = 0.05
@@ -224,10 +242,11 @@ class ImageParameters:
 
     Attributes
     ----------
-    values : ndarray, shape (1,), (3,) or (6,)
+    values : ndarray, shape (1,), (3,), (4,) or (6,)
         Logarithms of the diameter and of the blurs along z and in the plane, um; with a tail its
         share, and the logarithms of its blurs. Blurs include the voxel. With a measured point
-        spread the diameter alone.
+        spread the diameter alone; of a confocal one the logarithms of the diameter and of the
+        three values of a `Pupil`.
     voxel : tuple of float
         Voxel size (z, y, x), um.
     spread : float
@@ -238,6 +257,8 @@ class ImageParameters:
         The surface of the spheres is fluorescent, in place of all of them.
     asymmetry : Asymmetry or None
         By what the point spread differs from an even body of revolution.
+    depth : DepthChange or None
+        How the point spread changes with the height of a sphere.
 
     Examples
     --------
@@ -252,14 +273,25 @@ class ImageParameters:
     measured: PointSpread | None = None
     shell: bool = False
     asymmetry: Asymmetry | None = None
+    depth: DepthChange | None = None
 
     @property
     def voxel_blur(self) -> Floats:
         """Standard deviations (z, plane) of a voxel, um."""
         return np.sqrt(np.array([self.voxel[0] ** 2, self.voxel[1] * self.voxel[2]]) / 12)
 
-    def ball(self, values: Floats) -> BallBlur:
+    @property
+    def of_pupil(self) -> bool:
+        """Whether the point spread is that of a confocal microscope."""
+        return len(self.values) == 1 + len(Pupil._fields)
+
+    def ball(self, values: Floats) -> BallBlur | PupilBall:
         """Return the blurred ball at other values of the parameters."""
+        if self.of_pupil:
+            size, lateral, slope, pinhole = np.exp(values).tolist()
+            wide_z, wide = np.square(self.voxel_blur).tolist()
+            pupil = Pupil(lateral, slope, pinhole)
+            return PupilBall(size, pupil, (wide_z, wide), self.shell)
         if self.measured is not None:
             wide_z, wide = self.voxel_blur.tolist()
             measured = tuple(
@@ -286,6 +318,18 @@ class ImageParameters:
                 measured=self.measured,
                 shell=self.shell,
                 asymmetry=self.asymmetry,
+                depth=self.depth,
+            )
+        if isinstance(ball, PupilBall):
+            return sphere_image(
+                diameter=ball.diameter,
+                psf=ball.pupil.psf,
+                voxel=self.voxel,
+                spread=self.spread,
+                shell=self.shell,
+                asymmetry=self.asymmetry,
+                depth=self.depth,
+                pupil=ball.pupil,
             )
         (psf_z, psf), *wider = (
             np.sqrt(np.square(blur) - self.voxel_blur**2).tolist() for _, blur in ball.components
@@ -301,6 +345,7 @@ class ImageParameters:
             spread=self.spread,
             shell=self.shell,
             asymmetry=self.asymmetry,
+            depth=self.depth,
         )
 
     def with_tail(self) -> ImageParameters:
@@ -314,6 +359,12 @@ class ImageParameters:
         ]
         return replace(self, values=np.concatenate(start)).within_bounds()
 
+    def with_pupil(self, airy_units: float) -> ImageParameters:
+        """Return parameters of a confocal point spread at the start of its search."""
+        lateral, slope = _PUPIL_START
+        start = np.log([lateral, slope, airy_units * AIRY / lateral])
+        return replace(self, values=np.append(self.values[:1], start))
+
     def bounds(self) -> tuple[Floats, Floats]:
         """Return the least and the largest values of the parameters.
 
@@ -323,6 +374,9 @@ class ImageParameters:
         n = len(self.values)
         low, high = np.full(n, -np.inf), np.full(n, np.inf)
         if n == 1:
+            return low, high
+        if self.of_pupil:
+            low[1:], high[1:] = _PUPIL_LEAST, _PUPIL_MOST
             return low, high
         least = np.log(_LEAST_OVER_VOXEL * self.voxel_blur)
         low[2] = least[1]
@@ -366,13 +420,28 @@ class ImageParameters:
     def optics(self, noise: CameraNoise, information: Floats) -> Optics:
         """Return the optics, with standard errors from the information on the parameters."""
         image = self.image()
-        error = np.sqrt(np.diag(np.linalg.pinv(information, hermitian=True)))[:3]
+        covariance = np.linalg.pinv(information, hermitian=True)
+        error = np.sqrt(np.diag(covariance))[:3]
+        ball = self.ball(self.values)
+        if isinstance(ball, PupilBall):
+            # The width in the plane is as 1 / lateral, that along z as 1 / (lateral slope).
+            along = float(np.sqrt(max(covariance[1:3, 1:3].sum(), 0.0)))
+            z, plane = ball.pupil.psf
+            stderr = (float(image.diameter * error[0]), z * along, plane * float(error[1]))
+            return Optics(
+                *(image.diameter, image.psf, noise, stderr, None, self.spread),
+                shell=self.shell,
+                asymmetry=self.asymmetry,
+                depth=self.depth,
+                pupil=ball.pupil,
+            )
         if self.measured is not None:
             stderr = (float(image.diameter * error[0]), 0.0, 0.0)
             return Optics(
                 *(image.diameter, image.psf, noise, stderr, None, self.spread, self.measured),
                 shell=self.shell,
                 asymmetry=self.asymmetry,
+                depth=self.depth,
             )
         # The blur is the root of the sum of squares of point spread and voxel.
         factor = np.array([image.diameter, *(np.square(image.blur) / np.array(image.psf))])
@@ -381,7 +450,26 @@ class ImageParameters:
             *(image.diameter, image.psf, noise, (a, b, c), image.tail, self.spread),
             shell=self.shell,
             asymmetry=self.asymmetry,
+            depth=self.depth,
         )
+
+
+class MomentTables(NamedTuple):
+    """Tables of the derivatives of an image by the moments of the point spread.
+
+    Attributes
+    ----------
+    asymmetry : ndarray
+        Those by the components of an `Asymmetry` (`SphereImage.asymmetry_knots`).
+    widths : ndarray
+        Those by the variances along z and in the plane.
+    heights : DepthChange
+        The middle and the range of the heights of the spheres.
+    """
+
+    asymmetry: Floats
+    widths: Floats
+    heights: DepthChange
 
 
 class ImageVariations(NamedTuple):
@@ -394,17 +482,22 @@ class ImageVariations(NamedTuple):
     slopes : ndarray, shape (k, ...)
         Tables of the derivatives (`SphereImage.slopes`); of a single Gaussian the last one is that
         by the share of a tail, at a share of 0.
-    asymmetry : ndarray or None
-        Tables of the derivatives by the asymmetry of the point spread, if they are wanted.
+    moments : MomentTables or None
+        Tables of the derivatives by the moments of the point spread, if they are wanted.
     """
 
     image: SphereImage
     slopes: Floats
-    asymmetry: Floats | None = None
+    moments: MomentTables | None = None
 
     @classmethod
-    def about(cls, parameters: ImageParameters, *, asymmetry: bool = False) -> ImageVariations:
-        """Return image and derivatives at the values of parameters."""
+    def about(
+        cls, parameters: ImageParameters, *, heights: DepthChange | None = None
+    ) -> ImageVariations:
+        """Return image and derivatives at the values of parameters.
+
+        Those by the moments of the point spread are wanted where `heights` are stated.
+        """
         values, d = parameters.values, _PARAMETER_DIFFERENCE
         pairs = [
             (parameters.ball(values + shift), parameters.ball(values - shift))
@@ -415,8 +508,17 @@ class ImageVariations(NamedTuple):
             wide = np.concatenate([values, [2 * d], values[1:] + np.log(_WIDENED)])
             pairs.append((parameters.ball(wide), plain))
         image = parameters.image()
-        knots = image.asymmetry_knots() if asymmetry else None
-        return cls(image, image.slopes(pairs, 2 * d), knots)
+        slopes = image.slopes(pairs, 2 * d)
+        if heights is None:
+            return cls(image, slopes)
+        ball, square = parameters.ball(values), np.square(image.blur)
+        changes = ((d * square[0], 0.0), (0.0, d * square[1]))
+        widths = [
+            image.slopes([(ball.widened(*c), ball.widened(*(-x for x in c)))], 2 * sum(c))[0]
+            for c in changes
+        ]
+        tables = MomentTables(image.asymmetry_knots(), np.stack(widths), heights)
+        return cls(image, slopes, tables)
 
 
 class SampleFit(NamedTuple):
@@ -611,10 +713,12 @@ class GroupSample(NamedTuple):
         window = self.window(image)
         fit = fit_window(window, image, noise, FreeCenters(self.centers))
         slope = window.slopes(image, variations.slopes, fit.centers, fit.brightness, fit.sizes)
-        if variations.asymmetry is not None:
-            knots = variations.asymmetry
-            more = window.asymmetry_slopes(image, knots, fit.centers, fit.brightness)
-            slope = np.concatenate([slope, more])
+        if variations.moments is not None:
+            knots, widths, heights = variations.moments
+            spheres = fit.centers, fit.brightness
+            more = window.asymmetry_slopes(image, knots, *spheres)
+            deep = window.depth_slopes(image, widths, knots[2:4], *spheres, heights=heights)
+            slope = np.concatenate([slope, more, deep])
         # The Schur complement of the information, with the fit's own parameters eliminated.
         weighted = fit.precision.times(slope)
         nuisance = fit.precision.times(fit.jacobian)
@@ -828,11 +932,14 @@ def fit_samples(
 
     The point spread is a Gaussian. Where the derivative of the likelihood by the share of a wider
     second Gaussian is significant, the sum of two Gaussians is fitted to every other group, and it
-    is used if the likelihood of the groups between them is the larger one. Where the diameters of
-    single spheres, fitted with a wide distribution, differ by more than their errors, their spread
+    is used if the likelihood of the groups between them is the larger one. Where it is not, or much
+    of the light is in the wider Gaussian, the point spread of an aperture with a pinhole (`Pupil`)
+    is tried in the same way. Where the diameters of single spheres, fitted with a wide
+    distribution, differ by more than their errors, their spread
     is learned too: that of greatest likelihood, and the mean diameter is the mean of the spheres.
     A point spread that is no body of revolution, or differs above and below the focus, changes the
-    image by derivatives of it (`Asymmetry`), whose factors are found where they are significant.
+    image by derivatives of it (`Asymmetry`), whose factors are found where they are significant;
+    so are changes with the height of a sphere in the stack (`DepthChange`).
     Crowds have one even Gaussian and one diameter. Samples are left out first, because dust among
     them would appear as a tail or as a spread, and all are judged again by the image that is found.
     """
@@ -865,7 +972,7 @@ def fit_samples(
         # The first step of the share of a tail, and its error.
         variance = np.linalg.pinv(found.information, hermitian=True)
         if variance[-1] @ found.score > _LEAST_SHARE_ERRORS * np.sqrt(variance[-1, -1]):
-            found = _with_tail(found)
+            found = _with_pupil(_with_tail(found))
     if found is not plain and left_out:
         # All samples are judged again by the image that was found.
         variations = ImageVariations.about(found.parameters)
@@ -877,7 +984,7 @@ def fit_samples(
             found = _settled(kept, found.parameters, found.noise)
     elif found is not plain:
         found, left_out = _without_dust(found)
-    found = _with_asymmetry(found.with_neighbours())
+    found = _with_moments(found.with_neighbours())
     optics = found.parameters.optics(found.noise, found.information)
     return LearnedOptics(optics, replace(_usual_of(found), left_out=left_out))
 
@@ -1093,45 +1200,167 @@ def _with_tail(plain: _Settled) -> _Settled:
         return plain
 
 
-def _with_asymmetry(even: _Settled) -> _Settled:
-    """Return the parameters with an asymmetric point spread, if the residuals show one.
+def _with_pupil(found: _Settled) -> _Settled:
+    """Return the parameters of a confocal point spread if groups not fitted are likelier with it.
 
-    Its components multiply derivatives of the image, so that they are the solution of linear
-    equations together with the other parameters; few rounds are enough. Those are kept that differ
-    from 0 by more than the noise and by more than the scatter between the samples, in which
-    spheres that move during a scan, say, have images that are asymmetric in one way or another.
+    It is tried where the sum of two Gaussians is not used, or much of the light is in the wider
+    one, as behind an open pinhole. `found` has Gaussians, and is fitted to all groups; the other to
+    half of them.
+    """
+    tail = found.parameters.image().tail
+    if tail is not None and tail.share < _OPEN_SHARE:
+        return found
+    groups = [s for s in found.samples if isinstance(s, GroupSample)]
+    if len(groups) < max(2, len(found.samples)):
+        return found
+    starts = [found.parameters.with_pupil(pinhole) for pinhole in _PINHOLES_TRIED]
+    before = found.parameters.image()
+
+    def likelihood(parameters: ImageParameters, noise: CameraNoise, part: Sequence[int]) -> float:
+        image = parameters.image()
+        return sum(groups[k].log_likelihood(image, noise, within=before) for k in part)
+
+    fitted, others = range(0, len(groups), 2), range(1, len(groups), 2)
+    try:
+        start = max(starts, key=lambda one: likelihood(one, found.noise, fitted))
+        half = _settled(
+            list(groups[::2]),
+            start,
+            found.noise,
+            rounds=_MAX_PUPIL_ROUNDS,
+            tolerance=_TRIAL_STEP_IN_ERRORS,
+        )
+        gain = likelihood(half.parameters, half.noise, others)
+        if gain - likelihood(found.parameters, half.noise, others) < _LEAST_HELD_OUT_GAIN:
+            return found
+        return _settled(list(groups), half.parameters, half.noise)
+    except NoSpheresError:
+        # The Gaussians have settled, and this point spread has not: they are used.
+        return found
+
+
+def _with_moments(even: _Settled) -> _Settled:
+    """Return the parameters with moments of the point spread that the residuals show.
+
+    These are an asymmetric point spread, and moments that change with the height of a sphere. They
+    multiply derivatives of the image, so that they are the solution of linear equations together
+    with the other parameters; few rounds are enough. Those are kept that differ from 0 by more than
+    the noise and by more than the scatter between the samples, in which spheres that move during a
+    scan, say, have images that are asymmetric in one way or another.
     """
     of_groups = all(isinstance(s, GroupSample) for s in even.samples)
     if not of_groups or even.noise.neighbours:
         return even
-    parameters, samples, n = even.parameters, even.samples, len(even.parameters.values)
-    count = len(Asymmetry._fields)
-    values, used, settled = np.zeros(count), np.ones(count, dtype=np.bool_), even
-    for number in range(_ASYMMETRY_ROUNDS):
-        variations = ImageVariations.about(parameters, asymmetry=True)
-        fits = [s.fit(variations, even.noise) for s in samples]
-        samples = [s._replace(centers=fit.centers) for s, fit in zip(samples, fits, strict=True)]
-        size = len(fits[0].score) - count  # those of the image, and of the share of a tail
-        kept = np.r_[:n, size + np.flatnonzero(used)]
-        information = np.sum([fit.information for fit in fits], axis=0)[np.ix_(kept, kept)]
-        scores = np.array([fit.score[kept] for fit in fits])
-        if number == 0:
-            covariance = np.linalg.pinv(information, hermitian=True)
-            used = significant_sums(scores @ covariance, np.diag(covariance))[n:]
-            if not used.any():
-                return even
-            kept = np.r_[:n, n + np.flatnonzero(used)]
-            information, scores = information[np.ix_(kept, kept)], scores[:, kept]
-        step = np.linalg.pinv(information, hermitian=True) @ scores.sum(axis=0)
-        values[used] += step[n:]
-        moved = parameters.moved(information[:n, :n], information[:n, :n] @ step[:n])
-        parameters = replace(moved, asymmetry=Asymmetry(*values.tolist()))
-        settled = even._replace(
-            parameters=parameters, samples=samples, fits=fits, information=information[:n, :n]
+    found = _MomentFit.of(even).with_asymmetry()
+    if found.used.any():
+        found = found.settled()
+    deeper = found.with_depth()
+    if deeper is not found:
+        found = (deeper.refitted() if found.used.any() else deeper).settled()
+    return found.now if found.used.any() else even
+
+
+class _MomentFit(NamedTuple):
+    """Fits of the samples with derivatives by the moments of the point spread.
+
+    Attributes
+    ----------
+    now : _Settled
+        Parameters and fits.
+    used : ndarray of bool, shape (16,)
+        Which components of `Asymmetry` and which slopes of `DepthChange` are fitted.
+    values : ndarray, shape (16,)
+        Their values.
+    heights : DepthChange
+        The middle and the range of the heights.
+    """
+
+    now: _Settled
+    used: Bools
+    values: Floats
+    heights: DepthChange
+
+    @classmethod
+    def of(cls, even: _Settled) -> _MomentFit:
+        """Return the fits without any of the moments."""
+        z = np.concatenate([s.centers[:, 0] for s in even.samples])
+        heights = DepthChange(float(z.mean()), float(z.min()), float(z.max()))
+        none = np.zeros(_N_MOMENTS, dtype=np.bool_)
+        return cls(even, none, np.zeros(_N_MOMENTS), heights).refitted()
+
+    def refitted(self) -> _MomentFit:
+        """Return fits of the samples at the present parameters."""
+        variations = ImageVariations.about(self.now.parameters, heights=self.heights)
+        fits = [s.fit(variations, self.now.noise) for s in self.now.samples]
+        samples = [
+            s._replace(centers=fit.centers) for s, fit in zip(self.now.samples, fits, strict=True)
+        ]
+        return self._replace(now=self.now._replace(samples=samples, fits=fits))
+
+    def equations(self, moments: Bools) -> tuple[Floats, Floats]:
+        """Return information (N, k, k) and scores (N, k) of the image and of some moments."""
+        fits, n = self.now.fits, len(self.now.parameters.values)
+        size = len(fits[0].score) - _N_MOMENTS  # those of the image, and of the share of a tail
+        kept = np.r_[:n, size + np.flatnonzero(moments)]
+        information = np.array([fit.information[np.ix_(kept, kept)] for fit in fits])
+        return information, np.array([fit.score[kept] for fit in fits])
+
+    def with_asymmetry(self) -> _MomentFit:
+        """Return the fits with the components of an asymmetry that are significant."""
+        tested = ~_OF_DEPTH
+        information, scores = self.equations(tested)
+        covariance = np.linalg.pinv(information.sum(axis=0), hermitian=True)
+        shown = significant_sums(scores @ covariance, np.diag(covariance))
+        used = self.used.copy()
+        used[tested] = shown[-np.count_nonzero(tested) :]
+        return self._replace(used=used)
+
+    def with_depth(self) -> _MomentFit:
+        """Return the fits with the slopes against the height, if that of a width is significant.
+
+        Both widths change then, and with a point spread that differs above and below the focus its
+        third moments too. Light of other spheres that is spread over the field changes third
+        moments alone.
+        """
+        shown = significant_slopes(*self.equations(self.used | _OF_DEPTH))
+        if not shown[-_N_SLOPES:][:2].any():
+            return self
+        uneven = self.used[_ABOVE_FOCUS].any()
+        used = self.used.copy()
+        used[_OF_DEPTH] = [True, True, uneven, uneven]
+        return self._replace(used=used)
+
+    def settled(self) -> _MomentFit:
+        """Return the fits with the moments in use of greatest likelihood."""
+        found = self
+        for number in range(_MOMENT_ROUNDS):
+            if number:
+                found = found.refitted()
+            information, scores = found.equations(found.used)
+            information = information.sum(axis=0)
+            step = np.linalg.pinv(information, hermitian=True) @ scores.sum(axis=0)
+            found = found.moved(information, step)
+            if step @ information @ step < _STEP_IN_ERRORS**2:
+                break
+        return found
+
+    def moved(self, information: Floats, step: Floats) -> _MomentFit:
+        """Return the fits at the parameters after a step."""
+        n, values = len(self.now.parameters.values), self.values.copy()
+        values[self.used] += step[n:]
+        own = information[:n, :n]
+        parameters = self.now.parameters.moved(own, own @ step[:n])
+        stderr = np.zeros(len(values))
+        stderr[self.used] = np.sqrt(np.diag(np.linalg.pinv(information, hermitian=True))[n:])
+        uneven, slopes = values[~_OF_DEPTH], values[_OF_DEPTH]
+        depth = self.heights.with_slopes(slopes, stderr[_OF_DEPTH])
+        parameters = replace(
+            parameters,
+            asymmetry=Asymmetry(*uneven.tolist()) if uneven.any() else None,
+            depth=depth if slopes.any() else None,
         )
-        if step @ information @ step < _STEP_IN_ERRORS**2:
-            break
-    return settled
+        now = self.now._replace(parameters=parameters, information=own)
+        return self._replace(now=now, values=values)
 
 
 def photon_transfer(expected: Floats, variance: Floats) -> CameraNoise:

@@ -11,7 +11,9 @@ from perrin._arrays import to_plain
 from perrin._display import Shown
 from perrin.images.optics.asymmetry import Asymmetry
 from perrin.images.optics.ball_image import PsfTail, SphereImage, sphere_image
+from perrin.images.optics.depth import DepthChange
 from perrin.images.optics.point_spread import PointSpread
+from perrin.images.optics.pupil import Pupil
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -152,6 +154,12 @@ class Optics(Shown):
     asymmetry : Asymmetry or None
         By what the point spread differs from a body of revolution that is even along z; None where
         the movie shows no difference.
+    depth : DepthChange or None
+        How the point spread changes with the height of a sphere in the stack; None where the movie
+        shows no change.
+    pupil : Pupil or None
+        The point spread of a confocal microscope, where it is likelier than one or two Gaussians;
+        `psf` is then the Gaussian that is as wide at half of its maximum, and there is no `tail`.
 
     Examples
     --------
@@ -169,6 +177,8 @@ class Optics(Shown):
     measured: PointSpread | None = None
     shell: bool = False
     asymmetry: Asymmetry | None = None
+    depth: DepthChange | None = None
+    pupil: Pupil | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """Return values that JSON holds.
@@ -188,7 +198,9 @@ class Optics(Shown):
         shell = {"shell": True} if self.shell else {}
         measured = {} if self.measured is None else {"measured": self.measured.to_dict()}
         uneven = {} if self.asymmetry is None else {"asymmetry": self.asymmetry._asdict()}
-        return entry | measured | shell | uneven
+        deep = {} if self.depth is None else {"depth": to_plain(self.depth._asdict())}
+        pupil = {} if self.pupil is None else {"pupil": to_plain(self.pupil._asdict())}
+        return entry | measured | shell | uneven | deep | pupil
 
     @classmethod
     def from_dict(cls, entry: Mapping[str, Any]) -> Optics:
@@ -219,7 +231,15 @@ class Optics(Shown):
         shell = bool(entry.get("shell", False))
         uneven = entry.get("asymmetry")
         asymmetry = None if uneven is None else Asymmetry(**uneven)
-        return cls(size, (psf_z, psf), noise, (a, b, c), tail, spread, measured, shell, asymmetry)
+        deep, depth = entry.get("depth"), None
+        if deep is not None:
+            depth = DepthChange(**{**deep, "stderr": tuple(deep["stderr"])})
+        return cls(
+            *(size, (psf_z, psf), noise, (a, b, c), tail, spread, measured, shell),
+            asymmetry=asymmetry,
+            depth=depth,
+            pupil=Pupil(**entry["pupil"]) if "pupil" in entry else None,
+        )
 
     def image(self, voxel: tuple[float, float, float]) -> SphereImage:
         """Return the table of the sphere's image for voxels (z, y, x), um."""
@@ -232,4 +252,6 @@ class Optics(Shown):
             measured=self.measured,
             shell=self.shell,
             asymmetry=self.asymmetry,
+            depth=self.depth,
+            pupil=self.pupil,
         )

@@ -21,6 +21,7 @@ from perrin.images.optics.neighbours import neighbour_covariance
 if TYPE_CHECKING:
     from perrin._arrays import Bools, Floats
     from perrin.images.optics.ball_image import SphereImage
+    from perrin.images.optics.depth import DepthChange
     from perrin.images.optics.flicker import Lines
     from perrin.images.optics.optics import CameraNoise
 
@@ -72,22 +73,24 @@ class Window(NamedTuple):
         point spread.
         """
         origin = np.array([s.start for s in self.box]) * np.array(image.voxel)
-        layers = image.on_voxels(self.mask, centers - origin, sizes)
+        layers = image.on_voxels(self.mask, centers - origin, sizes, centers[:, 0])
         return layers[:, 0], layers[:, 1:]
 
     def changes(self, image: SphereImage, centers: Floats, sizes: Floats) -> Floats | None:
         """Return what the asymmetry of the point spread adds to `spots` (n, m), None if nothing."""
-        if image.asymmetry is None:
+        if not image.is_uneven:
             return None
         origin = np.array([s.start for s in self.box]) * np.array(image.voxel)
-        return image.changes_on_voxels(self.mask, centers - origin, sizes)
+        return image.changes_on_voxels(self.mask, centers - origin, sizes, centers[:, 0])
 
     def size_slopes(self, image: SphereImage, centers: Floats, sizes: Floats) -> Floats:
         """Return the derivatives (n, m) of unit images by the logarithms of the diameters."""
         origin = np.array([s.start for s in self.box]) * np.array(image.voxel)
         whole = np.zeros((len(centers), *self.mask.shape))
-        for layer, center, size in zip(whole, centers - origin, sizes, strict=True):
-            box, value = image.slope_spot(image.size_slope(size), center, self.mask.shape)
+        heights = centers[:, 0]
+        for layer, center, size, high in zip(whole, centers - origin, sizes, heights, strict=True):
+            table = image.size_slope(size, high)
+            box, value = image.slope_spot(table, center, self.mask.shape)
             layer[box] = value[0]
         return whole[:, self.mask]
 
@@ -134,6 +137,40 @@ class Window(NamedTuple):
         for center, bright in zip(centers - origin, brightness, strict=True):
             box, value = image.asymmetry_spot(knots, center, self.mask.shape)
             whole[(slice(None), *box)] += bright * value
+        return whole[:, self.mask]
+
+    def depth_slopes(
+        self,
+        image: SphereImage,
+        widths: Floats,
+        third: Floats,
+        centers: Floats,
+        brightness: Floats,
+        *,
+        heights: DepthChange,
+    ) -> Floats:
+        """Return derivatives (4, m) of the intensity by the slopes of a `DepthChange`.
+
+        Parameters
+        ----------
+        image : SphereImage
+        widths : ndarray, shape (2, ...)
+            Tables of the derivatives by the variances along z and in the plane.
+        third : ndarray, shape (2, ...)
+            Those by `zzz` and `zrr`, over the height.
+        centers, brightness : ndarray, shape (n, 3), (n,)
+            The spheres.
+        heights : DepthChange
+            The middle and the range of the heights.
+        """
+        origin = np.array([s.start for s in self.box]) * np.array(image.voxel)
+        whole = np.zeros((4, *self.mask.shape))
+        tables = np.concatenate([widths, third])
+        for center, bright in zip(centers, brightness, strict=True):
+            box, value = image.slope_spot(tables, center - origin, self.mask.shape)
+            above = np.arange(box[0].start, box[0].stop) * image.voxel[0] + origin[0] - center[0]
+            value[2:] *= -above[:, None, None]
+            whole[(slice(None), *box)] += bright * heights.above_middle(float(center[0])) * value
         return whole[:, self.mask]
 
 
