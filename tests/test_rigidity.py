@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import perrin
-from perrin.motion.residuals import lag_one_autocorrelation
+from perrin.motion.residuals import expected_squares, fit_projector, lag_one_autocorrelation
 
 
 def judged(x, **options):
@@ -292,3 +292,16 @@ def test_autocorrelation_of_a_known_series():
     assert lag_one_autocorrelation(x).value == pytest.approx(0.8, abs=0.02)
     x[::2] = np.nan
     assert np.isnan(lag_one_autocorrelation(x).value)
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_expected_squares_are_those_of_noise_along_one_axis(d):
+    """Squares along axis a of what a fit leaves of unit noise along axis b, one axis at a time."""
+    rng = np.random.default_rng(d)
+    shape = rng.normal(size=(5, d))
+    keeps = fit_projector(shape - shape.mean(axis=0))
+    rotation = perrin.geometry.exp_map(rng.normal(size=(7, 3 if d == 3 else 1)))
+    found = expected_squares(rotation, keeps)
+    for k, r in enumerate(rotation):
+        blocks = np.einsum("ai,nmij,bj->abnm", r, keeps, r)  # of the projector, in lab axes
+        np.testing.assert_allclose(found[k], (blocks**2).sum(axis=(2, 3)), atol=1e-12)

@@ -65,6 +65,20 @@ def test_a_lost_particle_written_as_a_point_is_missing(offset, point, digits):
     pd.testing.assert_frame_equal(table, before)
 
 
+@pytest.mark.parametrize("digits", [1, 5])
+def test_particles_elsewhere_do_not_change_what_is_missing(digits):
+    """Rows of other particles, with points of their own or with shared values, change nothing."""
+    x = tracks(4)
+    x[[30, 31, 90, 200], 2] = -1.0
+    others = tracks(5) + np.array([60.0, 0.0, 0.0])
+    alone = missing_in(screen_rows(table_of(x, digits)), x.shape[:2])
+    both = np.concatenate([others[:, :2], x, others[:, 2:]], axis=1)
+    together = missing_in(screen_rows(table_of(both, digits)), both.shape[:2])
+    assert alone.sum() == 4
+    np.testing.assert_array_equal(together[:, 2:6], alone)
+    assert not together[:, [0, 1, 6, 7]].any()
+
+
 def test_a_particle_lost_for_a_long_while_is_missing_all_of_it():
     """One unbroken stay at (0, 0, 0) is a placeholder, not one place that is repeated."""
     x = tracks(3)
