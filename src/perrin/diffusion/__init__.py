@@ -9,7 +9,15 @@ from perrin.diffusion.anomalous import (
 )
 from perrin.diffusion.bounds import cramer_rao
 from perrin.diffusion.changing import with_changing_interval
-from perrin.diffusion.confined import ConfinedEstimate, cage_size, fit_confined, fit_confined_steps
+from perrin.diffusion.confined import (
+    CagePeak,
+    ConfinedEstimate,
+    cage_size,
+    confined_estimate,
+    find_cage,
+    find_cage_in,
+    fit_confined,
+)
 from perrin.diffusion.curve_fits import (
     GridLags,
     best_window,
@@ -235,6 +243,7 @@ __all__ = [
     "AxisFit",
     "AxisModel",
     "BrownianTests",
+    "CagePeak",
     "ChainTrack",
     "Chains",
     "CoefficientCorrelation",
@@ -316,6 +325,7 @@ __all__ = [
     "combined_p",
     "compress_steps",
     "confined_autocovariance",
+    "confined_estimate",
     "confined_mean_square",
     "coupled_tensor",
     "covariance_bands",
@@ -342,6 +352,8 @@ __all__ = [
     "excess_scatter_of_each",
     "expanded_about",
     "filtered_each",
+    "find_cage",
+    "find_cage_in",
     "find_exponent",
     "find_jumps",
     "find_jumps_of_each",
@@ -349,7 +361,6 @@ __all__ = [
     "fisher",
     "fit_anomalous",
     "fit_confined",
-    "fit_confined_steps",
     "fit_decay",
     "fit_gls",
     "fit_line",

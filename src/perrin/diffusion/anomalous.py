@@ -224,7 +224,7 @@ def find_exponent(
     --------
     >>> from perrin import Cluster, Noise, simulate_motion
     >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=99, rng=3)
-    >>> 0.5 < find_exponent([truth], "translation", Noise()).best.shape < 1.5
+    >>> 0.5 < find_exponent([truth], "rotation", Noise()).best.shape < 1.5
     True
     """
 
@@ -253,7 +253,7 @@ def anomalous_estimate(peak: ExponentPeak, motions: Sequence[RigidMotion]) -> An
     --------
     >>> from perrin import Cluster, Noise, simulate_motion
     >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=99, rng=3)
-    >>> anomalous_estimate(find_exponent([truth], "translation", Noise()), [truth]).n_frames
+    >>> anomalous_estimate(find_exponent([truth], "rotation", Noise()), [truth]).n_frames
     99
     """
     likelihood, best, points, gain, quantity, frame, settings = peak

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -197,26 +197,86 @@ def fit_confined(
     False
     """
     motions, settings = motions_and_noise(motion, quantity, noise, exposure)
+    return confined_estimate(find_cage(motions, quantity, settings), motions)
 
+
+class CagePeak(NamedTuple):
+    """The most likely relaxation rate of some motions, before its intervals.
+
+    Attributes
+    ----------
+    likelihood : ShapeLikelihood
+        Likelihood of the logarithm of the rate, per frame time.
+    best : ShapePoint
+        Its maximum; that of free diffusion where no cage is likelier.
+    points : list of ShapePoint
+        Trial rates.
+    free : ShapePoint
+        Free diffusion.
+    quantity : {"rotation", "translation"}
+    frame : {"mean", "body", "lab"}
+        Attribute `frame` of the estimate.
+    settings : Noise
+    """
+
+    likelihood: ShapeLikelihood
+    best: ShapePoint
+    points: list[ShapePoint]
+    free: ShapePoint
+    quantity: Quantity
+    frame: Literal["mean", "body", "lab"]
+    settings: Noise
+
+    @property
+    def gain(self) -> float:
+        """Logarithm of the likelihood at the maximum over that of free diffusion."""
+        return max(self.best.value - self.free.value, 0.0)
+
+    @property
+    def seen(self) -> bool:
+        """Whether the track is long enough to show the relaxation."""
+        return bool(self.likelihood.n_steps * np.exp(self.best.shape) >= _LEAST_RELAXATIONS)
+
+
+def find_cage(motions: Sequence[RigidMotion], quantity: Quantity, settings: Noise) -> CagePeak:
+    """Return the most likely relaxation rate, in the frame that `fit_confined` takes.
+
+    Parameters
+    ----------
+    motions : sequence of RigidMotion
+    quantity : {"rotation", "translation"}
+    settings : Noise
+
+    Returns
+    -------
+    CagePeak
+
+    Examples
+    --------
+    >>> from perrin import Cluster, Noise, simulate_motion
+    >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=300, rng=3)
+    >>> find_cage([truth], "rotation", Noise()).frame
+    'body'
+    """
     if quantity == "translation":
-        return fit_confined_steps(motions, quantity, settings, frame="lab")
+        return find_cage_in(motions, quantity, settings, frame="lab")
     if motions[0].dimension == 3:
         rms = [np.sqrt(np.nanmean(orientation_about_mean(m) ** 2)) for m in motions]
         if max(rms) <= _SMALL_CAGE:
-            caged = fit_confined_steps(motions, quantity, settings, frame="mean")
-            if caged.resolved:
-                return caged
-    return fit_confined_steps(motions, quantity, settings, frame="body")
+            peak = find_cage_in(motions, quantity, settings, frame="mean")
+            if peak.seen and confined_estimate(peak, motions).resolved:
+                return peak
+    return find_cage_in(motions, quantity, settings, frame="body")
 
 
-def fit_confined_steps(
+def find_cage_in(
     motions: Sequence[RigidMotion],
     quantity: Quantity,
     settings: Noise,
     *,
     frame: Literal["mean", "body", "lab"],
-) -> ConfinedEstimate:
-    """Fit motion in a harmonic well to steps in one frame.
+) -> CagePeak:
+    """Return the most likely relaxation rate of steps in one frame.
 
     Parameters
     ----------
@@ -228,14 +288,14 @@ def fit_confined_steps(
 
     Returns
     -------
-    ConfinedEstimate
+    CagePeak
 
     Examples
     --------
     >>> from perrin import Cluster, Noise, simulate_motion
-    >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=99, rng=3)
-    >>> fit_confined_steps([truth], "rotation", Noise(), frame="mean").frame
-    'mean'
+    >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=300, rng=3)
+    >>> find_cage_in([truth], "rotation", Noise(), frame="mean").gain < 3
+    True
     """
 
     def mean_square(lag: Floats, shape: float) -> Floats:
@@ -248,14 +308,27 @@ def fit_confined_steps(
     count = 1 + int(np.ceil((fastest - slowest) / _LOG_DISTANCE))
     best, points = likelihood.best(np.linspace(slowest, fastest, count))
     free = likelihood.at(float(np.log(_NO_RATE / likelihood.longest)))
-    gain = max(best.value - free.value, 0.0)
-    best = best if gain > 0 else free
+    best = best if best.value > free.value else free
+    return CagePeak(likelihood, best, points, free, quantity, frame, settings)
+
+
+def confined_estimate(peak: CagePeak, motions: Sequence[RigidMotion]) -> ConfinedEstimate:
+    """Return the estimate with its intervals from the most likely relaxation rate.
+
+    Examples
+    --------
+    >>> from perrin import Cluster, Noise, simulate_motion
+    >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=300, rng=3)
+    >>> confined_estimate(find_cage([truth], "rotation", Noise()), [truth]).resolved
+    False
+    """
+    likelihood, best, points, free, quantity, frame, settings = peak
     intervals = likelihood.intervals(best, points)
-    free = free._replace(shape=-np.inf)
-    best = best if gain > 0 else free
+    caged, free = best is not free, free._replace(shape=-np.inf)
+    best = best if caged else free
     dt = float(np.mean([m.dt for m in motions]))
     rate = float(np.exp(best.shape))
-    seen = likelihood.n_steps * rate >= _LEAST_RELAXATIONS
+    seen = caged and peak.seen
     times, cages, coefficients = {}, {}, {}
     for level, (low, high) in intervals.items():
         low = low if seen and low else free
@@ -301,7 +374,7 @@ def fit_confined_steps(
         frame=frame,
         noise=settings.model,
         exposure=settings.exposure,
-        log_likelihood_gain=gain,
+        log_likelihood_gain=peak.gain,
         warnings=tuple(limits),
     )
 

@@ -13,7 +13,7 @@ from perrin._arrays import choice_fault, refuse, to_plain
 from perrin._display import Shown
 from perrin._text import listed, number_text
 from perrin.diffusion.anomalous import AnomalousEstimate, anomalous_estimate, find_exponent
-from perrin.diffusion.confined import ConfinedEstimate, fit_confined
+from perrin.diffusion.confined import ConfinedEstimate, confined_estimate, find_cage
 from perrin.diffusion.estimate import DiffusionEstimate
 from perrin.diffusion.estimators import estimate_diffusion
 from perrin.diffusion.goodness_of_fit import (
@@ -401,13 +401,12 @@ def _shape(
     p_rest = float(score_p(Score.total(scores), one_sided=False)[0])
     if not (p_steady < LEVEL and p_rest > LEVEL):
         peak = find_exponent(motions, quantity, settings)
-        slower, confined = peak.best.shape < 1, None
-        if slower:
-            confined = fit_confined(motion, quantity=quantity, noise=settings)
-        caged = -np.inf if confined is None else confined.log_likelihood_gain - penalty
-        if gain <= max(peak.gain - penalty, caged):
-            if confined is not None and caged > peak.gain - penalty:
-                return "confined", confined
+        slower = peak.best.shape < 1
+        cage = find_cage(motions, quantity, settings) if slower else None
+        caged = -np.inf if cage is None else cage.gain
+        if gain <= max(peak.gain, caged) - penalty:
+            if cage is not None and caged > peak.gain:
+                return "confined", confined_estimate(cage, motions)
             kind: Kind = "subdiffusion" if slower else "superdiffusion"
             return kind, anomalous_estimate(peak, motions)
     taken = replace(settings, drift=True)
