@@ -977,7 +977,7 @@ def unit_covariance(motion: RigidMotion) -> Floats:
     >>> unit_covariance(truth)[0].diagonal().round(9)
     array([0.375, 0.375, 0.375])
     """
-    square = float(np.mean(motion.noise**2))
+    square = float(motion.noise @ motion.noise) / len(motion.noise)
     if square > 0:
         return np.asarray(motion.step_covariance / square)
     unit = orientation_covariance(motion.template, np.eye(motion.template.shape[1]))
@@ -994,7 +994,7 @@ def unit_center_variance(motion: RigidMotion) -> Floats:
     >>> unit_center_variance(truth)
     array([0.25, 0.25])
     """
-    square = float(np.mean(motion.noise**2))
+    square = float(motion.noise @ motion.noise) / len(motion.noise)
     if square > 0:
         return np.asarray(motion.step_center_variance / square)
     return np.full(len(motion.time), 1 / len(motion.template))

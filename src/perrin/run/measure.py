@@ -1327,16 +1327,16 @@ def noise_floor_tests(
         # Over a scan the offset is mostly motion, and no multiple of sigma^2.
         if D_R.noise != "joint" or not D_R.value > 0 or motion.turn_noise is not None:
             continue
-        low = high = 1.0
-        if not stated:
-            if motion.template.shape[1] == 3:
-                rotation = motion.rotation[motion.fitted]
-                low, high = floor_range(motion.template, rotation, ratio=_NOISE_RATIO)
-            unsure = _TEST_ERRORS * np.sqrt(2 / max(residual_freedom(motion), 1))
-            low, high = low * max(1 - unsure, 0.0), high * (1 + unsure)
         # A stated exposure takes b D, b = exposure dt/3, from the noise of every frame.
         blur = (D_R.exposure or 0.0) * motion.dt / 3 * D_R.value
         measured = floor_factor(motion) * (D_R.offset + blur)
+        unsure = _TEST_ERRORS * np.sqrt(2 / max(residual_freedom(motion), 1))
+        low, high = (1.0, 1.0) if stated else (max(1 - unsure, 0.0), 1 + unsure)
+        within = low * predicted.phi2 <= measured <= high * predicted.phi2
+        if not (within or stated) and motion.template.shape[1] == 3:
+            rotation = motion.rotation[motion.fitted]
+            least, most = floor_range(motion.template, rotation, ratio=_NOISE_RATIO)
+            low, high = least * low, most * high
         if not low * predicted.phi2 <= measured <= high * predicted.phi2:
             nearest = high if measured > high * predicted.phi2 else low
             outside[k] = measured, float(np.sqrt(nearest * np.mean(motion.noise**2)))
