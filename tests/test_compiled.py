@@ -132,6 +132,26 @@ def test_sums_over_modes_equal_those_of_numpy(monkeypatch, axes, modes):
 
 
 @compiled
+@pytest.mark.parametrize("axes", [1, 2, 3])
+def test_curvatures_equal_those_of_numpy(monkeypatch, axes):
+    """Of symmetric slopes, of sums that are symmetric in two axes as those over modes are."""
+    rng = np.random.default_rng(axes)
+    turn = rng.normal(size=(4, axes, axes))
+    same, after = rng.normal(size=(2, 4, 5, axes, axes))
+    same, after = same + np.swapaxes(same, 2, 3), after + np.swapaxes(after, 2, 3)
+    weight = np.linspace(0.0, 4.0, 20)
+    sums = mode_sums(
+        rng.normal(size=(4, axes, 20)), turn, rng.uniform(0.1, 1, (4, axes)), weight, curved=True
+    )[:, 3 + 2 * axes**2 :]
+    power = sums[:, : 3 * axes**3].reshape(4, axes, axes, 3, axes)
+    trace = sums[:, 3 * axes**3 :].reshape(4, axes, 3, axes)
+    kernel = tensor_modes.information(turn, same, after, power, trace)
+    monkeypatch.setattr(tensor_modes, "compiled_kernels", lambda: None)
+    twin = tensor_modes.information(turn, same, after, power, trace)
+    np.testing.assert_allclose(kernel, twin, rtol=0, atol=1e-12 * np.abs(twin).max())
+
+
+@compiled
 def test_spectra_of_steps_equal_those_of_numpy():
     """Of several motions at several points, down to the least variance, and of unequal axes."""
     rng = np.random.default_rng(4)
@@ -208,6 +228,13 @@ def test_the_kernels_refuse_arrays_that_do_not_fit():
     ):
         with pytest.raises(ValueError, match="expected modes"):
             kernels.mode_sums(modes, turn, share, w, np.ones((2, n)))
+    slopes, power, trace = np.ones((2, 4, 3, 3)), np.ones((2, 3, 3, 3, 3)), np.ones((2, 3, 3, 3))
+    for wrong in ((turn[:1], slopes, power, trace, 4), (turn, slopes[:, :3], power, trace, 4),
+                  (turn, slopes, power[:1], trace, 4), (turn, slopes, power, trace[:1], 4),
+                  (turn, slopes, power, trace, 3)):  # fmt: skip
+        with pytest.raises(ValueError, match="expected axes"):
+            kernels.curvatures(*map(np.ascontiguousarray, (wrong[0], slopes, *wrong[1:4])),
+                               np.ones((2, wrong[4], 4)))  # fmt: skip
     rows, place = np.ones((2, 7)), np.ones((1, 2))
     for sums in (np.ones((1, 2, 10)), np.ones((2, 2, 11)), np.ones((1, 3, 11))):
         with pytest.raises(ValueError, match="expected power"):

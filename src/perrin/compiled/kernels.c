@@ -582,6 +582,75 @@ static void sum_modes(const Modes *modes)
         sum_rows(modes, (int)modes->b, curved);
 }
 
+/* Slopes (rows, m, b, b) of covariances, and sums over the modes in the axes (rows, b, b). */
+typedef struct {
+    Py_ssize_t rows, m, b;
+    const double *axes, *same, *next, *power, *trace;
+    double *slopes, *products, *out;
+} Curvatures;
+
+/* out = axes^T x axes for a symmetric x, (b, b) each. */
+INLINE void turn_slope(const double *axes, const double *x, int b, double *out)
+{
+    for (int i = 0; i < b; i++)
+        for (int j = i; j < b; j++) {
+            double sum = 0.0;
+            for (int c = 0; c < b; c++)
+                for (int d = 0; d < b; d++)
+                    sum += axes[c * b + i] * x[c * b + d] * axes[d * b + j];
+            out[i * b + j] = out[j * b + i] = sum;
+        }
+}
+
+/* The products of one pair of slopes with the sums, from which those with any other follow. */
+INLINE void slope_products(const double *slope, const double *power, const double *trace, int b,
+                           double *out)
+{
+    const double *same = slope, *next = slope + b * b;
+    for (int c = 0; c < b; c++)
+        for (int d = 0; d < b; d++)
+            for (int k = 0; k < 2; k++) {
+                const double *pair = trace + (c * 3 + k) * b + d;
+                double sum = -0.5 * (pair[0] * same[c * b + d] + pair[b] * next[c * b + d]);
+                for (int a = 0; a < b; a++) {
+                    const double *three = power + ((a * b + d) * 3 + k) * b + c;
+                    sum += three[0] * same[a * b + c] + three[b] * next[a * b + c];
+                }
+                out[(k * b + c) * b + d] = sum;
+            }
+}
+
+INLINE void sum_curvatures(const Curvatures *all, int b)
+{
+    Py_ssize_t square = b * b, m = all->m;
+    for (Py_ssize_t row = 0; row < all->rows; row++) {
+        const double *axes = all->axes + row * square;
+        for (Py_ssize_t i = 0; i < m; i++) {
+            double *slope = all->slopes + 2 * i * square;
+            turn_slope(axes, all->same + (row * m + i) * square, b, slope);
+            turn_slope(axes, all->next + (row * m + i) * square, b, slope + square);
+            slope_products(slope, all->power + row * 3 * square * b,
+                           all->trace + row * 3 * square, b, all->products + 2 * i * square);
+        }
+        for (Py_ssize_t i = 0; i < m; i++)
+            for (Py_ssize_t j = i; j < m; j++) {
+                double sum = 0.0;
+                for (int k = 0; k < 2 * b * b; k++)
+                    sum += all->products[2 * i * square + k] * all->slopes[2 * j * square + k];
+                all->out[(row * m + i) * m + j] = all->out[(row * m + j) * m + i] = sum;
+            }
+    }
+}
+
+EVERY_MACHINE
+static void write_curvatures(const Curvatures *all)
+{
+    if (all->b == 3)
+        sum_curvatures(all, 3);
+    else
+        sum_curvatures(all, (int)all->b);
+}
+
 /* Powers of the sine modes of `motions` tracks, (motions, count) each, at `points` places. */
 typedef struct {
     Py_ssize_t points, motions, count;
@@ -1102,9 +1171,53 @@ PyDoc_STRVAR(two_states_doc,
 "sizes (groups,), blur (2,) and points (P, 5) are read; pairs (count, 2, 2) and value (P,) are\n"
 "written.");
 
+static PyObject *curvature_views(Py_buffer views[6])
+{
+    Curvatures all = {.axes = views[0].buf, .same = views[1].buf, .next = views[2].buf,
+                      .power = views[3].buf, .trace = views[4].buf, .out = views[5].buf};
+    Py_ssize_t size = sizeof(double);
+    int fits = views[1].ndim == 4 && views[1].shape[3] <= MOST_AXES;
+    if (fits) {
+        all.rows = views[1].shape[0];
+        all.m = views[1].shape[1];
+        all.b = views[1].shape[3];
+        Py_ssize_t square = all.b * all.b * all.rows * size;
+        fits = views[0].len == square && views[1].len == all.m * square &&
+               views[2].len == views[1].len && views[3].len == 3 * all.b * square &&
+               views[4].len == 3 * square && views[5].len == all.rows * all.m * all.m * size;
+    }
+    if (!fits)
+        return PyErr_Format(PyExc_ValueError, "expected axes (rows, b, b), same and next (rows, m, "
+                            "b, b), power (rows, b, b, 3, b), trace (rows, b, 3, b), out (rows, m, "
+                            "m), b up to 3");
+    size_t numbers = (size_t)(2 * all.b * all.b * all.m);
+    all.slopes = malloc(2 * numbers * sizeof(double) + 1);
+    if (!all.slopes)
+        return PyErr_NoMemory();
+    all.products = all.slopes + numbers;
+    Py_BEGIN_ALLOW_THREADS
+    write_curvatures(&all);
+    Py_END_ALLOW_THREADS
+    free(all.slopes);
+    Py_RETURN_NONE;
+}
+
+static PyObject *curvatures(PyObject *self, PyObject *args)
+{
+    (void)self;
+    return with_doubles(args, 6, 1, curvature_views);
+}
+
+PyDoc_STRVAR(curvatures_doc,
+"curvatures(axes, same, next, power, trace, out)\n--\n\n"
+"Write minus the second derivatives of a likelihood along slopes of the covariances of its modes.\n\n"
+"axes (rows, b, b), symmetric slopes same and next (rows, m, b, b), power (rows, b, b, 3, b) and\n"
+"trace (rows, b, 3, b) are read, out (rows, m, m) is written.");
+
 static PyMethodDef functions[] = {
     {"wahba", wahba, METH_VARARGS, wahba_doc},
     {"spots", spots, METH_VARARGS, spots_doc},
+    {"curvatures", curvatures, METH_VARARGS, curvatures_doc},
     {"mode_sums", mode_sums, METH_VARARGS, mode_sums_doc},
     {"two_states", two_states, METH_VARARGS, two_states_doc},
     {"spectrum_sums", spectrum_sums, METH_VARARGS, spectrum_sums_doc},

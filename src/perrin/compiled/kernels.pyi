@@ -18,6 +18,9 @@ def spots(
     out: Floats,
     /,
 ) -> None: ...
+def curvatures(
+    axes: Floats, same: Floats, after: Floats, power: Floats, trace: Floats, out: Floats, /
+) -> None: ...
 def mode_sums(
     modes: Floats, axes: Floats, share: Floats, weight: Floats, sums: Floats, /
 ) -> None: ...

@@ -196,9 +196,7 @@ class EvenTracks:
         same = np.concatenate([self.tau[:, None, None, None] * of_D, none], axis=1)
         shapes = np.broadcast_to(self.shapes, (points, *self.shapes.shape[1:]))
         next_one = np.concatenate([of_noise[:, :m], shapes, of_noise[:, m:]], axis=1)
-        axes = sums.axes[:, None]
-        same, next_one = (np.swapaxes(axes, 2, 3) @ x @ axes for x in (same, next_one))
-        return information(same, next_one, sums.power, sums.trace)
+        return information(sums.axes, same, next_one, sums.power, sums.trace)
 
 
 def mode_sums(
@@ -416,14 +414,14 @@ class FewModesTrack:
         of_D = np.concatenate([E, none], axis=1)
         shapes = np.broadcast_to(self.shapes, (points, *self.shapes.shape))
         next_one = np.concatenate([of_noise[:, :m], shapes, of_noise[:, m:]], axis=1)
-        axes, inverse = modes.axes[:, None], modes.inverse
-        of_D, next_one = (np.swapaxes(axes, 2, 3) @ x @ axes for x in (of_D, next_one))
+        inverse = modes.inverse
         d, w = self.motion, self.modes.noise
         powers = np.stack([d * d, d * w, w * w], axis=1)
         weights = (inverse[:, :, None] * powers[:, :, None]).reshape(points, -1, 3 * b)
         pairs = modes.scaled.reshape(points, -1, b * b)
         counted = np.swapaxes(inverse * self.modes.count[:, None], 1, 2)
         return information(
+            modes.axes,
             of_D,
             next_one,
             (np.swapaxes(pairs, 1, 2) @ weights).reshape(points, b, b, 3, b),
@@ -431,11 +429,15 @@ class FewModesTrack:
         )
 
 
-def information(same: Floats, next_one: Floats, power: Floats, trace: Floats) -> Floats:
+def information(
+    axes: Floats, same: Floats, next_one: Floats, power: Floats, trace: Floats
+) -> Floats:
     """Return minus the second derivatives of a log-likelihood from sums over its modes.
 
     Parameters
     ----------
+    axes : ndarray, shape (P, b, b)
+        Axes of the sums, as columns.
     same, next_one : ndarray, shape (P, m, b, b)
         Slopes of the covariances of the modes: those of the motion and those of the noise.
     power : ndarray, shape (P, b, b, 3, b)
@@ -446,17 +448,24 @@ def information(same: Floats, next_one: Floats, power: Floats, trace: Floats) ->
     Examples
     --------
     >>> one = np.ones((1, 1, 1, 1))
-    >>> information(one, one, 2 * np.ones((1, 1, 1, 3, 1)), np.ones((1, 1, 3, 1)))
+    >>> information(one[0], one, one, 2 * np.ones((1, 1, 1, 3, 1)), np.ones((1, 1, 3, 1)))
     array([[[6.]]])
     """
-    points = len(power)
+    points, count, b = same.shape[:3]
+    kernels = compiled_kernels() if b <= 3 else None
+    if kernels is not None:
+        found = np.empty((points, count, count))
+        arrays = map(np.ascontiguousarray, (axes, same, next_one, power, trace))
+        kernels.curvatures(*arrays, found)
+        return found
+    turned_axes = axes[:, None]
+    same, next_one = (np.swapaxes(turned_axes, 2, 3) @ x @ turned_axes for x in (same, next_one))
 
     def form(k: int, left: Floats, right: Floats) -> Floats:
         # (c, a, b) times (c, b, j): sum over b of q_a q_b V_c X_j[c, b]
         turned = np.moveaxis(power[:, :, :, k], 3, 1) @ np.moveaxis(right, 1, 3)
         turned = np.moveaxis(turned, 3, 1)  # (j, c, a)
         turned = np.swapaxes(turned, 2, 3) - 0.5 * trace[:, None, :, k] * np.swapaxes(right, 2, 3)
-        count = left.shape[1]
         flat = turned.reshape(points, count, -1)
         return np.asarray(left.reshape(points, count, -1) @ np.swapaxes(flat, 1, 2))
 
