@@ -17,7 +17,6 @@ from perrin.diffusion.steps import (
     NoisySteps,
     Quantity,
     Steps,
-    distinct,
     groups_alike,
     pooled_steps,
     steps_of,
@@ -242,7 +241,7 @@ def _judged(
     # The noise of one orientation or centre coordinate, mean over frames, axes and motions.
     model = settings.model
     squares = [float(np.mean(m.noise**2)) if isinstance(model, str) else model**2 for m in motions]
-    means = [0.5 * float(sum(np.mean(distinct(end)) for end in s.variances)) for s in steps]
+    means = [s.mean_variance for s in steps]
     estimate = DiffusionEstimate.judged(
         found,
         quantity=quantity,

@@ -127,6 +127,24 @@ class Steps:
         return stored_once(diagonal[self.start]), stored_once(diagonal[self.stop])
 
     @cached_property
+    def mean_variance(self) -> float:
+        """Noise variance of a component, mean over components and the ends of all steps."""
+        return 0.5 * float(sum(distinct(end).mean() for end in self.variances))
+
+    @cached_property
+    def above_least(self) -> tuple[float, Floats, tuple[Floats, Floats]]:
+        """Least noise variance of a frame, ones (S, c), and by how much the ends of steps exceed it.
+
+        Variances are in um^2 or rad^2.
+        """
+        shape = self.vectors.shape
+        before, after = (self.sigma**2 * distinct(n) for n in self.variances)
+        least = min(float(before.min()), float(after.min()))
+        one = np.broadcast_to(np.ones((1, shape[1])), shape)
+        known = np.broadcast_to(before - least, shape), np.broadcast_to(after - least, shape)
+        return least, one, known
+
+    @cached_property
     def even(self) -> bool:
         """Whether all steps are linked, equally long and equally noisy."""
         same_time = np.ptp(self.duration) <= _EVEN_STEPS * self.duration[0]
@@ -222,11 +240,7 @@ class NoisySteps:
     @classmethod
     def free(cls, steps: Steps, *, blur: float, drift: bool) -> NoisySteps:
         """Leave the offset free; known is by how much a frame exceeds the least noisy one."""
-        shape = steps.vectors.shape
-        before, after = (steps.sigma**2 * distinct(n) for n in steps.variances)
-        least = min(float(before.min()), float(after.min()))
-        one = np.broadcast_to(np.ones((1, shape[1])), shape)
-        known = np.broadcast_to(before - least, shape), np.broadcast_to(after - least, shape)
+        least, one, known = steps.above_least
         level = steps.sigma**2 * steps.complete - least
         steps, steady = _subtracted(steps, drift=drift)
         return cls(steps, (one, one), known, blur, 0.0, 0.0, level, drift, steady)
