@@ -240,16 +240,19 @@ def _judged(
     """Return the estimate of some motions, with what limits its precision."""
     # The noise of one orientation or centre coordinate, mean over frames, axes and motions.
     model = settings.model
-    squares = [float(np.mean(m.noise**2)) if isinstance(model, str) else model**2 for m in motions]
-    means = [s.mean_variance for s in steps]
+    squares = [
+        float(m.noise @ m.noise) / len(m.noise) if isinstance(model, str) else model**2
+        for m in motions
+    ]
+    means, count = [s.mean_variance for s in steps], len(motions)
     estimate = DiffusionEstimate.judged(
         found,
         quantity=quantity,
         method=method,
         n_frames=sum(m.fitted.size for m in motions),
-        dt=float(np.mean([m.usual_interval for m in motions])),
-        noise_variance=float(np.mean(np.multiply(squares, means))),
-        resolution_floor=float(np.mean([m.resolution_floor for m in motions]))
+        dt=sum(m.usual_interval for m in motions) / count,
+        noise_variance=sum(a * b for a, b in zip(squares, means, strict=True)) / count,
+        resolution_floor=sum(m.resolution_floor for m in motions) / count
         if quantity == "rotation"
         else None,
         noise=settings,

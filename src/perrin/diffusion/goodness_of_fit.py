@@ -189,8 +189,8 @@ class AxisModel:
     def mean_known(self) -> Floats:
         """Mean known noise variance of each axis, (A,) or (B, A)."""
         # Of noise that is stored once for all frames one number is the mean.
-        ends = [known[..., :1] if known.strides[-1] == 0 else known for known in self.known]
-        return np.asarray(0.5 * (ends[0].mean(axis=-1) + ends[1].mean(axis=-1)))
+        first, last = (k[..., 0] if k.strides[-1] == 0 else k.mean(axis=-1) for k in self.known)
+        return np.asarray(0.5 * (first + last))
 
     def with_equal_noise(self) -> AxisModel:
         """Return the model with the mean noise in all frames."""

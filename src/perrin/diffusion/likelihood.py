@@ -23,7 +23,7 @@ from perrin.diffusion.step_kernels import (
     TridiagonalCovariance,
     difference_eigenvalues,
 )
-from perrin.diffusion.steps import distinct, groups_alike
+from perrin.diffusion.steps import groups_alike, mean_row
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -524,7 +524,7 @@ def _squared_deviations(tracks: Sequence[NoisySteps], D: Floats, theta: Floats) 
         some, own_D, own_theta = [tracks[k] for k in group], D[group], theta[group]
         c = difference_eigenvalues(count)
         weight, known = (
-            np.stack([0.5 * sum(distinct(end).mean(axis=0) for end in pair) for pair in pairs])
+            np.stack([0.5 * (mean_row(first) + mean_row(last)) for first, last in pairs])
             for pairs in ([t.weight for t in some], [t.known for t in some])
         )
         noise = own_theta[:, None] * weight + known

@@ -129,14 +129,11 @@ class Steps:
     @cached_property
     def mean_variance(self) -> float:
         """Noise variance of a component, mean over components and the ends of all steps."""
-        return 0.5 * float(sum(distinct(end).mean() for end in self.variances))
+        return 0.5 * float(sum(mean_row(end).mean() for end in self.variances))
 
     @cached_property
     def above_least(self) -> tuple[float, Floats, tuple[Floats, Floats]]:
-        """Least noise variance of a frame, ones (S, c), and by how much the ends of steps exceed it.
-
-        Variances are in um^2 or rad^2.
-        """
+        """Least noise variance, ones (S, c), and by how much the noise of both ends exceeds it."""
         shape = self.vectors.shape
         before, after = (self.sigma**2 * distinct(n) for n in self.variances)
         least = min(float(before.min()), float(after.min()))
@@ -374,6 +371,17 @@ def distinct(rows: Floats) -> Floats:
     ((1, 3), (5, 3))
     """
     return rows[:1] if rows.strides[0] == 0 else rows
+
+
+def mean_row(rows: Floats) -> Floats:
+    """Return the mean row of an array (N, ...); the one row where they are stored once.
+
+    Examples
+    --------
+    >>> mean_row(np.broadcast_to(2.0, (5, 2))), mean_row(np.array([[1.0], [2.0]]))
+    (array([2., 2.]), array([1.5]))
+    """
+    return rows[0] if rows.strides[0] == 0 else np.asarray(rows.mean(axis=0))
 
 
 def groups_alike(keys: Sequence[Hashable], sizes: Sequence[int], *, most: int) -> list[list[int]]:
