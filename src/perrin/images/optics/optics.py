@@ -255,3 +255,35 @@ class Optics(Shown):
             depth=self.depth,
             pupil=self.pupil,
         )
+
+
+def photon_transfer(expected: Floats, variance: Floats) -> CameraNoise:
+    """Return gain and floor of the camera from the growth of the variance with the mean.
+
+    Parameters
+    ----------
+    expected : ndarray, shape (m,)
+        Expected grey levels.
+    variance : ndarray, shape (m,)
+        Estimates of their variance.
+
+    Returns
+    -------
+    CameraNoise
+        A negative gain (of a processed image) is replaced by 0 and a constant variance.
+
+    Examples
+    --------
+    >>> noise = photon_transfer(np.array([10.0, 20.0, 30.0]), np.array([34.0, 64.0, 94.0]))
+    >>> round(noise.gain, 6), round(noise.floor, 6)
+    (3.0, 4.0)
+    """
+    design = np.stack([expected, np.ones_like(expected)])
+    noise = CameraNoise(0.0, float(variance.mean()))
+    for _ in range(4):
+        weighted = design * noise.weight(expected) ** 2
+        gain, floor = np.linalg.solve(weighted @ design.T, weighted @ variance)
+        if gain <= 0:
+            return CameraNoise(0.0, float(variance.mean()))
+        noise = CameraNoise(float(gain), float(floor))
+    return noise

@@ -19,17 +19,11 @@ from perrin._arrays import (
 )
 from perrin._text import listed
 from perrin.errors import FrameError, NoSpheresError, PrecisionWarning
+from perrin.images.optics.clipping import floor_share, saturated_share
 from perrin.images.optics.crowd_fit import CrowdFit, crowd_piece, fit_crowd
-from perrin.images.optics.learn import (
-    CrowdSample,
-    GroupSample,
-    LearnedOptics,
-    UsualImage,
-    fit_samples,
-    floor_share,
-    saturated_share,
-)
+from perrin.images.optics.learn import LearnedOptics, fit_samples
 from perrin.images.optics.pixel_pattern import find_pixel_pattern, pixel_offsets, without_pattern
+from perrin.images.optics.samples import CrowdSample, GroupSample, UsualImage
 from perrin.images.optics.window_fit import FreeCenters, fit_window
 from perrin.images.spheres.by_trackpy import Features, find_features, refine_by_trackpy
 from perrin.images.spheres.circles import circle_cut, find_circles
