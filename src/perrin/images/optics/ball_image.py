@@ -20,7 +20,7 @@ from perrin.images.optics.asymmetry import (
     plane_factors,
 )
 from perrin.images.optics.point_spread import voxel_variances
-from perrin.images.optics.pupil import Pupil, PupilBall
+from perrin.images.optics.pupil import MOST_DIAMETER, Pupil, PupilBall
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -336,6 +336,8 @@ class SphereImage:
             return self._tables, np.zeros_like(self._tables)
         assert self._height_tables is not None
         nodes = self.depth.nodes(_HEIGHT_NODES)
+        if nodes[0] == nodes[-1]:
+            return self._height_tables[0], np.zeros_like(self._tables)
         within = float(np.clip(height, nodes[0], nodes[-1]))
         value, slope = _cubic_factors(nodes, within)
         if within != height:
@@ -617,8 +619,8 @@ def sphere_image(
     Raises
     ------
     ValueError
-        For a length that is not positive, a share of the tail outside 0 to 1, or where the blur
-        along z is less than within the plane.
+        For a length that is not positive, a share of the tail outside 0 to 1, where the blur
+        along z is less than within the plane, or for a sphere that is too large for a `Pupil`.
 
     Notes
     -----
@@ -637,6 +639,11 @@ def sphere_image(
     require_positive(**{f"voxel[{axis}]": h for axis, h in zip("zyx", voxel, strict=True)})
     ball: BallBlur | PupilBall
     if pupil is not None:
+        require_positive(**{f"pupil {name}": value for name, value in pupil._asdict().items()})
+        if diameter > MOST_DIAMETER:
+            raise ValueError(
+                f"pupil: expected a sphere of at most {MOST_DIAMETER:g} um, got {diameter:g} um"
+            )
         wide_z, wide = voxel_variances(voxel).tolist()
         ball = PupilBall(diameter, pupil, (wide_z, wide), shell)
     else:

@@ -10,7 +10,7 @@ import numpy as np
 from perrin.images.optics.ball_image import BallBlur, PsfTail, SphereImage, sphere_image
 from perrin.images.optics.optics import Optics
 from perrin.images.optics.point_spread import voxel_variances
-from perrin.images.optics.pupil import AIRY, Pupil, PupilBall
+from perrin.images.optics.pupil import AIRY, MOST_DIAMETER, Pupil, PupilBall
 
 if TYPE_CHECKING:
     from perrin._arrays import Floats
@@ -156,7 +156,8 @@ class ImageParameters:
         """Return the least and the largest values of the parameters.
 
         A blur is at least that of the voxel, and a microscope's point spread is elongated along z;
-        the tail is wider than the other Gaussian, and narrower than the sphere.
+        the tail is wider than the other Gaussian, and narrower than the sphere. Behind a pinhole
+        they are those of apertures, and of spheres that the space of the point spread holds.
         """
         n = len(self.values)
         low, high = np.full(n, -np.inf), np.full(n, np.inf)
@@ -164,6 +165,7 @@ class ImageParameters:
             return low, high
         if self.of_pupil:
             low[1:], high[1:] = _PUPIL_LEAST, _PUPIL_MOST
+            high[0] = np.log(MOST_DIAMETER)
             return low, high
         least = np.log(_LEAST_OVER_VOXEL * self.voxel_blur)
         low[2] = least[1]

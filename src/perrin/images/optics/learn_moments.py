@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from perrin.images.optics.asymmetry import Asymmetry, significant_sums
+from perrin.images.optics.asymmetry import ABOVE_FOCUS, Asymmetry, significant_sums
 from perrin.images.optics.depth import DepthChange, significant_slopes
 from perrin.images.optics.image_parameters import ImageVariations
 from perrin.images.optics.likeliest import STEP_IN_ERRORS, LikeliestOptics
@@ -20,9 +20,6 @@ if TYPE_CHECKING:
 _MOMENT_ROUNDS, _N_SLOPES = 4, len(DepthChange(0.0, 0.0, 0.0).slopes)
 _N_MOMENTS = len(Asymmetry._fields) + _N_SLOPES
 _OF_DEPTH = np.arange(_N_MOMENTS) >= _N_MOMENTS - _N_SLOPES
-
-# Components of an asymmetry that differ above and below the focus alone.
-_ABOVE_FOCUS = [Asymmetry._fields.index(name) for name in ("zzz", "zrr")]
 
 
 class MomentFit(NamedTuple):
@@ -110,7 +107,7 @@ class MomentFit(NamedTuple):
         shown = significant_slopes(*self.equations(self.used | _OF_DEPTH))
         if not shown[-_N_SLOPES:][:2].any():
             return self
-        uneven = self.used[_ABOVE_FOCUS].any()
+        uneven = self.used[ABOVE_FOCUS].any()
         used = self.used.copy()
         used[_OF_DEPTH] = [True, True, uneven, uneven]
         return self._replace(used=used)
@@ -144,5 +141,5 @@ class MomentFit(NamedTuple):
             asymmetry=Asymmetry(*uneven.tolist()) if uneven.any() else None,
             depth=depth if slopes.any() else None,
         )
-        now = self.now._replace(parameters=parameters, information=own)
+        now = self.now._replace(parameters=parameters, information=information)
         return self._replace(now=now, values=values)

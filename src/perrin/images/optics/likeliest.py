@@ -12,6 +12,7 @@ from perrin.images.optics.flicker import LineChanges, Lines, find_flicker, find_
 from perrin.images.optics.image_parameters import ImageVariations
 from perrin.images.optics.neighbours import find_neighbours
 from perrin.images.optics.optics import photon_transfer
+from perrin.images.optics.pupil import MOST_DIAMETER
 from perrin.images.optics.samples import GroupSample, UsualImage
 
 if TYPE_CHECKING:
@@ -344,13 +345,14 @@ class LikeliestOptics(NamedTuple):
         """Return those of a confocal point spread if groups not fitted are likelier with it.
 
         It is tried where the sum of two Gaussians is not used, or much of the light is in the wider
-        one, as behind an open pinhole. The present ones have Gaussians, and are fitted to all
-        groups; the others to half of them.
+        one, as behind an open pinhole, and where spheres are at most 10 um large. The present ones
+        have Gaussians, and are fitted to all groups; the others to half of them.
         """
         before = self.parameters.image()
         closed = before.tail is not None and before.tail.share < _OPEN_SHARE
         groups = self.groups
-        if closed or not self.in_groups or len(groups) < _FEWEST_SAMPLES:
+        few = not self.in_groups or len(groups) < _FEWEST_SAMPLES
+        if closed or few or before.diameter > MOST_DIAMETER:
             return self
 
         def likelihood(start: ImageParameters) -> float:

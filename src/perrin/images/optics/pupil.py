@@ -23,8 +23,13 @@ _STOKES = 0.94
 # and nodes in the plane for each unit of the largest phase.
 _HALF, _PUPIL_NODES, _NODES_PER_PHASE = (9.0, 6.0), 48, 0.6
 
-# The fit uses voxels, and the table of the image ends, where less than this of its maximum is left.
-_FIT_LEVEL, _TABLE_LEVEL = 0.02, 0.002
+# The fit uses voxels, and the table of the image ends, where less than this is left of the
+# intensity inside a large ball, and at this distance outside the surface at the latest, um.
+_FIT_LEVEL, _TABLE_LEVEL, _MOST_RANGE = 0.02, 0.002, 4.0
+
+# Largest diameter of a ball, um: the image of a larger one would reach beyond the space above and
+# below it, and return from the other side, as a transform is periodic.
+MOST_DIAMETER = 2 * (_HALF[0] - _MOST_RANGE)
 
 # Phase at the first dark ring of a focus: its radius times `Pupil.lateral`.
 AIRY = 3.832
@@ -244,7 +249,7 @@ class PupilBall(NamedTuple):
     Attributes
     ----------
     diameter : float
-        Diameter of the ball, um.
+        Diameter of the ball, um; at most `MOST_DIAMETER`, 10 um.
     pupil : Pupil
     variances : tuple of float
         Variances (z, plane) by which the image is blurred besides, um^2: those of a voxel. Below 0
@@ -335,7 +340,7 @@ def image_transform(ball: PupilBall) -> tuple[FocalSpace, Floats]:
 @lru_cache(maxsize=64)
 def _image_ends(ball: PupilBall) -> tuple[tuple[float, float], tuple[float, float]]:
     """Return distances (z, plane) outside the surface where little is left, for fits and tables."""
-    out, axis = np.linspace(0.0, 4.0, 161), np.zeros(1)
+    out, axis = np.linspace(0.0, _MOST_RANGE, 161), np.zeros(1)
     along = ball.intensity(ball.diameter / 2 + out, axis)[:, 0]
     across = ball.intensity(axis, ball.diameter / 2 + out)[0]
     fit, table = (

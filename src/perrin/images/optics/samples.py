@@ -120,10 +120,10 @@ class GroupSample(NamedTuple):
         slope = window.slopes(image, variations.slopes, fit.centers, fit.brightness, fit.sizes)
         if variations.moments is not None:
             knots, widths, heights = variations.moments
-            spheres = fit.centers, fit.brightness
-            more = window.asymmetry_slopes(image, knots, *spheres)
-            deep = window.depth_slopes(image, widths, knots[2:4], *spheres, heights=heights)
-            slope = np.concatenate([slope, more, deep])
+            more = window.moment_slopes(
+                image, knots, widths, fit.centers, fit.brightness, heights=heights
+            )
+            slope = np.concatenate([slope, more])
         # The Schur complement of the information, with the fit's own parameters eliminated.
         weighted = fit.precision.times(slope)
         nuisance = fit.precision.times(fit.jacobian)
