@@ -13,6 +13,9 @@ from perrin.images import (
     DepthChange,
     FreeCenters,
     GroupSample,
+    ImageParameters,
+    LikeliestOptics,
+    MomentFit,
     Optics,
     cut_window,
     fit_crowd,
@@ -139,6 +142,20 @@ def test_a_movie_shows_the_change_and_an_even_one_shows_none():
     assert abs(depth.wide) < 4 * depth.stderr[1]
     assert depth.zzz == depth.zrr == 0
     assert depth.low < depth.middle < depth.high
+
+
+def test_errors_of_the_image_contain_those_of_its_moments():
+    samples = samples_of((0.30, 0.50), count=8, rng=np.random.default_rng(7))
+    start = ImageParameters(np.log([2.45, 0.41, 0.16]), VOXEL)
+    even = LikeliestOptics.search(samples, start, NOISE)
+    found = MomentFit.shown_by(even)
+    assert found.parameters.depth is not None
+    together, alone = (
+        found.parameters.optics(found.noise, information).stderr
+        for information in (found.information, found.information[:3, :3])
+    )
+    assert len(found.information) > 3
+    assert all(a > b for a, b in zip(together, alone, strict=True))
 
 
 def test_scores_that_scatter_show_no_slope_and_those_of_a_slope_do():

@@ -11,12 +11,14 @@ from perrin.images.optics.crowd_equations import profile_information, slopes_of_
 from perrin.images.optics.crowd_fit import fit_crowd
 from perrin.images.optics.neighbours import THIRD_DIFFERENCE, neighbour_variance
 from perrin.images.optics.window_fit import FreeCenters, cut_window, fit_window
+from perrin.tracks.groups import TOUCHING_REACH
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from perrin._arrays import Bools, Floats
     from perrin.images.optics.ball_image import SphereImage
+    from perrin.images.optics.crowd_fit import CrowdFit
     from perrin.images.optics.image_parameters import ImageVariations
     from perrin.images.optics.optics import CameraNoise
     from perrin.images.optics.window_fit import Window
@@ -343,6 +345,45 @@ class UsualImage:
         """
         bound = self.chi2 * np.maximum(_WORST_CHI2, _chance(voxels))
         return np.maximum(chi2 / bound, brightness / self.brightest)
+
+    def group_within(
+        self, crowd: CrowdFit, *, level: float, count: int, contact: float
+    ) -> CrowdFit | None:
+        """Return those spheres of a crowd's fit that are a group and have the usual image.
+
+        These are the spots of its start, and spheres that touch one of them.
+
+        Parameters
+        ----------
+        crowd : CrowdFit
+        level : float
+            The usual brightness in this frame and depth, grey levels.
+        count : int
+            Number of spots of the start.
+        contact : float
+            Centre distance of touching spheres, um.
+
+        Returns
+        -------
+        CrowdFit or None
+            None if a spot of the start is no such sphere.
+        """
+        same = (crowd.centers[:, None] == crowd.intensity.centers).all(axis=2)
+        bright = crowd.intensity.brightness[same.argmax(axis=1)] / level
+        good = (crowd.chi2 <= self.worst_chi2) & (bright < self.brightest)
+        good &= bright > 1 / self.brightest
+        start = crowd.origin >= 0
+        if not set(range(count)) <= set(crowd.origin[good].tolist()):
+            return None
+        away = np.linalg.norm(crowd.centers[:, None] - crowd.centers[start], axis=2).min(axis=1)
+        good &= start | (away < TOUCHING_REACH * contact)
+        return crowd._replace(
+            centers=crowd.centers[good],
+            sigma=crowd.sigma[good],
+            chi2=crowd.chi2[good],
+            converged=crowd.converged[good],
+            origin=crowd.origin[good],
+        )
 
     def spheres_among(
         self,

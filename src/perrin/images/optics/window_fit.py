@@ -68,7 +68,7 @@ class Window(NamedTuple):
 
     def origin(self, image: SphereImage) -> Floats:
         """Return the position (z, y, x) of the first voxel of the box, um."""
-        return np.array([s.start for s in self.box]) * np.array(image.voxel)
+        return np.asarray(np.array([s.start for s in self.box]) * np.array(image.voxel))
 
     def spots(self, image: SphereImage, centers: Floats, sizes: Floats) -> tuple[Floats, Floats]:
         """Return unit images (n, m) of spheres on these voxels and their gradients (n, 3, m).
