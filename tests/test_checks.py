@@ -13,7 +13,7 @@ from scipy.stats import t
 import perrin
 from perrin.geometry.rotations import exp_map
 from perrin.images import CameraNoise, Optics
-from perrin.images.optics.learn import saturated_share
+from perrin.images.optics.clipping import saturated_share
 from perrin.images.spheres.spots import mass_cut
 from perrin.movie import checks
 from perrin.movie.bodies import group_sizes

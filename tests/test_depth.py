@@ -1,5 +1,7 @@
 """Point spreads that change with the height of a sphere: images, fits, and what a movie shows."""
 
+import json
+
 import numpy as np
 import pytest
 
@@ -11,6 +13,9 @@ from perrin.images import (
     DepthChange,
     FreeCenters,
     GroupSample,
+    ImageParameters,
+    LikeliestOptics,
+    MomentFit,
     Optics,
     cut_window,
     fit_crowd,
@@ -139,6 +144,20 @@ def test_a_movie_shows_the_change_and_an_even_one_shows_none():
     assert depth.low < depth.middle < depth.high
 
 
+def test_errors_of_the_image_contain_those_of_its_moments():
+    samples = samples_of((0.30, 0.50), count=8, rng=np.random.default_rng(7))
+    start = ImageParameters(np.log([2.45, 0.41, 0.16]), VOXEL)
+    even = LikeliestOptics.search(samples, start, NOISE)
+    found = MomentFit.shown_by(even)
+    assert found.parameters.depth is not None
+    together, alone = (
+        found.parameters.optics(found.noise, information).stderr
+        for information in (found.information, found.information[:3, :3])
+    )
+    assert len(found.information) > 3
+    assert all(a > b for a, b in zip(together, alone, strict=True))
+
+
 def test_scores_that_scatter_show_no_slope_and_those_of_a_slope_do():
     rng, sets, n = np.random.default_rng(4), 3000, 15
     height = rng.normal(size=(sets, n))
@@ -157,10 +176,36 @@ def test_the_change_is_kept_with_the_optics_and_named():
     plain = Optics(2.45, (0.45, 0.15), CameraNoise(3.0, 4.0))
     deeper = DEEPER._replace(stderr=(1e-3, 2e-4, 0.0, 0.0))
     optics = Optics(2.45, (0.45, 0.15), CameraNoise(3.0, 4.0), depth=deeper)
-    assert Optics.from_dict(optics.to_dict()) == optics
+    assert Optics.from_dict(json.loads(json.dumps(optics.to_dict()))) == optics
     assert "depth" not in plain.to_dict()
     assert optics.image(VOXEL).depth == deeper
     note = changing_point_spread(optics).notes[0]
     assert note.startswith("point spread by depth: its standard deviations are 0.317 um along z")
     assert "0.552 and 0.16 um at 8 um" in note
     assert changing_point_spread(plain) == ((), ())
+
+
+def test_one_height_alone_has_one_point_spread():
+    flat = DepthChange(5.0, 6.0, 6.0, wide_z=0.05)
+    image, own = (
+        sphere_image(**BALL | more) for more in ({"depth": flat}, {"psf": (0.5025, 0.15)})
+    )
+    center, shape = np.array([2.4, 1.6, 1.5]), (20, 16, 16)
+    for height in (3.0, 6.0, 9.0):
+        spot = image.spot(center, shape, height=height)
+        assert np.abs(spot.value - own.spot(center, shape).value).max() < 2e-3
+        assert np.isfinite(spot.gradient).all()
+
+
+def test_a_movie_of_spheres_at_one_height_shows_no_change():
+    rng = np.random.default_rng(6)
+    samples = [
+        s._replace(centers=np.array([[5.0, 1.7, 1.7]]))
+        for s in samples_of((0.4, 0.4), count=6, rng=rng)
+    ]
+    shape, image = samples[0].frame.shape, sphere_image(**BALL)
+    frames = [3.0 * rng.poisson(drawn(s.centers, image, shape)) for s in samples]
+    samples = [s._replace(frame=frame) for s, frame in zip(samples, frames, strict=True)]
+    found = fit_samples(samples, diameter=2.45, voxel=VOXEL).optics
+    assert found.depth is None
+    assert np.isfinite(found.stderr).all()

@@ -12,7 +12,7 @@ from perrin.errors import FrameError
 from perrin.images import CameraNoise
 from perrin.images.optics.ball_image import sphere_image
 from perrin.images.optics.crowd_fit import CrowdFit
-from perrin.images.optics.learn import UsualImage
+from perrin.images.optics.samples import UsualImage
 from perrin.images.spheres.by_trackpy import Features
 from perrin.images.spheres.localisation import (
     NO_SPHERE,

@@ -14,14 +14,10 @@ from scipy.spatial.distance import cdist
 import perrin
 from perrin.geometry.rotations import exp_map, log_map
 from perrin.images.optics.ball_image import PsfTail, sphere_image
-from perrin.images.optics.learn import (
-    GroupSample,
-    ImageParameters,
-    ImageVariations,
-    UsualImage,
-    fit_samples,
-)
+from perrin.images.optics.image_parameters import ImageParameters, ImageVariations
+from perrin.images.optics.learn import fit_samples
 from perrin.images.optics.optics import CameraNoise
+from perrin.images.optics.samples import GroupSample, UsualImage
 from perrin.images.optics.window_fit import FreeCenters, RigidCenters, cut_window, fit_window
 from perrin.images.spheres.by_trackpy import Features
 from perrin.images.spheres.localisation import (

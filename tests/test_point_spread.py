@@ -8,7 +8,7 @@ import pytest
 import perrin
 from perrin.images import fit_samples, sphere_image
 from perrin.images.optics.ball_image import PsfTail
-from perrin.images.optics.learn import GroupSample
+from perrin.images.optics.samples import GroupSample
 from perrin.movie.stacks import analyze_stack
 
 pytest.importorskip("trackpy")

@@ -1,6 +1,10 @@
 """Point spreads of a confocal microscope with a pinhole: images, and what a movie shows."""
 
+import json
+from dataclasses import replace
+
 import numpy as np
+import pytest
 from scipy.special import j1
 
 from perrin.images import (
@@ -12,6 +16,7 @@ from perrin.images import (
     fit_samples,
     sphere_image,
 )
+from perrin.images.optics.pupil import MOST_DIAMETER
 from perrin.movie import confocal_point_spread
 
 VOXEL = (0.25, 0.2, 0.2)
@@ -81,10 +86,24 @@ def test_a_movie_shows_an_open_pinhole():
 
 def test_the_pinhole_is_kept_with_the_optics_and_named():
     optics = Optics(2.45, OPEN.psf, CameraNoise(3.0, 4.0), pupil=OPEN)
-    assert Optics.from_dict(optics.to_dict()) == optics
+    assert Optics.from_dict(json.loads(json.dumps(optics.to_dict()))) == optics
+    older = dict.fromkeys(("pupil", "depth", "asymmetry", "measured"))
+    assert Optics.from_dict(optics.to_dict() | older) == replace(optics, pupil=None)
     plain = Optics(2.45, OPEN.psf, CameraNoise(3.0, 4.0))
     assert "pupil" not in plain.to_dict()
     note = confocal_point_spread(optics).notes[0]
     assert note.startswith("confocal point spread: that of an aperture with a pinhole of 1 um")
     assert "3.9 Airy units" in note
     assert confocal_point_spread(plain) == ((), ())
+
+
+def test_values_without_an_image_are_refused():
+    """A larger ball would reach beyond the space of the point spread, and return into it."""
+    given = {"psf": (0.4, 0.15), "voxel": VOXEL}
+    with pytest.raises(ValueError, match="at most 10 um, got 12 um"):
+        sphere_image(diameter=12.0, pupil=OPEN, **given)
+    with pytest.raises(ValueError, match="pupil slope"):
+        sphere_image(diameter=2.0, pupil=OPEN._replace(slope=0.0), **given)
+    axis, far = np.zeros(1), np.array([9.0])
+    assert PupilBall(MOST_DIAMETER, OPEN, NO_VOXEL).intensity(far, axis) < 0.03
+    assert PupilBall(1.5 * MOST_DIAMETER, OPEN, NO_VOXEL).intensity(far, axis) > 0.1

@@ -8,7 +8,7 @@ import pytest
 import perrin
 from perrin.images import CameraNoise, fit_samples, sphere_image
 from perrin.images.optics.ball_image import BallBlur
-from perrin.images.optics.learn import GroupSample
+from perrin.images.optics.samples import GroupSample
 
 DIAMETER, PSF, VOXEL, GAIN = 2.0, (0.4, 0.15), (0.25, 0.2, 0.2), 2.0
 NONE = np.empty((0, 3))

@@ -73,7 +73,15 @@ from perrin.images.optics.asymmetry import (
     plane_factors,
     significant_sums,
 )
-from perrin.images.optics.ball_image import BallBlur, PsfTail, SphereImage, SphereSpot, sphere_image
+from perrin.images.optics.ball_image import (
+    BallBlur,
+    PsfTail,
+    SphereImage,
+    SphereSpot,
+    gaussian_quadrature,
+    sphere_image,
+)
+from perrin.images.optics.clipping import floor_share, saturated_share, without_clipped
 from perrin.images.optics.crowd_equations import (
     CrowdIntensity,
     CrowdWindow,
@@ -107,20 +115,13 @@ from perrin.images.optics.flicker import (
     find_flicker,
     find_gain_spread,
 )
-from perrin.images.optics.learn import (
-    CrowdSample,
-    GroupSample,
+from perrin.images.optics.image_parameters import (
     ImageParameters,
     ImageVariations,
-    LearnedOptics,
-    SampleFit,
-    UsualImage,
-    fit_samples,
-    floor_share,
-    photon_transfer,
-    saturated_share,
-    without_clipped,
+    MomentTables,
 )
+from perrin.images.optics.learn import LearnedOptics, fit_samples
+from perrin.images.optics.learn_moments import MomentFit
 from perrin.images.optics.learn_radial import (
     RadialSample,
     first_image,
@@ -131,6 +132,7 @@ from perrin.images.optics.learn_radial import (
     settled_image,
     size_spread,
 )
+from perrin.images.optics.likeliest import LikeliestOptics
 from perrin.images.optics.microscope import Camera, Light, RenderSettings, Scan
 from perrin.images.optics.neighbours import (
     find_along_z,
@@ -138,15 +140,30 @@ from perrin.images.optics.neighbours import (
     neighbour_covariance,
     neighbour_variance,
 )
-from perrin.images.optics.optics import CameraNoise, Optics
+from perrin.images.optics.optics import CameraNoise, Optics, photon_transfer
 from perrin.images.optics.pixel_pattern import (
     PixelPattern,
     find_pixel_pattern,
     pixel_offsets,
     without_pattern,
 )
-from perrin.images.optics.point_spread import PointSpread, StackLike, measure_point_spread
-from perrin.images.optics.pupil import Pupil, PupilBall
+from perrin.images.optics.point_spread import (
+    Bead,
+    PointSpread,
+    StackLike,
+    find_beads,
+    measure_point_spread,
+    voxel_variances,
+)
+from perrin.images.optics.pupil import (
+    FocalSpace,
+    Pupil,
+    PupilBall,
+    focal_intensity,
+    gaussian_widths,
+    image_transform,
+    transfer_function,
+)
 from perrin.images.optics.radial_image import (
     Patch,
     PatchFit,
@@ -163,6 +180,7 @@ from perrin.images.optics.render import (
     render_stack,
     sphere_paths,
 )
+from perrin.images.optics.samples import CrowdSample, GroupSample, SampleFit, UsualImage
 from perrin.images.optics.window_fit import (
     Arrangement,
     FreeCenters,
@@ -222,6 +240,7 @@ __all__ = [
     "ArrayFrames",
     "Asymmetry",
     "BallBlur",
+    "Bead",
     "Camera",
     "CameraNoise",
     "Contents",
@@ -233,6 +252,7 @@ __all__ = [
     "DepthChange",
     "Fading",
     "Features",
+    "FocalSpace",
     "Format",
     "FreeCenters",
     "GroupSample",
@@ -244,10 +264,13 @@ __all__ = [
     "Layout",
     "LearnedOptics",
     "Light",
+    "LikeliestOptics",
     "LineChanges",
     "Lines",
     "LocatedFrame",
     "Method",
+    "MomentFit",
+    "MomentTables",
     "Optics",
     "Patch",
     "PatchFit",
@@ -313,6 +336,7 @@ __all__ = [
     "file_contents",
     "file_states",
     "find_along_z",
+    "find_beads",
     "find_circles",
     "find_fading",
     "find_features",
@@ -332,9 +356,12 @@ __all__ = [
     "fit_window",
     "fitted_together",
     "floor_share",
+    "focal_intensity",
     "found_table",
     "frame_digest",
     "frames_of_planes",
+    "gaussian_quadrature",
+    "gaussian_widths",
     "grid",
     "group_columns",
     "groups_and_crowds",
@@ -344,6 +371,7 @@ __all__ = [
     "header_scale",
     "held_out_misfit",
     "image_header",
+    "image_transform",
     "imagej_scale",
     "imaris_size",
     "imaris_times",
@@ -422,8 +450,10 @@ __all__ = [
     "tiff",
     "tiff_kind",
     "touching_together",
+    "transfer_function",
     "vendor",
     "visible_fraction",
+    "voxel_variances",
     "with_crowds",
     "with_poses",
     "within",

@@ -12,7 +12,7 @@ from perrin._arrays import frozen
 from perrin._text import listed
 from perrin.geometry.rotations import kabsch
 from perrin.geometry.shapes import pair_distances
-from perrin.images.optics.learn import without_clipped
+from perrin.images.optics.clipping import without_clipped
 from perrin.images.optics.window_fit import RigidCenters, cut_window, fit_window
 from perrin.movie.checks import Findings
 from perrin.run.kinds import matched_particles, shape_numbers

@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 import numpy as np
 
 from perrin.errors import DamagedFileError, FrameError, PrecisionWarning, TooFewFramesError
-from perrin.images.optics.learn import UsualImage, without_clipped
+from perrin.images.optics.clipping import without_clipped
 from perrin.images.optics.optics import Optics
 from perrin.images.optics.radial_image import RadialImage
+from perrin.images.optics.samples import UsualImage
 from perrin.images.optics.window_fit import RigidCenters
 from perrin.images.spheres.localisation import Method, choose_method, found_table, sample_frames
 from perrin.images.spheres.poses import Pose, pose_in, with_poses

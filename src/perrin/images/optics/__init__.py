@@ -8,7 +8,15 @@ from perrin.images.optics.asymmetry import (
     plane_factors,
     significant_sums,
 )
-from perrin.images.optics.ball_image import BallBlur, PsfTail, SphereImage, SphereSpot, sphere_image
+from perrin.images.optics.ball_image import (
+    BallBlur,
+    PsfTail,
+    SphereImage,
+    SphereSpot,
+    gaussian_quadrature,
+    sphere_image,
+)
+from perrin.images.optics.clipping import floor_share, saturated_share, without_clipped
 from perrin.images.optics.crowd_equations import (
     CrowdIntensity,
     CrowdWindow,
@@ -42,20 +50,13 @@ from perrin.images.optics.flicker import (
     find_flicker,
     find_gain_spread,
 )
-from perrin.images.optics.learn import (
-    CrowdSample,
-    GroupSample,
+from perrin.images.optics.image_parameters import (
     ImageParameters,
     ImageVariations,
-    LearnedOptics,
-    SampleFit,
-    UsualImage,
-    fit_samples,
-    floor_share,
-    photon_transfer,
-    saturated_share,
-    without_clipped,
+    MomentTables,
 )
+from perrin.images.optics.learn import LearnedOptics, fit_samples
+from perrin.images.optics.learn_moments import MomentFit
 from perrin.images.optics.learn_radial import (
     RadialSample,
     first_image,
@@ -66,6 +67,7 @@ from perrin.images.optics.learn_radial import (
     settled_image,
     size_spread,
 )
+from perrin.images.optics.likeliest import LikeliestOptics
 from perrin.images.optics.microscope import Camera, Light, RenderSettings, Scan
 from perrin.images.optics.neighbours import (
     find_along_z,
@@ -73,15 +75,30 @@ from perrin.images.optics.neighbours import (
     neighbour_covariance,
     neighbour_variance,
 )
-from perrin.images.optics.optics import CameraNoise, Optics
+from perrin.images.optics.optics import CameraNoise, Optics, photon_transfer
 from perrin.images.optics.pixel_pattern import (
     PixelPattern,
     find_pixel_pattern,
     pixel_offsets,
     without_pattern,
 )
-from perrin.images.optics.point_spread import PointSpread, StackLike, measure_point_spread
-from perrin.images.optics.pupil import Pupil, PupilBall
+from perrin.images.optics.point_spread import (
+    Bead,
+    PointSpread,
+    StackLike,
+    find_beads,
+    measure_point_spread,
+    voxel_variances,
+)
+from perrin.images.optics.pupil import (
+    FocalSpace,
+    Pupil,
+    PupilBall,
+    focal_intensity,
+    gaussian_widths,
+    image_transform,
+    transfer_function,
+)
 from perrin.images.optics.radial_image import (
     Patch,
     PatchFit,
@@ -98,6 +115,7 @@ from perrin.images.optics.render import (
     render_stack,
     sphere_paths,
 )
+from perrin.images.optics.samples import CrowdSample, GroupSample, SampleFit, UsualImage
 from perrin.images.optics.window_fit import (
     Arrangement,
     FreeCenters,
@@ -114,6 +132,7 @@ __all__ = [
     "Arrangement",
     "Asymmetry",
     "BallBlur",
+    "Bead",
     "Camera",
     "CameraNoise",
     "CrowdFit",
@@ -121,6 +140,7 @@ __all__ = [
     "CrowdSample",
     "CrowdWindow",
     "DepthChange",
+    "FocalSpace",
     "FreeCenters",
     "GroupSample",
     "ImageFit",
@@ -128,8 +148,11 @@ __all__ = [
     "ImageVariations",
     "LearnedOptics",
     "Light",
+    "LikeliestOptics",
     "LineChanges",
     "Lines",
+    "MomentFit",
+    "MomentTables",
     "Optics",
     "Patch",
     "PatchFit",
@@ -166,6 +189,7 @@ __all__ = [
     "detection_chi2",
     "drawing_faults",
     "find_along_z",
+    "find_beads",
     "find_flicker",
     "find_gain_spread",
     "find_neighbours",
@@ -177,7 +201,11 @@ __all__ = [
     "fit_samples",
     "fit_window",
     "floor_share",
+    "focal_intensity",
+    "gaussian_quadrature",
+    "gaussian_widths",
     "held_out_misfit",
+    "image_transform",
     "learn_image",
     "log_likelihood",
     "measure_point_spread",
@@ -206,7 +234,9 @@ __all__ = [
     "spline_design",
     "standard_errors",
     "sum_of_spheres",
+    "transfer_function",
     "visible_fraction",
+    "voxel_variances",
     "within",
     "without_clipped",
     "without_pattern",

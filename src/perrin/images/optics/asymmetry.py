@@ -83,6 +83,9 @@ class Asymmetry(NamedTuple):
         return tuple(name for name, values in named.items() if any(values))
 
 
+# Components that differ above and below the focus alone, and may change with the height.
+ABOVE_FOCUS = [Asymmetry._fields.index(name) for name in ("zzz", "zrr")]
+
 # The table of each component (see `asymmetry_tables`), its factor in the plane (see
 # `plane_factors`), whether it is also multiplied by the height, and its sign.
 _COMPONENTS = (

@@ -19,7 +19,8 @@ from perrin.images.optics.asymmetry import (
     component_images,
     plane_factors,
 )
-from perrin.images.optics.pupil import Pupil, PupilBall
+from perrin.images.optics.point_spread import voxel_variances
+from perrin.images.optics.pupil import MOST_DIAMETER, Pupil, PupilBall
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -65,6 +66,26 @@ class PsfTail(NamedTuple):
     share: float
     psf: tuple[float, float]
 
+    def components(
+        self, narrow: tuple[float, float]
+    ) -> tuple[tuple[float, tuple[float, float]], ...]:
+        """Return the shares and standard deviations (z, plane) of both Gaussians, um.
+
+        Parameters
+        ----------
+        narrow : tuple of float
+            Standard deviations of the narrower one, um.
+
+        Raises
+        ------
+        ValueError
+            For a length that is not positive, or a share outside 0 to 1.
+        """
+        require_positive(**{"tail psf[z]": self.psf[0], "tail psf[plane]": self.psf[1]})
+        if not 0 <= self.share <= 1:
+            raise ValueError(f"tail: expected a share between 0 and 1, got {self.share}")
+        return (1.0 - self.share, narrow), (self.share, self.psf)
+
 
 class BallBlur(NamedTuple):
     """A ball, and the Gaussian components by which its image is blurred.
@@ -84,6 +105,46 @@ class BallBlur(NamedTuple):
     diameter: float
     components: tuple[tuple[float, tuple[float, float]], ...]
     shell: bool = False
+
+    @classmethod
+    def of_point_spread(
+        cls,
+        diameter: float,
+        spreads: Sequence[tuple[float, tuple[float, float]]],
+        *,
+        voxel: tuple[float, float, float],
+        shell: bool = False,
+    ) -> BallBlur:
+        """Return a ball that is blurred by the Gaussians of a point spread and by the voxels.
+
+        Parameters
+        ----------
+        diameter : float
+            Diameter of the ball, um.
+        spreads : sequence of tuple
+            ``(share, (z, plane))`` of each Gaussian, um.
+        voxel : tuple of float
+            Voxel size (z, y, x), um.
+        shell : bool
+            The surface of the ball is fluorescent.
+
+        Raises
+        ------
+        ValueError
+            Where the blur along z is less than within the plane.
+        """
+        more_z, more = voxel_variances(voxel).tolist()
+        components = []
+        for share, (psf_z, psf_plane) in spreads:
+            blur_z, blur = float(np.sqrt(psf_z**2 + more_z)), float(np.sqrt(psf_plane**2 + more))
+            if blur_z < blur:
+                raise ValueError(
+                    "psf: expected (z, plane) with the larger blur along z, as in every "
+                    f"microscope, got {(psf_z, psf_plane)} um, with the voxel {blur_z:.3g} and "
+                    f"{blur:.3g}; are the two exchanged?"
+                )
+            components.append((share, (blur_z, blur)))
+        return cls(diameter, tuple(components), shell)
 
     def ranges(self, narrow: float, wide: float) -> tuple[float, float]:
         """Return distances (z, plane), um, in blurs of the narrowest component or of the others."""
@@ -133,7 +194,7 @@ class BallBlur(NamedTuple):
         total = np.zeros((len(z), len(rho)))
         for share, (blur_z, blur) in self.components:
             excess = float(np.sqrt(max(blur_z**2 - blur**2, 0.0)))
-            nodes, weights = _gaussian_quadrature(z, excess, blur)
+            nodes, weights = gaussian_quadrature(z, excess, blur=blur)
             r = np.hypot(nodes[:, None], rho)
             a, b = (radius - r) / blur, (radius + r) / blur
             # Near the centre the difference of exponentials over r is its limit, the derivative.
@@ -275,8 +336,10 @@ class SphereImage:
             return self._tables, np.zeros_like(self._tables)
         assert self._height_tables is not None
         nodes = self.depth.nodes(_HEIGHT_NODES)
+        if nodes[0] == nodes[-1]:
+            return self._height_tables[0], np.zeros_like(self._tables)
         within = float(np.clip(height, nodes[0], nodes[-1]))
-        value, slope = _between(nodes, within)
+        value, slope = _cubic_factors(nodes, within)
         if within != height:
             slope = np.zeros_like(slope)
         tables = self._height_tables
@@ -286,7 +349,7 @@ class SphereImage:
         """Return the factors of the tables at a deviation, and their derivatives."""
         if self.spread == 0:
             return np.ones(1), np.zeros(1)
-        return _between(self._sizes, deviation)
+        return _cubic_factors(self._sizes, deviation)
 
     def spot(
         self, center: Floats, shape: tuple[int, ...], *, height: float | None = None
@@ -556,8 +619,8 @@ def sphere_image(
     Raises
     ------
     ValueError
-        For a length that is not positive, a share of the tail outside 0 to 1, or where the blur
-        along z is less than within the plane.
+        For a length that is not positive, a share of the tail outside 0 to 1, where the blur
+        along z is less than within the plane, or for a sphere that is too large for a `Pupil`.
 
     Notes
     -----
@@ -576,10 +639,18 @@ def sphere_image(
     require_positive(**{f"voxel[{axis}]": h for axis, h in zip("zyx", voxel, strict=True)})
     ball: BallBlur | PupilBall
     if pupil is not None:
-        ball = PupilBall(diameter, pupil, (voxel[0] ** 2 / 12, voxel[1] * voxel[2] / 12), shell)
+        require_positive(**{f"pupil {name}": value for name, value in pupil._asdict().items()})
+        if diameter > MOST_DIAMETER:
+            raise ValueError(
+                f"pupil: expected a sphere of at most {MOST_DIAMETER:g} um, got {diameter:g} um"
+            )
+        wide_z, wide = voxel_variances(voxel).tolist()
+        ball = PupilBall(diameter, pupil, (wide_z, wide), shell)
     else:
-        spreads = _gaussians(psf, tail) if measured is None else measured.components
-        ball = BallBlur(diameter, _with_voxel(spreads, voxel), shell)
+        spreads = ((1.0, psf),) if measured is None else measured.components
+        if measured is None and tail is not None:
+            spreads = tail.components(psf)
+        ball = BallBlur.of_point_spread(diameter, spreads, voxel=voxel, shell=shell)
     blur_z, blur = ball.components[0][1]
     spacing = _KNOT_SPACING * blur_z, _KNOT_SPACING * blur
     radius = diameter / 2 * float(np.exp(_size_range(spread)))
@@ -611,43 +682,13 @@ def sphere_image(
     )
 
 
-def _gaussians(
-    psf: tuple[float, float], tail: PsfTail | None
-) -> tuple[tuple[float, tuple[float, float]], ...]:
-    """Return the shares and standard deviations of one Gaussian, or of two."""
-    if tail is None:
-        return ((1.0, psf),)
-    require_positive(**{"tail psf[z]": tail.psf[0], "tail psf[plane]": tail.psf[1]})
-    if not 0 <= tail.share <= 1:
-        raise ValueError(f"tail: expected a share between 0 and 1, got {tail.share}")
-    return (1.0 - tail.share, psf), (tail.share, tail.psf)
-
-
-def _with_voxel(
-    spreads: Sequence[tuple[float, tuple[float, float]]], voxel: tuple[float, float, float]
-) -> tuple[tuple[float, tuple[float, float]], ...]:
-    """Return the shares of Gaussians and their standard deviations with those of a voxel."""
-    components = []
-    for share, (psf_z, psf_plane) in spreads:
-        blur_z = float(np.sqrt(psf_z**2 + voxel[0] ** 2 / 12))
-        blur = float(np.sqrt(psf_plane**2 + voxel[1] * voxel[2] / 12))
-        if blur_z < blur:
-            raise ValueError(
-                f"psf: expected (z, plane) with the larger blur along z, as in every microscope, "
-                f"got {(psf_z, psf_plane)} um, with the voxel {blur_z:.3g} and {blur:.3g}; are the "
-                "two exchanged?"
-            )
-        components.append((share, (blur_z, blur)))
-    return tuple(components)
-
-
 def _tables_of_sizes(ball: BallBlur | PupilBall, sizes: Floats, z: Floats, rho: Floats) -> Floats:
     """Return the knots of the images of balls whose logarithms of the diameter deviate."""
     balls = [ball._replace(diameter=ball.diameter * float(np.exp(size))) for size in sizes]
     return np.stack([_spline_knots(one.intensity(z, rho)) for one in balls])
 
 
-def _between(grid: Floats, at: float) -> tuple[Floats, Floats]:
+def _cubic_factors(grid: Floats, at: float) -> tuple[Floats, Floats]:
     """Return the factors of tables on an even grid in the cubic between them, and their slopes."""
     step = grid[1] - grid[0]
     t = (at - grid[0]) / step
@@ -678,11 +719,33 @@ def _spline_knots(table: Floats) -> Floats:
     return np.pad(table, 1, mode="reflect")
 
 
-def _gaussian_quadrature(z: Floats, width: float, blur: float) -> tuple[Floats, Floats]:
-    """Return nodes (k,) and weights (len(z), k) that convolve a function with a Gaussian at z.
+def gaussian_quadrature(z: Floats, width: float, *, blur: float) -> tuple[Floats, Floats]:
+    """Return nodes and weights that convolve an even function with a Gaussian.
 
-    The function is even, and smooth over `blur`. The sum over even spaces converges exponentially;
-    for a Gaussian far narrower than `blur` three Hermite nodes have an error below 1e-8.
+    Parameters
+    ----------
+    z : ndarray, shape (m,)
+        Where the convolution is wanted, um.
+    width : float
+        Standard deviation of the Gaussian, um.
+    blur : float
+        Length over which the function is smooth, um.
+
+    Returns
+    -------
+    nodes : ndarray, shape (k,)
+    weights : ndarray, shape (m, k)
+
+    Notes
+    -----
+    The sum over even spaces converges exponentially; for a Gaussian far narrower than `blur` three
+    Hermite nodes have an error below 1e-8.
+
+    Examples
+    --------
+    >>> nodes, weights = gaussian_quadrature(np.array([0.0, 2.0]), 0.5, blur=0.4)
+    >>> (weights @ nodes**2).round(6)
+    array([0.25, 4.25])
     """
     if width < 0.05 * blur:
         nodes = np.concatenate([z, z - np.sqrt(3) * width, z + np.sqrt(3) * width])

@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from perrin.errors import NoSpheresError
-from perrin.images.optics.learn import photon_transfer
 from perrin.images.optics.neighbours import neighbour_variance
-from perrin.images.optics.optics import CameraNoise
+from perrin.images.optics.optics import CameraNoise, photon_transfer
 from perrin.images.optics.radial_image import (
     Patch,
     PatchFit,

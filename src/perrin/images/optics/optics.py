@@ -135,7 +135,7 @@ class Optics(Shown):
         Diameter of the fluorescent sphere, um.
     psf : tuple of float
         Standard deviations of the Gaussian point spread, (z, plane), um; with a tail those of its
-        narrower Gaussian.
+        narrower Gaussian, with `depth` those at its middle.
     noise : CameraNoise
         ``(gain, floor, ...)``: the variance of a voxel is gain times its expected value plus floor,
         in squared grey levels; the floor includes read noise and the camera's offset.
@@ -209,9 +209,10 @@ class Optics(Shown):
         Parameters
         ----------
         entry : mapping
-            The dictionary of `to_dict`; one without `tail` has a Gaussian point spread, one without
-            `spread` equal spheres, one without `measured` a point spread that was learned, and one
-            without `shell` balls.
+            The dictionary of `to_dict`; one without `tail` and `pupil` has a Gaussian point spread,
+            one without `spread` equal spheres, one without `measured` a point spread that was
+            learned, one without `shell` balls, and one without `asymmetry` or `depth` a point
+            spread that is an even body of revolution, or the same at all heights.
 
         Returns
         -------
@@ -231,14 +232,15 @@ class Optics(Shown):
         shell = bool(entry.get("shell", False))
         uneven = entry.get("asymmetry")
         asymmetry = None if uneven is None else Asymmetry(**uneven)
-        deep, depth = entry.get("depth"), None
+        deep, pupil = entry.get("depth"), entry.get("pupil")
+        depth = None
         if deep is not None:
             depth = DepthChange(**{**deep, "stderr": tuple(deep["stderr"])})
         return cls(
             *(size, (psf_z, psf), noise, (a, b, c), tail, spread, measured, shell),
             asymmetry=asymmetry,
             depth=depth,
-            pupil=Pupil(**entry["pupil"]) if "pupil" in entry else None,
+            pupil=None if pupil is None else Pupil(**pupil),
         )
 
     def image(self, voxel: tuple[float, float, float]) -> SphereImage:
@@ -255,3 +257,35 @@ class Optics(Shown):
             depth=self.depth,
             pupil=self.pupil,
         )
+
+
+def photon_transfer(expected: Floats, variance: Floats) -> CameraNoise:
+    """Return gain and floor of the camera from the growth of the variance with the mean.
+
+    Parameters
+    ----------
+    expected : ndarray, shape (m,)
+        Expected grey levels.
+    variance : ndarray, shape (m,)
+        Estimates of their variance.
+
+    Returns
+    -------
+    CameraNoise
+        A negative gain (of a processed image) is replaced by 0 and a constant variance.
+
+    Examples
+    --------
+    >>> noise = photon_transfer(np.array([10.0, 20.0, 30.0]), np.array([34.0, 64.0, 94.0]))
+    >>> round(noise.gain, 6), round(noise.floor, 6)
+    (3.0, 4.0)
+    """
+    design = np.stack([expected, np.ones_like(expected)])
+    noise = CameraNoise(0.0, float(variance.mean()))
+    for _ in range(4):
+        weighted = design * noise.weight(expected) ** 2
+        gain, floor = np.linalg.solve(weighted @ design.T, weighted @ variance)
+        if gain <= 0:
+            return CameraNoise(0.0, float(variance.mean()))
+        noise = CameraNoise(float(gain), float(floor))
+    return noise

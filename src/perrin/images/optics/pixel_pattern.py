@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from perrin.images.optics.learn import without_clipped
+from perrin.images.optics.clipping import without_clipped
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -128,14 +128,82 @@ class PointSpread:
         return cls(parts, int(entry["beads"]), float(entry["misfit"]))
 
 
-class _Bead(NamedTuple):
-    """The voxels around one bead: distances from its centre, grey levels, and their scale."""
+def voxel_variances(voxel: Floats | tuple[float, float, float]) -> Floats:
+    """Return the variances (z, plane) of a Gaussian that stands for a voxel, um^2.
+
+    A voxel of side h has the variance h^2/12.
+
+    Parameters
+    ----------
+    voxel : tuple of float
+        Voxel size (z, y, x), um.
+
+    Returns
+    -------
+    ndarray, shape (2,)
+
+    Examples
+    --------
+    >>> voxel_variances((0.6, 0.3, 0.2)).round(4)
+    array([0.03 , 0.005])
+    """
+    return np.array([voxel[0] ** 2, voxel[1] * voxel[2]]) / 12
+
+
+class Bead(NamedTuple):
+    """The voxels around one bead.
+
+    Attributes
+    ----------
+    height, radius : ndarray, shape (m,)
+        Distances from its centre along z, and from its axis, um.
+    data : ndarray, shape (m,)
+        Grey levels.
+    brightness : float
+        Integral of its image, grey levels um^3.
+    background : float
+        Grey level beside it.
+    """
 
     height: Floats
     radius: Floats
     data: Floats
     brightness: float
     background: float
+
+    @classmethod
+    def at(cls, frame: Floats, place: Sequence[int] | Floats, half: Floats, voxel: Floats) -> Bead:
+        """Return the voxels around a bead, relative to the centre of a Gaussian fitted to them.
+
+        Parameters
+        ----------
+        frame : ndarray, shape (nz, ny, nx)
+            Grey levels.
+        place, half : ndarray of int, shape (3,)
+            The brightest voxel (z, y, x), and the number of voxels on either side of it.
+        voxel : ndarray, shape (3,)
+            Voxel size (z, y, x), um.
+        """
+        from scipy.optimize import least_squares
+
+        box = tuple(slice(int(p - h), int(p + h + 1)) for p, h in zip(place, half, strict=True))
+        data = frame[box]
+        grid = [v * np.arange(-h, h + 1) for h, v in zip(half, voxel, strict=True)]
+        z, y, x = np.meshgrid(*grid, indexing="ij", sparse=True)
+        level = float(np.median(data))
+
+        def residual(p: Floats) -> Floats:
+            exponent = ((z - p[0]) / np.exp(p[3])) ** 2
+            exponent = exponent + ((y - p[1]) ** 2 + (x - p[2]) ** 2) / np.exp(2 * p[4])
+            return np.asarray((p[5] * np.exp(-0.5 * exponent) + p[6] - data).ravel())
+
+        start = [0.0, 0.0, 0.0, np.log(0.4), np.log(0.2), float(data.max()) - level, level]
+        fit = least_squares(residual, start, x_scale=[0.1, 0.1, 0.1, 0.3, 0.3, start[5], start[5]])
+        cz, cy, cx, wide_z, wide, peak, background = fit.x.tolist()
+        radius = np.broadcast_to(np.hypot(y - cy, x - cx), data.shape).ravel()
+        height = np.broadcast_to(z - cz, data.shape).ravel()
+        integral = peak * np.exp(wide_z + 2 * wide) * (2 * np.pi) ** 1.5
+        return cls(height, radius, data.ravel(), float(integral), background)
 
 
 def measure_point_spread(stack: StackLike, *, diameter: float = 0.1) -> PointSpread:
@@ -188,12 +256,12 @@ def measure_point_spread(stack: StackLike, *, diameter: float = 0.1) -> PointSpr
     frame = np.zeros(stack.shape[1:])
     for i in range(stack.shape[0]):
         frame += np.asarray(stack.frame(i), dtype=np.float64) / stack.shape[0]
-    beads = _beads_of(frame, voxel)
+    beads = find_beads(frame, voxel)
     widths = np.array(
         [(ratio * r, r) for r in _WIDTHS for ratio in _ELONGATIONS if ratio * r <= _MOST_RADIUS]
     )
     # Variances of a voxel and of a bead.
-    added = np.array([voxel[0] ** 2, voxel[1] * voxel[2]]) / 12 + diameter**2 / 20
+    added = voxel_variances(voxel) + diameter**2 / 20
     total = np.sqrt(widths**2 + added)
     # Gaussians of unit integral.
     columns = [
@@ -241,8 +309,32 @@ def measure_point_spread(stack: StackLike, *, diameter: float = 0.1) -> PointSpr
     return PointSpread(components, len(beads), misfit)
 
 
-def _beads_of(frame: Floats, voxel: Floats) -> list[_Bead]:
-    """Return the beads of a frame that are apart from others and whole, with fitted centres."""
+def find_beads(frame: Floats, voxel: Floats) -> list[Bead]:
+    """Return the beads of a frame that are apart from others and whole, with fitted centres.
+
+    Parameters
+    ----------
+    frame : ndarray, shape (nz, ny, nx)
+        Grey levels.
+    voxel : ndarray, shape (3,)
+        Voxel size (z, y, x), um.
+
+    Returns
+    -------
+    list of Bead
+
+    Raises
+    ------
+    ValueError
+        If there are none.
+
+    Examples
+    --------
+    >>> frame = np.random.default_rng(1).normal(10.0, 1.0, (31, 41, 41))
+    >>> frame[13:18, 18:23, 18:23] += 90 * np.exp(-np.abs(np.arange(-2, 3)))
+    >>> len(find_beads(frame, np.array([0.2, 0.1, 0.1])))
+    1
+    """
     from scipy.ndimage import gaussian_filter, maximum_filter
 
     half = np.ceil(np.array([_AROUND[0], _AROUND[1], _AROUND[1]]) / voxel).astype(int)
@@ -269,28 +361,4 @@ def _beads_of(frame: Floats, voxel: Floats) -> list[_Bead]:
             f"{listed(2 * a for a in _AROUND)} um (z, plane) from others and from the borders: "
             "record sparse beads that are smaller than the point spread"
         )
-    return [_bead_at(frame, places[k], half, voxel) for k in chosen]
-
-
-def _bead_at(frame: Floats, place: Sequence[int] | Floats, half: Floats, voxel: Floats) -> _Bead:
-    """Return the voxels around a bead, relative to the centre of a Gaussian fitted to them."""
-    from scipy.optimize import least_squares
-
-    box = tuple(slice(int(p - h), int(p + h + 1)) for p, h in zip(place, half, strict=True))
-    data = frame[box]
-    grid = [v * np.arange(-h, h + 1) for h, v in zip(half, voxel, strict=True)]
-    z, y, x = np.meshgrid(*grid, indexing="ij", sparse=True)
-    level = float(np.median(data))
-
-    def residual(p: Floats) -> Floats:
-        exponent = ((z - p[0]) / np.exp(p[3])) ** 2
-        exponent = exponent + ((y - p[1]) ** 2 + (x - p[2]) ** 2) / np.exp(2 * p[4])
-        return np.asarray((p[5] * np.exp(-0.5 * exponent) + p[6] - data).ravel())
-
-    start = [0.0, 0.0, 0.0, np.log(0.4), np.log(0.2), float(data.max()) - level, level]
-    fit = least_squares(residual, start, x_scale=[0.1, 0.1, 0.1, 0.3, 0.3, start[5], start[5]])
-    cz, cy, cx, wide_z, wide, peak, background = fit.x.tolist()
-    radius = np.broadcast_to(np.hypot(y - cy, x - cx), data.shape).ravel()
-    height = np.broadcast_to(z - cz, data.shape).ravel()
-    integral = peak * np.exp(wide_z + 2 * wide) * (2 * np.pi) ** 1.5
-    return _Bead(height, radius, data.ravel(), float(integral), background)
+    return [Bead.at(frame, places[k], half, voxel) for k in chosen]

@@ -23,14 +23,19 @@ _STOKES = 0.94
 # and nodes in the plane for each unit of the largest phase.
 _HALF, _PUPIL_NODES, _NODES_PER_PHASE = (9.0, 6.0), 48, 0.6
 
-# The fit uses voxels, and the table of the image ends, where less than this of its maximum is left.
-_FIT_LEVEL, _TABLE_LEVEL = 0.02, 0.002
+# The fit uses voxels, and the table of the image ends, where less than this is left of the
+# intensity inside a large ball, and at this distance outside the surface at the latest, um.
+_FIT_LEVEL, _TABLE_LEVEL, _MOST_RANGE = 0.02, 0.002, 4.0
+
+# Largest diameter of a ball, um: the image of a larger one would reach beyond the space above and
+# below it, and return from the other side, as a transform is periodic.
+MOST_DIAMETER = 2 * (_HALF[0] - _MOST_RANGE)
 
 # Phase at the first dark ring of a focus: its radius times `Pupil.lateral`.
 AIRY = 3.832
 
 # The standard deviation of a Gaussian over its half width at half of the maximum.
-_SIGMA = 0.8493
+_OF_HALF_WIDTH = 1 / np.sqrt(2 * np.log(2))
 
 
 class Pupil(NamedTuple):
@@ -64,11 +69,31 @@ class Pupil(NamedTuple):
     @property
     def psf(self) -> tuple[float, float]:
         """Standard deviations (z, plane) of a Gaussian as wide at half of its maximum, um."""
-        return _gaussian_widths(self)
+        return gaussian_widths(self)
 
 
-def _focus(pupil: Pupil, z: Floats, r: Floats, factor: float) -> Floats:
-    """Return the intensity (len(z), len(r)) of a focus, the wavelength shorter by a factor."""
+def focal_intensity(pupil: Pupil, z: Floats, r: Floats, *, factor: float = 1.0) -> Floats:
+    """Return the intensity of the focus of an aperture.
+
+    Parameters
+    ----------
+    pupil : Pupil
+    z, r : ndarray
+        Heights above the focus and distances from the axis, um.
+    factor : float
+        By this the wavelength is shorter than that of the emission.
+
+    Returns
+    -------
+    ndarray, shape (len(z), len(r))
+        In units of its own.
+
+    Examples
+    --------
+    >>> value = focal_intensity(Pupil(15.0, 0.6, 0.2), np.zeros(1), np.array([0.0, AIRY / 15]))
+    >>> bool(value[0, 1] < 0.01 * value[0, 0])  # the first dark ring
+    True
+    """
     from scipy.special import j0
 
     x, weight = np.polynomial.legendre.leggauss(_PUPIL_NODES)
@@ -81,15 +106,31 @@ def _focus(pupil: Pupil, z: Floats, r: Floats, factor: float) -> Floats:
 
 
 @lru_cache(maxsize=64)
-def _gaussian_widths(pupil: Pupil) -> tuple[float, float]:
-    """Return the standard deviations (z, plane) of a Gaussian as wide at half of its maximum."""
-    space, _ = _transfer(pupil)
+def gaussian_widths(pupil: Pupil) -> tuple[float, float]:
+    """Return the standard deviations of a Gaussian as wide as a point spread at half its maximum.
+
+    Parameters
+    ----------
+    pupil : Pupil
+
+    Returns
+    -------
+    tuple of float
+        Along z and in the plane, um.
+
+    Examples
+    --------
+    >>> along, across = gaussian_widths(Pupil(15.0, 0.6, 0.2))
+    >>> round(along, 2), round(across, 2)
+    (0.19, 0.08)
+    """
+    space = FocalSpace.of(pupil)
     z, r, axis = np.linspace(0.0, 4.0, 400), np.linspace(0.0, 1.5, 400), np.zeros(1)
     emitted = space.through_pinhole(pupil, np.concatenate([axis, z]))
-    along = emitted[1:] @ space.back(axis) * _focus(pupil, z, axis, 1 / _STOKES)
-    across = emitted[:1] @ space.back(r) * _focus(pupil, axis, r, 1 / _STOKES)
+    along = emitted[1:] @ space.back(axis) * focal_intensity(pupil, z, axis, factor=1 / _STOKES)
+    across = emitted[:1] @ space.back(r) * focal_intensity(pupil, axis, r, factor=1 / _STOKES)
     wide_z, wide = (
-        _SIGMA * _first_below(x, value.ravel() / value.max(), 0.5)
+        float(_OF_HALF_WIDTH) * _first_below(x, value.ravel() / value.max(), 0.5)
         for x, value in ((z, along), (r, across))
     )
     return wide_z, wide
@@ -101,8 +142,28 @@ def _first_below(x: Floats, value: Floats, level: float) -> float:
     return float(np.interp(level, value[[k, k - 1]], x[[k, k - 1]]))
 
 
-class _Space(NamedTuple):
-    """Nodes of distances from the axis and of their wave numbers, and heights."""
+class FocalSpace(NamedTuple):
+    """The heights, distances from the axis and wave numbers on which a point spread is computed.
+
+    Attributes
+    ----------
+    z, kz : ndarray, shape (a,)
+        Even heights, um, the first one 0, and their wave numbers, 1/um, in the order of a Fourier
+        transform.
+    r, r_weight : ndarray, shape (b,)
+        Nodes of the distance from the axis, um, and weights of integrals over the plane, um^2.
+    k, k_weight : ndarray, shape (c,)
+        Nodes of the wave number in the plane, 1/um, and weights of the transform back, 1/um^2.
+    bessel : ndarray, shape (b, c)
+        Bessel function of order 0 of r k.
+
+    Examples
+    --------
+    >>> space = FocalSpace.of(Pupil(15.0, 0.6, 0.2))
+    >>> gauss = np.exp(-0.5 * (space.r / 0.3) ** 2) * space.r_weight
+    >>> (gauss @ space.bessel @ space.back(np.array([0.0, 0.3]))).round(3)
+    array([1.   , 0.607])
+    """
 
     z: Floats
     kz: Floats
@@ -113,7 +174,7 @@ class _Space(NamedTuple):
     bessel: Floats
 
     @classmethod
-    def of(cls, pupil: Pupil) -> _Space:
+    def of(cls, pupil: Pupil) -> FocalSpace:
         """Return a space that holds the whole band of a point spread."""
         from scipy.special import j0
 
@@ -143,7 +204,7 @@ class _Space(NamedTuple):
         from scipy.special import j1
 
         inside = np.maximum(self.k * pupil.pinhole, 1e-9)
-        emitted = _focus(pupil, z, self.r, 1.0)
+        emitted = focal_intensity(pupil, z, self.r)
         return np.asarray((emitted * self.r_weight) @ self.bessel * (2 * j1(inside) / inside))
 
     def back(self, r: Floats) -> Floats:
@@ -154,11 +215,28 @@ class _Space(NamedTuple):
 
 
 @lru_cache(maxsize=32)
-def _transfer(pupil: Pupil) -> tuple[_Space, Floats]:
-    """Return the transfer function (kz, k) of a point spread, of which all the light is 1."""
-    space = _Space.of(pupil)
+def transfer_function(pupil: Pupil) -> tuple[FocalSpace, Floats]:
+    """Return the optical transfer function of a confocal microscope.
+
+    Parameters
+    ----------
+    pupil : Pupil
+
+    Returns
+    -------
+    space : FocalSpace
+    transfer : ndarray, shape (a, c)
+        At the wave numbers along z and in the plane; all the light of a point is 1.
+
+    Examples
+    --------
+    >>> space, transfer = transfer_function(Pupil(15.0, 0.6, 0.2))
+    >>> transfer[0, np.searchsorted(space.k, [0.1, 10.0])].round(2)
+    array([1.  , 0.53])
+    """
+    space = FocalSpace.of(pupil)
     emitted = space.through_pinhole(pupil, space.z) @ space.back(space.r)
-    point = _focus(pupil, space.z, space.r, 1 / _STOKES) * emitted
+    point = focal_intensity(pupil, space.z, space.r, factor=1 / _STOKES) * emitted
     light = (point * space.r_weight).sum()
     whole = np.fft.fft((point * space.r_weight) @ space.bessel, axis=0).real / light
     frozen(whole)
@@ -171,7 +249,7 @@ class PupilBall(NamedTuple):
     Attributes
     ----------
     diameter : float
-        Diameter of the ball, um.
+        Diameter of the ball, um; at most `MOST_DIAMETER`, 10 um.
     pupil : Pupil
     variances : tuple of float
         Variances (z, plane) by which the image is blurred besides, um^2: those of a voxel. Below 0
@@ -208,16 +286,16 @@ class PupilBall(NamedTuple):
     @property
     def fit_range(self) -> tuple[float, float]:
         """Distances (z, plane) outside the surface up to which a fit uses voxels, um."""
-        return _ends(self)[0]
+        return _image_ends(self)[0]
 
     @property
     def table_range(self) -> tuple[float, float]:
         """Distances (z, plane) outside the surface at which the table of the image ends, um."""
-        return _ends(self)[1]
+        return _image_ends(self)[1]
 
     def intensity(self, z: Floats, rho: Floats) -> Floats:
         """Return the intensity (len(z), len(rho)) at heights z and distances rho from the axis."""
-        space, whole = _ball_transfer(self)
+        space, whole = image_transform(self)
         heights = np.cos(np.outer(z, space.kz)) / (2 * _HALF[0])
         shape = np.shape(rho)
         flat = heights @ whole @ space.back(np.ravel(rho))
@@ -225,9 +303,26 @@ class PupilBall(NamedTuple):
 
 
 @lru_cache(maxsize=64)
-def _ball_transfer(ball: PupilBall) -> tuple[_Space, Floats]:
-    """Return the transform (kz, k) of the image of a ball."""
-    space, whole = _transfer(ball.pupil)
+def image_transform(ball: PupilBall) -> tuple[FocalSpace, Floats]:
+    """Return the Fourier transform of the image of a ball.
+
+    Parameters
+    ----------
+    ball : PupilBall
+
+    Returns
+    -------
+    space : FocalSpace
+    transform : ndarray, shape (a, c)
+        At the wave numbers along z and in the plane, um^3.
+
+    Examples
+    --------
+    >>> _, transform = image_transform(PupilBall(2.0, Pupil(15.0, 0.6, 0.2), (0.005, 0.003)))
+    >>> round(float(transform[0, 0]), 2)  # the volume
+    4.19
+    """
+    space, whole = transfer_function(ball.pupil)
     radius = ball.diameter / 2
     q = np.maximum(radius * np.hypot(space.kz[:, None], space.k), 1e-3)
     if ball.shell:
@@ -243,9 +338,9 @@ def _ball_transfer(ball: PupilBall) -> tuple[_Space, Floats]:
 
 
 @lru_cache(maxsize=64)
-def _ends(ball: PupilBall) -> tuple[tuple[float, float], tuple[float, float]]:
+def _image_ends(ball: PupilBall) -> tuple[tuple[float, float], tuple[float, float]]:
     """Return distances (z, plane) outside the surface where little is left, for fits and tables."""
-    out, axis = np.linspace(0.0, 4.0, 161), np.zeros(1)
+    out, axis = np.linspace(0.0, _MOST_RANGE, 161), np.zeros(1)
     along = ball.intensity(ball.diameter / 2 + out, axis)[:, 0]
     across = ball.intensity(axis, ball.diameter / 2 + out)[0]
     fit, table = (

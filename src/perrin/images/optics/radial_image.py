@@ -150,11 +150,11 @@ class RadialImage:
     def _pieces(self, distance: Floats) -> tuple[list[Floats], Floats]:
         """Return the coefficients of the spline's piece at each distance, and the place in it."""
         knot, part = _in_knots(distance, self.spacing, len(self.coefficients))
-        return [of_order.take(knot, mode="clip") for of_order in self._cubics], part
+        return [of_order.take(knot, mode="clip") for of_order in self.cubics], part
 
     @cached_property
-    def _cubics(self) -> Floats:
-        """Coefficients (4, k + 2) of the pieces of the spline."""
+    def cubics(self) -> Floats:
+        """Coefficients (4, k + 2) of the cubic pieces of the spline, grey levels."""
         mirrored = np.concatenate([self.coefficients[1:2], self.coefficients, np.zeros(4)])
         pieces: Floats = _CUBIC @ np.lib.stride_tricks.sliding_window_view(mirrored, 4).T
         return pieces

@@ -14,7 +14,7 @@ import numpy as np
 
 from perrin.geometry.rigid import pose_slopes
 from perrin.geometry.rotations import exp_map
-from perrin.images.optics.asymmetry import Asymmetry
+from perrin.images.optics.asymmetry import ABOVE_FOCUS, Asymmetry
 from perrin.images.optics.flicker import VoxelPrecision
 from perrin.images.optics.neighbours import neighbour_covariance
 
@@ -66,13 +66,17 @@ class Window(NamedTuple):
         """Return whether there are enough voxels to fit `count` spheres."""
         return len(self.data) >= _VOXELS_PER_PARAMETER * (4 * count + _N_BACKGROUND)
 
+    def origin(self, image: SphereImage) -> Floats:
+        """Return the position (z, y, x) of the first voxel of the box, um."""
+        return np.asarray(np.array([s.start for s in self.box]) * np.array(image.voxel))
+
     def spots(self, image: SphereImage, centers: Floats, sizes: Floats) -> tuple[Floats, Floats]:
         """Return unit images (n, m) of spheres on these voxels and their gradients (n, 3, m).
 
         `sizes` (n,) are deviations of the logarithms of the diameters. Without the asymmetry of the
         point spread.
         """
-        origin = np.array([s.start for s in self.box]) * np.array(image.voxel)
+        origin = self.origin(image)
         layers = image.on_voxels(self.mask, centers - origin, sizes, centers[:, 0])
         return layers[:, 0], layers[:, 1:]
 
@@ -80,12 +84,12 @@ class Window(NamedTuple):
         """Return what the asymmetry of the point spread adds to `spots` (n, m), None if nothing."""
         if not image.is_uneven:
             return None
-        origin = np.array([s.start for s in self.box]) * np.array(image.voxel)
+        origin = self.origin(image)
         return image.changes_on_voxels(self.mask, centers - origin, sizes, centers[:, 0])
 
     def size_slopes(self, image: SphereImage, centers: Floats, sizes: Floats) -> Floats:
         """Return the derivatives (n, m) of unit images by the logarithms of the diameters."""
-        origin = np.array([s.start for s in self.box]) * np.array(image.voxel)
+        origin = self.origin(image)
         whole = np.zeros((len(centers), *self.mask.shape))
         heights = centers[:, 0]
         for layer, center, size, high in zip(whole, centers - origin, sizes, heights, strict=True):
@@ -112,65 +116,48 @@ class Window(NamedTuple):
         centers, brightness, sizes : ndarray, shape (n, 3), (n,), (n,)
             The spheres; `sizes` are deviations of the logarithms of their diameters.
         """
-        origin = np.array([s.start for s in self.box]) * np.array(image.voxel)
+        origin = self.origin(image)
         whole = np.zeros((len(slopes), *self.mask.shape))
         for center, bright, size in zip(centers - origin, brightness, sizes, strict=True):
             box, value = image.slope_spot(slopes, center, self.mask.shape, deviation=size)
             whole[(slice(None), *box)] += bright * value
         return whole[:, self.mask]
 
-    def asymmetry_slopes(
-        self, image: SphereImage, knots: Floats, centers: Floats, brightness: Floats
+    def moment_slopes(
+        self,
+        image: SphereImage,
+        knots: Floats,
+        widths: Floats,
+        centers: Floats,
+        brightness: Floats,
+        *,
+        heights: DepthChange,
     ) -> Floats:
-        """Return derivatives (12, m) of the intensity by the components of an `Asymmetry`.
+        """Return derivatives (16, m) of the intensity by moments of the point spread.
+
+        These are the components of an `Asymmetry`, and the slopes of a `DepthChange`.
 
         Parameters
         ----------
         image : SphereImage
         knots : ndarray, shape (7, ...)
             What `SphereImage.asymmetry_knots` returns.
-        centers, brightness : ndarray, shape (n, 3), (n,)
-            The spheres.
-        """
-        origin = np.array([s.start for s in self.box]) * np.array(image.voxel)
-        whole = np.zeros((len(Asymmetry._fields), *self.mask.shape))
-        for center, bright in zip(centers - origin, brightness, strict=True):
-            box, value = image.asymmetry_spot(knots, center, self.mask.shape)
-            whole[(slice(None), *box)] += bright * value
-        return whole[:, self.mask]
-
-    def depth_slopes(
-        self,
-        image: SphereImage,
-        widths: Floats,
-        third: Floats,
-        centers: Floats,
-        brightness: Floats,
-        *,
-        heights: DepthChange,
-    ) -> Floats:
-        """Return derivatives (4, m) of the intensity by the slopes of a `DepthChange`.
-
-        Parameters
-        ----------
-        image : SphereImage
         widths : ndarray, shape (2, ...)
             Tables of the derivatives by the variances along z and in the plane.
-        third : ndarray, shape (2, ...)
-            Those by `zzz` and `zrr`, over the height.
         centers, brightness : ndarray, shape (n, 3), (n,)
             The spheres.
         heights : DepthChange
             The middle and the range of the heights.
         """
-        origin = np.array([s.start for s in self.box]) * np.array(image.voxel)
-        whole = np.zeros((4, *self.mask.shape))
-        tables = np.concatenate([widths, third])
+        whole = np.zeros((len(Asymmetry._fields) + len(heights.slopes), *self.mask.shape))
+        origin, shape = self.origin(image), self.mask.shape
         for center, bright in zip(centers, brightness, strict=True):
-            box, value = image.slope_spot(tables, center - origin, self.mask.shape)
-            above = np.arange(box[0].start, box[0].stop) * image.voxel[0] + origin[0] - center[0]
-            value[2:] *= -above[:, None, None]
-            whole[(slice(None), *box)] += bright * heights.above_middle(float(center[0])) * value
+            box, uneven = image.asymmetry_spot(knots, center - origin, shape)
+            _, wider = image.slope_spot(widths, center - origin, shape)
+            deep = heights.above_middle(float(center[0])) * np.concatenate(
+                [wider, uneven[ABOVE_FOCUS]]
+            )
+            whole[(slice(None), *box)] += bright * np.concatenate([uneven, deep])
         return whole[:, self.mask]
 
 

@@ -19,17 +19,11 @@ from perrin._arrays import (
 )
 from perrin._text import listed
 from perrin.errors import FrameError, NoSpheresError, PrecisionWarning
+from perrin.images.optics.clipping import floor_share, saturated_share
 from perrin.images.optics.crowd_fit import CrowdFit, crowd_piece, fit_crowd
-from perrin.images.optics.learn import (
-    CrowdSample,
-    GroupSample,
-    LearnedOptics,
-    UsualImage,
-    fit_samples,
-    floor_share,
-    saturated_share,
-)
+from perrin.images.optics.learn import LearnedOptics, fit_samples
 from perrin.images.optics.pixel_pattern import find_pixel_pattern, pixel_offsets, without_pattern
+from perrin.images.optics.samples import CrowdSample, GroupSample, UsualImage
 from perrin.images.optics.window_fit import FreeCenters, fit_window
 from perrin.images.spheres.by_trackpy import Features, find_features, refine_by_trackpy
 from perrin.images.spheres.circles import circle_cut, find_circles
@@ -46,7 +40,6 @@ from perrin.images.spheres.spots import (
     mass_cut,
     touching_together,
 )
-from perrin.tracks.groups import TOUCHING_REACH
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -862,8 +855,8 @@ def group_columns(
                 and (excess[worst] > 1 or fit.chi2 > usual.worst_chi2 or (at_border and disturbed))
             ):
                 beyond = _crowd_of(frame, found, group, search, image, noise)
-                whole = _usual_spheres(
-                    beyond, usual, float(np.median(level)), count=len(group), contact=contact
+                whole = usual.group_within(
+                    beyond, level=float(np.median(level)), count=len(group), contact=contact
                 )
                 if whole is not None:
                     crowds.append((group, whole))
@@ -917,32 +910,6 @@ def _crowd_of(
     others = np.delete(found.centers, group, axis=0)
     return fit_crowd(
         frame, found.centers[group], others=others, contact=search.contact, image=image, noise=noise
-    )
-
-
-def _usual_spheres(
-    crowd: CrowdFit, usual: UsualImage, level: float, *, count: int, contact: float
-) -> CrowdFit | None:
-    """Return the fit with the spheres of the usual image and brightness `level` that are a group.
-
-    These are the `count` spots of its start, and spheres that touch one of them. None if a spot of
-    the start is no such sphere.
-    """
-    same = (crowd.centers[:, None] == crowd.intensity.centers).all(axis=2)
-    bright = crowd.intensity.brightness[same.argmax(axis=1)] / level
-    good = (crowd.chi2 <= usual.worst_chi2) & (bright < usual.brightest)
-    good &= bright > 1 / usual.brightest
-    start = crowd.origin >= 0
-    if not set(range(count)) <= set(crowd.origin[good].tolist()):
-        return None
-    away = np.linalg.norm(crowd.centers[:, None] - crowd.centers[start], axis=2).min(axis=1)
-    good &= start | (away < TOUCHING_REACH * contact)
-    return crowd._replace(
-        centers=crowd.centers[good],
-        sigma=crowd.sigma[good],
-        chi2=crowd.chi2[good],
-        converged=crowd.converged[good],
-        origin=crowd.origin[good],
     )
 
 

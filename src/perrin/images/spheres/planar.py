@@ -209,6 +209,88 @@ class PlaneFit(NamedTuple):
     chi2: Floats
     reason: NDArray[Any]
 
+    def sweep(
+        self,
+        frame: Floats,
+        first: Floats,
+        *,
+        contact: float,
+        image: RadialImage,
+        pixel: tuple[float, float],
+    ) -> None:
+        """Fit every group of the spheres in turn, until positions stay; the arrays are changed.
+
+        Parameters
+        ----------
+        frame : ndarray, shape (ny, nx)
+            Grey levels, or their logarithms (`RadialImage.seen_in`).
+        first : ndarray, shape (n, 2)
+            Positions (y, x) as found first, um.
+        contact, image, pixel
+            Those of `fit_plane`.
+        """
+        there = np.flatnonzero((self.reason == "") | (self.reason == _UNSETTLED_PLACE))
+        groups = [there[g] for g in fitted_together(first[there], contact=contact)]
+        overlap = image.reach + image.surroundings + 0.1 * contact
+        away = np.linalg.norm(first[there][:, None] - first[there], axis=2)
+        beside = []
+        for group in groups:
+            near = (away[np.isin(there, group)] < overlap).any(axis=0) & ~np.isin(there, group)
+            beside.append(there[near])
+        again = np.ones(len(groups), dtype=np.bool_)
+        for _ in range(_MAX_SWEEPS):
+            moved = np.zeros(len(first))
+            for group, others in ((groups[k], beside[k]) for k in np.flatnonzero(again)):
+                before = self.centers[group]
+                self.refit(frame, group, others, image=image, pixel=pixel)
+                moved[group] = np.abs(self.centers[group] - before).max()
+            change = _SWEEP_CONVERGED * image.spacing
+            again = np.array([len(o) > 0 and bool((moved[o] > change).any()) for o in beside])
+            if not again.any():
+                break
+
+    def refit(
+        self,
+        frame: Floats,
+        group: Ints,
+        others: Ints,
+        *,
+        image: RadialImage,
+        pixel: tuple[float, float],
+    ) -> None:
+        """Fit one group of spheres, with the images of the others subtracted.
+
+        The elements of the group in the arrays are changed.
+
+        Parameters
+        ----------
+        frame : ndarray, shape (ny, nx)
+            Grey levels, or their logarithms (`RadialImage.seen_in`).
+        group, others : ndarray of int
+            Indices of the spheres of the group, and of those beside it.
+        image, pixel
+            Those of `fit_plane`.
+        """
+        patch = cut_patch(frame, self.centers[group], reach=image.surroundings, pixel=pixel)
+        if not patch.has_enough_pixels(len(group)):
+            self.reason[group] = _NO_PIXELS
+            return
+        known = np.zeros(len(patch.data))
+        if len(others):
+            known = self.brightness[others] @ image.value(patch.offsets(self.centers[others])[1])
+            patch = Patch(patch.place, patch.data - known, patch.background, patch.pixel)
+        found = fit_patch(patch, image, self.centers[group], known=known)
+        n = len(group)
+        self.chi2[group] = found.chi2
+        if not (found.converged and np.isfinite(found.centers).all()):
+            dim = ~(found.brightness > LEAST_BRIGHTNESS * np.median(found.brightness))
+            self.reason[group] = np.where(dim, _NO_IMAGE, _UNSETTLED_PLACE)
+            return
+        self.reason[group] = ""
+        self.centers[group], self.brightness[group] = found.centers, found.brightness
+        variance = np.diag(found.covariance)[: 2 * n]
+        self.sigma[group] = np.sqrt(np.maximum(variance, 0.0)).reshape(n, 2)
+
 
 def fit_plane(
     frame: Floats,
@@ -266,7 +348,7 @@ def fit_plane(
     )
     for _ in range(n + 1):
         before = fit.reason.copy()
-        _sweep(frame, centers, fit, contact, image, pixel)
+        fit.sweep(frame, centers, contact=contact, image=image, pixel=pixel)
         # Spots whose fits show no sphere, or that of another spot.
         good = fit.reason == ""
         typical = float(np.median(fit.brightness[good])) if good.any() else 0.0
@@ -283,66 +365,6 @@ def fit_plane(
     failed = fit.reason != ""
     fit.centers[failed], fit.sigma[failed] = centers[failed], np.nan
     return fit
-
-
-def _sweep(
-    frame: Floats,
-    first: Floats,
-    fit: PlaneFit,
-    contact: float,
-    image: RadialImage,
-    pixel: tuple[float, float],
-) -> None:
-    """Fit every group of the spheres in turn, until positions stay."""
-    there = np.flatnonzero((fit.reason == "") | (fit.reason == _UNSETTLED_PLACE))
-    groups = [there[g] for g in fitted_together(first[there], contact=contact)]
-    overlap = image.reach + image.surroundings + 0.1 * contact
-    away = np.linalg.norm(first[there][:, None] - first[there], axis=2)
-    beside = []
-    for group in groups:
-        near = (away[np.isin(there, group)] < overlap).any(axis=0) & ~np.isin(there, group)
-        beside.append(there[near])
-    again = np.ones(len(groups), dtype=np.bool_)
-    for _ in range(_MAX_SWEEPS):
-        moved = np.zeros(len(first))
-        for group, others in ((groups[k], beside[k]) for k in np.flatnonzero(again)):
-            before = fit.centers[group]
-            _fit_group(frame, group, others, fit, image, pixel)
-            moved[group] = np.abs(fit.centers[group] - before).max()
-        change = _SWEEP_CONVERGED * image.spacing
-        again = np.array([len(o) > 0 and bool((moved[o] > change).any()) for o in beside])
-        if not again.any():
-            break
-
-
-def _fit_group(
-    frame: Floats,
-    group: Ints,
-    others: Ints,
-    fit: PlaneFit,
-    image: RadialImage,
-    pixel: tuple[float, float],
-) -> None:
-    """Fit one group of spheres, with the images of the others subtracted."""
-    patch = cut_patch(frame, fit.centers[group], reach=image.surroundings, pixel=pixel)
-    if not patch.has_enough_pixels(len(group)):
-        fit.reason[group] = _NO_PIXELS
-        return
-    known = np.zeros(len(patch.data))
-    if len(others):
-        known = fit.brightness[others] @ image.value(patch.offsets(fit.centers[others])[1])
-        patch = Patch(patch.place, patch.data - known, patch.background, patch.pixel)
-    found = fit_patch(patch, image, fit.centers[group], known=known)
-    n = len(group)
-    fit.chi2[group] = found.chi2
-    if not (found.converged and np.isfinite(found.centers).all()):
-        dim = ~(found.brightness > LEAST_BRIGHTNESS * np.median(found.brightness))
-        fit.reason[group] = np.where(dim, _NO_IMAGE, _UNSETTLED_PLACE)
-        return
-    fit.reason[group] = ""
-    fit.centers[group], fit.brightness[group] = found.centers, found.brightness
-    variance = np.diag(found.covariance)[: 2 * n]
-    fit.sigma[group] = np.sqrt(np.maximum(variance, 0.0)).reshape(n, 2)
 
 
 def plane_columns(

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from perrin.images.optics.learn import without_clipped
+from perrin.images.optics.clipping import without_clipped
 from perrin.images.optics.window_fit import RigidCenters, cut_window, fit_window
 
 if TYPE_CHECKING:
