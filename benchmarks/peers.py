@@ -471,7 +471,7 @@ def start_up(quick) -> Iterator[Row | str]:
 
 
 _MEMORY_OF_ANALYZE = """
-import resource, sys
+import re, resource, sys
 sys.path.insert(0, sys.argv[1])
 from peers import tetrahedra_table
 import perrin, perrin.run, scipy.stats, scipy.linalg, scipy.fft, scipy.spatial, scipy.optimize
@@ -479,7 +479,8 @@ perrin.analyze(tetrahedra_table(2, 50), dt=0.73)
 table = tetrahedra_table(int(sys.argv[2]), 300)
 before = int(open("/proc/self/statm").read().split()[1]) * resource.getpagesize()
 perrin.analyze(table, dt=0.73)
-peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+# ru_maxrss would be that of the process that started this one, where it had more.
+peak = int(re.search(r"VmHWM:\\s+(\\d+)", open("/proc/self/status").read())[1]) * 1024
 print((peak - before) / 1e6, table.memory_usage(deep=True).sum() / 1e6)
 """
 

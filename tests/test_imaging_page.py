@@ -10,7 +10,7 @@ import pytest
 
 import perrin
 from perrin._text import number_text
-from perrin.images import Asymmetry
+from perrin.images import Asymmetry, Pupil
 from perrin.plot import figure_style
 from perrin.report import write
 from perrin.report.imaging_page import render_imaging_quality
@@ -52,6 +52,15 @@ def test_the_page_holds_the_numbers(report):
     sigma = np.median([c.motion.sigma for c in report.clusters])
     assert f"error from rigid bodies {number_text(1e3 * sigma, digits=2)} nm" in text
     assert "Warnings" not in text
+
+
+def test_a_pinhole_is_named_beside_the_diameter(report):
+    """The radius of the pinhole stands in a row of its own, the diameter of the spheres stays."""
+    optics = replace(report.imaging.optics, pupil=Pupil(lateral=15.0, slope=0.5, pinhole=1.02))
+    text = text_of(replace(report, imaging=replace(report.imaging, optics=optics)))
+    assert "apparent diameter 2.440(2) µm" in text
+    # The first dark ring of the focus is 3.83 over `lateral` from its middle.
+    assert "pinhole 1.02 µm radius in the sample, learned; a diameter of 3.99 Airy units" in text
 
 
 def test_the_shape_of_an_asymmetric_point_spread_is_named(report):

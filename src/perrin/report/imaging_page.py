@@ -300,9 +300,9 @@ def _channel_facts(imaging: Imaging, optics: Optics) -> list[Fact]:
         share = f"{100 * optics.tail.share:.0f} % of the intensity, {wide_z} µm along z"
         tail = [("tail of the point spread", f"{wide} µm", share)]
     if optics.pupil is not None:
-        size, airy = number_text(optics.pupil.pinhole), number_text(optics.pupil.airy_units)
+        radius, airy = number_text(optics.pupil.pinhole), number_text(optics.pupil.airy_units)
         remark = f"radius in the sample, learned; a diameter of {airy} Airy units"
-        tail.append(("pinhole", f"{size} µm", remark))
+        tail.append(("pinhole", f"{radius} µm", remark))
     if optics.asymmetry is not None:
         kinds = listed(optics.asymmetry.kinds)
         remark = f"{kinds}; the fits allow for it to first order"
