@@ -99,7 +99,7 @@ def seconds_by_size(job, sizes, rounds):
 
 def seconds_a_cluster(workers, quick):
     """Return the seconds by the clock that a further cluster takes with so many workers."""
-    sizes, seconds = (16, 48) if quick else (200, 800), []
+    sizes, seconds = (16, 48) if quick else (500, 1500), []
     for count in sizes:
         table = tetrahedra_table(count, 300)
         start = time.perf_counter()

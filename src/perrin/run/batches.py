@@ -45,13 +45,17 @@ class _NumberedTask:
 def clusters_together(count: int, poses: int) -> int:
     """Return how many of `count` clusters, which have this many poses together, are a batch.
 
+    The batches are of about the same size, so that processes end together.
+
     Examples
     --------
     >>> [clusters_together(500, 500 * frames) for frames in (100, 400, 10_000)]
-    [256, 200, 16]
+    [250, 167, 16]
     """
-    size = count * _POSES_TOGETHER // max(poses, 1)
-    return min(max(size, _FEWEST_MEASURED), _MOST_MEASURED)
+    count = max(count, 1)
+    most = min(max(count * _POSES_TOGETHER // max(poses, 1), _FEWEST_MEASURED), _MOST_MEASURED)
+    parts = -(-count // most)
+    return -(-count // parts)
 
 
 def batches_of(items: Iterable[S], *, size: int) -> Iterator[list[S]]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+import warnings
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import lru_cache
@@ -162,7 +163,10 @@ def work_through(
 
         chunks = [list(items[k : k + at_once]) for k in range(0, len(items), at_once)]
         tasks = [task] * len(chunks)
-        futures = client.map(_several_items, tasks, chunks, pure=False, retries=0)
+        with warnings.catch_warnings():
+            # The items are the data: they have to be sent, and again where a worker is lost.
+            warnings.filterwarnings("ignore", "Sending large graph", UserWarning)
+            futures = client.map(_several_items, tasks, chunks, pure=False, retries=0)
         try:
             for future in as_completed(futures, loop=client.loop):
                 yield from future.result()
