@@ -27,6 +27,7 @@ from perrin.diffusion.noise_model import Noise
 from perrin.diffusion.steps import Steps, body_steps
 from perrin.diffusion.tensor_batches import SeparateTensors, maximise_each
 from perrin.diffusion.tensor_likelihood import (
+    ArrowHessian,
     Maximum,
     NoisyVectors,
     PooledLikelihood,
@@ -291,6 +292,20 @@ def test_the_hessian_of_even_steps(name, weight, B):
     mixed = found.mixed[0]
     hessian = np.block([[found.shared, mixed], [mixed.T, found.own[0]]])
     np.testing.assert_allclose(hessian, expected, atol=1e-7 * np.abs(expected).max())
+
+
+def test_a_newton_step_is_that_of_the_inverse_hessian():
+    """Several motions with noise of their own share D; negative curvatures are turned positive."""
+    rng = np.random.default_rng(6)
+    shared, own = rng.normal(size=(5, 4, 4)), rng.normal(size=(5, 3, 2, 2))
+    shared, own = (x + np.swapaxes(x, -1, -2) for x in (shared, own))
+    hessian = ArrowHessian(shared, rng.normal(size=(5, 3, 4, 2)), own)
+    of_D, of_noise = rng.normal(size=(5, 4)), rng.normal(size=(5, 3, 2))
+    slopes = np.concatenate([of_D, of_noise.reshape(5, -1)], axis=1)
+    expected = (hessian.inverse() @ slopes[..., None])[..., 0]
+    step = hessian.step(of_D, of_noise)
+    found = np.concatenate([step[0], step[1].reshape(5, -1)], axis=1)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
 
 
 def test_the_maximum_and_its_spread_without_noise():

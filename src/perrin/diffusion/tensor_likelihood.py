@@ -804,6 +804,15 @@ class ArrowHessian:
             inverse[..., rows, rows] += own[..., g, :, :]
         return inverse
 
+    def step(self, slope: Floats, by_noise: Floats) -> tuple[Floats, Floats]:
+        """Return the products of `inverse` with slopes (P, m) and (P, G, c), block by block."""
+        own = positive_inverse(self.own)
+        lever = self.mixed @ own
+        shared = positive_inverse(self.shared - np.einsum("pgmc,pgnc->pmn", lever, self.mixed))
+        of_D = shared @ (slope - np.einsum("pgmc,pgc->pm", lever, by_noise))[..., None]
+        of_noise = own @ by_noise[..., None] - np.swapaxes(lever, -1, -2) @ of_D[:, None]
+        return of_D[..., 0], of_noise[..., 0]
+
     def step_within(
         self, slope: Floats, by_noise: Floats, limits: tuple[Floats, Floats]
     ) -> tuple[Floats, Floats]:
@@ -812,7 +821,7 @@ class ArrowHessian:
         A change beyond a limit (P, G, c) is fixed there, and all others are found again for it:
         where noise and blur have nearly the same effect the step remains on the ridge.
         """
-        m, c = slope.shape[1], by_noise.shape[2]
+        c = by_noise.shape[2]
         fixed, change = np.zeros(by_noise.shape, dtype=np.bool_), np.zeros_like(by_noise)
         of_D, rows = np.zeros_like(slope), np.arange(len(slope))
         for _ in range(c + 1):
@@ -820,16 +829,14 @@ class ArrowHessian:
             moved = np.where(held, change[rows], 0.0)
             by_D = slope[rows] - np.einsum("pgmc,pgc->pm", self.mixed[rows], moved)
             rest = by_noise[rows] - np.einsum("pgcd,pgd->pgc", self.own[rows], moved)
-            rest = np.where(held, moved, rest).reshape(len(rows), -1)
+            rest = np.where(held, moved, rest)
             own = self.own[rows] * (free[..., :, None] & free[..., None, :])
             own += held[..., :, None] * np.eye(c)
             mixed = self.mixed[rows] * free[..., None, :]
-            inverse = ArrowHessian(self.shared[rows], mixed, own).inverse()
-            step = (inverse @ np.concatenate([by_D, rest], axis=1)[..., None])[..., 0]
-            noise = step[:, m:].reshape(moved.shape)
+            step, noise = ArrowHessian(self.shared[rows], mixed, own).step(by_D, rest)
             low, high = (limit[rows] for limit in limits)
             within = np.where(held, moved, np.clip(noise, low, high))
-            of_D[rows], change[rows] = step[:, :m], within
+            of_D[rows], change[rows] = step, within
             share = np.divide(within, noise, out=np.ones_like(noise), where=free & (noise != 0))
             # The one of each motion that comes to its limit first.
             first = (share < 1) & (share == share.min(axis=2, keepdims=True, initial=1.0))
