@@ -94,7 +94,8 @@ class PairSums(NamedTuple):
     def divisor(self) -> Floats:
         """Number of pairs, shape (L,); NaN at a lag without a pair."""
         number = self.pairs.astype(np.float64)
-        number[number == 0] = np.nan
+        if not self.pairs.all():
+            number[self.pairs == 0] = np.nan
         return number
 
     @property
