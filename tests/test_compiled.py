@@ -119,7 +119,7 @@ def test_sums_over_modes_equal_those_of_numpy(monkeypatch, axes, modes):
     rng = np.random.default_rng(axes)
     y, turn = rng.normal(size=(5, axes, modes)), rng.normal(size=(5, axes, axes))
     share, weight = rng.uniform(0.01, 1.2, (5, axes)), np.linspace(0.0, 4.0, modes)
-    share[0, 0] = -0.1
+    share[0, 0], share[4, 0] = -0.1, np.nan
     for own in (y, y[:1]):
         for curved in (False, True):
             kernel = mode_sums(own, turn, share, weight, curved=curved)
@@ -127,6 +127,9 @@ def test_sums_over_modes_equal_those_of_numpy(monkeypatch, axes, modes):
                 patch.setattr(tensor_modes, "compiled_kernels", lambda: None)
                 twin = mode_sums(own, turn, share, weight, curved=curved)
             assert kernel[0, 2] == pytest.approx(twin[0, 2], rel=1e-12)
+            assert np.isnan(kernel[4, 2])
+            assert np.isnan(twin[4, 2])
+            kernel, twin = kernel[:4], twin[:4]
             scale = np.abs(twin[1:]).max(axis=1, keepdims=True)
             np.testing.assert_allclose(kernel[1:] / scale, twin[1:] / scale, rtol=0, atol=1e-12)
 
@@ -166,6 +169,7 @@ def test_spectra_of_steps_equal_those_of_numpy():
     for one in (modes, mixed):
         D, theta = 5e-3 * rng.uniform(0.1, 3, (2, 3, 4)), 1e-3 * rng.uniform(0, 2, (2, 3, 4))
         D[0, 0], theta[0, 0] = 0.0, 0.0
+        D[1, 2, 3] = np.nan
         pairs = zip(one.sums(D, theta), one.sums_of_numpy(D, theta), strict=True)
         for kernel, twin in pairs:
             np.testing.assert_allclose(kernel, twin, rtol=1e-12)
@@ -185,7 +189,7 @@ def test_two_states_equal_those_of_numpy(monkeypatch, quantity, exposure):
     positions[rng.random(120) < 0.1] = np.nan
     positions[20:40, 0] = np.nan
     motion = track_rotation(positions, dt=0.7)
-    points = np.log([[2e-3, 8e-3, 0.1, 0.2, 1e-3], [1e-3, 0.5, 3.0, 1e-3, 1e-9]])
+    points = np.log([[2e-3, 8e-3, 0.1, 0.2, 1e-3], [1e-3, 0.5, 3.0, 1e-3, 1e-9], [np.nan] * 5])
     for model in ("joint", "residual"):
         noise = Noise(model=model, exposure=exposure)
         track = NoisySteps.of(steps_of(motion, quantity), noise)
@@ -194,6 +198,7 @@ def test_two_states_equal_those_of_numpy(monkeypatch, quantity, exposure):
         with monkeypatch.context() as patch:
             patch.setattr(switching, "compiled_kernels", lambda: None)
             twin = steps.filtered(points)
+        assert np.isnan(kernel[0][2])
         np.testing.assert_allclose(kernel[0], twin[0], rtol=1e-12)
         np.testing.assert_allclose(kernel[1], twin[1], rtol=1e-9, atol=1e-12)
 

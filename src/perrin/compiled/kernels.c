@@ -567,6 +567,8 @@ INLINE void sum_rows(const Modes *all, int b, int curved)
                 add_modes(all, row, k, stop - k, b, curved, &sums);
             add_to_row(&sums, (stop - start + WIDTH - 1) / WIDTH, b, curved, out);
         }
+        if (out[1] != out[1]) /* no variance is the least where one is not a number */
+            out[2] = out[1];
     }
 }
 
@@ -677,7 +679,7 @@ INLINE void add_spectrum(const Spectra *all, Py_ssize_t first, Py_ssize_t count,
         Lanes by_D = next_modes(all->by_D + place, left, 0.0);
         Lanes by_theta = next_modes(all->by_theta + place, left, 0.0);
         Lanes variance = by_D * D + by_theta * theta + next_modes(all->given + place, left, 1.0);
-        variance = larger(variance, least);
+        variance = larger(least, variance); /* what is not a number remains none */
         if (alike)
             add_logarithm(&log_variance, variance);
         else
@@ -770,7 +772,7 @@ INLINE double densities(const States *states, const Step *step, const Belief *be
             double sum_of_squares = 0.0, determinant = 1.0;
             for (Py_ssize_t g = 0; g < states->groups; g++) {
                 double sum = belief->variance[from][g] + (step->spread[to] + step->noise[g]);
-                total[from][to][g] = sum > 1e-100 ? sum : 1e-100;
+                total[from][to][g] = sum < 1e-100 ? 1e-100 : sum;
                 sum_of_squares += square[from][g] / total[from][to][g];
                 for (int i = 0; i < (int)states->sizes[g]; i++)
                     determinant *= total[from][to][g];
