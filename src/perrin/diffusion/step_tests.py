@@ -15,6 +15,7 @@ from perrin.diffusion.step_kernels import covariance_bands
 from perrin.diffusion.steps import NoisySteps, groups_alike, steps_of
 from perrin.errors import PrecisionWarning, TooFewFramesError
 from perrin.geometry.rotations import exp_map
+from perrin.geometry.shapes import squared_lengths
 from perrin.motion.residuals import median_present
 
 if TYPE_CHECKING:
@@ -839,7 +840,7 @@ def _jump_candidates(residuals: StepResiduals, known: Bools) -> Bools:
 
     count, root = known.shape[1], _robust_root(residuals.step)
     displaced = np.where(
-        residuals.linked & residuals.measured_badly, _squared_lengths(residuals.frame @ root), 0.0
+        residuals.linked & residuals.measured_badly, squared_lengths(residuals.frame @ root), 0.0
     )
 
     def before(x: Floats) -> Floats:
@@ -854,9 +855,9 @@ def _jump_candidates(residuals: StepResiduals, known: Bools) -> Bools:
     pairs = residuals.linked.astype(np.float64)
     inside = (before(pairs) > 0) & (after(pairs) > 0)
     limit = chdtri(residuals.step.shape[2], _CANDIDATE_LEVEL / count)
-    given_others = _squared_lengths(residuals.step @ root)
+    given_others = squared_lengths(residuals.step @ root)
     # Jumps back and forth resemble noise once the noise is fitted to them: the length alone.
-    own = _squared_lengths(residuals.length @ _robust_root(residuals.length))
+    own = squared_lengths(residuals.length @ _robust_root(residuals.length))
     alone = np.where(around == 0, own, 0.0)
     # A jump distorts the prediction of its neighbours: the largest of them is taken first.
     largest = np.maximum(after(given_others[:, 1:]), before(given_others[:, :-1]))
@@ -872,20 +873,15 @@ def _robust_root(bulk: Floats) -> Floats:
     from scipy.special import chdtri
 
     typical = np.median(bulk**2, axis=1, keepdims=True)
-    power = _squared_lengths(bulk / np.sqrt(np.maximum(typical, 1e-300)))
+    power = squared_lengths(bulk / np.sqrt(np.maximum(typical, 1e-300)))
     short = power <= np.median(power, axis=1, keepdims=True)
     half = np.where(short[..., None], bulk, 0.0)
     mean = np.swapaxes(half, 1, 2) @ half / short.sum(axis=1)[:, None, None]
     root = _inverse_root(mean)
-    median = np.median(_squared_lengths(bulk @ root), axis=1)
+    median = np.median(squared_lengths(bulk @ root), axis=1)
     usual = chdtri(bulk.shape[2], 0.5)
     scale = np.divide(usual, median, out=np.zeros_like(median), where=median > 0)
     return np.asarray(root * np.sqrt(scale)[:, None, None])
-
-
-def _squared_lengths(vectors: Floats) -> Floats:
-    """Return the squared lengths of vectors (..., A), A so small that `sum` is slow."""
-    return np.asarray(np.einsum("...a,...a->...", vectors, vectors))
 
 
 def _inverse_root(a: Floats, *, least: float = 0.0) -> Floats:

@@ -29,6 +29,7 @@ from perrin.geometry.shapes import (
     is_tetrahedron,
     lengths,
     pair_distances,
+    squared_lengths,
 )
 from perrin.geometry.symmetry import (
     are_collinear,
@@ -83,6 +84,7 @@ __all__ = [
     "similarity",
     "skew",
     "spatial_rotation",
+    "squared_lengths",
     "successive_product",
     "svd_rotation",
     "symmetry_elements",

@@ -257,7 +257,18 @@ def lengths(vectors: Floats) -> Floats:
     >>> lengths(np.array([[3.0, 4.0], [0.0, 2.0]]))
     array([5., 2.])
     """
-    return np.asarray(np.sqrt(np.einsum("...i,...i->...", vectors, vectors)))
+    return np.sqrt(squared_lengths(vectors))
+
+
+def squared_lengths(vectors: Floats) -> Floats:
+    """Return the squared lengths of vectors (..., d), d so small that `sum` is slow.
+
+    Examples
+    --------
+    >>> squared_lengths(np.array([[3.0, 4.0], [0.0, 2.0]]))
+    array([25.,  4.])
+    """
+    return np.asarray(np.einsum("...i,...i->...", vectors, vectors))
 
 
 def is_tetrahedron(positions: Floats, *, tolerance: float = 0.1) -> bool:
