@@ -3,7 +3,8 @@
  * Only the stable ABI of Python 3.11 is used: one binary serves every later version, and arrays
  * arrive as buffers. Compilers of the GNU family work on several rows at once in vectors; others
  * work on one row at a time. Without contracted multiplications (-ffp-contract=off) both, and every
- * instruction set, round alike.
+ * instruction set, round alike; but for sums over modes, which are added in another order where
+ * there are no vectors.
  */
 
 #define PY_SSIZE_T_CLEAN
