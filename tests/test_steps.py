@@ -10,6 +10,7 @@ from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
 from perrin import Noise, RigidMotion, TooFewFramesError
+from perrin._arrays import distinct, expanded, stored_once
 from perrin.diffusion.steps import (
     NoisySteps,
     Steps,
@@ -22,7 +23,6 @@ from perrin.diffusion.steps import (
     principal_steps,
     residual_freedom,
     steps_of,
-    stored_once,
 )
 from perrin.geometry.rotations import exp_map
 from perrin.motion.rods import RodMotion
@@ -414,6 +414,7 @@ def test_equal_rows_are_stored_once_and_equal_keys_grouped():
     assert stored_once(rows[:1]).strides == rows[:1].strides
     assert stored_once(rows[:2]).strides[0] == 0
     np.testing.assert_array_equal(stored_once(rows[:2]), rows[:2])
+    np.testing.assert_array_equal(expanded(distinct(stored_once(rows[:2])), 2), rows[:2])
     keys = ["a"] * 5 + ["b"] * 2 + ["c"] * 2
     sizes = [3] * 5 + [8] * 2 + [0] * 2
     assert groups_alike(keys, sizes, most=7) == [[0, 1], [2, 3], [4], [5], [6], [7, 8]]

@@ -12,7 +12,7 @@ from perrin._display import Shown
 from perrin._text import with_error
 from perrin.diffusion.spectral_likelihood import ShapeLikelihood, ShapePoint, motions_and_noise
 from perrin.diffusion.step_spectra import fractional_mean_square
-from perrin.diffusion.steps import Quantity, pooled_steps, principal_steps
+from perrin.diffusion.steps import Quantity, principal_steps_of_each
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -232,11 +232,11 @@ def find_exponent(
         return fractional_mean_square(lag, shape, exposure=settings.exposure or 0.0)
 
     frames: list[Literal["body", "lab"]] = ["lab" if quantity == "translation" else "body"]
-    tracks = [pooled_steps(motions, quantity, along=principal_steps)]
+    tracks = [principal_steps_of_each(motions, quantity)]
     turns = max(float(np.sqrt(np.mean(s.vectors**2))) for s in tracks[0])
     if quantity == "rotation" and motions[0].dimension == 3 and turns > _SMALL_TURN:
         frames.append("lab")
-        tracks.append([principal_steps(m, quantity, frame="lab") for m in motions])
+        tracks.append(principal_steps_of_each(motions, quantity, frame="lab"))
     choices = [ShapeLikelihood.of(steps, settings, mean_square) for steps in tracks]
     found = [likelihood.best(_EXPONENTS) for likelihood in choices]
     brownian = max(likelihood.at(1.0).value for likelihood in choices)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from functools import partial
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
@@ -17,8 +16,7 @@ from perrin.diffusion.step_spectra import confined_mean_square
 from perrin.diffusion.steps import (
     Quantity,
     orientation_about_mean,
-    pooled_steps,
-    principal_steps,
+    principal_steps_of_each,
 )
 
 if TYPE_CHECKING:
@@ -302,7 +300,7 @@ def find_cage_in(
         return confined_mean_square(lag, np.exp(shape), exposure=settings.exposure or 0.0)
 
     about: Literal["body", "mean"] = "mean" if frame == "mean" else "body"
-    tracks = pooled_steps(motions, quantity, along=partial(principal_steps, frame=about))
+    tracks = principal_steps_of_each(motions, quantity, frame=about)
     likelihood = ShapeLikelihood.of(tracks, settings, mean_square)
     slowest, fastest = np.log(_LEAST_LENGTHS / likelihood.longest), np.log(_MOST_RATE)
     count = 1 + int(np.ceil((fastest - slowest) / _LOG_DISTANCE))

@@ -19,7 +19,7 @@ from perrin.diffusion.steps import (
     Steps,
     groups_alike,
     pooled_steps,
-    steps_of,
+    steps_of_each,
 )
 from perrin.errors import PrecisionWarning, TooFewFramesError
 from perrin.motion.rigid_motion import RigidMotion
@@ -162,12 +162,7 @@ def estimate_each(
     >>> print(*estimate_each([truth, truth], quantity="rotation", noise=Noise()), sep="; ")
     D_R = 0.0050(4) rad^2/s [mle, 300 frames]; D_R = 0.0050(4) rad^2/s [mle, 300 frames]
     """
-    steps: list[Steps | TooFewFramesError] = []
-    for motion in motions:
-        try:
-            steps.append(steps_of(motion, quantity))
-        except TooFewFramesError as error:
-            steps.append(error)
+    steps = steps_of_each(motions, quantity)
     tracks = [NoisySteps.of(s, noise) for s in steps if isinstance(s, Steps)]
     found = iter(likelihood_of_each(tracks))
     return [

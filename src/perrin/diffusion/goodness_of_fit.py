@@ -13,14 +13,14 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from perrin._arrays import frozen
+from perrin._arrays import distinct, expanded, frozen
 from perrin.diffusion.step_kernels import SineModes, covariance_bands, difference_eigenvalues
 from perrin.diffusion.step_spectra import (
     confined_autocovariance,
     fractional_slope,
     sine_spectrum,
 )
-from perrin.diffusion.steps import NoisySteps, Quantity, distinct, groups_alike, principal_steps
+from perrin.diffusion.steps import NoisySteps, Quantity, groups_alike, principal_steps_of_each
 from perrin.errors import TooFewFramesError
 
 if TYPE_CHECKING:
@@ -169,6 +169,54 @@ class AxisModel:
 
     def __post_init__(self) -> None:
         frozen(self.start, self.tau, self.linked, *self.known, self.steady)
+
+    @classmethod
+    def of_track(
+        cls,
+        track: NoisySteps,
+        *,
+        start: Floats,
+        steady: Floats,
+        moves: Bools,
+        square: Floats,
+        free: bool,
+    ) -> AxisModel:
+        """Return the model of the steps along the axes that a body moves along.
+
+        Parameters
+        ----------
+        track : NoisySteps
+            Steps along all axes, without a free steady motion.
+        start : ndarray, shape (N,)
+        steady : ndarray, shape (N, A, p)
+            As in the attributes.
+        moves : ndarray of bool
+            Which axes the body moves along, A of them.
+        square : ndarray
+            Mean square step along every axis; noise that differs little beside it is equal.
+        free : bool
+            Whether the offset is free.
+        """
+        count, theta = len(start), 0.0 if free else track.theta
+        rows = [
+            (distinct(known) + distinct(weight) * theta)[:, moves]
+            for known, weight in zip(track.known, track.weight, strict=True)
+        ]
+        before, after = (expanded(noise, count).T for noise in rows)
+        model = cls(
+            start=start,
+            tau=track.steps.duration,
+            linked=track.steps.linked,
+            known=(before, after),
+            blur=0.0 if free else track.blur,
+            free=free,
+            steady=steady,
+        )
+        if len(rows[0]) == len(rows[1]) == 1 and np.array_equal(rows[0], rows[1]):
+            return model
+        spread = 0.5 * (before.std(axis=1) + after.std(axis=1))
+        equal = np.all(spread <= _EQUAL_NOISE * square[moves])
+        return model.with_equal_noise() if equal else model
 
     @property
     def n_steps(self) -> int:
@@ -637,47 +685,62 @@ def axis_model(motion: RigidMotion, quantity: Quantity, noise: Noise) -> tuple[A
     >>> model.even, y.shape
     (True, (1, 3, 99))
     """
-    steps = principal_steps(motion, quantity)
-    count = len(steps.duration)
-    if count < _LEAST_STEPS:
-        raise TooFewFramesError(
-            f"{count} steps: at least {_LEAST_STEPS} are needed to tell what kind of motion they "
-            "belong to",
-            count + 1,
-        )
-    track = NoisySteps.of(steps, replace(noise, drift=False))
-    free = noise.model == "joint"
-    theta = 0.0 if free else track.theta
-    noise_of_ends = [
-        (distinct(k) + distinct(w) * theta).T
-        for k, w in zip(track.known, track.weight, strict=True)
-    ]
-    squares = steps.vectors * steps.vectors
-    square = np.mean(squares, axis=0)
-    if not square.max() > 0:
-        raise ValueError(f"the body does not move: there is no {quantity} to judge")
-    moves = square > _SMALLEST_AXIS * square.max()
-    # Eigenvectors have any sign; one that the steps determine gives p, which are simulated from a
-    # seed made of the steps, that do not change with the axes of the laboratory.
-    sign = np.where(np.sum(squares * steps.vectors, axis=0) < 0, -1.0, 1.0)[moves]
-    shape = int(moves.sum()), count
-    before, after = (np.broadcast_to(n[moves], shape) for n in noise_of_ends)
-    model = AxisModel(
-        start=motion.time[steps.start],
-        tau=steps.duration,
-        linked=steps.linked,
-        known=(before, after),
-        blur=0.0 if free else track.blur,
-        free=free,
-        steady=np.ascontiguousarray(steps.steady[:, moves] * sign[:, None]),
-    )
-    y = np.ascontiguousarray(steps.vectors.T[moves] * sign[:, None])[None]
-    if all(n.shape[1] == 1 for n in noise_of_ends) and np.array_equal(before, after):
-        return model, y
-    spread = 0.5 * (before.std(axis=1) + after.std(axis=1))
-    if np.all(spread <= _EQUAL_NOISE * square[moves]):
-        model = model.with_equal_noise()
-    return model, y
+    return axis_models([motion], quantity, noise)[0]
+
+
+def axis_models(
+    motions: Sequence[RigidMotion], quantity: Quantity, noise: Noise
+) -> list[tuple[AxisModel, Floats]]:
+    """Return the model and the steps of several motions, as `axis_model`, alike ones together.
+
+    Raises
+    ------
+    TooFewFramesError, ValueError
+        As in `axis_model`.
+
+    Examples
+    --------
+    >>> from perrin import Cluster, Noise, simulate_motion
+    >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=100, rng=3)
+    >>> [y.shape for _, y in axis_models([truth, truth], "rotation", Noise())]
+    [(1, 3, 99), (1, 3, 99)]
+    """
+    every = principal_steps_of_each(motions, quantity)
+    for steps in every:
+        count = len(steps.duration)
+        if count < _LEAST_STEPS:
+            raise TooFewFramesError(
+                f"{count} steps: at least {_LEAST_STEPS} are needed to tell what kind of motion "
+                "they belong to",
+                count + 1,
+            )
+    settings = replace(noise, drift=False)
+    models: dict[int, tuple[AxisModel, Floats]] = {}
+    shapes = [steps.vectors.shape for steps in every]
+    for rows in groups_alike(shapes, [n * axes for n, axes in shapes], most=_MOST_SCORES):
+        vectors = np.stack([every[k].vectors for k in rows])
+        squares = vectors * vectors
+        mean_squares = squares.mean(axis=1)
+        # Eigenvectors have any sign; one that the steps determine gives p, which are simulated from
+        # a seed made of the steps, that do not change with the axes of the laboratory.
+        signs = np.where(np.sum(squares * vectors, axis=1) < 0, -1.0, 1.0)
+        y = np.ascontiguousarray(np.swapaxes(vectors, 1, 2) * signs[..., None])
+        steady = np.stack([every[k].steady for k in rows]) * signs[:, None, :, None]
+        for i, k in enumerate(rows):
+            square = mean_squares[i]
+            if not square.max() > 0:
+                raise ValueError(f"the body does not move: there is no {quantity} to judge")
+            moves = square > _SMALLEST_AXIS * square.max()
+            model = AxisModel.of_track(
+                NoisySteps.of(every[k], settings),
+                start=motions[k].time[every[k].start],
+                steady=steady[i] if moves.all() else np.ascontiguousarray(steady[i][:, moves]),
+                moves=moves,
+                square=square,
+                free=noise.model == "joint",
+            )
+            models[k] = model, y[i : i + 1] if moves.all() else y[i : i + 1, moves]
+    return [models[k] for k in range(len(motions))]
 
 
 def sine_powers(y: Floats) -> Floats:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from perrin._arrays import mean_row
 from perrin.diffusion.effective_modes import FewModes, NoiseProfile
 from perrin.diffusion.step_kernels import (
     LEAST_EIGENVALUE,
@@ -23,7 +24,7 @@ from perrin.diffusion.step_kernels import (
     TridiagonalCovariance,
     difference_eigenvalues,
 )
-from perrin.diffusion.steps import groups_alike, mean_row
+from perrin.diffusion.steps import groups_alike
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

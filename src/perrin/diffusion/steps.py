@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, NamedTuple
 from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from perrin._arrays import frozen
+from perrin._arrays import distinct, expanded, frozen, mean_row, repeated, stored_once
 from perrin.errors import TooFewFramesError
 from perrin.geometry.rigid import degrees_of_freedom
 from perrin.geometry.rotations import exp_map, log_map, successive_product
@@ -17,7 +17,7 @@ from perrin.geometry.wahba import svd_rotation
 from perrin.motion.residuals import unit_center_variance, unit_covariance
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Hashable, Sequence
+    from collections.abc import Hashable, Sequence
 
     from perrin._arrays import Bools, Floats, Ints
     from perrin.diffusion.noise_model import Noise
@@ -33,6 +33,9 @@ _EQUALLY_NOISY_AXES = 0.02
 
 # Steps are even, and a sine transform is used, if times and noise agree to this.
 _EVEN_STEPS = 1e-9
+
+# Frames of motions that are computed together: as many as stay in the processor's cache.
+_FRAMES_TOGETHER = 20_000
 
 # Steps of motions that are in use: a motion does not change, and neither do its steps, which
 # estimates and tests of one motion share.
@@ -121,7 +124,7 @@ class Steps:
     def variances(self) -> tuple[Floats, Floats]:
         """Noise variances of the first and the last frame of each step by component, (S, c)."""
         if self.noise.strides[1] == 0:
-            rows = np.broadcast_to(np.diagonal(self.noise[0, 0]).copy(), self.vectors.shape)
+            rows = repeated(self.noise[0, 0].diagonal(), len(self.vectors))
             return rows, rows
         diagonal = np.ascontiguousarray(np.einsum("tcc->tc", self.noise[0]))
         return stored_once(diagonal[self.start]), stored_once(diagonal[self.stop])
@@ -134,12 +137,11 @@ class Steps:
     @cached_property
     def above_least(self) -> tuple[float, Floats, tuple[Floats, Floats]]:
         """Least noise variance, ones (S, c), and by how much the noise of both ends exceeds it."""
-        shape = self.vectors.shape
+        count, axes = self.vectors.shape
         before, after = (self.sigma**2 * distinct(n) for n in self.variances)
         least = min(float(before.min()), float(after.min()))
-        one = np.broadcast_to(np.ones((1, shape[1])), shape)
-        known = np.broadcast_to(before - least, shape), np.broadcast_to(after - least, shape)
-        return least, one, known
+        known = expanded(before - least, count), expanded(after - least, count)
+        return least, repeated(np.ones(axes), count), known
 
     @cached_property
     def even(self) -> bool:
@@ -292,96 +294,171 @@ def steps_of(motion: RigidMotion, quantity: Quantity) -> Steps:
     >>> steps.vectors.shape, steps.even
     ((99, 3), True)
     """
-    known = _STEPS_OF_MOTIONS.setdefault(motion, {})
-    if quantity in known:
-        return known[quantity]
-    start, stop = motion.steps()
-    if len(start) < 2:
-        raise TooFewFramesError(
-            f"{motion.fitted.size} frames with a pose in too few steps: at least 3 in a row (gaps "
-            "allowed) are needed to separate diffusion from noise",
-            int(motion.fitted.size),
-        )
-    fitted = np.isfinite(motion.center[:, 0])
-    complete = fitted & (motion.n_present == motion.n_present[fitted].max())
-    duration = motion.time[stop] - motion.time[start]
-    if quantity == "rotation":
-        # Where all frames are equally noisy they are one row.
-        covariance = distinct(stored_once(unit_covariance(motion)))
-        whole = complete if len(covariance) > 1 else np.ones(1, dtype=np.bool_)
-        values, axes = np.linalg.eigh(np.mean(covariance[whole], axis=0))
-        turned = (covariance.reshape(-1, len(axes)) @ axes).reshape(covariance.shape)
-        noise = np.einsum("ji,tji->ti", axes, turned)
-        apart = np.diff(values) > _EQUALLY_NOISY_AXES * values[1:]
-        for group in np.split(np.arange(len(values)), 1 + np.flatnonzero(apart)):
-            alike = noise[:, group].mean(axis=1)
-            for axis in group:
-                noise[whole, axis] = alike[whole]
-        vectors = motion.step_vectors()[stop - 1] @ axes
-        # A spin of the lab moves the body by R^T of it; in the plane both are one number.
-        turned = np.ones((len(start), 1, 1))
-        if len(axes) == 3:
-            turned = (motion.rotation[start].reshape(-1, 3) @ axes).reshape(-1, 3, 3)
-        steady = np.swapaxes(turned, -1, -2) * duration[:, None, None]
+    steps = steps_of_each([motion], quantity)[0]
+    if isinstance(steps, TooFewFramesError):
+        raise steps
+    return steps
+
+
+def steps_of_each(
+    motions: Sequence[RigidMotion], quantity: Quantity
+) -> list[Steps | TooFewFramesError]:
+    """Return the steps of several motions, as `steps_of`, or the error; alike ones together.
+
+    Parameters
+    ----------
+    motions : sequence of RigidMotion
+    quantity : {"rotation", "translation"}
+
+    Examples
+    --------
+    >>> from perrin import Cluster, simulate_motion
+    >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=9, rng=3)
+    >>> [len(steps.duration) for steps in steps_of_each([truth, truth], "translation")]
+    [8, 8]
+    """
+    known = [_STEPS_OF_MOTIONS.setdefault(motion, {}) for motion in motions]
+    new = [k for k, steps in enumerate(known) if quantity not in steps]
+    errors: dict[int, TooFewFramesError] = {}
+    for k in new:
+        if len(motions[k].steps()[0]) < 2:
+            count = int(motions[k].fitted.size)
+            errors[k] = TooFewFramesError(
+                f"{count} frames with a pose in too few steps: at least 3 in a row (gaps allowed) "
+                "are needed to separate diffusion from noise",
+                count,
+            )
+    new = [k for k in new if k not in errors]
+    axes_of = _noise_axes if quantity == "rotation" else _lab_axes
+    for rows in alike_motions([motions[k] for k in new]):
+        some = [motions[new[i]] for i in rows]
+        for i, steps in zip(rows, _steps_together(some, axes_of(some)), strict=True):
+            known[new[i]][quantity] = steps
+    return [errors[k] if k in errors else known[k][quantity] for k in range(len(motions))]
+
+
+class _StepsAlongAxes(NamedTuple):
+    """Steps of B motions whose frames are alike along axes of each, and the noise along them.
+
+    The noise is that of all T frames, or one row where it is the same in all.
+    """
+
+    vectors: Floats
+    noise: Floats
+    steady: Floats
+
+
+def _noise_axes(motions: Sequence[RigidMotion]) -> _StepsAlongAxes:
+    """Return the rotation vectors along the axes in which the noise is diagonal."""
+    covariance = np.stack([unit_noise(motion)[0] for motion in motions])
+    whole = _complete_frames(motions[0], covariance.shape[1])
+    values, axes = np.linalg.eigh(covariance[:, whole].mean(axis=1))
+    noise = np.einsum("bji,btji->bti", axes, covariance @ axes[:, None])
+    # Axes that are equally noisy have the mean of their noise.
+    group = np.zeros(values.shape, dtype=np.int64)
+    np.cumsum(np.diff(values) > _EQUALLY_NOISY_AXES * values[:, 1:], axis=1, out=group[:, 1:])
+    same = group[:, :, None] == group[:, None, :]
+    share = same / same.sum(axis=2, keepdims=True)
+    noise[:, whole] = (noise[:, whole, None, :] * share[:, None]).sum(axis=3)
+    start, stop = motions[0].steps()
+    vectors = np.stack([motion.step_vectors() for motion in motions])[:, stop - 1] @ axes
+    # A spin of the lab moves the body by R^T of it; in the plane both are one number.
+    turned = np.ones((len(motions), len(start), 1, 1))
+    if axes.shape[1] == 3:
+        rotation = np.stack([motion.rotation for motion in motions])[:, start]
+        turned = (rotation.reshape(len(motions), -1, 3) @ axes).reshape(rotation.shape)
+    return _StepsAlongAxes(vectors, noise, np.swapaxes(turned, -1, -2))
+
+
+def _lab_axes(motions: Sequence[RigidMotion]) -> _StepsAlongAxes:
+    """Return the displacements of the centre in lab axes, all equally noisy."""
+    start, stop = motions[0].steps()
+    center = np.stack([motion.center for motion in motions])
+    vectors = center[:, stop] - center[:, start]
+    d = vectors.shape[2]
+    noise = np.repeat(np.stack([unit_noise(m)[1] for m in motions])[..., None], d, axis=2)
+    return _StepsAlongAxes(vectors, noise, np.eye(d)[None, None])
+
+
+def _steps_together(motions: Sequence[RigidMotion], along: _StepsAlongAxes) -> list[Steps]:
+    """Return the steps of motions whose frames are alike."""
+    start, stop = motions[0].steps()
+    frames, count, d = len(motions[0].time), len(start), along.vectors.shape[2]
+    time = np.stack([motion.time for motion in motions])
+    duration = time[:, stop] - time[:, start]
+    noise = along.noise[:, None, :, :, None] * np.eye(d)
+    noise = np.broadcast_to(noise, (len(motions), 1, frames, d, d))
+    complete = along.noise[:, _complete_frames(motions[0], along.noise.shape[1])].mean(axis=(1, 2))
+    if along.steady.shape[1] == 1 and np.all(duration == duration[:, :1]):
+        steady = along.steady * duration[:, :1, None, None]
+        steady = np.broadcast_to(steady, (len(motions), count, d, d))
     else:
-        vectors = motion.center[stop] - motion.center[start]
-        d = vectors.shape[1]
-        variance = distinct(stored_once(unit_center_variance(motion)))
-        whole = complete if len(variance) > 1 else np.ones(1, dtype=np.bool_)
-        noise = np.repeat(variance[:, None], d, axis=1)
-        lasting = distinct(stored_once(duration))[:, None, None]
-        steady = np.broadcast_to(np.eye(d) * lasting, (len(start), d, d))
-    d = vectors.shape[1]
-    known[quantity] = Steps(
-        vectors=vectors,
-        duration=duration,
-        start=start,
-        stop=stop,
-        noise=np.broadcast_to(noise[..., None] * np.eye(d), (1, len(motion.time), d, d)),
-        dt=motion.dt,
-        sigma=motion.sigma,
-        freedom=residual_freedom(motion),
-        complete=float(np.mean(noise[whole])),
-        steady=steady,
-    )
-    return known[quantity]
+        steady = along.steady * duration[:, :, None, None]
+    return [
+        Steps(
+            vectors=along.vectors[k],
+            duration=duration[k],
+            start=start,
+            stop=stop,
+            noise=noise[k],
+            dt=motion.dt,
+            sigma=motion.sigma,
+            freedom=residual_freedom(motion),
+            complete=float(complete[k]),
+            steady=steady[k],
+        )
+        for k, motion in enumerate(motions)
+    ]
 
 
-def stored_once(rows: Floats) -> Floats:
-    """Return an array (N, ...) whose rows are all the same as a view of one row.
-
-    Thousands of motions are in memory together, and most have equally noisy frames.
-
-    Examples
-    --------
-    >>> stored_once(np.ones((4, 2))).strides[0], stored_once(np.arange(4.0)).strides[0]
-    (0, 8)
-    """
-    if len(rows) < 2 or not np.array_equal(rows[1:], rows[:-1]):
-        return rows
-    return np.broadcast_to(rows[0].copy(), rows.shape)
+def _complete_frames(motion: RigidMotion, rows: int) -> Bools:
+    """Return which frames have all the particles that are ever seen; of one row that it counts."""
+    if rows == 1:
+        return np.ones(1, dtype=np.bool_)
+    present = np.where(np.isfinite(motion.center[:, 0]), motion.n_present, -1)
+    return np.asarray(present == present.max())
 
 
-def distinct(rows: Floats) -> Floats:
-    """Return the rows of an array (N, ...), one of them where they are stored once.
+def unit_noise(motion: RigidMotion) -> tuple[Floats, Floats]:
+    """Return the noise of the frames for a localisation error of 1 um; one row where all agree.
+
+    Returns
+    -------
+    covariance : ndarray, shape (T, a, a) or (1, a, a)
+        Step noise of the orientations.
+    variance : ndarray, shape (T,) or (1,)
+        Step noise of a coordinate of the centres.
 
     Examples
     --------
-    >>> distinct(np.broadcast_to(2.0, (5, 3))).shape, distinct(np.ones((5, 3))).shape
-    ((1, 3), (5, 3))
+    >>> from perrin import Cluster, simulate_motion
+    >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=9, rng=3)
+    >>> [noise.shape for noise in unit_noise(truth)]
+    [(1, 3, 3), (1,)]
     """
-    return rows[:1] if rows.strides[0] == 0 else rows
+    noise = unit_covariance(motion), unit_center_variance(motion)
+    covariance, variance = (distinct(stored_once(rows)) for rows in noise)
+    return covariance, variance
 
 
-def mean_row(rows: Floats) -> Floats:
-    """Return the mean row of an array (N, ...); the one row where they are stored once.
+def alike_motions(motions: Sequence[RigidMotion]) -> list[list[int]]:
+    """Return the numbers of motions in groups without gaps whose arrays can be stacked.
+
+    Motions with gaps, or with frames that are not equally noisy, are alone.
 
     Examples
     --------
-    >>> mean_row(np.broadcast_to(2.0, (5, 2))), mean_row(np.array([[1.0], [2.0]]))
-    (array([2., 2.]), array([1.5]))
+    >>> from perrin import Cluster, simulate_motion
+    >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=9, rng=3)
+    >>> alike_motions([truth, truth])
+    [[0, 1]]
     """
-    return rows[0] if rows.strides[0] == 0 else np.asarray(rows.mean(axis=0))
+    keys: list[Hashable] = []
+    for k, motion in enumerate(motions):
+        frames, steps = len(motion.time), len(motion.steps()[0])
+        stacked = steps == frames - 1 and all(len(rows) == 1 for rows in unit_noise(motion))
+        keys.append((frames, motion.dimension) if stacked else k)
+    return groups_alike(keys, [len(motion.time) for motion in motions], most=_FRAMES_TOGETHER)
 
 
 def groups_alike(keys: Sequence[Hashable], sizes: Sequence[int], *, most: int) -> list[list[int]]:
@@ -411,20 +488,13 @@ def groups_alike(keys: Sequence[Hashable], sizes: Sequence[int], *, most: int) -
     return groups
 
 
-def pooled_steps(
-    motions: Sequence[RigidMotion],
-    quantity: Quantity,
-    *,
-    along: Callable[[RigidMotion, Quantity], Steps] = steps_of,
-) -> list[Steps]:
+def pooled_steps(motions: Sequence[RigidMotion], quantity: Quantity) -> list[Steps]:
     """Return the steps of every motion; an error names the motion where there are several.
 
     Parameters
     ----------
     motions : sequence of RigidMotion
     quantity : {"rotation", "translation"}
-    along : callable
-        Function that returns the steps of one motion, which chooses their axes.
 
     Examples
     --------
@@ -434,13 +504,12 @@ def pooled_steps(
     [8, 8]
     """
     steps = []
-    for number, motion in enumerate(motions):
-        try:
-            steps.append(along(motion, quantity))
-        except TooFewFramesError as error:
+    for number, one in enumerate(steps_of_each(motions, quantity)):
+        if isinstance(one, TooFewFramesError):
             if len(motions) == 1:
-                raise
-            raise TooFewFramesError(f"motion {number}: {error}", error.n_frames) from None
+                raise one
+            raise TooFewFramesError(f"motion {number}: {one}", one.n_frames)
+        steps.append(one)
     return steps
 
 
@@ -476,34 +545,72 @@ def principal_steps(
     >>> (square / 1.4).round(3)
     array([0.001, 0.002, 0.006])
     """
-    steps = steps_of(motion, quantity)
-    if quantity == "translation" or motion.dimension == 2:
-        return steps
-    w = motion.step_vectors()[steps.stop - 1]
+    return principal_steps_of_each([motion], quantity, frame=frame)[0]
+
+
+def principal_steps_of_each(
+    motions: Sequence[RigidMotion], quantity: Quantity, *, frame: MemoryFrame = "body"
+) -> list[Steps]:
+    """Return the steps of several motions as `principal_steps`, those of alike motions together.
+
+    Parameters
+    ----------
+    motions, quantity, frame
+        As in `principal_steps`.
+
+    Raises
+    ------
+    TooFewFramesError
+        If a motion has fewer than two steps.
+
+    Examples
+    --------
+    >>> from perrin import Cluster, simulate_motion
+    >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=9, rng=3)
+    >>> [len(s.duration) for s in principal_steps_of_each([truth, truth], "rotation")]
+    [8, 8]
+    """
+    found = pooled_steps(motions, quantity)
+    if quantity == "translation" or motions[0].dimension == 2:
+        return found
+    for rows in alike_motions(motions):
+        some = [motions[k] for k in rows]
+        turned = _principal_axes(some, frame=frame)
+        shape = len(rows), 1, len(some[0].time), 3, 3
+        noise = np.broadcast_to((turned.noise[..., None] * np.eye(3))[:, None], shape)
+        duration = np.stack([found[k].duration for k in rows])
+        steady = turned.steady * duration[..., None, None]
+        for i, k in enumerate(rows):
+            found[k] = replace(
+                found[k], vectors=turned.vectors[i], noise=noise[i], steady=steady[i]
+            )
+    return found
+
+
+def _principal_axes(motions: Sequence[RigidMotion], *, frame: MemoryFrame) -> _StepsAlongAxes:
+    """Return the rotations along the axes in which their diffusion is diagonal."""
+    start, stop = motions[0].steps()
+    rotation = np.stack([motion.rotation for motion in motions])
+    w = np.stack([motion.step_vectors() for motion in motions])[:, stop - 1]
     # Rotation of the noise and of a spin, from body axes and from lab axes, into those of the steps
-    from_body, from_lab = np.eye(3)[None], np.swapaxes(motion.rotation, -1, -2)
+    from_body, from_lab = np.eye(3)[None, None], np.swapaxes(rotation, -1, -2)
     if frame == "lab":
-        from_body, from_lab = motion.rotation, np.eye(3)[None]
-        w = np.einsum("sij,sj->si", motion.rotation[steps.start], w)
+        from_body, from_lab = rotation, np.eye(3)[None, None]
+        w = (rotation[:, start] @ w[..., None])[..., 0]
     elif frame == "mean":
-        about = orientation_about_mean(motion)
-        w = about[steps.stop] - about[steps.start]
+        about = np.stack([orientation_about_mean(motion) for motion in motions])
+        w = about[:, stop] - about[:, start]
         from_body = exp_map(about)
         from_lab = from_body @ from_lab
-    linked = steps.linked[:-1]
-    tensor = 0.5 * w.T @ w + w[:-1][linked].T @ w[1:][linked]
-    axes = np.linalg.eigh((tensor + tensor.T) / 2)[1]
-    turned = np.broadcast_to(axes.T @ from_lab, (len(motion.time), 3, 3))[steps.start]
-    from_body = axes.T @ from_body
-    covariance = distinct(stored_once(unit_covariance(motion)))
-    noise = np.sum((from_body @ covariance) * from_body, axis=2)
-    noise = np.broadcast_to(noise[..., None] * np.eye(3), (len(motion.time), 3, 3))
-    return replace(
-        steps,
-        vectors=w @ axes,
-        noise=noise[None],
-        steady=turned * steps.duration[:, None, None],
-    )
+    linked = (start[1:] == stop[:-1])[:, None]
+    tensor = 0.5 * np.swapaxes(w, 1, 2) @ w + np.swapaxes(w[:, :-1] * linked, 1, 2) @ w[:, 1:]
+    axes = np.linalg.eigh((tensor + np.swapaxes(tensor, 1, 2)) / 2)[1]
+    across = np.swapaxes(axes, 1, 2)[:, None]
+    from_lab = from_lab[:, start] if from_lab.shape[1] > 1 else from_lab
+    from_body = across @ from_body
+    covariance = np.stack([unit_noise(motion)[0] for motion in motions])
+    noise = np.sum((from_body @ covariance) * from_body, axis=3)
+    return _StepsAlongAxes(w @ axes, noise, across @ from_lab)
 
 
 def orientation_about_mean(motion: RigidMotion) -> Floats:
@@ -556,9 +663,8 @@ def body_steps(motion: RigidMotion, quantity: Quantity | Literal["both"], turn: 
     start, stop = motion.steps()
     w = motion.step_vectors()[stop - 1]
     displacement = motion.center[stop] - motion.center[start]
-    variance = distinct(stored_once(unit_center_variance(motion)))
+    covariance, variance = unit_noise(motion)
     center_noise = variance[:, None, None] * np.eye(3)
-    covariance = distinct(stored_once(unit_covariance(motion)))
     every = (1, len(motion.time), 3, 3)
     if quantity == "rotation":
         vectors = w @ turn.T

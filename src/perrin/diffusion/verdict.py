@@ -20,7 +20,7 @@ from perrin.diffusion.goodness_of_fit import (
     FEWEST_HALF_PERIODS,
     BrownianTests,
     Score,
-    axis_model,
+    axis_models,
     brownian_tests_of_each,
     fisher,
     holm,
@@ -242,9 +242,7 @@ def judge_motion(
         faults.append("noise: expected no drift; the verdict tests for a steady motion itself")
     refuse(faults)
     settings = Noise.of(noise, exposure=exposure)
-    tested = brownian_tests_of_each(
-        [axis_model(m, quantity, settings) for m in motions], progress=progress
-    )
+    tested = brownian_tests_of_each(axis_models(motions, quantity, settings), progress=progress)
     singly = [
         _verdict([m], [one], quantity, settings) for m, one in zip(motions, tested, strict=True)
     ]

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from perrin._arrays import Bools, Floats, Ints, frozen, present
+from perrin._arrays import Bools, Floats, Ints, distinct, expanded, frozen, present
 from perrin.geometry.rigid import (
     degrees_of_freedom,
     inertia_tensor,
@@ -979,7 +979,7 @@ def unit_covariance(motion: RigidMotion) -> Floats:
     """
     square = float(motion.noise @ motion.noise) / len(motion.noise)
     if square > 0:
-        return np.asarray(motion.step_covariance / square)
+        return expanded(distinct(motion.step_covariance) / square, len(motion.time))
     unit = orientation_covariance(motion.template, np.eye(motion.template.shape[1]))
     return np.broadcast_to(unit, motion.covariance.shape)
 
@@ -996,5 +996,5 @@ def unit_center_variance(motion: RigidMotion) -> Floats:
     """
     square = float(motion.noise @ motion.noise) / len(motion.noise)
     if square > 0:
-        return np.asarray(motion.step_center_variance / square)
+        return expanded(distinct(motion.step_center_variance) / square, len(motion.time))
     return np.full(len(motion.time), 1 / len(motion.template))

@@ -19,6 +19,7 @@ from perrin._arrays import (
     present,
     refuse,
     require_positive,
+    stored_once,
 )
 from perrin._text import counted
 from perrin.geometry.rotations import successive_product
@@ -470,8 +471,8 @@ def _motions_of(
                 rotation=rotation[k],
                 residual=distance[k],
                 n_present=count[k],
-                covariance=covariance[k],
-                center_variance=variance[k],
+                covariance=stored_once(covariance[k]),
+                center_variance=stored_once(variance[k]),
                 piece=np.zeros(x.shape[1], dtype=np.int64),
                 reason=tuple(why[k].tolist()),
                 template=fit.template[k],
