@@ -41,6 +41,25 @@ INLINE int any(Mask mask)
         found |= mask[i];
     return found != 0;
 }
+/* One over the factorials of 13 to 0. */
+static const double series[] = {
+    1.6059043836821613e-10, 2.08767569878681e-09, 2.505210838544172e-08, 2.755731922398589e-07,
+    2.7557319223985893e-06, 2.48015873015873e-05, 0.0001984126984126984, 0.001388888888888889,
+    0.008333333333333333, 0.041666666666666664, 0.16666666666666666, 0.5, 1.0, 1.0};
+
+/* e^x for x <= 0, and 0 where that is below the normal numbers: 2^n times the series of e^r, with r
+ * at most half of ln 2, which is taken off in two parts. The sum x/ln 2 + 1.5 2^52 ends with n. */
+INLINE Lanes exponential(Lanes x)
+{
+    const double shift = 6755399441055744.0;
+    Lanes shifted = x * 1.44269504088896340736 + shift, n = shifted - shift, none = {0.0};
+    Lanes r = (x - n * 0.693147180369123816490) - n * 1.90821492927058770002e-10;
+    Lanes sum = none;
+    for (int k = 0; k < 14; k++)
+        sum = series[k] + sum * r;
+    Mask exponent = (Mask)shifted - (Mask)(none + shift) + 1023;
+    return choose(x < -708.0, none, sum * (Lanes)(exponent << 52));
+}
 #else
 #define WIDTH 1
 #define INLINE static __inline
@@ -51,6 +70,7 @@ INLINE Lanes choose(Mask mask, Lanes a, Lanes b) { return mask ? a : b; }
 INLINE Lanes magnitude(Lanes a) { return fabs(a); }
 INLINE Lanes square_root(Lanes a) { return sqrt(a); }
 INLINE int any(Mask mask) { return mask; }
+INLINE Lanes exponential(Lanes x) { return exp(x); }
 #endif
 
 /* The loader chooses among versions of a function for the vector registers of the machine. */
@@ -432,15 +452,19 @@ INLINE void add_logarithm(Logarithm *sum, Lanes number)
     sum->product *= number;
 }
 
+/* Sum of the logarithms of the `added` numbers in a lane. */
+INLINE double lane_logarithm(const Logarithm *sum, int lane, Py_ssize_t added)
+{
+    int64_t exponent = (int64_t)sum->exponents[lane] - 1023 * (int64_t)added;
+    return log(LANE(sum->product, lane)) + (double)exponent * 0.69314718055994530942;
+}
+
 INLINE double logarithm(const Logarithm *sum, Py_ssize_t added)
 {
     double found = 0.0;
-    int64_t exponent = -1023 * WIDTH * (int64_t)added;
-    for (int i = 0; i < WIDTH; i++) {
-        found += log(LANE(sum->product, i));
-        exponent += (int64_t)sum->exponents[i];
-    }
-    return found + (double)exponent * 0.69314718055994530942;
+    for (int i = 0; i < WIDTH; i++)
+        found += lane_logarithm(sum, i, added);
+    return found;
 }
 
 /* The next modes of a track, of which `left` are left; `fill` in the place of those beyond. */
@@ -741,75 +765,76 @@ typedef struct {
     double *value, *pairs;
 } States;
 
-/* What is known of the noise of the last frame, for each state. */
+/* What is known of the noise of the last frame, for each state; a point in each lane. */
 typedef struct {
-    double probability[2], mean[2][MOST_AXES], variance[2][MOST_AXES];
+    Lanes probability[2], mean[2][MOST_AXES], variance[2][MOST_AXES];
 } Belief;
 
-/* One step at one point: variances and noises of the two states. */
+/* One step: variances and noises of the two states; a point in each lane. */
 typedef struct {
     const double *y;
-    double spread[2], blur[2], noise[MOST_AXES];
+    Lanes spread[2], blur[2], noise[MOST_AXES];
 } Step;
 
-/* Densities of a step relative to the largest, by states before and after. The largest is the first
- * number that is returned times exp of minus the second. */
-INLINE double densities(const States *states, const Step *step, const Belief *belief,
-                        double square[2][MOST_AXES], double total[2][2][MOST_AXES],
-                        double density[2][2], double *least)
+/* Densities of a step relative to the largest, by states before and after, and `inverse` variances.
+ * The largest is the number that is returned times exp of minus `least`. */
+INLINE Lanes densities(const States *states, const Step *step, const Belief *belief,
+                       Lanes square[2][MOST_AXES], Lanes inverse[2][2][MOST_AXES],
+                       Lanes density[2][2], Lanes *least)
 {
-    double half_square[2][2], top = 0.0;
-    *least = DBL_MAX;
+    Lanes half_square[2][2], top = all_equal(0.0), tiny = all_equal(1e-100);
+    *least = all_equal(DBL_MAX);
     for (int from = 0; from < 2; from++) {
         Py_ssize_t axis = 0;
         for (Py_ssize_t g = 0; g < states->groups; g++) {
-            square[from][g] = 0.0;
+            square[from][g] = all_equal(0.0);
             for (int i = 0; i < (int)states->sizes[g]; i++, axis++) {
-                double surprise = step->y[axis] + belief->mean[from][axis];
+                Lanes surprise = step->y[axis] + belief->mean[from][axis];
                 square[from][g] += surprise * surprise;
             }
         }
         for (int to = 0; to < 2; to++) {
-            double sum_of_squares = 0.0, determinant = 1.0;
+            Lanes sum_of_squares = all_equal(0.0), determinant = all_equal(1.0);
             for (Py_ssize_t g = 0; g < states->groups; g++) {
-                double sum = belief->variance[from][g] + (step->spread[to] + step->noise[g]);
-                total[from][to][g] = sum < 1e-100 ? 1e-100 : sum;
-                sum_of_squares += square[from][g] / total[from][to][g];
+                Lanes sum = belief->variance[from][g] + (step->spread[to] + step->noise[g]);
+                inverse[from][to][g] = 1 / choose(sum < tiny, tiny, sum);
+                sum_of_squares += square[from][g] * inverse[from][to][g];
                 for (int i = 0; i < (int)states->sizes[g]; i++)
-                    determinant *= total[from][to][g];
+                    determinant *= inverse[from][to][g];
             }
             half_square[from][to] = 0.5 * sum_of_squares;
-            *least = half_square[from][to] < *least ? half_square[from][to] : *least;
-            density[from][to] = 1 / sqrt(determinant);
+            *least = choose(half_square[from][to] < *least, half_square[from][to], *least);
+            density[from][to] = square_root(determinant);
         }
     }
     for (int i = 0; i < 4; i++) {
-        density[i / 2][i % 2] *= exp(*least - half_square[i / 2][i % 2]);
-        top = density[i / 2][i % 2] > top ? density[i / 2][i % 2] : top;
+        density[i / 2][i % 2] *= exponential(*least - half_square[i / 2][i % 2]);
+        top = larger(density[i / 2][i % 2], top);
     }
+    Lanes scale = 1 / top;
     for (int i = 0; i < 4; i++)
-        density[i / 2][i % 2] /= top;
+        density[i / 2][i % 2] *= scale;
     return top;
 }
 
 /* Merge the noise of the last frame over the states before; `joint` has their weights. */
-INLINE void merge(const States *states, const Step *step, double joint[2][2],
-                  double square[2][MOST_AXES], double total[2][2][MOST_AXES], Belief *belief)
+INLINE void merge(const States *states, const Step *step, Lanes joint[2][2],
+                  Lanes square[2][MOST_AXES], Lanes inverse[2][2][MOST_AXES], Belief *belief)
 {
     Belief next;
     for (int to = 0; to < 2; to++) {
-        double both = joint[0][to] + joint[1][to];
+        Lanes both = joint[0][to] + joint[1][to], weight = 1 / both;
         Py_ssize_t axis = 0;
         for (Py_ssize_t g = 0; g < states->groups; g++) {
-            double shared = step->noise[g] - step->blur[to], share[2], second = 0.0;
+            Lanes shared = step->noise[g] - step->blur[to], share[2], second = all_equal(0.0);
             for (int from = 0; from < 2; from++) {
-                double gain = shared / total[from][to][g];
-                share[from] = joint[from][to] / both * gain;
+                Lanes gain = shared * inverse[from][to][g];
+                share[from] = joint[from][to] * weight * gain;
                 second += share[from] * gain * square[from][g];
             }
             for (int i = 0; i < (int)states->sizes[g]; i++, axis++) {
-                double mean = share[0] * (step->y[axis] + belief->mean[0][axis]) +
-                              share[1] * (step->y[axis] + belief->mean[1][axis]);
+                Lanes mean = share[0] * (step->y[axis] + belief->mean[0][axis]) +
+                             share[1] * (step->y[axis] + belief->mean[1][axis]);
                 next.mean[to][axis] = mean;
                 second -= mean * mean;
             }
@@ -818,67 +843,110 @@ INLINE void merge(const States *states, const Step *step, double joint[2][2],
         }
         next.probability[to] = both;
     }
-    double sum = next.probability[0] + next.probability[1];
+    Lanes scale = 1 / (next.probability[0] + next.probability[1]);
     for (int to = 0; to < 2; to++)
-        next.probability[to] /= sum;
+        next.probability[to] *= scale;
     *belief = next;
 }
 
 /* Noise variance of the frame before (end 0) or after (end 1) step j. */
-INLINE double noise_of(const States *states, int end, Py_ssize_t j, Py_ssize_t g,
-                       const double *point)
+INLINE Lanes noise_of(const States *states, int end, Py_ssize_t j, Py_ssize_t g,
+                      const Lanes point[5])
 {
     Py_ssize_t place = j * states->groups + g, size = states->count * states->groups;
     const double *noise = states->noise + 2 * end * size;
     return point[4] * noise[place] + noise[size + place] - states->blur[1] * point[0];
 }
 
+/* Add a step, before which the state may have changed with probability `leaving`, to the belief, and
+ * its density to the likelihood: two factors and `least`; `pairs` (2, 2) are written for the first
+ * lane if they are given. */
+INLINE void filter_step(const States *states, const Step *step, const Lanes leaving[2],
+                        Belief *belief, Logarithm *density, Lanes *least, double *pairs)
+{
+    Lanes square[2][MOST_AXES], inverse[2][2][MOST_AXES], pair[2][2], smaller;
+    Lanes top = densities(states, step, belief, square, inverse, pair, &smaller);
+    Lanes sum = all_equal(0.0);
+    for (int from = 0; from < 2; from++)
+        for (int to = 0; to < 2; to++) {
+            pair[from][to] *= from == to ? 1 - leaving[from] : leaving[from];
+            if (pairs)
+                pairs[2 * from + to] = LANE(pair[from][to], 0);
+            pair[from][to] = belief->probability[from] * pair[from][to] + 1e-300;
+        }
+    for (int to = 0; to < 2; to++)
+        sum += pair[0][to] + pair[1][to];
+    add_logarithm(density, top);
+    add_logarithm(density, sum);
+    /* What is not a number has no logarithm, and is kept here. */
+    *least += smaller + (sum - sum);
+    merge(states, step, pair, square, inverse, belief);
+}
+
+/* Filter the WIDTH points from number p on; where points end, the last is repeated. */
+INLINE void filter_points(const States *states, Py_ssize_t p)
+{
+    Py_ssize_t count = states->points - p < WIDTH ? states->points - p : WIDTH;
+    double numbers[5][WIDTH];
+    Lanes point[5];
+    for (int lane = 0; lane < WIDTH; lane++)
+        for (int k = 0; k < 5; k++)
+            numbers[k][lane] = states->point[5 * (p + (lane < count ? lane : count - 1)) + k];
+    memcpy(point, numbers, sizeof point);
+    const Lanes *rate = point + 2;
+    Lanes both = rate[0] + rate[1], leaving[2] = {rate[0], rate[1]};
+    Logarithm density = {all_equal(1.0), {0}};
+    Lanes least = all_equal(0.0);
+    double elapsed = -1.0;
+    Belief belief;
+    Step step;
+    for (int lane = 0; lane < count; lane++)
+        states->value[p + lane] = 0.0;
+    for (int k = 0; k < 2; k++) {
+        step.blur[k] = states->blur[0] * point[k];
+        belief.probability[k] = rate[1 - k] / both;
+    }
+    for (Py_ssize_t j = 0; j < states->count; j++) {
+        const double *clock = states->clock + j;
+        step.y = states->vectors + j * states->axes;
+        for (int k = 0; k < 2; k++)
+            step.spread[k] = 2 * point[k] * clock[0] - 4 * step.blur[k];
+        if (!(clock[2 * states->count] > 0)) {
+            for (int k = 0; k < 2; k++) {
+                for (Py_ssize_t axis = 0; axis < states->axes; axis++)
+                    belief.mean[k][axis] = all_equal(0.0);
+                for (Py_ssize_t g = 0; g < states->groups; g++)
+                    belief.variance[k][g] = noise_of(states, 0, j, g, point) + 2 * step.blur[k];
+            }
+        }
+        for (Py_ssize_t g = 0; g < states->groups; g++)
+            step.noise[g] = noise_of(states, 1, j, g, point);
+        if (clock[states->count] != elapsed) {
+            elapsed = clock[states->count];
+            for (int lane = 0; lane < WIDTH; lane++) {
+                double change = -expm1(-LANE(both, lane) * elapsed);
+                for (int k = 0; k < 2; k++)
+                    LANE(leaving[k], lane) = LANE(rate[k], lane) / LANE(both, lane) * change;
+            }
+        }
+        filter_step(states, &step, leaving, &belief, &density, &least,
+                    p == 0 ? states->pairs + 4 * j : NULL);
+        Py_ssize_t added = 2 * (j % (TRACK_BLOCK / 2) + 1);
+        if (added == TRACK_BLOCK || j + 1 == states->count) {
+            for (int lane = 0; lane < count; lane++)
+                states->value[p + lane] += lane_logarithm(&density, lane, added);
+            density = (Logarithm){all_equal(1.0), {0}};
+        }
+    }
+    for (int lane = 0; lane < count; lane++)
+        states->value[p + lane] -= LANE(least, lane);
+}
+
+EVERY_MACHINE
 static void filter_states(const States *states)
 {
-    for (Py_ssize_t p = 0; p < states->points; p++) {
-        const double *point = states->point + 5 * p, *rate = point + 2;
-        double both = rate[0] + rate[1], value = 0.0, elapsed = -1.0, change = 0.0;
-        Belief belief;
-        Step step;
-        for (int k = 0; k < 2; k++) {
-            step.blur[k] = states->blur[0] * point[k];
-            belief.probability[k] = rate[1 - k] / both;
-        }
-        for (Py_ssize_t j = 0; j < states->count; j++) {
-            const double *clock = states->clock + j;
-            step.y = states->vectors + j * states->axes;
-            for (int k = 0; k < 2; k++)
-                step.spread[k] = 2 * point[k] * clock[0] - 4 * step.blur[k];
-            if (!(clock[2 * states->count] > 0)) {
-                memset(belief.mean, 0, sizeof belief.mean);
-                for (int k = 0; k < 2; k++)
-                    for (Py_ssize_t g = 0; g < states->groups; g++)
-                        belief.variance[k][g] =
-                            noise_of(states, 0, j, g, point) + 2 * step.blur[k];
-            }
-            for (Py_ssize_t g = 0; g < states->groups; g++)
-                step.noise[g] = noise_of(states, 1, j, g, point);
-            double square[2][MOST_AXES], total[2][2][MOST_AXES], pair[2][2], least, sum = 0.0;
-            double top = densities(states, &step, &belief, square, total, pair, &least);
-            if (clock[states->count] != elapsed) {
-                elapsed = clock[states->count];
-                change = -expm1(-both * elapsed);
-            }
-            for (int from = 0; from < 2; from++)
-                for (int to = 0; to < 2; to++) {
-                    double leaving = rate[from] / both * change;
-                    pair[from][to] *= from == to ? 1 - leaving : leaving;
-                    if (p == 0)
-                        states->pairs[4 * j + 2 * from + to] = pair[from][to];
-                    pair[from][to] = belief.probability[from] * pair[from][to] + 1e-300;
-                }
-            for (int to = 0; to < 2; to++)
-                sum += pair[0][to] + pair[1][to];
-            value += log(top * sum) - least;
-            merge(states, &step, pair, square, total, &belief);
-        }
-        states->value[p] = value;
-    }
+    for (Py_ssize_t p = 0; p < states->points; p += WIDTH)
+        filter_points(states, p);
 }
 
 /* Keep `view` as doubles, C-contiguous; returns 0 with an exception set where it is not. */
