@@ -447,22 +447,24 @@ class AxisModel:
     def change_scores(self, fit: AxisFit) -> Floats:
         """Return the scores of a linear change of D and of the noise offset in time, (2, B).
 
+        The B data sets have a fit each, or one for all.
+
         With t from -1 to 1 along the track and z = C^-1 y they are the sums over steps of
         D t (z_j^2 - expected), and over shared frames of o t ((z_j - z_{j+1})^2 - expected)/2, the
         expected values those of diffusion and noise that do not change.
         """
         from scipy.linalg.lapack import dpttrf, dpttrs
 
-        shape = fit.y.shape
-        D, offset = (np.broadcast_to(x, shape[:2]) for x in (fit.D, fit.offset))
-        a, b = self.bands(D, offset)
+        # Of data sets with one fit the covariance is factorised once.
+        shape = fit.D.shape + fit.y.shape[2:]
+        a, b = self.bands(fit.D, fit.offset)
         d, lower, _ = dpttrf(a, b)
         up = dpttrf(a[::-1], b[::-1])[0]
-        z = dpttrs(d, lower, fit.y.reshape(-1, 1))[0].reshape(shape)
+        z = dpttrs(d, lower, fit.y.reshape(-1, a.size).T)[0].T.reshape(fit.y.shape)
         inverse = (1 / (d + up[::-1] - a)).reshape(shape)
         corner = np.append(-lower * inverse.ravel()[1:], 0.0).reshape(shape)[..., :-1]
         t = np.linspace(-1.0, 1.0, self.n_steps)
-        by_D = np.sum(D[..., None] * t * (z**2 - inverse), axis=(1, 2))
+        by_D = np.sum(fit.D[..., None] * t * (z**2 - inverse), axis=(1, 2))
         square = (z[..., :-1] - z[..., 1:]) ** 2
         expected = inverse[..., :-1] + inverse[..., 1:] - 2 * corner
         middle = 0.5 * (t[1:] + t[:-1]) * self.linked[:-1]

@@ -15,7 +15,7 @@ from perrin._text import listed, number_text
 from perrin.diffusion.anomalous import AnomalousEstimate, anomalous_estimate, find_exponent
 from perrin.diffusion.confined import ConfinedEstimate, confined_estimate, find_cage
 from perrin.diffusion.estimate import DiffusionEstimate
-from perrin.diffusion.estimators import estimate_diffusion
+from perrin.diffusion.estimators import estimate_diffusion, estimate_each
 from perrin.diffusion.goodness_of_fit import (
     FEWEST_HALF_PERIODS,
     BrownianTests,
@@ -246,7 +246,7 @@ def judge_motion(
     singly = [
         _verdict([m], [one], quantity, settings) for m, one in zip(motions, tested, strict=True)
     ]
-    each = tuple(_with_states(motions, singly, settings))
+    each = tuple(_with_models(motions, singly, settings))
     if len(motions) == 1:
         return each[0]
     together = _verdict(motions, tested, quantity, settings)
@@ -304,6 +304,8 @@ def _verdict(
         return replace(verdict, kind="vibration", text=_with_p(text, p_family))
     if first in _SHAPE_TESTS:
         kind, model = _shape(motions, tested, quantity, settings)
+        if model is None:  # of a single motion, which `_with_models` fits
+            return replace(verdict, kind=kind)
         text = _model_text(kind, model, quantity)
         return replace(verdict, kind=kind, model=model, text=_with_p(text, p_family))
     return _variance(verdict, motions, tested)
@@ -377,15 +379,15 @@ def _shape(
     tested: Sequence[BrownianTests],
     quantity: Quantity,
     settings: Noise,
-) -> tuple[Kind, Model]:
+) -> tuple[Kind, Model | None]:
     """Name what bends the spectrum, by likelihood less half ln N for each parameter.
 
     A steady motion is also the name where it explains the exponent: likelihood alone calls a spin
-    superdiffusion in a quarter of short tracks.
+    superdiffusion in a quarter of short tracks. That of a single motion is not fitted here.
     """
-    motion = list(motions) if len(motions) > 1 else motions[0]
     penalty = 0.5 * np.log(sum(one.model.n_steps for one in tested))
     # What a steady motion gains, its p, and that of the exponent once it is subtracted.
+    kind: Kind
     gain, p_of_each, scores = 0.0, [], []
     for one in tested:
         model, fit = one.model, one.fit
@@ -405,13 +407,15 @@ def _shape(
         if gain <= max(peak.gain, caged) - penalty:
             if cage is not None and caged > peak.gain:
                 return "confined", confined_estimate(cage, motions)
-            kind: Kind = "subdiffusion" if slower else "superdiffusion"
+            kind = "subdiffusion" if slower else "superdiffusion"
             return kind, anomalous_estimate(peak, motions)
+    kind = "spin" if quantity == "rotation" else "drift"
+    if len(motions) == 1:
+        return kind, None
     taken = replace(settings, drift=True)
     with python_warnings.catch_warnings():
         python_warnings.simplefilter("ignore", PrecisionWarning)
-        estimate = estimate_diffusion(motion, quantity=quantity, noise=taken)
-    return "spin" if quantity == "rotation" else "drift", estimate
+        return kind, estimate_diffusion(motions, quantity=quantity, noise=taken)
 
 
 def _variance(
@@ -448,16 +452,29 @@ def _variance(
     return replace(verdict, kind="changing D", text=_with_p(text, verdict.p_family))
 
 
-def _with_states(
+def _with_models(
     motions: Sequence[RigidMotion], verdicts: Sequence[MotionVerdict], settings: Noise
 ) -> list[MotionVerdict]:
-    """Return the verdicts on single motions with the two states of each whose D changes."""
-    judged = list(verdicts)
+    """Return the verdicts on single motions with the models that are fitted to several at once.
+
+    They are the steady motions, and the two states of each motion whose D changes.
+    """
+    judged, quantity = list(verdicts), verdicts[0].quantity
+    steady = [k for k, one in enumerate(verdicts) if one.kind in ("spin", "drift")]
+    estimates = estimate_each(
+        [motions[k] for k in steady], quantity=quantity, noise=replace(settings, drift=True)
+    )
+    for k, estimate in zip(steady, estimates, strict=True):
+        if isinstance(estimate, ValueError):
+            raise estimate
+        verdict = verdicts[k]
+        text = _with_p(_model_text(verdict.kind, estimate, quantity), verdict.p_family)
+        judged[k] = replace(verdict, model=estimate, text=text)
     changing = [k for k, one in enumerate(verdicts) if one.kind == "changing D"]
     if not changing:
         return judged
     pools = [[motions[k]] for k in changing]
-    fits = fit_switching_each(pools, quantity=verdicts[changing[0]].quantity, noise=settings)
+    fits = fit_switching_each(pools, quantity=quantity, noise=settings)
     for k, model in zip(changing, fits, strict=True):
         verdict = replace(verdicts[k], kind="diffusion")
         if isinstance(model, ValueError):
@@ -467,7 +484,7 @@ def _with_states(
             # A state that lasts less than a frame is single long steps.
             judged[k] = _jumps(verdict, np.flatnonzero(model.states[0] == 1).tolist())
         else:
-            text = _with_p(_model_text("changing D", model, verdict.quantity), verdict.p_family)
+            text = _with_p(_model_text("changing D", model, quantity), verdict.p_family)
             judged[k] = replace(verdict, kind="changing D", model=model, text=text)
     return judged
 
