@@ -224,6 +224,11 @@ class AxisModel:
         return len(self.tau)
 
     @cached_property
+    def mean_tau(self) -> float:
+        """Mean duration of a step, s."""
+        return float(self.tau.mean())
+
+    @cached_property
     def even(self) -> bool:
         """Whether all steps are linked and equally long."""
         return bool(np.ptp(self.tau) <= 1e-9 * self.tau[0] and self.linked[:-1].all())
@@ -255,20 +260,20 @@ class AxisModel:
     def ratio(self, D: Floats, offset: Floats) -> Floats:
         """Return v = ln(1 + 2 o/(D tau)), o the offset."""
         with np.errstate(divide="ignore", invalid="ignore"):
-            v = np.log1p(2 * offset / (D * self.tau.mean()))
+            v = np.log1p(2 * offset / (D * self.mean_tau))
         return np.asarray(np.clip(np.nan_to_num(v, nan=_MOST_V), _LEAST_V, _MOST_V))
 
     def eigenvalues(self, D: Floats, offset: Floats) -> Floats:
         """Return the variances of the sine modes for the mean duration and noise, (B, A, N)."""
         noise = offset + self.mean_known - self.blur * D
         return np.asarray(
-            2 * D[..., None] * self.tau.mean() + 2 * noise[..., None] * self.differences
+            2 * D[..., None] * self.mean_tau + 2 * noise[..., None] * self.differences
         )
 
     def slopes(self, D: Floats, offset: Floats) -> tuple[Floats, Floats]:
         """Return the derivatives of ln lambda_k in ln D and in the offset over D, (B, A, N)."""
         eigen = self.eigenvalues(D, offset)
-        by_D = 2 * D[..., None] * (self.tau.mean() - self.blur * self.differences) / eigen
+        by_D = 2 * D[..., None] * (self.mean_tau - self.blur * self.differences) / eigen
         by_offset = 2 * D[..., None] * self.differences / eigen
         return by_D, by_offset
 
@@ -312,7 +317,7 @@ class AxisModel:
     def _fit_modes(self, y: Floats, near: AxisFit | None) -> AxisFit:
         """Fit even steps: D follows from v, and v by scoring from the best of a grid."""
         power = sine_powers(y)
-        tau, c, noise = self.tau.mean(), self.differences, self.mean_known
+        tau, c, noise = self.mean_tau, self.differences, self.mean_known
 
         def relative(v: Floats) -> Floats:
             return np.asarray(2 * tau * (1 + np.expm1(v)[..., None] / 2 * c))
@@ -358,7 +363,7 @@ class AxisModel:
         The curvature is that of even steps of the mean duration (scoring); the fit of one data set
         takes its own curvature from differences of the score, where it has a maximum.
         """
-        tau, shape = self.tau.mean(), y.shape[:2]
+        tau, shape = self.mean_tau, y.shape[:2]
         # An offset above -D/2 times the shortest step makes the covariance positive definite.
         least = max(_LEAST_V, float(np.log1p(-(1 - 1e-4) * self.tau.min() / tau)))
         single = near is None
@@ -421,7 +426,7 @@ class AxisModel:
         in_D, in_o = D * in_D.reshape(shape), in_o.reshape(shape)
         if not self.free:
             return np.asarray(in_D[..., None])
-        half = D * self.tau.mean() / 2
+        half = D * self.mean_tau / 2
         return np.stack([in_D + offset * in_o, (half + offset) * in_o], axis=-1)
 
     def draws(self, fit: AxisFit, *, count: int, rng: np.random.Generator) -> Floats:
@@ -517,7 +522,7 @@ class AxisModel:
         n = self.n_steps
         rate = _CONFINED_RATE / n
         shapes = np.stack([fractional_slope(n), confined_autocovariance(rate, n)])
-        return np.asarray(self.tau.mean() * (sine_spectrum(shapes) - [[0.0], [2.0]]))
+        return np.asarray(self.mean_tau * (sine_spectrum(shapes) - [[0.0], [2.0]]))
 
     def score_shapes(self, fit: AxisFit) -> Floats:
         """Return the relative change of each mode by each alternative, (2, B, A, N).
@@ -572,7 +577,7 @@ class AxisModel:
         axes, parameters = y.shape[1], 3 + self.free
         U = np.zeros((axes, parameters, len(y)))
         matrix = np.zeros((axes, parameters, parameters))
-        tau = self.tau.mean()
+        tau = self.mean_tau
         rate = _CONFINED_RATE / (self.n_steps * tau)
         for rows in blocks:
             start, linked = self.start[rows], self.linked[rows]
@@ -996,6 +1001,11 @@ class BrownianTests:
     def __post_init__(self) -> None:
         frozen(self.u)
 
+    @cached_property
+    def mean_D(self) -> float:
+        """Mean D of the axes."""
+        return float(self.fit.D.mean())
+
 
 def brownian_tests(model: AxisModel, y: Floats) -> BrownianTests:
     """Test the steps of one motion against Brownian motion.
@@ -1097,7 +1107,8 @@ def _ranked_if_short(
 ) -> BrownianTests:
     """Return the tests of one motion, ranked among draws where the laws of p do not hold."""
     n, y = model.n_steps, fit.y
-    signal, noise = np.mean(fit.D) * model.tau.mean(), np.mean(fit.offset + model.mean_known)
+    signal = float(fit.D.mean()) * model.mean_tau
+    noise = float((fit.offset + model.mean_known).mean())
     # Without noise, in any unit of length, the ratio has no bound.
     snr = float(signal / noise) if noise > 1e-30 * signal else (np.inf if signal > 0 else 0.0)
     ranked = n < _FEWEST_ASYMPTOTIC_STEPS or 0 < n * snr < _LEAST_INFORMATION

@@ -266,7 +266,7 @@ def _verdict(
     p_family = holm(np.array(list(p.values())))
     detectable = detectable_by(tested, quantity)
     text = _diffusion_text(p_family, len(p), detectable, quantity)
-    turn = max(4 * float(np.mean(one.fit.D) * one.model.tau.mean()) for one in tested)
+    turn = max(4 * one.mean_D * one.model.mean_tau for one in tested)
     if quantity == "rotation" and motions[0].dimension == 3 and turn > _COARSE_TURN:
         detectable = dict.fromkeys(detectable)
         text = (
@@ -297,7 +297,7 @@ def _verdict(
             largest = slowest + int(np.argmax(modes[slowest:]))
             around = np.arange(largest - 2, min(len(modes), largest + 3))
             k = 1 + float(np.average(around, weights=modes[around]))
-            period = 2 * (one.model.n_steps + 1) * float(one.model.tau.mean()) / k
+            period = 2 * (one.model.n_steps + 1) * one.model.mean_tau / k
             peaks.append((float(largest_share(modes, one.fit.D.shape[1])), period))
         period = max(peaks)[1]
         text = f"{_SUBJECT[quantity]} vibrates with a period of {number_text(period)} s"
@@ -360,7 +360,7 @@ def detectable_by(tested: Sequence[BrownianTests], quantity: Quantity) -> dict[s
     reach = _DETECTED / np.sqrt(information)
     lengths, speeds = [], []
     for one in tested:
-        D, tau = float(np.mean(one.fit.D)), float(one.model.tau.mean())
+        D, tau = one.mean_D, one.model.mean_tau
         n = one.model.n_steps
         lengths.append(np.sqrt(2 * D * tau * n / _RELAXATIONS_SEEN))
         speeds.append(_DETECTED_MEAN * np.sqrt(2 * D / (n * tau)))

@@ -103,7 +103,7 @@ def alternative_spectrum(
     >>> alternative_spectrum(model, model.fit(y), judge_motion(turning))[1]
     'with a steady spin'
     """
-    found, tau, n = verdict.model, float(model.tau.mean()), model.n_steps
+    found, tau, n = verdict.model, model.mean_tau, model.n_steps
     if isinstance(found, AnomalousEstimate | ConfinedEstimate):
         exposure = min(1.0, (found.exposure or 0.0) * found.dt / tau)
         noise = 2 * found.offset * model.differences
@@ -160,7 +160,7 @@ def plot_step_spectrum(
     from scipy.special import gammaincinv
 
     n, axes = model.n_steps, fit.D.shape[1]
-    scale = 2 * float(model.tau.mean())
+    scale = 2 * model.mean_tau
     frequency = np.arange(1, n + 1) / ((n + 1) * scale)
     law = model.eigenvalues(fit.D, fit.offset)
     if model.even:
