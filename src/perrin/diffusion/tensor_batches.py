@@ -187,7 +187,7 @@ def batch_key(track: NoisyVectors) -> tuple[object, ...]:
 
 
 def maximise_each(
-    tracks: SeparateTensors, family: Family, q: Floats, own: Floats
+    tracks: SeparateTensors, family: Family, q: Floats, own: Floats, *, near: bool = False
 ) -> list[Maximum | None]:
     """Return the maxima over a family of D, one for each motion, and over their noise.
 
@@ -205,6 +205,8 @@ def maximise_each(
         Parameters to start from.
     own : ndarray, shape (P, c)
         Free parameters of the noise to start from.
+    near : bool
+        As in `maximise`.
 
     Returns
     -------
@@ -224,7 +226,7 @@ def maximise_each(
     True
     """
     count, m, active = len(q), q.shape[1], np.arange(len(q))
-    if tracks.B is None:
+    if tracks.B is None and not near:
         noise, D = tracks.tracks.shapes.sum(axis=1), family(q, active)[0]
         ratio = 2 * tracks.tracks.dt * np.trace(D, axis1=1, axis2=2)
         ratio /= np.trace(noise, axis1=1, axis2=2)

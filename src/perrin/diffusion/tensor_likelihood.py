@@ -469,10 +469,13 @@ class Maximum(NamedTuple):
     own: Floats
 
 
-def maximise(tracks: Sequence[NoisyVectors], family: Family, q: Floats, own: Floats) -> Maximum:
+def maximise(
+    tracks: Sequence[NoisyVectors], family: Family, q: Floats, own: Floats, *, near: bool = False
+) -> Maximum:
     """Return the maximum over a family of D, common to all, and over the noise of each motion.
 
-    There are two searches where the blur is unknown, from a small and from a large one. Where the
+    There are two searches where the blur is unknown, from a small and from a large one; with `near`
+    only one, from the noise and blur that are given, those of a maximum over more D. Where the
     steps are modes a search begins with Newton steps by the noise amplitudes and the
     blur themselves: noise and blur may have nearly the same effect, and the narrow ridge of the
     likelihood is straight in these. Then it is quasi-Newton (BFGS), by their square roots and an
@@ -491,7 +494,7 @@ def maximise(tracks: Sequence[NoisyVectors], family: Family, q: Floats, own: Flo
     >>> bool(abs(data.in_units(best.D)[0, 0] - 5e-3) < 1e-3)
     True
     """
-    if tracks[0].B is not None:
+    if near or tracks[0].B is not None:
         return _searched(tracks, family, q, own)
     ratio = np.array([t.blur_ratio(family(q)[0]) for t in tracks])
     found: list[Maximum] = []

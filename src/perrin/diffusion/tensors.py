@@ -564,7 +564,8 @@ class ScaledTracks:
     def fit_axial(self, near: Maximum) -> Maximum:
         """Return the best tensor with two values equal, about any axis."""
         found = [
-            maximise(self.tracks, axial(axis), q, near.own) for axis, q in axial_starts(near.D)
+            maximise(self.tracks, axial(axis), q, near.own, near=True)
+            for axis, q in axial_starts(near.D)
         ]
         return max(found, key=lambda m: m.value)
 
@@ -697,7 +698,8 @@ def _one_fit(data: ScaledTracks, basis: Floats) -> TensorFit:
     isotropic = data.fit(_ISOTROPIC, near=free)
     known = {6: free, 1: isotropic}  # by the number of tensors that span what the symmetry allows
     best = known[len(basis)] if len(basis) in known else data.fit(basis, near=free)
-    axially = data.fit_axial(free)
+    # An isotropic tensor is axial as well: the higher of two searches counts.
+    axially = max(data.fit_axial(free), isotropic, key=lambda m: m.value)
     closer = data.reaching([free, isotropic, best, axially])
     if closer is not None:
         return _one_fit(closer, basis)
@@ -728,7 +730,8 @@ def _even_fits(data: Sequence[ScaledTracks], bases: Sequence[Floats]) -> list[Te
     pairs = [pair for one in D for pair in axial_starts(one)]
     about = axial(np.stack([axis for axis, _ in pairs]))
     q = np.stack([q for _, q in pairs])
-    tilted = maximise_each(each.rows(np.repeat(kept, 2)), about, q, np.repeat(own, 2, axis=0))
+    own_of_pairs = np.repeat(own, 2, axis=0)
+    tilted = maximise_each(each.rows(np.repeat(kept, 2)), about, q, own_of_pairs, near=True)
     sizes = np.array([len(bases[i]) for i in kept])
     for size in np.unique(sizes):
         where = np.flatnonzero(sizes == size)
@@ -753,7 +756,7 @@ def _even_fits(data: Sequence[ScaledTracks], bases: Sequence[Floats]) -> list[Te
                 (directions, errors),
                 free=peaks[k],
                 isotropic=sphere,
-                axial=max(first, last, key=lambda m: m.value),
+                axial=max(first, last, sphere, key=lambda m: m.value),
             )
     return found
 
