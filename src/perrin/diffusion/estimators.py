@@ -422,7 +422,8 @@ def precision_limits(estimate: DiffusionEstimate, steps: Sequence[Steps]) -> tup
     snr = max(estimate.snr, 0.0) * durations / estimate.dt
     share = np.divide(snr, snr + 1, out=np.ones_like(snr), where=np.isfinite(snr))
     weight = share**2
-    usual = float(np.average(durations, weights=weight)) if weight.any() else estimate.dt
+    total = float(weight.sum())
+    usual = float(weight @ durations) / total if total > 0 else estimate.dt
     step = estimate.value * usual
     planar = steps[0].vectors.shape[1] == 1
     if planar and 4 * step > _COARSE_STEP_IN_PLANE:

@@ -131,15 +131,15 @@ class Likelihood:
     @cached_property
     def mean_square(self) -> Floats:
         """Mean square step of each motion: the scale of its theta."""
-        square = np.array([np.mean(t.steps.vectors**2) for t in self.tracks])
+        square = np.array([t.steps.sum_of_squares / t.steps.vectors.size for t in self.tracks])
         floor: Floats = np.maximum(square, _SMALLEST_STEP_RATIO * square.max())
         return floor
 
     @cached_property
     def scale(self) -> Floats:
         """D of each unit that explains all of its motion without noise."""
-        moved = np.array([np.sum(t.steps.vectors**2) for t in self.tracks])
-        spent = [2 * t.steps.vectors.shape[1] * np.sum(t.steps.duration) for t in self.tracks]
+        moved = np.array([t.steps.sum_of_squares for t in self.tracks])
+        spent = [2 * t.steps.vectors.shape[1] * t.steps.total_duration for t in self.tracks]
         return self.by_unit(moved) / self.by_unit(np.array(spent))
 
     @cached_property
@@ -198,8 +198,8 @@ class Likelihood:
         square, fixed = self.mean_square, self.fixed
         shape = (*D.shape[:-1], len(square))
         if start is None:
-            spent = np.array([np.mean(t.steps.duration) for t in self.tracks])
-            start = np.maximum(0.5 * square - D * spent, 0.01 * square)
+            spent = [t.steps.total_duration / len(t.steps.duration) for t in self.tracks]
+            start = np.maximum(0.5 * square - D * np.array(spent), 0.01 * square)
         low, high = np.full(shape, _LEAST_LOG_OFFSET), np.full(shape, _MOST_LOG_OFFSET)
         t = np.log(np.maximum(np.broadcast_to(start, shape) / square, 1e-6))
         t = np.minimum(t, _MOST_LOG_OFFSET)
@@ -531,7 +531,7 @@ def _squared_deviations(tracks: Sequence[NoisySteps], D: Floats, theta: Floats) 
         noise = own_theta[:, None] * weight + known
         level = noise.mean(axis=1)
         # Uneven steps are taken as even ones of their mean duration: only a width depends on it.
-        duration = np.array([t.steps.duration.mean() for t in some])
+        duration = np.array([t.steps.total_duration for t in some]) / count
         blur = np.array([t.blur for t in some])
         by_D, by_noise = 2 * (duration[:, None] - blur[:, None] * c), 2 * c
         eigen = by_D * own_D[:, None] + by_noise * level[:, None]

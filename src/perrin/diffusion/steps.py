@@ -132,7 +132,19 @@ class Steps:
     @cached_property
     def mean_variance(self) -> float:
         """Noise variance of a component, mean over components and the ends of all steps."""
-        return 0.5 * float(sum(mean_row(end).mean() for end in self.variances))
+        before, after = self.variances
+        mean = float(mean_row(before).mean())
+        return mean if after is before else 0.5 * (mean + float(mean_row(after).mean()))
+
+    @cached_property
+    def sum_of_squares(self) -> float:
+        """Sum of the squares of all components of the steps."""
+        return float(np.vdot(self.vectors, self.vectors))
+
+    @cached_property
+    def total_duration(self) -> float:
+        """Time that all steps take, s."""
+        return float(self.duration.sum())
 
     @cached_property
     def above_least(self) -> tuple[float, Floats, tuple[Floats, Floats]]:

@@ -1019,7 +1019,8 @@ def with_step_tests(
     estimates = [coefficients[k].estimate for k in few]
     moving: dict[int, SteadyMotion] = {}
     if not noise.drift:
-        moving = dict(zip(few, steady_motion_of_each(motions, estimates), strict=True))
+        steady_motions = steady_motion_of_each(motions, estimates, level=level)
+        moving = dict(zip(few, steady_motions, strict=True))
     tested = list(coefficients)
     for k, motion, estimate in zip(few, motions, estimates, strict=True):
         one, remarks = coefficients[k], coefficients[k].remarks
