@@ -142,6 +142,14 @@ class Steps:
         return float(np.vdot(self.vectors, self.vectors))
 
     @cached_property
+    def neighbour_products(self) -> Floats:
+        """Sum of the products of neighbouring steps that share a frame, symmetric, (c, c)."""
+        linked = self.linked[:-1]
+        first, second = self.vectors[:-1], self.vectors[1:]
+        product = first.T @ second if linked.all() else first[linked].T @ second[linked]
+        return np.asarray(0.5 * (product + product.T))
+
+    @cached_property
     def total_duration(self) -> float:
         """Time that all steps take, s."""
         return float(self.duration.sum())
@@ -673,18 +681,17 @@ def body_steps(motion: RigidMotion, quantity: Quantity | Literal["both"], turn: 
     ((8, 6), (2, 9, 6, 6))
     """
     start, stop = motion.steps()
-    w = motion.step_vectors()[stop - 1]
-    displacement = motion.center[stop] - motion.center[start]
+    w, frames = motion.step_vectors()[stop - 1], len(motion.time)
     covariance, variance = unit_noise(motion)
+    displacement = motion.center[stop] - motion.center[start]
     center_noise = variance[:, None, None] * np.eye(3)
-    every = (1, len(motion.time), 3, 3)
     if quantity == "rotation":
         vectors = w @ turn.T
-        noise = np.broadcast_to(turn @ covariance @ turn.T, every)
+        noise = expanded(turn @ covariance @ turn.T, frames)[None]
     elif quantity == "translation":
         middle = motion.rotation[start] @ exp_map(0.5 * w)
         vectors = np.einsum("sji,sj->si", middle, displacement) @ turn.T
-        noise = np.broadcast_to(center_noise, every)
+        noise = expanded(center_noise, frames)[None]
     else:
         jump = np.einsum("sji,sj->si", motion.rotation[start], displacement)
         half = 0.5 * np.linalg.norm(w, axis=1)
@@ -696,7 +703,7 @@ def body_steps(motion: RigidMotion, quantity: Quantity | Literal["both"], turn: 
         once = np.cross(w, jump)
         u = jump - 0.5 * once + factor[:, None] * np.cross(w, once)
         vectors = np.concatenate([u, w], axis=1)
-        noise = np.zeros((2, len(motion.time), 6, 6))
+        noise = np.zeros((2, frames, 6, 6))
         noise[0, :, :3, :3] = center_noise
         noise[1, :, 3:, 3:] = covariance
     return Steps(

@@ -221,7 +221,7 @@ def _tensor_of(
         tensor=tensor,
         principal_values=values,
         axes=axes,
-        stderr=np.sqrt([element_variance(fit.covariance, a, a) for a in axes.T]),
+        stderr=np.sqrt(element_variances(fit.covariance, axes).diagonal()),
         p_isotropic=fit.p_isotropic,
         p_axial=fit.p_axial,
         covariance=fit.covariance,
@@ -500,7 +500,8 @@ class ScaledTracks:
             # Noise that is stored once for all frames is scaled once.
             alike = one.noise.strides[1] == 0
             shapes = (one.noise[:, :1] if alike else one.noise) / np.outer(scale, scale)
-            size = np.nanmean(np.einsum("rtaa->rt", shapes), axis=1) / 3
+            traces = np.trace(shapes, axis1=2, axis2=3)
+            size = (traces[:, 0] if alike else np.nanmean(traces, axis=1)) / 3
             shapes = np.broadcast_to(shapes / size[:, None, None, None], one.noise.shape)
             scaled = replace(
                 one,
@@ -511,7 +512,7 @@ class ScaledTracks:
             )
             if noise.model == "joint":
                 # Neighbours' covariance is minus the noise; a little more keeps the start inside.
-                square = -np.trace(neighbour_products(scaled)) / max(scaled.linked.sum(), 1)
+                square = -np.trace(scaled.neighbour_products) / max(scaled.linked.sum(), 1)
                 square = square / scaled.vectors.shape[1]
                 theta, freedom = np.full(len(size), max(float(square), 0.0) + 0.05), 0.0
             elif noise.model == "residual":
@@ -529,10 +530,10 @@ class ScaledTracks:
 
     def start(self) -> tuple[Floats, Floats]:
         """Return a D > 0 from the covariance of steps and of neighbours, and the noise (G, c)."""
-        duration = sum(float(t.steps.duration.sum()) for t in self.tracks)
+        duration = sum(t.steps.total_duration for t in self.tracks)
         products = [t.steps.vectors.T @ t.steps.vectors for t in self.tracks]
         now = np.sum(products, axis=0) / duration
-        neighbour = np.sum([neighbour_products(t.steps) for t in self.tracks], axis=0) / duration
+        neighbour = np.sum([t.steps.neighbour_products for t in self.tracks], axis=0) / duration
         values, axes = np.linalg.eigh(0.5 * now + neighbour)
         D = (axes * np.maximum(values, 0.05 * np.trace(now) / len(now))) @ axes.T
         return D, np.array([t.start() for t in self.tracks])
@@ -605,7 +606,7 @@ class ScaledTracks:
     def mean_noise(self, best: Maximum) -> Floats:
         """Return the noise of one frame less blur in um and rad, mean over motions."""
         pairs = zip(self.tracks, best.own, strict=True)
-        noise = np.mean([t.noise(best.D, own) for t, own in pairs], axis=0)
+        noise = sum(t.noise(best.D, own) for t, own in pairs) / len(self.tracks)
         out: Floats = noise * np.outer(self.scale, self.scale)
         return out
 
@@ -794,34 +795,29 @@ def axial_starts(D: Floats) -> list[tuple[Floats, Floats]]:
     ]
 
 
-def neighbour_products(steps: Steps) -> Floats:
-    """Return the summed products of neighbouring steps that share a frame, symmetric, (b, b).
+def element_variances(covariance: Floats, axes: Floats) -> Floats:
+    """Return the variances (3, 3) of a.D.b for three directions, from that of the elements of D.
+
+    Parameters
+    ----------
+    covariance : ndarray, shape (6, 6)
+        Covariance of the elements xx, yy, zz, xy, xz, yz.
+    axes : ndarray, shape (3, 3)
+        Directions as columns.
 
     Examples
     --------
-    >>> from perrin import Cluster, simulate_motion
-    >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=30, rng=3)
-    >>> neighbour_products(body_steps(truth, "rotation", np.eye(3))).shape
-    (3, 3)
+    >>> element_variances(np.diag([1.0, 2, 3, 4, 5, 6]), np.eye(3))
+    array([[1., 4., 5.],
+           [4., 2., 6.],
+           [5., 6., 3.]])
     """
-    linked = steps.linked[:-1]
-    first, second = steps.vectors[:-1], steps.vectors[1:]
-    product = first.T @ second if linked.all() else first[linked].T @ second[linked]
-    return np.asarray(0.5 * (product + product.T))
-
-
-def element_variance(covariance: Floats, a: Floats, b: Floats) -> float:
-    """Return the variance of a.D.b from the covariance of the elements of D.
-
-    Examples
-    --------
-    >>> element_variance(np.diag([1.0, 2, 3, 4, 5, 6]), np.eye(3)[0], np.eye(3)[1])
-    4.0
-    """
-    weight = np.array(
-        [a[i] * b[j] + (a[j] * b[i] if i != j else 0.0) for i, j in SYMMETRIC_ELEMENTS]
+    rows, columns = np.transpose(SYMMETRIC_ELEMENTS)
+    products = axes[rows, :, None] * axes[columns, None, :]
+    weight = np.where(
+        (rows != columns)[:, None, None], products + products.swapaxes(1, 2), products
     )
-    return float(weight @ covariance @ weight)
+    return np.asarray(np.einsum("iab,iab->ab", weight, np.tensordot(covariance, weight, 1)))
 
 
 def axis_errors(values: Floats, axes: Floats, covariance: Floats) -> Floats:
@@ -838,9 +834,9 @@ def axis_errors(values: Floats, axes: Floats, covariance: Floats) -> Floats:
     """
     errors = np.zeros((3, 3))
     rounding = 1e-9 * values[2]
+    variances = element_variances(covariance, axes)
     for a, b in ((0, 1), (0, 2), (1, 2)):
-        variance = element_variance(covariance, axes[:, a], axes[:, b])
-        apart = values[b] - values[a]
+        variance, apart = float(variances[a, b]), float(values[b] - values[a])
         off = np.sqrt(variance) if not variance < rounding**2 else 0.0
         angle = (
             EQUAL_AXES_ERROR if apart <= rounding else np.degrees(0.5 * np.arctan2(2 * off, apart))
