@@ -228,7 +228,7 @@ def find_exponent(
     True
     """
 
-    def mean_square(lag: Floats, shape: float) -> Floats:
+    def mean_square(lag: Floats, shape: Floats | float) -> Floats:
         return fractional_mean_square(lag, shape, exposure=settings.exposure or 0.0)
 
     frames: list[Literal["body", "lab"]] = ["lab" if quantity == "translation" else "body"]

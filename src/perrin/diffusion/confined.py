@@ -296,7 +296,7 @@ def find_cage_in(
     True
     """
 
-    def mean_square(lag: Floats, shape: float) -> Floats:
+    def mean_square(lag: Floats, shape: Floats | float) -> Floats:
         return confined_mean_square(lag, np.exp(shape), exposure=settings.exposure or 0.0)
 
     about: Literal["body", "mean"] = "mean" if frame == "mean" else "body"
