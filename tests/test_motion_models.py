@@ -123,7 +123,7 @@ def test_sine_modes_agree_with_the_exact_likelihood():
 
         likelihood = ShapeLikelihood(((block,),), fractional, (None,), n_axes=3)
         best, points = likelihood.best(np.linspace(0.1, 1.9, 8))
-        found.append((likelihood.at(1.0), best, likelihood.crossings(best, points, 1.0)))
+        found.append((likelihood.at(1.0), best, likelihood.crossings(best, points, [1.0])[0]))
     (free, best, (low, high)), (exact_free, exact, _) = found
     assert pytest.approx(exact_free.D, rel=1e-7) == free.D
     assert free.offset == pytest.approx(exact_free.offset, rel=1e-6)

@@ -23,7 +23,7 @@ from perrin.diffusion.steps import Quantity
 from perrin.motion.rigid_motion import RigidMotion
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Generator, Sequence
 
     from perrin._arrays import Bools, Floats
     from perrin.diffusion.steps import Steps
@@ -280,55 +280,43 @@ class ShapeLikelihood:
         return best, points
 
     def crossings(
-        self, best: ShapePoint, points: list[ShapePoint], drop: float
-    ) -> tuple[ShapePoint | None, ShapePoint | None]:
-        """Return the outermost points at which twice the value has fallen by `drop`; None if none.
+        self, best: ShapePoint, points: list[ShapePoint], drops: Sequence[float]
+    ) -> list[tuple[ShapePoint | None, ShapePoint | None]]:
+        """Return the outermost points at which twice the value has fallen by each of some drops.
 
         Parameters
         ----------
         best, points
             Result of `best`.
-        drop : float
-            Quantile of chi-squared with one degree of freedom.
+        drops : sequence of float
+            Quantiles of chi-squared with one degree of freedom.
+
+        Returns
+        -------
+        list of tuple
+            Lower and upper point for every drop; None where there is none.
         """
-        # The root of twice the fall of the value is nearly straight in the shape parameter.
-        bound = float(np.sqrt(drop))
-
-        def root(point: ShapePoint) -> float:
-            return float(np.sqrt(max(2 * (best.value - point.value), np.finfo(float).tiny)))
-
-        ends: list[ShapePoint | None] = []
-        for side in (-1, 1):
-            outward = sorted(
-                [best, *(p for p in points if side * (p.shape - best.shape) > 0)],
-                key=lambda p: side * p.shape,
-            )
-            last = max(i for i, p in enumerate(outward) if root(p) <= bound)
-            if last == len(outward) - 1:
-                ends.append(None)
-                continue
-            inside, outside = outward[last], outward[last + 1]
-
-            low, high = inside.shape, outside.shape
-            share = (bound - root(inside)) / (root(outside) - root(inside))
-            point = self.at(low + share * (high - low))
-            for _ in range(60):
-                rest = bound - root(point)
-                if abs(rest) <= _ROOT_TOLERANCE:
-                    break
-                low, high = (point.shape, high) if rest > 0 else (low, point.shape)
-                # The slope of the root is minus that of the value over the root.
-                step = -rest * root(point) / point.slope if point.slope else np.inf
-                within = min(low, high) < point.shape + step < max(low, high)
-                point = self.at(point.shape + step if within else 0.5 * (low + high))
-            ends.append(point)
-        return ends[0], ends[1]
+        searches = [crossing(best, points, drop, side) for drop in drops for side in (-1, 1)]
+        ends: list[ShapePoint | None] = [None] * len(searches)
+        wanted: dict[int, float] = {}
+        seen: dict[int, ShapePoint | None] = dict.fromkeys(range(len(searches)))
+        while seen:
+            for k, point in seen.items():
+                try:
+                    wanted[k] = next(searches[k]) if point is None else searches[k].send(point)
+                except StopIteration as stop:
+                    ends[k] = stop.value
+                    wanted.pop(k, None)
+            found = self.at_each(np.array(list(wanted.values())))
+            seen = dict(zip(wanted, found, strict=True))
+        return list(zip(ends[::2], ends[1::2], strict=True))
 
     def intervals(
         self, best: ShapePoint, points: list[ShapePoint]
     ) -> dict[float, tuple[ShapePoint | None, ShapePoint | None]]:
         """Return the ends of the 68 % and the 95 % interval; None where the data set no bound."""
-        return {level: self.crossings(best, points, drop) for level, drop in CHI2.items()}
+        ends = self.crossings(best, points, [*CHI2.values()])
+        return dict(zip(CHI2, ends, strict=True))
 
     def scale_slope(self, best: ShapePoint, reach: float) -> float:
         """Return the slope of ln D in the shape parameter along the maximum of the likelihood."""
@@ -336,6 +324,66 @@ class ShapeLikelihood:
         if not (low.D > 0 and high.D > 0):
             return np.nan
         return float(np.log(high.D / low.D) / (2 * reach))
+
+
+def crossing(
+    best: ShapePoint, points: list[ShapePoint], drop: float, side: int
+) -> Generator[float, ShapePoint, ShapePoint | None]:
+    """Search for the outermost point at which twice the value has fallen by a drop.
+
+    Parameters
+    ----------
+    best, points
+        Result of `ShapeLikelihood.best`.
+    drop : float
+        Quantile of chi-squared with one degree of freedom.
+    side : {-1, 1}
+        Towards smaller or larger shapes.
+
+    Yields
+    ------
+    float
+        Shape whose point is sent back.
+
+    Returns
+    -------
+    ShapePoint or None
+        None where the value does not fall as far.
+
+    Examples
+    --------
+    >>> top, low = ShapePoint(0.0, 0.0, 0.0, 1, 0, 0), ShapePoint(-1.0, -2.0, 4.0, 1, 0, 0)
+    >>> search = crossing(top, [low], 1.0, -1)  # twice the value falls as 4 times the square
+    >>> next(search)
+    -0.5
+    """
+    # The root of twice the fall of the value is nearly straight in the shape parameter.
+    bound = float(np.sqrt(drop))
+
+    def root(point: ShapePoint) -> float:
+        return float(np.sqrt(max(2 * (best.value - point.value), np.finfo(float).tiny)))
+
+    outward = sorted(
+        [best, *(p for p in points if side * (p.shape - best.shape) > 0)],
+        key=lambda p: side * p.shape,
+    )
+    last = max(i for i, p in enumerate(outward) if root(p) <= bound)
+    if last == len(outward) - 1:
+        return None
+    inside, outside = outward[last], outward[last + 1]
+    low, high = inside.shape, outside.shape
+    share = (bound - root(inside)) / (root(outside) - root(inside))
+    point = yield low + share * (high - low)
+    for _ in range(60):
+        rest = bound - root(point)
+        if abs(rest) <= _ROOT_TOLERANCE:
+            break
+        low, high = (point.shape, high) if rest > 0 else (low, point.shape)
+        # The slope of the root is minus that of the value over the root.
+        step = -rest * root(point) / point.slope if point.slope else np.inf
+        within = min(low, high) < point.shape + step < max(low, high)
+        point = yield point.shape + step if within else 0.5 * (low + high)
+    return point
 
 
 def step_blocks(steps: Steps, moving: Bools) -> tuple[StepBlock, ...]:
