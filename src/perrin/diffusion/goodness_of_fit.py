@@ -55,7 +55,7 @@ _NO_STEADY_MOTION = 0.2
 _CLUSTERING_LAGS = 20
 
 # About this many step components are tested at once; more do not stay in the processor's cache.
-_MOST_SCORES = 30_000
+_MOST_SCORES = 60_000
 
 FEWEST_HALF_PERIODS = 6  # of a vibration in the track
 

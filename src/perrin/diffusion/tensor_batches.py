@@ -13,10 +13,12 @@ from perrin.diffusion.tensor_likelihood import (
     FIRST_REACH,
     LEAST_BLUR,
     MOST_BLUR,
+    MOST_HESSIANS,
     MOST_STRAIGHT_STEPS,
     NEAREST_REACH,
     ROUNDING_GAIN,
     START_ANGLES,
+    STEPS_A_HESSIAN,
     STRAIGHT_GAIN,
     ArrowHessian,
     Maximum,
@@ -35,9 +37,8 @@ if TYPE_CHECKING:
     from perrin.diffusion.tensor_likelihood import Family, NoisyVectors
     from perrin.diffusion.tensor_modes import TensorSlopes
 
-# Hessians that a search may need less one, steps from one of them, and times that a step may be
-# shortened, by this factor.
-_MOST_HESSIANS, _STEPS_A_HESSIAN, _MOST_SHORTENED, _SHORTER = 20, 30, 16, 0.4
+# Times that a step may be shortened, by this factor.
+_MOST_SHORTENED, _SHORTER = 16, 0.4
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,7 +195,7 @@ def maximise_each(
     The search is that of `maximise`: with Newton steps by the noise amplitudes and the blur
     themselves, from a small and from a large blur where that is unknown; then, from the higher end
     of the two, with quasi-Newton (BFGS) ones from the Hessian, which is computed again where no
-    step increases the likelihood, and after every 30 steps.
+    step increases the likelihood, and after every ten steps.
 
     Parameters
     ----------
@@ -248,7 +249,7 @@ def maximise_each(
         step = (inverse @ slope[..., None])[..., 0]
         gain = 0.5 * np.sum(slope * step, axis=1)
         done = gain <= CONVERGED_GAIN
-        lost = ~done & (hessians >= _MOST_HESSIANS)
+        lost = ~done & (hessians >= MOST_HESSIANS)
         done |= lost & (gain <= ROUNDING_GAIN)
         over = done | lost
         if over.any():
@@ -275,7 +276,7 @@ def maximise_each(
         )
         p[active[some]], value[some], slope[some] = trial[some], height[some], ahead[some]
         steps, shorter = steps + rises, np.where(rises, 0, shorter + 1)
-        again = np.flatnonzero((steps >= _STEPS_A_HESSIAN) | (shorter >= _MOST_SHORTENED))
+        again = np.flatnonzero((steps >= STEPS_A_HESSIAN) | (shorter >= _MOST_SHORTENED))
         if again.size:
             place = p[active[again]]
             tensor = family(place[:, :m], active[again])

@@ -35,6 +35,9 @@ MOST_BLUR = 0.25
 # log-likelihood selects the least blur. It changes the log-likelihood by 0.025 at most.
 LEAST_BLUR = 0.1
 
+# Hessians of a search, and steps from one of them: near an edge searches take many steps.
+MOST_HESSIANS, STEPS_A_HESSIAN = 60, 10
+
 # Searches begin at these angles of B = sin^2/4, a small and a large blur: the likelihood of short,
 # noisy steps may have a maximum at both ends of the ridge on which noise less blur is the same.
 START_ANGLES = (0.2, 1.2)
@@ -480,7 +483,7 @@ def maximise(
     blur themselves: noise and blur may have nearly the same effect, and the narrow ridge of the
     likelihood is straight in these. Then it is quasi-Newton (BFGS), by their square roots and an
     angle, and begins with the Hessian, with the average information in it where steps are not
-    modes; it is computed again where no step increases the likelihood, and after every 30 steps.
+    modes; it is computed again where no step increases the likelihood, and after every ten steps.
     The search ends at a root of the slopes.
 
     Examples
@@ -516,9 +519,9 @@ def _searched(tracks: Sequence[NoisyVectors], family: Family, q: Floats, own: Fl
     value, slope = problem.slopes(p)
     if all(t.mode_track is not None for t in tracks):
         p, value, slope = problem.climbed(p, value, slope)
-    for _ in range(20):
+    for _ in range(MOST_HESSIANS):
         inverse = problem.curvatures(p).inverse()
-        for _ in range(30):
+        for _ in range(STEPS_A_HESSIAN):
             step = inverse @ slope
             gain = 0.5 * float(slope @ step)
             if gain <= CONVERGED_GAIN:
