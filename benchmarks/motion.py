@@ -188,7 +188,7 @@ def pool_row(task):
     model, p = even_model(n_steps), []
     for _ in range(pools):
         y = with_noise(steps_of_kind("brownian", n_steps, tracks, rng), 5.0, rng)
-        p.append(list(combined_p([brownian_tests(model, one[None]) for one in y]).values()))
+        p.append(list(combined_p([brownian_tests(model, one[None]).summary for one in y]).values()))
     p, cells, bad = np.array(p), [], 0
     for one in p.T:
         at_5, at_1 = np.mean(one < 0.05), np.mean(one < 0.01)

@@ -17,10 +17,7 @@ def leave_out_tensors(patch: pytest.MonkeyPatch) -> None:
 
 def leave_out_verdicts(patch: pytest.MonkeyPatch) -> None:
     """Judge no motion: that takes up to half of the time; tests/test_run_verdicts.py tests it."""
-    patch.setattr(
-        "perrin.run.measure.judge_each_and_all",
-        lambda motions, **_: ([None] * len(motions), None),
-    )
+    patch.setattr("perrin.run.measure.judge_alone", lambda motions, **_: [None] * len(motions))
 
 
 def make_figures_without_rendering(patch: pytest.MonkeyPatch) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +10,7 @@ from scipy import stats
 
 import perrin
 from brownian_motions import brownian_motion, tetrahedron, with_poses
-from perrin.diffusion import NoisySteps, Score, combined_p, detectable_by, steps_of
+from perrin.diffusion import BrownianSummary, NoisySteps, Score, combined_p, detectable_by, steps_of
 from perrin.diffusion.step_tests import (
     Jumps,
     StageJumps,
@@ -382,12 +381,7 @@ def test_jumps_of_the_stage_over_gaps_and_of_some_bodies():
 def judged(*, D, tau, n_steps, information, p=None, value=0.0):
     """Return what a verdict uses of the tests of one motion."""
     score = Score(np.array([value]), np.full((4, 1), information / 4), np.zeros((4, 1)))
-    return SimpleNamespace(
-        p=p,
-        scores=(score, score),
-        fit=SimpleNamespace(D=np.array([D])),
-        model=SimpleNamespace(tau=np.full(n_steps, tau), n_steps=n_steps),
-    )
+    return BrownianSummary(p or {}, (score, score), n_steps, float(np.mean(D)), tau)
 
 
 def test_what_a_track_could_have_shown_is_its_arithmetic():
@@ -419,14 +413,9 @@ def test_p_values_of_several_motions_are_fishers_and_those_of_added_scores():
         joined = stats.chi2.sf(-2 * np.log(p[0][name] * p[1][name]), 4)
         assert combined_p(short)[name] == pytest.approx(joined)
     assert combined_p(short[:1]) == p[0]
-    long = [replace_model(one, 100) for one in short]
+    long = [one._replace(n_steps=100) for one in short]
     found = combined_p(long)
     # The sum of the scores is 6, of variance 18, and normal: sqrt(2) standard deviations.
     assert found["fractional"] == pytest.approx(2 * stats.norm.sf(np.sqrt(2)), rel=1e-3)
     assert found["steady"] == pytest.approx(combined_p(short)["steady"])
     assert found["cage"] == pytest.approx(stats.norm.sf(np.sqrt(2)), rel=1e-3)
-
-
-def replace_model(one, n_steps):
-    """Return tests of a longer motion."""
-    return SimpleNamespace(**(vars(one) | {"model": SimpleNamespace(n_steps=n_steps)}))

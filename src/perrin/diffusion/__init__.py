@@ -59,6 +59,7 @@ from perrin.diffusion.estimators import (
 from perrin.diffusion.goodness_of_fit import (
     AxisFit,
     AxisModel,
+    BrownianSummary,
     BrownianTests,
     Score,
     approximate_p,
@@ -238,7 +239,15 @@ from perrin.diffusion.tensors import (
     tensor_fits,
     tensor_of_each,
 )
-from perrin.diffusion.verdict import MotionVerdict, combined_p, detectable_by, judge_motion
+from perrin.diffusion.verdict import (
+    JudgedMotion,
+    MotionVerdict,
+    combined_p,
+    detectable_by,
+    judge_each,
+    judge_motion,
+    judge_together,
+)
 from perrin.diffusion.viscoelasticity import Moduli, curve_covariance, viscoelastic_moduli
 
 __all__ = [
@@ -247,6 +256,7 @@ __all__ = [
     "ArrowHessian",
     "AxisFit",
     "AxisModel",
+    "BrownianSummary",
     "BrownianTests",
     "CagePeak",
     "ChainTrack",
@@ -267,6 +277,7 @@ __all__ = [
     "Found",
     "GridLags",
     "GroupSlopes",
+    "JudgedMotion",
     "Jumps",
     "Likelihood",
     "LongTimeEstimate",
@@ -387,8 +398,10 @@ __all__ = [
     "imposed_symmetry",
     "information",
     "invariant_basis",
+    "judge_each",
     "judge_motion",
     "judge_sampling",
+    "judge_together",
     "largest_share",
     "leave_one_out_residuals",
     "likelihood_of_each",

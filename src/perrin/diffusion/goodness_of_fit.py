@@ -970,6 +970,29 @@ def fisher(p: Sequence[float]) -> float:
     return float(gammaincc(logs.size, logs.sum()))
 
 
+class BrownianSummary(NamedTuple):
+    """What the tests of one motion contribute to the verdict on several.
+
+    Attributes
+    ----------
+    p : dict of str to float
+        p-value of every test, as in `BrownianTests`.
+    scores : tuple of Score
+        Of fractional and of confined motion.
+    n_steps : int
+    mean_D : float
+        Mean over the axes.
+    mean_tau : float
+        Mean duration of a step, s.
+    """
+
+    p: dict[str, float]
+    scores: tuple[Score, Score]
+    n_steps: int
+    mean_D: float
+    mean_tau: float
+
+
 @dataclass(frozen=True, eq=False)
 class BrownianTests:
     """The tests of one motion against Brownian motion with constant noise.
@@ -1002,9 +1025,10 @@ class BrownianTests:
         frozen(self.u)
 
     @cached_property
-    def mean_D(self) -> float:
-        """Mean D of the axes."""
-        return float(self.fit.D.mean())
+    def summary(self) -> BrownianSummary:
+        """What the verdict on several motions needs."""
+        mean_D, model = float(self.fit.D.mean()), self.model
+        return BrownianSummary(self.p, self.scores, model.n_steps, mean_D, model.mean_tau)
 
 
 def brownian_tests(model: AxisModel, y: Floats) -> BrownianTests:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings as python_warnings
 from collections import Counter
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from perrin.diffusion.estimate import DiffusionEstimate
 from perrin.diffusion.estimators import estimate_diffusion, estimate_each
 from perrin.diffusion.goodness_of_fit import (
     FEWEST_HALF_PERIODS,
+    BrownianSummary,
     BrownianTests,
     Score,
     axis_models,
@@ -242,31 +243,115 @@ def judge_motion(
         faults.append("noise: expected no drift; the verdict tests for a steady motion itself")
     refuse(faults)
     settings = Noise.of(noise, exposure=exposure)
-    tested = brownian_tests_of_each(axis_models(motions, quantity, settings), progress=progress)
-    singly = [
-        _verdict([m], [one], quantity, settings) for m, one in zip(motions, tested, strict=True)
-    ]
-    each = tuple(_with_models(motions, singly, settings))
-    if len(motions) == 1:
-        return each[0]
-    together = _verdict(motions, tested, quantity, settings)
-    counts = Counter(one.kind for one in each).most_common()
+    each = judge_each(motions, quantity=quantity, noise=settings, progress=progress)
+    return each[0].verdict if len(each) == 1 else judge_together(motions, each, noise=settings)
+
+
+class JudgedMotion(NamedTuple):
+    """The verdict on one motion, and what its tests contribute to that on several.
+
+    Attributes
+    ----------
+    verdict : MotionVerdict
+    tests : BrownianSummary
+    """
+
+    verdict: MotionVerdict
+    tests: BrownianSummary
+
+
+def judge_each(
+    motions: Sequence[RigidMotion],
+    *,
+    quantity: Quantity,
+    noise: Noise,
+    progress: Callable[[], None] | None = None,
+) -> list[JudgedMotion]:
+    """Judge several motions, each alone, as `judge_motion`; their tests are computed together.
+
+    Parameters
+    ----------
+    motions : sequence of RigidMotion
+    quantity : {"rotation", "translation"}
+    noise : Noise
+        Without drift.
+    progress : callable, optional
+        Is called after each motion that has been tested.
+
+    Raises
+    ------
+    TooFewFramesError, ValueError
+        As in `judge_motion`.
+
+    Examples
+    --------
+    >>> from perrin import Cluster, simulate_motion
+    >>> free = simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=300, rng=3)
+    >>> [one.verdict.kind for one in judge_each([free, free], quantity="rotation", noise=Noise())]
+    ['diffusion', 'diffusion']
+    """
+    tested = brownian_tests_of_each(axis_models(motions, quantity, noise), progress=progress)
+
+    def verdict_on(motion: RigidMotion, tests: BrownianTests) -> MotionVerdict:
+        return _verdict(
+            [motion], [tests.summary], lambda: [tests], quantity=quantity, settings=noise
+        )
+
+    verdicts = _with_models(motions, [*map(verdict_on, motions, tested)], noise)
+    return [JudgedMotion(v, one.summary) for v, one in zip(verdicts, tested, strict=True)]
+
+
+def judge_together(
+    motions: Sequence[RigidMotion], each: Sequence[JudgedMotion], *, noise: Noise
+) -> MotionVerdict:
+    """Judge several motions together from the tests of each; the verdicts on each are in it.
+
+    Parameters
+    ----------
+    motions : sequence of RigidMotion
+    each : sequence of JudgedMotion
+        Result of `judge_each` for these motions, perhaps in several parts.
+    noise : Noise
+        As in `judge_each`.
+
+    Examples
+    --------
+    >>> from perrin import Cluster, simulate_motion
+    >>> free = simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=300, rng=3)
+    >>> each = judge_each([free, free], quantity="rotation", noise=Noise())
+    >>> judge_together([free, free], each, noise=Noise()).text[-20:]
+    'Singly: 2 diffusion.'
+    """
+    quantity = each[0].verdict.quantity
+
+    def tests() -> list[BrownianTests]:
+        return brownian_tests_of_each(axis_models(motions, quantity, noise))
+
+    summaries = [one.tests for one in each]
+    together = _verdict(motions, summaries, tests, quantity=quantity, settings=noise)
+    verdicts = tuple(one.verdict for one in each)
+    counts = Counter(one.kind for one in verdicts).most_common()
     kinds = ", ".join(f"{count} {kind}" for kind, count in counts)
-    return replace(together, text=f"{together.text} Singly: {kinds}.", each=each)
+    return replace(together, text=f"{together.text} Singly: {kinds}.", each=verdicts)
 
 
 def _verdict(
     motions: Sequence[RigidMotion],
-    tested: Sequence[BrownianTests],
+    summaries: Sequence[BrownianSummary],
+    tests: Callable[[], Sequence[BrownianTests]],
+    *,
     quantity: Quantity,
     settings: Noise,
 ) -> MotionVerdict:
-    """Return the verdict on motions that were tested one by one."""
-    p = combined_p(tested)
+    """Return the verdict on motions; what names the motion needs `tests`, if one of them rejects.
+
+    Bodies by the thousand are judged from the summaries, and their tests would need much memory.
+    """
+    p = combined_p(summaries)
     p_family = holm(np.array(list(p.values())))
-    detectable = detectable_by(tested, quantity)
+    detectable = detectable_by(summaries, quantity)
     text = _diffusion_text(p_family, len(p), detectable, quantity)
-    turn = max(4 * one.mean_D * one.model.mean_tau for one in tested)
+    turn = max(4 * one.mean_D * one.mean_tau for one in summaries)
     if quantity == "rotation" and motions[0].dimension == 3 and turn > _COARSE_TURN:
         detectable = dict.fromkeys(detectable)
         text = (
@@ -287,7 +372,7 @@ def _verdict(
     )
     if p_family > LEVEL:
         return verdict
-    first = min(p, key=lambda name: p[name])
+    tested, first = tests(), min(p, key=lambda name: p[name])
     if first == "line":
         peaks = []
         for one in tested:
@@ -311,7 +396,7 @@ def _verdict(
     return _variance(verdict, motions, tested)
 
 
-def combined_p(tested: Sequence[BrownianTests]) -> dict[str, float]:
+def combined_p(tested: Sequence[BrownianSummary]) -> dict[str, float]:
     """Return the p-values of all motions together.
 
     Scores and informations of the exponent and of the cage add; the p-values of the other tests are
@@ -324,7 +409,7 @@ def combined_p(tested: Sequence[BrownianTests]) -> dict[str, float]:
     >>> tested = [
     ...     brownian_tests(*axis_model(
     ...         simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=300, rng=seed),
-    ...         "rotation", Noise()))
+    ...         "rotation", Noise())).summary
     ...     for seed in (3, 4)
     ... ]
     >>> 0 < combined_p(tested)["cage"] < 1
@@ -333,14 +418,14 @@ def combined_p(tested: Sequence[BrownianTests]) -> dict[str, float]:
     if len(tested) == 1:
         return dict(tested[0].p)
     p = {name: fisher([one.p[name] for one in tested]) for name in tested[0].p}
-    if sum(one.model.n_steps for one in tested) >= 200:
+    if sum(one.n_steps for one in tested) >= 200:
         for i, name in enumerate(("fractional", "cage")):
             total = Score.total([one.scores[i] for one in tested])
             p[name] = float(score_p(total, one_sided=name == "cage")[0])
     return p
 
 
-def detectable_by(tested: Sequence[BrownianTests], quantity: Quantity) -> dict[str, float | None]:
+def detectable_by(tested: Sequence[BrownianSummary], quantity: Quantity) -> dict[str, float | None]:
     """Return what these tracks together could have shown.
 
     An exponent that differs from 1 by 2.8 standard errors; a cage of rms radius r with 12
@@ -352,7 +437,7 @@ def detectable_by(tested: Sequence[BrownianTests], quantity: Quantity) -> dict[s
     >>> from perrin import Cluster, simulate_motion
     >>> from perrin.diffusion import Noise, axis_model, brownian_tests
     >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=300, rng=3)
-    >>> tests = brownian_tests(*axis_model(truth, "rotation", Noise()))
+    >>> tests = brownian_tests(*axis_model(truth, "rotation", Noise())).summary
     >>> {name: round(x, 2) for name, x in detectable_by([tests], "rotation").items() if x}
     {'alpha_below': 0.77, 'alpha_above': 1.23, 'cage': 0.42, 'spin': 0.02}
     """
@@ -360,8 +445,7 @@ def detectable_by(tested: Sequence[BrownianTests], quantity: Quantity) -> dict[s
     reach = _DETECTED / np.sqrt(information)
     lengths, speeds = [], []
     for one in tested:
-        D, tau = one.mean_D, one.model.mean_tau
-        n = one.model.n_steps
+        D, tau, n = one.mean_D, one.mean_tau, one.n_steps
         lengths.append(np.sqrt(2 * D * tau * n / _RELAXATIONS_SEEN))
         speeds.append(_DETECTED_MEAN * np.sqrt(2 * D / (n * tau)))
     steady = float(min(speeds))

@@ -137,7 +137,8 @@ from perrin.run.tables import analyze, read_table
 from perrin.run.verdicts import (
     fit_model,
     is_at_rest,
-    judge_each_and_all,
+    judge_alone,
+    judge_pool,
     verdicts_from_dict,
     verdicts_to_dict,
 )
@@ -216,9 +217,10 @@ __all__ = [
     "is_known",
     "is_noise_floor",
     "is_not_diffusion",
+    "judge_alone",
     "judge_bodies",
     "judge_coefficient",
-    "judge_each_and_all",
+    "judge_pool",
     "jump_warning",
     "jumps_verdict_text",
     "kinds_text",

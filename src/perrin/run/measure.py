@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import platform
 import warnings as python_warnings
 from dataclasses import dataclass, field, replace
@@ -72,7 +71,7 @@ from perrin.run.results import (
     predicted_noise,
 )
 from perrin.run.singles import measure_singles
-from perrin.run.verdicts import fit_model, judge_each_and_all
+from perrin.run.verdicts import fit_model, judge_alone, judge_pool
 from perrin.tracks.clock import frame_stride, own_times, read_clock
 from perrin.tracks.clusters import each_cluster
 from perrin.tracks.identity import Identity, settle_each
@@ -92,7 +91,7 @@ if TYPE_CHECKING:
     from perrin._arrays import Bools, Floats, Ints
     from perrin.diffusion.noise_model import Noise
     from perrin.diffusion.tensor_results import DiffusionTensor
-    from perrin.diffusion.verdict import MotionVerdict
+    from perrin.diffusion.verdict import JudgedMotion, MotionVerdict
     from perrin.motion.floor import NoiseFloor
     from perrin.run.batches import InOrder
     from perrin.run.workers import Work
@@ -205,6 +204,8 @@ class Coefficient:
         Warnings and notes on this coefficient.
     verdict : MotionVerdict or None
         What kind of motion it is; None until it is judged, and where it cannot be.
+    judged : JudgedMotion or None
+        The verdict on the whole motion, without what the tests for jumps found.
     """
 
     estimate: DiffusionEstimate
@@ -215,6 +216,7 @@ class Coefficient:
     brownian: bool
     remarks: Remarks
     verdict: MotionVerdict | None = None
+    judged: JudgedMotion | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -760,7 +762,7 @@ def measure_bodies(
 def measure_together(
     bodies: Sequence[FittedBody], experiment: Experiment, recording: Recording, *, tested: int
 ) -> tuple[list[MeasuredBody], list[tuple[str, ValueError]]]:
-    """Estimate the coefficients and the tensors of some bodies, and collect the remarks on them.
+    """Estimate the coefficients and the tensors of some bodies, judge their motions, and remark.
 
     Parameters
     ----------
@@ -781,13 +783,19 @@ def measure_together(
         measure_coefficients(bodies, quantity, experiment, recording, tested=tested)
         for quantity in get_args(Quantity)
     ]
-    found: list[tuple[FittedBody, Coefficient, Coefficient]] = []
+    measured: list[FittedBody] = []
+    turns: list[Coefficient] = []
+    paths: list[Coefficient] = []
     for body, turn, path in zip(bodies, *coefficients, strict=True):
         if isinstance(turn, Coefficient) and isinstance(path, Coefficient):
-            found.append((body, turn, path))
+            measured.append(body)
+            turns.append(turn)
+            paths.append(path)
             continue
         error = path if isinstance(turn, Coefficient) else turn
         failures.append((body.tracks.label or str(body.tracks.cluster), error))
+    turns, paths = (judge_coefficients(some, experiment.noise) for some in (turns, paths))
+    found = list(zip(measured, turns, paths, strict=True))
     turning = [
         turn.motion
         if turn.estimate.drift is None
@@ -810,6 +818,31 @@ def measure_together(
         for k, one in enumerate(found)
     ]
     return results, failures
+
+
+def judge_coefficients(coefficients: Sequence[Coefficient], noise: Noise) -> list[Coefficient]:
+    """Judge the whole motions that some coefficients of one quantity were estimated from.
+
+    Parameters
+    ----------
+    coefficients : sequence of Coefficient
+    noise : Noise
+
+    Returns
+    -------
+    list of Coefficient
+        The same with `judged`.
+    """
+    shown = [k for k, one in enumerate(coefficients) if one.estimate.absent_because is None]
+    if not shown:
+        return list(coefficients)
+    alone = judge_alone(
+        [coefficients[k].whole for k in shown],
+        quantity=coefficients[shown[0]].estimate.quantity,
+        noise=noise,
+    )
+    judged = dict(zip(shown, alone, strict=True))
+    return [replace(one, judged=judged.get(k)) for k, one in enumerate(coefficients)]
 
 
 def measured_body(
@@ -1091,12 +1124,7 @@ def measure_kinds(
     kinds: list[BodyKind] = []
     found: list[tuple[str, str]] = []
 
-    total, counter = 2 * len(measured), itertools.count(1)
-
-    def tested() -> None:
-        if progress is not None:
-            progress(min(next(counter), total), total, "judging the motion")
-
+    total = 2 * len(measured)
     if progress is not None:
         progress(0, total, "judging the motion")
     for number in np.unique(shapes).tolist():
@@ -1106,7 +1134,6 @@ def measure_kinds(
             experiment,
             first_frame=first_frame,
             tested=len(measured),
-            progress=tested,
         )
         pooled, texts = pool_clusters(part, experiment, together)
         judged += part
@@ -1144,9 +1171,8 @@ def judge_bodies(
     *,
     first_frame: int,
     tested: int,
-    progress: Callable[[], None] | None = None,
 ) -> tuple[list[MeasuredBody], dict[str, MotionVerdict | None]]:
-    """Judge what kind of motion every body shows, and all rigid ones together.
+    """State what kind of motion every body shows, and judge all rigid ones together.
 
     Parameters
     ----------
@@ -1156,8 +1182,6 @@ def judge_bodies(
         The table's own number of its first frame.
     tested : int
         Number of clusters that share the level of a warning.
-    progress : callable, optional
-        Is called after each of two coefficients of a body whose steps have been tested.
 
     Returns
     -------
@@ -1173,24 +1197,23 @@ def judge_bodies(
         ("translation", [one.translation for one in measured]),
     ):
         shown = [i for i, c in enumerate(coefficients) if c.estimate.absent_because is None]
-        each, common = judge_each_and_all(
-            [coefficients[i].whole for i in shown],
-            quantity=coefficients[0].estimate.quantity if coefficients else "rotation",
-            noise=experiment.noise,
-            pooled=[measured[i].body.quality.rigid for i in shown],
-            progress=progress,
-        )
         judged[quantity] = list(coefficients)
-        for i, verdict in zip(shown, each, strict=True):
+        for i in shown:
+            alone = coefficients[i].judged
             judged[quantity][i] = judge_coefficient(
                 coefficients[i],
-                verdict,
+                None if alone is None else alone.verdict,
                 measured[i].body,
                 experiment,
                 first_frame=first_frame,
                 tested=tested,
             )
         used = [i for i in shown if measured[i].body.quality.rigid]
+        common = judge_pool(
+            [coefficients[i].whole for i in used],
+            [coefficients[i].judged for i in used],
+            noise=experiment.noise,
+        )
         if common is not None and len(used) > 1:
             jumped = [i for i in used if judged[quantity][i].left_out.size]
             if jumped:

@@ -12,7 +12,7 @@ from perrin.diffusion.anomalous import fit_anomalous
 from perrin.diffusion.confined import fit_confined
 from perrin.diffusion.step_tests import without_spin
 from perrin.diffusion.switching import fit_switching
-from perrin.diffusion.verdict import MotionVerdict, judge_motion
+from perrin.diffusion.verdict import MotionVerdict, judge_each, judge_together
 from perrin.errors import PrecisionWarning
 
 if TYPE_CHECKING:
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from perrin.diffusion.estimate import DiffusionEstimate
     from perrin.diffusion.noise_model import Noise
     from perrin.diffusion.steps import Quantity
-    from perrin.diffusion.verdict import Model
+    from perrin.diffusion.verdict import JudgedMotion, Model
     from perrin.motion.rigid_motion import RigidMotion
     from perrin.run.experiment import MotionModel
 
@@ -49,15 +49,10 @@ def is_at_rest(motion: RigidMotion, quantity: Quantity) -> bool:
     return bool(np.ptp(path, axis=0).max(initial=0.0) <= 1e-13 * size)
 
 
-def judge_each_and_all(
-    motions: Sequence[RigidMotion],
-    *,
-    quantity: Quantity,
-    noise: Noise,
-    pooled: Sequence[bool],
-    progress: Callable[[], None] | None = None,
-) -> tuple[list[MotionVerdict | None], MotionVerdict | None]:
-    """Judge every motion, and several of them together, testing each motion once.
+def judge_alone(
+    motions: Sequence[RigidMotion], *, quantity: Quantity, noise: Noise
+) -> list[JudgedMotion | None]:
+    """Judge every motion that can be judged.
 
     Parameters
     ----------
@@ -66,17 +61,11 @@ def judge_each_and_all(
     quantity : {"rotation", "translation"}
     noise : Noise
         What the estimates assume of the noise.
-    pooled : sequence of bool
-        Which motions are judged together.
-    progress : callable, optional
-        Is called after each motion that has been tested.
 
     Returns
     -------
-    each : list of MotionVerdict or None
+    list of JudgedMotion or None
         None for a motion of fewer than 20 steps, and for a body without this motion.
-    together : MotionVerdict or None
-        Verdict on the pooled motions that can be judged; None if there are none.
 
     Examples
     --------
@@ -85,46 +74,63 @@ def judge_each_and_all(
     ...     simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=n, rng=3)
     ...     for n in (300, 10)
     ... )
-    >>> each, together = judge_each_and_all(
-    ...     [long, short], quantity="rotation", noise=Noise(), pooled=[True, True]
-    ... )
-    >>> each[0].kind, each[1], together is each[0]
-    ('diffusion', None, True)
+    >>> first, second = judge_alone([long, short], quantity="rotation", noise=Noise())
+    >>> first.verdict.kind, second
+    ('diffusion', None)
     """
     settings = replace(noise, drift=False)
 
-    def judged(
-        some: RigidMotion | list[RigidMotion], report: Callable[[], None] | None = None
-    ) -> MotionVerdict | None:
-        bodies = some if isinstance(some, list) else [some]
-        if any(is_at_rest(body, quantity) for body in bodies):
-            return None
+    def judged(some: Sequence[RigidMotion]) -> list[JudgedMotion | None]:
         with python_warnings.catch_warnings():
             python_warnings.simplefilter("ignore", PrecisionWarning)
             try:
-                return judge_motion(some, quantity=quantity, noise=settings, progress=report)
+                return [*judge_each(some, quantity=quantity, noise=settings)]
             except ValueError:
-                return None
+                # The one that cannot be judged is found by itself.
+                return [None] if len(some) == 1 else [one for m in some for one in judged([m])]
 
-    each: list[MotionVerdict | None] = [None] * len(motions)
-    used = [i for i, one in enumerate(pooled) if one]
-    together = judged([motions[i] for i in used], progress) if len(used) > 1 else None
-    if together is not None:
-        for i, one in zip(used, together.each, strict=True):
-            each[i] = one
-        together = replace(together, each=())
-    each = [
-        judged(m, progress) if one is None else one for m, one in zip(motions, each, strict=True)
-    ]
-    if together is not None:
-        return each, together
-    known = [i for i in used if each[i] is not None]
-    if len(known) == 1:
-        together = each[known[0]]
-    elif 1 < len(known) < len(used):
-        together = judged([motions[i] for i in known])
-        together = together and replace(together, each=())
-    return each, together
+    moving = [k for k, motion in enumerate(motions) if not is_at_rest(motion, quantity)]
+    found = dict(zip(moving, judged([motions[k] for k in moving]) if moving else [], strict=True))
+    return [found.get(k) for k in range(len(motions))]
+
+
+def judge_pool(
+    motions: Sequence[RigidMotion], judged: Sequence[JudgedMotion | None], *, noise: Noise
+) -> MotionVerdict | None:
+    """Judge together the motions that could be judged alone.
+
+    Parameters
+    ----------
+    motions : sequence of RigidMotion
+    judged : sequence of JudgedMotion or None
+        Result of `judge_alone` for these motions.
+    noise : Noise
+
+    Returns
+    -------
+    MotionVerdict or None
+        The verdict on one motion, if only one could be judged; None if none could.
+
+    Examples
+    --------
+    >>> from perrin import Cluster, Noise, simulate_motion
+    >>> free = simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=300, rng=3)
+    >>> alone = judge_alone([free, free], quantity="rotation", noise=Noise())
+    >>> judge_pool([free, free], alone, noise=Noise()).n_frames
+    600
+    """
+    known = [k for k, one in enumerate(judged) if one is not None]
+    each = [one for one in judged if one is not None]
+    if len(each) < 2:
+        return each[0].verdict if each else None
+    with python_warnings.catch_warnings():
+        python_warnings.simplefilter("ignore", PrecisionWarning)
+        try:
+            settings = replace(noise, drift=False)
+            together = judge_together([motions[k] for k in known], each, noise=settings)
+        except ValueError:
+            return None
+    return replace(together, each=())
 
 
 def fit_model(
