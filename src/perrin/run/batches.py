@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -32,14 +33,18 @@ class InOrder(Protocol):
 
 
 @dataclass(frozen=True)
-class _NumberedTask:
-    """A task whose result has the number of its batch."""
+class _PickledTask:
+    """A task on numbered batches that are pickled, and whose results are.
+
+    Dask sends every array of a batch, tens of thousands of small ones, by itself: that takes as
+    long as the work.
+    """
 
     task: Callable[[list[Any]], Any]
 
-    def __call__(self, item: tuple[int, list[Any]]) -> tuple[int, Any]:
+    def __call__(self, item: tuple[int, bytes]) -> tuple[int, bytes]:
         number, batch = item
-        return number, self.task(batch)
+        return number, pickle.dumps(self.task(pickle.loads(batch)))
 
 
 def clusters_together(count: int, poses: int) -> int:
@@ -120,13 +125,14 @@ def shared_work(work: Work | None) -> Iterator[InOrder]:
     with dask_client(work.workers, work.scheduler) as client:
 
         def shared(task: Callable[[list[S]], T], batches: Iterable[list[S]]) -> Iterator[T]:
-            done: dict[int, T] = {}
-            numbered, expected = list(enumerate(batches)), 0
-            found = work_through(_NumberedTask(task), numbered, client=client, at_once=1)
+            done: dict[int, bytes] = {}
+            numbered = [(k, pickle.dumps(batch)) for k, batch in enumerate(batches)]
+            expected = 0
+            found = work_through(_PickledTask(task), numbered, client=client, at_once=1)
             for number, result in found:
                 done[number] = result
                 while expected in done:
-                    yield done.pop(expected)
+                    yield pickle.loads(done.pop(expected))
                     expected += 1
 
         yield shared
