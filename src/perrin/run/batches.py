@@ -126,7 +126,7 @@ def shared_work(work: Work | None) -> Iterator[InOrder]:
 
         def shared(task: Callable[[list[S]], T], batches: Iterable[list[S]]) -> Iterator[T]:
             done: dict[int, bytes] = {}
-            numbered = [(k, pickle.dumps(batch)) for k, batch in enumerate(batches)]
+            numbered = ((k, pickle.dumps(batch)) for k, batch in enumerate(batches))
             expected = 0
             found = work_through(_PickledTask(task), numbered, client=client, at_once=1)
             for number, result in found:

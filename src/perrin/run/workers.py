@@ -8,13 +8,14 @@ import warnings
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from perrin._arrays import flag_fault, number_fault, numpy_to_python, refuse
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable, Iterable, Iterator
     from typing import TypeAlias
 
     from threadpoolctl import ThreadpoolController
@@ -109,7 +110,7 @@ class Work:
 
 def work_through(
     task: Callable[[S], T],
-    items: Sequence[S],
+    items: Iterable[S],
     *,
     workers: int = 0,
     scheduler: str | None = None,
@@ -122,7 +123,7 @@ def work_through(
     ----------
     task : callable
         ``task(item)``; task, items and results can be pickled for other processes.
-    items : sequence
+    items : iterable
     workers : int
         Number of processes of this machine; 0 does the work in this one.
     scheduler : str, optional
@@ -161,12 +162,13 @@ def work_through(
     with opened as client:
         from distributed import KilledWorker, as_completed
 
-        chunks = [list(items[k : k + at_once]) for k in range(0, len(items), at_once)]
-        tasks = [task] * len(chunks)
+        rest, futures = iter(items), []
         with warnings.catch_warnings():
             # The items are the data: they have to be sent, and again where a worker is lost.
             warnings.filterwarnings("ignore", "Sending large graph", UserWarning)
-            futures = client.map(_several_items, tasks, chunks, pure=False, retries=0)
+            # Workers begin with the first items while the others are made.
+            while chunk := list(islice(rest, at_once)):
+                futures.append(client.submit(_several_items, task, chunk, pure=False, retries=0))
         try:
             for future in as_completed(futures, loop=client.loop):
                 yield from future.result()
@@ -318,5 +320,5 @@ def dask_client(workers: int, scheduler: str | None) -> Iterator[Any]:
                 "work anew; move the work into a function, and end the script with\n"
                 'if __name__ == "__main__":\n    main()'
             ) from None
-    with cluster, Client(cluster, set_as_default=False) as client:
+    with cluster, Client(cluster, set_as_default=False, direct_to_workers=True) as client:
         yield client
