@@ -1,12 +1,16 @@
 """Many motions at once give what each of them gives alone."""
 
+from dataclasses import replace
+
 import numpy as np
 import pandas as pd
 import pytest
 
 from perrin import (
     Cluster,
+    Confined,
     Noise,
+    Spin,
     Switching,
     add_noise,
     analyze,
@@ -18,11 +22,19 @@ from perrin import (
 )
 from perrin.diffusion import (
     axis_model,
+    axis_models,
     brownian_tests,
     brownian_tests_of_each,
     estimate_each,
     estimate_pooled,
     fit_switching_each,
+    judge_each,
+    judge_motion,
+    judge_together,
+    principal_steps,
+    principal_steps_of_each,
+    steps_of,
+    steps_of_each,
     tensor_of_each,
 )
 from perrin.errors import TooFewFramesError
@@ -82,15 +94,58 @@ def test_tensors(motions, noise):
         assert one.symmetry == alone.symmetry
 
 
+@pytest.mark.parametrize("frame", ["body", "lab", "mean"])
+@pytest.mark.parametrize("quantity", ["rotation", "translation"])
+def test_steps(motions, quantity, frame):
+    """Steps, their noise and steady motion are those of each motion alone, to rounding."""
+    copies = [replace(motion) for motion in motions]  # no steps are known of them
+    plain = steps_of_each(copies, quantity)
+    turned = principal_steps_of_each(copies, quantity, frame=frame)
+    for motion, *together in zip(motions, plain, turned, strict=True):
+        own = replace(motion)
+        alone = steps_of(own, quantity), principal_steps(own, quantity, frame=frame)
+        for one, expected in zip(together, alone, strict=True):
+            for name in ("vectors", "duration", "noise", "steady"):
+                found, wanted = getattr(one, name), getattr(expected, name)
+                np.testing.assert_allclose(found, wanted, rtol=1e-12, atol=1e-15)
+            assert one.complete == pytest.approx(expected.complete, rel=1e-12)
+            assert (one.freedom, one.even) == (expected.freedom, expected.even)
+
+
 @pytest.mark.parametrize("quantity", ["rotation", "translation"])
 def test_tests_against_diffusion(motions, quantity):
     """p-values are those of single tests, to 1e-9."""
-    each = [axis_model(motion, quantity, Noise()) for motion in motions[:3]]
+    each = axis_models(motions[:3], quantity, Noise())
+    for (_, y), motion in zip(each, motions, strict=False):
+        np.testing.assert_allclose(y, axis_model(motion, quantity, Noise())[1], rtol=1e-12)
     for one, alone in zip(brownian_tests_of_each(each), each, strict=True):
         expected = brownian_tests(*alone)
         assert one.p == pytest.approx(expected.p, rel=1e-9)
         np.testing.assert_allclose(one.u, expected.u, rtol=1e-9)
         assert one.ranked == expected.ranked
+
+
+@pytest.mark.filterwarnings("ignore::perrin.errors.PrecisionWarning")
+def test_verdicts_of_parts():
+    """Motions that are judged in two parts have the verdicts, alone and together, of one call."""
+    dynamics = (Spin(0.1), None, Spin(0.2), Confined(4.0), Spin(0.1), Switching(20.0, 40.0))
+    some = [tracked(TETRAHEDRON, 210, k, dynamics=one) for k, one in enumerate(dynamics)]
+    parts = [
+        one
+        for part in (some[:2], some[2:])
+        for one in judge_each(part, quantity="rotation", noise=Noise())
+    ]
+    together = judge_together(some, parts, noise=Noise())
+    for one, motion in [
+        *zip((part.verdict for part in parts), some, strict=True),
+        (together, some),
+    ]:
+        expected = judge_motion(motion)
+        assert one.p == pytest.approx(expected.p, rel=1e-9)
+        for name in ("kind", "frames", "n_frames", "text"):
+            assert getattr(one, name) == getattr(expected, name)
+    assert together.kind == "spin"
+    assert [one.kind for one in together.each][1:4] == ["diffusion", "spin", "confined"]
 
 
 def test_a_motion_without_an_estimate_does_not_stop_the_others(motions):

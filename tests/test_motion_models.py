@@ -10,15 +10,27 @@ import pytest
 from scipy.linalg import cholesky, toeplitz
 
 from brownian_motions import brownian_motion, motion_with_gaps, tetrahedron, with_poses
-from perrin import AnomalousEstimate, ConfinedEstimate, fit_anomalous, fit_confined
+from perrin import (
+    AnomalousEstimate,
+    Cluster,
+    ConfinedEstimate,
+    Noise,
+    add_noise,
+    fit_anomalous,
+    fit_confined,
+    simulate_motion,
+    track_rotation,
+)
 from perrin.diffusion import (
     ShapeLikelihood,
     StepBlock,
     confined_mean_square,
     fractional_autocovariance,
     fractional_mean_square,
+    log_sums,
     step_autocovariance,
     step_covariance,
+    steps_of,
 )
 from perrin.geometry import cumulative_product, exp_map
 
@@ -128,6 +140,37 @@ def test_sine_modes_agree_with_the_exact_likelihood():
     assert pytest.approx(exact_free.D, rel=1e-7) == free.D
     assert free.offset == pytest.approx(exact_free.offset, rel=1e-6)
     assert abs(best.shape - exact.shape) < 0.25 * (high.shape - low.shape)
+
+
+@pytest.mark.parametrize("model", ["joint", 0.02])
+@pytest.mark.parametrize("gaps", [0.0, 0.2])
+def test_shapes_together_are_those_alone(model, gaps):
+    """With even and uneven steps, and with free and known noise, to the end of the searches."""
+    rng = np.random.default_rng(4)
+    truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=90, rng=4)
+    positions = add_noise(truth.positions(), sigma=0.02, rng=4)
+    positions[1:][rng.random(89) < gaps] = np.nan
+    steps = [steps_of(track_rotation(positions, dt=0.7), "rotation")]
+    likelihood = ShapeLikelihood.of(steps, Noise(model), fractional_mean_square)
+    shapes = np.array([0.3, 1.0, 1.7])
+    alone = [likelihood.at(shape) for shape in shapes]
+    np.testing.assert_allclose(likelihood.at_each(shapes), alone, rtol=1e-7, atol=1e-9)
+    best, points = likelihood.best(np.linspace(0.1, 1.9, 8))
+    for drop, ends in zip(
+        (1.0, 3.84), likelihood.crossings(best, points, [1.0, 3.84]), strict=True
+    ):
+        falls = [2 * (best.value - end.value) for end in ends if end is not None]
+        assert falls == pytest.approx([drop] * len(falls), rel=1e-6)
+        assert falls
+
+
+def test_logarithms_are_summed_as_they_are():
+    """Of numbers near both ends of the range, in any number of them, and of infinity and NaN."""
+    rng = np.random.default_rng(1)
+    for count in (1, 7, 8, 50):
+        x = 10.0 ** rng.uniform(-37, 37, (3, count))
+        np.testing.assert_allclose(log_sums(x), np.log(x).sum(axis=1), rtol=1e-13, atol=1e-12)
+    assert np.isnan(log_sums(np.array([1.0, np.nan])))
 
 
 @pytest.mark.parametrize(("alpha", "gaps"), [(0.5, 0.0), (1.0, 0.0), (1.5, 0.0), (0.6, 0.5)])

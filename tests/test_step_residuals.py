@@ -218,6 +218,14 @@ def test_a_steady_motion_is_that_of_generalised_least_squares():
     assert together[1].value == pytest.approx(alone.value)
     assert together[1].p == pytest.approx(alone.p)
     assert together[0].p == together[2].p == pytest.approx(found.p)
+    # A p-value far above a level need not be exact, one below it is.
+    slow = replace(motion, center=motion.center + motion.time[:, None] * [0.5, 0, 0])
+    some = [slow, moving], [estimate_of(slow), settings]
+    exact = steady_motion_of_each(*some)
+    coarse = steady_motion_of_each(*some, level=exact[1].p * 1.01)
+    assert coarse[1] == exact[1]
+    assert coarse[0].p > exact[0].p
+    assert steady_motion_of_each(*some, level=exact[0].p * 1.01) == exact
     # The fit with the motion left free decides.
     free = perrin.estimate_diffusion(moving, quantity="translation", drift=True)
     assert alone.value == pytest.approx(free.drift[0], abs=1e-6)

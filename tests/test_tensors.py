@@ -22,7 +22,13 @@ from perrin import (
     simulate_motion,
     track_rotation,
 )
-from perrin.diffusion import effective_modes, tensor_likelihood, tensor_of_each
+from perrin.diffusion import (
+    SYMMETRIC_ELEMENTS,
+    effective_modes,
+    element_variances,
+    tensor_likelihood,
+    tensor_of_each,
+)
 from perrin.diffusion.noise_model import Noise
 from perrin.diffusion.steps import Steps, body_steps
 from perrin.diffusion.tensor_batches import SeparateTensors, maximise_each
@@ -663,6 +669,20 @@ def test_the_centre_of_diffusion(coupled, at_centroid):
     there = coupled_tensor(motion, point=found.point)
     np.testing.assert_allclose(there.tensor, shifted(at_centroid.tensor, found.point), rtol=1e-10)
     np.testing.assert_allclose(there.tensor, found.tensor, rtol=1e-10, atol=1e-15)
+
+
+def test_the_variance_of_an_element_along_any_directions():
+    """It is that of a linear function of the six elements."""
+    rng = np.random.default_rng(1)
+    root, axes = rng.normal(size=(6, 6)), exp_map(np.array([0.3, -0.5, 0.2]))
+    found = element_variances(root @ root.T, axes)
+    units = np.zeros((6, 3, 3))
+    for unit, (i, j) in zip(units, SYMMETRIC_ELEMENTS, strict=True):
+        unit[i, j] = unit[j, i] = 1.0
+    weight = axes.T @ units @ axes
+    np.testing.assert_allclose(
+        found, np.einsum("iab,ij,jab->ab", weight, root @ root.T, weight), rtol=1e-12
+    )
 
 
 def test_moving_the_point():
