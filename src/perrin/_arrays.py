@@ -29,7 +29,7 @@ def as_positions(positions: ArrayLike, *, name: str = "positions") -> Floats:
             f"{name}: expected shape (T, n, d) with d = 2 or 3 (frames, particles, "
             f"coordinates), got {x.shape}"
         )
-    if not np.isfinite(x.sum()) and np.isinf(x).any():
+    if not np.isfinite(np.vdot(x, x)) and np.isinf(x).any():
         t, i, _ = np.argwhere(np.isinf(x))[0]
         raise ValueError(
             f"{name}: infinite coordinate at row {t}, particle {i}; use NaN for a missing point"
@@ -37,9 +37,14 @@ def as_positions(positions: ArrayLike, *, name: str = "positions") -> Floats:
     return x
 
 
+def complete(numbers: Floats) -> bool:
+    """Return whether none of the numbers is NaN: the sum of their squares is not."""
+    return not np.isnan(np.vdot(numbers, numbers))
+
+
 def present(points: Floats) -> Bools:
     """Return which points (..., d) are present, those without a NaN: shape (...)."""
-    if not np.isnan(points.sum()):  # a NaN anywhere makes the sum one
+    if complete(points):
         return np.ones(points.shape[:-1], dtype=np.bool_)
     missing = np.isnan(points[..., 0])
     for axis in range(1, points.shape[-1]):
@@ -85,7 +90,7 @@ def require_positive(**values: float) -> None:
     bad = [
         f"{name} = {value!r}"
         for name, value in values.items()
-        if not (np.ndim(value) == 0 and np.isfinite(value) and value > 0)
+        if not (np.ndim(value) == 0 and 0 < value < np.inf)
     ]
     if bad:
         raise ValueError("expected a finite number > 0: " + ", ".join(bad))

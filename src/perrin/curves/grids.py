@@ -186,8 +186,7 @@ def complete_frames(time: Floats, piece: Ints, *, dt: float) -> Frames:
     >>> complete_frames(np.arange(3.0), np.zeros(3, dtype=int), dt=1.0).lengths
     array([2])
     """
-    slot = np.arange(len(time))
-    block = np.broadcast_to(np.zeros((), dtype=np.int64), slot.shape)
+    slot, block = np.arange(len(time)), np.zeros(len(time), dtype=np.int64)
     return Frames(slot, time, piece, block, slot, dt, exact=True)
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 
-from perrin._arrays import present
+from perrin._arrays import complete, present
 from perrin.curves.grids import GRID_TOLERANCE
 from perrin.errors import PrecisionWarning, TooFewFramesError
 
@@ -91,12 +91,15 @@ class PairSums(NamedTuple):
     listed: ListedPairs | None
 
     @property
+    def number(self) -> Floats:
+        """Number of pairs as floats, shape (L,)."""
+        return self.on_grid if self.listed is None else self.pairs.astype(np.float64)
+
+    @property
     def divisor(self) -> Floats:
         """Number of pairs, shape (L,); NaN at a lag without a pair."""
-        number = self.pairs.astype(np.float64)
-        if not self.pairs.all():
-            number[self.pairs == 0] = np.nan
-        return number
+        number = self.number
+        return number if number.all() else np.where(number > 0, number, np.nan)
 
     @property
     def mean(self) -> Floats:
@@ -158,10 +161,11 @@ def pair_sums(kernel: Kernel, frames: Frames, *, most: int | None = None) -> Pai
     lagtime = grid if frames.exact else grid.copy()
     for elements in [] if complete else frames.blocks:
         slot = frames.slot[elements]
+        row = slot if frames.row is frames.slot else frames.row[elements]
         lags = min(int(slot[-1]), longest)
         if lags < 1:
             continue
-        added, number = kernel.within(frames.row[elements], slot, lags)
+        added, number = kernel.within(row, slot, lags)
         if sums is None or count is None:
             if lags == longest and len(frames.blocks) == 1:
                 sums, count = added, number
@@ -355,11 +359,11 @@ class Squares:
     def within(self, rows: Ints, slots: Ints, count: int) -> tuple[Floats, Ints]:
         """Return the sums by FFT, of one component after the other."""
         walks = _on_grid(self.walks, rows, slots)
-        here = present(walks)
-        if here.all():
+        if complete(walks):
             n, walkers, _ = walks.shape
-            return complete_squares(walks, count), walkers * (n - np.arange(1, count + 1))
-        return gapped_squares(walks, here, count)
+            pairs = np.arange(walkers * (n - 1), walkers * (n - 1 - count), -walkers)
+            return complete_squares(walks, count), pairs
+        return gapped_squares(walks, present(walks), count)
 
     def between(self, first: Ints, last: Ints) -> tuple[Floats, Ints]:
         """Return the squared differences of pairs."""
@@ -400,34 +404,35 @@ def complete_squares(walks: Floats, count: int) -> Floats:
     half = len(transform.turn)
     at_once = min(max(_NUMBERS_AT_ONCE // (n * walkers), 1), components)
     time = np.arange(0.5 * (1 - n), 0.5 * n)
-    spread = walkers * float(time @ time)
+    spread = walkers * n * (n * n - 1) / 12  # the sum of the squares of these times
     # New memory takes as long as the transforms: arrays are used again.
-    x, power = np.empty((at_once, walkers, n)), np.empty((at_once, half))
+    memory = np.empty(at_once * walkers * max(n, half))
     spectrum = np.empty((at_once * walkers, half), dtype=np.complex128)
     sums = np.empty((components, count))
+    middle = (n + 1) // 2
     for low in range(0, components, at_once):
         out = sums[low : low + at_once]
         q = len(out)
-        some = x[:q]
-        some[:] = walks[..., low : low + at_once].T
-        some -= some.sum(axis=2, keepdims=True) / n
-        slope = _steady_slopes(some, time, spread)
+        x = memory[: q * walkers * n].reshape(q, walkers, n)
+        x[:] = walks[..., low : low + at_once].T
+        x -= x.sum(axis=2, keepdims=True) / n
+        slope = _steady_slopes(x, time, spread)
         rest = None
         if slope.any():
-            some -= slope[:, None, None] * time
-            total = some.sum(axis=1)
+            x -= slope[:, None, None] * time
+            total = x.sum(axis=1)
             rest = np.cumsum(total[:, : -count - 1 : -1] - total[:, :count], axis=1)
-        found = transform.spectrum(some.reshape(-1, n), out=spectrum[: q * walkers])
-        squared_size(found.reshape(q, walkers, half), overwrite=True, out=power[:q])
-        # Twice the sum of squares, less the squares of the frames that begin or end no pair.
-        np.multiply(some, some, out=some)
-        square = some[:, 0] if walkers == 1 else some.sum(axis=1)
-        np.add(square[:, :count], square[:, : -count - 1 : -1], out=out)
-        np.cumsum(out, axis=1, out=out)
-        np.subtract(2 * square.sum(axis=1, keepdims=True), out, out=out)
-        correlation = transform.even(power[:q], memory=spectrum, out=power[:q])
-        correlation *= 2
-        out -= correlation[:, 1 : count + 1]
+        found = transform.spectrum(x.reshape(-1, n), out=spectrum[: q * walkers])
+        # Twice the sum of squares, less the squares of the frames that begin or end no pair. The
+        # frames at the two ends take the same part, so that half of the sums are the others'.
+        np.multiply(x, x, out=x)
+        square = x[:, 0] if walkers == 1 else x.sum(axis=1)
+        ends = np.cumsum(square[:, :middle] + square[:, : n - middle - 1 : -1], axis=1)
+        np.subtract(ends[:, -1:] + ends[:, n - middle - 1 : n - middle], ends[:, :count], out=out[:, :middle])
+        out[:, middle:] = ends[:, n - count - 1 : n - middle - 1][:, ::-1]
+        power = memory[: q * half].reshape(q, half)
+        squared_size(found.reshape(q, walkers, half), overwrite=True, out=power)
+        transform.add_even(power, out=out, scale=-2.0, memory=spectrum)
         if rest is not None:
             lag = np.arange(1.0, count + 1)
             far = slope[:, None] * lag
@@ -471,11 +476,13 @@ def gapped_squares(walks: Floats, here: Bools, count: int) -> tuple[Floats, Ints
     at_once = min(max(_NUMBERS_AT_ONCE // (n * walkers), 1), components)
     mask = np.ascontiguousarray(here.T, dtype=np.float64)
     spectrum = transform.spectrum(mask)
-    pairs = np.rint(transform.even(squared_size(spectrum))[1 : count + 1])
+    pairs = np.zeros(count)
+    transform.add_even(squared_size(spectrum), out=pairs)
+    np.rint(pairs, out=pairs)
     time, lag = np.arange(float(n)), np.arange(1.0, count + 1)
     number = np.maximum(mask.sum(axis=1, keepdims=True), 1.0)
     middle = mask * (time - (mask @ time)[:, None] / number)
-    sums = np.empty((components, count))
+    sums = np.zeros((components, count))
     for low in range(0, components, at_once):
         out = sums[low : low + at_once]
         x = np.where(here.T, walks[..., low : low + at_once].T, 0.0)
@@ -487,7 +494,7 @@ def gapped_squares(walks: Floats, here: Bools, count: int) -> tuple[Floats, Ints
         both = transform.spectrum(np.concatenate([x, x * x]).reshape(-1, n))
         moved, squared = both.reshape(2, len(x), walkers, -1)
         power = (np.conj(spectrum) * squared).real.sum(axis=1) - squared_size(moved)
-        np.multiply(transform.even(power)[:, 1 : count + 1], 2.0, out=out)
+        transform.add_even(power, out=out, scale=2.0)
         if steady:
             far = slope[:, None] * lag
             rest = transform.odd((spectrum * np.conj(moved)).imag.sum(axis=1))[:, 1 : count + 1]
@@ -503,9 +510,15 @@ def _steady_slopes(x: Floats, time: Floats, spread: float) -> Floats:
     It is 0 where a straight line is not most of the motion. `spread` is the sum over the frames of
     all walks of the squared time from the walk's mean time.
     """
-    slope = (x @ time).sum(axis=1) / max(spread, 1.0)
-    square = np.array([float(np.vdot(one, one)) for one in x])
-    return np.where(slope**2 * spread > _STEADY_SHARE * square, slope, 0.0)
+    flat = x.reshape(len(x), 1, -1)
+    square = (flat @ flat.swapaxes(1, 2)).ravel().tolist()
+    slopes = ((x @ time).sum(axis=1) / max(spread, 1.0)).tolist()
+    return np.array(
+        [
+            slope if slope * slope * spread > _STEADY_SHARE * whole else 0.0
+            for slope, whole in zip(slopes, square, strict=True)
+        ]
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -526,8 +539,10 @@ class Correlations:
     --------
     >>> transform = Correlations.of(6)
     >>> spectrum = transform.spectrum(np.array([[1.0, 2.0, 3.0]]))
-    >>> transform.even(np.abs(spectrum[0]) ** 2).round(9)  # 1 + 4 + 9, 2 + 6 and 3
-    array([14.,  8.,  3.])
+    >>> sums = np.zeros(2)
+    >>> transform.add_even(np.abs(spectrum[0]) ** 2, out=sums)
+    >>> sums.round(9)  # 2 + 6 and 3
+    array([8., 3.])
     """
 
     turn: Complexes
@@ -542,44 +557,47 @@ class Correlations:
         half = len(self.turn)
         out = np.empty((len(x), half), dtype=np.complex128) if out is None else out
         size = min(half, x.shape[1])
-        np.multiply(x[:, :half], self.turn[:size], out=out[:, :size])
+        out[:, :size] = x[:, :half]
+        out[:, :size] *= self.turn[:size]
         out[:, size:] = 0.0
         rest = x[:, half:]
         if rest.shape[1]:
             out[:, : rest.shape[1]] -= 1j * rest * self.turn[: rest.shape[1]]
         return np.fft.fft(out, axis=1, out=out) if _IN_PLACE else np.fft.fft(out, axis=1)
 
-    def even(
-        self, power: Floats, *, memory: Complexes | None = None, out: Floats | None = None
-    ) -> Floats:
-        """Return sum_k p_k cos(2 pi (2k + 1/2) j/M)/H of p (..., H) at j = 0 to H - 1.
+    def add_even(
+        self,
+        power: Floats,
+        *,
+        out: Floats,
+        scale: float = 1.0,
+        memory: Complexes | None = None,
+    ) -> None:
+        """Add scale sum_k p_k cos(2 pi (2k + 1/2) j/M)/H of p (..., H) at j = 1 to L to (..., L).
 
-        The complex `memory` has at least as many numbers as p; `out` may be p.
+        The complex `memory` has at least as many numbers as p.
         """
         turned = self._summed(power, memory=memory)
-        split, back = turned.shape[-1], slice(len(self.turn) - turned.shape[-1], 0, -1)
-        out = np.empty(power.shape) if out is None else out
-        out[..., :split] = turned.real
-        np.negative(turned.imag[..., back], out=out[..., split:])
-        return out
+        turned *= scale * self.turn[: turned.shape[-1]]
+        half, count, split = len(self.turn), out.shape[-1], turned.shape[-1] - 1
+        near, far = out[..., :split], out[..., split:]
+        near += turned.real[..., 1 : count + 1]
+        far -= turned.imag[..., half - count : half - split][..., ::-1]
 
     def odd(self, power: Floats) -> Floats:
         """Return sum_k p_k sin(2 pi (2k + 1/2) j/M)/H of p (..., H) at j = 0 to H - 1."""
         turned = self._summed(power)
+        turned *= self.turn[: turned.shape[-1]]
         back = slice(len(self.turn) - turned.shape[-1], 0, -1)
         return np.concatenate([-turned.imag, turned.real[..., back]], axis=-1)
 
     def _summed(self, power: Floats, *, memory: Complexes | None = None) -> Complexes:
-        """Return sum_k p_k exp(-2 pi i (2k + 1/2) j/M)/H at j = 0 to H/2."""
-        size = len(self.turn) // 2 + 1
+        """Return sum_k p_k exp(-2 pi i k j/H)/H at j = 0 to H/2."""
         if memory is None or not _IN_PLACE:
-            summed = np.fft.rfft(power, norm="forward")
-        else:
-            shape = (*power.shape[:-1], size)
-            summed = memory.reshape(-1)[: prod(shape)].reshape(shape)
-            np.fft.rfft(power, norm="forward", out=summed)
-        summed *= self.turn[:size]
-        return summed
+            return np.fft.rfft(power, norm="forward")
+        shape = (*power.shape[:-1], len(self.turn) // 2 + 1)
+        summed = memory.reshape(-1)[: prod(shape)].reshape(shape)
+        return np.fft.rfft(power, norm="forward", out=summed)
 
 
 @lru_cache(maxsize=1)
@@ -642,7 +660,7 @@ class Products:
         columns = np.ascontiguousarray(
             (values if whole else np.where(here[:, None], values, 0.0)).T
         )
-        sums = np.empty((len(self.groups), count))
+        sums = np.zeros((len(self.groups), count))
         memory = np.empty((1, len(transform.turn)), dtype=np.complex128)
         squares = all(i == j for group in self.groups for i, j in group)
         parts = None if squares else transform.spectrum(columns).view(np.float64)
@@ -656,11 +674,12 @@ class Products:
                     # The real part is the transform of the mean of a product and its reverse.
                     product = parts[i] * parts[j]
                     power += product[::2] + product[1::2]
-            out[:] = transform.even(power, memory=memory, out=power)[1 : count + 1]
+            transform.add_even(power, out=out, memory=memory)
         if whole:
             return sums.T, len(values) - np.arange(1, count + 1)
         mask = transform.spectrum(here.astype(np.float64)[None])
-        pairs = transform.even(squared_size(mask))[1 : count + 1]
+        pairs = np.zeros(count)
+        transform.add_even(squared_size(mask), out=pairs)
         return sums.T, np.rint(pairs).astype(np.int64)
 
     def between(self, first: Ints, last: Ints) -> tuple[Floats, Ints]:
@@ -676,7 +695,7 @@ class Products:
 def _on_grid(values: Floats, rows: Ints, slots: Ints) -> Floats:
     """Return rows of an array at their places on a grid, NaN between them."""
     if len(slots) == slots[-1] + 1:
-        if len(rows) == len(values) and np.array_equal(rows, slots):
+        if len(rows) == len(values) and (rows is slots or np.array_equal(rows, slots)):
             return values
         if rows[-1] - rows[0] == len(rows) - 1 and np.array_equal(rows, slots + rows[0]):
             return values[rows[0] : rows[-1] + 1]

@@ -54,8 +54,9 @@ def relative_error(sums: PairSums, frames: Frames, half: Floats, pairs: Floats) 
     lengths = frames.lengths
     if len(lengths) == 1 and sums.listed is None and frames.exact:
         longest = int(lengths[0])
-        whole = np.arange(1.0, len(half) + 1)
-        if np.array_equal(pairs, longest + 1 - whole):
+        # All pairs of neighbours: no frame is missing.
+        if pairs[0] == longest:
+            whole = np.arange(1.0, len(half) + 1)
             d, s = two_lag_fit(whole, half, pairs)
             if not d + s > 0:
                 return np.full_like(half, np.nan)
@@ -286,10 +287,11 @@ def lag_covariance(
         (total[:middle], lag[:middle], near),
         (total[middle:], n - lag[middle:], far),
     ):
-        value[:] = coefficients[0]
-        for coefficient in coefficients[1:]:
-            value *= x
+        np.multiply(x, coefficients[0], out=value)
+        for coefficient in coefficients[1:-1]:
             value += coefficient
+            value *= x
+        value += coefficients[-1]
     if present is None:
         return total
     gap, b, p = 1 / present - 1, lag, n - lag
