@@ -251,7 +251,8 @@ def msd(
     else:
         require_positive(dt=dt)
         walks = as_positions(motion_or_positions)
-        time = dt * np.arange(len(walks), dtype=np.float64)
+        time = np.arange(len(walks), dtype=np.float64)
+        time *= dt
         piece = np.zeros(len(walks), dtype=np.int64)
         whole = len(walks) > 1 and complete(walks)
         frames = (complete_frames if whole else partial(frames_of, walks))(time, piece, dt=dt)
@@ -523,15 +524,17 @@ def mean_square_curve(
     components = sums.sums
     components /= sums.divisor[:, None]
     value = components.sum(axis=1)
-    pairs = sums.number / walks.shape[1]
-    relative = relative_error(sums, frames, value / (2 * dof), pairs)
+    pairs = sums.number if walks.shape[1] == 1 else sums.number / walks.shape[1]
+    stderr = relative_error(sums, frames, value / (2 * dof), pairs)
     free = n_walks is None
     n_walks = float(walks.shape[2] * walks.shape[1]) if n_walks is None else n_walks
+    stderr *= value
+    stderr /= n_walks**0.5
     return LagCurve(
         lagtime=sums.lagtime,
         value=value,
         components=components,
-        stderr=value * relative / np.sqrt(n_walks),
+        stderr=stderr,
         n_pairs=sums.pairs if free else np.rint(pairs).astype(np.int64),
         dof=dof,
         quantity=quantity,

@@ -157,7 +157,8 @@ def pair_sums(kernel: Kernel, frames: Frames, *, most: int | None = None) -> Pai
     sums: Floats | None = None
     count: Ints | None = None
     before: Ints | int = 0
-    grid = np.arange(1.0, longest + 1) * frames.step
+    grid = np.arange(1.0, longest + 1)
+    grid *= frames.step
     lagtime = grid if frames.exact else grid.copy()
     for elements in [] if complete else frames.blocks:
         slot = frames.slot[elements]

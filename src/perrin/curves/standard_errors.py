@@ -266,7 +266,7 @@ def lag_covariance(
     array([ 10., 460.])
     """
     square, both, noise, n = 4 * D * D, 8 * D * s, 2 * s * s, float(steps + 1)
-    middle = int(np.searchsorted(lag, 0.5 * n, side="right"))
+    middle = int(lag.searchsorted(0.5 * n, side="right"))
     # Up to half of the track a polynomial of b, beyond it one of the displacements q = n - b.
     near = (
         -5 / 6 * square,
