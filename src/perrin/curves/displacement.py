@@ -253,7 +253,7 @@ def msd(
         walks = as_positions(motion_or_positions)
         time = np.arange(len(walks), dtype=np.float64)
         time *= dt
-        piece = np.zeros(len(walks), dtype=np.int64)
+        piece = np.ndarray(len(walks), np.int64, bytes(8), strides=(0,))  # one number for all frames
         whole = len(walks) > 1 and complete(walks)
         frames = (complete_frames if whole else partial(frames_of, walks))(time, piece, dt=dt)
     dof = walks.shape[2]
@@ -525,11 +525,11 @@ def mean_square_curve(
     components /= sums.divisor[:, None]
     value = components.sum(axis=1)
     pairs = sums.number if walks.shape[1] == 1 else sums.number / walks.shape[1]
-    stderr = relative_error(sums, frames, value / (2 * dof), pairs)
+    stderr = relative_error(sums, frames, value, pairs)
     free = n_walks is None
     n_walks = float(walks.shape[2] * walks.shape[1]) if n_walks is None else n_walks
     stderr *= value
-    stderr /= n_walks**0.5
+    stderr *= n_walks**-0.5
     return LagCurve(
         lagtime=sums.lagtime,
         value=value,

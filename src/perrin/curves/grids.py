@@ -186,7 +186,8 @@ def complete_frames(time: Floats, piece: Ints, *, dt: float) -> Frames:
     >>> complete_frames(np.arange(3.0), np.zeros(3, dtype=int), dt=1.0).lengths
     array([2])
     """
-    slot, block = np.arange(len(time)), np.zeros(len(time), dtype=np.int64)
+    slot = np.arange(len(time))
+    block = np.ndarray(len(time), np.int64, bytes(8), strides=(0,))  # one number for all frames
     return Frames(slot, time, piece, block, slot, dt, exact=True)
 
 

@@ -419,8 +419,8 @@ def complete_squares(walks: Floats, count: int) -> Floats:
         x -= x.sum(axis=2, keepdims=True) / n
         slope = _steady_slopes(x, time, spread)
         rest = None
-        if slope.any():
-            x -= slope[:, None, None] * time
+        if any(slope):
+            x -= np.reshape(slope, (q, 1, 1)) * time
             total = x.sum(axis=1)
             rest = np.cumsum(total[:, : -count - 1 : -1] - total[:, :count], axis=1)
         found = transform.spectrum(x.reshape(-1, n), out=spectrum[: q * walkers])
@@ -428,7 +428,9 @@ def complete_squares(walks: Floats, count: int) -> Floats:
         # frames at the two ends take the same part, so that half of the sums are the others'.
         np.multiply(x, x, out=x)
         square = x[:, 0] if walkers == 1 else x.sum(axis=1)
-        ends = np.cumsum(square[:, :middle] + square[:, : n - middle - 1 : -1], axis=1)
+        ends = square[:, :middle]
+        ends += square[:, : n - middle - 1 : -1]
+        np.cumsum(ends, axis=1, out=ends)
         np.subtract(ends[:, -1:] + ends[:, n - middle - 1 : n - middle], ends[:, :count], out=out[:, :middle])
         out[:, middle:] = ends[:, n - count - 1 : n - middle - 1][:, ::-1]
         power = memory[: q * half].reshape(q, half)
@@ -436,10 +438,11 @@ def complete_squares(walks: Floats, count: int) -> Floats:
         transform.add_even(power, out=out, scale=-2.0, memory=spectrum)
         if rest is not None:
             lag = np.arange(1.0, count + 1)
-            far = slope[:, None] * lag
+            far = np.multiply.outer(slope, lag)
             out += far * (far * (walkers * (n - lag)) + 2 * rest)
         # A sum of squares that rounds below zero is zero.
-        np.maximum(out, 0.0, out=out)
+        if out.min() < 0:
+            np.maximum(out, 0.0, out=out)
     return sums.T
 
 
@@ -489,15 +492,14 @@ def gapped_squares(walks: Floats, here: Bools, count: int) -> tuple[Floats, Ints
         x = np.where(here.T, walks[..., low : low + at_once].T, 0.0)
         x -= mask * (x.sum(axis=2, keepdims=True) / number)
         slope = _steady_slopes(x, time, float(np.vdot(middle, middle)))
-        steady = bool(slope.any())
-        if steady:
-            x -= slope[:, None, None] * middle
+        if any(slope):
+            x -= np.reshape(slope, (-1, 1, 1)) * middle
         both = transform.spectrum(np.concatenate([x, x * x]).reshape(-1, n))
         moved, squared = both.reshape(2, len(x), walkers, -1)
         power = (np.conj(spectrum) * squared).real.sum(axis=1) - squared_size(moved)
         transform.add_even(power, out=out, scale=2.0)
-        if steady:
-            far = slope[:, None] * lag
+        if any(slope):
+            far = np.multiply.outer(slope, lag)
             rest = transform.odd((spectrum * np.conj(moved)).imag.sum(axis=1))[:, 1 : count + 1]
             out += far * (far * pairs + 4 * rest)
         # A sum of squares that rounds below zero is zero.
@@ -505,21 +507,19 @@ def gapped_squares(walks: Floats, here: Bools, count: int) -> tuple[Floats, Ints
     return sums.T, pairs.astype(np.int64)
 
 
-def _steady_slopes(x: Floats, time: Floats, spread: float) -> Floats:
-    """Return the common slope of the walks (q, K, n) of mean 0 along each component, (q,).
+def _steady_slopes(x: Floats, time: Floats, spread: float) -> list[float]:
+    """Return the common slope of the walks (q, K, n) of mean 0 along each of q components.
 
     It is 0 where a straight line is not most of the motion. `spread` is the sum over the frames of
     all walks of the squared time from the walk's mean time.
     """
     flat = x.reshape(len(x), 1, -1)
     square = (flat @ flat.swapaxes(1, 2)).ravel().tolist()
-    slopes = ((x @ time).sum(axis=1) / max(spread, 1.0)).tolist()
-    return np.array(
-        [
-            slope if slope * slope * spread > _STEADY_SHARE * whole else 0.0
-            for slope, whole in zip(slopes, square, strict=True)
-        ]
-    )
+    slopes = [sum(each) / max(spread, 1.0) for each in (x @ time).tolist()]
+    return [
+        slope if slope * slope * spread > _STEADY_SHARE * whole else 0.0
+        for slope, whole in zip(slopes, square, strict=True)
+    ]
 
 
 @dataclass(frozen=True, eq=False)

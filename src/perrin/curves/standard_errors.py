@@ -56,7 +56,7 @@ def relative_error(sums: PairSums, frames: Frames, half: Floats, pairs: Floats) 
         longest = int(lengths[0])
         # All pairs of neighbours: no frame is missing.
         if pairs[0] == longest:
-            whole = np.arange(1.0, len(half) + 1)
+            whole = longest + 1 - pairs
             d, s = two_lag_fit(whole, half, pairs)
             if not d + s > 0:
                 return np.full_like(half, np.nan)
