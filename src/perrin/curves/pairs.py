@@ -410,29 +410,21 @@ def complete_squares(walks: Floats, count: int) -> Floats:
     memory = np.empty(at_once * walkers * max(n, half))
     spectrum = np.empty((at_once * walkers, half), dtype=np.complex128)
     sums = np.empty((components, count))
-    middle = (n + 1) // 2
     for low in range(0, components, at_once):
         out = sums[low : low + at_once]
         q = len(out)
         x = memory[: q * walkers * n].reshape(q, walkers, n)
         x[:] = walks[..., low : low + at_once].T
         x -= x.sum(axis=2, keepdims=True) / n
-        slope = _steady_slopes(x, time, spread)
+        square = _squares_at_ends(x, out, memory=spectrum)
+        slope = _steady_slopes(x, time, spread, square)
         rest = None
         if any(slope):
             x -= np.reshape(slope, (q, 1, 1)) * time
             total = x.sum(axis=1)
             rest = np.cumsum(total[:, : -count - 1 : -1] - total[:, :count], axis=1)
+            _squares_at_ends(x, out, memory=spectrum)
         found = transform.spectrum(x.reshape(-1, n), out=spectrum[: q * walkers])
-        # Twice the sum of squares, less the squares of the frames that begin or end no pair. The
-        # frames at the two ends take the same part, so that half of the sums are the others'.
-        np.multiply(x, x, out=x)
-        square = x[:, 0] if walkers == 1 else x.sum(axis=1)
-        ends = square[:, :middle]
-        ends += square[:, : n - middle - 1 : -1]
-        np.cumsum(ends, axis=1, out=ends)
-        np.subtract(ends[:, -1:] + ends[:, n - middle - 1 : n - middle], ends[:, :count], out=out[:, :middle])
-        out[:, middle:] = ends[:, n - count - 1 : n - middle - 1][:, ::-1]
         power = memory[: q * half].reshape(q, half)
         squared_size(found.reshape(q, walkers, half), overwrite=True, out=power)
         transform.add_even(power, out=out, scale=-2.0, memory=spectrum)
@@ -444,6 +436,28 @@ def complete_squares(walks: Floats, count: int) -> Floats:
         if out.min() < 0:
             np.maximum(out, 0.0, out=out)
     return sums.T
+
+
+def _squares_at_ends(x: Floats, out: Floats, *, memory: Complexes) -> list[float]:
+    """Write, for lags 1 to L, the squares of the frames that begin a pair and of those that end one.
+
+    The sums over the walks x (q, K, n) are written to `out` (q, L); returned are those over all
+    frames, (q,). The complex `memory` has at least half as many numbers as x.
+    """
+    q, walkers, n = x.shape
+    count, middle = out.shape[1], (n + 1) // 2
+    square = memory.reshape(-1).view(np.float64)[: x.size].reshape(x.shape)
+    np.multiply(x, x, out=square)
+    square = square[:, 0] if walkers == 1 else square.sum(axis=1)
+    # The frame at lag n from one end and that from the other always count together: the sums over
+    # those that begin or end no pair are needed up to the middle only, and give all the others.
+    ends = square[:, :middle]
+    ends += square[:, : n - middle - 1 : -1]
+    np.cumsum(ends, axis=1, out=ends)
+    whole = ends[:, -1:] + ends[:, n - middle - 1 : n - middle]
+    np.subtract(whole, ends[:, :count], out=out[:, :middle])
+    out[:, middle:] = ends[:, n - count - 1 : n - middle - 1][:, ::-1]
+    return [0.5 * float(each) for each in whole.ravel().tolist()]
 
 
 def gapped_squares(walks: Floats, here: Bools, count: int) -> tuple[Floats, Ints]:
@@ -491,7 +505,8 @@ def gapped_squares(walks: Floats, here: Bools, count: int) -> tuple[Floats, Ints
         out = sums[low : low + at_once]
         x = np.where(here.T, walks[..., low : low + at_once].T, 0.0)
         x -= mask * (x.sum(axis=2, keepdims=True) / number)
-        slope = _steady_slopes(x, time, float(np.vdot(middle, middle)))
+        square = [float(np.vdot(one, one)) for one in x]
+        slope = _steady_slopes(x, time, float(np.vdot(middle, middle)), square)
         if any(slope):
             x -= np.reshape(slope, (-1, 1, 1)) * middle
         both = transform.spectrum(np.concatenate([x, x * x]).reshape(-1, n))
@@ -507,14 +522,12 @@ def gapped_squares(walks: Floats, here: Bools, count: int) -> tuple[Floats, Ints
     return sums.T, pairs.astype(np.int64)
 
 
-def _steady_slopes(x: Floats, time: Floats, spread: float) -> list[float]:
+def _steady_slopes(x: Floats, time: Floats, spread: float, square: list[float]) -> list[float]:
     """Return the common slope of the walks (q, K, n) of mean 0 along each of q components.
 
     It is 0 where a straight line is not most of the motion. `spread` is the sum over the frames of
     all walks of the squared time from the walk's mean time.
     """
-    flat = x.reshape(len(x), 1, -1)
-    square = (flat @ flat.swapaxes(1, 2)).ravel().tolist()
     slopes = [sum(each) / max(spread, 1.0) for each in (x @ time).tolist()]
     return [
         slope if slope * slope * spread > _STEADY_SHARE * whole else 0.0
