@@ -29,7 +29,7 @@ def as_positions(positions: ArrayLike, *, name: str = "positions") -> Floats:
             f"{name}: expected shape (T, n, d) with d = 2 or 3 (frames, particles, "
             f"coordinates), got {x.shape}"
         )
-    if not np.isfinite(np.vdot(x, x)) and np.isinf(x).any():
+    if not np.isfinite(x.sum()) and np.isinf(x).any():
         t, i, _ = np.argwhere(np.isinf(x))[0]
         raise ValueError(
             f"{name}: infinite coordinate at row {t}, particle {i}; use NaN for a missing point"
@@ -38,8 +38,8 @@ def as_positions(positions: ArrayLike, *, name: str = "positions") -> Floats:
 
 
 def complete(numbers: Floats) -> bool:
-    """Return whether none of the numbers is NaN: the sum of their squares is not."""
-    return not np.isnan(np.vdot(numbers, numbers))
+    """Return whether none of the numbers is NaN: the smallest of them would be."""
+    return not np.isnan(numbers.min(initial=0.0))
 
 
 def present(points: Floats) -> Bools:

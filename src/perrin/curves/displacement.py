@@ -253,7 +253,7 @@ def msd(
         walks = as_positions(motion_or_positions)
         time = np.arange(len(walks), dtype=np.float64)
         time *= dt
-        piece = np.ndarray(len(walks), np.int64, bytes(8), strides=(0,))  # one number for all frames
+        piece = np.ndarray(len(walks), np.int64, bytes(8), strides=(0,))  # one 0 for all frames
         whole = len(walks) > 1 and complete(walks)
         frames = (complete_frames if whole else partial(frames_of, walks))(time, piece, dt=dt)
     dof = walks.shape[2]

@@ -187,7 +187,7 @@ def complete_frames(time: Floats, piece: Ints, *, dt: float) -> Frames:
     array([2])
     """
     slot = np.arange(len(time))
-    block = np.ndarray(len(time), np.int64, bytes(8), strides=(0,))  # one number for all frames
+    block = np.ndarray(len(time), np.int64, bytes(8), strides=(0,))  # one 0 for all frames
     return Frames(slot, time, piece, block, slot, dt, exact=True)
 
 

@@ -92,7 +92,7 @@ class PairSums(NamedTuple):
 
     @property
     def number(self) -> Floats:
-        """Number of pairs as floats, shape (L,)."""
+        """Number of pairs, shape (L,), as floats."""
         return self.on_grid if self.listed is None else self.pairs.astype(np.float64)
 
     @property
@@ -360,11 +360,11 @@ class Squares:
     def within(self, rows: Ints, slots: Ints, count: int) -> tuple[Floats, Ints]:
         """Return the sums by FFT, of one component after the other."""
         walks = _on_grid(self.walks, rows, slots)
-        if complete(walks):
-            n, walkers, _ = walks.shape
-            pairs = np.arange(walkers * (n - 1), walkers * (n - 1 - count), -walkers)
-            return complete_squares(walks, count), pairs
-        return gapped_squares(walks, present(walks), count)
+        if not complete(walks):
+            return gapped_squares(walks, present(walks), count)
+        n, walkers, _ = walks.shape
+        pairs = np.arange(walkers * (n - 1), walkers * (n - 1 - count), -walkers)
+        return complete_squares(walks, count), pairs
 
     def between(self, first: Ints, last: Ints) -> tuple[Floats, Ints]:
         """Return the squared differences of pairs."""
@@ -417,7 +417,7 @@ def complete_squares(walks: Floats, count: int) -> Floats:
         x[:] = walks[..., low : low + at_once].T
         x -= x.sum(axis=2, keepdims=True) / n
         square = _squares_at_ends(x, out, memory=spectrum)
-        slope = _steady_slopes(x, time, spread, square)
+        slope = _steady_slopes(x, time, spread=spread, square=square)
         rest = None
         if any(slope):
             x -= np.reshape(slope, (q, 1, 1)) * time
@@ -439,25 +439,25 @@ def complete_squares(walks: Floats, count: int) -> Floats:
 
 
 def _squares_at_ends(x: Floats, out: Floats, *, memory: Complexes) -> list[float]:
-    """Write, for lags 1 to L, the squares of the frames that begin a pair and of those that end one.
+    """Write the sums of squares over the frames that begin a pair and over those that end one.
 
-    The sums over the walks x (q, K, n) are written to `out` (q, L); returned are those over all
-    frames, (q,). The complex `memory` has at least half as many numbers as x.
+    They are written to `out` (q, L) for walks (q, K, n) at lags 1 to L; returned is the sum of
+    squares of each component. The complex `memory` has at least half as many numbers as x.
     """
-    q, walkers, n = x.shape
+    _, walkers, n = x.shape
     count, middle = out.shape[1], (n + 1) // 2
     square = memory.reshape(-1).view(np.float64)[: x.size].reshape(x.shape)
     np.multiply(x, x, out=square)
     square = square[:, 0] if walkers == 1 else square.sum(axis=1)
-    # The frame at lag n from one end and that from the other always count together: the sums over
-    # those that begin or end no pair are needed up to the middle only, and give all the others.
+    # The frames that begin or end no pair lie at the two ends, as many at either: their sums up to
+    # the middle of the track give those beyond it.
     ends = square[:, :middle]
     ends += square[:, : n - middle - 1 : -1]
     np.cumsum(ends, axis=1, out=ends)
     whole = ends[:, -1:] + ends[:, n - middle - 1 : n - middle]
     np.subtract(whole, ends[:, :count], out=out[:, :middle])
     out[:, middle:] = ends[:, n - count - 1 : n - middle - 1][:, ::-1]
-    return [0.5 * float(each) for each in whole.ravel().tolist()]
+    return [0.5 * each for each in whole[:, 0].tolist()]
 
 
 def gapped_squares(walks: Floats, here: Bools, count: int) -> tuple[Floats, Ints]:
@@ -506,7 +506,8 @@ def gapped_squares(walks: Floats, here: Bools, count: int) -> tuple[Floats, Ints
         x = np.where(here.T, walks[..., low : low + at_once].T, 0.0)
         x -= mask * (x.sum(axis=2, keepdims=True) / number)
         square = [float(np.vdot(one, one)) for one in x]
-        slope = _steady_slopes(x, time, float(np.vdot(middle, middle)), square)
+        spread = float(np.vdot(middle, middle))
+        slope = _steady_slopes(x, time, spread=spread, square=square)
         if any(slope):
             x -= np.reshape(slope, (-1, 1, 1)) * middle
         both = transform.spectrum(np.concatenate([x, x * x]).reshape(-1, n))
@@ -522,11 +523,11 @@ def gapped_squares(walks: Floats, here: Bools, count: int) -> tuple[Floats, Ints
     return sums.T, pairs.astype(np.int64)
 
 
-def _steady_slopes(x: Floats, time: Floats, spread: float, square: list[float]) -> list[float]:
+def _steady_slopes(x: Floats, time: Floats, *, spread: float, square: list[float]) -> list[float]:
     """Return the common slope of the walks (q, K, n) of mean 0 along each of q components.
 
     It is 0 where a straight line is not most of the motion. `spread` is the sum over the frames of
-    all walks of the squared time from the walk's mean time.
+    all walks of the squared time from the walk's mean time, `square` that of each component.
     """
     slopes = [sum(each) / max(spread, 1.0) for each in (x @ time).tolist()]
     return [
@@ -571,7 +572,7 @@ class Correlations:
         half = len(self.turn)
         out = np.empty((len(x), half), dtype=np.complex128) if out is None else out
         size = min(half, x.shape[1])
-        out[:, :size] = x[:, :half]
+        out[:, :size] = x[:, :half]  # converted first: a product of two types takes longer
         out[:, :size] *= self.turn[:size]
         out[:, size:] = 0.0
         rest = x[:, half:]
@@ -587,12 +588,11 @@ class Correlations:
         scale: float = 1.0,
         memory: Complexes | None = None,
     ) -> None:
-        """Add scale sum_k p_k cos(2 pi (2k + 1/2) j/M)/H of p (..., H) at j = 1 to L to (..., L).
+        """Add scale sum_k p_k cos(2 pi (2k + 1/2) j/M)/H of p (..., H), j = 1 to L, to (..., L).
 
         The complex `memory` has at least as many numbers as p.
         """
-        turned = self._summed(power, memory=memory)
-        turned *= scale * self.turn[: turned.shape[-1]]
+        turned = self._summed(power, scale=scale, memory=memory)
         half, count, split = len(self.turn), out.shape[-1], turned.shape[-1] - 1
         near, far = out[..., :split], out[..., split:]
         near += turned.real[..., 1 : count + 1]
@@ -601,17 +601,22 @@ class Correlations:
     def odd(self, power: Floats) -> Floats:
         """Return sum_k p_k sin(2 pi (2k + 1/2) j/M)/H of p (..., H) at j = 0 to H - 1."""
         turned = self._summed(power)
-        turned *= self.turn[: turned.shape[-1]]
         back = slice(len(self.turn) - turned.shape[-1], 0, -1)
         return np.concatenate([-turned.imag, turned.real[..., back]], axis=-1)
 
-    def _summed(self, power: Floats, *, memory: Complexes | None = None) -> Complexes:
-        """Return sum_k p_k exp(-2 pi i k j/H)/H at j = 0 to H/2."""
+    def _summed(
+        self, power: Floats, *, scale: float = 1.0, memory: Complexes | None = None
+    ) -> Complexes:
+        """Return scale sum_k p_k exp(-2 pi i (2k + 1/2) j/M)/H at j = 0 to H/2."""
+        size = len(self.turn) // 2 + 1
         if memory is None or not _IN_PLACE:
-            return np.fft.rfft(power, norm="forward")
-        shape = (*power.shape[:-1], len(self.turn) // 2 + 1)
-        summed = memory.reshape(-1)[: prod(shape)].reshape(shape)
-        return np.fft.rfft(power, norm="forward", out=summed)
+            summed = np.fft.rfft(power, norm="forward")
+        else:
+            shape = (*power.shape[:-1], size)
+            summed = memory.reshape(-1)[: prod(shape)].reshape(shape)
+            np.fft.rfft(power, norm="forward", out=summed)
+        summed *= scale * self.turn[:size]
+        return summed
 
 
 @lru_cache(maxsize=1)
