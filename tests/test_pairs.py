@@ -32,7 +32,12 @@ from perrin import (
     track_rotation,
     van_hove,
 )
-from perrin.curves import Correlations, covariance_polynomials, lag_covariance
+from perrin.curves import (
+    Correlations,
+    complete_squares,
+    covariance_polynomials,
+    lag_covariance,
+)
 
 SMALL = settings(max_examples=8, deadline=None, derandomize=True)
 
@@ -396,6 +401,18 @@ def test_a_steady_motion_keeps_its_digits(gaps, walkers):
         if np.isfinite(square).any():
             assert curve.value[lag - 1] == pytest.approx(np.nanmean(square), rel=1e-12)
             assert curve.n_pairs[lag - 1] == np.isfinite(square).sum()
+
+
+@pytest.mark.parametrize("velocity", [0.0, 50.0])
+@pytest.mark.parametrize("n", [2, 3, 8, 9])
+def test_squares_of_complete_walks_up_to_any_lag(n, velocity):
+    """Sums up to every longest lag equal direct sums, for even and odd numbers of frames."""
+    walks = np.random.default_rng(n).normal(size=(n, 2, 3))
+    walks += velocity * np.arange(n)[:, None, None]
+    direct = [np.sum((walks[lag:] - walks[:-lag]) ** 2, axis=(0, 1)) for lag in range(1, n)]
+    for count in range(1, n):
+        found = complete_squares(walks, count)
+        np.testing.assert_allclose(found, direct[:count], rtol=1e-12)
 
 
 @pytest.mark.parametrize("count", [1, 5, 30, 39])
