@@ -32,7 +32,12 @@ from perrin import (
     track_rotation,
     van_hove,
 )
-from perrin.curves import Correlations, covariance_polynomials, lag_covariance
+from perrin.curves import (
+    Correlations,
+    complete_squares,
+    covariance_polynomials,
+    lag_covariance,
+)
 
 SMALL = settings(max_examples=8, deadline=None, derandomize=True)
 
@@ -398,6 +403,18 @@ def test_a_steady_motion_keeps_its_digits(gaps, walkers):
             assert curve.n_pairs[lag - 1] == np.isfinite(square).sum()
 
 
+@pytest.mark.parametrize("velocity", [0.0, 50.0])
+@pytest.mark.parametrize("n", [2, 3, 8, 9])
+def test_squares_of_complete_walks_up_to_any_lag(n, velocity):
+    """Sums up to every longest lag equal direct sums, for even and odd numbers of frames."""
+    walks = np.random.default_rng(n).normal(size=(n, 2, 3))
+    walks += velocity * np.arange(n)[:, None, None]
+    direct = [np.sum((walks[lag:] - walks[:-lag]) ** 2, axis=(0, 1)) for lag in range(1, n)]
+    for count in range(1, n):
+        found = complete_squares(walks, count)
+        np.testing.assert_allclose(found, direct[:count], rtol=1e-12)
+
+
 @pytest.mark.parametrize("count", [1, 5, 30, 39])
 def test_half_frequencies_give_all_correlations(count):
     """Even and odd parts of correlations equal direct sums, also where the period is shorter."""
@@ -408,8 +425,9 @@ def test_half_frequencies_give_all_correlations(count):
     forward = [x[: 40 - lag] @ y[lag:] for lag in range(count + 1)]
     back = [y[: 40 - lag] @ x[lag:] for lag in range(count + 1)]
     product = (np.conj(f) * g)[0]
-    even, odd = transform.even(product.real)[: count + 1], transform.odd(product.imag)[: count + 1]
-    np.testing.assert_allclose(2 * even, np.add(forward, back), atol=1e-12)
+    even, odd = np.zeros(count), transform.odd(product.imag)[: count + 1]
+    transform.add_even(product.real, out=even, scale=2.0)
+    np.testing.assert_allclose(even, np.add(forward, back)[1:], atol=1e-12)
     np.testing.assert_allclose(-2 * odd, np.subtract(forward, back), atol=1e-12)
 
 

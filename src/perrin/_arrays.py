@@ -37,9 +37,14 @@ def as_positions(positions: ArrayLike, *, name: str = "positions") -> Floats:
     return x
 
 
+def complete(numbers: Floats) -> bool:
+    """Return whether none of the numbers is NaN: the smallest of them would be."""
+    return not np.isnan(numbers.min(initial=0.0))
+
+
 def present(points: Floats) -> Bools:
     """Return which points (..., d) are present, those without a NaN: shape (...)."""
-    if not np.isnan(points.sum()):  # a NaN anywhere makes the sum one
+    if complete(points):
         return np.ones(points.shape[:-1], dtype=np.bool_)
     missing = np.isnan(points[..., 0])
     for axis in range(1, points.shape[-1]):
@@ -151,7 +156,7 @@ def require_positive(**values: float) -> None:
     bad = [
         f"{name} = {value!r}"
         for name, value in values.items()
-        if not (np.ndim(value) == 0 and np.isfinite(value) and value > 0)
+        if not (np.ndim(value) == 0 and 0 < value < np.inf)
     ]
     if bad:
         raise ValueError("expected a finite number > 0: " + ", ".join(bad))

@@ -13,6 +13,7 @@ from perrin._arrays import (
     Floats,
     Ints,
     as_positions,
+    complete,
     from_plain,
     frozen,
     present,
@@ -250,9 +251,10 @@ def msd(
     else:
         require_positive(dt=dt)
         walks = as_positions(motion_or_positions)
-        time = dt * np.arange(len(walks), dtype=np.float64)
-        piece = np.broadcast_to(np.zeros((), dtype=np.int64), len(walks))
-        whole = len(walks) > 1 and present(walks).all()
+        time = np.arange(len(walks), dtype=np.float64)
+        time *= dt
+        piece = np.ndarray(len(walks), np.int64, bytes(8), strides=(0,))  # one 0 for all frames
+        whole = len(walks) > 1 and complete(walks)
         frames = (complete_frames if whole else partial(frames_of, walks))(time, piece, dt=dt)
     dof = walks.shape[2]
     estimated = isinstance(drift, (bool, np.bool_)) and bool(drift)
@@ -522,15 +524,17 @@ def mean_square_curve(
     components = sums.sums
     components /= sums.divisor[:, None]
     value = components.sum(axis=1)
-    pairs = sums.pairs / walks.shape[1]
-    relative = relative_error(sums, frames, value / (2 * dof), pairs)
+    pairs = sums.number if walks.shape[1] == 1 else sums.number / walks.shape[1]
+    stderr = relative_error(sums, frames, value, pairs)
     free = n_walks is None
     n_walks = float(walks.shape[2] * walks.shape[1]) if n_walks is None else n_walks
+    stderr *= value
+    stderr *= n_walks**-0.5
     return LagCurve(
         lagtime=sums.lagtime,
         value=value,
         components=components,
-        stderr=value * relative / np.sqrt(n_walks),
+        stderr=stderr,
         n_pairs=sums.pairs if free else np.rint(pairs).astype(np.int64),
         dof=dof,
         quantity=quantity,
@@ -538,7 +542,7 @@ def mean_square_curve(
         n_walks=n_walks,
         noise=noise,
         step=frames.step,
-        blocks=tuple(int(n) for n in frames.lengths),
+        blocks=tuple(frames.lengths.tolist()),
     )
 
 

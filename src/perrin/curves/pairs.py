@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 
-from perrin._arrays import present
+from perrin._arrays import complete, present
 from perrin.curves.grids import GRID_TOLERANCE
 from perrin.errors import PrecisionWarning, TooFewFramesError
 
@@ -91,12 +91,15 @@ class PairSums(NamedTuple):
     listed: ListedPairs | None
 
     @property
+    def number(self) -> Floats:
+        """Number of pairs, shape (L,), as floats."""
+        return self.on_grid if self.listed is None else self.pairs.astype(np.float64)
+
+    @property
     def divisor(self) -> Floats:
         """Number of pairs, shape (L,); NaN at a lag without a pair."""
-        number = self.pairs.astype(np.float64)
-        if not self.pairs.all():
-            number[self.pairs == 0] = np.nan
-        return number
+        number = self.number
+        return number if number.all() else np.where(number > 0, number, np.nan)
 
     @property
     def mean(self) -> Floats:
@@ -154,14 +157,16 @@ def pair_sums(kernel: Kernel, frames: Frames, *, most: int | None = None) -> Pai
     sums: Floats | None = None
     count: Ints | None = None
     before: Ints | int = 0
-    grid = np.arange(1.0, longest + 1) * frames.step
+    grid = np.arange(1.0, longest + 1)
+    grid *= frames.step
     lagtime = grid if frames.exact else grid.copy()
     for elements in [] if complete else frames.blocks:
         slot = frames.slot[elements]
+        row = slot if frames.row is frames.slot else frames.row[elements]
         lags = min(int(slot[-1]), longest)
         if lags < 1:
             continue
-        added, number = kernel.within(frames.row[elements], slot, lags)
+        added, number = kernel.within(row, slot, lags)
         if sums is None or count is None:
             if lags == longest and len(frames.blocks) == 1:
                 sums, count = added, number
@@ -355,11 +360,11 @@ class Squares:
     def within(self, rows: Ints, slots: Ints, count: int) -> tuple[Floats, Ints]:
         """Return the sums by FFT, of one component after the other."""
         walks = _on_grid(self.walks, rows, slots)
-        here = present(walks)
-        if here.all():
-            n, walkers, _ = walks.shape
-            return complete_squares(walks, count), walkers * (n - np.arange(1, count + 1))
-        return gapped_squares(walks, here, count)
+        if not complete(walks):
+            return gapped_squares(walks, present(walks), count)
+        n, walkers, _ = walks.shape
+        pairs = np.arange(walkers * (n - 1), walkers * (n - 1 - count), -walkers)
+        return complete_squares(walks, count), pairs
 
     def between(self, first: Ints, last: Ints) -> tuple[Floats, Ints]:
         """Return the squared differences of pairs."""
@@ -400,41 +405,59 @@ def complete_squares(walks: Floats, count: int) -> Floats:
     half = len(transform.turn)
     at_once = min(max(_NUMBERS_AT_ONCE // (n * walkers), 1), components)
     time = np.arange(0.5 * (1 - n), 0.5 * n)
-    spread = walkers * float(time @ time)
+    spread = walkers * n * (n * n - 1) / 12  # the sum of the squares of these times
     # New memory takes as long as the transforms: arrays are used again.
-    x, power = np.empty((at_once, walkers, n)), np.empty((at_once, half))
+    memory = np.empty(at_once * walkers * max(n, half))
     spectrum = np.empty((at_once * walkers, half), dtype=np.complex128)
     sums = np.empty((components, count))
     for low in range(0, components, at_once):
         out = sums[low : low + at_once]
         q = len(out)
-        some = x[:q]
-        some[:] = walks[..., low : low + at_once].T
-        some -= some.sum(axis=2, keepdims=True) / n
-        slope = _steady_slopes(some, time, spread)
+        x = memory[: q * walkers * n].reshape(q, walkers, n)
+        x[:] = walks[..., low : low + at_once].T
+        x -= x.sum(axis=2, keepdims=True) / n
+        square = _squares_at_ends(x, out, memory=spectrum)
+        slope = _steady_slopes(x, time, spread=spread, square=square)
         rest = None
-        if slope.any():
-            some -= slope[:, None, None] * time
-            total = some.sum(axis=1)
+        if any(slope):
+            x -= np.reshape(slope, (q, 1, 1)) * time
+            total = x.sum(axis=1)
             rest = np.cumsum(total[:, : -count - 1 : -1] - total[:, :count], axis=1)
-        found = transform.spectrum(some.reshape(-1, n), out=spectrum[: q * walkers])
-        squared_size(found.reshape(q, walkers, half), overwrite=True, out=power[:q])
-        # Twice the sum of squares, less the squares of the frames that begin or end no pair.
-        np.multiply(some, some, out=some)
-        square = some[:, 0] if walkers == 1 else some.sum(axis=1)
-        np.add(square[:, :count], square[:, : -count - 1 : -1], out=out)
-        np.cumsum(out, axis=1, out=out)
-        np.subtract(2 * square.sum(axis=1, keepdims=True), out, out=out)
-        correlation = transform.even(power[:q], memory=spectrum, out=power[:q])
-        correlation *= 2
-        out -= correlation[:, 1 : count + 1]
+            _squares_at_ends(x, out, memory=spectrum)
+        found = transform.spectrum(x.reshape(-1, n), out=spectrum[: q * walkers])
+        power = memory[: q * half].reshape(q, half)
+        squared_size(found.reshape(q, walkers, half), overwrite=True, out=power)
+        transform.add_even(power, out=out, scale=-2.0, memory=spectrum)
         if rest is not None:
             lag = np.arange(1.0, count + 1)
-            far = slope[:, None] * lag
+            far = np.multiply.outer(slope, lag)
             out += far * (far * (walkers * (n - lag)) + 2 * rest)
         # A sum of squares that rounds below zero is zero.
-        np.maximum(out, 0.0, out=out)
+        if out.min() < 0:
+            np.maximum(out, 0.0, out=out)
     return sums.T
+
+
+def _squares_at_ends(x: Floats, out: Floats, *, memory: Complexes) -> list[float]:
+    """Write the sums of squares over the frames that begin a pair and over those that end one.
+
+    They are written to `out` (q, L) for walks (q, K, n) at lags 1 to L; returned is the sum of
+    squares of each component. The complex `memory` has at least half as many numbers as x.
+    """
+    _, walkers, n = x.shape
+    count, middle = out.shape[1], (n + 1) // 2
+    square = memory.reshape(-1).view(np.float64)[: x.size].reshape(x.shape)
+    np.multiply(x, x, out=square)
+    square = square[:, 0] if walkers == 1 else square.sum(axis=1)
+    # The frames that begin or end no pair lie at the two ends, as many at either: their sums up to
+    # the middle of the track give those beyond it.
+    ends = square[:, :middle]
+    ends += square[:, : n - middle - 1 : -1]
+    np.cumsum(ends, axis=1, out=ends)
+    whole = ends[:, -1:] + ends[:, n - middle - 1 : n - middle]
+    np.subtract(whole, ends[:, :count], out=out[:, :middle])
+    out[:, middle:] = ends[:, n - count - 1 : n - middle - 1][:, ::-1]
+    return [0.5 * each for each in whole[:, 0].tolist()]
 
 
 def gapped_squares(walks: Floats, here: Bools, count: int) -> tuple[Floats, Ints]:
@@ -471,25 +494,28 @@ def gapped_squares(walks: Floats, here: Bools, count: int) -> tuple[Floats, Ints
     at_once = min(max(_NUMBERS_AT_ONCE // (n * walkers), 1), components)
     mask = np.ascontiguousarray(here.T, dtype=np.float64)
     spectrum = transform.spectrum(mask)
-    pairs = np.rint(transform.even(squared_size(spectrum))[1 : count + 1])
+    pairs = np.zeros(count)
+    transform.add_even(squared_size(spectrum), out=pairs)
+    np.rint(pairs, out=pairs)
     time, lag = np.arange(float(n)), np.arange(1.0, count + 1)
     number = np.maximum(mask.sum(axis=1, keepdims=True), 1.0)
     middle = mask * (time - (mask @ time)[:, None] / number)
-    sums = np.empty((components, count))
+    sums = np.zeros((components, count))
     for low in range(0, components, at_once):
         out = sums[low : low + at_once]
         x = np.where(here.T, walks[..., low : low + at_once].T, 0.0)
         x -= mask * (x.sum(axis=2, keepdims=True) / number)
-        slope = _steady_slopes(x, time, float(np.vdot(middle, middle)))
-        steady = bool(slope.any())
-        if steady:
-            x -= slope[:, None, None] * middle
+        square = [float(np.vdot(one, one)) for one in x]
+        spread = float(np.vdot(middle, middle))
+        slope = _steady_slopes(x, time, spread=spread, square=square)
+        if any(slope):
+            x -= np.reshape(slope, (-1, 1, 1)) * middle
         both = transform.spectrum(np.concatenate([x, x * x]).reshape(-1, n))
         moved, squared = both.reshape(2, len(x), walkers, -1)
         power = (np.conj(spectrum) * squared).real.sum(axis=1) - squared_size(moved)
-        np.multiply(transform.even(power)[:, 1 : count + 1], 2.0, out=out)
-        if steady:
-            far = slope[:, None] * lag
+        transform.add_even(power, out=out, scale=2.0)
+        if any(slope):
+            far = np.multiply.outer(slope, lag)
             rest = transform.odd((spectrum * np.conj(moved)).imag.sum(axis=1))[:, 1 : count + 1]
             out += far * (far * pairs + 4 * rest)
         # A sum of squares that rounds below zero is zero.
@@ -497,15 +523,17 @@ def gapped_squares(walks: Floats, here: Bools, count: int) -> tuple[Floats, Ints
     return sums.T, pairs.astype(np.int64)
 
 
-def _steady_slopes(x: Floats, time: Floats, spread: float) -> Floats:
-    """Return the common slope of the walks (q, K, n) of mean 0 along each component, (q,).
+def _steady_slopes(x: Floats, time: Floats, *, spread: float, square: list[float]) -> list[float]:
+    """Return the common slope of the walks (q, K, n) of mean 0 along each of q components.
 
     It is 0 where a straight line is not most of the motion. `spread` is the sum over the frames of
-    all walks of the squared time from the walk's mean time.
+    all walks of the squared time from the walk's mean time, `square` that of each component.
     """
-    slope = (x @ time).sum(axis=1) / max(spread, 1.0)
-    square = np.array([float(np.vdot(one, one)) for one in x])
-    return np.where(slope**2 * spread > _STEADY_SHARE * square, slope, 0.0)
+    slopes = [sum(each) / max(spread, 1.0) for each in (x @ time).tolist()]
+    return [
+        slope if slope * slope * spread > _STEADY_SHARE * whole else 0.0
+        for slope, whole in zip(slopes, square, strict=True)
+    ]
 
 
 @dataclass(frozen=True, eq=False)
@@ -526,8 +554,10 @@ class Correlations:
     --------
     >>> transform = Correlations.of(6)
     >>> spectrum = transform.spectrum(np.array([[1.0, 2.0, 3.0]]))
-    >>> transform.even(np.abs(spectrum[0]) ** 2).round(9)  # 1 + 4 + 9, 2 + 6 and 3
-    array([14.,  8.,  3.])
+    >>> sums = np.zeros(2)
+    >>> transform.add_even(np.abs(spectrum[0]) ** 2, out=sums)
+    >>> sums.round(9)  # 2 + 6 and 3
+    array([8., 3.])
     """
 
     turn: Complexes
@@ -542,26 +572,31 @@ class Correlations:
         half = len(self.turn)
         out = np.empty((len(x), half), dtype=np.complex128) if out is None else out
         size = min(half, x.shape[1])
-        np.multiply(x[:, :half], self.turn[:size], out=out[:, :size])
+        out[:, :size] = x[:, :half]  # converted first: a product of two types takes longer
+        out[:, :size] *= self.turn[:size]
         out[:, size:] = 0.0
         rest = x[:, half:]
         if rest.shape[1]:
             out[:, : rest.shape[1]] -= 1j * rest * self.turn[: rest.shape[1]]
         return np.fft.fft(out, axis=1, out=out) if _IN_PLACE else np.fft.fft(out, axis=1)
 
-    def even(
-        self, power: Floats, *, memory: Complexes | None = None, out: Floats | None = None
-    ) -> Floats:
-        """Return sum_k p_k cos(2 pi (2k + 1/2) j/M)/H of p (..., H) at j = 0 to H - 1.
+    def add_even(
+        self,
+        power: Floats,
+        *,
+        out: Floats,
+        scale: float = 1.0,
+        memory: Complexes | None = None,
+    ) -> None:
+        """Add scale sum_k p_k cos(2 pi (2k + 1/2) j/M)/H of p (..., H), j = 1 to L, to (..., L).
 
-        The complex `memory` has at least as many numbers as p; `out` may be p.
+        The complex `memory` has at least as many numbers as p.
         """
-        turned = self._summed(power, memory=memory)
-        split, back = turned.shape[-1], slice(len(self.turn) - turned.shape[-1], 0, -1)
-        out = np.empty(power.shape) if out is None else out
-        out[..., :split] = turned.real
-        np.negative(turned.imag[..., back], out=out[..., split:])
-        return out
+        turned = self._summed(power, scale=scale, memory=memory)
+        half, count, split = len(self.turn), out.shape[-1], turned.shape[-1] - 1
+        near, far = out[..., :split], out[..., split:]
+        near += turned.real[..., 1 : count + 1]
+        far -= turned.imag[..., half - count : half - split][..., ::-1]
 
     def odd(self, power: Floats) -> Floats:
         """Return sum_k p_k sin(2 pi (2k + 1/2) j/M)/H of p (..., H) at j = 0 to H - 1."""
@@ -569,8 +604,10 @@ class Correlations:
         back = slice(len(self.turn) - turned.shape[-1], 0, -1)
         return np.concatenate([-turned.imag, turned.real[..., back]], axis=-1)
 
-    def _summed(self, power: Floats, *, memory: Complexes | None = None) -> Complexes:
-        """Return sum_k p_k exp(-2 pi i (2k + 1/2) j/M)/H at j = 0 to H/2."""
+    def _summed(
+        self, power: Floats, *, scale: float = 1.0, memory: Complexes | None = None
+    ) -> Complexes:
+        """Return scale sum_k p_k exp(-2 pi i (2k + 1/2) j/M)/H at j = 0 to H/2."""
         size = len(self.turn) // 2 + 1
         if memory is None or not _IN_PLACE:
             summed = np.fft.rfft(power, norm="forward")
@@ -578,7 +615,7 @@ class Correlations:
             shape = (*power.shape[:-1], size)
             summed = memory.reshape(-1)[: prod(shape)].reshape(shape)
             np.fft.rfft(power, norm="forward", out=summed)
-        summed *= self.turn[:size]
+        summed *= scale * self.turn[:size]
         return summed
 
 
@@ -642,7 +679,7 @@ class Products:
         columns = np.ascontiguousarray(
             (values if whole else np.where(here[:, None], values, 0.0)).T
         )
-        sums = np.empty((len(self.groups), count))
+        sums = np.zeros((len(self.groups), count))
         memory = np.empty((1, len(transform.turn)), dtype=np.complex128)
         squares = all(i == j for group in self.groups for i, j in group)
         parts = None if squares else transform.spectrum(columns).view(np.float64)
@@ -656,11 +693,12 @@ class Products:
                     # The real part is the transform of the mean of a product and its reverse.
                     product = parts[i] * parts[j]
                     power += product[::2] + product[1::2]
-            out[:] = transform.even(power, memory=memory, out=power)[1 : count + 1]
+            transform.add_even(power, out=out, memory=memory)
         if whole:
             return sums.T, len(values) - np.arange(1, count + 1)
         mask = transform.spectrum(here.astype(np.float64)[None])
-        pairs = transform.even(squared_size(mask))[1 : count + 1]
+        pairs = np.zeros(count)
+        transform.add_even(squared_size(mask), out=pairs)
         return sums.T, np.rint(pairs).astype(np.int64)
 
     def between(self, first: Ints, last: Ints) -> tuple[Floats, Ints]:
@@ -676,7 +714,7 @@ class Products:
 def _on_grid(values: Floats, rows: Ints, slots: Ints) -> Floats:
     """Return rows of an array at their places on a grid, NaN between them."""
     if len(slots) == slots[-1] + 1:
-        if len(rows) == len(values) and np.array_equal(rows, slots):
+        if len(rows) == len(values) and (rows is slots or np.array_equal(rows, slots)):
             return values
         if rows[-1] - rows[0] == len(rows) - 1 and np.array_equal(rows, slots + rows[0]):
             return values[rows[0] : rows[-1] + 1]

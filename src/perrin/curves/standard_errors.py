@@ -18,7 +18,7 @@ _INTEGER_RANGE = 1 << 22
 _CACHED_LAGS = 4096  # lags whose working arrays fit into the second-level cache
 
 
-def relative_error(sums: PairSums, frames: Frames, half: Floats, pairs: Floats) -> Floats:
+def relative_error(sums: PairSums, frames: Frames, value: Floats, pairs: Floats) -> Floats:
     """Return the relative standard error of a one-dimensional MSD at every lag.
 
     The variance of a mean of squares is twice the sum of the squared covariances of all pairs of
@@ -30,8 +30,9 @@ def relative_error(sums: PairSums, frames: Frames, half: Floats, pairs: Floats) 
         Sums of the squared displacements.
     frames : Frames
         Frames that form the pairs.
-    half : ndarray, shape (L,)
-        Half of the MSD, D t + s; D per step and s are estimated from its first two lags.
+    value : ndarray, shape (L,)
+        The MSD, or any multiple D t + s of it; D per step and s are estimated from its first two
+        lags, and their unit does not matter.
     pairs : ndarray, shape (L,)
         Number of pairs of one walker.
 
@@ -47,18 +48,18 @@ def relative_error(sums: PairSums, frames: Frames, half: Floats, pairs: Floats) 
     >>> walk = np.random.default_rng(1).normal(size=(101, 1, 1)).cumsum(axis=0)
     >>> frames = place_frames(time, piece, here, dt=1.0)
     >>> sums = pair_sums(Squares(walk), frames)
-    >>> error = relative_error(sums, frames, sums.mean[:, 0] / 2, sums.pairs)
+    >>> error = relative_error(sums, frames, sums.mean[:, 0], sums.pairs)
     >>> bool(abs(error[0] - np.sqrt(2 / 100)) < 1e-3)  # 100 independent squares
     True
     """
     lengths = frames.lengths
     if len(lengths) == 1 and sums.listed is None and frames.exact:
         longest = int(lengths[0])
-        whole = np.arange(1.0, len(half) + 1)
-        if np.array_equal(pairs, longest + 1 - whole):
-            d, s = two_lag_fit(whole, half, pairs)
+        if pairs[0] == longest:  # all pairs of neighbours: no frame is missing
+            whole = (longest + 1.0) - pairs
+            d, s = two_lag_fit(whole, value, pairs)
             if not d + s > 0:
-                return np.full_like(half, np.nan)
+                return np.full_like(value, np.nan)
             relative = lag_covariance(whole, longest, present=None, D=d, s=s)
             np.sqrt(relative, out=relative)
             whole *= d * 2**0.5
@@ -67,7 +68,7 @@ def relative_error(sums: PairSums, frames: Frames, half: Floats, pairs: Floats) 
             relative /= whole
             return relative
     lag = sums.lagtime / frames.step
-    d, s = two_lag_fit(lag, half, pairs)
+    d, s = two_lag_fit(lag, value, pairs)
     total = np.zeros_like(lag)
     blocks = [
         (int(n), int(k)) for n, k in zip(*np.unique(lengths, return_counts=True), strict=True)
@@ -99,7 +100,7 @@ def relative_error(sums: PairSums, frames: Frames, half: Floats, pairs: Floats) 
         chained = common_frames(listed.lag, listed.last, listed.first, n_lags=len(lag))
         total += 2 * chained * s * s
     mean = 2 * (d * lag + s)
-    relative = np.full_like(half, np.nan)
+    relative = np.full_like(value, np.nan)
     good = (pairs > 0) & (mean > 0)
     np.divide(np.sqrt(2 * total), pairs * mean, out=relative, where=good)
     return relative
@@ -265,7 +266,7 @@ def lag_covariance(
     array([ 10., 460.])
     """
     square, both, noise, n = 4 * D * D, 8 * D * s, 2 * s * s, float(steps + 1)
-    middle = int(np.searchsorted(lag, 0.5 * n, side="right"))
+    middle = int(lag.searchsorted(0.5 * n, side="right"))
     # Up to half of the track a polynomial of b, beyond it one of the displacements q = n - b.
     near = (
         -5 / 6 * square,
@@ -286,10 +287,11 @@ def lag_covariance(
         (total[:middle], lag[:middle], near),
         (total[middle:], n - lag[middle:], far),
     ):
-        value[:] = coefficients[0]
-        for coefficient in coefficients[1:]:
-            value *= x
+        np.multiply(x, coefficients[0], out=value)
+        for coefficient in coefficients[1:-1]:
             value += coefficient
+            value *= x
+        value += coefficients[-1]
     if present is None:
         return total
     gap, b, p = 1 / present - 1, lag, n - lag
