@@ -23,7 +23,6 @@ from perrin import (
     track_rotation,
 )
 from perrin.diffusion import (
-    SYMMETRIC_ELEMENTS,
     effective_modes,
     element_variances,
     tensor_likelihood,
@@ -43,6 +42,7 @@ from perrin.diffusion.tensor_likelihood import (
     squares,
 )
 from perrin.diffusion.tensor_modes import ChainTrack, FewModesTrack
+from perrin.diffusion.tensor_results import SYMMETRIC_ELEMENTS
 from perrin.diffusion.tensors import ScaledTracks, axes_like, symmetric_basis
 from perrin.geometry.rigid import diffusion_center, shifted
 from perrin.geometry.rotations import exp_map, skew
