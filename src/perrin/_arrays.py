@@ -13,6 +13,7 @@ Floats: TypeAlias = NDArray[np.float64]
 Ints: TypeAlias = NDArray[np.int64]
 Bools: TypeAlias = NDArray[np.bool_]
 Options = TypeVar("Options")
+Scalar = TypeVar("Scalar", bound=np.generic)
 
 
 def as_positions(positions: ArrayLike, *, name: str = "positions") -> Floats:
@@ -67,7 +68,7 @@ def stored_once(rows: Floats) -> Floats:
     return repeated(rows[0].copy(), len(rows))
 
 
-def repeated(row: Floats, count: int) -> Floats:
+def repeated(row: NDArray[Scalar], count: int) -> NDArray[Scalar]:
     """Return an array (count, ...) whose rows are all a view of one row.
 
     It is numpy.broadcast_to of one more axis, which takes ten times as long.
@@ -80,7 +81,7 @@ def repeated(row: Floats, count: int) -> Floats:
     """
     row = np.asarray(row, order="C")
     strides = (0, *row.strides)
-    rows: Floats = np.ndarray((count, *row.shape), row.dtype, row, strides=strides)
+    rows: NDArray[Scalar] = np.ndarray((count, *row.shape), row.dtype, row, strides=strides)
     rows.setflags(write=False)
     return rows
 

@@ -17,6 +17,7 @@ from perrin._arrays import (
     from_plain,
     frozen,
     present,
+    repeated,
     require_positive,
     to_plain,
 )
@@ -253,7 +254,7 @@ def msd(
         walks = as_positions(motion_or_positions)
         time = np.arange(len(walks), dtype=np.float64)
         time *= dt
-        piece = np.ndarray(len(walks), np.int64, bytes(8), strides=(0,))  # one 0 for all frames
+        piece = repeated(np.zeros((), dtype=np.int64), len(walks))
         whole = len(walks) > 1 and complete(walks)
         frames = (complete_frames if whole else partial(frames_of, walks))(time, piece, dt=dt)
     dof = walks.shape[2]

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from perrin._arrays import frozen
+from perrin._arrays import frozen, repeated
 from perrin.errors import TooFewFramesError
 
 if TYPE_CHECKING:
@@ -187,7 +187,7 @@ def complete_frames(time: Floats, piece: Ints, *, dt: float) -> Frames:
     array([2])
     """
     slot = np.arange(len(time))
-    block = np.ndarray(len(time), np.int64, bytes(8), strides=(0,))  # one 0 for all frames
+    block = repeated(np.zeros((), dtype=np.int64), len(time))
     return Frames(slot, time, piece, block, slot, dt, exact=True)
 
 
