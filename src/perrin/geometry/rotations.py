@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
 _CACHED_ROWS = 2048  # rows whose working arrays fit into the second-level cache
+_MANY_ROWS = 32  # rows from which copies of a reference take longer than a call of their own
 
 
 def kabsch(points: ArrayLike, reference: ArrayLike, *, weights: ArrayLike | None = None) -> Floats:
@@ -190,19 +191,27 @@ def fit_rotations(
     if w is not None or x.shape[:-2] != batch:
         batch = np.broadcast_shapes(batch, x.shape[:-2], () if w is None else w.shape[:-1])
     d, size = y.shape[-1], math.prod(batch)
-    y, x = _rows(y, batch), _rows(x, batch)
+    # Many neighbouring rows with one reference are solved together, without copies of it.
+    shared = w is None and y.shape[:-2] == batch and x.shape[:-2] == (*batch[:-1], 1)
+    shared = shared and size > 0 and batch[-1] >= _MANY_ROWS
+    x = _rows(x[..., 0, :, :], batch[:-1]) if shared else _rows(x, batch)
+    y = _rows(y, batch)
     w = None if w is None else _rows(w[..., None], batch)
     rotation, unique = np.empty((size, d, d)), np.zeros(size, dtype=np.bool_)
+    together = batch[-1] if shared else max(size, 1)
     kernels = compiled_kernels() if d == 3 else None
     if kernels is not None:
-        kernels.wahba(y, x, rotation, unique, w)
+        for k, low in enumerate(range(0, size, together)):
+            part = slice(low, low + together)
+            one = x[k : k + 1] if shared else x
+            kernels.wahba(y[part], one, rotation[part], unique[part], w)
     rest = np.flatnonzero(~unique)
     solve = planar_rotation if d == 2 else spatial_rotation
     for low in range(0, rest.size, _CACHED_ROWS):
         rows = rest[low : low + _CACHED_ROWS]
         some_y, some_x, some_w = _without_absent(
             y if len(y) == 1 else y[rows],
-            x if len(x) == 1 else x[rows],
+            x if len(x) == 1 else x[rows // together if shared else rows],
             w if w is None or len(w) == 1 else w[rows],
         )
         last_w = None if some_w is None else _batch_last(some_w)

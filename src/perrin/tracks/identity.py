@@ -533,16 +533,23 @@ def rigid_fits(points: Floats, template: Floats) -> tuple[Floats, Floats]:
     """
     rotation, unique = fit_rotations(points, template)
     here = present(points) & present(template)
+    # With the sets last, products of a few coordinates are those of long vectors.
+    sets = points, template, rotation, here[..., None]
+    y, t, turn, known = (
+        np.ascontiguousarray(np.moveaxis(a, -3, -1) if a.ndim > 2 else a[..., None]) for a in sets
+    )
     if here.all():
-        y, t = centred(points), centred(template)
-        e = y - t @ np.swapaxes(rotation, -1, -2)
+        y = y - y.sum(axis=-3, keepdims=True) / y.shape[-3]
+        t = t - t.sum(axis=-3, keepdims=True) / t.shape[-3]
+        e = y - np.einsum("...njk,...ijk->...nik", t, turn)
     else:
-        weight = here[..., None] / np.maximum(here.sum(axis=-1), 1)[..., None, None]
-        y, t = np.where(here[..., None], points, 0.0), np.where(here[..., None], template, 0.0)
-        y = y - (y * weight).sum(axis=-2, keepdims=True)
-        t = t - (t * weight).sum(axis=-2, keepdims=True)
-        e = np.where(here[..., None], y - t @ np.swapaxes(rotation, -1, -2), 0.0)
-    return rotation, np.where(unique, np.einsum("...ni,...ni->...", e, e), np.inf)
+        weight = known / np.maximum(known.sum(axis=-3, keepdims=True), 1)
+        y, t = np.where(known, y, 0.0), np.where(known, t, 0.0)
+        y = y - (y * weight).sum(axis=-3, keepdims=True)
+        t = t - (t * weight).sum(axis=-3, keepdims=True)
+        e = np.where(known, y - np.einsum("...njk,...ijk->...nik", t, turn), 0.0)
+    misfit = np.einsum("...nik,...nik->...k", e, e).reshape(unique.shape)
+    return rotation, np.where(unique, misfit, np.inf)
 
 
 @lru_cache(maxsize=64)
