@@ -388,11 +388,12 @@ def pose_errors(fit: PoseFit, seen: Bools, noise: Floats) -> tuple[Floats, Float
         some = np.flatnonzero(rows.any(axis=1))
         if not some.size:
             continue
-        template, place = fit.template[some], np.searchsorted(some, np.nonzero(rows)[0])
-        variance[rows] = center_variance(template, pattern, sigma[some])[place]
+        template, poses = fit.template[some], rows[some].sum(axis=1)
+        variance[rows] = np.repeat(center_variance(template, pattern, sigma[some]), poses)
         # Noise that is equal along all axes is the same in body axes.
         of_body = noise[some, 0][:, None, None] * np.eye(d)
-        covariance[rows] = orientation_covariance(template[:, pattern], of_body)[place]
+        of_poses = orientation_covariance(template[:, pattern], of_body)
+        covariance[rows] = np.repeat(of_poses, poses, axis=0)
         for k in some[~equal[some]].tolist():
             r = fit.rotation[k, rows[k]]
             body_noise = np.einsum("tij,i,tik->tjk", r, noise[k], r)
@@ -401,8 +402,11 @@ def pose_errors(fit: PoseFit, seen: Bools, noise: Floats) -> tuple[Floats, Float
 
 
 def _in_body(x: Floats, seen: Bools, rotation: Floats, center: Floats) -> Floats:
-    """Return the particles in the axes of the body, (..., T, n, d)."""
-    turned: Floats = (x - center[..., None, :]) @ rotation
+    """Return the particles in the axes of the body, (..., T, n, d), the frames last in memory."""
+    # Products of a few coordinates are those of long vectors.
+    arm, r = (np.ascontiguousarray(np.moveaxis(a, -3, -1)) for a in (x, rotation))
+    arm = arm - np.swapaxes(center, -1, -2)[..., None, :, :]
+    turned = np.moveaxis(np.einsum("...aik,...nak->...nik", r, arm), -1, -3)
     return turned if seen.all() else np.where(seen[..., None], turned, np.nan)
 
 
@@ -410,12 +414,14 @@ def _shape_centers(x: Floats, rotation: Floats, shape: Floats) -> Floats:
     """Return the lab position of the shape's origin, from the particles present in both."""
     centroid = centroids(x)
     if np.isfinite(centroid).all() and np.isfinite(shape).all():
-        arm = np.broadcast_to(shape.mean(axis=-2)[..., None, :], centroid.shape)
+        arm = shape.mean(axis=-2)[..., None, :]
     else:
         known = np.isfinite(x) & np.isfinite(shape[..., None, :, :])
         arm = mean_present(np.where(known, shape[..., None, :, :], np.nan), axis=-2)
         centroid = mean_present(np.where(known, x, np.nan), axis=-2)
-    center: Floats = centroid - (rotation @ arm[..., None])[..., 0]
+    r = np.ascontiguousarray(np.moveaxis(rotation, -3, -1))
+    lever = np.einsum("...ijk,...jk->...ik", r, np.swapaxes(arm, -1, -2))
+    center: Floats = centroid - np.swapaxes(lever, -1, -2)
     return center
 
 
@@ -451,7 +457,8 @@ def _fit_of(x: Floats, seen: Bools, rotation: Floats, shape: Floats) -> PoseFit:
     fitted = np.isfinite(rotation[..., 0, 0])
     first = np.argmax(fitted, axis=1)
     gauge = np.swapaxes(rotation[bodies, first], 1, 2)
-    shape, rotation = shape @ gauge, rotation @ gauge[:, None]
+    shape, turned = shape @ gauge, rotation.reshape(len(x), -1, d) @ gauge
+    rotation = turned.reshape(rotation.shape)
     rotation[bodies, first] = np.eye(d)
     center = _shape_centers(x, rotation, shape)
     residual = _in_body(x, seen, rotation, center) - shape[:, None]

@@ -259,7 +259,12 @@ def track_scanned(
 
 
 def track_each(
-    positions: Floats, *, time: Floats, dt: float, sigma: Floats | None = None
+    positions: Floats,
+    *,
+    time: Floats,
+    dt: float,
+    sigma: Floats | None = None,
+    piece: Ints | None = None,
 ) -> list[RigidMotion | DegenerateClusterError | TooFewFramesError | ValueError]:
     """Fit each of several bodies to its common shape, as `track_rotation`, all of them together.
 
@@ -273,6 +278,8 @@ def track_each(
         Time between frames, s.
     sigma : ndarray, shape (d,), optional
         Known localisation error, um; default: from the residuals.
+    piece : ndarray of int, shape (B, T), optional
+        Pieces of the tracks; default: one piece.
 
     Returns
     -------
@@ -300,7 +307,10 @@ def track_each(
     if rows.size:
         some, here = positions[rows], seen[rows]
         fit, faults = fit_templates(some, here)
-        motions = _motions_of(fit, faults, some, here, time=time[rows], dt=dt, sigma=sigma)
+        pieces = None if piece is None else piece[rows]
+        motions = _motions_of(
+            fit, faults, some, here, time=time[rows], dt=dt, sigma=sigma, piece=pieces
+        )
         for k, motion in zip(rows.tolist(), motions, strict=True):
             found[k] = motion
     return [one for one in found if one is not None]
@@ -424,6 +434,7 @@ def _motions_of(
     dt: float,
     sigma: Floats | None = None,
     errors: tuple[Floats, Floats] | None = None,
+    piece: Ints | None = None,
 ) -> list[RigidMotion | DegenerateClusterError | TooFewFramesError]:
     """Return the motions of the fitted poses of several bodies, or why there is none."""
     d = x.shape[3]
@@ -437,11 +448,16 @@ def _motions_of(
     lost[lost] = worst > _LOST_AXIS
     fitted = np.isfinite(fit.rotation[..., 0, 0]) & ~lost
     square = np.einsum("btni,btni->btn", fit.residual, fit.residual)
-    nan = np.where(fitted, 0.0, np.nan)
-    center, rotation = fit.center + nan[..., None], fit.rotation + nan[..., None, None]
-    distance = np.sqrt(mean_present(np.where(seen, square, np.nan), axis=2)) + nan
+    if not seen.all():
+        square = np.where(seen, square, np.nan)
+    distance = np.sqrt(mean_present(square, axis=2))
     count = seen.sum(axis=2)
-    covariance, variance = covariance + nan[..., None, None], variance + nan
+    center, rotation = fit.center, fit.rotation
+    if not fitted.all():
+        nan = np.where(fitted, 0.0, np.nan)
+        center, rotation = center + nan[..., None], rotation + nan[..., None, None]
+        covariance, variance = covariance + nan[..., None, None], variance + nan
+        distance = distance + nan
     # Why frames have no pose; the texts are those of all numbers of particles.
     numbers = range(x.shape[2] + 1)
     few = [f"{c} of {numbers[-1]} particles, {d} needed" if c else "no particles" for c in numbers]
@@ -455,6 +471,7 @@ def _motions_of(
     c = count[~fitted]
     texts = [np.array(part)[c] for part in (few, near, unfixed)]
     why[~fitted] = np.select([c < d, lost[~fitted]], texts[:2], texts[2])
+    pieces = np.zeros(fitted.shape, dtype=np.int64) if piece is None else piece
     motions: list[RigidMotion | DegenerateClusterError | TooFewFramesError] = []
     for k, fault in enumerate(faults):
         if fault is None and fitted[k].sum() < 2:
@@ -472,7 +489,7 @@ def _motions_of(
                 n_present=count[k],
                 covariance=covariance[k],
                 center_variance=variance[k],
-                piece=np.zeros(x.shape[1], dtype=np.int64),
+                piece=pieces[k],
                 reason=tuple(why[k].tolist()),
                 template=fit.template[k],
                 sigma=float(np.sqrt(sigma2[k])),

@@ -119,8 +119,13 @@ class Identity(Shown):
         x = np.asarray(positions, dtype=np.float64)
         if self.order.shape == x.shape[:2]:
             seen = present(x)
-            own = np.where(seen, np.arange(x.shape[1]), -1)
-            if np.array_equal(self.order, own) and np.isnan(x[~seen]).all():
+            own = np.arange(x.shape[1])
+            if seen.all():
+                same = bool((self.order == own).all())
+            else:
+                same = bool((self.order == np.where(seen, own, -1)).all())
+                same = same and bool(np.isnan(x[~seen]).all())
+            if same:
                 return x
         taken = np.take_along_axis(x, self.order[..., None], axis=1)
         return np.where(self.order[..., None] >= 0, taken, np.nan)
@@ -301,7 +306,7 @@ def settle_each(positions: Sequence[Floats], *, times: Sequence[Floats | None]) 
             alike.setdefault((x.shape, complete), []).append(k)
     found: dict[int, Identity] = {}
     for group in alike.values():
-        for part in _batches(len(group), len(positions[group[0]])):
+        for part in _batches(len(group), positions[group[0]].size):
             rows = group[part]
             some = np.stack([positions[k] for k in rows])
             for k, certain in zip(rows, certain_labels(some), strict=True):
