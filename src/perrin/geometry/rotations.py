@@ -288,8 +288,7 @@ def log_map(rotation: ArrayLike) -> Floats:
     angle = 2.0 * np.arctan2(sine, w)
     # sine < 1e-9 means cos = 1 to rounding: the angle is 2 sine, so the ratio is 2.
     ratio = np.divide(angle, sine, out=np.full_like(sine, 2.0), where=sine > 1e-9)
-    out: Floats = v * ratio[..., None]
-    return out
+    return np.ascontiguousarray(v * ratio[..., None])
 
 
 def axis_angle(rotation: ArrayLike) -> tuple[Floats, Floats]:
@@ -372,7 +371,8 @@ def unit_quaternion(rotation: Floats) -> Floats:
     array([0., 1., 0., 0.])
     """
     r = rotation
-    q = np.empty((*r.shape[:-2], 4))
+    # Each component is one vector in memory.
+    q = np.moveaxis(np.empty((4, *r.shape[:-2])), 0, -1)
     q[..., 0] = 1.0 + r[..., 0, 0] + r[..., 1, 1] + r[..., 2, 2]
     for i, (a, b) in enumerate(((2, 1), (0, 2), (1, 0))):
         np.subtract(r[..., a, b], r[..., b, a], out=q[..., i + 1])

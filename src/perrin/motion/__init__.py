@@ -41,6 +41,7 @@ from perrin.motion.residuals import (
     body_residuals,
     expected_squares,
     fit_projector,
+    frames_last,
     lag_one_autocorrelation,
     lagged_products,
     measure_scan,
@@ -56,6 +57,7 @@ from perrin.motion.residuals import (
 )
 from perrin.motion.rigid_motion import (
     RigidMotion,
+    find_step_vectors,
     find_symmetries,
     threshold_displacement,
     threshold_references,
@@ -107,9 +109,11 @@ __all__ = [
     "error_ratio",
     "expected_squares",
     "fast_states",
+    "find_step_vectors",
     "find_symmetries",
     "fit_chain",
     "fit_projector",
+    "frames_last",
     "fit_scanned",
     "fit_template",
     "fit_templates",

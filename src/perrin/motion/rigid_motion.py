@@ -46,6 +46,9 @@ _UNEVEN_POINTS = (0.0, 1.0, 2.0, 4.0, 7.0)
 # Distances of particles of bodies whose symmetries are searched for at once: bounds the memory.
 _MOST_COMPARED = 1_000_000
 
+# Steps whose rotation vectors are found at once: more do not stay in the processor's cache.
+_STEPS_TOGETHER = 4_000
+
 _ROTATION_ERROR = 1e-5  # largest departure of R^T R from the identity
 
 _WHOLE_NUMBERS = ("n_present", "piece")
@@ -240,15 +243,10 @@ class RigidMotion(Shown):
             Row k is the rotation (rad) that ends at frame k + 1, from the last pose before it; NaN
             where frame k + 1 has no pose or begins a piece.
         """
-        return self._step_vectors
-
-    @cached_property
-    def _step_vectors(self) -> Floats:
-        start, stop = self.steps()
-        vector = np.full((len(self.time) - 1, self.covariance.shape[-1]), np.nan)
-        vector[stop - 1] = log_map(np.swapaxes(self.rotation[start], -1, -2) @ self.rotation[stop])
-        frozen(vector)
-        return vector
+        if "_step_vectors" not in vars(self):
+            find_step_vectors([self])
+        found: Floats = vars(self)["_step_vectors"]
+        return found
 
     def orientation(self, p0: ArrayLike) -> Floats:
         """Follow body-fixed directions through time (Hunter 2011, Eq. 17).
@@ -583,6 +581,44 @@ def find_symmetries(motions: Iterable[RigidMotion]) -> None:
         at_once = max(1, _MOST_COMPARED // n**4)
         for low in range(0, len(bodies), at_once):
             _find_symmetries_together(bodies[low : low + at_once])
+
+
+def find_step_vectors(motions: Sequence[RigidMotion]) -> None:
+    """Find the rotation vectors of the steps of several bodies together.
+
+    They become what `RigidMotion.step_vectors` of each returns.
+
+    Examples
+    --------
+    >>> from perrin import Cluster, simulate_motion
+    >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=9, rng=3)
+    >>> find_step_vectors([truth])
+    >>> truth.step_vectors().shape
+    (8, 3)
+    """
+    for d in {motion.dimension for motion in motions}:
+        some = [motion for motion in motions if motion.dimension == d]
+        steps = sum(len(motion.time) for motion in some) // len(some)
+        at_once = max(1, _STEPS_TOGETHER // max(steps, 1))
+        for low in range(0, len(some), at_once):
+            _find_steps_together(some[low : low + at_once])
+
+
+def _find_steps_together(motions: Sequence[RigidMotion]) -> None:
+    """Find the rotation vectors of the steps of bodies in the same space."""
+    ends = [motion.steps() for motion in motions]
+    edges = np.cumsum([0, *(stop.size for _, stop in ends)]).tolist()
+    # With the steps last, products of a few numbers are those of long vectors.
+    before, after = np.empty((2, *motions[0].rotation.shape[1:], edges[-1]))
+    for motion, (start, stop), low, high in zip(motions, ends, edges[:-1], edges[1:], strict=True):
+        before[..., low:high] = motion.rotation.take(start, axis=0).transpose(1, 2, 0)
+        after[..., low:high] = motion.rotation.take(stop, axis=0).transpose(1, 2, 0)
+    vectors = log_map(np.moveaxis(np.einsum("jik,jlk->ilk", before, after), -1, 0))
+    for motion, (_, stop), low, high in zip(motions, ends, edges[:-1], edges[1:], strict=True):
+        vector = np.full((len(motion.time) - 1, vectors.shape[-1]), np.nan)
+        vector[stop - 1] = vectors[low:high]
+        frozen(vector)
+        vars(motion)["_step_vectors"] = vector
 
 
 def _find_symmetries_together(motions: Sequence[RigidMotion]) -> None:

@@ -42,7 +42,7 @@ from perrin.geometry.symmetry import point_group
 from perrin.hydrodynamics.units import viscosity_remarks
 from perrin.motion.common_motion import common_motion
 from perrin.motion.floor import floor_range
-from perrin.motion.rigid_motion import RigidMotion
+from perrin.motion.rigid_motion import RigidMotion, find_step_vectors
 from perrin.motion.rigidity import Corrections, Quality, judge_each
 from perrin.motion.rods import RodMotion, track_direction
 from perrin.motion.tracking import track_each, track_scanned
@@ -781,6 +781,7 @@ def measure_together(
         Names of the bodies whose steps give no estimate, with the error.
     """
     failures: list[tuple[str, ValueError]] = []
+    find_step_vectors([body.motion for body in bodies])
     coefficients = [
         measure_coefficients(bodies, quantity, experiment, recording, tested=tested)
         for quantity in get_args(Quantity)
