@@ -16,7 +16,6 @@ from perrin.geometry.rigid import (
     pose_slopes,
 )
 from perrin.geometry.rotations import skew
-from perrin.geometry.shapes import lengths
 from perrin.motion.rigid_motion import RigidMotion
 from perrin.motion.tracking import track_each
 
@@ -258,9 +257,9 @@ def sample_residuals(
     poses = np.array([m.fitted.size for m in motions])
     fitted = np.flatnonzero((poses == time.shape[1]) & (poses >= 3))
     velocity[fitted] = _velocities(center[fitted], time[fitted])
-    for k in np.flatnonzero((poses < time.shape[1]) & (poses >= 3)).tolist():
-        own = motions[k].fitted
-        velocity[k][:, own] = _velocities(center[k : k + 1, :, own], time[k : k + 1, own])[0]
+    for number in np.flatnonzero((poses < time.shape[1]) & (poses >= 3)).tolist():
+        own, body = motions[number].fitted, slice(number, number + 1)
+        velocity[body, :, own] = _velocities(center[body, :, own], time[body, own])
     template = np.stack([m.template for m in motions])
     return Residuals(
         rotation=sampled(frames_last([m.rotation for m in motions])),

@@ -371,7 +371,7 @@ def _judge_alike(
     misfit = misplaced_detections(all_residuals, radius)
     for own, rows in zip(misfit, unsettled, strict=True):
         own[rows] = True
-    misfit_frames, misplaced = misfit.any(axis=2), misfit.sum(axis=1)
+    misfit_frames, misplaced = np.asarray(misfit.any(axis=2)), misfit.sum(axis=1)
     smooth = lag_one_autocorrelation(residuals)
     drifts = bond_drifts(corrected)
     noise = axis_noise(stretch.sample)
@@ -576,7 +576,7 @@ def _shape_tests(each: Ints, total: int, count: int, drift: BondDrift) -> list[s
     from scipy.special import bdtrc
 
     texts = []
-    worst = int(each.argmax())
+    worst = int(each.argmax()) if total else 0
     chance = SIGNIFICANCE / len(each)
     if total and bdtrc(total - 1, count, _MISPLACED_FRAMES) <= SIGNIFICANCE:
         texts.append(

@@ -120,12 +120,9 @@ class Identity(Shown):
         if self.order.shape == x.shape[:2]:
             seen = present(x)
             own = np.arange(x.shape[1])
-            if seen.all():
-                same = bool((self.order == own).all())
-            else:
-                same = bool((self.order == np.where(seen, own, -1)).all())
-                same = same and bool(np.isnan(x[~seen]).all())
-            if same:
+            if not seen.all():
+                own = np.where(seen, own, -1)
+            if (self.order == own).all() and (seen.all() or np.isnan(x[~seen]).all()):
                 return x
         taken = np.take_along_axis(x, self.order[..., None], axis=1)
         return np.where(self.order[..., None] >= 0, taken, np.nan)
@@ -539,15 +536,16 @@ def rigid_fits(points: Floats, template: Floats) -> tuple[Floats, Floats]:
     rotation, unique = fit_rotations(points, template)
     here = present(points) & present(template)
     # With the sets last, products of a few coordinates are those of long vectors.
-    sets = points, template, rotation, here[..., None]
-    y, t, turn, known = (
-        np.ascontiguousarray(np.moveaxis(a, -3, -1) if a.ndim > 2 else a[..., None]) for a in sets
+    y, t, turn = (
+        np.ascontiguousarray(np.moveaxis(a, -3, -1) if a.ndim > 2 else a[..., None])
+        for a in (points, template, rotation)
     )
     if here.all():
         y = y - y.sum(axis=-3, keepdims=True) / y.shape[-3]
         t = t - t.sum(axis=-3, keepdims=True) / t.shape[-3]
         e = y - np.einsum("...njk,...ijk->...nik", t, turn)
     else:
+        known = (np.swapaxes(here, -2, -1) if here.ndim > 1 else here[:, None])[..., None, :]
         weight = known / np.maximum(known.sum(axis=-3, keepdims=True), 1)
         y, t = np.where(known, y, 0.0), np.where(known, t, 0.0)
         y = y - (y * weight).sum(axis=-3, keepdims=True)
