@@ -15,7 +15,7 @@ from perrin._arrays import Bools, Floats, from_plain, present, to_plain
 from perrin.compiled.loading import compiled_kernels
 from perrin.errors import DegenerateClusterError
 from perrin.geometry.shapes import lengths
-from perrin.geometry.wahba import planar_rotation, spatial_rotation
+from perrin.geometry.wahba import by_svd, planar_rotation, spatial_rotation
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -206,7 +206,7 @@ def fit_rotations(
             one = x[k : k + 1] if shared else x
             kernels.wahba(y[part], one, rotation[part], unique[part], w)
     rest = np.flatnonzero(~unique)
-    solve = planar_rotation if d == 2 else spatial_rotation
+    solve = planar_rotation if d == 2 else spatial_rotation if kernels is None else by_svd
     for low in range(0, rest.size, _CACHED_ROWS):
         rows = rest[low : low + _CACHED_ROWS]
         some_y, some_x, some_w = _without_absent(

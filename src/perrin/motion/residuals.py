@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
-from functools import cached_property
+from functools import cache, cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -125,6 +125,13 @@ class Residuals:
         return np.asarray(np.sqrt(square * unbiased / median_chi2(freedom)))
 
     @cached_property
+    def projector(self) -> Floats:
+        """The projector `keeps` as matrices of all coordinates, (B, n d, n d)."""
+        coordinates = self.template[0].size
+        swapped = np.swapaxes(self.keeps, 2, 3)
+        return np.ascontiguousarray(swapped).reshape(-1, coordinates, coordinates)
+
+    @cached_property
     def axes(self) -> Floats:
         """The products u_i u_j, i <= j, of the lab's axes u in body axes, (B, d, d(d + 1)/2, K)."""
         return _products(self.rotation)
@@ -154,8 +161,7 @@ class Residuals:
     def left_of(self, displacement: Floats) -> Floats:
         """Return what a rigid fit leaves of displacements (B, n, d, K), less their mean shape."""
         bodies, n, d, rows = displacement.shape
-        keeps = self.keeps.transpose(0, 1, 3, 2, 4).reshape(bodies, n * d, n * d)
-        left: Floats = keeps @ displacement.reshape(bodies, n * d, rows)
+        left: Floats = self.projector @ displacement.reshape(bodies, n * d, rows)
         left -= left.sum(axis=2, keepdims=True) / np.maximum(self.count, 1)[:, None, None]
         if not self.complete.all():
             left *= self.complete[:, None]
@@ -636,17 +642,24 @@ def _products(vectors: Floats) -> Floats:
     array([[ 0.36,  0.48,  0.64],
            [ 0.64, -0.48,  0.36]])
     """
-    i, j = np.triu_indices(vectors.shape[-2])
+    i, j, _ = _pairs_of_axes(vectors.shape[-2])
     return np.asarray(np.take(vectors, i, axis=-2) * np.take(vectors, j, axis=-2))
 
 
 def _of_products(form: Floats) -> Floats:
     """Return the coefficients of the products u_i u_j, i <= j, in quadratic forms (..., d, d)."""
     d = form.shape[-1]
+    return np.asarray(form.reshape(*form.shape[:-2], d * d) @ _pairs_of_axes(d)[2])
+
+
+@cache
+def _pairs_of_axes(d: int) -> tuple[Ints, Ints, Floats]:
+    """Return the pairs i <= j of axes, and which of the d^2 products u_i u_j is that of a pair."""
     i, j = np.triu_indices(d)
     place = np.arange(d * d)[:, None]
-    each = (place == i * d + j) | (place == j * d + i)
-    return np.asarray(form.reshape(*form.shape[:-2], d * d) @ each.astype(np.float64))
+    each = ((place == i * d + j) | (place == j * d + i)).astype(np.float64)
+    frozen(i, j, each)
+    return i, j, each
 
 
 def axis_noise(sample: Residuals) -> AxisNoise:
@@ -894,7 +907,7 @@ def _noise_forms(sample: Residuals) -> _NoiseForms:
     shift = 0.5 * shift - np.einsum("zipb,cpx->zixbc", arm, cross)
     # The derivative of z (z . r) with z -> z - delta x z, by delta_p z_b z_c.
     slope = np.einsum("bxp,znc->znxpbc", cross, r) + np.einsum("xb,znpc->znxpbc", unit, moment)
-    slope = np.einsum("zmnxy,znypbc->zmxpbc", sample.keeps, slope)
+    slope = (sample.projector @ slope.reshape(bodies, n * d, -1)).reshape(slope.shape)
     # <delta_p e_ix> of what the fit leaves of the noise, by u_b u_c.
     shared = np.einsum("zlpb,zlicx->zixpbc", arm, sample.keeps)
     turn, shift, slope, shared = (_of_products(part) for part in (turn, shift, slope, shared))

@@ -24,6 +24,7 @@ from perrin._arrays import (
 from perrin._display import Shown
 from perrin.errors import TooFewFramesError
 from perrin.geometry.rotations import log_map, skew
+from perrin.geometry.shapes import lengths
 from perrin.geometry.symmetry import (
     are_collinear,
     point_group,
@@ -140,7 +141,7 @@ class RigidMotion(Shown):
     @cached_property
     def R(self) -> float:
         """Mean distance of the particles to the centre, um."""
-        return float(np.linalg.norm(self.template, axis=1).mean())
+        return float(lengths(self.template).mean())
 
     @cached_property
     def template_error(self) -> float:
@@ -633,12 +634,11 @@ def _find_symmetries_together(motions: Sequence[RigidMotion]) -> None:
     if not rows.size:
         return
     found = symmetry_elements_of_each(templates[rows], errors[rows])
-    symbols: dict[tuple[int, bytes], str] = {}
+    symbols: dict[bytes, str] = {}
     for k, elements in zip(rows.tolist(), found, strict=True):
         # Groups with the same angles between all their elements have the same symbol.
         flat = elements.reshape(len(elements), -1)
-        angles = np.rint(1e4 * (flat @ flat.T)).astype(np.int64)
-        key = len(elements), angles.tobytes()
+        key = np.rint(1e4 * (flat @ flat.T)).astype(np.int32).tobytes()
         if key not in symbols:
             symbols[key] = schoenflies(elements)
         vars(motions[k])["symmetry_elements"] = elements

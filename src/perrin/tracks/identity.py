@@ -306,9 +306,8 @@ def settle_each(positions: Sequence[Floats], *, times: Sequence[Floats | None]) 
         for part in _batches(len(group), positions[group[0]].size):
             rows = group[part]
             some = np.stack([positions[k] for k in rows])
-            for k, certain in zip(rows, certain_labels(some), strict=True):
+            for k, seen, certain in zip(rows, present(some), certain_labels(some), strict=True):
                 if certain:
-                    seen = present(positions[k])
                     found[k] = _without_assignment(seen, seen.shape[1], labelled=True)
     return [
         found[k] if k in found else settle_identity(x, times=time)
