@@ -47,6 +47,19 @@ def present(points: Floats) -> Bools:
     return np.asarray(~missing, dtype=np.bool_)
 
 
+def count_present(seen: Bools) -> Ints:
+    """Return how many points of each set (..., n) are present: shape (...).
+
+    Examples
+    --------
+    >>> count_present(np.array([[True, True], [False, True]]))
+    array([2, 1])
+    """
+    if seen.all():  # a sum over a short axis takes longer
+        return np.full(seen.shape[:-1], seen.shape[-1], dtype=np.int64)
+    return np.asarray(seen.sum(axis=-1))
+
+
 def as_sigma(sigma: ArrayLike, dimensions: int) -> Floats:
     """Return a localisation error as one number per axis, shape (d,).
 

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from perrin._arrays import count_present
 from perrin.errors import DegenerateClusterError, TooFewFramesError
 from perrin.geometry.rigid import (
     center_variance,
@@ -110,7 +111,7 @@ def fit_templates(
     >>> fit.template.shape, faults
     ((2, 3, 2), [None, None])
     """
-    shape = x[np.arange(len(x)), np.argmax(seen.sum(axis=2), axis=1)]
+    shape = x[np.arange(len(x)), np.argmax(count_present(seen), axis=1)]
     rotation = np.empty((*x.shape[:2], x.shape[3], x.shape[3]))
     unique = np.empty(x.shape[:2], dtype=np.bool_)
     moving = np.arange(len(x))
@@ -463,7 +464,7 @@ def _fit_of(x: Floats, seen: Bools, rotation: Floats, shape: Floats) -> PoseFit:
     center = _shape_centers(x, rotation, shape)
     residual = _in_body(x, seen, rotation, center) - shape[:, None]
     # The template was fitted too: it takes the degrees of freedom of one complete frame.
-    freedom = (degrees_of_freedom(seen.sum(axis=2), d) * fitted).sum(axis=1)
+    freedom = (degrees_of_freedom(count_present(seen), d) * fitted).sum(axis=1)
     freedom = freedom - degrees_of_freedom(np.array(shape.shape[1]), d)
     known = np.where(np.isnan(residual), 0.0, residual)
     square = np.einsum("btni,btni->b", known, known)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from perrin._arrays import Bools, Floats, Ints, frozen, present
+from perrin._arrays import Bools, Floats, Ints, count_present, frozen, present
 from perrin.geometry.rigid import (
     degrees_of_freedom,
     inertia_tensor,
@@ -242,7 +242,7 @@ def sample_residuals(
     (1, 4, 3, 300)
     """
     vector = residuals_of_each(motions, positions) if residuals is None else residuals
-    whole = np.asarray(present(vector).all(axis=2))
+    whole = count_present(present(vector)) == vector.shape[2]
     count = np.minimum(whole.sum(axis=1), _SAMPLED_FRAMES)
     every = bool(whole.all()) and whole.shape[1] <= _SAMPLED_FRAMES
     rows = np.argsort(~whole, axis=1, kind="stable")[:, :_SAMPLED_FRAMES]
@@ -365,7 +365,12 @@ def fit_projector(template: Floats) -> Floats:
     n, d = template.shape[-2:]
     slopes = pose_slopes(template)
     slopes = slopes.reshape(*template.shape[:-2], n * d, -1)
-    left = np.eye(n * d) - slopes @ np.linalg.pinv(slopes)
+    basis, triangle = np.linalg.qr(slopes)
+    size = np.abs(np.diagonal(triangle, axis1=-2, axis2=-1))
+    if (size.min(axis=-1) > 1e-6 * size.max(axis=-1)).all():
+        left = np.eye(n * d) - basis @ np.swapaxes(basis, -1, -2)
+    else:  # fewer displacements are independent
+        left = np.eye(n * d) - slopes @ np.linalg.pinv(slopes)
     blocks = left.reshape(*template.shape[:-2], n, d, n, d)
     return np.ascontiguousarray(np.swapaxes(blocks, -3, -2))
 

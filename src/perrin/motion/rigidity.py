@@ -13,6 +13,7 @@ from perrin._arrays import (
     Ints,
     as_positions,
     as_sigma,
+    count_present,
     finite_or_none,
     present,
     to_plain,
@@ -613,7 +614,7 @@ def _flexing_tests(
     # Contribution of each particle's variance to the mean squares of all residuals.
     share = np.einsum("bnmij,bnmij->bnm", keeps, keeps)
     singular = np.linalg.svd(share, compute_uv=False)
-    whole = np.asarray(present(residuals).all(axis=2))
+    whole = count_present(present(residuals)) == n
     following = whole[:, 1:] & whole[:, :-1]
     pairs = following.sum(axis=1)
     tested = np.flatnonzero((pairs >= 10) & ~(singular[:, 0] > 1e6 * singular[:, -1]))

@@ -15,6 +15,7 @@ from perrin._arrays import (
     as_positions,
     as_sigma,
     choice_fault,
+    count_present,
     number_fault,
     present,
     refuse,
@@ -451,7 +452,7 @@ def _motions_of(
     if not seen.all():
         square = np.where(seen, square, np.nan)
     distance = np.sqrt(mean_present(square, axis=2))
-    count = seen.sum(axis=2)
+    count = count_present(seen)
     center, rotation = fit.center, fit.rotation
     if not fitted.all():
         nan = np.where(fitted, 0.0, np.nan)

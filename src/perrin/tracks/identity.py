@@ -37,7 +37,17 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from perrin._arrays import Bools, Floats, Ints, as_positions, from_plain, frozen, present, to_plain
+from perrin._arrays import (
+    Bools,
+    Floats,
+    Ints,
+    as_positions,
+    count_present,
+    from_plain,
+    frozen,
+    present,
+    to_plain,
+)
 from perrin._display import Shown
 from perrin._text import counted, frames_text
 from perrin.errors import IdentityWarning
@@ -838,7 +848,7 @@ def certain_labels(x: Floats) -> Bools:
     """
     _, _, n, d = x.shape
     seen = present(x)
-    shown = seen.sum(axis=2)
+    shown = count_present(seen)
     every = np.asarray(seen.any(axis=1)).all(axis=1)
     certain = ((shown == n).sum(axis=1) >= 2) & every & (n >= d)
     bodies = np.flatnonzero(certain)

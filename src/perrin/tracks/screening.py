@@ -139,7 +139,7 @@ def screen_rows(table: pd.DataFrame) -> Screened:
     empty = ~present(x)
     rows = np.lexsort((frame, code))
     rows = rows[~empty[rows]] if empty.any() else rows
-    own, points = code[rows], x[rows]
+    own, points = code.take(rows), x.take(rows, axis=0)
     at_placeholder = placeholder_rows(own, points)
     filled, rest = rows[at_placeholder], rows
     if filled.size:
