@@ -528,7 +528,8 @@ def regress(
     total = np.where(known, frames.sum(axis=1), 1.0)
     along = np.einsum("bnik,bnik->bk", left, sample.vector)
     slope = (along.sum(axis=1) - offset) / power
-    rest = sample.vector - slope[:, None, None, None] * left
+    rest = slope[:, None, None, None] * left
+    np.subtract(sample.vector, rest, out=rest)
     rho = autocorrelation(sample.in_lab(rest), sample.count, sample.freedom)
     share = np.where(known[:, None], frames / total[:, None], 0.0)  # leverage of every frame
     scores = (along - slope[:, None] * frames) / (1.0 - share)
@@ -654,7 +655,8 @@ def _products(vectors: Floats) -> Floats:
 def _of_products(form: Floats) -> Floats:
     """Return the coefficients of the products u_i u_j, i <= j, in quadratic forms (..., d, d)."""
     d = form.shape[-1]
-    return np.asarray(form.reshape(*form.shape[:-2], d * d) @ _pairs_of_axes(d)[2])
+    found = form.reshape(-1, d * d) @ _pairs_of_axes(d)[2]
+    return found.reshape(*form.shape[:-2], -1)
 
 
 @cache
@@ -829,7 +831,8 @@ def _stretch_step(sample: Residuals) -> tuple[Slope, Floats]:
     if not known.any():
         return unknown, left
     plain = np.where(known, np.einsum("bnik,bnik->b", left, sample.vector) / power, 0.0)
-    vector = sample.vector - plain[:, None, None, None] * left
+    vector = plain[:, None, None, None] * left
+    np.subtract(sample.vector, vector, out=vector)
     # The noise of the axes is shrunk to equal noise, the more the larger its error. A body whose
     # residuals do not separate the axes (a trimer that hardly turns) is left with equal noise, and
     # with an error that allows standard deviations of 1 : 1 : 3.
@@ -905,7 +908,7 @@ def _noise_forms(sample: Residuals) -> _NoiseForms:
     r, unit = sample.template, np.eye(3)
     bodies, n, d = r.shape
     cross, moment = skew(unit), skew(r)  # cross[k] is [e_k]x
-    arm = np.linalg.pinv(inertia_tensor(r))[:, None] @ moment
+    arm = np.linalg.inv(inertia_tensor(r))[:, None] @ moment
     # C by u_b u_c.
     turn = np.einsum("zipb,ziqc->zpqbc", arm, arm)
     shift = np.einsum("zip,zpxbc->zixbc", r, turn) - np.einsum("zix,zppbc->zixbc", r, turn)

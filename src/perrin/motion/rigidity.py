@@ -373,6 +373,7 @@ def _judge_alike(
     for own, rows in zip(misfit, unsettled, strict=True):
         own[rows] = True
     misfit_frames, misplaced = np.asarray(misfit.any(axis=2)), misfit.sum(axis=1)
+    misfits = misfit_frames.sum(axis=1).tolist()
     smooth = lag_one_autocorrelation(residuals)
     drifts = bond_drifts(corrected)
     noise = axis_noise(stretch.sample)
@@ -395,18 +396,17 @@ def _judge_alike(
     imaging = _imaging_texts(scale, stretched, delay, blur, ratio is not None)
     judged = []
     for k, (motion, body) in enumerate(zip(motions, bodies, strict=True)):
-        misfit_rows = np.flatnonzero(misfit_frames[k])
         soft = [
             *_residual_test(body, float(usual[k]), smooth.of_body(k), stated_sigma),
             *flexing[k],
-            *_shape_tests(misplaced[k], misfit_rows.size, body.fitted.size, drifts[k]),
+            *_shape_tests(misplaced[k], misfits[k], body.fitted.size, drifts[k]),
         ]
         warnings, notes = imaging[k]
-        if misfit_rows.size and not soft:
+        if misfits[k] and not soft:
             notes.insert(
                 0,
-                f"{misfit_rows.size} of {body.fitted.size} frames fit the common shape badly "
-                f"(first at {body.time[misfit_rows[0]]:g} s): a particle is over "
+                f"{misfits[k]} of {body.fitted.size} frames fit the common shape badly "
+                f"(first at {body.time[misfit_frames[k].argmax()]:g} s): a particle is over "
                 f"{_MISPLACED_MULTIPLE:g} times as far from its place as {_USUAL_SHARE:.0%} of all "
                 "detections are",
             )
@@ -435,7 +435,7 @@ def _judge_alike(
                 scan_blur_stderr=finite_or_none(blur.stderr[k]),
                 scan_delay=finite_or_none(delay.value[k]),
                 scan_delay_stderr=finite_or_none(delay.stderr[k]),
-                misfits=misfit_rows.size,
+                misfits=misfits[k],
             )
         )
     return judged
