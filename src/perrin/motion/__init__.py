@@ -23,6 +23,7 @@ from perrin.motion.error_ratio import ErrorRatio, error_ratio, with_error_ratio
 from perrin.motion.floor import NoiseFloor, floor_of, floor_range, noise_floor
 from perrin.motion.procrustes import (
     PoseFit,
+    arms_of_particles,
     chain_steps,
     fit_chain,
     fit_template,
@@ -99,6 +100,7 @@ __all__ = [
     "Stretch",
     "Switching",
     "add_noise",
+    "arms_of_particles",
     "autocorrelation",
     "axis_noise",
     "body_residuals",

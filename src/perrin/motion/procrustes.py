@@ -112,16 +112,17 @@ def fit_templates(
     ((2, 3, 2), [None, None])
     """
     shape = x[np.arange(len(x)), np.argmax(count_present(seen), axis=1)]
-    rotation = np.empty((*x.shape[:2], x.shape[3], x.shape[3]))
-    unique = np.empty(x.shape[:2], dtype=np.bool_)
     moving = np.arange(len(x))
-    arms = _arms_of_particles(x) if seen.all() else None
+    arms = arms_of_particles(x) if seen.all() else None
     for _ in range(100):
         every = moving.size == len(x)
         some, here = (x, seen) if every else (x[moving], seen[moving])
         before = shape[moving]
         turned, found = fit_rotations(some, before[:, None])
-        rotation[moving], unique[moving] = turned, found
+        if every:
+            rotation, unique = turned, found
+        else:
+            rotation[moving], unique[moving] = turned, found
         if arms is None:
             new = _mean_in_body(some, here, turned, before)
         else:
@@ -434,9 +435,27 @@ def _mean_in_body(x: Floats, seen: Bools, rotation: Floats, shape: Floats) -> Fl
     return mean_shape
 
 
-def _arms_of_particles(x: Floats) -> Floats:
-    """Return each particle's positions relative to the centroids of its frames, (B, n, T d)."""
-    return np.swapaxes(centred(x), 1, 2).reshape(len(x), x.shape[2], -1)
+def arms_of_particles(x: Floats) -> Floats:
+    """Return each particle's positions relative to the centroids of its frames.
+
+    Parameters
+    ----------
+    x : ndarray, shape (B, T, n, d)
+
+    Returns
+    -------
+    ndarray, shape (B, n, T d)
+
+    Examples
+    --------
+    >>> arms_of_particles(np.array([[[[0.0, 0.0], [4.0, 2.0]]]]))
+    array([[[-2., -1.],
+            [ 2.,  1.]]])
+    """
+    along = np.ascontiguousarray(np.moveaxis(x, 1, -1))  # the frames last: sums of long vectors
+    along = along - along.sum(axis=1, keepdims=True) / x.shape[2]
+    arms: Floats = np.swapaxes(along, 2, 3).reshape(len(x), x.shape[2], -1)
+    return arms
 
 
 def _mean_of_complete(arms: Floats, rotation: Floats, unique: Bools) -> Floats:

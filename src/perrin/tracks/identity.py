@@ -54,6 +54,7 @@ from perrin.errors import IdentityWarning
 from perrin.geometry.rigid import degrees_of_freedom
 from perrin.geometry.rotations import fit_rotations
 from perrin.geometry.shapes import centred, pair_distances
+from perrin.motion.procrustes import arms_of_particles
 from perrin.motion.residuals import median_chi2
 from perrin.motion.rods import LABEL_LOG_ODDS, LEAP_LABELLED, LEAP_UNLABELLED, SETTLED_LOG_ODDS
 
@@ -552,7 +553,8 @@ def rigid_fits(points: Floats, template: Floats) -> tuple[Floats, Floats]:
     if here.all():
         y = y - y.sum(axis=-3, keepdims=True) / y.shape[-3]
         t = t - t.sum(axis=-3, keepdims=True) / t.shape[-3]
-        e = y - np.einsum("...njk,...ijk->...nik", t, turn)
+        e = np.einsum("...njk,...ijk->...nik", t, turn)
+        e -= y
     else:
         known = (np.swapaxes(here, -2, -1) if here.ndim > 1 else here[:, None])[..., None, :]
         weight = known / np.maximum(known.sum(axis=-3, keepdims=True), 1)
@@ -939,12 +941,11 @@ def _labelled_shapes(x: Floats, whole: Bools) -> tuple[Floats, Bools, Ints]:
     worst = np.where(used, misfit, 0.0).max(axis=1)
     usable = np.asarray(worst <= 2 * _NOISE_LIKE * usual)
     fits = np.isfinite(misfit) & used
-    arms, turn = centred(points), rotation
+    turn = rotation
     if not fits.all():
-        arms, turn = (np.where(fits[..., None, None], part, 0.0) for part in (arms, turn))
+        points, turn = (np.where(fits[..., None, None], part, 0.0) for part in (points, turn))
     # The sum of R^T (x - centroid) over the rows is one product of matrices.
-    bodies, _, n, d = points.shape
-    total = np.swapaxes(arms, 1, 2).reshape(bodies, n, -1) @ turn.reshape(bodies, -1, d)
+    total = arms_of_particles(points) @ turn.reshape(len(turn), -1, turn.shape[-1])
     count = fits.sum(axis=1)[:, None, None]
     shape = np.where(count > 0, total / np.maximum(count, 1), template)
     return shape, usable, sampled
