@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 from functools import cached_property
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -589,6 +590,11 @@ def find_step_vectors(motions: Sequence[RigidMotion]) -> None:
 
     They become what `RigidMotion.step_vectors` of each returns.
 
+    Parameters
+    ----------
+    motions : sequence of RigidMotion
+        All in space, or all in the plane.
+
     Examples
     --------
     >>> from perrin import Cluster, simulate_motion
@@ -597,29 +603,22 @@ def find_step_vectors(motions: Sequence[RigidMotion]) -> None:
     >>> truth.step_vectors().shape
     (8, 3)
     """
-    for d in {motion.dimension for motion in motions}:
-        some = [motion for motion in motions if motion.dimension == d]
-        steps = sum(len(motion.time) for motion in some) // len(some)
-        at_once = max(1, _STEPS_TOGETHER // max(steps, 1))
-        for low in range(0, len(some), at_once):
-            _find_steps_together(some[low : low + at_once])
-
-
-def _find_steps_together(motions: Sequence[RigidMotion]) -> None:
-    """Find the rotation vectors of the steps of bodies in the same space."""
-    ends = [motion.steps() for motion in motions]
-    edges = np.cumsum([0, *(stop.size for _, stop in ends)]).tolist()
-    # With the steps last, products of a few numbers are those of long vectors.
-    before, after = np.empty((2, *motions[0].rotation.shape[1:], edges[-1]))
-    for motion, (start, stop), low, high in zip(motions, ends, edges[:-1], edges[1:], strict=True):
-        before[..., low:high] = motion.rotation.take(start, axis=0).transpose(1, 2, 0)
-        after[..., low:high] = motion.rotation.take(stop, axis=0).transpose(1, 2, 0)
-    vectors = log_map(np.moveaxis(np.einsum("jik,jlk->ilk", before, after), -1, 0))
-    for motion, (_, stop), low, high in zip(motions, ends, edges[:-1], edges[1:], strict=True):
-        vector = np.full((len(motion.time) - 1, vectors.shape[-1]), np.nan)
-        vector[stop - 1] = vectors[low:high]
-        frozen(vector)
-        vars(motion)["_step_vectors"] = vector
+    at_once = max(1, _STEPS_TOGETHER // max([1, *(len(motion.time) for motion in motions)]))
+    for some in (motions[low : low + at_once] for low in range(0, len(motions), at_once)):
+        ends = [motion.steps() for motion in some]
+        edges = np.cumsum([0, *(stop.size for _, stop in ends)]).tolist()
+        parts = [slice(low, high) for low, high in pairwise(edges)]
+        # With the steps last, products of a few numbers are those of long vectors.
+        before, after = np.empty((2, *some[0].rotation.shape[1:], edges[-1]))
+        for motion, (start, stop), part in zip(some, ends, parts, strict=True):
+            before[..., part] = motion.rotation.take(start, axis=0).transpose(1, 2, 0)
+            after[..., part] = motion.rotation.take(stop, axis=0).transpose(1, 2, 0)
+        vectors = log_map(np.moveaxis(np.einsum("jik,jlk->ilk", before, after), -1, 0))
+        for motion, (_, stop), part in zip(some, ends, parts, strict=True):
+            vector = np.full((len(motion.time) - 1, vectors.shape[-1]), np.nan)
+            vector[stop - 1] = vectors[part]
+            frozen(vector)
+            vars(motion)["_step_vectors"] = vector
 
 
 def _find_symmetries_together(motions: Sequence[RigidMotion]) -> None:
