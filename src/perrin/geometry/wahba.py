@@ -125,7 +125,7 @@ def spatial_rotation(y: Floats, x: Floats, w: Floats | None) -> tuple[Floats, Bo
 def by_svd(y: Floats, x: Floats, w: Floats | None) -> tuple[Floats, Bools]:
     """Maximise Tr(R^T C) over SO(3) by a singular value decomposition, as `spatial_rotation`.
 
-    It is for rows of which is known that the closed form has no certificate.
+    It is meant for rows that are known to have no certificate in closed form.
 
     Parameters
     ----------

@@ -597,8 +597,8 @@ def _tracked_bodies(
     sigma = None if experiment.sigma is None else as_sigma(experiment.sigma, d)
     # Bodies without gaps need no weights.
     complete = [bool(np.isfinite(x).all()) for x in positions]
-    for one_kind in (True, False):
-        some = [k for k in rest if complete[k] is one_kind]
+    for whole in (True, False):
+        some = [k for k in rest if complete[k] is whole]
         for rows in of_equal_shape([positions[k] for k in some]):
             numbers = [some[i] for i in rows]
             fits = track_each(

@@ -148,8 +148,9 @@ def each_cluster(table: pd.DataFrame) -> Iterator[tuple[int, Floats, Ints, Ints,
     label = table["cluster"].to_numpy(dtype=np.int64)
     late = table["delay"].to_numpy(dtype=np.float64)[:, None] if "delay" in table else None
     stretch = table["piece"].to_numpy(dtype=np.int64) if "piece" in table else None
+    every = bool(tracks.seen.all())
     for inside in _rows_by_label(label):
-        rows = inside if tracks.seen.all() else inside[tracks.seen[inside]]
+        rows = inside if every else inside[tracks.seen[inside]]
         frame, code = tracks.frame.take(rows), tracks.code.take(rows)
         positions, frames = _as_array(frame, code, tracks.x.take(rows, axis=0))
         piece = np.zeros(len(frames), dtype=np.int64)
