@@ -262,7 +262,8 @@ def sample_residuals(
     velocity = np.zeros_like(center)
     poses = np.array([m.fitted.size for m in motions])
     fitted = np.flatnonzero((poses == time.shape[1]) & (poses >= 3))
-    velocity[fitted] = _velocities(center[fitted], time[fitted])
+    if fitted.size:
+        velocity[fitted] = _velocities(center[fitted], time[fitted])
     for number in np.flatnonzero((poses < time.shape[1]) & (poses >= 3)).tolist():
         own, body = motions[number].fitted, slice(number, number + 1)
         velocity[body, :, own] = _velocities(center[body, :, own], time[body, own])
