@@ -119,6 +119,19 @@ def mean_row(rows: Floats) -> Floats:
     return rows[0] if rows.strides[0] == 0 else np.asarray(rows.mean(axis=0))
 
 
+def count_present(seen: Bools) -> Ints:
+    """Return how many points of each set (..., n) are present: shape (...).
+
+    Examples
+    --------
+    >>> count_present(np.array([[True, True], [False, True]]))
+    array([2, 1])
+    """
+    if seen.all():  # a sum over a short axis takes longer
+        return np.full(seen.shape[:-1], seen.shape[-1], dtype=np.int64)
+    return np.asarray(seen.sum(axis=-1))
+
+
 def as_sigma(sigma: ArrayLike, dimensions: int) -> Floats:
     """Return a localisation error as one number per axis, shape (d,).
 

@@ -15,12 +15,13 @@ from perrin._arrays import Bools, Floats, from_plain, present, to_plain
 from perrin.compiled.loading import compiled_kernels
 from perrin.errors import DegenerateClusterError
 from perrin.geometry.shapes import lengths
-from perrin.geometry.wahba import planar_rotation, spatial_rotation
+from perrin.geometry.wahba import by_svd, planar_rotation, spatial_rotation
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
 _CACHED_ROWS = 2048  # rows whose working arrays fit into the second-level cache
+_MANY_ROWS = 32  # rows from which copies of a reference take longer than a call of their own
 
 
 def kabsch(points: ArrayLike, reference: ArrayLike, *, weights: ArrayLike | None = None) -> Floats:
@@ -190,19 +191,27 @@ def fit_rotations(
     if w is not None or x.shape[:-2] != batch:
         batch = np.broadcast_shapes(batch, x.shape[:-2], () if w is None else w.shape[:-1])
     d, size = y.shape[-1], math.prod(batch)
-    y, x = _rows(y, batch), _rows(x, batch)
+    # Many neighbouring rows with one reference are solved together, without copies of it.
+    shared = w is None and y.shape[:-2] == batch and x.shape[:-2] == (*batch[:-1], 1)
+    shared = shared and size > 0 and batch[-1] >= _MANY_ROWS
+    x = _rows(x[..., 0, :, :], batch[:-1]) if shared else _rows(x, batch)
+    y = _rows(y, batch)
     w = None if w is None else _rows(w[..., None], batch)
     rotation, unique = np.empty((size, d, d)), np.zeros(size, dtype=np.bool_)
+    together = batch[-1] if shared else max(size, 1)
     kernels = compiled_kernels() if d == 3 else None
     if kernels is not None:
-        kernels.wahba(y, x, rotation, unique, w)
+        for k, low in enumerate(range(0, size, together)):
+            part = slice(low, low + together)
+            one = x[k : k + 1] if shared else x
+            kernels.wahba(y[part], one, rotation[part], unique[part], w)
     rest = np.flatnonzero(~unique)
-    solve = planar_rotation if d == 2 else spatial_rotation
+    solve = planar_rotation if d == 2 else spatial_rotation if kernels is None else by_svd
     for low in range(0, rest.size, _CACHED_ROWS):
         rows = rest[low : low + _CACHED_ROWS]
         some_y, some_x, some_w = _without_absent(
             y if len(y) == 1 else y[rows],
-            x if len(x) == 1 else x[rows],
+            x if len(x) == 1 else x[rows // together if shared else rows],
             w if w is None or len(w) == 1 else w[rows],
         )
         last_w = None if some_w is None else _batch_last(some_w)
@@ -279,8 +288,7 @@ def log_map(rotation: ArrayLike) -> Floats:
     angle = 2.0 * np.arctan2(sine, w)
     # sine < 1e-9 means cos = 1 to rounding: the angle is 2 sine, so the ratio is 2.
     ratio = np.divide(angle, sine, out=np.full_like(sine, 2.0), where=sine > 1e-9)
-    out: Floats = v * ratio[..., None]
-    return out
+    return np.ascontiguousarray(v * ratio[..., None])
 
 
 def axis_angle(rotation: ArrayLike) -> tuple[Floats, Floats]:
@@ -363,7 +371,8 @@ def unit_quaternion(rotation: Floats) -> Floats:
     array([0., 1., 0., 0.])
     """
     r = rotation
-    q = np.empty((*r.shape[:-2], 4))
+    # Each component is one vector in memory.
+    q = np.moveaxis(np.empty((4, *r.shape[:-2])), 0, -1)
     q[..., 0] = 1.0 + r[..., 0, 0] + r[..., 1, 1] + r[..., 2, 2]
     for i, (a, b) in enumerate(((2, 1), (0, 2), (1, 0))):
         np.subtract(r[..., a, b], r[..., b, a], out=q[..., i + 1])

@@ -122,6 +122,33 @@ def spatial_rotation(y: Floats, x: Floats, w: Floats | None) -> tuple[Floats, Bo
     return out, certain
 
 
+def by_svd(y: Floats, x: Floats, w: Floats | None) -> tuple[Floats, Bools]:
+    """Maximise Tr(R^T C) over SO(3) by a singular value decomposition, as `spatial_rotation`.
+
+    It is meant for rows that are known to have no certificate in closed form.
+
+    Parameters
+    ----------
+    y, x, w
+        As in `dispersion`.
+
+    Returns
+    -------
+    rotation : ndarray, shape (B, 3, 3)
+    unique : ndarray of bool, shape (B,)
+
+    Examples
+    --------
+    >>> x = np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, 1]])[:, :, None]
+    >>> by_svd(x[:, [1, 2, 0]], x, None)[0][0].round(12) + 0.0
+    array([[0., 1., 0.],
+           [0., 0., 1.],
+           [1., 0., 0.]])
+    """
+    c, error = dispersion(y, x, w)
+    return svd_rotation(c.transpose(2, 0, 1), error)
+
+
 def svd_rotation(c: Floats, error: Floats) -> tuple[Floats, Bools]:
     """Maximise Tr(R^T C) by a singular value decomposition (Hunter 2011, Eqs. 9 and 10).
 

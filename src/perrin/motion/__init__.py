@@ -23,6 +23,7 @@ from perrin.motion.error_ratio import ErrorRatio, error_ratio, with_error_ratio
 from perrin.motion.floor import NoiseFloor, floor_of, floor_range, noise_floor
 from perrin.motion.procrustes import (
     PoseFit,
+    arms_of_particles,
     chain_steps,
     fit_chain,
     fit_template,
@@ -41,6 +42,7 @@ from perrin.motion.residuals import (
     body_residuals,
     expected_squares,
     fit_projector,
+    frames_last,
     lag_one_autocorrelation,
     lagged_products,
     measure_scan,
@@ -56,6 +58,7 @@ from perrin.motion.residuals import (
 )
 from perrin.motion.rigid_motion import (
     RigidMotion,
+    find_step_vectors,
     find_symmetries,
     threshold_displacement,
     threshold_references,
@@ -97,6 +100,7 @@ __all__ = [
     "Stretch",
     "Switching",
     "add_noise",
+    "arms_of_particles",
     "autocorrelation",
     "axis_noise",
     "body_residuals",
@@ -107,6 +111,7 @@ __all__ = [
     "error_ratio",
     "expected_squares",
     "fast_states",
+    "find_step_vectors",
     "find_symmetries",
     "fit_chain",
     "fit_projector",
@@ -117,6 +122,7 @@ __all__ = [
     "floor_of",
     "floor_range",
     "fractional_noise",
+    "frames_last",
     "heat_kernel_angles",
     "hops",
     "judge_each",

@@ -94,33 +94,33 @@ def common_motion(bodies: Sequence[tuple[RigidMotion, Ints]]) -> CommonMotion | 
         return None
     last = 1 + max(int(frames.max()) for _, frames in bodies)
     d = bodies[0][0].dimension
-    steps = np.full((len(bodies), last, d), np.nan)
-    for b, (motion, frames) in enumerate(bodies):
-        start, stop = motion.steps()
-        near = frames[stop] - frames[start] == 1
-        moved = (motion.center[stop] - motion.center[start])[near]
-        if len(moved):
-            # A steady velocity is tested for each body by itself.
-            steps[b, frames[stop[near]]] = moved - moved.mean(axis=0)
-    seen = np.isfinite(steps[..., 0])
-    filled = np.where(seen[..., None], steps, 0.0)
-    own = (filled**2).sum(axis=1) / np.maximum(seen.sum(axis=1), 1)[:, None]
-    pairs = float((seen.sum(axis=0) * (seen.sum(axis=0) - 1) / 2).sum())
+    center = np.full((len(bodies), d, last), np.nan)
+    piece = np.full((len(bodies), last), -1, dtype=np.int64)
+    for own_center, own_piece, (motion, frames) in zip(center, piece, bodies, strict=True):
+        own_center[:, frames] = motion.center.T
+        own_piece[frames] = motion.piece
+    moved = center[..., 1:] - center[..., :-1]
+    seen = np.isfinite(moved[:, 0]) & (piece[:, 1:] == piece[:, :-1])
+    filled = np.where(seen[:, None], moved, 0.0)
+    steps = np.maximum(seen.sum(axis=1), 1)[:, None]
+    # A steady velocity is tested for each body by itself.
+    filled -= np.where(seen[:, None], (filled.sum(axis=2) / steps)[..., None], 0.0)
+    square = np.einsum("bdt,bdt->bd", filled, filled)
+    own, count = square / steps, seen.sum(axis=0)
+    pairs = float((count * (count - 1) / 2).sum())
     if pairs < _FEWEST_SHARED_STEPS or not (own[seen.any(axis=1)] > 0).all():
         return None
-    squares = np.where(seen[..., None], own[:, None], 0.0)
-    products = 0.5 * (filled.sum(axis=0) ** 2 - (filled**2).sum(axis=0))
-    spread = 0.5 * (squares.sum(axis=0) ** 2 - (squares**2).sum(axis=0))
-    total, following = filled.sum(axis=0), np.zeros(d)
-    both = float((seen[:, 1:].sum(axis=0) * seen[:, :-1].sum(axis=0)).sum())
-    both -= float((seen[:, 1:] & seen[:, :-1]).sum())
+    total = filled.sum(axis=0)
+    products = 0.5 * ((total * total).sum(axis=1) - square.sum(axis=0))
+    here = seen.astype(np.float64)
+    spread = 0.5 * ((own.T @ here) ** 2 - (own.T**2) @ here)
+    following = np.zeros(d)
+    both = float((count[1:] * count[:-1]).sum() - (seen[:, 1:] & seen[:, :-1]).sum())
     if both > 0:
-        across = (total[1:] * total[:-1]).sum(axis=0) - (filled[:, 1:] * filled[:, :-1]).sum(
-            axis=(0, 1)
-        )
-        following = across / both
-    covariance = products.sum(axis=0) / pairs
-    stderr = np.sqrt(spread.sum(axis=0)) / pairs
+        after = np.einsum("bdt,bdt->d", filled[..., 1:], filled[..., :-1])
+        following = ((total[:, 1:] * total[:, :-1]).sum(axis=1) - after) / both
+    covariance = products / pairs
+    stderr = np.sqrt(spread.sum(axis=1)) / pairs
     p = float(min(1.0, d * ndtr(-np.max(covariance / stderr))))
-    variance = (filled**2).sum(axis=(0, 1)) / seen.sum()
+    variance = square.sum(axis=0) / seen.sum()
     return CommonMotion(covariance, stderr, variance, following, len(bodies), p)

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from perrin._arrays import count_present
 from perrin.errors import DegenerateClusterError, TooFewFramesError
 from perrin.geometry.rigid import (
     center_variance,
@@ -110,17 +111,18 @@ def fit_templates(
     >>> fit.template.shape, faults
     ((2, 3, 2), [None, None])
     """
-    shape = x[np.arange(len(x)), np.argmax(seen.sum(axis=2), axis=1)]
-    rotation = np.empty((*x.shape[:2], x.shape[3], x.shape[3]))
-    unique = np.empty(x.shape[:2], dtype=np.bool_)
+    shape = x[np.arange(len(x)), np.argmax(count_present(seen), axis=1)]
     moving = np.arange(len(x))
-    arms = _arms_of_particles(x) if seen.all() else None
+    arms = arms_of_particles(x) if seen.all() else None
     for _ in range(100):
         every = moving.size == len(x)
         some, here = (x, seen) if every else (x[moving], seen[moving])
         before = shape[moving]
         turned, found = fit_rotations(some, before[:, None])
-        rotation[moving], unique[moving] = turned, found
+        if every:
+            rotation, unique = turned, found
+        else:
+            rotation[moving], unique[moving] = turned, found
         if arms is None:
             new = _mean_in_body(some, here, turned, before)
         else:
@@ -388,11 +390,12 @@ def pose_errors(fit: PoseFit, seen: Bools, noise: Floats) -> tuple[Floats, Float
         some = np.flatnonzero(rows.any(axis=1))
         if not some.size:
             continue
-        template, place = fit.template[some], np.searchsorted(some, np.nonzero(rows)[0])
-        variance[rows] = center_variance(template, pattern, sigma[some])[place]
+        template, poses = fit.template[some], rows[some].sum(axis=1)
+        variance[rows] = np.repeat(center_variance(template, pattern, sigma[some]), poses)
         # Noise that is equal along all axes is the same in body axes.
         of_body = noise[some, 0][:, None, None] * np.eye(d)
-        covariance[rows] = orientation_covariance(template[:, pattern], of_body)[place]
+        of_poses = orientation_covariance(template[:, pattern], of_body)
+        covariance[rows] = np.repeat(of_poses, poses, axis=0)
         for k in some[~equal[some]].tolist():
             r = fit.rotation[k, rows[k]]
             body_noise = np.einsum("tij,i,tik->tjk", r, noise[k], r)
@@ -401,8 +404,11 @@ def pose_errors(fit: PoseFit, seen: Bools, noise: Floats) -> tuple[Floats, Float
 
 
 def _in_body(x: Floats, seen: Bools, rotation: Floats, center: Floats) -> Floats:
-    """Return the particles in the axes of the body, (..., T, n, d)."""
-    turned: Floats = (x - center[..., None, :]) @ rotation
+    """Return the particles in the axes of the body, (..., T, n, d), the frames last in memory."""
+    # Products of a few coordinates are those of long vectors.
+    arm, r = (np.ascontiguousarray(np.moveaxis(a, -3, -1)) for a in (x, rotation))
+    arm = arm - np.swapaxes(center, -1, -2)[..., None, :, :]
+    turned = np.moveaxis(np.einsum("...aik,...nak->...nik", r, arm), -1, -3)
     return turned if seen.all() else np.where(seen[..., None], turned, np.nan)
 
 
@@ -410,12 +416,14 @@ def _shape_centers(x: Floats, rotation: Floats, shape: Floats) -> Floats:
     """Return the lab position of the shape's origin, from the particles present in both."""
     centroid = centroids(x)
     if np.isfinite(centroid).all() and np.isfinite(shape).all():
-        arm = np.broadcast_to(shape.mean(axis=-2)[..., None, :], centroid.shape)
+        arm = shape.mean(axis=-2)[..., None, :]
     else:
         known = np.isfinite(x) & np.isfinite(shape[..., None, :, :])
         arm = mean_present(np.where(known, shape[..., None, :, :], np.nan), axis=-2)
         centroid = mean_present(np.where(known, x, np.nan), axis=-2)
-    center: Floats = centroid - (rotation @ arm[..., None])[..., 0]
+    r = np.ascontiguousarray(np.moveaxis(rotation, -3, -1))
+    lever = np.einsum("...ijk,...jk->...ik", r, np.swapaxes(arm, -1, -2))
+    center: Floats = centroid - np.swapaxes(lever, -1, -2)
     return center
 
 
@@ -427,9 +435,27 @@ def _mean_in_body(x: Floats, seen: Bools, rotation: Floats, shape: Floats) -> Fl
     return mean_shape
 
 
-def _arms_of_particles(x: Floats) -> Floats:
-    """Return each particle's positions relative to the centroids of its frames, (B, n, T d)."""
-    return np.swapaxes(centred(x), 1, 2).reshape(len(x), x.shape[2], -1)
+def arms_of_particles(x: Floats) -> Floats:
+    """Return each particle's positions relative to the centroids of its frames.
+
+    Parameters
+    ----------
+    x : ndarray, shape (B, T, n, d)
+
+    Returns
+    -------
+    ndarray, shape (B, n, T d)
+
+    Examples
+    --------
+    >>> arms_of_particles(np.array([[[[0.0, 0.0], [4.0, 2.0]]]]))
+    array([[[-2., -1.],
+            [ 2.,  1.]]])
+    """
+    along = np.ascontiguousarray(np.moveaxis(x, 1, -1))  # the frames last: sums of long vectors
+    along = along - along.sum(axis=1, keepdims=True) / x.shape[2]
+    arms: Floats = np.swapaxes(along, 2, 3).reshape(len(x), x.shape[2], -1)
+    return arms
 
 
 def _mean_of_complete(arms: Floats, rotation: Floats, unique: Bools) -> Floats:
@@ -451,12 +477,13 @@ def _fit_of(x: Floats, seen: Bools, rotation: Floats, shape: Floats) -> PoseFit:
     fitted = np.isfinite(rotation[..., 0, 0])
     first = np.argmax(fitted, axis=1)
     gauge = np.swapaxes(rotation[bodies, first], 1, 2)
-    shape, rotation = shape @ gauge, rotation @ gauge[:, None]
+    shape, turned = shape @ gauge, rotation.reshape(len(x), -1, d) @ gauge
+    rotation = turned.reshape(rotation.shape)
     rotation[bodies, first] = np.eye(d)
     center = _shape_centers(x, rotation, shape)
     residual = _in_body(x, seen, rotation, center) - shape[:, None]
     # The template was fitted too: it takes the degrees of freedom of one complete frame.
-    freedom = (degrees_of_freedom(seen.sum(axis=2), d) * fitted).sum(axis=1)
+    freedom = (degrees_of_freedom(count_present(seen), d) * fitted).sum(axis=1)
     freedom = freedom - degrees_of_freedom(np.array(shape.shape[1]), d)
     known = np.where(np.isnan(residual), 0.0, residual)
     square = np.einsum("btni,btni->b", known, known)

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
-from functools import cached_property
+from functools import cache, cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from perrin._arrays import Bools, Floats, Ints, distinct, expanded, frozen, present
+from perrin._arrays import Bools, Floats, Ints, count_present, distinct, expanded, frozen, present
 from perrin.geometry.rigid import (
     degrees_of_freedom,
     inertia_tensor,
@@ -16,7 +16,6 @@ from perrin.geometry.rigid import (
     pose_slopes,
 )
 from perrin.geometry.rotations import skew
-from perrin.geometry.shapes import lengths
 from perrin.motion.rigid_motion import RigidMotion
 from perrin.motion.tracking import track_each
 
@@ -69,15 +68,16 @@ def median_chi2(freedom: float) -> float:
 class Residuals:
     """Residual vectors of the complete frames of B bodies of n particles, in body axes.
 
-    Bodies with fewer complete frames than others have rows of zeros after their last one.
+    The frames are the last axis, so that products of a few coordinates are those of long vectors.
+    Bodies with fewer complete frames than others have zeros after their last one.
 
     Attributes
     ----------
-    rotation : ndarray, shape (B, K, d, d)
+    rotation : ndarray, shape (B, d, d, K)
         Orientation of each body, lab from body.
-    vector : ndarray, shape (B, K, n, d)
+    vector : ndarray, shape (B, n, d, K)
         Measured positions minus those of the template, um.
-    velocity : ndarray, shape (B, K, d)
+    velocity : ndarray, shape (B, d, K)
         Velocity of the centre from the neighbouring poses, about its mean, um/s, lab axes; 0 at
         the ends and at jumps.
     count : ndarray of int, shape (B,)
@@ -107,7 +107,7 @@ class Residuals:
     @cached_property
     def complete(self) -> Bools:
         """Which rows are frames of each body, (B, K)."""
-        return np.asarray(np.arange(self.vector.shape[1]) < self.count[:, None])
+        return np.asarray(np.arange(self.vector.shape[-1]) < self.count[:, None])
 
     @cached_property
     def median_sigma(self) -> Floats:
@@ -118,21 +118,33 @@ class Residuals:
         freedom, count = self.freedom, self.count
         if freedom == 0:
             return np.full(count.shape, np.nan)
-        square = np.einsum("bkni,bkni->bk", self.vector, self.vector)
+        square = np.einsum("bnik,bnik->bk", self.vector, self.vector)
         square = np.where(self.complete, square, np.nan)
         square = median_present(square)
         unbiased = np.divide(count, count - 1, out=np.full(count.shape, np.nan), where=count > 1)
         return np.asarray(np.sqrt(square * unbiased / median_chi2(freedom)))
 
     @cached_property
+    def projector(self) -> Floats:
+        """The projector `keeps` as matrices of all coordinates, (B, n d, n d)."""
+        coordinates = self.template[0].size
+        swapped = np.swapaxes(self.keeps, 2, 3)
+        return np.ascontiguousarray(swapped).reshape(-1, coordinates, coordinates)
+
+    @cached_property
+    def axes(self) -> Floats:
+        """The products u_i u_j, i <= j, of the lab's axes u in body axes, (B, d, d(d + 1)/2, K)."""
+        return _products(self.rotation)
+
+    @cached_property
     def expected(self) -> Floats:
-        """The `expected_squares` of every frame, (B, K, d, d)."""
-        return expected_squares(self.rotation, self.keeps)
+        """The `expected_squares` of every frame, (B, d, d, K)."""
+        return _expected_of(self.axes, self.keeps)
 
     def with_vector(self, vector: Floats) -> Residuals:
         """Return the same poses with other residuals."""
         other = replace(self, vector=vector)
-        vars(other)["expected"] = self.expected
+        vars(other)["axes"], vars(other)["expected"] = self.axes, self.expected
         return other
 
     def of_bodies(self, bodies: Ints) -> Residuals:
@@ -147,17 +159,17 @@ class Residuals:
         return Residuals(**parts)
 
     def left_of(self, displacement: Floats) -> Floats:
-        """Return what a rigid fit leaves of displacements (B, K, n, d), less their mean shape."""
-        bodies, rows, n, d = displacement.shape
-        keeps = self.keeps.transpose(0, 2, 4, 1, 3).reshape(bodies, n * d, n * d)
-        left = displacement.reshape(bodies, rows, n * d) @ keeps
-        mean = left.sum(axis=1) / np.maximum(self.count, 1)[:, None]
-        from_mean: Floats = np.where(self.complete[..., None], left - mean[:, None], 0.0)
-        return from_mean.reshape(displacement.shape)
+        """Return what a rigid fit leaves of displacements (B, n, d, K), less their mean shape."""
+        bodies, n, d, rows = displacement.shape
+        left: Floats = self.projector @ displacement.reshape(bodies, n * d, rows)
+        left -= left.sum(axis=2, keepdims=True) / np.maximum(self.count, 1)[:, None, None]
+        if not self.complete.all():
+            left *= self.complete[:, None]
+        return left.reshape(displacement.shape)
 
     def in_lab(self, vectors: Floats) -> Floats:
-        """Return vectors (B, K, n, d) given in body axes along the axes of the lab."""
-        return np.asarray(vectors @ np.swapaxes(self.rotation, 2, 3))
+        """Return vectors (B, n, d, K) given in body axes along the axes of the lab."""
+        return np.asarray(np.einsum("baik,bnik->bnak", self.rotation, vectors))
 
 
 class Slope(NamedTuple):
@@ -227,10 +239,10 @@ def sample_residuals(
     >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=0.02, dt=0.7, n_frames=300, rng=1)
     >>> x = add_noise(truth.positions(), sigma=0.03, rng=2)
     >>> sample_residuals([track_rotation(x, dt=0.7)], x[None]).vector.shape
-    (1, 300, 4, 3)
+    (1, 4, 3, 300)
     """
     vector = residuals_of_each(motions, positions) if residuals is None else residuals
-    whole = np.asarray(present(vector).all(axis=2))
+    whole = count_present(present(vector)) == vector.shape[2]
     count = np.minimum(whole.sum(axis=1), _SAMPLED_FRAMES)
     every = bool(whole.all()) and whole.shape[1] <= _SAMPLED_FRAMES
     rows = np.argsort(~whole, axis=1, kind="stable")[:, :_SAMPLED_FRAMES]
@@ -242,34 +254,57 @@ def sample_residuals(
     def sampled(x: Floats) -> Floats:
         if every:
             return x
-        index = rows.reshape(*rows.shape, *[1] * (x.ndim - 2))
+        index = rows.reshape(len(rows), *[1] * (x.ndim - 2), -1)
         here = complete.reshape(index.shape)
-        return np.where(here, np.take_along_axis(x, index, axis=1), 0.0)
+        return np.where(here, np.take_along_axis(x, index, axis=-1), 0.0)
 
-    # The velocity of the centre between the poses before and after, about its mean; 0 at the first
-    # and at the last pose, and at jumps.
-    center, time = np.stack([m.center for m in motions]), np.stack([m.time for m in motions])
+    center, time = frames_last([m.center for m in motions]), np.stack([m.time for m in motions])
     velocity = np.zeros_like(center)
     poses = np.array([m.fitted.size for m in motions])
-    for size in np.unique(poses[poses >= 3]).tolist():
-        bodies = np.flatnonzero(poses == size)
-        fitted = np.stack([motions[k].fitted for k in bodies.tolist()])
-        x, t = center[bodies[:, None], fitted], time[bodies[:, None], fitted]
-        v = (x[:, 2:] - x[:, :-2]) / (t[:, 2:] - t[:, :-2])[..., None]
-        v = v - median_present(np.swapaxes(v, 1, 2))[:, None]
-        speed = lengths(v)
-        usual = (speed <= _JUMP_SPEED * median_present(speed)[:, None])[..., None]
-        mean = np.where(usual, v, 0.0).sum(axis=1, keepdims=True) / usual.sum(axis=1)[:, None]
-        velocity[bodies[:, None], fitted[:, 1:-1]] = np.where(usual, v - mean, 0.0)
+    fitted = np.flatnonzero((poses == time.shape[1]) & (poses >= 3))
+    if fitted.size:
+        velocity[fitted] = _velocities(center[fitted], time[fitted])
+    for number in np.flatnonzero((poses < time.shape[1]) & (poses >= 3)).tolist():
+        own, body = motions[number].fitted, slice(number, number + 1)
+        velocity[body, :, own] = _velocities(center[body, :, own], time[body, own])
     template = np.stack([m.template for m in motions])
     return Residuals(
-        rotation=sampled(np.stack([m.rotation for m in motions])),
-        vector=sampled(vector),
+        rotation=sampled(frames_last([m.rotation for m in motions])),
+        vector=sampled(np.ascontiguousarray(np.moveaxis(vector, 1, -1))),
         velocity=sampled(velocity),
         count=count,
         template=template,
         keeps=fit_projector(template),
     )
+
+
+def frames_last(arrays: Sequence[Floats]) -> Floats:
+    """Return arrays (T, ...) of B bodies as one with the frames last, (B, ..., T).
+
+    Examples
+    --------
+    >>> frames_last([np.zeros((300, 4, 3))] * 2).shape
+    (2, 4, 3, 300)
+    """
+    joined = np.empty((len(arrays), *arrays[0].shape[1:], len(arrays[0])))
+    for own, one in zip(np.moveaxis(joined, -1, 1), arrays, strict=True):
+        own[...] = one
+    return joined
+
+
+def _velocities(center: Floats, time: Floats) -> Floats:
+    """Return the velocity between the poses before and after, about its mean, (B, d, K).
+
+    It is 0 at the first and at the last pose, and at jumps. `center` is (B, d, K), `time` (B, K).
+    """
+    velocity = np.zeros_like(center)
+    v = (center[..., 2:] - center[..., :-2]) / (time[:, 2:] - time[:, :-2])[:, None]
+    v -= median_present(v)[..., None]
+    speed = np.sqrt(np.einsum("bdk,bdk->bk", v, v))
+    usual = speed <= _JUMP_SPEED * median_present(speed)[:, None]
+    mean = np.where(usual[:, None], v, 0.0).sum(axis=2) / usual.sum(axis=1)[:, None]
+    velocity[..., 1:-1] = np.where(usual[:, None], v - mean[..., None], 0.0)
+    return velocity
 
 
 def median_present(values: Floats) -> Floats:
@@ -298,13 +333,16 @@ def quantile_present(values: Floats, share: float) -> Floats:
     array([4., 7.])
     """
     ordered = np.sort(values, axis=-1)  # NaN last
-    last = np.full(ordered.shape[:-1], ordered.shape[-1] - 1)
+    last = np.full((1,) * (ordered.ndim - 1), ordered.shape[-1] - 1)
     if not np.isfinite(ordered[..., -1:]).all():
         last = np.maximum((~np.isnan(ordered)).sum(axis=-1) - 1, 0)
     place = share * last
     below = np.floor(place).astype(np.int64)
-    low = np.take_along_axis(ordered, below[..., None], axis=-1)[..., 0]
-    high = np.take_along_axis(ordered, np.minimum(below + 1, last)[..., None], axis=-1)[..., 0]
+    ends = below[..., None], np.minimum(below + 1, last)[..., None]
+    if last.size == 1:  # the same place in all rows
+        low, high = (ordered[..., int(k.item())] for k in ends)
+    else:
+        low, high = (np.take_along_axis(ordered, k, axis=-1)[..., 0] for k in ends)
     return np.asarray(low + (place - below) * (high - low))
 
 
@@ -328,7 +366,12 @@ def fit_projector(template: Floats) -> Floats:
     n, d = template.shape[-2:]
     slopes = pose_slopes(template)
     slopes = slopes.reshape(*template.shape[:-2], n * d, -1)
-    left = np.eye(n * d) - slopes @ np.linalg.pinv(slopes)
+    basis, triangle = np.linalg.qr(slopes)
+    size = np.abs(np.diagonal(triangle, axis1=-2, axis2=-1))
+    if (size.min(axis=-1) > 1e-6 * size.max(axis=-1)).all():
+        left = np.eye(n * d) - basis @ np.swapaxes(basis, -1, -2)
+    else:  # fewer displacements are independent
+        left = np.eye(n * d) - slopes @ np.linalg.pinv(slopes)
     blocks = left.reshape(*template.shape[:-2], n, d, n, d)
     return np.ascontiguousarray(np.swapaxes(blocks, -3, -2))
 
@@ -341,8 +384,8 @@ def autocorrelation(vectors: Floats, count: Ints, freedom: float) -> Floats:
 
     Parameters
     ----------
-    vectors : ndarray, shape (B, K, ...)
-        Residuals of B bodies, rows of zeros after the last frame of each.
+    vectors : ndarray, shape (B, ..., K)
+        Residuals of B bodies, zeros after the last frame of each.
     count : ndarray of int, shape (B,)
         Number of frames of each body.
     freedom : float
@@ -355,14 +398,13 @@ def autocorrelation(vectors: Floats, count: Ints, freedom: float) -> Floats:
 
     Examples
     --------
-    >>> white = np.random.default_rng(1).normal(size=(1, 300, 4, 3))
+    >>> white = np.random.default_rng(1).normal(size=(1, 4, 3, 300))
     >>> bool(np.abs(autocorrelation(white, np.array([300]), 6)).sum() < 0.1)
     True
     """
-    flat = vectors.reshape(*vectors.shape[:2], -1)
-    series, step = flat.reshape(len(flat), -1), flat.shape[2]
-    power = np.einsum("bx,bx->b", series, series)
-    following = np.einsum("bx,bx->b", series[:, step:], series[:, :-step])
+    flat = vectors.reshape(len(vectors), -1, vectors.shape[-1])
+    power = np.einsum("bxk,bxk->b", flat, flat)
+    following = np.einsum("bxk,bxk->b", flat[..., 1:], flat[..., :-1])
     least = 2.0 / np.sqrt(np.maximum(count * freedom, 1.0))
     first = np.divide(following, power, out=np.zeros(len(flat)), where=power > 0)
     smooth = np.flatnonzero((first >= least) & (count > 1) & (power > 0))
@@ -397,9 +439,10 @@ def lag_one_autocorrelation(residuals: Floats) -> Slope:
     >>> bool(abs(found.value) < 4 * found.stderr)
     True
     """
-    before, after = residuals[..., :-1, :, :], residuals[..., 1:, :, :]
-    both = np.isfinite(before) & np.isfinite(after)
-    a, b = np.where(both, before, 0.0), np.where(both, after, 0.0)
+    a, b = residuals[..., :-1, :, :], residuals[..., 1:, :, :]
+    both = np.isfinite(a) & np.isfinite(b)
+    if not both.all():
+        a, b = np.where(both, a, 0.0), np.where(both, b, 0.0)
     power = 0.5 * (np.einsum("...tni,...tni->...", a, a) + np.einsum("...tni,...tni->...", b, b))
     n, d = residuals.shape[-2:]
     share = float(degrees_of_freedom(np.array(n), d)) / (n * d)
@@ -416,7 +459,7 @@ def lagged_products(vectors: Floats) -> Floats:
 
     Parameters
     ----------
-    vectors : ndarray, shape (B, K, ...)
+    vectors : ndarray, shape (B, ..., K)
 
     Returns
     -------
@@ -424,12 +467,11 @@ def lagged_products(vectors: Floats) -> Floats:
 
     Examples
     --------
-    >>> lagged_products(np.array([[[1.0], [2.0], [3.0]]])).round(12)
+    >>> lagged_products(np.array([[[1.0, 2.0, 3.0]]])).round(12)
     array([[14.,  8.,  3.]])
     """
-    count = vectors.shape[1]
-    series = np.ascontiguousarray(np.swapaxes(vectors.reshape(*vectors.shape[:2], -1), 1, 2))
-    spectrum = np.fft.rfft(series, n=2 * count)
+    count = vectors.shape[-1]
+    spectrum = np.fft.rfft(vectors.reshape(len(vectors), -1, count), n=2 * count)
     power = (spectrum.real**2 + spectrum.imag**2).sum(axis=1)
     sums: Floats = np.fft.irfft(power, n=2 * count)[:, :count]
     return sums
@@ -454,9 +496,9 @@ def regress(
     ----------
     sample : Residuals
         Of B bodies.
-    displacement : ndarray, shape (B, K, n, d)
+    displacement : ndarray, shape (B, n, d, K)
         Displacement of every particle for a slope of 1, body axes.
-    left : ndarray, shape (B, K, n, d), optional
+    left : ndarray, shape (B, n, d, K), optional
         What a rigid fit leaves of it, where that is known already.
     offset : float or ndarray, shape (B,)
         Expectation of the product of residuals and displacement for a slope of 0.
@@ -475,7 +517,7 @@ def regress(
     >>> x = add_noise(truth.positions(), sigma=0.03, rng=2)
     >>> sample = sample_residuals([track_rotation(x, dt=0.7)], x[None])
     >>> moved = np.zeros(sample.vector.shape)
-    >>> moved[:, ::2, 0] = 1.0  # the first particle, in every second frame
+    >>> moved[:, 0, :, ::2] = 1.0  # the first particle, in every second frame
     >>> bool(abs(regress(sample, moved).value[0]) < 0.01)
     True
     """
@@ -483,15 +525,16 @@ def regress(
     power, known = _measurable_power(sample, displacement, left, imitated)
     if not known.any():
         return Slope.unknown(sample.count.shape)
-    frames = np.einsum("bkni,bkni->bk", left, left)
+    frames = np.einsum("bnik,bnik->bk", left, left)
     total = np.where(known, frames.sum(axis=1), 1.0)
-    along = np.einsum("bkni,bkni->bk", left, sample.vector)
+    along = np.einsum("bnik,bnik->bk", left, sample.vector)
     slope = (along.sum(axis=1) - offset) / power
-    rest = sample.vector - slope[:, None, None, None] * left
+    rest = slope[:, None, None, None] * left
+    np.subtract(sample.vector, rest, out=rest)
     rho = autocorrelation(sample.in_lab(rest), sample.count, sample.freedom)
     share = np.where(known[:, None], frames / total[:, None], 0.0)  # leverage of every frame
     scores = (along - slope[:, None] * frames) / (1.0 - share)
-    residual_square = np.einsum("bkni,bkni->b", rest, rest)
+    residual_square = np.einsum("bnik,bnik->b", rest, rest)
     mean_square = residual_square / (sample.freedom * np.maximum(sample.count - 1, 1))
     variance = np.maximum((scores * scores).sum(axis=1), mean_square * total)
     shared = np.zeros(len(total))
@@ -516,8 +559,8 @@ def _measurable_power(
 
     The power is 1 where the displacement is too small to measure its slope.
     """
-    power = np.einsum("bkni,bkni->b", left, left) - imitated
-    moved = np.einsum("bkni,bkni->b", displacement, displacement)
+    power = np.einsum("bnik,bnik->b", left, left) - imitated
+    moved = np.einsum("bnik,bnik->b", displacement, displacement)
     least = np.maximum(_LEAST_POWER * np.asarray(imitated), 1e-9 * moved)
     known = (sample.freedom > 0) & (sample.count >= 3) & (power > least)
     return np.where(known, power, 1.0), np.asarray(known)
@@ -579,39 +622,52 @@ def expected_squares(rotation: Floats, keeps: Floats) -> Floats:
     >>> float(expected_squares(np.eye(2)[None], fit_projector(triangle)).sum().round(9))  # 2 n - 3
     3.0
     """
-    d = rotation.shape[-1]
+    expected = _expected_of(_products(np.moveaxis(rotation, -3, -1)), keeps)
+    return np.moveaxis(expected, -1, -3)
+
+
+def _expected_of(axes: Floats, keeps: Floats) -> Floats:
+    """Return `expected_squares` (..., d, d, K) from the products of the axes (..., d, m, K)."""
+    d = keeps.shape[-1]
     blocks = keeps.reshape(*keeps.shape[:-4], -1, d * d)
     # u_i K_ij v_j u_k K_kl v_l is a quadratic form in the axis u and in the axis v.
     products = np.swapaxes(blocks, -1, -2) @ blocks
     form = np.swapaxes(products.reshape(*keeps.shape[:-4], d, d, d, d), -3, -2)
     form = _of_products(np.moveaxis(_of_products(form), -1, -3))
-    axes = _products(rotation)
-    along = axes.reshape(*rotation.shape[:-3], -1, axes.shape[-1]) @ form
-    return np.asarray(along.reshape(axes.shape) @ np.swapaxes(axes, -1, -2))
+    along = np.swapaxes(form, -1, -2)[..., None, :, :] @ axes
+    return np.asarray(np.einsum("...auk,...buk->...abk", along, axes))
 
 
 def _products(vectors: Floats) -> Floats:
-    """Return the products u_i u_j, i <= j, of the components of vectors (..., d).
+    """Return the products u_i u_j, i <= j, of the components of vectors (..., d, K).
 
     The rows of an orientation, lab from body, are the lab's axes in body axes.
 
     Examples
     --------
-    >>> _products(np.array([[0.6, 0.8], [-0.8, 0.6]])).round(2)
+    >>> _products(np.array([[[0.6], [0.8]], [[-0.8], [0.6]]])).round(2)[..., 0]
     array([[ 0.36,  0.48,  0.64],
            [ 0.64, -0.48,  0.36]])
     """
-    i, j = np.triu_indices(vectors.shape[-1])
-    return np.asarray(np.take(vectors, i, axis=-1) * np.take(vectors, j, axis=-1))
+    i, j, _ = _pairs_of_axes(vectors.shape[-2])
+    return np.asarray(np.take(vectors, i, axis=-2) * np.take(vectors, j, axis=-2))
 
 
 def _of_products(form: Floats) -> Floats:
     """Return the coefficients of the products u_i u_j, i <= j, in quadratic forms (..., d, d)."""
     d = form.shape[-1]
+    found = form.reshape(-1, d * d) @ _pairs_of_axes(d)[2]
+    return found.reshape(*form.shape[:-2], -1)
+
+
+@cache
+def _pairs_of_axes(d: int) -> tuple[Ints, Ints, Floats]:
+    """Return the pairs i <= j of axes, and which of the d^2 products u_i u_j is that of a pair."""
     i, j = np.triu_indices(d)
     place = np.arange(d * d)[:, None]
-    each = (place == i * d + j) | (place == j * d + i)
-    return np.asarray(form.reshape(*form.shape[:-2], d * d) @ each.astype(np.float64))
+    each = ((place == i * d + j) | (place == j * d + i)).astype(np.float64)
+    frozen(i, j, each)
+    return i, j, each
 
 
 def axis_noise(sample: Residuals) -> AxisNoise:
@@ -644,16 +700,16 @@ def axis_noise(sample: Residuals) -> AxisNoise:
     mix = sample.expected
     lab = sample.in_lab(sample.vector)
     unbiased = count / np.maximum(count - 1, 1)
-    square = np.einsum("bkni,bkni->bki", lab, lab) * unbiased[:, None, None]
-    sums, total = square.sum(axis=1), mix.sum(axis=1)
+    square = np.einsum("bnak,bnak->bak", lab, lab) * unbiased[:, None, None]
+    sums, total = square.sum(axis=2), mix.sum(axis=3)
     known = (count >= 3) & (sums.sum(axis=1) > 0)
     singular = np.linalg.svd(np.where(known[:, None, None], total, np.eye(d)), compute_uv=False)
     known &= singular[:, 0] <= 1e8 * singular[:, -1]
     inverse = np.linalg.inv(np.where(known[:, None, None], total, np.eye(d)))
     variance = np.einsum("bij,bj->bi", inverse, sums)
-    scores = square - np.einsum("bkij,bj->bki", mix, variance)
+    scores = square - np.einsum("bijk,bj->bik", mix, variance)
     rho = autocorrelation(lab, count, sample.freedom)
-    spread = inverse @ (np.swapaxes(scores, 1, 2) @ scores) @ np.swapaxes(inverse, 1, 2)
+    spread = inverse @ (scores @ np.swapaxes(scores, 1, 2)) @ np.swapaxes(inverse, 1, 2)
     spread = spread * (1.0 + 2.0 * (rho * rho).sum(axis=1))[:, None, None]
     return AxisNoise(
         np.where(known[:, None], variance, np.nan), np.where(known[:, None, None], spread, np.nan)
@@ -768,20 +824,20 @@ def measure_stretch(
 
 def _stretch_step(sample: Residuals) -> tuple[Slope, Floats]:
     """Return the stretch of z from the residuals, and what a rigid fit leaves of a unit stretch."""
-    up = sample.rotation[:, :, 2]  # the lab's z axis in body axes
-    height = up @ np.swapaxes(sample.template, 1, 2)
-    displacement = height[..., None] * up[:, :, None]
+    up = sample.rotation[:, 2]  # the lab's z axis in body axes
+    displacement = (sample.template @ up)[:, :, None] * up[:, None]
     left = sample.left_of(displacement)
     unknown = Slope.unknown(sample.count.shape)
     power, known = _measurable_power(sample, displacement, left)
     if not known.any():
         return unknown, left
-    plain = np.where(known, np.einsum("bkni,bkni->b", left, sample.vector) / power, 0.0)
-    vector = sample.vector - plain[:, None, None, None] * left
+    plain = np.where(known, np.einsum("bnik,bnik->b", left, sample.vector) / power, 0.0)
+    vector = plain[:, None, None, None] * left
+    np.subtract(sample.vector, vector, out=vector)
     # The noise of the axes is shrunk to equal noise, the more the larger its error. A body whose
     # residuals do not separate the axes (a trimer that hardly turns) is left with equal noise, and
     # with an error that allows standard deviations of 1 : 1 : 3.
-    square = np.einsum("bkni,bkni->b", vector, vector)
+    square = np.einsum("bnik,bnik->b", vector, vector)
     mean = square / (sample.freedom * np.maximum(sample.count - 1, 1))
     variance = np.repeat(mean[:, None], 3, axis=1)
     covariance = ((_VARIANCE_SPREAD * mean) ** 2)[:, None, None] * np.eye(3)
@@ -804,7 +860,7 @@ def _stretch_step(sample: Residuals) -> tuple[Slope, Floats]:
         offset=(products * variance).sum(axis=1),
         imitated=imitated,
     )
-    power = np.einsum("bkni,bkni->b", left, left) - imitated
+    power = np.einsum("bnik,bnik->b", left, left) - imitated
     noise_error = np.einsum("ba,bac,bc->b", products, covariance, products)
     with np.errstate(divide="ignore", invalid="ignore"):
         error = np.sqrt(found.stderr**2 + noise_error / power**2)
@@ -823,18 +879,11 @@ def _noise_products(sample: Residuals, left: Floats) -> tuple[Floats, Floats]:
     coefficients are those of the body; the frames enter by the sums of the products u_i u_j.
     """
     form = _noise_forms(sample)
-    axes = _products(sample.rotation)
-    bodies, count, _, products = axes.shape
-    up, every = axes[:, :, 2], axes.reshape(bodies, count, -1)
-
-    def summed(factor: Floats) -> Floats:
-        """Sum the products of a factor (B, K, x) with those of each axis, (B, x, 3, 6)."""
-        sums = np.swapaxes(factor, 1, 2) @ every
-        return sums.reshape(bodies, -1, 3, products)
-
-    residual = np.einsum("zxau,zxu->za", summed(left.reshape(bodies, count, -1)), form.shift)
-    residual += np.einsum("zxau,zxu->za", summed(up), form.crossed)
-    return residual, np.einsum("zxau,zxu->za", summed(_products(up)), form.square)
+    axes, up = sample.axes, sample.axes[:, 2]
+    moved = left.reshape(len(left), -1, left.shape[-1])
+    shift, crossed, square = (np.swapaxes(part, 1, 2) for part in form)
+    residual = np.einsum("zauk,zuk->za", axes, shift @ moved + crossed @ up)
+    return residual, np.einsum("zauk,zuk->za", axes, square @ _products(up))
 
 
 class _NoiseForms(NamedTuple):
@@ -860,14 +909,14 @@ def _noise_forms(sample: Residuals) -> _NoiseForms:
     r, unit = sample.template, np.eye(3)
     bodies, n, d = r.shape
     cross, moment = skew(unit), skew(r)  # cross[k] is [e_k]x
-    arm = np.linalg.pinv(inertia_tensor(r))[:, None] @ moment
+    arm = np.linalg.inv(inertia_tensor(r))[:, None] @ moment
     # C by u_b u_c.
     turn = np.einsum("zipb,ziqc->zpqbc", arm, arm)
     shift = np.einsum("zip,zpxbc->zixbc", r, turn) - np.einsum("zix,zppbc->zixbc", r, turn)
     shift = 0.5 * shift - np.einsum("zipb,cpx->zixbc", arm, cross)
     # The derivative of z (z . r) with z -> z - delta x z, by delta_p z_b z_c.
     slope = np.einsum("bxp,znc->znxpbc", cross, r) + np.einsum("xb,znpc->znxpbc", unit, moment)
-    slope = np.einsum("zmnxy,znypbc->zmxpbc", sample.keeps, slope)
+    slope = (sample.projector @ slope.reshape(bodies, n * d, -1)).reshape(slope.shape)
     # <delta_p e_ix> of what the fit leaves of the noise, by u_b u_c.
     shared = np.einsum("zlpb,zlicx->zixpbc", arm, sample.keeps)
     turn, shift, slope, shared = (_of_products(part) for part in (turn, shift, slope, shared))
@@ -906,11 +955,11 @@ def measure_scan(sample: Residuals) -> Slope:
     >>> measure_scan(sample_residuals([track_rotation(x, dt=0.7)], x[None])).differs_from(0.0)
     array([False])
     """
-    if sample.rotation.shape[-1] != 3:
+    if sample.template.shape[2] != 3:
         return Slope.unknown(sample.count.shape)
-    height = sample.rotation[:, :, 2] @ np.swapaxes(sample.template, 1, 2)
-    velocity = np.einsum("bki,bkij->bkj", sample.velocity, sample.rotation)
-    return regress(sample, height[..., None] * velocity[:, :, None])
+    height = sample.template @ sample.rotation[:, 2]
+    velocity = np.einsum("baik,bak->bik", sample.rotation, sample.velocity)
+    return regress(sample, height[:, :, None] * velocity[:, None])
 
 
 def body_residuals(motion: RigidMotion, positions: Floats) -> Floats:
@@ -960,11 +1009,13 @@ def residuals_of_each(motions: Sequence[RigidMotion], positions: Floats) -> Floa
     >>> residuals_of_each([truth, truth], np.stack([truth.positions()] * 2)).shape
     (2, 5, 4, 3)
     """
-    center = np.stack([m.center for m in motions])
-    rotation = np.stack([m.rotation for m in motions])
+    center = frames_last([m.center for m in motions])
+    rotation = frames_last([m.rotation for m in motions])
     template = np.stack([m.template for m in motions])
-    out: Floats = (positions - center[:, :, None]) @ rotation
-    return out - template[:, None]
+    from_center = np.moveaxis(positions, 1, -1) - center[:, None]
+    out: Floats = np.einsum("baik,bnak->bnik", rotation, from_center)
+    out -= template[..., None]
+    return np.moveaxis(out, -1, 1)
 
 
 def unit_covariance(motion: RigidMotion) -> Floats:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 from functools import cached_property
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -24,6 +25,7 @@ from perrin._arrays import (
 from perrin._display import Shown
 from perrin.errors import TooFewFramesError
 from perrin.geometry.rotations import log_map, skew
+from perrin.geometry.shapes import lengths
 from perrin.geometry.symmetry import (
     are_collinear,
     point_group,
@@ -45,6 +47,9 @@ _UNEVEN_POINTS = (0.0, 1.0, 2.0, 4.0, 7.0)
 
 # Distances of particles of bodies whose symmetries are searched for at once: bounds the memory.
 _MOST_COMPARED = 1_000_000
+
+# Steps whose rotation vectors are found at once: more do not stay in the processor's cache.
+_STEPS_TOGETHER = 4_000
 
 _ROTATION_ERROR = 1e-5  # largest departure of R^T R from the identity
 
@@ -137,7 +142,7 @@ class RigidMotion(Shown):
     @cached_property
     def R(self) -> float:
         """Mean distance of the particles to the centre, um."""
-        return float(np.linalg.norm(self.template, axis=1).mean())
+        return float(lengths(self.template).mean())
 
     @cached_property
     def template_error(self) -> float:
@@ -240,15 +245,10 @@ class RigidMotion(Shown):
             Row k is the rotation (rad) that ends at frame k + 1, from the last pose before it; NaN
             where frame k + 1 has no pose or begins a piece.
         """
-        return self._step_vectors
-
-    @cached_property
-    def _step_vectors(self) -> Floats:
-        start, stop = self.steps()
-        vector = np.full((len(self.time) - 1, self.covariance.shape[-1]), np.nan)
-        vector[stop - 1] = log_map(np.swapaxes(self.rotation[start], -1, -2) @ self.rotation[stop])
-        frozen(vector)
-        return vector
+        if "_step_vectors" not in vars(self):
+            find_step_vectors([self])
+        found: Floats = vars(self)["_step_vectors"]
+        return found
 
     def orientation(self, p0: ArrayLike) -> Floats:
         """Follow body-fixed directions through time (Hunter 2011, Eq. 17).
@@ -585,6 +585,42 @@ def find_symmetries(motions: Iterable[RigidMotion]) -> None:
             _find_symmetries_together(bodies[low : low + at_once])
 
 
+def find_step_vectors(motions: Sequence[RigidMotion]) -> None:
+    """Find the rotation vectors of the steps of several bodies together.
+
+    They become what `RigidMotion.step_vectors` of each returns.
+
+    Parameters
+    ----------
+    motions : sequence of RigidMotion
+        All in space, or all in the plane.
+
+    Examples
+    --------
+    >>> from perrin import Cluster, simulate_motion
+    >>> truth = simulate_motion(Cluster.tetrahedron(1.5), D_R=5e-3, dt=0.7, n_frames=9, rng=3)
+    >>> find_step_vectors([truth])
+    >>> truth.step_vectors().shape
+    (8, 3)
+    """
+    at_once = max(1, _STEPS_TOGETHER // max([1, *(len(motion.time) for motion in motions)]))
+    for some in (motions[low : low + at_once] for low in range(0, len(motions), at_once)):
+        ends = [motion.steps() for motion in some]
+        edges = np.cumsum([0, *(stop.size for _, stop in ends)]).tolist()
+        parts = [slice(low, high) for low, high in pairwise(edges)]
+        # With the steps last, products of a few numbers are those of long vectors.
+        before, after = np.empty((2, *some[0].rotation.shape[1:], edges[-1]))
+        for motion, (start, stop), part in zip(some, ends, parts, strict=True):
+            before[..., part] = motion.rotation.take(start, axis=0).transpose(1, 2, 0)
+            after[..., part] = motion.rotation.take(stop, axis=0).transpose(1, 2, 0)
+        vectors = log_map(np.moveaxis(np.einsum("jik,jlk->ilk", before, after), -1, 0))
+        for motion, (_, stop), part in zip(some, ends, parts, strict=True):
+            vector = np.full((len(motion.time) - 1, vectors.shape[-1]), np.nan)
+            vector[stop - 1] = vectors[part]
+            frozen(vector)
+            vars(motion)["_step_vectors"] = vector
+
+
 def _find_symmetries_together(motions: Sequence[RigidMotion]) -> None:
     """Find the point groups of bodies with the same number of particles."""
     templates = np.stack([motion.template for motion in motions])
@@ -597,12 +633,11 @@ def _find_symmetries_together(motions: Sequence[RigidMotion]) -> None:
     if not rows.size:
         return
     found = symmetry_elements_of_each(templates[rows], errors[rows])
-    symbols: dict[tuple[int, bytes], str] = {}
+    symbols: dict[bytes, str] = {}
     for k, elements in zip(rows.tolist(), found, strict=True):
         # Groups with the same angles between all their elements have the same symbol.
         flat = elements.reshape(len(elements), -1)
-        angles = np.rint(1e4 * (flat @ flat.T)).astype(np.int64)
-        key = len(elements), angles.tobytes()
+        key = np.rint(1e4 * (flat @ flat.T)).astype(np.int32).tobytes()
         if key not in symbols:
             symbols[key] = schoenflies(elements)
         vars(motions[k])["symmetry_elements"] = elements

@@ -13,6 +13,7 @@ from perrin._arrays import (
     Ints,
     as_positions,
     as_sigma,
+    count_present,
     finite_or_none,
     present,
     to_plain,
@@ -25,6 +26,7 @@ from perrin.motion.residuals import (
     autocorrelation,
     axis_noise,
     fit_projector,
+    frames_last,
     lag_one_autocorrelation,
     measure_scan,
     measure_stretch,
@@ -316,7 +318,7 @@ def judge_each(
             rows = group[low : low + at_once]
             judged = _judge_alike(
                 [motions[k] for k in rows],
-                np.stack([positions[k] for k in rows]),
+                np.moveaxis(frames_last([positions[k] for k in rows]), -1, 1),
                 sigma=sigma,
                 sigma_ratio=sigma_ratio,
                 corrections=[corrections[k] for k in rows],
@@ -338,7 +340,7 @@ def _judge_alike(
     detections: Sequence[Floats | None],
     unsettled: Sequence[Ints],
 ) -> list[Quality]:
-    """Judge bodies whose positions (B, T, n, d) have one shape."""
+    """Judge bodies whose positions (B, T, n, d) have one shape; in memory the frames are last."""
     d = x.shape[3]
     stated = None if sigma is None else as_sigma(sigma, d)
     ratio = stated if sigma_ratio is None else as_sigma(sigma_ratio, d)
@@ -370,6 +372,8 @@ def _judge_alike(
     misfit = misplaced_detections(all_residuals, radius)
     for own, rows in zip(misfit, unsettled, strict=True):
         own[rows] = True
+    misfit_frames, misplaced = np.asarray(misfit.any(axis=2)), misfit.sum(axis=1)
+    misfits = misfit_frames.sum(axis=1).tolist()
     smooth = lag_one_autocorrelation(residuals)
     drifts = bond_drifts(corrected)
     noise = axis_noise(stretch.sample)
@@ -392,18 +396,17 @@ def _judge_alike(
     imaging = _imaging_texts(scale, stretched, delay, blur, ratio is not None)
     judged = []
     for k, (motion, body) in enumerate(zip(motions, bodies, strict=True)):
-        misfit_rows = np.flatnonzero(misfit[k].any(axis=1))
         soft = [
             *_residual_test(body, float(usual[k]), smooth.of_body(k), stated_sigma),
             *flexing[k],
-            *_shape_tests(misfit[k], body.fitted.size, drifts[k]),
+            *_shape_tests(misplaced[k], misfits[k], body.fitted.size, drifts[k]),
         ]
         warnings, notes = imaging[k]
-        if misfit_rows.size and not soft:
+        if misfits[k] and not soft:
             notes.insert(
                 0,
-                f"{misfit_rows.size} of {body.fitted.size} frames fit the common shape badly "
-                f"(first at {body.time[misfit_rows[0]]:g} s): a particle is over "
+                f"{misfits[k]} of {body.fitted.size} frames fit the common shape badly "
+                f"(first at {body.time[misfit_frames[k].argmax()]:g} s): a particle is over "
                 f"{_MISPLACED_MULTIPLE:g} times as far from its place as {_USUAL_SHARE:.0%} of all "
                 "detections are",
             )
@@ -432,7 +435,7 @@ def _judge_alike(
                 scan_blur_stderr=finite_or_none(blur.stderr[k]),
                 scan_delay=finite_or_none(delay.value[k]),
                 scan_delay_stderr=finite_or_none(delay.stderr[k]),
-                misfits=misfit_rows.size,
+                misfits=misfits[k],
             )
         )
     return judged
@@ -558,19 +561,23 @@ def misplaced_detections(residuals: Floats, radius: Floats) -> Bools:
     """
     distance = lengths(residuals)
     seen = np.isfinite(distance)
-    usual = quantile_present(distance.reshape(len(distance), -1), _USUAL_SHARE)
+    # The order of the frames does not matter; they may be last in memory.
+    every = np.swapaxes(distance, 1, 2).reshape(len(distance), -1)
+    usual = quantile_present(every, _USUAL_SHARE)
     # A difference of rounding is no misfit.
     limit = np.maximum(_MISPLACED_MULTIPLE * np.nan_to_num(usual, nan=np.inf), 1e-9 * radius)
     return np.asarray(seen & (distance > limit[:, None, None]))
 
 
-def _shape_tests(misfit: Bools, count: int, drift: BondDrift) -> list[str]:
-    """Test the frames with a misplaced detection (binomial test), and the drift of distances."""
+def _shape_tests(each: Ints, total: int, count: int, drift: BondDrift) -> list[str]:
+    """Test the frames with a misplaced detection (binomial test), and the drift of distances.
+
+    `each` has the number of misplaced detections of every particle, in `total` of `count` frames.
+    """
     from scipy.special import bdtrc
 
     texts = []
-    each, total = misfit.sum(axis=0), int(misfit.any(axis=1).sum())
-    worst = int(each.argmax())
+    worst = int(each.argmax()) if total else 0
     chance = SIGNIFICANCE / len(each)
     if total and bdtrc(total - 1, count, _MISPLACED_FRAMES) <= SIGNIFICANCE:
         texts.append(
@@ -607,34 +614,36 @@ def _flexing_tests(
     # Contribution of each particle's variance to the mean squares of all residuals.
     share = np.einsum("bnmij,bnmij->bnm", keeps, keeps)
     singular = np.linalg.svd(share, compute_uv=False)
-    whole = np.asarray(present(residuals).all(axis=2))
+    whole = count_present(present(residuals)) == n
     following = whole[:, 1:] & whole[:, :-1]
     pairs = following.sum(axis=1)
     tested = np.flatnonzero((pairs >= 10) & ~(singular[:, 0] > 1e6 * singular[:, -1]))
     texts: list[list[str]] = [[] for _ in range(bodies)]
     if not tested.size:
         return texts
-    rows, linked = residuals[tested], following[tested]
+    rows, linked = np.moveaxis(residuals, 1, -1)[tested], following[tested]
     count, pairs = whole[tested].sum(axis=1), pairs[tested]
     complete = np.arange(frames) < count[:, None]
     if not complete.all():
         # Complete frames first, each with the number of the frame after it.
         order = np.argsort(~whole[tested], axis=1, kind="stable")
         linked = np.take_along_axis(np.pad(linked, ((0, 0), (0, 1))), order, axis=1)[:, :-1]
-        rows = np.take_along_axis(rows, order[..., None, None], axis=1)
-        rows = np.where(complete[..., None, None], rows, np.nan)
-    matrix = keeps[tested].transpose(0, 2, 4, 1, 3).reshape(len(tested), n * d, n * d)
-    vector = (rows.reshape(len(tested), frames, n * d) @ matrix).reshape(rows.shape)
-    vector = vector - median_present(np.moveaxis(vector, 1, -1))[:, None]
+        rows = np.take_along_axis(rows, order[:, None, None], axis=-1)
+        rows = np.where(complete[:, None, None], rows, np.nan)
+    matrix = keeps[tested].transpose(0, 1, 3, 2, 4).reshape(len(tested), n * d, n * d)
+    vector = (matrix @ rows.reshape(len(tested), n * d, frames)).reshape(rows.shape)
+    vector -= median_present(vector)[..., None]
     # The longest vectors of every particle are shortened to the length of the next (winsorised).
-    length = lengths(vector)
-    limit = quantile_present(np.moveaxis(length, 1, -1), 1 - _TRIMMED_SHARE)
-    vector = vector * np.minimum(1.0, limit[:, None] / np.maximum(length, 1e-300))[..., None]
-    vector = np.where(complete[..., None, None], vector, 0.0)
+    length = np.sqrt(np.einsum("bnik,bnik->bnk", vector, vector))
+    limit = quantile_present(length, 1 - _TRIMMED_SHARE)
+    vector *= np.minimum(1.0, limit[..., None] / np.maximum(length, 1e-300))[:, :, None]
+    if not complete.all():
+        vector = np.where(complete[:, None, None], vector, 0.0)
     inverse = np.linalg.inv(share[tested])
-    product = np.einsum("bkni,bkni->bkn", vector[:, :-1], vector[:, 1:]) @ inverse
-    product = np.where(linked[..., None], product, 0.0)
-    mean = product.sum(axis=1) / pairs[:, None]
+    product = inverse @ np.einsum("bnik,bnik->bnk", vector[..., :-1], vector[..., 1:])
+    if not linked.all():
+        product = np.where(linked[:, None], product, 0.0)
+    mean = product.sum(axis=2) / pairs[:, None]
     ranks = np.argsort(mean, axis=1)
     worst, usual = ranks[:, -1], ranks[:, (n - 1) // 2]
     number = np.arange(len(tested))
@@ -646,9 +655,9 @@ def _flexing_tests(
         # of the median particle, and its autocorrelation that of the other particles, as the error
         # of the worst would contain the tested motion itself.
         w, m, own = worst[i], usual[i], inverse[i]
-        variance = product[i, linked[i]].var(axis=0) / np.diag(own)
+        variance = product[i][:, linked[i]].var(axis=1) / np.diag(own)
         unit = float(np.sort(variance)[(n - 1) // 2])
-        others = np.delete(vector[i : i + 1], w, axis=2)
+        others = np.delete(vector[i : i + 1], w, axis=1)
         rho = autocorrelation(others, count[i : i + 1], d * (n - 1) / 2)[0]
         repeats = 1.0 + 2.0 * float(rho @ rho)
         contrast = own[w, w] + own[m, m] - 2 * own[w, m]

@@ -15,6 +15,7 @@ from perrin._arrays import (
     as_positions,
     as_sigma,
     choice_fault,
+    count_present,
     number_fault,
     present,
     refuse,
@@ -260,7 +261,12 @@ def track_scanned(
 
 
 def track_each(
-    positions: Floats, *, time: Floats, dt: float, sigma: Floats | None = None
+    positions: Floats,
+    *,
+    time: Floats,
+    dt: float,
+    sigma: Floats | None = None,
+    piece: Ints | None = None,
 ) -> list[RigidMotion | DegenerateClusterError | TooFewFramesError | ValueError]:
     """Fit each of several bodies to its common shape, as `track_rotation`, all of them together.
 
@@ -274,6 +280,8 @@ def track_each(
         Time between frames, s.
     sigma : ndarray, shape (d,), optional
         Known localisation error, um; default: from the residuals.
+    piece : ndarray of int, shape (B, T), optional
+        Pieces of the tracks; default: one piece.
 
     Returns
     -------
@@ -301,7 +309,10 @@ def track_each(
     if rows.size:
         some, here = positions[rows], seen[rows]
         fit, faults = fit_templates(some, here)
-        motions = _motions_of(fit, faults, some, here, time=time[rows], dt=dt, sigma=sigma)
+        pieces = None if piece is None else piece[rows]
+        motions = _motions_of(
+            fit, faults, some, here, time=time[rows], dt=dt, sigma=sigma, piece=pieces
+        )
         for k, motion in zip(rows.tolist(), motions, strict=True):
             found[k] = motion
     return [one for one in found if one is not None]
@@ -425,6 +436,7 @@ def _motions_of(
     dt: float,
     sigma: Floats | None = None,
     errors: tuple[Floats, Floats] | None = None,
+    piece: Ints | None = None,
 ) -> list[RigidMotion | DegenerateClusterError | TooFewFramesError]:
     """Return the motions of the fitted poses of several bodies, or why there is none."""
     d = x.shape[3]
@@ -438,11 +450,16 @@ def _motions_of(
     lost[lost] = worst > _LOST_AXIS
     fitted = np.isfinite(fit.rotation[..., 0, 0]) & ~lost
     square = np.einsum("btni,btni->btn", fit.residual, fit.residual)
-    nan = np.where(fitted, 0.0, np.nan)
-    center, rotation = fit.center + nan[..., None], fit.rotation + nan[..., None, None]
-    distance = np.sqrt(mean_present(np.where(seen, square, np.nan), axis=2)) + nan
-    count = seen.sum(axis=2)
-    covariance, variance = covariance + nan[..., None, None], variance + nan
+    if not seen.all():
+        square = np.where(seen, square, np.nan)
+    distance = np.sqrt(mean_present(square, axis=2))
+    count = count_present(seen)
+    center, rotation = fit.center, fit.rotation
+    if not fitted.all():
+        nan = np.where(fitted, 0.0, np.nan)
+        center, rotation = center + nan[..., None], rotation + nan[..., None, None]
+        covariance, variance = covariance + nan[..., None, None], variance + nan
+        distance = distance + nan
     # Why frames have no pose; the texts are those of all numbers of particles.
     numbers = range(x.shape[2] + 1)
     few = [f"{c} of {numbers[-1]} particles, {d} needed" if c else "no particles" for c in numbers]
@@ -456,6 +473,7 @@ def _motions_of(
     c = count[~fitted]
     texts = [np.array(part)[c] for part in (few, near, unfixed)]
     why[~fitted] = np.select([c < d, lost[~fitted]], texts[:2], texts[2])
+    pieces = np.zeros(fitted.shape, dtype=np.int64) if piece is None else piece
     motions: list[RigidMotion | DegenerateClusterError | TooFewFramesError] = []
     for k, fault in enumerate(faults):
         if fault is None and fitted[k].sum() < 2:
@@ -473,7 +491,7 @@ def _motions_of(
                 n_present=count[k],
                 covariance=stored_once(covariance[k]),
                 center_variance=stored_once(variance[k]),
-                piece=np.zeros(x.shape[1], dtype=np.int64),
+                piece=pieces[k],
                 reason=tuple(why[k].tolist()),
                 template=fit.template[k],
                 sigma=float(np.sqrt(sigma2[k])),

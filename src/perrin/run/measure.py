@@ -41,7 +41,7 @@ from perrin.geometry.symmetry import point_group
 from perrin.hydrodynamics.units import viscosity_remarks
 from perrin.motion.common_motion import common_motion
 from perrin.motion.floor import floor_range
-from perrin.motion.rigid_motion import RigidMotion
+from perrin.motion.rigid_motion import RigidMotion, find_step_vectors
 from perrin.motion.rigidity import Corrections, Quality, judge_each
 from perrin.motion.rods import RodMotion, track_direction
 from perrin.motion.tracking import track_each, track_scanned
@@ -511,8 +511,11 @@ def fit_bodies(
     ]
     pieces = []
     for identity, one in zip(identities, tracks, strict=True):
-        changed = (np.diff(one.piece) != 0) | (np.diff(identity.piece) != 0)
-        pieces.append(np.append(0, np.cumsum(changed)).astype(np.int64))
+        changed = one.piece[1:] != one.piece[:-1]
+        changed = changed | (identity.piece[1:] != identity.piece[:-1])
+        piece = np.zeros(len(one.piece), dtype=np.int64)
+        piece[1:] = changed.cumsum()
+        pieces.append(piece)
     motions = _tracked_bodies(
         tracks, identities, positions, pieces, times, experiment=experiment, recording=recording
     )
@@ -595,8 +598,9 @@ def _tracked_bodies(
     d = positions[rest[0]].shape[2] if rest else 3
     sigma = None if experiment.sigma is None else as_sigma(experiment.sigma, d)
     # Bodies without gaps need no weights.
-    for complete in (True, False):
-        some = [k for k in rest if bool(np.isfinite(positions[k]).all()) is complete]
+    complete = [bool(np.isfinite(x).all()) for x in positions]
+    for whole in (True, False):
+        some = [k for k in rest if complete[k] is whole]
         for rows in of_equal_shape([positions[k] for k in some]):
             numbers = [some[i] for i in rows]
             fits = track_each(
@@ -604,12 +608,12 @@ def _tracked_bodies(
                 time=np.stack([times[k] for k in numbers]),
                 dt=recording.dt,
                 sigma=sigma,
+                piece=np.stack([pieces[k] for k in numbers]),
             )
             for k, fit in zip(numbers, fits, strict=True):
                 if not isinstance(fit, RigidMotion | DegenerateClusterError | TooFewFramesError):
                     raise fit
-                piece = pieces[k]
-                found[k] = replace(fit, piece=piece) if isinstance(fit, RigidMotion) else fit
+                found[k] = fit
     return [found[k] for k in range(len(tracks))]
 
 
@@ -779,6 +783,7 @@ def measure_together(
         Names of the bodies whose steps give no estimate, with the error.
     """
     failures: list[tuple[str, ValueError]] = []
+    find_step_vectors([body.motion for body in bodies])
     coefficients = [
         measure_coefficients(bodies, quantity, experiment, recording, tested=tested)
         for quantity in get_args(Quantity)

@@ -148,19 +148,19 @@ def each_cluster(table: pd.DataFrame) -> Iterator[tuple[int, Floats, Ints, Ints,
     label = table["cluster"].to_numpy(dtype=np.int64)
     late = table["delay"].to_numpy(dtype=np.float64)[:, None] if "delay" in table else None
     stretch = table["piece"].to_numpy(dtype=np.int64) if "piece" in table else None
+    every = bool(tracks.seen.all())
     for inside in _rows_by_label(label):
-        rows = inside[tracks.seen[inside]]
-        positions, frames = _as_array(tracks.frame[rows], tracks.code[rows], tracks.x[rows])
+        rows = inside if every else inside[tracks.seen[inside]]
+        frame, code = tracks.frame.take(rows), tracks.code.take(rows)
+        positions, frames = _as_array(frame, code, tracks.x.take(rows, axis=0))
         piece = np.zeros(len(frames), dtype=np.int64)
         if stretch is not None:
-            position = tracks.frame[rows] - frames[0]
+            position = frame - frames[0]
             piece[position] = stretch[rows]
             last = np.zeros(len(frames), dtype=np.int64)
             last[position] = position
             piece = piece[np.maximum.accumulate(last)]
-        delay = None
-        if late is not None:
-            delay = _as_array(tracks.frame[rows], tracks.code[rows], late[rows])[0][..., 0]
+        delay = None if late is None else _as_array(frame, code, late[rows])[0][..., 0]
         yield int(label[inside[0]]), positions, frames, piece, delay
 
 
@@ -179,6 +179,16 @@ def _as_array(frame: Ints, code: Ints, x: Floats) -> tuple[Floats, Ints]:
             "occur: these numbers look like times or ids; number the frames 0, 1, 2, ..."
         )
         raise TrackTableError(fault, (fault,))
+    frames = np.arange(first, last + 1, dtype=np.int64)
+    if len(frame) % span == 0:
+        # Every particle in every frame, in order: the rows are those of the array.
+        table, codes = frame.reshape(span, -1), code.reshape(span, -1)
+        if (
+            (codes[0, 1:] > codes[0, :-1]).all()
+            and (codes == codes[0]).all()
+            and (table == frames[:, None]).all()
+        ):
+            return x.reshape(*codes.shape, -1), frames
     # The columns are the particles that occur, in the order of their numbers.
     number = code - code.min()
     occurs = np.zeros(int(number.max()) + 1, dtype=np.bool_)
@@ -186,7 +196,7 @@ def _as_array(frame: Ints, code: Ints, x: Floats) -> tuple[Floats, Ints]:
     column = np.cumsum(occurs) - 1
     positions = np.full((span, int(column[-1]) + 1, x.shape[1]), np.nan)
     positions[frame - first, column[number]] = x
-    return positions, np.arange(first, last + 1, dtype=np.int64)
+    return positions, frames
 
 
 def positions_table(positions: ArrayLike, *, frames: ArrayLike | None = None) -> pd.DataFrame:

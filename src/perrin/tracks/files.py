@@ -444,7 +444,8 @@ def _clean_table(
         raise table_error(source, *faults)
     if "time" in clean:
         factors["time"] = seconds(spelling.units)
-    tracks = pd.DataFrame({name: column * factors.get(name, 1) for name, column in clean.items()})
+    scaled = {k: c if factors.get(k, 1) == 1 else c * factors[k] for k, c in clean.items()}
+    tracks = pd.DataFrame(scaled)
     if notes:
         tracks.attrs["notes"] = notes
     tracks.attrs["columns"] = list(names)

@@ -37,13 +37,24 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from perrin._arrays import Bools, Floats, Ints, as_positions, from_plain, frozen, present, to_plain
+from perrin._arrays import (
+    Bools,
+    Floats,
+    Ints,
+    as_positions,
+    count_present,
+    from_plain,
+    frozen,
+    present,
+    to_plain,
+)
 from perrin._display import Shown
 from perrin._text import counted, frames_text
 from perrin.errors import IdentityWarning
 from perrin.geometry.rigid import degrees_of_freedom
 from perrin.geometry.rotations import fit_rotations
 from perrin.geometry.shapes import centred, pair_distances
+from perrin.motion.procrustes import arms_of_particles
 from perrin.motion.residuals import median_chi2
 from perrin.motion.rods import LABEL_LOG_ODDS, LEAP_LABELLED, LEAP_UNLABELLED, SETTLED_LOG_ODDS
 
@@ -119,8 +130,10 @@ class Identity(Shown):
         x = np.asarray(positions, dtype=np.float64)
         if self.order.shape == x.shape[:2]:
             seen = present(x)
-            own = np.where(seen, np.arange(x.shape[1]), -1)
-            if np.array_equal(self.order, own) and np.isnan(x[~seen]).all():
+            own = np.arange(x.shape[1])
+            if not seen.all():
+                own = np.where(seen, own, -1)
+            if (self.order == own).all() and (seen.all() or np.isnan(x[~seen]).all()):
                 return x
         taken = np.take_along_axis(x, self.order[..., None], axis=1)
         return np.where(self.order[..., None] >= 0, taken, np.nan)
@@ -301,12 +314,11 @@ def settle_each(positions: Sequence[Floats], *, times: Sequence[Floats | None]) 
             alike.setdefault((x.shape, complete), []).append(k)
     found: dict[int, Identity] = {}
     for group in alike.values():
-        for part in _batches(len(group), len(positions[group[0]])):
+        for part in _batches(len(group), positions[group[0]].size):
             rows = group[part]
             some = np.stack([positions[k] for k in rows])
-            for k, certain in zip(rows, certain_labels(some), strict=True):
+            for k, seen, certain in zip(rows, present(some), certain_labels(some), strict=True):
                 if certain:
-                    seen = present(positions[k])
                     found[k] = _without_assignment(seen, seen.shape[1], labelled=True)
     return [
         found[k] if k in found else settle_identity(x, times=time)
@@ -533,16 +545,25 @@ def rigid_fits(points: Floats, template: Floats) -> tuple[Floats, Floats]:
     """
     rotation, unique = fit_rotations(points, template)
     here = present(points) & present(template)
+    # With the sets last, products of a few coordinates are those of long vectors.
+    y, t, turn = (
+        np.ascontiguousarray(np.moveaxis(a, -3, -1) if a.ndim > 2 else a[..., None])
+        for a in (points, template, rotation)
+    )
     if here.all():
-        y, t = centred(points), centred(template)
-        e = y - t @ np.swapaxes(rotation, -1, -2)
+        y = y - y.sum(axis=-3, keepdims=True) / y.shape[-3]
+        t = t - t.sum(axis=-3, keepdims=True) / t.shape[-3]
+        e = np.einsum("...njk,...ijk->...nik", t, turn)
+        e -= y
     else:
-        weight = here[..., None] / np.maximum(here.sum(axis=-1), 1)[..., None, None]
-        y, t = np.where(here[..., None], points, 0.0), np.where(here[..., None], template, 0.0)
-        y = y - (y * weight).sum(axis=-2, keepdims=True)
-        t = t - (t * weight).sum(axis=-2, keepdims=True)
-        e = np.where(here[..., None], y - t @ np.swapaxes(rotation, -1, -2), 0.0)
-    return rotation, np.where(unique, np.einsum("...ni,...ni->...", e, e), np.inf)
+        known = (np.swapaxes(here, -2, -1) if here.ndim > 1 else here[:, None])[..., None, :]
+        weight = known / np.maximum(known.sum(axis=-3, keepdims=True), 1)
+        y, t = np.where(known, y, 0.0), np.where(known, t, 0.0)
+        y = y - (y * weight).sum(axis=-3, keepdims=True)
+        t = t - (t * weight).sum(axis=-3, keepdims=True)
+        e = np.where(known, y - np.einsum("...njk,...ijk->...nik", t, turn), 0.0)
+    misfit = np.einsum("...nik,...nik->...k", e, e).reshape(unique.shape)
+    return rotation, np.where(unique, misfit, np.inf)
 
 
 @lru_cache(maxsize=64)
@@ -829,7 +850,7 @@ def certain_labels(x: Floats) -> Bools:
     """
     _, _, n, d = x.shape
     seen = present(x)
-    shown = seen.sum(axis=2)
+    shown = count_present(seen)
     every = np.asarray(seen.any(axis=1)).all(axis=1)
     certain = ((shown == n).sum(axis=1) >= 2) & every & (n >= d)
     bodies = np.flatnonzero(certain)
@@ -920,12 +941,11 @@ def _labelled_shapes(x: Floats, whole: Bools) -> tuple[Floats, Bools, Ints]:
     worst = np.where(used, misfit, 0.0).max(axis=1)
     usable = np.asarray(worst <= 2 * _NOISE_LIKE * usual)
     fits = np.isfinite(misfit) & used
-    arms, turn = centred(points), rotation
+    turn = rotation
     if not fits.all():
-        arms, turn = (np.where(fits[..., None, None], part, 0.0) for part in (arms, turn))
+        points, turn = (np.where(fits[..., None, None], part, 0.0) for part in (points, turn))
     # The sum of R^T (x - centroid) over the rows is one product of matrices.
-    bodies, _, n, d = points.shape
-    total = np.swapaxes(arms, 1, 2).reshape(bodies, n, -1) @ turn.reshape(bodies, -1, d)
+    total = arms_of_particles(points) @ turn.reshape(len(turn), -1, turn.shape[-1])
     count = fits.sum(axis=1)[:, None, None]
     shape = np.where(count > 0, total / np.maximum(count, 1), template)
     return shape, usable, sampled

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import reduce
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from perrin._arrays import Bools, Floats, Ints, present
 from perrin._text import counted
-from perrin.geometry.shapes import centroids, lengths
 from perrin.motion.degenerate import mean_present
-from perrin.motion.residuals import median_present
+from perrin.motion.residuals import frames_last, median_present
 from perrin.tracks.groups import coordinates, group_quantiles
 
 if TYPE_CHECKING:
@@ -141,7 +139,7 @@ def screen_rows(table: pd.DataFrame) -> Screened:
     empty = ~present(x)
     rows = np.lexsort((frame, code))
     rows = rows[~empty[rows]] if empty.any() else rows
-    own, points = code[rows], x[rows]
+    own, points = code.take(rows), x.take(rows, axis=0)
     at_placeholder = placeholder_rows(own, points)
     filled, rest = rows[at_placeholder], rows
     if filled.size:
@@ -234,15 +232,15 @@ def far_points_of_each(positions: Sequence[Floats]) -> list[Bools]:
     """
     found = [np.zeros(x.shape[:2], dtype=np.bool_) for x in positions]
     for rows in of_equal_shape(positions):
-        x = np.stack([positions[k] for k in rows])
-        if x.shape[2] < 2:
+        x = frames_last([positions[k] for k in rows])
+        if x.shape[1] < 2:
             continue
         # A far point is farther from all others than many times any median distance. No distance
         # exceeds the diagonal of the box around the particles of a frame.
-        limit = _FAR_SIZES * median_present(lengths(x[:, :, 1] - x[:, :, 0]))
-        particles = np.moveaxis(x, 2, 0)
-        box = reduce(np.fmax, particles) - reduce(np.fmin, particles)
-        largest = np.nan_to_num(lengths(box)).max(axis=1, initial=0.0)
+        pair, box = x[:, 1] - x[:, 0], np.fmax.reduce(x, axis=1) - np.fmin.reduce(x, axis=1)
+        apart, diagonal = (np.sqrt(np.einsum("bdt,bdt->bt", a, a)) for a in (pair, box))
+        limit = _FAR_SIZES * median_present(apart)
+        largest = np.nan_to_num(diagonal).max(axis=1, initial=0.0)
         for i in np.flatnonzero(~(largest <= limit)).tolist():
             found[rows[i]] = far_points(positions[rows[i]])
     return found
@@ -361,19 +359,16 @@ def centres_removed(positions: Sequence[Floats]) -> list[bool]:
     """
     removed = [False] * len(positions)
     for rows in of_equal_shape(positions):
-        x = np.stack([positions[k] for k in rows])
-        seen = present(x)
-        several = seen.sum(axis=2) >= 2
-        axes = np.ascontiguousarray(np.moveaxis(x, 3, 1))  # (B, d, T, n)
-        every = axes.reshape(*axes.shape[:2], -1)
-        low, high = np.fmin.reduce(every, axis=2), np.fmax.reduce(every, axis=2)
+        x = frames_last([positions[k] for k in rows])
+        seen = present(np.moveaxis(x, 2, -1))
+        several = seen.sum(axis=1) >= 2
+        low, high = np.fmin.reduce(x, axis=(1, 3)), np.fmax.reduce(x, axis=(1, 3))
         rounding = 8 * float(np.finfo(np.float64).eps) * np.maximum(np.abs(low), np.abs(high))
-        mean = centroids(x) if seen.all() else mean_present(x, axis=2)
-        mean = np.ascontiguousarray(np.moveaxis(mean, 2, 1))
+        mean = mean_present(x, axis=1)
         clear = np.ones(len(rows), dtype=np.bool_)
-        for whole in (seen.all(axis=2) & several, several):
-            first = np.where(whole[:, None], axes[..., 0], np.nan)
-            step = np.abs(np.diff(first, axis=2))
+        for whole in (seen.all(axis=1) & several, several):
+            first = np.where(whole[:, None], x[:, 0], np.nan)
+            step = np.abs(first[..., 1:] - first[..., :-1])
             step = np.where(step > rounding[..., None], step, np.inf)
             finest = step.min(axis=2, initial=np.inf)
             centre = np.where(whole[:, None], mean, np.nan)
