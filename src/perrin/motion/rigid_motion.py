@@ -49,7 +49,7 @@ _UNEVEN_POINTS = (0.0, 1.0, 2.0, 4.0, 7.0)
 _MOST_COMPARED = 1_000_000
 
 # Steps whose rotation vectors are found at once: more do not stay in the processor's cache.
-_STEPS_TOGETHER = 4_000
+_VECTORS_TOGETHER = 4_000
 
 _ROTATION_ERROR = 1e-5  # largest departure of R^T R from the identity
 
@@ -603,7 +603,7 @@ def find_step_vectors(motions: Sequence[RigidMotion]) -> None:
     >>> truth.step_vectors().shape
     (8, 3)
     """
-    at_once = max(1, _STEPS_TOGETHER // max([1, *(len(motion.time) for motion in motions)]))
+    at_once = max(1, _VECTORS_TOGETHER // max([1, *(len(motion.time) for motion in motions)]))
     for some in (motions[low : low + at_once] for low in range(0, len(motions), at_once)):
         ends = [motion.steps() for motion in some]
         edges = np.cumsum([0, *(stop.size for _, stop in ends)]).tolist()
