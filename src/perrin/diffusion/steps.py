@@ -432,7 +432,7 @@ def _steps_together(motions: Sequence[RigidMotion], along: _StepsAlongAxes) -> l
 
 
 def _complete_frames(motion: RigidMotion, rows: int) -> Bools:
-    """Return which frames have all the particles that are ever seen; of one row that it counts."""
+    """Return which rows of the noise, of each frame or one of all, have the most particles."""
     if rows == 1:
         return np.ones(1, dtype=np.bool_)
     present = np.where(np.isfinite(motion.center[:, 0]), motion.n_present, -1)
