@@ -1,6 +1,6 @@
 """How the time of a job grows with its size: exponents fitted to processor time.
 
-Each job is timed at sizes a factor of two apart, the median of three rounds, in turn; the exponent
+Each job is timed at sizes a factor of two apart, the median of nine rounds, in turn; the exponent
 is the slope of a straight line through the logarithms of the larger half of the sizes, where the
 constant part does not matter any more. Processor time, one thread (set OMP_NUM_THREADS=1). The last
 row is by the clock, on a machine that does nothing else: what a further cluster takes with one and
@@ -119,7 +119,7 @@ def main():
         if not any(word in name for word in given.only):
             continue
         sizes = sizes[:-2] if given.quick else sizes
-        seconds = seconds_by_size(job, sizes, 1 if given.quick else 3)
+        seconds = seconds_by_size(job, sizes, 1 if given.quick else 9)
         half = len(sizes) // 2
         exponent = np.polyfit(np.log(sizes[half:]), np.log(seconds[half:]), 1)[0]
         spread = ", ".join(f"{s:.2g}" for s in seconds)
