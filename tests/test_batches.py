@@ -38,6 +38,7 @@ from perrin.diffusion import (
     tensor_of_each,
 )
 from perrin.errors import TooFewFramesError
+from perrin.run import verdicts
 
 IRREGULAR = Cluster.from_positions([[0, 0, 0], [3, 0, 0], [0, 2, 0], [0, 0, 1]])
 TETRAHEDRON = Cluster.tetrahedron(1.5)
@@ -146,6 +147,27 @@ def test_verdicts_of_parts():
             assert getattr(one, name) == getattr(expected, name)
     assert together.kind == "spin"
     assert [one.kind for one in together.each][1:4] == ["diffusion", "spin", "confined"]
+
+
+def test_motions_that_cannot_be_judged_leave_the_others_together(motions, monkeypatch):
+    """One of 20 frames and one at rest have no verdict; the others are judged in one call."""
+    seen = []
+
+    def counted(some, **options):
+        seen.append(len(some))
+        return judge_each(some, **options)
+
+    monkeypatch.setattr(verdicts, "judge_each", counted)
+    short = tracked(TETRAHEDRON, 20, 6)
+    still = replace(motions[0], center=np.zeros_like(motions[0].center))
+    some = [motions[0], short, still, motions[2]]
+    judged = verdicts.judge_alone(some, quantity="translation", noise=Noise())
+    assert [one is None for one in judged] == [False, True, True, False]
+    assert seen == [2]
+    alone = judge_each([motions[2]], quantity="translation", noise=Noise())[0]
+    assert judged[3].verdict.text == alone.verdict.text
+    assert verdicts.judge_pool(some, judged, noise=Noise()).n_frames == 420
+    assert verdicts.judge_pool(some[1:], judged[1:], noise=Noise()) is judged[3].verdict
 
 
 def test_a_motion_without_an_estimate_does_not_stop_the_others(motions):

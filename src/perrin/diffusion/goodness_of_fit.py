@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 # Names of the tests, in the order in which they are reported.
 TESTS = ("fractional", "cage", "steady", "clustering", "slow change", "tails", "largest", "line")
 
-_LEAST_STEPS = 20  # eight tests of fewer steps say nothing
+FEWEST_STEPS = 20  # eight tests of fewer steps say nothing
 
 # An axis whose mean square is this much smaller than another one's does not move.
 _SMALLEST_AXIS = 1e-20
@@ -715,9 +715,9 @@ def axis_models(
     every = principal_steps_of_each(motions, quantity)
     for steps in every:
         count = len(steps.duration)
-        if count < _LEAST_STEPS:
+        if count < FEWEST_STEPS:
             raise TooFewFramesError(
-                f"{count} steps: at least {_LEAST_STEPS} are needed to tell what kind of motion "
+                f"{count} steps: at least {FEWEST_STEPS} are needed to tell what kind of motion "
                 "they belong to",
                 count + 1,
             )
@@ -970,6 +970,29 @@ def fisher(p: Sequence[float]) -> float:
     return float(gammaincc(logs.size, logs.sum()))
 
 
+class FittedSteps(NamedTuple):
+    """The steps of one motion with the Brownian motion that is fitted to them.
+
+    Attributes
+    ----------
+    model : AxisModel
+    fit : AxisFit
+        D and offset of every axis.
+    u : ndarray, shape (N,)
+        Sums over the axes of squared prediction errors, scaled to the number of axes on average.
+    """
+
+    model: AxisModel
+    fit: AxisFit
+    u: Floats
+
+    @classmethod
+    def of(cls, model: AxisModel, y: Floats) -> FittedSteps:
+        """Fit the model to the steps (1, A, N) of one motion."""
+        fit = model.fit(y)
+        return cls(model, fit, model.squared_errors(fit)[0])
+
+
 class BrownianSummary(NamedTuple):
     """What the tests of one motion contribute to the verdict on several.
 
@@ -1024,6 +1047,11 @@ class BrownianTests:
     def __post_init__(self) -> None:
         frozen(self.u)
 
+    @property
+    def fitted(self) -> FittedSteps:
+        """The steps with their fit."""
+        return FittedSteps(self.model, self.fit, self.u)
+
     @cached_property
     def summary(self) -> BrownianSummary:
         """What the verdict on several motions needs."""
@@ -1051,11 +1079,12 @@ def brownian_tests(model: AxisModel, y: Floats) -> BrownianTests:
     >>> holm(np.array(list(tests.p.values()))) > 0.05
     True
     """
-    fit = model.fit(y)
+    _, fit, u = FittedSteps.of(model, y)
     scores = model.scores(fit) if model.even else model.dense_scores(fit, y)
-    u = model.squared_errors(fit)
-    p = {name: float(value[0]) for name, value in approximate_p(model, fit, scores, u).items()}
-    return _ranked_if_short(model, fit, scores, u[0], p)
+    p = approximate_p(model, fit, scores, u[None])
+    return _ranked_if_short(
+        model, fit, scores, u, {name: float(value[0]) for name, value in p.items()}
+    )
 
 
 def brownian_tests_of_each(

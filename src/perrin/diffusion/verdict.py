@@ -20,6 +20,7 @@ from perrin.diffusion.goodness_of_fit import (
     FEWEST_HALF_PERIODS,
     BrownianSummary,
     BrownianTests,
+    FittedSteps,
     Score,
     axis_models,
     brownian_tests_of_each,
@@ -294,7 +295,7 @@ def judge_each(
 
     def verdict_on(motion: RigidMotion, tests: BrownianTests) -> MotionVerdict:
         return _verdict(
-            [motion], [tests.summary], lambda: [tests], quantity=quantity, settings=noise
+            [motion], [tests.summary], lambda: [tests.fitted], quantity=quantity, settings=noise
         )
 
     verdicts = _with_models(motions, [*map(verdict_on, motions, tested)], noise)
@@ -324,11 +325,11 @@ def judge_together(
     """
     quantity = each[0].verdict.quantity
 
-    def tests() -> list[BrownianTests]:
-        return brownian_tests_of_each(axis_models(motions, quantity, noise))
+    def fitted() -> list[FittedSteps]:
+        return [FittedSteps.of(*one) for one in axis_models(motions, quantity, noise)]
 
     summaries = [one.tests for one in each]
-    together = _verdict(motions, summaries, tests, quantity=quantity, settings=noise)
+    together = _verdict(motions, summaries, fitted, quantity=quantity, settings=noise)
     verdicts = tuple(one.verdict for one in each)
     counts = Counter(one.kind for one in verdicts).most_common()
     kinds = ", ".join(f"{count} {kind}" for kind, count in counts)
@@ -338,14 +339,15 @@ def judge_together(
 def _verdict(
     motions: Sequence[RigidMotion],
     summaries: Sequence[BrownianSummary],
-    tests: Callable[[], Sequence[BrownianTests]],
+    fitted: Callable[[], Sequence[FittedSteps]],
     *,
     quantity: Quantity,
     settings: Noise,
 ) -> MotionVerdict:
-    """Return the verdict on motions; what names the motion needs `tests`, if one of them rejects.
+    """Return the verdict on motions; what names the motion needs their fits, if a test rejects.
 
-    Bodies by the thousand are judged from the summaries, and their tests would need much memory.
+    The summaries of the tests are enough for thousands of bodies that diffuse, whose steps and fits
+    would take much memory.
     """
     p = combined_p(summaries)
     p_family = holm(np.array(list(p.values())))
@@ -372,7 +374,7 @@ def _verdict(
     )
     if p_family > LEVEL:
         return verdict
-    tested, first = tests(), min(p, key=lambda name: p[name])
+    tested, first = fitted(), min(p, key=lambda name: p[name])
     if first == "line":
         peaks = []
         for one in tested:
@@ -460,7 +462,7 @@ def detectable_by(tested: Sequence[BrownianSummary], quantity: Quantity) -> dict
 
 def _shape(
     motions: Sequence[RigidMotion],
-    tested: Sequence[BrownianTests],
+    tested: Sequence[FittedSteps],
     quantity: Quantity,
     settings: Noise,
 ) -> tuple[Kind, Model | None]:
@@ -505,7 +507,7 @@ def _shape(
 def _variance(
     verdict: MotionVerdict,
     motions: Sequence[RigidMotion],
-    tested: Sequence[BrownianTests],
+    tested: Sequence[FittedSteps],
 ) -> MotionVerdict:
     """Tell a few long steps from a D that changes, and a D that changes from noise that does.
 
@@ -593,7 +595,7 @@ def _jumps(verdict: MotionVerdict, rows: Sequence[int]) -> MotionVerdict:
     return replace(verdict, kind="jumps", frames=tuple(rows), text=text)
 
 
-def _noise_changes(motions: Sequence[RigidMotion], tested: Sequence[BrownianTests]) -> bool:
+def _noise_changes(motions: Sequence[RigidMotion], tested: Sequence[FittedSteps]) -> bool:
     """Tell noise that changes linearly along a track from a D that does, by the larger score.
 
     The residuals of the rigid fits decide where they change beyond three standard errors.

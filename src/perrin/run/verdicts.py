@@ -10,6 +10,7 @@ import numpy as np
 
 from perrin.diffusion.anomalous import fit_anomalous
 from perrin.diffusion.confined import fit_confined
+from perrin.diffusion.goodness_of_fit import FEWEST_STEPS
 from perrin.diffusion.step_tests import without_spin
 from perrin.diffusion.switching import fit_switching
 from perrin.diffusion.verdict import MotionVerdict, judge_each, judge_together
@@ -89,7 +90,11 @@ def judge_alone(
                 # The one that cannot be judged is found by itself.
                 return [None] if len(some) == 1 else [one for m in some for one in judged([m])]
 
-    moving = [k for k, motion in enumerate(motions) if not is_at_rest(motion, quantity)]
+    moving = [
+        k
+        for k, motion in enumerate(motions)
+        if len(motion.steps()[0]) >= FEWEST_STEPS and not is_at_rest(motion, quantity)
+    ]
     found = dict(zip(moving, judged([motions[k] for k in moving]) if moving else [], strict=True))
     return [found.get(k) for k in range(len(motions))]
 
