@@ -294,6 +294,21 @@ def test_many_clusters_are_listed_and_pooled(single, tmp_path):
     assert unpacked(payloads["7"])[0]["title"] == "Cluster 7"
 
 
+def test_thousands_of_clusters_have_a_bounded_page(single, monkeypatch):
+    """All are in the table; details have the first, those with warnings, then the others."""
+    one = single.clusters[0]
+    many = tuple(replace(one, cluster=k, warnings=("a",) if k in (7, 9) else ()) for k in range(12))
+    monkeypatch.setattr("perrin.report.page.cluster_data", lambda *_, **__: "=" * 100)
+    monkeypatch.setattr("perrin.report.page._MOST_DETAILS", 450)
+    html = report.render_html(replace(single, clusters=many), [])
+    page = Page(html)
+    drawn = [0, 1, 2, 7, 9]
+    assert re.findall(r'class="payload" data-cluster="(\d+)"', html) == [str(k) for k in drawn]
+    assert [f"#cluster-{k}" in page.sources for k in range(12)] == [k in drawn for k in range(12)]
+    assert html.count("<tr data-cluster=") == 12
+    assert "figures and details of 5 of 12 clusters, those with warnings first" in page.text
+
+
 def unpacked(text):
     """Return header and columns of a packed text."""
     content = gzip.decompress(base64.b64decode(text))

@@ -83,6 +83,10 @@ _RESULT_CAPTIONS = {
     ),
 }
 
+# Characters of the figures and details of single clusters: those of some 600 clusters, so that the
+# page of any number of them stays below 15 MB.
+_MOST_DETAILS = 5_500_000
+
 # Units of the arguments of `analyze`.
 _ARGUMENT_UNITS = {
     "dt": "s",
@@ -124,7 +128,7 @@ def render_html(
     version = settings.get("versions", {}).get("perrin", "")
     script = page_script("report")
     plotly, plotly_hash = plotly_script()
-    chosen, payloads = None, []
+    chosen = None
     if report.results:
         first = report.results[0]
         kinds = {
@@ -139,8 +143,12 @@ def render_html(
             for name, kind in kinds.items()
         ]
         chosen = cluster_texts(first, report) | {"figures": [one for one in drawn if one]}
-    tracks = grouped_tracks(report.tracks)
-    for done, result in enumerate(report.results):
+    tracks, payloads, size = grouped_tracks(report.tracks), {}, 0
+    # Beside the first one clusters with warnings come before the others.
+    order = [*report.results[:1], *sorted(report.results[1:], key=lambda one: not one.warnings)]
+    for done, result in enumerate(order):
+        if size > _MOST_DETAILS:
+            break
         if progress is not None:
             progress(done, len(report.results), "writing the report")
         texts = cluster_texts(result, report)
@@ -154,7 +162,8 @@ def render_html(
             details=render_part("cluster", "details", texts),
             still=texts["still"],
         )
-        payloads.append((result.cluster, data))
+        payloads[result.cluster] = data
+        size += len(data)
     subject = f"Rotational diffusion of {'clusters' if several else 'a cluster'}"
     if not report.results:
         subject = "Translational diffusion of single spheres"
@@ -179,7 +188,10 @@ def render_html(
         kinds=kind_rows(report) if report.pooled_by_kind else [],
         headline=headline,
         verdict=[" ".join(texts) for texts in verdict_lines(report).values()],
-        overview=[overview_row(one, report) for one in (report.results if several else ())],
+        overview=[
+            overview_row(one, report) | {"detailed": one.cluster in payloads}
+            for one in (report.results if several else ())
+        ],
         pooled=pooled_texts(report) if several and pooled is not None else None,
         has_images=report.imaging is not None,
         warnings=condensed(report.warnings),
@@ -188,7 +200,11 @@ def render_html(
         noted=remark_rows(report, {c.name: c.notes for c in report.results}),
         overview_figure=captioned(pictures, "clusters", "clusters", _RESULT_CAPTIONS["clusters"]),
         chosen=chosen,
-        payloads=payloads,
+        payloads=[
+            (one.cluster, payloads[one.cluster])
+            for one in report.results
+            if one.cluster in payloads
+        ],
         overview_data=overview_data(report),
         copies=[
             ("Methods paragraph", methods_paragraph(report)),

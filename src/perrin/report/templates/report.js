@@ -429,7 +429,7 @@
   };
   const visibleOrder = () => (list.visible.length ? list.visible.map((row) => row.dataset.cluster) : order);
   const neighbour = (step) => {
-    const rows = visibleOrder(), at = rows.indexOf(shown);
+    const rows = visibleOrder().filter((key) => payloads.has(key)), at = rows.indexOf(shown);
     const next = rows[(at + step + rows.length) % rows.length];
     if (next !== undefined && next !== shown) {
       history.replaceState(null, "", `#cluster-${next}`);
