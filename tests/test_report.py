@@ -299,7 +299,7 @@ def test_thousands_of_clusters_have_a_bounded_page(single, monkeypatch):
     one = single.clusters[0]
     many = tuple(replace(one, cluster=k, warnings=("a",) if k in (7, 9) else ()) for k in range(12))
     monkeypatch.setattr("perrin.report.page.cluster_data", lambda *_, **__: "=" * 100)
-    monkeypatch.setattr("perrin.report.page._MOST_DETAILS", 450)
+    monkeypatch.setattr("perrin.report.page._MOST_DETAILS", 450 + 12 * 550)
     html = report.render_html(replace(single, clusters=many), [])
     page = Page(html)
     drawn = [0, 1, 2, 7, 9]

@@ -83,9 +83,9 @@ _RESULT_CAPTIONS = {
     ),
 }
 
-# Characters of the figures and details of single clusters: those of some 600 clusters, so that the
-# page of any number of them stays below 15 MB.
-_MOST_DETAILS = 5_500_000
+# Characters of the figures and details of single clusters, and what a row of the table takes of
+# them: with these the page of 10 000 clusters stays below 15 MB.
+_MOST_DETAILS, _ROW_SIZE = 11_000_000, 550
 
 # Units of the arguments of `analyze`.
 _ARGUMENT_UNITS = {
@@ -144,10 +144,11 @@ def render_html(
         ]
         chosen = cluster_texts(first, report) | {"figures": [one for one in drawn if one]}
     tracks, payloads, size = grouped_tracks(report.tracks), {}, 0
+    most = _MOST_DETAILS - _ROW_SIZE * len(report.results)
     # Beside the first one clusters with warnings come before the others.
     order = [*report.results[:1], *sorted(report.results[1:], key=lambda one: not one.warnings)]
     for done, result in enumerate(order):
-        if size > _MOST_DETAILS:
+        if payloads and size > most:
             break
         if progress is not None:
             progress(done, len(report.results), "writing the report")
