@@ -143,7 +143,8 @@ def render_html(
             for name, kind in kinds.items()
         ]
         chosen = cluster_texts(first, report) | {"figures": [one for one in drawn if one]}
-    tracks, payloads, size = grouped_tracks(report.tracks), {}, 0
+    payloads: dict[int, str] = {}
+    tracks, size = grouped_tracks(report.tracks), 0
     most = _MOST_DETAILS - _ROW_SIZE * len(report.results)
     # Beside the first one clusters with warnings come before the others.
     order = [*report.results[:1], *sorted(report.results[1:], key=lambda one: not one.warnings)]
