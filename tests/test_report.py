@@ -298,6 +298,7 @@ def test_thousands_of_clusters_have_a_bounded_page(single, monkeypatch):
     """All are in the table; details have the first, those with warnings, then the others."""
     one = single.clusters[0]
     many = tuple(replace(one, cluster=k, warnings=("a",) if k in (7, 9) else ()) for k in range(12))
+    many = (*many[:11], replace(many[11], notes=("a note",)))
     monkeypatch.setattr("perrin.report.page.cluster_data", lambda *_, **__: "=" * 100)
     monkeypatch.setattr("perrin.report.page._MOST_DETAILS", 450 + 12 * 550)
     html = report.render_html(replace(single, clusters=many), [])
@@ -306,6 +307,7 @@ def test_thousands_of_clusters_have_a_bounded_page(single, monkeypatch):
     assert re.findall(r'class="payload" data-cluster="(\d+)"', html) == [str(k) for k in drawn]
     assert [f"#cluster-{k}" in page.sources for k in range(12)] == [k in drawn for k in range(12)]
     assert html.count("<tr data-cluster=") == 12
+    assert "Cluster 11: a note" in page.text  # without a link that would lead nowhere
     assert "figures and details of 5 of 12 clusters, those with warnings first" in page.text
 
 

@@ -190,10 +190,7 @@ def render_html(
         kinds=kind_rows(report) if report.pooled_by_kind else [],
         headline=headline,
         verdict=[" ".join(texts) for texts in verdict_lines(report).values()],
-        overview=[
-            overview_row(one, report) | {"detailed": one.cluster in payloads}
-            for one in (report.results if several else ())
-        ],
+        overview=[overview_row(one, report) for one in (report.results if several else ())],
         pooled=pooled_texts(report) if several and pooled is not None else None,
         has_images=report.imaging is not None,
         warnings=condensed(report.warnings),
@@ -202,11 +199,9 @@ def render_html(
         noted=remark_rows(report, {c.name: c.notes for c in report.results}),
         overview_figure=captioned(pictures, "clusters", "clusters", _RESULT_CAPTIONS["clusters"]),
         chosen=chosen,
-        payloads=[
-            (one.cluster, payloads[one.cluster])
-            for one in report.results
-            if one.cluster in payloads
-        ],
+        payloads={
+            one.cluster: payloads[one.cluster] for one in report.results if one.cluster in payloads
+        },
         overview_data=overview_data(report),
         copies=[
             ("Methods paragraph", methods_paragraph(report)),
